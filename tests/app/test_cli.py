@@ -239,8 +239,6 @@ def test_mistakes_get_one_line_and_their_exit_code(scene, run, tmp_path, capsys)
     for command, *others in (("fit", "--out", out), ("eval",), ("view",)):
         said = failure(capsys, 3, command, str(tmp_path / "my-ran"), *others)
         assert "my-ran: no such f" in said and said.endswith("; did you mean my-run?")
-    nowhere = tmp_path / "nowhere.safetensors"
-    assert "cannot be read (No such file or directory); give" in failure(capsys, 3, "doctor", "--repeat", str(nowhere))
     said = failure(capsys, 2, "convert", str(run), "a b.ply")
     assert f"is a run folder; use `warpgs export {run} --to 'a b.ply'`" in said
     (tmp_path / "model.spz").touch()
@@ -251,7 +249,7 @@ def test_mistakes_get_one_line_and_their_exit_code(scene, run, tmp_path, capsys)
     assert "leave out --frames" in failure(capsys, 2, "render", str(run), "--path", "views", "--frames", "2")
     assert "--format requires --object" in failure(capsys, 2, "demo", out, "--format", "transforms")
     assert "--format must be transforms or colmap" in failure(capsys, 2, "demo", out, "--object", "--format", "ply")
-    assert "--device requires --repeat" in failure(capsys, 2, "doctor", "--device", "tpu")
+    assert "--repeat was removed: the error of the fit" in failure(capsys, 2, "doctor", "--repeat", "a.safetensors")
     assert "is the folder of a run" in failure(capsys, 2, "poses", str(run), "--out", out)
     assert "holds scenes, such as" in failure(capsys, 2, "poses", str(scene.parent), "--out", out)
     assert "path 'zigzag'" in failure(capsys, 2, "render", str(run), "--path", "zigzag")

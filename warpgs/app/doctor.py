@@ -18,7 +18,7 @@ from typing import Literal
 from warpgs.app.flags import parse_flags
 from warpgs.device import ASSUMED_BYTES, format_bytes, machine_memory, prepare_kernel_cache, processor_name, usable_cores
 from warpgs.errors import ResourceError, UsageError, install_extras
-from warpgs.process import counted, fast_imports, hidden_stderr, printable, say
+from warpgs.process import counted, fast_imports, hidden_stderr, printable
 from warpgs.report.progress import Stages, waiting
 
 OK, MISSING, NOTE = "ok", "missing", "note"
@@ -69,8 +69,8 @@ PACKAGES = (
     Package("psutil", "psutil", False, "free memory"),
     Package("safetensors", "safetensors", True, "checkpoints"),
     Package("onnxruntime", "onnxruntime", False, "depth and feature networks"),
-    Package("pyvista", "pyvista", False, "3D overviews in reports", imported=False),
-    Package("vtk", "vtk", False, "3D overviews in reports", imported=False),
+    Package("pyvista", "pyvista", False, "`warpgs plot` and `warpgs mesh`", imported=False),
+    Package("vtk", "vtk", False, "`warpgs plot` and `warpgs mesh`", imported=False),
 )
 EXTRAS = {
     "poses": ("pycolmap", "photographs without cameras"),
@@ -262,7 +262,7 @@ def _kernel_cache() -> Iterable[Finding]:
 
 
 def _rendering() -> Iterable[Finding]:
-    topic = "3D overview"
+    topic = "Plots"
     try:
         overview = importlib.import_module("warpgs.report.overview")
         ok, detail = overview.probe_rendering()
@@ -272,7 +272,7 @@ def _rendering() -> Iterable[Finding]:
         yield Finding(topic, OK, detail)
     else:
         remedy = "pip install pyvista vtk; on a machine without a screen, also libEGL or libOSMesa (libosmesa6)"
-        yield Finding(topic, NOTE, f"{detail}; reports come without the 3D overview", remedy)
+        yield Finding(topic, NOTE, f"{detail}; `warpgs plot` cannot render", remedy)
 
 
 def _video() -> Iterable[Finding]:
@@ -388,27 +388,17 @@ def run_doctor(arguments: list[str], about: str) -> int:
     """Run the command; ``about`` describes it in its help.
 
     Raises:
-        UsageError: Flags exclude each other, or a value is invalid.
+        UsageError: A flag or a value is invalid.
     """
 
     @dataclass(frozen=True)
     class Doctor:
         warm: bool = False
         """Compile the kernels of a fit with pinhole cameras for this machine's devices, and skip the checks."""
-        repeat: Path | None = None
-        """File not_finite.safetensors of a run: repeat the saved step, name the non-finite values, and skip the checks."""
-        device: str = "auto"
-        """Device for --repeat: auto, cpu or cuda."""
 
+    if any(a.partition("=")[0] == "--repeat" for a in arguments):
+        raise UsageError("--repeat was removed: the error of the fit itself names step, view, loss term and tensors")
     a = parse_flags(Doctor, arguments, "warpgs doctor", about)
-    if a.repeat is None and a.device != "auto":
-        raise UsageError("--device requires --repeat")
-    if a.repeat is not None:
-        from warpgs.pipeline.run.commands import repeat_failed_step
-
-        for line in repeat_failed_step(a.repeat, a.device):
-            say(line)
-        return 0
     if a.warm:
         with fast_imports():
             from warpgs.pipeline.run.precompile import print_warming

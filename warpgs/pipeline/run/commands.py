@@ -45,7 +45,6 @@ from warpgs.pipeline.model import edit
 from warpgs.pipeline.model.edit import coverage
 from warpgs.pipeline.model.start import InitConfig, consistent_depths, seen_points
 from warpgs.pipeline.model.table import FittedModel, model_bytes, pack
-from warpgs.pipeline.run.failed_step import findings, read_failed_step
 from warpgs.pipeline.run.folder import CONFIG, IMAGE_FOLDERS, StoredRun, camera_values, open_run, save_checkpoint, with_cameras
 from warpgs.pipeline.run.request import NO_SCORES, SceneRequest, choose_device, read_scene
 from warpgs.pipeline.run.results import evaluate_run, protocol_of, score_line
@@ -269,17 +268,6 @@ def render(
     if last.name == FILM:
         return [*notes, f"{len(files)} images and {FILM} in {out}"]
     return [*notes, f"{len(files) + 1} images in {out}; no film, since the views differ in size"]
-
-
-def repeat_failed_step(path: Path, device_name: str) -> list[str]:
-    """Repeat a step with a non-finite loss; returns lines for the user on its inputs and results.
-
-    Raises:
-        DataError: The file holds no such step.
-        ResourceError: The device is missing.
-    """
-    device, where = choose_device(device_name)
-    return [f"{path}, repeated {where}:", *findings(read_failed_step(path, device))]
 
 
 def mean_psnr(gaussians: Gaussians, views: list[View], options: RasterizeOptions) -> float:

@@ -7,7 +7,6 @@ import hashlib
 import json
 import time
 from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -26,8 +25,6 @@ from warpgs.pipeline.metrics.scores import Rendered, moved_fractions, moved_note
 from warpgs.pipeline.model.edit import drop_unused_sh
 from warpgs.pipeline.model.limits import shape_figures, shape_summary
 from warpgs.pipeline.model.table import FittedModel
-from warpgs.pipeline.run.failed_step import FILE as FAILED
-from warpgs.pipeline.run.failed_step import broken_terms, failed_step, save_failed_step
 from warpgs.pipeline.run.folder import (
     CONFIG,
     METRICS_FILE,
@@ -52,7 +49,6 @@ from warpgs.pipeline.run.results import (
     event_figures,
     given_figures,
     images_kept,
-    overview_of,
     protocol_of,
     result_lines,
     rule_report_of,
@@ -60,9 +56,11 @@ from warpgs.pipeline.run.results import (
     write_report,
 )
 from warpgs.pipeline.train.batch import check_ranks, check_renders, own_slots
+from warpgs.pipeline.train.loss import term_values
 from warpgs.pipeline.train.presets import chosen_settings
 from warpgs.pipeline.train.schedule import StepReport, choose_background, over_background
 from warpgs.pipeline.train.settings import FitConfig, settings_by_views, within_budget
+from warpgs.pipeline.train.step import StepBuffers, eager_renderer, forward
 from warpgs.pipeline.train.trainer import Trainer, background_warmup, complexity_figures, complexity_summary, run, train_views
 from warpgs.plugins import is_ours
 from warpgs.poses.find import JSON, TEXT, find_poses, needs_poses, read_poses_record, source_digest
@@ -222,28 +220,51 @@ def take_steps(job: FitJob, trainer: Trainer, images_written: Callable[[], None]
         except NotFiniteError as e:
             if e.view is None:
                 raise
-            if job.out is None:
+            if not job.ranks.first:
                 job.ranks.leave()  # all ranks have this loss; the first reports it
                 raise
-            failed = _saved_failure(job.out, job, trainer, e)
+            explained = _explained(job, trainer, e)
             recorder.save(trainer)
-            raise failed from e
+            raise explained from e
 
 
-def _saved_failure(out: Path, job: FitJob, trainer: Trainer, error: NotFiniteError) -> NotFiniteError:
-    """Save the inputs of a step with a non-finite loss; returns the error for the user."""
+def _explained(job: FitJob, trainer: Trainer, error: NotFiniteError) -> NotFiniteError:
+    """Return the error for the user on a step with a non-finite loss: view, loss terms, tensors, and what to do."""
     assert error.view is not None
-    name = job.split.train[error.view]
-    bundle = failed_step(trainer, error.view, name, error.slot)
-    save_failed_step(out / FAILED, bundle)
-    broken = broken_terms(bundle)
-    own = [t.name for t in trainer.terms if t.name in broken and not is_ours(type(t))]
-    where = f", in the loss term {' and '.join(broken)}" if broken else ""
-    mend = f"correct {' and '.join(own)}, and fit again" if own else "fit again with lower learning rates"
-    names = "names the non-finite values of the other terms" if own else "names the non-finite values"
-    return NotFiniteError(
-        f"{error}, on {name}{where}. The state before the step and its inputs are saved; `warpgs doctor --repeat "
-        f"{out / FAILED}` {names}. --resume would fail at the same step; {mend} into a new --out"
+    broken, tensors = non_finite_parts(trainer, error.view, error.slot)
+    own = [t.name for t in trainer.terms if f"the loss term {t.name}" in broken and not is_ours(type(t))]
+    text = f"{error}, on {job.split.train[error.view]}{', in ' if broken else ''}{' and '.join(broken)}; "
+    text += f"not finite: {', '.join(tensors)}" if tensors else "all of its inputs and renders are finite"
+    fix = f"correct {' and '.join(own)}, and fit again" if own else "fit again with lower learning rates"
+    report = "" if own else "; if that fails, report this message"
+    if job.out is not None:
+        text += f". The state before the step is saved in {job.out}, and --resume would fail at the same step"
+        fix, report = f"{fix} into a new --out", report and f"{report} and {job.out / CONFIG}"
+    return NotFiniteError(f"{text}. To fix it, {fix}{report}")
+
+
+def non_finite_parts(trainer: Trainer, view: int, slot: int) -> tuple[list[str], list[str]]:
+    """Repeat the forward pass of the next step on ``view``; returns the non-finite loss terms and tensors (inputs, renders)."""
+    number = trainer.step + 1
+    plan = trainer.plan_of(number)
+    kind, row = trainer.places[view + plan.half_size * len(trainer.views)]
+    stack, learned = trainer.stacks[kind], trainer.learned
+    buffers = StepBuffers(trainer.device, 1, 1)
+    buffers.load([row], [[0.0]], [trainer.settings(number, slot)])
+    render = eager_renderer(trainer.context.render_options(), None)
+    with torch.no_grad():
+        found = forward(trainer.gaussians, learned.views, learned.dropout_seed, stack, buffers, plan, render)
+        values = {f"the loss term {t.name}": v for t, v in zip(plan.terms, term_values(plan.terms, found.inputs), strict=True)}
+        values |= {f"the view module {n}": v for n, v in found.of_views.items()}
+        extra = trainer.strategy.regularisation(plan.phase, found.inputs.gaussians)
+        values |= {} if extra is None else {f"the strategy {trainer.config.strategy}": extra}
+    target = found.inputs.target
+    tensors = {"image": target.image} | {f"map {n}": t for n, t in target.maps.items()}
+    tensors |= learned.params | {f"rendered {n}": t for n, t in found.inputs.outputs.items()}
+    wrong = {n: int((~torch.isfinite(t)).sum()) for n, t in tensors.items()}
+    return (
+        [n for n, v in values.items() if not bool(torch.isfinite(v).all())],
+        [f"{n} ({count:,} of {tensors[n].numel():,} values)" for n, count in wrong.items() if count],
     )
 
 
@@ -624,18 +645,14 @@ def _finish(job: FitJob, trainer: Trainer, state: State | None, record: dict[str
             job.scene.normalization,
             antialiased=job.config.antialiased,
         )
-    with ThreadPoolExecutor(1) as beside:
-        # its process takes seconds; views are scored here meanwhile
-        overview = beside.submit(overview_of(trainer.gaussians, job.train, job.test)) if job.out is not None else None
-        metrics = _score(job, trainer, {"setup": setup, "training": training}, given)
-        if job.out is not None and overview is not None:
-            job.progress("making the report")
-            write_json(job.out / METRICS_FILE, metrics)
-            record["notes"] = job.notes
-            write_report(
-                job.out, job.scene, job.split, trainer.gaussians, trainer.context.render_options(), metrics, record,
-                sampling=sampling_report_of(trainer, job.out), overview=overview.result(), tell=job.progress,
-            )  # fmt: skip
+    metrics = _score(job, trainer, {"setup": setup, "training": training}, given)
+    if job.out is not None:
+        write_json(job.out / METRICS_FILE, metrics)
+        record["notes"] = job.notes
+        write_report(
+            job.out, job.scene, job.split, trainer.gaussians, trainer.context.render_options(), metrics, record,
+            sampling=sampling_report_of(trainer, job.out), tell=job.progress,
+        )  # fmt: skip
     for line in [*lost_lines(job.out), *result_lines(metrics, job.out)]:
         job.say(line)
     return FitResult(

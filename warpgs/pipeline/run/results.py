@@ -50,7 +50,7 @@ from warpgs.report.images import Tile, contact_sheet, depth_map, error_map, png,
 from warpgs.report.overview import render_overview
 from warpgs.report.page import Page, SamplingReport, ViewImages, curve, image_names, write_page
 from warpgs.report.progress import duration, read_events
-from warpgs.scene import Camera, Gaussians, Scene, View, base_colors
+from warpgs.scene import Camera, Gaussians, Scene, View
 
 DEPTH, NORMALS = "given_depth", "given_normals"
 """Names of the maps of the loss terms."""
@@ -422,8 +422,6 @@ def sampling_report_of(fit: Trainer, out: Path) -> SamplingReport | None:
     return SamplingReport(words, images, table)
 
 
-Overview = tuple[bytes | None, str]
-"""PNG of the 3D overview and an empty text, or None and the reason."""
 LABELS = {
     "psnr": "PSNR [dB]", "psnr_whole": "PSNR, whole image [dB]", "psnr_foreground": "PSNR, foreground [dB]",
     "alpha_empty": "alpha where empty", "alpha_object": "alpha in the object",
@@ -438,8 +436,6 @@ SHOWN_VIEWS = 6
 """Held-out views with images in the report; all have files in the run folder."""
 RENDER_WORKERS = 4
 """Threads that score and encode images while others are rendered."""
-OVERVIEW_POINTS = 60_000
-"""Gaussians shown in the 3D overview, sampled at random."""
 
 
 def score_keys(metrics: dict[str, Any]) -> list[str]:
@@ -585,16 +581,6 @@ def _images(
     return [ViewImages(name, caption, *parts) for name, caption, parts in result]
 
 
-def overview_of(gaussians: Gaussians, train: list[View], test: list[View]) -> Callable[[], Overview]:
-    """Return a function that plots the 3D overview in a separate process; the function may be called from another thread."""
-    means = gaussians.means.detach().cpu().numpy()
-    colors = np.clip(base_colors(gaussians.sh[:, :1].detach().cpu().numpy()), 0, 1)
-    sample = np.random.default_rng(0).permutation(len(means))[:OVERVIEW_POINTS]
-    points, cameras = means[sample].astype(np.float64), ([v.camera for v in train], [v.camera for v in test])
-    up = up_of(cameras[0], points)
-    return lambda: render_overview(*cameras, points, colors[sample], up)
-
-
 def _figures(metrics: dict[str, Any]) -> list[tuple[str, str]]:
     """Return the main figures of the page as pairs of label and value."""
     held_out = []
@@ -632,7 +618,6 @@ def write_report(
     record: dict[str, Any],
     *,
     sampling: SamplingReport | None,
-    overview: Overview,
     tell: Callable[[str], object] = lambda line: None,
 ) -> None:
     """Write report.html for a scored run.
@@ -646,12 +631,13 @@ def write_report(
         metrics: Contents of metrics.json.
         record: Contents of config.json.
         sampling: The part on sampling events, or None.
-        overview: Result of the function of `overview_of`.
         tell: Called with a line for each view before it is rendered.
     """
     train, test = [scene.view(n) for n in split.train], [scene.view(n) for n in split.test]
-    image, why = overview
-    notes = [*record["notes"], *([why] if why else [])]
+    tell("making the report")
+    cameras = [v.camera for v in train], [v.camera for v in test]
+    up = up_of(cameras[0], gaussians.means.detach().cpu().numpy().astype(np.float64))
+    overview = render_overview(gaussians, options, *cameras, up)
     events = read_events(out / "metrics.jsonl")
     steps = [e["step"] for e in events]
     curves = [
@@ -673,8 +659,8 @@ def write_report(
         title=(out if Path(scene.path).parent == out else Path(scene.path)).resolve().name,  # not "scene" for found poses
         subtitle=f"preset {metrics['preset']}, {len(train)} training views, {len(test)} held out, "
         f"{camera.width} x {camera.height} px, {metrics['device']}",
-        figures=_figures(metrics), notes=notes, table=table, views=images, curves=curves, sampling=sampling,
-        overview=None if image is None else webp(image), held_out=bool(test),
+        figures=_figures(metrics), notes=record["notes"], table=table, views=images, curves=curves, sampling=sampling,
+        overview=None if overview is None else webp(overview), held_out=bool(test),
         details={k: v for k, v in record.items() if k != "cameras"}, protocol=_protocol(metrics),
         coverage=covered,
     )  # fmt: skip
