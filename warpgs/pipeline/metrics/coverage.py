@@ -22,7 +22,7 @@ from warpgs.process import counted
 from warpgs.render.options import RasterizeOptions
 from warpgs.render.rasterize import rasterize
 from warpgs.report.images import COVERAGE_LEGEND, coverage_image, png, webp
-from warpgs.report.page import CoverageReport
+from warpgs.report.page import Section
 from warpgs.scene import Camera, Gaussians, View
 
 TOLERANCE = 0.02
@@ -472,7 +472,7 @@ def coverage_lines(coverage: dict[str, Any]) -> list[str]:
     return [*lines, coverage["summary"], EXPECTED, f"images in {FOLDER}/: {COVERAGE_LEGEND}"]
 
 
-def coverage_section(out: Path, coverage: dict[str, Any], shown: list[str], names: Mapping[str, str]) -> CoverageReport:
+def coverage_section(out: Path, coverage: dict[str, Any], shown: list[str], names: Mapping[str, str]) -> Section:
     """Return the section of the report page.
 
     Args:
@@ -483,8 +483,9 @@ def coverage_section(out: Path, coverage: dict[str, Any], shown: list[str], name
     """
     files = {n: out / FOLDER / f"{names[n]}.png" for n in shown}
     head, *rows = coverage_table(coverage)
-    return CoverageReport(
-        f"{coverage['summary'][0].upper()}{coverage['summary'][1:]}. {EXPECTED}", COVERAGE_LEGEND,
+    return Section(
+        f"{coverage['summary'][0].upper()}{coverage['summary'][1:]}. {EXPECTED}",
         [(n, webp(decode(f, data=read_file(f, out))[0], 640)) for n, f in files.items() if f.is_file()],
         [head[1:], *(r[1:] for r in rows if r[0] == "all views")],
-    )  # fmt: skip
+        f"{COVERAGE_LEGEND[0].upper()}{COVERAGE_LEGEND[1:]}.",
+    )

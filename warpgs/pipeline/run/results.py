@@ -48,7 +48,7 @@ from warpgs.render.rasterize import rasterize
 from warpgs.render.reference import reference_image
 from warpgs.report.images import Tile, contact_sheet, depth_map, error_map, png, side_by_side, webp
 from warpgs.report.overview import render_overview
-from warpgs.report.page import Page, SamplingReport, ViewImages, curve, image_names, write_page
+from warpgs.report.page import Section, ViewImages, curve, image_names, write_page
 from warpgs.report.progress import duration, read_events
 from warpgs.scene import Camera, Gaussians, Scene, View
 
@@ -388,7 +388,7 @@ def event_figures(fit: Trainer) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def sampling_report_of(fit: Trainer, out: Path) -> SamplingReport | None:
+def sampling_report_of(fit: Trainer, out: Path) -> Section | None:
     """Return the report's part on the sampling events of a finished fit; None without events."""
     method, figures = fit.config.method, event_figures(fit)
     events, layers = figures["events"], figures["layers"]
@@ -419,7 +419,7 @@ def sampling_report_of(fit: Trainer, out: Path) -> SamplingReport | None:
     images = [
         (f"sampling after step {int(p.stem):,}", webp(decode(p, data=read_file(p, out))[0], SHEET_WIDTH, 70)) for p in files
     ]
-    return SamplingReport(words, images, table)
+    return Section(words, images, table)
 
 
 LABELS = {
@@ -617,7 +617,7 @@ def write_report(
     metrics: dict[str, Any],
     record: dict[str, Any],
     *,
-    sampling: SamplingReport | None,
+    sampling: Section | None,
     tell: Callable[[str], object] = lambda line: None,
 ) -> None:
     """Write report.html for a scored run.
@@ -655,13 +655,13 @@ def write_report(
         names = image_names(v.name for v in scene.views)
         covered = coverage_section(out, metrics["coverage"], [v.name for v in images], names)
     camera = train[0].camera
-    page = Page(
+    write_page(
+        out / "report.html",
         title=(out if Path(scene.path).parent == out else Path(scene.path)).resolve().name,  # not "scene" for found poses
         subtitle=f"preset {metrics['preset']}, {len(train)} training views, {len(test)} held out, "
         f"{camera.width} x {camera.height} px, {metrics['device']}",
-        figures=_figures(metrics), notes=record["notes"], table=table, views=images, curves=curves, sampling=sampling,
+        figures=_figures(metrics), notes=record["notes"], scores=table, views=images, curves=curves, sampling=sampling,
         overview=None if overview is None else webp(overview), held_out=bool(test),
-        details={k: v for k, v in record.items() if k != "cameras"}, protocol=_protocol(metrics),
+        record={k: v for k, v in record.items() if k != "cameras"}, protocol=_protocol(metrics),
         coverage=covered,
     )  # fmt: skip
-    write_page(out / "report.html", page)
