@@ -178,13 +178,7 @@ def _failures(cards: list[JobCard]) -> list[tuple[str, list[str]]]:
 
 
 def farm_page(title: str, cards: list[JobCard], seconds: float) -> str:
-    """Return the page of a farm.
-
-    Args:
-        title: Headline.
-        cards: The jobs, in the order to show them.
-        seconds: Time since the farm began [s].
-    """
+    """Return the page of a farm, with its jobs in the order given, ``seconds`` after it began."""
     states = [c.row.state for c in cards]
     scores = [c.row.psnr for c in cards if c.row.psnr is not None]
     figures = [
@@ -200,9 +194,5 @@ def farm_page(title: str, cards: list[JobCard], seconds: float) -> str:
 
 
 def write_farm_page(path: Path, title: str, cards: list[JobCard], seconds: float) -> None:
-    """Write the page of `farm_page`, with links to images and reports.
-
-    Raises:
-        ResourceError: The file cannot be written.
-    """
+    """Write the page of `farm_page`, with links to images and reports."""
     write_text(path, farm_page(title, cards, seconds))

@@ -74,14 +74,7 @@ def frusta(cameras: list[Camera], size: float) -> np.ndarray:
 
 
 def framing(shown: np.ndarray, direction: np.ndarray, up: np.ndarray, aspect: float = WIDTH / HEIGHT) -> np.ndarray:
-    """Return eye, focal point and up vector, shape [3, 3], from which all points of ``shown`` are in the image.
-
-    Args:
-        shown: Points that must be seen [u], shape [N, 3].
-        direction: Direction from the scene to the eye, any length, shape [3].
-        up: Rough upward direction, shape [3]; replaced by any perpendicular where it lies along ``direction``.
-        aspect: Width of the image over its height.
-    """
+    """Return eye, focal point and up vector [3, 3] of a view along ``-direction`` of all points ``shown`` [N, 3]."""
     length = np.linalg.norm(direction)
     forward = -direction / length if length > 0 else np.array([0.0, 0.0, 1.0])
     right = np.cross(forward, up)
@@ -107,10 +100,7 @@ def framing(shown: np.ndarray, direction: np.ndarray, up: np.ndarray, aspect: fl
 
 
 def within(points: np.ndarray, margin: float) -> np.ndarray:
-    """Return a mask [N] of the points in the box between the 5th and 95th percentiles, enlarged by ``margin`` at each side.
-
-    The margin is a fraction of the box's size.
-    """
+    """Mask [N] of the points in the box of the 5th to 95th percentiles, enlarged by ``margin`` times its size at each side."""
     low, high = np.percentile(points, [5, 95], axis=0)
     return ((points >= low - margin * (high - low)) & (points <= high + margin * (high - low))).all(1)
 
@@ -267,16 +257,7 @@ def _with_legend(data: bytes, entries: list[tuple[str, str]], size: tuple[int, i
 
 
 def render_plot(plot: ScenePlot, size: tuple[int, int], background: str) -> bytes:
-    """Render a plot as PNG bytes.
-
-    Args:
-        plot: The contents; points far outside are left out.
-        size: Width and height [px].
-        background: white or black.
-
-    Raises:
-        ResourceError: This machine cannot render; the message names the packages to install.
-    """
+    """Render a plot as PNG bytes of ``size`` [px], on white or black; points far outside are left out."""
     inside = within(plot.points, OUTSIDE)
     points, colors = plot.points[inside], plot.colors[inside]
     core = points[within(points, EDGE)]

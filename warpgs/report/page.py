@@ -26,14 +26,9 @@ NOT_EVERYWHERE = re.compile(
 
 
 def image_names(views: Iterable[str]) -> dict[str, str]:
-    """Return the file name, without suffix, of the images of each view of a scene.
-
-    A file has the view's name without suffix, with _ for /, if this name is unique, ignoring capitals. A name that is
-    ambiguous, longer than 100 bytes or not allowed on some system is shortened; digits of a hash of the whole name follow.
-
-    Args:
-        views: Names of all views of the scene, so that a view has one name in every folder.
-    """
+    """Return the file name, without suffix, of the images of each view, by all view names: _ for /, made unique and valid."""
+    # A file has the view's name without suffix, with _ for /, if this name is unique, ignoring capitals. A name that is
+    # ambiguous, longer than 100 bytes or not allowed on some system is shortened; digits of a hash of the whole name follow.
     own = {view: _own_name(view) for view in views}
     count = Counter(map(_folded, own.values()))
     kept = {v: n for v, n in own.items() if count[_folded(n)] == 1 and not NOT_EVERYWHERE.search(n) and _size(n) <= MOST_BYTES}
@@ -97,10 +92,7 @@ def tick_label(value: float) -> str:
 
 
 def curve(title: str, xs: list[float], ys: list[float], unit: str = "") -> str:
-    """Return an SVG chart of ``ys`` over ``xs`` (steps); long series are shown by the means of at most 300 groups.
-
-    Non-finite points are left out; without any finite point the chart says "no data".
-    """
+    """Return an SVG chart of finite ``ys`` over ``xs``, as means of at most 300 groups; "no data" without any."""
     points = [(x, y) for x, y in zip(xs, ys) if math.isfinite(x) and math.isfinite(y)]
     group = max(1, math.ceil(len(points) / MAX_POINTS))
     chunks = [points[i : i + group] for i in range(0, len(points), group)]
@@ -186,14 +178,7 @@ def _without_folders(value: object) -> object:
 
 
 def write_page(path: Path, *, notes: list[str], record: dict[str, object], **contents: object) -> None:
-    """Write the report page: one HTML file that refers to nothing outside it.
-
-    ``contents`` are the names in report.html. ``notes`` are automatic choices; a `Detail` is shown in the last section, with
-    ``record``: configuration, versions and data, with paths reduced to the last name.
-
-    Raises:
-        ResourceError: The file cannot be written.
-    """
+    """Write the report page: one HTML file that refers to nothing outside it."""
     choices = [n for n in notes if not isinstance(n, Detail)]
     details = [n for n in notes if isinstance(n, Detail)]
     words = json.dumps(_without_folders(record), indent=1)

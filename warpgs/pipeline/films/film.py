@@ -139,11 +139,7 @@ class FilmSettings:
     """Colour behind the scene, in [0, 1]; None for the background of the fit."""
 
     def __post_init__(self) -> None:
-        """Check what can be checked before any work.
-
-        Raises:
-            UsageError: A number is out of its range.
-        """
+        """Check what can be checked before any work."""
         low, high = LIMITS["width"]
         if self.size is not None and not all(low <= s <= high for s in self.size):
             raise UsageError(f"each side of a film must have {low} to {high} px, not {self.size[0]} x {self.size[1]}")
@@ -182,10 +178,7 @@ class FilmPlan:
 
 @torch.no_grad()
 def depth_and_coverage(gaussians: Gaussians, cameras: list[Camera], options: RasterizeOptions) -> tuple[float, float]:
-    """Return the median depth [u] over covered pixels, and the median over images of their mean alpha, for up to nine cameras.
-
-    The depth is 1 if no pixel is covered.
-    """
+    """Return the median depth [u] of covered pixels, 1 without any, and the median of mean alpha, for up to nine cameras."""
     depths, alphas = [], []
     for camera in cameras[:: max(1, len(cameras) // 5)]:
         r = rasterize(gaussians, camera, options)
@@ -222,17 +215,7 @@ def _keyframes(model: FittedModel, path: Path, rig: Rig, first: Camera, settings
 
 
 def plan_film(model: FittedModel, path: str, settings: FilmSettings) -> FilmPlan:
-    """Return the cameras of a path for a model.
-
-    Args:
-        model: The model.
-        path: One of `PATHS`, or the name of a JSON file of keyframes.
-        settings: Settings of the film.
-
-    Raises:
-        DataError: The file of keyframes cannot be read.
-        UsageError: The path is unknown, or a setting does not apply to it.
-    """
+    """Return the cameras of a path, one of `PATHS` or a JSON file of keyframes, for a model."""
     if path not in PATHS and not path.lower().endswith(".json"):
         hint = did_you_mean(path, PATHS) or f"choose one of {', '.join(PATHS)}, or give a .json file of keyframes"
         raise UsageError(f"unknown path {path!r}; {hint}")
@@ -319,11 +302,7 @@ class RenderedPath:
 
 
 def _check_plan(plan: FilmPlan, out: Path, coverage: bool, sheet: bool) -> tuple[bool, bool]:
-    """Return whether ``out`` is a film and not a folder, and whether all frames have one size.
-
-    Raises:
-        UsageError: There is no camera, or the frames do not allow the requested film or output.
-    """
+    """Return whether ``out`` is a film and not a folder, and whether all frames have one size."""
     if not plan.cameras:
         raise UsageError("no camera to render; give at least one")
     alone = out.suffix.lower() in SUFFIXES
@@ -348,17 +327,7 @@ def _frames(
     model: FittedModel, plan: FilmPlan, files: Sequence[Path], settings: FilmSettings, coverage: bool | Sequence[View],
     check: FrameCheck, tell: Callable[[str], object] | None,
 ) -> Iterator[np.ndarray]:  # fmt: skip
-    """Render the frames of a plan, check each, and write its images; yields each image [H, W, 3].
-
-    Args:
-        model: The model.
-        plan: The frames.
-        files: File of each frame's image; none to write no images.
-        settings: Settings of the film.
-        coverage: As in `render_path`; the images lie in a subfolder beside ``files``.
-        check: Check of the frames.
-        tell: Called with a line for each frame before it is rendered.
-    """
+    """Render, check and write the frames of a plan, with coverage images in a subfolder; yields each image [H, W, 3]."""
     gaussians, options = model.gaussians(), model.options()
     if settings.background is not None:
         options = dataclasses.replace(options, background=gaussians.means.new_tensor(settings.background))
@@ -397,22 +366,7 @@ def render_film(
     sheet: bool = False,
     tell: Callable[[str], object] | None = None,
 ) -> RenderedPath:
-    """Render the cameras of a plan to files.
-
-    Args:
-        model: The model.
-        plan: The frames.
-        out: Folder for a PNG of each frame and film.mp4; or a film with one of the suffixes of `warpgs.report.film`, to write
-            only the film.
-        settings: Settings of the film.
-        coverage: As in `render_path`; only if ``out`` is a folder.
-        sheet: True to also write six frames in one image: sheet.png in the folder, or beside the film.
-        tell: Called with a line before each frame is rendered, and before the film is finished.
-
-    Raises:
-        ResourceError: A file cannot be written, or another process writes into the folder.
-        UsageError: There is no camera, or one film was requested of images that differ in size.
-    """
+    """Render a plan to a folder of PNG files and film.mp4, or to a film alone; ``sheet`` adds six frames in one image."""
     alone, one_size = _check_plan(plan, out, bool(coverage), sheet)
     folder, film = (out.parent, out) if alone else (out, out / FILM)
     if alone:

@@ -205,12 +205,7 @@ class StepTeller:
 
 
 def take_steps(job: FitJob, trainer: Trainer, images_written: Callable[[], None]) -> None:
-    """Take all remaining steps, with a log and checkpoints if there is a run folder; images are written before a checkpoint.
-
-    Raises:
-        NotFiniteError: A loss or the state is not finite; with a run folder, the state before the step is saved.
-        KeyboardInterrupt: A signal ended the fit; the state is saved.
-    """
+    """Take all remaining steps, with log and checkpoints if there is a run folder; images are written before a checkpoint."""
     recorder = RunRecorder(job, trainer.step, images_written)
     shown = Progress(trainer.steps, trainer.step) if job.verbose else contextlib.nullcontext()
     with shown as progress, contextlib.closing(recorder):
@@ -287,18 +282,7 @@ def tell(job: FitJob, trainer: Trainer) -> None:
 def check_batched(
     scene: Scene | SceneRequest | str | Path, config: FitConfig, ranks: Ranks, time_budget: float | None, resume: bool
 ) -> None:
-    """Check that the processes can share a fit.
-
-    Args:
-        scene: The scene, as in `warpgs.fit`.
-        config: Settings.
-        ranks: The processes.
-        time_budget: Time that the fit may take [s]; None for no limit.
-        resume: Whether a run is continued.
-
-    Raises:
-        UsageError: A step has fewer views than processes, or each process would choose its own settings or find its own poses.
-    """
+    """Refuse ranks without a view each, and ranks that would find their own poses or measure their own speed."""
     check_ranks(config.batch, ranks)
     if ranks.count == 1:
         return
@@ -315,16 +299,7 @@ def check_batched(
 
 
 def check_equal(record: dict[str, Any], step: int | None, ranks: Ranks) -> None:
-    """Check that all processes fit the same scene with the same settings, because each takes a part of the same steps.
-
-    Args:
-        record: Record of the run, as this process has it.
-        step: Step of the checkpoint to continue from; None without one.
-        ranks: The processes.
-
-    Raises:
-        UsageError: A process differs from the first one; raised in every process.
-    """
+    """Refuse, in every process, ranks whose scene, settings, code or checkpoint (``step``) differ from those of rank 0."""
     if ranks.count == 1:
         return
     parts = {
@@ -360,21 +335,7 @@ def batched_notes(config: FitConfig, ranks: Ranks) -> list[str]:
 
 
 def with_poses(request: SceneRequest, out: Path | None, progress: Callable[[str], object]) -> tuple[SceneRequest, list[str]]:
-    """Find the poses of photographs if a request names photographs without cameras; other requests are returned unchanged.
-
-    Args:
-        request: The request; its path may be a folder of images or a video.
-        out: Run folder, whose subfolder `scene` stores the poses; a run that is continued or restarted reads them from there.
-        progress: Called with lines for the user.
-
-    Returns:
-        The request for the scene with poses, and notes for the user.
-
-    Raises:
-        DataError: The photographs cannot be registered, or are too few.
-        UsageError: There is no run folder for the poses, pycolmap is not installed, a continued run has other photographs, or a
-            matcher is given for a scene with cameras.
-    """
+    """Find the poses of photographs without cameras, or read them from the run folder ``out``; returns request and notes."""
     source = Path(request.path)
     if request.reader is not None or not request.path or not needs_poses(source):
         if request.matcher is not None:
@@ -398,11 +359,7 @@ def with_poses(request: SceneRequest, out: Path | None, progress: Callable[[str]
 
 
 def lost_lines(out: Path | None) -> list[str]:
-    """Return a line on the photographs without a pose, which a run leaves out; an empty list if all have one.
-
-    Raises:
-        DataError: The record of the run's poses is incomplete.
-    """
+    """Return a line on the photographs without a pose, which a run leaves out; an empty list if all have one."""
     if out is None or not (out / POSED_SCENE / JSON).is_file():
         return []
     rows = read_poses_record(out / POSED_SCENE)["photographs"]
@@ -552,11 +509,7 @@ def _settle(job: FitJob, time_budget: float | None) -> None:
 
 
 def fit_request(request: FitRequest, **others: Any) -> FitResult:
-    """Run `fit` for the command line, a study or a farm; ``others`` are on_model, on_step and ranks of `fit`.
-
-    Raises:
-        KeyboardInterrupt: A signal ended the fit; the message explains how to continue.
-    """
+    """Run `fit` for the command line, a study or a farm; ``others`` are on_model, on_step and ranks of `fit`."""
     r = request
     try:
         return fit(

@@ -41,10 +41,8 @@ CAMERA_MODEL = "pinhole"
 
 
 def fit_kernels(cuda: bool) -> list[tuple[wp.Kernel, int]]:
-    """Return a kernel of each module that a fit on CUDA or on the CPU launches, with the block size of the launches.
-
-    On CUDA a module is compiled once for each block size. Scores are computed on the CPU for fits on any device.
-    """
+    """Return a kernel of each module that a fit on CUDA or on the CPU launches, with the block size of the launches."""
+    # On CUDA a module is compiled once for each block size. Scores are computed on the CPU for fits on any device.
     real = wp.float32
     common = [
         (tiles.make_kernels(real, cuda).pack_counts, THREADS),
@@ -110,14 +108,7 @@ def _load(device: torch.device, kernel: wp.Kernel, block: int) -> Precompiled:
 
 
 def precompile_kernels(devices: list[torch.device] | None = None) -> Iterator[Precompiled]:
-    """Compile the modules that are not cached, and yield each when it is done.
-
-    Args:
-        devices: Devices to compile for; None for the CPU and every CUDA device that torch sees.
-
-    Raises:
-        RuntimeError: A kernel does not compile.
-    """
+    """Compile the modules that are not cached, by default for the CPU and all CUDA devices; yield each when done."""
     if devices is None:
         devices = [torch.device("cpu"), *(torch.device("cuda", i) for i in range(torch.cuda.device_count()))]
     jobs = {}

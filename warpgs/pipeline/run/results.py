@@ -59,19 +59,7 @@ DEPTH, NORMALS = "given_depth", "given_normals"
 def given_figures(
     train: Sequence[View], views: Sequence[TrainingView], gaussians: Gaussians, options: RasterizeOptions
 ) -> dict[str, Any]:
-    """Return the comparison of the model with each kind of given map: a row for each view with such a map, and a summary.
-
-    Args:
-        train: The views to fit.
-        views: The same views, with the maps of the loss terms.
-        gaussians: The fitted model.
-        options: Options for rendering the model.
-
-    Returns:
-        For ``depth`` and ``normals``, each only if a loss term compared it: ``views`` with name, fraction of the pixels with a
-        given value, and median difference (relative for depth, in degrees for normals; NaN without rendered pixels); and
-        ``summary``.
-    """
+    """Compare the model with given depth and normals: rows by view and a summary, for each kind that a loss term compared."""
     rows: dict[str, list[dict[str, Any]]] = {"depth": [], "normals": []}
     for view, mapped in zip(train, views, strict=True):
         maps = {n: t.cpu().numpy() for n, t in mapped.maps.items() if n in (DEPTH, NORMALS) and bool(t.any())}
@@ -157,24 +145,10 @@ def _seconds(render: Callable[[], object], device: torch.device) -> float:
 def rule_report_of(
     gaussians: Gaussians, views: list[View], options: RasterizeOptions, *, seed: int, half_resolution: float = 0.0
 ) -> dict[str, Any]:
-    """Measure error and saved time of a rule on a scene; takes some tenths of a second.
-
-    Three random views are rendered with the rule, as in the fit. 64 x 64 px of each are compared with the image of rule `exact`
-    in float64. That image is computed by `warpgs.render.reference` without the kernels, or by the kernels if `warpgs.geometry`
-    does not have the camera model.
-
-    Args:
-        gaussians: Gaussians of the finished fit, float32.
-        views: Training views, at least one.
-        options: Options of the rasterizer, with the name of the fit's cut-offs and a background.
-        seed: Seed of the choice of views and parts.
-        half_resolution: Fraction of the steps with views of half size.
-
-    Returns:
-        ``max``, ``mean`` and ``psnr`` [dB] (None if infinite) of the error of colours in [0, 1] over all parts; ``views`` by
-        name with their compared parts; ``render_ms`` and, unless the rule is `exact`, ``exact_ms`` of one whole view; ``rule``;
-        and ``summary``, the same figures as a sentence.
-    """
+    """Measure error and saved time of a rule on 64 x 64 px of three random views against rule `exact` in float64."""
+    # Three random views are rendered with the rule, as in the fit. 64 x 64 px of each are compared with the image of rule
+    # `exact` in float64. That image is computed by `warpgs.render.reference` without the kernels, or by the kernels if
+    # `warpgs.geometry` does not have the camera model.
     generator = np.random.default_rng(seed)
     chosen = [views[i] for i in sorted(generator.permutation(len(views))[:VIEWS])]
     device = gaussians.means.device
@@ -259,18 +233,7 @@ def _open_pixels(consistent: bool, quantile: float) -> str:
 def view_sheet(
     name: str, step: int, view: TrainingView, disparity: np.ndarray | None, sampled: SampledView, config: MethodConfig
 ) -> np.ndarray:
-    """Return a sheet of one view at one event, colours [rows, columns, 3] in [0, 1]: images, gate, sampled pixels, scores.
-
-    Scores are shown if one of them has a weight above 0, the disparity if the view has a prior.
-
-    Args:
-        name: Name of the view.
-        step: Steps done.
-        view: The view.
-        disparity: Relative inverse depth of the view, shape [H, W]; None without a prior.
-        sampled: Maps and sampled pixels of the event.
-        config: Switches and settings of the fit.
-    """
+    """Return a sheet of one view at one event, colours [rows, columns, 3]: images, gate, samples, scores of weight above 0."""
     image, rendered, score = (t.cpu().numpy() for t in (view.image, sampled.rendered, sampled.score))
     at, gate = sampled.at.cpu().numpy(), sampled.gate.cpu().numpy()
     weights = config.weights(view.semantic is not None)
@@ -314,17 +277,10 @@ def _on_host(sampled: SampledView) -> SampledView:
 
 @contextlib.contextmanager
 def images_kept(fit: Trainer, names: list[str], out: Path) -> Iterator[Callable[[], None]]:
-    """Have a fit write images of some of its events into its run folder, ``sampling/STEP.png``, while it continues.
-
-    A separate thread writes the images. The end of the block waits for the images, and so does the yielded function. Call this
-    function before a checkpoint, since a fit that continues from the checkpoint does not write earlier images. If an image
-    cannot be written, the fit continues, with one message in ``fit.messages``.
-
-    Args:
-        fit: The fit, before its first step.
-        names: Names of its training views.
-        out: Run folder.
-    """
+    """Write images of some events, ``sampling/STEP.png``, in a thread during the block; yields a function that awaits them."""
+    # A separate thread writes the images. The end of the block waits for the images, and so does the yielded function. Call
+    # this function before a checkpoint, since a fit that continues from the checkpoint does not write earlier images. If an
+    # image cannot be written, the fit continues, with one message in ``fit.messages``.
     config, steps, strategy = fit.config.method, shown_steps(fit.phases), fit.strategy
     disparities = fit.disparities or [None] * len(names)
     lost: list[int] = []
@@ -369,12 +325,7 @@ def images_kept(fit: Trainer, names: list[str], out: Path) -> Iterator[Callable[
 
 
 def event_figures(fit: Trainer) -> dict[str, Any]:
-    """Return the sums over the events of a fit, and the sizes of its two layers, for metrics.json.
-
-    Returns:
-        ``events``: numbers of events, of Gaussians added and evicted, of samplings (one for each view of an event), and of
-        samplings with a widened gate; ``layers``: number of Gaussians in the coarse and in the fine layer.
-    """
+    """Return for metrics.json the sums over the events of a fit (``events``), and the sizes of its two layers (``layers``)."""
     asked = fit.config.method.asked_quantile
     layered = isinstance(fit.strategy, ImportanceSampling)
     events, fine = (fit.strategy.events, int(fit.strategy.fine.sum())) if layered else ([], 0)
@@ -460,12 +411,7 @@ def summary_line(metrics: dict[str, Any]) -> str:
 
 
 def result_lines(metrics: dict[str, Any], out: Path | None) -> list[str]:
-    """Return the final lines of a fit: scores, size, time, the path of the report, and the next steps.
-
-    Args:
-        metrics: Contents of metrics.json.
-        out: The run folder, or None.
-    """
+    """Return the final lines of a fit from metrics.json: scores, size, time, report, next steps."""
     if metrics["test"]:
         best = ", ".join(f"{BASELINES.get(name, name)} {value:.2f} dB" for name, value in metrics["baselines"].items())
         lines = [
@@ -512,23 +458,7 @@ def evaluate_run(
     names: dict[str, str] | None = None,
     tell: Callable[[str], object] = lambda line: None,
 ) -> dict[str, Any]:
-    """Score held-out and training views, and save a render and a depth map of each held-out view.
-
-    If no view is held out, the images show training views. LPIPS is measured only on held-out views.
-
-    Args:
-        out: The run folder; None to write nothing.
-        gaussians: N Gaussians in scene units [u].
-        train: Training views.
-        test: Held-out views.
-        options: Options of the rasterizer.
-        lpips: Network for LPIPS, or None.
-        names: Names of image files by view, from `image_names` of the whole scene; None to make names for these views only.
-        tell: Called with a line for each view before it is rendered.
-
-    Returns:
-        Means over held-out and over training views, a row per held-out view, scores of baselines, and definitions of scores.
-    """
+    """Score held-out and training views, and save a render and depth map of each held-out (else training) view in ``out``."""
     for folder in () if out is None else ("renders", "depth"):
         make_folder(out / folder)
     files = names or image_names(v.name for v in [*train, *test])
@@ -620,19 +550,7 @@ def write_report(
     sampling: Section | None,
     tell: Callable[[str], object] = lambda line: None,
 ) -> None:
-    """Write report.html for a scored run.
-
-    Args:
-        out: The run folder, with the curves in metrics.jsonl.
-        scene: The scene.
-        split: Its views to fit and those held out.
-        gaussians: The fitted model, in scene units [u].
-        options: Options of the rasterizer.
-        metrics: Contents of metrics.json.
-        record: Contents of config.json.
-        sampling: The part on sampling events, or None.
-        tell: Called with a line for each view before it is rendered.
-    """
+    """Write report.html of a scored run, from metrics.json, config.json (``record``), metrics.jsonl and new renders."""
     train, test = [scene.view(n) for n in split.train], [scene.view(n) for n in split.test]
     tell("making the report")
     cameras = [v.camera for v in train], [v.camera for v in test]

@@ -60,19 +60,9 @@ def sample(values: Sequence[float]) -> Sample:
 
 
 def paired_difference(ours: Sequence[float], base: Sequence[float], confidence: float = CONFIDENCE) -> Difference:
-    """Return Student's interval of the mean of ``ours - base`` over pairs (Student 1908): mean ± t s / sqrt(n).
-
-    Here t is the quantile for n - 1 degrees of freedom. Pairing removes the common effect of seed and scene, which is most of
-    the spread between runs.
-
-    Args:
-        ours: Measurements.
-        base: Measurements of the base, in the same order.
-        confidence: Probability that the interval contains the true mean, in (0, 1).
-
-    Raises:
-        ValueError: ``ours`` and ``base`` differ in length.
-    """
+    """Return Student's interval of the mean of ``ours - base`` over pairs (Student 1908): mean ± t s / sqrt(n)."""
+    # Here t is the quantile for n - 1 degrees of freedom. Pairing removes the common effect of seed and scene, which is most of
+    # the spread between runs.
     from scipy.special import stdtrit
 
     d = sample([a - b for a, b in zip(ours, base, strict=True)])
