@@ -397,7 +397,7 @@ def _spline(rows: np.ndarray, times: np.ndarray, at: np.ndarray, closed: bool) -
 
 
 def through(keyframes: list[Keyframe], frames: int, *, closed: bool = False) -> list[Camera]:
-    """Return cameras on a smooth curve through keyframes, at even times; a closed path ends a frame before the last keyframe."""
+    """Return cameras on a smooth curve through keyframes, at even times; a closed path ends one frame before its end."""
     # One spline interpolates the points looked at, the distances to them, rotations and fields of view. So an object that all
     # cameras look at stays in place while they go around it. Rotations are quaternions, normalised at each frame: between
     # neighbours they turn nearly as evenly as by spherical interpolation, and they do not jerk at a keyframe.
