@@ -291,16 +291,6 @@ def _covered(image: np.ndarray, depth: torch.Tensor, camera: Camera, training: l
     return png(coverage_image(image, classes["0"], classes["1"]))
 
 
-@dataclass(frozen=True)
-class RenderedPath:
-    """Result of `render_film`: files, and lines for the user."""
-
-    files: list[Path]
-    """A PNG for each camera in order, unless only a film was requested; and last the film, if any."""
-    notes: list[str]
-    """Lines for the user: choices made, and frames that show nothing."""
-
-
 def _check_plan(plan: FilmPlan, out: Path, coverage: bool, sheet: bool) -> tuple[bool, bool]:
     """Return whether ``out`` is a film and not a folder, and whether all frames have one size."""
     if not plan.cameras:
@@ -365,8 +355,8 @@ def render_film(
     coverage: bool | Sequence[View] = False,
     sheet: bool = False,
     tell: Callable[[str], object] | None = None,
-) -> RenderedPath:
-    """Render a plan to a folder of PNG files and film.mp4, or to a film alone; ``sheet`` adds six frames in one image."""
+) -> tuple[list[Path], list[str]]:
+    """Render a plan to PNG files and film.mp4, or to a film alone; ``sheet`` adds six frames in one image. Files and notes."""
     alone, one_size = _check_plan(plan, out, bool(coverage), sheet)
     folder, film = (out.parent, out) if alone else (out, out / FILM)
     if alone:
@@ -394,7 +384,7 @@ def render_film(
         if sheet:
             write_bytes(sheet_path(out), png(frame_sheet(chosen)))
     notes = [*notes, *plan.notes, *check.notes(plan.remedy, plan.nearer), *left]
-    return RenderedPath([*files, film] if one_size else files, notes)
+    return [*files, film] if one_size else files, notes
 
 
 def render_path(
@@ -445,7 +435,7 @@ def render_path(
     else:
         own = [(f"{i:04d}", convert_camera(c, model.normalization, units, "scene")) for i, c in enumerate(path)]
         plan = FilmPlan(own, 0.0, "check the poses and the units of the cameras", [])
-    done = render_film(model, plan, Path(out), settings, coverage=coverage)
-    for note in done.notes:
+    files, notes = render_film(model, plan, Path(out), settings, coverage=coverage)
+    for note in notes:
         say(f"warpgs: {note}", error=True)
-    return done.files
+    return files

@@ -49,20 +49,6 @@ class DepthView:
     """Expected z-depth [u], float32, shape [H, W]; 0 where the model shows no surface, or the mask of the view hides it."""
 
 
-@dataclass(frozen=True)
-class Match:
-    """The points of one view's pixels as another view sees them; tensors of the shape of the pixels, [H, W]."""
-
-    u: torch.Tensor
-    """Column in the other view [px], pixel centres at +0.5; undefined where ``difference`` is infinite."""
-    v: torch.Tensor
-    """Row in the other view [px]."""
-    difference: torch.Tensor
-    """Smallest difference between the point's depth in the other view and the depths seen at the four pixels around the point,
-    as a fraction of the depth. Four pixels are compared because depth varies within a pixel on a slanted surface. Infinite
-    outside the other image, where the other view sees no surface, and where the pixel itself shows none."""
-
-
 @torch.no_grad()
 def depth_of(gaussians: Gaussians, camera: Camera, options: RasterizeOptions) -> torch.Tensor:
     """Render the expected z-depth [u] of a view, shape [H, W]; 0 where less than `MIN_ALPHA` of a pixel is covered."""
@@ -102,8 +88,10 @@ def _resized(camera: Camera, factor: float) -> Camera:
     return replace(camera, K=scale * camera.K, width=width, height=height)
 
 
-def match(depth: torch.Tensor, camera: Camera, other: DepthView) -> Match:
-    """Compare the points at depth [H, W] [u] of a pinhole view, 0 for no surface, with the surface that another view sees."""
+def match(depth: torch.Tensor, camera: Camera, other: DepthView) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Return column and row [px] of a pinhole view's points in another view, and least difference of depths, [H, W] each."""
+    # The difference is a fraction of the depth. The four pixels around the point are compared, because depth varies within a
+    # pixel on a slanted surface. It is infinite outside the other image and where a view sees no surface (depth 0).
     check_pinhole(camera)
     u, v, z = _seen_from(depth, camera, other.camera)
     height, width = other.depth.shape
@@ -114,7 +102,7 @@ def match(depth: torch.Tensor, camera: Camera, other: DepthView) -> Match:
     flat = other.depth.flatten()
     around = torch.stack([flat[r + c] for r in rows for c in columns])
     distance = torch.where(around > 0, (around - z).abs(), torch.inf).amin(0)
-    return Match(u, v, torch.where(inside, distance / z, torch.inf))
+    return u, v, torch.where(inside, distance / z, torch.inf)
 
 
 def _seen_from(depth: torch.Tensor, camera: Camera, other: Camera) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
@@ -142,7 +130,7 @@ class Coverage:
     counts: torch.Tensor
     """Number of training views that saw the point, at most `MAX_COUNT`, uint8; 0 where the render shows no surface."""
     difference: torch.Tensor
-    """Least difference of depths to a training view, as in `Match`; infinite where the point is in no training image."""
+    """Least difference of depths to a training view, as of `match`; infinite where the point is in no training image."""
     empty: torch.Tensor
     """True where the render shows no surface, bool."""
 
@@ -155,7 +143,7 @@ def coverage_map(depth: torch.Tensor, camera: Camera, training: Sequence[DepthVi
     counts = torch.zeros(depth.shape, dtype=torch.int32, device=depth.device)
     least = torch.full_like(depth, torch.inf)
     for view in training:
-        difference = match(depth, camera, view).difference
+        _, _, difference = match(depth, camera, view)
         counts += difference <= tolerance
         least = torch.minimum(least, difference)
     return Coverage(counts.clamp_max(MAX_COUNT).to(torch.uint8), least, depth <= 0)
@@ -206,10 +194,10 @@ def photo_errors(train: Sequence[View], training: Sequence[DepthView]) -> np.nda
         for j in chosen:
             if i == j:
                 continue
-            m = match(training[i].depth, training[i].camera, training[j])
-            inside = torch.isfinite(m.difference)
-            error = (_sampled(photos[j], m.u[inside], m.v[inside]) - photos[i][inside]).double().square().mean(1)
-            index = _bin(m.difference[inside].cpu().numpy())
+            u, v, difference = match(training[i].depth, training[i].camera, training[j])
+            inside = torch.isfinite(difference)
+            error = (_sampled(photos[j], u[inside], v[inside]) - photos[i][inside]).double().square().mean(1)
+            index = _bin(difference[inside].cpu().numpy())
             total += np.bincount(index, error.cpu().numpy(), len(BINS))
             count += np.bincount(index, minlength=len(BINS))
     if not count.any():

@@ -202,16 +202,16 @@ def render(
             notes.append(f"masked-out regions are shown as seen, since the scene cannot be read: {e}")
         notes.append(f"images in {out / COVERAGE}: {COVERAGE_LEGEND}")
     with contextlib.nullcontext() if named else writing_into(home):
-        done = render_film(stored, plan, out, settings, coverage=training, sheet=sheet, tell=tell)
-    *files, last = done.files
+        files, faults = render_film(stored, plan, out, settings, coverage=training, sheet=sheet, tell=tell)
+    *others, last = files
     if last.suffix.lower() == ".mp4":
         notes.append(VP9.format(shlex.quote(str(last))))
-    notes += done.notes + ([f"sheet of {min(SHEET_FRAMES, len(plan.cameras))} frames in {sheet_path(out)}"] if sheet else [])
+    notes += faults + ([f"sheet of {min(SHEET_FRAMES, len(plan.cameras))} frames in {sheet_path(out)}"] if sheet else [])
     if last == out:
         return [*notes, f"{len(plan.cameras)} frames in {out}"]
     if last.name == FILM:
-        return [*notes, f"{len(files)} images and {FILM} in {out}"]
-    return [*notes, f"{len(files) + 1} images in {out}; no film, since the views differ in size"]
+        return [*notes, f"{len(others)} images and {FILM} in {out}"]
+    return [*notes, f"{len(files)} images in {out}; no film, since the views differ in size"]
 
 
 def mean_psnr(gaussians: Gaussians, views: list[View], options: RasterizeOptions) -> float:

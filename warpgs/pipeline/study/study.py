@@ -27,9 +27,7 @@ from warpgs.pipeline.run.request import FitRequest, SceneRequest, choose_device,
 from warpgs.pipeline.run.results import LABELS, summary_line
 from warpgs.pipeline.study.tables import (
     GAUSSIANS,
-    Line,
     Metric,
-    Panel,
     Row,
     Table,
     csv_text,
@@ -225,20 +223,6 @@ def _table(request: StudyRequest, runs: Runs, scenes: list[str], metrics: tuple[
     return Table(caption, base, metrics, tuple(rows), tuple(SWITCHES.values()) if request.marks else ())
 
 
-def _plot(request: StudyRequest, runs: Runs, scenes: list[str], table: Table) -> str:
-    """Return the SVG of the paired differences of a table."""
-    panels = []
-    for m in table.metrics:
-        theirs = _by_seed(runs, scenes, table.base, m.key, request.seeds)
-        lines = []
-        for row in table.rows:
-            ours = _by_seed(runs, scenes, row.name, m.key, request.seeds)
-            pairs = () if row.name == table.base else tuple(ours[s] - theirs[s] for s in sorted(ours.keys() & theirs.keys()))
-            lines.append(Line(row.name, pairs, row.differences.get(m.key), row.exercised))
-        panels.append(Panel(m.label + (" [dB]" if m.key == "psnr" else ""), m.upwards, m.digits, tuple(lines)))
-    return forest(table.caption, table.base, panels)
-
-
 def _figure(request: StudyRequest, runs: Runs, places: list[Place], device: torch.device) -> tuple[bytes | None, str]:
     """Return the figure (PNG) of the first seed for which all runs succeeded, or None, and a note."""
     whole = [s for s in range(request.seeds) if all(runs[p.name, v, s].metrics for p in places for v in request.variants)]
@@ -337,7 +321,7 @@ def write_study(request: StudyRequest, runs: Runs, places: list[Place], device: 
     write_text(request.out / "table.csv", csv_text(table))
     write_text(request.out / "table.tex", latex(table))
     write_text(request.out / "runs.csv", _runs_csv(request, runs))
-    write_text(request.out / "plot.svg", _plot(request, runs, scenes, table))
+    write_text(request.out / "plot.svg", forest(table))
     if image is not None:
         write_bytes(request.out / "figure.png", image)
     hashes = {n: dataclasses.replace(c, seed=0).fingerprint() for n, c in request.variants.items()}
