@@ -277,13 +277,6 @@ COVERAGE = "coverage"
 """Subfolder for images that mark regions by the number of training views that saw them."""
 
 
-def _training_depths(model: FittedModel, views: bool | Sequence[View], options: RasterizeOptions) -> list[DepthView]:
-    """Return the depths of the training views of a model; masks apply if the views themselves are given."""
-    masks = [v.mask for v in views] if isinstance(views, Sequence) else None
-    cameras = [v.camera for v in views] if isinstance(views, Sequence) else [model.cameras()[n] for n in model.train]
-    return depth_views(model.gaussians(), cameras, options, masks)
-
-
 def _covered(image: np.ndarray, depth: torch.Tensor, camera: Camera, training: list[DepthView], cut_out: bool) -> bytes:
     """Return the PNG of an image [H, W, 3] that marks regions that no training view saw, and regions that one view saw."""
     seen = coverage_map(depth, camera, training)
@@ -323,7 +316,11 @@ def _frames(
         options = dataclasses.replace(options, background=gaussians.means.new_tensor(settings.background))
     straight = model.transparent and settings.background is None
     photographs = [model.cameras()[n] for n in model.train]
-    training = _training_depths(model, coverage, options) if coverage else None
+    training = None
+    if coverage:
+        views = coverage if isinstance(coverage, Sequence) else None
+        cameras = photographs if views is None else [v.camera for v in views]
+        training = depth_views(gaussians, cameras, options, None if views is None else [v.mask for v in views])
     cut_out = isinstance(coverage, Sequence) and any(v.alpha is not None for v in coverage)
     for i, (_, camera) in enumerate(plan.cameras):
         if tell is not None:
@@ -338,12 +335,6 @@ def _frames(
         if training is not None:
             write_bytes(files[i].parent / COVERAGE / files[i].name, _covered(image, surface, camera, training, cut_out))
         yield image
-
-
-def _older_images(folder: Path, files: list[Path]) -> list[str]:
-    """Return notes on images of an earlier film in the same folder."""
-    older = [p for p in folder.glob("*.png") if p not in files and p.name != SHEET]
-    return [f"{len(older)} older images are also in {folder}: remove them, or give a new folder"] if older else []
 
 
 def render_film(
@@ -362,7 +353,8 @@ def render_film(
     if alone:
         check_file_path(out)
     files = [] if alone else [folder / f"{name}.png" for name, _ in plan.cameras]
-    left = [] if alone else _older_images(folder, files)
+    older = [] if alone else [p for p in folder.glob("*.png") if p not in files and p.name != SHEET]
+    left = [f"{len(older)} older images are also in {folder}: remove them, or give a new folder"] if older else []
     check, chosen, count = FrameCheck(plan.coverage), [], len(plan.cameras)
     in_sheet = {i * count // SHEET_FRAMES for i in range(SHEET_FRAMES)} if sheet else set()
 

@@ -145,12 +145,7 @@ def choose_split(scene: Scene, spec: str | None) -> tuple[Split, list[str]]:
 
 def read_scene(request: SceneRequest, progress: Callable[[str], object] | None = None) -> tuple[Scene, Split, list[str]]:
     """Load a scene and split its views; returns both with the notes for the user. ``progress`` is as in `load_scene`."""
-    scene = load_scene(
-        request.path, reader=request.reader, downscale=request.downscale, max_side=request.max_side, strict=request.strict,
-        allow_outside=request.allow_outside, masks=request.masks, mask_keeps=request.mask_keeps,
-        black_is_empty=request.black_is_empty, score_masks=request.score_masks, max_pixels=request.max_pixels,
-        lenses=request.lenses, depths=request.depths, normals=request.normals, depth_kind=request.depth_kind,
-        depth_unit=request.depth_unit, normal_axes=request.normal_axes, progress=progress,
-    )  # fmt: skip
+    options = {f.name: getattr(request, f.name) for f in fields(request) if f.name not in ("path", "split", "matcher")}
+    scene = load_scene(request.path, **options, progress=progress)
     split, notes = choose_split(scene, request.split)
     return scene, split, [*scene.notes, *notes]

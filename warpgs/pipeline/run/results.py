@@ -389,11 +389,6 @@ RENDER_WORKERS = 4
 """Threads that score and encode images while others are rendered."""
 
 
-def score_keys(metrics: dict[str, Any]) -> list[str]:
-    """Return the names of the scores that result files hold for held-out views, in the order to show them."""
-    return [k for k in LABELS if k in metrics["test"]]
-
-
 def score_line(scores: dict[str, float]) -> str:
     """Return mean scores as one line for the user."""
     distances = [f", {LABELS[k]} {v:.3f}" for k, v in scores.items() if k.startswith("lpips")]
@@ -465,7 +460,9 @@ def evaluate_run(
 
     def finish(view: View, image: np.ndarray, depth: np.ndarray, alpha: np.ndarray) -> ViewMetrics:
         if out is not None:
-            _write_images(out, f"{files[view.name]}.png", view, image, depth, alpha)
+            row = side_by_side([np.clip(image, 0, 1), view.image, error_map(image, view.image)])
+            write_bytes(out / "renders" / f"{files[view.name]}.png", png(row))
+            write_bytes(out / "depth" / f"{files[view.name]}.png", png(depth_map(depth, alpha)))
         return score(view, image, lpips if test else None, alpha)
 
     def compare(view: View, image: np.ndarray, depth: np.ndarray, alpha: np.ndarray) -> ViewMetrics:
@@ -485,13 +482,6 @@ def evaluate_run(
         "variants": variants(lpips) | (ALPHA_VARIANTS if any(r.opacity for r in found) else {}),
         "baselines": baselines(train, test) if test else {},
     }  # fmt: skip
-
-
-def _write_images(out: Path, name: str, view: View, image: np.ndarray, depth: np.ndarray, alpha: np.ndarray) -> None:
-    """Write the render [H, W, 3] of a view beside its photograph and the error, and the depth map [H, W]."""
-    row = side_by_side([np.clip(image, 0, 1), view.image, error_map(image, view.image)])
-    write_bytes(out / "renders" / name, png(row))
-    write_bytes(out / "depth" / name, png(depth_map(depth, alpha)))
 
 
 def _images(
@@ -562,7 +552,7 @@ def write_report(
         curve(title, steps, [e.get(name, math.nan) for e in events], unit)
         for title, name, unit in (("Training loss", "loss", ""), ("Training PSNR", "psnr", "dB"), ("Gaussians", "count", ""))
     ]
-    keys = score_keys(metrics)
+    keys = [k for k in LABELS if k in metrics["test"]]
     table = [["view", *(LABELS.get(k, k) for k in keys), "pixels"]] + [
         [r["name"], *(f"{r.get(k, math.nan):.{2 if k.startswith('psnr') else 4}f}" for k in keys), r["region"]]
         for r in metrics["views"]
