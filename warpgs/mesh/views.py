@@ -223,19 +223,19 @@ def agreed(view: SurfaceView, others: Sequence[DepthMap]) -> SurfaceView:
     shown = torch.isfinite(view.depth) & (view.depth > 0)
     confirmed, questioned = torch.zeros_like(shown), torch.zeros_like(shown)
     for other in others:
-        difference = _difference(torch.where(shown, view.depth, 0), view.camera, other)
+        depth = torch.where(shown, view.depth, 0)
+        _, _, difference = depth_difference(depth, view.camera, other.camera, other.depth, other.step)
         confirmed |= difference <= TOLERANCE
         questioned |= torch.isfinite(difference)
     kept = confirmed | ~questioned | ~shown
     return replace(view, depth=torch.where(kept, view.depth, 0), weights=torch.where(kept, view.weights, 0))
 
 
-def _difference(depth: torch.Tensor, camera: Camera, other: DepthMap) -> torch.Tensor:
-    """Return how far one view's points are from another view's surface in depth, as a fraction of depth, shape [H, W]."""
-    # A point is compared with the nearest of the four depths around its projection, since depth varies within a pixel on a
-    # slanted surface. The result is infinite where the pixel has no depth, outside of the other image, and where all four
-    # depths are missing. No product of matrices is used: its bits would depend on the processor.
-    rotation, translation = relative_pose(camera, other.camera)
+def seen_from(depth: torch.Tensor, camera: Camera, other: Camera) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Return column and row [px] and z-depth [u] in another view of the points at a view's pixels, shape [H, W] each."""
+    # No product of matrices is used, because its bits would depend on the processor. For points behind the other view, columns
+    # and rows are undefined.
+    rotation, translation = relative_pose(camera, other)
     height, width = depth.shape
     rows, columns = (torch.arange(n, dtype=depth.dtype, device=depth.device) + 0.5 for n in (height, width))
     x = (columns - float(camera.K[0, 2])) / float(camera.K[0, 0])
@@ -244,16 +244,27 @@ def _difference(depth: torch.Tensor, camera: Camera, other: DepthMap) -> torch.T
         depth * (x[None] * float(r[0]) + (y[:, None] * float(r[1]) + float(r[2]))) + float(t)
         for r, t in zip(rotation, translation)
     )
-    ahead = (depth > 0) & (z > NEAR)
-    K, safe = other.camera.K, torch.where(ahead, z, torch.inf)
+    K, safe = other.K, torch.where(z > NEAR, z, torch.inf)
     u, v = (p / safe * float(K[i, i]) + float(K[i, 2]) for i, p in enumerate((px, py)))
-    inside = ahead & (u >= 0) & (v >= 0) & (u < other.camera.width) & (v < other.camera.height)
-    left, top = (torch.floor((a - (other.step // 2 + 0.5)) / other.step) for a in (u, v))
-    h, w = other.depth.shape
-    least = torch.full_like(depth, torch.inf)
-    for down in (0, 1):
-        row = (top + down).clamp(0, h - 1).long()
-        for right in (0, 1):
-            found = other.depth[row, (left + right).clamp(0, w - 1).long()]
-            least = torch.minimum(least, torch.where(found > 0, (found - z).abs(), torch.inf))
-    return torch.where(inside, least / safe, torch.inf)
+    return u, v, z
+
+
+def depth_difference(
+    depth: torch.Tensor, camera: Camera, other: Camera, surface: torch.Tensor, step: int = 1
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Return column and row [px] in another view of a view's points, and the difference to its surface, [H, W] each.
+
+    ``surface`` [h, w] is every ``step``-th depth of the other view. The difference is a fraction of depth, and infinite where
+    the pixel has no depth, outside of the other image, and where no surface is seen there.
+    """
+    u, v, z = seen_from(depth, camera, other)
+    inside = (depth > 0) & (z > NEAR) & (u >= 0) & (u < other.width) & (v >= 0) & (v < other.height)
+    left, top = (torch.floor((a - (step // 2 + 0.5)) / step) for a in (u, v))
+    height, width = surface.shape
+    columns = [(left + i).clamp(0, width - 1).long() for i in (0, 1)]
+    rows = [(top + i).clamp(0, height - 1).long() * width for i in (0, 1)]
+    # the nearest of the four depths around the point, since depth varies within a pixel on a slanted surface
+    flat = surface.flatten()
+    around = torch.stack([flat[r + c] for r in rows for c in columns])
+    least = torch.where(around > 0, (around - z).abs(), torch.inf).amin(0)
+    return u, v, torch.where(inside, least / z, torch.inf)

@@ -13,9 +13,10 @@ from torch.nn.functional import interpolate
 
 from warpgs.constants import NEAR
 from warpgs.files import make_folder, read_file, write_bytes
-from warpgs.geometry import check_pinhole, pinhole_of, relative_pose
+from warpgs.geometry import check_pinhole, pinhole_of
 from warpgs.io.images import decode
 from warpgs.kernels.ssim import ssim
+from warpgs.mesh.views import depth_difference, seen_from
 from warpgs.pipeline.metrics.scores import over_white, psnr_of, render_view, scored_region, to_8_bit
 from warpgs.priors.given_depth import pinhole_view
 from warpgs.process import counted
@@ -90,37 +91,8 @@ def _resized(camera: Camera, factor: float) -> Camera:
 
 def match(depth: torch.Tensor, camera: Camera, other: DepthView) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Return column and row [px] of a pinhole view's points in another view, and least difference of depths, [H, W] each."""
-    # The difference is a fraction of the depth. The four pixels around the point are compared, because depth varies within a
-    # pixel on a slanted surface. It is infinite outside the other image and where a view sees no surface (depth 0).
     check_pinhole(camera)
-    u, v, z = _seen_from(depth, camera, other.camera)
-    height, width = other.depth.shape
-    inside = (depth > 0) & (z > NEAR) & (u >= 0) & (u < width) & (v >= 0) & (v < height)
-    left, top = torch.floor(u - 0.5), torch.floor(v - 0.5)
-    columns = [(left + i).clamp(0, width - 1).long() for i in (0, 1)]
-    rows = [(top + i).clamp(0, height - 1).long() * width for i in (0, 1)]
-    flat = other.depth.flatten()
-    around = torch.stack([flat[r + c] for r in rows for c in columns])
-    distance = torch.where(around > 0, (around - z).abs(), torch.inf).amin(0)
-    return u, v, torch.where(inside, distance / z, torch.inf)
-
-
-def _seen_from(depth: torch.Tensor, camera: Camera, other: Camera) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Return column and row [px] and z-depth [u] in another view of the points at a view's pixels, shape [H, W] each."""
-    # No product of matrices is used, because its bits would depend on the processor. For points behind the other view, columns
-    # and rows are undefined.
-    rotation, translation = relative_pose(camera, other)
-    K, other_K = camera.K, other.K
-    height, width = depth.shape
-    x = (torch.arange(width, dtype=depth.dtype, device=depth.device) + 0.5 - float(K[0, 2])) / float(K[0, 0])
-    y = (torch.arange(height, dtype=depth.dtype, device=depth.device) + 0.5 - float(K[1, 2])) / float(K[1, 1])
-    px, py, z = (
-        depth * (x[None] * float(r[0]) + (y[:, None] * float(r[1]) + float(r[2]))) + float(t)
-        for r, t in zip(rotation, translation)
-    )
-    safe = torch.where(z > NEAR, z, torch.inf)
-    u, v = (p / safe * float(other_K[i, i]) + float(other_K[i, 2]) for i, p in enumerate((px, py)))
-    return u, v, z
+    return depth_difference(depth, camera, other.camera, other.depth)
 
 
 @dataclass(frozen=True)
@@ -163,7 +135,7 @@ def fraction_outside(depth: torch.Tensor, camera: Camera, photographs: Sequence[
     outside = torch.ones_like(shown) if empty else shown
     points = torch.where(shown, points, points[shown].median())
     for other in sorted(photographs, key=lambda c: float(np.linalg.norm(c.center - camera.center))):
-        u, v, z = _seen_from(points, small, pinhole_of(other))
+        u, v, z = seen_from(points, small, pinhole_of(other))
         outside = outside & ~((z > NEAR) & (u >= 0) & (u < other.width) & (v >= 0) & (v < other.height))
         if not outside.any():  # mostly after the nearest few
             break
