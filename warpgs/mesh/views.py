@@ -174,7 +174,8 @@ def sample_surface(view: SurfaceView, count: int) -> tuple[np.ndarray, np.ndarra
 # occluding edge, the surface's depth is unconstrained.
 
 TOLERANCE = 0.02
-"""Largest difference of two depths of one surface, as a fraction of the depth; scores of coverage use the same limit (decision
+"""Largest difference of two depths of one surface, as a fraction of the depth. Measured on training photographs alone: at this
+difference, the squared colour difference of two photographs is twice (3 dB) the value at the best agreement of depths (decision
 019)."""
 NEIGHBOURS = 16
 """Largest number of views that each view is compared with: the nearest that see the same surface from another angle."""

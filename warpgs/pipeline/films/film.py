@@ -16,6 +16,7 @@ from warpgs.errors import UsageError, did_you_mean
 from warpgs.files import make_folder, write_bytes
 from warpgs.geometry import convert_camera
 from warpgs.locks import check_file_path, hold_folder
+from warpgs.mesh.views import MIN_ALPHA
 from warpgs.pipeline.films.paths import (
     LIMITS,
     Rig,
@@ -28,7 +29,7 @@ from warpgs.pipeline.films.paths import (
     tour_of,
     upright,
 )
-from warpgs.pipeline.metrics.coverage import MIN_ALPHA, DepthView, classes_of, coverage_map, depth_views, fraction_outside
+from warpgs.pipeline.metrics.coverage import DepthView, classes_of, coverage_map, depth_views, fraction_outside
 from warpgs.pipeline.model.table import FittedModel
 from warpgs.process import say
 from warpgs.render.options import RasterizeOptions

@@ -16,7 +16,7 @@ from warpgs.files import make_folder, read_file, write_bytes
 from warpgs.geometry import check_pinhole, pinhole_of
 from warpgs.io.images import decode
 from warpgs.kernels.ssim import ssim
-from warpgs.mesh.views import depth_difference, seen_from
+from warpgs.mesh.views import MIN_ALPHA, TOLERANCE, depth_difference, seen_from
 from warpgs.pipeline.metrics.scores import over_white, psnr_of, render_view, scored_region, to_8_bit
 from warpgs.priors.given_depth import pinhole_view
 from warpgs.process import counted
@@ -26,12 +26,6 @@ from warpgs.report.images import COVERAGE_LEGEND, coverage_image, png, webp
 from warpgs.report.page import Section
 from warpgs.scene import Camera, Gaussians, View
 
-TOLERANCE = 0.02
-"""Largest difference of two depths of one surface, as a fraction of the depth. Measured on training photographs alone: at this
-difference, the squared colour difference of two photographs is twice (3 dB) the value at the best agreement of depths (decision
-019)."""
-MIN_ALPHA = 0.5
-"""Least opacity of a pixel that shows a surface; other pixels have no depth."""
 MAX_COUNT = 255
 """Largest number of views that is stored for a pixel; higher counts are clamped."""
 GRID = 32
