@@ -40,8 +40,9 @@ def colored(image: np.ndarray, color: str) -> int:
     return int((np.abs(image - rgb).sum(-1) < 0.05).sum())
 
 
-def test_the_overview_shows_gaussians_and_both_kinds_of_cameras():
-    """On white, in the colour without directions; cameras behind a surface are hidden."""
+def test_the_overview_shows_gaussians_and_both_kinds_of_cameras(monkeypatch):
+    """On white, in the colour without directions, without another process."""
+    monkeypatch.setattr(module, "run_python", None)
     train, test = [camera(a) for a in (-0.4, 0.0, 0.4)], [camera(0.2)]
     image = render_overview(wall(), RasterizeOptions(rule="fast"), train, test, UP)
     assert image.shape == (module.HEIGHT, module.WIDTH, 3) and (image == 1).all(-1).mean() > 0.5
