@@ -6,7 +6,7 @@
 # a clean folder.
 # Python 3.11.16, all architectures
 FROM python:3.11-slim-bookworm@sha256:a36c24f9cbdf4fd0f52d67f0823eeac19c2028c637cecc392d97f980d4fec56b AS base
-# libEGL and Mesa: the 3D overview in reports; libgomp: threads
+# libEGL and Mesa: plots; libgomp: threads
 RUN apt-get update \
     && apt-get install --yes --no-install-recommends libegl1 libgl1 libgl1-mesa-dri libglib2.0-0 libgomp1 \
     && rm -rf /var/lib/apt/lists/* \

@@ -72,9 +72,9 @@ def dtype(request) -> torch.dtype:
 
 @pytest.fixture(autouse=True, scope="session")
 def no_overview_in_reports():
-    """Leave the 3D overview out of reports: it starts a process of its own, which tests/report/test_overview.py looks at."""
+    """Leave the 3D overview out of reports, for speed; tests/report/test_overview.py looks at it."""
     patch = pytest.MonkeyPatch()
-    patch.setattr("warpgs.pipeline.run.results.render_overview", lambda *_: (None, "no overview image: this is a test"))
+    patch.setattr("warpgs.pipeline.run.results.render_overview", lambda *_: None)
     yield
     patch.undo()
 

@@ -63,7 +63,7 @@ def test_this_machine_can_fit():
         "CPU",
         "Memory",
         "Kernel cache",
-        "3D overview",
+        "Plots",
         "Film encoder",
         "Disk",
     ):

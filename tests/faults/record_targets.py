@@ -10,11 +10,10 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import torch
 
 from tests.faults.bombs import many_rows, rarely
 from tests.faults.image_targets import png_checksums, png_rows
-from tests.faults.model_targets import gaussians, in_order, run_files, tensors_body, tensors_header
+from tests.faults.model_targets import run_files
 from tests.faults.mutations import Change, json_value, text_line, text_number
 from tests.faults.targets import Target, not_finite, register
 from warpgs import locks, schema
@@ -23,9 +22,8 @@ from warpgs.errors import DataError, UsageError
 from warpgs.files import write_json
 from warpgs.pipeline.farm import job, work
 from warpgs.pipeline.films import paths
-from warpgs.pipeline.run import failed_step, folder
+from warpgs.pipeline.run import folder
 from warpgs.pipeline.train import presets, settings
-from warpgs.pipeline.train.presets import PRESETS
 from warpgs.pipeline.train.settings import FitConfig
 from warpgs.poses import find as poses_record
 from warpgs.report import progress
@@ -228,26 +226,6 @@ def resumed(root: Path, path: Path) -> object:
 
 register(Target("continued run", run_files, resumed, RESUMED, JSON_CHANGES, lines=0.65))
 
-
-def failed_steps(root: Path) -> list[Path]:
-    tensors = {"image": torch.rand(4, 5, 3), "viewmat": torch.eye(4), "K": torch.eye(3), "background": torch.zeros(3)}
-    tensors |= {f"params.{n}": t for n, t in gaussians().tensors().items()}
-    plain = {
-        "config": PRESETS["quick"].to_json(), "step": 7, "view": "a.png", "number": 0, "camera_model": "pinhole", "degree": 1,
-        "settings": [1, 0, 0, 0, 0, 0, 7], "cutout": False, "dropout_seed": 5,
-    }  # fmt: skip
-    path = root / failed_step.FILE
-    failed_step.save_failed_step(path, (tensors, plain))
-    path.write_bytes(in_order(path.read_bytes()))
-    return [path]
-
-
-register(
-    Target(
-        "failed step", failed_steps, lambda root, path: failed_step.read_failed_step(path, torch.device("cpu")),
-        (failed_step.read_failed_step,), (tensors_header, tensors_header, tensors_body),
-    )
-)  # fmt: skip
 
 # ---- presets -----------------------------------------------------------------------------------------------------------
 

@@ -45,7 +45,6 @@ READERS = {
     "pipeline/model/edit.py": {"_box_of_file": "crop box", "box_of": "crop box"},
     "pipeline/model/table.py": {"load": "model file"},
     "pipeline/run/folder.py": {"load_checkpoint": "checkpoint", "read_record": "run record"},
-    "pipeline/run/failed_step.py": {"read_failed_step": "failed step"},
     "pipeline/train/presets.py": {"_read": "preset"},
     "poses/photographs.py": {
         "_coded_again": "heic",
@@ -97,8 +96,7 @@ REASONS = {
         "onnx_bytes": OWN},
     "report/film.py": {"_decoded_sizes": OWN},
     "report/images.py": {"webp": OWN},
-    "report/overview.py": {"render_overview": OWN,
-        "_rendered": OWN, "_with_legend": OWN},
+    "report/overview.py": {"_rendered": OWN, "_with_legend": OWN},
     "kernels/native.py": {"source": "reads a file of the package",
         "exclusive": "opens a lock"},
     "device.py": {"_text": SYSTEM,

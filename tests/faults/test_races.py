@@ -32,7 +32,7 @@ def at_first_step(log, **values):
     write(log, **values)
 
 write, EventLog.write = EventLog.write, at_first_step
-results.render_overview = lambda *_: (None, "no overview image: this is a test")
+results.render_overview = lambda *_: None
 print("ready", flush=True)
 sys.stdin.readline()
 sys.exit(main(sys.argv[1:]))

@@ -26,7 +26,6 @@ from warpgs.pipeline.model import table
 from warpgs.pipeline.model.edit import Pruned
 from warpgs.pipeline.run.commands import _write, evaluate
 from warpgs.pipeline.run.export import export
-from warpgs.pipeline.run.failed_step import save_failed_step
 from warpgs.pipeline.run.folder import StoredRun, open_run, save_checkpoint
 from warpgs.report.film import write_film
 from warpgs.report.progress import EventLog
@@ -132,7 +131,6 @@ WAYS: dict[str, Callable[[Saved], object]] = {
     "json": lambda s: write_json(s.folder / "a.json", {"number": [s.number] * 100}),
     "ply": lambda s: write_ply(s.folder / "a.ply", s.gaussians, s.run.normalization),
     "checkpoint": lambda s: save_checkpoint(s.folder, s.gaussians.tensors(), {"step": s.number}),
-    "failed_step": lambda s: save_failed_step(s.folder / "f.safetensors", (s.gaussians.tensors(), {"step": s.number})),
     "model": lambda s: table.save(s.folder / "a.model", s.gaussians, s.run.normalization),
     "log": save_log,
     "film": save_film,

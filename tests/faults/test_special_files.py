@@ -13,7 +13,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 
 import warpgs
 from tests.io import scenes
@@ -34,7 +33,6 @@ from warpgs.pipeline.films.paths import read_keyframes
 from warpgs.pipeline.metrics.lpips import convert_lpips, read_lpips
 from warpgs.pipeline.model.edit import box_of
 from warpgs.pipeline.run import folder as run_folder
-from warpgs.pipeline.run.failed_step import read_failed_step
 from warpgs.pipeline.run.folder import TENSORS, load_checkpoint
 from warpgs.pipeline.train.presets import preset_settings
 from warpgs.plugins import Registry
@@ -127,7 +125,6 @@ DOORS = {
     "heads.pth": ("pipeline.metrics.lpips", lambda p: convert_lpips(p, p, p.parent / "out")),
     "model.safetensors": ("pipeline.model.table", warpgs.load),
     TENSORS: ("pipeline.run.folder", lambda p: load_checkpoint(p.parent)),
-    "step.safetensors": ("pipeline.run.failed_step", lambda p: read_failed_step(p, torch.device("cpu"))),
     run_folder.CONFIG: ("schema", lambda p: run_folder.read_record(p.parent)),
     poses_record.JSON: ("schema", lambda p: poses_record.read_poses_record(p.parent)),
     "metrics.jsonl": ("report.progress", read_events),
@@ -251,7 +248,6 @@ ALLOWED = {
     ("pipeline/farm/slurm.py", "read_text"): "a job in a private folder; an answer in a private folder",
     ("pipeline/farm/slurm.py", "open"): "output in a private folder",
     ("pipeline/farm/worker.py", "fdopen"): "the standard output",
-    ("pipeline/run/failed_step.py", "safe_open"): "a path that open_input tried",
     ("poses/find.py", "read_bytes"): "a model that pycolmap has just written",
     ("poses/photographs.py", "read_text"): "a job that the calling process has just written",
     ("poses/photographs.py", "VideoCapture"): "a path whose first bytes read_start read",

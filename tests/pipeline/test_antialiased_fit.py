@@ -18,7 +18,6 @@ from warpgs.pipeline.metrics.scores import score
 from warpgs.pipeline.model.limits import LimitConfig, TrainingCameras
 from warpgs.pipeline.model.start import InitConfig
 from warpgs.pipeline.run.commands import open_file
-from warpgs.pipeline.run.failed_step import failed_step, repeated
 from warpgs.pipeline.train import step
 from warpgs.pipeline.train.memory import most_instances
 from warpgs.pipeline.train.trainer import Trainer
@@ -75,8 +74,6 @@ def test_a_step_renders_with_the_filter(device, captured):
     ]
     assert most_instances(fit.gaussians, cameras, options) == wanted[0] != wanted[1]
     assert step.instance_capacity(fit.gaussians, stack, 0, options) == int(step.CAPACITY_FACTOR * wanted[0]) + 1024
-    image = repeated(failed_step(fit, 1, "01.png"))[1].rendered.rgb.detach().cpu().numpy()
-    assert np.array_equal(image, filtered(fit.gaussians, view.camera))
 
 
 @pytest.mark.cuda

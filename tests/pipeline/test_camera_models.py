@@ -12,7 +12,6 @@ from tests.parallel_camera import NAME
 from tests.scenes import photos, ring, seeds, three_gaussians
 from warpgs.errors import UsageError
 from warpgs.pipeline.model.start import InitConfig
-from warpgs.pipeline.run.failed_step import failed_step, repeated
 from warpgs.pipeline.run.folder import _camera, camera_values
 from warpgs.pipeline.train import step
 from warpgs.pipeline.train.memory import most_instances
@@ -126,13 +125,6 @@ def test_half_size_views_and_stacks_keep_the_model(fit):
     for stack in mixed.stacks.values():
         for camera, number in zip(stack.cameras(), stack.numbers):
             assert camera.model == mixed.views[number].camera.model
-
-
-def test_a_failed_step_is_rendered_again_by_the_model(fit):
-    """The file of a step whose loss was not finite holds model and coefficients."""
-    tensors, plain = failed_step(fit, 1, "01.png")
-    inputs = repeated((tensors, json.loads(json.dumps(plain))))[1].inputs
-    assert torch.equal(inputs.outputs["rgb"], rendered_alone(fit, 1)) and inputs.camera.model == NAME
 
 
 def test_run_folders_keep_the_model():

@@ -14,7 +14,6 @@ from warpgs.pipeline.metrics.scores import fitted_region
 from warpgs.pipeline.model import start as init
 from warpgs.pipeline.model.depth_points import carve, hull_points, in_empty_region, silhouettes
 from warpgs.pipeline.model.start import InitConfig, initial_points, random_points
-from warpgs.pipeline.run.failed_step import failed_step, findings
 from warpgs.pipeline.train.loss import AlphaDifference, LossConfig, LossInputs, Target
 from warpgs.pipeline.train.schedule import over, random_shift
 from warpgs.pipeline.train.settings import FitConfig
@@ -146,14 +145,6 @@ def test_an_estimated_opacity_is_no_target():
     fit = fitted(views, LossConfig(), 1)
     assert [t.name for t in fit.terms] == ["photometric"] and fit.settings(5)[SHIFT] == (0, 0, 0)
     assert fit.views[0].countable is not None and fit.layout.sizes.cutout
-
-
-def test_a_failed_step_has_the_colour_behind_it():
-    """The file's losses add up to what the next step reports."""
-    fit = fitted(cutouts(), LossConfig(), 18)
-    lines = findings(failed_step(fit, fit.order[-1], "x"))
-    terms = [float(line.split(": ")[1]) for line in lines if line.startswith("  loss term")]
-    assert len(terms) == 2 and sum(terms) == pytest.approx(fit.advance()[0].loss, rel=1e-5)
 
 
 def test_hull_of_a_ball():

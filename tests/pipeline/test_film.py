@@ -134,12 +134,12 @@ def test_empty_and_black_frames_are_noticed(model, tmp_path):
         cameras=[(str(i), c) for i, c in enumerate([*good, away, away, good[0]])],
     )
     assert 0.02 < plan.coverage < 0.9
-    done = render_film(model, plan, tmp_path / "a.webp", FilmSettings())
-    assert done.notes[-1].startswith("2 of 6 frames show nearly nothing (frames 3 to 4): the path leaves the captured area")
-    assert "--path interpolate" in done.notes[-1] and done.files == [tmp_path / "a.webp"]
+    files, notes = render_film(model, plan, tmp_path / "a.webp", FilmSettings())
+    assert notes[-1].startswith("2 of 6 frames show nearly nothing (frames 3 to 4): the path leaves the captured area")
+    assert "--path interpolate" in notes[-1] and files == [tmp_path / "a.webp"]
     dark = dataclasses.replace(model, scene_gaussians=dataclasses.replace(black, sh=torch.full_like(black.sh, -2.0)))
-    done = render_film(dark, plan, tmp_path / "b.webp", FilmSettings())
-    assert "4 of 6 frames are black (frames 0 to 2 and 5)" in done.notes[-1]
+    _, notes = render_film(dark, plan, tmp_path / "b.webp", FilmSettings())
+    assert "4 of 6 frames are black (frames 0 to 2 and 5)" in notes[-1]
     check = FrameCheck(0.5)
     for alpha in (0.04, 0.06):  # a tenth of what a training view shows is nearly nothing, however much that is
         check.look(np.ones((4, 4, 3)), np.full((4, 4), alpha))
@@ -168,7 +168,7 @@ def test_what_no_photograph_saw_gets_a_note(model, tmp_path, path, settings, adv
         plan = FilmPlan([(str(i), c) for i, c in enumerate(aside)], 0.0, "", [])
     else:
         plan = plan_film(model, path, FilmSettings(frames=2, **settings))
-    notes = [n for n in render_film(model, plan, tmp_path / "a.webp", FilmSettings()).notes if "outside all photographs" in n]
+    notes = [n for n in render_film(model, plan, tmp_path / "a.webp", FilmSettings())[1] if "outside all photographs" in n]
     assert len(notes) == (advice is not None)
     if advice:
         frames = (
@@ -191,15 +191,15 @@ def test_a_film_alone_and_six_frames_on_a_sheet(model, tmp_path, capsys):
     assert warpgs.render_path(model, "turntable", out=tmp_path / "a.gif", frames=8) == [tmp_path / "a.gif"]
     assert "path: turntable, there and back" in capsys.readouterr().err
     plan = plan_film(model, "turntable", FilmSettings(frames=8))
-    done = render_film(model, plan, tmp_path / "a.webp", FilmSettings(), sheet=True)
-    assert done.files == [tmp_path / "a.webp"] and cv2.imread(str(tmp_path / "a-sheet.png")).shape == (
+    files, _ = render_film(model, plan, tmp_path / "a.webp", FilmSettings(), sheet=True)
+    assert files == [tmp_path / "a.webp"] and cv2.imread(str(tmp_path / "a-sheet.png")).shape == (
         2 * 32 + 4,
         3 * 40 + 8,
         3,
     )
     render_film(model, plan, tmp_path / "images", FilmSettings())
     less = render_film(model, plan_film(model, "turntable", FilmSettings(frames=5)), tmp_path / "images", FilmSettings())
-    assert less.notes[-1].startswith("3 older images are also in ")
+    assert less[1][-1].startswith("3 older images are also in ")
     with Image.open(tmp_path / "a.gif") as image:
         assert image.n_frames == 8 and image.size == (40, 32)
     with pytest.raises(UsageError, match="coverage images are PNG files"):

@@ -8,25 +8,24 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from warpgs.pipeline.study.tables import BETTER, UNDECIDED, WORSE, Line, Panel, forest, paired_difference
+from warpgs.pipeline.study.tables import BETTER, UNDECIDED, WORSE, Metric, Row, Table, forest, paired_difference
 from warpgs.report.images import BOXES, Cell, Strip, crops, disagreement, sheet
 
 SVG = "{http://www.w3.org/2000/svg}"
 
 
-def line(name, *pairs):
-    return Line(name, pairs, paired_difference(list(pairs), [0.0] * len(pairs)))
+def row(name, *pairs, base=False, metric="m"):
+    return Row(name, {}, {} if base else {metric: paired_difference(list(pairs), [0.0] * len(pairs))})
 
 
-def panel(upwards=True):
-    return Panel(
-        "PSNR", upwards, 2, (Line("a", (), None), line("b", 0.9, 1.0, 1.1), line("c", -0.9, -1.0, -1.1), line("d", -1.0, 1.0))
-    )
+def table(upwards=True, title="t"):
+    rows = (row("a", base=True), row("b", 0.9, 1.0, 1.1), row("c", -0.9, -1.0, -1.1), row("d", -1.0, 1.0))
+    return Table(title, "a", (Metric("m", "PSNR", upwards, 2),), rows)
 
 
 def test_forest_draws_every_seed_and_prints_every_interval():
     """Small dots for seeds, a large one for each mean, words for the ends; all inside the frame."""
-    root = ElementTree.fromstring(forest("t <&>", "a", [panel()]))
+    root = ElementTree.fromstring(forest(table(title="t <&>")))
     width, height = (float(root.get(k)) for k in ("width", "height"))
     circles = root.findall(f"{SVG}circle")
     small, large = ([c for c in circles if c.get("r") == r] for r in ("2.8", "5.5"))
@@ -42,17 +41,19 @@ def test_forest_draws_every_seed_and_prints_every_interval():
 @pytest.mark.parametrize("upwards,colors", [(True, [BETTER, WORSE, UNDECIDED]), (False, [WORSE, BETTER, UNDECIDED])])
 def test_forest_colours_follow_the_direction(upwards, colors):
     """More PSNR is better, more LPIPS is worse, and what the interval does not decide is neither."""
-    root = ElementTree.fromstring(forest("t", "a", [panel(upwards)]))
+    root = ElementTree.fromstring(forest(table(upwards)))
     assert [c.get("fill") for c in root.findall(f"{SVG}circle") if c.get("r") == "5.5"] == colors
 
 
 def test_forest_of_one_seed_and_of_none():
     """Without an interval the dot stands alone; a metric that nobody measured has no panel."""
-    one = Panel("PSNR", True, 2, (Line("a", (), None), line("b", 0.5)))
-    none = Panel("LPIPS", False, 3, (Line("a", (), None), Line("b", (), paired_difference([], []))))
-    words = [t.text for t in ElementTree.fromstring(forest("t", "a", [one, none])).findall(f"{SVG}text")]
+    metrics = Metric("m", "PSNR", True, 2), Metric("n", "LPIPS", False, 3)
+    one = Row("b", {}, row("b", 0.5).differences | row("b", metric="n").differences)
+    root = ElementTree.fromstring(forest(Table("t", "a", metrics, (row("a", base=True), one))))
+    words = [t.text for t in root.findall(f"{SVG}text")]
     assert "+0.50" in words and not any("LPIPS" in w for w in words)
-    assert "no pair of runs to compare" in forest("t", "a", [none])
+    none = Table("t", "a", metrics[1:], (row("a", base=True), row("b", metric="n")))
+    assert "no pair of runs to compare" in forest(none)
 
 
 def test_crops_find_where_pictures_differ():

@@ -9,7 +9,7 @@ import pytest
 
 from warpgs.process import Detail
 from warpgs.report.images import png, webp
-from warpgs.report.page import Page, SamplingReport, ViewImages, curve, write_page
+from warpgs.report.page import Section, ViewImages, curve, write_page
 
 VOID = {"meta", "img", "input", "br", "hr", "link"}
 
@@ -58,14 +58,14 @@ def write(path, **changes):
         "title": "garden", "subtitle": "preset default",
         "figures": [("held-out PSNR", "24.31 dB"), ("held-out SSIM", "0.842"), ("Gaussians", "104,233")],
         "notes": ["every 8th view held out", "downscaled by 2"],
-        "table": [["view", "PSNR [dB]"], ["images/0.png", "20.25"], ["images/1.png", "21.25"]],
+        "scores": [["view", "PSNR [dB]"], ["images/0.png", "20.25"], ["images/1.png", "21.25"]],
         "views": views, "curves": [curve("Training loss", [1, 2, 3], [0.3, 0.2, 0.1])],
-        "sampling": SamplingReport("Two sentences.", [("first", image(0.31)), ("later", image(0.32))], [["added"], ["12"]]),
+        "sampling": Section("Two sentences.", [("first", image(0.31)), ("later", image(0.32))], [["added"], ["12"]]),
         "overview": webp(np.full((6, 8, 3), 0.7)), "protocol": {"ground truth": "images_8 as stored", "LPIPS": "not measured"},
-        "details": {"config": {"steps": 2000}, "versions": {"torch": "2"}},
+        "held_out": True, "coverage": None, "record": {"config": {"steps": 2000}, "versions": {"torch": "2"}},
     }  # fmt: skip
     values |= changes
-    write_page(path, Page(**values))
+    write_page(path, **values)
     text = path.read_text("utf-8")
     return values, text, Parsed(text)
 
@@ -96,18 +96,18 @@ def test_every_number_given_is_shown_as_given(tmp_path):
     shown = page.text("b")
     assert [t for t in shown if t in figures] == list(figures)
     assert [t for t in page.text("span") if t in labels] == list(labels)
-    cells = [c for table in (values["table"], values["sampling"].table) for row in table for c in row]
+    cells = [c for table in (values["scores"], values["sampling"].table) for row in table for c in row]
     assert page.text("th", "td") == cells
     assert page.text("li") == values["notes"]
     assert dict(zip(page.text("dt"), page.text("dd"))) == values["protocol"]
     captions = " ".join(page.text("figcaption"))
     assert all(v.caption in captions and v.name in shown for v in values["views"])
-    assert json.loads("".join(page.text("pre"))) == values["details"]
+    assert json.loads("".join(page.text("pre"))) == values["record"]
 
 
 def test_settings_hold_no_folder_of_the_machine(tmp_path):
     details = {"scene": {"path": "/home/me/fern", "masks": r"C:\Users\me\m.png"}, "tried": ["/data/a.py:Own", "data/fern", 7]}
-    _, text, page = write(tmp_path / "report.html", details=details)
+    _, text, page = write(tmp_path / "report.html", record=details)
     shown = {"scene": {"path": "fern", "masks": "m.png"}, "tried": ["a.py:Own", "data/fern", 7]}
     assert json.loads("".join(page.text("pre"))) == shown and "/me" not in text
 
@@ -124,8 +124,8 @@ def test_names_from_files_cannot_become_markup(tmp_path):
     view = ViewImages(evil, evil, *(image(0.5) for _ in range(4)))
     _, _, page = write(
         tmp_path / "report.html", title=evil, subtitle=evil, figures=[(evil, evil)], notes=[evil],
-        table=[["view"], [evil]], views=[view], details={evil: evil},
-        sampling=SamplingReport(evil, [(evil, image(0.5))], [[evil]]),
+        scores=[["view"], [evil]], views=[view], record={evil: evil},
+        sampling=Section(evil, [(evil, image(0.5))], [[evil]]),
     )  # fmt: skip
     assert len(page.all("script")) == 1
     assert page.text("h1", "p", "li", "td") == [evil] * 5
@@ -134,7 +134,7 @@ def test_names_from_files_cannot_become_markup(tmp_path):
 
 def test_parts_that_are_not_there_leave_no_empty_heading(tmp_path):
     _, _, page = write(
-        tmp_path / "report.html", notes=[], table=[["view"]], views=[], curves=[], sampling=None, overview=None, protocol={}
+        tmp_path / "report.html", notes=[], scores=[["view"]], views=[], curves=[], sampling=None, overview=None, protocol={}
     )
     assert page.text("h2") == ["Details"] and not page.all("img") and not page.all("ul")
 

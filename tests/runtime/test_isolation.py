@@ -66,7 +66,7 @@ STUDY = ["--split", split_spec(8), "--steps", "2", "--device", "cpu", "--seeds",
 
 
 def test_no_fit_runs_what_lies_beside_a_scene(trap, tmp_path):
-    """Neither the command itself nor the process that draws the overview, not even as `python -m`."""
+    """Not even as `python -m`."""
     _, mark = trap
     done = run("-m", "warpgs", "fit", ".", *FIT, "--out", str(tmp_path / "run"))
     assert done.returncode == 0, done.stdout + done.stderr

@@ -272,7 +272,6 @@ Command = tuple[Callable[..., Any], str]
 
 def show_priors() -> Command:
     """Return `warpgs priors show`."""
-    from warpgs.io.image_files import MAX_PIXELS
     from warpgs.pipeline.run import commands
     from warpgs.pipeline.run.request import SceneRequest
     from warpgs.priors.views import PriorConfig

@@ -53,8 +53,8 @@ PACKAGES = (
     ("psutil", "psutil", False, "free memory"),
     ("safetensors", "safetensors", True, "checkpoints"),
     ("onnxruntime", "onnxruntime", False, "depth and feature networks"),
-    ("pyvista", "pyvista", False, "3D overviews in reports"),
-    ("vtk", "vtk", False, "3D overviews in reports"),
+    ("pyvista", "pyvista", False, "`warpgs plot` and `warpgs mesh`"),
+    ("vtk", "vtk", False, "`warpgs plot` and `warpgs mesh`"),
 )
 """Packages: name in the package index, module, whether a fit needs it, and the feature that does not work without it."""
 ONLY_LOCATED = ("pyvista", "vtk")
@@ -240,7 +240,7 @@ def _kernel_cache() -> Iterable[Finding]:
 
 
 def _rendering() -> Iterable[Finding]:
-    topic = "3D overview"
+    topic = "Plots"
     try:
         overview = importlib.import_module("warpgs.report.overview")
         ok, detail = overview.probe_rendering()
@@ -250,7 +250,7 @@ def _rendering() -> Iterable[Finding]:
         yield Finding(topic, OK, detail)
     else:
         remedy = "pip install pyvista vtk; on a machine without a screen, also libEGL or libOSMesa (libosmesa6)"
-        yield Finding(topic, NOTE, f"{detail}; reports come without the 3D overview", remedy)
+        yield Finding(topic, NOTE, f"{detail}; `warpgs plot` cannot render", remedy)
 
 
 def _video() -> Iterable[Finding]:

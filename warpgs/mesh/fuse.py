@@ -58,13 +58,7 @@ class GridPlan:
 
 
 def find_box(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the lower and upper corner, shape [3] each, of the box around points, except outliers along each axis.
-
-    Points far behind all others, such as a background at infinity, are cut off.
-
-    Args:
-        points: Positions [u], shape [N, 3].
-    """
+    """Return the lower and upper corner [3] of the box around points [N, 3] [u], except outliers along each axis."""
     first, third = np.quantile(points, [0.25, 0.75], axis=0)
     low, high = np.quantile(points, QUANTILES, axis=0)
     return np.maximum(low, first - FENCE * (third - first)), np.minimum(high, third + FENCE * (third - first))
@@ -73,19 +67,7 @@ def find_box(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def plan_grid(
     points: np.ndarray, footprints: np.ndarray, voxel: float | None = None, resolution: int | None = None
 ) -> GridPlan:
-    """Choose the grid that holds the surfaces which cameras see.
-
-    Args:
-        points: Points of the surfaces [u], shape [N, 3].
-        footprints: Width of a pixel at each point [u], shape [N].
-        voxel: Distance between neighbouring grid points [u]; None to derive it from ``resolution``.
-        resolution: Voxels along the longest side; None for `RESOLUTION`, or fewer where a voxel would be smaller than half of
-            the median footprint.
-
-    Raises:
-        DataError: No camera sees a surface.
-        UsageError: ``voxel`` is not positive, or too small for the extent of the points.
-    """
+    """Choose the grid for points [N, 3] [u] with pixels ``footprints`` [N] [u] wide, by ``voxel`` [u] or ``resolution``."""
     if not len(points):
         raise DataError(
             "no training view shows a surface: alpha is below 0.5 or depth uncertain everywhere; fit again with more steps"
@@ -106,11 +88,7 @@ def plan_grid(
 
 
 def check_memory(plan: GridPlan, device: torch.device) -> str:
-    """Return how much memory a grid takes, as text, before it is allocated.
-
-    Raises:
-        ResourceError: The grid needs more than 80 % of the free memory, or has more points than kernels can index.
-    """
+    """Return how much memory a grid takes, as text, before it is allocated."""
     cpu = torch.device("cpu")
     needs = {device: plan.points * GRID_BYTES}
     needs[cpu] = needs.get(cpu, 0) + plan.points * HOST_BYTES
@@ -148,17 +126,9 @@ def _grey(vertices: np.ndarray, faces: np.ndarray) -> Mesh:
 
 
 def extract(grid: DistanceGrid) -> Mesh:
-    """Return the surface where distances are 0, without colours.
-
-    The surface is left open where no view looked: a triangle is kept only if both grid points beside each of its vertices were
-    seen. No triangle is made where the distance jumps from in front of one surface to behind another, as at depth edges.
-
-    Args:
-        grid: The grid.
-
-    Raises:
-        DataError: There is no surface inside the grid.
-    """
+    """Return the surface where distances are 0, without colours, open where no view looked and at jumps of the distance."""
+    # The surface is left open where no view looked: a triangle is kept only if both grid points beside each of its vertices
+    # were seen. No triangle is made where the distance jumps from in front of one surface to behind another, as at depth edges.
     from skimage.measure import marching_cubes
 
     distances, weights = grid.distances.cpu().numpy(), grid.weights.cpu().numpy()
@@ -206,15 +176,9 @@ def remove_small_parts(mesh: Mesh, fraction: float = MIN_PART) -> tuple[Mesh, in
 
 
 def decimate(mesh: Mesh, max_faces: int) -> Mesh:
-    """Return a mesh of at most about ``max_faces`` triangles, without colours; open edges stay where they are.
-
-    VTK collapses edges in the order of their quadric error (Garland and Heckbert 1997). This part of VTK needs no graphics
-    library.
-
-    Args:
-        mesh: The mesh; it is returned unchanged if it is small enough.
-        max_faces: Number of triangles, at least 4.
-    """
+    """Return a mesh of at most about ``max_faces`` triangles, without colours, by quadric error (Garland and Heckbert 1997)."""
+    # VTK collapses edges in the order of their quadric error (Garland and Heckbert 1997). This part of VTK needs no graphics
+    # library.
     if len(mesh.faces) <= max_faces:
         return mesh
     import pyvista
@@ -248,11 +212,7 @@ class MeshOptions:
     """Rendered depth that is fused: median, or mean (expected depth), which mixes surfaces at edges."""
 
     def __post_init__(self) -> None:
-        """Check the options, before any view is rendered.
-
-        Raises:
-            UsageError: An option is out of its range, or two options exclude each other.
-        """
+        """Check the options, before any view is rendered."""
         if self.depth not in DEPTHS:
             raise UsageError(f"--depth {self.depth!r} is not one of {', '.join(DEPTHS)}")
         if self.voxel is not None and not 0 < self.voxel < math.inf:
@@ -284,17 +244,7 @@ class FusedMesh:
 
 
 def integrate_views(views: SurfaceViews, plan: GridPlan, maps: Sequence[DepthMap], like: torch.Tensor) -> DistanceGrid:
-    """Return the grid into which the depth of all views was fused, in the order of the cameras.
-
-    Args:
-        views: Surface that each camera sees.
-        plan: The grid.
-        maps: Depth map of each view, to compare other views with.
-        like: Any tensor with the scalar type and device that the grid gets, shape [...].
-
-    Raises:
-        DataError: Other views contradict all depths.
-    """
+    """Return the grid, typed as ``like``, into which the depth of all views was fused, in the order of the cameras."""
     grid, confirmed = empty_grid(plan.origin, plan.voxel, plan.shape, plan.truncation, like), False
     for view, others in zip(views("fusing depth"), neighbours(maps)):
         view = agreed(view, [maps[i] for i in others])
@@ -312,25 +262,10 @@ def fuse(
     gaussians: Gaussians, cameras: Sequence[Camera], render: RasterizeOptions, options: MeshOptions = MeshOptions(), *,
     stage: Callable[[str], object] = lambda line: None, planned: Callable[[GridPlan, str], object] = lambda plan, memory: None,
 ) -> FusedMesh:  # fmt: skip
-    """Make a mesh of the model's surfaces that cameras see.
-
-    Areas that no camera sees, or on which cameras disagree, stay open. Views are used three times: for the extent of the scene,
-    for distances and for colours. If the views have up to 16 million pixels in all, they are rendered once and kept. Otherwise
-    each use renders them again, one at a time, and only depths are kept.
-
-    Args:
-        gaussians: N Gaussians in the units of the cameras.
-        cameras: Cameras, arrays of numpy, at least one; lenses are replaced by pinholes of the same K.
-        render: Settings of the rasterizer, as the fit used them.
-        options: Options.
-        stage: Function that shows a line of progress.
-        planned: Called with the grid, and its memory as text, before the grid is allocated.
-
-    Raises:
-        DataError: No camera sees a surface, or other cameras contradict all depths.
-        ResourceError: The grid does not fit into memory.
-        UsageError: There is no camera, a camera has no pinhole of the same K, or an option is out of range.
-    """
+    """Make a mesh of the surfaces that cameras see; ``planned`` gets the grid and its memory before it is allocated."""
+    # Areas that no camera sees, or on which cameras disagree, stay open. Views are used three times: for the extent of the
+    # scene, for distances and for colours. If the views have up to 16 million pixels in all, they are rendered once and kept.
+    # Otherwise each use renders them again, one at a time, and only depths are kept.
     if not cameras:
         raise UsageError("fuse needs at least one camera that sees the surfaces")
     samples, maps = [], []
@@ -355,16 +290,7 @@ def fuse(
 
 
 def vertex_colors(mesh: Mesh, views: SurfaceViews, truncation: float) -> tuple[np.ndarray, int]:
-    """Return the weighted mean of the rendered colours that the views see at each vertex.
-
-    Args:
-        mesh: The mesh, V vertices.
-        views: Surface that each camera sees, at least one.
-        truncation: Truncation of the grid's distances [u].
-
-    Returns:
-        Colours in [0, 1], float32, shape [V, 3], and the number of vertices that no view sees.
-    """
+    """Return the weighted mean colour [V, 3] that views see at each vertex, and the number of vertices that none sees."""
     tolerance = COLOR_TOLERANCE * truncation
     for i, view in enumerate(views("colouring")):
         if i == 0:

@@ -60,15 +60,8 @@ def _with_one_palette(pixels: list[np.ndarray]) -> list:
 
 
 def write_animation(path: Path, frames: Iterable[np.ndarray], fps: int) -> int:
-    """Write frames [H, W, 3] in [0, 1], all of one size, as an animated WebP or GIF; returns their number.
-
-    Equal frames in a row become one frame that is shown longer.
-
-    Raises:
-        DataError: There are no frames, or they differ in size.
-        ResourceError: Pillow cannot encode the image, or the file cannot be written.
-        UsageError: There are too many frames, or too many per second for browsers.
-    """
+    """Write frames [H, W, 3] in [0, 1], all of one size, as an animated WebP or GIF; returns their number."""
+    # Equal frames in a row become one frame that is shown longer.
     from PIL import Image
 
     if fps > MAX_FPS:
@@ -94,20 +87,10 @@ SUFFIXES = (*VIDEOS, *ANIMATIONS)
 
 
 def write_film(path: Path, frames: Iterable[np.ndarray], fps: int = 30) -> int:
-    """Write frames [H, W, 3] in [0, 1], all of one size, as a film in the format that the path's suffix names.
-
-    A video (.mp4, .webm) is VP9, which OpenCV's wheels bring and current browsers play; an odd height loses a row, an odd width
-    a column. An animated image (.webp, .gif) runs in a loop. The film is decoded before it replaces an older one, because the
-    encoder does not report a full disk.
-
-    Returns:
-        The number of frames.
-
-    Raises:
-        DataError: There are no frames, or they differ in size.
-        ResourceError: This OpenCV has no VP9 encoder, or the file cannot be written.
-        UsageError: The suffix is not in `SUFFIXES`, or an animated image would be too large or too fast.
-    """
+    """Write frames [H, W, 3] in [0, 1], all of one size, as a film in the format that the path's suffix names."""
+    # A video (.mp4, .webm) is VP9, which OpenCV's wheels bring and current browsers play; an odd height loses a row, an odd
+    # width a column. An animated image (.webp, .gif) runs in a loop. The film is decoded before it replaces an older one,
+    # because the encoder does not report a full disk.
     suffix = path.suffix.lower()
     if suffix in ANIMATIONS:
         return write_animation(path, frames, fps)

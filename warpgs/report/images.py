@@ -19,11 +19,7 @@ MAX_WEBP_SIDE = 16383
 
 
 def png(image: np.ndarray) -> bytes:
-    """Encode colours in [0, 1], [H, W, 3] or with straight alpha [H, W, 4], as 8-bit PNG; values outside are clamped.
-
-    Raises:
-        ResourceError: OpenCV cannot encode the image.
-    """
+    """Encode colours in [0, 1], [H, W, 3] or with straight alpha [H, W, 4], as 8-bit PNG; values outside are clamped."""
     import cv2
 
     pixels = np.round(np.clip(image, 0, 1) * 255).astype(np.uint8)
@@ -34,16 +30,7 @@ def png(image: np.ndarray) -> bytes:
 
 
 def webp(image: np.ndarray | bytes, width: int = PAGE_WIDTH, quality: int = 82) -> bytes:
-    """Encode an image for a page as WebP: losses are hard to see, and a photograph takes a tenth of its PNG.
-
-    Args:
-        image: Colours in [0, 1], shape [H, W, 3], or the contents of an image file.
-        width: Largest width [px]; a wider image is reduced to it.
-        quality: From 0 to 100.
-
-    Raises:
-        ResourceError: OpenCV cannot encode the image.
-    """
+    """Encode colours [H, W, 3] in [0, 1], or an image file, as WebP of at most ``width`` px, a tenth of the size of a PNG."""
     import cv2
 
     if isinstance(image, bytes):
@@ -61,10 +48,7 @@ def webp(image: np.ndarray | bytes, width: int = PAGE_WIDTH, quality: int = 82) 
 
 
 def straight_alpha(image: np.ndarray, alpha: np.ndarray, background: tuple[float, float, float]) -> np.ndarray:
-    """Return colours with straight alpha, [H, W, 4], of colours over a background [H, W, 3]; black where ``alpha`` is 0.
-
-    Composited over ``background``, the result is the image again; over another colour, the scene in front of that colour.
-    """
+    """Return colours with straight alpha, [H, W, 4], of colours over a background [H, W, 3]; black where ``alpha`` is 0."""
     own = image - (1 - alpha[..., None]) * np.float32(background)
     colors = np.divide(own, alpha[..., None], out=np.zeros_like(own), where=alpha[..., None] > 0)
     return np.concatenate([np.clip(colors, 0, 1), alpha[..., None]], axis=2)
@@ -93,10 +77,7 @@ def error_map(image: np.ndarray, reference: np.ndarray, largest: float = 0.3) ->
 
 
 def depth_map(depth: np.ndarray, alpha: np.ndarray) -> np.ndarray:
-    """Return colours [H, W, 3] of depth, near warm and far cold, by inverse depth between its 2nd and 98th percentile.
-
-    Gray where alpha is at most one half, or depth is 0.
-    """
+    """Return colours [H, W, 3] of inverse depth, near warm, far cold; gray where alpha is at most 0.5 or depth is 0."""
     valid = (alpha > 0.5) & (depth > 0)
     colors = np.full((*depth.shape, 3), GRAY, np.float32)
     if valid.any():
@@ -123,10 +104,7 @@ def frame_sheet(frames: list[np.ndarray], columns: int = 3, gap: int = 4) -> np.
 
 
 def disagreement(images: list[np.ndarray], reference: np.ndarray) -> np.ndarray:
-    """Return the largest minus the smallest value of images [H, W, 3] at each pixel, averaged over channels, shape [H, W].
-
-    For a single image, return its absolute error against ``reference`` [H, W, 3], averaged over channels.
-    """
+    """Return the range of images [H, W, 3], mean over channels, [H, W]; of one image, its error to ``reference``."""
     if len(images) == 1:
         return np.abs(images[0] - reference).mean(-1)
     stack = np.stack(images)
@@ -134,10 +112,7 @@ def disagreement(images: list[np.ndarray], reference: np.ndarray) -> np.ndarray:
 
 
 def crops(values: np.ndarray, width: int, height: int, count: int) -> list[tuple[int, int]]:
-    """Return the top left corners (x, y) [px] of ``count`` crops with the largest sums of ``values`` [H, W], largest first.
-
-    Crops do not overlap; fewer are returned if no more fit. If all values are 0, the first crop is in the middle.
-    """
+    """Return corners (x, y) [px] of up to ``count`` disjoint crops with the largest sums of ``values`` [H, W]."""
     H, W = values.shape
     width, height = min(width, W), min(height, H)
     total = np.zeros((H + 1, W + 1))
@@ -167,16 +142,7 @@ STRIPES = 90
 
 
 def coverage_image(image: np.ndarray, unseen: np.ndarray, once: np.ndarray) -> np.ndarray:
-    """Return a render with magenta stripes where no training view saw the surface, and an amber tint where one did.
-
-    Args:
-        image: Colours in [0, 1], shape [H, W, 3]; values outside are clamped.
-        unseen: True where no training view saw the point, bool, shape [H, W].
-        once: True where one training view saw it, bool, shape [H, W].
-
-    Returns:
-        Colours in [0, 1], float32, shape [H, W, 3].
-    """
+    """Return a render [H, W, 3] with magenta stripes where ``unseen`` [H, W], and an amber tint where ``once`` [H, W]."""
     image = np.clip(image, 0, 1).astype(np.float32)
     height, width = unseen.shape
     period = max(4, round(max(height, width) / STRIPES))
@@ -226,15 +192,7 @@ def _column(count: int, widest: int) -> int:
 
 
 def sheet(headings: list[str], strips: list[Strip]) -> bytes:
-    """Return a figure as PNG bytes.
-
-    Args:
-        headings: Headings of the columns, from left to right.
-        strips: Rows; each has a cell per heading.
-
-    Returns:
-        An 8-bit RGB PNG; images are scaled to the width of a column, and the crops below them share this width.
-    """
+    """Return a figure with a cell for each heading and strip as bytes of an RGB PNG; images have the width of a column."""
     from PIL import Image, ImageDraw, ImageFont
 
     column = _column(len(headings), max(s.cells[0].image.shape[1] for s in strips))
@@ -338,19 +296,7 @@ def _dotted(image, centers: np.ndarray):
 def contact_sheet(
     title: str, lines: list[str], tiles: list[Tile], *, columns: int = 4, tile_width: int = 440, text: float = 1.0
 ) -> np.ndarray:
-    """Arrange labelled tiles in rows, with a colour bar at each map and lines of text after the last tile.
-
-    Args:
-        title: Headline.
-        lines: Sentences, wrapped to the width of a tile.
-        tiles: At least one; all of one height and width.
-        columns: Tiles per row.
-        tile_width: Width of a tile [px].
-        text: Factor on the font sizes, for a sheet that is shown at a reduced size.
-
-    Returns:
-        The sheet, colours in [0, 1], float32, shape [rows, columns, 3].
-    """
+    """Arrange labelled tiles of one size in rows, with colour bars of maps and lines of text; colours [rows, columns, 3]."""
     from PIL import Image, ImageDraw, ImageFont
 
     height, width = tiles[0].values.shape[:2]

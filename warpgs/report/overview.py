@@ -1,20 +1,25 @@
-"""A scene with its cameras in one image, drawn by VTK in a process of its own."""
+"""A scene with its cameras in one image: the overview of a report, and plots, which VTK draws in a process of its own."""
 
 from __future__ import annotations
 
 import io
 import json
+import math
 import subprocess
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+import torch
+from PIL import ImageColor
 
 from warpgs.errors import ResourceError
 from warpgs.files import disk_is_full
 from warpgs.folders import system_folder, temporary_folder
 from warpgs.process import run_python
+from warpgs.render.options import RasterizeOptions
+from warpgs.render.rasterize import rasterize
 from warpgs.report.images import png
-from warpgs.scene import Camera
+from warpgs.scene import Camera, Gaussians
 
 REMEDY = "install a software renderer: on Debian or Ubuntu `apt-get install libegl1 libgl1 libgl1-mesa-dri libxrender1`"
 TIMEOUT = 90
@@ -22,6 +27,8 @@ WIDTH, HEIGHT, VIEW_ANGLE = 1280, 640, 40.0  # [px], [px], vertical [deg]
 OUTSIDE, EDGE = 1.0, 0.15
 """Margins (see `within`) for the points to show and for the points to frame: they keep walls whole and drop far background."""
 TRAIN_COLOR, TEST_COLOR = "#149696", "#e08a2c"
+PIECES = 32
+"""Pieces of a line of the overview, each of which is shown or hidden."""
 
 PROBE = (
     "import pyvista as pv; p = pv.Plotter(off_screen=True, window_size=(16, 16)); p.add_mesh(pv.Sphere()); p.screenshot(None)"
@@ -66,32 +73,8 @@ def frusta(cameras: list[Camera], size: float) -> np.ndarray:
     return np.array(lines)
 
 
-RENDER_SCRIPT = f"""
-import sys, numpy as np, pyvista as pv
-d = np.load(sys.argv[1])
-p = pv.Plotter(off_screen=True, window_size=({WIDTH}, {HEIGHT}))
-p.set_background("white")
-cloud = pv.PolyData(d["points"])
-cloud["rgb"] = d["colors"]
-p.add_mesh(cloud, scalars="rgb", rgb=True, point_size=4, render_points_as_spheres=False)
-for key, color in (("train", "{TRAIN_COLOR}"), ("test", "{TEST_COLOR}")):
-    if len(d[key]):
-        p.add_lines(d[key].reshape(-1, 3), color=color, width=2)
-p.camera.position, p.camera.focal_point, p.camera.up = d["view"]
-p.camera.view_angle = {VIEW_ANGLE}
-p.screenshot(sys.argv[2])
-"""
-
-
 def framing(shown: np.ndarray, direction: np.ndarray, up: np.ndarray, aspect: float = WIDTH / HEIGHT) -> np.ndarray:
-    """Return eye, focal point and up vector, shape [3, 3], from which all points of ``shown`` are in the image.
-
-    Args:
-        shown: Points that must be seen [u], shape [N, 3].
-        direction: Direction from the scene to the eye, any length, shape [3].
-        up: Rough upward direction, shape [3]; replaced by any perpendicular where it lies along ``direction``.
-        aspect: Width of the image over its height.
-    """
+    """Return eye, focal point and up vector [3, 3] of a view along ``-direction`` of all points ``shown`` [N, 3]."""
     length = np.linalg.norm(direction)
     forward = -direction / length if length > 0 else np.array([0.0, 0.0, 1.0])
     right = np.cross(forward, up)
@@ -117,50 +100,63 @@ def framing(shown: np.ndarray, direction: np.ndarray, up: np.ndarray, aspect: fl
 
 
 def within(points: np.ndarray, margin: float) -> np.ndarray:
-    """Return a mask [N] of the points in the box between the 5th and 95th percentiles, enlarged by ``margin`` at each side.
-
-    The margin is a fraction of the box's size.
-    """
+    """Mask [N] of the points in the box of the 5th to 95th percentiles, enlarged by ``margin`` times its size at each side."""
     low, high = np.percentile(points, [5, 95], axis=0)
     return ((points >= low - margin * (high - low)) & (points <= high + margin * (high - low))).all(1)
 
 
 def render_overview(
-    train: list[Camera], test: list[Camera], points: np.ndarray, colors: np.ndarray, up: np.ndarray
-) -> tuple[bytes | None, str]:
-    """Render training and held-out cameras among points [N, 3] [u] with colours in [0, 1] [N, 3], ``up`` [3] upwards.
-
-    Returns:
-        PNG bytes and an empty string; or None and the reason why there is no image, with a remedy if there is one.
-    """
-    if not (len(points) and train):
-        return None, "no overview image: there are no points or no training cameras to show"
-    centers = np.array([c.center for c in train])
+    gaussians: Gaussians, options: RasterizeOptions, train: list[Camera], test: list[Camera], up: np.ndarray
+) -> np.ndarray | None:
+    """Render training and held-out cameras among Gaussians, ``up`` [3] upwards; colours [H, W, 3], None without Gaussians."""
+    points = gaussians.means.detach().cpu().numpy().astype(np.float64)
+    if not len(points):
+        return None
     low, high = np.percentile(points, [5, 95], axis=0)
-    inside = within(points, OUTSIDE)
-    middle, spread = np.median(points, axis=0), float(np.linalg.norm(high - low)) + 1e-9
-    forward = np.mean([c.viewmat[2, :3] for c in train], axis=0)
-    back = centers.mean(0) - middle
-    reach = max(float(np.linalg.norm(back)), 0.5 * spread)
-    side = np.cross(forward, up)
-    direction = 1.5 * back + 0.7 * reach * side / max(np.linalg.norm(side), 1e-9) + 0.5 * reach * up
-    size = 0.12 * max(reach, 1e-6)
-    lines = {"train": frusta(train, size), "test": frusta(test, size)}
+    back = np.mean([c.center for c in train], axis=0) - np.median(points, axis=0)
+    reach = max(float(np.linalg.norm(back)), 0.5 * float(np.linalg.norm(high - low)), 1e-6)
+    side = np.cross(np.mean([c.viewmat[2, :3] for c in train], axis=0), up)
+    direction = 1.5 * back + 0.7 * reach * side / max(float(np.linalg.norm(side)), 1e-9) + 0.5 * reach * up
     core = points[within(points, EDGE)]
-    view = framing(np.concatenate([core, *(f.reshape(-1, 3) for f in lines.values())]), direction, up)
-    try:
-        with temporary_folder() as folder:
-            source, target = (folder.path / name for name in ("scene.npz", "overview.png"))
-            np.savez(
-                source, points=points[inside].astype(np.float32),
-                colors=np.round(255 * np.clip(colors[inside], 0, 1)).astype(np.uint8), view=view, **lines,
-            )  # fmt: skip
-            works, why = run_pyvista(RENDER_SCRIPT, str(source), str(target))
-            if works and target.is_file():
-                return target.read_bytes(), ""
-    except OSError as e:
-        return None, f"no overview image: temporary files cannot be written ({e.strerror or e}); free some disk space"
-    return None, f"no overview image: {why}; {remedy_for(why)}"
+    size = _frustum_size([*train, *test], _extent(core, [*train, *test])[1])
+    lines = [(frusta(cameras, size), color) for cameras, color in ((train, TRAIN_COLOR), (test, TEST_COLOR)) if cameras]
+    shown = np.concatenate([core, *(segments.reshape(-1, 3) for segments, _ in lines)])
+    eye, focus, top = framing(shown, direction, up)
+    axis = (focus - eye) / np.linalg.norm(focus - eye)
+    right = np.cross(axis, top) / np.linalg.norm(np.cross(axis, top))
+    viewmat = np.eye(4)
+    viewmat[:3, :3] = right, np.cross(axis, right), axis
+    viewmat[:3, 3] = -viewmat[:3, :3] @ eye
+    focal = HEIGHT / 2 / math.tan(math.radians(VIEW_ANGLE / 2))
+    camera = Camera(viewmat, np.array([[focal, 0, WIDTH / 2], [0, focal, HEIGHT / 2], [0, 0, 1]]), WIDTH, HEIGHT)
+    near = torch.from_numpy(within(points, OUTSIDE)).to(gaussians.means.device)
+    inside = Gaussians(**{n: t.detach()[near] for n, t in gaussians.tensors().items()})
+    # the first harmonic alone: the others are not trained for directions beside the photographs
+    white = torch.ones(3, dtype=torch.float32, device=gaussians.means.device)
+    with torch.no_grad():
+        render = rasterize(inside, camera, replace(options, background=white, sh_degree=0))
+    depth = torch.where(render.alpha > 0.5, render.depth, torch.inf).cpu().numpy()
+    image = np.round(255 * render.rgb.clamp(0, 1).cpu().numpy()).astype(np.uint8)
+    for segments, color in lines:
+        _draw(image, depth, camera, segments, color)
+    return image / np.float32(255)
+
+
+def _draw(image: np.ndarray, depth: np.ndarray, camera: Camera, segments: np.ndarray, color: str) -> None:
+    """Draw segments [S, 2, 3] [u] into an 8-bit image [H, W, 3] where nothing nearer hides them; ``depth`` [H, W] [u]."""
+    import cv2
+
+    rgb = ImageColor.getrgb(color)
+    share = np.linspace(0, 1, PIECES + 1)[:, None]
+    for ends in segments:
+        points = (ends[0] + share * (ends[1] - ends[0])) @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
+        pixels = (points @ camera.K.T)[:, :2] / points[:, 2:]
+        columns, rows = np.clip(pixels.astype(int), 0, [camera.width - 1, camera.height - 1]).T
+        seen = points[:, 2] < 1.01 * depth[rows, columns]
+        fixed = np.round(16 * (pixels - 0.5)).astype(int).tolist()  # 4 bits after the point
+        changes = np.flatnonzero(np.diff(np.concatenate([[False], seen, [False]])))
+        for first, last in changes.reshape(-1, 2):
+            cv2.line(image, fixed[first], fixed[last - 1], rgb, 2, cv2.LINE_AA, 4)
 
 
 INK = {"white": "#1b1d21", "black": "#e8e9ec"}
@@ -223,6 +219,12 @@ class ScenePlot:
     """Text and colour (#rrggbb) of each entry besides the cameras."""
 
 
+def _extent(points: np.ndarray, cameras: list[Camera]) -> tuple[np.ndarray, float]:
+    """Return points [N, 3] and centres of cameras [C, 3] together, shape [N + C, 3], and the radius around their mean [u]."""
+    everything = np.concatenate([points, np.array([c.center for c in cameras]).reshape(-1, 3)])
+    return everything, float(np.sqrt(((everything - everything.mean(0)) ** 2).sum(1)).max())
+
+
 def _frustum_size(cameras: list[Camera], reach: float) -> float:
     """Return the height of camera pyramids [u]: 0.8 times the median gap between cameras, in [0.03, 0.12] times ``reach``."""
     if len(cameras) < 2:
@@ -255,22 +257,12 @@ def _with_legend(data: bytes, entries: list[tuple[str, str]], size: tuple[int, i
 
 
 def render_plot(plot: ScenePlot, size: tuple[int, int], background: str) -> bytes:
-    """Render a plot as PNG bytes.
-
-    Args:
-        plot: The contents; points far outside are left out.
-        size: Width and height [px].
-        background: white or black.
-
-    Raises:
-        ResourceError: This machine cannot render; the message names the packages to install.
-    """
+    """Render a plot as PNG bytes of ``size`` [px], on white or black; points far outside are left out."""
     inside = within(plot.points, OUTSIDE)
     points, colors = plot.points[inside], plot.colors[inside]
     core = points[within(points, EDGE)]
     cameras = [*plot.train, *plot.test]
-    everything = np.concatenate([core if len(core) else points, np.array([c.center for c in cameras]).reshape(-1, 3)])
-    reach = float(np.sqrt(((everything - everything.mean(0)) ** 2).sum(1)).max())
+    everything, reach = _extent(core if len(core) else points, cameras)
     length = _frustum_size(cameras, reach)
     arrays = {"train": frusta(plot.train, length), "test": frusta(plot.test, length), "points": points.astype(np.float32)}
     if plot.axes is not None:

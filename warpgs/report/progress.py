@@ -255,20 +255,12 @@ class EventLog:
     _file: BinaryIO | None = None
 
     def __init__(self, path: Path, step: int = 0):
-        """Open the log of a fit that has done ``step`` steps, and drop the events of later steps; 0 empties the log.
-
-        Raises:
-            ResourceError: The file cannot be written.
-        """
+        """Open the log of a fit that has done ``step`` steps, and drop the events of later steps; 0 empties the log."""
         self.path = Path(path)
         self.rewind(step)
 
     def rewind(self, step: int) -> None:
-        """Drop the events of all steps after ``step``; 0 empties the log.
-
-        Raises:
-            ResourceError: The file cannot be written.
-        """
+        """Drop the events of all steps after ``step``; 0 empties the log."""
         if self._file is not None:
             self.close()
         try:
@@ -280,22 +272,14 @@ class EventLog:
             raise self._failure(e) from e
 
     def write(self, *, step: int, **values: object) -> None:
-        """Append the event of one step; NaN and infinity become null.
-
-        Raises:
-            ResourceError: The file cannot be written.
-        """
+        """Append the event of one step; NaN and infinity become null."""
         try:
             self._file.write(_line({"step": step, **values}))
         except OSError as e:
             raise self._failure(e) from e
 
     def flush(self) -> None:
-        """Flush the log and sync it to the disk, so that it never lags behind a checkpoint.
-
-        Raises:
-            ResourceError: The file cannot be written.
-        """
+        """Flush the log and sync it to the disk, so that it never lags behind a checkpoint."""
         try:
             self._file.flush()
             os.fsync(self._file.fileno())
@@ -316,14 +300,7 @@ class EventLog:
 
 
 def read_events(path: Path) -> list[dict]:
-    """Return all events of a log in file order.
-
-    A line that is not an object of numbers with an integer ``step`` is skipped, because a killed run may leave an incomplete
-    last line. Null is read as NaN, so that a series has a number at every step.
-
-    Raises:
-        DataError: The log cannot be read, or is larger than `MAX_BYTES`.
-    """
+    """Return all events of a log in file order; null is NaN, and an invalid line, as a killed run may leave, is skipped."""
     events = []
     try:
         data = read_input(path, MAX_BYTES, path.parent)

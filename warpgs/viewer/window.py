@@ -18,7 +18,8 @@ from warpgs.export.base import read_with_antialiasing
 from warpgs.files import read_file, readable, remove_leftovers, write_json
 from warpgs.geometry import camera_extent, convert_camera, convert_gaussians, matmul, rotation_matrices
 from warpgs.io.image_files import decode
-from warpgs.pipeline.metrics.coverage import MIN_ALPHA, DepthView, classes_of, coverage_map, depth_views
+from warpgs.mesh.views import MIN_ALPHA
+from warpgs.pipeline.metrics.coverage import DepthView, classes_of, coverage_map, depth_views
 from warpgs.pipeline.model.table import FittedModel
 from warpgs.pipeline.run.commands import RULE, scene_of
 from warpgs.pipeline.run.folder import TENSORS, StoredRun, load_checkpoint, open_run

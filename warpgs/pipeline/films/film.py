@@ -16,6 +16,7 @@ from warpgs.errors import UsageError, did_you_mean
 from warpgs.files import make_folder, write_bytes
 from warpgs.geometry import convert_camera
 from warpgs.locks import check_file_path, hold_folder
+from warpgs.mesh.views import MIN_ALPHA
 from warpgs.pipeline.films.paths import (
     LIMITS,
     Rig,
@@ -28,7 +29,7 @@ from warpgs.pipeline.films.paths import (
     tour_of,
     upright,
 )
-from warpgs.pipeline.metrics.coverage import MIN_ALPHA, DepthView, classes_of, coverage_map, depth_views, fraction_outside
+from warpgs.pipeline.metrics.coverage import DepthView, classes_of, coverage_map, depth_views, fraction_outside
 from warpgs.pipeline.model.table import FittedModel
 from warpgs.process import say
 from warpgs.render.options import RasterizeOptions
@@ -139,11 +140,7 @@ class FilmSettings:
     """Colour behind the scene, in [0, 1]; None for the background of the fit."""
 
     def __post_init__(self) -> None:
-        """Check what can be checked before any work.
-
-        Raises:
-            UsageError: A number is out of its range.
-        """
+        """Check what can be checked before any work."""
         low, high = LIMITS["width"]
         if self.size is not None and not all(low <= s <= high for s in self.size):
             raise UsageError(f"each side of a film must have {low} to {high} px, not {self.size[0]} x {self.size[1]}")
@@ -182,10 +179,7 @@ class FilmPlan:
 
 @torch.no_grad()
 def depth_and_coverage(gaussians: Gaussians, cameras: list[Camera], options: RasterizeOptions) -> tuple[float, float]:
-    """Return the median depth [u] over covered pixels, and the median over images of their mean alpha, for up to nine cameras.
-
-    The depth is 1 if no pixel is covered.
-    """
+    """Return the median depth [u] of covered pixels, 1 without any, and the median of mean alpha, for up to nine cameras."""
     depths, alphas = [], []
     for camera in cameras[:: max(1, len(cameras) // 5)]:
         r = rasterize(gaussians, camera, options)
@@ -222,17 +216,7 @@ def _keyframes(model: FittedModel, path: Path, rig: Rig, first: Camera, settings
 
 
 def plan_film(model: FittedModel, path: str, settings: FilmSettings) -> FilmPlan:
-    """Return the cameras of a path for a model.
-
-    Args:
-        model: The model.
-        path: One of `PATHS`, or the name of a JSON file of keyframes.
-        settings: Settings of the film.
-
-    Raises:
-        DataError: The file of keyframes cannot be read.
-        UsageError: The path is unknown, or a setting does not apply to it.
-    """
+    """Return the cameras of a path, one of `PATHS` or a JSON file of keyframes, for a model."""
     if path not in PATHS and not path.lower().endswith(".json"):
         hint = did_you_mean(path, PATHS) or f"choose one of {', '.join(PATHS)}, or give a .json file of keyframes"
         raise UsageError(f"unknown path {path!r}; {hint}")
@@ -294,13 +278,6 @@ COVERAGE = "coverage"
 """Subfolder for images that mark regions by the number of training views that saw them."""
 
 
-def _training_depths(model: FittedModel, views: bool | Sequence[View], options: RasterizeOptions) -> list[DepthView]:
-    """Return the depths of the training views of a model; masks apply if the views themselves are given."""
-    masks = [v.mask for v in views] if isinstance(views, Sequence) else None
-    cameras = [v.camera for v in views] if isinstance(views, Sequence) else [model.cameras()[n] for n in model.train]
-    return depth_views(model.gaussians(), cameras, options, masks)
-
-
 def _covered(image: np.ndarray, depth: torch.Tensor, camera: Camera, training: list[DepthView], cut_out: bool) -> bytes:
     """Return the PNG of an image [H, W, 3] that marks regions that no training view saw, and regions that one view saw."""
     seen = coverage_map(depth, camera, training)
@@ -308,22 +285,8 @@ def _covered(image: np.ndarray, depth: torch.Tensor, camera: Camera, training: l
     return png(coverage_image(image, classes["0"], classes["1"]))
 
 
-@dataclass(frozen=True)
-class RenderedPath:
-    """Result of `render_film`: files, and lines for the user."""
-
-    files: list[Path]
-    """A PNG for each camera in order, unless only a film was requested; and last the film, if any."""
-    notes: list[str]
-    """Lines for the user: choices made, and frames that show nothing."""
-
-
 def _check_plan(plan: FilmPlan, out: Path, coverage: bool, sheet: bool) -> tuple[bool, bool]:
-    """Return whether ``out`` is a film and not a folder, and whether all frames have one size.
-
-    Raises:
-        UsageError: There is no camera, or the frames do not allow the requested film or output.
-    """
+    """Return whether ``out`` is a film and not a folder, and whether all frames have one size."""
     if not plan.cameras:
         raise UsageError("no camera to render; give at least one")
     alone = out.suffix.lower() in SUFFIXES
@@ -348,23 +311,17 @@ def _frames(
     model: FittedModel, plan: FilmPlan, files: Sequence[Path], settings: FilmSettings, coverage: bool | Sequence[View],
     check: FrameCheck, tell: Callable[[str], object] | None,
 ) -> Iterator[np.ndarray]:  # fmt: skip
-    """Render the frames of a plan, check each, and write its images; yields each image [H, W, 3].
-
-    Args:
-        model: The model.
-        plan: The frames.
-        files: File of each frame's image; none to write no images.
-        settings: Settings of the film.
-        coverage: As in `render_path`; the images lie in a subfolder beside ``files``.
-        check: Check of the frames.
-        tell: Called with a line for each frame before it is rendered.
-    """
+    """Render, check and write the frames of a plan, with coverage images in a subfolder; yields each image [H, W, 3]."""
     gaussians, options = model.gaussians(), model.options()
     if settings.background is not None:
         options = dataclasses.replace(options, background=gaussians.means.new_tensor(settings.background))
     straight = model.transparent and settings.background is None
     photographs = [model.cameras()[n] for n in model.train]
-    training = _training_depths(model, coverage, options) if coverage else None
+    training = None
+    if coverage:
+        views = coverage if isinstance(coverage, Sequence) else None
+        cameras = photographs if views is None else [v.camera for v in views]
+        training = depth_views(gaussians, cameras, options, None if views is None else [v.mask for v in views])
     cut_out = isinstance(coverage, Sequence) and any(v.alpha is not None for v in coverage)
     for i, (_, camera) in enumerate(plan.cameras):
         if tell is not None:
@@ -381,12 +338,6 @@ def _frames(
         yield image
 
 
-def _older_images(folder: Path, files: list[Path]) -> list[str]:
-    """Return notes on images of an earlier film in the same folder."""
-    older = [p for p in folder.glob("*.png") if p not in files and p.name != SHEET]
-    return [f"{len(older)} older images are also in {folder}: remove them, or give a new folder"] if older else []
-
-
 def render_film(
     model: FittedModel,
     plan: FilmPlan,
@@ -396,29 +347,15 @@ def render_film(
     coverage: bool | Sequence[View] = False,
     sheet: bool = False,
     tell: Callable[[str], object] | None = None,
-) -> RenderedPath:
-    """Render the cameras of a plan to files.
-
-    Args:
-        model: The model.
-        plan: The frames.
-        out: Folder for a PNG of each frame and film.mp4; or a film with one of the suffixes of `warpgs.report.film`, to write
-            only the film.
-        settings: Settings of the film.
-        coverage: As in `render_path`; only if ``out`` is a folder.
-        sheet: True to also write six frames in one image: sheet.png in the folder, or beside the film.
-        tell: Called with a line before each frame is rendered, and before the film is finished.
-
-    Raises:
-        ResourceError: A file cannot be written, or another process writes into the folder.
-        UsageError: There is no camera, or one film was requested of images that differ in size.
-    """
+) -> tuple[list[Path], list[str]]:
+    """Render a plan to PNG files and film.mp4, or to a film alone; ``sheet`` adds six frames in one image. Files and notes."""
     alone, one_size = _check_plan(plan, out, bool(coverage), sheet)
     folder, film = (out.parent, out) if alone else (out, out / FILM)
     if alone:
         check_file_path(out)
     files = [] if alone else [folder / f"{name}.png" for name, _ in plan.cameras]
-    left = [] if alone else _older_images(folder, files)
+    older = [] if alone else [p for p in folder.glob("*.png") if p not in files and p.name != SHEET]
+    left = [f"{len(older)} older images are also in {folder}: remove them, or give a new folder"] if older else []
     check, chosen, count = FrameCheck(plan.coverage), [], len(plan.cameras)
     in_sheet = {i * count // SHEET_FRAMES for i in range(SHEET_FRAMES)} if sheet else set()
 
@@ -440,7 +377,7 @@ def render_film(
         if sheet:
             write_bytes(sheet_path(out), png(frame_sheet(chosen)))
     notes = [*notes, *plan.notes, *check.notes(plan.remedy, plan.nearer), *left]
-    return RenderedPath([*files, film] if one_size else files, notes)
+    return [*files, film] if one_size else files, notes
 
 
 def render_path(
@@ -491,7 +428,7 @@ def render_path(
     else:
         own = [(f"{i:04d}", convert_camera(c, model.normalization, units, "scene")) for i, c in enumerate(path)]
         plan = FilmPlan(own, 0.0, "check the poses and the units of the cameras", [])
-    done = render_film(model, plan, Path(out), settings, coverage=coverage)
-    for note in done.notes:
+    files, notes = render_film(model, plan, Path(out), settings, coverage=coverage)
+    for note in notes:
         say(f"warpgs: {note}", error=True)
-    return done.files
+    return files

@@ -108,12 +108,10 @@ def _unit(v: np.ndarray) -> np.ndarray:
 
 
 def _normal_of(vectors: np.ndarray, largest: float) -> np.ndarray | None:
-    """Return the unit normal [3] of the plane through the origin that holds vectors [N, 3]; None if there is none.
-
-    The normal is the eigenvector of the smallest eigenvalue of their second moments, computed by squaring the inverse, without
-    LAPACK (see `warpgs.geometry.matmul`). There is no plane if the vectors lie on a line, or if the smallest eigenvalue is
-    above ``largest`` times the sum of the others.
-    """
+    """Return the unit normal [3] of the plane through the origin that holds vectors [N, 3]; None if there is none."""
+    # The normal is the eigenvector of the smallest eigenvalue of their second moments, computed by squaring the inverse,
+    # without LAPACK (see `warpgs.geometry.matmul`). There is no plane if the vectors lie on a line, or if the smallest
+    # eigenvalue is above ``largest`` times the sum of the others.
     covariance = (vectors[:, :, None] * vectors[:, None, :]).mean(0)
     total = float(np.trace(covariance))
     if not total > 0:
@@ -130,12 +128,10 @@ def _normal_of(vectors: np.ndarray, largest: float) -> np.ndarray | None:
 
 
 def _upward(cameras: list[Camera], looked_at: np.ndarray) -> tuple[np.ndarray, bool]:
-    """Return the upward direction [3] of a film, and whether the photographs lie on their side.
-
-    For cameras on a level circle, it is the normal of their plane, which does not depend on the rotation of photographs. If the
-    cameras' horizontal axes lie in another plane, it is the normal of that plane: then some photographs are nearer or lower
-    than the others. Else it is the mean of the cameras' own upward directions.
-    """
+    """Return the upward direction [3] of a film, and whether the photographs lie on their side."""
+    # For cameras on a level circle, it is the normal of their plane, which does not depend on the rotation of photographs. If
+    # the cameras' horizontal axes lie in another plane, it is the normal of that plane: then some photographs are nearer or
+    # lower than the others. Else it is the mean of the cameras' own upward directions.
     rights, ups, forwards = (sign * np.array([c.viewmat[i, :3] for c in cameras]) for i, sign in ((0, 1), (1, -1), (2, 1)))
     centers = np.array([c.center for c in cameras])
     mean = ups.mean(0)
@@ -200,15 +196,9 @@ def _kind(cameras: list[Camera], focus: np.ndarray, depth: float) -> str:
 
 
 def rig_of(cameras: list[Camera], depth: float) -> Rig:
-    """Return the arrangement of cameras around their subject.
-
-    If the optical axes meet, the subject is the point nearest to all axes. If the cameras see it from one side, or the axes are
-    nearly parallel, the subject is ``depth`` in front of their mean centre.
-
-    Args:
-        cameras: Training cameras, at least one.
-        depth: Distance from the cameras to their subject [u], above 0.
-    """
+    """Return the arrangement of cameras around their subject, ``depth`` [u] in front of them if their axes do not meet."""
+    # If the optical axes meet, the subject is the point nearest to all axes. If the cameras see it from one side, or the axes
+    # are nearly parallel, the subject is ``depth`` in front of their mean centre.
     centers, forwards = np.array([c.center for c in cameras]), np.array([c.viewmat[2, :3] for c in cameras])
     focus = focus_point(cameras)
     kind = _kind(cameras, focus, depth)
@@ -233,12 +223,7 @@ def rig_of(cameras: list[Camera], depth: float) -> Rig:
 
 
 def up_of(cameras: list[Camera], points: np.ndarray) -> np.ndarray:
-    """Return the upward direction of a scene for films: of length 1, shape [3].
-
-    Args:
-        cameras: Training cameras, at least one.
-        points: Points that they show, such as the means of Gaussians [u], shape [N, 3].
-    """
+    """Return the upward unit vector [3] of a scene for films, from training cameras and points [N, 3] [u]."""
     depths = np.concatenate([matmul(points - c.center, c.viewmat[2, :3]) for c in cameras[:: max(1, len(cameras) // 5)]])
     ahead = depths[depths > 0]
     return rig_of(cameras, float(np.median(ahead)) if len(ahead) else 1.0).up
@@ -265,17 +250,7 @@ LIMITS = {"width": (16, 8192), "fov": (1.0, 170.0)}
 
 
 def framed(camera: Camera, size: tuple[int, int] | None = None, fov_y: float | None = None, turned: bool = False) -> Camera:
-    """Return a camera with the size and field of view of a film.
-
-    Args:
-        camera: Camera of a photograph; its pose is kept, and a lens is replaced by the pinhole of the same K.
-        size: Width and height [px]; None for those of the photograph.
-        fov_y: Vertical field of view [rad] for a centred principal point; None for the field of view of the photograph.
-        turned: True if the photograph is rotated by a quarter turn, so that width and height are swapped.
-
-    Raises:
-        UsageError: The camera has no pinhole of the same K, such as an orthographic one.
-    """
+    """Return a pinhole camera with the size [px] and field of view [rad] of a film; ``turned`` swaps width and height."""
     camera = pinhole_of(camera)
     K, width, height = camera.K, camera.width, camera.height
     if turned:
@@ -329,16 +304,7 @@ def _spiral_to_one_side(rig: Rig, cameras: list[Camera], frames: int) -> list[np
 
 
 def _turn(rig: Rig, frames: int, turns: int, rise: float) -> list[np.ndarray]:
-    """Return poses on a circle about the rig's centre, or looking around from it.
-
-    If the cameras do not cover all sides, the path swings there and back.
-
-    Args:
-        rig: The rig.
-        frames: Number of poses.
-        turns: Number of times around.
-        rise: Amplitude of the elevation, one wave over the film [rad].
-    """
+    """Return poses on a circle about the rig's centre, or looking around from it, with an elevation of ``rise`` [rad]."""
     poses = []
     for t in np.arange(frames) / frames:
         azimuth = 2 * np.pi * turns * t
@@ -355,22 +321,7 @@ def _turn(rig: Rig, frames: int, turns: int, rise: float) -> list[np.ndarray]:
 
 
 def camera_path(kind: str, rig: Rig, cameras: list[Camera], frames: int) -> list[Camera]:
-    """Return cameras along a path, closed to a loop, with the size and intrinsics of the first camera.
-
-    Args:
-        kind: ``turntable``: a level circle at the cameras' distance and elevation; for cameras on one side, a swing through
-            their range and back; in a room, a turn on the spot. ``spiral``: two turns that rise and fall; for cameras that look
-            to one side, two turns that widen and narrow again.
-        rig: Arrangement of the training cameras.
-        cameras: Training cameras, at least one.
-        frames: Number of cameras.
-
-    Returns:
-        The cameras; all but those in a room look at the rig's centre.
-
-    Raises:
-        UsageError: The kind is unknown, or there are no frames.
-    """
+    """Return cameras on a closed path, turntable or spiral, with size and intrinsics of the first of ``cameras``."""
     if kind not in ("turntable", "spiral"):
         raise UsageError(f"path {kind!r} is neither turntable nor spiral")
     if frames < 1:
@@ -421,11 +372,9 @@ def _row(keyframe: Keyframe) -> np.ndarray:
 
 
 def _spline(rows: np.ndarray, times: np.ndarray, at: np.ndarray, closed: bool) -> np.ndarray:
-    """Return the values [F, 9] at times [F] of a smooth curve through rows [N, 9] at rising times [N].
-
-    The pieces are cubic Hermite. The slope at each row is that of the parabola through this row and its two neighbours (Catmull
-    and Rom 1974, for uneven times). In a closed curve, the last row repeats the first.
-    """
+    """Return the values [F, 9] at times [F] of a smooth curve through rows [N, 9] at rising times [N]."""
+    # The pieces are cubic Hermite. The slope at each row is that of the parabola through this row and its two neighbours
+    # (Catmull and Rom 1974, for uneven times). In a closed curve, the last row repeats the first.
     steps = np.diff(times)
     slopes = np.diff(rows, axis=0) / steps[:, None]
     tangents = np.empty_like(rows)
@@ -448,21 +397,10 @@ def _spline(rows: np.ndarray, times: np.ndarray, at: np.ndarray, closed: bool) -
 
 
 def through(keyframes: list[Keyframe], frames: int, *, closed: bool = False) -> list[Camera]:
-    """Return cameras on a smooth curve through keyframes, at even times from the first to the last.
-
-    One spline interpolates the points looked at, the distances to them, rotations and fields of view. So an object that all
-    cameras look at stays in place while they go around it. Rotations are quaternions, normalised at each frame: between
-    neighbours they turn nearly as evenly as by spherical interpolation, and they do not jerk at a keyframe.
-
-    Args:
-        keyframes: At least one, at rising times; in a closed path the last keyframe repeats the first.
-        frames: Number of cameras. If there are two or more, the path starts at the first keyframe and ends at the last; a
-            closed path ends one frame before the last.
-        closed: Whether the path goes through its end without a corner.
-
-    Raises:
-        UsageError: There are no frames.
-    """
+    """Return cameras on a smooth curve through keyframes, at even times; a closed path ends one frame before its end."""
+    # One spline interpolates the points looked at, the distances to them, rotations and fields of view. So an object that all
+    # cameras look at stays in place while they go around it. Rotations are quaternions, normalised at each frame: between
+    # neighbours they turn nearly as evenly as by spherical interpolation, and they do not jerk at a keyframe.
     if frames < 1:
         raise UsageError(f"a film needs at least 1 frame, not {frames}")
     if len(keyframes) == 1:
@@ -490,21 +428,7 @@ KEYFRAMES = schema.items(schema.fields({
 
 
 def read_keyframes(path: Path, template: Camera, normalization: Normalization) -> list[Keyframe]:
-    """Read keyframes of a JSON file: a list of ``{"c2w": 4x4, "fov_y": radians, "seconds": time}``.
-
-    ``c2w`` is camera-to-world in OpenCV axes and in the units of the scene's files; ``seconds`` rise from keyframe to keyframe.
-
-    Args:
-        path: The file.
-        template: Camera that gives the image size and the shape of a pixel.
-        normalization: Similarity from file to scene units.
-
-    Returns:
-        The keyframes in scene units, the first at 0 s.
-
-    Raises:
-        DataError: The file cannot be read, or one of its values is invalid; the message names the value.
-    """
+    """Read keyframes of a JSON file (OpenCV camera-to-world, file units) into scene units, the first at 0 s."""
     try:
         values = schema.parse(read_input(path, MAX_BYTES))
         KEYFRAMES(values, "keyframes")
@@ -593,17 +517,9 @@ class Tour:
 
 
 def tour_of(cameras: list[Camera], reaches: list[float], seconds: float, most: int) -> Tour:
-    """Return a path through training views at an even pace.
-
-    The views are passed in the order of their names if this path is not much longer than one from neighbour to neighbour: then
-    the names probably follow the order of capture. The path is closed if its ends are neighbours.
-
-    Args:
-        cameras: Cameras of the views by name, at least one; pinholes.
-        reaches: Distance along each optical axis to the point that the camera looks at [u]; 0 if unknown.
-        seconds: Duration of the path [s].
-        most: Largest number of views on the path; if there are more, evenly spaced views are taken.
-    """
+    """Return a path through at most ``most`` training views at an even pace; ``reaches`` [u] are depths of their subjects."""
+    # The views are passed in the order of their names if this path is not much longer than one from neighbour to neighbour:
+    # then the names probably follow the order of capture. The path is closed if its ends are neighbours.
     distances = _distances(cameras)
     named, near = list(range(len(cameras))), _neighbour_tour(distances)
     lengths = [float(sum(distances[a][b] for a, b in itertools.pairwise(o))) for o in (named, near)]

@@ -13,24 +13,19 @@ from torch.nn.functional import interpolate
 
 from warpgs.constants import NEAR
 from warpgs.files import make_folder, read_file, write_bytes
-from warpgs.geometry import check_pinhole, pinhole_of, relative_pose
+from warpgs.geometry import check_pinhole, pinhole_of
 from warpgs.io.image_files import decode
 from warpgs.kernels.ssim import ssim
+from warpgs.mesh.views import MIN_ALPHA, TOLERANCE, depth_difference, seen_from
 from warpgs.pipeline.metrics.scores import over_white, psnr_of, render_view, scored_region, to_8_bit
 from warpgs.priors.given_depth import pinhole_view
 from warpgs.process import counted
 from warpgs.render.options import RasterizeOptions
 from warpgs.render.rasterize import rasterize
 from warpgs.report.images import COVERAGE_LEGEND, coverage_image, png, webp
-from warpgs.report.page import CoverageReport
+from warpgs.report.page import Section
 from warpgs.scene import Camera, Gaussians, View
 
-TOLERANCE = 0.02
-"""Largest difference of two depths of one surface, as a fraction of the depth. Measured on training photographs alone: at this
-difference, the squared colour difference of two photographs is twice (3 dB) the value at the best agreement of depths (decision
-019)."""
-MIN_ALPHA = 0.5
-"""Least opacity of a pixel that shows a surface; other pixels have no depth."""
 MAX_COUNT = 255
 """Largest number of views that is stored for a pixel; higher counts are clamped."""
 GRID = 32
@@ -49,20 +44,6 @@ class DepthView:
     """Expected z-depth [u], float32, shape [H, W]; 0 where the model shows no surface, or the mask of the view hides it."""
 
 
-@dataclass(frozen=True)
-class Match:
-    """The points of one view's pixels as another view sees them; tensors of the shape of the pixels, [H, W]."""
-
-    u: torch.Tensor
-    """Column in the other view [px], pixel centres at +0.5; undefined where ``difference`` is infinite."""
-    v: torch.Tensor
-    """Row in the other view [px]."""
-    difference: torch.Tensor
-    """Smallest difference between the point's depth in the other view and the depths seen at the four pixels around the point,
-    as a fraction of the depth. Four pixels are compared because depth varies within a pixel on a slanted surface. Infinite
-    outside the other image, where the other view sees no surface, and where the pixel itself shows none."""
-
-
 @torch.no_grad()
 def depth_of(gaussians: Gaussians, camera: Camera, options: RasterizeOptions) -> torch.Tensor:
     """Render the expected z-depth [u] of a view, shape [H, W]; 0 where less than `MIN_ALPHA` of a pixel is covered."""
@@ -77,23 +58,7 @@ def depth_views(
     masks: Sequence[np.ndarray | None] | None = None,
     max_pixels: int = MAX_PIXELS,
 ) -> list[DepthView]:
-    """Render the depth of every training view once.
-
-    Args:
-        gaussians: N Gaussians in the units of the cameras.
-        cameras: Cameras of the training views, arrays of numpy.
-        options: Options of the rasterizer.
-        masks: True for pixels of a view that are used, bool, shape [H, W] each; None for a view without a mask, or for no
-            masks.
-        max_pixels: Largest total number of pixels of all maps; above it, both sides of every map are reduced by the same
-            factor.
-
-    Returns:
-        The views in the order of the cameras, on the device of the Gaussians.
-
-    Raises:
-        UsageError: A camera has no pinhole of the same K, such as an orthographic one.
-    """
+    """Render the depth of every training view once, 0 outside ``masks`` [H, W]; smaller if all maps exceed ``max_pixels``."""
     pixels = sum(c.width * c.height for c in cameras)
     factor = min(1.0, (max_pixels / max(1, pixels)) ** 0.5)
     views = []
@@ -118,48 +83,10 @@ def _resized(camera: Camera, factor: float) -> Camera:
     return replace(camera, K=scale * camera.K, width=width, height=height)
 
 
-def match(depth: torch.Tensor, camera: Camera, other: DepthView) -> Match:
-    """Compare the points that a view's pixels show with the surface that another view sees.
-
-    Args:
-        depth: z-depth of the pixels [u], 0 where there is no surface, shape [H, W].
-        camera: Their camera, arrays of numpy.
-        other: The other view.
-
-    Raises:
-        UsageError: ``camera`` is not a pinhole.
-    """
+def match(depth: torch.Tensor, camera: Camera, other: DepthView) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Return column and row [px] of a pinhole view's points in another view, and least difference of depths, [H, W] each."""
     check_pinhole(camera)
-    u, v, z = _seen_from(depth, camera, other.camera)
-    height, width = other.depth.shape
-    inside = (depth > 0) & (z > NEAR) & (u >= 0) & (u < width) & (v >= 0) & (v < height)
-    left, top = torch.floor(u - 0.5), torch.floor(v - 0.5)
-    columns = [(left + i).clamp(0, width - 1).long() for i in (0, 1)]
-    rows = [(top + i).clamp(0, height - 1).long() * width for i in (0, 1)]
-    flat = other.depth.flatten()
-    around = torch.stack([flat[r + c] for r in rows for c in columns])
-    distance = torch.where(around > 0, (around - z).abs(), torch.inf).amin(0)
-    return Match(u, v, torch.where(inside, distance / z, torch.inf))
-
-
-def _seen_from(depth: torch.Tensor, camera: Camera, other: Camera) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Return column and row [px] and z-depth [u] in another view of the points at a view's pixels, shape [H, W] each.
-
-    No product of matrices is used, because its bits would depend on the processor. For points behind the other view, columns
-    and rows are undefined.
-    """
-    rotation, translation = relative_pose(camera, other)
-    K, other_K = camera.K, other.K
-    height, width = depth.shape
-    x = (torch.arange(width, dtype=depth.dtype, device=depth.device) + 0.5 - float(K[0, 2])) / float(K[0, 0])
-    y = (torch.arange(height, dtype=depth.dtype, device=depth.device) + 0.5 - float(K[1, 2])) / float(K[1, 1])
-    px, py, z = (
-        depth * (x[None] * float(r[0]) + (y[:, None] * float(r[1]) + float(r[2]))) + float(t)
-        for r, t in zip(rotation, translation)
-    )
-    safe = torch.where(z > NEAR, z, torch.inf)
-    u, v = (p / safe * float(other_K[i, i]) + float(other_K[i, 2]) for i, p in enumerate((px, py)))
-    return u, v, z
+    return depth_difference(depth, camera, other.camera, other.depth)
 
 
 @dataclass(frozen=True)
@@ -169,52 +96,27 @@ class Coverage:
     counts: torch.Tensor
     """Number of training views that saw the point, at most `MAX_COUNT`, uint8; 0 where the render shows no surface."""
     difference: torch.Tensor
-    """Least difference of depths to a training view, as in `Match`; infinite where the point is in no training image."""
+    """Least difference of depths to a training view, as of `match`; infinite where the point is in no training image."""
     empty: torch.Tensor
     """True where the render shows no surface, bool."""
 
 
 def coverage_map(depth: torch.Tensor, camera: Camera, training: Sequence[DepthView], tolerance: float = TOLERANCE) -> Coverage:
-    """Count, for each pixel of a render, the training views that saw the point at this pixel.
-
-    A view saw a point that is in its image, inside its mask, and on its rendered surface: neither behind the surface (occluded)
-    nor in front of it (the view looks through). Counts use the model's depth, so they are as accurate as the model's geometry.
-
-    Args:
-        depth: z-depth of the render [u], 0 where there is no surface, shape [H, W], as `depth_of` gives it.
-        camera: Camera of the render, arrays of numpy.
-        training: Training views, from `depth_views`.
-        tolerance: Largest difference of depths of one surface, as a fraction of the depth.
-
-    Returns:
-        The coverage, on the device of ``depth``.
-
-    Raises:
-        UsageError: ``camera`` is not a pinhole.
-    """
+    """Count the training views that saw the point at each pixel of a render with depth [H, W] [u], 0 for no surface."""
+    # A view saw a point that is in its image, inside its mask, and on its rendered surface: neither behind the surface
+    # (occluded) nor in front of it (the view looks through). Counts use the model's depth, so they are as accurate as the
+    # model's geometry.
     counts = torch.zeros(depth.shape, dtype=torch.int32, device=depth.device)
     least = torch.full_like(depth, torch.inf)
     for view in training:
-        difference = match(depth, camera, view).difference
+        _, _, difference = match(depth, camera, view)
         counts += difference <= tolerance
         least = torch.minimum(least, difference)
     return Coverage(counts.clamp_max(MAX_COUNT).to(torch.uint8), least, depth <= 0)
 
 
 def fraction_outside(depth: torch.Tensor, camera: Camera, photographs: Sequence[Camera], empty: bool = True) -> float:
-    """Return the fraction of a render's pixels that show a point outside the images of all photographs, sampled on a grid.
-
-    Unlike `coverage_map`, this function renders nothing, and counts occluded points as seen.
-
-    Args:
-        depth: z-depth of the render [u], 0 where there is no surface, shape [H, W].
-        camera: Camera of the render, a pinhole; arrays of numpy.
-        photographs: Cameras of the photographs; a lens is replaced by the pinhole of the same K.
-        empty: Whether pixels without a surface are included, at the median depth of the other pixels.
-
-    Raises:
-        UsageError: A photograph has no pinhole of the same K, such as an orthographic one.
-    """
+    """Return the fraction of a render's pixels, on a grid, that show a point outside the images of all photographs."""
     small = _resized(camera, min(1.0, GRID / max(camera.width, camera.height)))
     rows, columns = (
         ((torch.arange(few, device=depth.device) + 0.5) * (many / few)).long()
@@ -227,7 +129,7 @@ def fraction_outside(depth: torch.Tensor, camera: Camera, photographs: Sequence[
     outside = torch.ones_like(shown) if empty else shown
     points = torch.where(shown, points, points[shown].median())
     for other in sorted(photographs, key=lambda c: float(np.linalg.norm(c.center - camera.center))):
-        u, v, z = _seen_from(points, small, pinhole_of(other))
+        u, v, z = seen_from(points, small, pinhole_of(other))
         outside = outside & ~((z > NEAR) & (u >= 0) & (u < other.width) & (v >= 0) & (v < other.height))
         if not outside.any():  # mostly after the nearest few
             break
@@ -247,20 +149,10 @@ PROBED = 6
 
 @torch.no_grad()
 def photo_errors(train: Sequence[View], training: Sequence[DepthView]) -> np.ndarray | None:
-    """Measure how much two training photographs of the same point differ in colour, as a function of the difference in depth.
-
-    Each photograph is warped to another view by the model's depth and compared with the photograph there, pixel by pixel. The
-    result estimates the error of a pixel from its least depth difference to a training view. The estimate uses the data that
-    the model was fitted to. It includes differences between the photographs, such as reflections and exposure.
-
-    Args:
-        train: Training views.
-        training: Their depths, from `depth_views`.
-
-    Returns:
-        Mean squared errors of colours in [0, 1] by class of `BINS`, float64, shape [8]; a class without pixels has the value of
-        the class before it. None if no pixel of a photograph can be compared.
-    """
+    """Return the mean squared colour difference of two photographs of a point by class of `BINS`, [8]; None without pixels."""
+    # Each photograph is warped to another view by the model's depth and compared with the photograph there, pixel by pixel. The
+    # result estimates the error of a pixel from its least depth difference to a training view. The estimate uses the data that
+    # the model was fitted to. It includes differences between the photographs, such as reflections and exposure.
     chosen = np.unique(np.linspace(0, len(train) - 1, min(PROBED, len(train))).round().astype(int))
     photos = {i: _photo(train[i], training[i]) for i in chosen}
     total, count = np.zeros(len(BINS)), np.zeros(len(BINS))
@@ -268,10 +160,10 @@ def photo_errors(train: Sequence[View], training: Sequence[DepthView]) -> np.nda
         for j in chosen:
             if i == j:
                 continue
-            m = match(training[i].depth, training[i].camera, training[j])
-            inside = torch.isfinite(m.difference)
-            error = (_sampled(photos[j], m.u[inside], m.v[inside]) - photos[i][inside]).double().square().mean(1)
-            index = _bin(m.difference[inside].cpu().numpy())
+            u, v, difference = match(training[i].depth, training[i].camera, training[j])
+            inside = torch.isfinite(difference)
+            error = (_sampled(photos[j], u[inside], v[inside]) - photos[i][inside]).double().square().mean(1)
+            index = _bin(difference[inside].cpu().numpy())
             total += np.bincount(index, error.cpu().numpy(), len(BINS))
             count += np.bincount(index, minlength=len(BINS))
     if not count.any():
@@ -308,12 +200,7 @@ def _sampled(image: torch.Tensor, u: torch.Tensor, v: torch.Tensor) -> torch.Ten
 
 
 def classes_of(coverage: Coverage, transparent: bool) -> dict[str, np.ndarray]:
-    """Return the pixels of each class of `CLASSES`, bool [H, W], every pixel in one.
-
-    Args:
-        coverage: Coverage of the render.
-        transparent: True if the scene has an alpha channel: a pixel without a surface is then background, else unseen.
-    """
+    """Return the pixels of each class of `CLASSES`, bool [H, W]; none is background if ``transparent``, else unseen."""
     counts, empty = coverage.counts.cpu().numpy(), coverage.empty.cpu().numpy() & transparent
     return {"0": (counts == 0) & ~empty, "1": counts == 1, "2+": counts >= 2, "background": empty}
 
@@ -354,27 +241,7 @@ def score_by_coverage(
     show: Callable[[View, np.ndarray, dict[str, np.ndarray]], object] = lambda *_: None,
     tell: Callable[[str], object] = lambda line: None,
 ) -> dict[str, Any]:
-    """Split the scores of held-out views by the number of training views that see the point at each pixel.
-
-    Views with a lens model are scored as a pinhole would show them.
-
-    Args:
-        gaussians: N Gaussians in the units of the views' cameras.
-        train: Training views, at least one.
-        test: Held-out views, at least one.
-        options: Options of the rasterizer.
-        show: Called for each held-out view with its render [H, W, 3] and the pixels of each class, bool [H, W].
-        tell: Called with a line before each view is rendered.
-
-    Returns:
-        ``classes``: over all held-out views together, by class, the number of scored ``pixels``, their ``share_of_pixels`` and
-        ``share_of_error`` (squared), and their ``psnr`` [dB], ``ssim`` and ``expected_psnr`` [dB] (by `photo_errors`; None with
-        a single training view); ``views``: the same values for each view by ``name``;
-        ``depth_differences`` and ``photo_psnr``: the table of `photo_errors`; ``tolerance``; ``summary``, a sentence.
-
-    Raises:
-        UsageError: A camera has no pinhole of the same K, such as an orthographic one.
-    """
+    """Return scores of held-out views by the number of training views that saw each pixel; ``show`` gets render and classes."""
     tell("checking coverage")
     train, test = ([pinhole_view(v) for v in views] for views in (train, test))
     training = depth_views(gaussians, [v.camera for v in train], options, [v.mask for v in train])
@@ -426,23 +293,7 @@ def coverage_of_run(
     names: Mapping[str, str],
     tell: Callable[[str], object] = lambda line: None,
 ) -> dict[str, Any]:
-    """Split the scores of held-out views by coverage, and save an image of each view.
-
-    Args:
-        out: The run folder; None to write nothing.
-        gaussians: N Gaussians in scene units [u].
-        train: Training views.
-        test: Held-out views, at least one.
-        options: Options of the rasterizer.
-        names: Names of image files by view, from `image_names` for the whole scene.
-        tell: Called with a line for each view before it is rendered.
-
-    Returns:
-        The result of `score_by_coverage`.
-
-    Raises:
-        ResourceError: An image cannot be written.
-    """
+    """Split the scores of held-out views by coverage, and save an image of each view in ``out``, if any."""
     if out is not None:
         make_folder(out / FOLDER)
 
@@ -472,19 +323,13 @@ def coverage_lines(coverage: dict[str, Any]) -> list[str]:
     return [*lines, coverage["summary"], EXPECTED, f"images in {FOLDER}/: {COVERAGE_LEGEND}"]
 
 
-def coverage_section(out: Path, coverage: dict[str, Any], shown: list[str], names: Mapping[str, str]) -> CoverageReport:
-    """Return the section of the report page.
-
-    Args:
-        out: The run folder, with the images.
-        coverage: Result of `coverage_of_run`.
-        shown: Names of the views whose images are shown.
-        names: Names of image files by view.
-    """
+def coverage_section(out: Path, coverage: dict[str, Any], shown: list[str], names: Mapping[str, str]) -> Section:
+    """Return the section of the report page, with the images of the views ``shown``."""
     files = {n: out / FOLDER / f"{names[n]}.png" for n in shown}
     head, *rows = coverage_table(coverage)
-    return CoverageReport(
-        f"{coverage['summary'][0].upper()}{coverage['summary'][1:]}. {EXPECTED}", COVERAGE_LEGEND,
+    return Section(
+        f"{coverage['summary'][0].upper()}{coverage['summary'][1:]}. {EXPECTED}",
         [(n, webp(decode(f, data=read_file(f, out))[0], 640)) for n, f in files.items() if f.is_file()],
         [head[1:], *(r[1:] for r in rows if r[0] == "all views")],
-    )  # fmt: skip
+        f"{COVERAGE_LEGEND[0].upper()}{COVERAGE_LEGEND[1:]}.",
+    )

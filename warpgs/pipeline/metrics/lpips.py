@@ -123,10 +123,8 @@ def _read_state(path: Path) -> tuple[dict[str, torch.Tensor], str]:
 
 
 def _mapped(file: BinaryIO) -> str | BinaryIO:
-    """Return a path that lets torch map an open archive: then tensors use no memory before they are read.
-
-    Return the file itself if the system has no such paths, or if torch would have to unpickle the tensors.
-    """
+    """Return a path that lets torch map an open archive: then tensors use no memory before they are read."""
+    # Return the file itself if the system has no such paths, or if torch would have to unpickle the tensors.
     name = files.DESCRIPTORS / str(file.fileno())
     named = name.exists() and zipfile.is_zipfile(file)
     file.seek(0)
@@ -134,11 +132,7 @@ def _mapped(file: BinaryIO) -> str | BinaryIO:
 
 
 def _check_unpacked(file: BinaryIO) -> None:
-    """Check that an archive has no large pickle and unpacks to no more than its own size, since torch does not compress.
-
-    Raises:
-        ValueError: The archive unpacks to more, or has a large pickle.
-    """
+    """Check that an archive has no large pickle and unpacks to no more than its own size, since torch does not compress."""
     if zipfile.is_zipfile(file):
         with zipfile.ZipFile(file) as archive:
             members = archive.infolist()
@@ -165,21 +159,7 @@ def _net_of(heads: dict[str, torch.Tensor], path: Path) -> Net:
 
 
 def convert_lpips(backbone: Path, heads: Path, out: Path) -> list[str]:
-    """Join a backbone and LPIPS heads, once, into a file without pickles that `--lpips-weights` takes.
-
-    Args:
-        backbone: State dict of torchvision's vgg16 or alexnet, trained on ImageNet.
-        heads: The five linear heads of PerceptualSimilarity for the same network.
-        out: The safetensors file to write; its header names net, version and the SHA-256 of both sources.
-
-    Returns:
-        Lines for the user: the written file, and whether a source differs from the published one.
-
-    Raises:
-        DataError: A source is missing, is not a state dict, belongs to another network, or is not finite.
-        ResourceError: The file cannot be written.
-        UsageError: ``out`` exists.
-    """
+    """Join a torchvision backbone and LPIPS heads into a file without pickles; returns lines on the file and its sources."""
     from safetensors.torch import save
 
     if os.path.exists(out):
@@ -215,15 +195,7 @@ def convert_lpips(backbone: Path, heads: Path, out: Path) -> list[str]:
 
 
 def read_lpips(path: Path) -> tuple[Net, dict[str, torch.Tensor], dict[str, str]]:
-    """Read a converted file.
-
-    Returns:
-        The network, its tensors by name (float32, CPU, shapes [...] as in `Net.shapes`), and the header with the file's own
-        SHA-256 as "sha256".
-
-    Raises:
-        DataError: The file is missing, damaged, or was not written by `convert_lpips`.
-    """
+    """Read a converted file: the network, its tensors by name (float32, CPU), and the header with the file's SHA-256."""
     from safetensors import SafetensorError
     from safetensors.torch import load
 
@@ -313,10 +285,6 @@ class Lpips:
 
 
 def load_lpips(path: Path, device: torch.device) -> Lpips:
-    """Load LPIPS with the weights of a file that `warpgs convert-lpips` wrote.
-
-    Raises:
-        DataError: The file is missing, damaged, or of another kind.
-    """
+    """Load LPIPS with the weights of a file that `warpgs convert-lpips` wrote."""
     net, tensors, header = read_lpips(path)
     return Lpips(net, {n: t.to(device) for n, t in tensors.items()}, header.get("version", "unknown"), header["sha256"])

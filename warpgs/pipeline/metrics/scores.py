@@ -23,10 +23,8 @@ from warpgs.scene import Camera, Gaussians, View, checked_views
 
 
 def quantiles(values: torch.Tensor, *fractions: float) -> list[torch.Tensor]:
-    """Return quantiles of numbers [N], N at least 1, for fractions in [0, 1], linear between neighbours; a NaN ranks last.
-
-    torch.quantile rejects more than 2^24 numbers, and photographs may have more pixels.
-    """
+    """Return quantiles of numbers [N], N at least 1, for fractions in [0, 1], linear between neighbours; a NaN ranks last."""
+    # torch.quantile rejects more than 2^24 numbers, and photographs may have more pixels.
     ordered = values.sort().values
     found = []
     for fraction in fractions:
@@ -41,21 +39,16 @@ OPAQUE = 0.5
 
 
 def scored_region(view: View) -> tuple[np.ndarray | None, str]:
-    """Return the pixels that a render is scored on, bool [H, W], and their name; None for all.
-
-    These are the pixels of the view's score mask, if any (DTU's protocol), else the region of `counted_region`.
-    """
+    """Return the pixels that a render is scored on, bool [H, W], and their name; None for all."""
     if view.score_mask is not None:
         return view.score_mask, "score mask"
     return counted_region(view)
 
 
 def counted_region(view: View) -> tuple[np.ndarray | None, str]:
-    """Return the pixels of a view that a fit compares with the render, bool [H, W], and their name; None for all.
-
-    These are the pixels of the view's mask, if any. Without a mask, they are the bright pixels of a view of an object on black,
-    because a black frame around a small object would dominate the score.
-    """
+    """Return the pixels of a view that a fit compares with the render, bool [H, W], and their name; None for all."""
+    # These are the pixels of the view's mask, if any. Without a mask, they are the bright pixels of a view of an object on
+    # black, because a black frame around a small object would dominate the score.
     if view.mask is not None and not view.mask.all():
         return view.mask, "mask"
     dark = dark_pixels(view.image)
@@ -63,10 +56,7 @@ def counted_region(view: View) -> tuple[np.ndarray | None, str]:
 
 
 def fitted_region(view: View) -> tuple[np.ndarray | None, str]:
-    """Return the pixels behind which a fit may start Gaussians, bool [H, W], and their name; None for all.
-
-    These are the opaque pixels within the mask if the view has an alpha channel, else the region of `counted_region`.
-    """
+    """Return the pixels behind which a fit may start Gaussians, bool [H, W], and their name; None for all."""
     if view.alpha is None:
         return counted_region(view)
     opaque = view.alpha > OPAQUE
@@ -74,13 +64,7 @@ def fitted_region(view: View) -> tuple[np.ndarray | None, str]:
 
 
 def masked_mse(rgb: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None) -> torch.Tensor:
-    """Return the mean squared error of a rendered image, clamped to [0, 1], over the unmasked pixels.
-
-    Args:
-        rgb: Rendered colours, shape [H, W, 3].
-        target: Colours in [0, 1], shape [H, W, 3].
-        mask: 1 for unmasked pixels, 0 for masked ones, shape [H, W]; None without a mask.
-    """
+    """Return the mean squared error of a render [H, W, 3], clamped to [0, 1], over the pixels where the mask [H, W] is 1."""
     if mask is None:
         return squared_error(rgb, target) / rgb.numel()
     return ((rgb.clamp(0, 1) - target) ** 2 * mask[..., None]).sum() / (3 * mask.sum().clamp_min(1))
@@ -92,12 +76,7 @@ def psnr_of(mse: float) -> float:
 
 
 def psnr(image: np.ndarray, target: np.ndarray, region: np.ndarray | None = None) -> float:
-    """Return the PSNR [dB] of two images in [0, 1], over all channels of the pixels in ``region`` [H, W]; infinite if equal.
-
-    Raises:
-        TypeError: The region is not bool: integers would select rows.
-        ValueError: A shape disagrees.
-    """
+    """Return the PSNR [dB] of two images in [0, 1], over all channels of the pixels in ``region`` [H, W]; infinite if equal."""
     if image.shape != target.shape:
         raise ValueError(f"psnr: both images must have one shape, not {list(image.shape)} and {list(target.shape)}; resize one")
     if region is not None and region.dtype != bool:
@@ -182,11 +161,9 @@ def _opacity_scores(
 
 
 def score(view: View, image: np.ndarray, lpips: Lpips | None = None, alpha: np.ndarray | None = None) -> ViewMetrics:
-    """Compare a rendered image [H, W, 3], and its alpha [H, W] if the view has an alpha channel, with the image of its view.
-
-    Masks are used as in DTU's protocol (Niemeyer et al. 2022 and later papers): PSNR over the mask's pixels alone, SSIM and
-    LPIPS on both images with white outside the mask.
-    """
+    """Compare a rendered image [H, W, 3], and its alpha [H, W] if the view has an alpha channel, with the image of its view."""
+    # Masks are used as in DTU's protocol (Niemeyer et al. 2022 and later papers): PSNR over the mask's pixels alone, SSIM and
+    # LPIPS on both images with white outside the mask.
     from skimage.metrics import structural_similarity
 
     region, name = scored_region(view)
@@ -244,11 +221,9 @@ def evaluate(
 
 
 def baselines(train: list[View], test: list[View]) -> dict[str, float]:
-    """Return the mean PSNR [dB] over the test views of two predictions without 3D, which any useful fit beats.
-
-    ``mean_photo``: the mean of the training images; ``nearest_photo``: the image of the nearest training camera. Training
-    images whose size differs from the test view's are left out, and so is a baseline without any score.
-    """
+    """Return the mean PSNR [dB] over the test views of two predictions without 3D, which any useful fit beats."""
+    # ``mean_photo``: the mean of the training images; ``nearest_photo``: the image of the nearest training camera. Training
+    # images whose size differs from the test view's are left out, and so is a baseline without any score.
     scores: dict[str, list[float]] = {"mean_photo": [], "nearest_photo": []}
     for view in test:
         same = [v for v in train if v.image.shape == view.image.shape]
@@ -262,10 +237,7 @@ def baselines(train: list[View], test: list[View]) -> dict[str, float]:
 
 
 def summarize(metrics: list[ViewMetrics]) -> dict[str, float]:
-    """Return the means over views of every numeric score; empty without views.
-
-    Means of opacity scores are over the views that have such a score.
-    """
+    """Return the means over views of every numeric score; empty without views."""
     if not metrics:
         return {}
     rows = [m.row() for m in metrics]
@@ -402,15 +374,10 @@ def _residuals_elsewhere(small: Sequence[_Small], index: int, others: Sequence[i
 
 
 def moved_fractions(views: Sequence[View], renders: Iterable[Rendered]) -> list[float]:
-    """Return for each training view the fraction of its pixels, in [0, 1], in regions that other views show differently.
-
-    A pixel is included if the view's residual is much larger than the residuals of other views at the same point, and at least
-    two other views show this point. All fractions are 0 for fewer than `MIN_TRAINING` views, and for an unconverged fit.
-
-    Args:
-        views: The training views, at least one.
-        renders: Render of each by the finished model, in the same order.
-    """
+    """Return the fraction of each training view's pixels, in [0, 1], in regions that other views show differently."""
+    # A pixel is included if the view's residual is much larger than the residuals of other views at the same point, and at
+    # least two other views show this point. All fractions are 0 for fewer than `MIN_TRAINING` views, and for an unconverged
+    # fit.
     import cv2
 
     if len(views) < MIN_TRAINING:

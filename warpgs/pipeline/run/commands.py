@@ -45,7 +45,6 @@ from warpgs.pipeline.model import edit
 from warpgs.pipeline.model.edit import coverage
 from warpgs.pipeline.model.start import InitConfig, consistent_depths, seen_points
 from warpgs.pipeline.model.table import FittedModel, model_bytes, pack
-from warpgs.pipeline.run.failed_step import findings, read_failed_step
 from warpgs.pipeline.run.folder import CONFIG, IMAGE_FOLDERS, StoredRun, camera_values, open_run, save_checkpoint, with_cameras
 from warpgs.pipeline.run.request import NO_SCORES, SceneRequest, choose_device, read_scene
 from warpgs.pipeline.run.results import evaluate_run, protocol_of, score_line
@@ -73,20 +72,7 @@ def open_file(
     device: str = "auto",
     antialiased: bool = False,
 ) -> tuple[FittedModel, list[str]]:
-    """Read a file of Gaussians and a file of cameras; returns the model and notes for the user.
-
-    Args:
-        path: The file, in any format of `warpgs.export.base`.
-        cameras: cameras.json, transforms.json, a COLMAP reconstruction, or a scene folder of any format.
-        rule: Name of the cut-offs that the model was trained with: inria, gsplat-1.6 or another of `RULES`; None for inria.
-        device: auto, cpu or cuda.
-        antialiased: True for a model that was trained with `RasterizeOptions.antialiased`, if its file does not declare it.
-
-    Raises:
-        DataError: The model or the cameras cannot be read, or an image would be larger than the limit for photographs.
-        ResourceError: The device is missing.
-        UsageError: No cameras are given, or the rule is unknown.
-    """
+    """Read a file of Gaussians, and cameras from a file or a scene folder; ``rule`` None is inria. Returns model and notes."""
     if cameras is None:
         raise UsageError(
             f"{path}: a file of Gaussians has no cameras; give --cameras cameras.json, transforms.json, or a scene"
@@ -134,16 +120,7 @@ ALPHAS = {"alpha_empty": "where empty", "alpha_object": "in the object"}
 def scene_of(
     stored: StoredRun, reader: str | None = None, tell: Callable[[str], object] | None = None
 ) -> tuple[Scene, list[View], list[View]]:
-    """Read the scene that a run was fitted to; returns it with its training and its held-out views.
-
-    Args:
-        stored: The run.
-        reader: User-defined reader, as given to `warpgs fit --reader`.
-        tell: Called with a line for each image before it is read.
-
-    Raises:
-        DataError: The scene is gone, or its images or cameras have changed since the fit.
-    """
+    """Read the scene of a run, with its training and held-out views; refuse a scene that has changed since the fit."""
     scene, _, _ = read_scene(stored.scene_request(reader), tell)
     if scene.fingerprint != stored.record["fingerprint"]:
         raise DataError(f"{scene.path}: images or cameras have changed since the fit of {stored.folder}; restore them")
@@ -160,22 +137,7 @@ def evaluate(
     reader: str | None = None,
     by_coverage: bool = False,
 ) -> list[str]:
-    """Score a run on its held-out views and render them again; returns lines for the user.
-
-    The scores are written to eval.json; metrics.json, which the fit wrote, is not changed.
-
-    Args:
-        folder: The run folder.
-        device_name: auto, cpu or cuda.
-        lpips_weights: File of `warpgs convert-lpips`; None to leave LPIPS out.
-        reader: User-defined reader, as given to `warpgs fit --reader`.
-        by_coverage: Whether to split the scores by the number of training views that see the point at each pixel.
-
-    Raises:
-        DataError: The folder is not a run, its scene is gone, the scene's data have changed since the fit, or the file of
-            weights is invalid.
-        ResourceError: Another process writes into the folder, or it cannot be written.
-    """
+    """Score a run on its held-out views and render them again, into eval.json and images; returns lines for the user."""
     device, _ = choose_device(device_name)
     lpips = None if lpips_weights is None else load_lpips(lpips_weights, device)
     stored, tell = open_run(folder, device), waiting()
@@ -214,26 +176,7 @@ def render(
     file_of: tuple[Path | None, str | None] | None = None,
     antialiased: bool = False,
 ) -> list[str]:  # fmt: skip
-    """Render a run or a file of Gaussians along a path to PNG files and a film, or only to a film; returns lines for the user.
-
-    Args:
-        folder: The run folder; or the file, if ``file_of`` is given.
-        path: One of `PATHS`, or a JSON file of keyframes.
-        out: Folder or film to write; None for `path-PATH` in the run folder, or beside the file.
-        settings: Settings of the film; their background is ignored.
-        device_name: auto, cpu or cuda.
-        background: Colour behind the scene; auto for the fit's colour, or for transparent images if the scene's images have an
-            alpha channel.
-        coverage: True to also write images of the coverage by training views.
-        sheet: Whether to write six frames in one image, too.
-        file_of: Cameras and rule of a file of Gaussians, as `open_file` takes them; None for a run.
-        antialiased: Whether the Gaussians of that file were trained with antialiasing.
-
-    Raises:
-        DataError: The folder is not a run, or the file, its cameras or the keyframes cannot be read.
-        ResourceError: A file cannot be written.
-        UsageError: The path is unknown, the background is not a colour, or a number is out of its range.
-    """
+    """Render a run, or a file of Gaussians with ``file_of`` (cameras, rule), to images and a film; returns lines."""
     color = color_of(background)
     if color is None and background != "auto":
         raise UsageError(f"--background {background}: expected auto, black, white, #rrggbb or r,g,b")
@@ -259,27 +202,16 @@ def render(
             notes.append(f"masked-out regions are shown as seen, since the scene cannot be read: {e}")
         notes.append(f"images in {out / COVERAGE}: {COVERAGE_LEGEND}")
     with contextlib.nullcontext() if named else writing_into(home):
-        done = render_film(stored, plan, out, settings, coverage=training, sheet=sheet, tell=tell)
-    *files, last = done.files
+        files, faults = render_film(stored, plan, out, settings, coverage=training, sheet=sheet, tell=tell)
+    *others, last = files
     if last.suffix.lower() == ".mp4":
         notes.append(VP9.format(shlex.quote(str(last))))
-    notes += done.notes + ([f"sheet of {min(SHEET_FRAMES, len(plan.cameras))} frames in {sheet_path(out)}"] if sheet else [])
+    notes += faults + ([f"sheet of {min(SHEET_FRAMES, len(plan.cameras))} frames in {sheet_path(out)}"] if sheet else [])
     if last == out:
         return [*notes, f"{len(plan.cameras)} frames in {out}"]
     if last.name == FILM:
-        return [*notes, f"{len(files)} images and {FILM} in {out}"]
-    return [*notes, f"{len(files) + 1} images in {out}; no film, since the views differ in size"]
-
-
-def repeat_failed_step(path: Path, device_name: str) -> list[str]:
-    """Repeat a step with a non-finite loss; returns lines for the user on its inputs and results.
-
-    Raises:
-        DataError: The file holds no such step.
-        ResourceError: The device is missing.
-    """
-    device, where = choose_device(device_name)
-    return [f"{path}, repeated {where}:", *findings(read_failed_step(path, device))]
+        return [*notes, f"{len(others)} images and {FILM} in {out}"]
+    return [*notes, f"{len(files)} images in {out}; no film, since the views differ in size"]
 
 
 def mean_psnr(gaussians: Gaussians, views: list[View], options: RasterizeOptions) -> float:
@@ -321,28 +253,7 @@ def prune(
     folder: Path, keep_psnr: float, out: Path | None, device_name: str, reader: str | None = None,
     tell: Callable[[str], object] = lambda line: None,
 ) -> list[str]:  # fmt: skip
-    """Shrink a run's model so that the mean PSNR over its training views falls by no more than ``keep_psnr`` [dB].
-
-    The new folder has config.json, a checkpoint with each Gaussian's own degree, and the PLY file; `warpgs eval`, `render` and
-    `export` accept the new folder like the original run.
-
-    Args:
-        folder: The run folder, which is not changed.
-        keep_psnr: Allowed loss [dB], above 0.
-        out: Folder to write; None for the run's name with ``-pruned``.
-        device_name: auto, cpu or cuda.
-        reader: User-defined reader, as given to `warpgs fit --reader`.
-        tell: Called with a line for the user about the current work.
-
-    Returns:
-        Lines for the user.
-
-    Raises:
-        DataError: The folder is not a run, its scene is gone, the scene's data have changed since the fit, or the training PSNR
-            is not finite.
-        ResourceError: The new folder cannot be written, or the device is missing.
-        UsageError: ``keep_psnr`` is not above 0, or the new folder exists.
-    """
+    """Shrink a run into a new folder whose mean training PSNR falls by at most ``keep_psnr`` [dB]; returns lines."""
     if not 0 < keep_psnr < math.inf:
         raise UsageError(f"--keep-psnr must be above 0 dB, not {keep_psnr}; a loss of 0.1 dB is invisible")
     device, _ = choose_device(device_name)
@@ -431,11 +342,7 @@ class PlotSettings:
     """True to show cameras."""
 
     def __post_init__(self) -> None:
-        """Check what can be checked before any work.
-
-        Raises:
-            UsageError: A value is not one of the choices.
-        """
+        """Check what can be checked before any work."""
         for flag, value, known in (
             ("--points", self.points, POINTS), ("--color", self.color, COLORS), ("--background", self.background, BACKGROUNDS),
         ):  # fmt: skip
@@ -479,19 +386,7 @@ def _eye(rig: Rig) -> np.ndarray:
 
 
 def plot(folder: Path, out: Path | None, settings: PlotSettings, device_name: str = "auto") -> list[str]:
-    """Write a plot of a run as PNG; returns lines for the user.
-
-    Args:
-        folder: The run folder.
-        out: File to write, .png; None for plot.png in the run folder.
-        settings: Settings of the plot.
-        device_name: auto, cpu or cuda.
-
-    Raises:
-        DataError: The folder is not a run, or the scene has no points to show.
-        ResourceError: This machine cannot render, or the file cannot be written.
-        UsageError: The file is not a .png file.
-    """
+    """Write a plot of a run as PNG; returns lines for the user."""
     out = folder / PLOT if out is None else out
     if out.suffix.lower() != ".png":
         raise UsageError(f"{out}: a plot is a .png file; give a name that ends in .png")
@@ -546,20 +441,7 @@ def prior_sheet(view: View, prior: Prior) -> np.ndarray:
 
 
 def show_priors(request: SceneRequest, config: PriorConfig, source: str, out: Path, threads: int = 0) -> list[str]:
-    """Write a sheet per training view as PNG; returns lines for the user.
-
-    Args:
-        request: The scene and its split.
-        config: Networks for the priors.
-        source: Method to find depth from other views if no depth network is given: sweep or flow.
-        out: Folder for the sheets.
-        threads: CPU threads of the networks; 0 for as many as there are cores.
-
-    Raises:
-        DataError: The scene or a network's file is invalid.
-        ResourceError: The folder cannot be written, or another process writes into it.
-        UsageError: The source or the split is unknown.
-    """
+    """Write a sheet of the priors of each training view as PNG; ``source`` finds depth without a network. Returns lines."""
     if source not in SOURCES:
         raise UsageError(f"source {source!r} is not one of {', '.join(SOURCES)}")
     scene, split, notes = read_scene(request)

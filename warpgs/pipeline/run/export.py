@@ -61,20 +61,7 @@ NO_FILTERS = Filters()
 def filtered(
     gaussians: Gaussians, stored: StoredRun | None, filters: Filters, cleaned: bool
 ) -> tuple[Gaussians, np.ndarray | None, list[str]]:
-    """Filter Gaussians in file units.
-
-    Args:
-        gaussians: N Gaussians in file units.
-        stored: The run of the Gaussians; None without cameras.
-        filters: The filters.
-        cleaned: Default for cleaning.
-
-    Returns:
-        The remaining Gaussians, their rotation [3, 3] (None for no rotation), and lines for the user.
-
-    Raises:
-        UsageError: A filter is invalid, or needs the cameras of a run.
-    """
+    """Filter Gaussians in file units."""
     rotation = rotation_of(filters.rotate, None if stored is None else training_cameras(stored))
     keep, lines = torch.ones(len(gaussians), dtype=torch.bool, device="cpu"), []
     if filters.crop is not None:
@@ -117,15 +104,7 @@ def _maxima(stored: StoredRun) -> torch.Tensor:
 
 
 def rotation_of(wish: str | None, cameras: list[Camera] | None) -> np.ndarray | None:
-    """Return the rotation [3, 3] that a user's text specifies; None for no rotation.
-
-    Args:
-        wish: Axis and angle as x,y,z,degrees; level; or None.
-        cameras: Cameras that define the upward direction for `level`; None if unknown.
-
-    Raises:
-        UsageError: The text is not a rotation, or there are no cameras for `level`.
-    """
+    """Return the rotation [3, 3] that a user's text specifies; None for no rotation."""
     if wish is None:
         return None
     if wish == "level":
@@ -162,20 +141,7 @@ ROUNDING = 1e-4
 def convert(
     source: Path, target: Path, filters: Filters = NO_FILTERS, formats: Sequence[str | type[Format] | Format] = ()
 ) -> list[str]:
-    """Write a file of Gaussians, or of cameras, in another format; returns lines for the user.
-
-    Args:
-        source: The file to read; for cameras also a folder with a COLMAP reconstruction.
-        target: The file to write; its suffix selects the format.
-        filters: Filters; cameras are only rotated.
-        formats: Formats that have priority for files with their suffix, as in `write_gaussians`.
-
-    Raises:
-        DataError: The file cannot be read or is malformed, or no Gaussian is left.
-        ResourceError: Another process writes into the target's folder, or the target cannot be written.
-        UsageError: A suffix is unknown, ``source`` is a run folder, a given format fits neither file, a filter is invalid, or a
-            filter needs the cameras of a run.
-    """
+    """Write the Gaussians of one file to another format, or cameras to another file; returns lines for the user."""
     if holds_cameras(target):
         _check_for_cameras(filters, formats)
         found, notes = read_cameras(source)
@@ -197,19 +163,7 @@ def convert(
 def export(
     folder: Path, target: Path, filters: Filters = NO_FILTERS, format: str | type[Format] | Format | None = None
 ) -> list[str]:
-    """Write a run's Gaussians, or its cameras, to a file, in the units of the scene's files; returns lines for the user.
-
-    Args:
-        folder: The run folder.
-        target: The file to write; its suffix selects the format.
-        filters: Filters; cameras are only rotated.
-        format: Format to write, as in `write_gaussians`; None for the format of the suffix.
-
-    Raises:
-        DataError: The folder is not a run, or no Gaussian is left.
-        ResourceError: Another process writes into the target's folder, or the target cannot be written.
-        UsageError: No format has the suffix, ``format`` has another suffix, or a filter is invalid.
-    """
+    """Write a run's Gaussians, or its cameras, in file units, in the format of the suffix; returns lines for the user."""
     if holds_cameras(target):
         _check_for_cameras(filters, () if format is None else (format,))
         stored = open_run(folder, torch.device("cpu"))
@@ -260,11 +214,7 @@ def _changes(target: Path, gaussians: Gaussians, kind: Format) -> list[str]:
 
 
 def _check_for_cameras(filters: Filters, formats: Sequence[object]) -> None:
-    """Check that only a rotation is requested.
-
-    Raises:
-        UsageError: A filter other than a rotation, or a format of Gaussians, is requested.
-    """
+    """Check that only a rotation is requested."""
     if formats:
         raise UsageError("--format does not apply to cameras; leave it out")
     if any(v is not None for v in (filters.crop, filters.clean, filters.sh_degree)):
@@ -288,24 +238,7 @@ def mesh(
     folder: Path, target: Path, options: MeshOptions, device_name: str, *, stage: Callable[[str], object],
     say: Callable[[str], object],
 ) -> list[str]:  # fmt: skip
-    """Write the mesh of the surfaces that a run's training views see, in the units of the scene's files.
-
-    Args:
-        folder: The run folder.
-        target: .ply or .glb file to write.
-        options: Options; ``voxel`` is in units of the scene's files.
-        device_name: auto, cpu or cuda.
-        stage: Function that shows a line of progress.
-        say: Called with the automatic choices before the work starts.
-
-    Returns:
-        Lines for the user.
-
-    Raises:
-        DataError: The folder is not a run, or its training views see no surface.
-        ResourceError: Memory does not suffice, the device is missing, or the file cannot be written.
-        UsageError: The suffix is not supported, or an option is out of range.
-    """
+    """Write the mesh of the surfaces that a run's training views see, in file units, as is ``voxel``; returns lines."""
     check_suffix(target)
     device, _ = choose_device(device_name)
     run = open_run(folder, device)

@@ -6,9 +6,8 @@ import contextlib
 import hashlib
 import json
 import time
-from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -26,8 +25,6 @@ from warpgs.pipeline.metrics.scores import Rendered, moved_fractions, moved_note
 from warpgs.pipeline.model.edit import drop_unused_sh
 from warpgs.pipeline.model.limits import shape_figures, shape_summary
 from warpgs.pipeline.model.table import FittedModel
-from warpgs.pipeline.run.failed_step import FILE as FAILED
-from warpgs.pipeline.run.failed_step import broken_terms, failed_step, save_failed_step
 from warpgs.pipeline.run.folder import (
     CONFIG,
     METRICS_FILE,
@@ -52,7 +49,6 @@ from warpgs.pipeline.run.results import (
     event_figures,
     given_figures,
     images_kept,
-    overview_of,
     protocol_of,
     result_lines,
     rule_report_of,
@@ -60,9 +56,11 @@ from warpgs.pipeline.run.results import (
     write_report,
 )
 from warpgs.pipeline.train.batch import check_ranks, check_renders, own_slots
+from warpgs.pipeline.train.loss import term_values
 from warpgs.pipeline.train.presets import chosen_settings
 from warpgs.pipeline.train.schedule import StepReport, choose_background, over_background
 from warpgs.pipeline.train.settings import FitConfig, settings_by_views, within_budget
+from warpgs.pipeline.train.step import StepBuffers, eager_renderer, forward
 from warpgs.pipeline.train.trainer import Trainer, background_warmup, complexity_figures, complexity_summary, run, train_views
 from warpgs.plugins import is_ours
 from warpgs.poses.find import JSON, TEXT, find_poses, needs_poses, read_poses_record, source_digest
@@ -71,10 +69,10 @@ from warpgs.process import Detail, counted, noted_signals, say
 from warpgs.ranks import ALONE, Ranks
 from warpgs.report.page import image_names, renaming_notes
 from warpgs.report.progress import EventLog, Progress, Stages
-from warpgs.scene import Camera, Gaussians, Normalization, Scene, View, checked_scene
+from warpgs.scene import Camera, Scene, View, checked_scene
 
 
-@dataclass
+@dataclass(kw_only=True)
 class FitJob:
     """One fit in progress: its inputs and its state."""
 
@@ -84,17 +82,18 @@ class FitJob:
     config: FitConfig
     device: torch.device
     where: str
+    """The device, as text."""
     out: Path | None
     lpips: Lpips | None
     notes: list[str]
     verbose: bool | Literal["progress"]
     on_step: Callable[[StepReport], object] | None
-    began: float
-    progress: Callable[[str], object]
     on_model: Callable[[FittedModel], object] | None
     ranks: Ranks
+    began: float
+    progress: Callable[[str], object]
     compiled: list[float]
-    photographs: list[PhotoCheck] = field(default_factory=list)
+    """Time of each compilation so far [s]."""
 
     @property
     def train(self) -> list[View]:
@@ -132,152 +131,122 @@ class FitJob:
         for note in [*before, *notes]:
             self.note(note)
 
+    def tell(self, trainer: Trainer) -> None:
+        """Print the messages of the trainer, and keep them for the report, that of a continued run, too."""
+        while trainer.messages:
+            trainer.notes.append(trainer.messages.pop(0))
+            self.note(trainer.notes[-1])
 
-Names = tuple[str, ...]
+    def model(self, trainer: Trainer) -> dict[str, Any]:
+        """Return the fields of the current `FittedModel`, by name."""
+        return {
+            "scene_gaussians": trainer.gaussians, "normalization": self.scene.normalization,
+            "scene_cameras": cameras_of(self.scene), "train": self.split.train, "test": self.split.test,
+            "rule": self.config.rule, "background": self.scene.background, "step": trainer.step,
+            "transparent": self.scene.transparent, "antialiased": self.config.antialiased,
+        }  # fmt: skip
 
 
-class RunRecorder:
-    """Log and checkpoints of a fit in its run folder; nothing is written without a folder."""
+def take_steps(job: FitJob, trainer: Trainer, images_written: Callable[[], None]) -> None:
+    """Take all remaining steps, with log and checkpoints if there is a run folder; images are written before a checkpoint."""
+    log = None if job.out is None else EventLog(job.out / "metrics.jsonl", trainer.step)
+    slow = compiled = -1  # the last step that was slow because it compiled kernels; the number of kernels compiled by then
 
-    def __init__(self, job: FitJob, step: int, images_written: Callable[[], None]):
-        """Open the log after ``step``; ``images_written`` waits for the images before a checkpoint is written."""
-        self.job, self.images_written = job, images_written
-        self.log = None if job.out is None else EventLog(job.out / "metrics.jsonl", step)
-
-    def write(self, r: StepReport) -> None:
-        """Write a step to the log."""
-        if self.log is not None:
-            self.log.write(step=r.step, loss=r.loss, psnr=r.psnr, count=r.count, seconds=round(r.seconds, 6))
-
-    def save(self, trainer: Trainer) -> None:
-        """Save the state as a checkpoint, after the log and the images of earlier steps are written."""
-        job = self.job
-        if job.out is None or self.log is None:
+    def save(trainer: Trainer) -> None:
+        if job.out is None or log is None:
             return
-        self.log.flush()
-        self.images_written()
+        log.flush()
+        images_written()
         tensors, state = trainer.state()
         if trainer.config.view_modules:  # by which a run is opened without their code
             cameras = learned_cameras(job.scene, job.split, trainer.learned.views)
             state["cameras"] = {n: camera_values(c) for n, c in cameras.items()}
         save_checkpoint(job.out, tensors, state | {"fingerprint": job.scene.fingerprint, "train": job.split.train})
 
-    def restore(self, trainer: Trainer) -> bool:
-        """Load the last checkpoint, and truncate the log to it; returns False without a checkpoint."""
-        out = self.job.out
-        if out is None or self.log is None or not (out / TENSORS).is_file():
+    def restore(trainer: Trainer) -> bool:
+        if job.out is None or log is None or not (job.out / TENSORS).is_file():
             return False
-        trainer.load(*load_checkpoint(out))
-        self.log.rewind(trainer.step)
+        trainer.load(*load_checkpoint(job.out))
+        log.rewind(trainer.step)
         return True
 
-    def close(self) -> None:
-        """Close the log."""
-        if self.log is not None:
-            self.log.close()
-
-
-class StepTeller:
-    """Receiver of each step's report, for the terminal, the log and the caller."""
-
-    def __init__(self, job: FitJob, trainer: Trainer, recorder: RunRecorder, progress: Progress | None):
-        """Start before the first step; ``progress`` is None for a fit without a display of progress."""
-        self.job, self.trainer, self.recorder, self.progress = job, trainer, recorder, progress
-        self.slow, self.compiled = -1, -1
-        """The last step that was slow because it compiled kernels; the number of kernels compiled by then."""
-
-    def __call__(self, r: StepReport) -> None:
-        """Take one report."""
-        job, trainer = self.job, self.trainer
-        if len(job.compiled) > self.compiled:
-            self.slow, self.compiled = trainer.step, len(job.compiled)
-        if self.progress is not None:
-            self.progress.total = trainer.steps  # fewer, once the fit is known to end earlier
-            seconds = None if r.step <= self.slow else r.seconds
-            self.progress.update(step=r.step, loss=r.loss, psnr=r.psnr, count=r.count, seconds=seconds)
-        self.recorder.write(r)
-        tell(job, trainer)
+    def report(r: StepReport) -> None:
+        nonlocal slow, compiled
+        if len(job.compiled) > compiled:
+            slow, compiled = trainer.step, len(job.compiled)
+        if progress is not None:
+            progress.total = trainer.steps  # fewer, once the fit is known to end earlier
+            seconds = None if r.step <= slow else r.seconds
+            progress.update(step=r.step, loss=r.loss, psnr=r.psnr, count=r.count, seconds=seconds)
+        if log is not None:
+            log.write(step=r.step, loss=r.loss, psnr=r.psnr, count=r.count, seconds=round(r.seconds, 6))
+        job.tell(trainer)
         if job.on_step is not None:
             job.on_step(r)
         if job.on_model is not None:
-            model = FittedModel(
-                *model_fields(job, trainer), transparent=job.scene.transparent, antialiased=job.config.antialiased
-            )
-            job.on_model(model)
+            job.on_model(FittedModel(**job.model(trainer)))
 
-
-def take_steps(job: FitJob, trainer: Trainer, images_written: Callable[[], None]) -> None:
-    """Take all remaining steps, with a log and checkpoints if there is a run folder; images are written before a checkpoint.
-
-    Raises:
-        NotFiniteError: A loss or the state is not finite; with a run folder, the state before the step is saved.
-        KeyboardInterrupt: A signal ended the fit; the state is saved.
-    """
-    recorder = RunRecorder(job, trainer.step, images_written)
-    shown = Progress(trainer.steps, trainer.step) if job.verbose else contextlib.nullcontext()
-    with shown as progress, contextlib.closing(recorder):
+    with contextlib.ExitStack() as stack:
+        progress = stack.enter_context(Progress(trainer.steps, trainer.step)) if job.verbose else None
+        if log is not None:
+            stack.callback(log.close)
         try:
-            with noted_signals() as stopped:
-                run(trainer, StepTeller(job, trainer, recorder, progress), recorder.save, stopped, recorder.restore)
+            run(trainer, report, save, stack.enter_context(noted_signals()), restore)
         except NotFiniteError as e:
             if e.view is None:
                 raise
-            if job.out is None:
+            if not job.ranks.first:
                 job.ranks.leave()  # all ranks have this loss; the first reports it
                 raise
-            failed = _saved_failure(job.out, job, trainer, e)
-            recorder.save(trainer)
-            raise failed from e
+            explained = _explained(job, trainer, e)
+            save(trainer)
+            raise explained from e
 
 
-def _saved_failure(out: Path, job: FitJob, trainer: Trainer, error: NotFiniteError) -> NotFiniteError:
-    """Save the inputs of a step with a non-finite loss; returns the error for the user."""
+def _explained(job: FitJob, trainer: Trainer, error: NotFiniteError) -> NotFiniteError:
+    """Return the error for the user on a step with a non-finite loss: view, loss terms, tensors, and what to do."""
     assert error.view is not None
-    name = job.split.train[error.view]
-    bundle = failed_step(trainer, error.view, name, error.slot)
-    save_failed_step(out / FAILED, bundle)
-    broken = broken_terms(bundle)
-    own = [t.name for t in trainer.terms if t.name in broken and not is_ours(type(t))]
-    where = f", in the loss term {' and '.join(broken)}" if broken else ""
-    mend = f"correct {' and '.join(own)}, and fit again" if own else "fit again with lower learning rates"
-    names = "names the non-finite values of the other terms" if own else "names the non-finite values"
-    return NotFiniteError(
-        f"{error}, on {name}{where}. The state before the step and its inputs are saved; `warpgs doctor --repeat "
-        f"{out / FAILED}` {names}. --resume would fail at the same step; {mend} into a new --out"
+    broken, tensors = non_finite_parts(trainer, error.view, error.slot)
+    own = [t.name for t in trainer.terms if f"the loss term {t.name}" in broken and not is_ours(type(t))]
+    text = f"{error}, on {job.split.train[error.view]}{', in ' if broken else ''}{' and '.join(broken)}; "
+    text += f"not finite: {', '.join(tensors)}" if tensors else "all of its inputs and renders are finite"
+    fix = f"correct {' and '.join(own)}, and fit again" if own else "fit again with lower learning rates"
+    report = "" if own else "; if that fails, report this message"
+    if job.out is not None:
+        text += f". The state before the step is saved in {job.out}, and --resume would fail at the same step"
+        fix, report = f"{fix} into a new --out", report and f"{report} and {job.out / CONFIG}"
+    return NotFiniteError(f"{text}. To fix it, {fix}{report}")
+
+
+def non_finite_parts(trainer: Trainer, view: int, slot: int) -> tuple[list[str], list[str]]:
+    """Repeat the forward pass of the next step on ``view``; returns the non-finite loss terms and tensors (inputs, renders)."""
+    number = trainer.step + 1
+    plan = trainer.plan_of(number)
+    kind, row = trainer.places[view + plan.half_size * len(trainer.views)]
+    stack, learned = trainer.stacks[kind], trainer.learned
+    buffers = StepBuffers(trainer.device, 1, 1)
+    buffers.load([row], [[0.0]], [trainer.settings(number, slot)])
+    render = eager_renderer(trainer.context.render_options(), None)
+    with torch.no_grad():
+        found = forward(trainer.gaussians, learned.views, learned.dropout_seed, stack, buffers, plan, render)
+        values = {f"the loss term {t.name}": v for t, v in zip(plan.terms, term_values(plan.terms, found.inputs), strict=True)}
+        values |= {f"the view module {n}": v for n, v in found.of_views.items()}
+        extra = trainer.strategy.regularisation(plan.phase, found.inputs.gaussians)
+        values |= {} if extra is None else {f"the strategy {trainer.config.strategy}": extra}
+    target = found.inputs.target
+    tensors = {"image": target.image} | {f"map {n}": t for n, t in target.maps.items()}
+    tensors |= learned.params | {f"rendered {n}": t for n, t in found.inputs.outputs.items()}
+    wrong = {n: int((~torch.isfinite(t)).sum()) for n, t in tensors.items()}
+    return (
+        [n for n, v in values.items() if not bool(torch.isfinite(v).all())],
+        [f"{n} ({count:,} of {tensors[n].numel():,} values)" for n, count in wrong.items() if count],
     )
-
-
-def model_fields(
-    job: FitJob, trainer: Trainer
-) -> tuple[Gaussians, Normalization, dict[str, Camera], Names, Names, str, tuple[float, float, float], int]:
-    """Return the fields of the current `FittedModel` of a fit."""
-    cameras = cameras_of(job.scene)
-    names, rule = (job.split.train, job.split.test), job.config.rule
-    return trainer.gaussians, job.scene.normalization, cameras, *names, rule, job.scene.background, trainer.step
-
-
-def tell(job: FitJob, trainer: Trainer) -> None:
-    """Print the messages of the fit, and keep them for the report."""
-    while trainer.messages:
-        trainer.notes.append(trainer.messages.pop(0))  # a continued run has them in its report, too
-        job.note(trainer.notes[-1])
 
 
 def check_batched(
     scene: Scene | SceneRequest | str | Path, config: FitConfig, ranks: Ranks, time_budget: float | None, resume: bool
 ) -> None:
-    """Check that the processes can share a fit.
-
-    Args:
-        scene: The scene, as in `warpgs.fit`.
-        config: Settings.
-        ranks: The processes.
-        time_budget: Time that the fit may take [s]; None for no limit.
-        resume: Whether a run is continued.
-
-    Raises:
-        UsageError: A step has fewer views than processes, or each process would choose its own settings or find its own poses.
-    """
+    """Refuse ranks without a view each, and ranks that would find their own poses or measure their own speed."""
     check_ranks(config.batch, ranks)
     if ranks.count == 1:
         return
@@ -294,16 +263,7 @@ def check_batched(
 
 
 def check_equal(record: dict[str, Any], step: int | None, ranks: Ranks) -> None:
-    """Check that all processes fit the same scene with the same settings, because each takes a part of the same steps.
-
-    Args:
-        record: Record of the run, as this process has it.
-        step: Step of the checkpoint to continue from; None without one.
-        ranks: The processes.
-
-    Raises:
-        UsageError: A process differs from the first one; raised in every process.
-    """
+    """Refuse, in every process, ranks whose scene, settings, code or checkpoint (``step``) differ from those of rank 0."""
     if ranks.count == 1:
         return
     parts = {
@@ -339,21 +299,7 @@ def batched_notes(config: FitConfig, ranks: Ranks) -> list[str]:
 
 
 def with_poses(request: SceneRequest, out: Path | None, progress: Callable[[str], object]) -> tuple[SceneRequest, list[str]]:
-    """Find the poses of photographs if a request names photographs without cameras; other requests are returned unchanged.
-
-    Args:
-        request: The request; its path may be a folder of images or a video.
-        out: Run folder, whose subfolder `scene` stores the poses; a run that is continued or restarted reads them from there.
-        progress: Called with lines for the user.
-
-    Returns:
-        The request for the scene with poses, and notes for the user.
-
-    Raises:
-        DataError: The photographs cannot be registered, or are too few.
-        UsageError: There is no run folder for the poses, pycolmap is not installed, a continued run has other photographs, or a
-            matcher is given for a scene with cameras.
-    """
+    """Find the poses of photographs without cameras, or read them from the run folder ``out``; returns request and notes."""
     source = Path(request.path)
     if request.reader is not None or not request.path or not needs_poses(source):
         if request.matcher is not None:
@@ -377,11 +323,7 @@ def with_poses(request: SceneRequest, out: Path | None, progress: Callable[[str]
 
 
 def lost_lines(out: Path | None) -> list[str]:
-    """Return a line on the photographs without a pose, which a run leaves out; an empty list if all have one.
-
-    Raises:
-        DataError: The record of the run's poses is incomplete.
-    """
+    """Return a line on the photographs without a pose, which a run leaves out; an empty list if all have one."""
     if out is None or not (out / POSED_SCENE / JSON).is_file():
         return []
     rows = read_poses_record(out / POSED_SCENE)["photographs"]
@@ -401,8 +343,6 @@ def _notes(record: dict[str, Any]) -> list[str]:
 
 COMPILING = "compiling kernels, once on this machine, for a minute or two"
 """Message while kernels are compiled."""
-State = tuple[dict[str, torch.Tensor], dict[str, Any]]
-"""Tensors and plain values of a checkpoint."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -483,37 +423,29 @@ def fit(
         check_spec(spec)
     check_batched(scene, config, ranks, time_budget, resume)
     verbose, own = ranks.first and verbose, out if ranks.first else None
-    with _opened(own, resume, verbose) as (held, progress, compiled):
+    folder = contextlib.nullcontext(list[str]()) if own is None else run_folder(own, resume)
+    stages = Stages() if verbose else Stages(lambda line: None)
+    with folder as held, stages as progress, told_of_compiling(lambda name: progress(COMPILING)) as compiled:
         resume = resume and out is not None and (out / CONFIG).is_file()  # else the folder holds only found poses
         if out is not None and resume:
             read_record(out)  # a run of another version is refused before anything takes time
-        where = choose_device(device)
+        chosen, where = choose_device(device)
         began = time.perf_counter()
-        lpips = None if lpips_weights is None else load_lpips(Path(lpips_weights), where[0])
-        request, read, parts, found = _scene_of(scene, split, out, where[0].type, progress)
+        lpips = None if lpips_weights is None else load_lpips(Path(lpips_weights), chosen)
+        request, read, parts, found = _scene_of(scene, split, out, chosen.type, progress)
         renamed = [] if out is None else renaming_notes(image_names(v.name for v in read.views))
-        own_notes = [*notes, *origin, *held, *found, *renamed]
         job = FitJob(
-            read, request, parts, config, *where, own, lpips, own_notes, verbose, on_step, began, progress, on_model, ranks,
-            compiled,
+            scene=read, request=request, split=parts, config=config, device=chosen, where=where, out=own, lpips=lpips,
+            notes=[*notes, *origin, *held, *found, *renamed], verbose=verbose, on_step=on_step, on_model=on_model, ranks=ranks,
+            began=began, progress=progress, compiled=compiled,
         )  # fmt: skip
         _settle(job, time_budget)
-        trainer, state, record = _prepare(job, out if resume else None)
-        result = _finish(job, trainer, state, record, resume)
+        trainer, state, record, checks = _prepare(job, out if resume else None)
+        if own is not None and not resume:
+            write_json(own / CONFIG, record)
+        result = _finish(job, trainer, state, record, checks)
     ranks.leave()
     return result
-
-
-@contextlib.contextmanager
-def _opened(
-    out: Path | None, resume: bool, verbose: bool | Literal["progress"]
-) -> Iterator[tuple[list[str], Callable[[str], object], list[float]]]:
-    """Lock the run folder; yields notes on it, the function that shows progress, and the time spent on compiling [s]."""
-    nothing: contextlib.AbstractContextManager[list[str]] = contextlib.nullcontext([])
-    folder = nothing if out is None else run_folder(out, resume)
-    stages = Stages() if verbose else Stages(lambda line: None)
-    with folder as held, stages as progress, told_of_compiling(lambda name: progress(COMPILING)) as compiled:
-        yield held, progress, compiled
 
 
 def _settle(job: FitJob, time_budget: float | None) -> None:
@@ -531,11 +463,7 @@ def _settle(job: FitJob, time_budget: float | None) -> None:
 
 
 def fit_request(request: FitRequest, **others: Any) -> FitResult:
-    """Run `fit` for the command line, a study or a farm; ``others`` are on_model, on_step and ranks of `fit`.
-
-    Raises:
-        KeyboardInterrupt: A signal ended the fit; the message explains how to continue.
-    """
+    """Run `fit` for the command line, a study or a farm; ``others`` are on_model, on_step and ranks of `fit`."""
     r = request
     try:
         return fit(
@@ -568,8 +496,10 @@ def _scene_of(
     return request, read, parts, [*found, *notes]
 
 
-def _prepare(job: FitJob, resumed: Path | None) -> tuple[Trainer, State | None, dict[str, Any]]:
-    """Set up the trainer; returns it, the state to continue the run ``resumed`` from, if any, and the record of the run."""
+def _prepare(
+    job: FitJob, resumed: Path | None
+) -> tuple[Trainer, tuple[dict[str, torch.Tensor], dict[str, Any]] | None, dict[str, Any], list[PhotoCheck]]:
+    """Return the trainer, the state to continue the run ``resumed`` from, the record of the run, and checks of photographs."""
     record, state = record_of(job.request, job.config, job.scene, job.split, job.notes, job.device), None
     if resumed is not None:
         stored = read_record(resumed)
@@ -580,24 +510,25 @@ def _prepare(job: FitJob, resumed: Path | None) -> tuple[Trainer, State | None, 
             if state[1]["step"] == state[1].get("steps"):
                 job.say(f"  all {state[1]['step']:,} steps are taken; only the images, scores and report are made again")
     check_equal(record, None if state is None else state[1].get("step"), job.ranks)
-    c = job.config
-    with background_warmup(c, job.device) as ready:
+    checks: list[PhotoCheck] = []
+    with background_warmup(job.config, job.device) as ready:
         if job.other_models:
             models = " and ".join(job.other_models)
             job.notes.append(f"camera model {models}: views cannot be compared, so blur, exposure and coverage are not checked")
         else:
-            job.photographs = check_photos([*job.train, *job.test], job.progress)
-        of = job.train, job.scene.points, c, job.device, job.scene.background
+            checks = check_photos([*job.train, *job.test], job.progress)
+        of = job.train, job.scene.points, job.config, job.device, job.scene.background
         trainer = Trainer(*of, ready=ready, progress=job.progress, ranks=job.ranks)
     if job.device.type == "cuda":
         torch.cuda.reset_peak_memory_stats(job.device)  # report the steps' memory, not that of the start or of an earlier fit
-    return trainer, state, record
+    return trainer, state, record, checks
 
 
-def _finish(job: FitJob, trainer: Trainer, state: State | None, record: dict[str, Any], resume: bool) -> FitResult:
+def _finish(
+    job: FitJob, trainer: Trainer, state: tuple[dict[str, torch.Tensor], dict[str, Any]] | None, record: dict[str, Any],
+    checks: list[PhotoCheck],
+) -> FitResult:  # fmt: skip
     """Take the steps, score the model, and write the run folder, if any."""
-    if job.out is not None and not resume:
-        write_json(job.out / CONFIG, record)
     if state is not None:
         try:
             trainer.load(*state)
@@ -605,46 +536,37 @@ def _finish(job: FitJob, trainer: Trainer, state: State | None, record: dict[str
             raise DataError(f"{job.out}/{TENSORS}: {e}") from e
         job.notes.append(f"continued from step {trainer.step}; this run's times count from there")
     shared = batched_notes(job.config, job.ranks)
-    job.announce([*photo_notes(job.photographs), *trainer.notes, *shared, trainer.memory.summary()])
+    job.announce([*photo_notes(checks), *trainer.notes, *shared, trainer.memory.summary()])
     setup = time.perf_counter() - job.began
-    nothing = contextlib.nullcontext(lambda: None)
-    with nothing if job.out is None else images_kept(trainer, list(job.split.train), job.out) as images_written:
+    images = images_kept(trainer, list(job.split.train), job.out) if job.out else contextlib.nullcontext(lambda: None)
+    with images as images_written:
         take_steps(job, trainer, images_written)
-    tell(job, trainer)  # of images that were written last
+    job.tell(trainer)  # of images that were written last
     training = time.perf_counter() - job.began - setup
     job.ranks.part()
     if not job.ranks.first:
-        return FitResult(*model_fields(job, trainer), job.config, {}, tuple(job.notes), None)
+        return FitResult(**job.model(trainer), config=job.config, metrics={}, notes=tuple(job.notes), folder=None)
     given = cameras_of(job.scene)
     job.scene = with_cameras(job.scene, learned_cameras(job.scene, job.split, trainer.learned.views))
     if job.out is not None:
-        write_ply(
-            job.out / "point_cloud.ply",
-            drop_unused_sh(trainer.gaussians),
-            job.scene.normalization,
-            antialiased=job.config.antialiased,
-        )
-    with ThreadPoolExecutor(1) as beside:
-        # its process takes seconds; views are scored here meanwhile
-        overview = beside.submit(overview_of(trainer.gaussians, job.train, job.test)) if job.out is not None else None
-        metrics = _score(job, trainer, {"setup": setup, "training": training}, given)
-        if job.out is not None and overview is not None:
-            job.progress("making the report")
-            write_json(job.out / METRICS_FILE, metrics)
-            record["notes"] = job.notes
-            write_report(
-                job.out, job.scene, job.split, trainer.gaussians, trainer.context.render_options(), metrics, record,
-                sampling=sampling_report_of(trainer, job.out), overview=overview.result(), tell=job.progress,
-            )  # fmt: skip
+        model = drop_unused_sh(trainer.gaussians)
+        write_ply(job.out / "point_cloud.ply", model, job.scene.normalization, antialiased=job.config.antialiased)
+    metrics = _score(job, trainer, {"setup": setup, "training": training}, given, checks)
+    if job.out is not None:
+        write_json(job.out / METRICS_FILE, metrics)
+        record["notes"] = job.notes
+        write_report(
+            job.out, job.scene, job.split, trainer.gaussians, trainer.context.render_options(), metrics, record,
+            sampling=sampling_report_of(trainer, job.out), tell=job.progress,
+        )  # fmt: skip
     for line in [*lost_lines(job.out), *result_lines(metrics, job.out)]:
         job.say(line)
-    return FitResult(
-        *model_fields(job, trainer), job.config, metrics, tuple(job.notes), job.out,
-        transparent=job.scene.transparent, antialiased=job.config.antialiased,
-    )  # fmt: skip
+    return FitResult(**job.model(trainer), config=job.config, metrics=metrics, notes=tuple(job.notes), folder=job.out)
 
 
-def _score(job: FitJob, trainer: Trainer, seconds: dict[str, float], given: dict[str, Camera]) -> dict[str, Any]:
+def _score(
+    job: FitJob, trainer: Trainer, seconds: dict[str, float], given: dict[str, Camera], checks: list[PhotoCheck]
+) -> dict[str, Any]:
     """Score the finished fit, with the ``given`` cameras from before it; returns the contents of metrics.json."""
     c, scene, train, test, gaussians = job.config, job.scene, job.train, job.test, trainer.gaussians
     on_cuda = job.device.type == "cuda"
@@ -658,26 +580,31 @@ def _score(job: FitJob, trainer: Trainer, seconds: dict[str, float], given: dict
     tell("checking float32 accuracy")
     rule = rule_report_of(gaussians, train, options, seed=c.seed, half_resolution=trainer.half_resolution)
     shape = shape_figures(gaussians, c.limits, trainer.radius, trainer.context.extent, [v.camera for v in train])
-    moved = {}
+    moved: dict[str, float] = {}
     if not job.other_models:
-        shown = counted(train, job.progress, "checking for moving objects", "views")
+        shown = counted(train, tell, "checking for moving objects", "views")
         fractions = moved_fractions(train, (Rendered(*render_view(gaussians, v, options)) for v in shown))
         moved = {v.name: f for v, f in zip(train, fractions, strict=True)}
     complexity = complexity_figures(trainer)
     learned = learned_figures(trainer.learned.views, scene, job.split, given, test, gaussians, options)
-    details = [rule["summary"], shape_summary(shape), complexity_summary(complexity)]
     mapped = given_figures(train, trainer.views, gaussians, options)
-    summaries = [e["summary"] for of in (learned, mapped) for e in of.values()]
-    for note in [*map(Detail, details), *moved_notes(moved), *summaries]:
-        job.note(note)
+    table: list[tuple[dict[str, Any], list[str]]] = [  # figures of metrics.json, and their sentences in the report
+        ({"rule": rule}, [Detail(rule["summary"])]),
+        ({"shape": shape}, [Detail(shape_summary(shape))]),
+        (complexity, [Detail(complexity_summary(complexity))]),
+        ({"photographs": [p.to_json() | {"moved": moved.get(p.name)} for p in checks]}, moved_notes(moved)),
+        ({"view_modules": learned}, [e["summary"] for e in learned.values()]),
+        ({"given": mapped}, [e["summary"] for e in mapped.values()]),
+    ]
+    for figures, sentences in table:
+        metrics |= figures
+        for sentence in sentences:
+            job.note(sentence)
     compiling = {"compiling": sum(job.compiled)} if job.compiled else {}
-    return metrics | {
+    return metrics | peak | event_figures(trainer) | {
         "protocol": protocol_of(scene, job.request.split, job.request.downscale or 1, train, test),
         "steps": trainer.step, "batch": c.batch, "ranks": job.ranks.count,
         "gaussians": len(gaussians), "preset": c.preset, "seed": c.seed,
         "config_hash": c.fingerprint(), "fingerprint": scene.fingerprint, "device": job.where.removeprefix("on "),
-        "seconds": {**seconds, **compiling, "total": time.perf_counter() - job.began}, **peak,
-        "memory": trainer.memory.to_json(), "rule": rule, "shape": shape,
-        **event_figures(trainer), **complexity, "view_modules": learned, "given": mapped,
-        "photographs": [p.to_json() | {"moved": moved.get(p.name)} for p in job.photographs],
+        "seconds": {**seconds, **compiling, "total": time.perf_counter() - job.began}, "memory": trainer.memory.to_json(),
     }  # fmt: skip

@@ -116,11 +116,7 @@ _RECORD = fields(
 
 
 def check_record(record: Any) -> None:
-    """Check the contents of config.json.
-
-    Raises:
-        SchemaError: A value is missing or invalid.
-    """
+    """Check the contents of config.json."""
     _RECORD(record, "")
     if not record["train"]:
         raise SchemaError("train must name a view")
@@ -201,22 +197,8 @@ def safetensors_chunks(tensors: dict[str, torch.Tensor], metadata: dict[str, str
 
 
 def save_checkpoint(folder: Path, tensors: dict[str, torch.Tensor], state: dict[str, Any]) -> Path:
-    """Write a checkpoint; the previous checkpoint is replaced only when the new one is complete on disk.
-
-    ``state`` is stored in the header of the same file, so tensors and state always belong to the same step.
-
-    Args:
-        folder: The run folder.
-        tensors: Of the types in `DTYPES`, on any device.
-        state: Values that JSON can hold.
-
-    Returns:
-        The file's path.
-
-    Raises:
-        NotFiniteError: A tensor holds a NaN or an infinity; the previous checkpoint is untouched.
-        ResourceError: The disk is full or not writable; the previous checkpoint is untouched.
-    """
+    """Write tensors and state, which JSON can hold, into one file, atomically; refuse non-finite tensors. Returns the path."""
+    # ``state`` is stored in the header of the same file, so tensors and state always belong to the same step.
     path = folder / TENSORS
     for name, t in tensors.items():
         # minimum and maximum suffice, without a copy: torch returns NaN if any value is NaN
@@ -235,14 +217,7 @@ def save_checkpoint(folder: Path, tensors: dict[str, torch.Tensor], state: dict[
 
 
 def load_checkpoint(folder: Path) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
-    """Read a checkpoint back.
-
-    Returns:
-        Tensors by name on the CPU, shapes [...] as they were saved, and the state.
-
-    Raises:
-        DataError: The checkpoint is missing, truncated, altered, or of another format.
-    """
+    """Read tensors by name, on the CPU, and state; refuse a damaged checkpoint or one of another format."""
     from safetensors import SafetensorError
     from safetensors.torch import load
 
@@ -296,17 +271,7 @@ def learned_figures(
     learned: LearnedViews, scene: Scene, split: Split, given: Mapping[str, Camera], test: Sequence[View],
     gaussians: Gaussians, options: RasterizeOptions,
 ) -> dict[str, dict[str, Any]]:  # fmt: skip
-    """Return the figures of each view module by its name, for metrics.json.
-
-    Args:
-        learned: View modules with their parameters.
-        scene: The scene, with its cameras after the fit.
-        split: Its views to fit and those held out.
-        given: Cameras before the fit.
-        test: Held-out views.
-        gaussians: The fitted model.
-        options: Options of the rasterizer.
-    """
+    """Return the figures of each view module by its name, for metrics.json; ``given`` are the cameras before the fit."""
     cameras, scale = cameras_of(scene), scene.normalization.scale
     return {
         m.name: m.figures(FittedViews(learned.params_of(m), split.train, test, given, cameras, scale, gaussians, options))
@@ -337,15 +302,7 @@ def versions() -> dict[str, str]:
 
 @contextlib.contextmanager
 def run_folder(out: Path, resume: bool) -> Iterator[list[str]]:
-    """Lock a run folder for a fit: a new or empty one, or one with a run to continue; yields notes for the user.
-
-    A folder with found poses only, from a fit that ended before its first step, is accepted with and without ``resume``.
-
-    Raises:
-        FolderHeldError: Another process writes into the folder.
-        ResourceError: The folder cannot be written.
-        UsageError: The folder is not empty, or has no run to continue.
-    """
+    """Lock a run folder for a fit: a new or empty one, or one with a run to continue; yields notes for the user."""
     _check_folder(out, resume)
     with hold_folder(out, *IMAGE_FOLDERS) as notes:
         _check_folder(out, resume)  # another process may have filled it before this one held it
@@ -406,12 +363,7 @@ def record_of(
 
 
 def read_record(folder: Path) -> dict[str, Any]:
-    """Read config.json of a run folder; its format is checked first.
-
-    Raises:
-        DataError: The folder is not a run, its record is incomplete, or another version of warpgs wrote it in an unsupported
-            format; the message names that version and the fix.
-    """
+    """Read config.json of a run folder; its format is checked first."""
     path = folder / CONFIG
     try:
         record = schema.read(path, folder)
@@ -440,11 +392,7 @@ def read_record(folder: Path) -> dict[str, Any]:
 
 
 def check_same(record: dict[str, Any], stored: dict[str, Any], out: Path) -> None:
-    """Check that a continued run has the same data, views, settings, user code and kind of device as before.
-
-    Raises:
-        UsageError: The run differs, or its user code is not named again.
-    """
+    """Check that a continued run has the same data, views, settings, user code and kind of device as before."""
     if "pruned" in stored:
         raise UsageError(
             f"--resume: {out} is a pruned model without the state of its fit; resume the original run, "
@@ -475,11 +423,7 @@ def check_same(record: dict[str, Any], stored: dict[str, Any], out: Path) -> Non
 
 
 def check_checkpoint(state: dict[str, Any], stored: dict[str, Any], out: Path) -> None:
-    """Check that a checkpoint belongs to the fit of its config.json: same settings, data and training views.
-
-    Raises:
-        DataError: The checkpoint belongs to another fit.
-    """
+    """Check that a checkpoint belongs to the fit of its config.json: same settings, data and training views."""
     for key in ("config", "fingerprint", "train"):
         found, wanted = plain(state.get(key)), stored.get(key)
         if found != wanted:
@@ -556,12 +500,7 @@ def _stored_scene(folder: Path, record: dict[str, Any], reader: str | None) -> S
 
 
 def stored_request(folder: Path) -> FitRequest:
-    """Return the request that continues a run, with the scene and all settings that the run was started with.
-
-    Raises:
-        DataError: The folder is not a run, its settings are invalid, or its scene was passed from Python.
-        UsageError: The run used code from outside warpgs, which must be named again.
-    """
+    """Return the request that continues a run, with the scene and all settings that the run was started with."""
     record = read_record(folder)
     try:
         scene = _stored_scene(folder, record, None)

@@ -7,7 +7,6 @@ import os
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -42,10 +41,8 @@ CAMERA_MODEL = "pinhole"
 
 
 def fit_kernels(cuda: bool) -> list[tuple[wp.Kernel, int]]:
-    """Return a kernel of each module that a fit on CUDA or on the CPU launches, with the block size of the launches.
-
-    On CUDA a module is compiled once for each block size. Scores are computed on the CPU for fits on any device.
-    """
+    """Return a kernel of each module that a fit on CUDA or on the CPU launches, with the block size of the launches."""
+    # On CUDA a module is compiled once for each block size. Scores are computed on the CPU for fits on any device.
     real = wp.float32
     common = [
         (tiles.make_kernels(real, cuda).pack_counts, THREADS),
@@ -89,37 +86,15 @@ def fit_kernels(cuda: bool) -> list[tuple[wp.Kernel, int]]:
     return common + own
 
 
-@dataclass(frozen=True)
-class Precompiled:
-    """One module of kernels, loaded on one device."""
-
-    device: str
-    """cpu, or the name of the CUDA device."""
-    kernel: str
-    """File and name of one kernel of the module."""
-    block: int
-    """Threads of a block that the module was compiled for."""
-    compiled: bool
-    """False if the cache already had the module."""
-    seconds: float
-    """Time to compile and load the module [s]."""
-
-
-def _load(device: torch.device, kernel: wp.Kernel, block: int) -> Precompiled:
+def _load(device: torch.device, kernel: wp.Kernel, block: int) -> tuple[str, str, int, bool, float]:
+    """Compile and load a module; returns device, kernel, block size, whether it was compiled and not cached, and time [s]."""
     began, name = time.time(), f"{kernel.func.__module__.rpartition('.')[2]}.{kernel.func.__name__}"
     path = Path(load_module(kernel.module, launch.warp_device(device), block).binary_path)
-    return Precompiled(str(device), name, block, path.stat().st_mtime >= began, time.time() - began)
+    return str(device), name, block, path.stat().st_mtime >= began, time.time() - began
 
 
-def precompile_kernels(devices: list[torch.device] | None = None) -> Iterator[Precompiled]:
-    """Compile the modules that are not cached, and yield each when it is done.
-
-    Args:
-        devices: Devices to compile for; None for the CPU and every CUDA device that torch sees.
-
-    Raises:
-        RuntimeError: A kernel does not compile.
-    """
+def precompile_kernels(devices: list[torch.device] | None = None) -> Iterator[tuple[str, str, int, bool, float]]:
+    """Compile the modules that are not cached, by default for the CPU and all CUDA devices; yield `_load` of each when done."""
     if devices is None:
         devices = [torch.device("cpu"), *(torch.device("cuda", i) for i in range(torch.cuda.device_count()))]
     jobs = {}
@@ -134,15 +109,14 @@ def precompile_kernels(devices: list[torch.device] | None = None) -> Iterator[Pr
 
 def print_warming(devices: list[torch.device] | None = None) -> None:
     """Warm the cache; print a line for each compiled module, and a summary."""
-    began, results = time.perf_counter(), []
-    for w in precompile_kernels(devices):
-        results.append(w)
-        if w.compiled:
-            blocks = "" if w.device == "cpu" else f" in blocks of {w.block}"
-            say(f"{w.device}: {w.kernel}{blocks}, {w.seconds:.1f} s")
-    compiled, folder = [w for w in results if w.compiled], Path(wp.config.kernel_cache_dir)
+    began, count, compiled = time.perf_counter(), 0, 0
+    for device, kernel, block, fresh, seconds in precompile_kernels(devices):
+        count, compiled = count + 1, compiled + fresh
+        if fresh:
+            say(f"{device}: {kernel}{'' if device == 'cpu' else f' in blocks of {block}'}, {seconds:.1f} s")
+    folder = Path(wp.config.kernel_cache_dir)
     size = sum(p.stat().st_size for p in folder.rglob("*") if p.is_file())
     say(
-        f"{len(results)} modules: {len(compiled)} compiled, {len(results) - len(compiled)} were in the cache, "
+        f"{count} modules: {compiled} compiled, {count - compiled} were in the cache, "
         f"{time.perf_counter() - began:.1f} s; {folder} holds {format_bytes(size)}"
     )

@@ -67,22 +67,13 @@ class FitRequest:
 
 
 def check_overrides(overrides: Mapping[str, object]) -> None:
-    """Check that keywords of a fit are not options of `load_scene`.
-
-    Raises:
-        UsageError: A keyword is an option of `load_scene`.
-    """
+    """Check that keywords of a fit are not options of `load_scene`."""
     for name in overrides.keys() & {f.name for f in fields(SceneRequest)}:
         raise UsageError(f"warpgs.fit: {name} is an option for reading a scene; pass it to load_scene, and fit the result")
 
 
 def choose_device(name: str | torch.device) -> tuple[torch.device, str]:
-    """Return the device for auto, cpu, cuda or cuda:N, or a given device itself, and a phrase for the user.
-
-    Raises:
-        ResourceError: CUDA was requested and is missing.
-        UsageError: The name is unknown.
-    """
+    """Return the device for auto, cpu, cuda or cuda:N, or a given device itself, and a phrase for the user."""
     if isinstance(name, torch.device):
         device = name
     elif re.fullmatch(r"cuda:[0-9]{1,3}", name):
@@ -105,19 +96,7 @@ def choose_device(name: str | torch.device) -> tuple[torch.device, str]:
 
 
 def choose_split(scene: Scene, spec: str | None) -> tuple[Split, list[str]]:
-    """Split the views of a scene into those to fit and those to hold out.
-
-    Args:
-        scene: The scene.
-        spec: As in `warpgs fit --split`; None for all to fit.
-
-    Returns:
-        The split, and notes for the user: the choice made, and masks and held-out views for which scores are less reliable.
-
-    Raises:
-        DataError: A named view is missing.
-        UsageError: The split is invalid.
-    """
+    """Split a scene by ``spec`` (None: all views train); returns the split and notes on doubtful scores."""
     split = split_views(scene, "all" if spec is None else spec)
     notes = [] if split.test else [NO_SCORES]
     if (spec or "").startswith("dtu:") and any(v.mask is not None for v in scene.views):

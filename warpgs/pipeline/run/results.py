@@ -48,9 +48,9 @@ from warpgs.render.rasterize import rasterize
 from warpgs.render.reference import reference_image
 from warpgs.report.images import Tile, contact_sheet, depth_map, error_map, png, side_by_side, webp
 from warpgs.report.overview import render_overview
-from warpgs.report.page import Page, SamplingReport, ViewImages, curve, image_names, write_page
+from warpgs.report.page import Section, ViewImages, curve, image_names, write_page
 from warpgs.report.progress import duration, read_events
-from warpgs.scene import Camera, Gaussians, Scene, View, base_colors
+from warpgs.scene import Camera, Gaussians, Scene, View
 
 DEPTH, NORMALS = "given_depth", "given_normals"
 """Names of the maps of the loss terms."""
@@ -59,19 +59,7 @@ DEPTH, NORMALS = "given_depth", "given_normals"
 def given_figures(
     train: Sequence[View], views: Sequence[TrainingView], gaussians: Gaussians, options: RasterizeOptions
 ) -> dict[str, Any]:
-    """Return the comparison of the model with each kind of given map: a row for each view with such a map, and a summary.
-
-    Args:
-        train: The views to fit.
-        views: The same views, with the maps of the loss terms.
-        gaussians: The fitted model.
-        options: Options for rendering the model.
-
-    Returns:
-        For ``depth`` and ``normals``, each only if a loss term compared it: ``views`` with name, fraction of the pixels with a
-        given value, and median difference (relative for depth, in degrees for normals; NaN without rendered pixels); and
-        ``summary``.
-    """
+    """Compare the model with given depth and normals: rows by view and a summary, for each kind that a loss term compared."""
     rows: dict[str, list[dict[str, Any]]] = {"depth": [], "normals": []}
     for view, mapped in zip(train, views, strict=True):
         maps = {n: t.cpu().numpy() for n, t in mapped.maps.items() if n in (DEPTH, NORMALS) and bool(t.any())}
@@ -157,24 +145,10 @@ def _seconds(render: Callable[[], object], device: torch.device) -> float:
 def rule_report_of(
     gaussians: Gaussians, views: list[View], options: RasterizeOptions, *, seed: int, half_resolution: float = 0.0
 ) -> dict[str, Any]:
-    """Measure error and saved time of a rule on a scene; takes some tenths of a second.
-
-    Three random views are rendered with the rule, as in the fit. 64 x 64 px of each are compared with the image of rule `exact`
-    in float64. That image is computed by `warpgs.render.reference` without the kernels, or by the kernels if `warpgs.geometry`
-    does not have the camera model.
-
-    Args:
-        gaussians: Gaussians of the finished fit, float32.
-        views: Training views, at least one.
-        options: Options of the rasterizer, with the name of the fit's cut-offs and a background.
-        seed: Seed of the choice of views and parts.
-        half_resolution: Fraction of the steps with views of half size.
-
-    Returns:
-        ``max``, ``mean`` and ``psnr`` [dB] (None if infinite) of the error of colours in [0, 1] over all parts; ``views`` by
-        name with their compared parts; ``render_ms`` and, unless the rule is `exact`, ``exact_ms`` of one whole view; ``rule``;
-        and ``summary``, the same figures as a sentence.
-    """
+    """Measure error and saved time of a rule on 64 x 64 px of three random views against rule `exact` in float64."""
+    # Three random views are rendered with the rule, as in the fit. 64 x 64 px of each are compared with the image of rule
+    # `exact` in float64. That image is computed by `warpgs.render.reference` without the kernels, or by the kernels if
+    # `warpgs.geometry` does not have the camera model.
     generator = np.random.default_rng(seed)
     chosen = [views[i] for i in sorted(generator.permutation(len(views))[:VIEWS])]
     device = gaussians.means.device
@@ -259,18 +233,7 @@ def _open_pixels(consistent: bool, quantile: float) -> str:
 def view_sheet(
     name: str, step: int, view: TrainingView, disparity: np.ndarray | None, sampled: SampledView, config: MethodConfig
 ) -> np.ndarray:
-    """Return a sheet of one view at one event, colours [rows, columns, 3] in [0, 1]: images, gate, sampled pixels, scores.
-
-    Scores are shown if one of them has a weight above 0, the disparity if the view has a prior.
-
-    Args:
-        name: Name of the view.
-        step: Steps done.
-        view: The view.
-        disparity: Relative inverse depth of the view, shape [H, W]; None without a prior.
-        sampled: Maps and sampled pixels of the event.
-        config: Switches and settings of the fit.
-    """
+    """Return a sheet of one view at one event, colours [rows, columns, 3]: images, gate, samples, scores of weight above 0."""
     image, rendered, score = (t.cpu().numpy() for t in (view.image, sampled.rendered, sampled.score))
     at, gate = sampled.at.cpu().numpy(), sampled.gate.cpu().numpy()
     weights = config.weights(view.semantic is not None)
@@ -314,17 +277,10 @@ def _on_host(sampled: SampledView) -> SampledView:
 
 @contextlib.contextmanager
 def images_kept(fit: Trainer, names: list[str], out: Path) -> Iterator[Callable[[], None]]:
-    """Have a fit write images of some of its events into its run folder, ``sampling/STEP.png``, while it continues.
-
-    A separate thread writes the images. The end of the block waits for the images, and so does the yielded function. Call this
-    function before a checkpoint, since a fit that continues from the checkpoint does not write earlier images. If an image
-    cannot be written, the fit continues, with one message in ``fit.messages``.
-
-    Args:
-        fit: The fit, before its first step.
-        names: Names of its training views.
-        out: Run folder.
-    """
+    """Write images of some events, ``sampling/STEP.png``, in a thread during the block; yields a function that awaits them."""
+    # A separate thread writes the images. The end of the block waits for the images, and so does the yielded function. Call
+    # this function before a checkpoint, since a fit that continues from the checkpoint does not write earlier images. If an
+    # image cannot be written, the fit continues, with one message in ``fit.messages``.
     config, steps, strategy = fit.config.method, shown_steps(fit.phases), fit.strategy
     disparities = fit.disparities or [None] * len(names)
     lost: list[int] = []
@@ -369,12 +325,7 @@ def images_kept(fit: Trainer, names: list[str], out: Path) -> Iterator[Callable[
 
 
 def event_figures(fit: Trainer) -> dict[str, Any]:
-    """Return the sums over the events of a fit, and the sizes of its two layers, for metrics.json.
-
-    Returns:
-        ``events``: numbers of events, of Gaussians added and evicted, of samplings (one for each view of an event), and of
-        samplings with a widened gate; ``layers``: number of Gaussians in the coarse and in the fine layer.
-    """
+    """Return for metrics.json the sums over the events of a fit (``events``), and the sizes of its two layers (``layers``)."""
     asked = fit.config.method.asked_quantile
     layered = isinstance(fit.strategy, ImportanceSampling)
     events, fine = (fit.strategy.events, int(fit.strategy.fine.sum())) if layered else ([], 0)
@@ -388,7 +339,7 @@ def event_figures(fit: Trainer) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def sampling_report_of(fit: Trainer, out: Path) -> SamplingReport | None:
+def sampling_report_of(fit: Trainer, out: Path) -> Section | None:
     """Return the report's part on the sampling events of a finished fit; None without events."""
     method, figures = fit.config.method, event_figures(fit)
     events, layers = figures["events"], figures["layers"]
@@ -419,11 +370,9 @@ def sampling_report_of(fit: Trainer, out: Path) -> SamplingReport | None:
     images = [
         (f"sampling after step {int(p.stem):,}", webp(decode(p, data=read_file(p, out))[0], SHEET_WIDTH, 70)) for p in files
     ]
-    return SamplingReport(words, images, table)
+    return Section(words, images, table)
 
 
-Overview = tuple[bytes | None, str]
-"""PNG of the 3D overview and an empty text, or None and the reason."""
 LABELS = {
     "psnr": "PSNR [dB]", "psnr_whole": "PSNR, whole image [dB]", "psnr_foreground": "PSNR, foreground [dB]",
     "alpha_empty": "alpha where empty", "alpha_object": "alpha in the object",
@@ -438,13 +387,6 @@ SHOWN_VIEWS = 6
 """Held-out views with images in the report; all have files in the run folder."""
 RENDER_WORKERS = 4
 """Threads that score and encode images while others are rendered."""
-OVERVIEW_POINTS = 60_000
-"""Gaussians shown in the 3D overview, sampled at random."""
-
-
-def score_keys(metrics: dict[str, Any]) -> list[str]:
-    """Return the names of the scores that result files hold for held-out views, in the order to show them."""
-    return [k for k in LABELS if k in metrics["test"]]
 
 
 def score_line(scores: dict[str, float]) -> str:
@@ -464,12 +406,7 @@ def summary_line(metrics: dict[str, Any]) -> str:
 
 
 def result_lines(metrics: dict[str, Any], out: Path | None) -> list[str]:
-    """Return the final lines of a fit: scores, size, time, the path of the report, and the next steps.
-
-    Args:
-        metrics: Contents of metrics.json.
-        out: The run folder, or None.
-    """
+    """Return the final lines of a fit from metrics.json: scores, size, time, report, next steps."""
     if metrics["test"]:
         best = ", ".join(f"{BASELINES.get(name, name)} {value:.2f} dB" for name, value in metrics["baselines"].items())
         lines = [
@@ -516,30 +453,16 @@ def evaluate_run(
     names: dict[str, str] | None = None,
     tell: Callable[[str], object] = lambda line: None,
 ) -> dict[str, Any]:
-    """Score held-out and training views, and save a render and a depth map of each held-out view.
-
-    If no view is held out, the images show training views. LPIPS is measured only on held-out views.
-
-    Args:
-        out: The run folder; None to write nothing.
-        gaussians: N Gaussians in scene units [u].
-        train: Training views.
-        test: Held-out views.
-        options: Options of the rasterizer.
-        lpips: Network for LPIPS, or None.
-        names: Names of image files by view, from `image_names` of the whole scene; None to make names for these views only.
-        tell: Called with a line for each view before it is rendered.
-
-    Returns:
-        Means over held-out and over training views, a row per held-out view, scores of baselines, and definitions of scores.
-    """
+    """Score held-out and training views, and save a render and depth map of each held-out (else training) view in ``out``."""
     for folder in () if out is None else ("renders", "depth"):
         make_folder(out / folder)
     files = names or image_names(v.name for v in [*train, *test])
 
     def finish(view: View, image: np.ndarray, depth: np.ndarray, alpha: np.ndarray) -> ViewMetrics:
         if out is not None:
-            _write_images(out, f"{files[view.name]}.png", view, image, depth, alpha)
+            row = side_by_side([np.clip(image, 0, 1), view.image, error_map(image, view.image)])
+            write_bytes(out / "renders" / f"{files[view.name]}.png", png(row))
+            write_bytes(out / "depth" / f"{files[view.name]}.png", png(depth_map(depth, alpha)))
         return score(view, image, lpips if test else None, alpha)
 
     def compare(view: View, image: np.ndarray, depth: np.ndarray, alpha: np.ndarray) -> ViewMetrics:
@@ -561,13 +484,6 @@ def evaluate_run(
     }  # fmt: skip
 
 
-def _write_images(out: Path, name: str, view: View, image: np.ndarray, depth: np.ndarray, alpha: np.ndarray) -> None:
-    """Write the render [H, W, 3] of a view beside its photograph and the error, and the depth map [H, W]."""
-    row = side_by_side([np.clip(image, 0, 1), view.image, error_map(image, view.image)])
-    write_bytes(out / "renders" / name, png(row))
-    write_bytes(out / "depth" / name, png(depth_map(depth, alpha)))
-
-
 def _images(
     views: list[View], gaussians: Gaussians, options: RasterizeOptions, rows: dict[str, Any], tell: Callable[[str], object]
 ) -> list[ViewImages]:
@@ -583,16 +499,6 @@ def _images(
             parts = (image, view.image, error_map(image, view.image), depth_map(depth, alpha))
             result.append((view.name, caption, render_workers.map(webp, parts)))
     return [ViewImages(name, caption, *parts) for name, caption, parts in result]
-
-
-def overview_of(gaussians: Gaussians, train: list[View], test: list[View]) -> Callable[[], Overview]:
-    """Return a function that plots the 3D overview in a separate process; the function may be called from another thread."""
-    means = gaussians.means.detach().cpu().numpy()
-    colors = np.clip(base_colors(gaussians.sh[:, :1].detach().cpu().numpy()), 0, 1)
-    sample = np.random.default_rng(0).permutation(len(means))[:OVERVIEW_POINTS]
-    points, cameras = means[sample].astype(np.float64), ([v.camera for v in train], [v.camera for v in test])
-    up = up_of(cameras[0], points)
-    return lambda: render_overview(*cameras, points, colors[sample], up)
 
 
 def _figures(metrics: dict[str, Any]) -> list[tuple[str, str]]:
@@ -631,34 +537,22 @@ def write_report(
     metrics: dict[str, Any],
     record: dict[str, Any],
     *,
-    sampling: SamplingReport | None,
-    overview: Overview,
+    sampling: Section | None,
     tell: Callable[[str], object] = lambda line: None,
 ) -> None:
-    """Write report.html for a scored run.
-
-    Args:
-        out: The run folder, with the curves in metrics.jsonl.
-        scene: The scene.
-        split: Its views to fit and those held out.
-        gaussians: The fitted model, in scene units [u].
-        options: Options of the rasterizer.
-        metrics: Contents of metrics.json.
-        record: Contents of config.json.
-        sampling: The part on sampling events, or None.
-        overview: Result of the function of `overview_of`.
-        tell: Called with a line for each view before it is rendered.
-    """
+    """Write report.html of a scored run, from metrics.json, config.json (``record``), metrics.jsonl and new renders."""
     train, test = [scene.view(n) for n in split.train], [scene.view(n) for n in split.test]
-    image, why = overview
-    notes = [*record["notes"], *([why] if why else [])]
+    tell("making the report")
+    cameras = [v.camera for v in train], [v.camera for v in test]
+    up = up_of(cameras[0], gaussians.means.detach().cpu().numpy().astype(np.float64))
+    overview = render_overview(gaussians, options, *cameras, up)
     events = read_events(out / "metrics.jsonl")
     steps = [e["step"] for e in events]
     curves = [
         curve(title, steps, [e.get(name, math.nan) for e in events], unit)
         for title, name, unit in (("Training loss", "loss", ""), ("Training PSNR", "psnr", "dB"), ("Gaussians", "count", ""))
     ]
-    keys = score_keys(metrics)
+    keys = [k for k in LABELS if k in metrics["test"]]
     table = [["view", *(LABELS.get(k, k) for k in keys), "pixels"]] + [
         [r["name"], *(f"{r.get(k, math.nan):.{2 if k.startswith('psnr') else 4}f}" for k in keys), r["region"]]
         for r in metrics["views"]
@@ -669,13 +563,13 @@ def write_report(
         names = image_names(v.name for v in scene.views)
         covered = coverage_section(out, metrics["coverage"], [v.name for v in images], names)
     camera = train[0].camera
-    page = Page(
+    write_page(
+        out / "report.html",
         title=(out if Path(scene.path).parent == out else Path(scene.path)).resolve().name,  # not "scene" for found poses
         subtitle=f"preset {metrics['preset']}, {len(train)} training views, {len(test)} held out, "
         f"{camera.width} x {camera.height} px, {metrics['device']}",
-        figures=_figures(metrics), notes=notes, table=table, views=images, curves=curves, sampling=sampling,
-        overview=None if image is None else webp(image), held_out=bool(test),
-        details={k: v for k, v in record.items() if k != "cameras"}, protocol=_protocol(metrics),
+        figures=_figures(metrics), notes=record["notes"], scores=table, views=images, curves=curves, sampling=sampling,
+        overview=None if overview is None else webp(overview), held_out=bool(test),
+        record={k: v for k, v in record.items() if k != "cameras"}, protocol=_protocol(metrics),
         coverage=covered,
     )  # fmt: skip
-    write_page(out / "report.html", page)

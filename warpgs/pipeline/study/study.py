@@ -28,9 +28,7 @@ from warpgs.pipeline.run.request import FitRequest, SceneRequest, choose_device,
 from warpgs.pipeline.run.results import LABELS, summary_line
 from warpgs.pipeline.study.tables import (
     GAUSSIANS,
-    Line,
     Metric,
-    Panel,
     Row,
     Table,
     csv_text,
@@ -68,19 +66,7 @@ def strips(
     count: int,
     device: torch.device,
 ) -> list[Strip]:
-    """Return rows of the figure for one scene: the held-out views on which the variants differ most.
-
-    Args:
-        scene: Name of the scene, for titles.
-        views: Its held-out views.
-        folders: Run folder of each variant, in the order of the columns.
-        scores: PSNR [dB] by variant and view name; no PSNR is printed for missing views.
-        count: Largest number of rows.
-        device: Device to render on.
-
-    Returns:
-        Rows with a cell per variant; the last cell is the image of the view.
-    """
+    """Return rows of the figure of one scene: up to ``count`` held-out views on which the variants' PSNR [dB] differs most."""
     images = {name: _rendered(folder, views, device) for name, folder in folders.items()}
     maps = []
     for i, view in enumerate(views):
@@ -238,20 +224,6 @@ def _table(request: StudyRequest, runs: Runs, scenes: list[str], metrics: tuple[
     return Table(caption, base, metrics, tuple(rows), tuple(SWITCHES.values()) if request.marks else ())
 
 
-def _plot(request: StudyRequest, runs: Runs, scenes: list[str], table: Table) -> str:
-    """Return the SVG of the paired differences of a table."""
-    panels = []
-    for m in table.metrics:
-        theirs = _by_seed(runs, scenes, table.base, m.key, request.seeds)
-        lines = []
-        for row in table.rows:
-            ours = _by_seed(runs, scenes, row.name, m.key, request.seeds)
-            pairs = () if row.name == table.base else tuple(ours[s] - theirs[s] for s in sorted(ours.keys() & theirs.keys()))
-            lines.append(Line(row.name, pairs, row.differences.get(m.key), row.exercised))
-        panels.append(Panel(m.label + (" [dB]" if m.key == "psnr" else ""), m.upwards, m.digits, tuple(lines)))
-    return forest(table.caption, table.base, panels)
-
-
 def _figure(request: StudyRequest, runs: Runs, places: list[Place], device: torch.device) -> tuple[bytes | None, str]:
     """Return the figure (PNG) of the first seed for which all runs succeeded, or None, and a note."""
     whole = [s for s in range(request.seeds) if all(runs[p.name, v, s].metrics for p in places for v in request.variants)]
@@ -331,14 +303,7 @@ def _runs_csv(request: StudyRequest, runs: Runs) -> str:
 
 
 def write_study(request: StudyRequest, runs: Runs, places: list[Place], device: torch.device, device_name: str) -> list[str]:
-    """Write tables, plot, figure and the record of a study into its folder.
-
-    Returns:
-        Lines for the user: the table and the notes.
-
-    Raises:
-        ResourceError: A file cannot be written.
-    """
+    """Write tables, plot, figure and record of a study into its folder; returns the table and the notes as lines."""
     metrics, scenes = _metrics(runs), [p.name for p in places]
     title = "Ablation" if request.marks else "Comparison"
     what = scenes[0] if len(scenes) == 1 else f"the mean over {len(scenes)} scenes"
@@ -357,7 +322,7 @@ def write_study(request: StudyRequest, runs: Runs, places: list[Place], device: 
     write_text(request.out / "table.csv", csv_text(table))
     write_text(request.out / "table.tex", latex(table))
     write_text(request.out / "runs.csv", _runs_csv(request, runs))
-    write_text(request.out / "plot.svg", _plot(request, runs, scenes, table))
+    write_text(request.out / "plot.svg", forest(table))
     if image is not None:
         write_bytes(request.out / "figure.png", image)
     hashes = {n: dataclasses.replace(c, seed=0).fingerprint() for n, c in request.variants.items()}
@@ -389,16 +354,7 @@ on alone. `PAPER` is a preset of its own. A row that equals an earlier one is le
 
 
 def preset_variants(names: list[str], steps: int | None) -> dict[str, FitConfig]:
-    """Return presets as the variants of a study, in the order of ``names``; ``steps`` replaces the steps of each preset.
-
-    Args:
-        names: Presets as `warpgs.fit` takes them; a file or an object is shown by the last part of its name.
-        steps: Steps of each run; None for the steps of its preset.
-
-    Raises:
-        DataError: The file of a preset cannot be read.
-        UsageError: A preset is unknown, or two have the same name.
-    """
+    """Return presets as the variants of a study, in the order of ``names``; ``steps`` replaces the steps of each preset."""
     words = [preset_word(n) for n in names]
     for word in words:
         if words.count(word) > 1:
@@ -408,13 +364,7 @@ def preset_variants(names: list[str], steps: int | None) -> dict[str, FitConfig]
 
 
 def ablation_variants(base: FitConfig) -> tuple[dict[str, FitConfig], dict[str, tuple[bool, ...]]]:
-    """Return the rows of the ablation of a configuration, and their check marks in the order of `SWITCHES`.
-
-    All rows have the configuration's number of steps.
-
-    Raises:
-        UsageError: The configuration has no sampling events, so there is nothing to ablate.
-    """
+    """Return the rows of an ablation, all with the same steps, and their check marks in the order of `SWITCHES`."""
     if not base.method.events:
         raise UsageError(f"preset {base.preset!r} has no sampling events; ablate a preset with them, such as default")
     variants: dict[str, FitConfig] = {}
@@ -512,19 +462,7 @@ def _run_all(request: StudyRequest, places: list[Place], device: torch.device, l
 
 
 def run_study(request: StudyRequest) -> list[str]:
-    """Fit every variant to every scene with every seed, and write the results into the study's folder.
-
-    Scenes and weights are read before the first fit. The notes name each failed run; its seed is excluded from paired
-    differences.
-
-    Returns:
-        Lines for the user: the table and the notes.
-
-    Raises:
-        DataError: A scene cannot be read or has no held-out view, the LPIPS weights are invalid, or every run of a variant
-            failed.
-        ResourceError: The folder cannot be written, another process writes into it, or the device is missing.
-    """
+    """Fit every variant to every scene with every seed, and write the results; returns the table and the notes as lines."""
     device, where = choose_device(request.device)
     lpips = {} if request.lpips_weights is None else load_lpips(request.lpips_weights, device).variants()
     places = _places(request, device.type)

@@ -42,8 +42,13 @@ class Difference:
     """Lower end of the interval; NaN with fewer than two pairs."""
     high: float
     """Upper end of the interval; NaN with fewer than two pairs."""
-    count: int
-    """Number of pairs."""
+    pairs: tuple[float, ...]
+    """The differences."""
+
+    @property
+    def count(self) -> int:
+        """Number of pairs."""
+        return len(self.pairs)
 
     @property
     def excludes_zero(self) -> bool:
@@ -60,26 +65,17 @@ def sample(values: Sequence[float]) -> Sample:
 
 
 def paired_difference(ours: Sequence[float], base: Sequence[float], confidence: float = CONFIDENCE) -> Difference:
-    """Return Student's interval of the mean of ``ours - base`` over pairs (Student 1908): mean ± t s / sqrt(n).
-
-    Here t is the quantile for n - 1 degrees of freedom. Pairing removes the common effect of seed and scene, which is most of
-    the spread between runs.
-
-    Args:
-        ours: Measurements.
-        base: Measurements of the base, in the same order.
-        confidence: Probability that the interval contains the true mean, in (0, 1).
-
-    Raises:
-        ValueError: ``ours`` and ``base`` differ in length.
-    """
+    """Return Student's interval of the mean of ``ours - base`` over pairs (Student 1908): mean ± t s / sqrt(n)."""
+    # Here t is the quantile for n - 1 degrees of freedom. Pairing removes the common effect of seed and scene, which is most of
+    # the spread between runs.
     from scipy.special import stdtrit
 
-    d = sample([a - b for a, b in zip(ours, base, strict=True)])
+    pairs = tuple(a - b for a, b in zip(ours, base, strict=True))
+    d = sample(pairs)
     if d.count < 2:
-        return Difference(d.mean, math.nan, math.nan, d.count)
+        return Difference(d.mean, math.nan, math.nan, pairs)
     half = float(stdtrit(d.count - 1, 0.5 + confidence / 2)) * d.sd / math.sqrt(d.count)
-    return Difference(d.mean, d.mean - half, d.mean + half, d.count)
+    return Difference(d.mean, d.mean - half, d.mean + half, pairs)
 
 
 GAUSSIANS = "gaussians"
@@ -308,34 +304,6 @@ LETTER = 7.2
 """Assumed width of a letter of the row labels [px], to compute the width of their column."""
 
 
-@dataclass(frozen=True)
-class Line:
-    """One variant in one panel."""
-
-    name: str
-    """Name of the variant."""
-    pairs: tuple[float, ...]
-    """Difference to the base for each seed."""
-    difference: Difference | None
-    """Mean of the differences, and its interval; None for the base."""
-    exercised: bool = True
-    """False if the variant's runs gave the same files as the base's."""
-
-
-@dataclass(frozen=True)
-class Panel:
-    """One metric; the lines have the same order in every panel."""
-
-    label: str
-    """Name of the metric, with its unit."""
-    upwards: bool
-    """True if larger values are better."""
-    digits: int
-    """Digits after the point of the printed figures."""
-    lines: tuple[Line, ...]
-    """Variants in the order of the rows."""
-
-
 def _text(x: float, y: float, words: str, size: int = 12, anchor: str = "start", color: str = INK, weight: int = 400) -> str:
     """Return a text element at ``x``, ``y`` [px]."""
     return (
@@ -344,41 +312,42 @@ def _text(x: float, y: float, words: str, size: int = 12, anchor: str = "start",
     )
 
 
-def _reach(panel: Panel) -> float:
-    """Return half the width of a panel's axis, which is centred on 0 so that both signs have the same scale."""
-    values = [abs(v) for line in panel.lines for v in line.pairs]
-    values += [abs(v) for line in panel.lines if line.difference for v in (line.difference.low, line.difference.high)]
+def _reach(differences: list[Difference], digits: int) -> float:
+    """Return half the width of a metric's axis, which is centred on 0 so that both signs have the same scale."""
+    values = [abs(v) for d in differences for v in (*d.pairs, d.low, d.high)]
     largest = max((v for v in values if math.isfinite(v)), default=0.0)
-    return 1.08 * largest or 10.0**-panel.digits
+    return 1.08 * largest or 10.0**-digits
 
 
-def _line(panel: Panel, line: Line, y: float, x0: float, px: Callable[[float], float]) -> list[str]:
-    """Return the elements of one variant in one panel, at height ``y`` [px]; ``px`` maps values to x [px]."""
-    d, right = line.difference, x0 + PANEL + 12
+def _line(metric: Metric, row: Row, y: float, x0: float, px: Callable[[float], float]) -> list[str]:
+    """Return the elements of one variant and metric at height ``y`` [px]; ``px`` maps values to x [px]."""
+    d, right = row.differences.get(metric.key), x0 + PANEL + 12
     if d is None:
         return [_text(right, y + 7, "the base", 11, color=SOFT)]
-    if not line.exercised:
+    if not row.exercised:
         return [_text(right, y + 7, "not exercised", 11, color=SOFT)]
     if not math.isfinite(d.mean):
         return [_text(right, y + 7, "not measured", 11, color=SOFT)]
-    good = d.mean > 0 if panel.upwards else d.mean < 0
+    good = d.mean > 0 if metric.upwards else d.mean < 0
     color = (BETTER if good else WORSE) if d.excludes_zero else UNDECIDED
-    parts = [f'<circle cx="{px(v):.1f}" cy="{y + 10:.1f}" r="2.8" fill="{color}" fill-opacity="0.45"/>' for v in line.pairs]
-    words = f"{d.mean:+.{panel.digits}f}"
+    parts = [f'<circle cx="{px(v):.1f}" cy="{y + 10:.1f}" r="2.8" fill="{color}" fill-opacity="0.45"/>' for v in d.pairs]
+    words = f"{d.mean:+.{metric.digits}f}"
     if math.isfinite(d.low):
         parts.append(
             f'<path d="M{px(d.low):.1f} {y - 6:.1f}v12m0 -6H{px(d.high):.1f}m0 -6v12" fill="none" stroke="{color}" '
             'stroke-width="2"/>'
         )
-        words += f"  [{d.low:+.{panel.digits}f}, {d.high:+.{panel.digits}f}]"
+        words += f"  [{d.low:+.{metric.digits}f}, {d.high:+.{metric.digits}f}]"
     parts.append(f'<circle cx="{px(d.mean):.1f}" cy="{y:.1f}" r="5.5" fill="{color}" stroke="#ffffff" stroke-width="1.5"/>')
     return [*parts, _text(right, y + 7, words, 11, color=color, weight=600 if d.excludes_zero else 400)]
 
 
-def forest(title: str, base: str, panels: Sequence[Panel]) -> str:
-    """Return an SVG of every variant's paired differences to ``base``; panels without a measured difference are left out."""
-    panels = [p for p in panels if any(line.pairs for line in p.lines)]
-    names = [line.name for line in panels[0].lines] if panels else []
+def forest(table: Table) -> str:
+    """Return an SVG of every variant's paired differences to the base; metrics without a measured difference are left out."""
+    base = table.base
+    measured = {m: [r.differences[m.key] for r in table.rows if m.key in r.differences] for m in table.metrics}
+    panels = {m: differences for m, differences in measured.items() if any(d.pairs for d in differences)}
+    names = [r.name for r in table.rows] if panels else []
     left = MARGIN + max([90.0, *(LETTER * len(n) + 18 for n in names)])
     step = PANEL + VALUES + GAP
     width = max(left + step * len(panels) - GAP + MARGIN, 560)
@@ -388,21 +357,22 @@ def forest(title: str, base: str, panels: Sequence[Panel]) -> str:
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width:.0f} {height:.0f}" width="{width:.0f}" '
         f'height="{height:.0f}" font-family="system-ui, -apple-system, Segoe UI, Helvetica, Arial, sans-serif">',
         f'<rect width="{width:.0f}" height="{height:.0f}" fill="#ffffff"/>',
-        _text(MARGIN, 34, title, 17, weight=600),
+        _text(MARGIN, 34, table.caption, 17, weight=600),
     ]
     for i, name in enumerate(names):
         y = TOP + ROW * i
         if i % 2 == 0:
             out.append(f'<rect x="{MARGIN - 8}" y="{y}" width="{width - 2 * MARGIN + 16:.0f}" height="{ROW}" fill="{BAND}"/>')
         out.append(_text(MARGIN, y + ROW / 2 + 4, name, 13, weight=600 if name == base else 400))
-    for k, panel in enumerate(panels):
-        x0, reach = left + k * step, _reach(panel)
+    for k, (metric, differences) in enumerate(panels.items()):
+        x0, reach = left + k * step, _reach(differences, metric.digits)
 
         def px(value: float, x0: float = x0, reach: float = reach) -> float:
             return x0 + PANEL * (value + reach) / (2 * reach)
 
-        better = "right is better" if panel.upwards else "left is better"
-        out.append(_text(x0, TOP - 30, f"Δ {panel.label}", 13, weight=600))
+        better = "right is better" if metric.upwards else "left is better"
+        label = metric.label + (" [dB]" if metric.key == "psnr" else "")
+        out.append(_text(x0, TOP - 30, f"Δ {label}", 13, weight=600))
         out.append(_text(x0, TOP - 12, f"to {base}, {better}", 11, color=SOFT))
         for tick in ticks(-reach, reach):
             heavy = abs(tick) < 1e-9 * reach
@@ -411,8 +381,8 @@ def forest(title: str, base: str, panels: Sequence[Panel]) -> str:
                 f'stroke-width="{1.2 if heavy else 1}"/>'
             )
             out.append(_text(px(tick), bottom + 18, "0" if heavy else f"{tick:+g}", 11, "middle", SOFT))
-        for i, line in enumerate(panel.lines):
-            out += _line(panel, line, TOP + ROW * (i + 0.5) - 3, x0, px)
+        for i, row in enumerate(table.rows):
+            out += _line(metric, row, TOP + ROW * (i + 0.5) - 3, x0, px)
     if not panels:
         out.append(_text(MARGIN, 66, "no pair of runs to compare", 13, color=SOFT))
     words = f"large dot: mean; bar: {'joint ' if len(names) > 2 else ''}95 % t interval; small dots: seeds"
