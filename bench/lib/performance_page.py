@@ -93,26 +93,21 @@ def fits_table(results: dict[str, dict]) -> str:
 
 
 def _roof(rows: list[dict], op: str, direction: str) -> str:
-    """Return the fraction of the roof of one of our tasks, where it was measured at its heaviest."""
+    """Return the percentage of the roof of one of our tasks, where it was measured at its heaviest."""
     own = [r for r in rows if (r["op"], r["program"], r["direction"]) == (op, OURS, direction) and "roof_ms" in r and _plain(r)]
-    return f"{figure(100 * max(own, key=lambda r: r['roof_ms'])['fraction'])} %" if own else ""
+    return figure(100 * max(own, key=lambda r: r["roof_ms"])["fraction"]) if own else ""
 
 
 def ops_table(results: dict[str, dict]) -> str:
-    """Return time, memory and fraction of the roof of each of our tasks at the base size, by machine."""
+    """Return time and fraction of the roof of each of our tasks at the base size, by machine."""
     every = [task for result in results.values() for task in tasks(result["rows"]) if task[1] == OURS]
     head, body = ["op", "direction"], []
     for result in results.values():
-        memory = [f"{result_file.machine_name(result)} [MiB]"] if result["machine"]["device"] == "cuda" else []
-        head += [f"{result_file.machine_name(result)} [ms]", *memory, f"{result_file.machine_name(result)}: of the roof"]
+        head += [f"{result_file.machine_name(result)} [ms]", "of the roof [%]"]
     for op, _, direction in dict.fromkeys(every):
         cells = [op, direction]
         for result in results.values():
-            row = _find(result, (op, OURS, direction), BASE)
-            cells.append(_timing(row))
-            if result["machine"]["device"] == "cuda":
-                cells.append(figure(row["peak_bytes"] / 2**20) if row and "peak_bytes" in row else "")
-            cells.append(_roof(result["rows"], op, direction))
+            cells += [_timing(_find(result, (op, OURS, direction), BASE)), _roof(result["rows"], op, direction)]
         body.append(cells)
     return markdown(head, body, WORDS)
 
@@ -191,12 +186,9 @@ def parts() -> dict[str, str]:
     """Return the generated parts of docs/performance.md by name."""
     ops, others, steps, turns = (result_file.stored(kind) for kind in ("ops", "rasterizers", "training_steps", "turns"))
     sources, beside = _sources("ops", ops), next(iter(others.values()))
-    gswarp = result_file.read(result_file.FOLDER / "gswarp_h200.json")
     return {
         "sizes": sizes_table(ops) + sources,
         "rasterizers": rasterizers_page.times_table(beside) + _sources("rasterizers", others),
-        "gswarp": rasterizers_page.gpu_table(gswarp, (OURS, "gswarp")) + "\n" + result_file.source("gswarp_h200"),
-        "many channels": rasterizers_page.times_table(beside, 32),
         "steps": rasterizers_page.steps_table(next(iter(steps.values()))) + _sources("training_steps", steps),
         "whole fits": fits_table(turns) + _sources("turns", turns),
         "ops": ops_table(ops),

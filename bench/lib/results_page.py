@@ -29,7 +29,7 @@ CAPTURES = {
     "fox:8": ("fox", 8), "fox:all": ("fox", 43), "temple:4": ("temple", 4), "temple:12": ("temple", 12),
 }  # fmt: skip
 """Scene and number of training views of each row of the presets' result."""
-PRESETS = ("default", "quick", "3dgs", "mcmc", "gsplat")
+PRESETS = ("default", "quick", "3dgs", "gsplat")
 SCORED = {
     "`fern`, 3 photographs": ("ladder_h200", "fern:3"),
     "`horns`, 3": ("ladder_h200", "horns:3"),
@@ -72,12 +72,11 @@ def ablation() -> str:
             seed: {k: statistics.mean(r[k] for r in rows if r["seed"] == seed) for k in ("psnr", "ssim")}
             for seed in {r["seed"] for r in rows}
         }
-    body = [["full method", _scores(list(scores["full"].values())), "", ""]]
+    body = [["full method", _scores(list(scores["full"].values())), ""]]
     for variant, words in ABLATED.items():
         own = scores[variant]
-        changes = [_change(own, scores["full"], key, digits) for key, digits in (("psnr", 2), ("ssim", 3))]
-        body.append([words, _scores(list(own.values())), *changes])
-    return table(["part that is off", "PSNR / SSIM", "change in PSNR", "change in SSIM"], body) + source
+        body.append([words, _scores(list(own.values())), _change(own, scores["full"], "psnr", 2)])
+    return table(["part that is off", "PSNR / SSIM", "change in PSNR"], body) + source
 
 
 def views() -> str:
@@ -88,9 +87,9 @@ def views() -> str:
     for name, (scene, count) in CAPTURES.items():
         rows = [list(found.get((name, preset), {}).values()) for preset in PRESETS]
         cells = (_scores(r) if r else "" for r in rows)
-        body.append([f"{scene}, {count}", f"`{ROWS[name].split}`", f"{len(rows[0])}", *cells])
+        body.append([f"{scene}, {count}", f"`{ROWS[name].split}`", *cells])
     heads = [*(f"`{p}`" for p in PRESETS[:-1]), f"gsplat {others['versions']['gsplat']}"]
-    head = ["scene, views", "split", "seeds of `default`", *heads]
+    head = ["scene, views", "split", *heads]
     return markdown(head, body, head[:2]) + own_source + source
 
 
