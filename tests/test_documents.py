@@ -85,7 +85,7 @@ BY_HAND = {
     ("dependencies.md", "| needed for"): "versions in names of licences",
     ("evaluation.md", "| key | definition"): "definitions",
     ("mutation.md", "| sample | mutants run"): "counts that tools/mutation prints",
-    ("numerics.md", "| device | poisoned"): "counts of a fuzzer, which prints them and keeps no file",
+    ("numerics.md", "| change | time"): "a summary of two files of results, with charts of both",
     ("presets.md", "| setting | rule"): "compared with the rule itself, below",
     ("results.md", "| method | `fern`"): "published scores, each with its source",
     ("tiles.md", "| bound | margin"): "derived margins",

@@ -14,14 +14,12 @@ COLORS = {
     "project": 0, "sh": 1, "tiles": 2, "blend": 3, "ssim": 4, "adam": 5, "knn": 6,
     "render forward": 0, "render both": 1, "step step": 2,
 }  # fmt: skip
-WORDS = ("op", "program", "direction", "machine", "other", "Gaussians, image", "capture")
+WORDS = ("op", "direction", "machine", "Gaussians, image", "capture")
 """Columns that hold words."""
 POINTS = (Point(10_000), Point(100_000), Point(1_000_000), Point(1_000_000, 1920, 1080))
 """Sizes of the table of renders and training steps."""
 WHOLE = (("render", "forward"), ("render", "both"), ("step", "step"))
 """Ops and directions of that table."""
-PEERS = ("gsplat", "gsplat + torch", "numpy", "torch conv2d")
-"""Programs of the table of other programs; results have slower ones, too."""
 
 
 def _sources(kind: str, results: dict[str, dict]) -> str:
@@ -112,23 +110,6 @@ def ops_table(results: dict[str, dict]) -> str:
     return markdown(head, body, WORDS)
 
 
-def peers_table(results: dict[str, dict]) -> str:
-    """Return the times of other programs at the largest size that both did."""
-    body = []
-    for result in results.values():
-        rows = result["rows"]
-        ours = {(r["op"], r["direction"], _key(r)): r for r in rows if r["program"] == OURS}
-        peers = [r for r in rows if r["program"] in PEERS and _plain(r) and (r["op"], r["direction"], _key(r)) in ours]
-        for op, program, direction in sorted(tasks(peers), key=lambda t: (t[0], t[2], t[1])):
-            r = max((r for r in peers if (r["op"], r["program"], r["direction"]) == (op, program, direction)), key=_key)
-            mine = ours[r["op"], r["direction"], _key(r)]
-            size = ", ".join(filter(None, _sizes(r, ["N", "image"])))
-            cells = [program, _timing(r), _timing(mine), figure(r["median_ms"] / mine["median_ms"])]
-            body.append([result_file.machine_name(result), op, direction, size, *cells])
-    head = ["machine", "op", "direction", "Gaussians, image", "other", "other [ms]", "warpgs [ms]", "other / warpgs"]
-    return markdown(head, body, WORDS)
-
-
 def _lines(series: list[Series], name) -> tuple[Line, ...]:
     lines = []
     for s in series:
@@ -192,5 +173,4 @@ def parts() -> dict[str, str]:
         "steps": rasterizers_page.steps_table(next(iter(steps.values()))) + _sources("training_steps", steps),
         "whole fits": fits_table(turns) + _sources("turns", turns),
         "ops": ops_table(ops),
-        "other programs": peers_table(ops),
     }
