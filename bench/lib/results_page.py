@@ -13,8 +13,8 @@ from bench.lib.tables import markdown, mean_sd
 from warpgs.pipeline.study.tables import family_confidence, paired_difference
 
 ABLATED = {
-    "no events": "no sampling events: no placement, layers or protection",
-    "no agp": "pixels of highest importance, not sampled ones",
+    "no events": "no sampling events",
+    "no agp": "pixels of highest importance",
     "no ra": "pixels without consistent depth too",
     "no hier": "one layer",
     "no s_render": "no residual in the importance",
@@ -91,17 +91,6 @@ def views() -> str:
     heads = [*(f"`{p}`" for p in PRESETS[:-1]), f"gsplat {others['versions']['gsplat']}"]
     head = ["scene, views", "split", *heads]
     return markdown(head, body, head[:2]) + own_source + source
-
-
-def meshes() -> str:
-    """Return the table of the accuracy of meshes."""
-    result, source = _result("demo_mesh_cpu2")
-    body = []
-    for r in sorted((r for r in result["rows"] if r["row"] == "mesh"), key=lambda r: -r["voxel"]):
-        if r["depth"] == "median":
-            cells = [f"{r['voxel']:.2g}", f"{r['triangles']:,}"]
-            body.append(cells + [f"{100 * r[k]:.2f} %" for k in ("accuracy_mean_of_radius", "completeness_mean_of_radius")])
-    return table(["voxel", "triangles", "accuracy", "completeness"], body) + source
 
 
 def _psnr(rows: list[dict], name: str | None, preset: str) -> dict[int, float]:
