@@ -99,11 +99,11 @@ def _roof(rows: list[dict], op: str, direction: str) -> str:
 def ops_table(results: dict[str, dict]) -> str:
     """Return time and fraction of the roof of each of our tasks at the base size, by machine."""
     every = [task for result in results.values() for task in tasks(result["rows"]) if task[1] == OURS]
-    head, body = ["op", "direction"], []
+    head, body = ["op"], []
     for result in results.values():
         head += [f"{result_file.machine_name(result)} [ms]", "of the roof [%]"]
     for op, _, direction in dict.fromkeys(every):
-        cells = [op, direction]
+        cells = [f"{op} {direction}"]
         for result in results.values():
             cells += [_timing(_find(result, (op, OURS, direction), BASE)), _roof(result["rows"], op, direction)]
         body.append(cells)
