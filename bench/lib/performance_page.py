@@ -16,7 +16,7 @@ COLORS = {
 }  # fmt: skip
 WORDS = ("op", "direction", "machine", "Gaussians, image", "capture")
 """Columns that hold words."""
-POINTS = (Point(10_000), Point(100_000), Point(1_000_000), Point(1_000_000, 1920, 1080))
+POINTS = (Point(100_000), Point(1_000_000), Point(1_000_000, 1920, 1080))
 """Sizes of the table of renders and training steps."""
 WHOLE = (("render", "forward"), ("render", "both"), ("step", "step"))
 """Ops and directions of that table."""
