@@ -107,8 +107,6 @@ def test_tables_of_other_rasterizers():
     """Each program has its row; ratios are right."""
     result = result_of_others()
     made = rasterizers_page.times_table(result)
-    assert "| 1k, 320 x 240 | Faster-GS | 1.25 | 2.5 | 6.25 | 2.5 | 5 | 12.5 | 3.5 |" in made
-    chosen = rasterizers_page.times_table(result, 32)
-    assert "| 1k, 320 x 240 | gsplat dense | 4 | 8 | 20 | 8 | 16 | 40 | 7 |" in chosen
-    assert "| 1k, 320 x 240 | Faster-GS | 1.25 | 2.5 | 6.25 |\n" in rasterizers_page.gpu_table(result, ("Faster-GS",))
+    assert "| 1k, 320 x 240 | Faster-GS | 1.25 | 6.25 | 2.5 | 12.5 | 3.5 |" in made
+    assert made.count("gsplat dense") == 1, "only rows with three channels"
     assert "| 1k, 320 x 240 | 2 | 8 | 0.250 |" in rasterizers_page.steps_table(result)

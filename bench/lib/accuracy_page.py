@@ -49,14 +49,9 @@ def budget_text(results: dict[str, dict]) -> str:
         for row in result["rows"]:
             rule = RENAMED.get(row["rule"], row["rule"])
             name = row["scene"] + ("" if rule == "exact" else f", `{rule}`")
-            both, v = _worst(row), row["gradients"]
-            worst = max(v, key=lambda n: v[n]["rel L2"])
-            lines.append([
-                name, *(_e(both[k]) for k in ("E mean", "E max", "allowed", "P32 max", "A max")),
-                f"{row['in band']}/{row['pixels']}", f"{_e(both['rel L2'])} ({worst})",
-            ])  # fmt: skip
-        head = ["scene", "image: mean E", "max E", "allowed", "max P32", "max A", "in band"]
-        parts.append(markdown([*head, "gradient: relative L2"], lines))
+            both = _worst(row)
+            lines.append([name, *(_e(both[k]) for k in ("E mean", "E max", "P32 max", "A max", "rel L2"))])
+        parts.append(markdown(["scene", "image: mean E", "max E", "max P32", "max A", "gradient: relative L2"], lines))
     return "\n".join(parts)
 
 

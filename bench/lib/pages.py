@@ -18,7 +18,6 @@ PARTS: dict[str, Callable[[], dict[str, str]]] = {
     "results.md": lambda: {
         "ablation": results_page.ablation(),
         "views": results_page.views(),
-        "meshes": results_page.meshes(),
         "rivals": rivals_page.rivals(),
         "other steps": rivals_page.other_steps(),
         "ladder of default": rivals_page.ladder_of_default(),

@@ -14,14 +14,12 @@ COLORS = {
     "project": 0, "sh": 1, "tiles": 2, "blend": 3, "ssim": 4, "adam": 5, "knn": 6,
     "render forward": 0, "render both": 1, "step step": 2,
 }  # fmt: skip
-WORDS = ("op", "program", "direction", "machine", "other", "Gaussians, image", "capture")
+WORDS = ("op", "direction", "machine", "Gaussians, image", "capture")
 """Columns that hold words."""
-POINTS = (Point(10_000), Point(100_000), Point(1_000_000), Point(1_000_000, 1920, 1080))
+POINTS = (Point(100_000), Point(1_000_000), Point(1_000_000, 1920, 1080))
 """Sizes of the table of renders and training steps."""
 WHOLE = (("render", "forward"), ("render", "both"), ("step", "step"))
 """Ops and directions of that table."""
-PEERS = ("gsplat", "gsplat + torch", "numpy", "torch conv2d")
-"""Programs of the table of other programs; results have slower ones, too."""
 
 
 def _sources(kind: str, results: dict[str, dict]) -> str:
@@ -93,44 +91,22 @@ def fits_table(results: dict[str, dict]) -> str:
 
 
 def _roof(rows: list[dict], op: str, direction: str) -> str:
-    """Return the fraction of the roof of one of our tasks, where it was measured at its heaviest."""
+    """Return the percentage of the roof of one of our tasks, where it was measured at its heaviest."""
     own = [r for r in rows if (r["op"], r["program"], r["direction"]) == (op, OURS, direction) and "roof_ms" in r and _plain(r)]
-    return f"{figure(100 * max(own, key=lambda r: r['roof_ms'])['fraction'])} %" if own else ""
+    return figure(100 * max(own, key=lambda r: r["roof_ms"])["fraction"]) if own else ""
 
 
 def ops_table(results: dict[str, dict]) -> str:
-    """Return time, memory and fraction of the roof of each of our tasks at the base size, by machine."""
+    """Return time and fraction of the roof of each of our tasks at the base size, by machine."""
     every = [task for result in results.values() for task in tasks(result["rows"]) if task[1] == OURS]
-    head, body = ["op", "direction"], []
+    head, body = ["op"], []
     for result in results.values():
-        memory = [f"{result_file.machine_name(result)} [MiB]"] if result["machine"]["device"] == "cuda" else []
-        head += [f"{result_file.machine_name(result)} [ms]", *memory, f"{result_file.machine_name(result)}: of the roof"]
+        head += [f"{result_file.machine_name(result)} [ms]", "of the roof [%]"]
     for op, _, direction in dict.fromkeys(every):
-        cells = [op, direction]
+        cells = [f"{op} {direction}"]
         for result in results.values():
-            row = _find(result, (op, OURS, direction), BASE)
-            cells.append(_timing(row))
-            if result["machine"]["device"] == "cuda":
-                cells.append(figure(row["peak_bytes"] / 2**20) if row and "peak_bytes" in row else "")
-            cells.append(_roof(result["rows"], op, direction))
+            cells += [_timing(_find(result, (op, OURS, direction), BASE)), _roof(result["rows"], op, direction)]
         body.append(cells)
-    return markdown(head, body, WORDS)
-
-
-def peers_table(results: dict[str, dict]) -> str:
-    """Return the times of other programs at the largest size that both did."""
-    body = []
-    for result in results.values():
-        rows = result["rows"]
-        ours = {(r["op"], r["direction"], _key(r)): r for r in rows if r["program"] == OURS}
-        peers = [r for r in rows if r["program"] in PEERS and _plain(r) and (r["op"], r["direction"], _key(r)) in ours]
-        for op, program, direction in sorted(tasks(peers), key=lambda t: (t[0], t[2], t[1])):
-            r = max((r for r in peers if (r["op"], r["program"], r["direction"]) == (op, program, direction)), key=_key)
-            mine = ours[r["op"], r["direction"], _key(r)]
-            size = ", ".join(filter(None, _sizes(r, ["N", "image"])))
-            cells = [program, _timing(r), _timing(mine), figure(r["median_ms"] / mine["median_ms"])]
-            body.append([result_file.machine_name(result), op, direction, size, *cells])
-    head = ["machine", "op", "direction", "Gaussians, image", "other", "other [ms]", "warpgs [ms]", "other / warpgs"]
     return markdown(head, body, WORDS)
 
 
@@ -191,14 +167,10 @@ def parts() -> dict[str, str]:
     """Return the generated parts of docs/performance.md by name."""
     ops, others, steps, turns = (result_file.stored(kind) for kind in ("ops", "rasterizers", "training_steps", "turns"))
     sources, beside = _sources("ops", ops), next(iter(others.values()))
-    gswarp = result_file.read(result_file.FOLDER / "gswarp_h200.json")
     return {
         "sizes": sizes_table(ops) + sources,
         "rasterizers": rasterizers_page.times_table(beside) + _sources("rasterizers", others),
-        "gswarp": rasterizers_page.gpu_table(gswarp, (OURS, "gswarp")) + "\n" + result_file.source("gswarp_h200"),
-        "many channels": rasterizers_page.times_table(beside, 32),
         "steps": rasterizers_page.steps_table(next(iter(steps.values()))) + _sources("training_steps", steps),
         "whole fits": fits_table(turns) + _sources("turns", turns),
         "ops": ops_table(ops),
-        "other programs": peers_table(ops),
     }

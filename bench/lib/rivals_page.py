@@ -52,11 +52,10 @@ def arms_table(arms: Sequence[Arm], rows: list[dict], names: Sequence[str], abov
                 f"{d.mean:+.2f} [{d.low:+.2f}, {d.high:+.2f}]" if len(seeds) >= SEEDS else f"{d.mean:+.2f}" if seeds else ""
             )
             count = "" if len(own) == max(len(s) for s in found.values()) else f" ({len(own)} seed{'s' * (len(own) > 1)})"
-            score = f"{mean_sd([r['psnr'] for r in own.values()])} / {statistics.mean(r['ssim'] for r in own.values()):.3f}"
+            score = " / ".join(f"{statistics.mean(r[k] for r in own.values()):.{n}f}" for k, n in (("psnr", 2), ("ssim", 3)))
             body[-1] += [f"{steps_in(preset):,}", score + count, change]
     scenes = [name.split(":")[0] for name in names]
-    what = "change" if above else f"difference to {arms[0].words}"
-    head = [heading for s in scenes for heading in (f"{s}: steps", f"{s}: PSNR / SSIM", what)]
+    head = [heading for s in scenes for heading in (f"{s}: steps", "PSNR / SSIM", "change" if above else "difference")]
     return markdown(["step" if above else "method", *head], body, ["step" if above else "method"])
 
 
@@ -98,7 +97,7 @@ def other_steps_table(arms: Sequence[Arm], rows: list[dict], names: Sequence[str
                     body[-1].append(
                         f"{statistics.mean(own[s]['psnr'] - first[s]['psnr'] for s in seeds):+.2f}" if seeds else ""
                     )
-    head = ["scene", "method", "steps", "PSNR", f"difference to {arms[0].words}"]
+    head = ["scene", "method", "steps", "PSNR", "difference"]
     return markdown(head, body, ["scene", "method"])
 
 
