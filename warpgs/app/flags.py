@@ -192,7 +192,9 @@ def _refuse_unknown_flag(kind: type, arguments: list[str], program: str) -> None
     for word in arguments:
         flag = word.partition("=")[0].replace("_", "-")
         if re.match(r"--|-[A-Za-z]", flag) and flag not in known:
-            hint = did_you_mean(flag, known) or f"`{program} --help-all` lists the flags"
+            from warpgs.pipeline.train.settings import removed_note
+
+            hint = removed_note(flag[2:]) or did_you_mean(flag, known) or f"`{program} --help-all` lists the flags"
             raise UsageError(f"unknown flag {flag}; {hint}")
 
 
