@@ -3,6 +3,7 @@
 import dataclasses
 
 import pytest
+from warpgs.pipeline.train.strategies.importance_sampling import MethodConfig
 
 from tests.pipeline.test_table_files import cells
 from warpgs.app.cli import main
@@ -12,7 +13,6 @@ from warpgs.pipeline.run.fit import fit_request
 from warpgs.pipeline.study.study import ABLATION_ROWS, SWITCHES, ablation_variants
 from warpgs.pipeline.train.presets import PRESETS
 from warpgs.pipeline.train.settings import FitConfig
-from warpgs.pipeline.train.strategies.importance_sampling import MethodConfig
 from warpgs.synthetic.demo import split_spec, write_demo
 
 FULL = FitConfig(

@@ -5,6 +5,8 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
+from warpgs.pipeline.train.sampling import SamplerConfig
+from warpgs.pipeline.train.strategies.importance_sampling import MethodConfig
 
 from tests.allocations import Allocations
 from tests.example_terms import DepthCorrelation
@@ -16,12 +18,10 @@ from warpgs.kernels import blend, project, tiles
 from warpgs.pipeline.model.start import InitConfig
 from warpgs.pipeline.train.loss import LOSS_TERMS, LossTerm
 from warpgs.pipeline.train.memory import most_instances, plan
-from warpgs.pipeline.train.sampling import SamplerConfig
 from warpgs.pipeline.train.schedule import PhaseConfig
 from warpgs.pipeline.train.settings import FitConfig
 from warpgs.pipeline.train.stopping import StoppingConfig
 from warpgs.pipeline.train.strategies.clone_split import DensityConfig
-from warpgs.pipeline.train.strategies.importance_sampling import MethodConfig
 from warpgs.pipeline.train.trainer import Trainer
 from warpgs.pipeline.train.view_modules import Exposure, RefinePoses
 from warpgs.render.options import RasterizeOptions

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
+from warpgs.pipeline.train.sampling import SamplerConfig
+from warpgs.pipeline.train.strategies.importance_sampling import MethodConfig
 
 from tests.example_terms import DepthCorrelation
 from tests.scenes import photos, priors, seeds
@@ -15,11 +17,9 @@ from warpgs.pipeline.metrics.scores import render_view, score
 from warpgs.pipeline.model.start import InitConfig
 from warpgs.pipeline.run import precompile
 from warpgs.pipeline.run.precompile import fit_kernels
-from warpgs.pipeline.train.sampling import SamplerConfig
 from warpgs.pipeline.train.schedule import OptimizerConfig, PhaseConfig
 from warpgs.pipeline.train.settings import FitConfig
 from warpgs.pipeline.train.strategies.clone_split import DensityConfig
-from warpgs.pipeline.train.strategies.importance_sampling import MethodConfig
 from warpgs.pipeline.train.trainer import Trainer
 from warpgs.render.options import RasterizeOptions
 

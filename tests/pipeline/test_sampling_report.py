@@ -6,6 +6,8 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from warpgs.pipeline.train.sampling import SamplerConfig
+from warpgs.pipeline.train.strategies.importance_sampling import MethodConfig, ProtectConfig
 
 from tests.scenes import photos, priors, seeds
 from warpgs.errors import ResourceError
@@ -13,11 +15,9 @@ from warpgs.pipeline.model.start import InitConfig
 from warpgs.pipeline.run import results
 from warpgs.pipeline.run.folder import load_checkpoint, save_checkpoint
 from warpgs.pipeline.run.results import SHEET_WIDTH, event_figures, images_kept, sampling_report_of, shown_steps, view_sheet
-from warpgs.pipeline.train.sampling import SamplerConfig
 from warpgs.pipeline.train.schedule import PhaseConfig, plan_phases
 from warpgs.pipeline.train.settings import FitConfig
 from warpgs.pipeline.train.strategies.clone_split import DensityConfig
-from warpgs.pipeline.train.strategies.importance_sampling import MethodConfig, ProtectConfig
 from warpgs.pipeline.train.trainer import Trainer
 from warpgs.report.images import CONTACT_GAP, CONTACT_HEAD, CONTACT_MARGIN, DOT, TITLE_SIZE, colored, webp
 

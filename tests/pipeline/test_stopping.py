@@ -6,6 +6,8 @@ import math
 
 import pytest
 import torch
+from warpgs.pipeline.train.sampling import SamplerConfig
+from warpgs.pipeline.train.strategies.importance_sampling import MethodConfig
 
 from tests.scenes import photos, seeds
 from warpgs.app.cli import main
@@ -13,12 +15,10 @@ from warpgs.errors import DataError, UsageError
 from warpgs.pipeline.model.start import InitConfig
 from warpgs.pipeline.run.folder import load_checkpoint, save_checkpoint
 from warpgs.pipeline.train.presets import PRESETS
-from warpgs.pipeline.train.sampling import SamplerConfig
 from warpgs.pipeline.train.schedule import PhaseConfig
 from warpgs.pipeline.train.settings import FitConfig
 from warpgs.pipeline.train.stopping import Stopping, StoppingConfig
 from warpgs.pipeline.train.strategies.clone_split import DensityConfig
-from warpgs.pipeline.train.strategies.importance_sampling import MethodConfig
 from warpgs.pipeline.train.strategies.mcmc import MCMCConfig
 from warpgs.pipeline.train.trainer import Trainer, complexity_figures, complexity_summary
 from warpgs.synthetic.demo import split_spec, write_demo

@@ -6,6 +6,8 @@ import threading
 import numpy as np
 import pytest
 import torch
+from warpgs.pipeline.train.sampling import SamplerConfig
+from warpgs.pipeline.train.strategies.importance_sampling import ImportanceSampling
 
 from tests.scenes import photos, priors, seeds
 from warpgs.errors import DataError
@@ -14,10 +16,8 @@ from warpgs.pipeline.model.start import InitConfig
 from warpgs.pipeline.train import setup
 from warpgs.pipeline.train import trainer as warmups
 from warpgs.pipeline.train.presets import PRESETS
-from warpgs.pipeline.train.sampling import SamplerConfig
 from warpgs.pipeline.train.settings import settings_by_views
 from warpgs.pipeline.train.setup import prepare
-from warpgs.pipeline.train.strategies.importance_sampling import ImportanceSampling
 from warpgs.pipeline.train.trainer import POINTS, STEPS, Trainer, background_warmup, run, warm_up
 from warpgs.priors.views import PriorConfig
 from warpgs.scene import ViewDepth
