@@ -216,7 +216,7 @@ class PriorConfig(Checked):
     """Use the depth network's map in views without a map of --depths, to place Gaussians and guide the fit."""
     segmentation_model: str | None = None
     """ONNX file of a segmentation network for the 21 PASCAL VOC classes; without one, saliency and edges are used."""
-    onnx_provider: Annotated[str, PROVIDERS] = "cpu"
+    onnx_provider: Annotated[str, tuple(PROVIDERS)] = "cpu"
     """Device of the networks: cpu or cuda."""
 
     def __post_init__(self) -> None:

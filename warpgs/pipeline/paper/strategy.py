@@ -8,6 +8,7 @@ from typing import Annotated
 
 import torch
 
+from warpgs.device import FLOAT, SAMPLING, STEP, Needs, StepSizes
 from warpgs.pipeline.paper.scores import (
     Residual,
     gain_map,
@@ -91,6 +92,11 @@ class Paper(Sampling):
         """Return whether an event reads the semantic or the geometric score, which are computed from priors."""
         _, semantic, geometry = own.weights()
         return semantic > 0 or geometry > 0 or own.asked_quantile > 0
+
+    def bytes(self, sizes: StepSizes) -> Needs:
+        """Return the bytes of an event, and of both scores of every view at any time."""
+        kept = 2 * FLOAT * sizes.pixels * sizes.views * self.needs_priors(self.config)
+        return {**dict.fromkeys(STEP, kept), SAMPLING: kept + super().bytes(sizes)[SAMPLING]}
 
     def setup(self) -> None:
         """Compute the semantic and the geometric score of each view, which do not change during the fit."""
