@@ -110,9 +110,9 @@ def test_alpha_term_is_a_mean_absolute_difference(masked):
 
     expected = (rendered - true).abs()[mask > 0].mean() if masked else (rendered - true).abs().mean()
     assert term(true) == pytest.approx(0.5 * float(expected), rel=1e-5) and term(None) == 0
-    with pytest.raises(UsageError, match="alpha.weight"):
+    with pytest.raises(UsageError, match=r"alpha\.weight"):
         AlphaDifference(-1.0)
-    with pytest.raises(UsageError, match="loss.alpha-weight"):
+    with pytest.raises(UsageError, match=r"loss\.alpha-weight"):
         LossConfig(alpha_weight=float("nan"))
 
 

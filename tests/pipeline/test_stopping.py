@@ -166,7 +166,7 @@ def test_only_the_product_presets_stop_early():
 
 @pytest.mark.parametrize("bad", [{"min_gain_db": x} for x in (-1, math.inf, math.nan)])
 def test_bad_settings_are_refused(bad):
-    with pytest.raises(UsageError, match="stopping.min-gain-db must be at least 0 and finite"):
+    with pytest.raises(UsageError, match=r"stopping\.min-gain-db must be at least 0 and finite"):
         StoppingConfig(**bad)
 
 

@@ -116,11 +116,9 @@ def test_priors_are_made_where_an_event_reads_them(setting, needed, monkeypatch)
     asked = []
     monkeypatch.setattr(setup, "view_priors", lambda *a, **k: (asked.append(1), ([], []))[-1])
     base = PRESETS["default"]
-    config = dataclasses.replace(
-        base, strategy="paper" if setting else "sampling", strategy_config=dataclasses.replace(UNIFORM, **setting) if setting else None,
-        init=InitConfig(source="random"),
-        priors=PriorConfig(segmentation_model="labels.onnx"),
-    )  # fmt: skip
+    own = {"strategy": "paper", "strategy_config": dataclasses.replace(UNIFORM, **setting)} if setting else {}
+    priors = PriorConfig(segmentation_model="labels.onnx")
+    config = dataclasses.replace(base, **own, init=InitConfig(source="random"), priors=priors)
     made = prepare(photos(2), None, config, np.random.default_rng(0), CPU, None, lambda: None)
     assert bool(asked) == needed
     assert any("--segmentation-model is not used" in note for note in made.notes) != needed

@@ -178,7 +178,7 @@ def test_a_network_of_the_other_kind_is_refused(tmp_path):
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
-        ({"onnx_provider": "tpu"}, "'tpu' is not one of cpu, cuda"),
+        ({"onnx_provider": "tpu"}, "onnx-provider must be one of cpu, cuda, not 'tpu'"),
         ({"depth_guides": True}, "--depth-guides requires --depth-model"),
     ],
 )
