@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import gc
 import json
+import re
 import statistics
 import tempfile
 import time
@@ -18,10 +19,11 @@ import torch
 import warpgs
 from bench.lib import gsplat_trainer
 from bench.lib.scenes import folds, scene_at
-from bench.lib.training import finish, full_bytes, make_trainer, model_bytes
+from bench.lib.training import full_bytes, make_trainer
 from warpgs.errors import UsageError
 from warpgs.io.load import split_views
-from warpgs.pipeline.metrics.scores import render_view, score
+from warpgs.pipeline.metrics.scores import score
+from warpgs.pipeline.paper.strategy import UNIFORM
 from warpgs.pipeline.run.commands import prune
 from warpgs.pipeline.run.precompile import precompile_kernels
 from warpgs.pipeline.run.request import SceneRequest
@@ -84,8 +86,18 @@ def config_of(preset: str, seed: int = 0) -> FitConfig:
     if name not in PRESETS:
         raise UsageError(f"preset {name!r} is not one of {', '.join(PRESETS)}")
     values = PRESETS[name].to_json() | {"seed": seed}
-    _change(values, preset, changes)
+    _change(values, preset, _present(changes))
     return FitConfig.from_json(values)
+
+
+def _present(changes: str) -> str:
+    """Return changes by the present names of settings; stored rows of `default` have some of version 0.2.0."""
+    parts = changes.replace("method.events=false", "strategy=clone_split").split(",")
+    renamed = [re.sub(r"^method\.(s_\w+|ra|agp|pm)=", r"paper.\1=", part) for part in parts]
+    if renamed == parts:
+        return ",".join(parts)
+    uniform = [f"paper.{n}={json.dumps(v)}" for n, v in dataclasses.asdict(UNIFORM).items()]
+    return ",".join(["strategy=paper", *uniform, *renamed])
 
 
 def peer_settings(preset: str, train: list[View]) -> gsplat_trainer.Settings:
@@ -212,17 +224,3 @@ def scores(images: Iterable[np.ndarray], views: list[View]) -> dict:
     rows = [score(view, image) for view, image in zip(views, images, strict=True)]
     by_view = {row.name: row.psnr for row in rows}
     return {"psnr": statistics.mean(by_view.values()), "ssim": statistics.mean(r.ssim for r in rows), "views": by_view}
-
-
-def bare_fit(scene: Scene, train: list[View], test: list[View], config: FitConfig, device: torch.device) -> dict:
-    """Return wall and processor time [s] of one of our fits, without reading and reporting, its size and its scores."""
-    wall, cpu = time.perf_counter(), time.process_time()
-    trainer = make_trainer(train, scene.points, config, device, scene.background)
-    points, setup, setup_cpu = len(trainer.gaussians), time.perf_counter() - wall, time.process_time() - cpu
-    finish(trainer)
-    row = {
-        "points": points, "seconds": time.perf_counter() - wall, "setup": setup, "cpu_seconds": time.process_time() - cpu,
-        "setup_cpu": setup_cpu, "gaussians": len(trainer.gaussians), "bytes": model_bytes(trainer), "steps": config.steps,
-    }  # fmt: skip
-    options = trainer.context.render_options()
-    return row | scores((render_view(trainer.gaussians, v, options)[0] for v in test), test)
