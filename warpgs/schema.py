@@ -283,7 +283,8 @@ class Checked:
         Raises:
             UsageError: A value is not allowed.
         """
-        for name, rule in _rules(type(self)):
+        kind: Any = type(self)
+        for name, rule in _rules(kind):
             value = getattr(self, name)
             if value is None or (rule.allows(value) if isinstance(rule, Within) else value in rule):
                 continue
