@@ -28,7 +28,7 @@ WHOLE = "expected an integer, got"
         ("fit scene --out run --time-budget 1e39", "--time-budget: expected a finite number of at most 3e+38, got '1e39'"),
         ("fit scene --out run --seed 1.5", f"--seed: {WHOLE} '1.5'; `warpgs fit --help` lists its arguments"),
         ("fit scene --out run --method.hier x", "--method.hier: expected true, false or none, got 'x'"),
-        ("fit scene --out run --depth-mean 1 2", "--depth-mean needs 3 values, got 2; `warpgs fit --help` lists"),
+        ("fit scene --out run --depth-mean 1 2", "unknown flag --depth-mean; the setting depth-mean was removed: give it in"),
         ("mesh run", "--out PATH is missing; `warpgs mesh --help` lists its arguments"),
         ("convert a", "TARGET is missing; `warpgs convert --help` lists its arguments"),
         ("demo", "FOLDER is missing; `warpgs demo --help` lists its arguments"),

@@ -134,8 +134,9 @@ def test_a_continued_fit_equals_one_in_one_go(run, tmp_path):
         assert torch.equal(t, getattr(whole.gaussians(), name)), name
 
 
-def test_no_axis_is_below_what_cameras_resolve():
+def test_no_axis_is_below_what_cameras_resolve(monkeypatch):
     """With the default limit every axis ends at 0.45 px or above of the finest camera; without the flag many are below."""
+    monkeypatch.setattr(limits, "MIN_PIXELS", 0.2**0.5)
     rows = TrainingCameras.of(ring(4), CPU).rows
     below = []
     for antialiased in (True, False):

@@ -1,16 +1,21 @@
 """The paper's strategy: scores and gate on images with known scores, the gain against renders, and fits with every switch."""
 
+import ast
 import dataclasses
+import importlib
 import itertools
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
+import warpgs
 from tests.scenes import photos, priors, ring, seeds, three_gaussians
 from tests.tolerances import GAIN
 from warpgs.constants import LOW_PASS, Rule
 from warpgs.errors import UsageError
+from warpgs.pipeline import paper
 from warpgs.pipeline.model.start import InitConfig
 from warpgs.pipeline.paper import scores
 from warpgs.pipeline.paper.scores import (
@@ -348,3 +353,16 @@ def test_wrong_settings_are_refused():
     ):
         with pytest.raises(UsageError, match=words):
             PaperConfig(**wrong)
+
+
+def test_the_room_of_the_paper_uses_public_names_alone():
+    """What its modules import from others is on the faces, so that it stands beside a strategy of one's own."""
+    folder = Path(paper.__file__).parent
+    used = set()
+    for file in folder.glob("*.py"):
+        for node in ast.walk(ast.parse(file.read_text("utf-8"))):
+            if isinstance(node, ast.ImportFrom) and node.module.startswith("warpgs") and "paper" not in node.module:
+                module = importlib.import_module(node.module)
+                used |= {(a.name, id(getattr(module, a.name))) for a in node.names}
+    public = {id(getattr(face, name)) for face in (warpgs, warpgs.train) for name in face.__all__}
+    assert len(used) > 10 and {name for name, own in used if own not in public} == set()

@@ -67,7 +67,10 @@ def test_stored_settings_are_those_of_the_preset(preset):
     config = PRESETS[preset]
     values, lost = upgraded(old(config))
     assert not lost and values == config.to_json() and FitConfig.from_json(values) == config
-    assert upgraded(config.to_json()) == (config.to_json(), [])
+    assert upgraded(config.to_json()) == (config.to_json(), []) and FitConfig.from_json(old(config)) == config
+    values["method"]["colour"] = 1
+    with pytest.raises(UsageError, match="another version"):
+        FitConfig.from_json(values)
 
 
 def test_strategies_follow_from_the_switches():

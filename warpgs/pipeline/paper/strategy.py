@@ -8,7 +8,7 @@ from typing import Annotated
 
 import torch
 
-from warpgs.device import FLOAT, SAMPLING, STEP, Needs, StepSizes
+from warpgs.device import STEP, Needs, StepSizes
 from warpgs.pipeline.paper.scores import (
     Residual,
     gain_map,
@@ -95,8 +95,8 @@ class Paper(Sampling):
 
     def bytes(self, sizes: StepSizes) -> Needs:
         """Return the bytes of an event, and of both scores of every view at any time."""
-        kept = 2 * FLOAT * sizes.pixels * sizes.views * self.needs_priors(self.config)
-        return {**dict.fromkeys(STEP, kept), SAMPLING: kept + super().bytes(sizes)[SAMPLING]}
+        kept = 2 * 4 * sizes.pixels * sizes.views * self.needs_priors(self.config)  # float32
+        return {moment: kept + n for moment, n in (dict.fromkeys(STEP, 0) | super().bytes(sizes)).items()}
 
     def setup(self) -> None:
         """Compute the semantic and the geometric score of each view, which do not change during the fit."""

@@ -159,7 +159,9 @@ class FitConfig(Checked):
         """
         mapping(anything)(values, "config")
         try:
-            values = dict(values)
+            values, lost = upgraded(values)
+            if lost:
+                raise UsageError(f"this version does not have the settings {', '.join(lost)}")
             parts = {n: tuple(_part(registry, dict(p), n) for p in values.pop(n)) for n, registry in _PARTS.items()}
             own = values.pop("strategy_config")
             kind = find_strategy(values["strategy"]).Config
