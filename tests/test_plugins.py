@@ -59,7 +59,7 @@ def test_registered_classes_are_found_by_name(registry):
 
 def test_ours_are_found_without_being_named_anywhere():
     """Every module of the folder is imported; a name is the class's own."""
-    assert {"clone_split", "importance_sampling", "mcmc"} <= set(STRATEGIES.names())
+    assert {"clone_split", "mcmc", "paper", "sampling"} <= set(STRATEGIES.names())
     assert all(STRATEGIES.find(n).name == n for n in STRATEGIES.names())
     assert {"photometric", "alpha"} <= set(LOSS_TERMS.names())
 

@@ -17,7 +17,7 @@ def test_a_tiny_scene_passes_35_db_in_200_steps():
     views = photos(7)
     config = FitConfig(
         steps=200, init=InitConfig(source="points"), sh_degree=0,
-        optimizer=OptimizerConfig(means_lr=2e-3, means_lr_final=2e-4, scales_lr=0.03, sh_lr=0.02),
+        optimizer=OptimizerConfig(means_lr=2e-3, scales_lr=0.03, sh_lr=0.02),
     )  # fmt: skip
     fit = Trainer([v for i, v in enumerate(views) if i != 3], seeds(), config, torch.device("cpu"))
     losses = [fit.advance()[0].loss for _ in range(200)]

@@ -36,9 +36,9 @@ class Registry(Generic[T]):
     name in a stored file never causes an import.
     """
 
-    def __init__(self, kind: str, base: type[T], package: str):
-        """Start without classes."""
-        self.kind, self.base, self.package = kind, base, package
+    def __init__(self, kind: str, base: type[T], *packages: str):
+        """Start without classes; ``packages`` are dotted names of packages or modules of the built-in ones."""
+        self.kind, self.base, self.packages = kind, base, packages
         self._classes: dict[str, type[T]] = {}
         self._searched = False
 
@@ -60,9 +60,10 @@ class Registry(Generic[T]):
     def names(self) -> list[str]:
         """Return the names of the registered classes, sorted; names of the form ``module:Class`` are left out."""
         if not self._searched:
-            package = importlib.import_module(self.package)
-            for module in pkgutil.iter_modules(getattr(package, "__path__", [])):
-                importlib.import_module(f"{self.package}.{module.name}")
+            for name in self.packages:
+                package = importlib.import_module(name)
+                for module in pkgutil.iter_modules(getattr(package, "__path__", [])):
+                    importlib.import_module(f"{name}.{module.name}")
             self._searched = True
         return sorted(n for n in self._classes if ":" not in n)
 

@@ -6,14 +6,16 @@ value.
 
 from __future__ import annotations
 
+import functools
 import json
 import math
 import types
 import typing
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar, NamedTuple
 
+from warpgs.errors import UsageError
 from warpgs.files import read_input
 
 MAX_BYTES = 2**25
@@ -209,3 +211,68 @@ def of_type(hint: Any) -> Schema:
 def _refuse(value: Any, place: str, wanted: str) -> None:
     found = repr(value)[:60] if isinstance(value, (str, float, bool, type(None))) else type(value).__name__
     raise SchemaError(f"{place[:100] or 'it'} must be {wanted}, not {found}")
+
+
+class Within(NamedTuple):
+    """Numbers that a setting allows, for `typing.Annotated`: from ``low`` to ``high``, without NaN."""
+
+    low: float = -math.inf
+    high: float = math.inf
+    open: str = ""
+    """Ends that are left out: "(" for ``low``, ")" for ``high``."""
+    zero: bool = False
+    """Whether 0 is allowed, too; it switches a limit off."""
+
+    def allows(self, value: float) -> bool:
+        """Return whether a number is in the range."""
+        ends = ("(" in self.open and value == self.low) or (")" in self.open and value == self.high)
+        return (self.low <= value <= self.high and not ends) or (self.zero and value == 0)
+
+    def __str__(self) -> str:
+        """Return the range in words."""
+        off = "0 (no limit), or " * self.zero
+        if self.high == math.inf:
+            return f"{off}{'above' if '(' in self.open else 'at least'} {self.low:g}{' and finite' * (')' in self.open)}"
+        ends = "(" if "(" in self.open else "[", ")" if ")" in self.open else "]"
+        return f"{off}in {ends[0]}{self.low:g}, {self.high:g}{ends[1]}"
+
+
+class Checked:
+    """Base of a dataclass of settings that checks its fields against their `Within`, or a tuple of allowed values."""
+
+    group: ClassVar[str] = ""
+    """Beginning of the names of the settings in messages, such as ``init.``."""
+
+    def __init_subclass__(cls, group: str | None = None, **others: Any) -> None:
+        """Take the name of the group of settings."""
+        super().__init_subclass__(**others)
+        if group is not None:
+            cls.group = group
+
+    def __post_init__(self) -> None:
+        """Check every field; None stands for an automatic choice.
+
+        Raises:
+            UsageError: A value is not allowed.
+        """
+        kind: Any = type(self)
+        for name, rule in _rules(kind):
+            value = getattr(self, name)
+            if value is None or (rule.allows(value) if isinstance(rule, Within) else value in rule):
+                continue
+            wanted = str(rule) if isinstance(rule, Within) else f"one of {', '.join(rule)}"
+            shown = value if isinstance(rule, Within) else repr(value)[:60]
+            raise UsageError(f"{self.group}{name.replace('_', '-')} must be {wanted}, not {shown}")
+
+
+@functools.cache
+def _rules(kind: type) -> tuple[tuple[str, Any], ...]:
+    """Return name and rule of each field with a range or a list of values."""
+    hints = typing.get_type_hints(kind, include_extras=True)
+    rules = ((name, rule) for name, hint in hints.items() for rule in getattr(_inner(hint), "__metadata__", ()))
+    return tuple((name, rule) for name, rule in rules if isinstance(rule, tuple))
+
+
+def _inner(hint: Any) -> Any:
+    """Return the type of a hint ``... | None`` that carries metadata; the hint itself otherwise."""
+    return next((part for part in typing.get_args(hint) if hasattr(part, "__metadata__")), hint)

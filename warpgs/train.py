@@ -8,6 +8,7 @@ from warpgs.faces import lazy
 
 __all__ = [
     "STEP",
+    "Checked",
     "CloneSplit",
     "Column",
     "DensityUpdate",
@@ -22,6 +23,8 @@ __all__ = [
     "OptimizerConfig",
     "Phases",
     "Prior",
+    "Rendered",
+    "Sampling",
     "Setting",
     "Settings",
     "StepSizes",
@@ -32,11 +35,15 @@ __all__ = [
     "Tensors",
     "TrainingView",
     "ViewModule",
+    "Within",
+    "back_project_tensors",
     "captured_renderer",
     "eager_renderer",
     "join_ranks",
     "most_instances",
     "photometric_loss",
+    "project_tensors",
+    "quantiles",
     "register_loss_term",
     "register_strategy",
     "register_view_module",
@@ -47,8 +54,10 @@ __all__ = [
 
 if TYPE_CHECKING:
     from warpgs.device import STEP, Needs, StepSizes
+    from warpgs.geometry import back_project_tensors, project_tensors
     from warpgs.kernels.ssim import ssim
     from warpgs.kernels.update import Setting
+    from warpgs.pipeline.metrics.scores import quantiles
     from warpgs.pipeline.model.start import InitConfig
     from warpgs.pipeline.model.table import Column, DensityUpdate, Table
     from warpgs.pipeline.train.loss import LossInputs, LossTerm, Target, photometric_loss, total
@@ -59,11 +68,13 @@ if TYPE_CHECKING:
     from warpgs.pipeline.train.strategies.base import Growth, Settings, Strategy, StrategyContext
     from warpgs.pipeline.train.strategies.base import register as register_strategy
     from warpgs.pipeline.train.strategies.clone_split import CloneSplit, GradientGrowth
+    from warpgs.pipeline.train.strategies.sampling import Rendered, Sampling
     from warpgs.pipeline.train.view_modules import FittedViews, Tensors, ViewModule
     from warpgs.pipeline.train.view_modules import register as register_view_module
     from warpgs.pipeline.train.views import LearnedView, TrainingView
     from warpgs.ranks import join as join_ranks
     from warpgs.scene import Prior
+    from warpgs.schema import Checked, Within
     from warpgs.schema import fields as state_schema
 else:
     __getattr__, __dir__ = lazy(
@@ -82,10 +93,13 @@ else:
         ("warpgs.pipeline.train.strategies.base", "Strategy", "register as register_strategy"),
         ("warpgs.pipeline.train.strategies.clone_split", "CloneSplit"),
         ("warpgs.pipeline.train.strategies.clone_split", "GradientGrowth"),
+        ("warpgs.pipeline.train.strategies.sampling", "Rendered", "Sampling"),
+        ("warpgs.geometry", "back_project_tensors", "project_tensors"),
+        ("warpgs.pipeline.metrics.scores", "quantiles"),
         ("warpgs.pipeline.train.view_modules", "FittedViews", "Tensors", "ViewModule", "register as register_view_module"),
         ("warpgs.pipeline.train.views", "TrainingView"),
         ("warpgs.ranks", "join as join_ranks"),
         ("warpgs.device", "STEP", "Needs", "StepSizes"),
         ("warpgs.scene", "Prior"),
-        ("warpgs.schema", "fields as state_schema"),
+        ("warpgs.schema", "Checked", "Within", "fields as state_schema"),
     )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import gc
 import json
+import re
 import statistics
 import tempfile
 import time
@@ -22,6 +23,7 @@ from bench.lib.training import full_bytes, make_trainer
 from warpgs.errors import UsageError
 from warpgs.io.load import split_views
 from warpgs.pipeline.metrics.scores import score
+from warpgs.pipeline.paper.strategy import UNIFORM
 from warpgs.pipeline.run.commands import prune
 from warpgs.pipeline.run.precompile import precompile_kernels
 from warpgs.pipeline.run.request import SceneRequest
@@ -84,8 +86,18 @@ def config_of(preset: str, seed: int = 0) -> FitConfig:
     if name not in PRESETS:
         raise UsageError(f"preset {name!r} is not one of {', '.join(PRESETS)}")
     values = PRESETS[name].to_json() | {"seed": seed}
-    _change(values, preset, changes)
+    _change(values, preset, _present(changes))
     return FitConfig.from_json(values)
+
+
+def _present(changes: str) -> str:
+    """Return changes by the present names of settings; stored rows of `default` have some of version 0.2.0."""
+    parts = changes.replace("method.events=false", "strategy=clone_split").split(",")
+    renamed = [re.sub(r"^method\.(s_\w+|ra|agp|pm)=", r"paper.\1=", part) for part in parts]
+    if renamed == parts:
+        return ",".join(parts)
+    uniform = [f"paper.{n}={json.dumps(v)}" for n, v in dataclasses.asdict(UNIFORM).items()]
+    return ",".join(["strategy=paper", *uniform, *renamed])
 
 
 def peer_settings(preset: str, train: list[View]) -> gsplat_trainer.Settings:

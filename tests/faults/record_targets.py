@@ -234,7 +234,6 @@ steps = 40
 memory-limit = "2GiB"
 loss-terms = "alpha"
 depth-model = "d.onnx"
-depth-mean = [0.5, 0.5, 0.5]
 init.opacity = 0.25
 cuda-graph = true
 

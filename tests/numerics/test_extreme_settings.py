@@ -10,25 +10,25 @@ from tests.scenes import photos, priors, seeds
 from warpgs.errors import UsageError
 from warpgs.pipeline.model.limits import LimitConfig
 from warpgs.pipeline.model.start import InitConfig
+from warpgs.pipeline.paper.strategy import PaperConfig
 from warpgs.pipeline.train.loss import LossConfig
-from warpgs.pipeline.train.sampling import ImportanceConfig, SamplerConfig
 from warpgs.pipeline.train.schedule import OptimizerConfig, PhaseConfig
 from warpgs.pipeline.train.settings import FitConfig
 from warpgs.pipeline.train.stopping import StoppingConfig
 from warpgs.pipeline.train.strategies.clone_split import DensityConfig
-from warpgs.pipeline.train.strategies.importance_sampling import MethodConfig, ProtectConfig
+from warpgs.pipeline.train.strategies.sampling import MethodConfig, SamplerConfig
 from warpgs.pipeline.train.trainer import Trainer
 
 NUMBERS = [math.nan, math.inf, -1, 0, 1e-300, 1, 3, 1e300]
 KINDS = [
-    DensityConfig, OptimizerConfig, LossConfig, ImportanceConfig, SamplerConfig, ProtectConfig, PhaseConfig, MethodConfig,
+    DensityConfig, OptimizerConfig, LossConfig, SamplerConfig, PhaseConfig, PaperConfig, MethodConfig,
     InitConfig, StoppingConfig, LimitConfig, FitConfig,
 ]  # fmt: skip
 SHORT = FitConfig(
-    steps=4, init=InitConfig(source="points"), sh_degree=1, sh_every=2, phases=PhaseConfig(coarse=1, every=1),
+    steps=4, init=InitConfig(source="points"), sh_degree=1, sh_every=2, phases=PhaseConfig(coarse=200),
     density=DensityConfig(start=1, every=2, stop_fraction=1.0, gradient=1e-6),
-    max_gaussians=200, strategy="importance_sampling",
-    method=MethodConfig(events=True, hier=True, pm=False, sampler=SamplerConfig(min_alpha=0.01)),
+    max_gaussians=200, strategy="paper", strategy_config=PaperConfig(pm=False),
+    method=MethodConfig(hier=True),
 )  # fmt: skip
 
 

@@ -22,11 +22,13 @@ from warpgs.kernels.update import adam_step
 from warpgs.pipeline.metrics.scores import quantiles
 from warpgs.pipeline.model.start import InitConfig, initial_gaussians, initial_points
 from warpgs.pipeline.model.table import Column, DensityUpdate, Table
+from warpgs.pipeline.paper.scores import geometry_gate, normalized
 from warpgs.pipeline.run.folder import TENSORS, load_checkpoint, save_checkpoint
 from warpgs.pipeline.train.loss import photometric_loss
-from warpgs.pipeline.train.sampling import geometry_gate, normalized, sample_pixels
 from warpgs.pipeline.train.settings import FitConfig
+from warpgs.pipeline.train.strategies import clone_split
 from warpgs.pipeline.train.strategies.clone_split import DensityConfig, refine
+from warpgs.pipeline.train.strategies.sampling import sample_pixels
 from warpgs.pipeline.train.trainer import Trainer, run
 from warpgs.render.rasterize import rasterize
 from warpgs.scene import Normalization, PointCloud, View
@@ -138,9 +140,10 @@ def test_cameras_without_extent(device, kind, source):
 # T4, T5, T6: everything pruned, rows and moments
 
 
-def test_pruning_everything_leaves_one_and_the_fit_goes_on(device):
+def test_pruning_everything_leaves_one_and_the_fit_goes_on(device, monkeypatch):
     """A threshold that no opacity reaches: one Gaussian stays at each event, and later steps still work."""
-    density = DensityConfig(start=1, every=2, stop_fraction=1.0, prune_opacity=1.0, gradient=math.inf)
+    density = DensityConfig(start=1, every=2, stop_fraction=1.0, gradient=math.inf)
+    monkeypatch.setattr(clone_split, "PRUNE_OPACITY", 1.0)
     fit = taken(photos(2), seeds(), device, steps=8, density=density)
     assert len(fit.gaussians) == 1
 
@@ -153,7 +156,7 @@ def test_a_set_of_none_is_legal(device):
     none = torch.zeros(0, dtype=torch.int64, device=device)
     table.apply(DensityUpdate(none, g.tensors(), none))
     change = refine(
-        g, torch.zeros(0, device=device), DensityConfig(prune_opacity=0.0), extent=1.0, capacity=9, after_reset=False,
+        g, torch.zeros(0, device=device), DensityConfig(), extent=1.0, capacity=9, after_reset=False,
         generator=torch.Generator(),
     )  # fmt: skip
     assert len(change.keep) == len(change.parents) == len(table) == 0

@@ -15,6 +15,7 @@ from warpgs.export.base import read_with_antialiasing
 from warpgs.export.meshes_and_cameras import write_cameras
 from warpgs.kernels.neighbours import pixel_size
 from warpgs.pipeline.metrics.scores import score
+from warpgs.pipeline.model import limits
 from warpgs.pipeline.model.limits import LimitConfig, TrainingCameras
 from warpgs.pipeline.model.start import InitConfig
 from warpgs.pipeline.run.commands import open_file
@@ -30,9 +31,16 @@ from warpgs.viewer.window import content_of_file, content_of_run
 CPU = torch.device("cpu")
 # points far below a pixel in size, so that every render with the filter is another than without
 SMALL = InitConfig(source="points", scale_factor=0.02)
-FREE = LimitConfig(min_pixels=0.0)
-CONFIG = warpgs.FitConfig(steps=6, init=SMALL, limits=FREE, antialiased=True, cpu_limit=False)
+CONFIG = warpgs.FitConfig(steps=6, init=SMALL, antialiased=True, cpu_limit=False)
 SPLIT = "train=00.png,01.png,02.png,03.png;test=04.png"
+
+
+@pytest.fixture(autouse=True, scope="module")
+def free():
+    """No limit of the smallest size, so that the filter is all that differs."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(limits, "MIN_PIXELS", 0.0)
+        yield
 
 
 def scene() -> Scene:
@@ -123,8 +131,9 @@ def test_a_continued_fit_equals_one_in_one_go(run, tmp_path):
         assert torch.equal(t, getattr(whole.gaussians(), name)), name
 
 
-def test_no_axis_is_below_what_cameras_resolve():
+def test_no_axis_is_below_what_cameras_resolve(monkeypatch):
     """With the default limit every axis ends at 0.45 px or above of the finest camera; without the flag many are below."""
+    monkeypatch.setattr(limits, "MIN_PIXELS", 0.2**0.5)
     rows = TrainingCameras.of(ring(4), CPU).rows
     below = []
     for antialiased in (True, False):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from tests.pipeline.test_importance_sampling import CONFIG as METHOD
+from tests.pipeline.test_paper import CONFIG as METHOD
 from tests.pipeline.test_slots import by_threads
 from tests.scenes import photos, priors, seeds
 from warpgs.errors import NotFiniteError

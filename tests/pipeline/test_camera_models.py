@@ -155,7 +155,7 @@ def test_a_fit_of_such_views_is_scored_written_and_opened_again(tmp_path):
     assert opened.model == NAME and np.array_equal(opened.distortion, views()[1].camera.distortion)
 
 
-@pytest.mark.parametrize("changes", [{"init_source": "random"}, {"strategy": "importance_sampling", "method_events": True}])
+@pytest.mark.parametrize("changes", [{"init_source": "random"}, {"strategy": "sampling"}])
 def test_settings_that_compare_views_are_refused_before_the_first_step(changes):
     scene = Scene("memory", "none", tuple(views()), points=seeds())
     with pytest.raises(UsageError, match=r"--preset 3dgs --init\.source points"):

@@ -8,6 +8,7 @@ import torch
 from tests.gaussians import cloud
 from warpgs.errors import UsageError
 from warpgs.pipeline.train.schedule import OptimizerConfig
+from warpgs.pipeline.train.strategies import clone_split
 from warpgs.pipeline.train.strategies.clone_split import DensityConfig, refine
 from warpgs.scene import Gaussians
 
@@ -88,12 +89,13 @@ def test_bad_settings_are_refused(bad):
         DensityConfig(**bad)
 
 
-def test_protected_are_not_pruned_and_only_the_growing_grow():
+def test_protected_are_not_pruned_and_only_the_growing_grow(monkeypatch):
     """Two faint ones, one of them protected; two that are pulled at, one of which may grow."""
+    monkeypatch.setattr(clone_split, "CLONE_SIZE", 1.0)
     gaussians = gaussians_of([0.1] * 4, [0.001, 0.001, 0.5, 0.5])
     pull = torch.tensor([0.0, 0, 1, 1])
     change = refine(
-        gaussians, pull, DensityConfig(clone_size=1.0), extent=1.0, capacity=100, after_reset=False,
+        gaussians, pull, DensityConfig(), extent=1.0, capacity=100, after_reset=False,
         generator=torch.Generator(),
         growing=torch.tensor([True, True, True, False]), protected=torch.tensor([True, False, False, False]),
     )  # fmt: skip

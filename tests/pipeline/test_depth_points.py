@@ -183,7 +183,7 @@ def test_fallbacks_are_said(tmp_path):
 
 @pytest.mark.parametrize(
     "bad",
-    [{"source": "magic"}, {"merge_px": -1}, {"fill_px": np.nan}, {"flow_range": "0"}, {"blend": "best"}, {"near_views": 0}],
+    [{"source": "magic"}, {"merge_px": -1}, {"fill_px": np.nan}, {"opacity": 1}],
 )
 def test_bad_settings_are_refused(bad):
     """Before any work, with the choices there are."""

@@ -14,14 +14,14 @@ from warpgs.app.cli import main
 from warpgs.device import StepSizes, add_needs
 from warpgs.kernels import blend, project, tiles
 from warpgs.pipeline.model.start import InitConfig
+from warpgs.pipeline.paper.strategy import PaperConfig
 from warpgs.pipeline.train.loss import LOSS_TERMS, LossTerm
 from warpgs.pipeline.train.memory import most_instances, plan
-from warpgs.pipeline.train.sampling import SamplerConfig
 from warpgs.pipeline.train.schedule import PhaseConfig
 from warpgs.pipeline.train.settings import FitConfig
 from warpgs.pipeline.train.stopping import StoppingConfig
+from warpgs.pipeline.train.strategies import sampling
 from warpgs.pipeline.train.strategies.clone_split import DensityConfig
-from warpgs.pipeline.train.strategies.importance_sampling import MethodConfig
 from warpgs.pipeline.train.trainer import Trainer
 from warpgs.pipeline.train.view_modules import Exposure, RefinePoses
 from warpgs.render.options import RasterizeOptions
@@ -106,14 +106,13 @@ def test_plan_covers_density_events():
     assert found <= layout.held(after) + layout.event(4000, after) <= 1.1 * found
 
 
-def test_plan_covers_sampling_events():
+def test_plan_covers_sampling_events(monkeypatch):
     """Scores, renderings and contributions of all views, and the fine Gaussians that they lead to."""
     views = photos(3, 200, 150)
-    method = MethodConfig(
-        events=True, hier=True, pm=False, sampler=SamplerConfig(fraction=0.01, min_alpha=0.05, max_fraction=0.2)
-    )
+    monkeypatch.setattr(sampling, "MIN_ALPHA", 0.05)
+    method = sampling.MethodConfig(hier=True, sampler=sampling.SamplerConfig(fraction=0.01, max_fraction=0.2))
     config = dataclasses.replace(
-        STEADY, steps=40, strategy="importance_sampling", method=method, phases=PhaseConfig(4, 6, every=2)
+        STEADY, steps=40, strategy="paper", strategy_config=PaperConfig(pm=False), method=method, phases=PhaseConfig(200, 300)
     )
     fit = Trainer(views, seeds(1500), config, CPU, priors=priors(views))
     for _ in range(6):
@@ -131,12 +130,12 @@ def bytes_of_tensors(tensors) -> int:
 
 
 @pytest.mark.parametrize("stops", [False, True])
-@pytest.mark.parametrize("strategy", ["clone_split", "importance_sampling", "mcmc"])
+@pytest.mark.parametrize("strategy", ["clone_split", "sampling", "mcmc"])
 def test_plan_counts_what_lasts(strategy, stops):
     """To the byte: every column of a strategy, each view once though a stack has it, whole views beside hidden ones."""
     views = masked(photos(4, 200, 150))
     config = dataclasses.replace(
-        STEADY, steps=60, strategy=strategy, strategy_config=None, method=MethodConfig(events=True), phases=PhaseConfig(4, 6),
+        STEADY, steps=60, strategy=strategy, strategy_config=None, phases=PhaseConfig(4, 6),
         loss_terms=(DepthCorrelation(0.1),), half_resolution=0.0 if stops else 0.5,
         stopping=StoppingConfig(min_gain_db=0.1 * stops),
     )  # fmt: skip

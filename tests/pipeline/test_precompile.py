@@ -13,13 +13,13 @@ from warpgs.app.cli import main
 from warpgs.kernels import launch as interop
 from warpgs.pipeline.metrics.scores import render_view, score
 from warpgs.pipeline.model.start import InitConfig
+from warpgs.pipeline.paper.strategy import PaperConfig
 from warpgs.pipeline.run import precompile
 from warpgs.pipeline.run.precompile import fit_kernels
-from warpgs.pipeline.train.sampling import SamplerConfig
 from warpgs.pipeline.train.schedule import OptimizerConfig, PhaseConfig
 from warpgs.pipeline.train.settings import FitConfig
+from warpgs.pipeline.train.strategies import sampling
 from warpgs.pipeline.train.strategies.clone_split import DensityConfig
-from warpgs.pipeline.train.strategies.importance_sampling import MethodConfig
 from warpgs.pipeline.train.trainer import Trainer
 from warpgs.render.options import RasterizeOptions
 
@@ -29,7 +29,7 @@ def nothing(begin: int): ...
 
 
 @pytest.mark.parametrize("recorded", [True, False])
-@pytest.mark.parametrize("strategy", ["importance_sampling", "mcmc"])
+@pytest.mark.parametrize("strategy", ["paper", "mcmc"])
 def test_a_fit_launches_nothing_else(device, strategy, recorded, monkeypatch):
     """Start, steps with and without masks, density events and scores: every module and size of blocks is among the warmed."""
     launched, launch = set(), interop.launch
@@ -41,15 +41,15 @@ def test_a_fit_launches_nothing_else(device, strategy, recorded, monkeypatch):
     monkeypatch.setattr(interop, "launch", note)
     views = photos(3)
     views[0] = dataclasses.replace(views[0], mask=np.ones(views[0].image.shape[:2], bool))
-    method = MethodConfig(
-        events=True, hier=True, pm=False, sampler=SamplerConfig(fraction=0.01, min_alpha=0.05, max_fraction=0.05)
-    )
+    monkeypatch.setattr(sampling, "MIN_ALPHA", 0.05)
+    method = sampling.MethodConfig(hier=True, sampler=sampling.SamplerConfig(fraction=0.01, max_fraction=0.05))
+    own = {} if strategy == "mcmc" else {"strategy_config": PaperConfig(pm=False)}
     config = FitConfig(
         steps=20, dropout=0.2, cuda_graph=recorded, init=InitConfig(source="points" if strategy == "mcmc" else "sweep"),
         optimizer=OptimizerConfig(opacities_decay=0.001),
-        strategy=strategy, method=method,
+        strategy=strategy, method=method, **own,
         loss_terms=(DepthCorrelation(0.1, 0.5),),
-        density=DensityConfig(start=2, every=2), phases=PhaseConfig(4, 6, every=2),
+        density=DensityConfig(start=2, every=2), phases=PhaseConfig(200, 300),
     )  # fmt: skip
     fit = Trainer(views, seeds(), config, device, priors=priors(views))
     while fit.step < 20:

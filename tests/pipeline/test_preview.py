@@ -31,8 +31,9 @@ def test_a_sheet_per_training_view(scene, tmp_path, capsys):
     """With networks: sheets, notes, and maps that are there the second time."""
     depth = nw.depth_network(tmp_path / "d.onnx")
     labels = nw.segmentation_network(tmp_path / "s.onnx")
-    flags = ["--depth-model", depth, "--depth-size", 64, "--segmentation-model", labels, "--segmentation-size", 64]
-    flags += ["--segmentation-mean", 0, 0, 0, "--segmentation-std", 1, 1, 1, "--threads", 1]
+    (tmp_path / "d.onnx.json").write_text('{"size": 64}')
+    (tmp_path / "s.onnx.json").write_text('{"size": 64, "mean": [0, 0, 0], "std": [1, 1, 1]}')
+    flags = ["--depth-model", depth, "--segmentation-model", labels, "--threads", 1]
     assert main(show(scene, "--out", tmp_path / "a", *flags)) == 0
     text = capsys.readouterr().out
     sheets = sorted((tmp_path / "a").glob("*.png"))
@@ -71,7 +72,9 @@ def test_mistakes_get_one_line(scene, tmp_path, capsys):
     assert "give show or export" in failure(capsys, 2, "priors", "draw")
     assert "source 'lidar' is not one of sweep, flow" in failure(capsys, 2, *show(scene, "--out", out, "--source", "lidar"))
     assert "--threads must be a number from 0" in failure(capsys, 2, *show(scene, "--out", out, "--threads", -1))
-    assert "requires --depth-model" in failure(capsys, 2, *show(scene, "--out", out, "--depth-size", 64))
+    assert "depth-size was removed: give it in FILE.onnx.json" in failure(
+        capsys, 2, *show(scene, "--out", out, "--depth-size", 64)
+    )
     (tmp_path / "x.onnx").write_text("no network")
     assert "not an ONNX model" in failure(capsys, 3, *show(scene, "--out", out, "--depth-model", tmp_path / "x.onnx"))
     assert "cannot be read" in failure(capsys, 3, *show(scene, "--out", out, "--segmentation-model", tmp_path / "none.onnx"))

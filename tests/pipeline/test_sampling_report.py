@@ -10,26 +10,34 @@ import torch
 from tests.scenes import photos, priors, seeds
 from warpgs.errors import ResourceError
 from warpgs.pipeline.model.start import InitConfig
+from warpgs.pipeline.paper.strategy import PaperConfig
 from warpgs.pipeline.run import results
 from warpgs.pipeline.run.folder import load_checkpoint, save_checkpoint
 from warpgs.pipeline.run.results import SHEET_WIDTH, event_figures, images_kept, sampling_report_of, shown_steps, view_sheet
-from warpgs.pipeline.train.sampling import SamplerConfig
 from warpgs.pipeline.train.schedule import PhaseConfig, plan_phases
 from warpgs.pipeline.train.settings import FitConfig
+from warpgs.pipeline.train.strategies import sampling
 from warpgs.pipeline.train.strategies.clone_split import DensityConfig
-from warpgs.pipeline.train.strategies.importance_sampling import MethodConfig, ProtectConfig
+from warpgs.pipeline.train.strategies.sampling import MethodConfig, SamplerConfig
 from warpgs.pipeline.train.trainer import Trainer
 from warpgs.report.images import CONTACT_GAP, CONTACT_HEAD, CONTACT_MARGIN, DOT, TITLE_SIZE, colored, webp
 
 CPU = torch.device("cpu")
 NAMES = ["00.png", "01.png", "02.png"]
-METHOD = MethodConfig(
-    events=True, hier=True, sampler=SamplerConfig(fraction=0.01, min_alpha=0.05), protect=ProtectConfig(steps=10)
-)
+METHOD = MethodConfig(hier=True, sampler=SamplerConfig(fraction=0.01))
 CONFIG = FitConfig(
-    steps=40, sh_every=10, dropout=0.2, init=InitConfig(source="points"), sh_degree=1, strategy="importance_sampling",
-    density=DensityConfig(start=2, every=8, gradient=1e-5), phases=PhaseConfig(8, 12, every=5), method=METHOD,
+    steps=40, sh_every=10, dropout=0.2, init=InitConfig(source="points"), sh_degree=1, strategy="paper",
+    density=DensityConfig(start=2, every=8, gradient=1e-5), phases=PhaseConfig(160, 240), method=METHOD,
 )  # fmt: skip
+
+
+@pytest.fixture(autouse=True, scope="module")
+def tiny():
+    """Three Gaussians are hardly opaque, and fits of 40 steps have no time for long protection."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sampling, "MIN_ALPHA", 0.05)
+        patch.setattr(sampling, "PROTECTED_STEPS", 10)
+        yield
 
 
 def fitted(config: FitConfig, steps: int) -> Trainer:
@@ -86,14 +94,14 @@ def test_tiles_show_what_the_event_saw(run):
     fit, _, seen = run
     step, event = seen[0]
     drawn, view = event.views[1], fit.views[1]
-    sheet = view_sheet("01.png", step, view, fit.disparities[1], drawn, METHOD)
+    sheet = view_sheet("01.png", step, view, fit.disparities[1], drawn, fit.strategy)
     big = {i: tile(sheet, i, view) for i in range(9)}
     H, W = view.camera.height, view.camera.width
     rows, columns = (((np.arange(n) + 0.5) * big[0].shape[i] / n).astype(int) for i, n in ((0, H), (1, W)))
     small = {i: t[rows][:, columns] for i, t in big.items()}
     np.testing.assert_allclose(small[0], drawn.rendered.numpy().clip(0, 1), atol=0.02)
     np.testing.assert_allclose(small[1], view.image.numpy(), atol=0.02)
-    for i, score in zip((5, 6, 7, 8), (*drawn.scores, drawn.score)):
+    for i, score in zip((5, 6, 7, 8), drawn.scores.values(), strict=True):
         assert np.abs(small[i] - colored(score.numpy(), "INFERNO")).mean() < 0.02, i
     assert np.abs(small[2] - colored(fit.disparities[1], "TURBO")).mean() < 0.03
     gate = drawn.gate.numpy()
@@ -106,16 +114,14 @@ def test_tiles_show_what_the_event_saw(run):
 
 def test_uniform_events_show_no_scores(tmp_path):
     """Nor a disparity, as no prior was made; the words say that nothing was scored."""
-    sampler = dataclasses.replace(METHOD.sampler, gate_quantile=0.0)
-    method = dataclasses.replace(METHOD, s_render=False, s_semantic=False, s_geometry=False, sampler=sampler)
-    fit, seen = Trainer(photos(3), seeds(), dataclasses.replace(CONFIG, method=method), CPU), []
+    fit, seen = Trainer(photos(3), seeds(), dataclasses.replace(CONFIG, strategy="sampling"), CPU), []
     with images_kept(fit, NAMES, tmp_path):
         fit.strategy.on_event = lambda step, event: seen.append(event)
         while not seen:
             fit.advance()
     drawn, view = seen[0].views[1], fit.views[1]
-    assert fit.disparities == [] and not any(s.any() for s in drawn.scores)
-    sheet = view_sheet("01.png", 8, view, None, drawn, method)
+    assert fit.disparities == [] and not drawn.scores
+    sheet = view_sheet("01.png", 8, view, None, drawn, fit.strategy)
     one_row = (
         tile(np.zeros((10**4, 10**4)), 0, view).shape[0]
         + round(1.25 * CONTACT_HEAD)
@@ -150,18 +156,21 @@ def test_story_follows_the_switches(run, tmp_path):
     assert [c for c, _ in story.images] == [f"sampling after step {s}" for s in sorted(shown_steps(fit.phases))]
     assert story.images[0][1] == webp(next(iter(sorted((out / "sampling").iterdir()))).read_bytes(), SHEET_WIDTH, 70)
     assert dict(zip(*story.table))["sampling events"] == str(len(fit.strategy.events))
-    sampler = dataclasses.replace(METHOD.sampler, fraction=0.2, depth="consistent")
-    method = dataclasses.replace(METHOD, agp=False, sampler=sampler)
-    other = fitted(dataclasses.replace(CONFIG, method=method), steps=8)
+    method = dataclasses.replace(METHOD, sampler=dataclasses.replace(METHOD.sampler, fraction=0.2))
+    base, own = dataclasses.replace(CONFIG, method=method), PaperConfig(agp=False, depth="consistent")
+    other = fitted(dataclasses.replace(base, strategy_config=own), steps=8)
     words = sampling_report_of(other, tmp_path).words
     assert "the highest in S_importance" in words and "other views confirm and with S_geometry" in words
     assert "In 3 of 3 samplings the gate was widened" in words and "widened" not in story.words
-    free = fitted(dataclasses.replace(CONFIG, method=dataclasses.replace(method, ra=False)), steps=8)
+    free = fitted(dataclasses.replace(base, strategy_config=dataclasses.replace(own, ra=False)), steps=8)
     assert "all pixels that Gaussians cover" in sampling_report_of(free, tmp_path).words
-    alike = dataclasses.replace(METHOD, s_render=False, s_semantic=False, s_geometry=False)
-    words = sampling_report_of(fitted(dataclasses.replace(CONFIG, method=alike), steps=8), tmp_path).words
+    alike = PaperConfig(s_render=False, s_semantic=False, s_geometry=False)
+    words = sampling_report_of(fitted(dataclasses.replace(CONFIG, strategy_config=alike), steps=8), tmp_path).words
     assert "sampled uniformly at random" in words and "All scores have weight 0" in words
-    assert sampling_report_of(fitted(dataclasses.replace(CONFIG, method=type(METHOD)()), steps=1), tmp_path) is None
+    assert (
+        sampling_report_of(fitted(dataclasses.replace(CONFIG, strategy="clone_split", strategy_config=None), steps=1), tmp_path)
+        is None
+    )
 
 
 def test_first_picture_outlives_a_continuation(run, tmp_path):

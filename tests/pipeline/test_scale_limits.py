@@ -149,16 +149,14 @@ def test_what_a_change_of_the_set_adds_is_within_the_limits():
 
 def test_the_ratio_is_held_from_its_time_on_and_at_the_last_step():
     """Not before; a limit of 0 is none; what cannot be a limit is refused."""
-    config = LimitConfig(ratio_from=0.5)
-    assert [config.at(p, 2.0).ratio for p in (0.0, 0.5, 0.6, 1.0)] == [math.inf, math.inf, 30, 30]
-    assert LimitConfig(ratio_from=1.0).at(1.0, 2.0).ratio == 30 and config.at(0.0, 3.0).largest == 3.0
+    config = LimitConfig()
+    assert [config.at(p, 2.0).ratio for p in (0.0, 0.7, 0.71, 1.0)] == [math.inf, math.inf, 30, 30]
+    assert config.at(0.0, 3.0).largest == 3.0
     assert LimitConfig(0.0, 0.0, 0.0).at(1.0, 2.0) == Limits()
     for wrong in (
         {"max_size": -1},
         {"max_reach": -1},
-        {"min_pixels": -1},
         {"max_ratio": 0.5},
-        {"ratio_from": 1.1},
         {"max_size": math.nan},
     ):
         with pytest.raises(UsageError, match="limits"):

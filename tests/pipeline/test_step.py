@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from tests.example_terms import DepthCorrelation
-from tests.pipeline.test_importance_sampling import CONFIG as METHOD
+from tests.pipeline.test_paper import CONFIG as METHOD
 from tests.scenes import photos, priors, seeds
 from warpgs.errors import NotFiniteError
 from warpgs.pipeline.model.start import InitConfig

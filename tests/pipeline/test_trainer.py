@@ -19,11 +19,13 @@ from warpgs.geometry import look_at
 from warpgs.kernels.neighbours import morton_codes
 from warpgs.pipeline.metrics.scores import counted_region
 from warpgs.pipeline.model.start import InitConfig, empty_votes, initial_gaussians, initial_points, nearest, random_points
+from warpgs.pipeline.model.table import Table
 from warpgs.pipeline.run.folder import TENSORS, load_checkpoint, save_checkpoint
 from warpgs.pipeline.train.loss import photometric_loss
 from warpgs.pipeline.train.presets import PRESETS
 from warpgs.pipeline.train.schedule import OptimizerConfig, log_linear, sh_degree
 from warpgs.pipeline.train.settings import FitConfig
+from warpgs.pipeline.train.strategies import clone_split
 from warpgs.pipeline.train.strategies.clone_split import DensityConfig
 from warpgs.pipeline.train.trainer import Trainer
 from warpgs.scene import Camera, PointCloud, View
@@ -100,11 +102,14 @@ def test_continued_fit_equals_uninterrupted_one(tmp_path):
     assert all(torch.equal(a[k], b[k]) for k in a)
 
 
-def test_order_of_the_gaussians_changes_nothing_but_their_order():
+def test_order_of_the_gaussians_changes_nothing_but_their_order(monkeypatch):
     """Sorted along the curve at each event or not: the same rows with their moments, bit for bit, as long as none splits."""
     results = []
     for morton in (True, False):
-        density = DensityConfig(start=5, every=10, gradient=1e-5, clone_size=1e9, morton_order=morton)
+        density = DensityConfig(start=5, every=10, gradient=1e-5)
+        monkeypatch.setattr(clone_split, "CLONE_SIZE", 1e9)
+        if not morton:
+            monkeypatch.setattr(Table, "sort_along_curve", lambda table: None)
         fit = fitted(FitConfig(steps=60, sh_every=15, init=InitConfig(source="points"), density=density), 30)
         assert bool((morton_codes(fit.gaussians.means).diff() >= 0).all()) == morton
         tensors = [t.flatten(1) if t.ndim > 1 else t[:, None] for t in fit.table.state().values()]
@@ -114,7 +119,7 @@ def test_order_of_the_gaussians_changes_nothing_but_their_order():
 
 def test_all_that_goes_by_row_is_sorted_together():
     """Parameters, moments and columns of a Gaussian stay together."""
-    fit = fitted(FitConfig(steps=9, init=InitConfig(source="points"), strategy="importance_sampling"), 3)
+    fit = fitted(FitConfig(steps=9, init=InitConfig(source="points"), strategy="sampling"), 3)
     table = fit.table
     table.columns["created_step"] = torch.arange(len(fit.gaussians), dtype=torch.int32)
     before = {name: t.clone() for name, t in table.state().items()}
@@ -318,9 +323,9 @@ def test_resume_after_kill_gives_the_same_ply(tmp_path):
     ]  # fmt: skip
     # stands still after the first checkpoint, says so, and waits for the end
     stand_still = (
-        "import sys\nfrom warpgs.app.cli import main\nfrom warpgs.pipeline.run import checkpoint, fit_steps\n"
+        "import sys\nfrom warpgs.app.cli import main\nfrom warpgs.pipeline.run import fit, folder\n"
         "def save(*a, **k):\n    made(*a, **k)\n    print('saved', flush=True)\n    sys.stdin.read()\n"
-        "made = checkpoint.save_checkpoint\nfit_steps.save_checkpoint = save\nsys.exit(main(sys.argv[1:]))"
+        "made = folder.save_checkpoint\nfit.save_checkpoint = save\nsys.exit(main(sys.argv[1:]))"
     )
 
     def command(out: str, *more: str) -> list[str]:

@@ -11,13 +11,13 @@ from tests.scenes import photos, priors, seeds
 from warpgs.errors import DataError
 from warpgs.pipeline.model import start
 from warpgs.pipeline.model.start import InitConfig
+from warpgs.pipeline.paper.strategy import UNIFORM
 from warpgs.pipeline.train import setup
 from warpgs.pipeline.train import trainer as warmups
 from warpgs.pipeline.train.presets import PRESETS
-from warpgs.pipeline.train.sampling import SamplerConfig
 from warpgs.pipeline.train.settings import settings_by_views
 from warpgs.pipeline.train.setup import prepare
-from warpgs.pipeline.train.strategies.importance_sampling import ImportanceSampling
+from warpgs.pipeline.train.strategies.sampling import Sampling
 from warpgs.pipeline.train.trainer import POINTS, STEPS, Trainer, background_warmup, run, warm_up
 from warpgs.priors.views import PriorConfig
 from warpgs.scene import ViewDepth
@@ -35,8 +35,8 @@ def test_every_part_of_a_fit_is_used(preset, monkeypatch):
     monkeypatch.setattr(warmups, "score", lambda view, image: scored.append(score(view, image)))
     fit = warm_up(config, CPU)
     assert fit.step == STEPS and len(fit.gaussians) > POINTS
-    assert isinstance(fit.strategy, ImportanceSampling) == config.method.events
-    assert not config.method.events or len(fit.strategy.events) == 1
+    assert isinstance(fit.strategy, Sampling) == (preset in ("default", "quick", "paper-literal"))
+    assert not isinstance(fit.strategy, Sampling) or len(fit.strategy.events) == 1
     assert len(scored) == 1 and 0 < scored[0].psnr < 30 and fit.taker.graphs is None
 
 
@@ -98,8 +98,7 @@ def test_the_device_is_asked_for_last(changes, monkeypatch):
     views = photos(3)
     monkeypatch.setattr(setup, "view_priors", lambda *a, depths, **k: (order.append("semantics"), depths(), ([], []))[-1])
     monkeypatch.setattr(start, "sweep_depths", lambda v, b, c, device, progress: (order.append(str(device)), consistent(v))[1])
-    method = dataclasses.replace(PRESETS["default"].method, s_semantic=True)
-    config = dataclasses.replace(PRESETS["default"], method=method, **changes)
+    config = dataclasses.replace(PRESETS["default"], strategy="paper", strategy_config=None, **changes)
     made = prepare(views, None, config, np.random.default_rng(0), CUDA, None, lambda: order.append("ready"))
     swept = ["ready", "cpu" if "memory_limit" in changes else "cuda"] if "init" not in changes else []
     assert order == ["semantics", *swept, "ready"] and len(made.start.cloud) > 100
@@ -109,7 +108,7 @@ def test_the_device_is_asked_for_last(changes, monkeypatch):
     ("setting", "needed"),
     [
         ({}, False), ({"s_render": True}, False), ({"s_semantic": True}, True), ({"s_geometry": True}, True),
-        ({"sampler": SamplerConfig(gate_quantile=0.6)}, True), ({"events": False, "s_semantic": True}, False),
+        ({"gate_quantile": 0.6}, True), ({"gate_quantile": 0.6, "ra": False}, False),
     ],
 )  # fmt: skip
 def test_priors_are_made_where_an_event_reads_them(setting, needed, monkeypatch):
@@ -117,10 +116,9 @@ def test_priors_are_made_where_an_event_reads_them(setting, needed, monkeypatch)
     asked = []
     monkeypatch.setattr(setup, "view_priors", lambda *a, **k: (asked.append(1), ([], []))[-1])
     base = PRESETS["default"]
-    config = dataclasses.replace(
-        base, method=dataclasses.replace(base.method, **setting), init=InitConfig(source="random"),
-        priors=PriorConfig(segmentation_model="labels.onnx"),
-    )  # fmt: skip
+    own = {"strategy": "paper", "strategy_config": dataclasses.replace(UNIFORM, **setting)} if setting else {}
+    priors = PriorConfig(segmentation_model="labels.onnx")
+    config = dataclasses.replace(base, **own, init=InitConfig(source="random"), priors=priors)
     made = prepare(photos(2), None, config, np.random.default_rng(0), CPU, None, lambda: None)
     assert bool(asked) == needed
     assert any("--segmentation-model is not used" in note for note in made.notes) != needed

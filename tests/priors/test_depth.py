@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tests.priors import networks as nw
-from warpgs.errors import DataError, UsageError
+from warpgs.errors import DataError
 from warpgs.priors.networks import (
     DEFAULTS,
     HALF,
@@ -82,7 +82,7 @@ def test_resize_is_linear_up_and_mean_down():
 
 def test_depth_that_is_not_positive_is_refused(tmp_path):
     network = open_network(nw.depth_network(tmp_path / "d.onnx"))
-    with pytest.raises(DataError, match=r"smallest depth is .*--depth-output disparity"):
+    with pytest.raises(DataError, match=r"smallest depth is .*JSON file beside it"):
         network_disparity(network, Preprocessing(32, 32, (6.0,) * 3, (0.2,) * 3, "depth"), photo(32, 32))
 
 
@@ -92,23 +92,21 @@ def test_an_output_that_is_no_map_is_refused(tmp_path):
         network_disparity(network, DEFAULTS, photo(32, 32))
 
 
-def described(path, **flags):
-    return describe(open_network(path), flags, DEFAULTS, "depth")
+def described(path):
+    return describe(open_network(path), DEFAULTS, "depth")
 
 
-def test_flags_come_before_the_side_file_and_that_before_what_is_usual(tmp_path):
+def test_the_side_file_comes_before_what_is_usual(tmp_path):
     path = nw.depth_network(tmp_path / "d.onnx")
     how, notes = described(path)
     assert how == DEFAULTS
     assert notes == [
         "d.onnx: assumed size 384, multiple 32, mean 0.5 0.5 0.5, std 0.5 0.5 0.5, output disparity; "
-        "change it with --depth-... or d.onnx.json"
+        "to change them, write d.onnx.json"
     ]
     side = {"size": 518, "multiple": 14, "mean": IMAGENET[0], "std": IMAGENET[1], "output": "depth"}
     (tmp_path / "d.onnx.json").write_text(json.dumps(side))
     assert described(path) == (Preprocessing(518, 14, *IMAGENET, "depth"), [])
-    how, notes = described(path, mean=MEAN, output="disparity", size=0)
-    assert how == Preprocessing(518, 14, MEAN, IMAGENET[1], "disparity") and notes == []
 
 
 def test_the_documented_side_file_is_one(tmp_path):
@@ -139,9 +137,13 @@ def test_side_files_with_faults(tmp_path, text, message):
 
 def test_a_size_against_the_graph_is_refused(tmp_path):
     path = nw.depth_network(tmp_path / "d.onnx", size=(32, 48))
-    with pytest.raises(UsageError, match=r"--depth-size 64: .* takes 48 x 32 px only"):
-        described(path, size=64)
-    assert described(path, size=32)[0].mean == DEFAULTS.mean
+    for size in (64, 32):
+        (tmp_path / "d.onnx.json").write_text(json.dumps({"size": size}))
+        if size == 32:
+            assert described(path)[0].mean == DEFAULTS.mean
+        else:
+            with pytest.raises(DataError, match=r"size 64, but .* takes 48 x 32 px only"):
+                described(path)
 
 
 def test_unit_range_of_a_wall_is_zero():

@@ -1,7 +1,7 @@
 """Priors of views end to end: sources, fallbacks, cache, notes."""
 
 import json
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
@@ -14,7 +14,8 @@ from warpgs.priors.views import PriorConfig, view_priors
 from warpgs.process import Detail
 from warpgs.scene import Camera, View
 
-PLAIN = {"segmentation_size": 32, "segmentation_mean": (0.0, 0.0, 0.0), "segmentation_std": (1.0, 1.0, 1.0)}
+PLAIN = {"size": 32, "mean": [0, 0, 0], "std": [1, 1, 1]}
+DEPTH = {"size": 32, "mean": [0.4, 0.5, 0.6], "std": [0.2, 0.25, 0.5]}
 
 
 @dataclass(frozen=True)
@@ -36,11 +37,14 @@ def dark(name="dark.png"):
     return view(0.02 * np.random.default_rng(1).random((32, 64, 3), np.float32), name)
 
 
-def networks(tmp_path, **more):
+def networks(tmp_path, depth=None, **more):
+    """Two networks, with a description of the input beside each; without one for ``depth``, the usual values are assumed."""
+    (tmp_path / "s.onnx.json").write_text(json.dumps(PLAIN))
+    if depth:
+        (tmp_path / "d.onnx.json").write_text(json.dumps(depth))
     return PriorConfig(
         depth_model=nw.depth_network(tmp_path / "d.onnx"),
         segmentation_model=nw.segmentation_network(tmp_path / "s.onnx"),
-        **PLAIN,
         **more,
     )
 
@@ -54,7 +58,7 @@ def check(prior, shape):
 
 def test_networks_give_the_maps_and_the_notes_say_what_was_assumed(tmp_path):
     image, labels = shapes()
-    config = networks(tmp_path, depth_size=32, depth_mean=(0.4, 0.5, 0.6), depth_std=(0.2, 0.25, 0.5))
+    config = networks(tmp_path, DEPTH)
     (prior,), notes = view_priors([view(image)], config)
     check(prior, labels.shape)
     np.testing.assert_allclose(prior.disparity, scaled(response(image)), atol=2e-6)
@@ -64,11 +68,10 @@ def test_networks_give_the_maps_and_the_notes_say_what_was_assumed(tmp_path):
     assert "d.onnx: assumed multiple 32, output disparity" in text and "s.onnx: assumed multiple 32;" in text
 
 
-def test_depth_output_flag_turns_the_map_over(tmp_path):
+def test_output_depth_turns_the_map_over(tmp_path):
     image = 0.5 + 0.5 * np.random.default_rng(0).random((32, 32, 3), np.float32)
-    flags = {"depth_size": 32, "depth_mean": (0.4, 0.5, 0.6), "depth_std": (0.2, 0.25, 0.5)}
-    (disparity,), _ = view_priors([view(image)], networks(tmp_path, **flags))
-    (depth,), notes = view_priors([view(image)], networks(tmp_path, **flags, depth_output="depth"))
+    (disparity,), _ = view_priors([view(image)], networks(tmp_path, DEPTH))
+    (depth,), notes = view_priors([view(image)], networks(tmp_path, DEPTH | {"output": "depth"}))
     np.testing.assert_allclose(depth.disparity, scaled(1 / response(image)), atol=2e-6)
     assert disparity.disparity.argmax() == depth.disparity.argmin() and any("gives depth" in n for n in notes)
 
@@ -83,14 +86,14 @@ def test_maps_are_kept_and_found_again(tmp_path):
     for f, s in zip(first, second):
         for name in ("disparity", "confidence", "boundary", "foreground"):
             np.testing.assert_array_equal(getattr(f, name), getattr(s, name))
-    # another setting, another file, keeping switched off: nothing old is taken
-    _, notes = view_priors(views, networks(tmp_path, depth_multiple=16), cache=folder)
+    # another description, another file, no folder: nothing old is taken
+    _, notes = view_priors(views, networks(tmp_path, {"multiple": 16}), cache=folder)
     assert any("2 of 4 maps" in n for n in notes)
     nw.write(tmp_path / "d.onnx", nw.linear(2 * nw.DEPTH_WEIGHTS, nw.DEPTH_BIAS))
     _, notes = view_priors(views, config, cache=folder)
     assert any("2 of 4 maps" in n for n in notes)
     count = len(list(folder.iterdir()))
-    _, notes = view_priors(views, networks(tmp_path, depth_multiple=8, cache=False), cache=folder)
+    _, notes = view_priors(views, networks(tmp_path, {"multiple": 8}))
     assert len(list(folder.iterdir())) == count and not any("there already" in n for n in notes)
 
 
@@ -175,25 +178,13 @@ def test_a_network_of_the_other_kind_is_refused(tmp_path):
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
-        ({"onnx_provider": "tpu"}, "'tpu' is not one of cpu, cuda"),
-        ({"depth_output": "height"}, "'height' is not one of auto, disparity, depth"),
-        ({"depth_model": "x", "depth_size": -3}, "--depth-size: size must be a whole number"),
-        ({"depth_model": "x", "depth_mean": (0.5, float("nan"), 0)}, "--depth-mean: mean must be three numbers"),
-        ({"segmentation_model": "x", "segmentation_std": (1, 0, 1)}, "--segmentation-std: std must be three numbers above 0"),
-        ({"depth_size": 32}, "--depth-size requires --depth-model; add it"),
-        ({"segmentation_mean": (0, 0, 0)}, "--segmentation-mean requires --segmentation-model"),
-        ({"depth_output": "depth"}, "--depth-output requires --depth-model"),
+        ({"onnx_provider": "tpu"}, "onnx-provider must be one of cpu, cuda, not 'tpu'"),
+        ({"depth_guides": True}, "--depth-guides requires --depth-model"),
     ],
 )
 def test_settings_are_checked(fields, message):
     with pytest.raises(UsageError, match=message):
         PriorConfig(**fields)
-
-
-def test_settings_survive_json():
-    config = PriorConfig(depth_model="x", depth_mean=(0.1, 0.2, 0.3))
-    again = PriorConfig(**json.loads(json.dumps(asdict(config))))
-    assert json.dumps(asdict(again)) == json.dumps(asdict(config))
 
 
 def test_the_provider_reaches_onnxruntime(tmp_path, monkeypatch):

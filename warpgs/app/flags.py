@@ -59,10 +59,6 @@ def parse_flags(kind: Callable[..., Any], arguments: list[str], program: str, de
     """Return the instance of a dataclass of flags for the arguments of a command line."""
     import tyro
 
-    for word in arguments:
-        flag = word.partition("=")[0].replace("_", "-")
-        if flag in REMOVED:
-            raise UsageError(f"{flag} was removed: {REMOVED[flag]}")
     words = ["--help" if word == "--help-all" else word for word in arguments]
     complaint, registry = io.StringIO(), tyro.constructors.ConstructorRegistry()
     registry.primitive_rule(_open_value)
@@ -72,6 +68,13 @@ def parse_flags(kind: Callable[..., Any], arguments: list[str], program: str, de
     except SystemExit as e:
         if not e.code:  # after the help
             raise
+    for word in arguments:
+        flag = word.partition("=")[0].replace("_", "-")
+        if flag.startswith("--"):
+            from warpgs.pipeline.train.settings import removed_note
+
+            if note := f"{flag} was removed: {REMOVED[flag]}" if flag in REMOVED else removed_note(flag[2:]):
+                raise UsageError(note)
     for line in complaint.getvalue().splitlines():
         say(line, error=True)
     raise UsageError(f"wrong arguments, as shown above; `{program} --help-all` lists them")

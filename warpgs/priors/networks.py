@@ -265,39 +265,21 @@ def read_side_file(model: Path) -> dict:
     return values
 
 
-def describe(network: Network, flags: dict, defaults: Preprocessing, flag: str) -> tuple[Preprocessing, list[str]]:
-    """Return the description of a network: flags override the file beside the model, and the file overrides the defaults.
+def describe(network: Network, defaults: Preprocessing, kind: str) -> tuple[Preprocessing, list[str]]:
+    """Return the description of a network: the file beside the model, over the defaults; and a note on assumed values.
 
-    Args:
-        network: The opened model.
-        flags: Values of flags by field name; None or 0 where a flag was not given.
-        defaults: Values for everything that neither the flags nor the file give.
-        flag: Prefix of the flags' names, for notes.
-
-    Returns:
-        The description, and notes on values that were assumed.
-
-    Raises:
-        DataError: The file beside the model is invalid.
-        UsageError: A size was requested that the graph does not allow.
+    ``kind`` is depth or segmentation. DataError: the file beside the model is invalid, or its size is not that of the graph.
     """
-    given = {k: v for k, v in flags.items() if v}
-    values = read_side_file(network.path) | given
+    given = read_side_file(network.path)
+    side = side_file(network.path).name
     if network.size and given.get("size", min(network.size)) != min(network.size):
         height, width = network.size
-        raise UsageError(f"--{flag}-size {given['size']}: {network.path} takes {width} x {height} px only; leave the flag out")
-    needed = ["mean", "std"] + ([] if network.size else ["size", "multiple"]) + (["output"] if flag == "depth" else [])
-    assumed = [k for k in needed if k not in values]
-    values = asdict(defaults) | values
-    values = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
-    notes = []
-    if assumed:
-        assumed_text = ", ".join(
-            f"{k} {' '.join(map(str, v)) if isinstance(v, tuple) else v}" for k, v in values.items() if k in assumed
-        )
-        notes.append(
-            f"{network.path.name}: assumed {assumed_text}; change it with --{flag}-... or {side_file(network.path).name}"
-        )
+        raise DataError(f"{side}: size {given['size']}, but {network.path} takes {width} x {height} px only; leave size out")
+    needed = ["mean", "std"] + ([] if network.size else ["size", "multiple"]) + (["output"] if kind == "depth" else [])
+    assumed = [k for k in needed if k not in given]
+    values = {k: tuple(v) if isinstance(v, list) else v for k, v in (asdict(defaults) | given).items()}
+    words = [f"{k} {' '.join(map(str, v)) if isinstance(v, tuple) else v}" for k, v in values.items() if k in assumed]
+    notes = [f"{network.path.name}: assumed {', '.join(words)}; to change them, write {side}"] if assumed else []
     return Preprocessing(**values), notes
 
 
@@ -449,7 +431,7 @@ def network_disparity(network: Network, preprocessing: Preprocessing, image: np.
         if not output.min() > 0:
             raise DataError(
                 f"{network.path}: its smallest depth is {output.min():.3g}, but depths must be above 0; "
-                "if the network gives inverse depth, use --depth-output disparity"
+                'if the network gives inverse depth, write {"output": "disparity"} into the JSON file beside it'
             )
         output = 1 / output
     return unit_range(resize(output, *image.shape[:2]))

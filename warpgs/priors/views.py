@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 
@@ -19,7 +19,6 @@ from warpgs.priors.networks import (
     MapCache,
     Network,
     Preprocessing,
-    check_value,
     complete_disparity,
     describe,
     network_disparity,
@@ -30,6 +29,7 @@ from warpgs.priors.networks import (
 )
 from warpgs.process import Detail, counted
 from warpgs.scene import Prior, View
+from warpgs.schema import Checked
 
 if TYPE_CHECKING:
     from warpgs.scene import ViewDepth
@@ -204,66 +204,25 @@ MIN_CONSISTENT = 50
 """Smallest number of pixels with a geometrically consistent depth; below it a view's depth counts as unknown."""
 MAX_OBJECT_FRACTION = 0.9
 """Largest fraction of the image that an object's region covers; a larger region only shows that a mask cuts something off."""
-FLAGS = ("size", "multiple", "mean", "std")
-OUTPUTS = ("auto", "disparity", "depth")
-
-Colors = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
-class PriorConfig:
-    """Networks for priors, and their inputs; without networks, classical methods are used."""
+class PriorConfig(Checked):
+    """Networks for priors; without networks, classical methods are used. FILE.onnx.json describes the input of FILE.onnx."""
 
     depth_model: str | None = None
     """ONNX file of a monocular depth network (DPT, MiDaS, Depth Anything); without one, depth comes from the other views."""
-    depth_output: str = "auto"
-    """Output of the depth network: disparity (inverse depth), depth, or auto: as in FILE.onnx.json, else disparity."""
     depth_guides: bool = False
     """Use the depth network's map in views without a map of --depths, to place Gaussians and guide the fit."""
-    depth_size: int = 0
-    """Shorter input side of the depth network [px], unless the ONNX file fixes it. Default (0): FILE.onnx.json, else 384."""
-    depth_multiple: int = 0
-    """Divisor of both sides of the depth network's input [px]. Default (0): FILE.onnx.json, else 32.
-    Depth Anything needs 14."""
-    depth_mean: Colors | None = None
-    """Colour subtracted from colours in [0, 1]. Default: FILE.onnx.json, else 0.5 0.5 0.5."""
-    depth_std: Colors | None = None
-    """Divisor of colours after the mean is subtracted. Default: FILE.onnx.json, else 0.5 0.5 0.5."""
     segmentation_model: str | None = None
     """ONNX file of a segmentation network for the 21 PASCAL VOC classes; without one, saliency and edges are used."""
-    segmentation_size: int = 0
-    """Shorter input side of the segmentation network [px], unless the ONNX file fixes it. Default (0): FILE.onnx.json, else
-    512."""
-    segmentation_multiple: int = 0
-    """Divisor of both sides of the segmentation network's input [px]. Default (0): FILE.onnx.json, else 32."""
-    segmentation_mean: Colors | None = None
-    """Colour subtracted from colours in [0, 1]. Default: FILE.onnx.json, else ImageNet's 0.485 0.456 0.406."""
-    segmentation_std: Colors | None = None
-    """Divisor of colours after the mean is subtracted. Default: FILE.onnx.json, else ImageNet's 0.229 0.224 0.225."""
-    onnx_provider: str = "cpu"
+    onnx_provider: Annotated[str, tuple(PROVIDERS)] = "cpu"
     """Device of the networks: cpu or cuda."""
-    cache: bool = True
-    """Cache the outputs of networks in the user's cache folder, or in WARPGS_CACHE."""
 
-    def __post_init__(self):
-        if self.onnx_provider not in PROVIDERS:
-            raise UsageError(f"onnx-provider {self.onnx_provider!r} is not one of {', '.join(PROVIDERS)}")
-        if self.depth_output not in OUTPUTS:
-            raise UsageError(f"depth-output {self.depth_output!r} is not one of {', '.join(OUTPUTS)}")
-        for kind in ("depth", "segmentation"):
-            for key, value in self.flags(kind).items():
-                if value is not None and value != 0:
-                    check_value(key, value, f"--{kind}-{key}")
-                    if getattr(self, f"{kind}_model") is None:
-                        raise UsageError(f"--{kind}-{key} requires --{kind}-model; add it, or leave --{kind}-{key} out")
+    def __post_init__(self) -> None:
+        super().__post_init__()
         if self.depth_guides and self.depth_model is None:
             raise UsageError("--depth-guides requires --depth-model; for maps from files, give --depths instead")
-        if self.depth_output != "auto" and self.depth_model is None:
-            raise UsageError("--depth-output requires --depth-model; add it, or leave --depth-output out")
-
-    def flags(self, kind: str) -> dict:
-        """Return the input flags of a network by name without prefix; ``kind`` is depth or segmentation."""
-        return {key: getattr(self, f"{kind}_{key}") for key in FLAGS}
 
 
 DisparitySource = Callable[[int], tuple[np.ndarray, str]]
@@ -272,8 +231,7 @@ DisparitySource = Callable[[int], tuple[np.ndarray, str]]
 
 def _depth_network(views: Sequence[View], config: PriorConfig, threads: int, cache: MapCache | None, notes: list[str]):
     network = open_network(config.depth_model, provider=config.onnx_provider, threads=threads)
-    output = None if config.depth_output == "auto" else config.depth_output
-    how, messages = describe(network, {**config.flags("depth"), "output": output}, networks.DEFAULTS, "depth")
+    how, messages = describe(network, networks.DEFAULTS, "depth")
     if how.output not in ("disparity", "depth"):
         raise DataError(f"{network.path}: its output is {how.output}, not depth; check --depth-model")
     notes += [f"depth: {network.title} gives {how.output}", *messages]
@@ -318,7 +276,7 @@ SemanticsSource = Callable[[int], tuple[SemanticMaps, str]]
 
 def _segmentation_network(views: Sequence[View], config: PriorConfig, threads: int, cache: MapCache | None, notes: list[str]):
     network = open_network(config.segmentation_model, provider=config.onnx_provider, threads=threads)
-    how, messages = describe(network, config.flags("segmentation"), DEFAULTS, "segmentation")
+    how, messages = describe(network, DEFAULTS, "segmentation")
     if how.output != "classes":
         raise DataError(f"{network.path}: its output is {how.output}, not a segmentation; check the flags")
     notes += [f"semantics: {network.title}, {CLASSES} classes", *messages]
@@ -402,7 +360,7 @@ def view_priors(
         regions: For each view the pixels that show its object, bool [H, W], or None; they replace saliency, or a foreground
             that the network does not find.
         threads: CPU threads of a network; 0 for as many as the process may use.
-        cache: Folder that keeps the maps of networks; no map is kept if the folder is None or ``config.cache`` is False.
+        cache: Folder that keeps the maps of networks; None to keep none.
         tell: Called with a line for each view.
 
     Returns:
@@ -413,7 +371,7 @@ def view_priors(
         UsageError: A flag contradicts a model.
         ResourceError: onnxruntime or its provider is missing.
     """
-    store = MapCache(Path(cache)) if config.cache and cache is not None else None
+    store = None if cache is None else MapCache(Path(cache))
     notes: list[str] = []
     # both are opened before either runs: a wrong file is found at once
     disparity = None if config.depth_model is None else _depth_network(views, config, threads, store, notes)

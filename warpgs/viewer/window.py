@@ -23,7 +23,7 @@ from warpgs.pipeline.metrics.coverage import DepthView, classes_of, coverage_map
 from warpgs.pipeline.model.table import FittedModel
 from warpgs.pipeline.run.commands import RULE, scene_of
 from warpgs.pipeline.run.folder import TENSORS, StoredRun, load_checkpoint, open_run
-from warpgs.pipeline.train.strategies.importance_sampling import FINE
+from warpgs.pipeline.train.strategies.sampling import FINE
 from warpgs.process import say
 from warpgs.render.options import RasterizeOptions
 from warpgs.render.rasterize import rasterize

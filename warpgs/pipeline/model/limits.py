@@ -5,15 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import torch
 
 from warpgs import geometry
-from warpgs.errors import UsageError
 from warpgs.kernels.neighbours import camera_reach, pixel_size
 from warpgs.scene import Camera, Gaussians, PointCloud
+from warpgs.schema import Checked, Within
 
 WITHIN = 0.9
 """Fraction of the initial points within the radius of a scene; the farthest points are often wrong."""
@@ -70,35 +70,25 @@ NO_LIMITS = Limits()
 """Limits that change nothing."""
 
 
+MIN_PIXELS = 0.2**0.5
+"""Smallest standard deviation of an axis in an antialiased fit, in pixels of the training camera that samples the Gaussian most
+finely: the 3D filter of Mip-Splatting (Yu et al. 2024), which it replaces, has a variance of 0.2 pixels squared."""
+RATIO_FROM = 0.7
+"""Fraction of the steps after which `LimitConfig.max_ratio` applies: long Gaussians help the first steps."""
+
+
 @dataclass(frozen=True)
-class LimitConfig:
+class LimitConfig(Checked, group="limits."):
     """Limits of every Gaussian of a fit."""
 
-    max_size: float = 1.0
+    max_size: Annotated[float, Within(0, 1e6)] = 1.0
     """Largest standard deviation of an axis, as a fraction of the scene's radius; 0 for no limit."""
-    max_ratio: float = NEEDLE
+    max_ratio: Annotated[float, Within(1, 1e6, zero=True)] = NEEDLE
     """Largest ratio of the longest axis to the middle one, at least 1; 0 for no limit."""
-    max_reach: float = 1 / 3
+    max_reach: Annotated[float, Within(0, 1e6)] = 1 / 3
     """Largest standard deviation of an axis, as a fraction of the distance to the nearest training camera; 0 for no limit. With
     a third, three standard deviations reach no camera; larger Gaussians beside or behind training cameras would be fog in other
     views."""
-    min_pixels: float = 0.2**0.5
-    """Smallest standard deviation of an axis in an antialiased fit, in pixels of the training camera that samples the Gaussian
-    most finely; 0 for no limit. It replaces the 3D filter of Mip-Splatting, which has a variance of 0.2 pixels squared."""
-    ratio_from: float = 0.7
-    """Fraction of the steps after which ``max_ratio`` applies, in [0, 1]. Long Gaussians help the first steps."""
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.max_size <= 1e6:
-            raise UsageError(f"limits: `max-size` must be 0 (no limit) to 1e6, not {self.max_size}")
-        if self.max_ratio != 0 and not 1 <= self.max_ratio <= 1e6:
-            raise UsageError(f"limits: `max-ratio` must be 0 (no limit) or between 1 and 1e6, not {self.max_ratio}")
-        if not 0 <= self.max_reach <= 1e6:
-            raise UsageError(f"limits: `max-reach` must be 0 (no limit) to 1e6, not {self.max_reach}")
-        if not 0 <= self.min_pixels <= 1e6:
-            raise UsageError(f"limits: `min-pixels` must be 0 (no limit) to 1e6, not {self.min_pixels}")
-        if not 0 <= self.ratio_from <= 1:
-            raise UsageError(f"limits: `ratio-from` must be between 0 and 1, not {self.ratio_from}")
 
     def at(self, progress: float, radius: float, antialiased: bool = False) -> Limits:
         """Return the limits of a step.
@@ -108,9 +98,9 @@ class LimitConfig:
             radius: Result of `scene_radius` [u].
             antialiased: True in an antialiased fit.
         """
-        held = self.max_ratio > 0 and (progress > self.ratio_from or progress == 1)
+        held = self.max_ratio > 0 and (progress > RATIO_FROM or progress == 1)
         largest = self.max_size * radius if self.max_size > 0 else math.inf
-        return Limits(largest, self.max_ratio if held else math.inf, self.max_reach, self.min_pixels if antialiased else 0.0)
+        return Limits(largest, self.max_ratio if held else math.inf, self.max_reach, MIN_PIXELS if antialiased else 0.0)
 
 
 class TrainingCameras(NamedTuple):

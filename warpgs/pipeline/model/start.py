@@ -5,13 +5,13 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 import torch
 
 from warpgs import geometry
-from warpgs.errors import DataError, UsageError
+from warpgs.errors import DataError
 from warpgs.kernels.neighbours import mean_square_distances
 from warpgs.kernels.sh import coefficient_count
 from warpgs.pipeline.metrics.scores import fitted_region
@@ -27,10 +27,11 @@ from warpgs.pipeline.model.depth_points import (
     joined,
     silhouettes,
 )
-from warpgs.priors.flow import RANGES, EpipolarConfig, flow_between, flow_depth, triangulate_matches
+from warpgs.priors.flow import EpipolarConfig, flow_between, flow_depth, triangulate_matches
 from warpgs.priors.given_depth import any_given, with_given_depth
 from warpgs.priors.sweep import CPU, SweepConfig, sweep_depths
 from warpgs.scene import Camera, Gaussians, PointCloud, View, ViewDepth, base_coefficients
+from warpgs.schema import Checked, Within
 
 OBJECTS = ("foreground", "object")
 """Names of the regions of an object (`fitted_region`): object on black, and object that an alpha channel cuts out."""
@@ -157,27 +158,25 @@ MIN_POINTS = 100
 
 
 @dataclass(frozen=True)
-class InitConfig:
+class InitConfig(Checked, group="init."):
     """Source and initial values of the Gaussians."""
 
-    source: str = "auto"
+    source: Annotated[str, SOURCES] = "auto"
     """Source of the first points: sweep or flow (one for each pixel with depth that other views confirm), points (those of the
     reconstruction), random, hull (surface of the visual hull of views with an alpha channel), or auto. auto is sweep if depth
     is given, or for at most --init.sweep-up-to views; else points if the training views saw at least 100 points; else random.
     If views have an alpha channel, points in an empty area of a view are left out."""
-    sweep_up_to: int = 0
+    sweep_up_to: Annotated[int, Within(0)] = 0
     """auto: largest number of training views for a start by sweep, which takes about a second per view on two cores."""
-    random_count: int = 20_000
+    random_count: Annotated[int, Within(1)] = 20_000
     """Number of random points."""
-    opacity: float = 0.1
+    opacity: Annotated[float, Within(0, 1, "()")] = 0.1
     """Initial opacity, in (0, 1)."""
-    scale_factor: float = 1.0
+    scale_factor: Annotated[float, Within(1e-3, 10)] = 1.0
     """Initial standard deviation of a Gaussian, as a multiple of the distance to its neighbours, in [0.001, 10]."""
-    near_views: int = 4
-    """sweep, flow: number of other views with which each view is matched."""
-    merge_px: float = 4.0
+    merge_px: Annotated[float, Within(0, np.inf, ")")] = 4.0
     """sweep, flow: width of the cells in which points of confirmed depth are merged [px]; 0 keeps a point for every pixel."""
-    fill_px: float = 16.0
+    fill_px: Annotated[float, Within(0, np.inf, ")")] = 16.0
     """sweep, flow: cell width [px] for filling in points where other views do not confirm depth; 0 fills in none."""
     extrapolate: bool | None = False
     """sweep, flow: add extrapolated points where no view looks, beyond the images and behind depth edges
@@ -185,37 +184,8 @@ class InitConfig:
     use. No points are added if a view has a mask, an alpha channel or a black background. None: chosen by the number of
     views."""
     flow: str = "dis"
-    """flow: source of optical flow: dis, deepflow, sparse, a folder of .flo files or an ONNX file (images in, flow out)."""
-    flow_range: str = "255"
-    """flow: range of input colours of an ONNX file: 255 (0 to 255), unit (0 to 1) or signed (-1 to 1)."""
-    max_residual: float = 1.0
-    """flow: largest distance of a match from its epipolar line [px]."""
-    blend: str = "least_sensitive"
-    """flow: rule to combine depths from several views: least_sensitive, nearest_first, mean_valid or inverse_sensitivity."""
-
-    def __post_init__(self):
-        if self.source not in SOURCES:
-            raise UsageError(f"init: `source` {self.source!r} is not one of {', '.join(SOURCES)}")
-        for name in ("merge_px", "fill_px", "sweep_up_to"):
-            if not 0 <= getattr(self, name) < np.inf:
-                raise UsageError(f"init: `{name.replace('_', '-')}` must be 0 or more, not {getattr(self, name)}")
-        if self.flow_range not in RANGES:
-            raise UsageError(f"init: `flow-range` {self.flow_range!r} is not one of {', '.join(RANGES)}")
-        self.epipolar()  # its own checks
-        if not 1e-3 <= self.scale_factor <= 10:
-            raise UsageError(f"init: `scale-factor` must be between 0.001 and 10, not {self.scale_factor}")
-        if not 0 < self.opacity < 1:
-            raise UsageError(f"init: `opacity` must be in (0, 1), not {self.opacity}")
-        if self.random_count < 1:
-            raise UsageError(f"init: `random-count` must be at least 1, not {self.random_count}")
-
-    def epipolar(self) -> EpipolarConfig:
-        """Return the settings of depth from flow.
-
-        Raises:
-            UsageError: A setting is out of range.
-        """
-        return EpipolarConfig(max_residual=self.max_residual, near_count=self.near_views, blend=self.blend)
+    """flow: source of optical flow: dis, deepflow, sparse, a folder of .flo files or an ONNX file (images of 0 to 255 in, flow
+    out)."""
 
 
 class Start(NamedTuple):
@@ -245,12 +215,12 @@ def consistent_depths(
         progress: Called with a line for the user about the current work.
     """
     if config.source == "flow":
-        between = flow_between(views, config.flow, config.flow_range)
-        return [flow_depth(views, i, between, config.epipolar()) for i in range(len(views))]
+        between = flow_between(views, config.flow)
+        return [flow_depth(views, i, between, EpipolarConfig()) for i in range(len(views))]
     points = np.concatenate([known.points, triangulate_matches(views).points])
     bounds = [depth_bounds(v, points, camera_depths(views)) for v in views]
     return sweep_depths(
-        views, bounds, SweepConfig(near_count=config.near_views), device(),
+        views, bounds, SweepConfig(), device(),
         lambda done, total: progress(f"finding depth: {done} of {total} views"),
     )  # fmt: skip
 

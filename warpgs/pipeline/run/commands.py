@@ -45,10 +45,10 @@ from warpgs.pipeline.model import edit
 from warpgs.pipeline.model.edit import coverage
 from warpgs.pipeline.model.start import InitConfig, consistent_depths, seen_points
 from warpgs.pipeline.model.table import FittedModel, model_bytes, pack
+from warpgs.pipeline.paper.scores import CURVATURE, geometry_score, semantic_score
 from warpgs.pipeline.run.folder import CONFIG, IMAGE_FOLDERS, StoredRun, camera_values, open_run, save_checkpoint, with_cameras
 from warpgs.pipeline.run.request import NO_SCORES, SceneRequest, choose_device, read_scene
 from warpgs.pipeline.run.results import evaluate_run, protocol_of, score_line
-from warpgs.pipeline.train.sampling import ImportanceConfig, geometry_score, semantic_score
 from warpgs.pipeline.train.schedule import color_of, over_background
 from warpgs.pipeline.train.trainer import train_views
 from warpgs.pipeline.train.views import TrainingView
@@ -420,7 +420,6 @@ SOURCES = ("sweep", "flow")
 
 def prior_sheet(view: View, prior: Prior) -> np.ndarray:
     """Return one sheet, [rows, columns, 3] in [0, 1]: image, the four maps, and the two scores computed from them."""
-    curvature = ImportanceConfig().curvature
     disparity, *semantics = map(torch.from_numpy, (prior.disparity, prior.confidence, prior.boundary, prior.foreground))
     tiles = [
         Tile("image", view.image),
@@ -429,7 +428,7 @@ def prior_sheet(view: View, prior: Prior) -> np.ndarray:
         Tile("foreground", prior.foreground, "VIRIDIS"),
         Tile("boundary", prior.boundary),
         Tile("S_semantic = confidence (boundary + foreground)", semantic_score(*semantics).numpy()),
-        Tile(f"S_geometry = |grad D| + {curvature:g} kappa", geometry_score(disparity, curvature).numpy()),
+        Tile(f"S_geometry = |grad D| + {CURVATURE:g} kappa", geometry_score(disparity).numpy()),
     ]
     size = f"{view.camera.width} x {view.camera.height} px"
     lines = [

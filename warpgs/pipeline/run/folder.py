@@ -28,7 +28,7 @@ from warpgs.kernels.cameras import check_camera
 from warpgs.locks import check_free, hold_folder
 from warpgs.pipeline.model.table import FittedModel, checked_gaussians, unpack
 from warpgs.pipeline.run.request import FitRequest, SceneRequest, choose_device
-from warpgs.pipeline.train.settings import FitConfig
+from warpgs.pipeline.train.settings import FitConfig, fingerprint, upgraded
 from warpgs.pipeline.train.view_modules import FittedViews
 from warpgs.pipeline.train.views import LearnedViews
 from warpgs.poses.find import JSON as POSES
@@ -388,6 +388,11 @@ def read_record(folder: Path) -> dict[str, Any]:
         check_record(record)
     except schema.SchemaError as e:
         raise DataError(f"{path}: incomplete or damaged: {e}; restore the file, or fit the scene again into a new --out") from e
+    record["config"], lost = upgraded(record["config"])
+    if lost:
+        record["lost"] = lost
+    else:
+        record["config_hash"] = fingerprint(record["config"])
     return record
 
 
@@ -398,6 +403,7 @@ def check_same(record: dict[str, Any], stored: dict[str, Any], out: Path) -> Non
             f"--resume: {out} is a pruned model without the state of its fit; resume the original run, "
             f"{stored['pruned']['source']}"
         )
+    _check_lost(stored, out)
     _check_named_again(record["config"], stored["config"], out)
     for key in ("fingerprint", "train", "test", "config", "device", "own_code"):
         now, then = json.loads(json.dumps(record[key])), stored.get(key, {} if key == "own_code" else None)
@@ -422,10 +428,21 @@ def check_same(record: dict[str, Any], stored: dict[str, Any], out: Path) -> Non
             )
 
 
+def _check_lost(stored: dict[str, Any], out: Path) -> None:
+    """Raise a UsageError if a run has settings that this version lacks."""
+    if lost := stored.get("lost"):
+        raise UsageError(
+            f"--resume: the run in {out} has settings that warpgs {__version__} does not have: {', '.join(lost)}. Resume it "
+            f"with warpgs {stored['versions'].get('warpgs', 'of that time')}, or fit again into a new --out"
+        )
+
+
 def check_checkpoint(state: dict[str, Any], stored: dict[str, Any], out: Path) -> None:
     """Check that a checkpoint belongs to the fit of its config.json: same settings, data and training views."""
     for key in ("config", "fingerprint", "train"):
         found, wanted = plain(state.get(key)), stored.get(key)
+        if key == "config" and isinstance(found, dict):
+            found = upgraded(found)[0]
         if found != wanted:
             if isinstance(found, dict) and isinstance(wanted, dict):
                 key = ", ".join(k for k in {**found, **wanted} if found.get(k) != wanted.get(k))
@@ -462,11 +479,13 @@ class StoredRun(FittedModel):
     """Contents of its config.json."""
 
     def notes(self) -> list[str]:
-        """Return a note for the user if the fit has not ended; nothing for a finished or a pruned run."""
+        """Return notes for the user: settings of a fit that no fit has now, and that a fit has not ended."""
+        lost = self.record.get("lost", [])
+        notes = [f"{self.folder}: fitted by another version, with {', '.join(lost)}"] if lost else []
         if "pruned" in self.record or (self.folder / METRICS_FILE).is_file():
-            return []
+            return notes
         why = f"the fit stopped after step {self.step:,}"
-        return [f"{self.folder}: {why}; to finish, repeat the fit's command with --resume"]
+        return [*notes, f"{self.folder}: {why}; to finish, repeat the fit's command with --resume"]
 
     def scene_request(self, reader: str | None = None) -> SceneRequest:
         """Return the fitted scene with the options for reading it.
@@ -502,6 +521,7 @@ def _stored_scene(folder: Path, record: dict[str, Any], reader: str | None) -> S
 def stored_request(folder: Path) -> FitRequest:
     """Return the request that continues a run, with the scene and all settings that the run was started with."""
     record = read_record(folder)
+    _check_lost(record, folder)
     try:
         scene = _stored_scene(folder, record, None)
         _check_named_again({}, record["config"], folder)

@@ -36,10 +36,10 @@ from warpgs.pipeline.metrics.scores import (
     summarize,
     variants,
 )
+from warpgs.pipeline.paper.scores import SUPPORT
 from warpgs.pipeline.train.loss import GIVEN_MIN_ALPHA
-from warpgs.pipeline.train.sampling import SUPPORT
 from warpgs.pipeline.train.schedule import Phases
-from warpgs.pipeline.train.strategies.importance_sampling import Event, ImportanceSampling, MethodConfig, SampledView
+from warpgs.pipeline.train.strategies.sampling import Event, SampledView, Sampling
 from warpgs.pipeline.train.trainer import Trainer
 from warpgs.pipeline.train.views import TrainingView
 from warpgs.process import counted
@@ -223,20 +223,19 @@ def shown_steps(phases: Phases) -> set[int]:
     return {*phases.events[:1], *late[:1]}
 
 
-def _open_pixels(consistent: bool, quantile: float) -> str:
-    """Describe the pixels that pass a gate."""
-    parts = ["with a depth that other views confirm"] * consistent
+def _open_pixels(strategy: Sampling, consistent: bool, quantile: float) -> str:
+    """Describe the pixels that pass a gate, in a view with or without ``consistent`` depth."""
+    parts = ["with a depth that other views confirm"] * (consistent and strategy.consistent and strategy.gated)
     parts += [f"with S_geometry above its {quantile:g} quantile"] * (quantile > 0)
     return f"pixels {' and '.join(parts)}" if parts else "all pixels that Gaussians cover"
 
 
 def view_sheet(
-    name: str, step: int, view: TrainingView, disparity: np.ndarray | None, sampled: SampledView, config: MethodConfig
+    name: str, step: int, view: TrainingView, disparity: np.ndarray | None, sampled: SampledView, strategy: Sampling
 ) -> np.ndarray:
     """Return a sheet of one view at one event, colours [rows, columns, 3]: images, gate, samples, scores of weight above 0."""
-    image, rendered, score = (t.cpu().numpy() for t in (view.image, sampled.rendered, sampled.score))
+    image, rendered = (t.cpu().numpy() for t in (view.image, sampled.rendered))
     at, gate = sampled.at.cpu().numpy(), sampled.gate.cpu().numpy()
-    weights = config.weights(view.semantic is not None)
     # each score is shown below its inputs
     tiles = [
         Tile("render before", rendered),
@@ -245,18 +244,16 @@ def view_sheet(
         Tile("gate", np.where(gate[..., None], OPEN, CLOSED).astype(np.float32)),
         Tile("sampled pixels", 1 - FADED * (1 - image.mean(-1, keepdims=True).repeat(3, -1)), dots=at),
     ]
-    scored = sum(weights) > 0
-    if scored:
-        names = ("S_render", "S_semantic", "S_geometry")
-        tiles += [Tile(f"{w:.2f} {n}", s.cpu().numpy()) for w, n, s in zip(weights, names, sampled.scores, strict=True)]
-        tiles.append(Tile("S_importance", score))
-    consistent = config.ra and config.sampler.depth == "consistent" and view.consistent is not None
-    widened = f"; too few passed at the {config.asked_quantile:g} quantile" if sampled.quantile < config.asked_quantile else ""
+    scores = {n: score.cpu().numpy() for n, score in sampled.scores.items()}
+    tiles += [Tile(n, score) for n, score in scores.items()]
+    asked = strategy.asked_quantile
+    widened = f"; too few passed at the {asked:g} quantile" if sampled.quantile < asked else ""
     lines = [
         f"{len(at):,} pixels sampled of the {gate.sum():,} that pass the gate, {gate.mean():.0%} of the view.",
-        f"Gate: {_open_pixels(consistent, sampled.quantile)}{widened}.",
+        f"Gate: {_open_pixels(strategy, view.consistent is not None, sampled.quantile)}{widened}.",
     ]
-    if scored:
+    if scores:
+        score = [*scores.values()][-1]
         mean = score[at[:, 0], at[:, 1]].mean() if len(at) else 0
         lines.append(f"Mean importance: {mean:.2f} at the sampled pixels, {score.mean():.2f} over the view.")
     return contact_sheet(f"{name}, step {step:,}", lines, tiles, columns=5, tile_width=320, text=1.25)
@@ -270,9 +267,8 @@ def _shown(event: Event) -> list[SampledView]:
 
 def _on_host(sampled: SampledView) -> SampledView:
     """Return a copy with its maps in host memory."""
-    maps = {n: getattr(sampled, n).cpu() for n in ("rendered", "score", "gate", "at")}
-    render, semantic, geometry = (s.cpu() for s in sampled.scores)
-    return dataclasses.replace(sampled, scores=(render, semantic, geometry), **maps)
+    maps = {n: getattr(sampled, n).cpu() for n in ("rendered", "gate", "at")}
+    return dataclasses.replace(sampled, scores={n: t.cpu() for n, t in sampled.scores.items()}, **maps)
 
 
 @contextlib.contextmanager
@@ -281,7 +277,7 @@ def images_kept(fit: Trainer, names: list[str], out: Path) -> Iterator[Callable[
     # A separate thread writes the images. The end of the block waits for the images, and so does the yielded function. Call
     # this function before a checkpoint, since a fit that continues from the checkpoint does not write earlier images. If an
     # image cannot be written, the fit continues, with one message in ``fit.messages``.
-    config, steps, strategy = fit.config.method, shown_steps(fit.phases), fit.strategy
+    steps, strategy = shown_steps(fit.phases), fit.strategy
     disparities = fit.disparities or [None] * len(names)
     lost: list[int] = []
     writing: list[Future[None]] = []
@@ -290,12 +286,12 @@ def images_kept(fit: Trainer, names: list[str], out: Path) -> Iterator[Callable[
         for sheet in writing:
             sheet.result()  # or what went wrong
 
-    if not isinstance(strategy, ImportanceSampling) or not config.events:
+    if not isinstance(strategy, Sampling):
         yield written
         return
 
     def write(step: int, views: list[TrainingView], kept: list[SampledView]) -> None:
-        sheets = [view_sheet(names[d.view], step, v, disparities[d.view], d, config) for v, d in zip(views, kept)]
+        sheets = [view_sheet(names[d.view], step, v, disparities[d.view], d, strategy) for v, d in zip(views, kept)]
         try:
             make_folder(out / FOLDER)
             write_bytes(out / FOLDER / f"{step:06d}.png", png(np.concatenate(sheets)))
@@ -326,9 +322,8 @@ def images_kept(fit: Trainer, names: list[str], out: Path) -> Iterator[Callable[
 
 def event_figures(fit: Trainer) -> dict[str, Any]:
     """Return for metrics.json the sums over the events of a fit (``events``), and the sizes of its two layers (``layers``)."""
-    asked = fit.config.method.asked_quantile
-    layered = isinstance(fit.strategy, ImportanceSampling)
-    events, fine = (fit.strategy.events, int(fit.strategy.fine.sum())) if layered else ([], 0)
+    s = fit.strategy
+    events, fine, asked = (s.events, int(s.fine.sum()), s.asked_quantile) if isinstance(s, Sampling) else ([], 0, 0.0)
     quantiles = [q for e in events for q in e["quantiles"]]
     return {
         "events": {
@@ -341,26 +336,25 @@ def event_figures(fit: Trainer) -> dict[str, Any]:
 
 def sampling_report_of(fit: Trainer, out: Path) -> Section | None:
     """Return the report's part on the sampling events of a finished fit; None without events."""
-    method, figures = fit.config.method, event_figures(fit)
+    strategy, figures = fit.strategy, event_figures(fit)
     events, layers = figures["events"], figures["layers"]
     if not events["count"]:
         return None
-    how = "sampled at random in proportion to S_importance," if method.agp else "the highest in S_importance"
-    weighted = sum(method.weights()) > 0
-    if method.agp and not weighted:
-        how = "sampled uniformly at random,"
-    consistent = method.sampler.depth == "consistent"
-    gate = _open_pixels(consistent and method.ra, method.asked_quantile)
+    how = "sampled at random in proportion to S_importance," if strategy.scored else "sampled uniformly at random,"
+    if not strategy.at_random:
+        how = "the highest in S_importance"
+    gate = _open_pixels(strategy, True, strategy.asked_quantile)
+    depth = "consistent" if strategy.consistent else "rendered"
     words = (
-        f"Each dot is a pixel behind which a fine Gaussian was added at the {method.sampler.depth} depth, while the layer had "
+        f"Each dot is a pixel behind which a fine Gaussian was added at the {depth} depth, while the layer had "
         f"capacity. These pixels are {how} among {gate} (the gate). "
         + ("S_importance is the weighted sum of the three scores; each score is shown below its source."
-           if weighted else "All scores have weight 0, so no score is shown.")
+           if strategy.scored else "All scores have weight 0, so no score is shown.")
     )  # fmt: skip
     if events["widened"]:
         words += (
             f" In {events['widened']:,} of {events['samplings']:,} samplings the gate was widened, because fewer than "
-            f"{SUPPORT} candidates for each sample passed at the {method.asked_quantile:g} quantile."
+            f"{SUPPORT} candidates for each sample passed at the {strategy.asked_quantile:g} quantile."
         )
     table = [
         ["sampling events", "Gaussians added", "evicted", "coarse at the end", "fine at the end"],

@@ -7,6 +7,7 @@ import dataclasses
 import gc
 import io
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,7 @@ from warpgs.pipeline.farm.job import PLY, FarmJob, JobRecord, file_digest
 from warpgs.pipeline.farm.work import Outcome, ensure_run
 from warpgs.pipeline.metrics.lpips import load_lpips
 from warpgs.pipeline.metrics.scores import over_white, render_view
+from warpgs.pipeline.paper.strategy import UNIFORM, PaperConfig
 from warpgs.pipeline.run.folder import open_run
 from warpgs.pipeline.run.request import FitRequest, SceneRequest, choose_device, read_scene
 from warpgs.pipeline.run.results import LABELS, summary_line
@@ -365,7 +367,7 @@ def preset_variants(names: list[str], steps: int | None) -> dict[str, FitConfig]
 
 def ablation_variants(base: FitConfig) -> tuple[dict[str, FitConfig], dict[str, tuple[bool, ...]]]:
     """Return the rows of an ablation, all with the same steps, and their check marks in the order of `SWITCHES`."""
-    if not base.method.events:
+    if base.strategy not in ("sampling", "paper"):
         raise UsageError(f"preset {base.preset!r} has no sampling events; ablate a preset with them, such as default")
     variants: dict[str, FitConfig] = {}
     marks: dict[str, tuple[bool, ...]] = {}
@@ -373,12 +375,30 @@ def ablation_variants(base: FitConfig) -> tuple[dict[str, FitConfig], dict[str, 
         if switches is None:  # the steps are the preset's, so that rows differ in the method alone
             changed = dataclasses.replace(PRESETS[PAPER], steps=base.steps, max_steps=base.max_steps, cpu_limit=base.cpu_limit)
         else:
-            method = dataclasses.replace(base.method, **switches)  # type: ignore[arg-type]  # names of bool fields alone
-            changed = dataclasses.replace(base, method=method)
+            changed = _switched(base, switches)
         if base.preset != row and changed not in variants.values():
             variants[row] = changed
-            marks[row] = tuple(bool(getattr(changed.method, name)) for name in SWITCHES)
+            events = changed.strategy != "clone_split"
+            parts = _parts(changed if events else base) | {"events": events}
+            marks[row] = tuple(bool(parts[name]) for name in SWITCHES)
     return variants, marks
+
+
+def _parts(config: FitConfig) -> dict[str, Any]:
+    """Return the value of each switch but events: the layers, and the settings of strategy paper that its parts have."""
+    own = config.strategy_config if config.strategy == "paper" else UNIFORM
+    return {"hier": config.method.hier, **dataclasses.asdict(own)}
+
+
+def _switched(base: FitConfig, switches: Mapping[str, bool]) -> FitConfig:
+    """Return settings with some switches changed; without scores and with all other parts, `paper` is `sampling`."""
+    parts = _parts(base) | switches
+    if not parts.pop("events", True):
+        return dataclasses.replace(base, strategy="clone_split", strategy_config=None)
+    method = dataclasses.replace(base.method, hier=parts.pop("hier"))
+    own = PaperConfig(**parts)
+    strategy, config = ("sampling", None) if own == UNIFORM else ("paper", own)
+    return dataclasses.replace(base, method=method, strategy=strategy, strategy_config=config)
 
 
 def _places(request: StudyRequest, device: str) -> list[Place]:

@@ -6,7 +6,7 @@ import dataclasses
 import functools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar, TypeVar
+from typing import Annotated, ClassVar, TypeVar
 
 import torch
 
@@ -17,7 +17,12 @@ from warpgs.kernels.ssim import difference_bytes, differences
 from warpgs.pipeline.train.views import TrainingView
 from warpgs.plugins import Registry
 from warpgs.scene import Camera, Gaussians, Prior
+from warpgs.schema import Checked, Within
 
+SSIM_WEIGHT = 0.2
+"""Fraction lambda of the SSIM term (Kerbl et al. 2023)."""
+Weight = Annotated[float, Within(0, 1000)]
+"""Weight of a term."""
 OUTPUTS = ("rgb", "alpha", "depth")
 """Images of `warpgs.Render` for loss terms."""
 
@@ -34,7 +39,7 @@ class Target:
     """Maps that loss terms requested (`LossTerm.needs`), by name, each of shape [H, W] or [H, W, C]."""
     alpha: torch.Tensor | None = None
     """Opacity of the subject, in [0, 1], shape [H, W]; None if no training view has one. ``image`` and the render have the same
-    background; with `LossConfig.random_background` the background changes at each step."""
+    background, which changes at each step."""
 
 
 class _Outputs(dict[str, torch.Tensor]):
@@ -75,7 +80,7 @@ class LossInputs:
 
 
 @dataclass(frozen=True)
-class LossTerm:
+class LossTerm(Checked):
     """One term of the loss. To write one, derive a frozen dataclass; its fields are its settings."""
 
     name: ClassVar[str] = ""
@@ -244,7 +249,7 @@ def photometric_loss(
 class Photometric(LossTerm):
     """The photometric loss; every fit has it."""
 
-    ssim_weight: float = 0.2
+    ssim_weight: float = SSIM_WEIGHT
     """Fraction lambda of the SSIM term, in [0, 1]."""
 
     def bytes(self, sizes: StepSizes) -> Needs:
@@ -259,16 +264,12 @@ class Photometric(LossTerm):
 
 @register("alpha")
 @dataclass(frozen=True)
-class AlphaDifference(LossTerm):
+class AlphaDifference(LossTerm, group="alpha."):
     """The weighted mean absolute difference of rendered and true opacity, 0 in views without an alpha channel."""
 
     needs_outputs: ClassVar[tuple[str, ...]] = ("alpha",)
-    weight: float = 0.1
+    weight: Weight = 0.1
     """Weight of the term, in [0, 1000]."""
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.weight <= 1000:
-            raise UsageError(f"alpha: `weight` must be between 0 and 1000, not {self.weight}")
 
     def bytes(self, sizes: StepSizes) -> Needs:
         """Return the bytes of the difference, its magnitude and its gradient."""
@@ -322,16 +323,12 @@ def inverse_depth_difference(
 
 @register("given_depth")
 @dataclass(frozen=True)
-class GivenDepthDifference(LossTerm):
+class GivenDepthDifference(LossTerm, group="given-depth."):
     """The weighted difference of rendered and given inverse depth, 0 in views without given depth."""
 
     needs_outputs: ClassVar[tuple[str, ...]] = ("alpha", "depth")
-    weight: float = 0.3
+    weight: Weight = 0.3
     """Weight of the term, in [0, 1000]."""
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.weight <= 1000:
-            raise UsageError(f"given-depth: `weight` must be between 0 and 1000, not {self.weight}")
 
     def needs(self, view: TrainingView, prior: Prior | None) -> dict[str, torch.Tensor]:
         """Return weight times q / d, weight, and weight times q, [H, W, 3], for depth d with median q; 0 without depth."""
@@ -374,16 +371,12 @@ def normal_difference(normals: torch.Tensor, target: torch.Tensor, mask: torch.T
 
 @register("given_normals")
 @dataclass(frozen=True)
-class GivenNormalsDifference(LossTerm):
+class GivenNormalsDifference(LossTerm, group="given-normals."):
     """The weighted 1 - cos of the angle between given and rendered normals, for pinholes; 0 in views without given normals."""
 
     needs_outputs: ClassVar[tuple[str, ...]] = ("alpha", "depth")
-    weight: float = 0.03
+    weight: Weight = 0.03
     """Weight of the term, in [0, 1000]."""
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.weight <= 1000:
-            raise UsageError(f"given-normals: `weight` must be between 0 and 1000, not {self.weight}")
 
     def needs(self, view: TrainingView, prior: Prior | None) -> dict[str, torch.Tensor]:
         """Return the view's normals in its camera's axes [H, W, 3]; 0 where none are given."""
@@ -454,16 +447,12 @@ def depth_roughness(
 
 @register("smooth_depth")
 @dataclass(frozen=True)
-class SmoothDepth(LossTerm):
+class SmoothDepth(LossTerm, group="smooth-depth."):
     """The weighted roughness of rendered depth."""
 
     needs_outputs: ClassVar[tuple[str, ...]] = ("alpha", "depth")
-    weight: float = 1.0
+    weight: Weight = 1.0
     """Weight of the term, in [0, 1000]."""
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.weight <= 1000:
-            raise UsageError(f"smooth-depth: `weight` must be between 0 and 1000, not {self.weight}")
 
     def needs(self, view: TrainingView, prior: Prior | None) -> dict[str, torch.Tensor]:
         """Return the weights of the view's pixels, shape [H, W]: `CONFIRMED` where depth is consistent, else 1."""
@@ -482,32 +471,20 @@ class SmoothDepth(LossTerm):
 
 
 @dataclass(frozen=True)
-class LossConfig:
+class LossConfig(Checked, group="loss."):
     """Weights of the loss."""
 
-    ssim_weight: float = 0.2
-    """Fraction lambda of the SSIM term, in [0, 1]."""
-    random_background: bool = True
-    """Put views with an alpha channel, and their renders, on a random background at each step. Without this, Gaussians of the
-    background colour could cover empty areas. No effect on opaque views."""
-    alpha_weight: float = 1.0
+    alpha_weight: Weight = 1.0
     """Weight of the mean absolute difference of rendered and given opacity, for views with an alpha channel, in [0, 1000]; 0 to
     disable."""
-    smooth_weight: float | None = 0.0
+    smooth_weight: Weight | None = 0.0
     """Weight of the roughness of rendered depth (docs/decisions/024-smooth-depth.md), in [0, 1000]; 0 to disable. None: chosen
     by the number of views."""
-    depth_weight: float = 0.3
+    depth_weight: Weight = 0.3
     """Weight of the difference of rendered and given inverse depth, for views with given depth, in [0, 1000]; 0 to disable."""
-    normal_weight: float = 0.03
+    normal_weight: Weight = 0.03
     """Weight of 1 - cos of the angle between given normals and normals of rendered depth, for views with given normals, in [0,
     1000]; 0 to disable."""
-
-    def __post_init__(self) -> None:
-        for name in ("alpha_weight", "smooth_weight", "depth_weight", "normal_weight"):
-            if getattr(self, name) is not None and not 0 <= getattr(self, name) <= 1000:
-                raise UsageError(f"loss: `{name.replace('_', '-')}` must be between 0 and 1000, not {getattr(self, name)}")
-        if not 0 <= self.ssim_weight <= 1:
-            raise UsageError(f"loss: `ssim-weight` must be between 0 and 1, not {self.ssim_weight}")
 
 
 def built_in_terms(
@@ -521,7 +498,7 @@ def built_in_terms(
         depth: True if a view has given depth.
         normals: True if a view has given normals.
     """
-    terms: list[LossTerm] = [Photometric(config.ssim_weight)]
+    terms: list[LossTerm] = [Photometric()]
     if cutout and config.alpha_weight > 0:
         terms.append(AlphaDifference(config.alpha_weight))
     if config.smooth_weight:

@@ -7,6 +7,7 @@ import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
 import torch
@@ -14,6 +15,7 @@ import torch
 from warpgs.errors import UsageError
 from warpgs.pipeline.metrics.scores import counted_region
 from warpgs.scene import Scene, View
+from warpgs.schema import Checked, Within
 
 
 def log_linear(start: float, end: float, progress: float) -> float:
@@ -27,58 +29,40 @@ def sh_degree(step: int, every: int, highest: int) -> int:
     return min(highest, (step - 1) // every)
 
 
-MAX_LR = 1e6
-"""Largest learning rate: far above useful rates, and far below rates that overflow within a fit."""
+LearningRate = Annotated[float, Within(0, 1e6, "(")]
+"""Learning rate; the largest is far above useful rates, and far below rates that overflow within a fit."""
+MEANS_LR_FINAL = 1.6e-6
+"""Learning rate of the means at the last step, in units of the scene's extent (Kerbl et al. 2023)."""
+QUATS_LR = 1e-3
+"""Learning rate of the rotations (Kerbl et al. 2023)."""
+SH_REST_FACTOR = 0.05
+"""Learning rate of the higher colour coefficients, as a fraction of the constant one's (Kerbl et al. 2023)."""
 MAX_DECAY = 0.1
 """Largest fraction by which a step may lower an opacity; at this value no Gaussian stays opaque."""
 
 
-def check_lrs(of: str, **rates: float | None) -> None:
-    """Check learning rates, or factors of learning rates, by name; None is allowed; ``of`` names the group of settings.
-
-    Raises:
-        UsageError: A value is not positive, or above `MAX_LR`.
-    """
-    for name, value in rates.items():
-        if value is not None and not 0 < value <= MAX_LR:
-            raise UsageError(f"{of}: `{name}` must be positive and at most {MAX_LR:g}, not {value}")
-
-
 @dataclass(frozen=True)
-class OptimizerConfig:
+class OptimizerConfig(Checked, group="optimizer."):
     """Learning rates, by default those of the reference implementation of Kerbl et al. 2023, except for the scales."""
 
-    means_lr: float | None = 1.6e-4
+    means_lr: LearningRate | None = 1.6e-4
     """Learning rate of the means at the start, in units of the scene's extent. None: 1.6e-4, or more if --cpu-limit shortens
     the fit."""
-    means_lr_final: float = 1.6e-6
-    """Learning rate of the means at the last step, in units of the scene's extent; log-linear in between."""
-    quats_lr: float = 1e-3
-    """Learning rate of the rotations."""
-    scales_lr: float | None = 0.01
+    scales_lr: LearningRate | None = 0.01
     """Learning rate of the log scales; 0.005 in the reference implementation (docs/decisions/004-scale-rate.md). None: chosen
     by the number of views."""
-    scales_decay: float = 1.0
+    scales_decay: LearningRate = 1.0
     """Learning rate of the log scales at the last step, as a fraction of the first. It falls log-linearly during phase 3;
     without phases, during the whole fit. 1: constant."""
-    opacities_lr: float | None = 0.05
+    opacities_lr: LearningRate | None = 0.05
     """Learning rate of the opacity logits. None: chosen by the number of views."""
-    opacities_decay: float | None = 0.0
+    opacities_decay: Annotated[float | None, Within(0, MAX_DECAY)] = 0.0
     """Fraction by which each step lowers every opacity, in [0, 0.1]; 0 for no decay. None: chosen by the number of views."""
-    sh_lr: float | None = 2.5e-3
+    sh_lr: LearningRate | None = 2.5e-3
     """Learning rate of the constant colour coefficient. None: 2.5e-3, or more if --cpu-limit shortens the fit."""
-    sh_rest_factor: float = 0.05
-    """Learning rate of the other colour coefficients, as a fraction of ``sh_lr``."""
-    average_last: float | None = 0.0
+    average_last: Annotated[float | None, Within(0, 1)] = 0.0
     """Fraction of the steps, the last ones, over which the parameters are averaged; the mean is the result of the fit. 0 for no
     mean. None: chosen by the number of views."""
-
-    def __post_init__(self) -> None:
-        if self.average_last is not None and not 0 <= self.average_last <= 1:
-            raise UsageError(f"optimizer: `average-last` must be in [0, 1], not {self.average_last}")
-        if self.opacities_decay is not None and not 0 <= self.opacities_decay <= MAX_DECAY:
-            raise UsageError(f"optimizer: `opacities-decay` must be between 0 and {MAX_DECAY}, not {self.opacities_decay}")
-        check_lrs("optimizer", **{n: v for n, v in vars(self).items() if n not in ("opacities_decay", "average_last")})
 
     def lrs(self, progress: float, extent: float, stable_start: float = 0.0) -> dict[str, float]:
         """Return the learning rate of each parameter.
@@ -92,11 +76,11 @@ class OptimizerConfig:
         assert self.means_lr is not None and self.sh_lr is not None
         stable = (progress - stable_start) / (1 - stable_start)
         return {
-            "means": extent * log_linear(self.means_lr, self.means_lr_final, progress),
-            "quats": self.quats_lr,
+            "means": extent * log_linear(self.means_lr, MEANS_LR_FINAL, progress),
+            "quats": QUATS_LR,
             "log_scales": log_linear(self.scales_lr, self.scales_lr * self.scales_decay, stable),
             "logit_opacities": self.opacities_lr,
-            "sh": self.sh_lr * self.sh_rest_factor,
+            "sh": self.sh_lr * SH_REST_FACTOR,
         }
 
     @property
@@ -106,34 +90,26 @@ class OptimizerConfig:
         return {"sh": self.sh_lr}
 
 
+EVENT_STEPS, EVENT_GROWTH = 100.0, 4.0
+"""Steps from the first sampling event to the second (T_base, which the paper leaves open), and growth of the interval over
+phase 2, gamma: T_sample(t) = T_base (1 + gamma t), t from 0 to 1."""
+
+
 @dataclass(frozen=True)
-class PhaseConfig:
+class PhaseConfig(Checked, group="phases."):
     """The paper's three phases (section "Training Strategy"), and when fine Gaussians are sampled in phase 2.
 
     In a fit shorter than twice the sum of phases 1 and 3, these phases and the interval between events are shortened in
     proportion.
     """
 
-    coarse: int = 0
+    coarse: Annotated[int, Within(0)] = 0
     """Steps of phase 1, with only the coarse layer; 2000 in the paper. If this and ``stable`` are 0, the fit has no phases."""
-    stable: int = 0
+    stable: Annotated[int, Within(0)] = 0
     """Steps of phase 3, in which no Gaussians are added or removed; 3000 in the paper."""
-    every: float = 100.0
-    """Steps from the first sampling event to the second (T_base, which the paper leaves open)."""
-    growth: float = 4.0
-    """Growth of the interval between events over phase 2, gamma: T_sample(t) = T_base (1 + gamma t), t from 0 to 1."""
-    least: float = 1.0
+    least: Annotated[float, Within(1, math.inf, ")")] = 1.0
     """Smallest number of steps from the first sampling event to the second in a short fit, which shortens this interval. On a
     CPU an event takes as long as ten steps."""
-
-    def __post_init__(self) -> None:
-        if self.coarse < 0 or self.stable < 0 or not 0 <= self.growth < math.inf:
-            raise UsageError(
-                "phases: `coarse`, `stable` and `growth` must be at least 0 and finite, not "
-                f"{self.coarse}, {self.stable} and {self.growth}"
-            )
-        if not 1 <= self.every < math.inf or not 1 <= self.least < math.inf:
-            raise UsageError(f"phases: `every` and `least` must be at least 1 and finite, not {self.every} and {self.least}")
 
 
 @dataclass(frozen=True)
@@ -168,7 +144,7 @@ class Phases:
 def plan_phases(config: PhaseConfig, steps: int) -> Phases:
     """Plan the phases of a fit of that many steps.
 
-    With the default intervals there are 102 events in 25,000 steps of phase 2, and 21 in 5000.
+    There are 102 events in 25,000 steps of phase 2, and 21 in 5000.
     """
     outer = config.coarse + config.stable
     shrink = min(1.0, 0.5 * steps / outer) if outer else 1.0
@@ -176,7 +152,7 @@ def plan_phases(config: PhaseConfig, steps: int) -> Phases:
     length, at, events = stable_start - refine, 0.0, []
     while at < length:
         events.append(max(1, refine + int(at)))
-        at += max(min(config.least, config.every), shrink * config.every) * (1 + config.growth * at / length)
+        at += max(min(config.least, EVENT_STEPS), shrink * EVENT_STEPS) * (1 + EVENT_GROWTH * at / length)
     return Phases(refine, stable_start, tuple(events), steps, steps)
 
 

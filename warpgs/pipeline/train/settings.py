@@ -13,7 +13,7 @@ import types
 import typing
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import torch
 
@@ -23,39 +23,39 @@ from warpgs.errors import UsageError, did_you_mean
 from warpgs.kernels.sh import MAX_DEGREE
 from warpgs.pipeline.model.limits import LimitConfig
 from warpgs.pipeline.model.start import InitConfig, extrapolates
-from warpgs.pipeline.train.loss import LOSS_TERMS, LossConfig, LossTerm, check_terms, photometric_loss
+from warpgs.pipeline.train.loss import LOSS_TERMS, SSIM_WEIGHT, LossConfig, LossTerm, check_terms, photometric_loss
 from warpgs.pipeline.train.schedule import OptimizerConfig, PhaseConfig, color_of, plan_phases
 from warpgs.pipeline.train.stopping import StoppingConfig
 from warpgs.pipeline.train.strategies.base import STRATEGIES, Settings, find_strategy
 from warpgs.pipeline.train.strategies.clone_split import DensityConfig
-from warpgs.pipeline.train.strategies.importance_sampling import MethodConfig
+from warpgs.pipeline.train.strategies.sampling import MethodConfig
 from warpgs.pipeline.train.view_modules import VIEW_MODULES, ViewModule, check_modules
 from warpgs.plugins import Registry, flag_group, own_code
 from warpgs.priors.views import PriorConfig
 from warpgs.process import Detail
 from warpgs.render.rasterize import rasterize
 from warpgs.scene import Camera, Gaussians, View
-from warpgs.schema import SchemaError, anything, mapping, of_type
+from warpgs.schema import Checked, SchemaError, Within, anything, mapping, of_type
 
 
 @dataclass(frozen=True)
-class FitConfig:
+class FitConfig(Checked):
     """All settings of a fit."""
 
     preset: str = "3dgs"
     """Preset that the other settings start from: a name, a .toml file of settings, or your own FitConfig or mapping as
     module:NAME or path/to/file.py:NAME."""
-    steps: int | None = 7000
+    steps: Annotated[int | None, Within(1)] = 7000
     """Number of optimisation steps; early stopping may end the fit sooner. None: chosen by the number of views."""
-    max_steps: int = 30_000
+    max_steps: Annotated[int, Within(1)] = 30_000
     """Largest number of steps that is chosen by the number of views."""
-    batch: int = 1
+    batch: Annotated[int, Within(1)] = 1
     """Number of views that each step renders; their gradients are averaged. Learning rates are multiplied by the square root of
     this number (docs/many-gpus.md). Several GPUs share the views of a step."""
     cpu_limit: bool = True
     """Limit the steps on a CPU, if --steps is None: at most as many as two cores finish in 1 to 20 minutes, depending on the
     number of views."""
-    seed: int = 0
+    seed: Annotated[int, Within(0, 2**31 - 1)] = 0
     """Seed of all random numbers; the same seed, data and kind of device give the same bytes."""
     rule: str = "exact"
     """Cut-offs of the rasterizer: exact, balanced, fast, gsplat-1.6, gsplat-1.5 or inria."""
@@ -63,29 +63,27 @@ class FitConfig:
     """Antialiased model, for renders at other sizes than the photos (Mip-Splatting, Yu et al. 2024). Gaussians smaller than a
     pixel get a lower opacity, and no axis is smaller than the training cameras resolve (docs/rasterizer.md). Renders of the run
     are antialiased, too; other programs need their antialiased mode."""
-    half_resolution: float | None = 0.0
+    half_resolution: Annotated[float | None, Within(0, 1)] = 0.0
     """Fraction of the steps, from the first step on, that use views of half size (docs/numerics.md). None: chosen by the number
     of views."""
-    sh_degree: int | None = 3
+    sh_degree: Annotated[int | None, Within(0, MAX_DEGREE)] = 3
     """Highest spherical-harmonics degree of the colours, 0 to 4; only PLY files store degree 4. None: chosen by the number of
     views."""
-    sh_every: int = 1000
+    sh_every: Annotated[int, Within(1)] = 1000
     """Number of steps after which the spherical-harmonics degree rises by one."""
-    dropout: float = 0.0
+    dropout: Annotated[float, Within(0, 1, ")")] = 0.0
     """Dropout: probability that a Gaussian is hidden in a step. It grows linearly from 0 to this value at the last step
-    (DropGaussian, Park et al. 2025)."""
-    dropout_views: int = 3
-    """Number of training views up to which dropout has its full probability; with more views it falls in proportion."""
-    checkpoint_every: int = 1000
+    (DropGaussian, Park et al. 2025), and falls in proportion to the number of training views above 3."""
+    checkpoint_every: Annotated[int, Within(1)] = 1000
     """Number of steps between checkpoints; the last step always writes a checkpoint."""
-    checkpoint_seconds: float = 20.0
+    checkpoint_seconds: Annotated[float, Within(0)] = 20.0
     """Least time between checkpoints [s], because writing takes time. This setting does not affect results."""
-    memory_limit: int | None = None
+    memory_limit: Annotated[int | None, Within(1)] = None
     """Memory limit for the tensors of the fit on its device during steps [bytes]; None for no limit. Densification stops before
     a step would exceed the limit, and images are rendered in chunks if a whole image would exceed the limit."""
     cuda_graph: bool = True
     """CUDA graphs: steps are captured once and replayed, which is faster and gives the same bytes."""
-    max_gaussians: int = 1_000_000
+    max_gaussians: Annotated[int, Within(1)] = 1_000_000
     """Largest number of Gaussians at any step, including the start."""
     background: str = "scene"
     """Background colour, behind all Gaussians: mean (mean colour of the training views), scene (colour of the files: white for
@@ -95,7 +93,7 @@ class FitConfig:
     """Density strategy, which adds and removes Gaussians: a name, or your own as module:Class or path/to/file.py:Class."""
     strategy_config: Any = None
     """Settings of the strategy, an instance of its ``Config``; None for the defaults. Settings of clone_split and
-    importance_sampling are the groups ``density`` and ``method``."""
+    sampling are the groups ``density`` and ``method``."""
     loss_terms: tuple[LossTerm, ...] = ()
     """Additional loss terms, besides those of ``loss``; each class is registered by a name."""
     view_modules: tuple[ViewModule, ...] = ()
@@ -110,32 +108,18 @@ class FitConfig:
     optimizer: OptimizerConfig = dataclasses.field(default_factory=OptimizerConfig)
     """Learning rates."""
     density: DensityConfig = dataclasses.field(default_factory=DensityConfig)
-    """Settings of cloning, splitting and pruning (strategies clone_split and importance_sampling)."""
+    """Settings of cloning, splitting and pruning (strategies clone_split, sampling and paper)."""
     limits: LimitConfig = dataclasses.field(default_factory=LimitConfig)
     """Limits of the size and the shape of every Gaussian."""
     phases: PhaseConfig = dataclasses.field(default_factory=PhaseConfig)
-    """Lengths of the three phases, and times of sampling."""
+    """Lengths of the three phases."""
     method: MethodConfig = dataclasses.field(default_factory=MethodConfig)
-    """Settings of strategy importance_sampling."""
+    """Settings of strategies sampling and paper."""
     priors: PriorConfig = dataclasses.field(default_factory=PriorConfig)
     """Networks that compute the priors of the views."""
 
     def __post_init__(self) -> None:
-        for name in ("steps", "max_steps", "batch", "sh_every", "checkpoint_every", "dropout_views", "max_gaussians"):
-            if getattr(self, name) is not None and getattr(self, name) < 1:
-                raise UsageError(f"{name.replace('_', '-')} must be at least 1, not {getattr(self, name)}")
-        if not 0 <= self.seed < 2**31:
-            raise UsageError(f"seed must be a whole number from 0 to 2^31 - 1, not {self.seed}")
-        if self.memory_limit is not None and not self.memory_limit >= 1:
-            raise UsageError(f"memory-limit must be at least one byte, not {self.memory_limit}")
-        if not self.checkpoint_seconds >= 0:
-            raise UsageError(f"checkpoint-seconds must be at least 0, not {self.checkpoint_seconds}")
-        if self.half_resolution is not None and not 0 <= self.half_resolution <= 1:
-            raise UsageError(f"half-resolution must be in [0, 1], not {self.half_resolution}")
-        if self.sh_degree is not None and not 0 <= self.sh_degree <= MAX_DEGREE:
-            raise UsageError(f"sh-degree must be in [0, {MAX_DEGREE}], not {self.sh_degree}")
-        if not 0 <= self.dropout < 1:
-            raise UsageError(f"dropout must be in [0, 1), not {self.dropout}")
+        super().__post_init__()
         rule_named(self.rule)
         color_of(self.background)
         check_terms(self.loss_terms)
@@ -175,11 +159,11 @@ class FitConfig:
         """
         mapping(anything)(values, "config")
         try:
-            values = dict(values)
+            values, lost = upgraded(values)
+            if lost:
+                raise UsageError(f"this version does not have the settings {', '.join(lost)}")
             parts = {n: tuple(_part(registry, dict(p), n) for p in values.pop(n)) for n, registry in _PARTS.items()}
             own = values.pop("strategy_config")
-            if isinstance(loss := values["loss"], dict):
-                values["loss"] = {n: v for n, v in loss.items() if n != "exposure_weight"}  # stored earlier, without effect
             kind = find_strategy(values["strategy"]).Config
             if own is not None and kind is None:
                 raise SchemaError(f"strategy_config must be null for strategy {values['strategy']}")
@@ -191,7 +175,12 @@ class FitConfig:
 
     def fingerprint(self) -> str:
         """Return the first 12 hexadecimal digits of the SHA-256 of the settings."""
-        return hashlib.sha256(json.dumps(self.to_json(), sort_keys=True).encode()).hexdigest()[:12]
+        return fingerprint(self.to_json())
+
+
+def fingerprint(config: Mapping[str, Any]) -> str:
+    """Return the first 12 hexadecimal digits of the SHA-256 of settings as plain values."""
+    return hashlib.sha256(json.dumps(config, sort_keys=True).encode()).hexdigest()[:12]
 
 
 _PARTS: dict[str, Registry[Any]] = {"loss_terms": LOSS_TERMS, "view_modules": VIEW_MODULES}
@@ -222,6 +211,81 @@ def _compose(kind: type, values: dict[str, Any], place: str) -> Any:
         else:
             composed[name] = value
     return kind(**composed)
+
+
+SIDE_FILE = "give it in FILE.onnx.json, beside the network (docs/priors.md)"
+PAPER = "--strategy paper --paper.{}"
+REMOVED: dict[str, tuple[Any, str]] = {
+    "dropout_views": (3, ""),
+    "stopping.fraction": (0.03, ""), "stopping.measurements": (12, ""), "stopping.noise": (1.0, ""),
+    "init.near_views": (4, ""), "init.max_residual": (1.0, ""), "init.blend": ("least_sensitive", ""),
+    "init.flow_range": ("255", "export the flow network with inputs of 0 to 255"),
+    "loss.random_background": (True, ""), "loss.ssim_weight": (0.2, ""),
+    "optimizer.means_lr_final": (1.6e-6, ""), "optimizer.quats_lr": (1e-3, ""), "optimizer.sh_rest_factor": (0.05, ""),
+    "density.clone_size": (0.01, ""), "density.prune_opacity": (0.005, ""), "density.morton_order": (True, ""),
+    "limits.min_pixels": (0.2**0.5, ""), "limits.ratio_from": (0.7, ""),
+    "phases.every": (100.0, ""), "phases.growth": (4.0, ""),
+    "method.events": (True, "use --strategy clone_split for a fit without sampling events"),
+    **{f"method.{n}": (v, f"use {PAPER.format(n.replace('_', '-'))}") for n, v in {
+        "s_render": False, "s_semantic": False, "s_geometry": False, "ra": True, "agp": True, "pm": True}.items()},
+    "method.coarse_lr_factor": (0.1, ""),
+    "method.importance.render": (0.4, ""), "method.importance.semantic": (0.2, ""), "method.importance.geometry": (0.4, ""),
+    "method.importance.residual": ("length", f"use {PAPER.format('residual')}"), "method.importance.curvature": (0.5, ""),
+    "method.sampler.depth": ("consistent", f"use {PAPER.format('depth')}"),
+    "method.sampler.gate_quantile": (0.0, f"use {PAPER.format('gate-quantile')}"),
+    "method.sampler.min_alpha": (0.5, ""), "method.sampler.border": (2, ""), "method.sampler.opacity": (0.1, ""),
+    "method.protect.steps": (500, ""), "method.protect.opacity": (0.05, ""),
+    "priors.depth_output": ("auto", SIDE_FILE),
+    **{f"priors.{kind}_{n}": (v, SIDE_FILE) for kind in ("depth", "segmentation")
+       for n, v in {"size": 0, "multiple": 0, "mean": None, "std": None}.items()},
+    "priors.cache": (True, "set the environment variable WARPGS_CACHE to a folder of your own"),
+}  # fmt: skip
+"""Settings of earlier versions: the value that every fit has now, and what replaces the setting; empty for a constant."""
+OLD_STRATEGY = "importance_sampling"
+"""Earlier name of the strategies sampling and paper."""
+
+
+def removed_note(name: str) -> str:
+    """Return what replaces a removed setting, given as flag, key or keyword; empty for another name."""
+    words = name.replace("-", "_").replace(".no_", ".").removeprefix("no_")
+    for full, (value, instead) in REMOVED.items():
+        short = full.removeprefix(f"{WITHOUT_PREFIX}.")
+        if words in (short, keyword(short)):
+            return f"the setting {flag(short)} was removed: {instead or f'every fit uses {value}'}"
+    return ""
+
+
+def upgraded(config: Mapping[str, Any]) -> tuple[dict[str, Any], list[str]]:
+    """Return stored settings by their present names, and each removed setting with a value that fits no longer have."""
+    values: dict[str, Any] = {n: dict(v) if isinstance(v, dict) else v for n, v in config.items()}
+    method = {n: dict(v) if isinstance(v, dict) else v for n, v in values.get("method", {}).items()}
+    if "method" in values:
+        values["method"] = method
+    if "loss" in values:
+        values["loss"].pop("exposure_weight", None)  # had no effect
+    parts: dict[str, Any] = {}
+    if "events" in method:
+        sampler = method.get("sampler", {})
+        parts = {n: method.pop(n) for n in ("s_render", "s_semantic", "s_geometry", "ra", "agp", "pm")}
+        parts |= {"residual": method["importance"].pop("residual")} | {n: sampler.pop(n) for n in ("depth", "gate_quantile")}
+        events = method.pop("events")
+        if values["strategy"] == OLD_STRATEGY:
+            plain = {n: REMOVED[f"method.{n}"][0] for n in ("s_render", "s_semantic", "s_geometry", "ra", "agp", "pm")}
+            plain |= {"residual": parts["residual"], "depth": "consistent", "gate_quantile": 0.0}
+            values["strategy"] = ("sampling" if parts == plain else "paper") if events else "clone_split"
+            values["strategy_config"] = parts if values["strategy"] == "paper" else None
+    lost = []
+    for name, (value, _) in REMOVED.items():
+        *path, last = name.split(".")
+        group = values
+        for part in path:
+            group = group.get(part, {})
+        if last in group and (stored := group.pop(last)) != value:
+            lost.append(f"{flag(name.removeprefix(f'{WITHOUT_PREFIX}.'))} {stored}")
+    for name in ("importance", "protect"):
+        if method.get(name) == {}:
+            del method[name]
+    return values, lost
 
 
 Path = tuple[str, ...]
@@ -346,6 +410,8 @@ def _parts(registry: Registry[Any], field: str, names: Any, own_code: bool) -> t
 
 
 def _found(registry: Registry[Any], name: Any, own_code: bool) -> type[Any]:
+    if name == OLD_STRATEGY:
+        raise UsageError(f"strategy {name} is now sampling, or paper, which samples by the paper's scores")
     if not isinstance(name, (str, type)):
         raise UsageError(f"{name!r} is not a {registry.kind}; give one of {', '.join(registry.names())}")
     return registry.load(name) if own_code and isinstance(name, str) else registry.find(name)
@@ -418,6 +484,8 @@ def _unknown(name: str, place: str, config: FitConfig, keywords: bool) -> str:
     """Return the message on an unknown setting, with the most similar name in the user's spelling."""
     known = {keyword(n) if keywords else n: n for n in setting_names(config)}
     groups = {n.partition(".")[0] for n in known.values() if "." in n}
+    if note := removed_note(name):
+        return f"{place}: {note}"
     if name in groups:
         return (
             f"{place}: {name} is a group of settings; give a mapping such as {{{name}: {{...}}}}, or name one of its settings"
@@ -660,7 +728,7 @@ def probe_seconds(width: int, height: int, device: torch.device) -> float:
     seconds = []
     for _ in range(REPEATS + 1):
         began = time.perf_counter()
-        loss = photometric_loss(rasterize(gaussians, camera).rgb, target, None, LossConfig().ssim_weight)
+        loss = photometric_loss(rasterize(gaussians, camera).rgb, target, None, SSIM_WEIGHT)
         torch.autograd.grad(loss, list(gaussians.tensors().values()))
         loss.item()
         if device.type == "cuda":

@@ -18,7 +18,6 @@ from warpgs.pipeline.model.start import Start, check_points, initial_points, see
 from warpgs.pipeline.train.loss import LossTerm, built_in_terms, collect
 from warpgs.pipeline.train.settings import FitConfig
 from warpgs.pipeline.train.strategies.base import find_strategy
-from warpgs.pipeline.train.strategies.importance_sampling import scored
 from warpgs.pipeline.train.views import TrainingView, with_alpha
 from warpgs.priors.given_depth import any_given, check_given, lens_depth, pinhole_view, with_given_depth
 from warpgs.priors.networks import cache_folder
@@ -118,7 +117,7 @@ def _start_of(
 
 def _unused_networks(config: FitConfig) -> list[str]:
     """Return notes on networks that are given although the fit reads no priors."""
-    switches = {"depth": "--depth-guides or --method.s-geometry", "segmentation": "--method.s-semantic"}
+    switches = {"depth": "--depth-guides or --strategy paper", "segmentation": "--strategy paper"}
     named = [kind for kind in switches if getattr(config.priors, f"{kind}_model") is not None]
     return [f"--{kind}-model is not used by this fit; to use it, add {switches[kind]}" for kind in named]
 
@@ -126,21 +125,16 @@ def _unused_networks(config: FitConfig) -> list[str]:
 def _check_models(train: list[View], config: FitConfig) -> None:
     """Check that every camera has a pinhole of the same K if the settings compare views with each other."""
     others = sorted({v.camera.model for v in train} - {*CENTRAL})
-    if others and (config.init.source != "points" or samples(config)):
+    if others and (config.init.source != "points" or find_strategy(config.strategy).samples):
         raise UsageError(
             f"camera model {others[0]}: this start or strategy compares views, which requires {' or '.join(CENTRAL)}; fit "
             "with --preset 3dgs --init.source points, or undistort the images"
         )
 
 
-def samples(config: FitConfig) -> bool:
-    """Return whether the strategy places Gaussians behind pixels, which needs depths that views confirm."""
-    return find_strategy(config.strategy).samples(config.groups())
-
-
 def needs_priors(config: FitConfig) -> bool:
     """Return whether the strategy, a loss term or depth guidance by a network needs the priors of the views."""
-    by_strategy = find_strategy(config.strategy).needs_priors(config.groups())
+    by_strategy = find_strategy(config.strategy).needs_priors(config.strategy_config)
     return by_strategy or config.priors.depth_guides or any(t.needs_priors for t in terms_of(config))
 
 
@@ -169,9 +163,14 @@ def prepared_views(
     """
     views, disparities = [TrainingView.of(v, device) for v in with_alpha(train)], []
     priors, depths = made.priors or [None] * len(train), made.start.depths or [None] * len(train)
-    if samples(config):
+    if find_strategy(config.strategy).samples:
         disparities = [p.disparity for p in made.priors or ()]
-        views = [scored(v, p, d, config.method) for v, p, d in zip(views, priors, depths, strict=True)]
+        views = [
+            v if d is None or not d.valid.any() else dataclasses.replace(
+                v, consistent=torch.as_tensor(np.where(d.valid, d.depth, 0), dtype=torch.float32, device=device)
+            )
+            for v, d in zip(views, depths, strict=True)
+        ]  # fmt: skip
     found = []
     for view, given, depth, prior in zip(views, train, depths, priors, strict=True):
         mapped = dataclasses.replace(view, **_given_maps(given, depth, device))

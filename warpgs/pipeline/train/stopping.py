@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, fields, replace
-from typing import Any
+from typing import Annotated, Any
 
 import torch
 
 from warpgs import schema
-from warpgs.errors import DataError, UsageError
+from warpgs.errors import DataError
 from warpgs.pipeline.metrics.scores import psnr_of
 from warpgs.pipeline.model.table import DensityUpdate
 from warpgs.pipeline.train.strategies.base import Strategy, StrategyContext
@@ -19,6 +19,7 @@ from warpgs.process import Detail
 from warpgs.render.options import RasterizeOptions
 from warpgs.render.rasterize import rasterize
 from warpgs.scene import Gaussians
+from warpgs.schema import Checked, Within
 
 # Held-out blocks of pixels; the gain on these blocks, compared with its noise, ends a fit early (docs/decisions/020).
 #
@@ -163,31 +164,23 @@ LATELY = 1.5
 the last third of the steps."""
 
 
+FRACTION = 0.03
+"""Fraction of the pixels that are left out, in blocks, until growth ends (docs/decisions/020-early-stopping-and-pruning.md)."""
+MEASUREMENTS = 12
+"""Number of equal intervals of the growth phase; the blocks are measured after each interval."""
+NOISES = 1.0
+"""Number of standard errors that are added to the gain, which is a mean over the blocks."""
+
+
 @dataclass(frozen=True)
-class StoppingConfig:
+class StoppingConfig(Checked, group="stopping."):
     """Settings of early stopping."""
 
-    min_gain_db: float | None = 0.0
+    min_gain_db: Annotated[float | None, Within(0, math.inf, ")")] = 0.0
     """Growth, the phase that adds Gaussians, ends when the gain of the left-out blocks over at least the last third of the
-    steps, plus ``noise`` standard errors, is below this [dB]. The rest of the fit is then shortened in proportion. Growth does
-    not end in its first third, nor while views have half size. 0: no blocks are left out, and the fit takes the planned steps.
-    None: 0.1, or 0 if --cpu-limit shortens the fit."""
-    fraction: float = 0.03
-    """Fraction of the pixels that are left out, in blocks, until growth ends."""
-    measurements: int = 12
-    """Number of equal intervals of the growth phase; the blocks are measured after each interval."""
-    noise: float = 1.0
-    """Number of standard errors that are added to the gain, which is a mean over the blocks."""
-
-    def __post_init__(self):
-        if not 0 < self.fraction <= 0.5:
-            raise UsageError(f"stopping: `fraction` must be above 0 and at most 0.5, not {self.fraction}")
-        if self.measurements < 1:
-            raise UsageError(f"stopping: `measurements` must be at least 1, not {self.measurements}")
-        for name in ("noise", "min_gain_db"):
-            value = getattr(self, name)
-            if value is not None and not 0 <= value < math.inf:
-                raise UsageError(f"stopping: `{name.replace('_', '-')}` must be 0 or more and finite, not {value}")
+    steps, plus its standard error, is below this [dB]. The rest of the fit is then shortened in proportion. Growth does not end
+    in its first third, nor while views have half size. 0: no blocks are left out, and the fit takes the planned steps. None:
+    0.1, or 0 if --cpu-limit shortens the fit."""
 
 
 @dataclass(frozen=True)
@@ -257,11 +250,11 @@ class Stopping:
             return []
         planned, (begins, ends, times) = context.phases.planned, strategy.growth()
         self.earliest = half_resolution * planned
-        count = self.config.measurements
+        count = MEASUREMENTS
         marks = {max(1, begins + round(k * (ends - begins) / count)) for k in range(count + 1)}
         if times:
             marks = {next((t for t in times if t >= m), ends) for m in marks}
-        self.marks, self.blocks = sorted(marks), sample_blocks(context.views, self.config.fraction, context.seed)
+        self.marks, self.blocks = sorted(marks), sample_blocks(context.views, FRACTION, context.seed)
         held = sum(map(len, self.blocks))
         self.active = held >= MIN_BLOCKS and ends < planned and len(marks) > 1
         if not self.active:
@@ -327,7 +320,7 @@ class Stopping:
         assert c.min_gain_db is not None
         since, earlier = next((m for m in reversed(self.measured) if m[0] * LATELY <= step), (0, None))
         lately = Gain(math.inf, 0.0) if earlier is None or self._is_early(step) else gain(earlier, errors)
-        if lately.upper_bound_below(c.min_gain_db, c.noise):
+        if lately.upper_bound_below(c.min_gain_db, NOISES):
             return (
                 f"left-out pixels no longer improve ({lately.mean:+.3f} dB in the last {step - since:,} steps, noise "
                 f"{lately.noise:.3f} dB)"

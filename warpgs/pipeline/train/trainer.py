@@ -170,6 +170,10 @@ def check_state(
         ) from e
 
 
+DROPOUT_VIEWS = 3
+"""Number of training views up to which dropout has its full probability; with more views it falls in proportion."""
+
+
 class Trainer:
     """The state of one fit, and the operations that take its steps."""
 
@@ -220,7 +224,7 @@ class Trainer:
         assert config.half_resolution is not None  # `settings_by_views` has chosen
         self.half_resolution = config.half_resolution
         """Fraction of the planned steps, from the first step on, in which views have half size."""
-        self.dropout = config.dropout * min(1.0, config.dropout_views / len(train))
+        self.dropout = config.dropout * min(1.0, DROPOUT_VIEWS / len(train))
         """Dropout probability at the last step."""
         self.cutout = any(v.alpha is not None and not v.alpha_estimated for v in train)  # then every view gets one
         given = {n: any(getattr(v, n) is not None for v in train) for n in ("depth", "normals")}
@@ -235,6 +239,7 @@ class Trainer:
         self._make_parts(train, made.start, scene_extent(cameras, cloud))
         self.layout: Layout
         views, self.disparities = prepared_views(train, made, config, self.terms, device)
+        self.context.priors = made.priors or []
         self._begin(with_learned(views, self.learned.views))
 
     def _make_parts(self, train: list[View], start: Start, extent: float) -> None:
@@ -435,8 +440,8 @@ class Trainer:
     def settings(self, step: int, slot: int | None = None) -> tuple[float, ...]:
         """Return the settings of a step (`Setting`), or of a slot, which has its own index for random numbers."""
         number = step if slot is None else (step - 1) * self.batch + slot + 1
-        shifted = self.cutout and self.config.loss.random_background
-        shift = random_shift(self.config.seed, number, self.scene_background) if shifted else (0.0, 0.0, 0.0)
+        # else Gaussians of the background colour could cover empty areas
+        shift = random_shift(self.config.seed, number, self.scene_background) if self.cutout else (0.0, 0.0, 0.0)
         means_lr = math.sqrt(self.batch) * self.lrs(step)["means"]
         return Setting.row(dropout=self.dropout * self.progress(step), number=number, step=step, means_lr=means_lr, shift=shift)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 import torch
@@ -14,10 +14,11 @@ from warpgs.errors import UsageError
 from warpgs.geometry import matmul, nearest_rotation
 from warpgs.kernels.launch import first_order
 from warpgs.pipeline.metrics.scores import MATCHED_RULE, matched_psnr, render_view
-from warpgs.pipeline.train.schedule import check_lrs, log_linear
+from warpgs.pipeline.train.schedule import LearningRate, log_linear
 from warpgs.plugins import Registry
 from warpgs.render.options import RasterizeOptions
 from warpgs.scene import Camera, Gaussians, View
+from warpgs.schema import Checked, Within
 
 CAMERA_BYTES = 4 * (16 + 9)
 """Bytes per Gaussian if cameras are learned: its part of the gradients of view matrix and intrinsics, before the sum over
@@ -49,7 +50,7 @@ class FittedViews:
 
 
 @dataclass(frozen=True)
-class ViewModule:
+class ViewModule(Checked):
     """Parameters of each training view that a fit learns together with the Gaussians.
 
     To write a module, derive a frozen dataclass; its fields are its settings.
@@ -222,23 +223,18 @@ def exposed(rgb: torch.Tensor, exposure: torch.Tensor) -> torch.Tensor:
 
 @register("exposure")
 @dataclass(frozen=True)
-class Exposure(ViewModule):
+class Exposure(ViewModule, group="exposure."):
     """Learn an affine map of colours for each training view, for photographs with different brightness or white balance.
 
     Held-out views and renders do not use the maps: scores are those of the model's own colours (docs/your-photos.md).
     """
 
-    lr: float = 5e-3
+    lr: LearningRate = 5e-3
     """Learning rate of the exposures at the start."""
-    decay: float = 0.1
+    decay: LearningRate = 0.1
     """Learning rate at the last step, as a fraction of the first; log-linear in between."""
-    weight: float = 0.01
+    weight: Annotated[float, Within(0, 1000)] = 0.01
     """Weight of the squared difference between each view's exposure and the identity, in [0, 1000]."""
-
-    def __post_init__(self) -> None:
-        check_lrs(self.name, lr=self.lr, decay=self.decay)
-        if not 0 <= self.weight <= 1000:
-            raise UsageError(f"exposure: `weight` must be between 0 and 1000, not {self.weight}")
 
     def check(self, views: Sequence[View]) -> None:
         """Check that no view has an alpha channel: an exposure would change the background with the object.
@@ -489,25 +485,19 @@ def pose_figures(
 
 @register("refine_poses")
 @dataclass(frozen=True)
-class RefinePoses(ViewModule):
+class RefinePoses(ViewModule, group="refine-poses."):
     """Learn a small correction of each training camera except the first, for inexact poses (docs/your-photos.md)."""
 
-    start: float = 0.2
+    start: Annotated[float, Within(0, 1, ")")] = 0.2
     """Fraction of the steps after which refinement of poses starts, in [0, 1): at first the Gaussians are inaccurate."""
-    rotation_lr: float = 2e-4
+    rotation_lr: LearningRate = 2e-4
     """Learning rate of the rotations of the training cameras [rad], when refinement starts."""
-    translation_lr: float = 2e-4
+    translation_lr: LearningRate = 2e-4
     """Learning rate of the translations of the training cameras, in units of the scene's extent."""
-    focal_lr: float | None = None
+    focal_lr: LearningRate | None = None
     """Learning rate of the logarithm of each camera's focal length, shared by all its views; None to keep it fixed."""
-    decay: float = 0.1
+    decay: LearningRate = 0.1
     """Learning rates at the last step, as a fraction of the first ones; log-linear in between."""
-
-    def __post_init__(self) -> None:
-        lrs = {"rotation_lr": self.rotation_lr, "translation_lr": self.translation_lr, "focal_lr": self.focal_lr}
-        check_lrs(self.name, **lrs, decay=self.decay)
-        if not 0 <= self.start < 1:
-            raise UsageError(f"refine_poses: `start` must be at least 0 and less than 1, not {self.start}")
 
     def parameters(self, views: Sequence[View]) -> dict[str, torch.Tensor]:
         """Return zeros, shape [V, 3] each; for learned focal lengths also zeros and the camera of each view, [V, 1] each."""

@@ -115,10 +115,6 @@ class TrainingView:
     """Colours in [0, 1], shape [H, W, 3]."""
     mask: torch.Tensor | None = None
     """1 for unmasked pixels, 0 for masked ones, shape [H, W]; None without a mask."""
-    semantic: torch.Tensor | None = None
-    """S_semantic in [0, 1], shape [H, W]; None for a view without a semantic score."""
-    geometry: torch.Tensor | None = None
-    """S_geometry in [0, 1], shape [H, W]; None if the strategy does not use it."""
     consistent: torch.Tensor | None = None
     """Geometrically consistent z-depth [u], 0 where no other view confirms it, shape [H, W]; None if not computed."""
     maps: Mapping[str, torch.Tensor] = field(default_factory=dict)
@@ -183,12 +179,12 @@ def step_bytes(sizes: StepSizes) -> Needs:
 
 
 def view_bytes(views: Iterable[TrainingView]) -> int:
-    """Return the bytes of views: images, masks, opacities, maps and scores; shared memory is counted once.
+    """Return the bytes of views: images, masks, opacities and maps; shared memory is counted once.
 
     Stacks are not counted: on CUDA, images, masks, opacities and maps of the views are parts of the stacks (`stack_views`); on
     a CPU, stacks have no memory of their own.
     """
-    tensors = (t for v in views for t in (v.image, v.mask, v.alpha, v.semantic, v.geometry, v.consistent, *v.maps.values()))
+    tensors = (t for v in views for t in (v.image, v.mask, v.alpha, v.consistent, *v.maps.values()))
     storages = (t.untyped_storage() for t in tensors if t is not None)
     return sum({s.data_ptr(): s.nbytes() for s in storages}.values())
 

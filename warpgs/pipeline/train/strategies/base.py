@@ -14,7 +14,7 @@ from warpgs.pipeline.train.schedule import Phases
 from warpgs.pipeline.train.views import TrainingView
 from warpgs.plugins import Registry
 from warpgs.render.options import RasterizeOptions
-from warpgs.scene import Gaussians
+from warpgs.scene import Gaussians, Prior
 from warpgs.schema import anything
 
 T = TypeVar("T")
@@ -70,6 +70,8 @@ class StrategyContext:
     """Cut-offs of the rasterizer."""
     background: torch.Tensor
     """Colour behind the scene, shape [3]."""
+    priors: list[Prior] = field(default_factory=list)
+    """Prior of each training view; empty if the fit needs none (`Strategy.needs_priors`)."""
     views: list[TrainingView] = field(default_factory=list)
     """Training views; empty before `Strategy.setup`."""
     capacity: int = 0
@@ -117,6 +119,8 @@ class Strategy:
     Config: ClassVar[type | None] = None
     """Frozen dataclass of the strategy's settings; None without settings. They become flags, grouped under the strategy's
     name."""
+    samples: ClassVar[bool] = False
+    """True for a strategy that places Gaussians behind pixels, which needs consistent depth."""
     STATE: ClassVar[staticmethod[[Any, str], None]] = staticmethod(anything)
     """Schema (`warpgs.train.state_schema`) of the plain values that `state` returns; checked before `load`."""
 
@@ -131,13 +135,8 @@ class Strategy:
         """The strategy's own settings."""
 
     @classmethod
-    def samples(cls, settings: Settings) -> bool:
-        """Return whether the strategy places Gaussians at pixels, which needs consistent depth; ``settings`` are the fit's."""
-        return False
-
-    @classmethod
-    def needs_priors(cls, settings: Settings) -> bool:
-        """Return whether the strategy reads scores from the priors of the views; ``settings`` are those of the fit."""
+    def needs_priors(cls, own: Any) -> bool:
+        """Return whether the strategy reads the priors of the views, by its own settings (its ``Config``)."""
         return False
 
     @classmethod
@@ -231,7 +230,7 @@ class Strategy:
         """Load what `state` returned."""
 
 
-STRATEGIES: Registry[Strategy] = Registry("strategy", Strategy, __package__)
-"""Strategies by name; those in the modules of this folder are built in."""
+STRATEGIES: Registry[Strategy] = Registry("strategy", Strategy, __package__, "warpgs.pipeline.paper")
+"""Strategies by name; those in the modules of this folder and of the paper's are built in."""
 register = STRATEGIES.register
 find_strategy = STRATEGIES.find

@@ -5,16 +5,16 @@ from __future__ import annotations
 import math
 from collections.abc import Hashable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import torch
 
 from warpgs import geometry, schema
-from warpgs.errors import UsageError
 from warpgs.pipeline.model.table import Column, DensityUpdate
 from warpgs.pipeline.train.schedule import EventTimes, PhaseConfig
 from warpgs.pipeline.train.strategies.base import Growth, Strategy, StrategyContext, register
 from warpgs.scene import Gaussians
+from warpgs.schema import Checked, Within
 
 # Growth by gradient: clone, split and prune (Kerbl et al. 2023, section 5.2), as a part of strategies.
 
@@ -22,49 +22,34 @@ RESET_FREE_STEPS = 500
 """No opacities are reset in this number of steps before the last event: transparent Gaussians would stay transparent."""
 
 
+CLONE_SIZE = 0.01
+"""Gaussians smaller than this fraction of the scene's extent are cloned, larger ones split (Kerbl et al. 2023)."""
+PRUNE_OPACITY = 0.005
+"""Gaussians below this opacity are removed (Kerbl et al. 2023)."""
+
+
 @dataclass(frozen=True)
-class DensityConfig:
+class DensityConfig(Checked, group="density."):
     """Thresholds and times of densification."""
 
-    start: int = 500
+    start: Annotated[int, Within(0)] = 500
     """Steps before Gaussians are first added and removed; at most a quarter of the fit."""
-    every: int = 100
+    every: Annotated[int, Within(1)] = 100
     """Steps between events that add and remove Gaussians."""
-    stop_fraction: float = 0.5
+    stop_fraction: Annotated[float, Within(0, 1)] = 0.5
     """Fraction of the fit after which no Gaussians are added or removed. In a fit with phases, the start of phase 3 counts
     instead."""
-    gradient: float = 2e-4
+    gradient: Annotated[float, Within(0)] = 2e-4
     """Mean norm of the gradient of a projected mean, in half image widths and heights, above which a Gaussian is cloned or
     split."""
-    clone_size: float = 0.01
-    """Gaussians smaller than this fraction of the scene's extent are cloned, larger ones split."""
-    prune_opacity: float = 0.005
-    """Gaussians below this opacity are removed."""
-    prune_size: float = 0.1
+    prune_size: Annotated[float, Within(0)] = 0.1
     """Size above which Gaussians are removed after the first opacity reset, as a fraction of the scene's extent; none are
     removed if more than half are larger. 0 to disable."""
-    reset_every: int = 0
+    reset_every: Annotated[int, Within(0)] = 0
     """Steps between opacity resets, 3000 in Kerbl et al. 2023; 0 for no resets. With few views the fit does not recover from a
     reset (docs/decisions/002-no-opacity-reset.md)."""
-    reset_opacity: float = 0.01
+    reset_opacity: Annotated[float, Within(0, 1, "()")] = 0.01
     """Largest opacity after a reset."""
-    morton_order: bool = True
-    """Order the Gaussians along a Morton curve after each event (docs/decisions/009-morton-order.md)."""
-
-    def __post_init__(self) -> None:
-        if self.every < 1 or self.start < 0 or self.reset_every < 0:
-            raise UsageError(
-                "density: `every` must be at least 1, `start` and `reset-every` at least 0, not "
-                f"{self.every}, {self.start} and {self.reset_every}"
-            )
-        for name in ("stop_fraction", "prune_opacity"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise UsageError(f"density: `{name.replace('_', '-')}` must be between 0 and 1, not {getattr(self, name)}")
-        for name in ("gradient", "clone_size", "prune_size"):
-            if not getattr(self, name) >= 0:
-                raise UsageError(f"density: `{name.replace('_', '-')}` must be at least 0, not {getattr(self, name)}")
-        if not 0 < self.reset_opacity < 1:
-            raise UsageError(f"density: `reset-opacity` must be in (0, 1), not {self.reset_opacity}")
 
     def times(self, steps: int) -> EventTimes:
         """Return the times of events in a fit of that many steps."""
@@ -130,8 +115,8 @@ def refine(
         if int(grows.sum()) > free:
             strongest = torch.topk(pull, free).indices
             grows = torch.zeros_like(grows).index_fill(0, strongest, True) & grows
-        small = scales <= config.clone_size * extent
-        faint = ~(logits >= geometry.logit(config.prune_opacity))
+        small = scales <= CLONE_SIZE * extent
+        faint = ~(logits >= geometry.logit(PRUNE_OPACITY))
         if after_reset and config.prune_size > 0:
             huge = scales > config.prune_size * extent
             if 2 * int(huge.sum()) <= len(gaussians):  # else the extent itself is small, since the cameras stand close together
@@ -216,8 +201,7 @@ class GradientGrowth:
             t.gaussians, pull, self.config, extent=t.extent, capacity=t.capacity, after_reset=self.was_reset,
             generator=t.generator, growing=growing, protected=protected,
         )  # fmt: skip
-        if self.config.morton_order:
-            t.table.sort_along_curve()
+        t.table.sort_along_curve()  # docs/decisions/009-morton-order.md
         for name in self.columns():
             t.table.columns[name].zero_()
 

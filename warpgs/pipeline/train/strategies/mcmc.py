@@ -10,17 +10,18 @@ import functools
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 import warp as wp
 
-from warpgs.errors import UsageError
 from warpgs.kernels import launch
 from warpgs.kernels.update import Setting
 from warpgs.pipeline.model.table import DensityUpdate
 from warpgs.pipeline.train.schedule import EventTimes
 from warpgs.pipeline.train.strategies.base import Growth, Strategy, register
 from warpgs.scene import Gaussians
+from warpgs.schema import Checked, Within
 
 MAX_COPIES = 51
 """Largest number of Gaussians that replace one Gaussian at an event, as in the authors' program."""
@@ -34,35 +35,25 @@ t = 0.995 for 1 - opacity."""
 
 
 @dataclass(frozen=True)
-class MCMCConfig:
+class MCMCConfig(Checked, group="mcmc."):
     """Settings of strategy mcmc; the defaults are the paper's."""
 
-    start: int = 500
+    start: Annotated[int, Within(0)] = 500
     """Steps before Gaussians are first relocated and added; at most a quarter of the fit."""
-    every: int = 100
+    every: Annotated[int, Within(1)] = 100
     """Steps between events that relocate and add Gaussians."""
-    stop_fraction: float = 0.83
+    stop_fraction: Annotated[float, Within(0, 1)] = 0.83
     """Fraction of the fit after which no Gaussians are added or relocated; 25,000 of 30,000 steps in the paper."""
-    growth: float = 0.05
+    growth: Annotated[float, Within(0, 1)] = 0.05
     """Gaussians added at an event, as a fraction of the current number, up to --max-gaussians."""
-    min_opacity: float = 0.005
+    min_opacity: Annotated[float, Within(0, 0.5)] = 0.005
     """Largest opacity of a dead Gaussian, in [0, 0.5]."""
-    noise_lr: float = 5e5
+    noise_lr: Annotated[float, Within(0, 1e9)] = 5e5
     """Size of the perturbation, as a multiple of the learning rate of the means."""
-    opacity_weight: float = 0.01
+    opacity_weight: Annotated[float, Within(0, 1e9)] = 0.01
     """Weight of the mean opacity in the loss."""
-    scale_weight: float = 0.01
+    scale_weight: Annotated[float, Within(0, 1e9)] = 0.01
     """Weight of the mean axis length [1/u] in the loss."""
-
-    def __post_init__(self):
-        if self.start < 0 or self.every < 1:
-            raise UsageError(f"mcmc: `start` must be at least 0, not {self.start}, and `every` at least 1, not {self.every}")
-        for name, top in (("stop_fraction", 1), ("growth", 1), ("min_opacity", 0.5)):
-            if not 0 <= getattr(self, name) <= top:
-                raise UsageError(f"mcmc: `{name.replace('_', '-')}` must be between 0 and {top}, not {getattr(self, name)}")
-        for name in ("noise_lr", "opacity_weight", "scale_weight"):
-            if not 0 <= getattr(self, name) <= 1e9:
-                raise UsageError(f"mcmc: `{name.replace('_', '-')}` must be between 0 and 1e9, not {getattr(self, name)}")
 
 
 @torch.no_grad()

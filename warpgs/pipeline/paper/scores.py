@@ -1,53 +1,28 @@
-"""Importance of pixels, and the Gaussians sampled by it."""
+"""The paper's importance of pixels: three scores, their sum, and the gate (Multi-Modal Importance Assessment)."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
 
-from warpgs.errors import UsageError
-from warpgs.geometry import back_project_tensors, logit, project_tensors
+from warpgs.geometry import back_project_tensors, project_tensors
 from warpgs.pipeline.metrics.scores import quantiles
 from warpgs.pipeline.train.views import TrainingView
-from warpgs.scene import Camera, base_coefficients
+from warpgs.scene import Camera
 
-# Importance of the pixels of a training view: the paper's three scores, and their weighted sum.
-#
-# Paper, section "Multi-Modal Importance Assessment". The paper does not specify the scale of each score, the unit of
-# depth and the weight of curvature; see docs/decisions/008-method.md for our choices.
+# The paper does not specify the scale of each score, the unit of depth and the weight of curvature; see
+# docs/decisions/008-method.md for our choices.
 
+WEIGHTS = 0.4, 0.2, 0.4
+"""Weights w1, w2, w3 of the rendering residual, the semantic and the geometric score."""
+CURVATURE = 0.5
+"""Weight of the second derivatives of inverse depth in the geometric score (lambda_curv; the paper gives no value)."""
 PERCENTILES = (0.02, 0.98)
 """Quantiles of a view's score that map to 0 and 1, so that a few extreme pixels do not compress the range of the rest."""
 BLUR = 1.0
 """Standard deviation [px] of the blur of residuals and disparities, so that single noisy pixels attract no samples."""
-
-
-@dataclass(frozen=True)
-class ImportanceConfig:
-    """Weights of the scores."""
-
-    render: float = 0.4
-    """Weight of the rendering residual (paper, w1)."""
-    semantic: float = 0.2
-    """Weight of the semantic score (paper, w2)."""
-    geometry: float = 0.4
-    """Weight of the geometric score (paper, w3)."""
-    residual: str = "length"
-    """Rendering residual: length, the length of the colour difference in the view (the paper); or gain, the estimated decrease
-    of the squared error over all training views by a fine Gaussian at the pixel."""
-    curvature: float = 0.5
-    """Weight of the second derivatives of inverse depth in the geometric score (lambda_curv; the paper gives no value)."""
-
-    def __post_init__(self):
-        if self.residual not in ("length", "gain"):
-            raise UsageError(f"importance: `residual` {self.residual!r} is not one of length, gain")
-        for name in ("render", "semantic", "geometry", "curvature"):
-            if not 0 <= getattr(self, name) < math.inf:
-                raise UsageError(f"importance: `{name}` must be at least 0 and finite, not {getattr(self, name)}")
 
 
 def blur(image: torch.Tensor, sigma: float = BLUR) -> torch.Tensor:
@@ -85,14 +60,13 @@ def _slopes(image: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     return dx, dy
 
 
-def geometry_score(disparity: torch.Tensor, curvature: float, valid: torch.Tensor | None = None) -> torch.Tensor:
-    """Compute S_geometry: length of the disparity's gradient plus ``curvature`` times the norm of its second derivatives.
+def geometry_score(disparity: torch.Tensor, valid: torch.Tensor | None = None) -> torch.Tensor:
+    """Compute S_geometry: length of the disparity's gradient plus `CURVATURE` times the norm of its second derivatives.
 
     Both are scaled to [0, 1] before they are added, and so is the sum, since relative disparity has no unit.
 
     Args:
         disparity: Relative inverse depth, shape [H, W].
-        curvature: Weight of the second derivatives.
         valid: Pixels that determine the range, bool, shape [H, W]; None for all.
 
     Returns:
@@ -104,7 +78,7 @@ def geometry_score(disparity: torch.Tensor, curvature: float, valid: torch.Tenso
     dx, dy = _slopes(smooth)
     (dxx, dxy), (_, dyy) = _slopes(dx), _slopes(dy)
     bend = (dxx**2 + 2 * dxy**2 + dyy**2).double().sqrt().to(smooth.dtype)
-    return normalized(normalized(torch.hypot(dx, dy), valid) + curvature * normalized(bend, valid), valid)
+    return normalized(normalized(torch.hypot(dx, dy), valid) + CURVATURE * normalized(bend, valid), valid)
 
 
 def semantic_score(confidence: torch.Tensor, boundary: torch.Tensor, foreground: torch.Tensor) -> torch.Tensor:
@@ -117,9 +91,9 @@ def render_score(rendered: torch.Tensor, image: torch.Tensor, valid: torch.Tenso
     return normalized(blur((rendered - image).norm(dim=-1)), valid)
 
 
-def weights(config: ImportanceConfig, *, render: bool, semantic: bool, geometry: bool) -> tuple[float, float, float]:
+def weights(render: bool, semantic: bool, geometry: bool) -> tuple[float, float, float]:
     """Return the three weights: 0 for missing scores, the others scaled to sum to 1; all 0 without any score."""
-    chosen = (config.render * render, config.semantic * semantic, config.geometry * geometry)
+    chosen = tuple(w * on for w, on in zip(WEIGHTS, (render, semantic, geometry)))
     total = sum(chosen)
     return chosen if total == 0 else tuple(w / total for w in chosen)
 
@@ -214,59 +188,6 @@ SUPPORT = 4
 """Fewest pixels that must pass a gate, as a multiple of those to be sampled; with fewer, the gate's quantile is lowered."""
 
 
-@dataclass(frozen=True)
-class SamplerConfig:
-    """Placement of fine Gaussians at one event."""
-
-    depth: str = "rendered"
-    """Depth of new Gaussians: rendered (the paper), or consistent, the initial depth that other views confirm. With consistent,
-    and with the reliability gate on, views with consistent depth are sampled only where it exists."""
-    fraction: float = 0.005
-    """Gaussians per event and view, as a fraction of the view's pixels."""
-    gate_quantile: float = 0.6
-    """Quantile of a view's geometric score above which a pixel is reliable, in [0, 1) (tau_geometry); 0 to disable."""
-    min_alpha: float = 0.5
-    """Smallest rendered opacity of a pixel that may receive a Gaussian, in [0, 1)."""
-    border: int = 2
-    """Width of the image border in which no pixel is sampled [px]."""
-    opacity: float = 0.1
-    """Initial opacity of a fine Gaussian, in (0, 1)."""
-    footprint: float = 1.0
-    """Initial standard deviation of a fine Gaussian [px], in the view of its pixel."""
-    max_fraction: float = 0.5
-    """Largest number of fine Gaussians, as a fraction of the coarse ones."""
-
-    def __post_init__(self):
-        if self.depth not in ("rendered", "consistent"):
-            raise UsageError(f"sampler: `depth` {self.depth!r} is not one of rendered, consistent")
-        if not 0 < self.fraction <= 1 or not 0 <= self.gate_quantile < 1 or not 0 <= self.min_alpha < 1:
-            raise UsageError(
-                "sampler: `fraction` must be in (0, 1], `gate-quantile` and `min-alpha` in [0, 1), not "
-                f"{self.fraction}, {self.gate_quantile} and {self.min_alpha}"
-            )
-        if (
-            not 0 < self.opacity < 1
-            or not 0 < self.footprint < math.inf
-            or self.border < 0
-            or not 0 <= self.max_fraction < math.inf
-        ):
-            raise UsageError(
-                "sampler: `opacity` must be in (0, 1), `footprint` above 0, `border` and `max-fraction` at least 0, not "
-                f"{self.opacity}, {self.footprint}, {self.border} and {self.max_fraction}"
-            )
-
-
-def valid_pixels(alpha: torch.Tensor, depth: torch.Tensor, mask: torch.Tensor | None, config: SamplerConfig) -> torch.Tensor:
-    """Return the unmasked pixels with enough opacity and positive, finite depth, away from the border; all maps are [H, W]."""
-    valid = (alpha > config.min_alpha) & torch.isfinite(depth) & (depth > 0)
-    if mask is not None:
-        valid &= mask > 0
-    inner = torch.zeros_like(valid)
-    b = config.border
-    inner[b : valid.shape[0] - b, b : valid.shape[1] - b] = True
-    return valid & inner
-
-
 def geometry_gate(geometry: torch.Tensor, valid: torch.Tensor, quantile: float, wanted: int) -> tuple[torch.Tensor, float]:
     """Return M_reliable, the valid pixels with a geometric score above a quantile over valid pixels, and the quantile used.
 
@@ -287,69 +208,3 @@ def geometry_gate(geometry: torch.Tensor, valid: torch.Tensor, quantile: float, 
             return gate, quantile
         quantile = quantile - 0.2 if quantile > 0.2 else 0.0
     return valid, 0.0
-
-
-def sample_pixels(
-    score: torch.Tensor, gate: torch.Tensor, count: int, generator: torch.Generator, *, random: bool
-) -> torch.Tensor:
-    """Sample pixels within a gate without replacement, with probability proportional to a score (P_sample).
-
-    Successive sampling: the ``count`` smallest of E_i / score_i with exponential E_i (Efraimidis and Spirakis 2006).
-
-    Args:
-        score: S_importance, at least 0, shape [H, W].
-        gate: Pixels that may be sampled, bool, shape [H, W].
-        count: Number of pixels.
-        generator: CPU generator, the same numbers on every device.
-        random: False takes the highest scores instead (the ablation without adaptive placement).
-
-    Returns:
-        Rows and columns, int64, shape [S, 2] with S = count or the number of gated pixels with a positive score.
-    """
-    allowed = gate & (score > 0)
-    count = min(count, int(allowed.sum()))
-    if random:
-        uniform = torch.rand(score.shape, dtype=torch.float64, generator=generator, device="cpu").to(score.device)
-        key = score.double() / -torch.log1p(-uniform)
-    else:
-        key = score.double()
-    key = torch.where(allowed, key, -1.0)
-    chosen = torch.topk(key.flatten(), count).indices.sort().values
-    return torch.stack([chosen // score.shape[1], chosen % score.shape[1]], 1)
-
-
-def fine_gaussians(
-    camera: Camera, image: torch.Tensor, depth: torch.Tensor, at: torch.Tensor, config: SamplerConfig, coefficients: int
-) -> dict[str, torch.Tensor]:
-    """Return isotropic Gaussians behind pixels, ``config.footprint`` pixels wide there, in the colours of the image.
-
-    Args:
-        camera: Camera of the view, tensors.
-        image: Colours in [0, 1], shape [H, W, 3].
-        depth: z-depth [u], shape [H, W].
-        at: Rows and columns, shape [S, 2].
-        config: Opacity and footprint.
-        coefficients: Spherical-harmonics coefficients per channel.
-
-    Returns:
-        Rows of the five tensors of `Gaussians`, shape [S, ...] each.
-
-    Raises:
-        UsageError: The camera model is only supported by the kernels.
-    """
-    rows, columns = at.unbind(1)
-    depths = depth[rows, columns]
-    means = back_project_tensors(camera, torch.stack([columns, rows], 1).to(depth.dtype) + 0.5, depths)
-    count = len(means)
-    focal = 0.5 * (camera.K[0, 0] + camera.K[1, 1])
-    sh = means.new_zeros(count, coefficients, 3)
-    sh[:, 0] = base_coefficients(image[rows, columns])
-    quats = means.new_zeros(count, 4)
-    quats[:, 0] = 1
-    return {
-        "means": means,
-        "quats": quats,
-        "log_scales": (math.log(config.footprint) + (depths / focal).double().log()).to(depths.dtype)[:, None].repeat(1, 3),
-        "logit_opacities": torch.full_like(depths, logit(config.opacity)),
-        "sh": sh,
-    }

@@ -1,4 +1,4 @@
-"""The method's parts in a fit: phases, layers, protection, capacity, and every combination of switches."""
+"""Sampling in a fit: pixels and the Gaussians behind them, phases, layers, protection, capacity."""
 
 import dataclasses
 import itertools
@@ -6,49 +6,53 @@ import itertools
 import numpy as np
 import pytest
 import torch
+from scipy.stats import chisquare
 
-from tests.scenes import photos, priors, seeds, three_gaussians
+from tests.scenes import photos, ring, seeds
+from warpgs import geometry
 from warpgs.errors import UsageError
 from warpgs.kernels.update import Setting
 from warpgs.pipeline.model.start import InitConfig, initial_points
 from warpgs.pipeline.model.table import DensityUpdate
 from warpgs.pipeline.run.folder import load_checkpoint, save_checkpoint
-from warpgs.pipeline.train.sampling import ImportanceConfig, SamplerConfig
 from warpgs.pipeline.train.schedule import PhaseConfig, plan_phases
 from warpgs.pipeline.train.settings import FitConfig
+from warpgs.pipeline.train.strategies import sampling
 from warpgs.pipeline.train.strategies.clone_split import DensityConfig
-from warpgs.pipeline.train.strategies.importance_sampling import (
+from warpgs.pipeline.train.strategies.sampling import (
     COARSE,
     FINE,
     NOT_SAMPLED,
     Event,
     MethodConfig,
-    ProtectConfig,
+    SamplerConfig,
+    fine_gaussians,
     keep_contributors,
-    render_before,
-    sample_view,
-    sampling_event,
+    sample_pixels,
+    valid_pixels,
 )
 from warpgs.pipeline.train.trainer import Trainer
 from warpgs.render.options import RasterizeOptions
 from warpgs.render.rasterize import rasterize
-from warpgs.scene import Gaussians
+from warpgs.scene import C0, Camera
 
 CPU = torch.device("cpu")
-SWITCHES = ("hier", "s_render", "s_semantic", "s_geometry", "ra", "agp", "pm")
-METHOD = MethodConfig(
-    events=True, hier=True, sampler=SamplerConfig(fraction=0.01, min_alpha=0.05), protect=ProtectConfig(steps=10)
-)
+METHOD = MethodConfig(hier=True, sampler=SamplerConfig(fraction=0.01))
 CONFIG = FitConfig(
     steps=40, sh_every=10, dropout=0.2, init=InitConfig(source="points"), sh_degree=1,
-    density=DensityConfig(start=2, every=8, gradient=1e-5), phases=PhaseConfig(8, 12, every=5),
-    strategy="importance_sampling", method=METHOD,
+    density=DensityConfig(start=2, every=8, gradient=1e-5), phases=PhaseConfig(160, 240), strategy="sampling", method=METHOD,
 )  # fmt: skip
 
 
-def fitted(config: FitConfig = CONFIG, steps: int | None = None, size: tuple[int, int] = (40, 32)) -> Trainer:
-    views = photos(3, *size)
-    fit = Trainer(views, seeds(), config, CPU, priors=priors(views))
+@pytest.fixture(autouse=True)
+def tiny(monkeypatch):
+    """Three Gaussians are hardly opaque, and fits of 40 steps have no time for long protection."""
+    monkeypatch.setattr(sampling, "MIN_ALPHA", 0.05)
+    monkeypatch.setattr(sampling, "PROTECTED_STEPS", 10)
+
+
+def fitted(config: FitConfig = CONFIG, steps: int | None = None) -> Trainer:
+    fit = Trainer(photos(3), seeds(), config, CPU)
     for _ in range(config.steps if steps is None else steps):
         fit.advance()
     return fit
@@ -61,13 +65,91 @@ def grown(fit: Trainer, keep: int | list[int], parents: list[int], **more) -> De
     return DensityUpdate(rows, added, torch.tensor(parents), **more)
 
 
-def event_of(fit: Trainer, views, method: MethodConfig, step: int) -> Event:
+def event_of(fit: Trainer, views, step: int, fraction: float = 0.01, max_fraction: float = 0.5) -> Event:
     """A sampling event on some views that is not applied."""
-    protected = fit.strategy.is_protected(step) & method.pm
-    return sampling_event(
-        fit.gaussians, fit.strategy.fine, protected, views, method, step=step, capacity=10_000,
-        options=RasterizeOptions(background=torch.zeros(3)), generator=torch.Generator().manual_seed(0),
-    )  # fmt: skip
+    return fit.strategy.sample(step, dict(enumerate(views)), fraction, max_fraction)
+
+
+def drawn_counts(score: torch.Tensor, gate: torch.Tensor, count: int, repeats: int) -> np.ndarray:
+    generator, counts = torch.Generator().manual_seed(0), np.zeros(score.shape, int)
+    for _ in range(repeats):
+        at = sample_pixels(score, gate, count, generator, random=True).numpy()
+        assert len(np.unique(at, axis=0)) == len(at) == count
+        counts[at[:, 0], at[:, 1]] += 1
+    return counts
+
+
+def test_frequencies_are_proportional_to_the_score():
+    """One pixel a draw: chi-square against S / sum S within the gate, never outside it."""
+    score = torch.arange(1.0, 25).reshape(4, 6)
+    gate = torch.ones(4, 6, dtype=torch.bool)
+    gate[2] = False
+    counts = drawn_counts(score, gate, 1, 4000)
+    expected = (score * gate).numpy() / float((score * gate).sum())
+    assert not counts[2].any()
+    assert chisquare(counts[gate], 4000 * expected[gate]).pvalue > 1e-4
+
+
+def test_several_pixels_are_drawn_without_replacement():
+    """Of two pixels out of three with weights 1, 1, 2, the heavy one is missing in one draw of six (successive sampling)."""
+    score = torch.tensor([[1.0, 1.0, 2.0]])
+    counts = drawn_counts(score, torch.ones(1, 3, dtype=torch.bool), 2, 3000)[0]
+    # P(missing heavy) = 2 * (1/4) (1/3) = 1/6
+    assert chisquare([counts[2], 3000 - counts[2]], [2500, 500]).pvalue > 1e-4
+
+
+def test_pixels_without_score_are_never_drawn_and_fewer_come_back():
+    """Asked for five, two have a score: two come back."""
+    score = torch.zeros(3, 4)
+    score[1, 2], score[0, 3] = 0.5, 1e-6
+    at = sample_pixels(score, torch.ones(3, 4, dtype=torch.bool), 5, torch.Generator(), random=True)
+    assert at.tolist() == [[0, 3], [1, 2]]
+
+
+def test_without_adaptive_placement_the_highest_are_taken():
+    """Deterministic top n within the gate."""
+    score = torch.rand(8, 9, generator=torch.Generator().manual_seed(3))
+    gate = score < 0.9
+    at = sample_pixels(score, gate, 5, torch.Generator(), random=False)
+    lowest = score[at[:, 0], at[:, 1]].min()
+    assert int((score[gate] >= lowest).sum()) == 5
+
+
+def test_valid_pixels_have_depth_and_lie_inside(monkeypatch):
+    """Thin, infinite, masked and border pixels are out."""
+    monkeypatch.undo()
+    alpha, depth, mask = torch.ones(10, 12), torch.ones(10, 12), torch.ones(10, 12)
+    alpha[4, 4], depth[4, 5], depth[4, 6], mask[4, 7] = 0.4, torch.inf, 0, 0
+    valid = valid_pixels(alpha, depth, mask)
+    assert valid.sum() == 6 * 8 - 4 and not bool(valid[4, 4:8].any()) and not bool(valid[:2].any())
+
+
+def test_back_projection_is_undone_by_projection():
+    """To 1e-5 px in float32."""
+    camera = ring(5)[1]
+    pixels = np.random.default_rng(0).uniform(0, 30, (50, 2))
+    depths = np.random.default_rng(1).uniform(0.5, 8, 50)
+    tensors = Camera(torch.as_tensor(camera.viewmat), torch.as_tensor(camera.K), camera.width, camera.height)
+    points = geometry.back_project_tensors(tensors, torch.as_tensor(pixels), torch.as_tensor(depths))
+    again, z = geometry.project_points(camera, points.numpy())
+    assert np.abs(again - pixels).max() < 1e-10 and np.abs(z - depths).max() < 1e-10
+
+
+def test_fine_gaussians_stand_behind_their_pixels():
+    """Centre, colour, opacity, and a width of one pixel at their depth."""
+    camera = ring(5)[3]
+    tensors = Camera(
+        *(torch.as_tensor(t, dtype=torch.float32) for t in (camera.viewmat, camera.K)), camera.width, camera.height
+    )
+    image = torch.rand(camera.height, camera.width, 3, generator=torch.Generator().manual_seed(0))
+    depth = torch.full((camera.height, camera.width), 2.5)
+    at = torch.tensor([[3, 7], [20, 30]])
+    rows = fine_gaussians(tensors, image, depth, at, 1.0, 4)
+    pixels, z = geometry.project_points(camera, rows["means"].double().numpy())
+    assert np.allclose(pixels, [[7.5, 3.5], [30.5, 20.5]], atol=1e-5) and np.allclose(z, 2.5)
+    assert torch.allclose(rows["sh"][:, 0] * C0 + 0.5, image[at[:, 0], at[:, 1]]) and not bool(rows["sh"][:, 1:].any())
+    assert torch.allclose(rows["logit_opacities"].sigmoid(), torch.tensor(0.1))
+    assert torch.allclose(rows["log_scales"].exp(), torch.tensor(2.5 / camera.K[0, 0], dtype=torch.float32))
 
 
 @pytest.mark.parametrize("length, count", [(5000, 21), (25_000, 102)])
@@ -90,13 +172,13 @@ def test_short_fit_has_all_phases():
     assert plan_phases(PhaseConfig(2000, 3000, least=20), 3000) == plan_phases(PhaseConfig(2000, 3000), 3000)
 
 
-def test_protected_gaussian_survives_its_protection_and_no_step_longer():
+def test_protected_gaussian_survives_its_protection_and_no_step_longer(monkeypatch):
     """An opacity pushed down every step stays at the least for T_protect steps after the event, then falls.
 
     In a step that is not taken nothing changes.
     """
-    config = dataclasses.replace(CONFIG, method=dataclasses.replace(METHOD, protect=ProtectConfig(steps=5)))
-    fit = fitted(config, steps=0)
+    monkeypatch.setattr(sampling, "PROTECTED_STEPS", 5)
+    fit = fitted(steps=0)
     fit.table.apply(grown(fit, 2, [-1], columns={"level": FINE, "created_step": 7}))
     logits, going = fit.table.params["logit_opacities"].detach(), torch.ones(1, dtype=torch.bool)
     for step in range(8, 16):
@@ -105,7 +187,7 @@ def test_protected_gaussian_survives_its_protection_and_no_step_longer():
         fit.strategy.after_step(fit.strategy.phase(step), settings, ~going)
         assert logits.tolist() == [-10.0] * 3
         fit.strategy.after_step(fit.strategy.phase(step), settings, going)
-        held = float(logits[2]) == pytest.approx(fit.strategy.method.protect.logit)
+        held = float(logits[2]) == pytest.approx(geometry.logit(sampling.PROTECTED_OPACITY))
         assert held == (step <= 12) and bool(fit.strategy.is_protected(step)[2]) == (step <= 12)
         assert logits[:2].tolist() == [-10.0, -10.0]
 
@@ -158,44 +240,19 @@ def test_full_fine_layer_frees_its_least_contributors():
     """At the cap an event removes as many unprotected fine Gaussians as it adds; without unprotected ones it adds fewer."""
     fit = fitted(steps=8)
     cap = len(fit.strategy.events) and int(fit.strategy.fine.sum())
-    method = dataclasses.replace(
-        METHOD, sampler=dataclasses.replace(METHOD.sampler, max_fraction=cap / int((~fit.strategy.fine).sum()))
-    )
-    protected = event_of(fit, fit.views, method, 9)
+    most = cap / int((~fit.strategy.fine).sum())
+    protected = event_of(fit, fit.views, 9, max_fraction=most)
     assert protected.evicted == 0 and len(protected.change.parents) == 0
-    old = event_of(fit, fit.views, method, 500)
+    old = event_of(fit, fit.views, 500, max_fraction=most)
     assert old.evicted == len(old.change.parents) == cap
     assert bool((~fit.strategy.fine)[old.change.keep].all())
 
 
-SOME = [(True,) * 7, (False,) * 7, *(tuple(i != j for i in range(7)) for j in range(7))]
-"""All parts, none, and each part switched off alone."""
-
-
-@pytest.mark.parametrize(
-    "combinations",
-    [SOME, pytest.param([*itertools.product((False, True), repeat=7)], marks=pytest.mark.slow)],
-    ids=["some", "all"],
-)
-def test_switch_combinations_run(combinations):
-    """Fits of a 32 x 32 scene, 2^7 of them in all: every one samples, protects or not as asked, and stays finite."""
-    config = dataclasses.replace(CONFIG, steps=6, phases=PhaseConfig(2, 1, every=2))
-    for values in combinations:
-        method = dataclasses.replace(METHOD, **dict(zip(SWITCHES, values)))
-        fit = fitted(dataclasses.replace(config, method=method), size=(32, 32))
-        assert all(bool(torch.isfinite(t).all()) for t in fit.gaussians.tensors().values()), values
-        # the first event fills the layer; the second finds no room among the protected
-        first, second = fit.strategy.events
-        assert first["added"] > 0 and first["evicted"] == 0, values
-        assert (second["added"] > 0) == (second["evicted"] > 0) == (not method.pm), values
-
-
-def test_continued_fit_with_all_parts_equals_uninterrupted_one(tmp_path):
+def test_continued_fit_equals_uninterrupted_one(tmp_path):
     """Saved between two sampling events: the same bits at the end, layers and events included."""
     straight, broken = fitted(), fitted(steps=17)
     save_checkpoint(tmp_path, *broken.state())
-    views = photos(3)
-    resumed = Trainer(views, seeds(), CONFIG, CPU, priors=priors(views))
+    resumed = Trainer(photos(3), seeds(), CONFIG, CPU)
     resumed.load(*load_checkpoint(tmp_path))
     while resumed.step < 40:
         resumed.advance()
@@ -205,67 +262,20 @@ def test_continued_fit_with_all_parts_equals_uninterrupted_one(tmp_path):
     )
 
 
-def test_settings_travel_through_json():
-    """Nested settings come back as they were; an unknown field is an error in words."""
-    assert FitConfig.from_json(CONFIG.to_json()) == CONFIG
-    values = CONFIG.to_json()
-    values["method"]["importance"]["colour"] = 1
-    with pytest.raises(UsageError, match="another version"):
-        FitConfig.from_json(values)
-
-
-@pytest.mark.parametrize("reliable", [True, False])
-def test_fine_gaussians_stand_at_confirmed_depths(reliable):
-    """Where other views confirm a depth it is used; elsewhere nothing is drawn, or the rendered depth without reliability."""
+@pytest.mark.parametrize("gated", [True, False])
+def test_fine_gaussians_stand_at_confirmed_depths(gated):
+    """Where other views confirm a depth it is used; elsewhere nothing is sampled, or the rendered depth without a gate."""
     fit = fitted(steps=8)
+    fit.strategy.gated = gated
     view, consistent = fit.views[0], torch.zeros(32, 40)
     consistent[:, :20] = 1.25
-    views = [dataclasses.replace(view, consistent=consistent)]
-    method = dataclasses.replace(
-        METHOD,
-        ra=reliable,
-        sampler=SamplerConfig(depth="consistent", fraction=0.2, gate_quantile=0, max_fraction=50, min_alpha=0.05),
-    )
-    event = event_of(fit, views, method, 9)
+    event = event_of(fit, [dataclasses.replace(view, consistent=consistent)], 9, 0.2, 50)
     columns = event.views[0].at[:, 1]
     points = event.change.added["means"]
     z = points @ view.camera.viewmat[2, :3] + view.camera.viewmat[2, 3]
     assert len(z) == len(columns) > 50
     assert torch.allclose(z[columns < 20], torch.tensor(1.25), atol=1e-4)
-    assert bool((columns >= 20).any()) != reliable and not torch.allclose(
-        z[columns >= 20].mean(), torch.tensor(1.25), atol=0.05
-    )
-
-
-def test_unknown_semantics_leave_the_weights_to_the_others():
-    """A view of which semantics say nothing is scored by the other two, whose weights sum to 1."""
-    blank = [dataclasses.replace(p, boundary=p.boundary * 0, foreground=p.foreground * 0) for p in priors(photos(3))]
-    fit = Trainer(photos(3), seeds(), CONFIG, CPU, priors=blank)
-    options, generator = RasterizeOptions(background=torch.zeros(3)), torch.Generator().manual_seed(0)
-    before = render_before(fit.gaussians, fit.views[0], METHOD, options)
-    drawn, _ = sample_view(fit.views[0], 0, before, [], METHOD, 4, generator)
-    assert fit.views[0].semantic is None
-    assert torch.allclose(drawn.score, 0.5 * drawn.scores[0] + 0.5 * drawn.scores[2])
-
-
-def test_gain_draws_where_all_views_ask_for_colour():
-    """One of the three Gaussians is missing: most pixels sampled by the gain lie on it, and uniform ones do not."""
-    fit = fitted(dataclasses.replace(CONFIG, steps=400, dropout=0.0), steps=0)
-    whole = three_gaussians()
-    kept = Gaussians(**{n: t[:2] for n, t in whole.tensors().items()})
-    views = [dataclasses.replace(v, consistent=rasterize(whole, v.camera).depth) for v in fit.views]
-    alone = {"s_semantic": False, "s_geometry": False, "importance": ImportanceConfig(residual="gain")}
-    sampler = SamplerConfig(depth="consistent", fraction=0.01, gate_quantile=0, max_fraction=50, min_alpha=0.05)
-    fraction = []
-    for switches in (alone, {"s_render": False, **alone}):
-        method = dataclasses.replace(METHOD, sampler=sampler, **switches)
-        event = sampling_event(
-            kept, torch.zeros(2, dtype=torch.bool), torch.zeros(2, dtype=torch.bool), views, method, step=9, capacity=10_000,
-            options=RasterizeOptions(background=torch.zeros(3)), generator=torch.Generator().manual_seed(0),
-        )  # fmt: skip
-        away = (event.change.added["means"] - whole.means[2]).norm(dim=1)
-        fraction.append(float((away < 0.45).float().mean()))
-    assert fraction[0] > 0.9 > 0.6 > fraction[1]
+    assert bool((columns >= 20).any()) != gated and not torch.allclose(z[columns >= 20].mean(), torch.tensor(1.25), atol=0.05)
 
 
 def test_phase_3_begins_with_those_that_contribute_most():
@@ -290,14 +300,8 @@ def test_growth_that_ends_early_keeps_those_that_contribute_most():
     assert len(first.keep) == round(0.5 * count) and len(first.parents) == 0 and all(len(c.keep) >= count for c in rest)
 
 
-def test_unknown_residual_is_refused():
-    """The message names the choices."""
-    with pytest.raises(UsageError, match="length, gain"):
-        ImportanceConfig(residual="error")
-
-
 def test_dropout_falls_with_the_number_of_views():
-    """Full up to `dropout_views` training views, then in proportion; it grows over the fit from 0."""
+    """Full up to three training views, then in proportion; it grows over the fit from 0."""
     plain = dataclasses.replace(CONFIG, strategy="clone_split", method=MethodConfig())
     few, many = (Trainer(photos(n), seeds(), plain, CPU) for n in (3, 6))
     assert few.dropout == pytest.approx(0.2) and many.dropout == pytest.approx(0.1)
@@ -310,3 +314,10 @@ def test_auto_start_sweeps_few_views():
     for most, word in ((3, "sweep"), (2, "random")):
         start = initial_points(views, None, InitConfig(sweep_up_to=most, random_count=200), np.random.default_rng(0))
         assert word in start.how and (start.depths is not None) == (most == 3)
+
+
+def test_bad_settings_are_named():
+    """Out of range: refused before anything starts, by the name of the flag."""
+    for bad in ({"fraction": 0}, {"footprint": 0}, {"max_fraction": -1}, {"fraction": float("nan")}):
+        with pytest.raises(UsageError, match=rf"method.sampler.{next(iter(bad)).replace('_', '-')} must be"):
+            SamplerConfig(**bad)

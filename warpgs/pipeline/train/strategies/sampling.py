@@ -1,0 +1,418 @@
+"""Sampling: fine Gaussians are added behind pixels of the training views, in two layers, and protected for some steps."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Hashable, Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Annotated, Any, NamedTuple
+
+import torch
+
+from warpgs import schema
+from warpgs.device import FLOAT, SAMPLING, Needs, StepSizes
+from warpgs.geometry import back_project_tensors, logit
+from warpgs.kernels.update import Setting
+from warpgs.pipeline.model.table import Column, DensityUpdate
+from warpgs.pipeline.train.strategies.base import Growth, Strategy, StrategyContext, register
+from warpgs.pipeline.train.strategies.clone_split import GradientGrowth
+from warpgs.pipeline.train.views import TrainingView, half_size_camera
+from warpgs.render.options import RasterizeOptions
+from warpgs.render.rasterize import rasterize
+from warpgs.scene import Camera, Gaussians, base_coefficients
+from warpgs.schema import Checked, Within
+
+COARSE, FINE = 0, 1
+"""Numbers of the layers: of Gaussians that were not sampled, and of sampled ones."""
+NOT_SAMPLED = -(2**30)
+"""Value of ``created_step`` in the coarse layer, whose Gaussians were not sampled."""
+MAX_VIEWS = 8
+"""Largest number of views in which one event samples; of more views, a random subset is taken."""
+MAX_WEIGHED = 32
+"""Largest number of views over which blending weights are summed to choose Gaussians for eviction."""
+MIN_ALPHA, BORDER = 0.5, 2
+"""Rendered opacity above which a pixel may receive a Gaussian, and width of the image border in which none is sampled [px]."""
+OPACITY = 0.1
+"""Initial opacity of a fine Gaussian, that of the first Gaussians."""
+PROTECTED_STEPS, PROTECTED_OPACITY = 500, 0.05
+"""Age up to which a sampled Gaussian is protected [steps] (T_protect, five densification intervals), and its smallest opacity
+(alpha_minimum, ten times the pruning threshold). The paper gives neither value."""
+COARSE_LR_FACTOR = 0.1
+"""Factor on the learning rate of the coarse layer's means from phase 2 on, with two layers."""
+
+
+@dataclass(frozen=True)
+class SamplerConfig(Checked, group="method.sampler."):
+    """Placement of fine Gaussians at one event."""
+
+    fraction: Annotated[float, Within(0, 1, "(")] = 0.005
+    """Gaussians per event and view, as a fraction of the view's pixels."""
+    footprint: Annotated[float, Within(0, math.inf, "()")] = 1.0
+    """Initial standard deviation of a fine Gaussian [px], in the view of its pixel."""
+    max_fraction: Annotated[float, Within(0, math.inf, ")")] = 0.5
+    """Largest number of fine Gaussians, as a fraction of the coarse ones."""
+
+
+@dataclass(frozen=True)
+class MethodConfig(Checked, group="method."):
+    """Settings of strategies sampling and paper."""
+
+    hier: bool | None = False
+    """Two layers: from phase 2 on, the coarse layer is neither cloned nor split, and its means move slowly. None: chosen by the
+    number of views."""
+    keep: Annotated[float, Within(0, 1, "(")] = 1.0
+    """Fraction of the Gaussians that is kept when phase 3 begins, in (0, 1]: those with the largest sums of blending weights
+    over at most 32 training views."""
+    sampler: SamplerConfig = field(default_factory=SamplerConfig)
+
+
+@dataclass(frozen=True)
+class SampledView:
+    """Maps and samples of an event in one view, on the device of the fit."""
+
+    view: int
+    """Index of the training view."""
+    rendered: torch.Tensor
+    """Colours before the event, shape [H, W, 3]."""
+    scores: Mapping[str, torch.Tensor]
+    """Scores by name, each [H, W] in [0, 1]; the last one is their sum, the importance. Empty for uniform sampling."""
+    gate: torch.Tensor
+    """Pixels that could be sampled, bool, shape [H, W]."""
+    quantile: float
+    """Quantile of a score that the gate used, as `Strategy` of the paper does; 0 for none."""
+    at: torch.Tensor
+    """Rows and columns of the sampled pixels, int64, shape [S, 2]."""
+
+
+class Event(NamedTuple):
+    """One sampling event: the change, the number of fine Gaussians removed for new ones, and the samples of each view."""
+
+    change: DensityUpdate
+    evicted: int
+    views: tuple[SampledView, ...]
+
+
+class Rendered(NamedTuple):
+    """A render of a view before an event, and the pixels that can be sampled."""
+
+    rgb: torch.Tensor
+    """Rendered colours after the view modules of the fit, shape [H, W, 3]."""
+    surface: torch.Tensor
+    """Rendered z-depth [u], shape [H, W]."""
+    depth: torch.Tensor
+    """Depth that Gaussians are placed at [u], shape [H, W]."""
+    valid: torch.Tensor
+    """Pixels that can be sampled, bool, shape [H, W]."""
+
+
+def valid_pixels(alpha: torch.Tensor, depth: torch.Tensor, mask: torch.Tensor | None) -> torch.Tensor:
+    """Return the unmasked pixels with enough opacity and positive, finite depth, away from the border; all maps are [H, W]."""
+    valid = (alpha > MIN_ALPHA) & torch.isfinite(depth) & (depth > 0)
+    if mask is not None:
+        valid &= mask > 0
+    inner = torch.zeros_like(valid)
+    inner[BORDER : valid.shape[0] - BORDER, BORDER : valid.shape[1] - BORDER] = True
+    return valid & inner
+
+
+def sample_pixels(
+    score: torch.Tensor, gate: torch.Tensor, count: int, generator: torch.Generator, *, random: bool
+) -> torch.Tensor:
+    """Sample pixels within a gate without replacement, with probability proportional to a score (P_sample).
+
+    Successive sampling: the ``count`` smallest of E_i / score_i with exponential E_i (Efraimidis and Spirakis 2006).
+
+    Returns rows and columns, int64, shape [S, 2], with S = ``count`` or the number of gated pixels with a positive score.
+    ``generator`` is on the CPU. If ``random`` is False, the highest scores are taken instead.
+    """
+    allowed = gate & (score > 0)
+    count = min(count, int(allowed.sum()))
+    if random:
+        uniform = torch.rand(score.shape, dtype=torch.float64, generator=generator, device="cpu").to(score.device)
+        key = score.double() / -torch.log1p(-uniform)
+    else:
+        key = score.double()
+    key = torch.where(allowed, key, -1.0)
+    chosen = torch.topk(key.flatten(), count).indices.sort().values
+    return torch.stack([chosen // score.shape[1], chosen % score.shape[1]], 1)
+
+
+def fine_gaussians(
+    camera: Camera, image: torch.Tensor, depth: torch.Tensor, at: torch.Tensor, footprint: float, coefficients: int
+) -> dict[str, torch.Tensor]:
+    """Return isotropic Gaussians behind pixels ``at`` [S, 2], ``footprint`` pixels wide, in the image's colours: rows [S, ...].
+
+    ``image`` has shape [H, W, 3] and ``depth`` is z-depth [u], shape [H, W]; there are ``coefficients`` harmonics per channel.
+    """
+    rows, columns = at.unbind(1)
+    depths = depth[rows, columns]
+    means = back_project_tensors(camera, torch.stack([columns, rows], 1).to(depth.dtype) + 0.5, depths)
+    count = len(means)
+    focal = 0.5 * (camera.K[0, 0] + camera.K[1, 1])
+    sh = means.new_zeros(count, coefficients, 3)
+    sh[:, 0] = base_coefficients(image[rows, columns])
+    quats = means.new_zeros(count, 4)
+    quats[:, 0] = 1
+    return {
+        "means": means,
+        "quats": quats,
+        "log_scales": (math.log(footprint) + (depths / focal).double().log()).to(depths.dtype)[:, None].repeat(1, 3),
+        "logit_opacities": torch.full_like(depths, logit(OPACITY)),
+        "sh": sh,
+    }
+
+
+def weight_sums(gaussians: Gaussians, cameras: list[Camera], options: RasterizeOptions) -> torch.Tensor:
+    """Return the sum of blending weights of each Gaussian over at most `MAX_WEIGHED` cameras, evenly spaced, shape [N]."""
+    weigh = dataclasses.replace(options, contributions=True)
+    total = torch.zeros(len(gaussians), device=gaussians.means.device, dtype=torch.float32)
+    for camera in cameras[:: -(-len(cameras) // MAX_WEIGHED)]:
+        total += rasterize(gaussians, camera, weigh).weight_sums[0]
+    return total
+
+
+@torch.no_grad()
+def keep_contributors(gaussians: Gaussians, count: int, views: list[TrainingView], options: RasterizeOptions) -> DensityUpdate:
+    """Return the change that keeps the ``count`` Gaussians with the largest sums of blending weights over the views."""
+    total = weight_sums(gaussians, [v.camera for v in views], options)
+    ids = torch.topk(total, min(count, len(gaussians))).indices.sort().values
+    return DensityUpdate(ids, {n: t[:0] for n, t in gaussians.tensors().items()}, ids[:0])
+
+
+@torch.no_grad()
+def added_within(
+    gaussians: Gaussians, added: dict[str, torch.Tensor], fine: torch.Tensor, protected: torch.Tensor,
+    views: list[TrainingView], max_fraction: float, *, step: int, capacity: int, options: RasterizeOptions,
+    generator: torch.Generator,
+) -> tuple[DensityUpdate, int]:  # fmt: skip
+    """Return the change that adds fine Gaussians within the limits of their number, and how many others are evicted.
+
+    If the fine layer reaches ``max_fraction`` of the coarse one, or the set its capacity, the unprotected fine Gaussians that
+    contribute least to the training views are evicted. New Gaussians beyond these limits are not added.
+
+    Args:
+        gaussians: The current set, N rows.
+        added: Rows of new Gaussians, [S, ...] each.
+        fine: Gaussians of the fine layer, bool, shape [N].
+        protected: Gaussians that are not evicted, bool, shape [N].
+        views: Training views.
+        max_fraction: Largest ratio of fine to coarse Gaussians.
+        step: Steps done.
+        capacity: Number of Gaussians that may be added.
+        options: Settings of the rasterizer.
+        generator: CPU generator, the same numbers on every device.
+    """
+    count, fine_count = len(added["means"]), int(fine.sum())
+    over = max(fine_count + count - int(max_fraction * (len(gaussians) - fine_count)), count - capacity)
+    keep = torch.ones(len(gaussians), dtype=torch.bool, device=fine.device)
+    evicted = 0
+    if over > 0:
+        # half size suffices to rank the Gaussians
+        total = weight_sums(gaussians, [half_size_camera(v.camera) for v in views], options)
+        candidates = fine & ~protected
+        total = torch.where(candidates, total, torch.inf)
+        ids = torch.topk(total, min(over, int(candidates.sum())), largest=False).indices
+        keep[ids] = False
+        evicted = len(ids)
+        if over > evicted:  # spread over the views, as they were sampled
+            order = torch.randperm(count, generator=generator, device="cpu")
+            left = order[: max(0, count - (over - evicted))].sort().values.to(fine.device)
+            added = {name: t[left] for name, t in added.items()}
+            count = len(left)
+    parents = torch.full((count,), -1, dtype=torch.int64, device=fine.device)
+    columns = {"level": FINE, "created_step": step}
+    return DensityUpdate(torch.nonzero(keep).squeeze(1), added, parents, columns), evicted
+
+
+_COUNT = schema.whole(0)
+EVENT = schema.fields({"step": _COUNT, "added": _COUNT, "evicted": _COUNT, "quantiles": schema.items(schema.real)})
+"""Schema of a stored event."""
+
+
+@register("sampling")
+class Sampling(Strategy):
+    """Growth by gradients; and at events in phase 2, fine Gaussians behind pixels that are sampled uniformly.
+
+    Its settings are `FitConfig.density`, `FitConfig.method` and `FitConfig.phases`. A derived class may sample by scores, see
+    `importance`.
+    """
+
+    STATE = staticmethod(schema.fields({**GradientGrowth.STATE, "events": schema.items(EVENT)}))
+    samples = True
+    consistent: bool = True
+    """Whether new Gaussians are placed at the depth that other views confirm, where it exists, instead of rendered depth."""
+    gated: bool = True
+    """Whether views with consistent depth are sampled only where it exists."""
+    at_random: bool = True
+    """Whether pixels are sampled in proportion to their importance; otherwise the most important ones are taken."""
+    protects: bool = True
+    """Whether young fine Gaussians are protected."""
+    scored: bool = False
+    """Whether importance is not the same everywhere."""
+    asked_quantile: float = 0.0
+    """Quantile of a score below which the gate rejects pixels; 0 for none."""
+
+    def __init__(self, context: StrategyContext):
+        """Begin without events."""
+        super().__init__(context)
+        self.gradients = GradientGrowth(context)
+        self.method = context.settings[MethodConfig]
+        """Settings."""
+        self.events: list[dict[str, Any]] = []
+        """Step of each sampling event, Gaussians added and evicted, and the quantile of the gate in each view."""
+        self.on_event: Callable[[int, Event], None] | None = None
+        """Function that is called with the step and the event after each event."""
+
+    def before_event(self, views: Mapping[int, TrainingView], rendered: Mapping[int, Rendered]) -> None:
+        """Prepare an event in some views, by their index among the training views."""
+
+    def importance(self, number: int, view: TrainingView, rendered: Rendered) -> dict[str, torch.Tensor]:
+        """Return scores of the pixels of a view by name, [H, W] each; the last one is the importance. None: all are equal."""
+        return {}
+
+    def gate(self, number: int, valid: torch.Tensor, wanted: int) -> tuple[torch.Tensor, float]:
+        """Return the pixels that may be sampled, of the ``valid`` ones [H, W], and the quantile that was used."""
+        return valid, 0.0
+
+    def render_before(self, view: TrainingView) -> Rendered:
+        """Render a view for an event, and find the depths for Gaussians at its pixels."""
+        t = self.context
+        render = rasterize(t.gaussians, view.camera, t.render_options())
+        depth, alpha = render.depth, render.alpha
+        if self.consistent and view.consistent is not None:
+            known = view.consistent > 0
+            depth = torch.where(known, view.consistent, depth)
+            alpha = torch.where(known, 1.0, 0.0 if self.gated else alpha)
+        return Rendered(view.seen(render.rgb), render.depth, depth, valid_pixels(alpha, depth, view.countable))
+
+    @torch.no_grad()
+    def sample(self, step: int, views: Mapping[int, TrainingView], fraction: float, max_fraction: float) -> Event:
+        """Return a sampling event on views, by their index among the training views (docs/decisions/008-method.md)."""
+        t, generator = self.context, self.context.generator
+        numbers = list(views)
+        if len(numbers) > MAX_VIEWS:
+            order = torch.randperm(len(views), generator=generator, device="cpu")
+            numbers = [numbers[i] for i in sorted(order[:MAX_VIEWS].tolist())]
+        rendered = {i: self.render_before(views[i]) for i in numbers}
+        self.before_event({i: views[i] for i in numbers}, rendered)
+        sampled, rows = [], []
+        for i, r in rendered.items():
+            view, wanted = views[i], max(1, round(fraction * r.valid.numel()))
+            scores = self.importance(i, view, r)
+            gate, quantile = self.gate(i, r.valid, wanted)
+            score = [*scores.values()][-1] if scores else torch.ones_like(r.depth)
+            at = sample_pixels(score, gate, wanted, generator, random=self.at_random)
+            footprint, coefficients = self.method.sampler.footprint, t.gaussians.sh.shape[1]
+            rows.append(fine_gaussians(view.camera, view.image, r.depth, at, footprint, coefficients))
+            sampled.append(SampledView(i, r.rgb, scores, gate, quantile, at))
+        change, evicted = added_within(
+            t.gaussians, {n: torch.cat([r[n] for r in rows]) for n in rows[0]}, self.fine,
+            self.is_protected(step) if self.protects else torch.zeros_like(self.fine), [*views.values()], max_fraction,
+            step=step, capacity=t.capacity - len(t.table), options=t.render_options(), generator=generator,
+        )  # fmt: skip
+        return Event(change, evicted, tuple(sampled))
+
+    def bytes(self, sizes: StepSizes) -> Needs:
+        """Return the bytes that an event keeps for its views: render, three scores and their sum."""
+        return {SAMPLING: 7 * FLOAT * sizes.pixels * min(sizes.views, MAX_VIEWS)}
+
+    def columns(self) -> Mapping[str, Column]:
+        """Return the columns for gradients, each Gaussian's layer, and the step at which the Gaussian was sampled."""
+        own = {"level": Column(COARSE, torch.int32), "created_step": Column(NOT_SAMPLED, torch.int32)}
+        return {**self.gradients.columns(), **own}
+
+    @property
+    def fine(self) -> torch.Tensor:
+        """Gaussians of the fine layer, bool, shape [N]."""
+        return self.context.table.columns["level"] == FINE
+
+    def is_protected(self, step: int | torch.Tensor) -> torch.Tensor:
+        """Return the Gaussians that are young enough for protection at a step, bool, shape [N]."""
+        return step - self.context.table.columns["created_step"] <= PROTECTED_STEPS
+
+    def is_layered(self, step: int) -> bool:
+        """Return whether only the fine layer grows and the coarse layer moves slowly: with two layers, from phase 2 on."""
+        return bool(self.method.hier) and step > self.context.phases.refine
+
+    def growth(self) -> Growth:
+        """Return the times of refinement and sampling; events are listed, since they lower PSNR by up to 3 dB for a while."""
+        phases = self.context.phases
+        return Growth(phases.refine, self.gradients.times.until, phases.events)
+
+    def phase(self, step: int) -> Hashable:
+        """Return whether gradients are gathered, and whether the coarse layer moves slowly."""
+        return self.gradients.gathers(step), self.is_layered(step)
+
+    def lr_factors(self, phase):
+        """Return `COARSE_LR_FACTOR` for the coarse layer and 1 for the fine one, shape [N]; None if all are 1."""
+        return torch.where(self.fine, 1.0, COARSE_LR_FACTOR) if phase[1] else None
+
+    def after_step(self, phase, settings, going):
+        """Raise the opacities of protected Gaussians to alpha_minimum; ``settings`` [7], ``going`` [1]."""
+        if self.protects:
+            logits = self.context.table.params["logit_opacities"].detach()
+            held = self.is_protected(settings[Setting.NUMBER]) & going
+            logits.copy_(torch.where(held, logits.clamp_min(logit(PROTECTED_OPACITY)), logits))
+
+    def statistics(self, phase, v_projected, visible, size):
+        """Return statistics of gradients, [N] each; ``v_projected`` has shape [1, N, 12], ``visible`` [1, N]."""
+        return self.gradients.statistics(v_projected, visible, size) if phase[0] else {}
+
+    def due(self, step: int) -> bool:
+        """Return whether the set changes after a step."""
+        return self.gradients.due(step) or step in self.context.phases.events or self.shrinks_after(step)
+
+    def shrinks_after(self, step: int) -> bool:
+        """Return whether the Gaussians that contribute least are removed after a step: after the last step of phase 2."""
+        return self.method.keep < 1 and step == self.context.phases.stable_start
+
+    def shrink(self, views: list[TrainingView]) -> DensityUpdate:
+        """Return the change that keeps the fraction ``method.keep`` of the Gaussians."""
+        t = self.context
+        return keep_contributors(t.gaussians, max(1, round(self.method.keep * len(t.table))), views, t.render_options())
+
+    def update(self, step: int) -> Iterator[DensityUpdate]:
+        """Refine, reset opacities, sample and shrink the set, each if it is due.
+
+        With two layers, only the fine layer grows from phase 2 on. Protected Gaussians are not pruned.
+        """
+        views = self.context.views
+        if self.gradients.refines(step):
+            growing = self.fine if self.is_layered(step) else None
+            yield from self.gradients.refine(growing, self.is_protected(step) if self.protects else None)
+        if self.gradients.resets(step):
+            self.gradients.reset_opacities()
+        if step in self.context.phases.events:
+            sampler = self.method.sampler
+            event = self.sample(step, dict(enumerate(views)), sampler.fraction, sampler.max_fraction)
+            yield event.change
+            self.events.append({
+                "step": step, "added": len(event.change.parents), "evicted": event.evicted,
+                "quantiles": [v.quantile for v in event.views],
+            })  # fmt: skip
+            if self.on_event is not None:
+                self.on_event(step, event)
+        if self.shrinks_after(step):
+            yield self.shrink(views)
+
+    def catch_up(self, step: int, views: list[TrainingView], held: int) -> Iterator[DensityUpdate]:
+        """Shrink the set; then sample fine Gaussians in the blocks that were held out, as many per pixel as elsewhere."""
+        if self.method.keep < 1:
+            yield self.shrink(views)
+        pixels = sum(v.image[..., 0].numel() for v in views)
+        fraction = int(self.fine.sum()) / (pixels - held) * held / pixels
+        if not fraction * pixels >= 1:
+            return
+        for first in range(0, len(views), MAX_VIEWS):
+            some = {i: views[i] for i in range(first, min(first + MAX_VIEWS, len(views)))}
+            yield self.sample(step, some, min(1.0, fraction), 1e6).change
+
+    def state(self):
+        """Return no tensors [...], and the events so far."""
+        return {}, {**self.gradients.state(), "events": self.events}
+
+    def load(self, tensors, plain):
+        """Load the events so far; ``tensors`` [...] are not read."""
+        self.gradients.load(plain)
+        self.events = plain["events"]
