@@ -217,21 +217,13 @@ def report_lines(record: dict[str, Any]) -> list[str]:
 
 
 def write_record(folder: Path, record: dict[str, Any]) -> None:
-    """Write poses.json and poses.txt into a folder.
-
-    Raises:
-        ResourceError: The disk is full.
-    """
+    """Write poses.json and poses.txt into a folder."""
     write_json(folder / JSON, record)
     write_text(folder / TEXT, "\n".join(report_lines(record)) + "\n")
 
 
 def read_poses_record(folder: Path) -> dict[str, Any]:
-    """Read poses.json of a scene whose poses were found.
-
-    Raises:
-        DataError: The record is missing or incomplete.
-    """
+    """Read poses.json of a scene whose poses were found."""
     path = folder / JSON
     try:
         record: dict[str, Any] = schema.read(path, folder)
@@ -262,11 +254,7 @@ def needs_poses(path: Path) -> bool:
 
 
 def source_digest(source: Path, allow_outside: bool = False) -> str:
-    """Return the SHA-256 over the names and contents of a source's photographs, or of a video.
-
-    Raises:
-        DataError: A file cannot be read, or a link points outside the folder and that is not allowed.
-    """
+    """Return the SHA-256 over the names and contents of a source's photographs, or of a video."""
     total = hashlib.sha256()
     if is_video(source):
         return _digest(source)
@@ -295,32 +283,7 @@ def find_poses(
     matcher: str | Path | None = None,
     progress: Callable[[str], object] = lambda line: None,
 ) -> dict[str, Any]:
-    """Find the poses of photographs or of a video's sharpest frames, and write a scene folder with the registered ones.
-
-    The folder appears whole or not at all. It contains ``images``, upright and without metadata; ``sparse/0``, a COLMAP model;
-    and a record of which photographs have a pose, with reasons (poses.json, poses.txt).
-
-    Args:
-        source: Folder of images, or a video file.
-        out: Scene folder to make; new or empty.
-        frames: Number of frames to take from a video.
-        threads: CPU threads; 0 for as many as there are cores.
-        max_pixels: Largest number of pixels that an image may have.
-        allow_outside: True to allow links to photographs outside the folder.
-        matcher: ONNX file of `warpgs priors export --model xfeat`, which is used if SIFT leaves photographs without a pose;
-            None for SIFT only.
-        progress: Called with lines for the user.
-
-    Returns:
-        The record, as poses.json holds it.
-
-    Raises:
-        DataError: There are too few photographs, one is outside the folder or cannot be decoded, fewer than three match, or the
-            matcher is invalid.
-        ResourceError: pycolmap failed, or the folder cannot be written.
-        UsageError: pycolmap, or pi-heif for HEIC, is not installed; ``source`` is a run or holds scenes; or ``out`` is not
-            empty.
-    """
+    """Find the poses of photographs or of a video's sharpest frames; write a scene folder, whole or not at all."""
     source, out = Path(source), Path(out)
     _check(source, out, allow_outside)
     check_installed()
@@ -352,11 +315,8 @@ def _with_network(
     network: Matcher, found: Mapping, photographs: list[Photograph], names: list[str], kind: str, work: Path,
     progress: Callable[[str], object], threads: int,
 ) -> tuple[Mapping, list[str]]:  # fmt: skip
-    """Return the model from the network's matches if it has more photographs than SIFT's, and notes.
-
-    The network runs only if SIFT leaves photographs without a pose. The model lies in ``work``/model. Arguments are those of
-    `find_model`.
-    """
+    """Return the model from the network's matches if it has more photographs than SIFT's, and notes."""
+    # the network, which is less accurate, runs only if SIFT leaves photographs without a pose
     count = len(found.views)
     if count == len(photographs):
         return found, [f"{network.title} is not used: SIFT finds the poses of all photographs, and is more accurate"]

@@ -96,11 +96,7 @@ class Mapping:
 
 
 def check_installed() -> None:
-    """Check that pycolmap is installed.
-
-    Raises:
-        UsageError: pycolmap is not installed.
-    """
+    """Raise a UsageError if pycolmap is not installed."""
     if importlib.util.find_spec("pycolmap") is None:
         raise UsageError(f"finding poses needs pycolmap, which is not installed; {install_extras('poses')}")
 
@@ -169,22 +165,7 @@ def find_model(
     threads: int = 0,
     learned: bool = False,
 ) -> Mapping:
-    """Find poses of photographs and write the model of those that fit together into ``folder``/model, in COLMAP's files.
-
-    The same photographs give the same bits on the same machine with any number of threads, except with the global mapper.
-
-    Args:
-        photographs: The photographs, sorted by name.
-        names: Names of their copies in ``folder``/small.
-        kind: photographs or video.
-        folder: Folder to work in.
-        progress: Called with lines for the user.
-        threads: CPU threads; 0 for as many as there are cores.
-        learned: True if ``folder`` contains keypoints and matches of a network instead of SIFT's.
-
-    Raises:
-        ResourceError: pycolmap failed.
-    """
+    """Find poses of photographs and write the model of those that fit together into ``folder``/model, in COLMAP's files."""
     result: dict[str, Any] | None = None
     for said in _lines(_job(photographs, names, kind, folder, threads or usable_cores(), learned), folder):
         if "progress" in said:
@@ -361,11 +342,8 @@ def map_incrementally(pycolmap: Any, job: dict[str, Any], keep_focal: bool = Fal
 
 
 def believes_exif(kept: list[Any], free: list[Any]) -> bool:
-    """Return whether EXIF's focal length is kept: models ``kept`` have it, for models ``free`` it was estimated.
-
-    The best of ``kept`` must have at least as many photographs as the best of ``free``, and at most `MAX_RATIO` times its
-    error. If a list is empty, return whether ``kept`` has models.
-    """
+    """Return whether EXIF's focal length is kept: models ``kept`` have it, for models ``free`` it was estimated."""
+    # as many photographs, and not much more error; without one of the lists, whether there are ``kept`` models
     if not kept or not free:
         return bool(kept)
     best, other = (max(m, key=lambda r: (r.num_reg_images(), r.num_points3D())) for m in (kept, free))

@@ -90,14 +90,7 @@ def homogeneous(pixels: np.ndarray) -> np.ndarray:
 
 
 def fundamental(first: Camera, second: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the fundamental matrix F [3, 3], the rotation R_st [3, 3] and the translation tau [3] of a pair of cameras.
-
-    ``F (x, y, 1)`` is the epipolar line, in the second image, of pixel (x, y) of the first. ``X_second = R_st (X_first +
-    tau)``: -tau is the second camera's centre in the frame of the first.
-
-    Raises:
-        UsageError: A camera is not a pinhole.
-    """
+    """Return F [3, 3], and R_st [3, 3] and tau [3] of ``X_second = R_st (X_first + tau)``, of a pair of cameras."""
     check_pinhole(first)
     check_pinhole(second)
     R_s, t_s = first.viewmat[:3, :3], first.viewmat[:3, 3]
@@ -112,19 +105,7 @@ def fundamental(first: Camera, second: Camera) -> tuple[np.ndarray, np.ndarray, 
 def epipolar_depth(
     first: Camera, second: Camera, pixels: np.ndarray, matches: np.ndarray, min_parallax: float = 0.5
 ) -> PairDepth:
-    """Return depths of pixels of the first view from their matches in the second (docs/flow_epipolar.md, equations 1 to 6).
-
-    Args:
-        first: Camera whose pixels get a depth.
-        second: Camera of the matches.
-        pixels: Positions in the first image [px], shape [N, 2].
-        matches: Position of each pixel in the second image [px], shape [N, 2]; NaN where there is no match.
-        min_parallax: Smallest angle between the rays [deg].
-
-    Returns:
-        Depth, residual, sensitivity and validity of N pixels; a match off its line is replaced by the nearest point of the
-        line. Without a baseline nothing is valid.
-    """
+    """Return depths of pixels [N, 2] from their matches [N, 2] (docs/flow_epipolar.md, equations 1 to 6)."""
     F, R_st, tau = fundamental(first, second)
     rays = homogeneous(pixels) @ np.linalg.inv(first.K).T
     lines = homogeneous(pixels) @ F.T
@@ -172,21 +153,7 @@ def round_trip(matches: np.ndarray, pixels: np.ndarray, back: np.ndarray) -> np.
 
 
 def blend(depths: np.ndarray, sensitivities: np.ndarray, valid: np.ndarray, mode: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return one depth and sensitivity per pixel from the candidates of S source views.
-
-    Args:
-        depths: Candidates [u], shape [S, N], nearest source first.
-        sensitivities: |dz/dpx| of each candidate [u/px], at least 0, shape [S, N].
-        valid: True where a candidate passed the checks, shape [S, N].
-        mode: least_sensitive takes the candidate with the smallest |dz/dpx|, on ties the nearest source's; nearest_first takes
-            the first valid one; mean_valid the mean; inverse_sensitivity the mean weighted by 1 / |dz/dpx|.
-
-    Returns:
-        Depths [u], shape [N], 0 where no candidate is valid; and sensitivities [u/px], shape [N], infinite there.
-
-    Raises:
-        UsageError: The mode is unknown.
-    """
+    """Return depths [N] [u] and sensitivities [N] [u/px] from candidates [S, N], nearest first; 0 and inf where none is valid."""
     if mode not in BLENDS:
         raise UsageError(f"blend {mode!r} is not one of {', '.join(BLENDS)}")
     some = valid.any(0)
@@ -207,17 +174,7 @@ def blend(depths: np.ndarray, sensitivities: np.ndarray, valid: np.ndarray, mode
 
 
 def flow_depth(views: Sequence[View], index: int, flow: FlowBetween, config: EpipolarConfig) -> ViewDepth:
-    """Return the depth of one view by flow to its nearest other views.
-
-    Args:
-        views: All views.
-        index: Index of the view that gets a depth.
-        flow: Function that gives the flow of an ordered pair.
-        config: Checks and blending.
-
-    Returns:
-        The depth; valid nowhere, with a note, if no flow passes the checks.
-    """
+    """Return the depth of one view by flow to its nearest other views; valid nowhere if no flow passes the checks."""
     view = views[index]
     shape = view.image.shape[:2]
     pixels = pixel_grid(view.camera)
@@ -273,13 +230,7 @@ class Features(NamedTuple):
 
 
 def sift_features(view: View, max_pixels: int | None = None, most: int = 0) -> Features:
-    """Find the SIFT features of a view (Lowe 2004) within its mask.
-
-    Args:
-        view: The view.
-        max_pixels: Number of pixels to which a larger image is reduced first; None for the full size.
-        most: Largest number of features, those of highest contrast; 0 for all.
-    """
+    """Find the SIFT features of a view (Lowe 2004) within its mask, at most ``most`` of them unless that is 0."""
     import cv2
 
     gray = cv2.cvtColor((view.image * 255).round().astype(np.uint8), cv2.COLOR_RGB2GRAY)
@@ -301,18 +252,7 @@ def sift_features(view: View, max_pixels: int | None = None, most: int = 0) -> F
 def agreeing_matches(
     a: View, b: View, first: Features, second: Features, min_angle: float = MIN_ANGLE
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Match the features of two views, and triangulate the matches that agree with the views' poses.
-
-    Args:
-        a: The first view.
-        b: The second view.
-        first: Features of the first.
-        second: Features of the second.
-        min_angle: Smallest angle between the two rays [deg]; 0 if only the matches are used, not their depth.
-
-    Returns:
-        For each match, the rows of its two features, int, shape [N, 2], and its point [u], shape [N, 3].
-    """
+    """Match two views' features; return rows [N, 2] and points [N, 3] [u] of matches that agree with the poses."""
     import cv2
 
     nothing = np.zeros((0, 2), int), np.zeros((0, 3))
@@ -352,11 +292,7 @@ def _triangulate(
 
 
 def triangulate_matches(views: list[View]) -> PointCloud:
-    """Match SIFT features between pairs of views (Lowe 2004) and triangulate the matches that agree with the known poses.
-
-    Returns:
-        N points [u] with the colours of their pixels in [0, 1]; none without matches.
-    """
+    """Return points [u] of SIFT matches (Lowe 2004) that agree with the known poses, with the pixels' colours."""
     centers = [v.camera.center for v in views]
     pairs = sorted(itertools.combinations(range(len(views)), 2), key=lambda p: np.linalg.norm(centers[p[0]] - centers[p[1]]))
     pairs = pairs[:MAX_PAIRS]
@@ -396,11 +332,7 @@ RANGES = {"255": (255.0, 0.0), "unit": (1.0, 0.0), "signed": (2.0, -1.0)}
 
 
 def read_flo(path: Path) -> np.ndarray:
-    """Return the flow of a Middlebury file, float32, shape [H, W, 2]; NaN where unknown.
-
-    Raises:
-        DataError: The file is missing, of another kind, or truncated.
-    """
+    """Return the flow of a Middlebury file, float32, shape [H, W, 2]; NaN where unknown."""
     try:
         raw = read_input(path, 12 + 8 * MAX_FLOW_PIXELS)
     except OSError as e:
@@ -420,17 +352,7 @@ def read_flo(path: Path) -> np.ndarray:
 
 
 def resize_flow(flow: np.ndarray, width: int, height: int, second: tuple[int, int] | None = None) -> np.ndarray:
-    """Return flow at another image size: resampled, with u and v scaled like the sides.
-
-    Args:
-        flow: Flow between two images of size h x w, shape [h, w, 2].
-        width: New width of the first image [px].
-        height: New height of the first image [px].
-        second: New width and height of the second image [px], where they differ from the first's.
-
-    Returns:
-        Flow [px], float32, shape [height, width, 2].
-    """
+    """Return flow [h, w, 2] [px] at another image size, [height, width, 2]; ``second`` is the second image's new size."""
     import cv2
 
     h, w = flow.shape[:2]
@@ -445,11 +367,7 @@ def resize_flow(flow: np.ndarray, width: int, height: int, second: tuple[int, in
 
 
 def flo_names(views: Sequence[View], i: int, j: int) -> list[str]:
-    """Return the file names under which the flow from view i to view j is looked for, in order.
-
-    ``A-to-B.flo`` with the stems of both image names; then NexusGS's ``A_i_j.flo``, with i and j counted in the sorted list of
-    training views.
-    """
+    """Return the names of the file of flow from view i to j: ``A-to-B.flo``, then NexusGS's ``A_i_j.flo``."""
     a, b = (Path(views[k].name) for k in (i, j))
     order = sorted(range(len(views)), key=lambda k: views[k].name)
     ij = f"{order.index(i)}_{order.index(j)}"
@@ -583,22 +501,7 @@ def _network(path: Path, value_range: str) -> Callable[[View, View], np.ndarray]
 
 
 def flow_between(views: Sequence[View], kind: str, value_range: str = "255") -> FlowBetween:
-    """Return a function that gives the flow of an ordered pair of views; each pair is computed or read only once.
-
-    Args:
-        views: Training views.
-        kind: dis (Kroeger et al. 2016), deepflow (Weinzaepfel et al. 2013), sparse (SIFT matches, interpolated along edges),
-            the path of a folder of .flo files with names of `flo_names`, or of an ONNX file.
-        value_range: Colours that an ONNX network takes: 255 (0 to 255), unit (0 to 1) or signed (-1 to 1).
-
-    Returns:
-        Function of (i, j) that returns the flow [H, W, 2] at the size of view i, or None if the pair has no flow.
-
-    Raises:
-        UsageError: The kind or the range is unknown.
-        DataError: A file is missing or malformed; the returned function may raise this error, too, when a pair is first
-            requested.
-    """
+    """Return a function of (i, j) for the flow [H, W, 2] [px] of a pair of views, or None; pairs are computed once."""
     if value_range not in RANGES:
         raise UsageError(f"flow range {value_range!r} is not one of {', '.join(RANGES)}")
     path = Path(kind)

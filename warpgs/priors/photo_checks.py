@@ -112,10 +112,7 @@ def _places(view: View) -> _Places:
 
 
 def _difference(views: Sequence[View], places: Sequence[_Places], i: int, j: int) -> np.ndarray | None:
-    """Return by how much photograph i exceeds photograph j: logarithms of the factors of detail, red, green and blue.
-
-    An unknown factor is NaN. Return None if too few features match.
-    """
+    """Return log factors [4] of detail, red, green, blue of photograph i over j, NaN if unknown; None without matches."""
     a, b = places[i], places[j]
     ids, _ = agreeing_matches(views[i], views[j], a.features, b.features, min_angle=0.0)
     if len(ids) < MIN_MATCHES:
@@ -138,10 +135,8 @@ def _pairs(views: Sequence[View]) -> list[tuple[int, int]]:
 
 
 def _typical(differences: list[float]) -> float | None:
-    """Return the median; with two middle values, the number between them nearest to 0; None if all are NaN.
-
-    A faulty photograph differs from most others, so the choice does not hide it.
-    """
+    """Return the median; with two middle values, the number between them nearest to 0; None if all are NaN."""
+    # a faulty photograph differs from most others, so the choice does not hide it
     known = sorted(d for d in differences if np.isfinite(d))
     if not known:
         return None
@@ -150,15 +145,7 @@ def _typical(differences: list[float]) -> float | None:
 
 
 def check_photos(views: Sequence[View], progress: Callable[[str], object] = lambda line: None) -> list[PhotoCheck]:
-    """Compare each photograph with the nearest ones.
-
-    Args:
-        views: All views of the scene, including held-out views; at least one.
-        progress: Called with a line for the user, at intervals and after each pair.
-
-    Returns:
-        One check per view, in order.
-    """
+    """Compare each photograph with the nearest ones; ``views`` include those that are held out."""
     count, began = len(views), time.monotonic()
     pairs = _pairs(views)
     with single_threaded_opencv(), ThreadPoolExecutor(torch.get_num_threads(), initializer=without_ipp) as pool:

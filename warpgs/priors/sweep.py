@@ -27,21 +27,9 @@ MIN_FRACTION = 1e-3
 
 
 def complete(depth: np.ndarray, valid: np.ndarray, image: np.ndarray) -> np.ndarray:
-    """Fill a depth map by edge-aware averages of inverse depth.
-
-    The result is a ratio: smoothed inverse depths of consistent pixels, divided by the smoothed mask. The smoother is that of
-    Min et al. 2014. Planes stay planes in inverse depth, and far surfaces are not pulled near. Measured in
-    docs/decisions/007-coarse-start.md.
-
-    Args:
-        depth: z-depths [u], float32, shape [H, W].
-        valid: True where the depth is consistent, bool, shape [H, W].
-        image: Colours in [0, 1], shape [H, W, 3].
-
-    Returns:
-        z-depths [u], float32, shape [H, W]: unchanged where valid, the median where no consistent pixel reaches; 0 everywhere
-        if no pixel is valid.
-    """
+    """Fill a depth map [u], [H, W], by edge-aware averages of inverse depth; the median where no valid depth reaches."""
+    # Smoothed inverse depths by the smoothed mask (Min et al. 2014): planes stay planes, and far surfaces are not pulled near.
+    # Measured in docs/decisions/007-coarse-start.md.
     import cv2
 
     if not valid.any():
@@ -91,15 +79,8 @@ def _sampled(camera: Camera, bounds: tuple[float, float]) -> np.ndarray:
 
 
 def shared_sight(cameras: Sequence[Camera], bounds: Sequence[tuple[float, float]]) -> Sight:
-    """Return what pairs of views share, by projecting points sampled in each camera's frustum into all others.
-
-    The method follows the view selection of multi-view stereo (Goesele et al. 2007; angles are weighted as by Yao et al. 2018),
-    but samples points instead of using reconstructed ones.
-
-    Args:
-        cameras: Pinhole cameras of V views.
-        bounds: Nearest and farthest depth of each view [u], 0 < near < far.
-    """
+    """Return what pairs of views share, by projecting points sampled in each camera's frustum into all others."""
+    # the view selection of multi-view stereo (Goesele et al. 2007; angles as in Yao et al. 2018), on sampled points
     turns, shifts = np.stack([c.viewmat[:3, :3] for c in cameras]), np.stack([c.viewmat[:3, 3] for c in cameras])
     K, centers = np.stack([c.K for c in cameras]), np.stack([c.center for c in cameras])
     sides = np.array([(c.width, c.height) for c in cameras], float)
@@ -125,19 +106,9 @@ def shared_sight(cameras: Sequence[Camera], bounds: Sequence[tuple[float, float]
 
 
 def matching_views(sight: Sight, cameras: Sequence[Camera], index: int, count: int, among: Sequence[int]) -> list[int]:
-    """Return up to ``count`` views to compare a view with: the nearest cameras (ties by order) that share sight with it.
-
-    Views too near for depth are skipped: their angles reduce `Sight.matching` to less than half of `Sight.overlap`. If no view
-    is left, the sampled points may have missed the overlap, and the nearest cameras are returned. Choosing the views that share
-    most at the best angles gave fewer depths, and mostly lower PSNR (docs/decisions/013-any-capture.md).
-
-    Args:
-        sight: What pairs of views share.
-        cameras: Cameras of all views.
-        index: The view.
-        count: Number of views wanted.
-        among: Views to choose from; the view itself is left out.
-    """
+    """Return up to ``count`` views to compare a view with: the nearest cameras that share sight with it."""
+    # Views too near for depth are skipped. The views that share most at the best angles gave fewer depths, and mostly lower
+    # PSNR (docs/decisions/013-any-capture.md). Without any, the sampled points may have missed the overlap.
     rest = [j for j in among if j != index]
     matching, overlap = sight.matching[index], sight.overlap[index]
     good = [j for j in rest if matching[j] > 0 and matching[j] >= 0.5 * overlap[j]]
@@ -146,11 +117,8 @@ def matching_views(sight: Sight, cameras: Sequence[Camera], index: int, count: i
 
 
 def spread_views(sight: Sight, most: int) -> list[int]:
-    """Return up to ``most`` views, in ascending order, chosen to cover as much of the area of all views as possible.
-
-    Each step adds the view that most increases the sum, over all views, of the largest overlap with a chosen view. This greedy
-    choice for a submodular sum reaches at least 1 - 1/e of the optimum (Nemhauser et al. 1978).
-    """
+    """Return up to ``most`` views, in ascending order, chosen to cover as much of the area of all views as possible."""
+    # greedy for a submodular sum: at least 1 - 1/e of the optimum (Nemhauser et al. 1978)
     count = len(sight.overlap)
     if count <= most:
         return list(range(count))
@@ -240,11 +208,7 @@ def inside_image(camera: Camera, pixels: np.ndarray) -> np.ndarray:
 def plane_inverses(
     first: Camera, others: Sequence[Camera], bounds: tuple[float, float], spacing: float, max_planes: int
 ) -> np.ndarray:
-    """Return inverse depths [1/u] of planes, evenly spaced and ascending, from the far to the near bound [u].
-
-    Their number, 8 to ``max_planes``, is the smallest at which no match inside an image moves more than about ``spacing`` px
-    between planes.
-    """
+    """Return 8 to ``max_planes`` inverse depths [1/u], evenly spaced and ascending, from the far to the near bound [u]."""
     near, far = bounds
     x, y = np.meshgrid(np.linspace(0, first.width, 5), np.linspace(0, first.height, 5))
     pixels = np.stack([x.ravel(), y.ravel()], 1)
@@ -295,17 +259,7 @@ def matching_costs_cpu(view: View, others: Sequence[View], inverses: np.ndarray,
 
 
 def path_costs(costs: torch.Tensor, image: np.ndarray, small_step: float, large_step: float) -> torch.Tensor:
-    """Return the sum of the semi-global path costs from four sides.
-
-    Args:
-        costs: Matching costs in units of 1 / `UNIT`, int16, shape [H, W, D], on any device.
-        image: Colours in [0, 1] whose edges allow jumps, shape [H, W, 3].
-        small_step: Penalty for a change of one plane.
-        large_step: Penalty for any other change, less across edges of the image (`step_limits`).
-
-    Returns:
-        Sums in units of 1 / `UNIT`, int16, shape [H, W, D].
-    """
+    """Return the sum of the semi-global path costs from four sides, int16 [H, W, D], in units of 1 / `UNIT`."""
     down, across = (
         torch.from_numpy(step_limits(colors, small_step, large_step).astype(np.int32)).to(costs.device)
         for colors in (image, image.swapaxes(0, 1))
@@ -314,14 +268,7 @@ def path_costs(costs: torch.Tensor, image: np.ndarray, small_step: float, large_
 
 
 def inverse_depths_cpu(view: View, others: Sequence[View], planes: np.ndarray, config: SweepConfig) -> np.ndarray:
-    """Return inverse depths [1/u] of a view, float64, shape [H, W], by sweeping planes against at least one other view.
-
-    Args:
-        view: The view.
-        others: Views to compare it with.
-        planes: Inverse depths [1/u] of the planes, ascending, shape [D].
-        config: Window, penalties.
-    """
+    """Return inverse depths [1/u] of a view, float64, shape [H, W], by sweeping planes against other views."""
     costs = matching_costs_cpu(view, others, planes, config.window)
     return best_inverses(path_costs(costs, view.image, config.small_step, config.large_step), planes)
 
@@ -421,18 +368,8 @@ def _reduced(view: View, max_pixels: int) -> View:
 def consistent_depth(
     views: Mapping[int, View], inverses: Mapping[int, np.ndarray], index: int, others: Sequence[int], config: SweepConfig
 ) -> ViewDepth:
-    """Return the depth of one view where it is geometrically consistent with the depth of at least one other view.
-
-    A point is projected to each other view and back by the depth found there. It must return to within ``max_round_trip``
-    of its pixel, with both rays at least ``min_parallax`` apart. The sensitivity is the smallest among the consistent views.
-
-    Args:
-        views: Views by index.
-        inverses: Inverse depths of each view [1/u], float64, shape [H, W].
-        index: Index of the view.
-        others: Indices of the views to check it with.
-        config: Checks.
-    """
+    """Return the depth of one view where it is geometrically consistent with the depth of at least one other view."""
+    # a point returns to its pixel by the other view's depth; the sensitivity is the smallest among the consistent views
     own, notes = inverses[index], []
     sensitivity = np.full(own.shape, np.inf)
     for j in others:
@@ -486,22 +423,7 @@ def sweep_depths(
     views: Sequence[View], bounds: Sequence[tuple[float, float]], config: SweepConfig, device: torch.device = CPU,
     progress: Callable[[int, int], object] = lambda done, total: None,
 ) -> list[ViewDepth]:  # fmt: skip
-    """Return the depth of every view by sweeping planes against views that see the same surfaces.
-
-    At most ``config.max_views`` views are swept, so that the time is bounded. Swept views are compared with their nearest
-    neighbours among all views, and checked by round trips to one another.
-
-    Args:
-        views: The views; a single one has no consistent depth.
-        bounds: Nearest and farthest depth of each view [u], 0 < near < far.
-        config: Planes, smoothing and checks.
-        device: Device of costs and paths; the CPU is used if a GPU has too little memory, or images are tiny.
-        progress: Called after each view with the number of views swept so far, and their total.
-
-    Returns:
-        One depth per view at its own size; its notes report a reduced size and views without a consistent depth. A view that
-        was not swept has a note, and no valid depth.
-    """
+    """Return the depth of every view, at its own size, by sweeping planes against views that see the same surfaces."""
     cameras = [v.camera for v in views]
     sight = shared_sight(cameras, bounds)
     swept = spread_views(sight, config.max_views)

@@ -74,17 +74,7 @@ def _softmax(logits: np.ndarray) -> np.ndarray:
 
 
 def class_probabilities(network: Network, preprocessing: Preprocessing, image: np.ndarray) -> np.ndarray:
-    """Return the probability of each of the 21 classes at every pixel of an image [H, W, 3] in [0, 1].
-
-    An output that already sums to one is treated as probabilities. Any other output is treated as logits, which are resized
-    before the softmax.
-
-    Returns:
-        Probabilities, float32, shape [H, W, 21].
-
-    Raises:
-        DataError: The output is not 1 x 21 x h x w or 1 x h x w x 21.
-    """
+    """Return the probability of each of the 21 classes at each pixel of an image [H, W, 3], float32 [H, W, 21]."""
     output = network.run(preprocessing.prepare(network, image))
     if output.ndim != 4 or output.shape[0] != 1 or CLASSES not in (output.shape[1], output.shape[3]):
         raise DataError(
@@ -98,11 +88,7 @@ def class_probabilities(network: Network, preprocessing: Preprocessing, image: n
 
 
 def boundary_weight(labels: np.ndarray) -> np.ndarray:
-    """Return omega_boundary of a label map [H, W]: exp(-d^2 / 2 s^2), float32, shape [H, W].
-
-    d is the distance [px] to the nearest pixel with a neighbour (of four) of another label, and s = 2 px per 500 px of width.
-    The result is 0 everywhere where all labels are the same.
-    """
+    """Return omega_boundary of a label map [H, W]: exp(-d^2 / 2 s^2) of the distance d [px] to another label, float32."""
     edge = np.zeros(labels.shape, bool)
     across, down = labels[:, 1:] != labels[:, :-1], labels[1:] != labels[:-1]
     edge[:, 1:] |= across
@@ -124,21 +110,14 @@ def _falloff(edge: np.ndarray) -> np.ndarray:
 
 
 def network_semantics(network: Network, preprocessing: Preprocessing, image: np.ndarray) -> SemanticMaps:
-    """Return the maps of an image [H, W, 3] in [0, 1] by a segmentation network.
-
-    Raises:
-        DataError: The output is not 1 x 21 x h x w or 1 x h x w x 21.
-    """
+    """Return the maps of an image [H, W, 3] in [0, 1] by a segmentation network."""
     p = class_probabilities(network, preprocessing, image)
     foreground = np.clip(1 - p[..., 0], 0, 1)
     return SemanticMaps(np.clip(p.max(-1), 0, 1), boundary_weight(p.argmax(-1)), foreground)
 
 
 def _fast_length(length: int) -> int:
-    """Return the largest number up to ``length`` with the prime factors 2, 3 and 5 only, for fast Fourier transforms.
-
-    Transforms of other lengths take up to ten times as long. ``length`` is the side of a reduced image, at least 1 [px].
-    """
+    """Return the largest number up to ``length`` [px] with the prime factors 2, 3 and 5 only, for fast Fourier transforms."""
     while length > 1:
         rest = length
         for factor in (2, 3, 5):
@@ -151,15 +130,7 @@ def _fast_length(length: int) -> int:
 
 
 def classical_semantics(image: np.ndarray) -> SemanticMaps:
-    """Return the maps of an image [H, W, 3] in [0, 1] without a network, from its colours.
-
-    L0 smoothing (Xu et al. 2011) flattens texture; Canny's edges in the result are the boundaries. Foreground is
-    fine-grained saliency (Montabone and Soto 2010), smoothed within the flat regions. Confidence is the larger of foreground
-    and 1 - foreground. Images above `MAX_PIXELS` are reduced, and their maps enlarged.
-
-    Raises:
-        DataError: OpenCV cannot compute the saliency.
-    """
+    """Return saliency as foreground and edges as boundaries of an image [H, W, 3] in [0, 1], without a network."""
     import cv2
 
     height, width = image.shape[:2]
@@ -181,21 +152,15 @@ def classical_semantics(image: np.ndarray) -> SemanticMaps:
 
 
 def classical_maps(images: Sequence[np.ndarray], tell: Callable[[str], object] = lambda line: None) -> list[SemanticMaps]:
-    """Return `classical_semantics` of each image; ``tell`` is called with a line for each.
-
-    Each image is processed by one thread, so results do not depend on the number of threads.
-    """
+    """Return `classical_semantics` of each image, each by one thread, so that results do not depend on their number."""
     with single_threaded_opencv(), ThreadPoolExecutor(os.cpu_count() or 1, initializer=without_ipp) as pool:
         made = [pool.submit(classical_semantics, image) for image in images]
         return [m.result() for m in counted(made, tell, "finding salient regions", "views")]
 
 
 def knows_foreground(maps: SemanticMaps) -> bool:
-    """Return whether the maps separate an object from its background.
-
-    They do not if the mean foreground is below 1 % (tabletop scans hold no VOC class). They also do not if there is no boundary
-    and the mean foreground is below a half.
-    """
+    """Return whether the maps separate an object from its background."""
+    # a network finds nothing in tabletop scans, which hold no VOC class
     mean = float(maps.foreground.mean())
     return mean >= MIN_FOREGROUND and (bool(maps.boundary.any()) or mean >= 0.5)
 
@@ -392,27 +357,7 @@ def view_priors(
     cache: Path | None = None,
     tell: Callable[[str], object] = lambda line: None,
 ) -> tuple[list[Prior], list[str]]:
-    """Return a prior for the pixels of each view, before anything is fitted.
-
-    Args:
-        views: The training views.
-        config: Networks and their inputs.
-        depths: Function that gives for each view the depth consistent with the others, or None for no depth; called last, and
-            only if no depth network is given.
-        regions: For each view the pixels that show its object, bool [H, W], or None; they replace saliency, or a foreground
-            that the network does not find.
-        threads: CPU threads of a network; 0 for as many as the process may use.
-        cache: Folder that keeps the maps of networks; no map is kept if the folder is None or ``config.cache`` is False.
-        tell: Called with a line for each view.
-
-    Returns:
-        A prior per view, and notes on choices, assumptions and missing inputs.
-
-    Raises:
-        DataError: A model is invalid, or its output is not a map.
-        UsageError: A flag contradicts a model.
-        ResourceError: onnxruntime or its provider is missing.
-    """
+    """Return a prior for the pixels of each view before anything is fitted, and notes on choices and assumptions."""
     store = MapCache(Path(cache)) if config.cache and cache is not None else None
     notes: list[str] = []
     # both are opened before either runs: a wrong file is found at once

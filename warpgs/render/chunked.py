@@ -48,14 +48,7 @@ def halves(window: Window, tile_size: int) -> tuple[Window, Window] | None:
 
 
 def chunks(frame: ChunkedFrame, inputs: ProjectInputs) -> Iterator[tuple[RenderSettings, torch.Tensor]]:
-    """Yield settings and tile counts [C, N] of windows that have at most ``frame.max_instances`` instances each.
-
-    Windows come from top to bottom. A window with more instances is halved, unless it is a single tile.
-
-    Args:
-        frame: Settings.
-        inputs: Tensors of Gaussians and cameras, detached.
-    """
+    """Yield settings and tile counts [C, N] of windows, top to bottom, with at most ``max_instances`` each or of one tile."""
     left = [frame.settings.window]
     while left:
         window = left.pop()
@@ -125,16 +118,7 @@ class _BlendChunked(torch.autograd.Function):
 def contributions_chunked(
     projected: torch.Tensor, frame: ChunkedFrame, inputs: ProjectInputs
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Compute sum and maximum of each projected Gaussian's blending weights, as `contributions` does, chunk by chunk.
-
-    Args:
-        projected: Result of `project` for the frame's window, shape [C, N, 12].
-        frame: Settings.
-        inputs: The tensors that ``projected`` was projected from.
-
-    Returns:
-        Sums and maxima, shape [C, N] each.
-    """
+    """Compute `contributions` of projected Gaussians [C, N, 12] chunk by chunk: sums and maxima, shape [C, N] each."""
     sums, maxima = torch.zeros_like(projected[..., 0]), torch.zeros_like(projected[..., 0])
     for settings, counts in chunks(frame, inputs.detached()):
         part, part_maxima = weights_of(projected, bin_projected(projected, counts, settings), settings)
@@ -144,16 +128,7 @@ def contributions_chunked(
 
 
 def median_depth_chunked(projected: torch.Tensor, frame: ChunkedFrame, inputs: ProjectInputs) -> torch.Tensor:
-    """Render the median depth chunk by chunk: the same bits as `median_depth` gives.
-
-    Args:
-        projected: Result of `project` for the frame's window, shape [C, N, 12].
-        frame: Settings.
-        inputs: The tensors that ``projected`` was projected from.
-
-    Returns:
-        Depth [u], 0 where alpha is below 1/2, shape [C, H, W].
-    """
+    """Render the `median_depth` [u] chunk by chunk, to the same bits, shape [C, H, W]."""
     _, _, width, height = frame.settings.window
     depths = projected.new_empty(len(projected), height, width)
     for settings, counts in chunks(frame, inputs.detached()):
@@ -167,17 +142,7 @@ def median_depth_chunked(projected: torch.Tensor, frame: ChunkedFrame, inputs: P
 def heaviest_chunked(
     projected: torch.Tensor, frame: ChunkedFrame, inputs: ProjectInputs, k: int
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Find the k Gaussians of largest blending weight in each pixel, chunk by chunk: the same bits as `heaviest` gives.
-
-    Args:
-        projected: Result of `project` for the frame's window, shape [C, N, 12].
-        frame: Settings.
-        inputs: The tensors that ``projected`` was projected from.
-        k: Number of Gaussians.
-
-    Returns:
-        Ids and weights of the Gaussians [C, H, W, k], and the number of blended Gaussians [C, H, W].
-    """
+    """Find the `heaviest` Gaussians chunk by chunk, to the same bits: ids, weights [C, H, W, k], counts [C, H, W]."""
     _, _, width, height = frame.settings.window
     shape = (len(projected), height, width)
     ids, counts = (projected.new_empty(s, dtype=torch.int32) for s in ((*shape, k), shape))
@@ -194,20 +159,7 @@ def blend_chunked(
     projected: torch.Tensor, backgrounds: torch.Tensor, frame: ChunkedFrame, inputs: ProjectInputs,
     colors: torch.Tensor | None = None,
 ) -> Images:  # fmt: skip
-    """Composite projected Gaussians chunk by chunk: the same images as `images_of` gives, to the bit.
-
-    The backward pass renders each chunk again and adds up the gradients, so only the inputs are saved for it. This takes
-    about 1.5 times as long as `blend`, but needs memory only for one chunk's instances.
-
-    Args:
-        projected: Result of `project` for the frame's window, shape [C, N, 12]; differentiable.
-        backgrounds: Colour behind everything, shape [C, 3], or [C, D] with ``colors``; differentiable.
-        frame: Settings.
-        inputs: The tensors that ``projected`` was projected from.
-        colors: Channels of each Gaussian, shape [1, N, D] or [C, N, D]; differentiable. None for their own colours.
-
-    Returns:
-        ``rgb`` [C, H, W, 3] or [C, H, W, D], ``alpha`` and ``depth`` [C, H, W].
-    """
+    """Composite [C, N, 12] chunk by chunk, to the bits of `images_of`; the backward pass renders each chunk again."""
+    # only the inputs are saved; about 1.5 times the time of `blend`, with memory for one chunk's instances
     images: Images = _BlendChunked.apply(projected, backgrounds, colors, frame, *inputs.detached())
     return images

@@ -98,11 +98,7 @@ def as_batch(array: Any, like: torch.Tensor, axes: int = 2) -> torch.Tensor:
 
 
 def _for_each(name: str, array: Any, like: torch.Tensor, axes: int = 2) -> torch.Tensor:
-    """Return the array ``name`` of a camera as a tensor [C, ...], with an entry for each of the poses ``like`` [C, 4, 4].
-
-    Raises:
-        ValueError: The number of entries is neither 1 nor that of the poses.
-    """
+    """Return the array ``name`` of a camera as a tensor [C, ...], with an entry for each of the poses ``like`` [C, 4, 4]."""
     tensor, cameras = as_batch(array, like, axes), like.shape[0]
     own = list(tensor.shape[1:])
     if tensor.ndim != axes + 1 or tensor.shape[0] not in (1, cameras):
@@ -113,18 +109,7 @@ def _for_each(name: str, array: Any, like: torch.Tensor, axes: int = 2) -> torch
 
 
 def inputs_of(gaussians: RasterizedGaussians, camera: Camera, opacity_factors: torch.Tensor | None = None) -> ProjectInputs:
-    """Return the tensors of a render; the camera's tensors are converted to the type and device of ``gaussians.means``.
-
-    Args:
-        gaussians: The scene, N Gaussians.
-        camera: One camera, or C of them.
-        opacity_factors: Factors of the opacities, shape [N]; None for 1.
-
-    Raises:
-        TypeError: The covariances or the factors have another scalar type than the means.
-        ValueError: The covariances or the factors have another shape, or are on another device; or the camera's number of
-            intrinsics or lenses is neither 1 nor the number of its poses.
-    """
+    """Return a render's tensors, in the type and on the device of the means; ``opacity_factors`` [N], None for 1."""
     means = gaussians.means
     viewmats = as_batch(camera.viewmat, means)
     Ks = _for_each("K", camera.K, viewmats)
@@ -158,19 +143,7 @@ def bin_projected(
     projected: torch.Tensor, tile_counts: torch.Tensor, settings: RenderSettings, memory: InstanceMemory = AS_NEEDED,
     slotted: bool = True, listed: torch.Tensor | None = None,
 ) -> Tiles:  # fmt: skip
-    """Return for each tile of the render's window the Gaussians that touch the tile, front to back.
-
-    Args:
-        projected: Projected Gaussians, shape [C, N, 12].
-        tile_counts: Number of tiles of the window that each Gaussian touches, int32, shape [C, N].
-        settings: Settings of the render.
-        memory: Memory that the (Gaussian, tile) instances may take.
-        slotted: True if gradients or `weights_of` follow; False is faster (`bin_tiles`).
-        listed: True for the tiles that get instances, bool, shape [C * tiles]; None for all tiles.
-
-    Raises:
-        ResourceError: There are more instances than memory allows.
-    """
+    """Return for each tile of the window the Gaussians [C, N, 12] that touch it, front to back (`bin_tiles`)."""
     named = {"memory": memory, "slotted": slotted, "listed": listed, **settings.of_window()}
     return bin_tiles(projected, tile_counts, tile_size=settings.tile_size, **named)
 
@@ -179,21 +152,7 @@ def compose(
     inputs: ProjectInputs, backgrounds: torch.Tensor, settings: RenderSettings, memory: InstanceMemory = AS_NEEDED,
     deterministic: bool = True,
 ) -> Composed:  # fmt: skip
-    """Render a window of the images of C cameras. Differentiable as `project` and `blend` are.
-
-    Args:
-        inputs: Tensors of Gaussians and cameras.
-        backgrounds: Colour behind everything, shape [C, 3].
-        settings: Settings of the render.
-        memory: Memory that the (Gaussian, tile) instances may take.
-        deterministic: True to sum gradients in a fixed order.
-
-    Raises:
-        ResourceError: There are more instances than memory allows.
-        TypeError: A scalar type is neither float32 nor float64, or scalar types differ.
-        UsageError: The camera model is unknown.
-        ValueError: A shape or a device disagrees.
-    """
+    """Render a window of the images of C cameras over backgrounds [C, 3]. Differentiable as `project` and `blend` are."""
     projected, tile_counts = project_inputs(inputs, settings.projection())
     tiles, images = bin_and_blend(projected, tile_counts, backgrounds, settings, memory, deterministic)
     return Composed(images, projected, tile_counts, tiles)
@@ -217,16 +176,7 @@ def images_of(
     projected: torch.Tensor, tiles: Tiles, backgrounds: torch.Tensor, settings: RenderSettings, deterministic: bool = True,
     colors: torch.Tensor | None = None,
 ) -> Images:  # fmt: skip
-    """Return the images of binned Gaussians: in their own colours (`blend`), or in D channels (`blend_channels`).
-
-    Args:
-        projected: Projected Gaussians, shape [C, N, 12].
-        tiles: Their (Gaussian, tile) instances.
-        backgrounds: Colour behind everything, shape [C, 3], or [C, D] with ``colors``.
-        settings: Settings of the render.
-        deterministic: True to sum gradients in a fixed order.
-        colors: Channels of each Gaussian, shape [1, N, D] or [C, N, D]; None for their own colours.
-    """
+    """Return the images of binned Gaussians: in their own colours, or in channels [1, N, D] or [C, N, D] of ``colors``."""
     named = {"deterministic": deterministic, "absgrad": settings.absgrad, **settings.of_window()}
     if colors is None:
         return blend(projected, tiles, backgrounds, **named)
@@ -260,19 +210,7 @@ def composite_into(
     projected: torch.Tensor, tile_counts: torch.Tensor, backgrounds: torch.Tensor, settings: RenderSettings,
     memory: InstanceMemory, save: bool = True,
 ) -> tuple[Tiles, Sequence[torch.Tensor]]:  # fmt: skip
-    """Bin and blend without autograd, in memory of the allocator; also return the tensors that the backward pass needs.
-
-    Args:
-        projected: Projected Gaussians, contiguous, shape [C, N, 12].
-        tile_counts: Number of tiles that each Gaussian touches, int32, shape [C, N].
-        backgrounds: Colour behind everything, contiguous, shape [C, 3].
-        settings: Settings of the render.
-        memory: Memory that the (Gaussian, tile) instances may take; its allocator provides all other tensors.
-        save: True if gradients will be taken.
-
-    Returns:
-        The instances, and the tensors [...] that `blending.composite` returns.
-    """
+    """Bin and blend [C, N, 12] without autograd, in the allocator's memory; also return the backward pass's tensors."""
     tiles = bin_projected(projected, tile_counts, settings, memory, save)
     found = blending.composite(projected, tiles, backgrounds, settings.blending(), save=save, allocator=memory.allocator)
     return tiles, found

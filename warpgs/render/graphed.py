@@ -67,15 +67,7 @@ class GraphedRasterizer:
     def __init__(
         self, settings: RenderSettings, cameras: int, capacity: Capacity, graphs: GraphPool, gradients: bool = True
     ):  # fmt: skip
-        """Prepare the functions; nothing is rendered yet.
-
-        Args:
-            settings: Settings of the render.
-            cameras: Number of images at a time.
-            capacity: Numbers of Gaussians and instances to allocate memory for.
-            graphs: Pool to capture graphs in.
-            gradients: True to keep what the backward pass needs.
-        """
+        """Prepare the functions for C ``cameras``; nothing is rendered yet."""
         self.settings, self.cameras, self.capacity, self.device = settings, cameras, capacity, graphs.device
         self.gradients = gradients
         self._project_settings = settings.projection()
@@ -108,12 +100,7 @@ class GraphedRasterizer:
         self._black: torch.Tensor | None = None
 
     def render(self, inputs: ProjectInputs, backgrounds: torch.Tensor | None):
-        """Return images, projected Gaussians and tile counts; None if the call exceeds the capacity.
-
-        Args:
-            inputs: The tensors, without opacity factors.
-            backgrounds: Colour behind everything, shape [C, 3]; None for black.
-        """
+        """Return images, projected Gaussians [C, N, 12] and tile counts [C, N]; None if the call exceeds the capacity."""
         of_cameras = [t.contiguous() for t in inputs[5:8]]
         self._addresses[:] = [t.data_ptr() for t in of_cameras]  # no longer read: the last call has finished
         (cameras, *projection), _ = self._forward_project(*inputs[:5])
@@ -261,10 +248,7 @@ class Recorder:
         """Key of the last call that exceeded its capacity, and the capacity that this call needed."""
 
     def render(self, inputs: ProjectInputs, backgrounds: torch.Tensor | None, settings: RenderSettings):
-        """Return the result of `GraphedRasterizer.render`; None if the call must run without graphs.
-
-        ``inputs`` are without opacity factors; ``backgrounds`` [C, 3] may be None.
-        """
+        """Return the result of `GraphedRasterizer.render`, over ``backgrounds`` [C, 3]; None if no graphs can be used."""
         key = None if self.graphs.failed else call_key(inputs, backgrounds, settings, self.gradients)
         if key is None or not self.graphs.lock.acquire(blocking=False):
             return None
@@ -330,15 +314,11 @@ def count_needed(inputs: ProjectInputs, settings: RenderSettings) -> Capacity:
 def call_key(
     inputs: ProjectInputs, backgrounds: torch.Tensor | None, settings: RenderSettings, gradients: bool = True
 ) -> tuple | None:  # fmt: skip
-    """Return the values that calls must have in common to use one rasterizer.
-
-    Return None for calls that cannot be captured, and for very large calls, where graphs gain nothing. ``backgrounds`` [C, 3]
-    may be None. Calls without ``gradients`` are captured only in the main thread: a viewer renders in another thread, beside a
-    loop that may wait for the whole device.
-    """
+    """Return what calls must have in common to use one rasterizer; None for calls that cannot be captured, or gain nothing."""
     means, viewmats = inputs.means, inputs.viewmats
     cameras = viewmats.shape[0]  # len of a tensor takes ten times as long
     projected, tiles = means.shape[0] * cameras, math.prod(grid(*settings.window[2:], settings.tile_size))
+    # without gradients in the main thread alone: a viewer renders in another one, beside a loop that may wait for the device
     small = 0 < projected <= MAX_PROJECTED and sums_fit(projected, tiles)
     fit = means.dtype == torch.float32 and (gradients or threading.current_thread() is threading.main_thread())
     if not (small and fit) or torch.is_inference_mode_enabled() or not _can_capture(means.device):
@@ -354,12 +334,8 @@ def call_key(
 
 
 def _can_capture(device: torch.device) -> bool:
-    """Return whether calls can be captured now, on this device.
-
-    Calls are not captured during another capture, on a device that is not current, or with hooks on saved tensors.
-    Activation checkpointing sets such hooks, and needs the same number of saved tensors each time. Nor are they captured where
-    torch allocates each tensor from the driver, or Warp checks for errors after each kernel.
-    """
+    """Return whether calls can be captured now, on this device."""
+    # nor with hooks on saved tensors, as activation checkpointing sets: it needs the same number of saved tensors each time
     if _UNCACHED or wp.config.verify_cuda:
         return False
     hooks = torch._C._autograd._top_saved_tensors_default_hooks(True)

@@ -99,11 +99,7 @@ class RasterizeOptions:
     torch.cuda.synchronize does."""
 
     def __post_init__(self) -> None:
-        """Check the types of switches and numbers, and the signs of some; other ranges are checked in `rasterize`.
-
-        Raises:
-            UsageError: An option has the wrong type, or is negative.
-        """
+        """Check types, signs, ranges, and options that exclude each other; what depends on the camera is checked later."""
         for name in SWITCHES:
             if not isinstance(getattr(self, name), (bool, np.bool_)):
                 raise UsageError(f"{name} must be True or False, not {getattr(self, name)!r}")

@@ -44,14 +44,7 @@ from warpgs.scene import ActivatedGaussians, Camera, CovarianceGaussians, Gaussi
 
 
 def check_arrays(camera: Camera) -> None:
-    """Check types and shapes of a camera's arrays, the types of width and height, and the values of arrays in main memory.
-
-    Raises:
-        TypeError: An array is neither a numpy array nor a tensor, is sparse, or has values that are not real or have half
-            precision; or width or height is not an integer.
-        ValueError: A shape is wrong; a number is not finite; K has a focal length of 0, a skew or another last row than
-            0, 0, 1; or a viewmat scales or shears, or has another last row than 0, 0, 0, 1.
-    """
+    """Check a camera's types and shapes, and the values of its arrays in main memory."""
     for name, rows, tolerance, off, check in MATRICES:
         given: Any = getattr(camera, name)
         _check_type(name, given)
@@ -158,11 +151,7 @@ MATRICES = (
 
 
 def for_each(cameras: Sequence[Camera], *, gaussians: Any, options: Any) -> list[tuple[Any, ...]]:
-    """Return Gaussians, camera and options of each of C cameras; single values are shared by all.
-
-    Raises:
-        ValueError: The length of a list is not C.
-    """
+    """Return Gaussians, camera and options of each of C cameras; single values are shared by all."""
     columns = []
     for name, given in (("gaussians", gaussians), ("options", options)):
         columns.append(given if isinstance(given, (list, tuple)) else [given] * len(cameras))
@@ -176,12 +165,7 @@ INTEGERS = (torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64)
 
 
 def checked_pixels(pixels: torch.Tensor, cameras: int, device: torch.device) -> torch.Tensor:
-    """Return pixels [P, 2] or [C, P, 2] of C cameras as int64 on a device, shape [1, P, 2] or [C, P, 2].
-
-    Raises:
-        TypeError: The pixels are not a dense tensor of integers.
-        ValueError: The shape is wrong.
-    """
+    """Return pixels [P, 2] or [C, P, 2] of C cameras as int64 on a device, shape [1, P, 2] or [C, P, 2]."""
     if not isinstance(pixels, torch.Tensor) or pixels.dtype not in INTEGERS:
         found = pixels.dtype if isinstance(pixels, torch.Tensor) else type(pixels).__name__
         raise TypeError(f"pixels must be a tensor of whole numbers, not {found}: columns and rows, from 0 at the upper left")
@@ -194,11 +178,7 @@ def checked_pixels(pixels: torch.Tensor, cameras: int, device: torch.device) -> 
 
 
 def window_of(pixels: torch.Tensor, camera: Camera, tile_size: int) -> Window:
-    """Return the smallest window of whole tiles that holds pixels [..., P, 2]; the pixels are read from the device.
-
-    Raises:
-        ValueError: A pixel is outside the image.
-    """
+    """Return the smallest window of whole tiles that holds pixels [..., P, 2]; the pixels are read from the device."""
     if not pixels.shape[-2]:
         return 0, 0, min(tile_size, camera.width), min(tile_size, camera.height)
     flat = pixels.reshape(-1, 2)
@@ -248,12 +228,7 @@ ARGUMENTS = ((Gaussians, ActivatedGaussians, CovarianceGaussians), (Camera,), (R
 
 
 def _checked_rule(camera: Camera, options: RasterizeOptions) -> Rule:
-    """Return the rule that the options name, with the near and far plane of the options.
-
-    Raises:
-        UsageError: The rule, the tile size or the camera model is unknown; or options exclude each other or are out of range.
-        ValueError: The near or the far plane is outside its range.
-    """
+    """Return the rule that the options name, with the near and far plane of the options."""
     rule = options.rule if isinstance(options.rule, Rule) else rule_named(options.rule)
     near = rule.near if options.near is None else options.near
     far = rule.far if options.far is None else options.far
@@ -279,15 +254,7 @@ def _checked_rule(camera: Camera, options: RasterizeOptions) -> Rule:
 
 
 def _check_arguments(gaussians: RasterizedGaussians, camera: Camera, options: RasterizeOptions) -> None:
-    """Check types, the camera's arrays, and the shape of ``sh``; other shapes are checked where the tensors are used.
-
-    Values of Gaussians are not checked; Gaussians with non-finite values are culled.
-
-    Raises:
-        TypeError: An argument, a field of the Gaussians, or an array of the camera has the wrong type.
-        UsageError: There is a feature background but no features, or the Gaussians have no colours.
-        ValueError: A shape or a number of the camera (`check_arrays`), or the shape of ``sh``, is wrong.
-    """
+    """Check types, the camera's arrays, and the shape of ``sh``; non-finite Gaussians are culled, not rejected."""
     for name, given, kinds in zip(("gaussians", "camera", "options"), (gaussians, camera, options), ARGUMENTS, strict=True):
         if not isinstance(given, kinds):
             listed = isinstance(given, (list, tuple))
@@ -330,12 +297,7 @@ def _checked_window(camera: Camera, options: RasterizeOptions) -> Window:
 
 
 def _checked_channels(name: str, values: torch.Tensor | None, inputs: ProjectInputs) -> torch.Tensor | None:
-    """Return channels, given as [N, D] or [C, N, D], in shape [1, N, D] or [C, N, D].
-
-    Raises:
-        TypeError: The channels are not a tensor, or have another scalar type than the Gaussians.
-        ValueError: The shape or the device is wrong.
-    """
+    """Return channels, given as [N, D] or [C, N, D], in shape [1, N, D] or [C, N, D]."""
     if values is None:
         return None
     pattern = "C N D" if isinstance(values, torch.Tensor) and values.ndim == 3 else "N D"
@@ -378,12 +340,7 @@ def _as_tensor(values: Any) -> torch.Tensor:
 
 
 def _layer(name: str, background: Any, colors: torch.Tensor | None, inputs: ProjectInputs) -> _Layer:
-    """Return channels [..., D] with their background (one, a batch, or None for zeros); ``name`` is the background's option.
-
-    Raises:
-        TypeError: The background does not hold real numbers, or is sparse.
-        ValueError: The shape of the background is wrong.
-    """
+    """Return channels [..., D] with their background (one, a batch, or None for zeros); ``name`` is the background's option."""
     channels, like = 3 if colors is None else colors.shape[-1], inputs.viewmats
     if background is None:  # outside of the try block: a full GPU is not a wrong background
         background = like.new_zeros(channels)
@@ -529,10 +486,7 @@ def _rasterize(
     inputs: ProjectInputs, layers: list[_Layer], settings: RenderSettings, options: RasterizeOptions,
     pixels: torch.Tensor | None,
 ) -> tuple[Any, ...]:  # fmt: skip
-    """Return the images of the first layer as one tuple, and the further fields of `Render`, by kernels launched one by one.
-
-    The last entry holds the further maps [C, H, W, ...] that were requested, by name.
-    """
+    """Return the first layer's images, the further fields of `Render`, and the other maps [C, H, W, ...] by name."""
     projected, tile_counts = project_inputs(inputs, settings.projection())
     overflow = None if options.capacity is None else torch.zeros(1, dtype=torch.int32, device=projected.device)
     if options.max_instances is not None and int(tile_counts.sum()) > options.max_instances:

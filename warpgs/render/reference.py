@@ -110,25 +110,7 @@ def reference_image(
     gaussians: Gaussians, camera: Camera, window: tuple[int, int, int, int], background: torch.Tensor, degree: int,
     antialiased: bool = False,
 ) -> torch.Tensor:  # fmt: skip
-    """Return the colours in a window of one camera's image under rule ``exact``, in float64.
-
-    Gaussians are evaluated at all pixels of a block, with matrices (Kerbl et al. 2023, section 4 and eq. 3). Use it for
-    windows of a few thousand pixels. Leave out Gaussians that do not reach the window: the time grows with their number.
-
-    Args:
-        gaussians: N Gaussians of any scalar type, all finite.
-        camera: One camera.
-        window: Left, top, width and height [px].
-        background: Colour behind the scene, shape [3].
-        degree: Spherical-harmonics degree used.
-        antialiased: As in `RasterizeOptions`.
-
-    Returns:
-        Colours, not clamped, shape [h, w, 3].
-
-    Raises:
-        UsageError: The camera model is only supported by the kernels.
-    """
+    """Return the colours [h, w, 3] in a window [px] of one image under rule ``exact``, in float64, not clamped."""
     geometry.check_known(camera.model)
     g, device = _project(gaussians, camera, degree, antialiased), gaussians.means.device
     left, top, width, height = window
