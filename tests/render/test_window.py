@@ -8,8 +8,8 @@ import torch
 from tests.gaussians import camera, cloud, leaves
 from warpgs.constants import RULES
 from warpgs.errors import UsageError
-from warpgs.render.chunked import ChunkedFrame, chunks
-from warpgs.render.compose import RenderSettings, inputs_of
+from warpgs.render.chunked import chunks
+from warpgs.render.compose import inputs_of, pass_of
 from warpgs.render.options import RasterizeOptions
 from warpgs.render.rasterize import rasterize
 
@@ -86,8 +86,7 @@ def test_chunks_make_the_same_image(device, dtype, most):
 def test_chunks_hold_no_more_instances_than_asked_for():
     """Every chunk but a single tile keeps to the number; together they are the window."""
     gaussians, cam, _ = scene(torch.float32, "cpu")
-    frame = ChunkedFrame(RenderSettings(*SIZE, (16, 16, 59, 37), 1, RULES["exact"], 16), 150)
-    found = list(chunks(frame, inputs_of(gaussians, cam)))
+    found = list(chunks(pass_of(cam, 1, RULES["exact"], window=(16, 16, 59, 37)), 150, inputs_of(gaussians, cam)))
     covered = torch.zeros(SIZE[1], SIZE[0], dtype=torch.int32)
     for settings, counts in found:
         x, y, width, height = settings.window

@@ -11,7 +11,7 @@ import warp as wp
 from warpgs.constants import Rule
 from warpgs.device import BINNING, BLENDING, FLOAT, LOSS, PROJECTION, SAMPLING, Needs, StepSizes
 from warpgs.kernels import blend_cpu, blend_cuda, launch
-from warpgs.kernels.falloff import COLORS, VALUES, WIDTHS, BlendSettings
+from warpgs.kernels.falloff import COLORS, VALUES, WIDTHS, Pass
 from warpgs.kernels.launch import TORCH, Allocator, first_order, keep, kept
 from warpgs.kernels.native import ROLLED
 from warpgs.kernels.tiles import Tiles, grid
@@ -123,7 +123,7 @@ def composite(
     projected: torch.Tensor,
     tiles: Tiles,
     backgrounds: torch.Tensor,
-    settings: BlendSettings,
+    settings: Pass,
     *,
     save: bool,
     allocator: Allocator = TORCH,
@@ -151,7 +151,7 @@ def composite(
         return blend_cuda.forward(projected, tiles, backgrounds, settings, save=save, allocator=allocator, image=image)
     real, device = launch.real_of(projected), projected.device
     cameras, channels = backgrounds.shape
-    shape = (cameras, settings.height, settings.width)
+    shape = (cameras, *settings.window[:1:-1])
     rgb = allocator.output((*shape, channels), projected.dtype, device) if image is None else image
     alpha, depth = (allocator.output(shape, projected.dtype, device) for _ in range(2))
     transmittances, weights = (allocator.saved(shape, projected.dtype, device) for _ in range(2))
@@ -166,7 +166,7 @@ def composite(
     return rgb, alpha, depth, transmittances, weights, ends, allocator.saved((0,), projected.dtype, device)
 
 
-def _backward(projected, tiles, backgrounds, settings: BlendSettings, saved, v_images, allocator) -> torch.Tensor:
+def _backward(projected, tiles, backgrounds, settings: Pass, saved, v_images, allocator) -> torch.Tensor:
     """Return what `blend_cuda.backward` returns, by the generic kernels."""
     _, depth, transmittances, weights, ends, _ = saved
     v_rgb, v_alpha, v_depth = v_images
@@ -201,7 +201,7 @@ def composite_gradients(
     projected: torch.Tensor,
     tiles: Tiles,
     backgrounds: torch.Tensor,
-    settings: BlendSettings,
+    settings: Pass,
     saved: Sequence[torch.Tensor],
     v_images: Sequence[torch.Tensor | None],
     allocator: Allocator = TORCH,
@@ -331,7 +331,7 @@ def blend(
         ValueError: A shape or device is wrong, or the tiles belong to another image size or lack the slots for gradients.
     """
     check_tiles(projected, tiles, width, height, backgrounds=(backgrounds, "C 3"))
-    settings = BlendSettings(origin, width, height, rule, deterministic, absgrad)
+    settings = Pass((width, height), (*origin, width, height), rule, deterministic=deterministic, absgrad=absgrad)
     return _Blend.apply(*without_gradients(projected, backgrounds), tiles, settings)
 
 
@@ -358,7 +358,7 @@ def contributions(
     check_tiles(projected, tiles, width, height)
     projected = projected.detach().contiguous()
     real, device = launch.real_of(projected), projected.device
-    settings = BlendSettings(origin, width, height, rule)
+    settings = Pass((width, height), (*origin, width, height), rule)
     check_slots(tiles)
     ends = composite(projected, tiles, projected.new_zeros(len(projected), 3), settings, save=False)[5]
     if is_native(projected):
@@ -495,7 +495,7 @@ class _BlendChannels(torch.autograd.Function):
         if save:
             check_slots(tiles)
         projected, colors = projected.contiguous(), colors.contiguous()
-        image = projected.new_empty(len(projected), settings.height, settings.width, colors.shape[-1])
+        image = projected.new_empty(len(projected), *settings.window[:1:-1], colors.shape[-1])
         found = None
         for group in _groups(projected, tiles, colors, backgrounds, _width(projected, colors.shape[-1], settings.absgrad)):
             # the first pass computes everything that does not depend on the channels
@@ -587,5 +587,5 @@ def blend_channels(
     check_tiles(projected, tiles, width, height, colors=(colors, f"{shared} N D"), backgrounds=(backgrounds, "C D"))
     if colors.shape[-1] == 0:
         raise ValueError(f"colors must have at least one channel, not shape {list(colors.shape)}")
-    settings = BlendSettings(origin, width, height, rule, deterministic, absgrad)
+    settings = Pass((width, height), (*origin, width, height), rule, deterministic=deterministic, absgrad=absgrad)
     return _BlendChannels.apply(*without_gradients(projected, colors, backgrounds), tiles, settings)

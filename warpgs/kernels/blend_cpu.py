@@ -379,7 +379,7 @@ def make_backward(real, tile_size: int, channels: int, absgrad: bool = False, de
         real: wp.float32 or wp.float64.
         tile_size: Side of a tile [px].
         channels: Number of channels.
-        absgrad: As in `BlendSettings`.
+        absgrad: As in `Pass`.
         deep: False where depth and alpha have no gradient; their data is then not read.
     """
     f = make_functions(real)

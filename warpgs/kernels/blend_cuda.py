@@ -14,7 +14,7 @@ import warp as wp
 from warpgs.constants import SMALLEST_WEIGHT, TILE_SIZE
 from warpgs.device import FLOAT, StepSizes
 from warpgs.kernels import launch
-from warpgs.kernels.falloff import COLORS, BlendSettings, make_struct
+from warpgs.kernels.falloff import COLORS, Pass, make_struct
 from warpgs.kernels.launch import TORCH, Allocator
 from warpgs.kernels.native import source
 from warpgs.kernels.tiles import Tiles, grid
@@ -158,7 +158,7 @@ def make_backward(
         atomic: True to add each instance's sum to its Gaussian's sum atomically, in no fixed order; False to store it in the
             instance's slot.
         channels: Number of channels, out of `WIDTHS`.
-        absgrad: True to sum magnitudes of the mean's gradient, too (`BlendSettings.absgrad`).
+        absgrad: True to sum magnitudes of the mean's gradient, too (`Pass.absgrad`).
     """
     Blending = make_struct(wp.float32)
     flags = {"WITH_DEPTH": with_depth, "ATOMIC": atomic, "ABSGRAD": absgrad}
@@ -247,7 +247,7 @@ def forward(
     projected: torch.Tensor,
     tiles: Tiles,
     backgrounds: torch.Tensor,
-    settings: BlendSettings,
+    settings: Pass,
     *,
     save: bool,
     allocator: Allocator = TORCH,
@@ -260,7 +260,7 @@ def forward(
         of instances and, with three channels, `STATE` numbers for each pixel of a tile.
     """
     device, channels = projected.device, backgrounds.shape[1]
-    shape = (backgrounds.shape[0], settings.height, settings.width)
+    shape = (backgrounds.shape[0], *settings.window[:1:-1])
     rgb = allocator.output((*shape, channels), torch.float32, device) if image is None else image
     alpha, depth = (allocator.output(shape, torch.float32, device) for _ in range(2))
     transmittances, weights = allocator.saved((2, *(shape if save else (0,))), torch.float32, device).unbind()
@@ -290,7 +290,7 @@ def backward(
     projected: torch.Tensor,
     tiles: Tiles,
     backgrounds: torch.Tensor,
-    settings: BlendSettings,
+    settings: Pass,
     saved: Sequence[torch.Tensor],
     v_images: Sequence[torch.Tensor | None],
     allocator: Allocator = TORCH,
@@ -334,7 +334,7 @@ def backward(
     return v_projected
 
 
-def instance_weights(projected: torch.Tensor, tiles: Tiles, settings: BlendSettings, ends: torch.Tensor) -> torch.Tensor:
+def instance_weights(projected: torch.Tensor, tiles: Tiles, settings: Pass, ends: torch.Tensor) -> torch.Tensor:
     """Return sum and maximum of each instance's blending weight over the pixels of its tile, in slot order, shape [M, 2].
 
     Args:

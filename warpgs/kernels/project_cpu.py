@@ -251,7 +251,7 @@ def make_backward(real, camera_model: str, parameters: str, antialiased: bool, b
     Args:
         real: wp.float32 or wp.float64.
         camera_model: Name of the camera model, whose functions are compiled in.
-        parameters: Kind of the Gaussians' parameters (`ProjectSettings.parameters`).
+        parameters: Kind of the Gaussians' parameters (`Pass.parameters`).
         antialiased: True where opacities were multiplied by `compensation`.
         bases: Number of basis values that a colour may have (`sh.bases_for`).
         camera_gradients: True to compute the gradients of viewmats and Ks.

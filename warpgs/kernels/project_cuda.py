@@ -22,7 +22,7 @@ def make_forward(
     Args:
         real: wp.float32, whose rows and coefficients are moved 16 bytes at a time, or wp.float64.
         camera_model: Name of the camera model, whose functions are compiled in.
-        parameters: Kind of the Gaussians' parameters (`ProjectSettings.parameters`).
+        parameters: Kind of the Gaussians' parameters (`Pass.parameters`).
         antialiased: True to multiply opacities by `compensation`.
         bases: Number of basis values that a colour may have (`sh.bases_for`).
     """
@@ -173,7 +173,7 @@ def make_backward(
     Args:
         real: wp.float32 or wp.float64.
         camera_model: Name of the camera model, whose functions are compiled in.
-        parameters: Kind of the Gaussians' parameters (`ProjectSettings.parameters`).
+        parameters: Kind of the Gaussians' parameters (`Pass.parameters`).
         antialiased: True where opacities were multiplied by `compensation`.
         bases: Number of basis values that a colour may have (`sh.bases_for`).
     """

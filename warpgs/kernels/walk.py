@@ -10,7 +10,7 @@ from warpgs.kernels import launch
 from warpgs.kernels.blend import check_tiles, is_native, tile_inputs
 from warpgs.kernels.blend_cuda import SCALE
 from warpgs.kernels.ellipse import PROJECTED_SIZE
-from warpgs.kernels.falloff import STRIP, BlendSettings, make_functions, make_struct
+from warpgs.kernels.falloff import STRIP, Pass, make_functions, make_struct
 from warpgs.kernels.native import ROLLED, source
 from warpgs.kernels.tiles import Tiles
 
@@ -145,7 +145,7 @@ def median_depth(
     check_tiles(projected, tiles, width, height)
     projected = projected.detach().contiguous()
     real, device = launch.real_of(projected), projected.device
-    settings, count = BlendSettings(origin, width, height, rule), len(tiles.ranges)
+    settings, count = Pass((width, height), (*origin, width, height), rule), len(tiles.ranges)
     depths = projected.new_empty(len(projected), height, width)
     own, output = settings.struct(tiles.size, real), launch.flat(depths, real)
     native = projected.is_cuda and projected.dtype == torch.float32
@@ -303,7 +303,7 @@ def heaviest(
         raise ValueError(f"the number of heaviest Gaussians must be at least 1, not {k}")
     projected = projected.detach().contiguous()
     real, device, (cameras, per_camera) = launch.real_of(projected), projected.device, projected.shape[:2]
-    settings, shape = BlendSettings(origin, width, height, rule), (cameras, height, width)
+    settings, shape = Pass((width, height), (*origin, width, height), rule), (cameras, height, width)
     weights = projected.new_zeros(*shape, k)
     ids = torch.full((*shape, k), -1, dtype=torch.int32, device=device)
     counts = torch.zeros(shape, dtype=torch.int32, device=device)

@@ -153,7 +153,7 @@ def round_trip(matches: np.ndarray, pixels: np.ndarray, back: np.ndarray) -> np.
 
 
 def blend(depths: np.ndarray, sensitivities: np.ndarray, valid: np.ndarray, mode: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return depths [N] [u] and sensitivities [N] [u/px] from candidates [S, N], nearest first; 0 and inf where none is valid."""
+    """Return depths [N] [u] and sensitivities [N] [u/px] from candidates [S, N], nearest first; 0 and inf if none is valid."""
     if mode not in BLENDS:
         raise UsageError(f"blend {mode!r} is not one of {', '.join(BLENDS)}")
     some = valid.any(0)

@@ -11,34 +11,33 @@ from typing import Any, NamedTuple, overload
 import numpy as np
 import torch
 
-from warpgs.constants import FAR, K_TOLERANCE, POSE_TOLERANCE, Rule, rule_named
+from warpgs.constants import K_TOLERANCE, POSE_TOLERANCE
 from warpgs.device import available_bytes, installed_bytes
 from warpgs.errors import ResourceError, UsageError
 from warpgs.kernels import launch
 from warpgs.kernels.cameras import check_camera
 from warpgs.kernels.ellipse import ProjectInputs
-from warpgs.kernels.falloff import WIDTHS
+from warpgs.kernels.falloff import WIDTHS, Pass
 from warpgs.kernels.launch import refuse_transforms, without_gradient
 from warpgs.kernels.project import project_inputs
-from warpgs.kernels.tiles import MAX_INSTANCES, InstanceMemory, grid
+from warpgs.kernels.tiles import InstanceMemory, grid
 from warpgs.means2d import count_passes
 from warpgs.render import graphed
-from warpgs.render.chunked import ChunkedFrame, blend_chunked, contributions_chunked, heaviest_chunked, median_depth_chunked
+from warpgs.render.chunked import blend_chunked, further_chunked
 from warpgs.render.compose import (
-    RenderSettings,
-    Window,
     bin_projected,
-    heaviest_of,
+    further_of,
     images_of,
     inputs_of,
-    median_depth_of,
     needs_slots,
     parameters_of,
-    settings_of,
-    weights_of,
+    pass_of,
 )
 from warpgs.render.options import RasterizeOptions
 from warpgs.scene import ActivatedGaussians, Camera, CovarianceGaussians, Gaussians, RasterizedGaussians, Render
+
+Window = tuple[int, int, int, int]
+"""Left, top, width and height [px]."""
 
 # Checks of the arrays of a camera. Values on a GPU are not checked: reading them would wait for the device.
 
@@ -194,7 +193,7 @@ def window_of(pixels: torch.Tensor, camera: Camera, tile_size: int) -> Window:
     return x, y, width, height
 
 
-def listed_tiles(pixels: torch.Tensor, settings: RenderSettings, cameras: int) -> torch.Tensor:
+def listed_tiles(pixels: torch.Tensor, settings: Pass, cameras: int) -> torch.Tensor:
     """Return a mask [T] over the tiles of C cameras, for `bin_tiles`: True where one of ``pixels`` [1 or C, P, 2] is inside."""
     (x, y, width, height), size = settings.window, settings.tile_size
     columns, rows = grid(width, height, size)
@@ -211,9 +210,6 @@ def at_pixels(image: torch.Tensor, pixels: torch.Tensor, window: Window) -> torc
     return image[cameras, pixels[..., 1] - window[1], pixels[..., 0] - window[0]]
 
 
-TILE_SIZES = (8, 16)
-"""Supported sides of a tile [px]."""
-
 BOUND_ROUNDING = 2.0**-29
 """Largest rounding error of a float64 render, as a fraction of the largest colour. A relative error e of every alpha changes a
 colour by at most 2 e: alpha shifts weight between its own colour and the colours behind, and the weights sum to 1. float64
@@ -223,34 +219,11 @@ rounds 2^29 times finer than float32, so e is at most 2^-30 if the relative erro
 WITHOUT_GRADIENT = ("weight_sums", "weight_maxima", "median_depth", "heaviest_weights", "error_bound")
 """Real-valued outputs without a gradient: a backward pass through them raises an error."""
 
+WHOLE = ("weight_sums", "weight_maxima", "overflow")
+"""Further outputs that are not images: they have one entry for each Gaussian, or a single one."""
+
 ARGUMENTS = ((Gaussians, ActivatedGaussians, CovarianceGaussians), (Camera,), (RasterizeOptions,))
 """Types of the arguments of `rasterize`."""
-
-
-def _checked_rule(camera: Camera, options: RasterizeOptions) -> Rule:
-    """Return the rule that the options name, with the near and far plane of the options."""
-    rule = options.rule if isinstance(options.rule, Rule) else rule_named(options.rule)
-    near = rule.near if options.near is None else options.near
-    far = rule.far if options.far is None else options.far
-    if not 0 <= near < far <= FAR:
-        raise ValueError(f"near {near} and far {far} are not a range of depths: give 0 <= near < far <= {FAR:g}")
-    if options.tile_size not in TILE_SIZES:
-        raise UsageError(f"tile size {options.tile_size} is not one of {', '.join(map(str, TILE_SIZES))}")
-    check_camera(camera)
-    if options.heaviest < 0:
-        raise UsageError(f"RasterizeOptions.heaviest must be at least 0, not {options.heaviest}")
-    if options.max_instances is not None and (options.capacity is not None or options.max_instances < 1):
-        raise UsageError(
-            "max_instances must be at least 1, and cannot be combined with capacity; found "
-            f"max_instances={options.max_instances}, capacity={options.capacity}"
-        )
-    if options.pixels is not None and (options.window or options.contributions or options.capacity is not None):
-        raise UsageError("RasterizeOptions.pixels cannot be combined with window, contributions or capacity; leave out pixels")
-    if options.capacity is not None and options.capacity > MAX_INSTANCES:
-        raise UsageError(f"capacity must be at most {MAX_INSTANCES:,}, not {options.capacity:,}")
-    if options.error_bound and options.capacity is not None:
-        raise UsageError("error_bound and capacity exclude each other: leave one out")
-    return rule if (near, far) == (rule.near, rule.far) else replace(rule, near=near, far=far)
 
 
 def _check_arguments(gaussians: RasterizedGaussians, camera: Camera, options: RasterizeOptions) -> None:
@@ -267,8 +240,6 @@ def _check_arguments(gaussians: RasterizedGaussians, camera: Camera, options: Ra
     for name, tensor in gaussians.tensors().items():
         _check_tensor(name, tensor)
     check_arrays(camera)
-    if options.feature_background is not None and options.features is None:
-        raise UsageError("feature_background requires features: give features=..., or leave feature_background out")
     sh = gaussians.tensors()["sh"]
     if sh.ndim != 3 or sh.shape[1] != (gaussians.sh_degree + 1) ** 2:
         raise ValueError(f"sh must have shape [N, K, 3], where K is 1, 4, 9, 16 or 25, not {list(sh.shape)}")
@@ -413,17 +384,16 @@ def _render(gaussians: RasterizedGaussians, camera: Camera, options: RasterizeOp
     """Return what `rasterize` returns for one camera or a batch [C, ...] of them."""
     refuse_transforms()
     _check_arguments(gaussians, camera, options)
-    rule = _checked_rule(camera, options)
+    check_camera(camera)
     inputs = inputs_of(gaussians, camera, options.opacity_factors)
     degree = gaussians.sh_degree if options.sh_degree is None else options.sh_degree
     degree = degree if options.colors is None else 0  # unused harmonics: read as few as possible
-    named = {n: getattr(options, n) for n in ("tile_size", "absgrad", "antialiased")}
     pixels = None
     if options.pixels is not None:
         pixels = checked_pixels(options.pixels, len(inputs.viewmats), inputs.means.device)
     window = _checked_window(camera, options) if pixels is None else window_of(pixels, camera, options.tile_size)
-    named |= {"window": window, "parameters": parameters_of(gaussians)}
-    settings = settings_of(camera, degree, rule, **named)
+    shared = {n: getattr(options, n) for n in ("tile_size", "absgrad", "antialiased", "deterministic")}
+    settings = pass_of(camera, degree, options.cut_offs(), window=window, parameters=parameters_of(gaussians), **shared)
     colors = _checked_channels("colors", options.colors, inputs)
     features = _checked_channels("features", options.features, inputs)
     if options.absgrad and (features is not None or (colors is not None and colors.shape[-1] > WIDTHS[-1])):
@@ -440,12 +410,12 @@ def _render(gaussians: RasterizedGaussians, camera: Camera, options: RasterizeOp
     if features is not None:
         layers.append(_layer("feature_background", options.feature_background, features, inputs))
     _check_memory(settings.window, layers, options.heaviest, inputs.means)
-    images, *found, maps = _rasterize(inputs, layers, settings, options, pixels)
+    images, projected, tile_counts, maps = _rasterize(inputs, layers, settings, options, pixels)
     if pixels is not None:
         images = tuple(at_pixels(image, pixels, window) for image in images)
-        maps = {name: None if image is None else at_pixels(image, pixels, window) for name, image in maps.items()}
-    count_passes(found[0])
-    render = _as_render(camera, images, *found, **maps)
+        maps = {name: at_pixels(values, pixels, window) for name, values in maps.items()}
+    count_passes(projected)
+    render = _as_render(camera, images, projected, tile_counts, **maps)
     if options.error_bound:
         render = replace(render, error_bound=_error_bound(render.rgb.detach(), gaussians, camera, options))
     if options.absgrad:
@@ -483,44 +453,40 @@ def _error_bound(rgb: torch.Tensor, gaussians: RasterizedGaussians, camera: Came
 
 
 def _rasterize(
-    inputs: ProjectInputs, layers: list[_Layer], settings: RenderSettings, options: RasterizeOptions,
-    pixels: torch.Tensor | None,
-) -> tuple[Any, ...]:  # fmt: skip
-    """Return the first layer's images, the further fields of `Render`, and the other maps [C, H, W, ...] by name."""
-    projected, tile_counts = project_inputs(inputs, settings.projection())
-    overflow = None if options.capacity is None else torch.zeros(1, dtype=torch.int32, device=projected.device)
+    inputs: ProjectInputs, layers: list[_Layer], settings: Pass, options: RasterizeOptions, pixels: torch.Tensor | None
+) -> tuple[Any, ...]:
+    """Return images, projected Gaussians [C, N, 12], tile counts [C, N], and the further fields of `Render` by name."""
+    projected, tile_counts = project_inputs(inputs, settings)
+    further = options.contributions, options.median_depth, options.heaviest
     if options.max_instances is not None and int(tile_counts.sum()) > options.max_instances:
-        frame = ChunkedFrame(settings, options.max_instances, options.deterministic)
-        images = [blend_chunked(projected, layer.backgrounds, frame, inputs, layer.colors) for layer in layers]
-        weights = contributions_chunked(projected, frame, inputs) if options.contributions else (None, None)
-        median = median_depth_chunked(projected, frame, inputs) if options.median_depth else None
-        heavy = heaviest_chunked(projected, frame, inputs, options.heaviest) if options.heaviest else ()
+        frame = settings, options.max_instances, inputs
+        images = [blend_chunked(projected, layer.backgrounds, *frame, layer.colors) for layer in layers]
+        maps = further_chunked(projected, *frame, *further) if any(further) else {}
     else:
+        overflow = None if options.capacity is None else torch.zeros(1, dtype=torch.int32, device=projected.device)
         memory = InstanceMemory(options.memory_budget, options.capacity, overflow)
         leaves = [projected, *(t for layer in layers for t in (layer.backgrounds, layer.colors) if t is not None)]
         slotted = options.contributions or needs_slots(leaves)
         listed = None if pixels is None else listed_tiles(pixels, settings, len(projected))
         tiles = bin_projected(projected, tile_counts, settings, memory, slotted, listed)
-        order = options.deterministic
-        images = [images_of(projected, tiles, layer.backgrounds, settings, order, layer.colors) for layer in layers]
-        weights = weights_of(projected, tiles, settings) if options.contributions else (None, None)
-        median = median_depth_of(projected, tiles, settings) if options.median_depth else None
-        heavy = heaviest_of(projected, tiles, settings, options.heaviest) if options.heaviest else ()
-    maps = {"features": images[1][0] if len(images) > 1 else None, "median_depth": median}
-    maps |= dict(zip(("heaviest_ids", "heaviest_weights", "blend_counts"), heavy))
-    return images[0], projected, tile_counts, *weights, overflow, maps
+        images = [images_of(projected, tiles, layer.backgrounds, settings, layer.colors) for layer in layers]
+        maps = further_of(projected, tiles, settings, *further)
+        if overflow is not None:
+            maps["overflow"] = overflow
+    if len(images) > 1:
+        maps["features"] = images[1][0]
+    return images[0], projected, tile_counts, maps
 
 
-def _as_render(camera: Camera, images: tuple[torch.Tensor, ...], *rest: Any, **maps: torch.Tensor | None) -> Render:
-    """Return the render, with tensors that have no leading axis for a single camera."""
-    single = len(camera.viewmat.shape) == 2
-
-    def own(image: torch.Tensor) -> torch.Tensor:
-        return image.squeeze(0) if single else image  # not image[0], whose gradient would be a copy among zeros
-
-    shaped: dict[str, Any] = {name: own(image) for name, image in maps.items() if image is not None}
-    rgb, alpha, depth = map(own, images)
-    return Render(rgb, alpha, depth, *rest, **shaped)
+def _as_render(
+    camera: Camera, images: Sequence[torch.Tensor], projected: torch.Tensor, tile_counts: torch.Tensor, **maps: Any
+) -> Render:
+    """Return the render, with images [C, H, W, ...] that have no leading axis for a single camera."""
+    if len(camera.viewmat.shape) == 2:  # not image[0], whose gradient would be a copy among zeros
+        images = [image.squeeze(0) for image in images]
+        maps = {name: values if name in WHOLE else values.squeeze(0) for name, values in maps.items()}
+    rgb, alpha, depth = images
+    return Render(rgb, alpha, depth, projected, tile_counts, **maps)
 
 
 FASTEST_FIRST = ("fast", "balanced", "exact")
