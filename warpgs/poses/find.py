@@ -183,13 +183,13 @@ def record_of(found: Mapping, photographs: Sequence[Photograph], digest: str, no
         "notes": [*notes, *remarks],
         "advice": advice(found, names), "mean_reprojection_error_px": found.error, "points": found.points,
         "method": found.method, "pairs_tried": found.tried, "pairs_matched": len([n for n in found.matches.values() if n]),
-        "cameras": [dict(vars(c)) for c in found.cameras], "pycolmap": found.version,
+        "cameras": list(found.cameras), "pycolmap": found.version,
     }  # fmt: skip
 
 
 def summary(found: Mapping, count: int) -> str:
     """Return a sentence on how many of ``count`` photographs have a pose, and how well they fit."""
-    focal = ", ".join(f"{c.focal:.0f} px of {max(c.width, c.height)}" for c in found.cameras)
+    focal = ", ".join(f"{c['focal']:.0f} px of {max(c['width'], c['height'])}" for c in found.cameras)
     return (
         f"poses found for {len(found.views)} of {count} photographs from {found.points:,} points, mean reprojection error "
         f"{found.error:.2f} px, {found.method} mapping, focal length {focal}"

@@ -43,20 +43,6 @@ class FoundView:
 
 
 @dataclass(frozen=True)
-class FoundCamera:
-    """Intrinsics that were found, of one or more photographs."""
-
-    focal: float
-    """Focal length [px of the photograph]."""
-    distortion: float
-    """Coefficient of the radius squared, on the plane at distance 1."""
-    width: int
-    """Image width [px]."""
-    height: int
-    """Image height [px]."""
-
-
-@dataclass(frozen=True)
 class Mapping:
     """Result of structure from motion; photographs are indexed in the order of their names."""
 
@@ -68,8 +54,9 @@ class Mapping:
     """Number of pairs that were matched."""
     views: dict[int, FoundView]
     """Views of the largest model."""
-    cameras: tuple[FoundCamera, ...]
-    """Cameras of the views in ``views``."""
+    cameras: tuple[dict[str, float], ...]
+    """Cameras of ``views``: focal length [px of the photograph], distortion (coefficient of the radius squared, on the plane at
+    distance 1), width and height [px]."""
     groups: tuple[tuple[int, ...], ...]
     """Photographs of each model, the largest first: photographs of different models share too little."""
     points: int
@@ -182,7 +169,7 @@ def find_model(
     scale = max(1.0, max(p.width, p.height) / MATCHING_SIDE)
     return Mapping(
         tuple(result["keypoints"]), {(i, j): n for i, j, n in result["pairs"]}, result["tried"], dict(sorted(views.items())),
-        tuple(FoundCamera(**c) for c in model["cameras"].values()),
+        tuple(model["cameras"].values()),
         tuple(tuple(sorted(index[n] for n in group)) for group in result["groups"]),
         model["points"], scale * model["error"], result["method"], result["version"], result["kept_focal"],
     )  # fmt: skip

@@ -11,6 +11,7 @@ import numpy as np
 from warpgs import geometry
 from warpgs.errors import DataError, UsageError
 from warpgs.priors.flow import nearest_views, pixel_grid
+from warpgs.priors.sweep import no_depth
 from warpgs.scene import DEPTH_KINDS, Camera, GivenDepth, PointCloud, View, ViewDepth
 
 # Given depth: converted to the scene's units, checked against consistent depth, and used instead of the depth of a
@@ -198,7 +199,7 @@ def with_given_depth(
     """Return the depth of each view (pinholes), combined with its given depth, and notes."""
     # An `exact` map replaces the estimate. Any other is used only where another view confirms it and the estimate is missing
     # or differs. Depths are dropped where more views see through them than confirm them.
-    before = [_unknown(v) for v in views] if found is None else list(found)
+    before = [no_depth(v) for v in views] if found is None else list(found)
     made = [None if v.depth is None else align(v, d, known) for v, d in zip(views, before, strict=True)]
     given = [np.zeros(v.image.shape[:2], np.float32) for v in views]
     for i, (view, a) in enumerate(zip(views, made, strict=True)):
@@ -227,11 +228,6 @@ def with_given_depth(
             sensitivity=np.where(placing, 0, d.sensitivity).astype(np.float32), given=np.where(own, given[i], 0),
         ))  # fmt: skip
     return after, _notes(views, made, refused, removed / max(1, total))
-
-
-def _unknown(view: View) -> ViewDepth:
-    shape = view.image.shape[:2]
-    return ViewDepth(np.zeros(shape, np.float32), np.zeros(shape, bool), np.full(shape, np.inf, np.float32))
 
 
 def _remedy(views: Sequence[View], made: Sequence[Alignment | None]) -> str:

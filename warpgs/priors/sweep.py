@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -58,13 +57,10 @@ LEAST_ANGLE, MOST_ANGLE, LOST_ANGLE = 1.0, 30.0, 60.0
 both views. From the third on, the views are assumed to share nothing."""
 
 
-class Sight(NamedTuple):
-    """Shared sight of pairs of V views, as fractions of what the first view of a pair sees."""
-
-    overlap: np.ndarray
-    """Fraction of what the first view sees that the second sees, too, less at larger angles, in [0, 1], shape [V, V]."""
-    matching: np.ndarray
-    """Shared fraction, weighted by how well depth can be found at the angle; 0 for a view and itself, shape [V, V]."""
+Sight = tuple[np.ndarray, np.ndarray]
+"""Shared sight of pairs of V views, [V, V] each, as fractions of what the first view of a pair sees. Overlap: what the second
+sees, too, less at larger angles. Matching: the same, weighted by how well depth can be found at the angle; 0 for a view and
+itself."""
 
 
 def _sampled(camera: Camera, bounds: tuple[float, float]) -> np.ndarray:
@@ -102,7 +98,7 @@ def shared_sight(cameras: Sequence[Camera], bounds: Sequence[tuple[float, float]
         overlap[i] = (seen * close).mean(1)
         matching[i] = (seen * alike * np.clip(turned / least, 0, 1)).mean(1)
         matching[i, i] = 0
-    return Sight(np.round(overlap, 9), np.round(matching, 9))  # rounding errors must not decide
+    return np.round(overlap, 9), np.round(matching, 9)  # rounding errors must not decide
 
 
 def matching_views(sight: Sight, cameras: Sequence[Camera], index: int, count: int, among: Sequence[int]) -> list[int]:
@@ -110,7 +106,7 @@ def matching_views(sight: Sight, cameras: Sequence[Camera], index: int, count: i
     # Views too near for depth are skipped. The views that share most at the best angles gave fewer depths, and mostly lower
     # PSNR (docs/decisions/013-any-capture.md). Without any, the sampled points may have missed the overlap.
     rest = [j for j in among if j != index]
-    matching, overlap = sight.matching[index], sight.overlap[index]
+    overlap, matching = (s[index] for s in sight)
     good = [j for j in rest if matching[j] > 0 and matching[j] >= 0.5 * overlap[j]]
     away = {j: float(np.linalg.norm(cameras[j].center - cameras[index].center)) for j in rest}
     return sorted(good or rest, key=away.get)[:count]
@@ -119,10 +115,10 @@ def matching_views(sight: Sight, cameras: Sequence[Camera], index: int, count: i
 def spread_views(sight: Sight, most: int) -> list[int]:
     """Return up to ``most`` views, in ascending order, chosen to cover as much of the area of all views as possible."""
     # greedy for a submodular sum: at least 1 - 1/e of the optimum (Nemhauser et al. 1978)
-    count = len(sight.overlap)
+    count = len(sight[0])
     if count <= most:
         return list(range(count))
-    shared = np.where(np.eye(count, dtype=bool), 1, sight.overlap)
+    shared = np.where(np.eye(count, dtype=bool), 1, sight[0])
     covered, taken = np.zeros(count), []
     while len(taken) < most:
         gains = np.maximum(shared - covered[:, None], 0).sum(0).round(9)
@@ -414,9 +410,10 @@ def _at_size(found: ViewDepth, small: View, view: View, notes: Sequence[str]) ->
     return ViewDepth(np.where(valid, depth, 0), valid, np.where(valid, sensitivity, np.inf), (*notes, *found.notes))
 
 
-def _unswept(view: View, note: str) -> ViewDepth:
+def no_depth(view: View, *notes: str, searched: bool = True) -> ViewDepth:
+    """Return the depth of a view of which none is known."""
     shape = view.image.shape[:2]
-    return ViewDepth(np.zeros(shape, np.float32), np.zeros(shape, bool), np.full(shape, np.inf, np.float32), (note,), False)
+    return ViewDepth(np.zeros(shape, np.float32), np.zeros(shape, bool), np.full(shape, np.inf, np.float32), notes, searched)
 
 
 def sweep_depths(
@@ -444,7 +441,8 @@ def sweep_depths(
             else:
                 inverses[i] = np.full(small[i].image.shape[:2], planes[i][0])
             progress(done, len(swept))
-        out = [_unswept(v, f"not swept: the {len(swept)} swept views (of {len(views)}) see most of the scene") for v in views]
+        note = f"not swept: the {len(swept)} swept views (of {len(views)}) see most of the scene"
+        out = [no_depth(v, note, searched=False) for v in views]
         for i in swept:
             partners = matching_views(sight, cameras, i, config.near_count, swept)
             found = consistent_depth(small, inverses, i, partners, config)

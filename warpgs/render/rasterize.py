@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import fields, replace
 from numbers import Real
-from typing import Any, NamedTuple, overload
+from typing import Any, overload
 
 import numpy as np
 import torch
@@ -281,11 +281,11 @@ def _checked_channels(name: str, values: torch.Tensor | None, inputs: ProjectInp
     return values if values.ndim == 3 else values[None]
 
 
-def _check_memory(window: Window, layers: list[_Layer], heaviest: int, like: torch.Tensor) -> None:
+def _check_memory(window: Window, layers: list[Layer], heaviest: int, like: torch.Tensor) -> None:
     """Raise ResourceError where the images [C, H, W, D] of the layers need more memory than the device of ``like`` has free."""
-    channels = sum(layer.backgrounds.shape[1] + 4 for layer in layers)  # and alpha, depth, transmittance, sum of weights
+    channels = sum(backgrounds.shape[1] + 4 for _, backgrounds in layers)  # and alpha, depth, transmittance, sum of weights
     channels += 2 * heaviest
-    needed = len(layers[0].backgrounds) * window[2] * window[3] * channels * like.element_size()
+    needed = len(layers[0][1]) * window[2] * window[3] * channels * like.element_size()
     if needed < installed_bytes(like.device) // 20:  # a query of the free memory takes 0.1 ms
         return
     free = available_bytes(like.device)
@@ -296,13 +296,9 @@ def _check_memory(window: Window, layers: list[_Layer], heaviest: int, like: tor
         )
 
 
-class _Layer(NamedTuple):
-    """Values that are blended into one image."""
-
-    colors: torch.Tensor | None
-    """Channels of each Gaussian, shape [1, N, D] or [C, N, D]; None for the spherical harmonics."""
-    backgrounds: torch.Tensor
-    """Values behind the scene, shape [C, D]."""
+Layer = tuple[torch.Tensor | None, torch.Tensor]
+"""Values that are blended into one image: channels of each Gaussian [1, N, D] or [C, N, D], None for the spherical harmonics;
+and what is behind the scene, shape [C, D]."""
 
 
 def _as_tensor(values: Any) -> torch.Tensor:
@@ -310,7 +306,7 @@ def _as_tensor(values: Any) -> torch.Tensor:
     return torch.as_tensor(values, device=getattr(values, "device", "cpu"))
 
 
-def _layer(name: str, background: Any, colors: torch.Tensor | None, inputs: ProjectInputs) -> _Layer:
+def _layer(name: str, background: Any, colors: torch.Tensor | None, inputs: ProjectInputs) -> Layer:
     """Return channels [..., D] with their background (one, a batch, or None for zeros); ``name`` is the background's option."""
     channels, like = 3 if colors is None else colors.shape[-1], inputs.viewmats
     if background is None:  # outside of the try block: a full GPU is not a wrong background
@@ -326,7 +322,7 @@ def _layer(name: str, background: Any, colors: torch.Tensor | None, inputs: Proj
     values = values.to(like)
     if values.ndim not in (1, 2) or values.shape[-1] != channels or (values.ndim == 2 and len(values) != len(like)):
         raise ValueError(f"{name} must have shape [{channels}] or [C, {channels}], C={len(like)}, not {list(values.shape)}")
-    return _Layer(colors, values.expand(len(like), channels) if values.ndim == 1 else values)
+    return colors, values.expand(len(like), channels) if values.ndim == 1 else values
 
 
 @overload
@@ -401,7 +397,7 @@ def _render(gaussians: RasterizedGaussians, camera: Camera, options: RasterizeOp
             f"absgrad supports at most {WIDTHS[-1]} channels of colors, and no features: render more in a second call"
         )
     if inputs.means.is_cuda and options.repeatable():
-        backgrounds = None if options.background is None else _layer("background", options.background, None, inputs).backgrounds
+        backgrounds = None if options.background is None else _layer("background", options.background, None, inputs)[1]
         gradients = needs_slots((*inputs, backgrounds))
         found = graphed.recorder(inputs.means.device, gradients).render(inputs, backgrounds, settings)
         if found is not None:
@@ -453,23 +449,22 @@ def _error_bound(rgb: torch.Tensor, gaussians: RasterizedGaussians, camera: Came
 
 
 def _rasterize(
-    inputs: ProjectInputs, layers: list[_Layer], settings: Pass, options: RasterizeOptions, pixels: torch.Tensor | None
+    inputs: ProjectInputs, layers: list[Layer], settings: Pass, options: RasterizeOptions, pixels: torch.Tensor | None
 ) -> tuple[Any, ...]:
     """Return images, projected Gaussians [C, N, 12], tile counts [C, N], and the further fields of `Render` by name."""
     projected, tile_counts = project_inputs(inputs, settings)
     further = options.contributions, options.median_depth, options.heaviest
     if options.max_instances is not None and int(tile_counts.sum()) > options.max_instances:
         frame = settings, options.max_instances, inputs
-        images = [blend_chunked(projected, layer.backgrounds, *frame, layer.colors) for layer in layers]
+        images = [blend_chunked(projected, backgrounds, *frame, colors) for colors, backgrounds in layers]
         maps = further_chunked(projected, *frame, *further) if any(further) else {}
     else:
         overflow = None if options.capacity is None else torch.zeros(1, dtype=torch.int32, device=projected.device)
         memory = InstanceMemory(options.memory_budget, options.capacity, overflow)
-        leaves = [projected, *(t for layer in layers for t in (layer.backgrounds, layer.colors) if t is not None)]
-        slotted = options.contributions or needs_slots(leaves)
+        slotted = options.contributions or needs_slots([projected, *(t for layer in layers for t in layer)])
         listed = None if pixels is None else listed_tiles(pixels, settings, len(projected))
         tiles = bin_projected(projected, tile_counts, settings, memory, slotted, listed)
-        images = [images_of(projected, tiles, layer.backgrounds, settings, layer.colors) for layer in layers]
+        images = [images_of(projected, tiles, backgrounds, settings, colors) for colors, backgrounds in layers]
         maps = further_of(projected, tiles, settings, *further)
         if overflow is not None:
             maps["overflow"] = overflow
