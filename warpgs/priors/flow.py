@@ -14,7 +14,7 @@ from warpgs import geometry
 from warpgs.errors import DataError, UsageError
 from warpgs.files import read_input, unread_reason
 from warpgs.geometry import check_pinhole
-from warpgs.onnx import read_model
+from warpgs.onnx import first_line, read_model, start_session
 from warpgs.scene import Camera, PointCloud, View, ViewDepth
 
 # Depth from optical flow between views with known poses: epipolar lines, checks, and the blending of source views.
@@ -464,13 +464,8 @@ def _sparse(views: Sequence[View]) -> FlowBetween:
 def _network(path: Path, value_range: str) -> Callable[[View, View], np.ndarray]:
     """Return a function for the flow by a network of two images [1, 3, h, w]; its last output [1, 2, h, w] is used."""
     import cv2
-    import onnxruntime
 
-    data = read_model(path)
-    try:
-        session = onnxruntime.InferenceSession(data, providers=["CPUExecutionProvider"], enable_fallback=0)
-    except Exception as e:
-        raise DataError(f"{path}: onnxruntime cannot open it ({str(e).splitlines()[0]}); export the network again") from e
+    session = start_session(read_model(path), path, "cpu", 0)
     inputs = session.get_inputs()
     if len(inputs) != 2 or any(len(i.shape) != 4 for i in inputs):
         shapes = ", ".join(f"{i.name} {i.shape}" for i in inputs)
@@ -488,7 +483,7 @@ def _network(path: Path, value_range: str) -> Callable[[View, View], np.ndarray]
         try:
             found = session.run(None, {i.name: t[None] for i, t in zip(inputs, tensors)})
         except Exception as e:
-            raise DataError(f"{path}: the network failed on {size[0]} x {size[1]} px ({str(e).splitlines()[0]})") from e
+            raise DataError(f"{path}: the network failed on {size[0]} x {size[1]} px ({first_line(e)})") from e
         flows = [f for f in found if np.shape(f) == (1, 2, size[1], size[0])]
         if not flows:
             raise DataError(

@@ -44,7 +44,7 @@ Window = tuple[int, int, int, int]
 
 def check_arrays(camera: Camera) -> None:
     """Check a camera's types and shapes, and the values of its arrays in main memory."""
-    for name, rows, tolerance, off, check in MATRICES:
+    for name, rows, check in (("viewmat", 4, _check_pose), ("K", 3, _check_intrinsics)):
         given: Any = getattr(camera, name)
         _check_type(name, given)
         if given.ndim not in (2, 3) or tuple(given.shape[-2:]) != (rows, rows):
@@ -53,8 +53,7 @@ def check_arrays(camera: Camera) -> None:
             continue
         listed = given.tolist()  # Python numbers take a third of the time of tensors
         for i, matrix in enumerate(listed if given.ndim == 3 else (listed,)):
-            if not off(matrix) <= tolerance:  # also where a number is NaN or infinite; few matrices get further
-                check(matrix, f"camera.{name}[{i}]" if given.ndim == 3 else f"camera.{name}")
+            check(matrix, f"camera.{name}[{i}]" if given.ndim == 3 else f"camera.{name}")
     distortion: Any = camera.distortion
     if distortion is not None:
         _check_type("distortion", distortion)
@@ -85,18 +84,13 @@ def _check_type(name: str, array: Any) -> None:
         raise TypeError(f"camera.{name} must hold real numbers, not {array.dtype}")
 
 
-def _skew_of(matrix: list[list[float]]) -> float:
-    """Return the sum of the errors of K's constant entries; non-finite if an entry of K is, or if a focal length is 0."""
-    (fx, skew, cx), (below, fy, cy), (left, middle, last) = matrix
-    if not (fx and fy):
-        return math.inf
-    return abs(skew) + abs(below) + abs(left) + abs(middle) + abs(last - 1) + 0 * (fx + cx + fy + cy)
-
-
 def _check_intrinsics(matrix: list[list[float]], where: str) -> None:
     """Raise ValueError where the intrinsics are non-finite, or have a skew, a focal length of 0, or a wrong last row."""
+    (fx, skew, cx), (below, fy, cy), (left, middle, last) = matrix
+    off = abs(skew) + abs(below) + abs(left) + abs(middle) + abs(last - 1) + 0 * (fx + cx + fy + cy)
+    if fx and fy and off <= K_TOLERANCE:  # a NaN or an infinity is not; few matrices get further
+        return
     _check_finite(matrix, where)
-    (fx, skew, _), (below, fy, _), (left, middle, last) = matrix
     if not (fx and fy):
         raise ValueError(f"{where} must have focal lengths other than 0, not {fx:g} and {fy:g}")
     if max(map(abs, (left, middle, last - 1))) > K_TOLERANCE:
@@ -108,28 +102,19 @@ def _check_intrinsics(matrix: list[list[float]], where: str) -> None:
         )
 
 
-def _products(matrix: list[list[float]]) -> tuple[float, ...]:
-    """Return the entries of R R^T - 1."""
-    (a, b, c, _), (d, e, f, _), (g, h, i, _), _ = matrix
-    return (
+def _check_pose(matrix: list[list[float]], where: str) -> None:
+    """Raise ValueError where the pose is not rigid; a reflection is allowed, since the mirrored image is correct."""
+    (a, b, c, x), (d, e, f, y), (g, h, i, z), (p, q, r, s) = matrix
+    products = (
         a * a + b * b + c * c - 1, d * d + e * e + f * f - 1, g * g + h * h + i * i - 1,
         a * d + b * e + c * f, a * g + b * h + c * i, d * g + e * h + f * i,
     )  # fmt: skip
-
-
-def _stretch_of(matrix: list[list[float]]) -> float:
-    """Return the sum of the errors of R R^T and of the last row of a pose; non-finite if an entry of the pose is."""
-    (p, q, r, s), shift = matrix[3], matrix[0][3] + matrix[1][3] + matrix[2][3]
-    return sum(map(abs, _products(matrix))) + abs(p) + abs(q) + abs(r) + abs(s - 1) + 0 * shift
-
-
-def _check_pose(matrix: list[list[float]], where: str) -> None:
-    """Raise ValueError where the pose is not rigid; a reflection is allowed, since the mirrored image is correct."""
+    if sum(map(abs, products)) + abs(p) + abs(q) + abs(r) + abs(s - 1) + 0 * (x + y + z) <= POSE_TOLERANCE:
+        return  # as in `_check_intrinsics`
     _check_finite(matrix, where)
-    p, q, r, s = matrix[3]
     if max(map(abs, (p, q, r, s - 1))) > POSE_TOLERANCE:
         raise ValueError(f"{where} must have the last row 0, 0, 0, 1, not {p:g}, {q:g}, {r:g}, {s:g}; is it transposed?")
-    off = max(map(abs, _products(matrix)))
+    off = max(map(abs, products))
     if not off <= POSE_TOLERANCE:  # products of huge numbers overflow
         raise ValueError(
             f"{where} scales or shears: R R^T is off by {off:.2g} from the identity, where R is the upper left 3 x 3 block. "
@@ -141,12 +126,6 @@ def _check_finite(matrix: list[list[float]], where: str) -> None:
     """Raise ValueError where a number of the matrix is not finite."""
     if not all(math.isfinite(value) for row in matrix for value in row):
         raise ValueError(f"{where} has non-finite values: {matrix}")
-
-
-MATRICES = (
-    ("viewmat", 4, POSE_TOLERANCE, _stretch_of, _check_pose), ("K", 3, K_TOLERANCE, _skew_of, _check_intrinsics),
-)  # fmt: skip
-"""Matrices of a camera: name, rows, tolerance, function that computes the error, and check for matrices with a larger error."""
 
 
 def for_each(cameras: Sequence[Camera], *, gaussians: Any, options: Any) -> list[tuple[Any, ...]]:

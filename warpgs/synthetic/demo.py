@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -53,11 +54,7 @@ def _turn(x: float = 0.0, y: float = 0.0) -> np.ndarray:
 
 def still_life(seed: int = 0) -> list[raycast.Shape]:
     """Return the scene's shapes: four planes that fill the frame, then six objects that hide one another."""
-    rng = np.random.default_rng(seed)
-
-    def surface(low: str, high: str, period: float, kind: str = "solid") -> raycast.Texture:
-        return checker_texture(rng, low, high, period, kind)
-
+    surface = functools.partial(checker_texture, np.random.default_rng(seed))
     return [
         raycast.Plane((0, 0, 6.4), surface("1a3a5f", "f7e6c6", 0.92, "flat")),
         raycast.Plane((-3.3, 0, 0), surface("7a2a22", "f5be78", 1.1, "flat"), _turn(y=-90)),
@@ -91,16 +88,20 @@ def camera_path(views: int, width: int, height: int) -> list[Camera]:
     return out
 
 
+def _split(views: int, train: set[int]) -> str:
+    """Return a split by the names of the images, all but those of ``train`` held out."""
+    names = [",".join(f"{i:03d}.png" for i in range(views) if (i in train) is wanted) for wanted in (True, False)]
+    return f"train={names[0]};test={names[1]}"
+
+
 def split_spec(views: int) -> str:
     """Return the split of a demo with that many views: six evenly spaced training views, all others held out."""
-    train = {round(i) for i in np.linspace(0, views - 1, TRAIN_VIEWS).tolist()}
-    names = [f"{i:03d}.png" for i in range(views)]
-    held_out = [n for i, n in enumerate(names) if i not in train]
-    return f"train={','.join(names[i] for i in sorted(train))};test={','.join(held_out)}"
+    return _split(views, {round(i) for i in np.linspace(0, views - 1, TRAIN_VIEWS).tolist()})
 
 
 def _project(camera: Camera, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return image positions [px], shape [N, 2], and depths [u], shape [N], of world points [u], shape [N, 3]."""
+    # as in the demo's first version: `geometry.project_points` rounds otherwise, which would change its files
     p = matmul(x, camera.viewmat[:3, :3].T) + camera.viewmat[:3, 3]
     with np.errstate(divide="ignore", invalid="ignore"):
         xy = p[:, :2] / p[:, 2:] * camera.K[[0, 1], [0, 1]] + camera.K[:2, 2]
@@ -204,20 +205,14 @@ def _check(folder: Path, width: int, height: int) -> None:
 
 def _files(views: int, width: int, height: int, seed: int, tell: Callable[[str], object]) -> dict[str, bytes]:
     """Return the contents of the demo folder by relative path, all at once, so that an interruption leaves no partial scene."""
-    import cv2
-
     shapes, light = still_life(seed), raycast.Light()
     cameras = camera_path(views, width, height)
     files = {}
     for i, camera in enumerate(counted(cameras, tell, "rendering", "views")):
-        rgb = raycast.render(shapes, light, camera.K, camera.viewmat, width, height)
-        _, png = cv2.imencode(".png", np.round(255 * rgb[..., ::-1]).astype(np.uint8))
-        files[f"images/{i:03d}.png"] = png.tobytes()
+        files[f"images/{i:03d}.png"] = _png(raycast.render(shapes, light, camera.K, camera.viewmat, width, height))
     tell("finding points")
-    points = surface_points(shapes, light, cameras, np.random.default_rng([seed, 1]))
-    for name, text in colmap_text(cameras, *points).items():
-        files[f"sparse/0/{name}"] = text.encode()
-    return files
+    texts = colmap_text(cameras, *surface_points(shapes, light, cameras, np.random.default_rng([seed, 1])))
+    return files | {f"sparse/0/{name}": text.encode() for name, text in texts.items()}
 
 
 def write_files(folder: Path, size: tuple[int, int], contents: Callable[[], dict[str, bytes]]) -> None:
@@ -408,9 +403,7 @@ def ring_cameras(views: int, width: int, height: int) -> list[Camera]:
 
 def object_split_spec(views: int) -> str:
     """Return the split of an object with that many views: eight evenly spaced training views, all others held out."""
-    train = {i * views // OBJECT_TRAIN_VIEWS for i in range(OBJECT_TRAIN_VIEWS)}
-    names = [[f"{i:03d}.png" for i in range(views) if (i in train) == wanted] for wanted in (True, False)]
-    return f"train={','.join(names[0])};test={','.join(names[1])}"
+    return _split(views, {i * views // OBJECT_TRAIN_VIEWS for i in range(OBJECT_TRAIN_VIEWS)})
 
 
 def _png(image: np.ndarray) -> bytes:
