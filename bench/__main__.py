@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 FOLDER = Path(__file__).parent
-GROUPS = ("kernels", "fits", "peers", "studies")
+GROUPS = ("kernels", "fits", "peers")
 
 
 def programs() -> dict[str, str]:

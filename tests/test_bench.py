@@ -2,14 +2,14 @@
 
 import json
 import math
-from types import SimpleNamespace
 from xml.etree import ElementTree
 
 import pytest
 import torch
 
-from bench.lib import inputs, ops, pages, peers, performance_page, timing
-from bench.lib.ops import OPS, Bench, run
+from bench.lib import inputs, ops, pages, peers, performance_page, result_file, timing
+from bench.lib.op_tasks import DEFAULT, OPS
+from bench.lib.ops import Bench, run
 from bench.lib.points import Point, growth, points
 from bench.lib.tables import mean_sd
 from warpgs import rasterize
@@ -42,16 +42,28 @@ def result():
 @pytest.mark.slow
 def test_every_op_gives_rows():
     """A positive time for each op and direction, sizes, and a fraction of the roof for our own."""
-    result = tiny(OPS)
+    result = tiny(tuple(OPS))
     rows = result["rows"]
     assert not result["skipped"]
     assert {r["op"] for r in rows} == set(OPS)
     assert all(r["median_ms"] > 0 and r["quartiles_ms"][0] <= r["median_ms"] <= r["quartiles_ms"][1] for r in rows)
     backward = {r["op"] for r in rows if r["direction"] in ("backward", "both")}
-    assert backward == {"project", "blend", "ssim", "render"}
-    ours = [r for r in rows if r["program"] == "warpgs" and not r.get("threads")]
+    assert backward == {"project", "blend", "blend_channels", "ssim", "render"}
+    ours = [r for r in rows if r["program"] == "warpgs" and r["op"] in DEFAULT and not r.get("threads")]
     assert all(r["fraction"] > 0 and r["bytes"] > 0 and r["roof_ms"] > 0 for r in ours)
     assert {r["program"] for r in rows} >= {"warpgs", peers.TORCH_SSIM, peers.DENSE}
+
+
+def test_the_ops_of_the_page_are_those_of_its_results():
+    """Names, sizes, programs and directions are those of the kept rows, so that old and new results compare."""
+    rows = [
+        r for r in result_file.stored("ops")["cpu2"]["rows"] if r["op"] in OPS
+    ]  # an op of its own, sh, became a part of others
+    assert set(DEFAULT) == {r["op"] for r in rows}
+    for r in rows:
+        op, image = OPS[r["op"]], {"width", "height"} <= r.keys()
+        assert r["direction"] in op.programs[r["program"]] and image == ("image" in op.axes)
+        assert ("N" in r, "degree" in r, "cameras" in r) == tuple(a in op.axes for a in ("count", "degree", "cameras"))
 
 
 def test_a_budget_of_nothing_skips_everything():
@@ -105,9 +117,9 @@ def test_disturbed_rows_are_known_and_give_way_to_faster_ones():
 
 def test_what_took_too_long_is_not_tried_at_larger_sizes():
     """Nor is anything where two sizes cannot be compared left out."""
-    bench, module = Bench(CPU, 3, None, lambda line: None), SimpleNamespace(PROGRAMS={"warpgs": ("forward",)})
+    bench = Bench(CPU, 3, None, lambda line: None)
     bench._stop("adam", "warpgs", "forward", {"N": 1000}, "took 3 s a repeat")
-    found = [bench._chosen("adam", module, Point(n), {"N": n}) for n in (100, 1000, 10_000)]
+    found = [bench._chosen("adam", Point(n), {"N": n}) for n in (100, 1000, 10_000)]
     assert found == [{("warpgs", "forward")}, set(), set()] and len(bench.skipped) == 3
 
 

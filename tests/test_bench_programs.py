@@ -1,14 +1,13 @@
 """Programs of the suite run on tiny sizes, their peers agree, and the kept results are of one format."""
 
 import sys
-from dataclasses import replace
 
 import pytest
 import torch
 
 import warpgs
 from bench import __main__ as bench_main
-from bench.lib import columns, needles, result_file, training
+from bench.lib import result_file, training
 from bench.lib.inputs import camera as bench_camera
 from bench.lib.inputs import gaussians, image
 from bench.lib.naive import rasterize
@@ -23,7 +22,7 @@ def test_everything_that_can_be_run_is_listed(capsys, monkeypatch):
     monkeypatch.setattr(sys, "argv", ["bench", "--help"])
     assert bench_main.main() == 0
     text = capsys.readouterr().out
-    for name in ("document", "kernels.ops", "peers.mcmc", "fits.presets", "studies.order"):
+    for name in ("document", "kernels.ops", "peers.against_others", "fits.presets"):
         assert f"\n  {name} " in text
     assert all(line.endswith((".", ":")) or line[:2] != "  " for line in text.splitlines()), text
     monkeypatch.setattr(sys, "argv", ["bench", "nothing"])
@@ -53,18 +52,6 @@ def test_a_result_says_what_it_was_made_by(tmp_path, monkeypatch):
         result_file.write(tmp_path / "b.json", {k: v for k, v in made.items() if k != "versions"})
 
 
-def test_statistics_of_exchanged_files():
-    """Those of the same Gaussians are equal, also after another quaternion of the same rotation; a moved column is named."""
-    g = cloud(30, degree=1)
-    ours, axes = columns.statistics(g), columns.statistics(g, axes=True)
-    assert len(ours) == 23 and len(axes) == 28 and columns.difference(ours, ours)["largest_of_range"] == 0
-    other = replace(g, quats=-2 * g.quats)
-    assert columns.difference(axes, columns.statistics(other, axes=True))["largest_of_range"] < 1e-6
-    moved = columns.difference(ours, ours | {"y": [ours["y"][0] - 1, *ours["y"][1:]]})
-    assert moved["column"] == "y min" and moved["same_columns"]
-    assert not columns.difference(ours, {"x": ours["x"]})["same_columns"]
-
-
 def test_steps_of_given_gaussians_train(device):
     """The same step over and over lowers the loss; with a learning rate of next to nothing all stays as it was."""
     g, view, target = gaussians(200, device, 1), bench_camera(48, 32, device), image(48, 32, device)
@@ -76,12 +63,6 @@ def test_steps_of_given_gaussians_train(device):
         losses.append(float(steps.buffers.history[0, 0]))
     assert losses[0] < 0.95 * losses[1]
     assert all(torch.equal(t, g.tensors()[n]) for n, t in steps.table.params.items() if n == "quats")
-
-
-def test_needles_err_less_in_the_factor_form(device):
-    """At 300 px the largest error of the weight is a hundredth of the conic's, also of the one with the same factor."""
-    e = needles.weight_errors(300, device)
-    assert all(e[n]["max"] >= 100 * e["factor"]["max"] for n in ("conic", "plain")), e
 
 
 def test_naive_kernels_equal_the_real_ones(device):

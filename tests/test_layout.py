@@ -7,7 +7,7 @@ from pathlib import Path
 ROOT = Path(__file__).parent.parent
 PRODUCT = sorted((ROOT / "warpgs").rglob("*.py"))
 BENCH = ROOT / "bench"
-BENCHES = sorted(p for name in ("kernels", "fits", "peers", "studies") for p in (BENCH / name).glob("*.py"))
+BENCHES = sorted(p for name in ("kernels", "fits", "peers") for p in (BENCH / name).glob("*.py"))
 
 
 def test_files_are_rooms():

@@ -16,7 +16,7 @@ RELATIVE_L2 = {
 
 @dataclass(frozen=True)
 class ParameterBounds:
-    """Largest E of one kind of scene (docs/accuracy.md says what each is and what was measured where)."""
+    """Largest E of one kind of scene (docs/numerics.md says what each is and what was measured where)."""
 
     image_mean: float
     """Of rgb, alpha, and depth over the largest depth."""

@@ -39,7 +39,7 @@ NEAR = 0.01
 FAR = 1e10
 """Farthest depth that is rendered [u]. This limit, `FARTHEST_PIXEL`, `LARGEST_AXIS`, `SMALLEST_DETERMINANT`, `SHORTEST_QUAT`
 and `LARGEST_COEFFICIENT` are far beyond any usual scene. They are narrow enough that no product in the backward pass overflows
-float32 (docs/extremes.md). So every rendered Gaussian has finite gradients, and float64 renders the same Gaussians."""
+float32 (docs/numerics.md). So every rendered Gaussian has finite gradients, and float64 renders the same Gaussians."""
 
 FARTHEST_PIXEL = 1e9
 """Largest coordinate of a projected mean [px]. Beyond it, neighbouring floats are 64 px and more apart."""
@@ -126,8 +126,8 @@ class Rule:
 
 RULES = {
     "exact": Rule("exact"),
-    # Faster and less accurate, as measured in docs/trade.md. A stop of 1e-2 would save more time in front of opaque surfaces,
-    # but gradients there would be wrong by a third.
+    # Faster and less accurate, as measured in docs/numerics.md. A stop of 1e-2 would save more time in front of opaque
+    # surfaces, but gradients there would be wrong by a third.
     "balanced": Rule("balanced", alpha_cut=2.0 / 255.0, transmittance_stop=1e-3),
     "fast": Rule("fast", alpha_cut=4.0 / 255.0, transmittance_stop=1e-3),
     # gsplat: exclusive stop. Its extent of 3.33 sigma never binds: sqrt(2 ln 255) = 3.329. The clamp of

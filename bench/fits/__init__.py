@@ -1,1 +1,1 @@
-"""Whole fits: presets, objects, poses, files, farms, scales."""
+"""Whole fits: presets, rivals, objects, files, meshes, farms, ranks."""

@@ -1,1 +1,1 @@
-"""One bench per op, run by `bench.kernels.ops`; single stages and orders of sums beside them."""
+"""Time of ops and of training steps."""

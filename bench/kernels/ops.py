@@ -13,13 +13,14 @@ import torch
 
 from bench.lib import result_file
 from bench.lib.arguments import parse
-from bench.lib.ops import OPS, run
+from bench.lib.op_tasks import DEFAULT
+from bench.lib.ops import run
 
 
 def main() -> None:
     """Parse, measure, write."""
     device = "cuda" if torch.cuda.is_available() else "cpu"
-    a = parse(__doc__, device=device, tiny=False, out=Path, op=list(OPS), budget=float, note="", again=False)
+    a = parse(__doc__, device=device, tiny=False, out=Path, op=list(DEFAULT), budget=float, note="", again=False)
     earlier = result_file.read(a.out) if a.again and a.out and a.out.exists() else None
     made = run(torch.device(a.device), tiny=a.tiny, ops=tuple(a.op), budget=a.budget, note=a.note, earlier=earlier)
     result_file.write(a.out, made)

@@ -29,13 +29,16 @@ import warp
 count, threads, target = int(sys.argv[1]), int(sys.argv[2]), sys.argv[3]
 if target != "native":
     warp.config.cpu_compiler_flags = warp.config.cpu_compiler_flags.replace("-march=native", f"-target-cpu {target}")
-from warpgs.kernels import launch as interop
+try:
+    from warpgs.kernels.launch import set_threads
+except ImportError:  # before warpgs had these rooms
+    from warpgs.runtime.interop import set_threads
 import torch
 try:
     from bench.lib import inputs, training
 except ImportError:  # before bench had this folder
     from bench import inputs, training
-interop.set_threads(threads)
+set_threads(threads)
 device = torch.device("cpu")
 gaussians, camera = inputs.gaussians(count, device), inputs.camera(504, 378, device)
 steps = training.Steps(gaussians, camera, inputs.image(504, 378, device), "exact", lr=0.0)

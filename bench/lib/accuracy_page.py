@@ -1,19 +1,12 @@
-"""The measured parts of docs/accuracy.md: the error budget, the needles, the same bits, and gradients of other programs.
-
-The figures are those of bench/results/budget_*.json (`python -m tests.numerics.report`) and bench/results/needles_*.json
-(`python -m bench.studies.needles`), tables of the first machine, of bench/results/same_bits.json
-(`python -m bench.fits.same_bits`), and of bench/results/gradients_*.json (`python -m bench.peers.gradient_accuracy`).
-"""
+"""The measured parts of docs/numerics.md: the error budget (`python -m tests.numerics.report`) and the same bits."""
 
 from __future__ import annotations
 
-from bench.lib import rasterizers_page, result_file, same_bits
+from bench.lib import result_file, same_bits
 from bench.lib.tables import markdown
 
 RENAMED = {"gsplat": "gsplat-1.5"}
 """Current names of rules that had other names when results were stored."""
-LENGTHS = (1, 10, 100, 300, 1000, 10_000)
-"""Needles of the table, of those in the results."""
 
 
 def _e(value: float) -> str:
@@ -67,31 +60,9 @@ def budget_text(results: dict[str, dict]) -> str:
     return "\n".join(parts)
 
 
-def needles_text(results: dict[str, dict]) -> str:
-    """Return a table of the first machine: largest errors by length."""
-    stem, result = next(iter(results.items()))
-    shown = {"weight": ("factor", "conic", "plain"), "image": ("factor", "conic", "plain"), "gradient": ("factor", "plain")}
-    rows = [
-        [f"{row['sigma']:,}", *(_e(row[what][name]["max"]) for what, names in shown.items() for name in names)]
-        for row in result["rows"] if row["sigma"] in LENGTHS
-    ]  # fmt: skip
-    head = ["length [px]", *(f"{what}: {name}" for what, names in shown.items() for name in names)]
-    of = f"Largest over {result['needles']} needles (weight) and {result['images']} (image, gradient)."
-    files = ", ".join(f"`bench/results/needles_{stem}.json`" for stem in results)
-    return f"{_machine(stem, result)} {of}\n\n{markdown(head, rows)}\nWith means, and of every machine: {files}.\n"
-
-
-def gradients_text() -> str:
-    """Return the table of gradients beside other programs, and the source of its figures."""
-    result = result_file.stored("gradients")["h200"]
-    return f"{rasterizers_page.gradients_table(result)}\n{result_file.source('gradients_h200')}"
-
-
 def parts() -> dict[str, str]:
-    """Return the generated parts of docs/accuracy.md by name."""
+    """Return the generated parts of docs/numerics.md by name."""
     return {
         "budget": budget_text(result_file.stored("budget")),
-        "needles": needles_text(result_file.stored("needles")),
-        "gradients": gradients_text(),
         "same bits": same_bits.table(result_file.read(same_bits.RESULTS)["rows"]),
     }

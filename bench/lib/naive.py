@@ -1,8 +1,6 @@
 """Naive blending in Warp, as a baseline: a thread per pixel, scalar code, float atomics.
 
-The rule is `exact`, in float32. On a CPU Warp's atomics are plain additions, so kernels must be launched on one thread only. On
-CUDA Warp can make atomics repeatable (`wp.DeterministicMode`): it stores each addition as a record, then sorts and adds the
-records.
+The rule is `exact`, in float32. On a CPU Warp's atomics are plain additions, so kernels must be launched on one thread only.
 """
 
 import functools
@@ -74,49 +72,10 @@ def forward_kernel():
 
 
 @functools.cache
-def count_kernel():
-    """Return the kernel that counts the Gaussians that were blended into each pixel."""
+def backward_kernel():
+    """Return the kernel of the gradients, which are added by float atomics."""
 
-    @wp.kernel(enable_backward=False, module="bench.naive.count")
-    def count(
-        projected: wp.array2d(dtype=float), ranges: wp.array2d(dtype=int), ids: wp.array(dtype=int),
-        width: int, height: int, columns: int, tiles: int, side: int, alpha_cut: float, ends: wp.array(dtype=int),
-        # outputs
-        counts: wp.array(dtype=int),
-    ):  # fmt: skip
-        i = wp.tid()
-        x = float(i % width) + 0.5
-        y = float((i // width) % height) + 0.5
-        tile = tile_of(i, width, height, columns, tiles, side)
-        n = int(0)
-        for k in range(ranges[tile, 0], ends[i]):
-            s = ids[k]
-            dx = x - projected[s, 0]
-            dy = y - projected[s, 1]
-            e1 = projected[s, 2] * dx + projected[s, 3] * dy
-            e2 = projected[s, 4] * dy
-            if projected[s, 5] * wp.exp(-0.5 * (e1 * e1 + e2 * e2)) >= alpha_cut:
-                n += 1
-        counts[i] = n
-
-    return count
-
-
-ATOMICS = 9
-"""Number of atomic additions of the backward kernel for each Gaussian blended into a pixel."""
-
-
-@functools.cache
-def backward_kernel(mode: wp.DeterministicMode = wp.DeterministicMode.NOT_GUARANTEED, layers: int = 0):
-    """Return the kernel of the gradients, which are added by float atomics.
-
-    Args:
-        mode: Warp's guarantee for the order of additions.
-        layers: Most Gaussians that are blended into a pixel; with a guarantee, memory depends on this number.
-    """
-    options = {"deterministic": mode, "deterministic_max_records": ATOMICS * layers}
-
-    @wp.kernel(enable_backward=False, module="unique", module_options=options)
+    @wp.kernel(enable_backward=False, module="bench.naive.backward")
     def backward(
         projected: wp.array2d(dtype=float), ranges: wp.array2d(dtype=int), ids: wp.array(dtype=int),
         backgrounds: wp.array2d(dtype=float), width: int, height: int, columns: int, tiles: int, side: int,
@@ -179,8 +138,6 @@ class Naive:
         width: int,
         height: int,
         rule: Rule,
-        mode: wp.DeterministicMode = wp.DeterministicMode.NOT_GUARANTEED,
-        layers: int = 0,
     ):
         if not rule.inclusive_stop or rule.square_sigma:
             raise ValueError("the naive kernels know only the rule `exact`")
@@ -200,7 +157,7 @@ class Naive:
             launch.view(tiles.gaussian_ids, wp.int32), launch.view(backgrounds, wp.float32), width, height, columns,
             columns * rows, tiles.size, rule.alpha_cut, rule.alpha_max,
         ]  # fmt: skip
-        self.stop, self.kept, self.how = rule.transmittance_stop, [transmittances, ends], (mode, layers)
+        self.stop, self.kept = rule.transmittance_stop, [transmittances, ends]
         self.state = [launch.view(transmittances, wp.float32), launch.view(ends, wp.int32)]
 
     def _launch(self, kernel, inputs: list) -> None:
@@ -214,33 +171,25 @@ class Naive:
         self._launch(forward_kernel(), [*self.inputs, self.stop, *outputs])
         return self.rgb
 
-    def layers(self) -> int:
-        """Return the most Gaussians that `forward` blended into a pixel."""
-        counts = torch.empty(self.pixels, dtype=torch.int32, device=self.rgb.device)
-        projected, ranges, ids, _, *sizes, alpha_cut, _ = self.inputs
-        outputs = [self.state[1], launch.view(counts, wp.int32)]
-        self._launch(count_kernel(), [projected, ranges, ids, *sizes, alpha_cut, *outputs])
-        return int(counts.max())
-
     def backward(self, v_rgb: torch.Tensor) -> torch.Tensor:
         """Return the gradient of the records for an upstream gradient, shape [C, N, 12]; call `forward` first."""
         self.v_projected.zero_()
         arrays = [launch.view(t.view(-1, t.shape[-1]), wp.float32) for t in (v_rgb.contiguous(), self.v_projected)]
-        self._launch(backward_kernel(*self.how), [*self.inputs, *self.state, *arrays])
+        self._launch(backward_kernel(), [*self.inputs, *self.state, *arrays])
         return self.v_projected
 
 
 class _Blend(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, projected, tiles, width, height, how):
+    def forward(ctx, projected, tiles, width, height):
         black = projected.new_zeros(len(projected), 3)
-        ctx.naive = Naive(projected, tiles, black, width, height, RULES["exact"], *how)
+        ctx.naive = Naive(projected, tiles, black, width, height, RULES["exact"])
         return ctx.naive.forward()
 
     @staticmethod
     @once_differentiable
     def backward(ctx, v_rgb):
-        return ctx.naive.backward(v_rgb), None, None, None, None
+        return ctx.naive.backward(v_rgb), None, None, None
 
 
 def _binned(gaussians: Gaussians, camera: Camera) -> tuple[torch.Tensor, Tiles]:
@@ -250,18 +199,6 @@ def _binned(gaussians: Gaussians, camera: Camera) -> tuple[torch.Tensor, Tiles]:
     return projected, bin_tiles(projected, counts, **size, rule=RULES["exact"])
 
 
-def rasterize(
-    gaussians: Gaussians, camera: Camera, mode: wp.DeterministicMode = wp.DeterministicMode.NOT_GUARANTEED, layers: int = 0
-) -> torch.Tensor:
+def rasterize(gaussians: Gaussians, camera: Camera) -> torch.Tensor:
     """Return images [C, H, W, 3] of a batch of cameras over black: our projection and lists, the naive blending."""
-    return _Blend.apply(*_binned(gaussians, camera), camera.width, camera.height, (mode, layers))
-
-
-def layers_of(gaussians: Gaussians, camera: Camera) -> int:
-    """Return the most Gaussians that are blended into a pixel."""
-    with torch.no_grad():
-        projected, tiles = _binned(gaussians, camera)
-        black = projected.new_zeros(len(projected), 3)
-        naive = Naive(projected, tiles, black, camera.width, camera.height, RULES["exact"])
-        naive.forward()
-        return naive.layers()
+    return _Blend.apply(*_binned(gaussians, camera), camera.width, camera.height)

@@ -18,10 +18,10 @@ import torch
 import warpgs
 from bench.lib import gsplat_trainer
 from bench.lib.scenes import folds, scene_at
-from bench.lib.training import finish, full_bytes, make_trainer, model_bytes
+from bench.lib.training import full_bytes, make_trainer
 from warpgs.errors import UsageError
 from warpgs.io.load import split_views
-from warpgs.pipeline.metrics.scores import render_view, score
+from warpgs.pipeline.metrics.scores import score
 from warpgs.pipeline.run.commands import prune
 from warpgs.pipeline.run.precompile import precompile_kernels
 from warpgs.pipeline.run.request import SceneRequest
@@ -212,17 +212,3 @@ def scores(images: Iterable[np.ndarray], views: list[View]) -> dict:
     rows = [score(view, image) for view, image in zip(views, images, strict=True)]
     by_view = {row.name: row.psnr for row in rows}
     return {"psnr": statistics.mean(by_view.values()), "ssim": statistics.mean(r.ssim for r in rows), "views": by_view}
-
-
-def bare_fit(scene: Scene, train: list[View], test: list[View], config: FitConfig, device: torch.device) -> dict:
-    """Return wall and processor time [s] of one of our fits, without reading and reporting, its size and its scores."""
-    wall, cpu = time.perf_counter(), time.process_time()
-    trainer = make_trainer(train, scene.points, config, device, scene.background)
-    points, setup, setup_cpu = len(trainer.gaussians), time.perf_counter() - wall, time.process_time() - cpu
-    finish(trainer)
-    row = {
-        "points": points, "seconds": time.perf_counter() - wall, "setup": setup, "cpu_seconds": time.process_time() - cpu,
-        "setup_cpu": setup_cpu, "gaussians": len(trainer.gaussians), "bytes": model_bytes(trainer), "steps": config.steps,
-    }  # fmt: skip
-    options = trainer.context.render_options()
-    return row | scores((render_view(trainer.gaussians, v, options)[0] for v in test), test)

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import gc
-import importlib
 import time
 from collections.abc import Callable
 
 import torch
 
 from bench.lib import peers, result_file, roofline
+from bench.lib.op_tasks import DEFAULT, OPS
 from bench.lib.pairs import instances_and_pairs
 from bench.lib.points import SIZES, Point, growth, load, points
 from bench.lib.timing import DISTURBED, OURS, REPEATS, Task, measure_in_turn, peak_bytes
@@ -17,7 +17,6 @@ from warpgs.errors import ResourceError
 from warpgs.kernels import launch
 
 WHAT = "every op, the whole image and a training step, forward and backward, over sizes"
-OPS = ("project", "tiles", "blend", "ssim", "adam", "step_buffers", "dropout", "knn", "scanlines", "render", "step")
 LIMIT_MS = 2000.0
 """Longest time of one repeat that is measured [ms]."""
 FAILURES = (ResourceError, RuntimeError, MemoryError)
@@ -43,12 +42,11 @@ class Bench:
         self.stopped.append((op, program, direction, sizes))
         self._skip({"op": op, "program": program, "direction": direction, **sizes}, reason)
 
-    def _chosen(self, op: str, module, point: Point, sizes: dict) -> set[tuple[str, str]]:
+    def _chosen(self, op: str, point: Point, sizes: dict) -> set[tuple[str, str]]:
         """Return the tasks of an op at a point that may succeed; the others are recorded as skipped."""
         chosen, late = set(), self.deadline is not None and time.monotonic() >= self.deadline
-        for program, directions in module.PROGRAMS.items():
-            largest = getattr(module, "LARGEST", {}).get(program, point.count)
-            if program in peers.absent(self.device) or point.count > largest:
+        for program, directions in OPS[op].programs.items():
+            if program in peers.absent(self.device) or point.count > OPS[op].largest.get(program, point.count):
                 continue
             for direction in directions:
                 vain = (s for *task, s in self.stopped if task == [op, program, direction])
@@ -59,19 +57,19 @@ class Bench:
                     chosen.add((program, direction))
         return chosen
 
-    def measure(self, op: str, module, point: Point, roof: dict | None) -> None:
+    def measure(self, op: str, point: Point, roof: dict | None) -> None:
         """Measure all programs and directions of an op at one point, in turn; only ours if they fail together."""
-        sizes = point.sizes(module.AXES)
-        chosen = self._chosen(op, module, point, sizes)
+        sizes = point.sizes(OPS[op].axes)
+        chosen = self._chosen(op, point, sizes)
         ours = {task for task in chosen if task[0] == OURS}
         for attempt in (chosen, ours) if chosen > ours else (ours,):
-            reason = self._attempt(op, module, point, sizes, attempt, None if point.threads else roof)
+            reason = self._attempt(op, point, sizes, attempt, None if point.threads else roof)
             if reason is None:
                 return
             for program, direction in sorted(attempt if attempt == ours else attempt - ours):
                 self._stop(op, program, direction, sizes, reason)
 
-    def _attempt(self, op: str, module, point: Point, sizes: dict, chosen: set, roof: dict | None) -> str | None:
+    def _attempt(self, op: str, point: Point, sizes: dict, chosen: set, roof: dict | None) -> str | None:
         """Measure the chosen tasks; the reason if that fails before any row is made."""
         if not chosen:
             return None
@@ -80,7 +78,7 @@ class Bench:
             launch.set_threads(point.threads)
         tasks: list[Task] = []
         try:
-            tasks += module.tasks(point, self.device, lambda p, d: (p, d) in chosen)
+            tasks += OPS[op].tasks(point, self.device, lambda p, d: (p, d) in chosen)
             timings = measure_in_turn([t.run for t in tasks], self.device, self.repeats, LIMIT_MS)
             rows = [self._row(op, task, sizes, timing, roof) for task, timing in zip(tasks, timings)]
         except FAILURES as e:
@@ -138,7 +136,7 @@ def run(
     device: torch.device,
     *,
     tiny: bool = False,
-    ops: tuple[str, ...] = OPS,
+    ops: tuple[str, ...] = DEFAULT,
     budget: float | None = None,
     note: str = "",
     earlier: dict | None = None,
@@ -164,18 +162,17 @@ def run(
         bench.rows = list(earlier["rows"])
     roof = earlier["roofline"] if earlier else roofline.ceilings(device, tiny)
     echo(f"roof: {roof['bytes_per_s'] / 1e9:.4g} GB/s, {roof['operations_per_s'] / 1e9:.4g} Gop/s")
-    modules = {op: importlib.import_module(f"bench.kernels.bench_{op}") for op in ops}
-    grid = [(p, op) for op, module in modules.items() for p in points(module.AXES, device, tiny)]
+    grid = [(p, op) for op in ops for p in points(OPS[op].axes, device, tiny)]
     grid.sort(key=lambda pair: load(pair[0]))
     for point, op in grid:
-        if bench.open(op, point.sizes(modules[op].AXES)):
-            bench.measure(op, modules[op], point, roof)
+        if bench.open(op, point.sizes(OPS[op].axes)):
+            bench.measure(op, point, roof)
     # what met other programs gets a second chance; what was skipped is not tried again
     once = list(bench.skipped)
     for point, op in grid:
-        sizes = point.sizes(modules[op].AXES)
+        sizes = point.sizes(OPS[op].axes)
         if not tiny and bench.open(op, sizes) and any(r["op"] == op and r.items() >= sizes.items() for r in bench.rows):
-            bench.measure(op, modules[op], point, roof)
+            bench.measure(op, point, roof)
     done = {_key(r) for r in bench.rows}
     skipped = {_key(s): s for s in (*(earlier["skipped"] if earlier else ()), *once) if _key(s) not in done}
     instances_and_pairs.cache_clear()

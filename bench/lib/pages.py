@@ -5,32 +5,24 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 
-from bench.lib import (
-    accuracy_page,
-    method_page,
-    performance_page,
-    result_file,
-    results_page,
-    rivals_page,
-    trade_page,
-    use_pages,
-)
+from bench.lib import accuracy_page, performance_page, result_file, results_page, rivals_page, use_pages
 
 DOCS = result_file.ROOT / "docs"
 PARTS: dict[str, Callable[[], dict[str, str]]] = {
-    "accuracy.md": accuracy_page.parts,
+    "numerics.md": accuracy_page.parts,
     "farm.md": lambda: {"packing": use_pages.packing()},
     "formats.md": lambda: {"formats": use_pages.formats()},
     "many-gpus.md": lambda: {"ranks": use_pages.ranks()},
-    "method.md": lambda: {"placement": method_page.placement(), "scores": method_page.scores()},
+    "method.md": lambda: {"scores": results_page.scores()},
     "performance.md": performance_page.parts,
     "results.md": lambda: {
-        **results_page.parts(),
+        "ablation": results_page.ablation(),
+        "views": results_page.views(),
+        "meshes": results_page.meshes(),
         "rivals": rivals_page.rivals(),
         "other steps": rivals_page.other_steps(),
         "ladder of default": rivals_page.ladder_of_default(),
     },
-    "trade.md": trade_page.parts,
 }
 """Functions that return the generated parts of each page by name."""
 

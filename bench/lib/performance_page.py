@@ -20,8 +20,6 @@ POINTS = (Point(10_000), Point(100_000), Point(1_000_000), Point(1_000_000, 1920
 """Sizes of the table of renders and training steps."""
 WHOLE = (("render", "forward"), ("render", "both"), ("step", "step"))
 """Ops and directions of that table."""
-FITS = {"fern_cpu2": "fern, 3 photographs of 504 x 378 px", "temple_cpu2": "temple, 12 photographs of 640 x 480 px"}
-"""Results of whole commands, and the captures in words."""
 PEERS = ("gsplat", "gsplat + torch", "numpy", "torch conv2d")
 """Programs of the table of other programs; results have slower ones, too."""
 

@@ -62,18 +62,17 @@ def _died(started: Future) -> bool:
     raise error
 
 
-def stored_rows(path: Path | None, **facts) -> list[dict]:
+def stored_rows(path: Path | None) -> list[dict]:
     """Return the finished rows of a file, without failed rows; none if there is no file.
 
     Raises:
-        UsageError: The rows were measured at another commit, or with facts other than these.
+        UsageError: The rows were measured at another commit.
     """
     if path is None or not path.is_file():
         return []
-    stored = result_file.read(path)
-    for name, now in ({"commit": result_file.commit_of()} | facts).items():
-        if stored.get(name) != now:
-            raise UsageError(f"{path} was measured with {name} {stored.get(name)}, not {now}; choose another --out")
+    stored, now = result_file.read(path), result_file.commit_of()
+    if stored["commit"] != now:
+        raise UsageError(f"{path} was measured with commit {stored['commit']}, not {now}; choose another --out")
     return [row for row in stored["rows"] if "error" not in row]
 
 

@@ -10,18 +10,15 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
-import warp as wp
 
-from bench.lib import inputs, peers
+from bench.lib import inputs
 from warpgs import RasterizeOptions, rasterize
-from warpgs.constants import RULES, Rule
+from warpgs.constants import Rule
 from warpgs.scene import Camera, Gaussians
 
 OURS = "warpgs"
 UNRECORDED = "warpgs, never recorded"
 ATOMIC = "warpgs atomic"
-FAST_MATH = "warpgs fast math"
-"""Our kernels with CUDA's fast math, which no option of warpgs enables."""
 GSPLAT = "gsplat dense"
 GSPLAT_PACKED = "gsplat packed"
 FASTER_GS = "Faster-GS"
@@ -29,8 +26,6 @@ GSWARP = "gswarp"
 
 FASTER_GS_RULE = Rule("Faster-GS", alpha_max=1.0)
 """Faster-GS at 3cb0b75: no clamp of alpha; the Gaussian that crosses the stop is blended."""
-RULE_OF = {GSPLAT: RULES["gsplat-1.6"], GSPLAT_PACKED: RULES["gsplat-1.6"], FASTER_GS: FASTER_GS_RULE, GSWARP: RULES["inria"]}
-"""The cut-offs of each program; gswarp has those of the first 3DGS renderer."""
 
 
 @dataclass(frozen=True)
@@ -63,18 +58,6 @@ class Drawing:
         if "sh0" in found:
             found["sh"] = torch.cat([found.pop("sh0"), found.pop("sh_rest")], 1)
         return {name: g.squeeze(-1) if name == "logit_opacities" and g.ndim == 2 else g for name, g in found.items()}
-
-
-def compile_with_fast_math() -> None:
-    """Compile all further kernels with CUDA's fast math, in single precision."""
-    module = type(wp.get_module("bench.lib.rasterizers"))
-    made = module.__init__
-
-    def make(self, *given, **named):
-        made(self, *given, **named)
-        self.options["fast_math"] = True
-
-    module.__init__ = make
 
 
 def _leaves(g: Gaussians) -> dict[str, torch.Tensor]:
@@ -177,13 +160,6 @@ def gswarp(g: Gaussians, camera: Camera) -> Drawing:
         )[0]  # fmt: skip
 
     return Drawing(draw, leaves, channels_first=True)
-
-
-def dense(g: Gaussians, camera: Camera, rule: Rule = RULES["exact"]) -> Drawing:
-    """Return the drawing of plain torch, for a few thousand Gaussians at most; it runs on a CPU, too."""
-    leaves = _leaves(g)
-    seen = Gaussians(**leaves)
-    return Drawing(lambda: peers.dense_rasterize(seen, camera, rule), leaves)
 
 
 PEERS: dict[str, Callable[..., Drawing]] = {

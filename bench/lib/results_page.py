@@ -1,16 +1,16 @@
-"""The generated parts of docs/results.md."""
+"""The generated parts of docs/results.md but rivals and ladder, and what the importance scores gain, of docs/method.md."""
 
 from __future__ import annotations
 
 import statistics
-from collections import defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
-from bench.lib import result_file, strategy_runs
+from bench.lib import result_file
+from bench.lib.arms import SCORES
 from bench.lib.preset_table import by_seed
 from bench.lib.scenes import ROWS
 from bench.lib.tables import markdown, mean_sd
-from warpgs.pipeline.study.tables import paired_difference
+from warpgs.pipeline.study.tables import family_confidence, paired_difference
 
 ABLATED = {
     "no events": "no sampling events: no placement, layers or protection",
@@ -30,13 +30,14 @@ CAPTURES = {
 }  # fmt: skip
 """Scene and number of training views of each row of the presets' result."""
 PRESETS = ("default", "quick", "3dgs", "mcmc", "gsplat")
-POSES = {
-    "given": "given with the photographs",
-    "joint": "found, held-out photographs included",
-    "aligned": "found from the training photographs alone",
+SCORED = {
+    "`fern`, 3 photographs": ("ladder_h200", "fern:3"),
+    "`horns`, 3": ("ladder_h200", "horns:3"),
+    "`fox`, 8": ("importance_scores_h200", "fox:8"),
+    "`temple`, 4": ("importance_scores_h200", "temple:4"),
+    "synthetic objects, 8 (before smooth depth)": ("importance_objects_h200", None),
 }
-PARITY, REPEATS = "parity_h200", "determinism_h100"
-"""Results of the agreement with gsplat, and of the price of repeatable sums."""
+"""Result file and row of each scene; the fits of objects differ in the object instead of the seed."""
 
 
 def table(head: Sequence[str], rows: list[list[str]]) -> str:
@@ -93,70 +94,6 @@ def views() -> str:
     return markdown(head, body, head[:2]) + own_source + source
 
 
-def coverage() -> str:
-    """Return the tables of pixels and errors by how many training views saw them, and of pixels unseen before and now."""
-    result, source = _result("coverage_h200")
-    body = []
-    for scene in ("fern:3", "horns:3"):
-        for seen, words in (("0", "no view"), ("1", "one"), ("2+", "two or more")):
-            own = [r["classes"][seen] for r in result["rows"] if (r["row"], r["preset"]) == (scene, "default")]
-            shares = (statistics.mean(c[k] for c in own) for k in ("share_of_pixels", "share_of_error"))
-            psnr = mean_sd([c["psnr"] for c in own])
-            body.append([f"{scene.replace(':', ', ')}: {words}", *(f"{100 * share:.0f} %" for share in shares), psnr])
-    both = []
-    for scene in ("fern:3", "horns:3"):
-        own = [r for r in result["unseen_in_both"] if r["row"] == scene]
-        share = f"{100 * statistics.mean(r['share_of_pixels'] for r in own):.0f} %"
-        both.append([scene.replace(":", ", "), share, *(mean_sd([r[k] for r in own]) for k in ("before", "after"))])
-    seen = table(["scene, views: pixels seen by", "pixels", "squared error", "PSNR"], body)
-    return f"{seen}\n{table(['unseen in both fits', 'pixels', 'earlier `default`: PSNR', '`default`: PSNR'], both)}{source}"
-
-
-def strategies() -> str:
-    """Return the table of gsplat's strategies on its rasterizer and on ours with rule `exact`."""
-    result, source = _result("strategies_fern_h200")
-    return strategy_runs.table([r for r in result["rows"] if r["rasterizer"] != "gsplat-1.6"]) + source
-
-
-def poses() -> str:
-    """Return the table of the cost of found poses."""
-    result, source = _result("found_poses_fern_cpu2")
-    rows = {(r["poses"], r["train"]): r for r in result["rows"]}
-    counts = sorted({r["train"] for r in result["rows"]})
-    keys = {"psnr": "", "psnr_cameras_refined": ", cameras refined"}
-    body = [[words, *(mean_sd(rows[kind, n][key]) for n in counts for key in keys)] for kind, words in POSES.items()]
-    return table(["poses", *(f"{n} training photographs{more}" for n in counts for more in keys.values())], body) + source
-
-
-def same_image() -> str:
-    """Return the table of the agreement with gsplat on its largest images."""
-    result, source = _result(PARITY)
-    width, body = max(r["width"] for r in result["rows"]), []
-    for r in result["rows"]:
-        if r["width"] == width:
-            worst = max(g["rel_l2"] for g in r["gradients"].values())
-            differences = (r["image_mean"], r["image_max"], worst)
-            body.append([r["case"], *(f"{d:.1e}" for d in differences), r["differs"]])
-    head = ["case", "mean difference", "largest", "gradients: largest relative L2", "differs by definition"]
-    return table(head, body) + source
-
-
-def antialiasing() -> str:
-    """Return the table of scores at three sizes by the filters of a fit, as differences to a fit without."""
-    result, source = _result("antialiased_fern_h200")
-    found: dict[tuple[str, str], dict[int, dict]] = defaultdict(dict)
-    for r in result["rows"]:
-        found[r["split"], r["filters"]][r["seed"]] = r
-    body = []
-    for (split, filters), own in found.items():
-        cells = [f"{split}, {filters}", f"{len(own)}"]
-        for size in ("half", "full", "double"):
-            key, base = f"psnr_{size}", found[split, "none"]
-            cells.append(mean_sd([r[key] for r in own.values()]) if own is base else _change(own, base, key, 2))
-        body.append(cells)
-    return table(["views, filters", "fits", "half size", "size of the photos", "double size"], body) + source
-
-
 def meshes() -> str:
     """Return the table of the accuracy of meshes."""
     result, source = _result("demo_mesh_cpu2")
@@ -168,22 +105,25 @@ def meshes() -> str:
     return table(["voxel", "triangles", "accuracy", "completeness"], body) + source
 
 
-def repeats() -> str:
-    """Return the table of the price of sums in a fixed order, and of the spread of atomic ones."""
-    result, source = _result(REPEATS)
-    body = []
-    for r in result["rows"]:
-        times = [f"{r['price'][mode]['median_ms']:.2f}" for mode in ("deterministic", "atomic")]
-        ulps = max(s["max_ulp"] for s in r["spread"].values())
-        body.append([f"{r['gaussians']:,}, {r['width']} x {r['height']}", *times, f"{ulps:,}"])
-    return table(["Gaussians, image", "fixed order [ms]", "atomic [ms]", "largest difference [ulp]"], body) + source
+def _psnr(rows: list[dict], name: str | None, preset: str) -> dict[int, float]:
+    """Return held-out PSNR by seed, or by object if there is no row name."""
+    if name is None:
+        return {r["object"]: r["psnr_white"] for r in rows if r["preset"] == preset}
+    return {r["seed"]: r["psnr"] for r in rows if (r["row"], r["preset"], r["left_out"]) == (name, preset, "")}
 
 
-PARTS: tuple[Callable[[], str], ...] = (
-    ablation, views, coverage, strategies, poses, same_image, antialiasing, meshes, repeats,
-)  # fmt: skip
-
-
-def parts() -> dict[str, str]:
-    """Return the generated parts of docs/results.md by name."""
-    return {part.__name__.replace("_", " "): part() for part in PARTS}
+def scores() -> str:
+    """Return the table of `default` with all three importance scores beside `default`, paired."""
+    body, confidence = [], family_confidence(len(SCORED))
+    for words, (file, name) in SCORED.items():
+        rows = result_file.read(result_file.FOLDER / f"{file}.json")["rows"]
+        uniform, scored = (_psnr(rows, name, preset) for preset in ("default", f"default:{SCORES}"))
+        pairs = sorted(uniform.keys() & scored.keys())
+        d = paired_difference([scored[k] for k in pairs], [uniform[k] for k in pairs], confidence)
+        means = [mean_sd([values[k] for k in pairs]) for values in (uniform, scored)]
+        mean = round(d.mean, 2) + 0.0  # not -0.00
+        body.append([words, d.count, *means, f"{mean:+.2f} [{d.low:+.2f}, {d.high:+.2f}]"])
+    head = ["scene", "fits", "sampled uniformly", "sampled by all three scores", "difference"]
+    files = ", ".join(f"`{file}.json`" for file in dict.fromkeys(file for file, _ in SCORED.values()))
+    note = "held-out PSNR [dB]; objects: over white, and measured before `default` smoothed depth with 8 views"
+    return markdown(head, body, head[:1]) + f"\nSources: {files}; {note}.\n"

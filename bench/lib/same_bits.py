@@ -221,7 +221,7 @@ def differing(one: dict, other: dict) -> list[str]:
 
 
 def table(rows: list[dict]) -> str:
-    """Return the table of docs/accuracy.md: a row for each run, beside the first run on the same kind of device."""
+    """Return the table of docs/numerics.md: a row for each run, beside the first run on the same kind of device."""
     lines = []
     for r in rows:
         first = next(f for f in rows if f["machine"]["device"] == r["machine"]["device"])

@@ -18,7 +18,6 @@ import torch
 import warp as wp
 
 from bench.lib.roofline import Cost
-from warpgs.kernels import launch
 
 REPEATS = 30
 WARM_UP = 3
@@ -167,28 +166,6 @@ def peak_bytes(task: Task, device: torch.device) -> int:
     if task.program in IN_WARP and wp.is_mempool_enabled(pool):
         peak += wp.get_mempool_used_mem_current(pool)
     return peak
-
-
-def recorded(work: Callable[[], object]) -> Callable[[], object]:
-    """Return the replay of a work as one CUDA graph, without time on the host. The work must not read from the device."""
-    stream = torch.cuda.Stream()
-    stream.wait_stream(torch.cuda.current_stream())
-    with torch.cuda.stream(stream):
-        for _ in range(3):
-            work()
-    torch.cuda.current_stream().wait_stream(stream)
-    graph = torch.cuda.CUDAGraph()
-    with torch.cuda.graph(graph, stream=stream):
-        here = launch.warp_stream(torch.device("cuda"))
-        wp.capture_begin(stream=here, external=True)
-        held = work()
-        lent = wp.capture_end(stream=here)
-
-    def replay():
-        graph.replay()
-        return held, lent
-
-    return replay
 
 
 def backward_of(outputs: torch.Tensor, inputs: Sequence[torch.Tensor]) -> Callable[[], object]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
 
 import torch
@@ -16,7 +15,7 @@ from warpgs.pipeline.train.schedule import OptimizerConfig, plan_phases
 from warpgs.pipeline.train.settings import FitConfig, settings_by_views
 from warpgs.pipeline.train.step import MAX_STEPS, Learned, StepBuffers, StepGraphs, StepPlan, eager_renderer, step
 from warpgs.pipeline.train.strategies.base import Strategy, StrategyContext
-from warpgs.pipeline.train.trainer import Trainer, complexity_figures, run
+from warpgs.pipeline.train.trainer import Trainer
 from warpgs.pipeline.train.views import LearnedViews, ViewStack
 from warpgs.ranks import ALONE
 from warpgs.render.options import RasterizeOptions
@@ -48,49 +47,14 @@ def state_tensors(trainer: Trainer) -> list[torch.Tensor]:
     return [t for _, t in sorted(trainer.table.state().items())]
 
 
-def finish(trainer: Trainer) -> None:
-    """Take all remaining steps, save nothing, and wait for the device."""
-    run(trainer, lambda _: None, lambda _: None, lambda: False)
-    if trainer.device.type == "cuda":
-        torch.cuda.synchronize(trainer.device)
-
-
-def take_steps(trainer: Trainer, count: int) -> int:
-    """Take at least ``count`` steps as a fit does, and return how many were taken."""
-    done = 0
-    while done < count:
-        done += len(trainer.advance(count - done))
-    return done
-
-
 def one_step(trainer: Trainer) -> None:
     """Take one step as a fit does: on CUDA a graph, elsewhere from Python."""
     trainer.advance()
 
 
-def sort_along_curve(trainer: Trainer) -> None:
-    """Put the Gaussians in Morton order."""
-    trainer.table.sort_along_curve()
-
-
-def model_bytes(trainer: Trainer) -> int:
-    """Return the bytes of the model, each Gaussian with the coefficients of its own degree."""
-    return complexity_figures(trainer)["complexity"]["bytes"]
-
-
 def full_bytes(count: int, degree: int = 3) -> int:
     """Return the bytes of a model of so many Gaussians, all of one degree."""
     return bytes_of(torch.full((count,), degree))
-
-
-def with_cap(config: FitConfig, most: int) -> FitConfig:
-    """Return the settings with a largest number of Gaussians."""
-    return dataclasses.replace(config, max_gaussians=most)
-
-
-def without_density(config: FitConfig) -> FitConfig:
-    """Return the settings with a set of Gaussians that does not change."""
-    return dataclasses.replace(config, density=dataclasses.replace(config.density, start=10**9))
 
 
 def step_parts(trainer: Trainer) -> tuple[View, dict[str, torch.Tensor], Callable[[], None]]:

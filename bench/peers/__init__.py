@@ -1,1 +1,1 @@
-"""warpgs compared with other programs: gsplat, splat-transform."""
+"""warpgs compared with other programs."""

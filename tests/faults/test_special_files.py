@@ -97,40 +97,40 @@ def package(path):
 DOORS = {
     **{f"a{suffix}": ("export.base", read_gaussians) for suffix in suffixes()},
     "b.ply": ("export.ply", warpgs.read_ply),
-    "c.ply": ("export.compressed_ply", start_of),
+    "c.ply": ("export.ply", start_of),
     "b.spz": ("export.spz", lambda p: SPZ().is_antialiased(p)),
     "b.sog": ("export.sog", lambda p: SOG().is_antialiased(p)),
-    "cameras.json": ("io.camera_files", transforms.read_cameras),
+    "cameras.json": ("io.transforms", transforms.read_cameras),
     "transforms.json": ("io.transforms", transforms.read_cameras),
-    **{f"a{suffix}": ("io.decoding", folders.read_mask) for suffix in images.SUFFIXES},
-    "a.heif": ("io.decoding", lambda p: is_heic(p) or folders.read_mask(p)),
-    "orientation.jpg": ("io.decoding", lambda p: folders.read_mask(p) if images.exif_orientation(p) else None),
+    **{f"a{suffix}": ("io.images", folders.read_mask) for suffix in images.SUFFIXES},
+    "a.heif": ("io.images", lambda p: is_heic(p) or folders.read_mask(p)),
+    "orientation.jpg": ("io.images", lambda p: folders.read_mask(p) if images.exif_orientation(p) else None),
     **{f"a{suffix}": ("poses.find", lambda p: find_poses(p, p.parent / "out")) for suffix in photographs.SUFFIXES},
-    "b.mp4": ("poses.video", lambda p: photographs.write_frames(p, p.parent, 3, lambda line: None)),
-    "path.json": ("pipeline.films.keyframes", lambda p: read_keyframes(p, CAMERA, Normalization())),
+    "b.mp4": ("poses.photographs", lambda p: photographs.write_frames(p, p.parent, 3, lambda line: None)),
+    "path.json": ("pipeline.films.paths", lambda p: read_keyframes(p, CAMERA, Normalization())),
     "preset.toml": ("pipeline.train.presets", preset_settings),
-    "crop.json": ("pipeline.model.filters", lambda p: box_of(str(p))),
-    "jobs.jsonl": ("pipeline.farm.listing", lambda p: list_jobs(str(p))),
-    RECORD: ("pipeline.farm.record", job_record),
-    "artefact": ("pipeline.farm.record", file_digest),
+    "crop.json": ("pipeline.model.edit", lambda p: box_of(str(p))),
+    "jobs.jsonl": ("pipeline.farm.job", lambda p: list_jobs(str(p))),
+    RECORD: ("pipeline.farm.job", job_record),
+    "artefact": ("pipeline.farm.job", file_digest),
     "render.png": ("files", lambda p: read_file(p, p.parent)),
-    "model.onnx": ("runtime.onnx_session", open_network),
-    "flow.onnx": ("runtime.onnx_session", lambda p: flow._network(p, "255")),
-    "side.onnx": ("priors.preprocess", side_file),
+    "model.onnx": ("onnx", open_network),
+    "flow.onnx": ("onnx", lambda p: flow._network(p, "255")),
+    "side.onnx": ("priors.networks", side_file),
     "a.flo": ("priors.flow", flow.read_flo),
     "b.flo": ("priors.flow", flow_folder),
-    "map": ("priors.cache", cached),
-    "a.npy": ("io.map_files", read_numbers),
-    "model.py": ("priors.export_matcher", package),
+    "map": ("priors.networks", cached),
+    "a.npy": ("io.maps", read_numbers),
+    "model.py": ("priors.export", package),
     "fcn.safetensors": ("priors.export", weights),
-    "lpips.safetensors": ("pipeline.metrics.lpips_weights", read_lpips),
-    "heads.pth": ("pipeline.metrics.lpips_weights", lambda p: convert_lpips(p, p, p.parent / "out")),
-    "model.safetensors": ("pipeline.model.model_file", warpgs.load),
-    TENSORS: ("pipeline.runs.checkpoint", lambda p: load_checkpoint(p.parent)),
-    "step.safetensors": ("pipeline.runs.failed_step", lambda p: read_failed_step(p, torch.device("cpu"))),
+    "lpips.safetensors": ("pipeline.metrics.lpips", read_lpips),
+    "heads.pth": ("pipeline.metrics.lpips", lambda p: convert_lpips(p, p, p.parent / "out")),
+    "model.safetensors": ("pipeline.model.table", warpgs.load),
+    TENSORS: ("pipeline.run.folder", lambda p: load_checkpoint(p.parent)),
+    "step.safetensors": ("pipeline.run.failed_step", lambda p: read_failed_step(p, torch.device("cpu"))),
     run_folder.CONFIG: ("schema", lambda p: run_folder.read_record(p.parent)),
     poses_record.JSON: ("schema", lambda p: poses_record.read_poses_record(p.parent)),
-    "metrics.jsonl": ("report.events", read_events),
+    "metrics.jsonl": ("report.progress", read_events),
     "plugin.py": ("plugins", lambda p: Registry("reader", object, None).load(f"{p}:Class")),
 }  # fmt: skip
 """By the name of a file: the module that opens it, and what reads it."""
@@ -293,10 +293,9 @@ def test_every_module_that_opens_files_is_tried():
     for path in PACKAGE.rglob("*.py"):
         if opening & set(calls(ast.parse(path.read_text("utf-8")))):
             modules.add(".".join(path.relative_to(PACKAGE).with_suffix("").parts))
-    tried = {module for module, _ in DOORS.values()} | {"input_files"}
-    of_scenes = {"io.colmap", "io.middlebury", "io.dtu", "io.llff"}
+    tried = {module for module, _ in DOORS.values()} | {"files"}
+    of_scenes = {"io.colmap", "io.others"}
     assert modules - tried == of_scenes, "add what is new to DOORS"
-    assert {f"io.{name}" for name in READERS.names()} == of_scenes | {"io.transforms"}
     assert {name.split()[0] for name in scenes.WRITERS} - {"instant-ngp", "blender"} == set(READERS.names())
 
 

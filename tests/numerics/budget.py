@@ -1,4 +1,4 @@
-"""Which lines of the error budget a split breaks; the limits stand in tests/tolerances.py, the reasons in docs/accuracy.md."""
+"""Which lines of the error budget a split breaks; the limits stand in tests/tolerances.py, the reasons in docs/numerics.md."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from tests.tolerances import GRADIENT_ULPS, IMAGE_ULPS, LAYER_ULPS, ORDINARY, RA
 from warpgs.constants import Rule
 
 SLOPE = {"rgb": 0.5**0.5 * math.exp(-0.5), "alpha": 0.5**0.5 * math.exp(-0.5), "depth": 0.5 * 0.5**0.5 * 3.33}
-"""What half an ulp in both coordinates of a mean does to a picture, per ulp and per 1/sigma; c in docs/accuracy.md."""
+"""What half an ulp in both coordinates of a mean does to a picture, per ulp and per 1/sigma; c in docs/numerics.md."""
 
 
 CASES = [("exact", name) for name in SCENES] + [("gsplat-1.5", "wall"), ("inria", "wall"), ("inria", "blobs")]

@@ -29,7 +29,7 @@ VALUES = (
 LRS = (0.05, 0.25, 0.5, 0.75, 0.95)
 SIZES = ((1, 1), (33, 17), (48, 32), (70, 50))
 ASPECT = 300.0
-"""Longest over shortest axis of an ellipse up to which float32 input alone keeps weights within 1e-4 (docs/extremes.md)."""
+"""Longest over shortest axis of an ellipse up to which float32 input alone keeps weights within 1e-4 (docs/numerics.md)."""
 
 
 @dataclass(frozen=True)

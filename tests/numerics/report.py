@@ -1,4 +1,4 @@
-"""Measure every line of the error budget and keep the figures; `python -m bench.document` puts them into docs/accuracy.md.
+"""Measure every line of the error budget and keep the figures; `python -m bench.document` puts them into docs/numerics.md.
 
 usage: python -m tests.numerics.report [--device cuda] [--out bench/results/budget_cpu.json]
 """
@@ -34,7 +34,7 @@ def main() -> int:
         rgb, worst = row["pictures"]["rgb"], max(e["rel L2"] for e in row["gradients"].values())
         print(f"{rule:7} {scene.name:18} rgb E mean {rgb['E mean']:.1e} max {rgb['E max']:.1e}, worst gradient {worst:.1e}")
     print(*(lines or ["every line is kept"]), sep="\n")
-    what = "the error budget of docs/accuracy.md, line by line, on its scenes"
+    what = "the error budget of docs/numerics.md, line by line, on its scenes"
     result_file.write(a.out, result_file.result(what, device, rows, broken=lines))
     return int(bool(lines))
 

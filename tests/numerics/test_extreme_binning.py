@@ -1,4 +1,4 @@
-"""Binning and sorting at the limits of their numbers, and pictures of extreme sizes (docs/extremes.md)."""
+"""Binning and sorting at the limits of their numbers, and pictures of extreme sizes (docs/numerics.md)."""
 
 import dataclasses
 from types import SimpleNamespace
@@ -100,7 +100,7 @@ def test_a_refused_size_leaves_a_recorded_launch_as_it_was():
     """A recorded launch that was refused an argument takes the next one whole, at the same address and of the same size too."""
     recorded, packed = launch._Recorded.__new__(launch._Recorded), SimpleNamespace(ndim=1, data=0, shape=[0])
     recorded.command = SimpleNamespace(bounds=SimpleNamespace(size=1), params=[None, None, packed], set_dim=lambda _: None)
-    recorded.known = [None]
+    recorded.known, recorded.dtypes, recorded.device = [None], [torch.float32], SimpleNamespace(is_cuda=False)
     small, other = torch.zeros(5), torch.zeros(6)
     recorded._patch(1, [launch.view(small, None)])
     with pytest.raises(ResourceError, match="2,147,483,648 entries"):

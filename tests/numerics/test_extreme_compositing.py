@@ -1,4 +1,4 @@
-"""Compositing at the ends of what numbers can say; docs/extremes.md lists the rows (C1 to C12) and what else holds them."""
+"""Compositing at the ends of what numbers can say; docs/numerics.md lists the rows (C1 to C12) and what else holds them."""
 
 import dataclasses
 import functools

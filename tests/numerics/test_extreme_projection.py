@@ -1,4 +1,4 @@
-"""Projection at the ends of what numbers can say; docs/extremes.md lists the rows (P1 to P14) and what else holds them."""
+"""Projection at the ends of what numbers can say; docs/numerics.md lists the rows (P1 to P14) and what else holds them."""
 
 import functools
 import itertools

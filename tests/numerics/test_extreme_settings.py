@@ -1,4 +1,4 @@
-"""Settings of a fit at the extremes: any number in any field is refused, or gives finite steps (docs/extremes.md, T11)."""
+"""Settings of a fit at the extremes: any number in any field is refused, or gives finite steps (docs/numerics.md, T11)."""
 
 import dataclasses
 import math

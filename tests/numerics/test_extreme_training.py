@@ -1,4 +1,4 @@
-"""Starting, densifying, losing and saving at the extremes of data and settings (docs/extremes.md)."""
+"""Starting, densifying, losing and saving at the extremes of data and settings (docs/numerics.md)."""
 
 import dataclasses
 import math

@@ -1,4 +1,4 @@
-"""What must hold for any scene: invariances of the picture, identities of its gradients (docs/extremes.md).
+"""What must hold for any scene: invariances of the picture, identities of its gradients (docs/numerics.md).
 
 Scenes are drawn by hypothesis: the same ones each time, but for the constants that it takes from the modules that are imported,
 so limits must hold for any scene. What float arithmetic allows is claimed bit for bit. Any other error is divided by the terms

@@ -1,4 +1,4 @@
-"""What Warp lets pass and warpgs must not: hidden float32, generated adjoints, writes out of bounds (docs/extremes.md)."""
+"""What Warp lets pass and warpgs must not: hidden float32, generated adjoints, writes out of bounds (docs/numerics.md)."""
 
 import ast
 import os

@@ -1,6 +1,6 @@
 """Where float32 may rightly decide otherwise than float64: pixels with a Gaussian within rounding of a threshold.
 
-Derivation of every closeness: docs/accuracy.md. A pixel outside these bands has no excuse.
+Derivation of every closeness: docs/numerics.md. A pixel outside these bands has no excuse.
 """
 
 from __future__ import annotations

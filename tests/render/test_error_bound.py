@@ -5,8 +5,8 @@ import dataclasses
 import pytest
 import torch
 
-from bench.lib.bound_scenes import HEIGHT, KINDS, WIDTH, bound_scene
 from tests.gaussians import camera, cloud
+from tests.render.bound_scenes import HEIGHT, KINDS, WIDTH, bound_scene
 from warpgs.constants import RULES, Rule
 from warpgs.render.options import RasterizeOptions
 from warpgs.render.rasterize import rasterize

@@ -296,5 +296,5 @@ def test_gaussians_that_change_in_number_before_the_backward_pass(surroundings):
     cam = camera(70, 50, 1, torch.float32)
     found = first_graphed(own, g, cam)
     g.means.data = torch.zeros(70, 3)
-    with pytest.raises(RuntimeError, match=r"\(\[50, 3\] torch.float32 on cpu, now \[70, 3\]"):
+    with pytest.raises(RuntimeError, match=r"replaced between .*\[50, 3\] .*, now \[70, 3\]"):
         found[0][0].sum().backward()

@@ -33,7 +33,7 @@ class RasterizeOptions:
     """Options of `rasterize`."""
 
     rule: str | Rule = "exact"
-    """Cut-offs: exact, balanced, fast (docs/trade.md), gsplat-1.6, gsplat-1.5, inria, or a `Rule` of your own."""
+    """Cut-offs: exact, balanced, fast (docs/numerics.md), gsplat-1.6, gsplat-1.5, inria, or a `Rule` of your own."""
     near: float | None = None
     """Nearest depth rendered, in the units of the Gaussians, at least 0; None for the value of the rule, 0.01 in `exact`. Whole
     Gaussians are culled by the depth of their mean: z in camera axes or, for a fisheye, the distance."""
@@ -65,7 +65,7 @@ class RasterizeOptions:
     error_bound: bool = False
     """True to also bound the error of ``rgb`` against rule `exact`. The bound of a pixel is its difference from a float64
     render under `exact`, plus the rounding of float64. So the bound covers both cut-offs and float32 rounding. The float64
-    render takes several times as long as one in float32 (docs/trade.md). Not with ``capacity``."""
+    render takes several times as long as one in float32 (docs/numerics.md). Not with ``capacity``."""
     memory_budget: int | None = None
     """Bytes that the (Gaussian, tile) instances may take; None for four fifths of the free memory."""
     deterministic: bool = True

@@ -64,8 +64,8 @@ class FitConfig:
     pixel get a lower opacity, and no axis is smaller than the training cameras resolve (docs/rasterizer.md). Renders of the run
     are antialiased, too; other programs need their antialiased mode."""
     half_resolution: float | None = 0.0
-    """Fraction of the steps, from the first step on, that use views of half size (docs/trade.md). None: chosen by the number of
-    views."""
+    """Fraction of the steps, from the first step on, that use views of half size (docs/numerics.md). None: chosen by the number
+    of views."""
     sh_degree: int | None = 3
     """Highest spherical-harmonics degree of the colours, 0 to 4; only PLY files store degree 4. None: chosen by the number of
     views."""

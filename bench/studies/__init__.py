@@ -1,1 +1,0 @@
-"""Studies of single questions, quoted by pages or decisions."""
