@@ -78,7 +78,7 @@ def reason(found: Mapping, i: int, names: Sequence[str]) -> str:
 
 def axis_angle(found: Mapping, i: int, j: int) -> float:
     """Return the angle between the optical axes of two views [degrees]."""
-    cosine = float((found.views[i].rotation[2] * found.views[j].rotation[2]).sum())
+    cosine = float((found.views[i][0][2] * found.views[j][0][2]).sum())
     return float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
 
 
@@ -156,7 +156,7 @@ def record_of(found: Mapping, photographs: Sequence[Photograph], digest: str, no
         registered = i in found.views
         rows.append({
             "name": p.name, "sha256": p.digest, "registered": registered, "keypoints": found.keypoints[i],
-            "points": found.views[i].points if registered else 0,
+            "points": found.views[i][1] if registered else 0,
             "matches": {names[j]: n for j, n in partners(found, i)[:SHOWN_PARTNERS]},
             "reason": None if registered else reason(found, i, names),
         })  # fmt: skip

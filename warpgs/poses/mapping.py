@@ -31,18 +31,6 @@ LAST_WORDS = 500
 
 
 @dataclass(frozen=True)
-class FoundView:
-    """A photograph with a pose."""
-
-    rotation: np.ndarray
-    """Rotation of camera_from_world, shape [3, 3]."""
-    center: np.ndarray
-    """Camera centre [file units], shape [3]."""
-    points: int
-    """Number of points that the photograph sees."""
-
-
-@dataclass(frozen=True)
 class Mapping:
     """Result of structure from motion; photographs are indexed in the order of their names."""
 
@@ -52,8 +40,8 @@ class Mapping:
     """Number of matches that agree with one motion of the camera, by pair, the smaller index first."""
     tried: int
     """Number of pairs that were matched."""
-    views: dict[int, FoundView]
-    """Views of the largest model."""
+    views: dict[int, tuple[np.ndarray, int]]
+    """Views of the largest model: rotation of camera_from_world, shape [3, 3], and the number of points that the view sees."""
     cameras: tuple[dict[str, float], ...]
     """Cameras of ``views``: focal length [px of the photograph], distortion (coefficient of the radius squared, on the plane at
     distance 1), width and height [px]."""
@@ -160,11 +148,9 @@ def find_model(
         result = said.get("result", result)
     if result is None:
         raise ResourceError("pycolmap ended without a result; try again, with fewer photographs if memory is short")
-    index, model = (
-        {n: i for i, n in enumerate(names)},
-        result["model"] or {"views": {}, "cameras": {}, "points": 0, "error": 0.0},
-    )
-    views = {int(i): FoundView(np.array(v["rotation"]), np.array(v["center"]), v["points"]) for i, v in model["views"].items()}
+    index = {n: i for i, n in enumerate(names)}
+    model = result["model"] or {"views": {}, "cameras": {}, "points": 0, "error": 0.0}
+    views = {int(i): (np.array(v["rotation"]), v["points"]) for i, v in model["views"].items()}
     p = photographs[min(views, default=0)]
     scale = max(1.0, max(p.width, p.height) / MATCHING_SIDE)
     return Mapping(
@@ -360,9 +346,8 @@ def finish(model: Any, job: dict[str, Any]) -> dict[str, Any]:
     for number in model.reg_image_ids():
         image = model.image(number)
         i = index[image.name]
-        pose = image.cam_from_world()
-        views[i] = {"rotation": pose.rotation.matrix().tolist(), "center": image.projection_center().tolist(),
-                    "points": image.num_points3D, "camera": image.camera_id}  # fmt: skip
+        rotation = image.cam_from_world().rotation.matrix().tolist()
+        views[i] = {"rotation": rotation, "points": image.num_points3D, "camera": image.camera_id}
         small, (width, height) = image.camera, job["sizes"][i]
         scale = [width / small.width, height / small.height]
         for point in image.points2D:

@@ -180,9 +180,6 @@ def write_frames(path: Path, folder: Path, count: int, progress: Callable[[str],
 # pi-heif (libheif and libde265, LGPL) reads them. A malicious file can crash the process that reads it, so one separate
 # process reads all photographs.
 
-QUALITY = 98
-"""JPEG quality of the copies, without subsampling of colours."""
-
 
 def is_heic(path: Path) -> bool:
     """Return whether a file begins as a HEIC file does."""
@@ -237,7 +234,7 @@ def _coded_again(source: Path, max_pixels: int) -> bytes:
         if found.focal is not None:
             kept.get_ifd(EXPOSURE)[FOCAL_35MM] = int(found.focal)
         pixels = io.BytesIO()
-        image.convert("RGB").save(pixels, "JPEG", quality=QUALITY, subsampling=0, exif=kept)
+        image.convert("RGB").save(pixels, "JPEG", quality=JPEG_QUALITY, subsampling=0, exif=kept)
     return pixels.getvalue()
 
 
@@ -265,7 +262,7 @@ MATCHING_SIDE = 2000
 DIAGONAL_35MM = math.hypot(36, 24)
 """Diagonal of 35 mm film [mm], by which the equivalent focal length in EXIF is defined (CIPA DCG-001)."""
 JPEG_QUALITY = 98
-"""Quality of a photograph that must be coded again since it is turned upright."""
+"""JPEG quality of photographs that must be coded again, since they are HEIC or turned upright."""
 
 
 @dataclass(frozen=True)

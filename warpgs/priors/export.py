@@ -381,9 +381,7 @@ def export_network(request: ExportRequest, out: Path) -> list[str]:
     values = {"output": "disparity" if request.model == "dpt" else "classes", "mean": mean, "std": std}
     description = json.dumps(values) + "\n"
     with folder_for_files() as folder:
-        trial = folder / "network.onnx"
-        write_bytes(trial, data)
-        write_text(side_file(trial), description)
+        write_bytes(trial := folder / "network.onnx", data)
         found = open_network(trial).run(image[0].permute(1, 2, 0).numpy())
     difference = float(np.abs(found - wanted).max() / wanted.std())
     if not difference < MAX_DIFFERENCE:

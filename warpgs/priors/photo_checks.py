@@ -10,8 +10,7 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -66,10 +65,6 @@ class PhotoCheck:
     """Brightness relative to the other photographs: the geometric mean of ``channels``."""
     channels: tuple[float, float, float] | None
     """Red, green and blue relative to the other photographs."""
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the figures by name, for metrics.json."""
-        return asdict(self)
 
     @property
     def blurred(self) -> bool:

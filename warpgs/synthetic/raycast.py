@@ -85,7 +85,6 @@ class Shape(abc.ABC):
         """Return outward unit normals in the local frame at local surface positions ``p``; both shape [N, 3]."""
 
 
-@dataclass(frozen=True)
 class Plane(Shape):
     """The plane through ``center`` with local normal -z, seen from the side of the normal."""
 

@@ -679,5 +679,5 @@ def _score(job: FitJob, trainer: Trainer, seconds: dict[str, float], given: dict
         "seconds": {**seconds, **compiling, "total": time.perf_counter() - job.began}, **peak,
         "memory": trainer.memory.to_json(), "rule": rule, "shape": shape,
         **event_figures(trainer), **complexity, "view_modules": learned, "given": mapped,
-        "photographs": [p.to_json() | {"moved": moved.get(p.name)} for p in job.photographs],
+        "photographs": [vars(p) | {"moved": moved.get(p.name)} for p in job.photographs],
     }  # fmt: skip
