@@ -76,12 +76,6 @@ def reason(found: Mapping, i: int, names: Sequence[str]) -> str:
     return f"{matched}, which has no pose either{together}"
 
 
-def axis_angle(found: Mapping, i: int, j: int) -> float:
-    """Return the angle between the optical axes of two views [degrees]."""
-    cosine = float((found.views[i][0][2] * found.views[j][0][2]).sum())
-    return float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
-
-
 def neighbours(found: Mapping) -> list[tuple[int, int, float]]:
     """Return the pairs of views that connect all views by the smallest angles (a minimum spanning tree), with their angles."""
     last, *left = list(found.views) or [-1]
@@ -89,7 +83,8 @@ def neighbours(found: Mapping) -> list[tuple[int, int, float]]:
     tree = []
     while nearest:
         for j, best in nearest.items():
-            nearest[j] = min(best, (axis_angle(found, last, j), last))
+            cosine = float((found.views[last][0][2] * found.views[j][0][2]).sum())  # of the optical axes
+            nearest[j] = min(best, (float(np.degrees(np.arccos(np.clip(cosine, -1, 1)))), last))
         (angle, i), last = min((best, j) for j, best in nearest.items())
         del nearest[last]
         tree.append((min(i, last), max(i, last), angle))
@@ -216,12 +211,6 @@ def report_lines(record: dict[str, Any]) -> list[str]:
     return lines + [f"- {a}" for a in record["advice"]]
 
 
-def write_record(folder: Path, record: dict[str, Any]) -> None:
-    """Write poses.json and poses.txt into a folder."""
-    write_json(folder / JSON, record)
-    write_text(folder / TEXT, "\n".join(report_lines(record)) + "\n")
-
-
 def read_poses_record(folder: Path) -> dict[str, Any]:
     """Read poses.json of a scene whose poses were found."""
     path = folder / JSON
@@ -306,7 +295,8 @@ def find_poses(
         for name in MODEL_FILES:
             if (work / "model" / name).is_file():
                 write_bytes(scene / "sparse" / "0" / name, (work / "model" / name).read_bytes())
-        write_record(scene, record)
+        write_json(scene / JSON, record)
+        write_text(scene / TEXT, "\n".join(report_lines(record)) + "\n")
         shutil.rmtree(work)
     return record
 

@@ -56,21 +56,6 @@ class EpipolarConfig:
             raise UsageError(f"near-count must be at least 1, not {self.near_count}")
 
 
-@dataclass(frozen=True)
-class PairDepth:
-    """Depths of N pixels of a view from their matches in a second view."""
-
-    depth: np.ndarray
-    """z-depth in the first view [u], float64, shape [N]; NaN if undefined."""
-    residual: np.ndarray
-    """Distance of the match from the epipolar line [px], shape [N]."""
-    sensitivity: np.ndarray
-    """|dz/dpx| [u/px], shape [N]; infinite where a shift by half a pixel moves the point behind a camera or to infinity."""
-    valid: np.ndarray
-    """True where both depths are positive, the parallax suffices, the depth is finite, and the epipolar line's point nearest to
-    the match is in the second image."""
-
-
 def pixel_grid(camera: Camera) -> np.ndarray:
     """Return the pixel centres [px] of an image, float64, shape [H * W, 2], row by row."""
     x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
@@ -104,8 +89,10 @@ def fundamental(first: Camera, second: Camera) -> tuple[np.ndarray, np.ndarray, 
 
 def epipolar_depth(
     first: Camera, second: Camera, pixels: np.ndarray, matches: np.ndarray, min_parallax: float = 0.5
-) -> PairDepth:
-    """Return depths of pixels [N, 2] from their matches [N, 2] (docs/flow_epipolar.md, equations 1 to 6)."""
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return z-depths [u], residuals [px], |dz/dpx| [u/px] and validity, [N] each, of pixels [N, 2] by their matches [N, 2]."""
+    # docs/flow_epipolar.md, equations 1 to 6. A residual is the distance of a match from its epipolar line. A depth is valid
+    # where both depths are positive, the parallax suffices, and the line's nearest point is in the image; NaN if undefined.
     F, R_st, tau = fundamental(first, second)
     rays = homogeneous(pixels) @ np.linalg.inv(first.K).T
     lines = homogeneous(pixels) @ F.T
@@ -122,7 +109,7 @@ def epipolar_depth(
         inside = (feet >= 0).all(1) & (feet[:, 0] < second.width) & (feet[:, 1] < second.height)
         valid = (depth > 0) & (along > 0) & (sine > np.sin(np.radians(min_parallax))) & inside & np.isfinite(depth)
         steady = (ahead > 0) & (behind > 0) & (ahead_along > 0) & (behind_along > 0) & np.isfinite(sensitivity)
-    return PairDepth(depth, np.abs(signed), np.where(steady, sensitivity, np.inf), valid)
+    return depth, np.abs(signed), np.where(steady, sensitivity, np.inf), valid
 
 
 def _ray_lengths(rays: np.ndarray, others: np.ndarray, tau: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -185,8 +172,8 @@ def flow_depth(views: Sequence[View], index: int, flow: FlowBetween, config: Epi
             notes.append(f"no flow to {views[j].name}")
             continue
         matches = pixels + there.reshape(-1, 2)
-        pair = epipolar_depth(view.camera, views[j].camera, pixels, matches, config.min_parallax)
-        good = pair.valid & (pair.residual < config.max_residual)
+        depth, residual, sensitivity, good = epipolar_depth(view.camera, views[j].camera, pixels, matches, config.min_parallax)
+        good &= residual < config.max_residual
         if np.isfinite(config.max_round_trip):
             back = flow(j, index)
             if back is None:
@@ -195,7 +182,7 @@ def flow_depth(views: Sequence[View], index: int, flow: FlowBetween, config: Epi
                 good &= round_trip(matches, pixels, back) < config.max_round_trip
         if not good.any():
             notes.append(f"no flow to {views[j].name} survives the checks")
-        candidates.append((pair.depth, pair.sensitivity, good))
+        candidates.append((depth, sensitivity, good))
     if not candidates:
         candidates = [(np.zeros(len(pixels)), np.full(len(pixels), np.inf), np.zeros(len(pixels), bool))]
     depth, sensitivity = blend(*(np.stack(c) for c in zip(*candidates)), config.blend)

@@ -10,7 +10,7 @@ import sys
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -118,22 +118,18 @@ def open_network(path: str | Path, *, provider: str = "cpu", threads: int = 0) -
     data = read_model(path)
     session = start_session(data, path, provider, threads)
     try:
-        return _checked(path, data, session)
+        inputs = [(i.name, i.type, i.shape) for i in session.get_inputs()]  # names that are not UTF-8 fail here
+        names = {"input": [name for name, _, _ in inputs], "output": [o.name for o in session.get_outputs()]}
     except UnicodeDecodeError as e:
         raise DataError(f"{path}: the name of an input or an output is not UTF-8; export the network again") from e
-
-
-def _checked(path: Path, data: bytes, session: Any) -> Network:
-    """Return the network of a session that has one input and one output; DataError for others."""
-    inputs, outputs = session.get_inputs(), session.get_outputs()
-    for what, found in (("input", inputs), ("output", outputs)):
-        names = ", ".join(f.name for f in found)  # read even if unused: names that are not UTF-8 fail here
+    for what, found in names.items():
         if len(found) != 1:
-            raise DataError(f"{path}: it has {len(found)} {what}s ({names}); export it with only one")
-    if inputs[0].type not in TYPES:
-        raise DataError(f"{path}: its input is a {inputs[0].type}; float or float16 is needed")
-    layout, size = _input_axes(path, inputs[0].shape)
-    return Network(path, hashlib.sha256(data).hexdigest(), session, layout, size, TYPES[inputs[0].type])
+            raise DataError(f"{path}: it has {len(found)} {what}s ({', '.join(found)}); export it with only one")
+    _, kind, shape = inputs[0]
+    if kind not in TYPES:
+        raise DataError(f"{path}: its input is a {kind}; float or float16 is needed")
+    layout, size = _input_axes(path, shape)
+    return Network(path, hashlib.sha256(data).hexdigest(), session, layout, size, TYPES[kind])
 
 
 IMAGENET = ((0.485, 0.456, 0.406), (0.229, 0.224, 0.225))

@@ -196,11 +196,6 @@ def project_inverse(first: Camera, second: Camera, pixels: np.ndarray, inverse: 
         return np.where(p[:, 2:] > 1e-9, p[:, :2] / p[:, 2:], np.nan)
 
 
-def inside_image(camera: Camera, pixels: np.ndarray) -> np.ndarray:
-    """Return True where pixels [..., 2] [px] are in the image of ``camera``; False for NaN."""
-    return (pixels >= 0).all(-1) & (pixels[..., 0] < camera.width) & (pixels[..., 1] < camera.height)
-
-
 def plane_inverses(
     first: Camera, others: Sequence[Camera], bounds: tuple[float, float], spacing: float, max_planes: int
 ) -> np.ndarray:
@@ -212,7 +207,7 @@ def plane_inverses(
     longest = 0.0
     for other in others:
         found = np.stack([project_inverse(first, other, pixels, np.full(len(pixels), w)) for w in ladder])
-        inside = inside_image(other, found)
+        inside = (found >= 0).all(-1) & (found[..., 0] < other.width) & (found[..., 1] < other.height)  # False for NaN
         steps = np.linalg.norm(np.diff(found, axis=0), axis=2)[inside[1:] & inside[:-1]]
         longest = max(longest, float(steps.max(initial=0)) * (len(ladder) - 1))
     return np.linspace(1 / far, 1 / near, int(np.clip(np.ceil(longest / spacing) + 1, 8, max_planes)))
@@ -281,7 +276,7 @@ def needed_bytes(view: View, planes: int) -> int:
 def matching_costs_cuda(
     view: View, others: Sequence[View], inverses: np.ndarray, window: int, device: torch.device
 ) -> torch.Tensor:
-    """Return the costs of `sweep_cpu.matching_costs`, without its padding planes, int16, shape [H, W, D], on the device."""
+    """Return the costs of `matching_costs_cpu`, without its padding planes, int16, shape [H, W, D], on the device."""
 
     def box(maps: torch.Tensor) -> torch.Tensor:
         r = window // 2
@@ -318,7 +313,7 @@ def matching_costs_cuda(
 
 
 def best_inverse(costs: torch.Tensor, inverses: np.ndarray) -> np.ndarray:
-    """Return inverse depths [1/u] as `plane_depths.best_inverses` does, float64, shape [H, W], on the host."""
+    """Return inverse depths [1/u] as `best_inverses` does, float64, shape [H, W], on the host."""
     k = costs.argmin(2, keepdim=True).clamp(1, len(inverses) - 2)
     left, middle, right = (costs.gather(2, k + o).double() for o in (-1, 0, 1))
     bend = left - 2 * middle + right

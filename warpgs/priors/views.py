@@ -68,11 +68,6 @@ class SemanticMaps:
     foreground: np.ndarray
 
 
-def _softmax(logits: np.ndarray) -> np.ndarray:
-    e = np.exp(logits - logits.max(-1, keepdims=True))
-    return e / e.sum(-1, keepdims=True)
-
-
 def class_probabilities(network: Network, preprocessing: Preprocessing, image: np.ndarray) -> np.ndarray:
     """Return the probability of each of the 21 classes at each pixel of an image [H, W, 3], float32 [H, W, 21]."""
     output = network.run(preprocessing.prepare(network, image))
@@ -84,7 +79,10 @@ def class_probabilities(network: Network, preprocessing: Preprocessing, image: n
     scores = output[0].transpose(1, 2, 0) if output.shape[1] == CLASSES else output[0]
     are_probabilities = bool((scores >= 0).all()) and np.allclose(scores.sum(-1), 1, atol=1e-3)
     scores = resize(scores, *image.shape[:2])
-    return scores if are_probabilities else _softmax(scores)
+    if are_probabilities:
+        return scores
+    e = np.exp(scores - scores.max(-1, keepdims=True))
+    return e / e.sum(-1, keepdims=True)
 
 
 def boundary_weight(labels: np.ndarray) -> np.ndarray:
