@@ -54,7 +54,7 @@ READERS = {
     },
     "poses/find.py": {"read_poses_record": "record of poses"},
     "priors/networks.py": {"MapCache._read": "stored maps", "read_side_file": "description of a network"},
-    "priors/flow.py": {"_network": "flow network", "read_flo": "flow"},
+    "priors/flow.py": {"read_flo": "flow"},
     "report/progress.py": {"read_events": "events"},
     "locks.py": {"_signed": "signature of a lock"},
     "onnx.py": {"read_model": "network", "start_session": "network"},

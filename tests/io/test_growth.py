@@ -16,7 +16,7 @@ from warpgs.io import transforms as camera_files
 from warpgs.io.load import coincident_views, load_scene, split_views
 from warpgs.pipeline.farm.job import list_jobs
 from warpgs.poses.find import _notes, advice, neighbours
-from warpgs.poses.mapping import FoundView, Mapping, camera_groups, cameras_of
+from warpgs.poses.mapping import Mapping, camera_groups, cameras_of
 from warpgs.poses.photographs import Photograph
 from warpgs.report.page import image_names
 from warpgs.report.progress import read_events
@@ -192,7 +192,7 @@ def test_what_to_photograph_next():
     def found(n):
         angles = np.linspace(0, 3, n)
         turns = [np.array([[np.cos(a), 0, -np.sin(a)], [0, 1, 0], [np.sin(a), 0, np.cos(a)]]) for a in angles]
-        views = {i: FoundView(r, np.zeros(3), 100) for i, r in enumerate(turns)}
+        views = {i: (r, 100) for i, r in enumerate(turns)}
         matches = {(i, i + 1): 200 for i in range(n - 1)}
         return Mapping((900,) * n, matches, n, views, (), (), 50, 0.4, "incremental", "4")
 

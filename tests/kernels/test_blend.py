@@ -12,7 +12,7 @@ from tests.reference.project import project_reference
 from tests.tolerances import close
 from warpgs.constants import ALPHA_CUT, ALPHA_MAX, RULES, TRANSMITTANCE_STOP
 from warpgs.kernels.blend import blend, composite
-from warpgs.kernels.falloff import BlendSettings
+from warpgs.kernels.falloff import Pass
 from warpgs.kernels.project import project
 from warpgs.kernels.tiles import Tiles, bin_tiles
 from warpgs.kernels.walk import contributions
@@ -284,7 +284,7 @@ def test_blocks_per_warp_change_no_bit(tile_size):
     found = []
     for visible in (1, len(tiles.gaussian_ids)):  # many tiles to a Gaussian, and one
         some = dataclasses.replace(tiles, visible=visible)
-        settings = BlendSettings((0, 0), cam.width, cam.height, rule)
+        settings = Pass((cam.width, cam.height), (0, 0, cam.width, cam.height), rule)
         found.append(composite(projected, some, torch.full((2, 3), 0.3, device="cuda:0"), settings, save=True))
     for one, other in zip(*(f[:6] for f in found)):
         assert torch.equal(one, other)
@@ -323,8 +323,8 @@ def test_both_passes_see_the_same_alpha(device):
 
 def test_settings_of_kernels_are_made_once():
     """Equal settings give one struct for each tile size and scalar type: numbers of the rule, tiles of the window."""
-    made = [BlendSettings((16, 32), 40, 20, RULES["inria"]).struct(16, wp.float64) for _ in range(2)]
-    assert made[0] is made[1] and made[0] is not BlendSettings((16, 32), 40, 20, RULES["inria"]).struct(8, wp.float64)
+    made = [Pass((90, 60), (16, 32, 40, 20), RULES["inria"]).struct(16, wp.float64) for _ in range(2)]
+    assert made[0] is made[1] and made[0] is not Pass((90, 60), (16, 32, 40, 20), RULES["inria"]).struct(8, wp.float64)
     found = {name: getattr(made[0], name) for name in made[0]._cls.vars}
     assert found == {
         "origin_x": 16, "origin_y": 32, "width": 40, "height": 20, "columns": 3, "tiles": 6, "alpha_cut": ALPHA_CUT,

@@ -9,7 +9,7 @@ import pytest
 from tests.poses.conftest import film, with_exif
 from warpgs.errors import DataError
 from warpgs.poses.find import _check_found, advice, reason, record_of, report_lines
-from warpgs.poses.mapping import FoundCamera, FoundView, Mapping
+from warpgs.poses.mapping import Mapping
 from warpgs.poses.matching import choose_pairs, similarity
 from warpgs.poses.photographs import (
     Photograph,
@@ -118,10 +118,11 @@ def mapping(**values) -> Mapping:
     """Three photographs in one model, 50 degrees apart at the end, and two that are lost."""
     angles = np.radians([0, 10, 60])
     turns = [np.array([[np.cos(a), 0, -np.sin(a)], [0, 1, 0], [np.sin(a), 0, np.cos(a)]]) for a in angles]
-    views = {i: FoundView(r, np.zeros(3), 100) for i, r in enumerate(turns)}
+    views = {i: (r, 100) for i, r in enumerate(turns)}
     given = {
         "keypoints": (900, 800, 700, 600, 12), "matches": {(0, 1): 200, (1, 2): 40, (2, 3): 9}, "tried": 10, "views": views,
-        "cameras": (FoundCamera(300, 0, 320, 240),), "groups": ((0, 1, 2),), "points": 50, "error": 0.4,
+        "cameras": ({"focal": 300, "distortion": 0, "width": 320, "height": 240},), "groups": ((0, 1, 2),), "points": 50,
+        "error": 0.4,
         "method": "incremental", "version": "4",
     }  # fmt: skip
     return Mapping(**(given | values))

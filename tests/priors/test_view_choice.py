@@ -22,15 +22,16 @@ def test_neighbours_see_the_same_from_another_side():
     sight = shared_sight(cameras, [(3, 5)] * 5)
     assert matching_views(sight, cameras, 0, 4, range(5))[0] == 2
     assert not {3, 4} & set(matching_views(sight, cameras, 0, 4, range(5)))
-    assert sight.overlap[0, 1] > 0.99 and sight.matching[0, 1] < 0.01 < 0.8 < sight.matching[0, 2]
-    assert (np.diag(sight.matching) == 0).all() and (sight.overlap[0, 3:] == 0).all()
+    overlap, matching = sight
+    assert overlap[0, 1] > 0.99 and matching[0, 1] < 0.01 < 0.8 < matching[0, 2]
+    assert (np.diag(matching) == 0).all() and (overlap[0, 3:] == 0).all()
 
 
 def test_views_that_share_nothing_take_the_nearest():
     """Where sampled points find nothing shared, the nearest cameras among those allowed are taken."""
     cameras = ring([0, 90, 180, 200])
     sight = shared_sight(cameras, [(0.5, 1)] * 4)
-    assert not sight.matching.any()
+    assert not sight[1].any()
     assert matching_views(sight, cameras, 0, 2, range(4)) == [1, 3] and matching_views(sight, cameras, 0, 2, [2, 3]) == [3, 2]
 
 

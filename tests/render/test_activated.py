@@ -1,15 +1,16 @@
 """Activated parameters: scales and opacities themselves, and the limits that stored ones reach at infinity."""
 
+import dataclasses
 import math
 
 import pytest
 import torch
 
-from tests.gaussians import SMOOTH, camera, cloud, hand_placed, leaves
+from tests.gaussians import camera, cloud, hand_placed, leaves
 from warpgs.errors import UsageError
 from warpgs.render.options import RasterizeOptions
 from warpgs.render.rasterize import rasterize
-from warpgs.scene import ActivatedGaussians
+from warpgs.scene import ActivatedGaussians, CovarianceGaussians
 
 
 def activated(gaussians):
@@ -33,20 +34,6 @@ def test_images_and_gradients_are_those_of_stored_parameters(device, factors):
     expected = v["means"], v["quats"], v["log_scales"] / scales, v["logit_opacities"] / (opacities * (1 - opacities)), v["sh"]
     for a, b in zip(expected, w.values()):
         assert float((a - b).norm()) <= 1e-12 * float(a.norm())  # measured: 3e-16
-
-
-@pytest.mark.slow
-def test_gradcheck(device):
-    """All five tensors and the pose, by finite differences through every kernel."""
-    given, cam = activated(hand_placed(device=device, degree=1)), camera(12, 11, device=device)
-    viewmat = cam.viewmat.clone().requires_grad_()
-
-    def images(*tensors):
-        posed = type(cam)(tensors[-1], cam.K, cam.width, cam.height)
-        r = rasterize(ActivatedGaussians(*tensors[:-1]), posed, RasterizeOptions(rule=SMOOTH))
-        return r.rgb, r.alpha, r.depth
-
-    assert torch.autograd.gradcheck(images, (*given.tensors().values(), viewmat), fast_mode=True)
 
 
 def flat(device, dtype):
@@ -92,11 +79,13 @@ def test_colors_need_no_harmonics():
     """``sh`` may be left out where colours are given, and nowhere else."""
     stored, cam = cloud(50), camera(dtype=torch.float32)
     given, values = activated(stored), torch.rand(50, 5)
-    bare = ActivatedGaussians(given.means, given.quats, given.scales, given.opacities)
     options = RasterizeOptions(colors=values)
-    assert torch.equal(rasterize(bare, cam, options).rgb, rasterize(given, cam, options).rgb)
-    with pytest.raises(UsageError, match=r"no sh: give sh=..., or RasterizeOptions\(colors=...\)"):
-        rasterize(bare, cam)
+    covariances = CovarianceGaussians(given.means, torch.eye(3).repeat(50, 1, 1), given.opacities, given.sh)
+    for whole in (given, covariances):
+        bare = dataclasses.replace(whole, sh=None)
+        assert torch.equal(rasterize(bare, cam, options).rgb, rasterize(whole, cam, options).rgb)
+        with pytest.raises(UsageError, match=r"no sh: give sh=..., or RasterizeOptions\(colors=...\)"):
+            rasterize(bare, cam)
 
 
 def test_wrong_input_is_named():

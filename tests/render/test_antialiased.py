@@ -1,20 +1,19 @@
 """Antialiasing: opacities times sqrt(det(cov2d) / det(cov2d + low_pass I)), the 2D filter of Mip-Splatting."""
 
 import dataclasses
-import functools
 import math
 
 import pytest
 import torch
 
-from tests.gaussians import SMOOTH, camera, cloud, hand_placed, leaves
+from tests.gaussians import SMOOTH, camera, hand_placed, leaves
 from tests.reference.blend import blend_reference
 from tests.reference.project import project_reference
 from tests.tolerances import close
 from warpgs.constants import ALPHA_CUT, RULES
 from warpgs.render.options import RasterizeOptions
 from warpgs.render.rasterize import rasterize
-from warpgs.scene import ActivatedGaussians, Camera, Gaussians
+from warpgs.scene import Camera, Gaussians
 
 ANTIALIASED = RasterizeOptions(antialiased=True)
 
@@ -58,24 +57,6 @@ def test_opacities_images_and_gradients_equal_reference(device, dtype, rule):
     other[6].grad[:, 0, 1] = other[6].grad[:, 1, 0] = 0
     for a, b in zip(own, other):
         close("gradient", a.grad, b.grad)
-
-
-def test_gradcheck(device):
-    """All seven tensors, by finite differences through every kernel, of stored and of activated parameters."""
-    stored, cam = small(device=device), camera(12, 11, device=device)
-    g = stored.tensors()
-    scales, opacities = (t.detach().requires_grad_() for t in (stored.log_scales.exp(), stored.logit_opacities.sigmoid()))
-    for given in (stored, ActivatedGaussians(g["means"], g["quats"], scales, opacities, g["sh"])):
-        inputs = (*given.tensors().values(), cam.viewmat.clone().requires_grad_(), cam.K.clone().requires_grad_())
-        images = functools.partial(images_of, type(given), cam)
-        assert torch.autograd.gradcheck(images, inputs, fast_mode=True)
-
-
-def images_of(kind, cam, *tensors):
-    """Colour, alpha and depth of Gaussians of a kind, without cut-offs."""
-    options = dataclasses.replace(ANTIALIASED, rule=SMOOTH)
-    r = rasterize(kind(*tensors[:5]), Camera(*tensors[5:], cam.width, cam.height), options)
-    return r.rgb, r.alpha, r.depth
 
 
 def spots(sigmas, dtype=torch.float32, device="cpu"):
@@ -151,20 +132,3 @@ def test_extremes_are_finite(device, dtype, low_pass):
         plain = rasterize(g, cam, RasterizeOptions(rule=dataclasses.replace(RULES["exact"], low_pass=0.0)))
         assert torch.equal(plain.visible, r.visible)
         close("projection", opacity, plain.projected[0, :, 5])
-
-
-def test_it_goes_with_chunks_windows_factors_and_error_bounds(device):
-    """Chunks and windows give the same bits; the bound of a float32 render against float64 stays at rounding."""
-    g, cam = cloud(400, device=device), camera(64, 48, dtype=torch.float32, device=device)
-    factors = torch.full((400,), 0.5, device=device)
-
-    def image(**options):
-        return rasterize(g, cam, RasterizeOptions(antialiased=True, **options)).rgb
-
-    whole = image()
-    assert not torch.equal(whole, rasterize(g, cam).rgb)
-    assert torch.equal(image(max_instances=50), whole)
-    assert torch.equal(image(window=(16, 16, 32, 32)), whole[16:48, 16:48])
-    assert not torch.equal(image(opacity_factors=factors), whole)
-    bound = rasterize(g, cam, RasterizeOptions(antialiased=True, error_bound=True)).error_bound
-    assert float(bound.median()) < 1e-5

@@ -1,13 +1,10 @@
 """Channels of the user: instead of the spherical harmonics' colours, beside them, in windows and in chunks."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 import torch
 
-from tests.gaussians import SMOOTH, camera, cloud, hand_placed, leaves
-from warpgs.errors import UsageError
+from tests.gaussians import SMOOTH, camera, cloud, leaves
 from warpgs.render.options import RasterizeOptions
 from warpgs.render.rasterize import rasterize
 from warpgs.scene import Camera, Gaussians
@@ -74,54 +71,6 @@ def test_one_camera_has_no_leading_axis():
     assert torch.equal(r.rgb, batch.rgb[1]) and torch.equal(r.features, batch.features[1])
 
 
-@pytest.mark.slow
-def test_gradcheck_end_to_end(device):
-    """Gaussians, pose, intrinsics, colours, features and both backgrounds, by finite differences through every kernel."""
-    gaussians, cam = hand_placed(device=device, degree=0), camera(12, 11, device=device)
-    like = {"dtype": torch.float64, "device": device}
-    values = [random(6, 2, **like), random(2, seed=1, **like), random(6, 4, seed=2, **like), random(4, seed=3, **like)]
-    inputs = [*list(gaussians.tensors().values())[:4], cam.viewmat, cam.K, *values]
-    inputs = [t.detach().clone().requires_grad_() for t in inputs]
-
-    def images(means, quats, scales, opacities, viewmat, K, colors, behind, features, behind_features):
-        g = Gaussians(means, quats, scales, opacities, gaussians.sh)
-        options = RasterizeOptions(
-            rule=SMOOTH, colors=colors, background=behind, features=features, feature_background=behind_features
-        )
-        r = rasterize(g, Camera(viewmat, K, 12, 11), options)
-        return r.rgb, r.alpha, r.depth, r.features
-
-    assert torch.autograd.gradcheck(images, inputs, eps=1e-6, atol=1e-7, rtol=1e-5, nondet_tol=0.0)
-
-
-@pytest.mark.parametrize("window", [(0, 16, 75, 16), (64, 48, 11, 5)])
-def test_window_is_the_crop(device, dtype, window):
-    """Of colours and of features, to the bit."""
-    gaussians, cam, values, behind = scene(dtype, device, 5)
-    options = RasterizeOptions(colors=values, background=behind, features=values[:, :2])
-    whole, part = (rasterize(gaussians, cam, dataclasses.replace(options, window=w)) for w in (None, window))
-    x, y, width, height = window
-    for name in ("rgb", "features"):
-        assert torch.equal(getattr(part, name), getattr(whole, name)[:, y : y + height, x : x + width]), name
-
-
-def test_chunks_make_the_same_image(device, dtype):
-    """Images are the same bits, and gradients the same numbers but for the order of sums."""
-    gaussians, cam, values, behind = scene(dtype, device, 5)
-    found = []
-    for most in (None, 150):
-        g = leaves(gaussians)
-        own = [values.clone().requires_grad_(), behind.clone().requires_grad_(), values[:, :4].clone().requires_grad_()]
-        r = rasterize(g, cam, RasterizeOptions(colors=own[0], background=own[1], features=own[2], max_instances=most))
-        loss = r.rgb.square().sum() + r.features.square().sum() + r.depth.sum()
-        geometry = [t for n, t in g.tensors().items() if n != "sh"]
-        found.append(([r.rgb, r.features, r.depth], torch.autograd.grad(loss, [*geometry, *own])))
-    assert all(torch.equal(a, b) for a, b in zip(found[0][0], found[1][0]))
-    near = 3e-5 if dtype is torch.float32 else 1e-12
-    for a, b in zip(found[0][1], found[1][1]):
-        assert float((a - b).norm()) <= near * float(a.norm())
-
-
 @pytest.mark.cuda
 @pytest.mark.parametrize("channels", [1, 2, 3, 5, 8, 32])
 def test_native_kernels_agree_with_generic_ones(channels):
@@ -164,7 +113,6 @@ def test_wrong_channels_are_named():
         ),
         (ValueError, r"background must have shape \[3\] .*, not \[2, 8\]", {"features": values, "background": behind}),
         (ValueError, r"feature_background .*\[8\]", {"features": values, "feature_background": behind[:, :3]}),
-        (UsageError, "feature_background requires features", {"feature_background": behind}),
     ]:
         with pytest.raises(kind, match=words):
             rasterize(gaussians, cam, RasterizeOptions(**options))

@@ -46,7 +46,7 @@ def test_options_check_their_types():
             with pytest.raises(UsageError, match=f"{name} must be a whole number, not {value!r}"):
                 RasterizeOptions(**{name: value})
         RasterizeOptions(**{name: np.int64(8)})
-    for name in ("sh_degree", "memory_budget", "capacity"):
+    for name in ("sh_degree", "memory_budget", "capacity", "heaviest"):
         with pytest.raises(UsageError, match=f"{name} must be at least 0, not -1"):
             RasterizeOptions(**{name: -1})
     for name in ("tile_size", "heaviest"):
@@ -62,11 +62,28 @@ def test_options_check_their_types():
     RasterizeOptions(near=np.float32(1), far=2, window=[np.int64(0), 0, 16, 16])
 
 
-def test_a_capacity_beyond_what_can_be_numbered_is_refused():
-    """With its bound, before memory is asked for."""
-    g = cloud(1)
-    with pytest.raises(UsageError, match="capacity must be at most 1,073,741,823, not 1,073,741,824"):
-        rasterize(g, camera(37, 30), RasterizeOptions(capacity=2**30))
+PIXELS = torch.zeros(1, 2, dtype=torch.int64)
+
+
+@pytest.mark.parametrize(
+    ("words", "options"),
+    [
+        ("unknown rule 'best': choose one of exact, balanced, fast, gsplat-1", {"rule": "best"}),
+        ("tile size 12 is not one of 8, 16", {"tile_size": 12}),
+        ("max_instances must be at least 1", {"max_instances": 0}),
+        ("max_instances must be at least 1", {"max_instances": 10, "capacity": 100}),
+        ("capacity must be at most 1,073,741,823, not 1,073,741,824", {"capacity": 2**30}),
+        ("error_bound and capacity exclude each other", {"error_bound": True, "capacity": 1000}),
+        ("feature_background requires features", {"feature_background": torch.zeros(8)}),
+        ("pixels cannot be combined", {"pixels": PIXELS, "window": (0, 0, 16, 16)}),
+        ("pixels cannot be combined", {"pixels": PIXELS, "contributions": True}),
+        ("pixels cannot be combined", {"pixels": PIXELS, "capacity": 100}),
+    ],
+)
+def test_options_out_of_range_or_together_are_refused(words, options):
+    """Where they are made, not at the first render."""
+    with pytest.raises(UsageError, match=words):
+        RasterizeOptions(**options)
 
 
 def test_a_background_is_numbers():

@@ -53,7 +53,7 @@ def some(*shape, like: torch.Tensor, seed: int = 0) -> torch.Tensor:
     return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64).to(like)
 
 
-QUICK = {("pinhole", kind, False) for kind in KINDS} | {(model, "stored", False) for model in MODELS}
+QUICK = {*itertools.product(["pinhole"], KINDS, (False, True)), *((model, "stored", False) for model in MODELS)}
 CASES = [
     pytest.param(*case, marks=() if case in QUICK else pytest.mark.slow)
     for case in itertools.product(MODELS, KINDS, (False, True))
@@ -106,23 +106,42 @@ def test_a_turned_scene_with_its_camera_gives_the_same_outputs(device, model):
         assert float((a - (b if back is None else b @ back)).norm()) < 1e-11 * float(a.norm())
 
 
-@pytest.mark.parametrize("model", MODELS)
-@pytest.mark.parametrize("rule", ["exact", "fast"])
-def test_a_window_is_the_crop_of_every_output(device, dtype, model, rule):
-    """To the bit, with the gradients of what the window shows equal to those of the whole image there."""
-    given, cam = leaves(cloud(200, dtype, device)), seen_by(model, *SIZE, cameras=2, dtype=dtype, device=device)
-    options = RasterizeOptions(rule=rule, features=some(200, 2, like=given.means), **EVERYTHING)
+@pytest.mark.parametrize(
+    ("model", "kind", "antialiased", "rule"),
+    [
+        *((m, "stored", False, "exact") for m in MODELS),
+        *(("pinhole", k, True, "fast" if k == "stored" else "exact") for k in KINDS),
+    ],
+)
+def test_windows_and_chunks_have_the_bits_of_every_output(device, dtype, model, kind, antialiased, rule):
+    """In every image; gradients of what they show are those of the whole, but for the order of sums in chunks."""
+    given = of_kind(kind, cloud(200, dtype, device))
+    cam = seen_by(model, *SIZE, cameras=2, dtype=dtype, device=device)
+    own = [some(200, 2, like=given.means), some(2, like=given.means, seed=1), torch.linspace(0.5, 1, 200).to(given.means)]
+    options = RasterizeOptions(
+        rule=rule, antialiased=antialiased, features=own[0].requires_grad_(), feature_background=own[1].requires_grad_(),
+        opacity_factors=own[2], **EVERYTHING,
+    )  # fmt: skip
     x, y, w, h = window = (16, 16, 34, 21)
-    whole, part = rasterize(given, cam, options), rasterize(given, cam, dataclasses.replace(options, window=window))
+    whole, part, chunked = (
+        rasterize(given, cam, dataclasses.replace(options, **how)) for how in ({}, {"window": window}, {"max_instances": 60})
+    )
+    assert int(whole.tile_counts.sum()) > 120 and (rule == "fast" or float(whole.error_bound.detach().median()) < 1e-5)
     for name in IMAGES:
         crop = getattr(whole, name)[:, y : y + h, x : x + w]
         assert torch.equal(getattr(part, name), crop) and bool(crop.any()), name
+        assert torch.equal(getattr(chunked, name), getattr(whole, name)), name
+    assert torch.equal(chunked.weight_maxima, whole.weight_maxima)
+    close("image", chunked.weight_sums, whole.weight_sums)
+    leaves_of = [*tensors_of(given), *own[:2]]
     gradients = []
-    for r, (i, j) in ((whole, (y, x)), (part, (0, 0))):
-        image = r.rgb[:, i : i + h, j : j + w]
-        gradients.append(torch.autograd.grad((image * some(*image.shape, like=image)).sum(), [given.means, given.log_scales]))
-    for a, b in zip(*gradients):
+    for r, (i, j) in ((whole, (y, x)), (part, (0, 0)), (chunked, (y, x))):
+        crops = [getattr(r, n)[:, i : i + h, j : j + w] for n in DIFFERENTIABLE]
+        loss = sum((c * some(*c.shape, like=c)).sum() for c in crops)
+        gradients.append(torch.autograd.grad(loss, leaves_of))
+    for a, b, c in zip(*gradients):
         close("gradient", b, a)
+        close("gradient", c, a)
 
 
 @pytest.mark.parametrize("channels", [6, 9, 32])

@@ -13,7 +13,7 @@ from tests.tolerances import close
 from warpgs.geometry import gaussian_normals, rotation_matrices
 from warpgs.render.options import RasterizeOptions
 from warpgs.render.rasterize import rasterize
-from warpgs.scene import ActivatedGaussians, Camera, CovarianceGaussians
+from warpgs.scene import ActivatedGaussians, CovarianceGaussians
 
 ANTIALIASED = RasterizeOptions(antialiased=True)
 
@@ -61,21 +61,6 @@ def test_images_and_gradients_are_those_of_scales(device, dtype, antialiased):
     covariances(dataclasses.replace(activated, quats=quats, scales=scales)).backward(given.covars.grad)
     close("gradient", quats.grad, activated.quats.grad)
     close("gradient", scales.grad, activated.scales.grad)
-
-
-@pytest.mark.parametrize("antialiased", [False, True])
-def test_gradcheck(device, antialiased):
-    """All four tensors, pose and intrinsics, by finite differences through every kernel."""
-    given, cam = pair(hand_placed(device=device, degree=1))[1], camera(12, 11, device=device)
-    inputs = (*given.tensors().values(), cam.viewmat.clone().requires_grad_(), cam.K.clone().requires_grad_())
-    images = functools.partial(images_of, cam, RasterizeOptions(rule=SMOOTH, antialiased=antialiased))
-    assert torch.autograd.gradcheck(images, inputs, fast_mode=True)
-
-
-def images_of(cam, options, *tensors):
-    """Colour, alpha and depth."""
-    r = rasterize(CovarianceGaussians(*tensors[:4]), Camera(*tensors[4:], cam.width, cam.height), options)
-    return r.rgb, r.alpha, r.depth
 
 
 DIRECTIONS = torch.tensor([[1.0, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 0], [1, 0, -1], [0, 1, 1]], dtype=torch.float64)
@@ -198,23 +183,6 @@ def test_extremes_stay_finite(device, exponent):
         assert bool(torch.isfinite(r.projected).all()) and (exponent > 30 or bool(r.visible[0, 1]))
         r.projected[..., :10].sum().backward()
         assert all(bool(torch.isfinite(t.grad).all()) for t in given.tensors().values())
-
-
-def test_every_way_to_render_takes_them(device):
-    """Chunks, windows, a batch, colours without harmonics, the error bound and float64: as with scales."""
-    activated, given = pair(cloud(60, device=device))
-    cam = camera(40, 30, cameras=2, dtype=torch.float32, device=device)
-    whole = rasterize(given, cam)
-    chunked = rasterize(given, cam, RasterizeOptions(max_instances=20))
-    assert torch.equal(whole.rgb, chunked.rgb)
-    part = rasterize(given, cam, RasterizeOptions(window=(16, 0, 16, 16)))
-    assert torch.equal(part.rgb, whole.rgb[:, :16, 16:32])
-    found = [rasterize(g, cam, RasterizeOptions(error_bound=True)) for g in (activated, given)]
-    assert float((found[0].rgb - found[1].rgb).detach().abs().max()) < 1e-5
-    assert float(found[1].error_bound.detach().max()) < 1e-5
-    colors = torch.rand(60, 5).to(device)
-    bare = CovarianceGaussians(given.means, given.covars, given.opacities)
-    assert rasterize(bare, cam, RasterizeOptions(colors=colors)).rgb.shape == (2, 30, 40, 5)
 
 
 def test_wrong_input_is_named():

@@ -13,17 +13,19 @@ from tests.gaussians import camera, cloud, leaves
 from warpgs.constants import RULES
 from warpgs.errors import UsageError
 from warpgs.kernels.ellipse import ProjectInputs
+from warpgs.kernels.falloff import Pass
 from warpgs.kernels.graphs import MIN_REPLAYS, GraphPool
+from warpgs.kernels.sh import coefficient_count
 from warpgs.means2d import projected_means
 from warpgs.render import graphed
-from warpgs.render.compose import RenderSettings, inputs_of
+from warpgs.render.compose import inputs_of, pass_of
 from warpgs.render.graphed import MIN_CALLS, SPARE, Capacity, Recorder, call_key
 from warpgs.render.options import RasterizeOptions
 from warpgs.render.rasterize import rasterize
 from warpgs.scene import Camera, Gaussians
 
 CPU = torch.device("cpu")
-SETTINGS = RenderSettings(18, 17, (0, 0, 18, 17), 1, RULES["exact"], 16)
+SETTINGS = Pass((18, 17), (0, 0, 18, 17), RULES["exact"], 4)
 
 
 class Counted:
@@ -82,7 +84,7 @@ def test_the_third_of_equal_calls_is_captured(recorder):
     assert Counted.made == 1
     assert recorder.render(other, None, SETTINGS) is None and recorder.rasterizer is None
     assert recorder.render(own, background, SETTINGS) is None
-    assert recorder.render(own, None, dataclasses.replace(SETTINGS, degree=0)) is None
+    assert recorder.render(own, None, dataclasses.replace(SETTINGS, sh_count=1)) is None
     recorder.clear()
     assert [recorder.render(other, None, SETTINGS) for _ in range(3)][-1] == "images" and Counted.made == 2
 
@@ -131,7 +133,7 @@ def test_calls_of_large_scenes_are_captured(surroundings):
     """2.8M Gaussians at 3840 x 2160 px; not where a running sum might overflow."""
     given = batch()
     own = given._replace(**{n: torch.empty(2_794_625, *t.shape[1:], device="meta") for n, t in zip(given._fields[:5], given)})
-    large = dataclasses.replace(SETTINGS, width=3840, height=2160, window=(0, 0, 3840, 2160))
+    large = dataclasses.replace(SETTINGS, size=(3840, 2160), window=(0, 0, 3840, 2160))
     assert call_key(own, None, large) is not None
     assert call_key(own, None, dataclasses.replace(large, window=(0, 0, 2**18, 2**18))) is None
 
@@ -156,7 +158,7 @@ def results(gaussians, cam, background, recorder=None):
         r = rasterize(gaussians, cam, RasterizeOptions(background=background))
         rgb, alpha, depth, projected, counts = r.rgb, r.alpha, r.depth, r.projected, r.tile_counts
     else:
-        settings = RenderSettings(cam.width, cam.height, (0, 0, cam.width, cam.height), gaussians.sh_degree, RULES["exact"], 16)
+        settings = pass_of(cam, gaussians.sh_degree, RULES["exact"])
         found = recorder.render(inputs_of(gaussians, cam), background, settings)
         if found is None:
             return None
@@ -184,7 +186,7 @@ def test_images_without_gradients_have_the_same_bits(surroundings):
     """And keep nothing for a backward pass."""
     g, own = leaves(cloud(300)), Recorder(NoGraphPool(CPU), gradients=False)
     cam = camera(70, 50, 2, torch.float32)
-    settings = RenderSettings(70, 50, (0, 0, 70, 50), g.sh_degree, RULES["exact"], 16)
+    settings = Pass((70, 50), (0, 0, 70, 50), RULES["exact"], coefficient_count(g.sh_degree))
     with torch.no_grad():
         for _ in range(MIN_CALLS + 1):
             found = own.render(inputs_of(g, cam), None, settings)
@@ -198,7 +200,7 @@ def test_other_planes_are_another_graph(surroundings):
     """Near and far plane of the rule count, in the image and in gradients."""
     g, cam, own = leaves(cloud(200)), camera(64, 48, dtype=torch.float32), Recorder(NoGraphPool(CPU))
     for planes in ({}, {"near": 3.5, "far": 4.5}, {"far": 4.0}):
-        settings = dataclasses.replace(SETTINGS, width=64, height=48, window=(0, 0, 64, 48))
+        settings = dataclasses.replace(SETTINGS, size=(64, 48), window=(0, 0, 64, 48))
         settings = dataclasses.replace(settings, rule=dataclasses.replace(RULES["exact"], **planes))
         calls = [own.render(inputs_of(g, cam), None, settings) for _ in range(4 * MIN_CALLS)]  # each time twice as many
         assert calls[0] is None
@@ -214,7 +216,7 @@ def test_a_rasterizer_that_is_too_small_says_so(surroundings, short):
     g, own = leaves(cloud(300)), Recorder(NoGraphPool(CPU))
     cam = camera(70, 50, 1, torch.float32)
     sources = inputs_of(g, cam)
-    settings = RenderSettings(70, 50, (0, 0, 70, 50), g.sh_degree, RULES["exact"], 16)
+    settings = Pass((70, 50), (0, 0, 70, 50), RULES["exact"], coefficient_count(g.sh_degree))
     for _ in range(MIN_CALLS):
         found = own.render(sources, None, settings)
     assert found is not None
@@ -227,7 +229,7 @@ def test_a_rasterizer_that_is_too_small_says_so(surroundings, short):
 
 def first_graphed(own: Recorder, g: Gaussians, cam: Camera):
     """Return the result of the first call that a graphed rasterizer renders."""
-    settings = RenderSettings(cam.width, cam.height, (0, 0, cam.width, cam.height), g.sh_degree, RULES["exact"], 16)
+    settings = pass_of(cam, g.sh_degree, RULES["exact"])
     return [own.render(inputs_of(g, cam), None, settings) for _ in range(MIN_CALLS)][-1]
 
 
@@ -255,7 +257,7 @@ def test_backward_passes_are_counted(surroundings, loss):
     g, own = leaves(cloud(50)), Recorder(NoGraphPool(CPU))
     cam = camera(70, 50, 1, torch.float32)
     first_graphed(own, g, cam)
-    settings = RenderSettings(70, 50, (0, 0, 70, 50), g.sh_degree, RULES["exact"], 16)
+    settings = Pass((70, 50), (0, 0, 70, 50), RULES["exact"], coefficient_count(g.sh_degree))
     for early in (True, False):
         images, projected, _ = own.render(inputs_of(g, cam), None, settings)
         means2d = projected_means(projected, False) if early else None

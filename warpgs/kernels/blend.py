@@ -10,7 +10,7 @@ import warp as wp
 from warpgs.constants import Rule
 from warpgs.device import BINNING, BLENDING, FLOAT, LOSS, PROJECTION, SAMPLING, Needs, StepSizes
 from warpgs.kernels import blend_cpu, blend_cuda, launch
-from warpgs.kernels.falloff import COLORS, VALUES, WIDTHS, BlendSettings
+from warpgs.kernels.falloff import COLORS, VALUES, WIDTHS, Pass
 from warpgs.kernels.launch import TORCH, Allocator, first_order, keep, kept
 from warpgs.kernels.native import ROLLED
 from warpgs.kernels.tiles import Tiles, grid
@@ -107,7 +107,7 @@ def composite(
     projected: torch.Tensor,
     tiles: Tiles,
     backgrounds: torch.Tensor,
-    settings: BlendSettings,
+    settings: Pass,
     *,
     save: bool,
     allocator: Allocator = TORCH,
@@ -120,7 +120,7 @@ def composite(
         return blend_cuda.forward(projected, tiles, backgrounds, settings, save=save, allocator=allocator, image=image)
     real, device = launch.real_of(projected), projected.device
     cameras, channels = backgrounds.shape
-    shape = (cameras, settings.height, settings.width)
+    shape = (cameras, *settings.window[:1:-1])
     rgb = allocator.output((*shape, channels), projected.dtype, device) if image is None else image
     alpha, depth = (allocator.output(shape, projected.dtype, device) for _ in range(2))
     transmittances, weights = (allocator.saved(shape, projected.dtype, device) for _ in range(2))
@@ -133,7 +133,7 @@ def composite(
     return rgb, alpha, depth, transmittances, weights, ends, allocator.saved((0,), projected.dtype, device)
 
 
-def _backward(projected, tiles, backgrounds, settings: BlendSettings, saved, v_images, allocator) -> torch.Tensor:
+def _backward(projected, tiles, backgrounds, settings: Pass, saved, v_images, allocator) -> torch.Tensor:
     """Return what `blend_cuda.backward` returns, by the generic kernels."""
     _, depth, transmittances, weights, ends, _ = saved
     v_rgb, v_alpha, v_depth = v_images
@@ -162,7 +162,7 @@ def composite_gradients(
     projected: torch.Tensor,
     tiles: Tiles,
     backgrounds: torch.Tensor,
-    settings: BlendSettings,
+    settings: Pass,
     saved: Sequence[torch.Tensor],
     v_images: Sequence[torch.Tensor | None],
     allocator: Allocator = TORCH,
@@ -250,7 +250,7 @@ def blend(
     # SMALLEST_WEIGHT. ``deterministic=False`` adds gradients atomically on CUDA in float32. ``absgrad`` puts sums of magnitudes
     # of the mean's gradient in the place of the gradient of the last two values of ``projected``.
     check_tiles(projected, tiles, width, height, backgrounds=(backgrounds, "C 3"))
-    settings = BlendSettings(origin, width, height, rule, deterministic, absgrad)
+    settings = Pass((width, height), (*origin, width, height), rule, deterministic=deterministic, absgrad=absgrad)
     return _Blend.apply(*without_gradients(projected, backgrounds), tiles, settings)
 
 
@@ -357,7 +357,7 @@ class _BlendChannels(torch.autograd.Function):
         if save:
             check_slots(tiles)
         projected, colors = projected.contiguous(), colors.contiguous()
-        image = projected.new_empty(len(projected), settings.height, settings.width, colors.shape[-1])
+        image = projected.new_empty(len(projected), *settings.window[:1:-1], colors.shape[-1])
         found = None
         width = _width(projected, colors.shape[-1], settings.absgrad)
         for channels, colored, behind in _groups(projected, tiles, colors, backgrounds, width):
@@ -423,5 +423,5 @@ def blend_channels(
     check_tiles(projected, tiles, width, height, colors=(colors, f"{shared} N D"), backgrounds=(backgrounds, "C D"))
     if colors.shape[-1] == 0:
         raise ValueError(f"colors must have at least one channel, not shape {list(colors.shape)}")
-    settings = BlendSettings(origin, width, height, rule, deterministic, absgrad)
+    settings = Pass((width, height), (*origin, width, height), rule, deterministic=deterministic, absgrad=absgrad)
     return _BlendChannels.apply(*without_gradients(projected, colors, backgrounds), tiles, settings)

@@ -14,7 +14,7 @@ import warp as wp
 from warpgs.constants import SMALLEST_WEIGHT, TILE_SIZE
 from warpgs.device import FLOAT, StepSizes
 from warpgs.kernels import launch
-from warpgs.kernels.falloff import COLORS, BlendSettings, make_struct
+from warpgs.kernels.falloff import COLORS, Pass, make_struct
 from warpgs.kernels.launch import TORCH, Allocator
 from warpgs.kernels.native import cuda_kernel, source
 from warpgs.kernels.tiles import Tiles, grid
@@ -163,7 +163,7 @@ def forward(
     projected: torch.Tensor,
     tiles: Tiles,
     backgrounds: torch.Tensor,
-    settings: BlendSettings,
+    settings: Pass,
     *,
     save: bool,
     allocator: Allocator = TORCH,
@@ -171,7 +171,7 @@ def forward(
 ) -> tuple[torch.Tensor, ...]:
     """Return what `blend.composite` returns; states [S, P] have a row for each chunk of instances."""
     device, channels = projected.device, backgrounds.shape[1]
-    shape = (backgrounds.shape[0], settings.height, settings.width)
+    shape = (backgrounds.shape[0], *settings.window[:1:-1])
     rgb = allocator.output((*shape, channels), torch.float32, device) if image is None else image
     alpha, depth = (allocator.output(shape, torch.float32, device) for _ in range(2))
     transmittances, weights = allocator.saved((2, *(shape if save else (0,))), torch.float32, device).unbind()
@@ -198,7 +198,7 @@ def backward(
     projected: torch.Tensor,
     tiles: Tiles,
     backgrounds: torch.Tensor,
-    settings: BlendSettings,
+    settings: Pass,
     saved: Sequence[torch.Tensor],
     v_images: Sequence[torch.Tensor | None],
     allocator: Allocator = TORCH,
@@ -230,9 +230,7 @@ def backward(
     return v_projected
 
 
-def instance_weights(
-    projected: torch.Tensor, tiles: Tiles, settings: BlendSettings, ends: torch.Tensor, weights: torch.Tensor
-) -> None:
+def instance_weights(projected: torch.Tensor, tiles: Tiles, settings: Pass, ends: torch.Tensor, weights: torch.Tensor) -> None:
     """Write sum and maximum of each instance's blending weight over its tile's pixels, in slot order, to ``weights`` [M, 2]."""
     inputs = [
         settings.struct(tiles.size, wp.float32), projected, tiles.ranges, tiles.gaussian_ids, tiles.slots, ends, weights

@@ -1,14 +1,13 @@
 """From a Gaussian to its ellipse in the image: the functions that all forms of the projection share, and their gradients."""
 
 import functools
-from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import NamedTuple, Self
 
 import torch
 import warp as wp
 
-from warpgs.constants import COVARIANCE_TOLERANCE, FARTHEST_PIXEL, LARGEST_AXIS, SHORTEST_QUAT, SMALLEST_DETERMINANT, Rule
+from warpgs.constants import COVARIANCE_TOLERANCE, FARTHEST_PIXEL, LARGEST_AXIS, SHORTEST_QUAT, SMALLEST_DETERMINANT
 from warpgs.errors import UsageError
 from warpgs.kernels import launch, sh
 from warpgs.kernels.cameras import CAMERA_MODELS
@@ -108,40 +107,13 @@ OFF_DIAGONAL = ((0, 1), (0, 2), (1, 2))
 """Rows and columns of the entries of a covariance above the diagonal, in the order in which they are packed."""
 
 
-@dataclass(frozen=True)
-class ProjectSettings:
-    """Everything that a projection depends on besides tensors."""
-
-    size: tuple[int, int]
-    """Width and height of the image [px]."""
-    window: tuple[int, int, int, int]
-    """Left, top, width and height [px] of the part that is rendered; left and top are multiples of ``tile_size``."""
-    sh_count: int
-    """Number of spherical-harmonics coefficients per channel that are used."""
-    rule: Rule
-    """Cut-offs."""
-    tile_size: int
-    """Side of a tile [px]."""
-    camera_model: str
-    """Name of the camera model."""
-    parameters: str = "stored"
-    """Parameters in `ProjectInputs`: ``stored`` log scales and logits, ``activated`` scales and opacities, or ``covariances``
-    (as `packed_covariances` returns them) and opacities."""
-    antialiased: bool = False
-    """True to multiply each opacity by sqrt(det(cov2d) / det(cov2d + low_pass I)) (docs/project.md)."""
-
-    def variant(self) -> tuple[str, str, bool, int]:
-        """Return the settings that are compiled into the kernels."""
-        return self.camera_model, self.parameters, self.antialiased, sh.bases_for(self.sh_count)
-
-
 class ProjectInputs(NamedTuple):
     """The tensors of a projection, of one scalar type and on one device."""
 
     means: torch.Tensor
     """World positions [u], shape [N, 3]."""
     quats: torch.Tensor
-    """Rotations wxyz, or entries xy, xz, yz of covariances and a 0 (`ProjectSettings.parameters`), shape [N, 4]."""
+    """Rotations wxyz, or entries xy, xz, yz of covariances and a 0 (`Pass.parameters`), shape [N, 4]."""
     log_scales: torch.Tensor
     """Logarithm of the axis lengths [u], the lengths themselves, or the diagonals of covariances, shape [N, 3]."""
     logit_opacities: torch.Tensor

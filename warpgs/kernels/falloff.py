@@ -6,7 +6,8 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from warpgs.constants import Rule
+from warpgs.constants import TILE_SIZE, Rule
+from warpgs.kernels import sh
 from warpgs.kernels.tiles import grid
 
 
@@ -34,29 +35,41 @@ def make_struct(real):
 
 
 @dataclass(frozen=True)
-class BlendSettings:
-    """Window, cut-offs and order of sums."""
+class Pass:
+    """Everything besides tensors that a pass of the rasterizer depends on: projection, binning and blending."""
 
-    origin: tuple[int, int]
-    """Left and top of the window [px], at the corner of a tile."""
-    width: int
-    """Width of the window [px]."""
-    height: int
-    """Height of the window [px]."""
+    size: tuple[int, int]
+    """Width and height of the whole image [px]."""
+    window: tuple[int, int, int, int]
+    """Left, top, width and height [px] of the part that is rendered; left and top are multiples of ``tile_size``."""
     rule: Rule
     """Cut-offs."""
+    sh_count: int = 1
+    """Number of spherical-harmonics coefficients per channel that are used."""
+    tile_size: int = TILE_SIZE
+    """Side of a tile [px]."""
+    camera_model: str = "pinhole"
+    """Name of the camera model."""
+    parameters: str = "stored"
+    """Parameters in `ProjectInputs`: ``stored`` log scales and logits, ``activated`` scales and opacities, or ``covariances``
+    (as `packed_covariances` returns them) and opacities."""
+    antialiased: bool = False
+    """True to multiply each opacity by sqrt(det(cov2d) / det(cov2d + low_pass I)) (docs/project.md)."""
     deterministic: bool = True
     """True to sum gradients in a fixed order on every device."""
     absgrad: bool = False
     """True to sum magnitudes of the mean's gradient over pixels, too; the gradient of the box holds these sums."""
 
+    def variant(self) -> tuple[str, str, bool, int]:
+        """Return the settings that are compiled into the kernels of the projection."""
+        return self.camera_model, self.parameters, self.antialiased, sh.bases_for(self.sh_count)
+
     @functools.lru_cache(maxsize=256)  # noqa: B019 - to make it takes 20 us, and steps ask for the same ones again
     def struct(self, tile_size: int, real):
-        """Return the struct for kernels of one scalar type and tiles of ``tile_size`` px; callers must not change it."""
-        columns, rows = grid(self.width, self.height, tile_size)
+        """Return the struct for blending kernels of one scalar type, and tiles of ``tile_size`` px; not to be changed."""
         found = make_struct(real)()
-        found.origin_x, found.origin_y = self.origin
-        found.width, found.height = self.width, self.height
+        found.origin_x, found.origin_y, found.width, found.height = self.window
+        columns, rows = grid(*self.window[2:], tile_size)
         found.columns, found.tiles = columns, columns * rows
         rule = self.rule
         found.alpha_cut, found.alpha_max, found.stop = rule.alpha_cut, rule.alpha_max, rule.transmittance_stop

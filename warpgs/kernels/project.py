@@ -11,7 +11,8 @@ from warpgs.device import BINNING, BLENDING, FLOAT, LOSS, PROJECTION, SAMPLING, 
 from warpgs.errors import UsageError
 from warpgs.kernels import launch, project_cpu, project_cuda, sh
 from warpgs.kernels.cameras import CAMERA_MODELS
-from warpgs.kernels.ellipse import PROJECTED_SIZE, ProjectInputs, ProjectSettings, checked_factors
+from warpgs.kernels.ellipse import PROJECTED_SIZE, ProjectInputs, checked_factors
+from warpgs.kernels.falloff import Pass
 from warpgs.kernels.launch import TORCH, Allocator, first_order, keep, kept
 from warpgs.kernels.native import BLOCK
 from warpgs.kernels.project_cpu import LANES
@@ -34,9 +35,7 @@ def _threads_each(tensor: torch.Tensor) -> bool:
     return tensor.is_cuda
 
 
-def project_tensors(
-    inputs: ProjectInputs, settings: ProjectSettings, allocator: Allocator = TORCH
-) -> tuple[torch.Tensor, torch.Tensor]:
+def project_tensors(inputs: ProjectInputs, settings: Pass, allocator: Allocator = TORCH) -> tuple[torch.Tensor, torch.Tensor]:
     """Return projected Gaussians [C, N, 12] and tile counts [C, N], int32, of contiguous tensors. Nothing is checked."""
     means, real = inputs.means, launch.real_of(inputs.means)
     cameras, count, rule = len(inputs.viewmats), len(means), settings.rule
@@ -77,7 +76,7 @@ class _Project(torch.autograd.Function):
 
 def project_gradients(
     inputs: Sequence[torch.Tensor],
-    settings: ProjectSettings,
+    settings: Pass,
     projected: torch.Tensor,
     tile_counts: torch.Tensor,
     v_projected: torch.Tensor | None,
@@ -141,10 +140,10 @@ def project(
     factors = checked_factors(means, opacity_factors)
     inputs = ProjectInputs(means, quats, log_scales, logit_opacities, sh_coefficients, viewmats, Ks, distortion, factors)
     count, window = sh.coefficient_count(degree), window or (0, 0, width, height)
-    return project_inputs(inputs, ProjectSettings((width, height), window, count, rule, tile_size, camera_model))
+    return project_inputs(inputs, Pass((width, height), window, rule, count, tile_size, camera_model))
 
 
-def project_inputs(inputs: ProjectInputs, settings: ProjectSettings) -> tuple[torch.Tensor, torch.Tensor]:
+def project_inputs(inputs: ProjectInputs, settings: Pass) -> tuple[torch.Tensor, torch.Tensor]:
     """Return projected Gaussians [C, N, 12] and tile counts [C, N], int32, as `project` does."""
     model = CAMERA_MODELS.find(settings.camera_model)
     scales, opacities = ("log_scales", "logit_opacities") if settings.parameters == "stored" else ("scales", "opacities")

@@ -15,7 +15,7 @@ from warpgs.kernels.native import make_functions as make_native
 def make_forward(
     real, camera_model: str, parameters: str = "stored", antialiased: bool = False, bases: int = sh.BASES
 ):  # fmt: skip
-    """Make the forward kernel of one `ProjectSettings.variant`. It computes colours last, because they need the most data."""
+    """Make the forward kernel of one `Pass.variant`. It computes colours last, because they need the most data."""
     # In float32 the first threads of each block compute the colours of the Gaussians that touch a tile.
     native = real is wp.float32
     m = make_projection(real, camera_model, parameters)

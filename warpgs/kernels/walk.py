@@ -11,7 +11,7 @@ from warpgs.kernels import blend_cuda, launch
 from warpgs.kernels.blend import check_slots, check_tiles, composite, is_native, make_segments
 from warpgs.kernels.blend_cuda import SCALE
 from warpgs.kernels.ellipse import PROJECTED_SIZE
-from warpgs.kernels.falloff import STRIP, BlendSettings, make_functions, make_struct
+from warpgs.kernels.falloff import STRIP, Pass, make_functions, make_struct
 from warpgs.kernels.native import ROLLED, cuda_kernel, source
 from warpgs.kernels.tiles import Tiles
 
@@ -150,7 +150,7 @@ def make_contributions(real):
     return visit
 
 
-def _walk(make_visit, projected: torch.Tensor, tiles: Tiles, settings: BlendSettings, k: int, *outputs: torch.Tensor) -> None:
+def _walk(make_visit, projected: torch.Tensor, tiles: Tiles, settings: Pass, k: int, *outputs: torch.Tensor) -> None:
     """Launch the generic kernel of a visitor over projected Gaussians [C, N, 12]; outputs may be fewer than its three."""
     ints = tiles.ranges.new_empty(0)
     inputs = [
@@ -187,7 +187,7 @@ def make_native(tile_size: int):
     return SimpleNamespace(median=median, heaviest=heaviest)
 
 
-def _launch_native(kernel, projected: torch.Tensor, tiles: Tiles, settings: BlendSettings, *rest: object) -> None:
+def _launch_native(kernel, projected: torch.Tensor, tiles: Tiles, settings: Pass, *rest: object) -> None:
     """Launch a kernel of `make_native`."""
     inputs = [settings.struct(tiles.size, wp.float32), projected, tiles.ranges, tiles.gaussian_ids, *rest]
     pixels = tiles.size * tiles.size
@@ -202,7 +202,7 @@ def median_depth(
     # unlike the mean depth of `blend`. Not differentiable. Results repeat bit for bit with any number of threads.
     check_tiles(projected, tiles, width, height)
     projected = projected.detach().contiguous()
-    settings, depths = BlendSettings(origin, width, height, rule), projected.new_zeros(len(projected), height, width)
+    settings, depths = Pass((width, height), (*origin, width, height), rule), projected.new_zeros(len(projected), height, width)
     if is_native(projected):
         _launch_native(make_native(tiles.size).median, projected, tiles, settings, depths)
     else:
@@ -220,7 +220,7 @@ def heaviest(
     if k < 1:
         raise ValueError(f"the number of heaviest Gaussians must be at least 1, not {k}")
     projected = projected.detach().contiguous()
-    settings, shape = BlendSettings(origin, width, height, rule), (len(projected), height, width)
+    settings, shape = Pass((width, height), (*origin, width, height), rule), (len(projected), height, width)
     weights = projected.new_zeros(*shape, k)
     ids = torch.full((*shape, k), -1, dtype=torch.int32, device=projected.device)
     counts = torch.zeros(shape, dtype=torch.int32, device=projected.device)
@@ -239,7 +239,7 @@ def contributions(
     check_tiles(projected, tiles, width, height)
     check_slots(tiles)
     projected = projected.detach().contiguous()
-    settings, weights = BlendSettings(origin, width, height, rule), projected.new_zeros(len(tiles.slots), 2)
+    settings, weights = Pass((width, height), (*origin, width, height), rule), projected.new_zeros(len(tiles.slots), 2)
     if is_native(projected):
         ends = composite(projected, tiles, projected.new_zeros(len(projected), 3), settings, save=False)[5]
         blend_cuda.instance_weights(projected, tiles, settings, ends, weights)

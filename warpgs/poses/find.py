@@ -76,12 +76,6 @@ def reason(found: Mapping, i: int, names: Sequence[str]) -> str:
     return f"{matched}, which has no pose either{together}"
 
 
-def axis_angle(found: Mapping, i: int, j: int) -> float:
-    """Return the angle between the optical axes of two views [degrees]."""
-    cosine = float((found.views[i].rotation[2] * found.views[j].rotation[2]).sum())
-    return float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
-
-
 def neighbours(found: Mapping) -> list[tuple[int, int, float]]:
     """Return the pairs of views that connect all views by the smallest angles (a minimum spanning tree), with their angles."""
     last, *left = list(found.views) or [-1]
@@ -89,7 +83,8 @@ def neighbours(found: Mapping) -> list[tuple[int, int, float]]:
     tree = []
     while nearest:
         for j, best in nearest.items():
-            nearest[j] = min(best, (axis_angle(found, last, j), last))
+            cosine = float((found.views[last][0][2] * found.views[j][0][2]).sum())  # of the optical axes
+            nearest[j] = min(best, (float(np.degrees(np.arccos(np.clip(cosine, -1, 1)))), last))
         (angle, i), last = min((best, j) for j, best in nearest.items())
         del nearest[last]
         tree.append((min(i, last), max(i, last), angle))
@@ -156,7 +151,7 @@ def record_of(found: Mapping, photographs: Sequence[Photograph], digest: str, no
         registered = i in found.views
         rows.append({
             "name": p.name, "sha256": p.digest, "registered": registered, "keypoints": found.keypoints[i],
-            "points": found.views[i].points if registered else 0,
+            "points": found.views[i][1] if registered else 0,
             "matches": {names[j]: n for j, n in partners(found, i)[:SHOWN_PARTNERS]},
             "reason": None if registered else reason(found, i, names),
         })  # fmt: skip
@@ -183,13 +178,13 @@ def record_of(found: Mapping, photographs: Sequence[Photograph], digest: str, no
         "notes": [*notes, *remarks],
         "advice": advice(found, names), "mean_reprojection_error_px": found.error, "points": found.points,
         "method": found.method, "pairs_tried": found.tried, "pairs_matched": len([n for n in found.matches.values() if n]),
-        "cameras": [dict(vars(c)) for c in found.cameras], "pycolmap": found.version,
+        "cameras": list(found.cameras), "pycolmap": found.version,
     }  # fmt: skip
 
 
 def summary(found: Mapping, count: int) -> str:
     """Return a sentence on how many of ``count`` photographs have a pose, and how well they fit."""
-    focal = ", ".join(f"{c.focal:.0f} px of {max(c.width, c.height)}" for c in found.cameras)
+    focal = ", ".join(f"{c['focal']:.0f} px of {max(c['width'], c['height'])}" for c in found.cameras)
     return (
         f"poses found for {len(found.views)} of {count} photographs from {found.points:,} points, mean reprojection error "
         f"{found.error:.2f} px, {found.method} mapping, focal length {focal}"
@@ -216,22 +211,8 @@ def report_lines(record: dict[str, Any]) -> list[str]:
     return lines + [f"- {a}" for a in record["advice"]]
 
 
-def write_record(folder: Path, record: dict[str, Any]) -> None:
-    """Write poses.json and poses.txt into a folder.
-
-    Raises:
-        ResourceError: The disk is full.
-    """
-    write_json(folder / JSON, record)
-    write_text(folder / TEXT, "\n".join(report_lines(record)) + "\n")
-
-
 def read_poses_record(folder: Path) -> dict[str, Any]:
-    """Read poses.json of a scene whose poses were found.
-
-    Raises:
-        DataError: The record is missing or incomplete.
-    """
+    """Read poses.json of a scene whose poses were found."""
     path = folder / JSON
     try:
         record: dict[str, Any] = schema.read(path, folder)
@@ -262,11 +243,7 @@ def needs_poses(path: Path) -> bool:
 
 
 def source_digest(source: Path, allow_outside: bool = False) -> str:
-    """Return the SHA-256 over the names and contents of a source's photographs, or of a video.
-
-    Raises:
-        DataError: A file cannot be read, or a link points outside the folder and that is not allowed.
-    """
+    """Return the SHA-256 over the names and contents of a source's photographs, or of a video."""
     total = hashlib.sha256()
     if is_video(source):
         return _digest(source)
@@ -295,32 +272,7 @@ def find_poses(
     matcher: str | Path | None = None,
     progress: Callable[[str], object] = lambda line: None,
 ) -> dict[str, Any]:
-    """Find the poses of photographs or of a video's sharpest frames, and write a scene folder with the registered ones.
-
-    The folder appears whole or not at all. It contains ``images``, upright and without metadata; ``sparse/0``, a COLMAP model;
-    and a record of which photographs have a pose, with reasons (poses.json, poses.txt).
-
-    Args:
-        source: Folder of images, or a video file.
-        out: Scene folder to make; new or empty.
-        frames: Number of frames to take from a video.
-        threads: CPU threads; 0 for as many as there are cores.
-        max_pixels: Largest number of pixels that an image may have.
-        allow_outside: True to allow links to photographs outside the folder.
-        matcher: ONNX file of `warpgs priors export --model xfeat`, which is used if SIFT leaves photographs without a pose;
-            None for SIFT only.
-        progress: Called with lines for the user.
-
-    Returns:
-        The record, as poses.json holds it.
-
-    Raises:
-        DataError: There are too few photographs, one is outside the folder or cannot be decoded, fewer than three match, or the
-            matcher is invalid.
-        ResourceError: pycolmap failed, or the folder cannot be written.
-        UsageError: pycolmap, or pi-heif for HEIC, is not installed; ``source`` is a run or holds scenes; or ``out`` is not
-            empty.
-    """
+    """Find the poses of photographs or of a video's sharpest frames; write a scene folder, whole or not at all."""
     source, out = Path(source), Path(out)
     _check(source, out, allow_outside)
     check_installed()
@@ -343,7 +295,8 @@ def find_poses(
         for name in MODEL_FILES:
             if (work / "model" / name).is_file():
                 write_bytes(scene / "sparse" / "0" / name, (work / "model" / name).read_bytes())
-        write_record(scene, record)
+        write_json(scene / JSON, record)
+        write_text(scene / TEXT, "\n".join(report_lines(record)) + "\n")
         shutil.rmtree(work)
     return record
 
@@ -352,11 +305,8 @@ def _with_network(
     network: Matcher, found: Mapping, photographs: list[Photograph], names: list[str], kind: str, work: Path,
     progress: Callable[[str], object], threads: int,
 ) -> tuple[Mapping, list[str]]:  # fmt: skip
-    """Return the model from the network's matches if it has more photographs than SIFT's, and notes.
-
-    The network runs only if SIFT leaves photographs without a pose. The model lies in ``work``/model. Arguments are those of
-    `find_model`.
-    """
+    """Return the model from the network's matches if it has more photographs than SIFT's, and notes."""
+    # the network, which is less accurate, runs only if SIFT leaves photographs without a pose
     count = len(found.views)
     if count == len(photographs):
         return found, [f"{network.title} is not used: SIFT finds the poses of all photographs, and is more accurate"]

@@ -31,32 +31,6 @@ LAST_WORDS = 500
 
 
 @dataclass(frozen=True)
-class FoundView:
-    """A photograph with a pose."""
-
-    rotation: np.ndarray
-    """Rotation of camera_from_world, shape [3, 3]."""
-    center: np.ndarray
-    """Camera centre [file units], shape [3]."""
-    points: int
-    """Number of points that the photograph sees."""
-
-
-@dataclass(frozen=True)
-class FoundCamera:
-    """Intrinsics that were found, of one or more photographs."""
-
-    focal: float
-    """Focal length [px of the photograph]."""
-    distortion: float
-    """Coefficient of the radius squared, on the plane at distance 1."""
-    width: int
-    """Image width [px]."""
-    height: int
-    """Image height [px]."""
-
-
-@dataclass(frozen=True)
 class Mapping:
     """Result of structure from motion; photographs are indexed in the order of their names."""
 
@@ -66,10 +40,11 @@ class Mapping:
     """Number of matches that agree with one motion of the camera, by pair, the smaller index first."""
     tried: int
     """Number of pairs that were matched."""
-    views: dict[int, FoundView]
-    """Views of the largest model."""
-    cameras: tuple[FoundCamera, ...]
-    """Cameras of the views in ``views``."""
+    views: dict[int, tuple[np.ndarray, int]]
+    """Views of the largest model: rotation of camera_from_world, shape [3, 3], and the number of points that the view sees."""
+    cameras: tuple[dict[str, float], ...]
+    """Cameras of ``views``: focal length [px of the photograph], distortion (coefficient of the radius squared, on the plane at
+    distance 1), width and height [px]."""
     groups: tuple[tuple[int, ...], ...]
     """Photographs of each model, the largest first: photographs of different models share too little."""
     points: int
@@ -96,11 +71,7 @@ class Mapping:
 
 
 def check_installed() -> None:
-    """Check that pycolmap is installed.
-
-    Raises:
-        UsageError: pycolmap is not installed.
-    """
+    """Raise a UsageError if pycolmap is not installed."""
     if importlib.util.find_spec("pycolmap") is None:
         raise UsageError(f"finding poses needs pycolmap, which is not installed; {install_extras('poses')}")
 
@@ -169,22 +140,7 @@ def find_model(
     threads: int = 0,
     learned: bool = False,
 ) -> Mapping:
-    """Find poses of photographs and write the model of those that fit together into ``folder``/model, in COLMAP's files.
-
-    The same photographs give the same bits on the same machine with any number of threads, except with the global mapper.
-
-    Args:
-        photographs: The photographs, sorted by name.
-        names: Names of their copies in ``folder``/small.
-        kind: photographs or video.
-        folder: Folder to work in.
-        progress: Called with lines for the user.
-        threads: CPU threads; 0 for as many as there are cores.
-        learned: True if ``folder`` contains keypoints and matches of a network instead of SIFT's.
-
-    Raises:
-        ResourceError: pycolmap failed.
-    """
+    """Find poses of photographs and write the model of those that fit together into ``folder``/model, in COLMAP's files."""
     result: dict[str, Any] | None = None
     for said in _lines(_job(photographs, names, kind, folder, threads or usable_cores(), learned), folder):
         if "progress" in said:
@@ -192,16 +148,14 @@ def find_model(
         result = said.get("result", result)
     if result is None:
         raise ResourceError("pycolmap ended without a result; try again, with fewer photographs if memory is short")
-    index, model = (
-        {n: i for i, n in enumerate(names)},
-        result["model"] or {"views": {}, "cameras": {}, "points": 0, "error": 0.0},
-    )
-    views = {int(i): FoundView(np.array(v["rotation"]), np.array(v["center"]), v["points"]) for i, v in model["views"].items()}
+    index = {n: i for i, n in enumerate(names)}
+    model = result["model"] or {"views": {}, "cameras": {}, "points": 0, "error": 0.0}
+    views = {int(i): (np.array(v["rotation"]), v["points"]) for i, v in model["views"].items()}
     p = photographs[min(views, default=0)]
     scale = max(1.0, max(p.width, p.height) / MATCHING_SIDE)
     return Mapping(
         tuple(result["keypoints"]), {(i, j): n for i, j, n in result["pairs"]}, result["tried"], dict(sorted(views.items())),
-        tuple(FoundCamera(**c) for c in model["cameras"].values()),
+        tuple(model["cameras"].values()),
         tuple(tuple(sorted(index[n] for n in group)) for group in result["groups"]),
         model["points"], scale * model["error"], result["method"], result["version"], result["kept_focal"],
     )  # fmt: skip
@@ -361,11 +315,8 @@ def map_incrementally(pycolmap: Any, job: dict[str, Any], keep_focal: bool = Fal
 
 
 def believes_exif(kept: list[Any], free: list[Any]) -> bool:
-    """Return whether EXIF's focal length is kept: models ``kept`` have it, for models ``free`` it was estimated.
-
-    The best of ``kept`` must have at least as many photographs as the best of ``free``, and at most `MAX_RATIO` times its
-    error. If a list is empty, return whether ``kept`` has models.
-    """
+    """Return whether EXIF's focal length is kept: models ``kept`` have it, for models ``free`` it was estimated."""
+    # as many photographs, and not much more error; without one of the lists, whether there are ``kept`` models
     if not kept or not free:
         return bool(kept)
     best, other = (max(m, key=lambda r: (r.num_reg_images(), r.num_points3D())) for m in (kept, free))
@@ -395,9 +346,8 @@ def finish(model: Any, job: dict[str, Any]) -> dict[str, Any]:
     for number in model.reg_image_ids():
         image = model.image(number)
         i = index[image.name]
-        pose = image.cam_from_world()
-        views[i] = {"rotation": pose.rotation.matrix().tolist(), "center": image.projection_center().tolist(),
-                    "points": image.num_points3D, "camera": image.camera_id}  # fmt: skip
+        rotation = image.cam_from_world().rotation.matrix().tolist()
+        views[i] = {"rotation": rotation, "points": image.num_points3D, "camera": image.camera_id}
         small, (width, height) = image.camera, job["sizes"][i]
         scale = [width / small.width, height / small.height]
         for point in image.points2D:

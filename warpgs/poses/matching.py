@@ -38,12 +38,7 @@ LOOKALIKES = {"photographs": 20, "video": 5}
 
 
 def vocabulary(descriptors: list[np.ndarray], seed: int = 0) -> np.ndarray:
-    """Return the words of a vocabulary, integers as float32 [W, D], by k-means on sampled descriptors.
-
-    Args:
-        descriptors: Descriptors of each photograph, by SIFT or a network, uint8 [K, D].
-        seed: Seed of the sample.
-    """
+    """Return a vocabulary's words, integers as float32 [W, D], by k-means on sampled descriptors, uint8 [K, D] each."""
     generator = np.random.default_rng(seed)
     rows = np.concatenate(descriptors).astype(np.float32)
     rows = rows[np.sort(generator.permutation(len(rows))[:SAMPLES])]
@@ -63,12 +58,7 @@ def _nearest(rows: np.ndarray, centers: np.ndarray) -> np.ndarray:
 
 
 def similarity(descriptors: list[np.ndarray], seed: int = 0) -> np.ndarray:
-    """Return the similarity of each pair of photographs: the cosine of their tf-idf vectors, in [0, 1], float64 [N, N].
-
-    Args:
-        descriptors: Descriptors of each photograph, by SIFT or a network, uint8 [K, D].
-        seed: Seed of the vocabulary.
-    """
+    """Return the cosine of the tf-idf vectors of each pair of photographs, in [0, 1], float64 [N, N]."""
     if not any(len(d) for d in descriptors):
         return np.zeros((len(descriptors), len(descriptors)))
     words = vocabulary(descriptors, seed)
@@ -81,13 +71,7 @@ def similarity(descriptors: list[np.ndarray], seed: int = 0) -> np.ndarray:
 
 
 def choose_pairs(descriptors: list[np.ndarray], kind: str, seed: int = 0) -> list[tuple[int, int]]:
-    """Choose the pairs of photographs to match, each as two indices, the smaller one first, in ascending order.
-
-    Args:
-        descriptors: Descriptors of each photograph, by SIFT or a network, in the order of names, uint8 [K, D].
-        kind: photographs or video, which determines `NEIGHBOURS` and `LOOKALIKES`.
-        seed: Seed of the vocabulary.
-    """
+    """Choose pairs of photographs to match, in ascending order, by their descriptors, uint8 [K, D] each."""
     count, alike = len(descriptors), similarity(descriptors, seed)
     np.fill_diagonal(alike, -1)
     pairs = {(i, j) for i in range(count) for j in range(i + 1, min(count, i + 1 + NEIGHBOURS[kind]))}
@@ -151,17 +135,7 @@ class Matcher:
         return f"{self.path.name} (SHA-256 {self.sha256[:12]})"
 
     def features(self, image: np.ndarray, turns: int = 0, side: int = SIDE, most: int = MAX_KEYPOINTS) -> Features:
-        """Return the keypoints of an image.
-
-        Args:
-            image: The image before rotation, uint8 RGB [H, W, 3].
-            turns: Quarter turns to the left by which the image is rotated first.
-            side: Longer side at which the network sees the image [px], unless its graph fixes the size.
-            most: Largest number of keypoints; those with the highest scores are kept.
-
-        Raises:
-            DataError: onnxruntime cannot run the network, or its outputs are not those of a matcher.
-        """
+        """Return the keypoints of an image, uint8 RGB [H, W, 3], after ``turns`` quarter turns to the left."""
         import cv2
 
         image = np.ascontiguousarray(np.rot90(image, turns))
@@ -210,17 +184,7 @@ def _network_size(height: int, width: int, side: int) -> tuple[int, int]:
 
 
 def open_matcher(path: str | Path, threads: int = 0) -> Matcher:
-    """Open an ONNX file and check that it maps one image to keypoints.
-
-    Args:
-        path: The file; its weights must be inside.
-        threads: CPU threads; 0 for as many as the process may use.
-
-    Raises:
-        DataError: The file is missing, not an ONNX model, needs other files or foreign operators, or has other inputs or
-            outputs.
-        ResourceError: onnxruntime is missing.
-    """
+    """Open an ONNX file and check that it maps one image to keypoints."""
     path = Path(path)
     data = read_model(path)
     session = start_session(data, path, "cpu", threads)
@@ -252,16 +216,8 @@ def mutual_matches(a: Features, b: Features) -> np.ndarray:
 
 
 def quarter_turns(matcher: Matcher, images: Iterable[np.ndarray], pairs: Sequence[tuple[int, int]]) -> list[int]:
-    """Return the quarter turns to the left after which photographs have the same side up; for most photographs 0.
-
-    Each pair is matched with the second photograph in all four turns. The pairs with the most matches, a maximum spanning tree,
-    decide.
-
-    Args:
-        matcher: The network.
-        images: The photographs, uint8 RGB [H, W, 3].
-        pairs: Pairs of photographs that may show the same place.
-    """
+    """Return the quarter turns to the left after which photographs have the same side up; for most photographs 0."""
+    # each pair is matched with the second photograph in all turns; those with most matches, a spanning tree, decide
     found = [[matcher.features(image, t, TURN_SIDE, TURN_KEYPOINTS) for t in range(4)] for image in images]
     links = []
     for i, j in pairs:
@@ -283,19 +239,7 @@ def quarter_turns(matcher: Matcher, images: Iterable[np.ndarray], pairs: Sequenc
 def write_matches(
     matcher: Matcher, images: Sequence[Path], out: Path, kind: str, exhaustive: int, progress: Callable[[str], object]
 ) -> list[int]:
-    """Find keypoints and matches of photographs, and write them for the worker.
-
-    Args:
-        matcher: The network.
-        images: Copies of the photographs that are matched, PNG.
-        out: File to write, .npz.
-        kind: photographs or video.
-        exhaustive: Largest number of photographs of which all pairs are matched.
-        progress: Called with lines for the user.
-
-    Returns:
-        Indices of the photographs that were rotated before the network saw them, because they then match others better.
-    """
+    """Write keypoints and matches of photographs for the worker; return the indices of the photographs that it rotated."""
     found = []
     for i, image in enumerate(images):
         progress(f"finding features: photograph {i + 1} of {len(images)}")

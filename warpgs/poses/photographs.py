@@ -51,13 +51,8 @@ KEPT_CHUNKS = (b"IHDR", b"PLTE", b"tRNS", b"IDAT", b"IEND")
 
 
 def without_jpeg_metadata(data: bytes) -> bytes:
-    """Return a JPEG file that decodes to the same pixels, without comments and application segments (JFIF and Adobe stay).
-
-    Data after the end of the image are removed, too: phones store films and depth maps there.
-
-    Args:
-        data: A file that was decoded without an error.
-    """
+    """Return a decodable JPEG file without comments, application segments (JFIF and Adobe stay) and trailing data."""
+    # phones store films and depth maps after the end of the image
     parts, at = [data[:2]], 2
     while found := MARKER.match(data, at):
         marker, begin, at = found[1][0], at, found.end()
@@ -74,11 +69,7 @@ def without_jpeg_metadata(data: bytes) -> bytes:
 
 
 def without_png_metadata(data: bytes) -> bytes:
-    """Return a PNG file with only those chunks that hold pixels.
-
-    Args:
-        data: A file that was decoded without an error.
-    """
+    """Return a decodable PNG file with only those chunks that hold pixels."""
     parts, at = [PNG_START], len(PNG_START)
     while at + 12 <= len(data):
         kind, begin = data[at + 4 : at + 8], at
@@ -169,21 +160,7 @@ def sharpest(values: list[float], count: int) -> list[int]:
 
 
 def write_frames(path: Path, folder: Path, count: int, progress: Callable[[str], object]) -> int:
-    """Write the sharpest frame of each of ``count`` equal parts of a video as PNG files, named by their number.
-
-    Args:
-        path: The video file.
-        folder: Folder to write into.
-        count: Number of frames to write; all frames if the video has fewer.
-        progress: Called with a line for the user for each frame.
-
-    Returns:
-        The number of frames that the video has.
-
-    Raises:
-        DataError: The video cannot be read, or is too long.
-        ResourceError: The disk is full.
-    """
+    """Write the sharpest frame of each of ``count`` equal parts of a video as PNG; return the video's number of frames."""
     import cv2
 
     values = []
@@ -206,35 +183,16 @@ def write_frames(path: Path, folder: Path, count: int, progress: Callable[[str],
 # pi-heif (libheif and libde265, LGPL) reads them. A malicious file can crash the process that reads it, so one separate
 # process reads all photographs.
 
-QUALITY = 98
-"""JPEG quality of the copies, without subsampling of colours."""
-
 
 def is_heic(path: Path) -> bool:
-    """Return whether a file begins as a HEIC file does.
-
-    Raises:
-        DataError: The file cannot be read.
-    """
+    """Return whether a file begins as a HEIC file does."""
     return brand(read_image_file(path, start=BRANDS_END)) == "HEIC"
 
 
 def to_jpeg(
     paths: Sequence[Path], root: Path, folder: Path, max_pixels: int, progress: Callable[[str], object] = lambda line: None
 ) -> dict[Path, Path]:
-    """Write upright JPEG copies of HEIC files, with only maker, model and focal length as EXIF; return the copy of each.
-
-    Args:
-        paths: HEIC files below ``root``.
-        root: The folder of photographs.
-        folder: Folder of the copies, which have the relative names with .jpg added.
-        max_pixels: Largest number of pixels that a header may announce.
-        progress: Called with lines for the user.
-
-    Raises:
-        DataError: A file cannot be decoded, or has too many pixels.
-        UsageError: pi-heif is not installed.
-    """
+    """Write upright JPEG copies of HEIC files below ``root``, without private EXIF, into ``folder``; return each one's copy."""
     if not paths:
         return {}
     if importlib.util.find_spec("pi_heif") is None:
@@ -279,7 +237,7 @@ def _coded_again(source: Path, max_pixels: int) -> bytes:
         if found.focal is not None:
             kept.get_ifd(EXPOSURE)[FOCAL_35MM] = int(found.focal)
         pixels = io.BytesIO()
-        image.convert("RGB").save(pixels, "JPEG", quality=QUALITY, subsampling=0, exif=kept)
+        image.convert("RGB").save(pixels, "JPEG", quality=JPEG_QUALITY, subsampling=0, exif=kept)
     return pixels.getvalue()
 
 
@@ -307,7 +265,7 @@ MATCHING_SIDE = 2000
 DIAGONAL_35MM = math.hypot(36, 24)
 """Diagonal of 35 mm film [mm], by which the equivalent focal length in EXIF is defined (CIPA DCG-001)."""
 JPEG_QUALITY = 98
-"""Quality of a photograph that must be coded again since it is turned upright."""
+"""JPEG quality of photographs that must be coded again, since they are HEIC or turned upright."""
 
 
 @dataclass(frozen=True)
@@ -361,10 +319,7 @@ def _sorted_out(folder: Path) -> tuple[list[Path], list[str]]:
 
 
 def find_photographs(folder: Path) -> list[Path]:
-    """Return the image files of a folder of photographs, sorted by name; no file is opened.
-
-    Masks are left out, and so are the images of earlier runs below the folder.
-    """
+    """Return the image files of a folder, sorted by name, without masks and earlier runs; no file is opened."""
     return _sorted_out(folder)[0]
 
 
@@ -380,20 +335,14 @@ def folder_notes(folder: Path) -> list[str]:
 
 
 def photographs_inside(folder: Path, allow_outside: bool) -> list[Path]:
-    """Return the image files as `find_photographs` does, to be opened.
-
-    Raises:
-        DataError: A link points outside the folder, and that is not allowed.
-    """
+    """Return the image files as `find_photographs` does; a DataError for a link out of the folder, if not allowed."""
     found = find_photographs(folder)
     return found if allow_outside else [inside(p, folder, "the folder of photographs") for p in found]
 
 
 def scene_name(name: str, data: bytes) -> str:
-    """Return the name of a photograph in the scene: its own, with .png added where the file becomes a PNG.
-
-    Bytes that are not UTF-8, which COLMAP needs, are written as in addresses: ``b%E4r.jpg``.
-    """
+    """Return the name of a photograph in the scene: its own, with .png added where the file becomes a PNG."""
+    # COLMAP needs UTF-8: other bytes are written as in addresses, b%E4r.jpg
     name = UNDECODABLE.sub(lambda byte: f"%{ord(byte[0]) - 0xDC00:02X}", name)
     return name if _format(data) in ("JPEG", "PNG") else f"{name}.png"
 
@@ -406,18 +355,7 @@ def _format(data: bytes) -> str:
 
 
 def prepare(path: Path, root: Path, small: Path, max_pixels: int = MAX_PIXELS) -> Photograph:
-    """Read a photograph and write the upright copy that is matched, at most `MATCHING_SIDE` pixels wide and high.
-
-    Args:
-        path: The image file.
-        root: The folder of photographs.
-        small: File to write, a PNG.
-        max_pixels: Largest number of pixels that the file may have.
-
-    Raises:
-        DataError: The file cannot be decoded.
-        ResourceError: There is not enough memory, or the copy cannot be written.
-    """
+    """Read a photograph and write the upright copy that is matched, at most `MATCHING_SIDE` pixels wide and high."""
     import cv2
 
     data = read_image_file(path, max_pixels)
@@ -440,15 +378,7 @@ def prepare(path: Path, root: Path, small: Path, max_pixels: int = MAX_PIXELS) -
 
 
 def write_copy(photograph: Photograph, folder: Path, max_pixels: int = MAX_PIXELS) -> None:
-    """Write a photograph into the image folder of a scene: upright, at full size, and without its metadata.
-
-    JPEG and PNG files that are upright keep their coded pixels. Other files are coded again: JPEG files as JPEG of quality
-    `JPEG_QUALITY`, all others as PNG of 8 bits.
-
-    Raises:
-        DataError: The file has changed since it was matched.
-        ResourceError: The disk is full.
-    """
+    """Write a photograph into the image folder of a scene: upright, at full size, and without its metadata."""
     import cv2
 
     data = read_image_file(photograph.path, max_pixels)

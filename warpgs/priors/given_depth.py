@@ -11,6 +11,7 @@ import numpy as np
 from warpgs import geometry
 from warpgs.errors import DataError, UsageError
 from warpgs.priors.flow import nearest_views, pixel_grid
+from warpgs.priors.sweep import no_depth
 from warpgs.scene import DEPTH_KINDS, Camera, GivenDepth, PointCloud, View, ViewDepth
 
 # Given depth: converted to the scene's units, checked against consistent depth, and used instead of the depth of a
@@ -74,11 +75,7 @@ def any_given(views: Sequence[View]) -> bool:
 
 
 def check_given(views: Sequence[View]) -> None:
-    """Check the given maps of views that were made in Python; `load_scene` has checked those that it read.
-
-    Raises:
-        UsageError: A map has another size than its image, an unknown kind, or non-finite or out-of-range values.
-    """
+    """Check the given maps of views that were made in Python; `load_scene` has checked those that it read."""
     for v in views:
         size = v.image.shape[:2]
         maps = {} if v.depth is None else {"depth": v.depth.values, "confidence": v.depth.confidence}
@@ -101,11 +98,8 @@ def check_given(views: Sequence[View]) -> None:
 
 
 def fit_line(values: np.ndarray, wanted: np.ndarray) -> tuple[float, float]:
-    """Return scale and shift that map values [N] to wanted values [N] above 0 with the smallest relative differences.
-
-    The method is least squares, reweighted by Cauchy's function of the differences. It starts from the line through the medians
-    of the lower and the upper third.
-    """
+    """Return scale and shift that map values [N] to ``wanted`` [N], above 0, with the smallest relative differences."""
+    # least squares, reweighted by Cauchy's function, from the line through the medians of the lower and upper third
     order = np.argsort(values, kind="stable")
     third = max(1, len(order) // 3)
     low, high = order[:third], order[-third:]
@@ -142,13 +136,7 @@ def references(view: View, found: ViewDepth | None, known: PointCloud) -> tuple[
 
 
 def align(view: View, found: ViewDepth | None, known: PointCloud) -> Alignment:
-    """Return the conversion of a view's given depth to scene units; metric depth is only compared with the references.
-
-    Args:
-        view: A view with given depth.
-        found: Swept depth of the view, where other views confirm it; None without a sweep.
-        known: Points of the reconstruction, with the views that saw them.
-    """
+    """Return the conversion of a view's given depth to scene units; metric depth is only compared with the references."""
     assert view.depth is not None
     values, wanted = references(view, found, known)
     count, kind = len(values), view.depth.kind
@@ -186,17 +174,7 @@ def exact(given: GivenDepth, made: Alignment | None) -> bool:
 def votes(
     views: Sequence[View], depths: Sequence[np.ndarray], index: int, near: int = NEIGHBORS
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Count the other views that confirm each depth of a view, and those that see through it to a farther surface.
-
-    Args:
-        views: All views, pinholes.
-        depths: Depth of each view [u], 0 for missing values, shape [H, W] each.
-        index: Index of the view.
-        near: Number of nearest views to compare with.
-
-    Returns:
-        Both counts, int, shape [H, W].
-    """
+    """Count the other views that confirm each depth of a view, and that see through it, int [H, W] each."""
     own = depths[index]
     step = math.ceil(math.sqrt(np.count_nonzero(own) / MAX_POINTS)) if own.any() else 1
     coarse = own[::step, ::step]
@@ -218,21 +196,10 @@ def votes(
 def with_given_depth(
     views: Sequence[View], found: Sequence[ViewDepth] | None, known: PointCloud
 ) -> tuple[list[ViewDepth], list[str]]:
-    """Return the depth of each view, combined with its given depth, and notes.
-
-    A given depth is dropped where more views see through it than confirm it. The depth of an `exact` map replaces the estimate.
-    The depth of any other map is used only where another view confirms it and the estimate is missing or differs from it.
-    ``ViewDepth.given`` has all given depths that are not dropped, in scene units.
-
-    Args:
-        views: Training views, pinholes.
-        found: Estimated depth of each view, where other views confirm it; None if not estimated.
-        known: Points of the reconstruction.
-
-    Raises:
-        DataError: No map can be used; the message gives the reasons for the first maps.
-    """
-    before = [_unknown(v) for v in views] if found is None else list(found)
+    """Return the depth of each view (pinholes), combined with its given depth, and notes."""
+    # An `exact` map replaces the estimate. Any other is used only where another view confirms it and the estimate is missing
+    # or differs. Depths are dropped where more views see through them than confirm them.
+    before = [no_depth(v) for v in views] if found is None else list(found)
     made = [None if v.depth is None else align(v, d, known) for v, d in zip(views, before, strict=True)]
     given = [np.zeros(v.image.shape[:2], np.float32) for v in views]
     for i, (view, a) in enumerate(zip(views, made, strict=True)):
@@ -261,11 +228,6 @@ def with_given_depth(
             sensitivity=np.where(placing, 0, d.sensitivity).astype(np.float32), given=np.where(own, given[i], 0),
         ))  # fmt: skip
     return after, _notes(views, made, refused, removed / max(1, total))
-
-
-def _unknown(view: View) -> ViewDepth:
-    shape = view.image.shape[:2]
-    return ViewDepth(np.zeros(shape, np.float32), np.zeros(shape, bool), np.full(shape, np.inf, np.float32))
 
 
 def _remedy(views: Sequence[View], made: Sequence[Alignment | None]) -> str:
@@ -299,13 +261,7 @@ def _notes(
 
 
 def pinhole_view(view: View) -> View:
-    """Return a view resampled to a pinhole of the same K and size; a pinhole's view is returned unchanged.
-
-    Pixels that the lens did not see are removed from the mask. The rim of a wide fisheye is lost.
-
-    Raises:
-        UsageError: The camera is orthographic, or its model is only supported by the kernels.
-    """
+    """Return a view resampled to a pinhole of the same K and size; a pinhole's view is returned unchanged."""
     import cv2
 
     camera = view.camera

@@ -10,7 +10,7 @@ import sys
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -27,12 +27,9 @@ if TYPE_CHECKING:
 
 @contextlib.contextmanager
 def single_threaded_opencv() -> Iterator[None]:
-    """Keep OpenCV from starting threads in this process; our own threads call OpenCV in parallel.
-
-    Many OpenCV calls here are so short that starting threads costs time. The rounding of some calls depends on the number of
-    threads. With one thread, `cv2.distanceTransform` uses IPP's code, unless `without_ipp` turned it off. The fast global
-    smoother cuts an image into as many stripes as there are threads, and processes the last rows of a stripe by different code.
-    """
+    """Keep OpenCV from starting threads in this process; our own threads call OpenCV in parallel."""
+    # Starting threads takes longer than many calls, and the rounding of some depends on their number: with one,
+    # distanceTransform uses IPP's code (see `without_ipp`), and the fast global smoother cuts an image into fewer stripes.
     import cv2
 
     before = cv2.getNumThreads()
@@ -76,11 +73,7 @@ class Network:
         return f"{self.path.name} (SHA-256 {self.sha256[:12]})"
 
     def run(self, image: np.ndarray) -> np.ndarray:
-        """Return the output, float32 of any shape, for one prepared image [h, w, 3].
-
-        Raises:
-            DataError: onnxruntime cannot run the graph, or the output is NaN, infinite, or the same number everywhere.
-        """
+        """Return the output, float32 of any shape, for one prepared image [h, w, 3]."""
         batch = image[None] if self.layout == "nhwc" else image.transpose(2, 0, 1)[None]
         feed = {self.session.get_inputs()[0].name: np.ascontiguousarray(batch, dtype=self.type)}
         try:
@@ -118,44 +111,25 @@ def _input_axes(path: Path, shape: list) -> tuple[str, tuple[int, int] | None]:
 
 
 def open_network(path: str | Path, *, provider: str = "cpu", threads: int = 0) -> Network:
-    """Open an ONNX file and check that it maps one image to one output.
-
-    Args:
-        path: The file; its weights must be inside.
-        provider: cpu or cuda.
-        threads: CPU threads; 0 for as many as the process may use.
-
-    Returns:
-        The network.
-
-    Raises:
-        UsageError: The provider is neither cpu nor cuda.
-        DataError: The file is missing or not an ONNX model, needs other files or custom operators, or does not map one image to
-            one output.
-        ResourceError: onnxruntime or the provider is missing.
-    """
+    """Open an ONNX file, with its weights inside, and check that it maps one image to one output."""
     if provider not in PROVIDERS:
         raise UsageError(f"onnx-provider {provider!r} is not one of {', '.join(PROVIDERS)}")
     path = Path(path)
     data = read_model(path)
     session = start_session(data, path, provider, threads)
     try:
-        return _checked(path, data, session)
+        inputs = [(i.name, i.type, i.shape) for i in session.get_inputs()]  # names that are not UTF-8 fail here
+        names = {"input": [name for name, _, _ in inputs], "output": [o.name for o in session.get_outputs()]}
     except UnicodeDecodeError as e:
         raise DataError(f"{path}: the name of an input or an output is not UTF-8; export the network again") from e
-
-
-def _checked(path: Path, data: bytes, session: Any) -> Network:
-    """Return the network of a session that has one input and one output; DataError for others."""
-    inputs, outputs = session.get_inputs(), session.get_outputs()
-    for what, found in (("input", inputs), ("output", outputs)):
-        names = ", ".join(f.name for f in found)  # read even if unused: names that are not UTF-8 fail here
+    for what, found in names.items():
         if len(found) != 1:
-            raise DataError(f"{path}: it has {len(found)} {what}s ({names}); export it with only one")
-    if inputs[0].type not in TYPES:
-        raise DataError(f"{path}: its input is a {inputs[0].type}; float or float16 is needed")
-    layout, size = _input_axes(path, inputs[0].shape)
-    return Network(path, hashlib.sha256(data).hexdigest(), session, layout, size, TYPES[inputs[0].type])
+            raise DataError(f"{path}: it has {len(found)} {what}s ({', '.join(found)}); export it with only one")
+    _, kind, shape = inputs[0]
+    if kind not in TYPES:
+        raise DataError(f"{path}: its input is a {kind}; float or float16 is needed")
+    layout, size = _input_axes(path, shape)
+    return Network(path, hashlib.sha256(data).hexdigest(), session, layout, size, TYPES[kind])
 
 
 IMAGENET = ((0.485, 0.456, 0.406), (0.229, 0.224, 0.225))
@@ -192,11 +166,7 @@ class Preprocessing:
 
 
 def resize(image: np.ndarray, height: int, width: int) -> np.ndarray:
-    """Return an image [H, W] or [H, W, C] at another size, float32, pixel centres aligned at +0.5.
-
-    If neither side grows, pixels are averaged over areas, so that fine texture does not alias; else they are interpolated
-    linearly.
-    """
+    """Return an image [H, W] or [H, W, C] at another size, float32, pixel centres aligned at +0.5."""
     import cv2
 
     shrinks = height <= image.shape[0] and width <= image.shape[1]
@@ -227,11 +197,7 @@ KEYS: dict[str, tuple[str, Callable[[object], bool]]] = {
 
 
 def check_value(key: str, value: object, where: str, error: type[Exception] = UsageError) -> None:
-    """Check that a value may describe a network's input or output.
-
-    Raises:
-        UsageError: The value is invalid; ``error`` instead, if given.
-    """
+    """Raise ``error`` unless a value may describe a network's input or output."""
     wanted, good = KEYS[key]
     if not good(value):
         raise error(f"{where}: {key} must be {wanted}, not {value!r}")
@@ -243,11 +209,7 @@ def side_file(model: Path) -> Path:
 
 
 def read_side_file(model: Path) -> dict:
-    """Return the entries of the JSON file beside a model; none without such a file.
-
-    Raises:
-        DataError: The file is not a JSON object, or has an unknown key or value.
-    """
+    """Return the entries of the JSON file beside a model; none without such a file."""
     path = side_file(model)
     if not os.path.lexists(path):
         return {}
@@ -266,10 +228,7 @@ def read_side_file(model: Path) -> dict:
 
 
 def describe(network: Network, defaults: Preprocessing, kind: str) -> tuple[Preprocessing, list[str]]:
-    """Return the description of a network: the file beside the model, over the defaults; and a note on assumed values.
-
-    ``kind`` is depth or segmentation. DataError: the file beside the model is invalid, or its size is not that of the graph.
-    """
+    """Return a network's description (the file beside a depth or segmentation model, over the defaults), and assumptions."""
     given = read_side_file(network.path)
     side = side_file(network.path).name
     if network.size and given.get("size", min(network.size)) != min(network.size):
@@ -288,14 +247,7 @@ CODE = 1
 
 
 def cache_folder() -> Path:
-    """Return the cache folder: WARPGS_CACHE if set, else warpgs in the system's folder for caches.
-
-    Without WARPGS_CACHE and a home folder, the maps go to a private folder of this process, and a line on stderr reports that.
-
-    Raises:
-        ResourceError: There is no home folder, and no folder for temporary files either; or WARPGS_CACHE names an unknown home
-            folder.
-    """
+    """Return the cache folder: WARPGS_CACHE if set, else warpgs in the system's folder for caches."""
     if own := os.environ.get("WARPGS_CACHE"):
         asked = Path(os.path.expanduser(own))  # as a shell does, but not within quotes
         if own.startswith("~") and not asked.is_absolute():
@@ -324,17 +276,7 @@ class MapCache:
     def maps(
         self, image: np.ndarray, names: tuple[str, ...], decided_by: dict, make: Callable[[], tuple[np.ndarray, ...]]
     ) -> tuple[np.ndarray, ...]:
-        """Return the maps of an image, read from disk or computed.
-
-        Args:
-            image: Colours, float32, shape [H, W, 3].
-            names: Names of the maps.
-            decided_by: All other values that affect the maps, as JSON data.
-            make: Function that computes the maps, float32 [H, W] in [0, 1] each.
-
-        Returns:
-            One map per name, float32, shape [H, W].
-        """
+        """Return one map per name, float32 [H, W], of an image [H, W, 3], read from disk or computed by ``make``."""
         path = self._path(image, names, decided_by)
         stored = self._read(path, names, image.shape[:2])
         if stored is not None:
@@ -404,19 +346,7 @@ def unit_range(values: np.ndarray) -> np.ndarray:
 
 
 def network_disparity(network: Network, preprocessing: Preprocessing, image: np.ndarray) -> np.ndarray:
-    """Return the disparity of an image by a monocular network (DPT, MiDaS, Depth Anything and the like).
-
-    Args:
-        network: The opened model; its output is [1, h, w], [1, 1, h, w], [1, h, w, 1] or [h, w].
-        preprocessing: Size and colours of the network's input, and whether the output is disparity or depth.
-        image: Colours in [0, 1], shape [H, W, 3].
-
-    Returns:
-        Relative inverse depth in [0, 1], larger is nearer, float32, shape [H, W].
-
-    Raises:
-        DataError: The output is not a map, or holds depths that are not positive.
-    """
+    """Return the relative inverse depth of an image [H, W, 3] by a network, in [0, 1], float32 [H, W]."""
     output = network.run(preprocessing.prepare(network, image))
     shape = output.shape
     if len(shape) == 4 and shape[1] != 1:
@@ -438,24 +368,9 @@ def network_disparity(network: Network, preprocessing: Preprocessing, image: np.
 
 
 def complete_disparity(image: np.ndarray, depth: np.ndarray, valid: np.ndarray, sensitivity: np.ndarray) -> np.ndarray:
-    """Fill the gaps of a depth map in inverse depth, along surfaces of uniform colour and not across colour edges.
-
-    The result is the ratio of smoothed ``w / z`` and smoothed ``w``, by the fast global smoother (Min et al. 2014), a solver
-    of weighted least squares that the image guides. The weight w is small where 1 / z changes much when the match shifts by
-    one pixel. So badly conditioned depths have less weight than their neighbours.
-
-    Args:
-        image: Colours in [0, 1], shape [H, W, 3].
-        depth: z-depth [u], shape [H, W].
-        valid: True where the depth is consistent, shape [H, W]; at least one pixel.
-        sensitivity: |dz/dpx| [u/px], at least 0, shape [H, W]; infinite values get the smallest weight.
-
-    Returns:
-        Relative inverse depth in [0, 1], larger is nearer, float32, shape [H, W].
-
-    Raises:
-        DataError: No pixel is valid.
-    """
+    """Fill the gaps of a depth map [u] in inverse depth, not across colour edges; return [H, W] in [0, 1]."""
+    # The ratio of smoothed w / z and smoothed w, by the fast global smoother (Min et al. 2014), which the image guides. The
+    # weight w is small where 1 / z changes much when the match shifts by one pixel.
     valid = valid & (depth > 0) & np.isfinite(depth)
     if not valid.any():
         raise DataError("no pixel has a depth, so there is nothing to complete; use --depth-model, or other views")

@@ -10,8 +10,7 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass
-from typing import Any, NamedTuple
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -67,10 +66,6 @@ class PhotoCheck:
     channels: tuple[float, float, float] | None
     """Red, green and blue relative to the other photographs."""
 
-    def to_json(self) -> dict[str, Any]:
-        """Return the figures by name, for metrics.json."""
-        return asdict(self)
-
     @property
     def blurred(self) -> bool:
         """True if the photograph is clearly less sharp than others."""
@@ -89,17 +84,11 @@ class PhotoCheck:
         return any(not 1 / MAX_TINT <= c / self.brightness <= MAX_TINT for c in self.channels)
 
 
-class _Places(NamedTuple):
-    """Appearance of a photograph at its features."""
-
-    features: Features
-    detail: np.ndarray
-    """Logarithm of fine over coarse detail, shape [N]."""
-    colors: np.ndarray
-    """Mean colours around the features, in [0, 1], shape [N, 3]."""
+Places = tuple[Features, np.ndarray, np.ndarray]
+"""Features of a photograph, the logarithm of fine over coarse detail [N] and the mean colours [N, 3] in [0, 1] around them."""
 
 
-def _places(view: View) -> _Places:
+def _places(view: View) -> Places:
     import cv2
 
     features = sift_features(view, MAX_PIXELS, MAX_FEATURES)
@@ -108,20 +97,17 @@ def _places(view: View) -> _Places:
     fine, coarse = (cv2.GaussianBlur(gray, (0, 0), sigma) for sigma in (FINE, COARSE))
     bands = [cv2.blur((a - b) ** 2, (PATCH, PATCH))[rows, columns].astype(float) for a, b in ((gray, fine), (fine, coarse))]
     colors = cv2.blur(view.image, (PATCH, PATCH))[rows, columns].astype(float)
-    return _Places(features, 0.5 * np.log((bands[0] + NOISE) / (bands[1] + NOISE)), colors)
+    return features, 0.5 * np.log((bands[0] + NOISE) / (bands[1] + NOISE)), colors
 
 
-def _difference(views: Sequence[View], places: Sequence[_Places], i: int, j: int) -> np.ndarray | None:
-    """Return by how much photograph i exceeds photograph j: logarithms of the factors of detail, red, green and blue.
-
-    An unknown factor is NaN. Return None if too few features match.
-    """
-    a, b = places[i], places[j]
-    ids, _ = agreeing_matches(views[i], views[j], a.features, b.features, min_angle=0.0)
+def _difference(views: Sequence[View], places: Sequence[Places], i: int, j: int) -> np.ndarray | None:
+    """Return log factors [4] of detail, red, green, blue of photograph i over j, NaN if unknown; None without matches."""
+    (first, detail_a, colors_a), (second, detail_b, colors_b) = places[i], places[j]
+    ids, _ = agreeing_matches(views[i], views[j], first, second, min_angle=0.0)
     if len(ids) < MIN_MATCHES:
         return None
-    detail = np.median(a.detail[ids[:, 0]] - b.detail[ids[:, 1]])
-    both = np.stack([a.colors[ids[:, 0]], b.colors[ids[:, 1]]])
+    detail = np.median(detail_a[ids[:, 0]] - detail_b[ids[:, 1]])
+    both = np.stack([colors_a[ids[:, 0]], colors_b[ids[:, 1]]])
     usable = ((both > DARKEST) & (both < BRIGHTEST)).all((0, 2))
     if usable.sum() < MIN_MATCHES:
         return np.array([detail, np.nan, np.nan, np.nan])
@@ -138,10 +124,8 @@ def _pairs(views: Sequence[View]) -> list[tuple[int, int]]:
 
 
 def _typical(differences: list[float]) -> float | None:
-    """Return the median; with two middle values, the number between them nearest to 0; None if all are NaN.
-
-    A faulty photograph differs from most others, so the choice does not hide it.
-    """
+    """Return the median; with two middle values, the number between them nearest to 0; None if all are NaN."""
+    # a faulty photograph differs from most others, so the choice does not hide it
     known = sorted(d for d in differences if np.isfinite(d))
     if not known:
         return None
@@ -150,15 +134,7 @@ def _typical(differences: list[float]) -> float | None:
 
 
 def check_photos(views: Sequence[View], progress: Callable[[str], object] = lambda line: None) -> list[PhotoCheck]:
-    """Compare each photograph with the nearest ones.
-
-    Args:
-        views: All views of the scene, including held-out views; at least one.
-        progress: Called with a line for the user, at intervals and after each pair.
-
-    Returns:
-        One check per view, in order.
-    """
+    """Compare each photograph with the nearest ones; ``views`` include those that are held out."""
     count, began = len(views), time.monotonic()
     pairs = _pairs(views)
     with single_threaded_opencv(), ThreadPoolExecutor(torch.get_num_threads(), initializer=without_ipp) as pool:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -27,21 +26,9 @@ MIN_FRACTION = 1e-3
 
 
 def complete(depth: np.ndarray, valid: np.ndarray, image: np.ndarray) -> np.ndarray:
-    """Fill a depth map by edge-aware averages of inverse depth.
-
-    The result is a ratio: smoothed inverse depths of consistent pixels, divided by the smoothed mask. The smoother is that of
-    Min et al. 2014. Planes stay planes in inverse depth, and far surfaces are not pulled near. Measured in
-    docs/decisions/007-coarse-start.md.
-
-    Args:
-        depth: z-depths [u], float32, shape [H, W].
-        valid: True where the depth is consistent, bool, shape [H, W].
-        image: Colours in [0, 1], shape [H, W, 3].
-
-    Returns:
-        z-depths [u], float32, shape [H, W]: unchanged where valid, the median where no consistent pixel reaches; 0 everywhere
-        if no pixel is valid.
-    """
+    """Fill a depth map [u], [H, W], by edge-aware averages of inverse depth; the median where no valid depth reaches."""
+    # Smoothed inverse depths by the smoothed mask (Min et al. 2014): planes stay planes, and far surfaces are not pulled near.
+    # Measured in docs/decisions/007-coarse-start.md.
     import cv2
 
     if not valid.any():
@@ -70,13 +57,10 @@ LEAST_ANGLE, MOST_ANGLE, LOST_ANGLE = 1.0, 30.0, 60.0
 both views. From the third on, the views are assumed to share nothing."""
 
 
-class Sight(NamedTuple):
-    """Shared sight of pairs of V views, as fractions of what the first view of a pair sees."""
-
-    overlap: np.ndarray
-    """Fraction of what the first view sees that the second sees, too, less at larger angles, in [0, 1], shape [V, V]."""
-    matching: np.ndarray
-    """Shared fraction, weighted by how well depth can be found at the angle; 0 for a view and itself, shape [V, V]."""
+Sight = tuple[np.ndarray, np.ndarray]
+"""Shared sight of pairs of V views, [V, V] each, as fractions of what the first view of a pair sees. Overlap: what the second
+sees, too, less at larger angles. Matching: the same, weighted by how well depth can be found at the angle; 0 for a view and
+itself."""
 
 
 def _sampled(camera: Camera, bounds: tuple[float, float]) -> np.ndarray:
@@ -91,15 +75,8 @@ def _sampled(camera: Camera, bounds: tuple[float, float]) -> np.ndarray:
 
 
 def shared_sight(cameras: Sequence[Camera], bounds: Sequence[tuple[float, float]]) -> Sight:
-    """Return what pairs of views share, by projecting points sampled in each camera's frustum into all others.
-
-    The method follows the view selection of multi-view stereo (Goesele et al. 2007; angles are weighted as by Yao et al. 2018),
-    but samples points instead of using reconstructed ones.
-
-    Args:
-        cameras: Pinhole cameras of V views.
-        bounds: Nearest and farthest depth of each view [u], 0 < near < far.
-    """
+    """Return what pairs of views share, by projecting points sampled in each camera's frustum into all others."""
+    # the view selection of multi-view stereo (Goesele et al. 2007; angles as in Yao et al. 2018), on sampled points
     turns, shifts = np.stack([c.viewmat[:3, :3] for c in cameras]), np.stack([c.viewmat[:3, 3] for c in cameras])
     K, centers = np.stack([c.K for c in cameras]), np.stack([c.center for c in cameras])
     sides = np.array([(c.width, c.height) for c in cameras], float)
@@ -121,40 +98,27 @@ def shared_sight(cameras: Sequence[Camera], bounds: Sequence[tuple[float, float]
         overlap[i] = (seen * close).mean(1)
         matching[i] = (seen * alike * np.clip(turned / least, 0, 1)).mean(1)
         matching[i, i] = 0
-    return Sight(np.round(overlap, 9), np.round(matching, 9))  # rounding errors must not decide
+    return np.round(overlap, 9), np.round(matching, 9)  # rounding errors must not decide
 
 
 def matching_views(sight: Sight, cameras: Sequence[Camera], index: int, count: int, among: Sequence[int]) -> list[int]:
-    """Return up to ``count`` views to compare a view with: the nearest cameras (ties by order) that share sight with it.
-
-    Views too near for depth are skipped: their angles reduce `Sight.matching` to less than half of `Sight.overlap`. If no view
-    is left, the sampled points may have missed the overlap, and the nearest cameras are returned. Choosing the views that share
-    most at the best angles gave fewer depths, and mostly lower PSNR (docs/decisions/013-any-capture.md).
-
-    Args:
-        sight: What pairs of views share.
-        cameras: Cameras of all views.
-        index: The view.
-        count: Number of views wanted.
-        among: Views to choose from; the view itself is left out.
-    """
+    """Return up to ``count`` views to compare a view with: the nearest cameras that share sight with it."""
+    # Views too near for depth are skipped. The views that share most at the best angles gave fewer depths, and mostly lower
+    # PSNR (docs/decisions/013-any-capture.md). Without any, the sampled points may have missed the overlap.
     rest = [j for j in among if j != index]
-    matching, overlap = sight.matching[index], sight.overlap[index]
+    overlap, matching = (s[index] for s in sight)
     good = [j for j in rest if matching[j] > 0 and matching[j] >= 0.5 * overlap[j]]
     away = {j: float(np.linalg.norm(cameras[j].center - cameras[index].center)) for j in rest}
     return sorted(good or rest, key=away.get)[:count]
 
 
 def spread_views(sight: Sight, most: int) -> list[int]:
-    """Return up to ``most`` views, in ascending order, chosen to cover as much of the area of all views as possible.
-
-    Each step adds the view that most increases the sum, over all views, of the largest overlap with a chosen view. This greedy
-    choice for a submodular sum reaches at least 1 - 1/e of the optimum (Nemhauser et al. 1978).
-    """
-    count = len(sight.overlap)
+    """Return up to ``most`` views, in ascending order, chosen to cover as much of the area of all views as possible."""
+    # greedy for a submodular sum: at least 1 - 1/e of the optimum (Nemhauser et al. 1978)
+    count = len(sight[0])
     if count <= most:
         return list(range(count))
-    shared = np.where(np.eye(count, dtype=bool), 1, sight.overlap)
+    shared = np.where(np.eye(count, dtype=bool), 1, sight[0])
     covered, taken = np.zeros(count), []
     while len(taken) < most:
         gains = np.maximum(shared - covered[:, None], 0).sum(0).round(9)
@@ -232,19 +196,10 @@ def project_inverse(first: Camera, second: Camera, pixels: np.ndarray, inverse: 
         return np.where(p[:, 2:] > 1e-9, p[:, :2] / p[:, 2:], np.nan)
 
 
-def inside_image(camera: Camera, pixels: np.ndarray) -> np.ndarray:
-    """Return True where pixels [..., 2] [px] are in the image of ``camera``; False for NaN."""
-    return (pixels >= 0).all(-1) & (pixels[..., 0] < camera.width) & (pixels[..., 1] < camera.height)
-
-
 def plane_inverses(
     first: Camera, others: Sequence[Camera], bounds: tuple[float, float], spacing: float, max_planes: int
 ) -> np.ndarray:
-    """Return inverse depths [1/u] of planes, evenly spaced and ascending, from the far to the near bound [u].
-
-    Their number, 8 to ``max_planes``, is the smallest at which no match inside an image moves more than about ``spacing`` px
-    between planes.
-    """
+    """Return 8 to ``max_planes`` inverse depths [1/u], evenly spaced and ascending, from the far to the near bound [u]."""
     near, far = bounds
     x, y = np.meshgrid(np.linspace(0, first.width, 5), np.linspace(0, first.height, 5))
     pixels = np.stack([x.ravel(), y.ravel()], 1)
@@ -252,7 +207,7 @@ def plane_inverses(
     longest = 0.0
     for other in others:
         found = np.stack([project_inverse(first, other, pixels, np.full(len(pixels), w)) for w in ladder])
-        inside = inside_image(other, found)
+        inside = (found >= 0).all(-1) & (found[..., 0] < other.width) & (found[..., 1] < other.height)  # False for NaN
         steps = np.linalg.norm(np.diff(found, axis=0), axis=2)[inside[1:] & inside[:-1]]
         longest = max(longest, float(steps.max(initial=0)) * (len(ladder) - 1))
     return np.linspace(1 / far, 1 / near, int(np.clip(np.ceil(longest / spacing) + 1, 8, max_planes)))
@@ -295,17 +250,7 @@ def matching_costs_cpu(view: View, others: Sequence[View], inverses: np.ndarray,
 
 
 def path_costs(costs: torch.Tensor, image: np.ndarray, small_step: float, large_step: float) -> torch.Tensor:
-    """Return the sum of the semi-global path costs from four sides.
-
-    Args:
-        costs: Matching costs in units of 1 / `UNIT`, int16, shape [H, W, D], on any device.
-        image: Colours in [0, 1] whose edges allow jumps, shape [H, W, 3].
-        small_step: Penalty for a change of one plane.
-        large_step: Penalty for any other change, less across edges of the image (`step_limits`).
-
-    Returns:
-        Sums in units of 1 / `UNIT`, int16, shape [H, W, D].
-    """
+    """Return the sum of the semi-global path costs from four sides, int16 [H, W, D], in units of 1 / `UNIT`."""
     down, across = (
         torch.from_numpy(step_limits(colors, small_step, large_step).astype(np.int32)).to(costs.device)
         for colors in (image, image.swapaxes(0, 1))
@@ -314,14 +259,7 @@ def path_costs(costs: torch.Tensor, image: np.ndarray, small_step: float, large_
 
 
 def inverse_depths_cpu(view: View, others: Sequence[View], planes: np.ndarray, config: SweepConfig) -> np.ndarray:
-    """Return inverse depths [1/u] of a view, float64, shape [H, W], by sweeping planes against at least one other view.
-
-    Args:
-        view: The view.
-        others: Views to compare it with.
-        planes: Inverse depths [1/u] of the planes, ascending, shape [D].
-        config: Window, penalties.
-    """
+    """Return inverse depths [1/u] of a view, float64, shape [H, W], by sweeping planes against other views."""
     costs = matching_costs_cpu(view, others, planes, config.window)
     return best_inverses(path_costs(costs, view.image, config.small_step, config.large_step), planes)
 
@@ -338,7 +276,7 @@ def needed_bytes(view: View, planes: int) -> int:
 def matching_costs_cuda(
     view: View, others: Sequence[View], inverses: np.ndarray, window: int, device: torch.device
 ) -> torch.Tensor:
-    """Return the costs of `sweep_cpu.matching_costs`, without its padding planes, int16, shape [H, W, D], on the device."""
+    """Return the costs of `matching_costs_cpu`, without its padding planes, int16, shape [H, W, D], on the device."""
 
     def box(maps: torch.Tensor) -> torch.Tensor:
         r = window // 2
@@ -375,7 +313,7 @@ def matching_costs_cuda(
 
 
 def best_inverse(costs: torch.Tensor, inverses: np.ndarray) -> np.ndarray:
-    """Return inverse depths [1/u] as `plane_depths.best_inverses` does, float64, shape [H, W], on the host."""
+    """Return inverse depths [1/u] as `best_inverses` does, float64, shape [H, W], on the host."""
     k = costs.argmin(2, keepdim=True).clamp(1, len(inverses) - 2)
     left, middle, right = (costs.gather(2, k + o).double() for o in (-1, 0, 1))
     bend = left - 2 * middle + right
@@ -421,18 +359,8 @@ def _reduced(view: View, max_pixels: int) -> View:
 def consistent_depth(
     views: Mapping[int, View], inverses: Mapping[int, np.ndarray], index: int, others: Sequence[int], config: SweepConfig
 ) -> ViewDepth:
-    """Return the depth of one view where it is geometrically consistent with the depth of at least one other view.
-
-    A point is projected to each other view and back by the depth found there. It must return to within ``max_round_trip``
-    of its pixel, with both rays at least ``min_parallax`` apart. The sensitivity is the smallest among the consistent views.
-
-    Args:
-        views: Views by index.
-        inverses: Inverse depths of each view [1/u], float64, shape [H, W].
-        index: Index of the view.
-        others: Indices of the views to check it with.
-        config: Checks.
-    """
+    """Return the depth of one view where it is geometrically consistent with the depth of at least one other view."""
+    # a point returns to its pixel by the other view's depth; the sensitivity is the smallest among the consistent views
     own, notes = inverses[index], []
     sensitivity = np.full(own.shape, np.inf)
     for j in others:
@@ -477,31 +405,17 @@ def _at_size(found: ViewDepth, small: View, view: View, notes: Sequence[str]) ->
     return ViewDepth(np.where(valid, depth, 0), valid, np.where(valid, sensitivity, np.inf), (*notes, *found.notes))
 
 
-def _unswept(view: View, note: str) -> ViewDepth:
+def no_depth(view: View, *notes: str, searched: bool = True) -> ViewDepth:
+    """Return the depth of a view of which none is known."""
     shape = view.image.shape[:2]
-    return ViewDepth(np.zeros(shape, np.float32), np.zeros(shape, bool), np.full(shape, np.inf, np.float32), (note,), False)
+    return ViewDepth(np.zeros(shape, np.float32), np.zeros(shape, bool), np.full(shape, np.inf, np.float32), notes, searched)
 
 
 def sweep_depths(
     views: Sequence[View], bounds: Sequence[tuple[float, float]], config: SweepConfig, device: torch.device = CPU,
     progress: Callable[[int, int], object] = lambda done, total: None,
 ) -> list[ViewDepth]:  # fmt: skip
-    """Return the depth of every view by sweeping planes against views that see the same surfaces.
-
-    At most ``config.max_views`` views are swept, so that the time is bounded. Swept views are compared with their nearest
-    neighbours among all views, and checked by round trips to one another.
-
-    Args:
-        views: The views; a single one has no consistent depth.
-        bounds: Nearest and farthest depth of each view [u], 0 < near < far.
-        config: Planes, smoothing and checks.
-        device: Device of costs and paths; the CPU is used if a GPU has too little memory, or images are tiny.
-        progress: Called after each view with the number of views swept so far, and their total.
-
-    Returns:
-        One depth per view at its own size; its notes report a reduced size and views without a consistent depth. A view that
-        was not swept has a note, and no valid depth.
-    """
+    """Return the depth of every view, at its own size, by sweeping planes against views that see the same surfaces."""
     cameras = [v.camera for v in views]
     sight = shared_sight(cameras, bounds)
     swept = spread_views(sight, config.max_views)
@@ -522,7 +436,8 @@ def sweep_depths(
             else:
                 inverses[i] = np.full(small[i].image.shape[:2], planes[i][0])
             progress(done, len(swept))
-        out = [_unswept(v, f"not swept: the {len(swept)} swept views (of {len(views)}) see most of the scene") for v in views]
+        note = f"not swept: the {len(swept)} swept views (of {len(views)}) see most of the scene"
+        out = [no_depth(v, note, searched=False) for v in views]
         for i in swept:
             partners = matching_views(sight, cameras, i, config.near_count, swept)
             found = consistent_depth(small, inverses, i, partners, config)

@@ -68,23 +68,8 @@ class SemanticMaps:
     foreground: np.ndarray
 
 
-def _softmax(logits: np.ndarray) -> np.ndarray:
-    e = np.exp(logits - logits.max(-1, keepdims=True))
-    return e / e.sum(-1, keepdims=True)
-
-
 def class_probabilities(network: Network, preprocessing: Preprocessing, image: np.ndarray) -> np.ndarray:
-    """Return the probability of each of the 21 classes at every pixel of an image [H, W, 3] in [0, 1].
-
-    An output that already sums to one is treated as probabilities. Any other output is treated as logits, which are resized
-    before the softmax.
-
-    Returns:
-        Probabilities, float32, shape [H, W, 21].
-
-    Raises:
-        DataError: The output is not 1 x 21 x h x w or 1 x h x w x 21.
-    """
+    """Return the probability of each of the 21 classes at each pixel of an image [H, W, 3], float32 [H, W, 21]."""
     output = network.run(preprocessing.prepare(network, image))
     if output.ndim != 4 or output.shape[0] != 1 or CLASSES not in (output.shape[1], output.shape[3]):
         raise DataError(
@@ -94,15 +79,14 @@ def class_probabilities(network: Network, preprocessing: Preprocessing, image: n
     scores = output[0].transpose(1, 2, 0) if output.shape[1] == CLASSES else output[0]
     are_probabilities = bool((scores >= 0).all()) and np.allclose(scores.sum(-1), 1, atol=1e-3)
     scores = resize(scores, *image.shape[:2])
-    return scores if are_probabilities else _softmax(scores)
+    if are_probabilities:
+        return scores
+    e = np.exp(scores - scores.max(-1, keepdims=True))
+    return e / e.sum(-1, keepdims=True)
 
 
 def boundary_weight(labels: np.ndarray) -> np.ndarray:
-    """Return omega_boundary of a label map [H, W]: exp(-d^2 / 2 s^2), float32, shape [H, W].
-
-    d is the distance [px] to the nearest pixel with a neighbour (of four) of another label, and s = 2 px per 500 px of width.
-    The result is 0 everywhere where all labels are the same.
-    """
+    """Return omega_boundary of a label map [H, W]: exp(-d^2 / 2 s^2) of the distance d [px] to another label, float32."""
     edge = np.zeros(labels.shape, bool)
     across, down = labels[:, 1:] != labels[:, :-1], labels[1:] != labels[:-1]
     edge[:, 1:] |= across
@@ -124,21 +108,14 @@ def _falloff(edge: np.ndarray) -> np.ndarray:
 
 
 def network_semantics(network: Network, preprocessing: Preprocessing, image: np.ndarray) -> SemanticMaps:
-    """Return the maps of an image [H, W, 3] in [0, 1] by a segmentation network.
-
-    Raises:
-        DataError: The output is not 1 x 21 x h x w or 1 x h x w x 21.
-    """
+    """Return the maps of an image [H, W, 3] in [0, 1] by a segmentation network."""
     p = class_probabilities(network, preprocessing, image)
     foreground = np.clip(1 - p[..., 0], 0, 1)
     return SemanticMaps(np.clip(p.max(-1), 0, 1), boundary_weight(p.argmax(-1)), foreground)
 
 
 def _fast_length(length: int) -> int:
-    """Return the largest number up to ``length`` with the prime factors 2, 3 and 5 only, for fast Fourier transforms.
-
-    Transforms of other lengths take up to ten times as long. ``length`` is the side of a reduced image, at least 1 [px].
-    """
+    """Return the largest number up to ``length`` [px] with the prime factors 2, 3 and 5 only, for fast Fourier transforms."""
     while length > 1:
         rest = length
         for factor in (2, 3, 5):
@@ -151,15 +128,7 @@ def _fast_length(length: int) -> int:
 
 
 def classical_semantics(image: np.ndarray) -> SemanticMaps:
-    """Return the maps of an image [H, W, 3] in [0, 1] without a network, from its colours.
-
-    L0 smoothing (Xu et al. 2011) flattens texture; Canny's edges in the result are the boundaries. Foreground is
-    fine-grained saliency (Montabone and Soto 2010), smoothed within the flat regions. Confidence is the larger of foreground
-    and 1 - foreground. Images above `MAX_PIXELS` are reduced, and their maps enlarged.
-
-    Raises:
-        DataError: OpenCV cannot compute the saliency.
-    """
+    """Return saliency as foreground and edges as boundaries of an image [H, W, 3] in [0, 1], without a network."""
     import cv2
 
     height, width = image.shape[:2]
@@ -181,21 +150,15 @@ def classical_semantics(image: np.ndarray) -> SemanticMaps:
 
 
 def classical_maps(images: Sequence[np.ndarray], tell: Callable[[str], object] = lambda line: None) -> list[SemanticMaps]:
-    """Return `classical_semantics` of each image; ``tell`` is called with a line for each.
-
-    Each image is processed by one thread, so results do not depend on the number of threads.
-    """
+    """Return `classical_semantics` of each image, each by one thread, so that results do not depend on their number."""
     with single_threaded_opencv(), ThreadPoolExecutor(os.cpu_count() or 1, initializer=without_ipp) as pool:
         made = [pool.submit(classical_semantics, image) for image in images]
         return [m.result() for m in counted(made, tell, "finding salient regions", "views")]
 
 
 def knows_foreground(maps: SemanticMaps) -> bool:
-    """Return whether the maps separate an object from its background.
-
-    They do not if the mean foreground is below 1 % (tabletop scans hold no VOC class). They also do not if there is no boundary
-    and the mean foreground is below a half.
-    """
+    """Return whether the maps separate an object from its background."""
+    # a network finds nothing in tabletop scans, which hold no VOC class
     mean = float(maps.foreground.mean())
     return mean >= MIN_FOREGROUND and (bool(maps.boundary.any()) or mean >= 0.5)
 
@@ -350,27 +313,7 @@ def view_priors(
     cache: Path | None = None,
     tell: Callable[[str], object] = lambda line: None,
 ) -> tuple[list[Prior], list[str]]:
-    """Return a prior for the pixels of each view, before anything is fitted.
-
-    Args:
-        views: The training views.
-        config: Networks and their inputs.
-        depths: Function that gives for each view the depth consistent with the others, or None for no depth; called last, and
-            only if no depth network is given.
-        regions: For each view the pixels that show its object, bool [H, W], or None; they replace saliency, or a foreground
-            that the network does not find.
-        threads: CPU threads of a network; 0 for as many as the process may use.
-        cache: Folder that keeps the maps of networks; None to keep none.
-        tell: Called with a line for each view.
-
-    Returns:
-        A prior per view, and notes on choices, assumptions and missing inputs.
-
-    Raises:
-        DataError: A model is invalid, or its output is not a map.
-        UsageError: A flag contradicts a model.
-        ResourceError: onnxruntime or its provider is missing.
-    """
+    """Return a prior for the pixels of each view before anything is fitted, and notes on choices and assumptions."""
     store = None if cache is None else MapCache(Path(cache))
     notes: list[str] = []
     # both are opened before either runs: a wrong file is found at once

@@ -1,9 +1,8 @@
-"""One pass of the rasterizer: projection, binning and blending, with the settings of each."""
+"""One pass of the rasterizer: the tensors and settings of a render, projection, binning and blending."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -12,81 +11,18 @@ from warpgs.constants import Rule
 from warpgs.kernels import blend as blending
 from warpgs.kernels import launch, sh
 from warpgs.kernels.blend import blend, blend_channels
-from warpgs.kernels.ellipse import ProjectInputs, ProjectSettings, checked_factors, nothing, packed_covariances
-from warpgs.kernels.falloff import BlendSettings
+from warpgs.kernels.ellipse import ProjectInputs, checked_factors, nothing, packed_covariances
+from warpgs.kernels.falloff import Pass
 from warpgs.kernels.project import project_inputs
 from warpgs.kernels.tiles import AS_NEEDED, InstanceMemory, Tiles, bin_tiles
 from warpgs.kernels.walk import contributions, heaviest, median_depth
 from warpgs.scene import ActivatedGaussians, Camera, CovarianceGaussians, RasterizedGaussians
 
-Window = tuple[int, int, int, int]
-"""Left, top, width and height [px]."""
-
-
-@dataclass(frozen=True)
-class RenderSettings:
-    """Image, window, cut-offs and camera model of a render."""
-
-    width: int
-    """Width of the whole image [px]."""
-    height: int
-    """Height of the whole image [px]."""
-    window: Window
-    """Part of the image to render."""
-    degree: int
-    """Spherical-harmonics degree used."""
-    rule: Rule
-    """Cut-offs."""
-    tile_size: int = 16
-    """Side of a tile [px]."""
-    camera_model: str = "pinhole"
-    """Name of the camera model."""
-    parameters: str = "stored"
-    """Kind of the Gaussians' parameters (`ProjectSettings.parameters`)."""
-    absgrad: bool = False
-    """True to sum magnitudes of the gradients of projected means, too (`BlendSettings.absgrad`)."""
-    antialiased: bool = False
-    """True to reduce the opacity of Gaussians that the pixel filter widens (`ProjectSettings.antialiased`)."""
-
-    def projection(self) -> ProjectSettings:
-        """Return the settings of the projection."""
-        size, count = (self.width, self.height), sh.coefficient_count(self.degree)
-        variant = (self.camera_model, self.parameters, self.antialiased)
-        return ProjectSettings(size, self.window, count, self.rule, self.tile_size, *variant)
-
-    def of_window(self) -> dict[str, Any]:
-        """Return the window's size and position, and the rule, as keyword arguments of binning and blending."""
-        x, y, width, height = self.window
-        return {"width": width, "height": height, "rule": self.rule, "origin": (x, y)}
-
-    def blending(self, deterministic: bool = True) -> BlendSettings:
-        """Return the settings of blending; True for ``deterministic`` sums gradients in a fixed order."""
-        x, y, width, height = self.window
-        return BlendSettings((x, y), width, height, self.rule, deterministic, self.absgrad)
-
-
-# Project, bin, blend: the steps from Gaussians to images.
-#
 # `rasterize`, chunked and graphed rendering and the training step all call these functions, each with its own way to
-# allocate memory. Only `RenderSettings` holds the camera model, the spherical-harmonics degree, the cut-offs and the
-# window of a render.
+# allocate memory.
 
 Images = tuple[torch.Tensor, torch.Tensor, torch.Tensor]
 """Colour [C, H, W, 3], or [C, H, W, D] of Gaussians with D channels; alpha and expected depth [C, H, W]."""
-
-
-@dataclass(frozen=True)
-class Composed:
-    """A render, with its projected Gaussians and their tiles."""
-
-    images: Images
-    """Colour, alpha and depth."""
-    projected: torch.Tensor
-    """Projected Gaussians, shape [C, N, 12]."""
-    tile_counts: torch.Tensor
-    """Number of tiles that each Gaussian touches, int32, shape [C, N]."""
-    tiles: Tiles
-    """(Gaussian, tile) instances: the Gaussians that touch each tile."""
 
 
 def as_batch(array: Any, like: torch.Tensor, axes: int = 2) -> torch.Tensor:
@@ -98,11 +34,7 @@ def as_batch(array: Any, like: torch.Tensor, axes: int = 2) -> torch.Tensor:
 
 
 def _for_each(name: str, array: Any, like: torch.Tensor, axes: int = 2) -> torch.Tensor:
-    """Return the array ``name`` of a camera as a tensor [C, ...], with an entry for each of the poses ``like`` [C, 4, 4].
-
-    Raises:
-        ValueError: The number of entries is neither 1 nor that of the poses.
-    """
+    """Return the array ``name`` of a camera as a tensor [C, ...], with an entry for each of the poses ``like`` [C, 4, 4]."""
     tensor, cameras = as_batch(array, like, axes), like.shape[0]
     own = list(tensor.shape[1:])
     if tensor.ndim != axes + 1 or tensor.shape[0] not in (1, cameras):
@@ -113,18 +45,7 @@ def _for_each(name: str, array: Any, like: torch.Tensor, axes: int = 2) -> torch
 
 
 def inputs_of(gaussians: RasterizedGaussians, camera: Camera, opacity_factors: torch.Tensor | None = None) -> ProjectInputs:
-    """Return the tensors of a render; the camera's tensors are converted to the type and device of ``gaussians.means``.
-
-    Args:
-        gaussians: The scene, N Gaussians.
-        camera: One camera, or C of them.
-        opacity_factors: Factors of the opacities, shape [N]; None for 1.
-
-    Raises:
-        TypeError: The covariances or the factors have another scalar type than the means.
-        ValueError: The covariances or the factors have another shape, or are on another device; or the camera's number of
-            intrinsics or lenses is neither 1 nor the number of its poses.
-    """
+    """Return a render's tensors, in the type and on the device of the means; ``opacity_factors`` [N], None for 1."""
     means = gaussians.means
     viewmats = as_batch(camera.viewmat, means)
     Ks = _for_each("K", camera.K, viewmats)
@@ -141,71 +62,49 @@ def inputs_of(gaussians: RasterizedGaussians, camera: Camera, opacity_factors: t
 
 
 def parameters_of(gaussians: RasterizedGaussians) -> str:
-    """Return the kind of the Gaussians' parameters (`ProjectSettings.parameters`)."""
+    """Return the kind of the Gaussians' parameters (`Pass.parameters`)."""
     if isinstance(gaussians, CovarianceGaussians):
         return "covariances"
     return "activated" if isinstance(gaussians, ActivatedGaussians) else "stored"
 
 
-def settings_of(camera: Camera, degree: int, rule: Any, **others: Any) -> RenderSettings:
-    """Return the settings of a render of a whole image; ``others`` are further fields of `RenderSettings`."""
-    window = (0, 0, camera.width, camera.height)
-    named = {"window": window, "camera_model": camera.model, **others}
-    return RenderSettings(camera.width, camera.height, degree=degree, rule=rule, **named)
+def pass_of(camera: Camera, degree: int, rule: Rule, **others: Any) -> Pass:
+    """Return the settings of a render of a whole image; ``others`` are further fields of `Pass`."""
+    size = camera.width, camera.height
+    named = {"window": (0, 0, *size), "camera_model": camera.model, **others}
+    return Pass(size, rule=rule, sh_count=sh.coefficient_count(degree), **named)
+
+
+def of_window(settings: Pass) -> dict[str, Any]:
+    """Return the window's size and position, and the rule, as keyword arguments of the kernels' public functions."""
+    x, y, width, height = settings.window
+    return {"width": width, "height": height, "rule": settings.rule, "origin": (x, y)}
 
 
 def bin_projected(
-    projected: torch.Tensor, tile_counts: torch.Tensor, settings: RenderSettings, memory: InstanceMemory = AS_NEEDED,
+    projected: torch.Tensor, tile_counts: torch.Tensor, settings: Pass, memory: InstanceMemory = AS_NEEDED,
     slotted: bool = True, listed: torch.Tensor | None = None,
 ) -> Tiles:  # fmt: skip
-    """Return for each tile of the render's window the Gaussians that touch the tile, front to back.
-
-    Args:
-        projected: Projected Gaussians, shape [C, N, 12].
-        tile_counts: Number of tiles of the window that each Gaussian touches, int32, shape [C, N].
-        settings: Settings of the render.
-        memory: Memory that the (Gaussian, tile) instances may take.
-        slotted: True if gradients or `weights_of` follow; False is faster (`bin_tiles`).
-        listed: True for the tiles that get instances, bool, shape [C * tiles]; None for all tiles.
-
-    Raises:
-        ResourceError: There are more instances than memory allows.
-    """
-    named = {"memory": memory, "slotted": slotted, "listed": listed, **settings.of_window()}
+    """Return for each tile of the window the Gaussians [C, N, 12] that touch it, front to back (`bin_tiles`)."""
+    named = {"memory": memory, "slotted": slotted, "listed": listed, **of_window(settings)}
     return bin_tiles(projected, tile_counts, tile_size=settings.tile_size, **named)
 
 
 def compose(
-    inputs: ProjectInputs, backgrounds: torch.Tensor, settings: RenderSettings, memory: InstanceMemory = AS_NEEDED,
-    deterministic: bool = True,
-) -> Composed:  # fmt: skip
-    """Render a window of the images of C cameras. Differentiable as `project` and `blend` are.
-
-    Args:
-        inputs: Tensors of Gaussians and cameras.
-        backgrounds: Colour behind everything, shape [C, 3].
-        settings: Settings of the render.
-        memory: Memory that the (Gaussian, tile) instances may take.
-        deterministic: True to sum gradients in a fixed order.
-
-    Raises:
-        ResourceError: There are more instances than memory allows.
-        TypeError: A scalar type is neither float32 nor float64, or scalar types differ.
-        UsageError: The camera model is unknown.
-        ValueError: A shape or a device disagrees.
-    """
-    projected, tile_counts = project_inputs(inputs, settings.projection())
-    tiles, images = bin_and_blend(projected, tile_counts, backgrounds, settings, memory, deterministic)
-    return Composed(images, projected, tile_counts, tiles)
+    inputs: ProjectInputs, backgrounds: torch.Tensor, settings: Pass, memory: InstanceMemory = AS_NEEDED
+) -> tuple[Images, torch.Tensor, torch.Tensor]:
+    """Return images over backgrounds [C, 3], projected Gaussians [C, N, 12] and their tile counts [C, N]; differentiable."""
+    projected, tile_counts = project_inputs(inputs, settings)
+    return bin_and_blend(projected, tile_counts, backgrounds, settings, memory), projected, tile_counts
 
 
 def bin_and_blend(
-    projected: torch.Tensor, tile_counts: torch.Tensor, backgrounds: torch.Tensor, settings: RenderSettings,
-    memory: InstanceMemory = AS_NEEDED, deterministic: bool = True, colors: torch.Tensor | None = None,
-) -> tuple[Tiles, Images]:  # fmt: skip
-    """Bin and blend projected Gaussians [C, N, 12]; arguments are those of `compose` and `images_of`."""
+    projected: torch.Tensor, tile_counts: torch.Tensor, backgrounds: torch.Tensor, settings: Pass,
+    memory: InstanceMemory = AS_NEEDED, colors: torch.Tensor | None = None,
+) -> Images:  # fmt: skip
+    """Bin and blend projected Gaussians [C, N, 12]; ``colors`` as in `images_of`."""
     tiles = bin_projected(projected, tile_counts, settings, memory, needs_slots((projected, backgrounds, colors)))
-    return tiles, images_of(projected, tiles, backgrounds, settings, deterministic, colors)
+    return images_of(projected, tiles, backgrounds, settings, colors)
 
 
 def needs_slots(tensors: Iterable[torch.Tensor | None]) -> bool:
@@ -214,65 +113,39 @@ def needs_slots(tensors: Iterable[torch.Tensor | None]) -> bool:
 
 
 def images_of(
-    projected: torch.Tensor, tiles: Tiles, backgrounds: torch.Tensor, settings: RenderSettings, deterministic: bool = True,
-    colors: torch.Tensor | None = None,
-) -> Images:  # fmt: skip
-    """Return the images of binned Gaussians: in their own colours (`blend`), or in D channels (`blend_channels`).
-
-    Args:
-        projected: Projected Gaussians, shape [C, N, 12].
-        tiles: Their (Gaussian, tile) instances.
-        backgrounds: Colour behind everything, shape [C, 3], or [C, D] with ``colors``.
-        settings: Settings of the render.
-        deterministic: True to sum gradients in a fixed order.
-        colors: Channels of each Gaussian, shape [1, N, D] or [C, N, D]; None for their own colours.
-    """
-    named = {"deterministic": deterministic, "absgrad": settings.absgrad, **settings.of_window()}
+    projected: torch.Tensor, tiles: Tiles, backgrounds: torch.Tensor, settings: Pass, colors: torch.Tensor | None = None
+) -> Images:
+    """Return the images of binned Gaussians: in their own colours, or in channels [1, N, D] or [C, N, D] of ``colors``."""
+    named = {"deterministic": settings.deterministic, "absgrad": settings.absgrad, **of_window(settings)}
     if colors is None:
         return blend(projected, tiles, backgrounds, **named)
     return blend_channels(projected, tiles, colors, backgrounds, **named)
 
 
-def weights_of(projected: torch.Tensor, tiles: Tiles, settings: RenderSettings) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return sum and maximum of each Gaussian's blending weights, shape [C, N] each (`contributions`)."""
-    return contributions(projected, tiles, **settings.of_window())
-
-
-def median_depth_of(projected: torch.Tensor, tiles: Tiles, settings: RenderSettings) -> torch.Tensor:
-    """Return the depth [u] at which transmittance falls to one half, shape [C, H, W] (`median_depth`)."""
-    return median_depth(projected, tiles, **settings.of_window())
-
-
-def heaviest_of(
-    projected: torch.Tensor, tiles: Tiles, settings: RenderSettings, k: int
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Return ids and weights [C, H, W, k] of the k heaviest Gaussians, and the number blended [C, H, W] (`heaviest`)."""
-    return heaviest(projected, tiles, k, **settings.of_window())
+def further_of(
+    projected: torch.Tensor, tiles: Tiles, settings: Pass, weights: bool, median: bool, k: int
+) -> dict[str, torch.Tensor]:
+    """Return further fields of `Render` by name: weights [C, N], median depth [C, H, W], and the ``k`` heaviest Gaussians."""
+    found, window = {}, of_window(settings)
+    if weights:
+        found["weight_sums"], found["weight_maxima"] = contributions(projected, tiles, **window)
+    if median:
+        found["median_depth"] = median_depth(projected, tiles, **window)
+    if k:
+        found |= dict(zip(("heaviest_ids", "heaviest_weights", "blend_counts"), heaviest(projected, tiles, k, **window)))
+    return found
 
 
 @torch.no_grad()
-def count_instances(inputs: ProjectInputs, settings: RenderSettings) -> torch.Tensor:
+def count_instances(inputs: ProjectInputs, settings: Pass) -> torch.Tensor:
     """Return the number of (Gaussian, tile) instances of a render, int64, shape []."""
-    return project_inputs(inputs, settings.projection())[1].sum()
+    return project_inputs(inputs, settings)[1].sum()
 
 
 def composite_into(
-    projected: torch.Tensor, tile_counts: torch.Tensor, backgrounds: torch.Tensor, settings: RenderSettings,
-    memory: InstanceMemory, save: bool = True,
+    projected: torch.Tensor, tile_counts: torch.Tensor, backgrounds: torch.Tensor, settings: Pass, memory: InstanceMemory,
+    save: bool = True,
 ) -> tuple[Tiles, Sequence[torch.Tensor]]:  # fmt: skip
-    """Bin and blend without autograd, in memory of the allocator; also return the tensors that the backward pass needs.
-
-    Args:
-        projected: Projected Gaussians, contiguous, shape [C, N, 12].
-        tile_counts: Number of tiles that each Gaussian touches, int32, shape [C, N].
-        backgrounds: Colour behind everything, contiguous, shape [C, 3].
-        settings: Settings of the render.
-        memory: Memory that the (Gaussian, tile) instances may take; its allocator provides all other tensors.
-        save: True if gradients will be taken.
-
-    Returns:
-        The instances, and the tensors [...] that `blending.composite` returns.
-    """
+    """Bin and blend [C, N, 12] without autograd, in the allocator's memory; also return the backward pass's tensors."""
     tiles = bin_projected(projected, tile_counts, settings, memory, save)
-    found = blending.composite(projected, tiles, backgrounds, settings.blending(), save=save, allocator=memory.allocator)
-    return tiles, found
+    return tiles, blending.composite(projected, tiles, backgrounds, settings, save=save, allocator=memory.allocator)

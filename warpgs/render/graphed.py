@@ -24,11 +24,12 @@ from warpgs.device import available_bytes
 from warpgs.kernels import blend, launch, project
 from warpgs.kernels.cameras import CAMERA_MODELS
 from warpgs.kernels.ellipse import ProjectInputs
+from warpgs.kernels.falloff import Pass
 from warpgs.kernels.graphs import MIN_REPLAYS, GraphedFunction, GraphPool
 from warpgs.kernels.launch import Allocator, fetch, first_order, keep, kept
 from warpgs.kernels.tiles import BYTES_PER_INSTANCE, InstanceMemory, Tiles, Visible, grid, running_counts, split_sum, sums_fit
 from warpgs.means2d import count_passes
-from warpgs.render.compose import RenderSettings, composite_into
+from warpgs.render.compose import composite_into
 
 MIN_CALLS = 3
 """Number of calls in a row with equal keys (`call_key`) before kernels are captured. It doubles after a capture that is
@@ -65,20 +66,11 @@ class GraphedRasterizer:
     """Render and gradients of one set of tensors for any camera, as four functions with graphs (`GraphedFunction`)."""
 
     def __init__(
-        self, settings: RenderSettings, cameras: int, capacity: Capacity, graphs: GraphPool, gradients: bool = True
+        self, settings: Pass, cameras: int, capacity: Capacity, graphs: GraphPool, gradients: bool = True
     ):  # fmt: skip
-        """Prepare the functions; nothing is rendered yet.
-
-        Args:
-            settings: Settings of the render.
-            cameras: Number of images at a time.
-            capacity: Numbers of Gaussians and instances to allocate memory for.
-            graphs: Pool to capture graphs in.
-            gradients: True to keep what the backward pass needs.
-        """
+        """Prepare the functions for C ``cameras``; nothing is rendered yet."""
         self.settings, self.cameras, self.capacity, self.device = settings, cameras, capacity, graphs.device
         self.gradients = gradients
-        self._project_settings = settings.projection()
         self._coefficients = CAMERA_MODELS.find(settings.camera_model).coefficients
         self.rendered = 0
         """Number of renders within the capacity."""
@@ -108,12 +100,7 @@ class GraphedRasterizer:
         self._black: torch.Tensor | None = None
 
     def render(self, inputs: ProjectInputs, backgrounds: torch.Tensor | None):
-        """Return images, projected Gaussians and tile counts; None if the call exceeds the capacity.
-
-        Args:
-            inputs: The tensors, without opacity factors.
-            backgrounds: Colour behind everything, shape [C, 3]; None for black.
-        """
+        """Return images, projected Gaussians [C, N, 12] and tile counts [C, N]; None if the call exceeds the capacity."""
         of_cameras = [t.contiguous() for t in inputs[5:8]]
         self._addresses[:] = [t.data_ptr() for t in of_cameras]  # no longer read: the last call has finished
         (cameras, *projection), _ = self._forward_project(*inputs[:5])
@@ -150,7 +137,7 @@ class GraphedRasterizer:
         # a copy: the backward pass may come after the next call has put its cameras at the same addresses
         cameras = allocator.output(((25 + self._coefficients) * self.cameras,), torch.float32, self.device)
         fetch(self._table.ptr, 16 * self.cameras, 25 * self.cameras, cameras)
-        _, counts = project.project_tensors(self._inputs(gaussians, cameras), self._project_settings, allocator)
+        _, counts = project.project_tensors(self._inputs(gaussians, cameras), self.settings, allocator)
         self._sums = running_counts(counts.view(-1), wp.float32, out=self._sums)  # no copy: used only within the call
         with launch.stream_of(self.device):
             wp.copy(self._host_total, launch.view(self._sums[-1:], wp.int64).array())
@@ -170,13 +157,13 @@ class GraphedRasterizer:
         ranges, ids, slots, starts, tile_ids, total, *saved = self._forward_blend.saved(block)
         tiles = Tiles(self.settings.tile_size, ranges, ids, slots, starts, counts.view(-1), tile_ids, total)
         saved = (rgb, depth, *saved)
-        blend.composite_gradients(projected, tiles, backgrounds, self.settings.blending(), saved, v_images, allocator)
+        blend.composite_gradients(projected, tiles, backgrounds, self.settings, saved, v_images, allocator)
         return ()
 
     def _project_gradients(self, allocator: Allocator, *inputs: torch.Tensor) -> tuple[()]:
         *gaussians, cameras, projected, counts, v_projected = inputs
         project.project_gradients(
-            self._inputs(gaussians, cameras)[:8], self._project_settings, projected, counts, v_projected,
+            self._inputs(gaussians, cameras)[:8], self.settings, projected, counts, v_projected,
             wants_camera=False, allocator=allocator,
         )  # fmt: skip
         return ()
@@ -196,7 +183,7 @@ class GraphedRasterizer:
         if v_projected is None or wants_camera:
             return project.project_gradients(
                 self._inputs(gaussians, cameras)[:8],
-                self._project_settings,
+                self.settings,
                 projected,
                 counts,
                 v_projected,
@@ -260,11 +247,8 @@ class Recorder:
         self._exceeded: tuple[tuple | None, Capacity] = (None, Capacity(0, 0))
         """Key of the last call that exceeded its capacity, and the capacity that this call needed."""
 
-    def render(self, inputs: ProjectInputs, backgrounds: torch.Tensor | None, settings: RenderSettings):
-        """Return the result of `GraphedRasterizer.render`; None if the call must run without graphs.
-
-        ``inputs`` are without opacity factors; ``backgrounds`` [C, 3] may be None.
-        """
+    def render(self, inputs: ProjectInputs, backgrounds: torch.Tensor | None, settings: Pass):
+        """Return the result of `GraphedRasterizer.render`, over ``backgrounds`` [C, 3]; None if no graphs can be used."""
         key = None if self.graphs.failed else call_key(inputs, backgrounds, settings, self.gradients)
         if key is None or not self.graphs.lock.acquire(blocking=False):
             return None
@@ -294,7 +278,7 @@ class Recorder:
         finally:
             self.graphs.lock.release()
 
-    def _make(self, inputs: ProjectInputs, settings: RenderSettings) -> None:
+    def _make(self, inputs: ProjectInputs, settings: Pass) -> None:
         """Make the rasterizer, unless its instances would take too much memory."""
         needed = count_needed(inputs, settings)
         if self._exceeded[0] == self._key:
@@ -321,24 +305,20 @@ class Recorder:
 
 
 @torch.no_grad()
-def count_needed(inputs: ProjectInputs, settings: RenderSettings) -> Capacity:
+def count_needed(inputs: ProjectInputs, settings: Pass) -> Capacity:
     """Return the numbers of visible Gaussians and of instances of a render."""
-    counts = project.project_inputs(inputs, settings.projection())[1]
+    counts = project.project_inputs(inputs, settings)[1]
     return Capacity(*torch.stack([(counts > 0).sum(), counts.sum()]).tolist())
 
 
 def call_key(
-    inputs: ProjectInputs, backgrounds: torch.Tensor | None, settings: RenderSettings, gradients: bool = True
+    inputs: ProjectInputs, backgrounds: torch.Tensor | None, settings: Pass, gradients: bool = True
 ) -> tuple | None:  # fmt: skip
-    """Return the values that calls must have in common to use one rasterizer.
-
-    Return None for calls that cannot be captured, and for very large calls, where graphs gain nothing. ``backgrounds`` [C, 3]
-    may be None. Calls without ``gradients`` are captured only in the main thread: a viewer renders in another thread, beside a
-    loop that may wait for the whole device.
-    """
+    """Return what calls must have in common to use one rasterizer; None for calls that cannot be captured, or gain nothing."""
     means, viewmats = inputs.means, inputs.viewmats
     cameras = viewmats.shape[0]  # len of a tensor takes ten times as long
     projected, tiles = means.shape[0] * cameras, math.prod(grid(*settings.window[2:], settings.tile_size))
+    # without gradients in the main thread alone: a viewer renders in another one, beside a loop that may wait for the device
     small = 0 < projected <= MAX_PROJECTED and sums_fit(projected, tiles)
     fit = means.dtype == torch.float32 and (gradients or threading.current_thread() is threading.main_thread())
     if not (small and fit) or torch.is_inference_mode_enabled() or not _can_capture(means.device):
@@ -354,12 +334,8 @@ def call_key(
 
 
 def _can_capture(device: torch.device) -> bool:
-    """Return whether calls can be captured now, on this device.
-
-    Calls are not captured during another capture, on a device that is not current, or with hooks on saved tensors.
-    Activation checkpointing sets such hooks, and needs the same number of saved tensors each time. Nor are they captured where
-    torch allocates each tensor from the driver, or Warp checks for errors after each kernel.
-    """
+    """Return whether calls can be captured now, on this device."""
+    # nor with hooks on saved tensors, as activation checkpointing sets: it needs the same number of saved tensors each time
     if _UNCACHED or wp.config.verify_cuda:
         return False
     hooks = torch._C._autograd._top_saved_tensors_default_hooks(True)

@@ -1,23 +1,26 @@
-"""Options of the rasterizer, and the settings that follow from them."""
+"""Options of the rasterizer."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from numbers import Real
 
 import numpy as np
 import torch
 
-from warpgs.constants import Rule, rule_named
+from warpgs.constants import FAR, Rule, rule_named
 from warpgs.errors import UsageError, document_fields
-from warpgs.render.compose import RenderSettings, settings_of
+from warpgs.kernels.falloff import Pass
+from warpgs.kernels.tiles import MAX_INSTANCES
+from warpgs.render.compose import pass_of
 from warpgs.scene import Camera
 
 SWITCHES = ("contributions", "median_depth", "error_bound", "deterministic", "absgrad", "antialiased", "record")
 """Options that are True or False."""
-
 WHOLE_NUMBERS = ("sh_degree", "tile_size", "heaviest", "memory_budget", "capacity", "max_instances")
 """Options that are integers; all but ``tile_size`` and ``heaviest`` may be None."""
+TILE_SIZES = (8, 16)
+"""Supported sides of a tile [px]."""
 
 
 def _is_whole(value: object) -> bool:
@@ -99,10 +102,11 @@ class RasterizeOptions:
     torch.cuda.synchronize does."""
 
     def __post_init__(self) -> None:
-        """Check the types of switches and numbers, and the signs of some; other ranges are checked in `rasterize`.
+        """Check types, ranges, and options that exclude each other; what depends on the camera is checked by `rasterize`.
 
         Raises:
-            UsageError: An option has the wrong type, or is negative.
+            UsageError: An option has the wrong type or is out of range, options exclude each other, or the rule is unknown.
+            ValueError: The near or the far plane is out of range.
         """
         for name in SWITCHES:
             if not isinstance(getattr(self, name), (bool, np.bool_)):
@@ -111,7 +115,7 @@ class RasterizeOptions:
             value = getattr(self, name)
             if not (_is_whole(value) or (value is None and name not in ("tile_size", "heaviest"))):
                 raise UsageError(f"{name} must be a whole number, not {value!r}")
-        for name in ("sh_degree", "memory_budget", "capacity"):
+        for name in ("sh_degree", "memory_budget", "capacity", "heaviest"):
             if (getattr(self, name) or 0) < 0:
                 raise UsageError(f"{name} must be at least 0, not {getattr(self, name)}")
         for name in ("near", "far"):
@@ -122,23 +126,45 @@ class RasterizeOptions:
             isinstance(self.window, (tuple, list)) and len(self.window) == 4 and all(map(_is_whole, self.window))
         ):
             raise UsageError(f"window must be four whole numbers, not {self.window!r}")
+        if self.tile_size not in TILE_SIZES:
+            raise UsageError(f"tile size {self.tile_size} is not one of {', '.join(map(str, TILE_SIZES))}")
+        if self.max_instances is not None and (self.capacity is not None or self.max_instances < 1):
+            raise UsageError(
+                "max_instances must be at least 1, and cannot be combined with capacity; found "
+                f"max_instances={self.max_instances}, capacity={self.capacity}"
+            )
+        if self.pixels is not None and (self.window or self.contributions or self.capacity is not None):
+            raise UsageError(
+                "RasterizeOptions.pixels cannot be combined with window, contributions or capacity; leave out pixels"
+            )
+        if self.capacity is not None and self.capacity > MAX_INSTANCES:
+            raise UsageError(f"capacity must be at most {MAX_INSTANCES:,}, not {self.capacity:,}")
+        if self.error_bound and self.capacity is not None:
+            raise UsageError("error_bound and capacity exclude each other: leave one out")
+        if self.feature_background is not None and self.features is None:
+            raise UsageError("feature_background requires features: give features=..., or leave feature_background out")
+        self.cut_offs()
+
+    def cut_offs(self) -> Rule:
+        """Return the rule, with the near and the far plane of the options.
+
+        Raises:
+            UsageError: The rule is unknown.
+            ValueError: The near or the far plane is out of range.
+        """
+        rule = self.rule if isinstance(self.rule, Rule) else rule_named(self.rule)
+        near, far = rule.near if self.near is None else self.near, rule.far if self.far is None else self.far
+        if not 0 <= near < far <= FAR:
+            raise ValueError(f"near {near} and far {far} are not a range of depths: give 0 <= near < far <= {FAR:g}")
+        return rule if (near, far) == (rule.near, rule.far) else replace(rule, near=near, far=far)
 
     def repeatable(self) -> bool:
         """Return whether calls with these options may be captured as CUDA graphs."""
-        others = (
-            self.colors,
-            self.features,
-            self.opacity_factors,
-            self.memory_budget,
-            self.capacity,
-            self.max_instances,
-            self.pixels,
-        )
+        others = (self.colors, self.features, self.opacity_factors, self.memory_budget, self.capacity, self.max_instances)
         extra = self.contributions or self.median_depth or self.heaviest or self.absgrad or self.error_bound
-        return self.record and self.deterministic and not extra and all(o is None for o in others)
+        return self.record and self.deterministic and not extra and all(o is None for o in (*others, self.pixels))
 
 
-def image_settings(camera: Camera, degree: int, options: RasterizeOptions) -> RenderSettings:
-    """Return the settings by which a fit renders whole images; rule and antialiasing are those of the options."""
-    rule = options.rule if isinstance(options.rule, Rule) else rule_named(options.rule)
-    return settings_of(camera, degree, rule, antialiased=options.antialiased)
+def image_settings(camera: Camera, degree: int, options: RasterizeOptions) -> Pass:
+    """Return the settings by which a fit renders whole images; cut-offs and antialiasing are those of the options."""
+    return pass_of(camera, degree, options.cut_offs(), antialiased=options.antialiased)

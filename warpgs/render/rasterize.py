@@ -6,53 +6,45 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import fields, replace
 from numbers import Real
-from typing import Any, NamedTuple, overload
+from typing import Any, overload
 
 import numpy as np
 import torch
 
-from warpgs.constants import FAR, K_TOLERANCE, POSE_TOLERANCE, Rule, rule_named
+from warpgs.constants import K_TOLERANCE, POSE_TOLERANCE
 from warpgs.device import available_bytes, installed_bytes
 from warpgs.errors import ResourceError, UsageError
 from warpgs.kernels import launch
 from warpgs.kernels.cameras import check_camera
 from warpgs.kernels.ellipse import ProjectInputs
-from warpgs.kernels.falloff import WIDTHS
+from warpgs.kernels.falloff import WIDTHS, Pass
 from warpgs.kernels.launch import refuse_transforms, without_gradient
 from warpgs.kernels.project import project_inputs
-from warpgs.kernels.tiles import MAX_INSTANCES, InstanceMemory, grid
+from warpgs.kernels.tiles import InstanceMemory, grid
 from warpgs.means2d import count_passes
 from warpgs.render import graphed
-from warpgs.render.chunked import ChunkedFrame, blend_chunked, contributions_chunked, heaviest_chunked, median_depth_chunked
+from warpgs.render.chunked import blend_chunked, further_chunked
 from warpgs.render.compose import (
-    RenderSettings,
-    Window,
     bin_projected,
-    heaviest_of,
+    further_of,
     images_of,
     inputs_of,
-    median_depth_of,
     needs_slots,
     parameters_of,
-    settings_of,
-    weights_of,
+    pass_of,
 )
 from warpgs.render.options import RasterizeOptions
 from warpgs.scene import ActivatedGaussians, Camera, CovarianceGaussians, Gaussians, RasterizedGaussians, Render
+
+Window = tuple[int, int, int, int]
+"""Left, top, width and height [px]."""
 
 # Checks of the arrays of a camera. Values on a GPU are not checked: reading them would wait for the device.
 
 
 def check_arrays(camera: Camera) -> None:
-    """Check types and shapes of a camera's arrays, the types of width and height, and the values of arrays in main memory.
-
-    Raises:
-        TypeError: An array is neither a numpy array nor a tensor, is sparse, or has values that are not real or have half
-            precision; or width or height is not an integer.
-        ValueError: A shape is wrong; a number is not finite; K has a focal length of 0, a skew or another last row than
-            0, 0, 1; or a viewmat scales or shears, or has another last row than 0, 0, 0, 1.
-    """
-    for name, rows, tolerance, off, check in MATRICES:
+    """Check a camera's types and shapes, and the values of its arrays in main memory."""
+    for name, rows, check in (("viewmat", 4, _check_pose), ("K", 3, _check_intrinsics)):
         given: Any = getattr(camera, name)
         _check_type(name, given)
         if given.ndim not in (2, 3) or tuple(given.shape[-2:]) != (rows, rows):
@@ -61,8 +53,7 @@ def check_arrays(camera: Camera) -> None:
             continue
         listed = given.tolist()  # Python numbers take a third of the time of tensors
         for i, matrix in enumerate(listed if given.ndim == 3 else (listed,)):
-            if not off(matrix) <= tolerance:  # also where a number is NaN or infinite; few matrices get further
-                check(matrix, f"camera.{name}[{i}]" if given.ndim == 3 else f"camera.{name}")
+            check(matrix, f"camera.{name}[{i}]" if given.ndim == 3 else f"camera.{name}")
     distortion: Any = camera.distortion
     if distortion is not None:
         _check_type("distortion", distortion)
@@ -93,18 +84,13 @@ def _check_type(name: str, array: Any) -> None:
         raise TypeError(f"camera.{name} must hold real numbers, not {array.dtype}")
 
 
-def _skew_of(matrix: list[list[float]]) -> float:
-    """Return the sum of the errors of K's constant entries; non-finite if an entry of K is, or if a focal length is 0."""
-    (fx, skew, cx), (below, fy, cy), (left, middle, last) = matrix
-    if not (fx and fy):
-        return math.inf
-    return abs(skew) + abs(below) + abs(left) + abs(middle) + abs(last - 1) + 0 * (fx + cx + fy + cy)
-
-
 def _check_intrinsics(matrix: list[list[float]], where: str) -> None:
     """Raise ValueError where the intrinsics are non-finite, or have a skew, a focal length of 0, or a wrong last row."""
+    (fx, skew, cx), (below, fy, cy), (left, middle, last) = matrix
+    off = abs(skew) + abs(below) + abs(left) + abs(middle) + abs(last - 1) + 0 * (fx + cx + fy + cy)
+    if fx and fy and off <= K_TOLERANCE:  # a NaN or an infinity is not; few matrices get further
+        return
     _check_finite(matrix, where)
-    (fx, skew, _), (below, fy, _), (left, middle, last) = matrix
     if not (fx and fy):
         raise ValueError(f"{where} must have focal lengths other than 0, not {fx:g} and {fy:g}")
     if max(map(abs, (left, middle, last - 1))) > K_TOLERANCE:
@@ -116,28 +102,19 @@ def _check_intrinsics(matrix: list[list[float]], where: str) -> None:
         )
 
 
-def _products(matrix: list[list[float]]) -> tuple[float, ...]:
-    """Return the entries of R R^T - 1."""
-    (a, b, c, _), (d, e, f, _), (g, h, i, _), _ = matrix
-    return (
+def _check_pose(matrix: list[list[float]], where: str) -> None:
+    """Raise ValueError where the pose is not rigid; a reflection is allowed, since the mirrored image is correct."""
+    (a, b, c, x), (d, e, f, y), (g, h, i, z), (p, q, r, s) = matrix
+    products = (
         a * a + b * b + c * c - 1, d * d + e * e + f * f - 1, g * g + h * h + i * i - 1,
         a * d + b * e + c * f, a * g + b * h + c * i, d * g + e * h + f * i,
     )  # fmt: skip
-
-
-def _stretch_of(matrix: list[list[float]]) -> float:
-    """Return the sum of the errors of R R^T and of the last row of a pose; non-finite if an entry of the pose is."""
-    (p, q, r, s), shift = matrix[3], matrix[0][3] + matrix[1][3] + matrix[2][3]
-    return sum(map(abs, _products(matrix))) + abs(p) + abs(q) + abs(r) + abs(s - 1) + 0 * shift
-
-
-def _check_pose(matrix: list[list[float]], where: str) -> None:
-    """Raise ValueError where the pose is not rigid; a reflection is allowed, since the mirrored image is correct."""
+    if sum(map(abs, products)) + abs(p) + abs(q) + abs(r) + abs(s - 1) + 0 * (x + y + z) <= POSE_TOLERANCE:
+        return  # as in `_check_intrinsics`
     _check_finite(matrix, where)
-    p, q, r, s = matrix[3]
     if max(map(abs, (p, q, r, s - 1))) > POSE_TOLERANCE:
         raise ValueError(f"{where} must have the last row 0, 0, 0, 1, not {p:g}, {q:g}, {r:g}, {s:g}; is it transposed?")
-    off = max(map(abs, _products(matrix)))
+    off = max(map(abs, products))
     if not off <= POSE_TOLERANCE:  # products of huge numbers overflow
         raise ValueError(
             f"{where} scales or shears: R R^T is off by {off:.2g} from the identity, where R is the upper left 3 x 3 block. "
@@ -151,18 +128,8 @@ def _check_finite(matrix: list[list[float]], where: str) -> None:
         raise ValueError(f"{where} has non-finite values: {matrix}")
 
 
-MATRICES = (
-    ("viewmat", 4, POSE_TOLERANCE, _stretch_of, _check_pose), ("K", 3, K_TOLERANCE, _skew_of, _check_intrinsics),
-)  # fmt: skip
-"""Matrices of a camera: name, rows, tolerance, function that computes the error, and check for matrices with a larger error."""
-
-
 def for_each(cameras: Sequence[Camera], *, gaussians: Any, options: Any) -> list[tuple[Any, ...]]:
-    """Return Gaussians, camera and options of each of C cameras; single values are shared by all.
-
-    Raises:
-        ValueError: The length of a list is not C.
-    """
+    """Return Gaussians, camera and options of each of C cameras; single values are shared by all."""
     columns = []
     for name, given in (("gaussians", gaussians), ("options", options)):
         columns.append(given if isinstance(given, (list, tuple)) else [given] * len(cameras))
@@ -176,12 +143,7 @@ INTEGERS = (torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64)
 
 
 def checked_pixels(pixels: torch.Tensor, cameras: int, device: torch.device) -> torch.Tensor:
-    """Return pixels [P, 2] or [C, P, 2] of C cameras as int64 on a device, shape [1, P, 2] or [C, P, 2].
-
-    Raises:
-        TypeError: The pixels are not a dense tensor of integers.
-        ValueError: The shape is wrong.
-    """
+    """Return pixels [P, 2] or [C, P, 2] of C cameras as int64 on a device, shape [1, P, 2] or [C, P, 2]."""
     if not isinstance(pixels, torch.Tensor) or pixels.dtype not in INTEGERS:
         found = pixels.dtype if isinstance(pixels, torch.Tensor) else type(pixels).__name__
         raise TypeError(f"pixels must be a tensor of whole numbers, not {found}: columns and rows, from 0 at the upper left")
@@ -194,11 +156,7 @@ def checked_pixels(pixels: torch.Tensor, cameras: int, device: torch.device) -> 
 
 
 def window_of(pixels: torch.Tensor, camera: Camera, tile_size: int) -> Window:
-    """Return the smallest window of whole tiles that holds pixels [..., P, 2]; the pixels are read from the device.
-
-    Raises:
-        ValueError: A pixel is outside the image.
-    """
+    """Return the smallest window of whole tiles that holds pixels [..., P, 2]; the pixels are read from the device."""
     if not pixels.shape[-2]:
         return 0, 0, min(tile_size, camera.width), min(tile_size, camera.height)
     flat = pixels.reshape(-1, 2)
@@ -214,7 +172,7 @@ def window_of(pixels: torch.Tensor, camera: Camera, tile_size: int) -> Window:
     return x, y, width, height
 
 
-def listed_tiles(pixels: torch.Tensor, settings: RenderSettings, cameras: int) -> torch.Tensor:
+def listed_tiles(pixels: torch.Tensor, settings: Pass, cameras: int) -> torch.Tensor:
     """Return a mask [T] over the tiles of C cameras, for `bin_tiles`: True where one of ``pixels`` [1 or C, P, 2] is inside."""
     (x, y, width, height), size = settings.window, settings.tile_size
     columns, rows = grid(width, height, size)
@@ -231,9 +189,6 @@ def at_pixels(image: torch.Tensor, pixels: torch.Tensor, window: Window) -> torc
     return image[cameras, pixels[..., 1] - window[1], pixels[..., 0] - window[0]]
 
 
-TILE_SIZES = (8, 16)
-"""Supported sides of a tile [px]."""
-
 BOUND_ROUNDING = 2.0**-29
 """Largest rounding error of a float64 render, as a fraction of the largest colour. A relative error e of every alpha changes a
 colour by at most 2 e: alpha shifts weight between its own colour and the colours behind, and the weights sum to 1. float64
@@ -243,51 +198,15 @@ rounds 2^29 times finer than float32, so e is at most 2^-30 if the relative erro
 WITHOUT_GRADIENT = ("weight_sums", "weight_maxima", "median_depth", "heaviest_weights", "error_bound")
 """Real-valued outputs without a gradient: a backward pass through them raises an error."""
 
+WHOLE = ("weight_sums", "weight_maxima", "overflow")
+"""Further outputs that are not images: they have one entry for each Gaussian, or a single one."""
+
 ARGUMENTS = ((Gaussians, ActivatedGaussians, CovarianceGaussians), (Camera,), (RasterizeOptions,))
 """Types of the arguments of `rasterize`."""
 
 
-def _checked_rule(camera: Camera, options: RasterizeOptions) -> Rule:
-    """Return the rule that the options name, with the near and far plane of the options.
-
-    Raises:
-        UsageError: The rule, the tile size or the camera model is unknown; or options exclude each other or are out of range.
-        ValueError: The near or the far plane is outside its range.
-    """
-    rule = options.rule if isinstance(options.rule, Rule) else rule_named(options.rule)
-    near = rule.near if options.near is None else options.near
-    far = rule.far if options.far is None else options.far
-    if not 0 <= near < far <= FAR:
-        raise ValueError(f"near {near} and far {far} are not a range of depths: give 0 <= near < far <= {FAR:g}")
-    if options.tile_size not in TILE_SIZES:
-        raise UsageError(f"tile size {options.tile_size} is not one of {', '.join(map(str, TILE_SIZES))}")
-    check_camera(camera)
-    if options.heaviest < 0:
-        raise UsageError(f"RasterizeOptions.heaviest must be at least 0, not {options.heaviest}")
-    if options.max_instances is not None and (options.capacity is not None or options.max_instances < 1):
-        raise UsageError(
-            "max_instances must be at least 1, and cannot be combined with capacity; found "
-            f"max_instances={options.max_instances}, capacity={options.capacity}"
-        )
-    if options.pixels is not None and (options.window or options.contributions or options.capacity is not None):
-        raise UsageError("RasterizeOptions.pixels cannot be combined with window, contributions or capacity; leave out pixels")
-    if options.capacity is not None and options.capacity > MAX_INSTANCES:
-        raise UsageError(f"capacity must be at most {MAX_INSTANCES:,}, not {options.capacity:,}")
-    if options.error_bound and options.capacity is not None:
-        raise UsageError("error_bound and capacity exclude each other: leave one out")
-    return rule if (near, far) == (rule.near, rule.far) else replace(rule, near=near, far=far)
-
-
 def _check_arguments(gaussians: RasterizedGaussians, camera: Camera, options: RasterizeOptions) -> None:
-    """Check types, the camera's arrays, and the shape of ``sh``; other shapes are checked where the tensors are used.
-
-    Values of Gaussians are not checked; Gaussians with non-finite values are culled.
-
-    Raises:
-        TypeError: An argument, a field of the Gaussians, or an array of the camera has the wrong type.
-        UsageError: There is a feature background but no features, or the Gaussians have no colours.
-        ValueError: A shape or a number of the camera (`check_arrays`), or the shape of ``sh``, is wrong.
-    """
+    """Check types, the camera's arrays, and the shape of ``sh``; non-finite Gaussians are culled, not rejected."""
     for name, given, kinds in zip(("gaussians", "camera", "options"), (gaussians, camera, options), ARGUMENTS, strict=True):
         if not isinstance(given, kinds):
             listed = isinstance(given, (list, tuple))
@@ -300,8 +219,6 @@ def _check_arguments(gaussians: RasterizedGaussians, camera: Camera, options: Ra
     for name, tensor in gaussians.tensors().items():
         _check_tensor(name, tensor)
     check_arrays(camera)
-    if options.feature_background is not None and options.features is None:
-        raise UsageError("feature_background requires features: give features=..., or leave feature_background out")
     sh = gaussians.tensors()["sh"]
     if sh.ndim != 3 or sh.shape[1] != (gaussians.sh_degree + 1) ** 2:
         raise ValueError(f"sh must have shape [N, K, 3], where K is 1, 4, 9, 16 or 25, not {list(sh.shape)}")
@@ -330,12 +247,7 @@ def _checked_window(camera: Camera, options: RasterizeOptions) -> Window:
 
 
 def _checked_channels(name: str, values: torch.Tensor | None, inputs: ProjectInputs) -> torch.Tensor | None:
-    """Return channels, given as [N, D] or [C, N, D], in shape [1, N, D] or [C, N, D].
-
-    Raises:
-        TypeError: The channels are not a tensor, or have another scalar type than the Gaussians.
-        ValueError: The shape or the device is wrong.
-    """
+    """Return channels, given as [N, D] or [C, N, D], in shape [1, N, D] or [C, N, D]."""
     if values is None:
         return None
     pattern = "C N D" if isinstance(values, torch.Tensor) and values.ndim == 3 else "N D"
@@ -348,11 +260,11 @@ def _checked_channels(name: str, values: torch.Tensor | None, inputs: ProjectInp
     return values if values.ndim == 3 else values[None]
 
 
-def _check_memory(window: Window, layers: list[_Layer], heaviest: int, like: torch.Tensor) -> None:
+def _check_memory(window: Window, layers: list[Layer], heaviest: int, like: torch.Tensor) -> None:
     """Raise ResourceError where the images [C, H, W, D] of the layers need more memory than the device of ``like`` has free."""
-    channels = sum(layer.backgrounds.shape[1] + 4 for layer in layers)  # and alpha, depth, transmittance, sum of weights
+    channels = sum(backgrounds.shape[1] + 4 for _, backgrounds in layers)  # and alpha, depth, transmittance, sum of weights
     channels += 2 * heaviest
-    needed = len(layers[0].backgrounds) * window[2] * window[3] * channels * like.element_size()
+    needed = len(layers[0][1]) * window[2] * window[3] * channels * like.element_size()
     if needed < installed_bytes(like.device) // 20:  # a query of the free memory takes 0.1 ms
         return
     free = available_bytes(like.device)
@@ -363,13 +275,9 @@ def _check_memory(window: Window, layers: list[_Layer], heaviest: int, like: tor
         )
 
 
-class _Layer(NamedTuple):
-    """Values that are blended into one image."""
-
-    colors: torch.Tensor | None
-    """Channels of each Gaussian, shape [1, N, D] or [C, N, D]; None for the spherical harmonics."""
-    backgrounds: torch.Tensor
-    """Values behind the scene, shape [C, D]."""
+Layer = tuple[torch.Tensor | None, torch.Tensor]
+"""Values that are blended into one image: channels of each Gaussian [1, N, D] or [C, N, D], None for the spherical harmonics;
+and what is behind the scene, shape [C, D]."""
 
 
 def _as_tensor(values: Any) -> torch.Tensor:
@@ -377,13 +285,8 @@ def _as_tensor(values: Any) -> torch.Tensor:
     return torch.as_tensor(values, device=getattr(values, "device", "cpu"))
 
 
-def _layer(name: str, background: Any, colors: torch.Tensor | None, inputs: ProjectInputs) -> _Layer:
-    """Return channels [..., D] with their background (one, a batch, or None for zeros); ``name`` is the background's option.
-
-    Raises:
-        TypeError: The background does not hold real numbers, or is sparse.
-        ValueError: The shape of the background is wrong.
-    """
+def _layer(name: str, background: Any, colors: torch.Tensor | None, inputs: ProjectInputs) -> Layer:
+    """Return channels [..., D] with their background (one, a batch, or None for zeros); ``name`` is the background's option."""
     channels, like = 3 if colors is None else colors.shape[-1], inputs.viewmats
     if background is None:  # outside of the try block: a full GPU is not a wrong background
         background = like.new_zeros(channels)
@@ -398,7 +301,7 @@ def _layer(name: str, background: Any, colors: torch.Tensor | None, inputs: Proj
     values = values.to(like)
     if values.ndim not in (1, 2) or values.shape[-1] != channels or (values.ndim == 2 and len(values) != len(like)):
         raise ValueError(f"{name} must have shape [{channels}] or [C, {channels}], C={len(like)}, not {list(values.shape)}")
-    return _Layer(colors, values.expand(len(like), channels) if values.ndim == 1 else values)
+    return colors, values.expand(len(like), channels) if values.ndim == 1 else values
 
 
 @overload
@@ -456,17 +359,16 @@ def _render(gaussians: RasterizedGaussians, camera: Camera, options: RasterizeOp
     """Return what `rasterize` returns for one camera or a batch [C, ...] of them."""
     refuse_transforms()
     _check_arguments(gaussians, camera, options)
-    rule = _checked_rule(camera, options)
+    check_camera(camera)
     inputs = inputs_of(gaussians, camera, options.opacity_factors)
     degree = gaussians.sh_degree if options.sh_degree is None else options.sh_degree
     degree = degree if options.colors is None else 0  # unused harmonics: read as few as possible
-    named = {n: getattr(options, n) for n in ("tile_size", "absgrad", "antialiased")}
     pixels = None
     if options.pixels is not None:
         pixels = checked_pixels(options.pixels, len(inputs.viewmats), inputs.means.device)
     window = _checked_window(camera, options) if pixels is None else window_of(pixels, camera, options.tile_size)
-    named |= {"window": window, "parameters": parameters_of(gaussians)}
-    settings = settings_of(camera, degree, rule, **named)
+    shared = {n: getattr(options, n) for n in ("tile_size", "absgrad", "antialiased", "deterministic")}
+    settings = pass_of(camera, degree, options.cut_offs(), window=window, parameters=parameters_of(gaussians), **shared)
     colors = _checked_channels("colors", options.colors, inputs)
     features = _checked_channels("features", options.features, inputs)
     if options.absgrad and (features is not None or (colors is not None and colors.shape[-1] > WIDTHS[-1])):
@@ -474,7 +376,7 @@ def _render(gaussians: RasterizedGaussians, camera: Camera, options: RasterizeOp
             f"absgrad supports at most {WIDTHS[-1]} channels of colors, and no features: render more in a second call"
         )
     if inputs.means.is_cuda and options.repeatable():
-        backgrounds = None if options.background is None else _layer("background", options.background, None, inputs).backgrounds
+        backgrounds = None if options.background is None else _layer("background", options.background, None, inputs)[1]
         gradients = needs_slots((*inputs, backgrounds))
         found = graphed.recorder(inputs.means.device, gradients).render(inputs, backgrounds, settings)
         if found is not None:
@@ -483,12 +385,12 @@ def _render(gaussians: RasterizedGaussians, camera: Camera, options: RasterizeOp
     if features is not None:
         layers.append(_layer("feature_background", options.feature_background, features, inputs))
     _check_memory(settings.window, layers, options.heaviest, inputs.means)
-    images, *found, maps = _rasterize(inputs, layers, settings, options, pixels)
+    images, projected, tile_counts, maps = _rasterize(inputs, layers, settings, options, pixels)
     if pixels is not None:
         images = tuple(at_pixels(image, pixels, window) for image in images)
-        maps = {name: None if image is None else at_pixels(image, pixels, window) for name, image in maps.items()}
-    count_passes(found[0])
-    render = _as_render(camera, images, *found, **maps)
+        maps = {name: at_pixels(values, pixels, window) for name, values in maps.items()}
+    count_passes(projected)
+    render = _as_render(camera, images, projected, tile_counts, **maps)
     if options.error_bound:
         render = replace(render, error_bound=_error_bound(render.rgb.detach(), gaussians, camera, options))
     if options.absgrad:
@@ -526,47 +428,39 @@ def _error_bound(rgb: torch.Tensor, gaussians: RasterizedGaussians, camera: Came
 
 
 def _rasterize(
-    inputs: ProjectInputs, layers: list[_Layer], settings: RenderSettings, options: RasterizeOptions,
-    pixels: torch.Tensor | None,
-) -> tuple[Any, ...]:  # fmt: skip
-    """Return the images of the first layer as one tuple, and the further fields of `Render`, by kernels launched one by one.
-
-    The last entry holds the further maps [C, H, W, ...] that were requested, by name.
-    """
-    projected, tile_counts = project_inputs(inputs, settings.projection())
-    overflow = None if options.capacity is None else torch.zeros(1, dtype=torch.int32, device=projected.device)
+    inputs: ProjectInputs, layers: list[Layer], settings: Pass, options: RasterizeOptions, pixels: torch.Tensor | None
+) -> tuple[Any, ...]:
+    """Return images, projected Gaussians [C, N, 12], tile counts [C, N], and the further fields of `Render` by name."""
+    projected, tile_counts = project_inputs(inputs, settings)
+    further = options.contributions, options.median_depth, options.heaviest
     if options.max_instances is not None and int(tile_counts.sum()) > options.max_instances:
-        frame = ChunkedFrame(settings, options.max_instances, options.deterministic)
-        images = [blend_chunked(projected, layer.backgrounds, frame, inputs, layer.colors) for layer in layers]
-        weights = contributions_chunked(projected, frame, inputs) if options.contributions else (None, None)
-        median = median_depth_chunked(projected, frame, inputs) if options.median_depth else None
-        heavy = heaviest_chunked(projected, frame, inputs, options.heaviest) if options.heaviest else ()
+        frame = settings, options.max_instances, inputs
+        images = [blend_chunked(projected, backgrounds, *frame, colors) for colors, backgrounds in layers]
+        maps = further_chunked(projected, *frame, *further) if any(further) else {}
     else:
+        overflow = None if options.capacity is None else torch.zeros(1, dtype=torch.int32, device=projected.device)
         memory = InstanceMemory(options.memory_budget, options.capacity, overflow)
-        leaves = [projected, *(t for layer in layers for t in (layer.backgrounds, layer.colors) if t is not None)]
-        slotted = options.contributions or needs_slots(leaves)
+        slotted = options.contributions or needs_slots([projected, *(t for layer in layers for t in layer)])
         listed = None if pixels is None else listed_tiles(pixels, settings, len(projected))
         tiles = bin_projected(projected, tile_counts, settings, memory, slotted, listed)
-        order = options.deterministic
-        images = [images_of(projected, tiles, layer.backgrounds, settings, order, layer.colors) for layer in layers]
-        weights = weights_of(projected, tiles, settings) if options.contributions else (None, None)
-        median = median_depth_of(projected, tiles, settings) if options.median_depth else None
-        heavy = heaviest_of(projected, tiles, settings, options.heaviest) if options.heaviest else ()
-    maps = {"features": images[1][0] if len(images) > 1 else None, "median_depth": median}
-    maps |= dict(zip(("heaviest_ids", "heaviest_weights", "blend_counts"), heavy))
-    return images[0], projected, tile_counts, *weights, overflow, maps
+        images = [images_of(projected, tiles, backgrounds, settings, colors) for colors, backgrounds in layers]
+        maps = further_of(projected, tiles, settings, *further)
+        if overflow is not None:
+            maps["overflow"] = overflow
+    if len(images) > 1:
+        maps["features"] = images[1][0]
+    return images[0], projected, tile_counts, maps
 
 
-def _as_render(camera: Camera, images: tuple[torch.Tensor, ...], *rest: Any, **maps: torch.Tensor | None) -> Render:
-    """Return the render, with tensors that have no leading axis for a single camera."""
-    single = len(camera.viewmat.shape) == 2
-
-    def own(image: torch.Tensor) -> torch.Tensor:
-        return image.squeeze(0) if single else image  # not image[0], whose gradient would be a copy among zeros
-
-    shaped: dict[str, Any] = {name: own(image) for name, image in maps.items() if image is not None}
-    rgb, alpha, depth = map(own, images)
-    return Render(rgb, alpha, depth, *rest, **shaped)
+def _as_render(
+    camera: Camera, images: Sequence[torch.Tensor], projected: torch.Tensor, tile_counts: torch.Tensor, **maps: Any
+) -> Render:
+    """Return the render, with images [C, H, W, ...] that have no leading axis for a single camera."""
+    if len(camera.viewmat.shape) == 2:  # not image[0], whose gradient would be a copy among zeros
+        images = [image.squeeze(0) for image in images]
+        maps = {name: values if name in WHOLE else values.squeeze(0) for name, values in maps.items()}
+    rgb, alpha, depth = images
+    return Render(rgb, alpha, depth, projected, tile_counts, **maps)
 
 
 FASTEST_FIRST = ("fast", "balanced", "exact")

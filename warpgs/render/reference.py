@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import torch
 
 from warpgs import geometry
@@ -16,23 +14,13 @@ BLOCK = 16
 """Side of the blocks of pixels that are composited at a time [px]."""
 
 
-@dataclass(frozen=True)
-class _Ellipses:
-    """The visible Gaussians in the image, from front to back."""
-
-    pixels: torch.Tensor
-    """Projected means [px], shape [N, 2]."""
-    half: torch.Tensor
-    """Half sides [px] of the box that holds every pixel with alpha at or above the cut-off, shape [N, 2]."""
-    power: tuple[torch.Tensor, torch.Tensor, torch.Tensor]
-    """Factors of dx^2, dx dy and dy^2 in the exponent, each of shape [N, 1]."""
-    opacities: torch.Tensor
-    """Opacities, shape [N]."""
-    colors: torch.Tensor
-    """Colours, shape [N, 3]."""
+Ellipses = tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]
+"""The visible Gaussians in the image, from front to back: projected means [N, 2] [px]; half sides [N, 2] [px] of the box that
+holds every pixel with alpha at or above the cut-off; factors [N, 3] of dx^2, dx dy and dy^2 in the exponent; opacities [N]; and
+colours [N, 3]."""
 
 
-def _project(gaussians: Gaussians, camera: Camera, degree: int, antialiased: bool) -> _Ellipses:
+def _project(gaussians: Gaussians, camera: Camera, degree: int, antialiased: bool) -> Ellipses:
     """Project all Gaussians by the matrices of Kerbl et al. 2023, section 4."""
     rule = RULES["exact"]
     means, quats, log_scales, logits, coefficients = (t.detach().double() for t in gaussians.tensors().values())
@@ -53,14 +41,14 @@ def _project(gaussians: Gaussians, camera: Camera, degree: int, antialiased: boo
     if antialiased:
         opacities = opacities * (torch.linalg.det(axes @ axes.mT).clamp_min(0) / torch.linalg.det(covariances)).sqrt()
     inverse = torch.linalg.inv_ex(covariances).inverse
-    A, B, C = -0.5 * inverse[:, 0, :1], -inverse[:, 0, 1:], -0.5 * inverse[:, 1, 1:]
+    factors = torch.stack([-0.5 * inverse[:, 0, 0], -inverse[:, 0, 1], -0.5 * inverse[:, 1, 1]], 1)
     away = means[visible] + rotation.T @ translation
     directions, count = away / away.norm(dim=-1, keepdim=True), sh.coefficient_count(degree)
     colors = torch.einsum("nk,nkc->nc", sh.basis(directions)[:, :count], coefficients[visible, :count])
     colors = (colors + 0.5).clamp_min(0)
     reach = torch.sqrt(2 * torch.log(opacities / rule.alpha_cut))[:, None] + 0.01  # slightly beyond alpha = cut
     half = reach * torch.sqrt(torch.diagonal(covariances, dim1=-2, dim2=-1))
-    return _Ellipses(pixels, half, (A, B, C), opacities, colors)
+    return pixels, half, factors, opacities, colors
 
 
 def _pixels(
@@ -89,14 +77,14 @@ def _pixels(
     return pixels, focal[:, None] * torch.stack(rows, 1)
 
 
-def _block(g: _Ellipses, corner: torch.Tensor, size: tuple[int, int], steps: torch.Tensor, background: torch.Tensor):
+def _block(g: Ellipses, corner: torch.Tensor, size: tuple[int, int], steps: torch.Tensor, background: torch.Tensor):
     """Return the colours [w * h, 3] of a block of ``size`` w x h, by rows; ``steps`` are offsets of pixel centres."""
-    rule, (w, h), (A, B, C) = RULES["exact"], size, g.power
+    rule, (w, h), (pixels, half, factors, opacities, colors) = RULES["exact"], size, g
     extent = torch.tensor([w, h], dtype=torch.float64, device=corner.device)
-    pixels, half, opacities, colors = g.pixels, g.half, g.opacities, g.colors
     near = torch.nonzero(((pixels + half >= corner) & (pixels - half <= corner + extent)).all(1)).squeeze(1)
     dx, dy = corner[0] + steps[:w] - pixels[near, :1], corner[1] + steps[:h] - pixels[near, 1:]
-    power = (A[near] * dx * dx)[:, None] + (B[near] * dy)[..., None] * dx[:, None] + (C[near] * dy * dy)[..., None]
+    A, B, C = factors[near].split(1, 1)
+    power = (A * dx * dx)[:, None] + (B * dy)[..., None] * dx[:, None] + (C * dy * dy)[..., None]
     alpha = opacities[near, None] * torch.exp(power.flatten(1))
     alpha = torch.where(alpha >= rule.alpha_cut, alpha.clamp_max(rule.alpha_max), 0.0)
     after = torch.cumprod(1 - alpha, 0)
@@ -110,25 +98,7 @@ def reference_image(
     gaussians: Gaussians, camera: Camera, window: tuple[int, int, int, int], background: torch.Tensor, degree: int,
     antialiased: bool = False,
 ) -> torch.Tensor:  # fmt: skip
-    """Return the colours in a window of one camera's image under rule ``exact``, in float64.
-
-    Gaussians are evaluated at all pixels of a block, with matrices (Kerbl et al. 2023, section 4 and eq. 3). Use it for
-    windows of a few thousand pixels. Leave out Gaussians that do not reach the window: the time grows with their number.
-
-    Args:
-        gaussians: N Gaussians of any scalar type, all finite.
-        camera: One camera.
-        window: Left, top, width and height [px].
-        background: Colour behind the scene, shape [3].
-        degree: Spherical-harmonics degree used.
-        antialiased: As in `RasterizeOptions`.
-
-    Returns:
-        Colours, not clamped, shape [h, w, 3].
-
-    Raises:
-        UsageError: The camera model is only supported by the kernels.
-    """
+    """Return the colours [h, w, 3] in a window [px] of one image under rule ``exact``, in float64, not clamped."""
     geometry.check_known(camera.model)
     g, device = _project(gaussians, camera, degree, antialiased), gaussians.means.device
     left, top, width, height = window

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -29,19 +30,7 @@ TAU = 2 * np.pi
 
 
 def checker_texture(rng: np.random.Generator, low: str, high: str, period: float, kind: str = "solid") -> raycast.Texture:
-    """Return a smoothed checker with five tinting waves of 0.6 to 2.2 times the checker's period.
-
-    Args:
-        rng: Generator of directions, tints and phases.
-        low: One colour, as six hexadecimal digits.
-        high: The other colour, likewise.
-        period: Period of the checker [u].
-        kind: ``solid``; ``flat`` where the surface is the local plane z = 0 and only x and y make a pattern; ``box`` for a box
-            with edges of two periods, so that its faces lie where the checker pattern is strongest.
-
-    Returns:
-        The texture, matte.
-    """
+    """Return a checker of ``period`` [u] in two colours (hexadecimal), with five waves of 0.6 to 2.2 times its period."""
     directions = rng.normal(size=(5, 3))
     if kind == "flat":
         directions[:, 2] = 0
@@ -64,19 +53,8 @@ def _turn(x: float = 0.0, y: float = 0.0) -> np.ndarray:
 
 
 def still_life(seed: int = 0) -> list[raycast.Shape]:
-    """Return the shapes of the scene: three walls and a floor that fill the frame, and six objects that hide one another.
-
-    Args:
-        seed: Seed of the patterns; the arrangement is fixed.
-
-    Returns:
-        The shapes, the four planes first.
-    """
-    rng = np.random.default_rng(seed)
-
-    def surface(low: str, high: str, period: float, kind: str = "solid") -> raycast.Texture:
-        return checker_texture(rng, low, high, period, kind)
-
+    """Return the scene's shapes: four planes that fill the frame, then six objects that hide one another."""
+    surface = functools.partial(checker_texture, np.random.default_rng(seed))
     return [
         raycast.Plane((0, 0, 6.4), surface("1a3a5f", "f7e6c6", 0.92, "flat")),
         raycast.Plane((-3.3, 0, 0), surface("7a2a22", "f5be78", 1.1, "flat"), _turn(y=-90)),
@@ -92,17 +70,7 @@ def still_life(seed: int = 0) -> list[raycast.Shape]:
 
 
 def camera_path(views: int, width: int, height: int) -> list[Camera]:
-    """Return cameras along a wave from left to right; its crests and troughs are the training views.
-
-    Args:
-        views: Number of cameras.
-        width: Image width [px].
-        height: Image height [px].
-
-    Returns:
-        The cameras in the order of the path. Held-out views lie between two training views, both horizontally and vertically,
-        so that they interpolate.
-    """
+    """Return cameras along a wave from left to right; its crests and troughs are the training views."""
     focal = 0.95 * max(width, height * 4 / 3)
     K = np.array([[focal, 0, 0.515 * width], [0, focal, 0.485 * height], [0, 0, 1]])
     out = []
@@ -120,16 +88,20 @@ def camera_path(views: int, width: int, height: int) -> list[Camera]:
     return out
 
 
+def _split(views: int, train: set[int]) -> str:
+    """Return a split by the names of the images, all but those of ``train`` held out."""
+    names = [",".join(f"{i:03d}.png" for i in range(views) if (i in train) is wanted) for wanted in (True, False)]
+    return f"train={names[0]};test={names[1]}"
+
+
 def split_spec(views: int) -> str:
     """Return the split of a demo with that many views: six evenly spaced training views, all others held out."""
-    train = {round(i) for i in np.linspace(0, views - 1, TRAIN_VIEWS).tolist()}
-    names = [f"{i:03d}.png" for i in range(views)]
-    held_out = [n for i, n in enumerate(names) if i not in train]
-    return f"train={','.join(names[i] for i in sorted(train))};test={','.join(held_out)}"
+    return _split(views, {round(i) for i in np.linspace(0, views - 1, TRAIN_VIEWS).tolist()})
 
 
 def _project(camera: Camera, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return image positions [px], shape [N, 2], and depths [u], shape [N], of world points [u], shape [N, 3]."""
+    # as in the demo's first version: `geometry.project_points` rounds otherwise, which would change its files
     p = matmul(x, camera.viewmat[:3, :3].T) + camera.viewmat[:3, 3]
     with np.errstate(divide="ignore", invalid="ignore"):
         xy = p[:, :2] / p[:, 2:] * camera.K[[0, 1], [0, 1]] + camera.K[:2, 2]
@@ -137,20 +109,7 @@ def _project(camera: Camera, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _sees(shapes: list[raycast.Shape], camera: Camera, x: np.ndarray, index: np.ndarray) -> np.ndarray:
-    """Return True for points that a camera sees well enough for a feature detector.
-
-    A point counts if the ray through its projection hits the point itself, and the rays 1.5 px around hit the point's own
-    shape. Points on a silhouette, where a pixel mixes two surfaces, do not count.
-
-    Args:
-        shapes: Shapes of the scene.
-        camera: The camera.
-        x: Surface points [u], shape [N, 3].
-        index: Index of the shape of each point, shape [N].
-
-    Returns:
-        True where the camera sees the point, shape [N].
-    """
+    """Return whether a camera sees surface points [N, 3] [u] of the shapes ``index`` [N] well enough for a feature detector."""
     xy, depth = _project(camera, x)
     size = np.array([camera.width, camera.height])
     seen = (depth > 0) & (xy >= 2).all(axis=1) & (xy <= size - 2).all(axis=1)
@@ -168,18 +127,7 @@ def _sees(shapes: list[raycast.Shape], camera: Camera, x: np.ndarray, index: np.
 def surface_points(
     shapes: list[raycast.Shape], light: raycast.Light, cameras: list[Camera], rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return points on the visible surfaces, as a reconstruction without error would find them.
-
-    Args:
-        shapes: Shapes of the scene.
-        light: Light of the scene.
-        cameras: C cameras.
-        rng: Generator of the pixels whose surface points are taken.
-
-    Returns:
-        Positions [u], float64, shape [N, 3]; colours in [0, 1], shape [N, 3]; and True where a camera sees a point, shape
-        [N, C]: every point is seen by at least two cameras.
-    """
+    """Return points [N, 3] [u] that at least two cameras see, colours [N, 3], and which cameras see them [N, C]."""
     width, height = cameras[0].width, cameras[0].height
     count = int(np.clip(CANDIDATES * width * height / (320 * 240), 600, CANDIDATES))
     xs, indices = [], []
@@ -209,14 +157,7 @@ def _quaternion(R: np.ndarray) -> np.ndarray:
 
 
 def colmap_text(cameras: list[Camera], x: np.ndarray, colors: np.ndarray, seen: np.ndarray) -> dict[str, str]:
-    """Return the contents of the three text files of a COLMAP model, by file name.
-
-    Args:
-        cameras: C cameras with equal intrinsics; camera i took ``{i:03d}.png``.
-        x: Point positions [u], shape [N, 3].
-        colors: Point colours in [0, 1], shape [N, 3].
-        seen: True where a camera sees a point, bool, shape [N, C].
-    """
+    """Return a COLMAP model's text files by name; camera i took ``{i:03d}.png``, and ``seen`` is [N, C]."""
 
     def join(values, digits: int) -> str:
         return " ".join(f"{v:z.{digits}f}" for v in values)  # z: a zero has no sign
@@ -264,34 +205,18 @@ def _check(folder: Path, width: int, height: int) -> None:
 
 def _files(views: int, width: int, height: int, seed: int, tell: Callable[[str], object]) -> dict[str, bytes]:
     """Return the contents of the demo folder by relative path, all at once, so that an interruption leaves no partial scene."""
-    import cv2
-
     shapes, light = still_life(seed), raycast.Light()
     cameras = camera_path(views, width, height)
     files = {}
     for i, camera in enumerate(counted(cameras, tell, "rendering", "views")):
-        rgb = raycast.render(shapes, light, camera.K, camera.viewmat, width, height)
-        _, png = cv2.imencode(".png", np.round(255 * rgb[..., ::-1]).astype(np.uint8))
-        files[f"images/{i:03d}.png"] = png.tobytes()
+        files[f"images/{i:03d}.png"] = _png(raycast.render(shapes, light, camera.K, camera.viewmat, width, height))
     tell("finding points")
-    points = surface_points(shapes, light, cameras, np.random.default_rng([seed, 1]))
-    for name, text in colmap_text(cameras, *points).items():
-        files[f"sparse/0/{name}"] = text.encode()
-    return files
+    texts = colmap_text(cameras, *surface_points(shapes, light, cameras, np.random.default_rng([seed, 1])))
+    return files | {f"sparse/0/{name}": text.encode() for name, text in texts.items()}
 
 
 def write_files(folder: Path, size: tuple[int, int], contents: Callable[[], dict[str, bytes]]) -> None:
-    """Write the files of a demo into a new or empty folder, all or none.
-
-    Args:
-        folder: Target folder.
-        size: Image width and height [px].
-        contents: Function that returns the contents by relative path; called once the folder is known to be writable.
-
-    Raises:
-        UsageError: The folder is not empty, or the images are too small.
-        ResourceError: The folder cannot be written.
-    """
+    """Write the files of a demo into a new or empty folder, all or none."""
     _check(folder, *size)
     with filling(folder) as temporary:  # before the work: a folder that cannot be made is reported at once
         for path, content in contents().items():
@@ -453,14 +378,7 @@ def _antennas(rng: np.random.Generator, surface: Surface) -> list[raycast.Shape]
 
 
 def cut_out_object(seed: int = 0) -> list[raycast.Shape]:
-    """Return the shapes of an object: a body on thin legs, a ring and a grid to see through, thin plates, rods with balls.
-
-    Args:
-        seed: Decides shapes, places, sizes and patterns.
-
-    Returns:
-        The shapes, all within `REACH` of the origin.
-    """
+    """Return an object's shapes, within `REACH`: a body on legs, a ring and a grid, thin plates, rods with balls."""
     rng = np.random.default_rng([seed, 2])
     order = iter(np.tile(rng.permutation(len(PALETTE)), 4))
 
@@ -472,16 +390,7 @@ def cut_out_object(seed: int = 0) -> list[raycast.Shape]:
 
 
 def ring_cameras(views: int, width: int, height: int) -> list[Camera]:
-    """Return cameras once around the origin, on a wave 17 to 53 degrees high; training views are its crests and troughs.
-
-    Args:
-        views: Number of cameras.
-        width: Image width [px].
-        height: Image height [px].
-
-    Returns:
-        The cameras in the order of the ring; a sphere of radius `REACH` around the origin nearly fills the shorter image side.
-    """
+    """Return cameras around the origin, on a wave 17 to 53 degrees high; training views are its crests and troughs."""
     focal = 0.48 * min(width, height) / np.tan(np.arcsin(REACH / DISTANCE))
     K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
     cameras = []
@@ -494,9 +403,7 @@ def ring_cameras(views: int, width: int, height: int) -> list[Camera]:
 
 def object_split_spec(views: int) -> str:
     """Return the split of an object with that many views: eight evenly spaced training views, all others held out."""
-    train = {i * views // OBJECT_TRAIN_VIEWS for i in range(OBJECT_TRAIN_VIEWS)}
-    names = [[f"{i:03d}.png" for i in range(views) if (i in train) == wanted] for wanted in (True, False)]
-    return f"train={','.join(names[0])};test={','.join(names[1])}"
+    return _split(views, {i * views // OBJECT_TRAIN_VIEWS for i in range(OBJECT_TRAIN_VIEWS)})
 
 
 def _png(image: np.ndarray) -> bytes:
@@ -543,27 +450,7 @@ def write_object(
     folder: Path, *, form: str = "transforms", views: int = 24, width: int = 320, height: int = 240, seed: int = 0,
     tell: Callable[[str], object] = lambda line: None,
 ) -> str:  # fmt: skip
-    """Write an object as a scene folder: RGBA images with straight colours, or RGB images with soft masks.
-
-    The same arguments give the same bytes on the same machine and library versions.
-
-    Args:
-        folder: Target folder, new or empty.
-        form: ``transforms``: transforms.json with RGBA images. ``colmap``: a COLMAP model with a few exact points, RGB images,
-            grey outside the object, and masks that hold the alpha, white for the object.
-        views: Number of images, at least 9; eight of them are training views.
-        width: Image width [px].
-        height: Image height [px].
-        seed: Decides the object.
-        tell: Called with a line for each view before it is rendered.
-
-    Returns:
-        The split to use: eight training views around the object, all others held out.
-
-    Raises:
-        UsageError: The folder is not empty, the sizes are too small, or the format is unknown.
-        ResourceError: The folder cannot be written.
-    """
+    """Write an object as a scene folder: RGBA images with straight colours, or RGB images with soft masks."""
     if form not in FORMATS:
         raise UsageError(f"a demo object is written as {' or '.join(FORMATS)}, not as {form!r}")
     if views < OBJECT_MIN_VIEWS:

@@ -41,14 +41,7 @@ class Texture:
     """Gain before the tanh that rounds the checker's edges: a larger gain makes crisper edges."""
 
     def __call__(self, p: np.ndarray) -> np.ndarray:
-        """Return the albedo at local positions.
-
-        Args:
-            p: Local positions [u], shape [N, 3].
-
-        Returns:
-            Colours in [0, 1], shape [N, 3], in the dtype of ``p``.
-        """
+        """Return the albedo [N, 3] in [0, 1] at local positions [N, 3] [u]."""
         dt = p.dtype
         product = np.ones(len(p), dt)
         for axis, frequency in enumerate(self.checker):
@@ -85,22 +78,13 @@ class Shape(abc.ABC):
 
     @abc.abstractmethod
     def hit(self, o: np.ndarray, d: np.ndarray) -> np.ndarray:
-        """Return the distance to the first hit in front of the origin.
-
-        Args:
-            o: Ray origin in the local frame [u], shape [3].
-            d: Unit directions in the local frame, shape [N, 3].
-
-        Returns:
-            Distances [u], shape [N]; infinite where the ray misses.
-        """
+        """Return distances [N] [u] from a local origin [3] along unit directions [N, 3] to the first hit; inf for none."""
 
     @abc.abstractmethod
     def normal(self, p: np.ndarray) -> np.ndarray:
         """Return outward unit normals in the local frame at local surface positions ``p``; both shape [N, 3]."""
 
 
-@dataclass(frozen=True)
 class Plane(Shape):
     """The plane through ``center`` with local normal -z, seen from the side of the normal."""
 
@@ -268,16 +252,7 @@ class Light:
 
 
 def cast(shapes: Sequence[Shape], origin: np.ndarray, dirs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the first hits of rays from one point.
-
-    Args:
-        shapes: Shapes of the scene.
-        origin: Origin of the rays in the world [u], shape [3].
-        dirs: Unit directions in the world, shape [N, 3].
-
-    Returns:
-        Distances [u], shape [N], infinite where nothing is hit; and indices into ``shapes``, shape [N], -1 for nothing.
-    """
+    """Return distances [N] [u] and shapes [N] that rays ``dirs`` [N, 3] from one point hit first; inf and -1 for none."""
     t = np.full(len(dirs), np.inf, dirs.dtype)
     index = np.full(len(dirs), -1, np.int16)
     for i, shape in enumerate(shapes):
@@ -297,17 +272,7 @@ def cast(shapes: Sequence[Shape], origin: np.ndarray, dirs: np.ndarray) -> tuple
 
 
 def shade(shapes: Sequence[Shape], light: Light, x: np.ndarray, index: np.ndarray) -> np.ndarray:
-    """Return the colours of surface points: albedo times soft light, contact shade and soft shadows.
-
-    Args:
-        shapes: Shapes of the scene.
-        light: Light of the scene.
-        x: Surface points in the world [u], shape [N, 3].
-        index: Index of the shape of each point, shape [N]; -1 is black.
-
-    Returns:
-        Colours in [0, 1], shape [N, 3], in the dtype of ``x``.
-    """
+    """Return colours [N, 3] of points ``x`` [N, 3] on shapes ``index`` [N]: albedo, soft light, contact shade, soft shadows."""
     rgb, normals = np.zeros_like(x), np.zeros_like(x)
     for i, shape in enumerate(shapes):
         rows = np.flatnonzero(index == i)
@@ -337,16 +302,7 @@ def shade(shapes: Sequence[Shape], light: Light, x: np.ndarray, index: np.ndarra
 
 
 def pixel_rays(K: np.ndarray, viewmat: np.ndarray, xy: np.ndarray) -> np.ndarray:
-    """Return unit world directions through image positions.
-
-    Args:
-        K: Intrinsics [px], shape [3, 3].
-        viewmat: camera_from_world, shape [4, 4].
-        xy: Image positions [px], pixel centres at +0.5, shape [N, 2].
-
-    Returns:
-        Directions, shape [N, 3], in the dtype of ``xy``.
-    """
+    """Return unit world directions [N, 3] through image positions ``xy`` [N, 2] [px]."""
     d = np.ones((len(xy), 3), xy.dtype)
     d[:, 0] = (xy[:, 0] - K[0, 2]) / K[0, 0]
     d[:, 1] = (xy[:, 1] - K[1, 2]) / K[1, 1]
@@ -357,21 +313,7 @@ def pixel_rays(K: np.ndarray, viewmat: np.ndarray, xy: np.ndarray) -> np.ndarray
 def render_rgba(
     shapes: Sequence[Shape], light: Light, K: np.ndarray, viewmat: np.ndarray, width: int, height: int, samples: int = 3
 ) -> np.ndarray:
-    """Render an anti-aliased image and its alpha.
-
-    Args:
-        shapes: Shapes of the scene.
-        light: Light of the scene.
-        K: Intrinsics [px], shape [3, 3].
-        viewmat: camera_from_world, shape [4, 4].
-        width: Image width [px].
-        height: Image height [px].
-        samples: Number of rays along each side of a pixel.
-
-    Returns:
-        Colours in [0, 1], multiplied by alpha, and alpha as fourth channel: the fraction of a pixel's rays that hit a shape.
-        float32, shape [H, W, 4].
-    """
+    """Render colours over black and alpha, the fraction of ``samples`` x ``samples`` rays that hit, float32 [H, W, 4]."""
     origin = -matmul(viewmat[:3, :3].T, viewmat[:3, 3])
     sub = (np.arange(width * samples, dtype=np.float32) + 0.5) / samples
     out = np.empty((height, width, 4), np.float32)

@@ -173,8 +173,9 @@ def captured_renderer(options: RasterizeOptions, capacity: int, overflow: torch.
         gaussians: Gaussians, camera: Camera, degree: int, factors: torch.Tensor | None, shift: torch.Tensor | None
     ) -> Render:
         behind = backgrounds if shift is None else backgrounds + shift
-        found = compose(inputs_of(gaussians, camera, factors), behind, image_settings(camera, degree, options), memory)
-        return _single(Render(*found.images, found.projected, found.tile_counts))
+        settings = image_settings(camera, degree, options)
+        images, projected, tile_counts = compose(inputs_of(gaussians, camera, factors), behind, settings, memory)
+        return _single(Render(*images, projected, tile_counts))
 
     return render
 
