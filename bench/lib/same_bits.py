@@ -23,7 +23,6 @@ from warpgs.io.load import load_scene, split_views
 from warpgs.pipeline.train.loss import LossInputs, Target, outputs_of
 from warpgs.pipeline.train.presets import PRESETS
 from warpgs.pipeline.train.settings import FitConfig, settings_by_views
-from warpgs.pipeline.train.setup import samples
 from warpgs.pipeline.train.step import total_loss
 from warpgs.pipeline.train.trainer import Trainer, train_views
 from warpgs.priors.flow import triangulate_matches
@@ -149,11 +148,9 @@ def fit_stages(
     """Yield the stages of one fit: its start, the first step, parameters after 1, 10 and all steps, and both PLY files."""
     config, _ = settings_by_views(config, train, device.type)
     trainer = Trainer(train, scene.points, config, device, scene.background)
-    if samples(config):
+    if trainer.strategy.samples:
         yield "consistent depths", digest(*(v.consistent for v in trainer.views))
         yield "disparities", digest(*trainer.disparities)
-        yield "semantic score", digest(*(v.semantic for v in trainer.views))
-        yield "geometric score", digest(*(v.geometry for v in trainer.views))
     for name in sorted({name for v in trainer.views for name in v.maps}):
         yield f"maps of the loss: {name}", digest(*(v.maps[name] for v in trainer.views))
     yield "first points", digest(trainer.gaussians.means, trainer.gaussians.sh[:, 0])

@@ -592,7 +592,7 @@ def _score(
         ({"rule": rule}, [Detail(rule["summary"])]),
         ({"shape": shape}, [Detail(shape_summary(shape))]),
         (complexity, [Detail(complexity_summary(complexity))]),
-        ({"photographs": [p.to_json() | {"moved": moved.get(p.name)} for p in checks]}, moved_notes(moved)),
+        ({"photographs": [vars(p) | {"moved": moved.get(p.name)} for p in checks]}, moved_notes(moved)),
         ({"view_modules": learned}, [e["summary"] for e in learned.values()]),
         ({"given": mapped}, [e["summary"] for e in mapped.values()]),
     ]
