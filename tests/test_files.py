@@ -184,10 +184,10 @@ WRITERS = {
 """Functions of other modules that write to a path they are given."""
 ELSEWHERE = {
     ("app/cli.py", "NamedTemporaryFile"): "details of a defect, in the folder for temporary files",
+    ("process.py", "open wb"): "the null device",
     ("report/film.py", "VideoWriter"): "into the temporary file of `replacing`, which decodes it",
     ("report/overview.py", "savez"): "into a temporary folder",
     ("poses/matching.py", "savez"): "into the file of `writing`",
-    ("pipeline/run/fit.py", "save"): "writes a checkpoint by warpgs.files",
     ("report/images.py", "save"): "Pillow, into memory",
     ("report/film.py", "save"): "the same",
     ("export/sog.py", "save"): "the same",

@@ -100,7 +100,7 @@ DOORS = {
     "b.sog": ("export.sog", lambda p: SOG().is_antialiased(p)),
     "cameras.json": ("io.transforms", transforms.read_cameras),
     "transforms.json": ("io.transforms", transforms.read_cameras),
-    **{f"a{suffix}": ("io.images", folders.read_mask) for suffix in images.SUFFIXES},
+    **{f"a{suffix}": ("io.image_files", folders.read_mask) for suffix in images.SUFFIXES},
     "a.heif": ("io.images", lambda p: is_heic(p) or folders.read_mask(p)),
     "orientation.jpg": ("io.images", lambda p: folders.read_mask(p) if images.exif_orientation(p) else None),
     **{f"a{suffix}": ("poses.find", lambda p: find_poses(p, p.parent / "out")) for suffix in photographs.SUFFIXES},

@@ -6,11 +6,12 @@ from types import SimpleNamespace
 import pytest
 
 from warpgs.errors import UsageError
+from warpgs.files import write_json
 from warpgs.pipeline.run import fit as module
 from warpgs.pipeline.run.fit import fit, lost_lines, with_poses
 from warpgs.pipeline.run.folder import StoredRun, run_folder
 from warpgs.pipeline.run.request import SceneRequest
-from warpgs.poses.find import write_record
+from warpgs.poses.find import JSON
 
 
 def test_poses_are_kept_in_the_run_folder(tmp_path, photographs, found, monkeypatch):
@@ -50,7 +51,7 @@ def test_photographs_without_a_pose_are_told_of_at_the_end(tmp_path, found):
     missing = f"2 of 6 photographs have no pose and were not used: {scene / 'poses.txt'} lists reasons and remedies"
     for lost, said in ((0, []), (2, [missing])):
         unposed = [p | {"registered": False, "reason": "has none"} for p in rows[:lost]]
-        write_record(scene, found[1] | {"photographs": [*unposed, *rows[lost:]]})
+        write_json(scene / JSON, found[1] | {"photographs": [*unposed, *rows[lost:]]})
         assert [line.partition(", and")[0] for line in lost_lines(tmp_path)] == said
     assert lost_lines(None) == lost_lines(scene) == []
 

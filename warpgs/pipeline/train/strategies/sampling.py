@@ -344,18 +344,20 @@ class Sampling(Strategy):
         """Return whether gradients are gathered, and whether the coarse layer moves slowly."""
         return self.gradients.gathers(step), self.is_layered(step)
 
-    def lr_factors(self, phase):
+    def lr_factors(self, phase: Any) -> torch.Tensor | None:
         """Return `COARSE_LR_FACTOR` for the coarse layer and 1 for the fine one, shape [N]; None if all are 1."""
         return torch.where(self.fine, 1.0, COARSE_LR_FACTOR) if phase[1] else None
 
-    def after_step(self, phase, settings, going):
+    def after_step(self, phase: Any, settings: torch.Tensor, going: torch.Tensor) -> None:
         """Raise the opacities of protected Gaussians to alpha_minimum; ``settings`` [7], ``going`` [1]."""
         if self.protects:
             logits = self.context.table.params["logit_opacities"].detach()
             held = self.is_protected(settings[Setting.NUMBER]) & going
             logits.copy_(torch.where(held, logits.clamp_min(logit(PROTECTED_OPACITY)), logits))
 
-    def statistics(self, phase, v_projected, visible, size):
+    def statistics(
+        self, phase: Any, v_projected: torch.Tensor, visible: torch.Tensor, size: tuple[int, int]
+    ) -> dict[str, torch.Tensor]:
         """Return statistics of gradients, [N] each; ``v_projected`` has shape [1, N, 12], ``visible`` [1, N]."""
         return self.gradients.statistics(v_projected, visible, size) if phase[0] else {}
 
@@ -408,11 +410,11 @@ class Sampling(Strategy):
             some = {i: views[i] for i in range(first, min(first + MAX_VIEWS, len(views)))}
             yield self.sample(step, some, min(1.0, fraction), 1e6).change
 
-    def state(self):
+    def state(self) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
         """Return no tensors [...], and the events so far."""
         return {}, {**self.gradients.state(), "events": self.events}
 
-    def load(self, tensors, plain):
+    def load(self, tensors: Mapping[str, torch.Tensor], plain: dict[str, Any]) -> None:
         """Load the events so far; ``tensors`` [...] are not read."""
         self.gradients.load(plain)
         self.events = plain["events"]
