@@ -99,7 +99,7 @@ def test_all_flags_are_one_word_further(capsys):
         main(["fit", help_all])
     text = capsys.readouterr().out
     assert end.value.code == 0 and all(name in text for name, *_ in cli.FLAGS)
-    assert "--stopping.measurements" in text and len(text.splitlines()) > 200
+    assert "--stopping.min-gain-db" in text and len(text.splitlines()) > 200
 
 
 def test_every_command_has_one_purpose(capsys):

@@ -120,7 +120,7 @@ def test_terms_follow_from_the_views_and_the_weights():
     assert [t.name for t in Trainer(photos(2), seeds(), CONFIG, CPU).terms] == ["photometric"]
     assert len(built_in_terms(LossConfig(depth_weight=0, normal_weight=0), False, True, True)) == 1
     for bad in ({"depth_weight": -1}, {"normal_weight": float("nan")}):
-        with pytest.raises(UsageError, match="must be between"):
+        with pytest.raises(UsageError, match=r"loss\.(depth|normal)-weight must be in \[0, 1000\]"):
             LossConfig(**bad)
 
 

@@ -112,7 +112,7 @@ def test_plan_covers_sampling_events(monkeypatch):
     monkeypatch.setattr(sampling, "MIN_ALPHA", 0.05)
     method = sampling.MethodConfig(hier=True, sampler=sampling.SamplerConfig(fraction=0.01, max_fraction=0.2))
     config = dataclasses.replace(
-        STEADY, steps=40, strategy="paper", strategy_config=PaperConfig(pm=False), method=method, phases=PhaseConfig(200, 300)
+        STEADY, steps=40, strategy="paper", strategy_config=PaperConfig(pm=False), method=method, phases=PhaseConfig(1000, 1500)
     )
     fit = Trainer(views, seeds(1500), config, CPU, priors=priors(views))
     for _ in range(6):

@@ -8,13 +8,14 @@ import pytest
 import warpgs
 from tests.scenes import photos, seeds
 from warpgs.app.cli import main
-from warpgs.app.flags import refuse
+from warpgs.app.fit import request_of
 from warpgs.errors import UsageError
 from warpgs.pipeline.paper.strategy import PaperConfig
 from warpgs.pipeline.run.folder import CONFIG, check_same, open_run, read_record, stored_request
 from warpgs.pipeline.train.presets import PRESETS, preset_settings
 from warpgs.pipeline.train.settings import REMOVED, FitConfig, keyword, removed_note, setting_names, upgraded, with_settings
 from warpgs.scene import Scene
+from warpgs.schema import SchemaError
 
 
 def old(config: FitConfig, **method) -> dict:
@@ -48,7 +49,7 @@ def test_a_removed_setting_names_what_replaces_it(name, tmp_path):
             given()
         assert note in str(error.value)
     with pytest.raises(UsageError) as error:
-        refuse(FitConfig, [f"--{short.replace('_', '-')}", "1"], "warpgs fit", "")
+        request_of(["scene", "--out", "run", f"--{short.replace('_', '-')}", "1"], "")
     assert note in str(error.value)
 
 
@@ -92,6 +93,19 @@ def test_strategies_follow_from_the_switches():
     )
     values, lost = upgraded(old(PRESETS["default"], events=False))
     assert (values["strategy"], values["strategy_config"], lost) == ("clone_split", None, [])
+
+
+@pytest.mark.parametrize("value", [None, 5, "x", []])
+@pytest.mark.parametrize("group", ["method", "method.importance", "method.sampler", "loss", "priors", "strategy"])
+def test_malformed_settings_of_an_earlier_version_are_refused_in_words(group, value):
+    """Whatever stands in the place of a group; the stored values stay as they are."""
+    values = old(PRESETS["default"])
+    *path, last = group.split(".")
+    (values[path[0]] if path else values)[last] = value
+    before = copy.deepcopy(values)
+    with pytest.raises((UsageError, SchemaError)):
+        FitConfig.from_json(values)
+    assert values == before
 
 
 def test_other_values_open_with_a_note_and_do_not_resume(tmp_path):

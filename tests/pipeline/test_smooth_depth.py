@@ -99,7 +99,7 @@ def test_wrong_weights_are_refused():
     """In the settings and in the term."""
     for wrong in (-1, math.nan, 1001):
         for kind, name in ((LossConfig, "smooth_weight"), (SmoothDepth, "weight")):
-            with pytest.raises(UsageError, match="must be between"):
+            with pytest.raises(UsageError, match=r"(loss\.smooth-|smooth-depth\.)weight must be in \[0, 1000\]"):
                 kind(**{name: wrong})
 
 

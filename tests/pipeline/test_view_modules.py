@@ -198,8 +198,8 @@ def test_modules_that_cannot_be_are_refused(own):
     with pytest.raises(UsageError, match="Vignetting' and 'twin' both have a parameter 'falloff'; rename"):
         Trainer(photos(2), seeds(), config, CPU)
     for settings in ({"lr": 0.0}, {"decay": 2e6}, {"weight": -1.0}):
-        with pytest.raises(UsageError, match=f"exposure: `{next(iter(settings))}` must"):
+        with pytest.raises(UsageError, match=rf"exposure\.{next(iter(settings))} must be in "):
             Exposure(**settings)
     for settings in ({"rotation_lr": float("nan")}, {"start": 1.0}):
-        with pytest.raises(UsageError, match=f"refine_poses: `{next(iter(settings))}` must"):
+        with pytest.raises(UsageError, match=rf"refine-poses\.{next(iter(settings)).replace('_', '-')} must be in "):
             RefinePoses(**settings)

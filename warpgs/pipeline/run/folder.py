@@ -388,10 +388,10 @@ def read_record(folder: Path) -> dict[str, Any]:
         check_record(record)
     except schema.SchemaError as e:
         raise DataError(f"{path}: incomplete or damaged: {e}; restore the file, or fit the scene again into a new --out") from e
-    record["config"], lost = upgraded(record["config"])
+    stored, (record["config"], lost) = record["config"], upgraded(record["config"])
     if lost:
         record["lost"] = lost
-    else:
+    elif record["config"] != stored:
         record["config_hash"] = fingerprint(record["config"])
     return record
 

@@ -257,35 +257,41 @@ def removed_note(name: str) -> str:
 
 def upgraded(config: Mapping[str, Any]) -> tuple[dict[str, Any], list[str]]:
     """Return stored settings by their present names, and each removed setting with a value that fits no longer have."""
-    values: dict[str, Any] = {n: dict(v) if isinstance(v, dict) else v for n, v in config.items()}
-    method = {n: dict(v) if isinstance(v, dict) else v for n, v in values.get("method", {}).items()}
-    if "method" in values:
-        values["method"] = method
-    if "loss" in values:
-        values["loss"].pop("exposure_weight", None)  # had no effect
-    parts: dict[str, Any] = {}
-    if "events" in method:
-        sampler = method.get("sampler", {})
-        parts = {n: method.pop(n) for n in ("s_render", "s_semantic", "s_geometry", "ra", "agp", "pm")}
-        parts |= {"residual": method["importance"].pop("residual")} | {n: sampler.pop(n) for n in ("depth", "gate_quantile")}
-        events = method.pop("events")
-        if values["strategy"] == OLD_STRATEGY:
-            plain = {n: REMOVED[f"method.{n}"][0] for n in ("s_render", "s_semantic", "s_geometry", "ra", "agp", "pm")}
+    values = _copied(config)
+    method, importance, sampler = (_group(values, n) for n in ("method", "method.importance", "method.sampler"))
+    _group(values, "loss").pop("exposure_weight", None)  # had no effect
+    homes = dict.fromkeys(("s_render", "s_semantic", "s_geometry", "ra", "agp", "pm"), method)
+    homes |= {"residual": importance, "depth": sampler, "gate_quantile": sampler}
+    if "events" in method and all(n in home for n, home in homes.items()):
+        events, parts = method.pop("events"), {n: home.pop(n) for n, home in homes.items()}
+        if values.get("strategy") == OLD_STRATEGY:
+            plain = {n: REMOVED[f"method.{n}"][0] for n, home in homes.items() if home is method}
             plain |= {"residual": parts["residual"], "depth": "consistent", "gate_quantile": 0.0}
             values["strategy"] = ("sampling" if parts == plain else "paper") if events else "clone_split"
             values["strategy_config"] = parts if values["strategy"] == "paper" else None
     lost = []
     for name, (value, _) in REMOVED.items():
-        *path, last = name.split(".")
-        group = values
-        for part in path:
-            group = group.get(part, {})
+        place, _, last = name.rpartition(".")
+        group = _group(values, place)
         if last in group and (stored := group.pop(last)) != value:
-            lost.append(f"{flag(name.removeprefix(f'{WITHOUT_PREFIX}.'))} {stored}")
+            lost.append(f"{flag(name.removeprefix(f'{WITHOUT_PREFIX}.'))} {str(stored)[:60]}")
     for name in ("importance", "protect"):
         if method.get(name) == {}:
             del method[name]
     return values, lost
+
+
+def _copied(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return nested mappings whose groups may be changed."""
+    return {n: _copied(v) if isinstance(v, dict) else v for n, v in values.items()}
+
+
+def _group(values: dict[str, Any], name: str) -> dict[str, Any]:
+    """Return a group of stored settings; an empty one if it is missing or no mapping, which `FitConfig.from_json` refuses."""
+    for part in filter(None, name.split(".")):
+        inner = values.get(part)
+        values = inner if isinstance(inner, dict) else {}
+    return values
 
 
 Path = tuple[str, ...]
