@@ -1,17 +1,30 @@
-"""Whatever the documents name is there: files, tests and flags. Links and formulas are checked by `make docs`."""
+"""The documents: what they name is there, what they show runs, and what they quote is printed."""
 
 import ast
+import dataclasses
 import json
 import re
+import shutil
+import subprocess
 from collections import defaultdict
 from pathlib import Path
 from typing import get_type_hints
 
+import pytest
+import torch
+
 from bench.lib import result_file
 from tests.scenes import view_stub
-from warpgs import PRESETS
+from tools.run_dockerfile import ROOT as run_dockerfile_ROOT
+from tools.run_dockerfile import instructions, of_target, run
+from tools.run_docs import ROOT as run_docs_ROOT
+from tools.run_docs import collect, main, pages, prepare, run_blocks, shortened
+from warpgs import PRESETS, read_ply
 from warpgs.pipeline.train import settings as by_views
 from warpgs.pipeline.train.settings import FitConfig, settings_by_views
+from warpgs.synthetic.demo import write_demo
+
+# Whatever the documents name is there: files, tests and flags. Links and formulas are checked by `make docs`.
 
 ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -256,3 +269,214 @@ def test_pages_and_kept_results_agree():
         gone = gone_presets(values["command"] or "")
         broken += [f"{name}: preset {preset} is gone" for preset in sorted(gone) if preset not in values.get("note", "")]
     assert not broken, "\n".join(broken)
+
+
+# The examples of the README and of the page on Python do what they say.
+
+
+def snippets(page: str) -> list[str]:
+    return re.findall(r"```python\n(.*?)```", (ROOT / page).read_text("utf-8"), re.DOTALL)
+
+
+def test_the_example_of_the_rasterizer_fits_an_image(capsys):
+    """Run as printed, it ends near the target."""
+    text = next(t for t in snippets("docs/rasterizer.md") if "rasterize(" in t and "backward()" in t)
+    assert len(text.splitlines()) <= 28
+    exec(compile(text, "docs/rasterizer.md", "exec"), {})
+    assert float(capsys.readouterr().out.split()[-1]) < 0.06
+
+
+def test_the_example_fits_a_scene(tmp_path, monkeypatch):
+    """Run as printed beside a tiny scene, with fewer steps: the PLY is there, in file units."""
+    write_demo(tmp_path / "scene", views=8, width=48, height=36)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setitem(PRESETS._made, "quick", dataclasses.replace(PRESETS["quick"], steps=5))
+    exec(compile(snippets("README.md")[0], "README.md", "exec"), {})
+    ours, runs = (read_ply(tmp_path / name) for name in ("model.ply", "fitted/point_cloud.ply"))
+    assert torch.equal(ours.means, runs.means)
+
+
+def test_links_lead_somewhere():
+    """Every file that the README and the architecture name exists."""
+    for document in ("README.md", "docs/architecture.md", "CONTRIBUTING.md"):
+        text = (ROOT / document).read_text("utf-8")
+        for target in re.findall(r"\]\((?!http)([^)#]+)\)", text):
+            assert ((ROOT / document).parent / target).exists(), f"{document}: {target}"
+
+
+def test_the_hosted_checks_are_those_of_the_readme():
+    """Both commands, each system, and every Python that the package allows."""
+    text = (ROOT / ".github/workflows/test.yml").read_text("utf-8")
+    commands = re.findall(r"^(make \w+) ", (ROOT / "README.md").read_text("utf-8"), re.MULTILINE)
+    assert re.findall(r"- run: (make \w+)", text) == commands == ["make demo", "make test"]
+    assert all(f"{system}-latest" in text for system in ("ubuntu", "macos", "windows"))
+    low, high = re.search(r'requires-python = ">=3\.(\d+),<3\.(\d+)"', (ROOT / "pyproject.toml").read_text("utf-8")).groups()
+    assert re.search(r"python: \[(.*)\]", text)[1] == ", ".join(f'"3.{n}"' for n in range(int(low), int(high)))
+
+
+@pytest.mark.skipif(shutil.which("make") is None, reason="there is no make")
+@pytest.mark.parametrize(("system", "folder"), [("Windows_NT", "Scripts"), ("", "bin")])
+def test_the_commands_call_what_a_virtual_environment_has(tmp_path, system, folder):
+    """On Windows programs lie in another folder."""
+    command = ["make", "-n", "-f", str(ROOT / "Makefile"), "demo", "test", f"OS={system}"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
+    assert f".venv/{folder}/warpgs fit" in done.stdout and f".venv/{folder}/python -m pytest" in done.stdout
+    assert ("/bin/" in done.stdout) == (folder == "bin")
+
+
+# Every message that docs/troubleshooting.md quotes is one that the code can print.
+
+
+def messages() -> list[str]:
+    """Return all string literals of the package, with ... where a value is filled in."""
+    found = []
+    for path in sorted((ROOT / "warpgs").rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+            if isinstance(node, ast.JoinedStr):
+                found.append("".join(p.value if isinstance(p, ast.Constant) else "..." for p in node.values))
+            elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+                found.append(node.value)
+    return found
+
+
+def test_quoted_messages_are_there():
+    quoted = re.findall(r"^\*\*`(.+)`\*\*", (ROOT / "docs/troubleshooting.md").read_text("utf-8"), re.MULTILINE)
+    assert len(quoted) > 30
+    known, missing = messages(), []
+    for message in quoted:
+        pattern = re.compile(".*?".join(re.escape(p.strip()) for p in message.split("...") if p.strip()), re.DOTALL)
+        if not any(map(pattern.search, known)):
+            missing.append(message)
+    assert not missing, f"docs/troubleshooting.md quotes what nothing says: {missing}"
+
+
+# The commands of the pages are found, left out with a reason, and their failures seen.
+
+PAGE = """Words.
+
+```bash
+echo first > a
+ssh -L 8080:127.0.0.1:8080 you@there
+```
+
+<!-- docs-run: needs a GPU -->
+```bash
+echo never > b
+```
+
+```
+$ warpgs export run --to a.ply
+warpgs fit scene --out x --device cuda
+```
+
+```{math}
+1 + 1
+```
+
+```python
+open("p", "w").write("python")
+```
+
+```
+a table without a language
+```
+"""
+
+
+def test_blocks_and_reasons():
+    first, marked, bare, python = collect("x.md", PAGE)
+    assert (first.line, first.code) == (4, "echo first > a")
+    assert first.left_out == (("ssh -L 8080:127.0.0.1:8080 you@there", "another machine"),)
+    assert (marked.code, marked.left_out) == ("", (("echo never > b", "needs a GPU"),))
+    assert (bare.code, bare.left_out[0][1]) == ("warpgs export run --to a.ply", "GPU")
+    assert python.python and python.code.startswith("open(") and not first.python
+
+
+def test_a_marker_says_why():
+    with pytest.raises(ValueError, match="line 3"):
+        collect("x.md", "<!-- docs-run:  -->\n```bash\necho a\n```\n")
+
+
+@pytest.mark.skipif(shutil.which("bash") is None, reason="there is no bash")
+def test_blocks_run_in_order_and_failures_are_named(tmp_path):
+    text = "```python\nopen('a', 'w')\n```\n```bash\ncat a\nfalse\ntouch late\n```\n```bash\ncp a b\n```\n"
+    (line,) = run_blocks(collect("x.md", text), tmp_path, tmp_path)
+    assert line.startswith("x.md, line 5: exit code 1") and (tmp_path / "b").exists() and not (tmp_path / "late").exists()
+
+
+@pytest.mark.skipif(shutil.which("bash") is None, reason="there is no bash")
+def test_the_next_block_runs_where_the_last_one_ended(tmp_path):
+    """As in the reader's shell, after `cd`."""
+    text = "```bash\nmkdir tour && cd tour\n```\n```bash\ntouch a\n```\n```python\nopen('b', 'w')\n```\n"
+    assert run_blocks(collect("x.md", text), tmp_path, tmp_path) == []
+    assert (tmp_path / "tour" / "a").exists() and (tmp_path / "tour" / "b").exists()
+
+
+def test_a_page_gets_what_it_uses_and_does_not_make(tmp_path):
+    made, folder = tmp_path / "made", tmp_path / "page"
+    for name in ("scene", "run", "photographs"):
+        (made / name).mkdir(parents=True)
+    folder.mkdir()
+    prepare(folder, "warpgs fit scene/ --out run/\nwarpgs render run/", made)
+    assert [p.name for p in folder.iterdir()] == ["scene"]
+
+
+def test_only_what_is_long_is_made_short():
+    assert shortened(["fit", "s", "--out", "r"])[-2:] == ["--steps", "40"]
+    assert shortened(["compare", "s", "--seeds", "5", "--steps=9"]) == ["compare", "s", "--seeds", "1", "--steps=9"]
+    assert shortened(["fit", "s", "--steps=3", "--view"])[2:] == ["--steps=3", "--view", "--view-port", "0"]
+    for words in (["fit", "s", "--steps=3"], ["fit", "--help"], ["export", "run"], []):
+        assert shortened(words) == words
+
+
+def test_every_page_can_be_read():
+    """No marker lacks its reason, and hardly anything is left out."""
+    blocks = [b for p in pages() for b in collect(p, Path(run_docs_ROOT / p).read_text("utf-8"))]
+    assert sum(bool(b.code) for b in blocks) > 20
+    assert sum(len(b.left_out) for b in blocks) <= 26
+
+
+def test_the_program_shows_its_flags_and_names_an_unknown_page(capsys):
+    with pytest.raises(SystemExit, match="0"):
+        main(["--help"])
+    assert "--install" in capsys.readouterr().out
+    with pytest.raises(SystemExit, match="2"):
+        main(["docs/no.md"])
+    assert "no such page: docs/no.md" in capsys.readouterr().err
+
+
+# The lines of a Dockerfile that run without Docker: those of a target, in their order, in a clean folder.
+
+TEXT = """
+FROM somewhere AS base
+# a comment
+RUN apt-get update \\
+    && apt-get install everything
+USER me
+ENV WHERE=/opt/warpgs/a
+RUN mkdir -p /opt/warpgs/a
+FROM base AS cpu
+ARG NAME=b
+RUN touch "$WHERE/$NAME"
+FROM base AS cuda
+RUN false
+"""
+
+
+def test_lines_of_a_target_run_in_the_folder_and_those_of_root_do_not(tmp_path, monkeypatch):
+    monkeypatch.setattr("tools.run_dockerfile.CHECK", "true")
+    steps = of_target(instructions(TEXT), "cpu")
+    assert [word for word, _ in steps] == ["RUN", "USER", "ENV", "RUN", "ARG", "RUN"]
+    (left_out,) = run(steps, tmp_path, {"NAME": "c"})
+    assert "apt-get install everything" in left_out and [p.name for p in (tmp_path / "a").iterdir()] == ["c"]
+
+
+def test_the_dockerfile_has_both_targets_and_runs_as_no_root():
+    """Only the system's libraries are installed before USER; every file that COPY names is there."""
+    found = instructions((run_dockerfile_ROOT / "Dockerfile").read_text("utf-8"))
+    for target in ("cpu", "cuda"):
+        steps = of_target(found, target)
+        words = [word for word, _ in steps]
+        assert words.count("USER") == 1 and words[: words.index("USER")] == ["RUN"] and words[-1] == "CMD"
+        for rest in (rest for word, rest in steps if word == "COPY"):
+            assert all((run_dockerfile_ROOT / name).exists() for name in rest.split()[:-1] if not name.startswith("--"))

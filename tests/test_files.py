@@ -1,18 +1,61 @@
-"""A file appears whole or not at all, however its writing ends, and nothing in the package writes any other way."""
+"""Files and folders: read with bounds, written whole or not at all, no link followed, nothing left behind."""
 
 import ast
 import contextlib
 import errno
 import os
+import socket
+import sqlite3
 import subprocess
 import sys
+import tempfile
+import threading
 from pathlib import Path
 
 import pytest
 
-from warpgs import files
+import warpgs
+from warpgs import files, folders
+from warpgs import files as disk_space
 from warpgs.errors import DataError, ResourceError, UsageError
-from warpgs.files import LOCK, OWN_NAMES, filling, is_empty, make_folder, remove_leftovers, replacing, write_bytes
+from warpgs.files import (
+    LOCK,
+    OWN_NAMES,
+    appending,
+    disk_is_full,
+    filling,
+    input_digest,
+    is_empty,
+    make_folder,
+    move_folder,
+    open_input,
+    read_input,
+    read_start,
+    remove_file,
+    remove_leftovers,
+    replacing,
+    unread_reason,
+    write_bytes,
+)
+from warpgs.folders import (
+    NAMES,
+    RefusedError,
+    TemporaryFile,
+    TemporaryFolder,
+    open_file,
+    open_folder,
+    output_folder,
+    shared_locks,
+    sweep,
+    system_folder,
+    temporary_folder,
+)
+from warpgs.locks import hold_folder
+from warpgs.poses import mapping
+from warpgs.process import ProcessFailed
+from warpgs.report.overview import remedy_for, run_pyvista
+
+# A file appears whole or not at all, however its writing ends, and nothing in the package writes any other way.
 
 ROOT = Path(__file__).parent.parent
 LEFT = ".warpgs-0123456789abcdef.tmp"
@@ -257,3 +300,483 @@ def test_commands_put_every_file_in_place_as_a_whole(tmp_path):
     )
     assert done.returncode == 0, done.stdout + done.stderr
     assert done.stdout.splitlines()[-1] == "every file was put in place as a whole"
+
+
+# One function opens every input file: pipes, devices and folders are refused before a byte is read, and sizes are
+# bounded.
+
+PACKAGE = Path(warpgs.__file__).parent
+
+
+def special(kind, path):
+    """Make a file of a kind that is no regular one, or skip where the system has none."""
+    if os.name == "nt":
+        pytest.skip("Windows has no such files")
+    if kind == "pipe":
+        os.mkfifo(path)
+    elif kind == "device":
+        path.symlink_to("/dev/zero")
+    elif kind == "socket":
+        with socket.socket(socket.AF_UNIX) as s:
+            s.bind(str(path))
+    elif kind == "folder":
+        path.mkdir()
+    elif kind == "unreadable":
+        path.symlink_to(path)  # a link to itself: what even root cannot open
+    else:
+        path.write_bytes(b"")
+    return path
+
+
+@pytest.mark.parametrize("kind, words", [
+    ("pipe", "is not a regular file"), ("device", "is not a regular file"), ("socket", "is not a regular file"),
+    ("folder", "is a folder"), ("unreadable", "symbolic links"),
+])  # fmt: skip
+@pytest.mark.parametrize("read", [open_input, read_input, input_digest, lambda p: read_start(p, 4)])
+def test_what_is_no_regular_file_is_refused(kind, words, read, tmp_path):
+    with pytest.raises(OSError) as e:
+        read(special(kind, tmp_path / "x"))
+    assert words in unread_reason(e.value) and str(tmp_path) in str(e.value)
+
+
+def test_a_pipe_that_takes_the_place_of_a_file_does_not_block(tmp_path, monkeypatch):
+    pipe, file = special("pipe", tmp_path / "p"), tmp_path / "f"
+    file.write_bytes(b"x")
+    ordinary = os.stat(file)
+    monkeypatch.setattr(files.os, "stat", lambda path: ordinary)
+    with pytest.raises(OSError, match="is not a regular file"):
+        open_input(pipe)
+
+
+def test_sizes_are_bounded_before_and_while_reading(tmp_path, monkeypatch):
+    path = tmp_path / "f"
+    path.write_bytes(b"12345678")
+    assert read_input(path, 8) == b"12345678" and read_start(path, 3) == b"123"
+    with pytest.raises(OSError, match="larger than 7 bytes"):
+        read_input(path, 7)
+    with path.open("wb") as f:
+        f.truncate(2**40)  # a hole: takes no disk
+    with pytest.raises(OSError, match="larger than 16,384 MiB"):
+        read_input(path)
+
+
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="only Linux has files without a size")
+def test_files_without_a_size_are_read_whole_and_bounded(tmp_path):
+    assert b"VmPeak" in read_input("/proc/self/status")
+    with pytest.raises(OSError, match="larger than 10 bytes"):
+        read_input("/proc/self/status", 10)
+
+
+def test_descriptors_are_closed_blocking_and_not_inherited(tmp_path):
+    (tmp_path / "f").write_bytes(b"x")
+    with open_input(tmp_path / "f") as file:
+        assert os.get_blocking(file.fileno()) if os.name != "nt" else True
+        assert not os.get_inheritable(file.fileno())
+    if os.name != "nt":
+        before = len(os.listdir("/proc/self/fd")) if Path("/proc/self/fd").exists() else 0
+        with pytest.raises(OSError):
+            open_input(tmp_path)
+        assert before == (len(os.listdir("/proc/self/fd")) if before else 0)
+
+
+# Below a folder of results no link is followed, neither to write nor to read; the folder itself may be a link.
+
+with_links = pytest.mark.skipif(os.name == "nt", reason="links need a right that users of Windows often lack")
+WAYS = {
+    "write": lambda p: write_bytes(p / "canary", b"new"),
+    "replace": lambda p: _replace(p / "canary"),
+    "append": lambda p: appending(p / "canary").close(),
+    "make": lambda p: make_folder(p / "below"),
+    "fill": lambda p: _fill(p / "below"),
+    "remove": lambda p: remove_file(p / "canary"),
+    "move": lambda p: move_folder(p / "folder", "moved"),
+    "read": lambda p: open_file(p / "canary", p).close(),
+}
+
+
+def _replace(path):
+    with replacing(path) as temporary:
+        temporary.write_bytes(b"new")
+
+
+def _fill(path):
+    with filling(path) as temporary:
+        (temporary / "x").touch()
+
+
+@pytest.fixture
+def outside(tmp_path):
+    """A folder elsewhere whose contents must stay."""
+    outside = tmp_path / "outside"
+    (outside / "folder").mkdir(parents=True)
+    (outside / "canary").write_bytes(b"old")
+    yield outside
+    assert sorted(p.name for p in outside.iterdir()) == ["canary", "folder"]
+    assert (outside / "canary").read_bytes() == b"old"
+
+
+@with_links
+@pytest.mark.parametrize("depth", [1, 3])
+@pytest.mark.parametrize("way", WAYS)
+def test_a_folder_that_is_a_link_is_refused(tmp_path, outside, way, depth):
+    """At every depth below the folder that was opened, with an error that names the link."""
+    root = tmp_path / "results"
+    at = root.joinpath(*"abc"[:depth])
+    at.parent.mkdir(parents=True)
+    at.symlink_to(outside)
+    with output_folder(root), pytest.raises((ResourceError, RefusedError), match=f"{at}: is a link"):
+        WAYS[way](at)
+
+
+@with_links
+@pytest.mark.parametrize("way", WAYS)
+def test_the_folder_itself_may_be_a_link(tmp_path, way):
+    """As may folders above it: people keep results on another disk."""
+    real = tmp_path / "disk" / "results"
+    (real / "folder").mkdir(parents=True)
+    (real / "canary").write_bytes(b"old")
+    (tmp_path / "home").symlink_to(tmp_path / "disk")
+    (tmp_path / "disk" / "link").symlink_to(real)
+    with output_folder(tmp_path / "home" / "link"):
+        WAYS[way](tmp_path / "home" / "link")
+
+
+@with_links
+def test_a_file_that_is_a_link_is_replaced_and_never_followed(tmp_path, outside):
+    """A write takes the place of the name; what would be appended to or read is refused, as is a pipe, without waiting."""
+    root = tmp_path / "results"
+    root.mkdir()
+    link = root / "link"
+    with output_folder(root):
+        for write in (lambda: write_bytes(link, b"new"), lambda: _replace(link)):
+            link.symlink_to(outside / "canary")
+            write()
+            assert not link.is_symlink() and link.read_bytes() == b"new"
+            link.unlink()
+        for target in (outside / "canary", outside / "new", outside):
+            link.symlink_to(target)
+            for refused in (appending, lambda p: open_file(p, root)):
+                with pytest.raises(RefusedError, match="is a link, and links inside"):
+                    refused(link)
+            with pytest.raises(ResourceError, match="link: is a link, and links inside"), filling(link):
+                pass
+            remove_file(link)
+            assert not link.is_symlink()
+        os.mkfifo(link)
+        with pytest.raises(RefusedError, match="not a regular file"):
+            open_file(link, root)
+        with pytest.raises(OSError):
+            appending(link)
+    with pytest.raises(OSError, match="not a regular file"):
+        open_input(link)
+
+
+@with_links
+def test_reading_below_a_folder_that_nobody_opened(tmp_path, outside):
+    """A file that the user names may be a link; one of a run, or behind a folder of it, may not."""
+    run = tmp_path / "run"
+    run.mkdir()
+    (run / "link").symlink_to(outside)
+    (run / "file").symlink_to(outside / "canary")
+    assert open_input(run / "file").read() == b"old"
+    for path in (run / "file", run / "link" / "canary"):
+        with pytest.raises(RefusedError, match="is a link"):
+            open_input(path, run)
+    with pytest.raises(FileNotFoundError):
+        open_input(run / "none" / "x", run)
+
+
+@with_links
+def test_a_folder_that_was_replaced_is_not_written(tmp_path):
+    """Neither the one that took its place nor, once that is gone, another; at its own place again it is."""
+    root, inner = tmp_path / "results", tmp_path / "results" / "a"
+    inner.mkdir(parents=True)
+    with output_folder(root), output_folder(inner):
+        for folder in (root, inner):
+            moved = tmp_path / "moved"
+            folder.rename(moved)
+            with pytest.raises(ResourceError, match=f"{folder}: the folder was moved|a: cannot be written|No such file"):
+                write_bytes(inner / "x", b"")
+            (root / "a").mkdir(parents=True)
+            with pytest.raises(ResourceError, match=f"{folder}: the folder was moved"):
+                write_bytes(inner / "x", b"")
+            assert not (inner / "x").exists()
+            inner.rmdir()
+            if folder is root:
+                root.rmdir()
+            moved.rename(folder)
+        write_bytes(inner / "x", b"1")
+    assert (inner / "x").read_bytes() == b"1"
+
+
+@with_links
+def test_a_name_that_leads_out_is_refused(tmp_path):
+    root = tmp_path / "results"
+    root.mkdir()
+    with output_folder(root), pytest.raises(ResourceError, match="use a path without"):
+        write_bytes(root / ".." / "x", b"")
+
+
+@with_links
+def test_folders_are_closed(tmp_path):
+    """No descriptor is left behind, be there an error or not, and another thread may hold the same folder."""
+    descriptors = "/proc/self/fd" if os.path.isdir("/proc/self/fd") else "/dev/fd"
+    (tmp_path / "link").symlink_to(tmp_path)
+    before = len(os.listdir(descriptors))
+    with output_folder(tmp_path):
+        with output_folder(tmp_path):
+            write_bytes(tmp_path / "a", b"1")
+            with pytest.raises(ResourceError):
+                make_folder(tmp_path / "link" / "b")
+            with pytest.raises(RefusedError):
+                open_folder(tmp_path / "link")
+        thread = threading.Thread(target=write_bytes, args=(tmp_path / "b", b"2"))
+        thread.start()
+        thread.join()
+    assert len(os.listdir(descriptors)) == before and (tmp_path / "b").read_bytes() == b"2"
+
+
+# Temporary files and folders: what a process holds stays, what a killed one left goes with the next command.
+
+HOLDS = """
+import sys
+from pathlib import Path
+from warpgs.files import filling, replacing
+from warpgs.folders import temporary_folder
+with temporary_folder(), filling(Path(sys.argv[1]) / "scene") as folder, replacing(Path(sys.argv[1]) / "a.ply") as file:
+    (folder / "photo.jpg").touch()
+    file.touch()
+    print("holds", flush=True)
+    sys.stdin.read()
+"""
+ORPHAN = """
+import subprocess, sys
+from warpgs.folders import shared_locks, temporary_folder
+folder = temporary_folder()
+with shared_locks() as locks:
+    child = subprocess.Popen([sys.executable, "-c", "input()"], stdin=sys.stdin, pass_fds=locks)
+    print("started", flush=True)
+    child.wait()
+"""
+
+
+@pytest.fixture
+def places(tmp_path, monkeypatch):
+    """A folder of results, and one for temporary files."""
+    for name in ("X", "tmp"):
+        (tmp_path / name).mkdir()
+    monkeypatch.setenv("TMPDIR", str(tmp_path / "tmp"))
+    monkeypatch.setattr(tempfile, "tempdir", None)
+    folders.sweep_temporary_files.cache_clear()
+    yield tmp_path / "X", tmp_path / "tmp"
+    folders.sweep_temporary_files.cache_clear()
+
+
+def started(code, *words):
+    """Start Python, and wait for its first line."""
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    words = [sys.executable, "-c", code, *map(str, words)]
+    process = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment)
+    assert process.stdout.readline()
+    return process
+
+
+def test_another_command_leaves_what_is_held_and_removes_what_a_killed_one_left(places):
+    """As `export --to X/a.ply` beside `poses --out X/scene`: files and folders, beside results and of the system."""
+    results, system = places
+    process = started(HOLDS, results)
+    there = {p.name for p in results.iterdir()}, {p.name for p in system.iterdir()}
+    assert [len(t) for t in there] == [3, 2] and all(map(NAMES.fullmatch, there[0] | there[1]))
+    with hold_folder(results), temporary_folder():
+        now = {p.name for p in results.iterdir()}, {p.name for p in system.iterdir()}
+    assert now[0] >= there[0] and now[1] >= there[1]
+    process.kill()
+    process.communicate()
+    folders.sweep_temporary_files.cache_clear()  # of another process
+    with hold_folder(results):
+        pass
+    assert not list(results.iterdir()) and not list(system.iterdir())
+
+
+def test_a_folder_is_held_until_the_last_process_in_it_has_ended(places):
+    """A child that works in it may outlive its parent for a moment."""
+    _, system = places
+    read, write = os.pipe()
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    with subprocess.Popen([sys.executable, "-c", ORPHAN], stdin=read, stdout=subprocess.PIPE, env=environment) as process:
+        process.stdout.readline()
+        process.kill()
+    (lock,) = system.glob("*.lock")
+    with open_folder(system) as folder:
+        sweep(folder)
+        assert lock.exists() and len(list(system.iterdir())) == 2
+        os.close(read)
+        os.close(write)
+        with lock.open("r+b") as file:
+            folders.lock_descriptor(file.fileno())  # waits for it
+        sweep(folder)
+    assert not list(system.iterdir())
+
+
+def test_only_own_names_are_swept(tmp_path):
+    """Not what looks like it, nor through a link; a name of ours that is a link goes itself."""
+    hexes = "0123456789abcdef"
+    (tmp_path / "kept").mkdir()
+    (tmp_path / "kept" / "file").touch()
+    for name in (f"warpgs-{hexes}", f"warpgs-{hexes}.txt", f".warpgs-{hexes[1:]}.tmp", "warpgs-error-x.txt"):
+        (tmp_path / name).mkdir()
+    kept = {p.name for p in tmp_path.iterdir()}
+    (tmp_path / f".warpgs-{hexes}.tmp" / "below").mkdir(parents=True)
+    (tmp_path / f"warpgs-{hexes}.tmp.mp4").touch()
+    (tmp_path / f"warpgs-{hexes}.tmp.lock").touch()
+    (tmp_path / f"warpgs-{hexes}.tmp").symlink_to("kept", target_is_directory=True)
+    with open_folder(tmp_path) as folder:
+        sweep(folder)
+    assert {p.name for p in tmp_path.iterdir()} == kept and (tmp_path / "kept" / "file").exists()
+
+
+@pytest.mark.skipif(not hasattr(os, "getuid") or os.getuid() != 0, reason="only root can give files to another user")
+def test_what_another_user_has_in_the_system_s_folder_stays(tmp_path):
+    names = "warpgs-0123456789abcdef.tmp", "warpgs-0123456789abcdee.tmp"
+    for name, user in zip(names, (0, 12345)):
+        (tmp_path / name).mkdir()
+        os.chown(tmp_path / name, user, -1)
+    with open_folder(tmp_path) as folder:
+        sweep(folder, own=True)
+    assert [p.name for p in tmp_path.iterdir()] == [names[1]]
+
+
+@pytest.mark.parametrize("late", ["locks first", "removes first"])
+def test_a_sweep_between_making_and_locking_costs_a_name(tmp_path, monkeypatch, late):
+    """The maker sees that its file was taken for a leftover, and makes another one."""
+    lock, calls = folders.lock_descriptor, []
+
+    def raced(descriptor, blocking):
+        calls.append(descriptor)
+        if len(calls) == 1:
+            if late == "locks first":
+                return False
+            (left,) = tmp_path.iterdir()
+            left.unlink()
+        return lock(descriptor, blocking=blocking)
+
+    monkeypatch.setattr(folders, "lock_descriptor", raced)
+    with open_folder(tmp_path) as folder, TemporaryFile(folder) as file:
+        assert len(calls) == 2 and (tmp_path / file.name).exists()
+
+
+def test_a_temporary_folder_is_private_and_goes_with_its_lock(places):
+    _, system = places
+    with shared_locks() as locks:
+        before = len(locks)
+    with temporary_folder() as folder:
+        assert folder.path.parent == system.resolve() and (os.name == "nt" or folder.path.stat().st_mode & 0o777 == 0o700)
+        (folder.path / "file").touch()
+        with shared_locks() as locks:
+            assert len(locks) == before + (os.name != "nt")
+        folder.remove()
+        assert not list(system.iterdir())
+    with shared_locks() as locks:
+        assert len(locks) == before
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork")
+def test_a_forked_child_leaves_the_folder_to_its_parent(places):
+    with temporary_folder() as folder:
+        child = os.fork()
+        if not child:
+            folder.remove()
+            os._exit(0)
+        os.waitpid(child, 0)
+        assert folder.path.is_dir()
+
+
+def test_leftovers_in_a_folder_that_is_made_anew_go(tmp_path):
+    (tmp_path / "a").mkdir()
+    with open_folder(tmp_path / "a") as above:
+        left = TemporaryFolder(above)
+        with pytest.raises(Exception, match="cannot be created"), filling(tmp_path / "a"):
+            pass  # another process works in it
+        with replacing(tmp_path / "a" / "b") as file:
+            file.touch()
+            remove_leftovers(tmp_path / "a")
+        assert (tmp_path / "a" / "b").exists() and left.path.is_dir()
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows keeps Python's own choice")
+def test_the_system_s_folder_is_found_without_writing(tmp_path, monkeypatch):
+    """Python's own search writes a file, which a command that is killed at that moment leaves behind."""
+    named = tmp_path / "named"
+    named.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", None)
+    monkeypatch.setattr(tempfile, "_get_default_tempdir", lambda *_: pytest.fail("it searched"))
+    monkeypatch.setenv("TMPDIR", str(tmp_path / "missing"))
+    monkeypatch.setenv("TEMP", str(named))
+    assert system_folder() == named.resolve() and tempfile.gettempdir() == str(named)
+
+
+# A full disk of another process is called that, and neither a lack of memory nor a fault of a renderer.
+
+FULL = f"[Errno {errno.ENOSPC}] {os.strerror(errno.ENOSPC)}"
+
+
+def test_words_and_room(tmp_path, monkeypatch):
+    assert disk_is_full(tmp_path, f"OSError: {FULL}: 'a.png'") and not disk_is_full(tmp_path, "Segmentation fault")
+    with pytest.raises(sqlite3.OperationalError) as e:
+        database = sqlite3.connect(tmp_path / "a.db")
+        database.execute("pragma max_page_count = 2")
+        database.execute("create table a (x)")
+        database.execute("insert into a values (zeroblob(100000))")
+    assert disk_is_full(tmp_path, str(e.value))
+    monkeypatch.setattr(disk_space, "MIN_FREE", 2**80)
+    assert disk_is_full(tmp_path, "") and not disk_is_full(tmp_path / "none", "")
+
+
+@pytest.mark.parametrize(("said", "words"), [(FULL, "its disk is full"), ("killed", "too little memory")])
+def test_poses(tmp_path, monkeypatch, said, words):
+    def failing(*_, **__):
+        raise ProcessFailed(-6, said)
+        yield
+
+    monkeypatch.setattr(mapping, "python_lines", failing)
+    work = tmp_path / ".warpgs-0.tmp" / "work"
+    work.mkdir(parents=True)
+    with pytest.raises(ResourceError, match=words) as e:
+        list(mapping._lines({}, work))
+    assert (str(e.value).startswith(f"{tmp_path}: ")) == (said == FULL)
+
+
+def test_a_renderer():
+    works, why = run_pyvista(f"import os; raise OSError({errno.ENOSPC}, os.strerror({errno.ENOSPC}))")
+    assert not works and remedy_for(why).startswith("free some disk space for temporary files in ")
+    assert "renderer" in remedy_for(run_pyvista("raise SystemExit(3)")[1])
+
+
+@pytest.mark.fault
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="no Linux mount")
+@pytest.mark.parametrize("command", ["poses", "plot"])
+def test_real_disks(tmp_path, command):
+    """A file system in memory that is nearly full holds the results, or the temporary files."""
+    disk, files = tmp_path / "disk", tmp_path / "files"
+    for folder in (disk, files):
+        folder.mkdir()
+    size = {"poses": "size=1m", "plot": "size=4k"}[command]
+    if subprocess.run(["mount", "-t", "tmpfs", "-o", size, "tmpfs", str(disk)], capture_output=True, check=False).returncode:
+        pytest.skip("this user cannot mount")
+    try:
+        program = [sys.executable, "-P", "-m", "warpgs"]
+        subprocess.run(
+            [*program, "demo", str(files / "scene"), "--views", "8", "--width", "320", "--height", "240"], check=True
+        )
+        words = ["poses", str(files / "scene" / "images"), "--out", str(disk / "scene")]
+        environment = dict(os.environ)
+        if command == "plot":
+            fit = ["fit", str(files / "scene"), "--out", str(files / "run"), "--steps", "2", "--device", "cpu"]
+            subprocess.run([*program, *fit, "--preset", "3dgs", "--init.source", "random"], check=True)
+            words, environment["TMPDIR"] = ["plot", str(files / "run"), "--device", "cpu"], str(disk)
+        done = subprocess.run([*program, *words], capture_output=True, text=True, env=environment, check=False)
+        assert done.returncode == 4, done.stderr
+        assert "disk" in done.stderr and "memory" not in done.stderr and "renderer" not in done.stderr
+        assert str(disk) in done.stderr or os.strerror(errno.ENOSPC) in done.stderr
+    finally:
+        subprocess.run(["umount", "-l", str(disk)], check=True)

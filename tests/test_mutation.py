@@ -258,8 +258,8 @@ def test_score_counts_no_claims(candidates):
 
 def test_tests_must_pass_without_a_mutant(monkeypatch):
     """A file without a test for the device is left out, unless none is left; one that fails ends the run."""
-    cuda, cpu = ("tests/runtime/test_interop.py", True), ("tests/kernels/test_knn.py", False)
-    ends = {"tests/runtime/test_interop.py on CUDA": "untested"}
+    cuda, cpu = ("tests/kernels/test_launch.py", True), ("tests/kernels/test_neighbours.py", False)
+    ends = {"tests/kernels/test_launch.py on CUDA": "untested"}
 
     def instead(jobs, *_, **__):
         return [Outcome(j.name, ends.get(j.name, "survived"), 0, "") for j in jobs]
@@ -268,6 +268,6 @@ def test_tests_must_pass_without_a_mutant(monkeypatch):
     assert check_unmutated([cuda, ("tests/kernels/test_sh.py", True), cpu], arguments([])) == list(ends)
     with pytest.raises(SystemExit, match="do they see the device"):
         check_unmutated([cuda, cpu], arguments([]))
-    ends["tests/kernels/test_knn.py on the CPU"] = "broken"
-    with pytest.raises(SystemExit, match=r"fail without a mutant: .*test_knn"):
+    ends["tests/kernels/test_neighbours.py on the CPU"] = "broken"
+    with pytest.raises(SystemExit, match=r"fail without a mutant: .*test_neighbours"):
         check_unmutated([cuda, cpu], arguments([]))

@@ -1,10 +1,12 @@
-"""Every format reads back what it wrote within its quantum, and a stranger's file ends in one sentence."""
+"""Formats of files: each reads back what it wrote, says how it is rendered, and a stranger's file ends in one sentence."""
 
 import base64
 import gzip
 import io
 import json
 import struct
+import sys
+import warnings
 import zipfile
 from pathlib import Path
 
@@ -13,12 +15,29 @@ import pytest
 import torch
 
 from tests.gaussians import cloud
+from warpgs.app.cli import main
 from warpgs.errors import DataError, UsageError
 from warpgs.export import base, gltf, ply, sog, spz
-from warpgs.export.base import arrays_of, format_of, gaussians_of, half_turn, read_gaussians, suffixes, write_gaussians
+from warpgs.export.base import (
+    FORMATS,
+    Format,
+    arrays_of,
+    format_of,
+    gaussians_of,
+    half_turn,
+    read_gaussians,
+    read_with_antialiasing,
+    suffixes,
+    write_gaussians,
+)
+from warpgs.export.meshes_and_cameras import linear, rotation_to_y, write_mesh
+from warpgs.export.ply import read_ply
 from warpgs.geometry import rotation_matrices
 from warpgs.kernels.sh import basis
-from warpgs.scene import Normalization
+from warpgs.pipeline.run.export import convert
+from warpgs.scene import Mesh, Normalization
+
+# Every format reads back what it wrote within its quantum, and a stranger's file ends in one sentence.
 
 GOLDEN = Path(__file__).parent / "golden"
 SUFFIXES = suffixes()
@@ -387,3 +406,292 @@ def test_rows_of_splat_that_make_no_sense(tmp_path):
     row = np.frombuffer(encoded(".splat", degree=0), base._ROW).copy()
     row["scale"][2, 1] = -1
     refused(tmp_path / "a.splat", row.tobytes(), "axis of Gaussian 2 has a negative length")
+
+
+# Files that say how they are rendered: antialiased or not, in our words and in those of other programs.
+
+
+def antialiased_files_model():
+    return cloud(300, degree=3)
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".compressed.ply"])
+def test_other_ways_of_rendering_are_refused(suffix, tmp_path):
+    path = tmp_path / f"a{suffix}"
+    write_gaussians(path, antialiased_files_model(), units="file")
+    data = path.read_bytes()
+    assert b"comment SplatRenderMode: default\ncomment antialiased 0\n" in data
+    path.write_bytes(data.replace(b"comment antialiased 0", b"comment SplatRenderMode: 2dgs"))
+    with pytest.raises(DataError, match="'2dgs'"):
+        read_gaussians(path)
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_files_say_that_they_are_antialiased(suffix, tmp_path):
+    """Those that can; reading them warns, once, and only then."""
+    for antialiased in (True, False):
+        path = tmp_path / f"{antialiased}{suffix}"
+        write_gaussians(path, antialiased_files_model(), units="file", antialiased=antialiased)
+        expected = antialiased and format_of(path).declares
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            read_gaussians(path)
+            if suffix == ".ply":
+                read_ply(path)
+        assert [("antialiased=True" in str(w.message), w.filename) for w in caught] == [(True, __file__)] * len(caught)
+        assert len(caught) == expected * (1 + (suffix == ".ply"))
+        again = tmp_path / f"{antialiased}-again.spz"
+        convert(path, again)
+        assert read_with_antialiasing(again, None, "file")[1] is expected
+    declaring = {".ply", ".compressed.ply", ".spz", ".sog"}
+    assert format_of(path).declares == (suffix in declaring)
+
+
+@pytest.mark.parametrize("line,expected", [("SplatRenderMode: mip", True), ("antialiased 1", True), ("antialiased 0", False)])
+def test_comments_of_other_programs(line, expected, tmp_path):
+    """The last of them decides."""
+    path = tmp_path / "a.ply"
+    write_gaussians(path, antialiased_files_model(), units="file")
+    before = b"comment antialiased 0"
+    path.write_bytes(path.read_bytes().replace(before, b"comment SplatRenderMode: mip\ncomment " + line.encode()))
+    assert read_with_antialiasing(path, None, "file")[1] is expected
+
+
+def test_spz_of_version_4_says_it_too(tmp_path):
+    pytest.importorskip("zstandard")
+    path = tmp_path / "a.spz"
+    write_gaussians(path, antialiased_files_model(), units="file", format=spz.SPZ(spz.SPZConfig(version=4)), antialiased=True)
+    assert read_with_antialiasing(path, None, "file")[1]
+
+
+# A file format of one's own: one class in one file, written and read by the commands and from Python.
+
+OWN = '''
+import io
+from dataclasses import dataclass
+
+import numpy as np
+
+from warpgs.export.base import Format
+
+
+@dataclass(frozen=True)
+class Options:
+    packed: bool = False
+    """Make the archive smaller,
+    in more time."""
+
+
+class Archive(Format):
+    """Arrays of numpy."""
+
+    suffix = ".mine"
+    Config = Options
+
+    def encode(self, arrays):
+        out = io.BytesIO()
+        (np.savez_compressed if self.config.packed else np.savez)(out, **arrays)
+        return [out.getvalue()]
+
+    def decode(self, path, data):
+        with np.load(io.BytesIO(data), allow_pickle=False) as found:
+            return dict(found)
+
+
+class Nameless(Format):
+    pass
+
+
+class Written(Format):
+    suffix = ".txt"
+
+    def encode(self, arrays):
+        return [b"%d" % len(arrays["means"])]
+'''
+
+
+@pytest.fixture
+def own(tmp_path, monkeypatch):
+    """The file, which is forgotten after the test."""
+    FORMATS.names()
+    monkeypatch.setattr(FORMATS, "_classes", dict(FORMATS._classes))
+    path = tmp_path / "mine.py"
+    path.write_text(OWN)
+    write_gaussians(tmp_path / "a.ply", cloud(40), units="file")
+    yield path
+    for name in [n for n, m in sys.modules.items() if getattr(m, "__file__", None) == str(path)]:
+        del sys.modules[name]
+
+
+def test_one_file_adds_a_format(own, tmp_path, capsys):
+    """To convert to it and back, with options of its own; the bits are those that were stored."""
+    spec, flags = f"{own}:Archive", ["--no-clean"]
+    assert main(["convert", str(tmp_path / "a.ply"), str(tmp_path / "b.mine"), "--format", spec, *flags]) == 0
+    small = ["--archive.packed", *flags]
+    assert main(["convert", str(tmp_path / "a.ply"), str(tmp_path / "c.mine"), "--format", spec, *small]) == 0
+    assert (tmp_path / "c.mine").stat().st_size < (tmp_path / "b.mine").stat().st_size
+    assert main(["convert", str(tmp_path / "c.mine"), str(tmp_path / "d.ply"), "--format", spec]) == 0
+    assert (tmp_path / "d.ply").read_bytes() == (tmp_path / "a.ply").read_bytes()
+    with pytest.raises(SystemExit):
+        main(["convert", "--format", spec, "--help"])
+    said = " ".join(capsys.readouterr().out.replace("│", "").split())
+    assert "--archive.packed" in said and "Make the archive smaller, in more time" in said
+
+
+def test_python_takes_a_class_an_object_or_its_place(own, tmp_path):
+    cls = FORMATS.load(f"{own}:Archive")
+    for i, choice in enumerate((cls, cls(), cls(cls.Config(packed=True)), f"{own}:Archive")):
+        write_gaussians(tmp_path / f"{i}.mine", cloud(40), units="file", format=choice)
+        back = read_gaussians(tmp_path / f"{i}.mine", format=choice)
+        assert torch.equal(back.means, cloud(40).means)
+    assert (tmp_path / "2.mine").stat().st_size < (tmp_path / "1.mine").stat().st_size
+    lines = convert(tmp_path / "0.mine", tmp_path / "o.spz", formats=[cls])
+    assert any("the format rounds positions" in line for line in lines)
+
+
+def test_a_registered_format_is_found_by_its_suffix(own, tmp_path, capsys):
+    """Without a word about it, in the help too; those of ours keep their files."""
+
+    @FORMATS.register("rows")
+    class Rows(Format):
+        """Rows of numbers. More."""
+
+        suffix = ".rows"
+
+    @FORMATS.register("taken")
+    class Taken(Format):
+        suffix = ".ply"
+
+    assert ".rows" in suffixes() and type(format_of("a.rows")) is Rows and format_of("a.ply").name == "ply"
+    assert type(format_of("a.ply", Taken)) is Taken and FORMATS.described()["rows"] == "Rows of numbers"
+    for command in ("export", "convert"):
+        with pytest.raises(SystemExit):
+            main([command, "--help"])
+        assert ".rows" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("flags", "said"),
+    [
+        (["b.other", "--format", "{own}:Archive"], "expected a name that ends in .mine"),
+        (["b.mine"], "format .mine is not supported"),
+        (["b.mine", "--format", "{own}:Nameless"], "has the suffix ''"),
+        (["b.mine", "--format", "{own}:np"], "must be a class that derives from warpgs.Format"),
+        (["b.mine", "--format", "best"], "unknown format 'best'; choose one of"),
+        (["b.mine", "--format", "{own}:Archive", "--spz.version", "2"], "--spz.* are not options of the format"),
+        (["b.spz", "--spz.version", "9"], "SPZ version 9"),
+        (["cameras.json", "--format", "{own}:Archive"], "--format does not apply to cameras"),
+    ],
+)
+def test_mistakes_are_one_sentence(own, tmp_path, capsys, flags, said):
+    name, *more = (word.format(own=own) for word in flags)
+    assert main(["convert", str(tmp_path / "a.ply"), str(tmp_path / name), *more]) == 2
+    text = capsys.readouterr().err
+    assert said in text and len(text.splitlines()) == 1 and not (tmp_path / name).exists()
+
+
+def test_a_format_may_write_alone(own, tmp_path):
+    """What it cannot read is not read back to tell what was rounded."""
+    spec = f"{own}:Written"
+    assert main(["convert", str(tmp_path / "a.ply"), str(tmp_path / "n.txt"), "--format", spec, "--no-clean"]) == 0
+    assert (tmp_path / "n.txt").read_text() == "40"
+    with pytest.raises(UsageError, match="can be written but not read"):
+        read_gaussians(tmp_path / "n.txt", format=spec)
+
+
+def test_an_option_of_ours_is_a_flag(tmp_path):
+    write_gaussians(tmp_path / "a.ply", cloud(9), units="file")
+    assert main(["convert", str(tmp_path / "a.ply"), str(tmp_path / "b.spz"), "--spz.version", "2", "--no-clean"]) == 0
+    assert np.frombuffer(gzip.decompress((tmp_path / "b.spz").read_bytes())[4:8], "<u4") == 2
+
+
+def test_no_file_names_code(own, tmp_path):
+    """A name with a colon is looked up where something stored names it, and never imported."""
+    before = set(sys.modules)
+    with pytest.raises(UsageError, match="does not load your code"):
+        FORMATS.find(f"{own}:Archive")
+    with pytest.raises(UsageError, match="is not supported"):
+        format_of(tmp_path / f"{own.name}:Archive")
+    assert not any("mine" in n for n in set(sys.modules) - before)
+
+
+# Meshes as files, read back by numpy, by VTK and by pygltflib.
+
+TETRAHEDRON = Mesh(
+    np.array([[1000.0, 0, -5], [1001, 0, -5], [1000, 2, -5], [1000, 0, -2]]),
+    np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]], np.int32),
+    np.array([[0, 0, 0], [1, 0, 0.5], [0.2, 1, 0], [1, 1, 1]], np.float32),
+)
+
+
+def glb(path):
+    """Return the document and the binary chunk of a .glb file, whose lengths are checked."""
+    data = path.read_bytes()
+    magic, version, size, length, kind = struct.unpack_from("<4sIII4s", data)
+    assert (magic, version, size, kind) == (b"glTF", 2, len(data), b"JSON") and length % 4 == 0
+    binary, second = struct.unpack_from("<I4s", data, 20 + length)
+    assert second == b"BIN\0" and binary % 4 == 0 and 28 + length + binary == len(data)
+    return json.loads(data[20 : 20 + length]), data[28 + length :]
+
+
+def test_ply_is_read_by_vtk(tmp_path):
+    """Positions, triangles and 8-bit colours."""
+    import pyvista
+
+    write_mesh(tmp_path / "a.ply", TETRAHEDRON)
+    found = pyvista.read(tmp_path / "a.ply")
+    assert np.array_equal(found.points, TETRAHEDRON.vertices) and np.array_equal(found.regular_faces, TETRAHEDRON.faces)
+    colors = np.asarray(found.point_data["RGB"])
+    assert np.array_equal(colors[:, :3], np.round(255 * TETRAHEDRON.colors))
+
+
+def test_glb_holds_the_mesh(tmp_path):
+    """Positions around their middle with its translation, bounds, linear colours, triangles, aligned views."""
+    write_mesh(tmp_path / "a.glb", TETRAHEDRON)
+    text, data = glb(tmp_path / "a.glb")
+    arrays = []
+    for accessor, dtype in zip(text["accessors"], ("<f4", "<u2", "<u4"), strict=True):
+        view = text["bufferViews"][accessor["bufferView"]]
+        assert view["byteOffset"] % 4 == 0
+        arrays.append(np.frombuffer(data, dtype, view["byteLength"] // np.dtype(dtype).itemsize, view["byteOffset"]))
+    positions, colors, indices = arrays[0].reshape(-1, 3), arrays[1].reshape(-1, 4), arrays[2]
+    inner, outer = text["nodes"][1], text["nodes"][0]
+    assert np.allclose(positions + np.array(inner["translation"]), TETRAHEDRON.vertices) and outer["rotation"] == [0, 0, 0, 1]
+    assert text["accessors"][0]["min"] == positions.min(0).tolist() and text["accessors"][0]["max"] == positions.max(0).tolist()
+    assert np.array_equal(indices.reshape(-1, 3), TETRAHEDRON.faces) and (colors[:, 3] == 65535).all()
+    assert np.allclose(colors[:, :3] / 65535, linear(TETRAHEDRON.colors), atol=1e-5)
+    assert linear(np.array([0.0, 0.04, 0.5, 1.0])) == pytest.approx([0, 0.04 / 12.92, 0.21404, 1], abs=1e-5)
+
+
+def test_glb_is_read_by_trimesh(tmp_path):
+    """Another reader, which comes with viser, finds what was written."""
+    library = pytest.importorskip("trimesh")
+    write_mesh(tmp_path / "a.glb", TETRAHEDRON, np.array([0, 0, 1.0]))
+    (found,) = library.load(tmp_path / "a.glb", process=False).geometry.values()
+    assert np.array_equal(found.faces, TETRAHEDRON.faces) and found.vertices.shape == (4, 3)
+    colors = found.visual.vertex_attributes["color"]
+    assert np.allclose(colors[:, :3] / 65535, linear(TETRAHEDRON.colors), atol=1e-5)
+
+
+@pytest.mark.parametrize("up", [(0, 1, 0), (0, -1, 0), (0, 0, 2), (-3, 0, 0), (0.3, -0.9, 0.2), (1e-9, -1, 0)])
+def test_upwards_becomes_y(up):
+    """The quaternion xyzw turns the direction to +y."""
+    x, y, z, w = rotation_to_y(np.array(up, float))
+    v, q = np.array(up, float) / np.linalg.norm(up), np.array([x, y, z])
+    turned = v + 2 * np.cross(q, np.cross(q, v) + w * v)
+    assert np.allclose(turned, [0, 1, 0], atol=1e-6) and np.isclose(x * x + y * y + z * z + w * w, 1)
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".glb"])
+def test_what_is_no_mesh_is_not_written(tmp_path, suffix):
+    """Numbers that are not finite, triangles of missing vertices, other suffixes."""
+    path = tmp_path / f"a{suffix}"
+    bad = TETRAHEDRON.vertices.copy()
+    bad[1, 1] = np.nan
+    with pytest.raises(DataError, match="not finite"):
+        write_mesh(path, Mesh(bad, TETRAHEDRON.faces, TETRAHEDRON.colors))
+    with pytest.raises(DataError, match="missing vertex"):
+        write_mesh(path, Mesh(TETRAHEDRON.vertices[:3], TETRAHEDRON.faces, TETRAHEDRON.colors[:3]))
+    with pytest.raises(UsageError, match=r"use \.ply or \.glb"):
+        write_mesh(tmp_path / f"a.obj{suffix[1:]}", TETRAHEDRON)
+    assert not list(tmp_path.iterdir())

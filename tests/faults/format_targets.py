@@ -14,9 +14,20 @@ from pathlib import Path
 
 import numpy as np
 
-from tests.faults.bombs import large_webp, many_rows, rarely, spz_bomb, zip_bomb
 from tests.faults.model_targets import gaussians, nonsense, ply_body, ply_header
-from tests.faults.mutations import Change, damage, json_value, number, text_line, text_number
+from tests.faults.mutations import (
+    Change,
+    damage,
+    json_value,
+    large_webp,
+    many_rows,
+    number,
+    rarely,
+    spz_bomb,
+    text_line,
+    text_number,
+    zip_bomb,
+)
 from tests.faults.targets import Target, not_finite, register
 from tests.io import scenes
 from warpgs.errors import DataError

@@ -25,9 +25,22 @@ from pathlib import Path
 
 import numpy as np
 
-from tests.faults.bounds import ALLOCATOR, LIMIT, MEMORY, WALL, Hang, PeakMemory, bound_process, size_of, spent, time_limit
+from tests.faults.bounds import (
+    ALLOCATOR,
+    LIMIT,
+    MEMORY,
+    WALL,
+    Hang,
+    Line,
+    PeakMemory,
+    Reached,
+    bound_process,
+    garbage,
+    size_of,
+    spent,
+    time_limit,
+)
 from tests.faults.mutations import damage
-from tests.faults.reached import Line, Reached, garbage
 from tests.faults.targets import MODULES, Target, all_targets, parser_lines
 
 FAILURES_KEPT = 20

@@ -11,8 +11,7 @@ import cv2
 import numpy as np
 from PIL import Image
 
-from tests.faults.bombs import png_bomb, rarely
-from tests.faults.mutations import Change, damage, number
+from tests.faults.mutations import Change, damage, number, png_bomb, rarely
 from tests.faults.scene_targets import nonsense as scene_nonsense
 from tests.faults.scene_targets import read_scene, write_masked
 from tests.faults.targets import Target, not_finite, register

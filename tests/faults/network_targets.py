@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from tests.faults.bombs import rarely, zip_bomb
 from tests.faults.format_targets import zip_member
 from tests.faults.model_targets import SMALL, onnx_field, tensors_body, tensors_header
+from tests.faults.mutations import rarely, zip_bomb
 from tests.faults.targets import Target, register
 from tests.priors import networks as nw
 from warpgs import onnx

@@ -12,9 +12,8 @@ import numpy as np
 from PIL import Image
 
 from tests.faults import image_targets
-from tests.faults.bombs import png_bomb, rarely
 from tests.faults.image_targets import encoded, jpeg_segments, photo, png_checksums, tiff_tag
-from tests.faults.mutations import Change, damage, number
+from tests.faults.mutations import Change, damage, number, png_bomb, rarely
 from tests.faults.targets import Target, register
 from warpgs.errors import DataError
 from warpgs.io import image_files
@@ -127,7 +126,7 @@ image_targets.add("avif", AVIFS, (image_files._opened, image_files._loaded), (bo
 
 
 def heic_files(root: Path) -> list[Path]:
-    from tests.poses.test_heic import HEIC
+    from tests.poses.test_photographs import HEIC
 
     (root / "in").mkdir()
     (root / "in" / "a.heic").write_bytes(HEIC)

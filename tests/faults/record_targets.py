@@ -11,10 +11,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from tests.faults.bombs import many_rows, rarely
 from tests.faults.image_targets import png_checksums, png_rows
 from tests.faults.model_targets import run_files
-from tests.faults.mutations import Change, json_value, text_line, text_number
+from tests.faults.mutations import Change, json_value, many_rows, rarely, text_line, text_number
 from tests.faults.targets import Target, not_finite, register
 from warpgs import locks, schema
 from warpgs.app import farm as farm_command

@@ -9,8 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tests.faults.bombs import many_rows, rarely
-from tests.faults.mutations import Change, json_value, text_line, text_number
+from tests.faults.mutations import Change, json_value, many_rows, rarely, text_line, text_number
 from tests.faults.targets import Target, not_finite, register
 from tests.io import scenes
 from warpgs.io import colmap, load, maps, others, transforms

@@ -16,7 +16,7 @@ import pytest
 
 import warpgs
 from tests.io import scenes
-from tests.test_input_files import special
+from tests.test_files import special
 from warpgs.errors import WarpgsError
 from warpgs.export.base import read_gaussians, suffixes
 from warpgs.export.ply import start_of

@@ -1,11 +1,17 @@
-"""The same cameras and images give the same scene, whatever the format."""
+"""Formats of scenes: the same cameras, lenses and images whatever the format; objects on black."""
 
 import numpy as np
 import pytest
 
+from tests.gaussians import opencv_pixels
 from tests.io import scenes
+from warpgs import geometry
 from warpgs.errors import DataError, UsageError
+from warpgs.geometry import project_points
 from warpgs.io.load import load_scene, split_views
+from warpgs.pipeline.metrics.scores import counted_region
+
+# The same cameras and images give the same scene, whatever the format.
 
 
 def landing(scene, i, point):
@@ -225,3 +231,157 @@ def test_outside_images_need_permission_and_get_harmless_names(tmp_path):
     scene = load_scene(root, allow_outside=True)
     assert any(v.name.startswith("outside/") and v.name.endswith("elsewhere.png") for v in scene.views)
     assert any("1 images are outside" in n for n in scene.notes)
+
+
+# Lenses that are kept: the same point lands on the same pixel through the camera as through the lens of the file.
+
+F, CX, CY = scenes.FOCAL, scenes.WIDTH / 2, scenes.HEIGHT / 2
+EIGHT = (0.1, -0.02, 0.01, 0.02, 0.03, 0.04, 0.05, 0.06)
+COLMAP = {
+    "SIMPLE_PINHOLE": ((F, CX, CY), "pinhole", ()),
+    "PINHOLE": ((F, F, CX, CY), "pinhole", ()),
+    "SIMPLE_RADIAL": ((F, CX, CY, 0.1), "opencv", (0.1,)),
+    "RADIAL": ((F, CX, CY, 0.1, -0.02), "opencv", (0.1, -0.02)),
+    "OPENCV": ((F, F, CX, CY, 0.1, -0.02, 0.01, 0.02), "opencv", (0.1, -0.02, 0.01, 0.02)),
+    "FULL_OPENCV": ((F, F, CX, CY, *EIGHT), "opencv", EIGHT),
+    "OPENCV_FISHEYE": ((F, F, CX, CY, 0.1, -0.02, 0.01, 0.02), "fisheye", (0.1, -0.02, 0.01, 0.02)),
+    "SIMPLE_RADIAL_FISHEYE": ((F, CX, CY, 0.1), "fisheye", (0.1,)),
+    "RADIAL_FISHEYE": ((F, CX, CY, 0.1, -0.02), "fisheye", (0.1, -0.02)),
+}  # fmt: skip
+TRANSFORMS = {
+    "pinhole": ({}, "pinhole", ()),
+    "opencv": ({"k1": 0.1, "k2": -0.02, "p1": 0.01, "p2": 0.02, "k3": 0.03}, "opencv", (0.1, -0.02, 0.01, 0.02, 0.03)),
+    "fisheye by its model": ({"camera_model": "OPENCV_FISHEYE", "k1": 0.1, "k4": 0.02}, "fisheye", (0.1, 0, 0, 0.02)),
+    "fisheye by its flag": ({"is_fisheye": True, "k1": 0.1, "k2": -0.02}, "fisheye", (0.1, -0.02)),
+    "fisheye without coefficients": ({"camera_model": "OPENCV_FISHEYE"}, "fisheye", ()),
+}
+
+
+def lands(scene, model: str, terms: tuple[float, ...]) -> None:
+    """Check camera, pixels and where a point lands."""
+    for i, view in enumerate(scene.views):
+        camera = view.camera
+        assert camera.model == model and np.array_equal(view.image, (scenes.image(i) / 255).astype(np.float32))
+        point = scenes.POINT
+        wanted = scenes.pixel(i)
+        if model != "pinhole":
+            padded = np.zeros(4 if model == "fisheye" else 8)
+            padded[: len(terms)] = terms
+            assert np.array_equal(camera.distortion, padded)
+            in_camera = scenes.VIEWMATS[i, :3, :3] @ point + scenes.VIEWMATS[i, :3, 3]
+            wanted = opencv_pixels(model, padded, scenes.K, in_camera[None])[0]
+        n = scene.normalization
+        found, _ = project_points(camera, n.scale * (point - n.offset)[None])
+        np.testing.assert_allclose(found[0], wanted, atol=1e-8)
+
+
+@pytest.mark.parametrize("name", COLMAP)
+@pytest.mark.parametrize("write", [scenes.write_colmap, scenes.write_colmap_txt], ids=["bin", "txt"])
+def test_colmap_lenses_are_kept(name, write, tmp_path):
+    parameters, model, terms = COLMAP[name]
+    scene = load_scene(write(tmp_path, model=name, parameters=parameters), lenses="native")
+    lands(scene, model, terms)
+    notes = [n for n in scene.notes if "lens" in n]
+    assert notes == ([] if model == "pinhole" else [f"5 images kept with the distortion of their lens ({name})"])
+
+
+@pytest.mark.parametrize("name", TRANSFORMS)
+def test_lenses_of_transforms_are_kept(name, tmp_path):
+    values, model, terms = TRANSFORMS[name]
+    content = scenes.transforms_json(fl_x=F, fl_y=F, cx=CX, cy=CY, **values)
+    lands(load_scene(scenes.write_transforms(tmp_path, content), lenses="native"), model, terms)
+
+
+def test_what_a_lens_does_not_reach_leaves_the_mask(tmp_path):
+    """A fisheye of a short focal length folds at 85 degrees: its corners are dark, and do not count; half the size agrees."""
+    parameters, rim = (5.0, 5.0, CX, CY, -0.15, 0, 0, 0), np.sqrt(1 / 0.45)
+    scene = load_scene(scenes.write_colmap(tmp_path, model="OPENCV_FISHEYE", parameters=parameters), lenses="native")
+    x, y = np.meshgrid(np.arange(scenes.WIDTH) + 0.5 - CX, np.arange(scenes.HEIGHT) + 0.5 - CY)
+    wanted = np.hypot(x, y) / 5 < rim - 0.15 * rim**3
+    assert 0.2 < wanted.mean() < 0.9 and all(np.array_equal(v.mask, wanted) for v in scene.views)
+    half = load_scene(tmp_path, lenses="native", downscale=2).views[0]
+    assert half.camera.K[0, 0] == 2.5 and np.array_equal(half.camera.distortion, scene.views[0].camera.distortion)
+    assert np.array_equal(half.mask, lenses_reach(half.camera))
+
+
+def lenses_reach(camera) -> np.ndarray:
+    """Return where the way back from the pixels of a camera ends."""
+    x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    plane = (np.stack([x, y], -1) - camera.K[:2, 2]) / camera.K[0, 0]
+    return np.isfinite(geometry.from_plane(camera.model, camera.distortion, plane)).all(-1)
+
+
+def test_errors_name_the_way_to_keep_a_lens(tmp_path):
+    """Undistorting stays the default; terms that no model here has are refused either way."""
+    scenes.write_colmap(tmp_path / "a", model="OPENCV_FISHEYE", parameters=COLMAP["OPENCV_FISHEYE"][0])
+    with pytest.raises(DataError, match=r"OPENCV_FISHEYE is not supported.*or fit with --lenses native"):
+        load_scene(tmp_path / "a")
+    for values, message in (
+        ({"camera_model": "OPENCV_FISHEYE"}, "OPENCV_FISHEYE is not supported.*or fit them with --lenses native"),
+        ({"is_fisheye": True}, "is_fisheye belongs to a fisheye.*or fit them with --lenses native"),
+    ):
+        scenes.write_transforms(tmp_path / "b", scenes.transforms_json(fl_x=F, **values))
+        with pytest.raises(DataError, match=message):
+            load_scene(tmp_path / "b")
+    for values, message in (
+        ({"k4": 0.1}, "k4 belongs to a fisheye or rational lens"),
+        ({"is_fisheye": True, "p1": 0.1}, "p1 is not supported for a fisheye"),
+        ({"is_fisheye": True, "fisheye_crop_radius": 9}, "fisheye_crop_radius is not supported for a fisheye"),
+    ):
+        scenes.write_transforms(tmp_path / "b", scenes.transforms_json(fl_x=F, **values))
+        with pytest.raises(DataError, match=message):
+            load_scene(tmp_path / "b", lenses="native")
+    with pytest.raises(UsageError, match="--lenses must be undistort or native, not 'both'"):
+        load_scene(tmp_path / "b", lenses="both")
+
+
+# Objects on black: what around them is empty, and scenes that are left alone.
+
+
+def ring(i):
+    """Return an image [36, 48, 3] of a bright ring on black, with noise in the black and a dark pixel in the bright."""
+    image = np.full((36, 48, 3), 5, np.uint8)
+    image[6:30, 12:36] = 200 - 10 * i
+    image[12:24, 18:30] = 0
+    image[9, 15] = 3
+    image[:2, :2] = [[[4] * 3, [90] * 3], [[90] * 3] * 2]  # what lies in the corner is joined to the border alone
+    return image
+
+
+def write(root, images):
+    scenes.write_middlebury(root)
+    for name, image in zip(scenes.NAMES, images, strict=True):
+        scenes.save(root / name, image)
+
+
+def test_dark_pixels_around_objects_and_in_holes_are_transparent(tmp_path):
+    """A speck stays opaque; the region of the score is that of the same images without opacity."""
+    write(tmp_path, [ring(i) for i in range(5)])
+    scene, plain = load_scene(tmp_path), load_scene(tmp_path, black_is_empty=False)
+    alpha = np.zeros((36, 48), np.float32)
+    alpha[6:30, 12:36] = 1
+    alpha[12:24, 18:30] = 0
+    alpha[:2, :2] = [[0, 1], [1, 1]]
+    for v, before in zip(scene.views, plain.views):
+        assert (v.alpha == alpha).all() and v.alpha.dtype == np.float32 and not v.image[alpha == 0].any()
+        assert v.alpha_estimated and not before.alpha_estimated
+        assert (v.image[alpha == 1] == before.image[alpha == 1]).all() and before.alpha is None
+        assert (counted_region(v)[0] == counted_region(before)[0]).all()
+    note = "every image shows an object on black: the dark pixels around the object and in its holes (74.8% of all pixels)"
+    assert any(n.startswith(note) and "--no-black-is-empty" in n for n in scene.notes)
+    assert not any("object on black" in n for n in plain.notes) and scene.fingerprint != plain.fingerprint
+
+
+@pytest.mark.parametrize("what", ["a bright image", "a mask", "an alpha channel"])
+def test_one_view_that_differs_leaves_all_as_they_are(what, tmp_path):
+    write(tmp_path, [ring(i) for i in range(5)])
+    if what == "a bright image":
+        scenes.save(tmp_path / scenes.NAMES[4], np.full((36, 48, 3), 90, np.uint8))
+    elif what == "a mask":
+        scenes.save(tmp_path / "masks" / "photo4.png", np.full((36, 48), 255, np.uint8))
+    else:
+        alpha = np.full((36, 48, 1), 255, np.uint8)
+        alpha[0] = 9
+        scenes.save(tmp_path / scenes.NAMES[4], np.concatenate([ring(4), alpha], axis=2))
+    scene = load_scene(tmp_path)
+    assert all(v.alpha is None for v in scene.views[:4]) and not any("object on black" in n for n in scene.notes)

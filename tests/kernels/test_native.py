@@ -1,7 +1,12 @@
-"""Contracts between the CUDA bodies: items dealt, tiles ordered, blocks left out, chunks of one size for both passes."""
+"""CUDA text: where it lies, that it compiles without a GPU, and the contracts between its bodies."""
 
+import ast
+import fnmatch
 import functools
+import itertools
 import math
+import tomllib
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -10,12 +15,15 @@ import warp as wp
 
 from tests.gaussians import camera, cloud, leaves
 from warpgs.constants import ALPHA_CUT
-from warpgs.kernels import blend_cuda, launch, native
-from warpgs.kernels.native import source
+from warpgs.kernels import blend, blend_cuda, launch, native, project_cuda, walk
+from warpgs.kernels.cameras import CAMERA_MODELS
+from warpgs.kernels.native import FOLDER, source
+from warpgs.pipeline.run.precompile import fit_kernels
 from warpgs.render.options import RasterizeOptions
 from warpgs.render.rasterize import rasterize
 
-pytestmark = pytest.mark.cuda
+# Contracts between the CUDA bodies: items dealt, tiles ordered, blocks left out, chunks of one size for both passes.
+
 CUDA = torch.device("cuda", 0)
 
 
@@ -23,6 +31,7 @@ def ints(tensor: torch.Tensor) -> launch.View:
     return launch.view(tensor.view(-1), wp.int32)
 
 
+@pytest.mark.cuda
 @pytest.mark.parametrize("count", [1, 31, 1000, 1025, 8192, 8193, 20_000])
 def test_long_lists_come_first(count):
     """Each tile once, in the row of its length's leading zeros, and nothing behind the last; lists lie anywhere."""
@@ -75,6 +84,7 @@ def small_kernels() -> SimpleNamespace:
     return SimpleNamespace(block=block, deal=deal)
 
 
+@pytest.mark.cuda
 @pytest.mark.parametrize("fraction", [0.0, 0.3, 0.97, 1.0])
 def test_wanted_items_go_to_the_first_threads(fraction):
     """Wanted items come in order within their block, for any nonzero flag; left-over threads get -1."""
@@ -114,6 +124,7 @@ def at_their_edge(count: int, longest: float, corner: bool):
     return records.float(), corners.float()
 
 
+@pytest.mark.cuda
 @pytest.mark.parametrize("corner", [False, True], ids=["any pixel", "corners"])
 @pytest.mark.parametrize("longest", [5.0, 11.5, 15.5])
 def test_no_block_that_draws_is_left_out(longest, corner):
@@ -130,6 +141,7 @@ def test_no_block_that_draws_is_left_out(longest, corner):
     assert int(drawn.sum()) > 180_000 and int((drawn & (found == 0)).sum()) == 0
 
 
+@pytest.mark.cuda
 def test_chunks_are_the_larger_ones_in_large_pictures_and_without_an_order():
     """Both passes take the chunk from the same function."""
     sizes = (4096, 4097, 16384, 16385)
@@ -137,6 +149,7 @@ def test_chunks_are_the_larger_ones_in_large_pictures_and_without_an_order():
     assert [blend_cuda.chunk_of(tiles, False) for tiles in sizes] == [128, 128, 128, 256]
 
 
+@pytest.mark.cuda
 def test_gradients_agree_for_every_chunk(monkeypatch):
     """Lists that are longer than the largest chunk, begun anywhere; images have the same bits, gradients differ by rounding."""
     gaussians = leaves(cloud(3000, torch.float32, CUDA))
@@ -157,6 +170,7 @@ def test_gradients_agree_for_every_chunk(monkeypatch):
             assert float((own - wanted).norm()) <= 1e-5 * float(wanted.norm())
 
 
+@pytest.mark.cuda
 def test_devices_and_streams_without_a_number():
     """The current device is meant; Warp's own work runs on torch's stream, and on no other afterwards."""
     unnumbered = torch.device("cuda")
@@ -167,3 +181,83 @@ def test_devices_and_streams_without_a_number():
         wanted = torch.cuda.current_stream(CUDA).cuda_stream
         assert where.stream.cuda_stream == wanted == launch.warp_stream(unnumbered).cuda_stream
     assert where.stream.cuda_stream == before != wanted
+
+
+# CUDA text compiles, also on a machine without a GPU: NVRTC comes with Warp.
+
+ARCHITECTURE = 75
+"""Oldest architecture that is compiled for (Turing)."""
+
+
+def modules() -> dict[str, wp.Module]:
+    """Modules of all kernels that a fit launches on CUDA, and of those that only the public op launches."""
+    kernels = [k for k, _ in fit_kernels(True)]
+    kernels += [k for size in (8, 16) for k in vars(walk.make_native(size)).values()]
+    variants = list(itertools.product(("stored", "activated", "covariances"), (True, False)))  # parameters, antialiased
+    for variant in [*variants, ("stored", False, 25)]:
+        both = project_cuda.make_forward, project_cuda.make_backward
+        kernels += [make(real, "pinhole", *variant) for make in both for real in (wp.float32, wp.float64)]
+    for channels in blend.WIDTHS:
+        kernels += [blend_cuda.make_forward(8, save, per, channels) for save in (True, False) for per in (1, 2)]
+        for depth, absgrad in itertools.product((True, False), repeat=2):
+            made = blend_cuda.make_backward(8, depth, 64, True, channels, absgrad)
+            kernels += [made.backward, made.gather]
+    for model in CAMERA_MODELS.names():
+        kernels += [project_cuda.make_forward(wp.float32, model), project_cuda.make_backward(wp.float32, model)]
+    return {k.module.name: k.module for k in kernels}
+
+
+@pytest.mark.slow
+def test_cuda_text_compiles(tmp_path):
+    """Each module, to PTX."""
+    wp.init()
+    if wp.get_cuda_supported_archs() == []:
+        pytest.skip("this build of Warp has no NVRTC")
+    found = modules()
+    assert len(found) > 20
+    for module in found.values():
+        wp.compile_aot_module(module, arch=ARCHITECTURE, use_ptx=True, module_dir=str(tmp_path))
+
+
+# CUDA text: it lies in files of one folder, is read by one function, and is part of what is installed.
+
+ROOT = Path(__file__).parents[2]
+FILES = {p.name for p in (ROOT / "warpgs/kernels/cuda").iterdir()}
+
+
+def native_bodies():
+    """Return file and expression of the CUDA body of each native function of the package."""
+    for path in sorted((ROOT / "warpgs").rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+            if isinstance(node, ast.Call) and ast.unparse(node.func) in ("wp.func_native", "cuda_kernel"):
+                yield path.name, node.args[0]
+
+
+def test_no_cuda_text_stands_in_python():
+    """Every body comes from a file, and every file is read by name or included."""
+    bodies = list(native_bodies())
+    assert len(bodies) >= 20
+    others = [f"{file}: {ast.unparse(body)}" for file, body in bodies if not isinstance(body, ast.Call)]
+    assert others == ["native.py: text"]  # of `cuda_kernel` itself, whose callers are among these
+    bodies = [(file, body) for file, body in bodies if isinstance(body, ast.Call)]
+    assert {ast.unparse(body.func) for _, body in bodies} == {"source", "_source"}
+    named = {body.args[0].value for _, body in bodies if ast.unparse(body.func) == "source"}
+    named |= {f"blend_{body.args[0].value}.cu" for _, body in bodies if ast.unparse(body.func) == "_source"}
+    text = "".join((FOLDER / name).read_text("utf-8") for name in named)
+    assert {name for name in FILES if name in named or f'#include "{name}"' in text} == FILES
+
+
+def test_names_are_replaced_and_files_included(tmp_path):
+    """Whole words alone become numbers, also in a file that is included."""
+    (tmp_path / "body.cu").write_text('#include "blend_common.cu"\nint SIDES = SIDE;\n')
+    text = source(str(tmp_path / "body.cu"), SIDE=8)
+    assert text.startswith("// Declarations") and "WIDE = 8 / 8" in text and text.endswith("int SIDES = 8;\n")
+    assert "#include" not in text
+
+
+def test_a_wheel_holds_all_cuda_text():
+    """A wheel takes all files of the package that git does not ignore."""
+    wheel = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["tool"]["hatch"]["build"]["targets"]["wheel"]
+    assert wheel == {"packages": ["warpgs"]}
+    ignored = [line for line in (ROOT / ".gitignore").read_text("utf-8").splitlines() if line and not line.startswith("#")]
+    assert not [n for n in FILES for pattern in ignored if fnmatch.fnmatch(n, pattern.strip("/"))]

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from tests.reference.sh import basis_reference
-from tests.reference.sh_polynomials import colors_reference
+from tests.reference.sh import basis_reference, colors_reference
 from tests.tolerances import close
 from warpgs.constants import RULES
 from warpgs.geometry import look_at

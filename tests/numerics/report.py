@@ -12,9 +12,8 @@ from pathlib import Path
 import torch
 
 from bench.lib import result_file
-from tests.numerics.budget import CASES, broken, measure, tile_size_of
+from tests.numerics.budget import CASES, broken, measure, split, tile_size_of
 from tests.numerics.scenes import SCENES
-from tests.numerics.split import split
 from warpgs.constants import RULES
 
 

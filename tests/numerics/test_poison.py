@@ -68,7 +68,7 @@ def test_the_fuzz_sees_a_gaussian_that_is_painted():
     case = make_case(0, 3, 200)
     quiet = Gaussians(**{n: t.nan_to_num(0.1, 0.1, 0.1) for n, t in case.gaussians.tensors().items()})
     assert failures(Case(quiet, case.poisoned, case.camera, case.rule), "cpu")[0] == []
-    import tests.numerics.poison as module
+    from tests.numerics import poison as module
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(module, "non_finite", lambda g: torch.arange(len(g)) % 2 == 0)

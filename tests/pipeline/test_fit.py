@@ -1,22 +1,44 @@
-"""`warpgs.fit` from Python: the same fit as the command, with or without a run folder, in either units."""
+"""Fits from Python and by commands: run folders, given maps, backgrounds, objects cut out, previews."""
 
 import dataclasses
+import html
 import json
 
+import cv2
 import numpy as np
 import pytest
 import torch
 from PIL import Image
 
 import warpgs
+from tests.io import scenes
+from tests.io.scenes import save
+from tests.priors import networks as nw
+from tests.priors.rigs import exact_depth
 from warpgs.app.cli import main
 from warpgs.errors import DataError, UsageError
 from warpgs.export.base import read_gaussians
 from warpgs.geometry import convert_camera
+from warpgs.io.load import load_scene
+from warpgs.pipeline.films.film import render_path
+from warpgs.pipeline.metrics import scores
+from warpgs.pipeline.metrics.scores import score, summarize
 from warpgs.pipeline.model.start import InitConfig
-from warpgs.pipeline.run.request import NO_SCORES
+from warpgs.pipeline.run import folder as schemas
+from warpgs.pipeline.run.commands import scene_of
+from warpgs.pipeline.run.folder import open_run
+from warpgs.pipeline.run.request import NO_SCORES, SceneRequest
+from warpgs.pipeline.run.results import score_line
+from warpgs.pipeline.train.presets import PRESETS
+from warpgs.pipeline.train.schedule import choose_background, color_of, over_background
+from warpgs.pipeline.train.settings import FitConfig
 from warpgs.process import Detail
+from warpgs.report.images import png, straight_alpha
+from warpgs.scene import Camera, View
+from warpgs.synthetic import demo
 from warpgs.synthetic.demo import split_spec, write_demo
+
+# `warpgs.fit` from Python: the same fit as the command, with or without a run folder, in either units.
 
 STEPS, SPLIT = 12, split_spec(8)
 CONFIG = warpgs.FitConfig(steps=STEPS, init=InitConfig(source="random", random_count=80))
@@ -165,3 +187,348 @@ def test_degree_4_is_fitted_and_stored(folder, tmp_path, capsys):
         assert main(["export", str(out), "--to", str(tmp_path / f"a{suffix}"), "--no-clean", "--rotate", "0,0,1,30"]) == 0
         assert ("harmonics above degree 3 are dropped" in capsys.readouterr().out) == (count == 16)
         assert read_gaussians(tmp_path / f"a{suffix}").sh.shape[1] == count
+
+
+# `warpgs fit --depths --normals`: what it says, what a run keeps of it, and what continues it or scores it.
+
+VIEWS, SIZE, GIVEN_STEPS = 8, (48, 36), 8
+GIVEN_SPLIT = demo.split_spec(VIEWS)
+
+
+def write_depths(folder, factor=1.0):
+    """Write the true depth of the demo's views, but of the first, in millimetres as 16-bit PNG."""
+    for i, camera in enumerate(demo.camera_path(VIEWS, *SIZE)):
+        if i:
+            save(folder / f"{i:03d}.png", np.round(1000 * factor * exact_depth(demo.still_life(0), camera)).astype(np.uint16))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def given_folder(tmp_path_factory):
+    """A scene, its maps and a run with them."""
+    folder = tmp_path_factory.mktemp("given")
+    demo.write_demo(folder / "scene", views=VIEWS, width=SIZE[0], height=SIZE[1])
+    write_depths(folder / "depths")
+    assert main(command(folder, folder / "run", "--depths", str(folder / "depths"))) == 0
+    return folder
+
+
+def command(folder, out, *more, steps=GIVEN_STEPS):
+    flags = ["--device", "cpu", "--split", GIVEN_SPLIT, "--preset", "3dgs", "--steps", str(steps), "--sh-degree", "0"]
+    return ["fit", str(folder / "scene"), "--out", str(out), *flags, *more]
+
+
+def test_a_run_says_and_keeps_what_was_given(given_folder, capsys):
+    """Notes before the first step and after the last, figures of each view, and the settings by which the scene is read."""
+    record, metrics = (json.loads((given_folder / "run" / f).read_text()) for f in ("config.json", "metrics.json"))
+    notes = html.unescape((given_folder / "run" / "report.html").read_text())
+    assert (
+        "depth maps: 7 of 8 views, 100.0% of their pixels, metric (a unit is 0.001 for integers" in notes
+        and "given depth: used in 5 of 6 views" in notes
+    )
+    assert "median difference of rendered depth" in notes and "start: " in notes and "by given depth and sweep" in notes
+    assert record["scene"]["depths"] == str(given_folder / "depths") and record["scene"]["depth_kind"] == "metric"
+    rows = metrics["given"]["depth"]["views"]
+    assert len(rows) == 5 and all(r["coverage"] > 0.9 and 0 < r["difference"] < 0.5 for r in rows)
+    assert main(["eval", str(given_folder / "run"), "--device", "cpu"]) == 0
+
+
+def test_maps_decide_whether_a_run_continues(given_folder, tmp_path, capsys):
+    """The same maps give the same bits as an uninterrupted run; other maps are another scene."""
+    run = tmp_path / "run"
+    maps = ["--depths", str(given_folder / "depths")]
+
+    def stop(report):
+        if report.step == 5:
+            raise KeyboardInterrupt
+
+    request = SceneRequest(str(given_folder / "scene"), GIVEN_SPLIT, depths=str(given_folder / "depths"))
+    config = {"preset": "3dgs", "steps": GIVEN_STEPS, "sh_degree": 0, "device": "cpu", "verbose": False}
+    with pytest.raises(KeyboardInterrupt):
+        warpgs.fit(request, out=run, on_step=stop, **config)
+    assert main(["fit", "--out", str(run), "--resume"]) == 0
+    whole, again = (warpgs.open_run(f, "cpu").gaussians().tensors() for f in (given_folder / "run", run))
+    assert all((whole[n] == again[n]).all() for n in whole)
+    other = write_depths(tmp_path / "other", 1.01)
+    assert main(command(given_folder, run, "--depths", str(other), "--resume")) == 2
+    assert "the scene" in capsys.readouterr().err
+    assert main(command(given_folder, run, *maps, "--resume")) == 0
+    assert f"all {GIVEN_STEPS} steps are taken; only the images, scores and report are made again" in capsys.readouterr().out
+
+
+def test_a_wrong_unit_is_named_before_the_first_step(given_folder, tmp_path, capsys):
+    """With the ratio, view by view, and the flag that mends it; it mends it."""
+    out = tmp_path / "run"
+    assert main(command(given_folder, out, "--depths", str(given_folder / "depths"), "--depth-unit", "1")) == 3
+    said = capsys.readouterr().err
+    assert "no depth map can be used" in said and "times those that the views confirm" in said and "--depth-unit" in said
+    assert not (out / "metrics.jsonl").exists()
+    assert main(command(given_folder, out, "--depths", "nowhere")) == 3 and "no such folder" in capsys.readouterr().err
+
+
+def test_scenes_from_python(given_folder):
+    """`load_scene(depths=...)` and fit; a weight of 0 leaves the loss out."""
+    scene = warpgs.load_scene(given_folder / "scene", depths=given_folder / "depths")
+    fitted = warpgs.fit(scene, "3dgs", split=GIVEN_SPLIT, steps=2, device="cpu", verbose=False, loss_depth_weight=0.0)
+    assert fitted.metrics["given"] == {} and any("given depth: used in 5" in n for n in fitted.notes)
+
+
+# `warpgs priors show` as a user types it.
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    """A small demo scene."""
+    folder = tmp_path_factory.mktemp("data") / "scene"
+    write_demo(folder, views=9, width=64, height=48)
+    return folder
+
+
+@pytest.fixture
+def own_cache(tmp_path, monkeypatch):
+    """Nothing goes to the user's cache."""
+    monkeypatch.setenv("WARPGS_CACHE", str(tmp_path / "cache"))
+
+
+def show(scene, *flags):
+    return ["priors", "show", str(scene), "--split", split_spec(9), *map(str, flags)]
+
+
+@pytest.mark.usefixtures("own_cache")
+def test_a_sheet_per_training_view(scene, tmp_path, capsys):
+    """With networks: sheets, notes, and maps that are there the second time."""
+    depth = nw.depth_network(tmp_path / "d.onnx")
+    labels = nw.segmentation_network(tmp_path / "s.onnx")
+    (tmp_path / "d.onnx.json").write_text('{"size": 64}')
+    (tmp_path / "s.onnx.json").write_text('{"size": 64, "mean": [0, 0, 0], "std": [1, 1, 1]}')
+    flags = ["--depth-model", depth, "--segmentation-model", labels, "--threads", 1]
+    assert main(show(scene, "--out", tmp_path / "a", *flags)) == 0
+    text = capsys.readouterr().out
+    sheets = sorted((tmp_path / "a").glob("*.png"))
+    assert f"{len(sheets)} sheets in {tmp_path / 'a'}" in text and len(sheets) >= 3
+    assert "d.onnx (SHA-256 " in text and "assumed multiple 32, mean 0.5 0.5 0.5" in text
+    sheet = cv2.imread(str(sheets[0]))
+    assert sheet.shape[1] > 1500 and sheet.std() > 20
+    assert main(show(scene, "--out", tmp_path / "b", *flags)) == 0
+    assert f"{2 * len(sheets)} of {2 * len(sheets)} maps were read from the cache" in capsys.readouterr().out
+    for path in sheets:
+        np.testing.assert_array_equal(cv2.imread(str(tmp_path / "b" / path.name)), cv2.imread(str(path)))
+
+
+@pytest.mark.usefixtures("own_cache")
+@pytest.mark.parametrize("source", ["sweep", "flow"])
+def test_without_networks_the_notes_say_what_stands_in(scene, tmp_path, capsys, source):
+    """Depth comes from the other views, and some of it is confirmed in every one."""
+    assert main(show(scene, "--out", tmp_path / "a", "--source", source)) == 0
+    text = capsys.readouterr().out
+    assert "semantics: no network, so saliency is used as foreground" in text and "held out" not in text
+    assert "depth: from the other views, " in text and "no consistent depth" not in text
+    assert not (tmp_path / "cache").exists()
+
+
+def failure(capsys, code, *arguments):
+    """Run a command that must fail with that code and one line on stderr; returns the line."""
+    assert main(list(arguments)) == code
+    text = capsys.readouterr().err.strip()
+    assert text.startswith("warpgs: ") and "internal error" not in text and len(text.splitlines()) == 1
+    return text
+
+
+@pytest.mark.usefixtures("own_cache")
+def test_mistakes_get_one_line(scene, tmp_path, capsys):
+    """2 usage, 3 data, 4 resources."""
+    out = tmp_path / "out"
+    assert "give show or export" in failure(capsys, 2, "priors")
+    assert "give show or export" in failure(capsys, 2, "priors", "draw")
+    assert "source 'lidar' is not one of sweep, flow" in failure(capsys, 2, *show(scene, "--out", out, "--source", "lidar"))
+    assert "--threads must be a number from 0" in failure(capsys, 2, *show(scene, "--out", out, "--threads", -1))
+    assert "depth-size was removed: give it in FILE.onnx.json" in failure(
+        capsys, 2, *show(scene, "--out", out, "--depth-size", 64)
+    )
+    (tmp_path / "x.onnx").write_text("no network")
+    assert "not an ONNX model" in failure(capsys, 3, *show(scene, "--out", out, "--depth-model", tmp_path / "x.onnx"))
+    assert "cannot be read" in failure(capsys, 3, *show(scene, "--out", out, "--segmentation-model", tmp_path / "none.onnx"))
+    below = scene / "images" / "000.png" / "sheets"
+    assert "choose another folder" in failure(capsys, 4, *show(scene, "--out", below))
+    assert not out.exists() or not list(out.iterdir())
+    assert main(["priors", "--help"]) == 0 and "priors export" in capsys.readouterr().out
+
+
+# The colour behind a scene: named, chosen, shown by renders, and kept by the run folder.
+
+
+@pytest.mark.parametrize(
+    "text,color",
+    [("black", (0, 0, 0)), ("white", (1, 1, 1)), ("#ff8000", (1, 128 / 255, 0)), ("0.25,1,.5", (0.25, 1, 0.5)),
+     ("auto", None), ("mean", None), ("scene", None)],
+)  # fmt: skip
+def test_colours_by_name_and_by_number(text, color):
+    assert color_of(text) == color and FitConfig(background=text).background == text
+
+
+@pytest.mark.parametrize("text", ["", "grey", "#fff", "#gggggg", "1,1", "1,1,2", "nan,0,0", "1.5,0,0", "-0.1,0,0", "1e-1,0,0"])
+def test_what_is_no_colour_is_refused(text):
+    with pytest.raises(UsageError, match=r"is not a colour: give auto, mean, scene, black, white, #rrggbb, or r,g,b"):
+        FitConfig(background=text)
+
+
+def test_the_mean_colour_is_of_training_pixels_that_count(tmp_path):
+    """Masked pixels and held-out views have no part in it; where the preset does not ask for it the scene's colour stays."""
+    scene = load_scene(scenes.write_colmap(tmp_path))
+    first, second, *_ = scene.views
+    mask = np.zeros((12, 16), bool)
+    mask[:, :4] = True
+    train = [dataclasses.replace(first, mask=mask), second]
+    expected = np.concatenate([first.image[mask], second.image.reshape(-1, 3)]).astype(np.float64).mean(0)
+    for wish in ("auto", "mean"):
+        color, note = choose_background(wish, scene, train)
+        np.testing.assert_allclose(color, expected, atol=1e-6)
+        assert "the mean colour of the training views, #" in note
+    assert choose_background("scene", scene, train) == ((0, 0, 0), "")
+    assert choose_background("#ff0000", scene, train) == ((1, 0, 0), "background: #ff0000, #ff0000")
+    assert [n for n, c in PRESETS.items() if c.background == "auto"] == ["default", "quick"]
+
+
+def test_cut_out_objects_keep_the_background_of_the_scene(tmp_path):
+    """Whether they know their opacity or stand on black."""
+    scene = load_scene(scenes.write_blender(tmp_path))
+    color, note = choose_background("auto", scene, list(scene.views))
+    assert color == (1, 1, 1) and "#ffffff, since the views show a cut-out object" in note
+    assert choose_background("scene", scene, list(scene.views))[1] == "background: #ffffff, from the scene's files"
+    black = [dataclasses.replace(v, image=v.image * (v.alpha[..., None] > 0), alpha=None) for v in scene.views]
+    assert choose_background("auto", dataclasses.replace(scene, background=(0, 0, 0)), black)[0] == (0, 0, 0)
+
+
+def test_transparent_pixels_change_with_the_background_and_come_back(tmp_path):
+    scene = load_scene(scenes.write_blender(tmp_path))
+    half = [dataclasses.replace(v, alpha=v.alpha * np.float32(0.5), image=(v.image + 1) / 2) for v in scene.views]
+    scene = dataclasses.replace(scene, views=tuple(half))
+    other = over_background(scene, (0.0, 0.5, 1.0))
+    assert other.background == (0, 0.5, 1) and other.views[0].image.dtype == np.float32
+    np.testing.assert_allclose(other.views[0].image[0, 0], [0, 0.5, 1], atol=1e-6)
+    np.testing.assert_allclose(other.views[0].image[0, 9], scene.views[0].image[0, 9] - [0.5, 0.25, 0], atol=1e-6)
+    back = over_background(other, scene.background)
+    assert all(np.allclose(a.image, b.image, atol=1e-6) for a, b in zip(back.views, scene.views))
+    assert over_background(scene, scene.background) is scene
+
+
+def test_a_run_keeps_its_background(tmp_path, capsys):
+    """config.json holds the colour; scoring and continuing put the scene over it, and no colour makes another scene of it."""
+    scenes.write_blender(tmp_path / "scene")
+    flags = ["--init.source", "random", "--init.random-count", "20", "--preset", "3dgs", "--steps", "2", "--device", "cpu"]
+    fit = [
+        "fit",
+        str(tmp_path / "scene"),
+        "--out",
+        str(tmp_path / "run"),
+        "--split",
+        "every:8",
+        "--background",
+        "0.5,0.25,0",
+        *flags,
+    ]
+    assert main(fit) == 0
+    assert "background: 0.5,0.25,0, #804000" in capsys.readouterr().out
+    record = json.loads((tmp_path / "run" / "config.json").read_text())
+    assert record["background"] == [0.5, 0.25, 0] and record["config"]["background"] == "0.5,0.25,0"
+    assert record["fingerprint"] == load_scene(tmp_path / "scene").fingerprint
+    stored = open_run(tmp_path / "run", "cpu")
+    scene, _, test = scene_of(stored)
+    assert stored.options().background.tolist() == [0.5, 0.25, 0] and scene.background == (0.5, 0.25, 0)
+    np.testing.assert_allclose(test[0].image[0, 0], [0.5, 0.25, 0], atol=1e-6)
+    assert main(["eval", str(tmp_path / "run"), "--device", "cpu"]) == 0
+    scores = [json.loads((tmp_path / "run" / n).read_text())["test"]["psnr"] for n in ("metrics.json", "eval.json")]
+    assert scores[0] == scores[1]
+    assert main([*fit, "--resume"]) == 0
+
+
+# Runs on objects cut out: scores of opacity, transparent renders, films over a colour, and what the run folder holds.
+
+
+def view(alpha=None, mask=None):
+    """Return a gray view of 12 x 16 px with an opacity and a mask."""
+    camera = Camera(np.eye(4), np.eye(3), 16, 12)
+    return View("a.png", camera, np.full((12, 16, 3), 0.4, np.float32), mask, alpha=alpha)
+
+
+def test_scores_of_opacity_are_over_the_pixels_of_each_kind():
+    """Empty, object and edge have an error of their own; masked pixels do not count."""
+    alpha = np.zeros((12, 16), np.float32)
+    alpha[:, 4:12], alpha[:, 12:] = 1, 0.6
+    mask = np.ones((12, 16), bool)
+    mask[0] = False
+    rendered = np.where(alpha == 1, np.float32(0.9), np.float32(0.25))
+    rendered[0] = 0.5
+    image = np.full((12, 16, 3), 102 / 255, np.float32)
+    image[:, :4] += 51 / 255
+    image[0] = 0
+    m = score(view(alpha, mask), image, alpha=rendered)
+    assert m.opacity["alpha_empty"] == pytest.approx(0.25) and m.opacity["alpha_object"] == pytest.approx(0.9)
+    assert m.opacity["psnr_whole"] == pytest.approx(10 * np.log10(4 * 25)) and m.opacity["psnr_foreground"] == np.inf
+    assert score(view(), image, alpha=rendered).opacity == {} == score(view(alpha), image).opacity
+    assert set(m.opacity) == set(scores.ALPHA_VARIANTS) == set(schemas.OPACITY)
+
+
+def test_means_are_over_the_views_that_have_such_pixels():
+    whole, half = np.ones((12, 16), np.float32), np.ones((12, 16), np.float32)
+    half[:, :8] = 0
+    image = np.full((12, 16, 3), 0.5, np.float32)
+    rows = [score(view(a), image, alpha=np.full((12, 16), r, np.float32)) for a, r in ((whole, 1.0), (half, 0.5), (None, 0.1))]
+    means = summarize(rows)
+    assert means["alpha_empty"] == 0.5 and means["alpha_object"] == 0.75
+    line = score_line(means)
+    assert ", PSNR of the foreground 19.83 dB" in line and ", alpha where empty 0.500, alpha in the object 0.750" in line
+    assert "alpha" not in score_line(summarize(rows[2:]))
+
+
+def test_straight_alpha_shows_the_image_again_over_any_background():
+    rng = np.random.default_rng(0)
+    colors, alpha = rng.uniform(0, 1, (6, 7, 3)).astype(np.float32), rng.uniform(0, 1, (6, 7)).astype(np.float32)
+    alpha[0] = 0
+    over = {b: colors * alpha[..., None] + (1 - alpha[..., None]) * np.float32(b) for b in ((0, 0, 0), (1, 0.5, 0.2))}
+    for background, image in over.items():
+        made = straight_alpha(image, alpha, background)
+        assert (made[0] == 0).all()
+        np.testing.assert_allclose(made[1:, :, :3] * alpha[1:, :, None], over[0, 0, 0][1:], atol=1e-5)
+    decoded = cv2.imdecode(np.frombuffer(png(made), np.uint8), cv2.IMREAD_UNCHANGED)[..., [2, 1, 0, 3]]
+    np.testing.assert_array_equal(decoded, np.round(made * 255))
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """A short run on a Blender scene."""
+    folder = tmp_path_factory.mktemp("cut_out")
+    scenes.write_blender(folder / "scene")
+    flags = ["--init.source", "random", "--init.random-count", "60", "--preset", "3dgs", "--steps", "3", "--device", "cpu"]
+    flags += ["--split", "every:8"]
+    assert main(["fit", str(folder / "scene"), "--out", str(folder / "run"), *flags]) == 0
+    return folder / "run"
+
+
+def test_metrics_config_and_report_speak_of_opacity(run):
+    metrics, record = (json.loads((run / n).read_text()) for n in ("metrics.json", "config.json"))
+    assert set(schemas.OPACITY) <= set(metrics["test"]) & set(metrics["views"][0]) & set(metrics["variants"])
+    assert metrics["test"]["psnr"] == metrics["test"]["psnr_whole"] and record["transparent"] is True
+    schemas.METRICS(metrics, "")
+    assert "alpha where empty" in (run / "report.html").read_text()
+    assert open_run(run, "cpu").transparent
+
+
+def test_renders_are_transparent_unless_a_colour_is_named(run, tmp_path, capsys):
+    """Over the background of the fit the transparent image is the opaque one; films have the colour."""
+    stored = open_run(run, "cpu")
+    images = {}
+    for name in ("auto", "white", "#0000ff"):
+        out = tmp_path / name.strip("#")
+        assert main(["render", str(run), "--out", str(out), "--path", "views", "--device", "cpu", "--background", name]) == 0
+        file = sorted(out.rglob("*.png"))[0]
+        images[name] = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)[..., ::-1] / 255.0
+    assert [i.shape[2] for i in images.values()] == [4, 3, 3]
+    alpha, colors = images["auto"][..., :1], images["auto"][..., 1:]  # reversed: ARGB
+    for name, background in (("white", [1, 1, 1]), ("#0000ff", [0, 0, 1])):
+        np.testing.assert_allclose(alpha * colors + (1 - alpha) * background, images[name], atol=2.5 / 255)
+    assert main(["render", str(run), "--out", str(tmp_path / "x"), "--background", "mean"]) == 2
+    assert "expected auto, black, white" in capsys.readouterr().err
+    opaque = dataclasses.replace(stored, transparent=False)
+    file, film = render_path(opaque, [stored.scene_cameras[stored.train[0]]], out=tmp_path / "opaque")
+    assert cv2.imread(str(file), cv2.IMREAD_UNCHANGED).shape[2] == 3 and film.name == "film.mp4"

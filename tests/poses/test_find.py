@@ -1,4 +1,12 @@
-"""From photographs to a scene with poses; whatever does not work ends in a sentence and leaves nothing behind."""
+"""The search for poses: its parts, whole scenes from photographs, interruptions, and fits that find poses once."""
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -7,11 +15,29 @@ import pytest
 from tests.poses.conftest import film, with_exif, write_png
 from warpgs.app.cli import main
 from warpgs.errors import DataError, ResourceError, UsageError
+from warpgs.files import write_json
 from warpgs.io.load import load_scene
+from warpgs.pipeline.run import fit as module
+from warpgs.pipeline.run.fit import fit, lost_lines, with_poses
+from warpgs.pipeline.run.folder import StoredRun, run_folder
+from warpgs.pipeline.run.request import SceneRequest
 from warpgs.poses import find, mapping
 from warpgs.poses import photographs as module_of_photographs
-from warpgs.poses.find import find_poses, needs_poses
-from warpgs.poses.photographs import prepare
+from warpgs.poses.find import JSON, _check_found, advice, find_poses, needs_poses, reason, record_of, report_lines
+from warpgs.poses.mapping import Mapping
+from warpgs.poses.matching import choose_pairs, similarity
+from warpgs.poses.photographs import (
+    Photograph,
+    find_photographs,
+    folder_notes,
+    prepare,
+    sharpest,
+    without_jpeg_metadata,
+    without_png_metadata,
+    write_frames,
+)
+
+# From photographs to a scene with poses; whatever does not work ends in a sentence and leaves nothing behind.
 
 
 def test_all_photographs_get_the_poses_that_they_were_taken_from(found, still_life_views):
@@ -145,8 +171,8 @@ def test_a_video_of_one_frame(sfm, tmp_path):
 def test_pairs_are_chosen_and_copies_are_small(sfm, tmp_path, photographs, found, monkeypatch):
     """As for many and large photographs: copies of less than their size are matched; cameras are of full size."""
     monkeypatch.setattr(mapping, "EXHAUSTIVE", 5)
-    for module in (mapping, module_of_photographs):
-        monkeypatch.setattr(module, "MATCHING_SIDE", 216)
+    for room in (mapping, module_of_photographs):
+        monkeypatch.setattr(room, "MATCHING_SIDE", 216)
     record = find_poses(photographs, tmp_path / "out")
     assert all(p["registered"] for p in record["photographs"]) and record["pairs_tried"] == 15
     assert [c["width"] for c in record["cameras"]] == [c["width"] for c in found[1]["cameras"]]
@@ -183,3 +209,267 @@ def test_folders_that_need_poses(tmp_path, photographs, found):
     assert needs_poses(tmp_path / "film.MP4")
     assert needs_poses(found[0] / "images") and not needs_poses(tmp_path / "none")
     assert not needs_poses(tmp_path / ("x" * 5000))
+
+
+# Ctrl-C while the process that calls pycolmap runs.
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="there are no process groups")
+@pytest.mark.parametrize("everyone", [False, True], ids=["warpgs alone", "its group, as a terminal does"])
+def test_ctrl_c_ends_both_processes_and_leaves_nothing(sfm, tmp_path, photographs, everyone):
+    """One sentence, exit code 130, no process and no file left."""
+    # tests may run in the background, where a shell has Ctrl-C ignored and their children inherit that
+    heeding = (
+        "import signal, sys; signal.signal(2, signal.default_int_handler); from warpgs.app.cli import main; sys.exit(main())"
+    )
+    command = [sys.executable, "-c", heeding, "poses", str(photographs), "--out", str(tmp_path / "deep" / "scene")]
+    process = subprocess.Popen(
+        [*command, "--threads", "1"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
+    )
+    lines = []
+    for line in process.stdout:
+        lines.append(line)
+        if "finding features" in line:
+            break
+    (os.killpg if everyone else os.kill)(process.pid, signal.SIGINT)
+    _, errors = process.communicate(timeout=60)
+    assert (process.returncode, errors) == (130, "warpgs: interrupted\n"), lines
+    with pytest.raises(ProcessLookupError):
+        os.killpg(process.pid, 0)
+    assert not list(tmp_path.rglob("*.tmp")) and not list(tmp_path.rglob("scene"))
+
+
+# A fit of photographs without cameras: poses are found once, kept in the run folder, and found there again.
+
+
+def test_poses_are_kept_in_the_run_folder(tmp_path, photographs, found, monkeypatch):
+    """Found at first; a continued run takes them from there, and refuses other photographs."""
+    calls, said, run = [], [], tmp_path / "run"
+    run.mkdir()
+
+    def copied(source, out, **options):
+        calls.append(source)
+        assert options["matcher"] == "x.onnx"
+        shutil.copytree(found[0], out)
+        return found[1]
+
+    monkeypatch.setattr(module, "find_poses", copied)
+    shutil.copytree(photographs, tmp_path / "in")
+    request = SceneRequest(str(tmp_path / "in"), matcher="x.onnx")
+    for _ in range(2):
+        posed, notes = with_poses(request, run, said.append)
+        assert (
+            posed.path == str(run / "scene")
+            and posed.matcher is None
+            and any(n.startswith("poses found for 6 of 6") for n in notes)
+        )
+    assert calls == [tmp_path / "in"] and "has no cameras: finding the poses" in said[0]
+    (tmp_path / "in" / "0.png").write_bytes((tmp_path / "in" / "1.png").read_bytes())
+    with pytest.raises(UsageError, match="holds poses of other photographs than"):
+        with_poses(request, run, said.append)
+    for resume in (False, True):  # a fit that ended before its first step begins again either way
+        with run_folder(run, resume):
+            pass
+
+
+def test_photographs_without_a_pose_are_told_of_at_the_end(tmp_path, found):
+    scene = tmp_path / "scene"
+    scene.mkdir()
+    rows = found[1]["photographs"]
+    missing = f"2 of 6 photographs have no pose and were not used: {scene / 'poses.txt'} lists reasons and remedies"
+    for lost, said in ((0, []), (2, [missing])):
+        unposed = [p | {"registered": False, "reason": "has none"} for p in rows[:lost]]
+        write_json(scene / JSON, found[1] | {"photographs": [*unposed, *rows[lost:]]})
+        assert [line.partition(", and")[0] for line in lost_lines(tmp_path)] == said
+    assert lost_lines(None) == lost_lines(scene) == []
+
+
+def test_other_requests_stay_as_they_are(tmp_path, photographs, found):
+    for request in (SceneRequest(str(found[0])), SceneRequest(str(photographs), reader="llff"), SceneRequest("")):
+        assert with_poses(request, tmp_path, print) == (request, [])
+    with pytest.raises(UsageError, match=r"--matcher requires a folder of photographs without cameras; leave it out for"):
+        with_poses(SceneRequest(str(found[0]), matcher="x.onnx"), tmp_path, print)
+    with pytest.raises(UsageError, match="needs a run folder; give out="):
+        with_poses(SceneRequest(str(photographs)), None, print)
+
+
+def test_a_split_that_is_not_understood_is_refused_before_poses_are_found(tmp_path, photographs, monkeypatch):
+    monkeypatch.setattr(module, "find_poses", lambda *_, **__: pytest.fail("poses are found"))
+    for spec in ("every8", "every:1", "tset=0.png"):
+        with pytest.raises(UsageError, match="split"):
+            fit(SceneRequest(str(photographs), spec), out=tmp_path / "run", device="cpu", verbose=False)
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_run_that_was_moved_finds_its_scene(tmp_path, found):
+    """The record holds where the scene lay; where nothing is there any more, the run's own scene is read."""
+    options = {"path": str(tmp_path / "gone" / "scene"), "downscale": 2}
+    run = SimpleNamespace(folder=tmp_path, record={"scene": options})
+    assert StoredRun.scene_request(run).path == options["path"]
+    (tmp_path / "scene").mkdir()
+    shutil.copy(found[0] / "poses.json", tmp_path / "scene")
+    assert StoredRun.scene_request(run) == SceneRequest(str(tmp_path / "scene"), downscale=2)
+
+
+# Parts of the search for poses that need no pycolmap: pairs, metadata, frames of a video, advice.
+
+
+def descriptors(places: int, each: int, seed: int = 0) -> list[np.ndarray]:
+    """Descriptors of photographs of some places in turn: those of one place share most of theirs."""
+    generator = np.random.default_rng(seed)
+    kinds = generator.integers(0, 256, (places, 60, 128), np.uint8)
+    noisy = [
+        np.clip(kinds[i % places] + generator.normal(0, 5, (60, 128)), 0, 255).astype(np.uint8) for i in range(places * each)
+    ]
+    return [*noisy, np.zeros((0, 128), np.uint8)]
+
+
+def test_photographs_of_one_place_look_alike():
+    alike = similarity(descriptors(4, 3))
+    assert alike[0, 4] > 0.7 > 0.4 > alike[0, 1] and not alike[-1].any()
+
+
+def test_pairs_are_neighbours_and_lookalikes():
+    """Of 26 photographs of 25 places not all pairs, but those of one place, and neighbours in order; the same each time."""
+    found = descriptors(25, 2)
+    pairs = choose_pairs(found, "video")
+    assert {(i, i + 25) for i in range(25)} <= set(pairs) and {(i, i + 1) for i in range(50)} <= set(pairs)
+    assert len(pairs) < 51 * 50 / 2 * 0.7 and pairs == sorted(pairs) == choose_pairs(found, "video")
+    assert choose_pairs([np.zeros((0, 128), np.uint8)] * 3, "photographs") == [(0, 1), (0, 2), (1, 2)]
+
+
+@pytest.mark.parametrize("progressive", [0, 1])
+def test_a_jpeg_without_its_metadata_has_the_same_pixels(progressive):
+    image = np.random.default_rng(0).integers(0, 255, (40, 56, 3), np.uint8)
+    coded = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_PROGRESSIVE, progressive])[1].tobytes()
+    exif = with_exif(image, 1)
+    at = exif.index(b"\xff\xe1")
+    block = exif[at : at + 2 + int.from_bytes(exif[at + 2 : at + 4], "big")]
+    bare = without_jpeg_metadata(coded[:2] + block + coded[2:] + b"a film follows \xff\xd9")
+    assert b"Jane" in block and bare == coded
+
+
+def test_a_png_without_its_metadata_has_the_same_pixels():
+    coded = cv2.imencode(".png", np.arange(300, dtype=np.uint16).reshape(10, 30))[1].tobytes()
+    text = b"\0\0\0\4tEXtJane\0\0\0\0"
+    assert without_png_metadata(coded[:33] + text + coded[33:] + b"more") == coded
+
+
+def test_what_exif_says_of_the_lens(tmp_path):
+    """The equivalent focal length is by the diagonal: 34 mm of 43.3 on 4:3 is 0.98 longer sides; the size is that upright."""
+    (tmp_path / "a.jpg").write_bytes(with_exif(np.zeros((80, 60, 3), np.uint8), 8))
+    p = prepare(tmp_path / "a.jpg", tmp_path, tmp_path / "small.png")
+    assert (p.width, p.height, p.orientation, p.device) == (80, 60, 8, "ACME Phone 7 34 mm")
+    assert p.focal == pytest.approx(34 / np.hypot(36, 24) * 100 / 80)
+    assert cv2.imread(str(tmp_path / "small.png")).shape == (60, 80, 3)
+
+
+def test_masks_are_no_photographs(tmp_path):
+    for name in ("images/a.png", "images/masks/a.png", "b.png", "masks/a.png"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).touch()
+    assert [p.name for p in find_photographs(tmp_path)] == ["a.png"]
+
+
+def test_images_of_earlier_runs_are_no_photographs(tmp_path):
+    """A run below the photographs is left out with all below it, also one that holds found poses alone; both are named."""
+    names = ("a.png", "b/c.png", "b/run/renders/d.png", "b/run/path-auto/0000.png", "b/run/e.png", "posed/scene/images/f.png")
+    others = ("g/h.png", "b/run/config.json", "b/run/metrics.jsonl", "posed/scene/poses.json", "g/config.json")
+    for name in (*names, *others):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).touch()
+    assert [p.relative_to(tmp_path).as_posix() for p in find_photographs(tmp_path)] == ["a.png", "b/c.png", "g/h.png"]
+    assert folder_notes(tmp_path) == [
+        "skipped as earlier runs: b/run, posed", "photographs by folder: 1 in the folder itself, 1 in b, 1 in g"
+    ]  # fmt: skip
+
+
+def test_one_folder_of_photographs_needs_no_notes(tmp_path):
+    for name in ("images/a.png", "images/b.png", "c.png"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).touch()
+    assert folder_notes(tmp_path) == []
+
+
+def test_frames_of_a_video_are_sharp_and_evenly_spaced(tmp_path):
+    film(tmp_path / "a.avi", 12)
+    (tmp_path / "frames").mkdir()
+    assert write_frames(tmp_path / "a.avi", tmp_path / "frames", 4, lambda line: None) == 12
+    assert sorted(p.name for p in (tmp_path / "frames").iterdir()) == [f"frame_{i:06d}.png" for i in (1, 4, 7, 10)]
+    assert sharpest([3.0, 1.0], 5) == [0, 1] and sharpest([1.0, 1.0, 2.0, 2.0], 2) == [0, 2]
+
+
+def test_videos_that_cannot_work(tmp_path):
+    (tmp_path / "a.mp4").write_bytes(b"no video" * 100)
+    with pytest.raises(DataError, match="cannot read it as a video"):
+        write_frames(tmp_path / "a.mp4", tmp_path, 3, lambda line: None)
+
+
+def found_mapping(**values) -> Mapping:
+    """Three photographs in one model, 50 degrees apart at the end, and two that are lost."""
+    angles = np.radians([0, 10, 60])
+    turns = [np.array([[np.cos(a), 0, -np.sin(a)], [0, 1, 0], [np.sin(a), 0, np.cos(a)]]) for a in angles]
+    views = {i: (r, 100) for i, r in enumerate(turns)}
+    given = {
+        "keypoints": (900, 800, 700, 600, 12), "matches": {(0, 1): 200, (1, 2): 40, (2, 3): 9}, "tried": 10, "views": views,
+        "cameras": ({"focal": 300, "distortion": 0, "width": 320, "height": 240},), "groups": ((0, 1, 2),), "points": 50,
+        "error": 0.4,
+        "method": "incremental", "version": "4",
+    }  # fmt: skip
+    return Mapping(**(given | values))
+
+
+def test_too_few_that_fit_together_are_told_with_their_links():
+    """The pairs that do match, once each, and who matches nobody."""
+    photographs = [Photograph(f"{n}.png", Path(n), 320, 240, 1, "", None, "0") for n in "abcde"]
+    found = found_mapping(views={}, keypoints=(900,) * 5, matches={(0, 1): 525, (2, 3): 292})
+    with pytest.raises(
+        DataError, match=r"e\.png matches no other; c\.png and d\.png share 292 matches; a\.png and b\.png share 525"
+    ):
+        _check_found(Path("in"), found, photographs)
+
+
+@pytest.mark.parametrize(("focal", "count", "said"), [(None, 5, True), (None, 6, False), (0.8, 5, False)])
+def test_a_record_says_that_few_photographs_do_not_tell_the_focal_length(focal, count, said):
+    """Where EXIF does not tell it, up to five of them."""
+    view = found_mapping().views[0]
+    photographs = [Photograph(f"{n}.png", Path(str(n)), 320, 240, 1, "", focal, "0") for n in range(count)]
+    found = found_mapping(views=dict.fromkeys(range(count), view), keypoints=(900,) * count, matches={(0, 1): 200})
+    notes = record_of(found, photographs, "0", [])["notes"]
+    assert any(f"An estimate from {count} photographs is often 5 % off" in n for n in notes) is said
+
+
+def test_a_record_says_what_does_not_repeat_and_who_has_no_pose():
+    """Its lines name the photographs without a pose, why, and what to do."""
+    photographs = [Photograph(f"{n}.png", Path(n), 320, 240, 1, "", None, "0") for n in "abcde"]
+    assert not any("run to run" in n for n in record_of(found_mapping(), photographs, "0", [])["notes"])
+    record = record_of(found_mapping(method="global"), photographs, "0", ["a note"])
+    assert record["notes"][0] == "a note" and record["notes"][-1].endswith("from run to run")
+    lines = report_lines(record)
+    assert "poses found for 3 of 5 photographs" in lines[1] and "What to photograph next:" in lines
+    assert lines[8].startswith("d.png  NO POSE: it has 600 keypoints and 9 matches with c.png")
+
+
+def test_reasons_and_advice():
+    """Blank and lost photographs first, then wide gaps, then weak links; nothing where all is well."""
+    names = ["a", "b", "c", "d", "e"]
+    assert (
+        reason(found_mapping(), 3, names) == "has 600 keypoints and 9 matches with c, too few of them at places of known depth"
+    )
+    assert reason(found_mapping(), 4, names).startswith("has 12 keypoints, too few to match")
+    said = advice(found_mapping(), names)
+    assert [
+        "between d and c" in said[0],
+        "take e again" in said[1],
+        "between b and c, whose axes differ by 50 degrees" in said[2],
+    ] == [True] * 3
+    assert said[3] == "take a photograph between c and b, which share only 40 matches" and len(said) == 4
+    well = found_mapping(keypoints=(900, 800), matches={(0, 1): 200}, views=dict(list(found_mapping().views.items())[:2]))
+    assert advice(well, ["a", "b"]) == []
+    assert "matches no other" in reason(found_mapping(matches={}), 3, names)
+
+
+def test_a_record_without_photographs_has_lines():
+    """Records are files that anybody may have changed."""
+    record = {"notes": ["a note"], "photographs": [], "advice": []}
+    assert report_lines(record)[0] == "a note"

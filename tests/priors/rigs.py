@@ -1,6 +1,7 @@
-"""Views whose depth is known exactly: of the demo scene, ray cast."""
+"""Rigs of cameras before a still life with exact depth, and files of flow."""
 
 import functools
+from pathlib import Path
 
 import numpy as np
 
@@ -8,6 +9,8 @@ from warpgs.geometry import look_at
 from warpgs.priors.flow import pixel_grid
 from warpgs.scene import Camera, View
 from warpgs.synthetic import demo, raycast
+
+# Views whose depth is known exactly: of the demo scene, ray cast.
 
 SIZE = (160, 120)
 
@@ -40,3 +43,13 @@ def rig(count: int = 3) -> list[Camera]:
         K = np.array([[70 + 5 * i, 0, 31.2], [0, 73 - 2 * i, 22.9], [0, 0, 1.0]])
         cameras.append(Camera(look_at(center, 0.1 * generator.standard_normal(3), np.array([0.1, -1, 0])), K, 64, 48))
     return cameras
+
+
+# Flow files as other programs write them.
+
+
+def write_flo(path: Path, flow: np.ndarray) -> None:
+    """Write flow [H, W, 2] in the format of Baker et al. 2011 (vision.middlebury.edu/flow); NaN becomes 1e10, unknown."""
+    height, width = flow.shape[:2]
+    values = np.where(np.isfinite(flow).all(2, keepdims=True), flow, 1e10)
+    path.write_bytes(b"PIEH" + np.array([width, height], "<i4").tobytes() + values.astype("<f4").tobytes())

@@ -1,10 +1,12 @@
-"""Compositing by a plain loop over Gaussians sorted by depth, dense over pixels, float64, with the cut-offs of a rule."""
+"""Compositing as a plain loop over Gaussians, and as a product of matrices."""
 
 import math
 
 import torch
 
 from warpgs.constants import SMALLEST_WEIGHT
+
+# Compositing by a plain loop over Gaussians sorted by depth, dense over pixels, float64, with the cut-offs of a rule.
 
 
 def blend_reference(means, covs, opacities, colors, depths, background, width, height, rule, keep=None, tile_size=16):
@@ -54,3 +56,15 @@ def _square(mean, cov, grid, sigma, tile_size):
             tile = (slice(y, y + tile_size), slice(x, x + tile_size))
             result[tile] = inside[tile].any()
     return result
+
+
+# Any number of channels as one product: blending weights [P, N] times channels [N, D], and what is left of the
+# background.
+
+
+def blend_channels_reference(means, covs, opacities, colors, depths, background, width, height, rule):
+    """One camera: image [H, W, D], alpha [H, W], depth [H, W]; inputs [N, ...], colors [N, D], background [D]."""
+    black, none = colors.new_zeros(len(means), 3), background.new_zeros(3)
+    _, alpha, depth, weights = blend_reference(means, covs, opacities, black, depths, none, width, height, rule)
+    product = weights.flatten(1).T @ colors
+    return product.view(height, width, -1) + (1 - weights.sum(0))[..., None] * background, alpha, depth

@@ -2,7 +2,7 @@
 
 import torch
 
-from tests.reference.sh_polynomials import colors_reference
+from tests.reference.sh import colors_reference
 
 
 def product(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:

@@ -1,19 +1,26 @@
-"""The public op: shapes, gradients through everything, options, and errors."""
+"""The public op: shapes, gradients through everything, options, errors, antialiasing, near and far plane."""
 
 import dataclasses
 import functools
+import math
 
 import numpy as np
 import pytest
 import torch
 
 import warpgs
-from tests.gaussians import SMOOTH, camera, cloud, hand_placed, leaves
+from tests.gaussians import LENSES, SMOOTH, camera, cloud, hand_placed, leaves, lens_camera
+from tests.reference.blend import blend_reference
+from tests.reference.project import project_reference
 from tests.scenes import ring, three_gaussians
+from tests.tolerances import close
+from warpgs.constants import ALPHA_CUT, FAR, RULES
 from warpgs.errors import ResourceError, UsageError
 from warpgs.render.options import RasterizeOptions
 from warpgs.render.rasterize import rasterize
 from warpgs.scene import ActivatedGaussians, Camera, CovarianceGaussians, Gaussians
+
+# The public op: shapes, gradients through everything, options, and errors.
 
 
 def test_public_names_load_on_use():
@@ -255,3 +262,199 @@ def test_a_pose_that_scales_or_shears_is_refused():
     eye[0, 0] = -1
     mirrored = rasterize(gaussians, dataclasses.replace(cam, viewmat=eye @ rotation, K=K)).rgb
     assert torch.allclose(mirrored.flip(1), rasterize(gaussians, cam).rgb, atol=1e-5)
+
+
+# Antialiasing: opacities times sqrt(det(cov2d) / det(cov2d + low_pass I)), the 2D filter of Mip-Splatting.
+
+ANTIALIASED = RasterizeOptions(antialiased=True)
+
+
+def small(dtype=torch.float64, device="cpu"):
+    """Six Gaussians with axes from 0.2 to 1 px, as leaves."""
+    g = hand_placed(dtype, device)
+    return leaves(Gaussians(**{**g.tensors(), "log_scales": g.log_scales - 2}))
+
+
+def reference(tensors, cam, rule):
+    """Opacities [C, N] with the factor from determinants of matrices, and the images of each camera."""
+    means, covs, colors, depths, opacities = project_reference(
+        *tensors, width=cam.width, height=cam.height, degree=3, low_pass=rule.low_pass
+    )
+    bare = covs - rule.low_pass * torch.eye(2, dtype=covs.dtype)
+    opacities = opacities * torch.sqrt(torch.linalg.det(bare) / torch.linalg.det(covs))
+    background, size = torch.zeros(3, dtype=covs.dtype), (cam.width, cam.height)
+    found = [blend_reference(*p, background, *size, rule) for p in zip(means, covs, opacities, colors, depths)]
+    return opacities, [torch.stack(t) for t in zip(*found)][:3]
+
+
+@pytest.mark.parametrize("rule", [SMOOTH, RULES["exact"]], ids=lambda rule: rule.name)
+def test_opacities_images_and_gradients_equal_reference(device, dtype, rule):
+    """By matrices and autograd in float64: Gaussians, poses and intrinsics."""
+    gaussians, cam = small(dtype, device), camera(cameras=2, dtype=dtype, device=device)
+    views, Ks = cam.viewmat.clone().requires_grad_(), cam.K.clone().requires_grad_()
+    r = rasterize(gaussians, dataclasses.replace(cam, viewmat=views, K=Ks), dataclasses.replace(ANTIALIASED, rule=rule))
+    own = [*gaussians.tensors().values(), views, Ks]
+    other = [t.detach().cpu().double().requires_grad_() for t in own]
+    opacities, images = reference(other, cam, rule)
+    assert bool((opacities < 0.5 * torch.sigmoid(other[3])).any())  # the factor matters
+    seen = r.visible.cpu()
+    close("projection", r.projected[..., 5].cpu()[seen], opacities[seen])
+    found = (r.rgb, r.alpha, r.depth)
+    for a, b in zip(found, images):
+        close("image", a, b)
+    upstream = [torch.randn(b.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64) for b in images]
+    sum((a * v.to(a)).sum() for a, v in zip(found, upstream)).backward()
+    sum((b * v).sum() for b, v in zip(images, upstream)).backward()
+    other[6].grad[:, 0, 1] = other[6].grad[:, 1, 0] = 0
+    for a, b in zip(own, other):
+        close("gradient", a.grad, b.grad)
+
+
+def spots(sigmas, dtype=torch.float32, device="cpu"):
+    """Gaussians at the centre of pixel (16, 16), one for each row of standard deviations [N, 3] in px."""
+    sigmas = torch.as_tensor(sigmas, dtype=torch.float64)
+    n = len(sigmas)
+    tensors = {
+        "means": torch.tensor([[0.05, 0.05, 10.0]]).expand(n, 3), "quats": torch.tensor([[1.0, 0, 0, 0]]).expand(n, 4),
+        "log_scales": torch.log(sigmas / 10), "logit_opacities": torch.zeros(n), "sh": torch.zeros(n, 1, 3),
+    }  # fmt: skip
+    K = torch.tensor([[100.0, 0, 16], [0, 100, 16], [0, 0, 1]], dtype=dtype, device=device)
+    cam = Camera(torch.eye(4, dtype=dtype, device=device), K, 32, 32)
+    return Gaussians(**{k: t.to(device, dtype).contiguous().requires_grad_() for k, t in tensors.items()}), cam
+
+
+def test_the_total_is_that_of_the_gaussian_at_any_size(device, dtype):
+    """Alphas sum to opacity x 2 pi sigma^2 from a hundredth of a pixel on; without the option small ones are too bright."""
+    for sigma in (0.01, 0.1, 0.5, 2.0):
+        g, cam = spots([[sigma] * 3], dtype, device)
+        totals = [
+            float(rasterize(g, cam, RasterizeOptions(rule=SMOOTH, antialiased=a)).alpha.detach().sum()) / (math.pi * sigma**2)
+            for a in (True, False)
+        ]  # alpha sums, over those of one Gaussian at opacity 1/2
+        # Pixels sample a Gaussian of variance v >= 0.3: their sum is off by at most 2 exp(-2 pi^2 v) = 0.54 % an axis
+        assert abs(totals[0] - 1) < 0.012
+        assert totals[1] == pytest.approx(1 + 0.3 / sigma**2, rel=0.012)
+
+
+def test_tiles_follow_from_the_reduced_opacity(device):
+    """A Gaussian below the cut is culled, and one just above it gets the box of that opacity."""
+    sigma = math.sqrt(0.3 / (0.5 / ALPHA_CUT - 1))  # sigma^2 / (sigma^2 + 0.3) times 1/2 is the cut
+    g, cam = spots([[0.99 * sigma] * 3, [1.01 * sigma] * 3], device=device)
+    r = rasterize(g, cam, ANTIALIASED)
+    assert r.visible[0].tolist() == [False, True] and r.tile_counts[0].tolist() == [0, 1]
+    half_widths = [float(found.projected[0, 1, 10].detach()) for found in (r, rasterize(g, cam))]
+    assert half_widths[0] < 0.2 < 1 < half_widths[1]
+    assert float(r.alpha.detach().max()) >= ALPHA_CUT
+
+
+def test_float32_keeps_the_digits_of_needles(device):
+    """Axes from 1e-4 to 1e4 px in any direction: opacity and gradients beside float64."""
+    generator = torch.Generator().manual_seed(5)
+    sigmas = 10 ** (8 * torch.rand(400, 3, generator=generator, dtype=torch.float64) - 4)
+    turns = torch.randn(400, 4, generator=generator, dtype=torch.float64)
+    found = []
+    for dtype in (torch.float32, torch.float64):
+        g, cam = spots(sigmas.float().double(), dtype, device)
+        with torch.no_grad():
+            g.log_scales.copy_(g.log_scales.float())
+            g.quats.copy_(turns.float())
+        r = rasterize(g, cam, dataclasses.replace(ANTIALIASED, rule=SMOOTH))
+        r.projected[..., 5].sum().backward()
+        found.append((r.projected[0, :, 5].detach(), g.log_scales.grad, g.quats.grad))
+    for name, a, b in zip(("opacity", "log_scales", "quats"), *found):
+        assert float((a - b).norm() / b.norm()) < 1e-5, name  # measured: 1e-7, 3e-7, 2e-6
+
+
+@pytest.mark.parametrize("low_pass", [0.3, 0.0])
+def test_extremes_are_finite(device, dtype, low_pass):
+    """Points, lines, discs seen from the edge, needles up to 1e20 px: finite images and gradients; no area, no brightness."""
+    sizes = (0.0, 1e-30, 1e-12, 1e-3, 1.0, 1e3, 1e9, 1e20)
+    g, cam = spots([(a, b, c) for a in sizes for b in sizes for c in (0.0, 1.0, 1e9)], dtype, device)
+    for rule in (SMOOTH, RULES["exact"]):
+        r = rasterize(g, cam, RasterizeOptions(rule=dataclasses.replace(rule, low_pass=low_pass), antialiased=True))
+        opacity = r.projected[0, :, 5].detach()
+        assert bool((opacity <= 0.5).all()) and bool(r.visible.any())
+        (r.rgb.square().sum() + r.alpha.square().sum() + r.depth.sum()).backward()
+        assert all(bool(torch.isfinite(t).all()) for t in (r.rgb, r.alpha, r.depth))
+        assert all(bool(torch.isfinite(t.grad).all()) for t in g.tensors().values())
+    flat = (g.log_scales[:, :2] == -math.inf).any(1) & (g.log_scales[:, 2] == -math.inf)
+    assert not bool(r.visible[0, flat.to(r.visible.device)].any())
+    if low_pass == 0:  # nothing is added, so nothing is taken back
+        plain = rasterize(g, cam, RasterizeOptions(rule=dataclasses.replace(RULES["exact"], low_pass=0.0)))
+        assert torch.equal(plain.visible, r.visible)
+        close("projection", opacity, plain.projected[0, :, 5])
+
+
+# Near and far plane: Gaussians outside are not there, on every way to render (graphed calls: `test_graphed.py`).
+
+PLANES = {"near": 3.5, "far": 4.5}
+"""Depths between which about half of `cloud` lies, whose depths are 3 to 5 u."""
+PATHS = {
+    "whole": {}, "chunked": {"max_instances": 50}, "window": {"window": (16, 0, 16, 48)}, "capacity": {"capacity": 100_000},
+    "channels": {"features": torch.ones(200, 5)}, "rule": {"rule": dataclasses.replace(RULES["exact"], name="own", **PLANES)},
+}  # fmt: skip
+"""Ways to render, by their options."""
+
+
+def cast(options: dict, dtype, device) -> dict:
+    return {n: v.to(device, dtype) if isinstance(v, torch.Tensor) else v for n, v in options.items()}
+
+
+@pytest.mark.parametrize("path", PATHS)
+def test_gaussians_outside_are_not_there(path, device, dtype):
+    """To the bit, the images and gradients are those without them, whose gradients are zero."""
+    cam, planes = camera(64, 48, dtype=dtype, device=device), {} if path == "rule" else PLANES
+    g = cloud(200, dtype, device)
+    inside = (g.means[:, 2] >= PLANES["near"]) & (g.means[:, 2] <= PLANES["far"])
+    assert 50 < int(inside.sum()) < 150
+    some = type(g)(**{n: t[inside] for n, t in g.tensors().items()})
+    options = cast(PATHS[path], dtype, device)
+    found, expected = leaves(g), leaves(some)
+    rendered = rasterize(found, cam, RasterizeOptions(**options, **planes))
+    alone = rasterize(
+        expected,
+        cam,
+        RasterizeOptions(**{n: v[inside] if n == "features" else v for n, v in options.items()} | {"rule": "exact"}),
+    )
+    assert torch.equal(rendered.rgb, alone.rgb) and torch.equal(rendered.depth, alone.depth)
+    assert float(rendered.alpha.detach().max()) > 0.5
+    for r in (rendered, alone):
+        (r.rgb.square().sum() + r.depth.sum()).backward()
+    for name, tensor in found.tensors().items():
+        assert torch.equal(tensor.grad[inside], expected.tensors()[name].grad)
+        assert not bool(tensor.grad[~inside].any())
+
+
+@pytest.mark.parametrize("model", LENSES)
+def test_the_depth_of_a_lens(model, dtype, device):
+    """Along the z axis, or the distance from a fisheye."""
+    g, cam = cloud(200, dtype, device), lens_camera(model, width=64, height=48, dtype=dtype, device=device)
+    depths = g.means.norm(dim=1) if model == "fisheye" else g.means[:, 2]
+    inside = (depths >= PLANES["near"]) & (depths <= PLANES["far"])
+    seen = rasterize(g, cam).tile_counts[0] > 0
+    assert bool((seen & ~inside).any()) and bool((seen & inside).any())
+    assert torch.equal(rasterize(g, cam, RasterizeOptions(**PLANES)).tile_counts[0] > 0, seen & inside)
+
+
+def test_planes_are_inclusive(device, dtype):
+    """A mean on a plane is rendered, one float beyond is not."""
+    g, cam = cloud(6, dtype, device), camera(dtype=dtype, device=device)
+    near, far = (torch.tensor(p, dtype=dtype) for p in PLANES.values())
+    inf = torch.tensor(math.inf, dtype=dtype)
+    depths = [torch.nextafter(p, side) if side else p for p in (near, far) for side in (-inf, None, inf)]
+    g.means[:] = torch.stack([torch.zeros(6, dtype=dtype), torch.zeros(6, dtype=dtype), torch.stack(depths)], 1)
+    counts = rasterize(g, cam, RasterizeOptions(**PLANES)).tile_counts[0]
+    assert (counts > 0).tolist() == [False, True, True, True, True, False]
+
+
+@pytest.mark.parametrize(
+    "planes",
+    [(2.0, 1.0), (1.0, 1.0), (-1.0, None), (math.nan, None), (None, math.nan), (None, math.inf), (None, 0.001), (1.0, 2 * FAR)],
+)
+def test_planes_that_bound_nothing_are_refused(planes):
+    """By a message with both values and the range, wherever they come from."""
+    near, far = planes
+    own = dataclasses.replace(RULES["exact"], **{n: v for n, v in zip(("near", "far"), planes) if v is not None})
+    for options in ({"near": near, "far": far}, {"rule": own}):
+        with pytest.raises(ValueError, match=r"near .* and far .*: give 0 <= near < far <= 1e\+10"):
+            RasterizeOptions(**options)

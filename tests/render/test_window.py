@@ -1,4 +1,4 @@
-"""A window is the crop of the whole image, to the bit, and windows rendered one by one add up to it."""
+"""Windows and lists of pixels: the bits of the whole image there, and its gradients."""
 
 import dataclasses
 
@@ -8,10 +8,14 @@ import torch
 from tests.gaussians import camera, cloud, leaves
 from warpgs.constants import RULES
 from warpgs.errors import UsageError
+from warpgs.kernels import tiles
+from warpgs.render import compose
 from warpgs.render.chunked import chunks
 from warpgs.render.compose import inputs_of, pass_of
 from warpgs.render.options import RasterizeOptions
 from warpgs.render.rasterize import rasterize
+
+# A window is the crop of the whole image, to the bit, and windows rendered one by one add up to it.
 
 SIZE = (75, 53)  # no multiple of a tile
 WINDOWS = [(0, 0, 75, 53), (0, 16, 75, 16), (32, 0, 16, 53), (16, 32, 59, 21), (64, 48, 11, 5), (48, 16, 16, 32)]
@@ -115,3 +119,130 @@ def test_windows_off_the_tiles_are_refused(window):
     gaussians, cam, _ = scene(torch.float32, "cpu")
     with pytest.raises(UsageError, match=r"window .* multiples of 16"):
         rasterize(gaussians, cam, RasterizeOptions(window=window))
+
+
+# A list of pixels: the bits of the whole image there, its gradients, and no tile without one.
+
+MAPS = ("rgb", "alpha", "depth", "median_depth", "features", "heaviest_ids", "heaviest_weights", "blend_counts")
+
+
+def pixels_scene(device, dtype=torch.float32, cameras=2):
+    """Gaussians and a batch of cameras, with everything that one can render of them."""
+    gaussians, cam = cloud(300, dtype, device), camera(*SIZE, cameras=cameras, dtype=dtype, device=device)
+    features = torch.randn(300, 5, dtype=dtype, generator=torch.Generator().manual_seed(1)).to(device)
+    options = RasterizeOptions(
+        features=features, median_depth=True, heaviest=3, background=torch.tensor([0.1, 0.5, 0.9])
+    )  # fmt: skip
+    return gaussians, cam, options
+
+
+def some(count, seed, low=(0, 0), high=SIZE):
+    generator = torch.Generator().manual_seed(seed)
+    return torch.stack([torch.randint(a, b, (count,), generator=generator) for a, b in zip(low, high, strict=True)], 1)
+
+
+@pytest.mark.parametrize("low,high", [((0, 0), SIZE), ((20, 17), (44, 30)), ((74, 52), SIZE)], ids=["all", "part", "corner"])
+@pytest.mark.parametrize("how", [{}, {"tile_size": 8}, {"max_instances": 100}], ids=["", "8", "chunked"])
+def test_they_have_the_bits_of_the_image(device, dtype, low, high, how):
+    """Every map, for pixels of all cameras and of each its own, some of them twice, and for a single camera."""
+    gaussians, cam, options = pixels_scene(device, dtype)
+    whole = rasterize(gaussians, cam, options)
+    shared, own = some(9, 1, low, high), torch.stack([some(9, 2, low, high), some(9, 3, low, high)])
+    for pixels in (shared, own.int()):
+        found = rasterize(gaussians, cam, dataclasses.replace(options, pixels=pixels.to(device), **how))
+        x, y = (pixels.expand(2, 9, 2)[..., i].long().to(device) for i in range(2))
+        of = torch.arange(2, device=device)[:, None]
+        for name in MAPS:
+            image = getattr(whole, name)
+            assert (getattr(found, name) is None) == (image is None)
+            assert image is None or torch.equal(getattr(found, name), image[of, y, x]), name
+    single = dataclasses.replace(cam, viewmat=cam.viewmat[1], K=cam.K[1])
+    found = rasterize(gaussians, single, dataclasses.replace(options, pixels=shared, **how))
+    assert found.rgb.shape == (9, 3) and found.alpha.shape == (9,)
+    bounded = dataclasses.replace(options, pixels=shared, error_bound=True, **how)
+    assert rasterize(gaussians, single, bounded).error_bound.shape == (9,)
+    assert torch.equal(found.rgb, whole.rgb[1][shared[:, 1], shared[:, 0]])
+
+
+@pytest.mark.parametrize("how", [{}, {"max_instances": 100}, {"colors": True}], ids=["", "chunked", "channels"])
+def test_gradients_are_those_of_the_image(device, how):
+    """To the bit, of Gaussians, pose, K, background and channels, also where a pixel comes twice."""
+    gaussians, cam, options = pixels_scene(device)
+    options = dataclasses.replace(options, heaviest=0, **{k: v for k, v in how.items() if k != "colors"})
+    if "colors" in how:
+        options = dataclasses.replace(options, colors=options.features[:, :4], background=None)
+    pixels = torch.cat([some(40, 4), some(3, 4)]).to(device)
+    weight = torch.randn(2, 43, generator=torch.Generator().manual_seed(5)).to(device)
+
+    def gradients(make):
+        leaves = [t.detach().clone().requires_grad_() for t in (*gaussians.tensors().values(), cam.viewmat, cam.K)]
+        own = type(gaussians)(*leaves[:5])
+        r = make(own, dataclasses.replace(cam, viewmat=leaves[5], K=leaves[6]))
+        ((r.rgb.square().sum(-1) + r.alpha + 0.1 * r.depth + r.features.sum(-1)) * weight).sum().backward()
+        return [t.grad for t in leaves if t.grad is not None]
+
+    def listed(g, c):
+        return rasterize(g, c, dataclasses.replace(options, pixels=pixels))
+
+    def whole(g, c):
+        r = rasterize(g, c, options)
+        x, y = pixels.T
+        return dataclasses.replace(r, **{n: getattr(r, n)[:, y, x] for n in ("rgb", "alpha", "depth", "features")})
+
+    pairs = list(zip(gradients(listed), gradients(whole), strict=True))
+    assert len(pairs) >= 6 and any(bool(a.any()) for a, _ in pairs)
+    for a, b in pairs:
+        if device.type == "cpu" and "max_instances" not in how:
+            assert torch.equal(a, b)
+        assert torch.allclose(a, b, rtol=1e-4, atol=1e-5 * float(b.abs().max()))
+
+
+def test_tiles_without_a_pixel_are_empty(device, monkeypatch):
+    """Of the tiles around two far pixels, those two alone have Gaussians."""
+    gaussians, cam, _ = pixels_scene(device, cameras=1)
+    made = []
+
+    def bin_tiles(*arguments, **named):
+        made.append(tiles.bin_tiles(*arguments, **named))
+        return made[-1]
+
+    monkeypatch.setattr(compose, "bin_tiles", bin_tiles)
+    pixels = torch.tensor([[20, 20], [60, 20]], device=device)
+    r = rasterize(gaussians, cam, RasterizeOptions(pixels=pixels))
+    lengths = made[0].ranges.diff(dim=1).flatten().tolist()
+    assert len(lengths) == 3 and lengths[1] == 0 and lengths[0] > 0 and lengths[2] > 0
+    assert int(r.tile_counts.sum()) > sum(lengths), "the window is what is projected"
+
+
+def test_no_pixel_at_all(device):
+    """Images of no pixel, and gradients of zero."""
+    gaussians, cam, options = pixels_scene(device)
+    gaussians.means.requires_grad_()
+    r = rasterize(gaussians, cam, dataclasses.replace(options, pixels=torch.zeros(0, 2, dtype=torch.int64)))
+    assert r.rgb.shape == (2, 0, 3) and r.heaviest_ids.shape == (2, 0, 3)
+    r.rgb.sum().backward()
+    assert not bool(gaussians.means.grad.any())
+
+
+@pytest.mark.parametrize(
+    ("pixels", "kind", "match"),
+    [
+        (torch.zeros(3, 2), TypeError, "whole numbers"), ([[1, 2]], TypeError, "whole numbers"),
+        (torch.zeros(3, 3, dtype=torch.int64), ValueError, r"\[P, 2\] or \[2, P, 2\]"),
+        (torch.zeros(3, 4, 2, dtype=torch.int64), ValueError, r"\[P, 2\] or \[2, P, 2\]"),
+        (torch.tensor([[75, 0]]), ValueError, "beyond the image of 75 x 53"), (torch.tensor([[0, -1]]), ValueError, "beyond"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_is_refused(pixels, kind, match):
+    """Other types and shapes, pixels outside, and options that do not go with a list."""
+    gaussians, cam, _ = pixels_scene(torch.device("cpu"))
+    with pytest.raises(kind, match=match):
+        rasterize(gaussians, cam, RasterizeOptions(pixels=pixels))
+
+
+def test_coefficients_that_require_gradients_are_refused():
+    """An error instead of a gradient that is missing."""
+    gaussians, cam, _ = pixels_scene(torch.device("cpu"))
+    lens = dataclasses.replace(cam, model="fisheye", distortion=torch.zeros(4, requires_grad=True))
+    with pytest.raises(UsageError, match="detach"):
+        rasterize(gaussians, lens)

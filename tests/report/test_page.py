@@ -1,15 +1,24 @@
+"""The report page, what it is told by events, and the index of a farm."""
+
 import base64
+import io
 import json
+import math
 import re
 from html.parser import HTMLParser
 
 import cv2
 import numpy as np
 import pytest
+from rich.console import Console
 
+from warpgs.errors import ResourceError
+from warpgs.files import write_bytes, write_json
 from warpgs.process import Detail
+from warpgs.report.farm import FarmTable, JobCard, JobRow, farm_page
 from warpgs.report.images import png, webp
 from warpgs.report.page import Section, ViewImages, curve, write_page
+from warpgs.report.progress import EventLog, read_events
 
 VOID = {"meta", "img", "input", "br", "hr", "link"}
 
@@ -184,3 +193,122 @@ def test_curve_runs_down_where_values_fall_and_long_series_are_thinned():
     assert 100 < len(points) <= 300 and (np.diff(points[:, 0]) > 0).all() and (np.diff(points[:, 1]) >= 0).all()
     assert "loss [u]" in svg.text("text")
     assert Parsed(curve("none", [], [])).text("text") == ["none", "no data"]
+
+
+def fill(path, steps, start=0):
+    log = EventLog(path, start)
+    for step in steps:
+        log.write(step=step, loss=1 / step, psnr=20.0, count=5, seconds=0.1)
+    log.close()
+
+
+def test_every_event_is_a_line_of_strict_json(tmp_path):
+    path = tmp_path / "metrics.jsonl"
+    log = EventLog(path)
+    log.write(step=1, loss=0.5, psnr=math.inf, count=7)
+    log.write(step=2, loss=math.nan, psnr=21.5, count=8)
+    log.flush()
+
+    def refuse(word):
+        raise AssertionError(f"{word} is no JSON")
+
+    lines = [json.loads(line, parse_constant=refuse) for line in path.read_text().splitlines()]
+    assert lines == [
+        {"step": 1, "loss": 0.5, "psnr": None, "count": 7},
+        {"step": 2, "loss": None, "psnr": 21.5, "count": 8},
+    ]
+    log.close()
+    assert math.isnan(read_events(path)[0]["psnr"]) and math.isnan(read_events(path)[1]["loss"])
+
+
+def test_resume_forgets_what_came_after_the_checkpoint(tmp_path):
+    path = tmp_path / "metrics.jsonl"
+    fill(path, range(1, 11))
+    fill(path, range(7, 9), start=6)
+    assert [e["step"] for e in read_events(path)] == [1, 2, 3, 4, 5, 6, 7, 8]
+
+
+def test_resume_after_a_kill_in_the_middle_of_a_line(tmp_path):
+    path = tmp_path / "metrics.jsonl"
+    fill(path, range(1, 4))
+    with path.open("ab") as f:
+        f.write(b'{"step": 4, "lo')
+    assert [e["step"] for e in read_events(path)] == [1, 2, 3]
+    fill(path, [4], start=3)
+    assert [e["step"] for e in read_events(path)] == [1, 2, 3, 4]
+    assert path.read_bytes().count(b"\n") == 4
+
+
+def test_a_new_fit_starts_empty_and_resume_without_a_log_works(tmp_path):
+    path = tmp_path / "metrics.jsonl"
+    fill(path, range(1, 4))
+    EventLog(path).close()
+    assert path.read_bytes() == b""
+    path.unlink()
+    fill(path, [5], start=4)
+    assert [e["step"] for e in read_events(path)] == [5]
+
+
+def test_lines_that_are_no_events_are_skipped(tmp_path):
+    path = tmp_path / "metrics.jsonl"
+    path.write_bytes(b'[1]\n"x"\n{"loss": 1}\n{"step": "1"}\n\n\xff\n{"step": 3}\n')
+    assert read_events(path) == [{"step": 3}]
+
+
+def test_a_folder_that_is_not_there(tmp_path):
+    with pytest.raises(ResourceError, match="no"):
+        EventLog(tmp_path / "no" / "metrics.jsonl")
+
+
+@pytest.mark.parametrize("stage", ["os.fsync", "os.replace"])
+def test_a_failing_write_leaves_the_old_file_alone(tmp_path, monkeypatch, stage):
+    path = tmp_path / "a.json"
+    write_json(path, {"old": 1})
+
+    def full(*_, **__):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(f"warpgs.files.{stage}", full)
+    with pytest.raises(ResourceError, match="No space left"):
+        write_bytes(path, b"new")
+    monkeypatch.undo()
+    assert json.loads(path.read_text()) == {"old": 1} and list(tmp_path.iterdir()) == [path]
+
+
+def test_json_holds_no_nan(tmp_path):
+    write_json(tmp_path / "a.json", {"a": [math.nan, 1.5], "b": (math.inf,), "c": {"d": 2}})
+    assert json.loads((tmp_path / "a.json").read_text()) == {"a": [None, 1.5], "b": [None], "c": {"d": 2}}
+
+
+# The index of a farm and its live table: every job, whatever it is called.
+
+ROWS = [
+    JobRow("a", "done", 500, 61.0, 25.5, 1200), JobRow("b\x1b[31m", "running", 40, 3.0), JobRow("c", "waiting"),
+    JobRow("d", "failed", message="d: no images <b>"), JobRow("e", "failed", message="e: no images <b>"),
+]  # fmt: skip
+
+
+def test_failures_are_counted_by_message():
+    """The name of the scene in it makes no other message; nothing of a name is markup."""
+    page = farm_page("a & b", [JobCard(r, thumbnail="x y/t.jpg" if r.name == "a" else "") for r in ROWS], 90)
+    assert "<td>SCENE: no images &lt;b&gt;</td><td>2</td><td>d, e</td>" in page and "<h1>a &amp; b</h1>" in page
+    assert 'src="x%20y/t.jpg"' in page and "2 jobs are not done yet" in page and "25.50 dB" in page
+
+
+def test_the_table_shows_running_jobs_the_last_ones_and_the_time_left():
+    table = FarmTable(live=True)
+    table.display = type("Live", (), {"update": lambda self, panel: None})()
+    table.update(ROWS, 75.0)
+    console = Console(file=io.StringIO(), width=100)
+    console.print(table.panel())
+    text = console.file.getvalue()
+    assert "1 waiting  1 running  1 done  2 failed" in text and "left 1 min 15 s" in text
+    assert "25.50 dB" in text and "\x1b" not in text and "\\x1b[31m" in text
+
+
+def test_without_a_terminal_each_job_is_a_line_once(capsys):
+    with FarmTable(live=False) as table:
+        table.update(ROWS, None)
+        table.update(ROWS, None)
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split("  ")[0] for line in lines[:3]] == ["a", "d", "e"] and len(lines) == 4

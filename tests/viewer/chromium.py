@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.report.test_page_in_browser import BROWSERS
+from tests.report.test_in_browser import BROWSERS
 
 TIME = 120
 """Seconds that anything may take."""

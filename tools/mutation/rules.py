@@ -39,39 +39,39 @@ CUDA_FUNCTIONS = {
 CUDA_ARGUMENTS = {"deterministic", "block_dim"}
 """Arguments that have an effect only on CUDA, where their defaults and their values are tested."""
 
-LIMITS, LIMITS_PROJECT, LIMITS_BLEND = (f"kernels/test_limits{what}.py" for what in ("", "_project", "_blend"))
-SPANS, CUTS = "kernels/test_spans.py", "runtime/test_interop.py"
-RECORDS, BODIES, GUARDS = (f"kernels/test_{what}.py" for what in ("limits_gradients", "native", "guard_bytes"))
+LIMITS, LIMITS_PROJECT, LIMITS_BLEND = (f"kernels/test_{what}.py" for what in ("limits", "project", "limits"))
+SPANS, CUTS = "kernels/test_ellipse.py", "kernels/test_launch.py"
+RECORDS, BODIES, GUARDS = (f"kernels/test_{what}.py" for what in ("limits", "native", "guard_bytes"))
 EXTREMES, LAYERS = "numerics/test_extreme_projection.py", "numerics/test_extreme_compositing.py"
 OPS = {
-    "adam": ["kernels/test_adam.py", LIMITS, "pipeline/test_table.py"],
+    "adam": ["kernels/test_update.py", LIMITS, "pipeline/test_model.py"],
     "blend": ["kernels/test_blend.py", "render/test_rasterize.py", LIMITS_BLEND],
-    "blend_channels": ["kernels/test_blend_channels.py", "render/test_channels.py"],
+    "blend_channels": ["kernels/test_blend.py", "render/test_outputs.py"],
     "blend_cpu": ["kernels/test_blend.py", LIMITS_BLEND, RECORDS, LAYERS, "render/test_window.py"],
     "blend_cuda": ["kernels/test_blend.py", "render/test_rasterize.py", LIMITS_BLEND, RECORDS, LAYERS, "render/test_window.py"],
     "cameras/": ["kernels/test_project.py", LIMITS_PROJECT, EXTREMES, "kernels/test_cameras.py"],
-    "cuda_graph": ["runtime/test_cuda_graph.py", "render/test_graphed.py"],
-    "step_buffers": ["kernels/test_step_buffers.py"],
-    "interop": [CUTS, "kernels/test_adam.py", "kernels/test_sh.py", "kernels/test_tiles.py"],
+    "cuda_graph": ["kernels/test_graphs.py", "render/test_graphed.py"],
+    "step_buffers": ["kernels/test_update.py"],
+    "interop": [CUTS, "kernels/test_update.py", "kernels/test_sh.py", "kernels/test_tiles.py"],
     "compiler": ["kernels/test_blend.py"],
-    "camera_reach": ["kernels/test_camera_reach.py"],
-    "dropout": ["kernels/test_dropout.py"],
-    "covariance": ["render/test_covariances.py"],
+    "camera_reach": ["kernels/test_neighbours.py"],
+    "dropout": ["kernels/test_update.py"],
+    "covariance": ["render/test_inputs.py"],
     "falloff": [SPANS, "kernels/test_blend.py", LIMITS_BLEND],
     "functions": ["kernels/test_project.py", SPANS, LIMITS_PROJECT, EXTREMES, "kernels/test_tiles.py", "render/test_window.py"],
-    "knn": ["kernels/test_knn.py", LIMITS],
-    "allocator": ["runtime/test_allocator.py", "runtime/test_cuda_graph.py", "render/test_graphed.py"],
-    "heaviest": ["kernels/test_heaviest.py"],
-    "median_depth": ["kernels/test_median_depth.py", "kernels/test_blend.py"],
+    "knn": ["kernels/test_neighbours.py", LIMITS],
+    "allocator": ["kernels/test_launch.py", "kernels/test_graphs.py", "render/test_graphed.py"],
+    "heaviest": ["kernels/test_walk.py"],
+    "median_depth": ["kernels/test_walk.py", "kernels/test_blend.py"],
     "native": [
         "kernels/test_project.py", "kernels/test_tiles.py", "render/test_rasterize.py", LIMITS_PROJECT, LIMITS_BLEND, RECORDS,
     ],
-    "opacity_decay": ["kernels/test_opacity_decay.py"],
-    "pixel_size": ["kernels/test_pixel_size.py"],
-    "plane_costs": ["kernels/test_plane_costs.py"], "plane_depths": ["kernels/test_plane_depths.py"],
+    "opacity_decay": ["kernels/test_update.py"],
+    "pixel_size": ["kernels/test_neighbours.py"],
+    "plane_costs": ["kernels/test_sweep.py"], "plane_depths": ["kernels/test_sweep.py"],
     "project": ["kernels/test_project.py", LIMITS_PROJECT, EXTREMES, "kernels/test_tiles.py", "render/test_rasterize.py"],
     "project_backward": ["kernels/test_project.py", LIMITS_PROJECT, RECORDS, EXTREMES, "render/test_rasterize.py"],
-    "scanlines": ["kernels/test_scanlines.py"],
+    "scanlines": ["kernels/test_sweep.py"],
     "sh": ["kernels/test_sh.py", "kernels/test_project.py"],
     "ssim": ["kernels/test_ssim.py", LIMITS],
     "tsdf": ["kernels/test_tsdf.py"],
@@ -88,12 +88,13 @@ ROOMS = {
 """Entries of the table above for files that hold several ops."""
 
 CUDA_OPS = {
-    "adam": [GUARDS, "pipeline/test_step.py"], "blend_cuda": [BODIES, GUARDS, "render/test_channels.py"], "cameras/": [GUARDS],
-    "cuda_graph": ["render/test_graphed_cuda.py", "pipeline/test_step.py"],
-    "interop": [BODIES, "kernels/test_project.py", "pipeline/test_step.py"],
+    "adam": [GUARDS, "pipeline/train/test_step.py"],
+    "blend_cuda": [BODIES, GUARDS, "render/test_outputs.py"], "cameras/": [GUARDS],
+    "cuda_graph": ["render/test_graphed_cuda.py", "pipeline/train/test_step.py"],
+    "interop": [BODIES, "kernels/test_project.py", "pipeline/train/test_step.py"],
     "median_depth": [GUARDS], "native": [BODIES, GUARDS], "project": [GUARDS],
     "project_backward": [GUARDS], "project_cuda": [BODIES, GUARDS], "ssim": [GUARDS],
-    "tiles": [BODIES, GUARDS, "pipeline/test_step.py"],
+    "tiles": [BODIES, GUARDS, "pipeline/train/test_step.py"],
 }  # fmt: skip
 """Further tests for CUDA: single bodies, memory next to a tensor, captured steps."""
 

@@ -1,0 +1,418 @@
+"""Maps beside images: depth, normals and masks for scoring, matched by image; bad ones are refused with a reason."""
+
+import json
+import os
+import shutil
+
+import numpy as np
+import pytest
+
+from tests.io import scenes
+from warpgs.errors import DataError, UsageError
+from warpgs.io.folder import image_ids
+from warpgs.io.images import LoadedImage, turn_upright
+from warpgs.io.load import load_scene
+from warpgs.io.maps import in_pixels_of, resized
+from warpgs.pipeline.metrics.scores import score
+
+# Maps of depth and normals: found by the names of images, in their pixels and units; bad ones are refused with a
+# reason.
+
+SHAPE = (scenes.HEIGHT, scenes.WIDTH)
+RAMP = (np.arange(np.prod(SHAPE), dtype=np.uint16).reshape(SHAPE) * 10 + 1000).astype(np.uint16)
+"""Depths from 1 m to 2.91 m in millimetres."""
+
+
+def facing() -> np.ndarray:
+    """Return normals that face the camera, slanted by the column, float32 [H, W, 3]."""
+    x = np.broadcast_to(np.linspace(-0.5, 0.5, scenes.WIDTH), SHAPE)
+    return np.stack([x, np.zeros(SHAPE), -np.sqrt(1 - x**2)], -1).astype(np.float32)
+
+
+def write_maps(folder, values=RAMP, names=scenes.NAMES, suffix=".png"):
+    folder.mkdir(parents=True, exist_ok=True)
+    for name in names:
+        path = folder / (name.rpartition(".")[0] + suffix)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if suffix.endswith(".png"):
+            scenes.save(path, values)
+        else:
+            np.save(path, values)
+    return folder
+
+
+@pytest.mark.parametrize("kind", scenes.WRITERS)
+def test_depths_of_every_format_are_in_scene_units(kind, tmp_path):
+    """Millimetres become units of the cameras, and follow the scene's own scale; a note says so."""
+    scene = scenes.WRITERS[kind](tmp_path / "scene")
+    names = [v.name for v in load_scene(scene).views]
+    loaded = load_scene(scene, depths=write_maps(tmp_path / "maps", names=[n.rpartition("/")[2] for n in names]))
+    for view in loaded.views:
+        assert view.depth.kind == "metric" and view.depth.values.dtype == np.float32
+        assert np.allclose(view.depth.values, RAMP * 0.001 * loaded.normalization.scale, rtol=1e-6)
+    assert any("depth maps: 5 of 5 views" in n and "0.001 for integers" in n for n in loaded.notes)
+    assert loaded.fingerprint != load_scene(scene).fingerprint
+
+
+def test_missing_views_units_and_kinds(tmp_path):
+    """Views without a map have none; --depth-unit counts for all numbers; relative maps keep theirs."""
+    scene = scenes.write_colmap(tmp_path / "scene")
+    write_maps(tmp_path / "maps", RAMP.astype(np.float32), scenes.NAMES[:2], ".npy")
+    maps = tmp_path / "maps"
+    loaded = load_scene(scene, depths=maps)
+    assert [v.depth is not None for v in loaded.views] == [True, True, False, False, False]
+    scale = loaded.normalization.scale
+    assert np.allclose(loaded.views[0].depth.values, RAMP * scale)
+    assert np.allclose(load_scene(scene, depths=maps, depth_unit=0.5).views[1].depth.values, 0.5 * RAMP * scale)
+    relative = load_scene(scene, depths=maps, depth_kind="disparity").views[0].depth
+    assert relative.kind == "disparity" and (relative.values == RAMP).all()
+
+
+def test_what_is_not_finite_or_zero_is_no_depth(tmp_path):
+    scene, values = scenes.write_colmap(tmp_path / "scene"), RAMP.astype(np.float32)
+    values[0], values[1], values[2] = np.nan, np.inf, 0
+    found = load_scene(scene, depths=write_maps(tmp_path / "maps", values, suffix=".npy")).views[0].depth.values
+    assert (found[:3] == 0).all() and (found[3:] > 0).all()
+
+
+@pytest.mark.parametrize(("raw", "wanted"), [(np.float32(0.25), 0.25), (np.uint8(51), 0.2), (np.uint8(1), 0.5)])
+def test_confidence_lies_beside_the_map(tmp_path, raw, wanted):
+    """Gray levels are fractions of the largest; three levels 0, 1, 2 are halves. Depth without confidence does not count."""
+    scene, maps = scenes.write_colmap(tmp_path / "scene"), write_maps(tmp_path / "maps")
+    confidence = np.full(SHAPE, raw)
+    confidence[0] = 0
+    np.save(maps / "photo1.confidence.npy", confidence)
+    found = load_scene(scene, depths=maps)
+    assert found.views[0].depth.confidence is None
+    assert np.allclose(found.views[1].depth.confidence[1:], wanted) and (found.views[1].depth.values[0] == 0).all()
+
+
+@pytest.mark.parametrize("suffix", [".png", ".npy"])
+def test_normals_in_both_axes(tmp_path, suffix):
+    """RGB (n + 1) / 2 or vectors, in OpenCV axes or OpenGL's."""
+    scene = scenes.write_colmap(tmp_path / "scene")
+    for axes, sign in (("opencv", 1), ("opengl", -1)):
+        n = facing() * np.array([1, sign, sign], np.float32)
+        stored = np.round((n + 1) / 2 * 255).astype(np.uint8) if suffix == ".png" else n
+        maps = write_maps(tmp_path / axes, stored, suffix=suffix)
+        found = load_scene(scene, normals=maps, normal_axes=axes).views[2].normals
+        assert np.allclose(found, facing(), atol=0.01) and np.allclose(np.linalg.norm(found, axis=-1), 1, atol=1e-6)
+        other = {"opencv": "opengl", "opengl": "opencv"}[axes]
+        with pytest.raises(DataError, match=rf"photo0.*face away from the camera.*--normal-axes {axes}"):
+            load_scene(scene, normals=maps, normal_axes=other)
+
+
+BAD = {
+    "size": (RAMP[:, :-3], r"13 x 12 px, its image 16 x 12: the aspects differ"),
+    "empty": (np.zeros(SHAPE, np.uint16), "contains no depth"),
+    "negative": (-RAMP.astype(np.float32), r"192 depths are negative, down to -2910"),
+    "nan": (np.full(SHAPE, np.nan, np.float32), "no depth is finite"),
+    "infinite": (np.full(SHAPE, np.inf, np.float32), "no depth is finite"),
+    "huge": (np.full(SHAPE, 1e20, np.float32), "beyond 1e"),
+    "picture": (np.stack([RAMP, RAMP, RAMP + 1], -1), "colour image of 3 channels"),
+    "bits": (RAMP.astype(np.uint8) | 1, "has 8 bits"),
+    "numbers": (RAMP.astype(np.int32), "its numbers are int32"),
+    "words": (np.full(SHAPE, "a"), "its numbers are"),
+    "axes": (np.zeros((2, 3, 4, 5), np.float32), "must be an array"),
+    "vectors": (2 * facing(), "100% of its vectors are not unit normals"),
+    "none": (0 * facing(), "contains no normals"),
+    "one channel": (facing()[..., 0], "normals need three channels"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_a_bad_map_is_refused_with_view_and_reason(case, tmp_path):
+    values, reason = BAD[case]
+    scene, maps = scenes.write_colmap(tmp_path / "scene"), tmp_path / "maps"
+    normals = case in ("vectors", "none", "one channel")
+    write_maps(maps, facing() if normals else RAMP.astype(np.float32), suffix=".npy")
+    np.save(maps / "photo3.npy", values)
+    with pytest.raises(DataError, match=f"photo3.npy: .*{reason}"):
+        load_scene(scene, **{"normals" if normals else "depths": maps})
+
+
+def test_bad_confidence_is_refused(tmp_path):
+    scene, maps = scenes.write_colmap(tmp_path / "scene"), write_maps(tmp_path / "maps")
+    for values, reason in (
+        (np.full(SHAPE, 2.5, np.float32), "must be in"),
+        (np.ones((2, 2), np.float32), "make both equal in size"),
+    ):
+        np.save(maps / "photo1.confidence.npy", values)
+        with pytest.raises(DataError, match=f"photo1.confidence.npy.*{reason}"):
+            load_scene(scene, depths=maps)
+
+
+def test_folders_without_maps(tmp_path):
+    """A missing folder, an empty one, other formats, other names, two files for one image, and objects that numpy pickles."""
+    scene, maps = scenes.write_colmap(tmp_path / "scene"), tmp_path / "maps"
+    with pytest.raises(DataError, match="no such folder"):
+        load_scene(scene, depths=maps)
+    maps.mkdir()
+    with pytest.raises(DataError, match="holds no maps; add NPY"):
+        load_scene(scene, depths=maps)
+    (maps / "photo0.exr").write_bytes(b"v/1\1")
+    with pytest.raises(DataError, match=r"it holds \.exr files, which are not read"):
+        load_scene(scene, depths=maps)
+    write_maps(maps, names=("else.png",))
+    with pytest.raises(DataError, match="none of its 1 maps has the name of an image"):
+        load_scene(scene, depths=maps)
+    write_maps(maps)
+    np.save(maps / "photo0.npy", RAMP)
+    with pytest.raises(DataError, match="is for the same image"):
+        load_scene(scene, depths=maps)
+    (maps / "photo0.png").unlink()
+    np.save(maps / "photo0.npy", np.array([{}], object))
+    with pytest.raises(DataError, match="cannot be read as a numpy array"):
+        load_scene(scene, depths=maps)
+    (maps / "photo0.npy").rename(maps / "photo0.png")
+    with pytest.raises(DataError, match="is not a PNG"):
+        load_scene(scene, depths=maps)
+
+
+def test_sizes_beyond_the_limit_and_links_are_refused(tmp_path):
+    scene, maps = scenes.write_colmap(tmp_path / "scene"), tmp_path / "maps"
+    write_maps(maps, np.ones((60, 80), np.float32), suffix=".npy")
+    with pytest.raises(DataError, match="80 x 60 px, more than the limit of 200 pixels"):
+        load_scene(scene, depths=maps, max_pixels=200)
+    (maps / "photo0.npy").rename(tmp_path / "outside.npy")
+    try:
+        (maps / "photo0.npy").symlink_to(tmp_path / "outside.npy")
+    except OSError:
+        pytest.skip("this system does not let the user make links")
+    with pytest.raises(DataError, match=r"photo0\.npy: a link points outside the folder of maps"):
+        load_scene(scene, depths=maps)
+    assert load_scene(scene, depths=maps, allow_outside=True).views[0].depth is not None
+    if hasattr(os, "mkfifo"):
+        (maps / "photo0.npy").unlink()
+        os.mkfifo(maps / "photo0.npy")
+        assert load_scene(scene, depths=maps).views[0].depth is None  # no file, so no map
+
+
+def test_choices(tmp_path):
+    scene = scenes.write_colmap(tmp_path)
+    for wrong in ({"depth_kind": "deep"}, {"normal_axes": "blender"}, {"depth_unit": 0}, {"depth_unit": float("nan")}):
+        with pytest.raises(UsageError):
+            load_scene(scene, **wrong)
+
+
+def write_named(root, unit=None):
+    """Write a transforms scene that names maps, as nerfstudio does."""
+    content = scenes.transforms_json()
+    if unit is not None:
+        content["depth_unit_scale_factor"] = unit
+    for i, frame in enumerate(content["frames"]):
+        frame["depth_file_path"], frame["normal_file_path"] = f"depths/photo{i}.png", f"normals/photo{i}.npy"
+    write_maps(root / "depths"), write_maps(root / "normals", facing(), suffix=".npy")
+    return scenes.write_transforms(root, content)
+
+
+def test_maps_that_transforms_json_names(tmp_path):
+    """`depth_file_path`, `normal_file_path` and `depth_unit_scale_factor`; flags come before them, and `none` skips them."""
+    root = write_named(tmp_path / "a")
+    found = load_scene(root)
+    assert np.allclose(found.views[1].depth.values, RAMP * 0.001 * found.normalization.scale)
+    assert np.allclose(found.views[1].normals, facing(), atol=1e-6)
+    assert any("listed in the scene's file" in n for n in found.notes)
+    tenth = load_scene(write_named(tmp_path / "b", 0.0001))
+    assert np.allclose(tenth.views[1].depth.values, RAMP * 0.0001 * tenth.normalization.scale)
+    assert np.allclose(load_scene(tmp_path / "b", depth_unit=0.002).views[1].depth.values, 20 * tenth.views[1].depth.values)
+    bare = load_scene(root, depths="none", normals="none")
+    assert bare.views[0].depth is None and bare.views[0].normals is None
+    file = root / "transforms.json"
+    content = json.loads(file.read_text())
+    for name, reason in (
+        ("../x.png", "points outside"),
+        ("x.exr", "maps must be .png or .npy"),
+        ("gone.npy", "cannot be read"),
+    ):
+        content["frames"][2]["depth_file_path"] = name
+        file.write_text(json.dumps(content))
+        with pytest.raises(DataError, match=reason):
+            load_scene(root)
+
+
+def test_maps_follow_size_and_mask(tmp_path):
+    """A map of another size, images made smaller, and pixels that a mask leaves out."""
+    scene = scenes.write_colmap(tmp_path / "scene")
+    small = write_maps(tmp_path / "small", np.full((6, 8), 1500, np.uint16))
+    for downscale in (1, 3):
+        loaded = load_scene(scene, depths=small, downscale=downscale)
+        assert np.allclose(loaded.views[0].depth.values, 1.5 * loaded.normalization.scale)
+    half = np.tile(np.array([0, 255], np.uint8).repeat(8), (12, 1))
+    for i in range(scenes.VIEWS):
+        scenes.save(scene / "masks" / f"photo{i}.png", half)
+    values = load_scene(scene, depths=small).views[0].depth.values
+    assert (values[:, :8] == 0).all() and (values[:, 8:] > 0).all()
+
+
+def test_depth_follows_the_undistorted_image(tmp_path):
+    """The columns of an image and a depth map that grow alike stay alike when the lens is undone."""
+    scene = scenes.write_colmap(tmp_path / "scene", model="OPENCV", parameters=(20, 20, 8, 6, 1.0, 0, 0, 0))
+    columns = np.broadcast_to(np.arange(scenes.WIDTH) + 1.0, SHAPE).astype(np.float32)
+    view = load_scene(scene, depths=write_maps(tmp_path / "maps", columns, suffix=".npy"), depth_kind="relative").views[2]
+    shown = view.image[..., 0] * scenes.WIDTH + 0.5  # red grows to the right
+    known = view.depth.values > 0
+    assert known.mean() > 0.7 and np.abs(view.depth.values - shown)[known].max() < 0.6
+    assert np.abs(view.depth.values - columns).max() > 0.9  # it moved
+
+
+def test_few_points_stay_few_and_surfaces_are_not_mixed():
+    sparse = np.zeros((12, 16), np.float32)
+    sparse[3, 5], sparse[9, 14] = 2.0, 3.0
+    found = resized(sparse, 4, 3)
+    assert sorted(found[found > 0].tolist()) == [2.0, 3.0] and found[0, 1] == 2 and found[2, 3] == 3
+    step = np.where(np.arange(8) < 4, 1.0, 4.0).astype(np.float32)[None].repeat(6, 0)
+    assert set(np.unique(resized(step, 16, 12))) == {1.0, 4.0}
+    slope = (10 + 0.1 * np.arange(8)).astype(np.float32)[None].repeat(6, 0)
+    assert np.abs(np.diff(resized(slope, 16, 12)[5])).max() < 0.06
+
+
+def test_a_map_lies_as_its_image_was_stored_or_upright():
+    image = LoadedImage(np.zeros((16, 12, 3), np.float32), None, np.eye(3), orientation=6, full_size=(16, 12))
+    stored = RAMP.astype(np.float32)
+    upright = turn_upright(stored, 6)
+    assert (in_pixels_of(image, stored, "a.npy") == upright).all() and (in_pixels_of(image, upright, "a.npy") == upright).all()
+    with pytest.raises(DataError, match="rotated by an EXIF tag"):
+        in_pixels_of(image, facing(), "n.npy")
+
+
+# Object masks for scoring: matched by image id, never by sorted order.
+
+RECT = tuple(f"rect_{i + 1:03d}_3_r5000.png" for i in range(scenes.VIEWS))
+
+
+def mask_of(i: int) -> np.ndarray:
+    """Return a mask that names its id: row i is black."""
+    mask = np.full((scenes.HEIGHT, scenes.WIDTH), 255, np.uint8)
+    mask[i] = 0
+    return mask
+
+
+def write_masks(folder, ids=range(scenes.VIEWS), form="{:03d}.png"):
+    for i in ids:
+        scenes.save(folder / form.format(i), mask_of(i))
+
+
+def black_rows(scene):
+    """Return the row that each view's score mask leaves out."""
+    return [np.flatnonzero(~v.score_mask.any(1)).tolist() for v in scene.views]
+
+
+@pytest.mark.parametrize("inner", ["", "mask"])
+@pytest.mark.parametrize("names", [scenes.NAMES, RECT])
+def test_masks_of_a_scene_folder_are_found_and_matched_by_id(tmp_path, names, inner):
+    """`idrmasks` in the scene folder, with or without DTU's inner `mask`; the fit keeps every pixel."""
+    scenes.write_colmap(tmp_path, names=names)
+    write_masks(tmp_path / "idrmasks" / inner)
+    scene = load_scene(tmp_path)
+    assert black_rows(scene) == [[i] for i in range(scenes.VIEWS)]
+    assert all(v.mask is None for v in scene.views)
+    assert any("matched by image id" in n for n in scene.notes)
+
+
+def test_masks_elsewhere_of_more_views_than_there_are(tmp_path):
+    """Masks of 64 images serve a scan of five, also from a folder elsewhere."""
+    scenes.write_colmap(tmp_path / "scene", names=RECT)
+    write_masks(tmp_path / "scan8" / "mask", range(8), "{:05d}.png")
+    scene = load_scene(tmp_path / "scene", score_masks=tmp_path / "scan8")
+    assert black_rows(scene) == [[i] for i in range(scenes.VIEWS)]
+    assert load_scene(tmp_path / "scene").views[0].score_mask is None
+
+
+def test_a_missing_mask_is_named_by_its_id(tmp_path):
+    """Matching by sorted order would give every later view its neighbour's mask."""
+    scenes.write_colmap(tmp_path, names=RECT)
+    write_masks(tmp_path / "idrmasks", [0, 1, 3, 4])
+    with pytest.raises(DataError, match=r"no mask for image id 2 .* rect_001_... is id 0"):
+        load_scene(tmp_path)
+
+
+def test_counting_from_one_is_not_guessed(tmp_path):
+    """Images 1 to 5 and masks 0 to 5 can be matched in two ways, so the scene is refused."""
+    scenes.write_colmap(tmp_path, names=tuple(f"{i + 1:03d}.png" for i in range(scenes.VIEWS)))
+    write_masks(tmp_path / "idrmasks", range(6))
+    with pytest.raises(DataError, match="off by one"):
+        load_scene(tmp_path)
+    shutil.rmtree(tmp_path / "idrmasks")
+    write_masks(tmp_path / "idrmasks", range(5))
+    with pytest.raises(DataError, match="no mask for image id 5"):
+        load_scene(tmp_path)
+
+
+def test_masks_that_cannot_be_used_are_named(tmp_path):
+    """No masks, masks without numbers, of another shape, or all black."""
+    scenes.write_colmap(tmp_path / "scene")
+    folder = tmp_path / "m"
+
+    def refused(message):
+        with pytest.raises(DataError, match=message):
+            load_scene(tmp_path / "scene", score_masks=folder)
+
+    refused("contains no masks")
+    for name in "abcde":
+        scenes.save(folder / f"{name}.png", mask_of(0))
+    refused("no distinct numbers")
+    shutil.rmtree(folder)
+    write_masks(folder)
+    scenes.save(folder / "002.png", np.full((20, 20), 255, np.uint8))
+    refused("002.png: the mask is 20 x 20 px, its image photo2.png 16 x 12")
+    scenes.save(folder / "002.png", np.zeros((12, 16), np.uint8))
+    refused("leaves no pixel of photo2.png")
+
+
+def test_larger_masks_shrink_with_the_images(tmp_path):
+    """Masks of the original size serve at any downscale."""
+    scenes.write_colmap(tmp_path)
+    write_masks(tmp_path / "idrmasks")
+    scenes.save(tmp_path / "idrmasks" / "001.png", np.repeat(np.repeat(mask_of(1), 4, 0), 4, 1))
+    assert black_rows(load_scene(tmp_path))[1] == [1]
+    assert load_scene(tmp_path, downscale=2).views[0].score_mask.shape == (6, 8)
+
+
+def test_masks_belong_to_the_fingerprint(tmp_path):
+    """Scores over other pixels do not compare, so the fingerprint differs."""
+    scenes.write_colmap(tmp_path)
+    plain = load_scene(tmp_path).fingerprint
+    write_masks(tmp_path / "idrmasks")
+    assert load_scene(tmp_path).fingerprint != plain
+
+
+@pytest.mark.parametrize(
+    "names,ids",
+    [
+        (["rect_001_3_r5000.png", "rect_026_3_r5000.png"], [0, 25]),
+        (["a/000003.png", "a/000010.png"], [3, 10]),
+        (["cam2_07.png", "cam2_09.png"], [7, 9]),
+        (["x.png", "y.png"], None),
+        (["1_2.png", "1_2.jpg"], None),
+    ],
+)
+def test_ids_of_names(names, ids):
+    """The id is the number that differs from name to name."""
+    assert image_ids(names) == ids
+
+
+def test_where_pixels_come_from(tmp_path):
+    """A ready-made folder and resampling give different descriptions."""
+    scenes.write_colmap(tmp_path)
+    assert load_scene(tmp_path).pixels == "images as stored"
+    assert load_scene(tmp_path, downscale=2).pixels == "images area-resampled by 2"
+    scenes.save_images(tmp_path / "images_2", width=8, height=6)
+    assert load_scene(tmp_path, downscale=2).pixels == "images_2 as stored"
+
+
+def test_undistorted_images_are_scored_inside_their_mask_only(tmp_path):
+    """Pixels that the lens did not see change no score, with a score mask and without one."""
+    for folder, masks in ((tmp_path / "plain", False), (tmp_path / "masked", True)):
+        scenes.write_transforms(folder, scenes.transforms_json(k1=0.8, k2=0.0, p1=0.0, p2=0.0))
+        if masks:
+            for i in range(scenes.VIEWS):
+                scenes.save(folder / "idrmasks" / f"{i:03d}.png", np.full((scenes.HEIGHT, scenes.WIDTH), 255, np.uint8))
+        view = load_scene(folder).views[0]
+        assert view.mask is not None and not view.mask[0, 0] and (view.score_mask is not None) == masks
+        image = view.image.copy()
+        image[~view.mask] = 1 - image[~view.mask]
+        m = score(view, image)
+        assert m.psnr == np.inf and m.ssim == 1
+        image[view.mask] = 0
+        assert score(view, image).psnr < 30

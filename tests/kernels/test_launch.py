@@ -1,0 +1,722 @@
+"""Launches cover every item once and check their arguments; modules load once; an arena gives tensors at the same places."""
+
+import dataclasses
+import os
+import subprocess
+import sys
+import threading
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+import torch
+import warp as wp
+from torch._subclasses.fake_tensor import FakeTensorMode
+
+from tests.gaussians import camera, cloud, leaves
+from warpgs.constants import RULES
+from warpgs.errors import ResourceError
+from warpgs.kernels import launch, native
+from warpgs.kernels import launch as interop
+from warpgs.kernels import launch as sorting
+from warpgs.kernels.blend import blend
+from warpgs.kernels.graphs import CapturedGraph
+from warpgs.kernels.launch import ALIGNMENT, TORCH, Arena, SizingAllocator, fetch, part
+from warpgs.kernels.neighbours import mean_square_distances
+from warpgs.kernels.project import project
+from warpgs.kernels.ssim import differences, ssim
+from warpgs.kernels.tiles import InstanceMemory, bin_tiles
+from warpgs.kernels.update import Setting, adam_step, opacity_dropout
+from warpgs.kernels.walk import contributions, median_depth
+from warpgs.render.rasterize import rasterize
+from warpgs.scene import Gaussians
+
+# Launches are cut into ranges that cover every item once; arguments are checked by name.
+
+
+@wp.kernel(enable_backward=False)
+def interop_mark(
+    begin: int,
+    # outputs
+    visits: wp.array(dtype=int), firsts: wp.array(dtype=int),
+):  # fmt: skip
+    """Count the visits of an item, and tell where its range begins."""
+    i = begin + wp.tid()
+    visits[i] = visits[i] + 1
+    firsts[i] = begin
+
+
+class Recorded:
+    """A pool of one thread that counts what is handed to it."""
+
+    def __init__(self):
+        self.handed = 0
+
+    def submit(self, work):
+        self.handed += 1
+        work()
+        return self
+
+    def result(self):
+        return None
+
+
+@pytest.mark.parametrize(
+    ("threads", "count", "cost", "ranges"),
+    [
+        (1, 30_000, 1, 1), (2, 30_000, 9, 16), (4, 30_001, 99, 32), (5, 30_000, 99, 20), (2, 1, 10**6, 1),
+        (2, 2, 10_000, 2), (2, 2, 9_999, 1), (2, 5, 40_000, 5), (2, 19_999, 1, 1), (2, 20_000, 1, 2), (2, 0, 1, 0),
+        (2, 39_999, 1, 3), (4, 30_001, 1, 4),
+    ],
+)  # fmt: skip
+def test_ranges_cover_every_item_once(monkeypatch, threads, count, cost, ranges):
+    """There are as many ranges as there is work for, and at most one hand-over to each other thread; small ones have none."""
+    pool = Recorded()
+    monkeypatch.setattr(interop, "_pool", lambda *_: pool)
+    torch.set_num_threads(threads)
+    visits, firsts = torch.zeros(2, count, dtype=torch.int32).unbind()
+    outputs = [interop.view(t, wp.int32) for t in (visits, firsts)]
+    interop.launch(interop_mark, count, outputs, torch.device("cpu"), cost=cost)
+    assert bool((visits == 1).all())
+    assert sorted(set(firsts.tolist())) == [count * i // ranges for i in range(ranges)]
+    assert pool.handed == max(min(threads, ranges) - 1, 0)
+
+
+def everything():
+    """Return the results of every float32 kernel for a CPU, with gradients."""
+    g, cam = leaves(cloud(61)), camera(37, 30, cameras=2, dtype=torch.float32)
+    size, rule = {"width": 37, "height": 30}, RULES["exact"]
+    views, Ks = cam.viewmat.clone().requires_grad_(), cam.K.clone().requires_grad_()
+    projected, counts = project(*g.tensors().values(), views, Ks, **size, degree=1, rule=rule)
+    tiles = bin_tiles(projected, counts, **size, rule=rule)
+    memory = InstanceMemory(capacity=2000, overflow=torch.zeros(1, dtype=torch.int32))
+    capped = bin_tiles(projected, counts, **size, rule=rule, memory=memory)
+    images = blend(projected, tiles, torch.ones(2, 3), **size, rule=rule)
+    target = torch.rand(images[0].shape, generator=torch.Generator().manual_seed(0))
+    maps, sums = ssim(images[0], target), differences(images[0], target)
+    loss = sum((t * t).sum() for t in (*images, maps, sums))
+    gradients = torch.autograd.grad(loss, [*g.tensors().values(), views, Ks])
+    moved = torch.rand(3 * 4096, 3, generator=torch.Generator().manual_seed(1))
+    state = [moved, moved.flip(0).contiguous(), moved * 0, moved * 0]
+    adam_step(*state, lr=0.1, step=1)
+    settings = Setting.row(dropout=0.3, number=1, step=1, means_lr=0.1, shift=(0.0, 0.0, 0.0))
+    factors = opacity_dropout(53, torch.tensor(settings, dtype=torch.float32), 5)
+    lists = [t for tiled in (tiles, capped) for t in (tiled.ranges, tiled.counts, tiled.gaussian_ids[: len(tiles.slots)])]
+    weights = (*contributions(projected, tiles, **size, rule=rule), median_depth(projected, tiles, **size, rule=rule))
+    near = mean_square_distances(moved[:91])
+    return [t.detach() for t in (projected, counts, *lists, *images, *gradients, *weights, *state, near, factors, maps, sums)]
+
+
+@pytest.fixture
+def poisoned_memory():
+    """Fill what torch allocates with NaN and with the largest numbers."""
+    torch.use_deterministic_algorithms(True)
+    assert bool(torch.empty(3).isnan().all())
+    yield
+    torch.use_deterministic_algorithms(False)
+
+
+@pytest.fixture(scope="module")
+def whole():
+    """The results of one thread, each launch in one piece."""
+    count = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield everything()
+    torch.set_num_threads(count)
+
+
+def test_every_op_gives_the_same_bits_in_ranges(monkeypatch, whole, poisoned_memory):
+    """However a launch is cut, items know their own number, share nothing, and none is left out.
+
+    Ranges of unequal length, none of which may cover for another: Warp counts a negative index from the end, and so a
+    kernel that goes backwards from the beginning of its range visits every item of equal ranges.
+    """
+    monkeypatch.setattr(interop, "SERIAL_WORK", 1)
+    monkeypatch.setattr(interop, "CHUNKS_PER_THREAD", 2)
+    torch.set_num_threads(4)
+    for i, (a, b) in enumerate(zip(whole, everything(), strict=True)):
+        assert torch.equal(a, b), i
+
+
+def test_items_run_in_any_order(monkeypatch, whole, poisoned_memory):
+    """One by one from the last to the first: the same bits, since none may rely on another having run."""
+
+    def backwards(kernel, count, inputs, device, **_):
+        arrays = [a.array() if isinstance(a, interop.View) else a for a in interop.arguments(kernel, inputs)]
+        for i in reversed(range(count)):
+            wp.launch(kernel, 1, inputs=[i, *arrays], device="cpu")
+
+    monkeypatch.setattr(interop, "launch", backwards)
+    for i, (a, b) in enumerate(zip(whole, everything(), strict=True)):
+        assert torch.equal(a, b), i
+
+
+def test_memory_that_nobody_wrote_is_not_read(whole, poisoned_memory):
+    """Workspace and outputs that were full of NaN and of the largest numbers give the same bits."""
+    for i, (a, b) in enumerate(zip(whole, everything(), strict=True)):
+        assert torch.equal(a, b), i
+
+
+@pytest.mark.parametrize("several", [False, True])
+def test_the_device_that_is_current_stays_so(monkeypatch, several):
+    """Warp leaves the one current that it worked on: where there are several, launches and its own work stand in a guard."""
+    events, device = [], torch.device("cuda", 1)
+
+    class Guard:
+        def __init__(self, where):
+            self.where = where
+
+        def __enter__(self):
+            events.append(("enter", self.where))
+
+        def __exit__(self, *_):
+            events.append("exit")
+
+    class Noted:
+        def launch(self, *_):
+            events.append("launch")
+
+        def set_stream(self, stream, sync):
+            events.append(stream)
+
+    Noted.stream = "before"
+    monkeypatch.setattr(interop, "_several_devices", lambda: several)
+    monkeypatch.setattr(torch.cuda, "device", Guard)
+    monkeypatch.setattr(interop, "_recorded", lambda *_: Noted())
+    monkeypatch.setattr(interop, "warp_stream", lambda _: "ours")
+    monkeypatch.setattr(interop, "warp_device", lambda _: Noted())
+    interop.launch(interop_mark, 1, [None, None], device)
+    with interop.stream_of(device):
+        events.append("sort")
+    guarded = [[("enter", device), *body, "exit"] if several else body for body in (["launch"], ["ours", "sort", "before"])]
+    assert events == guarded[0] + guarded[1]
+
+
+@wp.struct
+class Pair:
+    """Two numbers."""
+
+    count: wp.int32
+    step: wp.float64
+
+
+@wp.kernel(enable_backward=False)
+def add_pair(begin: int, pair: Pair, found: wp.array(dtype=wp.float64)):
+    i = begin + wp.tid()
+    found[i] = found[i] + wp.float64(pair.count) * pair.step
+
+
+def test_a_recorded_launch_takes_structs_by_value():
+    """Each launch sees the struct that it is given, and none is changed: callers keep them."""
+
+    def pair(count, step):
+        made = Pair()
+        made.count, made.step = count, step
+        return made
+
+    first, second = pair(1, 0.5), pair(3, 2.0)
+    found = torch.zeros(4, dtype=torch.float64)
+    recorded = interop._Recorded(add_pair, torch.device("cpu"), 1)
+    totals = []
+    for given in (first, second, second, first):
+        recorded.launch(4, [given, interop.view(found, wp.float64)], None)
+        totals.append(found.tolist())
+    assert totals == [[n] * 4 for n in (0.5, 6.5, 12.5, 13.0)]
+    assert (first.count, first.step, second.count, second.step) == (1, 0.5, 3, 2.0)
+    assert first.__ctype__().count == 1 and second.__ctype__().count == 3
+
+
+@wp.kernel(enable_backward=False)
+def turned(begin: int, turn: wp.mat33d, shift: wp.vec3d, out: wp.array(dtype=wp.float64)):  # fmt: skip
+    """Write entries of a vector after a rotation and a shift."""
+    i = begin + wp.tid()
+    out[i] = (turn * wp.vec3d(wp.float64(1.0), wp.float64(2.0), wp.float64(3.0)) + shift)[i]
+
+
+def test_a_recorded_launch_takes_vectors_and_matrices(device):
+    """The values of each call, not those of the first."""
+    for scale in (1.0, 2.0, -3.0):
+        out = torch.zeros(3, dtype=torch.float64, device=device)
+        turn = wp.mat33d(scale, 0.0, 0.0, 0.0, scale, 0.0, 0.0, 0.0, scale)
+        interop.launch(turned, 3, [turn, wp.vec3d(0.0, 0.0, scale), interop.view(out, wp.float64)], out.device)
+        assert out.tolist() == [scale, 2 * scale, 4 * scale]
+
+
+def test_a_thread_launches_with_its_own_arguments(monkeypatch):
+    """One kernel from two threads at a time, over memory of other sizes, each interrupted between patch and launch."""
+    patch, meeting, counts = interop._Recorded._patch, threading.Barrier(2), (1000, 30)
+
+    def launches(count):
+        visits, firsts = torch.zeros(2, count, dtype=torch.int32).unbind()
+        found = []
+        for _ in range(3):
+            interop.launch(interop_mark, count, [interop.view(t, wp.int32) for t in (visits, firsts)], torch.device("cpu"))
+            found.append(visits.tolist())
+        return found
+
+    def interrupted(recorded, *given):
+        patch(recorded, *given)
+        meeting.wait(10)
+
+    monkeypatch.setattr(interop._Recorded, "_patch", interrupted)
+
+    with ThreadPoolExecutor(2) as pool:
+        for count, found in zip(counts, pool.map(launches, counts), strict=True):
+            assert found == [[times] * count for times in (1, 2, 3)]
+
+
+FORKED = """
+import os, signal, sys
+from tests.gaussians import camera, cloud
+from warpgs.render.rasterize import rasterize
+import torch
+torch.set_num_threads(2)
+g, cam = cloud(2000), camera(75, 53, dtype=torch.float32)
+image = rasterize(g, cam).rgb
+child = os.fork()
+if child == 0:
+    signal.alarm(20)
+    os._exit(0 if torch.equal(rasterize(g, cam).rgb, image) else 3)
+print(len(sys._current_frames()) > 1, os.waitpid(child, 0)[1])
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
+def test_a_forked_process_launches_in_threads_of_its_own():
+    """The parent's do not exist there, and nothing may wait for them."""
+    found = subprocess.run([sys.executable, "-c", FORKED], check=False, capture_output=True, text=True)
+    assert found.stdout.split() == ["True", "0"], found.stderr
+
+
+def interrupted_at(number: int, call) -> bool:
+    """Run ``call`` with a Ctrl-C where Python looks for one for the n-th time; return whether it came that far.
+
+    Python looks at the begin of a function and after a call into C.
+    """
+    left = number
+
+    def profile(frame, event, _):
+        nonlocal left
+        left -= event in ("call", "c_return")
+        if left == 0:
+            sys.setprofile(None)
+            raise KeyboardInterrupt
+
+    sys.setprofile(profile)
+    try:
+        call()
+    except KeyboardInterrupt:
+        return True
+    finally:
+        sys.setprofile(None)
+    return False
+
+
+def test_an_interrupt_at_any_time_leaves_no_thread_at_work(monkeypatch):
+    """The caller frees the memory that the threads use, and the next launch writes their arguments anew."""
+    torch.set_num_threads(2)
+    pool, handed = interop._Pool(1), []
+
+    def submit(work):
+        handed.append(work)
+        pool.submit(work)
+
+    monkeypatch.setattr(interop, "_pool", lambda *_: SimpleNamespace(submit=submit))
+
+    def launched():
+        visits, firsts = torch.zeros(2, 30_000, dtype=torch.int32).unbind()
+        handed.clear()
+        try:
+            interop.launch(interop_mark, 30_000, [interop.view(t, wp.int32) for t in (visits, firsts)], torch.device("cpu"))
+        finally:
+            shared = interop._OF_THREAD.shared
+            assert shared is None or not handed or (shared.ended and not shared.open and not shared.working)
+        return visits
+
+    launched()
+    number = 0
+    while interrupted_at(number := number + 1, launched):
+        assert bool((launched() == 1).all())  # the launch after it is whole
+    assert number > 50
+
+
+def test_queued_work_that_begins_late_touches_nothing(monkeypatch):
+    """An interrupt between the queue and its thread: the range is processed by nobody, and not in freed memory."""
+    queued = []
+
+    def submit(work):
+        queued.append(work)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(interop, "_pool", lambda *_: SimpleNamespace(submit=submit))
+    torch.set_num_threads(2)
+    visits, firsts = torch.zeros(2, 30_000, dtype=torch.int32).unbind()
+    with pytest.raises(KeyboardInterrupt):
+        interop.launch(interop_mark, 30_000, [interop.view(t, wp.int32) for t in (visits, firsts)], torch.device("cpu"))
+    (late,) = queued
+    late()
+    assert not visits.any()
+
+
+def test_a_second_interrupt_waits_too(monkeypatch):
+    """It comes while the first one waits for a thread, which is still at work."""
+    begun, ended, finish, finished = threading.Event(), threading.Event(), interop._SharedLaunch.finish, []
+
+    def work(shared):
+        if threading.current_thread() is threading.main_thread():
+            begun.wait(10)
+            raise KeyboardInterrupt("first")
+        begun.set()
+        ended.wait(10)
+
+    def interrupted(shared):
+        if not finished:
+            finished.append("interrupted")
+            raise KeyboardInterrupt("second")
+        ended.set()
+        finish(shared)
+        finished.append(shared.working)
+
+    monkeypatch.setattr(interop._SharedLaunch, "work", work)
+    monkeypatch.setattr(interop._SharedLaunch, "finish", interrupted)
+    monkeypatch.setattr(interop, "_OF_THREAD", interop._OfThread())
+    torch.set_num_threads(2)
+    arguments = [interop.view(torch.zeros(30_000, dtype=torch.int32), wp.int32) for _ in range(2)]
+    with pytest.raises(KeyboardInterrupt, match="second"):
+        interop.launch(interop_mark, 30_000, arguments, torch.device("cpu"))
+    assert finished == ["interrupted", 0]
+
+
+def test_an_error_of_another_thread_is_raised(monkeypatch):
+    """A launch that failed there is not taken for a whole one."""
+    work, failed = interop._SharedLaunch.work, threading.Event()
+
+    def fails(shared):
+        if threading.current_thread() is not threading.main_thread():
+            failed.set()
+            raise MemoryError
+        failed.wait(10)
+        work(shared)
+
+    monkeypatch.setattr(interop._SharedLaunch, "work", fails)
+    torch.set_num_threads(2)
+    arguments = [interop.view(torch.zeros(30_000, dtype=torch.int32), wp.int32) for _ in range(2)]
+    with pytest.raises(MemoryError):
+        interop.launch(interop_mark, 30_000, arguments, torch.device("cpu"))
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"dtype": torch.float64}, "visits must be torch.int32 on .*, not torch.float64 on "),
+        ({"dtype": torch.int32, "device": "meta"}, "visits must be torch.int32 on .*, not torch.int32 on meta"),
+    ],
+)
+def test_a_recorded_launch_checks_type_and_device(device, wrong, message):
+    """Kernels would read other numbers, or no memory."""
+    right = {"dtype": torch.int32, "device": device}
+    rest = interop.view(torch.zeros(3, **right), wp.int32)
+    interop.launch(interop_mark, 3, [interop.view(torch.zeros(3, **right), wp.int32), rest], device)
+    with pytest.raises(TypeError, match=message):
+        interop.launch(interop_mark, 3, [interop.view(torch.zeros(3, **right | wrong), wp.int32), rest], device)
+
+
+def test_another_type_at_the_same_address_is_seen():
+    """A tensor of 32-bit integers read as floats: same address, same shape."""
+    numbers, rest = torch.zeros(3, dtype=torch.int32), interop.view(torch.zeros(3, dtype=torch.int32), wp.int32)
+    interop.launch(interop_mark, 3, [interop.view(numbers, wp.int32), rest], torch.device("cpu"))
+    with pytest.raises(TypeError, match=r"not torch.float32 on cpu"):
+        interop.launch(interop_mark, 3, [interop.view(numbers.view(torch.float32), wp.int32), rest], torch.device("cpu"))
+
+
+def test_devices_without_kernels_are_refused_by_name():
+    """Before a launch is looked up: meta stands for mps, xpu and the others."""
+    g, cam = cloud(30), camera(dtype=torch.float32)
+    rasterize(g, cam)
+    with pytest.raises(ValueError, match=r"means is on meta, but the kernels run on cpu and cuda only"):
+        rasterize(g.to("meta"), cam)
+    with pytest.raises(ValueError, match=r"camera.K is on meta, but the kernels"):
+        rasterize(g, dataclasses.replace(cam, K=cam.K.to("meta")))
+    with pytest.raises(ValueError, match="mark: the kernels run on cpu and cuda only, not on meta"):
+        interop.launch(interop_mark, 3, [], torch.device("meta"))
+
+
+@pytest.mark.filterwarnings("ignore:Accessing the data pointer of FakeTensor")
+def test_fake_tensors_are_refused():
+    """They have a device and no memory; under their mode every new tensor is one."""
+    g, cam = cloud(30), camera(dtype=torch.float32)
+    rasterize(g, cam)
+    with FakeTensorMode(allow_non_fake_inputs=True) as mode:
+        with pytest.raises(ValueError, match="means is a fake tensor, without memory"):
+            rasterize(Gaussians(**{n: mode.from_tensor(t) for n, t in g.tensors().items()}), cam)
+        with pytest.raises(TypeError, match="not a FakeTensor without memory"):
+            rasterize(g, cam)
+
+
+def test_a_launch_that_failed_is_recorded_anew(monkeypatch):
+    """Under the lock, as a first one: it may have to be compiled."""
+    locked, load = [], interop.load_module
+    arguments = [interop.view(torch.zeros(3, dtype=torch.int32), wp.int32) for _ in range(2)]
+
+    def fails_once(*given):
+        locked.append(interop._LOADING.locked())
+        if len(locked) == 1:
+            raise ResourceError("no memory")
+        return load(*given)
+
+    monkeypatch.setattr(interop, "_OF_THREAD", interop._OfThread())
+    monkeypatch.setattr(interop, "load_module", fails_once)
+    with pytest.raises(ResourceError):
+        interop.launch(interop_mark, 3, arguments, torch.device("cpu"))
+    interop.launch(interop_mark, 3, arguments, torch.device("cpu"))
+    assert locked == [True, True]
+
+
+@wp.kernel(enable_backward=False)
+def tell_apart(
+    begin: int, table: wp.array2d(dtype=wp.float32), numbers: wp.array(dtype=wp.float32), found: wp.array(dtype=wp.float32)
+):
+    i = begin + wp.tid()
+    found[i] = wp.float32(table.shape[0] * 100 + table.shape[1]) + 1000.0 * table[i, 1] + 1000000.0 * numbers[i]
+
+
+def test_arguments_of_one_and_two_axes_share_the_memory_of_any_tensor():
+    """Flat, and in rows: also slices at the same address, of the same shape, whose rows lie at other distances."""
+    memory = torch.arange(60, dtype=torch.float32)
+    for width in (5, 10, 5):
+        image = memory.view(-1, 2, width)[:3]  # as of two rows of pixels
+        part = image[..., :3]
+        found = torch.zeros(6)
+        interop.launch(tell_apart, 6, [part, image, found], torch.device("cpu"))
+        wanted = 603 + 1000 * part.reshape(6, 3)[:, 1] + 1e6 * image.reshape(-1)[:6]
+        assert torch.equal(found, wanted), width
+    column = memory.view(1, 6, 10).transpose(0, 1)  # of images one pixel wide; its stride there is that of no row
+    for image in (column, column[..., :4]):
+        found = torch.zeros(6)
+        interop.launch(tell_apart, 6, [image, memory, found], torch.device("cpu"))
+        wanted = 600 + image.shape[-1] + 1000 * image[:, 0, 1] + 1e6 * memory[:6]
+        assert torch.equal(found, wanted), image.shape
+    for none, shape in ((part[..., :0], (0, 0)), (part[:0], (0, 3))):
+        assert [v.array().shape for v in interop.arguments(tell_apart, [none, none, found])] == [shape, (0,), (6,)]
+
+
+@wp.kernel(enable_backward=False)
+def second_of_row(begin: int, entries: wp.array(dtype=wp.float32), step: int, found: wp.array(dtype=wp.float32)):
+    i = begin + wp.tid()
+    found[i] = wp.float32(entries.shape[0]) + 1000.0 * entries[i * step + 1]
+
+
+def test_an_argument_of_one_axis_spans_what_lies_between_rows():
+    """Slices at the same address, of the same shape, whose rows lie at other distances; and those without rows."""
+    memory = torch.arange(60, dtype=torch.float32)
+    for width in (5, 10, 5):
+        part, found = memory.view(-1, 2, width)[:3][..., :3], torch.zeros(6)
+        arguments = [interop.span(part, wp.float32), part.stride(-2), found]
+        interop.launch(second_of_row, 6, arguments, torch.device("cpu"))
+        assert torch.equal(found, 5 * width + 3 + 1000 * part.reshape(6, 3)[:, 1]), width
+    assert interop.span(part[:0], wp.float32).array().shape == (0,)
+
+
+def test_pairs_are_sorted_in_place_where_they_lie():
+    """Stably, by tensors that come and go at the same address, too."""
+    for seed in range(3):
+        keys = torch.randint(4, (40,), dtype=torch.int32, generator=torch.Generator().manual_seed(seed))
+        values, wanted = torch.arange(40, dtype=torch.int32), keys[:20].sort(stable=True)
+        sorting.sort_pairs(keys, values, 20, end_bit=2)
+        assert torch.equal(keys[:20], wanted.values) and torch.equal(values[:20].long(), wanted.indices)
+
+
+def test_items_are_numbered_in_31_bits():
+    """2^31 - 1 of them can be, one more cannot."""
+    interop._check_size(2**31 - 1)
+    with pytest.raises(ResourceError, match=r"2,147,483,648 entries is beyond the 2,147,483,647"):
+        interop._check_size(2**31)
+
+
+def test_check_names_what_disagrees():
+    """Each rule of `check` alone, and the sizes where all hold."""
+    a, b = torch.zeros(2, 3), torch.zeros(4, 2)
+    assert interop.check(a=(a, "N 3"), b=(b, "K N")) == {"N": 2, "K": 4}
+    with pytest.raises(TypeError, match="a must be a torch tensor, not list"):
+        interop.check(a=([1.0], "N"))
+    with pytest.raises(TypeError, match=r"a must be float32 or float64, not torch\.int32"):
+        interop.check(a=(a.int(), "N 3"))
+    with pytest.raises(TypeError, match=r"b is torch\.float64 but a is torch\.float32"):
+        interop.check(a=(a, "N 3"), b=(b.double(), "K N"))
+    with pytest.raises(ValueError, match="b is on meta but a is on cpu"):
+        interop.check(a=(a, "N 3"), b=(b.to("meta"), "K N"))
+    for pattern in ("N", "N 3 1", "N 4", "N N", "3 3"):
+        with pytest.raises(ValueError, match=r"a must have shape .* not \[2, 3\]"):
+            interop.check(a=(a, pattern))
+    with pytest.raises(ValueError, match=r"b must have shape \[N, 2\] \(N=2\), not \[4, 2\]"):
+        interop.check(a=(a, "N 3"), b=(b, "N 2"))
+
+
+def test_a_driver_that_is_missing_is_no_news(monkeypatch, capfd):
+    """Output of native code is dropped inside the context, not after it."""
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    with interop._without_driver_notice():
+        os.write(2, b"no driver")
+    os.write(2, b"news")
+    assert capfd.readouterr().err == "news"
+
+
+# Allocators: an arena gives a function its tensors again, apart, aligned, at the same places each time.
+
+CPU = torch.device("cpu")
+BYTE = torch.empty(0, dtype=torch.uint8)
+
+
+def ask(allocator):
+    """Ask for two output, three saved and two workspace tensors; one of each kind has an odd size."""
+    outputs = [allocator.output((3, 5), torch.float32, CPU), allocator.output((7,), torch.int32, CPU)]
+    saved = [allocator.saved(s, t, CPU) for s, t in (((11,), torch.int64), ((0,), torch.float32), ((2, 33), torch.float32))]
+    return outputs, saved, [allocator.workspace((1,), torch.int32, CPU), allocator.workspace((2, 3, 4), torch.float64, CPU)]
+
+
+def test_an_arena_gives_the_same_shapes_and_each_its_own_memory():
+    """A write to one tensor changes no other."""
+    sizes = SizingAllocator()
+    wanted = [[(tuple(t.shape), t.dtype) for t in kind] for kind in ask(sizes)]
+    arena = Arena(sizes, BYTE)
+    found = ask(arena)
+    assert [[(tuple(t.shape), t.dtype) for t in kind] for kind in found] == wanted
+    assert [[(tuple(t.shape), t.dtype) for t in kind] for kind in ask(TORCH)] == wanted
+    every = [t for kind in found for t in kind]
+    for number, t in enumerate(every):
+        t.fill_(number)
+    assert all(bool((t == number).all()) for number, t in enumerate(every))
+    assert all(a is b for a, b in zip(arena.outputs, found[0], strict=True))
+
+
+def test_saved_tensors_are_found_again_in_any_such_block():
+    """Places are multiples of ALIGNMENT, and hold for every block of that size."""
+    sizes = SizingAllocator()
+    ask(sizes)
+    first, second = Arena(sizes, BYTE), Arena(sizes, BYTE)
+    places = [first.place(t) for t in ask(first)[1]]
+    assert all(begin % ALIGNMENT == 0 for begin, _, _ in places) and len({begin for begin, _, _ in places}) >= 2
+    _, saved, _ = ask(second)
+    for number, t in enumerate(saved):
+        t.fill_(number + 1)
+    assert all(torch.equal(part(second.block, *place), t) for place, t in zip(places, saved, strict=True))
+
+
+def test_addresses_name_all_memory():
+    """They are those of the outputs and of both blocks; another arena has others."""
+    sizes = SizingAllocator()
+    ask(sizes)
+    arena = Arena(sizes, BYTE)
+    outputs, saved, workspace = ask(arena)
+    assert arena.addresses() == tuple(t.data_ptr() for t in (*outputs, saved[0], workspace[0]))
+    assert Arena(sizes, BYTE).addresses() != arena.addresses()
+
+
+def test_addresses_are_looked_up_when_the_kernel_runs(device):
+    """Two tensors of any lengths are joined; another time they are others, also where a graph is replayed."""
+    on_gpu = device.type == "cuda"
+    table = wp.zeros(3, dtype=wp.uint64, device="cpu", pinned=on_gpu)
+    out = torch.zeros(9, device=device)
+
+    def work():
+        fetch(table.ptr, 4, 7, out)
+
+    graph = None
+    for base in (0, 100, 200):
+        first, second = base + torch.arange(4.0, device=device), base + 50 + torch.arange(3.0, device=device)
+        third = base + 80 + torch.arange(2.0, device=device)
+        table.numpy()[:] = first.data_ptr(), second.data_ptr(), third.data_ptr()
+        if on_gpu and graph is None and base > 0:
+            graph = CapturedGraph(work, torch.cuda.Stream())
+            torch.cuda.synchronize()
+        work() if graph is None else graph.replay()
+        assert out.tolist() == [*first.tolist(), *second.tolist(), *third.tolist()]
+
+
+# A module is compiled by one process while another that needs it waits; nothing is locked once it is loaded.
+
+ROOT = Path(__file__).parent.parent.parent
+OTHER = """
+import torch
+from tests.kernels.test_launch import load_module_mark as mark
+from warpgs.errors import ResourceError
+from warpgs.kernels import launch as interop
+from warpgs.kernels import native as load_module
+import warp
+def refuse(*_, **__): raise AssertionError("compiled a second time")
+warp._src.build.build_cpu = refuse
+lock = load_module.lock_descriptor
+def note(descriptor):
+    print("waits", flush=True)
+    lock(descriptor)
+load_module.lock_descriptor = note
+seen = torch.zeros(3, dtype=torch.int32)
+interop.launch(mark, 3, [interop.view(seen, warp.int32)], torch.device("cpu"))
+print(seen.tolist())
+"""
+
+
+@wp.kernel(enable_backward=False, module="unique")
+def load_module_mark(begin: int, seen: wp.array(dtype=int)):
+    i = begin + wp.tid()
+    seen[i] = i + 1
+
+
+@pytest.fixture
+def cache(tmp_path, monkeypatch):
+    """An empty cache for this process and those it starts; returns this version's folder."""
+    folder = tmp_path / wp.config.version
+    monkeypatch.setattr(wp.config, "kernel_cache_dir", str(folder))
+    monkeypatch.setenv("WARP_CACHE_PATH", str(tmp_path))
+    return folder
+
+
+def test_two_processes_compile_a_module_once(cache):
+    """The other process waits for the one that has the lock, finds the compiled module, and runs it."""
+    environment = os.environ | {"PYTHONPATH": str(ROOT), "CUDA_VISIBLE_DEVICES": ""}
+    name, cpu = load_module_mark.module.get_module_identifier(1), wp.get_device("cpu")
+    (cache / "locks").mkdir(parents=True)
+    with native.exclusive(cache / "locks" / f"{name}.0"):
+        other = subprocess.Popen([sys.executable, "-c", OTHER], env=environment, stdout=subprocess.PIPE, text=True)
+        assert other.stdout.readline() == "waits\n"
+        load_module_mark.module.load(cpu, block_dim=1)
+    assert other.communicate()[0] == "[1, 2, 3]\n" and other.returncode == 0
+
+
+def test_a_loaded_module_takes_no_lock(cache, monkeypatch):
+    """Neither the second launch nor any later one opens a file."""
+    seen = torch.zeros(3, dtype=torch.int32)
+    for _ in range(2):
+        launch.launch(load_module_mark, 3, [launch.view(seen, wp.int32)], torch.device("cpu"))
+        monkeypatch.setattr(native, "exclusive", None)
+    assert seen.tolist() == [1, 2, 3]
+
+
+def test_a_listener_hears_of_modules_that_the_cache_lacks(cache, monkeypatch):
+    """Once: not of one that the cache holds by now, nor after the block."""
+    cpu, heard, took = wp.get_device("cpu"), [], []
+    for _ in range(2):
+        monkeypatch.setattr(native, "_LOADED", set())
+        load_module_mark.module.unload()
+        with native.told_of_compiling(heard.append) as seconds:
+            native.load_module(load_module_mark.module, cpu, 1)
+        took.append(len(seconds))
+        assert heard == [load_module_mark.module.get_module_identifier(1)]
+    assert not native._LISTENERS and took == [1, 0]
+
+
+def test_a_file_system_without_locks_is_no_obstacle(tmp_path, monkeypatch):
+    def refuse(_):
+        raise OSError(95, "not supported")
+
+    monkeypatch.setattr(native, "lock_descriptor", refuse)
+    with native.exclusive(tmp_path / "lock"):
+        pass
+    with pytest.raises(OSError, match="of the body"), native.exclusive(tmp_path / "lock"):
+        raise OSError("of the body")
+
+
+def test_a_lock_that_cannot_be_made_is_named_with_a_remedy(tmp_path):
+    with pytest.raises(ResourceError, match="WARP_CACHE_PATH"), native.exclusive(tmp_path / "no" / "lock"):
+        pytest.fail("held")

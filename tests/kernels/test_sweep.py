@@ -1,0 +1,107 @@
+"""The plane sweep: matching costs, costs of paths, and the best plane."""
+
+import numpy as np
+import pytest
+import torch
+
+from tests.priors.rigs import still_life
+from tests.reference import sweep as plane_costs
+from tests.reference.sweep import best_inverse
+from tests.reference.sweep import scanline_costs as defined
+from warpgs.kernels.sweep import LARGEST, best_inverses, scanline_costs
+from warpgs.priors.sweep import UNIT, matching_costs_cpu
+from warpgs.scene import Camera, View
+
+# Matching costs are those of OpenCV.
+
+
+@pytest.mark.parametrize("size", [(7, 160), (160, 5), (1, 1), (40, 70)])
+def test_costs_are_those_of_opencv(size):
+    """Costs differ from those of OpenCV's warps and blurs by rounding, in images of any size, and at their borders."""
+    height, width = size
+    views = []
+    for v in still_life()[0]:
+        c = v.camera
+        views.append(View(v.name, Camera(c.viewmat, c.K, width, height), np.resize(v.image[40:], (height, width, 3))))
+    views[2] = still_life()[0][2]  # of another size
+    inverses = np.linspace(1 / 12, 1 / 2, 21)
+    found = matching_costs_cpu(views[1], [views[0], views[2]], inverses, 7).numpy()
+    wanted = plane_costs.matching_costs(views[1], [views[0], views[2]], inverses, 7).transpose(1, 2, 0)
+    off = np.abs(found[..., :21] / UNIT - wanted)
+    # a pixel at the very border is inside for one and outside for the other
+    assert found.shape == (height, width, 32) and np.quantile(off, 0.995) < 0.01 and off.mean() < 2e-3
+    assert (found[..., 21:] == UNIT).all()
+
+
+# The best plane is that of numpy, to the bit.
+
+
+def test_best_planes_are_those_of_numpy():
+    """Ties go to the first plane, ends are moved inwards, and planes past the last do not count."""
+    inverses = np.linspace(0.1, 0.5, 9)
+    costs = np.random.default_rng(2).integers(0, 99, (6, 5, 16)).astype(np.int16)
+    assert np.array_equal(best_inverses(torch.from_numpy(costs), inverses), best_inverse(costs[..., :9], inverses))
+
+
+# Path costs: equal to their definition to the last unit, in every shape, and never beyond 16 bits.
+
+
+def problem(shape: tuple[int, int, int], seed: int = 0, largest: int = 4096):
+    """Random costs and limits."""
+    g = np.random.default_rng(seed)
+    height, width, _ = shape
+    limits = [g.integers(0, 2000, s).astype(np.int32) for s in ((height - 1, width), (height, width - 1))]
+    return g.integers(0, largest + 1, shape).astype(np.int16), *limits
+
+
+def computed(device, costs, down, across, small) -> np.ndarray:
+    on_device = (torch.from_numpy(np.ascontiguousarray(a)).to(device) for a in (costs, down, across))
+    return scanline_costs(*on_device, small).cpu().numpy()
+
+
+@pytest.mark.parametrize("shape", [(4, 5, 6), (1, 7, 3), (7, 1, 3), (3, 4, 1), (3, 4, 2), (40, 33, 17), (1, 1, 4)])
+def test_equal_to_the_definition(device, shape):
+    """The sums agree to the last unit, also for one row, one column and one plane."""
+    costs, down, across = problem(shape)
+    assert np.array_equal(computed(device, costs, down, across, 123), defined(costs, down, across, 123))
+
+
+def test_penalties_decide(device):
+    """Without any, each pixel keeps its costs four times; large ones carry one pixel's plane all along its lines."""
+    costs, down, across = problem((6, 9, 5))
+    free = computed(device, costs, np.zeros_like(down), np.zeros_like(across), 0)
+    assert np.array_equal(free, 4 * costs.astype(int))
+    even = np.full((6, 9, 5), 100, np.int16)
+    even[2, 3, 4] = 0
+    tied = computed(device, even, np.full_like(down, 4000), np.full_like(across, 4000), 1000)
+    assert (tied[2].argmin(1) == 4).all() and (tied[:, 3].argmin(1) == 4).all() and (tied[0, 0] == tied[0, 0, 0]).all()
+
+
+def test_the_dearest_costs_fit(device):
+    """Costs and penalties of `LARGEST` together, the best plane another in every pixel: still below 2^15."""
+    cost, penalty = 4096, LARGEST - 4096
+    costs = np.full((6, 6, 8), cost, np.int16)
+    y, x = np.indices((6, 6))
+    costs[y, x, (3 * y + 5 * x) % 8] = 0
+    limits = np.full((5, 6), penalty, np.int32), np.full((6, 5), penalty, np.int32)
+    found = computed(device, costs, *limits, penalty)
+    assert np.array_equal(found, defined(costs, *limits, penalty)) and found.min() >= 0 and found.max() > 3 * 2**13
+
+
+def test_memory_order_does_not_matter(device):
+    """A transposed view of the costs, as a caller may hold them, gives the same sums."""
+    costs, down, across = (torch.from_numpy(a).to(device) for a in problem((5, 8, 6)))
+    turned = costs.permute(2, 0, 1).contiguous().permute(1, 2, 0)
+    assert not turned.is_contiguous()
+    assert torch.equal(scanline_costs(turned, down, across, 50), scanline_costs(costs, down, across, 50))
+
+
+@pytest.mark.parametrize("wrong", ["costs", "down", "across"])
+def test_wrong_arguments_are_named(device, wrong):
+    """A type or a shape that does not fit: which, what was wanted and what was found."""
+    good = dict(zip(("costs", "down", "across"), (torch.from_numpy(a).to(device) for a in problem((5, 8, 6)))))
+    with pytest.raises(ValueError, match=f"{wrong} must be"):
+        scanline_costs(**(good | {wrong: good[wrong].float()}), small=1)
+    if wrong != "costs":
+        with pytest.raises(ValueError, match=f"{wrong} must be .* not torch.int32 of shape"):
+            scanline_costs(**(good | {wrong: good[wrong][:-1]}), small=1)

@@ -1,0 +1,608 @@
+"""Kinds of views in a fit: other camera models, lenses from a folder, the antialiasing filter, objects cut out."""
+
+import dataclasses
+import json
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+import warpgs
+from tests.io.scenes import save
+from tests.parallel_camera import NAME
+from tests.scenes import photos, ring, seeds, three_gaussians
+from warpgs import geometry
+from warpgs.app.cli import main
+from warpgs.errors import UsageError
+from warpgs.export.base import read_with_antialiasing
+from warpgs.export.meshes_and_cameras import write_cameras
+from warpgs.geometry import look_at, pinhole_of, seen_pixels
+from warpgs.io.images import list_images
+from warpgs.kernels.neighbours import pixel_size
+from warpgs.kernels.update import SHIFT
+from warpgs.pipeline.films.paths import framed
+from warpgs.pipeline.metrics.scores import fitted_region, score
+from warpgs.pipeline.model import limits
+from warpgs.pipeline.model import start as init
+from warpgs.pipeline.model.depth_points import carve, hull_points, in_empty_region, silhouettes
+from warpgs.pipeline.model.limits import LimitConfig, TrainingCameras
+from warpgs.pipeline.model.start import InitConfig, initial_points, random_points
+from warpgs.pipeline.run.commands import open_file
+from warpgs.pipeline.run.folder import _camera, camera_values
+from warpgs.pipeline.train import step, trainer
+from warpgs.pipeline.train.loss import AlphaDifference, LossConfig, LossInputs, Target
+from warpgs.pipeline.train.memory import most_instances
+from warpgs.pipeline.train.schedule import over, random_shift
+from warpgs.pipeline.train.settings import FitConfig, settings_by_views
+from warpgs.pipeline.train.setup import prepare
+from warpgs.pipeline.train.strategies.clone_split import DensityConfig
+from warpgs.pipeline.train.trainer import Trainer
+from warpgs.pipeline.train.views import TrainingView, half_size, stack_views, with_alpha
+from warpgs.render.options import RasterizeOptions
+from warpgs.render.rasterize import rasterize
+from warpgs.scene import Camera, PointCloud, Scene, View
+from warpgs.synthetic.demo import split_spec, write_demo
+from warpgs.viewer.window import content_of_file, content_of_run
+
+# A fit of views whose camera model is not a pinhole: model and coefficients reach every place that renders.
+
+CPU = torch.device("cpu")
+CONFIG = FitConfig(
+    steps=40, strategy="clone_split", init=InitConfig(source="points"), max_gaussians=60, half_resolution=0.0, dropout=0.0,
+    batch=1,
+)  # fmt: skip
+BEND = (0.15, -0.05, -0.1, 0.08)
+
+
+def bent(camera: Camera, bend: tuple[float, ...] = BEND) -> Camera:
+    """Return a parallel camera that shows about what a pinhole shows at the distance of the scene's middle."""
+    distance = np.linalg.norm(camera.center)
+    K = np.diag([1 / distance, 1 / distance, 1]) @ camera.K
+    K[:2, 2] = camera.K[:2, 2]
+    return dataclasses.replace(camera, K=K, model=NAME, distortion=np.array(bend))
+
+
+def views(count: int = 4) -> list[View]:
+    """Views of three Gaussians; of every two cameras the second bends the other way."""
+    found = []
+    for i, camera in enumerate(ring(count, 40, 32)):
+        c = bent(camera, tuple((-1) ** i * b for b in BEND))
+        found.append(View(f"{i:02d}.png", c, rasterize(three_gaussians(), c).rgb.clamp(0, 1).numpy()))
+    return found
+
+
+@pytest.fixture(scope="module")
+def fit() -> Trainer:
+    """A fit before its first step."""
+    return Trainer(views(), seeds(), CONFIG, CPU)
+
+
+def rendered_alone(fit: Trainer, number: int, **options) -> torch.Tensor:
+    """Return a view's image from the fit's Gaussians, by its own camera."""
+    camera = views()[number].camera
+    return rasterize(fit.gaussians, camera, RasterizeOptions(rule=fit.config.rule, sh_degree=0, **options)).rgb
+
+
+@pytest.mark.slow
+def test_the_fit_explains_what_the_model_shows():
+    """As pinholes, the same cameras leave nearly twice the error."""
+    lost = [dataclasses.replace(v, camera=dataclasses.replace(v.camera, model="pinhole", distortion=None)) for v in views()]
+    errors = []
+    for train in (views(), lost):
+        trainer, mse = Trainer(train, seeds(), dataclasses.replace(CONFIG, steps=200), CPU), []
+        while trainer.step < trainer.steps:
+            mse += [10 ** (-report.psnr / 10) for report in trainer.advance()]
+        errors.append(np.mean(mse[-4:]))
+    assert errors[0] < 0.7 * errors[1]
+
+
+@pytest.mark.parametrize("captured", [False, True], ids=["eager", "fixed capacity"])
+def test_a_step_renders_by_the_views_own_camera(fit, captured):
+    """The loss of the first step is that of an image which `rasterize` renders alone, to the bit."""
+    plan = fit.plan_of(1)
+    (stack,) = fit.stacks.values()
+    for number in range(4):
+        fit.buffers.load([number], [[0.0] * fit.buffers.lr_rows.shape[1]], [fit.settings(1)])
+        if captured:
+            capacity = step.instance_capacity(fit.gaussians, stack, plan.degree, fit.context.render_options())
+            render = step.captured_renderer(fit.context.render_options(), capacity, fit.buffers.stop)
+        else:
+            render = step.eager_renderer(fit.context.render_options(), None)
+        step.view_gradients(fit.learned, stack, fit.buffers, plan, render)
+        image = torch.as_tensor(views()[number].image)
+        wanted = ((rendered_alone(fit, number) - image) ** 2).mean()
+        _, _, history = fit.buffers.result()
+        assert history[0][1] == pytest.approx(float(wanted), rel=1e-6) and float(wanted) > 1e-3
+
+
+def test_a_step_in_chunks_renders_the_same(fit):
+    """Chunks count the tiles of each window by the same camera; its coefficients move Gaussians by tiles."""
+    whole, chunks = rendered_alone(fit, 1), rendered_alone(fit, 1, max_instances=20)
+    assert torch.equal(whole, chunks)
+    camera = ring(1, 160, 128)[0]
+    for number in (1, -1):
+        c = bent(camera, (0.8 * number, 0.0, -0.8 * number, 0.0))
+        renders = [rasterize(three_gaussians(), c, RasterizeOptions(max_instances=most)) for most in (None, 20)]
+        assert torch.equal(renders[0].rgb, renders[1].rgb) and float(renders[0].alpha.max()) > 0.5
+
+
+def test_memory_is_planned_for_the_instances_of_the_model(fit):
+    """Capacity of captured steps and the memory plan count what the model projects."""
+    cameras = [v.camera for v in views()]
+    options = RasterizeOptions(rule=fit.config.rule, sh_degree=0)
+    most = max(int(rasterize(fit.gaussians, c, options).tile_counts.sum()) for c in cameras)
+    pinholes = [dataclasses.replace(c, model="pinhole", distortion=None) for c in cameras]
+    assert most != max(int(rasterize(fit.gaussians, c, options).tile_counts.sum()) for c in pinholes)
+    assert most_instances(fit.gaussians, [v.camera for v in fit.views], options) == most
+    (stack,) = fit.stacks.values()
+    capacity = step.instance_capacity(fit.gaussians, stack, 0, options)
+    assert capacity == int(step.CAPACITY_FACTOR * most) + 1024
+
+
+def test_half_size_views_and_stacks_keep_the_model(fit):
+    """Coefficients do not depend on the size; stacks hold views of one model."""
+    for shown, view in zip(fit.views, views()):
+        for camera in (shown.camera, half_size(shown).camera):
+            assert camera.model == NAME and np.allclose(camera.distortion, view.camera.distortion)
+    mixed = Trainer([*views(2), *photos(2, 40, 32)], seeds(), CONFIG, CPU)
+    assert sorted(s.model for s in mixed.stacks.values()) == ["pinhole", NAME]
+    for stack in mixed.stacks.values():
+        for camera, number in zip(stack.cameras(), stack.numbers):
+            assert camera.model == mixed.views[number].camera.model
+
+
+def test_run_folders_keep_the_model():
+    """config.json holds model and coefficients, and a pinhole's record has none."""
+    camera = views()[1].camera
+    back = _camera(json.loads(json.dumps(camera_values(camera))))
+    assert back.model == NAME and np.array_equal(back.distortion, camera.distortion) and np.array_equal(back.K, camera.K)
+    assert "distortion" not in camera_values(photos(1)[0].camera)
+
+
+def test_what_cannot_be_rendered_is_refused_before_the_first_step():
+    """An unknown model, or one with other coefficients; the error says which."""
+    first, *rest = views(2)
+    for change, words in (({"model": "fish"}, "unknown camera model 'fish'"), ({"distortion": np.zeros(2)}, "takes 4")):
+        wrong = dataclasses.replace(first, camera=dataclasses.replace(first.camera, **change))
+        with pytest.raises(UsageError, match=words):
+            Trainer([*rest, wrong], seeds(), CONFIG, CPU)
+
+
+def test_a_fit_of_such_views_is_scored_written_and_opened_again(tmp_path):
+    """The whole command, with scores and report; a note names the checks that compare views, which are left out."""
+    scene = Scene("memory", "none", tuple(views()), points=seeds())
+    done = warpgs.fit(scene, CONFIG, steps=3, split="every:4", out=tmp_path / "run", device="cpu", verbose=False)
+    assert "coverage" not in done.metrics and any(NAME in n and "cannot be compared" in n for n in done.notes)
+    assert done.metrics["rule"]["max"] < 2e-6  # the same kernels in float32 and float64: measured 1.3e-7
+    assert (tmp_path / "run" / "report.html").is_file()
+    opened = warpgs.open_run(tmp_path / "run").cameras()["01.png"]
+    assert opened.model == NAME and np.array_equal(opened.distortion, views()[1].camera.distortion)
+
+
+@pytest.mark.parametrize("changes", [{"init_source": "random"}, {"strategy": "sampling"}])
+def test_settings_that_compare_views_are_refused_before_the_first_step(changes):
+    scene = Scene("memory", "none", tuple(views()), points=seeds())
+    with pytest.raises(UsageError, match=r"--preset 3dgs --init\.source points"):
+        warpgs.fit(scene, CONFIG, device="cpu", verbose=False, **changes)
+
+
+# A fit through a lens from a folder to its scores, and what each command makes of such a run.
+
+LENS = ("OPENCV_FISHEYE", "fisheye", (2.0, 0, 0, 0))
+"""A lens that shows less of the scene than the pinhole of the same K."""
+LENS_CPU = ["--device", "cpu"]
+
+
+def write_lens_demo(folder) -> None:
+    """Write the demo scene as a fisheye takes it: its images through the lens, and cameras that say so."""
+    write_demo(folder, views=8, width=64, height=48)
+    cameras = folder / "sparse" / "0" / "cameras.txt"
+    number, _, width, height, *K = cameras.read_text().splitlines()[-1].split()
+    fx, fy, cx, cy = map(float, K)
+    x, y = np.meshgrid(np.arange(64) + 0.5, np.arange(48) + 0.5)
+    rays = geometry.from_plane(LENS[1], np.array(LENS[2]), np.stack([(x - cx) / fx, (y - cy) / fy], -1))
+    at = rays[..., :2] / rays[..., 2:] * [fx, fy] + [cx - 0.5, cy - 0.5]
+    for path in list_images(folder / "images"):
+        image = cv2.imread(str(path))[..., ::-1]
+        save(path, cv2.remap(image, *np.moveaxis(at.astype(np.float32), -1, 0), cv2.INTER_LINEAR))
+    cameras.write_text(f"{number} {LENS[0]} {width} {height} {' '.join(K)} {' '.join(map(str, LENS[2]))}\n")
+
+
+@pytest.fixture(scope="module")
+def lens_run(tmp_path_factory):
+    """A run of the default preset through the lens."""
+    folder = tmp_path_factory.mktemp("lens")
+    write_lens_demo(folder / "scene")
+    flags = ["--lenses", "native", "--steps", "8", "--split", split_spec(8), *LENS_CPU]
+    assert main(["fit", str(folder / "scene"), "--out", str(folder / "run"), *flags]) == 0
+    return folder / "run"
+
+
+@pytest.mark.slow
+def test_the_default_fit_goes_through_the_lens(lens_run):
+    """Images are those of the float64 reference through the lens, and coverage is known."""
+    record, metrics = (json.loads((lens_run / f"{n}.json").read_text()) for n in ("config", "metrics"))
+    assert record["scene"]["lenses"] == "native"
+    assert {c["model"] for c in record["cameras"].values()} == {"fisheye"}
+    assert metrics["rule"]["mean"] < 1e-5 and metrics["coverage"]["classes"]
+
+
+@pytest.mark.slow
+def test_depth_found_in_other_views_is_that_of_the_lens(lens_run):
+    """Where the sweep finds depth, exact points of the scene lie there in half of the pixels."""
+    scene = warpgs.load_scene(lens_run.parent / "scene", lenses="native")
+    config, _ = settings_by_views(FitConfig(steps=2, init=InitConfig(source="sweep")), list(scene.views), "cpu")
+    cpu, generator = torch.device("cpu"), np.random.default_rng(0)
+    depths = prepare(list(scene.views), None, config, generator, cpu, [], lambda: None).start.depths
+    errors = []
+    for view, found in zip(scene.views, depths, strict=True):
+        own = np.array([view.name in t for t in scene.points.tracks])
+        _, rows, columns, exact = seen_pixels(view.camera, scene.points.points[own])
+        valid = found.valid[rows, columns]
+        errors.append(np.abs(found.depth[rows, columns][valid] / exact[valid] - 1))
+    # 0.009; where the lens is read as a pinhole 0.045
+    assert sum(map(len, errors)) > 500 and np.median(np.concatenate(errors)) < 0.018
+
+
+@pytest.mark.slow
+def test_commands_know_the_lens_or_take_its_pinhole(lens_run, tmp_path, capsys):
+    """Scores go through the lens; films, meshes and files of cameras take the pinhole of the same K, which a note says."""
+    stored = warpgs.open_run(lens_run, "cpu")
+    camera = next(iter(stored.cameras().values()))
+    assert camera.model == "fisheye" and camera.distortion.tolist() == list(LENS[2])
+    before = json.loads((lens_run / "metrics.json").read_text())["test"]
+    assert main(["eval", str(lens_run), *LENS_CPU]) == 0
+    assert json.loads((lens_run / "metrics.json").read_text())["test"]["psnr"] == pytest.approx(before["psnr"], abs=1e-6)
+    assert (
+        main(["render", str(lens_run), "--path", "interpolate", "--frames", "2", "--out", str(tmp_path / "film"), *LENS_CPU])
+        == 0
+    )
+    assert main(["mesh", str(lens_run), "--out", str(tmp_path / "m.ply"), "--resolution", "16", *LENS_CPU]) == 0
+    capsys.readouterr()
+    assert main(["export", str(lens_run), "--to", str(tmp_path / "transforms.json")]) == 0
+    assert "written without their lens distortion, as pinholes" in capsys.readouterr().out
+    frame = json.loads((tmp_path / "transforms.json").read_text())["frames"][0]
+    assert frame["fl_x"] == pytest.approx(camera.K[0, 0])
+
+
+@pytest.mark.slow
+def test_orthographic_views_are_fitted_from_points(tmp_path):
+    """With scores and a report; where a pinhole would be needed, the error says what to do."""
+    views = []
+    for i, c in enumerate(ring(8)):
+        K = np.concatenate([c.K[:, :2] / 2.2, c.K[:, 2:]], 1)
+        c = dataclasses.replace(c, K=K, model="orthographic")
+        views.append(View(f"{i}.png", c, rasterize(three_gaussians(), c).rgb.clamp(0, 1).numpy()))
+    scene = Scene("", "own", tuple(views), points=seeds())
+    options = {"device": "cpu", "verbose": False, "split": "every:4"}
+    result = warpgs.fit(scene, "3dgs", steps=60, init={"source": "points"}, out=tmp_path / "run", **options)
+    # 16.7 dB; 16.8 by pinholes
+    assert result.metrics["test"]["psnr"] > 16 and "coverage" not in result.metrics
+    assert result.metrics["rule"]["mean"] < 1e-5 and (tmp_path / "run" / "report.html").is_file()
+    with pytest.raises(UsageError, match=r"camera model orthographic: .* --init.source points"):
+        warpgs.fit(scene, steps=2, **options)
+    with pytest.raises(UsageError, match="'orthographic'"):
+        warpgs.render_path(result, "turntable", out=tmp_path / "film", frames=2)
+
+
+def test_a_pinhole_in_place_of_a_lens():
+    """Pose, K and size stay; parallel rays have no pinhole."""
+    camera = dataclasses.replace(ring(1)[0], model="opencv", distortion=np.ones(8))
+    found = pinhole_of(camera)
+    assert (found.model, found.distortion) == ("pinhole", None) and found.K is camera.K and found.viewmat is camera.viewmat
+    assert framed(camera, (20, 16)).model == "pinhole" and pinhole_of(found) is found
+    parallel = Camera(camera.viewmat, camera.K, 40, 32, "orthographic")
+    with pytest.raises(UsageError, match="only pinhole cameras are supported here, not 'orthographic'"):
+        pinhole_of(parallel)
+
+
+# An antialiased fit: every part renders with the filter, from the first step to the files of the run.
+
+# points far below a pixel in size, so that every render with the filter is another than without
+SMALL = InitConfig(source="points", scale_factor=0.02)
+FILTERED_CONFIG = warpgs.FitConfig(steps=6, init=SMALL, antialiased=True, cpu_limit=False)
+SPLIT = "train=00.png,01.png,02.png,03.png;test=04.png"
+
+
+@pytest.fixture(scope="module")
+def free():
+    """No limit of the smallest size, so that the filter is all that differs."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(limits, "MIN_PIXELS", 0.0)
+        yield
+
+
+def scene() -> Scene:
+    return Scene("", "made", tuple(photos(5)), seeds(), fingerprint="x", pixels="as made")
+
+
+def filtered(gaussians, camera, antialiased: bool = True) -> np.ndarray:
+    """Render without anything of a fit."""
+    return rasterize(gaussians, camera, RasterizeOptions(antialiased=antialiased, record=False)).rgb.detach().cpu().numpy()
+
+
+@pytest.fixture(scope="module")
+def filtered_run(tmp_path_factory):
+    """The result of a fit with a run folder, and the models that it showed."""
+    shown = []
+    folder = tmp_path_factory.mktemp("antialiased") / "run"
+    result = warpgs.fit(scene(), FILTERED_CONFIG, split=SPLIT, out=folder, device="cpu", verbose=False, on_model=shown.append)
+    return result, shown
+
+
+@pytest.mark.usefixtures("free")
+@pytest.mark.parametrize("captured", [False, True], ids=["eager", "fixed capacity"])
+def test_a_step_renders_with_the_filter(device, captured):
+    """Its error is that of an image which `rasterize` renders alone; memory is planned for its instances."""
+    fit = Trainer(photos(4), seeds(), FILTERED_CONFIG, device)
+    options, plan, view = fit.context.render_options(), fit.plan_of(1), fit.views[1]
+    (stack,) = fit.stacks.values()
+    fit.buffers.load([1], [[0.0] * fit.buffers.lr_rows.shape[1]], [fit.settings(1)])
+    render = step.eager_renderer(options, None)
+    if captured:
+        render = step.captured_renderer(options, 10_000, fit.buffers.stop)
+    step.view_gradients(fit.learned, stack, fit.buffers, plan, render)
+    errors = [((filtered(fit.gaussians, view.camera, a) - photos(4)[1].image) ** 2).mean() for a in (True, False)]
+    assert fit.buffers.result()[2][0][1] == pytest.approx(errors[0], rel=1e-5)
+    assert abs(errors[0] - errors[1]) > 1e-3 * errors[0]
+    cameras = [v.camera for v in fit.views]
+    wanted = [
+        max(int(rasterize(fit.gaussians, c, RasterizeOptions(antialiased=a)).tile_counts.sum()) for c in cameras)
+        for a in (True, False)
+    ]
+    assert most_instances(fit.gaussians, cameras, options) == wanted[0] != wanted[1]
+    assert step.instance_capacity(fit.gaussians, stack, 0, options) == int(step.CAPACITY_FACTOR * wanted[0]) + 1024
+
+
+@pytest.mark.usefixtures("free")
+@pytest.mark.cuda
+def test_captured_steps_are_the_eager_ones(device):
+    """The same Gaussians, to the bit, with CUDA graphs and without."""
+    fits = [Trainer(photos(4), seeds(), dataclasses.replace(FILTERED_CONFIG, cuda_graph=g), device) for g in (True, False)]
+    for fit in fits:
+        while fit.step < FILTERED_CONFIG.steps:
+            fit.advance(FILTERED_CONFIG.steps)
+    for name, t in fits[0].gaussians.tensors().items():
+        assert torch.equal(t, fits[1].gaussians.tensors()[name]), name
+
+
+@pytest.mark.usefixtures("free")
+def test_scores_models_and_images_have_the_filter(filtered_run):
+    """Of the fit, of each step, of the folder, of the viewer; scores and images are of renders with it."""
+    result, shown = filtered_run
+    stored = warpgs.open_run(result.folder, "cpu")
+    models = [result, shown[-1], stored, content_of_run(result.folder).model]
+    assert all(m.antialiased and m.options().antialiased for m in models)
+    test = scene().view("04.png")
+    image = filtered(stored.gaussians(), test.camera)
+    assert result.metrics["test"]["psnr"] == score(test, image).psnr
+    assert np.abs(image - filtered(stored.gaussians(), test.camera, False)).max() > 0.01
+    kept = np.asarray(Image.open(result.folder / "renders" / "04.png").convert("RGB")) / 255
+    assert np.abs(kept[:, : image.shape[1]] - image.clip(0, 1)).max() < 1 / 255
+    assert result.metrics["rule"]["max"] < 1e-4, "the reference has the filter"
+    assert json.loads((result.folder / "config.json").read_text())["config"]["antialiased"] is True
+    assert any("antialiased" in note for note in result.notes)
+
+
+@pytest.mark.usefixtures("free")
+def test_a_continued_fit_equals_one_in_one_go(filtered_run, tmp_path):
+    """A run that stopped half-way, to the bit; and not without the setting, which is another fit."""
+
+    def stop(report):
+        if report.step == FILTERED_CONFIG.steps // 2:
+            raise KeyboardInterrupt
+
+    whole, _ = filtered_run
+    how = {"split": SPLIT, "out": tmp_path / "run", "device": "cpu", "verbose": False}
+    config = dataclasses.replace(FILTERED_CONFIG, checkpoint_every=1, checkpoint_seconds=0.0)
+    with pytest.raises(KeyboardInterrupt):
+        warpgs.fit(scene(), config, on_step=stop, **how)
+    with pytest.raises(warpgs.errors.UsageError, match="antialiased"):
+        warpgs.fit(scene(), dataclasses.replace(config, antialiased=False), resume=True, **how)
+    result = warpgs.fit(scene(), config, resume=True, **how)
+    for name, t in result.gaussians().tensors().items():
+        assert torch.equal(t, getattr(whole.gaussians(), name)), name
+
+
+@pytest.mark.usefixtures("free")
+def test_no_axis_is_below_what_cameras_resolve(monkeypatch):
+    """With the default limit every axis ends at 0.45 px or above of the finest camera; without the flag many are below."""
+    monkeypatch.setattr(limits, "MIN_PIXELS", 0.2**0.5)
+    rows = TrainingCameras.of(ring(4), CPU).rows
+    below = []
+    for antialiased in (True, False):
+        fit = Trainer(
+            photos(4), seeds(), dataclasses.replace(FILTERED_CONFIG, limits=LimitConfig(), antialiased=antialiased), CPU
+        )
+        while fit.step < FILTERED_CONFIG.steps:
+            fit.advance()
+        smallest = pixel_size(fit.gaussians.means, rows, 0.2**0.5)
+        below.append(int((fit.gaussians.log_scales < smallest[:, None] - 1e-5).sum()))
+    assert below[0] == 0 < below[1]
+
+
+@pytest.mark.usefixtures("free")
+def test_the_flag_and_the_files(tmp_path, capsys):
+    """Of the run, its exports and its pruned model: those that can say so do, of others the command tells."""
+    write_demo(tmp_path / "scene", views=8, width=40, height=32)
+    flags = ["--preset", "3dgs", "--steps", "2", "--init.source", "random", "--init.random-count", "30", "--device", "cpu"]
+    for name, own in (("with", ["--antialiased"]), ("without", [])):
+        assert main(["fit", str(tmp_path / "scene"), "--out", str(tmp_path / name), *flags, *own]) == 0
+        assert warpgs.open_run(tmp_path / name, "cpu").antialiased is bool(own)
+        data = (tmp_path / name / "point_cloud.ply").read_bytes()
+        assert (b"comment antialiased 1" in data[:500]) is bool(own)
+        for file in ("a.spz", "a.splat"):
+            assert main(["export", str(tmp_path / name), "--to", str(tmp_path / name / file), "--no-clean"]) == 0
+            assert read_with_antialiasing(tmp_path / name / file, None, "file")[1] is (bool(own) and file == "a.spz")
+        assert ("choose the antialiased mode in your viewer" in capsys.readouterr().out) is bool(own)
+        assert content_of_file(tmp_path / name / "a.spz").model.options().antialiased is bool(own)
+        write_cameras(tmp_path / "cameras.json", ring(2))
+        opened, notes = open_file(tmp_path / name / "point_cloud.ply", tmp_path / "cameras.json", "exact", "cpu")
+        assert opened.antialiased is bool(own) and any("declares an antialiased model" in note for note in notes) is bool(own)
+    assert main(["prune", str(tmp_path / "with"), "--keep-psnr", "1", "--device", "cpu"]) == 0
+    assert warpgs.open_run(tmp_path / "with-pruned", "cpu").antialiased
+    assert read_with_antialiasing(tmp_path / "with-pruned" / "point_cloud.ply", None, "file")[1]
+
+
+# Objects that are cut out: views that know their opacity, the loss over other backgrounds, the hull, and where fits
+# start.
+
+WHITE = (1.0, 1.0, 1.0)
+CUTOUT = FitConfig(
+    steps=80, init=InitConfig(source="points"), density=DensityConfig(start=10, every=10), dropout=0.2, half_resolution=0.2
+)
+
+
+def cutouts(count: int = 4) -> list[View]:
+    """Views of the three Gaussians before white, with their opacity."""
+    views = []
+    for i, camera in enumerate(ring(count)):
+        render = rasterize(three_gaussians(), camera, RasterizeOptions(background=torch.ones(3)))
+        views.append(View(f"{i}", camera, render.rgb.clamp(0, 1).numpy(), alpha=render.alpha.numpy()))
+    return views
+
+
+def balls(count: int = 8, side: int = 40) -> list[View]:
+    """Views of a ball of radius 0.4 around the origin from 4 u away, all around it."""
+    views = []
+    for angle in 2 * np.pi * np.arange(count) / count:
+        center = 4 * np.array([np.sin(angle), 0.3 * np.cos(3 * angle), -np.cos(angle)])
+        K = np.array([[2.0 * side, 0, side / 2], [0, 2.0 * side, side / 2], [0, 0, 1]])
+        camera = Camera(look_at(center, np.zeros(3), np.array([0, -1.0, 0])), K, side, side)
+        y, x = np.mgrid[:side, :side] + 0.5 - side / 2
+        distance = np.linalg.norm(center)
+        ball = np.hypot(x, y) < 2 * side * 0.4 / np.sqrt(distance**2 - 0.4**2)
+        image = np.where(ball[..., None], np.float32([0.2, 0.4, 0.6]), np.float32(1))
+        views.append(View(f"{angle:.2f}", camera, image, alpha=ball.astype(np.float32)))
+    return views
+
+
+def fitted(views: list[View], loss: LossConfig, steps: int = CUTOUT.steps, points: PointCloud | None = None) -> Trainer:
+    fit = Trainer(views, points or seeds(), dataclasses.replace(CUTOUT, loss=loss), CPU, WHITE)
+    for _ in range(steps):
+        fit.advance()
+    return fit
+
+
+def alpha_errors(fit: Trainer, views: list[View]) -> tuple[float, float]:
+    """Mean rendered opacity where the truth is empty, and what is missing of it where the truth is nearly opaque."""
+    alphas = [rasterize(fit.gaussians, v.camera).alpha.numpy() for v in views]
+    true = np.stack([v.alpha for v in views])
+    return float(np.stack(alphas)[true < 0.02].mean()), float(1 - np.stack(alphas)[true > 0.9].mean())
+
+
+def test_an_image_over_another_background():
+    """What is opaque stays, what is empty shows the other colour, and both sides of the loss mean the same."""
+    view = cutouts(1)[0]
+    shift = torch.tensor([-0.9, -0.3, 0.0])
+    black = rasterize(three_gaussians(), view.camera, RasterizeOptions(background=1 + shift)).rgb
+    shown = over(torch.from_numpy(view.image), torch.from_numpy(view.alpha), shift)
+    assert torch.allclose(shown, black, atol=1e-6)
+    shifts = np.array([random_shift(3, step, WHITE) for step in range(200)])
+    assert (shifts <= 0).all() and (shifts >= -1).all() and np.allclose(shifts.mean(0), -0.5, atol=0.1)
+    assert random_shift(3, 7, WHITE) == random_shift(3, 7, WHITE) != random_shift(4, 7, WHITE)
+
+
+def test_views_carry_their_opacity():
+    """An opaque view among others gets one; at half the size it is a mean, and stacks share its memory."""
+    first, second = cutouts(2)
+    both = with_alpha([dataclasses.replace(first, alpha=None), second])
+    assert (both[0].alpha == 1).all() and both[1] is second
+    assert with_alpha([both[0]]) == [both[0]]
+    views = [TrainingView.of(v, CPU) for v in both]
+    half = half_size(views[1])
+    assert torch.allclose(half.alpha, torch.from_numpy(second.alpha.reshape(16, 2, 20, 2).mean((1, 3))), atol=1e-6)
+    _, stacks, _ = stack_views([*views, half], 2)
+    assert [len(s.alphas) for s in stacks.values()] == [2, 1]
+    assert torch.equal(views[1].countable, (views[1].alpha > 0.5).float())
+
+
+@pytest.mark.parametrize("masked", [False, True])
+def test_alpha_term_is_a_mean_absolute_difference(masked):
+    """Over the pixels that count; views without an opacity have none, and weights beyond reason are refused."""
+    rendered, true, kept = torch.rand(3, 9, 11, generator=torch.Generator().manual_seed(0))
+    mask = (kept > 0.3).float() if masked else None
+    image = torch.zeros(9, 11, 3)
+
+    def term(alpha: torch.Tensor | None) -> float:
+        target = Target(image, mask, {}, alpha)
+        return float(AlphaDifference(0.5)(LossInputs({"alpha": rendered}, target, None, None, torch.ones(()))))
+
+    expected = (rendered - true).abs()[mask > 0].mean() if masked else (rendered - true).abs().mean()
+    assert term(true) == pytest.approx(0.5 * float(expected), rel=1e-5) and term(None) == 0
+    with pytest.raises(UsageError, match=r"alpha\.weight"):
+        AlphaDifference(-1.0)
+    with pytest.raises(UsageError, match=r"loss\.alpha-weight"):
+        LossConfig(alpha_weight=float("nan"))
+
+
+@pytest.mark.parametrize("loss", [LossConfig(alpha_weight=0), LossConfig()], ids=["background", "alpha"])
+def test_either_way_empties_what_is_empty(loss, monkeypatch):
+    """Without opacities Gaussians in the colour of the background are left where nothing is."""
+    if loss.alpha_weight:
+        monkeypatch.setattr(trainer, "random_shift", lambda *_: (0.0, 0.0, 0.0))
+    monkeypatch.setattr(init, "on_object", lambda start, views: start)
+    points = np.random.default_rng(0).uniform(-0.7, 0.7, (200, 3))
+    white = PointCloud(np.concatenate([seeds().points, points]), np.ones((len(seeds()) + 200, 3), np.float32))
+    views = cutouts()
+    plain = alpha_errors(fitted([dataclasses.replace(v, alpha=None) for v in views], LossConfig(), points=white), views)[0]
+    empty, missing = alpha_errors(fitted(views, loss, points=white), views)
+    assert empty < 0.3 * plain and missing < (0.1 if loss.alpha_weight else 1)  # by colour alone it takes more steps
+
+
+def test_a_continued_fit_equals_an_uninterrupted_one():
+    """The colour behind a step depends on seed and step alone; opaque views have none."""
+    whole, half = fitted(cutouts(), LossConfig()), fitted(cutouts(), LossConfig(), 30)
+    other = fitted(cutouts(), LossConfig(), 0)
+    other.load(*half.state())
+    while other.step < CUTOUT.steps:
+        other.advance()
+    assert all(torch.equal(a, b) for a, b in zip(whole.gaussians.tensors().values(), other.gaussians.tensors().values()))
+    opaque = fitted([dataclasses.replace(v, alpha=None) for v in cutouts()], LossConfig(), 1)
+    assert opaque.settings(5)[SHIFT] == (0, 0, 0) != whole.settings(5)[SHIFT]
+    assert [t.name for t in opaque.terms] == ["photometric"]
+
+
+def test_an_estimated_opacity_is_no_target():
+    """It says where Gaussians start and are sampled; the loss is that of opaque views."""
+    views = [dataclasses.replace(v, alpha_estimated=True) for v in cutouts()]
+    fit = fitted(views, LossConfig(), 1)
+    assert [t.name for t in fit.terms] == ["photometric"] and fit.settings(5)[SHIFT] == (0, 0, 0)
+    assert fit.views[0].countable is not None and fit.layout.sizes.cutout
+
+
+def test_hull_of_a_ball():
+    """All points lie near its surface, in its colour, and none in the empty region of a view."""
+    views = balls()
+    cloud, how = hull_points(views, 2)
+    distance = np.linalg.norm(cloud.points, axis=1)
+    assert len(cloud) > 100 and f"{len(cloud):,} points on the hull of 8 silhouettes" in how
+    assert (distance > 0.3).all() and (distance < 0.6).all()
+    assert np.allclose(cloud.colors, [0.2, 0.4, 0.6], atol=1e-6)
+    shapes = silhouettes(views)
+    assert not in_empty_region(shapes, cloud.points).any()
+    assert in_empty_region(shapes, np.array([[0, 0, 0], [0, 0.6, 0], [0.6, 0, 0]])).tolist() == [False, True, True]
+    assert hull_points([views[0], dataclasses.replace(views[1], alpha=None)], 2)[0].points.shape == (0, 3)
+
+
+def test_one_view_in_many_may_err():
+    """A hole in one silhouette of twelve carves nothing; the same hole in a second one does."""
+    views = balls(12)
+    torn = dataclasses.replace(views[0], alpha=np.zeros_like(views[0].alpha))
+    assert len(carve(silhouettes([torn, *views[1:]]))[0]) > 100
+    also = dataclasses.replace(views[1], alpha=np.zeros_like(views[1].alpha))
+    assert len(carve(silhouettes([torn, also, *views[2:]]))[0]) == 0
+
+
+def test_starts_stand_on_the_object():
+    """Whatever the source, no point lies in a place that is empty in a view."""
+    views = balls()
+    assert fitted_region(views[0])[1] == "object"
+    shapes = silhouettes(views)
+    everywhere = PointCloud(np.random.default_rng(0).uniform(-0.8, 0.8, (3000, 3)), np.ones((3000, 3), np.float32))
+    starts = [initial_points(views, everywhere, InitConfig(source=s), np.random.default_rng(0)) for s in ("hull", "points")]
+    assert "left out: they are in an empty area of a view" in starts[1].how
+    for cloud in (*(s.cloud for s in starts), random_points(views, 200, np.random.default_rng(0))[0]):
+        assert len(cloud) >= 100 and not in_empty_region(shapes, cloud.points).any()

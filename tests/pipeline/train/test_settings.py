@@ -1,0 +1,337 @@
+"""Settings of a fit: presets, files, mappings and keywords, all checked; and those that are chosen for the user."""
+
+import dataclasses
+import inspect
+import json
+import sys
+
+import numpy as np
+import pytest
+
+import warpgs
+from tests.scenes import photos, seeds, view_stub
+from warpgs.app.cli import main
+from warpgs.app.fit import request_of
+from warpgs.errors import DataError, UsageError
+from warpgs.pipeline.model.start import InitConfig
+from warpgs.pipeline.run.fit import fit
+from warpgs.pipeline.run.request import SceneRequest
+from warpgs.pipeline.train.loss import AlphaDifference
+from warpgs.pipeline.train.presets import MAX_BYTES, MAX_DOTS, PRESETS, preset_settings
+from warpgs.pipeline.train.schedule import plan_phases
+from warpgs.pipeline.train.settings import ONE_LAYER, FitConfig, keyword, setting_names, settings_by_views, with_settings
+from warpgs.pipeline.train.stopping import StoppingConfig
+from warpgs.pipeline.train.strategies.mcmc import MCMCConfig
+from warpgs.scene import Scene
+
+# Presets and settings from outside: files, objects, mappings and keywords, all of them checked and typed.
+
+OWN = """
+from warpgs.pipeline.train.settings import FitConfig
+PLAIN = FitConfig(steps=5)
+SOME = {"base": "quick", "init": {"opacity": 0.5}}
+NUMBER = 3
+"""
+
+
+@pytest.fixture
+def own(tmp_path):
+    path = tmp_path / "own.py"
+    path.write_text(OWN)
+    yield path
+    for name in [n for n, m in sys.modules.items() if getattr(m, "__file__", None) == str(path)]:
+        del sys.modules[name]
+
+
+def written(folder, text, name="my.toml"):
+    (folder / name).write_text(text)
+    return folder / name
+
+
+def test_a_file_starts_from_another(tmp_path):
+    """From a preset by name, or a file beside it; numbers are of the type of their fields, open settings are none."""
+    first = written(
+        tmp_path, 'base = "3dgs"\nsteps = 40\nmemory-limit = "2GiB"\n[init]\nopacity = 1e-1\nmerge-px = 3\n', "a.toml"
+    )
+    second = written(tmp_path, 'base = "a.toml"\nabout = "mine"\nsteps = "none"\nsh_degree = "none"\n')
+    config, origin = preset_settings(str(first))
+    assert config == dataclasses.replace(
+        PRESETS["3dgs"], preset="a.toml", steps=40, memory_limit=2 * 2**30,
+        init=dataclasses.replace(PRESETS["3dgs"].init, opacity=0.1, merge_px=3.0),
+    )  # fmt: skip
+    assert type(config.init.merge_px) is float and str(first) in origin and "SHA-256" in origin
+    config, origin = preset_settings(second)
+    assert (config.preset, config.steps, config.sh_degree, config.init.opacity) == ("my.toml", None, None, 0.1)
+    assert all(word in origin for word in (str(first), str(second), "preset 3dgs", "init.merge-px", "sh-degree"))
+    assert preset_settings(written(tmp_path, "steps = 7"))[0].strategy == PRESETS["default"].strategy
+
+
+def test_a_file_has_settings_of_the_strategy_and_of_loss_terms(tmp_path):
+    path = written(
+        tmp_path,
+        'strategy = "mcmc"\nloss-terms = "alpha"\n[mcmc]\nnoise-lr = 1e4\n[alpha]\nweight = 0.5\n',
+    )
+    config, _ = preset_settings(path)
+    assert config.strategy_config == MCMCConfig(noise_lr=1e4) and config.loss_terms == (AlphaDifference(weight=0.5),)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("stpes = 3", "my.toml: unknown setting 'stpes'; did you mean steps?"),
+        ("[init]\nopacty = 3", "unknown setting 'init.opacty'; did you mean init.opacity?"),
+        ("opacity = 0.1", "unknown setting 'opacity'; did you mean init.opacity?"),
+        ('strategy = "mcmc"\n[top-split]\nevery = 3', "unknown setting 'top_split.every'; did you mean mcmc.every?"),
+        ('strategy = "mcmc"\n[densty]\nevery = 3', "unknown setting 'densty.every'; did you mean density.every?"),
+        ('steps = "many"', "my.toml: steps must be a whole number of 64 bits, not 'many'"),
+        ("steps = 3.5", "steps must be a whole number of 64 bits, not 3.5"),
+        ("steps = true", "steps must be a whole number of 64 bits, not True"),
+        ("steps = 0", "my.toml: steps must be at least 1, not 0"),
+        ("seed = 99999999999999999999999", "seed must be a whole number"),
+        ("steps = 2024-01-01", "steps must be a whole number of 64 bits, not date"),
+        ("dropout = nan", "dropout must be a finite number, not nan"),
+        ("init.opacity = -inf", "init.opacity must be a finite number, not -inf"),
+        ('cuda-graph = "yes"', "cuda_graph must be true or false"),
+        ("rule = 3", "rule must be text"),
+        ('memory-limit = "2 cows"', "memory limit '2 cows' is not a size"),
+        ("init = 3", "init is a group of settings"),
+        ("[steps]\nx = 1", "unknown setting 'steps.x'"),
+        ("depth-mean = [0.1, 0.2, 0.3]", "the setting depth-mean was removed: give it in FILE.onnx.json"),
+        ('strategy = "best"', "my.toml: unknown strategy 'best'"),
+        ("strategy = 3", "3 is not a strategy"),
+        ('strategy = "json:JSONDecoder"', 'in a study, use a preset in a .py file with "strategy": JSONDecoder'),
+        ('loss-terms = "json:JSONDecoder"', "does not load your code"),
+        ('base = "json:dumps"', "is code; a preset file never loads code"),
+        ('base = "best"', "base 'best' is not one of"),
+        ("base = 3", "base must be text, not 3"),
+        ('base = "my.toml"', "is circular"),
+        ('preset = "quick"', "unknown setting 'preset'"),
+    ],
+)
+def test_a_wrong_setting_is_named(tmp_path, text, said):
+    with pytest.raises(UsageError) as error:
+        preset_settings(written(tmp_path, text))
+    assert said in str(error.value) and str(tmp_path) in str(error.value)
+    assert len(str(error.value)) < 400
+
+
+@pytest.mark.parametrize(
+    ("data", "said"),
+    [
+        (b"steps = ", "not valid TOML"),
+        (b"steps = 1\nseed = = 2", "at line 2"),
+        (b"steps = 1\nsteps = 2", "not valid TOML"),
+        (b"\xff\xfe", "not valid TOML"),
+        (b"x = " + b"[" * 5000 + b"]" * 5000, "nested deeper"),
+        (b"a = " + b"[" * 20 + b"]" * 20, "nested deeper"),
+        (b"#" * (MAX_BYTES + 1), "larger than"),
+        (b"a = 1\n" + b"a." * (MAX_DOTS + 1) + b"a = 1", "more than 100 dots in a line"),
+        (None, "cannot be read"),
+    ],
+)
+def test_a_file_that_is_none_is_refused(tmp_path, data, said):
+    if data is not None:
+        (tmp_path / "my.toml").write_bytes(data)
+    with pytest.raises(DataError, match=said) as error:
+        preset_settings(tmp_path / "my.toml")
+    assert str(tmp_path / "my.toml") in str(error.value) and len(str(error.value)) < 400
+
+
+def test_objects_and_mappings_are_presets(own):
+    assert preset_settings(f"{own}:PLAIN")[0] == FitConfig(steps=5)
+    config, origin = preset_settings(f"{own}:SOME")
+    assert config.init.opacity == 0.5 and config.max_steps == 600 and "), preset quick" in origin
+    assert origin.startswith(f"{own}:SOME (SHA-256 ")
+    assert preset_settings({"base": "quick", "init.opacity": 0.5})[0] == config
+    for wrong, said in (
+        (f"{own}:NUMBER", "is of type int"),
+        (f"{own}:NONE", "does not exist"),
+        ("no.such:X", "cannot be imported"),
+    ):
+        with pytest.raises(UsageError, match=said):
+            preset_settings(wrong)
+    with pytest.raises(UsageError, match="3 is not a preset"):
+        preset_settings(3)
+
+
+def test_a_registered_preset_is_taken_by_name(monkeypatch):
+    monkeypatch.setattr(PRESETS, "_made", dict(PRESETS._made))
+    PRESETS.register("mine", FitConfig(steps=3), "three steps")
+    assert preset_settings("mine")[0].steps == 3 and "mine" in PRESETS and PRESETS.described()["mine"] == "three steps"
+    for name in ("default", "a:b", "a.toml", ""):
+        with pytest.raises(UsageError, match="cannot be registered"):
+            PRESETS.register(name, FitConfig())
+
+
+def test_every_setting_has_a_keyword_of_its_own():
+    """As the flag, with underscores; none is an argument of the fit or an option of reading."""
+    for config in (FitConfig(), PRESETS["mcmc"], dataclasses.replace(PRESETS["default"], loss_terms=(AlphaDifference(2.0),))):
+        names = setting_names(config)
+        assert len({*map(keyword, names)}) == len(names) > 60
+        assert not {*map(keyword, names)} & {*inspect.signature(fit).parameters}
+    assert {"steps", "sh_degree", "init.opacity", "depth_model", "method.sampler.fraction"} <= {*setting_names(FitConfig())}
+
+
+def test_keywords_replace_settings():
+    """Flat, or a group as a mapping or its dataclass; numbers of numpy are numbers; classes stand for themselves."""
+    made = with_settings(
+        FitConfig(),
+        {"steps": np.int64(30), "sh_degree": 1, "init_opacity": 0.3, "dropout": np.float32(0.5), "density": {"every": 7}},
+        "x",
+    )
+    assert (made.steps, made.sh_degree, made.init.opacity, made.dropout, made.density.every) == (30, 1, 0.3, 0.5, 7)
+    assert type(made.steps) is int and type(made.dropout) is float
+    made = with_settings(FitConfig(), {"init": InitConfig(opacity=0.3), "loss_terms": (AlphaDifference(0.2),)}, "x")
+    assert made.init.opacity == 0.3 and made.loss_terms == (AlphaDifference(0.2),)
+    made = with_settings(made, {"alpha_weight": 0.25, "strategy": "mcmc", "mcmc_every": 9}, "x")
+    assert made.loss_terms[0].weight == 0.25 and made.strategy_config.every == 9
+    assert with_settings(made, {"steps": None}, "x").steps is None
+    for wrong, said in (
+        ({3: 1}, "3 is not a setting's name"),
+        ({"loss_terms": 3}, "must be names"),
+        ({"opacity": 0.3}, "mean init.opacity"),
+    ):
+        with pytest.raises(UsageError, match=said):
+            with_settings(FitConfig(), wrong, "x")
+
+
+def test_view_modules_are_switched_and_set_by_keyword():
+    """By their own names, as flags do, and by the list; each has settings."""
+    config = with_settings(
+        PRESETS["default"], {"exposure": True, "refine_poses_start": 0.5, "refine_poses": True}, "here", keywords=True
+    )
+    assert {m.name: m for m in config.view_modules}["refine_poses"].start == 0.5
+    assert [m.name for m in config.view_modules] == ["exposure", "refine_poses"]
+    assert [m.name for m in with_settings(config, {"exposure": False}, "here").view_modules] == ["refine_poses"]
+    assert with_settings(config, {"view_modules": "none"}, "here").view_modules == ()
+    with pytest.raises(UsageError, match="exposure"):
+        with_settings(config, {"exposure": 3}, "here")
+
+
+def test_a_fit_takes_keywords_and_records_where_settings_come_from(tmp_path):
+    """The bits are those of the same settings given whole; config.json has them resolved, with a note."""
+    scene = Scene("memory", "none", tuple(photos(3)), points=seeds())
+    path = written(tmp_path, 'base = "3dgs"\nsteps = 9\ninit.source = "points"\n')
+    options = {"device": "cpu", "verbose": False}
+    result = warpgs.fit(scene, path, steps=3, sh_degree=1, out=tmp_path / "run", **options)
+    whole = dataclasses.replace(PRESETS["3dgs"], steps=3, init=InitConfig(source="points"), sh_degree=1)
+    again = warpgs.fit(scene, whole, **options)
+    assert result.gaussians().means.equal(again.gaussians().means) and result.config == dataclasses.replace(
+        whole, preset="my.toml"
+    )
+    record = json.loads((tmp_path / "run" / "config.json").read_text())
+    (note,) = (n for n in record["notes"] if n.startswith("settings: "))
+    assert str(path) in note and "SHA-256" in note and note.endswith("then given: steps, sh-degree")
+    assert record["config"]["preset"] == "my.toml" and record["config"]["steps"] == 3
+    for wrong, said in (
+        ({"step": 3}, r"warpgs.fit: unknown setting 'step'; did you mean steps\?"),
+        ({"steps": "3"}, "warpgs.fit: steps must be a whole number of 64 bits, not '3'"),
+        ({"init_opacity": float("nan")}, "init_opacity must be a finite number"),
+        ({"opacity": 0.3}, "did you mean init_opacity"),
+        ({"sh_degree": 5}, r"sh-degree must be in \[0, 4\], not 5"),
+        ({"downscale": 2}, "downscale is an option for reading a scene"),
+    ):
+        with pytest.raises(UsageError, match=said):
+            warpgs.fit(scene, "quick", out=tmp_path / "x", **wrong, **options)
+    assert not (tmp_path / "x").exists()
+
+
+def test_the_command_line_takes_files_and_objects(own, tmp_path, capsys):
+    """Flags come after the preset; a mistake is one line."""
+    path = written(tmp_path, "steps = 9\nseed = 4\n")
+    base = ["scene", "--out", "run"]
+    request = request_of([*base, "--preset", str(path), "--steps", "3"], "")
+    assert (request.config.steps, request.config.seed, request.config.preset) == (3, 4, "my.toml")
+    assert str(path) in request.notes[0] and request.notes[0].endswith("then given: steps")
+    assert request_of([*base, "--preset", f"{own}:PLAIN"], "").config == FitConfig(steps=5)
+    (tmp_path / "broken.py").write_text("1 / 0\n")
+    (tmp_path / "wrong.py").write_text("X = {'stepz': 3}\n")
+    (tmp_path / "open.py").write_text("X = {\n")
+    for preset, said in (
+        (f"{tmp_path}/wrong.py:X", f"{tmp_path}/wrong.py:X: unknown setting 'stepz'; did you mean steps?"),
+        (f"{tmp_path}/open.py:X", f"SyntaxError: '{{' was never closed ({tmp_path}/open.py, line 1); correct that code"),
+        (f"{tmp_path}/broken.py:X", "ZeroDivisionError: division by zero"),
+        (str(written(tmp_path, "stepz = 3", "b.toml")), "did you mean steps?"),
+        ("best", "preset 'best' is not one of"),
+    ):
+        assert main(["fit", *base, "--preset", preset]) == 2
+        text = capsys.readouterr().err
+        assert said in text and len(text.splitlines()) == 1
+    assert main(["compare", *base, "--presets", f"default,{tmp_path}/broken.py:X"]) == 2
+    assert f"the preset '{tmp_path}/broken.py:X' cannot be loaded" in capsys.readouterr().err
+
+
+def test_presets_are_listed():
+    """As a mapping: names, number, membership."""
+    assert list(warpgs.PRESETS) == ["default", "3dgs", "mcmc", "paper-literal", "quick"]
+    assert len(warpgs.PRESETS) == 5 and "quick" in warpgs.PRESETS
+
+
+# Settings and sizes of images that are chosen for the user.
+
+
+@pytest.mark.parametrize("device", ["cpu", "cuda"])
+@pytest.mark.parametrize(("views", "width", "height"), [(3, 126, 94), (3, 504, 378), (10, 900, 1600), (54, 504, 378)])
+def test_quick_is_never_slower_than_default(device, views, width, height):
+    """At most 600 steps, and on a CPU at most as many as its time has for the default; a number that is given holds."""
+    train = [view_stub(width, height)] * views
+    quick, default = (settings_by_views(PRESETS[name], train, device)[0].steps for name in ("quick", "default"))
+    assert 0 < quick == min(600, default)
+    given = dataclasses.replace(PRESETS["quick"], steps=700)
+    assert settings_by_views(given, train, device)[0].steps == 700
+
+
+def test_rates_rise_where_the_time_of_a_cpu_limits_many_views():
+    """With more than nine views, and only where steps are left out; rates that are given hold, and the loss is said."""
+
+    def chosen(views, device, **optimizer):
+        train = [view_stub()] * views
+        config = PRESETS["default"]
+        config = dataclasses.replace(config, optimizer=dataclasses.replace(config.optimizer, **optimizer))
+        found, notes = settings_by_views(config, train, device)
+        return (found.optimizer.means_lr, found.optimizer.sh_lr), notes
+
+    usual = (1.6e-4, 2.5e-3)
+    assert chosen(9, "cpu")[0] == chosen(10, "cuda")[0] == usual
+    rates, notes = chosen(10, "cpu")
+    assert rates == (4e-4, 6.25e-3)
+    assert chosen(10, "cpu", means_lr=1e-3, sh_lr=2e-3)[0] == (1e-3, 2e-3)
+    assert "--no-cpu-limit takes all, about 11 min, and raises PSNR by at least 0.5 dB" in notes[-1]
+
+
+def test_one_layer_has_fewer_steps_in_the_time_of_a_cpu():
+    """Its steps take longer, so that both take the same time."""
+    train = [view_stub()] * 3
+    config = PRESETS["default"]
+    one, two = (
+        settings_by_views(dataclasses.replace(config, method=dataclasses.replace(config.method, hier=hier)), train, "cpu")[0]
+        for hier in (False, True)
+    )
+    assert abs(ONE_LAYER * one.steps - two.steps) < 2 and one.steps < two.steps
+
+
+def test_nothing_is_held_out_where_the_time_of_a_cpu_limits_the_steps():
+    """All degrees of the harmonics are in use when growth begins, as with held-out blocks; a gain that is given holds."""
+
+    def chosen(views, device, config=PRESETS["default"]):
+        train = [view_stub()] * views
+        return settings_by_views(config, train, device)[0]
+
+    for views in (3, 12):
+        limited, whole = chosen(views, "cpu"), chosen(views, "cuda")
+        assert limited.stopping.min_gain_db == 0 and whole.stopping.min_gain_db == 0.1
+        assert limited.steps < whole.steps and whole.sh_every == 500
+        assert limited.sh_degree * limited.sh_every <= plan_phases(limited.phases, limited.steps).refine
+    assert chosen(12, "cpu", dataclasses.replace(PRESETS["default"], steps=100)).stopping.min_gain_db == 0.1
+    given = dataclasses.replace(PRESETS["default"], stopping=StoppingConfig(min_gain_db=0.2))
+    assert chosen(12, "cpu", given).stopping.min_gain_db == 0.2 and chosen(12, "cpu", given).sh_every == 500
+
+
+def test_a_fit_on_a_cpu_has_smaller_images_unless_told():
+    """A side or a factor that is given holds on both devices, and a run that remembers its size keeps it."""
+    for device, side in (("cpu", 800), ("cuda", 1600)):
+        chosen = SceneRequest("scene").with_scale(device)
+        assert (chosen.downscale, chosen.max_side) == (1, side)
+        assert SceneRequest("scene", max_side=1200).with_scale(device).max_side == 1200
+        assert SceneRequest("scene", downscale=2).with_scale(device).max_side == 0
+        assert chosen.with_scale("cpu") == chosen == chosen.with_scale("cuda")

@@ -1,0 +1,515 @@
+"""Density strategies: clone and split, MCMC, merging with moments, and parts of a user's own."""
+
+import dataclasses
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+import torch
+
+from tests.gaussians import cloud
+from tests.scenes import photos, seeds
+from warpgs.errors import UsageError
+from warpgs.geometry import quaternions, rotation_matrices
+from warpgs.pipeline.model.edit import OPAQUE, covariances, merges
+from warpgs.pipeline.model.start import InitConfig
+from warpgs.pipeline.run.folder import load_checkpoint, save_checkpoint
+from warpgs.pipeline.train.loss import LOSS_TERMS, LossTerm
+from warpgs.pipeline.train.schedule import OptimizerConfig
+from warpgs.pipeline.train.settings import FitConfig
+from warpgs.pipeline.train.strategies import clone_split
+from warpgs.pipeline.train.strategies.base import STRATEGIES
+from warpgs.pipeline.train.strategies.clone_split import DensityConfig, refine
+from warpgs.pipeline.train.strategies.mcmc import MAX_COPIES, MCMCConfig, perturb, relocated
+from warpgs.pipeline.train.trainer import Trainer
+from warpgs.scene import Gaussians
+
+# Clone, split and prune, and how fast scales may change meanwhile.
+
+
+def run(gaussians, pull, config=DensityConfig(), after_reset=False, seed=0, capacity=1000):  # noqa: B008
+    generator, pull = torch.Generator().manual_seed(seed), torch.tensor(pull, dtype=torch.float32)
+    return refine(
+        gaussians, pull, config, extent=1.0, capacity=capacity, after_reset=after_reset, generator=generator
+    )  # fmt: skip
+
+
+def gaussians_of(scales: list[float], opacities: list[float]) -> Gaussians:
+    g = cloud(len(scales))
+    g.log_scales[:] = torch.log(torch.tensor(scales))[:, None]
+    g.logit_opacities[:] = torch.logit(torch.tensor(opacities))
+    return g
+
+
+def test_small_ones_are_cloned_large_ones_split_faint_ones_removed():
+    """Rows: 0 small and pulled, 1 large and pulled, 2 faint, 3 left alone."""
+    g = gaussians_of([0.005, 0.5, 0.005, 0.005], [0.5, 0.5, 0.001, 0.5])
+    change = run(g, [1.0, 1.0, 1.0, 0.0])
+    assert change.keep.tolist() == [0, 3]
+    assert len(change.added["means"]) == 3  # one clone, two children
+    assert torch.equal(change.added["means"][0], g.means[0])
+    assert torch.allclose(change.added["log_scales"][1:], g.log_scales[1] - math.log(1.6))
+    assert not torch.equal(change.added["means"][1], change.added["means"][2])
+
+
+def test_children_lie_where_their_parent_does():
+    """The children of many equal parents have the parent's mean and covariance (a needle turned by 60 degrees)."""
+    count = 4000
+    g = cloud(count)
+    g.means[:] = torch.tensor([1.0, 2.0, 3.0])
+    g.quats[:] = 3 * torch.tensor([math.cos(math.pi / 6), 0, 0, math.sin(math.pi / 6)])
+    g.log_scales[:] = torch.log(torch.tensor([0.5, 0.1, 0.2]))
+    g.logit_opacities[:] = 2.0
+    children = run(g, [1.0] * count, capacity=2 * count).added["means"].double()
+    offsets = children - torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64)
+    c, s = 0.5, math.sqrt(0.75)
+    turn = torch.tensor([[c, -s, 0], [s, c, 0], [0, 0, 1]], dtype=torch.float64)
+    wanted = turn @ torch.diag(torch.tensor([0.25, 0.01, 0.04], dtype=torch.float64)) @ turn.T
+    assert float(offsets.mean(0).abs().max()) < 0.03
+    assert float((offsets.T @ offsets / len(offsets) - wanted).abs().max()) < 0.02
+
+
+def test_the_cap_lets_only_the_strongest_grow():
+    """With room for one, the most pulled Gaussian is cloned; with none, nothing is."""
+    g = gaussians_of([0.005] * 4, [0.5] * 4)
+    change = run(g, [1.0, 3.0, 2.0, 0.0], capacity=5)
+    assert torch.equal(change.added["means"], g.means[1:2])
+    assert len(run(g, [1.0] * 4, capacity=4).added["means"]) == 0
+
+
+def test_huge_ones_go_only_after_a_reset():
+    """Size pruning waits for the first opacity reset, as in the reference."""
+    g = gaussians_of([0.5, 0.005], [0.5, 0.5])
+    assert run(g, [0, 0]).keep.tolist() == [0, 1]
+    assert run(g, [0, 0], after_reset=True).keep.tolist() == [1]
+
+
+def test_one_gaussian_always_survives():
+    """Where all are faint, or not a number, the most opaque stays."""
+    assert run(gaussians_of([0.1] * 3, [0.001, 0.003, 0.002]), [0, 0, 0]).keep.tolist() == [1]
+
+
+def test_same_seed_same_children():
+    """Splitting is repeatable, and another seed gives other children."""
+    g = gaussians_of([0.5] * 3, [0.5] * 3)
+    a, b, c = (run(g, [1.0] * 3, seed=s).added["means"] for s in (1, 1, 2))
+    assert torch.equal(a, b) and not torch.equal(a, c)
+
+
+@pytest.mark.parametrize("bad", [{"every": 0}, {"start": -1}, {"stop_fraction": 1.5}, {"reset_opacity": 0}])
+def test_bad_settings_are_refused(bad):
+    """A setting that cannot work is an error at once."""
+    with pytest.raises(UsageError):
+        DensityConfig(**bad)
+
+
+def test_protected_are_not_pruned_and_only_the_growing_grow(monkeypatch):
+    """Two faint ones, one of them protected; two that are pulled at, one of which may grow."""
+    monkeypatch.setattr(clone_split, "CLONE_SIZE", 1.0)
+    gaussians = gaussians_of([0.1] * 4, [0.001, 0.001, 0.5, 0.5])
+    pull = torch.tensor([0.0, 0, 1, 1])
+    change = refine(
+        gaussians, pull, DensityConfig(), extent=1.0, capacity=100, after_reset=False,
+        generator=torch.Generator(),
+        growing=torch.tensor([True, True, True, False]), protected=torch.tensor([True, False, False, False]),
+    )  # fmt: skip
+    assert change.keep.tolist() == [0, 2, 3] and change.parents.tolist() == [2]
+
+
+def test_rates_of_scales_may_fall():
+    """Log-linear to the share that is left at the last step, from where the set settles; level where nothing is asked for."""
+    falling = OptimizerConfig(scales_lr=0.1, scales_decay=0.01)
+
+    def lrs(stable_start: float, *progress: float) -> list[float]:
+        return [falling.lrs(p, 1.0, stable_start)["log_scales"] for p in progress]
+
+    assert lrs(0.0, 0.0, 0.5, 1.0) == pytest.approx([0.1, 0.01, 0.001])
+    assert lrs(0.5, 0.0, 0.5, 0.75, 1.0) == pytest.approx([0.1, 0.1, 0.01, 0.001])
+    assert OptimizerConfig(scales_lr=0.1).lrs(1.0, 1.0)["log_scales"] == pytest.approx(0.1)
+
+
+# The MCMC strategy: its formulas against the paper's, and what it does to a fit.
+
+CPU = torch.device("cpu")
+CONFIG = FitConfig(
+    steps=40, sh_every=10, strategy="mcmc", strategy_config=MCMCConfig(start=4, every=5, min_opacity=0.05),
+    init=InitConfig(source="points", opacity=0.3), max_gaussians=75,
+)  # fmt: skip
+
+
+def trained(config: FitConfig = CONFIG, steps: int = 40, device: torch.device = CPU) -> Trainer:
+    trainer = Trainer(photos(4), seeds(61), config, device)
+    while trainer.step < steps:
+        trainer.advance(steps - trainer.step)
+    return trainer
+
+
+@pytest.mark.parametrize("copies", [1, 2, 5, MAX_COPIES])
+def test_relocated_gaussians_render_as_the_one_they_stand_for(copies):
+    """Equation 9: as opaque at the centre, and the same integral along a line, by quadrature of what is composited."""
+    opacities = torch.tensor([0.005, 0.3, 0.9, 0.999], dtype=torch.float64)
+    new, factor = relocated(opacities, torch.full((4,), copies))
+    assert torch.allclose(1 - (1 - new) ** copies, opacities, rtol=1e-12)
+    x = np.linspace(-40, 40, 400_001)
+    for o, n, f in zip(opacities.tolist(), new.tolist(), factor.tolist()):
+        shape = np.exp(-0.5 * (x / f) ** 2)
+        composited = 1 - (1 - n * shape) ** copies
+        whole = o * math.sqrt(2 * math.pi)
+        assert np.trapezoid(composited, x) == pytest.approx(whole, rel=1e-6)
+    assert copies == 1 or bool((new < opacities).all())
+
+
+def test_relocation_in_float32_is_that_of_float64():
+    """At the ends of the range of opacities, for every number of copies."""
+    opacities = torch.tensor([0.005, 0.5, 1 - 2**-24])
+    for copies in range(1, MAX_COPIES + 1):
+        found = relocated(opacities, torch.full((3,), copies))
+        wanted = relocated(opacities.double(), torch.full((3,), copies))
+        for a, b in zip(found, wanted):
+            assert torch.allclose(a.double(), b, rtol=1e-6, atol=0) and bool((a > 0).all())
+
+
+def test_noise_has_each_gaussians_covariance_and_spares_the_opaque(device):
+    """Of many equal needles: covariance Sigma^2 of the move, nothing for opaque ones or for a step that is not taken."""
+    g = cloud(20_000, device=device)
+    g.means[:] = 0
+    g.quats[:] = torch.tensor([math.cos(math.pi / 6), 0, 0, math.sin(math.pi / 6)], device=device)
+    g.log_scales[:] = torch.log(torch.tensor([0.5, 0.1, 0.2], device=device))
+    g.logit_opacities[:] = torch.where(torch.arange(20_000, device=device) < 10_000, -20.0, 3.0)
+    settings = torch.tensor([0.0, 7.0, 0.1, 0.0, 0.0, 0.0], device=device)
+    still = torch.zeros(1, dtype=torch.bool, device=device)
+    perturb(g, settings, still, seed=0, noise_lr=10.0)
+    assert not bool(g.means.any())
+    perturb(g, settings, ~still, seed=0, noise_lr=10.0)
+    moved = g.means[:10_000].double().cpu()
+    c, s = 0.5, math.sqrt(0.75)
+    turn = torch.tensor([[c, -s, 0], [s, c, 0], [0, 0, 1]], dtype=torch.float64)
+    sigma = turn @ torch.diag(torch.tensor([0.25, 0.01, 0.04], dtype=torch.float64)) @ turn.T
+    gate = 1 / (1 + math.exp(-0.5))  # opacity 0 is 0.005 below the middle of the gate
+    wanted = gate**2 * sigma @ sigma
+    assert float((moved.T @ moved / len(moved) - wanted).abs().max()) < 0.05 * float(wanted.max())
+    assert float(g.means[10_000:].abs().max()) < 1e-12
+    again = g.means.clone()
+    g.means[:] = 0
+    perturb(g, settings, ~still, seed=0, noise_lr=10.0)
+    assert torch.equal(g.means, again)
+
+
+def test_the_dead_are_relocated_and_the_set_grows_to_its_cap():
+    """After an event no Gaussian is dead, and none was removed; the set grows by a fraction up to the cap."""
+    trainer = trained(steps=9)
+    trainer.table.params["logit_opacities"].detach()[:20] = -8.0
+    before = len(trainer.table)
+    trainer.advance()
+    assert trainer.step == 10 and len(trainer.table) == int(1.05 * before)
+    assert float(trainer.gaussians.logit_opacities.sigmoid().min()) >= 0.05 - 1e-6
+    assert not bool(trainer.table.exp_avg["means"][:20].any())
+    assert len(trained().table) == 75
+
+
+def test_a_continued_fit_gives_the_same_bits(tmp_path):
+    """Noise and sampling go on as if the fit had never stopped."""
+    straight, broken = trained(), trained(steps=17)
+    save_checkpoint(tmp_path, *broken.state())
+    resumed = Trainer(photos(4), seeds(61), CONFIG, CPU)
+    resumed.load(*load_checkpoint(tmp_path))
+    while resumed.step < 40:
+        resumed.advance()
+    a, b = straight.state()[0], resumed.state()[0]
+    assert a.keys() == b.keys() and all(torch.equal(a[k], b[k]) for k in a)
+
+
+@pytest.mark.cuda
+def test_captured_steps_equal_single_steps():
+    """On CUDA, noise and regularisation included."""
+    device = torch.device("cuda", 0)
+    single, captured = (trained(dataclasses.replace(CONFIG, cuda_graph=g), device=device) for g in (False, True))
+    a, b = single.state()[0], captured.state()[0]
+    assert all(torch.equal(a[k], b[k]) for k in a)
+
+
+def test_settings_survive_json_and_bad_ones_are_refused():
+    """The strategy's own settings stand in the configuration; numbers that cannot work are refused."""
+    from warpgs.errors import UsageError
+
+    assert FitConfig.from_json(CONFIG.to_json()) == CONFIG
+    assert FitConfig(strategy="mcmc").strategy_config == MCMCConfig()
+    for bad in ({"every": 0}, {"growth": -1.0}, {"noise_lr": math.nan}, {"min_opacity": 0.9}):
+        with pytest.raises(UsageError, match="mcmc"):
+            MCMCConfig(**bad)
+
+
+# Merging with moments, against the mixture's own.
+
+
+def test_rotations_there_and_back():
+    """Every quaternion, also a half turn about an axis, gives its rotation, and the rotation gives it back up to its sign."""
+    q = torch.nn.functional.normalize(
+        torch.randn(200, 4, dtype=torch.float64, generator=torch.Generator().manual_seed(0)), dim=1
+    )
+    q = torch.cat([q, torch.eye(4, dtype=torch.float64), torch.tensor([[0, 1.0, 1, 0]], dtype=torch.float64) / math.sqrt(2)])
+    r = rotation_matrices(q)
+    assert torch.allclose(r @ r.transpose(1, 2), torch.eye(3, dtype=torch.float64).expand_as(r), atol=1e-12)
+    assert torch.allclose(torch.linalg.det(r), torch.ones(len(r), dtype=torch.float64))
+    assert torch.allclose((quaternions(r) * q).sum(1).abs(), torch.ones(len(r), dtype=torch.float64), atol=1e-12)
+    turn = rotation_matrices(torch.tensor([[math.cos(0.3), 0, 0, math.sin(0.3)]]))[0]
+    assert torch.allclose(turn[:2, 0], torch.tensor([math.cos(0.6), math.sin(0.6)]))
+
+
+def test_moments_of_a_pair():
+    """Mean, covariance and colours of the mixture; what the pair covers stays."""
+    g = cloud(2, seed=3)
+    pairs = merges(g, torch.ones(2), torch.zeros(2), odd=False)
+    assert sorted([*pairs.first.tolist(), *pairs.second.tolist()]) == [0, 1]
+    areas = g.log_scales.double().exp().sort(1).values[:, 1:].prod(1)
+    mass = g.logit_opacities.double().sigmoid() * areas
+    fraction = (mass / mass.sum())[:, None]
+    mean = (fraction * g.means.double()).sum(0)
+    apart = g.means.double() - mean
+    cov = covariances(g.quats.double(), g.log_scales.double()) + apart[:, :, None] * apart[:, None, :]
+    merged = {n: t.double() for n, t in pairs.merged.items()}
+    assert torch.allclose(merged["means"][0], mean, atol=1e-6)
+    assert torch.allclose(covariances(merged["quats"], merged["log_scales"])[0], (fraction[:, None] * cov).sum(0), atol=1e-6)
+    assert torch.allclose(merged["sh"][0], (fraction[:, None] * g.sh.double()).sum(0), atol=1e-6)
+    new = merged["logit_opacities"].sigmoid() * merged["log_scales"].exp().sort(1).values[:, 1:].prod(1)
+    assert 0.5 * float(mass.sum()) < float(new) < float(mass.sum()) * (1 + 1e-6)
+
+
+def flat_pair(apart: float, opacity: float, widths=(0.3, 0.2)) -> Gaussians:
+    """Two thin discs in the plane z = 0."""
+    rows = {n: t[[0, 0]].clone() for n, t in cloud(1).tensors().items()}
+    rows["means"] = torch.tensor([[0.0, 0, 0], [apart, 0, 0]])
+    rows["quats"] = torch.tensor([[1.0, 0, 0, 0]] * 2)
+    rows["log_scales"] = torch.log(torch.tensor([[widths[0], widths[1], 1e-3]] * 2))
+    rows["logit_opacities"] = torch.logit(torch.full((2,), opacity))
+    return Gaussians(**rows)
+
+
+@pytest.mark.parametrize("apart, opacity", [(0.1, 0.4), (0.4, 0.6), (0.5, 0.97), (0.05, 0.97)])
+def test_a_pair_covers_what_it_covered(apart, opacity):
+    """The integral of alpha, added up pixel by pixel, is that of the pair, also where opacity has no more room."""
+    x, y = torch.meshgrid(*[torch.linspace(-3, 3, 601, dtype=torch.float64)] * 2, indexing="ij")
+
+    def covered(rows) -> float:
+        left = torch.ones_like(x)
+        for mean, scale, logit in zip(rows["means"].double(), rows["log_scales"].double().exp(), rows["logit_opacities"]):
+            flat = scale.sort().values  # the long axis is x in both
+            left = left * (
+                1
+                - logit.double().sigmoid() * torch.exp(-0.5 * (((x - mean[0]) / flat[2]) ** 2 + ((y - mean[1]) / flat[1]) ** 2))
+            )
+        return float((1 - left).sum()) * 1e-4
+
+    g = flat_pair(apart, opacity)
+    merged = merges(g, torch.ones(2), torch.zeros(2), odd=False).merged
+    assert covered(merged) == pytest.approx(covered(g.tensors()), rel=1e-3)
+    assert float(merged["logit_opacities"].sigmoid()) <= OPAQUE + 1e-6
+
+
+def test_a_gaussian_in_two_halves_becomes_one_again():
+    """Two faint ones in the same place are one of nearly twice the opacity, in the same place."""
+    g = cloud(1)
+    rows = {n: t[[0, 0]] for n, t in g.tensors().items()}
+    rows["logit_opacities"] = torch.logit(torch.full((2,), 0.02))
+    pairs = merges(Gaussians(**rows), torch.ones(2), torch.zeros(2), odd=False)
+    assert torch.allclose(pairs.merged["logit_opacities"].sigmoid(), torch.tensor([0.04 - 0.5 * 0.02**2]), atol=1e-5)
+    assert torch.allclose(pairs.merged["means"], g.means, atol=1e-6) and torch.allclose(pairs.merged["sh"], g.sh)
+
+
+def test_pairs_are_disjoint_cheapest_first_and_of_one_kind():
+    """No row twice; other kinds stay apart; like neighbours come before unlike ones; a change has a parent for every row."""
+    g = cloud(101)
+    kinds = torch.arange(101) % 2
+    for odd in (False, True):
+        pairs = merges(g, torch.ones(101), kinds, odd)
+        rows = torch.cat([pairs.first, pairs.second])
+        assert len(rows) == len(rows.unique()) > 20 and bool((kinds[pairs.first] == kinds[pairs.second]).all())
+    means = torch.tensor([[0.0, 0, 1], [0.01, 0, 1], [5, 5, 1], [5.01, 5, 1]])
+    four = {n: t[[0, 0, 0, 0]].clone() for n, t in cloud(1).tensors().items()} | {"means": means}
+    four["sh"][2] += 1
+    pairs = merges(Gaussians(**four), torch.ones(4), torch.zeros(4), odd=False)
+    assert {int(pairs.first[0]), int(pairs.second[0])} == {0, 1} and len(pairs.first) == 2
+    change = pairs.change(4, 1)
+    assert change.keep.tolist() == [2, 3] and change.parents.tolist() == pairs.first[:1].tolist()
+    assert all(len(t) == 1 for t in change.added.values())
+
+
+# Parts of a user's own in a fit: loss terms, and a density strategy.
+
+PLAIN = FitConfig(steps=40, sh_every=15, init=InitConfig(source="points"), sh_degree=0)
+
+
+@pytest.fixture
+def registries_as_they_were(monkeypatch):
+    """What a test registers is gone after it."""
+    for registry in (STRATEGIES, LOSS_TERMS):
+        registry.names()
+        monkeypatch.setattr(registry, "_classes", dict(registry._classes))
+
+
+def advanced(fit: Trainer, until: int) -> Trainer:
+    while fit.step < until:
+        fit.advance()
+    return fit
+
+
+def same_bits(a: Trainer, b: Trainer) -> bool:
+    (tensors, plain), (others, again) = a.state(), b.state()
+    return tensors.keys() == others.keys() and all(torch.equal(t, others[n]) for n, t in tensors.items()) and plain == again
+
+
+@dataclass(frozen=True)
+class Gray(LossTerm):
+    """Mean squared difference of the render from a gray."""
+
+    weight: float = 20.0
+
+    def __call__(self, inputs):
+        """See the class."""
+        return self.weight * (inputs.outputs["rgb"] - 0.5).square().mean()
+
+
+@pytest.mark.usefixtures("registries_as_they_were")
+def test_a_term_that_is_not_active_changes_no_bit():
+    """One that is active does."""
+
+    class Never(Gray):
+        def active(self, step, steps):
+            return False
+
+    plain, active, never = (
+        advanced(Trainer(photos(2), seeds(), dataclasses.replace(PLAIN, loss_terms=terms), CPU), 6).gaussians.tensors()
+        for terms in ((), (LOSS_TERMS.register("gray")(Gray)(),), (LOSS_TERMS.register("never")(Never)(),))
+    )
+    assert all(torch.equal(t, never[n]) for n, t in plain.items()) and not torch.equal(active["sh"], plain["sh"])
+
+
+@pytest.mark.usefixtures("registries_as_they_were")
+def test_a_term_without_a_name_of_its_own_is_refused():
+    """A run folder could not tell it: never registered, or only by the name of the class that it derives from."""
+    with pytest.raises(UsageError, match=r"the loss term Gray has no registered name.*register_loss_term"):
+        dataclasses.replace(PLAIN, loss_terms=(Gray(),))
+    LOSS_TERMS.register("gray")(Gray)
+
+    class Stronger(Gray):
+        """Another class, which inherits the name."""
+
+    with pytest.raises(UsageError, match="Stronger has no registered name"):
+        dataclasses.replace(PLAIN, loss_terms=(Stronger(),))
+    with pytest.raises(UsageError, match=r"0\.5 is not a loss term"):
+        dataclasses.replace(PLAIN, loss_terms=(0.5,))
+    config = dataclasses.replace(PLAIN, loss_terms=(Gray(3.0),))
+    assert FitConfig.from_json(config.to_json()) == config
+
+
+@pytest.mark.usefixtures("registries_as_they_were")
+def test_two_terms_with_one_name_for_a_map_are_refused():
+    """The message names both, where one would have silently read what the other asked for."""
+
+    @LOSS_TERMS.register("first")
+    @dataclass(frozen=True)
+    class First(LossTerm):
+        def needs(self, view, prior):
+            return {"shared": view.image[..., 0]}
+
+    @LOSS_TERMS.register("second")
+    class Second(First):
+        pass
+
+    config = dataclasses.replace(PLAIN, loss_terms=(First(), Second()))
+    with pytest.raises(UsageError, match="'first' and 'second' both have a map 'shared'; rename"):
+        Trainer(photos(2), seeds(), config, CPU)
+
+
+@pytest.mark.usefixtures("registries_as_they_were")
+def test_a_term_sees_the_maps_that_it_asked_for():
+    """Those of the step's own view, at the size at which it is fitted; and what it returns is trained on."""
+    seen = []
+
+    @LOSS_TERMS.register("number")
+    @dataclass(frozen=True)
+    class Number(LossTerm):
+        def needs(self, view, prior):
+            assert prior is None
+            return {"red": view.image[..., 0], "pair": view.image[..., 1:]}
+
+        def __call__(self, inputs):
+            target, gaussians = inputs.target, inputs.gaussians
+            seen.append(tuple(target.image.shape))
+            assert torch.allclose(target.maps["red"], target.image[..., 0], atol=1e-6)
+            assert torch.allclose(target.maps["pair"], target.image[..., 1:], atol=1e-6)
+            return 0.1 * gaussians.log_scales.square().mean()
+
+    config = dataclasses.replace(PLAIN, loss_terms=(Number(),), half_resolution=0.5, steps=8)
+    fit, plain = (Trainer(photos(3), seeds(), c, CPU) for c in (config, dataclasses.replace(config, loss_terms=())))
+    advanced(fit, 8), advanced(plain, 8)
+    assert seen == [(16, 20, 3)] * 4 + [(32, 40, 3)] * 4
+    assert not torch.equal(fit.gaussians.log_scales, plain.gaussians.log_scales)
+
+
+OWN = """
+from dataclasses import dataclass
+import torch
+from warpgs.pipeline.model.table import Column, DensityUpdate
+from warpgs.pipeline.train.strategies.base import Strategy
+
+@dataclass(frozen=True)
+class Settings:
+    every: int = 5
+
+class OneMore(Strategy):
+    Config = Settings
+
+    def columns(self):
+        return {"came": Column(0, torch.int32, inherited=False)}
+
+    def setup(self):
+        self.asked = len(self.context.table), len(self.context.views)
+
+    def due(self, step):
+        return step % self.config.every == 0
+
+    def update(self, step):
+        t = self.context
+        keep = torch.arange(len(t.table), device=t.device)
+        added = {n: row[:1] for n, row in t.gaussians.tensors().items()}
+        yield DensityUpdate(keep, added, keep[:1], {"came": step})
+        assert len(t.table) == len(keep) + 1
+
+    def state(self):
+        return {"own.seen": torch.tensor(self.asked)}, {"asked": list(self.asked)}
+
+    def load(self, tensors, plain):
+        assert tensors["own.seen"].tolist() == plain["asked"] == list(self.asked)
+"""
+
+
+@pytest.mark.usefixtures("registries_as_they_were")
+@pytest.mark.parametrize("named", ["by file", "by name"])
+def test_a_strategy_of_ones_own(tmp_path, named):
+    """One more Gaussian every 5 steps, or as its settings say; it has columns and a state, and goes on from a checkpoint."""
+    (tmp_path / "own.py").write_text(OWN)
+    spec = f"{tmp_path / 'own.py'}:OneMore"
+    config = dataclasses.replace(PLAIN, strategy=spec, steps=12)
+    with pytest.raises(UsageError, match="does not load your code"):
+        Trainer(photos(2), seeds(), config, CPU)
+    cls = STRATEGIES.load(spec)
+    if named == "by name":
+        config = dataclasses.replace(config, strategy=STRATEGIES.register("one_more")(cls).name)
+        assert config.strategy == "one_more" and config.strategy_config == cls.Config(5)
+    fit, reports = Trainer(photos(2), seeds(), config, CPU), []
+    while fit.step < 12:
+        reports += fit.advance()
+    assert [r.count for r in reports] == [60] * 4 + [61] * 5 + [62] * 3
+    assert fit.table.columns["came"].tolist() == [0] * 60 + [5, 10] and fit.strategy.asked == (60, 2)
+
+    save_checkpoint(tmp_path, *advanced(Trainer(photos(2), seeds(), config, CPU), 7).state())
+    stored, values = load_checkpoint(tmp_path)
+    resumed = Trainer(photos(2), seeds(), FitConfig.from_json(values["config"]), CPU)
+    resumed.load(stored, values)
+    assert same_bits(advanced(resumed, 12), fit)
+
+    often = dataclasses.replace(config, strategy_config=cls.Config(every=2))
+    assert FitConfig.from_json(often.to_json()) == often
+    assert len(advanced(Trainer(photos(2), seeds(), often, CPU), 6).gaussians) == 63

@@ -1,0 +1,341 @@
+"""Options and rules: checked where they are made, named after other programs, chosen by error, with a true bound."""
+
+import dataclasses
+import math
+import re
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+import torch
+
+import warpgs
+from tests.gaussians import camera, cloud
+from tests.reference.project import project_reference
+from tests.render.bound_scenes import HEIGHT, KINDS, WIDTH, bound_scene
+from tools.run_docs import ROOT, collect
+from warpgs import RasterizeOptions, Rule, rasterize
+from warpgs.constants import RULES
+from warpgs.errors import UsageError
+from warpgs.render.options import SWITCHES, WHOLE_NUMBERS
+from warpgs.render.rasterize import FASTEST_FIRST, select_rule
+from warpgs.render.reference import reference_image
+from warpgs.scene import Camera, Gaussians
+
+# Options and rules of wrong types or ranges: an error where they are made, which names the field.
+
+
+@pytest.mark.parametrize(
+    "field, values",
+    {
+        "alpha_cut": (-1, 1, math.nan, "0.1"),
+        "alpha_max": (0, 1.01, 2, math.nan, None),
+        "transmittance_stop": (-0.1, 1, 2, math.nan),
+        "low_pass": (-1, math.nan, math.inf, "0.1"),
+        "square_sigma": (-1, math.nan, math.inf),
+        "inclusive_stop": ("no", 1),
+        "near": ("0.1",),
+        "far": ("10",),
+    }.items(),
+)
+def test_a_rule_checks_its_cut_offs(field, values):
+    """Types and ranges; numpy's numbers are numbers, and the ends of a range are in it."""
+    for value in values:
+        with pytest.raises(UsageError, match=rf"Rule\.{field} must be .*{value}"):
+            Rule("own", **{field: value})
+    assert Rule("own", alpha_cut=0, transmittance_stop=0.0, low_pass=np.float32(0)).low_pass == 0
+
+
+def test_options_check_their_types():
+    """A switch takes no text, whole numbers no text, no switch and no fraction."""
+    for name in SWITCHES:
+        for value in ("no", "antialiased", 1, None):
+            with pytest.raises(UsageError, match=f"{name} must be True or False, not {value!r}"):
+                RasterizeOptions(**{name: value})
+        RasterizeOptions(**{name: np.bool_(True)})
+    for name in WHOLE_NUMBERS:
+        for value in ("1", 1.5, True):
+            with pytest.raises(UsageError, match=f"{name} must be a whole number, not {value!r}"):
+                RasterizeOptions(**{name: value})
+        RasterizeOptions(**{name: np.int64(8)})
+    for name in ("sh_degree", "memory_budget", "capacity", "heaviest"):
+        with pytest.raises(UsageError, match=f"{name} must be at least 0, not -1"):
+            RasterizeOptions(**{name: -1})
+    for name in ("tile_size", "heaviest"):
+        with pytest.raises(UsageError, match=f"{name} must be a whole number, not None"):
+            RasterizeOptions(**{name: None})
+    for name in ("near", "far"):
+        for value in ("1", True, [1.0]):
+            with pytest.raises(UsageError, match=re.escape(f"{name} must be a number, not {value!r}")):
+                RasterizeOptions(**{name: value})
+    for value in ((0, 0, 16), (0.0, 0, 16, 16), "0 0 16 16", 16):
+        with pytest.raises(UsageError, match=re.escape(f"window must be four whole numbers, not {value!r}")):
+            RasterizeOptions(window=value)
+    RasterizeOptions(near=np.float32(1), far=2, window=[np.int64(0), 0, 16, 16])
+
+
+PIXELS = torch.zeros(1, 2, dtype=torch.int64)
+
+
+@pytest.mark.parametrize(
+    ("words", "options"),
+    [
+        ("unknown rule 'best': choose one of exact, balanced, fast, gsplat-1", {"rule": "best"}),
+        ("tile size 12 is not one of 8, 16", {"tile_size": 12}),
+        ("max_instances must be at least 1", {"max_instances": 0}),
+        ("max_instances must be at least 1", {"max_instances": 10, "capacity": 100}),
+        ("capacity must be at most 1,073,741,823, not 1,073,741,824", {"capacity": 2**30}),
+        ("error_bound and capacity exclude each other", {"error_bound": True, "capacity": 1000}),
+        ("feature_background requires features", {"feature_background": torch.zeros(8)}),
+        ("pixels cannot be combined", {"pixels": PIXELS, "window": (0, 0, 16, 16)}),
+        ("pixels cannot be combined", {"pixels": PIXELS, "contributions": True}),
+        ("pixels cannot be combined", {"pixels": PIXELS, "capacity": 100}),
+    ],
+)
+def test_options_out_of_range_or_together_are_refused(words, options):
+    """Where they are made, not at the first render."""
+    with pytest.raises(UsageError, match=words):
+        RasterizeOptions(**options)
+
+
+def test_a_background_is_numbers():
+    """Words of the command line are not."""
+    for value in ("white", ["a", "b", "c"], None.__class__):
+        with pytest.raises(TypeError, match=r"background must be numbers, shape \[3\] or \[C, 3\], not"):
+            rasterize(cloud(1), camera(37, 30), RasterizeOptions(background=value))
+
+
+def test_a_full_device_is_not_called_a_wrong_background(monkeypatch):
+    """The default background is made on the device; what fails there keeps its own error."""
+
+    def full(*_, **__):
+        raise torch.OutOfMemoryError("out of memory")
+
+    g, cam = cloud(1), camera(37, 30)
+    monkeypatch.setattr(torch.Tensor, "new_zeros", full)
+    with pytest.raises(torch.OutOfMemoryError):
+        rasterize(g, cam, RasterizeOptions())
+
+
+# The fastest rule within an error, measured on the scene at hand.
+
+BACKGROUND = torch.tensor([1.0, 0.5, 0.0])
+
+
+def cameras(device) -> list[Camera]:
+    """Two views of the cloud, the second further away."""
+    both = camera(50, 34, cameras=2, dtype=torch.float32, device=device)
+    return [dataclasses.replace(both, viewmat=v, K=k) for v, k in zip(both.viewmat, both.K)]
+
+
+@pytest.mark.parametrize(("measure", "reduce"), [("mean", torch.mean), ("max", torch.amax)])
+def test_the_fastest_rule_within_the_error(device, measure, reduce):
+    """At the largest error over the views a rule is chosen, just below it the next one; below float32 none is."""
+    g, views = cloud(300, device=device), cameras(device)
+    for number, rule in enumerate(FASTEST_FIRST):
+        options = RasterizeOptions(rule=rule, background=BACKGROUND, error_bound=True)
+        error = max(float(reduce(rasterize(g, c, options).error_bound)) for c in views)
+        given = {"measure": measure, "options": RasterizeOptions(background=BACKGROUND)}
+        assert select_rule(g, iter(views), max_error=error, **given) == (rule, error)
+        if number < 2:
+            slower, less = select_rule(g, views, max_error=0.99 * error, **given)
+            assert slower == FASTEST_FIRST[number + 1] and 0 < less < error
+        else:
+            with pytest.raises(UsageError, match=rf"no rule keeps the {measure} error within .* rounding alone gives"):
+                select_rule(g, views, max_error=0.99 * error, **given)
+
+
+def test_haze_keeps_the_exact_rule(device):
+    """Layers of 1.9/255 are seen under `exact` alone, so an error that a usual scene keeps with `fast` chooses `exact`."""
+    g = cloud(300, device=device)
+    haze = dataclasses.replace(
+        g, log_scales=g.log_scales + 5, logit_opacities=torch.logit(torch.full_like(g.logit_opacities, 1.9 / 255))
+    )
+    assert warpgs.select_rule(g, cameras(device), max_error=0.05)[0] == "fast"
+    assert warpgs.select_rule(haze, cameras(device), max_error=0.05)[0] == "exact"
+
+
+@pytest.mark.parametrize("error", [0.0, -1.0, float("nan"), float("inf"), "0.1"])
+def test_wrong_arguments(error):
+    """The limit, the measure and the views are checked before a view is rendered."""
+    g, views = cloud(1), cameras("cpu")
+    with pytest.raises(UsageError, match="positive number"):
+        select_rule(g, views, max_error=error)
+    with pytest.raises(UsageError, match="measure 'median' is not one of mean, max"):
+        select_rule(g, views, max_error=0.1, measure="median")
+    with pytest.raises(UsageError, match="at least one camera"):
+        select_rule(g, [], max_error=0.1)
+    with pytest.raises(UsageError, match=r"list of cameras, not one: give \[camera\]"):
+        select_rule(g, views[0], max_error=0.1)
+
+
+# Rules with the name of another program, against that program's documented constants in float64.
+
+
+class Program(NamedTuple):
+    """Constants of a program, copied here as numbers so that a change of `RULES` is noticed."""
+
+    alpha_max: float
+    near: float
+    sigmas: float
+    """Half side of the square around a Gaussian that is tiled, in standard deviations; above 3.33 it never binds."""
+
+
+PROGRAMS = {
+    "gsplat-1.6": Program(0.99, 0.01, 3.33),  # include/Common.h: MAX_ALPHA, GAUSSIAN_EXTEND; rendering.py: near_plane
+    "gsplat-1.5": Program(0.999, 0.01, 3.33),  # csrc/RasterizeToPixels3DGSFwd.cu, csrc/ProjectionEWA3DGSFused.cu
+    "inria": Program(0.99, 0.2, 3.0),  # forward.cu, auxiliary.h of diff-gaussian-rasterization
+}
+
+
+def image_of(gaussians: Gaussians, cam, program: Program) -> torch.Tensor:
+    """Return the image [H, W, 3] over black: 1/255 cuts, a Gaussian that leaves less than 1e-4 ends the pixel unblended."""
+    tensors = [t.double() for t in gaussians.tensors().values()]
+    size = {"width": cam.width, "height": cam.height}
+    means, covs, colors, depths, opacities = project_reference(
+        *tensors, cam.viewmat[None], cam.K[None], **size, degree=1, low_pass=0.3
+    )
+    xs, ys = (torch.arange(count, dtype=torch.float64) + 0.5 for count in (cam.width, cam.height))
+    image = torch.zeros(cam.height, cam.width, 3, dtype=torch.float64)
+    left = torch.ones(cam.height, cam.width, dtype=torch.float64)
+    done = torch.zeros_like(left, dtype=torch.bool)
+    for n in torch.argsort(depths[0], stable=True).tolist():
+        if depths[0, n] < program.near:
+            continue
+        A, dx, dy = torch.linalg.inv(covs[0, n]), xs - means[0, n, 0], (ys - means[0, n, 1])[:, None]
+        alpha = opacities[n] * torch.exp(-0.5 * (A[0, 0] * dx**2 + 2 * A[0, 1] * dx * dy + A[1, 1] * dy**2))
+        radius = torch.ceil(program.sigmas * torch.linalg.eigvalsh(covs[0, n])[-1].sqrt())
+        columns, rows = ((d.abs() <= radius).view(-1) for d in (dx, dy))
+        tiled = [torch.stack([part.any().expand(len(part)) for part in inside.split(16)]) for inside in (columns, rows)]
+        hit = (alpha >= 1 / 255) & tiled[0].view(-1) & tiled[1].view(-1, 1) & ~done
+        after = left * (1 - alpha.clamp_max(program.alpha_max))
+        done |= hit & (after < 1e-4)
+        hit &= ~done
+        image += torch.where(hit, left - after, 0.0)[..., None] * colors[0, n]
+        left = torch.where(hit, after, left)
+    return image
+
+
+def crowd() -> Gaussians:
+    """Opaque layers at every depth from 0.05 u on, so that clamp, stop and near plane all decide."""
+    g = cloud(250, torch.float64, seed=5)
+    depths = torch.linspace(0.05, 6, len(g), dtype=torch.float64)
+    means = g.means * depths[:, None] / g.means[:, 2:]
+    return Gaussians(means, g.quats, g.log_scales + (depths / 4).log()[:, None], 3 * g.logit_opacities + 3, g.sh)
+
+
+@pytest.mark.parametrize("name", PROGRAMS)
+def test_a_rule_has_the_constants_of_its_program(name, device):
+    """In float64 to rounding; the constants of every other program give another image."""
+    g, cam = crowd(), camera(64, 48)
+    on_device = Gaussians(**{n: t.to(device) for n, t in g.tensors().items()})
+    found = rasterize(on_device, cam, RasterizeOptions(rule=name)).rgb.cpu()
+    # sums of 250 terms below 3, each within some ulp: 1e-12 is a hundred times that
+    assert float((found - image_of(g, cam, PROGRAMS[name])).abs().max()) < 1e-12
+    for other in PROGRAMS.keys() - {name}:
+        assert float((found - image_of(g, cam, PROGRAMS[other])).abs().max()) > 1e-3
+
+
+def test_a_program_is_named_with_its_version():
+    """The name without one is refused with the names that there are."""
+    with pytest.raises(UsageError, match=r"'gsplat' needs a version.*choose gsplat-1\.6 or gsplat-1\.5$"):
+        rasterize(cloud(1), camera(), RasterizeOptions(rule="gsplat"))
+    assert {n for n in RULES if n.startswith("gsplat")} == {n for n in PROGRAMS if n.startswith("gsplat")}
+
+
+# The bound of a render's error: never below the true error, and close to it.
+
+
+def error_and_bound(number: int, device, rule) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return the true error of a scene's render and its bound, float64, shape [H, W] each."""
+    _, g, cam, background = bound_scene(number)
+    truth = reference_image(g, cam, (0, 0, WIDTH, HEIGHT), background, 1)
+    on_device = Gaussians(**{n: t.to(device) for n, t in g.tensors().items()})
+    r = rasterize(on_device, cam, RasterizeOptions(rule=rule, background=background, error_bound=True))
+    return (r.rgb.double().cpu() - truth).abs().amax(-1), r.error_bound.double().cpu()
+
+
+def bounds(number: int, device) -> None:
+    """Assert that the bounds of all rules hold in a scene, and are close where the cut-offs cost something."""
+    for rule in (*RULES, Rule("own", alpha_cut=0.02, alpha_max=0.9, transmittance_stop=0.1, near=0.4, low_pass=0.5)):
+        error, bound = error_and_bound(number, device, rule)
+        assert bool((error <= bound).all()), (number, rule)
+        # the rounding of float64 is 2e-9 of the largest colour, here at most 30, and float32 rounds a bound of 1 by 1.2e-7
+        assert bool((bound <= error * (1 + 3e-7) + 6e-8).all()), (number, rule)
+
+
+def test_the_bound_holds_and_is_tight(device):
+    """Two scenes of each kind, under every rule and one that differs in everything."""
+    for number in range(2 * len(KINDS)):
+        bounds(number, device)
+
+
+@pytest.mark.slow
+def test_the_bound_holds_in_more_scenes(device):
+    for number in range(2 * len(KINDS), 10 * len(KINDS)):
+        bounds(number, device)
+
+
+def test_haze_that_a_rule_drops(device):
+    """Layers of 3.9/255 are opaque under `exact` and nothing under `fast`: the bound shows the whole colour that is lost."""
+    g, count = cloud(1, device=device), 400
+    haze = Gaussians(**{n: t.expand(count, *t.shape[1:]).clone() for n, t in g.tensors().items()})
+    haze.means[:] = torch.tensor([0.0, 0.0, 4.0])
+    haze.log_scales.fill_(9.0)
+    haze.logit_opacities.fill_(float(torch.logit(torch.tensor(3.9 / 255))))
+    haze.sh.fill_(0.0)
+    options = RasterizeOptions(rule="fast", background=torch.full((3,), 1.5), error_bound=True)
+    found = rasterize(haze, camera(20, 12, dtype=torch.float32, device=device), options)
+    assert float(found.alpha.max()) == 0 and float(found.error_bound.min()) > 0.99
+
+
+def test_it_goes_with_the_other_options(device):
+    """Only on request; windows, chunks, batches and channels have it, with the same image."""
+    g, cam = cloud(300, device=device), camera(50, 34, cameras=2, dtype=torch.float32, device=device)
+    g.means.requires_grad_()
+    options = RasterizeOptions(rule="fast", error_bound=True)
+    whole, plain = rasterize(g, cam, options), rasterize(g, cam, RasterizeOptions(rule="fast"))
+    assert plain.error_bound is None and not options.repeatable() and torch.equal(whole.rgb, plain.rgb)
+    assert whole.error_bound.shape == (2, 34, 50)
+    chunked = rasterize(g, cam, dataclasses.replace(options, max_instances=100, median_depth=True, contributions=True))
+    assert torch.equal(chunked.error_bound, whole.error_bound)
+    window = rasterize(g, cam, dataclasses.replace(options, window=(16, 16, 34, 18)))
+    assert torch.equal(window.error_bound, whole.error_bound[:, 16:, 16:])
+    colors = torch.rand(300, 5, device=device)
+    channels = dataclasses.replace(options, colors=colors, features=colors, background=colors[0], opacity_factors=colors[:, 0])
+    found = rasterize(g, cam, channels)
+    exact = rasterize(g, cam, dataclasses.replace(channels, rule="exact", error_bound=False))
+    off = (found.rgb - exact.rgb).detach().abs().amax(-1)
+    # the reference is float64, this exact render float32: measured 4e-8 on average
+    assert float(off.max()) > 1e-3 and float((found.error_bound.detach() - off).abs().mean()) < 1e-6
+    none = Gaussians(**{n: t[:0] for n, t in g.tensors().items()})
+    assert float(rasterize(none, cam, options).error_bound.detach().max()) < 1e-30
+
+
+# The page for users of gsplat: its code runs, and it has a row for every argument.
+
+PAGE = ROOT / "docs" / "coming-from-gsplat.md"
+ARGUMENTS = """means quats scales opacities colors viewmats Ks width height near_plane far_plane radius_clip eps2d sh_degree
+packed tile_size backgrounds render_mode sparse_grad absgrad rasterize_mode channel_chunk distributed camera_model segmented
+covars
+with_ut with_eval3d return_normals global_z_order rays radial_coeffs tangential_coeffs thin_prism_coeffs ftheta_coeffs
+lidar_coeffs external_distortion_coeffs rolling_shutter viewmats_rs ut_params extra_signals extra_signals_sh_degree
+renderer_config""".split()
+"""Arguments of gsplat 1.6.0's rasterization, in its order."""
+
+
+def test_the_code_runs(capsys):
+    """The block with warpgs prints the shapes that its comment states."""
+    (block,) = [b for b in collect(PAGE.name, PAGE.read_text("utf-8")) if b.python and b.code]
+    exec(compile(block.code, PAGE.name, "exec"), {})
+    printed = re.findall(r"\[[\d, ]+\]", capsys.readouterr().out)
+    assert printed == re.findall(r"\[[\d, ]+\]", block.code.splitlines()[-1].split("#")[1])
+
+
+def test_every_argument_has_a_row():
+    """No argument of gsplat is left out, and none is invented; the page stays short."""
+    text = PAGE.read_text("utf-8")
+    table = text.split("## Arguments")[1].split("## Results")[0]
+    named = [name for row in table.splitlines()[4:] for name in re.findall(r"`(\w+)`", row.split("|")[1] if "|" in row else "")]
+    assert set(named) == set(ARGUMENTS)
+    assert len(text.split()) <= 800

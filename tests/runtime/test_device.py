@@ -1,0 +1,421 @@
+"""The machine: memory and its units, processors, idle threads, and the cache of kernels."""
+
+import os
+import platform
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from warpgs import device, folders
+from warpgs.device import (
+    available_bytes,
+    choose_kernel_cache,
+    container_memory,
+    format_bytes,
+    installed_bytes,
+    machine_memory,
+    parse_bytes,
+)
+from warpgs.errors import UsageError
+
+# Sizes in bytes: what is read, what is refused, what is written.
+
+
+@pytest.mark.parametrize(
+    ("text", "size"), [("2GiB", 2**31), ("512 MB", 512 * 10**6), ("1.5kib", 1536), (".5 TB", 5 * 10**11), ("7B", 7)]
+)
+def test_sizes_are_read(text, size):
+    """Powers of 1000 and of 1024, any case, with or without a space."""
+    assert parse_bytes(text) == size
+
+
+@pytest.mark.parametrize("text", ["", "2", "GiB", "-1GiB", "1e3MB", "nan GB", "0.1B", "2GiB!", "9" * 400 + "B", "٣GiB"])
+def test_nonsense_is_no_size(text):
+    """Without a unit it may be anything."""
+    with pytest.raises(UsageError, match="memory limit"):
+        parse_bytes(text)
+
+
+def test_sizes_are_written():
+    """One figure behind the point from MiB on."""
+    assert [format_bytes(n) for n in (5, 2048, 3 * 2**20, 2.5 * 2**30, 2**41)] == [
+        "5 B",
+        "2 KiB",
+        "3.0 MiB",
+        "2.5 GiB",
+        "2.0 TiB",
+    ]
+
+
+# Memory and processor on systems that lack what this one has, by stand-ins for what they read.
+
+CPU, GIB = torch.device("cpu"), 2**30
+
+
+def psutil_like(found):
+    """Return a stand-in for psutil that finds this, or raises it."""
+
+    def virtual_memory():
+        if isinstance(found, Exception):
+            raise found
+        return found
+
+    return SimpleNamespace(virtual_memory=virtual_memory)
+
+
+@pytest.fixture
+def elsewhere(monkeypatch, tmp_path):
+    """A machine without /proc and /sys, of 16 GiB, 10 of them free; nothing is remembered of this one."""
+    monkeypatch.setattr(device, "OWN_CGROUPS", tmp_path / "proc")
+    monkeypatch.setattr(device, "CGROUPS", tmp_path / "sys")
+    monkeypatch.setattr(device, "CPU_INFO", tmp_path / "cpuinfo")
+    monkeypatch.setitem(sys.modules, "psutil", psutil_like(SimpleNamespace(total=16 * GIB, available=10 * GIB)))
+    forgotten = (device.installed_bytes, device._say_assumed)
+    for f in forgotten:
+        f.cache_clear()
+    yield tmp_path
+    for f in forgotten:
+        f.cache_clear()
+
+
+def group(root, parts: str, **files):
+    """Write the files of a control group; a double underscore stands for a point."""
+    folder = root / "sys" / parts
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, text in files.items():
+        (folder / name.replace("__", ".")).write_text(f"{text}\n", "utf-8")
+
+
+def test_this_machine():
+    """Something between a small computer and a large one; free is less than installed."""
+    assert 2**28 < installed_bytes(CPU) < 2**46 and 2**20 < available_bytes(CPU) <= installed_bytes(CPU)
+    assert 1 <= device.usable_cores() <= (os.cpu_count() or 1) and device.processor_name()
+
+
+def test_without_control_groups(elsewhere):
+    """As on macOS and Windows: what psutil says."""
+    assert container_memory() is None and machine_memory() == (16 * GIB, 10 * GIB)
+    assert (installed_bytes(CPU), available_bytes(CPU)) == (16 * GIB, 10 * GIB)
+
+
+def test_limits_of_version_2(elsewhere):
+    """The tightest group between the process and the root counts; file pages not used lately are free."""
+    (elsewhere / "proc").write_text("0::/a/b\n", "utf-8")
+    group(elsewhere, "", memory__stat="anon 5")  # the root has no limit file
+    group(elsewhere, "a", memory__max=4 * GIB, memory__current=3 * GIB, memory__stat=f"anon 1\ninactive_file {GIB}")
+    group(elsewhere, "a/b", memory__max="max", memory__current=1)
+    assert container_memory() == machine_memory() == (4 * GIB, 2 * GIB)
+    group(elsewhere, "a/b", memory__max=3 * GIB, memory__current=GIB, memory__stat="")
+    assert machine_memory() == (3 * GIB, 2 * GIB)
+    group(elsewhere, "a", memory__current=6 * GIB)
+    assert machine_memory() == (3 * GIB, 0)
+
+
+@pytest.mark.parametrize("own", ["0::/\n", "0::/../elsewhere\n", "", "odd\n0::\n", None])
+def test_the_root_of_a_container_is_its_own_group(elsewhere, own):
+    """Also where the process's path cannot be read, leaves the mounted tree, or is not what it must be."""
+    if own is not None:
+        (elsewhere / "proc").write_text(own, "utf-8")
+    group(elsewhere, "", memory__max=GIB, memory__current=2**20)
+    assert machine_memory() == (GIB, GIB - 2**20)
+
+
+def test_limits_of_version_1(elsewhere):
+    """No limit is a large number; the group's path may lie outside of what the container sees."""
+    (elsewhere / "proc").write_text("4:cpu,memory:/docker/x\n1:name=systemd:/\n0::/\n", "utf-8")
+    none = {"memory__limit_in_bytes": 2**63 - 4096, "memory__usage_in_bytes": GIB}
+    group(elsewhere, "memory", **none)
+    assert container_memory() is None
+    group(elsewhere, "memory", memory__limit_in_bytes=2 * GIB, memory__stat=f"total_inactive_file {GIB // 2}")
+    assert machine_memory() == (2 * GIB, 3 * GIB // 2)
+    group(elsewhere, "memory/docker/x", memory__limit_in_bytes=GIB)  # what is used is not said
+    assert machine_memory() == (GIB, GIB)
+
+
+def test_a_limit_above_the_machine_changes_nothing(elsewhere):
+    """Nor does a file of nonsense."""
+    group(elsewhere, "", memory__max=64 * GIB, memory__current=0)
+    assert machine_memory() == (16 * GIB, 10 * GIB)
+    group(elsewhere, "", memory__max="-7 or so")
+    assert container_memory() is None
+
+
+REFUSALS = [FileNotFoundError("/proc/meminfo"), PermissionError("/proc"), RuntimeError("host_statistics64"), None]
+
+
+@pytest.mark.parametrize("found", [*REFUSALS, SimpleNamespace(total=GIB)], ids=[*map(repr, REFUSALS), "no field"])
+def test_a_system_that_says_nothing(elsewhere, monkeypatch, capsys, found):
+    """A stated amount is assumed, with one line; a container's limit still counts."""
+    monkeypatch.setitem(sys.modules, "psutil", found and psutil_like(found))  # None: it cannot be imported
+    assert machine_memory() is None
+    assert [available_bytes(CPU), available_bytes(CPU), installed_bytes(CPU)] == [device.ASSUMED_BYTES] * 3
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1 and "2 GiB are assumed" in said
+    group(elsewhere, "", memory__max=GIB, memory__current=2**20)
+    assert available_bytes(CPU) == GIB - 2**20 and not capsys.readouterr().err
+
+
+def test_memory_that_torch_holds_unused_is_available(monkeypatch):
+    """Free on a CUDA device is what the driver says, and what torch has reserved and not given out."""
+    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda _: (1000, 5000))
+    monkeypatch.setattr(torch.cuda, "memory_reserved", lambda _: 300)
+    monkeypatch.setattr(torch.cuda, "memory_allocated", lambda _: 20)
+    assert available_bytes(torch.device("cuda", 0)) == 1280
+
+
+@pytest.mark.parametrize("system", ["Darwin", "Windows"])
+def test_a_processor_without_affinity_or_proc(elsewhere, monkeypatch, system):
+    """All cores are usable, and the name is what Python knows."""
+    monkeypatch.delattr(os, "sched_getaffinity", raising=False)
+    monkeypatch.setattr(os, "cpu_count", lambda: 12)
+    monkeypatch.setattr(platform, "processor", lambda: {"Darwin": "arm", "Windows": ""}[system])
+    monkeypatch.setattr(platform, "machine", lambda: "AMD64")
+    assert device.usable_cores() == 12
+    assert device.processor_name() == {"Darwin": "arm", "Windows": "AMD64"}[system]
+    monkeypatch.setattr(os, "cpu_count", lambda: None)
+    monkeypatch.setattr(platform, "machine", lambda: "")
+    assert device.usable_cores() == 1 and device.processor_name()
+
+
+def test_a_processor_that_linux_names(elsewhere, monkeypatch):
+    """The model, and the cores that the process is bound to."""
+    (elsewhere / "cpuinfo").write_text("processor : 0\nmodel name\t: Some Processor: 3\n", "utf-8")
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {3, 5}, raising=False)
+    assert device.processor_name() == "Some Processor: 3" and device.usable_cores() == 2
+
+
+# Where kernels are compiled to: the usual folder, or a private one with a line that says so, or an error with its
+# remedy.
+
+POSIX = pytest.mark.skipif(not hasattr(os, "getuid"), reason="mode bits say nothing on Windows")
+HOMES = ("HOME", "USERPROFILE", "HOMEDRIVE", "HOMEPATH", "LOCALAPPDATA", "XDG_CACHE_HOME", "WARP_CACHE_PATH", "WARPGS_CACHE")
+
+COMPILE = """
+import os
+import torch
+import warp as wp
+from warpgs.kernels import tiles
+from warpgs.kernels import launch as interop
+
+module = tiles.make_kernels(wp.float32, False).pack_counts.module
+made = module.load(interop.warp_device(torch.device("cpu")), block_dim=1).binary_path
+folder = wp.config.kernel_cache_dir
+assert str(made).startswith(folder) and os.path.isfile(made)
+print(folder, oct(os.stat(os.path.dirname(os.path.dirname(folder))).st_mode & 0o777))
+"""
+
+UNKNOWN = """
+import grp, os, pwd, random, shutil, tempfile
+import warp
+from warpgs.device import prepare_kernel_cache
+os.setgroups([])
+os.setgid(54321)
+os.setuid(54321)  # after the imports: where Python lies may not be for everyone
+folder = prepare_kernel_cache()[0]
+print(folder / "version", oct(os.stat(os.path.dirname(folder)).st_mode & 0o777))
+"""
+
+
+@pytest.fixture
+def python(tmp_path):
+    """Run code in an empty folder with no home but what is given; nothing may be left there."""
+    here = tmp_path / "here"
+    here.mkdir()
+
+    def run(code: str, **variables: str) -> subprocess.CompletedProcess:
+        environment = {k: v for k, v in os.environ.items() if k not in HOMES} | variables
+        environment |= {"PYTHONPATH": str(Path(__file__).parent.parent.parent), "CUDA_VISIBLE_DEVICES": ""}
+        done = subprocess.run(
+            [sys.executable, "-c", code], env=environment, cwd=here, capture_output=True, text=True, check=False
+        )
+        assert not list(here.iterdir()), "a folder is left in the current one"
+        return done
+
+    return run
+
+
+def private(done: subprocess.CompletedProcess, reason: str) -> None:
+    """Assert that a kernel ran from a private folder, that one line said why, and that the folder is gone."""
+    assert done.returncode == 0, done.stderr
+    folder, mode = done.stdout.split()
+    (line,) = [row for row in done.stderr.splitlines() if row.startswith("warpgs:")]
+    assert reason in line and "WARP_CACHE_PATH" in line and str(Path(folder).parent) in line
+    assert Path(folder).parent.parent.name.startswith("warpgs-") and not Path(folder).exists()
+    assert mode == "0o700" or os.name == "nt"
+
+
+def test_a_home_that_cannot_be_written(python, tmp_path):
+    """A path below a file stands for /proc/1, a read-only disk and the like; kernels compile and run all the same."""
+    (tmp_path / "file").write_text("")
+    home = str(tmp_path / "file" / "home")
+    private(python(COMPILE, HOME=home, USERPROFILE=home, LOCALAPPDATA=home), "cannot be written")
+
+
+@pytest.mark.skipif(not hasattr(os, "getuid") or os.getuid() != 0, reason="to become a user that is not known takes root")
+@pytest.mark.parametrize(("home", "reason"), [(None, "no home folder"), ("/", "cannot be written"), ("/proc/1", "cannot be")])
+def test_a_user_that_the_system_does_not_know(python, home, reason):
+    """As in containers that run under any number: no home, or one that belongs to somebody else."""
+    private(python(UNKNOWN, **({} if home is None else {"HOME": home})), reason)
+
+
+def test_nothing_can_be_written(python, tmp_path):
+    """Exit class 4 and the remedy, from any command; not a defect."""
+    (tmp_path / "file").write_text("")
+    home = str(tmp_path / "file" / "home")
+    code = """
+import sys, tempfile
+def refuse(*_, **__): raise FileNotFoundError(2, "No usable temporary directory found")
+tempfile.gettempdir = refuse
+from warpgs.app.cli import main
+sys.exit(main(["eval", "run"]))
+"""
+    done = python(code, HOME=home, USERPROFILE=home, LOCALAPPDATA=home)
+    assert done.returncode == 4 and "WARP_CACHE_PATH" in done.stderr and "TMPDIR" in done.stderr
+    assert done.stderr.count("\n") == 1 and "defect" not in done.stderr
+
+
+def chosen(monkeypatch, folder) -> tuple[Path, str]:
+    monkeypatch.setenv("WARP_CACHE_PATH", str(folder))
+    return choose_kernel_cache()
+
+
+def test_a_sound_folder_is_used(monkeypatch, tmp_path):
+    """It is made for this user alone; one that the user's program or Warp has set comes first."""
+    assert chosen(monkeypatch, tmp_path / "new" / "cache") == ((tmp_path / "new" / "cache").resolve(), "")
+    assert os.name == "nt" or (tmp_path / "new" / "cache").stat().st_mode & 0o777 == 0o700
+    assert choose_kernel_cache(str(tmp_path / "mine")) == ((tmp_path / "mine").resolve(), "")
+
+
+@POSIX
+@pytest.mark.parametrize("where", ["cache", "cache/1.0", "cache/1.0/wp_x", "cache/1.0/wp_x/x.o", "."])
+def test_a_folder_that_others_can_write_to_is_refused(monkeypatch, tmp_path, where):
+    """They could plant a kernel, which would run as this user: in the cache, a version of it, a module, or in place of it."""
+    cache = tmp_path / "cache"
+    (cache / "1.0" / "wp_x").mkdir(parents=True)
+    (cache / "1.0" / "wp_x" / "x.o").write_bytes(b"")
+    cache.chmod(0o755)
+    assert chosen(monkeypatch, cache) == (cache.resolve(), "")
+    (tmp_path / where).chmod(0o777)
+    folder, why = chosen(monkeypatch, cache)
+    assert "other users can write to" in why and folder != cache.resolve()
+    if where == ".":
+        tmp_path.chmod(0o1777)  # as /tmp: others cannot move what is not theirs
+        assert chosen(monkeypatch, cache) == (cache.resolve(), "")
+
+
+@POSIX
+def test_groups_links_and_owners(monkeypatch, tmp_path):
+    """A group of other users may not write, the user's own may; links in a cache and folders of others are not followed."""
+    from warpgs import locks
+
+    cache = tmp_path / "cache"
+    cache.mkdir()
+    cache.chmod(0o775)
+    monkeypatch.setattr(locks, "_is_own_group", lambda gid: True)
+    assert not chosen(monkeypatch, cache)[1]
+    monkeypatch.setattr(locks, "_is_own_group", lambda gid: False)
+    assert "other users" in chosen(monkeypatch, cache)[1]
+    cache.chmod(0o755)
+    (cache / "1.0").symlink_to(tmp_path)
+    assert "other users" in chosen(monkeypatch, cache)[1]
+    cache.chmod(0o700)  # they cannot get in
+    assert not chosen(monkeypatch, cache)[1]
+    monkeypatch.setattr(os, "getuid", lambda: 12345)
+    if cache.stat().st_uid:
+        assert "other users" in chosen(monkeypatch, cache)[1]
+
+
+@POSIX
+@pytest.mark.parametrize(("planted", "refused"), [(".", True), ("cache", True), ("cache/1.0/wp_x/x.o", True), (None, False)])
+def test_what_another_user_owns_is_refused(monkeypatch, tmp_path, planted, refused):
+    """A folder above the cache, the cache, or a kernel planted in it: its owner can change it, whatever its mode says."""
+    cache = tmp_path / "cache"
+    (cache / "1.0" / "wp_x").mkdir(parents=True)
+    (cache / "1.0" / "wp_x" / "x.o").write_bytes(b"")
+    cache.chmod(0o755)
+    stranger = tmp_path / planted if planted else None
+    for name in ("stat", "lstat"):
+        look = getattr(Path, name)
+
+        def owned(path, look=look, **how):
+            found = look(path, **how)
+            return os.stat_result([*found[:4], 54321, *found[5:]]) if stranger is not None and path == stranger else found
+
+        monkeypatch.setattr(Path, name, owned)
+    folder, why = chosen(monkeypatch, cache)
+    assert (folder != cache.resolve()) == refused == ("other users can write to" in why)
+
+
+def test_where_files_have_no_owners_nothing_is_refused(monkeypatch, tmp_path):
+    """As on Windows, where the folder of a user's caches is private and mode bits say nothing."""
+    monkeypatch.delattr(os, "getuid", raising=False)
+    tmp_path.chmod(0o777)
+    assert chosen(monkeypatch, tmp_path / "cache") == ((tmp_path / "cache").resolve(), "")
+
+
+def test_no_folder_is_ever_called_tilde(monkeypatch, tmp_path):
+    """A ~ that nobody has replaced means the home folder; where that is not known, nothing is made."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    for name in ("HOME", "USERPROFILE"):
+        monkeypatch.setenv(name, str(tmp_path / "home"))
+    assert chosen(monkeypatch, "~/k") == ((tmp_path / "home" / "k").resolve(), "")
+    for home in ("~", "relative"):
+        for name in ("HOME", "USERPROFILE"):
+            monkeypatch.setenv(name, home)
+        assert "an unknown home folder" in chosen(monkeypatch, "~/k")[1]
+        monkeypatch.delenv("WARP_CACHE_PATH")
+        monkeypatch.delenv("LOCALAPPDATA", raising=False)
+        assert folders.cache_home() is None and "no home" in choose_kernel_cache()[1]
+    from warpgs.priors.networks import cache_folder
+
+    for name in ("HOME", "USERPROFILE"):
+        monkeypatch.setenv(name, str(tmp_path / "home"))
+    monkeypatch.setenv("WARPGS_CACHE", "~/maps")  # of another cache, that of the networks' maps
+    assert cache_folder() == tmp_path / "home" / "maps"
+    assert {p.name for p in tmp_path.iterdir()} == {"home"}
+
+
+@pytest.mark.parametrize("system", ["linux", "darwin", "win32"])
+def test_the_place_on_each_system(monkeypatch, tmp_path, system):
+    """Where Warp keeps its kernels by itself, so that what is compiled there is found."""
+    monkeypatch.setattr(sys, "platform", system)
+    monkeypatch.setattr(Path, "home", lambda: tmp_path)
+    for name in ("XDG_CACHE_HOME", "LOCALAPPDATA", "WARP_CACHE_PATH"):
+        monkeypatch.delenv(name, raising=False)
+    wanted = {"linux": ".cache/warp", "darwin": "Library/Caches/warp", "win32": "AppData/Local/NVIDIA/warp/Cache"}[system]
+    assert choose_kernel_cache() == ((tmp_path / wanted).resolve(), "")
+
+
+# Idle threads of OpenMP: they sleep where warpgs is imported first, and a warning says so where they do not.
+
+RENDER = """
+n = 5000
+g = warpgs.Gaussians(torch.rand(n, 3), torch.rand(n, 4), torch.rand(n, 3) - 4, torch.zeros(n), torch.zeros(n, 1, 3))
+camera = warpgs.Camera(torch.eye(4), torch.eye(3), 16, 16)
+for threads in (1, 2, 2):
+    torch.set_num_threads(threads)
+    warpgs.rasterize(g, camera)
+    print("rendered", threads, file=sys.stderr)
+"""
+"""5,000 Gaussians are enough work for the threads of a launch (`interop.SERIAL_WORK`)."""
+
+
+@pytest.mark.parametrize(
+    "imports, policy, warned", [("torch, warpgs", None, 1), ("warpgs, torch", None, 0), ("torch, warpgs", "active", 0)]
+)
+def test_a_warning_where_torch_was_imported_first(imports, policy, warned):
+    """Once, in the first render with threads, unless the environment says how OpenMP waits."""
+    environment = {k: v for k, v in os.environ.items() if k != "OMP_WAIT_POLICY"}
+    if policy:
+        environment["OMP_WAIT_POLICY"] = policy
+    code = f"import sys\nimport {imports}\n{RENDER}"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment)
+    alone, *threaded = done.stderr.split("rendered 1")
+    assert "OMP_WAIT_POLICY" not in alone
+    assert threaded[0].count("import warpgs before torch, or set OMP_WAIT_POLICY=passive") == warned
+    assert threaded[0].count("<string>:9: RuntimeWarning") == warned  # the line that calls rasterize

@@ -1,0 +1,435 @@
+"""Benches of whole fits: presets, rivals, objects, meshes, and gsplat's trainer."""
+
+import functools
+import math
+import sys
+from dataclasses import dataclass
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from bench.lib import gsplat_trainer, one_fit, pool, result_file, surfaces
+from bench.lib.arms import ABLATION, ARMS, LADDER, RIVALS, Arm, chosen_steps
+from bench.lib.backgrounds import ply_scores
+from bench.lib.gsplat_trainer import default_settings, strategy_of
+from bench.lib.one_fit import Fit, config_of, is_peer, peer_settings
+from bench.lib.pool import finished
+from bench.lib.preset_table import rival, sizes_table, tables
+from bench.lib.rivals_page import arms_table, other_steps_table
+from bench.lib.scenes import ROWS, Row, folds, left_out, row_of, scene_at
+from tests import gaussians as sets
+from tests.scenes import photos
+from warpgs import RasterizeOptions, rasterize
+from warpgs.errors import UsageError
+from warpgs.io.load import split_views
+from warpgs.pipeline.train.presets import PRESETS
+from warpgs.pipeline.train.schedule import mean_color
+from warpgs.pipeline.train.settings import settings_by_views
+from warpgs.pipeline.train.strategies.base import STRATEGIES
+from warpgs.scene import Camera, Gaussians, Mesh, Normalization, View
+from warpgs.synthetic import raycast
+from warpgs.synthetic.demo import camera_path, split_spec, still_life, write_demo
+
+# The training loop around gsplat, with a stand-in for gsplat that renders with our rasterizer and notes its calls.
+
+
+@pytest.fixture
+def fake_gsplat(monkeypatch):
+    """A module in place of gsplat; it notes strategies, degrees, and the learning rate of the means at each step."""
+    told = SimpleNamespace(strategies=[], degrees=[], lrs=[])
+
+    class MCMCStrategy:
+        def __init__(self, **settings):
+            told.strategies.append(settings)
+            told.lrs.clear()
+
+        def check_sanity(self, params, optimizers):
+            assert set(params) == set(optimizers) == {"means", "scales", "quats", "opacities", "sh0", "shN"}
+
+        def initialize_state(self):
+            return {}
+
+        def step_pre_backward(self, params, optimizers, state, step, info):
+            assert info == {"seen": step}
+
+        def step_post_backward(self, params, optimizers, state, step, info, lr):
+            assert all(p.grad is None for p in params.values()) and step == len(told.lrs)
+            told.lrs.append(lr)
+
+    def rasterization(means, quats, scales, opacities, colors, viewmats, Ks, width, height, sh_degree, packed):
+        told.degrees.append(sh_degree)
+        g = Gaussians(means, quats, scales.log(), opacities.logit(), colors)
+        rgb = rasterize(g, Camera(viewmats, Ks, width, height), RasterizeOptions(rule="gsplat-1.5", sh_degree=sh_degree)).rgb
+        return rgb, None, {"seen": len(told.lrs)}
+
+    module = SimpleNamespace(MCMCStrategy=MCMCStrategy, rasterization=rasterization)
+    monkeypatch.setitem(sys.modules, "gsplat", module)
+    return told
+
+
+def first(count: int) -> Gaussians:
+    """Gaussians in front of the cameras of `photos`, of which only means and colours matter."""
+    generator = torch.Generator().manual_seed(0)
+    means = torch.rand(count, 3, generator=generator) - 0.5
+    return Gaussians(means, torch.zeros(count, 4), torch.zeros(count, 3), torch.zeros(count), torch.zeros(count, 1, 3))
+
+
+def test_gsplat_is_trained_as_its_example_trainer_does(fake_gsplat):
+    """Settings of the strategy, degree by step, rate of the means from its start to a hundredth; the loss falls."""
+    views = photos(3)
+    s = gsplat_trainer.Settings(steps=12, cap=123, sh_every=4)
+    params = gsplat_trainer.train(views, first(200), s, seed=1, scale=2.0, size=3.0)
+    assert fake_gsplat.strategies == [
+        {"cap_max": 123, "noise_lr": 5e5, "refine_start_iter": 500, "refine_stop_iter": 10, "refine_every": 100}
+    ]
+    assert fake_gsplat.degrees == [0] * 4 + [1] * 4 + [2] * 4
+    wanted = [3.0 * 1.6e-4 * 0.01 ** ((k + 1) / 12) for k in range(12)]
+    assert fake_gsplat.lrs == pytest.approx(wanted)
+    again = gsplat_trainer.start(2 * first(200).means, torch.full((200, 3), 0.5), s)
+    before, after = (
+        np.mean([np.square(gsplat_trainer.image_of(p, v, 2.0) - v.image).mean() for v in views]) for p in (again, params)
+    )
+    assert after < before
+
+
+def test_the_unit_changes_nothing_that_is_seen(fake_gsplat):
+    """Twice the unit with twice the world gives the same image."""
+    view, s = photos(1)[0], gsplat_trainer.Settings(steps=1, cap=1)
+    torch.manual_seed(0)
+    params = gsplat_trainer.start(first(100).means, torch.rand(100, 3), s)
+    image = gsplat_trainer.image_of(params, view, 1.0)
+    params["means"].data *= 2
+    params["scales"].data += np.log(2)
+    assert image.max() > 0.05 and np.abs(gsplat_trainer.image_of(params, view, 2.0) - image).max() < 1e-3
+
+
+def test_its_own_unit_is_that_of_its_parser():
+    """Cameras on a circle of radius 4 in the files that look at the origin: there 4 is 1, whatever our unit."""
+    cameras, n = [], Normalization(np.array([1.0, 2.0, 3.0]), 0.5)
+    for angle in np.linspace(0, 2 * np.pi, 8, endpoint=False):
+        axis = -np.array([np.cos(angle), np.sin(angle), 0])
+        right = np.array([-axis[1], axis[0], 0])
+        rotation = np.stack([right, np.cross(axis, right), axis])
+        center = 0.5 * (-4 * axis - n.offset)
+        viewmat = np.eye(4)
+        viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ center
+        cameras.append(Camera(viewmat, np.eye(3), 4, 4))
+    assert gsplat_trainer.own_scale(cameras, n) == pytest.approx(1 / (4 * 0.5))
+    assert gsplat_trainer.scene_scale(cameras, 0.5) == pytest.approx(1.1 * 0.5 * 2)
+
+
+# Presets side by side: rows and what is left out of them, the worker processes, one fit, and the tables.
+
+
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory) -> str:
+    """Folder of a tiny scene."""
+    folder = tmp_path_factory.mktemp("data") / "scene"
+    write_demo(folder, views=8, width=40, height=32)
+    return str(folder)
+
+
+def test_rows_are_named_or_given():
+    """A name, or a folder with its split and downscale; anything else is an error that lists them."""
+    assert row_of("fern:3") is ROWS["fern:3"] and row_of("a/b@llff:3") == Row("a/b", "llff:3")
+    assert row_of("a/b@every:8@2") == Row("a/b", "every:8", 2)
+    for name in ("fern:4", "a@", "@llff:3", "a@all@0"):
+        with pytest.raises(UsageError, match="fern:17"):
+            row_of(name)
+
+
+def test_training_views_are_left_out_and_held_out_ones_are_not_read(demo):
+    """Up to four views one by one, of more some between the ends; what is scored is no held-out view."""
+    assert left_out(("a", "b", "c"), 2) == [("a",), ("b",), ("c",)]
+    assert left_out(tuple("abcdefghi"), 1) == [("e",)] and left_out(tuple("abcdefghi"), 3) == [("c", "e", "g")]
+    with pytest.raises(UsageError, match="at least two"):
+        left_out(("a", "b"), 1)
+    scene, spec = scene_at(demo, 1), split_spec(8)
+    whole = split_views(scene, spec)
+    assert folds(scene, spec, 0) == [(spec, "")]
+    ((part, names),) = folds(scene, spec, 2)
+    cut = split_views(scene, part)
+    assert set(cut.train) | set(cut.test) == set(whole.train) and ",".join(cut.test) == names and len(cut.test) == 2
+
+
+def test_failures_are_results_and_no_task_begins_after_the_limit():
+    """An exception and a dead worker each become the result of their task; the others go on."""
+    assert list(finished(eval, ["{}"], 1, 0.0)) == []
+    died, good = "__import__('os')._exit(1)", "{'square': 4}"
+    found = dict(finished(eval, ["1 / 0", died, good], 1, math.inf))  # built in: workers import nothing
+    assert found["1 / 0"]["error"].startswith("ZeroDivisionError") and found[good] == {"square": 4}
+    assert "Broken" in found[died]["error"]
+
+
+def test_an_error_before_the_first_task_is_not_lost():
+    """Without compiled kernels, every worker would compile them again."""
+    with pytest.raises(ZeroDivisionError):
+        list(finished(eval, ["{}"], 1, math.inf, functools.partial(divmod, 1, 0)))
+
+
+def test_a_fit_gives_a_row_and_the_peer_starts_from_the_same_points(demo, fake_gsplat, monkeypatch):
+    """Ours through the public fit; gsplat from our start, and from the points of the reconstruction; all scored alike."""
+
+    class DefaultStrategy(sys.modules["gsplat"].MCMCStrategy):
+        def initialize_state(self, scene_scale):
+            assert scene_scale > 0
+            return {}
+
+        def step_post_backward(self, **values):
+            super().step_post_backward(**values, lr=0.0)
+
+    monkeypatch.setattr(sys.modules["gsplat"], "DefaultStrategy", DefaultStrategy, raising=False)
+    counts = {}
+    for preset in ("quick", *one_fit.PEERS):
+        row = one_fit.measure(Fit("r", f"{preset}:steps=3", 1, demo, split_spec(8), "", 1, "cpu"))
+        assert 3 < row["psnr"] < 40 and row["steps"] == 3 and row["bytes"] > 0 and row["setup"] > 0
+        counts[preset] = row.get("points")
+    seen = scene_at(demo, 1).points.seen_by(set(split_views(scene_at(demo, 1), split_spec(8)).train), least=2)
+    assert counts[one_fit.PEER_POINTS] == len(seen) != counts[one_fit.PEER] > 0
+
+
+def test_the_default_strategy_has_its_own_settings(fake_gsplat, monkeypatch):
+    """Refinement up to half of the steps, no regularizers, opacity 0.1; its state knows the size of the scene."""
+    made = SimpleNamespace(
+        DefaultStrategy=lambda **k: SimpleNamespace(told=k, initialize_state=lambda scene_scale: scene_scale)
+    )
+    monkeypatch.setitem(sys.modules, "gsplat", made)
+    s = default_settings(7000)
+    strategy, state = strategy_of(s, 2.5)
+    assert strategy.told == {"refine_start_iter": 500, "refine_stop_iter": 3500, "refine_every": 100} and state == 2.5
+    assert (s.init_opacity, s.init_scale, s.opacity_reg, s.scale_reg) == (0.1, 1.0, 0.0, 0.0)
+
+
+def results(row: str, preset: str, scores: list[float], **more) -> list[dict]:
+    """Rows of a preset, one for each seed."""
+    rest = {"ssim": 0.5, "gaussians": 10, "bytes": 2000, "steps": 7, "setup": 1.0, "training": 2.0, "left_out": ""} | more
+    return [{"row": row, "preset": preset, "seed": s, "psnr": p} | rest for s, p in enumerate(scores)]
+
+
+def test_the_rival_is_picked_on_the_other_seeds():
+    """One lucky seed makes a rival everywhere but on that seed."""
+    scores = {"default": [20.0, 20.0, 20.0], "even": [20.1, 20.1, 20.1], "lucky": [19.0, 25.0, 19.0]}
+    d, names = rival({k: dict(enumerate(v)) for k, v in scores.items()}, "default")
+    assert sorted(names) == ["even", "lucky"]
+    assert d.mean == pytest.approx(((20 - 19) + (20 - 20.1) + (20 - 19)) / 3) and d.count == 3
+    shorter, _ = rival(
+        {"default": {0: 20.0, 1: 20.0, 2: 20.0}, "weak": {0: 1.0, 1: 1.0, 2: 1.0}, "best": {0: 21.0, 1: 21.0}}, "default"
+    )
+    assert shorter.count == 2 and shorter.mean == pytest.approx(-1), "seeds that the best lacks are not compared"
+
+
+def test_tables_say_worst_seed_times_and_failures():
+    """The worst seed below the median, times beside other fits in brackets, views left out averaged, errors named."""
+    rows = results("a", "default", [20.0, 20.2, 19.5], jobs=1) + results("a", "x", [20.1, 20.1, 20.1], jobs=6)
+    rows += results("b", "x", [1.0], left_out="u") + results("b", "x", [3.0], left_out="v")
+    rows += [{"row": "b", "preset": "default", "seed": 0, "error": "E: no"}]
+    text = tables(rows, "default")
+    assert "| a | `default` | 3 | 19.90 ± 0.36 | 0.5000 ± 0.0000 | 0.50 | 10 | 2 | 1.0 + 2.0 | 7 |" in text
+    assert "| (1.0 + 2.0) | 7 |" in text and "| b | `x` | 1 | 2.00 |" in text
+    assert "Worst row: a, -0.20 dB, beyond" in text and "- failed: b, `default`, seed 0: E: no" in text
+
+
+@dataclass(frozen=True)
+class Task:
+    """A task as `measure_all` takes it."""
+
+    seed: int
+
+    @property
+    def key(self) -> dict:
+        """What tells its row from others."""
+        return {"seed": self.seed}
+
+
+def test_a_stopped_comparison_goes_on(tmp_path, monkeypatch, capsys):
+    """Finished rows are kept, failed ones are tried again, and another commit is refused."""
+    calls = []
+
+    def ran(work, tasks, *_):
+        calls.append([t.seed for t in tasks])
+        return [(t, {"error": "E: no"} if len(calls) == 1 and t.seed else {"psnr": 20.0}) for t in tasks]
+
+    monkeypatch.setattr(pool, "finished", ran)
+    out = tmp_path / "p.json"
+    a = SimpleNamespace(out=out, jobs=1, seconds=math.inf)
+    for _ in range(2):
+        rows = pool.measure_all(None, [Task(0), Task(1)], None, a, "w", torch.device("cpu"), lambda r: f"{r['psnr']:.1f}")
+    assert calls == [[0, 1], [1]] and [r["psnr"] for r in rows] == [20.0, 20.0]
+    assert "failed: E: no" in capsys.readouterr().out and pool.stored_rows(out) == rows
+    result_file.write(out, result_file.read(out) | {"commit": "other"})
+    with pytest.raises(UsageError, match="choose another --out"):
+        pool.stored_rows(out)
+
+
+def test_a_preset_changes_what_it_names_and_nothing_else():
+    """Values by name in the preset's settings; what sets nothing is refused."""
+    made = one_fit.config_of("quick:optimizer.scales_decay=0.5,init.source=flow,steps=7", 3).to_json()
+    base = PRESETS["quick"].to_json() | {"seed": 3}
+    base["optimizer"]["scales_decay"], base["init"]["source"], base["steps"] = 0.5, "flow", 7
+    assert made == base and one_fit.config_of("pruned/quick") == PRESETS["quick"]
+    for bad in ("slow", "quick:steps", "quick:optimizer.speed=1", "quick:steps.x=1", "quick:steps=0"):
+        with pytest.raises(UsageError):
+            one_fit.config_of(bad)
+
+
+def test_sizes_are_paired_with_the_fixed_fit():
+    """Half the bytes at 0.04 dB less is within the limits; SSIM that is not measured is left out."""
+    rows = []
+    for row in ("a", "b"):
+        rows += results(row, "paper", [20.0, 21.0]) + results(row, "small", [19.96, 20.96], bytes=1000)
+        rows += results(row, "pruned/paper", [19.9, 20.9], ssim=None)
+    text = sizes_table(rows, "paper")
+    assert "- small: 0.50 of the bytes, -0.0400 dB [-0.0400, -0.0400], +0.0000 SSIM" in text
+    assert "- pruned/paper: 1.00 of the bytes, -0.1000 dB [-0.1000, -0.1000] over 2 scenes; beyond limits" in text
+
+
+# Rivals under one rule: their steps are chosen on training views left out, and all share start, background and degree.
+
+
+@pytest.fixture
+def registry_as_it_was(monkeypatch):
+    """What a test registers is gone after it."""
+    STRATEGIES.names()
+    monkeypatch.setattr(STRATEGIES, "_classes", dict(STRATEGIES._classes))
+
+
+@pytest.mark.usefixtures("registry_as_it_was")
+@pytest.mark.parametrize("views", [3, 6])
+def test_all_arms_share_start_background_and_degree(views):
+    """Those of `default`, for any number of views; only the ladder's first arm starts at random."""
+    train = photos(views)
+    default = settings_by_views(config_of("default"), train, "cpu")[0]
+    for arm in (*RIVALS, *LADDER, *ABLATION):
+        if is_peer(arm.preset):
+            peer = peer_settings(arm.preset, train)
+            assert (peer.sh_degree, peer.background) == (default.sh_degree, mean_color(train)), arm.words
+            continue
+        own = settings_by_views(config_of(arm.preset), train, "cpu")[0]
+        assert (own.sh_degree, own.background) == (default.sh_degree, "auto"), arm.words
+        start = (own.init.merge_px, own.init.fill_px, own.init.opacity, own.init.scale_factor)
+        same = start == (8, 32, default.init.opacity, default.init.scale_factor) and own.init.source in ("auto", "sweep")
+        assert same != (arm is LADDER[0]), arm.words
+
+
+@pytest.mark.usefixtures("registry_as_it_was")
+def test_the_page_pairs_each_method_with_its_base():
+    """Differences are paired by seed, to the first arm or to the one above; few seeds have no interval; cells may lack."""
+    arms = (Arm("a", "default"), Arm("b", "3dgs", (10, 20)), Arm("c", "mcmc:steps=7"))
+    rows = results("fern:3", "default", [20.0, 20.2, 20.1]) + results("fern:3", "3dgs:steps=20", [21.0, 21.4, 21.2])
+    rows += results("fern:3", "mcmc:steps=7", [19.0, 19.2])
+    rows += [{"row": "fern:3", "preset": f"3dgs:steps={n}", "seed": 0, "left_out": "x", "psnr": float(n)} for n in (10, 20)]
+    table = arms_table(arms, rows, ["fern:3"], above=False).splitlines()
+    assert table[0].startswith("| method | fern: steps | PSNR / SSIM | difference |")
+    assert "| a | 4,500 | 20.10 / 0.500 |  |" in table
+    low, high = (1.1 + sign * 0.1 / math.sqrt(3) * 6.2053 for sign in (-1, 1))  # Student's t, 97.5 % of two rows, two degrees
+    assert f"| b | 20 | 21.20 / 0.500 | +1.10 [{low:+.2f}, {high:+.2f}] |" in table
+    assert "| c | 7 | 19.10 / 0.500 (2 seeds) | -1.00 |" in table
+    again = arms_table((*arms, Arm("d", "quick")), rows, ["fern:3"], above=True).splitlines()
+    assert again[-2:] == ["| c | 7 | 19.10 / 0.500 (2 seeds) | -2.10 |", "| d |  |  |  |"]
+
+
+@pytest.mark.usefixtures("registry_as_it_was")
+def test_the_page_lists_scores_with_steps_that_were_not_chosen():
+    """Those on held-out views alone, beside the first arm: the chosen number stands in the other table."""
+    arms = (Arm("a", "default"), Arm("b", "3dgs", (10, 20)))
+    rows = results("fern:3", "3dgs:steps=10", [21.0, 21.4]) + results("fern:3", "3dgs:steps=20", [20.0])
+    rows += results("fern:3", "default", [22.0, 22.0, 25.0])
+    rows += [{"row": "fern:3", "preset": f"3dgs:steps={n}", "seed": 0, "left_out": "x", "psnr": float(n)} for n in (10, 20)]
+    assert other_steps_table(arms, rows, ["fern:3"]).splitlines()[2:] == ["| fern | b | 10 | 21.20 ± 0.28 (2 seeds) | -0.80 |"]
+
+
+@pytest.mark.usefixtures("registry_as_it_was")
+def test_every_arm_names_its_steps_once():
+    """Numbers of steps are read from the preset itself."""
+    for arm in (a for arms in ARMS.values() for a in arms if a.steps):
+        assert len(arm.steps) > 1 and arm.steps == tuple(sorted(arm.steps))
+        for steps in arm.steps:
+            preset = arm.with_steps(steps)
+            found = peer_settings(preset, photos(3)) if is_peer(preset) else config_of(preset)
+            assert found.steps == steps
+
+
+@pytest.mark.usefixtures("registry_as_it_was")
+def test_an_arm_sets_what_a_strategy_of_ones_own_has():
+    """By the names of its flags, after the strategy; a name that it lacks is refused."""
+    own = "3dgs:strategy=examples/05_own_strategy.py:Sprout,sprout.growth="
+    assert config_of(f"{own}0.5").strategy_config.growth == 0.5
+    assert config_of(f"{own}0.5,steps=7,sprout.every=3").strategy_config.every == 3
+    for bad in (f"{own}0.5,sprout.speed=1", "3dgs:sprout.growth=0.5"):
+        with pytest.raises(UsageError, match="sets nothing"):
+            config_of(bad)
+
+
+@pytest.mark.usefixtures("registry_as_it_was")
+def test_steps_are_chosen_on_views_left_out():
+    """The best mean; a number that lacks a view, a test score and a failure count for nothing."""
+    arm = Arm("a", "3dgs:sh_degree=0", (10, 20, 30))
+
+    def row(steps: int, out: str, psnr: float) -> dict:
+        return {"row": "r", "preset": f"3dgs:sh_degree=0,steps={steps}", "seed": 0, "left_out": out, "psnr": psnr}
+
+    rows = [row(10, "x", 20.0), row(10, "y", 22.0), row(20, "x", 21.5), row(20, "y", 21.0), row(30, "x", 99.0)]
+    rows += [row(10, "", 99.0), row(10, "z", 99.0) | {"error": "died"}, row(10, "x", 99.0) | {"row": "other"}]
+    assert chosen_steps(rows, "r", arm) == 20
+    with pytest.raises(UsageError, match="a: no number of steps was tried"):
+        chosen_steps(rows, "r", Arm("a", "mcmc", (10, 20)))
+
+
+# Objects with true alpha in the bench are scored right before other backgrounds.
+
+
+def test_a_ply_is_right_before_every_background_where_the_truth_is_rendered_by_itself():
+    """What the Gaussians themselves look like over a colour is no error before any background; another opacity is one."""
+    ours, camera, gray = sets.cloud(40), sets.camera(dtype=torch.float32), (0.5, 0.25, 0.75)
+    r = rasterize(ours, camera, RasterizeOptions(background=torch.tensor(gray)))
+    view = View("a", camera, r.rgb.clamp(0, 1).numpy(), alpha=r.alpha.numpy())
+    assert 0.02 < view.alpha.mean() < 0.98
+    right = ply_scores(ours, [view], gray)
+    assert set(right) == {"ply_black", "ply_white", "ply_pattern"} and min(right.values()) > 45
+    denser = View("a", camera, view.image, alpha=np.sqrt(view.alpha))
+    wrong = ply_scores(ours, [denser], gray)
+    assert max(wrong.values()) < 35
+
+
+# The errors of meshes are measured right: distances to shapes, to triangles, and what is made of them.
+
+SQUARE = Mesh(
+    np.array([[0.0, 0, 0], [2, 0, 0], [2, 1, 0], [0, 1, 0]]),
+    np.array([[0, 1, 2], [0, 2, 3]], np.int32),
+    np.zeros((4, 3), np.float32),
+)
+
+
+def test_distances_to_the_shapes_that_rays_hit():
+    """Points that rays hit lie on a surface; moved along its normal they lie that far from their shape, also inside of it."""
+    shapes, camera = still_life(), camera_path(8, 64, 48)[3]
+    points = surfaces.true_points(shapes, [camera])
+    assert len(points) == 64 * 48 and np.min([surfaces.distance_to(s, points) for s in shapes], axis=0).max() < 1e-4
+    rays = raycast.pixel_rays(camera.K, camera.viewmat, np.random.default_rng(0).uniform(0, 48, (500, 2)))
+    t, index = raycast.cast(shapes, camera.center, rays)
+    for i, shape in enumerate(shapes):
+        x = camera.center + (t[:, None] * rays)[index == i]
+        normals = shape.normal(shape.local(x)) @ shape.rotation.T
+        for step in (0.02, -0.02):
+            found = surfaces.distance_to(shape, x + step * normals)
+            assert (found <= 0.02 + 1e-6).all() and (not len(x) or np.median(found) == pytest.approx(0.02, abs=1e-6))
+
+
+def test_depth_is_along_the_axis():
+    """A wall across the axis has one depth."""
+    wall = raycast.Plane((0, 0, 3.0), still_life()[0].texture)
+    camera = Camera(np.eye(4), np.array([[30.0, 0, 16], [0, 30, 12], [0, 0, 1]]), 32, 24)
+    assert np.allclose(surfaces.true_depth([wall], camera), 3) and surfaces.true_depth([wall], camera).shape == (24, 32)
+
+
+def test_samples_and_distances_of_triangles():
+    """Samples lie on the triangles, evenly; distances are to the nearest point of them, not to a vertex."""
+    found = surfaces.sample(SQUARE, 4000)
+    assert (found[:, 2] == 0).all() and np.allclose(found.mean(0), [1, 0.5, 0], atol=0.05)
+    assert np.allclose(surfaces.distance_to_mesh(SQUARE, np.array([[1.0, 0.5, 3], [4, 0.5, 0], [1, 0.2, 0]])), [3, 2, 0])
+    row = surfaces.summary("x", np.array([0.0, 0.01, 0.02, 0.97]), 1.0)
+    assert (
+        row["x_mean"] == row["x_mean_of_radius"] == 0.25 and row["x_median"] == 0.015 and row["x_within_0.01_of_radius"] == 0.5
+    )

@@ -1,0 +1,360 @@
+"""The package as `import warpgs` shows it: names, types, documentation of fields, and schemas of what users write."""
+
+import ast
+import dataclasses
+import importlib
+import inspect
+import json
+import math
+import pydoc
+import re
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+import warpgs
+from warpgs import faces, schema
+from warpgs.errors import document_fields, field_docs
+from warpgs.schema import SchemaError, fields, flag, items, mapping, number, one_of, or_null, parse, real, text, whole
+
+# The package as `import warpgs` shows it.
+
+ROOT = Path(warpgs.__file__).parent
+BELOW = ("train", "kernels", "io", "export")
+FACES = {name: importlib.import_module(name) for name in ("warpgs", *(f"warpgs.{n}" for n in BELOW))}
+NAMES = [f"{face}.{name}" for face, module in FACES.items() for name in module.__all__]
+PAGES = [ROOT.parent / "README.md", ROOT.parent / "CONTRIBUTING.md", *sorted((ROOT.parent / "docs").glob("*.md"))]
+
+
+def seen_by_type_checkers(face: str) -> dict[str, tuple[str, str]]:
+    """Module and name there of each name that a face imports under TYPE_CHECKING; modules are left out."""
+    tree = ast.parse(Path(FACES[face].__file__).read_text("utf-8"))
+    (block,) = (n for n in tree.body if isinstance(n, ast.If) and ast.unparse(n.test) == "TYPE_CHECKING")
+    found = {a.asname or a.name: (n.module, a.name) for n in block.body if isinstance(n, ast.ImportFrom) for a in n.names}
+    return {public: home for public, home in found.items() if home[0] != "warpgs"}
+
+
+@pytest.mark.parametrize("face", FACES)
+def test_dir_lists_the_public_names_and_nothing_else(face):
+    """Beside the faces and names with two underscores; none twice, and none that a module of the same folder would hide."""
+    module = FACES[face]
+    others = set(BELOW) if module is warpgs else set()
+    assert {n for n in dir(module) if not n.startswith("__")} == set(module.__all__) | others
+    assert len(set(module.__all__)) == len(module.__all__)
+    assert not set(module.__all__) & {p.stem for path in getattr(module, "__path__", []) for p in Path(path).iterdir()}
+    with pytest.raises(AttributeError, match=f"module '{face}' has no attribute 'os_path'"):
+        module.os_path  # noqa: B018
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_public_name_is_there_and_documented(name):
+    """It loads from where type checkers find it, and its own docstring says what it is."""
+    face, _, public = name.rpartition(".")
+    home, attribute = seen_by_type_checkers(face)[public]
+    value = getattr(FACES[face], public)
+    assert value is getattr(importlib.import_module(home), attribute) or attribute == "register"  # a method: new at each look
+    assert public.isupper() or value.__doc__
+
+
+@pytest.mark.parametrize("kind", [warpgs.RasterizeOptions, warpgs.Rule])
+def test_help_describes_every_option(kind):
+    """The class documentation has the field's name and at least 20 letters about it, in lines that fit a terminal."""
+    text = inspect.getdoc(kind)
+    assert max(map(len, text.splitlines())) <= 76  # help adds a margin of 4
+    assert len(dataclasses.fields(kind)) >= 8
+    assert all(re.search(rf"^    {f.name}: \w.{{20}}", text, re.MULTILINE) for f in dataclasses.fields(kind))
+
+
+@pytest.mark.parametrize("face", FACES)
+def test_type_checkers_see_the_same_names(face):
+    """Names under TYPE_CHECKING are those of ``__all__``; the marker of PEP 561 is there."""
+    assert set(seen_by_type_checkers(face)) == set(FACES[face].__all__)
+    assert (ROOT / "py.typed").is_file()
+
+
+def test_import_loads_neither_torch_nor_warp():
+    """A bare import is cheap; the first use of a name pays for it."""
+    code = (
+        "import sys, warpgs; heavy = {'torch', 'warp', 'numpy', 'cv2', 'tyro'};"
+        "warpgs.train, warpgs.kernels, warpgs.io, warpgs.export; print(sorted(heavy & set(sys.modules)));"
+        "dir(warpgs); warpgs.Camera; print('numpy' in sys.modules, 'torch' in sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split("\n")[:2] == ["[]", "True False"]
+
+
+def names_in_annotations(cls: type) -> set[str]:
+    """Return the names of warpgs in the annotations of a class: of its fields and of its public methods."""
+    module = ast.parse(inspect.getsource(sys.modules[cls.__module__]))
+    (body,) = (n for n in module.body if isinstance(n, ast.ClassDef) and n.name == cls.__name__)
+    public = [n for n in body.body if not getattr(n, "name", "").startswith("_") or getattr(n, "name", "") == "__call__"]
+    annotations = []
+    for node in public:
+        if isinstance(node, ast.AnnAssign):
+            annotations.append(node.annotation)
+        elif isinstance(node, ast.FunctionDef):
+            annotations += [a.annotation for a in (*node.args.args, *node.args.kwonlyargs) if a.annotation]
+            annotations += [node.returns] if node.returns else []
+    found = {n.id for annotation in annotations for n in ast.walk(annotation) if isinstance(n, ast.Name)}
+    imported = {
+        a.name for n in ast.walk(module) if isinstance(n, ast.ImportFrom) and n.module.startswith("warpgs") for a in n.names
+    }
+    return {n for n in found & (imported | {n.name for n in module.body if isinstance(n, ast.ClassDef)}) if n[0] != "_"}
+
+
+REFERENCE = (ROOT.parent / "docs/api.md").read_text("utf-8")
+LISTED = re.findall(r"^\.\. (?:auto\w+|py:data):: (warpgs[\w.]+)", REFERENCE, re.MULTILINE)
+
+
+def test_the_reference_lists_every_public_name():
+    """Under the face; a name of several faces at one of them; decorators and `STEP` stand in the text."""
+    named = {n.rpartition(".")[2] for n in [*LISTED, *re.findall(r"`(warpgs[\w.]+)", REFERENCE)]}
+    assert {n.rpartition(".")[2] for n in NAMES} - named == set()
+    assert set(LISTED) <= set(NAMES)
+
+
+def test_the_reference_lists_what_a_class_of_ones_own_meets():
+    """Every type in the signatures of the base classes, and in those of the types that they lead to."""
+    own = re.findall(r"^\.\. autoclass:: (warpgs[\w.]+)", REFERENCE.split("## Classes to derive from")[1], re.MULTILINE)
+    assert len(own) > 15
+    classes = [getattr(importlib.import_module(path.rpartition(".")[0]), path.rpartition(".")[2]) for path in own]
+    named = set().union(*map(names_in_annotations, classes))
+    assert named - {path.rpartition(".")[2] for path in LISTED} == set()
+
+
+def named(code: str) -> set[str]:
+    """Full names of all that a text of code imports or uses of warpgs, up to the first name that is not a face."""
+    tree = ast.walk(ast.parse(code))
+    found = set()
+    for node in tree:
+        if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "warpgs":
+            found |= {f"{node.module}.{a.name}" for a in node.names}
+        elif isinstance(node, ast.Import):
+            found |= {a.name for a in node.names if a.name.startswith("warpgs.")}
+        elif isinstance(node, ast.Attribute) and re.fullmatch(r"warpgs(\.\w+)+", text := ast.unparse(node)):
+            found.add(re.match(r"warpgs\.(?:(?:train|kernels|io|export)\.)?\w+", text)[0])
+    return found
+
+
+def code_of_pages() -> dict[str, str]:
+    """Examples, a plug-in of the tests, and the Python blocks of all pages, by place."""
+    files = [*sorted((ROOT.parent / "examples").rglob("*.py")), ROOT.parent / "tests/parallel_camera.py"]
+    code = {path.name: path.read_text("utf-8") for path in files}
+    for page in PAGES:
+        for i, block in enumerate(re.findall(r"^```python\n(.*?)^```", page.read_text("utf-8"), re.MULTILINE | re.DOTALL)):
+            code[f"{page.name}, block {i}"] = block
+    return code
+
+
+def test_examples_and_pages_import_faces_alone():
+    """Users copy them, and what is not on a face may move on any day."""
+    code = code_of_pages()
+    assert len(code) > 20
+    strangers = {place: left for place, text in code.items() if (left := named(text) - set(NAMES) - set(FACES))}
+    assert not strangers
+
+
+def test_the_package_imports_nothing_from_a_face():
+    """Names come from where they are defined; modules of a face's folder are no names of the face."""
+    for path in ROOT.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+            if isinstance(node, ast.ImportFrom) and node.module in FACES and path != ROOT / "__init__.py":
+                assert not {a.name for a in node.names} & {*FACES[node.module].__all__, "train"}, f"{path}:{node.lineno}"
+
+
+OLD = [(f"warpgs.{module}", name, new) for module, names in faces.OLD.items() for name, new in names.items()]
+
+
+@pytest.mark.parametrize("module,name,new", OLD)
+def test_an_old_import_answers(module, name, new):
+    """It works as long as the name stays where it is; then the error has the new name, which exists."""
+    try:
+        getattr(importlib.import_module(module), name)
+    except ImportError as error:
+        assert f"{module}.{name} is now {new}" in str(error)
+    assert new in NAMES or not new.startswith("warpgs.")
+
+
+def test_what_is_gone_names_its_new_place(monkeypatch):
+    """A module, a module of a folder that is gone or became a file, and a name; other names of the module stay."""
+    gone = {name: {"Thing": "warpgs.train.Thing"} for name in ("nowhere.at_all", "version", "version.deep")}
+    monkeypatch.setattr(faces, "OLD", gone)
+    monkeypatch.delitem(sys.modules, "warpgs.version")
+    for name in ("nowhere.at_all", "nowhere", "version.deep"):
+        with pytest.raises(ModuleNotFoundError, match=r"Thing is now warpgs\.train\.Thing"):
+            importlib.import_module(f"warpgs.{name}")
+    with pytest.raises(ImportError, match=r"^warpgs\.version\.Thing is now warpgs\.train\.Thing$"):
+        from warpgs.version import Thing  # noqa: F401
+    version = importlib.import_module("warpgs.version")
+    assert version.__version__ and not hasattr(version, "Other")
+    with pytest.raises(ModuleNotFoundError, match=r"No module named 'warpgs\.never_was'"):
+        importlib.import_module("warpgs.never_was")
+
+
+def test_the_changelog_lists_old_imports():
+    """A row for each, with the version since which the new name is there."""
+    rows = re.findall(
+        r"^\| `(warpgs\.\S+)` \| `(\S+)` \| \S+ \|$", (ROOT.parent / "CHANGELOG.md").read_text("utf-8"), re.MULTILINE
+    )
+    assert rows == [(f"{module}.{name}", new) for module, name, new in OLD]
+
+
+# Whoever imports warpgs gets types, and the checker looks at the modules that define public names.
+
+PUBLIC_TYPES_ROOT = Path(__file__).parent.parent
+UNCHECKED = {
+    "warpgs.geometry", "warpgs.io.folder", "warpgs.kernels.ssim", "warpgs.kernels.update", "warpgs.mesh.fuse",
+    "warpgs.pipeline.model.start", "warpgs.pipeline.model.table", "warpgs.pipeline.train.step", "warpgs.pipeline.train.views",
+    "warpgs.pipeline.train.strategies.sampling", "warpgs.render.graphed", "warpgs.ranks", "warpgs.synthetic.demo",
+}  # fmt: skip
+"""Homes of public names whose bodies mypy does not accept yet: Warp kernels, and fields that are arrays or tensors."""
+
+
+def test_every_module_of_a_public_name_is_type_checked():
+    """Faces and homes of their names are among mypy's files, and the package says that it carries types."""
+    settings = tomllib.loads((PUBLIC_TYPES_ROOT / "pyproject.toml").read_text("utf-8"))["tool"]["mypy"]
+    homes = {home for face in FACES for home, _ in seen_by_type_checkers(face).values()}
+    files = {
+        str(Path(importlib.import_module(m).__file__).relative_to(PUBLIC_TYPES_ROOT)) for m in homes - UNCHECKED | set(FACES)
+    }
+    assert settings["strict"] and files <= set(settings["files"])
+    assert (PUBLIC_TYPES_ROOT / "warpgs/py.typed").exists()
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_signatures_of_public_names_are_typed(name):
+    """Every argument and result of a function, and of the methods that a class defines; checked homes are not enough."""
+    face, _, public = name.rpartition(".")
+    value = getattr(FACES[face], public)
+    functions = [value] if inspect.isfunction(value) else []
+    if inspect.isclass(value):
+        functions = [f for f in vars(value).values() if inspect.isfunction(f) and f.__module__ == value.__module__]
+    for function in functions:
+        if function.__name__[0] != "_" or function.__name__ == "__call__":
+            bare = [p.name for p in inspect.signature(function).parameters.values() if p.annotation is p.empty]
+            assert set(bare) <= {"self", "cls"} and "return" in function.__annotations__, function
+
+
+# Schemas: what is allowed passes, anything else is named with its place; size and depth are bounded.
+
+
+@pytest.mark.parametrize(
+    ("kind", "good", "bad"),
+    [
+        (flag, [True, False], [0, 1, None, "true"]),
+        (text, ["", "ä", "\udcff"], [1, None, "a\0b", "\ud800"]),
+        (whole(1, 5), [1, 5], [0, 6, True, 1.0, "1", None, 10**4000]),
+        (number(0), [0, 0.5, 10**18], [-1, math.nan, math.inf, True, "1", 10**400, None]),
+        (number(above=0), [1e-300], [0, -0.0]),
+        (real, [math.nan, -math.inf, 3], [True, "3", 10**400]),
+        (one_of("a", 1), ["a", 1], ["b", True, 1.0, [], {}]),
+        (or_null(flag), [None, True], [0]),
+        (items(flag), [[], [True]], [[1], {}, "", None]),
+        (items(flag, 2), [[True, False]], [[True], []]),
+        (mapping(flag), [{}, {"a": True}], [{"a": 1}, {"a\0": True}, []]),
+        (fields({"a": flag}, {"b": flag}), [{"a": True}, {"a": True, "b": False, "c": 1}], [{}, {"a": 1}, {"a": True, "b": 1}]),
+        (fields({"a": flag}, others=False), [{"a": True}], [{"a": True, "c": 1}, []]),
+    ],
+)
+def test_what_is_allowed_and_what_is_not(kind, good, bad):
+    for value in good:
+        kind(value, "x")
+    for value in bad:
+        with pytest.raises(SchemaError, match="x"):
+            kind(value, "x")
+
+
+def test_the_place_is_named():
+    with pytest.raises(SchemaError, match=r"^a\[1\]\.b must be a finite number, not 'c'$"):
+        fields({"a": items(fields({"b": number()}))})({"a": [{"b": 1}, {"b": "c"}]}, "")
+
+
+@pytest.mark.parametrize("inner", ["[]", "{}", '{"a": []}'])
+def test_depth_and_size_are_bounded(inner, monkeypatch):
+    """Neither Python's stack nor anybody's who walks through the value is in danger."""
+
+    def nested(depth):
+        return "[" * (depth - 1) + inner + "]" * (depth - 1)
+
+    least = parse(nested(schema.MAX_DEPTH - 1))
+    assert isinstance(least, list) and json.dumps(least)
+    for depth in (schema.MAX_DEPTH + 2, 100_000):
+        with pytest.raises(SchemaError, match="nested deeper"):
+            parse(nested(depth))
+    monkeypatch.setattr(schema, "MAX_BYTES", 10)
+    assert parse("[1, 2, 3]") == [1, 2, 3]
+    with pytest.raises(SchemaError, match="larger"):
+        parse("[1, 2, 3, 4]")
+
+
+@pytest.mark.parametrize("bad", [b"", b"[", b"\xff\xfe\xfd", b"9" * 5000, b'{"a":}'])
+def test_what_is_no_json(bad, tmp_path):
+    (tmp_path / "a").write_bytes(bad)
+    with pytest.raises(SchemaError, match="not valid JSON"):
+        schema.read(tmp_path / "a")
+
+
+@pytest.mark.parametrize("text", ["[" + "[]," * 20 + "[]]", b"[" + b"{}," * 20 + b"{}]"])
+def test_many_lists_are_refused_before_they_are_made(text, monkeypatch):
+    """Two bytes of text become seventy."""
+    assert len(schema.parse(text)) == 21
+    monkeypatch.setattr(schema, "MAX_PARTS", 20)
+    monkeypatch.setattr(schema.json, "loads", lambda text: pytest.fail("it was parsed"))
+    with pytest.raises(SchemaError, match="more than 20 lists and objects"):
+        schema.parse(text)
+
+
+def test_only_ordinary_files_are_read(tmp_path):
+    with pytest.raises(IsADirectoryError):
+        schema.read(tmp_path)
+    with pytest.raises(FileNotFoundError):
+        schema.read(tmp_path / "none")
+
+
+# Docstrings of fields are read from source, and `help` shows them.
+
+DOCUMENTED = ("ActivatedGaussians", "Camera", "CovarianceGaussians", "Gaussians", "RasterizeOptions", "Render", "Scene", "View")
+
+
+@pytest.mark.parametrize("name", DOCUMENTED)
+def test_help_shows_every_field(name):
+    """With the start of its docstring."""
+    kind = getattr(warpgs, name)
+    shown = pydoc.plain(pydoc.render_doc(kind))
+    for field in dataclasses.fields(kind):
+        assert f"{field.name}: {field_docs(kind)[field.name].split()[0]} " in shown
+
+
+@dataclasses.dataclass
+class Same:
+    """A class whose name is used twice in this file."""
+
+    outer: int
+    """Field of the outer class."""
+
+    @dataclasses.dataclass
+    class Same:
+        """The inner class."""
+
+        inner: int
+        """Field of the inner class."""
+
+
+def test_classes_of_one_name_keep_their_own_fields():
+    """Nested in a class, in a function, derived, or without source."""
+
+    @dataclasses.dataclass
+    class Local(Same):
+        """A class of a function."""
+
+        local: int
+        """Field of the local class."""
+
+    assert field_docs(Same) == {"outer": "Field of the outer class."}
+    assert field_docs(Same.Same) == {"inner": "Field of the inner class."}
+    assert field_docs(Local) == {"outer": "Field of the outer class.", "local": "Field of the local class."}
+    typed = dataclasses.make_dataclass("Typed", ["x"], namespace={"__doc__": "About."})
+    assert field_docs(typed) == {} and document_fields(typed).__doc__.startswith("About.")
