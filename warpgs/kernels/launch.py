@@ -396,6 +396,7 @@ class _SharedLaunch:
             self.open = False
         with self.busy:
             self.ended = True
+        self.inputs = ()  # a thread that has yet to start holds the launch, and must not hold the caller's memory
 
 
 @functools.cache
