@@ -36,13 +36,6 @@ def rival(scores: dict[str, dict[int, float]], base: str) -> tuple[Difference, l
 
     For each seed with results for all presets, the rival is the preset with the best mean over the other seeds, which avoids
     winner's bias. Seeds without results for some presets are not used, because the best preset could be missing.
-
-    Args:
-        scores: PSNR by preset and seed [dB].
-        base: The preset that is compared.
-
-    Raises:
-        ValueError: The base has no score.
     """
     if not scores.get(base):
         raise ValueError(f"no score of {base}: name another with --base, of {', '.join(scores)}")

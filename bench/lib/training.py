@@ -69,15 +69,7 @@ def step_parts(trainer: Trainer) -> tuple[View, dict[str, torch.Tensor], Callabl
 
 
 class Steps:
-    """Training steps of given Gaussians on one image: image, L1 and SSIM, backward pass, Adam, as a fit takes them.
-
-    Args:
-        gaussians: The start; a copy of it is trained.
-        camera: A batch of one camera.
-        target: Image, shape [H, W, 3].
-        rule: Cut-offs of the rasterizer.
-        lr: Learning rate of all parameters; None for those of a fit in a scene of size 1.
-    """
+    """Training steps of given Gaussians on one image: image, L1 and SSIM, backward pass, Adam, as a fit takes them."""
 
     def __init__(self, gaussians: Gaussians, camera: Camera, target: torch.Tensor, rule: str, lr: float | None = None):
         device = target.device
