@@ -15,7 +15,6 @@ from warpgs.kernels.project import project
 from warpgs.kernels.tiles import (
     EACH,
     InstanceMemory,
-    Visible,
     bin_tiles,
     make_find_ranges,
     make_kernels,
@@ -177,7 +176,7 @@ def test_room_for_visible_gaussians_changes_no_list(device):
     assert split_sum(int(sums[-1]), counts.numel()) == (seen, total)
     for room, spare in ((seen, 9), (seen + 1, 3000), (550, 0), (600, 9), (seen - 1, 9), (1, 9)):
         overflow = torch.zeros(1, dtype=torch.int32, device=device)
-        memory = InstanceMemory(capacity=total + spare, overflow=overflow, visible=Visible(sums, room))
+        memory = InstanceMemory(capacity=total + spare, overflow=overflow, visible=(sums, room))
         made = bin_tiles(projected, counts, width=64, height=48, rule=EXACT, memory=memory)
         assert made.visible == room and int(made.total) <= total
         assert bool((made.tile_ids[int(made.total) :] == len(made.ranges)).all())  # the rest is no tile's

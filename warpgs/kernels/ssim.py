@@ -45,7 +45,7 @@ def make_functions(real):
     vec5 = wp.types.vector(5, real)
     w0, w1, w2, w3, w4, w5 = (real(w) for w in WINDOW[RADIUS:])
     vec6 = wp.types.vector(6, real)
-    channels = wp.constant(CHANNELS)
+    channels = CHANNELS
 
     @wp.func
     def tap(k: wp.int32) -> real:

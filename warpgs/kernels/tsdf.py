@@ -41,7 +41,7 @@ def make_kernels(real):
     mat33 = wp.types.matrix((3, 3), real)
     mat44 = wp.types.matrix((4, 4), real)
     module = f"warpgs.kernels.tsdf.{real.__name__}"
-    near = wp.constant(real(NEAR))
+    near = real(NEAR)
 
     @wp.func
     def in_camera(view: mat44, point: vec3) -> vec3:
