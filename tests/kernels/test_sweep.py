@@ -59,22 +59,14 @@ def computed(device, costs, down, across, small) -> np.ndarray:
     return scanline_costs(*on_device, small).cpu().numpy()
 
 
-@pytest.mark.parametrize("shape", [(4, 5, 6), (1, 7, 3), (7, 1, 3), (3, 4, 1), (3, 4, 2), (40, 33, 17), (1, 1, 4)])
+@pytest.mark.parametrize("shape", [(1, 7, 3), (7, 1, 3), (3, 4, 1), (40, 33, 17), (1, 1, 4)])
 def test_equal_to_the_definition(device, shape):
-    """The sums agree to the last unit, also for one row, one column and one plane."""
+    """The sums agree to the last unit, also for one row, one column and one plane, and for costs in another order of memory."""
     costs, down, across = problem(shape)
-    assert np.array_equal(computed(device, costs, down, across, 123), defined(costs, down, across, 123))
-
-
-def test_penalties_decide(device):
-    """Without any, each pixel keeps its costs four times; large ones carry one pixel's plane all along its lines."""
-    costs, down, across = problem((6, 9, 5))
-    free = computed(device, costs, np.zeros_like(down), np.zeros_like(across), 0)
-    assert np.array_equal(free, 4 * costs.astype(int))
-    even = np.full((6, 9, 5), 100, np.int16)
-    even[2, 3, 4] = 0
-    tied = computed(device, even, np.full_like(down, 4000), np.full_like(across, 4000), 1000)
-    assert (tied[2].argmin(1) == 4).all() and (tied[:, 3].argmin(1) == 4).all() and (tied[0, 0] == tied[0, 0, 0]).all()
+    wanted = defined(costs, down, across, 123)
+    assert np.array_equal(computed(device, costs, down, across, 123), wanted)
+    turned, *limits = (torch.from_numpy(a).to(device) for a in (np.ascontiguousarray(costs.transpose(2, 0, 1)), down, across))
+    assert np.array_equal(scanline_costs(turned.permute(1, 2, 0), *limits, 123).cpu().numpy(), wanted)
 
 
 def test_the_dearest_costs_fit(device):
@@ -86,14 +78,6 @@ def test_the_dearest_costs_fit(device):
     limits = np.full((5, 6), penalty, np.int32), np.full((6, 5), penalty, np.int32)
     found = computed(device, costs, *limits, penalty)
     assert np.array_equal(found, defined(costs, *limits, penalty)) and found.min() >= 0 and found.max() > 3 * 2**13
-
-
-def test_memory_order_does_not_matter(device):
-    """A transposed view of the costs, as a caller may hold them, gives the same sums."""
-    costs, down, across = (torch.from_numpy(a).to(device) for a in problem((5, 8, 6)))
-    turned = costs.permute(2, 0, 1).contiguous().permute(1, 2, 0)
-    assert not turned.is_contiguous()
-    assert torch.equal(scanline_costs(turned, down, across, 50), scanline_costs(costs, down, across, 50))
 
 
 @pytest.mark.parametrize("wrong", ["costs", "down", "across"])

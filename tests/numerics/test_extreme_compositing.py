@@ -12,7 +12,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from tests.gaussians import camera, cloud, leaves
 from tests.kernels.test_blend import drawn, stack_of
 from tests.reference.blend import blend_reference
-from warpgs.constants import ALPHA_CUT, RULES
+from warpgs.constants import RULES
 from warpgs.kernels import blend_cuda, launch
 from warpgs.kernels.falloff import make_falloff
 from warpgs.kernels.native import source
@@ -340,19 +340,3 @@ def test_depth_where_weights_are_denormal(device, dtype):
     found = gradients(depth.sum() + alpha.sum(), gaussians)
     assert bool((depth > 0).any()) and bool((depth == 0).any())
     assert finite(depth, *found.values())
-
-
-def test_depth_of_pixels_that_nothing_covers(device, dtype):
-    """C12: 0, with finite gradients, beside pixels that are covered; and so for a weight just above the cut."""
-    gaussians, cam = cloud(1, dtype, device), camera(40, 30, cameras=1, dtype=dtype, device=device)
-    gaussians.means[:] = torch.tensor([0.0, 0.0, 3.0])
-    for opacity in (0.8, ALPHA_CUT * 1.05):
-        gaussians.logit_opacities[:] = math.log(opacity / (1 - opacity))
-        moving = leaves(gaussians)
-        _, alpha, depth = drawn(moving, cam, torch.zeros(1, 3, dtype=dtype, device=device), EXACT)[:3]
-        empty = alpha == 0
-        assert bool(empty.any()) and bool((~empty).any())
-        assert not bool(depth[empty].any()) and float((depth.detach()[~empty] - 3).abs().max()) <= 1e-6
-        assert finite(*gradients(depth.sum(), moving).values())
-        depth = drawn(moving, cam, torch.zeros(1, 3, dtype=dtype, device=device), EXACT)[2]
-        assert not any(bool(v.any()) for v in gradients(depth[empty].sum(), moving).values())

@@ -8,15 +8,18 @@ import threading
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
 from tests.gaussians import camera, cloud
 from warpgs.kernels.neighbours import mean_square_distances
-from warpgs.kernels.ssim import differences
+from warpgs.kernels.ssim import differences, ssim
+from warpgs.kernels.tsdf import integrate
+from warpgs.kernels.update import adam_step, squared_error
 from warpgs.render.options import RasterizeOptions
 from warpgs.render.rasterize import rasterize
-from warpgs.scene import Gaussians
+from warpgs.scene import Camera, Gaussians
 
 # The same bits every time: under load, for any number of threads, beside other streams, and in another process.
 
@@ -54,28 +57,41 @@ def test_50_repeats_give_the_same_bits(device):
         load.result()
 
 
-def test_thread_counts_give_the_same_bits():
+def other_bits(device) -> list[torch.Tensor]:
+    """Results of the other ops: similarity with its gradient, neighbours, Adam, squared errors, and fused depth."""
+    generator = torch.Generator().manual_seed(0)
+    image, target = torch.rand(2, 130, 150, 3, generator=generator).to(device)
+    points = torch.randn(3000, 3, generator=generator).to(device)
+    leaf = image.clone().requires_grad_()
+    sums = differences(leaf, target)
+    sums.sum().backward()
+    param, mean, square = target.clone(), torch.zeros_like(target), torch.zeros_like(target)
+    adam_step(param, image, mean, square, lr=0.1, step=1)
+    distances, weights = torch.zeros(2, 40, 40, 40, device=device)
+    view = Camera(np.eye(4), np.array([[150.0, 0, 75], [0, 150, 65], [0, 0, 1]]), 150, 130)
+    integrate(distances, weights, (-1.0, -1.0, 2.0), 0.05, 0.2, view, 3 + image[..., 0], target[..., 0].contiguous())
+    assert bool(weights.any())
+    found = [
+        sums,
+        leaf.grad,
+        ssim(image, target),
+        mean_square_distances(points),
+        param,
+        squared_error(image, target),
+        distances,
+    ]
+    return [t.detach() for t in found]
+
+
+def test_thread_counts_give_the_same_bits(device):
     """1, 2, 3, 5 and 8 threads: ranges of a launch own what they write, however it is cut."""
-    gaussians, cam = cloud(4000), camera(160, 96, dtype=torch.float32)
+    gaussians, cam = cloud(4000, device=device), camera(160, 96, dtype=torch.float32, device=device)
     torch.set_num_threads(1)
-    first = all_bits(gaussians, cam)
+    first = all_bits(gaussians, cam) + other_bits(device)
     for threads in (2, 3, 5, 8):
         torch.set_num_threads(threads)
-        assert all(torch.equal(a, b) for a, b in zip(first, all_bits(gaussians, cam), strict=True)), threads
-
-
-def test_other_ops_repeat_too(device):
-    """Similarity sums with their gradient, and nearest-neighbour distances."""
-    generator = torch.Generator().manual_seed(0)
-    image, target = torch.rand(2, 61, 83, 3, generator=generator).to(device)
-    points = torch.randn(3000, 3, generator=generator).to(device)
-    results = []
-    for _ in range(10):
-        leaf = image.clone().requires_grad_()
-        sums = differences(leaf, target)
-        sums.sum().backward()
-        results.append((sums.detach(), leaf.grad, mean_square_distances(points)))
-    assert all(torch.equal(a, b) for other in results[1:] for a, b in zip(results[0], other))
+        again = all_bits(gaussians, cam) + other_bits(device)
+        assert all(torch.equal(a, b) for a, b in zip(first, again, strict=True)), threads
 
 
 @pytest.mark.cuda

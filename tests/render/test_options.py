@@ -276,19 +276,6 @@ def test_the_bound_holds_in_more_scenes(device):
         bounds(number, device)
 
 
-def test_haze_that_a_rule_drops(device):
-    """Layers of 3.9/255 are opaque under `exact` and nothing under `fast`: the bound shows the whole colour that is lost."""
-    g, count = cloud(1, device=device), 400
-    haze = Gaussians(**{n: t.expand(count, *t.shape[1:]).clone() for n, t in g.tensors().items()})
-    haze.means[:] = torch.tensor([0.0, 0.0, 4.0])
-    haze.log_scales.fill_(9.0)
-    haze.logit_opacities.fill_(float(torch.logit(torch.tensor(3.9 / 255))))
-    haze.sh.fill_(0.0)
-    options = RasterizeOptions(rule="fast", background=torch.full((3,), 1.5), error_bound=True)
-    found = rasterize(haze, camera(20, 12, dtype=torch.float32, device=device), options)
-    assert float(found.alpha.max()) == 0 and float(found.error_bound.min()) > 0.99
-
-
 def test_it_goes_with_the_other_options(device):
     """Only on request; windows, chunks, batches and channels have it, with the same image."""
     g, cam = cloud(300, device=device), camera(50, 34, cameras=2, dtype=torch.float32, device=device)

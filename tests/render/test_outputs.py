@@ -118,41 +118,6 @@ def test_features_beside_colors_change_nothing_of_them(device):
         assert float((a + b - whole).norm()) <= 1e-5 * float(whole.norm())
 
 
-def test_one_camera_has_no_leading_axis():
-    """Channels [N, D], or [1, N, D] of the one camera; the background may be an array."""
-    gaussians, cam, values, behind = scene(torch.float32, "cpu", 4)
-    one = Camera(cam.viewmat[1], cam.K[1], *SIZE)
-    r = rasterize(gaussians, one, RasterizeOptions(colors=values, background=behind[1].numpy(), features=values[None]))
-    batch = rasterize(gaussians, cam, RasterizeOptions(colors=values, background=behind, features=values))
-    assert torch.equal(r.rgb, batch.rgb[1]) and torch.equal(r.features, batch.features[1])
-
-
-@pytest.mark.cuda
-@pytest.mark.parametrize("channels", [1, 2, 3, 5, 8, 32])
-def test_native_kernels_agree_with_generic_ones(channels):
-    """Float32 on CUDA against float64: images and gradients within 1e-5, the same bits each time."""
-    device = torch.device("cuda", 0)
-    gaussians, cam, values, behind = scene(torch.float32, device, channels)
-    results = []
-    for dtype in (torch.float32, torch.float32, torch.float64):
-        g = Gaussians(**{n: t.detach().to(dtype).requires_grad_() for n, t in gaussians.tensors().items()})
-        own = [values.to(dtype).requires_grad_(), behind.to(dtype).requires_grad_()]
-        view = Camera(cam.viewmat.to(dtype), cam.K.to(dtype), *SIZE)
-        r = rasterize(g, view, RasterizeOptions(rule=SMOOTH, features=own[0], feature_background=own[1]))
-        loss = (r.features * random(*r.features.shape, seed=2, dtype=dtype, device=device)).sum() + r.rgb.square().sum()
-        results.append((r.rgb.detach(), r.features.detach(), *torch.autograd.grad(loss, [*g.tensors().values(), *own])))
-    for a, b, exact in zip(*results):
-        assert torch.equal(a, b) and float((a.double() - exact).norm()) <= 1e-5 * float(exact.norm())
-
-
-def test_no_gaussians_show_the_background():
-    """An empty set has channels, too."""
-    empty, cam = cloud(0), camera(20, 12, dtype=torch.float32)
-    behind = random(7)
-    r = rasterize(empty, cam, RasterizeOptions(features=torch.zeros(0, 7), feature_background=behind))
-    assert torch.equal(r.features, behind.expand(12, 20, 7)) and not bool(r.rgb.any())
-
-
 def test_wrong_channels_are_named():
     """Type, scalar type, number of Gaussians and of cameras, no channel, backgrounds of another length."""
     gaussians, cam, values, behind = scene(torch.float32, "cpu", 8)
@@ -475,33 +440,6 @@ def test_gradcheck(device, model, kind, antialiased):
     assert torch.autograd.gradcheck(outputs, inputs, eps=1e-6, atol=1e-6, rtol=1e-5, nondet_tol=0.0, fast_mode=True)
 
 
-@pytest.mark.parametrize("model", MODELS)
-def test_a_turned_scene_with_its_camera_gives_the_same_outputs(device, model):
-    """All of them, and gradients turn along; in float64, with colours that do not depend on the direction."""
-    given, cam = leaves(cloud(150, torch.float64, device)), seen_by(model, *COMBINATIONS_SIZE, cameras=2, device=device)
-    w, x, y, z = quat = torch.nn.functional.normalize(cam.K.new_tensor([0.8, -0.3, 0.5, 0.2]), dim=0)
-    Q, shift = rotation_matrices(quat), cam.K.new_tensor([0.7, -2.0, 1.1])
-    from_left = torch.stack([w, -x, -y, -z, x, w, -z, y, y, z, w, -x, z, -y, x, w]).reshape(4, 4)  # the product with it
-    moved = dataclasses.replace(given, means=given.means @ Q.T + shift, quats=given.quats @ from_left.T)
-    turned = leaves(moved)
-    R, t = cam.viewmat[:, :3, :3] @ Q.T, cam.viewmat[:, :3, 3:]
-    viewmat = torch.cat([torch.cat([R, t - R @ shift[:, None]], 2), cam.viewmat[:, 3:]], 1)
-    values = some(150, 3, like=given.means)
-    options = RasterizeOptions(colors=values, features=values[:, :2], **EVERYTHING)
-    found = []
-    for g, c in ((given, cam), (turned, dataclasses.replace(cam, viewmat=viewmat))):
-        r = rasterize(g, c, options)
-        loss = sum((i * some(*i.shape, like=i)).sum() for i in (getattr(r, n) for n in COMBINATIONS_DIFFERENTIABLE))
-        found.append((r, *torch.autograd.grad(loss, [g.means, g.quats, g.log_scales, g.logit_opacities])))
-    (one, *before), (other, *after) = found
-    for name in (*IMAGES, "weight_sums", "weight_maxima", "tile_counts"):
-        a, b = getattr(one, name).detach(), getattr(other, name).detach()
-        assert bool(a.any()), name
-        assert torch.equal(a, b) if a.dtype == torch.int32 else float((a - b).abs().max()) < 1e-11, name  # measured 6e-14
-    for a, b, back in zip(before, after, (Q, from_left, None, None)):
-        assert float((a - (b if back is None else b @ back)).norm()) < 1e-11 * float(a.norm())
-
-
 @pytest.mark.parametrize(
     ("model", "kind", "antialiased", "rule"),
     [
@@ -538,28 +476,6 @@ def test_windows_and_chunks_have_the_bits_of_every_output(device, dtype, model, 
     for a, b, c in zip(*gradients):
         close("gradient", b, a)
         close("gradient", c, a)
-
-
-@pytest.mark.parametrize("channels", [6, 9, 32])
-def test_channels_are_the_bits_of_calls_of_three(device, dtype, channels):
-    """Colours and features of one call against a call for each three of them, and the gradient of each channel."""
-    given, cam = cloud(200, dtype, device), camera(*COMBINATIONS_SIZE, cameras=2, dtype=dtype, device=device)
-    values, behind = some(200, channels, like=given.means), some(channels, like=given.means, seed=1)
-    own = [values.clone().requires_grad_(), behind.clone().requires_grad_()]
-    whole = rasterize(given, cam, RasterizeOptions(colors=own[0], background=own[1]))
-    beside = rasterize(given, cam, RasterizeOptions(features=values, feature_background=behind))
-    assert torch.equal(whole.rgb, beside.features)
-    upstream = some(*whole.rgb.shape, like=values, seed=2)
-    found = torch.autograd.grad((whole.rgb * upstream).sum(), own)
-    for first in range(0, channels, 3):
-        part = slice(first, first + 3)
-        three = [values[:, part].clone().requires_grad_(), behind[part].clone().requires_grad_()]
-        r = rasterize(given, cam, RasterizeOptions(colors=three[0], background=three[1]))
-        assert (
-            torch.equal(r.rgb, whole.rgb[..., part]) and torch.equal(r.depth, whole.depth) and torch.equal(r.alpha, whole.alpha)
-        )
-        v = torch.autograd.grad((r.rgb * upstream[..., part]).sum(), three)
-        assert torch.equal(v[0], found[0][:, part]) and torch.equal(v[1], found[1][part])
 
 
 @pytest.mark.cuda

@@ -44,50 +44,6 @@ def test_window_is_the_crop(device, dtype, rule, tile_size):
         assert torch.allclose(part.weight_sums.sum(), part.alpha.sum(), rtol=1e-4)
 
 
-def gradients(gaussians, cam, background, upstream, **options) -> list[torch.Tensor]:
-    """Return the gradients of Gaussians, camera and background; ``upstream`` holds those of colour, alpha and depth."""
-    cam = dataclasses.replace(cam, viewmat=cam.viewmat.clone().requires_grad_(), K=cam.K.clone().requires_grad_())
-    g, background = leaves(gaussians), background.clone().requires_grad_()
-    r = rasterize(g, cam, RasterizeOptions(background=background, **options))
-    x, y, width, height = options.get("window") or (0, 0, *SIZE)
-    images = torch.cat([r.rgb, r.alpha[..., None], r.depth[..., None]], -1)
-    loss = (images * upstream[:, y : y + height, x : x + width]).sum()
-    inputs = [*g.tensors().values(), cam.viewmat, cam.K, background]
-    return list(torch.autograd.grad(loss, inputs, allow_unused=False))
-
-
-def test_gradients_of_windows_add_up(device, dtype):
-    """The sum over windows equals the gradient of the whole, but for the order of sums."""
-    scenery = scene(dtype, device)
-    upstream = torch.rand(2, SIZE[1], SIZE[0], 5, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    upstream = upstream.to(device, dtype) - 0.4
-    whole = gradients(*scenery, upstream)
-    windows = [gradients(*scenery, upstream, window=(0, y, 75, min(16, 53 - y))) for y in range(0, 53, 16)]
-    near = 3e-5 if dtype is torch.float32 else 1e-12
-    for a, *pieces in zip(whole, *windows):
-        assert float((a - sum(pieces)).norm()) <= near * float(a.norm())
-
-
-@pytest.mark.parametrize("most", [1, 150])
-def test_chunks_make_the_same_image(device, dtype, most):
-    """In chunks as small as a tile, images are the same bits and gradients the same numbers."""
-    gaussians, cam, background = scene(dtype, device)
-    whole = rasterize(gaussians, cam, RasterizeOptions(background=background))
-    chunked = rasterize(gaussians, cam, RasterizeOptions(background=background, max_instances=most, contributions=True))
-    weights = rasterize(gaussians, cam, RasterizeOptions(contributions=True))
-    assert torch.equal(weights.weight_maxima, chunked.weight_maxima)
-    assert torch.allclose(weights.weight_sums, chunked.weight_sums, rtol=1e-5, atol=1e-6)
-    assert int(whole.tile_counts.sum()) > 2 * most and torch.equal(whole.projected, chunked.projected)
-    for name in ("rgb", "alpha", "depth"):
-        assert torch.equal(getattr(whole, name), getattr(chunked, name)), name
-    upstream = torch.rand(2, SIZE[1], SIZE[0], 5, generator=torch.Generator().manual_seed(1), dtype=torch.float64) - 0.4
-    upstream = upstream.to(device, dtype)
-    near = 3e-5 if dtype is torch.float32 else 1e-12
-    pairs = [gradients(gaussians, cam, background, upstream, **o) for o in ({}, {"max_instances": most})]
-    for a, b in zip(*pairs):
-        assert float((a - b).norm()) <= near * float(a.norm())
-
-
 def test_chunks_hold_no_more_instances_than_asked_for():
     """Every chunk but a single tile keeps to the number; together they are the window."""
     gaussians, cam, _ = scene(torch.float32, "cpu")
