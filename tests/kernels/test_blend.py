@@ -191,9 +191,6 @@ def test_both_passes_see_the_same_alpha(device):
     assert float((forward - backward).abs().max()) < 0.5 * rule.alpha_cut
 
 
-# Compositing of any number of channels: against a product of matrices, calls of three channels, and finite differences.
-
-
 def random(*shape, seed=0, like):
     """Numbers of either sign, well beyond [0, 1]."""
     numbers = torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)

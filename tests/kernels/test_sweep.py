@@ -12,8 +12,6 @@ from warpgs.kernels.sweep import LARGEST, best_inverses, scanline_costs
 from warpgs.priors.sweep import UNIT, matching_costs_cpu
 from warpgs.scene import Camera, View
 
-# Matching costs are those of OpenCV.
-
 
 @pytest.mark.parametrize("size", [(7, 160), (160, 5), (1, 1), (40, 70)])
 def test_costs_are_those_of_opencv(size):
@@ -33,17 +31,11 @@ def test_costs_are_those_of_opencv(size):
     assert (found[..., 21:] == UNIT).all()
 
 
-# The best plane is that of numpy, to the bit.
-
-
 def test_best_planes_are_those_of_numpy():
     """Ties go to the first plane, ends are moved inwards, and planes past the last do not count."""
     inverses = np.linspace(0.1, 0.5, 9)
     costs = np.random.default_rng(2).integers(0, 99, (6, 5, 16)).astype(np.int16)
     assert np.array_equal(best_inverses(torch.from_numpy(costs), inverses), best_inverse(costs[..., :9], inverses))
-
-
-# Path costs: equal to their definition to the last unit, in every shape, and never beyond 16 bits.
 
 
 def problem(shape: tuple[int, int, int], seed: int = 0, largest: int = 4096):

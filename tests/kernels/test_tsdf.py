@@ -9,7 +9,6 @@ import torch
 from tests.gaussians import camera as torch_camera
 from tests.reference import tsdf as reference
 from warpgs.errors import UsageError
-from warpgs.geometry import back_project
 from warpgs.kernels.tsdf import face_cosines, gather_colors, integrate
 from warpgs.scene import Camera
 
@@ -132,24 +131,6 @@ def test_depths_as_far_apart_as_the_truncation_are_two_surfaces(device, dtype):
         integrate(*grid, (0.0, 0.0, 1.9), 0.1, truncation, c, *tensors([depth, np.ones((8, 8))], dtype, device))
         found.append(float(grid[0]) * truncation)
     assert found == pytest.approx([0.5, 0.35], abs=1e-3)
-
-
-def test_a_wall_is_found_where_it_is(device):
-    """Between two points of the grid, to a thousandth of a voxel; far behind it nothing is known, before it all is empty."""
-    c = cameras(1)[0]
-    grid = empty((10, 8, 30), torch.float32, device)
-    depth, one = torch.full((SIZE[1], SIZE[0]), 2.137, device=device), torch.ones(SIZE[1], SIZE[0], device=device)
-    integrate(*grid, (-0.5, -0.4, 1.0), 0.1, 0.3, c, depth, one)
-    distances, weights = grid[0][5, 4].cpu(), grid[1][5, 4].cpu()
-    z = 1.0 + 0.1 * torch.arange(30)
-    assert torch.equal(weights > 0, z <= 2.137 + 0.3) and bool((distances[z < 1.8] == 1).all())
-    before, behind = float(distances[11]), float(distances[12])
-    assert before > 0 > behind and abs(2.1 + 0.1 * before / (before - behind) - 2.137) < 1e-4
-    middle = back_project(c, np.array([[20.0, 15.0]]), np.array([2.137]))
-    sums, found = torch.zeros(1, 3, device=device), torch.zeros(1, device=device)
-    red = one[..., None] * torch.tensor([1.0, 0, 0], device=device)
-    gather_colors(torch.as_tensor(middle, dtype=torch.float32, device=device), 0.05, c, depth, one, red, sums, found)
-    assert sums.tolist() == [[1, 0, 0]] and found.tolist() == [1]
 
 
 def test_bad_input_is_refused():

@@ -21,8 +21,6 @@ from warpgs.kernels.update import (
     squared_error,
 )
 
-# The fused Adam step against torch's.
-
 
 def run(param, grads, **options):
     """The parameter after one fused step per gradient, with its moments."""
@@ -72,8 +70,6 @@ def test_empty_and_bad_input():
         adam_step(a, a.clone(), a.clone(), a.clone(), lr=0.1, step=0)
 
 
-# Dropout: as often as asked, never twice the same, always the same for one seed and step.
-
 COUNT = 20_000
 
 
@@ -110,9 +106,6 @@ def test_every_device_draws_the_same():
     assert torch.equal(factors("cpu", 0.3, 17), factors("cuda", 0.3, 17).cpu())
 
 
-# Opacity decay against opacities in float64.
-
-
 @pytest.mark.parametrize("factor", [0.5, 0.995, 0.999, 1 - 1e-6])
 def test_opacities_are_multiplied(device, factor):
     """From 2e-9 to 1 - 2e-9, within a rounding of float32."""
@@ -131,9 +124,6 @@ def test_ends_and_what_is_no_number(device):
     for wrong in (0.0, 1.0, np.nan):
         with pytest.raises(ValueError, match="factor"):
             opacity_decay(found.to(device), wrong)
-
-
-# The bookkeeping of captured steps, against torch.
 
 
 def rows(device, height=5, width=7, views=3, steps=4) -> list[torch.Tensor]:

@@ -50,9 +50,6 @@ def binned(gaussians: Gaussians, cam: Camera, rule=EXACT, tile_size: int = 16, *
     return projected, counts, bin_tiles(projected, counts, **size, **options)
 
 
-# B1: counts of more than 32 bits
-
-
 def test_counts_beyond_the_packed_sum_are_told_exactly(device):
     """140,000 Gaussians over all tiles of an 8K picture are more than 2^36 instances, and 2^36 is what counts as a Gaussian.
 
@@ -101,10 +98,7 @@ def test_a_refused_size_leaves_a_recorded_launch_as_it_was():
     assert packed.data == small.data_ptr() and packed.shape == [5]
 
 
-# B2: numbers of tiles around powers of two
-
-
-@pytest.mark.parametrize("tiles", [1, 2, 3, 4, 5, 127, 128, 129, 255, 256, 257])
+@pytest.mark.parametrize("tiles", [1, 2, 3, 127, 128, 129, 257])
 def test_tile_numbers_of_every_bit_length(device, tiles):
     """A row of tiles, one Gaussian in each: each tile lists its own, the first and the last tile too."""
     gaussians = spots([(8.0 + 16 * i, 8.0) for i in range(tiles)], 1.0, device)
@@ -112,9 +106,6 @@ def test_tile_numbers_of_every_bit_length(device, tiles):
     assert bool((counts == 1).all())
     assert torch.equal(lists.gaussian_ids.cpu(), torch.arange(tiles, dtype=torch.int32))
     assert lists.ranges.tolist() == [[i, i + 1] for i in range(tiles)]
-
-
-# B3 and B4: order
 
 
 def test_depths_are_sorted_as_numpy_sorts_them(device, dtype):
@@ -133,20 +124,13 @@ def test_depths_are_sorted_as_numpy_sorts_them(device, dtype):
     assert np.array_equal(lists.gaussian_ids.cpu().numpy(), np.argsort(depths.cpu().numpy(), kind="stable"))
 
 
-def test_coplanar_gaussians_keep_their_order_100_times(device):
-    """1000 Gaussians at one depth: by number in every tile, and the same bits of pictures in 100 runs."""
-    gaussians, cam = cloud(1000, device=device), camera(64, 48, dtype=torch.float32, device=device)
+def test_coplanar_gaussians_keep_their_order(device):
+    """1000 Gaussians at one depth: by number in every tile."""
+    gaussians, cam = cloud(1000, device=device, degree=0), camera(64, 48, dtype=torch.float32, device=device)
     gaussians.means[:, 2] = 4.0
-    _, _, lists = binned(dataclasses.replace(gaussians, sh=gaussians.sh[:, :1]), cam)
+    _, _, lists = binned(gaussians, cam)
     for begin, end in lists.ranges.tolist():
         assert bool((lists.gaussian_ids[begin:end].diff() > 0).all())
-    first = rasterize(gaussians, cam)
-    for _ in range(99):
-        again = rasterize(gaussians, cam)
-        assert torch.equal(first.rgb, again.rgb) and torch.equal(first.depth, again.depth)
-
-
-# B5: counted and emitted
 
 
 def test_emitted_equals_counted(device):
@@ -181,9 +165,6 @@ def test_emitted_equals_counted(device):
     assert total > 200_000
 
 
-# B6: few instances
-
-
 def test_a_single_intersection_is_drawn(device):
     """One Gaussian in one tile of a picture of many: first, last, and in between."""
     for at in [(8.0, 8.0), (72.0, 40.0), (40.0, 24.0)]:
@@ -195,9 +176,6 @@ def test_a_single_intersection_is_drawn(device):
         rows, columns = torch.nonzero(image.alpha.detach() > 0, as_tuple=True)
         assert bool((rows // 16 == at[1] // 16).all()) and bool((columns // 16 == at[0] // 16).all())
         image.rgb.sum().backward()
-
-
-# B7: very many cameras
 
 
 def test_70_000_cameras_of_one_pixel(device):
@@ -216,9 +194,7 @@ def test_70_000_cameras_of_one_pixel(device):
     assert len(batch.alpha.unique()) > 1000
 
 
-# B9: sizes
-
-SIZES = [(1, 1), (1, 17), (17, 1), (15, 15), (16, 16), (17, 17), (33, 47), (97, 129), (257, 257), (1, 8192), (8192, 1)]
+SIZES = [(1, 1), (1, 17), (16, 16), (33, 47), (257, 257), (1, 8192), (8192, 1)]
 
 
 @pytest.mark.parametrize(("width", "height"), SIZES)

@@ -10,8 +10,6 @@ import torch
 from tests.gaussians import SMOOTH, camera, cloud, leaves
 from tests.io.scenes import transforms_json, write_transforms
 from tests.numerics.poison import documented
-from tests.reference.blend import blend_reference
-from tests.reference.project import project_reference
 from tests.scenes import three_gaussians
 from warpgs.constants import FAR, FARTHEST_PIXEL, LARGEST_AXIS, LARGEST_COEFFICIENT, RULES, SHORTEST_QUAT
 from warpgs.export.ply import read_ply, write_ply
@@ -112,50 +110,6 @@ def test_log_scales(device, dtype, value, axes):
         assert not any(bool(v[2].any()) for v in found[3:])
 
 
-def test_camera_inside_a_gaussian_that_is_drawn(device):
-    """P6, P11: a mean just behind the near plane, its Gaussian far larger than the image: finite, and equal to float64."""
-    cam = camera(24, 20, cameras=1, dtype=torch.float32, device=device)
-    for mean, log_scale in (
-        ((0.001, 0.0, 0.0101), 0.0),
-        ((0.2, -0.1, 0.3), 1.0),
-        ((5.0, 2.0, 1.0), 3.0),
-        ((0.0, 0.0, 1e9), 20.0),
-    ):
-        g = one(mean, (log_scale, log_scale - 1, log_scale + 0.5), (0.9, 0.3, -0.2, 0.1), device=device)
-        found, visible = image_of(g, cam, SMOOTH)
-        assert bool(visible.all()) and finite(found)
-        tensors = [t.cpu().double() for t in (*g.tensors().values(), cam.viewmat, cam.K)]
-        means, covs, colors, depths, opacities = project_reference(*tensors, width=24, height=20, degree=1, low_pass=0.3)
-        black = torch.zeros(3, dtype=torch.float64)
-        rgb, alpha, _, _ = blend_reference(means[0], covs[0], opacities, colors[0], depths[0], black, 24, 20, SMOOTH)
-        assert float((found[0][0].cpu() - rgb).abs().max()) <= 1e-5 and float((found[1][0].cpu() - alpha).abs().max()) <= 1e-5
-
-
-def test_gradient_of_the_clamped_jacobian(device):
-    """P8: 1.2 to 3 times outside the view but reaching in, the gradient of the mean is that of finite differences, to 1e-6."""
-    cam = camera(20, 16, cameras=1, device=device)
-    weights = torch.rand(16, 20, 5, generator=torch.Generator().manual_seed(0), dtype=torch.float64).to(device)
-
-    def loss(mean):
-        g = Gaussians(**(base.tensors() | {"means": mean}))
-        r = rasterize(g, cam, RasterizeOptions(rule=SMOOTH))
-        return (torch.cat([r.rgb, r.alpha[..., None], r.depth[..., None]], -1)[0] * weights).sum()
-
-    for x, y in ((1.2, 0.0), (-2.0, 0.1), (0.1, 3.0), (0.0, -1.5), (2.0, -2.0)):
-        base = one((0.0, 0.0, 0.0), (0.7, 0.9, 0.5), (0.9, 0.2, 0.1, -0.3), dtype=torch.float64, device=device)
-        z = 1.7
-        at = torch.tensor([[x * 10 / float(cam.K[0, 0, 0]) * z, y * 8 / float(cam.K[0, 1, 1]) * z, z]], dtype=torch.float64)
-        mean = at.to(device).requires_grad_()
-        (gradient,) = torch.autograd.grad(loss(mean), mean)
-        numeric = torch.zeros(3, dtype=torch.float64)
-        for k in range(3):
-            step = torch.zeros(1, 3, dtype=torch.float64, device=device)
-            step[0, k] = 1e-3
-            d1, d2 = ((loss(mean.detach() + s * step) - loss(mean.detach() - s * step)) / (2 * s * 1e-3) for s in (1.0, 0.5))
-            numeric[k] = float(4 * d2 - d1) / 3  # Richardson
-        assert float((gradient[0].cpu() - numeric).norm()) <= 1e-6 * float(numeric.norm()), (x, y)
-
-
 @pytest.mark.parametrize("distance", [0.0, 1e-20, 1e-8, 0.02, 1.0, 1e4, 1e6, 1e8])
 def test_view_directions_of_any_length(device, distance):
     """P9: with harmonics of degree 3 colour and gradient equal float64 from the near plane to 1e8 u; nearer is nothing."""
@@ -210,28 +164,30 @@ def test_documented_ranges_are_those_of_the_kernel(device, dtype):
     """One Gaussian on either side of every limit: drawn inside, not there outside, finite everywhere."""
     cam = camera(20, 16, cameras=1, dtype=dtype, device=device)
     far, long = FARTHEST_PIXEL / float(cam.K[0, 0, 0]), LARGEST_AXIS / float(cam.K[0, 1, 1])
-    cases = [
-        one((0.0, 0.0, f * FAR), [math.log(FAR) - 2] * 3, dtype=dtype, device=device) for f in (0.999, 1.001)
-    ] + [
-        one((f * far, 0.0, 1.0), [math.log(far)] * 3, dtype=dtype, device=device) for f in (0.999, 1.001)
-    ] + [
-        one((0.0, 0.0, 1.0), [math.log(f * long)] * 3, dtype=dtype, device=device) for f in (0.99, 1.01)
-    ] + [
-        one((0.0, 0.0, 1.0), quat=(f * SHORTEST_QUAT, 0.0, 0.0, 0.0), dtype=dtype, device=device) for f in (1.001, 0.999)
-    ] + [
-        one((0.0, 0.0, 1.0), quat=(f / SHORTEST_QUAT, 0.0, 0.0, 0.0), dtype=dtype, device=device) for f in (0.999, 1.001)
+
+    def at(mean=(0.0, 0.0, 1.0), scales=(-2.0, -2.0, -2.0), length=1.0, coefficient=0.0):
+        g = one(mean, scales, (length, 0.0, 0.0, 0.0), dtype=dtype, device=device)
+        g.sh[0, 0, 1] = coefficient
+        return g
+
+    pairs = [
+        tuple(at((0.0, 0.0, f * FAR), [math.log(FAR) - 2] * 3) for f in (0.999, 1.001)),
+        tuple(at((f * far, 0.0, 1.0), [math.log(far)] * 3) for f in (0.999, 1.001)),
+        (at(scales=[math.log(0.99 * long)] * 3), at(scales=[math.log(1.01 * long)] * 3)),
+        (at(length=1.001 * SHORTEST_QUAT), at(length=0.999 * SHORTEST_QUAT)),
+        (at(length=0.999 / SHORTEST_QUAT), at(length=1.001 / SHORTEST_QUAT)),
+        (at(coefficient=0.999 * LARGEST_COEFFICIENT), at(coefficient=1.001 * LARGEST_COEFFICIENT)),
+        (at((0.0, 0.0, 0.0101)), at((0.0, 0.0, 0.005))), (at(), at((0.0, 0.0, -0.5))),  # P6
+        (at(scales=(-800.0, -1.0, -1.0)), at(length=0.0)),  # P5: a disc of no thickness; P4: no rotation
     ]  # fmt: skip
-    for f in (0.999, 1.001):
-        g = one((0.0, 0.0, 1.0), dtype=dtype, device=device)
-        g.sh[0, 0, 1] = f * LARGEST_COEFFICIENT
-        cases.append(g)
     on_cpu = Camera(cam.viewmat.cpu(), cam.K.cpu(), 20, 16)
-    for i, g in enumerate(cases):
-        found, visible = image_of(g, cam)
-        assert bool(visible.any()) == (i % 2 == 0), i
-        assert finite(found), i
-        moved = Gaussians(**{n: t.cpu() for n, t in g.tensors().items()})
-        assert bool(documented(moved, on_cpu, EXACT.near)[0][0]) == (i % 2 == 0), i
+    for number, pair in enumerate(pairs):
+        for g, inside in zip(pair, (True, False)):
+            found, visible = image_of(g, cam)
+            assert bool(visible.any()) == inside and finite(found), (number, inside)
+            assert inside or not any(bool(t.any()) for t in found), number
+            moved = Gaussians(**{n: t.cpu() for n, t in g.tensors().items()})
+            assert bool(documented(moved, on_cpu, EXACT.near)[0][0]) == inside, number
 
 
 def test_corners_of_the_ranges_are_finite(device):

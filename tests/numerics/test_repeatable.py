@@ -21,8 +21,6 @@ from warpgs.render.options import RasterizeOptions
 from warpgs.render.rasterize import rasterize
 from warpgs.scene import Camera, Gaussians
 
-# The same bits every time: under load, for any number of threads, beside other streams, and in another process.
-
 REPEATS = 50
 
 
@@ -32,29 +30,6 @@ def all_bits(gaussians, cam, deterministic=True) -> list[torch.Tensor]:
     r = rasterize(Gaussians(**leaves), cam, RasterizeOptions(deterministic=deterministic, record=False))
     loss = r.rgb.square().sum() + (r.alpha * r.depth).sum()
     return [t.detach() for t in (r.rgb, r.alpha, r.depth)] + list(torch.autograd.grad(loss, list(leaves.values())))
-
-
-def test_50_repeats_give_the_same_bits(device):
-    """Forward and backward, fifty times with one thread or several, while other work keeps the machine busy."""
-    gaussians, cam = cloud(1500, device=device), camera(72, 50, cameras=2, dtype=torch.float32, device=device)
-    torch.set_num_threads(2)
-    first = all_bits(gaussians, cam)
-    assert all(bool(t.any()) for t in first)
-    over = threading.Event()
-
-    def disturb() -> None:
-        while not over.is_set():
-            torch.rand(200, 200) @ torch.rand(200, 200)
-
-    with ThreadPoolExecutor(1) as pool:
-        load = pool.submit(disturb)
-        try:
-            for i in range(REPEATS):
-                torch.set_num_threads(1 + i % 3)
-                assert all(torch.equal(a, b) for a, b in zip(first, all_bits(gaussians, cam), strict=True)), i
-        finally:
-            over.set()
-        load.result()
 
 
 def other_bits(device) -> list[torch.Tensor]:
@@ -83,15 +58,28 @@ def other_bits(device) -> list[torch.Tensor]:
     return [t.detach() for t in found]
 
 
-def test_thread_counts_give_the_same_bits(device):
-    """1, 2, 3, 5 and 8 threads: ranges of a launch own what they write, however it is cut."""
-    gaussians, cam = cloud(4000, device=device), camera(160, 96, dtype=torch.float32, device=device)
+def test_50_repeats_give_the_same_bits(device):
+    """All ops, fifty times with 1 to 8 threads, while other work keeps the machine busy."""
+    gaussians, cam = cloud(1500, device=device), camera(72, 50, cameras=2, dtype=torch.float32, device=device)
     torch.set_num_threads(1)
-    first = all_bits(gaussians, cam) + other_bits(device)
-    for threads in (2, 3, 5, 8):
-        torch.set_num_threads(threads)
-        again = all_bits(gaussians, cam) + other_bits(device)
-        assert all(torch.equal(a, b) for a, b in zip(first, again, strict=True)), threads
+    first, others = all_bits(gaussians, cam), other_bits(device)
+    assert all(bool(t.any()) for t in first)
+    over = threading.Event()
+
+    def disturb() -> None:
+        while not over.is_set():
+            torch.rand(200, 200) @ torch.rand(200, 200)
+
+    with ThreadPoolExecutor(1) as pool:
+        load = pool.submit(disturb)
+        try:
+            for i in range(REPEATS):
+                torch.set_num_threads((2, 3, 5, 8, 1)[i % 5])
+                assert all(torch.equal(a, b) for a, b in zip(first, all_bits(gaussians, cam), strict=True)), i
+                assert i >= 10 or all(torch.equal(a, b) for a, b in zip(others, other_bits(device), strict=True)), i
+        finally:
+            over.set()
+        load.result()
 
 
 @pytest.mark.cuda
@@ -150,8 +138,6 @@ def test_atomic_sums_differ_by_rounding_alone(device):
         for a, b in zip(all_bits(gaussians, cam, deterministic=False), ordered, strict=True):
             assert (a.double() - b.double()).norm() <= (0.0 if device.type == "cpu" else 1e-4) * b.double().norm()
 
-
-# What Warp lets pass and warpgs must not: hidden float32, generated adjoints, writes out of bounds (docs/numerics.md).
 
 KERNELS = sorted((Path(__file__).parents[2] / "warpgs/kernels").glob("*.py"))
 

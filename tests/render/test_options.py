@@ -22,8 +22,6 @@ from warpgs.render.rasterize import FASTEST_FIRST, select_rule
 from warpgs.render.reference import reference_image
 from warpgs.scene import Camera, Gaussians
 
-# Options and rules of wrong types or ranges: an error where they are made, which names the field.
-
 
 @pytest.mark.parametrize(
     "field, values",
@@ -117,8 +115,6 @@ def test_a_full_device_is_not_called_a_wrong_background(monkeypatch):
         rasterize(g, cam, RasterizeOptions())
 
 
-# The fastest rule within an error, measured on the scene at hand.
-
 BACKGROUND = torch.tensor([1.0, 0.5, 0.0])
 
 
@@ -167,9 +163,6 @@ def test_wrong_arguments(error):
         select_rule(g, [], max_error=0.1)
     with pytest.raises(UsageError, match=r"list of cameras, not one: give \[camera\]"):
         select_rule(g, views[0], max_error=0.1)
-
-
-# Rules with the name of another program, against that program's documented constants in float64.
 
 
 class Program(NamedTuple):
@@ -243,9 +236,6 @@ def test_a_program_is_named_with_its_version():
     assert {n for n in RULES if n.startswith("gsplat")} == {n for n in PROGRAMS if n.startswith("gsplat")}
 
 
-# The bound of a render's error: never below the true error, and close to it.
-
-
 def error_and_bound(number: int, device, rule) -> tuple[torch.Tensor, torch.Tensor]:
     """Return the true error of a scene's render and its bound, float64, shape [H, W] each."""
     _, g, cam, background = bound_scene(number)
@@ -276,30 +266,23 @@ def test_the_bound_holds_in_more_scenes(device):
         bounds(number, device)
 
 
-def test_it_goes_with_the_other_options(device):
-    """Only on request; windows, chunks, batches and channels have it, with the same image."""
+def test_channels_have_a_bound_too(device):
+    """Of a scene with everything that a bound may go with, and of none."""
     g, cam = cloud(300, device=device), camera(50, 34, cameras=2, dtype=torch.float32, device=device)
     g.means.requires_grad_()
-    options = RasterizeOptions(rule="fast", error_bound=True)
-    whole, plain = rasterize(g, cam, options), rasterize(g, cam, RasterizeOptions(rule="fast"))
-    assert plain.error_bound is None and not options.repeatable() and torch.equal(whole.rgb, plain.rgb)
-    assert whole.error_bound.shape == (2, 34, 50)
-    chunked = rasterize(g, cam, dataclasses.replace(options, max_instances=100, median_depth=True, contributions=True))
-    assert torch.equal(chunked.error_bound, whole.error_bound)
-    window = rasterize(g, cam, dataclasses.replace(options, window=(16, 16, 34, 18)))
-    assert torch.equal(window.error_bound, whole.error_bound[:, 16:, 16:])
     colors = torch.rand(300, 5, device=device)
-    channels = dataclasses.replace(options, colors=colors, features=colors, background=colors[0], opacity_factors=colors[:, 0])
-    found = rasterize(g, cam, channels)
-    exact = rasterize(g, cam, dataclasses.replace(channels, rule="exact", error_bound=False))
+    options = RasterizeOptions(
+        rule="fast", error_bound=True, colors=colors, features=colors, background=colors[0], opacity_factors=colors[:, 0]
+    )
+    found = rasterize(g, cam, options)
+    exact = rasterize(g, cam, dataclasses.replace(options, rule="exact", error_bound=False))
     off = (found.rgb - exact.rgb).detach().abs().amax(-1)
     # the reference is float64, this exact render float32: measured 4e-8 on average
     assert float(off.max()) > 1e-3 and float((found.error_bound.detach() - off).abs().mean()) < 1e-6
     none = Gaussians(**{n: t[:0] for n, t in g.tensors().items()})
-    assert float(rasterize(none, cam, options).error_bound.detach().max()) < 1e-30
+    assert float(rasterize(none, cam, RasterizeOptions(error_bound=True)).error_bound.detach().max()) < 1e-30
+    assert not options.repeatable() and exact.error_bound is None
 
-
-# The page for users of gsplat: its code runs, and it has a row for every argument.
 
 PAGE = ROOT / "docs" / "coming-from-gsplat.md"
 ARGUMENTS = """means quats scales opacities colors viewmats Ks width height near_plane far_plane radius_clip eps2d sh_degree

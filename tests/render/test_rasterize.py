@@ -20,8 +20,6 @@ from warpgs.render.options import RasterizeOptions
 from warpgs.render.rasterize import rasterize
 from warpgs.scene import ActivatedGaussians, Camera, CovarianceGaussians, Gaussians
 
-# The public op: shapes, gradients through everything, options, and errors.
-
 
 def test_public_names_load_on_use():
     """The package offers what its __all__ says, and nothing else by accident."""
@@ -200,8 +198,6 @@ def test_a_pose_that_scales_or_shears_is_refused():
     assert torch.allclose(mirrored.flip(1), rasterize(gaussians, cam).rgb, atol=1e-5)
 
 
-# Antialiasing: opacities times sqrt(det(cov2d) / det(cov2d + low_pass I)), the 2D filter of Mip-Splatting.
-
 ANTIALIASED = RasterizeOptions(antialiased=True)
 
 
@@ -320,8 +316,6 @@ def test_extremes_are_finite(device, dtype, low_pass):
         assert torch.equal(plain.visible, r.visible)
         close("projection", opacity, plain.projected[0, :, 5])
 
-
-# Near and far plane: Gaussians outside are not there, on every way to render (graphed calls: `test_graphed.py`).
 
 PLANES = {"near": 3.5, "far": 4.5}
 """Depths between which about half of `cloud` lies, whose depths are 3 to 5 u."""

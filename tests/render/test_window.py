@@ -15,33 +15,13 @@ from warpgs.render.compose import inputs_of, pass_of
 from warpgs.render.options import RasterizeOptions
 from warpgs.render.rasterize import rasterize
 
-# A window is the crop of the whole image, to the bit, and windows rendered one by one add up to it.
-
 SIZE = (75, 53)  # no multiple of a tile
-WINDOWS = [(0, 0, 75, 53), (0, 16, 75, 16), (32, 0, 16, 53), (16, 32, 59, 21), (64, 48, 11, 5), (48, 16, 16, 32)]
 
 
 def scene(dtype, device):
     """Two cameras that see a cloud, and background colours."""
     background = torch.tensor([[0.1, 0.5, 0.9], [0.7, 0.2, 0.3]], dtype=dtype, device=device)
     return cloud(400, dtype, device), camera(*SIZE, cameras=2, dtype=dtype, device=device), background
-
-
-@pytest.mark.parametrize(("rule", "tile_size"), [("exact", 8), ("gsplat-1.5", 16), ("inria", 16)])
-def test_window_is_the_crop(device, dtype, rule, tile_size):
-    """Bands, columns and corners: colour, alpha and depth to the bit, and contributions; float32 and the generic path."""
-    gaussians, cam, background = scene(dtype, device)
-    options = RasterizeOptions(rule=rule, background=background, tile_size=tile_size)
-    whole = rasterize(gaussians, cam, options)
-    assert bool(whole.alpha.any())
-    for window in WINDOWS:
-        part = rasterize(gaussians, cam, dataclasses.replace(options, window=window, contributions=True))
-        x, y, width, height = window
-        for name in ("rgb", "alpha", "depth"):
-            crop = getattr(whole, name)[:, y : y + height, x : x + width]
-            assert torch.equal(getattr(part, name), crop), (name, window)
-        assert bool((part.tile_counts <= whole.tile_counts).all())
-        assert torch.allclose(part.weight_sums.sum(), part.alpha.sum(), rtol=1e-4)
 
 
 def test_chunks_hold_no_more_instances_than_asked_for():
@@ -76,8 +56,6 @@ def test_windows_off_the_tiles_are_refused(window):
     with pytest.raises(UsageError, match=r"window .* multiples of 16"):
         rasterize(gaussians, cam, RasterizeOptions(window=window))
 
-
-# A list of pixels: the bits of the whole image there, its gradients, and no tile without one.
 
 MAPS = ("rgb", "alpha", "depth", "median_depth", "features", "heaviest_ids", "heaviest_weights", "blend_counts")
 

@@ -271,10 +271,10 @@ def _layer(name: str, background: Any, colors: torch.Tensor | None, inputs: Proj
         background = like.new_zeros(channels)
     try:
         values = _as_tensor(background)
+        if values.is_complex():
+            raise TypeError(values.dtype)
     except (RuntimeError, TypeError, ValueError) as e:
         raise TypeError(f"{name} must be numbers, shape [{channels}] or [C, {channels}], not {background!r}") from e
-    if values.is_complex():
-        raise TypeError(f"{name} must be numbers, shape [{channels}] or [C, {channels}], not {values.dtype}")
     if values.layout != torch.strided:
         raise TypeError(f"{name} must be dense, not {values.layout}; {name}.to_dense() converts it")
     values = values.to(like)
