@@ -4,7 +4,6 @@ import dataclasses
 import itertools
 import math
 
-import numpy as np
 import pytest
 import torch
 
@@ -13,7 +12,6 @@ from tests.reference.project import rotations
 from tests.tolerances import close
 from warpgs.errors import UsageError
 from warpgs.geometry import gaussian_normals, rotation_matrices
-from warpgs.pipeline.model.edit import rotate, rotation_about
 from warpgs.render.options import RasterizeOptions
 from warpgs.render.rasterize import rasterize
 from warpgs.scene import ActivatedGaussians, CovarianceGaussians
@@ -242,27 +240,6 @@ def test_extremes_stay_finite(device, exponent):
         assert bool(torch.isfinite(r.projected).all()) and (exponent > 30 or bool(r.visible[0, 1]))
         r.projected[..., :10].sum().backward()
         assert all(bool(torch.isfinite(t.grad).all()) for t in given.tensors().values())
-
-
-@pytest.mark.parametrize("degree", [3, 4])
-def test_a_turned_scene_with_its_camera_gives_the_same_image(device, dtype, degree):
-    """Means, shapes and harmonics turn; colours and gradients of opacities stay."""
-    turn = rotation_about(np.array([0.3, -0.8, 0.5]), 1.1)
-    gaussians, cam = cloud(60, dtype, device, degree=degree), camera(40, 30, dtype=dtype, device=device)
-    pose = torch.eye(4, dtype=dtype, device=device)
-    pose[:3, :3] = torch.from_numpy(turn.T).to(pose)
-    turned = dataclasses.replace(cam, viewmat=cam.viewmat @ pose)
-    found = []
-    for g, c in ((gaussians, cam), (rotate(gaussians, turn), turned)):
-        g = leaves(g)
-        r = rasterize(g, c)
-        r.rgb.square().sum().backward()
-        found.append((r.rgb, g.logit_opacities.grad))
-    limit = 2e-5 if dtype == torch.float32 else 1e-12  # measured: 2.0e-6, 4.1e-15
-    assert float((found[0][0] - found[1][0]).detach().abs().max()) <= limit
-    assert float((found[0][1] - found[1][1]).norm()) <= 10 * limit * float(found[0][1].norm())
-    unturned = rasterize(gaussians, turned).rgb
-    assert float((unturned - found[0][0]).detach().abs().max()) > 0.01
 
 
 @pytest.mark.parametrize("degree", [0, 2, 3])

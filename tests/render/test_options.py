@@ -44,40 +44,16 @@ def test_a_rule_checks_its_cut_offs(field, values):
     assert Rule("own", alpha_cut=0, transmittance_stop=0.0, low_pass=np.float32(0)).low_pass == 0
 
 
-def test_options_check_their_types():
-    """A switch takes no text, whole numbers no text, no switch and no fraction."""
-    for name in SWITCHES:
-        for value in ("no", "antialiased", 1, None):
-            with pytest.raises(UsageError, match=f"{name} must be True or False, not {value!r}"):
-                RasterizeOptions(**{name: value})
-        RasterizeOptions(**{name: np.bool_(True)})
-    for name in WHOLE_NUMBERS:
-        for value in ("1", 1.5, True):
-            with pytest.raises(UsageError, match=f"{name} must be a whole number, not {value!r}"):
-                RasterizeOptions(**{name: value})
-        RasterizeOptions(**{name: np.int64(8)})
-    for name in ("sh_degree", "memory_budget", "capacity", "heaviest"):
-        with pytest.raises(UsageError, match=f"{name} must be at least 0, not -1"):
-            RasterizeOptions(**{name: -1})
-    for name in ("tile_size", "heaviest"):
-        with pytest.raises(UsageError, match=f"{name} must be a whole number, not None"):
-            RasterizeOptions(**{name: None})
-    for name in ("near", "far"):
-        for value in ("1", True, [1.0]):
-            with pytest.raises(UsageError, match=re.escape(f"{name} must be a number, not {value!r}")):
-                RasterizeOptions(**{name: value})
-    for value in ((0, 0, 16), (0.0, 0, 16, 16), "0 0 16 16", 16):
-        with pytest.raises(UsageError, match=re.escape(f"window must be four whole numbers, not {value!r}")):
-            RasterizeOptions(window=value)
-    RasterizeOptions(near=np.float32(1), far=2, window=[np.int64(0), 0, 16, 16])
-
-
-PIXELS = torch.zeros(1, 2, dtype=torch.int64)
-
-
-@pytest.mark.parametrize(
-    ("words", "options"),
-    [
+def test_options_are_checked_where_they_are_made():
+    """Types, ranges, and options that exclude each other; numpy's numbers are numbers."""
+    pixels = torch.zeros(1, 2, dtype=torch.int64)
+    wrong = [
+        *((f"{n} must be True or False, not {v!r}", {n: v}) for n in SWITCHES for v in ("no", 1, None)),
+        *((f"{n} must be a whole number, not {v!r}", {n: v}) for n in WHOLE_NUMBERS for v in ("1", 1.5, True)),
+        *((f"{n} must be a whole number, not None", {n: None}) for n in ("tile_size", "heaviest")),
+        *((f"{n} must be at least 0, not -1", {n: -1}) for n in ("sh_degree", "memory_budget", "capacity", "heaviest")),
+        *((f"{n} must be a number, not {v!r}", {n: v}) for n in ("near", "far") for v in ("1", True, [1.0])),
+        *((f"window must be four whole numbers, not {v!r}", {"window": v}) for v in ((0, 0, 16), (0.0, 0, 16, 16), "0 0", 16)),
         ("unknown rule 'best': choose one of exact, balanced, fast, gsplat-1", {"rule": "best"}),
         ("tile size 12 is not one of 8, 16", {"tile_size": 12}),
         ("max_instances must be at least 1", {"max_instances": 0}),
@@ -85,15 +61,15 @@ PIXELS = torch.zeros(1, 2, dtype=torch.int64)
         ("capacity must be at most 1,073,741,823, not 1,073,741,824", {"capacity": 2**30}),
         ("error_bound and capacity exclude each other", {"error_bound": True, "capacity": 1000}),
         ("feature_background requires features", {"feature_background": torch.zeros(8)}),
-        ("pixels cannot be combined", {"pixels": PIXELS, "window": (0, 0, 16, 16)}),
-        ("pixels cannot be combined", {"pixels": PIXELS, "contributions": True}),
-        ("pixels cannot be combined", {"pixels": PIXELS, "capacity": 100}),
-    ],
-)
-def test_options_out_of_range_or_together_are_refused(words, options):
-    """Where they are made, not at the first render."""
-    with pytest.raises(UsageError, match=words):
-        RasterizeOptions(**options)
+        *(
+            ("pixels cannot be combined", {"pixels": pixels, n: v})
+            for n, v in (("window", (0, 0, 16, 16)), ("contributions", True), ("capacity", 100))
+        ),
+    ]
+    for words, options in wrong:
+        with pytest.raises(UsageError, match=re.escape(words)):
+            RasterizeOptions(**options)
+    RasterizeOptions(near=np.float32(1), far=2, window=[np.int64(0), 0, 16, 16], capacity=2**30 - 1, absgrad=np.bool_(True))
 
 
 def test_a_background_is_numbers():

@@ -108,22 +108,16 @@ def test_gradients_are_those_of_the_image(device, how):
     pixels = torch.cat([some(40, 4), some(3, 4)]).to(device)
     weight = torch.randn(2, 43, generator=torch.Generator().manual_seed(5)).to(device)
 
-    def gradients(make):
-        leaves = [t.detach().clone().requires_grad_() for t in (*gaussians.tensors().values(), cam.viewmat, cam.K)]
-        own = type(gaussians)(*leaves[:5])
-        r = make(own, dataclasses.replace(cam, viewmat=leaves[5], K=leaves[6]))
-        ((r.rgb.square().sum(-1) + r.alpha + 0.1 * r.depth + r.features.sum(-1)) * weight).sum().backward()
-        return [t.grad for t in leaves if t.grad is not None]
-
-    def listed(g, c):
-        return rasterize(g, c, dataclasses.replace(options, pixels=pixels))
-
-    def whole(g, c):
-        r = rasterize(g, c, options)
-        x, y = pixels.T
-        return dataclasses.replace(r, **{n: getattr(r, n)[:, y, x] for n in ("rgb", "alpha", "depth", "features")})
-
-    pairs = list(zip(gradients(listed), gradients(whole), strict=True))
+    (x, y), found = pixels.T, []
+    for listed in (True, False):
+        own = [t.detach().clone().requires_grad_() for t in (*gaussians.tensors().values(), cam.viewmat, cam.K)]
+        view = dataclasses.replace(cam, viewmat=own[5], K=own[6])
+        r = rasterize(type(gaussians)(*own[:5]), view, dataclasses.replace(options, pixels=pixels) if listed else options)
+        images = [getattr(r, n) if listed else getattr(r, n)[:, y, x] for n in ("rgb", "alpha", "depth", "features")]
+        rgb, alpha, depth, features = images
+        ((rgb.square().sum(-1) + alpha + 0.1 * depth + features.sum(-1)) * weight).sum().backward()
+        found.append([t.grad for t in own if t.grad is not None])
+    pairs = list(zip(*found, strict=True))
     assert len(pairs) >= 6 and any(bool(a.any()) for a, _ in pairs)
     for a, b in pairs:
         if device.type == "cpu" and "max_instances" not in how:

@@ -86,11 +86,6 @@ def make_backward(real, tile_size: int, channels: int, absgrad: bool = False, de
             first = (camera * settings.height + top + row) * settings.width + left
             for part in range(parts):
                 base = ((part * side + row) * strip) & pixel_bits
-                o = wp.max(first + part * strip, 0)
-                if across == side:
-                    for lane in range(strip):
-                        pixels.t[base + lane] = transmittances[o + lane]
-                        pixels.end[base + lane] = ends[o + lane]
                 lane = int(0)
                 while lane < wp.min(across - part * strip, strip):
                     q = first + part * strip + lane
@@ -98,9 +93,8 @@ def make_backward(real, tile_size: int, channels: int, absgrad: bool = False, de
                         break
                     p = wp.max(base + lane, 0)
                     lane += 1
-                    if across < side:
-                        pixels.t[p] = transmittances[q]
-                        pixels.end[p] = ends[q]
+                    pixels.t[p] = transmittances[q]
+                    pixels.end[p] = ends[q]
                     load_channels(q * pitch, p, v_rgb, pixels)
                     load_depth(q, p, weights, depth, v_alpha, v_depth, pixels)
             row += 1

@@ -212,7 +212,7 @@ def make_emit(real, slotted: bool):
 
 @functools.cache
 def make_emit_cpu(real, slotted: bool):
-    """Make the kernel; arguments are those of `tiles_emit.make_emit`."""
+    """Make the kernel; arguments are those of `make_emit`."""
     s = make_spans(real, lanes=True)
     vec3 = wp.types.vector(3, real)
     lane_reals = wp.types.vector(LANES, real)
