@@ -13,7 +13,6 @@ from tests.mesh.balls import ALL_SIDES, CENTER, RADIUS, RED, ball, cameras
 from warpgs import rasterize
 from warpgs.app.cli import main
 from warpgs.errors import DataError, ResourceError, UsageError
-from warpgs.kernels.tsdf import DistanceGrid
 from warpgs.mesh import fuse as fusing
 from warpgs.mesh import views
 from warpgs.mesh.fuse import (
@@ -268,7 +267,7 @@ def grid_of(distance, seen=None, shape=(31, 29, 33)):
     x = np.array(ORIGIN) + VOXEL * np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), -1)
     weights = np.ones(shape) if seen is None else seen(x).astype(float)
     values = np.clip(distance(x) / (4 * VOXEL), -1, 1)
-    return DistanceGrid(ORIGIN, VOXEL, 4 * VOXEL, torch.tensor(values).float(), torch.tensor(weights).float())
+    return GridPlan(ORIGIN, VOXEL, shape, 1.0), torch.tensor(values).float(), torch.tensor(weights).float()
 
 
 def sphere(x):
@@ -283,7 +282,7 @@ def areas_and_normals(mesh: Mesh):
 
 def test_a_sphere_is_closed_and_faces_outwards():
     """Vertices a hundredth of a voxel from the surface, its area and volume, one part, every edge of two triangles."""
-    mesh = extract(grid_of(sphere))
+    mesh = extract(*grid_of(sphere))
     assert np.abs(np.linalg.norm(mesh.vertices, axis=1) - 1).max() < 0.02 * VOXEL
     area, normals, middles = areas_and_normals(mesh)
     assert area.sum() == pytest.approx(4 * np.pi, rel=0.01)
@@ -295,7 +294,7 @@ def test_a_sphere_is_closed_and_faces_outwards():
 
 def test_what_was_not_seen_stays_open():
     """No triangle reaches into the unseen half, and none closes it."""
-    mesh = extract(grid_of(sphere, lambda x: x[..., 0] < 0.33))
+    mesh = extract(*grid_of(sphere, lambda x: x[..., 0] < 0.33))
     assert 0.2 < mesh.vertices[:, 0].max() < 0.33
     _, normals, middles = areas_and_normals(mesh)
     assert ((normals * middles).sum(1) > 0).all()  # a lid would face another way than outwards
@@ -304,14 +303,14 @@ def test_what_was_not_seen_stays_open():
 
 def test_no_skirt_between_two_surfaces():
     """Where distance jumps from before a surface to behind another, no triangles connect the two."""
-    mesh = extract(grid_of(lambda x: np.where(x[..., 0] < 0.05, x[..., 2] + 0.53, x[..., 2] - 0.53)))
+    mesh = extract(*grid_of(lambda x: np.where(x[..., 0] < 0.05, x[..., 2] + 0.53, x[..., 2] - 0.53)))
     assert (np.abs(np.abs(mesh.vertices[:, 2]) - 0.53) < 1.2 * VOXEL).all() and parts(mesh)[0] == 2
 
 
 def test_small_parts_go():
     """A speck beside a sphere; the sphere stays as it is."""
-    alone = extract(grid_of(sphere))
-    both = extract(grid_of(lambda x: np.minimum(sphere(x), np.linalg.norm(x - [1.2, 1.1, 1.3], axis=-1) - 0.12)))
+    alone = extract(*grid_of(sphere))
+    both = extract(*grid_of(lambda x: np.minimum(sphere(x), np.linalg.norm(x - [1.2, 1.1, 1.3], axis=-1) - 0.12)))
     assert parts(both)[0] == 2
     mesh, removed = remove_small_parts(both, 0.05)
     assert removed == 1 and len(mesh.faces) == len(alone.faces) and np.allclose(mesh.vertices, alone.vertices)
@@ -321,7 +320,7 @@ def test_small_parts_go():
 
 def test_fewer_triangles_of_the_same_surface():
     """A fifth of them, at most a tenth of a voxel off, with the same open edge; the same bits twice; few stay as they are."""
-    mesh = extract(grid_of(sphere, lambda x: x[..., 0] < 0.33))
+    mesh = extract(*grid_of(sphere, lambda x: x[..., 0] < 0.33))
     fewer = decimate(mesh, len(mesh.faces) // 5)
     assert 0.15 * len(mesh.faces) < len(fewer.faces) <= 0.2 * len(mesh.faces) + 1
     assert np.abs(np.linalg.norm(fewer.vertices, axis=1) - 1).max() < 0.1 * VOXEL
@@ -336,7 +335,7 @@ def test_fewer_triangles_of_the_same_surface():
 def test_triangles_no_surface_is_said(seen):
     """Nothing seen at all, and nothing but emptiness."""
     with pytest.raises(DataError, match="no surface inside the grid"):
-        extract(grid_of(sphere, seen))
+        extract(*grid_of(sphere, seen))
 
 
 # Depth that one view alone shows is kept where no other view looks, and left out where another one sees something else.

@@ -31,8 +31,8 @@ CUDA_FUNCTIONS = {
     "warpgs/kernels/graphs.py": (
         "CapturedGraph", "GraphMemory", "GraphPool.capture", "GraphPool.pool", "GraphPool.release",
     ),
-    "warpgs/kernels/update.py": ("make_scheduled_kernel",),
-    "warpgs/kernels/walk.py": ("make_native", "_launch_native"),
+    "warpgs/kernels/update.py": ("scheduled_update",),
+    "warpgs/kernels/walk.py": ("make_native",),
 }  # fmt: skip
 """Code that only a CUDA device runs, in addition to code that `sides` and `ends_cpu` find."""
 

@@ -12,7 +12,7 @@ import torch
 from warpgs.device import available_bytes, format_bytes
 from warpgs.errors import DataError, ResourceError, UsageError
 from warpgs.kernels.launch import MAX_SIZE
-from warpgs.kernels.tsdf import DistanceGrid, empty_grid, gather_colors, integrate
+from warpgs.kernels.tsdf import gather_colors, integrate
 from warpgs.mesh.views import DEPTHS, SAMPLES, DepthMap, SurfaceViews, agreed, depth_map, neighbours, sample_surface
 from warpgs.render.options import RasterizeOptions
 from warpgs.scene import Camera, Gaussians, Mesh
@@ -125,13 +125,13 @@ def _grey(vertices: np.ndarray, faces: np.ndarray) -> Mesh:
     return Mesh(vertices, faces.astype(np.int32), np.full(vertices.shape, 0.5, np.float32))
 
 
-def extract(grid: DistanceGrid) -> Mesh:
-    """Return the surface where distances are 0, without colours, open where no view looked and at jumps of the distance."""
+def extract(plan: GridPlan, distance_grid: torch.Tensor, weight_grid: torch.Tensor) -> Mesh:
+    """Return the surface where distances [X, Y, Z] are 0, open where no view looked and at jumps of the distance."""
     # The surface is left open where no view looked: a triangle is kept only if both grid points beside each of its vertices
     # were seen. No triangle is made where the distance jumps from in front of one surface to behind another, as at depth edges.
     from skimage.measure import marching_cubes
 
-    distances, weights = grid.distances.cpu().numpy(), grid.weights.cpu().numpy()
+    distances, weights = distance_grid.cpu().numpy(), weight_grid.cpu().numpy()
     seen = weights > 0
     values = np.where(seen, distances, np.float32(1))
     if not (values < 0).any() or min(values.shape) < 2:
@@ -143,7 +143,7 @@ def extract(grid: DistanceGrid) -> Mesh:
     faces = faces[kept[faces].all(1)]
     if not len(faces):
         raise DataError(NO_SURFACE)
-    return _compact(_grey(np.array(grid.origin) + grid.voxel * corners.astype(np.float64), faces))
+    return _compact(_grey(np.array(plan.origin) + plan.voxel * corners.astype(np.float64), faces))
 
 
 def _compact(mesh: Mesh) -> Mesh:
@@ -243,19 +243,22 @@ class FusedMesh:
     """Number of vertices that no view saw; each has the colour of the nearest vertex that was seen."""
 
 
-def integrate_views(views: SurfaceViews, plan: GridPlan, maps: Sequence[DepthMap], like: torch.Tensor) -> DistanceGrid:
-    """Return the grid, typed as ``like``, into which the depth of all views was fused, in the order of the cameras."""
-    grid, confirmed = empty_grid(plan.origin, plan.voxel, plan.shape, plan.truncation, like), False
+def integrate_views(
+    views: SurfaceViews, plan: GridPlan, maps: Sequence[DepthMap], like: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return distances and weights [X, Y, Z], typed as ``like``, fused from the depth of all views in the cameras' order."""
+    distances, weights, confirmed = like.new_zeros(plan.shape), like.new_zeros(plan.shape), False
     for view, others in zip(views("fusing depth"), neighbours(maps)):
         view = agreed(view, [maps[i] for i in others])
         confirmed = confirmed or bool(((view.depth > 0) & torch.isfinite(view.depth)).any())
-        integrate(grid, view.camera, view.depth, view.weights)
+        place = plan.origin, plan.voxel, plan.truncation
+        integrate(distances, weights, *place, view.camera, view.depth, view.weights)
     if not confirmed:
         raise DataError(
             "no depth of a training view is confirmed by another view, so there is no surface to mesh; fit again with more "
             "steps, or with more photographs that show the same surfaces"
         )
-    return grid
+    return distances, weights
 
 
 def fuse(
@@ -275,12 +278,12 @@ def fuse(
         maps.append(depth_map(view, len(cameras)))
     plan = plan_grid(*map(np.concatenate, zip(*samples)), options.voxel, options.resolution)
     planned(plan, check_memory(plan, gaussians.means.device))
-    grid = integrate_views(views, plan, maps, gaussians.means)
+    distances, weights = integrate_views(views, plan, maps, gaussians.means)
     del maps
-    unseen = 1 - np.count_nonzero(grid.weights.cpu().numpy()) / plan.points
+    unseen = 1 - np.count_nonzero(weights.cpu().numpy()) / plan.points
     stage("finding triangles: marching cubes")
-    whole = extract(grid)
-    del grid
+    whole = extract(plan, distances, weights)
+    del distances, weights
     cleaned, removed = remove_small_parts(whole)
     if len(cleaned.faces) > options.max_faces:
         stage(f"simplifying: {len(cleaned.faces):,} triangles")

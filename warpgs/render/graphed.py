@@ -27,7 +27,7 @@ from warpgs.kernels.ellipse import ProjectInputs
 from warpgs.kernels.falloff import Pass
 from warpgs.kernels.graphs import MIN_REPLAYS, GraphedFunction, GraphPool
 from warpgs.kernels.launch import Allocator, fetch, first_order, keep, kept
-from warpgs.kernels.tiles import BYTES_PER_INSTANCE, InstanceMemory, Tiles, Visible, grid, running_counts, split_sum, sums_fit
+from warpgs.kernels.tiles import BYTES_PER_INSTANCE, InstanceMemory, Tiles, grid, running_counts, split_sum, sums_fit
 from warpgs.means2d import count_passes
 from warpgs.render.compose import composite_into
 
@@ -146,7 +146,7 @@ class GraphedRasterizer:
     def _bin_and_blend(self, allocator: Allocator, projected, counts, backgrounds) -> tuple[torch.Tensor, ...]:
         overflow = allocator.workspace((1,), torch.int32, self.device)  # not read, since the sums show it first
         memory = InstanceMemory(
-            None, self.capacity.instances, overflow, allocator, Visible(self._sums, self.capacity.visible)
+            None, self.capacity.instances, overflow, allocator, (self._sums, self.capacity.visible)
         )  # fmt: skip
         tiles, (_, _, _, *saved) = composite_into(projected, counts, backgrounds, self.settings, memory, self.gradients)
         if not self.gradients:

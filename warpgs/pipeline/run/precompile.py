@@ -48,9 +48,9 @@ def fit_kernels(cuda: bool) -> list[tuple[wp.Kernel, int]]:
         (tiles.make_kernels(real, cuda).pack_counts, THREADS),
         *(((tiles.make_emit if cuda else tiles.make_emit_cpu)(real, slotted), THREADS) for slotted in (True, False)),
         *((tiles.make_find_ranges(slotted, cuda), THREADS) for slotted in (True, False)),
-        (neighbours.make_knn_kernels(real).search, THREADS), (update.make_dropout_kernel(), THREADS),
-        (neighbours.make_reach_kernel(), THREADS), (update.make_decay_kernel(), THREADS),
-        (update.make_step_kernels().end_step, THREADS), (mcmc.make_kernel(), THREADS),
+        (neighbours.make_knn_kernels(real).search, THREADS), (update.sample, THREADS),
+        (neighbours.make_reach_kernel(), THREADS), (update.decay, THREADS),
+        (update.end_kernel, THREADS), (mcmc.make_kernel(), THREADS),
     ]  # fmt: skip
     if not cuda:
         blending, scoring = (
@@ -65,8 +65,8 @@ def fit_kernels(cuda: bool) -> list[tuple[wp.Kernel, int]]:
             blending.forward, blending.backward, without_depth.backward,
             walk.make_walk(real, TILE_SIZE, walk.make_contributions),
             blend.make_segments(real, VALUES, 9 + COLORS).sum_gradients, blend.make_segments(real).gather_weights,
-            update.make_errors(),
-            sweep.make_costs_kernel(), sweep.make_depth_kernels().best, sweep.make_scanline_kernel_cpu(),
+            update.squared_errors,
+            sweep.match, sweep.best, sweep.follow_cpu,
             *(k for s in scoring for k in (s.forward, s.backward)), *updates,
         ]  # fmt: skip
         return [(kernel, 1) for kernel in [*(k for k, _ in common), *own]]
@@ -78,11 +78,11 @@ def fit_kernels(cuda: bool) -> list[tuple[wp.Kernel, int]]:
     own += [(blend_cuda.make_forward(TILE_SIZE, save, per), warps) for save in (True, False) for per in (1, 2)]
     own += [(launch.make_fetch(), THREADS), (blending.order_tiles, blend_cuda.ORDER_THREADS)]
     own += [(blending.contributions, TILE_SIZE * TILE_SIZE)]
-    own += [(blend.make_segments(real).gather_weights, THREADS), (sweep.make_scanline_kernel(), sweep.BLOCK)]
+    own += [(blend.make_segments(real).gather_weights, THREADS), (sweep.follow, sweep.BLOCK)]
     for depth, chunk in itertools.product((False, True), blend_cuda.CHUNKS):  # with a loss term that reads depth, and without
         passes = blend_cuda.make_backward(TILE_SIZE, depth, chunk, False)
         own += [(passes.backward, warps), (passes.gather, THREADS)]
-    own += [(ssim.make_cuda_kernels().forward, ssim.THREADS), (update.make_scheduled_kernel(), THREADS)]
+    own += [(ssim.make_cuda_kernels().forward, ssim.THREADS), (update.scheduled_update, THREADS)]
     return common + own
 
 
