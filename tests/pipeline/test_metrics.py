@@ -250,10 +250,10 @@ def test_coverage_of_gaussians_that_all_views_see():
     g = three_gaussians()
     far = {n: torch.cat([t, t[:1]]) for n, t in g.tensors().items()}
     far["means"][3] = torch.tensor([0.0, 0.0, -50.0])
-    seen = coverage(Gaussians(**far), cameras(), RasterizeOptions())
-    assert seen.views.tolist() == [4, 4, 4, 0] and float(seen.maxima[3]) == 0
+    maxima, views = coverage(Gaussians(**far), cameras(), RasterizeOptions())
+    assert views.tolist() == [4, 4, 4, 0] and float(maxima[3]) == 0
     weights = [rasterize(g, c, RasterizeOptions(contributions=True)).weight_maxima[0] for c in cameras()]
-    assert torch.equal(seen.maxima[:3], torch.stack(weights).amax(0))
+    assert torch.equal(maxima[:3], torch.stack(weights).amax(0))
 
 
 def test_hidden_gaussian_is_not_seen():
@@ -264,8 +264,8 @@ def test_hidden_gaussian_is_not_seen():
     rows["log_scales"][0], rows["log_scales"][1] = math.log(0.4), math.log(0.02)
     away = rows["means"][0] - torch.from_numpy(cameras(1)[0].center)
     rows["means"][1] = rows["means"][0] + 0.3 * away.float()
-    seen = coverage(Gaussians(**rows), cameras(1), RasterizeOptions())
-    assert seen.views.tolist() == [1, 0] and 0 < float(seen.maxima[1]) < SEEN
+    maxima, views = coverage(Gaussians(**rows), cameras(1), RasterizeOptions())
+    assert views.tolist() == [1, 0] and 0 < float(maxima[1]) < SEEN
 
 
 def test_fisher_is_the_trace_of_the_jacobian():
