@@ -18,8 +18,6 @@ from warpgs.errors import DataError
 from warpgs.geometry import back_project, camera_extent, focus_point, in_image, look_at, project_points
 from warpgs.pipeline.metrics.coverage import (
     BINS,
-    MAX_COUNT,
-    DepthView,
     classes_of,
     coverage_lines,
     coverage_map,
@@ -27,9 +25,8 @@ from warpgs.pipeline.metrics.coverage import (
     depth_views,
     fraction_outside,
     photo_errors,
-    score_by_coverage,
 )
-from warpgs.pipeline.metrics.lpips import MODES, NETS, convert_lpips, load_lpips
+from warpgs.pipeline.metrics.lpips import MODES, NETS, Lpips, convert_lpips
 from warpgs.pipeline.metrics.scores import (
     Rendered,
     baselines,
@@ -330,13 +327,13 @@ def test_counts_are_those_of_cast_rays():
     cameras = camera_path(9, 120, 90)
     target, training = cameras[4], [cameras[i] for i in (0, 3, 8)]
     depth = ray_depth(target)
-    found = coverage_map(depth, target, [DepthView(c, ray_depth(c)) for c in training])
+    counts, _ = coverage_map(depth, target, [(c, ray_depth(c)) for c in training])
     xy = np.stack(np.meshgrid(np.arange(120) + 0.5, np.arange(90) + 0.5), -1).reshape(-1, 2)
     rays = np.concatenate([(xy - target.K[:2, 2]) / target.K[[0, 1], [0, 1]], np.ones((len(xy), 1))], 1)
     points = (rays * depth.numpy().reshape(-1, 1) - target.viewmat[:3, 3]) @ target.viewmat[:3, :3]
     wanted = np.sum([truly_sees(c, points) for c in training], 0).reshape(90, 120)
     assert (wanted[..., None] == [0, 1, 2, 3]).mean((0, 1)).min() > 0.01  # every count is there to be got wrong
-    assert (found.counts.numpy() == wanted).mean() > 0.95
+    assert (counts.numpy() == wanted).mean() > 0.95
 
 
 def plane(width: int = 30, height: int = 20, depth: float = 2.0) -> tuple[Camera, torch.Tensor]:
@@ -349,22 +346,20 @@ def test_views_that_saw_nothing_of_it():
     """One turned away, one hidden behind a nearer wall, one that looks through, one without a surface."""
     camera, depth = plane()
     away = Camera(look_at(np.zeros(3), np.array([0.0, 0, -1]), np.array([0.0, -1, 0])), camera.K, 30, 20)
-    others = [DepthView(away, depth), DepthView(camera, depth / 2), DepthView(camera, 2 * depth), DepthView(camera, 0 * depth)]
-    found = coverage_map(depth, camera, others)
-    assert not found.counts.any() and not bool(found.difference.isnan().any())
-    assert (found.difference == 0.5).all()  # of the nearer wall, as a share of the depth
-    assert (coverage_map(depth, camera, [*others, DepthView(camera, 1.01 * depth)]).counts == 1).all()
+    others = [(away, depth), (camera, depth / 2), (camera, 2 * depth), (camera, 0 * depth)]
+    counts, difference = coverage_map(depth, camera, others)
+    assert not counts.any() and (difference == 0.5).all()  # of the nearer wall, as a share of the depth
+    assert (coverage_map(depth, camera, [*others, (camera, 1.01 * depth)])[0] == 1).all()
 
 
-def test_counts_end_at_255_and_pixels_without_surface_are_nobodys():
+def test_pixels_without_surface_are_nobodys():
     """Background where the scene is transparent, else seen by none; every pixel is in one class."""
     camera, depth = plane()
     depth[:5] = 0
-    found = coverage_map(depth, camera, [DepthView(camera, depth)] * 300)
-    assert found.counts.dtype == torch.uint8 and (found.counts[5:] == MAX_COUNT).all() and not found.counts[:5].any()
-    assert bool(torch.isinf(found.difference[:5]).all())
+    counts, difference = coverage_map(depth, camera, [(camera, depth)] * 300)
+    assert (counts[5:] == 300).all() and not counts[:5].any() and bool(torch.isinf(difference[:5]).all())
     for transparent, name in ((True, "background"), (False, "0")):
-        classes = classes_of(found, transparent)
+        classes = classes_of(counts, (depth <= 0) & transparent)
         assert (np.sum(list(classes.values()), 0) == 1).all() and classes[name][:5].all() and classes["2+"][5:].all()
 
 
@@ -373,12 +368,12 @@ def test_masks_hide_and_many_pixels_are_rendered_smaller():
     cameras, g = ring(3), three_gaussians()
     mask = np.ones((32, 40), bool)
     mask[:, :20] = False
-    whole, half = depth_views(g, cameras[:2], RasterizeOptions(), [None, mask])
-    assert bool((half.depth[:, 20:] > 0).any()) and not bool((half.depth[:, :20] > 0).any()) and bool((whole.depth > 0).any())
+    (_, whole), (_, half) = depth_views(g, cameras[:2], RasterizeOptions(), [None, mask])
+    assert bool((half[:, 20:] > 0).any()) and not bool((half[:, :20] > 0).any()) and bool((whole > 0).any())
     small = depth_views(g, cameras, RasterizeOptions(), max_pixels=1500)
-    assert sum(v.depth.numel() for v in small) <= 1500
-    seen = whole.depth > 0
-    counts = coverage_map(whole.depth, cameras[0], small).counts
+    assert sum(d.numel() for _, d in small) <= 1500
+    seen = whole > 0
+    counts = coverage_map(whole, cameras[0], small)[0]
     assert (counts[seen] > 0).float().mean() > 0.8
 
 
@@ -386,7 +381,7 @@ def test_photographs_tell_the_error_to_expect():
     """None from one view; two photographs of one wall that differ by 0.1 give 0.01 at the first class, and fill the others."""
     camera, depth = plane()
     views = [View(f"{i}", camera, np.full((20, 30, 3), 0.4 + 0.1 * i, np.float32)) for i in range(2)]
-    training = [DepthView(camera, depth)] * 2
+    training = [(camera, depth)] * 2
     assert photo_errors(views[:1], training[:1]) is None
     errors = photo_errors(views, training)
     assert errors.shape == (len(BINS),) and errors == pytest.approx(0.01, rel=1e-5)
@@ -415,7 +410,7 @@ def test_scores_split_into_what_they_are_made_of(tmp_path):
     assert sorted(p.name for p in (tmp_path / "coverage").iterdir()) == sorted(v.name for v in test)
     lines = coverage_lines(found)
     assert found["summary"] in lines and sum(line.startswith("all views") for line in lines) == len(found["classes"])
-    again = score_by_coverage(three_gaussians(), train, dim, RasterizeOptions())
+    again = coverage_of_run(None, three_gaussians(), train, dim, RasterizeOptions(), names={})
     assert again["classes"] == found["classes"]
 
 
@@ -510,7 +505,7 @@ def test_equals_networks_of_torch_layers(files, weights, mode):
     rng = np.random.default_rng(0)
     a = rng.random((33, 38, 3), np.float32)
     b = np.clip(a + 0.2 * rng.standard_normal(a.shape, np.float32), 0, 1)
-    lpips = load_lpips(weights, torch.device("cpu"))
+    lpips = Lpips(weights, torch.device("cpu"))
     expected = reference(net, features, heads, a, b, mode)
     assert expected > 1e-3
     assert lpips.distance(a, b, mode) == pytest.approx(expected, rel=2e-5)
@@ -524,14 +519,14 @@ def test_modes_differ(weights):
     """[0, 1] inputs un-rescaled are another metric than inputs in [-1, 1]."""
     rng = np.random.default_rng(1)
     a, b = rng.random((2, 40, 40, 3), np.float32)
-    lpips = load_lpips(weights, torch.device("cpu"))
+    lpips = Lpips(weights, torch.device("cpu"))
     assert abs(lpips.distance(a, b, "legacy") / lpips.distance(a, b, "standard") - 1) > 0.01
 
 
 @ALEX
 def test_images_too_small_give_no_number(weights):
     """Where the last layer would see nothing the figure is NaN, not an error in the middle of an evaluation."""
-    lpips = load_lpips(weights, torch.device("cpu"))
+    lpips = Lpips(weights, torch.device("cpu"))
     side = lpips.net.smallest
     small, enough = np.zeros((side - 1, 64, 3), np.float32), np.zeros((side, side, 3), np.float32)
     assert np.isnan(lpips.distance(small, small, "legacy")) and lpips.distance(enough, enough, "legacy") == 0
@@ -546,8 +541,8 @@ def test_file_says_what_it_was_made_of(files, weights):
     assert metadata["backbone_sha256"] == hashlib.sha256(backbone.read_bytes()).hexdigest()
     assert metadata["heads_sha256"] == hashlib.sha256(heads.read_bytes()).hexdigest()
     assert not any("classifier" in n for n in names)
-    lpips = load_lpips(weights, torch.device("cpu"))
-    assert lpips.sha256 == hashlib.sha256(weights.read_bytes()).hexdigest()
+    lpips = Lpips(weights, torch.device("cpu"))
+    assert lpips.header["sha256"] == hashlib.sha256(weights.read_bytes()).hexdigest()
     assert set(lpips.variants()) == {f"lpips_{net}_{m}" for m in MODES}
     assert "[0, 1]" in lpips.variants()[f"lpips_{net}_legacy"] and "[-1, 1]" in lpips.variants()[f"lpips_{net}_standard"]
 
@@ -582,7 +577,7 @@ def test_bad_sources_are_named(files, tmp_path):
         torch.save(value, tmp_path / "bad.pth")
         return tmp_path / "bad.pth"
 
-    refused("no such file", heads=tmp_path / "nowhere.pth")
+    refused("No such file", heads=tmp_path / "nowhere.pth")
     (tmp_path / "text.pth").write_bytes(b"<html>not found</html>")
     refused("cannot be read as a torch state dict", heads=tmp_path / "text.pth")
     (tmp_path / "cut.pth").write_bytes(backbone.read_bytes()[:5000])
@@ -631,17 +626,17 @@ def test_bad_weights_are_named(weights, tmp_path):
     from safetensors.torch import save_file
 
     cpu, bad = torch.device("cpu"), tmp_path / "bad.safetensors"
-    with pytest.raises(DataError, match="no such file"):
-        load_lpips(bad, cpu)
+    with pytest.raises(DataError, match="No such file"):
+        Lpips(bad, cpu)
     bad.write_bytes(weights.read_bytes()[:-1000])
     with pytest.raises(DataError, match="warpgs convert-lpips"):
-        load_lpips(bad, cpu)
+        Lpips(bad, cpu)
     save_file({"a": torch.zeros(1)}, bad)
     with pytest.raises(DataError, match="warpgs convert-lpips"):
-        load_lpips(bad, cpu)
+        Lpips(bad, cpu)
     save_file({"a": torch.zeros(1)}, bad, {"format": "warpgs-lpips-1", "net": "vgg"})
     with pytest.raises(DataError, match="no features"):
-        load_lpips(bad, cpu)
+        Lpips(bad, cpu)
 
 
 def test_headers_without_entries_and_numbers_that_are_none(tmp_path, monkeypatch):

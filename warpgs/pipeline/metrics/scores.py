@@ -206,7 +206,7 @@ def evaluate(
         gaussians: N Gaussians in the units of the views' cameras: scene units for the views of a `Scene`.
         views: Views with images; use held-out views for a meaningful score.
         options: Options of the rasterizer, such as `FitResult.options`; None for the defaults.
-        lpips: Network for LPIPS (`load_lpips`); None to skip LPIPS.
+        lpips: `Lpips`, the network with its weights; None to skip LPIPS.
 
     Returns:
         The scores of each view, in order; `summarize` gives their means.

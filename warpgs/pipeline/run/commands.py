@@ -38,7 +38,7 @@ from warpgs.pipeline.films.film import (
 )
 from warpgs.pipeline.films.paths import Rig, rig_of
 from warpgs.pipeline.metrics.coverage import coverage_lines, coverage_of_run
-from warpgs.pipeline.metrics.lpips import load_lpips
+from warpgs.pipeline.metrics.lpips import Lpips
 from warpgs.pipeline.metrics.scores import counted_region, psnr, render_view, scored_region, to_8_bit
 from warpgs.pipeline.model import edit
 from warpgs.pipeline.model.edit import coverage
@@ -138,7 +138,7 @@ def evaluate(
 ) -> list[str]:
     """Score a run on its held-out views and render them again, into eval.json and images; returns lines for the user."""
     device, _ = choose_device(device_name)
-    lpips = None if lpips_weights is None else load_lpips(lpips_weights, device)
+    lpips = None if lpips_weights is None else Lpips(lpips_weights, device)
     stored, tell = open_run(folder, device), waiting()
     scene, train, test = scene_of(stored, reader, tell)
     request = stored.scene_request(reader)

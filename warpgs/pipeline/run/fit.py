@@ -20,7 +20,7 @@ from warpgs.geometry import CENTRAL
 from warpgs.io.load import Split, check_spec
 from warpgs.kernels.native import told_of_compiling
 from warpgs.pipeline.metrics.coverage import coverage_of_run
-from warpgs.pipeline.metrics.lpips import Lpips, load_lpips
+from warpgs.pipeline.metrics.lpips import Lpips
 from warpgs.pipeline.metrics.scores import Rendered, moved_fractions, moved_notes, render_view
 from warpgs.pipeline.model.edit import drop_unused_sh
 from warpgs.pipeline.model.limits import shape_figures, shape_summary
@@ -431,7 +431,7 @@ def fit(
             read_record(out)  # a run of another version is refused before anything takes time
         chosen, where = choose_device(device)
         began = time.perf_counter()
-        lpips = None if lpips_weights is None else load_lpips(Path(lpips_weights), chosen)
+        lpips = None if lpips_weights is None else Lpips(Path(lpips_weights), chosen)
         request, read, parts, found = _scene_of(scene, split, out, chosen.type, progress)
         renamed = [] if out is None else renaming_notes(image_names(v.name for v in read.views))
         job = FitJob(
