@@ -28,7 +28,6 @@ from warpgs.pipeline.metrics.coverage import (
 )
 from warpgs.pipeline.metrics.lpips import MODES, NETS, Lpips, convert_lpips
 from warpgs.pipeline.metrics.scores import (
-    Rendered,
     baselines,
     counted_region,
     moved_fractions,
@@ -175,7 +174,7 @@ WALL = 2.2
 """Depth of a wall that all of it is painted on [u]."""
 
 
-def _scene(count: int = 6) -> tuple[list[View], list[Rendered]]:
+def _scene(count: int = 6) -> tuple[list[View], list[tuple]]:
     """Views side by side of a wall that their renders show exactly."""
     first = photos(1, 64, 48)[0]
     views = []
@@ -185,7 +184,7 @@ def _scene(count: int = 6) -> tuple[list[View], list[Rendered]]:
         views.append(
             View(f"{i}.png", dataclasses.replace(first.camera, viewmat=viewmat), np.full((48, 64, 3), 0.4, np.float32))
         )
-    return views, [Rendered(v.image.copy(), np.full((48, 64), WALL), np.ones((48, 64))) for v in views]
+    return views, [(v.image.copy(), np.full((48, 64), WALL), np.ones((48, 64))) for v in views]
 
 
 def _with_patch(view: View) -> View:
@@ -212,7 +211,7 @@ def test_it_takes_two_others_that_show_the_place():
     """Nothing is said where the renders of others show another depth, there are few views, or a mask hides it."""
     views, renders = _scene()
     views[2] = _with_patch(views[2])
-    elsewhere = [r if i == 2 else r._replace(depth=2 * r.depth) for i, r in enumerate(renders)]
+    elsewhere = [(rgb, depth if i == 2 else 2 * depth, alpha) for i, (rgb, depth, alpha) in enumerate(renders)]
     assert not any(moved_fractions(views, elsewhere))
     assert not any(moved_fractions(views[:5], renders[:5]))
     mask = np.ones((48, 64), bool)
@@ -232,7 +231,7 @@ def test_a_fit_that_has_hardly_begun_accuses_no_view():
     """All views are far from their renders."""
     views, renders = _scene()
     views[2] = _with_patch(views[2])
-    assert not any(moved_fractions(views, [r._replace(rgb=r.rgb + np.float32(0.01)) for r in renders]))
+    assert not any(moved_fractions(views, [(rgb + np.float32(0.01), *rest) for rgb, *rest in renders]))
 
 
 # What views know of each Gaussian, against geometry by hand and the Jacobian by autograd.

@@ -18,7 +18,7 @@ from warpgs.geometry import check_pinhole, pinhole_of
 from warpgs.io.image_files import decode
 from warpgs.kernels.ssim import ssim
 from warpgs.mesh.views import MIN_ALPHA, TOLERANCE, depth_difference, seen_from
-from warpgs.pipeline.metrics.scores import over_white, psnr_of, render_view, scored_region, to_8_bit
+from warpgs.pipeline.metrics.scores import psnr_of, render_view, scored_pair
 from warpgs.priors.given_depth import pinhole_view
 from warpgs.process import counted
 from warpgs.render.options import RasterizeOptions
@@ -172,11 +172,8 @@ def classes_of(counts: torch.Tensor, empty: torch.Tensor) -> dict[str, np.ndarra
 
 def _sums(view: View, image: np.ndarray, classes: dict[str, np.ndarray], expected: np.ndarray | None) -> dict[str, np.ndarray]:
     """Return for each class the number of scored pixels and the sums over them of squared error, SSIM and expected error."""
-    region, kind = scored_region(view)
-    image, target = to_8_bit(image), to_8_bit(view.image)
+    image, target, region, _ = scored_pair(view, image)
     error = np.square(image.astype(np.float64) - target).mean(-1)
-    if region is not None and kind != "foreground":
-        image, target = over_white(image, region), over_white(target, region)
     similarity = ssim(torch.from_numpy(image), torch.from_numpy(target)).numpy().astype(np.float64).mean(-1)
     maps = [np.ones_like(error), error, similarity, np.zeros_like(error) if expected is None else expected]
     inside = {c: m if region is None else m & region for c, m in classes.items()}
@@ -235,9 +232,7 @@ def coverage_of_run(
     summary = "every held-out pixel was seen by a training view"
     if unseen:
         pixels, loss = (f"{100 * unseen[f'share_of_{what}']:.3g} %" for what in ("pixels", "error"))
-        summary = (
-            f"{pixels} of the held-out pixels were seen by no training view; they account for {loss} of the squared error"
-        )
+        summary = f"{pixels} of the held-out pixels were seen by no training view; they account for {loss} of the squared error"
     return {
         "classes": pooled, "views": views, "tolerance": TOLERANCE, "depth_differences": list(BINS[:-1]),
         "photo_psnr": None if errors is None else [psnr_of(e) for e in errors.tolist()], "summary": summary,

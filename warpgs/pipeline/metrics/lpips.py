@@ -148,9 +148,7 @@ def _net_of(heads: dict[str, torch.Tensor], path: Path) -> Net:
     for net in NETS.values():
         if shapes == {k: v for k, v in net.shapes().items() if k.startswith("lin")}:
             return net
-    raise DataError(
-        f"{path}: heads of an unsupported network; give PerceptualSimilarity's vgg.pth or alex.pth"
-    )
+    raise DataError(f"{path}: heads of an unsupported network; give PerceptualSimilarity's vgg.pth or alex.pth")
 
 
 def convert_lpips(backbone: Path, heads: Path, out: Path) -> list[str]:

@@ -18,7 +18,6 @@ from warpgs.geometry import check_stored, checked_normalization, convert_camera,
 from warpgs.kernels.neighbours import morton_codes
 from warpgs.kernels.sh import MAX_DEGREE
 from warpgs.kernels.update import BETAS, adam_scheduled, scheduled_lrs
-from warpgs.pipeline.metrics.scores import options_for
 from warpgs.render.options import RasterizeOptions
 from warpgs.scene import Camera, Gaussians, Normalization
 from warpgs.version import __version__
@@ -357,7 +356,8 @@ class FittedModel(Model):
 
     def options(self) -> RasterizeOptions:
         """Return the rasterizer's options of the fit: rule, background and antialiasing."""
-        return options_for(self.rule, self.background, self.scene_gaussians, self.antialiased)
+        background = self.scene_gaussians.means.new_tensor(self.background)
+        return RasterizeOptions(rule=self.rule, background=background, antialiased=self.antialiased)
 
 
 def save(path: str | Path, gaussians: Gaussians, normalization: Normalization | None = None, units: str = "scene") -> None:
