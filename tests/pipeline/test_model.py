@@ -46,7 +46,6 @@ from warpgs.pipeline.model.edit import (
 from warpgs.pipeline.model.limits import (
     LimitConfig,
     Limits,
-    TrainingCameras,
     long_axes,
     scene_radius,
     shape_figures,
@@ -218,7 +217,7 @@ def test_a_change_that_is_not_whole_is_refused():
 
 CPU = torch.device("cpu")
 YES, NO = torch.tensor([True]), torch.tensor([False])
-CAMERAS, VIEWS = TrainingCameras(torch.zeros(1, 3), torch.zeros(1, 9)), photos(4)
+CAMERAS, VIEWS = (torch.zeros(1, 3), torch.zeros(1, 9)), photos(4)
 
 
 def params(log_scales: torch.Tensor) -> dict[str, torch.Tensor]:
@@ -264,7 +263,7 @@ def test_no_gaussian_reaches_a_camera():
     found = params(torch.log(torch.tensor([[9.0, 1.0, 1e-3], [0.5, 0.2, 0.1], [math.inf, 1.0, 1.0]])))
     found["means"] = torch.tensor([[0.0, 0, 6], [0, 0, 6], [0, 0, 6]])
     limits, centers = LimitConfig(max_ratio=0).at(1.0, 100.0), torch.tensor([[0.0, 0, 0], [0, 0, 20]])
-    limits.hold(found, CAMERAS._replace(centers=centers), YES)
+    limits.hold(found, (centers, CAMERAS[1]), YES)
     sizes = found["log_scales"].exp()
     assert torch.allclose(sizes[:2], torch.tensor([[2.0, 1.0, 1e-3], [0.5, 0.2, 0.1]])) and sizes[2, 0].isinf()
     model = Gaussians(**(cloud(2).tensors() | {n: t[:2] for n, t in found.items()}))
