@@ -210,8 +210,7 @@ def consistent_depths(
         return [flow_depth(views, i, between, EpipolarConfig()) for i in range(len(views))]
     points = np.concatenate([known.points, triangulate_matches(views).points])
     bounds = [depth_bounds(v, points, camera_depths(views)) for v in views]
-    say = lambda done, total: progress(f"finding depth: {done} of {total} views")  # noqa: E731
-    return sweep_depths(views, bounds, SweepConfig(), device(), say)
+    return sweep_depths(views, bounds, SweepConfig(), device(), lambda n, of: progress(f"finding depth: {n} of {of} views"))
 
 
 def consistent_points(
@@ -235,12 +234,8 @@ def consistent_points(
             if len(extrapolated):
                 notes[-1] += f", {len(extrapolated):,} extrapolated where no view looks"
             elif config.extrapolate:
-                hidden = (
-                    ""
-                    if all_count(views)
-                    else ", because masks, an alpha channel or a black background hide parts of the views"
-                )
-                notes[-1] += f", none extrapolated{hidden}"
+                why = "" if all_count(views) else ", because masks, an alpha channel or a black background hide parts of views"
+                notes[-1] += f", none extrapolated{why}"
             how = "\n".join((notes[-1], *given, *(f"    {n}" for n in notes[:-1])))
             return Start(joined((cloud, extrapolated)), how, depths, len(extrapolated))
         reason = f"only {len(cloud)} points survived the checks ({' | '.join(notes[:-1])}); do the views overlap?"
