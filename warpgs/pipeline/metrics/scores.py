@@ -130,9 +130,10 @@ class ViewMetrics:
 
     def row(self) -> dict[str, Any]:
         """Return all scores by name, flat, as in result files."""
-        row = asdict(self)
-        opacity, lpips = row.pop("opacity"), row.pop("lpips")
-        return row | opacity | lpips
+        row: dict[str, Any] = asdict(self)
+        for scores in (row.pop("opacity"), row.pop("lpips")):
+            row |= scores
+        return row
 
 
 def to_8_bit(image: np.ndarray) -> np.ndarray:
