@@ -36,10 +36,7 @@ that leaves the bracket is replaced by a bisection."""
 def check_known(model: str) -> None:
     """Check that a camera model is known here."""
     if model not in MODELS:
-        raise UsageError(
-            f"outside the rasterizer only the camera models {', '.join(MODELS)} are supported, not {model!r}; undistort the "
-            "images first"
-        )
+        raise UsageError(f"only the lenses {', '.join(MODELS)} are supported here, not {model!r}; undistort the images first")
 
 
 def _library(array: Array) -> Any:
@@ -211,10 +208,7 @@ def quaternions(rotations: torch.Tensor) -> torch.Tensor:
 def check_pinhole(camera: Camera) -> None:
     """Check that a camera is a pinhole, for code that assumes that straight lines stay straight."""
     if camera.model != "pinhole":
-        raise UsageError(
-            f"only pinhole cameras are supported here, not {camera.model!r}; read the scene with --lenses undistort, or "
-            "undistort the images first"
-        )
+        raise UsageError(f"only pinhole cameras are supported here, not {camera.model!r}; read with --lenses undistort")
 
 
 def pinhole_of(camera: Camera) -> Camera:
@@ -466,13 +460,9 @@ SH_COUNTS = (1, 4, 9, 16, 25)
 
 def checked_normalization(normalization: Normalization | None, units: str, where: str) -> Normalization:
     """Check and return ``normalization``; with file units, None becomes the identity."""
-    if units not in UNITS:
-        raise UsageError(f"units {units!r} is not one of {', '.join(UNITS)}")
+    _same_units(units, "file")
     if normalization is None and units == "scene":
-        raise UsageError(
-            f"{where}: units='scene' requires normalization=scene.normalization; give it, or units='file' for Gaussians "
-            "without a scene"
-        )
+        raise UsageError(f"{where}: units='scene' requires normalization=scene.normalization; give it, or units='file'")
     n = normalization or Normalization()
     offset = np.asarray(n.offset)
     if not (math.isfinite(n.scale) and n.scale > 0 and offset.shape == (3,) and np.isfinite(offset).all()):

@@ -97,10 +97,8 @@ def check_memory(plan: GridPlan, device: torch.device) -> str:
     for where, needed in needs.items():
         free = available_bytes(where)
         if needed > 0.8 * free:
-            raise ResourceError(
-                f"a grid of {sizes} points takes {format_bytes(needed)} of memory on {where}, more than 80 % of the free "
-                f"{format_bytes(free)}; {remedy}"
-            )
+            most = f"{format_bytes(needed)} of memory on {where}, more than 80 % of the free {format_bytes(free)}"
+            raise ResourceError(f"a grid of {sizes} points takes {most}; {remedy}")
     return format_bytes(sum(needs.values()))
 
 
@@ -259,10 +257,7 @@ def fuse(
         integrate(grid, view.camera, view.depth, view.weights)
     del maps
     if not confirmed:
-        raise DataError(
-            "no depth of a training view is confirmed by another view, so there is no surface to mesh; fit again with more "
-            "steps, or with more photographs that show the same surfaces"
-        )
+        raise DataError("no depth of a training view is confirmed by another view; fit with more steps, or more photographs")
     unseen = 1 - np.count_nonzero(grid.weights.cpu().numpy()) / plan.points
     stage("finding triangles: marching cubes")
     whole = extract(grid)

@@ -40,11 +40,10 @@ DepthView = tuple[Camera, torch.Tensor]
 
 @torch.no_grad()
 def depth_views(
-    gaussians: Gaussians, cameras: Sequence[Camera], options: RasterizeOptions,
-    masks: Sequence[np.ndarray | None] | None = None, max_pixels: int = MAX_PIXELS,
-) -> list[DepthView]:  # fmt: skip
-    """Render the depth of every training view once, 0 outside ``masks`` [H, W]; smaller if all maps exceed ``max_pixels``."""
-    factor = min(1.0, (max_pixels / max(1, sum(c.width * c.height for c in cameras))) ** 0.5)
+    gaussians: Gaussians, cameras: Sequence[Camera], options: RasterizeOptions, masks: Sequence[np.ndarray | None] | None = None
+) -> list[DepthView]:
+    """Render the depth of every training view once, 0 outside ``masks`` [H, W]; smaller if all maps exceed `MAX_PIXELS`."""
+    factor = min(1.0, (MAX_PIXELS / max(1, sum(c.width * c.height for c in cameras))) ** 0.5)
     views = []
     for camera, mask in zip(cameras, masks or [None] * len(cameras)):
         small = _resized(pinhole_of(camera), factor)

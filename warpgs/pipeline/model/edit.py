@@ -315,6 +315,10 @@ WORTHWHILE = 0.02
 """Least fraction of the Gaussians that a round must merge away; merging ends after two rounds in a row with less."""
 
 
+Accepted = Callable[[Gaussians, float], bool]
+"""Whether a model is good enough when a fraction in [0, 1] of the allowed loss may be spent."""
+
+
 def largest_fraction(accepted: Callable[[float], bool]) -> float:
     """Return the largest accepted fraction in [0, 1], by bisection; 1 is tried first, 0 needs no test.
 
@@ -373,14 +377,11 @@ def lower_degrees(gaussians: Gaussians, maxima: torch.Tensor, accepted: Callable
     return lowered(largest_fraction(lambda s: accepted(lowered(s))))
 
 
-def merge_neighbours(
-    gaussians: Gaussians, maxima_of: Callable[[Gaussians], torch.Tensor], accepted: Callable[[Gaussians, float], bool]
-) -> Gaussians:
+def merge_neighbours(gaussians: Gaussians, maxima_of: Callable[[Gaussians], torch.Tensor], accepted: Accepted) -> Gaussians:
     """Merge pairs, cheapest first, in rounds while they are worthwhile; return the smaller set.
 
-    ``accepted`` tests whether a model is good enough when a fraction in [0, 1] of the allowed loss may be spent. The fraction
-    grows over the first `RAMP` rounds, because the cheapest pairs of one round cost less than the last merged pairs of the
-    round before.
+    The allowed loss grows over the first `RAMP` rounds, because the cheapest pairs of one round cost less than the last merged
+    pairs of the round before.
     """
     idle = 0
     for number in range(PASSES):
@@ -398,13 +399,11 @@ def merge_neighbours(
 
 
 def prune_model(
-    gaussians: Gaussians, cameras: list[Camera], options: RasterizeOptions, seed: int,
-    accepted: Callable[[Gaussians, float], bool],
-) -> Gaussians:  # fmt: skip
+    gaussians: Gaussians, cameras: list[Camera], options: RasterizeOptions, seed: int, accepted: Accepted
+) -> Gaussians:
     """Lower degrees, merge neighbours, then remove Gaussians as far as ``accepted`` allows; return them by ascending degree.
 
-    ``accepted`` tests whether a model is good enough when a fraction in [0, 1] of the allowed loss may be spent; the result was
-    accepted with fraction 1, or nothing could be removed. ``cameras`` are those of the training views, tensors.
+    The result was accepted with fraction 1, or nothing could be removed. ``cameras`` are those of the training views, tensors.
     """
 
     def maxima_of(model: Gaussians) -> torch.Tensor:

@@ -45,6 +45,10 @@ DEPTH_SPREAD = 0.1
 """Standard deviation of the logarithm of depth around a matched point."""
 
 
+Device, Say = Callable[[], torch.device], Callable[[str], object]
+"""A function that waits until the device to sweep on may be used, and returns it; one that shows a line of progress."""
+
+
 def camera_depths(views: list[View]) -> tuple[float, float]:
     """Return the default near and far depth [u]: 0.1 and 10 times the distance to the cameras' focus point.
 
@@ -136,10 +140,7 @@ def random_points(views: list[View], count: int, generator: np.random.Generator)
         points.append(candidates[best])
         colors.append(view.image[rows[best], columns[best]])
     if not points:
-        raise DataError(
-            "no random start: all pixels of the training views are masked out or transparent; check --mask-keeps and the alpha "
-            "channel of the images"
-        )
+        raise DataError("no random start: masks or alpha hide all pixels of the views; check --mask-keeps and the images")
     with_matches = sum(s.has_matches for s in sources)
     how = f"{count:,} random points, {with_matches} of {len(views)} views with depths from {len(matched):,} matched points"
     how += f", on the object ({objects} views show it on black)" if objects else ""
@@ -197,13 +198,11 @@ class Start(NamedTuple):
 
 
 def consistent_depths(
-    views: list[View], known: PointCloud, config: InitConfig, device: Callable[[], torch.device] = lambda: CPU,
-    progress: Callable[[str], object] = lambda line: None,
-) -> list[ViewDepth]:  # fmt: skip
+    views: list[View], known: PointCloud, config: InitConfig, device: Device = lambda: CPU, progress: Say = lambda line: None
+) -> list[ViewDepth]:
     """Return the geometrically consistent depth of each of at least two views, by flow or by sweeping planes.
 
-    ``known`` points bound the planes; ``device`` waits until the device to sweep on may be used, and returns it; ``progress``
-    is called with a line for the user about the current work.
+    ``known`` points bound the planes.
     """
     if config.source == "flow":
         between = flow_between(views, config.flow)
@@ -214,9 +213,8 @@ def consistent_depths(
 
 
 def consistent_points(
-    views: list[View], points: PointCloud, config: InitConfig, generator: np.random.Generator,
-    device: Callable[[], torch.device], progress: Callable[[str], object],
-) -> Start:  # fmt: skip
+    views: list[View], points: PointCloud, config: InitConfig, generator: np.random.Generator, device: Device, progress: Say
+) -> Start:
     """Return points behind pixels whose depth other views confirm, and a line on each view.
 
     If fewer than `MIN_POINTS` points are found, the start is random, with a note.
@@ -267,10 +265,7 @@ def extrapolates(config: InitConfig, views: list[View]) -> bool:
 def check_points(views: list[View], points: PointCloud | None, config: InitConfig) -> None:
     """Check that a start from points has points that the training views saw; DataError if it has none."""
     if config.source == "points" and len(seen_points(views, points)) == 0:
-        raise DataError(
-            "--init.source points needs 3D points that the training views saw, but the scene has none; use --init.source "
-            "random, or give a reconstruction with points"
-        )
+        raise DataError("--init.source points needs 3D points that training views saw; give them, or use --init.source random")
 
 
 def on_object(start: Start, views: list[View]) -> Start:
@@ -292,7 +287,7 @@ def on_object(start: Start, views: list[View]) -> Start:
 
 def initial_points(
     views: list[View], points: PointCloud | None, config: InitConfig, generator: np.random.Generator,
-    device: Callable[[], torch.device] = lambda: CPU, progress: Callable[[str], object] = lambda line: None,
+    device: Device = lambda: CPU, progress: Say = lambda line: None,
 ) -> Start:  # fmt: skip
     """Return the points to start from; DataError if there are none. Arguments are those of `consistent_depths`."""
     check_points(views, points, config)

@@ -48,9 +48,7 @@ def unpack(packed: torch.Tensor, degrees: torch.Tensor) -> torch.Tensor:
     """Return coefficients [N, K, 3] from the vector [M] of `pack`: K for the highest degree, 0 above each Gaussian's degree."""
     whole = degrees.ndim == 1 and not degrees.is_floating_point() and bool(((degrees >= 0) & (degrees <= MAX_DEGREE)).all())
     if packed.shape != (3 * int((degrees.long() + 1).square().sum()) if whole else -1,):
-        raise ValueError(
-            f"{list(packed.shape)} packed coefficients do not match {list(degrees.shape)} degrees from 0 to {MAX_DEGREE}"
-        )
+        raise ValueError(f"coefficients {list(packed.shape)} do not fit degrees {list(degrees.shape)}, 0 to {MAX_DEGREE}")
     highest = int(degrees.max()) if len(degrees) else 0
     sh, at = packed.new_zeros(len(degrees), (highest + 1) ** 2, 3), 0
     for d in range(highest + 1):
