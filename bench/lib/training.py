@@ -7,7 +7,6 @@ from collections.abc import Callable
 import torch
 
 from warpgs.kernels.update import Setting
-from warpgs.pipeline.model.limits import TrainingCameras
 from warpgs.pipeline.model.table import DensityUpdate, Table
 from warpgs.pipeline.model.table import model_bytes as bytes_of
 from warpgs.pipeline.train.loss import LossConfig, built_in_terms
@@ -94,7 +93,7 @@ class Steps:
             LearnedViews((), (), device, 0),
             strategy,
             None,
-            TrainingCameras(torch.zeros(1, 3, device=device), torch.zeros(1, 9, device=device)),
+            (torch.zeros(1, 3, device=device), torch.zeros(1, 9, device=device)),
         )
         numbers = torch.zeros(1, dtype=torch.int64, device=device)
         self.views = ViewStack(

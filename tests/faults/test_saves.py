@@ -36,7 +36,7 @@ from warpgs.files import write_json
 from warpgs.locks import hold_folder
 from warpgs.pipeline.films.film import render_path
 from warpgs.pipeline.model import table
-from warpgs.pipeline.model.edit import Pruned
+from warpgs.pipeline.model.edit import limit_degree
 from warpgs.pipeline.run.commands import _write, evaluate
 from warpgs.pipeline.run.export import export
 from warpgs.pipeline.run.folder import StoredRun, load_checkpoint, open_run, save_checkpoint
@@ -122,9 +122,7 @@ def save_pruned(s: Saved) -> None:
     if (s.folder / "pruned").exists():  # then the next command is another one
         with hold_folder(s.folder):
             return
-    g = s.gaussians
-    made = Pruned(g, torch.zeros(len(g), dtype=torch.int32))
-    _write(s.folder / "pruned", s.run.record, made, s.run.step, s.run.normalization)
+    _write(s.folder / "pruned", s.run.record, limit_degree(s.gaussians, 0), s.run.step, s.run.normalization)
 
 
 def save_held(s: Saved) -> None:

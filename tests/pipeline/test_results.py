@@ -12,7 +12,7 @@ from tests.gaussians import cloud
 from tests.scenes import photos, priors, seeds, three_gaussians
 from warpgs.constants import RULES, TILE_SIZE
 from warpgs.errors import ResourceError, UsageError
-from warpgs.pipeline.metrics.scores import options_for, render_view, score
+from warpgs.pipeline.metrics.scores import render_view, score
 from warpgs.pipeline.model.start import InitConfig, initial_gaussians
 from warpgs.pipeline.paper.strategy import PaperConfig
 from warpgs.pipeline.run import results
@@ -42,8 +42,6 @@ from warpgs.scene import Gaussians, View
 
 # What a fit leaves: scores in the order of the views, a picture of each, and errors that are said.
 
-BLACK = (0.0, 0.0, 0.0)
-
 
 @pytest.fixture(scope="module")
 def scene():
@@ -57,8 +55,8 @@ def test_scores_are_those_of_their_views(scene, tmp_path):
     """Each row is the score of its view, whoever finished first; means are over these; every held-out view has its files."""
     gaussians, views = scene
     test, train = views[:10], views[10:]
-    found = evaluate_run(tmp_path, gaussians, train, test, options_for("exact", BLACK, gaussians))
-    options = options_for("exact", BLACK, gaussians)
+    found = evaluate_run(tmp_path, gaussians, train, test, RasterizeOptions())
+    options = RasterizeOptions()
     wanted = [score(v, render_view(gaussians, v, options)[0]).row() for v in views]
     assert found["views"] == wanted[:10] and len({r["psnr"] for r in wanted}) == 12
     assert found["train"]["psnr"] == pytest.approx(sum(r["psnr"] for r in wanted[10:]) / 2)
@@ -70,7 +68,7 @@ def test_scores_are_those_of_their_views(scene, tmp_path):
 def test_without_held_out_views_training_views_are_pictured(scene, tmp_path):
     """And no score is called held-out."""
     gaussians, views = scene
-    found = evaluate_run(tmp_path, gaussians, views[:2], [], options_for("exact", BLACK, gaussians))
+    found = evaluate_run(tmp_path, gaussians, views[:2], [], RasterizeOptions())
     assert found["test"] == {} and found["views"] == [] and found["baselines"] == {} and found["train"]["psnr"] > 5
     assert len(list((tmp_path / "renders").iterdir())) == 2
 
@@ -83,7 +81,7 @@ def test_a_picture_that_cannot_be_written_is_said(scene, tmp_path, monkeypatch):
 
     monkeypatch.setattr(results, "write_bytes", full)
     with pytest.raises(ResourceError, match="no space left"):
-        evaluate_run(tmp_path, scene[0], scene[1][:1], scene[1][1:3], options_for("exact", BLACK, scene[0]))
+        evaluate_run(tmp_path, scene[0], scene[1][:1], scene[1][1:3], RasterizeOptions())
 
 
 def test_a_fit_ends_with_its_score_its_size_its_time_and_what_to_do_next(tmp_path):

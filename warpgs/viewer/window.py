@@ -208,7 +208,8 @@ class Maps:
             masks = [v.mask if (v := self.content.views.get(n)) else None for n in model.train]
             self._depths = depth_views(model.gaussians(), [cameras[n] for n in model.train], options, masks)
         r = rasterize(gaussians, camera, options)
-        seen = classes_of(coverage_map(torch.where(r.alpha >= MIN_ALPHA, r.depth, 0), camera, self._depths), model.transparent)
+        surface = torch.where(r.alpha >= MIN_ALPHA, r.depth, 0)
+        seen = classes_of(coverage_map(surface, camera, self._depths)[0], (surface <= 0) & model.transparent)
         return coverage_image(r.rgb.cpu().numpy(), seen["0"], seen["1"]), MAPS[COVERAGE]
 
     def _error(self, camera: Camera, gaussians: Gaussians, options: RasterizeOptions) -> tuple[np.ndarray, str]:

@@ -27,7 +27,7 @@ from warpgs.pipeline.metrics.scores import fitted_region, score
 from warpgs.pipeline.model import limits
 from warpgs.pipeline.model import start as init
 from warpgs.pipeline.model.depth_points import carve, hull_points, in_empty_region, silhouettes
-from warpgs.pipeline.model.limits import LimitConfig, TrainingCameras
+from warpgs.pipeline.model.limits import LimitConfig, camera_rows
 from warpgs.pipeline.model.start import InitConfig, initial_points, random_points
 from warpgs.pipeline.run.commands import open_file
 from warpgs.pipeline.run.folder import _camera, camera_values
@@ -410,7 +410,7 @@ def test_a_continued_fit_equals_one_in_one_go(filtered_run, tmp_path):
 def test_no_axis_is_below_what_cameras_resolve(monkeypatch):
     """With the default limit every axis ends at 0.45 px or above of the finest camera; without the flag many are below."""
     monkeypatch.setattr(limits, "MIN_PIXELS", 0.2**0.5)
-    rows = TrainingCameras.of(ring(4), CPU).rows
+    rows = camera_rows(ring(4), CPU)
     below = []
     for antialiased in (True, False):
         fit = Trainer(

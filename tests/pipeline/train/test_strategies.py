@@ -12,7 +12,7 @@ from tests.gaussians import cloud
 from tests.scenes import photos, seeds
 from warpgs.errors import UsageError
 from warpgs.geometry import quaternions, rotation_matrices
-from warpgs.pipeline.model.edit import OPAQUE, covariances, merges
+from warpgs.pipeline.model.edit import OPAQUE, covariances, merged_pairs, merges
 from warpgs.pipeline.model.start import InitConfig
 from warpgs.pipeline.run.folder import load_checkpoint, save_checkpoint
 from warpgs.pipeline.train.loss import LOSS_TERMS, LossTerm
@@ -260,15 +260,15 @@ def test_rotations_there_and_back():
 def test_moments_of_a_pair():
     """Mean, covariance and colours of the mixture; what the pair covers stays."""
     g = cloud(2, seed=3)
-    pairs = merges(g, torch.ones(2), torch.zeros(2), odd=False)
-    assert sorted([*pairs.first.tolist(), *pairs.second.tolist()]) == [0, 1]
+    pairs, merged = merges(g, torch.ones(2), odd=False)
+    assert sorted(pairs.flatten().tolist()) == [0, 1]
     areas = g.log_scales.double().exp().sort(1).values[:, 1:].prod(1)
     mass = g.logit_opacities.double().sigmoid() * areas
     fraction = (mass / mass.sum())[:, None]
     mean = (fraction * g.means.double()).sum(0)
     apart = g.means.double() - mean
     cov = covariances(g.quats.double(), g.log_scales.double()) + apart[:, :, None] * apart[:, None, :]
-    merged = {n: t.double() for n, t in pairs.merged.items()}
+    merged = {n: t.double() for n, t in merged.items()}
     assert torch.allclose(merged["means"][0], mean, atol=1e-6)
     assert torch.allclose(covariances(merged["quats"], merged["log_scales"])[0], (fraction[:, None] * cov).sum(0), atol=1e-6)
     assert torch.allclose(merged["sh"][0], (fraction[:, None] * g.sh.double()).sum(0), atol=1e-6)
@@ -302,7 +302,7 @@ def test_a_pair_covers_what_it_covered(apart, opacity):
         return float((1 - left).sum()) * 1e-4
 
     g = flat_pair(apart, opacity)
-    merged = merges(g, torch.ones(2), torch.zeros(2), odd=False).merged
+    _, merged = merges(g, torch.ones(2), odd=False)
     assert covered(merged) == pytest.approx(covered(g.tensors()), rel=1e-3)
     assert float(merged["logit_opacities"].sigmoid()) <= OPAQUE + 1e-6
 
@@ -312,27 +312,24 @@ def test_a_gaussian_in_two_halves_becomes_one_again():
     g = cloud(1)
     rows = {n: t[[0, 0]] for n, t in g.tensors().items()}
     rows["logit_opacities"] = torch.logit(torch.full((2,), 0.02))
-    pairs = merges(Gaussians(**rows), torch.ones(2), torch.zeros(2), odd=False)
-    assert torch.allclose(pairs.merged["logit_opacities"].sigmoid(), torch.tensor([0.04 - 0.5 * 0.02**2]), atol=1e-5)
-    assert torch.allclose(pairs.merged["means"], g.means, atol=1e-6) and torch.allclose(pairs.merged["sh"], g.sh)
+    _, merged = merges(Gaussians(**rows), torch.ones(2), odd=False)
+    assert torch.allclose(merged["logit_opacities"].sigmoid(), torch.tensor([0.04 - 0.5 * 0.02**2]), atol=1e-5)
+    assert torch.allclose(merged["means"], g.means, atol=1e-6) and torch.allclose(merged["sh"], g.sh)
 
 
-def test_pairs_are_disjoint_cheapest_first_and_of_one_kind():
-    """No row twice; other kinds stay apart; like neighbours come before unlike ones; a change has a parent for every row."""
+def test_pairs_are_disjoint_and_cheapest_first():
+    """No row twice; like neighbours come before unlike ones; a pair that is taken becomes one row."""
     g = cloud(101)
-    kinds = torch.arange(101) % 2
     for odd in (False, True):
-        pairs = merges(g, torch.ones(101), kinds, odd)
-        rows = torch.cat([pairs.first, pairs.second])
-        assert len(rows) == len(rows.unique()) > 20 and bool((kinds[pairs.first] == kinds[pairs.second]).all())
+        rows = merges(g, torch.ones(101), odd)[0].flatten()
+        assert len(rows) == len(rows.unique()) == 100
     means = torch.tensor([[0.0, 0, 1], [0.01, 0, 1], [5, 5, 1], [5.01, 5, 1]])
     four = {n: t[[0, 0, 0, 0]].clone() for n, t in cloud(1).tensors().items()} | {"means": means}
     four["sh"][2] += 1
-    pairs = merges(Gaussians(**four), torch.ones(4), torch.zeros(4), odd=False)
-    assert {int(pairs.first[0]), int(pairs.second[0])} == {0, 1} and len(pairs.first) == 2
-    change = pairs.change(4, 1)
-    assert change.keep.tolist() == [2, 3] and change.parents.tolist() == pairs.first[:1].tolist()
-    assert all(len(t) == 1 for t in change.added.values())
+    pairs, merged = merges(Gaussians(**four), torch.ones(4), odd=False)
+    assert set(pairs[0].tolist()) == {0, 1} and len(pairs) == 2
+    fewer = merged_pairs(Gaussians(**four), pairs, merged, 1)
+    assert torch.equal(fewer.means, torch.cat([means[2:], merged["means"][:1]])) and len(fewer.sh) == 3
 
 
 # Parts of a user's own in a fit: loss terms, and a density strategy.

@@ -48,7 +48,7 @@ from warpgs.pipeline.farm.job import (
     source_stamp,
     write_record,
 )
-from warpgs.pipeline.metrics.lpips import load_lpips
+from warpgs.pipeline.metrics.lpips import Lpips
 from warpgs.pipeline.run.commands import evaluate
 from warpgs.pipeline.run.fit import fit_request, with_poses
 from warpgs.pipeline.run.folder import CONFIG, METRICS, read_record
@@ -249,7 +249,7 @@ def _ensure(job: FarmJob, on_step: Callable[[StepReport], object] | None) -> Out
     """Return the outcome of the fit; the scene is read here only if an existing run may match."""
     request = job.request
     device, _ = choose_device(request.device)
-    lpips = {} if request.lpips_weights is None else load_lpips(request.lpips_weights, device).variants()
+    lpips = {} if request.lpips_weights is None else Lpips(request.lpips_weights, device).variants()
     remove_leftovers(job.folder)
     before = read_job_record(job.folder)
     if before is not None and before.state == "done" and not is_whole(request.out, before):

@@ -280,8 +280,7 @@ COVERAGE = "coverage"
 
 def _covered(image: np.ndarray, depth: torch.Tensor, camera: Camera, training: list[DepthView], cut_out: bool) -> bytes:
     """Return the PNG of an image [H, W, 3] that marks regions that no training view saw, and regions that one view saw."""
-    seen = coverage_map(depth, camera, training)
-    classes = classes_of(seen, cut_out)
+    classes = classes_of(coverage_map(depth, camera, training)[0], (depth <= 0) & cut_out)
     return png(coverage_image(image, classes["0"], classes["1"]))
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import itertools
 import math
 import os
@@ -39,7 +38,7 @@ from warpgs.pipeline.films.film import (
 )
 from warpgs.pipeline.films.paths import Rig, rig_of
 from warpgs.pipeline.metrics.coverage import coverage_lines, coverage_of_run
-from warpgs.pipeline.metrics.lpips import load_lpips
+from warpgs.pipeline.metrics.lpips import Lpips
 from warpgs.pipeline.metrics.scores import counted_region, psnr, render_view, scored_region, to_8_bit
 from warpgs.pipeline.model import edit
 from warpgs.pipeline.model.edit import coverage
@@ -139,7 +138,7 @@ def evaluate(
 ) -> list[str]:
     """Score a run on its held-out views and render them again, into eval.json and images; returns lines for the user."""
     device, _ = choose_device(device_name)
-    lpips = None if lpips_weights is None else load_lpips(lpips_weights, device)
+    lpips = None if lpips_weights is None else Lpips(lpips_weights, device)
     stored, tell = open_run(folder, device), waiting()
     scene, train, test = scene_of(stored, reader, tell)
     request = stored.scene_request(reader)
@@ -235,17 +234,17 @@ def _new_folder(folder: Path, out: Path | None) -> Path:
     return out
 
 
-def _write(out: Path, record: dict[str, Any], made: edit.Pruned, step: int, normalization: Normalization) -> list[str]:
+def _write(out: Path, record: dict[str, Any], made: Gaussians, step: int, normalization: Normalization) -> list[str]:
     """Write the new run folder atomically; returns notes for the user."""
-    tensors = {f"params.{n}": t for n, t in made.gaussians.tensors().items() if n != "sh"}
-    tensors |= {"params.sh_packed": pack(made.gaussians.sh, made.degrees), "degrees": made.degrees}
+    tensors, degrees = {f"params.{n}": t for n, t in made.tensors().items() if n != "sh"}, edit.stored_degrees(made.sh)
+    tensors |= {"params.sh_packed": pack(made.sh, degrees), "degrees": degrees}
     with hold_folder(out.parent) as notes:
         _new_folder(out, out)  # another process may have made it before this one held the folder above
         with filling(out) as temporary:
             write_json(temporary / CONFIG, record)
             save_checkpoint(temporary, tensors, {"step": step})
             antialiased = record["config"].get("antialiased", False)
-            write_ply(temporary / "point_cloud.ply", made.gaussians, normalization, antialiased=antialiased)
+            write_ply(temporary / "point_cloud.ply", made, normalization, antialiased=antialiased)
     return notes
 
 
@@ -265,12 +264,12 @@ def prune(
     made = _pruned(stored, train, options, keep_psnr, tell)
     tell("scoring the smaller model")
 
-    degrees = edit.stored_degrees(before.sh)
-    sizes = [model_bytes(d) for d in (degrees, made.degrees)]
-    scores = [(mean_psnr(before, v, options), mean_psnr(made.gaussians, v, options)) for v in (train, test)]
+    degrees = [edit.stored_degrees(g.sh) for g in (before, made)]
+    sizes = [model_bytes(d) for d in degrees]
+    scores = [(mean_psnr(before, v, options), mean_psnr(made, v, options)) for v in (train, test)]
     figures: dict[str, Any] = {
-        "source": str(folder.resolve()), "keep_psnr": keep_psnr, "count": [len(before), len(made.degrees)], "bytes": sizes,
-        "mean_degree": [float(d.double().mean()) for d in (degrees, made.degrees)],
+        "source": str(folder.resolve()), "keep_psnr": keep_psnr, "count": [len(before), len(made)], "bytes": sizes,
+        "mean_degree": [float(d.double().mean()) for d in degrees],
         "train_psnr": scores[0], "test_psnr": scores[1] if test else None,
     }  # fmt: skip
     # the new checkpoint has no increments of poses: its record holds the cameras after them
@@ -279,7 +278,7 @@ def prune(
     lines = [
         *stored.notes(),
         *notes,
-        f"{len(before):,} -> {len(made.degrees):,} Gaussians, mean SH degree {figures['mean_degree'][0]:.2f} -> "
+        f"{len(before):,} -> {len(made):,} Gaussians, mean SH degree {figures['mean_degree'][0]:.2f} -> "
         f"{figures['mean_degree'][1]:.2f}",
         f"{format_bytes(sizes[0])} -> {format_bytes(sizes[1])} uncompressed, {sizes[0] / sizes[1]:.2f} times smaller",
         f"training PSNR {scores[0][0]:.2f} -> {scores[0][1]:.2f} dB over {len(train)} views",
@@ -292,23 +291,20 @@ def prune(
 
 def _pruned(
     stored: StoredRun, train: list[View], options: RasterizeOptions, keep_psnr: float, tell: Callable[[str], object]
-) -> edit.Pruned:
+) -> Gaussians:
     """Prune the model of a run; DataError if its PSNR on the training views is not finite."""
     before = stored.gaussians()
-    device = before.means.device
     whole = mean_psnr(before, train, options)
     if not math.isfinite(whole):
         raise DataError(f"{stored.folder}: training PSNR is {whole} dB, so its loss cannot be limited; fit again")
-    kinds = torch.zeros(len(before), dtype=torch.int64, device=device)
-    view_set = edit.ViewSet([TrainingView.of(v, device).camera for v in train], options, stored.record["config"]["seed"])
+    cameras = [TrainingView.of(v, before.means.device).camera for v in train]
     tried = itertools.count(1)
 
     def accepted(gaussians: Gaussians, fraction: float) -> bool:
         tell(f"trying smaller models: number {next(tried)}, {len(gaussians):,} Gaussians")
         return mean_psnr(gaussians, train, options) >= whole - fraction * keep_psnr
 
-    made = edit.prune_model(before, kinds, view_set, accepted)
-    return dataclasses.replace(made, gaussians=edit.drop_unused_sh(made.gaussians))
+    return edit.drop_unused_sh(edit.prune_model(before, cameras, options, stored.record["config"]["seed"], accepted))
 
 
 PLOT = "plot.png"
@@ -362,7 +358,7 @@ def _gaussians(stored: StoredRun, train: list[Camera], by_coverage: bool) -> tup
         colors = np.clip(base_colors(gaussians.sh[:, :1].cpu().numpy()), 0, 1)
     else:
         tensors = [replace(c, viewmat=gaussians.means.new_tensor(c.viewmat), K=gaussians.means.new_tensor(c.K)) for c in train]
-        views = coverage(gaussians, tensors, stored.options()).views.cpu().numpy()
+        views = coverage(gaussians, tensors, stored.options())[1].cpu().numpy()
         lowest, palette = np.array([c[0] for c in CLASSES]), [c[2] for c in CLASSES]
         values = np.array([[int(c[i : i + 2], 16) / 255 for i in (1, 3, 5)] for c in palette])
         colors = values[np.searchsorted(lowest, views, side="right") - 1]

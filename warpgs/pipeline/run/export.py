@@ -100,7 +100,7 @@ def _maxima(stored: StoredRun) -> torch.Tensor:
     gaussians = stored.gaussians()
     like = gaussians.means.new_tensor
     tensors = [replace(c, viewmat=like(c.viewmat), K=like(c.K)) for c in training_cameras(stored)]
-    return coverage(gaussians, tensors, stored.options()).maxima
+    return coverage(gaussians, tensors, stored.options())[0]
 
 
 def rotation_of(wish: str | None, cameras: list[Camera] | None) -> np.ndarray | None:

@@ -20,8 +20,8 @@ from warpgs.geometry import CENTRAL
 from warpgs.io.load import Split, check_spec
 from warpgs.kernels.native import told_of_compiling
 from warpgs.pipeline.metrics.coverage import coverage_of_run
-from warpgs.pipeline.metrics.lpips import Lpips, load_lpips
-from warpgs.pipeline.metrics.scores import Rendered, moved_fractions, moved_notes, render_view
+from warpgs.pipeline.metrics.lpips import Lpips
+from warpgs.pipeline.metrics.scores import moved_fractions, moved_notes, render_view
 from warpgs.pipeline.model.edit import drop_unused_sh
 from warpgs.pipeline.model.limits import shape_figures, shape_summary
 from warpgs.pipeline.model.table import FittedModel
@@ -431,7 +431,7 @@ def fit(
             read_record(out)  # a run of another version is refused before anything takes time
         chosen, where = choose_device(device)
         began = time.perf_counter()
-        lpips = None if lpips_weights is None else load_lpips(Path(lpips_weights), chosen)
+        lpips = None if lpips_weights is None else Lpips(Path(lpips_weights), chosen)
         request, read, parts, found = _scene_of(scene, split, out, chosen.type, progress)
         renamed = [] if out is None else renaming_notes(image_names(v.name for v in read.views))
         job = FitJob(
@@ -583,7 +583,7 @@ def _score(
     moved: dict[str, float] = {}
     if not job.other_models:
         shown = counted(train, tell, "checking for moving objects", "views")
-        fractions = moved_fractions(train, (Rendered(*render_view(gaussians, v, options)) for v in shown))
+        fractions = moved_fractions(train, (render_view(gaussians, v, options) for v in shown))
         moved = {v.name: f for v, f in zip(train, fractions, strict=True)}
     complexity = complexity_figures(trainer)
     learned = learned_figures(trainer.learned.views, scene, job.split, given, test, gaussians, options)

@@ -22,7 +22,7 @@ from warpgs.locks import hold_folder
 from warpgs.pipeline.farm.farm import make_engine, run_and_show
 from warpgs.pipeline.farm.job import PLY, FarmJob, JobRecord, file_digest
 from warpgs.pipeline.farm.work import Outcome, ensure_run
-from warpgs.pipeline.metrics.lpips import load_lpips
+from warpgs.pipeline.metrics.lpips import Lpips
 from warpgs.pipeline.metrics.scores import over_white, render_view
 from warpgs.pipeline.paper.strategy import UNIFORM, PaperConfig
 from warpgs.pipeline.run.folder import open_run
@@ -484,7 +484,7 @@ def _run_all(request: StudyRequest, places: list[Place], device: torch.device, l
 def run_study(request: StudyRequest) -> list[str]:
     """Fit every variant to every scene with every seed, and write the results; returns the table and the notes as lines."""
     device, where = choose_device(request.device)
-    lpips = {} if request.lpips_weights is None else load_lpips(request.lpips_weights, device).variants()
+    lpips = {} if request.lpips_weights is None else Lpips(request.lpips_weights, device).variants()
     places = _places(request, device.type)
     with hold_folder(request.out) as notes:
         for note in notes:

@@ -14,7 +14,7 @@ from warpgs.kernels.graphs import CapturedGraph, GraphMemory
 from warpgs.kernels.tiles import BYTES_PER_INSTANCE, MAX_INSTANCES, InstanceMemory
 from warpgs.kernels.update import NOT_FINITE, SHIFT, Setting, begin_step, end_step, opacity_decay, opacity_dropout
 from warpgs.pipeline.metrics.scores import masked_mse
-from warpgs.pipeline.model.limits import NO_LIMITS, Limits, TrainingCameras
+from warpgs.pipeline.model.limits import NO_LIMITS, Limits
 from warpgs.pipeline.model.table import Table
 from warpgs.pipeline.train.loss import LossInputs, LossTerm, Target, outputs_of, term_values
 from warpgs.pipeline.train.schedule import over
@@ -198,8 +198,8 @@ class Learned:
     """Density strategy."""
     dropout_seed: int | None
     """Seed of the opacity dropout; None without dropout."""
-    cameras: TrainingCameras
-    """Training cameras, for limits of sizes."""
+    cameras: tuple[torch.Tensor, torch.Tensor]
+    """Training cameras, as `Limits.hold` takes them."""
 
     @property
     def params(self) -> dict[str, torch.Tensor]:

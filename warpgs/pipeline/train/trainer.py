@@ -20,7 +20,7 @@ from warpgs.errors import DataError, NotFiniteError, OutOfMemoryError, ResourceE
 from warpgs.kernels.update import NOT_FINITE, Setting
 from warpgs.pipeline.metrics.scores import psnr_of, render_view, score
 from warpgs.pipeline.model.edit import stored_degrees
-from warpgs.pipeline.model.limits import TrainingCameras, scene_radius
+from warpgs.pipeline.model.limits import camera_centers, camera_rows, scene_radius
 from warpgs.pipeline.model.start import Start, initial_gaussians, scene_extent, sweeps
 from warpgs.pipeline.model.table import Table, model_bytes
 from warpgs.pipeline.train.batch import StepTaker
@@ -257,7 +257,8 @@ class Trainer:
         self.table.add_columns(self.strategy.columns())
         views = LearnedViews.first(c.view_modules, train, device)
         self.table.batch = views.table.batch = self.batch
-        seed, cameras = c.seed if self.dropout > 0 else None, TrainingCameras.of([v.camera for v in train], device)
+        seed, seen_by = c.seed if self.dropout > 0 else None, [v.camera for v in train]
+        cameras = camera_centers(seen_by, device), camera_rows(seen_by, device)
         self.learned = Learned(self.table, views, self.strategy, seed, cameras)
         self.mean = ParameterMean(c.optimizer.average_last)
         self.buffers = StepBuffers(device, 3 * (len(self.table.params) + len(views.table.params)))
