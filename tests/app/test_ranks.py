@@ -57,7 +57,7 @@ def test_any_number_of_processes_fits_the_same_model(tmp_path, capsys, first, th
     flags = [
         str(tmp_path / "scene"), "--device", "cpu", "--preset", "3dgs", "--steps", "8", "--batch", "5", "--dropout", "0.3",
         "--init.source", "random", "--init.random-count", "60", "--density.start", "1", "--density.every", "3",
-        "--density.gradient", "1e-6", "--checkpoint-every", "2", "--checkpoint-seconds", "0",
+        "--density.gradient", "1e-6", "--checkpoint-every", "2",
         "--optimizer.average-last", "0.75",
     ]  # fmt: skip
     shared = ["--out", str(tmp_path / "shared")]

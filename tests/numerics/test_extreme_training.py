@@ -254,7 +254,6 @@ def test_what_is_no_number_is_never_saved(device, tmp_path, name, where, value):
         sh_degree=0,
         density=DensityConfig(start=100),
         checkpoint_every=2,
-        checkpoint_seconds=0,
         cuda_graph=False,
     )
     fit, saved = Trainer(photos(2), seeds(), config, device), []

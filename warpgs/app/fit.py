@@ -85,7 +85,7 @@ class Request:
     lpips_weights: Path | None = None
     """File of `warpgs convert-lpips`; without it LPIPS is not measured."""
     time_budget: float | None = None
-    """Choose the number of steps so that set-up and steps take about this time [s]; not with --steps or --resume."""
+    """Choose the number of steps so that set-up and steps take about this time [s]; not if --steps or --resume is given."""
     view: bool = False
     """Show the model in a browser while it trains, at the printed address; this changes no byte of the result."""
     view_port: int = 8080
