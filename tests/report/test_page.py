@@ -17,7 +17,7 @@ from warpgs.files import write_bytes, write_json
 from warpgs.process import Detail
 from warpgs.report.farm import FarmTable, JobCard, JobRow, farm_page
 from warpgs.report.images import png, webp
-from warpgs.report.page import Section, ViewImages, curve, write_page
+from warpgs.report.page import curve, write_page
 from warpgs.report.progress import EventLog, read_events
 
 VOID = {"meta", "img", "input", "br", "hr", "link"}
@@ -60,7 +60,7 @@ def image(value):
 
 def write(path, **changes):
     views = [
-        ViewImages(f"images/{i}.png", f"PSNR {20 + i}.25 dB, SSIM 0.{80 + i}", *(image(0.1 * i + j / 5) for j in range(4)))
+        (f"images/{i}.png", f"PSNR {20 + i}.25 dB, SSIM 0.{80 + i}", *(image(0.1 * i + j / 5) for j in range(4)))
         for i in range(2)
     ]
     values = {
@@ -69,7 +69,7 @@ def write(path, **changes):
         "notes": ["every 8th view held out", "downscaled by 2"],
         "scores": [["view", "PSNR [dB]"], ["images/0.png", "20.25"], ["images/1.png", "21.25"]],
         "views": views, "curves": [curve("Training loss", [1, 2, 3], [0.3, 0.2, 0.1])],
-        "sampling": Section("Two sentences.", [("first", image(0.31)), ("later", image(0.32))], [["added"], ["12"]]),
+        "sampling": ("Two sentences.", [("first", image(0.31)), ("later", image(0.32))], [["added"], ["12"]], ""),
         "overview": webp(np.full((6, 8, 3), 0.7)), "protocol": {"ground truth": "images_8 as stored", "LPIPS": "not measured"},
         "held_out": True, "coverage": None, "record": {"config": {"steps": 2000}, "versions": {"torch": "2"}},
     }  # fmt: skip
@@ -91,8 +91,8 @@ def test_nothing_is_loaded_from_anywhere(tmp_path):
 def test_all_images_are_embedded_byte_for_byte(tmp_path):
     values, _, page = write(tmp_path / "report.html")
     embedded = [base64.b64decode(a["src"].split(",", 1)[1], validate=True) for a in page.all("img")]
-    given = [b for v in values["views"] for b in (v.reference, v.render, v.error, v.depth)]
-    given += [values["overview"], *(data for _, data in values["sampling"].images)]
+    given = [data for v in values["views"] for data in v[2:]]
+    given += [values["overview"], *(data for _, data in values["sampling"][1])]
     assert sorted(embedded) == sorted(given)
     for data in embedded:
         assert cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR).shape == (6, 8, 3)
@@ -105,12 +105,12 @@ def test_every_number_given_is_shown_as_given(tmp_path):
     shown = page.text("b")
     assert [t for t in shown if t in figures] == list(figures)
     assert [t for t in page.text("span") if t in labels] == list(labels)
-    cells = [c for table in (values["scores"], values["sampling"].table) for row in table for c in row]
+    cells = [c for table in (values["scores"], values["sampling"][2]) for row in table for c in row]
     assert page.text("th", "td") == cells
     assert page.text("li") == values["notes"]
     assert dict(zip(page.text("dt"), page.text("dd"))) == values["protocol"]
     captions = " ".join(page.text("figcaption"))
-    assert all(v.caption in captions and v.name in shown for v in values["views"])
+    assert all(caption in captions and name in shown for name, caption, *_ in values["views"])
     assert json.loads("".join(page.text("pre"))) == values["record"]
 
 
@@ -130,11 +130,11 @@ def test_every_view_has_a_slider_a_keyboard_reaches(tmp_path):
 
 def test_names_from_files_cannot_become_markup(tmp_path):
     evil = '<script>alert("x")</script>&amp;\'"'
-    view = ViewImages(evil, evil, *(image(0.5) for _ in range(4)))
+    view = (evil, evil, *(image(0.5) for _ in range(4)))
     _, _, page = write(
         tmp_path / "report.html", title=evil, subtitle=evil, figures=[(evil, evil)], notes=[evil],
         scores=[["view"], [evil]], views=[view], record={evil: evil},
-        sampling=Section(evil, [(evil, image(0.5))], [[evil]]),
+        sampling=(evil, [(evil, image(0.5))], [[evil]], ""),
     )  # fmt: skip
     assert len(page.all("script")) == 1
     assert page.text("h1", "p", "li", "td") == [evil] * 5
