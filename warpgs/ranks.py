@@ -124,12 +124,10 @@ class Allowance:
     def take(self) -> bool:
         """Take one message; return False if none is left."""
         now = self._clock()
-        self._left = min(self._most, self._left + self._per_second * (now - self._last))
-        self._last = now
-        if self._left < 1:
-            return False
-        self._left -= 1
-        return True
+        self._left, self._last = min(self._most, self._left + self._per_second * (now - self._last)), now
+        taken = self._left >= 1
+        self._left -= taken
+        return taken
 
 
 class WebGuard:
@@ -161,27 +159,16 @@ class WebGuard:
         """Return the headers of every answer."""
         # in Safari, 'self' covers http only; a foreign host must not get into the header
         sockets = f" ws://{host}" if _is_own(host) else ""
-        policy = {
-            "default-src": "'none'",
-            "script-src": f"'nonce-{nonce}' 'unsafe-eval'",  # of the worker that sorts Gaussians
-            "worker-src": "blob:",
-            "style-src": "'unsafe-inline'",
-            "img-src": "'self' data: blob:",
-            "font-src": "data:",
-            "connect-src": f"'self'{sockets} data: blob:",
-            "base-uri": "'none'",
-            "form-action": "'none'",
-            "frame-ancestors": "'none'",
-        }
+        policy = (
+            f"default-src 'none'; script-src 'nonce-{nonce}' 'unsafe-eval'; "  # eval: the worker that sorts Gaussians
+            "worker-src blob:; style-src 'unsafe-inline'; img-src 'self' data: blob:; font-src data:; "
+            f"connect-src 'self'{sockets} data: blob:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+        )
         return {
-            "Content-Security-Policy": "; ".join(f"{name} {value}" for name, value in policy.items()),
-            "X-Frame-Options": "DENY",
-            "Referrer-Policy": "no-referrer",
-            "X-Content-Type-Options": "nosniff",
-            "Cache-Control": "no-store",
-            "Cross-Origin-Opener-Policy": "same-origin",
+            "Content-Security-Policy": policy, "X-Frame-Options": "DENY", "Referrer-Policy": "no-referrer",
+            "X-Content-Type-Options": "nosniff", "Cache-Control": "no-store", "Cross-Origin-Opener-Policy": "same-origin",
             "Cross-Origin-Resource-Policy": "same-origin",
-        }
+        }  # fmt: skip
 
 
 def _is_own(host: str) -> bool:
@@ -496,7 +483,12 @@ def join(device: str) -> Ranks:
     backend = "nccl" if cuda else "gloo"
     _joined = Group(rank, count, backend, watch)
     if cuda:
-        _take_gpu(rank, local)
+        if torch.cuda.device_count() <= local:
+            raise ResourceError(
+                f"rank {rank} needs GPU {local} of this machine, but torch finds {torch.cuda.device_count()} GPUs, and NCCL "
+                "needs one for each process. Start fewer processes, or give --device cpu"
+            )
+        torch.cuda.set_device(local)
     watch.meet(JOIN_SECONDS)
     try:
         dist.init_process_group(
@@ -523,18 +515,6 @@ def _store(address: str, port: int, count: int, home: str | None, *, hosts: bool
     return dist.PrefixStore("/".join(["warpgs", *run]), store)
 
 
-def _take_gpu(rank: int, local: int) -> None:
-    """Take the GPU of a local rank; ResourceError without one."""
-    import torch
-
-    if torch.cuda.device_count() <= local:
-        raise ResourceError(
-            f"rank {rank} needs GPU {local} of this machine, but torch finds {torch.cuda.device_count()} GPUs, and NCCL needs "
-            "one for each process. Start fewer processes, or give --device cpu"
-        )
-    torch.cuda.set_device(local)
-
-
 def _stay_home(address: str) -> str | None:
     """Have gloo and NCCL listen at the loopback interface if all ranks are on this machine; return its address, else None."""
     home = loopback_of(address)
@@ -547,18 +527,12 @@ def _stay_home(address: str) -> str | None:
 def last_words(line: str, code: int) -> int:
     """Print why this process ends, and return its exit code."""
     if _joined is None:
-        if place_or_first()[0] == 0:
-            say(line, error=True)
+        with contextlib.suppress(UsageError):  # unusable variables are those of no rank
+            if place()[0]:
+                return code
+        say(line, error=True)
         return code
     with ignored_signals():  # torchrun ends the others once one has ended
         _joined.watch.fail(line)
     sys.stdout.flush()
     os._exit(code)  # a broken group may wait for ever
-
-
-def place_or_first() -> tuple[int, int]:
-    """Return the result of `place`, or 0 and 1 if the variables are unusable."""
-    try:
-        return place()
-    except UsageError:
-        return 0, 1

@@ -126,7 +126,7 @@ def test_the_same_without_the_command_line(scene, tmp_path, monkeypatch, capfd):
 
     stream = Broken(1, errno.EPIPE)
     monkeypatch.setattr(sys, "stdout", stream)
-    monkeypatch.setattr(process, "_lost", False)
+    monkeypatch.setattr(process, "_is_lost", False)
     assert warpgs.fit(scene, warpgs.FitConfig(steps=2), out=tmp_path / "run", device="cpu").metrics["steps"] == 2
     assert sys.stdout is stream
     assert capfd.readouterr().err.count(GOES_ON) == 1
@@ -148,7 +148,7 @@ def test_a_table_that_cannot_be_written(monkeypatch, capsys):
 def test_an_answer_that_nobody_reads_is_an_error(monkeypatch, capsys):
     """A process that works for another one ends with it."""
     monkeypatch.setattr(sys, "stdout", Broken(0, errno.EPIPE))
-    monkeypatch.setattr(process, "_lost", False)
+    monkeypatch.setattr(process, "_is_lost", False)
     say("a line")
     say("a line")
     assert capsys.readouterr().err.count("\n") == 1
@@ -163,9 +163,9 @@ def test_what_is_no_failure_of_the_stream_is_raised(capsys):
         sys.stdout.write(b"bytes")
     stream = io.TextIOWrapper(io.BytesIO(), "ascii")
     with pytest.raises(UnicodeEncodeError):
-        CarefulStream(stream, "stdout").write("é")
+        CarefulStream(stream).write("é")
     stream.close()
-    careful = CarefulStream(stream, "stdout")
+    careful = CarefulStream(stream)
     careful.write("a")
     careful.flush()
     assert isinstance(careful.failure, ValueError) and "closed file" in capsys.readouterr().err

@@ -188,13 +188,13 @@ def main(arguments: list[str] | None = None) -> int:
         system_folder()
     words = sys.argv[1:] if arguments is None else arguments
     prints = words[:1] in ([], *([name] for name in PRINTING)) and "--warm" not in words
-    with careful_output(prints or bool(ASKING & {*words})) as output:
+    with careful_output(prints or bool(ASKING & {*words})) as exit_code:
         accept_all_letters()
         try:
             with interrupting_signals():
-                return output.exit_code(_run(words))
+                return exit_code(_run(words))
         except SystemExit as e:  # after the help of a command
-            if e.code or not (code := output.exit_code(0)):
+            if e.code or not (code := exit_code(0)):
                 raise
             raise SystemExit(code) from e
 
