@@ -143,14 +143,8 @@ def plugged(tmp_path_factory):
     write_demo(folder / "scene", views=8, width=32, height=32)
     flags = ["--steps", "3", "--device", "cpu", "--preset", "3dgs", "--init.source", "random", "--init.random-count", "40"]
     command = ["fit", str(folder / "scene"), "--split", split_spec(8), "--out", str(folder / "run"), *flags]
-    named = [
-        "--strategy",
-        f"{folder}/mine.py:SlowGrowth",
-        "--slow-growth.rate",
-        "0.75",
-        "--loss-terms",
-        f"{folder}/mine.py:Opaque",
-    ]
+    named = ["--strategy", f"{folder}/mine.py:SlowGrowth", "--slow-growth.rate", "0.75", "--loss-terms"]
+    named.append(f"{folder}/mine.py:Opaque")
     assert main([*command, *named, "--reader", f"{folder}/mine.py:Folder"]) == 0
     return folder, command, named
 
