@@ -159,7 +159,7 @@ def test_plot(run, tmp_path, capsys):
     ("words", "why"),
     [
         (["--points", "stars"], "gaussians, start"), (["--color", "red"], "own, coverage"),
-        (["--size", "9", "9"], "64 to 8192"), (["--background", "red"], "white, black"), (["--out", "a.jpg"], "a plot is a .png"),
+        (["--size", "9", "9"], "64 to 8192"), (["--background", "red"], "white, black"), (["--out", "a.jpg"], "is a .png"),
         (["--points", "start", "--color", "coverage"], "coverage needs Gaussians"),
     ],
 )  # fmt: skip

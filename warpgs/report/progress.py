@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import json
 import math
@@ -10,7 +11,7 @@ import re
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import BinaryIO
 
@@ -33,11 +34,10 @@ COUNTED = re.compile(r"(?P<done>[\d,]+) of (?P<total>[\d,]+)")
 def duration(seconds: float) -> str:
     """Return a time span in words: 8 s, 2 min 05 s, 1 h 10 min."""
     seconds = int(round(seconds))
-    if seconds < 60:
-        return f"{seconds} s"
-    if seconds < 3600:
-        return f"{seconds // 60} min {seconds % 60:02d} s"
-    return f"{seconds // 3600} h {seconds % 3600 // 60:02d} min"
+    minutes, hours = seconds // 60, seconds // 3600
+    if hours:
+        return f"{hours} h {minutes % 60:02d} min"
+    return f"{minutes} min {seconds % 60:02d} s" if minutes else f"{seconds} s"
 
 
 def is_live() -> bool:
@@ -263,40 +263,36 @@ class EventLog:
         """Drop the events of all steps after ``step``; 0 empties the log."""
         if self._file is not None:
             self.close()
-        try:
+        with self._writing():
             kept = [e for e in read_events(self.path) if e["step"] <= step] if step and self.path.is_file() else []
             # The old log stays until the shortened one is on the disk.
             write_bytes(self.path, *(_line(e) for e in kept))
             self._file = appending(self.path)
-        except OSError as e:
-            raise self._failure(e) from e
 
     def write(self, *, step: int, **values: object) -> None:
         """Append the event of one step; NaN and infinity become null."""
-        try:
+        with self._writing():
             self._file.write(_line({"step": step, **values}))
-        except OSError as e:
-            raise self._failure(e) from e
 
     def flush(self) -> None:
         """Flush the log and sync it to the disk, so that it never lags behind a checkpoint."""
-        try:
+        with self._writing():
             self._file.flush()
             os.fsync(self._file.fileno())
-        except OSError as e:
-            raise self._failure(e) from e
 
     def close(self) -> None:
         """Flush and close the log, which takes no further events."""
-        try:
+        with self._writing():
             self._file.close()
-        except OSError as e:
-            raise self._failure(e) from e
 
-    def _failure(self, error: OSError) -> ResourceError:
-        if isinstance(error, RefusedError):
-            return ResourceError(f"{self.path}: cannot be written, as {error}")
-        return ResourceError(f"{self.path}: cannot be written ({error.strerror or error}). Free some disk space")
+    @contextlib.contextmanager
+    def _writing(self) -> Iterator[None]:
+        try:
+            yield
+        except RefusedError as e:
+            raise ResourceError(f"{self.path}: cannot be written, as {e}") from e
+        except OSError as e:
+            raise ResourceError(f"{self.path}: cannot be written ({e.strerror or e}). Free some disk space") from e
 
 
 def read_events(path: Path) -> list[dict]:
