@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.report.test_in_browser import BROWSERS
-
+BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
+WEBGL = ("--disable-gpu-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 TIME = 120
 """Seconds that anything may take."""
 CHANGED = ("navigated", "context was destroyed", "context with specified id", "Promise was collected", "active page")
@@ -31,17 +31,16 @@ class PageChanged(Exception):
 class Chromium:
     """One page of a browser."""
 
-    def __init__(self, folder, size=(900, 700)):
+    def __init__(self, folder, *graphics: str):
         browser = next(filter(None, map(shutil.which, BROWSERS)), None)
         if browser is None or not hasattr(os, "set_inheritable"):
             pytest.skip(f"none of {', '.join(BROWSERS)} is there")
         to_read, self._write = os.pipe()
         self._read, to_write = os.pipe()
         words = [
-            browser, "--headless=new", "--no-sandbox", "--disable-gpu-sandbox", "--use-gl=angle", "--use-angle=swiftshader",
-            "--enable-unsafe-swiftshader", "--disable-quic", "--no-first-run", "--disable-background-networking",
-            "--disable-component-update", "--disable-sync", "--remote-debugging-pipe", f"--user-data-dir={folder / 'profile'}",
-            f"--window-size={size[0]},{size[1]}", "about:blank",
+            browser, "--headless=new", "--no-sandbox", *(graphics or WEBGL), "--disable-quic", "--no-first-run",
+            "--disable-background-networking", "--disable-component-update", "--disable-sync", "--remote-debugging-pipe",
+            f"--user-data-dir={folder / 'profile'}", "--window-size=900,700", "about:blank",
         ]  # fmt: skip
         # the browser reads commands at 3 and writes at 4
         shell = 'exec 3<&"$0" 4>&"$1"; shift; exec "$@"'
