@@ -28,7 +28,6 @@ number = 3
 
 @pytest.fixture
 def registry(monkeypatch) -> Registry:
-    """That of strategies, without what a test adds to it."""
     STRATEGIES.names()
     monkeypatch.setattr(STRATEGIES, "_classes", dict(STRATEGIES._classes))
     return STRATEGIES
@@ -46,8 +45,6 @@ def own(tmp_path, monkeypatch):
 
 
 def test_registered_classes_are_found_by_name(registry):
-    """A decorator names a class; a class stands for itself; names are sorted."""
-
     @registry.register("zeta")
     class Zeta(Strategy):
         pass
@@ -152,7 +149,6 @@ def test_an_unknown_name_lists_those_there_are(registry):
 
 
 def test_a_name_with_a_colon_is_never_imported_by_find(registry, own):
-    """Whatever it names, module or file."""
     for spec in (f"{own}:Own", "own_strategy:Own"):
         with pytest.raises(UsageError, match="does not load your code"):
             registry.find(spec)
@@ -174,7 +170,6 @@ def test_a_stored_configuration_imports_nothing(own):
 
 
 def test_a_run_continues_with_the_code_that_it_began_with(tmp_path):
-    """An edited file, and one that only one of both knows, is named."""
     same = {key: {} for key in ("fingerprint", "train", "test", "device", "scene")} | {"config": FitConfig().to_json()}
     check_same(same | {"own_code": {"mine": "a"}}, same | {"own_code": {"mine": "a"}}, tmp_path)
     check_same(same | {"own_code": {}}, same, tmp_path)  # of a version that did not record it

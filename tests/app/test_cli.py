@@ -38,7 +38,6 @@ from warpgs.synthetic.demo import split_spec, write_demo
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
-    """A small demo scene."""
     folder = tmp_path_factory.mktemp("data") / "scene"
     write_demo(folder, views=9, width=64, height=48)
     return folder
@@ -46,7 +45,6 @@ def scene(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def run(scene):
-    """A short run on it."""
     out = scene.parent / "run"
     flags = ["--steps", "40", "--phases.least", "5", "--out", str(out), "--device", "cpu"]
     assert main(["fit", str(scene), "--split", split_spec(9), *flags]) == 0
@@ -110,7 +108,6 @@ def test_run_folder_holds_what_it_promises(run, scene):
 
 
 def test_eval_repeats_the_scores(run, capsys):
-    """Scoring the checkpoint again gives the figures of the fit."""
     assert main(["eval", str(run), "--device", "cpu"]) == 0
     metrics = json.loads((run / "metrics.json").read_text())
     assert f"PSNR {metrics['test']['psnr']:.2f} dB" in capsys.readouterr().out.splitlines()[-1]
@@ -136,7 +133,6 @@ def test_eval_measures_lpips(run, tmp_path, capsys):
 
 @pytest.mark.parametrize(("path", "pictures"), [("auto", 4), ("turntable", 4), ("spiral", 4), ("interpolate", 4), ("views", 9)])
 def test_render_paths(run, tmp_path, path, pictures, capsys):
-    """Every path gives its pictures and a film."""
     flags = ["--path", path, *([] if path == "views" else ["--frames", "4"]), "--out", str(tmp_path), "--sheet"]
     assert main(["render", str(run), *flags, "--device", "cpu"]) == 0
     assert len(list(tmp_path.glob("*.png"))) == pictures + 1 and (tmp_path / "film.mp4").stat().st_size > 0
@@ -251,7 +247,6 @@ def test_words_in_the_wrong_place_get_the_right_command(run, tmp_path, monkeypat
 
 
 def test_cuda_where_there_is_none(scene, tmp_path, capsys, monkeypatch):
-    """Asking for CUDA without a device is a resource error that names the way out."""
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
     text = failure(capsys, 4, "fit", str(scene), "--out", str(tmp_path / "x"), "--device", "cuda")
     assert "warpgs doctor" in text and "--device cpu" in text
@@ -265,7 +260,6 @@ def test_unwritable_output(scene, tmp_path, capsys):
 
 
 def test_output_below_a_file(scene, capsys):
-    """A path through a file cannot become a folder."""
     below = scene / "images" / "000.png" / "run"
     assert "cannot be written" in failure(capsys, 4, "fit", str(scene), "--out", str(below))
 
@@ -281,8 +275,6 @@ NO_MEMORY = [
 
 @pytest.mark.parametrize("error", NO_MEMORY, ids=[str(e)[-20:] for e in NO_MEMORY])
 def test_no_memory_left_is_no_defect(error, capsys, monkeypatch):
-    """Where memory runs out, one line says so and how to need less."""
-
     def full(*_):
         raise error
 
@@ -324,7 +316,6 @@ def test_numbers_at_their_extremes(tmp_path, capsys, monkeypatch, command, flag)
 
 
 def test_defects_are_called_defects(tmp_path, capsys, monkeypatch):
-    """An unexpected error is one line with a file that holds the details."""
     monkeypatch.setattr("warpgs.pipeline.run.export.export", lambda *a: 1 / 0)
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     assert main(["export", "run", "--to", "x.ply"]) == 5
@@ -334,14 +325,12 @@ def test_defects_are_called_defects(tmp_path, capsys, monkeypatch):
 
 
 def test_a_package_that_is_gone_is_named(capsys, monkeypatch):
-    """A package that warpgs was installed with and that is no longer there is no defect of warpgs."""
     monkeypatch.setitem(sys.modules, "pyvista", None)
     monkeypatch.setattr("warpgs.pipeline.run.export.export", lambda *a: __import__("pyvista"))
     assert "the Python package pyvista, which is missing" in failure(capsys, 2, "export", "run", "--to", "x.ply")
 
 
 def test_changed_data_are_noticed(scene, run, tmp_path, capsys):
-    """eval refuses a scene whose photographs are no longer those of the fit."""
     moved, copy = (Path(shutil.copytree(folder, tmp_path / folder.name)) for folder in (scene, run))
     record = json.loads((copy / "config.json").read_text())
     record["scene"]["path"] = str(moved)
@@ -404,8 +393,6 @@ def test_the_help_of_a_command_is_that_of_the_parser(capsys):
 
 @dataclasses.dataclass(frozen=True)
 class Open:
-    """Settings that may be left open."""
-
     switch: bool | None = True
     whole: int | None = 1
     number: float | None = 1.0

@@ -30,7 +30,6 @@ def by_topic(findings):
 
 
 def test_missing_extras_are_named_with_what_they_are_for(monkeypatch):
-    """With one command for all of them; where none is missing there is nothing to do."""
     there = {"pycolmap", "viser", "zstandard"}
     monkeypatch.setattr(doctor.importlib.util, "find_spec", lambda name: object() if name in there else None)
     (found,) = doctor._extras()
@@ -60,7 +59,6 @@ def test_this_machine_can_fit():
     ],
 )
 def test_a_package_that_cannot_be_imported(monkeypatch, name, error, topic, status, remedy, code):
-    """Missing, or without a system library: a fit cannot run if it needs the package."""
     real = importlib.import_module
 
     def fake(module, *args):
@@ -117,7 +115,6 @@ def test_devices_that_torch_sees(monkeypatch, both, status, words):
 
 
 def test_the_prior_cache(monkeypatch, tmp_path):
-    """Its place and size; a place that cannot be written is a note, since a fit works without."""
     monkeypatch.setenv("WARPGS_CACHE", str(tmp_path / "maps"))
     (f,) = doctor._prior_cache()
     assert f.status == OK and str(tmp_path / "maps") in f.detail and "0 B" in f.detail
@@ -128,7 +125,6 @@ def test_the_prior_cache(monkeypatch, tmp_path):
 
 
 def test_a_cache_that_another_process_changes_has_a_size(monkeypatch, tmp_path):
-    """A folder that is gone between listing and reading counts as nothing."""
     for name in ("gone", "kept"):
         (tmp_path / name).mkdir()
         (tmp_path / name / "a").write_bytes(bytes(7))

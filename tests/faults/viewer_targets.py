@@ -47,7 +47,6 @@ def frame_files(root: Path) -> list[Path]:
 
 
 def frame_value(data: bytes, rng: np.random.Generator) -> bytes:
-    """Change a value of a message, or its type to another's."""
     import msgspec
 
     try:
@@ -94,7 +93,6 @@ def request_files(root: Path) -> list[Path]:
 
 
 def request_line(data: bytes, rng: np.random.Generator) -> bytes:
-    """Exchange the target, or add, remove or exchange a header."""
     lines = data.split(b"\r\n")
     kind, at = int(rng.integers(4)), int(rng.integers(1, max(2, len(lines) - 2)))
     if kind == 0:

@@ -130,7 +130,6 @@ def test_settings_out_of_range_are_refused(wrong):
 
 
 def test_empty_and_black_frames_are_noticed(model, tmp_path):
-    """A camera that looks away, one in front of something black, and good ones between them."""
     good, black = list(model.cameras().values())[:3], three_gaussians()
     away = dataclasses.replace(good[0], viewmat=look_at(good[0].center, 2 * good[0].center, np.array([0, -1.0, 0])))
     plan = dataclasses.replace(
@@ -177,7 +176,6 @@ def test_what_no_photograph_saw_gets_a_note(model, tmp_path, path, settings, adv
 
 
 def _moved(x: float) -> np.ndarray:
-    """A rigid motion to one side [u]."""
     motion = np.eye(4)
     motion[0, 3] = x
     return motion
@@ -214,7 +212,6 @@ UP = np.array([0.3, -0.9, 0.1]) / math.sqrt(0.91)
 
 
 def rolled(camera: Camera, degrees: float) -> Camera:
-    """The camera turned about its axis."""
     c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
     turn = np.eye(4)
     turn[:2, :2] = [[c, -s], [s, c]]
@@ -233,7 +230,6 @@ def around(azimuths, elevation: float = 20.0, distance: float = 4.0) -> list[Cam
 
 
 def one_way(count: int = 6) -> list[Camera]:
-    """Parallel cameras on a small grid."""
     return [
         Camera(look_at(np.array([x, y, 0.0]), np.array([x, y, 1.0]), np.array([0, -1.0, 0])), K, 40, 30)
         for x, y in [(0.3 * (i % 3), 0.2 * (i // 3)) for i in range(count)]
@@ -247,7 +243,6 @@ def room(count: int = 10) -> list[Camera]:
 
 
 def walk(count: int = 12) -> list[Camera]:
-    """Cameras along a corridor and round a corner and back, looking where they go."""
     corners = np.array([[0, 0, 0], [0, 0, 9.0], [9, 0, 9], [9, 0, 0]])
     at = np.linspace(0, 2.999, count)
     eyes = [corners[int(t)] + (t % 1) * (corners[int(t) + 1] - corners[int(t)]) for t in at]
@@ -357,7 +352,6 @@ def test_close_photographs_from_below_do_not_tilt_a_film():
 
 
 def test_in_a_room_a_film_looks_around():
-    """From the middle, level, all the way round."""
     cameras = room()
     path = camera_path("turntable", rig_of(cameras, 2.0), cameras, 8)
     assert all(np.allclose(c.center, TARGET, atol=1e-9) and abs(c.viewmat[2, :3] @ UP) < 1e-6 for c in path)

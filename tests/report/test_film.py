@@ -32,7 +32,6 @@ def test_video_holds_all_frames_in_colour_and_time(tmp_path, capfd, name, shape)
 
 @pytest.mark.parametrize("name", ["a.mp4", "a.gif"])
 def test_frames_that_make_no_film_leave_the_old_one(tmp_path, name):
-    """None, some of another size, and a renderer that fails; without a folder nothing can be written."""
     path = tmp_path / name
     path.write_bytes(b"old")
 

@@ -29,7 +29,6 @@ TOP = CONTACT_MARGIN + TITLE_SIZE + 18
 
 
 def corner(index, width, height, columns):
-    """Return the left upper corner x, y of a tile's image [px]."""
     return CONTACT_MARGIN + index % columns * (width + CONTACT_GAP), TOP + CONTACT_HEAD + index // columns * (
         CONTACT_HEAD + height + CONTACT_GAP
     )
@@ -117,7 +116,6 @@ def test_side_by_side_keeps_every_pixel():
 
 
 def test_threads_may_write_one_file(tmp_path):
-    """The file is one of those written, complete, and no other file is left."""
     contents = [bytes([i]) * 50_000 for i in range(8)]
     with ThreadPoolExecutor(8) as pool:
         list(pool.map(lambda c: [write_bytes(tmp_path / "a.png", c) for _ in range(20)], contents))

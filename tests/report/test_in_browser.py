@@ -22,7 +22,6 @@ wide:document.documentElement.scrollWidth-innerWidth}})()"""
 
 
 def probed(browser, page, width: int) -> dict:
-    """Return what is found on a page in a window so many pixels wide."""
     browser.resize(width, 900)
     browser.open(page.as_uri())
     browser.wait("document.readyState === 'complete' && document.querySelector('.slider') !== null")
@@ -32,7 +31,6 @@ def probed(browser, page, width: int) -> dict:
 @pytest.mark.browser
 @pytest.mark.parametrize("width", [1280, 500])
 def test_page_opens_whole(browser, tmp_path, width):
-    """All images are decoded and have a height, the slider uncovers, and the page is no wider than the window."""
     path = tmp_path / "report.html"
     write(path)
     found = probed(browser, path, width)
@@ -64,7 +62,6 @@ COLORS = np.array([[0.8, 0.3, 0.2], [0.2, 0.7, 0.3], [0.25, 0.35, 0.9]], np.floa
 
 
 def played(browser, film) -> dict:
-    """Return what a page with the film finds at its end."""
     page = film.with_suffix(".html")
     page.write_text(PAGE.format(kind=f"video/{film.suffix[1:]}", data=base64.b64encode(film.read_bytes()).decode()))
     browser.open(page.as_uri())
@@ -72,7 +69,6 @@ def played(browser, film) -> dict:
 
 
 def stripes(shape, count):
-    """Three upright stripes, with a bar that moves so that frames differ."""
     height, width = shape
     image = COLORS[np.arange(width) * 3 // width][None].repeat(height, 0)
     for i in range(count):

@@ -20,7 +20,6 @@ K = np.array([[300.0, 0, 160], [0, 300, 120], [0, 0, 1]])
 
 
 def camera(angle):
-    """Return a camera 4 u from the origin that looks at it."""
     center = np.array([4 * np.sin(angle), 0, -4 * np.cos(angle)])
     forward, down = -center / 4, np.array([0.0, 1, 0])
     R = np.stack([np.cross(down, forward), down, forward])
@@ -40,7 +39,6 @@ def wall(color: float = 0.2, depth: float = 0.0) -> Gaussians:
 
 
 def colored(image: np.ndarray, color: str) -> int:
-    """Return the number of pixels of a colour."""
     rgb = np.array(ImageColor.getrgb(color)) / 255
     return int((np.abs(image - rgb).sum(-1) < 0.05).sum())
 
@@ -58,7 +56,6 @@ def test_the_overview_shows_gaussians_and_both_kinds_of_cameras(monkeypatch):
 
 
 def test_lines_behind_a_surface_are_hidden():
-    """One half of a line lies behind."""
     shown = Camera(np.eye(4), np.array([[10.0, 0, 20], [0, 10, 10], [0, 0, 1]]), 40, 20)
     image, depth = np.full((20, 40, 3), 255, np.uint8), np.full((20, 40), np.inf)
     depth[:, :20] = 1
@@ -142,7 +139,6 @@ def plot(size, background, count: int = 400, **changes) -> bytes:
 
 @pytest.fixture
 def sent(monkeypatch) -> dict:
-    """What the script is given; instead of rendering, the image is gray."""
     found: dict = {}
 
     def instead(code, source, words, target):

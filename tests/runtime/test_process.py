@@ -66,7 +66,6 @@ def run(*command: str, **more: str) -> subprocess.CompletedProcess:
 
 @pytest.fixture
 def program(tmp_path):
-    """The path of the program `warpgs`."""
     (tmp_path / "bin").mkdir()
     (tmp_path / "bin" / "warpgs").write_text(PROGRAM)
     return str(tmp_path / "bin" / "warpgs")
@@ -154,7 +153,6 @@ def dotted(node: ast.AST) -> str:
 
 
 def starters(path: Path) -> list[str]:
-    """What a file uses to start processes, however it is imported."""
     tree = ast.parse(path.read_text("utf-8"))
     found, names = [], {}
     for node in ast.walk(tree):
@@ -324,8 +322,6 @@ def test_within_the_steps_the_one_in_progress_is_saved(stop_signals_scene, tmp_p
 
 @pytest.mark.usefixtures("handlers")
 def test_more_signals_while_the_program_ends(monkeypatch, capsys):
-    """One while it tidies up, one while it says its last words."""
-
     def tidy(*_):
         try:
             signal.raise_signal(signal.SIGINT)
@@ -363,7 +359,6 @@ def test_bytes_that_are_no_text_are_printed_as_codes(tmp_path):
 
 @on_linux
 def test_a_name_that_a_library_can_take(tmp_path, monkeypatch):
-    """A file in a folder of such a name, and one that has such a name itself."""
     folder = tmp_path / BYTES
     folder.mkdir()
     for path in (folder / "file", folder / f"{BYTES}.txt", tmp_path / "plain"):
@@ -413,7 +408,6 @@ def flags(steps, preset="3dgs"):
 
 @on_linux
 def test_a_fit_and_what_follows(scene, tmp_path, capsys):
-    """The run remembers its scene, and is continued, scored and shown; reports hold text."""
     run = tmp_path / BYTES
     assert main(["fit", str(scene), "--out", str(run), *flags(2)]) == 0
     record = json.loads((run / "config.json").read_bytes())
@@ -445,7 +439,6 @@ def test_transforms(tmp_path):
 @on_linux
 @pytest.mark.slow
 def test_the_farm(scene, tmp_path):
-    """A job's folder has such a name; the page links to it, and the table holds text."""
     out = tmp_path / BYTES
     assert main(["farm", str(scene.parent), "--out", str(out), *flags(1)]) == 0
     page = (out / "index.html").read_text("utf-8")
@@ -457,7 +450,6 @@ def test_the_farm(scene, tmp_path):
 
 @on_linux
 def test_plug_ins(scene, tmp_path):
-    """A reader's file has such a name."""
     file = tmp_path / f"{BYTES}.py"
     file.write_text("from warpgs.io.colmap import ColmapReader\nclass Own(ColmapReader):\n    pass\n")
     assert main(["fit", str(scene), "--out", str(tmp_path / "run"), "--reader", f"{file}:Own", *flags(1)]) == 0
@@ -550,7 +542,6 @@ FOLDERS = ("/proc/", "/sys/", "/dev/", "/etc/", "/tmp/")
 
 
 def found_in(path: Path) -> list[str]:
-    """Return what a file calls, imports or names that only some systems have."""
     found = []
     for node in ast.walk(ast.parse(path.read_text("utf-8"))):
         if isinstance(node, ast.Import):

@@ -29,8 +29,6 @@ class PageChanged(Exception):
 
 
 class Chromium:
-    """One page of a browser."""
-
     def __init__(self, folder, *graphics: str):
         browser = next(filter(None, map(shutil.which, BROWSERS)), None)
         if browser is None or not hasattr(os, "set_inheritable"):
@@ -70,7 +68,6 @@ class Chromium:
         self._answers.put({"id": None, "error": "the browser has ended"})
 
     def ask(self, method: str, **params) -> dict:
-        """Result of a method of the protocol."""
         self._number += 1
         session = {"sessionId": self._session} if self._session else {}
         text = json.dumps({"id": self._number, "method": method, "params": params, **session})
@@ -82,11 +79,9 @@ class Chromium:
         return answer["result"]
 
     def open(self, address: str) -> None:
-        """Go to a page."""
         self.ask("Page.navigate", url=address)
 
     def value(self, expression: str):
-        """Value of JavaScript, awaited."""
         found = self.ask("Runtime.evaluate", expression=expression, awaitPromise=True, returnByValue=True)
         assert "exceptionDetails" not in found, found["exceptionDetails"]
         return found["result"].get("value")
@@ -121,7 +116,6 @@ class Chromium:
                     return image
 
     def console(self) -> list[str]:
-        """Lines of the console, and errors."""
         lines = []
         for event in self.events:
             found = event.get("params", {})
@@ -134,11 +128,9 @@ class Chromium:
         return lines
 
     def picture(self) -> bytes:
-        """PNG of the page."""
         return base64.b64decode(self.ask("Page.captureScreenshot", format="png")["data"])
 
     def close(self) -> None:
-        """End the browser and its children."""
         os.close(self._write)
         try:
             self.process.wait(10)

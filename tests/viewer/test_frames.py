@@ -38,7 +38,6 @@ def test_messages_of_the_page_pass(message):
     ids=lambda m: str(m)[:40],
 )  # fmt: skip
 def test_other_messages_are_refused(message):
-    """Unknown types, fields that are missing, unknown or of another kind, numbers out of range."""
     with pytest.raises(DataError):
         read_frame(write_frame(message))
 
@@ -47,13 +46,11 @@ def test_other_messages_are_refused(message):
     "frame", [b"", b"\xc1", b"\x81", b"\x91" * 5000, b"\xd4\x05a", "text", b"\xc4", b"\x00" * (MAX_FRAME + 1)]
 )
 def test_frames_that_are_no_messages(frame):
-    """Cut off, nested without end, not MessagePack, text, or too long."""
     with pytest.raises(DataError):
         read_frame(frame)
 
 
 def test_controls_take_values_within_their_limits():
-    """A choice is one of the options, numbers are moved to the nearest limit, all else is refused."""
     choice, slider, vector, box = (CONTROLS[name] for name in ("choice", "slider", "vector", "tick"))
     number, text = SimpleNamespace(value=2.0, min=0.1, max=600.0), SimpleNamespace(value="free")
     for control, given_value, taken in (

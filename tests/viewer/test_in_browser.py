@@ -44,7 +44,6 @@ def crowd():
 
 
 def test_the_middle_of_the_cameras_comes_first():
-    """The one nearest to the mean of all centres, then the others in their order."""
     cameras = [moved(x) for x in (4.0, 0.0, 1.5, 1.0)]
     assert [c.center[0] for c in middle_first(cameras)] == [1.5, 4.0, 0.0, 1.0] and middle_first([]) == []
 
@@ -68,7 +67,6 @@ def test_a_page_turns_as_far_as_the_photographs():
 
 @pytest.mark.browser
 def test_a_page_stops_where_the_photographs_end(browser, tmp_path):
-    """To both sides; the key R leads back to the first view."""
     path, cameras = tmp_path / "scene.html", middle_first(ring(3))
     write_html(path, crowd(), cameras)
     browser.open(path.as_uri())

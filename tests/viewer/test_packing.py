@@ -33,14 +33,12 @@ def test_half_precision_keeps_gaussians_of_any_scene():
 
 
 def test_colors_and_opacities_are_those_of_degree_0():
-    """The three colours of the scene, rounded to bytes."""
     (*_, colors, opacities), _, _ = packed(three_gaussians())
     np.testing.assert_allclose(colors, 255 * np.array([[0.9, 0.2, 0.1], [0.15, 0.8, 0.2], [0.2, 0.3, 0.95]]), atol=0.51)
     np.testing.assert_allclose(opacities[:, 0], 255 * np.array([0.9, 0.85, 0.95]), atol=0.51)
 
 
 def test_poses_there_and_back():
-    """A camera told to the browser comes back; the made one sees the model; up is up."""
     for c in ring(5):
         back = camera_at(wxyz_of(c), c.center, fov_y(c), c.width, c.height)
         np.testing.assert_allclose(back.viewmat, c.viewmat, atol=1e-12)
@@ -53,7 +51,6 @@ def test_poses_there_and_back():
 
 
 def test_a_box_in_file_units_holds_the_same_points():
-    """A turned box, the Gaussians moved to a georeferenced place."""
     turn = rotation_matrices(np.array([0.8, 0.0, 0.6, 0.0]))
     g, box = cloud(300), (np.array([0.2, 0.1, 4.0]), np.array([2.0, 1.0, 1.5]), turn)
     within = inside(box, g.means)
@@ -68,7 +65,6 @@ def test_a_box_in_file_units_holds_the_same_points():
 
 
 def test_a_keyframe_is_camera_to_world_in_file_units():
-    """Its last column is the camera's centre in the files."""
     n, c = Normalization(np.array([4.0, -2.0, 7.0]), 0.25), ring(3)[0]
     k = keyframe(c, 1.5, n)
     c2w = np.array(k["c2w"])

@@ -51,7 +51,6 @@ SIZE = (40, 32)
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """A scene, and a run on it that somebody looked at."""
     folder = tmp_path_factory.mktemp("view")
     write_demo(folder / "scene", views=8, width=SIZE[0], height=SIZE[1])
     with watch.live_view(folder / "run", port=0) as live:
@@ -61,7 +60,6 @@ def folder(tmp_path_factory):
 
 
 def fit(folder, name, on_model=None):
-    """Fit a few steps."""
     warpgs.fit(
         str(folder / "scene"), CONFIG, split=split_spec(8), out=folder / name, device="cpu", verbose=False, on_model=on_model
     )
@@ -109,7 +107,6 @@ def test_images_at_a_camera_are_those_of_the_rasterizer(window):
 
 
 def test_an_image_is_placed_where_another_camera_sees_it(window):
-    """Twice as large and shifted: pixel centres lie at +0.5."""
     camera = next(iter(window.content.model.scene_cameras.values()))
     K = camera.K * np.array([[2.0], [2.0], [1.0]])
     K[0, 2] += 6
@@ -198,7 +195,6 @@ def test_a_narrow_window_shows_the_whole_width_of_an_image(window):
 
 
 def test_a_browser_gets_the_image_that_it_asks_for(window):
-    """Once for each camera and wish; Gaussians again where they are asked for."""
     camera = window.content.model.scene_cameras[window.content.model.train[0]]
     sent = []
     state = SimpleNamespace(
@@ -238,7 +234,6 @@ def test_an_unknown_wish_ends_no_thread(window, monkeypatch):
 
 
 def test_keyframes_are_bounded(window, monkeypatch):
-    """One more than there may be is refused with a note, and the path keeps what it has."""
     panel, told = window.panel, []
     camera = window.content.model.scene_cameras[window.content.model.train[0]]
     monkeypatch.setattr(panel, "keyframes", [])
@@ -274,7 +269,6 @@ def test_no_image_of_a_run_is_read_through_a_link(window, tmp_path, monkeypatch,
 
 
 def test_a_ply_and_what_is_neither(folder, tmp_path):
-    """A PLY file is shown without cameras, about its middle; saved files lie beside it; others are one sentence."""
     content = content_of_file(folder / "run" / "point_cloud.ply")
     assert not content.model.scene_cameras and content.saved("crop.json") == folder / "run" / "point_cloud-crop.json"
     middle = content.model.gaussians().means.double().quantile(0.5, dim=0)
@@ -289,7 +283,6 @@ def test_a_ply_and_what_is_neither(folder, tmp_path):
 
 
 def test_a_run_is_followed_until_it_is_interrupted(folder, monkeypatch, capsys):
-    """A checkpoint that replaces another is shown; Ctrl-C ends with code 0."""
     shown: list = []
     polls, times = iter(range(3)), iter((None, None, 1.0, 2.0))
 
@@ -323,7 +316,6 @@ def test_a_page_names_nobody(folder, tmp_path, capsys):
 
 
 def test_names_that_are_not_utf8(window, monkeypatch):
-    """Text for the page is UTF-8, and a view is chosen by what is shown of its name."""
     chosen, texts = [], []
     (camera, *_) = window.content.model.scene_cameras.values()
     model = dataclasses.replace(window.content.model, scene_cameras={"b\udce4r.png": camera})
