@@ -72,10 +72,10 @@ def loopback_interface(host: str = HOST) -> str:
     """Return the name of the network interface that has a loopback address, such as lo."""
     import psutil
 
-    for name, addresses in psutil.net_if_addrs().items():
-        if any(a.address == host for a in addresses):
-            return str(name)
-    raise ResourceError(f"no network interface has the address {host}; bring up the loopback interface (ip link set lo up)")
+    names = [str(name) for name, addresses in psutil.net_if_addrs().items() if any(a.address == host for a in addresses)]
+    if not names:
+        raise ResourceError(f"no network interface has the address {host}; bring up the loopback interface (ip link set lo up)")
+    return names[0]
 
 
 def listening_at(process: int | None = None) -> list[tuple[str, int]]:
@@ -305,10 +305,6 @@ class RankWatch:
         below = (self._seen[r][0].split("|", 2) for r in range(self.rank) if r in self._seen)
         return all(there != self.here or is_gone(int(process)) for _, process, there in below)
 
-    def settle(self, seconds: float) -> None:
-        """Wait a little more than ``seconds`` for the thread, which ends this process once it knows the lost rank."""
-        time.sleep(seconds + 2 * BEAT_SECONDS)
-
     def leave(self) -> None:
         """Tell the other ranks that this process ends normally; all ranks but the first wait for the first to end."""
         try:
@@ -319,13 +315,11 @@ class RankWatch:
             self.leaving.set()
             self.store.set(f"heard/{self.rank}", "")
             until = time.monotonic() + 3 * BEAT_SECONDS  # the store may end with the first process
-            while self.rank == 0 and time.monotonic() < until and not self._all_heard():
+            heard = [f"heard/{r}" for r in range(self.count)]
+            while self.rank == 0 and time.monotonic() < until and not self.store.check(heard):
                 time.sleep(0.05)
         except RuntimeError:  # the store has ended with the process that held it
             self.leaving.set()
-
-    def _all_heard(self) -> bool:
-        return bool(self.store.check([f"heard/{r}" for r in range(self.count)]))
 
 
 # Processes that fit one scene together: their ranks, their exchange of data, and their end when one is lost.
@@ -410,7 +404,7 @@ class Group(Ranks):
         try:
             yield
         except RuntimeError as e:
-            self.watch.settle(LOST_SECONDS)
+            time.sleep(LOST_SECONDS + 2 * BEAT_SECONDS)  # the thread ends this process once it knows the lost rank
             raise ResourceError(
                 f"rank {self.rank} of {self.count} cannot exchange data with the others ({str(e).splitlines()[0][:200]}); "
                 "--resume continues from the last checkpoint"

@@ -13,13 +13,16 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import BinaryIO
+from typing import TYPE_CHECKING, BinaryIO
 
 from warpgs import schema
 from warpgs.errors import DataError, ResourceError
 from warpgs.files import appending, read_input, unread_reason, write_bytes
 from warpgs.folders import RefusedError
 from warpgs.process import careful, printable, say
+
+if TYPE_CHECKING:
+    from rich.console import Console
 
 PLAIN_INTERVAL = 10.0
 """Seconds between two plain lines on the steps of a fit."""
@@ -44,6 +47,13 @@ def is_live() -> bool:
     """Return whether stdout is a terminal in which a line can be overwritten."""
     stdout = getattr(sys.stdout, "rich_proxied_file", sys.stdout)  # while a line is shown, rich wraps stdout
     return stdout is not None and stdout.isatty() and os.environ.get("TERM") != "dumb"
+
+
+def _console() -> tuple[Console, bool]:
+    """Return rich's console, and whether stderr is a terminal, too: redirected errors do not disturb a line."""
+    from rich.console import Console
+
+    return Console(file=careful(sys.stdout)), sys.stderr is not None and sys.stderr.isatty()
 
 
 class _StatusLine:
@@ -81,17 +91,15 @@ class _StatusLine:
 
     def _started(self):
         """Return rich's display of one task, which draws itself eight times a second until it is stopped."""
-        from rich.console import Console
         from rich.progress import BarColumn, SpinnerColumn, TextColumn, TimeElapsedColumn
         from rich.progress import Progress as Display
 
-        console = Console(file=careful(sys.stdout))
+        console, own = _console()
         columns = (
             SpinnerColumn("dots" if (console.encoding or "").startswith("utf") else "line"),
             TextColumn("{task.description}", markup=False), BarColumn(24), TextColumn("{task.fields[detail]}", markup=False),
             TimeElapsedColumn(),
         )  # fmt: skip
-        own = sys.stderr is not None and sys.stderr.isatty()  # redirected errors do not disturb the line
         display = Display(*columns, console=console, transient=True, refresh_per_second=8, redirect_stderr=own)
         display.start()
         return display
@@ -125,16 +133,12 @@ class Stages:
 
     def __call__(self, line: str) -> None:
         """Show a line; a plain line is skipped if its stage had one a moment ago."""
+        stage, now = line.rpartition(":")[0] or line, time.perf_counter()
         if self.live and _PANELS:
             _PANELS[-1].doing = line
         elif self.live:
             _STATUS.show(line)
-        else:
-            self._print(line)
-
-    def _print(self, line: str) -> None:
-        stage, now = line.rpartition(":")[0] or line, time.perf_counter()
-        if line not in self.shown and now - self.printed.get(stage, -STAGE_INTERVAL) >= STAGE_INTERVAL:
+        elif line not in self.shown and now - self.printed.get(stage, -STAGE_INTERVAL) >= STAGE_INTERVAL:
             self.printed[stage] = now
             self.shown.add(line)
             self.show(line)
@@ -168,14 +172,12 @@ class Progress:
     def __enter__(self) -> Progress:
         """Start the display."""
         if self.live:
-            from rich.console import Console
             from rich.live import Live
             from rich.spinner import Spinner
 
             _STATUS.clear()
             self.spinner = Spinner("dots" if (sys.stdout.encoding or "").lower().startswith("utf") else "line")
-            own = sys.stderr is not None and sys.stderr.isatty()
-            console = Console(file=careful(sys.stdout))
+            console, own = _console()
             self.display = Live(console=console, get_renderable=self._panel, refresh_per_second=8, redirect_stderr=own)
             self.display.__enter__()
             _PANELS.append(self)

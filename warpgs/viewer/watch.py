@@ -121,27 +121,21 @@ class LiveView:
             self._window.close()
 
     def _draw(self) -> None:
+        """Show each state that comes, until `close`."""
         try:
-            self._draw_states()
+            while self._wake.wait() and self._open:
+                self._wake.clear()
+                model, self._latest = self._latest, None
+                if model is None or not len(model.gaussians()):
+                    continue
+                content = Content(self.title, model, self.folder)
+                if self._window is None:
+                    self._window = Window(self.server, content, maps=False)
+                else:
+                    self._window.show(content)
+                self._shown.set()
         except Exception as e:  # errors of viser, too, so that the fit continues
             say(f"the viewer stopped ({type(e).__name__}: {e}); the fit continues", error=True)
-
-    def _draw_states(self) -> None:
-        """Show each state that comes, until `close`."""
-        while True:
-            self._wake.wait()
-            self._wake.clear()
-            if not self._open:
-                return
-            model, self._latest = self._latest, None
-            if model is None or not len(model.gaussians()):
-                continue
-            content = Content(self.title, model, self.folder)
-            if self._window is None:
-                self._window = Window(self.server, content, maps=False)
-            else:
-                self._window.show(content)
-            self._shown.set()
 
 
 @contextlib.contextmanager

@@ -478,10 +478,9 @@ class Window:
     def camera_of(self, client: viser.ClientHandle, side: int | None = None) -> Camera:
         """Return a browser's camera in scene units, at its own size, or with a longer side of at most ``side`` [px]."""
         state = client.camera
-        width, height = max(int(state.image_width), 16), max(int(state.image_height), 16)
-        factor = 1.0 if side is None else min(1.0, side / max(width, height))
-        size = max(16, round(factor * width)), max(16, round(factor * height))
-        return camera_at(state.wxyz, state.position, state.fov, *size)
+        size = max(int(state.image_width), 16), max(int(state.image_height), 16)
+        factor = 1.0 if side is None else min(1.0, side / max(size))
+        return camera_at(state.wxyz, state.position, state.fov, *(max(16, round(factor * length)) for length in size))
 
     def _connected(self, client: viser.ClientHandle) -> None:
         client.camera.fov = fov_y(self.first, client.camera.aspect)
