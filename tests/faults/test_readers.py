@@ -184,7 +184,7 @@ REASONS = {
     "device.py": {"_text": SYSTEM,
         "processor_name": SYSTEM},
     "process.py": {"utf8_name": "opens by another name for readers that are named here",
-        "hidden_stderr": "opens /dev/null for writing",
+        "hidden_stderr": "opens /dev/null for writing", "run_python": PIPE,
         "_send_to_null": "opens /dev/null for writing"},
     "ranks.py": {"machine": SYSTEM},
     "viewer/window.py": {"Panel._add_sampling": "reads an image for `decode`, whose reader is named here"},

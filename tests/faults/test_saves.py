@@ -403,7 +403,7 @@ def test_places_for_a_run(reference, disk, capfd, folder):
 def test_a_run_folder_that_goes_away(reference, tmp_path, what):
     """The fit ends with an error of ours at its next checkpoint, and what stands there now is left alone."""
     out = tmp_path / "run"
-    config = replace(PRESETS["quick"], steps=STEPS, checkpoint_every=10, checkpoint_seconds=0)
+    config = replace(PRESETS["quick"], steps=STEPS, checkpoint_every=10)
 
     def go_away(report) -> None:
         if report.step == 15:

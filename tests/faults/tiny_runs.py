@@ -62,7 +62,7 @@ def words_of(command: str, scene: Path, work: Path) -> list[str]:
     run, cpu = str(work / "run"), ["--device", "cpu"]
     fit = [
         "fit", str(scene), "--out", run, "--split", split_spec(VIEWS), "--steps", str(STEPS), "--preset", "quick",
-        "--checkpoint-every", "10", "--checkpoint-seconds", "0", "--threads", "1", *cpu,
+        "--checkpoint-every", "10", "--threads", "1", *cpu,
     ]  # fmt: skip
     short = ["--split", split_spec(VIEWS), "--steps", "4", *cpu]
     farm = [

@@ -163,7 +163,7 @@ def poison(fit: Trainer, name: str, where: str, value: float) -> None:
 def test_what_is_no_number_is_never_saved(device, tmp_path, name, where, value):
     """The Gaussian is culled, so the loss stays finite; the next checkpoint is refused by name, and the last one is whole."""
     config = FitConfig(
-        steps=6, init=POINTS, sh_degree=0, density=DensityConfig(start=100), checkpoint_every=2, checkpoint_seconds=0,
+        steps=6, init=POINTS, sh_degree=0, density=DensityConfig(start=100), checkpoint_every=2,
         cuda_graph=False,
     )  # fmt: skip
     fit, saved = Trainer(photos(2), seeds(), config, device), []

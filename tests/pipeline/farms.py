@@ -10,7 +10,7 @@ from warpgs.pipeline.run.request import FitRequest, SceneRequest
 from warpgs.pipeline.train.settings import FitConfig
 from warpgs.synthetic.demo import split_spec, write_demo
 
-CONFIG = FitConfig(steps=6, checkpoint_every=2, checkpoint_seconds=0, init=InitConfig(source="random", random_count=60))
+CONFIG = FitConfig(steps=6, checkpoint_every=2, init=InitConfig(source="random", random_count=60))
 
 
 def write_scenes(folder: Path, count: int = 2) -> Path:

@@ -272,7 +272,7 @@ def test_the_format_is_a_number_in_both_files(run, tmp_path):
 
 with_links = pytest.mark.skipif(os.name == "nt", reason="links need a right that users of Windows often lack")
 LINKS_CONFIG = warpgs.FitConfig(
-    steps=6, checkpoint_every=2, checkpoint_seconds=0, init=InitConfig(source="random", random_count=50)
+    steps=6, checkpoint_every=2, init=InitConfig(source="random", random_count=50)
 )  # fmt: skip
 
 

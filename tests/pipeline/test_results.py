@@ -334,7 +334,7 @@ def test_uniform_events_show_no_scores(tmp_path):
         + 18
     )
     assert sheet.shape[0] == one_row  # render, image, gate, pixels, words
-    words = sampling_report_of(fit, tmp_path).words
+    words = sampling_report_of(fit, tmp_path)[0]
     assert "uniformly at random" in words and "All scores have weight 0, so no score is shown." in words
 
 
@@ -358,20 +358,20 @@ def test_story_follows_the_switches(run, tmp_path):
     (out / "sampling" / "own.png").write_bytes(b"an image of the user's own")
     story = sampling_report_of(fit, out)
     (out / "sampling" / "own.png").unlink()
-    assert "sampled at random" in story.words and "above its 0.6 quantile" in story.words and "rendered depth" in story.words
-    assert [c for c, _ in story.images] == [f"sampling after step {s}" for s in sorted(shown_steps(fit.phases))]
-    assert story.images[0][1] == webp(next(iter(sorted((out / "sampling").iterdir()))).read_bytes(), SHEET_WIDTH, 70)
-    assert dict(zip(*story.table))["sampling events"] == str(len(fit.strategy.events))
+    assert "sampled at random" in story[0] and "above its 0.6 quantile" in story[0] and "rendered depth" in story[0]
+    assert [c for c, _ in story[1]] == [f"sampling after step {s}" for s in sorted(shown_steps(fit.phases))]
+    assert story[1][0][1] == webp(next(iter(sorted((out / "sampling").iterdir()))).read_bytes(), SHEET_WIDTH, 70)
+    assert dict(zip(*story[2]))["sampling events"] == str(len(fit.strategy.events))
     method = dataclasses.replace(METHOD, sampler=dataclasses.replace(METHOD.sampler, fraction=0.2))
     base, own = dataclasses.replace(CONFIG, method=method), PaperConfig(agp=False, depth="consistent")
     other = fitted(dataclasses.replace(base, strategy_config=own), steps=8)
-    words = sampling_report_of(other, tmp_path).words
+    words = sampling_report_of(other, tmp_path)[0]
     assert "the highest in S_importance" in words and "other views confirm and with S_geometry" in words
-    assert "In 3 of 3 samplings the gate was widened" in words and "widened" not in story.words
+    assert "In 3 of 3 samplings the gate was widened" in words and "widened" not in story[0]
     free = fitted(dataclasses.replace(base, strategy_config=dataclasses.replace(own, ra=False)), steps=8)
-    assert "all pixels that Gaussians cover" in sampling_report_of(free, tmp_path).words
+    assert "all pixels that Gaussians cover" in sampling_report_of(free, tmp_path)[0]
     alike = PaperConfig(s_render=False, s_semantic=False, s_geometry=False)
-    words = sampling_report_of(fitted(dataclasses.replace(CONFIG, strategy_config=alike), steps=8), tmp_path).words
+    words = sampling_report_of(fitted(dataclasses.replace(CONFIG, strategy_config=alike), steps=8), tmp_path)[0]
     assert "sampled uniformly at random" in words and "All scores have weight 0" in words
     assert (
         sampling_report_of(fitted(dataclasses.replace(CONFIG, strategy="clone_split", strategy_config=None), steps=1), tmp_path)

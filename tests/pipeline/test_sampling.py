@@ -27,13 +27,10 @@ from warpgs.pipeline.train.strategies.sampling import (
     MethodConfig,
     SamplerConfig,
     fine_gaussians,
-    keep_contributors,
     sample_pixels,
     valid_pixels,
 )
 from warpgs.pipeline.train.trainer import Trainer
-from warpgs.render.options import RasterizeOptions
-from warpgs.render.rasterize import rasterize
 from warpgs.scene import C0, Camera
 
 CPU = torch.device("cpu")
@@ -276,28 +273,6 @@ def test_fine_gaussians_stand_at_confirmed_depths(gated):
     assert len(z) == len(columns) > 50
     assert torch.allclose(z[columns < 20], torch.tensor(1.25), atol=1e-4)
     assert bool((columns >= 20).any()) != gated and not torch.allclose(z[columns >= 20].mean(), torch.tensor(1.25), atol=0.05)
-
-
-def test_phase_3_begins_with_those_that_contribute_most():
-    """Half stay, none of which has a smaller sum of blending weights than one that went; nothing changes afterwards."""
-    fit = fitted(steps=27)
-    options = RasterizeOptions(background=torch.zeros(3), contributions=True)
-    weights = torch.stack([rasterize(fit.gaussians, v.camera, options).weight_sums[0] for v in fit.views]).sum(0)
-    kept = keep_contributors(fit.gaussians, len(weights) // 2, fit.views, options)
-    stays = torch.zeros(len(weights), dtype=torch.bool).index_fill(0, kept.keep, True)
-    assert int(stays.sum()) == len(weights) // 2 and weights[stays].min() >= weights[~stays].max()
-    whole, half = (fitted(dataclasses.replace(CONFIG, method=dataclasses.replace(METHOD, keep=k))) for k in (1.0, 0.5))
-    assert len(half.gaussians) == round(0.5 * len(whole.gaussians))
-    with pytest.raises(UsageError, match="keep"):
-        MethodConfig(keep=0.0)
-
-
-def test_growth_that_ends_early_keeps_those_that_contribute_most():
-    """Then, too, they are counted once, before pixels that were held out are sampled."""
-    fit = fitted(dataclasses.replace(CONFIG, method=dataclasses.replace(METHOD, keep=0.5)), steps=20)
-    count, views = len(fit.gaussians), fit.views
-    first, *rest = fit.strategy.catch_up(20, [dataclasses.replace(v, mask=torch.ones_like(v.image[..., 0])) for v in views], 64)
-    assert len(first.keep) == round(0.5 * count) and len(first.parents) == 0 and all(len(c.keep) >= count for c in rest)
 
 
 def test_dropout_falls_with_the_number_of_views():

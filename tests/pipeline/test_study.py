@@ -61,7 +61,7 @@ from warpgs.pipeline.train.presets import PRESETS, preset_settings
 from warpgs.pipeline.train.settings import FitConfig
 from warpgs.pipeline.train.strategies.base import STRATEGIES
 from warpgs.pipeline.train.strategies.sampling import MethodConfig
-from warpgs.report.images import BOXES, Cell, Strip, crops, disagreement, sheet
+from warpgs.report.images import BOXES, crops, disagreement, sheet
 from warpgs.synthetic.demo import split_spec, write_demo
 
 # Tables of a study: the figures that were measured, in three notations that agree.
@@ -700,8 +700,8 @@ def test_crops_of_equal_pictures_and_of_small_ones():
 def test_sheet_shows_every_picture_and_its_crops():
     """Columns of one width; a flat picture keeps its colour; boxes and frames have the colours of their crop."""
     colors = [(0.2, 0.4, 0.6), (0.8, 0.1, 0.3), (0.5, 0.5, 0.1)]
-    cells = tuple(Cell(np.full((30, 40, 3), c, np.float32), f"{i}.00 dB") for i, c in enumerate(colors))
-    data = sheet(["a", "b" * 90, "photograph"], [Strip("scene, view", cells, ((2, 3, 8, 6), (20, 10, 8, 6)))] * 2)
+    cells = [(np.full((30, 40, 3), c, np.float32), f"{i}.00 dB") for i, c in enumerate(colors)]
+    data = sheet(["a", "b" * 90, "photograph"], [("scene, view", cells, [(2, 3, 8, 6), (20, 10, 8, 6)])] * 2)
     image = np.array(Image.open(io.BytesIO(data)))
     assert image.dtype == np.uint8 and image.shape[2] == 3 and image.shape[1] <= 2600
     areas = [int((image == np.round(np.array(c) * 255).astype(np.uint8)).all(-1).sum()) for c in colors]
@@ -713,6 +713,6 @@ def test_sheet_shows_every_picture_and_its_crops():
 
 def test_sheet_of_many_columns_stays_printable():
     """Nine settings and the photograph share the width."""
-    cell = Cell(np.zeros((24, 32, 3), np.float32), "")
-    image = Image.open(io.BytesIO(sheet([str(i) for i in range(10)], [Strip("s", (cell,) * 10, ())])))
+    cell = (np.zeros((24, 32, 3), np.float32), "")
+    image = Image.open(io.BytesIO(sheet([str(i) for i in range(10)], [("s", [cell] * 10, [])])))
     assert image.width <= 2600 and math.isclose(image.width / 10, 256, rel_tol=0.2)

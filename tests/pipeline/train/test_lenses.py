@@ -396,7 +396,7 @@ def test_a_continued_fit_equals_one_in_one_go(filtered_run, tmp_path):
 
     whole, _ = filtered_run
     how = {"split": SPLIT, "out": tmp_path / "run", "device": "cpu", "verbose": False}
-    config = dataclasses.replace(FILTERED_CONFIG, checkpoint_every=1, checkpoint_seconds=0.0)
+    config = dataclasses.replace(FILTERED_CONFIG, checkpoint_every=1)
     with pytest.raises(KeyboardInterrupt):
         warpgs.fit(scene(), config, on_step=stop, **how)
     with pytest.raises(warpgs.errors.UsageError, match="antialiased"):

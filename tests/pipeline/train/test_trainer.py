@@ -331,7 +331,7 @@ def test_resume_after_kill_gives_the_same_ply(tmp_path):
     write_demo(tmp_path / "scene", views=8, width=64, height=48)
     flags = [
         str(tmp_path / "scene"), "--split", split_spec(8), "--steps", "60", "--device", "cpu",
-        "--checkpoint-every", "10", "--checkpoint-seconds", "0",
+        "--checkpoint-every", "10",
         "--density.start", "10", "--density.every", "10",
     ]  # fmt: skip
     # stands still after the first checkpoint, says so, and waits for the end

@@ -261,7 +261,7 @@ def coverage_section(out: Path, coverage: dict[str, Any], shown: list[str], name
     """Return the section of the report page, with the images of the views ``shown``."""
     files = {n: out / FOLDER / f"{names[n]}.png" for n in shown}
     head, *rows = coverage_table(coverage)
-    return Section(
+    return (
         f"{coverage['summary'][0].upper()}{coverage['summary'][1:]}. {EXPECTED}",
         [(n, webp(decode(f, data=read_file(f, out))[0], 640)) for n, f in files.items() if f.is_file()],
         [head[1:], *(r[1:] for r in rows if r[0] == "all views")],

@@ -55,7 +55,7 @@ from warpgs.priors.networks import cache_folder
 from warpgs.priors.views import PriorConfig, view_priors
 from warpgs.render.options import RasterizeOptions
 from warpgs.report.images import COVERAGE_LEGEND, Tile, contact_sheet, png
-from warpgs.report.overview import ScenePlot, render_plot
+from warpgs.report.overview import render_plot
 from warpgs.report.page import image_names, renaming_notes
 from warpgs.report.progress import Stages, waiting
 from warpgs.scene import Camera, Gaussians, Normalization, Prior, Scene, View, base_colors
@@ -402,10 +402,10 @@ def plot(folder: Path, out: Path | None, settings: PlotSettings, device_name: st
     shown = (train, test) if settings.cameras else ([], [])
     legend = [(words, color) for _, words, color in CLASSES] if by_coverage else []
     axes = None if axes is None else axes[chosen]
-    contents = ScenePlot(points[chosen], colors[chosen], axes, *shown, rig.up, _eye(rig), legend)
+    contents = points[chosen], colors[chosen], axes, *shown, rig.up, _eye(rig), legend
     with hold_file(out) as held:
         tell("rendering the plot")
-        write_bytes(out, render_plot(contents, settings.size, settings.background))
+        write_bytes(out, render_plot(*contents, settings.size, settings.background))
     faint = f"Gaussians of opacity {MIN_OPACITY:g} or more"
     what = "points of the reconstruction" if settings.points == "start" else faint
     return [*held, *notes, f"{len(points):,} {what}, {len(train)} training and {len(test)} held-out cameras in {out}"]

@@ -48,7 +48,7 @@ from warpgs.render.rasterize import rasterize
 from warpgs.render.reference import reference_image
 from warpgs.report.images import Tile, contact_sheet, depth_map, error_map, png, side_by_side, webp
 from warpgs.report.overview import render_overview
-from warpgs.report.page import Section, ViewImages, curve, image_names, write_page
+from warpgs.report.page import Section, curve, image_names, write_page
 from warpgs.report.progress import duration, read_events
 from warpgs.scene import Camera, Gaussians, Scene, View
 
@@ -364,7 +364,7 @@ def sampling_report_of(fit: Trainer, out: Path) -> Section | None:
     images = [
         (f"sampling after step {int(p.stem):,}", webp(decode(p, data=read_file(p, out))[0], SHEET_WIDTH, 70)) for p in files
     ]
-    return Section(words, images, table)
+    return words, images, table, ""
 
 
 LABELS = {
@@ -480,7 +480,7 @@ def evaluate_run(
 
 def _images(
     views: list[View], gaussians: Gaussians, options: RasterizeOptions, rows: dict[str, Any], tell: Callable[[str], object]
-) -> list[ViewImages]:
+) -> list[tuple[Any, ...]]:
     """Render up to `SHOWN_VIEWS` of the views, evenly spaced, and encode their images for the page."""
     chosen = [views[i] for i in np.unique(np.linspace(0, len(views) - 1, min(SHOWN_VIEWS, len(views))).round().astype(int))]
     result = []
@@ -492,7 +492,7 @@ def _images(
             caption = f"PSNR {row['psnr']:.2f} dB{region}, SSIM {row['ssim']:.3f}" if row else "training view"
             parts = (image, view.image, error_map(image, view.image), depth_map(depth, alpha))
             result.append((view.name, caption, render_workers.map(webp, parts)))
-    return [ViewImages(name, caption, *parts) for name, caption, parts in result]
+    return [(name, caption, *parts) for name, caption, parts in result]
 
 
 def _figures(metrics: dict[str, Any]) -> list[tuple[str, str]]:
@@ -555,7 +555,7 @@ def write_report(
     covered = None
     if "coverage" in metrics:
         names = image_names(v.name for v in scene.views)
-        covered = coverage_section(out, metrics["coverage"], [v.name for v in images], names)
+        covered = coverage_section(out, metrics["coverage"], [name for name, *_ in images], names)
     camera = train[0].camera
     write_page(
         out / "report.html",

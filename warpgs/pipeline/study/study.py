@@ -45,7 +45,7 @@ from warpgs.pipeline.train.presets import PRESETS, preset_settings, preset_word
 from warpgs.pipeline.train.settings import FitConfig, settings_by_views
 from warpgs.pipeline.train.trainer import train_views
 from warpgs.process import say
-from warpgs.report.images import Cell, Strip, crops, disagreement, sheet
+from warpgs.report.images import Strip, crops, disagreement, sheet
 from warpgs.scene import View
 
 CROPS = 2
@@ -75,7 +75,7 @@ def strips(
         values = disagreement([p[i] for p in images.values()], view.image)
         maps.append(values if view.score_mask is None else values * view.score_mask)
     chosen = sorted(sorted(range(len(views)), key=lambda i: -float(maps[i].mean()))[:count])
-    rows = []
+    rows: list[Strip] = []
     for i in chosen:
         view = views[i]
         H, W = view.image.shape[:2]
@@ -84,10 +84,10 @@ def strips(
         cells = []
         for name, rendered in images.items():
             value = scores.get(name, {}).get(view.name)
-            cells.append(Cell(rendered[i], f"{value:.2f} dB" if value is not None else ""))
+            cells.append((rendered[i], f"{value:.2f} dB" if value is not None else ""))
         reference = view.image if view.score_mask is None else over_white(view.image, view.score_mask) * 0.5 + view.image * 0.5
         words = "held-out image" if view.score_mask is None else "image, bleached where not scored"
-        rows.append(Strip(f"{scene}, {view.name}", (*cells, Cell(reference, words)), tuple((x, y, w, h) for x, y in corners)))
+        rows.append((f"{scene}, {view.name}", [*cells, (reference, words)], [(x, y, w, h) for x, y in corners]))
     return rows
 
 

@@ -75,9 +75,8 @@ class FitConfig(Checked):
     """Dropout: probability that a Gaussian is hidden in a step. It grows linearly from 0 to this value at the last step
     (DropGaussian, Park et al. 2025), and falls in proportion to the number of training views above 3."""
     checkpoint_every: Annotated[int, Within(1)] = 1000
-    """Number of steps between checkpoints; the last step always writes a checkpoint."""
-    checkpoint_seconds: Annotated[float, Within(0)] = 20.0
-    """Least time between checkpoints [s], because writing takes time. This setting does not affect results."""
+    """Number of steps between checkpoints; the last step always writes a checkpoint. Because writing takes time, checkpoints at
+    every 1000 steps or more are also at least 20 s apart."""
     memory_limit: Annotated[int | None, Within(1)] = None
     """Memory limit for the tensors of the fit on its device during steps [bytes]; None for no limit. Densification stops before
     a step would exceed the limit, and images are rendered in chunks if a whole image would exceed the limit."""
@@ -216,6 +215,7 @@ def _compose(kind: type, values: dict[str, Any], place: str) -> Any:
 SIDE_FILE = "give it in FILE.onnx.json, beside the network (docs/priors.md)"
 PAPER = "--strategy paper --paper.{}"
 REMOVED: dict[str, tuple[Any, str]] = {
+    "checkpoint_seconds": (20.0, "--checkpoint-every below 1000 writes each checkpoint"),
     "dropout_views": (3, ""),
     "stopping.fraction": (0.03, ""), "stopping.measurements": (12, ""), "stopping.noise": (1.0, ""),
     "init.near_views": (4, ""), "init.max_residual": (1.0, ""), "init.blend": ("least_sensitive", ""),
@@ -225,6 +225,7 @@ REMOVED: dict[str, tuple[Any, str]] = {
     "density.clone_size": (0.01, ""), "density.prune_opacity": (0.005, ""), "density.morton_order": (True, ""),
     "limits.min_pixels": (0.2**0.5, ""), "limits.ratio_from": (0.7, ""),
     "phases.every": (100.0, ""), "phases.growth": (4.0, ""),
+    "method.keep": (1.0, "use `warpgs prune` on the finished run"),
     "method.events": (True, "use --strategy clone_split for a fit without sampling events"),
     **{f"method.{n}": (v, f"use {PAPER.format(n.replace('_', '-'))}") for n, v in {
         "s_render": False, "s_semantic": False, "s_geometry": False, "ra": True, "agp": True, "pm": True}.items()},
@@ -260,6 +261,7 @@ def upgraded(config: Mapping[str, Any]) -> tuple[dict[str, Any], list[str]]:
     values = _copied(config)
     method, importance, sampler = (_group(values, n) for n in ("method", "method.importance", "method.sampler"))
     _group(values, "loss").pop("exposure_weight", None)  # had no effect
+    values.pop("checkpoint_seconds", None)  # affected no result
     homes = dict.fromkeys(("s_render", "s_semantic", "s_geometry", "ra", "agp", "pm"), method)
     homes |= {"residual": importance, "depth": sampler, "gate_quantile": sampler}
     if "events" in method and all(n in home for n, home in homes.items()):

@@ -44,6 +44,8 @@ from warpgs.schema import Schema, SchemaError, anything, fields, items, mapping,
 # The mean over many steps does not (Polyak and Juditsky 1992; Izmailov et al. 2018, arXiv 1803.05407).
 # docs/decisions/029-mean-of-the-last-steps.md has measurements.
 
+ALL_SAVED, CHECKPOINT_SECONDS = 1000, 20.0
+"""Steps between checkpoints below which each is written; least time between others [s]."""
 SAMPLES = 32
 """Least number of samples of a mean; a shorter mean takes every step."""
 PREFIX = "mean."
@@ -587,7 +589,7 @@ def run(
         for report in reports:
             on_step(report)
         stop = trainer.taker.agreed(stopped())
-        due = trainer.step % every == 0 and time.monotonic() - saved >= trainer.config.checkpoint_seconds
+        due = trainer.step % every == 0 and (every < ALL_SAVED or time.monotonic() - saved >= CHECKPOINT_SECONDS)
         if stop or due or trainer.step == trainer.steps:
             save(trainer)
             saved = time.monotonic()

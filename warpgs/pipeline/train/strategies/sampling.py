@@ -61,9 +61,6 @@ class MethodConfig(Checked, group="method."):
     hier: bool | None = False
     """Two layers: from phase 2 on, the coarse layer is neither cloned nor split, and its means move slowly. None: chosen by the
     number of views."""
-    keep: Annotated[float, Within(0, 1, "(")] = 1.0
-    """Fraction of the Gaussians that is kept when phase 3 begins, in (0, 1]: those with the largest sums of blending weights
-    over at most 32 training views."""
     sampler: SamplerConfig = field(default_factory=SamplerConfig)
 
 
@@ -170,14 +167,6 @@ def weight_sums(gaussians: Gaussians, cameras: list[Camera], options: RasterizeO
     for camera in cameras[:: -(-len(cameras) // MAX_WEIGHED)]:
         total += rasterize(gaussians, camera, weigh).weight_sums[0]
     return total
-
-
-@torch.no_grad()
-def keep_contributors(gaussians: Gaussians, count: int, views: list[TrainingView], options: RasterizeOptions) -> DensityUpdate:
-    """Return the change that keeps the ``count`` Gaussians with the largest sums of blending weights over the views."""
-    total = weight_sums(gaussians, [v.camera for v in views], options)
-    ids = torch.topk(total, min(count, len(gaussians))).indices.sort().values
-    return DensityUpdate(ids, {n: t[:0] for n, t in gaussians.tensors().items()}, ids[:0])
 
 
 @torch.no_grad()
@@ -363,19 +352,10 @@ class Sampling(Strategy):
 
     def due(self, step: int) -> bool:
         """Return whether the set changes after a step."""
-        return self.gradients.due(step) or step in self.context.phases.events or self.shrinks_after(step)
-
-    def shrinks_after(self, step: int) -> bool:
-        """Return whether the Gaussians that contribute least are removed after a step: after the last step of phase 2."""
-        return self.method.keep < 1 and step == self.context.phases.stable_start
-
-    def shrink(self, views: list[TrainingView]) -> DensityUpdate:
-        """Return the change that keeps the fraction ``method.keep`` of the Gaussians."""
-        t = self.context
-        return keep_contributors(t.gaussians, max(1, round(self.method.keep * len(t.table))), views, t.render_options())
+        return self.gradients.due(step) or step in self.context.phases.events
 
     def update(self, step: int) -> Iterator[DensityUpdate]:
-        """Refine, reset opacities, sample and shrink the set, each if it is due.
+        """Refine, reset opacities and sample, each if it is due.
 
         With two layers, only the fine layer grows from phase 2 on. Protected Gaussians are not pruned.
         """
@@ -395,13 +375,9 @@ class Sampling(Strategy):
             })  # fmt: skip
             if self.on_event is not None:
                 self.on_event(step, event)
-        if self.shrinks_after(step):
-            yield self.shrink(views)
 
     def catch_up(self, step: int, views: list[TrainingView], held: int) -> Iterator[DensityUpdate]:
-        """Shrink the set; then sample fine Gaussians in the blocks that were held out, as many per pixel as elsewhere."""
-        if self.method.keep < 1:
-            yield self.shrink(views)
+        """Sample fine Gaussians in the blocks that were held out, as many per pixel as elsewhere."""
         pixels = sum(v.image[..., 0].numel() for v in views)
         fraction = int(self.fine.sum()) / (pixels - held) * held / pixels
         if not fraction * pixels >= 1:
