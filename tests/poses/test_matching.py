@@ -13,7 +13,7 @@ from warpgs.errors import DataError
 from warpgs.poses import find
 from warpgs.poses.find import find_poses
 from warpgs.poses.mapping import find_model
-from warpgs.poses.matching import MAX_KEYPOINTS, WHOLE, Features, Matcher, mutual_matches, open_matcher, quarter_turns
+from warpgs.poses.matching import MAX_KEYPOINTS, WHOLE, Features, Matcher, mutual_matches, Matcher, quarter_turns
 
 AT = np.array([[3.0, 4.0], [60.0, 20.0], [5.0, 6.0]])
 SCORES = np.array([0.2, 0.9, 0.0])
@@ -21,7 +21,7 @@ UNIT = np.array([[0.6, 0.8], [0.0, 1.0], [0.0, 0.0]])
 
 
 def opened(tmp_path, *arrays, **options) -> Matcher:
-    return open_matcher(networks.write(tmp_path / "m.onnx", networks.matcher(*arrays, **options)), threads=1)
+    return Matcher(networks.write(tmp_path / "m.onnx", networks.matcher(*arrays, **options)), threads=1)
 
 
 def test_keypoints_are_in_pixels_of_the_photograph(tmp_path):
@@ -101,7 +101,7 @@ def test_the_network_is_asked_where_sift_leaves_photographs_out(sfm, tmp_path, p
         return replace(made[0], views=dict(list(made[0].views.items())[some]))
 
     monkeypatch.setattr(find, "find_model", by_sift_once)
-    monkeypatch.setattr(find, "open_matcher", lambda path, threads: Sift())
+    monkeypatch.setattr(find, "Matcher", lambda path, threads: Sift())
     record = find_poses(photographs, tmp_path / "all", matcher="x.onnx")
     assert record["cameras"] == found[1]["cameras"] and any("SIFT finds the poses of all" in n for n in record["notes"])
     some = slice(3)

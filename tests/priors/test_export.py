@@ -12,9 +12,9 @@ import torch
 
 from warpgs.app.cli import main
 from warpgs.errors import DataError, ResourceError, UsageError
-from warpgs.poses.matching import mutual_matches, open_matcher
+from warpgs.poses.matching import mutual_matches, Matcher
 from warpgs.priors.export import ExportRequest, build, export_network
-from warpgs.priors.networks import open_network
+from warpgs.priors.networks import Network
 from warpgs.priors.views import PriorConfig, view_priors
 from warpgs.scene import Camera, View
 
@@ -69,7 +69,7 @@ def test_a_matcher_is_exported(tmp_path):
     """An image of another size and proportion than that of the export; keypoints of a shifted image shift with it."""
     lines = export_network(ExportRequest("xfeat"), tmp_path / "x.onnx")
     assert "of torch's keypoints" in lines[0] and "--matcher" in lines[1]
-    matcher = open_matcher(tmp_path / "x.onnx", threads=1)
+    matcher = Matcher(tmp_path / "x.onnx", threads=1)
     noise = np.random.default_rng(0).integers(0, 255, (52, 68, 3), np.uint8)
     large = cv2.resize(noise, (1088, 832), interpolation=cv2.INTER_CUBIC)
     a, b = (matcher.features(np.ascontiguousarray(large[at : at + 768, at : at + 1024])) for at in (0, 16))
@@ -87,7 +87,7 @@ def test_the_architecture_gives_in_onnxruntime_what_it_gives_in_torch(name, shap
     lines = export_network(request, path)
     assert "small and untrained" in lines[0] and "warpgs priors show" in lines[1]
     image = np.random.default_rng(3).normal(size=(64, 64, 3)).astype(np.float32)
-    found = open_network(path).run(image)[0]
+    found = Network(path).run(image)[0]
     with torch.no_grad():
         wanted = build(request)(torch.from_numpy(image).permute(2, 0, 1)[None])[0].numpy()
     assert found.shape == wanted.shape == shape and wanted.std() > 1e-3

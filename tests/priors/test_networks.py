@@ -18,7 +18,7 @@ from warpgs.priors.networks import (
     complete_disparity,
     describe,
     network_disparity,
-    open_network,
+    Network,
     resize,
     unit_range,
 )
@@ -39,13 +39,13 @@ EYE, ZERO = np.eye(3), np.zeros(3)
 
 def test_a_network_knows_its_file_layout_and_size(tmp_path):
     path = nw.depth_network(tmp_path / "a.onnx", size=(8, 12))
-    network = open_network(path, threads=1)
+    network = Network(path, threads=1)
     assert (network.layout, network.size) == ("nchw", (8, 12))
     assert network.sha256 == hashlib.sha256((tmp_path / "a.onnx").read_bytes()).hexdigest()
     assert network.title == f"a.onnx (SHA-256 {network.sha256[:12]})"
     assert network.session.get_providers() == ["CPUExecutionProvider"]
     assert network.session.get_session_options().intra_op_num_threads == 1
-    free = open_network(nw.depth_network(tmp_path / "b.onnx", layout="nhwc"))
+    free = Network(nw.depth_network(tmp_path / "b.onnx", layout="nhwc"))
     assert (free.layout, free.size) == ("nhwc", None)
 
 
@@ -53,7 +53,7 @@ def test_a_network_knows_its_file_layout_and_size(tmp_path):
 def test_an_image_goes_in_with_its_axes_in_order(tmp_path, layout):
     path = nw.write(tmp_path / "a.onnx", nw.linear(EYE, ZERO, layout=layout))
     image = np.random.default_rng(0).normal(size=(5, 7, 3)).astype(np.float32)
-    output = open_network(path).run(image)[0]
+    output = Network(path).run(image)[0]
     np.testing.assert_allclose(output if layout == "nhwc" else output.transpose(1, 2, 0), image, rtol=1e-6)
 
 
@@ -104,7 +104,7 @@ def test_files_that_are_refused(tmp_path, name, capsys):
     data, message = REFUSED[name]
     path = nw.write(tmp_path / "m.onnx", data)
     with pytest.raises(DataError, match=message) as e:
-        open_network(path)
+        Network(path)
     assert path in str(e.value) and capsys.readouterr().out == ""
 
 
@@ -153,7 +153,7 @@ def test_weights_in_another_file_are_refused_though_it_exists(tmp_path, where, m
     monkeypatch.chdir(tmp_path)  # onnxruntime would look for them here
     path = nw.write(tmp_path / "m.onnx", placed(where))
     with pytest.raises(DataError, match="weights of 'k' are in another file"):
-        open_network(path)
+        Network(path)
 
 
 def test_what_protobuf_would_read_otherwise_is_refused(tmp_path):
@@ -164,10 +164,10 @@ def test_what_protobuf_would_read_otherwise_is_refused(tmp_path):
     x, y = nw.value("x", (1, 3, "h", "w")), nw.value("y", (1, 3, "h", "w"))
     add = nw.node("Add", ["x", "k"], ["y"])
     with pytest.raises(DataError, match="field number"):
-        open_network(nw.write(tmp_path / "m.onnx", nw.model(nw.graph([add], [hidden], [x], [y]))))
+        Network(nw.write(tmp_path / "m.onnx", nw.model(nw.graph([add], [hidden], [x], [y]))))
     twice = add + nw.field(7, "ai.on") + nw.field(7, "nx")
     with pytest.raises(DataError, match="nx::Add is not part of ONNX"):
-        open_network(nw.write(tmp_path / "m.onnx", nw.model(nw.graph([twice], [], [x], [y]))))
+        Network(nw.write(tmp_path / "m.onnx", nw.model(nw.graph([twice], [], [x], [y]))))
 
 
 def test_functions_that_travel_in_the_file_are_welcome(tmp_path):
@@ -178,7 +178,7 @@ def test_functions_that_travel_in_the_file_are_welcome(tmp_path):
     more = nw.field(25, twice) + nw.field(8, nw.field(1, "own") + nw.field(2, 1))
     path = nw.write(tmp_path / "m.onnx", nw.model(nw.graph([nw.node("Twice", ["x"], ["y"], "own")], [], [x], [y]), more))
     image = np.random.default_rng(0).normal(size=(4, 4, 3)).astype(np.float32)
-    np.testing.assert_allclose(open_network(path).run(image)[0], 2 * image.transpose(2, 0, 1))
+    np.testing.assert_allclose(Network(path).run(image)[0], 2 * image.transpose(2, 0, 1))
 
 
 def test_nested_graphs_end(tmp_path):
@@ -186,7 +186,7 @@ def test_nested_graphs_end(tmp_path):
     for _ in range(200):
         body = nw.graph([nw.node("If", [], [], attributes=nw.field(5, nw.field(6, body)))], [], [], [])
     with pytest.raises(DataError, match="nested deeper"):
-        open_network(nw.write(tmp_path / "m.onnx", nw.model(body)))
+        Network(nw.write(tmp_path / "m.onnx", nw.model(body)))
 
 
 def test_no_bytes_crash_the_reader(tmp_path):
@@ -197,16 +197,16 @@ def test_no_bytes_crash_the_reader(tmp_path):
         for at in rng.integers(len(data), size=rng.integers(1, 6)):
             data[at] = rng.integers(256)
         try:
-            open_network(nw.write(tmp_path / f"{i}.onnx", bytes(data)))
+            Network(nw.write(tmp_path / f"{i}.onnx", bytes(data)))
         except DataError as e:
             assert f"{i}.onnx" in str(e)
 
 
 def test_a_missing_file_and_an_unknown_provider(tmp_path):
     with pytest.raises(DataError, match="cannot be read"):
-        open_network(tmp_path / "none.onnx")
+        Network(tmp_path / "none.onnx")
     with pytest.raises(UsageError, match="'tpu' is not one of cpu, cuda"):
-        open_network(tmp_path / "none.onnx", provider="tpu")
+        Network(tmp_path / "none.onnx", provider="tpu")
 
 
 def test_cuda_where_onnxruntime_has_none(tmp_path, monkeypatch):
@@ -215,13 +215,13 @@ def test_cuda_where_onnxruntime_has_none(tmp_path, monkeypatch):
     path = nw.depth_network(tmp_path / "a.onnx")
     monkeypatch.setattr(onnxruntime, "get_available_providers", lambda: ["AzureExecutionProvider", "CPUExecutionProvider"])
     with pytest.raises(ResourceError, match=r"has only cpu\. .*onnxruntime-gpu"):
-        open_network(path, provider="cuda")
+        Network(path, provider="cuda")
     # it may also promise CUDA and then run without: libraries are missing
     monkeypatch.setattr(onnxruntime, "get_available_providers", lambda: ["CUDAExecutionProvider", "CPUExecutionProvider"])
     start = onnxruntime.InferenceSession
     monkeypatch.setattr(onnxruntime, "InferenceSession", lambda data, options, **_: start(data, options))
     with pytest.raises(ResourceError, match="finds no cuda libraries or device"):
-        open_network(path, provider="cuda")
+        Network(path, provider="cuda")
 
     # or fail on the device, which a damaged file would do on the CPU, too
     def broken(data, options, providers, **_):
@@ -231,9 +231,9 @@ def test_cuda_where_onnxruntime_has_none(tmp_path, monkeypatch):
 
     monkeypatch.setattr(onnxruntime, "InferenceSession", broken)
     with pytest.raises(ResourceError, match=r"--onnx-provider cuda: onnxruntime cannot use it \(CUDA failure 100"):
-        open_network(path, provider="cuda")
+        Network(path, provider="cuda")
     with pytest.raises(DataError, match="cannot load it"):
-        open_network(nw.write(tmp_path / "m.onnx", REFUSED["unknown operator"][0]), provider="cuda")
+        Network(nw.write(tmp_path / "m.onnx", REFUSED["unknown operator"][0]), provider="cuda")
 
 
 @pytest.mark.parametrize(
@@ -241,7 +241,7 @@ def test_cuda_where_onnxruntime_has_none(tmp_path, monkeypatch):
     [(EYE, [0, np.nan, 0], "NaN or infinity"), (EYE, [0, np.inf, 0], "NaN or infinity"), (0 * EYE, [2, 2, 2], "same number")],
 )
 def test_outputs_that_say_nothing_are_refused(tmp_path, weights, bias, message):
-    network = open_network(nw.write(tmp_path / "m.onnx", nw.linear(weights, np.array(bias, float))))
+    network = Network(nw.write(tmp_path / "m.onnx", nw.linear(weights, np.array(bias, float))))
     with pytest.raises(DataError, match=message):
         network.run(np.random.default_rng(0).random((4, 4, 3), np.float32))
 
@@ -249,7 +249,7 @@ def test_outputs_that_say_nothing_are_refused(tmp_path, weights, bias, message):
 def test_labels_instead_of_scores_are_refused(tmp_path):
     x, y = nw.value("x", (1, 3, "h", "w")), nw.value("y", (1, 1, "h", "w"), 7)
     argmax = nw.node("ArgMax", ["x"], ["y"], attributes=nw.whole_attribute("axis", 1))
-    network = open_network(nw.write(tmp_path / "m.onnx", nw.model(nw.graph([argmax], [], [x], [y]))))
+    network = Network(nw.write(tmp_path / "m.onnx", nw.model(nw.graph([argmax], [], [x], [y]))))
     with pytest.raises(DataError, match="leave argmax out"):
         network.run(np.random.default_rng(0).random((4, 4, 3), np.float32))
 
@@ -257,7 +257,7 @@ def test_labels_instead_of_scores_are_refused(tmp_path):
 def test_a_size_that_the_graph_cannot_take_is_said(tmp_path):
     x, y = nw.value("x", (1, 3, "h", "w")), nw.value("y", (1, 3, "h", "w"))
     graph = nw.graph([nw.node("Add", ["x", "k"], ["y"])], [nw.tensor("k", np.ones((1, 3, 8, 8)))], [x], [y])
-    network = open_network(nw.write(tmp_path / "m.onnx", nw.model(graph)))
+    network = Network(nw.write(tmp_path / "m.onnx", nw.model(graph)))
     with pytest.raises(DataError, match="cannot run it on an input of 1 x 3 x 5 x 5"):
         network.run(np.random.default_rng(0).random((5, 5, 3), np.float32))
 
@@ -265,11 +265,11 @@ def test_a_size_that_the_graph_cannot_take_is_said(tmp_path):
 def test_names_that_are_not_utf8_are_refused(tmp_path):
     """onnxruntime loads such a network, and fails only where the name is read."""
     path = nw.depth_network(tmp_path / "a.onnx", size=(8, 12))
-    name = open_network(path).session.get_inputs()[0].name.encode()
+    name = Network(path).session.get_inputs()[0].name.encode()
     file = tmp_path / "a.onnx"
     file.write_bytes(file.read_bytes().replace(name, b"\xff" * len(name)))
     with pytest.raises(DataError, match=r"a\.onnx"):
-        open_network(path)
+        Network(path)
 
 
 # Disparity from networks with known answers, and from depth that is consistent between views at some pixels.
@@ -299,7 +299,7 @@ def test_normalisation_and_sign(tmp_path, layout, output, sign):
     how = Preprocessing(32, 32, MEAN, STD, output)
     if output == "depth":
         image = 0.5 + 0.5 * image  # keeps the response above 0
-    found = network_disparity(open_network(nw.depth_network(tmp_path / "d.onnx", layout=layout)), how, image)
+    found = network_disparity(Network(nw.depth_network(tmp_path / "d.onnx", layout=layout)), how, image)
     assert found.dtype == np.float32 and found.shape == (32, 64) and (found.min(), found.max()) == (0, 1)
     np.testing.assert_allclose(found, scaled(response(image) ** sign), atol=2e-6)
 
@@ -308,7 +308,7 @@ def test_resizing_keeps_pixel_centres(tmp_path):
     """A ramp stays a ramp through a network of a quarter of the size, flat only beyond its outermost centres."""
     x, y = np.meshgrid(np.arange(96) + 0.5, np.arange(64) + 0.5)
     image = np.repeat((x / 200 + y / 150)[..., None], 3, 2).astype(np.float32)
-    network = open_network(nw.depth_network(tmp_path / "d.onnx", size=(16, 24)))
+    network = Network(nw.depth_network(tmp_path / "d.onnx", size=(16, 24)))
     found = network_disparity(network, Preprocessing(0, 0, (0.0,) * 3, (1.0,) * 3, "disparity"), image)
     np.testing.assert_allclose(found, scaled(x.clip(2, 94) / 200 + y.clip(2, 62) / 150), atol=1e-5)
 
@@ -333,19 +333,19 @@ def test_resize_is_linear_up_and_mean_down():
 
 
 def test_depth_that_is_not_positive_is_refused(tmp_path):
-    network = open_network(nw.depth_network(tmp_path / "d.onnx"))
+    network = Network(nw.depth_network(tmp_path / "d.onnx"))
     with pytest.raises(DataError, match=r"smallest depth is .*JSON file beside it"):
         network_disparity(network, Preprocessing(32, 32, (6.0,) * 3, (0.2,) * 3, "depth"), photo(32, 32))
 
 
 def test_an_output_that_is_no_map_is_refused(tmp_path):
-    network = open_network(nw.segmentation_network(tmp_path / "s.onnx"))
+    network = Network(nw.segmentation_network(tmp_path / "s.onnx"))
     with pytest.raises(DataError, match=r"shape \(1, 21, 384, 384\), not that of one depth map"):
         network_disparity(network, DEFAULTS, photo(32, 32))
 
 
 def described(path):
-    return describe(open_network(path), DEFAULTS, "depth")
+    return describe(Network(path), DEFAULTS, "depth")
 
 
 def test_the_side_file_comes_before_what_is_usual(tmp_path):
@@ -526,7 +526,7 @@ def brute_boundary(labels):
 def test_maps_equal_the_formula(tmp_path, options):
     """Softmax, largest probability, 1 - background and falloff, for logits and probabilities, in both layouts."""
     image, labels = shapes()
-    maps = network_semantics(open_network(nw.segmentation_network(tmp_path / "s.onnx", **options)), PLAIN, image)
+    maps = network_semantics(Network(nw.segmentation_network(tmp_path / "s.onnx", **options)), PLAIN, image)
     weights, bias = nw.segmentation_weights()
     p = np.exp(image.astype(float) @ weights.T + bias)
     p /= p.sum(-1, keepdims=True)
@@ -544,7 +544,7 @@ def test_a_coarse_network_puts_labels_where_they_are(tmp_path):
     """At a quarter of the size each label covers its object; a shift of half a pixel would show."""
     image, labels = np.zeros((128, 256, 3), np.float32), np.zeros((128, 256), int)
     image[32:80, 64:160, 0], labels[32:80, 64:160] = 0.9, 3
-    network = open_network(nw.segmentation_network(tmp_path / "s.onnx", size=(32, 64)))
+    network = Network(nw.segmentation_network(tmp_path / "s.onnx", size=(32, 64)))
     p = class_probabilities(network, PLAIN, image)
     found = p.argmax(-1)
     # the object's outline lies on the coarse grid, so errors are the same on all sides
@@ -558,7 +558,7 @@ def test_a_coarse_network_puts_labels_where_they_are(tmp_path):
 def test_another_number_of_classes_is_refused(tmp_path, count):
     path = nw.write(tmp_path / "s.onnx", nw.linear(np.random.default_rng(0).normal(size=(count, 3)), np.zeros(count)))
     with pytest.raises(DataError, match=f"{count}, 32, 64.*21 PASCAL VOC classes"):
-        class_probabilities(open_network(path), PLAIN, shapes()[0])
+        class_probabilities(Network(path), PLAIN, shapes()[0])
 
 
 def test_boundary_scales_with_the_width_and_is_nothing_without_labels():

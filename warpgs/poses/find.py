@@ -27,7 +27,7 @@ from warpgs.files import (
 from warpgs.io.folder import all_readers
 from warpgs.io.image_files import MAX_PIXELS, unread_note
 from warpgs.poses.mapping import EXHAUSTIVE, LEARNED, Mapping, camera_groups, cameras_of, check_installed, find_model
-from warpgs.poses.matching import Matcher, open_matcher, write_matches
+from warpgs.poses.matching import Matcher, write_matches
 from warpgs.poses.photographs import (
     Photograph,
     find_photographs,
@@ -276,7 +276,7 @@ def find_poses(
     source, out = Path(source), Path(out)
     _check(source, out, allow_outside)
     check_installed()
-    network = None if matcher is None else open_matcher(matcher, threads)
+    network = None if matcher is None else Matcher(matcher, threads)
     with filling(out) as scene:
         work, kind = scene / "work", "video" if is_video(source) else "photographs"
         digest = source_digest(source, allow_outside)  # before anything is written, which may be below the source

@@ -21,7 +21,7 @@ from warpgs.errors import DataError, ResourceError, UsageError, install_extras
 from warpgs.files import read_input, remove_leftovers, write_bytes, write_text
 from warpgs.folders import temporary_folder
 from warpgs.onnx import check_onnx, start_session
-from warpgs.priors.networks import HALF, IMAGENET, open_network, side_file
+from warpgs.priors.networks import HALF, IMAGENET, Network, side_file
 from warpgs.priors.views import CLASSES
 
 if TYPE_CHECKING:
@@ -382,7 +382,7 @@ def export_network(request: ExportRequest, out: Path) -> list[str]:
     description = json.dumps(values) + "\n"
     with folder_for_files() as folder:
         write_bytes(trial := folder / "network.onnx", data)
-        found = open_network(trial).run(image[0].permute(1, 2, 0).numpy())
+        found = Network(trial).run(image[0].permute(1, 2, 0).numpy())
     difference = float(np.abs(found - wanted).max() / wanted.std())
     if not difference < MAX_DIFFERENCE:
         raise DataError(

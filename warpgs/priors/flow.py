@@ -14,7 +14,7 @@ from warpgs import geometry
 from warpgs.errors import DataError, UsageError
 from warpgs.files import read_input, unread_reason
 from warpgs.geometry import check_pinhole
-from warpgs.onnx import first_line, read_model, start_session
+from warpgs.onnx import Model
 from warpgs.scene import Camera, PointCloud, View, ViewDepth
 
 # Depth from optical flow between views with known poses: epipolar lines, checks, and the blending of source views.
@@ -452,13 +452,12 @@ def _network(path: Path, value_range: str) -> Callable[[View, View], np.ndarray]
     """Return a function for the flow by a network of two images [1, 3, h, w]; its last output [1, 2, h, w] is used."""
     import cv2
 
-    session = start_session(read_model(path), path, "cpu", 0)
-    inputs = session.get_inputs()
-    if len(inputs) != 2 or any(len(i.shape) != 4 for i in inputs):
-        shapes = ", ".join(f"{i.name} {i.shape}" for i in inputs)
-        raise DataError(f"{path}: the inputs are {shapes}, but a flow network takes two images [1, 3, h, w]; export it again")
+    network = Model(path)
+    shapes = [shape for _, _, shape in network.inputs]
+    if len(shapes) != 2 or any(len(shape) != 4 for shape in shapes):
+        raise DataError(f"{path}: has inputs of {shapes}, but a flow network takes two images [1, 3, h, w]; export it again")
     factor, offset = RANGES[value_range]
-    fixed = [n if isinstance(n, int) else 0 for n in inputs[0].shape[2:]]
+    fixed = [n if isinstance(n, int) else 0 for n in shapes[0][2:]]
 
     def compute(first: View, second: View) -> np.ndarray:
         h, w = first.image.shape[:2]
@@ -467,10 +466,7 @@ def _network(path: Path, value_range: str) -> Callable[[View, View], np.ndarray]
             (cv2.resize(v.image, size, interpolation=cv2.INTER_LINEAR) * factor + offset).astype(np.float32).transpose(2, 0, 1)
             for v in (first, second)
         ]
-        try:
-            found = session.run(None, {i.name: t[None] for i, t in zip(inputs, tensors)})
-        except Exception as e:
-            raise DataError(f"{path}: the network failed on {size[0]} x {size[1]} px ({first_line(e)})") from e
+        found = network.outputs_of(*(t[None] for t in tensors))
         flows = [f for f in found if np.shape(f) == (1, 2, size[1], size[0])]
         if not flows:
             raise DataError(
