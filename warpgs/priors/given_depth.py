@@ -10,8 +10,7 @@ import numpy as np
 
 from warpgs import geometry
 from warpgs.errors import DataError, UsageError
-from warpgs.priors.flow import nearest_views, pixel_grid
-from warpgs.priors.sweep import no_depth
+from warpgs.priors.flow import nearest_views, no_depth, pixel_grid
 from warpgs.scene import DEPTH_KINDS, Camera, GivenDepth, PointCloud, View, ViewDepth
 
 # Given depth: converted to the scene's units, checked against consistent depth, and used instead of the depth of a

@@ -92,7 +92,7 @@ def _places(view: View) -> Places:
     import cv2
 
     features = sift_features(view, MAX_PIXELS, MAX_FEATURES)
-    columns, rows = features.pixels.astype(int).T
+    columns, rows = features[0].astype(int).T
     gray = cv2.cvtColor(view.image, cv2.COLOR_RGB2GRAY)
     fine, coarse = (cv2.GaussianBlur(gray, (0, 0), sigma) for sigma in (FINE, COARSE))
     bands = [cv2.blur((a - b) ** 2, (PATCH, PATCH))[rows, columns].astype(float) for a, b in ((gray, fine), (fine, coarse))]
