@@ -31,7 +31,6 @@ from warpgs.poses.matching import Matcher, write_matches
 from warpgs.poses.photographs import (
     Photograph,
     find_photographs,
-    folder_notes,
     image_root,
     is_heic,
     is_video,
@@ -94,25 +93,22 @@ def neighbours(found: Mapping) -> list[tuple[int, int, float]]:
 def advice(found: Mapping, names: Sequence[str]) -> list[str]:
     """Return what to photograph next, a sentence each, the most urgent first; empty if nothing is missing."""
     said = []
-    for i in range(len(names)):
-        if i not in found.views:
-            best = partners(found, i)
-            if found.keypoints[i] < MIN_KEYPOINTS:
-                said.append(f"take {names[i]} again: sharp, in good light, with a textured object in view")
-            elif best:
-                said.append(f"take two or three photographs between {names[i]} and {names[best[0][0]]}, in small steps")
-            else:
-                said.append(f"take photographs from {names[i]} to the others, each overlapping the previous one by two thirds")
-    tree = neighbours(found)
-    for i, j, angle in sorted(tree, key=lambda t: -t[2]):
+    for i in (i for i in range(len(names)) if i not in found.views):
+        best = partners(found, i)
+        if found.keypoints[i] < MIN_KEYPOINTS:
+            said.append(f"take {names[i]} again: sharp, in good light, with a textured object in view")
+        elif best:
+            said.append(f"take two or three photographs between {names[i]} and {names[best[0][0]]}, in small steps")
+        else:
+            said.append(f"take photographs from {names[i]} to the others, each overlapping the previous one by two thirds")
+    for i, j, angle in sorted(neighbours(found), key=lambda t: -t[2]):
         if angle > WIDE_ANGLE:
-            said.append(
-                f"take one or two photographs between {names[i]} and {names[j]}, whose axes differ by {angle:.0f} degrees"
-            )
+            pair = f"{names[i]} and {names[j]}"
+            said.append(f"take one or two photographs between {pair}, whose axes differ by {angle:.0f} degrees")
     for i in found.views:
-        best = [(n, j) for j, n in partners(found, i) if j in found.views]
-        if best and best[0][0] < WEAK_MATCHES:
-            said.append(f"take a photograph between {names[i]} and {names[best[0][1]]}, which share only {best[0][0]} matches")
+        j, n = next((link for link in partners(found, i) if link[0] in found.views), (i, WEAK_MATCHES))
+        if n < WEAK_MATCHES:
+            said.append(f"take a photograph between {names[i]} and {names[j]}, which share only {n} matches")
     more = len(said) - MAX_ADVICE
     return said[:MAX_ADVICE] + ([f"and {more} more; begin with those above"] if more > 0 else [])
 
@@ -155,18 +151,23 @@ def record_of(found: Mapping, photographs: Sequence[Photograph], digest: str, no
             "matches": {names[j]: n for j, n in partners(found, i)[:SHOWN_PARTNERS]},
             "reason": None if registered else reason(found, i, names),
         })  # fmt: skip
-    remarks = [summary(found, len(names))]
+    focal = ", ".join(f"{c['focal']:.0f} px of {max(c['width'], c['height'])}" for c in found.cameras)
+    count = f"{len(found.views)} photographs"
+    remarks = [
+        f"poses found for {len(found.views)} of {len(names)} photographs from {found.points:,} points, mean reprojection error "
+        f"{found.error:.2f} px, {found.method} mapping, focal length {focal}"
+    ]
     if found.kept_focal:
-        remarks.append(f"the focal length is taken from EXIF, because {len(found.views)} photographs cannot improve it")
+        remarks.append(f"the focal length is taken from EXIF, because {count} cannot improve it")
     elif found.kept_focal is False:
         remarks.append(
-            f"the EXIF focal length does not fit the {len(found.views)} photographs, which may be cropped; the focal length "
-            "was estimated instead. Such an estimate is often 5 % off, at worst 20 % or more"
+            f"the EXIF focal length does not fit the {count}, which may be cropped; the focal length was estimated instead. "
+            "Such an estimate is often 5 % off, at worst 20 % or more"
         )
     elif len(found.views) <= FEW and any(photographs[i].focal is None for i in found.views):
         remarks.append(
-            f"EXIF holds no focal length. An estimate from {len(found.views)} photographs is often 5 % off, at worst 20 % or "
-            "more, and so is depth. Add photographs from more directions"
+            f"EXIF holds no focal length. An estimate from {count} is often 5 % off, at worst 20 % or more, and so is depth. "
+            "Add photographs from more directions"
         )
     if found.method == "global":
         remarks.append(
@@ -174,21 +175,11 @@ def record_of(found: Mapping, photographs: Sequence[Photograph], digest: str, no
             "differ a little from run to run"
         )
     return {
-        "format": FORMAT, "source_sha256": digest, "photographs": rows,
-        "notes": [*notes, *remarks],
+        "format": FORMAT, "source_sha256": digest, "photographs": rows, "notes": [*notes, *remarks],
         "advice": advice(found, names), "mean_reprojection_error_px": found.error, "points": found.points,
-        "method": found.method, "pairs_tried": found.tried, "pairs_matched": len([n for n in found.matches.values() if n]),
+        "method": found.method, "pairs_tried": found.tried, "pairs_matched": sum(n > 0 for n in found.matches.values()),
         "cameras": list(found.cameras), "pycolmap": found.version,
     }  # fmt: skip
-
-
-def summary(found: Mapping, count: int) -> str:
-    """Return a sentence on how many of ``count`` photographs have a pose, and how well they fit."""
-    focal = ", ".join(f"{c['focal']:.0f} px of {max(c['width'], c['height'])}" for c in found.cameras)
-    return (
-        f"poses found for {len(found.views)} of {count} photographs from {found.points:,} points, mean reprojection error "
-        f"{found.error:.2f} px, {found.method} mapping, focal length {focal}"
-    )
 
 
 def report_lines(record: dict[str, Any]) -> list[str]:
@@ -198,17 +189,10 @@ def report_lines(record: dict[str, Any]) -> list[str]:
     lines = [*record["notes"], ""]
     for p in rows:
         best = ", ".join(f"{name} ({n})" for name, n in list(p["matches"].items())[:2])
-        if p["registered"]:
-            lines.append(
-                f"{p['name']:<{width}}  pose    {p['keypoints']:>6,} keypoints, {p['points']:>5,} points, matches {best}"
-            )
-        else:
-            lines.append(f"{p['name']:<{width}}  NO POSE: it {p['reason']}")
-    lines += [
-        "",
-        "What to photograph next:" if record["advice"] else "Nothing more is needed: all photographs are well linked.",
-    ]
-    return lines + [f"- {a}" for a in record["advice"]]
+        pose = f"pose    {p['keypoints']:>6,} keypoints, {p['points']:>5,} points, matches {best}"
+        lines.append(f"{p['name']:<{width}}  {pose if p['registered'] else 'NO POSE: it ' + str(p['reason'])}")
+    next_step = "What to photograph next:" if record["advice"] else "Nothing more is needed: all photographs are well linked."
+    return [*lines, "", next_step, *(f"- {a}" for a in record["advice"])]
 
 
 def read_poses_record(folder: Path) -> dict[str, Any]:
@@ -237,28 +221,27 @@ def needs_poses(path: Path) -> bool:
     try:
         if is_video(path):
             return True
-        return path.is_dir() and all(r.probe(path) is None for r in all_readers()) and bool(find_photographs(path))
+        return path.is_dir() and all(r.probe(path) is None for r in all_readers()) and bool(find_photographs(path)[0])
     except OSError:  # the scene reader reports the error
         return False
 
 
 def source_digest(source: Path, allow_outside: bool = False) -> str:
     """Return the SHA-256 over the names and contents of a source's photographs, or of a video."""
-    total = hashlib.sha256()
+
+    def digest(path: Path) -> str:
+        try:
+            return input_digest(path)
+        except OSError as e:
+            raise DataError(f"{path}: cannot be read ({unread_reason(e)}); fix its permissions or copy it again") from e
+
     if is_video(source):
-        return _digest(source)
-    root = image_root(source)
+        return digest(source)
+    root, total = image_root(source), hashlib.sha256()
     for path in photographs_inside(source, allow_outside):
         name = path.relative_to(root).as_posix().encode("utf-8", "surrogateescape")
-        total.update(name + b"\0" + bytes.fromhex(_digest(path)))
+        total.update(name + b"\0" + bytes.fromhex(digest(path)))
     return total.hexdigest()
-
-
-def _digest(path: Path) -> str:
-    try:
-        return input_digest(path)
-    except OSError as e:
-        raise DataError(f"{path}: cannot be read ({unread_reason(e)}); fix its permissions or copy it again") from e
 
 
 def find_poses(
@@ -338,15 +321,16 @@ def _something_else(folder: Path) -> str:
 def _check(source: Path, out: Path, allow_outside: bool) -> None:
     """Raise an error for an unusable source or target, before any work."""
     try:
-        if not is_video(source) and not source.is_dir():
-            there = NOT_REGULAR if source.exists() else "does not exist"
-            what = "is not a supported video (mp4, mov, m4v, avi, mkv, webm)" if source.is_file() else there
-            raise DataError(f"{source}: {what}; give a folder of photographs, or a video")
-        if not is_video(source) and (other := _something_else(source)):
-            raise UsageError(f"{source}: {other}")
-        if not is_video(source) and not photographs_inside(source, allow_outside):
-            none = "holds no supported image (JPEG, PNG, BMP, TIFF, WebP, AVIF or HEIC); give the folder of photographs"
-            raise DataError(f"{source}: {unread_note(source) or none}")
+        if not is_video(source):
+            if not source.is_dir():
+                there = NOT_REGULAR if source.exists() else "does not exist"
+                what = "is not a supported video (mp4, mov, m4v, avi, mkv, webm)" if source.is_file() else there
+                raise DataError(f"{source}: {what}; give a folder of photographs, or a video")
+            if other := _something_else(source):
+                raise UsageError(f"{source}: {other}")
+            if not photographs_inside(source, allow_outside):
+                none = "holds no supported image (JPEG, PNG, BMP, TIFF, WebP, AVIF or HEIC); give the folder of photographs"
+                raise DataError(f"{source}: {unread_note(source) or none}")
         if out.exists() and not (out.is_dir() and is_empty(out)):
             raise UsageError(f"{out} exists already; choose another --out, or remove it")
     except OSError as e:
@@ -365,8 +349,8 @@ def _prepared(
         taken = min(frames, total)
         notes.append(f"{taken} of {total} frames are used: the sharpest frame of each of {taken} equal parts of the video")
     root = image_root(root)
-    paths, unread = find_photographs(root), unread_note(root)
-    notes += folder_notes(root)
+    (paths, about), unread = find_photographs(root), unread_note(root)
+    notes += about
     if unread:
         notes.append(f"left out: {unread}")
     if len(paths) < MIN_PHOTOGRAPHS:
@@ -426,18 +410,17 @@ def _check_found(source: Path, found: Mapping, photographs: list[Photograph]) ->
     count, blank = len(photographs), sum(k < MIN_KEYPOINTS for k in found.keypoints)
     largest = max(found.matches.values(), default=0)
     if 2 * blank >= count:
-        most = max(found.keypoints)
         why = (
             f"{blank} of {count} photographs show almost nothing that can be matched (fewer than {MIN_KEYPOINTS} keypoints; "
-            f"the best one has {most:,}): a blank wall, darkness or blur. Take sharp photographs of textured things, in good "
-            "light"
+            f"the best one has {max(found.keypoints):,}): a blank wall, darkness or blur. Take sharp photographs of textured "
+            "things, in good light"
         )
     elif not largest:
         why = f"no two of {count} photographs could be matched. Take photographs that overlap by two thirds, in small steps"
     else:
         why = (
             f"at most {len(found.views)} of {count} photographs fit together, and {MIN_PHOTOGRAPHS} are needed. Take "
-            f"photographs that overlap by two thirds, moving the camera, not only turning it. "
+            "photographs that overlap by two thirds, moving the camera, not only turning it. "
             f"So far {_links(found, photographs)}"
         )
     raise DataError(f"{source}: no poses: {why}")

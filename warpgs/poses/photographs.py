@@ -303,8 +303,8 @@ def _is_run(folder: Path) -> bool:
     return (folder / "config.json").is_file() and any((folder / name).is_file() for name in RUN_FILES)
 
 
-def _sorted_out(folder: Path) -> tuple[list[Path], list[str]]:
-    """Return the image files of a folder of photographs, and the names of the runs below it, whose images are left out."""
+def find_photographs(folder: Path) -> tuple[list[Path], list[str]]:
+    """Return the image files of a folder by name, without masks and earlier runs, and notes on these runs and on subfolders."""
     root = image_root(folder)
     is_run = functools.cache(_is_run)
     files, runs = [], set()
@@ -315,28 +315,18 @@ def _sorted_out(folder: Path) -> tuple[list[Path], list[str]]:
             runs.add(run.relative_to(root).as_posix())
         elif not {p.name for p in parents} & set(MASK_FOLDERS):
             files.append(path)
-    return files, sorted(runs)
-
-
-def find_photographs(folder: Path) -> list[Path]:
-    """Return the image files of a folder, sorted by name, without masks and earlier runs; no file is opened."""
-    return _sorted_out(folder)[0]
-
-
-def folder_notes(folder: Path) -> list[str]:
-    """Return notes on skipped runs, and on the folders of the photographs if there are several."""
-    root = image_root(folder)
-    files, runs = _sorted_out(folder)
     count = Counter(p.parent.relative_to(root).as_posix() for p in files)
     places = [f"{n} in {'the folder itself' if name == '.' else name}" for name, n in sorted(count.items())]
     more = [f"{len(places) - SHOWN_FOLDERS} more folders"] if len(places) > SHOWN_FOLDERS else []
-    notes = [f"skipped as earlier runs: {', '.join(runs)}"] if runs else []
-    return [*notes, *([f"photographs by folder: {', '.join([*places[:SHOWN_FOLDERS], *more])}"] if len(places) > 1 else [])]
+    notes = [f"skipped as earlier runs: {', '.join(sorted(runs))}"] if runs else []
+    if len(places) > 1:
+        notes.append(f"photographs by folder: {', '.join([*places[:SHOWN_FOLDERS], *more])}")
+    return files, notes
 
 
 def photographs_inside(folder: Path, allow_outside: bool) -> list[Path]:
     """Return the image files as `find_photographs` does; a DataError for a link out of the folder, if not allowed."""
-    found = find_photographs(folder)
+    found, _ = find_photographs(folder)
     return found if allow_outside else [inside(p, folder, "the folder of photographs") for p in found]
 
 
