@@ -13,7 +13,7 @@ from warpgs.errors import DataError
 from warpgs.poses import find
 from warpgs.poses.find import find_poses
 from warpgs.poses.mapping import find_model
-from warpgs.poses.matching import MAX_KEYPOINTS, WHOLE, Features, Matcher, mutual_matches, Matcher, quarter_turns
+from warpgs.poses.matching import MAX_KEYPOINTS, WHOLE, Features, Matcher, mutual_matches, quarter_turns
 
 AT = np.array([[3.0, 4.0], [60.0, 20.0], [5.0, 6.0]])
 SCORES = np.array([0.2, 0.9, 0.0])

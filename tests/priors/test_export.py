@@ -12,7 +12,7 @@ import torch
 
 from warpgs.app.cli import main
 from warpgs.errors import DataError, ResourceError, UsageError
-from warpgs.poses.matching import mutual_matches, Matcher
+from warpgs.poses.matching import Matcher, mutual_matches
 from warpgs.priors.export import ExportRequest, build, export_network
 from warpgs.priors.networks import Network
 from warpgs.priors.views import PriorConfig, view_priors
