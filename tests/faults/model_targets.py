@@ -273,8 +273,8 @@ def side_nonsense(values: dict) -> str:
 
 register(
     Target(
-        "description of a network", side_files, lambda root, path: networks.read_side_file(root / "m.onnx"), (networks.read_side_file,),
-        (json_value, json_value, text_number), nonsense=side_nonsense,
+        "description of a network", side_files, lambda root, path: networks.read_side_file(root / "m.onnx"),
+        (networks.read_side_file,), (json_value, json_value, text_number), nonsense=side_nonsense,
     )
 )  # fmt: skip
 
