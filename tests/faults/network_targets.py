@@ -117,7 +117,7 @@ def flow_networks(root: Path) -> list[Path]:
 
 register(
     Target(
-        "flow network", flow_networks, lambda root, path: flow._network(path, "255"), (flow._network,),
+        "flow network", flow_networks, lambda root, path: flow._network(path), (flow._network,),
         (onnx_field, onnx_field, onnx_field), lines=0.45, share=0.3,
     )
 )  # fmt: skip
