@@ -293,30 +293,24 @@ def complete_disparity(image: np.ndarray, depth: np.ndarray, valid: np.ndarray, 
     """Fill the gaps of a depth map [u] in inverse depth, not across colour edges; return [H, W] in [0, 1]."""
     # The ratio of smoothed w / z and smoothed w, by the fast global smoother (Min et al. 2014), which the image guides. The
     # weight w is small where 1 / z changes much when the match shifts by one pixel.
+    import cv2
+
     valid = valid & (depth > 0) & np.isfinite(depth)
     if not valid.any():
         raise DataError("no pixel has a depth, so there is nothing to complete; use --depth-model, or other views")
-    inverse = np.zeros(depth.shape, np.float64)
-    inverse[valid] = 1 / depth[valid].astype(np.float64)
-    inverse[valid] = np.clip(inverse[valid], *np.percentile(inverse[valid], CLIP))
-    low, high = inverse[valid].min(), inverse[valid].max()
+    inverse = 1 / depth[valid].astype(np.float64)
+    inverse = np.clip(inverse, *np.percentile(inverse, CLIP))
+    low, high = inverse.min(), inverse.max()
     if not high > low:
         return np.zeros(depth.shape, np.float32)
-    error = sensitivity[valid] * inverse[valid] ** 2  # |d(1/z)/dpx|
+    error = sensitivity[valid] * inverse**2  # |d(1/z)/dpx|
     known = error[np.isfinite(error)]
     scale = max(float(np.median(known)) if len(known) else 0.0, 1e-6 * high)
     ratio = np.minimum(np.where(np.isfinite(error), error, np.inf) / scale, MAX_ERROR_RATIO)
-    weight = np.zeros(depth.shape, np.float32)
-    weight[valid] = 1 / (1 + ratio**2)
-    return unit_range(_spread(image, ((inverse - low) / (high - low)).astype(np.float32), weight))
-
-
-def _spread(image: np.ndarray, values: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Return values [H, W] smoothed by weight: from nearby pixels if these have weight, else from farther ones."""
-    import cv2
-
+    values, weight = np.zeros((2, *depth.shape), np.float32)
+    values[valid], weight[valid] = (inverse - low) / (high - low), 1 / (1 + ratio**2)
     guide = np.round(np.clip(image, 0, 1) * 255).astype(np.uint8)
-    received = np.full(values.shape, MEAN_WEIGHT)
+    received = np.full(depth.shape, MEAN_WEIGHT)
     total = received * np.average(values, weights=weight)
     with single_threaded_opencv():
         for reach, fraction in REACHES:
@@ -324,4 +318,4 @@ def _spread(image: np.ndarray, values: np.ndarray, weight: np.ndarray) -> np.nda
             smoother = cv2.ximgproc.createFastGlobalSmootherFilter(guide, reach**2, COLOR_SIGMA)
             total += fraction * smoother.filter(weight * values)
             received += fraction * smoother.filter(weight)
-    return total / received
+    return unit_range(total / received)
