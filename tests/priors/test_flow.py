@@ -161,6 +161,8 @@ def test_depth_of_a_view_from_flow():
     assert nothing.coverage == 0 and nothing.notes == ("no flow to 001.png", "no flow to 002.png")
     one_way = flow_depth(views, 0, lambda i, j: flow(i, j) if i == 0 else None)
     assert one_way.coverage > 0.8 and "not checked by a round trip" in one_way.notes[0]
+    aside = flow_depth(views, 0, lambda i, j: flow(i, j) + np.float32([0, 9]) if i == 0 else None)
+    assert aside.coverage < 0.01
     unknown = flow_depth(views, 0, lambda i, j: np.full((120, 160, 2), np.nan, np.float32))
     assert unknown.coverage == 0 and "survives" in unknown.notes[0]
 

@@ -345,11 +345,10 @@ def test_where_the_cache_lies(monkeypatch, tmp_path):
     monkeypatch.setattr(Path, "home", lambda: home)
     for name in ("WARPGS_CACHE", "XDG_CACHE_HOME", "LOCALAPPDATA"):
         monkeypatch.delenv(name, raising=False)
-    for platform, xdg, folder in (
-        ("linux", None, home / ".cache" / "warpgs"), ("linux", "relative", home / ".cache" / "warpgs"),
-        ("linux", str(system), system / "warpgs"), ("darwin", str(system), home / "Library" / "Caches" / "warpgs"),
-        ("win32", str(system), home / "AppData" / "Local" / "warpgs" / "Cache"),
-    ):  # fmt: skip
+    linux, apple, windows = home / ".cache" / "warpgs", home / "Library" / "Caches" / "warpgs", home / "AppData" / "Local"
+    cases = [("linux", None, linux), ("linux", "relative", linux), ("linux", str(system), system / "warpgs")]
+    cases += [("darwin", str(system), apple), ("win32", str(system), windows / "warpgs" / "Cache")]
+    for platform, xdg, folder in cases:
         monkeypatch.setattr(sys, "platform", platform)
         if xdg:
             monkeypatch.setenv("XDG_CACHE_HOME", xdg)

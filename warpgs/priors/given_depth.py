@@ -77,21 +77,16 @@ def check_given(views: Sequence[View]) -> None:
     """Check the given maps of views that were made in Python; `load_scene` has checked those that it read."""
     for v in views:
         size = v.image.shape[:2]
-        maps = {} if v.depth is None else {"depth": v.depth.values, "confidence": v.depth.confidence}
-        for name, found in {**maps, "normals": v.normals}.items():
-            if found is None:
+        depth, sure = (None, None) if v.depth is None else (v.depth.values, v.depth.confidence)
+        maps = [("depth", depth, size, 0, np.inf), ("confidence", sure, size, 0, 1)]
+        for name, values, wanted, low, high in (*maps, ("normals", v.normals, (*size, 3), -1.01, 1.01)):
+            if values is None:
                 continue
-            wanted = (*size, 3) if name == "normals" else size
-            if found.shape != wanted:
-                raise UsageError(
-                    f"view {v.name}: the map of {name} has shape {list(found.shape)}, the image needs {list(wanted)}"
-                )
-            low, high = (-1.01, 1.01) if name == "normals" else (0, 1 if name == "confidence" else np.inf)
-            if not (np.isfinite(found).all() and found.min() >= low and found.max() <= high):
-                raise UsageError(
-                    f"view {v.name}: the map of {name} holds values that are non-finite or out of range; use 0 for missing "
-                    "values"
-                )
+            what = f"view {v.name}: the map of {name}"
+            if values.shape != wanted:
+                raise UsageError(f"{what} has shape {list(values.shape)}, the image needs {list(wanted)}")
+            if not (np.isfinite(values).all() and values.min() >= low and values.max() <= high):
+                raise UsageError(f"{what} holds values that are non-finite or out of range; use 0 for missing values")
         if v.depth is not None and v.depth.kind not in DEPTH_KINDS:
             raise UsageError(f"view {v.name}: depth kind {v.depth.kind!r} is not one of {', '.join(DEPTH_KINDS)}")
 
