@@ -113,7 +113,7 @@ DOORS = {
     "artefact": ("pipeline.farm.job", file_digest),
     "render.png": ("files", lambda p: read_file(p, p.parent)),
     "model.onnx": ("onnx", Network),
-    "flow.onnx": ("onnx", lambda p: flow._network(p)),
+    "flow.onnx": ("onnx", flow._network),
     "side.onnx": ("priors.networks", side_file),
     "a.flo": ("priors.flow", flow.read_flo),
     "b.flo": ("priors.flow", flow_folder),
