@@ -326,11 +326,6 @@ def test_a_size_against_the_graph_is_refused(tmp_path):
         described(path)
 
 
-def test_unit_range_of_a_wall_is_zero():
-    assert (unit_range(np.full((3, 4), 7.0)) == 0).all()
-    assert unit_range(np.array([[3.0, 5.0, 4.0]])).tolist() == [[0, 1, 0.5]]
-
-
 # completion
 
 
@@ -392,6 +387,7 @@ def test_lone_wild_and_missing_depths():
     assert np.isfinite(complete_disparity(image, 1 / inverse, everywhere, unknown)).all()
     lone[30, 40] = True
     assert (complete_disparity(image, np.where(lone, 2.0, 0), lone, np.where(lone, 0.1, np.inf)) == 0).all()
+    assert (unit_range(np.full((3, 4), 7.0)) == 0).all() and unit_range(np.array([[3.0, 5, 4]])).tolist() == [[0, 1, 0.5]]
     depth, sensitivity = 1 / inverse, np.full(near.shape, 0.1)
     depth[0, 0], sensitivity[0, 0] = 1e-6, 0  # a million times nearer than all else, and quite sure of it
     found = complete_disparity(image, depth, everywhere, sensitivity)

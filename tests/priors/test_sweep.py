@@ -17,7 +17,6 @@ from warpgs.priors.sweep import (
     complete,
     consistent_depth,
     inverse_depths_cpu,
-    matching_costs_cpu,
     plane_homographies,
     plane_homography,
     plane_inverses,
@@ -56,24 +55,6 @@ def test_planes_are_half_a_pixel_apart():
     steps = np.linalg.norm(np.diff(at, axis=0), axis=2)[inside[1:] & inside[:-1]]
     assert 0.4 < steps.max() < 0.55
     assert len(plane_inverses(a, [b], (2.5, 6.0), 20)) == 20 and len(plane_inverses(a, [], (2.5, 6.0))) == 8
-
-
-def test_cost_is_least_at_the_true_plane():
-    """A wall parallel to the image costs nothing at its plane, more at others, 0.5 where the other view does not reach."""
-    generator = np.random.default_rng(0)
-    K = np.array([[40.0, 0, 20], [0, 40, 15], [0, 0, 1]])
-    texture = generator.uniform(0.1, 0.9, (30, 60, 3)).astype(np.float32)
-    shifted = np.eye(4)
-    shifted[0, 3] = -0.5  # a step to the right: 5 px at depth 4
-    views = [
-        View("a", Camera(np.eye(4), K, 40, 30), texture[:, :40]),
-        View("b", Camera(shifted, K, 40, 30), 0.5 * texture[:, 5:45] + 0.2),  # another exposure
-    ]
-    costs = matching_costs_cpu(views[0], views[1:], np.array([0.15, 0.25, 0.35]), 5).numpy().transpose(2, 0, 1) / UNIT
-    seen = (slice(3, -3), slice(9, -3))
-    assert costs.shape == (16, 30, 40) and (costs[3:] == 1).all() and costs[1][seen].max() < 0.01
-    assert costs[0][seen].min() > 0.1 and costs[2][seen].min() > 0.1
-    assert np.allclose(costs[1, :, :4], 0.5)
 
 
 def test_depths_are_the_same_bits_on_any_number_of_threads():
