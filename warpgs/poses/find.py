@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import math
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +30,7 @@ from warpgs.poses.mapping import EXHAUSTIVE, LEARNED, Mapping, camera_groups, ca
 from warpgs.poses.matching import Matcher, write_matches
 from warpgs.poses.photographs import (
     Photograph,
+    Progress,
     find_photographs,
     image_root,
     is_heic,
@@ -53,25 +54,19 @@ MAX_ADVICE = 8
 """Number of pieces of advice that are given, the most urgent first."""
 
 
-def partners(found: Mapping, i: int) -> list[tuple[int, int]]:
-    """Return the photographs that photograph ``i`` matches, each with the number of matches, most matches first."""
-    return sorted(found.links.get(i, ()), key=lambda link: (-link[1], link[0]))
-
-
 def reason(found: Mapping, i: int, names: Sequence[str]) -> str:
     """Return why a photograph has no pose, in words that follow its name."""
     keypoints = found.keypoints[i]
     if keypoints < MIN_KEYPOINTS:
         return f"has {keypoints} keypoints, too few to match: a blank wall, darkness or blur"
-    best = partners(found, i)
+    best = found.links[i]
     if not best:
         return f"has {keypoints:,} keypoints and matches no other photograph"
     j, n = best[0]
     matched = f"has {keypoints:,} keypoints and {n} matches with {names[j]}"
     if j in found.views:
         return f"{matched}, too few of them at places of known depth"
-    group = next((g for g in found.groups[1:] if i in g), ())
-    together = f", in a separate group of {len(group)}" if group else ""
+    together = next((f", in a separate group of {len(group)}" for group in found.groups[1:] if i in group), "")
     return f"{matched}, which has no pose either{together}"
 
 
@@ -94,7 +89,7 @@ def advice(found: Mapping, names: Sequence[str]) -> list[str]:
     """Return what to photograph next, a sentence each, the most urgent first; empty if nothing is missing."""
     said = []
     for i in (i for i in range(len(names)) if i not in found.views):
-        best = partners(found, i)
+        best = found.links[i]
         if found.keypoints[i] < MIN_KEYPOINTS:
             said.append(f"take {names[i]} again: sharp, in good light, with a textured object in view")
         elif best:
@@ -106,7 +101,7 @@ def advice(found: Mapping, names: Sequence[str]) -> list[str]:
             pair = f"{names[i]} and {names[j]}"
             said.append(f"take one or two photographs between {pair}, whose axes differ by {angle:.0f} degrees")
     for i in found.views:
-        j, n = next((link for link in partners(found, i) if link[0] in found.views), (i, WEAK_MATCHES))
+        j, n = next((link for link in found.links[i] if link[0] in found.views), (i, WEAK_MATCHES))
         if n < WEAK_MATCHES:
             said.append(f"take a photograph between {names[i]} and {names[j]}, which share only {n} matches")
     more = len(said) - MAX_ADVICE
@@ -148,7 +143,7 @@ def record_of(found: Mapping, photographs: Sequence[Photograph], digest: str, no
         rows.append({
             "name": p.name, "sha256": p.digest, "registered": registered, "keypoints": found.keypoints[i],
             "points": found.views[i][1] if registered else 0,
-            "matches": {names[j]: n for j, n in partners(found, i)[:SHOWN_PARTNERS]},
+            "matches": {names[j]: n for j, n in found.links[i][:SHOWN_PARTNERS]},
             "reason": None if registered else reason(found, i, names),
         })  # fmt: skip
     focal = ", ".join(f"{c['focal']:.0f} px of {max(c['width'], c['height'])}" for c in found.cameras)
@@ -253,7 +248,7 @@ def find_poses(
     max_pixels: int = MAX_PIXELS,
     allow_outside: bool = False,
     matcher: str | Path | None = None,
-    progress: Callable[[str], object] = lambda line: None,
+    progress: Progress = lambda line: None,
 ) -> dict[str, Any]:
     """Find the poses of photographs or of a video's sharpest frames; write a scene folder, whole or not at all."""
     source, out = Path(source), Path(out)
@@ -286,7 +281,7 @@ def find_poses(
 
 def _with_network(
     network: Matcher, found: Mapping, photographs: list[Photograph], names: list[str], kind: str, work: Path,
-    progress: Callable[[str], object], threads: int,
+    progress: Progress, threads: int,
 ) -> tuple[Mapping, list[str]]:  # fmt: skip
     """Return the model from the network's matches if it has more photographs than SIFT's, and notes."""
     # the network, which is less accurate, runs only if SIFT leaves photographs without a pose
@@ -338,7 +333,7 @@ def _check(source: Path, out: Path, allow_outside: bool) -> None:
 
 
 def _prepared(
-    source: Path, work: Path, frames: int, max_pixels: int, progress: Callable[[str], object]
+    source: Path, work: Path, frames: int, max_pixels: int, progress: Progress
 ) -> tuple[list[Photograph], list[str], list[str]]:
     """Return the photographs of a source, the names of their copies in ``work``/small, and notes for the user."""
     notes, root = [], source
@@ -392,7 +387,7 @@ def _links(found: Mapping, photographs: list[Photograph]) -> str:
     """Return which pairs match best, and which photographs match none; fewest matches first."""
     pairs: dict[tuple[int, ...], int] = {}
     for i in range(len(photographs)):
-        best = partners(found, i)[:1]
+        best = found.links[i][:1]
         pairs[tuple(sorted((i, best[0][0]))) if best else (i,)] = best[0][1] if best else 0
     order = sorted(pairs, key=lambda pair: (pairs[pair], pair))
     words = []

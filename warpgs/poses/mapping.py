@@ -6,7 +6,7 @@ import importlib.util
 import itertools
 import json
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -18,7 +18,7 @@ from warpgs.device import usable_cores
 from warpgs.errors import ResourceError, UsageError, install_extras
 from warpgs.files import disk_is_full, write_json, write_text
 from warpgs.poses.matching import choose_pairs
-from warpgs.poses.photographs import MATCHING_SIDE, Photograph
+from warpgs.poses.photographs import MATCHING_SIDE, Photograph, Progress
 from warpgs.process import ProcessFailed, answer, end_with_parent, python_lines
 
 EXHAUSTIVE = 60
@@ -29,6 +29,7 @@ IMAGES, DATABASE, PAIRS, MODELS, MODEL = "small", "matches.db", "pairs.txt", "mo
 """Names in the folder that the worker runs in: relative, since pycolmap takes names in UTF-8 alone."""
 LAST_WORDS = 500
 """Number of letters of pycolmap's last message that an error shows."""
+Json = dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -62,13 +63,13 @@ class Mapping:
 
     @cached_property
     def links(self) -> dict[int, list[tuple[int, int]]]:
-        """Photographs that each photograph matches, with the number of matches."""
-        links: dict[int, list[tuple[int, int]]] = {}
+        """Photographs that each photograph matches, each with the number of matches, most matches first."""
+        links: dict[int, list[tuple[int, int]]] = {i: [] for i in range(len(self.keypoints))}
         for (a, b), n in self.matches.items():
             if n > 0:
-                links.setdefault(a, []).append((b, n))
-                links.setdefault(b, []).append((a, n))
-        return links
+                links[a].append((b, n))
+                links[b].append((a, n))
+        return {i: sorted(some, key=lambda link: (-link[1], link[0])) for i, some in links.items()}
 
 
 def check_installed() -> None:
@@ -85,15 +86,11 @@ def camera_groups(photographs: list[Photograph]) -> list[int]:
 
 def cameras_of(photographs: list[Photograph], groups: list[int]) -> list[Photograph]:
     """Return the first photograph of each camera, in the order of the camera numbers (``groups``, from `camera_groups`)."""
-    first: dict[int, Photograph] = {}
-    for number, photograph in zip(groups, photographs):
-        first.setdefault(number, photograph)
+    first = dict(zip(groups[::-1], photographs[::-1]))
     return [first[number] for number in range(len(first))]
 
 
-def _job(
-    photographs: list[Photograph], names: list[str], kind: str, folder: Path, threads: int, learned: bool
-) -> dict[str, Any]:
+def _job(photographs: list[Photograph], names: list[str], kind: str, folder: Path, threads: int, learned: bool) -> Json:
     """Return the worker's input."""
     of = camera_groups(photographs)
     cameras = []
@@ -109,7 +106,7 @@ def _job(
     }  # fmt: skip
 
 
-def _lines(job: dict[str, Any], folder: Path) -> Iterator[dict[str, Any]]:
+def _lines(job: Json, folder: Path) -> Iterator[Json]:
     """Yield the worker's messages; end the worker when the reader stops."""
     write_json(folder / JOB, job)
     try:
@@ -132,12 +129,12 @@ def find_model(
     names: list[str],
     kind: str,
     folder: Path,
-    progress: Callable[[str], object],
+    progress: Progress,
     threads: int = 0,
     learned: bool = False,
 ) -> Mapping:
     """Find poses of photographs and write the model of those that fit together into ``folder``/model, in COLMAP's files."""
-    result: dict[str, Any] | None = None
+    result: Json | None = None
     for said in _lines(_job(photographs, names, kind, folder, threads or usable_cores(), learned), folder):
         if "progress" in said:
             progress(said["progress"])
@@ -196,12 +193,12 @@ def _in_steps(items: list, words: str, least: int = 1) -> Iterator[list]:
         yield items[begin : begin + step]
 
 
-def _write_pairs(pairs: list[tuple[int, int]], job: dict[str, Any]) -> None:
+def _write_pairs(pairs: list[tuple[int, int]], job: Json) -> None:
     """Write the list of pairs of photographs that pycolmap reads."""
     write_text(Path(PAIRS), "".join(f"{job['names'][i]} {job['names'][j]}\n" for i, j in pairs))
 
 
-def import_photographs(pycolmap: Any, job: dict[str, Any]) -> None:
+def import_photographs(pycolmap: Any, job: Json) -> None:
     """Write cameras and photographs into a new database; numbers follow the order of the job."""
     pycolmap.Database.open(DATABASE).close()
     for number, camera in enumerate(job["cameras"]):
@@ -213,7 +210,7 @@ def import_photographs(pycolmap: Any, job: dict[str, Any]) -> None:
         pycolmap.import_images(DATABASE, IMAGES, pycolmap.CameraMode.SINGLE, names, reader)
 
 
-def extract(pycolmap: Any, job: dict[str, Any]) -> None:
+def extract(pycolmap: Any, job: Json) -> None:
     """Write the SIFT features of the photographs into the database."""
     options = pycolmap.FeatureExtractionOptions()
     options.num_threads, options.use_gpu, options.sift.peak_threshold = job["threads"], False, PEAK
@@ -223,7 +220,7 @@ def extract(pycolmap: Any, job: dict[str, Any]) -> None:
         pycolmap.extract_features(DATABASE, IMAGES, names, mode, reader, options, pycolmap.Device.cpu)
 
 
-def numbers_of(database: Any, job: dict[str, Any]) -> list[int]:
+def numbers_of(database: Any, job: Json) -> list[int]:
     """Return the database's id of each photograph, in the order of the job."""
     numbers = {image.name: image.image_id for image in database.read_all_images()}
     return [numbers[name] for name in job["names"]]
@@ -236,7 +233,7 @@ def verification_options(pycolmap: Any) -> Any:
     return options
 
 
-def verify_learned(pycolmap: Any, job: dict[str, Any]) -> dict[str, Any]:
+def verify_learned(pycolmap: Any, job: Json) -> Json:
     """Write the keypoints and matches of a network into the database and verify them; return the result of `matched`."""
     with np.load(LEARNED, allow_pickle=False) as learned:
         pairs, ends = learned["pairs"], np.cumsum(learned["counts"])
@@ -262,7 +259,7 @@ def verify_learned(pycolmap: Any, job: dict[str, Any]) -> dict[str, Any]:
     return matched(pycolmap, job, len(pairs))
 
 
-def match(pycolmap: Any, job: dict[str, Any]) -> dict[str, Any]:
+def match(pycolmap: Any, job: Json) -> Json:
     """Match pairs of photographs; return the result of `matched`."""
     with pycolmap.Database.open(DATABASE) as database:
         order = numbers_of(database, job)
@@ -279,7 +276,7 @@ def match(pycolmap: Any, job: dict[str, Any]) -> dict[str, Any]:
     return matched(pycolmap, job, len(pairs))
 
 
-def matched(pycolmap: Any, job: dict[str, Any], tried: int) -> dict[str, Any]:
+def matched(pycolmap: Any, job: Json, tried: int) -> Json:
     """Return the number of keypoints of each photograph, and for each pair the number of matches that agree with one motion."""
     with pycolmap.Database.open(DATABASE) as database:
         order = numbers_of(database, job)
@@ -293,7 +290,7 @@ def matched(pycolmap: Any, job: dict[str, Any], tried: int) -> dict[str, Any]:
     return {"keypoints": keypoints, "pairs": sorted(agreed), "tried": tried}
 
 
-def map_incrementally(pycolmap: Any, job: dict[str, Any], keep_focal: bool = False) -> list[Any]:
+def map_incrementally(pycolmap: Any, job: Json, keep_focal: bool = False) -> list[Any]:
     """Return the models that grow photograph by photograph from a good pair; ``keep_focal`` keeps EXIF's focal lengths."""
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads = options.mapper.num_threads = 1  # else the rounding depends on which thread finishes first
@@ -323,7 +320,7 @@ def believes_exif(kept: list[Any], free: list[Any]) -> bool:
     return bool(best.num_reg_images() >= other.num_reg_images() and as_well)
 
 
-def map_globally(pycolmap: Any, job: dict[str, Any]) -> list[Any]:
+def map_globally(pycolmap: Any, job: Json) -> list[Any]:
     """Return the models in which all poses are found at once."""
     _say(progress="finding poses: all photographs at once")
     if not pycolmap.calibrate_view_graph(DATABASE):
@@ -338,7 +335,7 @@ def map_globally(pycolmap: Any, job: dict[str, Any]) -> list[Any]:
     return list(pycolmap.global_mapping(DATABASE, IMAGES, str(folder), options).values())
 
 
-def finish(model: Any, job: dict[str, Any]) -> dict[str, Any]:
+def finish(model: Any, job: Json) -> Json:
     """Give a model the names and sizes of the scene's images and write it; return its description."""
     error, index = model.compute_mean_reprojection_error(), {name: i for i, name in enumerate(job["names"])}
     views = {}

@@ -42,6 +42,8 @@ from warpgs.io.image_files import (
 from warpgs.io.images import list_images, turn_upright
 from warpgs.process import ProcessFailed, answer, end_with_parent, hidden_stderr, python_lines, utf8_name
 
+Progress = Callable[[str], object]
+"""Called with lines for the user about the current work."""
 JFIF, ADOBE, COMMENT = 0xE0, 0xEE, 0xFE
 """JPEG segments: the first two define the colour coding, and are kept."""
 APPLICATION = range(0xE0, 0xF0)
@@ -159,7 +161,7 @@ def sharpest(values: list[float], count: int) -> list[int]:
     return [a + int(np.argmax(values[a:b])) for a, b in itertools.pairwise(bounds)]
 
 
-def write_frames(path: Path, folder: Path, count: int, progress: Callable[[str], object]) -> int:
+def write_frames(path: Path, folder: Path, count: int, progress: Progress) -> int:
     """Write the sharpest frame of each of ``count`` equal parts of a video as PNG; return the video's number of frames."""
     import cv2
 
@@ -190,7 +192,7 @@ def is_heic(path: Path) -> bool:
 
 
 def to_jpeg(
-    paths: Sequence[Path], root: Path, folder: Path, max_pixels: int, progress: Callable[[str], object] = lambda line: None
+    paths: Sequence[Path], root: Path, folder: Path, max_pixels: int, progress: Progress = lambda line: None
 ) -> dict[Path, Path]:
     """Write upright JPEG copies of HEIC files below ``root``, without private EXIF, into ``folder``; return each one's copy."""
     if not paths:
