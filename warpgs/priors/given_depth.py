@@ -154,11 +154,6 @@ def align(view: View, found: ViewDepth | None, known: PointCloud) -> Alignment:
     return Alignment(scale, shift, count, float(np.median(off)), why_not)
 
 
-def exact(given: GivenDepth, made: Alignment | None) -> bool:
-    """Return whether a map replaces estimated depth: a metric map, or one that fits its references closely."""
-    return given.kind == "metric" or (made is not None and made.difference <= EXACT)
-
-
 def votes(
     views: Sequence[View], depths: Sequence[np.ndarray], index: int, near: int = NEIGHBORS
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -185,8 +180,8 @@ def with_given_depth(
     views: Sequence[View], found: Sequence[ViewDepth] | None, known: PointCloud
 ) -> tuple[list[ViewDepth], list[str]]:
     """Return the depth of each view (pinholes), combined with its given depth, and notes."""
-    # An `exact` map replaces the estimate. Any other is used only where another view confirms it and the estimate is missing
-    # or differs. Depths are dropped where more views see through them than confirm them.
+    # A metric map, or one that fits its references closely, replaces the estimate. Any other is used only where another view
+    # confirms it and the estimate is missing or differs. Depths are dropped where more views see through them than confirm them.
     before = [no_depth(v) for v in views] if found is None else list(found)
     made = [None if v.depth is None else align(v, d, known) for v, d in zip(views, before, strict=True)]
     given = [
@@ -201,18 +196,17 @@ def with_given_depth(
         raise DataError(f"no depth map can be used: {'; '.join(refused[:SHOWN])}. {remedy}")
     best = [np.where(g > 0, g, np.where(d.valid, d.depth, 0)) for g, d in zip(given, before, strict=True)]
     after, removed, total = [], 0, 0
-    for i, (view, d) in enumerate(zip(views, before, strict=True)):
-        if not given[i].any():
+    for i, (view, a, d) in enumerate(zip(views, made, before, strict=True)):
+        known = given[i] > 0
+        if view.depth is None or a is None or not known.any():
             after.append(d)
             continue
-        assert view.depth is not None
         confirm, through = votes(views, best, i)
-        own = (given[i] > 0) & (through <= confirm)
-        removed, total = removed + int(((given[i] > 0) & ~own).sum()), total + int((given[i] > 0).sum())
+        own = known & (through <= confirm)
+        removed, total = removed + int((known & ~own).sum()), total + int(known.sum())
         placing = own if view.depth.confidence is None else own & (view.depth.confidence >= MIN_CONFIDENCE)
-        if not exact(view.depth, made[i]):
-            outlier = np.abs(d.depth - given[i]) > NEAR * given[i]
-            placing = placing & (confirm > 0) & (~d.valid | outlier)
+        if view.depth.kind != "metric" and not a.difference <= EXACT:
+            placing = placing & (confirm > 0) & (~d.valid | (np.abs(d.depth - given[i]) > NEAR * given[i]))
         after.append(replace(
             d, depth=np.where(placing, given[i], d.depth).astype(np.float32), valid=d.valid | placing,
             sensitivity=np.where(placing, 0, d.sensitivity).astype(np.float32), given=np.where(own, given[i], 0),
