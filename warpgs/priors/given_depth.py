@@ -181,7 +181,7 @@ def with_given_depth(
 ) -> tuple[list[ViewDepth], list[str]]:
     """Return the depth of each view (pinholes), combined with its given depth, and notes."""
     # A metric map, or one that fits its references closely, replaces the estimate. Any other is used only where another view
-    # confirms it and the estimate is missing or differs. Depths are dropped where more views see through them than confirm them.
+    # confirms it and the estimate is missing or differs. Depths that more views see through than confirm are dropped.
     before = [no_depth(v) for v in views] if found is None else list(found)
     made = [None if v.depth is None else align(v, d, known) for v, d in zip(views, before, strict=True)]
     given = [
