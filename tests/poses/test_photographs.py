@@ -96,6 +96,13 @@ def test_links_inside_are_followed_and_a_pipe_is_no_photograph(folder):
         find_poses(folder, folder.parent / "out")
 
 
+def test_two_photographs_of_one_name_in_the_scene_are_refused(folder):
+    cv2.imwrite(str(folder / "a.bmp"), np.zeros((40, 60, 3), np.uint8))
+    (folder / "a.png").rename(folder / "a.bmp.png")
+    with pytest.raises(DataError, match=r"a\.bmp and a\.bmp\.png would both be 'a\.bmp\.png' in the scene"):
+        find_poses(folder, folder.parent / "out")
+
+
 def test_a_size_beyond_the_limit_is_refused_before_exif(folder):
     """Pillow allots the canvas of a WebP file, a gigabyte here, as soon as it looks at EXIF."""
     (folder / "b.webp").write_bytes(BOMB)
