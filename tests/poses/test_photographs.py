@@ -217,7 +217,7 @@ def test_videos_are_bounded(name, most, why, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("text", ["#EXTM3U\n#EXT-X-TARGETDURATION:1\n#EXTINF:1,\n{}\n", "ffconcat version 1.0\nfile {}\n"])
-def test_videos_are_not_believed(text, tmp_path):
+def test_a_playlist_is_no_video(text, tmp_path):
     """FFmpeg would open the files that a playlist names; an AVI header claims four thousand million frames, not twelve."""
     film(tmp_path / "private.avi", 12)
     (tmp_path / "a.mp4").write_text(text.format("private.avi"))
