@@ -114,8 +114,8 @@ def prior_stages(train: list[View]) -> Iterator[Stage]:
     matches = triangulate_matches(train)
     yield "triangulated matches", digest(matches.points, matches.colors)
     maps = classical_maps([v.image for v in train])
-    for name in ("confidence", "boundary", "foreground"):
-        yield f"semantics: {name}", digest(*(getattr(m, name) for m in maps))
+    for name, of_views in zip(("confidence", "boundary", "foreground"), zip(*maps)):
+        yield f"semantics: {name}", digest(*of_views)
 
 
 def _ply(gaussians: Gaussians, scene: Scene, folder: Path) -> str:

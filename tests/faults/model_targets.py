@@ -238,7 +238,8 @@ def check_onnx(root: Path, path: Path) -> bytes:
     return data
 
 
-register(Target("onnx", onnx_files, check_onnx, (onnx,), (onnx_field, onnx_field, onnx_field)))
+PARTS = (onnx.check_onnx, onnx._walk, onnx._message, onnx._varint, onnx._text)
+register(Target("onnx", onnx_files, check_onnx, PARTS, (onnx_field, onnx_field, onnx_field)))
 
 
 def flo_files(root: Path) -> list[Path]:
@@ -270,11 +271,10 @@ def side_nonsense(values: dict) -> str:
     return "" if isinstance(values, dict) and set(values) <= set(networks.KEYS) else "no description"
 
 
-SIDE = (networks.read_side_file, networks.check_value, networks._numbers, networks._whole)
 register(
     Target(
-        "description of a network", side_files, lambda root, path: networks.read_side_file(root / "m.onnx"), SIDE,
-        (json_value, json_value, text_number), nonsense=side_nonsense,
+        "description of a network", side_files, lambda root, path: networks.read_side_file(root / "m.onnx"),
+        (networks.read_side_file,), (json_value, json_value, text_number), nonsense=side_nonsense,
     )
 )  # fmt: skip
 

@@ -169,7 +169,7 @@ REASONS = {
     "pipeline/run/folder.py": {"check_same": "copies a value"},
     "pipeline/run/results.py": {"sampling_report_of": "reads images for `webp`, which is named here"},
     "plugins.py": {"module_digest": DIGEST},
-    "poses/find.py": {"find_poses": OWN, "_digest": DIGEST},
+    "poses/find.py": {"find_poses": OWN, "source_digest": DIGEST},
     "poses/photographs.py": {"main": PIPE},
     "poses/mapping.py": {"_lines": PIPE,
         "main": PIPE, "match": OWN, "import_photographs": OWN, "matched": OWN, "verify_learned": OWN},

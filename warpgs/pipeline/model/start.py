@@ -27,9 +27,9 @@ from warpgs.pipeline.model.depth_points import (
     joined,
     silhouettes,
 )
-from warpgs.priors.flow import EpipolarConfig, flow_between, flow_depth, triangulate_matches
+from warpgs.priors.flow import flow_between, flow_depth, triangulate_matches
 from warpgs.priors.given_depth import any_given, with_given_depth
-from warpgs.priors.sweep import CPU, SweepConfig, sweep_depths
+from warpgs.priors.sweep import CPU, sweep_depths
 from warpgs.scene import Camera, Gaussians, PointCloud, View, ViewDepth, base_coefficients
 from warpgs.schema import Checked, Within
 
@@ -206,10 +206,10 @@ def consistent_depths(
     """
     if config.source == "flow":
         between = flow_between(views, config.flow)
-        return [flow_depth(views, i, between, EpipolarConfig()) for i in range(len(views))]
+        return [flow_depth(views, i, between) for i in range(len(views))]
     points = np.concatenate([known.points, triangulate_matches(views).points])
     bounds = [depth_bounds(v, points, camera_depths(views)) for v in views]
-    return sweep_depths(views, bounds, SweepConfig(), device(), lambda n, of: progress(f"finding depth: {n} of {of} views"))
+    return sweep_depths(views, bounds, device(), lambda n, of: progress(f"finding depth: {n} of {of} views"))
 
 
 def consistent_points(

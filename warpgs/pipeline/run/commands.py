@@ -51,7 +51,6 @@ from warpgs.pipeline.run.results import evaluate_run, protocol_of, score_line
 from warpgs.pipeline.train.schedule import color_of, over_background
 from warpgs.pipeline.train.trainer import train_views
 from warpgs.pipeline.train.views import TrainingView
-from warpgs.priors.networks import cache_folder
 from warpgs.priors.views import PriorConfig, view_priors
 from warpgs.render.options import RasterizeOptions
 from warpgs.report.images import COVERAGE_LEGEND, Tile, contact_sheet, png
@@ -447,8 +446,7 @@ def show_priors(request: SceneRequest, config: PriorConfig, source: str, out: Pa
         depths = None
         if config.depth_model is None and len(views) > 1:
             depths = consistent_depths(views, seen_points(views, scene.points), InitConfig(source=source))
-        cache = cache_folder()
-        priors, found = view_priors(views, config, depths=lambda: depths, regions=regions, threads=threads, cache=cache)
+        priors, found = view_priors(views, config, depths=lambda: depths, regions=regions, threads=threads)
         for view, prior in zip(views, priors):
             write_bytes(out / f"{names[view.name]}.png", png(prior_sheet(view, prior)))
         notes = [n for n in notes if n != NO_SCORES]

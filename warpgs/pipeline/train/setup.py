@@ -20,7 +20,6 @@ from warpgs.pipeline.train.settings import FitConfig
 from warpgs.pipeline.train.strategies.base import find_strategy
 from warpgs.pipeline.train.views import TrainingView, with_alpha
 from warpgs.priors.given_depth import any_given, check_given, lens_depth, pinhole_view, with_given_depth
-from warpgs.priors.networks import cache_folder
 from warpgs.priors.views import view_priors
 from warpgs.process import Detail
 from warpgs.scene import GivenDepth, PointCloud, Prior, View, ViewDepth
@@ -80,11 +79,9 @@ def prepare(
 
     notes = []
     if priors is None and needs_priors(config):
-        regions, cache = [fitted_region(v)[0] for v in train], cache_folder()
+        regions = [fitted_region(v)[0] for v in train]
         # semantics come first: they are found while the device is made ready; depth by a network comes before the start
-        priors, notes = view_priors(
-            train, config.priors, depths=lambda: start().depths, regions=regions, cache=cache, tell=progress
-        )
+        priors, notes = view_priors(train, config.priors, depths=lambda: start().depths, regions=regions, tell=progress)
     elif priors is None:
         notes = _unused_networks(config)
     if config.priors.depth_guides and priors is not None:

@@ -32,7 +32,7 @@ from warpgs.pipeline.train.step import CAPACITY_FACTOR, Learned, OverLimitError,
 from warpgs.pipeline.train.stopping import STATE, Stopping
 from warpgs.pipeline.train.strategies.base import StrategyContext, find_strategy
 from warpgs.pipeline.train.views import Kind, LearnedViews, TrainingView, half_size, show_learned, stack_views, with_learned
-from warpgs.priors.sweep import SweepConfig, sweep_depths
+from warpgs.priors.sweep import sweep_depths
 from warpgs.process import Detail
 from warpgs.ranks import ALONE, Ranks
 from warpgs.scene import Camera, Gaussians, PointCloud, Prior, Scene, View
@@ -666,7 +666,7 @@ def warm_up(config: FitConfig, device: torch.device, stopped: Callable[[], bool]
         small = replace(small, strategy_config=replace(small.strategy_config, every=1))
     black = (0.0, 0.0, 0.0)
     if sweeps(config.init, len(views)) and config.memory_limit is None:
-        sweep_depths(views, [(2, 4)] * len(views), SweepConfig(max_planes=PLANES), device)
+        sweep_depths(views, [(2, 4)] * len(views), device, max_planes=PLANES)
     fit = Trainer(views, cloud, small, device, black, [Prior(*maps, "noise", "noise") for _ in views])
     run(fit, lambda _: None, lambda _: None, stopped)
     score(views[0], render_view(fit.gaussians, views[0], fit.context.render_options())[0])
