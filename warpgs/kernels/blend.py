@@ -11,7 +11,8 @@ from warpgs.constants import Rule
 from warpgs.device import BINNING, BLENDING, FLOAT, LOSS, PROJECTION, SAMPLING, Needs, StepSizes
 from warpgs.kernels import blend_cpu, blend_cuda, launch
 from warpgs.kernels.falloff import COLORS, VALUES, WIDTHS, Pass
-from warpgs.kernels.launch import TORCH, Allocator, first_order, keep, kept
+from warpgs.kernels.graphs import TORCH, Allocator
+from warpgs.kernels.launch import first_order, keep, kept
 from warpgs.kernels.native import ROLLED
 from warpgs.kernels.tiles import Tiles, grid
 
@@ -97,12 +98,6 @@ def _launch(kernel, tiles: int, inputs: list, device: torch.device) -> None:
     launch.launch(kernel, tiles, inputs, device, cost=10_000, block_dim=32)
 
 
-def _span(image: torch.Tensor, real) -> tuple[launch.View, int]:
-    """Return an image [C, H, W, D], which may be a slice of channels, as one axis, and the stride of its pixels."""
-    found = launch.span(image, real)
-    return found, found.row_stride()
-
-
 def composite(
     projected: torch.Tensor,
     tiles: Tiles,
@@ -126,8 +121,8 @@ def composite(
     transmittances, weights = (allocator.saved(shape, projected.dtype, device) for _ in range(2))
     ends = allocator.saved(shape, torch.int32, device)
     inputs = [
-        settings.struct(tiles.size, real), projected, tiles.ranges, tiles.gaussian_ids, backgrounds, *_span(rgb, real),
-        alpha, depth, transmittances, weights, ends,
+        settings.struct(tiles.size, real), projected, tiles.ranges, tiles.gaussian_ids, backgrounds, rgb,
+        launch.row_stride(rgb), alpha, depth, transmittances, weights, ends,
     ]  # fmt: skip
     _launch(blend_cpu.make_kernels(real, tiles.size, channels).forward, len(tiles.ranges), inputs, device)
     return rgb, alpha, depth, transmittances, weights, ends, allocator.saved((0,), projected.dtype, device)
@@ -142,7 +137,7 @@ def _backward(projected, tiles, backgrounds, settings: Pass, saved, v_images, al
     v_projected = allocator.output(projected.shape, projected.dtype, device)
     v_slots = allocator.workspace((len(tiles.slots), values), projected.dtype, device).zero_()
     deep = v_alpha is not None or v_depth is not None
-    upstream: list = [*_span(v_rgb, real)]
+    upstream: list = [v_rgb, launch.row_stride(v_rgb)]
     for v in (v_alpha, v_depth):
         v = (torch.zeros_like(depth) if deep else depth.new_empty(0)) if v is None else v.contiguous()
         upstream.append(v)

@@ -13,7 +13,8 @@ from warpgs.kernels import launch, project_cpu, project_cuda, sh
 from warpgs.kernels.cameras import CAMERA_MODELS
 from warpgs.kernels.ellipse import PROJECTED_SIZE, ProjectInputs, checked_factors
 from warpgs.kernels.falloff import Pass
-from warpgs.kernels.launch import TORCH, Allocator, first_order, keep, kept
+from warpgs.kernels.graphs import TORCH, Allocator
+from warpgs.kernels.launch import first_order, keep, kept
 from warpgs.kernels.native import BLOCK
 from warpgs.kernels.project_cpu import LANES
 

@@ -25,8 +25,8 @@ from warpgs.kernels import blend, launch, project
 from warpgs.kernels.cameras import CAMERA_MODELS
 from warpgs.kernels.ellipse import ProjectInputs
 from warpgs.kernels.falloff import Pass
-from warpgs.kernels.graphs import MIN_REPLAYS, GraphedFunction, GraphPool
-from warpgs.kernels.launch import Allocator, fetch, first_order, keep, kept
+from warpgs.kernels.graphs import MIN_REPLAYS, Allocator, GraphedFunction, GraphPool, fetch
+from warpgs.kernels.launch import first_order, keep, kept
 from warpgs.kernels.tiles import BYTES_PER_INSTANCE, InstanceMemory, Tiles, Visible, grid, running_counts, split_sum, sums_fit
 from warpgs.means2d import count_passes
 from warpgs.render.compose import composite_into
@@ -140,7 +140,7 @@ class GraphedRasterizer:
         _, counts = project.project_tensors(self._inputs(gaussians, cameras), self.settings, allocator)
         self._sums = running_counts(counts.view(-1), wp.float32, out=self._sums)  # no copy: used only within the call
         with launch.stream_of(self.device):
-            wp.copy(self._host_total, launch.view(self._sums[-1:], wp.int64).array())
+            wp.copy(self._host_total, wp.from_torch(self._sums[-1:]))
         return ()
 
     def _bin_and_blend(self, allocator: Allocator, projected, counts, backgrounds) -> tuple[torch.Tensor, ...]:
