@@ -19,7 +19,7 @@ from warpgs.kernels.sh import coefficient_count
 from warpgs.means2d import projected_means
 from warpgs.render import graphed
 from warpgs.render.compose import inputs_of, pass_of
-from warpgs.render.graphed import MIN_CALLS, SPARE, Capacity, Recorder, call_key
+from warpgs.render.graphed import MIN_CALLS, SPARE, Recorder, call_key
 from warpgs.render.options import RasterizeOptions
 from warpgs.render.rasterize import rasterize
 from warpgs.scene import Camera, Gaussians
@@ -35,11 +35,11 @@ class Counted:
 
     def __init__(self, settings, cameras, capacity, graphs, gradients):
         type(self).made += 1
-        self.limit, self.needed, self.rendered = capacity.instances - SPARE, None, 0
+        self.limit, self.needed, self.rendered = capacity[1] - SPARE, None, 0
 
     def render(self, sources, backgrounds):
-        self.needed = Capacity(5, type(self).seen)
-        fits = self.needed.instances <= self.limit
+        self.needed = 5, type(self).seen
+        fits = self.needed[1] <= self.limit
         self.rendered += fits
         return "images" if fits else None
 
@@ -63,7 +63,7 @@ def recorder(monkeypatch, surroundings) -> Recorder:
     """A recorder whose rasterizers render nothing; a call has `Counted.seen` instances."""
     Counted.made, Counted.seen = 0, 100
     monkeypatch.setattr(graphed, "GraphedRasterizer", Counted)
-    monkeypatch.setattr(graphed, "count_needed", lambda *_: Capacity(5, Counted.seen))
+    monkeypatch.setattr(graphed, "count_needed", lambda *_: (5, Counted.seen))
     return Recorder(GraphPool(CPU))
 
 
@@ -210,7 +210,7 @@ def test_other_planes_are_another_graph(surroundings):
         assert torch.equal(*images) and all(torch.equal(a, b) for a, b in zip(*gradients))
 
 
-@pytest.mark.parametrize("short", ["visible", "instances"])
+@pytest.mark.parametrize("short", [(1, 0), (0, 1)], ids=["visible", "instances"])
 def test_a_rasterizer_that_is_too_small_says_so(surroundings, short):
     """The call runs without graphs, and the next rasterizer has the capacity."""
     g, own = leaves(cloud(300)), Recorder(NoGraphPool(CPU))
@@ -220,11 +220,11 @@ def test_a_rasterizer_that_is_too_small_says_so(surroundings, short):
     for _ in range(MIN_CALLS):
         found = own.render(sources, None, settings)
     assert found is not None
-    own.rasterizer.capacity = own.rasterizer.needed._replace(**{short: getattr(own.rasterizer.needed, short) - 1})
+    own.rasterizer.capacity = tuple(n - one for n, one in zip(own.rasterizer.needed, short))
     assert own.render(sources, None, settings) is None and own.rasterizer is None
     for _ in range(2 * MIN_CALLS):
         found = own.render(sources, None, settings)
-    assert found is not None and own.rasterizer.needed.within(own.rasterizer.capacity)
+    assert found is not None and all(n <= most for n, most in zip(own.rasterizer.needed, own.rasterizer.capacity))
 
 
 def first_graphed(own: Recorder, g: Gaussians, cam: Camera):

@@ -156,24 +156,29 @@ class CapturedGraph:
     """A CUDA graph of the kernels that torch and Warp launch in one call, and the objects that it needs."""
 
     def __init__(self, work: Callable[[], object], stream: torch.cuda.Stream, pool: tuple[int, int] | None = None):
-        """Capture the work, which neither reads from the device nor loads kernels; nothing runs yet."""
-        # The caller lets ``stream``, not the default one, wait for what ``work`` reads. ``pool`` is that of a graph to share
-        # memory with: it must never be replayed at the same time, nor leave results there. Raises RuntimeError where the work
-        # cannot be captured. torch.cuda.graph would collect garbage and empty the cache each time, which takes 80 ms
-        self._graph = torch.cuda.CUDAGraph()
-        with torch.cuda.stream(stream), _CAPTURING, _no_collection():
-            here = launch.warp_stream(torch.device("cuda"))
-            # other threads may allocate meanwhile, and wait for streams and events, but not for the whole device
-            self._graph.capture_begin(pool=pool, capture_error_mode="thread_local")
-            try:
-                wp.capture_begin(stream=here, external=True)
+        """Capture the work on a stream that is not the default one; it neither reads from the device nor loads kernels."""
+        # ``pool`` is that of a graph to share memory with: it must never be replayed at the same time, nor leave results there.
+        # Raises RuntimeError where the work cannot be captured. torch.cuda.graph would collect garbage and empty the cache each
+        # time, which takes 80 ms
+        self._graph, caller = torch.cuda.CUDAGraph(), torch.cuda.current_stream(stream.device)
+        # for what the work reads; and a capture sets numbers of torch's generator that graphs in flight may still read
+        stream.wait_stream(caller)
+        try:
+            with torch.cuda.stream(stream), _CAPTURING, _no_collection():
+                here = launch.warp_stream(torch.device("cuda"))
+                # other threads may allocate meanwhile, and wait for streams and events, but not for the whole device
+                self._graph.capture_begin(pool=pool, capture_error_mode="thread_local")
                 try:
-                    self.result = work()
-                    """Return value of the work."""
+                    wp.capture_begin(stream=here, external=True)
+                    try:
+                        self.result = work()
+                        """Return value of the work."""
+                    finally:
+                        self._lent = wp.capture_end(stream=here)  # memory of Warp that the graph uses
                 finally:
-                    self._lent = wp.capture_end(stream=here)  # memory of Warp that the graph uses
-            finally:
-                self._graph.capture_end()
+                    self._graph.capture_end()
+        finally:
+            caller.wait_stream(stream)
 
     def replay(self) -> None:
         """Run the graph on the current stream."""
@@ -210,7 +215,6 @@ class GraphPool:
         """Number of replays so far."""
         self.failed = False
         """True once a capture failed for another reason than lack of memory."""
-        self._aside: torch.cuda.Stream | None = None
         self._keeper: CapturedGraph | None = None
 
     @functools.cached_property
@@ -218,28 +222,16 @@ class GraphPool:
         """Empty tensor of bytes on the device, shape [0]."""
         return torch.empty(0, dtype=torch.uint8, device=self.device)
 
-    def capturing(self) -> bool:
-        """Return whether other code captures a graph on the current stream."""
-        return self.stream is not None and torch._C._cuda_isCurrentStreamCapturing()
+    @functools.cached_property
+    def _aside(self) -> torch.cuda.Stream:
+        return torch.cuda.Stream(self.device)
 
+    @torch.no_grad()
     def capture(self, work: Callable[[], object]) -> CapturedGraph:
         """Return a graph of ``work``, captured on a separate stream, or raise what `CapturedGraph` raises."""
-        if self._aside is None:
-            self._aside = torch.cuda.Stream(self.device)
-        here = torch.cuda.current_stream(self.device)
-        self._aside.wait_stream(here)  # a capture sets numbers of torch's generator that graphs in flight may still read
-        try:
-            with torch.no_grad():
-                # holds the shared memory, which torch would not reuse once the last graph is gone
-                if self._keeper is None:
-                    self._keeper = CapturedGraph(lambda: torch.zeros(1, device=self.device, dtype=torch.float32), self._aside)
-                return CapturedGraph(work, self._aside, self._keeper.pool())
-        finally:
-            here.wait_stream(self._aside)
-
-    def pool(self) -> tuple[int, int] | None:
-        """Return the handle of the shared memory; None before the first capture."""
-        return None if self._keeper is None else self._keeper.pool()
+        if self._keeper is None:  # holds the shared memory, which torch would not reuse once the last graph is gone
+            self._keeper = CapturedGraph(lambda: torch.zeros(1, device=self.device, dtype=torch.float32), self._aside)
+        return CapturedGraph(work, self._aside, self._keeper.pool())
 
     def release(self) -> None:
         """Keep no memory for later graphs, and forget that a capture failed."""
@@ -273,11 +265,10 @@ class GraphedFunction:
             arena = Arena(self._sizes, self.graphs.byte, self._workspace)
             key = (*[0 if t is None else t.data_ptr() for t in inputs], *arena.addresses())
             graph = None
-            if not self.graphs.capturing():
+            if self.graphs.stream is None or not torch._C._cuda_isCurrentStreamCapturing():  # nor does other code capture
                 graph = self._graphs.get(key) or self._capture(key, arena, inputs)
             if graph is None:
-                with torch.no_grad():
-                    self._run(arena, inputs)
+                self._run(arena, inputs)
             else:
                 graph.replay()
                 self.replays += 1
@@ -288,6 +279,7 @@ class GraphedFunction:
         """Return the tensors [...] that the function returned when it filled a block [B]."""
         return [part(block, *place) for place in self._places]
 
+    @torch.no_grad()
     def _run(self, arena: Arena, inputs: tuple[torch.Tensor | None, ...]) -> None:
         """Call the function without a graph."""
         arena.begin()  # a capture may have ended half way
