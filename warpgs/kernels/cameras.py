@@ -86,9 +86,7 @@ def check_camera(camera: Camera) -> type[CameraModel]:
 @functools.cache
 def make_linear(real: type) -> SimpleNamespace:
     """Make the structs, products and functions that models share, for one scalar type, wp.float32 or wp.float64."""
-    vec2 = wp.types.vector(2, real)
-    vec3 = wp.types.vector(3, real)
-    mat33 = wp.types.matrix((3, 3), real)
+    vec2, vec3, mat33 = wp.types.vector(2, real), wp.types.vector(3, real), wp.types.matrix((3, 3), real)
 
     @wp.struct
     class Rows:
@@ -110,6 +108,22 @@ def make_linear(real: type) -> SimpleNamespace:
         rows.first = first
         rows.second = second
         return rows
+
+    @wp.func
+    def intrinsics_of(fx: real, fy: real, center: vec2) -> mat33:
+        v_K = mat33()
+        v_K[0, 0] = fx
+        v_K[1, 1] = fy
+        v_K[0, 2] = center[0]
+        v_K[1, 2] = center[1]
+        return v_K
+
+    @wp.func
+    def gradients_of(v_position: vec3, v_K: mat33) -> Gradients:
+        gradients = Gradients()
+        gradients.v_position = v_position
+        gradients.v_K = v_K
+        return gradients
 
     @wp.func
     def in_front(position: vec3, lens: wp.array(dtype=real), near: real) -> wp.bool:
@@ -151,8 +165,8 @@ def make_linear(real: type) -> SimpleNamespace:
         return {"project_axes": project_axes, "axes_backward": axes_backward}
 
     return SimpleNamespace(
-        Rows=Rows, Gradients=Gradients, rows_of=rows_of, in_front=in_front, z_of=z_of, unclamped=unclamped, clamped=clamped,
-        products=products,
+        Rows=Rows, Gradients=Gradients, rows_of=rows_of, intrinsics_of=intrinsics_of, gradients_of=gradients_of,
+        in_front=in_front, z_of=z_of, unclamped=unclamped, clamped=clamped, products=products, types=(vec2, vec3, mat33),
     )  # fmt: skip
 
 
@@ -165,9 +179,7 @@ class Pinhole(CameraModel):
     def make_functions(real: type) -> SimpleNamespace:
         """Make the functions of `CameraModel.make_functions`."""
         linear = make_linear(real)
-        vec2 = wp.types.vector(2, real)
-        vec3 = wp.types.vector(3, real)
-        mat33 = wp.types.matrix((3, 3), real)
+        vec2, vec3, mat33 = linear.types
 
         @wp.func
         def pixel_of(position: vec3, K: mat33, lens: wp.array(dtype=real)) -> vec2:
@@ -201,10 +213,7 @@ class Pinhole(CameraModel):
             jy = K[1, 1] * inv_z
             jxz = (K[0, 2] - point[0]) * inv_z
             jyz = (K[1, 2] - point[1]) * inv_z
-            g0 = jx * v_first
-            g1 = jy * v_second
-            g2 = jxz * v_first + jyz * v_second
-            return mat33(g0[0], g0[1], g0[2], g1[0], g1[1], g1[2], g2[0], g2[1], g2[2])
+            return wp.matrix_from_rows(jx * v_first, jy * v_second, jxz * v_first + jyz * v_second)
 
         @wp.func
         def position_backward(
@@ -218,24 +227,18 @@ class Pinhole(CameraModel):
             jy = K[1, 1] * inv_z
             jxz = (K[0, 2] - point[0]) * inv_z
             jyz = (K[1, 2] - point[1]) * inv_z
-            axes0 = vec3(axes[0, 0], axes[0, 1], axes[0, 2])
-            axes1 = vec3(axes[1, 0], axes[1, 1], axes[1, 2])
             axes2 = vec3(axes[2, 0], axes[2, 1], axes[2, 2])
-            v_jx = wp.dot(v_first, axes0)
+            v_jx = wp.dot(v_first, vec3(axes[0, 0], axes[0, 1], axes[0, 2]))
             v_jxz = wp.dot(v_first, axes2)
-            v_jy = wp.dot(v_second, axes1)
+            v_jy = wp.dot(v_second, vec3(axes[1, 0], axes[1, 1], axes[1, 2]))
             v_jyz = wp.dot(v_second, axes2)
-            v_K = mat33()
             v_x = v_pixel[0] * jx
             v_y = v_pixel[1] * jy
             v_z = (
                 -(v_pixel[0] * jx * x + v_pixel[1] * jy * y + v_jx * jx + v_jy * jy + v_jxz * jxz + v_jyz * jyz) * inv_z
                 + v_depth
             )
-            v_K[0, 0] = (v_pixel[0] * x + v_jx) * inv_z
-            v_K[1, 1] = (v_pixel[1] * y + v_jy) * inv_z
-            v_K[0, 2] = v_pixel[0]
-            v_K[1, 2] = v_pixel[1]
+            v_K = linear.intrinsics_of((v_pixel[0] * x + v_jx) * inv_z, (v_pixel[1] * y + v_jy) * inv_z, v_pixel)
             if point[0] == pixel[0]:  # the Jacobian moves with the mean: cx - px = -fx x / z
                 v_x -= v_jxz * jx * inv_z
                 v_z += v_jxz * jx * x * inv_z * inv_z
@@ -248,10 +251,7 @@ class Pinhole(CameraModel):
                 v_K[1, 1] = v_K[1, 1] - v_jyz * y * inv_z * inv_z
             else:
                 v_K[1, 2] = v_K[1, 2] + v_jyz * inv_z
-            g = linear.Gradients()
-            g.v_position = vec3(v_x, v_y, v_z)
-            g.v_K = v_K
-            return g
+            return linear.gradients_of(vec3(v_x, v_y, v_z), v_K)
 
         return SimpleNamespace(
             in_range=linear.in_front, depth_of=linear.z_of, pixel_of=pixel_of, expansion_point=linear.clamped,
@@ -268,9 +268,7 @@ class Orthographic(CameraModel):
     def make_functions(real: type) -> SimpleNamespace:
         """Make the functions of `CameraModel.make_functions`."""
         linear = make_linear(real)
-        vec2 = wp.types.vector(2, real)
-        vec3 = wp.types.vector(3, real)
-        mat33 = wp.types.matrix((3, 3), real)
+        vec2, vec3, mat33 = linear.types
 
         @wp.func
         def pixel_of(position: vec3, K: mat33, lens: wp.array(dtype=real)) -> vec2:
@@ -286,15 +284,10 @@ class Orthographic(CameraModel):
             position: vec3, K: mat33, lens: wp.array(dtype=real), pixel: vec2, point: vec2, axes: mat33,
             v_first: vec3, v_second: vec3, v_pixel: vec2, v_depth: real,
         ) -> linear.Gradients:  # fmt: skip
-            v_K = mat33()
-            v_K[0, 0] = v_pixel[0] * position[0] + wp.dot(v_first, vec3(axes[0, 0], axes[0, 1], axes[0, 2]))
-            v_K[1, 1] = v_pixel[1] * position[1] + wp.dot(v_second, vec3(axes[1, 0], axes[1, 1], axes[1, 2]))
-            v_K[0, 2] = v_pixel[0]
-            v_K[1, 2] = v_pixel[1]
-            g = linear.Gradients()
-            g.v_position = vec3(v_pixel[0] * K[0, 0], v_pixel[1] * K[1, 1], v_depth)
-            g.v_K = v_K
-            return g
+            fx = v_pixel[0] * position[0] + wp.dot(v_first, axes[0])
+            fy = v_pixel[1] * position[1] + wp.dot(v_second, axes[1])
+            v_position = vec3(v_pixel[0] * K[0, 0], v_pixel[1] * K[1, 1], v_depth)
+            return linear.gradients_of(v_position, linear.intrinsics_of(fx, fy, v_pixel))
 
         return SimpleNamespace(
             in_range=linear.in_front, depth_of=linear.z_of, pixel_of=pixel_of, expansion_point=linear.unclamped,
@@ -314,9 +307,7 @@ class OpenCV(CameraModel):
         """Make the functions of `CameraModel.make_functions`."""
         linear = make_linear(real)
         lensed = _make_distortion(real)
-        vec2 = wp.types.vector(2, real)
-        vec3 = wp.types.vector(3, real)
-        mat33 = wp.types.matrix((3, 3), real)
+        vec2, vec3, mat33 = linear.types
         one = real(1.0)
 
         @wp.func
@@ -394,11 +385,7 @@ class OpenCV(CameraModel):
             v_b = v_pixel[0] * K[0, 0] * mean.ab + v_pixel[1] * K[1, 1] * mean.bb
             v_a += v_ea * sx
             v_b += v_eb * sy
-            v_K = mat33()
-            v_K[0, 0] = v_pixel[0] * mean.a + first * inv_z
-            v_K[1, 1] = v_pixel[1] * mean.b + second * inv_z
-            v_K[0, 2] = v_pixel[0]
-            v_K[1, 2] = v_pixel[1]
+            v_K = linear.intrinsics_of(v_pixel[0] * mean.a + first * inv_z, v_pixel[1] * mean.b + second * inv_z, v_pixel)
             if sx < one:  # a = a0 (limit - cx) / (fx distorted a0)
                 v_a -= v_ea * a / mean.a * mean.aa
                 v_b -= v_ea * a / mean.a * mean.ab
@@ -410,10 +397,7 @@ class OpenCV(CameraModel):
                 v_K[1, 1] = v_K[1, 1] - v_eb * b / K[1, 1]
                 v_K[1, 2] = v_K[1, 2] - v_eb * b0 / (K[1, 1] * mean.b)
             v_z = -(v_a * a0 + v_b * b0 + first * jx + second * jy) * inv_z + v_depth
-            gradients = linear.Gradients()
-            gradients.v_position = vec3(v_a * inv_z, v_b * inv_z, v_z)
-            gradients.v_K = v_K
-            return gradients
+            return linear.gradients_of(vec3(v_a * inv_z, v_b * inv_z, v_z), v_K)
 
         return SimpleNamespace(
             in_range=in_range, depth_of=linear.z_of, pixel_of=pixel_of, expansion_point=linear.clamped,
@@ -520,9 +504,7 @@ class Fisheye(CameraModel):
         """Make the functions of `CameraModel.make_functions`."""
         linear = make_linear(real)
         radial = _make_profile(real)
-        vec2 = wp.types.vector(2, real)
-        vec3 = wp.types.vector(3, real)
-        mat33 = wp.types.matrix((3, 3), real)
+        vec2, vec3, mat33 = linear.types
 
         @wp.func
         def in_range(position: vec3, lens: wp.array(dtype=real), near: real) -> wp.bool:
@@ -585,15 +567,10 @@ class Fisheye(CameraModel):
             v_x = two * g[0] * x * p.H + (g[1] + h[0]) * y * p.H + g[2] * p.E + u * p.G + v_r * x
             v_y = (g[1] + h[0]) * x * p.H + two * h[1] * y * p.H + h[2] * p.E + v * p.G + v_r * y
             v_z = v_G * p.E + v_H * p.N + v_E * p.P
-            v_K = mat33()
-            v_K[0, 0] = v_pixel[0] * x * p.G + v_row0[0] * (p.G + x * x * p.H) + v_row0[1] * x * y * p.H + v_row0[2] * x * p.E
-            v_K[1, 1] = v_pixel[1] * y * p.G + v_row1[0] * x * y * p.H + v_row1[1] * (p.G + y * y * p.H) + v_row1[2] * y * p.E
-            v_K[0, 2] = v_pixel[0]
-            v_K[1, 2] = v_pixel[1]
-            gradients = linear.Gradients()
-            gradients.v_position = vec3(v_x, v_y, v_z) / distance + v_depth * unit
-            gradients.v_K = v_K
-            return gradients
+            fx = v_pixel[0] * x * p.G + v_row0[0] * (p.G + x * x * p.H) + v_row0[1] * x * y * p.H + v_row0[2] * x * p.E
+            fy = v_pixel[1] * y * p.G + v_row1[0] * x * y * p.H + v_row1[1] * (p.G + y * y * p.H) + v_row1[2] * y * p.E
+            v_position = vec3(v_x, v_y, v_z) / distance + v_depth * unit
+            return linear.gradients_of(v_position, linear.intrinsics_of(fx, fy, v_pixel))
 
         return SimpleNamespace(
             in_range=in_range, depth_of=radial.distance, pixel_of=pixel_of, expansion_point=linear.unclamped,
