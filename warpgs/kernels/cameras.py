@@ -84,9 +84,16 @@ def check_camera(camera: Camera) -> type[CameraModel]:
 
 
 @functools.cache
+def types_of(real: type) -> tuple[Any, ...]:
+    """Return vectors of 2, 3 and 4, matrices of 3 x 3 and 4 x 4, and an array of a scalar type."""
+    vectors = [wp.types.vector(size, real) for size in (2, 3, 4)]
+    return *vectors, wp.types.matrix((3, 3), real), wp.types.matrix((4, 4), real), wp.array(dtype=real)
+
+
+@functools.cache
 def make_linear(real: type) -> SimpleNamespace:
     """Make the structs, products and functions that models share, for one scalar type, wp.float32 or wp.float64."""
-    vec2, vec3, mat33 = wp.types.vector(2, real), wp.types.vector(3, real), wp.types.matrix((3, 3), real)
+    vec2, vec3, _, mat33, _, Reals = types_of(real)
 
     @wp.struct
     class Rows:
@@ -126,7 +133,7 @@ def make_linear(real: type) -> SimpleNamespace:
         return gradients
 
     @wp.func
-    def in_front(position: vec3, lens: wp.array(dtype=real), near: real) -> wp.bool:
+    def in_front(position: vec3, lens: Reals, near: real) -> wp.bool:
         # phrased so that a NaN gives False
         return position[2] >= near and position[2] <= real(FAR)
 
@@ -150,15 +157,13 @@ def make_linear(real: type) -> SimpleNamespace:
         """Return ``project_axes`` and ``axes_backward`` of a model by its ``jacobian(position, K, lens, point) -> Rows``."""
 
         @wp.func
-        def project_axes(position: vec3, K: mat33, lens: wp.array(dtype=real), point: vec2, axes: mat33) -> Rows:
+        def project_axes(position: vec3, K: mat33, lens: Reals, point: vec2, axes: mat33) -> Rows:
             j = jacobian(position, K, lens, point)
             turned = wp.transpose(axes)
             return rows_of(turned * j.first, turned * j.second)
 
         @wp.func
-        def axes_backward(
-            position: vec3, K: mat33, lens: wp.array(dtype=real), point: vec2, v_first: vec3, v_second: vec3
-        ) -> mat33:
+        def axes_backward(position: vec3, K: mat33, lens: Reals, point: vec2, v_first: vec3, v_second: vec3) -> mat33:
             j = jacobian(position, K, lens, point)
             return wp.outer(j.first, v_first) + wp.outer(j.second, v_second)
 
@@ -166,7 +171,7 @@ def make_linear(real: type) -> SimpleNamespace:
 
     return SimpleNamespace(
         Rows=Rows, Gradients=Gradients, rows_of=rows_of, intrinsics_of=intrinsics_of, gradients_of=gradients_of,
-        in_front=in_front, z_of=z_of, unclamped=unclamped, clamped=clamped, products=products, types=(vec2, vec3, mat33),
+        in_front=in_front, z_of=z_of, unclamped=unclamped, clamped=clamped, products=products,
     )  # fmt: skip
 
 
@@ -179,14 +184,14 @@ class Pinhole(CameraModel):
     def make_functions(real: type) -> SimpleNamespace:
         """Make the functions of `CameraModel.make_functions`."""
         linear = make_linear(real)
-        vec2, vec3, mat33 = linear.types
+        vec2, vec3, _, mat33, _, Reals = types_of(real)
 
         @wp.func
-        def pixel_of(position: vec3, K: mat33, lens: wp.array(dtype=real)) -> vec2:
+        def pixel_of(position: vec3, K: mat33, lens: Reals) -> vec2:
             return vec2(K[0, 0] * position[0] / position[2] + K[0, 2], K[1, 1] * position[1] / position[2] + K[1, 2])
 
         @wp.func
-        def project_axes(position: vec3, K: mat33, lens: wp.array(dtype=real), point: vec2, axes: mat33) -> linear.Rows:
+        def project_axes(position: vec3, K: mat33, lens: Reals, point: vec2, axes: mat33) -> linear.Rows:
             z = position[2]
             jx = K[0, 0] / z
             jy = K[1, 1] / z
@@ -205,9 +210,7 @@ class Pinhole(CameraModel):
             return linear.rows_of(first, second)
 
         @wp.func
-        def axes_backward(
-            position: vec3, K: mat33, lens: wp.array(dtype=real), point: vec2, v_first: vec3, v_second: vec3
-        ) -> mat33:
+        def axes_backward(position: vec3, K: mat33, lens: Reals, point: vec2, v_first: vec3, v_second: vec3) -> mat33:
             inv_z = real(1.0) / position[2]
             jx = K[0, 0] * inv_z
             jy = K[1, 1] * inv_z
@@ -217,7 +220,7 @@ class Pinhole(CameraModel):
 
         @wp.func
         def position_backward(
-            position: vec3, K: mat33, lens: wp.array(dtype=real), pixel: vec2, point: vec2, axes: mat33,
+            position: vec3, K: mat33, lens: Reals, pixel: vec2, point: vec2, axes: mat33,
             v_first: vec3, v_second: vec3, v_pixel: vec2, v_depth: real,
         ) -> linear.Gradients:  # fmt: skip
             x = position[0]
@@ -268,20 +271,20 @@ class Orthographic(CameraModel):
     def make_functions(real: type) -> SimpleNamespace:
         """Make the functions of `CameraModel.make_functions`."""
         linear = make_linear(real)
-        vec2, vec3, mat33 = linear.types
+        vec2, vec3, _, mat33, _, Reals = types_of(real)
 
         @wp.func
-        def pixel_of(position: vec3, K: mat33, lens: wp.array(dtype=real)) -> vec2:
+        def pixel_of(position: vec3, K: mat33, lens: Reals) -> vec2:
             return vec2(K[0, 0] * position[0] + K[0, 2], K[1, 1] * position[1] + K[1, 2])
 
         @wp.func
-        def jacobian(position: vec3, K: mat33, lens: wp.array(dtype=real), point: vec2) -> linear.Rows:
+        def jacobian(position: vec3, K: mat33, lens: Reals, point: vec2) -> linear.Rows:
             zero = real(0.0)
             return linear.rows_of(vec3(K[0, 0], zero, zero), vec3(zero, K[1, 1], zero))
 
         @wp.func
         def position_backward(
-            position: vec3, K: mat33, lens: wp.array(dtype=real), pixel: vec2, point: vec2, axes: mat33,
+            position: vec3, K: mat33, lens: Reals, pixel: vec2, point: vec2, axes: mat33,
             v_first: vec3, v_second: vec3, v_pixel: vec2, v_depth: real,
         ) -> linear.Gradients:  # fmt: skip
             fx = v_pixel[0] * position[0] + wp.dot(v_first, axes[0])
@@ -307,11 +310,11 @@ class OpenCV(CameraModel):
         """Make the functions of `CameraModel.make_functions`."""
         linear = make_linear(real)
         lensed = _make_distortion(real)
-        vec2, vec3, mat33 = linear.types
+        vec2, vec3, _, mat33, _, Reals = types_of(real)
         one = real(1.0)
 
         @wp.func
-        def in_range(position: vec3, lens: wp.array(dtype=real), near: real) -> wp.bool:
+        def in_range(position: vec3, lens: Reals, near: real) -> wp.bool:
             # phrased so that a NaN gives False
             if not (position[2] >= near and position[2] <= real(FAR)):
                 return False
@@ -327,7 +330,7 @@ class OpenCV(CameraModel):
             return True
 
         @wp.func
-        def pixel_of(position: vec3, K: mat33, lens: wp.array(dtype=real)) -> vec2:
+        def pixel_of(position: vec3, K: mat33, lens: Reals) -> vec2:
             d = lensed.distort(position[0] / position[2], position[1] / position[2], lens)
             return vec2(K[0, 0] * d.a + K[0, 2], K[1, 1] * d.b + K[1, 2])
 
@@ -340,7 +343,7 @@ class OpenCV(CameraModel):
             return one
 
         @wp.func
-        def jacobian(position: vec3, K: mat33, lens: wp.array(dtype=real), point: vec2) -> linear.Rows:
+        def jacobian(position: vec3, K: mat33, lens: Reals, point: vec2) -> linear.Rows:
             pixel = pixel_of(position, K, lens)
             inv_z = one / position[2]
             a = position[0] * inv_z * scale_to(point[0] - K[0, 2], pixel[0] - K[0, 2])
@@ -352,7 +355,7 @@ class OpenCV(CameraModel):
 
         @wp.func
         def position_backward(
-            position: vec3, K: mat33, lens: wp.array(dtype=real), pixel: vec2, point: vec2, axes: mat33,
+            position: vec3, K: mat33, lens: Reals, pixel: vec2, point: vec2, axes: mat33,
             v_first: vec3, v_second: vec3, v_pixel: vec2, v_depth: real,
         ) -> linear.Gradients:  # fmt: skip
             inv_z = one / position[2]
@@ -407,7 +410,7 @@ class OpenCV(CameraModel):
 
 @functools.cache
 def _make_distortion(real: type) -> SimpleNamespace:
-    vec2 = wp.types.vector(2, real)
+    vec2, *_, Reals = types_of(real)
     one = real(1.0)
     two = real(2.0)
 
@@ -432,7 +435,7 @@ def _make_distortion(real: type) -> SimpleNamespace:
         folded: wp.bool
 
     @wp.func
-    def radial_at(t: real, lens: wp.array(dtype=real)) -> Radial:
+    def radial_at(t: real, lens: Reals) -> Radial:
         three = real(3.0)
         k1 = lens[0]
         k2 = lens[1]
@@ -451,7 +454,7 @@ def _make_distortion(real: type) -> SimpleNamespace:
         return r
 
     @wp.func
-    def distort(a: real, b: real, lens: wp.array(dtype=real)) -> Distorted:
+    def distort(a: real, b: real, lens: Reals) -> Distorted:
         six = real(6.0)
         p1 = lens[2]
         p2 = lens[3]
@@ -468,7 +471,7 @@ def _make_distortion(real: type) -> SimpleNamespace:
         return d
 
     @wp.func
-    def curved(a: real, b: real, v_aa: real, v_ab: real, v_bb: real, lens: wp.array(dtype=real)) -> vec2:
+    def curved(a: real, b: real, v_aa: real, v_ab: real, v_bb: real, lens: Reals) -> vec2:
         """Return the gradients of (a, b) from those of the Jacobian's entries."""
         four = real(4.0)
         six = real(6.0)
@@ -504,10 +507,10 @@ class Fisheye(CameraModel):
         """Make the functions of `CameraModel.make_functions`."""
         linear = make_linear(real)
         radial = _make_profile(real)
-        vec2, vec3, mat33 = linear.types
+        vec2, vec3, _, mat33, _, Reals = types_of(real)
 
         @wp.func
-        def in_range(position: vec3, lens: wp.array(dtype=real), near: real) -> wp.bool:
+        def in_range(position: vec3, lens: Reals, near: real) -> wp.bool:
             # phrased so that a NaN gives False
             distance = radial.distance(position)
             if not (distance >= near and distance <= real(FAR)):
@@ -525,13 +528,13 @@ class Fisheye(CameraModel):
             return True
 
         @wp.func
-        def pixel_of(position: vec3, K: mat33, lens: wp.array(dtype=real)) -> vec2:
+        def pixel_of(position: vec3, K: mat33, lens: Reals) -> vec2:
             unit = position / radial.distance(position)
             p = radial.profile(unit, lens)
             return vec2(K[0, 0] * unit[0] * p.G + K[0, 2], K[1, 1] * unit[1] * p.G + K[1, 2])
 
         @wp.func
-        def jacobian(position: vec3, K: mat33, lens: wp.array(dtype=real), point: vec2) -> linear.Rows:
+        def jacobian(position: vec3, K: mat33, lens: Reals, point: vec2) -> linear.Rows:
             distance = radial.distance(position)
             unit = position / distance
             x = unit[0]
@@ -545,7 +548,7 @@ class Fisheye(CameraModel):
 
         @wp.func
         def position_backward(
-            position: vec3, K: mat33, lens: wp.array(dtype=real), pixel: vec2, point: vec2, axes: mat33,
+            position: vec3, K: mat33, lens: Reals, pixel: vec2, point: vec2, axes: mat33,
             v_first: vec3, v_second: vec3, v_pixel: vec2, v_depth: real,
         ) -> linear.Gradients:  # fmt: skip
             two = real(2.0)
@@ -580,7 +583,7 @@ class Fisheye(CameraModel):
 
 @functools.cache
 def _make_profile(real: type) -> SimpleNamespace:
-    vec3 = wp.types.vector(3, real)
+    _, vec3, *_, Reals = types_of(real)
 
     @wp.struct
     class Profile:
@@ -597,7 +600,7 @@ def _make_profile(real: type) -> SimpleNamespace:
         P: real
 
     @wp.func
-    def slope(t: real, lens: wp.array(dtype=real)) -> real:
+    def slope(t: real, lens: Reals) -> real:
         """Return the derivative of the radius by the angle, whose square is t."""
         return real(1.0) + t * (
             real(3.0) * lens[0] + t * (real(5.0) * lens[1] + t * (real(7.0) * lens[2] + t * real(9.0) * lens[3]))
@@ -625,7 +628,7 @@ def _make_profile(real: type) -> SimpleNamespace:
         return vec3(A, B, -(real(2.0) * z + real(3.0) * B) / r2)
 
     @wp.func
-    def profile(unit: vec3, lens: wp.array(dtype=real)) -> Profile:
+    def profile(unit: vec3, lens: Reals) -> Profile:
         two = real(2.0)
         r2 = unit[0] * unit[0] + unit[1] * unit[1]
         z = unit[2]

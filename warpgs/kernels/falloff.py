@@ -204,10 +204,7 @@ def make_batches(real, tile_size: int, channels: int):
     strip_reals = wp.types.vector(STRIP, real)
     lane_reals = wp.types.vector(TOGETHER, real)
     strip_ints = wp.types.vector(tile_size * (tile_size // STRIP), wp.int32)
-    batch = wp.constant(BATCH)
-    together = wp.constant(TOGETHER)
     side = wp.constant(tile_size)
-    strip = wp.constant(STRIP)
     parts = wp.constant(tile_size // STRIP)
     bits = wp.constant(BATCH - 1)
     place_z = wp.constant(6 + channels)
@@ -251,7 +248,7 @@ def make_batches(real, tile_size: int, channels: int):
     def load_channels(projected: wp.array(dtype=record), i: wp.int32, j: wp.int32, b: wp.ref[Batch]):
         """Load the channels of a Gaussian."""
         for c in range(wp.static(channels)):
-            b.color[c * batch + j] = projected[i][6 + c]
+            b.color[c * BATCH + j] = projected[i][6 + c]
 
     @wp.func(inline=True)
     def load(
@@ -297,27 +294,27 @@ def make_batches(real, tile_size: int, channels: int):
         group = int(0)
         while group < count:
             j = group & bits
-            group += together
+            group += TOGETHER
             for part in range(parts):
-                for lane in range(together):
-                    b.begin[part * batch + j + lane] = side
-                    b.end[part * batch + j + lane] = 0
+                for lane in range(TOGETHER):
+                    b.begin[part * BATCH + j + lane] = side
+                    b.end[part * BATCH + j + lane] = 0
             for row in range(side):
                 y = real(top + row) + real(0.5)
-                for lane in range(together):
+                for lane in range(TOGETHER):
                     dy = y - at(b.y[j + lane])
                     e2 = at(b.u22[j + lane]) * dy
                     e12[lane] = f.apart(at(b.u12[j + lane]) * dy)
                     e22[lane] = f.apart(e2 * e2)
                 for part in range(parts):
-                    x = real(left + part * strip) + real(0.5)
+                    x = real(left + part * STRIP) + real(0.5)
                     strip_end = at_int(until[part * side + row])
-                    for lane in range(together):
+                    for lane in range(TOGETHER):
                         u11 = at(b.u11[j + lane])
                         start = f.apart(u11 * (x - at(b.x[j + lane]))) + e12[lane]
                         seen = last - (j + lane) < strip_end
                         hit = f.reaches(start, u11, e22[lane], at(b.aside[j + lane]), at(b.limit[j + lane])) and seen
-                        o = part * batch + j + lane
+                        o = part * BATCH + j + lane
                         b.begin[o] = wp.min(at_int(b.begin[o]), wp.where(hit, row, side))
                         b.end[o] = wp.max(at_int(b.end[o]), wp.where(hit, row + 1, 0))
 
@@ -334,7 +331,7 @@ def make_batches(real, tile_size: int, channels: int):
             rows.dy[row] = dy
             rows.e12[row] = f.apart(u12 * dy)
             rows.e22[row] = f.apart(e2 * e2)
-        for lane in range(strip):
+        for lane in range(STRIP):
             rows.ramp[lane] = f.apart(u11 * real(lane))
 
     return SimpleNamespace(

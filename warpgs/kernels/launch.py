@@ -233,7 +233,7 @@ class _Recorded:
             packed = command.params[i + 2]  # after the bounds and ``begin``
             # In a loop most arguments are those of the call before, memory addresses included.
             if array:
-                stride = row_stride(value) if value.ndim != array[1] else 0
+                stride = row_stride(value) if 0 < value.ndim != array[1] else 0
                 key = value.data_ptr(), value.shape, stride, value.dtype
                 if known[i] == key:
                     continue

@@ -93,9 +93,7 @@ def project_gradients(
     cameras, count = len(inputs[5]), len(inputs[0])
     rows = (cameras, count) if wants_camera else (0, 0)
     v_viewmats, v_Ks = (projected.new_zeros(*rows, n, n) if wants_camera else projected.new_empty(*rows, n, n) for n in (4, 3))
-    arguments = [
-        *inputs[:8], *settings.size, settings.sh_count, rule.near, rule.low_pass, projected, tile_counts, v_projected
-    ]  # fmt: skip
+    arguments = [*inputs[:8], *settings.size, settings.sh_count, rule.near, rule.low_pass, projected, tile_counts, v_projected]
     if _threads_each(projected):
         kernel, tasks, cost = project_cuda.make_backward(real, *settings.variant()), -(-count // BLOCK) * BLOCK, 10
         if real is wp.float64:
