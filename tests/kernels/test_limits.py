@@ -7,8 +7,7 @@ import pytest
 import torch
 
 from tests.gaussians import SMOOTH, camera, cloud, leaves
-from tests.kernels.test_project import facing
-from tests.kernels.test_project import limit_run as run
+from tests.kernels.test_project import facing, run
 from tests.numerics.test_extreme_compositing import Filled
 from tests.reference.blend import blend_reference
 from tests.reference.ssim import ssim_reference
