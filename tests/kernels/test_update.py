@@ -39,9 +39,10 @@ def problem(dtype, device, shape=(1500, 4, 3)):
     return param.to(device, dtype), [g.to(device, dtype) for g in grads]
 
 
-def test_steps_equal_torch(device, dtype):
-    """Four steps move every element as torch.optim.Adam does."""
-    param, grads = problem(dtype, device)
+@pytest.mark.parametrize("shape", [(1500, 4, 3), *((count, 1) for count in (1, 15, 16, 17, 33, 4096, 4097))])
+def test_steps_equal_torch(device, dtype, shape):
+    """Four steps move every element as torch.optim.Adam does, also one more than a step of lanes or a segment of tasks."""
+    param, grads = problem(dtype, device, shape)
     found, _, _ = run(param, grads, lr=0.01)
     wanted = adam_reference(param.cpu().double(), [g.cpu().double() for g in grads], 0.01)
     moved = (wanted - param.cpu().double()).abs().max()

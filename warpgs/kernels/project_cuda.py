@@ -14,6 +14,11 @@ from warpgs.kernels.native import make_functions as make_native
 Ints = wp.array(dtype=int)
 
 
+def _module(kind: str, real, camera_model: str, parameters: str, antialiased: bool, bases: int) -> str:
+    variant = f"{camera_model}.{parameters}.{bases}{'.antialiased' * antialiased}"
+    return f"warpgs.kernels.project.{kind}.cuda.{real.__name__}.{variant}"
+
+
 @functools.cache
 def make_forward(real, camera_model: str, parameters: str = "stored", antialiased: bool = False, bases: int = sh.BASES):
     """Make the forward kernel of one `Pass.variant`. It computes colours last, because they need the most data."""
@@ -34,8 +39,7 @@ def make_forward(real, camera_model: str, parameters: str = "stored", antialiase
             projected[i, k] = values[k]
 
     store = make_native().store_row if native else store_values
-    variant = f".{parameters}.{bases}{'.antialiased' * antialiased}"
-    module = f"warpgs.kernels.project.forward.cuda.{real.__name__}.{camera_model}{variant}"
+    module = _module("forward", real, camera_model, parameters, antialiased, bases)
 
     @wp.func
     def project_one(
@@ -169,8 +173,7 @@ def make_backward(real, camera_model: str, parameters: str = "stored", antialias
 
     # three blocks to a multiprocessor: enough registers
     registers = {"cuda_max_registers": 168, "grid_stride": False} if native else {}
-    variant = f".{parameters}.{bases}{'.antialiased' * antialiased}"
-    module = f"warpgs.kernels.project.backward.cuda.{real.__name__}.{camera_model}{variant}"
+    module = _module("backward", real, camera_model, parameters, antialiased, bases)
 
     @wp.kernel(enable_backward=False, module=module, **registers)
     def backward(
