@@ -57,8 +57,9 @@ def test_bad_input_is_refused():
         mean_square_distances(torch.tensor([[0.0, 0, 0], [float("nan"), 0, 0]]))
     with pytest.raises(ValueError, match="points"):
         mean_square_distances(torch.zeros(4, 2))
-    with pytest.raises(ValueError, match="k must be"):
-        mean_square_distances(torch.zeros(4, 3), 0)
+    for k in (0, 9):
+        with pytest.raises(ValueError, match=f"k must be 1 to 8, not {k}"):
+            mean_square_distances(torch.zeros(4, 3), k)
 
 
 # Sizes at which Gaussians reach no camera, against distances in float64.

@@ -7,7 +7,20 @@ from tests.reference.ssim import ssim_reference
 from tests.tolerances import close
 from warpgs.kernels.ssim import differences, ssim
 
-SIZES = [(1, 1), (1, 17), (17, 1), (5, 7), (10, 11), (33, 47)]
+SIZES = [
+    (1, 1),
+    (1, 17),
+    (17, 1),
+    (5, 7),
+    (9, 5),
+    (9, 6),
+    (10, 11),
+    (16, 16),
+    (15, 32),
+    (32, 17),
+    (17, 33),
+    (33, 47),
+]
 
 
 def images(height, width, dtype=torch.float64, device="cpu"):

@@ -174,7 +174,7 @@ def test_ranges_by_four_instances_a_thread(device, count, slotted):
     for native in (True, False):
         each = EACH if native else 1
         ids, ranges = torch.full((count,), -1, dtype=torch.int32, device=device), torch.zeros_like(tiles)[:, None].repeat(1, 2)
-        ints = [launch.view(t, wp.int32) for t in (keys, slots, owners, ids, ranges)]
+        ints = [keys, slots, owners, ids, ranges]
         launch.launch(make_find_ranges(slotted, native), -(-count // each), [*ints[:3], count, no_tile, *ints[3:]], device)
         empty = begin == end
         assert torch.equal(ranges[~empty], torch.stack([begin, end], 1)[~empty]) and not ranges[empty].any()
@@ -196,8 +196,8 @@ def test_visible_ones_come_first_and_in_order(device, count):
     wanted = torch.where(counts[order] > 0, projected[order, 9], torch.inf)
     for limit in (count, seen, seen // 2):
         keys, ids = torch.zeros(count, device=device), torch.full((count,), -1, dtype=torch.int32, device=device)
-        inputs = [launch.view(projected, wp.float32), launch.view(counts, wp.int32), launch.view(sums, wp.int64)]
-        inputs += [sum_bits(count), limit, launch.view(keys, wp.float32), launch.view(ids, wp.int32)]
+        inputs = [projected, counts, sums]
+        inputs += [sum_bits(count), limit, keys, ids]
         launch.launch(kernels.visible_keys, sum_entries(count, native)[1], inputs, device)
         assert torch.equal(keys[:limit], wanted[:limit]) and torch.equal(ids[:limit].long(), order[:limit])
         assert not keys[limit:].any() and bool((ids[limit:] == -1).all())

@@ -77,9 +77,10 @@ def test_sizes_beyond_32_bits_are_refused(device):
     """An axis, a launch and a number of tiles that would wrap around are errors that say what to do."""
     huge = torch.zeros(1, device=device).expand(2**31)
     with pytest.raises(ResourceError, match=r"2,147,483,648 entries .* fewer Gaussians"):
-        launch.view(huge, torch.float32).array()
+        launch.as_array(huge, None, 1)
     with pytest.raises(ResourceError, match=r"2,147,483,648 entries"):
         launch.launch(None, 2**31, [], device)
+    launch._check_size(2**31 - 1)
     projected, counts = torch.zeros(1, 0, 12, device=device), torch.zeros(1, 0, dtype=torch.int32, device=device)
     with pytest.raises(ResourceError, match=r"2,147,483,648 tiles of 8 px.* fewer cameras"):
         bin_tiles(projected, counts, width=8 * 2**16, height=8 * 2**15, tile_size=8, rule=EXACT)
@@ -90,11 +91,12 @@ def test_a_refused_size_leaves_a_recorded_launch_as_it_was():
     recorded, packed = launch._Recorded.__new__(launch._Recorded), SimpleNamespace(ndim=1, data=0, shape=[0])
     recorded.command = SimpleNamespace(bounds=SimpleNamespace(size=1), params=[None, None, packed], set_dim=lambda _: None)
     recorded.known, recorded.dtypes, recorded.device = [None], [torch.float32], SimpleNamespace(is_cuda=False)
+    recorded.declared = [(None, 1)]
     small, other = torch.zeros(5), torch.zeros(6)
-    recorded._patch(1, [launch.view(small, None)])
+    recorded._patch(1, [small])
     with pytest.raises(ResourceError, match="2,147,483,648 entries"):
-        recorded._patch(1, [launch.view(other[:1].expand(2**31), None)])
-    recorded._patch(1, [launch.view(small, None)])
+        recorded._patch(1, [other[:1].expand(2**31)])
+    recorded._patch(1, [small])
     assert packed.data == small.data_ptr() and packed.shape == [5]
 
 

@@ -29,7 +29,7 @@ CUDA_FILES = ("warpgs/kernels/blend_cuda.py", "warpgs/kernels/ssim.py", "warpgs/
 CUDA_FUNCTIONS = {
     "warpgs/kernels/launch.py": ("_Recorded", "_recorded", "warp_stream", "_warp_stream", "stream_of", "warp_device"),
     "warpgs/kernels/graphs.py": (
-        "CapturedGraph", "GraphMemory", "GraphPool.capture", "GraphPool.pool", "GraphPool.release",
+        "CapturedGraph", "GraphMemory", "GraphPool.capture", "GraphPool.release",
     ),
     "warpgs/kernels/update.py": ("scheduled_update",),
     "warpgs/kernels/walk.py": ("make_native",),

@@ -11,7 +11,8 @@ from warpgs.constants import Rule
 from warpgs.device import BINNING, BLENDING, FLOAT, LOSS, PROJECTION, SAMPLING, Needs, StepSizes
 from warpgs.kernels import blend_cpu, blend_cuda, launch
 from warpgs.kernels.falloff import COLORS, VALUES, WIDTHS, Pass
-from warpgs.kernels.launch import TORCH, Allocator, first_order, keep, kept
+from warpgs.kernels.graphs import TORCH, Allocator
+from warpgs.kernels.launch import first_order, keep, kept
 from warpgs.kernels.native import ROLLED
 from warpgs.kernels.tiles import Tiles, grid
 
@@ -114,10 +115,9 @@ def composite(
     alpha, depth = (allocator.output(shape, projected.dtype, device) for _ in range(2))
     transmittances, weights = (allocator.saved(shape, projected.dtype, device) for _ in range(2))
     ends = allocator.saved(shape, torch.int32, device)
-    pixels = launch.span(rgb, real)
     inputs = [
-        settings.struct(tiles.size, real), projected, tiles.ranges, tiles.gaussian_ids, backgrounds,
-        pixels, pixels.row_stride(), alpha, depth, transmittances, weights, ends,
+        settings.struct(tiles.size, real), projected, tiles.ranges, tiles.gaussian_ids, backgrounds, rgb,
+        launch.row_stride(rgb), alpha, depth, transmittances, weights, ends,
     ]  # fmt: skip
     kernel = blend_cpu.make_kernels(real, tiles.size, channels).forward
     launch.launch(kernel, len(tiles.ranges), inputs, device, cost=10_000, block_dim=32)
@@ -146,10 +146,10 @@ def composite_gradients(
     values = VALUES + channels - COLORS + 2 * settings.absgrad
     v_projected = allocator.output(projected.shape, projected.dtype, device)
     v_slots = allocator.workspace((len(tiles.slots), values), projected.dtype, device).zero_()
-    pixels, nothing = launch.span(v_rgb, real), torch.zeros_like(depth) if deep else depth.new_empty(0)
+    nothing = torch.zeros_like(depth) if deep else depth.new_empty(0)
     inputs = [
         settings.struct(tiles.size, real), projected, tiles.ranges, tiles.gaussian_ids, tiles.slots, backgrounds,
-        transmittances, weights, depth, ends, pixels, pixels.row_stride(),
+        transmittances, weights, depth, ends, v_rgb, launch.row_stride(v_rgb),
         *(nothing if v is None else v.contiguous() for v in (v_alpha, v_depth)), v_slots,
     ]  # fmt: skip
     kernel = blend_cpu.make_kernels(real, tiles.size, channels, settings.absgrad, deep).backward

@@ -23,7 +23,8 @@ from warpgs.device import (
 from warpgs.errors import ResourceError
 from warpgs.kernels import launch
 from warpgs.kernels.ellipse import make_spans
-from warpgs.kernels.launch import TORCH, Allocator, sort_pairs
+from warpgs.kernels.graphs import TORCH, Allocator
+from warpgs.kernels.launch import sort_pairs
 from warpgs.kernels.native import EXACT
 from warpgs.kernels.native import make_functions as make_native
 from warpgs.kernels.project_cpu import LANES

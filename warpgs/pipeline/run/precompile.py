@@ -18,6 +18,7 @@ from warpgs.kernels import (
     blend,
     blend_cpu,
     blend_cuda,
+    graphs,
     launch,
     neighbours,
     project_cpu,
@@ -76,7 +77,7 @@ def fit_kernels(cuda: bool) -> list[tuple[wp.Kernel, int]]:
         (project_cuda.make_backward(wp.float32, CAMERA_MODEL), BLOCK),
     ]
     own += [(blend_cuda.make_forward(TILE_SIZE, save, per), warps) for save in (True, False) for per in (1, 2)]
-    own += [(launch.make_fetch(), THREADS), (blending.order_tiles, blend_cuda.ORDER_THREADS)]
+    own += [(graphs.make_fetch(), THREADS), (blending.order_tiles, blend_cuda.ORDER_THREADS)]
     own += [(blending.contributions, TILE_SIZE * TILE_SIZE)]
     own += [(blend.make_segments(real).gather_weights, THREADS), (sweep.follow, sweep.BLOCK)]
     for depth, chunk in itertools.product((False, True), blend_cuda.CHUNKS):  # with a loss term that reads depth, and without
