@@ -323,7 +323,7 @@ def test_unknown_semantics_leave_the_weights_to_the_others(tiny):
     """A view of which semantics say nothing is scored by the other two, whose weights sum to 1."""
     blank = [dataclasses.replace(p, boundary=p.boundary * 0, foreground=p.foreground * 0) for p in priors(photos(3, 32, 32))]
     fit = trainer(given=blank)
-    render, semantic, geometry, total = fit.strategy.sample(1, {0: fit.views[0]}, 0.01, 0.5).views[0].scores.values()
+    render, semantic, geometry, total = fit.strategy.sample(1, {0: fit.views[0]}, 0.01, 0.5)[2][0].scores.values()
     assert not bool(semantic.any()) and torch.allclose(total, 0.5 * render + 0.5 * geometry)
 
 
@@ -338,8 +338,8 @@ def test_gain_draws_where_all_views_ask_for_colour(tiny):
         fit.table.params.update(kept)
         fit.table.columns.update({n: c[:2] for n, c in fit.table.columns.items()})
         fit.context.capacity = 10_000
-        event = fit.strategy.sample(9, views, 0.01, 50.0)
-        away = (event.change.added["means"] - whole.means[2]).norm(dim=1)
+        change, *_ = fit.strategy.sample(9, views, 0.01, 50.0)
+        away = (change.added["means"] - whole.means[2]).norm(dim=1)
         fraction.append(float((away < 0.45).float().mean()))
     assert fraction[0] > 0.9 > 0.6 > fraction[1]
 

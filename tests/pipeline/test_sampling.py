@@ -23,7 +23,6 @@ from warpgs.pipeline.train.strategies.sampling import (
     COARSE,
     FINE,
     NOT_SAMPLED,
-    Event,
     MethodConfig,
     SamplerConfig,
     fine_gaussians,
@@ -65,7 +64,7 @@ def grown(fit: Trainer, keep: int | list[int], parents: list[int], **more) -> De
     return DensityUpdate(rows, added, torch.tensor(parents), **more)
 
 
-def event_of(fit: Trainer, views, step: int, fraction: float = 0.01, max_fraction: float = 0.5) -> Event:
+def event_of(fit: Trainer, views, step: int, fraction: float = 0.01, max_fraction: float = 0.5):
     """A sampling event on some views that is not applied."""
     return fit.strategy.sample(step, dict(enumerate(views)), fraction, max_fraction)
 
@@ -241,11 +240,11 @@ def test_full_fine_layer_frees_its_least_contributors():
     fit = fitted(steps=8)
     cap = len(fit.strategy.events) and int(fit.strategy.fine.sum())
     most = cap / int((~fit.strategy.fine).sum())
-    protected = event_of(fit, fit.views, 9, max_fraction=most)
-    assert protected.evicted == 0 and len(protected.change.parents) == 0
-    old = event_of(fit, fit.views, 500, max_fraction=most)
-    assert old.evicted == len(old.change.parents) == cap
-    assert bool((~fit.strategy.fine)[old.change.keep].all())
+    change, evicted, _ = event_of(fit, fit.views, 9, max_fraction=most)
+    assert evicted == 0 and len(change.parents) == 0
+    change, evicted, _ = event_of(fit, fit.views, 500, max_fraction=most)
+    assert evicted == len(change.parents) == cap
+    assert bool((~fit.strategy.fine)[change.keep].all())
 
 
 def test_continued_fit_equals_uninterrupted_one(tmp_path):
@@ -269,9 +268,9 @@ def test_fine_gaussians_stand_at_confirmed_depths(gated):
     fit.strategy.gated = gated
     view, consistent = fit.views[0], torch.zeros(32, 40)
     consistent[:, :20] = 1.25
-    event = event_of(fit, [dataclasses.replace(view, consistent=consistent)], 9, 0.2, 50)
-    columns = event.views[0].at[:, 1]
-    points = event.change.added["means"]
+    change, _, sampled = event_of(fit, [dataclasses.replace(view, consistent=consistent)], 9, 0.2, 50)
+    columns = sampled[0].at[:, 1]
+    points = change.added["means"]
     z = points @ view.camera.viewmat[2, :3] + view.camera.viewmat[2, 3]
     assert len(z) == len(columns) > 50
     assert torch.allclose(z[columns < 20], torch.tensor(1.25), atol=1e-4)

@@ -152,7 +152,8 @@ def test_a_batch_of_one_view_is_a_step_of_one_view():
     """Through dropout, sampling events, layers and protection: the same bits by way of the sums."""
     views = photos(3)
     one, batch = (Trainer(views, seeds(61), METHOD, CPU, priors=priors(views)) for _ in range(2))
-    batch.taker.batched = BatchSteps(batch.learned, batch.buffers, batch.context.render_options(), Tree(1, ALONE))
+    t = batch.taker
+    batch.taker = BatchSteps(t.table, t.views, t.strategy, t.cameras, t.options, t.dropout_seed, Tree(1, ALONE))
     advanced(one, 24), advanced(batch, 24)
     assert len(one.strategy.events) > 1 and same_bits(one, batch)
 
@@ -206,9 +207,9 @@ def test_a_loss_that_is_no_number_names_its_view_and_harms_nothing():
 
 def in_series(fit: Trainer) -> Trainer:
     """Have a fit take several steps before it reads their results, as on CUDA, but without graphs."""
-    fit.layout = dataclasses.replace(fit.layout, graphs=1)
-    fit.buffers = StepBuffers(CPU, fit.buffers.lr_rows.shape[1], MAX_STEPS)
-    fit.taker.batched = BatchSteps(fit.learned, fit.buffers, fit.context.render_options(), fit.taker.batched.tree)
+    fit.layout.graphs = 1
+    fit.taker.buffers = StepBuffers(CPU, fit.taker.buffers.lr_rows.shape[1], MAX_STEPS)
+    fit.taker.clear()
     return fit
 
 
@@ -245,16 +246,16 @@ def test_a_view_beyond_the_capacity_ends_a_series_which_is_taken_up_again(monkey
     """It stops steps in the middle of a series, as a graph with too little capacity does: their bits do not change."""
     config = dataclasses.replace(PLAIN, batch=3, dropout=0.3, steps=12)
     one, many = (Trainer(photos(3), seeds(61), config, CPU) for _ in range(2))
-    honest, calls = batch.view_gradients, []
+    honest, calls = BatchSteps.view_gradients, []
 
-    def overflowing(learned, views, buffers, *rest):
+    def overflowing(taker, views, buffers, *rest):
         calls.append(1)
-        found = honest(learned, views, buffers, *rest)
+        found = honest(taker, views, buffers, *rest)
         if len(calls) in (8, 30):
             buffers.stop.fill_(1)
         return found
 
-    monkeypatch.setattr(batch, "view_gradients", overflowing)
+    monkeypatch.setattr(BatchSteps, "view_gradients", overflowing)
     steps = [r.step for _ in range(12) if many.step < 12 for r in in_series(many).advance(100)]
     monkeypatch.undo()
     assert steps == list(range(1, 13)) and len(calls) > 36 and same_bits(advanced(one, 12), many, ("generator",))
@@ -287,7 +288,7 @@ def test_ranks_that_divide_the_coefficients_have_the_bits_of_one(monkeypatch):
     alone = advanced(Trainer(photos(3), seeds(61), config, CPU), 10)
     for count in (2, 3):
         fits = by_threads(lambda ranks: advanced(Trainer(photos(3), seeds(61), config, CPU, ranks=ranks), 10), count)
-        assert 0 < fits[0].taker.batched.sums.divided < len(alone.table) and all(same_bits(alone, fit) for fit in fits)
+        assert 0 < fits[0].taker.sums.divided < len(alone.table) and all(same_bits(alone, fit) for fit in fits)
 
 
 @pytest.mark.parametrize("stopped", [None, 5])
@@ -316,7 +317,7 @@ def test_ranks_that_divide_the_coefficients_take_several_steps_at_once(monkeypat
     alone.order = list(order)
     advanced(alone, 10 if stopped is None else stopped - 1)
     fits = by_threads(fitted, 2)
-    assert all(0 < fit.taker.batched.sums.divided for fit in fits)
+    assert all(0 < fit.taker.sums.divided for fit in fits)
     assert all(same_bits(alone, fit, () if stopped is None else ("generator",)) for fit in fits)
 
 

@@ -40,7 +40,7 @@ from warpgs.pipeline.train.loss import (
 )
 from warpgs.pipeline.train.presets import PRESETS
 from warpgs.pipeline.train.settings import FEW, SMOOTH_STEPS, FitConfig, settings_by_views, steps_by_views
-from warpgs.pipeline.train.step import StepPlan, eager_renderer, total_loss, view_gradients
+from warpgs.pipeline.train.step import StepPlan, eager_renderer, total_loss
 from warpgs.pipeline.train.strategies.base import Strategy
 from warpgs.pipeline.train.strategies.clone_split import DensityConfig
 from warpgs.pipeline.train.trainer import Trainer
@@ -208,11 +208,12 @@ def test_a_refined_pose_learns_from_a_term():
     config = dataclasses.replace(PLAIN, view_modules=(RefinePoses(),), loss_terms=(Puller(),))
     fit = Trainer(photos(3), seeds(), config, CPU)
     plan = fit.plan_of(1)
-    fit.learned.views.table.params[ROTATION].data[1] = torch.tensor([0.0, 0.2, 0.0])
+    fit.learned.table.params[ROTATION].data[1] = torch.tensor([0.0, 0.2, 0.0])
     (stack,) = fit.stacks.values()
-    fit.buffers.load([1], [[0.0] * fit.buffers.lr_rows.shape[1]], [fit.settings(1)])
-    found = view_gradients(fit.learned, stack, fit.buffers, plan, eager_renderer(fit.context.render_options(), None))
-    rotation = found.gradients[len(fit.table.params) + list(fit.learned.views.table.params).index(ROTATION)]
+    fit.taker.buffers.load([1], [[0.0] * fit.taker.buffers.lr_rows.shape[1]], [fit.settings(1)])
+    render = eager_renderer(fit.context.render_options(), None)
+    gradients, *_ = fit.taker.view_gradients(stack, fit.taker.buffers, plan, render)
+    rotation = gradients[len(fit.table.params) + list(fit.learned.table.params).index(ROTATION)]
     assert float(rotation[1].abs().max()) > 10 and not bool(rotation[[0, 2]].any())
 
 

@@ -182,16 +182,16 @@ def test_cameras_of_now_are_those_that_steps_render_from(own):
     """Intrinsics too, at both sizes; stacks keep what was given."""
     zoom = VIEW_MODULES.load(f"{own}:Zoom")()
     fit = advanced(Trainer(photos(3), seeds(), dataclasses.replace(PLAIN, view_modules=(zoom,), half_resolution=0.5), CPU), 20)
-    factors = 1 + fit.learned.views.table.params["zoom"].detach()[:, 0]
+    factors = 1 + fit.learned.table.params["zoom"].detach()[:, 0]
     assert (factors != 1).all()
     given = [float(v.camera.K[0, 0]) for v in photos(3)]
     fit.show_learned()
     torch.testing.assert_close(torch.stack([v.camera.K[0, 0] for v in fit.views]), torch.tensor(given) * factors)
     fit.set_views(fit.views)
     for stack in fit.stacks.values():
-        half = stack.size[0] / photos(1)[0].camera.width
-        torch.testing.assert_close(stack.Ks[:, 0, 0], torch.tensor(given) * half)
-        torch.testing.assert_close(current(stack, fit.learned.views).Ks[:, 0, 0], torch.tensor(given) * half * factors)
+        half = stack.camera.width / photos(1)[0].camera.width
+        torch.testing.assert_close(stack.camera.K[:, 0, 0], torch.tensor(given) * half)
+        torch.testing.assert_close(current(stack, fit.learned).camera.K[:, 0, 0], torch.tensor(given) * half * factors)
 
 
 def test_each_of_ours_has_a_flag(own):
@@ -313,7 +313,7 @@ def test_strategies_see_the_exposures_of_now():
     trainer = Trainer(views, scenes.seeds(), FitConfig(steps=40, view_modules=(Exposure(),), half_resolution=0.0), CPU)
     shown = [v.learned.values[EXPOSURE] for v in trainer.views]
     assert not torch.stack(shown).any()
-    trainer.learned.views.table.params[EXPOSURE].data[0] = 0.3
+    trainer.learned.table.params[EXPOSURE].data[0] = 0.3
     trainer.show_learned()
     assert torch.stack(shown).abs().min() > 0.05 and torch.stack(shown).mean(0).abs().max() < 1e-6
     options = RasterizeOptions(background=trainer.background)
@@ -501,13 +501,13 @@ def test_a_fit_finds_poses_back(tmp_path):
     trainer = Trainer(given, scene.points, FitConfig(steps=400, half_resolution=0.25, view_modules=(RefinePoses(),)), CPU)
     while trainer.step < 400:
         trainer.advance()
-    cameras = refined_cameras({v.name: v.camera for v in given}, names, (), trainer.learned.views.table.params)
+    cameras = refined_cameras({v.name: v.camera for v in given}, names, (), trainer.learned.table.params)
     assert np.array_equal(cameras[names[0]].viewmat, given[0].camera.viewmat)
     found = [dataclasses.replace(v, camera=cameras[v.name]) for v in given]
     before, after = errors(given, truth), errors(found, truth)
     assert (after < 0.8 * before).all(), (before, after)
     for name in (ROTATION, TRANSLATION):
-        assert not trainer.learned.views.table.params[name][0].any()
+        assert not trainer.learned.table.params[name][0].any()
 
 
 @pytest.mark.slow
@@ -522,7 +522,7 @@ def test_a_fit_finds_a_focal_length_back(tmp_path):
     while trainer.step < 400:
         trainer.advance()
     names = [v.name for v in given]
-    cameras = refined_cameras({v.name: v.camera for v in given}, names, (), trainer.learned.views.table.params)
+    cameras = refined_cameras({v.name: v.camera for v in given}, names, (), trainer.learned.table.params)
     ratios = {float(cameras[v.name].K[0, 0] / v.camera.K[0, 0]) for v in scene.views}
     assert len(ratios) == 1 and abs(ratios.pop() - 1) < 0.03
 
@@ -557,9 +557,9 @@ def test_strategies_see_the_poses_of_now_and_steps_count_from_the_given_ones():
     assert torch.equal(shown[0], first[0]) and not torch.equal(shown[1], first[1])
     trainer.set_views(trainer.views)
     for stack in trainer.stacks.values():
-        assert torch.equal(stack.viewmats, first[stack.numbers])
-        now = current(stack, trainer.learned.views)  # by which a captured step finds its capacity
-        assert torch.equal(now.viewmats, torch.stack(shown)[stack.numbers])
+        assert torch.equal(stack.camera.viewmat, first[stack.numbers])
+        now = current(stack, trainer.learned)  # by which a captured step finds its capacity
+        assert torch.equal(now.camera.viewmat, torch.stack(shown)[stack.numbers])
     trainer.show_learned()
     assert all(torch.equal(v.camera.viewmat, a) for v, a in zip(trainer.views, shown))
 

@@ -156,27 +156,6 @@ def plan_phases(config: PhaseConfig, steps: int) -> Phases:
     return Phases(refine, stable_start, tuple(events), steps, steps)
 
 
-@dataclass(frozen=True)
-class EventTimes:
-    """Events at equal intervals, in steps done."""
-
-    after: int
-    """Step after which events begin."""
-    every: int
-    """Steps between two events; events are at multiples of this number."""
-    until: int
-    """Step after which there are no more events."""
-
-    @staticmethod
-    def of_fit(start: int, every: int, stop_fraction: float, steps: int) -> EventTimes:
-        """Return the times for a fit of that many steps; in a short fit events start after a quarter of its length."""
-        return EventTimes(min(start, steps // 4), every, int(stop_fraction * steps))
-
-    def due(self, step: int) -> bool:
-        """Return whether there is an event after a step."""
-        return self.after < step <= self.until and step % self.every == 0
-
-
 Color = tuple[float, float, float]
 """Red, green and blue in [0, 1]."""
 NAMED: dict[str, Color] = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}

@@ -85,14 +85,6 @@ class SampledView:
     """Rows and columns of the sampled pixels, int64, shape [S, 2]."""
 
 
-class Event(NamedTuple):
-    """One sampling event: the change, the number of fine Gaussians removed for new ones, and the samples of each view."""
-
-    change: DensityUpdate
-    evicted: int
-    views: tuple[SampledView, ...]
-
-
 class Rendered(NamedTuple):
     """A render of a view before an event, and the pixels that can be sampled."""
 
@@ -261,8 +253,8 @@ class Sampling(Strategy):
         """Settings."""
         self.events: list[dict[str, Any]] = []
         """Step of each sampling event, Gaussians added and evicted, and the quantile of the gate in each view."""
-        self.on_event: Callable[[int, Event], None] | None = None
-        """Function that is called with the step and the event after each event."""
+        self.on_event: Callable[[int, list[SampledView]], None] | None = None
+        """Function that is called with the step and the samples of each view after each event."""
 
     def before_event(self, views: Mapping[int, TrainingView], rendered: Mapping[int, Rendered]) -> None:
         """Prepare an event in some views, by their index among the training views."""
@@ -287,8 +279,11 @@ class Sampling(Strategy):
         return Rendered(view.seen(render.rgb), render.depth, depth, valid_pixels(alpha, depth, view.countable))
 
     @torch.no_grad()
-    def sample(self, step: int, views: Mapping[int, TrainingView], fraction: float, max_fraction: float) -> Event:
-        """Return a sampling event on views, by their index among the training views (docs/decisions/008-method.md)."""
+    def sample(
+        self, step: int, views: Mapping[int, TrainingView], fraction: float, max_fraction: float
+    ) -> tuple[DensityUpdate, int, list[SampledView]]:
+        """Return the change by an event on views by index, the number of evicted Gaussians, and the samples of each view."""
+        # docs/decisions/008-method.md
         t, generator = self.context, self.context.generator
         numbers = list(views)
         if len(numbers) > MAX_VIEWS:
@@ -311,7 +306,7 @@ class Sampling(Strategy):
             self.is_protected(step) if self.protects else torch.zeros_like(self.fine), [*views.values()], max_fraction,
             step=step, capacity=t.capacity - len(t.table), options=t.render_options(), generator=generator,
         )  # fmt: skip
-        return Event(change, evicted, tuple(sampled))
+        return change, evicted, sampled
 
     def bytes(self, sizes: StepSizes) -> Needs:
         """Return the bytes that an event keeps for its views: render, three scores and their sum."""
@@ -338,7 +333,7 @@ class Sampling(Strategy):
     def growth(self) -> Growth:
         """Return the times of refinement and sampling; events are listed, since they lower PSNR by up to 3 dB for a while."""
         phases = self.context.phases
-        return Growth(phases.refine, self.gradients.times.until, phases.events)
+        return Growth(phases.refine, self.gradients.growth().ends, phases.events)
 
     def phase(self, step: int) -> Hashable:
         """Return whether gradients are gathered, and whether the coarse layer moves slowly."""
@@ -387,14 +382,12 @@ class Sampling(Strategy):
             self.gradients.reset_opacities()
         if step in self.context.phases.events:
             sampler = self.method.sampler
-            event = self.sample(step, dict(enumerate(views)), sampler.fraction, sampler.max_fraction)
-            yield event.change
-            self.events.append({
-                "step": step, "added": len(event.change.parents), "evicted": event.evicted,
-                "quantiles": [v.quantile for v in event.views],
-            })  # fmt: skip
+            change, evicted, sampled = self.sample(step, dict(enumerate(views)), sampler.fraction, sampler.max_fraction)
+            yield change
+            quantiles = [v.quantile for v in sampled]
+            self.events.append({"step": step, "added": len(change.parents), "evicted": evicted, "quantiles": quantiles})
             if self.on_event is not None:
-                self.on_event(step, event)
+                self.on_event(step, sampled)
         if self.shrinks_after(step):
             yield self.shrink(views)
 
@@ -408,7 +401,7 @@ class Sampling(Strategy):
             return
         for first in range(0, len(views), MAX_VIEWS):
             some = {i: views[i] for i in range(first, min(first + MAX_VIEWS, len(views)))}
-            yield self.sample(step, some, min(1.0, fraction), 1e6).change
+            yield self.sample(step, some, min(1.0, fraction), 1e6)[0]
 
     def state(self) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
         """Return no tensors [...], and the events so far."""
