@@ -249,8 +249,8 @@ def test_fit_keeps_to_its_limit(tmp_path):
     whole = free.layout.step(1200, free.memory["instances"])
     need = (whole + free.layout.smallest(1200)) // 2
     limited = Trainer(views, seeds(1200), dataclasses.replace(config, memory_limit=need), CPU)
-    said = plan_summary(limited.memory)
-    assert limited.memory["cap"] < 4000 and f"at most {limited.memory['cap']:,} Gaussians, not 4,000" in said and "chunks" in said
+    said, cap = plan_summary(limited.memory), limited.memory["cap"]
+    assert cap < 4000 and f"at most {cap:,} Gaussians, not 4,000" in said and "chunks" in said
     assert limited.memory["planned"] <= need and limited.memory["planned_at_cap"] <= need
     peak = 0
     for _ in range(config.steps):

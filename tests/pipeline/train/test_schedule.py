@@ -526,7 +526,8 @@ def test_blocks_do_not_overlap_and_keep_to_the_picture():
     for rows, columns in drawn:
         cover = torch.zeros(128, 160)
         cover[rows, columns] += 1
-        assert rows.shape[1] == columns.shape[2] == SIDES[0] == 16 and int(cover.sum()) == len(rows) * 256 == 256 * round(0.1 * 80)
+        assert rows.shape[1] == columns.shape[2] == SIDES[0] == 16
+        assert int(cover.sum()) == len(rows) * 256 == 256 * round(0.1 * 80)
     again, other = sample_blocks(views(), 0.1, 5), sample_blocks(views(), 0.1, 6)
     assert all(torch.equal(a, b) for pair in zip(drawn, again) for a, b in zip(*pair))
     assert not all(torch.equal(a, b) for pair in zip(drawn, other) for a, b in zip(*pair))
