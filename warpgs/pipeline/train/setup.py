@@ -14,7 +14,7 @@ from warpgs.geometry import CENTRAL
 from warpgs.kernels.cameras import check_camera
 from warpgs.pipeline.metrics.scores import fitted_region
 from warpgs.pipeline.model.start import Start, check_points, initial_points, seen_points, subsample
-from warpgs.pipeline.train.loss import LossTerm, built_in_terms, collect
+from warpgs.pipeline.train.loss import LossTerm, built_in_terms, maps_of
 from warpgs.pipeline.train.settings import FitConfig
 from warpgs.pipeline.train.strategies.base import find_strategy
 from warpgs.pipeline.train.views import TrainingView, there, with_alpha
@@ -135,6 +135,5 @@ def prepared_views(
             view, depth=there(depth.given, device) if used else None, normals=there(given.normals, device),
             depth_weight=there(given.depth.confidence, device) if used and given.depth is not None else None,
         )  # fmt: skip
-        maps = collect(terms, lambda term, view=mapped, prior=prior: term.needs(view, prior), "map")
-        views.append(replace(view, maps=maps))
+        views.append(replace(view, maps=maps_of(terms, mapped, prior)))
     return views, [p.disparity for p in priors or ()] if samples else []

@@ -76,10 +76,7 @@ class ParameterMean:
         if step not in self.samples(steps):
             return False
         for name, value in params.items():
-            if self.count:
-                self.sums[name] += value
-            else:
-                self.sums[name] = value.detach().clone()
+            self.sums[name] = self.sums[name].add_(value) if self.count else value.detach().clone()
         self.count += 1
         if step < steps:
             return False
@@ -258,8 +255,8 @@ class Trainer:
 
     def degree(self, step: int) -> int:
         """Return the degree of the harmonics in use at a step."""
-        highest = self.config.sh_degree
-        return sh_degree(step, self.stopping.sh_every(self.config.sh_every, highest), highest)
+        c = self.config
+        return sh_degree(step, self.stopping.sh_every(c.sh_every, c.sh_degree), c.sh_degree)
 
     def plan_of(self, step: int) -> StepPlan:
         """Return the plan of step number ``step``, from 1."""
@@ -267,8 +264,8 @@ class Trainer:
         terms = tuple(t for t in self.terms if t.active(step, self.phases.planned))
         half = step <= self.half_resolution * self.phases.planned
         limits = c.limits.at(1.0 if step >= self.steps else self.progress(step), self.radius, c.antialiased)
-        decay = c.optimizer.opacities_decay
-        return StepPlan(self.degree(step), half, terms, self.strategy.phase(step), limits, decay, self.extrapolated)
+        phase, decay = self.strategy.phase(step), c.optimizer.opacities_decay
+        return StepPlan(self.degree(step), half, terms, phase, limits, decay, self.extrapolated)
 
     def next_view(self) -> int:
         """Return the index of the next view. The order is random; each view comes once before any view comes again."""
@@ -380,9 +377,8 @@ class Trainer:
 
     def _lr_row(self, step: int) -> list[float]:
         """Return the learning rates of a step as `StepBuffers` holds them: of the Gaussians, then of view modules."""
-        row = self.table.lr_row(self.lrs(step), step, self.config.optimizer.head_lrs)
-        lrs = self.learned.lrs(self.progress(step), self.context.extent)
-        return row + self.learned.table.lr_row(lrs, step, {})
+        own, lrs = self.lrs(step), self.learned.lrs(self.progress(step), self.context.extent)
+        return self.table.lr_row(own, step, self.config.optimizer.head_lrs) + self.learned.table.lr_row(lrs, step, {})
 
     def lrs(self, step: int) -> dict[str, float]:
         """Return the learning rate of each parameter of the Gaussians at a step."""
