@@ -11,6 +11,7 @@ import pytest
 import torch
 
 import warpgs
+from tests.pipeline.train.fits import advanced
 from tests.scenes import photos, priors, ring, seeds, three_gaussians
 from tests.tolerances import GAIN
 from warpgs.constants import LOW_PASS, Rule
@@ -298,8 +299,7 @@ def test_switch_combinations_run(tiny, combinations):
     for hier, *values in combinations:
         own = dict(zip(SWITCHES, values))
         fit = trainer(dataclasses.replace(with_own(**own), method=dataclasses.replace(METHOD, hier=hier)))
-        for _ in range(6):
-            fit.advance()
+        advanced(fit)
         assert all(bool(torch.isfinite(t).all()) for t in fit.gaussians.tensors().values()), own
         # the first event fills the layer; the second finds no room among the protected
         first, second = fit.strategy.events
@@ -309,13 +309,8 @@ def test_switch_combinations_run(tiny, combinations):
 
 def test_without_its_parts_it_is_the_strategy_sampling(tiny):
     """The same bits, with `UNIFORM`; other settings differ."""
-    fits = [
-        trainer(c) for c in (dataclasses.replace(CONFIG, strategy="sampling"), with_own(**dataclasses.asdict(UNIFORM)), CONFIG)
-    ]
-    for fit in fits:
-        for _ in range(6):
-            fit.advance()
-    plain, uniform, full = (fit.gaussians.means for fit in fits)
+    configs = dataclasses.replace(CONFIG, strategy="sampling"), with_own(**dataclasses.asdict(UNIFORM)), CONFIG
+    plain, uniform, full = (advanced(trainer(c)).gaussians.means for c in configs)
     assert torch.equal(plain, uniform) and not (plain.shape == full.shape and torch.equal(plain, full))
 
 

@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from tests.pipeline.test_paper import CONFIG as METHOD
+from tests.pipeline.train.fits import advanced, continued, same_bits
 from tests.scenes import photos, priors, seeds
 from warpgs.errors import NotFiniteError, UsageError
 from warpgs.kernels.update import Setting, scheduled_lrs
@@ -107,19 +108,13 @@ def test_rows_of_a_large_tensor_are_divided_and_means_are_sums_over_slots(monkey
             assert all(torch.equal(a, b) for a, b in zip(alone, found, strict=True))
 
 
-@pytest.mark.parametrize(("batch", "ranks"), [(8, 1), (8, 3), (7, 4), (5, 5)])
-def test_every_slot_is_in_one_process_and_one_node(batch, ranks):
-    """The slots of the processes, and those of the nodes that they sum, are all slots from the first to the last."""
-    assert [s for r in range(ranks) for s in own_slots(batch, ranks, r)] == list(range(batch))
-    tree = Tree(batch, Thread(ranks - 1, ranks, [], threading.Barrier(1)))
-    assert [s for nodes in tree.nodes for first, end in nodes for s in range(first, end)] == list(range(batch))
-
-
-@pytest.mark.parametrize(("batch", "ranks"), [(12, 2), (24, 4), (32, 3)])
-def test_every_process_plans_the_same_memory(batch, ranks):
+@pytest.mark.parametrize(("batch", "ranks"), [(5, 5), (7, 4), (12, 2), (32, 3)])
+def test_every_process_plans_the_same_memory_and_every_slot_is_in_one(batch, ranks):
     """Also where processes sum different subtrees: with a memory limit, different plans would end in different models."""
     trees = [Tree(batch, Thread(r, ranks, [], threading.Barrier(1))) for r in range(ranks)]
     assert len({tree.buffers for tree in trees}) == 1
+    assert [s for r in range(ranks) for s in own_slots(batch, ranks, r)] == list(range(batch))
+    assert [s for nodes in trees[0].nodes for first, end in nodes for s in range(first, end)] == list(range(batch))
 
 
 def test_a_process_without_a_view_is_refused():
@@ -134,17 +129,6 @@ def test_a_process_without_a_view_is_refused():
 
 CPU = torch.device("cpu")
 PLAIN = FitConfig(steps=20, init=InitConfig(source="points"), density=DensityConfig(start=100))
-
-
-def advanced(fit: Trainer, until: int) -> Trainer:
-    while fit.step < until:
-        fit.advance(100)
-    return fit
-
-
-def same_bits(a: Trainer, b: Trainer, but: tuple[str, ...] = ()) -> bool:
-    mine, theirs = a.state()[0], b.state()[0]
-    return all(torch.equal(mine[n], theirs[n]) for n in mine if n not in but)
 
 
 def test_a_batch_of_one_view_is_a_step_of_one_view():
@@ -181,14 +165,17 @@ def test_rates_follow_the_square_root_of_the_batch():
     assert [fit.settings(3, slot)[Setting.STEP] for slot in range(4)] == [3] * 4
 
 
-def test_a_fit_with_batches_continues_with_the_same_bits():
+def test_a_fit_with_batches_continues_with_the_same_bits(tmp_path):
     """From a state between two epochs, and through changes of the set."""
     config = dataclasses.replace(
         PLAIN, steps=12, batch=5, dropout=0.3, density=DensityConfig(start=2, every=3, gradient=1e-5, reset_every=6)
     )
-    whole, first, second = (Trainer(photos(3), seeds(61), config, CPU) for _ in range(3))
-    second.load(*advanced(first, 7).state())
-    assert same_bits(advanced(whole, 12), advanced(second, 12)) and len(whole.table) > 61
+
+    def begun() -> Trainer:
+        return Trainer(photos(3), seeds(61), config, CPU)
+
+    whole, again = advanced(begun()), continued(begun, 7, tmp_path)
+    assert same_bits(whole, again) and len(whole.table) > 61
 
 
 def test_a_loss_that_is_no_number_names_its_view_and_harms_nothing():

@@ -11,6 +11,7 @@ import torch
 from tests.allocations import Allocations
 from tests.example_terms import DepthCorrelation
 from tests.gaussians import camera, cloud, leaves
+from tests.pipeline.train.fits import same_bits
 from tests.pipeline.train.test_trainer import BUSY, fitted
 from tests.scenes import photos, priors, seeds
 from warpgs.app.cli import main
@@ -60,48 +61,24 @@ def measured(fit: Trainer, steps: int) -> int:
     return allocations.peak
 
 
+@pytest.mark.parametrize(
+    ("size", "count", "changes"),
+    [
+        ((40, 32), 60, {}), ((400, 300), 60, {}), ((40, 32), 5000, {}), ((40, 32), 5000, {"batch": 3}),
+        ((40, 32), 5000, {"batch": 8}), ((400, 300), 60, {"loss_terms": (DepthCorrelation(0.1),)}),
+        ((40, 32), 20_000, {"view_modules": (RefinePoses(),)}), ((400, 300), 60, {"view_modules": (Exposure(),)}),
+    ],
+)  # fmt: skip
 @pytest.mark.parametrize("change", [list, masked])
-@pytest.mark.parametrize("size", [(40, 32), (400, 300)])
-@pytest.mark.parametrize("count", [60, 5000])
-def test_plan_covers_a_step_and_not_much_more(change, size, count):
-    """From few Gaussians on many pixels to many on few, with and without masks."""
-    fit = Trainer(change(photos(2, *size)), seeds(count), STEADY, CPU)
+def test_plan_covers_a_step_and_not_much_more(change, size, count, changes):
+    """From few Gaussians on many pixels to many on few, with and without masks, terms on depth, and view modules."""
+    views = change(photos(2, *size))
+    fit = Trainer(views, seeds(count), dataclasses.replace(STEADY, **changes), CPU, priors=priors(views))
     fit.advance()
     found = measured(fit, 2)
     planned = fit.layout.step(count, instances(fit))
+    assert fit.layout.sums == {1: 0, 3: 1, 8: 3}[fit.batch] and fit.layout.sizes.depth == ("loss_terms" in changes)
     assert fit.memory["planned"] >= 0.95 * planned and found <= planned <= 1.25 * found + 20_000
-
-
-@pytest.mark.parametrize("batch", [3, 8])
-def test_plan_covers_the_sums_of_several_views(batch):
-    """Their gradients and statistics, of many Gaussians on few pixels."""
-    fit = Trainer(photos(2), seeds(5000), dataclasses.replace(STEADY, batch=batch), CPU)
-    fit.advance()
-    found = measured(fit, 2)
-    planned = fit.layout.step(5000, instances(fit))
-    assert fit.layout.sums == {3: 1, 8: 3}[batch] and found <= planned <= 1.1 * found
-
-
-@pytest.mark.parametrize("change", [list, masked])
-def test_plan_covers_the_depth_term(change):
-    """A disparity a pixel that stays, and what a correlation and its gradient take."""
-    views = change(photos(2, 400, 300))
-    config = dataclasses.replace(STEADY, loss_terms=(DepthCorrelation(0.1),))
-    fit = Trainer(views, seeds(60), config, CPU, priors=priors(views))
-    fit.advance()
-    found = measured(fit, 2)
-    planned = fit.layout.step(60, instances(fit))
-    assert fit.layout.sizes.depth and found <= planned <= 1.25 * found + 20_000
-
-
-@pytest.mark.parametrize(("module", "size", "count"), [(RefinePoses(), (40, 32), 20_000), (Exposure(), (400, 300), 60)])
-def test_plan_covers_what_is_learned_of_views(module, size, count):
-    """A gradient of the camera for each Gaussian, and renders with and without their exposure."""
-    fit = Trainer(photos(2, *size), seeds(count), dataclasses.replace(STEADY, view_modules=(module,)), CPU)
-    fit.advance()
-    found = measured(fit, 2)
-    planned = fit.layout.step(count, instances(fit))
-    assert found <= planned <= 1.25 * found + 20_000
 
 
 def test_plan_covers_density_events():
@@ -362,18 +339,13 @@ def finished(fit: Trainer, states: list) -> list[int]:
     return seen
 
 
-def same(a: Trainer, b: Trainer) -> bool:
-    tensors, others = a.state()[0], b.state()[0]
-    return tensors.keys() == others.keys() and all(torch.equal(tensors[k], others[k]) for k in tensors)
-
-
 def test_a_step_is_tried_again_and_nothing_else_changes(monkeypatch):
     """The same bits as without the lack; it is said once for each."""
     reference = fitted(BUSY, 60)
     fit = fitted(BUSY, 0)
     failing(monkeypatch, StepTaker, "step", {3, 30})
     assert finished(fit, []) == list(range(1, 61))
-    assert same(fit, reference)
+    assert same_bits(fit, reference)
     assert len(fit.messages) == 2 and "step 3 ran out of memory" in fit.messages[0]
 
 
@@ -387,7 +359,7 @@ def test_a_step_that_fails_twice_ends_the_fit_and_is_saved(monkeypatch):
     again = fitted(BUSY, 0)
     again.load(*states[-1])
     finished(again, [])
-    assert same(again, reference)
+    assert same_bits(again, reference)
 
 
 def test_where_not_even_the_smallest_step_fits_the_state_is_saved(monkeypatch):
@@ -412,7 +384,7 @@ def test_a_change_of_the_set_starts_from_the_last_saved_state(monkeypatch, calls
         return
     seen = finished(fit, states)
     assert set(seen) == set(range(1, 61)) and len(seen) >= 60
-    assert same(fit, reference)
+    assert same_bits(fit, reference)
 
 
 def test_a_change_with_nothing_saved_before_ends_the_fit(monkeypatch):

@@ -146,8 +146,8 @@ def test_recorded_depth_term_equals_single_steps(make):
 
 
 def test_recorded_steps_at_half_size_equal_single_steps():
-    """Two sizes one after the other, through the change between them."""
-    config = dataclasses.replace(BUSY, half_resolution=0.5)
+    """Two sizes one after the other, through the change between them, with the antialiasing filter."""
+    config = dataclasses.replace(BUSY, half_resolution=0.5, antialiased=True)
     single, _ = fitted(photos(4), recorded=False, config=config)
     recorded, _ = fitted(photos(4), recorded=True, config=config)
     a, b = single.state()[0], recorded.state()[0]

@@ -9,6 +9,7 @@ import torch
 
 import warpgs
 from tests import scenes
+from tests.pipeline.train.fits import advanced, continued, same_bits
 from tests.scenes import photos, seeds
 from warpgs.app.cli import main
 from warpgs.app.fit import request_of
@@ -33,11 +34,9 @@ from warpgs.pipeline.train.view_modules import (
     exposed,
     exposure_of,
     increments,
-    moved,
     pose_figures,
     refined_cameras,
     similarity,
-    zoomed,
 )
 from warpgs.pipeline.train.views import current, half_size
 from warpgs.render.options import RasterizeOptions
@@ -122,12 +121,6 @@ def vignetted(views, falloffs):
         shade = 1 - f * (rows[:, None] ** 2 + columns**2) / 2
         found.append(dataclasses.replace(v, image=(v.image * shade[..., None]).astype(np.float32)))
     return found
-
-
-def advanced(fit: Trainer, until: int) -> Trainer:
-    while fit.step < until:
-        fit.advance()
-    return fit
 
 
 def test_its_parameters_are_learned_shown_and_kept(own):
@@ -277,36 +270,6 @@ def test_photographs_of_many_exposures_make_one_model(tmp_path):
     np.testing.assert_allclose([r["gain"] for r in figures["views"]], made, atol=0.05)
 
 
-def exposure_fitted(views, steps, config):
-    trainer = Trainer(views, scenes.seeds(), dataclasses.replace(config, steps=steps), CPU)
-    while trainer.step < steps:
-        trainer.advance()
-    return trainer
-
-
-@pytest.mark.slow
-def test_exposure_steps_on_any_number_of_threads_and_continued_ones_have_the_same_bits():
-    views, whole = dimmed(scenes.photos(4), [0.6, 1, 0.8, 0.9]), None
-    config = FitConfig(steps=40, half_resolution=0.25, view_modules=(Exposure(), RefinePoses()))
-    before = torch.get_num_threads()
-    for threads in (1, 2):
-        torch.set_num_threads(threads)
-        try:
-            found = exposure_fitted(views, 40, config).state()[0]
-        finally:
-            torch.set_num_threads(before)
-        whole = whole or found
-        assert all(torch.equal(t, found[n]) for n, t in whole.items())
-    first, second = (Trainer(views, scenes.seeds(), config, CPU) for _ in range(2))
-    while first.step < 20:
-        first.advance()
-    second.load(*first.state())
-    while second.step < 40:
-        second.advance()
-    assert whole[f"views.params.{EXPOSURE}"].any()
-    assert all(torch.equal(t, whole[n]) for n, t in second.state()[0].items())
-
-
 def test_strategies_see_the_exposures_of_now():
     """Held-out blocks are compared with renders under the exposure of their view: else growth would end too early."""
     views = dimmed(scenes.photos(4), [0.6, 1, 0.8, 0.9])
@@ -320,24 +283,6 @@ def test_strategies_see_the_exposures_of_now():
     plain = rasterize(trainer.gaussians, trainer.views[0].camera, options).rgb
     assert torch.equal(rendered(trainer.gaussians, trainer.views[0], options), exposed(plain, shown[0]))
     assert half_size(trainer.views[0]).learned.values[EXPOSURE] is shown[0]
-
-
-def test_runs_tell_their_exposures(tmp_path):
-    """metrics.json and the report; `eval` scores without exposures, as the fit did; a resumed run has the same figures."""
-    write_demo(tmp_path / "scene", views=8, width=32, height=32)
-    flags = ["--preset", "3dgs", "--steps", "8", "--init.source", "random", "--init.random-count", "60", "--device", "cpu"]
-    words = ["fit", str(tmp_path / "scene"), "--out", str(tmp_path / "run"), *flags, "--split", split_spec(8), "--exposure"]
-    assert main(words) == 0
-    metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
-    rows, summary = (metrics["view_modules"]["exposure"][key] for key in ("views", "summary"))
-    assert len(rows) == 6 and np.shape(rows[0]["affine"]) == (3, 4) and rows[0]["gain"] != 1
-    assert "scores use renders without learned exposures" in summary
-    assert summary in (tmp_path / "run" / "report.html").read_text()
-    assert main(["eval", str(tmp_path / "run"), "--device", "cpu"]) == 0
-    scores = json.loads((tmp_path / "run" / "eval.json").read_text())
-    assert scores["test"] == metrics["test"] and scores["train"] == metrics["train"]
-    assert main([*words, "--resume"]) == 0
-    assert json.loads((tmp_path / "run" / "metrics.json").read_text())["view_modules"] == metrics["view_modules"]
 
 
 def test_views_that_know_their_opacity_have_no_exposure():
@@ -399,23 +344,6 @@ def test_increments_are_rigid_and_their_gradients_are_right():
     torch.testing.assert_close(rendered_from(w, t)[1:], increments(w, t)[1:] @ V[1:])
 
 
-def test_a_gradient_through_the_rasterizer_is_that_of_differences():
-    gaussians, camera = scenes.three_gaussians(), scenes.ring(2)[1]
-    gaussians = dataclasses.replace(gaussians, **{n: x.double() for n, x in gaussians.tensors().items()})
-    V, K = (torch.tensor(x, dtype=torch.float64) for x in (camera.viewmat, camera.K))
-    weights = torch.rand(camera.height, camera.width, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-
-    def value(p):
-        now = moved(V[None], p[None, :3], p[None, 3:])[0]
-        return (rasterize(gaussians, dataclasses.replace(camera, viewmat=now, K=K)).rgb * weights).sum()
-
-    p = torch.tensor([0.01, -0.02, 0.015, 0.02, 0.01, -0.03], dtype=torch.float64, requires_grad=True)
-    (gradient,) = torch.autograd.grad(value(p), p)
-    eye = 1e-6 * torch.eye(6, dtype=torch.float64)
-    differences = torch.stack([(value(p.detach() + e) - value(p.detach() - e)) / 2e-6 for e in eye])
-    torch.testing.assert_close(gradient, differences, rtol=1e-4, atol=1e-4)
-
-
 def test_a_focal_length_s_gradient_is_right_and_shared_by_the_views_of_a_camera():
     """Against differences, in the module and through the rasterizer; a second camera has a factor of its own."""
     views = [
@@ -438,19 +366,6 @@ def test_a_focal_length_s_gradient_is_right_and_shared_by_the_views_of_a_camera(
     assert torch.equal(intrinsics(z)[:, :, 2], K[:, :, 2])
     (gradient,) = torch.autograd.grad(intrinsics(z)[0].sum(), z)
     assert gradient[0] == gradient[2] != 0 and gradient[1] == 0
-
-    gaussians, camera = scenes.three_gaussians(), scenes.ring(2)[1]
-    gaussians = dataclasses.replace(gaussians, **{n: x.double() for n, x in gaussians.tensors().items()})
-    V, K = (torch.tensor(x, dtype=torch.float64) for x in (camera.viewmat, camera.K))
-    weights = torch.rand(camera.height, camera.width, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-
-    def value(s):
-        return (rasterize(gaussians, dataclasses.replace(camera, viewmat=V, K=zoomed(K[None], s)[0])).rgb * weights).sum()
-
-    s = torch.tensor([1.02], dtype=torch.float64, requires_grad=True)
-    (gradient,) = torch.autograd.grad(value(s), s)
-    differences = (value(s.detach() + 1e-6) - value(s.detach() - 1e-6)) / 2e-6
-    torch.testing.assert_close(gradient[0], differences, rtol=1e-4, atol=1e-4)
 
 
 def test_held_out_cameras_have_the_focal_length_of_their_camera():
@@ -485,10 +400,7 @@ def fitted_config(steps):
 
 
 def refine_poses_fitted(views, steps=240):
-    trainer = Trainer(views, scenes.seeds(), fitted_config(steps), CPU)
-    while trainer.step < steps:
-        trainer.advance()
-    return trainer
+    return advanced(Trainer(views, scenes.seeds(), fitted_config(steps), CPU))
 
 
 @pytest.mark.slow
@@ -498,9 +410,8 @@ def test_a_fit_finds_poses_back(tmp_path):
     scene = warpgs.load_scene(tmp_path)
     truth = list(scene.views)
     given, names = noisy(truth), [v.name for v in truth]
-    trainer = Trainer(given, scene.points, FitConfig(steps=400, half_resolution=0.25, view_modules=(RefinePoses(),)), CPU)
-    while trainer.step < 400:
-        trainer.advance()
+    config = FitConfig(steps=400, half_resolution=0.25, view_modules=(RefinePoses(),))
+    trainer = advanced(Trainer(given, scene.points, config, CPU))
     cameras = refined_cameras({v.name: v.camera for v in given}, names, (), trainer.learned.table.params)
     assert np.array_equal(cameras[names[0]].viewmat, given[0].camera.viewmat)
     found = [dataclasses.replace(v, camera=cameras[v.name]) for v in given]
@@ -518,33 +429,26 @@ def test_a_fit_finds_a_focal_length_back(tmp_path):
     longer = [[1.05, 1, 1], [1, 1.05, 1], [1, 1, 1]]
     given = [dataclasses.replace(v, camera=dataclasses.replace(v.camera, K=v.camera.K * longer)) for v in scene.views]
     config = FitConfig(steps=400, half_resolution=0.25, view_modules=(RefinePoses(focal_lr=1e-3),))
-    trainer = Trainer(given, scene.points, config, CPU)
-    while trainer.step < 400:
-        trainer.advance()
+    trainer = advanced(Trainer(given, scene.points, config, CPU))
     names = [v.name for v in given]
     cameras = refined_cameras({v.name: v.camera for v in given}, names, (), trainer.learned.table.params)
     ratios = {float(cameras[v.name].K[0, 0] / v.camera.K[0, 0]) for v in scene.views}
     assert len(ratios) == 1 and abs(ratios.pop() - 1) < 0.03
 
 
-def test_refine_poses_steps_on_any_number_of_threads_and_continued_ones_have_the_same_bits():
-    views, whole = noisy(scenes.photos(4)), None
-    before = torch.get_num_threads()
+def test_steps_on_any_number_of_threads_and_continued_ones_have_the_same_bits(tmp_path):
+    views = dimmed(noisy(scenes.photos(4)), [0.6, 1, 0.8, 0.9])
+    modules = Exposure(), RefinePoses(rotation_lr=2e-3, translation_lr=2e-3)
+    config = FitConfig(steps=40, half_resolution=0.25, view_modules=modules)
+    fits, before = [], torch.get_num_threads()
     for threads in (1, 2):
         torch.set_num_threads(threads)
         try:
-            found = refine_poses_fitted(views, 40).state()[0]
+            fits.append(advanced(Trainer(views, scenes.seeds(), config, CPU)))
         finally:
             torch.set_num_threads(before)
-        whole = whole or found
-        assert all(torch.equal(t, found[n]) for n, t in whole.items())
-    first, second = (Trainer(views, scenes.seeds(), fitted_config(40), CPU) for _ in range(2))
-    while first.step < 20:
-        first.advance()
-    second.load(*first.state())
-    while second.step < 40:
-        second.advance()
-    assert all(torch.equal(t, whole[n]) for n, t in second.state()[0].items())
+    assert fits[0].learned.table.params[EXPOSURE].any() and same_bits(*fits)
+    assert same_bits(fits[0], continued(lambda: Trainer(views, scenes.seeds(), config, CPU), 20, tmp_path))
 
 
 def test_strategies_see_the_poses_of_now_and_steps_count_from_the_given_ones():
@@ -582,13 +486,21 @@ def test_held_out_cameras_follow_the_similarity_of_the_training_cameras():
     np.testing.assert_allclose([scale, *t], [1.1, 0.3, -0.2, 0.1], atol=1e-12)
 
 
-def test_runs_keep_refined_poses(tmp_path):
-    """The report's figures, a run opened, scored again, continued and pruned: all have the cameras that were found."""
+def test_runs_keep_refined_poses_and_tell_their_exposures(tmp_path):
+    """The report's figures, a run opened, scored again, continued and pruned: all have the cameras that were found.
+
+    Exposures are in metrics.json and the report, and no score uses them.
+    """
     write_demo(tmp_path / "scene", views=8, width=32, height=32)
     flags = ["--preset", "3dgs", "--steps", "8", "--init.source", "random", "--init.random-count", "60", "--device", "cpu"]
-    words = ["fit", str(tmp_path / "scene"), "--out", str(tmp_path / "run"), *flags, "--split", split_spec(8), "--refine-poses"]
+    words = ["fit", str(tmp_path / "scene"), "--out", str(tmp_path / "run"), *flags, "--split", split_spec(8)]
+    words += ["--refine-poses", "--exposure"]
     assert main(words) == 0
     metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    rows, summary = (metrics["view_modules"]["exposure"][key] for key in ("views", "summary"))
+    assert len(rows) == 6 and np.shape(rows[0]["affine"]) == (3, 4) and rows[0]["gain"] != 1
+    assert "scores use renders without learned exposures" in summary
+    assert summary in (tmp_path / "run" / "report.html").read_text()
     rows, summary = (metrics["view_modules"]["refine_poses"][key] for key in ("views", "summary"))
     assert rows[0]["degrees"] < 1e-9 and rows[0]["units"] < 1e-9 and all(r["degrees"] > 0 for r in rows[1:])
     assert "moved by the similarity that best maps" in summary
@@ -604,4 +516,4 @@ def test_runs_keep_refined_poses(tmp_path):
     pruned = warpgs.open_run(tmp_path / "pruned", "cpu").scene_cameras
     assert all(np.array_equal(pruned[n].viewmat, c.viewmat) for n, c in run.scene_cameras.items())
     assert main([*words, "--resume"]) == 0
-    assert json.loads((tmp_path / "run" / "metrics.json").read_text())["view_modules"]["refine_poses"]["views"] == rows
+    assert json.loads((tmp_path / "run" / "metrics.json").read_text())["view_modules"] == metrics["view_modules"]
