@@ -113,23 +113,13 @@ def test_render_score_is_the_length_of_the_colour_difference():
     assert score[9, 9] == 1 and abs(float(score[23, 23]) - 0.9) < 5e-3 and score[0, 29] == 0
 
 
-@pytest.mark.parametrize(
-    "switches, expected",
-    [
-        ((True, True, True), (0.4, 0.2, 0.4)),
-        ((False, True, True), (0, 1 / 3, 2 / 3)),
-        ((True, False, True), (0.5, 0, 0.5)),
-        ((True, True, False), (2 / 3, 1 / 3, 0)),
-        ((False, False, False), (0, 0, 0)),
-    ],
-)
-def test_weights_renormalise(switches, expected):
-    """The rows of the ablation table."""
-    assert np.allclose(weights(*switches), expected)
-
-
-def test_importance_is_the_weighted_sum_and_uniform_without_weights():
-    """w . s; without any score every pixel counts the same."""
+def test_weights_renormalise_and_importance_is_the_weighted_sum():
+    """The rows of the ablation table; without any score every pixel counts the same."""
+    for switches, expected in (
+        ((True, True, True), (0.4, 0.2, 0.4)), ((False, True, True), (0, 1 / 3, 2 / 3)), ((True, False, True), (0.5, 0, 0.5)),
+        ((True, True, False), (2 / 3, 1 / 3, 0)), ((False, False, False), (0, 0, 0)),
+    ):  # fmt: skip
+        assert np.allclose(weights(*switches), expected)
     values = tuple(torch.full((2, 3), v) for v in (0.5, 0.25, 1.0))
     assert torch.allclose(importance(values, (0.4, 0.2, 0.4)), torch.tensor(0.65))
     assert torch.equal(importance(values, (0, 0, 0)), torch.ones(2, 3))

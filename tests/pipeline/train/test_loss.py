@@ -125,31 +125,6 @@ def test_a_term_reads_the_outputs_that_it_asks_for_alone():
         dataclasses.replace(PLAIN, loss_terms=(Silent(),))
 
 
-def test_depth_has_a_gradient_where_a_term_reads_it(monkeypatch):
-    """Else the backward pass of blending is not asked for one, which costs time."""
-    seen = []
-    gradients = torch.autograd.grad
-
-    def noted(loss, wanted, *args, **more):
-        names, nodes = set(), [loss.grad_fn]
-        while nodes:
-            node = nodes.pop()
-            if node is not None and node.name() not in names | {"_BlendBackward"}:
-                names.add(node.name())
-            for parent, place in () if node is None else node.next_functions:
-                if parent is not None and parent.name() == "_BlendBackward":
-                    seen[-1].add(place)
-                else:
-                    nodes.append(parent)
-        return gradients(loss, wanted, *args, **more)
-
-    monkeypatch.setattr(torch.autograd, "grad", noted)
-    for terms in ((), (DepthCorrelation(),)):
-        seen.append(set())
-        Trainer(photos(2), seeds(), dataclasses.replace(PLAIN, loss_terms=terms), CPU, priors=priors(photos(2))).advance()
-    assert seen == [{0}, {0, 2}]
-
-
 @pytest.mark.usefixtures("registry_as_it_was")
 @pytest.mark.parametrize("batch", [1, 3])
 def test_a_term_sees_camera_and_step(batch):
@@ -234,23 +209,6 @@ def test_normals_example_a_fit_with_the_term_is_smoother():
         return sum(float(unevenness(depth_normals(v.camera, d), v.image)) for v, d in depths)
 
     assert found(SMOOTH) < 0.8 * found(dataclasses.replace(SMOOTH, loss_terms=()))
-
-
-def test_the_weight_grows_over_the_first_steps():
-    """By the number of the step: a tenth of it in the first of ten."""
-    fit = Trainer(photos(4), seeds(), dataclasses.replace(SMOOTH, half_resolution=0.0), CPU)
-    term, steps = fit.terms[-1], []
-
-    class Noted(NormalSmoothness):
-        def __call__(self, inputs):
-            with torch.no_grad():
-                whole = NormalSmoothness(2.0, growth=1)(inputs)
-                steps.append(float(NormalSmoothness.__call__(self, inputs) / whole))
-            return super().__call__(inputs)
-
-    fit.terms = (*fit.terms[:-1], Noted(term.weight, term.growth))
-    advanced(fit, 12)
-    assert steps == pytest.approx([min(1, k / 10) for k in range(1, 13)])
 
 
 @pytest.mark.parametrize(

@@ -387,22 +387,18 @@ def test_a_change_of_the_set_starts_from_the_last_saved_state(monkeypatch, calls
     assert same_bits(fit, reference)
 
 
-def test_a_change_with_nothing_saved_before_ends_the_fit(monkeypatch):
+def test_a_change_with_nothing_saved_before_ends_the_fit_and_other_errors_pass(monkeypatch):
     fit = fitted(BUSY, 0)
     failing(monkeypatch, fit.table, "apply", {1})
     with pytest.raises(OutOfMemoryError):
         run(fit, lambda _: None, lambda _: None, lambda: False)
-
-
-def test_other_errors_pass(monkeypatch):
-    fit = fitted(BUSY, 0)
 
     def broken(*_):
         raise RuntimeError("something else")
 
     monkeypatch.setattr(StepTaker, "step", broken)
     with pytest.raises(RuntimeError, match="something else"):
-        finished(fit, [])
+        finished(fitted(BUSY, 0), [])
 
 
 class OtherProgram:

@@ -172,19 +172,25 @@ def test_a_run_with_one_of_ones_own(own, tmp_path, capsys):
 
 
 def test_cameras_of_now_are_those_that_steps_render_from(own):
-    """Intrinsics too, at both sizes; stacks keep what was given."""
-    zoom = VIEW_MODULES.load(f"{own}:Zoom")()
-    fit = advanced(Trainer(photos(3), seeds(), dataclasses.replace(PLAIN, view_modules=(zoom,), half_resolution=0.5), CPU), 20)
-    factors = 1 + fit.learned.table.params["zoom"].detach()[:, 0]
-    assert (factors != 1).all()
-    given = [float(v.camera.K[0, 0]) for v in photos(3)]
+    """At both sizes; stacks keep what was given, so views that are set again do not get their increments twice."""
+    modules, given = (VIEW_MODULES.load(f"{own}:Zoom")(), RefinePoses(0.0, 2e-3, 2e-3)), noisy(photos(4))
+    config = dataclasses.replace(PLAIN, view_modules=modules, half_resolution=0.5)
+    fit = advanced(Trainer(given, seeds(), config, CPU), 35)
     fit.show_learned()
-    torch.testing.assert_close(torch.stack([v.camera.K[0, 0] for v in fit.views]), torch.tensor(given) * factors)
+    factors, focal = 1 + fit.learned.table.params["zoom"].detach()[:, 0], float(given[0].camera.K[0, 0])
+    shown, Ks = (torch.stack([getattr(v.camera, n) for v in fit.views]) for n in ("viewmat", "K"))
+    first = torch.stack([torch.as_tensor(v.camera.viewmat, dtype=torch.float32) for v in given])
+    assert torch.equal(shown[0], first[0]) and not torch.equal(shown[1], first[1]) and (factors != 1).all()
+    torch.testing.assert_close(Ks[:, 0, 0], focal * factors)
     fit.set_views(fit.views)
     for stack in fit.stacks.values():
-        half = stack.camera.width / photos(1)[0].camera.width
-        torch.testing.assert_close(stack.camera.K[:, 0, 0], torch.tensor(given) * half)
-        torch.testing.assert_close(current(stack, fit.learned).camera.K[:, 0, 0], torch.tensor(given) * half * factors)
+        half = stack.camera.width / given[0].camera.width
+        now = current(stack, fit.learned).camera  # by which a captured step finds its capacity
+        assert torch.equal(stack.camera.viewmat, first[stack.numbers]) and torch.equal(now.viewmat, shown[stack.numbers])
+        torch.testing.assert_close(stack.camera.K[:, 0, 0], torch.full((4,), focal * half))
+        torch.testing.assert_close(now.K[:, 0, 0], focal * half * factors)
+    fit.show_learned()
+    assert all(torch.equal(v.camera.viewmat, a) for v, a in zip(fit.views, shown))
 
 
 def test_each_of_ours_has_a_flag(own):
@@ -395,14 +401,6 @@ def similar(camera):
     return dataclasses.replace(camera, viewmat=viewmat)
 
 
-def fitted_config(steps):
-    return FitConfig(steps=steps, half_resolution=0.25, view_modules=(RefinePoses(rotation_lr=2e-3, translation_lr=2e-3),))
-
-
-def refine_poses_fitted(views, steps=240):
-    return advanced(Trainer(views, scenes.seeds(), fitted_config(steps), CPU))
-
-
 @pytest.mark.slow
 def test_a_fit_finds_poses_back(tmp_path):
     """Of a ray-cast scene with poses that are off, a good part of the error goes, at the rates of the default."""
@@ -449,23 +447,6 @@ def test_steps_on_any_number_of_threads_and_continued_ones_have_the_same_bits(tm
             torch.set_num_threads(before)
     assert fits[0].learned.table.params[EXPOSURE].any() and same_bits(*fits)
     assert same_bits(fits[0], continued(lambda: Trainer(views, scenes.seeds(), config, CPU), 20, tmp_path))
-
-
-def test_strategies_see_the_poses_of_now_and_steps_count_from_the_given_ones():
-    """Views that are set again, as a strategy or a lack of memory asks for, do not get their increments twice."""
-    given = noisy(scenes.photos(4))
-    trainer = refine_poses_fitted(given, 30)
-    trainer.show_learned()
-    shown = [v.camera.viewmat.clone() for v in trainer.views]
-    first = torch.stack([torch.as_tensor(v.camera.viewmat, dtype=torch.float32) for v in given])
-    assert torch.equal(shown[0], first[0]) and not torch.equal(shown[1], first[1])
-    trainer.set_views(trainer.views)
-    for stack in trainer.stacks.values():
-        assert torch.equal(stack.camera.viewmat, first[stack.numbers])
-        now = current(stack, trainer.learned)  # by which a captured step finds its capacity
-        assert torch.equal(now.camera.viewmat, torch.stack(shown)[stack.numbers])
-    trainer.show_learned()
-    assert all(torch.equal(v.camera.viewmat, a) for v, a in zip(trainer.views, shown))
 
 
 def test_held_out_cameras_follow_the_similarity_of_the_training_cameras():
