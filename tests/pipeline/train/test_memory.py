@@ -267,6 +267,7 @@ def test_captured_steps_are_given_up_where_they_need_more():
     wide = planned(2**33)
     assert not wide["graph_refused"] and not wide["chunked"] and layout.graphs == 1
     needed = layout.step(20_000, 200_000)
+    assert layout.step(9, 99, graphs=3) - layout.held(9) == 3 * (layout.step(9, 99) - layout.held(9))
     tight = planned(needed)
     assert tight["graph_refused"] and layout.graphs == 0 and not tight["chunked"]
     assert "without a CUDA graph" in plan_summary(tight) and planned(needed - 2**20)["chunked"]

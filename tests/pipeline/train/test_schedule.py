@@ -377,6 +377,13 @@ def test_continued_fit_equals_uninterrupted_one(tmp_path, strategy, at):
 
 
 @pytest.mark.usefixtures("tiny")
+def test_growth_does_not_end_while_views_have_half_size():
+    assert (
+        begun(GROWING, None).stopping.ended < 24 < begun(dataclasses.replace(GROWING, half_resolution=0.4), None).stopping.ended
+    )
+
+
+@pytest.mark.usefixtures("tiny")
 def test_errors_of_other_blocks_are_refused():
     """A stored state whose measurements are not of these blocks."""
     fit = begun(GROWING, 13)

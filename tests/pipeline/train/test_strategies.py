@@ -25,6 +25,8 @@ from warpgs.pipeline.train.strategies.mcmc import MAX_COPIES, MCMCConfig, pertur
 from warpgs.pipeline.train.trainer import Trainer
 from warpgs.scene import Gaussians
 
+CPU = torch.device("cpu")
+
 # Clone, split and prune, and how fast scales may change meanwhile.
 
 
@@ -115,9 +117,16 @@ def test_rates_of_scales_may_fall():
     assert OptimizerConfig(scales_lr=0.1).lrs(1.0, 1.0)["log_scales"] == pytest.approx(0.1)
 
 
+def test_growth_begins_after_a_quarter_of_a_short_fit():
+    """And ends when phase 3 begins, or after the fraction that is asked for in a fit without phases."""
+    for strategy, ends in (("clone_split", 20), ("mcmc", 33)):
+        config = FitConfig(steps=40, init=InitConfig(source="points"), strategy=strategy)
+        growth = Trainer(photos(2), seeds(), config, CPU).strategy.growth()
+        assert growth[:2] == (10, ends) and [s for s in range(41) if growth.due(s, 7)] == [*range(14, ends + 1, 7)]
+
+
 # The MCMC strategy: its formulas against the paper's, and what it does to a fit.
 
-CPU = torch.device("cpu")
 CONFIG = FitConfig(
     steps=40, sh_every=10, strategy="mcmc", strategy_config=MCMCConfig(start=4, every=5, min_opacity=0.05),
     init=InitConfig(source="points", opacity=0.3), max_gaussians=75,

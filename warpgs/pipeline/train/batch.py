@@ -270,24 +270,26 @@ class BatchSteps(StepTaker):
         update: list[Callable[[], object]] = []
         for begin in range(0, len(own), len(slots)):  # a step each
             first = [self._contribution(begin, works)]  # the strategy's statistics determine the sums
-            update = update or self._prepared(*first[0], plan, captured)
+            if not update:
+                sums, update = self._prepared(*first[0], plan, captured)
 
             def add(slot: int, parts: list[torch.Tensor], adds: bool) -> None:
                 place = begin + slot - slots.start  # noqa: B023
                 self._add(slot, place, *(first.pop() if first else self._contribution(place, works)), parts, adds)  # noqa: B023
 
-            self.sums.add_up(add)
+            sums.add_up(add)
             for work in update:
                 work()
-        if self.sums.divided:  # only the process that updates a row has its moments
+        if sums.divided:  # only the process that updates a row has its moments
             for moments in (self.table.exp_avg, self.table.exp_avg_sq):
-                self.sums.share(moments[self.large])
+                sums.share(moments[self.large])
 
     def _contribution(self, place: int, works: list[Callable[[], Any]]) -> tuple[list[torch.Tensor], dict[str, torch.Tensor]]:
         """Return the gradients and statistics of a view; ``place`` counts this process's slots of all steps."""
         self.slots.counter.fill_(place)
         self.slots.stop.zero_()
-        return works[place]()[:2]
+        gradients, statistics, *_ = works[place]()
+        return gradients, statistics
 
     @torch.no_grad()
     def _add(
@@ -307,8 +309,8 @@ class BatchSteps(StepTaker):
 
     def _prepared(
         self, gradients: list[torch.Tensor], statistics: Mapping[str, torch.Tensor], plan: StepPlan, captured: bool
-    ) -> list[Callable[[], object]]:
-        """Return the functions that update by the sums, whose shapes are those of a view's contribution."""
+    ) -> tuple[SlotSums, list[Callable[[], object]]]:
+        """Return sums, and the functions that update by them; their shapes are those of a view's contribution."""
         shapes = [*(tuple(t.shape) for t in (*gradients, *statistics.values())), (FLAGS + self.tree.batch,)]
         if self.sums is None or self.sums.shapes != shapes:
             self.sums = self._update = None
@@ -318,17 +320,17 @@ class BatchSteps(StepTaker):
             self.sums = SlotSums(self.tree, shapes, self.buffers.device, means=len(gradients), large=place)
         if self._update is None or self._update[0] != plan:
             parts, count = self.sums.parts(), len(gradients)
-            functions = self._functions(plan, parts[:count], dict(zip(statistics, parts[count:-1], strict=True)))
+            functions = self._functions(plan, self.sums, parts[:count], dict(zip(statistics, parts[count:-1], strict=True)))
             if captured and self.cuda:  # all but the exchanges between processes
                 functions = [f if k % 2 else self.capture(f, self.buffers).replay for k, f in enumerate(functions)]
             self._update = plan, functions
-        return self._update[1]
+        return self.sums, self._update[1]
 
     def _functions(
-        self, plan: StepPlan, gradients: list[torch.Tensor], statistics: dict[str, torch.Tensor]
+        self, plan: StepPlan, sums: SlotSums, gradients: list[torch.Tensor], statistics: dict[str, torch.Tensor]
     ) -> list[Callable[[], object]]:
         """Return the functions of an update by sums; every second one is an exchange between processes."""
-        b, sums, lrs, divided = self.buffers, self.sums, self._lrs, self.sums.divided
+        b, lrs, divided = self.buffers, self._lrs, sums.divided
 
         def descend(names: list[str], rows: slice = slice(None)) -> None:
             self.descend(plan, gradients, lrs, b.stop, names, rows)

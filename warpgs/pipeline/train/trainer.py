@@ -188,7 +188,7 @@ class Trainer:
         extent, self.radius = scene_extent(cameras, start.cloud), scene_radius(cameras, start.cloud)
         """Radius of the scene [u], as `scene_radius` measures it."""
         self.scene_background, self.background = background, torch.tensor(background, dtype=torch.float32, device=device)
-        self.half_resolution = c.half_resolution
+        self.half_resolution = c.half_resolution or 0.0
         """Fraction of the planned steps, from the first step on, in which views have half size."""
         self.dropout = c.dropout * min(1.0, DROPOUT_VIEWS / len(train))
         """Dropout probability at the last step."""

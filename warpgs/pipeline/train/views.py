@@ -270,9 +270,9 @@ def stack_views(
     rows: dict[Kind, list[int]] = {}
     places = []
     for i, view in enumerate(views):
-        same = rows.setdefault(view.kind, [])
-        places.append((view.kind, len(same)))
-        same.append(i)
+        before = rows.setdefault(view.kind, [])
+        places.append((view.kind, len(before)))
+        before.append(i)
     stacks, shared = {}, list(views)
     for kind, numbers in rows.items():
         same = [views[i] for i in numbers]
