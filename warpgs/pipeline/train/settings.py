@@ -575,7 +575,7 @@ def settings_by_views(config: FitConfig, train: list[View], device: str) -> tupl
         init = dataclasses.replace(init, extrapolate=opaque and views <= EXTRAPOLATED_VIEWS and steps >= SMOOTH_STEPS)
         init = dataclasses.replace(init, extrapolate=extrapolates(init, train))
     decay = EXTRAPOLATED_DECAY if extrapolates(init, train) else OPACITIES_DECAY
-    factor = CPU_RATES if limit else 1.0
+    factor = CPU_RATES if limit and views > CPU_RATES_VIEWS else 1.0
     rates = {
         "scales_lr": SCALES_LR * min(1.0, SCALES_VIEWS / views) ** SCALES_POWER,
         "opacities_lr": min(MAX_OPACITIES_LR, OPACITIES_LR * math.sqrt(views / 3)),
