@@ -168,14 +168,7 @@ LEVELS = 2**16 - 1
 
 
 def color_of(text: str) -> Color | None:
-    """Return the colour that a text names; None for a colour that depends on the scene.
-
-    Args:
-        text: auto, mean, scene, black, white, ``#rrggbb``, or three numbers in [0, 1] as ``r,g,b``.
-
-    Raises:
-        UsageError: The colour is invalid.
-    """
+    """Return the colour that a text names, as `FitConfig.background`; None for a colour that depends on the scene."""
     if text in CHOSEN:
         return None
     if text in NAMED:
@@ -205,16 +198,7 @@ def mean_color(views: list[View]) -> Color:
 
 
 def choose_background(wish: str, scene: Scene, train: list[View]) -> tuple[Color, str]:
-    """Return the colour behind a scene, and a note for the user; no note if opaque views keep the scene's own background.
-
-    Args:
-        wish: As `FitConfig.background`.
-        scene: The scene.
-        train: Its training views.
-
-    Raises:
-        UsageError: ``wish`` is not a colour.
-    """
+    """Return the colour behind a scene, and a note for the user; no note if opaque views keep the scene's own background."""
     color = color_of(wish)
     if color is not None:
         return color, f"background: {wish}, {_words(color)}"

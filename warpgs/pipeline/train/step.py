@@ -311,11 +311,8 @@ class StepTaker:
         """Take the steps whose learning rates and settings the buffers hold, with the views at these kinds and rows.
 
         With several views in a step, ``places`` and ``settings`` list those of each slot, step by step. A view has at most
-        ``max_instances`` (Gaussian, tile) instances at a time.
-
-        Raises:
-            OverLimitError: The capacity of a graph would be above ``max_instances``; nothing was changed.
-            ResourceError: The instances would not fit into memory, or another process is gone.
+        ``max_instances`` (Gaussian, tile) instances at a time; if a graph would exceed them, OverLimitError is raised, and
+        nothing was changed.
         """
         kinds = [kind for kind, _ in places]
         for work in self.works(self.step, kinds, self.buffers, stacks, plan, max_instances, captured=captured):
@@ -340,12 +337,7 @@ class StepTaker:
         return [functools.partial(_replay, self._graphs[kind, plan]) for kind in kinds]
 
     def capacity(self, kind: Kind, stacks: Mapping[Kind, ViewStack], plan: StepPlan, max_instances: int | None) -> int:
-        """Return the capacity of captured steps with a kind of view, computed at its first use.
-
-        Raises:
-            OverLimitError: The capacity would be above ``max_instances``.
-            ResourceError: The instances would not fit into memory.
-        """
+        """Return the capacity of captured steps with a kind of view, or raise OverLimitError above ``max_instances``."""
         self._capacities = {k: c for k, c in self._capacities.items() if k[1] == plan}
         if (kind, plan) not in self._capacities:
             now = current(stacks[kind], self.views)
@@ -395,11 +387,7 @@ def _replay(graph: CapturedGraph) -> object:
 
 @torch.no_grad()
 def instance_capacity(gaussians: Gaussians, views: ViewStack, degree: int, options: RasterizeOptions) -> int:
-    """Return the capacity of a captured step for (Gaussian, tile) instances, over all views of a stack.
-
-    Raises:
-        ResourceError: The instances would not fit into memory.
-    """
+    """Return the capacity of a captured step for (Gaussian, tile) instances, over all views of a stack."""
     cameras = [camera_at(views.camera, i) for i in range(len(views.numbers))]
     counts = [count_instances(inputs_of(gaussians, c), image_settings(c, degree, options)) for c in cameras]
     wanted = int(CAPACITY_FACTOR * int(torch.stack(counts).max())) + 1024

@@ -154,22 +154,10 @@ class Trainer:
     ):  # fmt: skip
         """Set up the initial Gaussians.
 
-        Args:
-            train: The views to fit, at least one.
-            points: The reconstruction's points, or None.
-            config: Settings without automatic ones (None): `warpgs.pipeline.train.settings.settings_by_views` chooses those.
-            device: Device of the fit.
-            background: Colour behind the scene.
-            priors: Prior of each view; None to compute them if sampling or a loss term needs them.
-            ready: Called before the device is used.
-            progress: Called with a line for the user about the work before the first step.
-            ranks: Processes that share the views of a step; the fit has the same bits for any number of them.
-
-        Raises:
-            DataError: There is no training view, or the scene gives no initial points.
-            UsageError: A camera cannot be rendered, the memory limit is below the smallest step, a plug-in is missing, two loss
-                terms have a map of the same name, two view modules have a parameter of the same name, or a view module does
-                not support the views.
+        Automatic settings are chosen already (`warpgs.pipeline.train.settings.settings_by_views`). Priors are computed if they
+        are None, and sampling or a loss term needs them. ``ready`` is called before the device is used, and ``progress`` with
+        lines on the work before the first step. A fit has the same bits for any number of ``ranks``, which share the views of a
+        step.
         """
         if not train:
             raise DataError("there is no training view; leave at least one in --split")
@@ -277,12 +265,7 @@ class Trainer:
         """Take up to ``limit`` steps, and let the strategy change the set of Gaussians after the last step if a change is due.
 
         On CUDA, steps are replayed as graphs, several at a time, up to the next step after which the host has work. On a CPU,
-        or if a memory limit does not allow graphs, one step is taken.
-
-        Raises:
-            NotFiniteError: A loss is not finite; the Gaussians are as before that step.
-            OutOfMemoryError: A step, or a change of the set of Gaussians, ran out of memory.
-            ResourceError: The instances would not fit into memory, or another process is gone.
+        or if a memory limit does not allow graphs, one step is taken. After a NotFiniteError the Gaussians are as before.
         """
         with self._out_of_memory():
             return self._advance(limit)
@@ -301,11 +284,7 @@ class Trainer:
             raise OutOfMemoryError(no_memory_message(e, f" for step {self.step + 1}"), intact) from e
 
     def spare_memory(self) -> None:
-        """Free unused memory, and run all further steps without graphs, in chunks that fit into the free memory.
-
-        Raises:
-            ResourceError: Not even the smallest step fits.
-        """
+        """Free unused memory, and run all further steps without graphs, in chunks that fit into the free memory."""
         self.taker.clear()
         if self.device.type == "cuda":
             torch.cuda.empty_cache()
@@ -461,11 +440,7 @@ class Trainer:
         return tensors, plain
 
     def load(self, tensors: dict[str, torch.Tensor], plain: dict[str, Any]) -> None:
-        """Load what `state` returned, ``tensors`` of shape [...] by name.
-
-        Raises:
-            DataError: The values are not a result of `state`.
-        """
+        """Load what `state` returned, ``tensors`` of shape [...] by name, or raise DataError."""
         check_state(
             tensors, plain, views=len(self.views), steps=self.phases.planned, strategy=self.strategy.STATE, stopping=STATE
         )

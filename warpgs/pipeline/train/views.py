@@ -46,11 +46,7 @@ class LearnedViews:
     """The view modules of a fit and the table of their parameters, which has a row for each training view."""
 
     def __init__(self, modules: Sequence[ViewModule], views: Sequence[View], device: torch.device):
-        """Begin with the initial parameters of each module for training views.
-
-        Raises:
-            UsageError: Two modules have a parameter of the same name.
-        """
+        """Begin with the initial parameters of each module for training views."""
         self.modules = tuple(modules)
         self._names: list[tuple[str, ...]] = []
         first: dict[str, torch.Tensor] = {}
