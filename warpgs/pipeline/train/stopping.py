@@ -241,9 +241,8 @@ class Stopping:
         errors = block_errors(context.gaussians, self.whole, self.blocks, options)
         if self.measured:
             mean, noise = gain(self.measured[-1][1], errors)
-            self.measurements.append({
-                "step": step, "count": len(context.table), "held_out_psnr": decibels(errors), "gain": mean, "noise": noise,
-            })  # fmt: skip
+            count, psnr = len(context.table), decibels(errors)
+            self.measurements.append({"step": step, "count": count, "held_out_psnr": psnr, "gain": mean, "noise": noise})
             self.why = self._reason(step, errors)
         self.measured.append((step, errors))
         return self.why != ""

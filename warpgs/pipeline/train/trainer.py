@@ -204,10 +204,8 @@ class Trainer:
         """View modules with their parameters."""
         self.table.batch = self.learned.table.batch = c.batch
         self.mean = ParameterMean(c.optimizer.average_last)
-        parts = (
-            self.table, self.learned, self.strategy, TrainingCameras.of(cameras, device), self.context.render_options(),
-            c.seed if self.dropout > 0 else None,
-        )  # fmt: skip
+        limiting, options, seed = TrainingCameras.of(cameras, device), self.context.render_options(), c.seed
+        parts = self.table, self.learned, self.strategy, limiting, options, seed if self.dropout > 0 else None
         self.taker = StepTaker(*parts) if c.batch == 1 else BatchSteps(*parts, Tree(c.batch, ranks))
         views, self.disparities = prepared_views(train, start, priors, c, self.terms, device)
         self.context.priors = priors or []
