@@ -203,7 +203,7 @@ def test_a_fit_starts_at_half_size_and_ends_whole(device):
         number = fit.next_view()
         fit.order.append(number)
         kind, _ = fit.places[number + fit.plan_of(fit.step + 1).half_size * len(fit.views)]
-        sizes.append(fit.stacks[kind].size[0])
+        sizes.append(fit.stacks[kind].camera.width)
         (report,) = fit.advance()
         assert math.isfinite(report.loss)
     assert sizes == [20] * 4 + [40] * 4
@@ -257,7 +257,7 @@ def run(tmp_path_factory):
     fit = Trainer(views, seeds(), CONFIG, CPU, priors=priors(views))
     with images_kept(fit, NAMES, out):
         draw = fit.strategy.on_event
-        fit.strategy.on_event = lambda step, event: (draw(step, event), seen.append((step, event)))
+        fit.strategy.on_event = lambda step, views: (draw(step, views), seen.append((step, views)))
         while fit.step < CONFIG.steps:
             fit.advance()
     return fit, out, seen
@@ -296,7 +296,7 @@ def test_tiles_show_what_the_event_saw(run):
     """Each map in its place, values as colours; dots at the drawn pixels and nowhere else; the gate in two colours."""
     fit, _, seen = run
     step, event = seen[0]
-    drawn, view = event.views[1], fit.views[1]
+    drawn, view = event[1], fit.views[1]
     sheet = view_sheet("01.png", step, view, fit.disparities[1], drawn, fit.strategy)
     big = {i: tile(sheet, i, view) for i in range(9)}
     H, W = view.camera.height, view.camera.width
@@ -320,10 +320,10 @@ def test_uniform_events_show_no_scores(tmp_path):
     """Nor a disparity, as no prior was made; the words say that nothing was scored."""
     fit, seen = Trainer(photos(3), seeds(), dataclasses.replace(CONFIG, strategy="sampling"), CPU), []
     with images_kept(fit, NAMES, tmp_path):
-        fit.strategy.on_event = lambda step, event: seen.append(event)
+        fit.strategy.on_event = lambda step, views: seen.append(views)
         while not seen:
             fit.advance()
-    drawn, view = seen[0].views[1], fit.views[1]
+    drawn, view = seen[0][1], fit.views[1]
     assert fit.disparities == [] and not drawn.scores
     sheet = view_sheet("01.png", 8, view, None, drawn, fit.strategy)
     one_row = (
@@ -344,10 +344,11 @@ def test_figures_add_up(run):
     fit, _, seen = run
     figures = event_figures(fit)
     assert figures["events"] == {
-        "count": len(seen), "added": sum(len(e.change.parents) for _, e in seen), "evicted": sum(e.evicted for _, e in seen),
-        "samplings": 3 * len(seen), "widened": sum(v.quantile < 0.6 for _, e in seen for v in e.views),
+        "count": len(seen), **{n: sum(e[n] for e in fit.strategy.events) for n in ("added", "evicted")},
+        "samplings": 3 * len(seen), "widened": sum(v.quantile < 0.6 for _, views in seen for v in views),
     }  # fmt: skip
-    assert figures["events"]["added"] > 0 and sum(figures["layers"].values()) == len(fit.gaussians)
+    assert 0 < figures["events"]["added"] <= sum(len(v.at) for _, views in seen for v in views)
+    assert sum(figures["layers"].values()) == len(fit.gaussians)
     assert figures["layers"]["fine"] == int(fit.strategy.fine.sum()) > 0
 
 

@@ -57,10 +57,11 @@ from warpgs.pipeline.run.results import (
 )
 from warpgs.pipeline.train.batch import check_ranks, check_renders, own_slots
 from warpgs.pipeline.train.loss import term_values
+from warpgs.pipeline.train.memory import plan_summary
 from warpgs.pipeline.train.presets import chosen_settings
 from warpgs.pipeline.train.schedule import StepReport, choose_background, over_background
 from warpgs.pipeline.train.settings import FitConfig, settings_by_views, within_budget
-from warpgs.pipeline.train.step import StepBuffers, eager_renderer, forward
+from warpgs.pipeline.train.step import StepBuffers, eager_renderer
 from warpgs.pipeline.train.trainer import Trainer, background_warmup, complexity_figures, complexity_summary, run, train_views
 from warpgs.plugins import is_ours
 from warpgs.poses.find import JSON, TEXT, find_poses, needs_poses, read_poses_record, source_digest
@@ -159,7 +160,7 @@ def take_steps(job: FitJob, trainer: Trainer, images_written: Callable[[], None]
         images_written()
         tensors, state = trainer.state()
         if trainer.config.view_modules:  # by which a run is opened without their code
-            cameras = learned_cameras(job.scene, job.split, trainer.learned.views)
+            cameras = learned_cameras(job.scene, job.split, trainer.learned)
             state["cameras"] = {n: camera_values(c) for n, c in cameras.items()}
         save_checkpoint(job.out, tensors, state | {"fingerprint": job.scene.fingerprint, "train": job.split.train})
 
@@ -223,19 +224,17 @@ def non_finite_parts(trainer: Trainer, view: int, slot: int) -> tuple[list[str],
     number = trainer.step + 1
     plan = trainer.plan_of(number)
     kind, row = trainer.places[view + plan.half_size * len(trainer.views)]
-    stack, learned = trainer.stacks[kind], trainer.learned
     buffers = StepBuffers(trainer.device, 1, 1)
     buffers.load([row], [[0.0]], [trainer.settings(number, slot)])
     render = eager_renderer(trainer.context.render_options(), None)
     with torch.no_grad():
-        found = forward(trainer.gaussians, learned.views, learned.dropout_seed, stack, buffers, plan, render)
-        values = {f"the loss term {t.name}": v for t, v in zip(plan.terms, term_values(plan.terms, found.inputs), strict=True)}
-        values |= {f"the view module {n}": v for n, v in found.of_views.items()}
-        extra = trainer.strategy.regularisation(plan.phase, found.inputs.gaussians)
+        _, inputs, of_views, _, _ = trainer.taker.forward(trainer.stacks[kind], buffers, plan, render)
+        values = {f"the loss term {t.name}": v for t, v in zip(plan.terms, term_values(plan.terms, inputs), strict=True)}
+        values |= {f"the view module {n}": v for n, v in of_views.items()}
+        extra = trainer.strategy.regularisation(plan.phase, inputs.gaussians)
         values |= {} if extra is None else {f"the strategy {trainer.config.strategy}": extra}
-    target = found.inputs.target
-    tensors = {"image": target.image} | {f"map {n}": t for n, t in target.maps.items()}
-    tensors |= learned.params | {f"rendered {n}": t for n, t in found.inputs.outputs.items()}
+    tensors = {"image": inputs.target.image} | {f"map {n}": t for n, t in inputs.target.maps.items()}
+    tensors |= trainer.taker.params | {f"rendered {n}": t for n, t in inputs.outputs.items()}
     wrong = {n: int((~torch.isfinite(t)).sum()) for n, t in tensors.items()}
     return (
         [n for n, v in values.items() if not bool(torch.isfinite(v).all())],
@@ -536,7 +535,7 @@ def _finish(
             raise DataError(f"{job.out}/{TENSORS}: {e}") from e
         job.notes.append(f"continued from step {trainer.step}; this run's times count from there")
     shared = batched_notes(job.config, job.ranks)
-    job.announce([*photo_notes(checks), *trainer.notes, *shared, trainer.memory.summary()])
+    job.announce([*photo_notes(checks), *trainer.notes, *shared, plan_summary(trainer.memory)])
     setup = time.perf_counter() - job.began
     images = images_kept(trainer, list(job.split.train), job.out) if job.out else contextlib.nullcontext(lambda: None)
     with images as images_written:
@@ -547,7 +546,7 @@ def _finish(
     if not job.ranks.first:
         return FitResult(**job.model(trainer), config=job.config, metrics={}, notes=tuple(job.notes), folder=None)
     given = cameras_of(job.scene)
-    job.scene = with_cameras(job.scene, learned_cameras(job.scene, job.split, trainer.learned.views))
+    job.scene = with_cameras(job.scene, learned_cameras(job.scene, job.split, trainer.learned))
     if job.out is not None:
         model = drop_unused_sh(trainer.gaussians)
         write_ply(job.out / "point_cloud.ply", model, job.scene.normalization, antialiased=job.config.antialiased)
@@ -586,7 +585,7 @@ def _score(
         fractions = moved_fractions(train, (render_view(gaussians, v, options) for v in shown))
         moved = {v.name: f for v, f in zip(train, fractions, strict=True)}
     complexity = complexity_figures(trainer)
-    learned = learned_figures(trainer.learned.views, scene, job.split, given, test, gaussians, options)
+    learned = learned_figures(trainer.learned, scene, job.split, given, test, gaussians, options)
     mapped = given_figures(train, trainer.views, gaussians, options)
     table: list[tuple[dict[str, Any], list[str]]] = [  # figures of metrics.json, and their sentences in the report
         ({"rule": rule}, [Detail(rule["summary"])]),
@@ -606,5 +605,5 @@ def _score(
         "steps": trainer.step, "batch": c.batch, "ranks": job.ranks.count,
         "gaussians": len(gaussians), "preset": c.preset, "seed": c.seed,
         "config_hash": c.fingerprint(), "fingerprint": scene.fingerprint, "device": job.where.removeprefix("on "),
-        "seconds": {**seconds, **compiling, "total": time.perf_counter() - job.began}, "memory": trainer.memory.to_json(),
+        "seconds": {**seconds, **compiling, "total": time.perf_counter() - job.began}, "memory": trainer.memory,
     }  # fmt: skip

@@ -39,7 +39,7 @@ from warpgs.pipeline.metrics.scores import (
 from warpgs.pipeline.paper.scores import SUPPORT
 from warpgs.pipeline.train.loss import GIVEN_MIN_ALPHA
 from warpgs.pipeline.train.schedule import Phases
-from warpgs.pipeline.train.strategies.sampling import Event, SampledView, Sampling
+from warpgs.pipeline.train.strategies.sampling import SampledView, Sampling
 from warpgs.pipeline.train.trainer import Trainer
 from warpgs.pipeline.train.views import TrainingView
 from warpgs.process import counted
@@ -259,10 +259,10 @@ def view_sheet(
     return contact_sheet(f"{name}, step {step:,}", lines, tiles, columns=5, tile_width=320, text=1.25)
 
 
-def _shown(event: Event) -> list[SampledView]:
+def _shown(views: Sequence[SampledView]) -> list[SampledView]:
     """Return up to three of an event's views, evenly spaced."""
-    count = len(event.views)
-    return [event.views[i] for i in np.unique(np.linspace(0, count - 1, min(SHOWN, count)).round().astype(int))]
+    count = len(views)
+    return [views[i] for i in np.unique(np.linspace(0, count - 1, min(SHOWN, count)).round().astype(int))]
 
 
 def _on_host(sampled: SampledView) -> SampledView:
@@ -302,13 +302,13 @@ def images_kept(fit: Trainer, names: list[str], out: Path) -> Iterator[Callable[
 
     with ThreadPoolExecutor(1) as thread:
 
-        def on_event(step: int, event: Event) -> None:
+        def on_event(step: int, sampled: Sequence[SampledView]) -> None:
             for sheet in writing:
                 if sheet.done():
                     sheet.result()  # or what went wrong
             if step in steps:
                 # the thread must not use the device, since steps may be captured at that time
-                kept = [_on_host(d) for d in _shown(event)]
+                kept = [_on_host(d) for d in _shown(sampled)]
                 views = [dataclasses.replace(fit.views[d.view], image=fit.views[d.view].image.cpu()) for d in kept]
                 writing.append(thread.submit(write, step, views, kept))
 
