@@ -25,7 +25,7 @@ Pixels = tuple[np.ndarray, np.ndarray | None]
 
 def read(folder: Path, path: Path) -> Pixels:
     pixels = image_files.decode(path, MAX_PIXELS)
-    assert images.exif_orientation(path) in range(1, 9)
+    assert image_files.read_exif(path.read_bytes())[0] in range(1, 9)
     return pixels
 
 

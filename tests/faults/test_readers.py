@@ -98,7 +98,7 @@ def test_defects_are_noticed(data, kind, tmp_path):
 
 PACKAGE = Path(warpgs.__file__).parent
 OPENING = {
-    "open", "open_file", "open_input", "read_bytes", "read_file", "read_input", "read_start", "read_text", "input_digest",
+    "open", "open_input", "read_bytes", "read_file", "read_input", "read_start", "read_text", "input_digest",
     "fromfile", "imdecode", "imread", "safe_open", "HeifImageFile", "InferenceSession", "VideoCapture",
     "ZipFile",
 }  # fmt: skip
@@ -153,10 +153,11 @@ SYSTEM = "reads what the system says"
 LAYER = "opens for others, which are named here"
 REASONS = {
     "export/sog.py": {"SOG.is_antialiased": "SOG", "encode": "writes"},
-    "files.py": {"appending": "writes", "writing": "writes", "read_file": LAYER,
+    "files.py": {"appending": "writes", "_replaced": "writes", "read_file": LAYER,
         "open_input": LAYER, "read_input": LAYER, "read_start": LAYER, "input_digest": LAYER},
-    "folders.py": {"Folder.open": LAYER, "Folder.open_regular": LAYER, "_opened": LAYER,
-        "_own_file": "writes"},
+    "folders.py": {"Folder.__init__": LAYER, "Folder.open": LAYER, "Folder.open_regular": LAYER,
+        "Temporary.__init__": "writes"},
+    "locks.py": {"_held": "writes"},
     "pipeline/farm/work.py": {"_with_lpips": OWN},
     "pipeline/farm/slurm.py": {"main": PRIVATE,
         "SlurmEngine._answered": PRIVATE, "SlurmEngine._output": PRIVATE},

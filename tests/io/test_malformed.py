@@ -47,7 +47,7 @@ def test_the_complete_format_is_taken_with_a_note(tmp_path):
 def test_a_complete_reconstruction_elsewhere_is_found(tmp_path):
     scenes.write_files(tmp_path / "sparse" / "0", {"points3D.bin": b""})
     scenes.write_colmap_txt(tmp_path)
-    assert colmap.model_folder(tmp_path) == tmp_path / "sparse" and detect(tmp_path)[0].name == "colmap"
+    assert colmap.reconstruction(tmp_path)[0] == tmp_path / "sparse" and detect(tmp_path)[0].name == "colmap"
 
 
 def test_the_folder_itself_may_be_the_reconstruction(tmp_path):

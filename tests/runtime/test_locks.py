@@ -8,7 +8,7 @@ import sys
 
 import pytest
 
-from warpgs import folders, locks
+from warpgs import folders
 from warpgs.errors import ResourceError, UsageError
 from warpgs.files import LOCK, is_empty
 from warpgs.locks import hold_file, hold_folder
@@ -67,7 +67,7 @@ def test_a_lock_file_alone_holds_nothing(tmp_path):
 
 def test_a_lock_that_was_removed_meanwhile_is_taken_anew(tmp_path, monkeypatch):
     """The last holder ends between our opening and our locking: what we have locked then is no longer in the folder."""
-    lock, calls = locks.lock_descriptor, []
+    lock, calls = folders.lock_descriptor, []
 
     def late(descriptor, blocking):
         calls.append(descriptor)
@@ -75,7 +75,7 @@ def test_a_lock_that_was_removed_meanwhile_is_taken_anew(tmp_path, monkeypatch):
             (tmp_path / LOCK).unlink()
         return lock(descriptor, blocking=blocking)
 
-    monkeypatch.setattr(locks, "lock_descriptor", late)
+    monkeypatch.setattr(folders, "lock_descriptor", late)
     with hold_folder(tmp_path):
         assert len(calls) == 2 and (tmp_path / LOCK).is_file()
         assert str(os.getpid()) in refusal(tmp_path)
@@ -87,8 +87,7 @@ def test_a_file_system_without_locks_is_noted(tmp_path, monkeypatch):
     def refuse(descriptor, blocking):
         raise OSError(errno.ENOSYS, "Function not implemented")
 
-    for module in (locks, folders):
-        monkeypatch.setattr(module, "lock_descriptor", refuse)
+    monkeypatch.setattr(folders, "lock_descriptor", refuse)
     (tmp_path / LEFT).write_text("perhaps being written")
     with hold_folder(tmp_path) as notes:
         assert len(notes) == 1 and "has no locks" in notes[0] and str(tmp_path) in notes[0]

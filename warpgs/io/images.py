@@ -192,11 +192,6 @@ def list_images(folder: Path) -> list[Path]:
     return sorted(files, key=lambda p: p.relative_to(folder).as_posix())
 
 
-def exif_orientation(path: Path) -> int:
-    """Return the EXIF orientation, 1 to 8; 1 where the file has none."""
-    return read_exif(read_image_file(path)).orientation
-
-
 def turn_upright(array: np.ndarray, orientation: int) -> np.ndarray:
     """Rotate or mirror a raster [H, W, ...] upright by its EXIF orientation."""
     if orientation in (5, 6, 7, 8):
@@ -326,11 +321,11 @@ def _fit_mask(path: Path, mask: np.ndarray, stored: tuple[int, int], upright: tu
     return resized > 0.5 if mask.dtype == bool else resized
 
 
-def _upright(path: Path, lens: Lens, image: np.ndarray) -> int:
+def _upright(path: Path, lens: Lens, image: np.ndarray, data: bytes) -> int:
     """Return the EXIF orientation to apply: 1 (none) where the raster fits the camera as stored, else the tag's."""
     if _fits(image.shape, lens):
         return 1
-    orientation = exif_orientation(path)
+    orientation = read_exif(data)[0]
     if orientation not in (5, 6, 7, 8) or not _fits(image.shape[1::-1], lens):
         raise DataError(
             f"{path}: the image is {image.shape[1]} x {image.shape[0]} px, its camera {lens.width} x {lens.height}: the "
@@ -384,11 +379,12 @@ def load_image(
     Colours are resampled in proportion to their opacity, so that the colours of transparent pixels do not affect others.
     """
     cutout, native = options.masks == "cutout", options.lenses == "native"
-    image, alpha = decode(path, options.max_pixels)
+    data = read_image_file(path, options.max_pixels)
+    image, alpha = decode(path, options.max_pixels, data)
     stored = image.shape[:2]
     if not isinstance(lens, Lens):
         lens = lens(stored[1], stored[0])
-    orientation = _upright(path, lens, image)
+    orientation = _upright(path, lens, image, data)
     if orientation != 1:
         image, alpha = turn_upright(image, orientation), None if alpha is None else turn_upright(alpha, orientation)
     height, width = image.shape[:2]

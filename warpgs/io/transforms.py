@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from warpgs.errors import DataError
-from warpgs.files import read_input, unread_reason
+from warpgs.files import read_file
 from warpgs.io import colmap
 from warpgs.io.folder import (
     Probe,
@@ -60,18 +60,16 @@ def _reject_constant(name: str):
 def _json(path: Path, fix: str, constants: Callable[[str], object] | None = None) -> Any:
     """Return the values of a JSON file of bounded size."""
     try:
-        text = read_input(path, MAX_BYTES).decode("utf-8-sig", "surrogateescape")
+        text = read_file(path, None, MAX_BYTES, fix).decode("utf-8-sig", "surrogateescape")
         check_parts(text)
         return json.loads(text, parse_constant=constants)
-    except OSError as e:
-        raise DataError(f"{path}: cannot be read ({unread_reason(e)}){fix}") from e
     except (ValueError, RecursionError) as e:
-        raise DataError(f"{path}: cannot be read as JSON ({str(e)[:80]}){fix}") from e
+        raise DataError(f"{path}: cannot be read as JSON ({str(e)[:80]}); {fix}") from e
 
 
 def read_json(path: Path) -> dict:
     """Return the parsed file with its list of frames."""
-    values = _json(path, "; write it again", _reject_constant)
+    values = _json(path, "write it again", _reject_constant)
     try:
         check_depth(values, MAX_DEPTH)
     except SchemaError as e:  # else the error message could not name its values
@@ -123,9 +121,7 @@ def lens_of(frame: dict, shared: dict, width: int, height: int, where: str, nati
         unread = [k for k in UNSUPPORTED_TERMS if not (fisheye and k in ("k4", "is_fisheye"))]
         other = [k for k in (*unread, *(("p1", "p2") if fisheye else ())) if frame.get(k, shared.get(k))]
         if other:
-            why = (
-                "is not supported for a fisheye" if fisheye else "belongs to a fisheye or rational lens, which is not supported"
-            )
+            why = "is not supported for a fisheye" if fisheye else "belongs to a fisheye or rational lens, not supported here"
             raise ValueError(f"{other[0]} {why}. Undistort the images{kept if other[0] == 'is_fisheye' else ''}")
     except ValueError as e:
         raise DataError(f"{where}: {e}") from e
@@ -245,7 +241,7 @@ def read_cameras(path: Path) -> tuple[dict[str, Camera], list[str]]:
     if path.is_dir():
         found = _colmap(path)
     else:
-        values = _json(path, ". Check the path, or write the file again")
+        values = _json(path, "check the path, or write the file again")
         found = _inria(path, values) if isinstance(values, list) else _transforms(path)
     if not found:
         raise DataError(f"{path}: holds no camera. Give cameras.json, transforms.json, or the folder of a scene")
@@ -289,21 +285,18 @@ def _transforms(path: Path) -> dict[str, tuple[np.ndarray, Lens]]:
     return found
 
 
-def colmap_folder(folder: Path) -> Path | None:
-    """Return the folder of the reconstruction in a scene folder, sparse or sparse/0; None without one."""
-    found = colmap.model_folder(folder)
-    return colmap.model_folder(folder / "0") if found is None else found
+def colmap_folder(folder: Path) -> tuple[Path, str, list[str]] | None:
+    """Return the `colmap.reconstruction` in a scene folder, sparse or sparse/0; None without one."""
+    return colmap.reconstruction(folder) or colmap.reconstruction(folder / "0")
 
 
 def _colmap(folder: Path) -> dict[str, tuple[np.ndarray, Lens]]:
     """Return pose and lens of each image of a reconstruction, sorted by name."""
-    model = colmap_folder(folder)
-    kind = None if model is None else colmap.complete_kind(model)
-    if model is None or kind is None:
+    model, kind, lacks = colmap_folder(folder) or (folder, "", ["all"])
+    if lacks:
         raise DataError(f"{folder}: lacks COLMAP's files cameras and images. Give cameras.json, transforms.json or a scene")
-    lenses = colmap.read_cameras(model / f"cameras.{kind}")
+    lenses, poses = colmap.read_cameras(model / f"cameras.{kind}"), colmap.read_poses(model / f"images.{kind}")
     found = _Names()
-    poses = colmap.read_poses(model / f"images.{kind}")
     for name, lens, viewmat in colmap.posed_lenses(poses, lenses, model / f"images.{kind}"):
         found.add(name, viewmat, lens)
     return found
