@@ -151,7 +151,7 @@ def interlaced() -> bytes:
 PNG_MODES = ("RGB", "RGBA", "L", "LA", "P", "1", "I;16")
 add(
     "png", {m.replace(";", ""): encoded("PNG", m) for m in PNG_MODES} | {"interlaced": interlaced()},
-    (image_files._png_chunks, image_files._loaded),
+    (image_files._opened, image_files._loaded),
     (png_rows, rarely(png_bomb, png_rows)), repair=png_checksums, unexplained=same,
 )  # fmt: skip
 

@@ -144,14 +144,14 @@ def test_splits_by_names(form):
     ("c.png", "could be any of a/b/c.png, b/c.png"), ("/c.png", "no view"), ("", "no view"), ("f" * 9999, "no view"),
 ])  # fmt: skip
 def test_names_are_found_by_their_ends(wanted, found):
-    from warpgs.io.load import _Names
+    from warpgs.io.load import _finder
 
-    names = _Names(["a/b/c.png", "b/c.png", "x/d/e.png", "f" * 5000], "s")
+    find = _finder(["a/b/c.png", "b/c.png", "x/d/e.png", "f" * 5000], "s")
     if " " in found:
         with pytest.raises(DataError, match=found):
-            names.find(wanted)
+            find(wanted)
     else:
-        assert names.find(wanted) == found
+        assert find(wanted) == found
 
 
 def test_views_of_a_scene():

@@ -45,16 +45,16 @@ _TINY = 1e-37
 
 def encode_glb(arrays: Arrays) -> list[bytes]:
     """Return the bytes of a .glb file."""
-    document, body = _document(arrays)
+    return glb(*_document(arrays))
+
+
+def glb(document: dict[str, Any], *body: bytes) -> list[bytes]:
+    """Return the bytes of a .glb file of a document and the parts of its buffer."""
     text = json.dumps(document, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 4)
-    total = 12 + 8 + len(text) + 8 + len(body)
-    return [
-        struct.pack("<IIIII", GLB, 2, total, len(text), JSON_CHUNK),
-        text,
-        struct.pack("<II", len(body), BINARY_CHUNK),
-        body,
-    ]
+    size = sum(map(len, body))
+    head = struct.pack("<IIIII", GLB, 2, 28 + len(text) + size, len(text), JSON_CHUNK)
+    return [head, text, struct.pack("<II", size, BINARY_CHUNK), *body]
 
 
 def encode_gltf(arrays: Arrays) -> list[bytes]:

@@ -172,13 +172,9 @@ def _decoded(name: str, data: bytes) -> np.ndarray | None:
     if name == "WEBP":
         if not any(kind in WEBP_PIXELS for kind, _ in _webp_chunks(data)):
             raise ValueError("it holds no pixels")
-    elif name == "PNG":
-        for _ in _png_chunks(data):  # their checksums
-            pass
-        _loaded(_opened(name, data)).close()
-    elif name == "BMP":
+    elif name in ("PNG", "BMP"):
         with _opened(name, data) as image:
-            if image.info.get("compression") in BMP_RLE:
+            if name == "BMP" and image.info.get("compression") in BMP_RLE:
                 raise ValueError("its pixels are compressed, so damage would not be detected; save it as PNG")
             _loaded(image)
     else:
@@ -266,22 +262,6 @@ def _decoded_jpeg(data: bytes) -> np.ndarray | None:
         return None
     pixels: np.ndarray = simplejpeg.decode_jpeg(data, "GRAY" if colors == "Gray" else "BGR", strict=True)
     return pixels
-
-
-def _png_chunks(data: bytes) -> Iterator[tuple[bytes, memoryview]]:
-    """Yield kind and contents of each chunk of a PNG up to the last, after a check of its checksum."""
-    at, view, kind = len(PNG_START), memoryview(data), b""
-    while kind != b"IEND":
-        if at + 12 > len(data):
-            raise ValueError("it ends early")
-        length, kind = struct.unpack_from(">I4s", data, at)
-        end = at + 8 + length
-        if end + 4 > len(data):
-            raise ValueError("it ends within a chunk")
-        if zlib.crc32(view[at + 4 : end]) != struct.unpack_from(">I", data, end)[0]:
-            raise ValueError(f"the checksum of its part {kind.decode('ascii', 'replace')} does not match")
-        yield kind, view[at + 8 : end]
-        at = end + 4
 
 
 WEBP_PIXELS = (b"VP8 ", b"VP8L", b"ANMF")
@@ -561,13 +541,12 @@ def parse_exif(block: bytes) -> Exif:
 def _block(data: bytes) -> bytes:
     """Return the bytes of EXIF in an image file, which begin as a TIFF file does; maybe empty."""
     name = format_of(data)
-    if name == "TIFF":
-        return data
-    if name == "AVIF":
-        with _opened(name, data) as image:
-            return bytes(image.info.get("exif", b""))
     if name == "JPEG":
         head = itertools.takewhile(lambda segment: segment[0] != SOS, _segments(data))
         return next((body for marker, body in head if marker == APP1 and body.startswith(PREFIX)), b"")
-    chunks = {"PNG": _png_chunks, "WEBP": _webp_chunks}.get(name, lambda data: iter(()))
-    return bytes(next((body for kind, body in chunks(data) if kind.upper() == b"EXIF"), b""))
+    if name == "WEBP":
+        return bytes(next((body for kind, body in _webp_chunks(data) if kind == b"EXIF"), b""))
+    if name in ("PNG", "AVIF"):
+        with _opened(name, data) as image:
+            return bytes(image.info.get("exif", b""))
+    return data if name == "TIFF" else b""

@@ -241,7 +241,6 @@ def _undistort(loaded: LoadedImage, lens: Lens) -> LoadedImage:
     map_x, map_y = undistortion_maps(loaded.K, lens, width, height)
     K = loaded.K.copy()
     K[:2, 2] -= 0.5
-    image = cv2.remap(loaded.image, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     inside = (map_x >= -0.5) & (map_x <= width - 0.5) & (map_y >= -0.5) & (map_y <= height - 0.5)
     # beyond the fold of the polynomial, the map returns into the image, but to the pixel of another ray
     x2 = ((np.arange(width) - K[0, 2]) / K[0, 0]) ** 2
@@ -249,11 +248,12 @@ def _undistort(loaded: LoadedImage, lens: Lens) -> LoadedImage:
     inside &= y2[:, None] + x2 < _fold_radius2(lens.distortion)
     if loaded.mask is not None:
         inside &= cv2.remap(loaded.mask.astype(np.float32), map_x, map_y, cv2.INTER_LINEAR) > 0.5
-    alpha = None
-    if loaded.alpha is not None:
-        alpha = cv2.remap(loaded.alpha, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    image, alpha = (
+        None if a is None else cv2.remap(a, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        for a in (loaded.image, loaded.alpha)
+    )
     done = (*loaded.done, f"undistorted ({lens.model})")
-    return LoadedImage(image, None if inside.all() else inside, loaded.K, done, alpha, loaded.kept)
+    return replace(loaded, image=image, mask=None if inside.all() else inside, done=done, alpha=alpha)
 
 
 @functools.lru_cache(maxsize=4)
