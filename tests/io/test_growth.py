@@ -102,22 +102,19 @@ def test_cameras_keep_all_names_unique(tmp_path):
     assert list(found) == ["a", "a-2", "a-3", "a-4", "a-2-2", "b"]
 
 
-def test_points_and_poses_of_colmap(tmp_path):
-    def make(n):
+def test_points_of_colmap_and_parameters_of_middlebury(tmp_path):
+    def points(n):
         path = tmp_path / f"{n}.txt"
         path.write_text("".join(f"{i} 0 0 1 9 9 9 0.1 1 0 2 0\n" for i in range(n)))
         return lambda: colmap.read_points(path, {1: "a", 2: "b"})
 
-    grows(make)
-
-
-def test_parameters_of_middlebury(tmp_path):
-    def make(n):
+    def parameters(n):
         path = tmp_path / f"{n}_par.txt"
         path.write_text(f"{n}\n" + "".join(f"{i}.png {'1 ' * 21}\n" for i in range(n)))
         return lambda: others.read_camera_rows(path)
 
-    grows(make)
+    grows(points)
+    grows(parameters)
 
 
 def scene(n):
