@@ -18,9 +18,8 @@ from warpgs.export.base import (
     SQRT2,
     Arrays,
     Format,
-    arrays_of,
+    arrays_to_write,
     by_rows,
-    check_finite,
     from_smallest_three,
     logits,
     malformed,
@@ -132,7 +131,7 @@ _VERTEX_NAMES = ["packed_position", "packed_rotation", "packed_scale", "packed_c
 _BITS = (11, 10, 11)
 
 
-def encode(arrays: Arrays, antialiased: bool = False) -> list[bytes]:
+def encode(arrays: Arrays, antialiased: bool) -> list[bytes]:
     """Return the bytes of a file, with antialiasing declared in its header; harmonics above degree 0 are clamped to +-4."""
     n, k = arrays["sh"].shape[:2]
     chunks = np.arange(n) // CHUNK
@@ -351,12 +350,7 @@ def write_ply(
         ValueError: A tensor has the wrong shape.
     """
     path = Path(path)
-    normalization = checked_normalization(normalization, units, f"{path}: not written")
-    in_file = convert_gaussians(gaussians, normalization, units, "file")
-    for g in (gaussians, in_file):  # finite numbers may overflow float32 in the conversion
-        arrays = arrays_of(g)
-        check_finite(path, arrays)
-
+    arrays = arrays_to_write(path, gaussians, normalization, units)
     n, k = arrays["sh"].shape[:2]
     header = _header(n, 3 * (k - 1), antialiased)
     with writing(path, len(header) + 4 * n * (14 + 3 * k)) as file:
