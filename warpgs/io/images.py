@@ -248,10 +248,9 @@ def _undistort(loaded: LoadedImage, lens: Lens) -> LoadedImage:
     inside &= y2[:, None] + x2 < _fold_radius2(lens.distortion)
     if loaded.mask is not None:
         inside &= cv2.remap(loaded.mask.astype(np.float32), map_x, map_y, cv2.INTER_LINEAR) > 0.5
-    image, alpha = (
-        None if a is None else cv2.remap(a, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        for a in (loaded.image, loaded.alpha)
-    )
+    edge = cv2.BORDER_REPLICATE
+    image = cv2.remap(loaded.image, map_x, map_y, cv2.INTER_LINEAR, borderMode=edge)
+    alpha = None if loaded.alpha is None else cv2.remap(loaded.alpha, map_x, map_y, cv2.INTER_LINEAR, borderMode=edge)
     done = (*loaded.done, f"undistorted ({lens.model})")
     return replace(loaded, image=image, mask=None if inside.all() else inside, done=done, alpha=alpha)
 
