@@ -174,13 +174,21 @@ def test_a_folder_with_nothing_but_our_own_leftovers_is_empty(tmp_path):
 
 def test_a_folder_appears_whole_or_not_at_all(tmp_path, monkeypatch):
     """Also in the place of an empty one; an error of the block goes on, and one of the disk says what to do."""
-    (tmp_path / "a").mkdir()
+    assert make_folder(tmp_path / "a") and not make_folder(tmp_path / "a")
     (tmp_path / "a" / LEFT).touch()
+    for name in (f"a/{LEFT}", f"a/{LEFT}/below", "x" * 300):
+        with pytest.raises(ResourceError, match="cannot be created"):
+            make_folder(tmp_path / name)
     for name in ("a", "b/c"):
         with filling(tmp_path / name) as temporary:
             assert OWN_NAMES.fullmatch(temporary.name) and temporary.parent == (tmp_path / name).parent
             (temporary / "x").touch()
         assert [p.name for p in (tmp_path / name).iterdir()] == ["x"] and not temporary.exists()
+    with open_folder(tmp_path / "a") as above, Temporary(above) as held:  # another process works in it
+        above.mkdir(held.name)
+        with pytest.raises(ResourceError, match="cannot be created"), filling(tmp_path / "a"):
+            pass
+        assert held.path.is_dir()
     with pytest.raises(KeyboardInterrupt), filling(tmp_path / "d") as temporary:
         (temporary / "x").touch()
         raise KeyboardInterrupt
@@ -191,14 +199,6 @@ def test_a_folder_appears_whole_or_not_at_all(tmp_path, monkeypatch):
     with pytest.raises(ResourceError, match="d: cannot be created"), filling(tmp_path / "d"):
         pass
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a", "b"]
-
-
-def test_a_folder_that_cannot_be_made(tmp_path):
-    assert make_folder(tmp_path / "a" / "b") and not make_folder(tmp_path / "a")
-    (tmp_path / "file").touch()
-    for name in ("file", "file/below", "x" * 300):
-        with pytest.raises(ResourceError, match="cannot be created"):
-            make_folder(tmp_path / name)
 
 
 WRITERS = {
@@ -305,7 +305,7 @@ def special(kind, path):
     ("pipe", "is not a regular file"), ("device", "is not a regular file"), ("socket", "is not a regular file"),
     ("folder", "is a folder"), ("unreadable", "symbolic links"),
 ])  # fmt: skip
-def test_what_is_no_regular_file_is_refused(kind, words, tmp_path):
+def test_what_is_no_regular_file_is_refused(kind, words, tmp_path, monkeypatch):
     path = special(kind, tmp_path / "x")
     for read in (open_input, read_input, input_digest, lambda p: read_start(p, 4)):
         with pytest.raises(OSError) as e:
@@ -313,21 +313,24 @@ def test_what_is_no_regular_file_is_refused(kind, words, tmp_path):
         assert words in unread_reason(e.value) and str(tmp_path) in str(e.value)
     with pytest.raises(DataError, match=f"cannot be read .*{words}.*; mend it"):
         read_file(path, fix="mend it")
-
-
-def test_a_pipe_that_takes_the_place_of_a_file_does_not_block(tmp_path, monkeypatch):
-    pipe, file = special("pipe", tmp_path / "p"), tmp_path / "f"
-    file.write_bytes(b"x")
-    ordinary = os.stat(file)
-    monkeypatch.setattr(files.os, "stat", lambda path: ordinary)
-    with pytest.raises(OSError, match="is not a regular file"):
-        open_input(pipe)
+    if kind == "pipe":  # that takes the place of a file: it does not block
+        (tmp_path / "f").touch()
+        ordinary = os.stat(tmp_path / "f")
+        monkeypatch.setattr(files.os, "stat", lambda path: ordinary)
+        with pytest.raises(OSError, match="is not a regular file"):
+            open_input(path)
 
 
 def test_sizes_are_bounded_before_and_while_reading(tmp_path, monkeypatch):
     path = tmp_path / "f"
     path.write_bytes(b"12345678")
     assert read_input(path, 8) == b"12345678" and read_start(path, 3) == b"123"
+    with open_input(path) as file:
+        assert (os.name == "nt" or os.get_blocking(file.fileno())) and not os.get_inheritable(file.fileno())
+    open_files = len(os.listdir("/proc/self/fd")) if Path("/proc/self/fd").exists() else 0
+    with pytest.raises(OSError):
+        open_input(tmp_path)
+    assert not open_files or open_files == len(os.listdir("/proc/self/fd"))
     with pytest.raises(OSError, match="larger than 7 bytes"):
         read_input(path, 7)
     with path.open("wb") as f:
@@ -338,18 +341,6 @@ def test_sizes_are_bounded_before_and_while_reading(tmp_path, monkeypatch):
         assert b"VmPeak" in read_input("/proc/self/status")
         with pytest.raises(OSError, match="larger than 10 bytes"):
             read_input("/proc/self/status", 10)
-
-
-def test_descriptors_are_closed_blocking_and_not_inherited(tmp_path):
-    (tmp_path / "f").write_bytes(b"x")
-    with open_input(tmp_path / "f") as file:
-        assert os.get_blocking(file.fileno()) if os.name != "nt" else True
-        assert not os.get_inheritable(file.fileno())
-    if os.name != "nt":
-        before = len(os.listdir("/proc/self/fd")) if Path("/proc/self/fd").exists() else 0
-        with pytest.raises(OSError):
-            open_input(tmp_path)
-        assert before == (len(os.listdir("/proc/self/fd")) if before else 0)
 
 
 # Below a folder of results no link is followed, neither to write nor to read; the folder itself may be a link.
@@ -443,21 +434,15 @@ def test_a_file_that_is_a_link_is_replaced_and_never_followed(tmp_path, outside)
             appending(link)
     with pytest.raises(OSError, match="not a regular file"):
         open_input(link)
-
-
-@with_links
-def test_reading_below_a_folder_that_nobody_opened(tmp_path, outside):
-    """A file that the user names may be a link; one of a run, or behind a folder of it, may not."""
-    run = tmp_path / "run"
-    run.mkdir()
-    (run / "link").symlink_to(outside)
-    (run / "file").symlink_to(outside / "canary")
-    assert open_input(run / "file").read() == b"old"
-    for path in (run / "file", run / "link" / "canary"):
+    # a file that the user names may be a link; one of a run that nobody opened, or behind a folder of it, may not
+    (root / "folder").symlink_to(outside)
+    (root / "file").symlink_to(outside / "canary")
+    assert open_input(root / "file").read() == b"old"
+    for path in (root / "file", root / "folder" / "canary"):
         with pytest.raises(RefusedError, match="is a link"):
-            open_input(path, run)
+            open_input(path, root)
     with pytest.raises(FileNotFoundError):
-        open_input(run / "none" / "x", run)
+        open_input(root / "none" / "x", root)
 
 
 @with_links
@@ -652,16 +637,6 @@ def test_a_temporary_folder_is_private_and_goes_with_its_lock(places):
                 os._exit(0)
             os.waitpid(child, 0)
             assert folder.path.is_dir()
-
-
-def test_leftovers_in_a_folder_that_is_made_anew_go(tmp_path):
-    (tmp_path / "a").mkdir()
-    with open_folder(tmp_path / "a") as above, Temporary(above) as held:
-        above.mkdir(held.name)
-        with pytest.raises(Exception, match="cannot be created"), filling(tmp_path / "a"):
-            pass  # another process works in it
-        remove_leftovers(tmp_path / "a")
-        assert held.path.is_dir()
 
 
 @pytest.mark.skipif(os.name == "nt", reason="Windows keeps Python's own choice")
