@@ -276,8 +276,12 @@ class Temporary:
         while True:
             self.name = f"{prefix}{secrets.token_hex(8)}.tmp{suffix}"
             self._lock = above.open(self.name + LOCKED, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o600)
-            if lock(self._lock) is not False and os.fstat(self._lock).st_nlink:
-                break
+            try:
+                if lock(self._lock) is not False and os.fstat(self._lock).st_nlink:
+                    break
+            except BaseException:
+                unlock(above, self.name + LOCKED, self._lock)
+                raise
             os.close(self._lock)  # another process found it before it was locked, and removes it
         self.path = above.path / self.name
         with _LOCK:
