@@ -17,7 +17,7 @@ from typing import BinaryIO
 
 from warpgs.errors import DataError, ResourceError, UsageError
 from warpgs.folders import NAMES as OWN_NAMES
-from warpgs.folders import WINDOWS, Folder, RefusedError, Temporary, is_below, open_folder, output_folder, sweep
+from warpgs.folders import WINDOWS, Folder, RefusedError, Temporary, is_below, open_folder, output_folder, sweep, temporary_file
 
 # Opening of input files: only regular files of bounded size, so that no pipe hangs a command and no device fills its
 # memory.
@@ -152,16 +152,15 @@ def _replaced(
     with (
         writable(path, amount=amount, note="; the old file is untouched"),
         open_folder(path.parent) as folder,
-        Temporary(folder, suffix) as temporary,
-        open(folder.open(temporary.name, os.O_RDWR | os.O_CREAT | os.O_EXCL), "wb") as file,
+        temporary_file(folder, suffix) as (name, file),
     ):
         shown = DESCRIPTORS / str(folder.descriptor)  # a path that libraries can use, where the system has such paths
-        reachable = (shown if folder.descriptor is not None and shown.is_dir() else folder.path) / temporary.name
+        reachable = (shown if folder.descriptor is not None and shown.is_dir() else folder.path) / name
         yield file, reachable
         file.flush()
         os.fsync(file.fileno())
         written = os.fstat(file.fileno())
-        if not os.path.samestat(written, folder.lstat(temporary.name)):
+        if not os.path.samestat(written, folder.lstat(name)):
             raise OSError(errno.EIO, "another file took the place of the temporary one")
         if size is not None and written.st_size != size:  # some file systems report no error
             raise OSError(errno.EIO, f"only {written.st_size} of {size} bytes were written")
@@ -171,11 +170,11 @@ def _replaced(
             file.close()
         for pause in PAUSES if WINDOWS else ():
             with contextlib.suppress(PermissionError):
-                folder.replace(temporary.name, path.name)
+                folder.replace(name, path.name)
                 break
             time.sleep(pause)
         else:
-            folder.replace(temporary.name, path.name)
+            folder.replace(name, path.name)
         _sync(folder)
 
 

@@ -16,6 +16,7 @@ import tempfile
 import threading
 from collections.abc import Iterator
 from pathlib import Path
+from typing import BinaryIO
 
 from filelock import lock_descriptor
 
@@ -215,7 +216,7 @@ def _replaced(path: Path) -> RefusedError:
     )
 
 
-# Temporary files and folders: each has a lock of its owner beside it; any process may remove those whose lock is free.
+# Temporary files and folders: the owner locks its file, or a file beside its folder; any process may remove unlocked ones.
 #
 # The system releases a lock when its holder ends, killed or not. So a temporary file of a running process is never
 # removed as a leftover, and the next command removes the files of a killed process.
@@ -223,12 +224,12 @@ def _replaced(path: Path) -> RefusedError:
 NAMES = re.compile(r"\.?warpgs-[0-9a-f]{16}\.tmp(\.(mp4|webm))?(\.lock)?")
 """Names of temporary files, folders and their locks: short and ASCII, so that every file system accepts them."""
 LOCKED = ".lock"
-"""End of the name of a lock."""
+"""End of the name of the lock beside a temporary folder."""
 NO_LOCKS = (errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOLCK, errno.EINVAL)
 """Errors of file systems without locks."""
 
 _HELD: set[int] = set()
-"""Descriptors of the locks of temporary files and folders of this process."""
+"""Descriptors of the locks of temporary folders of this process."""
 
 
 def lock(descriptor: int) -> bool | None:
@@ -267,22 +268,40 @@ def shared_locks() -> Iterator[tuple[int, ...]]:
             os.close(descriptor)
 
 
-class Temporary:
-    """A locked name for a new file or folder, which its owner makes; at the end, what has the name is removed."""
+def _locked(above: Folder, prefix: str, end: str, mode: int) -> tuple[str, int]:
+    """Make and lock a file with a new name; return name and descriptor."""
+    while True:
+        name = f"{prefix}{secrets.token_hex(8)}.tmp{end}"
+        descriptor = above.open(name, os.O_RDWR | os.O_CREAT | os.O_EXCL, mode)
+        try:
+            if lock(descriptor) is not False and os.fstat(descriptor).st_nlink:
+                return name, descriptor
+        except BaseException:
+            unlock(above, name, descriptor)
+            raise
+        os.close(descriptor)  # another process found it before it was locked, and removes it
 
-    def __init__(self, above: Folder, suffix: str = "", prefix: str = ".warpgs-"):
+
+@contextlib.contextmanager
+def temporary_file(above: Folder, suffix: str = "") -> Iterator[tuple[str, BinaryIO]]:
+    """Give the name of a new locked file, and the file; it is removed after the block unless it was renamed."""
+    name, descriptor = _locked(above, ".warpgs-", suffix, 0o666)
+    try:
+        with open(descriptor, "wb") as file:
+            yield name, file
+    finally:
+        with contextlib.suppress(OSError):  # leftovers are recognised by name
+            above.unlink(name)
+
+
+class Temporary:
+    """A name for a new folder, with a lock beside it; at the end, the folder that has the name is removed."""
+
+    def __init__(self, above: Folder, prefix: str = ".warpgs-"):
         """Make the lock."""
         self._above, self._process = above, os.getpid()
-        while True:
-            self.name = f"{prefix}{secrets.token_hex(8)}.tmp{suffix}"
-            self._lock = above.open(self.name + LOCKED, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o600)
-            try:
-                if lock(self._lock) is not False and os.fstat(self._lock).st_nlink:
-                    break
-            except BaseException:
-                unlock(above, self.name + LOCKED, self._lock)
-                raise
-            os.close(self._lock)  # another process found it before it was locked, and removes it
+        name, self._lock = _locked(above, prefix, LOCKED, 0o600)
+        self.name = name.removesuffix(LOCKED)
         self.path = above.path / self.name
         with _LOCK:
             _HELD.add(self._lock)
@@ -294,7 +313,7 @@ class Temporary:
         self.remove()
 
     def remove(self) -> None:
-        """Remove the file or folder unless it was renamed, then its lock; a forked child leaves both to its parent."""
+        """Remove the folder unless it was renamed, then its lock; a forked child leaves both to its parent."""
         if os.getpid() == self._process and self._lock in _HELD:
             try:
                 self._above.remove(self.name)
@@ -308,7 +327,7 @@ class Temporary:
 def temporary_folder() -> Iterator[Temporary]:
     """Make a folder that only this user can read or write, in the `system_folder`, and remove it after the block."""
     sweep_temporary_files()
-    with open_folder(system_folder()) as above, Temporary(above, prefix="warpgs-") as made:
+    with open_folder(system_folder()) as above, Temporary(above, "warpgs-") as made:
         above.mkdir(made.name, 0o700)
         yield made
 
@@ -335,13 +354,15 @@ def sweep(folder: Folder, own: bool = False) -> None:
     with contextlib.suppress(OSError):
         for name in filter(NAMES.fullmatch, folder.names()):
             with contextlib.suppress(OSError):
-                if own and not WINDOWS and folder.lstat(name).st_uid != os.getuid():
+                found = folder.lstat(name)
+                if own and not WINDOWS and found.st_uid != os.getuid():
                     continue
-                held = name.removesuffix(LOCKED)
-                descriptor = folder.open_regular(held + LOCKED, os.O_RDWR | os.O_CREAT)
+                is_file = stat.S_ISREG(found.st_mode) and not name.endswith(LOCKED)
+                held = name if is_file else name.removesuffix(LOCKED) + LOCKED
+                descriptor = folder.open_regular(held, os.O_RDWR | (0 if is_file else os.O_CREAT))
                 if lock(descriptor):
-                    folder.remove(held)
-                    unlock(folder, held + LOCKED, descriptor)
+                    folder.remove(held.removesuffix(LOCKED))
+                    unlock(folder, held, descriptor)
                 else:
                     os.close(descriptor)
 

@@ -153,10 +153,10 @@ SYSTEM = "reads what the system says"
 LAYER = "opens for others, which are named here"
 REASONS = {
     "export/sog.py": {"SOG.is_antialiased": "SOG", "encode": "writes"},
-    "files.py": {"appending": "writes", "_replaced": "writes", "read_file": LAYER,
+    "files.py": {"appending": "writes", "read_file": LAYER,
         "open_input": LAYER, "read_input": LAYER, "read_start": LAYER, "input_digest": LAYER},
     "folders.py": {"Folder.__init__": LAYER, "Folder.open": LAYER, "Folder.open_regular": LAYER,
-        "Temporary.__init__": "writes"},
+        "_locked": "writes", "temporary_file": "writes"},
     "locks.py": {"_held": "writes"},
     "pipeline/farm/work.py": {"_with_lpips": OWN},
     "pipeline/farm/slurm.py": {"main": PRIVATE,
