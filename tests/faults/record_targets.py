@@ -207,7 +207,7 @@ def lock_files(root: Path) -> list[Path]:
 
 def holder(root: Path, path: Path) -> str | None:
     data = path.read_bytes() if path.is_file() else b""
-    return locks._signed(io.BytesIO(data))
+    return locks._signed(data[1:])
 
 
 register(Target("signature of a lock", lock_files, holder, (locks._signed,), (one_line(json_value), text_number)))
