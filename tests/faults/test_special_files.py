@@ -246,7 +246,6 @@ ALLOWED = {
     ("folders.py", "open"): "opens below a folder without following links, and regular files alone; makes a temporary file",
     ("folders.py", "fdopen"): "opens below a folder without following links, and regular files alone",
     ("pipeline/farm/slurm.py", "read_text"): "a job in a private folder; an answer in a private folder",
-    ("pipeline/farm/slurm.py", "open"): "output in a private folder",
     ("pipeline/farm/worker.py", "fdopen"): "the standard output",
     ("poses/find.py", "read_bytes"): "a model that pycolmap has just written",
     ("poses/photographs.py", "read_text"): "a job that the calling process has just written",

@@ -45,12 +45,8 @@ class RayEngine:
             raise UsageError(
                 f"no job of {threads} threads and {gpus:g} GPUs fits into Ray's cluster ({found}); give fewer --threads"
             )
-        self._options = {
-            "num_cpus": threads,
-            "num_gpus": gpus,
-            "max_retries": 1,
-            "runtime_env": {"env_vars": {"PYTHONSAFEPATH": "1"}},
-        }
+        environment = {"env_vars": {"PYTHONSAFEPATH": "1"}}
+        self._options = {"num_cpus": threads, "num_gpus": gpus, "max_retries": 1, "runtime_env": environment}
         self._running: dict[Any, str] = {}
         self.use(run_job)
 
@@ -69,9 +65,9 @@ class RayEngine:
 
     def _event(self, name: str, reference: Any) -> Event:
         try:
-            return Event(name, self._ray.get(reference))
+            return name, self._ray.get(reference), ""
         except self._ray.exceptions.RayError as e:  # its process died twice, or a record could not be written
-            return Event(name, "crashed", str(e).strip().splitlines()[-1])
+            return name, "crashed", str(e).strip().splitlines()[-1]
 
     def close(self) -> None:
         """Stop all running jobs, and leave the cluster."""
