@@ -148,8 +148,8 @@ def test_processes_give_the_bytes_of_single_fits_and_one_that_is_killed_is_repla
     assert (tmp_path / "out" / "s1" / THUMBNAIL).is_file()
 
 
-def test_a_rerun_skips_what_is_finished_and_valid(scenes, single, results):
-    """Nothing is started; a changed byte, setting or photograph starts that job alone."""
+def test_a_rerun_skips_what_is_finished_and_valid(scenes, single, results, tmp_path):
+    """A changed byte starts that job alone; other times of files are no other data; another setting is another run."""
     engine = HereEngine()
     assert [s.state for s in run_farm(jobs_of(scenes, results), engine)] == ["done", "done"] and engine.begun == []
     ply = results / "s1" / "run" / PLY
@@ -159,6 +159,15 @@ def test_a_rerun_skips_what_is_finished_and_valid(scenes, single, results):
     statuses = run_farm(jobs_of(scenes, results), engine)
     assert engine.begun == ["s1"] and digests(statuses) == single
     assert [s.record.how for s in statuses] == ["fitted", "continued"]
+    copied = shutil.copytree(scenes, tmp_path / "scenes")
+    moved = [replace(j, request=replace(j.request, scene=replace(j.request.scene, path=str(copied / j.name))))
+             for j in jobs_of(scenes, results)]  # fmt: skip
+    assert all(finished(j) is None for j in moved)
+    assert [s.record.how for s in run_farm(moved, HereEngine())] == ["kept", "kept"] and finished(moved[0])
+    os.utime(copied / "s0" / "images" / "000.png", (0, 0))
+    assert finished(moved[0]) is None and finished(moved[1])
+    (status,) = run_farm(jobs_of(scenes, results, steps=4)[:1], HereEngine())
+    assert (status.record.how, status.record.steps) == ("redone", 4) and (results / "s0" / "run.old1").is_dir()
 
 
 def test_links_that_double_a_scene_at_each_level_are_not_listed(tmp_path, monkeypatch):
@@ -172,18 +181,6 @@ def test_links_that_double_a_scene_at_each_level_are_not_listed(tmp_path, monkey
     for level in ("0", "3"):
         (tmp_path / level / "image.png").touch()
     assert record.source_stamp(tmp_path / "3") and not record.source_stamp(tmp_path / "0")  # 31 folders, and 255
-
-
-def test_touched_photographs_are_read_again_and_the_run_is_kept(scenes, results, tmp_path):
-    """Other times of files are no other data; another setting is another run, and the old one is moved aside."""
-    copied = shutil.copytree(scenes, tmp_path / "scenes")
-    moved = [replace(j, request=replace(j.request, scene=replace(j.request.scene, path=str(copied / j.name))))
-             for j in jobs_of(scenes, results)]  # fmt: skip
-    assert all(finished(j) is None for j in moved)
-    assert [s.record.how for s in run_farm(moved, HereEngine())] == ["kept", "kept"]
-    (status,) = run_farm(jobs_of(scenes, results, steps=4)[:1], HereEngine())
-    assert (status.record.how, status.record.steps) == ("redone", 4)
-    assert (results / "s0" / "run.old1").is_dir()
 
 
 def test_settings_that_follow_from_the_views_are_the_same_settings(scenes, tmp_path):
@@ -419,34 +416,21 @@ def test_lines_are_flags_of_fit(tmp_path):
         list_jobs(str(path))
 
 
-@pytest.mark.parametrize(
-    ("line", "word"),
-    [
-        ("{", "not valid JSON"),
-        ("[]", "must be an object"),
-        ('{"name": "a"}', "scene is missing"),
-        ('{"scene": 3}', "scene must be text"),
-        ('{"scene": "a", "name": "../b"}', "is not a valid name"),
-        ('{"scene": "a", "name": "index.html"}', "is not a valid name"),
-        ('{"scene": "a", "out": "/b"}', "cannot be set for a single job"),
-        ('{"scene": "a", "allow_outside": true}', "cannot be set"),
-        ('{"scene": "a", "strategy": "evil.py:Evil"}', "names user code"),
-        ('{"scene": "a", "view_modules": "evil.py:Evil"}', "names user code"),
-        ('{"scene": "a", "steps": [1]}', "must be text"),
-        ('{"scene": "a", "--steps": 1}', "cannot be set"),
-        ('{"scene": "a\\u0000"}', "without a zero byte"),
-        ('{"scene": "a", "name": ".b"}', "is not a valid name"),
-        ('{"scene": "a", "name": "%s"}' % (100 * "写"), "has 300 bytes, but a job's name may have at most 200"),
-        ('{"scene": "a", "name": "%s"}' % (101 * "x"), "is not a valid name"),
-        ("[" * 60 + "]" * 60, "nested deeper"),
-    ],
-)
-def test_lines_that_are_no_jobs(tmp_path, line, word):
+def test_lines_that_are_no_jobs(tmp_path):
     """One sentence, with the number of the line where it is the line's fault."""
     path = tmp_path / "jobs.jsonl"
-    path.write_text(line, "utf-8")
-    with pytest.raises(DataError, match=word):
-        list_jobs(str(path))
+    for word, values in {
+        "is not a valid name": [{"name": n} for n in ("../b", "index.html", ".b", 101 * "x")], "must be text": [{"steps": [1]}],
+        "has 300 bytes, but a job's name may have at most 200": [{"name": 100 * "写"}], "scene must be text": [{"scene": 3}],
+        "cannot be set for a single job": [{"out": "/b"}, {"allow_outside": True}, {"--steps": 1}],
+        "names user code": [{"strategy": "evil.py:Evil"}, {"view_modules": "evil.py:Evil"}],
+        "without a zero byte": [{"scene": "a\0"}], "not valid JSON": ["{"], "must be an object": ["[]"],
+        "scene is missing": ['{"name": "a"}'], "nested deeper": ["[" * 60 + "]" * 60],
+    }.items():  # fmt: skip
+        for value in values:
+            path.write_text(value if isinstance(value, str) else json.dumps({"scene": "a"} | value), "utf-8")
+            with pytest.raises(DataError, match=word):
+                list_jobs(str(path))
 
 
 # Slurm's engine: private files, nothing unpickled, and each way in which a job of Slurm can end.

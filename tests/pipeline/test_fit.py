@@ -336,18 +336,13 @@ def test_mistakes_get_one_line(scene, tmp_path, capsys):
 # The colour behind a scene: named, chosen, shown by renders, and kept by the run folder.
 
 
-@pytest.mark.parametrize(
-    "text,color",
-    [("black", (0, 0, 0)), ("white", (1, 1, 1)), ("#ff8000", (1, 128 / 255, 0)), ("0.25,1,.5", (0.25, 1, 0.5)), ("auto", None)],
-)
-def test_colours_by_name_and_by_number(text, color):
-    assert color_of(text) == color and FitConfig(background=text).background == text
-
-
-@pytest.mark.parametrize("text", ["", "grey", "#fff", "#gggggg", "1,1", "nan,0,0", "1.5,0,0", "-0.1,0,0"])
-def test_what_is_no_colour_is_refused(text):
-    with pytest.raises(UsageError, match=r"is not a colour: give auto, mean, scene, black, white, #rrggbb, or r,g,b"):
-        FitConfig(background=text)
+def test_colours_by_name_and_by_number():
+    named = {"black": (0, 0, 0), "white": (1, 1, 1), "#ff8000": (1, 128 / 255, 0), "0.25,1,.5": (0.25, 1, 0.5), "auto": None}
+    for text, color in named.items():
+        assert color_of(text) == color and FitConfig(background=text).background == text
+    for text in ("", "grey", "#fff", "#gggggg", "1,1", "nan,0,0", "1.5,0,0", "-0.1,0,0"):
+        with pytest.raises(UsageError, match=r"is not a colour: give auto, mean, scene, black, white, #rrggbb, or r,g,b"):
+            FitConfig(background=text)
 
 
 def test_the_mean_colour_is_of_training_pixels_that_count(tmp_path):

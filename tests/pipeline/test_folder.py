@@ -19,7 +19,6 @@ from warpgs.app.cli import main
 from warpgs.errors import DataError, FolderHeldError, ResourceError, UsageError
 from warpgs.files import LOCK, writing_into
 from warpgs.locks import hold_folder
-from warpgs.pipeline.farm import work
 from warpgs.pipeline.farm.farm import run_farm
 from warpgs.pipeline.films.film import FilmSettings
 from warpgs.pipeline.model.start import InitConfig, initial_gaussians
@@ -27,7 +26,6 @@ from warpgs.pipeline.run import fit as fit_module
 from warpgs.pipeline.run.commands import evaluate, render
 from warpgs.pipeline.run.export import export
 from warpgs.pipeline.run.folder import FORMAT, TENSORS, load_checkpoint, open_run
-from warpgs.pipeline.run.request import FitRequest, SceneRequest
 from warpgs.pipeline.run.results import evaluate_run
 from warpgs.render.options import RasterizeOptions
 from warpgs.report.page import image_names, renaming_notes
@@ -110,17 +108,6 @@ def test_export_and_prune_remove_what_killed_ones_left(folder, tmp_path):
         (tmp_path / "own.tmp").touch()
         assert main(words) == 0
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.ply", "b", "own.tmp"]
-
-
-def test_a_study_leaves_a_run_in_progress_alone(folder, tmp_path):
-    """It neither moves it aside nor writes into it, and says whose it is."""
-    out = tmp_path / "study" / "0"
-    shutil.copytree(folder / "run", out)
-    scene = warpgs.load_scene(folder / "scene")
-    request = FitRequest(SceneRequest(str(folder / "scene")), out, dataclasses.replace(CONFIG, steps=3), "cpu")
-    with hold_folder(out), pytest.raises(FolderHeldError, match="is writing there"):
-        work.ensure_run(request, scene.fingerprint, warpgs.open_run(out, "cpu"), "cpu", {})
-    assert [p.name for p in out.parent.iterdir()] == ["0"]
 
 
 @pytest.mark.parametrize("key", ["config", "fingerprint"])

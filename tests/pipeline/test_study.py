@@ -236,7 +236,7 @@ def states(request):
 
 
 def test_finished_runs_are_kept_and_half_finished_ones_continued(finished, tmp_path, capsys):
-    """Nothing is fitted twice; one run without its scores goes on from its checkpoint and gives the same scores."""
+    """Nothing is fitted twice; a run without its scores goes on from its checkpoint; more seeds are added to what is there."""
     request = copy_of(finished, tmp_path)
     times = {p: p.stat().st_mtime_ns for p in request.out.glob("still/*/*/point_cloud.ply")}
     before = metrics_of(request, "a", 1)["test"]
@@ -252,14 +252,10 @@ def test_finished_runs_are_kept_and_half_finished_ones_continued(finished, tmp_p
     assert [p.parent for p, t in times.items() if p.stat().st_mtime_ns != t] == [half]
     assert "continued from the last checkpoint" in capsys.readouterr().out
     assert "still, a, seed 1: was interrupted" in (request.out / "table.md").read_text()
-
-
-def test_more_seeds_fit_only_what_is_new(finished, tmp_path):
-    """A study grows: the pairs that are there stay."""
-    request = copy_of(finished, tmp_path, seeds=3)
-    run_study(request)
-    assert states(request) == ["kept"] * 4 + ["fitted"] * 2
-    assert cells((request.out / "table.md").read_text())[0][2][-1] == "3"
+    grown = dataclasses.replace(request, seeds=3)
+    run_study(grown)
+    assert states(grown) == ["kept"] * 4 + ["fitted"] * 2
+    assert cells((grown.out / "table.md").read_text())[0][2][-1] == "3"
 
 
 def test_runs_of_another_kind_are_moved_aside_and_said(finished, tmp_path):
@@ -381,10 +377,9 @@ def test_several_scenes_are_averaged_by_seed(finished, scene, tmp_path):
     tables = cells((request.out / "table.md").read_text())
     assert len(tables) == 6
     rows = list(csv.DictReader(io.StringIO((request.out / "runs.csv").read_text())))
-    psnr = {
-        v: [np.mean([float(r["psnr"]) for r in rows if (r["variant"], r["seed"]) == (v, s)]) for s in "01"]
-        for v in ("a", "b b")
-    }
+    psnr = {"a": [], "b b": []}
+    for variant, seed in (("a", "0"), ("a", "1"), ("b b", "0"), ("b b", "1")):
+        psnr[variant].append(np.mean([float(r["psnr"]) for r in rows if (r["variant"], r["seed"]) == (variant, seed)]))
     assert tables[0][3][1].strip("*") == f"{np.mean(psnr['b b']):.2f} ± {np.std(psnr['b b'], ddof=1):.2f}"
     d = paired_difference(psnr["b b"], psnr["a"])
     assert tables[1][2][1].removesuffix(" \\*") == f"{d.mean:+.2f} [{d.low:+.2f}, {d.high:+.2f}]"
@@ -412,18 +407,16 @@ def fail(text):
 
 def test_requests_that_make_no_sense(scene, tmp_path):
     """Found out before anything is fitted."""
-    with pytest.raises(UsageError, match="--seeds must be a number from 1 to 1000"):
-        StudyRequest((scene,), {"a": A, "b": B}, 0, tmp_path)
-    with pytest.raises(UsageError, match="at least two settings"):
-        StudyRequest((scene,), {"a": A}, 2, tmp_path)
-    with pytest.raises(UsageError, match="have the same name"):
-        StudyRequest((scene, scene), {"a": A, "b": B}, 2, tmp_path)
-    with pytest.raises(UsageError, match="name at least one scene"):
-        StudyRequest((), {"a": A, "b": B}, 2, tmp_path)
-    with pytest.raises(UsageError, match="preset 'x' is not one of"):
-        preset_variants(["x"], None)
-    with pytest.raises(UsageError, match="appears twice"):
-        preset_variants([next(iter(PRESETS))] * 2, None)
+    both = {"a": A, "b": B}
+    for words, scenes, variants, seeds in (
+        ("--seeds must be a number from 1 to 1000", (scene,), both, 0), ("at least two settings", (scene,), {"a": A}, 2),
+        ("have the same name", (scene, scene), both, 2), ("name at least one scene", (), both, 2),
+    ):  # fmt: skip
+        with pytest.raises(UsageError, match=words):
+            StudyRequest(scenes, variants, seeds, tmp_path)
+    for words, names in (("preset 'x' is not one of", ["x"]), ("appears twice", ["quick", "quick"])):
+        with pytest.raises(UsageError, match=words):
+            preset_variants(names, None)
     with pytest.raises(DataError, match="no view is held out"):
         run_study(StudyRequest((dataclasses.replace(scene, split="all"),), {"a": A, "b": B}, 1, tmp_path / "x", "cpu"))
     assert not (tmp_path / "x").exists()
@@ -437,10 +430,8 @@ def test_command_compares_presets(scene, tmp_path, capsys, monkeypatch):
     assert main(["compare", scene.path, "--split", scene.split, *flags]) == 0
     out = capsys.readouterr().out
     lines = out.splitlines()
-    first, second = (
-        next(i for i, line in enumerate(lines) if line.startswith(f"[{k}/2] still, {n}, seed 0"))
-        for k, n in ((1, "a"), (2, "b"))
-    )
+    heads = "[1/2] still, a, seed 0", "[2/2] still, b, seed 0"
+    first, second = (next(i for i, line in enumerate(lines) if line.startswith(head)) for head in heads)
     assert sum("2 steps" in line for line in lines[first:second]) == 1 and lines[second - 1].startswith("  PSNR ")
     assert "next:" not in out and "one seed" in out and "table.tex" in out and "1 seed:" in out
     assert main(["compare", scene.path, "--out", str(tmp_path / "y"), "--presets", "a,zzz"]) == 2
@@ -449,13 +440,7 @@ def test_command_compares_presets(scene, tmp_path, capsys, monkeypatch):
 
 # `warpgs ablate`: a row for each part that is switched off or on, and a table with check marks.
 
-FULL = FitConfig(
-    steps=8,
-    init=InitConfig(source="random", random_count=200),
-    preset="whole",
-    strategy="paper",
-    method=MethodConfig(hier=True),
-)
+FULL = dataclasses.replace(A, preset="whole", strategy="paper", method=MethodConfig(hier=True))
 
 
 def test_ablation_rows_switch_off_one_part_each():
@@ -614,12 +599,8 @@ def test_crops_find_where_pictures_differ():
     (x0, y0), (x1, y1) = crops(values, 12, 8, 2)
     assert x0 <= 44 and x0 + 12 >= 54 and y0 <= 30 and y0 + 8 >= 36
     assert x1 <= 4 and x1 + 12 >= 14 and y1 <= 4 and y1 + 8 >= 10
-
-
-def test_crops_of_equal_pictures_and_of_small_ones():
-    """Nothing differs: the middle. Windows larger than the picture: one, the whole."""
-    assert crops(np.zeros((20, 30)), 10, 8, 1) == [(10, 6)]
-    assert crops(np.ones((6, 5)), 9, 9, 3) == [(0, 0)]
+    # nothing differs: the middle; windows larger than the picture: one, the whole
+    assert crops(np.zeros((20, 30)), 10, 8, 1) == [(10, 6)] and crops(np.ones((6, 5)), 9, 9, 3) == [(0, 0)]
     many = crops(np.random.default_rng(0).random((20, 20)), 10, 10, 9)
     assert 1 <= len(many) <= 4
     assert all(abs(a - c) >= 10 or abs(b - d) >= 10 for i, (a, b) in enumerate(many) for c, d in many[:i])
@@ -635,12 +616,8 @@ def test_sheet_shows_every_picture_and_its_crops():
     areas = [int((image == np.round(np.array(c) * 255).astype(np.uint8)).all(-1).sum()) for c in colors]
     assert min(areas) > 0.9 * max(areas) > 0
     assert all((image == box).all(-1).sum() > 100 for box in BOXES[:2])
+    cell = Cell(np.zeros((24, 32, 3), np.float32), "")
+    wide = Image.open(io.BytesIO(sheet([str(i) for i in range(10)], [Strip("s", (cell,) * 10, ())])))
+    assert wide.width <= 2600 and math.isclose(wide.width / 10, 256, rel_tol=0.2)  # ten columns share the width
     # what is left of the page is paper, so the labels have not grown over the pictures
     assert (image[:4] == 255).all() and (image[:, :8] == 255).all()
-
-
-def test_sheet_of_many_columns_stays_printable():
-    """Nine settings and the photograph share the width."""
-    cell = Cell(np.zeros((24, 32, 3), np.float32), "")
-    image = Image.open(io.BytesIO(sheet([str(i) for i in range(10)], [Strip("s", (cell,) * 10, ())])))
-    assert image.width <= 2600 and math.isclose(image.width / 10, 256, rel_tol=0.2)

@@ -70,7 +70,7 @@ class FarmTable:
         self.began = self.printed = time.monotonic()
         self.rows: list[JobRow] = []
         self.left: float | None = None
-        self.order: dict[str, None] = {}
+        self.ended: dict[str, JobRow] = {}
         self.display: Any = None
 
     def __enter__(self) -> FarmTable:
@@ -94,8 +94,8 @@ class FarmTable:
 
     def update(self, rows: list[JobRow], left: float | None) -> None:
         """Show the jobs, and the time left [s] where it is known."""
-        ended = [r for r in rows if r.state in ("done", "failed") and r.name not in self.order]
-        self.order |= dict.fromkeys(r.name for r in ended)
+        ended = [r for r in rows if r.state in ("done", "failed") and r.name not in self.ended]
+        self.ended |= {r.name: r for r in ended}
         self.rows, self.left = rows, left
         if self.display is not None:
             self.display.update(self.panel())
@@ -123,20 +123,16 @@ class FarmTable:
         table = Table(box=None, padding=(0, 2, 0, 0), header_style="dim")
         for name in ("scene", "state", "step", "time", "PSNR", "Gaussians"):
             table.add_column(name, justify="left" if name in ("scene", "state") else "right", no_wrap=True)
-        by_name = {r.name: r for r in self.rows}
-        last = [by_name[n] for n in list(self.order)[-LAST:] if n in by_name]
-        running = [r for r in self.rows if r.state == "running"]
-        for row in [*running[:MOST_RUNNING], *reversed(last)]:
-            cells = [Text(printable(c)) for c in row_values(row)[:-1]]
-            table.add_row(*cells, style=STYLES.get(row.state, ""))
-        done = sum(r.state in ("done", "failed") for r in self.rows)
+        last, running = [*self.ended.values()][: -LAST - 1 : -1], [r for r in self.rows if r.state == "running"]
+        for row in [*running[:MOST_RUNNING], *last]:
+            table.add_row(*(Text(printable(c)) for c in row_values(row)[:-1]), style=STYLES.get(row.state, ""))
         bar = Table.grid()  # alone, the bar does not end its line
-        bar.add_row(ProgressBar(total=max(1, len(self.rows)), completed=done, width=78))
+        bar.add_row(ProgressBar(total=max(1, len(self.rows)), completed=len(self.ended), width=78))
         more = len(running) - MOST_RUNNING
         rest = [Text(f"and {more} more running", style="dim")] if more > 0 else []
         messages = [
             Text(printable(f"{r.name}: {r.message}"), style="dim", no_wrap=True, overflow="ellipsis")
-            for r in reversed(last) if r.message
+            for r in last if r.message
         ]  # fmt: skip
         return Group(bar, Text(self.summary(), style="bold"), table, *rest, *messages)
 

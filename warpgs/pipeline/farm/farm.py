@@ -9,7 +9,7 @@ import queue
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -97,10 +97,13 @@ class LocalEngine:
     def _serve(self, slot: Slot) -> None:
         """Run jobs in the process of a slot, one after another."""
         (_, threads, environment), worker = slot, None
+        lines: Iterator[str] = iter(())
         while (job := self._jobs.get()) is not None:
             (name, text), state, reason = job, "crashed", ""
             try:
-                worker = worker or PythonWorker(WORKER, environment={"OMP_NUM_THREADS": str(threads), **environment})
+                if worker is None:
+                    worker = PythonWorker(WORKER, environment={"OMP_NUM_THREADS": str(threads), **environment})
+                    lines = worker.lines()
             except OSError as e:
                 self._news.put((name, state, str(e)))
                 continue
@@ -109,12 +112,12 @@ class LocalEngine:
                     break
                 self._workers[name] = worker
                 worker.send(json.dumps({"job": text, "threads": threads}))
-            for line in worker.lines():
+            while state == "crashed" and (line := next(lines, None)) is not None:
                 values = json.loads(line)
-                if "state" in values:
+                if "step" in values:
+                    self._news.put((name, "running", values["step"]))
+                else:
                     state = values["state"]
-                    break
-                self._news.put((name, "running", values["step"]))
             with self._lock:
                 del self._workers[name]
                 if self._closing:

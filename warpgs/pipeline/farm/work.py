@@ -101,12 +101,12 @@ def _set_aside(folder: Path) -> Path:
 
 def _with_lpips(metrics: dict[str, Any], folder: Path, request: FitRequest, variants: dict[str, str]) -> dict[str, Any]:
     """Return the scores of a finished run with LPIPS for the requested weights; LPIPS is measured now if it is missing."""
-    for found in (metrics, _scores(folder / "eval.json")):
-        if found and found.get("config_hash") == metrics["config_hash"] and variants.items() <= found["variants"].items():
-            return metrics | {k: found[k] for k in ("test", "views", "variants")}
-    evaluate(folder, request.device, request.lpips_weights)
-    written = schema.read(folder / "eval.json", folder)
-    return metrics | {k: written[k] for k in ("test", "views", "variants")}
+    there = [m for m in (metrics, _scores(folder / "eval.json")) if m and m["config_hash"] == metrics["config_hash"]]
+    found = next((m for m in there if variants.items() <= m["variants"].items()), None)
+    if found is None:
+        evaluate(folder, request.device, request.lpips_weights)
+        found = schema.read(folder / "eval.json", folder)
+    return metrics | {k: found[k] for k in ("test", "views", "variants")}
 
 
 def ensure_run(

@@ -546,8 +546,11 @@ def _score(
         fractions = moved_fractions(train, (Rendered(*render_view(gaussians, v, options)) for v in shown))
         moved = {v.name: f for v, f in zip(train, fractions, strict=True)}
     complexity, cameras, scale = complexity_figures(trainer), cameras_of(scene), scene.normalization.scale
-    views = [job.split.train, test, given, cameras, scale, gaussians, options]
-    modules = {m.name: m.figures(FittedViews(learned.params_of(m), *views)) for m in learned.modules}
+    modules = {
+        m.name: m.figures(
+            FittedViews(learned.params_of(m), job.split.train, test, given, cameras, scale, gaussians, options)
+        ) for m in learned.modules
+    }  # fmt: skip
     mapped = given_figures(train, trainer.views, gaussians, options)
     table: list[tuple[dict[str, Any], list[str]]] = [  # figures of metrics.json, and their sentences in the report
         ({"rule": rule}, [Detail(rule["summary"])]),

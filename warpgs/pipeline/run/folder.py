@@ -247,7 +247,7 @@ def _cameras(stored: dict[str, Any], path: Path) -> dict[str, Camera]:
     for name, values in stored.items():
         arrays = {k: np.array(values[k], np.float64) for k in ("viewmat", "K", "distortion") if values.get(k) is not None}
         camera = found[name] = Camera(**(values | arrays))
-        pose, K, (least, most) = camera.viewmat, camera.K, FOCAL_LENGTHS
+        pose, K, (least, most) = arrays["viewmat"], arrays["K"], FOCAL_LENGTHS
         off = max(abs(K[0, 1]), abs(K[1, 0]), *np.abs(K[2] - (0, 0, 1)))
         with np.errstate(over="ignore", invalid="ignore"):  # where products overflow, no comparison is true
             rigid = np.abs(pose[:3, :3] @ pose[:3, :3].T - np.eye(3)).max() <= POSE_TOLERANCE
@@ -287,12 +287,12 @@ def read_record(folder: Path) -> dict[str, Any]:
     path = folder / CONFIG
     try:
         record = schema.read(path, folder)
-    except FileNotFoundError as e:
-        lack = f"holds no run ({CONFIG} is missing)" if folder.is_dir() else "no such folder"
-        near = "" if folder.is_dir() else similar_folder(folder)
+    except (FileNotFoundError, NotADirectoryError) as e:
+        lack, near = f"holds no run ({CONFIG} is missing)", ""
+        if not folder.is_dir():
+            lack = "is a file, not the folder of a run" if folder.is_file() else "no such folder"
+            near = similar_folder(folder)
         raise DataError(f"{folder}: {lack}; {near or 'give a folder that `warpgs fit --out` filled'}") from e
-    except NotADirectoryError as e:
-        raise DataError(f"{folder}: is a file, not the folder of a run; give a folder that `warpgs fit --out` filled") from e
     except (OSError, SchemaError) as e:
         raise DataError(f"{path}: cannot be read ({e}); give a folder that `warpgs fit --out` filled") from e
     if not isinstance(record, dict) or "config" not in record:
@@ -336,7 +336,8 @@ def check_same(record: dict[str, Any], stored: dict[str, Any], out: Path) -> Non
     _check_lost(stored, out)
     _check_named_again(record["config"], stored["config"], out)
     for key, words in SAME.items():
-        now, then = plain(record[key]), stored.get(key, {})
+        now: Any = plain(record[key])
+        then = stored.get(key, {})
         if now == then:
             continue
         if key == "own_code":

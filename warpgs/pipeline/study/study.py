@@ -33,7 +33,7 @@ from warpgs.pipeline.train.settings import FitConfig, settings_by_views
 from warpgs.pipeline.train.trainer import train_views
 from warpgs.process import say
 from warpgs.report.images import Cell, Strip, crops, disagreement, sheet
-from warpgs.scene import Scene
+from warpgs.scene import Scene, View
 
 CROPS = 2
 """Enlarged parts of each view."""
@@ -42,11 +42,15 @@ FRACTION = 0.22
 
 
 def strips(
-    place: Place, folders: dict[str, Path], scores: dict[str, dict[str, float]], count: int, device: torch.device
+    title: str,
+    views: list[View],
+    folders: dict[str, Path],
+    scores: dict[str, dict[str, float]],
+    count: int,
+    device: torch.device,
 ) -> list[Strip]:
     """Return rows of the figure of one scene: up to ``count`` held-out views on which the variants' PSNR [dB] differs most."""
-    request, scene, split = place
-    views, images = train_views(scene, split.test), {}
+    images = {}
     for name, folder in folders.items():
         run = open_run(folder, device)
         images[name] = [np.clip(render_view(run.gaussians(), v, run.options())[0], 0, 1) for v in views]
@@ -66,7 +70,7 @@ def strips(
             value = scores[name].get(view.name)  # None if infinite
             cells.append(Cell(rendered[i], "" if value is None else f"{value:.2f} dB"))
         boxes = tuple((x, y, w, h) for x, y in crops(maps[i], w, h, CROPS))
-        rows.append(Strip(f"{scene_name(request)}, {view.name}", (*cells, Cell(reference, words)), boxes))
+        rows.append(Strip(f"{title}, {view.name}", (*cells, Cell(reference, words)), boxes))
     return rows
 
 
@@ -125,6 +129,7 @@ def scene_name(request: SceneRequest) -> str:
 
 Place = tuple[SceneRequest, Scene, Split]
 """One scene of a study, read once, and its views to fit and to hold out."""
+Places = dict[str, Place]
 Key = tuple[str, str, int]
 """Scene, variant and seed of a run."""
 Runs = dict[Key, Outcome]
@@ -182,18 +187,17 @@ def _table(request: StudyRequest, runs: Runs, scenes: list[str], caption: str) -
     return Table(caption, metrics, samples, differences, tuple(SWITCHES.values()) if request.marks else (), request.marks)
 
 
-def _figure(request: StudyRequest, runs: Runs, places: list[Place], device: torch.device) -> tuple[bytes | None, str]:
+def _figure(request: StudyRequest, runs: Runs, places: Places, device: torch.device) -> tuple[bytes | None, str]:
     """Return the figure (PNG) of the first seed for which all runs succeeded, or None, and a note."""
-    names = [scene_name(asked) for asked, _, _ in places]
     for seed in range(request.seeds):
-        if not all(runs[n, v, seed][1] for n in names for v in request.variants):
+        if not all(runs[n, v, seed][1] for n in places for v in request.variants):
             continue
         rows, each = [], {1: FIGURE_ROWS, 2: 2}.get(len(places), 1)
-        for name, place in zip(names, places):
+        for name, (_, scene, split) in places.items():
             folders = {v: run_folder(request, name, v, seed) for v in request.variants}
             found = {v: runs[name, v, seed][1] or {} for v in request.variants}
             scores = {v: {r["name"]: r["psnr"] for r in metrics["views"]} for v, metrics in found.items()}
-            rows += strips(place, folders, scores, each, device)
+            rows += strips(name, train_views(scene, split.test), folders, scores, each, device)
         return sheet([*request.variants, "image"], rows), f"the figure shows seed {seed}"
     return None, "no figure: no seed succeeded in every row"
 
@@ -255,9 +259,9 @@ def _run_rows(request: StudyRequest, runs: Runs) -> list[list[Any]]:
     return rows
 
 
-def write_study(request: StudyRequest, runs: Runs, places: list[Place], device: torch.device, device_name: str) -> list[str]:
+def write_study(request: StudyRequest, runs: Runs, places: Places, device: torch.device, device_name: str) -> list[str]:
     """Write tables, plot, figure and record of a study into its folder; returns the table and the notes as lines."""
-    out, scenes = request.out, [scene_name(asked) for asked, _, _ in places]
+    out, scenes = request.out, list(places)
     what = scenes[0] if len(scenes) == 1 else f"the mean over {len(scenes)} scenes"
     seeds = f"{request.seeds} seed{'' if request.seeds == 1 else 's'}"
     table = _table(request, runs, scenes, f"{'Ablation' if request.marks else 'Comparison'} on {what}, {seeds}")
@@ -281,9 +285,7 @@ def write_study(request: StudyRequest, runs: Runs, places: list[Place], device: 
     write_json(out / "study.json", {
         "variants": {n: {"config_hash_of_seed_0": hashes[n], "config": c.to_json()} for n, c in request.variants.items()},
         "seeds": request.seeds, "device": device_name, "notes": notes,
-        "scenes": {
-            scene_name(asked): {**dataclasses.asdict(asked), "fingerprint": scene.fingerprint} for asked, scene, _ in places
-        },
+        "scenes": {n: {**dataclasses.asdict(p[0]), "fingerprint": p[1].fingerprint} for n, p in places.items()},
     })  # fmt: skip
     return [f"{table.caption}:", "", *text.splitlines(), "", *(f"  {n}" for n in notes)]
 
@@ -367,14 +369,14 @@ def _place(asked: SceneRequest, device: str) -> Place:
     return asked, scene, split
 
 
-def _run_all(request: StudyRequest, places: list[Place], device: torch.device, lpips: dict[str, str]) -> Runs:
+def _run_all(request: StudyRequest, places: Places, device: torch.device, lpips: dict[str, str]) -> Runs:
     """Make all runs, or read the results of a farm; seed by seed, so that an interrupted study has complete pairs."""
     runs: Runs = {}
     fits: dict[Key, tuple[Place, FitRequest]] = {}
     for seed in range(request.seeds):
-        for place in places:
+        for name, place in places.items():
             for variant, config in request.variants.items():
-                key, config = (scene_name(place[0]), variant, seed), dataclasses.replace(config, seed=seed)
+                key, config = (name, variant, seed), dataclasses.replace(config, seed=seed)
                 out = run_folder(request, *key)
                 fit = FitRequest(place[0], out, config, request.device, lpips_weights=request.lpips_weights)
                 fits[key] = place, fit
@@ -412,7 +414,7 @@ def run_study(request: StudyRequest) -> list[str]:
     """Fit every variant to every scene with every seed, and write the results; returns the table and the notes as lines."""
     device, where = choose_device(request.device)
     lpips = {} if request.lpips_weights is None else load_lpips(request.lpips_weights, device).variants()
-    places = [_place(asked, device.type) for asked in request.scenes]
+    places = {scene_name(asked): _place(asked, device.type) for asked in request.scenes}
     with hold_folder(request.out) as notes:
         for note in notes:
             say(note)
