@@ -345,7 +345,7 @@ def test_engines_of_clusters_give_the_same_bytes(scenes, single, tmp_path, monke
         address = sys.modules["ray"].get_runtime_context().gcs_address
         stranger = run_python(JOIN, address, timeout=120, environment={"RAY_AUTH_TOKEN": "0" * 64})
         assert stranger.stdout == "refused\n", stranger.stderr
-        engine.use(_die_once(str(killed)))
+        engine._task = engine._ray.remote(**engine._options)(_die_once(str(killed)))
     else:
         install_slurm(tmp_path / "bin", tmp_path / "cluster")
         monkeypatch.setenv("PATH", f"{tmp_path / 'bin'}{os.pathsep}{os.environ['PATH']}")

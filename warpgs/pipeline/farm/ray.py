@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import os
 import secrets
-from collections.abc import Callable
 from typing import Any
 
 from warpgs.errors import ResourceError, UsageError, install_extras
@@ -48,11 +47,7 @@ class RayEngine:
         environment = {"env_vars": {"PYTHONSAFEPATH": "1"}}
         self._options = {"num_cpus": threads, "num_gpus": gpus, "max_retries": 1, "runtime_env": environment}
         self._running: dict[Any, str] = {}
-        self.use(run_job)
-
-    def use(self, work: Callable[[str, int], str]) -> None:
-        """Run jobs by a function other than `run_job`, with the same arguments and result."""
-        self._task = self._ray.remote(**self._options)(work)
+        self._task = ray.remote(**self._options)(run_job)
 
     def start(self, job: FarmJob) -> None:
         """Send a job."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import json
 import time
 from collections.abc import Callable, Mapping
@@ -141,25 +140,26 @@ class FitJob:
         }  # fmt: skip
 
 
-def take_steps(job: FitJob, trainer: Trainer, images_written: Callable[[], None]) -> None:
-    """Take all remaining steps, with log and checkpoints if there is a run folder; images are written before a checkpoint."""
-    log = None if job.out is None else EventLog(job.out / "metrics.jsonl", trainer.step)
+def take_steps(job: FitJob, trainer: Trainer) -> None:
+    """Take all remaining steps, with log, images of events and checkpoints if there is a run folder."""
+    out = job.out
+    log = None if out is None else EventLog(out / "metrics.jsonl", trainer.step)
     slow = compiled = -1  # the last step that was slow because it compiled kernels; the number of kernels compiled by then
 
     def save(trainer: Trainer) -> None:
-        if job.out is None or log is None:
+        if out is None or log is None:
             return
         log.flush()
-        images_written()
+        images_written()  # a fit that continues from the checkpoint does not write them
         tensors, state = trainer.state()
         if trainer.config.view_modules:  # by which a run is opened without their code
             state["cameras"] = {n: camera_values(c) for n, c in job.cameras(trainer).items()}
-        save_checkpoint(job.out, tensors, state | {"fingerprint": job.scene.fingerprint, "train": job.split.train})
+        save_checkpoint(out, tensors, state | {"fingerprint": job.scene.fingerprint, "train": job.split.train})
 
     def restore(trainer: Trainer) -> bool:
-        if job.out is None or log is None or not (job.out / TENSORS).is_file():
+        if out is None or log is None or not (out / TENSORS).is_file():
             return False
-        trainer.load(*load_checkpoint(job.out))
+        trainer.load(*load_checkpoint(out))
         log.rewind(trainer.step)
         return True
 
@@ -180,9 +180,10 @@ def take_steps(job: FitJob, trainer: Trainer, images_written: Callable[[], None]
             job.on_model(FittedModel(**job.model(trainer)))
 
     with contextlib.ExitStack() as stack:
-        progress = stack.enter_context(Progress(trainer.steps, trainer.step)) if job.verbose else None
-        if log is not None:
+        if out is not None and log is not None:
+            images_written = stack.enter_context(images_kept(trainer, list(job.split.train), out))
             stack.callback(log.close)
+        progress = stack.enter_context(Progress(trainer.steps, trainer.step)) if job.verbose else None
         try:
             run(trainer, report, save, stack.enter_context(noted_signals()), restore)
         except NotFiniteError as e:
@@ -191,17 +192,17 @@ def take_steps(job: FitJob, trainer: Trainer, images_written: Callable[[], None]
             if not job.ranks.first:
                 job.ranks.leave()  # all ranks have this loss; the first reports it
                 raise
-            explained = _explained(job, trainer, e)
+            explained = _explained(job, trainer, e, e.view)
             save(trainer)
             raise explained from e
+    job.tell(trainer)  # of images that were written last
 
 
-def _explained(job: FitJob, trainer: Trainer, error: NotFiniteError) -> NotFiniteError:
+def _explained(job: FitJob, trainer: Trainer, error: NotFiniteError, view: int) -> NotFiniteError:
     """Return the error for the user on a step with a non-finite loss: view, loss terms, tensors, and what to do."""
-    assert error.view is not None
-    broken, tensors = non_finite_parts(trainer, error.view, error.slot)
+    broken, tensors = non_finite_parts(trainer, view, error.slot)
     own = [t.name for t in trainer.terms if f"the loss term {t.name}" in broken and not is_ours(type(t))]
-    text = f"{error}, on {job.split.train[error.view]}{', in ' if broken else ''}{' and '.join(broken)}; "
+    text = f"{error}, on {job.split.train[view]}{', in ' if broken else ''}{' and '.join(broken)}; "
     text += f"not finite: {', '.join(tensors)}" if tensors else "all of its inputs and renders are finite"
     fix = f"correct {' and '.join(own)}, and fit again" if own else "fit again with lower learning rates"
     report = "" if own else "; if that fails, report this message"
@@ -247,8 +248,7 @@ def check_equal(record: dict[str, Any], step: int | None, ranks: Ranks) -> None:
         "different settings": ([record["config"], record["own_code"]], "start all ranks with the same flags and the same code"),
         "a different checkpoint": (step, "give all ranks the same --out, on a file system that all machines share"),
     }
-    own = {name: hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest() for name, (value, _) in parts.items()}
-    first, *others = map(json.loads, ranks.texts(json.dumps(own)))
+    first, *others = map(json.loads, ranks.texts(json.dumps({name: value for name, (value, _) in parts.items()})))
     for rank, other in enumerate(others, 1):
         for name, (_, fix) in parts.items():
             if other.get(name) != first.get(name):
@@ -499,10 +499,7 @@ def _finish(job: FitJob, trainer: Trainer, record: dict[str, Any], checks: list[
     job.notes = []
     job.note(*chosen, *batched_notes(job.config, job.ranks), trainer.memory.summary())
     setup = time.perf_counter() - job.began
-    images = images_kept(trainer, list(job.split.train), job.out) if job.out else contextlib.nullcontext(lambda: None)
-    with images as images_written:
-        take_steps(job, trainer, images_written)
-    job.tell(trainer)  # of images that were written last
+    take_steps(job, trainer)
     seconds = {"setup": setup, "training": time.perf_counter() - job.began - setup}
     job.ranks.part()
     metrics: dict[str, Any] = {}

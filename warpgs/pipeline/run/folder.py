@@ -13,7 +13,7 @@ import shlex
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Any, get_type_hints
 
 import numpy as np
 import torch
@@ -58,18 +58,13 @@ _CAMERA = fields(
     {"model": text, "distortion": items(number())},
     others=False,
 )  # fmt: skip
-_PATH = or_null(text)
 _SCENE = fields(
-    {
-        "path": _PATH, "split": _PATH, "downscale": whole(1), "strict": flag, "allow_outside": flag, "black_is_empty": flag,
-        "score_masks": _PATH, "reader": _PATH, **{name: one_of(*choices) for name, choices in CHOICES.items()},
-    },
-    {
-        "max_pixels": whole(1), "max_side": whole(0), "depths": _PATH, "normals": _PATH, "matcher": _PATH,
-        "depth_unit": or_null(number(above=0)),
-    },
+    {"path": or_null(text)},
+    {name: schema.of_type(hint) for name, hint in get_type_hints(SceneRequest).items() if name != "path"}
+    | {name: one_of(*choices) for name, choices in CHOICES.items()}
+    | {"downscale": whole(1)},
     others=False,
-)  # fmt: skip
+)
 _PARTS = items(fields({"name": text}))
 _RECORD = fields(
     {
