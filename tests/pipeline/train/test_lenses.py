@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -30,7 +31,7 @@ from warpgs.pipeline.model.depth_points import carve, hull_points, in_empty_regi
 from warpgs.pipeline.model.limits import LimitConfig, TrainingCameras
 from warpgs.pipeline.model.start import InitConfig, initial_points, random_points
 from warpgs.pipeline.run.commands import open_file
-from warpgs.pipeline.run.folder import _camera, camera_values
+from warpgs.pipeline.run.folder import _cameras, camera_values
 from warpgs.pipeline.train import step, trainer
 from warpgs.pipeline.train.loss import AlphaDifference, LossConfig, LossInputs, Target
 from warpgs.pipeline.train.memory import most_instances
@@ -156,7 +157,7 @@ def test_half_size_views_and_stacks_keep_the_model(fit):
 def test_run_folders_keep_the_model():
     """config.json holds model and coefficients, and a pinhole's record has none."""
     camera = views()[1].camera
-    back = _camera(json.loads(json.dumps(camera_values(camera))))
+    back = _cameras({"a": json.loads(json.dumps(camera_values(camera)))}, Path("config.json"))["a"]
     assert back.model == NAME and np.array_equal(back.distortion, camera.distortion) and np.array_equal(back.K, camera.K)
     assert "distortion" not in camera_values(photos(1)[0].camera)
 
