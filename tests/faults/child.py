@@ -50,7 +50,7 @@ class OneProcess:
 
     def wait(self, seconds: float) -> list[Event]:
         job = self.jobs.pop(0)
-        return [Event(job.name, run_job(job_text(job)))]
+        return [(job.name, run_job(job_text(job)), "")]
 
     def close(self) -> None:
         """Do nothing."""
