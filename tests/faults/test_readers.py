@@ -166,7 +166,6 @@ REASONS = {
     "pipeline/farm/farm.py": {"LocalEngine._serve": PIPE},
     "pipeline/farm/worker.py": {"main": PIPE},
     "pipeline/metrics/coverage.py": {"coverage_section": OWN},
-    "pipeline/run/commands.py": {"render": "opens a writer of a film"},
     "pipeline/run/results.py": {"sampling_report_of": "reads images for `webp`, which is named here"},
     "plugins.py": {"module_digest": DIGEST},
     "poses/find.py": {"find_poses": OWN, "source_digest": DIGEST},

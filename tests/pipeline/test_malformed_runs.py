@@ -275,7 +275,7 @@ def test_packed_coefficients_that_do_not_go_with_their_degrees(run, degrees):
     put_checkpoint(run, tensors | {"degrees": torch.tensor([0] * 50)}, state)
     assert open_run(run, "cpu").gaussians().sh.shape == (50, 1, 3)
     put_checkpoint(run, tensors | {"degrees": torch.tensor(degrees)}, state)
-    with pytest.raises(DataError, match="do not match"):
+    with pytest.raises(DataError, match="do not fit degrees"):
         open_run(run, "cpu")
 
 

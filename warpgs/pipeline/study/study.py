@@ -58,7 +58,7 @@ def strips(
     for i, view in enumerate(views):
         values = disagreement([p[i] for p in images.values()], view.image)
         maps.append(values if view.score_mask is None else values * view.score_mask)
-    rows = []
+    rows: list[Strip] = []
     for i in sorted(sorted(range(len(views)), key=lambda i: -float(maps[i].mean()))[:count]):
         view, reference, words = views[i], views[i].image, "held-out image"
         if view.score_mask is not None:
