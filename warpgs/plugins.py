@@ -115,7 +115,8 @@ class Registry(Generic[T]):
                 f"the {self.kind} {name!r} is a class of your own. The file of a preset or run does not load your code: "
                 f"name the class on the command line, or pass it in Python{in_study}"
             )
-        raise UsageError(f"unknown {self.kind} {name!r}; choose one of {', '.join(self.names())}, or give module:Class")
+        more = "import the file that registers it first, in Python" if self.kind == "camera model" else "give module:Class"
+        raise UsageError(f"unknown {self.kind} {name!r}; choose one of {', '.join(self.names())}, or {more}")
 
     def load(self, spec: str) -> type[T]:
         """Return the class of a name; ``module:Class`` or ``path/to/file.py:Class`` is imported, which runs its code."""

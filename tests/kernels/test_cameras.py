@@ -49,7 +49,8 @@ def test_another_model_renders(device, dtype, max_instances):
 def test_unknown_models_are_refused():
     """The error names the models there are."""
     cam = dataclasses.replace(camera(dtype=torch.float32), model="fish")
-    with pytest.raises(UsageError, match=r"unknown camera model 'fish'; choose one of fisheye, opencv, orthographic, pinhole"):
+    message = "unknown camera model 'fish'; choose one of fisheye, opencv, orthographic, pinhole.* or import the file"
+    with pytest.raises(UsageError, match=message):
         rasterize(cloud(3), cam)
     options = {"width": 18, "height": 17, "degree": 1, "rule": RULES["exact"], "camera_model": "fish"}
     with pytest.raises(UsageError, match="unknown camera model 'fish'"):
