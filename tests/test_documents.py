@@ -20,6 +20,7 @@ from tools.run_dockerfile import instructions, of_target, run
 from tools.run_docs import ROOT as run_docs_ROOT
 from tools.run_docs import collect, main, pages, prepare, run_blocks, shortened
 from warpgs import PRESETS, read_ply
+from warpgs.app.cli import ASKING
 from warpgs.pipeline.train import settings as by_views
 from warpgs.pipeline.train.settings import FitConfig, settings_by_views
 from warpgs.synthetic.demo import write_demo
@@ -57,6 +58,7 @@ def test_named_flags_are_there():
     folders = ("warpgs", "bench", "tools", "tests", "examples")
     code = "".join(p.read_text("utf-8") for folder in folders for p in (ROOT / folder).rglob("*.py"))
     known = {*re.findall(r"\w+", code), *(flag.replace("-", "_") for flag in re.findall(r"--([a-z][a-z-]+)", code))}
+    known |= {flag.strip("-").replace("-", "_") for flag in ASKING}
     missing, settings = [], get_type_hints(FitConfig)
     for page in [*PAGES, *sorted((ROOT / "docs/decisions").glob("*.md"))]:
         flags = set(re.findall(r"(?<![\w-])--([a-z][a-z0-9.-]*[a-z0-9])", page.read_text("utf-8"))) - GONE_FLAGS
