@@ -71,7 +71,7 @@ class Reader(abc.ABC):
 
         Returns:
             The scene in file coordinates: cameras as camera_from_world with OpenCV axes, images at their final size, notes on
-            automatic choices. `warpgs.io.load.load_scene` sorts the views, normalises the coordinates, and adds score masks and
+            automatic choices. `warpgs.load_scene` sorts the views, normalises the coordinates, and adds score masks and
             the fingerprint.
 
         Raises:
