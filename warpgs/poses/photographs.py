@@ -319,6 +319,15 @@ def _sorted_out(folder: Path) -> tuple[list[Path], list[str]]:
     return files, sorted(runs)
 
 
+def models_below(folder: Path) -> Iterator[Path]:
+    """Yield the folders below ``folder`` with a COLMAP reconstruction, relative to it, without those of earlier runs."""
+    is_run = functools.cache(_is_run)
+    for file in sorted(folder.rglob("images.*")):
+        pair = file.suffix in (".bin", ".txt") and file.with_name(f"cameras{file.suffix}").is_file()
+        if pair and file.parent != folder and not any(is_run(p) for p in file.parents if folder in p.parents):
+            yield file.parent.relative_to(folder)
+
+
 def find_photographs(folder: Path) -> list[Path]:
     """Return the image files of a folder, sorted by name, without masks and earlier runs; no file is opened."""
     return _sorted_out(folder)[0]

@@ -251,7 +251,8 @@ def check_batched(
     if ranks.count == 1:
         return
     path = None if isinstance(scene, Scene) else Path(scene.path if isinstance(scene, SceneRequest) else scene)
-    if path is not None and not resume and needs_poses(path):
+    named = isinstance(scene, SceneRequest) and scene.reconstruction is not None
+    if path is not None and not resume and not named and needs_poses(path):
         raise UsageError(
             f"{path}: has no cameras, and each of {ranks.count} ranks would find its own poses; run `warpgs poses {path} --out "
             "SCENE` first, and fit SCENE"
@@ -301,7 +302,7 @@ def batched_notes(config: FitConfig, ranks: Ranks) -> list[str]:
 def with_poses(request: SceneRequest, out: Path | None, progress: Callable[[str], object]) -> tuple[SceneRequest, list[str]]:
     """Find the poses of photographs without cameras, or read them from the run folder ``out``; returns request and notes."""
     source = Path(request.path)
-    if request.reader is not None or not request.path or not needs_poses(source):
+    if request.reader is not None or request.reconstruction is not None or not request.path or not needs_poses(source):
         if request.matcher is not None:
             raise UsageError(f"--matcher requires a folder of photographs without cameras; leave it out for {source}")
         return request, []

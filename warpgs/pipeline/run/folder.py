@@ -93,7 +93,7 @@ _SCENE = fields(
         "score_masks": or_null(text), "reader": or_null(text),
     },
     {
-        "max_pixels": whole(1), "max_side": whole(0),
+        "max_pixels": whole(1), "max_side": whole(0), "reconstruction": or_null(text), "exclude": or_null(text),
         "depths": or_null(text), "normals": or_null(text),
         "depth_unit": or_null(number(above=0)), "matcher": or_null(text),
     },
