@@ -252,7 +252,7 @@ def test_the_largest_sub_model_is_taken(tmp_path):
         assert len(scene.views) == count and scene.notes[0] == f"cameras taken from {folder} (--reconstruction)"
     (tmp_path / "sparse" / "1" / "images.bin").write_bytes(b"broken")
     assert len(load_scene(tmp_path).views) == 3
-    refused(tmp_path, "sparse/7: the COLMAP reconstruction lacks cameras and images", reconstruction="sparse/7")
+    refused(tmp_path, "sparse/7: holds no COLMAP reconstruction; give its folder in the scene", reconstruction="sparse/7")
     scenes.write_colmap(tmp_path.parent / "other")
     refused(tmp_path, "a link points outside|outside the scene", reconstruction="../other/sparse/0")
     with pytest.raises(UsageError, match="--reconstruction requires a COLMAP scene"):
@@ -382,6 +382,7 @@ def test_points_of_a_ply_file_are_read(form, kind, tmp_path):
         (ply(CLOUD).replace(b"element vertex", b"element other"), "first element is not vertex"),
         (ply(CLOUD).replace(b"format ascii", b"format other"), "points cannot be understood"),
         (ply(CLOUD).replace(b"double x", b"list uchar int x"), "points cannot be understood"),
+        (ply(CLOUD).replace(b"quality", b"z"), "its header is inconsistent"),
     ],
 )
 def test_malformed_ply_files(data, message, tmp_path):
@@ -394,7 +395,7 @@ def test_malformed_ply_files(data, message, tmp_path):
 @pytest.mark.parametrize("stored", ["with the transform", "without it", "no transform"])
 @pytest.mark.parametrize("scale", [None, 0.5])
 def test_points_of_transforms_stand_where_the_images_show_them(stored, scale, tmp_path):
-    """The poses contain applied_transform; the points do in files of today's nerfstudio, but not in those of its first versions."""
+    """The poses contain applied_transform; the points do in files of today's nerfstudio, not in those of its first versions."""
     applied = np.array([[1.0, 0, 0, 0.2], [0, 0, 1, 0.1], [0, -1, 0, -0.3]])
     back = (CLOUD / (scale or 1.0) - applied[:, 3]) @ applied[:, :3]
     content = scenes.transforms_json(ply_file_path="pc.ply", applied_transform=applied.tolist(), applied_scale=scale)

@@ -5,6 +5,7 @@ Other files of a reconstruction (rigs, frames, project.ini) hold nothing that a 
 
 from __future__ import annotations
 
+import re
 import struct
 import unicodedata
 from collections import Counter
@@ -44,7 +45,7 @@ OTHER_MODELS = {
 """Models that are not read, for messages."""
 STEMS = ("cameras", "images", "points3D")
 IMAGES = ("images", "input")
-"""Names of image folders, the preferred one first."""
+"""Names of image folders."""
 
 Model = tuple[Path, str, list[str]]
 """Folder, kind (bin or txt) and missing files of a reconstruction."""
@@ -275,7 +276,7 @@ def _cloud(
     if bad:
         raise DataError(f"{path}: {bad} of {len(positions)} points are not finite; reconstruct again, or remove them")
     fractions = bool((colors % 1).any()) and colors.max() <= 1
-    return PointCloud(positions, (np.clip(colors, 0, 255) / (1 if fractions else 255)).astype(np.float32), tracks)
+    return PointCloud(positions, np.clip(colors, 0, 255).astype(np.float32) / np.float32(1 if fractions else 255), tracks)
 
 
 PLY_TYPES = {
@@ -298,6 +299,7 @@ def read_ply_points(path: Path) -> PointCloud:
         count = int(lines[elements[0]][2])
         rows = [w for w in lines[elements[0] : [*elements, len(lines)][1]] if w[:1] == ["property"]]
         kinds = {w[2]: PLY_TYPES[w[1]] for w in rows}
+        _expect(count >= 0 and len(kinds) == len(rows), "its header is inconsistent")
         _expect({"x", "y", "z"} <= kinds.keys(), "its vertices lack x, y or z")
         body = data[len(head) + len(mark) + rest.find(b"\n") + 1 :]
         if order:
@@ -307,11 +309,13 @@ def read_ply_points(path: Path) -> PointCloud:
             words = np.array([row.split()[: len(kinds)] for row in body.splitlines()[:count]], np.float64)
             _expect(count == len(words), f"it lists {len(words)} of {count} points")
             values = dict(zip(kinds, words.reshape(count, len(kinds)).T))
-    except (ValueError, KeyError, IndexError, StopIteration) as e:
+    except (ValueError, KeyError, IndexError, OverflowError, StopIteration) as e:
         raise DataError(f"{path}: the points cannot be understood ({e}); export them again as PLY, or remove the file") from e
     rgb = next((c for c in (("red", "green", "blue"), ("r", "g", "b")) if kinds.keys() >= set(c)), ())
     colors = np.stack([values[c] for c in rgb], 1) if rgb else np.full((count, 3), 127.0)
-    if rgb and kinds[rgb[0]] in ("f4", "f8") and colors.size and colors.max() <= 1:
+    if rgb and kinds[rgb[0]] == "u2":
+        colors = colors / 257
+    elif rgb and kinds[rgb[0]][0] == "f" and colors.size and colors.max() <= 1:
         colors = colors * 255
     return _cloud(path, np.stack([values[c] for c in "xyz"], 1), colors)
 
@@ -380,20 +384,20 @@ def image_base(root: Path, model: Path) -> str | None:
     if model != root and root in model.parents:
         space = model.parent if model.name.isdecimal() else model
         space = space.parent if space.name == "sparse" else space
-    for place in (space, root):
-        for name in IMAGES:
-            if has_folder(place, name, f"{name}_*" if name == "images" else name):
-                return (place / name).relative_to(root).as_posix() if root in (place / name).parents else None
-    for place in (model, space, root):  # as RealityScan exports them
+    for place in dict.fromkeys((space, root)):
+        for name, others in (("images", "images_*"), ("input", "input")):
+            if place.is_relative_to(root) and has_folder(place, name, others):
+                return (place / name).relative_to(root).as_posix()
+    for place in dict.fromkeys((model, space, root)):  # as RealityScan exports them
         if place.is_relative_to(root) and any(p.suffix.lower() in SUFFIXES and p.is_file() for p in place.glob("[!.]*")):
             return place.relative_to(root).as_posix()
     return None
 
 
 def _key(name: str) -> str:
-    """Return a name without suffix, with / between folders, in the form that all systems and spellings share."""
-    path = PurePosixPath(name.replace("\\", "/"))
-    return unicodedata.normalize("NFC", path.with_suffix("").as_posix()).casefold()
+    """Return a name without suffix, with / between folders, in one spelling of its letters."""
+    plain = re.sub(r"(?<=[^/])\.[^./]*$", "", name.replace("\\", "/"))
+    return unicodedata.normalize("NFC", plain).casefold()
 
 
 def _by_key(files: dict[Path, str]) -> dict[str, Path]:
@@ -416,13 +420,13 @@ def _image_paths(
     name, if only one file fits. Files of reduced images (images_8) may also have other names (LLFF's image000.png): they are
     matched in sorted order if the counts agree.
     """
-    outside = [n for n in names if _is_absolute(n) and not (scene.options.allow_outside and (images / n).is_file())]
+    outside = {n for n in names if _is_absolute(n) and not (scene.options.allow_outside and (images / n).is_file())}
     paths = {n: scene.child(images, n, where) for n in names if n not in outside}
-    lost = [n for n in names if n in outside or not paths[n].is_file()]
+    used = {n: p for n, p in paths.items() if p.is_file()}
+    lost, taken = [n for n in names if n not in used], set(used.values())
     if not lost:
         return paths, []
-    used = {p for n, p in paths.items() if n not in lost}
-    free = {p: p.relative_to(images).as_posix() for p in files if p not in used}
+    free = {p: p.relative_to(images).as_posix() for p in files if p not in taken}
     by_path, by_name = _by_key(free), _by_key({p: p.name for p in free})
     found: dict[str, Path] = {}
     for n in lost:
@@ -439,7 +443,7 @@ def _image_paths(
         if match is not None:
             found[n] = match
     claims = Counter(found.values())
-    found = {n: p for n, p in found.items() if claims[p] == 1 and p not in used}
+    found = {n: p for n, p in found.items() if claims[p] == 1 and p not in taken}
     reduced = images != scene.root / base
     if reduced and len(lost) == len(names) == len(files) > len(found):
         pairs = dict(zip(sorted(names), files))
@@ -456,7 +460,9 @@ def _image_paths(
 class ColmapReader(Reader):
     """COLMAP reconstructions, binary or text, with their image folder."""
 
-    description = "sparse/0, sparse or the folder itself with cameras and images .bin/.txt (COLMAP)"
+    description = (
+        "sparse/0, sparse, dense/0/sparse, colmap/sparse/0 or the folder itself with cameras and images .bin/.txt (COLMAP)"
+    )
     priority = 10
 
     def probe(self, folder: Path) -> Probe | None:
@@ -474,7 +480,10 @@ class ColmapReader(Reader):
     def read(self, folder: Path, options: ReadOptions) -> Scene:
         """See `Reader.read`."""
         choice, chosen = reconstruction(folder, options.reconstruction)
-        model, kind, lacks = choice or (folder / (options.reconstruction or ""), "", ["cameras and images"])
+        if choice is None:
+            named = options.reconstruction or "sparse/0"
+            raise DataError(f"{folder / named}: holds no COLMAP reconstruction; give its folder in the scene, such as sparse/1")
+        model, kind, lacks = choice
         if lacks:
             raise DataError(f"{model}: the COLMAP reconstruction lacks {' and '.join(lacks)}; copy the whole folder")
         scene, file = SceneFolder(folder, options), model / f"images.{kind}"
