@@ -211,7 +211,7 @@ def test_a_reconstruction_deep_in_the_photographs_is_named(tmp_path, photographs
     assert not list(models_below(folder))
     scenes.write_files(folder / "out" / "my model", scenes.colmap_txt())
     with pytest.raises(
-        UsageError, match="holds a COLMAP reconstruction in out/my model: `warpgs fit .* --reconstruction out/my"
+        UsageError, match=r"holds a COLMAP reconstruction in out/my model: `warpgs fit .* --reconstruction out/my"
     ):
         find_poses(folder, tmp_path / "out")
     request = SceneRequest(path=str(folder), reconstruction="out/my model")
