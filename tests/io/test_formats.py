@@ -278,6 +278,10 @@ def test_names_are_matched_to_the_only_file_that_fits(kind, tmp_path):
     for i, view in enumerate(scene.views):
         np.testing.assert_array_equal(view.image, (scenes.image(i) / 255).astype(np.float32))
     assert any("matched by their names" in n for n in scene.notes) == (kind != "windows")
+    if kind == "project root":  # of reduced images, those are read
+        scenes.save_images(tmp_path / "images_2", [f"{i}.png" for i in range(4)], 8, 6)
+        scenes.save(tmp_path / "images_2" / "0.png", np.full((6, 8, 3), 7, np.uint8))
+        assert (load_scene(tmp_path, downscale=2).views[0].image == np.float32(7 / 255)).all()
     if kind in ("suffix", "case"):
         scenes.save(tmp_path / "images" / stored.format(1).replace("png", "bmp").replace("PNG", "bmp"), scenes.image(4))
         assert [v.name for v in load_scene(tmp_path).views] == [shown.format(i) for i in (0, 2, 3, 4)]
@@ -355,11 +359,13 @@ def ply(points: np.ndarray, colors: np.ndarray | None = None, form: str = "ascii
 
 
 @pytest.mark.parametrize("form", ["ascii", "binary_little_endian", "binary_big_endian"])
-@pytest.mark.parametrize("kind", ["uchar", "float", None])
+@pytest.mark.parametrize("kind", ["uchar", "float", "double", None])
 def test_points_of_a_ply_file_are_read(form, kind, tmp_path):
     scenes.write_colmap(tmp_path)
     colors = cloud_colors()
-    given = {"uchar": colors, "float": colors / 255, None: None}[kind]
+    if kind == "double":  # fractions, too, if all are 0 or 1
+        colors = 255.0 * (colors > 128)
+    given = {"uchar": colors, "float": colors / 255, "double": colors / 255, None: None}[kind]
     (tmp_path / "sparse" / "0" / "points3D.bin").unlink()
     (tmp_path / "sparse" / "0" / "points3D.ply").write_bytes(ply(CLOUD, given, form, kind or "uchar"))
     scene = load_scene(tmp_path)
