@@ -170,15 +170,10 @@ def _blender(names: list[str], count: int, spec: str) -> Split:
     return Split(tuple(train[i] for i in BLENDER_TRAIN), tuple(test[::8]))
 
 
-def _forms(name: str) -> tuple[str, ...]:
-    """Return the name of a view without folder and suffix, without either, and whole."""
-    path = PurePosixPath(name)
-    return path.stem, path.name, str(path.with_suffix("")), name
-
-
 def _nearest(names: list[str], wanted: str) -> str:
     """Return up to three names that resemble a wanted one, for messages."""
-    forms = {f: n for n in names for f in _forms(n)}
+    paths = {n: PurePosixPath(n) for n in names}
+    forms = {f: n for n, p in paths.items() for f in (p.stem, p.name, str(p.with_suffix("")), n)}
     short = [f for f in forms if len(f) <= MAX_COMPARED]  # the comparison takes the product of both lengths
     near = dict.fromkeys(forms[f] for f in difflib.get_close_matches(wanted[:MAX_COMPARED], short, 4, 0.3))
     return ", ".join(list(near)[:3] or names[:3])
@@ -457,19 +452,15 @@ def read_folder(
             found = f"is a file; {fix}" if root.is_file() else f"no such folder; {similar_folder(root) or fix}"
             raise DataError(f"{root}: {found}")
         if checked.reconstruction is not None:
-            reader = _colmap(reader)
-        chosen, notes = detect(root) if reader is None else (_accepted(root, find_reader(reader), checked), [])
+            if reader not in (None, "colmap"):
+                raise UsageError("--reconstruction requires a COLMAP scene; leave it out, or give --reader colmap")
+            chosen, notes = find_reader("colmap"), []
+        else:
+            chosen, notes = detect(root) if reader is None else (_accepted(root, find_reader(reader)), [])
         return _finished(root, chosen, chosen.read(root, checked), notes, checked)
     except OSError as e:
         # folders without permission, names too long for the file system, disks that fail
         raise DataError(f"{e.filename or root}: cannot be read ({e.strerror or e}); fix its permissions or copy it") from e
-
-
-def _colmap(reader: str | type[Reader] | Reader | None) -> str:
-    """Return the reader of a reconstruction that the user names; UsageError if the user chose a reader of another format."""
-    if reader not in (None, "colmap"):
-        raise UsageError("--reconstruction requires a COLMAP scene; leave it out, or give --reader colmap")
-    return "colmap"
 
 
 def detect(root: Path) -> tuple[Reader, list[str]]:
@@ -495,10 +486,8 @@ def detect(root: Path) -> tuple[Reader, list[str]]:
     return taken, notes
 
 
-def _accepted(root: Path, reader: Reader, options: ReadOptions) -> Reader:
+def _accepted(root: Path, reader: Reader) -> Reader:
     """Return a reader that the user chose; DataError where its format is not in the folder or not complete."""
-    if options.reconstruction is not None:
-        return reader
     probe = reader.probe(root)
     if probe is None:
         others = [p.found for r in all_readers() if (p := r.probe(root)) is not None]
