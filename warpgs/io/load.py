@@ -451,12 +451,12 @@ def read_folder(
             fix = "give a folder of photographs, or of images with their cameras"
             found = f"is a file; {fix}" if root.is_file() else f"no such folder; {similar_folder(root) or fix}"
             raise DataError(f"{root}: {found}")
-        if checked.reconstruction is not None:
-            if reader not in (None, "colmap"):
-                raise UsageError("--reconstruction requires a COLMAP scene; leave it out, or give --reader colmap")
+        if checked.reconstruction is None:
+            chosen, notes = detect(root) if reader is None else (_accepted(root, find_reader(reader)), [])
+        elif reader in (None, "colmap"):
             chosen, notes = find_reader("colmap"), []
         else:
-            chosen, notes = detect(root) if reader is None else (_accepted(root, find_reader(reader)), [])
+            raise UsageError("--reconstruction requires a COLMAP scene; leave it out, or give --reader colmap")
         return _finished(root, chosen, chosen.read(root, checked), notes, checked)
     except OSError as e:
         # folders without permission, names too long for the file system, disks that fail
