@@ -40,7 +40,9 @@ def nonsense(scene: Scene) -> str:
     if points is not None:
         if bad := not_finite(points=points.points.astype(np.float32), colors=points.colors):
             return bad
-        if len(points.tracks) != len(points.points) or np.abs(points.points).max(initial=0) > 1e13:
+        if (points.tracks is not None and len(points.tracks) != len(points.points)) or np.abs(points.points).max(
+            initial=0
+        ) > 1e13:
             return "points are none"
     n = scene.normalization
     return not_finite(offset=n.offset, scale=np.array(n.scale))
@@ -115,14 +117,43 @@ def radial(writer, model: str, *terms: float) -> Callable[[Path], object]:
     return functools.partial(writer, model=model, parameters=(20, *((20,) if model == "OPENCV" else ()), 8, 6, *terms))
 
 
+PLY = b"""ply
+format ascii 1.0
+element vertex 2
+property float x
+property float y
+property float z
+property uchar red
+property uchar green
+property uchar blue
+end_header
+0.1 0.2 0.3 255 0 51
+-0.2 0.1 0.0 9 9 9
+"""
+
+
+def write_ply(root: Path) -> None:
+    """Write a reconstruction with its points as PLY, and names with another suffix than the files."""
+    scenes.write_colmap_txt(root, names=tuple(f"C:\\photo{i}.png" for i in range(scenes.VIEWS)))
+    scenes.save_images(root / "images")
+    (root / "sparse" / "points3D.txt").unlink()
+    (root / "sparse" / "points3D.ply").write_bytes(PLY)
+
+
+def write_nerfstudio(root: Path) -> None:
+    applied = [[1, 0, 0, 0.1], [0, 0, 1, 0], [0, -1, 0, 0]]
+    scenes.write_transforms(root, scenes.transforms_json(ply_file_path="pc.ply", applied_transform=applied, applied_scale=2))
+    (root / "pc.ply").write_bytes(PLY)
+
+
 TEXT = (text_number, text_number, text_line)
 COLMAP = {
     "bin": radial(scenes.write_colmap, "OPENCV", 0.01, 0.001, 0.001, 0.001), "txt": scenes.write_colmap_txt,
     "radial": radial(scenes.write_colmap_txt, "SIMPLE_RADIAL", 0.01),
     "small stems": functools.partial(write_small, names=tuple(f"photo{i}.bmp" for i in range(scenes.VIEWS))),
-    "small order": functools.partial(write_small, names=tuple(f"image{i}.bmp" for i in range(scenes.VIEWS))),
+    "ply": write_ply, "small order": functools.partial(write_small, names=tuple(f"image{i}.bmp" for i in range(scenes.VIEWS))),
 }  # fmt: skip
-FRAMES = {"own": write_frames, "ngp": scenes.write_ngp, "blender": scenes.write_blender}
+FRAMES = {"own": write_frames, "ngp": scenes.write_ngp, "blender": scenes.write_blender, "ply": write_nerfstudio}
 add("colmap", COLMAP, (colmap,), TEXT)
 add("transforms", FRAMES, (transforms,), (rarely(many_rows, json_value), json_value, text_number))
 add("llff", {"a": scenes.write_llff}, (others,), (matrices_changed,))

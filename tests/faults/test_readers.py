@@ -112,7 +112,7 @@ READERS = {
     "export/gltf.py": {"_split": "glTF"},
     "export/sog.py": {"SOG.is_antialiased": "SOG", "decode": "SOG", "_member": "SOG", "_meta": "SOG", "_pixels": "SOG"},
     "io/transforms.py": {"_json": "cameras"},
-    "io/colmap.py": {"_BinaryFile.__init__": "colmap", "_lines": "colmap"},
+    "io/colmap.py": {"_BinaryFile.__init__": "colmap", "_lines": "colmap", "read_ply_points": "colmap"},
     "io/image_files.py": {"_raster": "any image", "read_image_file": "any image"},
     "io/others.py": {"_read_matrices": "dtu", "read_camera_rows": "middlebury"},
     "io/maps.py": {"mapped_array": "given maps"},

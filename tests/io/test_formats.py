@@ -1,15 +1,20 @@
 """Formats of scenes: the same cameras, lenses and images whatever the format; objects on black."""
 
+import json
+from pathlib import PurePosixPath
+
 import numpy as np
 import pytest
 
 from tests.gaussians import opencv_pixels
 from tests.io import scenes
+from tests.io.scenes import refused
 from warpgs import geometry
 from warpgs.errors import DataError, UsageError
 from warpgs.geometry import project_points
 from warpgs.io.load import load_scene, split_views
 from warpgs.pipeline.metrics.scores import counted_region
+from warpgs.poses.find import needs_poses
 
 # The same cameras and images give the same scene, whatever the format.
 
@@ -201,6 +206,259 @@ def test_outside_images_need_permission_and_get_harmless_names(tmp_path):
     scene = load_scene(root, allow_outside=True)
     assert any(v.name.startswith("outside/") and v.name.endswith("elsewhere.png") for v in scene.views)
     assert any("1 images are outside" in n for n in scene.notes)
+
+
+# COLMAP folders of other tools: the same scene as in sparse/0 and images, with a note on the choice.
+
+PLACES = {
+    "sparse/1": ("sparse/1", "images"), "undistorted": ("dense/0/sparse", "dense/0/images"),
+    "dense": ("dense/sparse", "dense/images"), "nerfstudio": ("colmap/sparse/0", "images"), "flat": (".", "."),
+    "flat model": ("colmap", "colmap"), "input": ("sparse/0", "input"), "reduced": ("dense/0/sparse", "dense/0/images_2"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("place", PLACES)
+@pytest.mark.parametrize("files", [scenes.colmap_bin, scenes.colmap_txt])
+def test_reconstructions_at_other_places_are_read(place, files, tmp_path):
+    model, images = PLACES[place]
+    plain = load_scene(scenes.write_colmap(tmp_path / "plain"))
+    root = tmp_path / "scene"
+    scenes.write_files(root / model, files())
+    scenes.save_images(root / images)
+    scene = load_scene(root)
+    assert not needs_poses(root) and scene.format == "colmap" and scene.fingerprint == plain.fingerprint
+    np.testing.assert_allclose(scene.points.points, plain.points.points)
+    assert scene.points.tracks == plain.points.tracks
+    base = images.removesuffix("_2")
+    assert f"cameras taken from {model}, images from {base}" in scene.notes
+    assert "left out" not in str(scene.notes)
+    if place in ("flat", "input"):
+        return
+    scenes.write_transforms(root)  # a scene of nerfstudio holds COLMAP's files, too
+    assert load_scene(root).format == "transforms" and load_scene(root, reader="colmap").format == "colmap"
+
+
+def test_the_largest_sub_model_is_taken(tmp_path):
+    """Or the one that the user names, anywhere in the scene; another format has none."""
+    scenes.write_colmap(tmp_path)
+    two = scenes.NAMES[:2]
+    for folder, names in (("sparse/0", two), ("sparse/1", scenes.NAMES), ("sparse/10", scenes.NAMES[:3]), ("own/model", two)):
+        scenes.write_files(tmp_path / folder, scenes.colmap_bin(names=names))
+    scene = load_scene(tmp_path)
+    note = "sparse/1 is the largest of 3 reconstructions (images in sparse/0: 2, sparse/1: 5, sparse/10: 3); --reconstruction"
+    assert len(scene.views) == 5 and scene.notes[0].startswith(note)
+    for folder, count in (("sparse/0", 2), ("sparse/10", 3), ("own/model", 2)):
+        scene = load_scene(tmp_path, reconstruction=folder)
+        assert len(scene.views) == count and scene.notes[0] == f"cameras taken from {folder} (--reconstruction)"
+    (tmp_path / "sparse" / "1" / "images.bin").write_bytes(b"broken")
+    assert len(load_scene(tmp_path).views) == 3
+    refused(tmp_path, "sparse/7: holds no COLMAP reconstruction; give its folder in the scene", reconstruction="sparse/7")
+    scenes.write_colmap(tmp_path.parent / "other")
+    refused(tmp_path, "a link points outside|outside the scene", reconstruction="../other/sparse/0")
+    with pytest.raises(UsageError, match="--reconstruction requires a COLMAP scene"):
+        load_scene(tmp_path, reader="llff", reconstruction="sparse/0")
+
+
+NAMED = {
+    "project root": ("images/{}.png", "{}.png", "images/{}.png"), "windows": (r"a\{}.png", "a/{}.png", r"a\{}.png"),
+    "windows absolute": (r"C:\me\{}.png", "a/{}.png", "a/{}.png"), "absolute": ("/home/me/{}.JPG", "{}.png", "{}.png"),
+    "suffix": ("{}.JPG", "{}.png", "{}.JPG"), "case": ("A/{}.png", "a/{}.PNG", "A/{}.png"),
+    "unicode": ("fo\u0308n{}.png", "f\u00f6n{}.png", "fo\u0308n{}.png"), "dots": ("./{}.jpg", "{}.png", "{}.jpg"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", NAMED)
+def test_names_are_matched_to_the_only_file_that_fits(kind, tmp_path):
+    """And to none where two files fit, or two names one file: these photographs are skipped."""
+    written, stored, shown = NAMED[kind]
+    scenes.write_files(tmp_path / "sparse" / "0", scenes.colmap_bin(names=[written.format(i) for i in range(5)]))
+    scenes.save_images(tmp_path / "images", [stored.format(i) for i in range(5)])
+    scene = load_scene(tmp_path)
+    assert [v.name for v in scene.views] == [shown.format(i) for i in range(5)]
+    for i, view in enumerate(scene.views):
+        np.testing.assert_array_equal(view.image, (scenes.image(i) / 255).astype(np.float32))
+    assert any("matched by their names" in n for n in scene.notes) == (kind != "windows")
+    if kind == "project root":  # of reduced images, those are read
+        scenes.save_images(tmp_path / "images_2", [f"{i}.png" for i in range(4)], 8, 6)
+        scenes.save(tmp_path / "images_2" / "0.png", np.full((6, 8, 3), 7, np.uint8))
+        assert (load_scene(tmp_path, downscale=2).views[0].image == np.float32(7 / 255)).all()
+    if kind in ("suffix", "case"):
+        scenes.save(tmp_path / "images" / stored.format(1).replace("png", "bmp").replace("PNG", "bmp"), scenes.image(4))
+        assert [v.name for v in load_scene(tmp_path).views] == [shown.format(i) for i in (0, 2, 3, 4)]
+        names = [f"{i}.{end}" for i, end in ((0, "jpg"), (0, "tif"), (1, "jpg"), (2, "bmp"), (3, "bmp"))]
+        scenes.write_files(tmp_path / "sparse" / "0", scenes.colmap_bin(names=names))
+        for i in range(4):
+            scenes.save(tmp_path / "images" / f"{i}.png", scenes.image(i))
+        assert "0.jpg, 0.tif" in str([n for n in load_scene(tmp_path).notes if n.startswith("skipped")])
+
+
+@pytest.mark.parametrize("kind", scenes.WRITERS)
+def test_photographs_are_left_out_by_name_before_they_are_decoded(kind, tmp_path):
+    root = scenes.WRITERS[kind](tmp_path)
+    scene = load_scene(root)
+    name = scene.views[1].name
+    bad = next(p for p in root.rglob("*.png") if p.as_posix().endswith(name))
+    bad.write_bytes(b"damaged")
+    refused(root, "cannot be decoded")
+    for pattern in (name, PurePosixPath(name).stem, f"*{PurePosixPath(name).stem[-1]}.png", f"{name} , {scene.views[2].name}"):
+        left = load_scene(root, exclude=pattern, strict=True)
+        gone = {name, scene.views[2].name} if "," in pattern else {name}
+        assert [v.name for v in left.views] == [v.name for v in scene.views if v.name not in gone]
+        assert any(n.startswith(f"left out by --exclude: {len(gone)} image") and name in n for n in left.notes)
+    refused(
+        root,
+        f"--exclude x{scene.views[0].name}: no view has this name; the nearest names are {scene.views[0].name}",
+        exclude=f"x{scene.views[0].name},{name}",
+    )
+
+
+@pytest.mark.parametrize("kind", ["colmap", "colmap text", "transforms"])
+def test_missing_photographs_are_skipped_and_all_named(kind, tmp_path):
+    root = scenes.WRITERS[kind](tmp_path)
+    for i in (1, 3):
+        (root / "images" / scenes.NAMES[i]).unlink()
+    scene = load_scene(root)
+    assert [v.name.removeprefix("images/") for v in scene.views] == [scenes.NAMES[i] for i in (0, 2, 4)]
+    prefix = "images/" if kind == "transforms" else ""
+    assert any(n.startswith("skipped: 2 of 5") and n.endswith(f": {prefix}photo1.png, {prefix}photo3.png") for n in scene.notes)
+    if kind != "transforms":
+        assert set().union(*scene.points.tracks) == {v.name for v in scene.views}
+    refused(root, "2 of 5 .* have no image file: .*photo1.png.*photo3.png. Restore", strict=True)
+    assert len(load_scene(root, strict=True, exclude="photo1, photo3.png").views) == 3
+
+
+# Points of PLY files.
+
+CLOUD = np.random.default_rng(0).uniform(-0.8, 0.8, (60, 3))
+
+
+def cloud_colors() -> np.ndarray:
+    """Return the mean colours, 0 to 255, of the images where the points of CLOUD are."""
+    seen = [np.floor([scenes.pixel(i, p) for p in CLOUD]).astype(int).clip(0, (15, 11)) for i in range(5)]
+    return np.round(np.mean([scenes.image(i)[at[:, 1], at[:, 0]] for i, at in enumerate(seen)], axis=0))
+
+
+def ply(points: np.ndarray, colors: np.ndarray | None = None, form: str = "ascii", kind: str = "uchar") -> bytes:
+    """Return a PLY file of points with colours of a type, a comment, a further property and a further element."""
+    types = {"uchar": "u1", "float": "f4", "double": "f8"}
+    names = {"x": "double", "y": "double", "z": "double", "quality": "float"}
+    names |= {} if colors is None else dict.fromkeys(("red", "green", "blue"), kind)
+    columns = [*points.T, np.zeros(len(points)), *([] if colors is None else colors.T)]
+    head = ["ply", f"format {form} 1.0", "comment made up", f"element vertex {len(points)}"]
+    head += [f"property {t} {n}" for n, t in names.items()] + ["element face 0", "property list uchar int vertex_indices"]
+    if form == "ascii":
+        rows = zip(*[np.asarray(c).astype(types[t]).tolist() for c, t in zip(columns, names.values())])
+        body = "".join(" ".join(map(repr, row)) + "\n" for row in rows).encode()
+    else:
+        order = "<" if "little" in form else ">"
+        table = np.zeros(len(points), [(n, order + types[t]) for n, t in names.items()])
+        for n, c in zip(names, columns):
+            table[n] = c
+        body = table.tobytes()
+    return "\n".join([*head, "end_header\n"]).encode() + body
+
+
+@pytest.mark.parametrize("form", ["ascii", "binary_little_endian", "binary_big_endian"])
+@pytest.mark.parametrize("kind", ["uchar", "float", "double", None])
+def test_points_of_a_ply_file_are_read(form, kind, tmp_path):
+    scenes.write_colmap(tmp_path)
+    colors = cloud_colors()
+    if kind == "double":  # fractions, too, if all are 0 or 1
+        colors = 255.0 * (colors > 128)
+    given = {"uchar": colors, "float": colors / 255, "double": colors / 255, None: None}[kind]
+    (tmp_path / "sparse" / "0" / "points3D.bin").unlink()
+    (tmp_path / "sparse" / "0" / "points3D.ply").write_bytes(ply(CLOUD, given, form, kind or "uchar"))
+    scene = load_scene(tmp_path)
+    points, n = scene.points, scene.normalization
+    np.testing.assert_allclose(points.points / n.scale + n.offset, CLOUD, atol=1e-9)
+    np.testing.assert_allclose(points.colors, 127 / 255 if kind is None else colors / 255, atol=1e-6)
+    assert points.tracks is None and "points taken from points3D.ply, because points3D.bin is missing" in scene.notes
+
+
+@pytest.mark.parametrize(
+    "data,message",
+    [
+        (b"solid", "it has no PLY header"),
+        (ply(CLOUD)[:-9], "points3D.ply: the points cannot be understood"),
+        (ply(CLOUD, form="binary_little_endian")[:-9], "points3D.ply: the points cannot be understood"),
+        (ply(CLOUD).replace(b" z\n", b" w\n"), "vertices lack x, y or z"),
+        (ply(CLOUD).replace(b"vertex 60", b"vertex 6000000000000"), "points cannot be understood"),
+        (ply(CLOUD).replace(b"vertex 60", b"vertex -1"), "points cannot be understood"),
+        (ply(CLOUD * np.nan), "60 of 60 points are not finite"),
+        (ply(CLOUD).replace(b"element vertex", b"element other"), "first element is not vertex"),
+        (ply(CLOUD).replace(b"format ascii", b"format other"), "points cannot be understood"),
+        (ply(CLOUD).replace(b"double x", b"list uchar int x"), "points cannot be understood"),
+        (ply(CLOUD).replace(b"quality", b"z"), "its header is inconsistent"),
+    ],
+)
+def test_malformed_ply_files(data, message, tmp_path):
+    scenes.write_colmap(tmp_path)
+    (tmp_path / "sparse" / "0" / "points3D.bin").unlink()
+    (tmp_path / "sparse" / "0" / "points3D.ply").write_bytes(data)
+    refused(tmp_path, message)
+
+
+@pytest.mark.parametrize("stored", ["with the transform", "without it", "no transform"])
+@pytest.mark.parametrize("scale", [None, 0.5])
+def test_points_of_transforms_stand_where_the_images_show_them(stored, scale, tmp_path):
+    """The poses contain applied_transform; the points do in files of today's nerfstudio, not in those of its first versions."""
+    applied = np.array([[1.0, 0, 0, 0.2], [0, 0, 1, 0.1], [0, -1, 0, -0.3]])
+    back = (CLOUD / (scale or 1.0) - applied[:, 3]) @ applied[:, :3]
+    content = scenes.transforms_json(ply_file_path="pc.ply", applied_transform=applied.tolist(), applied_scale=scale)
+    if stored == "no transform":
+        content.pop("applied_transform")
+    scenes.write_transforms(tmp_path, content)
+    (tmp_path / "pc.ply").write_bytes(ply(back if stored == "without it" else CLOUD, cloud_colors()))
+    scene = load_scene(tmp_path)
+    n = scene.normalization
+    np.testing.assert_allclose(scene.points.points / n.scale + n.offset, CLOUD, atol=1e-9)
+    assert any(note.startswith("points taken from pc.ply") for note in scene.notes)
+    for name, words in (("gone.ply", "gone.ply is missing"), ("../x.ply", "points outside the scene folder")):
+        (tmp_path / "transforms.json").write_text(json.dumps(content | {"ply_file_path": name}))
+        scene = load_scene(tmp_path)
+        assert scene.points is None and any(words in note for note in scene.notes)
+
+
+# Lenses without terms, and numbers as other tools write them.
+
+
+@pytest.mark.parametrize("write", [scenes.write_colmap, scenes.write_colmap_txt])
+def test_rational_lenses_without_rational_terms_are_undistorted(write, tmp_path):
+    """A fisheye without terms is no pinhole: its image radius is f times the angle."""
+    plain = load_scene(write(tmp_path / "a"))
+    assert (
+        load_scene(write(tmp_path / "b", model="FULL_OPENCV", parameters=(*scenes.PINHOLE, *[0] * 8))).fingerprint
+        == plain.fingerprint
+    )
+    four = (0.1, -0.02, 0.01, 0.02)
+    opencv = load_scene(write(tmp_path / "c", model="OPENCV", parameters=(*scenes.PINHOLE, *four)))
+    full = load_scene(write(tmp_path / "d", model="FULL_OPENCV", parameters=(*scenes.PINHOLE, *four, *[0] * 4)))
+    assert full.fingerprint == opencv.fingerprint
+    third = load_scene(write(tmp_path / "e", model="FULL_OPENCV", parameters=(*scenes.PINHOLE, *four, 0.3, *[0] * 3)))
+    assert third.fingerprint != opencv.fingerprint and "5 images undistorted (FULL_OPENCV)" in third.notes
+    refused(
+        write(tmp_path / "f", model="FULL_OPENCV", parameters=(*scenes.PINHOLE, *[0] * 7, 0.1)),
+        "FULL_OPENCV is not supp.*native",
+    )
+    for model, count in (("OPENCV_FISHEYE", 8), ("FOV", 5), ("THIN_PRISM_FISHEYE", 12), ("RAD_TAN_THIN_PRISM_FISHEYE", 16)):
+        refused(
+            write(tmp_path / "g", model=model, parameters=(*scenes.PINHOLE, *[0] * (count - 4))), f"camera model {model} is not"
+        )
+
+
+def test_numbers_of_text_files_may_be_written_as_fractions(tmp_path):
+    plain = load_scene(scenes.write_colmap_txt(tmp_path))
+    for file, old, new in (("cameras", "16 12", "16.0 12.0"), ("points3D", "255 0 51", "255.0 0.0 51.0"),
+                           ("points3D", "255.0 0.0 51.0", "1.0 0.0 0.2")):  # fmt: skip
+        path = tmp_path / "sparse" / f"{file}.txt"
+        assert old in path.read_text()
+        path.write_text(path.read_text().replace(old, new))
+        scene = load_scene(tmp_path)
+        assert scene.fingerprint == plain.fingerprint
+        np.testing.assert_allclose(scene.points.colors, plain.points.colors, atol=1e-7)
+    path = tmp_path / "sparse" / "cameras.txt"
+    path.write_text(path.read_text().replace("16.0 12.0", "16.5 12.0"))
+    refused(tmp_path, r"cameras.txt, line 2: .*16.5 x 12 px is not whole")
 
 
 # Lenses that are kept: the same point lands on the same pixel through the camera as through the lens of the file.

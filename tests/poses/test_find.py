@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 import pytest
 
+from tests.io import scenes
 from tests.poses.conftest import film, with_exif, write_png
 from warpgs.app.cli import main
 from warpgs.errors import DataError, ResourceError, UsageError
@@ -30,6 +31,7 @@ from warpgs.poses.matching import choose_pairs, similarity
 from warpgs.poses.photographs import (
     Photograph,
     find_photographs,
+    models_below,
     prepare,
     sharpest,
     without_jpeg_metadata,
@@ -198,6 +200,22 @@ def test_folders_that_need_poses(tmp_path, photographs, found):
     assert needs_poses(tmp_path / "film.MP4")
     assert needs_poses(found[0] / "images") and not needs_poses(tmp_path / "none")
     assert not needs_poses(tmp_path / ("x" * 5000))
+
+
+def test_a_reconstruction_deep_in_the_photographs_is_named(tmp_path, photographs):
+    """Instead of other poses in other units; a fit reads it by --reconstruction, and those of earlier runs do not count."""
+    folder = tmp_path / "photographs"
+    shutil.copytree(photographs, folder)
+    scenes.write_files(folder / "run" / "scene" / "sparse" / "0", scenes.colmap_bin())
+    (folder / "run" / "scene" / "poses.json").touch()
+    assert not list(models_below(folder))
+    scenes.write_files(folder / "out" / "my model", scenes.colmap_txt())
+    with pytest.raises(
+        UsageError, match=r"holds a COLMAP reconstruction in out/my model: `warpgs fit .* --reconstruction out/my"
+    ):
+        find_poses(folder, tmp_path / "out")
+    request = SceneRequest(path=str(folder), reconstruction="out/my model")
+    assert with_poses(request, None, print) == (request, [])
 
 
 # Ctrl-C while the process that calls pycolmap runs.

@@ -5,10 +5,13 @@ Other files of a reconstruction (rigs, frames, project.ini) hold nothing that a 
 
 from __future__ import annotations
 
+import re
 import struct
+import unicodedata
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path, PurePosixPath
+from pathlib import Path, PurePosixPath, PureWindowsPath
 
 import numpy as np
 
@@ -20,12 +23,13 @@ from warpgs.io.folder import (
     SceneFolder,
     ViewList,
     has_folder,
+    missing_note,
     quat_rotation,
     register,
     rigid,
     view_name,
 )
-from warpgs.io.images import Lens, ReadOptions, list_images
+from warpgs.io.images import SUFFIXES, Lens, ReadOptions, list_images
 from warpgs.scene import PointCloud, Scene
 
 MODELS = {0: ("SIMPLE_PINHOLE", 3), 1: ("PINHOLE", 4), 2: ("SIMPLE_RADIAL", 4), 3: ("RADIAL", 5), 4: ("OPENCV", 8)}
@@ -34,8 +38,17 @@ NATIVE_MODELS = {
     5: ("OPENCV_FISHEYE", 8), 6: ("FULL_OPENCV", 12), 8: ("SIMPLE_RADIAL_FISHEYE", 4), 9: ("RADIAL_FISHEYE", 5),
 }  # fmt: skip
 """Models that are only read with `--lenses native`, because undistortion is not implemented for them."""
-OTHER_MODELS = {7: "FOV", 10: "THIN_PRISM_FISHEYE"} | {number: name for number, (name, _) in NATIVE_MODELS.items()}
+OTHER_MODELS = {
+    7: "FOV", 10: "THIN_PRISM_FISHEYE", 11: "RAD_TAN_THIN_PRISM_FISHEYE", 12: "SIMPLE_DIVISION", 13: "DIVISION",
+    14: "SIMPLE_FISHEYE", 15: "FISHEYE", 16: "EUCM", 17: "EQUIRECTANGULAR",
+}  # fmt: skip
+"""Models that are not read, for messages."""
 STEMS = ("cameras", "images", "points3D")
+IMAGES = ("images", "input")
+"""Names of image folders."""
+
+Model = tuple[Path, str, list[str]]
+"""Folder, kind (bin or txt) and missing files of a reconstruction."""
 
 
 Pose = tuple[str, int, tuple[float, ...], tuple[float, ...]]
@@ -128,8 +141,10 @@ def _store(table: dict, key: int, value: object, where: str) -> None:
     table[key] = value
 
 
-def _lens(where: str, model: str, width: int, height: int, p: tuple[float, ...]) -> Lens:
+def _lens(where: str, model: str, width: int, height: int, p: tuple[float, ...], native: bool) -> Lens:
     fisheye = model.endswith("FISHEYE")
+    if model == "FULL_OPENCV" and not native:
+        p = p[:9]  # the terms behind are 0
     if "OPENCV" in model or model == "PINHOLE":
         (fx, fy, cx, cy), distortion = p[:4], p[4:]
     else:
@@ -153,27 +168,36 @@ def _unknown_model(path: Path, model: object, known: dict[int, tuple[str, int]])
 def read_cameras(path: Path, native: bool = False) -> dict[int, Lens]:
     """Return lenses by camera number from cameras.bin or cameras.txt; ``native`` also allows models without undistortion."""
     cameras: dict[int, Lens] = {}
-    known = MODELS | NATIVE_MODELS if native else MODELS
+    known, readable = MODELS | NATIVE_MODELS if native else MODELS, MODELS | NATIVE_MODELS
+
+    def allow(model: object, parameters: tuple[float, ...] = ()) -> None:
+        """Refuse a model; FULL_OPENCV without rational terms is OPENCV with k3, which can be undistorted."""
+        plain = model == "FULL_OPENCV" and not any(parameters[9:])
+        if not plain and model not in [name for name, _ in known.values()]:
+            raise _unknown_model(path, model, known)
+
     if path.suffix == ".bin":
         r = _BinaryFile(path)
         for _ in range(r.count(24)):
             number, model, width, height = r.take("iiQQ")
-            if model not in known:
-                raise _unknown_model(path, OTHER_MODELS.get(model, model), known)
-            name, count = known[model]
+            name, count = readable.get(model, (OTHER_MODELS.get(model, model), 0))
+            allow(name)
+            parameters = r.take(f"{count}d")
+            allow(name, parameters)
             where = f"{path}, camera {number}"
-            _store(cameras, number, _lens(where, name, width, height, r.take(f"{count}d")), where)
+            _store(cameras, number, _lens(where, name, width, height, parameters, native), where)
         r.end()
         return cameras
-    counts = dict(known.values())
+    counts = dict(readable.values())
     for line, words in _rows(path):
         with _understood(path, line):
             number, model, parameters = int(words[0]), words[1], tuple(float(w) for w in words[4:])
-            if model not in counts:
-                raise _unknown_model(path, model, known)
+            allow(model, parameters)
             _expect(len(parameters) == counts[model], f"{model} has {counts[model]} parameters, not {len(parameters)}")
             where = f"{path}, line {line}, camera {number}"
-            _store(cameras, number, _lens(where, model, int(words[2]), int(words[3]), parameters), where)
+            width, height = float(words[2]), float(words[3])  # some exports write 1920.0
+            _expect(width % 1 == height % 1 == 0, f"the size {width:g} x {height:g} px is not whole")
+            _store(cameras, number, _lens(where, model, int(width), int(height), parameters, native), where)
     return cameras
 
 
@@ -223,7 +247,7 @@ def posed_lenses(poses: dict[int, Pose], lenses: dict[int, Lens], file: Path) ->
 def read_points(path: Path, names: dict[int, str]) -> PointCloud:
     """Return points, with the views that saw them, from points3D.bin or points3D.txt."""
     points: list[tuple[float, ...]] = []
-    colors: list[tuple[int, ...]] = []
+    colors: list[tuple[float, ...]] = []
     tracks: list[frozenset[str]] = []
     if path.suffix == ".bin":
         r = _BinaryFile(path)
@@ -239,92 +263,267 @@ def read_points(path: Path, names: dict[int, str]) -> PointCloud:
             with _understood(path, line):
                 _expect(len(words) >= 8 and len(words) % 2 == 0, "a point needs 8 numbers, then pairs IMAGE OBSERVATION")
                 points.append(tuple(float(w) for w in words[1:4]))
-                colors.append(tuple(min(max(int(w), 0), 255) for w in words[4:7]))
+                colors.append(tuple(float(w) for w in words[4:7]))
                 tracks.append(frozenset(names[i] for w in words[8::2] if (i := int(w)) in names))
-    positions = np.array(points, np.float64).reshape(-1, 3)
-    bad = int((~np.isfinite(positions).all(axis=1)).sum())
+    return _cloud(path, np.array(points, np.float64).reshape(-1, 3), np.array(colors, np.float64).reshape(-1, 3), tuple(tracks))
+
+
+def _cloud(
+    path: Path, positions: np.ndarray, colors: np.ndarray, tracks: tuple[frozenset[str], ...] | None = None
+) -> PointCloud:
+    """Return points [N, 3] with colours of 0 to 255, or of 0 to 1 if they are fractions."""
+    bad = int((~np.isfinite(np.concatenate([positions, colors], axis=1)).all(axis=1)).sum())
     if bad:
         raise DataError(f"{path}: {bad} of {len(positions)} points are not finite; reconstruct again, or remove them")
-    return PointCloud(positions, np.array(colors, np.float32).reshape(-1, 3) / 255, tuple(tracks))
+    fractions = bool((colors % 1).any()) and colors.max() <= 1
+    return PointCloud(positions, np.clip(colors, 0, 255).astype(np.float32) / np.float32(1 if fractions else 255), tracks)
 
 
-def reconstruction(root: Path) -> tuple[Path, str, list[str]] | None:
-    """Return folder, kind (bin or txt) and missing files of a reconstruction; None if there is no COLMAP file.
+PLY_TYPES = {
+    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2", "uint16": "u2",
+    "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4", "double": "f8", "float64": "f8",
+}  # fmt: skip
+PLY_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 
-    Of sparse/0, sparse and the root, the first complete folder is taken, else the first with any COLMAP file.
+
+def read_ply_points(path: Path) -> PointCloud:
+    """Return the points of a PLY file, text or binary; points without colours are gray, and no views are known."""
+    data = read_file(path, fix="fix its permissions or copy it again")
+    head, mark, rest = data[: 2**16].partition(b"end_header")
+    try:
+        _expect(data[:3] == b"ply" and bool(mark), "it has no PLY header")
+        lines = [line.split() for line in head.decode("ascii", "replace").splitlines()]
+        order = PLY_ORDERS[next(w[1] for w in lines if w[:1] == ["format"])]
+        elements = [i for i, w in enumerate(lines) if w[:1] == ["element"]]
+        _expect(bool(elements) and lines[elements[0]][1] == "vertex", "its first element is not vertex")
+        count = int(lines[elements[0]][2])
+        rows = [w for w in lines[elements[0] : [*elements, len(lines)][1]] if w[:1] == ["property"]]
+        kinds = {w[2]: PLY_TYPES[w[1]] for w in rows}
+        _expect(count >= 0 and len(kinds) == len(rows), "its header is inconsistent")
+        _expect({"x", "y", "z"} <= kinds.keys(), "its vertices lack x, y or z")
+        body = data[len(head) + len(mark) + rest.find(b"\n") + 1 :]
+        if order:
+            table = np.frombuffer(body, np.dtype([(n, order + k) for n, k in kinds.items()]), count)
+            values = {n: table[n].astype(np.float64) for n in kinds}
+        else:
+            words = np.array([row.split()[: len(kinds)] for row in body.splitlines()[:count]], np.float64)
+            _expect(count == len(words), f"it lists {len(words)} of {count} points")
+            values = dict(zip(kinds, words.reshape(count, len(kinds)).T))
+    except (ValueError, KeyError, IndexError, OverflowError, StopIteration) as e:
+        raise DataError(f"{path}: the points cannot be understood ({e}); export them again as PLY, or remove the file") from e
+    rgb = next((c for c in (("red", "green", "blue"), ("r", "g", "b")) if kinds.keys() >= set(c)), ())
+    colors = np.stack([values[c] for c in rgb], 1) if rgb else np.full((count, 3), 127.0)
+    if rgb and kinds[rgb[0]] == "u2":
+        colors = colors / 257
+    elif rgb and kinds[rgb[0]][0] == "f" and colors.size and colors.max() <= 1:
+        colors = colors * 255
+    return _cloud(path, np.stack([values[c] for c in "xyz"], 1), colors)
+
+
+def _found(folder: Path) -> Model | None:
+    """Return the reconstruction in a folder; None if it has no COLMAP file."""
+    kinds = ("bin", "txt")
+    lacks = {k: [n for s in STEMS[:2] if not (folder / (n := f"{s}.{k}")).is_file()] for k in kinds}
+    if not any((folder / f"{s}.{k}").is_file() for s in STEMS for k in kinds):
+        return None
+    kind = min(kinds, key=lambda k: len(lacks[k]))
+    return folder, kind, lacks[kind]
+
+
+def _numbered(folder: Path) -> list[Path]:
+    """Return the subfolders 0, 1, 2, ... of a folder in this order."""
+    return sorted((p for p in folder.glob("[0-9]*") if p.name.isdecimal() and p.is_dir()), key=lambda p: (int(p.name), p.name))
+
+
+def reconstructions(root: Path) -> list[Model]:
+    """Return the sub-models among which the choice is: the first place with a complete one decides, if possible with images.
+
+    The places are sparse/N, sparse, the root, dense/N/sparse, dense/sparse, colmap/sparse/N, colmap/sparse and colmap. Without
+    a complete one, the first with any COLMAP file is returned.
     """
-    partial, kinds = [], ("bin", "txt")
-    for folder in (root / "sparse" / "0", root / "sparse", root):
-        lacks = {k: [n for s in STEMS[:2] if not (folder / (n := f"{s}.{k}")).is_file()] for k in kinds}
-        if any((folder / f"{s}.{k}").is_file() for s in STEMS for k in kinds):
-            kind = min(kinds, key=lambda k: len(lacks[k]))
-            partial.append((folder, kind, lacks[kind]))
-    return next((p for p in partial if not p[2]), partial[0] if partial else None)
+    dense, colmap = root / "dense", root / "colmap"
+    places = [
+        _numbered(root / "sparse"), [root / "sparse"], [root], [p / "sparse" for p in _numbered(dense)], [dense / "sparse"],
+        _numbered(colmap / "sparse"), [colmap / "sparse"], [colmap],
+    ]  # fmt: skip
+    groups = [[m for folder in place if (m := _found(folder)) is not None] for place in places]
+    complete = [found for group in groups if (found := [m for m in group if not m[2]])]
+    pictured = [group for group in complete if image_base(root, group[0][0])]
+    return next(iter(pictured or complete), [m for group in groups for m in group][:1])
 
 
-def _image_paths(scene: SceneFolder, images: Path, names: list[str], where: str) -> tuple[dict[str, Path], str]:
-    """Return the image file by view name, and a note for the user (empty where nothing was chosen).
+def reconstruction(root: Path, named: str | None = None) -> tuple[Model | None, str]:
+    """Return the reconstruction ``named``, else the largest of `reconstructions` (None without any), and a note on it."""
+    if named is not None:
+        return _found(root / named), f"cameras taken from {named} (--reconstruction)"
+    models = reconstructions(root)
+    if len(models) < 2:
+        return (models[0] if models else None), ""
+    sizes = [_size(m) for m in models]
+    best = models[sizes.index(max(sizes))]
+    names = [m[0].relative_to(root).as_posix() for m in models]
+    counts = ", ".join(f"{name}: {size}" for name, size in zip(names, sizes))
+    chosen = best[0].relative_to(root).as_posix()
+    return (
+        best,
+        f"{chosen} is the largest of {len(models)} reconstructions (images in {counts}); --reconstruction FOLDER takes another",
+    )
 
-    Folders of reduced images often have other suffixes (images_8/a.png for a.JPG) or other names (LLFF's image000.png). Files
-    with another suffix are matched by stem, files with other names by sorted order if the counts agree.
+
+def _size(model: Model) -> int:
+    """Return the number of posed images of a complete reconstruction; 0 for a damaged file, so that another one is taken."""
+    try:
+        return len(read_poses(model[0] / f"images.{model[1]}"))
+    except DataError:
+        return 0
+
+
+def image_base(root: Path, model: Path) -> str | None:
+    """Return the image folder of a reconstruction relative to the scene folder, such as ``images`` or ``.``, or None."""
+    space = model
+    if model != root and root in model.parents:
+        space = model.parent if model.name.isdecimal() else model
+        space = space.parent if space.name == "sparse" else space
+    for place in dict.fromkeys((space, root)):
+        for name, others in (("images", "images_*"), ("input", "input")):
+            if place.is_relative_to(root) and has_folder(place, name, others):
+                return (place / name).relative_to(root).as_posix()
+    for place in dict.fromkeys((model, space, root)):  # as RealityScan exports them
+        if place.is_relative_to(root) and any(p.suffix.lower() in SUFFIXES and p.is_file() for p in place.glob("[!.]*")):
+            return place.relative_to(root).as_posix()
+    return None
+
+
+def _key(name: str) -> str:
+    """Return a name without suffix, with / between folders, in one spelling of its letters."""
+    plain = re.sub(r"(?<=[^/])\.[^./]*$", "", name.replace("\\", "/"))
+    return unicodedata.normalize("NFC", plain).casefold()
+
+
+def _by_key(files: dict[Path, str]) -> dict[str, Path]:
+    """Return the files by the key of their names, without those that share one."""
+    keys = {path: _key(name) for path, name in files.items()}
+    counts = Counter(keys.values())
+    return {key: path for path, key in keys.items() if counts[key] == 1}
+
+
+def _is_absolute(name: str) -> bool:
+    return PurePosixPath(name).is_absolute() or PureWindowsPath(name).is_absolute()
+
+
+def _image_paths(
+    scene: SceneFolder, images: Path, base: str, names: list[str], files: list[Path], where: str
+) -> tuple[dict[str, Path], list[str]]:
+    """Return the image file by name of the reconstruction, and notes for the user; missing files keep the path of their name.
+
+    A name may begin with the image folder. Names without a file are matched without suffix and case, and absolute ones by file
+    name, if only one file fits. Files of reduced images (images_8) may also have other names (LLFF's image000.png): they are
+    matched in sorted order if the counts agree.
     """
-    paths = {n: scene.child(images, n, where) for n in names}
-    lost = [n for n in names if not paths[n].is_file()]
-    if not lost or images.name == "images":
-        return paths, ""
-    files = list_images(images)
-    stems = {p.relative_to(images).with_suffix("").as_posix(): p for p in files}
-    found = {n: stems.get(str(PurePosixPath(n).with_suffix(""))) for n in lost}
-    if len(stems) == len(files) and all(found.values()):
-        return paths | found, f"{len(lost)} images of {images.name} matched by their names without suffix"
-    if len(lost) == len(names) == len(files):
+    outside = {n for n in names if _is_absolute(n) and not (scene.options.allow_outside and (images / n).is_file())}
+    paths = {n: scene.child(images, n, where) for n in names if n not in outside}
+    used = {n: p for n, p in paths.items() if p.is_file()}
+    lost, taken = [n for n in names if n not in used], set(used.values())
+    if not lost:
+        return paths, []
+    free = {p: p.relative_to(images).as_posix() for p in files if p not in taken}
+    by_path, by_name = _by_key(free), _by_key({p: p.name for p in free})
+    found: dict[str, Path] = {}
+    for n in lost:
+        plain = n.replace("\\", "/").removeprefix("./")
+        inner = plain.removeprefix(f"{base}/")
+        if n in outside:
+            match = by_name.get(_key(plain.rpartition("/")[2]))
+        elif inner != plain and (images / inner).is_file():
+            match = scene.child(images, inner, where)
+        elif images == scene.root / base and (scene.root / plain).is_file():
+            match = scene.child(scene.root, plain, where)
+        else:
+            match = by_path.get(_key(plain)) or by_path.get(_key(inner))
+        if match is not None:
+            found[n] = match
+    claims = Counter(found.values())
+    found = {n: p for n, p in found.items() if claims[p] == 1 and p not in taken}
+    reduced = images != scene.root / base
+    if reduced and len(lost) == len(names) == len(files) > len(found):
         pairs = dict(zip(sorted(names), files))
         order = f"images of {images.name} matched in sorted order, because their names differ"
-        return pairs, f"{order} ({min(names)} is {pairs[min(names)].name})"
-    return paths, ""  # the missing file is named when it is read
+        return pairs, [f"{order} ({min(names)} is {pairs[min(names)].name})"]
+    paths |= {n: scene.child(images, n, where) for n in outside if n not in found}  # refuses those that point outside
+    first = min(found, default="")
+    some = f"{len(found)} image{'s' if len(found) != 1 else ''} of {images.name} matched by their names without"
+    note = f"{some} suffix, case or folder ({first} is {found[first].relative_to(scene.root)})" if found else ""
+    return paths | found, [note] if note else []
 
 
 @register("colmap")
 class ColmapReader(Reader):
     """COLMAP reconstructions, binary or text, with their image folder."""
 
-    description = "sparse/0, sparse or the folder itself with cameras and images .bin/.txt (COLMAP)"
+    description = (
+        "sparse/0, sparse, dense/0/sparse, colmap/sparse/0 or the folder itself with cameras and images .bin/.txt (COLMAP)"
+    )
     priority = 10
 
     def probe(self, folder: Path) -> Probe | None:
         """See `Reader.probe`."""
-        model = reconstruction(folder)
-        if model is None:
+        models = reconstructions(folder)
+        if not models:
             return None
-        images = [] if has_folder(folder, "images", "images_*") else ["its image folder, images"]
-        return Probe(
-            f"the COLMAP reconstruction in {model[0].relative_to(folder).as_posix()}", " and ".join(model[2] or images)
-        )
+        base, usual = image_base(folder, models[0][0]), (folder / "sparse" / "0", folder / "sparse", folder)
+        lacks = models[0][2] or ([] if base else ["its image folder, images"])
+        found = f"the COLMAP reconstruction in {models[0][0].relative_to(folder).as_posix()}"
+        # scenes of other formats have such files, too: nerfstudio's have colmap/sparse/0
+        other = base not in (None, "images") or not any(_found(place) in models for place in usual)
+        return Probe(found, " and ".join(lacks), fallback=other)
 
     def read(self, folder: Path, options: ReadOptions) -> Scene:
         """See `Reader.read`."""
-        model, kind, lacks = reconstruction(folder) or (folder, "", ["cameras and images"])
+        choice, chosen = reconstruction(folder, options.reconstruction)
+        if choice is None:
+            named = options.reconstruction or "sparse/0"
+            raise DataError(f"{folder / named}: holds no COLMAP reconstruction; give its folder in the scene, such as sparse/1")
+        model, kind, lacks = choice
         if lacks:
             raise DataError(f"{model}: the COLMAP reconstruction lacks {' and '.join(lacks)}; copy the whole folder")
         scene, file = SceneFolder(folder, options), model / f"images.{kind}"
         poses = read_poses(scene.inside(file))
         lenses = read_cameras(scene.inside(model / f"cameras.{kind}"), options.lenses == "native")
-        images, factor, chosen = scene.images()
-        paths, matched = _image_paths(scene, images, [name for name, *_ in poses.values()], str(file))
-        notes, views = [note for note in (chosen, matched) if note], ViewList()
+        base = image_base(folder, model) or "images"
+        images, factor, resized = scene.images(base)
+        flat = PurePosixPath(base).name not in IMAGES
+        files = [p for p in list_images(images) if not flat or p.parent == images]
+        paths, notes = _image_paths(scene, images, base, [name for name, *_ in poses.values()], files, str(file))
+        place = model.relative_to(folder).as_posix() if model.is_relative_to(folder) else str(model)
+        if not chosen and (base != "images" or place not in ("sparse/0", "sparse", ".")):
+            chosen = f"cameras taken from {place}, images from {base}"
+        notes, views, missing = [note for note in (chosen, resized) if note] + notes, ViewList(), []
+        named: dict[str, str] = {}  # names of the views by name of the reconstruction
         for name, lens, viewmat in posed_lenses(poses, lenses, file):
-            view = views.claim(view_name(name), f"{file}, image {name!r}")
-            mask = scene.find_mask(paths[name], images)
-            views.add(view, viewmat, scene.image(paths[name], lens, downscale=factor, mask=mask))
-        unposed = len(set(list_images(images)) - set(paths.values()))
+            path = paths[name]
+            view = view_name(path.relative_to(images).as_posix() if _is_absolute(name) and images in path.parents else name)
+            if options.excludes(view):
+                continue
+            if not path.is_file():
+                missing.append(name)
+                continue
+            named[name] = views.claim(view, f"{file}, image {name!r}")
+            mask = scene.find_mask(path, images, images / "masks" if flat else None)
+            views.add(view, viewmat, scene.image(path, lens, downscale=factor, mask=mask))
+        unposed = len(set(files) - set(paths.values()))
         if unposed:
             notes.append(f"{unposed} files in {images.name} have no pose in the reconstruction and are left out")
-        notes += views.notes(options)
-        points_path, points = model / f"points3D.{kind}", None
-        if not points_path.is_file():
-            notes.append(f"{points_path.name} is missing, so there are no points to start from")
-        else:
-            points = read_points(scene.inside(points_path), {n: view_name(p[0]) for n, p in poses.items()})
-            if len(points) == 0:
-                notes.append(f"{points_path.name} holds no points")
-        return self.scene(folder, views.views, notes, points=points, pixels=scene.pixel_source(by_folder=True))
+        notes += missing_note(missing, len(poses), "images", file, options.strict) + views.notes(options)
+        points, more = self._points(scene, model, kind, {n: named[p[0]] for n, p in poses.items() if p[0] in named})
+        pixels = scene.pixel_source(by_folder=True)
+        return self.scene(folder, views.views, notes + more, points=points, pixels=pixels)
+
+    def _points(self, scene: SceneFolder, model: Path, kind: str, names: dict[int, str]) -> tuple[PointCloud | None, list[str]]:
+        """Return the points of a reconstruction, else those of points3D.ply beside it, and notes."""
+        path, ply = model / f"points3D.{kind}", model / "points3D.ply"
+        if path.is_file():
+            points = read_points(scene.inside(path), names)
+            return points, [] if len(points) else [f"{path.name} holds no points"]
+        if ply.is_file():
+            return read_ply_points(scene.inside(ply)), [f"points taken from {ply.name}, because {path.name} is missing"]
+        return None, [f"{path.name} is missing, so there are no points to start from"]

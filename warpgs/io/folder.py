@@ -39,6 +39,8 @@ class Probe:
     """Files of the format that were found, such as ``poses_bounds.npy``, as the subject of a sentence."""
     missing: str = ""
     """Missing files; empty if the folder is complete."""
+    fallback: bool = False
+    """True if other complete formats of the folder come first, whatever the priorities."""
 
 
 class Reader(abc.ABC):
@@ -223,6 +225,7 @@ class SceneFolder:
     def __init__(self, root: Path, options: ReadOptions):
         self.root, self.options = root, options
         self._reduced = False
+        self._base = "images"
         self._maps = GivenMaps(options)
 
     def inside(self, path: Path) -> Path:
@@ -318,13 +321,13 @@ class SceneFolder:
             DataError: There is no image folder, or it is a link that points outside the scene folder.
         """
         downscale, folder = self.options.downscale, self.root / base
-        ready = self.root / f"{base}_{downscale}"
-        if downscale > 1 and ready.is_dir() and list_images(ready):
+        self._base, ready = base, folder.parent / f"{folder.name}_{downscale}"
+        if downscale > 1 and folder != self.root and ready.is_dir() and list_images(ready):
             return self.inside(ready), 1, f"images taken from {ready.name}"
         how = f"area-resampled by {downscale}" if downscale > 1 else ""
         if folder.is_dir() and list_images(folder):
             return self.inside(folder), downscale, how and f"images {how}"
-        sizes = ((p.name[len(base) + 1 :], p) for p in self.root.glob(f"{base}_*"))
+        sizes = ((p.name[len(folder.name) + 1 :], p) for p in folder.parent.glob(f"{folder.name}_*"))
         others = {int(n): p for n, p in sizes if n.isdecimal() and list_images(p)}
         if not others:
             note = unread_note(folder) or "missing, or without images; put the images into it"
@@ -344,7 +347,7 @@ class SceneFolder:
         """
         name, factor = "images", self.options.downscale
         if by_folder:
-            folder, factor, _ = self.images()
+            folder, factor, _ = self.images(self._base)
             name = folder.name
         how = f"area-resampled by {factor}" if factor > 1 else "as stored"
         return f"{name} {how}, {REDUCED}at most {self.options.max_side} px a side" if self._reduced else f"{name} {how}"
@@ -359,6 +362,26 @@ def read_mask(path: Path, keeps: str = "white", max_pixels: int = MAX_PIXELS) ->
 def resampling_note(downscale: int) -> list[str]:
     """Return the note of a format that always resamples its images; an empty list for a factor of 1."""
     return [f"images area-resampled by {downscale}"] if downscale > 1 else []
+
+
+SHOWN = 100
+"""Largest number of names in a note."""
+
+
+def listed(names: list[str]) -> str:
+    """Return names for a note: all of them, or the first of very many."""
+    more = f" and {len(names) - SHOWN} more" if len(names) > SHOWN else ""
+    return f"{', '.join(names[:SHOWN])}{more}"
+
+
+def missing_note(missing: list[str], total: int, noun: str, file: Path, strict: bool) -> list[str]:
+    """Return the note on frames without an image file, which are skipped; a DataError if ``strict``; [] if all have one."""
+    if not missing:
+        return []
+    text = f"{len(missing)} of {total} {noun} have no image file: {listed(missing)}"
+    if strict:
+        raise DataError(f"{file}: {text}. Restore them, or leave out --strict to go on without them")
+    return [f"skipped: {text}"]
 
 
 class ViewList:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from fnmatch import fnmatchcase
 from pathlib import Path
 
 import numpy as np
@@ -50,6 +51,10 @@ class SceneOptions:
     """Factor by which both image sides shrink; None for 1."""
     strict: bool = False
     """Treat a frame without an image file as an error."""
+    reconstruction: str | None = None
+    """Folder of the COLMAP reconstruction inside the scene folder, such as sparse/1. None: the largest at the usual places."""
+    exclude: str | None = None
+    """Images to leave out: names or patterns such as blurry*, with or without folder and suffix, separated by commas."""
     allow_outside: bool = False
     """Allow names and links that point to files outside the scene folder."""
     masks: str = "ignore"
@@ -91,6 +96,19 @@ class ReadOptions(SceneOptions):
     """Largest image side [px], after ``downscale``; 0 for no limit."""
     on_image: Callable[[Path], object] | None = None
     """Called with the file of each image before it is decoded; None for no call."""
+    excluded: list[str] = field(default_factory=list)
+    """Names of the views that ``exclude`` has left out so far."""
+
+    def excludes(self, name: str) -> bool:
+        """Return whether ``exclude`` leaves out the view of this name, and count it then."""
+        out = any(matches(name, pattern) for pattern in self.patterns())
+        if out:
+            self.excluded.append(name)
+        return out
+
+    def patterns(self) -> list[str]:
+        """Return the names and patterns of ``exclude``."""
+        return [p.strip() for p in (self.exclude or "").split(",") if p.strip()]
 
     def __post_init__(self) -> None:
         for name, least, needs in (
@@ -106,6 +124,12 @@ class ReadOptions(SceneOptions):
         unit = self.depth_unit
         if unit is not None and (isinstance(unit, bool) or not isinstance(unit, (int, float)) or not 0 < unit < math.inf):
             raise UsageError(f"--depth-unit must be a finite number above 0, not {unit!r}")
+
+
+def matches(name: str, pattern: str) -> bool:
+    """Return whether a view's name matches a name or glob pattern, whole or by its end, with suffix or without."""
+    end = "/".join(name.split("/")[-1 - pattern.count("/") :])
+    return any(n == pattern or fnmatchcase(n, pattern) for n in (name, end, end.rpartition(".")[0]))
 
 
 CHOICES = {

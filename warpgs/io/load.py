@@ -22,11 +22,12 @@ from warpgs.io.folder import (
     all_readers,
     find_reader,
     image_ids,
+    listed,
     named_by_dtu,
     protocol_ids,
 )
 from warpgs.io.image_files import MAX_PIXELS, READ, unread_note
-from warpgs.io.images import ReadOptions, SceneOptions, cut_from_black, image_scale, list_images
+from warpgs.io.images import ReadOptions, SceneOptions, cut_from_black, image_scale, list_images, matches
 from warpgs.io.maps import check_found
 from warpgs.scene import Normalization, PointCloud, Scene, View, checked_scene
 
@@ -169,6 +170,15 @@ def _blender(names: list[str], count: int, spec: str) -> Split:
     return Split(tuple(train[i] for i in BLENDER_TRAIN), tuple(test[::8]))
 
 
+def _nearest(names: list[str], wanted: str) -> str:
+    """Return up to three names that resemble a wanted one, for messages."""
+    paths = {n: PurePosixPath(n) for n in names}
+    forms = {f: n for n, p in paths.items() for f in (p.stem, p.name, str(p.with_suffix("")), n)}
+    short = [f for f in forms if len(f) <= MAX_COMPARED]  # the comparison takes the product of both lengths
+    near = dict.fromkeys(forms[f] for f in difflib.get_close_matches(wanted[:MAX_COMPARED], short, 4, 0.3))
+    return ", ".join(list(near)[:3] or names[:3])
+
+
 def _finder(names: list[str], spec: str) -> Callable[[str], str]:
     """Return a function that finds views by name or name end, with suffix or without; the strictest kind of match decides."""
     bare = {n: str(PurePosixPath(n).with_suffix("")) for n in names}
@@ -191,11 +201,7 @@ def _finder(names: list[str], spec: str) -> Callable[[str], str]:
                     return matches[0]
                 if matches:
                     raise DataError(f"split {spec}: {wanted!r} could be any of {', '.join(matches[:5])}; give the whole name")
-        forms = {f: n for n in names for f in (PurePosixPath(n).stem, PurePosixPath(n).name, bare[n], n)}
-        short = [f for f in forms if len(f) <= MAX_COMPARED]  # the comparison takes the product of both lengths
-        near = dict.fromkeys(forms[f] for f in difflib.get_close_matches(wanted[:MAX_COMPARED], short, 4, 0.3))
-        some = ", ".join(list(near)[:3] or names[:3])
-        raise DataError(f"split {spec}: no view {wanted!r}; the nearest names are {some}")
+        raise DataError(f"split {spec}: no view {wanted!r}; the nearest names are {_nearest(names, wanted)}")
 
     return find
 
@@ -352,6 +358,8 @@ def load_scene(
     downscale: int | None = None,
     max_side: int | None = None,
     strict: bool = False,
+    reconstruction: str | None = None,
+    exclude: str | None = None,
     allow_outside: bool = False,
     masks: str = "ignore",
     mask_keeps: str = "white",
@@ -379,6 +387,10 @@ def load_scene(
         max_side: Largest image side [px], 0 for no limit; larger images are reduced to it, and the intrinsics with them. None
             means 1600 if ``downscale`` is None, too, and no limit otherwise.
         strict: True to treat a frame without an image file as an error instead of a note.
+        reconstruction: Folder of the COLMAP reconstruction inside the scene folder, such as ``sparse/1``. None for the largest
+            one at the usual places (docs/scenes.md).
+        exclude: Images to leave out: names or patterns such as ``blurry*``, with or without folder and suffix, separated by
+            commas.
         allow_outside: True to allow names and links that point to files outside the scene folder.
         masks: Treatment of masked-out pixels: ignore (left out of fit and scores) or cutout (transparent, gray pixels partly:
             `View.alpha`).
@@ -411,7 +423,8 @@ def load_scene(
     """
     folders = {name: None if p is None else str(p) for name, p in (("depths", depths), ("normals", normals))}
     options = SceneOptions(
-        downscale=downscale, max_side=max_side, strict=strict, allow_outside=allow_outside, masks=masks, mask_keeps=mask_keeps,
+        downscale=downscale, max_side=max_side, strict=strict, reconstruction=reconstruction, exclude=exclude,
+        allow_outside=allow_outside, masks=masks, mask_keeps=mask_keeps,
         black_is_empty=black_is_empty, score_masks=None if score_masks is None else str(score_masks), max_pixels=max_pixels,
         lenses=lenses, depth_kind=depth_kind, depth_unit=depth_unit, normal_axes=normal_axes, **folders,
     )  # fmt: skip
@@ -438,7 +451,12 @@ def read_folder(
             fix = "give a folder of photographs, or of images with their cameras"
             found = f"is a file; {fix}" if root.is_file() else f"no such folder; {similar_folder(root) or fix}"
             raise DataError(f"{root}: {found}")
-        chosen, notes = detect(root) if reader is None else (_accepted(root, find_reader(reader)), [])
+        if checked.reconstruction is None:
+            chosen, notes = detect(root) if reader is None else (_accepted(root, find_reader(reader)), [])
+        elif reader in (None, "colmap"):
+            chosen, notes = find_reader("colmap"), []
+        else:
+            raise UsageError("--reconstruction requires a COLMAP scene; leave it out, or give --reader colmap")
         return _finished(root, chosen, chosen.read(root, checked), notes, checked)
     except OSError as e:
         # folders without permission, names too long for the file system, disks that fail
@@ -449,7 +467,7 @@ def detect(root: Path) -> tuple[Reader, list[str]]:
     """Return the reader of the first complete format of a scene folder, and notes on the formats passed over."""
     readers = all_readers()
     found = [(r, p) for r in readers if (p := r.probe(root)) is not None]
-    complete = [r for r, p in found if not p.missing]
+    complete = [r for r, p in sorted(found, key=lambda row: row[1].fallback) if not p.missing]
     broken = [f"{p.found} lacks {p.missing}" for _, p in found if p.missing]
     if not complete and broken:
         raise DataError(f"{root}: {broken[0]}, and no other format was found. Copy the whole reconstruction")
@@ -481,6 +499,17 @@ def _accepted(root: Path, reader: Reader) -> Reader:
     return reader
 
 
+def _exclusions(options: ReadOptions, names: list[str]) -> list[str]:
+    """Return the note on views that `--exclude` left out; DataError for a pattern without a view, with similar ``names``."""
+    out = options.excluded
+    for pattern in options.patterns():
+        if not any(matches(name, pattern) for name in out):
+            raise DataError(
+                f"--exclude {pattern[:80]}: no view has this name; the nearest names are {_nearest(names, pattern)}"
+            )
+    return [f"left out by --exclude: {len(out)} image{'s' if len(out) != 1 else ''}: {listed(out)}"] if out else []
+
+
 def _finished(root: Path, reader: Reader, scene: Scene, notes: list[str], options: ReadOptions) -> Scene:
     """Check a scene that a reader returned; return it sorted, in scene coordinates, with score masks and fingerprint."""
     own = f"the reader {reader.name} must return a Scene in file coordinates, without a Normalization; fix it"
@@ -489,7 +518,8 @@ def _finished(root: Path, reader: Reader, scene: Scene, notes: list[str], option
     scene = checked_scene(scene, f"{root}, ")
     if scene.normalization.scale != 1 or scene.normalization.offset.any():
         raise UsageError(own)
-    views, points, more = list(scene.views), scene.points, scene.notes
+    views, points, more = [v for v in scene.views if not options.excludes(v.name)], scene.points, scene.notes
+    more = (*more, *_exclusions(options, [v.name for v in views]))
     if len(views) < 2:
         reasons = f" ({'; '.join(more)})" if more else ""
         raise DataError(

@@ -73,6 +73,8 @@ class LLFFReader(Reader):
         views = ViewList()
         for file, row in zip(files, rows):
             name = file.relative_to(images).as_posix()
+            if options.excludes(name):
+                continue
             where = f"{path}, image {name!r}"
             matrix = row[:15].reshape(3, 5)
             height, width, focal = matrix[:, 4].tolist()
@@ -201,6 +203,8 @@ class DTUReader(Reader):
         masks, views = _masks(folder, files), ViewList()
         for i, file in enumerate(files):
             name = file.relative_to(images).as_posix()
+            if options.excludes(name):
+                continue
             where = f"{path}, image {name!r}"
             world, scale = matrices.get(f"world_mat_{i}"), matrices.get(f"scale_mat_{i}", np.eye(4))
             if world is None:
@@ -271,6 +275,8 @@ class MiddleburyReader(Reader):
         notes = [f"cameras taken from {path.name}; {', '.join(p.name for p in others)} ignored"] if others else []
         scene, views = SceneFolder(folder, options), ViewList()
         for number, name, values in read_camera_rows(scene.inside(path)):
+            if options.excludes(view_name(name)):
+                continue
             where = f"{path}, line {number}, image {name!r}"
             K, viewmat = _centred(values[:9].reshape(3, 3).copy(), where), np.eye(4)
             if not np.allclose(K[[1, 2, 2, 2], [0, 0, 1, 2]], (0, 0, 0, 1)):

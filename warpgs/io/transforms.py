@@ -13,6 +13,7 @@ import numpy as np
 
 from warpgs.errors import DataError
 from warpgs.files import read_file
+from warpgs.geometry import matmul, seen_pixels
 from warpgs.io import colmap
 from warpgs.io.folder import (
     Probe,
@@ -20,6 +21,7 @@ from warpgs.io.folder import (
     SceneFolder,
     ViewList,
     from_camera_to_world,
+    missing_note,
     register,
     resampling_note,
     view_name_of,
@@ -27,7 +29,7 @@ from warpgs.io.folder import (
 from warpgs.io.images import BLACK, SUFFIXES, Lens, ReadOptions
 from warpgs.io.maps import SUFFIXES as MAPS
 from warpgs.io.maps import NamedMaps
-from warpgs.scene import Camera, Scene
+from warpgs.scene import Camera, PointCloud, Scene, View
 from warpgs.schema import SchemaError, check_depth, check_parts
 
 BLENDER_FILES = tuple(f"transforms_{split}.json" for split in ("train", "val", "test"))
@@ -175,6 +177,52 @@ def _named_maps(scene: SceneFolder, folder: Path, shared: dict, frame: dict, whe
     return NamedMaps(path("depth_file_path", "depths"), path("normal_file_path", "normals"), unit)
 
 
+def _points(scene: SceneFolder, file: Path, shared: dict, views: list[View]) -> tuple[PointCloud | None, str]:
+    """Return the points that the file names, in the coordinates of its cameras, and a note.
+
+    The cameras include ``applied_transform``. nerfstudio's first versions stored points without it, later ones with it, under
+    the same keys; so the form whose colours agree with the images is taken, and the later one in doubt.
+    """
+    where, name = f"{file}, ply_file_path", shared["ply_file_path"]
+    try:
+        path = scene.inside(scene.child(file.parent, name, where, root=scene.root))
+    except DataError as e:
+        return None, f"no points to start from: {e}"
+    if not path.is_file():
+        return None, f"{str(name)[:80]} is missing, so there are no points to start from"
+    points = colmap.read_ply_points(path)
+    if shared.get("applied_transform") is None or not len(points):
+        return points, f"points taken from {path.name}"
+    matrix = matrix_of({"transform_matrix": shared["applied_transform"]}, f"{file}, applied_transform")[:3]
+    try:
+        scale = _number({}, shared, "applied_scale")
+    except ValueError as e:
+        raise DataError(f"{file}: {e}") from e
+    moved = (1.0 if scale is None else scale) * (matmul(points.points, matrix[:, :3].T) + matrix[:, 3])
+    other = PointCloud(moved, points.colors)
+    if _disagreement(other, views) < CLEARLY * _disagreement(points, views):
+        return other, f"points taken from {path.name}, moved by applied_transform, since the colours of the images agree then"
+    return points, f"points taken from {path.name}, without applied_transform, since the colours of the images agree so"
+
+
+CLEARLY = 0.8
+"""Largest ratio of two disagreements that decides: they differ by a factor of 2 to 5 if only one fits."""
+COMPARED_VIEWS, COMPARED_POINTS = 16, 2000
+"""Largest numbers of views and of points whose colours are compared."""
+
+
+def _disagreement(points: PointCloud, views: list[View]) -> float:
+    """Return the mean difference of the points' colours from the images, 0 to 1; a point outside of an image counts as 1."""
+    some = slice(None, None, max(1, len(points) // COMPARED_POINTS))
+    positions, colors = points.points[some], points.colors[some]
+    errors = []
+    for view in views[:: max(1, len(views) // COMPARED_VIEWS)]:
+        seen, rows, columns, _ = seen_pixels(view.camera, positions)
+        near = np.abs(view.image[rows, columns] - colors[seen]).mean(1).sum() if len(seen) else 0.0
+        errors.append((near + len(positions) - len(seen)) / len(positions))
+    return float(np.mean(errors)) if errors else 0.0
+
+
 @register("transforms")
 class TransformsReader(Reader):
     """Scenes with transforms.json, or Blender's transforms_train/val/test.json.
@@ -196,7 +244,7 @@ class TransformsReader(Reader):
         background = WHITE if is_blender(folder) else BLACK
         scene, views, notes = SceneFolder(folder, options), ViewList(), []
         missing: list[str] = []
-        total = 0
+        total, points = 0, None
         for file in files_of(folder):
             shared = read_json(scene.inside(file))
             total += len(shared["frames"])
@@ -205,6 +253,8 @@ class TransformsReader(Reader):
                 if not isinstance(frame, dict):
                     raise DataError(f"{where}: expected an object with file_path and transform_matrix; write the file again")
                 path = _image_path(scene, file.parent, frame.get("file_path"), where)
+                if options.excludes(view_name_of(path, folder)):
+                    continue
                 if not path.is_file():
                     missing.append(str(frame["file_path"]))
                     continue
@@ -219,18 +269,14 @@ class TransformsReader(Reader):
                 named = _named_maps(scene, file.parent, shared, frame, where)
                 views.add(name, viewmat, scene.image(path, lens, mask=mask, background=background, named=named))
             if shared.get("ply_file_path"):
-                notes.append(f"the points in {str(shared['ply_file_path'])[:80]} are not read")
-        if missing:
-            some = f"{', '.join(missing[:5])}{' ...' if len(missing) > 5 else ''}"
-            text = f"{len(missing)} of {total} frames have no image file: {some}"
-            if options.strict:
-                raise DataError(f"{files_of(folder)[0]}: {text}. Restore them, or leave out --strict to go on without them")
-            notes.append(f"skipped: {text}")
+                points, note = _points(scene, file, shared, views.views)
+                notes.append(note)
+        notes += missing_note(missing, total, "frames", files_of(folder)[0], options.strict)
         if outside := sum(v.name.startswith("outside/") for v in views.views):
             notes.append(f"{outside} images are outside the scene folder; their views are named outside/...")
         notes += resampling_note(options.downscale) + views.notes(options)
         pixels = scene.pixel_source(by_folder=False)
-        return self.scene(folder, views.views, notes, background=background, pixels=pixels)
+        return self.scene(folder, views.views, notes, background=background, pixels=pixels, points=points)
 
 
 Row = tuple[str, np.ndarray, Lens]
@@ -295,7 +341,7 @@ def _transforms(path: Path) -> Iterator[Row]:
 
 def colmap_folder(folder: Path) -> tuple[Path, str, list[str]] | None:
     """Return the `colmap.reconstruction` in a scene folder, sparse or sparse/0; None without one."""
-    return colmap.reconstruction(folder) or colmap.reconstruction(folder / "0")
+    return colmap.reconstruction(folder)[0] or colmap.reconstruction(folder / "0")[0]
 
 
 def _colmap(folder: Path) -> Iterator[Row]:

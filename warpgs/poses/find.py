@@ -35,6 +35,7 @@ from warpgs.poses.photographs import (
     image_root,
     is_heic,
     is_video,
+    models_below,
     photographs_inside,
     prepare,
     to_jpeg,
@@ -307,7 +308,11 @@ def _something_else(folder: Path) -> str:
     """Return a message on a folder of a run or of scenes, with the fix; empty for a folder that may hold photographs."""
     if (folder / "config.json").is_file() and (folder / "renders").is_dir():
         return "is the folder of a run; give the scene that it was fitted to"
-    scenes = [d.name for d in sorted(folder.iterdir()) if d.is_dir() and any(r.probe(d) is not None for r in all_readers())]
+    probes = {d.name: [p for r in all_readers() if (p := r.probe(d))] for d in sorted(folder.iterdir()) if d.is_dir()}
+    scenes = [name for name, found in probes.items() if found]
+    if model := next((m for m in models_below(folder) if all(p.missing for p in probes[m.parts[0]])), None):
+        use = f"`warpgs fit {folder} --reconstruction {model.as_posix()}` uses its poses; move it away to find new ones"
+        return f"holds a COLMAP reconstruction in {model.as_posix()}: {use}"
     if scenes:
         return f"holds scenes, such as {scenes[0]}; give one scene, or only photographs, or use `warpgs farm` for all"
     return ""

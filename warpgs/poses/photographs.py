@@ -306,6 +306,15 @@ def _is_run(folder: Path) -> bool:
     return (folder / "config.json").is_file() and any((folder / name).is_file() for name in RUN_FILES)
 
 
+def models_below(folder: Path) -> Iterator[Path]:
+    """Yield the folders below ``folder`` with a COLMAP reconstruction, relative to it, without those of earlier runs."""
+    is_run = functools.cache(_is_run)
+    for file in sorted(folder.rglob("images.*")):
+        pair = file.suffix in (".bin", ".txt") and file.with_name(f"cameras{file.suffix}").is_file()
+        if pair and file.parent != folder and not any(is_run(p) for p in file.parents if folder in p.parents):
+            yield file.parent.relative_to(folder)
+
+
 def find_photographs(folder: Path) -> tuple[list[Path], list[str]]:
     """Return the image files of a folder by name, without masks and earlier runs, and notes on these runs and on subfolders."""
     root = image_root(folder)

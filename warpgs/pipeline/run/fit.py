@@ -273,7 +273,7 @@ def with_poses(
 ) -> tuple[SceneRequest, list[str]]:
     """Find the poses of photographs without cameras, or read them from the run folder ``out``; returns request and notes."""
     source = Path(request.path)
-    if request.reader is not None or not request.path or not needs_poses(source):
+    if request.reader is not None or request.reconstruction is not None or not request.path or not needs_poses(source):
         if request.matcher is not None:
             raise UsageError(f"--matcher requires a folder of photographs without cameras; leave it out for {source}")
         return request, []
