@@ -20,7 +20,7 @@ from warpgs.export.base import read_gaussians, write_gaussians
 from warpgs.export.meshes_and_cameras import NAMES, write_cameras
 from warpgs.export.ply import read_ply
 from warpgs.files import make_folder
-from warpgs.geometry import look_at, rotation_matrices
+from warpgs.geometry import harmonics, harmonics_rotation, look_at, rotate, rotation_matrices
 from warpgs.io.transforms import read_cameras
 from warpgs.kernels.sh import basis
 from warpgs.pipeline.films.film import FilmSettings
@@ -29,7 +29,6 @@ from warpgs.pipeline.model.edit import (
     box_of,
     disturbing,
     drop_unused_sh,
-    harmonics_rotation,
     inside,
     keep_last,
     largest_fraction,
@@ -37,7 +36,6 @@ from warpgs.pipeline.model.edit import (
     limit_degree,
     needed_degrees,
     prune_order,
-    rotate,
     rotation_about,
     rows_of,
     stored_degrees,
@@ -389,10 +387,11 @@ def covariances(g):
     return axes @ torch.diag_embed((2 * g.log_scales.double()).exp()) @ axes.mT
 
 
-@pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_colours_and_shapes_turn_with_the_scene(degree):
+@pytest.mark.parametrize("matrix", [TURN, TURN * [-1, 1, 1]], ids=["rotation", "reflection"])
+@pytest.mark.parametrize("degree", [0, 1, 2, 3, 4])
+def test_colours_and_shapes_turn_with_the_scene(degree, matrix):
     made = cloud(40, degree=degree)
-    turned, turn = rotate(made, TURN), torch.from_numpy(TURN)
+    turned, turn = rotate(made, matrix), torch.from_numpy(matrix)
     d = torch.nn.functional.normalize(torch.randn(9, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(2)), dim=1)
     k = made.sh.shape[1]
     before = torch.einsum("dk,nkc->dnc", basis(d)[:, :k], made.sh.double())
@@ -403,6 +402,8 @@ def test_colours_and_shapes_turn_with_the_scene(degree):
 
 
 def test_rotations_of_harmonics_are_orthogonal_and_compose():
+    d = torch.nn.functional.normalize(torch.randn(9, 3, dtype=torch.float64), dim=1)
+    assert np.allclose(harmonics(d.numpy()), basis(d), atol=1e-14)
     first, second = harmonics_rotation(TURN), harmonics_rotation(TURN @ TURN)
     assert torch.allclose(first @ first.T, torch.eye(25, dtype=torch.float64), atol=1e-13)
     assert torch.allclose(first @ first, second, atol=1e-13)

@@ -13,8 +13,8 @@ from tests.reference.blend import blend_reference
 from tests.reference.project import project_reference, rotations
 from tests.tolerances import close
 from warpgs.errors import UsageError
-from warpgs.geometry import gaussian_normals, rotation_matrices
-from warpgs.pipeline.model.edit import rotate, rotation_about
+from warpgs.geometry import gaussian_normals, rotate, rotation_matrices
+from warpgs.pipeline.model.edit import rotation_about
 from warpgs.render.options import RasterizeOptions
 from warpgs.render.rasterize import rasterize
 from warpgs.scene import ActivatedGaussians, CovarianceGaussians

@@ -16,7 +16,7 @@ from warpgs.device import format_bytes
 from warpgs.errors import DataError, UsageError
 from warpgs.export.base import Format, find_format, format_of, read_with_antialiasing, write_gaussians
 from warpgs.export.meshes_and_cameras import check_suffix, holds_cameras, write_cameras, write_mesh
-from warpgs.geometry import convert_gaussians, convert_mesh, matmul
+from warpgs.geometry import convert_gaussians, convert_mesh, matmul, rotate
 from warpgs.io.transforms import read_cameras
 from warpgs.kernels.neighbours import morton_codes
 from warpgs.locks import hold_file
@@ -30,7 +30,6 @@ from warpgs.pipeline.model.edit import (
     inside,
     levelling,
     limit_degree,
-    rotate,
     rotation_about,
     select,
 )
