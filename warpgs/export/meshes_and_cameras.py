@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from warpgs.errors import DataError, UsageError
-from warpgs.export.gltf import glb
+from warpgs.export.gltf import glb, linear
 from warpgs.files import filling, is_empty, make_folder, write_bytes, write_json, write_text
 from warpgs.geometry import pinhole_of, quaternions
 from warpgs.scene import Camera, Mesh
@@ -54,12 +54,6 @@ def _ply(mesh: Mesh) -> list[bytes]:
     faces = np.empty(len(mesh.faces), [("count", "u1"), ("vertices", "<i4", 3)])
     faces["count"], faces["vertices"] = 3, mesh.faces
     return [header.encode("ascii"), vertices.tobytes(), faces.tobytes()]
-
-
-def linear(colors: np.ndarray) -> np.ndarray:
-    """Return sRGB colours in [0, 1] as linear colours (IEC 61966-2-1), which glTF stores; the shape is unchanged."""
-    c = np.clip(colors.astype(np.float64), 0, 1)
-    return np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)
 
 
 def rotation_to_y(up: np.ndarray) -> list[float]:

@@ -87,8 +87,8 @@ def open_file(
             )
     # the unit stays that of the file, since the near plane of a rule is in that unit
     normalization = Normalization(np.mean([c.center for c in found.values()], axis=0))
-    gaussians, declared = read_with_antialiasing(path, normalization, "scene")
-    gaussians = gaussians.to(where)
+    gaussians, declared, lost = read_with_antialiasing(path, normalization, "scene")
+    gaussians, notes = gaussians.to(where), [*notes, *lost]
     notes += [note] if (note := format_of(path).note) else []
     if declared:
         notes.append(f"{path.name} declares an antialiased model; renders use a pixel filter of {LOW_PASS:g} px²")

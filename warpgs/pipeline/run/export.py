@@ -154,8 +154,8 @@ def convert(
         )
     read, kind = (format_of(p, next((f for f in given if f.fits(p)), None)) for p in (source, target))
     rotation_of(filters.rotate, None)  # before anything is read
-    gaussians, antialiased = read_with_antialiasing(source, None, "file", read)
-    lines = _written(gaussians, None, target, kind, filters, antialiased)
+    gaussians, antialiased, notes = read_with_antialiasing(source, None, "file", read)
+    lines = [*notes, *_written(gaussians, None, target, kind, filters, antialiased)]
     return [read.note, *lines] if read.note and not kind.note else lines
 
 
@@ -202,7 +202,7 @@ def _written(
 
 def _changes(target: Path, gaussians: Gaussians, kind: Format) -> list[str]:
     """Return a line on the rounding errors of the format, measured on the file; none for a format in float32."""
-    back, _ = read_with_antialiasing(target, None, "file", kind)
+    back, *_ = read_with_antialiasing(target, None, "file", kind)
     moved = float((back.means.double() - gaussians.means.double()).abs().max())
     scales = (back.log_scales.double() - gaussians.log_scales.double()).abs().amax(1)
     if moved == 0 and float(scales.max()) < ROUNDING:
