@@ -32,7 +32,10 @@ Arrays = dict[str, np.ndarray]
 SH_SIZES = (1, 4, 9, 16)
 """Numbers of spherical-harmonics coefficients of degrees 0 to 3."""
 SQRT2 = 1.4142135623730951
-_AXES = ("", "y", "z", "x", "xy", "yz", "", "xz", "", "y", "xyz", "y", "z", "x", "z", "x")
+_AXES = (
+    "", "y", "z", "x", "xy", "yz", "", "xz", "", "y", "xyz", "y", "z", "x", "z", "x",
+    "xy", "yz", "xy", "yz", "", "xz", "", "xz", "",
+)  # fmt: skip
 """Axes that flip the sign of each harmonic, in the order of docs/sh.md."""
 
 
