@@ -590,10 +590,10 @@ def rotate(gaussians: Gaussians, rotation: np.ndarray) -> Gaussians:
     """
     import torch
 
-    like = {"dtype": torch.float64, "device": gaussians.means.device}
-    turn = torch.tensor(np.asarray(rotation), **like)
+    device = gaussians.means.device
+    turn = torch.tensor(np.asarray(rotation), dtype=torch.float64, device=device)
     k = gaussians.sh.shape[1]
-    coefficients = harmonics_rotation(rotation).to(like["device"])[:k, :k]
+    coefficients = harmonics_rotation(rotation).to(device)[:k, :k]
     quats = torch.nn.functional.normalize(gaussians.quats.double(), dim=1)
     proper = turn if np.linalg.det(rotation) > 0 else -turn
     turned = torch.einsum("ij,njk->nik", proper, torch.as_tensor(rotation_matrices(quats)))

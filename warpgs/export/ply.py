@@ -514,7 +514,8 @@ def _assemble(
     k = rest // 3
     shapes = {"means": (3,), "quats": (4,), "log_scales": (3,), "logit_opacities": (), "sh": (1 + k, 3)}
     arrays = {name: np.empty((n, *shape), np.float32) for name, shape in shapes.items()}
-    bad, reasons = np.zeros(n, bool), []
+    bad = np.zeros(n, bool)
+    reasons: list[str] = []
     for part in parts(n):
         rows = read(part)
 

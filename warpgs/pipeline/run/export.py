@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 import shlex
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -35,7 +35,7 @@ from warpgs.pipeline.model.edit import (
 )
 from warpgs.pipeline.run.folder import CONFIG, StoredRun, open_run
 from warpgs.pipeline.run.request import choose_device
-from warpgs.scene import Camera, Gaussians
+from warpgs.scene import Camera, Gaussians, base_colors
 
 
 @dataclass(frozen=True)
@@ -133,6 +133,8 @@ def rotate_camera(camera: Camera, rotation: np.ndarray) -> Camera:
     return replace(camera, viewmat=viewmat)
 
 
+MAX_POINTS = 100_000
+"""Largest number of points that COLMAP's files get: as many as a reconstruction of some hundred photographs."""
 ROUNDING = 1e-4
 """Smallest change of a log scale that is reported: a hundredth of a percent."""
 
@@ -144,7 +146,7 @@ def convert(
     if holds_cameras(target):
         _check_for_cameras(filters, formats)
         found, notes = read_cameras(source)
-        return [*notes, *_cameras_written(list(found.values()), list(found.values()), target, filters)]
+        return [*notes, *_cameras_written(found, list(found.values()), target, filters)]
     given = [find_format(f) for f in formats]
     for unused in (f for f in given if not (f.fits(source) or f.fits(target))):
         format_of(target, unused)  # says that its name is another
@@ -160,13 +162,17 @@ def convert(
 
 
 def export(
-    folder: Path, target: Path, filters: Filters = NO_FILTERS, format: str | type[Format] | Format | None = None
-) -> list[str]:
+    folder: Path, target: Path, filters: Filters = NO_FILTERS, format: str | type[Format] | Format | None = None,
+    keep_names: bool = False,
+) -> list[str]:  # fmt: skip
     """Write a run's Gaussians, or its cameras, in file units, in the format of the suffix; returns lines for the user."""
     if holds_cameras(target):
         _check_for_cameras(filters, () if format is None else (format,))
         stored = open_run(folder, torch.device("cpu"))
-        return _cameras_written(list(stored.cameras("file").values()), training_cameras(stored), target, filters)
+        level = training_cameras(stored)
+        return _cameras_written(stored.cameras("file"), level, target, filters, keep_names, file_gaussians(stored))
+    if keep_names:
+        raise UsageError(f"{target}: --keep-names requires cameras; name the file cameras.json, transforms.json or sparse")
     kind = format_of(target, format)
     stored = open_run(folder, torch.device("cpu"))
     return _written(file_gaussians(stored), stored, target, kind, filters, stored.antialiased)
@@ -220,17 +226,34 @@ def _check_for_cameras(filters: Filters, formats: Sequence[object]) -> None:
         raise UsageError("--crop, --clean and --sh-degree do not apply to cameras; use --rotate only")
 
 
-def _cameras_written(cameras: list[Camera], level: list[Camera], target: Path, filters: Filters) -> list[str]:
-    """Rotate cameras in file units, and write them; ``level`` are the cameras that define up. Returns lines for the user."""
-    rotation, lines = rotation_of(filters.rotate, level), []
+def _cameras_written(
+    named: Mapping[str, Camera], level: list[Camera], target: Path, filters: Filters, keep_names: bool = False,
+    gaussians: Gaussians | None = None,
+) -> list[str]:  # fmt: skip
+    """Rotate cameras in file units, and write them; ``level`` are the cameras that define up. Returns lines for the user.
+
+    The most opaque of the Gaussians become COLMAP's points.
+    """
+    rotation, lines, points, cameras = rotation_of(filters.rotate, level), [], None, list(named.values())
     if rotation is not None:
         cameras = [rotate_camera(c, rotation) for c in cameras]
         lines.append(turned_line(rotation))
+    if gaussians is not None and target.name == "sparse":
+        shown = gaussians.logit_opacities.argsort(descending=True, stable=True)[:MAX_POINTS]
+        turned = gaussians if rotation is None else rotate(gaussians, rotation)
+        points = turned.means[shown].numpy(), base_colors(gaussians.sh[shown]).numpy()
+        lines.append(
+            f"points3D.txt has the positions and colours of {len(shown):,} Gaussians, for trainers that start from points"
+        )
     with hold_file(target) as notes:
-        lines += write_cameras(target, cameras)
+        lines += write_cameras(target, cameras, list(named) if keep_names else None, points)
     sizes = sorted({(c.width, c.height) for c in cameras})
     some = ", ".join(f"{w} x {h}" for w, h in sizes[:3]) + (" ..." if len(sizes) > 3 else "")
-    return [*notes, *lines, f"{len(cameras):,} cameras for images of {some} px in {target}; their names are numbers"]
+    return [
+        *notes,
+        *lines,
+        f"{len(cameras):,} cameras for images of {some} px in {target}; their names are {'kept' if keep_names else 'numbers'}",
+    ]
 
 
 def mesh(
