@@ -516,6 +516,15 @@ def test_nodes_place_gaussians(nodes, roots, wanted, tmp_path):
     assert len(back) == 5 * len(wanted)
 
 
+def test_rotations_of_zero_length_stay(tmp_path):
+    """A turned model still tells which Gaussians have no rotation."""
+    made = arrays_of(model(5, 1))
+    made["quats"][2] = 0
+    base.transform_in_place(made, placed(TURN)[:3, :3], np.zeros(3))
+    with pytest.raises(DataError, match="the rotation of Gaussian 2 has zero length"):
+        gaussians_of(tmp_path, made)
+
+
 def test_integers_and_points_of_gltf(tmp_path):
     """Scales and positions may be plain integers; programs without Gaussians show points in linear colours, with opacities."""
     path, made = tmp_path / "a.glb", arrays_of(model(5, 1))

@@ -62,6 +62,7 @@ from warpgs.render.options import RasterizeOptions
 from warpgs.render.rasterize import rasterize
 from warpgs.scene import Camera, Gaussians, PointCloud
 from warpgs.synthetic.demo import split_spec, write_demo
+from warpgs.viewer.window import content_of_file
 
 # The table of what training learns: everything that goes by row stays together, whatever happens to the rows.
 
@@ -784,6 +785,17 @@ def test_a_file_shows_what_it_held(rule, tmp_path):
         image = rasterize(model.gaussians(), torch_camera(there)).rgb
         want = rasterize(made, torch_camera(c)).rgb
         assert float((image - want).abs().max()) < 1e-3 and float(want.max()) > 0.1
+
+
+def test_commands_count_what_a_file_loses(tmp_path, capsys):
+    """Renders and the viewer, as an export does."""
+    path = tmp_path / "a.splat"
+    write_gaussians(path, cloud(50), units="file")
+    path.write_bytes(np.array([np.nan], "<f4").tobytes() + path.read_bytes()[4:])
+    write_cameras(tmp_path / "cameras.json", make_cameras())
+    model, notes = open_file(path, tmp_path / "cameras.json", "inria", "cpu")
+    assert len(model.gaussians()) == 49 and any("1 of 50 Gaussians left out" in note for note in notes)
+    assert len(content_of_file(path).model.gaussians()) == 49 and "1 of 50 Gaussians left out" in capsys.readouterr().out
 
 
 def test_a_file_renders_antialiased(tmp_path):
