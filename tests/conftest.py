@@ -70,6 +70,16 @@ def dtype(request) -> torch.dtype:
     return request.param
 
 
+@pytest.fixture
+def browser(tmp_path, request):
+    """Return a headless Chromium, with the ``GRAPHICS`` of the test's module if it has some; skips where none is installed."""
+    from tests.viewer.chromium import Chromium
+
+    opened = Chromium(tmp_path, *getattr(request.module, "GRAPHICS", ()))
+    yield opened
+    opened.close()
+
+
 @pytest.fixture(autouse=True, scope="session")
 def no_overview_in_reports():
     """Leave the 3D overview out of reports, for speed; tests/report/test_overview.py looks at it."""

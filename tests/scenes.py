@@ -84,16 +84,7 @@ def textured_photos(
     colour: Callable[[np.ndarray, np.ndarray, float], np.ndarray], count: int = 4, width: int = 96, height: int = 72,
     half: tuple[float, float] = HALF, cameras=None,
 ) -> list[View]:  # fmt: skip
-    """Views of a card on black.
-
-    Args:
-        colour: Colours [..., 3] from x and y on the card [u] and the camera's place on the arc, -1 to 1.
-        count: Number of views.
-        width: Of the pictures [px].
-        height: Of the pictures [px].
-        half: Half width and height of the card [u].
-        cameras: Instead of those of `ring`.
-    """
+    """Views of a card on black; ``colour`` takes x, y on the card [u] and the camera's place on the arc, -1 to 1."""
     cameras = ring(count, width, height) if cameras is None else cameras
     views = []
     for i, c in enumerate(cameras):

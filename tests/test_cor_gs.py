@@ -72,14 +72,6 @@ def advanced(trainer: Trainer, until: int) -> Trainer:
     return trainer
 
 
-def test_distances_are_to_the_nearest_other_point(module, monkeypatch):
-    """Also where they do not fit into one chunk."""
-    points, others = torch.rand(7, 3), torch.rand(5, 3)
-    wanted = torch.stack([(others - p).norm(dim=1).min() for p in points])
-    monkeypatch.setattr(module, "CHUNK", 11)
-    torch.testing.assert_close(module.nearest(points, others), wanted)
-
-
 def test_a_continued_fit_equals_an_uninterrupted_one(module):
     """Both models, bit for bit: their Gaussians, moments and statistics, and the random cameras to come."""
     whole, half = advanced(fit(module), 10), advanced(fit(module), 5)

@@ -28,7 +28,6 @@ number = 3
 
 @pytest.fixture
 def registry(monkeypatch) -> Registry:
-    """That of strategies, without what a test adds to it."""
     STRATEGIES.names()
     monkeypatch.setattr(STRATEGIES, "_classes", dict(STRATEGIES._classes))
     return STRATEGIES
@@ -46,22 +45,16 @@ def own(tmp_path, monkeypatch):
 
 
 def test_registered_classes_are_found_by_name(registry):
-    """A decorator names a class; a class stands for itself; names are sorted."""
-
     @registry.register("zeta")
     class Zeta(Strategy):
         pass
 
     registry.register("alpha")(type("Alpha", (Strategy,), {}))
+    assert registry.load("clone_split") is registry.find("clone_split")
     assert registry.find("zeta") is Zeta and Zeta.name == "zeta" and registry.find(Zeta) is Zeta
-    assert registry.names() == sorted(registry.names()) and {"alpha", "zeta"} <= set(registry.names())
-
-
-def test_ours_are_found_without_being_named_anywhere():
-    """Every module of the folder is imported; a name is the class's own."""
-    assert {"clone_split", "mcmc", "paper", "sampling"} <= set(STRATEGIES.names())
-    assert all(STRATEGIES.find(n).name == n for n in STRATEGIES.names())
-    assert {"photometric", "alpha"} <= set(LOSS_TERMS.names())
+    assert registry.names() == sorted(registry.names())
+    assert {"alpha", "zeta", "clone_split", "mcmc", "paper", "sampling"} <= set(registry.names())  # ours are not named anywhere
+    assert all(registry.find(n).name == n for n in registry.names()) and {"photometric", "alpha"} <= set(LOSS_TERMS.names())
 
 
 @pytest.mark.parametrize("as_file", [True, False])
@@ -72,10 +65,6 @@ def test_a_class_of_ones_own_is_loaded_once(registry, own, as_file):
     assert issubclass(cls, Strategy) and cls.name == spec and cls.__name__ == "Own"
     assert registry.load(spec) is cls is registry.find(spec) and own.with_suffix(".ran").read_text() == "x"
     assert spec not in registry.names()
-
-
-def test_a_name_without_a_colon_is_loaded_as_it_is_found(registry):
-    assert registry.load("clone_split") is registry.find("clone_split")
 
 
 @pytest.mark.parametrize(
@@ -160,7 +149,6 @@ def test_an_unknown_name_lists_those_there_are(registry):
 
 
 def test_a_name_with_a_colon_is_never_imported_by_find(registry, own):
-    """Whatever it names, module or file."""
     for spec in (f"{own}:Own", "own_strategy:Own"):
         with pytest.raises(UsageError, match="does not load your code"):
             registry.find(spec)
@@ -182,7 +170,6 @@ def test_a_stored_configuration_imports_nothing(own):
 
 
 def test_a_run_continues_with_the_code_that_it_began_with(tmp_path):
-    """An edited file, and one that only one of both knows, is named."""
     same = {key: {} for key in ("fingerprint", "train", "test", "device", "scene")} | {"config": FitConfig().to_json()}
     check_same(same | {"own_code": {"mine": "a"}}, same | {"own_code": {"mine": "a"}}, tmp_path)
     check_same(same | {"own_code": {}}, same, tmp_path)  # of a version that did not record it
@@ -224,9 +211,8 @@ def test_settings_of_ones_own_travel_through_json(registry, monkeypatch):
 def test_an_error_in_own_code_names_its_file(tmp_path, capsys):
     """What a user's own class raises is not called a defect of warpgs: the line says which file and line."""
     own = tmp_path / "mine.py"
-    own.write_text(
-        "import warpgs\n\n\nclass Mine(warpgs.Strategy):\n    def columns(self):\n        raise ValueError('my own bug')\n"
-    )
+    code = "class Mine(warpgs.Strategy):\n    def columns(self):\n        raise ValueError('my own bug')\n"
+    own.write_text(f"import warpgs\n\n\n{code}")
     write_demo(tmp_path / "scene", views=8, width=48, height=36)
     flags = ["--split", split_spec(8), "--preset", "3dgs", "--steps", "2", "--device", "cpu", "--strategy", f"{own}:Mine"]
     assert main(["fit", str(tmp_path / "scene"), "--out", str(tmp_path / "run"), *flags]) == 2

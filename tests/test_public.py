@@ -195,10 +195,9 @@ def test_what_is_gone_names_its_new_place(monkeypatch):
 
 
 def test_the_changelog_lists_old_imports():
-    """A row for each, with the version since which the new name is there."""
-    rows = re.findall(
-        r"^\| `(warpgs\.\S+)` \| `(\S+)` \| \S+ \|$", (ROOT.parent / "CHANGELOG.md").read_text("utf-8"), re.MULTILINE
-    )
+    """A row for each."""
+    table = (ROOT.parent / "CHANGELOG.md").read_text("utf-8").split("## New names of old imports")[1]
+    rows = re.findall(r"^\| `(warpgs\.\S+)` \| `(\S+)` \|$", table, re.MULTILINE)
     assert rows == [(f"{module}.{name}", new) for module, name, new in OLD]
 
 
@@ -308,7 +307,7 @@ def test_many_lists_are_refused_before_they_are_made(text, monkeypatch):
 
 
 def test_only_ordinary_files_are_read(tmp_path):
-    with pytest.raises(IsADirectoryError):
+    with pytest.raises(OSError, match="is a folder"):
         schema.read(tmp_path)
     with pytest.raises(FileNotFoundError):
         schema.read(tmp_path / "none")

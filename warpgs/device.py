@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import functools
 import os
@@ -194,10 +195,13 @@ def installed_bytes(device: torch.device) -> int:
 
 def machine_memory() -> Memory | None:
     """Return the memory of the machine within the limits of the container, if any; None if unknown."""
-    found = [m for m in (_system_memory(), container_memory()) if m is not None]
-    if not found:
-        return None
-    return (min(total for total, _ in found), max(0, min(free for _, free in found)))
+    found = [m for m in (container_memory(),) if m is not None]
+    with contextlib.suppress(ImportError, AttributeError, KeyError, OSError, RuntimeError, ValueError):  # access may be denied
+        import psutil
+
+        system = psutil.virtual_memory()
+        found.append((int(system.total), int(system.available)))
+    return (min(total for total, _ in found), max(0, min(free for _, free in found))) if found else None
 
 
 def container_memory(own: Path | None = None, mount: Path | None = None) -> Memory | None:
@@ -231,23 +235,10 @@ def _groups(own: Path, mount: Path) -> Iterator[tuple[Path, str, str, str]]:
             yield root.joinpath(*parts[:end]), *names
 
 
-def _system_memory() -> Memory | None:
-    """Return the memory that psutil reports; None where psutil is missing or the system denies access."""
-    try:
-        import psutil
-
-        found = psutil.virtual_memory()
-        return (int(found.total), int(found.available))
-    except (ImportError, AttributeError, KeyError, OSError, RuntimeError, ValueError):
-        return None
-
-
 def _machine_or_assumed() -> Memory:
-    found = machine_memory()
-    if found is None:
+    if (found := machine_memory()) is None:
         _say_assumed()
-        return (ASSUMED_BYTES, ASSUMED_BYTES)
-    return found
+    return found or (ASSUMED_BYTES, ASSUMED_BYTES)
 
 
 @functools.cache

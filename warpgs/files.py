@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import contextlib
+import csv
 import errno
 import hashlib
+import io
 import json
 import os
 import re
 import shutil
 import stat
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import BinaryIO
 
@@ -222,6 +224,13 @@ def write_bytes(path: Path, *chunks: bytes | memoryview) -> None:
 def write_text(path: Path, text: str) -> None:
     """Replace a text file (UTF-8) as `write_bytes` does; undecodable bytes of file names are escaped by `readable`."""
     write_bytes(path, readable(text).encode())
+
+
+def write_csv(path: Path, rows: Iterable[Iterable[object]]) -> None:
+    """Replace a CSV file as `write_text` does."""
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows(rows)
+    write_text(path, text.getvalue())
 
 
 def readable(text: str) -> str:

@@ -370,7 +370,7 @@ def sweep(folder: Folder, own: bool = False) -> None:
 def cache_home() -> Path | None:
     """Return the system's folder for a user's caches; None without a home folder."""
     home = Path(os.path.expanduser("~"))
-    if WINDOWS:
+    if sys.platform == "win32":
         found = Path(os.environ.get("LOCALAPPDATA") or home / "AppData" / "Local")
     elif sys.platform == "darwin":
         found = home / "Library" / "Caches"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Sequence
 from dataclasses import replace
@@ -37,10 +36,7 @@ that leaves the bracket is replaced by a bisection."""
 def check_known(model: str) -> None:
     """Check that a camera model is known here."""
     if model not in MODELS:
-        raise UsageError(
-            f"outside the rasterizer only the camera models {', '.join(MODELS)} are supported, not {model!r}; undistort the "
-            "images first"
-        )
+        raise UsageError(f"only the lenses {', '.join(MODELS)} are supported here, not {model!r}; undistort the images first")
 
 
 def _library(array: Array) -> Any:
@@ -54,10 +50,7 @@ def _library(array: Array) -> Any:
 
 def depth_of(model: str, positions: Array) -> Array:
     """Return the depths [...] [u] of positions in the camera [..., 3], as in renders: distance for a fisheye, else z."""
-    if model == "fisheye":
-        depth: Array = (positions**2).sum(-1) ** 0.5
-        return depth
-    return positions[..., 2]
+    return (positions**2).sum(-1) ** 0.5 if model == "fisheye" else positions[..., 2]
 
 
 def to_plane(model: str, distortion: Array | None, positions: Array) -> Array:
@@ -193,37 +186,29 @@ def rotation_matrices(quats: np.ndarray | torch.Tensor) -> np.ndarray | torch.Te
         2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
         2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
     ]  # fmt: skip
-    if isinstance(quats, np.ndarray):
-        return np.stack(entries, -1).reshape(*quats.shape[:-1], 3, 3)
-    import torch
-
-    return torch.stack(entries, -1).reshape(*quats.shape[:-1], 3, 3)
+    return _library(quats).stack(entries, -1).reshape(*quats.shape[:-1], 3, 3)
 
 
 def quaternions(rotations: torch.Tensor) -> torch.Tensor:
     """Return unit quaternions wxyz [N, 4] of rotations [N, 3, 3], computed from the largest component to avoid cancellation."""
     import torch
 
-    m = rotations
-    xx, yy, zz = m[:, 0, 0], m[:, 1, 1], m[:, 2, 2]
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = (row.unbind(1) for row in rotations.unbind(1))
     # row i is 4 q_i q
     outer = torch.stack([
-        torch.stack([1 + xx + yy + zz, m[:, 2, 1] - m[:, 1, 2], m[:, 0, 2] - m[:, 2, 0], m[:, 1, 0] - m[:, 0, 1]], 1),
-        torch.stack([m[:, 2, 1] - m[:, 1, 2], 1 + xx - yy - zz, m[:, 0, 1] + m[:, 1, 0], m[:, 0, 2] + m[:, 2, 0]], 1),
-        torch.stack([m[:, 0, 2] - m[:, 2, 0], m[:, 0, 1] + m[:, 1, 0], 1 - xx + yy - zz, m[:, 1, 2] + m[:, 2, 1]], 1),
-        torch.stack([m[:, 1, 0] - m[:, 0, 1], m[:, 0, 2] + m[:, 2, 0], m[:, 1, 2] + m[:, 2, 1], 1 - xx - yy + zz], 1),
+        torch.stack([1 + xx + yy + zz, zy - yz, xz - zx, yx - xy], 1),
+        torch.stack([zy - yz, 1 + xx - yy - zz, xy + yx, xz + zx], 1),
+        torch.stack([xz - zx, xy + yx, 1 - xx + yy - zz, yz + zy], 1),
+        torch.stack([yx - xy, xz + zx, yz + zy, 1 - xx - yy + zz], 1),
     ], 1)  # fmt: skip
     largest = outer.diagonal(dim1=1, dim2=2).argmax(1)
-    return torch.nn.functional.normalize(outer[torch.arange(len(m), device=m.device), largest], dim=1)
+    return torch.nn.functional.normalize(outer[torch.arange(len(largest), device=largest.device), largest], dim=1)
 
 
 def check_pinhole(camera: Camera) -> None:
     """Check that a camera is a pinhole, for code that assumes that straight lines stay straight."""
     if camera.model != "pinhole":
-        raise UsageError(
-            f"only pinhole cameras are supported here, not {camera.model!r}; read the scene with --lenses undistort, or "
-            "undistort the images first"
-        )
+        raise UsageError(f"only pinhole cameras are supported here, not {camera.model!r}; read with --lenses undistort")
 
 
 def pinhole_of(camera: Camera) -> Camera:
@@ -414,23 +399,20 @@ def gaussian_normals(gaussians: Gaussians | ActivatedGaussians, camera: Camera) 
     return torch.where(faces, normals, -normals)
 
 
-def in_image(camera: Camera, points: np.ndarray, near: float = 0.0) -> np.ndarray:
-    """Return a mask [N], True where a world point [N, 3] is beyond ``near`` [u] and inside the camera's image."""
-    pixels, z = project_points(camera, points)
-    return _inside(camera, pixels) & (z > near)
+def in_image(camera: Camera, points: np.ndarray) -> np.ndarray:
+    """Return a mask [N], True where a world point [N, 3] is in front of the camera and inside its image."""
+    seen = np.zeros(len(points), bool)
+    seen[seen_pixels(camera, points)[0]] = True
+    return seen
 
 
 def seen_pixels(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return indices, rows, columns and depths [u], shape [S] each, of the world points [N, 3] that a camera sees."""
     pixels, z = project_points(camera, points)
-    seen = np.nonzero(_inside(camera, pixels) & (z > 0))[0]
+    x, y = pixels.T
+    seen = np.flatnonzero((x >= 0) & (y >= 0) & (x < camera.width) & (y < camera.height) & (z > 0))
     columns, rows = np.floor(pixels[seen]).astype(int).T
     return seen, rows, columns, z[seen]
-
-
-def _inside(camera: Camera, pixels: np.ndarray) -> np.ndarray:
-    x, y = pixels.T
-    return (x >= 0) & (y >= 0) & (x < camera.width) & (y < camera.height)
 
 
 def camera_extent(cameras: list[Camera]) -> float:
@@ -476,26 +458,16 @@ SH_COUNTS = (1, 4, 9, 16, 25)
 """Numbers of spherical-harmonics coefficients that Gaussians may have."""
 
 
-def check_units(units: str) -> None:
-    """Check that ``units`` names one of the two systems."""
-    if units not in UNITS:
-        raise UsageError(f"units {units!r} is not one of {', '.join(UNITS)}")
-
-
 def checked_normalization(normalization: Normalization | None, units: str, where: str) -> Normalization:
     """Check and return ``normalization``; with file units, None becomes the identity."""
-    check_units(units)
-    if normalization is None:
-        if units == "scene":
-            raise UsageError(
-                f"{where}: units='scene' requires normalization=scene.normalization; give it, or units='file' "
-                "for Gaussians without a scene"
-            )
-        return Normalization()
-    scale, offset = normalization.scale, np.asarray(normalization.offset)
-    if not (math.isfinite(scale) and scale > 0 and offset.shape == (3,) and np.isfinite(offset).all()):
-        raise DataError(f"{where}: the scene's normalization is not a similarity: {normalization}. Read the scene again")
-    return normalization
+    _same_units(units, "file")
+    if normalization is None and units == "scene":
+        raise UsageError(f"{where}: units='scene' requires normalization=scene.normalization; give it, or units='file'")
+    n = normalization or Normalization()
+    offset = np.asarray(n.offset)
+    if not (math.isfinite(n.scale) and n.scale > 0 and offset.shape == (3,) and np.isfinite(offset).all()):
+        raise DataError(f"{where}: the scene's normalization is not a similarity: {n}. Read the scene again")
+    return n
 
 
 def check_stored(gaussians: object) -> None:
@@ -517,9 +489,15 @@ def check_stored(gaussians: object) -> None:
 
 def _same_units(source: str, target: str) -> bool:
     """Return whether two names of units are equal; UsageError for an unknown one."""
-    check_units(source)
-    check_units(target)
+    for units in (source, target):
+        if units not in UNITS:
+            raise UsageError(f"units {units!r} is not one of {', '.join(UNITS)}")
     return source == target
+
+
+def _converted(points: Array, offset: Array, scale: float, target: str) -> Array:
+    """Return points [N, 3] in the other units, ``target``."""
+    return points / scale + offset if target == "file" else scale * (points - offset)
 
 
 def convert_gaussians(gaussians: Gaussians, normalization: Normalization, source: str, target: str) -> Gaussians:
@@ -531,14 +509,10 @@ def convert_gaussians(gaussians: Gaussians, normalization: Normalization, source
     check_stored(gaussians)
     if _same_units(source, target):
         return gaussians
-    means, log_scales = gaussians.means.double(), gaussians.log_scales.double()
-    offset = means.new_tensor(np.asarray(normalization.offset, np.float64))
-    if target == "file":
-        means, log_scales = means / normalization.scale + offset, log_scales - math.log(normalization.scale)
-    else:
-        means, log_scales = normalization.scale * (means - offset), log_scales + math.log(normalization.scale)
-    kind = gaussians.means.dtype
-    return dataclasses.replace(gaussians, means=means.to(kind), log_scales=log_scales.to(kind))
+    means, kind = gaussians.means.double(), gaussians.means.dtype
+    means = _converted(means, means.new_tensor(np.asarray(normalization.offset, np.float64)), normalization.scale, target)
+    longer = math.log(normalization.scale) * (-1 if target == "file" else 1)
+    return replace(gaussians, means=means.to(kind), log_scales=(gaussians.log_scales.double() + longer).to(kind))
 
 
 _NODES = ((0.0, 0.5688888888888889), (0.5384693101056831, 0.47862867049936647), (0.906179845938664, 0.23692688505618908))
@@ -582,26 +556,21 @@ def harmonics_rotation(rotation: np.ndarray) -> torch.Tensor:
 
 
 def rotate(gaussians: Gaussians, rotation: np.ndarray) -> Gaussians:
-    """Return Gaussians turned about the origin: means, shapes and the directions that colours depend on.
+    """Return Gaussians turned about the origin by [3, 3]: means, shapes and the directions that colours depend on.
 
-    Args:
-        gaussians: N Gaussians.
-        rotation: Rotation or reflection, new from old coordinates, shape [3, 3]. An ellipsoid is its own mirror image.
+    The matrix may be a reflection, since an ellipsoid is its own mirror image.
     """
     import torch
 
-    device = gaussians.means.device
-    turn = torch.tensor(np.asarray(rotation), dtype=torch.float64, device=device)
-    k = gaussians.sh.shape[1]
-    coefficients = harmonics_rotation(rotation).to(device)[:k, :k]
-    quats = torch.nn.functional.normalize(gaussians.quats.double(), dim=1)
+    means, quats, k = gaussians.means, gaussians.quats, gaussians.sh.shape[1]
+    turn = torch.tensor(np.asarray(rotation), dtype=torch.float64, device=means.device)
+    coefficients = harmonics_rotation(rotation).to(means.device)[:k, :k]
+    axes = torch.as_tensor(rotation_matrices(torch.nn.functional.normalize(quats.double(), dim=1)))
     proper = turn if np.linalg.det(rotation) > 0 else -turn
-    turned = torch.einsum("ij,njk->nik", proper, torch.as_tensor(rotation_matrices(quats)))
-    return Gaussians(
-        means=torch.einsum("ij,nj->ni", turn, gaussians.means.double()).to(gaussians.means.dtype),
-        quats=quaternions(turned).to(gaussians.quats.dtype),
-        log_scales=gaussians.log_scales,
-        logit_opacities=gaussians.logit_opacities,
+    return replace(
+        gaussians,
+        means=torch.einsum("ij,nj->ni", turn, means.double()).to(means.dtype),
+        quats=quaternions(torch.einsum("ij,njk->nik", proper, axes)).to(quats.dtype),
         sh=torch.einsum("jk,nkc->njc", coefficients, gaussians.sh.double()).to(gaussians.sh.dtype),
     )
 
@@ -610,22 +579,22 @@ def convert_mesh(mesh: Mesh, normalization: Normalization, source: str, target: 
     """Return a mesh in other units: its vertices change, triangles and colours are shared."""
     if _same_units(source, target):
         return mesh
-    scale, offset = normalization.scale, np.asarray(normalization.offset, np.float64)
-    vertices = mesh.vertices / scale + offset if target == "file" else scale * (mesh.vertices - offset)
-    return dataclasses.replace(mesh, vertices=vertices)
+    offset = np.asarray(normalization.offset, np.float64)
+    return replace(mesh, vertices=_converted(mesh.vertices, offset, normalization.scale, target))
 
 
 def convert_camera(camera: Camera, normalization: Normalization, source: str, target: str) -> Camera:
     """Return a camera, or a batch of them, in other units: its translation changes, rotation and intrinsics do not."""
     if _same_units(source, target):
         return camera
-    viewmat: Any = camera.viewmat.copy() if isinstance(camera.viewmat, np.ndarray) else camera.viewmat.clone()
     offset: Any = np.asarray(normalization.offset, np.float64)
-    if not isinstance(viewmat, np.ndarray):
-        offset = viewmat.new_tensor(offset)
+    if isinstance(camera.viewmat, np.ndarray):
+        viewmat: Any = camera.viewmat.copy()
+    else:
+        viewmat, offset = camera.viewmat.clone(), camera.viewmat.new_tensor(offset)
     rotation, translation = viewmat[..., :3, :3], viewmat[..., :3, 3]
     if target == "file":
         viewmat[..., :3, 3] = translation / normalization.scale - rotation @ offset
     else:
         viewmat[..., :3, 3] = normalization.scale * (rotation @ offset + translation)
-    return dataclasses.replace(camera, viewmat=viewmat)
+    return replace(camera, viewmat=viewmat)

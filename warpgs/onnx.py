@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import hashlib
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+import numpy as np
 
 from warpgs.device import usable_cores
 from warpgs.errors import DataError, ResourceError
@@ -23,13 +26,19 @@ DOMAINS = ("", "ai.onnx", "ai.onnx.ml", "com.microsoft")
 MAX_NESTING = 32
 """Largest depth of graphs within graphs (If, Loop, Scan) that is accepted."""
 
-MODEL_GRAPH, MODEL_OPSET, MODEL_TRAINING, MODEL_FUNCTION = 7, 8, 20, 25
-TRAINING_GRAPHS = (1, 2)
-GRAPH_NODE, GRAPH_INITIALIZER, GRAPH_SPARSE = 1, 5, 15
-FUNCTION_NAME, FUNCTION_NODE, FUNCTION_DOMAIN, FUNCTION_ATTRIBUTE = 1, 7, 10, 11
-NODE_TYPE, NODE_ATTRIBUTE, NODE_DOMAIN = 4, 5, 7
-ATTRIBUTE_TENSORS, ATTRIBUTE_GRAPHS, ATTRIBUTE_SPARSE = (5, 10), (6, 11), (22, 23)
-SPARSE_TENSORS = (1, 2)
+PARTS: dict[str, dict[int, str]] = {
+    "model": {7: "graph", 20: "training", 25: "function"},
+    "training": {1: "graph", 2: "graph"},
+    "function": {7: "node", 11: "attribute"},
+    "graph": {1: "node", 5: "tensor", 15: "sparse"},
+    "node": {5: "attribute"},
+    "attribute": {5: "tensor", 6: "graph", 10: "tensor", 11: "graph", 22: "sparse", 23: "sparse"},
+    "sparse": {1: "tensor", 2: "tensor"},
+    "tensor": {},
+}
+"""Messages in the fields of each message, as far as they lead to tensors and nodes."""
+MODEL_GRAPH, MODEL_OPSET, MODEL_FUNCTION = 7, 8, 25
+FUNCTION_NAME, FUNCTION_DOMAIN, NODE_TYPE, NODE_DOMAIN = 1, 10, 4, 7
 TENSOR_NAME, TENSOR_EXTERNAL, TENSOR_LOCATION = 8, 13, 14
 MAX_FIELD = 2**29 - 1
 """Largest field number of protobuf; its parser drops the higher bits, so that a larger number would stand for another field."""
@@ -68,82 +77,44 @@ def _message(data: memoryview) -> Message:
     return fields
 
 
-def _parts(message: Message, *numbers: int) -> Iterator[Message]:
-    return (_message(v) for n, v in message if n in numbers and isinstance(v, memoryview))
-
-
 def _text(message: Message, number: int) -> str:
     """Return the text of a field, maybe empty; of duplicate fields the last one, as in protobuf."""
     texts = [v for n, v in message if n == number and isinstance(v, memoryview)]
     return bytes(texts[-1]).decode("utf-8", "replace") if texts else ""
 
 
-class _Walk:
-    """A walk through every node and tensor of a model; it rejects models that need other files or foreign code."""
-
-    def __init__(self, path: Path, own: set[tuple[str, str]]):
-        self.path, self.own = path, own
-
-    def tensor(self, tensor: Message) -> None:
-        if any(n == TENSOR_EXTERNAL or (n == TENSOR_LOCATION and v != 0) for n, v in tensor):
-            raise DataError(
-                f"{self.path}: the weights of {_text(tensor, TENSOR_NAME) or 'a constant'!r} are in another file, which is "
-                f"not read. Save the model as one file: `onnx.save(onnx.load(FILE), OUT)`, or export it without external data"
-            )
-
-    def node(self, node: Message, depth: int) -> None:
-        domain, kind = _text(node, NODE_DOMAIN), _text(node, NODE_TYPE)
-        if domain not in DOMAINS and (domain, kind) not in self.own:
-            raise DataError(
-                f"{self.path}: the operator {domain}::{kind} is not part of ONNX and would need foreign code to run. "
-                "Export the model with standard operators"
-            )
-        self.attributes(node, NODE_ATTRIBUTE, depth)
-
-    def attributes(self, message: Message, number: int, depth: int) -> None:
-        for attribute in _parts(message, number):
-            for tensor in _parts(attribute, *ATTRIBUTE_TENSORS):
-                self.tensor(tensor)
-            for sparse in _parts(attribute, *ATTRIBUTE_SPARSE):
-                self.sparse(sparse)
-            for graph in _parts(attribute, *ATTRIBUTE_GRAPHS):
-                self.graph(graph, depth + 1)
-
-    def function(self, function: Message) -> None:
-        self.attributes(function, FUNCTION_ATTRIBUTE, 0)
-        for node in _parts(function, FUNCTION_NODE):
-            self.node(node, 0)
-
-    def sparse(self, sparse: Message) -> None:
-        for tensor in _parts(sparse, *SPARSE_TENSORS):
-            self.tensor(tensor)
-
-    def graph(self, graph: Message, depth: int = 0) -> None:
-        if depth > MAX_NESTING:
-            raise ValueError(f"graphs nested deeper than {MAX_NESTING}")
-        for tensor in _parts(graph, GRAPH_INITIALIZER):
-            self.tensor(tensor)
-        for sparse in _parts(graph, GRAPH_SPARSE):
-            self.sparse(sparse)
-        for node in _parts(graph, GRAPH_NODE):
-            self.node(node, depth)
+def _walk(kind: str, message: Message, depth: int = 0) -> Iterator[tuple[str, Message]]:
+    """Yield a message and all that it holds, as far as `PARTS` leads; ValueError where graphs are nested too deep."""
+    if depth > MAX_NESTING:
+        raise ValueError(f"graphs nested deeper than {MAX_NESTING}")
+    yield kind, message
+    for number, value in message:
+        if (part := PARTS[kind].get(number)) and isinstance(value, memoryview):
+            yield from _walk(part, _message(value), depth + (part == "graph"))
 
 
 def check_onnx(data: bytes, path: Path) -> None:
     """Check that bytes are an ONNX model without external data and without custom operators."""
     try:
         model = _message(memoryview(data))
-        graphs, functions = list(_parts(model, MODEL_GRAPH)), list(_parts(model, MODEL_FUNCTION))
-        if len(graphs) != 1 or not any(n == MODEL_OPSET for n, _ in model):
-            raise ValueError("it has no graph" if not graphs else "it has several graphs, or names no operator set")
+        graphs = sum(n == MODEL_GRAPH and isinstance(v, memoryview) for n, v in model)
+        if graphs != 1 or not any(n == MODEL_OPSET for n, _ in model):
+            raise ValueError("it has several graphs, or names no operator set" if graphs else "it has no graph")
         # exporters store compositions of standard operators as functions in the file
-        walk = _Walk(path, {(_text(f, FUNCTION_DOMAIN), _text(f, FUNCTION_NAME)) for f in functions})
-        walk.graph(graphs[0])
-        for function in functions:
-            walk.function(function)
-        for training in _parts(model, MODEL_TRAINING):
-            for graph in _parts(training, *TRAINING_GRAPHS):
-                walk.graph(graph)
+        functions = [_message(v) for n, v in model if n == MODEL_FUNCTION and isinstance(v, memoryview)]
+        own = {(_text(f, FUNCTION_DOMAIN), _text(f, FUNCTION_NAME)) for f in functions}
+        for kind, part in _walk("model", model):
+            if kind == "tensor" and any(n == TENSOR_EXTERNAL or (n == TENSOR_LOCATION and v != 0) for n, v in part):
+                raise DataError(
+                    f"{path}: the weights of {_text(part, TENSOR_NAME) or 'a constant'!r} are in another file, which is not "
+                    "read. Save the model as one file: `onnx.save(onnx.load(FILE), OUT)`, or export it without external data"
+                )
+            if kind == "node" and (domain := _text(part, NODE_DOMAIN)) not in DOMAINS:
+                if (operator := (domain, _text(part, NODE_TYPE))) not in own:
+                    raise DataError(
+                        f"{path}: the operator {'::'.join(operator)} is not part of ONNX and would need foreign code to run. "
+                        "Export the model with standard operators"
+                    )
     except (ValueError, IndexError) as e:
         raise DataError(f"{path}: not an ONNX model ({e}); give a file written by `torch.onnx.export` or a similar tool") from e
 
@@ -164,7 +135,7 @@ def read_model(path: Path) -> bytes:
     return data
 
 
-def first_line(error: Exception) -> str:
+def _first_line(error: Exception) -> str:
     """Return the first line of an error's message, at most 200 letters."""
     lines = str(error).strip().splitlines()
     return lines[0][:200] if lines else type(error).__name__
@@ -179,9 +150,8 @@ def start_session(data: bytes, path: Path, provider: str, threads: int) -> Infer
     there = [name for name, long in PROVIDERS.items() if long in ort.get_available_providers()]
     remedy = "`pip uninstall onnxruntime`, then `pip install onnxruntime-gpu[cuda,cudnn]`; or leave the flag out"
     if provider not in there:
-        raise ResourceError(
-            f"--onnx-provider {provider}: this onnxruntime {ort.__version__} has only {', '.join(there)}. {remedy}"
-        )
+        has = f"this onnxruntime {ort.__version__} has only {', '.join(there)}"
+        raise ResourceError(f"--onnx-provider {provider}: {has}. {remedy}")
     options = ort.SessionOptions()
     options.intra_op_num_threads = threads or usable_cores()
     options.inter_op_num_threads = 1
@@ -193,10 +163,49 @@ def start_session(data: bytes, path: Path, provider: str, threads: int) -> Infer
     except Exception as e:
         if provider != "cpu":
             start_session(data, path, "cpu", threads)  # DataError where the file is at fault
-            raise ResourceError(f"--onnx-provider {provider}: onnxruntime cannot use it ({first_line(e)}). {remedy}") from e
-        raise DataError(f"{path}: onnxruntime {ort.__version__} cannot load it ({first_line(e)}); export it again, perhaps "
-                        "with an older operator set") from e  # fmt: skip
+            raise ResourceError(f"--onnx-provider {provider}: onnxruntime cannot use it ({_first_line(e)}). {remedy}") from e
+        why = f"onnxruntime {ort.__version__} cannot load it ({_first_line(e)})"
+        raise DataError(f"{path}: {why}; export it again, perhaps with an older operator set") from e
     # onnxruntime continues without a provider if its libraries are missing
     if PROVIDERS[provider] not in session.get_providers():
         raise ResourceError(f"--onnx-provider {provider}: onnxruntime finds no {provider} libraries or device. {remedy}")
     return session
+
+
+def fixed_size(path: Path, sides: Sequence[object]) -> tuple[int, int] | None:
+    """Return height and width [px] that an input fixes, or None where both are free."""
+    fixed = [side for side in sides if isinstance(side, int) and side > 0]
+    if len(fixed) == 1:
+        raise DataError(f"{path}: its input fixes only one side of the image; export it with both fixed or both free")
+    return (fixed[0], fixed[1]) if fixed else None
+
+
+class Model:
+    """An opened ONNX file; ``inputs`` are name, type and shape of each input, ``outputs`` the names of the outputs."""
+
+    def __init__(self, path: str | Path, provider: str = "cpu", threads: int = 0):
+        self.path = Path(path)
+        data = read_model(self.path)
+        self.session, self.sha256 = start_session(data, self.path, provider, threads), hashlib.sha256(data).hexdigest()
+        try:
+            self.inputs: list[tuple[str, str, list]] = [(i.name, i.type, i.shape) for i in self.session.get_inputs()]
+            self.outputs: list[str] = [o.name for o in self.session.get_outputs()]
+        except UnicodeDecodeError as e:
+            raise DataError(f"{path}: the name of an input or an output is not UTF-8; export the network again") from e
+
+    @property
+    def title(self) -> str:
+        """File name and first digits of the hash, for reports."""
+        return f"{self.path.name} (SHA-256 {self.sha256[:12]})"
+
+    def outputs_of(self, *images: np.ndarray, names: Sequence[str] | None = None) -> list[np.ndarray]:
+        """Return the outputs for batches of images, one for each input."""
+        feed = {name: np.ascontiguousarray(image) for (name, _, _), image in zip(self.inputs, images, strict=True)}
+        try:
+            return [np.asarray(output) for output in self.session.run(names, feed)]
+        except Exception as e:  # onnxruntime's errors share no base but Exception
+            shape = " x ".join(map(str, images[0].shape))
+            raise DataError(
+                f"{self.path}: onnxruntime cannot run it on an input of {shape} ({_first_line(e)}); describe its input in "
+                f"{self.path.name}.json, or export it again"
+            ) from e

@@ -51,26 +51,25 @@ def _send_to_null(number: int) -> None:
         os.close(null)
 
 
-def is_gone_reader(error: BaseException | None) -> bool:
-    """Return whether a write failed because the pipe's reader has gone, as with ``| head``."""
-    return isinstance(error, BrokenPipeError) or (
-        sys.platform == "win32" and isinstance(error, OSError) and error.errno == errno.EINVAL
-    )
+def _lost(error: BaseException, remedy: str) -> None:
+    """Print on stderr, if that is possible, why stdout cannot be written, and what follows."""
+    reason = (isinstance(error, OSError) and error.strerror) or str(error)
+    line = f"warpgs: stdout cannot be written ({reason}); {remedy}"
+    if sys.stderr is not None:
+        with contextlib.suppress(OSError, ValueError):
+            print(line.encode("ascii", "backslashreplace").decode(), file=sys.stderr, flush=True)
 
 
-def reason(error: BaseException) -> str:
-    """Return why a write failed, as the system reports it."""
-    return (isinstance(error, OSError) and error.strerror) or str(error)
+GOES_ON = "the command continues without it"
 
 
 class CarefulStream:
     """A text stream that does not raise if it cannot be written: the first error is kept, and later writes are dropped."""
 
-    def __init__(self, stream: TextIO | None, name: str, goes_on: bool = True):
-        """Wrap a stream."""
-        self.closed_at_start = stream is None
+    def __init__(self, stream: TextIO | None, says: bool = True):
+        """Wrap a stream; ``says`` prints on stderr that the command continues without it."""
+        self.closed_at_start, self.says = stream is None, says
         self.stream: TextIO = io.StringIO() if stream is None else stream
-        self.name, self.goes_on = name, goes_on
         self.failure: BaseException | None = None
 
     def write(self, text: str) -> int:
@@ -107,55 +106,38 @@ class CarefulStream:
         if not self.closed_at_start:
             with contextlib.suppress(OSError, ValueError):
                 _send_to_null(self.stream.fileno())
-        if self.goes_on:
-            say_lost(self.name, error)
+        if self.says:
+            _lost(error, GOES_ON)
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self.stream, name)
 
 
-def say_lost(name: str, error: BaseException) -> None:
-    """Print on stderr that the command continues without stdout; a lost stderr cannot be reported."""
-    if name == "stdout":
-        _to_stderr(f"warpgs: stdout cannot be written ({reason(error)}); the command continues without it")
-
-
-def _to_stderr(line: str) -> None:
-    """Write a line to stderr, if that is possible."""
-    if sys.stderr is not None:
-        with contextlib.suppress(OSError, ValueError):
-            print(line.encode("ascii", "backslashreplace").decode(), file=sys.stderr, flush=True)
-
-
-class CarefulOutput:
-    """Streams of a command, and their state."""
-
-    def __init__(self, stdout: CarefulStream, stderr: CarefulStream, is_product: bool):
-        """Keep both streams, and whether stdout is the command's only result."""
-        self.stdout, self.stderr, self.is_product = stdout, stderr, is_product
-
-    def exit_code(self, code: int) -> int:
-        """Return ``code``, or the code of ResourceError if the command succeeded but its only result could not be written."""
-        self.stdout.flush()
-        self.stderr.flush()
-        failure = self.stdout.failure
-        if code or failure is None or not self.is_product or is_gone_reader(failure):
-            return code
-        full = isinstance(failure, OSError) and failure.errno in FULL
-        remedy = "free some disk space, or send the output elsewhere" if full else "send the output elsewhere"
-        _to_stderr(f"warpgs: stdout cannot be written ({reason(failure)}); {remedy}")
-        return ResourceError.exit_code
-
-
 @contextlib.contextmanager
-def careful_output(is_product: bool) -> Iterator[CarefulOutput]:
-    """Replace stdout and stderr by streams whose writes do not raise."""
+def careful_output(is_product: bool) -> Iterator[Callable[[int], int]]:
+    """Replace stdout and stderr by streams whose writes do not raise; give a function that returns the final exit code.
+
+    It is that of ResourceError if the command succeeded but its only result, stdout, could not be written.
+    """
     open_missing_descriptors()
     before = sys.stdout, sys.stderr
-    streams = CarefulStream(before[0], "stdout", not is_product), CarefulStream(before[1], "stderr", False)
+    streams = out, _ = CarefulStream(before[0], not is_product), CarefulStream(before[1], False)
     sys.stdout, sys.stderr = (cast(TextIO, s) for s in streams)
+
+    def exit_code(code: int) -> int:
+        for stream in streams:
+            stream.flush()
+        failure, number = out.failure, getattr(out.failure, "errno", None)
+        gone = isinstance(failure, BrokenPipeError) or (
+            sys.platform == "win32" and number == errno.EINVAL
+        )  # as with ``| head``
+        if code or failure is None or not is_product or gone:
+            return code
+        _lost(failure, ("free some disk space, or " if number in FULL else "") + "send the output elsewhere")
+        return ResourceError.exit_code
+
     try:
-        yield CarefulOutput(*streams, is_product)
+        yield exit_code
     finally:
         for stream in streams:
             stream.flush()
@@ -164,7 +146,7 @@ def careful_output(is_product: bool) -> Iterator[CarefulOutput]:
 
 def careful(stream: TextIO) -> TextIO:
     """Return a stream whose writes do not raise, wrapped unless it already is; for displays that draw during a fit."""
-    return stream if isinstance(stream, CarefulStream) else cast(TextIO, CarefulStream(stream, "stdout"))
+    return stream if isinstance(stream, CarefulStream) else cast(TextIO, CarefulStream(stream))
 
 
 T = TypeVar("T")
@@ -189,8 +171,7 @@ def printable(text: object) -> str:
     )
 
 
-_quiet = False
-_lost = False
+_quiet = _is_lost = False
 
 
 def be_quiet() -> None:
@@ -201,24 +182,19 @@ def be_quiet() -> None:
 
 def say(line: object = "", *, error: bool = False) -> None:
     """Print one `printable` line at once, with codes for letters that the terminal does not have."""
-    global _lost
+    global _is_lost
     if _quiet and not error:
         return
     try:
-        _print(line, error)
+        answer(line, error)
     except OSError as e:
-        if not (error or _lost):
-            _lost = True
-            say_lost("stdout", e)
+        if not (error or _is_lost):
+            _is_lost = True
+            _lost(e, GOES_ON)
 
 
-def answer(line: object) -> None:
-    """Print one line to the process that started this one."""
-    _print(line, False)
-
-
-def _print(line: object, error: bool) -> None:
-    """Print one line as `say` does."""
+def answer(line: object, error: bool = False) -> None:
+    """Print one line as `say` does, for the process that started this one: an error is raised if nobody reads it."""
     stream = sys.stderr if error else sys.stdout
     encoding = getattr(stream, "encoding", None) or "utf-8"
     print(printable(line).encode(encoding, "backslashreplace").decode(encoding), file=stream, flush=True)
@@ -360,9 +336,7 @@ def _send(number: signal.Signals) -> None:
     if sys.platform == "win32":
         signal.raise_signal(number)
     else:
-        main = threading.main_thread().ident
-        assert main is not None
-        signal.pthread_kill(main, number)
+        signal.pthread_kill(threading.main_thread().ident or 0, number)
 
 
 @contextlib.contextmanager
@@ -418,6 +392,7 @@ def ignored_signals() -> Iterator[None]:
 
 # Other processes. Python processes import nothing from the folder that warpgs was called in; no shell is started.
 
+SAFE = {"PYTHONSAFEPATH": "1", "PYTHONIOENCODING": "utf-8"}
 ENDS_WITH_PARENT = (
     "import os as _os, threading as _threading\n"
     "_threading.Thread(target=lambda: (_os.read(0, 1), _os._exit(1)), daemon=True).start()\n"
@@ -430,17 +405,6 @@ def end_with_parent() -> None:
     threading.Thread(target=lambda: (os.read(0, 1), os._exit(1)), daemon=True).start()
 
 
-@contextlib.contextmanager
-def _stdin_until_our_end() -> Iterator[int]:
-    """Give a child an empty stdin, which closes at the end of the block or of this process; the child then ends."""
-    read, write = os.pipe()
-    try:
-        yield read
-    finally:
-        os.close(read)
-        os.close(write)
-
-
 def run_python(
     code: str, *arguments: str, timeout: float, environment: dict[str, str] | None = None
 ) -> subprocess.CompletedProcess[str]:
@@ -448,10 +412,11 @@ def run_python(
     # The process works in an empty folder that is removed afterwards, and ends when this process is killed. Neither it
     # nor its children import modules from the current folder (``-P``, PYTHONSAFEPATH), which may be an untrusted scene
     # with a numpy.py.
-    with temporary_folder() as folder, shared_locks() as locks, _stdin_until_our_end() as stdin:
+    read, write = os.pipe()  # an empty stdin, which ends with the block or this process; the child then ends
+    with temporary_folder() as folder, shared_locks() as locks, open(read, "rb") as stdin, open(write, "wb"):
         return subprocess.run(
             [sys.executable, "-P", "-c", ENDS_WITH_PARENT + code, *arguments],
-            env={**os.environ, "PYTHONSAFEPATH": "1", "PYTHONIOENCODING": "utf-8", **(environment or {})},
+            env={**os.environ, **SAFE, **(environment or {})},
             cwd=folder.path,
             stdin=stdin,
             pass_fds=locks,
@@ -477,8 +442,7 @@ def _environment(more: dict[str, str] | None) -> dict[str, str]:
     """Return variables with which a process imports this package as this process does, and nothing from the current folder."""
     home = str(Path(__file__).parents[1])
     search = os.pathsep.join(p for p in (home, os.environ.get("PYTHONPATH", "")) if p)
-    own = {"PYTHONPATH": search, "PYTHONSAFEPATH": "1", "PYTHONIOENCODING": "utf-8"}
-    return {**os.environ, **own, **(more or {})}
+    return {**os.environ, **SAFE, "PYTHONPATH": search, **(more or {})}
 
 
 def python_lines(module: str, *arguments: str, folder: Path, environment: dict[str, str] | None = None) -> Iterator[str]:

@@ -72,10 +72,10 @@ def loopback_interface(host: str = HOST) -> str:
     """Return the name of the network interface that has a loopback address, such as lo."""
     import psutil
 
-    for name, addresses in psutil.net_if_addrs().items():
-        if any(a.address == host for a in addresses):
-            return str(name)
-    raise ResourceError(f"no network interface has the address {host}; bring up the loopback interface (ip link set lo up)")
+    names = [str(name) for name, addresses in psutil.net_if_addrs().items() if any(a.address == host for a in addresses)]
+    if not names:
+        raise ResourceError(f"no network interface has the address {host}; bring up the loopback interface (ip link set lo up)")
+    return names[0]
 
 
 def listening_at(process: int | None = None) -> list[tuple[str, int]]:
@@ -124,12 +124,10 @@ class Allowance:
     def take(self) -> bool:
         """Take one message; return False if none is left."""
         now = self._clock()
-        self._left = min(self._most, self._left + self._per_second * (now - self._last))
-        self._last = now
-        if self._left < 1:
-            return False
-        self._left -= 1
-        return True
+        self._left, self._last = min(self._most, self._left + self._per_second * (now - self._last)), now
+        taken = self._left >= 1
+        self._left -= taken
+        return taken
 
 
 class WebGuard:
@@ -161,27 +159,16 @@ class WebGuard:
         """Return the headers of every answer."""
         # in Safari, 'self' covers http only; a foreign host must not get into the header
         sockets = f" ws://{host}" if _is_own(host) else ""
-        policy = {
-            "default-src": "'none'",
-            "script-src": f"'nonce-{nonce}' 'unsafe-eval'",  # of the worker that sorts Gaussians
-            "worker-src": "blob:",
-            "style-src": "'unsafe-inline'",
-            "img-src": "'self' data: blob:",
-            "font-src": "data:",
-            "connect-src": f"'self'{sockets} data: blob:",
-            "base-uri": "'none'",
-            "form-action": "'none'",
-            "frame-ancestors": "'none'",
-        }
+        policy = (
+            f"default-src 'none'; script-src 'nonce-{nonce}' 'unsafe-eval'; "  # eval: the worker that sorts Gaussians
+            "worker-src blob:; style-src 'unsafe-inline'; img-src 'self' data: blob:; font-src data:; "
+            f"connect-src 'self'{sockets} data: blob:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+        )
         return {
-            "Content-Security-Policy": "; ".join(f"{name} {value}" for name, value in policy.items()),
-            "X-Frame-Options": "DENY",
-            "Referrer-Policy": "no-referrer",
-            "X-Content-Type-Options": "nosniff",
-            "Cache-Control": "no-store",
-            "Cross-Origin-Opener-Policy": "same-origin",
+            "Content-Security-Policy": policy, "X-Frame-Options": "DENY", "Referrer-Policy": "no-referrer",
+            "X-Content-Type-Options": "nosniff", "Cache-Control": "no-store", "Cross-Origin-Opener-Policy": "same-origin",
             "Cross-Origin-Resource-Policy": "same-origin",
-        }
+        }  # fmt: skip
 
 
 def _is_own(host: str) -> bool:
@@ -318,10 +305,6 @@ class RankWatch:
         below = (self._seen[r][0].split("|", 2) for r in range(self.rank) if r in self._seen)
         return all(there != self.here or is_gone(int(process)) for _, process, there in below)
 
-    def settle(self, seconds: float) -> None:
-        """Wait a little more than ``seconds`` for the thread, which ends this process once it knows the lost rank."""
-        time.sleep(seconds + 2 * BEAT_SECONDS)
-
     def leave(self) -> None:
         """Tell the other ranks that this process ends normally; all ranks but the first wait for the first to end."""
         try:
@@ -332,13 +315,11 @@ class RankWatch:
             self.leaving.set()
             self.store.set(f"heard/{self.rank}", "")
             until = time.monotonic() + 3 * BEAT_SECONDS  # the store may end with the first process
-            while self.rank == 0 and time.monotonic() < until and not self._all_heard():
+            heard = [f"heard/{r}" for r in range(self.count)]
+            while self.rank == 0 and time.monotonic() < until and not self.store.check(heard):
                 time.sleep(0.05)
         except RuntimeError:  # the store has ended with the process that held it
             self.leaving.set()
-
-    def _all_heard(self) -> bool:
-        return bool(self.store.check([f"heard/{r}" for r in range(self.count)]))
 
 
 # Processes that fit one scene together: their ranks, their exchange of data, and their end when one is lost.
@@ -423,7 +404,7 @@ class Group(Ranks):
         try:
             yield
         except RuntimeError as e:
-            self.watch.settle(LOST_SECONDS)
+            time.sleep(LOST_SECONDS + 2 * BEAT_SECONDS)  # the thread ends this process once it knows the lost rank
             raise ResourceError(
                 f"rank {self.rank} of {self.count} cannot exchange data with the others ({str(e).splitlines()[0][:200]}); "
                 "--resume continues from the last checkpoint"
@@ -496,7 +477,12 @@ def join(device: str) -> Ranks:
     backend = "nccl" if cuda else "gloo"
     _joined = Group(rank, count, backend, watch)
     if cuda:
-        _take_gpu(rank, local)
+        if torch.cuda.device_count() <= local:
+            raise ResourceError(
+                f"rank {rank} needs GPU {local} of this machine, but torch finds {torch.cuda.device_count()} GPUs, and NCCL "
+                "needs one for each process. Start fewer processes, or give --device cpu"
+            )
+        torch.cuda.set_device(local)
     watch.meet(JOIN_SECONDS)
     try:
         dist.init_process_group(
@@ -523,18 +509,6 @@ def _store(address: str, port: int, count: int, home: str | None, *, hosts: bool
     return dist.PrefixStore("/".join(["warpgs", *run]), store)
 
 
-def _take_gpu(rank: int, local: int) -> None:
-    """Take the GPU of a local rank; ResourceError without one."""
-    import torch
-
-    if torch.cuda.device_count() <= local:
-        raise ResourceError(
-            f"rank {rank} needs GPU {local} of this machine, but torch finds {torch.cuda.device_count()} GPUs, and NCCL needs "
-            "one for each process. Start fewer processes, or give --device cpu"
-        )
-    torch.cuda.set_device(local)
-
-
 def _stay_home(address: str) -> str | None:
     """Have gloo and NCCL listen at the loopback interface if all ranks are on this machine; return its address, else None."""
     home = loopback_of(address)
@@ -547,18 +521,12 @@ def _stay_home(address: str) -> str | None:
 def last_words(line: str, code: int) -> int:
     """Print why this process ends, and return its exit code."""
     if _joined is None:
-        if place_or_first()[0] == 0:
-            say(line, error=True)
+        with contextlib.suppress(UsageError):  # unusable variables are those of no rank
+            if place()[0]:
+                return code
+        say(line, error=True)
         return code
     with ignored_signals():  # torchrun ends the others once one has ended
         _joined.watch.fail(line)
     sys.stdout.flush()
     os._exit(code)  # a broken group may wait for ever
-
-
-def place_or_first() -> tuple[int, int]:
-    """Return the result of `place`, or 0 and 1 if the variables are unusable."""
-    try:
-        return place()
-    except UsageError:
-        return 0, 1

@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Iterable, Sized
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from warpgs.errors import DataError, document_fields
 if TYPE_CHECKING:
     import torch
 
+    Array = np.ndarray | torch.Tensor
 
 C0 = 0.28209479177387814
 """Harmonic of degree 0, 1/2 sqrt(1/pi): a colour is 1/2 + C0 times its coefficient."""
@@ -36,11 +37,6 @@ def base_coefficients(colors: np.ndarray | torch.Tensor) -> np.ndarray | torch.T
 #
 # Conventions (docs/conventions.md): camera_from_world poses, OpenCV axes (+x right, +y down, +z forward), pixel centres
 # at +0.5, quaternions wxyz, log scales, logit opacities, colours in [0, 1]. Lengths are in scene units [u].
-
-if TYPE_CHECKING:
-    import torch
-
-    Array = np.ndarray | torch.Tensor
 
 
 @document_fields
@@ -252,6 +248,7 @@ class _GaussianSet:
 
     means: torch.Tensor
     sh: torch.Tensor | None
+    __dataclass_fields__: ClassVar[dict[str, Any]]
 
     def __len__(self) -> int:
         """Return the number of Gaussians."""
@@ -261,6 +258,11 @@ class _GaussianSet:
     def sh_degree(self) -> int:
         """Highest spherical-harmonics degree; 0 without ``sh``."""
         return 0 if self.sh is None else int(round(self.sh.shape[1] ** 0.5)) - 1
+
+    def tensors(self) -> dict[str, torch.Tensor]:
+        """Return the tensors by field name, in their order; ``sh`` is zeros [N, 1, 3] if it is None."""
+        sh = self.means.new_zeros(len(self), 1, 3) if self.sh is None else self.sh
+        return {name: getattr(self, name) for name in self.__dataclass_fields__} | {"sh": sh}
 
 
 @document_fields
@@ -278,10 +280,6 @@ class Gaussians(_GaussianSet):
     """Inverse sigmoid of the opacity, shape [N]."""
     sh: torch.Tensor
     """Spherical-harmonics coefficients, shape [N, K, 3] with K = (degree + 1)^2, K in {1, 4, 9, 16, 25}."""
-
-    def tensors(self) -> dict[str, torch.Tensor]:
-        """Return the five tensors by field name, in a fixed order."""
-        return {name: getattr(self, name) for name in ("means", "quats", "log_scales", "logit_opacities", "sh")}
 
     def to(self, device: str | torch.device) -> Gaussians:
         """Return the same N Gaussians on a device. Differentiable, as `torch.Tensor.to` is."""
@@ -308,11 +306,6 @@ class ActivatedGaussians(_GaussianSet):
     sh: torch.Tensor | None = None
     """Spherical-harmonics coefficients, shape [N, K, 3] as in `Gaussians`; None with ``RasterizeOptions.colors``."""
 
-    def tensors(self) -> dict[str, torch.Tensor]:
-        """Return the five tensors by field name, in the order of `Gaussians`; ``sh`` is zeros [N, 1, 3] if it is None."""
-        sh = self.means.new_zeros(len(self), 1, 3) if self.sh is None else self.sh
-        return {"means": self.means, "quats": self.quats, "scales": self.scales, "opacities": self.opacities, "sh": sh}
-
     def stored(self) -> Gaussians:
         """Return the same N Gaussians by log scales and logits: scale 0 becomes -inf, opacity 1 inf, which no file stores."""
         means, quats, scales, opacities, sh = self.tensors().values()
@@ -334,11 +327,6 @@ class CovarianceGaussians(_GaussianSet):
     """Opacities in [0, 1], shape [N]."""
     sh: torch.Tensor | None = None
     """Spherical-harmonics coefficients, shape [N, K, 3] as in `Gaussians`; None with ``RasterizeOptions.colors``."""
-
-    def tensors(self) -> dict[str, torch.Tensor]:
-        """Return the four tensors by field name, in a fixed order; ``sh`` is zeros [N, 1, 3] if it is None."""
-        sh = self.means.new_zeros(len(self), 1, 3) if self.sh is None else self.sh
-        return {"means": self.means, "covars": self.covars, "opacities": self.opacities, "sh": sh}
 
 
 RasterizedGaussians = Gaussians | ActivatedGaussians | CovarianceGaussians
@@ -454,13 +442,10 @@ def checked_scene(scene: Scene, where: str = "") -> Scene:
     if not (isinstance(n.scale, (int, float, np.number)) and 0 < n.scale <= MOST):
         raise _wrong(f"{of}normalization.scale", "a number above 0", repr(n.scale), "give scene units per file unit, or 1.0")
     return _with(
-        scene,
-        views=scene.views if [*map(id, scene.views)] == [*map(id, views)] else tuple(views),
-        notes=tuple(scene.notes),
-        points=points,
-        background=background if isinstance(background, tuple) else tuple(map(float, colors)),
+        scene, views=scene.views if [*map(id, scene.views)] == [*map(id, views)] else tuple(views), notes=tuple(scene.notes),
+        points=points, background=background if isinstance(background, tuple) else tuple(map(float, colors)),
         normalization=_with(n, offset=offset),
-    )
+    )  # fmt: skip
 
 
 def checked_views(views: Iterable[View], where: str = "") -> list[View]:
@@ -511,30 +496,26 @@ def _checked_camera(what: str, camera: Camera) -> Camera:
         return _numbers(f"{what}.{name}", value, shape, fix, -math.inf, math.inf, None)
 
     viewmat = matrix("viewmat", camera.viewmat, (4, 4), "give camera_from_world, [R t] above the row 0, 0, 0, 1")
-    K, R, row = matrix("K", camera.K, (3, 3), INTRINSICS), viewmat[:3, :3].astype(np.float64), viewmat[3]
+    K, R, lens = matrix("K", camera.K, (3, 3), INTRINSICS), viewmat[:3, :3].astype(np.float64), camera.distortion
     with np.errstate(over="ignore", invalid="ignore"):
         off = float(np.abs(R @ R.T - np.eye(3)).max())
-
-    def need(good: bool | np.bool_, name: str, needs: str, got: str, fix: str) -> None:
-        if not good:
-            raise _wrong(f"{what}.{name}", needs, got, fix)
-
-    near = np.abs(row - (0, 0, 0, 1)).max() <= POSE_TOLERANCE
-    need(near, "viewmat", "a pose above 0, 0, 0, 1", str(row.tolist()), "transpose it: viewmat.T")
-    got = f"R R^T off by {off:.2g} from the identity"
-    need(off <= POSE_TOLERANCE, "viewmat", "rigid", got, "divide its scale out of R and t")
-    got, fix = "a mirrored pose (determinant -1)", "for OpenGL axes, negate rows y and z"
-    need(np.linalg.det(R) > 0, "viewmat", "a rotation", got, fix)
+        turns = np.linalg.det(R) > 0
+    near = np.abs(viewmat[3] - (0, 0, 0, 1)).max() <= POSE_TOLERANCE
     plain = max(abs(K[0, 1]), abs(K[1, 0]), *np.abs(K[2] - (0, 0, 1))) <= K_TOLERANCE
-    fix = f"divide K by K[2, 2], or undistort skewed images; {INTRINSICS}"
-    need(plain, "K", "without skew, above 0, 0, 1", str(K.tolist()), fix)
     focal, least = np.abs([K[0, 0], K[1, 1]]), MIN_FOCAL * np.array([camera.width, camera.height])
     in_pixels = focal.all() and (camera.model not in ("pinhole", "opencv") or (focal >= least).all())
-    fix = "multiply normalised intrinsics by width (first row) and height (second row)"
-    need(in_pixels, "K", "in pixels", f"focal lengths {K[0, 0]:g} and {K[1, 1]:g}", fix)
-    lens, count = camera.distortion, COEFFICIENTS.get(camera.model)
-    fix = "give None, or model='opencv'"
-    need(count != 0 or lens is None, "distortion", f"None for model {camera.model}", "a value", fix)
+    count = COEFFICIENTS.get(camera.model)
+    for good, name, needs, got, fix in (
+        (near, "viewmat", "a pose above 0, 0, 0, 1", f"{viewmat[3].tolist()}", "transpose it: viewmat.T"),
+        (off <= POSE_TOLERANCE, "viewmat", "rigid", f"R R^T off by {off:.2g} from 1", "divide its scale out of R and t"),
+        (turns, "viewmat", "a rotation", "a mirrored pose (determinant -1)", "for OpenGL axes, negate rows y and z"),
+        (plain, "K", "without skew, above 0, 0, 1", f"{K.tolist()}", f"divide K by K[2, 2], or undistort images; {INTRINSICS}"),
+        (in_pixels, "K", "in pixels", f"focal lengths {K[0, 0]:g} and {K[1, 1]:g}",
+         "multiply normalised intrinsics by width (first row) and height (second row)"),
+        (count != 0 or lens is None, "distortion", f"None for model {camera.model}", "a value", "give None, or model='opencv'"),
+    ):  # fmt: skip
+        if not good:
+            raise _wrong(f"{what}.{name}", needs, got, fix)
     if count:
         given = np.zeros(0) if lens is None else lens
         lens = matrix("distortion", given, (count,), f"give {count} coefficients, np.zeros({count}) for an ideal lens")
@@ -546,9 +527,7 @@ def _checked_mask(what: str, value: Any, shape: tuple[int, int]) -> np.ndarray |
     if value is None:
         return None
     noun, needs = what.rpartition(" ")[2], f"bool, True where used, shape {list(shape)}"
-    mask = _plain(what, value, needs, f"np.asarray({noun}) > 0")
-    if mask.shape != shape:
-        raise _wrong(what, needs, f"shape {list(mask.shape)}", _shape_fix(noun, mask.shape, shape))
+    mask = _plain(what, value, shape, needs, f"np.asarray({noun}) > 0")
     if mask.dtype != bool:
         raise _wrong(what, needs, f"{mask.dtype}", f"give {noun} > 0")
     if not mask.any():
@@ -599,9 +578,7 @@ def _numbers(
     noun = what.rpartition(" ")[2]
     span = "finite" if high == math.inf else "finite, at least 0" if high == MOST else f"in [{low:g}, {high:g}]"
     needs = f"{np.dtype(kind)}, {span}, shape {list(shape)}"  # float64 for None
-    array = _plain(what, value, needs, f"np.asarray({noun}, np.{np.dtype(kind)})")
-    if array.shape != shape:
-        raise _wrong(what, needs, f"shape {list(array.shape)}", fix or _shape_fix(noun, array.shape, shape))
+    array = _plain(what, value, shape, needs, f"np.asarray({noun}, np.{np.dtype(kind)})", fix)
     real = array.dtype in (np.float32, np.float64) if kind is None else array.dtype.kind == "f"
     least, most = (float(array.min()), float(array.max())) if array.size and array.dtype.kind in "fiu" else (0, 0)
     if not (real and low - SLACK <= least and most <= high + SLACK and math.isfinite(least) and math.isfinite(most)):
@@ -610,17 +587,20 @@ def _numbers(
     return array if kind is None else np.ascontiguousarray(array, kind)
 
 
-def _plain(what: str, value: Any, needs: str, fix: str) -> np.ndarray:
-    """Return a numpy array, or a tensor as one; readers know no torch, so tensors are recognised by their methods."""
+def _plain(what: str, value: Any, shape: tuple[int, ...], needs: str, cast: str, fix: str = "") -> np.ndarray:
+    """Return a numpy array of a shape, or a tensor as one; readers know no torch, so its methods tell a tensor."""
+    noun = what.rpartition(" ")[2]
     if hasattr(value, "detach") and hasattr(value, "numpy"):
         try:
-            return np.asarray(value.detach().cpu().numpy())
+            value = np.asarray(value.detach().cpu().numpy())
         except (TypeError, RuntimeError) as e:  # bfloat16, sparse
             raise _wrong(what, needs, f"a tensor of {value.dtype}", "give a dense tensor, or .float()") from e
     if isinstance(value, np.ma.MaskedArray):
-        raise _wrong(what, needs, "MaskedArray", f"give {what.rpartition(' ')[2]}.data, and its mask as View.mask")
+        raise _wrong(what, needs, "MaskedArray", f"give {noun}.data, and its mask as View.mask")
     if not isinstance(value, np.ndarray):
-        raise _wrong(what, needs, type(value).__name__, "give an array" if value is None else f"give {fix}")
+        raise _wrong(what, needs, type(value).__name__, "give an array" if value is None else f"give {cast}")
+    if value.shape != shape:
+        raise _wrong(what, needs, f"shape {list(value.shape)}", fix or _shape_fix(noun, value.shape, shape))
     return value
 
 

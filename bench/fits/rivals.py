@@ -59,12 +59,7 @@ class Study:
         return sorted(found, key=work, reverse=True)
 
     def scored(self, done: list[dict], tuned: bool) -> list[Fit]:
-        """Return the fits to all training views, seed by seed: of arms whose steps were chosen, or of the others.
-
-        Args:
-            done: Results so far.
-            tuned: Whether steps were chosen.
-        """
+        """Return the fits to all training views, seed by seed: of arms whose steps were chosen, or of the others."""
         presets = {
             (name, arm): self._preset(done, name, arm)
             for arm in self.arms for name in self.rows if bool(arm.steps) == tuned

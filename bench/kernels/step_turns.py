@@ -61,11 +61,7 @@ def _process(checkout: Path, cache: Path, count: int, threads: int, target: str)
 
 
 def _steps(process: subprocess.Popen, count: int) -> list[list[float]]:
-    """Take steps; return wall and processor time of each [ms].
-
-    Raises:
-        RuntimeError: The process ended.
-    """
+    """Take steps; return wall and processor time of each [ms]."""
     assert process.stdin is not None and process.stdout is not None
     process.stdin.write(f"{count}\n")
     process.stdin.flush()

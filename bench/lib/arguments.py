@@ -37,17 +37,7 @@ class _Help(argparse.RawDescriptionHelpFormatter, argparse.ArgumentDefaultsHelpF
 def parse(
     doc: str, given: list[str] | None = None, places: dict | None = None, need: tuple[str, ...] = (), **flags
 ) -> argparse.Namespace:
-    """Parse a command line.
-
-    Args:
-        doc: Docstring of the program.
-        given: Arguments of the command line; None for those of this process.
-        places: Types of positional arguments by name; a list of one type for one or more arguments, a tuple for a choice. An
-            argument whose name ends in ``?`` is optional.
-        need: Required flags.
-        **flags: Default of each flag by name. A type means one argument, by default None; False means a switch; a list means
-            several arguments; a list of one type is empty by default.
-    """
+    """Parse a command line."""
     spec = getattr(sys.modules["__main__"], "__spec__", None)
     program = f"python -m {spec.name}" if spec else None
     parser = argparse.ArgumentParser(program, description=doc, formatter_class=_Help)

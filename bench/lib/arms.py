@@ -88,9 +88,6 @@ def chosen_steps(rows: list[dict], row: str, arm: Arm) -> int:
     """Return the number of steps with the best mean PSNR over the left-out training views of a row.
 
     If the tuning was cut short, only the numbers that were tried on the most views are compared.
-
-    Raises:
-        UsageError: No number of steps was measured.
     """
     found = defaultdict(list)
     for r in rows:

@@ -31,13 +31,7 @@ def over(view: View, behind: np.ndarray, ours: tuple[float, float, float]) -> np
 
 @torch.no_grad()
 def ply_scores(gaussians: Gaussians, views: list[View], own: tuple[float, float, float]) -> dict[str, float]:
-    """Return the mean PSNR [dB] over each background of Gaussians rendered as a viewer does, without their own background.
-
-    Args:
-        gaussians: Those of a PLY file, in scene units [u].
-        views: Views with their true alpha.
-        own: Background that the views' images stand over.
-    """
+    """Return the mean PSNR [dB] over each background of Gaussians rendered as a viewer does, without their own background."""
     found: dict[str, list[float]] = {}
     for view in views:
         r = warpgs.rasterize(gaussians, view.camera)  # over black

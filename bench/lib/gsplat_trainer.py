@@ -181,17 +181,7 @@ def loaded(view: View, device: torch.device, scale: float) -> _Loaded:
 def train(
     views: list[View], first: Gaussians, s: Settings, *, seed: int, scale: float, size: float, draw: Callable = render
 ) -> dict:
-    """Train from the positions and colours of the first Gaussians, and return gsplat's parameters in its own world.
-
-    Args:
-        views: Training views, in our units.
-        first: Gaussians whose means and colours of degree 0 are the start; other initial values are gsplat's.
-        s: Settings.
-        seed: Seed of torch, and of the order of views.
-        scale: Length of our unit in gsplat's world.
-        size: Size of the scene in gsplat's world.
-        draw: Rasterizer, with arguments and results of `render`.
-    """
+    """Train from the positions and colours of the first Gaussians, and return gsplat's parameters in its own world."""
     device = first.means.device
     torch.manual_seed(seed)
     params = start(scale * first.means.detach(), C0 * first.sh.detach()[:, 0] + 0.5, s)
@@ -220,20 +210,7 @@ def fit(
     scene: Scene, views: list[View], first: Gaussians, s: Settings, *, seed: int, own_units: bool = True,
     draw: Callable = render,
 ):  # fmt: skip
-    """Train on views of a scene; return the parameters, and seconds, count, unit and size of the scene as figures of a row.
-
-    Args:
-        scene: Scene of the views; settings have the background.
-        views: Training views.
-        first: Gaussians whose means and colours are the start.
-        s: Settings.
-        seed: Seed of torch, and of the order of views.
-        own_units: Scale the world as gsplat's parser does; else use our units.
-        draw: Rasterizer, with arguments and results of `render`.
-
-    Raises:
-        UsageError: The scene's images are composited over a background other than that of the settings.
-    """
+    """Train on views of a scene; return the parameters, and seconds, count, unit and size of the scene as figures of a row."""
     if any(scene.background) and scene.background != s.background:
         raise UsageError(f"{scene.path}: its background is {scene.background}, but the settings have {s.background}")
     cameras, began = [view.camera for view in scene.views], time.perf_counter()

@@ -43,18 +43,6 @@ def garden_inputs(
 
     Points within 2 u of the origin (112k of them), repeated on a grid of ``tiles`` x ``tiles`` cells. Scales
     are uniform up to 0.02 u, rotations and opacities uniform, colours the points' own with small random higher degrees.
-
-    Args:
-        path: The npz file with means3d, colors, viewmats, Ks, width, height.
-        tiles: Cells per side; 1 gives 112k Gaussians, 5 gives 2.8M.
-        sh_degree: Degree of the colour coefficients.
-        width: Image width [px]; intrinsics are scaled to it.
-        height: Image height [px].
-        seed: Of the random parameters.
-        device: Where the tensors go.
-
-    Returns:
-        Gaussians that require gradients, and a batch of three cameras.
     """
     data = np.load(path)
     points, colors = data["means3d"], data["colors"].astype(np.float32) / 255

@@ -153,28 +153,28 @@ class Naive:
         ends = torch.empty(pixels, dtype=torch.int32, device=projected.device)
         columns, rows = grid(width, height, tiles.size)
         self.inputs = [
-            launch.view(self.projected.view(-1, 12), wp.float32), launch.view(tiles.ranges, wp.int32),
-            launch.view(tiles.gaussian_ids, wp.int32), launch.view(backgrounds, wp.float32), width, height, columns,
+            self.projected.view(-1, 12), tiles.ranges,
+            tiles.gaussian_ids, backgrounds, width, height, columns,
             columns * rows, tiles.size, rule.alpha_cut, rule.alpha_max,
         ]  # fmt: skip
         self.stop, self.kept = rule.transmittance_stop, [transmittances, ends]
-        self.state = [launch.view(transmittances, wp.float32), launch.view(ends, wp.int32)]
+        self.state = [transmittances, ends]
 
     def _launch(self, kernel, inputs: list) -> None:
-        inputs = [a.array() if isinstance(a, launch.View) else a for a in inputs]
+        inputs = [wp.from_torch(a) if isinstance(a, torch.Tensor) else a for a in inputs]
         with launch.stream_of(self.rgb.device):
             wp.launch(kernel, self.pixels, inputs=inputs, device=self.device, record_tape=False)
 
     def forward(self) -> torch.Tensor:
         """Return the image, shape [C, H, W, 3]."""
-        outputs = [launch.view(self.rgb.view(-1, 3), wp.float32), *self.state]
+        outputs = [self.rgb.view(-1, 3), *self.state]
         self._launch(forward_kernel(), [*self.inputs, self.stop, *outputs])
         return self.rgb
 
     def backward(self, v_rgb: torch.Tensor) -> torch.Tensor:
         """Return the gradient of the records for an upstream gradient, shape [C, N, 12]; call `forward` first."""
         self.v_projected.zero_()
-        arrays = [launch.view(t.view(-1, t.shape[-1]), wp.float32) for t in (v_rgb.contiguous(), self.v_projected)]
+        arrays = [t.view(-1, t.shape[-1]) for t in (v_rgb.contiguous(), self.v_projected)]
         self._launch(backward_kernel(), [*self.inputs, *self.state, *arrays])
         return self.v_projected
 

@@ -78,9 +78,6 @@ def config_of(preset: str, seed: int = 0) -> FitConfig:
 
     ``PRESET:a.b=value,c=value`` changes the named settings; values are JSON, or text without quotes. A strategy may be
     ``FILE.py:CLASS``; its own settings come after it, by the names of their flags, as in ``lottery.growth=0.2``.
-
-    Raises:
-        UsageError: The preset or a setting is unknown, or a value is out of range.
     """
     name, _, changes = preset.removeprefix(PRUNED).partition(":")
     if name not in PRESETS:
@@ -101,11 +98,7 @@ def _present(changes: str) -> str:
 
 
 def peer_settings(preset: str, train: list[View]) -> gsplat_trainer.Settings:
-    """Return the settings of gsplat's trainer: ``gsplat:steps=1000,sh_degree=auto,background=mean``; auto is as in `default`.
-
-    Raises:
-        UsageError: A setting is unknown.
-    """
+    """Return the settings of gsplat's trainer: ``gsplat:steps=1000,sh_degree=auto,background=mean``; auto as in `default`."""
     changes = preset.partition(":")[2]
     given: dict = {f.name: None for f in dataclasses.fields(gsplat_trainer.Settings)}
     _change(given, preset, changes)
@@ -148,17 +141,7 @@ def compile_all(presets: tuple[str, ...], device: str) -> None:
 
 
 def plan(row: str, preset: str, seed: int, folder: str, place: tuple[str, int], count: int, device: str) -> list[Fit]:
-    """Return the fits of a row, a preset and a seed: one, or one for each set of training views that is left out.
-
-    Args:
-        row: Name of the row.
-        preset: As in `Fit`.
-        seed: Seed of the fit.
-        folder: Folder of the scene.
-        place: Split and downscale.
-        count: Training views to leave out, 0 for none.
-        device: cpu or cuda.
-    """
+    """Return the fits of a row, a preset and a seed: one, or one for each set of training views that is left out."""
     split, downscale = place
     cut = folds(scene_at(folder, downscale), split, count)
     return [Fit(row, preset, seed, folder, part, names, downscale, device) for part, names in cut]

@@ -23,7 +23,7 @@ from warpgs.kernels.project import project
 from warpgs.kernels.ssim import ssim
 from warpgs.kernels.sweep import best_inverses, plane_costs, scanline_costs
 from warpgs.kernels.tiles import bin_tiles
-from warpgs.kernels.tsdf import empty_grid, integrate
+from warpgs.kernels.tsdf import integrate
 from warpgs.kernels.update import Setting, adam_step, begin_step, end_step, opacity_decay, opacity_dropout
 from warpgs.kernels.walk import heaviest, median_depth
 from warpgs.priors.sweep import UNIT, step_limits
@@ -238,9 +238,9 @@ def tsdf_tasks(point: Point, device: torch.device, wanted: Wanted) -> Tasks:
     one = Camera(*(t[0].double().cpu().numpy() for t in (camera.viewmat, camera.K)), point.width, point.height)
     side = max(2, round(point.count ** (1 / 3)))
     depth = torch.full((point.height, point.width), 4.0, device=device)
-    grid = empty_grid((-2.0, -2.0, 2.0), 4.0 / side, (side,) * 3, 16.0 / side, depth)
+    grid = depth.new_zeros(side, side, side), depth.new_zeros(side, side, side), (-2.0, -2.0, 2.0), 4.0 / side, 16.0 / side
     weights = torch.ones_like(depth)
-    yield Task(OURS, "forward", lambda: integrate(grid, one, depth, weights))
+    yield Task(OURS, "forward", lambda: integrate(*grid, one, depth, weights))
 
 
 def render_tasks(point: Point, device: torch.device, wanted: Wanted) -> Tasks:

@@ -142,17 +142,7 @@ def run(
     earlier: dict | None = None,
     echo: Callable[[str], None] = lambda line: print(line, flush=True),
 ) -> dict:
-    """Measure the ops named and return the result, with the roofline, a row per task, and what was skipped and why.
-
-    Args:
-        device: Where to measure.
-        tiny: True for few repeats at small sizes, for tests.
-        ops: Names out of `OPS`.
-        budget: Time limit [s], after which remaining points are skipped. None for no limit.
-        note: Note on the machine for the results.
-        earlier: Results of the same code on the same machine; only missing or disturbed rows are measured.
-        echo: Takes a line per task.
-    """
+    """Measure the ops named and return the result, with the roofline, a row per task, and what was skipped and why."""
     if device.type == "cuda" and device.index is None:
         device = torch.device("cuda", torch.cuda.current_device())  # Warp asks for the number
     head = result_file.result(WHAT, device, []) | ({"note": note} if note else {})

@@ -27,15 +27,7 @@ PARTS: dict[str, Callable[[], dict[str, str]]] = {
 
 
 def filled(page: str, parts: dict[str, str]) -> str:
-    """Return a page with its generated parts replaced.
-
-    Args:
-        page: Text with a pair of comments for each part, ``NAME: written by bench.document`` and ``end of NAME``.
-        parts: Text of each part by name.
-
-    Raises:
-        ValueError: The page and ``parts`` have different names.
-    """
+    """Return a page with its generated parts replaced."""
     marks = re.compile(r"(<!-- ([\w ]+): written by bench\.document -->\n).*?(<!-- end of \2 -->)", re.DOTALL)
     names = [match[2] for match in marks.finditer(page)]
     if sorted(names) != sorted(parts):

@@ -49,9 +49,9 @@ def drawn_pairs(projected: torch.Tensor, tiles: Tiles, width: int, height: int, 
     drawn = torch.empty(ends.numel(), dtype=torch.int32, device=projected.device)
     with launch.stream_of(projected.device):
         arguments = [
-            launch.view(projected.reshape(-1, projected.shape[-1]), wp.float32), launch.view(tiles.ranges, wp.int32),
-            launch.view(tiles.gaussian_ids, wp.int32), launch.view(ends.reshape(-1), wp.int32),
-            width, height, columns, columns * rows, tiles.size, rule.alpha_cut, launch.view(drawn, wp.int32),
+            projected.reshape(-1, projected.shape[-1]), tiles.ranges,
+            tiles.gaussian_ids, ends.reshape(-1),
+            width, height, columns, columns * rows, tiles.size, rule.alpha_cut, drawn,
         ]  # fmt: skip
         launch.launch(count_drawn, len(drawn), arguments, projected.device, cost=100)
     return int(drawn.sum(dtype=torch.int64))

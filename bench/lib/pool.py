@@ -24,15 +24,7 @@ def finished(
 ) -> Iterator[tuple[object, dict]]:
     """Yield each task with its result of ``work``, as they finish; ``{"error": ...}`` if ``work`` raised or the process died.
 
-    Args:
-        work: Function of a module, called in a worker process.
-        tasks: Arguments of ``work``, the longest tasks first.
-        jobs: Tasks at a time.
-        seconds: Time after which no further task begins [s].
-        first: Function of a module, called in one worker before any task begins, to compile kernels once for all.
-
-    Raises:
-        Exception: ``first`` raised it.
+    No task begins after ``seconds``; ``first`` runs once before all, to compile kernels; give the longest tasks first.
     """
     began, waiting = time.monotonic(), deque(tasks)
     while waiting and time.monotonic() - began < seconds:
@@ -63,11 +55,7 @@ def _died(started: Future) -> bool:
 
 
 def stored_rows(path: Path | None) -> list[dict]:
-    """Return the finished rows of a file, without failed rows; none if there is no file.
-
-    Raises:
-        UsageError: The rows were measured at another commit.
-    """
+    """Return the finished rows of a file, without failed rows; none if there is no file."""
     if path is None or not path.is_file():
         return []
     stored, now = result_file.read(path), result_file.commit_of()
@@ -77,17 +65,7 @@ def stored_rows(path: Path | None) -> list[dict]:
 
 
 def measure_all(work: Work, tasks: Sequence, first, a, what: str, device: torch.device, line: Line) -> list[dict]:
-    """Run the tasks that a file lacks, write it after each, and return all rows.
-
-    Args:
-        work: As in `finished`.
-        tasks: Tasks, each with a ``key`` that identifies its row.
-        first: As in `finished`.
-        a: Arguments of the program: ``out``, ``jobs`` and ``seconds``.
-        what: What a row measures.
-        device: Where it is measured.
-        line: Returns a row as text.
-    """
+    """Run the tasks that a file lacks, write it after each, and return all rows."""
     rows, done = stored_rows(a.out), 0
     todo = [t for t in tasks if not any(t.key.items() <= row.items() for row in rows)]
     for task, figures in finished(work, todo, a.jobs, a.seconds, first):

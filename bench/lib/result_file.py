@@ -75,14 +75,7 @@ def command_line() -> str:
 
 
 def result(what: str, device: torch.device, rows: list[dict], **facts) -> dict:
-    """Return a result of this program on this machine.
-
-    Args:
-        what: One sentence on what a row measures.
-        device: Where it was measured.
-        rows: Plain values, a dictionary for each measurement.
-        **facts: Further facts for readers or later runs.
-    """
+    """Return a result of this program on this machine."""
     head = {"what": what, "command": command_line(), "commit": commit_of(), "date": datetime.now(UTC).strftime("%Y-%m-%d")}
     return head | {"machine": _machine(device), "versions": _versions(device)} | facts | {"rows": rows}
 
@@ -93,11 +86,7 @@ def keep(path: Path | None, what: str, device: torch.device, rows: list[dict], *
 
 
 def write(path: Path | None, values: dict) -> None:
-    """Write a result; nothing if no path is given.
-
-    Raises:
-        ValueError: The result lacks a key of the format.
-    """
+    """Write a result; nothing if no path is given."""
     missing = [k for k in KEYS if k not in values]
     if missing:
         raise ValueError(f"{path}: the result has no {', '.join(missing)}; make it with bench.lib.result_file.result")
@@ -107,11 +96,7 @@ def write(path: Path | None, values: dict) -> None:
 
 
 def read(path: Path) -> dict:
-    """Return a stored result.
-
-    Raises:
-        ValueError: The file is of another format.
-    """
+    """Return a stored result."""
     values = json.loads(path.read_text("utf-8"))
     missing = [k for k in KEYS if not isinstance(values, dict) or k not in values]
     if missing:

@@ -26,14 +26,7 @@ def preset_in(rows: list[dict], row: str, arm: Arm) -> str | None:
 
 
 def arms_table(arms: Sequence[Arm], rows: list[dict], names: Sequence[str], above: bool) -> str:
-    """Return PSNR and SSIM of each arm on each row, with its steps, and the difference in PSNR to the base by seed.
-
-    Args:
-        arms: Rows of the table.
-        rows: Results on held-out views, and on training views left out.
-        names: Rows of the comparison, a group of columns each.
-        above: The base of an arm is the one above it, else the first arm.
-    """
+    """Return PSNR and SSIM of each arm on each row, with its steps, and the difference in PSNR to the base by seed."""
     held_out = [r for r in rows if not r.get("left_out")]
     found, confidence, body = by_seed(held_out), family_confidence(len(arms) - 1), []
     for place, arm in enumerate(arms):

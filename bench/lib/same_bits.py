@@ -114,8 +114,8 @@ def prior_stages(train: list[View]) -> Iterator[Stage]:
     matches = triangulate_matches(train)
     yield "triangulated matches", digest(matches.points, matches.colors)
     maps = classical_maps([v.image for v in train])
-    for name in ("confidence", "boundary", "foreground"):
-        yield f"semantics: {name}", digest(*(getattr(m, name) for m in maps))
+    for name, of_views in zip(("confidence", "boundary", "foreground"), zip(*maps)):
+        yield f"semantics: {name}", digest(*of_views)
 
 
 def _ply(gaussians: Gaussians, scene: Scene, folder: Path) -> str:
@@ -171,17 +171,7 @@ def fit_stages(
 def stages(
     device: torch.device, *, views: int, width: int, height: int, steps: int, only_start: bool, given: Path | None = None
 ) -> Iterator[Stage]:
-    """Yield names and digests of stages in their order of computation.
-
-    Args:
-        device: Device of the fits.
-        views: Number of views of the demo.
-        width: Width of its images [px].
-        height: Height of its images [px].
-        steps: Steps of each fit.
-        only_start: True to stop each fit before its first step.
-        given: Folder of such a demo from another machine; None to write one.
-    """
+    """Yield names and digests of stages in their order of computation."""
     yield from function_stages()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)

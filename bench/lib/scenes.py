@@ -49,11 +49,7 @@ ROWS = {
 
 
 def row_of(name: str) -> Row:
-    """Return a named row, or that of ``FOLDER@SPLIT`` or ``FOLDER@SPLIT@DOWNSCALE``.
-
-    Raises:
-        UsageError: The name is neither a row nor such a text.
-    """
+    """Return a named row, or that of ``FOLDER@SPLIT`` or ``FOLDER@SPLIT@DOWNSCALE``."""
     if name in ROWS:
         return ROWS[name]
     match = re.fullmatch(r"([^@]+)@([^@]+)(?:@([1-9][0-9]?))?", name)
@@ -79,11 +75,7 @@ def scene_at(folder: str, downscale: int) -> Scene:
 
 
 def left_out(names: tuple[str, ...], count: int) -> list[tuple[str, ...]]:
-    """Return the sets of training views to leave out: of up to four each in turn, else ``count`` evenly between the ends.
-
-    Raises:
-        UsageError: Fewer than two views would be left to train.
-    """
+    """Return the sets of training views to leave out: of up to four each in turn, else ``count`` evenly between the ends."""
     n = len(names)
     if n < 3 or (n > FEW and not 1 <= count <= n - 2):
         raise UsageError(f"{count} of {n} training views cannot be left out: at least two must stay; use fewer")

@@ -8,13 +8,7 @@ from collections.abc import Iterable, Sequence
 
 
 def markdown(head: Sequence[str], rows: Iterable[Sequence[object]], left: Sequence[str] | None = None) -> str:
-    """Return a Markdown table.
-
-    Args:
-        head: Names of the columns.
-        rows: Cells.
-        left: Names of left-aligned columns; the others are right-aligned. None for no alignment.
-    """
+    """Return a Markdown table."""
     rule = ["---" if left is None or name in left else "---:" for name in head]
     return "\n".join("| " + " | ".join(map(str, line)) + " |" for line in (head, rule, *rows)) + "\n"
 

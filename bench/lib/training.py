@@ -7,13 +7,12 @@ from collections.abc import Callable
 import torch
 
 from warpgs.kernels.update import Setting
-from warpgs.pipeline.model.limits import TrainingCameras
 from warpgs.pipeline.model.table import DensityUpdate, Table
 from warpgs.pipeline.model.table import model_bytes as bytes_of
 from warpgs.pipeline.train.loss import LossConfig, built_in_terms
 from warpgs.pipeline.train.schedule import OptimizerConfig, plan_phases
 from warpgs.pipeline.train.settings import FitConfig, settings_by_views
-from warpgs.pipeline.train.step import MAX_STEPS, Learned, StepBuffers, StepGraphs, StepPlan, eager_renderer, step
+from warpgs.pipeline.train.step import MAX_STEPS, StepPlan, StepTaker, eager_renderer
 from warpgs.pipeline.train.strategies.base import Strategy, StrategyContext
 from warpgs.pipeline.train.trainer import Trainer
 from warpgs.pipeline.train.views import LearnedViews, ViewStack
@@ -69,21 +68,12 @@ def step_parts(trainer: Trainer) -> tuple[View, dict[str, torch.Tensor], Callabl
 
 
 class Steps:
-    """Training steps of given Gaussians on one image: image, L1 and SSIM, backward pass, Adam, as a fit takes them.
-
-    Args:
-        gaussians: The start; a copy of it is trained.
-        camera: A batch of one camera.
-        target: Image, shape [H, W, 3].
-        rule: Cut-offs of the rasterizer.
-        lr: Learning rate of all parameters; None for those of a fit in a scene of size 1.
-    """
+    """Training steps of given Gaussians on one image: image, L1 and SSIM, backward pass, Adam, as a fit takes them."""
 
     def __init__(self, gaussians: Gaussians, camera: Camera, target: torch.Tensor, rule: str, lr: float | None = None):
         device = target.device
         self.lr, self.options = lr, RasterizeOptions(rule=rule, background=torch.zeros(3, device=device))
         self.table = Table.of_gaussians(gaussians, {})
-        self.buffers = StepBuffers(device, 3 * len(self.table.params))
         config = FitConfig()
         context = StrategyContext(
             config.groups(),
@@ -97,19 +87,11 @@ class Steps:
             self.options.background,
         )
         strategy = Strategy(context)  # of the base class: it changes nothing
-        self.learned = Learned(
-            self.table,
-            LearnedViews((), (), device, 0),
-            strategy,
-            None,
-            TrainingCameras(torch.zeros(1, 3, device=device), torch.zeros(1, 9, device=device)),
-        )
-        numbers = torch.zeros(1, dtype=torch.int64, device=device)
-        self.views = ViewStack(
-            camera.viewmat, camera.K, camera.K.new_empty(1, 0), camera.model, target[None], None, {}, numbers
-        )
+        cameras = torch.zeros(1, 3, device=device), torch.zeros(1, 9, device=device)
+        self.taker = StepTaker(self.table, LearnedViews((), (), device), strategy, cameras, self.options)
+        self.buffers = self.taker.buffers
+        self.views = ViewStack(camera, target[None], None, {}, torch.zeros(1, dtype=torch.int64, device=device))
         self.plan = StepPlan(gaussians.sh_degree, False, tuple(built_in_terms(LossConfig())), None)
-        self.graphs = StepGraphs(self.learned, self.buffers, self.options) if device.type == "cuda" else None
         self._load(range(1, (MAX_STEPS if device.type == "cuda" else 1) + 1))
 
     def _load(self, steps: range) -> None:
@@ -123,13 +105,11 @@ class Steps:
     def eager(self) -> None:
         """Take the first step of a batch from Python, again and again: the same work each time."""
         self.buffers.counter.zero_()
-        step(self.learned, self.views, self.buffers, self.plan, eager_renderer(self.options, None))
-
-    def _graph(self) -> torch.cuda.CUDAGraph:
-        return self.graphs.capture_all([KIND], {KIND: self.views}, self.plan, None)[0]
+        self.taker.step(self.views, self.buffers, self.plan, eager_renderer(self.options, None))
 
     def replay(self) -> None:
         """Take the first step of a batch as a CUDA graph, again and again; captured at the first call."""
-        graph = self._graph()
+        taker = self.taker
+        replay = taker.works(taker.step, [KIND], self.buffers, {KIND: self.views}, self.plan, None, captured=True)[0]
         self.buffers.counter.zero_()
-        graph.replay()
+        replay()

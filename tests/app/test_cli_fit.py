@@ -59,12 +59,10 @@ class Opaque(loss.LossTerm):
 
 
 def parsed(*flags):
-    """The settings that a command line leads to."""
     return request_of([*BASE, *flags], "").config
 
 
 def squeezed(text):
-    """A text without its layout: frames and white space."""
     return "".join(text.replace("│", "").split())
 
 
@@ -102,7 +100,6 @@ def test_without_flags_the_settings_are_the_presets(preset):
 
 
 def test_flags_change_what_they_name(capsys):
-    """Sizes with units, nested settings, the default preset, and both forms of a flag."""
     found = parsed("--memory-limit", "2GiB", "--init.source=random", "--no-cuda-graph", "--max-gaussians", "900")
     assert (found.memory_limit, found.init.source, found.cuda_graph, found.max_gaussians) == (2 * 2**30, "random", False, 900)
     assert found.preset == "default" and "preset default: any capture" in capsys.readouterr().out
@@ -113,7 +110,6 @@ def test_flags_change_what_they_name(capsys):
 
 
 def test_mistakes_are_named_before_anything_starts(tmp_path, capsys):
-    """One line and exit code 2 for names, sizes and plug-ins that cannot be."""
     (tmp_path / "broken.py").write_text("x = 1\ny = 1 / 0\n")
     (tmp_path / "crooked.py").write_text("def f(:\n")
     (tmp_path / "clash.py").write_text(PLUG_INS.replace("SlowGrowth", "Init"))
@@ -137,20 +133,13 @@ def test_mistakes_are_named_before_anything_starts(tmp_path, capsys):
 
 @pytest.fixture(scope="module")
 def plugged(tmp_path_factory):
-    """A scene, a file with a strategy and a loss term, and a run with both."""
     folder = tmp_path_factory.mktemp("plugged")
     (folder / "mine.py").write_text(PLUG_INS)
     write_demo(folder / "scene", views=8, width=32, height=32)
     flags = ["--steps", "3", "--device", "cpu", "--preset", "3dgs", "--init.source", "random", "--init.random-count", "40"]
     command = ["fit", str(folder / "scene"), "--split", split_spec(8), "--out", str(folder / "run"), *flags]
-    named = [
-        "--strategy",
-        f"{folder}/mine.py:SlowGrowth",
-        "--slow-growth.rate",
-        "0.75",
-        "--loss-terms",
-        f"{folder}/mine.py:Opaque",
-    ]
+    named = ["--strategy", f"{folder}/mine.py:SlowGrowth", "--slow-growth.rate", "0.75", "--loss-terms"]
+    named.append(f"{folder}/mine.py:Opaque")
     assert main([*command, *named, "--reader", f"{folder}/mine.py:Folder"]) == 0
     return folder, command, named
 

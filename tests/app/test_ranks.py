@@ -20,7 +20,6 @@ from warpgs.synthetic.demo import write_demo
 
 
 def started(count: int, *command: str) -> list[subprocess.Popen]:
-    """Processes with the variables that torchrun sets."""
     with socket.socket() as s:
         s.bind(("127.0.0.1", 0))
         port = str(s.getsockname()[1])
@@ -35,7 +34,6 @@ def started(count: int, *command: str) -> list[subprocess.Popen]:
 
 
 def ended(processes: list[subprocess.Popen]) -> list[tuple[int, str, str]]:
-    """Exit code, stdout and stderr of each."""
     found = []
     try:
         for process in processes:
@@ -57,7 +55,7 @@ def test_any_number_of_processes_fits_the_same_model(tmp_path, capsys, first, th
     flags = [
         str(tmp_path / "scene"), "--device", "cpu", "--preset", "3dgs", "--steps", "8", "--batch", "5", "--dropout", "0.3",
         "--init.source", "random", "--init.random-count", "60", "--density.start", "1", "--density.every", "3",
-        "--density.gradient", "1e-6", "--checkpoint-every", "2", "--checkpoint-seconds", "0",
+        "--density.gradient", "1e-6", "--checkpoint-every", "2",
         "--optimizer.average-last", "0.75",
     ]  # fmt: skip
     shared = ["--out", str(tmp_path / "shared")]
@@ -87,7 +85,6 @@ def test_any_number_of_processes_fits_the_same_model(tmp_path, capsys, first, th
 
 @pytest.mark.parametrize(("name", "value"), [("RANK", "2"), ("RANK", "-1"), ("WORLD_SIZE", "two"), ("MASTER_PORT", "")])
 def test_variables_that_are_no_numbers_are_named(monkeypatch, name, value):
-    """One of torchrun's variables is something else: a sentence, before anything else happens."""
     for key, usual in (("RANK", "0"), ("WORLD_SIZE", "2"), ("LOCAL_RANK", "0"), ("MASTER_PORT", "29500")):
         monkeypatch.setenv(key, usual)
     monkeypatch.setenv(name, value)
@@ -96,7 +93,6 @@ def test_variables_that_are_no_numbers_are_named(monkeypatch, name, value):
 
 
 def test_a_process_alone_joins_nobody(monkeypatch):
-    """Without the variables, and where torchrun starts one process."""
     monkeypatch.delenv("RANK", raising=False)
     assert ranks.join("cpu") is ranks.ALONE and ranks.ALONE.first
     for key, value in (("RANK", "0"), ("WORLD_SIZE", "1")):
@@ -105,8 +101,6 @@ def test_a_process_alone_joins_nobody(monkeypatch):
 
 
 class Store(dict):
-    """A store as torch's is, in this process."""
-
     def set(self, key, value):
         self[key] = value.encode()
 
@@ -191,8 +185,6 @@ def test_all_ranks_read_the_texts_of_all(unwatched):
 
 
 class Two(ranks.Ranks):
-    """The first of two ranks; the other has changed one entry."""
-
     count = 2
 
     def __init__(self, changed: str):
@@ -226,8 +218,6 @@ def test_the_error_of_a_rank_is_printed_whole(monkeypatch):
 
 
 def test_a_machine_has_a_name_on_every_system(monkeypatch):
-    """Where there is no /proc it is that of the computer."""
-
     def none(*_):
         raise FileNotFoundError
 

@@ -31,14 +31,8 @@ from warpgs.scene import Gaussians, Normalization
 
 def gaussians(count: int = 3) -> Gaussians:
     generator = torch.Generator().manual_seed(0)
-    shapes = {
-        "means": (count, 3),
-        "quats": (count, 4),
-        "log_scales": (count, 3),
-        "logit_opacities": (count,),
-        "sh": (count, 4, 3),
-    }
-    return Gaussians(**{n: torch.randn(s, generator=generator) for n, s in shapes.items()})
+    shapes = {"means": (3,), "quats": (4,), "log_scales": (3,), "logit_opacities": (), "sh": (4, 3)}
+    return Gaussians(**{n: torch.randn((count, *s), generator=generator) for n, s in shapes.items()})
 
 
 def nonsense(g: Gaussians) -> str:
@@ -242,7 +236,8 @@ def check_onnx(root: Path, path: Path) -> bytes:
     return data
 
 
-register(Target("onnx", onnx_files, check_onnx, (onnx,), (onnx_field, onnx_field, onnx_field)))
+PARTS = (onnx.check_onnx, onnx._walk, onnx._message, onnx._varint, onnx._text)
+register(Target("onnx", onnx_files, check_onnx, PARTS, (onnx_field, onnx_field, onnx_field)))
 
 
 def flo_files(root: Path) -> list[Path]:
@@ -274,11 +269,10 @@ def side_nonsense(values: dict) -> str:
     return "" if isinstance(values, dict) and set(values) <= set(networks.KEYS) else "no description"
 
 
-SIDE = (networks.read_side_file, networks.check_value, networks._numbers, networks._whole)
 register(
     Target(
-        "description of a network", side_files, lambda root, path: networks.read_side_file(root / "m.onnx"), SIDE,
-        (json_value, json_value, text_number), nonsense=side_nonsense,
+        "description of a network", side_files, lambda root, path: networks.read_side_file(root / "m.onnx"),
+        (networks.read_side_file,), (json_value, json_value, text_number), nonsense=side_nonsense,
     )
 )  # fmt: skip
 

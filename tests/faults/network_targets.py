@@ -75,10 +75,10 @@ def network_files(root: Path) -> list[Path]:
     return sorted(root.glob("*.onnx"))
 
 
-NETWORK = (networks.open_network, onnx.start_session, onnx.read_model, networks._input_axes)
+NETWORK = (networks.Network.__init__, onnx.Model.__init__, onnx.start_session, onnx.read_model)
 register(
     Target(
-        "network", network_files, lambda root, path: networks.open_network(path, threads=1), NETWORK,
+        "network", network_files, lambda root, path: networks.Network(path, threads=1), NETWORK,
         (onnx_field, onnx_field, onnx_field), lines=0.7, share=0.3,
     )
 )  # fmt: skip
@@ -90,17 +90,18 @@ def matcher_files(root: Path) -> list[Path]:
 
 
 def matched(root: Path, path: Path) -> matching.Features:
-    return matching.open_matcher(path, threads=1).features(np.zeros((8, 8, 3), np.uint8))
+    return matching.Matcher(path, threads=1).features(np.zeros((8, 8, 3), np.uint8))
 
 
 def matcher_nonsense(found: matching.Features) -> str:
-    inside = (found.pixels >= 0) & (found.pixels <= 8)
-    return "" if inside.all() and len(found.pixels) == len(found.descriptors) else "a keypoint is none"
+    pixels, descriptors = found
+    inside = (pixels >= 0) & (pixels <= 8)
+    return "" if inside.all() and len(pixels) == len(descriptors) else "a keypoint is none"
 
 
 register(
     Target(
-        "matcher", matcher_files, matched, (matching.open_matcher, matching.Matcher.features, matching.Matcher._check),
+        "matcher", matcher_files, matched, (matching.Matcher.__init__, matching.Matcher.features, matching.Matcher._check),
         (onnx_field, onnx_field, onnx_field), nonsense=matcher_nonsense, lines=0.6, share=0.2,
     )
 )  # fmt: skip
@@ -116,7 +117,7 @@ def flow_networks(root: Path) -> list[Path]:
 
 register(
     Target(
-        "flow network", flow_networks, lambda root, path: flow._network(path, "255"), (flow._network,),
+        "flow network", flow_networks, lambda root, path: flow._network(path), (flow._network,),
         (onnx_field, onnx_field, onnx_field), lines=0.45, share=0.3,
     )
 )  # fmt: skip

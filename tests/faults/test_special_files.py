@@ -40,7 +40,7 @@ from warpgs.poses import photographs
 from warpgs.poses.find import find_poses, source_digest
 from warpgs.poses.photographs import is_heic
 from warpgs.priors import export, flow, networks
-from warpgs.priors.networks import MapCache, open_network
+from warpgs.priors.networks import MapCache, Network
 from warpgs.report.progress import read_events
 from warpgs.scene import Camera, Normalization, View
 
@@ -110,8 +110,8 @@ DOORS = {
     RECORD: ("pipeline.farm.job", job_record),
     "artefact": ("pipeline.farm.job", file_digest),
     "render.png": ("files", lambda p: read_file(p, p.parent)),
-    "model.onnx": ("onnx", open_network),
-    "flow.onnx": ("onnx", lambda p: flow._network(p, "255")),
+    "model.onnx": ("onnx", Network),
+    "flow.onnx": ("onnx", flow._network),
     "side.onnx": ("priors.networks", side_file),
     "a.flo": ("priors.flow", flow.read_flo),
     "b.flo": ("priors.flow", flow_folder),

@@ -47,7 +47,6 @@ def frame_files(root: Path) -> list[Path]:
 
 
 def frame_value(data: bytes, rng: np.random.Generator) -> bytes:
-    """Change a value of a message, or its type to another's."""
     import msgspec
 
     try:
@@ -81,32 +80,19 @@ OTHERS = (
     b"Host: example.org", b"Host: localhost:8080", b"Origin: null", b"Origin: http://example.org", b"Origin: ",
     b"Host: 127.0.0.1:x", b"X: \xff", b"Host", b": x", b"Content-Length: 5", b"Cookie: " + b"a" * 9000,
 )  # fmt: skip
-TARGETS = (
-    b"/",
-    b"//",
-    b"*",
-    b"http://x/",
-    b"/" + TOKEN.encode(),
-    b"/" + TOKEN.encode() + b"/../x",
-    b"/?a=b",
-    b"/\xff",
-    b"/" * 9000,
-)
+SECRET = b"/" + TOKEN.encode()
+TARGETS = (b"/", b"//", b"*", b"http://x/", SECRET, SECRET + b"/../x", b"/?a=b", b"/\xff", b"/" * 9000)
 
 
 def request_files(root: Path) -> list[Path]:
-    for name, path, headers in (
-        ("page", b"/", HEADERS[:1]),
-        ("socket", b"/", HEADERS),
-        ("script", b"/assets/a.js", HEADERS[:2]),
-    ):
-        lines = [b"GET /" + TOKEN.encode() + path + b" HTTP/1.1", *headers, b"", b""]
+    page, socket, script = (b"/", HEADERS[:1]), (b"/", HEADERS), (b"/assets/a.js", HEADERS[:2])
+    for name, (path, headers) in {"page": page, "socket": socket, "script": script}.items():
+        lines = [b"GET " + SECRET + path + b" HTTP/1.1", *headers, b"", b""]
         (root / f"{name}.http").write_bytes(b"\r\n".join(lines))
     return sorted(root.glob("*.http"))
 
 
 def request_line(data: bytes, rng: np.random.Generator) -> bytes:
-    """Exchange the target, or add, remove or exchange a header."""
     lines = data.split(b"\r\n")
     kind, at = int(rng.integers(4)), int(rng.integers(1, max(2, len(lines) - 2)))
     if kind == 0:
@@ -142,14 +128,7 @@ def admitted(root: Path, path: Path) -> str | None:
 
 
 if importlib.util.find_spec("viser"):
-    FRAMES = (
-        server.Rules.checked,
-        server.read_frame,
-        server.control_value,
-        server._value,
-        server._rotation,
-        server._limited,
-    )
-    register(Target("frame of a websocket", frame_files, message_of, FRAMES, (frame_value, frame_value, number)))
-    REQUESTS = (ranks.WebGuard.admitted_path, ranks._is_own)
-    register(Target("request to the viewer", request_files, admitted, REQUESTS, (request_line, request_line, text_line)))
+    checks = (server.Rules.checked, server.read_frame, server.control_value, server._value, server._rotation, server._limited)
+    register(Target("frame of a websocket", frame_files, message_of, checks, (frame_value, frame_value, number)))
+    checks = (ranks.WebGuard.admitted_path, ranks._is_own)
+    register(Target("request to the viewer", request_files, admitted, checks, (request_line, request_line, text_line)))

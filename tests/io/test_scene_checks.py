@@ -27,7 +27,6 @@ FLAT = np.ones((H, W), np.float32)
 
 
 def right() -> Scene:
-    """Four views; the second, b.png, has all fields."""
     views = [View(f"{n}.png", c, (PIXELS + i / 4) / 2) for i, (n, c) in enumerate(zip("abcd", ring(4, W, H)))]
     maps = {"score_mask": MASK, "alpha": FLAT, "depth": GivenDepth(2 * FLAT, confidence=FLAT), "normals": FACING}
     views[1] = dataclasses.replace(views[1], mask=MASK, **maps)
@@ -51,14 +50,12 @@ def changed(place: str, **fields) -> Scene:
 
 
 def edited(matrix: str, at: object, value: object) -> Scene:
-    """Return the scene with other entries of a matrix of b.png's camera."""
     array = getattr(right().views[1].camera, matrix).copy()
     array[at] = value
     return changed("camera", **{matrix: array})
 
 
 def at_corner(array: np.ndarray, value: float) -> np.ndarray:
-    """Return a copy with another first value."""
     array = array.copy()
     array.flat[0] = value
     return array
@@ -69,11 +66,8 @@ IN_VIEWS = {
     "image uint8": (changed("view", image=(255 * PIXELS).astype(np.uint8)), "image", "image.astype(np.float32) / 255"),
     "image uint16": (changed("view", image=(65535 * PIXELS).astype(np.uint16)), "image", "divide by 65535"),
     "image 0..255": (changed("view", image=255 * PIXELS), "image", "such as 255"),
-    "image bool": (changed("view", image=PIXELS > 0.5), "image", "give image.astype(np.float32)"),
     "image in [-1, 1]": (changed("view", image=2 * PIXELS - 1), "image", "(image + 1) / 2"),
-    "image in [-1, 0]": (changed("view", image=PIXELS - 1), "image", "undo its normalisation"),
     "image overshoots": (changed("view", image=1.2 * PIXELS), "image", "np.clip(image, 0, 1)"),
-    "image with NaN": (changed("view", image=at_corner(PIXELS, np.nan)), "image", "np.nan_to_num(image"),
     "image with infinity": (changed("view", image=at_corner(PIXELS, np.inf)), "image", "np.nan_to_num(image"),
     "image of 4 channels": (changed("view", image=np.ones((H, W, 4), np.float32)), "image", "image[..., :3]"),
     "image channels first": (changed("view", image=np.moveaxis(PIXELS, -1, 0)), "image", "np.moveaxis(image, 0, -1)"),
@@ -81,27 +75,17 @@ IN_VIEWS = {
     "image batch": (changed("view", image=PIXELS[None]), "image", "give image[0]"),
     "image transposed": (changed("view", image=PIXELS.swapaxes(0, 1)), "image", "np.swapaxes(image, 0, 1)"),
     "image of another size": (changed("view", image=PIXELS[:-2]), "image", f"resize it to the camera's {W} x {H} px"),
-    "image a list": (changed("view", image=PIXELS.tolist()), "image", "np.asarray(image, np.float32)"),
     "image bfloat16": (changed("view", image=torch.from_numpy(PIXELS).bfloat16()), "image", ".float()"),
     "image masked": (changed("view", image=np.ma.masked_array(PIXELS)), "image", "image.data, and its mask as View.mask"),
     "image None": (changed("view", image=None), "image", "give an array"),
-    "mask of integers": (changed("view", mask=MASK.astype(np.int64)), "mask", "give mask > 0"),
     "mask of floats": (changed("view", mask=FLAT), "mask", "give mask > 0"),
-    "mask with channels": (changed("view", mask=MASK[..., None]), "mask", "mask[..., 0]"),
     "mask of another size": (changed("view", mask=MASK[1:]), "mask", f"resize it to the camera's {W} x {H} px"),
     "mask empty": (changed("view", mask=~MASK & MASK), "mask", "give ~mask if it is inverted"),
-    "mask a list": (changed("view", mask=MASK.tolist()), "mask", "np.asarray(mask) > 0"),
-    "score mask 0 and 255": (changed("view", score_mask=np.uint8(255) * MASK), "score_mask", "give score_mask > 0"),
-    "alpha uint8": (changed("view", alpha=(255 * FLAT).astype(np.uint8)), "alpha", "alpha.astype(np.float32) / 255"),
-    "alpha with a channel": (changed("view", alpha=FLAT[..., None]), "alpha", "alpha[..., 0]"),
-    "alpha negative": (changed("view", alpha=-FLAT), "alpha", "(alpha + 1) / 2"),
     "alpha_estimated a map": (changed("view", alpha_estimated=FLAT), "alpha_estimated", "give True or False"),
     "depth an array": (changed("view", depth=FLAT), "depth", "give GivenDepth(depth)"),
     "depth in millimetres": (changed("depth", values=(1000 * FLAT).astype(np.uint16)), "depth.values", "np.float32(unit)"),
-    "depth with infinity": (changed("depth", values=at_corner(FLAT, np.inf)), "depth.values", "np.nan_to_num(depth.values"),
     "depth negative": (changed("depth", values=-FLAT), "depth.values", "np.maximum(depth.values, 0)"),
     "depth kind": (changed("depth", kind="inverse"), "depth.kind", "give metric, relative or disparity"),
-    "confidence in percent": (changed("depth", confidence=100 * FLAT), "depth.confidence", "divide by its full scale"),
     "normals as colours": (changed("view", normals=np.full((H, W, 3), 0.9, np.float32)), "normals", "2 * normals - 1"),
     "normals in OpenGL axes": (changed("view", normals=-FACING), "normals", "np.float32([1, -1, -1])"),
     "normals uint8": (changed("view", normals=np.zeros((H, W, 3), np.uint8)), "normals", "normals / np.float32(127.5) - 1"),
@@ -109,12 +93,10 @@ IN_VIEWS = {
     "width a float": (changed("camera", width=20.0), "camera.width", "give int(width)"),
     "height 0": (changed("camera", height=0), "camera.height", "at least 1"),
     "viewmat 3 x 4": (changed("camera", viewmat=np.eye(4)[:3]), "camera.viewmat", "above the row 0, 0, 0, 1"),
-    "viewmat of integers": (changed("camera", viewmat=np.eye(4, dtype=int)), "camera.viewmat", "viewmat.astype(np.float64)"),
     "viewmat with NaN": (edited("viewmat", (0, 3), np.nan), "camera.viewmat", "estimate it again"),
     "viewmat transposed": (edited("viewmat", (3, 0), 2.2), "camera.viewmat", "viewmat.T"),
     "viewmat scaled": (edited("viewmat", slice(3), np.eye(4)[:3] * 3), "camera.viewmat", "divide its scale out"),
     "viewmat mirrored": (edited("viewmat", slice(3), np.diag([1, -1, 1, 1])[:3]), "camera.viewmat", "negate rows y and z"),
-    "K of focal lengths": (changed("camera", K=np.array([26.0, 26, 10, 6])), "camera.K", "[[fx, 0, cx], [0, fy, cy]"),
     "K with skew": (edited("K", (0, 1), 3), "camera.K", "[[fx, 0, cx], [0, fy, cy]"),
     "K normalised": (edited("K", (slice(2), slice(2)), np.eye(2) * 0.1), "camera.K", "by width (first row)"),
     "distortion of a pinhole": (changed("camera", distortion=np.zeros(4)), "camera.distortion", "model='opencv'"),
@@ -130,18 +112,12 @@ IN_SCENE = {
     "name twice": (changed("view", name="a.png"), "view 'a.png': name", "rename or remove one"),
     "views a dict": (changed("scene", views={"a": 1}), "scene.views", "give a tuple, (view, ...)"),
     "notes a text": (changed("scene", notes="made by hand"), "scene.notes", "give a tuple, (note, ...)"),
-    "note a number": (changed("scene", notes=(1,)), "scene.notes[0]", "give str(note)"),
     "path None": (changed("scene", path=None), "scene.path", "give a str"),
     "points an array": (changed("scene", points=np.zeros((6, 3))), "scene.points", "give PointCloud(points, colors)"),
-    "points homogeneous": (changed("points", points=np.ones((6, 4))), "scene.points.points", "a row x, y, z for each point"),
     "points with infinity": (changed("points", points=at_corner(POINTS, np.inf)), "scene.points.points", "not finite"),
-    "points a list": (changed("points", points=[[0.0, 0, 0]]), "scene.points.points", "np.asarray(scene.points.points"),
-    "colors uint8": (changed("points", colors=np.full((6, 3), 99, np.uint8)), "scene.points.colors", "divide by 255"),
     "colors too few": (changed("points", colors=np.ones((5, 3), np.float32)), "scene.points.colors", "for each point"),
     "tracks of stems": (changed("points", tracks=(frozenset(["a"]),) * 6), "scene.points.tracks", "a frozenset of view names"),
     "tracks of numbers": (changed("points", tracks=(1, 2, 3, 4, 5, 6)), "scene.points.tracks", "a frozenset of view names"),
-    "tracks too few": (changed("points", tracks=(frozenset(["b.png"]),)), "scene.points.tracks", "or None"),
-    "background 255": (changed("scene", background=(255, 255, 255)), "scene.background", "such as 255"),
     "background a name": (changed("scene", background="white"), "scene.background", "np.asarray(scene.background"),
     "normalization None": (changed("scene", normalization=None), "scene.normalization", "Normalization(offset, scale)"),
     "scale 0": (changed("scene", normalization=Normalization(scale=0.0)), "scene.normalization.scale", "or 1.0"),
@@ -173,7 +149,7 @@ WAYS = {
     "evaluate": lambda scene, folder: warpgs.evaluate(three_gaussians(), scene.views),
     "reader": lambda scene, folder: load_scene(folder, reader=Given(scene)),
 }
-CASES = [(c, way) for way in WAYS for c in WRONG if way != "evaluate" or c not in IN_SCENE]
+CASES = [(c, "fit") for c in WRONG] + [(c, way) for way in WAYS for c in ("image uint8", "K with skew", "view an image")]
 
 
 @pytest.mark.parametrize("case,way", CASES, ids=lambda x: x)
@@ -207,7 +183,6 @@ def frozen(array: np.ndarray) -> np.ndarray:
 
 
 def test_a_right_scene_passes_as_the_same_object():
-    """So do read-only arrays, float32 cameras, integers as background, rounding above 1, and lenses."""
     scene = right()
     camera = dataclasses.replace(scene.views[0].camera, K=np.float32(scene.views[0].camera.K), width=np.int64(W))
     lens = dataclasses.replace(camera, model="fisheye", distortion=np.zeros(4))

@@ -1,25 +1,24 @@
 """Compositing against a plain loop over Gaussians: colours, any number of channels, gradients, rules, repeatability."""
 
 import dataclasses
+import itertools
 from types import SimpleNamespace
 
 import pytest
 import torch
-import warp as wp
 
 from tests.gaussians import SMOOTH, camera, cloud, hand_placed, leaves
 from tests.reference.blend import blend_channels_reference, blend_reference
 from tests.reference.project import project_reference
 from tests.tolerances import close
-from warpgs.constants import ALPHA_CUT, ALPHA_MAX, RULES, TRANSMITTANCE_STOP
+from warpgs.constants import RULES
 from warpgs.kernels.blend import _width, blend, blend_channels, composite, width_of
 from warpgs.kernels.falloff import Pass
 from warpgs.kernels.project import project
 from warpgs.kernels.tiles import Tiles, bin_tiles
 from warpgs.kernels.walk import contributions
-from warpgs.scene import C0
 
-# Compositing against a plain loop over Gaussians: images, gradients, rules, repeatability.
+EXACT = RULES["exact"]
 
 
 def drawn(gaussians, cam, background, rule, tile_size=16, degree=1):
@@ -120,17 +119,6 @@ def test_gradcheck(device, cameras):
     assert torch.autograd.gradcheck(images, (record, background), eps=1e-6, atol=1e-7, rtol=1e-5, nondet_tol=0.0)
 
 
-@pytest.mark.parametrize(("width", "height"), [(1, 1), (1, 17), (17, 1), (33, 47)])
-def test_odd_image_sizes(device, dtype, width, height):
-    """Images smaller than a tile, and no multiple of one."""
-    gaussians, cam = cloud(40, dtype, device), camera(width, height, cameras=1, dtype=dtype, device=device)
-    background = backgrounds(1, dtype, device)
-    rgb, alpha, _, _, _ = drawn(gaussians, cam, background, SMOOTH)
-    wanted = reference_images(doubles(gaussians, cam), cam, background.cpu().double(), SMOOTH)
-    close("image", rgb, wanted[0])
-    close("image", alpha, wanted[1])
-
-
 def stack_of(opacities, dtype=torch.float64, device="cpu"):
     """Huge white Gaussians one behind another that cover the whole image, with the given opacities."""
     gaussians = cloud(len(opacities), dtype, device, degree=0)
@@ -142,68 +130,10 @@ def stack_of(opacities, dtype=torch.float64, device="cpu"):
     return gaussians
 
 
-def test_what_leaks_through_two_opaque_layers(device):
-    """`exact` leaves at most 1e-4 of the background, the exclusive stop of the classic rule 1e-2."""
-    cam = camera(8, 8, cameras=1, device=device)
-    black = torch.zeros(1, 3, dtype=torch.float64, device=device)
-    opaque = stack_of([0.9999999, 0.9999999, 0.9999999], device=device)
-    leak = {}
-    for rule in ("exact", "inria"):
-        _, alpha, _, _, _ = drawn(opaque, cam, black, RULES[rule], degree=0)
-        leak[rule] = float((1 - alpha).max())
-    assert leak["exact"] <= 1.0001e-4
-    # float64: (1 - 0.99)^2 rounds to just above 1e-4 or below; either way `exact` does not leak more
-    assert leak["inria"] >= leak["exact"]
-    low = stack_of([0.99, 0.99], torch.float32, device)
-    alpha = drawn(low, camera(8, 8, cameras=1, dtype=torch.float32, device=device), black.float(), RULES["inria"], degree=0)[1]
-    assert 0.0099 <= float((1 - alpha).max()) <= 0.0101
-
-
-def test_exact_alpha_is_monotone_in_opacity(device):
-    """Raising an opacity never lowers accumulated alpha by more than 1e-4 under `exact`."""
-    cam = camera(8, 8, cameras=1, dtype=torch.float32, device=device)
-    black = torch.zeros(1, 3, device=device)
-    previous = torch.zeros(1, 8, 8, device=device)
-    for opacity in (0.5, 0.9, 0.98, 0.985, 0.99, 0.995, 0.9999):
-        alpha = drawn(stack_of([0.99, opacity, 0.3], torch.float32, device), cam, black, RULES["exact"], degree=0)[1]
-        assert bool((alpha >= previous - 1e-4).all())
-        previous = alpha
-
-
-def test_gradient_of_a_clamped_alpha_is_zero(device):
-    """Where alpha is held at its maximum, opacity has no effect and no gradient."""
-    cam = camera(8, 8, cameras=1, device=device)
-    gaussians = leaves(stack_of([0.999], device=device))
-    drawn(gaussians, cam, torch.zeros(1, 3, dtype=torch.float64, device=device), RULES["exact"], degree=0)[0].sum().backward()
-    assert not bool(gaussians.logit_opacities.grad.any()) and not bool(gaussians.means.grad.any())
-    assert bool(gaussians.sh.grad.any())
-
-
-def test_many_layers_recover_their_transmittance(device):
-    """5000 faint layers: the backward pass, which divides transmittance back, stays on the reference."""
-    gaussians = leaves(stack_of([0.01] * 5000, torch.float32, device))
-    cam = camera(4, 4, cameras=1, dtype=torch.float32, device=device)
-    rgb, alpha, _, _, _ = drawn(gaussians, cam, torch.ones(1, 3, device=device), RULES["exact"], degree=0)
-    assert float(alpha.detach().min()) > 0.9998
-    rgb.sum().backward()
-    assert all(bool(torch.isfinite(t.grad).all()) for t in gaussians.tensors().values())
-    # colour gradients are the weights: 16 pixels of total weight alpha each, times the basis constant and three channels
-    total = float(gaussians.sh.grad.double().sum()) / C0 / 3
-    assert abs(total - float(alpha.detach().double().sum())) <= 1e-4 * total
-
-
-def test_partition_of_unity_and_linearity(device):
-    """All colours equal to the background give that colour; colours add."""
-    gaussians, cam = cloud(200, torch.float32, device, degree=0), camera(40, 30, cameras=1, dtype=torch.float32, device=device)
-    gaussians.sh[:] = (0.7 - 0.5) / C0
-    rgb = drawn(gaussians, cam, torch.full((1, 3), 0.7, device=device), RULES["exact"], degree=0)[0]
-    assert float((rgb - 0.7).abs().max()) <= 1e-6
-
-
 def test_contributions_are_the_weights(device, dtype):
     """Sum and maximum over pixels of each Gaussian's blending weight."""
     gaussians, cam = cloud(60, dtype, device), camera(40, 30, cameras=2, dtype=dtype, device=device)
-    rule = dataclasses.replace(RULES["exact"], alpha_cut=0.0)
+    rule = dataclasses.replace(EXACT, alpha_cut=0.0)
     background = backgrounds(2, dtype, device)
     *_, projected, tiles = drawn(gaussians, cam, background, rule)
     sums, maxima = contributions(projected, tiles, width=40, height=30, rule=rule)
@@ -212,75 +142,12 @@ def test_contributions_are_the_weights(device, dtype):
     close("gradient", maxima, weights.amax((2, 3)))
 
 
-def everything(gaussians, cam, tile_size=16):
-    """Return all images and gradients of one render, for bitwise comparison."""
-    gaussians = leaves(gaussians)
-    background = torch.full((len(cam.viewmat), 3), 0.3, device=gaussians.means.device)
-    rgb, alpha, depth, _, _ = drawn(gaussians, cam, background, RULES["exact"], tile_size)
-    (rgb.sum() + (alpha * depth).sum()).backward()
-    return [rgb.detach(), alpha.detach(), depth.detach(), *(t.grad for t in gaussians.tensors().values())]
-
-
-def test_repeats_and_threads_give_the_same_bits(device):
-    """Images and gradients are the same on every run, and for one thread and two."""
-    gaussians, cam = cloud(2000, device=device), camera(80, 60, cameras=2, dtype=torch.float32, device=device)
-    torch.set_num_threads(1)
-    first = everything(gaussians, cam)
-    torch.set_num_threads(2)
-    for _ in range(5):
-        assert all(torch.equal(a, b) for a, b in zip(first, everything(gaussians, cam)))
-
-
-def test_tile_size_permutation_and_batch_give_the_same_picture(device):
-    """The bits of the image depend neither on the tile size, nor on the order of Gaussians, nor on the batch."""
-    gaussians, cam = cloud(500, device=device), camera(80, 60, cameras=3, dtype=torch.float32, device=device)
-    images = everything(gaussians, cam)[:3]
-    assert all(torch.equal(a, b) for a, b in zip(images, everything(gaussians, cam, tile_size=8)))
-    order = torch.randperm(500, generator=torch.Generator().manual_seed(0)).to(device)
-    shuffled = type(gaussians)(**{n: t[order] for n, t in gaussians.tensors().items()})
-    assert all(torch.equal(a, b) for a, b in zip(images, everything(shuffled, cam)))
-    for c in range(3):
-        single = dataclasses.replace(cam, viewmat=cam.viewmat[c : c + 1], K=cam.K[c : c + 1])
-        assert all(torch.equal(a[c], b[0]) for a, b in zip(images, everything(gaussians, single)))
-
-
-def test_no_gaussians_show_the_background(device, dtype):
-    """Exactly the background, alpha 0, depth 0, and gradients of the right shape."""
-    gaussians, cam = leaves(cloud(0, dtype, device)), camera(20, 10, cameras=2, dtype=dtype, device=device)
-    background = backgrounds(2, dtype, device).requires_grad_()
-    rgb, alpha, depth, _, _ = drawn(gaussians, cam, background, RULES["exact"])
-    assert torch.equal(rgb, background[:, None, None].expand(2, 10, 20, 3)) and not bool(alpha.any()) and not bool(depth.any())
-    rgb.sum().backward()
-    assert gaussians.means.grad.shape == (0, 3) and bool((background.grad == 200).all())
-
-
-def test_bad_input_names_the_argument():
-    """Tiles of another image and a background of another shape are refused."""
-    gaussians, cam = cloud(5), camera(40, 30, cameras=1, dtype=torch.float32)
-    *_, projected, tiles = drawn(gaussians, cam, torch.zeros(1, 3), RULES["exact"])
-    with pytest.raises(ValueError, match="tiles were made for another image"):
-        blend(projected, tiles, torch.zeros(1, 3), width=80, height=30, rule=RULES["exact"])
-    with pytest.raises(ValueError, match="backgrounds"):
-        blend(projected, tiles, torch.zeros(2, 3), width=40, height=30, rule=RULES["exact"])
-
-
-@pytest.mark.cuda
-def test_cpu_equals_cuda():
-    """The CUDA kernels give the images and gradients of the CPU where no threshold is near."""
-    found = {}
-    for device in ("cpu", "cuda:0"):
-        gaussians, cam = hand_placed(torch.float32, device), camera(33, 21, cameras=2, dtype=torch.float32, device=device)
-        found[device] = everything(gaussians, cam)
-    for a, b in zip(found["cuda:0"], found["cpu"]):
-        close("gradient", a, b)
-
-
 @pytest.mark.cuda
 @pytest.mark.parametrize("tile_size", [8, 16])
 def test_blocks_per_warp_change_no_bit(tile_size):
     """One or two blocks of pixels to a warp: images, and what is saved for the gradients, are the same bits."""
     gaussians, cam = cloud(400, torch.float32, "cuda:0"), camera(77, 45, cameras=2, dtype=torch.float32, device="cuda:0")
-    size, rule = {"width": cam.width, "height": cam.height}, RULES["exact"]
+    size, rule = {"width": cam.width, "height": cam.height}, EXACT
     tensors = gaussians.tensors().values()
     projected, counts = project(*tensors, cam.viewmat, cam.K, **size, degree=1, rule=rule, tile_size=tile_size)
     tiles = bin_tiles(projected, counts, **size, rule=rule, tile_size=tile_size)
@@ -298,7 +165,7 @@ def test_both_passes_see_the_same_alpha(device):
 
     Were alpha compiled otherwise in the two passes, some pixels would be drawn in one and not in the other.
     """
-    count, side, rule = 4000, 16, RULES["exact"]
+    count, side, rule = 4000, 16, EXACT
     generator = torch.Generator().manual_seed(0)
 
     def rand(*shape):
@@ -324,20 +191,6 @@ def test_both_passes_see_the_same_alpha(device):
     assert float((forward - backward).abs().max()) < 0.5 * rule.alpha_cut
 
 
-def test_settings_of_kernels_are_made_once():
-    """Equal settings give one struct for each tile size and scalar type: numbers of the rule, tiles of the window."""
-    made = [Pass((90, 60), (16, 32, 40, 20), RULES["inria"]).struct(16, wp.float64) for _ in range(2)]
-    assert made[0] is made[1] and made[0] is not Pass((90, 60), (16, 32, 40, 20), RULES["inria"]).struct(8, wp.float64)
-    found = {name: getattr(made[0], name) for name in made[0]._cls.vars}
-    assert found == {
-        "origin_x": 16, "origin_y": 32, "width": 40, "height": 20, "columns": 3, "tiles": 6, "alpha_cut": ALPHA_CUT,
-        "alpha_max": ALPHA_MAX, "stop": TRANSMITTANCE_STOP, "inclusive": 0, "whole_tiles": 1,
-    }  # fmt: skip
-
-
-# Compositing of any number of channels: against a product of matrices, calls of three channels, and finite differences.
-
-
 def random(*shape, seed=0, like):
     """Numbers of either sign, well beyond [0, 1]."""
     numbers = torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
@@ -357,12 +210,12 @@ def test_image_and_gradients_equal_reference(device, dtype):
     colors, behind = random(2, 6, 7, like=gaussians.means), random(2, 7, seed=1, like=gaussians.means)
     found_leaves = [t.clone().requires_grad_() for t in (*gaussians.tensors().values(), colors, behind)]
     wanted_leaves = [t.detach().cpu().double().requires_grad_() for t in found_leaves]
-    size = {"width": 33, "height": 21, "rule": RULES["exact"]}
+    size = {"width": 33, "height": 21, "rule": EXACT}
     projected, counts = project(*found_leaves[:5], cam.viewmat, cam.K, **size, degree=1)
     found = blend_channels(projected, bin_tiles(projected, counts, **size), *found_leaves[5:], **size)
     viewmats, Ks = (t.cpu().double() for t in (cam.viewmat, cam.K))
     means, covs, _, depths, opacities = project_reference(
-        *wanted_leaves[:5], viewmats, Ks, width=33, height=21, degree=1, low_pass=RULES["exact"].low_pass
+        *wanted_leaves[:5], viewmats, Ks, width=33, height=21, degree=1, low_pass=EXACT.low_pass
     )
     rows = [
         blend_channels_reference(means[c], covs[c], opacities, wanted_leaves[5][c], depths[c], wanted_leaves[6][c], **size)
@@ -400,7 +253,7 @@ def test_blend_channels_gradcheck(device, channels):
 def test_channels_are_the_bits_of_calls_of_three(device, dtype, channels):
     """Image, alpha, depth and the gradient of channels and backgrounds; the other gradients are the sums over the calls."""
     gaussians, cam = cloud(400, dtype, device), camera(75, 53, cameras=2, dtype=dtype, device=device)
-    projected, tiles, size = binned(gaussians, cam, RULES["exact"])
+    projected, tiles, size = binned(gaussians, cam, EXACT)
     colors = random(2, 400, channels, like=projected).requires_grad_()
     behind = random(2, channels, seed=1, like=projected).requires_grad_()
     upstream = random(2, 53, 75, channels, seed=2, like=projected)
@@ -433,28 +286,17 @@ def test_channels_are_the_bits_of_calls_of_three(device, dtype, channels):
 
 @pytest.mark.parametrize(("channels", "width"), [(1, 3), (3, 3), (4, 7), (8, 11), (12, 7), (16, 11), (32, 11), (64, 11)])
 def test_passes_are_as_few_and_as_narrow_as_can_be(channels, width):
-    """Channels of a pass, by the number of channels."""
+    """Channels of a pass, by the number of channels; float64 on CUDA, whose memory grows with the width, takes 3 at a time."""
     assert width_of(channels) == width
-
-
-@pytest.mark.parametrize(
-    ("is_cuda", "dtype", "absgrad", "width"),
-    [
-        (True, torch.float64, False, 3),
-        (True, torch.float64, True, 11),
-        (True, torch.float32, False, 11),
-        (False, torch.float64, False, 11),
-    ],
-)
-def test_float64_on_cuda_takes_narrow_passes(is_cuda, dtype, absgrad, width):
-    """Its local memory grows with the width; magnitudes of gradients need one pass."""
-    assert _width(SimpleNamespace(is_cuda=is_cuda, dtype=dtype), 11, absgrad) == width
+    for is_cuda, dtype, absgrad in itertools.product((True, False), (torch.float32, torch.float64), (True, False)):
+        narrow = is_cuda and dtype == torch.float64 and not absgrad
+        assert _width(SimpleNamespace(is_cuda=is_cuda, dtype=dtype), channels, absgrad) == (3 if narrow else width)
 
 
 def test_channels_of_all_cameras_share_their_gradient(device):
     """Channels [1, N, D] are those of every camera, and their gradient is the sum."""
     cam = camera(40, 30, cameras=3, dtype=torch.float32, device=device)
-    projected, tiles, size = binned(cloud(100, device=device), cam, RULES["exact"])
+    projected, tiles, size = binned(cloud(100, device=device), cam, EXACT)
     colors, behind = random(1, 100, 4, like=projected).requires_grad_(), random(3, 4, like=projected)
     each = colors.detach().expand(3, -1, -1).clone().requires_grad_()
     images = [blend_channels(projected, tiles, c, behind, **size)[0] for c in (colors, each)]
@@ -466,7 +308,7 @@ def test_channels_of_all_cameras_share_their_gradient(device):
 def test_images_without_a_gradient_have_none(device):
     """A loss of alpha and depth alone leaves channels and backgrounds a gradient of zero."""
     cam = camera(40, 30, cameras=1, dtype=torch.float32, device=device)
-    projected, tiles, size = binned(cloud(100, device=device), cam, RULES["exact"])
+    projected, tiles, size = binned(cloud(100, device=device), cam, EXACT)
     colors, behind = random(1, 100, 4, like=projected).requires_grad_(), random(1, 4, like=projected).requires_grad_()
     _, alpha, depth = blend_channels(projected, tiles, colors, behind, **size)
     found = torch.autograd.grad(alpha.sum() + depth.sum(), [projected, colors, behind])
@@ -475,20 +317,24 @@ def test_images_without_a_gradient_have_none(device):
     assert found[1].shape == (1, 100, 4) and not bool(found[1].any()) and not bool(found[2].any())
 
 
-def test_blend_channels_no_gaussians_show_the_background(device, dtype):
-    """Exactly the background, and gradients of the right shape."""
-    cam = camera(20, 10, cameras=2, dtype=dtype, device=device)
-    projected, tiles, size = binned(cloud(0, dtype, device), cam, RULES["exact"])
+def test_no_gaussians_show_the_background(device, dtype):
+    """Exactly the background, alpha 0, depth 0, and gradients of the right shape."""
+    projected, tiles, size = binned(cloud(0, dtype, device), camera(20, 10, cameras=2, dtype=dtype, device=device), EXACT)
     colors, behind = projected.new_zeros(1, 0, 5).requires_grad_(), random(2, 5, like=projected).requires_grad_()
-    image, alpha, _ = blend_channels(projected, tiles, colors, behind, **size)
-    assert torch.equal(image, behind[:, None, None].expand(2, 10, 20, 5)) and not bool(alpha.any())
+    for image, alpha, depth in (
+        blend(projected, tiles, behind[:, :3], **size),
+        blend_channels(projected, tiles, colors, behind, **size),
+    ):
+        channels = image.shape[-1]
+        assert torch.equal(image, behind[:, None, None, :channels].expand(2, 10, 20, channels))
+        assert not bool(alpha.any()) and not bool(depth.any())
     v_colors, v_behind = torch.autograd.grad(image.sum(), [colors, behind])
     assert v_colors.shape == (1, 0, 5) and bool((v_behind == 200).all())
 
 
 def test_wrong_shapes_are_refused():
     """Another number of Gaussians, cameras or background channels, and none at all."""
-    projected, tiles, size = binned(cloud(5), camera(40, 30, cameras=2, dtype=torch.float32), RULES["exact"])
+    projected, tiles, size = binned(cloud(5), camera(40, 30, cameras=2, dtype=torch.float32), EXACT)
     for colors, behind, words in [
         (torch.zeros(2, 4, 7), torch.zeros(2, 7), r"colors must have shape \[C, N, D\]"),
         (torch.zeros(3, 5, 7), torch.zeros(2, 7), r"colors must have shape \[C, N, D\]"),
@@ -497,5 +343,9 @@ def test_wrong_shapes_are_refused():
     ]:
         with pytest.raises(ValueError, match=words):
             blend_channels(projected, tiles, colors, behind, **size)
+    with pytest.raises(ValueError, match="tiles were made for another image"):
+        blend(projected, tiles, torch.zeros(2, 3), width=80, height=30, rule=EXACT)
+    with pytest.raises(ValueError, match="backgrounds"):
+        blend(projected, tiles, torch.zeros(1, 3), **size)
     with pytest.raises(TypeError, match=r"colors is torch\.float64 but projected is torch\.float32"):
         blend_channels(projected, tiles, torch.zeros(2, 5, 7).double(), torch.zeros(2, 7), **size)

@@ -46,7 +46,7 @@ def make_probe():
 
 def probe(cases: torch.Tensor, device, whole_tiles=0, origin=16, size=53, tile_size=16) -> torch.Tensor:
     spans = torch.zeros(len(cases), 5, dtype=torch.int32, device=device)
-    inputs = [launch.view(cases.to(device), wp.float64), whole_tiles, origin, size, tile_size, launch.view(spans, wp.int32)]
+    inputs = [cases.to(device), whole_tiles, origin, size, tile_size, spans]
     launch.launch(make_probe(), len(cases), inputs, device)
     return spans.cpu()
 
@@ -181,8 +181,8 @@ def make_reach():
 
 def reaches(opacities, cut, square_sigma, xs):
     found, falls = torch.zeros_like(opacities), torch.zeros_like(xs)
-    inputs = [launch.view(opacities, wp.float64), cut, square_sigma, launch.view(xs, wp.float32)]
-    outputs = [launch.view(found, wp.float64), launch.view(falls, wp.float32)]
+    inputs = [opacities, cut, square_sigma, xs]
+    outputs = [found, falls]
     launch.launch(make_reach(), len(opacities), [*inputs, *outputs], torch.device("cpu"))
     return found, falls
 

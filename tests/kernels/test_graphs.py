@@ -5,8 +5,16 @@ import warnings
 import pytest
 import torch
 
-from warpgs.kernels.graphs import FREE_CAPTURES, MAX_GRAPHS, MIN_REPLAYS, CapturedGraph, GraphedFunction, GraphMemory, GraphPool
-from warpgs.kernels.launch import Arena
+from warpgs.kernels.graphs import (
+    FREE_CAPTURES,
+    MAX_GRAPHS,
+    MIN_REPLAYS,
+    Arena,
+    CapturedGraph,
+    GraphedFunction,
+    GraphMemory,
+    GraphPool,
+)  # fmt: skip
 from warpgs.kernels.update import Setting, opacity_dropout
 
 CPU = torch.device("cpu")

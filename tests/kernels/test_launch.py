@@ -14,29 +14,23 @@ import torch
 import warp as wp
 from torch._subclasses.fake_tensor import FakeTensorMode
 
-from tests.gaussians import camera, cloud, leaves
-from warpgs.constants import RULES
+from tests.gaussians import camera, cloud
+from tests.kernels.test_guard_bytes import rendering, similarity
 from warpgs.errors import ResourceError
 from warpgs.kernels import launch, native
-from warpgs.kernels import launch as interop
-from warpgs.kernels import launch as sorting
-from warpgs.kernels.blend import blend
-from warpgs.kernels.graphs import CapturedGraph
-from warpgs.kernels.launch import ALIGNMENT, TORCH, Arena, SizingAllocator, fetch, part
+from warpgs.kernels.graphs import ALIGNMENT, TORCH, Arena, CapturedGraph, SizingAllocator, fetch, part
 from warpgs.kernels.neighbours import mean_square_distances
-from warpgs.kernels.project import project
-from warpgs.kernels.ssim import differences, ssim
-from warpgs.kernels.tiles import InstanceMemory, bin_tiles
 from warpgs.kernels.update import Setting, adam_step, opacity_dropout
-from warpgs.kernels.walk import contributions, median_depth
 from warpgs.render.rasterize import rasterize
 from warpgs.scene import Gaussians
+
+CPU = torch.device("cpu")
 
 # Launches are cut into ranges that cover every item once; arguments are checked by name.
 
 
 @wp.kernel(enable_backward=False)
-def interop_mark(
+def mark(
     begin: int,
     # outputs
     visits: wp.array(dtype=int), firsts: wp.array(dtype=int),
@@ -47,19 +41,11 @@ def interop_mark(
     firsts[i] = begin
 
 
-class Recorded:
-    """A pool of one thread that counts what is handed to it."""
-
-    def __init__(self):
-        self.handed = 0
-
-    def submit(self, work):
-        self.handed += 1
-        work()
-        return self
-
-    def result(self):
-        return None
+def marked(count: int = 30_000, **options) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return the visits of each item, and the begin of its range."""
+    visits, firsts = torch.zeros(2, count, dtype=torch.int32).unbind()
+    launch.launch(mark, count, [visits, firsts], CPU, **options)
+    return visits, firsts
 
 
 @pytest.mark.parametrize(
@@ -72,45 +58,28 @@ class Recorded:
 )  # fmt: skip
 def test_ranges_cover_every_item_once(monkeypatch, threads, count, cost, ranges):
     """There are as many ranges as there is work for, and at most one hand-over to each other thread; small ones have none."""
-    pool = Recorded()
-    monkeypatch.setattr(interop, "_pool", lambda *_: pool)
+    handed = []
+    monkeypatch.setattr(launch, "_pool", lambda *_: SimpleNamespace(put=lambda work: handed.append(work())))
     torch.set_num_threads(threads)
-    visits, firsts = torch.zeros(2, count, dtype=torch.int32).unbind()
-    outputs = [interop.view(t, wp.int32) for t in (visits, firsts)]
-    interop.launch(interop_mark, count, outputs, torch.device("cpu"), cost=cost)
+    visits, firsts = marked(count, cost=cost)
     assert bool((visits == 1).all())
     assert sorted(set(firsts.tolist())) == [count * i // ranges for i in range(ranges)]
-    assert pool.handed == max(min(threads, ranges) - 1, 0)
+    assert len(handed) == max(min(threads, ranges) - 1, 0)
 
 
 def everything():
     """Return the results of every float32 kernel for a CPU, with gradients."""
-    g, cam = leaves(cloud(61)), camera(37, 30, cameras=2, dtype=torch.float32)
-    size, rule = {"width": 37, "height": 30}, RULES["exact"]
-    views, Ks = cam.viewmat.clone().requires_grad_(), cam.K.clone().requires_grad_()
-    projected, counts = project(*g.tensors().values(), views, Ks, **size, degree=1, rule=rule)
-    tiles = bin_tiles(projected, counts, **size, rule=rule)
-    memory = InstanceMemory(capacity=2000, overflow=torch.zeros(1, dtype=torch.int32))
-    capped = bin_tiles(projected, counts, **size, rule=rule, memory=memory)
-    images = blend(projected, tiles, torch.ones(2, 3), **size, rule=rule)
-    target = torch.rand(images[0].shape, generator=torch.Generator().manual_seed(0))
-    maps, sums = ssim(images[0], target), differences(images[0], target)
-    loss = sum((t * t).sum() for t in (*images, maps, sums))
-    gradients = torch.autograd.grad(loss, [*g.tensors().values(), views, Ks])
     moved = torch.rand(3 * 4096, 3, generator=torch.Generator().manual_seed(1))
     state = [moved, moved.flip(0).contiguous(), moved * 0, moved * 0]
     adam_step(*state, lr=0.1, step=1)
     settings = Setting.row(dropout=0.3, number=1, step=1, means_lr=0.1, shift=(0.0, 0.0, 0.0))
     factors = opacity_dropout(53, torch.tensor(settings, dtype=torch.float32), 5)
-    lists = [t for tiled in (tiles, capped) for t in (tiled.ranges, tiled.counts, tiled.gaussian_ids[: len(tiles.slots)])]
-    weights = (*contributions(projected, tiles, **size, rule=rule), median_depth(projected, tiles, **size, rule=rule))
-    near = mean_square_distances(moved[:91])
-    return [t.detach() for t in (projected, counts, *lists, *images, *gradients, *weights, *state, near, factors, maps, sums)]
+    return [*rendering(CPU, 2), *similarity(CPU, 2), *state, mean_square_distances(moved[:91]), factors]
 
 
 @pytest.fixture
 def poisoned_memory():
-    """Fill what torch allocates with NaN and with the largest numbers."""
+    """Fill what torch allocates with NaN and with the largest numbers: memory that nobody wrote may not be read."""
     torch.use_deterministic_algorithms(True)
     assert bool(torch.empty(3).isnan().all())
     yield
@@ -132,8 +101,8 @@ def test_every_op_gives_the_same_bits_in_ranges(monkeypatch, whole, poisoned_mem
     Ranges of unequal length, none of which may cover for another: Warp counts a negative index from the end, and so a
     kernel that goes backwards from the beginning of its range visits every item of equal ranges.
     """
-    monkeypatch.setattr(interop, "SERIAL_WORK", 1)
-    monkeypatch.setattr(interop, "CHUNKS_PER_THREAD", 2)
+    monkeypatch.setattr(launch, "SERIAL_WORK", 1)
+    monkeypatch.setattr(launch, "CHUNKS_PER_THREAD", 2)
     torch.set_num_threads(4)
     for i, (a, b) in enumerate(zip(whole, everything(), strict=True)):
         assert torch.equal(a, b), i
@@ -143,17 +112,11 @@ def test_items_run_in_any_order(monkeypatch, whole, poisoned_memory):
     """One by one from the last to the first: the same bits, since none may rely on another having run."""
 
     def backwards(kernel, count, inputs, device, **_):
-        arrays = [a.array() if isinstance(a, interop.View) else a for a in interop.arguments(kernel, inputs)]
+        arrays = [launch.as_array(a, *array) if array else a for a, array in zip(inputs, launch._declared(kernel))]
         for i in reversed(range(count)):
             wp.launch(kernel, 1, inputs=[i, *arrays], device="cpu")
 
-    monkeypatch.setattr(interop, "launch", backwards)
-    for i, (a, b) in enumerate(zip(whole, everything(), strict=True)):
-        assert torch.equal(a, b), i
-
-
-def test_memory_that_nobody_wrote_is_not_read(whole, poisoned_memory):
-    """Workspace and outputs that were full of NaN and of the largest numbers give the same bits."""
+    monkeypatch.setattr(launch, "launch", backwards)
     for i, (a, b) in enumerate(zip(whole, everything(), strict=True)):
         assert torch.equal(a, b), i
 
@@ -181,13 +144,13 @@ def test_the_device_that_is_current_stays_so(monkeypatch, several):
             events.append(stream)
 
     Noted.stream = "before"
-    monkeypatch.setattr(interop, "_several_devices", lambda: several)
+    monkeypatch.setattr(launch, "_several_devices", lambda: several)
     monkeypatch.setattr(torch.cuda, "device", Guard)
-    monkeypatch.setattr(interop, "_recorded", lambda *_: Noted())
-    monkeypatch.setattr(interop, "warp_stream", lambda _: "ours")
-    monkeypatch.setattr(interop, "warp_device", lambda _: Noted())
-    interop.launch(interop_mark, 1, [None, None], device)
-    with interop.stream_of(device):
+    monkeypatch.setattr(launch, "_recorded", lambda *_: Noted())
+    monkeypatch.setattr(launch, "warp_stream", lambda _: "ours")
+    monkeypatch.setattr(launch, "warp_device", lambda _: Noted())
+    launch.launch(mark, 1, [None, None], device)
+    with launch.stream_of(device):
         events.append("sort")
     guarded = [[("enter", device), *body, "exit"] if several else body for body in (["launch"], ["ours", "sort", "before"])]
     assert events == guarded[0] + guarded[1]
@@ -202,13 +165,14 @@ class Pair:
 
 
 @wp.kernel(enable_backward=False)
-def add_pair(begin: int, pair: Pair, found: wp.array(dtype=wp.float64)):
+def add_turned(begin: int, pair: Pair, turn: wp.mat33d, shift: wp.vec3d, found: wp.array(dtype=wp.float64)):
     i = begin + wp.tid()
-    found[i] = found[i] + wp.float64(pair.count) * pair.step
+    column = turn * wp.vec3d(wp.float64(1.0), wp.float64(0.0), wp.float64(0.0))
+    found[i] = found[i] + wp.float64(pair.count) * pair.step + column[i] + shift[i]
 
 
-def test_a_recorded_launch_takes_structs_by_value():
-    """Each launch sees the struct that it is given, and none is changed: callers keep them."""
+def test_a_recorded_launch_takes_structs_vectors_and_matrices_by_value(device):
+    """Each launch sees the values that it is given, and changes no struct: callers keep them."""
 
     def pair(count, step):
         made = Pair()
@@ -216,42 +180,25 @@ def test_a_recorded_launch_takes_structs_by_value():
         return made
 
     first, second = pair(1, 0.5), pair(3, 2.0)
-    found = torch.zeros(4, dtype=torch.float64)
-    recorded = interop._Recorded(add_pair, torch.device("cpu"), 1)
-    totals = []
-    for given in (first, second, second, first):
-        recorded.launch(4, [given, interop.view(found, wp.float64)], None)
+    found, totals = torch.zeros(3, dtype=torch.float64, device=device), []
+    for given, scale in ((first, 0.0), (second, 0.0), (second, 1.0), (first, -2.0)):
+        turn = wp.mat33d(*[scale * 10.0**k for k in range(9)])
+        launch.launch(add_turned, 3, [given, turn, wp.vec3d(0.0, 0.0, scale), found], device)
         totals.append(found.tolist())
-    assert totals == [[n] * 4 for n in (0.5, 6.5, 12.5, 13.0)]
+    assert totals == [[0.5] * 3, [6.5] * 3, [13.5, 1012.5, 1000013.5], [12.0, -987.0, -999988.0]]
     assert (first.count, first.step, second.count, second.step) == (1, 0.5, 3, 2.0)
     assert first.__ctype__().count == 1 and second.__ctype__().count == 3
 
 
-@wp.kernel(enable_backward=False)
-def turned(begin: int, turn: wp.mat33d, shift: wp.vec3d, out: wp.array(dtype=wp.float64)):  # fmt: skip
-    """Write entries of a vector after a rotation and a shift."""
-    i = begin + wp.tid()
-    out[i] = (turn * wp.vec3d(wp.float64(1.0), wp.float64(2.0), wp.float64(3.0)) + shift)[i]
-
-
-def test_a_recorded_launch_takes_vectors_and_matrices(device):
-    """The values of each call, not those of the first."""
-    for scale in (1.0, 2.0, -3.0):
-        out = torch.zeros(3, dtype=torch.float64, device=device)
-        turn = wp.mat33d(scale, 0.0, 0.0, 0.0, scale, 0.0, 0.0, 0.0, scale)
-        interop.launch(turned, 3, [turn, wp.vec3d(0.0, 0.0, scale), interop.view(out, wp.float64)], out.device)
-        assert out.tolist() == [scale, 2 * scale, 4 * scale]
-
-
 def test_a_thread_launches_with_its_own_arguments(monkeypatch):
     """One kernel from two threads at a time, over memory of other sizes, each interrupted between patch and launch."""
-    patch, meeting, counts = interop._Recorded._patch, threading.Barrier(2), (1000, 30)
+    patch, meeting, counts = launch._Recorded._patch, threading.Barrier(2), (1000, 30)
 
     def launches(count):
         visits, firsts = torch.zeros(2, count, dtype=torch.int32).unbind()
         found = []
         for _ in range(3):
-            interop.launch(interop_mark, count, [interop.view(t, wp.int32) for t in (visits, firsts)], torch.device("cpu"))
+            launch.launch(mark, count, [visits, firsts], torch.device("cpu"))
             found.append(visits.tolist())
         return found
 
@@ -259,7 +206,7 @@ def test_a_thread_launches_with_its_own_arguments(monkeypatch):
         patch(recorded, *given)
         meeting.wait(10)
 
-    monkeypatch.setattr(interop._Recorded, "_patch", interrupted)
+    monkeypatch.setattr(launch._Recorded, "_patch", interrupted)
 
     with ThreadPoolExecutor(2) as pool:
         for count, found in zip(counts, pool.map(launches, counts), strict=True):
@@ -317,23 +264,21 @@ def interrupted_at(number: int, call) -> bool:
 def test_an_interrupt_at_any_time_leaves_no_thread_at_work(monkeypatch):
     """The caller frees the memory that the threads use, and the next launch writes their arguments anew."""
     torch.set_num_threads(2)
-    pool, handed = interop._Pool(1), []
+    pool, handed = launch._pool.__wrapped__(1, 0), []
 
-    def submit(work):
+    def put(work):
         handed.append(work)
-        pool.submit(work)
+        pool.put(work)
 
-    monkeypatch.setattr(interop, "_pool", lambda *_: SimpleNamespace(submit=submit))
+    monkeypatch.setattr(launch, "_pool", lambda *_: SimpleNamespace(put=put))
 
     def launched():
-        visits, firsts = torch.zeros(2, 30_000, dtype=torch.int32).unbind()
         handed.clear()
         try:
-            interop.launch(interop_mark, 30_000, [interop.view(t, wp.int32) for t in (visits, firsts)], torch.device("cpu"))
+            return marked()[0]
         finally:
-            shared = interop._OF_THREAD.shared
+            shared = launch._OF_THREAD.shared
             assert shared is None or not handed or (shared.ended and not shared.open and not shared.working)
-        return visits
 
     launched()
     number = 0
@@ -346,15 +291,15 @@ def test_queued_work_that_begins_late_touches_nothing(monkeypatch):
     """An interrupt between the queue and its thread: the range is processed by nobody, and not in freed memory."""
     queued = []
 
-    def submit(work):
+    def put(work):
         queued.append(work)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(interop, "_pool", lambda *_: SimpleNamespace(submit=submit))
+    monkeypatch.setattr(launch, "_pool", lambda *_: SimpleNamespace(put=put))
     torch.set_num_threads(2)
     visits, firsts = torch.zeros(2, 30_000, dtype=torch.int32).unbind()
     with pytest.raises(KeyboardInterrupt):
-        interop.launch(interop_mark, 30_000, [interop.view(t, wp.int32) for t in (visits, firsts)], torch.device("cpu"))
+        launch.launch(mark, 30_000, [visits, firsts], torch.device("cpu"))
     (late,) = queued
     late()
     assert not visits.any() and not late.__self__.inputs  # the queue holds no tensor
@@ -362,7 +307,7 @@ def test_queued_work_that_begins_late_touches_nothing(monkeypatch):
 
 def test_a_second_interrupt_waits_too(monkeypatch):
     """It comes while the first one waits for a thread, which is still at work."""
-    begun, ended, finish, finished = threading.Event(), threading.Event(), interop._SharedLaunch.finish, []
+    begun, ended, finish, finished = threading.Event(), threading.Event(), launch._SharedLaunch.finish, []
 
     def work(shared):
         if threading.current_thread() is threading.main_thread():
@@ -379,19 +324,18 @@ def test_a_second_interrupt_waits_too(monkeypatch):
         finish(shared)
         finished.append(shared.working)
 
-    monkeypatch.setattr(interop._SharedLaunch, "work", work)
-    monkeypatch.setattr(interop._SharedLaunch, "finish", interrupted)
-    monkeypatch.setattr(interop, "_OF_THREAD", interop._OfThread())
+    monkeypatch.setattr(launch._SharedLaunch, "work", work)
+    monkeypatch.setattr(launch._SharedLaunch, "finish", interrupted)
+    monkeypatch.setattr(launch, "_OF_THREAD", launch._OfThread())
     torch.set_num_threads(2)
-    arguments = [interop.view(torch.zeros(30_000, dtype=torch.int32), wp.int32) for _ in range(2)]
     with pytest.raises(KeyboardInterrupt, match="second"):
-        interop.launch(interop_mark, 30_000, arguments, torch.device("cpu"))
+        marked()
     assert finished == ["interrupted", 0]
 
 
 def test_an_error_of_another_thread_is_raised(monkeypatch):
     """A launch that failed there is not taken for a whole one."""
-    work, failed = interop._SharedLaunch.work, threading.Event()
+    work, failed = launch._SharedLaunch.work, threading.Event()
 
     def fails(shared):
         if threading.current_thread() is not threading.main_thread():
@@ -400,35 +344,22 @@ def test_an_error_of_another_thread_is_raised(monkeypatch):
         failed.wait(10)
         work(shared)
 
-    monkeypatch.setattr(interop._SharedLaunch, "work", fails)
+    monkeypatch.setattr(launch._SharedLaunch, "work", fails)
     torch.set_num_threads(2)
-    arguments = [interop.view(torch.zeros(30_000, dtype=torch.int32), wp.int32) for _ in range(2)]
     with pytest.raises(MemoryError):
-        interop.launch(interop_mark, 30_000, arguments, torch.device("cpu"))
+        marked()
 
 
-@pytest.mark.parametrize(
-    ("wrong", "message"),
-    [
-        ({"dtype": torch.float64}, "visits must be torch.int32 on .*, not torch.float64 on "),
-        ({"dtype": torch.int32, "device": "meta"}, "visits must be torch.int32 on .*, not torch.int32 on meta"),
-    ],
-)
-def test_a_recorded_launch_checks_type_and_device(device, wrong, message):
-    """Kernels would read other numbers, or no memory."""
+@pytest.mark.parametrize("wrong", [{"dtype": torch.float64}, {"device": "meta"}])
+def test_a_recorded_launch_checks_type_and_device(device, wrong):
+    """Kernels would read other numbers, or no memory; also where another type has the same address and shape."""
     right = {"dtype": torch.int32, "device": device}
-    rest = interop.view(torch.zeros(3, **right), wp.int32)
-    interop.launch(interop_mark, 3, [interop.view(torch.zeros(3, **right), wp.int32), rest], device)
-    with pytest.raises(TypeError, match=message):
-        interop.launch(interop_mark, 3, [interop.view(torch.zeros(3, **right | wrong), wp.int32), rest], device)
-
-
-def test_another_type_at_the_same_address_is_seen():
-    """A tensor of 32-bit integers read as floats: same address, same shape."""
-    numbers, rest = torch.zeros(3, dtype=torch.int32), interop.view(torch.zeros(3, dtype=torch.int32), wp.int32)
-    interop.launch(interop_mark, 3, [interop.view(numbers, wp.int32), rest], torch.device("cpu"))
-    with pytest.raises(TypeError, match=r"not torch.float32 on cpu"):
-        interop.launch(interop_mark, 3, [interop.view(numbers.view(torch.float32), wp.int32), rest], torch.device("cpu"))
+    numbers, rest = torch.zeros(3, **right), torch.zeros(3, **right)
+    launch.launch(mark, 3, [numbers, rest], device)
+    other = torch.zeros(3, **right | wrong)
+    for bad in (other, numbers.view(torch.float32)):
+        with pytest.raises(TypeError, match=f"visits must be torch.int32 on {device.type}, not {bad.dtype} on {bad.device}"):
+            launch.launch(mark, 3, [bad, rest], device)
 
 
 def test_devices_without_kernels_are_refused_by_name():
@@ -440,7 +371,7 @@ def test_devices_without_kernels_are_refused_by_name():
     with pytest.raises(ValueError, match=r"camera.K is on meta, but the kernels"):
         rasterize(g, dataclasses.replace(cam, K=cam.K.to("meta")))
     with pytest.raises(ValueError, match="mark: the kernels run on cpu and cuda only, not on meta"):
-        interop.launch(interop_mark, 3, [], torch.device("meta"))
+        launch.launch(mark, 3, [], torch.device("meta"))
 
 
 @pytest.mark.filterwarnings("ignore:Accessing the data pointer of FakeTensor")
@@ -457,20 +388,20 @@ def test_fake_tensors_are_refused():
 
 def test_a_launch_that_failed_is_recorded_anew(monkeypatch):
     """Under the lock, as a first one: it may have to be compiled."""
-    locked, load = [], interop.load_module
-    arguments = [interop.view(torch.zeros(3, dtype=torch.int32), wp.int32) for _ in range(2)]
+    locked, load = [], launch.load_module
+    arguments = [torch.zeros(3, dtype=torch.int32) for _ in range(2)]
 
     def fails_once(*given):
-        locked.append(interop._LOADING.locked())
+        locked.append(launch._LOADING.locked())
         if len(locked) == 1:
             raise ResourceError("no memory")
         return load(*given)
 
-    monkeypatch.setattr(interop, "_OF_THREAD", interop._OfThread())
-    monkeypatch.setattr(interop, "load_module", fails_once)
+    monkeypatch.setattr(launch, "_OF_THREAD", launch._OfThread())
+    monkeypatch.setattr(launch, "load_module", fails_once)
     with pytest.raises(ResourceError):
-        interop.launch(interop_mark, 3, arguments, torch.device("cpu"))
-    interop.launch(interop_mark, 3, arguments, torch.device("cpu"))
+        launch.launch(mark, 3, arguments, torch.device("cpu"))
+    launch.launch(mark, 3, arguments, torch.device("cpu"))
     assert locked == [True, True]
 
 
@@ -489,17 +420,17 @@ def test_arguments_of_one_and_two_axes_share_the_memory_of_any_tensor():
         image = memory.view(-1, 2, width)[:3]  # as of two rows of pixels
         part = image[..., :3]
         found = torch.zeros(6)
-        interop.launch(tell_apart, 6, [part, image, found], torch.device("cpu"))
+        launch.launch(tell_apart, 6, [part, image, found], torch.device("cpu"))
         wanted = 603 + 1000 * part.reshape(6, 3)[:, 1] + 1e6 * image.reshape(-1)[:6]
         assert torch.equal(found, wanted), width
     column = memory.view(1, 6, 10).transpose(0, 1)  # of images one pixel wide; its stride there is that of no row
     for image in (column, column[..., :4]):
         found = torch.zeros(6)
-        interop.launch(tell_apart, 6, [image, memory, found], torch.device("cpu"))
+        launch.launch(tell_apart, 6, [image, memory, found], torch.device("cpu"))
         wanted = 600 + image.shape[-1] + 1000 * image[:, 0, 1] + 1e6 * memory[:6]
         assert torch.equal(found, wanted), image.shape
     for none, shape in ((part[..., :0], (0, 0)), (part[:0], (0, 3))):
-        assert [v.array().shape for v in interop.arguments(tell_apart, [none, none, found])] == [shape, (0,), (6,)]
+        assert [launch.as_array(none, wp.float32, axes).shape for axes in (2, 1)] == [shape, (0,)]
 
 
 @wp.kernel(enable_backward=False)
@@ -513,59 +444,33 @@ def test_an_argument_of_one_axis_spans_what_lies_between_rows():
     memory = torch.arange(60, dtype=torch.float32)
     for width in (5, 10, 5):
         part, found = memory.view(-1, 2, width)[:3][..., :3], torch.zeros(6)
-        arguments = [interop.span(part, wp.float32), part.stride(-2), found]
-        interop.launch(second_of_row, 6, arguments, torch.device("cpu"))
+        arguments = [part, part.stride(-2), found]
+        launch.launch(second_of_row, 6, arguments, torch.device("cpu"))
         assert torch.equal(found, 5 * width + 3 + 1000 * part.reshape(6, 3)[:, 1]), width
-    assert interop.span(part[:0], wp.float32).array().shape == (0,)
-
-
-def test_pairs_are_sorted_in_place_where_they_lie():
-    """Stably, by tensors that come and go at the same address, too."""
-    for seed in range(3):
-        keys = torch.randint(4, (40,), dtype=torch.int32, generator=torch.Generator().manual_seed(seed))
-        values, wanted = torch.arange(40, dtype=torch.int32), keys[:20].sort(stable=True)
-        sorting.sort_pairs(keys, values, 20, end_bit=2)
-        assert torch.equal(keys[:20], wanted.values) and torch.equal(values[:20].long(), wanted.indices)
-
-
-def test_items_are_numbered_in_31_bits():
-    """2^31 - 1 of them can be, one more cannot."""
-    interop._check_size(2**31 - 1)
-    with pytest.raises(ResourceError, match=r"2,147,483,648 entries is beyond the 2,147,483,647"):
-        interop._check_size(2**31)
+    assert launch.as_array(part[:0], wp.float32, 1).shape == (0,)
 
 
 def test_check_names_what_disagrees():
     """Each rule of `check` alone, and the sizes where all hold."""
     a, b = torch.zeros(2, 3), torch.zeros(4, 2)
-    assert interop.check(a=(a, "N 3"), b=(b, "K N")) == {"N": 2, "K": 4}
+    assert launch.check(a=(a, "N 3"), b=(b, "K N")) == {"N": 2, "K": 4}
     with pytest.raises(TypeError, match="a must be a torch tensor, not list"):
-        interop.check(a=([1.0], "N"))
+        launch.check(a=([1.0], "N"))
     with pytest.raises(TypeError, match=r"a must be float32 or float64, not torch\.int32"):
-        interop.check(a=(a.int(), "N 3"))
+        launch.check(a=(a.int(), "N 3"))
     with pytest.raises(TypeError, match=r"b is torch\.float64 but a is torch\.float32"):
-        interop.check(a=(a, "N 3"), b=(b.double(), "K N"))
+        launch.check(a=(a, "N 3"), b=(b.double(), "K N"))
     with pytest.raises(ValueError, match="b is on meta but a is on cpu"):
-        interop.check(a=(a, "N 3"), b=(b.to("meta"), "K N"))
+        launch.check(a=(a, "N 3"), b=(b.to("meta"), "K N"))
     for pattern in ("N", "N 3 1", "N 4", "N N", "3 3"):
         with pytest.raises(ValueError, match=r"a must have shape .* not \[2, 3\]"):
-            interop.check(a=(a, pattern))
+            launch.check(a=(a, pattern))
     with pytest.raises(ValueError, match=r"b must have shape \[N, 2\] \(N=2\), not \[4, 2\]"):
-        interop.check(a=(a, "N 3"), b=(b, "N 2"))
-
-
-def test_a_driver_that_is_missing_is_no_news(monkeypatch, capfd):
-    """Output of native code is dropped inside the context, not after it."""
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    with interop._without_driver_notice():
-        os.write(2, b"no driver")
-    os.write(2, b"news")
-    assert capfd.readouterr().err == "news"
+        launch.check(a=(a, "N 3"), b=(b, "N 2"))
 
 
 # Allocators: an arena gives a function its tensors again, apart, aligned, at the same places each time.
 
-CPU = torch.device("cpu")
 BYTE = torch.empty(0, dtype=torch.uint8)
 
 
@@ -577,18 +482,20 @@ def ask(allocator):
 
 
 def test_an_arena_gives_the_same_shapes_and_each_its_own_memory():
-    """A write to one tensor changes no other."""
+    """A write to one tensor changes no other; addresses are those of the outputs and of both blocks."""
     sizes = SizingAllocator()
     wanted = [[(tuple(t.shape), t.dtype) for t in kind] for kind in ask(sizes)]
     arena = Arena(sizes, BYTE)
-    found = ask(arena)
-    assert [[(tuple(t.shape), t.dtype) for t in kind] for kind in found] == wanted
-    assert [[(tuple(t.shape), t.dtype) for t in kind] for kind in ask(TORCH)] == wanted
+    outputs, saved, workspace = found = ask(arena)
+    for each in (found, ask(TORCH)):
+        assert [[(tuple(t.shape), t.dtype) for t in kind] for kind in each] == wanted
     every = [t for kind in found for t in kind]
     for number, t in enumerate(every):
         t.fill_(number)
     assert all(bool((t == number).all()) for number, t in enumerate(every))
-    assert all(a is b for a, b in zip(arena.outputs, found[0], strict=True))
+    assert all(a is b for a, b in zip(arena.outputs, outputs, strict=True))
+    assert arena.addresses() == tuple(t.data_ptr() for t in (*outputs, saved[0], workspace[0]))
+    assert Arena(sizes, BYTE).addresses() != arena.addresses()
 
 
 def test_saved_tensors_are_found_again_in_any_such_block():
@@ -602,16 +509,6 @@ def test_saved_tensors_are_found_again_in_any_such_block():
     for number, t in enumerate(saved):
         t.fill_(number + 1)
     assert all(torch.equal(part(second.block, *place), t) for place, t in zip(places, saved, strict=True))
-
-
-def test_addresses_name_all_memory():
-    """They are those of the outputs and of both blocks; another arena has others."""
-    sizes = SizingAllocator()
-    ask(sizes)
-    arena = Arena(sizes, BYTE)
-    outputs, saved, workspace = ask(arena)
-    assert arena.addresses() == tuple(t.data_ptr() for t in (*outputs, saved[0], workspace[0]))
-    assert Arena(sizes, BYTE).addresses() != arena.addresses()
 
 
 def test_addresses_are_looked_up_when_the_kernel_runs(device):
@@ -640,9 +537,9 @@ def test_addresses_are_looked_up_when_the_kernel_runs(device):
 ROOT = Path(__file__).parent.parent.parent
 OTHER = """
 import torch
-from tests.kernels.test_launch import load_module_mark as mark
+from tests.kernels.test_launch import load_module_mark
 from warpgs.errors import ResourceError
-from warpgs.kernels import launch as interop
+from warpgs.kernels import launch
 from warpgs.kernels import native as load_module
 import warp
 def refuse(*_, **__): raise AssertionError("compiled a second time")
@@ -653,7 +550,7 @@ def note(descriptor):
     lock(descriptor)
 load_module.lock_descriptor = note
 seen = torch.zeros(3, dtype=torch.int32)
-interop.launch(mark, 3, [interop.view(seen, warp.int32)], torch.device("cpu"))
+launch.launch(load_module_mark, 3, [seen], torch.device("cpu"))
 print(seen.tolist())
 """
 
@@ -689,7 +586,7 @@ def test_a_loaded_module_takes_no_lock(cache, monkeypatch):
     """Neither the second launch nor any later one opens a file."""
     seen = torch.zeros(3, dtype=torch.int32)
     for _ in range(2):
-        launch.launch(load_module_mark, 3, [launch.view(seen, wp.int32)], torch.device("cpu"))
+        launch.launch(load_module_mark, 3, [seen], torch.device("cpu"))
         monkeypatch.setattr(native, "exclusive", None)
     assert seen.tolist() == [1, 2, 3]
 
@@ -707,7 +604,7 @@ def test_a_listener_hears_of_modules_that_the_cache_lacks(cache, monkeypatch):
     assert not native._LISTENERS and took == [1, 0]
 
 
-def test_a_file_system_without_locks_is_no_obstacle(tmp_path, monkeypatch):
+def test_a_lock_that_is_not_supported_is_no_obstacle_and_one_without_a_file_has_a_remedy(tmp_path, monkeypatch):
     def refuse(_):
         raise OSError(95, "not supported")
 
@@ -716,8 +613,5 @@ def test_a_file_system_without_locks_is_no_obstacle(tmp_path, monkeypatch):
         pass
     with pytest.raises(OSError, match="of the body"), native.exclusive(tmp_path / "lock"):
         raise OSError("of the body")
-
-
-def test_a_lock_that_cannot_be_made_is_named_with_a_remedy(tmp_path):
     with pytest.raises(ResourceError, match="WARP_CACHE_PATH"), native.exclusive(tmp_path / "no" / "lock"):
         pytest.fail("held")

@@ -7,11 +7,9 @@ import pytest
 import torch
 
 from tests.gaussians import SMOOTH, camera, cloud, leaves
-from tests.kernels.test_project import facing
-from tests.kernels.test_project import limit_run as run
+from tests.kernels.test_project import facing, run
 from tests.numerics.test_extreme_compositing import Filled
 from tests.reference.blend import blend_reference
-from tests.reference.ssim import ssim_reference
 from tests.reference.update import adam_reference
 from tests.tolerances import close
 from warpgs.constants import RULES
@@ -72,45 +70,12 @@ def test_morton_codes_interleave_the_bits():
 
 
 def test_neighbours_are_three_unless_said_and_at_most_eight():
-    """The default, the most, one more, and two points."""
+    """The default, the most, and two points."""
     points = torch.rand(70, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     assert torch.equal(mean_square_distances(points), mean_square_distances(points, 3))
     assert not torch.equal(mean_square_distances(points, 8), mean_square_distances(points, 7))
-    with pytest.raises(ValueError, match="k must be 1 to 8, not 9"):
-        mean_square_distances(points, 9)
     two = torch.tensor([[0.0, 0, 0], [3.0, 0, 4.0]])
     assert mean_square_distances(two, 1).tolist() == [25.0, 25.0]
-
-
-def test_groups_of_boxes_are_exact(device):
-    """More points than a group holds, in clusters that prune most of them."""
-    generator = torch.Generator().manual_seed(3)
-    points = torch.randn(2100, 3, generator=generator, dtype=torch.float64)
-    points[::2] *= 1e-3
-    points[::3] += 5.0
-    found = mean_square_distances(points.to(device), 4).cpu()
-    distances = torch.cdist(points, points).square().fill_diagonal_(math.inf)
-    assert torch.allclose(found, distances.topk(4, largest=False).values.mean(1), rtol=1e-7)
-
-
-@pytest.mark.parametrize("width", [1, 5, 6, 7])
-def test_narrow_pictures_equal_the_same_beside_black(device, width):
-    """Columns of zeros beside an image change nothing, since the window finds zeros there; padding is not returned."""
-    generator = torch.Generator().manual_seed(width)
-    a, b = torch.rand(2, 9, width, 3, generator=generator, dtype=torch.float64).to(device).unbind()
-    wide = [torch.nn.functional.pad(t, (0, 0, 0, 20 - width)) for t in (a, b)]
-    map_, wanted = ssim(a, b), ssim(*wide)[:, :width]
-    assert torch.allclose(map_, wanted, atol=1e-14)
-    sums = differences(a, b)
-    assert torch.allclose(sums, torch.stack([(1 - wanted).sum(), (a - b).abs().sum()]), atol=1e-12)
-
-
-@pytest.mark.parametrize("count", [1, 15, 16, 17, 33, 4096, 4097])
-def test_adam_takes_every_element(device, dtype, count):
-    """One more than a step of lanes or a segment of tasks is not left out."""
-    param, grad = torch.zeros(count, 1, dtype=dtype, device=device), torch.ones(count, 1, dtype=dtype, device=device)
-    adam_step(param, grad, param.clone(), param.clone(), lr=0.5, step=1)
-    assert torch.allclose(param, torch.full_like(param, -0.5))
 
 
 @pytest.mark.parametrize(("width", "ways"), [(5, 0), (6, 1), (40, 1)])
@@ -140,25 +105,6 @@ def test_a_pixel_reaches_five_pixels(device):
         found = ssim(many.requires_grad_(), b.expand_as(many)).view(len(few), -1, 3)[torch.arange(len(few)), few]
         (gradient,) = torch.autograd.grad(found.sum(), many)
         assert not bool((gradient.view(len(few), -1, 3) != 0).any(-1).cpu()[far[few]].any())
-
-
-@pytest.mark.parametrize(("height", "width"), [(16, 16), (15, 32), (32, 17), (17, 33), (8, 11)])
-def test_pictures_that_fill_the_blocks(device, dtype, height, width):
-    """Whole blocks, and one row or column more or less than that, in a batch: map, sums and both gradients."""
-    generator = torch.Generator().manual_seed(height)
-    a, b = torch.rand(2, 2, height, width, 3, generator=generator, dtype=torch.float64).unbind()
-    weights = torch.rand(a.shape, generator=generator, dtype=torch.float64)
-    leaf64, leaf = a.clone().requires_grad_(), a.to(device, dtype).requires_grad_()
-    wanted = torch.stack([ssim_reference(x, y) for x, y in zip(leaf64, b)])
-    found = ssim(leaf, b.to(leaf))
-    close("ssim", found, wanted)
-    sums = differences(leaf, b.to(leaf))
-    both = torch.stack([(1 - wanted).sum(), (leaf64 - b).abs().sum()])
-    close("ssim", sums, both)
-    maps = (found * weights.to(leaf)).sum(), (wanted * weights).sum()
-    for ours, theirs in (maps, (0.3 * sums[0] + 2 * sums[1], 0.3 * both[0] + 2 * both[1])):
-        (mine,), (other,) = torch.autograd.grad(ours, leaf), torch.autograd.grad(theirs, leaf64, retain_graph=True)
-        close("gradient", mine, other)
 
 
 # Lists and blending at their limits: the last byte, the last slot, an alpha or transmittance equal to a cut-off.
@@ -230,11 +176,16 @@ def test_counted_apart_where_one_sum_might_not_hold_both(monkeypatch, fits):
 def test_tiles_of_a_smaller_or_larger_picture_are_refused():
     """`blend` counts columns, rows and cameras."""
     gaussians, cam = cloud(5), camera(40, 30, cameras=2, dtype=torch.float32)
-    projected, counts = run(gaussians, cam)
-    made = tiles.bin_tiles(projected, counts, width=40, height=30, rule=EXACT)
+    projected, _, made = binned(gaussians, cam)
     for count, width, height in ((2, 16, 30), (2, 40, 16), (1, 40, 30)):
         with pytest.raises(ValueError, match="made for another image"):
             walk.contributions(projected[:count], made, width=width, height=height, rule=EXACT)
+
+
+def binned(gaussians, cam, rule=EXACT, **options):
+    """Return projected Gaussians, their counts and their tiles."""
+    projected, counts = run(gaussians, cam, rule, **options)
+    return projected, counts, tiles.bin_tiles(projected, counts, width=cam.width, height=cam.height, rule=rule, **options)
 
 
 def one_a_tile(device, columns=3, rows=3):
@@ -251,8 +202,7 @@ def one_a_tile(device, columns=3, rows=3):
 def test_tiles_of_one_instance_each(device):
     """Every instance begins and ends a tile; the default tile is 16 px."""
     gaussians, cam = one_a_tile(device)
-    projected, counts = run(gaussians, cam)
-    made = tiles.bin_tiles(projected, counts, width=48, height=48, rule=EXACT)
+    projected, counts, made = binned(gaussians, cam)
     assert made.size == 16 and made.ranges.tolist() == [[i, i + 1] for i in range(9)]
     assert made.gaussian_ids.tolist() == list(range(9)) and made.total.tolist() == [9]
     assert torch.equal(counts, run(gaussians, cam, tile_size=16)[1])
@@ -260,24 +210,12 @@ def test_tiles_of_one_instance_each(device):
     assert single.total.tolist() == [1] and single.ranges[4].tolist() == [0, 1] and single.gaussian_ids.tolist() == [0]
 
 
-def test_a_gaussian_of_every_tile(device, dtype):
-    """A hundred tiles, each of which lists it once."""
-    gaussians, cam = facing(2, dtype, device, size=160)
-    gaussians.log_scales[1] += 6.0
-    projected, counts = run(gaussians, cam)
-    made = tiles.bin_tiles(projected, counts, width=160, height=160, rule=EXACT)
-    assert counts.tolist() == [[1, 100]] and made.total.tolist() == [101]
-    assert sorted(made.tile_ids.tolist()) == sorted([0, *range(100)])
-    assert (made.ranges[:, 1] - made.ranges[:, 0]).tolist() == [2] + [1] * 99
-
-
 def test_nothing_has_no_length(device):
     """No Gaussians, and none that is seen: every list is empty and the total is 0."""
     for gaussians in (cloud(0, device=device), cloud(3, device=device)):
         cam = camera(40, 30, cameras=1, dtype=torch.float32, device=device)
         gaussians.means[:, 2] = -4.0
-        projected, counts = run(gaussians, cam)
-        made = tiles.bin_tiles(projected, counts, width=40, height=30, rule=EXACT)
+        _, _, made = binned(gaussians, cam)
         assert [len(t) for t in (made.gaussian_ids, made.slots, made.tile_ids)] == [0, 0, 0]
         assert len(made.starts) == len(made.counts) == len(gaussians.means) and made.total.tolist() == [0]
 
@@ -374,14 +312,6 @@ def test_an_alpha_equal_to_the_cut_or_to_the_most(device, dtype):
     assert opened.tolist() == [True, False, True, False]
 
 
-def test_layers_behind_one_open_pixel(device, dtype):
-    """More layers than are taken at a time, over a single pixel."""
-    projected, (_, alpha, _), _ = plain([0.01] * 100, device, dtype, EXACT, side=1)
-    assert abs(float(alpha.detach()) - (1 - 0.99**100)) < (1e-5 if dtype == torch.float32 else 1e-12)
-    (gradient,) = torch.autograd.grad(alpha.sum(), projected)
-    assert bool((gradient[0, :, 5] > 0).all())
-
-
 def needles(count, device):
     """Long and round Gaussians of many sizes and opacities, from a fraction of a pixel to the whole image."""
     gaussians = cloud(count, torch.float32, device)
@@ -397,9 +327,8 @@ def test_all_three_passes_draw_the_same_pixels(device, dtype, rule):
     gaussians, cam = needles(400, device), camera(70, 50, cameras=1, dtype=dtype, device=device)
     gaussians.log_scales[:100] = -2.9  # about 3 sigma times 10 px to the edge of a square, which alpha passes by a row
     gaussians = Gaussians(**{n: t.to(dtype) for n, t in gaussians.tensors().items()})
-    projected, counts = run(gaussians, cam, RULES[rule])
     size = {"width": 70, "height": 50, "rule": RULES[rule]}
-    made = tiles.bin_tiles(projected, counts, **size)
+    projected, _, made = binned(gaussians, cam, RULES[rule])
     record = projected.detach().requires_grad_()
     rgb, _, _ = blend.blend(record, made, torch.zeros(1, 3, dtype=dtype, device=device), **size)
     (gradient,) = torch.autograd.grad(rgb[..., 0].sum(), record)
@@ -419,9 +348,8 @@ def test_blocks_that_are_left_out_draw_nothing(rule, tile_size):
     found = []
     for device in ("cpu", "cuda:0"):
         gaussians, cam = needles(1500, device), camera(150, 110, cameras=2, dtype=torch.float32, device=device)
-        projected, counts = run(gaussians, cam, rule, tile_size=tile_size)
         size = {"width": 150, "height": 110, "rule": rule}
-        made = tiles.bin_tiles(projected, counts, tile_size=tile_size, **size)
+        projected, _, made = binned(gaussians, cam, rule, tile_size=tile_size)
         record = projected.detach().requires_grad_()
         rgb, alpha, depth = blend.blend(record, made, torch.zeros(2, 3, device=device), **size)
         fractions = walk.contributions(projected, made, **size)
@@ -442,11 +370,10 @@ def test_blocks_at_needles_far_longer_than_the_picture(tile_size):
         gaussians, cam = needles(300, device), camera(150, 110, cameras=2, dtype=torch.float32, device=device)
         gaussians.log_scales[:] = torch.tensor([6.5, -4.0, -4.0])
         gaussians.logit_opacities[:] = -4.0
-        projected, counts = run(gaussians, cam, EXACT, tile_size=tile_size)
+        projected, _, made = binned(gaussians, cam, tile_size=tile_size)
         assert int((projected[..., 10] > 2e4).sum()) > 100  # half widths
-        size = {"width": 150, "height": 110, "rule": EXACT}
-        made = tiles.bin_tiles(projected, counts, tile_size=tile_size, **size)
-        found.append(blend.blend(projected, made, torch.zeros(2, 3, device=device), **size)[1].cpu())
+        black = torch.zeros(2, 3, device=device)
+        found.append(blend.blend(projected, made, black, width=150, height=110, rule=EXACT)[1].cpu())
     off = (found[0] - found[1]).abs() > 2e-3
     assert int((found[0] > 0).sum()) > 1000 and int(off.sum()) <= 3
 
@@ -523,8 +450,7 @@ def test_every_row_of_the_gradient_is_written(device, only_rgb, deterministic):
     for kind in (torch.float32, torch.float64):
         g = Gaussians(**{n: t.to(kind) for n, t in gaussians.tensors().items()})
         view = dataclasses.replace(cam, viewmat=cam.viewmat.to(kind), K=cam.K.to(kind))
-        projected, counts = run(g, view, SMOOTH if only_rgb else EXACT, tile_size=8)
-        made = tiles.bin_tiles(projected, counts, rule=SMOOTH if only_rgb else EXACT, tile_size=8, **size)
+        projected, counts, made = binned(g, view, SMOOTH if only_rgb else EXACT, tile_size=8)
         assert int(counts.max()) > 100 and int(counts.min()) == 0
         found = of_records(projected, made, SMOOTH if only_rgb else EXACT, only_rgb, deterministic, **size)
         assert bool(torch.isfinite(found).all()) and not bool(found[counts == 0].any())
@@ -559,27 +485,23 @@ def test_layers_that_draw_nothing_have_no_gradient(device, dtype):
     assert bool((gradient[0, 1::2, 5:9] > 0).all()) and bool((sums[0, 1::2] > 0).all())
 
 
-def test_contributions_count_the_pixels_of_the_picture(device, dtype):
-    """In a tile with more instances than a chunk, the first instance has its gradient, too."""
-    _, _, (sums, _) = plain([0.25, 0.5, 0.5], device, dtype, EXACT, side=3)
-    assert sums.tolist() == [[9 * 0.25, 9 * 0.375, 9 * 0.1875]]
-
-
-def test_a_first_layer_behind_the_stop(device, dtype):
-    """Where one layer already crosses the stop, nothing is blended, and nothing has a gradient."""
+def test_layers_over_a_single_pixel_a_small_picture_and_none(device, dtype):
+    """More layers than are taken at a time; sums over the image's pixels alone; a first layer that crosses the stop."""
+    projected, (_, alpha, _), _ = plain([0.01] * 100, device, dtype, EXACT, side=1)
+    assert abs(float(alpha.detach()) - (1 - 0.99**100)) < (1e-5 if dtype == torch.float32 else 1e-12)
+    assert bool((torch.autograd.grad(alpha.sum(), projected)[0][0, :, 5] > 0).all())
+    assert plain([0.25, 0.5, 0.5], device, dtype, EXACT, side=3)[2][0].tolist() == [[9 * 0.25, 9 * 0.375, 9 * 0.1875]]
     rule = dataclasses.replace(EXACT, transmittance_stop=0.6, inclusive_stop=False)
     projected, (rgb, alpha, depth), (sums, _) = plain([0.5, 0.1], device, dtype, rule)
     assert not bool(alpha.any()) and not bool(sums.any())
-    (gradient,) = torch.autograd.grad(rgb.sum() + alpha.sum() + depth.sum(), projected)
-    assert not bool(gradient.any())
+    assert not bool(torch.autograd.grad(rgb.sum() + alpha.sum() + depth.sum(), projected)[0].any())
 
 
 def test_depth_where_every_weight_is_zero(device, dtype):
     """Without a cut a Gaussian is listed everywhere, and far away its weight is 0: depth 0, and gradients are numbers."""
     size = {"width": 64, "height": 64}
     gaussians, cam = facing(2, dtype, device, size=64)
-    projected, counts = run(gaussians, cam, SMOOTH)
-    made = tiles.bin_tiles(projected, counts, rule=SMOOTH, **size)
+    projected, _, made = binned(gaussians, cam, SMOOTH)
     record = projected.detach().requires_grad_()
     black = torch.zeros(1, 3, dtype=dtype, device=device)
     depth = blend.blend(record, made, black, rule=SMOOTH, **size)[2]
@@ -594,9 +516,8 @@ def test_as_many_gaussians_as_a_block_has_threads(device, count):
     """With one more or fewer, too, each is listed and has its gradient."""
     gaussians, cam = facing(count, device=device)
     gaussians.logit_opacities[:] = -4.0
-    projected, counts = run(gaussians, cam)
     size = {"width": 16, "height": 16}
-    made = tiles.bin_tiles(projected, counts, rule=EXACT, **size)
+    projected, _, made = binned(gaussians, cam)
     assert made.gaussian_ids.tolist() == list(range(count)) and made.ranges.tolist() == [[0, count]]
     assert bool((of_records(projected, made, EXACT, True, **size)[0, :, 6] > 0).all())
 
@@ -609,11 +530,12 @@ def test_long_lists_are_written_by_a_warp(device, dtype):
     projected, counts = run(gaussians, cam)
     assert counts.tolist() == [[100, 1]]
     size = {"width": 160, "height": 160, "rule": EXACT}
+    both = tiles.bin_tiles(projected, counts, **size)
+    assert both.total.tolist() == [101] and (both.ranges[:, 1] - both.ranges[:, 0]).tolist() == [2] + [1] * 99
     alone = tiles.bin_tiles(projected[:, :1], counts[:, :1], **size)
     assert alone.ranges.tolist() == [[i, i + 1] for i in range(100)]
     short = tiles.bin_tiles(projected, counts - torch.tensor([[1, 0]], dtype=torch.int32, device=device), **size)
     assert sorted(short.gaussian_ids.tolist()) == [0] * 99 + [1] and short.tile_ids.tolist() == [0, *range(99)]
     tall = dataclasses.replace(cam, width=16, height=640)
-    projected, counts = run(Gaussians(**{n: t[:1] for n, t in gaussians.tensors().items()}), tall)
-    made = tiles.bin_tiles(projected, counts, width=16, height=640, rule=EXACT)
+    projected, counts, made = binned(Gaussians(**{n: t[:1] for n, t in gaussians.tensors().items()}), tall)
     assert counts.tolist() == [[40]] and made.ranges.tolist() == [[i, i + 1] for i in range(40)]

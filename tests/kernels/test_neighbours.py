@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from tests.reference.neighbours import log_pixel, log_reach, mean_square_distances_reference
 from tests.scenes import ring
 from warpgs.kernels.neighbours import SMALLEST_PIXEL, SMALLEST_REACH, camera_reach, mean_square_distances, pixel_size
-from warpgs.pipeline.model.limits import TrainingCameras
+from warpgs.pipeline.model.limits import camera_rows
 from warpgs.scene import Camera
 
 # Nearest-neighbour distances against all pairs.
@@ -57,8 +57,9 @@ def test_bad_input_is_refused():
         mean_square_distances(torch.tensor([[0.0, 0, 0], [float("nan"), 0, 0]]))
     with pytest.raises(ValueError, match="points"):
         mean_square_distances(torch.zeros(4, 2))
-    with pytest.raises(ValueError, match="k must be"):
-        mean_square_distances(torch.zeros(4, 3), 0)
+    for k in (0, 9):
+        with pytest.raises(ValueError, match=f"k must be 1 to 8, not {k}"):
+            mean_square_distances(torch.zeros(4, 3), k)
 
 
 # Sizes at which Gaussians reach no camera, against distances in float64.
@@ -126,11 +127,10 @@ def test_a_row_says_what_a_camera_sees(device):
         (rim, [0.05, math.sqrt(1.9**2 + 1.4**2 + 25) / 100, None, None]),
         (Camera(np.eye(4), K, 80, 60, "orthographic"), [None] * 4),
     ):
-        found = pixel_size(means.to(device), TrainingCameras.of([camera], device).rows, 1.0).cpu()
+        found = pixel_size(means.to(device), camera_rows([camera], device), 1.0).cpu()
         for size, expected in zip(found.exp().tolist(), wanted, strict=True):
             assert size == pytest.approx(SMALLEST_PIXEL if expected is None else expected, rel=1e-5)
-    both = TrainingCameras.of([pinhole, *ring(3)], device)
-    assert both.rows.shape == (4, 9) and both.centers.shape == (4, 3)
+    assert camera_rows([pinhole, *ring(3)], device).shape == (4, 9)
 
 
 def test_pixel_size_at_a_camera_and_without_gaussians(device):

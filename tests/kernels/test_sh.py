@@ -93,14 +93,6 @@ def test_gradient_of_each_basis_function(device, degree):
         close("gradient", means.grad, other.grad)
 
 
-def test_unused_coefficients_get_no_gradient(device):
-    """Coefficients above the degree in use have a gradient of exactly zero."""
-    coefficients, dirs, viewmats = inputs(torch.float64, device)
-    coefficients.requires_grad_()
-    colors(coefficients, dirs, viewmats, 1).sum().backward()
-    assert bool((coefficients.grad[:, 4:] == 0).all()) and bool((coefficients.grad[:, :4] != 0).any(-1).all())
-
-
 def test_a_degree_out_of_range_is_refused():
     """The error names the range."""
     for degree in (-1, 5):

@@ -12,8 +12,6 @@ from warpgs.kernels.sweep import LARGEST, best_inverses, scanline_costs
 from warpgs.priors.sweep import UNIT, matching_costs_cpu
 from warpgs.scene import Camera, View
 
-# Matching costs are those of OpenCV.
-
 
 @pytest.mark.parametrize("size", [(7, 160), (160, 5), (1, 1), (40, 70)])
 def test_costs_are_those_of_opencv(size):
@@ -33,17 +31,11 @@ def test_costs_are_those_of_opencv(size):
     assert (found[..., 21:] == UNIT).all()
 
 
-# The best plane is that of numpy, to the bit.
-
-
 def test_best_planes_are_those_of_numpy():
     """Ties go to the first plane, ends are moved inwards, and planes past the last do not count."""
     inverses = np.linspace(0.1, 0.5, 9)
-    costs = np.random.default_rng(2).integers(0, 99, (6, 5, 16)).astype(np.int16)
+    costs = np.random.default_rng(2).integers(0, 9, (6, 5, 16)).astype(np.int16)
     assert np.array_equal(best_inverses(torch.from_numpy(costs), inverses), best_inverse(costs[..., :9], inverses))
-
-
-# Path costs: equal to their definition to the last unit, in every shape, and never beyond 16 bits.
 
 
 def problem(shape: tuple[int, int, int], seed: int = 0, largest: int = 4096):
@@ -59,22 +51,14 @@ def computed(device, costs, down, across, small) -> np.ndarray:
     return scanline_costs(*on_device, small).cpu().numpy()
 
 
-@pytest.mark.parametrize("shape", [(4, 5, 6), (1, 7, 3), (7, 1, 3), (3, 4, 1), (3, 4, 2), (40, 33, 17), (1, 1, 4)])
+@pytest.mark.parametrize("shape", [(1, 7, 3), (7, 1, 3), (3, 4, 1), (40, 33, 17), (1, 1, 4)])
 def test_equal_to_the_definition(device, shape):
-    """The sums agree to the last unit, also for one row, one column and one plane."""
+    """The sums agree to the last unit, also for one row, one column and one plane, and for costs in another order of memory."""
     costs, down, across = problem(shape)
-    assert np.array_equal(computed(device, costs, down, across, 123), defined(costs, down, across, 123))
-
-
-def test_penalties_decide(device):
-    """Without any, each pixel keeps its costs four times; large ones carry one pixel's plane all along its lines."""
-    costs, down, across = problem((6, 9, 5))
-    free = computed(device, costs, np.zeros_like(down), np.zeros_like(across), 0)
-    assert np.array_equal(free, 4 * costs.astype(int))
-    even = np.full((6, 9, 5), 100, np.int16)
-    even[2, 3, 4] = 0
-    tied = computed(device, even, np.full_like(down, 4000), np.full_like(across, 4000), 1000)
-    assert (tied[2].argmin(1) == 4).all() and (tied[:, 3].argmin(1) == 4).all() and (tied[0, 0] == tied[0, 0, 0]).all()
+    wanted = defined(costs, down, across, 123)
+    assert np.array_equal(computed(device, costs, down, across, 123), wanted)
+    turned, *limits = (torch.from_numpy(a).to(device) for a in (np.ascontiguousarray(costs.transpose(2, 0, 1)), down, across))
+    assert np.array_equal(scanline_costs(turned.permute(1, 2, 0), *limits, 123).cpu().numpy(), wanted)
 
 
 def test_the_dearest_costs_fit(device):
@@ -86,14 +70,6 @@ def test_the_dearest_costs_fit(device):
     limits = np.full((5, 6), penalty, np.int32), np.full((6, 5), penalty, np.int32)
     found = computed(device, costs, *limits, penalty)
     assert np.array_equal(found, defined(costs, *limits, penalty)) and found.min() >= 0 and found.max() > 3 * 2**13
-
-
-def test_memory_order_does_not_matter(device):
-    """A transposed view of the costs, as a caller may hold them, gives the same sums."""
-    costs, down, across = (torch.from_numpy(a).to(device) for a in problem((5, 8, 6)))
-    turned = costs.permute(2, 0, 1).contiguous().permute(1, 2, 0)
-    assert not turned.is_contiguous()
-    assert torch.equal(scanline_costs(turned, down, across, 50), scanline_costs(costs, down, across, 50))
 
 
 @pytest.mark.parametrize("wrong", ["costs", "down", "across"])

@@ -9,12 +9,16 @@ import torch
 from tests.gaussians import camera as torch_camera
 from tests.reference import tsdf as reference
 from warpgs.errors import UsageError
-from warpgs.geometry import back_project
-from warpgs.kernels.tsdf import empty_grid, face_cosines, gather_colors, integrate
+from warpgs.kernels.tsdf import face_cosines, gather_colors, integrate
 from warpgs.scene import Camera
 
 SIZE = (40, 31)
 BOUND = {torch.float32: 2e-4, torch.float64: 1e-10}
+
+
+def empty(shape, dtype, device):
+    """Distances and weights of a grid that no view has seen."""
+    return [torch.zeros(shape, dtype=dtype, device=device) for _ in range(2)]
 
 
 def cameras(count=2):
@@ -46,18 +50,18 @@ def tensors(arrays, dtype, device):
 def test_distances_and_weights_equal_numpy(device, dtype):
     """Two views one after the other, with steps, holes, sky and weights of 0; few points lie where rounding decides."""
     views = [(c, *maps(i)[:2]) for i, c in enumerate(cameras())]
-    place = {"origin": (-1.61, -1.23, 1.93), "voxel": 0.1103, "shape": (30, 22, 33), "truncation": 0.35}
-    grid = empty_grid(*place.values(), like=torch.empty(0, dtype=dtype, device=device))
+    origin, voxel, shape, truncation = (-1.61, -1.23, 1.93), 0.1103, (30, 22, 33), 0.35
+    grid = empty(shape, dtype, device)
     for c, *arrays in views:
-        integrate(grid, c, *tensors(arrays, dtype, device))
-    distances, weights = reference.integrated(*place.values(), views)
+        integrate(*grid, origin, voxel, truncation, c, *tensors(arrays, dtype, device))
+    distances, weights = reference.integrated(origin, voxel, shape, truncation, views)
     seen = weights > 0
     assert 0.2 < seen.mean() < 0.9 and (distances[seen] < 0).mean() > 0.05 and (distances == 1).any()
-    off = np.abs(grid.distances.cpu().numpy() - distances)[seen] > BOUND[dtype]
-    off_weights = np.abs(grid.weights.cpu().numpy() - weights) > BOUND[dtype]
+    off = np.abs(grid[0].cpu().numpy() - distances)[seen] > BOUND[dtype]
+    off_weights = np.abs(grid[1].cpu().numpy() - weights) > BOUND[dtype]
     limit = 2e-3 if dtype is torch.float32 else 0
     assert off.mean() <= limit and off_weights.mean() <= limit
-    assert not bool(grid.distances[~torch.as_tensor(seen, device=device)].any()) or dtype is torch.float32
+    assert not bool(grid[0][~torch.as_tensor(seen, device=device)].any()) or dtype is torch.float32
 
 
 def test_colors_equal_numpy(device, dtype):
@@ -109,11 +113,11 @@ def test_borders(device, dtype):
     sums, weights = torch.zeros(8, 3, dtype=dtype, device=device), torch.zeros(8, dtype=dtype, device=device)
     gather_colors(torch.tensor(points, dtype=dtype, device=device), 0.5, c, depth, one, image, sums, weights)
     assert weights.tolist() == [1, 0, 1, 0, 1, 0, 0, 1] and torch.equal(sums, weights[:, None].expand(8, 3))
-    grid = empty_grid((-1.0, -1.0, 2.0), 1.0, (3, 3, 2), 1.0, depth)
-    integrate(grid, c, depth, one)
+    grid = empty((3, 3, 2), dtype, device)
+    integrate(*grid, (-1.0, -1.0, 2.0), 1.0, 1.0, c, depth, one)
     inside = [[1, 1, 0], [1, 1, 0], [0, 0, 0]]  # at depth 2; at depth 3, the truncation behind, the whole grid is
-    assert grid.weights[:, :, 0].tolist() == inside and bool((grid.weights[:, :, 1] == 1).all())
-    assert bool((grid.distances[:, :, 1] == -1).all()) and not bool(grid.distances[:, :, 0].any())
+    assert grid[1][:, :, 0].tolist() == inside and bool((grid[1][:, :, 1] == 1).all())
+    assert bool((grid[0][:, :, 1] == -1).all()) and not bool(grid[0][:, :, 0].any())
 
 
 def test_depths_as_far_apart_as_the_truncation_are_two_surfaces(device, dtype):
@@ -123,48 +127,17 @@ def test_depths_as_far_apart_as_the_truncation_are_two_surfaces(device, dtype):
     depth[4:] = 2.5
     found = []
     for truncation in (0.5, 0.5001):
-        grid = empty_grid((0.0, 0.0, 1.9), 0.1, (1, 1, 1), truncation, torch.empty(0, dtype=dtype, device=device))
-        integrate(grid, c, *tensors([depth, np.ones((8, 8))], dtype, device))
-        found.append(float(grid.distances) * truncation)
+        grid = empty((1, 1, 1), dtype, device)
+        integrate(*grid, (0.0, 0.0, 1.9), 0.1, truncation, c, *tensors([depth, np.ones((8, 8))], dtype, device))
+        found.append(float(grid[0]) * truncation)
     assert found == pytest.approx([0.5, 0.35], abs=1e-3)
-
-
-def test_a_wall_is_found_where_it_is(device):
-    """Between two points of the grid, to a thousandth of a voxel; far behind it nothing is known, before it all is empty."""
-    c = cameras(1)[0]
-    grid = empty_grid((-0.5, -0.4, 1.0), 0.1, (10, 8, 30), 0.3, torch.empty(0, device=device))
-    depth, one = torch.full((SIZE[1], SIZE[0]), 2.137, device=device), torch.ones(SIZE[1], SIZE[0], device=device)
-    integrate(grid, c, depth, one)
-    distances, weights = grid.distances[5, 4].cpu(), grid.weights[5, 4].cpu()
-    z = 1.0 + 0.1 * torch.arange(30)
-    assert torch.equal(weights > 0, z <= 2.137 + 0.3) and bool((distances[z < 1.8] == 1).all())
-    before, behind = float(distances[11]), float(distances[12])
-    assert before > 0 > behind and abs(2.1 + 0.1 * before / (before - behind) - 2.137) < 1e-4
-    middle = back_project(c, np.array([[20.0, 15.0]]), np.array([2.137]))
-    sums, found = torch.zeros(1, 3, device=device), torch.zeros(1, device=device)
-    red = one[..., None] * torch.tensor([1.0, 0, 0], device=device)
-    gather_colors(torch.as_tensor(middle, dtype=torch.float32, device=device), 0.05, c, depth, one, red, sums, found)
-    assert sums.tolist() == [[1, 0, 0]] and found.tolist() == [1]
-
-
-def test_threads_give_the_same_bits(device):
-    """Every grid point is its own."""
-    depth, weights, _ = tensors(maps(), torch.float32, device)
-    found, before = [], torch.get_num_threads()
-    for threads in (1, 2):
-        torch.set_num_threads(threads)
-        grid = empty_grid((-1.6, -1.2, 1.9), 0.05, (60, 50, 66), 0.2, depth)
-        for c in cameras():
-            integrate(grid, c, depth, weights)
-        found.append(grid)
-    torch.set_num_threads(before)
-    assert torch.equal(found[0].distances, found[1].distances) and torch.equal(found[0].weights, found[1].weights)
 
 
 def test_bad_input_is_refused():
     """Another camera model, and shapes that disagree."""
-    c, grid, depth = cameras(1)[0], empty_grid((0, 0, 0), 1, (2, 2, 2), 1, torch.empty(0)), torch.ones(SIZE[1], SIZE[0])
+    c, depth = cameras(1)[0], torch.ones(SIZE[1], SIZE[0])
+    grid = *empty((2, 2, 2), torch.float32, "cpu"), (0, 0, 0), 1, 1
     with pytest.raises(UsageError, match="pinhole"):
-        integrate(grid, dataclasses.replace(c, model="fisheye"), depth, depth)
+        integrate(*grid, dataclasses.replace(c, model="fisheye"), depth, depth)
     with pytest.raises(ValueError, match="pixel_weights"):
-        integrate(grid, c, depth, depth[1:])
+        integrate(*grid, c, depth, depth[1:])

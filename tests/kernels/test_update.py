@@ -21,8 +21,6 @@ from warpgs.kernels.update import (
     squared_error,
 )
 
-# The fused Adam step against torch's.
-
 
 def run(param, grads, **options):
     """The parameter after one fused step per gradient, with its moments."""
@@ -39,24 +37,17 @@ def problem(dtype, device, shape=(1500, 4, 3)):
     return param.to(device, dtype), [g.to(device, dtype) for g in grads]
 
 
-def test_steps_equal_torch(device, dtype):
-    """Four steps move every element as torch.optim.Adam does."""
-    param, grads = problem(dtype, device)
-    found, _, _ = run(param, grads, lr=0.01)
-    wanted = adam_reference(param.cpu().double(), [g.cpu().double() for g in grads], 0.01)
-    moved = (wanted - param.cpu().double()).abs().max()
-    assert float((found.cpu().double() - wanted).abs().max()) <= (1e-5 if dtype == torch.float32 else 1e-13) * float(moved)
-
-
-@pytest.mark.parametrize("shape", [(50, 4, 3), (701, 9, 3), (701, 16, 3), (999, 1, 3)])
-def test_head_of_a_row_takes_its_own_rate(device, dtype, shape):
-    """The first columns move with head_lr, all others with lr; rows cross lanes, segments and groups of four."""
+@pytest.mark.parametrize(("shape", "head"), [((1500, 4, 3), 0), ((50, 4, 3), 3), ((701, 16, 3), 3), ((999, 1, 3), 3)])
+def test_steps_equal_torch(device, dtype, shape, head):
+    """Four steps, also with a rate of their own for the first columns; rows cross lanes, segments and groups of four."""
     param, grads = problem(dtype, device, shape)
     lrs = torch.full((shape[0], shape[1] * 3), 0.01, dtype=torch.float64)
-    lrs[:, :3] = 0.2
-    found, _, _ = run(param, grads, lr=0.01, head_lr=0.2, head=3)
-    wanted = adam_reference(param.cpu().double(), [g.cpu().double() for g in grads], lrs.view(shape))
-    assert torch.allclose(found.cpu().double(), wanted, atol=1e-5 if dtype == torch.float32 else 1e-12)
+    lrs[:, :head] = 0.2
+    found, _, _ = run(param, grads, lr=0.01, head_lr=0.2, head=head)
+    start = param.cpu().double()
+    wanted = adam_reference(start, [g.cpu().double() for g in grads], lrs.view(shape))
+    moved = float((wanted - start).abs().max())
+    assert float((found.cpu().double() - wanted).abs().max()) <= (1e-5 if dtype == torch.float32 else 1e-13) * moved
 
 
 def test_zero_gradient_moves_nothing(device, dtype):
@@ -64,15 +55,6 @@ def test_zero_gradient_moves_nothing(device, dtype):
     param, _ = problem(dtype, device)
     found, mean, square = run(param, [torch.zeros_like(param)], lr=0.1)
     assert torch.equal(found, param) and not bool(mean.any()) and not bool(square.any())
-
-
-def test_threads_do_not_change_the_bits():
-    """One thread and two give the same parameter."""
-    param, grads = problem(torch.float32, "cpu", (40_000, 4, 3))
-    torch.set_num_threads(1)
-    one = run(param, grads, lr=0.01)
-    torch.set_num_threads(2)
-    assert all(torch.equal(a, b) for a, b in zip(one, run(param, grads, lr=0.01)))
 
 
 def test_empty_and_bad_input():
@@ -87,8 +69,6 @@ def test_empty_and_bad_input():
     with pytest.raises(ValueError, match="step must be at least 1"):
         adam_step(a, a.clone(), a.clone(), a.clone(), lr=0.1, step=0)
 
-
-# Dropout: as often as asked, never twice the same, always the same for one seed and step.
 
 COUNT = 20_000
 
@@ -108,38 +88,22 @@ def test_frequencies(device):
         assert abs(dropped - COUNT * chances[0]) < 3.9 * (COUNT * chances.prod()) ** 0.5
 
 
-def test_nothing_is_dropped_at_zero(device):
-    """p = 0 leaves every opacity as it is."""
-    assert bool((factors(device, 0.0) == 1).all())
-
-
-def test_same_seed_and_step_same_factors(device):
-    """Repeatable; another step or seed hides others: about half of what either hides at p = 0.5."""
+def test_factors_follow_from_seed_and_step(device):
+    """Repeatable; another step or seed hides others, neighbours are independent, and p = 0 hides none."""
     first = factors(device, 0.5, 4, 2)
-    assert torch.equal(first, factors(device, 0.5, 4, 2))
+    assert torch.equal(first, factors(device, 0.5, 4, 2)) and bool((factors(device, 0.0) == 1).all())
     for other in (factors(device, 0.5, 5, 2), factors(device, 0.5, 4, 3)):
         assert 0.45 < float((first == other).float().mean()) < 0.55
-
-
-def test_neighbours_are_independent(device):
-    """Neighbouring Gaussians are hidden independently of each other."""
-    hidden = (factors(device, 0.5) == 0).double()
+    hidden = (first == 0).double()
     assert abs(float(torch.corrcoef(torch.stack([hidden[1:], hidden[:-1]]))[0, 1])) < 0.03
+    with pytest.raises(ValueError, match="settings"):
+        opacity_dropout(3, torch.zeros(3), 0)
 
 
 @pytest.mark.cuda
 def test_every_device_draws_the_same():
     """A fit that moves to another device hides the same Gaussians."""
     assert torch.equal(factors("cpu", 0.3, 17), factors("cuda", 0.3, 17).cpu())
-
-
-def test_bad_settings():
-    """Settings of another shape are refused by name."""
-    with pytest.raises(ValueError, match="settings"):
-        opacity_dropout(3, torch.zeros(3), 0)
-
-
-# Opacity decay against opacities in float64.
 
 
 @pytest.mark.parametrize("factor", [0.5, 0.995, 0.999, 1 - 1e-6])
@@ -160,9 +124,6 @@ def test_ends_and_what_is_no_number(device):
     for wrong in (0.0, 1.0, np.nan):
         with pytest.raises(ValueError, match="factor"):
             opacity_decay(found.to(device), wrong)
-
-
-# The bookkeeping of captured steps, against torch.
 
 
 def rows(device, height=5, width=7, views=3, steps=4) -> list[torch.Tensor]:
@@ -216,7 +177,7 @@ def test_settings_stand_in_their_columns():
     assert (row[Setting.RED], row[Setting.GREEN], row[Setting.BLUE]) == row[SHIFT] and len(row) == len(Setting)
 
 
-@pytest.mark.parametrize("size", [(1, 1), (5, 7), (37, 111), (64, 64)])
+@pytest.mark.parametrize("size", [(1, 1), (5, 7), (37, 111)])
 def test_squared_errors_are_those_of_the_clamped_image(device, size):
     """Colours below 0 and above 1, images of part of a task and of several; a NaN stays one."""
     g = torch.Generator().manual_seed(0)
@@ -226,16 +187,3 @@ def test_squared_errors_are_those_of_the_clamped_image(device, size):
     assert found.shape == () and abs(float(found) / float(wanted) - 1) < 1e-6
     rgb[0, 0, 1] = math.nan
     assert math.isnan(squared_error(rgb.to(device), target.to(device)))
-
-
-def test_squared_errors_have_the_same_bits_on_any_number_of_threads():
-    """Tasks do not depend on the number of threads."""
-    rgb, target = torch.rand(2, 64, 128, 3, generator=torch.Generator().manual_seed(0))
-    threads, found = torch.get_num_threads(), set()
-    try:
-        for count in (1, 2, 5):
-            torch.set_num_threads(count)
-            found.add(float(squared_error(rgb, target)))
-    finally:
-        torch.set_num_threads(threads)
-    assert len(found) == 1

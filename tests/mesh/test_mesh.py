@@ -2,7 +2,6 @@
 
 import dataclasses
 import re
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,7 +12,6 @@ from tests.mesh.balls import ALL_SIDES, CENTER, RADIUS, RED, ball, cameras
 from warpgs import rasterize
 from warpgs.app.cli import main
 from warpgs.errors import DataError, ResourceError, UsageError
-from warpgs.kernels.tsdf import DistanceGrid
 from warpgs.mesh import fuse as fusing
 from warpgs.mesh import views
 from warpgs.mesh.fuse import (
@@ -59,25 +57,17 @@ def fused():
     return fuse(ball(), cameras(ALL_SIDES), RENDER, MeshOptions(voxel=0.07))
 
 
-def test_the_ball_is_found(fused):
+def test_the_ball_is_found_in_its_colours(fused):
     """Its vertices lie around the sphere, closer on average than half a voxel, on every side; its inside was not seen."""
     away = fused.mesh.vertices - CENTER
     distances = np.abs(np.linalg.norm(away, axis=1) - RADIUS)
     assert distances.mean() < 0.035 and np.quantile(distances, 0.99) < 0.14
     assert (np.abs(away).max(0) > 0.95).all() and fused.plan.voxel == 0.07 and 0.02 < fused.unseen < 0.5
     assert fused.extracted >= len(fused.mesh.faces) > 500
-
-
-def test_colors_are_those_of_the_renders(fused):
-    """Red on one side and blue on the other."""
     x = fused.mesh.vertices[:, 0] - CENTER[0]
     red = fused.mesh.colors[:, 0] > fused.mesh.colors[:, 2]
     assert (red == (x > 0))[np.abs(x) > 0.15].all()
     assert np.abs(fused.mesh.colors[x > 0.3] - RED).mean() < 0.05
-
-
-def test_a_vertex_that_nobody_sees_has_its_neighbours_colour(fused):
-    """The middle of the ball, and a point far behind every camera."""
     hidden = CENTER + np.array([[0.2, 0, 0], [-99, 0, 0]])
     more = dataclasses.replace(fused.mesh, vertices=np.concatenate([fused.mesh.vertices, hidden]))
     colors, count = vertex_colors(more, SurfaceViews(ball(), cameras(ALL_SIDES), RENDER, "median"), fused.plan.truncation)
@@ -86,7 +76,6 @@ def test_a_vertex_that_nobody_sees_has_its_neighbours_colour(fused):
 
 
 def test_the_back_that_nobody_saw_stays_open():
-    """With cameras on one side alone; and the same bits on another number of threads."""
     found = []
     for threads in (1, 2):
         torch.set_num_threads(threads)
@@ -108,13 +97,10 @@ def test_what_a_view_knows():
     points, footprints = sample_surface(view, 1000)
     assert 200 < len(points) < 1200 and np.abs(np.linalg.norm(points - CENTER, axis=1) - RADIUS).mean() < 0.05
     assert footprints.mean() == pytest.approx(2.7 / (1.4 * 72), rel=0.1)
-    with pytest.raises(UsageError, match="median, mean"):
-        surface_view(ball(), c, RENDER, "mode")
 
 
 @pytest.mark.parametrize("depth", ["median", "mean"])
 def test_cameras_that_see_nothing_are_an_error(depth):
-    """Of a transparent ball and of no Gaussians; also without cameras."""
     options, views = MeshOptions(depth=depth), cameras(ALL_SIDES[:2])
     nothing = Gaussians(*(t[:0] for t in ball().tensors().values()))
     for gaussians in (dataclasses.replace(ball(), logit_opacities=torch.full((3000,), -9.0)), nothing):
@@ -122,17 +108,12 @@ def test_cameras_that_see_nothing_are_an_error(depth):
             fuse(gaussians, views, RENDER, options)
     with pytest.raises(UsageError, match="at least one camera"):
         fuse(ball(), [], RENDER, options)
-
-
-def test_views_that_confirm_no_depth_are_an_error():
-    """Front and back: each sees its own side, and neither confirms the other."""
-    with pytest.raises(DataError, match="no depth of a training view is confirmed by another"):
-        fuse(ball(), cameras(ALL_SIDES[[0, 3]]), RENDER, MeshOptions(voxel=0.07))
+    with pytest.raises(DataError, match="no depth of a training view is confirmed by another"):  # front and back
+        fuse(ball(), cameras(ALL_SIDES[[0, 3]]), RENDER, MeshOptions(voxel=0.07, depth=depth))
 
 
 @pytest.fixture
 def stored(monkeypatch, tmp_path_factory):
-    """A finished run whose scene units are half of its files' units, and elsewhere."""
     views = {f"{i}.png": c for i, c in enumerate(cameras(ALL_SIDES))}
     folder = tmp_path_factory.mktemp("run")
     (folder / METRICS_FILE).touch()
@@ -145,7 +126,6 @@ def stored(monkeypatch, tmp_path_factory):
 
 
 def test_the_command_writes_in_units_of_the_files(stored, tmp_path, capsys):
-    """What was chosen comes first; the voxel is in units of the files, and what no view saw is said."""
     assert main(["mesh", "run", "--out", str(tmp_path / "a.ply"), "--voxel", "0.16", "--device", "cpu"]) == 0
     text = capsys.readouterr().out
     assert text.index("voxel 0.16 in units of the scene's files") < text.index("fusing depth: view 1 of 9")
@@ -165,12 +145,9 @@ def test_upright_where_the_cameras_agree(stored, tmp_path, capsys):
     half = np.diag([-1.0, -1, 1, 1])
     assert common_up([*views, *(dataclasses.replace(c, viewmat=half @ c.viewmat) for c in views)]) is None
     for upside_down in (False, True):
-        kept = {n: c for n, c in stored.scene_cameras.items() if n in stored.train}
-        for i, name in enumerate(kept if upside_down else ()):
-            kept[name] = dataclasses.replace(
-                kept[name], viewmat=np.diag([-1.0, -1, 1, 1] if i % 2 else np.ones(4)) @ kept[name].viewmat
-            )
-        stored.scene_cameras.update(kept)
+        for name in stored.train[1::2] if upside_down else ():
+            c = stored.scene_cameras[name]
+            stored.scene_cameras[name] = dataclasses.replace(c, viewmat=half @ c.viewmat)
         assert main(["mesh", "run", "--out", str(tmp_path / "a.glb"), "--resolution", "24", "--device", "cpu"]) == 0
         assert ("may be tilted in a viewer" in capsys.readouterr().out) == upside_down
 
@@ -180,13 +157,10 @@ def test_upright_where_the_cameras_agree(stored, tmp_path, capsys):
     [
         (["--out", "a.obj"], r"format \.obj is not supported; use \.ply or \.glb"),
         (["--out", "a.ply", "--max-faces", "3"], "--max-faces must be at least 4"),
-        (["--out", "a.ply", "--voxel", "-1"], "--voxel must be a number above 0, not -1"),
-        (["--out", "a.ply", "--voxel", "1e-9"], "--voxel must be at least a millionth of the longest side of the scene"),
         (["--out", "a.ply", "--depth", "mode"], "median, mean"),
     ],
 )
 def test_flags_that_cannot_be_honoured(stored, tmp_path, monkeypatch, capsys, words, message):
-    """One sentence, exit code 2, and no file."""
     monkeypatch.chdir(tmp_path)
     assert main(["mesh", "run", *words, "--device", "cpu"]) == 2
     error = capsys.readouterr().err
@@ -194,28 +168,17 @@ def test_flags_that_cannot_be_honoured(stored, tmp_path, monkeypatch, capsys, wo
     assert not [p for p in tmp_path.iterdir() if not p.name.startswith(".")]
 
 
-# The grid holds the surfaces, leaves far ones out, and is refused before it is made where memory does not hold it.
-
 CPU = torch.device("cpu")
 
 
 def points(count=20_000):
-    """Return a box of points with a few per cent a hundred times as far away."""
     rng = np.random.default_rng(0)
     x = rng.uniform((-1, 0, 2), (1, 0.5, 6), (count, 3))
     x[: count // 50] *= 100
     return x
 
 
-def test_the_box_cuts_what_is_far_behind():
-    """Outliers go, and no more than a two-hundredth of the rest."""
-    low, high = find_box(points())
-    assert (low > [-3.6, -0.1, 1.9]).all() and (low <= [-0.98, 0.01, 2.04]).all()
-    assert (high < [3.6, 1.2, 11.2]).all() and (high >= [0.98, 0.49, 5.9]).all()
-
-
 def test_a_voxel_is_what_is_asked_for():
-    """By its side, by their number, or by default no smaller than half of what a pixel shows."""
     x, pixel = points(), np.full(20_000, 1e-4)
     longest = float(np.ptp(find_box(x), axis=0).max())
     assert plan_grid(x, pixel, voxel=0.05).voxel == 0.05
@@ -226,6 +189,8 @@ def test_a_voxel_is_what_is_asked_for():
     low, high = find_box(x)
     assert (low - first >= 4 * 0.05 - 1e-9).all() and (last - high >= 4 * 0.05 - 1e-9).all()
     assert plan.points == np.prod(plan.shape) and 0.97 < plan.inside < 1 and plan.truncation == 0.2
+    assert (low > [-3.6, -0.1, 1.9]).all() and (low <= [-0.98, 0.01, 2.04]).all()
+    assert (high < [3.6, 1.2, 11.2]).all() and (high >= [0.98, 0.49, 5.9]).all()
 
 
 @pytest.mark.parametrize(
@@ -240,13 +205,7 @@ def test_what_makes_no_grid_is_refused(options, words):
         plan_grid(points(), np.full(20_000, 1e-4), MeshOptions(**options).voxel)
 
 
-def test_grid_no_surface_is_said():
-    with pytest.raises(DataError, match="no training view shows a surface"):
-        plan_grid(np.zeros((0, 3)), np.zeros(0))
-
-
 def test_a_grid_that_does_not_fit_is_refused(monkeypatch):
-    """Before anything is allocated; the message has both sizes and the remedy."""
     plan = GridPlan((0, 0, 0), 1.0, (1000, 1000, 100), 1.0)
     monkeypatch.setattr(fusing, "available_bytes", lambda _: 3 * 10**9)
     assert check_memory(plan, CPU) == "2.0 GiB"
@@ -258,8 +217,6 @@ def test_a_grid_that_does_not_fit_is_refused(monkeypatch):
         check_memory(GridPlan((0, 0, 0), 1.0, (1300, 1300, 1300), 1.0), CPU)
 
 
-# Triangles of grids whose surface is known: where they are, which way they face, where the mesh stays open.
-
 ORIGIN, VOXEL = (-1.5, -1.4, -1.6), 0.1
 
 
@@ -268,7 +225,7 @@ def grid_of(distance, seen=None, shape=(31, 29, 33)):
     x = np.array(ORIGIN) + VOXEL * np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), -1)
     weights = np.ones(shape) if seen is None else seen(x).astype(float)
     values = np.clip(distance(x) / (4 * VOXEL), -1, 1)
-    return DistanceGrid(ORIGIN, VOXEL, 4 * VOXEL, torch.tensor(values).float(), torch.tensor(weights).float())
+    return GridPlan(ORIGIN, VOXEL, shape, 1.0), torch.tensor(values).float(), torch.tensor(weights).float()
 
 
 def sphere(x):
@@ -283,7 +240,7 @@ def areas_and_normals(mesh: Mesh):
 
 def test_a_sphere_is_closed_and_faces_outwards():
     """Vertices a hundredth of a voxel from the surface, its area and volume, one part, every edge of two triangles."""
-    mesh = extract(grid_of(sphere))
+    mesh = extract(*grid_of(sphere))
     assert np.abs(np.linalg.norm(mesh.vertices, axis=1) - 1).max() < 0.02 * VOXEL
     area, normals, middles = areas_and_normals(mesh)
     assert area.sum() == pytest.approx(4 * np.pi, rel=0.01)
@@ -294,24 +251,24 @@ def test_a_sphere_is_closed_and_faces_outwards():
 
 
 def test_what_was_not_seen_stays_open():
-    """No triangle reaches into the unseen half, and none closes it."""
-    mesh = extract(grid_of(sphere, lambda x: x[..., 0] < 0.33))
+    mesh = extract(*grid_of(sphere, lambda x: x[..., 0] < 0.33))
     assert 0.2 < mesh.vertices[:, 0].max() < 0.33
     _, normals, middles = areas_and_normals(mesh)
     assert ((normals * middles).sum(1) > 0).all()  # a lid would face another way than outwards
     assert len(np.unique(mesh.faces)) == len(mesh.vertices)
+    for limit in (9, 1.2):  # nothing seen at all, and nothing but emptiness
+        with pytest.raises(DataError, match="no surface inside the grid"):
+            extract(*grid_of(sphere, lambda x, limit=limit: x[..., 0] > limit))
 
 
 def test_no_skirt_between_two_surfaces():
-    """Where distance jumps from before a surface to behind another, no triangles connect the two."""
-    mesh = extract(grid_of(lambda x: np.where(x[..., 0] < 0.05, x[..., 2] + 0.53, x[..., 2] - 0.53)))
+    mesh = extract(*grid_of(lambda x: np.where(x[..., 0] < 0.05, x[..., 2] + 0.53, x[..., 2] - 0.53)))
     assert (np.abs(np.abs(mesh.vertices[:, 2]) - 0.53) < 1.2 * VOXEL).all() and parts(mesh)[0] == 2
 
 
 def test_small_parts_go():
-    """A speck beside a sphere; the sphere stays as it is."""
-    alone = extract(grid_of(sphere))
-    both = extract(grid_of(lambda x: np.minimum(sphere(x), np.linalg.norm(x - [1.2, 1.1, 1.3], axis=-1) - 0.12)))
+    alone = extract(*grid_of(sphere))
+    both = extract(*grid_of(lambda x: np.minimum(sphere(x), np.linalg.norm(x - [1.2, 1.1, 1.3], axis=-1) - 0.12)))
     assert parts(both)[0] == 2
     mesh, removed = remove_small_parts(both, 0.05)
     assert removed == 1 and len(mesh.faces) == len(alone.faces) and np.allclose(mesh.vertices, alone.vertices)
@@ -321,7 +278,7 @@ def test_small_parts_go():
 
 def test_fewer_triangles_of_the_same_surface():
     """A fifth of them, at most a tenth of a voxel off, with the same open edge; the same bits twice; few stay as they are."""
-    mesh = extract(grid_of(sphere, lambda x: x[..., 0] < 0.33))
+    mesh = extract(*grid_of(sphere, lambda x: x[..., 0] < 0.33))
     fewer = decimate(mesh, len(mesh.faces) // 5)
     assert 0.15 * len(mesh.faces) < len(fewer.faces) <= 0.2 * len(mesh.faces) + 1
     assert np.abs(np.linalg.norm(fewer.vertices, axis=1) - 1).max() < 0.1 * VOXEL
@@ -332,90 +289,62 @@ def test_fewer_triangles_of_the_same_surface():
     assert np.array_equal(fewer.vertices, decimate(mesh, len(mesh.faces) // 5).vertices)
 
 
-@pytest.mark.parametrize("seen", [lambda x: x[..., 0] > 9, lambda x: x[..., 0] > 1.2])
-def test_triangles_no_surface_is_said(seen):
-    """Nothing seen at all, and nothing but emptiness."""
-    with pytest.raises(DataError, match="no surface inside the grid"):
-        extract(grid_of(sphere, seen))
-
-
-# Depth that one view alone shows is kept where no other view looks, and left out where another one sees something else.
-
 WIDTH, HEIGHT = 48, 32
 K = np.array([[40.0, 0, 24], [0, 40, 16], [0, 0, 1]])
 
 
 def wall(x: float, depth: float = 4.0) -> SurfaceView:
-    """Return what a camera at x sees of a wall across its axis."""
     viewmat = np.eye(4)
     viewmat[0, 3] = -x
     z = torch.full((HEIGHT, WIDTH), depth)
     return SurfaceView(Camera(viewmat, K, WIDTH, HEIGHT), z, torch.ones_like(z), torch.zeros(HEIGHT, WIDTH, 3))
 
 
-def test_depth_that_another_view_confirms_stays():
-    """Depths within 2 % are confirmed, and empty pixels stay empty."""
+def test_depth_stays_where_another_view_confirms_it_or_none_looks():
     view = wall(0.0)
     view.depth[:4] = torch.inf
     for depth, kept in ((4.0, True), (4.07, True), (4.09, False), (3.9, False)):
         found = agreed(view, [depth_map(wall(0.5, depth), 2)])
         assert bool((found.depth[4:, 8:] > 0).all()) == kept and bool((found.weights[4:, 8:] > 0).all()) == kept
         assert torch.equal(found.depth[:4], view.depth[:4]) and torch.equal(found.weights[:4], view.weights[:4])
-
-
-def test_one_of_several_confirms():
-    """One view that agrees is enough; where only the other one looks, the depth goes."""
     found = agreed(wall(0.0), [depth_map(wall(x, d), 3) for x, d in ((0.5, 6.0), (-0.5, 4.0))])
     assert bool((found.depth[:, :40] == 4).all()) and not bool(found.depth[:, -3:].any())
-
-
-def test_what_no_other_view_looks_at_stays():
-    """Nothing speaks against a depth outside of all other images, before empty pixels, and with one view alone."""
     view = wall(0.0)
     found = agreed(view, [depth_map(wall(2.4, 9.0), 2)])
     beside = round(40 * 2.4 / 4)  # the columns that the other image shows begin here
     assert bool((found.depth[:, : beside - 1] == 4).all()) and not bool(found.depth[:, beside:].any())
-    empty = replace(wall(0.5), depth=torch.zeros(HEIGHT, WIDTH))
+    empty = dataclasses.replace(wall(0.5), depth=torch.zeros(HEIGHT, WIDTH))
     for others in ([], [depth_map(empty, 2)]):
         assert torch.equal(agreed(view, others).depth, view.depth)
+    sky = dataclasses.replace(wall(0.5), depth=torch.full((HEIGHT, WIDTH), torch.inf))
+    maps = [depth_map(v, 2) for v in (wall(0.0), sky)]
+    assert neighbours(maps) == [[1], [0]] and torch.equal(agreed(wall(0.0), maps[1:]).depth, wall(0.0).depth)
+    assert torch.equal(agreed(sky, maps[:1]).depth, sky.depth) and maps[1][3] == pytest.approx((1.0, 1.01))
 
 
 def test_thinned_maps_say_the_same(monkeypatch):
-    """Keep every third depth of every third row of a slanted wall."""
     view, other = wall(0.0), wall(0.3)
     for v in (view, other):
         x = (torch.arange(WIDTH) + 0.5 - 24) / 40
         v.depth[:] = (4 + 0.1 * float(v.camera.center[0])) / (1 - 0.1 * x)  # z = 4 + x / 10
     monkeypatch.setattr(views, "MAX_PIXELS", 2 * WIDTH * HEIGHT / 7)
     thin = depth_map(other, 2)
-    assert thin.step == 3 and thin.depth.shape == (11, 16) and torch.equal(thin.depth, other.depth[1::3, 1::3])
+    assert thin[2] == 3 and thin[1].shape == (11, 16) and torch.equal(thin[1], other.depth[1::3, 1::3])
     assert torch.equal(agreed(view, [thin]).depth, view.depth)
-    assert not bool(agreed(replace(view, depth=view.depth * 1.1), [thin]).depth[:, 8:].any())
+    assert not bool(agreed(dataclasses.replace(view, depth=view.depth * 1.1), [thin]).depth[:, 8:].any())
 
 
 def test_neighbours_share_sight(monkeypatch):
-    """The nearest views with another angle come first, at most so many."""
     maps = [depth_map(wall(x), 5) for x in (0.0, 0.5, 1.0, 1.5, 90.0)]
     monkeypatch.setattr(views, "NEIGHBOURS", 2)
     assert neighbours(maps)[0] == [1, 2] and sorted(neighbours(maps)[2]) == [1, 3]
     assert neighbours(maps[:1]) == [[]]
 
 
-def test_a_view_without_a_surface():
-    """Sky alone confirms nothing and questions nothing."""
-    sky = replace(wall(0.5), depth=torch.full((HEIGHT, WIDTH), torch.inf))
-    maps = [depth_map(v, 2) for v in (wall(0.0), sky)]
-    assert neighbours(maps) == [[1], [0]] and torch.equal(agreed(wall(0.0), maps[1:]).depth, wall(0.0).depth)
-    assert torch.equal(agreed(sky, maps[:1]).depth, sky.depth) and maps[1].bounds == pytest.approx((1.0, 1.01))
-
-
-# Depth along each ray is that of the densest points, and it is known where most of the weights agree.
-
 FRONT = Camera(np.eye(4), K, 48, 32)
 
 
 def layer(depth: float, slope: float = 0.0, opacity: float = 3.0, spacing: float = 0.3) -> Gaussians:
-    """Return flat wide Gaussians on the plane z = depth + slope x, across the whole image."""
     x, y = (a.ravel() for a in np.meshgrid(np.arange(-6, 6, spacing), np.arange(-4, 4, spacing)))
     turn = -np.arctan(slope) / 2  # about the y axis
     quat = torch.tensor([np.cos(turn), 0.0, np.sin(turn), 0.0])
@@ -433,7 +362,6 @@ def joined(*parts: Gaussians) -> Gaussians:
 
 
 def test_the_densest_point_of_a_ray():
-    """Against the largest density of many points along it, of Gaussians of all shapes, before a turned camera."""
     gaussians, cam = cloud(40, torch.float64, "cpu"), camera(8, 6, cameras=2, dtype=torch.float64)
     one = Camera(cam.viewmat[1].numpy(), cam.K[1].numpy(), 8, 6)
     rays = torch.tensor([[0.1, -0.2, 1.0], [0.0, 0.3, 1.0]], dtype=torch.float64)
@@ -454,7 +382,6 @@ def test_the_densest_point_of_a_ray():
 
 
 def test_the_median_by_weight():
-    """The order of the depths does not matter, and those without weight do not count."""
     depths = torch.tensor([[3.0, 1.0, 2.0, 0.1], [5.0, 4.0, 9.0, 9.0], [7.0, 7.0, 7.0, 7.0]])
     weights = torch.tensor([[0.2, 0.2, 0.3, 0.0], [0.3, 0.2, 0.0, 0.0], [0.0, 0.0, 0.0, 0.0]])
     assert weighted_median(depths, weights).tolist() == [2.0, 5.0, 7.0]

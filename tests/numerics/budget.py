@@ -16,10 +16,6 @@ from warpgs.render.options import RasterizeOptions
 from warpgs.render.rasterize import rasterize
 from warpgs.scene import Camera, Gaussians
 
-# Where float32 may rightly decide otherwise than float64: pixels with a Gaussian within rounding of a threshold.
-#
-# Derivation of every closeness: docs/numerics.md. A pixel outside these bands has no excuse.
-
 EPS = 2.0**-23
 """Spacing of float32 at 1."""
 
@@ -124,12 +120,6 @@ def band(inputs: Inputs, frame: Frame, rule: Rule, tile_size: int = 16) -> Band:
     reasons = {n: torch.cat(v).view(shape) for n, v in flags.items()}
     return Band(reasons, torch.cat(jumps).view(shape), most, largest, float(projected.depths.max()))
 
-
-# The error of the kernels split in two: arithmetic E = |kernel - R64c| and approximation A = |R64c - R64|.
-#
-# Gradients are those of one random mix of colour, alpha and depth, with nothing asked of pixels in a band: there a
-# Gaussian may rightly be drawn in one program and not in the other, so everything else can be compared without
-# exemptions.
 
 IMAGES = Images._fields
 GRADIENTS = Inputs._fields
@@ -242,9 +232,6 @@ def gradient_errors(s: Split, name: str) -> dict[str, float]:
         found |= {"A max": float(a.max()) / largest, "A mean": float(a.mean()) / largest}
     return found
 
-
-# Which lines of the error budget a split breaks; the limits stand in tests/tolerances.py, the reasons in
-# docs/numerics.md.
 
 SLOPE = {"rgb": 0.5**0.5 * math.exp(-0.5), "alpha": 0.5**0.5 * math.exp(-0.5), "depth": 0.5 * 0.5**0.5 * 3.33}
 """What half an ulp in both coordinates of a mean does to a picture, per ulp and per 1/sigma; c in docs/numerics.md."""

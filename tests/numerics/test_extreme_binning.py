@@ -7,13 +7,12 @@ import numpy as np
 import pytest
 import torch
 
-from tests.gaussians import SMOOTH, camera, cloud, leaves
+from tests.gaussians import camera, cloud, leaves
 from warpgs.constants import RULES
 from warpgs.errors import ResourceError
 from warpgs.kernels import launch
 from warpgs.kernels.project import project
 from warpgs.kernels.tiles import InstanceMemory, bin_tiles
-from warpgs.render.options import RasterizeOptions
 from warpgs.render.rasterize import rasterize
 from warpgs.scene import Camera, Gaussians
 
@@ -51,9 +50,6 @@ def binned(gaussians: Gaussians, cam: Camera, rule=EXACT, tile_size: int = 16, *
     return projected, counts, bin_tiles(projected, counts, **size, **options)
 
 
-# B1: counts of more than 32 bits
-
-
 def test_counts_beyond_the_packed_sum_are_told_exactly(device):
     """140,000 Gaussians over all tiles of an 8K picture are more than 2^36 instances, and 2^36 is what counts as a Gaussian.
 
@@ -63,13 +59,6 @@ def test_counts_beyond_the_packed_sum_are_told_exactly(device):
     counts = torch.full((1, 140_000), 518_400, dtype=torch.int32, device=device)
     with pytest.raises(ResourceError, match=r"140,000 visible .* 518400 of 518400 tiles .* 72,576,000,000"):
         bin_tiles(projected, counts, width=7680, height=4320, tile_size=8, rule=EXACT)
-
-
-def test_full_screen_gaussians_at_4k_are_counted(device):
-    """3000 Gaussians over the whole picture: 97 million instances, 4.6 GiB by the budget's reckoning, and refused beyond it."""
-    gaussians = spots([(1920.0, 1080.0)] * 3000, 4000.0, device)
-    with pytest.raises(ResourceError, match=r"3,000 visible .* 32400 of 32400 tiles .* 97,200,000"):
-        binned(gaussians, plain(3840, 2160, device), memory=InstanceMemory(2**30))
 
 
 @pytest.mark.slow
@@ -88,9 +77,10 @@ def test_sizes_beyond_32_bits_are_refused(device):
     """An axis, a launch and a number of tiles that would wrap around are errors that say what to do."""
     huge = torch.zeros(1, device=device).expand(2**31)
     with pytest.raises(ResourceError, match=r"2,147,483,648 entries .* fewer Gaussians"):
-        launch.view(huge, torch.float32).array()
+        launch.as_array(huge, None, 1)
     with pytest.raises(ResourceError, match=r"2,147,483,648 entries"):
         launch.launch(None, 2**31, [], device)
+    launch._check_size(2**31 - 1)
     projected, counts = torch.zeros(1, 0, 12, device=device), torch.zeros(1, 0, dtype=torch.int32, device=device)
     with pytest.raises(ResourceError, match=r"2,147,483,648 tiles of 8 px.* fewer cameras"):
         bin_tiles(projected, counts, width=8 * 2**16, height=8 * 2**15, tile_size=8, rule=EXACT)
@@ -101,18 +91,16 @@ def test_a_refused_size_leaves_a_recorded_launch_as_it_was():
     recorded, packed = launch._Recorded.__new__(launch._Recorded), SimpleNamespace(ndim=1, data=0, shape=[0])
     recorded.command = SimpleNamespace(bounds=SimpleNamespace(size=1), params=[None, None, packed], set_dim=lambda _: None)
     recorded.known, recorded.dtypes, recorded.device = [None], [torch.float32], SimpleNamespace(is_cuda=False)
+    recorded.declared = [(None, 1)]
     small, other = torch.zeros(5), torch.zeros(6)
-    recorded._patch(1, [launch.view(small, None)])
+    recorded._patch(1, [small])
     with pytest.raises(ResourceError, match="2,147,483,648 entries"):
-        recorded._patch(1, [launch.view(other[:1].expand(2**31), None)])
-    recorded._patch(1, [launch.view(small, None)])
+        recorded._patch(1, [other[:1].expand(2**31)])
+    recorded._patch(1, [small])
     assert packed.data == small.data_ptr() and packed.shape == [5]
 
 
-# B2: numbers of tiles around powers of two
-
-
-@pytest.mark.parametrize("tiles", [1, 2, 3, 4, 5, 127, 128, 129, 255, 256, 257])
+@pytest.mark.parametrize("tiles", [1, 2, 3, 127, 128, 129, 257])
 def test_tile_numbers_of_every_bit_length(device, tiles):
     """A row of tiles, one Gaussian in each: each tile lists its own, the first and the last tile too."""
     gaussians = spots([(8.0 + 16 * i, 8.0) for i in range(tiles)], 1.0, device)
@@ -120,21 +108,6 @@ def test_tile_numbers_of_every_bit_length(device, tiles):
     assert bool((counts == 1).all())
     assert torch.equal(lists.gaussian_ids.cpu(), torch.arange(tiles, dtype=torch.int32))
     assert lists.ranges.tolist() == [[i, i + 1] for i in range(tiles)]
-
-
-@pytest.mark.parametrize("cameras", [3, 4, 5])
-def test_cameras_times_tiles_of_every_bit_length(device, cameras):
-    """C cameras of 5 tiles: each camera's tile lists that camera's copy."""
-    gaussians = spots([(8.0 + 16 * i, 8.0) for i in range(5)], 1.0, device)
-    cam = plain(80, 16, device)
-    size = {"width": 80, "height": 16, "rule": EXACT}
-    many = cam.viewmat.expand(cameras, 4, 4), cam.K.expand(cameras, 3, 3)
-    projected, counts = project(*gaussians.tensors().values(), *many, degree=0, **size)
-    lists = bin_tiles(projected, counts, **size)
-    assert torch.equal(lists.gaussian_ids.cpu(), torch.arange(5 * cameras, dtype=torch.int32))
-
-
-# B3 and B4: order
 
 
 def test_depths_are_sorted_as_numpy_sorts_them(device, dtype):
@@ -153,29 +126,13 @@ def test_depths_are_sorted_as_numpy_sorts_them(device, dtype):
     assert np.array_equal(lists.gaussian_ids.cpu().numpy(), np.argsort(depths.cpu().numpy(), kind="stable"))
 
 
-def test_coplanar_gaussians_keep_their_order_100_times(device):
-    """1000 Gaussians at one depth: by number in every tile, and the same bits of pictures in 100 runs."""
-    gaussians, cam = cloud(1000, device=device), camera(64, 48, dtype=torch.float32, device=device)
+def test_coplanar_gaussians_keep_their_order(device):
+    """1000 Gaussians at one depth: by number in every tile."""
+    gaussians, cam = cloud(1000, device=device, degree=0), camera(64, 48, dtype=torch.float32, device=device)
     gaussians.means[:, 2] = 4.0
-    _, _, lists = binned(dataclasses.replace(gaussians, sh=gaussians.sh[:, :1]), cam)
+    _, _, lists = binned(gaussians, cam)
     for begin, end in lists.ranges.tolist():
         assert bool((lists.gaussian_ids[begin:end].diff() > 0).all())
-    first = rasterize(gaussians, cam)
-    for _ in range(99):
-        again = rasterize(gaussians, cam)
-        assert torch.equal(first.rgb, again.rgb) and torch.equal(first.depth, again.depth)
-
-
-def test_permuting_ties_is_the_order_of_numbers(device):
-    """Which of two coplanar Gaussians lies in front is decided by their numbers alone."""
-    gaussians = spots([(8.0, 8.0)] * 2, 4.0, device)
-    gaussians.sh[0], gaussians.sh[1] = 1.0, -1.0
-    swapped = Gaussians(**{n: t.flip(0) for n, t in gaussians.tensors().items()})
-    light, dark = (float(rasterize(g, plain(16, 16, device)).rgb[8, 8, 0]) for g in (gaussians, swapped))
-    assert light > dark + 0.3
-
-
-# B5: counted and emitted
 
 
 def test_emitted_equals_counted(device):
@@ -210,9 +167,6 @@ def test_emitted_equals_counted(device):
     assert total > 200_000
 
 
-# B6: few instances
-
-
 def test_a_single_intersection_is_drawn(device):
     """One Gaussian in one tile of a picture of many: first, last, and in between."""
     for at in [(8.0, 8.0), (72.0, 40.0), (40.0, 24.0)]:
@@ -224,22 +178,6 @@ def test_a_single_intersection_is_drawn(device):
         rows, columns = torch.nonzero(image.alpha.detach() > 0, as_tuple=True)
         assert bool((rows // 16 == at[1] // 16).all()) and bool((columns // 16 == at[0] // 16).all())
         image.rgb.sum().backward()
-
-
-def test_three_gaussians_on_512_pixels(device):
-    """Fewer instances than tiles: every tile has a range, all but two are empty, and the picture is finite."""
-    gaussians = spots([(5.0, 5.0), (7.0, 6.0), (500.0, 505.0)], 1.0, device)
-    _, counts, lists = binned(gaussians, plain(512, 512, device))
-    assert len(lists.ranges) == 1024 and int(counts.sum()) == 3
-    lengths = (lists.ranges[:, 1] - lists.ranges[:, 0]).tolist()
-    assert lengths[0] == 2 and lengths[-1] == 1 and sum(lengths) == 3
-    moving = leaves(gaussians)
-    image = rasterize(moving, plain(512, 512, device))
-    image.rgb.sum().backward()
-    assert bool(torch.isfinite(image.rgb).all()) and all(bool(t.grad.any()) for t in (moving.sh, moving.logit_opacities))
-
-
-# B7: very many cameras
 
 
 def test_70_000_cameras_of_one_pixel(device):
@@ -258,9 +196,7 @@ def test_70_000_cameras_of_one_pixel(device):
     assert len(batch.alpha.unique()) > 1000
 
 
-# B9: sizes
-
-SIZES = [(1, 1), (1, 17), (17, 1), (15, 15), (16, 16), (17, 17), (33, 47), (97, 129), (257, 257), (1, 8192), (8192, 1)]
+SIZES = [(1, 1), (1, 17), (16, 16), (33, 47), (257, 257), (1, 8192), (8192, 1)]
 
 
 @pytest.mark.parametrize(("width", "height"), SIZES)
@@ -279,14 +215,3 @@ def test_pictures_of_any_size_are_crops_of_a_larger_one(device, width, height):
     assert float(small.alpha.max()) > 0.1
     for name in ("rgb", "alpha", "depth"):
         assert torch.equal(getattr(small, name), getattr(whole, name)[:height, :width]), name
-
-
-def test_a_long_thin_picture_in_every_part(device):
-    """1 x 8192: Gaussians in its first and its last tile are drawn there, gradients too; also without any cut."""
-    gaussians = spots([(0.5, 4.0), (0.5, 8190.0)], 2.0, device)
-    for rule in (EXACT, dataclasses.replace(SMOOTH, low_pass=0.3)):
-        moving = leaves(gaussians)
-        image = rasterize(moving, plain(1, 8192, device), RasterizeOptions(rule=rule))
-        assert float(image.alpha.detach()[3:5].min()) > 0.5 and float(image.alpha.detach()[8189:8191].min()) > 0.5
-        image.rgb.sum().backward()
-        assert bool((moving.logit_opacities.grad != 0).all())

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from tests.gaussians import camera, cloud
-from tests.numerics.fuzz import REFERENCE_LIMIT, fuzz, load, save
+from tests.numerics.fuzz import REFERENCE_LIMIT, fuzz
 from tests.numerics.poison import SLOTS, VALUES, Case, failures, make_case, non_finite, reference_error
 from warpgs.scene import Gaussians
 
@@ -49,18 +49,13 @@ def test_finite_extremes_equal_float64(device):
     assert drawn > 100
 
 
-def test_a_failure_can_be_replayed(tmp_path, monkeypatch, capsys):
-    """A broken scene is kept, counted, and reads back as it was; the last line says how many there were."""
+def test_a_failure_is_counted_and_named(monkeypatch, capsys):
+    """The line of a broken scene has the call that makes it again; the last line says how many there were."""
     monkeypatch.setattr("tests.numerics.fuzz.failures", lambda case, device: (["all of it"], 0))
     monkeypatch.setattr("tests.numerics.fuzz.reference_error", lambda *_: (0.0, 0, 0))
-    assert fuzz("cpu", 1, 5, 100, tmp_path) == 1
+    assert fuzz("cpu", 1, 5, 100) == 1
     out = capsys.readouterr().out
-    assert "all of it" in out and out.splitlines()[-1].startswith("1 failures in ")
-    case, kept = make_case(5, 0, 100), load(tmp_path / "fuzz-5-0.safetensors")
-    for a, b in zip(case.gaussians.tensors().values(), kept.gaussians.tensors().values()):
-        assert torch.equal(a.view(torch.int32), b.view(torch.int32))
-    assert kept.rule == case.rule and kept.camera.width == case.camera.width
-    save(kept, tmp_path / "again.safetensors", [])
+    assert "make_case(5, 0, 100)" in out and out.splitlines()[-1].startswith("1 failures in ")
 
 
 def test_the_fuzz_sees_a_gaussian_that_is_painted():

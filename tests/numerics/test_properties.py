@@ -124,11 +124,13 @@ def gray(gaussians: Gaussians, colors: torch.Tensor) -> Gaussians:
 @few
 @given(scenes(), RULE_NAMES)
 def test_order_of_the_gaussians_does_not_show(device, scene, rule):
-    """Distinct depths: the same bits of the picture, and of each Gaussian's gradient."""
+    """Distinct depths: the same bits of the picture, and of each Gaussian's gradient; tiles show under `inria` alone."""
     gaussians, cam = build(scene, device)
     options = RasterizeOptions(rule=rule)
     order = torch.randperm(len(gaussians), generator=torch.Generator().manual_seed(scene[0])).to(device)
     assert same(rasterize(gaussians, cam, options), rasterize(rows(gaussians, order), cam, options))
+    small = rasterize(gaussians, cam, RasterizeOptions(rule=rule, tile_size=8))
+    assert rule == "inria" or same(rasterize(gaussians, cam, options), small)
     before, after = gradients(gaussians, cam, options), gradients(rows(gaussians, order), cam, options)
     assert all(torch.equal(before[n][order], after[n]) for n in before)
 
@@ -263,15 +265,6 @@ def test_gradients_know_that_the_world_may_move(device, dtype, scene):
 
 
 @few
-@given(scenes(300), st.sampled_from(["exact", "gsplat-1.5"]))
-def test_tiles_do_not_show(device, scene, rule):
-    """Tiles of 8 and of 16 px: the same bits."""
-    gaussians, cam = build(scene, device)
-    a, b = (rasterize(gaussians, cam, RasterizeOptions(rule=rule, tile_size=side)) for side in (8, 16))
-    assert same(a, b)
-
-
-@few
 @given(scenes(), RULE_NAMES, st.integers(1, 4))
 def test_a_batch_is_its_cameras(device, scene, rule, cameras):
     """C cameras at once or one after the other: the same bits of pictures, the same gradients but for the last sum."""
@@ -338,25 +331,6 @@ def test_the_picture_is_linear_in_colours(device, scene, rule, k):
 
 
 @few
-@given(scenes(), RULE_NAMES)
-def test_the_picture_is_affine_in_the_background(device, scene, rule):
-    """Its slope is what is left of the light, and so is the background's gradient."""
-    gaussians, cam = build(scene, device, cameras=1)
-    paint = painted(gaussians, cam, rule)
-    generator = torch.Generator().manual_seed(scene[0])
-    colors = torch.rand(len(gaussians), 3, generator=generator).to(device)
-    behind = torch.rand(3, generator=generator).to(device).requires_grad_()
-    on_black, alpha = paint(colors, torch.zeros(3, device=device))
-    image = paint(colors, behind)[0]
-    slope = 1 - alpha[..., None]
-    gap = (image - (on_black + slope * behind)).detach()
-    assert float(gap.abs().max()) <= 4 * torch.finfo(F32).eps  # measured 0.5
-    weights = torch.rand(image.shape, generator=generator).to(device)
-    v = torch.autograd.grad((image * weights).sum(), behind)[0]
-    assert torch.allclose(v, (slope * weights).sum((0, 1, 2)), rtol=1e-5, atol=1e-5)
-
-
-@few
 @given(scenes(300), st.data())
 def test_more_opacity_is_more_alpha(device, scene, data):
     """Under `exact`, raising one opacity lowers accumulated alpha nowhere by more than the stop, 1e-4."""
@@ -413,22 +387,3 @@ def test_a_mirrored_world_is_a_mirrored_picture(device, dtype, scene):
     a, b = rasterize(gaussians, cam, options), rasterize(mirrored, dataclasses.replace(cam, K=K), options)
     flipped = dataclasses.replace(b, rgb=b.rgb.flip(2), alpha=b.alpha.flip(2), depth=b.depth.flip(2))
     close_pictures("mirror", flipped, a, sensitivity(gaussians, cam, "means", gaussians.means.norm(dim=1)), len(gaussians))
-
-
-@few
-@given(scenes(300), RULE_NAMES)
-def test_colour_gradients_do_not_depend_on_colours(device, scene, rule):
-    """The same bits for any two sets of positive colours, and zero where a Gaussian has no weight."""
-    gaussians, cam = build(scene, device)
-    options = RasterizeOptions(rule=rule, contributions=True)
-    generator = torch.Generator().manual_seed(scene[0])
-    found = []
-    for _ in range(2):
-        colors = 0.05 + torch.rand(len(gaussians), 3, generator=generator).to(device)
-        moving = leaves(gray(gaussians, colors))
-        render = rasterize(moving, cam, options)
-        loss = (render.rgb * upstream(render)[..., :3]).sum()
-        found.append(torch.autograd.grad(loss, moving.sh)[0])
-    assert torch.equal(*found)
-    unseen = (render.weight_sums == 0).all(0)
-    assert not bool(found[0][unseen].any())

@@ -1,6 +1,7 @@
 """Films of a model: paths of cameras, keyframes, choices that are said, and the files that are asked for."""
 
 import dataclasses
+import itertools
 import json
 import math
 
@@ -14,7 +15,7 @@ import warpgs
 from tests.scenes import ring, three_gaussians
 from warpgs.errors import DataError, UsageError
 from warpgs.geometry import look_at, project_points
-from warpgs.pipeline.films.film import FilmPlan, FilmSettings, FrameCheck, plan_film, render_film
+from warpgs.pipeline.films.film import FilmPlan, FilmSettings, fault_notes, fault_of, plan_film, render_film
 from warpgs.pipeline.films.paths import (
     BY_KIND,
     Keyframe,
@@ -77,46 +78,31 @@ def test_keyframes_of_a_viewer_give_back_its_cameras(model, tmp_path):
         (lambda k: [], "holds 0 keyframes"),
         (lambda k: [{**k, "c2w": np.diag([1.0, 1, 2, 1]).tolist()}], "keyframe 0 must be a rigid"),
         (lambda k: [{**k, "c2w": np.diag([1.0, 1, -1, 1]).tolist()}], "keyframe 0 must be a rigid"),
-        (lambda k: [{**k, "c2w": np.zeros((4, 4)).tolist()}], "keyframe 0 must be a rigid"),
         (lambda k: [{**k, "c2w": (1e200 * np.ones((4, 4))).tolist()}], "keyframe 0 must be a rigid"),
         (lambda k: [{**k, "c2w": [[1, 0], [0, 1]]}], "c2w"),
         (lambda k: [{**k, "c2w": [[math.nan] * 4] * 4}], "c2w"),
         (lambda k: [{**k, "fov_y": 50}], "give radians"),
         (lambda k: [{**k, "fov_y": 0}], "fov_y"),
-        (lambda k: [{**k, "seconds": "1"}], "seconds"),
         (lambda k: [k, {**k, "seconds": 5e-324}], "keyframe 1 must be 0.001 to 86400 above those of keyframe 0"),
-        (lambda k: [k, {**k, "seconds": 1e300}], "keyframe 1 must be 0.001 to 86400 above those of keyframe 0"),
-        (lambda k: [k, k], "keyframe 1 must be 0.001 to 86400 above those of keyframe 0"),
+        (lambda k: [k, {**k, "seconds": 1e300}], "keyframe 1 must be 0.001 to 86400"),
         (lambda k: [k] * 10_001, "1 to 10,000"),
         (lambda k: [{"c2w": k["c2w"], "fov_y": 1.0}], "seconds is missing"),
+        (None, "no such file; give a .json file of keyframes"),
+        (lambda k: "{", "cannot be read as keyframes"),
+        (lambda k: "[" * 100_000, "cannot be read as keyframes"),
     ],
 )
 def test_keyframes_that_are_none_are_refused(model, tmp_path, change, words):
     path = tmp_path / "keys.json"
-    path.write_text(json.dumps(change(keyframe(model, 0, 0.0))))
+    if change is not None:
+        found = change(keyframe(model, 0, 0.0))
+        path.write_text(found if isinstance(found, str) else json.dumps(found))
     with pytest.raises(DataError, match=words):
         read_keyframes(path, model.cameras()["0.png"], UNITS)
 
 
-def test_no_file_of_keyframes(model, tmp_path):
-    for name, text in (("none.json", None), ("a.json", "{"), ("b.json", "[" * 100_000)):
-        if text is not None:
-            (tmp_path / name).write_text(text)
-        words = "no such file; give a .json file of keyframes" if text is None else "cannot be read as keyframes"
-        with pytest.raises(DataError, match=words):
-            read_keyframes(tmp_path / name, model.cameras()["0.png"], UNITS)
-
-
-def test_a_film_through_photographs_of_one_side_names_the_calmer_path(model, monkeypatch):
-    """Where warpgs chose the path, and only there."""
-    monkeypatch.setattr("warpgs.pipeline.films.film.path_of", lambda rig: "interpolate")
-    calmer = "; --path turntable is calmer"
-    named = [plan_film(model, path, FilmSettings()).notes[-1].endswith(calmer) for path in ("auto", "interpolate")]
-    assert named == [True, False]
-
-
-def test_what_was_chosen_is_said(model):
-    """Auto takes what suits the cameras; durations and frames are those asked for."""
+def test_what_was_chosen_is_said(model, monkeypatch):
+    """Auto takes what suits the cameras, and may name a calmer path; durations and frames are those asked for."""
     plan = plan_film(model, "auto", FilmSettings(frames=4))
     assert len(plan.cameras) == 4 and plan.notes[1:] == ["path: spiral"]
     assert plan.notes[0].startswith("5 cameras on one side of the scene, over 6")
@@ -126,6 +112,9 @@ def test_what_was_chosen_is_said(model):
     plan = plan_film(model, "interpolate", FilmSettings(frames=13))
     assert plan.notes[-1].startswith("path: interpolate, through 3 of 5 cameras in the given order")
     assert [n for n, _ in plan_film(model, "views", FilmSettings()).cameras] == [f"{i}" for i in range(5)]
+    monkeypatch.setattr("warpgs.pipeline.films.film.path_of", lambda rig: "interpolate")
+    named = [plan_film(model, path, FilmSettings()).notes[-1].endswith("is calmer") for path in ("auto", "interpolate")]
+    assert named == [True, False]
     with pytest.raises(UsageError, match="path 'orbit'; choose one of auto, views, turntable, spiral, interpolate, or give"):
         plan_film(model, "orbit", FilmSettings())
     with pytest.raises(UsageError, match=r"unknown path 'turntabel'; did you mean turntable\?"):
@@ -141,7 +130,6 @@ def test_settings_out_of_range_are_refused(wrong):
 
 
 def test_empty_and_black_frames_are_noticed(model, tmp_path):
-    """A camera that looks away, one in front of something black, and good ones between them."""
     good, black = list(model.cameras().values())[:3], three_gaussians()
     away = dataclasses.replace(good[0], viewmat=look_at(good[0].center, 2 * good[0].center, np.array([0, -1.0, 0])))
     plan = dataclasses.replace(
@@ -155,14 +143,9 @@ def test_empty_and_black_frames_are_noticed(model, tmp_path):
     dark = dataclasses.replace(model, scene_gaussians=dataclasses.replace(black, sh=torch.full_like(black.sh, -2.0)))
     _, notes = render_film(dark, plan, tmp_path / "b.webp", FilmSettings())
     assert "4 of 6 frames are black (frames 0 to 2 and 5)" in notes[-1]
-    check = FrameCheck(0.5)
-    for alpha in (0.04, 0.06):  # a tenth of what a training view shows is nearly nothing, however much that is
-        check.look(np.ones((4, 4, 3)), np.full((4, 4), alpha))
-    assert check.empty == [0]
-    check = FrameCheck(0.0)
-    for i in range(40):
-        check.look(np.ones((4, 4, 3)), np.full((4, 4), i % 3))
-    assert "(frames 0, 3, 6, 9, 12 and 9 more)" in check.notes("", "")[0]
+    white = np.ones((4, 4, 3))  # a tenth of what a training view shows is nearly nothing, however much that is
+    assert [bool(fault_of(white, np.full((4, 4), alpha), 0.5)) for alpha in (0.04, 0.06)] == [True, False]
+    assert "(frames 0, 3, 6, 9, 12 and 9 more)" in fault_notes(["are black", "", ""] * 14, "", "")[0]
 
 
 @pytest.mark.parametrize(
@@ -186,16 +169,13 @@ def test_what_no_photograph_saw_gets_a_note(model, tmp_path, path, settings, adv
     notes = [n for n in render_film(model, plan, tmp_path / "a.webp", FilmSettings())[1] if "outside all photographs" in n]
     assert len(notes) == (advice is not None)
     if advice:
-        frames = (
-            "1 of 2 frames have over 10% of their pixels outside all photographs (frames 1)"
-            if path == "own"
-            else "2 of 2 frames"
+        frames = "1 of 2 frames have over 10% of their pixels outside all photographs (frames 1)"
+        assert notes[0].startswith(frames if path == "own" else "2 of 2 frames") and notes[0].endswith(
+            f"expect artefacts there; {advice}"
         )
-        assert notes[0].startswith(frames) and notes[0].endswith(f"expect artefacts there; {advice}")
 
 
 def _moved(x: float) -> np.ndarray:
-    """A rigid motion to one side [u]."""
     motion = np.eye(4)
     motion[0, 3] = x
     return motion
@@ -207,11 +187,8 @@ def test_a_film_alone_and_six_frames_on_a_sheet(model, tmp_path, capsys):
     assert "path: turntable, there and back" in capsys.readouterr().err
     plan = plan_film(model, "turntable", FilmSettings(frames=8))
     files, _ = render_film(model, plan, tmp_path / "a.webp", FilmSettings(), sheet=True)
-    assert files == [tmp_path / "a.webp"] and cv2.imread(str(tmp_path / "a-sheet.png")).shape == (
-        2 * 32 + 4,
-        3 * 40 + 8,
-        3,
-    )
+    shape = 2 * 32 + 4, 3 * 40 + 8, 3
+    assert files == [tmp_path / "a.webp"] and cv2.imread(str(tmp_path / "a-sheet.png")).shape == shape
     render_film(model, plan, tmp_path / "images", FilmSettings())
     less = render_film(model, plan_film(model, "turntable", FilmSettings(frames=5)), tmp_path / "images", FilmSettings())
     assert less[1][-1].startswith("3 older images are also in ")
@@ -219,9 +196,8 @@ def test_a_film_alone_and_six_frames_on_a_sheet(model, tmp_path, capsys):
         assert image.n_frames == 8 and image.size == (40, 32)
     with pytest.raises(UsageError, match="coverage images are PNG files"):
         render_film(model, plan, tmp_path / "a.webp", FilmSettings(), coverage=True)
-    mixed = dataclasses.replace(
-        plan, cameras=[("0", plan.cameras[0][1]), ("1", dataclasses.replace(plan.cameras[1][1], width=50))]
-    )
+    (_, first), (_, second), *_ = plan.cameras
+    mixed = dataclasses.replace(plan, cameras=[("0", first), ("1", dataclasses.replace(second, width=50))])
     with pytest.raises(UsageError, match="the views differ in size"):
         render_film(model, mixed, tmp_path / "a.mp4", FilmSettings())
     with pytest.raises(UsageError, match="no camera"):
@@ -236,7 +212,6 @@ UP = np.array([0.3, -0.9, 0.1]) / math.sqrt(0.91)
 
 
 def rolled(camera: Camera, degrees: float) -> Camera:
-    """The camera turned about its axis."""
     c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
     turn = np.eye(4)
     turn[:2, :2] = [[c, -s], [s, c]]
@@ -255,7 +230,6 @@ def around(azimuths, elevation: float = 20.0, distance: float = 4.0) -> list[Cam
 
 
 def one_way(count: int = 6) -> list[Camera]:
-    """Parallel cameras on a small grid."""
     return [
         Camera(look_at(np.array([x, y, 0.0]), np.array([x, y, 1.0]), np.array([0, -1.0, 0])), K, 40, 30)
         for x, y in [(0.3 * (i % 3), 0.2 * (i // 3)) for i in range(count)]
@@ -269,7 +243,6 @@ def room(count: int = 10) -> list[Camera]:
 
 
 def walk(count: int = 12) -> list[Camera]:
-    """Cameras along a corridor and round a corner and back, looking where they go."""
     corners = np.array([[0, 0, 0], [0, 0, 9.0], [9, 0, 9], [9, 0, 0]])
     at = np.linspace(0, 2.999, count)
     eyes = [corners[int(t)] + (t % 1) * (corners[int(t) + 1] - corners[int(t)]) for t in at]
@@ -309,12 +282,17 @@ def test_a_film_of_one_side_stays_near_the_photographs():
     centers = np.array([c.center for c in narrow])
     ahead = rig.center - centers.mean(0)
     ahead /= np.linalg.norm(ahead)
-    eyes = np.array([c.center for c in camera_path("spiral", rig, narrow, 40)])
+    path = camera_path("spiral", rig, narrow, 40)
+    for c in path:
+        assert abs(project_points(c, rig.center[None])[0][0] - c.K[:2, 2]).max() < 1e-6
+        assert np.allclose(c.viewmat[:3, :3] @ c.viewmat[:3, :3].T, np.eye(3), atol=1e-12)
+    eyes = np.array([c.center for c in path])
+    assert np.linalg.norm(eyes - np.roll(eyes, 1, 0), axis=1).max() < 0.5  # the last is near the first
     np.testing.assert_allclose((eyes - centers.mean(0)) @ ahead, 0, atol=1e-9)
     assert np.linalg.norm(eyes - centers.mean(0), axis=1).max() < np.linalg.norm(centers - centers.mean(0), axis=1).max()
 
 
-@pytest.mark.parametrize("roll", [(0, 0), (90, 90), (90, -90), (3, -4)])
+@pytest.mark.parametrize("roll", [(0, 0), (90, 90), (3, -4)])
 @pytest.mark.parametrize("kind", ["turntable", "spiral"])
 def test_a_ring_is_circled_level_whatever_way_the_photographs_lie(kind, roll):
     """Every frame has the object at its centre, upright, from the distance and height of the cameras; sides are swapped."""
@@ -336,7 +314,7 @@ def test_a_ring_is_circled_level_whatever_way_the_photographs_lie(kind, roll):
     assert turned == pytest.approx((2 if kind == "spiral" else 1) * 2 * math.pi, rel=1e-6)
 
 
-@pytest.mark.parametrize("rolls", [(90, -90), (92, 92), (88, 88), (180, 0)])
+@pytest.mark.parametrize("rolls", [(90, -90), (92, 92), (180, 0)])
 def test_up_is_the_side_that_people_stand_on(rolls):
     """Where photographs do not agree on what is up, cameras stand above what they look at; also in a world upside down."""
     cameras = [rolled(c, rolls[i % 2]) for i, c in enumerate(around(np.arange(0, 360, 24)))]
@@ -357,19 +335,6 @@ def test_a_turntable_never_goes_where_no_camera_was(cameras):
         assert z[0] > 0 and (0 < pixels[0]).all() and (pixels[0] < (c.width, c.height)).all()
 
 
-def test_a_spiral_to_one_side_looks_at_one_point_and_closes():
-    """All cameras see the middle of the scene, and the last is near the first."""
-    cameras = ring(5)
-    rig = rig_of(cameras, 2.2)
-    path = camera_path("spiral", rig, cameras, 40)
-    for c in path:
-        pixels, z = project_points(c, rig.center[None])
-        assert z[0] > 0 and abs(pixels[0] - c.K[:2, 2]).max() < 1e-6
-        assert np.allclose(c.viewmat[:3, :3] @ c.viewmat[:3, :3].T, np.eye(3), atol=1e-12)
-    steps = [np.linalg.norm(a.center - b.center) for a, b in zip(path, path[1:] + path[:1])]
-    assert max(steps) < 0.5
-
-
 @pytest.mark.parametrize(("roll", "azimuths"), [(0, [0, 110, 235]), (90, [0, 110, 235]), (-90, [10, 80, 150, 290])])
 def test_three_photographs_are_enough_to_know_what_is_up(roll, azimuths):
     """Any three centres lie in a plane, which says nothing where the photographs were taken from different heights."""
@@ -387,7 +352,6 @@ def test_close_photographs_from_below_do_not_tilt_a_film():
 
 
 def test_in_a_room_a_film_looks_around():
-    """From the middle, level, all the way round."""
     cameras = room()
     path = camera_path("turntable", rig_of(cameras, 2.0), cameras, 8)
     assert all(np.allclose(c.center, TARGET, atol=1e-9) and abs(c.viewmat[2, :3] @ UP) < 1e-6 for c in path)
@@ -402,27 +366,27 @@ def test_in_a_room_a_film_looks_around():
 def test_a_tour_passes_through_the_cameras(cameras, closed):
     """At a keyframe's time the path is that camera, and from frame to frame it neither jumps nor jerks."""
     rig = rig_of(cameras, 2.0)
-    tour = tour_of(cameras, [rig.reach(c) for c in cameras], 4.0, 100)
-    assert {id(k.camera) for k in tour.keyframes} == {id(c) for c in cameras} and tour.closed is closed
-    end = tour.keyframes[-1].seconds
+    keys, is_closed, by_name = tour_of(cameras, [rig.reach(c) for c in cameras], 4.0, 100)
+    assert {id(k.camera) for k in keys} == {id(c) for c in cameras} and is_closed is closed
+    end = keys[-1].seconds
     assert end == pytest.approx(4.0)
-    path = through(tour.keyframes, 2001)
-    for key in tour.keyframes:
+    path = through(keys, 2001)
+    for key in keys:
         at = path[round(key.seconds / end * 2000)]
         assert np.linalg.norm(at.center - key.camera.center) < 0.03 and at.viewmat[2] @ key.camera.viewmat[2] > 0.999
     eyes = np.array([c.center for c in path])
     steps = np.linalg.norm(np.diff(eyes, axis=0), axis=1)
     assert steps.max() < 20 * np.median(steps)
     assert np.linalg.norm(np.diff(eyes, 2, axis=0), axis=1).max() < 0.15 * np.median(steps)
-    assert np.allclose(path[0].viewmat, cameras[0].viewmat, atol=1e-9) or not tour.by_name
+    assert np.allclose(path[0].viewmat, cameras[0].viewmat, atol=1e-9) or not by_name
 
 
 def test_a_tour_around_an_object_keeps_it_in_every_frame():
     """Between two far views of a ring the path goes around, not through."""
     cameras = around([0, 70, 140, 220, 290])
     rig = rig_of(cameras, 2.0)
-    tour = tour_of(cameras, [rig.reach(c) for c in cameras], 2.0, 100)
-    for c in through(tour.keyframes, 60, closed=tour.closed):
+    keys, closed, _ = tour_of(cameras, [rig.reach(c) for c in cameras], 2.0, 100)
+    for c in through(keys, 60, closed=closed):
         seen = c.viewmat[:3, :3] @ TARGET + c.viewmat[:3, 3]
         assert np.abs(seen[:2]).max() < 1e-4 and abs(seen[2] - 4) < 0.05
 
@@ -431,12 +395,12 @@ def test_a_tour_of_views_whose_names_say_nothing_goes_from_neighbour_to_neighbou
     """And of too many views it passes through some."""
     azimuths = np.arange(0, 300, 20)
     shuffled = around(azimuths[np.random.default_rng(0).permutation(15)])
-    tour = tour_of(shuffled, [0.0] * 15, 4.0, 100)
-    legs = [np.linalg.norm(a.camera.center - b.camera.center) for a, b in zip(tour.keyframes, tour.keyframes[1:])]
-    assert not tour.by_name and len(legs) == 14 and max(legs) < 1.5
-    assert tour_of(around(azimuths), [0.0] * 15, 4.0, 100).by_name
-    some = tour_of(around(azimuths), [0.0] * 15, 4.0, 6)
-    assert len(some.keyframes) - some.closed == 6
+    keys, _, by_name = tour_of(shuffled, [0.0] * 15, 4.0, 100)
+    legs = [np.linalg.norm(a.camera.center - b.camera.center) for a, b in itertools.pairwise(keys)]
+    assert not by_name and len(legs) == 14 and max(legs) < 1.5
+    assert tour_of(around(azimuths), [0.0] * 15, 4.0, 100)[2]
+    keys, closed, _ = tour_of(around(azimuths), [0.0] * 15, 4.0, 6)
+    assert len(keys) - closed == 6
 
 
 def test_a_closed_spline_has_no_corner_where_it_closes():
@@ -461,11 +425,3 @@ def test_size_and_field_of_view():
     assert framed(camera) == camera
     turned = framed(Camera(camera.viewmat, K, 40, 30), turned=True)
     assert turned.K.tolist() == [[55, 0, 15], [0, 50, 20], [0, 0, 1]] and (turned.width, turned.height) == (30, 40)
-
-
-def test_unknown_paths_are_refused():
-    rig = rig_of(ring(3), 1.0)
-    with pytest.raises(UsageError, match="neither turntable nor spiral"):
-        camera_path("zigzag", rig, ring(3), 5)
-    with pytest.raises(UsageError, match="at least 1 frame"):
-        camera_path("turntable", rig, ring(3), 0)

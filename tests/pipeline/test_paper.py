@@ -11,6 +11,7 @@ import pytest
 import torch
 
 import warpgs
+from tests.pipeline.train.fits import advanced
 from tests.scenes import photos, priors, ring, seeds, three_gaussians
 from tests.tolerances import GAIN
 from warpgs.constants import LOW_PASS, Rule
@@ -112,23 +113,13 @@ def test_render_score_is_the_length_of_the_colour_difference():
     assert score[9, 9] == 1 and abs(float(score[23, 23]) - 0.9) < 5e-3 and score[0, 29] == 0
 
 
-@pytest.mark.parametrize(
-    "switches, expected",
-    [
-        ((True, True, True), (0.4, 0.2, 0.4)),
-        ((False, True, True), (0, 1 / 3, 2 / 3)),
-        ((True, False, True), (0.5, 0, 0.5)),
-        ((True, True, False), (2 / 3, 1 / 3, 0)),
-        ((False, False, False), (0, 0, 0)),
-    ],
-)
-def test_weights_renormalise(switches, expected):
-    """The rows of the ablation table."""
-    assert np.allclose(weights(*switches), expected)
-
-
-def test_importance_is_the_weighted_sum_and_uniform_without_weights():
-    """w . s; without any score every pixel counts the same."""
+def test_weights_renormalise_and_importance_is_the_weighted_sum():
+    """The rows of the ablation table; without any score every pixel counts the same."""
+    for switches, expected in (
+        ((True, True, True), (0.4, 0.2, 0.4)), ((False, True, True), (0, 1 / 3, 2 / 3)), ((True, False, True), (0.5, 0, 0.5)),
+        ((True, True, False), (2 / 3, 1 / 3, 0)), ((False, False, False), (0, 0, 0)),
+    ):  # fmt: skip
+        assert np.allclose(weights(*switches), expected)
     values = tuple(torch.full((2, 3), v) for v in (0.5, 0.25, 1.0))
     assert torch.allclose(importance(values, (0.4, 0.2, 0.4)), torch.tensor(0.65))
     assert torch.equal(importance(values, (0, 0, 0)), torch.ones(2, 3))
@@ -298,8 +289,7 @@ def test_switch_combinations_run(tiny, combinations):
     for hier, *values in combinations:
         own = dict(zip(SWITCHES, values))
         fit = trainer(dataclasses.replace(with_own(**own), method=dataclasses.replace(METHOD, hier=hier)))
-        for _ in range(6):
-            fit.advance()
+        advanced(fit)
         assert all(bool(torch.isfinite(t).all()) for t in fit.gaussians.tensors().values()), own
         # the first event fills the layer; the second finds no room among the protected
         first, second = fit.strategy.events
@@ -309,13 +299,8 @@ def test_switch_combinations_run(tiny, combinations):
 
 def test_without_its_parts_it_is_the_strategy_sampling(tiny):
     """The same bits, with `UNIFORM`; other settings differ."""
-    fits = [
-        trainer(c) for c in (dataclasses.replace(CONFIG, strategy="sampling"), with_own(**dataclasses.asdict(UNIFORM)), CONFIG)
-    ]
-    for fit in fits:
-        for _ in range(6):
-            fit.advance()
-    plain, uniform, full = (fit.gaussians.means for fit in fits)
+    configs = dataclasses.replace(CONFIG, strategy="sampling"), with_own(**dataclasses.asdict(UNIFORM)), CONFIG
+    plain, uniform, full = (advanced(trainer(c)).gaussians.means for c in configs)
     assert torch.equal(plain, uniform) and not (plain.shape == full.shape and torch.equal(plain, full))
 
 
@@ -323,7 +308,7 @@ def test_unknown_semantics_leave_the_weights_to_the_others(tiny):
     """A view of which semantics say nothing is scored by the other two, whose weights sum to 1."""
     blank = [dataclasses.replace(p, boundary=p.boundary * 0, foreground=p.foreground * 0) for p in priors(photos(3, 32, 32))]
     fit = trainer(given=blank)
-    render, semantic, geometry, total = fit.strategy.sample(1, {0: fit.views[0]}, 0.01, 0.5).views[0].scores.values()
+    render, semantic, geometry, total = fit.strategy.sample(1, {0: fit.views[0]}, 0.01, 0.5)[2][0].scores.values()
     assert not bool(semantic.any()) and torch.allclose(total, 0.5 * render + 0.5 * geometry)
 
 
@@ -338,8 +323,8 @@ def test_gain_draws_where_all_views_ask_for_colour(tiny):
         fit.table.params.update(kept)
         fit.table.columns.update({n: c[:2] for n, c in fit.table.columns.items()})
         fit.context.capacity = 10_000
-        event = fit.strategy.sample(9, views, 0.01, 50.0)
-        away = (event.change.added["means"] - whole.means[2]).norm(dim=1)
+        change, *_ = fit.strategy.sample(9, views, 0.01, 50.0)
+        away = (change.added["means"] - whole.means[2]).norm(dim=1)
         fraction.append(float((away < 0.45).float().mean()))
     assert fraction[0] > 0.9 > 0.6 > fraction[1]
 

@@ -53,6 +53,10 @@ def test_a_removed_setting_names_what_replaces_it(name, tmp_path):
     assert note in str(error.value)
 
 
+def test_a_time_between_checkpoints_changes_no_result():
+    assert upgraded(FitConfig().to_json() | {"checkpoint_seconds": 0.0}) == (FitConfig().to_json(), [])
+
+
 def test_flags_that_switched_off_and_the_old_strategy_are_named(capsys):
     for flag, words in (("--density.no-morton-order", "morton-order was removed"), ("--no-cache", "WARPGS_CACHE"),
                         ("--method.no-events", "--strategy clone_split")):  # fmt: skip

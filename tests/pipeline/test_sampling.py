@@ -8,13 +8,12 @@ import pytest
 import torch
 from scipy.stats import chisquare
 
+from tests.pipeline.train.fits import advanced, continued, same_bits
 from tests.scenes import photos, ring, seeds
 from warpgs import geometry
-from warpgs.errors import UsageError
 from warpgs.kernels.update import Setting
 from warpgs.pipeline.model.start import InitConfig, initial_points
 from warpgs.pipeline.model.table import DensityUpdate
-from warpgs.pipeline.run.folder import load_checkpoint, save_checkpoint
 from warpgs.pipeline.train.schedule import PhaseConfig, plan_phases
 from warpgs.pipeline.train.settings import FitConfig
 from warpgs.pipeline.train.strategies import sampling
@@ -23,17 +22,13 @@ from warpgs.pipeline.train.strategies.sampling import (
     COARSE,
     FINE,
     NOT_SAMPLED,
-    Event,
     MethodConfig,
     SamplerConfig,
     fine_gaussians,
-    keep_contributors,
     sample_pixels,
     valid_pixels,
 )
 from warpgs.pipeline.train.trainer import Trainer
-from warpgs.render.options import RasterizeOptions
-from warpgs.render.rasterize import rasterize
 from warpgs.scene import C0, Camera
 
 CPU = torch.device("cpu")
@@ -52,10 +47,7 @@ def tiny(monkeypatch):
 
 
 def fitted(config: FitConfig = CONFIG, steps: int | None = None) -> Trainer:
-    fit = Trainer(photos(3), seeds(), config, CPU)
-    for _ in range(config.steps if steps is None else steps):
-        fit.advance()
-    return fit
+    return advanced(Trainer(photos(3), seeds(), config, CPU), steps)
 
 
 def grown(fit: Trainer, keep: int | list[int], parents: list[int], **more) -> DensityUpdate:
@@ -65,7 +57,7 @@ def grown(fit: Trainer, keep: int | list[int], parents: list[int], **more) -> De
     return DensityUpdate(rows, added, torch.tensor(parents), **more)
 
 
-def event_of(fit: Trainer, views, step: int, fraction: float = 0.01, max_fraction: float = 0.5) -> Event:
+def event_of(fit: Trainer, views, step: int, fraction: float = 0.01, max_fraction: float = 0.5):
     """A sampling event on some views that is not applied."""
     return fit.strategy.sample(step, dict(enumerate(views)), fraction, max_fraction)
 
@@ -122,17 +114,6 @@ def test_valid_pixels_have_depth_and_lie_inside(monkeypatch):
     alpha[4, 4], depth[4, 5], depth[4, 6], mask[4, 7] = 0.4, torch.inf, 0, 0
     valid = valid_pixels(alpha, depth, mask)
     assert valid.sum() == 6 * 8 - 4 and not bool(valid[4, 4:8].any()) and not bool(valid[:2].any())
-
-
-def test_back_projection_is_undone_by_projection():
-    """To 1e-5 px in float32."""
-    camera = ring(5)[1]
-    pixels = np.random.default_rng(0).uniform(0, 30, (50, 2))
-    depths = np.random.default_rng(1).uniform(0.5, 8, 50)
-    tensors = Camera(torch.as_tensor(camera.viewmat), torch.as_tensor(camera.K), camera.width, camera.height)
-    points = geometry.back_project_tensors(tensors, torch.as_tensor(pixels), torch.as_tensor(depths))
-    again, z = geometry.project_points(camera, points.numpy())
-    assert np.abs(again - pixels).max() < 1e-10 and np.abs(z - depths).max() < 1e-10
 
 
 def test_fine_gaussians_stand_behind_their_pixels():
@@ -216,8 +197,7 @@ def test_coarse_layer_is_stable_and_fine_layer_grows():
     moved = (fit.gaussians.means - before).abs().amax(1)
     lr = fit.lrs(9)["means"]
     assert float(moved[~fit.strategy.fine].max()) < 0.11 * 3 * lr < float(moved[fit.strategy.fine].max())
-    while fit.step < 40:
-        fit.advance()
+    advanced(fit)
     assert int((~fit.strategy.fine).sum()) <= coarse and int(fit.strategy.fine.sum()) > event["added"]
     assert [e["step"] for e in fit.strategy.events] == list(fit.phases.events)
 
@@ -225,15 +205,8 @@ def test_coarse_layer_is_stable_and_fine_layer_grows():
 def test_phase_three_leaves_the_set_alone():
     """From the end of phase 2 on rows neither come nor go."""
     fit = fitted(steps=29)
-    count = len(fit.gaussians)
-    created_steps = fit.table.columns["created_step"].clone()
-    for _ in range(11):
-        fit.advance()
-    assert (
-        fit.phases.stable_start == 28
-        and len(fit.gaussians) == count
-        and torch.equal(fit.table.columns["created_step"], created_steps)
-    )
+    before = fit.table.columns["created_step"].clone()
+    assert fit.phases.stable_start == 28 and torch.equal(advanced(fit).table.columns["created_step"], before)
 
 
 def test_full_fine_layer_frees_its_least_contributors():
@@ -241,25 +214,16 @@ def test_full_fine_layer_frees_its_least_contributors():
     fit = fitted(steps=8)
     cap = len(fit.strategy.events) and int(fit.strategy.fine.sum())
     most = cap / int((~fit.strategy.fine).sum())
-    protected = event_of(fit, fit.views, 9, max_fraction=most)
-    assert protected.evicted == 0 and len(protected.change.parents) == 0
-    old = event_of(fit, fit.views, 500, max_fraction=most)
-    assert old.evicted == len(old.change.parents) == cap
-    assert bool((~fit.strategy.fine)[old.change.keep].all())
+    change, evicted, _ = event_of(fit, fit.views, 9, max_fraction=most)
+    assert evicted == 0 and len(change.parents) == 0
+    change, evicted, _ = event_of(fit, fit.views, 500, max_fraction=most)
+    assert evicted == len(change.parents) == cap
+    assert bool((~fit.strategy.fine)[change.keep].all())
 
 
 def test_continued_fit_equals_uninterrupted_one(tmp_path):
     """Saved between two sampling events: the same bits at the end, layers and events included."""
-    straight, broken = fitted(), fitted(steps=17)
-    save_checkpoint(tmp_path, *broken.state())
-    resumed = Trainer(photos(3), seeds(), CONFIG, CPU)
-    resumed.load(*load_checkpoint(tmp_path))
-    while resumed.step < 40:
-        resumed.advance()
-    a, b = straight.state()[0], resumed.state()[0]
-    assert (
-        a.keys() == b.keys() and all(torch.equal(a[k], b[k]) for k in a) and straight.strategy.events == resumed.strategy.events
-    )
+    assert same_bits(fitted(), continued(lambda: fitted(steps=0), 17, tmp_path))
 
 
 @pytest.mark.parametrize("gated", [True, False])
@@ -269,35 +233,13 @@ def test_fine_gaussians_stand_at_confirmed_depths(gated):
     fit.strategy.gated = gated
     view, consistent = fit.views[0], torch.zeros(32, 40)
     consistent[:, :20] = 1.25
-    event = event_of(fit, [dataclasses.replace(view, consistent=consistent)], 9, 0.2, 50)
-    columns = event.views[0].at[:, 1]
-    points = event.change.added["means"]
+    change, _, sampled = event_of(fit, [dataclasses.replace(view, consistent=consistent)], 9, 0.2, 50)
+    columns = sampled[0].at[:, 1]
+    points = change.added["means"]
     z = points @ view.camera.viewmat[2, :3] + view.camera.viewmat[2, 3]
     assert len(z) == len(columns) > 50
     assert torch.allclose(z[columns < 20], torch.tensor(1.25), atol=1e-4)
     assert bool((columns >= 20).any()) != gated and not torch.allclose(z[columns >= 20].mean(), torch.tensor(1.25), atol=0.05)
-
-
-def test_phase_3_begins_with_those_that_contribute_most():
-    """Half stay, none of which has a smaller sum of blending weights than one that went; nothing changes afterwards."""
-    fit = fitted(steps=27)
-    options = RasterizeOptions(background=torch.zeros(3), contributions=True)
-    weights = torch.stack([rasterize(fit.gaussians, v.camera, options).weight_sums[0] for v in fit.views]).sum(0)
-    kept = keep_contributors(fit.gaussians, len(weights) // 2, fit.views, options)
-    stays = torch.zeros(len(weights), dtype=torch.bool).index_fill(0, kept.keep, True)
-    assert int(stays.sum()) == len(weights) // 2 and weights[stays].min() >= weights[~stays].max()
-    whole, half = (fitted(dataclasses.replace(CONFIG, method=dataclasses.replace(METHOD, keep=k))) for k in (1.0, 0.5))
-    assert len(half.gaussians) == round(0.5 * len(whole.gaussians))
-    with pytest.raises(UsageError, match="keep"):
-        MethodConfig(keep=0.0)
-
-
-def test_growth_that_ends_early_keeps_those_that_contribute_most():
-    """Then, too, they are counted once, before pixels that were held out are sampled."""
-    fit = fitted(dataclasses.replace(CONFIG, method=dataclasses.replace(METHOD, keep=0.5)), steps=20)
-    count, views = len(fit.gaussians), fit.views
-    first, *rest = fit.strategy.catch_up(20, [dataclasses.replace(v, mask=torch.ones_like(v.image[..., 0])) for v in views], 64)
-    assert len(first.keep) == round(0.5 * count) and len(first.parents) == 0 and all(len(c.keep) >= count for c in rest)
 
 
 def test_dropout_falls_with_the_number_of_views():
@@ -314,10 +256,3 @@ def test_auto_start_sweeps_few_views():
     for most, word in ((3, "sweep"), (2, "random")):
         start = initial_points(views, None, InitConfig(sweep_up_to=most, random_count=200), np.random.default_rng(0))
         assert word in start.how and (start.depths is not None) == (most == 3)
-
-
-def test_bad_settings_are_named():
-    """Out of range: refused before anything starts, by the name of the flag."""
-    for bad in ({"fraction": 0}, {"footprint": 0}, {"max_fraction": -1}, {"fraction": float("nan")}):
-        with pytest.raises(UsageError, match=rf"method.sampler.{next(iter(bad)).replace('_', '-')} must be"):
-            SamplerConfig(**bad)

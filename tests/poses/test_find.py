@@ -1,6 +1,7 @@
 """The search for poses: its parts, whole scenes from photographs, interruptions, and fits that find poses once."""
 
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -29,7 +30,6 @@ from warpgs.poses.matching import choose_pairs, similarity
 from warpgs.poses.photographs import (
     Photograph,
     find_photographs,
-    folder_notes,
     prepare,
     sharpest,
     without_jpeg_metadata,
@@ -77,18 +77,14 @@ def test_few_photographs_keep_the_focal_length_of_exif(sfm, still_life_views, tm
     assert any(n.startswith("the EXIF focal length does not fit the 4 photographs") for n in record["notes"]) is not kept
 
 
-def test_images_are_upright_and_at_full_size(found, still_life_views):
-    """A photograph that lies on its side is turned, one of another size has a camera of its own; PNG keeps its pixels."""
+def test_images_are_upright_at_full_size_and_without_anything_personal(found, photographs, still_life_views):
+    """One that lies on its side is turned, one of another size has its own camera; no owner, position or path is written."""
     out, record = found
     images = {p.name: cv2.imread(str(p), cv2.IMREAD_UNCHANGED)[..., ::-1] for p in (out / "images").iterdir()}
     assert np.array_equal(images["0.png"], still_life_views[1][0]) and images["3.png"].shape == (150, 200, 3)
     assert np.abs(images["2.jpg"].astype(int) - still_life_views[1][2]).mean() < 4
     assert sorted((c["width"], c["height"]) for c in record["cameras"]) == [(200, 150), (240, 180), (240, 180)]
     assert "1 photograph turned upright by EXIF" in record["notes"]
-
-
-def test_nothing_personal_is_written(found, photographs):
-    """No position, owner or maker of the camera, no path of this machine."""
     personal = [b"Exif", b"GPS", b"Jane", b"ACME", str(photographs).encode(), str(found[0].parent).encode()]
     for path in (p for p in found[0].rglob("*") if p.is_file()):
         assert not [word for word in personal if word in path.read_bytes()], path
@@ -104,9 +100,9 @@ def test_the_command_gives_the_same_bits_on_another_number_of_threads(found, pho
         assert path.read_bytes() == (tmp_path / "a 2nd" / path.relative_to(found[0])).read_bytes(), path
 
 
-def noise(path, seed, smooth=0):
+def noise(path, seed):
     image = np.random.default_rng(seed).integers(0, 255, (120, 160, 3), np.uint8)
-    write_png(path, cv2.GaussianBlur(image, (0, 0), smooth) if smooth else image)
+    write_png(path, cv2.GaussianBlur(image, (0, 0), 2))
 
 
 @pytest.mark.parametrize(
@@ -119,17 +115,13 @@ def test_photographs_that_cannot_work(sfm, tmp_path, capsys, kind, count, messag
     source = tmp_path / "in"
     source.mkdir()
     for i in range(count):
+        noise(source / f"{i}.png", i)
         if kind == "blank":
             write_png(source / f"{i}.png", np.full((120, 160, 3), 200, np.uint8))
-        else:
-            noise(source / f"{i}.png", i, 2)
     if kind == "broken":
         (source / "1.png").write_bytes((source / "1.png").read_bytes()[:500])
     assert main(["poses", str(source), "--out", str(tmp_path / "out")]) == DataError.exit_code
-    said = capsys.readouterr().err
-    assert len(said.splitlines()) == 1
-    with pytest.raises(DataError, match=message):
-        raise DataError(said)
+    assert re.fullmatch(f".*{message}.*\n", capsys.readouterr().err)
     assert [p.name for p in tmp_path.iterdir()] == ["in"]
 
 
@@ -146,26 +138,26 @@ def test_photographs_of_an_unread_format_are_named(sfm, tmp_path, capsys, comman
     assert len(said.splitlines()) == 1 and "a.nef is a RAW file, which is not supported; convert" in said
     assert "(2 such files)" in said
     for i in range(2):
-        noise(source / f"{i}.png", i, 2)
+        noise(source / f"{i}.png", i)
     assert main(words) == DataError.exit_code
     said = capsys.readouterr().err.splitlines()[-1]
     assert "has 2 photographs" in said and "left out: a.nef is a RAW" in said
     assert [p.name for p in tmp_path.iterdir()] == ["in"]
 
 
-def test_a_broken_video_is_told_of_once(sfm, tmp_path, capfd):
-    """OpenCV's own warnings, written past Python, are not shown."""
-    (tmp_path / "a.mp4").write_bytes(b"")
-    assert main(["poses", str(tmp_path / "a.mp4"), "--out", str(tmp_path / "out")]) == DataError.exit_code
-    said = capfd.readouterr().err
-    assert said.startswith("warpgs: ") and len(said.splitlines()) == 1
-
-
-def test_a_video_of_one_frame(sfm, tmp_path):
+def test_videos_that_cannot_work(sfm, tmp_path, capfd):
+    """A broken one is told of once, without OpenCV's own warnings, which are written past Python; one frame is too few."""
     film(tmp_path / "a.avi", 1)
-    with pytest.raises(DataError, match=r"a\.avi: has 1 frame; poses need"):
-        find_poses(tmp_path / "a.avi", tmp_path / "out")
-    assert [p.name for p in tmp_path.iterdir()] == ["a.avi"]
+    (tmp_path / "empty.mp4").write_bytes(b"")
+    (tmp_path / "text.mp4").write_bytes(b"no video" * 100)
+    for name, words in (
+        ("empty.mp4", "cannot read it as a video"),
+        ("text.mp4", "cannot read"),
+        ("a.avi", "has 1 frame; poses"),
+    ):
+        assert main(["poses", str(tmp_path / name), "--out", str(tmp_path / "out")]) == DataError.exit_code
+        assert re.fullmatch(rf"warpgs: .*{name}.*{words}.*\n", capfd.readouterr().err)
+    assert not (tmp_path / "out").exists()
 
 
 def test_pairs_are_chosen_and_copies_are_small(sfm, tmp_path, photographs, found, monkeypatch):
@@ -187,16 +179,13 @@ def test_what_is_there_is_not_overwritten(sfm, tmp_path, photographs):
     assert [p.name for p in tmp_path.iterdir()] == ["mine"]
 
 
-def test_without_pycolmap_a_sentence_says_what_to_install(tmp_path, photographs, monkeypatch):
-    monkeypatch.setattr(mapping.importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(UsageError, match=r"pip install '\.\[poses\]'"):
-        find_poses(photographs, tmp_path / "out")
-
-
-def test_a_worker_that_fails_is_reported_and_leaves_nothing(sfm, tmp_path, photographs, monkeypatch):
-    """Its last words are in the message."""
+def test_a_worker_that_fails_or_is_not_there(sfm, tmp_path, photographs, monkeypatch):
+    """Its last words are in the message, or what to install; nothing is left."""
     monkeypatch.setattr(find, "prepare", lambda path, root, small, most: prepare(path, root, small.with_name("lost"), most))
     with pytest.raises(ResourceError, match=r"pycolmap ended with code \d+.*last message: "):
+        find_poses(photographs, tmp_path / "out")
+    monkeypatch.setattr(mapping.importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(UsageError, match=r"pip install '\.\[poses\]'"):
         find_poses(photographs, tmp_path / "out")
     assert not list(tmp_path.iterdir())
 
@@ -258,11 +247,8 @@ def test_poses_are_kept_in_the_run_folder(tmp_path, photographs, found, monkeypa
     request = SceneRequest(str(tmp_path / "in"), matcher="x.onnx")
     for _ in range(2):
         posed, notes = with_poses(request, run, said.append)
-        assert (
-            posed.path == str(run / "scene")
-            and posed.matcher is None
-            and any(n.startswith("poses found for 6 of 6") for n in notes)
-        )
+        assert (posed.path, posed.matcher) == (str(run / "scene"), None)
+        assert any(n.startswith("poses found for 6 of 6") for n in notes)
     assert calls == [tmp_path / "in"] and "has no cameras: finding the poses" in said[0]
     (tmp_path / "in" / "0.png").write_bytes((tmp_path / "in" / "1.png").read_bytes())
     with pytest.raises(UsageError, match="holds poses of other photographs than"):
@@ -314,32 +300,21 @@ def test_a_run_that_was_moved_finds_its_scene(tmp_path, found):
 # Parts of the search for poses that need no pycolmap: pairs, metadata, frames of a video, advice.
 
 
-def descriptors(places: int, each: int, seed: int = 0) -> list[np.ndarray]:
-    """Descriptors of photographs of some places in turn: those of one place share most of theirs."""
-    generator = np.random.default_rng(seed)
-    kinds = generator.integers(0, 256, (places, 60, 128), np.uint8)
-    noisy = [
-        np.clip(kinds[i % places] + generator.normal(0, 5, (60, 128)), 0, 255).astype(np.uint8) for i in range(places * each)
-    ]
-    return [*noisy, np.zeros((0, 128), np.uint8)]
-
-
-def test_photographs_of_one_place_look_alike():
-    alike = similarity(descriptors(4, 3))
-    assert alike[0, 4] > 0.7 > 0.4 > alike[0, 1] and not alike[-1].any()
-
-
 def test_pairs_are_neighbours_and_lookalikes():
-    """Of 26 photographs of 25 places not all pairs, but those of one place, and neighbours in order; the same each time."""
-    found = descriptors(25, 2)
-    pairs = choose_pairs(found, "video")
+    """Of two photographs of each of 25 places not all pairs, but those of one place, and neighbours; the same each time."""
+    generator = np.random.default_rng(0)
+    kinds = np.tile(generator.integers(0, 256, (25, 60, 128), np.uint8), (2, 1, 1))
+    noisy = [*np.clip(kinds + generator.normal(0, 5, kinds.shape), 0, 255).astype(np.uint8), np.zeros((0, 128), np.uint8)]
+    alike = similarity(noisy)
+    assert alike[0, 25] > 0.7 > 0.4 > alike[0, 1] and not alike[-1].any()
+    pairs = choose_pairs(noisy, "video")
     assert {(i, i + 25) for i in range(25)} <= set(pairs) and {(i, i + 1) for i in range(50)} <= set(pairs)
-    assert len(pairs) < 51 * 50 / 2 * 0.7 and pairs == sorted(pairs) == choose_pairs(found, "video")
+    assert len(pairs) < 51 * 50 / 2 * 0.7 and pairs == sorted(pairs) == choose_pairs(noisy, "video")
     assert choose_pairs([np.zeros((0, 128), np.uint8)] * 3, "photographs") == [(0, 1), (0, 2), (1, 2)]
 
 
 @pytest.mark.parametrize("progressive", [0, 1])
-def test_a_jpeg_without_its_metadata_has_the_same_pixels(progressive):
+def test_files_without_their_metadata_have_the_same_pixels(progressive):
     image = np.random.default_rng(0).integers(0, 255, (40, 56, 3), np.uint8)
     coded = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_PROGRESSIVE, progressive])[1].tobytes()
     exif = with_exif(image, 1)
@@ -347,9 +322,6 @@ def test_a_jpeg_without_its_metadata_has_the_same_pixels(progressive):
     block = exif[at : at + 2 + int.from_bytes(exif[at + 2 : at + 4], "big")]
     bare = without_jpeg_metadata(coded[:2] + block + coded[2:] + b"a film follows \xff\xd9")
     assert b"Jane" in block and bare == coded
-
-
-def test_a_png_without_its_metadata_has_the_same_pixels():
     coded = cv2.imencode(".png", np.arange(300, dtype=np.uint16).reshape(10, 30))[1].tobytes()
     text = b"\0\0\0\4tEXtJane\0\0\0\0"
     assert without_png_metadata(coded[:33] + text + coded[33:] + b"more") == coded
@@ -364,31 +336,25 @@ def test_what_exif_says_of_the_lens(tmp_path):
     assert cv2.imread(str(tmp_path / "small.png")).shape == (60, 80, 3)
 
 
-def test_masks_are_no_photographs(tmp_path):
-    for name in ("images/a.png", "images/masks/a.png", "b.png", "masks/a.png"):
-        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
-        (tmp_path / name).touch()
-    assert [p.name for p in find_photographs(tmp_path)] == ["a.png"]
-
-
-def test_images_of_earlier_runs_are_no_photographs(tmp_path):
+@pytest.mark.parametrize(
+    ("files", "photographs", "notes"),
+    [
+        ("images/a.png images/masks/a.png b.png masks/a.png images/b.png", "images/a.png images/b.png", []),
+        (
+            "a.png b/c.png b/run/renders/d.png b/run/path-auto/0.png b/run/e.png posed/scene/images/f.png g/h.png "
+            "b/run/config.json b/run/metrics.jsonl posed/scene/poses.json g/config.json",
+            "a.png b/c.png g/h.png",
+            ["skipped as earlier runs: b/run, posed", "photographs by folder: 1 in the folder itself, 1 in b, 1 in g"],
+        ),
+    ],
+)
+def test_masks_and_images_of_earlier_runs_are_no_photographs(tmp_path, files, photographs, notes):
     """A run below the photographs is left out with all below it, also one that holds found poses alone; both are named."""
-    names = ("a.png", "b/c.png", "b/run/renders/d.png", "b/run/path-auto/0000.png", "b/run/e.png", "posed/scene/images/f.png")
-    others = ("g/h.png", "b/run/config.json", "b/run/metrics.jsonl", "posed/scene/poses.json", "g/config.json")
-    for name in (*names, *others):
+    for name in files.split():
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).touch()
-    assert [p.relative_to(tmp_path).as_posix() for p in find_photographs(tmp_path)] == ["a.png", "b/c.png", "g/h.png"]
-    assert folder_notes(tmp_path) == [
-        "skipped as earlier runs: b/run, posed", "photographs by folder: 1 in the folder itself, 1 in b, 1 in g"
-    ]  # fmt: skip
-
-
-def test_one_folder_of_photographs_needs_no_notes(tmp_path):
-    for name in ("images/a.png", "images/b.png", "c.png"):
-        (tmp_path / name).parent.mkdir(exist_ok=True)
-        (tmp_path / name).touch()
-    assert folder_notes(tmp_path) == []
+    found, said = find_photographs(tmp_path)
+    assert [p.relative_to(tmp_path).as_posix() for p in found] == photographs.split() and said == notes
 
 
 def test_frames_of_a_video_are_sharp_and_evenly_spaced(tmp_path):
@@ -397,12 +363,6 @@ def test_frames_of_a_video_are_sharp_and_evenly_spaced(tmp_path):
     assert write_frames(tmp_path / "a.avi", tmp_path / "frames", 4, lambda line: None) == 12
     assert sorted(p.name for p in (tmp_path / "frames").iterdir()) == [f"frame_{i:06d}.png" for i in (1, 4, 7, 10)]
     assert sharpest([3.0, 1.0], 5) == [0, 1] and sharpest([1.0, 1.0, 2.0, 2.0], 2) == [0, 2]
-
-
-def test_videos_that_cannot_work(tmp_path):
-    (tmp_path / "a.mp4").write_bytes(b"no video" * 100)
-    with pytest.raises(DataError, match="cannot read it as a video"):
-        write_frames(tmp_path / "a.mp4", tmp_path, 3, lambda line: None)
 
 
 def found_mapping(**values) -> Mapping:
@@ -419,57 +379,50 @@ def found_mapping(**values) -> Mapping:
     return Mapping(**(given | values))
 
 
+def unposed(names, focal=None) -> list[Photograph]:
+    return [Photograph(f"{n}.png", Path(f"{n}.png"), 320, 240, 1, "", focal, "0") for n in names]
+
+
 def test_too_few_that_fit_together_are_told_with_their_links():
     """The pairs that do match, once each, and who matches nobody."""
-    photographs = [Photograph(f"{n}.png", Path(n), 320, 240, 1, "", None, "0") for n in "abcde"]
     found = found_mapping(views={}, keypoints=(900,) * 5, matches={(0, 1): 525, (2, 3): 292})
-    with pytest.raises(
-        DataError, match=r"e\.png matches no other; c\.png and d\.png share 292 matches; a\.png and b\.png share 525"
-    ):
-        _check_found(Path("in"), found, photographs)
+    words = r"e\.png matches no other; c\.png and d\.png share 292 matches; a\.png and b\.png share 525"
+    with pytest.raises(DataError, match=words):
+        _check_found(Path("in"), found, unposed("abcde"))
 
 
 @pytest.mark.parametrize(("focal", "count", "said"), [(None, 5, True), (None, 6, False), (0.8, 5, False)])
 def test_a_record_says_that_few_photographs_do_not_tell_the_focal_length(focal, count, said):
     """Where EXIF does not tell it, up to five of them."""
     view = found_mapping().views[0]
-    photographs = [Photograph(f"{n}.png", Path(str(n)), 320, 240, 1, "", focal, "0") for n in range(count)]
     found = found_mapping(views=dict.fromkeys(range(count), view), keypoints=(900,) * count, matches={(0, 1): 200})
-    notes = record_of(found, photographs, "0", [])["notes"]
+    notes = record_of(found, unposed(range(count), focal), "0", [])["notes"]
     assert any(f"An estimate from {count} photographs is often 5 % off" in n for n in notes) is said
 
 
 def test_a_record_says_what_does_not_repeat_and_who_has_no_pose():
     """Its lines name the photographs without a pose, why, and what to do."""
-    photographs = [Photograph(f"{n}.png", Path(n), 320, 240, 1, "", None, "0") for n in "abcde"]
+    photographs = unposed("abcde")
     assert not any("run to run" in n for n in record_of(found_mapping(), photographs, "0", [])["notes"])
     record = record_of(found_mapping(method="global"), photographs, "0", ["a note"])
     assert record["notes"][0] == "a note" and record["notes"][-1].endswith("from run to run")
     lines = report_lines(record)
     assert "poses found for 3 of 5 photographs" in lines[1] and "What to photograph next:" in lines
     assert lines[8].startswith("d.png  NO POSE: it has 600 keypoints and 9 matches with c.png")
+    nobody = {"notes": ["a note"], "photographs": [], "advice": []}  # records are files that anybody may have changed
+    assert report_lines(nobody)[0] == "a note"
 
 
 def test_reasons_and_advice():
-    """Blank and lost photographs first, then wide gaps, then weak links; nothing where all is well."""
-    names = ["a", "b", "c", "d", "e"]
-    assert (
-        reason(found_mapping(), 3, names) == "has 600 keypoints and 9 matches with c, too few of them at places of known depth"
-    )
-    assert reason(found_mapping(), 4, names).startswith("has 12 keypoints, too few to match")
-    said = advice(found_mapping(), names)
-    assert [
-        "between d and c" in said[0],
-        "take e again" in said[1],
-        "between b and c, whose axes differ by 50 degrees" in said[2],
-    ] == [True] * 3
-    assert said[3] == "take a photograph between c and b, which share only 40 matches" and len(said) == 4
-    well = found_mapping(keypoints=(900, 800), matches={(0, 1): 200}, views=dict(list(found_mapping().views.items())[:2]))
-    assert advice(well, ["a", "b"]) == []
+    """Lost and blank photographs first, then wide gaps, then weak links; nothing where all is well."""
+    names, found = ["a", "b", "c", "d", "e"], found_mapping()
+    assert reason(found, 3, names) == "has 600 keypoints and 9 matches with c, too few of them at places of known depth"
+    assert reason(found, 4, names).startswith("has 12 keypoints, too few to match")
     assert "matches no other" in reason(found_mapping(matches={}), 3, names)
-
-
-def test_a_record_without_photographs_has_lines():
-    """Records are files that anybody may have changed."""
-    record = {"notes": ["a note"], "photographs": [], "advice": []}
-    assert report_lines(record)[0] == "a note"
+    said = advice(found, names)
+    for line, words in zip(
+        said, ("between d and c", "take e again", "b and c, whose axes differ by 50", "only 40 matches"), strict=True
+    ):
+        assert words in line
+    well = found_mapping(keypoints=(900, 800), matches={(0, 1): 200}, views=dict(list(found.views.items())[:2]))
+    assert advice(well, ["a", "b"]) == []

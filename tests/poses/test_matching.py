@@ -13,7 +13,7 @@ from warpgs.errors import DataError
 from warpgs.poses import find
 from warpgs.poses.find import find_poses
 from warpgs.poses.mapping import find_model
-from warpgs.poses.matching import MAX_KEYPOINTS, WHOLE, Features, Matcher, mutual_matches, open_matcher, quarter_turns
+from warpgs.poses.matching import MAX_KEYPOINTS, WHOLE, Matcher, mutual_matches, quarter_turns
 
 AT = np.array([[3.0, 4.0], [60.0, 20.0], [5.0, 6.0]])
 SCORES = np.array([0.2, 0.9, 0.0])
@@ -21,20 +21,31 @@ UNIT = np.array([[0.6, 0.8], [0.0, 1.0], [0.0, 0.0]])
 
 
 def opened(tmp_path, *arrays, **options) -> Matcher:
-    return open_matcher(networks.write(tmp_path / "m.onnx", networks.matcher(*arrays, **options)), threads=1)
+    return Matcher(networks.write(tmp_path / "m.onnx", networks.matcher(*arrays, **options)), threads=1)
+
+
+def whole(rows) -> np.ndarray:
+    """Return descriptors as a matcher does, of length `WHOLE`."""
+    return np.round(np.array(rows) / np.linalg.norm(rows, axis=1, keepdims=True) * WHOLE).astype(np.int16)
 
 
 def test_keypoints_are_in_pixels_of_the_photograph(tmp_path):
     """The best first; what has no score is none. A photograph of 512 x 256 px is seen at twice its size."""
     matcher = opened(tmp_path, AT, SCORES, UNIT)
-    found = matcher.features(np.zeros((256, 512, 3), np.uint8))
-    np.testing.assert_array_equal(found.pixels, AT[[1, 0]] / 2)
-    np.testing.assert_array_equal(found.descriptors, np.round(UNIT[[1, 0]] * WHOLE))
+    pixels, descriptors = matcher.features(np.zeros((256, 512, 3), np.uint8))
+    np.testing.assert_array_equal(pixels, AT[[1, 0]] / 2)
+    np.testing.assert_array_equal(descriptors, np.round(UNIT[[1, 0]] * WHOLE))
     assert matcher.title.startswith("m.onnx (SHA-256 ") and matcher.size is None
     fixed = opened(tmp_path, AT, SCORES, UNIT, size=(64, 64))
-    np.testing.assert_allclose(fixed.features(np.zeros((32, 128, 3), np.uint8)).pixels, AT[[1, 0]] * [2, 0.5])
+    np.testing.assert_allclose(fixed.features(np.zeros((32, 128, 3), np.uint8))[0], AT[[1, 0]] * [2, 0.5])
     many = np.tile(AT[:1], (MAX_KEYPOINTS + 5, 1)), np.ones(MAX_KEYPOINTS + 5), np.tile(UNIT[:1], (MAX_KEYPOINTS + 5, 1))
-    assert len(opened(tmp_path, *many).features(np.zeros((32, 32, 3), np.uint8)).pixels) == MAX_KEYPOINTS
+    assert len(opened(tmp_path, *many).features(np.zeros((32, 32, 3), np.uint8))[0]) == MAX_KEYPOINTS
+    image = np.zeros((40, 60, 3), np.uint8)
+    for turns in range(4):  # the first keypoint is at (60, 20) of what the network sees, 1024 px at the longer side
+        (width, height), (w, h) = ((60, 40), (1024, 672)) if turns % 2 == 0 else ((40, 60), (672, 1024))
+        x, y = 60 * width / w, 20 * height / h
+        wanted = [(x, y), (60 - y, x), (60 - x, 40 - y), (y, 40 - x)][turns]
+        np.testing.assert_allclose(matcher.features(image, turns)[0][0], wanted, rtol=1e-5)
 
 
 @pytest.mark.parametrize(
@@ -65,13 +76,9 @@ def test_a_network_of_another_kind_is_refused_before_any_work(sfm, tmp_path, pho
 
 
 def test_matches_are_mutual_and_similar():
-    def features(rows):
-        rows = np.array(rows) / np.linalg.norm(rows, axis=1, keepdims=True)
-        return Features(np.zeros((len(rows), 2), np.float32), np.round(rows * WHOLE).astype(np.int16))
-
-    a, b = features([[1, 0, 0], [0, 1, 0], [1, 0.1, 0], [0, 0, 1]]), features([[0, 1, 0.1], [1, 0.01, 0], [0, -1, 0.5]])
+    a, b = whole([[1, 0, 0], [0, 1, 0], [1, 0.1, 0], [0, 0, 1]]), whole([[0, 1, 0.1], [1, 0.01, 0], [0, -1, 0.5]])
     assert mutual_matches(a, b).tolist() == [[0, 1], [1, 0]]
-    assert mutual_matches(a, Features(np.zeros((0, 2), np.float32), np.zeros((0, 3), np.int16))).shape == (0, 2)
+    assert mutual_matches(a, np.zeros((0, 3), np.int16)).shape == (0, 2)
 
 
 class Sift:
@@ -83,7 +90,7 @@ class Sift:
         image = np.ascontiguousarray(np.rot90(image, turns))
         points, found = cv2.SIFT_create(contrastThreshold=0.01).detectAndCompute(image, None)
         found /= np.maximum(np.linalg.norm(found, axis=1, keepdims=True), 1)
-        return Features(np.array([p.pt for p in points], np.float32) + 0.5, np.round(found * WHOLE).astype(np.int16))
+        return np.array([p.pt for p in points], np.float32) + 0.5, np.round(found * WHOLE).astype(np.int16)
 
 
 def test_the_network_is_asked_where_sift_leaves_photographs_out(sfm, tmp_path, photographs, found, monkeypatch):
@@ -101,7 +108,7 @@ def test_the_network_is_asked_where_sift_leaves_photographs_out(sfm, tmp_path, p
         return replace(made[0], views=dict(list(made[0].views.items())[some]))
 
     monkeypatch.setattr(find, "find_model", by_sift_once)
-    monkeypatch.setattr(find, "open_matcher", lambda path, threads: Sift())
+    monkeypatch.setattr(find, "Matcher", lambda path, threads: Sift())
     record = find_poses(photographs, tmp_path / "all", matcher="x.onnx")
     assert record["cameras"] == found[1]["cameras"] and any("SIFT finds the poses of all" in n for n in record["notes"])
     some = slice(3)
@@ -113,7 +120,7 @@ def test_the_network_is_asked_where_sift_leaves_photographs_out(sfm, tmp_path, p
     assert len(list((tmp_path / "a" / "images").iterdir())) == 6 and not (tmp_path / "a" / "work").exists()
     monkeypatch.setattr(find, "EXHAUSTIVE", 5)
     assert all(p["registered"] for p in find_poses(photographs, tmp_path / "c", matcher="x.onnx")["photographs"])
-    monkeypatch.setattr(Sift, "features", lambda self, image, *_: Features(np.zeros((0, 2)), np.zeros((0, 128))))
+    monkeypatch.setattr(Sift, "features", lambda self, image, *_: (np.zeros((0, 2)), np.zeros((0, 128))))
     record = find_poses(photographs, tmp_path / "d", matcher="x.onnx")
     assert "sift.onnx (SHA-256 0) is not used: it finds 0 poses, and SIFT 3" in record["notes"]
 
@@ -124,8 +131,7 @@ class Upright:
     def features(self, image, turns=0, side=0, most=0):
         colors = np.rot90(image, turns).reshape(-1, 3)
         rows = np.stack([np.random.default_rng([i, *c]).normal(size=32) for i, c in enumerate(colors)])
-        whole = np.round(rows / np.linalg.norm(rows, axis=1, keepdims=True) * WHOLE).astype(np.int16)
-        return Features(np.zeros((len(rows), 2), np.float32), whole)
+        return np.zeros((len(rows), 2), np.float32), whole(rows)
 
 
 def test_turns_of_photographs_are_found():
@@ -134,15 +140,3 @@ def test_turns_of_photographs_are_found():
     images = [image, np.rot90(image), image, np.rot90(image, 2)]
     assert quarter_turns(Upright(), images, [(0, 1), (0, 2), (1, 2), (1, 3)]) == [0, 3, 0, 2]
     assert quarter_turns(Upright(), [], []) == []
-
-
-def test_keypoints_of_turned_photographs_are_in_their_own_pixels(tmp_path):
-    image = np.zeros((40, 60, 3), np.uint8)
-    image[5, 8] = 255
-    matcher = opened(tmp_path, AT, SCORES, UNIT)
-    for turns in range(4):  # the first keypoint is at (60, 20) of what the network sees, 1024 px at the longer side
-        width, height = (60, 40) if turns % 2 == 0 else (40, 60)
-        h, w = (672, 1024) if turns % 2 == 0 else (1024, 672)
-        x, y = 60 * width / w, 20 * height / h
-        wanted = [(x, y), (60 - y, x), (60 - x, 40 - y), (y, 40 - x)][turns]
-        np.testing.assert_allclose(matcher.features(image, turns).pixels[0], wanted, rtol=1e-5)

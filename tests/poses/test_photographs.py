@@ -2,6 +2,7 @@
 
 import base64
 import io
+import json
 import os
 import struct
 import sys
@@ -52,7 +53,7 @@ class Searched(Exception):
     """The search for poses begins."""
 
 
-@pytest.fixture
+@pytest.fixture(autouse=True)
 def no_search(monkeypatch):
     def found(*arguments):
         raise Searched
@@ -67,19 +68,11 @@ def commands(folder, **options):
     yield lambda: with_poses(SceneRequest(str(folder), None, **options), folder.parent / "run", lambda line: None)
 
 
-@pytest.mark.usefixtures("no_search")
-@pytest.mark.parametrize("what", ["photograph", "folder", "images"])
+@pytest.mark.parametrize("what", ["d.png", "x/y.png", "images"])
 def test_links_lead_out_only_where_that_is_allowed(folder, what):
     private = folder.parent / "private"
-    if what == "photograph":
-        link(folder / "d.png", private / "d.png")
-    else:
-        name = "images" if what == "images" else "more"
-        (folder / "x").mkdir()
-        if what == "images":
-            link(folder / name, private)
-        else:
-            link(folder / "x" / "y.png", private / "d.png")
+    (folder / "x").mkdir()
+    link(folder / what, private if what == "images" else private / "d.png")
     for command in commands(folder):
         with pytest.raises(DataError, match=r"a link points outside the folder of photographs; .*--allow-outside"):
             command()
@@ -93,16 +86,23 @@ def test_links_lead_out_only_where_that_is_allowed(folder, what):
     assert source_digest(folder, allow_outside=True)
 
 
-@pytest.mark.usefixtures("no_search")
-def test_links_inside_of_the_folder_are_followed(folder):
+def test_links_inside_are_followed_and_a_pipe_is_no_photograph(folder):
     (folder / "originals").mkdir()
     (folder / "a.png").rename(folder / "originals" / "a.jpg")
     link(folder / "a.png", folder / "originals" / "a.jpg")
+    if os.name != "nt":
+        special("pipe", folder / "x.png")
     with pytest.raises(Searched):
         find_poses(folder, folder.parent / "out")
 
 
-@pytest.mark.usefixtures("no_search")
+def test_two_photographs_of_one_name_in_the_scene_are_refused(folder):
+    cv2.imwrite(str(folder / "a.bmp"), np.zeros((40, 60, 3), np.uint8))
+    (folder / "a.png").rename(folder / "a.bmp.png")
+    with pytest.raises(DataError, match=r"a\.bmp and a\.bmp\.png would both be 'a\.bmp\.png' in the scene"):
+        find_poses(folder, folder.parent / "out")
+
+
 def test_a_size_beyond_the_limit_is_refused_before_exif(folder):
     """Pillow allots the canvas of a WebP file, a gigabyte here, as soon as it looks at EXIF."""
     (folder / "b.webp").write_bytes(BOMB)
@@ -114,7 +114,6 @@ def test_a_size_beyond_the_limit_is_refused_before_exif(folder):
     tracemalloc.stop()
 
 
-@pytest.mark.usefixtures("no_search")
 @pytest.mark.parametrize("kind", ["JPEG", "PNG", "WEBP", "TIFF", "AVIF"])
 def test_exif_of_every_format(kind):
     exif, out = Image.Exif(), io.BytesIO()
@@ -125,9 +124,8 @@ def test_exif_of_every_format(kind):
     assert read_exif(out.getvalue()) == expected
 
 
-@pytest.mark.usefixtures("no_search")
 @pytest.mark.parametrize("order", ["<", ">"])
-def test_exif_is_read_with_bounds(order):
+def test_exif_is_read_with_bounds(order, tmp_path):
     """Entries that overlap, lie outside, or are of another kind than they must be."""
     head = (b"II*\0" if order == "<" else b"MM\0*") + struct.pack(order + "I", 8)
 
@@ -152,10 +150,6 @@ def test_exif_is_read_with_bounds(order):
     whole = block((0x0112, 3, 1, short(8)), (0x010F, 2, 9, long(38)), after=b"some text")
     for end in range(len(whole)):
         assert len(parse_exif(whole[:end])) == 4
-
-
-@pytest.mark.usefixtures("no_search")
-def test_broken_exif_leaves_the_photograph(tmp_path):
     data = with_exif(np.zeros((40, 60, 3), np.uint8), 6)
     at = data.index(b"Exif\0\0") + 6
     (tmp_path / "a.jpg").write_bytes(data[:at] + b"\xff" * 40 + data[at + 40 :])
@@ -163,7 +157,6 @@ def test_broken_exif_leaves_the_photograph(tmp_path):
     assert (p.width, p.height, p.orientation, p.device, p.focal) == (60, 40, 1, "", None)
 
 
-@pytest.mark.usefixtures("no_search")
 def test_tags_of_a_tiff_may_not_overlap(tmp_path):
     """4,000 tags that all stand for the whole file: Pillow and libtiff would copy it 4,000 times."""
     out, count = io.BytesIO(), 4000
@@ -179,7 +172,6 @@ def test_tags_of_a_tiff_may_not_overlap(tmp_path):
     tracemalloc.stop()
 
 
-@pytest.mark.usefixtures("no_search")
 def test_a_jpeg_of_many_scans_is_refused(tmp_path):
     """Each scan passes over all pixels."""
     data = cv2.imencode(".jpg", np.zeros((40, 60, 3), np.uint8), [cv2.IMWRITE_JPEG_PROGRESSIVE, 1])[1].tobytes()
@@ -189,7 +181,6 @@ def test_a_jpeg_of_many_scans_is_refused(tmp_path):
         prepare(tmp_path / "a.jpg", tmp_path, tmp_path / "small.png")
 
 
-@pytest.mark.usefixtures("no_search")
 def test_pixels_are_unpacked_without_copies_of_the_rest(monkeypatch):
     """The unpacker copies the input that it leaves, so it is given little at a time."""
     from warpgs.io import image_files
@@ -213,27 +204,6 @@ def test_pixels_are_unpacked_without_copies_of_the_rest(monkeypatch):
     assert sum(lengths) < 2 * len(packed)
 
 
-@pytest.mark.usefixtures("no_search")
-@pytest.mark.parametrize("kind", ["pipe", "device", "socket"])
-def test_a_video_that_is_no_regular_file(kind, tmp_path):
-    path = special(kind, tmp_path / "a.mp4")
-    with pytest.raises(DataError, match=r"a\.mp4: is not a regular file; give a folder of photographs, or a video"):
-        find_poses(path, tmp_path / "out")
-    with pytest.raises(DataError, match=r"a\.mp4: the video cannot be read \(is not a regular file\)"):
-        write_frames(path, tmp_path, 3, lambda line: None)
-
-
-@pytest.mark.usefixtures("no_search")
-@pytest.mark.parametrize("text", ["#EXTM3U\n#EXT-X-TARGETDURATION:1\n#EXTINF:1,\n{}\n", "ffconcat version 1.0\nfile {}\n"])
-def test_a_playlist_is_no_video(text, tmp_path):
-    """FFmpeg would open the files that it names."""
-    film(tmp_path / "private.avi", 4)
-    (tmp_path / "a.mp4").write_text(text.format("private.avi"))
-    with pytest.raises(DataError, match="cannot read it as a video"):
-        write_frames(tmp_path / "a.mp4", tmp_path, 3, lambda line: None)
-
-
-@pytest.mark.usefixtures("no_search")
 @pytest.mark.parametrize("name, most, why", [
     ("MAX_FRAME_PIXELS", 96 * 64 - 1, "its frames have 6,144 pixels"),
     ("MAX_TOTAL_PIXELS", 96 * 64 * 5, "pixels in all frames"),
@@ -246,41 +216,17 @@ def test_videos_are_bounded(name, most, why, tmp_path, monkeypatch):
         write_frames(tmp_path / "a.avi", tmp_path, 3, lambda line: None)
 
 
-@pytest.mark.usefixtures("no_search")
-def test_a_header_that_claims_absurd_frames_is_not_believed(tmp_path):
-    """The count in an AVI header says four thousand million; twelve are there."""
-    film(tmp_path / "a.avi", 12)
-    data = bytearray((tmp_path / "a.avi").read_bytes())
-    at = data.index(b"avih") + 8
-    struct.pack_into("<I", data, at + 16, 2**32 - 1)
+@pytest.mark.parametrize("text", ["#EXTM3U\n#EXT-X-TARGETDURATION:1\n#EXTINF:1,\n{}\n", "ffconcat version 1.0\nfile {}\n"])
+def test_a_playlist_is_no_video(text, tmp_path):
+    """FFmpeg would open the files that a playlist names; an AVI header claims four thousand million frames, not twelve."""
+    film(tmp_path / "private.avi", 12)
+    (tmp_path / "a.mp4").write_text(text.format("private.avi"))
+    with pytest.raises(DataError, match="cannot read it as a video"):
+        write_frames(tmp_path / "a.mp4", tmp_path, 3, lambda line: None)
+    data = bytearray((tmp_path / "private.avi").read_bytes())
+    struct.pack_into("<I", data, data.index(b"avih") + 24, 2**32 - 1)
     (tmp_path / "a.avi").write_bytes(data)
-    (tmp_path / "frames").mkdir()
-    assert write_frames(tmp_path / "a.avi", tmp_path / "frames", 3, lambda line: None) == 12
-
-
-@pytest.mark.usefixtures("no_search")
-def test_any_error_of_the_heic_decoder_names_the_file(tmp_path, monkeypatch, capsys):
-    """Whatever it raises becomes a line for the caller."""
-    import json
-
-    from warpgs.poses import photographs
-
-    def bomb(source, max_pixels):
-        raise Image.DecompressionBombError("too large")
-
-    monkeypatch.setattr(photographs, "_coded_again", bomb)
-    (tmp_path / "job.json").write_text(json.dumps({"max_pixels": 1, "files": [["a.heic", "b.jpg"]]}))
-    photographs.main(str(tmp_path / "job.json"))
-    assert [json.loads(line) for line in capsys.readouterr().out.splitlines()] == [{"file": 0}, {"error": "too large"}]
-
-
-@pytest.mark.usefixtures("no_search")
-def test_a_fifo_among_photographs_is_no_photograph(folder):
-    if os.name == "nt":
-        pytest.skip("Windows has no such files")
-    special("pipe", folder / "x.png")
-    with pytest.raises(Searched):
-        find_poses(folder, folder.parent / "out")
+    assert write_frames(tmp_path / "a.avi", tmp_path, 3, lambda line: None) == 12
 
 
 # HEIC photographs are read in a process of their own: upright, with what EXIF says of the lens alone, or told of by
@@ -301,7 +247,7 @@ HEIC = base64.b64decode(
 
 def convert(folder, data: bytes, max_pixels: int = 10**6):
     source = folder / "in" / "sub" / "a.heic"
-    source.parent.mkdir(parents=True)
+    source.parent.mkdir(parents=True, exist_ok=True)
     source.write_bytes(data)
     return to_jpeg([source], folder / "in", folder / "out", max_pixels)[source]
 
@@ -319,37 +265,29 @@ def test_copies_are_upright_and_tell_the_lens(tmp_path):
     np.testing.assert_allclose(pixels[24, 16], 60, atol=10)
 
 
-@pytest.mark.parametrize(
-    ("data", "max_pixels", "why"),
-    [
-        (HEIC[:-9], 10**6, "end of file"),
-        (HEIC[:100], 10**6, "meta"),
-        (HEIC, 100, r"64 x 96 px are more than the limit of 100 pixels \(--max-pixels\)"),
-    ],
-)
-def test_a_file_that_cannot_be_read_is_named(tmp_path, data, max_pixels, why):
+def test_a_file_that_cannot_be_read_is_named(tmp_path, monkeypatch, capsys):
+    """Also where the file ends its reader, as some do that were changed at random, or where there is no reader."""
     pytest.importorskip("pi_heif")
-    with pytest.raises(DataError, match=rf"a\.heic: the image cannot be decoded: .*{why}.*\. Restore it"):
-        convert(tmp_path, data, max_pixels)
+    limit = r"64 x 96 px are more than the limit of 100 pixels \(--max-pixels\)"
+    for data, max_pixels, why in ((HEIC[:-9], 10**6, "end of file"), (HEIC[:100], 10**6, "meta"), (HEIC, 100, limit)):
+        with pytest.raises(DataError, match=rf"a\.heic: the image cannot be decoded: .*{why}.*\. Restore it"):
+            convert(tmp_path, data, max_pixels)
 
+    def bomb(source, max_pixels):
+        raise Image.DecompressionBombError("too large")
 
-def test_a_file_that_ends_its_reader_is_named(tmp_path, monkeypatch):
-    """Some that were changed at random do."""
+    monkeypatch.setattr(photographs, "_coded_again", bomb)
+    (tmp_path / "job.json").write_text(json.dumps({"max_pixels": 1, "files": [["a.heic", "b.jpg"]]}))
+    photographs.main(str(tmp_path / "job.json"))
+    assert [json.loads(line) for line in capsys.readouterr().out.splitlines()] == [{"file": 0}, {"error": "too large"}]
 
     def lines(*arguments, **options):
         yield '{"file": 0}'
         raise ProcessFailed(-11, "")
 
-    pytest.importorskip("pi_heif")
     monkeypatch.setattr(photographs, "python_lines", lines)
     with pytest.raises(DataError, match=r"a\.heic: the image cannot be decoded: the decoder ended with code -11\. Restore it"):
         convert(tmp_path, HEIC)
-
-
-def test_what_reads_it_is_named_where_it_is_missing(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "pi_heif", None)
-    with pytest.raises(
-        UsageError,
-        match=r"a\.heic: is a HEIC photograph, .*`pip install '\.\[poses\]'` .*, or convert",
-    ):
+    with pytest.raises(UsageError, match=r"a\.heic: is a HEIC photograph, .*`pip install '\.\[poses\]'` .*, or convert"):
         convert(tmp_path, HEIC)

@@ -12,7 +12,7 @@ from warpgs.geometry import back_project
 from warpgs.pipeline.model.start import InitConfig, initial_points
 from warpgs.priors import given_depth
 from warpgs.priors.given_depth import align, check_given, fit_line, lens_depth, pinhole_view, votes, with_given_depth
-from warpgs.priors.sweep import SweepConfig, sweep_depths
+from warpgs.priors.sweep import sweep_depths
 from warpgs.scene import GivenDepth, PointCloud, View, ViewDepth
 from warpgs.synthetic import demo
 
@@ -22,7 +22,12 @@ NO_POINTS = PointCloud(np.zeros((0, 3)), np.zeros((0, 3), np.float32))
 @functools.cache
 def swept():
     views, depths = still_life()
-    return sweep_depths(views, [(0.5 * d.min(), 2 * d.max()) for d in depths], SweepConfig())
+    return sweep_depths(views, [(0.5 * d.min(), 2 * d.max()) for d in depths])
+
+
+def combined(views):
+    """Return the depths and notes of views with given maps, beside depth that was swept."""
+    return with_given_depth(views, swept(), NO_POINTS)
 
 
 def given(view, values, kind="metric", confidence=None):
@@ -82,8 +87,8 @@ def test_maps_that_contradict_are_refused_with_figures():
     for reason, view in cases.items():
         assert reason in align(view, swept()[0], NO_POINTS).why_not
         with pytest.raises(DataError, match=rf"no depth map can be used: {view.name}: .*{reason}"):
-            with_given_depth([view, *views[1:]], swept(), NO_POINTS)
-    found, notes = with_given_depth([cases["its depths are 99"], given(views[1], depths[1]), views[2]], swept(), NO_POINTS)
+            combined([view, *views[1:]])
+    found, notes = combined([cases["its depths are 99"], given(views[1], depths[1]), views[2]])
     assert "used in 1 of 3 views" in notes[0] and f"1 maps are not used: {views[0].name}: its depths are 99" in notes[1]
     assert found[0] is swept()[0] and found[0].given is None and found[1].given is not None
 
@@ -92,13 +97,13 @@ def test_metric_depth_comes_before_searched_depth_and_sparse_depth_joins_it():
     views, depths = still_life()
     rng = np.random.default_rng(0)
     noisy = [d * (1 + 0.01 * rng.standard_normal(d.shape)) for d in depths]
-    found, notes = with_given_depth([given(v, d) for v, d in zip(views, noisy)], swept(), NO_POINTS)
+    found, notes = combined([given(v, d) for v, d in zip(views, noisy)])
     for d, true, before in zip(found, depths, swept()):
         assert d.coverage > 0.98 > before.coverage and np.median(error(d, true)) < 0.008
         assert np.isfinite(d.sensitivity[d.valid]).all()
     assert "used in 3 of 3 views; median difference" in notes[0]
     sparse = [np.where(rng.random(d.shape) < 0.02, d, 0) for d in depths]
-    found, _ = with_given_depth([given(v, d) for v, d in zip(views, sparse)], swept(), NO_POINTS)
+    found, _ = combined([given(v, d) for v, d in zip(views, sparse)])
     for d, s, before in zip(found, sparse, swept()):
         assert (d.valid >= before.valid).all() and np.allclose(d.depth[d.given > 0], s[d.given > 0], rtol=1e-6)
         assert (d.given > 0).sum() > 0.95 * (s > 0).sum()
@@ -110,7 +115,7 @@ def test_depth_that_other_views_look_through_is_left_out(monkeypatch):
     wrong = depths[1].copy()
     wrong[40:60, 60:90] *= 0.5
     maps = [depths[0], wrong, depths[2]]
-    found, notes = with_given_depth([given(v, d) for v, d in zip(views, maps)], swept(), NO_POINTS)
+    found, notes = combined([given(v, d) for v, d in zip(views, maps)])
     assert (found[1].given[42:58, 62:88] > 0).mean() < 0.1 and "left out, because other views see through them" in notes[0]
     assert (found[1].given > 0).mean() > 0.9
     confirm, through = votes(views, [d.astype(np.float32) for d in maps], 1)
@@ -125,23 +130,21 @@ def test_a_fitted_map_that_is_not_exact_fills_gaps_and_replaces_outliers():
     views, depths = still_life()
     bend = 1 + 0.04 * np.sin(np.linspace(0, 18, 160))
     bent = [given(v, 3 / (d * bend) + 1, "disparity") for v, d in zip(views, depths)]
-    for d, before in zip(with_given_depth(bent, swept(), NO_POINTS)[0], swept()):
+    for d, before in zip(combined(bent)[0], swept()):
         changed = before.valid & (d.depth != before.depth)
         assert d.coverage > before.coverage + 0.05 and changed.mean() < 0.12
         assert np.abs(d.depth[changed] / before.depth[changed] - 1).min() > 0.04
     close = [given(v, 3 / d + 1, "disparity") for v, d in zip(views, depths)]
-    for d, true in zip(with_given_depth(close, swept(), NO_POINTS)[0], depths):
+    for d, true in zip(combined(close)[0], depths):
         assert d.coverage > 0.98 and np.median(error(d, true)) < 0.005
 
 
 def test_confidence_below_half_places_nothing():
     views, depths = still_life()
     confidence = np.where(np.arange(160) < 80, 0.4, 0.6).astype(np.float32)[None].repeat(120, 0)
-    nothing = [dataclasses.replace(d, valid=np.zeros_like(d.valid)) for d in swept()]
-    found, _ = with_given_depth([given(v, d, confidence=confidence) for v, d in zip(views, depths)], nothing, NO_POINTS)
-    assert (
-        not found[1].valid[:, :80].any() and found[1].valid[:, 80:].mean() > 0.9 and (found[1].given[:, :80] > 0).mean() > 0.9
-    )
+    found, _ = with_given_depth([given(v, d, confidence=confidence) for v, d in zip(views, depths)], None, NO_POINTS)
+    valid = found[1].valid
+    assert not valid[:, :80].any() and valid[:, 80:].mean() > 0.9 and (found[1].given[:, :80] > 0).mean() > 0.9
 
 
 def test_the_start_is_at_the_given_depth():

@@ -9,21 +9,20 @@ import numpy as np
 import pytest
 
 from tests.priors import networks as nw
-from warpgs.errors import DataError, ResourceError, UsageError
+from warpgs.errors import DataError, ResourceError
 from warpgs.priors.networks import (
     DEFAULTS,
     HALF,
     IMAGENET,
+    Network,
     Preprocessing,
     complete_disparity,
     describe,
     network_disparity,
-    open_network,
     resize,
     unit_range,
 )
 from warpgs.priors.views import (
-    SemanticMaps,
     _fast_length,
     boundary_weight,
     class_probabilities,
@@ -35,77 +34,64 @@ from warpgs.priors.views import (
 # Opening networks: what is taken, and everything that is refused before it runs.
 
 EYE, ZERO = np.eye(3), np.zeros(3)
+FREE = (1, 3, "h", "w")
+
+
+def one_node(
+    kind: str, shape: tuple = FREE, out: tuple | None = None, *, domain="", scalar=1, of=("x",), tensors=(), attributes=b""
+):
+    """Return a model of one operator from x to y."""
+    node = nw.node(kind, list(of), ["y"], domain, attributes)
+    outs = [nw.value("y", out or shape, 7 if kind == "ArgMax" else scalar)]
+    more = nw.field(8, nw.field(1, domain) + nw.field(2, 1)) if domain else b""
+    return nw.model(nw.graph([node], list(tensors), [nw.value("x", shape, scalar)], outs), more)
+
+
+def opened(tmp_path, data: bytes, name="m.onnx", **options) -> Network:
+    return Network(nw.write(tmp_path / name, data), **options)
 
 
 def test_a_network_knows_its_file_layout_and_size(tmp_path):
-    path = nw.depth_network(tmp_path / "a.onnx", size=(8, 12))
-    network = open_network(path, threads=1)
+    """And an image goes in with its axes in order."""
+    network = Network(nw.depth_network(tmp_path / "a.onnx", size=(8, 12)), threads=1)
     assert (network.layout, network.size) == ("nchw", (8, 12))
     assert network.sha256 == hashlib.sha256((tmp_path / "a.onnx").read_bytes()).hexdigest()
     assert network.title == f"a.onnx (SHA-256 {network.sha256[:12]})"
     assert network.session.get_providers() == ["CPUExecutionProvider"]
     assert network.session.get_session_options().intra_op_num_threads == 1
-    free = open_network(nw.depth_network(tmp_path / "b.onnx", layout="nhwc"))
-    assert (free.layout, free.size) == ("nhwc", None)
-
-
-@pytest.mark.parametrize("layout", ["nchw", "nhwc"])
-def test_an_image_goes_in_with_its_axes_in_order(tmp_path, layout):
-    path = nw.write(tmp_path / "a.onnx", nw.linear(EYE, ZERO, layout=layout))
     image = np.random.default_rng(0).normal(size=(5, 7, 3)).astype(np.float32)
-    output = open_network(path).run(image)[0]
-    np.testing.assert_allclose(output if layout == "nhwc" else output.transpose(1, 2, 0), image, rtol=1e-6)
+    for layout in ("nchw", "nhwc"):
+        free = opened(tmp_path, nw.linear(EYE, ZERO, layout=layout))
+        assert (free.layout, free.size) == (layout, None)
+        output = free.run(image)[0]
+        np.testing.assert_allclose(output if layout == "nhwc" else output.transpose(1, 2, 0), image, rtol=1e-6)
 
 
 GOOD = nw.linear(EYE, ZERO)
 REFUSED = {
     "empty": (b"", "not an ONNX model"),
-    "text": (b"an image, not a network", "not an ONNX model"),
     "png": (b"\x89PNG\r\n\x1a\n" + bytes(64), "not an ONNX model"),
     "cut off": (GOOD[: len(GOOD) // 2], "not an ONNX model"),
     "no graph": (nw.field(1, 8) + nw.field(8, nw.field(2, 17)), "it has no graph"),
+    "two graphs": (GOOD + GOOD, "it has several graphs"),
     "two inputs": (nw.linear(EYE, ZERO, inputs=2), r"2 inputs \(x, in1\)"),
     "two outputs": (nw.linear(EYE, ZERO, outputs=2), r"2 outputs \(y, more1\)"),
-    "four channels": (
-        nw.model(nw.graph([nw.node("Relu", ["x"], ["y"])], [], [nw.value("x", (1, 4, 8, 9))], [nw.value("y", (1, 4, 8, 9))])),
-        "has the 3 channels",
-    ),
-    "a batch": (
-        nw.model(nw.graph([nw.node("Relu", ["x"], ["y"])], [], [nw.value("x", (2, 3, 8, 8))], [nw.value("y", (2, 3, 8, 8))])),
-        "one image",
-    ),
-    "three axes": (
-        nw.model(nw.graph([nw.node("Relu", ["x"], ["y"])], [], [nw.value("x", (3, 8, 8))], [nw.value("y", (3, 8, 8))])),
-        "one image",
-    ),
+    "four channels": (one_node("Relu", (1, 4, 8, 9)), "has the 3 channels"),
+    "a batch": (one_node("Relu", (2, 3, 8, 8)), "one image"),
+    "three axes": (one_node("Relu", (3, 8, 8)), "one image"),
     "one free side": (nw.linear(EYE, ZERO, size=(8, "w")), "fixes only one side"),
-    "whole numbers": (
-        nw.model(
-            nw.graph([nw.node("Abs", ["x"], ["y"])], [], [nw.value("x", (1, 3, 8, 8), 2)], [nw.value("y", (1, 3, 8, 8), 2)])
-        ),
-        r"tensor\(uint8\); float",
-    ),
-    "foreign operator": (
-        nw.model(
-            nw.graph([nw.node("Run", ["x"], ["y"], "evil")], [], [nw.value("x", (1, 3, 8, 8))], [nw.value("y", (1, 3, 8, 8))]),
-            nw.field(8, nw.field(1, "evil") + nw.field(2, 1)),
-        ),
-        "evil::Run is not part of ONNX",
-    ),
-    "unknown operator": (
-        nw.model(nw.graph([nw.node("Frob", ["x"], ["y"])], [], [nw.value("x", (1, 3, 8, 8))], [nw.value("y", (1, 3, 8, 8))])),
-        "cannot load it",
-    ),
+    "whole numbers": (one_node("Abs", scalar=2), r"tensor\(uint8\); float"),
+    "foreign operator": (one_node("Run", domain="evil"), "evil::Run is not part of ONNX"),
+    "unknown operator": (one_node("Frob"), "cannot load it"),
 }
 
 
 @pytest.mark.parametrize("name", REFUSED)
 def test_files_that_are_refused(tmp_path, name, capsys):
     data, message = REFUSED[name]
-    path = nw.write(tmp_path / "m.onnx", data)
-    with pytest.raises(DataError, match=message) as e:
-        open_network(path)
-    assert path in str(e.value) and capsys.readouterr().out == ""
+    with pytest.raises(DataError, match=rf"m\.onnx.*{message}"):
+        opened(tmp_path, data)
+    assert capsys.readouterr().out == ""
 
 
 OUTSIDE = nw.external_tensor("k", (1,), "weights.bin")
@@ -114,99 +100,65 @@ CONSTANT = nw.field(1, "value") + nw.field(5, OUTSIDE) + nw.field(20, 4)
 
 def placed(where: str) -> bytes:
     """Return a model with a tensor of a side file in one of the places that a model has for tensors."""
-    x, y = nw.value("x", (1, 3, "h", "w")), nw.value("y", (1, 3, "h", "w"))
+    x, y = nw.value("x", FREE), nw.value("y", FREE)
     add, constant = nw.node("Add", ["x", "k"], ["y"]), nw.node("Constant", [], ["k"], attributes=nw.field(5, CONSTANT))
-    inner = nw.graph([constant], [], [], [])
-    graph, more = nw.graph([add], [], [x], [y]), b""
-    own = nw.field(1, "Own") + nw.field(10, "own")
-    if where == "initializer":
-        graph = nw.graph([add], [OUTSIDE], [x], [y])
-    elif where == "attribute":
-        graph = nw.graph([constant, add], [], [x], [y])
-    elif where == "branch":
-        branch = nw.field(5, nw.field(1, "then_branch") + nw.field(6, inner) + nw.field(20, 5))
-        graph = nw.graph([nw.node("If", ["c"], ["y"], attributes=branch)], [], [x], [y])
-    elif where.startswith("sparse"):
-        graph += nw.field(15, nw.field(2 if where.endswith("indices") else 1, OUTSIDE))
-    elif where == "list of tensors":
-        graph = nw.graph([nw.node("Add", [], [], attributes=nw.field(5, nw.field(10, OUTSIDE))), add], [], [x], [y])
-    elif where == "function":
-        more = nw.field(25, own + nw.field(7, constant))
-    elif where == "default of a function":
-        more = nw.field(25, own + nw.field(11, CONSTANT))
-    elif where == "graph in a default of a function":
-        more = nw.field(25, own + nw.field(11, nw.field(1, "body") + nw.field(6, inner)))
-    else:
-        more = nw.field(20, nw.field({"first step of training": 1, "training": 2}[where], inner))
-    return nw.model(graph, more)
+    inner, own = nw.graph([constant], [], [], []), nw.field(1, "Own") + nw.field(10, "own")
+    branch = nw.field(5, nw.field(1, "then_branch") + nw.field(6, inner) + nw.field(20, 5))
+    listed = nw.node("Add", [], [], attributes=nw.field(5, nw.field(10, OUTSIDE)))
+    plain = nw.graph([add], [], [x], [y])
+    return {
+        "initializer": nw.model(nw.graph([add], [OUTSIDE], [x], [y])),
+        "attribute": nw.model(nw.graph([constant, add], [], [x], [y])),
+        "branch": nw.model(nw.graph([nw.node("If", ["c"], ["y"], attributes=branch)], [], [x], [y])),
+        "sparse values": nw.model(plain + nw.field(15, nw.field(1, OUTSIDE))),
+        "sparse indices": nw.model(plain + nw.field(15, nw.field(2, OUTSIDE))),
+        "list of tensors": nw.model(nw.graph([listed, add], [], [x], [y])),
+        "function": nw.model(plain, nw.field(25, own + nw.field(7, constant))),
+        "default of a function": nw.model(plain, nw.field(25, own + nw.field(11, CONSTANT))),
+        "graph of a default": nw.model(plain, nw.field(25, own + nw.field(11, nw.field(1, "body") + nw.field(6, inner)))),
+        "first step of training": nw.model(plain, nw.field(20, nw.field(1, inner))),
+        "training": nw.model(plain, nw.field(20, nw.field(2, inner))),
+    }[where]
 
 
 @pytest.mark.parametrize(
     "where",
     [
         "initializer", "attribute", "branch", "sparse values", "sparse indices", "list of tensors", "function",
-        "default of a function", "graph in a default of a function", "first step of training", "training",
+        "default of a function", "graph of a default", "first step of training", "training",
     ],
 )  # fmt: skip
 def test_weights_in_another_file_are_refused_though_it_exists(tmp_path, where, monkeypatch):
     np.ones(1, "<f4").tofile(tmp_path / "weights.bin")
     monkeypatch.chdir(tmp_path)  # onnxruntime would look for them here
-    path = nw.write(tmp_path / "m.onnx", placed(where))
     with pytest.raises(DataError, match="weights of 'k' are in another file"):
-        open_network(path)
+        opened(tmp_path, placed(where))
 
 
 def test_what_protobuf_would_read_otherwise_is_refused(tmp_path):
-    """A key of 33 bits stands for another field there, and of a text that is given twice the last holds."""
+    """A key of 33 bits stands for another field there, of a text that is given twice the last holds, and graphs may nest."""
     key = nw.varint((1 << 32) + (13 << 3 | 2))
     entry = nw.field(1, "location") + nw.field(2, "weights.bin")
     hidden = nw.field(1, 1) + nw.field(2, 1) + nw.field(8, "k") + key + nw.varint(len(entry)) + entry
-    x, y = nw.value("x", (1, 3, "h", "w")), nw.value("y", (1, 3, "h", "w"))
-    add = nw.node("Add", ["x", "k"], ["y"])
-    with pytest.raises(DataError, match="field number"):
-        open_network(nw.write(tmp_path / "m.onnx", nw.model(nw.graph([add], [hidden], [x], [y]))))
-    twice = add + nw.field(7, "ai.on") + nw.field(7, "nx")
-    with pytest.raises(DataError, match="nx::Add is not part of ONNX"):
-        open_network(nw.write(tmp_path / "m.onnx", nw.model(nw.graph([twice], [], [x], [y]))))
+    body = nw.graph([], [], [], [])
+    for _ in range(200):
+        body = nw.graph([nw.node("If", [], [], attributes=nw.field(5, nw.field(6, body)))], [], [], [])
+    twice = nw.graph([nw.node("Add", ["x", "k"], ["y"]) + nw.field(7, "ai.on") + nw.field(7, "nx")], [], [], [])
+    for data, words in (
+        (one_node("Add", of=("x", "k"), tensors=[hidden]), "field number"), (nw.model(body), "nested deeper"),
+        (nw.model(twice), "nx::Add is not part of ONNX"),
+    ):  # fmt: skip
+        with pytest.raises(DataError, match=words):
+            opened(tmp_path, data)
 
 
 def test_functions_that_travel_in_the_file_are_welcome(tmp_path):
     """Exporters of torch put composed operators into functions of domains of their own."""
     twice = nw.field(1, "Twice") + nw.field(10, "own") + nw.field(4, "a") + nw.field(5, "b")
     twice += nw.field(7, nw.node("Add", ["a", "a"], ["b"])) + nw.field(9, nw.field(1, "") + nw.field(2, 17))
-    x, y = nw.value("x", (1, 3, "h", "w")), nw.value("y", (1, 3, "h", "w"))
-    more = nw.field(25, twice) + nw.field(8, nw.field(1, "own") + nw.field(2, 1))
-    path = nw.write(tmp_path / "m.onnx", nw.model(nw.graph([nw.node("Twice", ["x"], ["y"], "own")], [], [x], [y]), more))
     image = np.random.default_rng(0).normal(size=(4, 4, 3)).astype(np.float32)
-    np.testing.assert_allclose(open_network(path).run(image)[0], 2 * image.transpose(2, 0, 1))
-
-
-def test_nested_graphs_end(tmp_path):
-    body = nw.graph([], [], [], [])
-    for _ in range(200):
-        body = nw.graph([nw.node("If", [], [], attributes=nw.field(5, nw.field(6, body)))], [], [], [])
-    with pytest.raises(DataError, match="nested deeper"):
-        open_network(nw.write(tmp_path / "m.onnx", nw.model(body)))
-
-
-def test_no_bytes_crash_the_reader(tmp_path):
-    """Damaged files raise a DataError or still work."""
-    rng = np.random.default_rng(5)
-    for i in range(150):
-        data = bytearray(GOOD)
-        for at in rng.integers(len(data), size=rng.integers(1, 6)):
-            data[at] = rng.integers(256)
-        try:
-            open_network(nw.write(tmp_path / f"{i}.onnx", bytes(data)))
-        except DataError as e:
-            assert f"{i}.onnx" in str(e)
-
-
-def test_a_missing_file_and_an_unknown_provider(tmp_path):
-    with pytest.raises(DataError, match="cannot be read"):
-        open_network(tmp_path / "none.onnx")
-    with pytest.raises(UsageError, match="'tpu' is not one of cpu, cuda"):
-        open_network(tmp_path / "none.onnx", provider="tpu")
+    network = opened(tmp_path, one_node("Twice", domain="own") + nw.field(25, twice))
+    np.testing.assert_allclose(network.run(image)[0], 2 * image.transpose(2, 0, 1))
 
 
 def test_cuda_where_onnxruntime_has_none(tmp_path, monkeypatch):
@@ -215,13 +167,13 @@ def test_cuda_where_onnxruntime_has_none(tmp_path, monkeypatch):
     path = nw.depth_network(tmp_path / "a.onnx")
     monkeypatch.setattr(onnxruntime, "get_available_providers", lambda: ["AzureExecutionProvider", "CPUExecutionProvider"])
     with pytest.raises(ResourceError, match=r"has only cpu\. .*onnxruntime-gpu"):
-        open_network(path, provider="cuda")
+        Network(path, provider="cuda")
     # it may also promise CUDA and then run without: libraries are missing
     monkeypatch.setattr(onnxruntime, "get_available_providers", lambda: ["CUDAExecutionProvider", "CPUExecutionProvider"])
     start = onnxruntime.InferenceSession
     monkeypatch.setattr(onnxruntime, "InferenceSession", lambda data, options, **_: start(data, options))
     with pytest.raises(ResourceError, match="finds no cuda libraries or device"):
-        open_network(path, provider="cuda")
+        Network(path, provider="cuda")
 
     # or fail on the device, which a damaged file would do on the CPU, too
     def broken(data, options, providers, **_):
@@ -231,45 +183,30 @@ def test_cuda_where_onnxruntime_has_none(tmp_path, monkeypatch):
 
     monkeypatch.setattr(onnxruntime, "InferenceSession", broken)
     with pytest.raises(ResourceError, match=r"--onnx-provider cuda: onnxruntime cannot use it \(CUDA failure 100"):
-        open_network(path, provider="cuda")
+        Network(path, provider="cuda")
     with pytest.raises(DataError, match="cannot load it"):
-        open_network(nw.write(tmp_path / "m.onnx", REFUSED["unknown operator"][0]), provider="cuda")
+        opened(tmp_path, REFUSED["unknown operator"][0], provider="cuda")
 
 
 @pytest.mark.parametrize(
-    ("weights", "bias", "message"),
-    [(EYE, [0, np.nan, 0], "NaN or infinity"), (EYE, [0, np.inf, 0], "NaN or infinity"), (0 * EYE, [2, 2, 2], "same number")],
-)
-def test_outputs_that_say_nothing_are_refused(tmp_path, weights, bias, message):
-    network = open_network(nw.write(tmp_path / "m.onnx", nw.linear(weights, np.array(bias, float))))
-    with pytest.raises(DataError, match=message):
-        network.run(np.random.default_rng(0).random((4, 4, 3), np.float32))
-
-
-def test_labels_instead_of_scores_are_refused(tmp_path):
-    x, y = nw.value("x", (1, 3, "h", "w")), nw.value("y", (1, 1, "h", "w"), 7)
-    argmax = nw.node("ArgMax", ["x"], ["y"], attributes=nw.whole_attribute("axis", 1))
-    network = open_network(nw.write(tmp_path / "m.onnx", nw.model(nw.graph([argmax], [], [x], [y]))))
-    with pytest.raises(DataError, match="leave argmax out"):
-        network.run(np.random.default_rng(0).random((4, 4, 3), np.float32))
-
-
-def test_a_size_that_the_graph_cannot_take_is_said(tmp_path):
-    x, y = nw.value("x", (1, 3, "h", "w")), nw.value("y", (1, 3, "h", "w"))
-    graph = nw.graph([nw.node("Add", ["x", "k"], ["y"])], [nw.tensor("k", np.ones((1, 3, 8, 8)))], [x], [y])
-    network = open_network(nw.write(tmp_path / "m.onnx", nw.model(graph)))
-    with pytest.raises(DataError, match="cannot run it on an input of 1 x 3 x 5 x 5"):
-        network.run(np.random.default_rng(0).random((5, 5, 3), np.float32))
+    ("data", "message"),
+    [
+        (nw.linear(EYE, np.array([0, np.nan, 0])), "NaN or infinity"), (nw.linear(EYE, np.array([0, np.inf, 0])), "NaN or inf"),
+        (nw.linear(0 * EYE, np.array([2.0, 2, 2])), "same number"),
+        (one_node("ArgMax", out=(1, 1, "h", "w"), attributes=nw.whole_attribute("axis", 1)), "leave argmax out"),
+        (one_node("Add", of=("x", "k"), tensors=[nw.tensor("k", np.ones((1, 3, 8, 8)))]), "input of 1 x 3 x 5 x 5"),
+    ],
+)  # fmt: skip
+def test_outputs_that_say_nothing_are_refused(tmp_path, data, message):
+    with pytest.raises(DataError, match=rf"m\.onnx.*{message}"):
+        opened(tmp_path, data).run(np.random.default_rng(0).random((5, 5, 3), np.float32))
 
 
 def test_names_that_are_not_utf8_are_refused(tmp_path):
     """onnxruntime loads such a network, and fails only where the name is read."""
-    path = nw.depth_network(tmp_path / "a.onnx", size=(8, 12))
-    name = open_network(path).session.get_inputs()[0].name.encode()
-    file = tmp_path / "a.onnx"
-    file.write_bytes(file.read_bytes().replace(name, b"\xff" * len(name)))
-    with pytest.raises(DataError, match=r"a\.onnx"):
-        open_network(path)
+    data = nw.linear(EYE, ZERO)
+    with pytest.raises(DataError, match=r"m\.onnx"):
+        opened(tmp_path, data.replace(nw.field(1, "x"), nw.field(1, b"\xff")))
 
 
 # Disparity from networks with known answers, and from depth that is consistent between views at some pixels.
@@ -299,7 +236,7 @@ def test_normalisation_and_sign(tmp_path, layout, output, sign):
     how = Preprocessing(32, 32, MEAN, STD, output)
     if output == "depth":
         image = 0.5 + 0.5 * image  # keeps the response above 0
-    found = network_disparity(open_network(nw.depth_network(tmp_path / "d.onnx", layout=layout)), how, image)
+    found = network_disparity(Network(nw.depth_network(tmp_path / "d.onnx", layout=layout)), how, image)
     assert found.dtype == np.float32 and found.shape == (32, 64) and (found.min(), found.max()) == (0, 1)
     np.testing.assert_allclose(found, scaled(response(image) ** sign), atol=2e-6)
 
@@ -308,17 +245,16 @@ def test_resizing_keeps_pixel_centres(tmp_path):
     """A ramp stays a ramp through a network of a quarter of the size, flat only beyond its outermost centres."""
     x, y = np.meshgrid(np.arange(96) + 0.5, np.arange(64) + 0.5)
     image = np.repeat((x / 200 + y / 150)[..., None], 3, 2).astype(np.float32)
-    network = open_network(nw.depth_network(tmp_path / "d.onnx", size=(16, 24)))
+    network = Network(nw.depth_network(tmp_path / "d.onnx", size=(16, 24)))
     found = network_disparity(network, Preprocessing(0, 0, (0.0,) * 3, (1.0,) * 3, "disparity"), image)
     np.testing.assert_allclose(found, scaled(x.clip(2, 94) / 200 + y.clip(2, 62) / 150), atol=1e-5)
 
 
 def test_free_inputs_keep_proportions_and_multiples():
     how = Preprocessing(384, 32, *HALF, "disparity")
-    assert how.free_size(378, 504) == (384, 512)
-    assert how.free_size(1920, 1080) == (672, 384)
-    assert Preprocessing(518, 14, *HALF, "disparity").free_size(378, 504) == (518, 686)
+    assert how.free_size(378, 504) == (384, 512) and how.free_size(1920, 1080) == (672, 384)
     assert how.free_size(10, 10_000)[0] == 384
+    assert Preprocessing(518, 14, *HALF, "disparity").free_size(378, 504) == (518, 686)
 
 
 def test_resize_is_linear_up_and_mean_down():
@@ -332,75 +268,62 @@ def test_resize_is_linear_up_and_mean_down():
         np.testing.assert_array_equal(found, np.stack([resize(many[..., c], *size) for c in range(21)], -1))
 
 
-def test_depth_that_is_not_positive_is_refused(tmp_path):
-    network = open_network(nw.depth_network(tmp_path / "d.onnx"))
+def test_outputs_that_are_no_depth_are_refused(tmp_path):
+    network = Network(nw.depth_network(tmp_path / "d.onnx"))
     with pytest.raises(DataError, match=r"smallest depth is .*JSON file beside it"):
         network_disparity(network, Preprocessing(32, 32, (6.0,) * 3, (0.2,) * 3, "depth"), photo(32, 32))
-
-
-def test_an_output_that_is_no_map_is_refused(tmp_path):
-    network = open_network(nw.segmentation_network(tmp_path / "s.onnx"))
+    network = Network(nw.segmentation_network(tmp_path / "s.onnx"))
     with pytest.raises(DataError, match=r"shape \(1, 21, 384, 384\), not that of one depth map"):
         network_disparity(network, DEFAULTS, photo(32, 32))
 
 
 def described(path):
-    return describe(open_network(path), DEFAULTS, "depth")
+    return describe(Network(path), DEFAULTS, "depth")
 
 
 def test_the_side_file_comes_before_what_is_usual(tmp_path):
-    path = nw.depth_network(tmp_path / "d.onnx")
+    """Also the documented one."""
+    path, side = nw.depth_network(tmp_path / "d.onnx"), tmp_path / "d.onnx.json"
     how, notes = described(path)
     assert how == DEFAULTS
     assert notes == [
         "d.onnx: assumed size 384, multiple 32, mean 0.5 0.5 0.5, std 0.5 0.5 0.5, output disparity; "
         "to change them, write d.onnx.json"
     ]
-    side = {"size": 518, "multiple": 14, "mean": IMAGENET[0], "std": IMAGENET[1], "output": "depth"}
-    (tmp_path / "d.onnx.json").write_text(json.dumps(side))
+    side.write_text(json.dumps({"size": 518, "multiple": 14, "mean": IMAGENET[0], "std": IMAGENET[1], "output": "depth"}))
     assert described(path) == (Preprocessing(518, 14, *IMAGENET, "depth"), [])
-
-
-def test_the_documented_side_file_is_one(tmp_path):
-    (text,) = re.findall(r"```json\n(.*?)```", (Path(__file__).parents[2] / "docs" / "priors.md").read_text("utf-8"), re.DOTALL)
-    (tmp_path / "d.onnx.json").write_text(text)
-    assert described(nw.depth_network(tmp_path / "d.onnx")) == (Preprocessing(518, 14, *IMAGENET, "disparity"), [])
+    page = Path(__file__).parents[2] / "docs" / "priors.md"
+    side.write_text(*re.findall(r"```json\n(.*?)```", page.read_text("utf-8"), re.DOTALL))
+    assert described(path) == (Preprocessing(518, 14, *IMAGENET, "disparity"), [])
 
 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
         ("{", "cannot be read"),
-        ("[1]", "no JSON object"),
-        ('{"men": [0, 0, 0]}', "key 'men' is unknown; size, multiple, mean, std, output"),
-        ('{"mean": [0, 0]}', "mean must be three numbers"),
-        ('{"mean": [0, 0, NaN]}', "mean must be three numbers"),
-        ('{"std": [1, 1, 0]}', "std must be three numbers above 0"),
+        ("[1]", "must be an object"),
+        ('{"men": [0, 0, 0]}', "men is unknown.* size, multiple, mean, std, output"),
+        ('{"mean": [0, 0]}', "mean must be a list of 3"),
+        ('{"mean": [0, 0, NaN]}', "must be a finite number"),
+        ('{"std": [1, 1, 0]}', "must be a finite number above 0"),
         ('{"size": 1.5}', "size must be a whole number"),
         ('{"multiple": true}', "multiple must be a whole number"),
-        ('{"output": "height"}', "output must be disparity, depth or classes, not 'height'"),
+        ('{"output": "height"}', "output must be one of disparity, depth, classes, not 'height'"),
     ],
 )
 def test_side_files_with_faults(tmp_path, text, message):
     (tmp_path / "d.onnx.json").write_text(text)
-    with pytest.raises(DataError, match=message):
+    with pytest.raises(DataError, match=rf"d\.onnx\.json.*{message}"):
         described(nw.depth_network(tmp_path / "d.onnx"))
 
 
 def test_a_size_against_the_graph_is_refused(tmp_path):
     path = nw.depth_network(tmp_path / "d.onnx", size=(32, 48))
-    for size in (64, 32):
-        (tmp_path / "d.onnx.json").write_text(json.dumps({"size": size}))
-        if size == 32:
-            assert described(path)[0].mean == DEFAULTS.mean
-        else:
-            with pytest.raises(DataError, match=r"size 64, but .* takes 48 x 32 px only"):
-                described(path)
-
-
-def test_unit_range_of_a_wall_is_zero():
-    assert (unit_range(np.full((3, 4), 7.0)) == 0).all()
-    assert unit_range(np.array([[3.0, 5.0, 4.0]])).tolist() == [[0, 1, 0.5]]
+    (tmp_path / "d.onnx.json").write_text(json.dumps({"size": 32}))
+    assert described(path)[0].mean == DEFAULTS.mean
+    (tmp_path / "d.onnx.json").write_text(json.dumps({"size": 64}))
+    with pytest.raises(DataError, match=r"size 64, but .* takes 48 x 32 px only"):
+        described(path)
 
 
 # completion
@@ -425,15 +348,8 @@ def test_gaps_are_filled_up_to_the_colour_edge_and_not_across():
     wanted = scaled(inverse)
     assert np.abs(found - wanted).max() < 0.08 and np.abs(found - wanted).mean() < 0.02
     assert ((found > 0.5) == near).all()
-
-
-def test_completion_knows_no_unit_of_length():
-    image, inverse, near = two_planes()
-    valid = np.random.default_rng(1).random(near.shape) < 0.1
-    depth = np.where(valid, 1 / inverse, 0)
-    sensitivity = np.where(valid, 0.01 / inverse**2, np.inf)
-    found = complete_disparity(image, depth, valid, sensitivity)
-    np.testing.assert_allclose(complete_disparity(image, 1000 * depth, valid, 1000 * sensitivity), found, atol=1e-4)
+    again = complete_disparity(image, 1000 * depth, valid, np.where(valid, 10, np.inf))  # in another unit of length
+    np.testing.assert_allclose(again, found, atol=1e-4)
 
 
 def test_badly_conditioned_depths_yield():
@@ -461,29 +377,21 @@ def test_weights_are_those_of_inverse_depth():
     assert found[:, :25].min() > 0.95 and found[:, 65:].max() < 0.05
 
 
-def test_one_depth_and_one_far_wild_depth():
+def test_lone_wild_and_missing_depths():
     image, inverse, near = two_planes()
-    lone = np.zeros(near.shape, bool)
+    lone, everywhere, unknown = np.zeros(near.shape, bool), np.ones(near.shape, bool), np.full(near.shape, np.inf)
+    for depth, valid in ((1 / inverse, lone), (np.full(near.shape, np.nan), everywhere)):
+        with pytest.raises(DataError, match="no pixel has a depth"):
+            complete_disparity(image, depth, valid, unknown)
+    # a depth without a known sensitivity still counts, if least
+    assert np.isfinite(complete_disparity(image, 1 / inverse, everywhere, unknown)).all()
     lone[30, 40] = True
     assert (complete_disparity(image, np.where(lone, 2.0, 0), lone, np.where(lone, 0.1, np.inf)) == 0).all()
-    everywhere = np.ones(near.shape, bool)
-    depth = 1 / inverse
-    depth[0, 0] = 1e-6  # a million times nearer than all else
-    sensitivity = np.full(near.shape, 0.1)
-    sensitivity[0, 0] = 0  # and quite sure of it
+    assert (unit_range(np.full((3, 4), 7.0)) == 0).all() and unit_range(np.array([[3.0, 5, 4]])).tolist() == [[0, 1, 0.5]]
+    depth, sensitivity = 1 / inverse, np.full(near.shape, 0.1)
+    depth[0, 0], sensitivity[0, 0] = 1e-6, 0  # a million times nearer than all else, and quite sure of it
     found = complete_disparity(image, depth, everywhere, sensitivity)
     assert found[near].mean() - found[~near].mean() > 0.8
-
-
-def test_without_any_depth_there_is_nothing_to_complete():
-    image, inverse, near = two_planes()
-    nowhere, unknown = np.zeros(near.shape, bool), np.full(near.shape, np.inf)
-    with pytest.raises(DataError, match="no pixel has a depth"):
-        complete_disparity(image, 1 / inverse, nowhere, unknown)
-    with pytest.raises(DataError, match="no pixel has a depth"):
-        complete_disparity(image, np.full(near.shape, np.nan), ~nowhere, unknown)
-    # a depth without a known sensitivity still counts, if least
-    assert np.isfinite(complete_disparity(image, 1 / inverse, ~nowhere, unknown)).all()
 
 
 # Maps of a segmentation network with known answers, the falloff of boundaries, and the classical stand-in.
@@ -509,14 +417,10 @@ def test_sides_of_reduced_images_are_quick_to_transform():
 def brute_boundary(labels):
     """Return exp(-d^2 / 2 s^2) by the distances of every pixel to all pixels at a label change."""
     height, width = labels.shape
-    edges = []
-    for i in range(height):
-        for j in range(width):
-            near = [(i + a, j + b) for a, b in ((0, 1), (1, 0), (0, -1), (-1, 0))]
-            if any(0 <= k < height and 0 <= m < width and labels[k, m] != labels[i, j] for k, m in near):
-                edges.append((i, j))
+    padded = np.pad(labels, 1, mode="edge")
+    near = [padded[1 + a : 1 + a + height, 1 + b : 1 + b + width] for a, b in ((0, 1), (1, 0), (0, -1), (-1, 0))]
     i, j = np.mgrid[:height, :width]
-    d2 = np.min([(i - a) ** 2 + (j - b) ** 2 for a, b in edges], axis=0)
+    d2 = np.min([(i - a) ** 2 + (j - b) ** 2 for a, b in np.argwhere(np.any([n != labels for n in near], 0))], axis=0)
     return np.exp(-d2 / (2 * (2 * width / 500) ** 2))
 
 
@@ -526,16 +430,12 @@ def brute_boundary(labels):
 def test_maps_equal_the_formula(tmp_path, options):
     """Softmax, largest probability, 1 - background and falloff, for logits and probabilities, in both layouts."""
     image, labels = shapes()
-    maps = network_semantics(open_network(nw.segmentation_network(tmp_path / "s.onnx", **options)), PLAIN, image)
+    maps = network_semantics(Network(nw.segmentation_network(tmp_path / "s.onnx", **options)), PLAIN, image)
     weights, bias = nw.segmentation_weights()
     p = np.exp(image.astype(float) @ weights.T + bias)
     p /= p.sum(-1, keepdims=True)
     assert (p.argmax(-1) == labels).all()
-    for found, wanted in (
-        (maps.confidence, p.max(-1)),
-        (maps.foreground, 1 - p[..., 0]),
-        (maps.boundary, brute_boundary(labels)),
-    ):
+    for found, wanted in zip(maps, (p.max(-1), brute_boundary(labels), 1 - p[..., 0])):
         assert found.dtype == np.float32 and found.shape == labels.shape
         np.testing.assert_allclose(found, wanted, atol=1e-5)
 
@@ -544,7 +444,7 @@ def test_a_coarse_network_puts_labels_where_they_are(tmp_path):
     """At a quarter of the size each label covers its object; a shift of half a pixel would show."""
     image, labels = np.zeros((128, 256, 3), np.float32), np.zeros((128, 256), int)
     image[32:80, 64:160, 0], labels[32:80, 64:160] = 0.9, 3
-    network = open_network(nw.segmentation_network(tmp_path / "s.onnx", size=(32, 64)))
+    network = Network(nw.segmentation_network(tmp_path / "s.onnx", size=(32, 64)))
     p = class_probabilities(network, PLAIN, image)
     found = p.argmax(-1)
     # the object's outline lies on the coarse grid, so errors are the same on all sides
@@ -554,11 +454,11 @@ def test_a_coarse_network_puts_labels_where_they_are(tmp_path):
     np.testing.assert_allclose(p.sum(-1), 1, atol=1e-5)
 
 
-@pytest.mark.parametrize("count", [1, 20, 22])
+@pytest.mark.parametrize("count", [1, 20])
 def test_another_number_of_classes_is_refused(tmp_path, count):
     path = nw.write(tmp_path / "s.onnx", nw.linear(np.random.default_rng(0).normal(size=(count, 3)), np.zeros(count)))
     with pytest.raises(DataError, match=f"{count}, 32, 64.*21 PASCAL VOC classes"):
-        class_probabilities(open_network(path), PLAIN, shapes()[0])
+        class_probabilities(Network(path), PLAIN, shapes()[0])
 
 
 def test_boundary_scales_with_the_width_and_is_nothing_without_labels():
@@ -571,12 +471,9 @@ def test_boundary_scales_with_the_width_and_is_nothing_without_labels():
 
 
 def test_when_foreground_is_known():
-    def maps(foreground, boundary):
-        return SemanticMaps(np.ones((10, 10)), np.full((10, 10), float(boundary)), np.full((10, 10), foreground))
-
-    assert knows_foreground(maps(0.02, 1)) and not knows_foreground(maps(0.009, 1))
-    assert not knows_foreground(maps(0.1, 0)), "every label is background"
-    assert knows_foreground(maps(0.9, 0)), "every label is an object"
+    for foreground, boundary, known in ((0.02, 1, True), (0.009, 1, False), (0.1, 0, False), (0.9, 0, True)):
+        maps = np.full((10, 10), float(boundary)), np.full((10, 10), foreground)
+        assert knows_foreground(*maps) is known, "without a boundary every label is background, or an object"
 
 
 def test_classical_maps_show_an_object_and_its_outline():
@@ -586,14 +483,11 @@ def test_classical_maps_show_an_object_and_its_outline():
     disc = radius < 22
     image = np.where(disc[..., None], [0.9, 0.7, 0.2], [0.1, 0.12, 0.15])
     image = np.clip(image + np.random.default_rng(0).normal(0, 0.01, image.shape), 0, 1).astype(np.float32)
-    maps = classical_semantics(image)
-    for m in (maps.confidence, maps.boundary, maps.foreground):
+    confidence, boundary, foreground = maps = classical_semantics(image)
+    for m in maps:
         assert m.dtype == np.float32 and m.shape == disc.shape and 0 <= m.min() <= m.max() <= 1
-    assert maps.foreground[disc].mean() > 2 * maps.foreground[radius > 40].mean() + 0.1
-    assert maps.boundary[np.abs(radius - 22) < 0.7].mean() > 0.5 and maps.boundary[np.abs(radius - 22) > 6].max() < 0.01
-    np.testing.assert_array_equal(maps.confidence, np.maximum(maps.foreground, 1 - maps.foreground))
-
-
-def test_classical_maps_of_an_even_wall_are_finite():
-    maps = classical_semantics(np.full((40, 50, 3), 0.5, np.float32))
-    assert all(np.isfinite(m).all() for m in (maps.confidence, maps.boundary, maps.foreground)) and not maps.boundary.any()
+    assert foreground[disc].mean() > 2 * foreground[radius > 40].mean() + 0.1
+    assert boundary[np.abs(radius - 22) < 0.7].mean() > 0.5 and boundary[np.abs(radius - 22) > 6].max() < 0.01
+    np.testing.assert_array_equal(confidence, np.maximum(foreground, 1 - foreground))
+    wall = classical_semantics(np.full((40, 50, 3), 0.5, np.float32))
+    assert all(np.isfinite(m).all() for m in wall) and not wall[1].any()

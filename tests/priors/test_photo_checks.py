@@ -29,11 +29,6 @@ def sharp():
     return photos(_print, width=160, height=120, half=(1.2, 0.9), cameras=ring(9, 160, 120)[2:7])
 
 
-def _named(views) -> list[str]:
-    """The notes on these photographs."""
-    return photo_notes(check_photos(views))
-
-
 def _with(views, index, image):
     """The views, one of them with another image."""
     changed = list(views)
@@ -54,9 +49,8 @@ def test_photographs_without_faults_are_not_named(sharp):
 def test_a_blurred_photograph_is_named_alone(sharp, index):
     """A shake of 3 px, at the end of the row and in the middle."""
     kernel = np.diag([1 / 3] * 3).astype(np.float32)
-    notes = _named(_with(sharp, index, cv2.filter2D(sharp[index].image, -1, kernel)))
-    assert len(notes) == 1 and "blurred" in notes[0]
-    assert [v.name for v in sharp if v.name in notes[0]] == [sharp[index].name]
+    (note,) = photo_notes(check_photos(_with(sharp, index, cv2.filter2D(sharp[index].image, -1, kernel))))
+    assert "blurred" in note and [v.name for v in sharp if v.name in note] == [sharp[index].name]
 
 
 @pytest.mark.parametrize("gain", [0.7, 1.4])

@@ -1,35 +1,33 @@
 """The plane sweep: planes, costs and paths as defined, depth of a known scene, and the same on any device."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import torch
 
 from tests.priors.rigs import rig, still_life
 from tests.reference.sweep import best_inverse, matching_costs, scanline_costs
-from warpgs.errors import UsageError
 from warpgs.geometry import back_project, project_points
-from warpgs.kernels.sweep import NEUTRAL, best_inverses
+from warpgs.kernels.sweep import NEUTRAL
 from warpgs.priors import sweep
 from warpgs.priors.flow import pixel_grid
 from warpgs.priors.sweep import (
-    MAX_LARGE_STEP,
     UNIT,
-    SweepConfig,
     complete,
     consistent_depth,
     inverse_depths_cpu,
-    matching_costs_cpu,
-    path_costs,
     plane_homographies,
     plane_homography,
     plane_inverses,
     project_inverse,
-    step_limits,
     sweep_depths,
 )
 from warpgs.scene import Camera, View
 
 # Planes in the right places, costs and paths as defined, and depth of a scene that is known exactly.
+
+CPU, PLANES = torch.device("cpu"), np.linspace(1 / 12, 1 / 2, 40)
 
 
 def test_homography_and_inverse_depth_agree_with_projection():
@@ -49,69 +47,14 @@ def test_homography_and_inverse_depth_agree_with_projection():
 def test_planes_are_half_a_pixel_apart():
     """No match inside both images moves farther than asked between planes; fewer planes where they are capped or needless."""
     a, b, _ = rig()
-    inverses = plane_inverses(a, [b], (2.5, 6.0), 0.5, 256)
+    inverses = plane_inverses(a, [b], (2.5, 6.0))
     assert inverses[0] == pytest.approx(1 / 6) and inverses[-1] == pytest.approx(1 / 2.5) and 8 < len(inverses) < 256
     pixels = pixel_grid(a)
     at = np.stack([project_inverse(a, b, pixels, np.full(len(pixels), w)) for w in inverses])
     inside = ((at >= 0) & (at < [64, 48])).all(2)
     steps = np.linalg.norm(np.diff(at, axis=0), axis=2)[inside[1:] & inside[:-1]]
     assert 0.4 < steps.max() < 0.55
-    assert len(plane_inverses(a, [b], (2.5, 6.0), 0.5, 20)) == 20 and len(plane_inverses(a, [], (2.5, 6.0), 0.5, 20)) == 8
-
-
-def test_cost_is_least_at_the_true_plane():
-    """A wall parallel to the image costs nothing at its plane, more at others, 0.5 where the other view does not reach."""
-    generator = np.random.default_rng(0)
-    K = np.array([[40.0, 0, 20], [0, 40, 15], [0, 0, 1]])
-    texture = generator.uniform(0.1, 0.9, (30, 60, 3)).astype(np.float32)
-    shifted = np.eye(4)
-    shifted[0, 3] = -0.5  # a step to the right: 5 px at depth 4
-    views = [
-        View("a", Camera(np.eye(4), K, 40, 30), texture[:, :40]),
-        View("b", Camera(shifted, K, 40, 30), 0.5 * texture[:, 5:45] + 0.2),  # another exposure
-    ]
-    costs = matching_costs_cpu(views[0], views[1:], np.array([0.15, 0.25, 0.35]), 5).numpy().transpose(2, 0, 1) / UNIT
-    seen = (slice(3, -3), slice(9, -3))
-    assert costs.shape == (16, 30, 40) and (costs[3:] == 1).all() and costs[1][seen].max() < 0.01
-    assert costs[0][seen].min() > 0.1 and costs[2][seen].min() > 0.1
-    assert np.allclose(costs[1, :, :4], 0.5)
-
-
-def test_paths_are_those_of_the_definition():
-    """Paths equal the recursion written pixel by pixel, to the last unit; an edge of the image lets depth jump."""
-    generator = np.random.default_rng(1)
-    costs = generator.integers(0, UNIT + 1, (4, 5, 6)).astype(np.int16)
-    image = generator.uniform(0.4, 0.55, (4, 5, 3)).astype(np.float32)
-    p1, p2 = 0.05, 0.6
-
-    def limit(a: np.ndarray, b: np.ndarray) -> int:
-        return round(max(p2 * np.exp(-np.abs(a - b).max() / 0.06), 1.5 * p1) * UNIT)
-
-    down = np.array([[limit(image[y, x], image[y + 1, x]) for x in range(5)] for y in range(3)])
-    across = np.array([[limit(image[y, x], image[y, x + 1]) for x in range(4)] for y in range(4)])
-    found = path_costs(torch.from_numpy(costs), image, p1, p2).numpy()
-    assert np.array_equal(found, scanline_costs(costs, down, across, round(p1 * UNIT))) and np.ptp(down) > 500
-
-
-def test_paths_of_the_largest_costs_fit_in_16_bits():
-    """With the best plane changing at every pixel and all others at cost 1, nothing overflows."""
-    costs = np.full((6, 6, 8), UNIT, np.int16)
-    y, x = np.indices((6, 6))
-    costs[y, x, (3 * y + 5 * x) % 8] = 0
-    found = path_costs(torch.from_numpy(costs), np.zeros((6, 6, 3), np.float32), 0.03, MAX_LARGE_STEP).numpy()
-    limits = np.full((6, 6), round(MAX_LARGE_STEP * UNIT))
-    wanted = scanline_costs(costs, limits[1:], limits[:, 1:], round(0.03 * UNIT))
-    assert np.array_equal(found, wanted) and wanted.max() > 3 * UNIT and wanted.min() >= 0
-    assert 4 * (1 + MAX_LARGE_STEP) * UNIT + 4 < 2**15
-
-
-def test_parabola_between_planes():
-    """The minimum of a sampled parabola is found between the samples; flat costs give the sample itself."""
-    inverses = np.linspace(0.1, 0.5, 9)
-    truth = np.array([[0.2, 0.237, 0.31]])
-    costs = torch.from_numpy(np.rint(1e5 * (inverses - truth[..., None]) ** 2).astype(np.int16))
-    assert np.allclose(best_inverses(costs, inverses), truth, rtol=1e-4)
-    assert np.allclose(best_inverses(torch.zeros(1, 1, 16, dtype=torch.int16), inverses), inverses[1])
+    assert len(plane_inverses(a, [b], (2.5, 6.0), 20)) == 20 and len(plane_inverses(a, [], (2.5, 6.0))) == 8
 
 
 def test_depths_are_the_same_bits_on_any_number_of_threads():
@@ -120,7 +63,7 @@ def test_depths_are_the_same_bits_on_any_number_of_threads():
     found, before = [], torch.get_num_threads()
     for threads in (1, 3):
         torch.set_num_threads(threads)
-        found.append(inverse_depths_cpu(views[1], [views[0], views[2]], np.linspace(1 / 12, 1 / 2, 40), SweepConfig()))
+        found.append(inverse_depths_cpu(views[1], [views[0], views[2]], PLANES))
     torch.set_num_threads(before)
     assert np.array_equal(*found)
 
@@ -129,22 +72,21 @@ def test_only_consistent_depth_counts():
     """True depths pass where a second view sees them, a wrong patch does not, nor does anything without parallax."""
     views, depths = still_life()
     inverses = [1 / d for d in depths]
-    config = SweepConfig()
-    right = consistent_depth(views, inverses, 1, (0, 2), config)
+    right = consistent_depth(views, inverses, 1, (0, 2))
     assert right.coverage > 0.85 and np.allclose(right.depth[right.valid], depths[1][right.valid], rtol=1e-5)
     wrong = [i.copy() for i in inverses]
     wrong[1][40:60, 60:90] *= 1.2
-    patch = consistent_depth(views, wrong, 1, (0, 2), config)
+    patch = consistent_depth(views, wrong, 1, (0, 2))
     assert not patch.valid[42:58, 62:88].any() and np.array_equal(patch.valid[:38], right.valid[:38])
     assert np.isinf(patch.sensitivity[~patch.valid]).all() and (patch.depth[~patch.valid] == 0).all()
-    still = consistent_depth([views[0], views[0]], [inverses[0]] * 2, 0, (1,), config)
+    still = consistent_depth([views[0], views[0]], [inverses[0]] * 2, 0, (1,))
     assert still.coverage == 0 and "agrees" in still.notes[0]
 
 
 def test_sensitivity_is_depth_per_pixel():
     """A change of depth by the sensitivity moves the match by a pixel, in the view where it moves most."""
     views, depths = still_life()
-    found = consistent_depth(views, [1 / d for d in depths], 1, (0, 2), SweepConfig())
+    found = consistent_depth(views, [1 / d for d in depths], 1, (0, 2))
     pixels, z = pixel_grid(views[1].camera), depths[1].ravel()
     moved = []
     for j in (0, 2):
@@ -156,53 +98,35 @@ def test_sensitivity_is_depth_per_pixel():
     assert np.median(np.abs(product[valid] - 1)) < 1e-3 and product[valid].min() > 0.999
 
 
-def test_depth_of_a_known_scene():
-    """Of every ray-cast view three quarters are consistent; half of these err by at most 0.8 %, nine tenths by 5 %."""
+def test_depth_of_a_known_scene(monkeypatch):
+    """Three quarters are consistent; half of these err by at most 0.8 %. Reduced images, with a note, still give 1.5 %."""
     views, depths = still_life()
-    for found, true in zip(sweep_depths(views, [(2, 12)] * 3, SweepConfig()), depths):
+    for found, true in zip(sweep_depths(views, [(2, 12)] * 3), depths):
         error = np.abs(found.depth / true - 1)[found.valid]
         assert found.coverage > 0.75 and np.quantile(error, 0.5) < 0.008 and np.quantile(error, 0.9) < 0.05
-
-
-def test_large_images_are_swept_small_and_masks_hold():
-    """Above the limit of pixels the size is reduced, with a note; masked pixels are not valid."""
-    views, depths = still_life()
-    mask = np.ones(depths[0].shape, bool)
-    mask[:, :50] = False
-    masked = [View(v.name, v.camera, v.image, mask) for v in views]
-    found = sweep_depths(masked, [(2, 12)] * 3, SweepConfig(max_pixels=10_000))
+    monkeypatch.setattr(sweep, "MAX_PIXELS", 10_000)
+    mask = np.broadcast_to(np.arange(160) >= 50, (120, 160))
+    found = sweep_depths([dataclasses.replace(v, mask=mask) for v in views], [(2, 12)] * 3)
     assert found[0].depth.shape == (120, 160) and "swept at 115 x 86 px" in found[0].notes
     assert not any(f.valid[:, :50].any() for f in found)
     error = np.abs(found[1].depth / depths[1] - 1)[found[1].valid]
     assert found[1].valid[:, 50:].mean() > 0.6 and np.median(error) < 0.015
 
 
-def test_of_many_views_some_are_swept():
-    """No more views than asked are swept; the others say so and are valid nowhere; depths are as good, progress is told."""
-    views, depths = still_life(5)
-    told = []
-    config = SweepConfig(max_views=3, max_pixels=10_000)
-    found = sweep_depths(views, [(2, 12)] * 5, config, progress=lambda *counts: told.append(counts))
+def test_of_many_views_some_are_swept(monkeypatch):
+    """No more views than allowed are swept; the others say so and are valid nowhere; progress is told."""
+    views, told = still_life(5)[0], []
+    monkeypatch.setattr(sweep, "MAX_VIEWS", 3)
+    monkeypatch.setattr(sweep, "MAX_PIXELS", 5_000)
+    found = sweep_depths(views, [(2, 12)] * 5, progress=lambda *counts: told.append(counts))
     assert told == [(1, 3), (2, 3), (3, 3)]
     left = [f for f in found if f.notes[0].startswith("not swept: the 3 swept views (of 5) see")]
     assert len(left) == 2 and all(f.coverage == 0 and not f.depth.any() and np.isinf(f.sensitivity).all() for f in left)
-    for f, true in zip(found, depths):
-        if not f.notes[0].startswith("not swept"):
-            assert f.coverage > 0.6 and np.median(np.abs(f.depth / true - 1)[f.valid]) < 0.015
+    assert sum(f.coverage > 0.5 for f in found) == 3
 
 
-@pytest.mark.parametrize("bad", [
-    {"window": 4}, {"window": 1}, {"max_planes": 2}, {"spacing": np.nan}, {"near_count": 0}, {"large_step": 1.0},
-    {"small_step": 0.7}, {"window": 9}, {"max_views": 1},
-])  # fmt: skip
-def test_bad_settings_are_refused(bad):
-    """A UsageError is raised when the settings are made."""
-    with pytest.raises(UsageError):
-        SweepConfig(**bad)
-
-
-def test_completion_follows_the_image():
-    """Each of two flat regions takes the depth of its few valid pixels, up to the edge between them."""
+def test_completion_follows_the_image_and_keeps_planes():
+    """Flat regions take the depth of their few valid pixels up to the edge between them; a slanted plane stays linear."""
     image = np.zeros((40, 60, 3), np.float32)
     image[:, 30:] = 0.8
     true = np.where(np.arange(60) < 30, 2.0, 5.0)[None].repeat(40, 0).astype(np.float32)
@@ -210,15 +134,9 @@ def test_completion_follows_the_image():
     valid[5:10, 5:10] = valid[30:35, 45:55] = True
     filled = complete(np.where(valid, true, 0), valid, image)
     assert np.abs(filled / true - 1).max() < 0.02 and np.array_equal(filled[valid], true[valid])
-
-
-def test_completion_keeps_planes_and_bounds():
-    """A slanted plane with a hole stays linear in inverse depth; all valid changes nothing."""
-    x = np.arange(64)[None].repeat(48, 0)
-    true = (1 / (0.1 + 0.004 * x)).astype(np.float32)
-    valid = np.ones((48, 64), bool)
-    valid[18:30, 26:38] = False
-    image = np.full((48, 64, 3), 0.5, np.float32)
+    true = (1 / (0.1 + 0.004 * np.arange(60)[None].repeat(40, 0))).astype(np.float32)
+    valid[:], image[:] = True, 0.5
+    valid[14:26, 24:36] = False
     filled = complete(np.where(valid, true, 0), valid, image)
     assert np.abs(filled / true - 1).max() < 0.05
     assert filled.min() >= true.min() - 1e-5 and filled.max() <= true.max() + 1e-5
@@ -228,9 +146,6 @@ def test_completion_keeps_planes_and_bounds():
 
 # The sweep in torch finds what the one on the CPU does, step by step; its code is the same on any device.
 
-CPU = torch.device("cpu")
-PLANES = np.linspace(1 / 12, 1 / 2, 40)
-
 
 @pytest.fixture(params=["cpu", pytest.param("cuda", marks=pytest.mark.cuda)])
 def device(request):
@@ -238,9 +153,9 @@ def device(request):
     return torch.device(request.param)
 
 
-def computed(view: View, others: list[View], inverses: np.ndarray, window: int, device: torch.device) -> np.ndarray:
+def computed(view: View, others: list[View], inverses: np.ndarray, device: torch.device, window: int = 7) -> np.ndarray:
     """Return costs in the layout of the reference, [D, H, W]."""
-    found = sweep.matching_costs_cuda(view, others, inverses, window, device)
+    found = sweep.matching_costs_cuda(view, others, inverses, device, window)
     return found.cpu().numpy().transpose(2, 0, 1) / UNIT
 
 
@@ -248,7 +163,7 @@ def test_costs_agree(device):
     """Costs agree to half a unit and the rounding of correlations; neutral costs are neutral in both."""
     views, _ = still_life()
     wanted = matching_costs(views[1], [views[0], views[2]], PLANES, 7)
-    found = computed(views[1], [views[0], views[2]], PLANES, 7, device)
+    found = computed(views[1], [views[0], views[2]], PLANES, device)
     off = np.abs(found - wanted)
     assert off.max() < 2e-3 and np.quantile(off, 0.999) < 2e-4 + 0.5 / UNIT and off.mean() < 5e-6 + 0.25 / UNIT
     silent = wanted == NEUTRAL
@@ -265,19 +180,23 @@ def test_costs_of_another_size_agree(device):
     views = [View("a", Camera(np.eye(4), K, 40, 30), texture[:, :40]), View("b", Camera(behind, K, 60, 30), texture)]
     inverses = np.array([0.15, 0.25, 0.5, 1.0])
     wanted = matching_costs(views[0], views[1:], inverses, 5)
-    found = computed(views[0], views[1:], inverses, 5, device)
+    found = computed(views[0], views[1:], inverses, device, 5)
     assert np.abs(found - wanted).max() < 1e-4 + 0.5 / UNIT and (wanted != NEUTRAL).mean() > 0.3
 
 
-def test_paths_agree(device):
-    """Paths agree to the last unit, in an image with edges."""
+def test_paths_are_those_of_the_definition(device):
+    """Paths agree to the last unit with the recursion written pixel by pixel; an edge of the image lets depth jump."""
     generator = np.random.default_rng(1)
     costs = generator.integers(0, UNIT + 1, (9, 7, 12)).astype(np.int16)
     image = generator.uniform(0.4, 0.55, (9, 7, 3)).astype(np.float32)
-    limits = [step_limits(colors, 0.05, 0.6) for colors in (image, image.swapaxes(0, 1))]
-    wanted = scanline_costs(costs, limits[0], limits[1].T, round(0.05 * UNIT))
+
+    def limits(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        return np.rint(np.maximum(0.6 * np.exp(-np.abs(a - b).max(2).astype(float) / 0.06), 1.5 * 0.05) * UNIT).astype(int)
+
+    down, across = limits(image[1:], image[:-1]), limits(image[:, 1:], image[:, :-1])
     found = sweep.path_costs(torch.from_numpy(costs).to(device), image, 0.05, 0.6)
-    assert np.array_equal(found.cpu().numpy(), wanted)
+    assert np.array_equal(found.cpu().numpy(), scanline_costs(costs, down, across, round(0.05 * UNIT))) and np.ptp(down) > 500
+    assert 4 * (1 + sweep.LARGE_STEP) * UNIT + 4 < 2**15  # no sum of four paths overflows
 
 
 def test_parabola_agrees(device):
@@ -292,10 +211,10 @@ def test_parabola_agrees(device):
 def test_depths_agree(device):
     """Depths of a view of the still life are nearly all the same, with the same error."""
     views, depths = still_life()
-    config, others = SweepConfig(), [views[0], views[2]]
-    planes = plane_inverses(views[1].camera, [o.camera for o in others], (2, 12), config.spacing, config.max_planes)
-    wanted = sweep.inverse_depths_cpu(views[1], others, planes, config)
-    found = sweep.inverse_depths_cuda(views[1], others, planes, config, device)
+    others = [views[0], views[2]]
+    planes = plane_inverses(views[1].camera, [o.camera for o in others], (2, 12))
+    wanted = inverse_depths_cpu(views[1], others, planes)
+    found = sweep.inverse_depths_cuda(views[1], others, planes, device)
     assert found.shape == depths[1].shape and np.quantile(np.abs(found / wanted - 1), 0.95) < 2e-4
     error = np.abs(1 / (found * depths[1]) - 1)
     assert np.median(error) < 0.008
@@ -305,13 +224,14 @@ def test_a_small_gpu_leaves_it_to_the_cpu(monkeypatch):
     """Depths are those of the CPU, and one note names the memory that since a GPU needs."""
     views, _ = still_life()
     monkeypatch.setattr(sweep, "installed_bytes", lambda _: 2**20)
-    found = sweep_depths(views, [(2, 12)] * 3, SweepConfig(), torch.device("cuda"))
-    for a, b in zip(found, sweep_depths(views, [(2, 12)] * 3, SweepConfig())):
-        assert np.array_equal(a.depth, b.depth) and not b.notes
-    assert "since a GPU needs" in found[0].notes[0] and "MiB" in found[0].notes[0] and not found[1].notes
+    monkeypatch.setattr(sweep, "MAX_PIXELS", 5_000)
+    found = sweep_depths(views, [(2, 12)] * 3, torch.device("cuda"))
+    for a, b in zip(found, sweep_depths(views, [(2, 12)] * 3)):
+        assert np.array_equal(a.depth, b.depth) and len(b.notes) == 1
+    assert "since a GPU needs" in found[0].notes[0] and "MiB" in found[0].notes[0] and len(found[1].notes) == 1
 
 
-@pytest.mark.parametrize("size", [(40, 3), (3, 40), (3, 3), (40, 1), (1, 1)])
+@pytest.mark.parametrize("size", [(40, 3), (3, 40), (1, 1)])
 def test_tiny_images_are_left_to_the_cpu(size, monkeypatch):
     """Images narrower than half a window are swept on the CPU: torch mirrors no border there."""
     width, height = size
@@ -321,7 +241,7 @@ def test_tiny_images_are_left_to_the_cpu(size, monkeypatch):
     image = np.random.default_rng(0).random((height, width, 3), np.float32)
     views = [View("a", Camera(np.eye(4), K, width, height), image), View("b", Camera(aside, K, width, height), image)]
     monkeypatch.setattr(sweep, "installed_bytes", lambda _: 2**40)
-    found = sweep_depths(views, [(2, 12)] * 2, SweepConfig(), torch.device("cuda"))
+    found = sweep_depths(views, [(2, 12)] * 2, torch.device("cuda"))
     assert [f.depth.shape for f in found] == [(height, width)] * 2
 
 
@@ -330,10 +250,10 @@ def test_the_gpu_takes_no_more_than_it_says():
     """Peak memory of a view is below `needed_bytes`."""
     views, _ = still_life()
     device, planes = torch.device("cuda"), np.linspace(1 / 12, 1 / 2, 200)
-    sweep.inverse_depths_cuda(views[1], [views[0], views[2]], planes, SweepConfig(), device)
+    sweep.inverse_depths_cuda(views[1], [views[0], views[2]], planes, device)
     torch.cuda.reset_peak_memory_stats(device)
     before = torch.cuda.memory_allocated(device)
-    sweep.inverse_depths_cuda(views[1], [views[0], views[2]], planes, SweepConfig(), device)
+    sweep.inverse_depths_cuda(views[1], [views[0], views[2]], planes, device)
     assert torch.cuda.max_memory_allocated(device) - before < sweep.needed_bytes(views[1], len(planes))
 
 
@@ -341,5 +261,5 @@ def test_the_gpu_takes_no_more_than_it_says():
 def test_a_gpu_finds_as_much_consistent_depth():
     """Coverage of the still life agrees within half a per cent of the pixels."""
     views, _ = still_life()
-    for a, b in zip(*(sweep_depths(views, [(2, 12)] * 3, SweepConfig(), d) for d in (CPU, torch.device("cuda")))):
+    for a, b in zip(*(sweep_depths(views, [(2, 12)] * 3, d) for d in (CPU, torch.device("cuda")))):
         assert abs(a.coverage - b.coverage) < 0.005

@@ -3,13 +3,12 @@
 import dataclasses
 import json
 import sys
-from dataclasses import dataclass
-from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 import torch
+from safetensors.numpy import save
 
 from tests.gaussians import cloud, lens_camera
 from tests.priors import networks as nw
@@ -31,13 +30,15 @@ PLAIN = {"size": 32, "mean": [0, 0, 0], "std": [1, 1, 1]}
 DEPTH = {"size": 32, "mean": [0.4, 0.5, 0.6], "std": [0.2, 0.25, 0.5]}
 
 
-@dataclass(frozen=True)
-class Depth:
-    """A stand-in for `warpgs.scene.ViewDepth`."""
+REGION = np.zeros((32, 64), bool)
+REGION[10:20, 20:40] = True
 
-    depth: np.ndarray
-    valid: np.ndarray
-    sensitivity: np.ndarray
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path, monkeypatch):
+    """Keep maps in a folder of the test."""
+    monkeypatch.setenv("WARPGS_CACHE", str(tmp_path / "cache"))
+    return tmp_path / "cache"
 
 
 def view(image, name="a.png", mask=None):
@@ -55,11 +56,8 @@ def networks(tmp_path, depth=None, **more):
     (tmp_path / "s.onnx.json").write_text(json.dumps(PLAIN))
     if depth:
         (tmp_path / "d.onnx.json").write_text(json.dumps(depth))
-    return PriorConfig(
-        depth_model=nw.depth_network(tmp_path / "d.onnx"),
-        segmentation_model=nw.segmentation_network(tmp_path / "s.onnx"),
-        **more,
-    )
+    depth, labels = nw.depth_network(tmp_path / "d.onnx"), nw.segmentation_network(tmp_path / "s.onnx")
+    return PriorConfig(depth_model=depth, segmentation_model=labels, **more)
 
 
 def check(prior, shape):
@@ -89,64 +87,52 @@ def test_output_depth_turns_the_map_over(tmp_path):
     assert disparity.disparity.argmax() == depth.disparity.argmin() and any("gives depth" in n for n in notes)
 
 
-def test_maps_are_kept_and_found_again(tmp_path):
+def test_maps_are_kept_and_found_again(tmp_path, folder):
+    """Unless the network or its description is another."""
     views = [view(shapes()[0], "a.png"), view(1 - shapes()[0], "b.png")]
-    config, folder = networks(tmp_path), tmp_path / "cache"
-    first, notes = view_priors(views, config, cache=folder)
-    assert len(list(folder.iterdir())) == 4 and not any("there already" in n for n in notes)
-    second, notes = view_priors(views, config, cache=folder)
+    config = networks(tmp_path)
+    first, notes = view_priors(views, config)
+    assert len(list(folder.iterdir())) == 4 and not any("from the cache" in n for n in notes)
+    second, notes = view_priors(views, config)
     assert f"priors: 4 of 4 maps were read from the cache {folder}" in notes
     for f, s in zip(first, second):
         for name in ("disparity", "confidence", "boundary", "foreground"):
             np.testing.assert_array_equal(getattr(f, name), getattr(s, name))
-    # another description, another file, no folder: nothing old is taken
-    _, notes = view_priors(views, networks(tmp_path, {"multiple": 16}), cache=folder)
+    _, notes = view_priors(views, networks(tmp_path, {"mean": [0.1, 0.2, 0.3], "multiple": 16}))
     assert any("2 of 4 maps" in n for n in notes)
     nw.write(tmp_path / "d.onnx", nw.linear(2 * nw.DEPTH_WEIGHTS, nw.DEPTH_BIAS))
-    _, notes = view_priors(views, config, cache=folder)
+    _, notes = view_priors(views, config)
     assert any("2 of 4 maps" in n for n in notes)
-    count = len(list(folder.iterdir()))
-    _, notes = view_priors(views, networks(tmp_path, {"multiple": 8}))
-    assert len(list(folder.iterdir())) == count and not any("there already" in n for n in notes)
-
-
-def test_a_side_file_decides_the_entry_too(tmp_path):
-    folder = tmp_path / "cache"
-    view_priors([view(shapes()[0])], networks(tmp_path), cache=folder)
-    (tmp_path / "d.onnx.json").write_text(json.dumps({"mean": [0.1, 0.2, 0.3], "output": "disparity"}))
-    _, notes = view_priors([view(shapes()[0])], networks(tmp_path), cache=folder)
-    assert any("1 of 2 maps" in n for n in notes)
 
 
 def test_a_region_stands_in_where_the_network_finds_no_foreground(tmp_path):
-    region = np.zeros((32, 64), bool)
-    region[10:20, 20:40] = True
-    views = [dark("a.png"), view(shapes()[0], "b.png"), dark("c.png"), dark("d.png")]
-    regions = [region, region, None, np.ones((32, 64), bool)]
-    priors, notes = view_priors(views, networks(tmp_path), regions=regions)
-    assert (priors[0].foreground == region).all() and "mask or black background" in priors[0].semantics_source
+    views = [dark("a.png"), view(shapes()[0], "b.png"), dark("c.png"), *(dark(f"{i}.png") for i in range(6))]
+    priors, notes = view_priors(views, networks(tmp_path), regions=[REGION, REGION, None, *[np.ones((32, 64), bool)] * 6])
+    assert (priors[0].foreground == REGION).all() and "mask or black background" in priors[0].semantics_source
     assert priors[0].boundary[10, 20] == 1 and priors[0].boundary[0, 0] < 1e-6
     assert ((priors[1].foreground > 0.5) == (shapes()[1] > 0)).all(), "the network knows better"
     for p in priors[2:]:  # no region, or one that is no object
         assert not p.foreground.any() and not p.boundary.any() and p.semantics_source.startswith("none")
         check(p, (32, 64))
     text = "\n".join(notes)
-    assert "gave the foreground of a.png" in text and "no score for c.png, d.png, which have hardly any foreground" in text
+    assert "gave the foreground of a.png" in text
+    assert "no score for c.png, 0.png, 1.png, 2.png, 3.png and 2 more views, which have hardly any foreground" in text
 
 
 def test_a_region_beats_saliency():
-    region = np.zeros((32, 64), bool)
-    region[10:20, 20:40] = True
-    (prior,), notes = view_priors([view(shapes()[0])], PriorConfig(), regions=[region])
-    assert (prior.foreground == region).all() and (prior.confidence == 1).all()
+    """Without any depth, geometry does not count."""
+    (prior,), notes = view_priors([view(shapes()[0])], PriorConfig(), regions=[REGION])
+    assert (prior.foreground == REGION).all() and (prior.confidence == 1).all()
     assert any("a mask is more reliable than saliency" in n and isinstance(n, Detail) for n in notes)
+    assert not prior.disparity.any() and prior.depth_source == "none"
+    assert any("neither a network nor other views gave depth" in n for n in notes)
 
 
 def test_classical_sources_say_so():
     image, inverse, near = two_planes()
     valid = np.random.default_rng(1).random(near.shape) < 0.1
-    consistent = Depth(np.where(valid, 1 / inverse, 0), valid, np.where(valid, 0.01, np.inf))
-    nothing = Depth(np.zeros(near.shape), np.zeros(near.shape, bool), np.full(near.shape, np.inf))
+    consistent = ViewDepth(np.where(valid, 1 / inverse, 0), valid, np.where(valid, 0.01, np.inf))
+    nothing = ViewDepth(np.zeros(near.shape), np.zeros(near.shape, bool), np.full(near.shape, np.inf))
     views = [view(image, "a.png"), view(image, "b.png")]
     (a, b), notes = view_priors(views, PriorConfig(), depths=lambda: [consistent, nothing])
     for p in (a, b):
@@ -156,17 +142,6 @@ def test_classical_sources_say_so():
     text = "\n".join(notes)
     assert f"0.0% to {valid.mean():.1%} of a view's pixels" in text and "no consistent depth in b.png" in text
     assert "saliency is used as foreground" in text and "--segmentation-model" in text
-
-
-def test_without_any_depth_geometry_does_not_count():
-    (prior,), notes = view_priors([view(shapes()[0])], PriorConfig())
-    assert not prior.disparity.any() and prior.depth_source == "none"
-    assert any("neither a network nor other views gave depth" in n for n in notes)
-
-
-def test_many_names_are_cut_short(tmp_path):
-    _, notes = view_priors([dark(f"{i}.png") for i in range(8)], networks(tmp_path))
-    assert any("0.png, 1.png, 2.png, 3.png, 4.png and 3 more views" in n for n in notes)
 
 
 def test_both_networks_are_opened_before_one_runs(tmp_path, monkeypatch):
@@ -188,21 +163,12 @@ def test_a_network_of_the_other_kind_is_refused(tmp_path):
             view_priors([view(shapes()[0])], PriorConfig(**{flag: path}))
 
 
-@pytest.mark.parametrize(
-    ("fields", "message"),
-    [
-        ({"onnx_provider": "tpu"}, "onnx-provider must be one of cpu, cuda, not 'tpu'"),
-        ({"depth_guides": True}, "--depth-guides requires --depth-model"),
-    ],
-)
-def test_settings_are_checked(fields, message):
-    with pytest.raises(UsageError, match=message):
-        PriorConfig(**fields)
-
-
-def test_the_provider_reaches_onnxruntime(tmp_path, monkeypatch):
+def test_settings_are_checked(tmp_path, monkeypatch):
     import onnxruntime
 
+    for fields, words in (({"onnx_provider": "tpu"}, "onnx-provider must be one"), ({"depth_guides": True}, "--depth-model")):
+        with pytest.raises(UsageError, match=words):
+            PriorConfig(**fields)
     monkeypatch.setattr(onnxruntime, "get_available_providers", lambda: ["CPUExecutionProvider"])
     with pytest.raises(ResourceError, match="--onnx-provider cuda"):
         view_priors([view(shapes()[0])], networks(tmp_path, onnx_provider="cuda"))
@@ -276,8 +242,8 @@ def test_a_lens_view_becomes_that_of_a_pinhole_and_back(model):
     assert inner.mean() > 0.8 and np.array_equal(found.score_mask, inner)
     # a first-order footprint and a bilinear sample of features of 4 px differ by a few levels; no resampling, by more than 60
     change = np.abs(shown.rgb.numpy() - wanted.rgb.numpy())[inner].mean()
-    assert np.abs(found.image - wanted.rgb.numpy())[inner].mean() < 0.15 * change
-    assert np.abs(found.alpha - wanted.alpha.numpy())[inner].mean() < 0.15 * change
+    for moved, true in ((found.image, wanted.rgb), (found.alpha, wanted.alpha)):
+        assert np.abs(moved - true.numpy())[inner].mean() < 0.15 * change
     depth = ViewDepth(wanted.depth.numpy(), wanted.alpha.numpy() > 0.5, np.ones((90, 120), np.float32))
     back = lens_depth(view.camera, depth)
     both = back.valid & (shown.alpha.numpy() > 0.5)
@@ -323,72 +289,45 @@ IMAGE = np.random.default_rng(0).random((6, 9, 3), np.float32)
 NAMES = ("a", "b")
 
 
-def make_maps(calls=None):
-    def make():
-        if calls is not None:
-            calls.append(1)
-        return tuple(np.full((6, 9), v, np.float32) for v in (0.25, 1.0))
-
-    return make
-
-
-def test_a_second_call_reads_what_the_first_made(tmp_path):
-    calls, store = [], MapCache(tmp_path / "deep" / "folder")
-    first = store.maps(IMAGE, NAMES, {"model": "x"}, make_maps(calls))
-    again = MapCache(store.folder)
-    second = again.maps(IMAGE.copy(), NAMES, {"model": "x"}, make_maps(calls))
-    assert len(calls) == 1 and (again.found, again.made, again.notes) == (1, 0, [])
-    for f, s in zip(first, second):
-        np.testing.assert_array_equal(f, s)
-    assert [p.suffix for p in store.folder.iterdir()] == [".safetensors"], "nothing temporary is left"
+MADE = tuple(np.full((6, 9), v, np.float32) for v in (0.25, 1.0))
 
 
 def test_whatever_decides_the_maps_decides_the_entry(tmp_path, monkeypatch):
-    store, calls = MapCache(tmp_path), []
+    """The same is read again; another pixel, network, shape, name or version of the code is not."""
+    calls, folder = [], tmp_path / "deep" / "folder"
+
+    def ask(image, names=NAMES, **decided_by):
+        store = MapCache(folder)
+        maps = store.maps(image, names, decided_by, lambda: calls.append(1) or MADE)
+        assert store.notes == [] and all(np.array_equal(a, b) for a, b in zip(maps, MADE))
+        return store.found
+
     changed = IMAGE.copy()
     changed[3, 4, 1] = np.nextafter(changed[3, 4, 1], 2)
-    cases = [(IMAGE, {"m": 1}), (changed, {"m": 1}), (IMAGE, {"m": 2}), (IMAGE.reshape(9, 6, 3), {"m": 1})]
-    for image, decided_by in cases:
-        store.maps(image, NAMES, decided_by, make_maps(calls))
-    store.maps(IMAGE, ("a", "c"), {"m": 1}, make_maps(calls))
+    assert [ask(IMAGE, m=1), ask(IMAGE.copy(), m=1), ask(changed, m=1), ask(IMAGE, m=2)] == [0, 1, 0, 0]
     monkeypatch.setattr(cache_module, "CODE", cache_module.CODE + 1)
-    store.maps(IMAGE, NAMES, {"m": 1}, make_maps(calls))
-    assert len(calls) == 6 == len(list(tmp_path.iterdir()))
+    assert [ask(IMAGE, m=1), ask(IMAGE, ("a", "c"), m=1), ask(IMAGE, ("a", "c"), m=1)] == [0, 0, 1]
+    assert len(calls) == 5 == len(list(folder.glob("*.safetensors"))) == len(list(folder.iterdir()))
 
 
-def damage(path: Path, how: str) -> None:
-    from safetensors.numpy import save
-
-    good = path.read_bytes()
-    one = np.ones((6, 9), np.float32)
-    path.write_bytes(
-        {
-            "empty": b"",
-            "cut off": good[: len(good) // 2],
-            "noise": bytes(200),
-            "one map short": save({"a": one}),
-            "another shape": save({"a": one.T.copy(), "b": one}),
-            "another type": save({"a": one.astype(np.float64), "b": one}),
-            "NaN": save({"a": one * np.nan, "b": one}),
-            "out of range": save({"a": one * 2, "b": one}),
-        }[how]
-    )
+ONE = np.ones((6, 9), np.float32)
+DAMAGED = {
+    "empty": b"", "cut off": save({"a": ONE, "b": ONE})[:99], "noise": bytes(200), "one map short": save({"a": ONE}),
+    "another shape": save({"a": ONE.T.copy(), "b": ONE}), "another type": save({"a": ONE.astype(np.float64), "b": ONE}),
+    "NaN": save({"a": ONE * np.nan, "b": ONE}), "out of range": save({"a": ONE * 2, "b": ONE}),
+}  # fmt: skip
 
 
-HOW = ("empty", "cut off", "noise", "one map short", "another shape", "another type", "NaN", "out of range")
-
-
-@pytest.mark.parametrize("how", HOW)
+@pytest.mark.parametrize("how", DAMAGED)
 def test_a_damaged_entry_is_made_again_with_a_note(tmp_path, how):
-    MapCache(tmp_path).maps(IMAGE, NAMES, {}, make_maps())
+    MapCache(tmp_path).maps(IMAGE, NAMES, {}, lambda: MADE)
     (path,) = tmp_path.iterdir()
-    damage(path, how)
-    store = MapCache(tmp_path)
-    maps = store.maps(IMAGE, NAMES, {}, make_maps())
+    path.write_bytes(DAMAGED[how])
+    store, mended = MapCache(tmp_path), MapCache(tmp_path)
+    maps = store.maps(IMAGE, NAMES, {}, lambda: MADE)
     assert (maps[0] == 0.25).all() and (maps[1] == 1).all() and store.made == 1
     assert len(store.notes) == 1 and "computed again" in store.notes[0] and str(path) in store.notes[0]
-    mended = MapCache(tmp_path)
-    mended.maps(IMAGE, NAMES, {}, make_maps())
+    mended.maps(IMAGE, NAMES, {}, lambda: MADE)
     assert mended.found == 1 and mended.notes == []
 
 
@@ -396,25 +335,23 @@ def test_a_folder_that_cannot_be_written_is_done_without(tmp_path):
     (tmp_path / "file").write_text("in the way")
     store = MapCache(tmp_path / "file" / "maps")
     for seed in range(3):
-        maps = store.maps(IMAGE + seed, NAMES, {}, make_maps())
-        assert (maps[1] == 1).all()
+        assert (store.maps(IMAGE + seed, NAMES, {}, lambda: MADE)[1] == 1).all()
     assert len(store.notes) == 1 and "WARPGS_CACHE" in store.notes[0]
 
 
 def test_where_the_cache_lies(monkeypatch, tmp_path):
     home, system = tmp_path / "home", tmp_path / "system"
-    monkeypatch.setattr(Path, "home", lambda: home)
+    for name in ("HOME", "USERPROFILE"):
+        monkeypatch.setenv(name, str(home))
     for name in ("WARPGS_CACHE", "XDG_CACHE_HOME", "LOCALAPPDATA"):
         monkeypatch.delenv(name, raising=False)
-    monkeypatch.setattr(sys, "platform", "linux")
-    assert cache_folder() == home / ".cache" / "warpgs"
-    monkeypatch.setenv("XDG_CACHE_HOME", "relative")
-    assert cache_folder() == home / ".cache" / "warpgs"
-    monkeypatch.setenv("XDG_CACHE_HOME", str(system))
-    assert cache_folder() == system / "warpgs"
-    monkeypatch.setattr(sys, "platform", "darwin")
-    assert cache_folder() == home / "Library" / "Caches" / "warpgs"
-    monkeypatch.setattr(sys, "platform", "win32")
-    assert cache_folder() == home / "AppData" / "Local" / "warpgs" / "Cache"
+    linux, apple, windows = home / ".cache" / "warpgs", home / "Library" / "Caches" / "warpgs", home / "AppData" / "Local"
+    cases = [("linux", None, linux), ("linux", "relative", linux), ("linux", str(system), system / "warpgs")]
+    cases += [("darwin", str(system), apple), ("win32", str(system), windows / "warpgs" / "Cache")]
+    for platform, xdg, folder in cases:
+        monkeypatch.setattr(sys, "platform", platform)
+        if xdg:
+            monkeypatch.setenv("XDG_CACHE_HOME", xdg)
+        assert cache_folder() == folder
     monkeypatch.setenv("WARPGS_CACHE", str(tmp_path))
     assert cache_folder() == tmp_path

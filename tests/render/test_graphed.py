@@ -15,11 +15,10 @@ from warpgs.errors import UsageError
 from warpgs.kernels.ellipse import ProjectInputs
 from warpgs.kernels.falloff import Pass
 from warpgs.kernels.graphs import MIN_REPLAYS, GraphPool
-from warpgs.kernels.sh import coefficient_count
 from warpgs.means2d import projected_means
 from warpgs.render import graphed
 from warpgs.render.compose import inputs_of, pass_of
-from warpgs.render.graphed import MIN_CALLS, SPARE, Capacity, Recorder, call_key
+from warpgs.render.graphed import MIN_CALLS, SPARE, Recorder, call_key
 from warpgs.render.options import RasterizeOptions
 from warpgs.render.rasterize import rasterize
 from warpgs.scene import Camera, Gaussians
@@ -35,11 +34,11 @@ class Counted:
 
     def __init__(self, settings, cameras, capacity, graphs, gradients):
         type(self).made += 1
-        self.limit, self.needed, self.rendered = capacity.instances - SPARE, None, 0
+        self.limit, self.needed, self.rendered = capacity[1] - SPARE, None, 0
 
     def render(self, sources, backgrounds):
-        self.needed = Capacity(5, type(self).seen)
-        fits = self.needed.instances <= self.limit
+        self.needed = 5, type(self).seen
+        fits = self.needed[1] <= self.limit
         self.rendered += fits
         return "images" if fits else None
 
@@ -63,16 +62,18 @@ def recorder(monkeypatch, surroundings) -> Recorder:
     """A recorder whose rasterizers render nothing; a call has `Counted.seen` instances."""
     Counted.made, Counted.seen = 0, 100
     monkeypatch.setattr(graphed, "GraphedRasterizer", Counted)
-    monkeypatch.setattr(graphed, "count_needed", lambda *_: Capacity(5, Counted.seen))
+    monkeypatch.setattr(graphed, "count_needed", lambda *_: (5, Counted.seen))
     return Recorder(GraphPool(CPU))
 
 
-def sources_of(gaussians: Gaussians, cam: Camera) -> ProjectInputs:
-    return inputs_of(gaussians, cam)
+@pytest.fixture
+def small(surroundings):
+    """Fifty Gaussians, a recorder without graphs, and a camera."""
+    return leaves(cloud(50)), Recorder(NoGraphPool(CPU)), camera(70, 50, 1, torch.float32)
 
 
 def batch(**size) -> ProjectInputs:
-    return sources_of(leaves(cloud(20)), camera(dtype=torch.float32, **size))
+    return inputs_of(leaves(cloud(20)), camera(dtype=torch.float32, **size))
 
 
 def test_the_third_of_equal_calls_is_captured(recorder):
@@ -186,7 +187,7 @@ def test_images_without_gradients_have_the_same_bits(surroundings):
     """And keep nothing for a backward pass."""
     g, own = leaves(cloud(300)), Recorder(NoGraphPool(CPU), gradients=False)
     cam = camera(70, 50, 2, torch.float32)
-    settings = Pass((70, 50), (0, 0, 70, 50), RULES["exact"], coefficient_count(g.sh_degree))
+    settings = pass_of(cam, g.sh_degree, RULES["exact"])
     with torch.no_grad():
         for _ in range(MIN_CALLS + 1):
             found = own.render(inputs_of(g, cam), None, settings)
@@ -210,21 +211,21 @@ def test_other_planes_are_another_graph(surroundings):
         assert torch.equal(*images) and all(torch.equal(a, b) for a, b in zip(*gradients))
 
 
-@pytest.mark.parametrize("short", ["visible", "instances"])
+@pytest.mark.parametrize("short", [(1, 0), (0, 1)], ids=["visible", "instances"])
 def test_a_rasterizer_that_is_too_small_says_so(surroundings, short):
     """The call runs without graphs, and the next rasterizer has the capacity."""
     g, own = leaves(cloud(300)), Recorder(NoGraphPool(CPU))
     cam = camera(70, 50, 1, torch.float32)
     sources = inputs_of(g, cam)
-    settings = Pass((70, 50), (0, 0, 70, 50), RULES["exact"], coefficient_count(g.sh_degree))
+    settings = pass_of(cam, g.sh_degree, RULES["exact"])
     for _ in range(MIN_CALLS):
         found = own.render(sources, None, settings)
     assert found is not None
-    own.rasterizer.capacity = own.rasterizer.needed._replace(**{short: getattr(own.rasterizer.needed, short) - 1})
+    own.rasterizer.capacity = tuple(n - one for n, one in zip(own.rasterizer.needed, short))
     assert own.render(sources, None, settings) is None and own.rasterizer is None
     for _ in range(2 * MIN_CALLS):
         found = own.render(sources, None, settings)
-    assert found is not None and own.rasterizer.needed.within(own.rasterizer.capacity)
+    assert found is not None and all(n <= most for n, most in zip(own.rasterizer.needed, own.rasterizer.capacity))
 
 
 def first_graphed(own: Recorder, g: Gaussians, cam: Camera):
@@ -233,10 +234,9 @@ def first_graphed(own: Recorder, g: Gaussians, cam: Camera):
     return [own.render(inputs_of(g, cam), None, settings) for _ in range(MIN_CALLS)][-1]
 
 
-def test_a_rasterizer_is_freed_when_nobody_holds_it(surroundings):
+def test_a_rasterizer_is_freed_when_nobody_holds_it(small):
     """It needs no garbage collection: graphs hold memory of the device. A backward pass still to come holds it."""
-    g, own = leaves(cloud(50)), Recorder(NoGraphPool(CPU))
-    cam = camera(70, 50, 1, torch.float32)
+    g, own, cam = small
     found = first_graphed(own, g, cam)
     gone, loss = weakref.ref(own.rasterizer), found[0][0].sum()
     gc.disable()
@@ -252,12 +252,11 @@ def test_a_rasterizer_is_freed_when_nobody_holds_it(surroundings):
 
 
 @pytest.mark.parametrize("loss", ["image", "projected", "up to projected"])
-def test_backward_passes_are_counted(surroundings, loss):
+def test_backward_passes_are_counted(small, loss):
     """Projected means read after a pass are refused; those read before hold its gradients."""
-    g, own = leaves(cloud(50)), Recorder(NoGraphPool(CPU))
-    cam = camera(70, 50, 1, torch.float32)
+    g, own, cam = small
     first_graphed(own, g, cam)
-    settings = Pass((70, 50), (0, 0, 70, 50), RULES["exact"], coefficient_count(g.sh_degree))
+    settings = pass_of(cam, g.sh_degree, RULES["exact"])
     for early in (True, False):
         images, projected, _ = own.render(inputs_of(g, cam), None, settings)
         means2d = projected_means(projected, False) if early else None
@@ -277,10 +276,9 @@ def test_after_a_failed_capture_calls_run_without_graphs(recorder):
     assert [recorder.render(own, None, SETTINGS) for _ in range(MIN_CALLS)][-1] == "images"
 
 
-def test_torchs_default_type_does_not_matter(surroundings):
+def test_torchs_default_type_does_not_matter(small):
     """A default background is of the Gaussians' type."""
-    g, own = leaves(cloud(50)), Recorder(NoGraphPool(CPU))
-    cam = camera(70, 50, 1, torch.float32)
+    g, own, cam = small
     usual = torch.get_default_dtype()
     torch.set_default_dtype(torch.bfloat16)
     try:
@@ -290,10 +288,9 @@ def test_torchs_default_type_does_not_matter(surroundings):
     assert torch.equal(found[0][0], rasterize(g, cam).rgb)
 
 
-def test_gaussians_that_change_in_number_before_the_backward_pass(surroundings):
+def test_gaussians_that_change_in_number_before_the_backward_pass(small):
     """A swap that autograd does not see is an error, not a write beside the gradients."""
-    g, own = leaves(cloud(50)), Recorder(NoGraphPool(CPU))
-    cam = camera(70, 50, 1, torch.float32)
+    g, own, cam = small
     found = first_graphed(own, g, cam)
     g.means.data = torch.zeros(70, 3)
     with pytest.raises(RuntimeError, match=r"replaced between .*\[50, 3\] .*, now \[70, 3\]"):

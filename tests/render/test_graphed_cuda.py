@@ -163,7 +163,7 @@ def test_more_instances_than_the_capacity_run_without_graphs(fresh):
     capacities = []
     for step in range(14):
         assert equal([image(True)], [image(False)])
-        capacities.append(0 if fresh.rasterizer is None else fresh.rasterizer.capacity.instances)
+        capacities.append(0 if fresh.rasterizer is None else fresh.rasterizer.capacity[1])
         if step in (5, 6):
             with torch.no_grad():
                 g.log_scales.add_(1)

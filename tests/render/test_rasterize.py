@@ -20,8 +20,6 @@ from warpgs.render.options import RasterizeOptions
 from warpgs.render.rasterize import rasterize
 from warpgs.scene import ActivatedGaussians, Camera, CovarianceGaussians, Gaussians
 
-# The public op: shapes, gradients through everything, options, and errors.
-
 
 def test_public_names_load_on_use():
     """The package offers what its __all__ says, and nothing else by accident."""
@@ -42,58 +40,6 @@ def test_one_camera_has_no_leading_axis(device):
     assert isinstance(plain.viewmat, np.ndarray) and torch.equal(rasterize(gaussians, plain).rgb, single.rgb)
 
 
-def test_gradcheck_end_to_end(device):
-    """Gaussians, pose, intrinsics and background at once, by finite differences through every kernel."""
-    gaussians, cam = leaves(hand_placed(device=device)), camera(12, 11, device=device)
-    background = torch.rand(3, dtype=torch.float64, generator=torch.Generator().manual_seed(0)).to(device)
-    inputs = [*gaussians.tensors().values(), cam.viewmat.clone(), cam.K.clone(), background]
-    inputs = [t.detach().requires_grad_() for t in inputs]
-
-    def images(means, quats, scales, opacities, sh, viewmat, K, behind):
-        g = warpgs.Gaussians(means, quats, scales, opacities, sh)
-        r = rasterize(g, Camera(viewmat, K, 12, 11), RasterizeOptions(rule=SMOOTH, background=behind))
-        return r.rgb, r.alpha, r.depth
-
-    assert torch.autograd.gradcheck(images, inputs, eps=1e-6, atol=1e-7, rtol=1e-5, nondet_tol=0.0)
-
-
-def test_moving_scene_and_camera_together_changes_nothing(device):
-    """The gradient of a translation of the world equals the opposite one of the camera."""
-    gaussians, cam = leaves(hand_placed(device=device)), camera(24, 20, cameras=1, device=device)
-    viewmat = cam.viewmat.clone().requires_grad_()
-    r = rasterize(gaussians, dataclasses.replace(cam, viewmat=viewmat), RasterizeOptions(rule=SMOOTH))
-    weights = torch.rand(r.rgb.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64).to(device)
-    (r.rgb * weights).sum().backward()
-    # the identity rotation of the first camera makes world and camera axes the same
-    assert torch.allclose(gaussians.means.grad.sum(0), viewmat.grad[0, :3, 3], atol=1e-10)
-
-
-def test_gradients_of_projected_means_on_request(device):
-    """`projected.retain_grad()` gives the gradients that densification needs."""
-    gaussians, cam = leaves(cloud(50, device=device)), camera(20, 12, dtype=torch.float32, device=device)
-    r = rasterize(gaussians, cam)
-    r.projected.retain_grad()
-    r.rgb.sum().backward()
-    assert bool(r.projected.grad[..., :2].any()) and not bool(r.projected.grad[..., 10:].any())
-
-
-def test_contributions_only_on_request(device):
-    """Weights are None by default, and bounded by the covered pixels where asked for."""
-    gaussians, cam = cloud(50, device=device), camera(20, 12, dtype=torch.float32, device=device)
-    assert rasterize(gaussians, cam).weight_sums is None
-    r = rasterize(gaussians, cam, RasterizeOptions(contributions=True))
-    assert torch.allclose(r.weight_sums.sum(), r.alpha.sum(), rtol=1e-5)
-    assert bool((r.weight_maxima <= 0.99).all()) and bool((r.weight_maxima <= r.weight_sums + 1e-6).all())
-
-
-def test_sh_degree_limits_the_colour(device):
-    """A lower degree ignores the higher coefficients."""
-    gaussians, cam = hand_placed(torch.float32, device), camera(20, 12, dtype=torch.float32, device=device)
-    plain = dataclasses.replace(gaussians, sh=gaussians.sh[:, :1])
-    assert torch.equal(rasterize(gaussians, cam, RasterizeOptions(sh_degree=0)).rgb, rasterize(plain, cam).rgb)
-    assert not torch.equal(rasterize(gaussians, cam).rgb, rasterize(plain, cam).rgb)
-
-
 def test_capacity_changes_nothing_but_says_when_it_is_too_small(device):
     """A larger capacity gives the same bits of images and gradients; one too small sets overflow, and nothing else breaks."""
     gaussians, cam = leaves(cloud(200, device=device)), camera(70, 50, dtype=torch.float32, device=device)
@@ -107,18 +53,6 @@ def test_capacity_changes_nothing_but_says_when_it_is_too_small(device):
     cut = rasterize(gaussians, cam, RasterizeOptions(capacity=40))
     assert int(cut.overflow) == 1
     torch.autograd.grad(cut.rgb.sum(), list(gaussians.tensors().values()))
-
-
-def test_atomic_sums_agree_with_ordered_ones(device):
-    """Without a fixed order gradients differ by rounding only; on a CPU, where there are no atomics, not at all."""
-    gaussians, cam = leaves(cloud(300, device=device)), camera(70, 50, dtype=torch.float32, device=device)
-    gradients = []
-    for deterministic in (True, False):
-        r = rasterize(gaussians, cam, RasterizeOptions(deterministic=deterministic))
-        loss = r.rgb.square().sum() + r.depth.sum() + r.alpha.sum()
-        gradients.append(torch.autograd.grad(loss, list(gaussians.tensors().values())))
-    for a, b in zip(*gradients):
-        assert torch.equal(a, b) if device.type == "cpu" else float((a - b).norm()) <= 1e-5 * float(a.norm())
 
 
 @pytest.mark.cuda
@@ -264,8 +198,6 @@ def test_a_pose_that_scales_or_shears_is_refused():
     assert torch.allclose(mirrored.flip(1), rasterize(gaussians, cam).rgb, atol=1e-5)
 
 
-# Antialiasing: opacities times sqrt(det(cov2d) / det(cov2d + low_pass I)), the 2D filter of Mip-Splatting.
-
 ANTIALIASED = RasterizeOptions(antialiased=True)
 
 
@@ -384,8 +316,6 @@ def test_extremes_are_finite(device, dtype, low_pass):
         assert torch.equal(plain.visible, r.visible)
         close("projection", opacity, plain.projected[0, :, 5])
 
-
-# Near and far plane: Gaussians outside are not there, on every way to render (graphed calls: `test_graphed.py`).
 
 PLANES = {"near": 3.5, "far": 4.5}
 """Depths between which about half of `cloud` lies, whose depths are 3 to 5 u."""

@@ -50,16 +50,3 @@ def test_what_is_not_drawn_does_not_show(device):
     ):
         found = reference_image(hidden, cam, (0, 0, 18, 17), BACKGROUND.to(device), 1)
         assert torch.equal(found, BACKGROUND.to(device).expand_as(found))
-
-
-def test_kernels_without_cut_offs_are_the_model(device):
-    """Float64 kernels that blend every Gaussian of a tile, against the plain loop over Gaussians."""
-    uncut = dataclasses.replace(RULES["exact"], name="uncut", alpha_cut=0.0, transmittance_stop=0.0)
-    g, cam = cloud(60, torch.float64, device), camera(40, 33, device=device)
-    found = rasterize(g, cam, RasterizeOptions(rule=uncut)).rgb.cpu()
-    plain = {n: t.cpu() for n, t in g.tensors().items()}
-    views = (cam.viewmat[None].cpu(), cam.K[None].cpu())
-    projected = project_reference(*plain.values(), *views, width=40, height=33, degree=1, low_pass=uncut.low_pass)
-    means, covs, colors, depths, opacities = (t[0] if t.ndim > 1 else t for t in projected)
-    wanted = blend_reference(means, covs, opacities, colors, depths, torch.zeros(3).double(), 40, 33, uncut)[0]
-    assert float((found - wanted).abs().max()) < 1e-12

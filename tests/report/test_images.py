@@ -29,7 +29,6 @@ TOP = CONTACT_MARGIN + TITLE_SIZE + 18
 
 
 def corner(index, width, height, columns):
-    """Return the left upper corner x, y of a tile's image [px]."""
     return CONTACT_MARGIN + index % columns * (width + CONTACT_GAP), TOP + CONTACT_HEAD + index // columns * (
         CONTACT_HEAD + height + CONTACT_GAP
     )
@@ -42,11 +41,8 @@ def test_tiles_keep_their_pixels_and_order():
     maps = [rng.random((150, 200), np.float32) for _ in range(3)]
     tiles = [Tile("photo", image), *(Tile(f"map {i}", m, "VIRIDIS") for i, m in enumerate(maps))]
     sheet = contact_sheet("a view", ["one sentence"], tiles, columns=3, tile_width=200)
-    assert (
-        sheet.shape
-        == (TOP + 2 * (CONTACT_HEAD + 150) + CONTACT_GAP + CONTACT_MARGIN, 2 * CONTACT_MARGIN + 3 * 200 + 2 * CONTACT_GAP, 3)
-        and sheet.dtype == np.float32
-    )
+    height = TOP + 2 * (CONTACT_HEAD + 150) + CONTACT_GAP + CONTACT_MARGIN
+    assert sheet.shape == (height, 2 * CONTACT_MARGIN + 3 * 200 + 2 * CONTACT_GAP, 3) and sheet.dtype == np.float32
     for i, wanted in enumerate([image, *(colored(m, "VIRIDIS") for m in maps)]):
         x, y = corner(i, 200, 150, 3)
         np.testing.assert_allclose(sheet[y : y + 150, x : x + 200], wanted, atol=0.51 / 255)
@@ -106,25 +102,20 @@ def test_depth_map_is_warm_near_cold_far_and_gray_where_nothing_is():
     colors = depth_map(depth, alpha)
     near, far = colors[0, 0], colors[0, -1]
     assert near[0] > near[2] and far[2] > far[0]
-    assert (colors[1, 10:20] == GRAY).all() and (colors[1, 30] == GRAY).all() and not (colors[0] == GRAY).all(-1).any()
-
-
-def test_depth_map_of_nothing_and_of_a_wall():
     assert (depth_map(np.zeros((3, 4)), np.zeros((3, 4))) == GRAY).all()
     wall = depth_map(np.full((3, 4), 2.0), np.ones((3, 4)))
     assert np.isfinite(wall).all() and (wall == wall[0, 0]).all()
+    assert (colors[1, 10:20] == GRAY).all() and (colors[1, 30] == GRAY).all() and not (colors[0] == GRAY).all(-1).any()
 
 
 def test_side_by_side_keeps_every_pixel():
-    images = [np.full((5, w, 3), v, np.float32) for w, v in ((4, 0.1), (6, 0.2), (3, 0.3))]
+    images = [np.full((5, w, 3), v, np.float32) for w, v in ((4, 0.1), (6, 0.2))]
     row = side_by_side(images, gap=2)
-    assert row.shape == (5, 17, 3)
-    assert (row[:, :4] == images[0]).all() and (row[:, 6:12] == images[1]).all() and (row[:, 14:] == images[2]).all()
+    assert row.shape == (5, 12, 3) and (row[:, :4] == images[0]).all() and (row[:, 6:] == images[1]).all()
     assert (row[:, 4:6] == 1).all()
 
 
 def test_threads_may_write_one_file(tmp_path):
-    """The file is one of those written, complete, and no other file is left."""
     contents = [bytes([i]) * 50_000 for i in range(8)]
     with ThreadPoolExecutor(8) as pool:
         list(pool.map(lambda c: [write_bytes(tmp_path / "a.png", c) for _ in range(20)], contents))

@@ -1,6 +1,5 @@
 """The 3D overview of a report, and plots of scenes."""
 
-import dataclasses
 import io
 import subprocess
 
@@ -13,7 +12,7 @@ from tests.scenes import ring
 from warpgs.errors import ResourceError
 from warpgs.render.options import RasterizeOptions
 from warpgs.report import overview as module
-from warpgs.report.overview import TRAIN_COLOR, ScenePlot, probe_rendering, render_overview, render_plot
+from warpgs.report.overview import TRAIN_COLOR, probe_rendering, render_overview, render_plot
 from warpgs.scene import C0, Camera, Gaussians
 
 UP = np.array([0.0, -1, 0])
@@ -21,7 +20,6 @@ K = np.array([[300.0, 0, 160], [0, 300, 120], [0, 0, 1]])
 
 
 def camera(angle):
-    """Return a camera 4 u from the origin that looks at it."""
     center = np.array([4 * np.sin(angle), 0, -4 * np.cos(angle)])
     forward, down = -center / 4, np.array([0.0, 1, 0])
     R = np.stack([np.cross(down, forward), down, forward])
@@ -41,7 +39,6 @@ def wall(color: float = 0.2, depth: float = 0.0) -> Gaussians:
 
 
 def colored(image: np.ndarray, color: str) -> int:
-    """Return the number of pixels of a colour."""
     rgb = np.array(ImageColor.getrgb(color)) / 255
     return int((np.abs(image - rgb).sum(-1) < 0.05).sum())
 
@@ -59,7 +56,6 @@ def test_the_overview_shows_gaussians_and_both_kinds_of_cameras(monkeypatch):
 
 
 def test_lines_behind_a_surface_are_hidden():
-    """One half of a line lies behind."""
     shown = Camera(np.eye(4), np.array([[10.0, 0, 20], [0, 10, 10], [0, 0, 1]]), 40, 20)
     image, depth = np.full((20, 40, 3), 255, np.uint8), np.full((20, 40), np.inf)
     depth[:, :20] = 1
@@ -130,18 +126,19 @@ def test_everything_shown_is_in_the_image_and_fills_it(direction, aspect):
 # Plots: the script gets what is to be shown, the legend stands below, and a machine that cannot render is told why.
 
 
-def plot(count: int = 400) -> ScenePlot:
+def plot(size, background, count: int = 400, **changes) -> bytes:
     points = np.random.default_rng(0).normal(size=(count, 3)) * 0.3
     points[0] = 1000
     axes = np.broadcast_to(0.05 * np.eye(3), (count, 3, 3)).copy()
     axes[1] *= 1e6
     up, direction = np.array([0, -1.0, 0]), np.array([1.0, -0.5, -1])
-    return ScenePlot(points, np.full((count, 3), 0.5), axes, ring(4), ring(2), up, direction, [("seen by 1", "#ff0000")])
+    contents = {"axes": axes, "train": ring(4), "test": ring(2), "legend": [("seen by 1", "#ff0000")]} | changes
+    colors = np.full((count, 3), 0.5)
+    return render_plot(points, colors, up=up, direction=direction, size=size, background=background, **contents)
 
 
 @pytest.fixture
 def sent(monkeypatch) -> dict:
-    """What the script is given; instead of rendering, the image is gray."""
     found: dict = {}
 
     def instead(code, source, words, target):
@@ -157,7 +154,7 @@ def sent(monkeypatch) -> dict:
 
 
 def test_what_lies_far_outside_is_left_out_and_what_is_huge_is_shrunk(sent):
-    data = render_plot(plot(), (400, 300), "black")
+    data = plot((400, 300), "black")
     assert len(sent["points"]) == 399 and np.abs(sent["points"]).max() < 2
     lengths = np.linalg.norm(sent["axes"], axis=1)
     assert lengths[0].max() < 0.2 and lengths[1:].min() > 0.03
@@ -169,7 +166,7 @@ def test_what_lies_far_outside_is_left_out_and_what_is_huge_is_shrunk(sent):
 
 
 def test_without_a_legend_the_plot_fills_the_image(sent):
-    data = render_plot(dataclasses.replace(plot(), train=[], test=[], legend=[], axes=None), (200, 100), "white")
+    data = plot((200, 100), "white", train=[], test=[], legend=[], axes=None)
     with Image.open(io.BytesIO(data)) as image:
         assert image.size == (200, 100) and (np.asarray(image) == 128).all()
     assert "axes" not in sent
@@ -178,4 +175,4 @@ def test_without_a_legend_the_plot_fills_the_image(sent):
 def test_a_machine_that_cannot_render_is_told_what_to_install(monkeypatch):
     monkeypatch.setattr(module, "run_pyvista", lambda *_: (False, "pyvista ended with code -11"))
     with pytest.raises(ResourceError, match=r"no plot: pyvista ended with code -11.*libegl1"):
-        render_plot(plot(), (200, 100), "white")
+        plot((200, 100), "white")

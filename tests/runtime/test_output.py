@@ -93,7 +93,6 @@ class Broken(io.StringIO):
         return super().write(text)
 
 
-@with_sh
 @pytest.mark.parametrize(("lines", "number"), [(0, errno.ENOSPC), (4, errno.EIO)])
 def test_a_fit_goes_on_without_its_output(scene, tmp_path, monkeypatch, lines, number):
     errors = io.StringIO()
@@ -104,7 +103,6 @@ def test_a_fit_goes_on_without_its_output(scene, tmp_path, monkeypatch, lines, n
     assert len(read_ply(tmp_path / "run" / "point_cloud.ply")) and (tmp_path / "run" / "report.html").is_file()
 
 
-@with_sh
 def test_neither_stdout_nor_stderr(scene, tmp_path, monkeypatch):
     """As under pythonw, or after `>&- 2>&-`: Python has no streams at all."""
     monkeypatch.setattr(sys, "stdout", None)
@@ -119,20 +117,18 @@ def test_neither_stdout_nor_stderr(scene, tmp_path, monkeypatch):
     assert main(["export", "--nonsense"]) == 2
 
 
-@with_sh
 def test_the_same_without_the_command_line(scene, tmp_path, monkeypatch, capfd):
     """`warpgs.fit` in a program whose reader has gone; the program's own streams stay as they are."""
     import warpgs
 
     stream = Broken(1, errno.EPIPE)
     monkeypatch.setattr(sys, "stdout", stream)
-    monkeypatch.setattr(process, "_lost", False)
+    monkeypatch.setattr(process, "_is_lost", False)
     assert warpgs.fit(scene, warpgs.FitConfig(steps=2), out=tmp_path / "run", device="cpu").metrics["steps"] == 2
     assert sys.stdout is stream
     assert capfd.readouterr().err.count(GOES_ON) == 1
 
 
-@with_sh
 def test_a_table_that_cannot_be_written(monkeypatch, capsys):
     """The doctor's lines and tables, by rich and by `say`: code 4 for a full disk, none for a closed pipe."""
     from warpgs.app import doctor
@@ -144,11 +140,10 @@ def test_a_table_that_cannot_be_written(monkeypatch, capsys):
         assert capsys.readouterr().err.count("stdout cannot be written") == (code == 4)
 
 
-@with_sh
 def test_an_answer_that_nobody_reads_is_an_error(monkeypatch, capsys):
     """A process that works for another one ends with it."""
     monkeypatch.setattr(sys, "stdout", Broken(0, errno.EPIPE))
-    monkeypatch.setattr(process, "_lost", False)
+    monkeypatch.setattr(process, "_is_lost", False)
     say("a line")
     say("a line")
     assert capsys.readouterr().err.count("\n") == 1
@@ -156,16 +151,15 @@ def test_an_answer_that_nobody_reads_is_an_error(monkeypatch, capsys):
         answer("a line")
 
 
-@with_sh
 def test_what_is_no_failure_of_the_stream_is_raised(capsys):
     """An error of the program itself, such as text that is none, is not taken for one."""
     with careful_output(False), pytest.raises(TypeError):
         sys.stdout.write(b"bytes")
     stream = io.TextIOWrapper(io.BytesIO(), "ascii")
     with pytest.raises(UnicodeEncodeError):
-        CarefulStream(stream, "stdout").write("é")
+        CarefulStream(stream).write("é")
     stream.close()
-    careful = CarefulStream(stream, "stdout")
+    careful = CarefulStream(stream)
     careful.write("a")
     careful.flush()
     assert isinstance(careful.failure, ValueError) and "closed file" in capsys.readouterr().err
@@ -191,7 +185,6 @@ def test_no_file_becomes_stdout_or_stderr(tmp_path, closed):
     open_missing_descriptors()  # nothing to do
 
 
-@with_sh
 def test_native_output_without_streams(monkeypatch, tmp_path):
     """Hiding and redirecting output work where Python has no streams, and where a stream cannot be flushed."""
     for stream in (None, Broken(0, errno.ENOSPC)):
@@ -305,7 +298,6 @@ def test_one_place_prints():
 
 
 def streams(monkeypatch, encoding):
-    """Put streams of a terminal with these letters in place; return what was written so far."""
     made = [io.TextIOWrapper(io.BytesIO(), encoding, write_through=True) for _ in range(2)]
     for name, stream in zip(("stdout", "stderr"), made):
         monkeypatch.setattr(sys, name, stream)

@@ -11,6 +11,7 @@ import signal
 import subprocess
 import sys
 import threading
+from concurrent.futures import ThreadPoolExecutor
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -55,27 +56,19 @@ def trap(tmp_path, monkeypatch):
     return folder, mark
 
 
-def run(*command: str, path: str = str(ROOT)) -> subprocess.CompletedProcess:
+def run(*command: str, **more: str) -> subprocess.CompletedProcess:
     """Run Python as a user does who has installed warpgs: without any word on safe paths."""
-    environment = {k: v for k, v in os.environ.items() if k != "PYTHONSAFEPATH"} | {"PYTHONPATH": path}
+    environment = {k: v for k, v in os.environ.items() if k != "PYTHONSAFEPATH"} | {"PYTHONPATH": str(ROOT)} | more
     return subprocess.run(
-        [sys.executable, *command], env=environment, capture_output=True, text=True, encoding="utf-8", check=False
+        [sys.executable, *command], env=environment, capture_output=True, text=True, encoding="utf-8", check=False, timeout=300
     )
 
 
 @pytest.fixture
 def program(tmp_path):
-    """The path of the program `warpgs`."""
     (tmp_path / "bin").mkdir()
     (tmp_path / "bin" / "warpgs").write_text(PROGRAM)
     return str(tmp_path / "bin" / "warpgs")
-
-
-def test_the_trap_works(trap):
-    """Plain Python from there runs a planted module."""
-    _, mark = trap
-    assert subprocess.run([sys.executable, "-c", "import pyvista"], capture_output=True, check=False).returncode == 1
-    assert "pyvista.py" in mark.read_text()
 
 
 FIT = ["--split", split_spec(8), "--steps", "2", "--device", "cpu", "--init.source", "random", "--init.random-count", "50"]
@@ -83,11 +76,12 @@ STUDY = ["--split", split_spec(8), "--steps", "2", "--device", "cpu", "--seeds",
 
 
 def test_no_fit_runs_what_lies_beside_a_scene(trap, tmp_path):
-    """Not even as `python -m`."""
+    """Not even as `python -m`; plain Python from there runs a planted module."""
     _, mark = trap
     done = run("-m", "warpgs", "fit", ".", *FIT, "--out", str(tmp_path / "run"))
     assert done.returncode == 0, done.stdout + done.stderr
     assert not mark.exists(), mark.read_text()
+    assert run("-c", "import pyvista").returncode == 1 and "pyvista.py" in mark.read_text()
 
 
 def test_the_program_runs_nothing_from_the_current_folder(trap, program):
@@ -159,7 +153,6 @@ def dotted(node: ast.AST) -> str:
 
 
 def starters(path: Path) -> list[str]:
-    """What a file uses to start processes, however it is imported."""
     tree = ast.parse(path.read_text("utf-8"))
     found, names = [], {}
     for node in ast.walk(tree):
@@ -268,16 +261,13 @@ def test_a_signal_during_a_destructor_is_not_lost(number):
 @pytest.mark.parametrize("context", CONTEXTS)
 def test_other_threads_leave_signals_alone(context):
     """Python lets the main thread alone set handlers."""
-    found = []
 
     def work():
         with context():
-            found.append(signal.getsignal(signal.SIGINT))
+            return signal.getsignal(signal.SIGINT)
 
-    thread = threading.Thread(target=work)
-    thread.start()
-    thread.join()
-    assert found == [signal.default_int_handler]
+    with ThreadPoolExecutor(1) as pool:
+        assert pool.submit(work).result() == signal.default_int_handler
 
 
 @pytest.mark.usefixtures("handlers")
@@ -291,10 +281,7 @@ def test_the_first_is_noted_and_the_second_raised(number):
     assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
 
 
-STAGES = [
-    "fit.read_scene", "fit.Trainer", "fit.background_warmup", "fit.write_ply", "fit.evaluate_run", "fit.rule_report_of",
-    "fit.write_report", "results.render_overview", "results.write_page",
-]  # fmt: skip
+STAGES = ["fit.read_scene", "fit.Trainer", "fit.background_warmup", "fit.write_ply", "fit.evaluate_run", "results.write_page"]
 
 
 @pytest.mark.usefixtures("handlers")
@@ -335,8 +322,6 @@ def test_within_the_steps_the_one_in_progress_is_saved(stop_signals_scene, tmp_p
 
 @pytest.mark.usefixtures("handlers")
 def test_more_signals_while_the_program_ends(monkeypatch, capsys):
-    """One while it tidies up, one while it says its last words."""
-
     def tidy(*_):
         try:
             signal.raise_signal(signal.SIGINT)
@@ -374,7 +359,6 @@ def test_bytes_that_are_no_text_are_printed_as_codes(tmp_path):
 
 @on_linux
 def test_a_name_that_a_library_can_take(tmp_path, monkeypatch):
-    """A file in a folder of such a name, and one that has such a name itself."""
     folder = tmp_path / BYTES
     folder.mkdir()
     for path in (folder / "file", folder / f"{BYTES}.txt", tmp_path / "plain"):
@@ -390,15 +374,13 @@ def test_a_name_that_a_library_can_take(tmp_path, monkeypatch):
 
 
 @on_linux
-@pytest.mark.parametrize("suffix", [".mp4", ".webm", ".gif"])
-def test_films(tmp_path, suffix):
+def test_films(tmp_path):
     """OpenCV ended the process at such a name; a film is written, checked and read."""
-    path = tmp_path / BYTES / f"{BYTES}{suffix}"
+    path = tmp_path / BYTES / f"{BYTES}.mp4"
     path.parent.mkdir()
     frames = [np.full((16, 16, 3), 0.2 * i, np.float32) for i in range(3)]
     assert write_film(path, frames) == 3 and [p.name for p in path.parent.iterdir()] == [path.name]
-    if suffix != ".gif":
-        assert len(list(_frames(path))) == 3
+    assert len(list(_frames(path))) == 3
 
 
 def rename_an_image(scene: Path) -> str:
@@ -426,7 +408,6 @@ def flags(steps, preset="3dgs"):
 
 @on_linux
 def test_a_fit_and_what_follows(scene, tmp_path, capsys):
-    """The run remembers its scene, and is continued, scored and shown; reports hold text."""
     run = tmp_path / BYTES
     assert main(["fit", str(scene), "--out", str(run), *flags(2)]) == 0
     record = json.loads((run / "config.json").read_bytes())
@@ -458,13 +439,10 @@ def test_transforms(tmp_path):
 @on_linux
 @pytest.mark.slow
 def test_the_farm(scene, tmp_path):
-    """A job's folder has such a name; the page links to it, and the table holds text."""
     out = tmp_path / BYTES
     assert main(["farm", str(scene.parent), "--out", str(out), *flags(1)]) == 0
-    page, (row,) = (
-        (out / "index.html").read_text("utf-8"),
-        csv.DictReader(io.StringIO((out / "results.csv").read_text("utf-8"))),
-    )
+    page = (out / "index.html").read_text("utf-8")
+    (row,) = csv.DictReader(io.StringIO((out / "results.csv").read_text("utf-8")))
     assert row["name"] == "sceneb\\xe4ü" and row["state"] == "done"
     assert "sceneb%E4%C3%BC/run/report.html" in page and "sceneb%E4%C3%BC/thumbnail.jpg" in page
     assert cv2.imdecode(np.fromfile(out / scene.name / "thumbnail.jpg", np.uint8), cv2.IMREAD_COLOR) is not None
@@ -472,7 +450,6 @@ def test_the_farm(scene, tmp_path):
 
 @on_linux
 def test_plug_ins(scene, tmp_path):
-    """A reader's file has such a name."""
     file = tmp_path / f"{BYTES}.py"
     file.write_text("from warpgs.io.colmap import ColmapReader\nclass Own(ColmapReader):\n    pass\n")
     assert main(["fit", str(scene), "--out", str(tmp_path / "run"), "--reader", f"{file}:Own", *flags(1)]) == 0
@@ -526,22 +503,15 @@ def test_poses(tmp_path, capfd):
         assert load_scene(tmp_path / f"{BYTES}out").views
 
 
-def shell(words: list[str], environment: dict[str, str]) -> subprocess.CompletedProcess[bytes]:
-    """Run a command in an environment of its own."""
-    own = os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": str(Path(__file__).parents[2])} | environment
-    program = [sys.executable, "-P", "-m", "warpgs", *words]
-    return subprocess.run(program, env=own, capture_output=True, check=False, timeout=300)
-
-
 @on_linux
 def test_python_that_takes_names_for_ascii(tmp_path):
     """It is started again in its UTF-8 mode, once, which is said; letters are printed as the terminal has them."""
-    ascii_names = {"LC_ALL": "C", "PYTHONUTF8": "0"}
-    done = shell(["demo", str(tmp_path / "写"), "--views", "8", "--width", "32", "--height", "32"], ascii_names)
-    said = done.stderr.decode("ascii")
-    assert done.returncode == 0 and (tmp_path / "写" / "sparse").is_dir(), said
-    assert said.count("UTF-8 mode") == 1 and said.count("\n") == 1 and b"\\u5199" in done.stdout
-    assert shell(["--version"], {"LC_ALL": "C.UTF-8", "PYTHONUTF8": "0"}).stderr == b""
+    program, ascii_names = ("-P", "-m", "warpgs"), {"LC_ALL": "C", "PYTHONUTF8": "0"}
+    done = run(*program, "demo", str(tmp_path / "写"), "--views", "8", "--width", "32", "--height", "32", **ascii_names)
+    said = done.stderr
+    assert done.returncode == 0 and (tmp_path / "写" / "sparse").is_dir() and said.isascii(), said
+    assert said.count("UTF-8 mode") == 1 and said.count("\n") == 1 and "\\u5199" in done.stdout
+    assert run(*program, "--version", LC_ALL="C.UTF-8", PYTHONUTF8="0").stderr == ""
 
 
 @on_linux
@@ -560,12 +530,7 @@ def test_starting_again_keeps_the_command(monkeypatch):
 
 # No file of the product calls what only some systems have, but for those whose tests stand in for the others.
 
-TESTED = {
-    f"warpgs/{name}.py"
-    for name in (
-        "files", "device", "process", "kernels/launch", "locks", "ranks", "folders",
-    )
-}  # fmt: skip
+TESTED = {f"warpgs/{n}.py" for n in ("files", "device", "process", "kernels/launch", "locks", "ranks", "folders")}
 FILES = [p for p in sorted((ROOT / "warpgs").rglob("*.py")) if p.relative_to(ROOT).as_posix() not in TESTED]
 MODULES = {"fcntl", "grp", "pty", "pwd", "resource", "syslog", "termios", "msvcrt", "winreg"}
 NAMES = {
@@ -577,7 +542,6 @@ FOLDERS = ("/proc/", "/sys/", "/dev/", "/etc/", "/tmp/")
 
 
 def found_in(path: Path) -> list[str]:
-    """Return what a file calls, imports or names that only some systems have."""
     found = []
     for node in ast.walk(ast.parse(path.read_text("utf-8"))):
         if isinstance(node, ast.Import):

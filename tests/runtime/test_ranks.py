@@ -12,7 +12,6 @@ OWN = "127.0.0.1:8080"
 
 
 def test_a_taken_port_is_one_sentence():
-    """It says how to fix it; a port beyond the last one is none."""
     with loopback_socket(0, "give another") as taken:
         taken.listen()
         port = taken.getsockname()[1]

@@ -64,40 +64,29 @@ def project(camera, view, x):
     return np.array([fx * p[0] / p[2] + cx, fy * p[1] / p[2] + cy]), p[2]
 
 
-def test_images_are_complete_and_fill_the_frame(made):
+def test_images_fill_the_frame(made):
     folder, _, camera, views, _ = made
     assert sorted(p.name for p in (folder / "images").iterdir()) == [f"{i:03d}.png" for i in range(9)]
     assert camera[:2] == (128, 96) and camera[4] != 64 and camera[5] != 48  # off-centre on purpose
     for view in views.values():
-        assert view["image"].shape == (96, 128, 3)
+        assert view["image"].shape == (96, 128, 3) and view["image"].std() > 0.15
         assert (view["image"].max(axis=2) == 0).mean() < 0.002
-        assert view["image"].std() > 0.15
 
 
-def test_points_reproject_onto_their_observations(made):
+def test_points_are_where_their_images_show_them(made):
+    """They reproject onto their observations, in the colours there."""
     _, _, camera, views, points = made
-    assert len(points) > 300
-    for number, (x, _, track) in points.items():
+    errors = []
+    for number, (x, rgb, track) in points.items():
         assert len(track) >= 2 and len({i for i, _ in track}) == len(track)
         for i, k in track:
             u, v, back = views[i]["observed"][k]
             xy, depth = project(camera, views[i], x)
-            assert back == number and depth > 0
-            assert np.abs(xy - (u, v)).max() < 0.01
-            assert 0 < u < 128 and 0 < v < 96
-    assert sum(len(t) for _, _, t in points.values()) == sum(len(v["observed"]) for v in views.values())
-
-
-def test_point_colours_agree_with_the_images(made):
-    _, _, camera, views, points = made
-    errors = []
-    for x, rgb, track in points.values():
-        for i, _ in track:
-            (u, v), _ = project(camera, views[i], x)
-            patch = cv2.getRectSubPix(views[i]["image"].astype(np.float32), (1, 1), (u - 0.5, v - 0.5))
+            assert back == number and depth > 0 and np.abs(xy - (u, v)).max() < 0.01 and 0 < u < 128 and 0 < v < 96
+            patch = cv2.getRectSubPix(views[i]["image"].astype(np.float32), (1, 1), tuple(xy - 0.5))
             errors.append(np.abs(patch[0, 0] - rgb).max())
-    assert np.median(errors) < 0.03
-    assert np.quantile(errors, 0.95) < 0.15
+    assert len(points) > 300 and len(errors) == sum(len(v["observed"]) for v in views.values())
+    assert np.median(errors) < 0.03 and np.quantile(errors, 0.95) < 0.15
 
 
 def test_tracks_respect_occlusion(made):
@@ -118,21 +107,16 @@ def test_tracks_respect_occlusion(made):
     assert hidden > 20  # the scene does hide points from some views
 
 
-def test_split_is_a_partition_that_interpolates(made):
+def test_the_split_interpolates_and_copies_do_not_help(made):
+    """Held-out views lie between training views, and neither one of these nor their mean resembles them."""
     _, spec, _, views, _ = made
     train, test = (part.split("=")[1].split(",") for part in spec.split(";"))
     assert spec.startswith("train=") and ";test=" in spec
     assert len(train) == 6 and sorted(train + test) == sorted(v["name"] for v in views.values())
-    centers = {v["name"]: -v["R"].T @ v["t"] for v in views.values()}
-    xs = np.array([centers[n][:2] for n in train])
-    for name in test:
-        assert (centers[name][:2] > xs.min(axis=0)).all() and (centers[name][:2] < xs.max(axis=0)).all()
-
-
-def test_images_are_poor_predictors_of_each_other(made):
-    _, spec, _, views, _ = made
+    centers = {v["name"]: (-v["R"].T @ v["t"])[:2] for v in views.values()}
+    xs = np.array([centers[n] for n in train])
+    assert all((centers[n] > xs.min(axis=0)).all() and (centers[n] < xs.max(axis=0)).all() for n in test)
     image = {v["name"]: v["image"] for v in views.values()}
-    train, test = (part.split("=")[1].split(",") for part in spec.split(";"))
 
     def psnr(a, b):
         return -10 * np.log10(np.mean((a - b) ** 2))
@@ -148,14 +132,6 @@ def test_the_same_seed_gives_the_same_bytes(tmp_path):
     a, b, c = ({p.relative_to(tmp_path / n): p.read_bytes() for p in (tmp_path / n).rglob("*.*")} for n in "abc")
     assert len(a) == 11 and a == b and specs[0] == specs[1]
     assert all(a[k] != c[k] for k in a if k.suffix == ".png")
-
-
-def test_an_empty_folder_is_fine_and_a_full_one_is_refused(tmp_path):
-    demo.write_demo(tmp_path, views=8, width=32, height=32)
-    before = {p: p.stat().st_mtime_ns for p in tmp_path.rglob("*")}
-    with pytest.raises(UsageError, match="not empty"):
-        demo.write_demo(tmp_path, views=8, width=32, height=32)
-    assert before == {p: p.stat().st_mtime_ns for p in tmp_path.rglob("*")}
 
 
 @pytest.mark.parametrize("empty", [False, True])
@@ -176,19 +152,21 @@ def test_a_full_disk_leaves_no_half_a_scene(tmp_path, monkeypatch, empty):
     assert list(tmp_path.rglob("*")) == [folder] * empty
 
 
-@pytest.mark.parametrize("change", [{"views": 7}, {"width": 31}, {"height": 8}])
-def test_sizes_too_small_are_refused(tmp_path, change):
-    with pytest.raises(UsageError, match="at least"):
-        demo.write_demo(tmp_path / "d", **(SIZE | change))
-    assert not (tmp_path / "d").exists()
-
-
-def test_a_file_in_the_way(tmp_path):
+def test_demos_that_cannot_be_written(tmp_path):
+    """Too small, in the way of something, or of an unknown form; what is there stays."""
     (tmp_path / "file").write_text("")
-    with pytest.raises(UsageError, match="is a file"):
-        demo.write_demo(tmp_path / "file", **SIZE)
-    with pytest.raises(ResourceError, match="cannot be written"):
-        demo.write_demo(tmp_path / "file" / "below", **SIZE)
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "mine").touch()
+    cases = [("d", {"views": 7}, "at least 8"), ("d", {"width": 31}, "at least 32"), ("d", {"height": 8}, "at least 32")]
+    cases += [("file", {}, "is a file"), ("full", {}, "not empty"), ("file/below", {}, "cannot be written")]
+    for name, change, words in cases:
+        error = ResourceError if name == "file/below" else UsageError
+        with pytest.raises(error, match=words):
+            demo.write_demo(tmp_path / name, **(SIZE | change))
+    for change, words in (({"form": "llff"}, "transforms or colmap"), ({"views": 8}, "at least 9 views")):
+        with pytest.raises(UsageError, match=words):
+            demo.write_object(tmp_path / "d", **change)
+    assert sorted(p.name for p in tmp_path.rglob("*")) == ["file", "full", "mine"]
 
 
 def surface_equation(shape, p):
@@ -219,24 +197,12 @@ def test_hits_lie_on_the_surface_and_nothing_lies_before_them(number):
     assert np.abs(surface_equation(shape, p)).max() < 1e-6
     normals = shape.normal(p)
     np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-9)
-    outside = surface_equation(shape, p - 1e-4 * d)
     start = surface_equation(shape, shape.local(eye[None]))[0]
-    facing = np.abs(np.einsum("ij,ij->i", normals, d)) > 0.05
-    assert (np.sign(outside[facing]) == np.sign(start)).all()
-    assert (np.einsum("ij,ij->i", normals, d)[facing] < 0).all()
+    cosine = np.einsum("ij,ij->i", normals, d)
+    assert (cosine[np.abs(cosine) > 0.05] < 0).all()
     for s in np.linspace(0.02, 0.98, 40):
         along = surface_equation(shape, shape.local(eye[None]) + (s * t)[:, None] * d)
         assert (np.sign(along) == np.sign(start)).all()
-
-
-def test_rays_that_miss_everything_are_black():
-    sphere = [s for s in demo.still_life() if isinstance(s, raycast.Sphere)][:1]
-    K = np.array([[20.0, 0, 16], [0, 20, 16], [0, 0, 1]])
-    view = np.eye(4)
-    view[:3, 3] = -np.array(sphere[0].center) + [0, 0, 3]
-    rgb = raycast.render(sphere, raycast.Light(), K, view, 32, 32)
-    assert rgb.dtype == np.float32 and rgb[16, 16].max() > 0.05
-    assert (rgb[0] == 0).all() and (rgb[:, 0] == 0).all()
 
 
 # Objects cut out of their surroundings: true alpha, thin parts, the same views in two formats.
@@ -272,9 +238,10 @@ def test_two_formats_show_the_same_object_to_the_same_cameras(tmp_path):
         np.testing.assert_allclose(left.image, right.image, atol=1e-6)
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(4))
 def test_objects_have_holes_and_stay_in_the_frame(seed):
     shapes = demo.cut_out_object(seed)
+    assert str([s.center for s in shapes]) != str([s.center for s in demo.cut_out_object(seed + 1)])
     thin = [s for s in shapes if isinstance(s, raycast.Cylinder) and s.size < 0.05]
     assert len(thin) >= 10 and any(isinstance(s, raycast.Torus) for s in shapes)
     holes = 0
@@ -284,16 +251,6 @@ def test_objects_have_holes_and_stay_in_the_frame(seed):
         _, _, stats, _ = cv2.connectedComponentsWithStats(empty.astype(np.uint8), connectivity=4)
         holes += (stats[1:, cv2.CC_STAT_AREA] > 3).sum() - 1  # all but the surroundings
     assert holes >= 3
-
-
-def test_seeds_differ_and_wishes_are_checked(tmp_path):
-    a, b = (raycast.render_rgba(demo.cut_out_object(s), demo.LIGHT, c.K, c.viewmat, 32, 32, 1)[..., 3]
-            for s, c in zip((0, 1), 2 * demo.ring_cameras(9, 32, 32)[:1]))  # fmt: skip
-    assert (a != b).mean() > 0.05
-    with pytest.raises(UsageError, match="transforms or colmap"):
-        demo.write_object(tmp_path / "a", form="llff", **CUT_OUT_SIZE)
-    with pytest.raises(UsageError, match="9 views or more"):
-        demo.write_object(tmp_path / "a", views=8)
 
 
 @pytest.mark.parametrize("axis", range(3))

@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.report.test_in_browser import BROWSERS
-
+BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
+WEBGL = ("--disable-gpu-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 TIME = 120
 """Seconds that anything may take."""
 CHANGED = ("navigated", "context was destroyed", "context with specified id", "Promise was collected", "active page")
@@ -29,19 +29,16 @@ class PageChanged(Exception):
 
 
 class Chromium:
-    """One page of a browser."""
-
-    def __init__(self, folder, size=(900, 700)):
+    def __init__(self, folder, *graphics: str):
         browser = next(filter(None, map(shutil.which, BROWSERS)), None)
         if browser is None or not hasattr(os, "set_inheritable"):
             pytest.skip(f"none of {', '.join(BROWSERS)} is there")
         to_read, self._write = os.pipe()
         self._read, to_write = os.pipe()
         words = [
-            browser, "--headless=new", "--no-sandbox", "--disable-gpu-sandbox", "--use-gl=angle", "--use-angle=swiftshader",
-            "--enable-unsafe-swiftshader", "--disable-quic", "--no-first-run", "--disable-background-networking",
-            "--disable-component-update", "--disable-sync", "--remote-debugging-pipe", f"--user-data-dir={folder / 'profile'}",
-            f"--window-size={size[0]},{size[1]}", "about:blank",
+            browser, "--headless=new", "--no-sandbox", *(graphics or WEBGL), "--disable-quic", "--no-first-run",
+            "--disable-background-networking", "--disable-component-update", "--disable-sync", "--remote-debugging-pipe",
+            f"--user-data-dir={folder / 'profile'}", "--window-size=900,700", "about:blank",
         ]  # fmt: skip
         # the browser reads commands at 3 and writes at 4
         shell = 'exec 3<&"$0" 4>&"$1"; shift; exec "$@"'
@@ -71,7 +68,6 @@ class Chromium:
         self._answers.put({"id": None, "error": "the browser has ended"})
 
     def ask(self, method: str, **params) -> dict:
-        """Result of a method of the protocol."""
         self._number += 1
         session = {"sessionId": self._session} if self._session else {}
         text = json.dumps({"id": self._number, "method": method, "params": params, **session})
@@ -83,11 +79,9 @@ class Chromium:
         return answer["result"]
 
     def open(self, address: str) -> None:
-        """Go to a page."""
         self.ask("Page.navigate", url=address)
 
     def value(self, expression: str):
-        """Value of JavaScript, awaited."""
         found = self.ask("Runtime.evaluate", expression=expression, awaitPromise=True, returnByValue=True)
         assert "exceptionDetails" not in found, found["exceptionDetails"]
         return found["result"].get("value")
@@ -122,7 +116,6 @@ class Chromium:
                     return image
 
     def console(self) -> list[str]:
-        """Lines of the console, and errors."""
         lines = []
         for event in self.events:
             found = event.get("params", {})
@@ -135,11 +128,9 @@ class Chromium:
         return lines
 
     def picture(self) -> bytes:
-        """PNG of the page."""
         return base64.b64decode(self.ask("Page.captureScreenshot", format="png")["data"])
 
     def close(self) -> None:
-        """End the browser and its children."""
         os.close(self._write)
         try:
             self.process.wait(10)

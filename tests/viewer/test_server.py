@@ -20,7 +20,6 @@ pytest.importorskip("viser")
 
 @pytest.fixture(scope="module")
 def server():
-    """A server at a free port."""
     opened = open_server(0)
     yield opened
     stop_server(opened)
@@ -43,7 +42,6 @@ def asked(server, target=None, *, upgrade=True, host=None, origin="own", method=
 
 
 def read(stream: socket.socket, until=None) -> bytes:
-    """What comes until the other side closes, or until some bytes are there."""
     found = b""
     while until is None or until not in found:
         try:
@@ -57,13 +55,11 @@ def read(stream: socket.socket, until=None) -> bytes:
 
 
 def answer(server, *args, **named) -> bytes:
-    """Everything that comes back to a request that is refused, or for a page."""
     with asked(server, *args, **named) as stream:
         return read(stream)
 
 
 def opened(server) -> socket.socket:
-    """A websocket that is open."""
     stream = asked(server)
     assert read(stream, b"\r\n\r\n").startswith(b"HTTP/1.1 101 ")
     return stream
@@ -187,8 +183,6 @@ def test_values_that_a_control_cannot_have_are_passed_over(server, capfd):
 
 
 def test_a_callback_that_fails_is_one_line(capfd):
-    """Whatever it raises."""
-
     def wrong(_):
         raise KeyError("no\nsuch thing")
 
@@ -197,7 +191,6 @@ def test_a_callback_that_fails_is_one_line(capfd):
 
 
 def test_numbers_are_bounded(monkeypatch, capfd):
-    """Messages, websockets, and connections on which nothing was asked."""
     server = open_server(0)
     try:
         with opened(server):

@@ -35,6 +35,7 @@ from warpgs.viewer.window import (
     PATH,
     RENDER,
     Window,
+    box_json,
     content_of_file,
     content_of_run,
     keyframe,
@@ -50,7 +51,6 @@ SIZE = (40, 32)
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """A scene, and a run on it that somebody looked at."""
     folder = tmp_path_factory.mktemp("view")
     write_demo(folder / "scene", views=8, width=SIZE[0], height=SIZE[1])
     with watch.live_view(folder / "run", port=0) as live:
@@ -60,7 +60,6 @@ def folder(tmp_path_factory):
 
 
 def fit(folder, name, on_model=None):
-    """Fit a few steps."""
     warpgs.fit(
         str(folder / "scene"), CONFIG, split=split_spec(8), out=folder / name, device="cpu", verbose=False, on_model=on_model
     )
@@ -78,6 +77,10 @@ def window(folder):
     yield opened
     opened.close()
     stop_server(server)
+
+
+def button(window, label):
+    return next(h for h in window.server.gui._gui_input_handle_from_uuid.values() if getattr(h, "label", "") == label)
 
 
 def test_looking_on_changes_nothing(folder):
@@ -104,7 +107,6 @@ def test_images_at_a_camera_are_those_of_the_rasterizer(window):
 
 
 def test_an_image_is_placed_where_another_camera_sees_it(window):
-    """Twice as large and shifted: pixel centres lie at +0.5."""
     camera = next(iter(window.content.model.scene_cameras.values()))
     K = camera.K * np.array([[2.0], [2.0], [1.0]])
     K[0, 2] += 6
@@ -118,14 +120,14 @@ def test_layers_and_the_crop_box_choose_what_is_shown(window):
     panel, count = window.panel, len(window.content.model.gaussians())
     shown = {}
     for layer in (FINE_LAYER, COARSE_LAYER):
-        panel._layer.value = layer
+        panel.layer.value = layer
         shown[layer] = len(window.shown())
-    panel._layer.value = "all"
+    panel.layer.value = "all"
     assert shown[FINE_LAYER] == (count + 2) // 3 and sum(shown.values()) == len(window.shown()) == count
     panel._crop.value = True
     assert 0 < len(window.shown()) < count
     n = window.content.model.normalization
-    panel._save("crop.json", panel.crop_box().to_json(n))
+    panel._save("crop.json", box_json(panel.crop_box(), n))
     stored = json.loads((window.content.stem / "crop.json").read_text())
     means = (window.shown().means.double().numpy() / n.scale + n.offset) - stored["center"]
     assert (np.abs(means @ np.array(stored["rotation"])) <= np.array(stored["size"]) / 2 + 1e-4).all()
@@ -148,7 +150,7 @@ def test_what_is_saved_is_rendered_and_exported(window, tmp_path):
         image = np.asarray(Image.open(tmp_path / "film" / f"{i:04d}.png").convert("RGB")) / 255
         assert image.shape == wanted.shape and np.abs(image - wanted).max() < 0.01
     panel._crop.value = True
-    panel._save(CROP, panel.crop_box().to_json(n))
+    panel._save(CROP, box_json(panel.crop_box(), n))
     whole = ["export", run, "--to", str(tmp_path / "a.ply")]
     assert main([*whole, "--crop", f"{run}/{CROP}"]) == 0
     shown = convert_gaussians(window.shown(), n, "scene", "file").means
@@ -165,8 +167,7 @@ def test_the_first_view_is_that_of_the_page(window):
     client = SimpleNamespace(atomic=contextlib.nullcontext, camera=SimpleNamespace(aspect=2.0))
     window.step_into(model.train[0], client)
     assert not np.allclose(client.camera.position, middle.center)
-    buttons = {getattr(h, "label", None): h for h in server.gui._gui_input_handle_from_uuid.values()}
-    (back,) = buttons["Reset"]._impl.update_cb
+    (back,) = button(window, "Reset")._impl.update_cb
     client.camera.fov = 0.1
     back(SimpleNamespace(client=client))
     for name in ("position", "look_at", "fov"):
@@ -189,12 +190,11 @@ def test_a_narrow_window_shows_the_whole_width_of_an_image(window):
         window._connected(client)
         assert state.fov == pytest.approx(2 * np.arctan(side / 2))
         state.fov = 0.1
-        window.reset(client)
+        window.move(camera, client)
         assert state.fov == pytest.approx(2 * np.arctan(side / 2))
 
 
 def test_a_browser_gets_the_image_that_it_asks_for(window):
-    """Once for each camera and wish; Gaussians again where they are asked for."""
     camera = window.content.model.scene_cameras[window.content.model.train[0]]
     sent = []
     state = SimpleNamespace(
@@ -203,11 +203,11 @@ def test_a_browser_gets_the_image_that_it_asks_for(window):
     client = SimpleNamespace(
         client_id=7, camera=state, scene=SimpleNamespace(set_background_image=lambda i, **_: sent.append(i))
     )
-    window.panel._kind.value = DEPTH
+    window.panel.kind.value = DEPTH
     window._render_for(client)
     window._render_for(client)
     assert [i.shape for i in sent] == [(48, 64, 3)] and MAPS[DEPTH].split(",")[0] in window.panel._note.content
-    window.panel._kind.value = GAUSSIANS
+    window.panel.kind.value = GAUSSIANS
     window._render_for(client)
     assert sent[-1].shape == (2, 2, 3) and not window.panel._note.visible
 
@@ -234,16 +234,12 @@ def test_an_unknown_wish_ends_no_thread(window, monkeypatch):
 
 
 def test_keyframes_are_bounded(window, monkeypatch):
-    """One more than there may be is refused with a note, and the path keeps what it has."""
     panel, told = window.panel, []
     camera = window.content.model.scene_cameras[window.content.model.train[0]]
     monkeypatch.setattr(panel, "keyframes", [])
     monkeypatch.setattr(panel, "explain", told.append)
     monkeypatch.setattr(window, "camera_of", lambda client: camera)
-    add = next(
-        h for h in window.server.gui._gui_input_handle_from_uuid.values() if getattr(h, "label", "") == "add this camera"
-    )
-    (append,) = add._impl.update_cb
+    (append,) = button(window, "add this camera")._impl.update_cb
     for _ in range(MAX_KEYFRAMES + 3):
         append(SimpleNamespace(client=None))
     assert len(panel.keyframes) == MAX_KEYFRAMES and told == ["a path has at most 1,000 keyframes"] * 3
@@ -273,7 +269,6 @@ def test_no_image_of_a_run_is_read_through_a_link(window, tmp_path, monkeypatch,
 
 
 def test_a_ply_and_what_is_neither(folder, tmp_path):
-    """A PLY file is shown without cameras, about its middle; saved files lie beside it; others are one sentence."""
     content = content_of_file(folder / "run" / "point_cloud.ply")
     assert not content.model.scene_cameras and content.saved("crop.json") == folder / "run" / "point_cloud-crop.json"
     middle = content.model.gaussians().means.double().quantile(0.5, dim=0)
@@ -288,7 +283,6 @@ def test_a_ply_and_what_is_neither(folder, tmp_path):
 
 
 def test_a_run_is_followed_until_it_is_interrupted(folder, monkeypatch, capsys):
-    """A checkpoint that replaces another is shown; Ctrl-C ends with code 0."""
     shown: list = []
     polls, times = iter(range(3)), iter((None, None, 1.0, 2.0))
 
@@ -303,23 +297,16 @@ def test_a_run_is_followed_until_it_is_interrupted(folder, monkeypatch, capsys):
     monkeypatch.setattr(watch, "address", lambda _: "http://127.0.0.1:1/word/")
     assert main(["view", str(folder / "run"), "--device", "cpu"]) == 0
     told = capsys.readouterr().out
-    assert (
-        "waiting for the first checkpoint" in told
-        and "step 12" in told
-        and len(shown) == 1
-        and "http://127.0.0.1:1/word/" in told
-    )
+    assert len(shown) == 1
+    assert all(words in told for words in ("waiting for the first checkpoint", "step 12", "http://127.0.0.1:1/word/"))
 
 
 def test_a_page_names_nobody(folder, tmp_path, capsys):
     """One file without a path, an image's name or an address in the network; cleaned, and it starts at a training camera."""
     assert main(["export", str(folder / "run"), "--to", str(tmp_path / "scene.html"), "--rotate", "level"]) == 0
     text = (tmp_path / "scene.html").read_text("utf-8")
-    assert (
-        "default-src 'none'" in text
-        and text.index("URLSearchParams=") < text.index("<script data-p")
-        and "<title>scene</title>" in text
-    )
+    assert "default-src 'none'" in text and "<title>scene</title>" in text
+    assert text.index("URLSearchParams=") < text.index("<script data-p")
     head, _, data = text.partition('__VISER_EMBED_DATA__="')
     assert str(folder) not in text and "warpgs/" not in head
     scene = zstandard.ZstdDecompressor().decompressobj().decompress(base64.b64decode(data.partition('"')[0])[8:])
@@ -329,14 +316,10 @@ def test_a_page_names_nobody(folder, tmp_path, capsys):
 
 
 def test_names_that_are_not_utf8(window, monkeypatch):
-    """Text for the page is UTF-8, and a view is chosen by what is shown of its name."""
     chosen, texts = [], []
     (camera, *_) = window.content.model.scene_cameras.values()
-    content = dataclasses.replace(
-        window.content,
-        title="b\udce4r",
-        model=dataclasses.replace(window.content.model, scene_cameras={"b\udce4r.png": camera}),
-    )
+    model = dataclasses.replace(window.content.model, scene_cameras={"b\udce4r.png": camera})
+    content = dataclasses.replace(window.content, title="b\udce4r", model=model)
     monkeypatch.setattr(window.panel, "content", content)
     monkeypatch.setattr(window, "step_into", lambda name, client: chosen.append(name))
 

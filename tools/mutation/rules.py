@@ -29,10 +29,10 @@ CUDA_FILES = ("warpgs/kernels/blend_cuda.py", "warpgs/kernels/ssim.py", "warpgs/
 CUDA_FUNCTIONS = {
     "warpgs/kernels/launch.py": ("_Recorded", "_recorded", "warp_stream", "_warp_stream", "stream_of", "warp_device"),
     "warpgs/kernels/graphs.py": (
-        "CapturedGraph", "GraphMemory", "GraphPool.capture", "GraphPool.pool", "GraphPool.release",
+        "CapturedGraph", "GraphMemory", "GraphPool.capture", "GraphPool.release",
     ),
-    "warpgs/kernels/update.py": ("make_scheduled_kernel",),
-    "warpgs/kernels/walk.py": ("make_native", "_launch_native"),
+    "warpgs/kernels/update.py": ("scheduled_update",),
+    "warpgs/kernels/walk.py": ("make_native",),
 }  # fmt: skip
 """Code that only a CUDA device runs, in addition to code that `sides` and `ends_cpu` find."""
 

@@ -4,6 +4,7 @@ import contextlib
 import importlib
 import os
 import sys
+from collections.abc import Sequence
 
 from warpgs.device import is_out_of_memory, no_memory_message
 from warpgs.errors import ResourceError, UsageError, WarpgsError, did_you_mean
@@ -39,8 +40,7 @@ def report_defect(error: Exception, arguments: list[str]) -> int:
     import tempfile
     import traceback
 
-    gone = missing_package(error)
-    if gone:
+    if gone := missing_package(error):
         line = f"warpgs: this command needs the Python package {gone}, which is missing; reinstall warpgs with pip"
         return last_words(line, UsageError.exit_code)
     details = f"warpgs {__version__} {' '.join(arguments)}\n\n{''.join(traceback.format_exception(error))}"
@@ -54,15 +54,11 @@ def report_defect(error: Exception, arguments: list[str]) -> int:
         for line in details.splitlines():
             say(line, error=True)
         where = "above"
-    own = own_frame(error)
-    if own:
-        line = f"warpgs: {type(error).__name__}: {error} (in your own code, {own}; the details are {where})"
-        return last_words(line, UsageError.exit_code)
-    line = (
-        f"warpgs: internal error, {type(error).__name__}: {error}. This is a bug in warpgs; please report it with the "
-        f"details {where}"
-    )
-    return last_words(line, WarpgsError.exit_code)
+    said = f"{type(error).__name__}: {error}"
+    if own := own_frame(error):
+        return last_words(f"warpgs: {said} (in your own code, {own}; the details are {where})", UsageError.exit_code)
+    more = f"This is a bug in warpgs; please report it with the details {where}"
+    return last_words(f"warpgs: internal error, {said}. {more}", WarpgsError.exit_code)
 
 
 FLAGS = (
@@ -107,21 +103,23 @@ SCENE = (
 """Description of the positional argument."""
 
 
+def _rows(pairs: Sequence[tuple[str, str]], width: int = 0) -> list[str]:
+    """Return pairs in two columns."""
+    width = width or max(len(left) for left, _ in pairs)
+    return [f"  {left:<{width}}  {right}".rstrip() for left, right in pairs]
+
+
 def help_lines(about: str) -> list[str]:
     """Return the help of `warpgs fit` in at most 45 lines of 80 columns."""
-
-    def rows(pairs: list[tuple[str, str]]) -> list[str]:
-        width = max(len(left) for left, _ in pairs)
-        return [f"  {left:<{width}}  {right}".rstrip() for left, right in pairs]
-
     flags = [("SCENE", SCENE[0]), ("", SCENE[1])]
-    for name, word, default, text in FLAGS:
-        stated = f" [{default}]" if default not in ("", "False") else ""
-        flags.append((f"{name} {word}".strip(), text + stated))
+    flags += [
+        (f"{name} {word}".strip(), text if default in ("", "False") else f"{text} [{default}]")
+        for name, word, default, text in FLAGS
+    ]
     return [
         f"warpgs fit: {about}", "", "usage: warpgs fit SCENE --out RUN [flags]", "",
-        "flags most fits need, and their [defaults]:", *rows(flags), "",
-        "presets (--preset):", *rows([*PRESETS.described().items()]), "", "splits (--split):", *rows([*SPLITS.items()]), "",
+        "flags most fits need, and their [defaults]:", *_rows(flags), "",
+        "presets (--preset):", *_rows([*PRESETS.described().items()]), "", "splits (--split):", *_rows([*SPLITS.items()]), "",
         "examples:", *(f"  {line}" for line in EXAMPLES), "", "`warpgs fit --help-all` lists every flag by topic.",
     ]  # fmt: skip
 
@@ -168,10 +166,7 @@ ASKING = {"-h", "--help", "--help-all", "help", "--version", "-V"}
 
 def _help() -> str:
     width = max(map(len, COMMANDS))
-    groups = (
-        "\n".join([f"{purpose}:", *(f"  {name:<{width}}  {COMMANDS[name]}" for name in names)])
-        for purpose, names in GROUPS.items()
-    )
+    groups = ["\n".join([f"{title}:", *_rows([(n, COMMANDS[n]) for n in names], width)]) for title, names in GROUPS.items()]
     return (
         f"warpgs {__version__}: from a handful of photographs to a 3D Gaussian scene\n\n"
         "usage: warpgs COMMAND [flags]\n\n" + "\n\n".join(groups) + "\n\n"
@@ -188,13 +183,13 @@ def main(arguments: list[str] | None = None) -> int:
         system_folder()
     words = sys.argv[1:] if arguments is None else arguments
     prints = words[:1] in ([], *([name] for name in PRINTING)) and "--warm" not in words
-    with careful_output(prints or bool(ASKING & {*words})) as output:
+    with careful_output(prints or bool(ASKING & {*words})) as exit_code:
         accept_all_letters()
         try:
             with interrupting_signals():
-                return output.exit_code(_run(words))
+                return exit_code(_run(words))
         except SystemExit as e:  # after the help of a command
-            if e.code or not (code := output.exit_code(0)):
+            if e.code or not (code := exit_code(0)):
                 raise
             raise SystemExit(code) from e
 

@@ -73,15 +73,16 @@ def _reason(error: BaseException) -> str:
     return f"{type(error).__name__}: {text[0][:160]}" if text else type(error).__name__
 
 
+def _noted(topic: str, sound: bool, detail: str, remedy: str) -> Finding:
+    """Return a finding that is a note with a remedy unless it is ``sound``."""
+    return Finding(topic, OK, detail) if sound else Finding(topic, NOTE, detail, remedy)
+
+
 def _python() -> Iterable[Finding]:
-    version = platform.python_version()
-    detail = f"{version} at {sys.executable}"
-    low, high = PYTHON
-    if low <= sys.version_info[:2] < high:
-        yield Finding("Python", OK, detail, required=True)
-    else:
-        span = f">={low[0]}.{low[1]}, <{high[0]}.{high[1]}"
-        yield Finding("Python", MISSING, detail, f"create an environment with Python {span}", True)
+    detail, (low, high) = f"{platform.python_version()} at {sys.executable}", PYTHON
+    sound, span = low <= sys.version_info[:2] < high, f">={low[0]}.{low[1]}, <{high[0]}.{high[1]}"
+    remedy = "" if sound else f"create an environment with Python {span}"
+    yield Finding("Python", OK if sound else MISSING, detail, remedy, True)
     yield Finding("System", OK, f"{platform.system()} {platform.release()} on {platform.machine()}")
 
 
@@ -113,27 +114,19 @@ def _packages() -> Iterable[Finding]:
 
 def _extras() -> Iterable[Finding]:
     lacking = [name for name, (module, _) in EXTRAS.items() if importlib.util.find_spec(module) is None]
-    here = ", ".join(name for name in EXTRAS if name not in lacking)
-    if not lacking:
-        yield Finding("Extras", OK, here)
-        return
-    words = ", ".join(f"{name} ({EXTRAS[name][1]})" for name in lacking)
-    yield Finding("Extras", NOTE, f"{here + '; ' if here else ''}not installed: {words}", install_extras(*lacking))
+    words = [", ".join(name for name in EXTRAS if name not in lacking)]
+    words += [f"not installed: {', '.join(f'{name} ({EXTRAS[name][1]})' for name in lacking)}"] if lacking else []
+    yield _noted("Extras", not lacking, "; ".join(filter(None, words)), install_extras(*lacking))
 
 
 def _processor() -> Iterable[Finding]:
     yield Finding("CPU", OK, f"{processor_name()}, {usable_cores()} of {os.cpu_count()} cores usable")
-    memory = machine_memory()
-    if memory is None:
+    if (memory := machine_memory()) is None:
         assumed = f"the system does not report its memory; {format_bytes(ASSUMED_BYTES)} are assumed"
         yield Finding("Memory", NOTE, assumed)
         return
-    total, free = memory
-    detail = f"{format_bytes(total)}, {format_bytes(free)} available"
-    if free < LOW_MEMORY:
-        yield Finding("Memory", NOTE, detail, "close other programs, or fit at a smaller image size")
-    else:
-        yield Finding("Memory", OK, detail)
+    detail = f"{format_bytes(memory[0])}, {format_bytes(memory[1])} available"
+    yield _noted("Memory", memory[1] >= LOW_MEMORY, detail, "close other programs, or fit at a smaller image size")
 
 
 def _cuda() -> Iterable[Finding]:
@@ -240,22 +233,17 @@ def _kernel_cache() -> Iterable[Finding]:
 
 
 def _rendering() -> Iterable[Finding]:
-    topic = "Plots"
     try:
-        overview = importlib.import_module("warpgs.report.overview")
-        ok, detail = overview.probe_rendering()
+        sound, detail = importlib.import_module("warpgs.report.overview").probe_rendering()
     except Exception as e:
-        ok, detail = False, _reason(e)
-    if ok:
-        yield Finding(topic, OK, detail)
-    else:
-        remedy = "pip install pyvista vtk; on a machine without a screen, also libEGL or libOSMesa (libosmesa6)"
-        yield Finding(topic, NOTE, f"{detail}; `warpgs plot` cannot render", remedy)
+        sound, detail = False, _reason(e)
+    remedy = "pip install pyvista vtk; on a machine without a screen, also libEGL or libOSMesa (libosmesa6)"
+    yield _noted("Plots", sound, detail + ("" if sound else "; `warpgs plot` cannot render"), remedy)
 
 
 def _video() -> Iterable[Finding]:
     """Encode a few frames for real: a build of OpenCV may accept the codec and still write nothing."""
-    topic = "Film encoder"
+    sound, detail = True, "VP9 through OpenCV"
     try:
         import numpy as np
 
@@ -264,22 +252,17 @@ def _video() -> Iterable[Finding]:
 
         with temporary_folder() as folder:
             write_film(folder.path / "probe.mp4", (np.full((64, 64, 3), level) for level in (0, 0.5, 1)), 10)
-        yield Finding(topic, OK, "VP9 through OpenCV")
-        return
     except Exception as e:
-        why = _reason(e)
+        sound, detail = False, f"{_reason(e)}; films are written as single frames"
     remedy = "pip install --force-reinstall opencv-contrib-python-headless (its wheels include the encoder)"
-    yield Finding(topic, NOTE, f"{why}; films are written as single frames", remedy)
+    yield _noted("Film encoder", sound, detail, remedy)
 
 
 def _disk() -> Iterable[Finding]:
     here = Path.cwd()
     free = shutil.disk_usage(here).free
-    detail = f"{format_bytes(free)} free at {here}"
-    if free < LOW_DISK:
-        yield Finding("Disk", NOTE, detail, "free some disk space, or work in a folder on another disk")
-    else:
-        yield Finding("Disk", OK, detail)
+    remedy = "free some disk space, or work in a folder on another disk"
+    yield _noted("Disk", free >= LOW_DISK, f"{format_bytes(free)} free at {here}", remedy)
 
 
 CHECKS: tuple[Callable[[], Iterable[Finding]], ...] = (
@@ -305,8 +288,9 @@ def diagnose(tell: Callable[[str], object] = lambda line: None) -> list[Finding]
     with ThreadPoolExecutor(len(APART)) as pool:
         apart = {check: pool.submit(_findings, check) for check in CHECKS if check in APART}
         checks = [check for check in CHECKS if check not in APART]
-        here = {check: _findings(check) for check in counted(checks, tell, "checking this machine", "parts")}
-        return [f for check in CHECKS for f in (here[check] if check in here else apart[check].result())]
+        found = {check: _findings(check) for check in counted(checks, tell, "checking this machine", "parts")}
+        found |= {check: future.result() for check, future in apart.items()}
+        return [f for check in CHECKS for f in found[check]]
 
 
 def print_report(findings: list[Finding], console=None) -> int:
@@ -326,16 +310,14 @@ def print_report(findings: list[Finding], console=None) -> int:
     for f in findings:
         table.add_row(escape(names.get(f.topic, f.topic)), f"[{styles[f.status]}]{f.status}[/]", escape(printable(f.detail)))
     console.print(table)
-    open_ends = [f for f in findings if f.status != OK and f.remedy]
-    if open_ends:
-        remedies = Table.grid(padding=(0, 2))
-        remedies.add_column(no_wrap=True)
-        remedies.add_column(overflow="fold")
-        for f in open_ends:
+    remedies = Table.grid(padding=(0, 2))
+    remedies.add_column(no_wrap=True)
+    remedies.add_column(overflow="fold")
+    for f in findings:
+        if f.status != OK and f.remedy:
             remedies.add_row(f"[{styles[f.status]}]{escape(names.get(f.topic, f.topic))}[/]", escape(printable(f.remedy)))
-        console.print("[bold]What to do[/]")
-        console.print(remedies)
-        console.print()
+    if remedies.row_count:
+        console.print("[bold]What to do[/]", remedies, "", sep="\n")
     stops = [names.get(f.topic, f.topic) for f in findings if f.status == MISSING and f.required]
     if stops:
         console.print(f"[bold red]A fit cannot run yet[/]: {escape(', '.join(stops))}.")

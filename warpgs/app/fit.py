@@ -40,11 +40,8 @@ def scene_flags(*, positional: bool) -> tuple[type, Any]:
     """Return the dataclass of the flags, and their defaults."""
     import tyro
 
-    if positional:
-        path, shown = tyro.MISSING, (tyro.conf.Positional, tyro.conf.arg(metavar="SCENE"))
-    else:
-        path, shown = "", (tyro.conf.Fixed, tyro.conf.Suppress)
-    return flags_of(SceneRequest, SceneRequest(path), {"path": shown})
+    shown = (tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")) if positional else (tyro.conf.Fixed, tyro.conf.Suppress)
+    return flags_of(SceneRequest, SceneRequest(tyro.MISSING if positional else ""), {"path": shown})
 
 
 def scene_of(flags: Any, path: str) -> SceneRequest:
@@ -85,7 +82,7 @@ class Request:
     lpips_weights: Path | None = None
     """File of `warpgs convert-lpips`; without it LPIPS is not measured."""
     time_budget: float | None = None
-    """Choose the number of steps so that set-up and steps take about this time [s]; not with --steps or --resume."""
+    """Choose the number of steps so that set-up and steps take about this time [s]; not if --steps or --resume is given."""
     view: bool = False
     """Show the model in a browser while it trains, at the printed address; this changes no byte of the result."""
     view_port: int = 8080
@@ -211,17 +208,6 @@ def _config(a: Any, base: FitConfig, terms: Parts, modules: Parts) -> FitConfig:
     return dataclasses.replace(config, loss_terms=found, view_modules=learned)
 
 
-def _check_time_budget(a: Any, arguments: list[str]) -> None:
-    """Raise UsageError for an invalid time budget, or one that is given together with --steps or --resume."""
-    if a.time_budget is None:
-        return
-    if a.resume or word_after(arguments, "--steps"):
-        raise UsageError(
-            "--time-budget chooses the number of steps; leave out --steps. To continue a run, give only --out RUN --resume"
-        )
-    check_budget(a.time_budget)
-
-
 def _names_a_run_alone(arguments: list[str]) -> bool:
     """Return whether arguments continue a run without giving any of its settings."""
     words = [w for a in arguments for w in a.split("=", 1)]
@@ -264,7 +250,12 @@ def request_of(arguments: list[str], about: str) -> FitRequest:
     view_port = _machine(a)
     config = dataclasses.replace(_config(a, base, *parts), preset=base.preset)
     check_range("--steps", config.steps or 1, 1, MAX_WHOLE)
-    _check_time_budget(a, arguments)
+    if a.time_budget is not None:
+        if a.resume or word_after(arguments, "--steps"):
+            raise UsageError(
+                "--time-budget chooses the number of steps; leave out --steps. To continue a run, give only --out RUN --resume"
+            )
+        check_budget(a.time_budget)
     notes = (origin_note(origin, base, config),)
     if word_after(arguments, "--preset") is None:
         say(f"preset {base.preset}: {PRESETS.described()[base.preset]}")

@@ -11,7 +11,8 @@ from warpgs.constants import Rule
 from warpgs.device import BINNING, BLENDING, FLOAT, LOSS, PROJECTION, SAMPLING, Needs, StepSizes
 from warpgs.kernels import blend_cpu, blend_cuda, launch
 from warpgs.kernels.falloff import COLORS, VALUES, WIDTHS, Pass
-from warpgs.kernels.launch import TORCH, Allocator, first_order, keep, kept
+from warpgs.kernels.graphs import TORCH, Allocator
+from warpgs.kernels.launch import first_order, keep, kept
 from warpgs.kernels.native import ROLLED
 from warpgs.kernels.tiles import Tiles, grid
 
@@ -41,8 +42,8 @@ def make_segments(real, values: int = VALUES, width: int = 9 + COLORS):
     reals = wp.types.vector(values, real)
     record = wp.types.vector(width, real)
     lane_reals = wp.types.vector(SUMMED * values, real)
-    count = wp.constant(values)
-    lanes = wp.constant(SUMMED)
+    count = values
+    lanes = SUMMED
 
     @wp.kernel(enable_backward=False, module="unique", module_options=ROLLED)
     def sum_gradients(
@@ -92,17 +93,6 @@ def is_native(projected: torch.Tensor) -> bool:
     return projected.is_cuda and projected.dtype == torch.float32
 
 
-def _launch(kernel, tiles: int, inputs: list, device: torch.device) -> None:
-    """Launch a generic kernel, one task per tile."""
-    launch.launch(kernel, tiles, inputs, device, cost=10_000, block_dim=32)
-
-
-def _span(image: torch.Tensor, real) -> tuple[launch.View, int]:
-    """Return an image [C, H, W, D], which may be a slice of channels, as one axis, and the stride of its pixels."""
-    found = launch.span(image, real)
-    return found, found.row_stride()
-
-
 def composite(
     projected: torch.Tensor,
     tiles: Tiles,
@@ -126,36 +116,12 @@ def composite(
     transmittances, weights = (allocator.saved(shape, projected.dtype, device) for _ in range(2))
     ends = allocator.saved(shape, torch.int32, device)
     inputs = [
-        settings.struct(tiles.size, real), projected, tiles.ranges, tiles.gaussian_ids, backgrounds, *_span(rgb, real),
-        alpha, depth, transmittances, weights, ends,
+        settings.struct(tiles.size, real), projected, tiles.ranges, tiles.gaussian_ids, backgrounds, rgb,
+        launch.row_stride(rgb), alpha, depth, transmittances, weights, ends,
     ]  # fmt: skip
-    _launch(blend_cpu.make_kernels(real, tiles.size, channels).forward, len(tiles.ranges), inputs, device)
+    kernel = blend_cpu.make_kernels(real, tiles.size, channels).forward
+    launch.launch(kernel, len(tiles.ranges), inputs, device, cost=10_000, block_dim=32)
     return rgb, alpha, depth, transmittances, weights, ends, allocator.saved((0,), projected.dtype, device)
-
-
-def _backward(projected, tiles, backgrounds, settings: Pass, saved, v_images, allocator) -> torch.Tensor:
-    """Return what `blend_cuda.backward` returns, by the generic kernels."""
-    _, depth, transmittances, weights, ends, _ = saved
-    v_rgb, v_alpha, v_depth = v_images
-    real, device, channels = launch.real_of(projected), projected.device, backgrounds.shape[1]
-    values = VALUES + channels - COLORS + 2 * settings.absgrad
-    v_projected = allocator.output(projected.shape, projected.dtype, device)
-    v_slots = allocator.workspace((len(tiles.slots), values), projected.dtype, device).zero_()
-    deep = v_alpha is not None or v_depth is not None
-    upstream: list = [*_span(v_rgb, real)]
-    for v in (v_alpha, v_depth):
-        v = (torch.zeros_like(depth) if deep else depth.new_empty(0)) if v is None else v.contiguous()
-        upstream.append(v)
-    inputs = [
-        settings.struct(tiles.size, real), projected, tiles.ranges, tiles.gaussian_ids, tiles.slots, backgrounds,
-        transmittances, weights, depth, ends, *upstream, v_slots,
-    ]  # fmt: skip
-    kernels = blend_cpu.make_kernels(real, tiles.size, channels, settings.absgrad, deep)
-    _launch(kernels.backward, len(tiles.ranges), inputs, device)
-    inputs = [v_slots, tiles.starts, tiles.counts, v_projected]
-    tasks, kernel = -(-len(tiles.counts) // SUMMED), make_segments(real, values, projected.shape[-1]).sum_gradients
-    launch.launch(kernel, tasks, inputs, device, cost=5 * SUMMED)
-    return v_projected
 
 
 def composite_gradients(
@@ -171,9 +137,27 @@ def composite_gradients(
     # Only those channels of ``rgb`` are read that have a gradient. On CUDA in float32 the gradient of ``rgb`` may have fewer
     # than D channels; the others have gradient 0.
     v_rgb, v_alpha, v_depth = v_images
-    v_rgb = saved[0].new_zeros(*saved[0].shape[:-1], backgrounds.shape[1]) if v_rgb is None else v_rgb
-    backward = blend_cuda.backward if is_native(projected) else _backward
-    return backward(projected, tiles, backgrounds, settings, saved, (v_rgb, v_alpha, v_depth), allocator)
+    channels = backgrounds.shape[1]
+    v_rgb = saved[0].new_zeros(*saved[0].shape[:-1], channels) if v_rgb is None else v_rgb
+    if is_native(projected):
+        return blend_cuda.backward(projected, tiles, backgrounds, settings, saved, (v_rgb, v_alpha, v_depth), allocator)
+    _, depth, transmittances, weights, ends, _ = saved
+    real, device, deep = launch.real_of(projected), projected.device, v_alpha is not None or v_depth is not None
+    values = VALUES + channels - COLORS + 2 * settings.absgrad
+    v_projected = allocator.output(projected.shape, projected.dtype, device)
+    v_slots = allocator.workspace((len(tiles.slots), values), projected.dtype, device).zero_()
+    nothing = torch.zeros_like(depth) if deep else depth.new_empty(0)
+    inputs = [
+        settings.struct(tiles.size, real), projected, tiles.ranges, tiles.gaussian_ids, tiles.slots, backgrounds,
+        transmittances, weights, depth, ends, v_rgb, launch.row_stride(v_rgb),
+        *(nothing if v is None else v.contiguous() for v in (v_alpha, v_depth)), v_slots,
+    ]  # fmt: skip
+    kernel = blend_cpu.make_kernels(real, tiles.size, channels, settings.absgrad, deep).backward
+    launch.launch(kernel, len(tiles.ranges), inputs, device, cost=10_000, block_dim=32)
+    inputs = [v_slots, tiles.starts, tiles.counts, v_projected]
+    tasks, kernel = -(-len(tiles.counts) // SUMMED), make_segments(real, values, projected.shape[-1]).sum_gradients
+    launch.launch(kernel, tasks, inputs, device, cost=5 * SUMMED)
+    return v_projected
 
 
 def background_gradient(transmittances: torch.Tensor, v_rgb: torch.Tensor | None, channels: int = 3) -> torch.Tensor:
@@ -282,8 +266,8 @@ def _width(projected: torch.Tensor, channels: int, absgrad: bool) -> int:
 def make_kernels(real, width: int):
     """Make two kernels: one gives Gaussians the ``width`` channels of a pass, the other takes the pass's gradient apart."""
     module = f"warpgs.kernels.blend_channels.{real.__name__}.{width}"
-    geometry, box = wp.constant(GEOMETRY), wp.constant(GEOMETRY + COLORS)
-    own, rest = wp.constant(width), wp.constant(GEOMETRY + width)
+    geometry, box = GEOMETRY, GEOMETRY + COLORS
+    own, rest = width, GEOMETRY + width
 
     @wp.kernel(enable_backward=False, module=module)
     def color(
@@ -329,11 +313,6 @@ def make_kernels(real, width: int):
 def _padded(values: torch.Tensor, width: int) -> torch.Tensor:
     """Return values [..., F], filled up with zeros to [..., width]."""
     return torch.nn.functional.pad(values, (0, width - values.shape[-1]))
-
-
-def _given(v_image: torch.Tensor, width: int, native: bool) -> torch.Tensor:
-    """Return the gradient of a pass [..., F] as its kernels take it: generic kernels read ``width`` channels."""
-    return v_image if native or v_image.shape[-1] == width else _padded(v_image, width)
 
 
 def _groups(
@@ -394,7 +373,9 @@ class _BlendChannels(torch.autograd.Function):
             if is_native(projected) and first > 0:
                 # states hold the channels of one group, so that memory does not grow with the number of channels
                 saved[1:] = composite(colored, tiles, behind, ctx.settings, save=True, image=image[..., :0])[2:]
-            v_rgb = None if v_image is None else _given(v_image[..., channels], width, is_native(projected))
+            v_rgb = None if v_image is None else v_image[..., channels]
+            if v_rgb is not None and v_rgb.shape[-1] < width and not is_native(projected):
+                v_rgb = _padded(v_rgb, width)  # generic kernels read all channels of a pass
             v_images = (v_rgb, v_alpha, v_depth) if first == 0 else (v_rgb, None, None)
             v = composite_gradients(colored, tiles, behind, ctx.settings, saved, v_images)
             inputs, count = [v, tiles.counts, first, v_projected, v_colors], v_colors.shape[0] * v_colors.shape[1]

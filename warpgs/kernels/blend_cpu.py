@@ -17,21 +17,26 @@ from warpgs.kernels.native import ROLLED
 
 
 @functools.cache
-def make_pixels(real, tile_size: int, channels: int, absgrad: bool, deep: bool):
-    """Make the function that loads the pixels of a tile; arguments are those of `make_backward`."""
+def make_backward(real, tile_size: int, channels: int, absgrad: bool = False, deep: bool = True):
+    """Make the backward kernel; without ``deep``, depth and alpha have no gradient, and their data is not read."""
     f = make_functions(real)
     r = make_records(real, tile_size, channels, absgrad)
     b = make_batches(real, tile_size, channels)
-    stride = wp.constant(tile_size * (tile_size + 1))
-    side = wp.constant(tile_size)
-    strip = wp.constant(STRIP)
-    parts = wp.constant(tile_size // STRIP)
-    strips = wp.constant(tile_size * (tile_size // STRIP))
-    pixels_of_tile = wp.constant(tile_size * tile_size)
-    bits = wp.constant(tile_size * tile_size - 1)
-    smallest = wp.constant(real(SMALLEST_WEIGHT))
-    at = b.at
-    at_int = b.at_int
+    at, at_int = b.at, b.at_int
+    count = VALUES + channels - COLORS + 2 * absgrad
+    values, together_values = count, TOGETHER * count
+    stride, side, pixels_of_tile = tile_size * (tile_size + 1), tile_size, tile_size * tile_size
+    strip, half, abreast = STRIP, STRIP // 2, ABREAST
+    parts, strips = tile_size // STRIP, tile_size * (tile_size // STRIP)
+    batch, together = BATCH, TOGETHER
+    # masks of indices, whose ranges are powers of 2
+    pixel_bits, strip_bits = tile_size * tile_size - 1, tile_size * (tile_size // STRIP) - 1
+    row_bits, column_bits = tile_size - 1, tile_size * STRIP - 1
+    bits, group_bits = BATCH - 1, TOGETHER - 1
+    smallest = real(SMALLEST_WEIGHT)
+    # values of a row of gradients that are at most 64 bytes apart
+    spacing = max(1, 64 // ((4 if real is wp.float32 else 8) * channels))
+    apart, touches = spacing, -(-(tile_size - 1) // spacing) + 1
 
     @wp.func(inline=True)
     def load_channels(o: wp.int32, p: wp.int32, v_rgb: wp.array(dtype=real), pixels: wp.ref[r.Pixels]):
@@ -80,12 +85,7 @@ def make_pixels(real, tile_size: int, channels: int, absgrad: bool, deep: bool):
         while row < rows:
             first = (camera * settings.height + top + row) * settings.width + left
             for part in range(parts):
-                base = ((part * side + row) * strip) & bits
-                o = wp.max(first + part * strip, 0)
-                if across == side:
-                    for lane in range(strip):
-                        pixels.t[base + lane] = transmittances[o + lane]
-                        pixels.end[base + lane] = ends[o + lane]
+                base = ((part * side + row) * strip) & pixel_bits
                 lane = int(0)
                 while lane < wp.min(across - part * strip, strip):
                     q = first + part * strip + lane
@@ -93,9 +93,8 @@ def make_pixels(real, tile_size: int, channels: int, absgrad: bool, deep: bool):
                         break
                     p = wp.max(base + lane, 0)
                     lane += 1
-                    if across < side:
-                        pixels.t[p] = transmittances[q]
-                        pixels.end[p] = ends[q]
+                    pixels.t[p] = transmittances[q]
+                    pixels.end[p] = ends[q]
                     load_channels(q * pitch, p, v_rgb, pixels)
                     load_depth(q, p, weights, depth, v_alpha, v_depth, pixels)
             row += 1
@@ -109,32 +108,6 @@ def make_pixels(real, tile_size: int, channels: int, absgrad: bool, deep: bool):
             until[s] = end
             last = wp.max(last, end)
         return last
-
-    return load_pixels
-
-
-@functools.cache
-def make_walk(real, tile_size: int, channels: int, absgrad: bool, deep: bool):
-    """Make the functions that walk past one Gaussian and sum its gradient; arguments are those of `make_backward`."""
-    f = make_functions(real)
-    r = make_records(real, tile_size, channels, absgrad)
-    b = make_batches(real, tile_size, channels)
-    count = VALUES + channels - COLORS + 2 * absgrad
-    values = wp.constant(count)
-    group_bits = wp.constant(TOGETHER - 1)
-    together_values = wp.constant(TOGETHER * count)
-    stride = wp.constant(tile_size * (tile_size + 1))
-    batch = wp.constant(BATCH)
-    side = wp.constant(tile_size)
-    strip = wp.constant(STRIP)
-    parts = wp.constant(tile_size // STRIP)
-    bits = wp.constant(tile_size * (tile_size // STRIP) - 1)
-    row_bits = wp.constant(tile_size - 1)
-    column_bits = wp.constant(tile_size * STRIP - 1)
-    half = wp.constant(STRIP // 2)
-    abreast = wp.constant(ABREAST)
-    at = b.at
-    at_int = b.at_int
 
     @wp.func(inline=True)
     def effect(j: wp.int32, p: wp.int32, g: wp.ref[b.Batch], pixels: wp.ref[r.Pixels]) -> real:
@@ -190,7 +163,7 @@ def make_walk(real, tile_size: int, channels: int, absgrad: bool, deep: bool):
                 k += abreast  # the last few may lie beyond the end; their values are not read
             k = int(0)
             while row < end:
-                o = (part * side + row) & bits
+                o = (part * side + row) & strip_bits
                 q = k & column_bits
                 row += 1
                 k += strip
@@ -229,7 +202,7 @@ def make_walk(real, tile_size: int, channels: int, absgrad: bool, deep: bool):
             dx = real(left + part * strip) + real(0.5) - at(g.x[j])
             at_left = f.apart(u11 * dx)
             while row < end:
-                o = (part * side + row) & bits
+                o = (part * side + row) & strip_bits
                 dy = at(rows.dy[row & row_bits])
                 start = at_left + at(rows.e12[row & row_bits])
                 row += 1
@@ -300,25 +273,6 @@ def make_walk(real, tile_size: int, channels: int, absgrad: bool, deep: bool):
             v_slots[slot, values - 2] = opacity * wp.abs(u11) * at(held.totals[o + values - 3])
             v_slots[slot, values - 1] = opacity * at(held.totals[o + values - 2])
 
-    return SimpleNamespace(walk=walk, sum_up=sum_up, hold=hold, fold=fold, store=store)
-
-
-@functools.cache
-def make_backward(real, tile_size: int, channels: int, absgrad: bool = False, deep: bool = True):
-    """Make the backward kernel; without ``deep``, depth and alpha have no gradient, and their data is not read."""
-    f = make_functions(real)
-    r = make_records(real, tile_size, channels, absgrad)
-    b = make_batches(real, tile_size, channels)
-    load_pixels = make_pixels(real, tile_size, channels, absgrad, deep)
-    m = make_walk(real, tile_size, channels, absgrad, deep)
-    side = wp.constant(tile_size)
-    batch = wp.constant(BATCH)
-    bits = wp.constant(BATCH - 1)
-    together = wp.constant(TOGETHER)
-    # values of a row of gradients that are at most 64 bytes apart
-    apart = wp.constant(max(1, 64 // ((4 if real is wp.float32 else 8) * channels)))
-    touches = wp.constant(-(-(tile_size - 1) // max(1, 64 // ((4 if real is wp.float32 else 8) * channels))) + 1)
-
     @wp.kernel(enable_backward=False, module="unique", module_options=ROLLED)
     def backward(
         begin: int, settings: f.Blending, projected: wp.array(dtype=b.record), ranges: wp.array2d(dtype=int),
@@ -362,16 +316,16 @@ def make_backward(real, tile_size: int, channels: int, absgrad: bool = False, de
             while j < count:
                 last -= 1
                 b.find_row_values(j & bits, top, gaussians, rows)
-                m.walk(j & bits, last, left, settings, gaussians, rows, pixels, shades)
+                walk(j & bits, last, left, settings, gaussians, rows, pixels, shades)
                 # Apart from the walk, since both together would need more than 16 registers.
-                sums = m.sum_up(j & bits, left, gaussians, rows, pixels, shades)
-                m.hold(j & bits, sums, held)
+                sums = sum_up(j & bits, left, gaussians, rows, pixels, shades)
+                hold(j & bits, sums, held)
                 j += 1
                 if j % together == 0 or j == count:
-                    m.fold(held)
+                    fold(held)
                     k = (j - 1) // together * together
                     while k < j:
-                        m.store(k & bits, gaussians, held, slots[last + j - 1 - k], v_slots)
+                        store(k & bits, gaussians, held, slots[last + j - 1 - k], v_slots)
                         k += 1
 
     return backward
@@ -406,20 +360,11 @@ def make_forward(real, tile_size: int, channels: int):
     tile_channels = wp.types.vector(channels * tile_size * (tile_size + 1), real)
     strip_channels = wp.types.vector(2 * channels * STRIP, real)
     batch_channels = wp.types.vector(channels * FORWARD_BATCH, real)
-    place_z = wp.constant(6 + channels)
-    tile_stride = wp.constant(tile_size * (tile_size + 1))
-    per_pixel = wp.constant(channels)
-    per_row = wp.constant(channels * tile_size)
-    side = wp.constant(tile_size)
-    pixels = wp.constant(tile_size * tile_size)
-    strip = wp.constant(STRIP)
-    parts = wp.constant(tile_size // STRIP)
-    abreast = wp.constant(ABREAST)
-    batch = wp.constant(FORWARD_BATCH)
-    bits = wp.constant(FORWARD_BATCH - 1)
-    outside = wp.constant(real(-1.0))
-    together = wp.constant(FORWARD_TOGETHER)
-    smallest = wp.constant(real(SMALLEST_WEIGHT))
+    place_z, per_pixel, per_row = 6 + channels, channels, channels * tile_size
+    tile_stride, side, pixels = tile_size * (tile_size + 1), tile_size, tile_size * tile_size
+    strip, parts, abreast = STRIP, tile_size // STRIP, ABREAST
+    batch, bits, together = FORWARD_BATCH, FORWARD_BATCH - 1, FORWARD_TOGETHER
+    outside, smallest = real(-1.0), real(SMALLEST_WEIGHT)
 
     # Loops over channels have a static length and are unrolled, so they are kept apart from loops that must stay rolled.
     @wp.func(inline=True)

@@ -15,7 +15,7 @@ from warpgs.constants import SMALLEST_WEIGHT, TILE_SIZE
 from warpgs.device import FLOAT, StepSizes
 from warpgs.kernels import launch
 from warpgs.kernels.falloff import COLORS, Pass, make_struct
-from warpgs.kernels.launch import TORCH, Allocator
+from warpgs.kernels.graphs import TORCH, Allocator
 from warpgs.kernels.native import cuda_kernel, source
 from warpgs.kernels.tiles import Tiles, grid
 

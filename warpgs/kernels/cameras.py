@@ -84,11 +84,16 @@ def check_camera(camera: Camera) -> type[CameraModel]:
 
 
 @functools.cache
+def types_of(real: type) -> tuple[Any, ...]:
+    """Return vectors of 2, 3 and 4, matrices of 3 x 3 and 4 x 4, and an array of a scalar type."""
+    vectors = [wp.types.vector(size, real) for size in (2, 3, 4)]
+    return *vectors, wp.types.matrix((3, 3), real), wp.types.matrix((4, 4), real), wp.array(dtype=real)
+
+
+@functools.cache
 def make_linear(real: type) -> SimpleNamespace:
     """Make the structs, products and functions that models share, for one scalar type, wp.float32 or wp.float64."""
-    vec2 = wp.types.vector(2, real)
-    vec3 = wp.types.vector(3, real)
-    mat33 = wp.types.matrix((3, 3), real)
+    vec2, vec3, _, mat33, _, Reals = types_of(real)
 
     @wp.struct
     class Rows:
@@ -112,7 +117,23 @@ def make_linear(real: type) -> SimpleNamespace:
         return rows
 
     @wp.func
-    def in_front(position: vec3, lens: wp.array(dtype=real), near: real) -> wp.bool:
+    def intrinsics_of(fx: real, fy: real, center: vec2) -> mat33:
+        v_K = mat33()
+        v_K[0, 0] = fx
+        v_K[1, 1] = fy
+        v_K[0, 2] = center[0]
+        v_K[1, 2] = center[1]
+        return v_K
+
+    @wp.func
+    def gradients_of(v_position: vec3, v_K: mat33) -> Gradients:
+        gradients = Gradients()
+        gradients.v_position = v_position
+        gradients.v_K = v_K
+        return gradients
+
+    @wp.func
+    def in_front(position: vec3, lens: Reals, near: real) -> wp.bool:
         # phrased so that a NaN gives False
         return position[2] >= near and position[2] <= real(FAR)
 
@@ -136,23 +157,21 @@ def make_linear(real: type) -> SimpleNamespace:
         """Return ``project_axes`` and ``axes_backward`` of a model by its ``jacobian(position, K, lens, point) -> Rows``."""
 
         @wp.func
-        def project_axes(position: vec3, K: mat33, lens: wp.array(dtype=real), point: vec2, axes: mat33) -> Rows:
+        def project_axes(position: vec3, K: mat33, lens: Reals, point: vec2, axes: mat33) -> Rows:
             j = jacobian(position, K, lens, point)
             turned = wp.transpose(axes)
             return rows_of(turned * j.first, turned * j.second)
 
         @wp.func
-        def axes_backward(
-            position: vec3, K: mat33, lens: wp.array(dtype=real), point: vec2, v_first: vec3, v_second: vec3
-        ) -> mat33:
+        def axes_backward(position: vec3, K: mat33, lens: Reals, point: vec2, v_first: vec3, v_second: vec3) -> mat33:
             j = jacobian(position, K, lens, point)
             return wp.outer(j.first, v_first) + wp.outer(j.second, v_second)
 
         return {"project_axes": project_axes, "axes_backward": axes_backward}
 
     return SimpleNamespace(
-        Rows=Rows, Gradients=Gradients, rows_of=rows_of, in_front=in_front, z_of=z_of, unclamped=unclamped, clamped=clamped,
-        products=products,
+        Rows=Rows, Gradients=Gradients, rows_of=rows_of, intrinsics_of=intrinsics_of, gradients_of=gradients_of,
+        in_front=in_front, z_of=z_of, unclamped=unclamped, clamped=clamped, products=products,
     )  # fmt: skip
 
 
@@ -165,16 +184,14 @@ class Pinhole(CameraModel):
     def make_functions(real: type) -> SimpleNamespace:
         """Make the functions of `CameraModel.make_functions`."""
         linear = make_linear(real)
-        vec2 = wp.types.vector(2, real)
-        vec3 = wp.types.vector(3, real)
-        mat33 = wp.types.matrix((3, 3), real)
+        vec2, vec3, _, mat33, _, Reals = types_of(real)
 
         @wp.func
-        def pixel_of(position: vec3, K: mat33, lens: wp.array(dtype=real)) -> vec2:
+        def pixel_of(position: vec3, K: mat33, lens: Reals) -> vec2:
             return vec2(K[0, 0] * position[0] / position[2] + K[0, 2], K[1, 1] * position[1] / position[2] + K[1, 2])
 
         @wp.func
-        def project_axes(position: vec3, K: mat33, lens: wp.array(dtype=real), point: vec2, axes: mat33) -> linear.Rows:
+        def project_axes(position: vec3, K: mat33, lens: Reals, point: vec2, axes: mat33) -> linear.Rows:
             z = position[2]
             jx = K[0, 0] / z
             jy = K[1, 1] / z
@@ -193,22 +210,17 @@ class Pinhole(CameraModel):
             return linear.rows_of(first, second)
 
         @wp.func
-        def axes_backward(
-            position: vec3, K: mat33, lens: wp.array(dtype=real), point: vec2, v_first: vec3, v_second: vec3
-        ) -> mat33:
+        def axes_backward(position: vec3, K: mat33, lens: Reals, point: vec2, v_first: vec3, v_second: vec3) -> mat33:
             inv_z = real(1.0) / position[2]
             jx = K[0, 0] * inv_z
             jy = K[1, 1] * inv_z
             jxz = (K[0, 2] - point[0]) * inv_z
             jyz = (K[1, 2] - point[1]) * inv_z
-            g0 = jx * v_first
-            g1 = jy * v_second
-            g2 = jxz * v_first + jyz * v_second
-            return mat33(g0[0], g0[1], g0[2], g1[0], g1[1], g1[2], g2[0], g2[1], g2[2])
+            return wp.matrix_from_rows(jx * v_first, jy * v_second, jxz * v_first + jyz * v_second)
 
         @wp.func
         def position_backward(
-            position: vec3, K: mat33, lens: wp.array(dtype=real), pixel: vec2, point: vec2, axes: mat33,
+            position: vec3, K: mat33, lens: Reals, pixel: vec2, point: vec2, axes: mat33,
             v_first: vec3, v_second: vec3, v_pixel: vec2, v_depth: real,
         ) -> linear.Gradients:  # fmt: skip
             x = position[0]
@@ -218,24 +230,18 @@ class Pinhole(CameraModel):
             jy = K[1, 1] * inv_z
             jxz = (K[0, 2] - point[0]) * inv_z
             jyz = (K[1, 2] - point[1]) * inv_z
-            axes0 = vec3(axes[0, 0], axes[0, 1], axes[0, 2])
-            axes1 = vec3(axes[1, 0], axes[1, 1], axes[1, 2])
             axes2 = vec3(axes[2, 0], axes[2, 1], axes[2, 2])
-            v_jx = wp.dot(v_first, axes0)
+            v_jx = wp.dot(v_first, vec3(axes[0, 0], axes[0, 1], axes[0, 2]))
             v_jxz = wp.dot(v_first, axes2)
-            v_jy = wp.dot(v_second, axes1)
+            v_jy = wp.dot(v_second, vec3(axes[1, 0], axes[1, 1], axes[1, 2]))
             v_jyz = wp.dot(v_second, axes2)
-            v_K = mat33()
             v_x = v_pixel[0] * jx
             v_y = v_pixel[1] * jy
             v_z = (
                 -(v_pixel[0] * jx * x + v_pixel[1] * jy * y + v_jx * jx + v_jy * jy + v_jxz * jxz + v_jyz * jyz) * inv_z
                 + v_depth
             )
-            v_K[0, 0] = (v_pixel[0] * x + v_jx) * inv_z
-            v_K[1, 1] = (v_pixel[1] * y + v_jy) * inv_z
-            v_K[0, 2] = v_pixel[0]
-            v_K[1, 2] = v_pixel[1]
+            v_K = linear.intrinsics_of((v_pixel[0] * x + v_jx) * inv_z, (v_pixel[1] * y + v_jy) * inv_z, v_pixel)
             if point[0] == pixel[0]:  # the Jacobian moves with the mean: cx - px = -fx x / z
                 v_x -= v_jxz * jx * inv_z
                 v_z += v_jxz * jx * x * inv_z * inv_z
@@ -248,10 +254,7 @@ class Pinhole(CameraModel):
                 v_K[1, 1] = v_K[1, 1] - v_jyz * y * inv_z * inv_z
             else:
                 v_K[1, 2] = v_K[1, 2] + v_jyz * inv_z
-            g = linear.Gradients()
-            g.v_position = vec3(v_x, v_y, v_z)
-            g.v_K = v_K
-            return g
+            return linear.gradients_of(vec3(v_x, v_y, v_z), v_K)
 
         return SimpleNamespace(
             in_range=linear.in_front, depth_of=linear.z_of, pixel_of=pixel_of, expansion_point=linear.clamped,
@@ -268,33 +271,26 @@ class Orthographic(CameraModel):
     def make_functions(real: type) -> SimpleNamespace:
         """Make the functions of `CameraModel.make_functions`."""
         linear = make_linear(real)
-        vec2 = wp.types.vector(2, real)
-        vec3 = wp.types.vector(3, real)
-        mat33 = wp.types.matrix((3, 3), real)
+        vec2, vec3, _, mat33, _, Reals = types_of(real)
 
         @wp.func
-        def pixel_of(position: vec3, K: mat33, lens: wp.array(dtype=real)) -> vec2:
+        def pixel_of(position: vec3, K: mat33, lens: Reals) -> vec2:
             return vec2(K[0, 0] * position[0] + K[0, 2], K[1, 1] * position[1] + K[1, 2])
 
         @wp.func
-        def jacobian(position: vec3, K: mat33, lens: wp.array(dtype=real), point: vec2) -> linear.Rows:
+        def jacobian(position: vec3, K: mat33, lens: Reals, point: vec2) -> linear.Rows:
             zero = real(0.0)
             return linear.rows_of(vec3(K[0, 0], zero, zero), vec3(zero, K[1, 1], zero))
 
         @wp.func
         def position_backward(
-            position: vec3, K: mat33, lens: wp.array(dtype=real), pixel: vec2, point: vec2, axes: mat33,
+            position: vec3, K: mat33, lens: Reals, pixel: vec2, point: vec2, axes: mat33,
             v_first: vec3, v_second: vec3, v_pixel: vec2, v_depth: real,
         ) -> linear.Gradients:  # fmt: skip
-            v_K = mat33()
-            v_K[0, 0] = v_pixel[0] * position[0] + wp.dot(v_first, vec3(axes[0, 0], axes[0, 1], axes[0, 2]))
-            v_K[1, 1] = v_pixel[1] * position[1] + wp.dot(v_second, vec3(axes[1, 0], axes[1, 1], axes[1, 2]))
-            v_K[0, 2] = v_pixel[0]
-            v_K[1, 2] = v_pixel[1]
-            g = linear.Gradients()
-            g.v_position = vec3(v_pixel[0] * K[0, 0], v_pixel[1] * K[1, 1], v_depth)
-            g.v_K = v_K
-            return g
+            fx = v_pixel[0] * position[0] + wp.dot(v_first, axes[0])
+            fy = v_pixel[1] * position[1] + wp.dot(v_second, axes[1])
+            v_position = vec3(v_pixel[0] * K[0, 0], v_pixel[1] * K[1, 1], v_depth)
+            return linear.gradients_of(v_position, linear.intrinsics_of(fx, fy, v_pixel))
 
         return SimpleNamespace(
             in_range=linear.in_front, depth_of=linear.z_of, pixel_of=pixel_of, expansion_point=linear.unclamped,
@@ -314,13 +310,11 @@ class OpenCV(CameraModel):
         """Make the functions of `CameraModel.make_functions`."""
         linear = make_linear(real)
         lensed = _make_distortion(real)
-        vec2 = wp.types.vector(2, real)
-        vec3 = wp.types.vector(3, real)
-        mat33 = wp.types.matrix((3, 3), real)
+        vec2, vec3, _, mat33, _, Reals = types_of(real)
         one = real(1.0)
 
         @wp.func
-        def in_range(position: vec3, lens: wp.array(dtype=real), near: real) -> wp.bool:
+        def in_range(position: vec3, lens: Reals, near: real) -> wp.bool:
             # phrased so that a NaN gives False
             if not (position[2] >= near and position[2] <= real(FAR)):
                 return False
@@ -336,7 +330,7 @@ class OpenCV(CameraModel):
             return True
 
         @wp.func
-        def pixel_of(position: vec3, K: mat33, lens: wp.array(dtype=real)) -> vec2:
+        def pixel_of(position: vec3, K: mat33, lens: Reals) -> vec2:
             d = lensed.distort(position[0] / position[2], position[1] / position[2], lens)
             return vec2(K[0, 0] * d.a + K[0, 2], K[1, 1] * d.b + K[1, 2])
 
@@ -349,7 +343,7 @@ class OpenCV(CameraModel):
             return one
 
         @wp.func
-        def jacobian(position: vec3, K: mat33, lens: wp.array(dtype=real), point: vec2) -> linear.Rows:
+        def jacobian(position: vec3, K: mat33, lens: Reals, point: vec2) -> linear.Rows:
             pixel = pixel_of(position, K, lens)
             inv_z = one / position[2]
             a = position[0] * inv_z * scale_to(point[0] - K[0, 2], pixel[0] - K[0, 2])
@@ -361,7 +355,7 @@ class OpenCV(CameraModel):
 
         @wp.func
         def position_backward(
-            position: vec3, K: mat33, lens: wp.array(dtype=real), pixel: vec2, point: vec2, axes: mat33,
+            position: vec3, K: mat33, lens: Reals, pixel: vec2, point: vec2, axes: mat33,
             v_first: vec3, v_second: vec3, v_pixel: vec2, v_depth: real,
         ) -> linear.Gradients:  # fmt: skip
             inv_z = one / position[2]
@@ -394,11 +388,7 @@ class OpenCV(CameraModel):
             v_b = v_pixel[0] * K[0, 0] * mean.ab + v_pixel[1] * K[1, 1] * mean.bb
             v_a += v_ea * sx
             v_b += v_eb * sy
-            v_K = mat33()
-            v_K[0, 0] = v_pixel[0] * mean.a + first * inv_z
-            v_K[1, 1] = v_pixel[1] * mean.b + second * inv_z
-            v_K[0, 2] = v_pixel[0]
-            v_K[1, 2] = v_pixel[1]
+            v_K = linear.intrinsics_of(v_pixel[0] * mean.a + first * inv_z, v_pixel[1] * mean.b + second * inv_z, v_pixel)
             if sx < one:  # a = a0 (limit - cx) / (fx distorted a0)
                 v_a -= v_ea * a / mean.a * mean.aa
                 v_b -= v_ea * a / mean.a * mean.ab
@@ -410,10 +400,7 @@ class OpenCV(CameraModel):
                 v_K[1, 1] = v_K[1, 1] - v_eb * b / K[1, 1]
                 v_K[1, 2] = v_K[1, 2] - v_eb * b0 / (K[1, 1] * mean.b)
             v_z = -(v_a * a0 + v_b * b0 + first * jx + second * jy) * inv_z + v_depth
-            gradients = linear.Gradients()
-            gradients.v_position = vec3(v_a * inv_z, v_b * inv_z, v_z)
-            gradients.v_K = v_K
-            return gradients
+            return linear.gradients_of(vec3(v_a * inv_z, v_b * inv_z, v_z), v_K)
 
         return SimpleNamespace(
             in_range=in_range, depth_of=linear.z_of, pixel_of=pixel_of, expansion_point=linear.clamped,
@@ -423,7 +410,7 @@ class OpenCV(CameraModel):
 
 @functools.cache
 def _make_distortion(real: type) -> SimpleNamespace:
-    vec2 = wp.types.vector(2, real)
+    vec2, *_, Reals = types_of(real)
     one = real(1.0)
     two = real(2.0)
 
@@ -448,7 +435,7 @@ def _make_distortion(real: type) -> SimpleNamespace:
         folded: wp.bool
 
     @wp.func
-    def radial_at(t: real, lens: wp.array(dtype=real)) -> Radial:
+    def radial_at(t: real, lens: Reals) -> Radial:
         three = real(3.0)
         k1 = lens[0]
         k2 = lens[1]
@@ -467,7 +454,7 @@ def _make_distortion(real: type) -> SimpleNamespace:
         return r
 
     @wp.func
-    def distort(a: real, b: real, lens: wp.array(dtype=real)) -> Distorted:
+    def distort(a: real, b: real, lens: Reals) -> Distorted:
         six = real(6.0)
         p1 = lens[2]
         p2 = lens[3]
@@ -484,7 +471,7 @@ def _make_distortion(real: type) -> SimpleNamespace:
         return d
 
     @wp.func
-    def curved(a: real, b: real, v_aa: real, v_ab: real, v_bb: real, lens: wp.array(dtype=real)) -> vec2:
+    def curved(a: real, b: real, v_aa: real, v_ab: real, v_bb: real, lens: Reals) -> vec2:
         """Return the gradients of (a, b) from those of the Jacobian's entries."""
         four = real(4.0)
         six = real(6.0)
@@ -520,12 +507,10 @@ class Fisheye(CameraModel):
         """Make the functions of `CameraModel.make_functions`."""
         linear = make_linear(real)
         radial = _make_profile(real)
-        vec2 = wp.types.vector(2, real)
-        vec3 = wp.types.vector(3, real)
-        mat33 = wp.types.matrix((3, 3), real)
+        vec2, vec3, _, mat33, _, Reals = types_of(real)
 
         @wp.func
-        def in_range(position: vec3, lens: wp.array(dtype=real), near: real) -> wp.bool:
+        def in_range(position: vec3, lens: Reals, near: real) -> wp.bool:
             # phrased so that a NaN gives False
             distance = radial.distance(position)
             if not (distance >= near and distance <= real(FAR)):
@@ -543,13 +528,13 @@ class Fisheye(CameraModel):
             return True
 
         @wp.func
-        def pixel_of(position: vec3, K: mat33, lens: wp.array(dtype=real)) -> vec2:
+        def pixel_of(position: vec3, K: mat33, lens: Reals) -> vec2:
             unit = position / radial.distance(position)
             p = radial.profile(unit, lens)
             return vec2(K[0, 0] * unit[0] * p.G + K[0, 2], K[1, 1] * unit[1] * p.G + K[1, 2])
 
         @wp.func
-        def jacobian(position: vec3, K: mat33, lens: wp.array(dtype=real), point: vec2) -> linear.Rows:
+        def jacobian(position: vec3, K: mat33, lens: Reals, point: vec2) -> linear.Rows:
             distance = radial.distance(position)
             unit = position / distance
             x = unit[0]
@@ -563,7 +548,7 @@ class Fisheye(CameraModel):
 
         @wp.func
         def position_backward(
-            position: vec3, K: mat33, lens: wp.array(dtype=real), pixel: vec2, point: vec2, axes: mat33,
+            position: vec3, K: mat33, lens: Reals, pixel: vec2, point: vec2, axes: mat33,
             v_first: vec3, v_second: vec3, v_pixel: vec2, v_depth: real,
         ) -> linear.Gradients:  # fmt: skip
             two = real(2.0)
@@ -585,15 +570,10 @@ class Fisheye(CameraModel):
             v_x = two * g[0] * x * p.H + (g[1] + h[0]) * y * p.H + g[2] * p.E + u * p.G + v_r * x
             v_y = (g[1] + h[0]) * x * p.H + two * h[1] * y * p.H + h[2] * p.E + v * p.G + v_r * y
             v_z = v_G * p.E + v_H * p.N + v_E * p.P
-            v_K = mat33()
-            v_K[0, 0] = v_pixel[0] * x * p.G + v_row0[0] * (p.G + x * x * p.H) + v_row0[1] * x * y * p.H + v_row0[2] * x * p.E
-            v_K[1, 1] = v_pixel[1] * y * p.G + v_row1[0] * x * y * p.H + v_row1[1] * (p.G + y * y * p.H) + v_row1[2] * y * p.E
-            v_K[0, 2] = v_pixel[0]
-            v_K[1, 2] = v_pixel[1]
-            gradients = linear.Gradients()
-            gradients.v_position = vec3(v_x, v_y, v_z) / distance + v_depth * unit
-            gradients.v_K = v_K
-            return gradients
+            fx = v_pixel[0] * x * p.G + v_row0[0] * (p.G + x * x * p.H) + v_row0[1] * x * y * p.H + v_row0[2] * x * p.E
+            fy = v_pixel[1] * y * p.G + v_row1[0] * x * y * p.H + v_row1[1] * (p.G + y * y * p.H) + v_row1[2] * y * p.E
+            v_position = vec3(v_x, v_y, v_z) / distance + v_depth * unit
+            return linear.gradients_of(v_position, linear.intrinsics_of(fx, fy, v_pixel))
 
         return SimpleNamespace(
             in_range=in_range, depth_of=radial.distance, pixel_of=pixel_of, expansion_point=linear.unclamped,
@@ -603,7 +583,7 @@ class Fisheye(CameraModel):
 
 @functools.cache
 def _make_profile(real: type) -> SimpleNamespace:
-    vec3 = wp.types.vector(3, real)
+    _, vec3, *_, Reals = types_of(real)
 
     @wp.struct
     class Profile:
@@ -620,7 +600,7 @@ def _make_profile(real: type) -> SimpleNamespace:
         P: real
 
     @wp.func
-    def slope(t: real, lens: wp.array(dtype=real)) -> real:
+    def slope(t: real, lens: Reals) -> real:
         """Return the derivative of the radius by the angle, whose square is t."""
         return real(1.0) + t * (
             real(3.0) * lens[0] + t * (real(5.0) * lens[1] + t * (real(7.0) * lens[2] + t * real(9.0) * lens[3]))
@@ -648,7 +628,7 @@ def _make_profile(real: type) -> SimpleNamespace:
         return vec3(A, B, -(real(2.0) * z + real(3.0) * B) / r2)
 
     @wp.func
-    def profile(unit: vec3, lens: wp.array(dtype=real)) -> Profile:
+    def profile(unit: vec3, lens: Reals) -> Profile:
         two = real(2.0)
         r2 = unit[0] * unit[0] + unit[1] * unit[1]
         z = unit[2]

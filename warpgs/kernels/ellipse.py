@@ -10,16 +10,21 @@ import warp as wp
 from warpgs.constants import COVARIANCE_TOLERANCE, FARTHEST_PIXEL, LARGEST_AXIS, SHORTEST_QUAT, SMALLEST_DETERMINANT
 from warpgs.errors import UsageError
 from warpgs.kernels import launch, sh
-from warpgs.kernels.cameras import CAMERA_MODELS
+from warpgs.kernels.cameras import CAMERA_MODELS, types_of
 from warpgs.kernels.launch import first_order
+
+
+@functools.cache
+def arrays_of(real):
+    """Return arrays of vectors of 3 and 4, of matrices of 3 x 3 and 4 x 4, and tables of numbers and of vectors of 3."""
+    _, vec3, vec4, mat33, mat44, _ = types_of(real)
+    return *(wp.array(dtype=kind) for kind in (vec3, vec4, mat33, mat44)), wp.array2d(dtype=real), wp.array2d(dtype=vec3)
 
 
 @functools.cache
 def make_covariance(real):
     """Make the functions for one scalar type. A covariance is stored as xy, xz, yz and a 0, and its diagonal."""
-    vec3 = wp.types.vector(3, real)
-    vec4 = wp.types.vector(4, real)
-    mat33 = wp.types.matrix((3, 3), real)
+    _, vec3, vec4, mat33, *_ = types_of(real)
 
     @wp.struct
     class Packed:
@@ -180,9 +185,7 @@ def packed_covariances(covars: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor
 @functools.cache
 def make_rotations(real):
     """Make the quaternion and rotation functions for one scalar type (docs/project.md, section 2)."""
-    vec4 = wp.types.vector(4, real)
-    mat33 = wp.types.matrix((3, 3), real)
-    mat44 = wp.types.matrix((4, 4), real)
+    *_, vec4, mat33, mat44, _ = types_of(real)
 
     @wp.func
     def quat_length(q: vec4) -> real:
@@ -216,18 +219,15 @@ def make_rotations(real):
         two = real(2.0)
         four = real(4.0)
         v_w = two * (x * (v[2, 1] - v[1, 2]) + y * (v[0, 2] - v[2, 0]) + z * (v[1, 0] - v[0, 1]))
-        v_x = (
-            two * (w * (v[2, 1] - v[1, 2]) + y * (v[0, 1] + v[1, 0]) + z * (v[0, 2] + v[2, 0]))
-            - four * x * (v[1, 1] + v[2, 2])
-        )  # fmt: skip
-        v_y = (
-            two * (w * (v[0, 2] - v[2, 0]) + x * (v[0, 1] + v[1, 0]) + z * (v[1, 2] + v[2, 1]))
-            - four * y * (v[0, 0] + v[2, 2])
-        )  # fmt: skip
-        v_z = (
-            two * (w * (v[1, 0] - v[0, 1]) + x * (v[0, 2] + v[2, 0]) + y * (v[1, 2] + v[2, 1]))
-            - four * z * (v[0, 0] + v[1, 1])
-        )  # fmt: skip
+        v_x = two * (w * (v[2, 1] - v[1, 2]) + y * (v[0, 1] + v[1, 0]) + z * (v[0, 2] + v[2, 0])) - four * x * (
+            v[1, 1] + v[2, 2]
+        )
+        v_y = two * (w * (v[0, 2] - v[2, 0]) + x * (v[0, 1] + v[1, 0]) + z * (v[1, 2] + v[2, 1])) - four * y * (
+            v[0, 0] + v[2, 2]
+        )
+        v_z = two * (w * (v[1, 0] - v[0, 1]) + x * (v[0, 2] + v[2, 0]) + y * (v[1, 2] + v[2, 1])) - four * z * (
+            v[0, 0] + v[1, 1]
+        )
         return vec4(v_w, v_x, v_y, v_z)
 
     @wp.func
@@ -238,15 +238,6 @@ def make_rotations(real):
     return SimpleNamespace(
         quat_length=quat_length, rotation=rotation, rotation_backward=rotation_backward, rotation_of=rotation_of
     )
-
-
-@functools.cache
-def make_types(real):
-    """Make the vector and matrix types that the kernels of one scalar type share."""
-    return SimpleNamespace(
-        vec2=wp.types.vector(2, real), vec3=wp.types.vector(3, real), vec4=wp.types.vector(4, real),
-        mat33=wp.types.matrix((3, 3), real), mat44=wp.types.matrix((4, 4), real),
-    )  # fmt: skip
 
 
 SHRINKS = 6
@@ -261,12 +252,7 @@ def make_projection(real, camera_model: str, parameters: str = "stored", lanes: 
     r = make_rotations(real)
     factor = make_covariance(real).factor
     camera = CAMERA_MODELS.find(camera_model).make_functions(real)
-    t = make_types(real)
-    vec2 = t.vec2
-    vec3 = t.vec3
-    vec4 = t.vec4
-    mat33 = t.mat33
-    mat44 = t.mat44
+    vec2, vec3, vec4, mat33, mat44, Reals = types_of(real)
 
     @wp.struct
     class Ellipse:
@@ -315,7 +301,7 @@ def make_projection(real, camera_model: str, parameters: str = "stored", lanes: 
 
     @wp.func
     def ellipse(
-        mean: vec3, q: vec4, log_scale: vec3, view: mat44, K: mat33, lens: wp.array(dtype=real),
+        mean: vec3, q: vec4, log_scale: vec3, view: mat44, K: mat33, lens: Reals,
         width: real, height: real, near: real, low_pass: real,
     ) -> Ellipse:  # fmt: skip
         e = Ellipse()
@@ -443,7 +429,6 @@ def make_projection(real, camera_model: str, parameters: str = "stored", lanes: 
         direction=direction, finite3=finite3, project_axes=camera.project_axes,
         rotation=r.rotation, rotation_backward=r.rotation_backward, rotation_of=r.rotation_of,
         depth_of=camera.depth_of, axes_backward=camera.axes_backward, position_backward=camera.position_backward,
-        vec2=vec2, vec3=vec3, vec4=vec4, mat33=mat33, mat44=mat44,
     )  # fmt: skip
 
 
@@ -452,8 +437,7 @@ def make_spans(real, lanes: bool = False):
     """Make the functions that decide which tiles a projected Gaussian touches, for one scalar type (docs/tiles.md)."""
     # Counting and emitting call the same functions. Every bound is widened by a margin that covers the rounding of its own
     # arithmetic, so a pixel that blending would change is never missed; a tile listed in excess changes nothing.
-    vec2 = wp.types.vector(2, real)
-    vec3 = wp.types.vector(3, real)
+    vec2, vec3, *_ = types_of(real)
     vec2i = wp.types.vector(2, wp.int32)
 
     @wp.func
@@ -543,13 +527,8 @@ def make_functions(real, camera_model: str, parameters: str, antialiased: bool, 
     """Make the functions that compute a Gaussian's gradients from that of the projected Gaussian."""
     # With ``lanes``, they take a projected Gaussian and its gradient as vectors, not as rows of arrays.
     m = make_projection(real, camera_model, parameters, lanes)
-    vec2 = m.vec2
-    vec3 = m.vec3
-    vec4 = m.vec4
-    values = sh.make_functions(real, bases).values
-    mat33 = m.mat33
-    basis_backward = sh.make_functions(real, bases).basis_backward
-    c = make_covariance(real)
+    vec2, vec3, vec4, mat33, mat44, Reals = types_of(real)
+    c, basis = make_covariance(real), sh.make_functions(real, bases)
 
     row = wp.types.vector(PROJECTED_SIZE, real) if lanes else wp.array2d(dtype=real)
 
@@ -574,9 +553,7 @@ def make_functions(real, camera_model: str, parameters: str, antialiased: bool, 
         K: mat33
 
     @wp.func
-    def covariance_2d(
-        e: m.Ellipse, projected: row, v_projected: row, i: int, low_pass: real
-    ) -> vec3:  # fmt: skip
+    def covariance_2d(e: m.Ellipse, projected: row, v_projected: row, i: int, low_pass: real) -> vec3:
         """Return the gradients of xx, of each xy and of yy of the projected covariance [px^2] (section 9)."""
         u11 = at(projected, i, 2)
         u12 = at(projected, i, 3)
@@ -601,7 +578,7 @@ def make_functions(real, camera_model: str, parameters: str, antialiased: bool, 
 
     @wp.func
     def shape(
-        mean: vec3, quat: vec4, log_scale: vec3, view: m.mat44, K: mat33, lens: wp.array(dtype=real),
+        mean: vec3, quat: vec4, log_scale: vec3, view: mat44, K: mat33, lens: Reals,
         width: real, height: real, near: real, low_pass: real,
         projected: row, v_projected: row, i: int,
     ) -> ShapeGradient:  # fmt: skip
@@ -675,15 +652,15 @@ def make_functions(real, camera_model: str, parameters: str, antialiased: bool, 
         return v_color
 
     @wp.func
-    def centered(d: vec4, w: values) -> vec3:
+    def centered(d: vec4, w: basis.values) -> vec3:
         """Return the gradient of the mean through its viewing direction ``d``; ``w`` is that of the basis (section 5)."""
         v_centered = vec3()
         unit = vec3(d[0], d[1], d[2])
         if wp.static(lanes):
-            v_unit = basis_backward(unit, w)
+            v_unit = basis.basis_backward(unit, w)
             v_centered = (v_unit - unit * wp.dot(unit, v_unit)) / wp.where(d[3] > real(0.0), d[3], real(wp.inf))
         elif d[3] > real(0.0):
-            v_unit = basis_backward(unit, w)
+            v_unit = basis.basis_backward(unit, w)
             v_centered = (v_unit - unit * wp.dot(unit, v_unit)) / d[3]
         return v_centered
 
@@ -696,8 +673,8 @@ def make_functions(real, camera_model: str, parameters: str, antialiased: bool, 
 
     @wp.func
     def view_gradient(
-        view: m.mat44, mean: vec3, quat: vec4, log_scale: vec3, position: vec3, turned: mat33, unit: vec4, v_centered: vec3
-    ) -> m.mat44:  # fmt: skip
+        view: mat44, mean: vec3, quat: vec4, log_scale: vec3, position: vec3, turned: mat33, unit: vec4, v_centered: vec3
+    ) -> mat44:  # fmt: skip
         """Return the gradient of the view matrix; arguments are a Gaussian, fields of its ShapeGradient, and `centered`."""
         rotation = m.rotation_of(view)
         t = vec3(view[0, 3], view[1, 3], view[2, 3])
@@ -707,7 +684,7 @@ def make_functions(real, camera_model: str, parameters: str, antialiased: bool, 
             turning = m.rotation(unit)
         v_rotation = wp.outer(position, mean) + wp.outer(t, v_centered) + turned * wp.transpose(turning)
         v_t = position + rotation * v_centered
-        v_view = m.mat44()
+        v_view = mat44()
         for row in range(3):
             for column in range(3):
                 v_view[row, column] = v_rotation[row, column]

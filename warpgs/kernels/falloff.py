@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from types import SimpleNamespace
 
 import warp as wp
+from warp.types import vector
 
 from warpgs.constants import TILE_SIZE, Rule
 from warpgs.kernels import sh
@@ -86,7 +87,7 @@ ABREAST = 4
 @functools.cache
 def make_falloffs(real, count: int):
     """Make exp(-x / 2) for ``count`` numbers x >= 0: a polynomial in float32, since calls to the C library do not vectorise."""
-    reals = wp.types.vector(count, real)
+    reals = vector(count, real)
 
     if real is wp.float64:
 
@@ -124,7 +125,7 @@ def make_falloffs(real, count: int):
 @functools.cache
 def make_falloff(real):
     """Make exp(-x / 2) of one number."""
-    one = wp.types.vector(1, real)
+    one = vector(1, real)
     falloffs = make_falloffs(real, 1)
 
     @wp.func
@@ -137,7 +138,7 @@ def make_falloff(real):
 @functools.cache
 def make_functions(real):
     """Make the functions for one scalar type."""
-    vec2 = wp.types.vector(2, real)
+    vec2 = vector(2, real)
     half_strip = wp.constant(real((STRIP - 1) / 2))
     Blending = make_struct(real)
 
@@ -180,7 +181,7 @@ def make_functions(real):
 
     return SimpleNamespace(
         Blending=Blending, place_of=place_of, apart=apart, never=never, bounds_of=bounds_of, reaches=reaches,
-        falloff=make_falloff(real), falloffs=make_falloffs(real, ABREAST), abreast=wp.types.vector(ABREAST, real),
+        falloff=make_falloff(real), falloffs=make_falloffs(real, ABREAST), abreast=vector(ABREAST, real),
     )  # fmt: skip
 
 
@@ -196,18 +197,14 @@ def make_batches(real, tile_size: int, channels: int):
     # A tile is stored in columns as wide as a strip, one after the other. The strips of a column that a Gaussian reaches are
     # contiguous, since an ellipse is convex. So only the first of their rows and one past the last are stored.
     f = make_functions(real)
-    record = wp.types.vector(9 + channels, real)
-    batch_reals = wp.types.vector(BATCH, real)
-    batch_channels = wp.types.vector(channels * BATCH, real)
-    batch_rows = wp.types.vector((tile_size // STRIP) * BATCH, wp.int32)
-    row_reals = wp.types.vector(tile_size, real)
-    strip_reals = wp.types.vector(STRIP, real)
-    lane_reals = wp.types.vector(TOGETHER, real)
-    strip_ints = wp.types.vector(tile_size * (tile_size // STRIP), wp.int32)
-    batch = wp.constant(BATCH)
-    together = wp.constant(TOGETHER)
+    record = vector(9 + channels, real)
+    batch_reals = vector(BATCH, real)
+    batch_rows = vector((tile_size // STRIP) * BATCH, wp.int32)
+    row_reals = vector(tile_size, real)
+    strip_reals = vector(STRIP, real)
+    lane_reals = vector(TOGETHER, real)
+    strip_ints = vector(tile_size * (tile_size // STRIP), wp.int32)
     side = wp.constant(tile_size)
-    strip = wp.constant(STRIP)
     parts = wp.constant(tile_size // STRIP)
     bits = wp.constant(BATCH - 1)
     place_z = wp.constant(6 + channels)
@@ -222,7 +219,7 @@ def make_batches(real, tile_size: int, channels: int):
         u12: batch_reals
         u22: batch_reals
         opacity: batch_reals
-        color: batch_channels
+        color: vector(channels * BATCH, real)
         z: batch_reals
         aside: batch_reals  # see `falloff.make_functions`
         limit: batch_reals
@@ -251,7 +248,7 @@ def make_batches(real, tile_size: int, channels: int):
     def load_channels(projected: wp.array(dtype=record), i: wp.int32, j: wp.int32, b: wp.ref[Batch]):
         """Load the channels of a Gaussian."""
         for c in range(wp.static(channels)):
-            b.color[c * batch + j] = projected[i][6 + c]
+            b.color[c * BATCH + j] = projected[i][6 + c]
 
     @wp.func(inline=True)
     def load(
@@ -297,27 +294,27 @@ def make_batches(real, tile_size: int, channels: int):
         group = int(0)
         while group < count:
             j = group & bits
-            group += together
+            group += TOGETHER
             for part in range(parts):
-                for lane in range(together):
-                    b.begin[part * batch + j + lane] = side
-                    b.end[part * batch + j + lane] = 0
+                for lane in range(TOGETHER):
+                    b.begin[part * BATCH + j + lane] = side
+                    b.end[part * BATCH + j + lane] = 0
             for row in range(side):
                 y = real(top + row) + real(0.5)
-                for lane in range(together):
+                for lane in range(TOGETHER):
                     dy = y - at(b.y[j + lane])
                     e2 = at(b.u22[j + lane]) * dy
                     e12[lane] = f.apart(at(b.u12[j + lane]) * dy)
                     e22[lane] = f.apart(e2 * e2)
                 for part in range(parts):
-                    x = real(left + part * strip) + real(0.5)
+                    x = real(left + part * STRIP) + real(0.5)
                     strip_end = at_int(until[part * side + row])
-                    for lane in range(together):
+                    for lane in range(TOGETHER):
                         u11 = at(b.u11[j + lane])
                         start = f.apart(u11 * (x - at(b.x[j + lane]))) + e12[lane]
                         seen = last - (j + lane) < strip_end
                         hit = f.reaches(start, u11, e22[lane], at(b.aside[j + lane]), at(b.limit[j + lane])) and seen
-                        o = part * batch + j + lane
+                        o = part * BATCH + j + lane
                         b.begin[o] = wp.min(at_int(b.begin[o]), wp.where(hit, row, side))
                         b.end[o] = wp.max(at_int(b.end[o]), wp.where(hit, row + 1, 0))
 
@@ -334,7 +331,7 @@ def make_batches(real, tile_size: int, channels: int):
             rows.dy[row] = dy
             rows.e12[row] = f.apart(u12 * dy)
             rows.e22[row] = f.apart(e2 * e2)
-        for lane in range(strip):
+        for lane in range(STRIP):
             rows.ramp[lane] = f.apart(u11 * real(lane))
 
     return SimpleNamespace(
@@ -358,18 +355,12 @@ def make_records(real, tile_size: int, channels: int, absgrad: bool):
     # `blend_cpu.make_forward`. Channels are stored one after the other. In a gradient, the two magnitudes follow the channels
     # if ``absgrad`` is set. The compiler puts records 8 bytes before a cache line; with this vector in front, no strip lies in
     # two lines.
-    lead_reals = wp.types.vector(2, real)
-    trail_reals = wp.types.vector(14, real)
-    tile_reals = wp.types.vector(tile_size * (tile_size + 1), real)
-    tile_ints = wp.types.vector(tile_size * (tile_size + 1), wp.int32)
-    column_reals = wp.types.vector((tile_size + ABREAST) * STRIP, real)
-    strip_reals = wp.types.vector(STRIP, real)
-    tile_channels = wp.types.vector(channels * tile_size * (tile_size + 1), real)
-    strip_channels = wp.types.vector((channels + 2 * absgrad) * STRIP, real)
+    lead_reals = vector(2, real)
+    trail_reals = vector(14, real)
+    tile_reals = vector(tile_size * (tile_size + 1), real)
+    strip_reals = vector(STRIP, real)
 
     count = VALUES + channels - COLORS + 2 * absgrad
-    half_reals = wp.types.vector(TOGETHER * count * (STRIP // 2), real)
-    total_reals = wp.types.vector(TOGETHER * count, real)
 
     @wp.struct
     class Pixels:
@@ -378,10 +369,10 @@ def make_records(real, tile_size: int, channels: int, absgrad: bool):
         lead: lead_reals
         t: tile_reals  # transmittance behind the current instance, then before it
         behind: tile_reals  # sum of w d over what lies behind, background included
-        g: tile_channels  # upstream gradient of the channels
+        g: vector(channels * tile_size * (tile_size + 1), real)  # upstream gradient of the channels
         v_z: tile_reals
         v_w: tile_reals
-        end: tile_ints  # one past the last instance that was blended
+        end: vector(tile_size * (tile_size + 1), wp.int32)  # one past the last instance that was blended
         trail: trail_reals
 
     @wp.struct
@@ -389,7 +380,7 @@ def make_records(real, tile_size: int, channels: int, absgrad: bool):
         """Gradient and weight of the current instance at each pixel that it reaches."""
 
         lead: lead_reals
-        falloff: column_reals  # of one column of strips, and of a few rows beyond it
+        falloff: vector((tile_size + ABREAST) * STRIP, real)  # of one column of strips, and of a few rows beyond it
         v: tile_reals  # gradient of the falloff
         w: tile_reals  # blending weight
         trail: trail_reals
@@ -404,14 +395,14 @@ def make_records(real, tile_size: int, channels: int, absgrad: bool):
         xy: strip_reals
         yy: strip_reals
         opacity: strip_reals
-        color: strip_channels
+        color: vector((channels + 2 * absgrad) * STRIP, real)
         z: strip_reals
 
     @wp.struct
     class Held:
         """Sums of several instances' gradients, one instance after the other."""
 
-        halves: half_reals  # by place in half a strip
-        totals: total_reals
+        halves: vector(TOGETHER * count * (STRIP // 2), real)  # by place in half a strip
+        totals: vector(TOGETHER * count, real)
 
     return SimpleNamespace(Held=Held, Pixels=Pixels, Shades=Shades, Gradient=Gradient)

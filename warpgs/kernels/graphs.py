@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import gc
+import math
 import threading
 import warnings
 from collections.abc import Callable
@@ -16,7 +17,7 @@ import torch
 import warp as wp
 
 from warpgs.kernels import launch
-from warpgs.kernels.launch import Arena, SizingAllocator, part
+from warpgs.kernels.native import cuda_kernel, source
 
 MAX_GRAPHS = 8
 """Largest number of graphs of a function, one for each set of addresses; a loop that keeps its last result alternates between
@@ -27,6 +28,113 @@ FREE_CAPTURES = 16
 """Number of captures that a function may make without a gain: at the start of a loop, addresses do not repeat yet."""
 SMALL_BYTES = 2**16
 """Largest workspace that is kept between calls [bytes]: allocating one at each call would be slower."""
+
+ALIGNMENT = 256
+"""Alignment of the parts of a block [bytes]: enough for sorts and 16-byte loads, and whole cache lines."""
+
+
+class Allocator:
+    """Provider of tensors by lifetime, so that captured kernels find them at the same addresses; this class asks torch."""
+
+    def new(self, kind: str, shape: tuple[int, ...], dtype: torch.dtype, device: torch.device) -> torch.Tensor:
+        """Return a new tensor of a shape [...]."""
+        return torch.empty(shape, dtype=dtype, device=device)
+
+    def output(self, shape: tuple[int, ...], dtype: torch.dtype, device: torch.device) -> torch.Tensor:
+        """Return a new tensor of a shape [...] that the caller may keep."""
+        return self.new("output", shape, dtype, device)
+
+    def saved(self, shape: tuple[int, ...], dtype: torch.dtype, device: torch.device) -> torch.Tensor:
+        """Return a new tensor of a shape [...] that the backward pass needs."""
+        return self.new("saved", shape, dtype, device)
+
+    def workspace(self, shape: tuple[int, ...], dtype: torch.dtype, device: torch.device) -> torch.Tensor:
+        """Return a new tensor of a shape [...] that is needed only until the function returns."""
+        return self.new("workspace", shape, dtype, device)
+
+
+TORCH = Allocator()
+"""The allocator of torch."""
+
+
+def _bytes(shape: tuple[int, ...], dtype: torch.dtype) -> int:
+    """Return the aligned size of a tensor [bytes]."""
+    return -(-math.prod(shape) * dtype.itemsize // ALIGNMENT) * ALIGNMENT
+
+
+class SizingAllocator(Allocator):
+    """An allocator of torch that records the requested sizes."""
+
+    def __init__(self):
+        self.outputs: list[tuple[torch.Tensor, tuple[int, ...]]] = []
+        """For each output tensor, an empty tensor of its type and device, and its shape."""
+        self.bytes = {"saved": 0, "workspace": 0}
+        """Sizes of all saved tensors, and of all workspace, with alignment."""
+
+    def new(self, kind, shape, dtype, device):
+        """Return a new tensor of a shape [...], and note its shape or its size."""
+        tensor = super().new(kind, shape, dtype, device)
+        if kind == "output":
+            self.outputs.append((tensor.new_empty(0), tuple(shape)))
+        else:
+            self.bytes[kind] += _bytes(shape, dtype)
+        return tensor
+
+
+class Arena(Allocator):
+    """An allocator of the tensors that a function requested before: outputs one by one, the others as parts of two blocks."""
+
+    def __init__(self, sizes: SizingAllocator, byte: torch.Tensor, workspace: torch.Tensor | None = None):
+        """Ask torch for all memory of a function that ran with ``sizes``; ``byte`` is any tensor of bytes."""
+        self.outputs = [kind.new_empty(shape) for kind, shape in sizes.outputs]
+        """Output tensors, in the order in which the function asks for them."""
+        self.block = byte.new_empty(sizes.bytes["saved"]) if sizes.bytes["saved"] else None
+        """Block of the saved tensors, or None."""
+        self._workspace = byte.new_empty(sizes.bytes["workspace"]) if workspace is None else workspace
+        self.begin()
+
+    def begin(self) -> None:
+        """Start again: the next requests get the same tensors, from the first on."""
+        self._left, self._ends = iter(self.outputs), {"saved": 0, "workspace": 0}
+
+    def addresses(self) -> tuple[int, ...]:
+        """Return the addresses of all memory that is handed out."""
+        block = 0 if self.block is None else self.block.data_ptr()
+        return *[t.data_ptr() for t in self.outputs], block, self._workspace.data_ptr()
+
+    def place(self, tensor: torch.Tensor) -> tuple[int, tuple[int, ...], torch.dtype]:
+        """Return the place of a saved tensor [...], as the arguments of `part` that follow the block."""
+        begin = tensor.data_ptr() - self.block.data_ptr() if tensor.numel() else 0  # an empty tensor has no address
+        return begin, tuple(tensor.shape), tensor.dtype
+
+    def new(self, kind, shape, dtype, device):
+        """Return the next of the output tensors, or the next part of a block, as a tensor of a shape [...]."""
+        if kind == "output":
+            return next(self._left)
+        begin = self._ends[kind]
+        self._ends[kind] += _bytes(shape, dtype)
+        return part(self.block if kind == "saved" else self._workspace, begin, shape, dtype)
+
+
+def part(block: torch.Tensor, begin: int, shape: tuple[int, ...], dtype: torch.dtype) -> torch.Tensor:
+    """Return a part of a block of bytes [B], from byte ``begin`` on, as a tensor of ``shape`` [...]."""
+    return block[begin : begin + math.prod(shape) * dtype.itemsize].view(dtype).view(shape)
+
+
+@functools.cache
+def make_fetch():
+    """Make the kernel of `fetch`."""
+
+    @cuda_kernel(source("allocator_fetch.cu"), "begin + wp.tid()", "warpgs.runtime.allocator.fetch")
+    def fetch(item: int, table: wp.uint64, first: int, second: int, out: wp.array(dtype=float)): ...
+
+    return fetch
+
+
+def fetch(table: int, first: int, second: int, out: torch.Tensor) -> None:
+    """Fill ``out`` from a table of three addresses, read when the kernel runs; ``second`` counts the first two's numbers."""
+    launch.launch(make_fetch(), out.numel(), [table, first, second, out], out.device)
+
 
 _CAPTURING = threading.Lock()
 """Lock held during a capture."""
@@ -48,24 +156,29 @@ class CapturedGraph:
     """A CUDA graph of the kernels that torch and Warp launch in one call, and the objects that it needs."""
 
     def __init__(self, work: Callable[[], object], stream: torch.cuda.Stream, pool: tuple[int, int] | None = None):
-        """Capture the work, which neither reads from the device nor loads kernels; nothing runs yet."""
-        # The caller lets ``stream``, not the default one, wait for what ``work`` reads. ``pool`` is that of a graph to share
-        # memory with: it must never be replayed at the same time, nor leave results there. Raises RuntimeError where the work
-        # cannot be captured. torch.cuda.graph would collect garbage and empty the cache each time, which takes 80 ms
-        self._graph = torch.cuda.CUDAGraph()
-        with torch.cuda.stream(stream), _CAPTURING, _no_collection():
-            here = launch.warp_stream(torch.device("cuda"))
-            # other threads may allocate meanwhile, and wait for streams and events, but not for the whole device
-            self._graph.capture_begin(pool=pool, capture_error_mode="thread_local")
-            try:
-                wp.capture_begin(stream=here, external=True)
+        """Capture the work on a stream that is not the default one; it neither reads from the device nor loads kernels."""
+        # ``pool`` is that of a graph to share memory with: it must never be replayed at the same time, nor leave results there.
+        # Raises RuntimeError where the work cannot be captured. torch.cuda.graph would collect garbage and empty the cache each
+        # time, which takes 80 ms
+        self._graph, caller = torch.cuda.CUDAGraph(), torch.cuda.current_stream(stream.device)
+        # for what the work reads; and a capture sets numbers of torch's generator that graphs in flight may still read
+        stream.wait_stream(caller)
+        try:
+            with torch.cuda.stream(stream), _CAPTURING, _no_collection():
+                here = launch.warp_stream(torch.device("cuda"))
+                # other threads may allocate meanwhile, and wait for streams and events, but not for the whole device
+                self._graph.capture_begin(pool=pool, capture_error_mode="thread_local")
                 try:
-                    self.result = work()
-                    """Return value of the work."""
+                    wp.capture_begin(stream=here, external=True)
+                    try:
+                        self.result = work()
+                        """Return value of the work."""
+                    finally:
+                        self._lent = wp.capture_end(stream=here)  # memory of Warp that the graph uses
                 finally:
-                    self._lent = wp.capture_end(stream=here)  # memory of Warp that the graph uses
-            finally:
-                self._graph.capture_end()
+                    self._graph.capture_end()
+        finally:
+            caller.wait_stream(stream)
 
     def replay(self) -> None:
         """Run the graph on the current stream."""
@@ -102,7 +215,6 @@ class GraphPool:
         """Number of replays so far."""
         self.failed = False
         """True once a capture failed for another reason than lack of memory."""
-        self._aside: torch.cuda.Stream | None = None
         self._keeper: CapturedGraph | None = None
 
     @functools.cached_property
@@ -110,28 +222,16 @@ class GraphPool:
         """Empty tensor of bytes on the device, shape [0]."""
         return torch.empty(0, dtype=torch.uint8, device=self.device)
 
-    def capturing(self) -> bool:
-        """Return whether other code captures a graph on the current stream."""
-        return self.stream is not None and torch._C._cuda_isCurrentStreamCapturing()
+    @functools.cached_property
+    def _aside(self) -> torch.cuda.Stream:
+        return torch.cuda.Stream(self.device)
 
+    @torch.no_grad()
     def capture(self, work: Callable[[], object]) -> CapturedGraph:
         """Return a graph of ``work``, captured on a separate stream, or raise what `CapturedGraph` raises."""
-        if self._aside is None:
-            self._aside = torch.cuda.Stream(self.device)
-        here = torch.cuda.current_stream(self.device)
-        self._aside.wait_stream(here)  # a capture sets numbers of torch's generator that graphs in flight may still read
-        try:
-            with torch.no_grad():
-                # holds the shared memory, which torch would not reuse once the last graph is gone
-                if self._keeper is None:
-                    self._keeper = CapturedGraph(lambda: torch.zeros(1, device=self.device, dtype=torch.float32), self._aside)
-                return CapturedGraph(work, self._aside, self._keeper.pool())
-        finally:
-            here.wait_stream(self._aside)
-
-    def pool(self) -> tuple[int, int] | None:
-        """Return the handle of the shared memory; None before the first capture."""
-        return None if self._keeper is None else self._keeper.pool()
+        if self._keeper is None:  # holds the shared memory, which torch would not reuse once the last graph is gone
+            self._keeper = CapturedGraph(lambda: torch.zeros(1, device=self.device, dtype=torch.float32), self._aside)
+        return CapturedGraph(work, self._aside, self._keeper.pool())
 
     def release(self) -> None:
         """Keep no memory for later graphs, and forget that a capture failed."""
@@ -160,16 +260,15 @@ class GraphedFunction:
                 with torch.no_grad():
                     self.function(sizes, *inputs)
                 self._sizes = sizes
-                if sizes.workspace_bytes <= SMALL_BYTES:
-                    self._workspace = self.graphs.byte.new_empty(sizes.workspace_bytes)
+                if sizes.bytes["workspace"] <= SMALL_BYTES:
+                    self._workspace = self.graphs.byte.new_empty(sizes.bytes["workspace"])
             arena = Arena(self._sizes, self.graphs.byte, self._workspace)
             key = (*[0 if t is None else t.data_ptr() for t in inputs], *arena.addresses())
             graph = None
-            if not self.graphs.capturing():
+            if self.graphs.stream is None or not torch._C._cuda_isCurrentStreamCapturing():  # nor does other code capture
                 graph = self._graphs.get(key) or self._capture(key, arena, inputs)
             if graph is None:
-                with torch.no_grad():
-                    self._run(arena, inputs)
+                self._run(arena, inputs)
             else:
                 graph.replay()
                 self.replays += 1
@@ -180,6 +279,7 @@ class GraphedFunction:
         """Return the tensors [...] that the function returned when it filled a block [B]."""
         return [part(block, *place) for place in self._places]
 
+    @torch.no_grad()
     def _run(self, arena: Arena, inputs: tuple[torch.Tensor | None, ...]) -> None:
         """Call the function without a graph."""
         arena.begin()  # a capture may have ended half way

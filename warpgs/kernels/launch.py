@@ -1,4 +1,4 @@
-"""Torch and Warp side by side: tensors as arrays, launches, memory for kernels, derivatives."""
+"""Torch and Warp side by side: tensors as arrays, devices and streams, launches, derivatives."""
 
 from __future__ import annotations
 
@@ -6,12 +6,11 @@ import _thread
 import contextlib
 import ctypes
 import functools
-import math
 import os
 import threading
 from collections.abc import Callable, Sequence
 from queue import SimpleQueue
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 import warp as wp
@@ -19,22 +18,16 @@ from torch._subclasses.fake_tensor import FakeTensor
 
 from warpgs.device import prepare_kernel_cache
 from warpgs.errors import ResourceError, UsageError
-from warpgs.kernels.native import cuda_kernel, load_module, source
+from warpgs.kernels.native import load_module
 from warpgs.openmp import warn_if_spinning
 from warpgs.process import hidden_stderr
 
 wp.config.log_level = wp.LOG_WARNING  # its banner and compile notes are not for users
 
 
-@contextlib.contextmanager
-def _without_driver_notice():
-    """Hide the warning that Warp's native code prints where there is no CUDA driver."""
-    with contextlib.nullcontext() if torch.cuda.is_available() else hidden_stderr():
-        yield
-
-
 prepare_kernel_cache()
-with _without_driver_notice():
+# without a CUDA driver, Warp's native code prints a warning
+with contextlib.nullcontext() if torch.cuda.is_available() else hidden_stderr():
     wp.init()  # device_from_torch fails before this
 
 REALS = {torch.float32: wp.float32, torch.float64: wp.float64}
@@ -83,75 +76,54 @@ def set_threads(count: int) -> None:
     torch.set_num_threads(count)
 
 
-class _Pool:
-    """Threads that make the calls of a queue."""
-
+def _serve(calls: SimpleQueue[Callable[[], None]]) -> None:
+    """Make the calls of a queue, which must not raise."""
     # The locks of `concurrent.futures` and of `threading.Thread.start` can stay locked after an interrupt; the queue's cannot.
-
-    def __init__(self, count: int):
-        self.calls: SimpleQueue[Callable[[], None]] = SimpleQueue()
-        for _ in range(count):
-            _thread.start_new_thread(self._serve, ())
-
-    def submit(self, call: Callable[[], None]) -> None:
-        """Let the next free thread make a call, which must not raise."""
-        self.calls.put(call)
-
-    def _serve(self) -> None:
-        while True:
-            self.calls.get()()
+    while True:
+        calls.get()()
 
 
 @functools.cache
-def _pool(count: int, process: int) -> _Pool:
-    return _Pool(count)
+def _pool(count: int, process: int) -> SimpleQueue[Callable[[], None]]:
+    """Return the queue that a number of threads of this process serve."""
+    calls: SimpleQueue[Callable[[], None]] = SimpleQueue()
+    for _ in range(count):
+        _thread.start_new_thread(_serve, (calls,))
+    return calls
 
 
-class View(NamedTuple):
-    """A tensor as a kernel argument: its memory, read as elements of a Warp type."""
-
-    tensor: torch.Tensor
-    dtype: object
-    axes: int | None = None
-    """1 for a flat array, 2 for rows of the last axis, 0 for a flat array with the gaps between rows, None for the axes of the
-    tensor."""
-
-    def shape(self) -> tuple[int, ...]:
-        """Return the sizes of the axes that a kernel sees, followed by the shape of an element."""
-        if self.axes is None:
-            return tuple(self.tensor.shape)
-        if self.axes == 0:
-            last = sum((n - 1) * step for n, step in zip(self.tensor.shape, self.tensor.stride()))
-            return (last + 1 if self.tensor.numel() else 0,)
-        count = self.tensor.numel()
-        return (count,) if self.axes == 1 else (count // max(self.tensor.shape[-1], 1), self.tensor.shape[-1])
-
-    def array(self) -> wp.array:
-        """Return the tensor's memory as a Warp array of the shape [...], without a copy and without gradient."""
-        tensor = self.tensor.detach()
-        if self.axes is not None:
-            tensor = tensor.view(self.shape()) if self.axes else tensor.as_strided(self.shape(), (1,))
-        for size in tensor.shape:
-            _check_size(size)
-        return wp.from_torch(tensor, dtype=self.dtype, requires_grad=False)
-
-    def row_stride(self) -> int:
-        """Return the number of entries from one row of the last axis to the next."""
-        tensor = self.tensor
-        for axis in range(-2, -tensor.ndim - 1, -1):
-            if tensor.shape[axis] > 1:  # the stride of an axis of one entry may be any number
-                return tensor.stride(axis)
-        return tensor.shape[-1]
+@functools.cache
+def _declared(kernel) -> tuple[tuple[object, int] | None, ...]:
+    """Return for each argument after ``begin`` the Warp type of an array's elements and the axes of its tensor; else None."""
+    types = [a.type for a in kernel.adj.args[1:]]
+    return tuple((t.dtype, t.ndim + len(getattr(t.dtype, "_shape_", ()))) if isinstance(t, wp.array) else None for t in types)
 
 
-def view(tensor: torch.Tensor, dtype) -> View:
-    """Return a contiguous tensor of any shape as a kernel argument with elements of Warp type ``dtype``."""
-    return View(tensor, dtype)
+def _shape(tensor: torch.Tensor, axes: int) -> tuple[int, ...]:
+    """Return the sizes of a tensor [...] for a kernel with so many axes: as it is, flat with all gaps, or as rows."""
+    if tensor.ndim == axes:
+        return tuple(tensor.shape)
+    count = tensor.numel()
+    if axes == 1:
+        return (1 + sum((n - 1) * step for n, step in zip(tensor.shape, tensor.stride())) if count else 0,)
+    return count // max(tensor.shape[-1], 1), tensor.shape[-1]
 
 
-def span(tensor: torch.Tensor, dtype) -> View:
-    """Return a tensor [..., K] of contiguous rows as an argument of one axis, including gaps between rows (`Vi."""
-    return View(tensor, dtype, 0)
+def row_stride(tensor: torch.Tensor) -> int:
+    """Return the number of entries from one row of the last axis of a tensor [..., K] to the next."""
+    for axis in range(-2, -tensor.ndim - 1, -1):
+        if tensor.shape[axis] > 1:  # the stride of an axis of one entry may be any number
+            return tensor.stride(axis)
+    return tensor.shape[-1]
+
+
+def as_array(tensor: torch.Tensor, dtype, axes: int) -> wp.array:
+    """Return the memory of a tensor [...] as a Warp array of the sizes of `_shape`, without a copy and without gradient."""
+    shape, tensor = _shape(tensor, axes), tensor.detach()
+    for size in shape:
+        _check_size(size)
+    tensor = tensor.as_strided(shape, (1,)) if axes == 1 < tensor.ndim else tensor.view(shape)
+    return wp.from_torch(tensor, dtype=dtype, requires_grad=False)
 
 
 def warp_device(device: torch.device) -> wp.Device:
@@ -187,11 +159,6 @@ def warp_stream(device: torch.device) -> wp.Stream:
     return _warp_stream(device, torch._C._cuda_getCurrentRawStream(index))
 
 
-def _is_struct(value) -> bool:
-    """Return whether a kernel argument is an instance of a Warp struct."""
-    return hasattr(value, "__ctype__") and not isinstance(value, wp.array)
-
-
 _LOADING = threading.Lock()
 """Lock held while a CPU module is loaded, since several threads must not compile at once. In debug mode it is also held while a
 kernel runs, since kernels of that mode are not thread-safe."""
@@ -218,12 +185,6 @@ def stream_of(device: torch.device):
             where.set_stream(before, sync=False)
 
 
-def _copied(struct):
-    """Return another instance of a Warp struct with the same numbers."""
-    packed = struct.__ctype__()
-    return type(struct)(type(packed).from_buffer_copy(packed))
-
-
 class _Recorded:
     """A kernel with a launch that is recorded once; later calls only replace its arguments.
 
@@ -233,6 +194,7 @@ class _Recorded:
 
     def __init__(self, kernel, device: torch.device, block_dim: int):
         self.kernel, self.device, self.block_dim = kernel, warp_device(device), block_dim
+        self.declared = _declared(kernel)
         self.command, self.known, self.dtypes = None, [], []
         self.lock = threading.Lock()  # autograd launches from a thread of its own
 
@@ -242,57 +204,55 @@ class _Recorded:
 
     def patched(self, count: int, inputs: Sequence) -> wp.Launch:
         """Return the recorded launch with these arguments; the first call records it."""
-        if self.command is None:
-            load_module(self.kernel.module, self.device, self.block_dim)
-            self.dtypes = [a.tensor.dtype if isinstance(a, View) else None for a in inputs]
-            for i, a in enumerate(inputs):
-                if isinstance(a, View):
-                    self._check(i, a.tensor)
-            own = [a.array() if isinstance(a, View) else _copied(a) if _is_struct(a) else a for a in inputs]
-            where = {"device": self.device, "block_dim": self.block_dim}
-            command = wp.launch(self.kernel, count, inputs=[0, *own], record_cmd=True, **where)
-            command.fwd_args = None  # else the first call's arrays would stay in memory
-            self.known = [None] * len(inputs)
-            self.command = command  # set last: after an interrupt there is no launch
-        else:
+        if self.command is not None:
             self._patch(count, inputs)
-        return self.command
+            return self.command
+        load_module(self.kernel.module, self.device, self.block_dim)
+        self.dtypes = [getattr(value, "dtype", None) for value in inputs]
+        packed = [0]
+        for i, (value, array) in enumerate(zip(inputs, self.declared, strict=True)):
+            if array:
+                self._check(i, value)
+                packed.append(as_array(value, *array))
+            elif hasattr(value, "__ctype__"):  # a copy of the struct, since later calls write into it
+                numbers = value.__ctype__()
+                packed.append(type(value)(type(numbers).from_buffer_copy(numbers)))
+            else:
+                packed.append(value)
+        command = wp.launch(self.kernel, count, inputs=packed, record_cmd=True, device=self.device, block_dim=self.block_dim)
+        command.fwd_args = None  # else the first call's arrays would stay in memory
+        self.known = [None] * len(inputs)
+        self.command = command  # set last: after an interrupt there is no launch
+        return command
 
     def _patch(self, count: int, inputs: Sequence) -> None:
         command, known = self.command, self.known
         if command.bounds.size != count:
             command.set_dim(count)
-        for i, value in enumerate(inputs):
+        for i, (value, array) in enumerate(zip(inputs, self.declared, strict=True)):
+            packed = command.params[i + 2]  # after the bounds and ``begin``
             # In a loop most arguments are those of the call before, memory addresses included.
-            if type(value) is View:
-                tensor = value.tensor
-                address, shape, dtype, before = tensor.data_ptr(), tensor.shape, tensor.dtype, known[i]
-                strided = value.axes in (0, 2) and value.row_stride()  # others are contiguous
-                if (
-                    before is not None
-                    and before[0] == address
-                    and before[1] == shape
-                    and before[2] == strided
-                    and before[3] is dtype
-                ):
+            if array:
+                stride = row_stride(value) if 0 < value.ndim != array[1] else 0
+                key = value.data_ptr(), value.shape, stride, value.dtype
+                if known[i] == key:
                     continue
-                self._check(i, tensor)
-                packed = command.params[i + 2]  # after the bounds and ``begin``
-                seen = value.shape()
-                for size in seen[: packed.ndim]:
+                self._check(i, value)
+                shape = _shape(value, array[1])
+                for size in shape[: packed.ndim]:
                     _check_size(size)  # it would wrap around
                 known[i] = None  # an interrupt here must leave no half-written entry
-                packed.data = address
+                packed.data = key[0]
                 for axis in range(packed.ndim):
-                    packed.shape[axis] = seen[axis]
+                    packed.shape[axis] = shape[axis]
                 if packed.ndim == 2:
-                    packed.strides[0] = (strided or tensor.stride(0)) * tensor.element_size()
-                known[i] = (address, shape, strided, dtype)
+                    packed.strides[0] = (stride or value.stride(0)) * value.element_size()
+                known[i] = key
             elif known[i] != value:
-                if _is_struct(value):
-                    ctypes.pointer(command.params[i + 2])[0] = value.__ctype__()  # copies its numbers
+                if hasattr(value, "__ctype__"):
+                    ctypes.pointer(packed)[0] = value.__ctype__()  # copies its numbers
                 elif isinstance(value, (int, float)):
-                    command.params[i + 2].value = value
+                    packed.value = value
                 else:  # vectors and matrices
                     command.set_param_at_index(i + 1, value)
                 known[i] = value
@@ -303,8 +263,7 @@ class _Recorded:
         if dtype is self.dtypes[i] and tensor.device.type == kind and (tensor.data_ptr() or not tensor.numel()):
             return
         label = self.kernel.adj.args[i + 1].label  # after ``begin``
-        fake = isinstance(tensor, FakeTensor)
-        found = "a FakeTensor without memory" if fake else f"{dtype} on {tensor.device}"
+        found = "a FakeTensor without memory" if isinstance(tensor, FakeTensor) else f"{dtype} on {tensor.device}"
         raise TypeError(f"{self.kernel.key}: {label} must be {self.dtypes[i]} on {kind}, not {found}")
 
 
@@ -340,11 +299,11 @@ class _SharedLaunch:
         self.lock = threading.Lock()
         self.busy = threading.Lock()  # held while other threads work
 
-    def run(self, pool: _Pool, helpers: int) -> None:
+    def run(self, pool: SimpleQueue, helpers: int) -> None:
         """Process all ranges on this thread and at most ``helpers`` others."""
         try:
             for _ in range(helpers):
-                pool.submit(self.help)
+                pool.put(self.help)
             self.work()  # here, too: each hand-over costs processor time
         finally:
             interrupt = None
@@ -399,24 +358,9 @@ class _SharedLaunch:
         self.inputs = ()  # a thread that has yet to start holds the launch, and must not hold the caller's memory
 
 
-@functools.cache
-def _declared(kernel) -> tuple[tuple[object, int] | None, ...]:
-    """Return for each argument after ``begin`` the Warp type of an array's elements and the axes of its tensor; else None."""
-    types = [a.type for a in kernel.adj.args[1:]]
-    return tuple((t.dtype, t.ndim + len(getattr(t.dtype, "_shape_", ()))) if isinstance(t, wp.array) else None for t in types)
-
-
-def arguments(kernel, inputs: Sequence) -> list:
-    """Return inputs with each tensor [...] as the array that the kernel declares: as it is, or flat, or as rows."""
-    return [
-        View(value, array[0], None if value.ndim == array[1] else array[1]) if isinstance(value, torch.Tensor) else value
-        for value, array in zip(inputs, _declared(kernel), strict=True)
-    ]
-
-
 def launch(kernel, count: int, inputs: Sequence, device: torch.device, *, cost: int = 1, block_dim: int = 256) -> None:
     """Launch ``kernel`` over ``count`` independent items; its first argument is the number of the first item."""
-    # Tensors become the arrays that the kernel declares (`arguments`); they are contiguous, or their rows are.
+    # Tensors become the arrays that the kernel declares (`as_array`); they are contiguous, or their rows are.
     # On a CPU, as many threads as torch uses share the items; results repeat, since each item has its own output memory.
     # ``cost`` is the rough work of an item in units of 10 ns, which decides whether threads pay. ``block_dim`` is CUDA's
     # threads per block.
@@ -425,20 +369,19 @@ def launch(kernel, count: int, inputs: Sequence, device: torch.device, *, cost: 
     _check_size(count)
     if device.type == "cuda":
         with _current(device):
-            _recorded(kernel, device, block_dim).launch(count, arguments(kernel, inputs), warp_stream(device))
+            _recorded(kernel, device, block_dim).launch(count, inputs, warp_stream(device))
         return
     if device.type != "cpu":
         raise ValueError(f"{kernel.key}: the kernels run on cpu and cuda only, not on {device}")
-    inputs = arguments(kernel, inputs)
     if _OF_THREAD.shared is not None:
         _OF_THREAD.shared.finish()
         _OF_THREAD.shared = None
     # A kernel of Warp 1.19 for x86 keeps a pointer into its stack in a static variable, which only optimised code leaves out.
     if wp.config.mode == "debug":
         with _LOADING:
-            arrays = [a.array() if isinstance(a, View) else a for a in inputs]
             load_module(kernel.module, warp_device(device), 1)
-            wp.launch(kernel, count, inputs=[0, *arrays], device="cpu", record_tape=False)
+            packed = [as_array(value, *array) if array else value for value, array in zip(inputs, _declared(kernel))]
+            wp.launch(kernel, count, inputs=[0, *packed], device="cpu", record_tape=False)
         return
     recorded = _OF_THREAD.recorded.get(kernel)
     if recorded is None:
@@ -495,138 +438,20 @@ def check(**tensors: tuple[torch.Tensor, str]) -> dict[str, int]:
     return sizes
 
 
-# Allocators, which group a function's tensors by lifetime, so that captured kernels find them at the same addresses.
-#
-# For tensors that are at another address each time, `fetch` reads the address when the kernel runs.
-
-ALIGNMENT = 256
-"""Alignment of the parts of a block [bytes]: enough for sorts and 16-byte loads, and whole cache lines."""
-
-
-class Allocator:
-    """Provider of a function's tensors; this class allocates each with torch."""
-
-    def output(self, shape: tuple[int, ...], dtype: torch.dtype, device: torch.device) -> torch.Tensor:
-        """Return a new tensor of a shape [...] that the caller may keep."""
-        return torch.empty(shape, dtype=dtype, device=device)
-
-    def saved(self, shape: tuple[int, ...], dtype: torch.dtype, device: torch.device) -> torch.Tensor:
-        """Return a new tensor of a shape [...] that the backward pass needs."""
-        return torch.empty(shape, dtype=dtype, device=device)
-
-    def workspace(self, shape: tuple[int, ...], dtype: torch.dtype, device: torch.device) -> torch.Tensor:
-        """Return a new tensor of a shape [...] that is needed only until the function returns."""
-        return torch.empty(shape, dtype=dtype, device=device)
-
-
-TORCH = Allocator()
-"""The allocator of torch."""
-
-
-def _bytes(shape: tuple[int, ...], dtype: torch.dtype) -> int:
-    """Return the aligned size of a tensor [bytes]."""
-    return -(-math.prod(shape) * dtype.itemsize // ALIGNMENT) * ALIGNMENT
-
-
-class SizingAllocator(Allocator):
-    """An allocator of torch that records the requested sizes."""
-
-    def __init__(self):
-        self.outputs: list[tuple[torch.Tensor, tuple[int, ...]]] = []
-        """For each output tensor, an empty tensor of its type and device, and its shape."""
-        self.saved_bytes = self.workspace_bytes = 0
-        """Sizes of all saved tensors, and of all workspace, with alignment."""
-
-    def output(self, shape, dtype, device):
-        """Return a new tensor of a shape [...], and note its shape."""
-        tensor = super().output(shape, dtype, device)
-        self.outputs.append((tensor.new_empty(0), tuple(shape)))
-        return tensor
-
-    def saved(self, shape, dtype, device):
-        """Return a new tensor of a shape [...], and add its size to `saved_bytes`."""
-        self.saved_bytes += _bytes(shape, dtype)
-        return super().saved(shape, dtype, device)
-
-    def workspace(self, shape, dtype, device):
-        """Return a new tensor of a shape [...], and add its size to `workspace_bytes`."""
-        self.workspace_bytes += _bytes(shape, dtype)
-        return super().workspace(shape, dtype, device)
-
-
-class Arena(Allocator):
-    """An allocator of the tensors that a function requested before: outputs one by one, the others as parts of two blocks."""
-
-    def __init__(self, sizes: SizingAllocator, byte: torch.Tensor, workspace: torch.Tensor | None = None):
-        """Ask torch for all memory of a function that ran with ``sizes``; ``byte`` is any tensor of bytes."""
-        self.outputs = [kind.new_empty(shape) for kind, shape in sizes.outputs]
-        """Output tensors, in the order in which the function asks for them."""
-        self.block = byte.new_empty(sizes.saved_bytes) if sizes.saved_bytes else None
-        """Block of the saved tensors, or None."""
-        self._workspace = byte.new_empty(sizes.workspace_bytes) if workspace is None else workspace
-        self.begin()
-
-    def begin(self) -> None:
-        """Start again: the next requests get the same tensors, from the first on."""
-        self._asked = self._saved_to = self._workspace_to = 0
-
-    def addresses(self) -> tuple[int, ...]:
-        """Return the addresses of all memory that is handed out."""
-        block = 0 if self.block is None else self.block.data_ptr()
-        return *[t.data_ptr() for t in self.outputs], block, self._workspace.data_ptr()
-
-    def place(self, tensor: torch.Tensor) -> tuple[int, tuple[int, ...], torch.dtype]:
-        """Return the place of a saved tensor [...], as the arguments of `part` that follow the block."""
-        begin = tensor.data_ptr() - self.block.data_ptr() if tensor.numel() else 0  # an empty tensor has no address
-        return begin, tuple(tensor.shape), tensor.dtype
-
-    def output(self, shape, dtype, device):
-        """Return the next of the output tensors, of the given shape [...]."""
-        tensor = self.outputs[self._asked]
-        self._asked += 1
-        return tensor
-
-    def saved(self, shape, dtype, device):
-        """Return the next part of the block, as a tensor of a shape [...]."""
-        begin, self._saved_to = self._saved_to, self._saved_to + _bytes(shape, dtype)
-        return part(self.block, begin, shape, dtype)
-
-    def workspace(self, shape, dtype, device):
-        """Return the next part of the workspace, as a tensor of a shape [...]."""
-        begin, self._workspace_to = self._workspace_to, self._workspace_to + _bytes(shape, dtype)
-        return part(self._workspace, begin, shape, dtype)
-
-
-def part(block: torch.Tensor, begin: int, shape: tuple[int, ...], dtype: torch.dtype) -> torch.Tensor:
-    """Return a part of a block of bytes [B], from byte ``begin`` on, as a tensor of ``shape`` [...]."""
-    return block[begin : begin + math.prod(shape) * dtype.itemsize].view(dtype).view(shape)
-
-
-@functools.cache
-def make_fetch():
-    """Make the kernel of `fetch`."""
-
-    @cuda_kernel(source("allocator_fetch.cu"), "begin + wp.tid()", "warpgs.runtime.allocator.fetch")
-    def fetch(item: int, table: wp.uint64, first: int, second: int, out: wp.array(dtype=float)): ...
-
-    return fetch
-
-
-def fetch(table: int, first: int, second: int, out: torch.Tensor) -> None:
-    """Fill ``out`` from a table of three addresses, read when the kernel runs; ``second`` counts the first two's numbers."""
-    launch(make_fetch(), out.numel(), [table, first, second, out], out.device)
-
-
-class _NotTwice(torch.autograd.Function):
-    """A gradient that depends on tensors, and raises where its own gradient is requested."""
+class _Refusing(torch.autograd.Function):
+    """Values that autograd connects to their sources, so that a gradient through them is an error and not silently zero."""
 
     @staticmethod
-    def forward(ctx: Any, gradient: torch.Tensor, *tensors: torch.Tensor | None) -> torch.Tensor:
-        return gradient.view_as(gradient)
+    def forward(ctx: Any, message: str, values: torch.Tensor, *sources: torch.Tensor | None) -> torch.Tensor:
+        ctx.message = message
+        return values.view_as(values)
 
     @staticmethod
     def backward(ctx: Any, *gradients: torch.Tensor) -> None:
-        raise UsageError("the kernels have no second derivatives: leave out create_graph=True, or detach the gradient")
+        raise UsageError(ctx.message)
+
+
+_NO_SECOND = "the kernels have no second derivatives: leave out create_graph=True, or detach the gradient"
 
 
 def keep(ctx: Any, *tensors: torch.Tensor | None) -> None:
@@ -666,29 +491,15 @@ def first_order(backward: Callable[..., Any]) -> Callable[..., Any]:
         with torch.no_grad():
             found = backward(ctx, *gradients)
         sources = (*gradients, *ctx.saved_tensors)
-        return tuple(None if v is None else _NotTwice.apply(v, *sources) for v in found)
+        return tuple(None if v is None else _Refusing.apply(_NO_SECOND, v, *sources) for v in found)
 
     return once
 
 
-class _WithoutGradient(torch.autograd.Function):
-    """Values that autograd connects to their source, so that a gradient through them is an error and not silently zero."""
-
-    @staticmethod
-    def forward(ctx: Any, name: str, values: torch.Tensor, source: torch.Tensor) -> torch.Tensor:
-        ctx.name = name
-        return values.view_as(values)
-
-    @staticmethod
-    def backward(ctx: Any, *gradients: torch.Tensor) -> None:
-        raise UsageError(
-            f"{ctx.name} has no gradient: use {ctx.name}.detach(), or a loss of rgb, alpha, depth or features instead"
-        )
-
-
 def without_gradient(name: str, values: torch.Tensor, source: torch.Tensor) -> torch.Tensor:
     """Return values [...]; a gradient through them is an error where ``source`` [...] requires gradients."""
-    found: torch.Tensor = _WithoutGradient.apply(name, values, source)
+    message = f"{name} has no gradient: use {name}.detach(), or a loss of rgb, alpha, depth or features instead"
+    found: torch.Tensor = _Refusing.apply(message, values, source)
     return found
 
 

@@ -84,37 +84,30 @@ def make_functions():
 
         All BLOCK threads of the block must call it.
         """
-        ...
 
     @wp.func_native(source("native_store_row.cu"))
     def store_row(records: wp.array2d(dtype=float), i: int, v: vec12):
         """Write row i of an array of rows of 12 floats, 16-byte aligned."""
-        ...
 
     @wp.func_native(source("native_clear_rows.cu", BLOCK=BLOCK))
     def clear_rows(item: int, kept: int, sh: wp.array2d(dtype=wp.vec3)):
         """Set the rows of the block's items to zero, except those that are kept. All BLOCK threads must call it."""
-        ...
 
     @wp.func_native(source("native_broadcast.cu"))
     def broadcast(value: int, lane: int) -> int:
         """Return the value that a lane of the warp holds. All 32 lanes of the warp must call this and the next three."""
-        ...
 
     @wp.func_native(source("native_running_sum.cu"))
     def running_sum(value: int) -> int:
         """Return the sum over this lane of the warp and those before it."""
-        ...
 
     @wp.func_native(source("native_whole_sum.cu"))
     def whole_sum(value: wp.int64) -> wp.int64:
         """Return the sum over all lanes of the warp."""
-        ...
 
     @wp.func_native(source("native_holder.cu"))
     def holder(running_sum: int, item: int) -> int:
         """Return the first lane of the warp whose running sum exceeds ``item``, or the last lane."""
-        ...
 
     return SimpleNamespace(
         compact=compact, store_row=store_row, clear_rows=clear_rows, broadcast=broadcast,
@@ -130,7 +123,6 @@ def make_color(bases: int):
     @wp.func_native(source("native_color.cu", BASES=bases))
     def color(sh: wp.array2d(dtype=wp.vec3), n: int, count: int, weights: values) -> wp.vec4:
         """Return the weighted sum of the first ``count`` coefficients of row n, and their largest magnitude (ignoring NaN)."""
-        ...
 
     @wp.func_native(source("native_color_backward.cu", BASES=bases))
     def color_backward(
@@ -138,7 +130,6 @@ def make_color(bases: int):
         v_sh: wp.array2d(dtype=wp.vec3),
     ) -> values:  # fmt: skip
         """Return the weights' gradient of `color` for upstream ``v``; store (0 past ``count``) or add the row's gradient."""
-        ...
 
     return SimpleNamespace(color=color, color_backward=color_backward)
 

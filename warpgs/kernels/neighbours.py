@@ -174,8 +174,12 @@ def make_reach_kernel():
 def camera_reach(means: torch.Tensor, centers: torch.Tensor, fraction: float) -> torch.Tensor:
     """Return log(``fraction`` x distance of means [N, 3] to the nearest of centers [C, 3]), from log(`SMALLEST_REACH`)."""
     launch.check(means=(means, "N 3"), centers=(centers, "C 3"))
+    return _log_sizes(make_reach_kernel(), means, centers, fraction)
+
+
+def _log_sizes(kernel, means: torch.Tensor, cameras: torch.Tensor, fraction: float) -> torch.Tensor:
     log_sizes = torch.empty(len(means), dtype=torch.float32, device=means.device)
-    launch.launch(make_reach_kernel(), len(means), [means, centers, float(fraction), log_sizes], means.device)
+    launch.launch(kernel, len(means), [means, cameras, float(fraction), log_sizes], means.device)
     return log_sizes
 
 
@@ -217,6 +221,4 @@ def pixel_size(means: torch.Tensor, cameras: torch.Tensor, fraction: float) -> t
     # The pixel size of a camera is depth / focal length, or distance / focal length for a fisheye (Yu et al. 2024,
     # Mip-Splatting, section 4.1). A camera sees the points in the cone around its image.
     launch.check(means=(means, "N 3"), cameras=(cameras, "C 9"))
-    log_sizes = torch.empty(len(means), dtype=torch.float32, device=means.device)
-    launch.launch(make_pixel_kernel(), len(means), [means, cameras, float(fraction), log_sizes], means.device)
-    return log_sizes
+    return _log_sizes(make_pixel_kernel(), means, cameras, fraction)

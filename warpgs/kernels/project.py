@@ -13,7 +13,8 @@ from warpgs.kernels import launch, project_cpu, project_cuda, sh
 from warpgs.kernels.cameras import CAMERA_MODELS
 from warpgs.kernels.ellipse import PROJECTED_SIZE, ProjectInputs, checked_factors
 from warpgs.kernels.falloff import Pass
-from warpgs.kernels.launch import TORCH, Allocator, first_order, keep, kept
+from warpgs.kernels.graphs import TORCH, Allocator
+from warpgs.kernels.launch import first_order, keep, kept
 from warpgs.kernels.native import BLOCK
 from warpgs.kernels.project_cpu import LANES
 
@@ -92,9 +93,7 @@ def project_gradients(
     cameras, count = len(inputs[5]), len(inputs[0])
     rows = (cameras, count) if wants_camera else (0, 0)
     v_viewmats, v_Ks = (projected.new_zeros(*rows, n, n) if wants_camera else projected.new_empty(*rows, n, n) for n in (4, 3))
-    arguments = [
-        *inputs[:8], *settings.size, settings.sh_count, rule.near, rule.low_pass, projected, tile_counts, v_projected
-    ]  # fmt: skip
+    arguments = [*inputs[:8], *settings.size, settings.sh_count, rule.near, rule.low_pass, projected, tile_counts, v_projected]
     if _threads_each(projected):
         kernel, tasks, cost = project_cuda.make_backward(real, *settings.variant()), -(-count // BLOCK) * BLOCK, 10
         if real is wp.float64:

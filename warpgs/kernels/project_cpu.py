@@ -7,11 +7,14 @@ import warp as wp
 
 from warpgs.constants import LARGEST_COEFFICIENT
 from warpgs.kernels import ellipse, sh
-from warpgs.kernels.ellipse import PROJECTED_SIZE, make_projection, make_spans
+from warpgs.kernels.cameras import types_of
+from warpgs.kernels.ellipse import PROJECTED_SIZE, arrays_of, make_projection, make_spans
 from warpgs.kernels.native import EXACT
 
 LANES = 16
 """Gaussians of a task."""
+
+Ints = wp.array(dtype=int)
 
 
 @functools.cache
@@ -54,8 +57,7 @@ def make_shapes(real, parameters: str):
     """Make the record of a task's Gaussians, and the function that stores one; lanes beyond the last hold zeros."""
     scales_of = make_projection(real, "pinhole", parameters).scales_of
     three, four = make_lanes(real, 3), make_lanes(real, 4)
-    vec3 = wp.types.vector(3, real)
-    vec4 = wp.types.vector(4, real)
+    _, vec3, vec4, *_ = types_of(real)
 
     @wp.struct
     class Shapes:
@@ -90,31 +92,30 @@ def make_forward(real, camera_model: str, parameters: str, antialiased: bool, ba
     g = make_shapes(real, parameters)
     three, four, basis = make_lanes(real, 3), make_lanes(real, 4), make_lanes(real, bases)
     basis_of = sh.make_functions(real, bases).basis
-    vec3 = m.vec3
+    _, vec3, _, _, _, Reals = types_of(real)
+    Vec3s, Vec4s, Mat33s, Mat44s, Rows, Vec3Rows = arrays_of(real)
     lane_reals = wp.types.vector(LANES, real)
     lane_ints = wp.types.vector(LANES, wp.int32)
-    lane_bases = basis.vectors
-    lanes = wp.constant(LANES)
 
     @wp.kernel(enable_backward=False, module="unique", module_options=EXACT)
     def forward(
         begin: int,
-        means: wp.array(dtype=m.vec3), quats: wp.array(dtype=m.vec4), log_scales: wp.array(dtype=m.vec3),
-        logit_opacities: wp.array(dtype=real), coefficients: wp.array2d(dtype=m.vec3),
-        viewmats: wp.array(dtype=m.mat44), Ks: wp.array(dtype=m.mat33), lenses: wp.array2d(dtype=real),
-        opacity_factors: wp.array(dtype=real),
+        means: Vec3s, quats: Vec4s, log_scales: Vec3s,
+        logit_opacities: Reals, coefficients: Vec3Rows,
+        viewmats: Mat44s, Ks: Mat33s, lenses: Rows,
+        opacity_factors: Reals,
         width: int, height: int, origin_x: int, origin_y: int, window_width: int, window_height: int,
         tile_size: int, sh_count: int,
         near: real, far: real, low_pass: real, alpha_cut: real, square_sigma: real,
         # outputs
-        projected: wp.array2d(dtype=real), tile_counts: wp.array(dtype=int),
+        projected: Rows, tile_counts: Ints,
     ):  # fmt: skip
         task = begin + wp.tid()
         count = means.shape[0]
-        tasks = (count + lanes - 1) // lanes
+        tasks = (count + LANES - 1) // LANES
         camera = task // tasks
-        first = (task - camera * tasks) * lanes
-        used = wp.min(lanes, count - first)
+        first = (task - camera * tasks) * LANES
+        used = wp.min(LANES, count - first)
         view = viewmats[camera]
         K = Ks[camera]
         lens = lenses[camera]
@@ -139,7 +140,7 @@ def make_forward(real, camera_model: str, parameters: str, antialiased: bool, ba
         a = lane_reals()
         b = lane_reals()
         c = lane_reals()
-        for lane in range(lanes):
+        for lane in range(LANES):
             e = m.ellipse(
                 three.get(shapes.mean, lane), four.get(shapes.quat, lane), three.get(shapes.scale, lane),
                 view, K, lens, real(width), real(height), near, low_pass,
@@ -173,7 +174,7 @@ def make_forward(real, camera_model: str, parameters: str, antialiased: bool, ba
         begin_row = lane_ints()
         end_row = lane_ints()
         tiles = lane_ints()
-        for lane in range(lanes):
+        for lane in range(LANES):
             half = s.half_sides(a[lane], b[lane], c[lane], shrink[lane], reach[lane], alpha_cut, square_sigma)
             rows = s.tile_rows(pixel_y[lane], half[1], origin_y, window_height, tile_size)
             begin_row[lane] = wp.where(valid[lane] != 0, rows[0], 0)
@@ -184,7 +185,7 @@ def make_forward(real, camera_model: str, parameters: str, antialiased: bool, ba
         for lane in range(used):
             most = wp.max(most, end_row[lane] - begin_row[lane])
         for k in range(most):
-            for lane in range(lanes):
+            for lane in range(LANES):
                 row = begin_row[lane] + k
                 columns = s.tile_columns(
                     pixel_x[lane], pixel_y[lane], vec3(u11[lane], u12[lane], u22[lane]), reach[lane], half_width[lane],
@@ -193,8 +194,8 @@ def make_forward(real, camera_model: str, parameters: str, antialiased: bool, ba
                 tiles[lane] = tiles[lane] + wp.where(row < end_row[lane], columns[1] - columns[0], 0)
 
         # last, since it reads the most
-        values = lane_bases()
-        for lane in range(lanes):
+        values = basis.vectors()
+        for lane in range(LANES):
             d = m.direction(three.get(shapes.mean, lane), view)
             basis.put(basis_of(vec3(d[0], d[1], d[2])), lane, values)
         for lane in range(used):
@@ -206,7 +207,7 @@ def make_forward(real, camera_model: str, parameters: str, antialiased: bool, ba
                 k = int(0)
                 while k < sh_count:
                     coefficient = coefficients[wp.max(n, 0), wp.max(k, 0)]
-                    color += values[wp.max(k, 0) * lanes + lane] * coefficient
+                    color += values[wp.max(k, 0) * LANES + lane] * coefficient
                     large += wp.where(wp.max(wp.abs(coefficient)) <= real(LARGEST_COEFFICIENT), 0, 1)
                     k += 1
                 if not (m.finite3(color) and large == 0):
@@ -240,15 +241,11 @@ def make_backward(real, camera_model: str, parameters: str, antialiased: bool, b
     gaussians = make_shapes(real, parameters)
     three, four, nine, row, basis = (make_lanes(real, size) for size in (3, 4, 9, PROJECTED_SIZE, bases))
     basis_of = sh.make_functions(real, bases).basis
-    vec3 = m.vec3
-    mat33 = m.mat33
+    _, vec3, _, mat33, mat44, Reals = types_of(real)
+    Vec3s, Vec4s, Mat33s, Mat44s, Rows, Vec3Rows = arrays_of(real)
     vec9 = wp.types.vector(9, real)
     lane_reals = wp.types.vector(LANES, real)
     lane_ints = wp.types.vector(LANES, wp.int32)
-    lane_rows = row.vectors
-    lane_centers = three.vectors
-    lane_bases = basis.vectors
-    lanes = wp.constant(LANES)
 
     @wp.struct
     class CameraParts:
@@ -270,19 +267,19 @@ def make_backward(real, camera_model: str, parameters: str, antialiased: bool, b
     @wp.kernel(enable_backward=False, module="unique", module_options=EXACT)
     def backward(
         begin: int,
-        means: wp.array(dtype=m.vec3), quats: wp.array(dtype=m.vec4), log_scales: wp.array(dtype=m.vec3),
-        logit_opacities: wp.array(dtype=real), coefficients: wp.array2d(dtype=m.vec3),
-        viewmats: wp.array(dtype=m.mat44), Ks: wp.array(dtype=m.mat33), lenses: wp.array2d(dtype=real),
+        means: Vec3s, quats: Vec4s, log_scales: Vec3s,
+        logit_opacities: Reals, coefficients: Vec3Rows,
+        viewmats: Mat44s, Ks: Mat33s, lenses: Rows,
         width: int, height: int, sh_count: int, near: real, low_pass: real,
-        projected: wp.array2d(dtype=real), tile_counts: wp.array(dtype=int), v_projected: wp.array2d(dtype=real),
+        projected: Rows, tile_counts: Ints, v_projected: Rows,
         # outputs; those of the cameras zero on entry
-        v_means: wp.array(dtype=m.vec3), v_quats: wp.array(dtype=m.vec4), v_log_scales: wp.array(dtype=m.vec3),
-        v_logit_opacities: wp.array(dtype=real), v_coefficients: wp.array2d(dtype=m.vec3),
-        v_viewmats: wp.array2d(dtype=m.mat44), v_Ks: wp.array2d(dtype=m.mat33),
+        v_means: Vec3s, v_quats: Vec4s, v_log_scales: Vec3s,
+        v_logit_opacities: Reals, v_coefficients: Vec3Rows,
+        v_viewmats: wp.array2d(dtype=mat44), v_Ks: wp.array2d(dtype=mat33),
     ):  # fmt: skip
         count = means.shape[0]
-        first = (begin + wp.tid()) * lanes
-        used = wp.min(lanes, count - first)
+        first = (begin + wp.tid()) * LANES
+        used = wp.min(LANES, count - first)
         shapes = gaussians.Shapes()
         for lane in range(used):
             n = first + lane
@@ -293,11 +290,11 @@ def make_backward(real, camera_model: str, parameters: str, antialiased: bool, b
         v_logit = lane_reals()
         views = lane_ints()
         seen = lane_ints()
-        rows = lane_rows()
-        v_rows = lane_rows()
-        values = lane_bases()
-        weights = lane_bases()
-        centered = lane_centers()
+        rows = row.vectors()
+        v_rows = row.vectors()
+        values = basis.vectors()
+        weights = basis.vectors()
+        centered = three.vectors()
         parts = CameraParts()
         for camera in range(viewmats.shape[0]):
             view = viewmats[camera]
@@ -308,9 +305,9 @@ def make_backward(real, camera_model: str, parameters: str, antialiased: bool, b
                 seen[lane] = wp.where(tile_counts[i] > 0, 1, 0)
                 if tile_counts[i] > 0:
                     for k in range(wp.static(PROJECTED_SIZE)):
-                        rows[k * lanes + lane] = projected[i, k]
-                        v_rows[k * lanes + lane] = v_projected[i, k]
-            for lane in range(lanes):
+                        rows[k * LANES + lane] = projected[i, k]
+                        v_rows[k * LANES + lane] = v_projected[i, k]
+            for lane in range(LANES):
                 g = f.shape(
                     three.get(shapes.mean, lane), four.get(shapes.quat, lane), three.get(shapes.scale, lane),
                     view, K, lens, real(width), real(height), near, low_pass, row.get(rows, lane), row.get(v_rows, lane), 0,
@@ -324,7 +321,7 @@ def make_backward(real, camera_model: str, parameters: str, antialiased: bool, b
                     nine.put(flat(g.turned), lane, parts.turned)
                     four.put(g.unit, lane, parts.unit)
                     nine.put(flat(g.K), lane, parts.K)
-            for lane in range(lanes):
+            for lane in range(LANES):
                 d = m.direction(three.get(shapes.mean, lane), view)
                 basis.put(basis_of(vec3(d[0], d[1], d[2])), lane, values)
             for lane in range(used):
@@ -336,14 +333,14 @@ def make_backward(real, camera_model: str, parameters: str, antialiased: bool, b
                     k = int(0)
                     while k < sh_count:
                         o = wp.max(k, 0)
-                        weights[o * lanes + lane] = wp.dot(coefficients[n, o], v_color)
-                        v_coefficient = values[o * lanes + lane] * v_color
+                        weights[o * LANES + lane] = wp.dot(coefficients[n, o], v_color)
+                        v_coefficient = values[o * LANES + lane] * v_color
                         if views[lane] > 0:
                             v_coefficient += v_coefficients[n, o]
                         v_coefficients[n, o] = v_coefficient
                         k += 1
                     views[lane] = views[lane] + 1
-            for lane in range(lanes):
+            for lane in range(LANES):
                 d = m.direction(three.get(shapes.mean, lane), view)
                 v_centered = f.centered(d, basis.get(weights, lane))
                 hit = seen[lane] != 0

@@ -6,47 +6,51 @@ import warp as wp
 
 from warpgs.constants import LARGEST_COEFFICIENT
 from warpgs.kernels import ellipse, sh
-from warpgs.kernels.ellipse import PROJECTED_SIZE, make_projection, make_spans
+from warpgs.kernels.cameras import types_of
+from warpgs.kernels.ellipse import PROJECTED_SIZE, arrays_of, make_projection, make_spans
 from warpgs.kernels.native import make_color
 from warpgs.kernels.native import make_functions as make_native
 
+Ints = wp.array(dtype=int)
+
+
+def _module(kind: str, real, camera_model: str, parameters: str, antialiased: bool, bases: int) -> str:
+    variant = f"{camera_model}.{parameters}.{bases}{'.antialiased' * antialiased}"
+    return f"warpgs.kernels.project.{kind}.cuda.{real.__name__}.{variant}"
+
 
 @functools.cache
-def make_forward(
-    real, camera_model: str, parameters: str = "stored", antialiased: bool = False, bases: int = sh.BASES
-):  # fmt: skip
+def make_forward(real, camera_model: str, parameters: str = "stored", antialiased: bool = False, bases: int = sh.BASES):
     """Make the forward kernel of one `Pass.variant`. It computes colours last, because they need the most data."""
     # In float32 the first threads of each block compute the colours of the Gaussians that touch a tile.
     native = real is wp.float32
     m = make_projection(real, camera_model, parameters)
     s = make_spans(real)
     basis = sh.make_functions(real, bases).basis
-    vec3 = m.vec3
+    _, vec3, _, mat33, mat44, Reals = types_of(real)
+    Vec3s, Vec4s, Mat33s, Mat44s, Rows, Vec3Rows = arrays_of(real)
     color_of = make_color(bases).color if native else None
     compact = make_native().compact if native else None
     vec12 = wp.types.vector(PROJECTED_SIZE, real)
 
     @wp.func
-    def store_values(projected: wp.array2d(dtype=real), i: int, values: vec12):
+    def store_values(projected: Rows, i: int, values: vec12):
         for k in range(wp.static(PROJECTED_SIZE)):
             projected[i, k] = values[k]
 
     store = make_native().store_row if native else store_values
-    variant = f".{parameters}.{bases}{'.antialiased' * antialiased}"
-    module = f"warpgs.kernels.project.forward.cuda.{real.__name__}.{camera_model}{variant}"
+    module = _module("forward", real, camera_model, parameters, antialiased, bases)
 
     @wp.func
     def project_one(
-        i: int, n: int, view: m.mat44, K: m.mat33, lens: wp.array(dtype=real),
-        means: wp.array(dtype=m.vec3), quats: wp.array(dtype=m.vec4), log_scales: wp.array(dtype=m.vec3),
-        logit_opacities: wp.array(dtype=real), opacity_factors: wp.array(dtype=real),
+        i: int, n: int, view: mat44, K: mat33, lens: Reals,
+        means: Vec3s, quats: Vec4s, log_scales: Vec3s,
+        logit_opacities: Reals, opacity_factors: Reals,
         width: int, height: int, origin_x: int, origin_y: int, window_width: int, window_height: int, tile_size: int,
-        near: real, far: real, low_pass: real, alpha_cut: real, square_sigma: real, projected: wp.array2d(dtype=real),
+        near: real, far: real, low_pass: real, alpha_cut: real, square_sigma: real, projected: Rows,
     ):  # fmt: skip
         """Write row i without its colour; return the number of tiles touched. Where that is 0 nothing is written."""
-        e = m.ellipse(
-            means[n], quats[n], log_scales[n], view, K, lens, real(width), real(height), near, low_pass
-        )  # fmt: skip
+        e = m.ellipse(means[n], quats[n], log_scales[n], view, K, lens, real(width), real(height), near, low_pass)
         if e.valid == 0 or not (m.depth_of(e.position) <= far):
             return 0
         opacity = m.opacity_of(logit_opacities[n])
@@ -88,8 +92,8 @@ def make_forward(
 
     @wp.func
     def color_one(
-        i: int, n: int, view: m.mat44, means: wp.array(dtype=m.vec3), coefficients: wp.array2d(dtype=m.vec3), sh_count: int,
-        projected: wp.array2d(dtype=real), tile_counts: wp.array(dtype=int),
+        i: int, n: int, view: mat44, means: Vec3s, coefficients: Vec3Rows, sh_count: int,
+        projected: Rows, tile_counts: Ints,
     ):  # fmt: skip
         """Write the colour of row i; if the colour is not finite, Gaussian n is culled after all."""
         d = m.direction(means[n], view)
@@ -116,15 +120,15 @@ def make_forward(
     @wp.kernel(enable_backward=False, grid_stride=False, module=module)
     def forward(
         begin: int,
-        means: wp.array(dtype=m.vec3), quats: wp.array(dtype=m.vec4), log_scales: wp.array(dtype=m.vec3),
-        logit_opacities: wp.array(dtype=real), coefficients: wp.array2d(dtype=m.vec3),
-        viewmats: wp.array(dtype=m.mat44), Ks: wp.array(dtype=m.mat33), lenses: wp.array2d(dtype=real),
-        opacity_factors: wp.array(dtype=real),
+        means: Vec3s, quats: Vec4s, log_scales: Vec3s,
+        logit_opacities: Reals, coefficients: Vec3Rows,
+        viewmats: Mat44s, Ks: Mat33s, lenses: Rows,
+        opacity_factors: Reals,
         width: int, height: int, origin_x: int, origin_y: int, window_width: int, window_height: int,
         tile_size: int, sh_count: int,
         near: real, far: real, low_pass: real, alpha_cut: real, square_sigma: real,
         # outputs
-        projected: wp.array2d(dtype=real), tile_counts: wp.array(dtype=int),
+        projected: Rows, tile_counts: Ints,
     ):  # fmt: skip
         i = begin + wp.tid()
         count = means.shape[0]
@@ -154,40 +158,36 @@ def make_forward(
 
 
 @functools.cache
-def make_backward(
-    real, camera_model: str, parameters: str = "stored", antialiased: bool = False, bases: int = sh.BASES
-):  # fmt: skip
+def make_backward(real, camera_model: str, parameters: str = "stored", antialiased: bool = False, bases: int = sh.BASES):
     """Make the backward kernel: one thread per Gaussian, over all cameras, so no sum needs atomics."""
     # In float32 the Gaussians that some camera sees are assigned to the first threads of each block.
     native = real is wp.float32
     m = make_projection(real, camera_model, parameters)
     f = ellipse.make_functions(real, camera_model, parameters, antialiased, bases)
     functions = sh.make_functions(real, bases)
-    vec3 = m.vec3
-    vec4 = m.vec4
-    values = functions.values
+    _, vec3, vec4, mat33, mat44, Reals = types_of(real)
+    Vec3s, Vec4s, Mat33s, Mat44s, Rows, Vec3Rows = arrays_of(real)
     compact = make_native().compact if native else None
     clear_rows = make_native().clear_rows if native else None
     color_backward = make_color(bases).color_backward if native else None
 
     # three blocks to a multiprocessor: enough registers
     registers = {"cuda_max_registers": 168, "grid_stride": False} if native else {}
-    variant = f".{parameters}.{bases}{'.antialiased' * antialiased}"
-    module = f"warpgs.kernels.project.backward.cuda.{real.__name__}.{camera_model}{variant}"
+    module = _module("backward", real, camera_model, parameters, antialiased, bases)
 
     @wp.kernel(enable_backward=False, module=module, **registers)
     def backward(
         begin: int,
-        means: wp.array(dtype=m.vec3), quats: wp.array(dtype=m.vec4), log_scales: wp.array(dtype=m.vec3),
-        logit_opacities: wp.array(dtype=real), coefficients: wp.array2d(dtype=m.vec3),
-        viewmats: wp.array(dtype=m.mat44), Ks: wp.array(dtype=m.mat33), lenses: wp.array2d(dtype=real),
+        means: Vec3s, quats: Vec4s, log_scales: Vec3s,
+        logit_opacities: Reals, coefficients: Vec3Rows,
+        viewmats: Mat44s, Ks: Mat33s, lenses: Rows,
         width: int, height: int, sh_count: int, near: real, low_pass: real,
-        projected: wp.array2d(dtype=real), tile_counts: wp.array(dtype=int), v_projected: wp.array2d(dtype=real),
+        projected: Rows, tile_counts: Ints, v_projected: Rows,
         camera_gradients: int,
         # outputs, of which coefficients are zero on entry in float64
-        v_means: wp.array(dtype=m.vec3), v_quats: wp.array(dtype=m.vec4), v_log_scales: wp.array(dtype=m.vec3),
-        v_logit_opacities: wp.array(dtype=real), v_coefficients: wp.array2d(dtype=m.vec3),
-        v_viewmats: wp.array2d(dtype=m.mat44), v_Ks: wp.array2d(dtype=m.mat33),
+        v_means: Vec3s, v_quats: Vec4s, v_log_scales: Vec3s,
+        v_logit_opacities: Reals, v_coefficients: Vec3Rows,
+        v_viewmats: wp.array2d(dtype=mat44), v_Ks: wp.array2d(dtype=mat33),
     ):  # fmt: skip
         n = begin + wp.tid()
         count = means.shape[0]
@@ -240,7 +240,7 @@ def make_backward(
                 d = m.direction(means[n], view)
                 basis = functions.basis(vec3(d[0], d[1], d[2]))
                 v_color = f.color(projected, v_projected, i)
-                w = values()
+                w = functions.values()
                 if wp.static(native):
                     w = color_backward(coefficients, n, sh_count, basis, v_color, stored, v_coefficients)
                     stored += 1

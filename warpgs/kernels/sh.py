@@ -66,9 +66,7 @@ def basis(directions: torch.Tensor) -> torch.Tensor:
 @functools.cache
 def make_functions(real, bases: int = BASES):
     """Make the basis and its gradient for one scalar type and a number of basis values, with the signs of Kerbl et al. 2023."""
-    vec3 = wp.types.vector(3, real)
-    vec16 = wp.types.vector(16, real)
-    values = wp.types.vector(bases, real)
+    vec3, vec16, values = (wp.types.vector(size, real) for size in (3, 16, bases))
 
     @wp.func
     def up_to_3(d: vec3) -> vec16:
@@ -124,43 +122,6 @@ def make_functions(real, bases: int = BASES):
         return v
 
     @wp.func
-    def backward_of_4(d: vec3, w: values) -> vec3:
-        """Return the part of `basis_backward` from the values of degree 4."""
-        x = d[0]
-        y = d[1]
-        z = d[2]
-        xx = x * x
-        yy = y * y
-        zz = z * z
-        three = real(3.0)
-        four = real(4.0)
-        six = real(6.0)
-        nine = real(9.0)
-        twelve = real(12.0)
-        v_x = (
-            real(C44) * y * (three * xx - yy) * w[16] - real(C43) * z * (six * x * y * w[17] + three * (xx - yy) * w[23])
-            + real(C42) * y * (six * zz - three * xx - yy) * w[18]
-            + real(C41) * z * (six * x * y * w[19] - (four * zz - nine * xx - three * yy) * w[21])
-            + real(C40) * twelve * x * (xx + yy - four * zz) * w[20] + real(C422) * four * x * (three * zz - xx) * w[22]
-            + real(C444) * four * x * (xx - three * yy) * w[24]
-        )  # fmt: skip
-        v_y = (
-            real(C44) * x * (xx - three * yy) * w[16] - real(C43) * z * (three * (xx - yy) * w[17] - six * x * y * w[23])
-            + real(C42) * x * (six * zz - xx - three * yy) * w[18]
-            + real(C41) * z * (six * x * y * w[21] - (four * zz - three * xx - nine * yy) * w[19])
-            + real(C40) * twelve * y * (xx + yy - four * zz) * w[20] - real(C422) * four * y * (three * zz - yy) * w[22]
-            + real(C444) * four * y * (yy - three * xx) * w[24]
-        )  # fmt: skip
-        v_z = (
-            -real(C43) * (y * (three * xx - yy) * w[17] + x * (xx - three * yy) * w[23])
-            + real(C42) * twelve * x * y * z * w[18]
-            - real(C41) * (twelve * zz - three * (xx + yy)) * (y * w[19] + x * w[21])
-            + real(C40) * real(16.0) * z * (real(2.0) * zz - three * (xx + yy)) * w[20]
-            + real(C422) * twelve * z * (xx - yy) * w[22]
-        )  # fmt: skip
-        return vec3(v_x, v_y, v_z)
-
-    @wp.func
     def basis_backward(d: vec3, w: values) -> vec3:
         """Return the gradient of sum(w * basis(d)) by d, not constrained to unit length."""
         x = d[0]
@@ -190,9 +151,31 @@ def make_functions(real, bases: int = BASES):
             + real(C30) * (six * zz - three * xx - three * yy) * w[12] + real(C322) * (xx - yy) * w[14]
         )  # fmt: skip
         if wp.static(bases > BASES):
-            return vec3(v_x, v_y, v_z) + backward_of_4(d, w)
-        else:
-            return vec3(v_x, v_y, v_z)
+            four = real(4.0)
+            nine = real(9.0)
+            twelve = real(12.0)
+            v_x += (
+                real(C44) * y * (three * xx - yy) * w[16] - real(C43) * z * (six * x * y * w[17] + three * (xx - yy) * w[23])
+                + real(C42) * y * (six * zz - three * xx - yy) * w[18]
+                + real(C41) * z * (six * x * y * w[19] - (four * zz - nine * xx - three * yy) * w[21])
+                + real(C40) * twelve * x * (xx + yy - four * zz) * w[20] + real(C422) * four * x * (three * zz - xx) * w[22]
+                + real(C444) * four * x * (xx - three * yy) * w[24]
+            )  # fmt: skip
+            v_y += (
+                real(C44) * x * (xx - three * yy) * w[16] - real(C43) * z * (three * (xx - yy) * w[17] - six * x * y * w[23])
+                + real(C42) * x * (six * zz - xx - three * yy) * w[18]
+                + real(C41) * z * (six * x * y * w[21] - (four * zz - three * xx - nine * yy) * w[19])
+                + real(C40) * twelve * y * (xx + yy - four * zz) * w[20] - real(C422) * four * y * (three * zz - yy) * w[22]
+                + real(C444) * four * y * (yy - three * xx) * w[24]
+            )  # fmt: skip
+            v_z += (
+                -real(C43) * (y * (three * xx - yy) * w[17] + x * (xx - three * yy) * w[23])
+                + real(C42) * twelve * x * y * z * w[18]
+                - real(C41) * (twelve * zz - three * (xx + yy)) * (y * w[19] + x * w[21])
+                + real(C40) * real(16.0) * z * (real(2.0) * zz - three * (xx + yy)) * w[20]
+                + real(C422) * twelve * z * (xx - yy) * w[22]
+            )  # fmt: skip
+        return vec3(v_x, v_y, v_z)
 
     basis = up_to_3 if bases == BASES else up_to_4
     return SimpleNamespace(basis=basis, basis_backward=basis_backward, vec3=vec3, values=values)

@@ -24,13 +24,8 @@ C2 = 0.03**2
 """(K2 L)^2 of Wang et al. 2004."""
 
 
-def _window() -> list[float]:
-    """Return the weights of the window along one axis."""
-    weights = [math.exp(-0.5 * (k / SIGMA) ** 2) for k in range(-RADIUS, RADIUS + 1)]
-    return [w / sum(weights) for w in weights]
-
-
-WINDOW = _window()
+_BELL = [math.exp(-0.5 * (k / SIGMA) ** 2) for k in range(-RADIUS, RADIUS + 1)]
+WINDOW = [w / sum(_BELL) for w in _BELL]
 """Weights of the window along one axis; their sum is 1."""
 
 CHANNELS = 3
@@ -50,7 +45,7 @@ def make_functions(real):
     vec5 = wp.types.vector(5, real)
     w0, w1, w2, w3, w4, w5 = (real(w) for w in WINDOW[RADIUS:])
     vec6 = wp.types.vector(6, real)
-    channels = wp.constant(CHANNELS)
+    channels = CHANNELS
 
     @wp.func
     def tap(k: wp.int32) -> real:
@@ -122,6 +117,7 @@ def make_kernels(real, summed: bool):
     vec11 = wp.types.vector(TAPS, real)
     vec11i = wp.types.vector(TAPS, wp.int32)
     values = wp.types.vector(LANES, real)
+    several = wp.types.vector(5 * LANES, real)
     kernel = functools.partial(wp.kernel, enable_backward=False, module="unique", module_options=ROLLED)
 
     @wp.func
@@ -141,10 +137,12 @@ def make_kernels(real, summed: bool):
         return w
 
     @wp.func
-    def clear_padding(scratch: wp.array(dtype=real), o: wp.int32, columns: wp.int32):
-        for k in range(PADDING):
-            scratch[o + k] = real(0.0)
-            scratch[o + PADDING + columns + k] = real(0.0)
+    def clear_padding(scratch: wp.array(dtype=real), first: wp.int32, columns: wp.int32, rows: wp.int32):
+        for row in range(rows):
+            o = first + row * (columns + 2 * PADDING)
+            for k in range(PADDING):
+                scratch[o + k] = real(0.0)
+                scratch[o + PADDING + columns + k] = real(0.0)
 
     # Warp unrolls loops that hold a `wp.static`: inside the loop over lanes, they would keep the latter from vectorising.
 
@@ -156,6 +154,11 @@ def make_kernels(real, summed: bool):
         for k in range(TAPS):
             s = f.add_pair(s, w[wp.static(k)], a[f.at(o[k] + x, lane)], b[f.at(o[k] + x, lane)])
         return s
+
+    @wp.func(inline=True)
+    def put(s: f.vec5, lane: wp.int32, sums: wp.ref[several]):
+        for k in range(wp.static(5)):
+            sums[k * LANES + lane] = s[k]
 
     @wp.func
     def down(m: wp.array(dtype=real), o: vec11i, w: vec11, x: wp.int32, lane: wp.int32) -> real:
@@ -176,21 +179,9 @@ def make_kernels(real, summed: bool):
         image = task // blocks
         top = (task - image * blocks) * BLOCK
         stride = columns + 2 * PADDING
-        m0 = task * 5 * stride
-        m1 = m0 + stride
-        m2 = m1 + stride
-        m3 = m2 + stride
-        m4 = m3 + stride
-        clear_padding(scratch, m0, columns)
-        clear_padding(scratch, m1, columns)
-        clear_padding(scratch, m2, columns)
-        clear_padding(scratch, m3, columns)
-        clear_padding(scratch, m4, columns)
-        s0 = values()
-        s1 = values()
-        s2 = values()
-        s3 = values()
-        s4 = values()
+        first = task * 5 * stride
+        clear_padding(scratch, first, columns, 5)
+        sums = several()
         unlike = values()
         error = values()
         for y in range(top, wp.min(top + BLOCK, height)):
@@ -199,41 +190,31 @@ def make_kernels(real, summed: bool):
             for step in range((columns + LANES - 1) // LANES):
                 x = wp.min(step * LANES, columns - LANES)
                 for lane in range(LANES):
-                    s = down_pairs(a, b, o, w, x, lane)
-                    s0[lane] = s[0]
-                    s1[lane] = s[1]
-                    s2[lane] = s[2]
-                    s3[lane] = s[3]
-                    s4[lane] = s[4]
-                for lane in range(LANES):
-                    scratch[f.at(m0 + PADDING + x, lane)] = s0[lane]
-                    scratch[f.at(m1 + PADDING + x, lane)] = s1[lane]
-                    scratch[f.at(m2 + PADDING + x, lane)] = s2[lane]
-                    scratch[f.at(m3 + PADDING + x, lane)] = s3[lane]
-                    scratch[f.at(m4 + PADDING + x, lane)] = s4[lane]
+                    put(down_pairs(a, b, o, w, x, lane), lane, sums)
+                for k in range(5):
+                    for lane in range(LANES):
+                        scratch[f.at(first + k * stride + PADDING + x, lane)] = sums[k * LANES + lane]
             row = (image * height + y) * columns
             for step in range((columns + LANES - 1) // LANES):
                 x = wp.min(step * LANES, columns - LANES)
                 fresh = step * LANES - x  # elements before this one were counted in the step before
                 for lane in range(LANES):
                     t = f.score(
-                        f.across(scratch, m0 + x, lane), f.across(scratch, m1 + x, lane), f.across(scratch, m2 + x, lane),
-                        f.across(scratch, m3 + x, lane), f.across(scratch, m4 + x, lane),
+                        f.across(scratch, first + x, lane), f.across(scratch, first + stride + x, lane),
+                        f.across(scratch, first + 2 * stride + x, lane), f.across(scratch, first + 3 * stride + x, lane),
+                        f.across(scratch, first + 4 * stride + x, lane),
                     )  # fmt: skip
-                    s0[lane] = t[0]
-                    s1[lane] = t[1]
-                    s2[lane] = t[2]
-                    s3[lane] = t[3]
+                    put(f.vec5(t[0], t[1], t[2], t[3], real(0.0)), lane, sums)
                     if wp.static(summed):
                         unlike[lane] = unlike[lane] + wp.where(lane >= fresh, real(1.0) - t[0], real(0.0))
                         gap = wp.abs(a[f.at(row + x, lane)] - b[f.at(row + x, lane)])
                         error[lane] = error[lane] + wp.where(lane >= fresh, gap, real(0.0))
                 for lane in range(LANES):
                     if not wp.static(summed):
-                        result[f.at(row + x, lane)] = s0[lane]
-                    by_mean[f.at(row + x, lane)] = s1[lane]
-                    by_variance[f.at(row + x, lane)] = s2[lane]
-                    by_gap[f.at(row + x, lane)] = s3[lane]
+                        result[f.at(row + x, lane)] = sums[lane]
+                    by_mean[f.at(row + x, lane)] = sums[LANES + lane]
+                    by_variance[f.at(row + x, lane)] = sums[2 * LANES + lane]
+                    by_gap[f.at(row + x, lane)] = sums[3 * LANES + lane]
         if wp.static(summed):
             unlike_sum = real(0.0)
             error_sum = real(0.0)
@@ -255,42 +236,35 @@ def make_kernels(real, summed: bool):
         image = task // blocks
         top = (task - image * blocks) * BLOCK
         stride = columns + 2 * PADDING
-        m0 = task * 3 * stride
-        m1 = m0 + stride
-        m2 = m1 + stride
-        clear_padding(scratch, m0, columns)
-        clear_padding(scratch, m1, columns)
-        clear_padding(scratch, m2, columns)
-        s0 = values()
-        s1 = values()
-        s2 = values()
+        first = task * 3 * stride
+        clear_padding(scratch, first, columns, 3)
+        sums = several()
         for y in range(top, wp.min(top + BLOCK, height)):
             o = starts_of(y, height, image, columns)
             w = taps_of(y, height)
             for step in range((columns + LANES - 1) // LANES):
                 x = wp.min(step * LANES, columns - LANES)
                 for lane in range(LANES):
-                    s0[lane] = down(by_mean, o, w, x, lane)
-                    s1[lane] = down(by_variance, o, w, x, lane)
-                    s2[lane] = down(by_gap, o, w, x, lane)
-                for lane in range(LANES):
-                    scratch[f.at(m0 + PADDING + x, lane)] = s0[lane]
-                    scratch[f.at(m1 + PADDING + x, lane)] = s1[lane]
-                    scratch[f.at(m2 + PADDING + x, lane)] = s2[lane]
+                    sums[lane] = down(by_mean, o, w, x, lane)
+                    sums[LANES + lane] = down(by_variance, o, w, x, lane)
+                    sums[2 * LANES + lane] = down(by_gap, o, w, x, lane)
+                for k in range(3):
+                    for lane in range(LANES):
+                        scratch[f.at(first + k * stride + PADDING + x, lane)] = sums[k * LANES + lane]
             row = (image * height + y) * columns
             for step in range((columns + LANES - 1) // LANES):
                 x = wp.min(step * LANES, columns - LANES)
                 for lane in range(LANES):
                     p = a[f.at(row + x, lane)]
                     d = p - b[f.at(row + x, lane)]
-                    v = f.across(scratch, m1 + x, lane) * p + f.across(scratch, m2 + x, lane) * d
-                    v = f.across(scratch, m0 + x, lane) + real(2.0) * v
+                    v = f.across(scratch, first + stride + x, lane) * p + f.across(scratch, first + 2 * stride + x, lane) * d
+                    v = f.across(scratch, first + x, lane) + real(2.0) * v
                     if wp.static(summed):
                         sign = wp.where(d > real(0.0), v_result[1], wp.where(d < real(0.0), -v_result[1], real(0.0)))
                         v = sign - v_result[0] * v
-                    s0[lane] = v
+                    sums[lane] = v
                 for lane in range(LANES):
-                    v_a[f.at(row + x, lane)] = s0[lane]
+                    v_a[f.at(row + x, lane)] = sums[lane]
 
     return SimpleNamespace(forward=forward, backward=backward)
 
@@ -328,41 +302,6 @@ def make_cuda_kernels():
     return SimpleNamespace(forward=forward, backward=backward)
 
 
-def _forward(image: torch.Tensor, target: torch.Tensor, summed: bool) -> tuple[torch.Tensor, ...]:
-    """Return similarities [B, H, W, 3] or, if ``summed``, two sums per task [tasks, 2]; then three partial derivatives."""
-    native, (batch, height, width, _) = _native(image), image.shape
-    columns, blocks = width * CHANNELS, -(-height // (SIDE if native else BLOCK))
-    tasks = batch * blocks * (-(-width // SIDE) if native else 1)
-    result = image.new_empty(tasks, 2) if summed else torch.empty_like(image)
-    outputs = [result, *(torch.empty_like(image) for _ in range(3))]
-    if native:
-        inputs = [image, target, height, columns, int(summed), *outputs]
-        launch.launch(make_cuda_kernels().forward, tasks * THREADS, inputs, image.device, block_dim=THREADS)
-    else:
-        kernel = make_kernels(launch.real_of(image), summed).forward
-        workspace = image.new_empty(tasks * 5 * (columns + 2 * PADDING))
-        inputs = [image, target, height, blocks, columns, workspace, *outputs]
-        launch.launch(kernel, tasks, inputs, image.device, cost=BLOCK * columns)
-    return tuple(outputs)
-
-
-def _backward(image: torch.Tensor, target: torch.Tensor, partials, v_result: torch.Tensor, summed: bool) -> torch.Tensor:
-    """Return the gradient of the image from the gradient of the similarities [B, H, W, 3] or of the two sums [2]."""
-    batch, height, width, _ = image.shape
-    v_image, v_result, columns = torch.empty_like(image), v_result.contiguous(), width * CHANNELS
-    if _native(image):
-        blocks = batch * -(-height // SIDE) * -(-width // SIDE)
-        inputs = [image, target, v_result, *partials, height, columns, int(summed), v_image]
-        launch.launch(make_cuda_kernels().backward, blocks * THREADS, inputs, image.device, block_dim=THREADS)
-        return v_image
-    blocks, kernel = -(-height // BLOCK), make_kernels(launch.real_of(image), summed).backward
-    fields = partials if summed else [v_result * t for t in partials]  # v_result is then not read
-    workspace = image.new_empty(batch * blocks * 3 * (columns + 2 * PADDING))
-    inputs = [image, target, *fields, v_result, height, blocks, columns, workspace, v_image]
-    launch.launch(kernel, batch * blocks, inputs, image.device, cost=BLOCK * columns)
-    return v_image
-
-
 # Structural similarity with an 11 x 11 Gaussian window (Wang et al. 2004), separable, forward and backward.
 #
 # For images a and b, the forward pass sums a, b, a^2, b^2 and (a - b)^2 over the window; the backward pass sums three
@@ -384,22 +323,46 @@ class _Ssim(torch.autograd.Function):
     @staticmethod
     def forward(ctx, image, target, summed):
         image, target = image.contiguous(), target.contiguous()
-        result, *partials = _forward(image, target, summed)
+        native, (batch, height, width, _) = _native(image), image.shape
+        columns, blocks = width * CHANNELS, -(-height // (SIDE if native else BLOCK))
+        tasks = batch * blocks * (-(-width // SIDE) if native else 1)
+        result = image.new_empty(tasks, 2) if summed else torch.empty_like(image)
+        partials = [torch.empty_like(image) for _ in range(3)]
+        if native:
+            inputs = [image, target, height, columns, int(summed), result, *partials]
+            launch.launch(make_cuda_kernels().forward, tasks * THREADS, inputs, image.device, block_dim=THREADS)
+        else:
+            kernel = make_kernels(launch.real_of(image), summed).forward
+            workspace = image.new_empty(tasks * 5 * (columns + 2 * PADDING))
+            inputs = [image, target, height, blocks, columns, workspace, result, *partials]
+            launch.launch(kernel, tasks, inputs, image.device, cost=BLOCK * columns)
         keep(ctx, image, target, *partials)
-        ctx.summed = summed
+        ctx.summed, ctx.tasks = summed, tasks
         return result.sum(0) if summed else result
 
     @staticmethod
     @first_order
     def backward(ctx, v_result):
         image, target, *partials = kept(ctx)
-        return _backward(image, target, partials, v_result, ctx.summed), None, None
+        height, columns, tasks = image.shape[1], image.shape[2] * CHANNELS, ctx.tasks
+        v_image, v_result = torch.empty_like(image), v_result.contiguous()
+        if _native(image):
+            inputs = [image, target, v_result, *partials, height, columns, int(ctx.summed), v_image]
+            launch.launch(make_cuda_kernels().backward, tasks * THREADS, inputs, image.device, block_dim=THREADS)
+        else:
+            fields = partials if ctx.summed else [v_result * t for t in partials]  # v_result is then not read
+            workspace = image.new_empty(tasks * 3 * (columns + 2 * PADDING))
+            inputs = [image, target, *fields, v_result, height, -(-height // BLOCK), columns, workspace, v_image]
+            kernel = make_kernels(launch.real_of(image), ctx.summed).backward
+            launch.launch(kernel, tasks, inputs, image.device, cost=BLOCK * columns)
+        return v_image, None, None
 
 
-def _check(image: torch.Tensor, target: torch.Tensor) -> None:
-    """Check shapes, types and devices of two images or batches."""
+def _checked(image: torch.Tensor, target: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Check two images or batches, and return them as batches [B, H, W, 3], the target without gradient."""
     pattern = "B H W 3" if isinstance(image, torch.Tensor) and image.ndim == 4 else "H W 3"
     launch.check(image=(image, pattern), target=(target, pattern))
+    return image.reshape(-1, *image.shape[-3:]), target.detach().reshape(-1, *image.shape[-3:])
 
 
 def ssim(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
@@ -420,9 +383,7 @@ def ssim(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
         TypeError: A scalar type is neither float32 nor float64, or scalar types differ.
         ValueError: A shape or device is wrong.
     """
-    _check(image, target)
-    target = target.detach()
-    a, b = (image, target) if image.ndim == 4 else (image[None], target[None])
+    a, b = _checked(image, target)
     # A row must fill a step; columns of zeros beside the image are what the window finds there anyway.
     missing = max(0, -(-LANES // CHANNELS) - a.shape[2])
     if missing:
@@ -433,8 +394,7 @@ def ssim(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
 def differences(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
     """Return the sums over pixels and channels of 1 - `ssim` and |image - target| [2], for images [H, W, 3] or [B, H, W, 3]."""
     # One pass computes both sums; for tiny images, torch sums the map of `ssim`.
-    _check(image, target)
-    target = target.detach()
-    if not (_native(image) or image.shape[-2] * CHANNELS >= LANES):
-        return torch.stack([(1 - ssim(image, target)).sum(), (image - target).abs().sum()])
-    return _Ssim.apply(*(t.reshape(-1, *t.shape[-3:]) for t in (image, target)), True)
+    a, b = _checked(image, target)
+    if not (_native(a) or a.shape[2] * CHANNELS >= LANES):
+        return torch.stack([(1 - ssim(a, b)).sum(), (a - b).abs().sum()])
+    return _Ssim.apply(a, b, True)

@@ -1,9 +1,7 @@
 """Plane sweeps: depths of the planes, their costs, and the scanlines that smooth them."""
 
-import functools
 import math
 from collections.abc import Sequence
-from types import SimpleNamespace
 
 import numpy as np
 import torch
@@ -24,77 +22,73 @@ STEP = 1e-3
 """Step of the central difference that gives the change of depth per pixel, as a fraction of the inverse depth."""
 
 
-@functools.cache
-def make_depth_kernels():
-    """Make the kernels."""
-    real = wp.float64
-    module = "warpgs.kernels.plane_depths"
+@wp.kernel(enable_backward=False, module="warpgs.kernels.plane_depths")
+def best(
+    begin: int, costs: wp.array2d(dtype=wp.int16), planes: int, first: wp.float64, step: wp.float64,
+    # outputs
+    inverses: wp.array(dtype=wp.float64),
+):  # fmt: skip
+    """Find the plane of least cost of a pixel, and refine its inverse depth by a parabola."""
+    pixel = begin + wp.tid()
+    lowest = int(costs[pixel, 0])
+    k = int(0)
+    for d in range(1, planes):
+        cost = int(costs[pixel, d])
+        if cost < lowest:
+            lowest = cost
+            k = d
+    k = wp.clamp(k, 1, planes - 2)
+    left = wp.float64(costs[pixel, k - 1])
+    right = wp.float64(costs[pixel, k + 1])
+    bend = left - wp.float64(2.0) * wp.float64(costs[pixel, k]) + right
+    offset = wp.float64(0.0)
+    if bend > wp.float64(0.0):  # costs are whole numbers
+        offset = wp.clamp(wp.float64(0.5) * (left - right) / bend, wp.float64(-1.0), wp.float64(1.0))
+    inverses[pixel] = first + (wp.float64(k) + offset) * step
 
-    @wp.kernel(enable_backward=False, module=module)
-    def best(
-        begin: int, costs: wp.array2d(dtype=wp.int16), planes: int, first: real, step: real,
-        # outputs
-        inverses: wp.array(dtype=real),
-    ):  # fmt: skip
-        pixel = begin + wp.tid()
-        lowest = int(costs[pixel, 0])
-        k = int(0)
-        for d in range(1, planes):
-            cost = int(costs[pixel, d])
-            if cost < lowest:
-                lowest = cost
-                k = d
-        k = wp.clamp(k, 1, planes - 2)
-        left = real(costs[pixel, k - 1])
-        right = real(costs[pixel, k + 1])
-        bend = left - real(2.0) * real(costs[pixel, k]) + right
-        offset = real(0.0)
-        if bend > real(0.0):  # costs are whole numbers
-            offset = wp.clamp(real(0.5) * (left - right) / bend, real(-1.0), real(1.0))
-        inverses[pixel] = first + (real(k) + offset) * step
 
-    @wp.func
-    def project(turn: wp.mat33d, shift: wp.vec3d, x: real, y: real, w: real) -> wp.vec3d:
-        """Return the position of a pixel at inverse depth w in another view, and whether it is in front of that camera."""
-        p = turn * wp.vec3d(x, y, real(1.0)) + w * shift
-        ahead = p[2] > real(BEHIND)
-        z = wp.where(ahead, p[2], real(1.0))
-        return wp.vec3d(p[0] / z, p[1] / z, wp.where(ahead, real(1.0), real(0.0)))
+@wp.func
+def project(turn: wp.mat33d, shift: wp.vec3d, x: wp.float64, y: wp.float64, w: wp.float64) -> wp.vec3d:
+    """Return the position of a pixel at inverse depth w in another view, and whether it is in front of that camera."""
+    p = turn * wp.vec3d(x, y, wp.float64(1.0)) + w * shift
+    ahead = p[2] > wp.float64(BEHIND)
+    z = wp.where(ahead, p[2], wp.float64(1.0))
+    return wp.vec3d(p[0] / z, p[1] / z, wp.where(ahead, wp.float64(1.0), wp.float64(0.0)))
 
-    @wp.kernel(enable_backward=False, module=module)
-    def check(
-        begin: int, own: wp.array2d(dtype=real), found: wp.array2d(dtype=real), turn: wp.mat33d, shift: wp.vec3d,
-        turn_back: wp.mat33d, shift_back: wp.vec3d, to_ray: wp.mat33d, center: wp.vec3d, most: real, cosine: real,
-        # outputs
-        sensitivity: wp.array2d(dtype=real), agrees: wp.array2d(dtype=wp.uint8),
-    ):  # fmt: skip
-        i = begin + wp.tid()
-        row = i // own.shape[1]
-        column = i - row * own.shape[1]
-        x = real(column) + real(0.5)
-        y = real(row) + real(0.5)
-        w = own[row, column]
-        good = int(0)
-        there = project(turn, shift, x, y, w)
-        if there[2] > real(0.0) and there[0] >= real(0.0) and there[1] >= real(0.0):
-            if there[0] < real(found.shape[1]) and there[1] < real(found.shape[0]):
-                back = project(turn_back, shift_back, there[0], there[1], found[int(there[1]), int(there[0])])
-                distance = wp.vec3d(back[0] - x, back[1] - y, real(0.0))
-                point = to_ray * wp.vec3d(x, y, real(1.0)) / w
-                other = point - center
-                apart = wp.dot(point, other) < cosine * wp.length(point) * wp.length(other)
-                if apart and back[2] > real(0.0) and wp.length(distance) < most:
-                    good = 1
-        if good == 1:
-            near = project(turn, shift, x, y, w + real(STEP) * w)
-            far = project(turn, shift, x, y, w - real(STEP) * w)
-            slide = wp.length(wp.vec3d(near[0] - far[0], near[1] - far[1], real(0.0)))
-            if near[2] * far[2] > real(0.0):
-                moved = real(2.0) * real(STEP) / w / slide  # dz = -dw / w^2
-                sensitivity[row, column] = wp.min(sensitivity[row, column], moved)
-        agrees[row, column] = wp.uint8(good)
 
-    return SimpleNamespace(best=best, check=check)
+@wp.kernel(enable_backward=False, module="warpgs.kernels.plane_depths")
+def check(
+    begin: int, own: wp.array2d(dtype=wp.float64), found: wp.array2d(dtype=wp.float64), turn: wp.mat33d, shift: wp.vec3d,
+    turn_back: wp.mat33d, shift_back: wp.vec3d, to_ray: wp.mat33d, center: wp.vec3d, most: wp.float64, cosine: wp.float64,
+    # outputs
+    sensitivity: wp.array2d(dtype=wp.float64), agrees: wp.array2d(dtype=wp.uint8),
+):  # fmt: skip
+    """Follow a pixel into another view and back."""
+    i = begin + wp.tid()
+    row = i // own.shape[1]
+    column = i - row * own.shape[1]
+    x = wp.float64(column) + wp.float64(0.5)
+    y = wp.float64(row) + wp.float64(0.5)
+    w = own[row, column]
+    good = int(0)
+    there = project(turn, shift, x, y, w)
+    if there[2] > wp.float64(0.0) and there[0] >= wp.float64(0.0) and there[1] >= wp.float64(0.0):
+        if there[0] < wp.float64(found.shape[1]) and there[1] < wp.float64(found.shape[0]):
+            back = project(turn_back, shift_back, there[0], there[1], found[int(there[1]), int(there[0])])
+            distance = wp.vec3d(back[0] - x, back[1] - y, wp.float64(0.0))
+            point = to_ray * wp.vec3d(x, y, wp.float64(1.0)) / w
+            other = point - center
+            apart = wp.dot(point, other) < cosine * wp.length(point) * wp.length(other)
+            if apart and back[2] > wp.float64(0.0) and wp.length(distance) < most:
+                good = 1
+    if good == 1:
+        near = project(turn, shift, x, y, w + wp.float64(STEP) * w)
+        far = project(turn, shift, x, y, w - wp.float64(STEP) * w)
+        slide = wp.length(wp.vec3d(near[0] - far[0], near[1] - far[1], wp.float64(0.0)))
+        if near[2] * far[2] > wp.float64(0.0):
+            moved = wp.float64(2.0) * wp.float64(STEP) / w / slide  # dz = -dw / w^2
+            sensitivity[row, column] = wp.min(sensitivity[row, column], moved)
+    agrees[row, column] = wp.uint8(good)
 
 
 def best_inverses(costs: torch.Tensor, inverses: np.ndarray) -> np.ndarray:
@@ -102,7 +96,7 @@ def best_inverses(costs: torch.Tensor, inverses: np.ndarray) -> np.ndarray:
     height, width, _ = costs.shape
     found = torch.empty(height, width, dtype=torch.float64, device="cpu")
     inputs = [costs.contiguous(), len(inverses), float(inverses[0]), float(inverses[1] - inverses[0]), found]
-    launch.launch(make_depth_kernels().best, height * width, inputs, costs.device, cost=max(1, len(inverses) // 10))
+    launch.launch(best, height * width, inputs, costs.device, cost=max(1, len(inverses) // 10))
     return found.numpy()
 
 
@@ -128,7 +122,7 @@ def check_round_trip(
         *maps[:2], *_between(first, second), *_between(second, first), wp.mat33d(*geometry.inverse(first.K).ravel()),
         wp.vec3d(*center), most, math.cos(math.radians(min_parallax)), maps[2], agrees,
     ]  # fmt: skip
-    launch.launch(make_depth_kernels().check, own.size, inputs, agrees.device, cost=5)
+    launch.launch(check, own.size, inputs, agrees.device, cost=5)
     return agrees.numpy().astype(bool)
 
 
@@ -156,203 +150,207 @@ NEUTRAL = 0.5
 """Cost of correlation 0: where a plane projects outside of the other image, or a window has no texture."""
 
 
-@functools.cache
-def make_costs_kernel():
-    """Make the kernel."""
-    ints = wp.types.vector(LANES, wp.int32)
-    reals = wp.types.vector(LANES, wp.float32)
+ints = wp.types.vector(LANES, wp.int32)
+reals = wp.types.vector(LANES, wp.float32)
+shorts = wp.types.vector(LANES, wp.int16)
 
-    @wp.func
-    def at(first: wp.int32, lane: wp.int32) -> wp.int32:
-        """Return an index that the compiler can see is not negative; else it would load each lane separately."""
-        return wp.max(first, 0) + lane
 
-    @wp.func
-    def mirror(i: wp.int32, count: wp.int32) -> wp.int32:
-        """Return the number in [0, count) of a row or column beyond the border, mirrored at the centre of the last one."""
-        period = wp.max(2 * (count - 1), 1)
-        i = wp.abs(i) % period
-        return wp.min(i, period - i) % count
+@wp.func
+def at(first: wp.int32, lane: wp.int32) -> wp.int32:
+    """Return an index that the compiler can see is not negative; else it would load each lane separately."""
+    return wp.max(first, 0) + lane
 
-    @wp.func
-    def warp_row(
-        y: wp.int32, pitch: wp.int32, images: wp.array(dtype=wp.int32), offset: wp.int32, other_width: wp.int32,
-        other_height: wp.int32, h: wp.array(dtype=wp.float32), first: wp.int32, ring: wp.array(dtype=wp.int32), into: wp.int32,
-    ):  # fmt: skip
-        """Write a row of the other image as the first camera sees it: centred colours, below -MIDDLE outside."""
-        fy = float(y)
-        cx = h[first + 1] * fy + h[first + 2]
-        cy = h[first + 4] * fy + h[first + 5]
-        cz = h[first + 7] * fy + h[first + 8]
-        ax = h[first]
-        ay = h[first + 3]
-        az = h[first + 6]
-        most_x = float(other_width) + 0.995
-        most_y = float(other_height) + 0.995
-        stride = other_width + 2
-        found = ints()
-        for step in range(pitch // LANES):
-            x = step * LANES
-            for lane in range(LANES):
-                fx = float(x + lane)
-                z = az * fx + cz
-                ahead = z > 1.0e-6
-                inverse = 1.0 / wp.where(ahead, z, 1.0)
-                # positions in the image with its frame of one pixel
-                u = wp.where(ahead, (ax * fx + cx) * inverse + 1.0, 0.0)
-                v = wp.where(ahead, (ay * fx + cy) * inverse + 1.0, 0.0)
-                iu = int(wp.min(wp.max(u, 0.0), most_x) * 256.0 + 0.5)
-                iv = int(wp.min(wp.max(v, 0.0), most_y) * 256.0 + 0.5)
-                wx = iu & 255
-                wy = iv & 255
-                i = wp.max(offset + (iv >> 8) * stride + (iu >> 8), 0)
-                a = images[i]
-                b = images[i + stride]
-                upper = (a & 65535) * (256 - wx) + (a >> 16) * wx
-                lower = (b & 65535) * (256 - wx) + (b >> 16) * wx
-                found[lane] = ((upper * (256 - wy) + lower * wy + 32768) >> 16) - (LOW + MIDDLE)
-            for lane in range(LANES):
-                ring[at(into + x, lane)] = found[lane]
 
-    @wp.func
-    def add_row(
-        own: wp.array(dtype=wp.int32), row: wp.int32, ring: wp.array(dtype=wp.int32), slot: wp.int32, sign: wp.int32,
-        sums: wp.int32, side: wp.int32, pitch: wp.int32,
-    ):  # fmt: skip
-        """Add a row to the sums over the columns of windows, or subtract it; the sums lie behind the rows in ``ring``."""
-        s = ints()
-        q = ints()
-        p = ints()
-        for step in range(pitch // LANES):
-            x = step * LANES
-            for lane in range(LANES):
-                w = ring[at(slot + x, lane)]
-                signed = sign * w
-                s[lane] = ring[at(sums + x, lane)] + signed
-                q[lane] = ring[at(sums + side + x, lane)] + signed * w
-                p[lane] = ring[at(sums + 2 * side + x, lane)] + signed * own[at(row + x, lane)]
-            for lane in range(LANES):
-                ring[at(sums + x, lane)] = s[lane]
-                ring[at(sums + side + x, lane)] = q[lane]
-                ring[at(sums + 2 * side + x, lane)] = p[lane]
+@wp.func
+def mirror(i: wp.int32, count: wp.int32) -> wp.int32:
+    """Return the number in [0, count) of a row or column beyond the border, mirrored at the centre of the last one."""
+    period = wp.max(2 * (count - 1), 1)
+    i = wp.abs(i) % period
+    return wp.min(i, period - i) % count
 
-    @wp.func
-    def correlate_row(
-        own_sums: wp.array(dtype=wp.int32), roots: wp.array(dtype=wp.float32), row: wp.int32,
-        ring: wp.array(dtype=wp.int32), slot: wp.int32, sums: wp.int32, side: wp.int32, pitch: wp.int32, radius: wp.int32,
-        noise: wp.float32, number: wp.int32, totals: wp.array(dtype=wp.float32), total: wp.int32, least: wp.int32,
-    ):  # fmt: skip
-        """Add the costs of a row to their sum over the other images, and to the smallest."""
-        whole = float((2 * radius + 1) * (2 * radius + 1))
-        share = 1.0 / whole
-        s = ints()
-        q = ints()
-        p = ints()
-        sum_out = reals()
-        least_out = reals()
-        for step in range(pitch // LANES):
-            x = step * LANES
-            for lane in range(LANES):
-                s[lane] = 0
-                q[lane] = 0
-                p[lane] = 0
-            for k in range(2 * radius + 1):
-                for lane in range(LANES):
-                    s[lane] = s[lane] + ring[at(sums + x + k - radius, lane)]
-                    q[lane] = q[lane] + ring[at(sums + side + x + k - radius, lane)]
-                    p[lane] = p[lane] + ring[at(sums + 2 * side + x + k - radius, lane)]
-            for lane in range(LANES):
-                mean = float(s[lane]) * share
-                variance = wp.max(float(q[lane]) - float(s[lane]) * mean, 0.0) + noise
-                shared = float(p[lane]) - float(own_sums[at(row + x, lane)]) * mean
-                cost = 0.5 - 0.5 * (shared * roots[at(row + x, lane)]) / wp.sqrt(variance)
-                cost = wp.where(ring[at(slot + x, lane)] >= -MIDDLE, cost, NEUTRAL)
-                before = wp.where(number == 0, 0.0, totals[at(total + x, lane)])
-                lowest = wp.where(number == 0, 2.0, totals[at(least + x, lane)])
-                sum_out[lane] = before + cost
-                least_out[lane] = wp.min(lowest, cost)
-            for lane in range(LANES):
-                totals[at(total + x, lane)] = sum_out[lane]
-                totals[at(least + x, lane)] = least_out[lane]
 
-    @wp.func
-    def mirror_columns(ring: wp.array(dtype=wp.int32), sums: wp.int32, radius: wp.int32, width: wp.int32):
-        """Write the sums over columns beyond both borders of the image."""
-        for k in range(1, radius + 1):
-            ring[sums - k] = ring[sums + mirror(-k, width)]
-            ring[sums + width - 1 + k] = ring[sums + mirror(width - 1 + k, width)]
+@wp.func
+def warp_row(
+    y: wp.int32, pitch: wp.int32, images: wp.array(dtype=wp.int32), offset: wp.int32, other_width: wp.int32,
+    other_height: wp.int32, h: wp.array(dtype=wp.float32), first: wp.int32, ring: wp.array(dtype=wp.int32), into: wp.int32,
+):  # fmt: skip
+    """Write a row of the other image as the first camera sees it: centred colours, below -MIDDLE outside."""
+    fy = float(y)
+    cx = h[first + 1] * fy + h[first + 2]
+    cy = h[first + 4] * fy + h[first + 5]
+    cz = h[first + 7] * fy + h[first + 8]
+    ax = h[first]
+    ay = h[first + 3]
+    az = h[first + 6]
+    most_x = float(other_width) + 0.995
+    most_y = float(other_height) + 0.995
+    stride = other_width + 2
+    found = ints()
+    for step in range(pitch // LANES):
+        x = step * LANES
+        for lane in range(LANES):
+            fx = float(x + lane)
+            z = az * fx + cz
+            ahead = z > 1.0e-6
+            inverse = 1.0 / wp.where(ahead, z, 1.0)
+            # positions in the image with its frame of one pixel
+            u = wp.where(ahead, (ax * fx + cx) * inverse + 1.0, 0.0)
+            v = wp.where(ahead, (ay * fx + cy) * inverse + 1.0, 0.0)
+            iu = int(wp.min(wp.max(u, 0.0), most_x) * 256.0 + 0.5)
+            iv = int(wp.min(wp.max(v, 0.0), most_y) * 256.0 + 0.5)
+            wx = iu & 255
+            wy = iv & 255
+            i = wp.max(offset + (iv >> 8) * stride + (iu >> 8), 0)
+            a = images[i]
+            b = images[i + stride]
+            upper = (a & 65535) * (256 - wx) + (a >> 16) * wx
+            lower = (b & 65535) * (256 - wx) + (b >> 16) * wx
+            found[lane] = ((upper * (256 - wy) + lower * wy + 32768) >> 16) - (LOW + MIDDLE)
+        for lane in range(LANES):
+            ring[at(into + x, lane)] = found[lane]
 
-    @wp.kernel(enable_backward=False, module="unique", module_options=EXACT)
-    def match(
-        begin: int, own: wp.array(dtype=int), own_sums: wp.array(dtype=int), roots: wp.array(dtype=float),
-        images: wp.array(dtype=int), shapes: wp.array(dtype=int), h: wp.array(dtype=float), height: int, width: int,
-        pitch: int, others: int, planes: int, padded: int, radius: int, noise: float, unit: int,
-        # rows of the other image and sums over columns; costs; costs as whole numbers, of a task each
-        ring: wp.array(dtype=int), totals: wp.array(dtype=float), found: wp.array(dtype=wp.int16),
-        # outputs
-        costs: wp.array(dtype=wp.int16),
-    ):  # fmt: skip
-        task = begin + wp.tid()
-        blocks = padded // PLANES
-        top = (task // blocks) * ROWS
-        bottom = wp.min(top + ROWS, height)
-        first_plane = (task - (task // blocks) * blocks) * PLANES
-        window = 2 * radius + 1
-        side = pitch + 2 * radius
-        rows = task * (window * pitch + 3 * side)
-        sums = rows + window * pitch + radius
-        base = task * 2 * ROWS * pitch
-        whole = task * ROWS * PLANES * pitch
-        share = 0.5 / float(others)
-        levels = float(unit)
-        rounded = ints()
-        for k in range(PLANES):
-            plane = first_plane + k
-            if plane < planes:
-                for number in range(others):
-                    offset = shapes[3 * number]
-                    other_width = shapes[3 * number + 1]
-                    other_height = shapes[3 * number + 2]
-                    first = 9 * (plane * others + number)
-                    for i in range(3 * side):
-                        ring[at(sums - radius, i)] = 0
-                    for y in range(top - radius, bottom + radius):
-                        slot = rows + ((y + radius - top) % window) * pitch
-                        if y > top + radius:
-                            add_row(own, mirror(y - window, height) * pitch, ring, slot, -1, sums, side, pitch)
-                        warp_row(mirror(y, height), pitch, images, offset, other_width, other_height, h, first, ring, slot)
-                        add_row(own, mirror(y, height) * pitch, ring, slot, 1, sums, side, pitch)
-                        middle = y - radius
-                        if middle >= top:
-                            mirror_columns(ring, sums, radius, width)
-                            mirror_columns(ring, sums + side, radius, width)
-                            mirror_columns(ring, sums + 2 * side, radius, width)
-                            centre = rows + ((middle + radius - top) % window) * pitch
-                            total = base + (middle - top) * pitch
-                            correlate_row(
-                                own_sums, roots, middle * pitch, ring, centre, sums, side, pitch, radius, noise, number,
-                                totals, total, total + ROWS * pitch,
-                            )  # fmt: skip
-            for y in range(bottom - top):
-                total = base + y * pitch
-                least = total + ROWS * pitch
-                into = whole + (y * PLANES + k) * pitch
-                for step in range(pitch // LANES):
-                    x = step * LANES
-                    for lane in range(LANES):
-                        cost = totals[at(total + x, lane)] * share + 0.5 * totals[at(least + x, lane)]
-                        scaled = int(wp.min(wp.max(cost, 0.0), 1.0) * levels + 0.5)
-                        # planes past the last have the worst cost, so that paths do not change
-                        rounded[lane] = wp.where(plane < planes, scaled, unit)
-                    for lane in range(LANES):
-                        found[at(into + x, lane)] = wp.int16(rounded[lane])
+
+@wp.func
+def add_row(
+    own: wp.array(dtype=wp.int32), row: wp.int32, ring: wp.array(dtype=wp.int32), slot: wp.int32, sign: wp.int32,
+    sums: wp.int32, side: wp.int32, pitch: wp.int32,
+):  # fmt: skip
+    """Add a row to the sums over the columns of windows, or subtract it; the sums lie behind the rows in ``ring``."""
+    s = ints()
+    q = ints()
+    p = ints()
+    for step in range(pitch // LANES):
+        x = step * LANES
+        for lane in range(LANES):
+            w = ring[at(slot + x, lane)]
+            signed = sign * w
+            s[lane] = ring[at(sums + x, lane)] + signed
+            q[lane] = ring[at(sums + side + x, lane)] + signed * w
+            p[lane] = ring[at(sums + 2 * side + x, lane)] + signed * own[at(row + x, lane)]
+        for lane in range(LANES):
+            ring[at(sums + x, lane)] = s[lane]
+            ring[at(sums + side + x, lane)] = q[lane]
+            ring[at(sums + 2 * side + x, lane)] = p[lane]
+
+
+@wp.func
+def correlate_row(
+    own_sums: wp.array(dtype=wp.int32), roots: wp.array(dtype=wp.float32), row: wp.int32,
+    ring: wp.array(dtype=wp.int32), slot: wp.int32, sums: wp.int32, side: wp.int32, pitch: wp.int32, radius: wp.int32,
+    noise: wp.float32, number: wp.int32, totals: wp.array(dtype=wp.float32), total: wp.int32, least: wp.int32,
+):  # fmt: skip
+    """Add the costs of a row to their sum over the other images, and to the smallest."""
+    whole = float((2 * radius + 1) * (2 * radius + 1))
+    share = 1.0 / whole
+    s = ints()
+    q = ints()
+    p = ints()
+    sum_out = reals()
+    least_out = reals()
+    for step in range(pitch // LANES):
+        x = step * LANES
+        for lane in range(LANES):
+            s[lane] = 0
+            q[lane] = 0
+            p[lane] = 0
+        for k in range(2 * radius + 1):
+            for lane in range(LANES):
+                s[lane] = s[lane] + ring[at(sums + x + k - radius, lane)]
+                q[lane] = q[lane] + ring[at(sums + side + x + k - radius, lane)]
+                p[lane] = p[lane] + ring[at(sums + 2 * side + x + k - radius, lane)]
+        for lane in range(LANES):
+            mean = float(s[lane]) * share
+            variance = wp.max(float(q[lane]) - float(s[lane]) * mean, 0.0) + noise
+            shared = float(p[lane]) - float(own_sums[at(row + x, lane)]) * mean
+            cost = 0.5 - 0.5 * (shared * roots[at(row + x, lane)]) / wp.sqrt(variance)
+            cost = wp.where(ring[at(slot + x, lane)] >= -MIDDLE, cost, NEUTRAL)
+            before = wp.where(number == 0, 0.0, totals[at(total + x, lane)])
+            lowest = wp.where(number == 0, 2.0, totals[at(least + x, lane)])
+            sum_out[lane] = before + cost
+            least_out[lane] = wp.min(lowest, cost)
+        for lane in range(LANES):
+            totals[at(total + x, lane)] = sum_out[lane]
+            totals[at(least + x, lane)] = least_out[lane]
+
+
+@wp.func
+def mirror_columns(ring: wp.array(dtype=wp.int32), sums: wp.int32, radius: wp.int32, width: wp.int32):
+    """Write the sums over columns beyond both borders of the image."""
+    for k in range(1, radius + 1):
+        ring[sums - k] = ring[sums + mirror(-k, width)]
+        ring[sums + width - 1 + k] = ring[sums + mirror(width - 1 + k, width)]
+
+
+@wp.kernel(enable_backward=False, module="unique", module_options=EXACT)
+def match(
+    begin: int, own: wp.array(dtype=int), own_sums: wp.array(dtype=int), roots: wp.array(dtype=float),
+    images: wp.array(dtype=int), shapes: wp.array(dtype=int), h: wp.array(dtype=float), height: int, width: int,
+    pitch: int, others: int, planes: int, padded: int, radius: int, noise: float, unit: int,
+    # rows of the other image and sums over columns; costs; costs as whole numbers, of a task each
+    ring: wp.array(dtype=int), totals: wp.array(dtype=float), found: wp.array(dtype=wp.int16),
+    # outputs
+    costs: wp.array(dtype=wp.int16),
+):  # fmt: skip
+    """Compute the costs of some rows at some planes."""
+    task = begin + wp.tid()
+    blocks = padded // PLANES
+    top = (task // blocks) * ROWS
+    bottom = wp.min(top + ROWS, height)
+    first_plane = (task - (task // blocks) * blocks) * PLANES
+    window = 2 * radius + 1
+    side = pitch + 2 * radius
+    rows = task * (window * pitch + 3 * side)
+    sums = rows + window * pitch + radius
+    base = task * 2 * ROWS * pitch
+    whole = task * ROWS * PLANES * pitch
+    share = 0.5 / float(others)
+    levels = float(unit)
+    rounded = ints()
+    for k in range(PLANES):
+        plane = first_plane + k
+        if plane < planes:
+            for number in range(others):
+                offset = shapes[3 * number]
+                other_width = shapes[3 * number + 1]
+                other_height = shapes[3 * number + 2]
+                first = 9 * (plane * others + number)
+                for i in range(3 * side):
+                    ring[at(sums - radius, i)] = 0
+                for y in range(top - radius, bottom + radius):
+                    slot = rows + ((y + radius - top) % window) * pitch
+                    if y > top + radius:
+                        add_row(own, mirror(y - window, height) * pitch, ring, slot, -1, sums, side, pitch)
+                    warp_row(mirror(y, height), pitch, images, offset, other_width, other_height, h, first, ring, slot)
+                    add_row(own, mirror(y, height) * pitch, ring, slot, 1, sums, side, pitch)
+                    middle = y - radius
+                    if middle >= top:
+                        mirror_columns(ring, sums, radius, width)
+                        mirror_columns(ring, sums + side, radius, width)
+                        mirror_columns(ring, sums + 2 * side, radius, width)
+                        centre = rows + ((middle + radius - top) % window) * pitch
+                        total = base + (middle - top) * pitch
+                        correlate_row(
+                            own_sums, roots, middle * pitch, ring, centre, sums, side, pitch, radius, noise, number,
+                            totals, total, total + ROWS * pitch,
+                        )  # fmt: skip
         for y in range(bottom - top):
-            for x in range(width):
-                pixel = ((top + y) * width + x) * padded + first_plane
-                for k in range(PLANES):
-                    costs[at(pixel, k)] = found[at(whole + (y * PLANES + k) * pitch, x)]
-
-    return match
+            total = base + y * pitch
+            least = total + ROWS * pitch
+            into = whole + (y * PLANES + k) * pitch
+            for step in range(pitch // LANES):
+                x = step * LANES
+                for lane in range(LANES):
+                    cost = totals[at(total + x, lane)] * share + 0.5 * totals[at(least + x, lane)]
+                    scaled = int(wp.min(wp.max(cost, 0.0), 1.0) * levels + 0.5)
+                    # planes past the last have the worst cost, so that paths do not change
+                    rounded[lane] = wp.where(plane < planes, scaled, unit)
+                for lane in range(LANES):
+                    found[at(into + x, lane)] = wp.int16(rounded[lane])
+    for y in range(bottom - top):
+        for x in range(width):
+            pixel = ((top + y) * width + x) * padded + first_plane
+            for k in range(PLANES):
+                costs[at(pixel, k)] = found[at(whole + (y * PLANES + k) * pitch, x)]
 
 
 def _packed(gray: np.ndarray) -> np.ndarray:
@@ -413,7 +411,7 @@ def plane_costs(
         own, sums, roots, torch.from_numpy(np.concatenate(images)), torch.from_numpy(shapes), h, height, width, pitch,
         len(others), len(homographies), padded, radius, added, unit, ring, totals, found, costs,
     ]  # fmt: skip
-    launch.launch(make_costs_kernel(), tasks, inputs, costs.device, cost=ROWS * PLANES * pitch * len(others) // 2)
+    launch.launch(match, tasks, inputs, costs.device, cost=ROWS * PLANES * pitch * len(others) // 2)
     return costs
 
 
@@ -421,68 +419,56 @@ FAR_AWAY_16 = 2**14
 """Number above every path cost to which a penalty can be added in 16 bits."""
 
 
-@functools.cache
-def make_scanline_kernel_cpu():
-    """Make the kernel."""
-    shorts = wp.types.vector(LANES, wp.int16)
-
-    @wp.func
-    def at(first: wp.int32, lane: wp.int32) -> wp.int32:
-        """Return an index that the compiler can see is not negative; else it would load each lane separately."""
-        return wp.max(first, 0) + lane
-
-    @wp.kernel(enable_backward=False, module="unique", module_options=EXACT)
-    def follow(
-        begin: int, costs: wp.array(dtype=wp.int16), bounds: wp.array(dtype=int), small: int, planes: int,
-        # pixels of a line: where it starts, from one to the next, how many; the same for the steps between them
-        line_step: int, pixel_step: int, length: int, line_edge: int, pixel_edge: int,
-        # whether sums begin with this line; two rows of costs for each line
-        fresh: int, path: wp.array(dtype=wp.int16),
-        # outputs
-        total: wp.array(dtype=wp.int16),
-    ):  # fmt: skip
-        line = begin + wp.tid()
-        pitch = planes + 2 * LANES
-        rows = line * 2 * pitch + LANES
-        step = wp.int16(small)
-        out = shorts()
-        sums = shorts()
-        least = shorts()
-        for way in range(2):
-            for i in range(2 * pitch):
-                path[at(rows - LANES, i)] = wp.int16(FAR_AWAY_16)
-            for i in range(planes):
-                path[at(rows + pitch, i)] = wp.int16(0)
-            lowest = wp.int16(0)
-            for k in range(length):
-                j = wp.where(way == 0, k, length - 1 - k)
-                edge = wp.where(way == 0, k - 1, j)
-                pixel = (line * line_step + j * pixel_step) * planes
-                most = wp.int16(0)  # the most that any change of depth may add to the best of the pixel before
-                if k > 0:
-                    most = lowest + wp.int16(bounds[line * line_edge + edge * pixel_edge])
-                to = rows + (k & 1) * pitch
-                before = rows + pitch - (k & 1) * pitch
-                set = fresh != 0 and way == 0
+@wp.kernel(enable_backward=False, module="unique", module_options=EXACT)
+def follow_cpu(
+    begin: int, costs: wp.array(dtype=wp.int16), bounds: wp.array(dtype=int), small: int, planes: int,
+    # pixels of a line: where it starts, from one to the next, how many; the same for the steps between them
+    line_step: int, pixel_step: int, length: int, line_edge: int, pixel_edge: int,
+    # two rows of costs for each line
+    path: wp.array(dtype=wp.int16),
+    # outputs, added to
+    total: wp.array(dtype=wp.int16),
+):  # fmt: skip
+    """Add the costs of the paths along a line, both ways, `LANES` planes at a time."""
+    line = begin + wp.tid()
+    pitch = planes + 2 * LANES
+    rows = line * 2 * pitch + LANES
+    step = wp.int16(small)
+    out = shorts()
+    sums = shorts()
+    least = shorts()
+    for way in range(2):
+        for i in range(2 * pitch):
+            path[at(rows - LANES, i)] = wp.int16(FAR_AWAY_16)
+        for i in range(planes):
+            path[at(rows + pitch, i)] = wp.int16(0)
+        lowest = wp.int16(0)
+        for k in range(length):
+            j = wp.where(way == 0, k, length - 1 - k)
+            edge = wp.where(way == 0, k - 1, j)
+            pixel = (line * line_step + j * pixel_step) * planes
+            most = wp.int16(0)  # the most that any change of depth may add to the best of the pixel before
+            if k > 0:
+                most = lowest + wp.int16(bounds[line * line_edge + edge * pixel_edge])
+            to = rows + (k & 1) * pitch
+            before = rows + pitch - (k & 1) * pitch
+            for lane in range(LANES):
+                least[lane] = wp.int16(FAR_AWAY_16)
+            for chunk in range(planes // LANES):
+                d = chunk * LANES
                 for lane in range(LANES):
-                    least[lane] = wp.int16(FAR_AWAY_16)
-                for chunk in range(planes // LANES):
-                    d = chunk * LANES
-                    for lane in range(LANES):
-                        beside = wp.min(path[at(before + d - 1, lane)], path[at(before + d + 1, lane)]) + step
-                        best = wp.min(wp.min(path[at(before + d, lane)], most), beside)
-                        cost = costs[at(pixel + d, lane)] + best - lowest
-                        out[lane] = cost
-                        least[lane] = wp.min(least[lane], cost)
-                        sums[lane] = wp.where(set, wp.int16(0), total[at(pixel + d, lane)]) + cost
-                    for lane in range(LANES):
-                        path[at(to + d, lane)] = out[lane]
-                        total[at(pixel + d, lane)] = sums[lane]
-                lowest = least[0]
-                for lane in range(1, LANES):
-                    lowest = wp.min(lowest, least[lane])
-
-    return follow
+                    beside = wp.min(path[at(before + d - 1, lane)], path[at(before + d + 1, lane)]) + step
+                    best = wp.min(wp.min(path[at(before + d, lane)], most), beside)
+                    cost = costs[at(pixel + d, lane)] + best - lowest
+                    out[lane] = cost
+                    least[lane] = wp.min(least[lane], cost)
+                    sums[lane] = total[at(pixel + d, lane)] + cost
+                for lane in range(LANES):
+                    path[at(to + d, lane)] = out[lane]
+                    total[at(pixel + d, lane)] = sums[lane]
+            lowest = least[0]
+            for lane in range(1, LANES):
+                lowest = wp.min(lowest, least[lane])
 
 
 BLOCK = 32
@@ -493,48 +479,43 @@ LARGEST = 2**13 - 1
 """Largest cost plus penalties: the sum of four paths then fits into signed 16 bits."""
 
 
-@functools.cache
-def make_scanline_kernel():
-    """Make the kernel; a thread owns a line."""
-
-    @wp.kernel(enable_backward=False, module="warpgs.kernels.scanlines")
-    def follow(
-        begin: int, costs: wp.array2d(dtype=wp.int16), bounds: wp.array(dtype=int), small: int, planes: int,
-        # pixels of a line: where it starts, from one to the next, how many; the same for the steps between them
-        line_step: int, pixel_step: int, length: int, line_edge: int, pixel_edge: int,
-        # outputs
-        path: wp.array2d(dtype=int), total: wp.array2d(dtype=wp.int16),
-    ):  # fmt: skip
-        line = begin + wp.tid()
-        path[line, planes] = FAR_AWAY
-        for way in range(2):
-            lowest = int(0)
-            for k in range(length):
-                j = k
-                edge = k - 1
-                if way == 1:
-                    j = length - 1 - k
-                    edge = j
-                pixel = line * line_step + j * pixel_step
-                most = int(0)  # the most that any change of depth may add to the best of the pixel before
+@wp.kernel(enable_backward=False, module="warpgs.kernels.scanlines")
+def follow(
+    begin: int, costs: wp.array2d(dtype=wp.int16), bounds: wp.array(dtype=int), small: int, planes: int,
+    # pixels of a line: where it starts, from one to the next, how many; the same for the steps between them
+    line_step: int, pixel_step: int, length: int, line_edge: int, pixel_edge: int,
+    # outputs
+    path: wp.array2d(dtype=int), total: wp.array2d(dtype=wp.int16),
+):  # fmt: skip
+    """Add the costs of the paths along a line, both ways."""
+    line = begin + wp.tid()
+    path[line, planes] = FAR_AWAY
+    for way in range(2):
+        lowest = int(0)
+        for k in range(length):
+            j = k
+            edge = k - 1
+            if way == 1:
+                j = length - 1 - k
+                edge = j
+            pixel = line * line_step + j * pixel_step
+            most = int(0)  # the most that any change of depth may add to the best of the pixel before
+            if k > 0:
+                most = lowest + bounds[line * line_edge + edge * pixel_edge]
+            left = int(FAR_AWAY)
+            here = path[line, 0]
+            least = int(FAR_AWAY)
+            for d in range(planes):
+                right = path[line, d + 1]
+                cost = int(costs[pixel, d])
                 if k > 0:
-                    most = lowest + bounds[line * line_edge + edge * pixel_edge]
-                left = int(FAR_AWAY)
-                here = path[line, 0]
-                least = int(FAR_AWAY)
-                for d in range(planes):
-                    right = path[line, d + 1]
-                    cost = int(costs[pixel, d])
-                    if k > 0:
-                        cost += wp.min(wp.min(here, most), wp.min(left, right) + small) - lowest
-                    path[line, d] = cost
-                    total[pixel, d] = wp.int16(int(total[pixel, d]) + cost)
-                    least = wp.min(least, cost)
-                    left = here
-                    here = right
-                lowest = least
-
-    return follow
+                    cost += wp.min(wp.min(here, most), wp.min(left, right) + small) - lowest
+                path[line, d] = cost
+                total[pixel, d] = wp.int16(int(total[pixel, d]) + cost)
+                least = wp.min(least, cost)
+                left = here
+                here = right
+            lowest = least
 
 
 def scanline_costs(costs: torch.Tensor, down: torch.Tensor, across: torch.Tensor, small: int) -> torch.Tensor:
@@ -552,32 +533,22 @@ def scanline_costs(costs: torch.Tensor, down: torch.Tensor, across: torch.Tensor
                 f"{name} must be {dtype} of shape {list(shape)} on {costs.device}, "
                 f"not {tensor.dtype} of shape {list(tensor.shape)} on {tensor.device}"
             )
-    if costs.device.type == "cpu":
-        return _on_cpu(costs, down, across, small)
-    total = torch.zeros_like(costs, memory_format=torch.contiguous_format)
-    costs = costs.contiguous()
-    for lines, length, steps, bounds, edges in _ways(height, width, down, across):
-        path = torch.empty(lines, planes + 1, dtype=torch.int32, device=costs.device)
-        inputs = [costs, bounds.contiguous(), small, planes, *steps, length, *edges, path, total]
-        launch.launch(make_scanline_kernel(), lines, inputs, costs.device, cost=max(1, length * planes // 2), block_dim=BLOCK)
-    return total
-
-
-def _ways(height: int, width: int, down: torch.Tensor, across: torch.Tensor):
-    """Return the number of lines, their length, strides of pixels, limits and strides of limits: along rows, then columns."""
-    return (height, width, (width, 1), across, (width - 1, 1)), (width, height, (1, width), down, (1, width))
-
-
-def _on_cpu(costs: torch.Tensor, down: torch.Tensor, across: torch.Tensor, small: int) -> torch.Tensor:
-    """Return the sums of `scanline_costs`; a number of planes that is a multiple of `scanlines_cpu.LANES` saves a copy."""
-    height, width, planes = costs.shape
-    more = -planes % LANES
+    cpu = costs.device.type == "cpu"
+    more = -planes % LANES if cpu else 0
     if more:  # extra planes with the worst cost, which no path prefers
         costs = torch.nn.functional.pad(costs, (0, more), value=int(costs.max()))
-    total, padded = torch.empty_like(costs, memory_format=torch.contiguous_format), planes + more
-    costs = costs.contiguous()
-    for fresh, (lines, length, steps, bounds, edges) in zip((1, 0), _ways(height, width, down, across)):
-        path = torch.empty(lines * 2 * (padded + 2 * LANES), dtype=torch.int16, device="cpu")
-        inputs = [costs, bounds.contiguous(), small, padded, *steps, length, *edges, fresh, path, total]
-        launch.launch(make_scanline_kernel_cpu(), lines, inputs, costs.device, cost=max(1, length * padded // 20))
+    costs, padded = costs.contiguous(), planes + more
+    total = torch.zeros_like(costs)
+    # along rows, then columns: lines, their length, strides of pixels, limits and strides of limits
+    ways = (height, width, (width, 1), across, (width - 1, 1)), (width, height, (1, width), down, (1, width))
+    for lines, length, steps, bounds, edges in ways:
+        inputs = [costs, bounds.contiguous(), small, padded, *steps, length, *edges]
+        if cpu:
+            path = torch.empty(lines * 2 * (padded + 2 * LANES), dtype=torch.int16, device="cpu")
+            cost = max(1, length * padded // 20)
+            launch.launch(follow_cpu, lines, [*inputs, path, total], costs.device, cost=cost)
+        else:
+            path = torch.empty(lines, planes + 1, dtype=torch.int32, device=costs.device)
+            cost = max(1, length * planes // 2)
+            launch.launch(follow, lines, [*inputs, path, total], costs.device, cost=cost, block_dim=BLOCK)
     return total[..., :planes]

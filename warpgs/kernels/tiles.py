@@ -3,7 +3,6 @@
 import functools
 from dataclasses import dataclass
 from types import SimpleNamespace
-from typing import NamedTuple
 
 import torch
 import warp as wp
@@ -24,7 +23,8 @@ from warpgs.device import (
 from warpgs.errors import ResourceError
 from warpgs.kernels import launch
 from warpgs.kernels.ellipse import make_spans
-from warpgs.kernels.launch import TORCH, Allocator, sort_pairs
+from warpgs.kernels.graphs import TORCH, Allocator
+from warpgs.kernels.launch import sort_pairs
 from warpgs.kernels.native import EXACT
 from warpgs.kernels.native import make_functions as make_native
 from warpgs.kernels.project_cpu import LANES
@@ -37,7 +37,7 @@ EACH = 4
 def make_find_ranges(slotted: bool, native: bool):
     """Make the kernel that finds the instances of each tile in the sorted keys; arguments are those of `make_emit`."""
     # A thread's instances lie far apart, so that neighbouring threads read neighbouring instances.
-    each = wp.constant(EACH if native else 1)
+    each = EACH if native else 1
     ints = wp.types.vector(each, wp.int32)
     module = f"warpgs.kernels.tiles.ranges.{int(slotted)}.{int(native)}"
 
@@ -213,12 +213,12 @@ def make_emit(real, slotted: bool):
 
 @functools.cache
 def make_emit_cpu(real, slotted: bool):
-    """Make the kernel; arguments are those of `tiles_emit.make_emit`."""
+    """Make the kernel; arguments are those of `make_emit`."""
     s = make_spans(real, lanes=True)
     vec3 = wp.types.vector(3, real)
     lane_reals = wp.types.vector(LANES, real)
     lane_ints = wp.types.vector(LANES, wp.int32)
-    lanes = wp.constant(LANES)
+    lanes = LANES
     write = make_write(slotted)
 
     @wp.kernel(enable_backward=False, module="unique", module_options=EXACT)
@@ -326,7 +326,7 @@ def sum_entries(count: int, native: bool) -> tuple[int, int]:
 def make_kernels(real, native: bool):
     """Make the kernels for one scalar type; ``native`` is True for CUDA, where each warp has one entry of the running sums."""
     lanes = make_native() if native else None
-    width, each = (wp.constant(n) for n in _of_sum(native))
+    width, each = _of_sum(native)
     ints, reals = wp.types.vector(each, wp.int32), wp.types.vector(each, real)
     module = f"warpgs.kernels.tiles.{real.__name__}.{int(native)}"
 
@@ -489,16 +489,6 @@ class Tiles:
         return self.ranges, self.gaussian_ids, self.slots, self.starts, self.counts, self.tile_ids, self.total
 
 
-class Visible(NamedTuple):
-    """Capacity for visible Gaussians, for renders that read nothing from the device."""
-
-    sums: torch.Tensor
-    """Running sums of `running_counts`, int64, shape [S]."""
-    capacity: int
-    """Number of visible Gaussians to allocate for, at most the number of all Gaussians. If the last of the sums shows more, the
-    lists must not be used."""
-
-
 @dataclass(frozen=True)
 class InstanceMemory:
     """Memory that the (Gaussian, tile) instances of a render may take."""
@@ -513,8 +503,9 @@ class InstanceMemory:
     shape [1]; needed with a capacity."""
     allocator: Allocator = TORCH
     """Provider of the lists' memory."""
-    visible: Visible | None = None
-    """Capacity for visible Gaussians, if instances have a capacity too; None to sort all Gaussians."""
+    visible: tuple[torch.Tensor, int] | None = None
+    """Running sums of `running_counts` [S], and the number of visible Gaussians to allocate for, if instances have a capacity
+    too; None to sort all Gaussians. If the last of the sums shows more of them, the lists must not be used."""
 
 
 AS_NEEDED = InstanceMemory()
@@ -524,27 +515,6 @@ AS_NEEDED = InstanceMemory()
 def grid(width: int, height: int, tile_size: int) -> tuple[int, int]:
     """Return the columns and rows of tiles that cover an image."""
     return -(-width // tile_size), -(-height // tile_size)
-
-
-def _checked_counts(projected: torch.Tensor, tile_counts: torch.Tensor) -> torch.Tensor:
-    """Return the tile counts by flat Gaussian number, int32, shape [C * N]; ValueError where a shape or type is wrong."""
-    sizes = launch.check(projected=(projected, "C N 12"))
-    if tuple(tile_counts.shape) != (sizes["C"], sizes["N"]) or tile_counts.dtype != torch.int32:
-        wanted, found = [sizes["C"], sizes["N"]], list(tile_counts.shape)
-        raise ValueError(f"tile_counts must be int32 of shape {wanted}, not {tile_counts.dtype} of shape {found}")
-    return tile_counts.contiguous().view(-1)
-
-
-def _checked_tiles(cameras: int, width: int, height: int, tile_size: int) -> int:
-    """Return the number of tiles of all images; ResourceError where there are more than kernels can index."""
-    columns, rows = grid(width, height, tile_size)
-    tiles = cameras * columns * rows
-    if tiles > launch.MAX_SIZE:
-        raise ResourceError(
-            f"{cameras:,} images of {width} x {height} px have {tiles:,} tiles of {tile_size} px, beyond the "
-            f"{launch.MAX_SIZE:,} that kernels can index; render fewer cameras at once, or a window of each image"
-        )
-    return tiles
 
 
 def step_bytes(sizes: StepSizes) -> Needs:
@@ -606,25 +576,6 @@ def _depth_order(
     return order, visible, total
 
 
-def _slot_ends(order: torch.Tensor, counts: torch.Tensor, visible: int, kernel, allocator: Allocator) -> torch.Tensor:
-    """Return the slot after the last slot of each visible Gaussian, front to back, int64, shape [max(visible, 1)]."""
-    ends = allocator.saved((max(visible, 1),), torch.int64, counts.device)
-    launch.launch(kernel, visible, [order, counts, ends], counts.device)
-    return torch.cumsum(ends, 0, out=ends) if visible > 0 else ends.zero_()
-
-
-def _sort_by_tile(
-    keys: torch.Tensor, slots: torch.Tensor, owners: torch.Tensor, ranges: torch.Tensor, total: int, slotted: bool
-) -> torch.Tensor:
-    """Sort the instances stably by tile, fill in the range of each tile, and return the Gaussian numbers, int32, [M]."""
-    no_tile, ids = len(ranges), slots[total:] if slotted else slots[:total]  # the second half of the buffers is free again
-    sort_pairs(keys, slots, total, end_bit=no_tile.bit_length())
-    inputs = [keys, slots, owners, total, no_tile, ids, ranges]
-    native = keys.is_cuda
-    launch.launch(make_find_ranges(slotted, native), -(-total // EACH) if native else total, inputs, keys.device)
-    return ids
-
-
 def bin_tiles(
     projected: torch.Tensor, tile_counts: torch.Tensor, *, width: int, height: int, rule: Rule, tile_size: int = TILE_SIZE,
     origin: tuple[int, int] = (0, 0), memory: InstanceMemory = AS_NEEDED, slotted: bool = True,
@@ -634,9 +585,19 @@ def bin_tiles(
     # ``origin`` is left and top [px] of the window given to `project`, multiples of ``tile_size``. Without ``slotted``, which
     # gradients and `contributions` need, slots stay empty. ``listed`` [C * tiles] is True for the tiles that get instances;
     # None for all.
-    counts, (columns, rows) = _checked_counts(projected, tile_counts), grid(width, height, tile_size)
-    cameras, per_camera = tile_counts.shape
-    no_tile = _checked_tiles(cameras, width, height, tile_size)
+    sizes = launch.check(projected=(projected, "C N 12"))
+    cameras, per_camera = sizes["C"], sizes["N"]
+    if tuple(tile_counts.shape) != (cameras, per_camera) or tile_counts.dtype != torch.int32:
+        wanted, found = [cameras, per_camera], list(tile_counts.shape)
+        raise ValueError(f"tile_counts must be int32 of shape {wanted}, not {tile_counts.dtype} of shape {found}")
+    columns, rows = grid(width, height, tile_size)
+    no_tile = cameras * columns * rows
+    if no_tile > launch.MAX_SIZE:
+        raise ResourceError(
+            f"{cameras:,} images of {width} x {height} px have {no_tile:,} tiles of {tile_size} px, beyond the "
+            f"{launch.MAX_SIZE:,} that kernels can index; render fewer cameras at once, or a window of each image"
+        )
+    counts = tile_counts.contiguous().view(-1)
     device, real, native, allocator = projected.device, launch.real_of(projected), projected.is_cuda, memory.allocator
     ranges = allocator.saved((no_tile, 2), torch.int32, device).zero_()
     if len(counts) == 0:
@@ -645,7 +606,9 @@ def bin_tiles(
     projected = projected.detach().contiguous().view(len(counts), -1)
     with launch.stream_of(device):
         order, visible, total = _depth_order(projected, counts, columns * rows, memory)
-        ends = _slot_ends(order, counts, visible, make_kernels(real, native).ordered_counts, allocator)
+        ends = allocator.saved((max(visible, 1),), torch.int64, device)
+        launch.launch(make_kernels(real, native).ordered_counts, visible, [order, counts, ends], device)
+        ends = torch.cumsum(ends, 0, out=ends) if visible > 0 else ends.zero_()
         starts, keys, slots = (allocator.saved((n,), torch.int32, device) for n in (len(counts), 2 * total, 2 * total))
         owners = allocator.workspace((total if slotted else 0,), torch.int32, device)
         if memory.capacity is not None and not native:  # the CUDA kernel fills the unused capacity
@@ -655,13 +618,16 @@ def bin_tiles(
             projected, order, counts, ends, visible, per_camera, *origin, width, height, tile_size, rule.alpha_cut,
             rule.square_sigma, columns, columns * rows, no_tile, total, starts, keys, slots, owners, overflow,
         ]  # fmt: skip
+        emit, threads, cost = make_emit_cpu, -(-visible // LANES), 10 * LANES
         if native:
-            launch.launch(make_emit(real, slotted), -(-visible // 256) * 256, inputs, device, cost=10)
-        else:
-            launch.launch(make_emit_cpu(real, slotted), -(-visible // LANES), inputs, device, cost=10 * LANES)
+            emit, threads, cost = make_emit, -(-visible // 256) * 256, 10
+        launch.launch(emit(real, slotted), threads, inputs, device, cost=cost)
         if listed is not None:
             own, kept = keys[:total], torch.cat([listed, listed.new_zeros(1)])
             own.masked_fill_(~kept[own.long()], no_tile)
-        ids = _sort_by_tile(keys, slots, owners, ranges, total, slotted)
+        sort_pairs(keys, slots, total, end_bit=no_tile.bit_length())
+        ids = slots[total:] if slotted else slots[:total]  # the second half of the buffers is free again
+        inputs = [keys, slots, owners, total, no_tile, ids, ranges]
+        launch.launch(make_find_ranges(slotted, native), -(-total // EACH) if native else total, inputs, device)
     own_slots = slots[: total if slotted else 0]
     return Tiles(tile_size, ranges, ids, own_slots, starts, counts, keys[:total], ends[-1:], visible)

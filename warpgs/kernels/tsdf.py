@@ -6,7 +6,6 @@ differentiable.
 """
 
 import functools
-from dataclasses import dataclass
 from types import SimpleNamespace
 
 import torch
@@ -18,22 +17,6 @@ from warpgs.kernels import launch
 from warpgs.scene import Camera
 
 
-@dataclass(frozen=True)
-class DistanceGrid:
-    """A grid of X x Y x Z points, parallel to the world axes, with truncated signed distances fused from depth maps."""
-
-    origin: tuple[float, float, float]
-    """Position of the first point [u]."""
-    voxel: float
-    """Distance from one point to the next [u]."""
-    truncation: float
-    """Largest distance from a surface that is stored [u]."""
-    distances: torch.Tensor
-    """Mean distance in front of the surface divided by ``truncation``, in [-1, 1], shape [X, Y, Z]; undefined at weight 0."""
-    weights: torch.Tensor
-    """Sum of the weights of the views that saw the point, shape [X, Y, Z]."""
-
-
 @functools.cache
 def make_kernels(real):
     """Make the kernels for one scalar type."""
@@ -41,7 +24,7 @@ def make_kernels(real):
     mat33 = wp.types.matrix((3, 3), real)
     mat44 = wp.types.matrix((4, 4), real)
     module = f"warpgs.kernels.tsdf.{real.__name__}"
-    near = wp.constant(real(NEAR))
+    near = real(NEAR)
 
     @wp.func
     def in_camera(view: mat44, point: vec3) -> vec3:
@@ -174,13 +157,6 @@ def make_kernels(real):
     return SimpleNamespace(face=face, integrate=integrate, gather=gather)
 
 
-def empty_grid(
-    origin: tuple[float, float, float], voxel: float, shape: tuple[int, int, int], truncation: float, like: torch.Tensor
-) -> DistanceGrid:
-    """Allocate a grid of points ``shape`` that no view has seen, of the type and on the device of ``like`` [...]."""
-    return DistanceGrid(origin, voxel, truncation, like.new_zeros(shape), like.new_zeros(shape))
-
-
 def _pose(camera: Camera, like: torch.Tensor) -> list[torch.Tensor]:
     """Return viewmat [1, 4, 4] and intrinsics [1, 3, 3] of a numpy camera, of the type and on the device of ``like`` [...]."""
     return [torch.as_tensor(a[None], dtype=like.dtype, device=like.device) for a in (camera.viewmat, camera.K)]
@@ -195,19 +171,23 @@ def face_cosines(depth: torch.Tensor, camera: Camera) -> torch.Tensor:
     return cosines
 
 
-def integrate(grid: DistanceGrid, camera: Camera, depth: torch.Tensor, pixel_weights: torch.Tensor) -> None:
-    """Add one view's signed distances to a grid, in place, except at points more than a truncation behind the surface."""
+def integrate(
+    distances: torch.Tensor, weights: torch.Tensor, origin: tuple[float, float, float], voxel: float, truncation: float,
+    camera: Camera, depth: torch.Tensor, pixel_weights: torch.Tensor,
+) -> None:  # fmt: skip
+    """Add one view's signed distances to a grid [X, Y, Z], except at points more than ``truncation`` [u] behind the surface."""
+    # Distances are means in front of the surface divided by the truncation, in [-1, 1], undefined at weight 0; weights are the
+    # sums over the views that saw the point. Both are changed in place.
     check_pinhole(camera)
     launch.check(
-        depth=(depth, "H W"), pixel_weights=(pixel_weights, "H W"), distances=(grid.distances, "X Y Z"),
-        weights=(grid.weights, "X Y Z"),
-    )  # fmt: skip
+        depth=(depth, "H W"), pixel_weights=(pixel_weights, "H W"), distances=(distances, "X Y Z"), weights=(weights, "X Y Z")
+    )
     inputs = [
-        depth.new_tensor([grid.origin]), grid.voxel, grid.truncation, *grid.distances.shape[1:], *_pose(camera, depth),
-        depth, pixel_weights, grid.distances, grid.weights,
+        depth.new_tensor([origin]), voxel, truncation, *distances.shape[1:], *_pose(camera, depth), depth, pixel_weights,
+        distances, weights,
     ]  # fmt: skip
     kernels = make_kernels(launch.real_of(depth))
-    launch.launch(kernels.integrate, grid.distances.numel(), inputs, depth.device, cost=3)
+    launch.launch(kernels.integrate, distances.numel(), inputs, depth.device, cost=3)
 
 
 def gather_colors(

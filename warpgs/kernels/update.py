@@ -2,7 +2,6 @@
 
 import functools
 from enum import IntEnum
-from types import SimpleNamespace
 
 import torch
 import warp as wp
@@ -50,87 +49,80 @@ SHIFT = slice(Setting.RED, Setting.BLUE + 1)
 """Columns of the difference of the backgrounds."""
 
 
-@functools.cache
-def make_step_kernels():
-    """Make the two kernels."""
-
-    @wp.kernel(enable_backward=False, module="warpgs.kernels.step_buffers")
-    def begin_step(
-        begin: int, counter: wp.array(dtype=wp.int64), view_rows: wp.array(dtype=wp.int64),
-        lr_rows: wp.array2d(dtype=float), setting_rows: wp.array2d(dtype=float),
-        viewmats: wp.array2d(dtype=float), Ks: wp.array2d(dtype=float), targets: wp.array2d(dtype=float),
-        # outputs
-        lrs: wp.array(dtype=float), settings: wp.array(dtype=float),
-        viewmat: wp.array(dtype=float), K: wp.array(dtype=float), target: wp.array(dtype=float),
-    ):  # fmt: skip
-        i = begin + wp.tid()
-        step = int(counter[0])
-        view = int(view_rows[step])
-        if i < target.shape[0]:
-            target[i] = targets[view, i]
-        if i < lrs.shape[0]:
-            lrs[i] = lr_rows[step, i]
-        if i < settings.shape[0]:
-            settings[i] = setting_rows[step, i]
-        if i < 16:
-            viewmat[i] = viewmats[view, i]
-        if i < 9:
-            K[i] = Ks[view, i]
-
-    @wp.kernel(enable_backward=False, module="warpgs.kernels.step_buffers")
-    def end_step(
-        begin: int, loss: wp.array(dtype=float), mse: wp.array(dtype=float),
-        # outputs; all but the last are read, too
-        counter: wp.array(dtype=wp.int64), stop: wp.array(dtype=int), history: wp.array2d(dtype=float),
-        going: wp.array(dtype=wp.bool),
-    ):  # fmt: skip
-        step = int(counter[begin])
-        history[step, 0] = loss[0]
-        history[step, 1] = mse[0]
-        if not wp.isfinite(loss[0]):
-            stop[0] = wp.static(NOT_FINITE)
-        going[0] = stop[0] == 0
-        if stop[0] == 0:
-            counter[0] = wp.int64(step + 1)
-
-    return SimpleNamespace(begin_step=begin_step, end_step=end_step)
+@wp.kernel(enable_backward=False, module="warpgs.kernels.step_buffers")
+def begin_kernel(
+    begin: int, counter: wp.array(dtype=wp.int64), view_rows: wp.array(dtype=wp.int64),
+    lr_rows: wp.array2d(dtype=float), setting_rows: wp.array2d(dtype=float),
+    viewmats: wp.array2d(dtype=float), Ks: wp.array2d(dtype=float), targets: wp.array2d(dtype=float),
+    # outputs
+    lrs: wp.array(dtype=float), settings: wp.array(dtype=float),
+    viewmat: wp.array(dtype=float), K: wp.array(dtype=float), target: wp.array(dtype=float),
+):  # fmt: skip
+    """Copy what a step needs, by its number and the number of its view."""
+    i = begin + wp.tid()
+    step = int(counter[0])
+    view = int(view_rows[step])
+    if i < target.shape[0]:
+        target[i] = targets[view, i]
+    if i < lrs.shape[0]:
+        lrs[i] = lr_rows[step, i]
+    if i < settings.shape[0]:
+        settings[i] = setting_rows[step, i]
+    if i < 16:
+        viewmat[i] = viewmats[view, i]
+    if i < 9:
+        K[i] = Ks[view, i]
 
 
-@functools.cache
-def make_errors():
-    """Make the kernel that sums squared errors on a CPU, one task per `ERROR_SEGMENT` elements."""
-    values = wp.types.vector(ERROR_LANES, wp.float32)
-    lanes, segment = wp.constant(ERROR_LANES), wp.constant(ERROR_SEGMENT)
+@wp.kernel(enable_backward=False, module="warpgs.kernels.step_buffers")
+def end_kernel(
+    begin: int, loss: wp.array(dtype=float), mse: wp.array(dtype=float),
+    # outputs; all but the last are read, too
+    counter: wp.array(dtype=wp.int64), stop: wp.array(dtype=int), history: wp.array2d(dtype=float),
+    going: wp.array(dtype=wp.bool),
+):  # fmt: skip
+    """Store the loss and the error of a step, and count it."""
+    step = int(counter[begin])
+    history[step, 0] = loss[0]
+    history[step, 1] = mse[0]
+    if not wp.isfinite(loss[0]):
+        stop[0] = NOT_FINITE
+    going[0] = stop[0] == 0
+    if stop[0] == 0:
+        counter[0] = wp.int64(step + 1)
 
-    @wp.kernel(enable_backward=False, module="unique", module_options=ROLLED)
-    def squared_errors(
-        begin: int, rgb: wp.array(dtype=float), target: wp.array(dtype=float),
-        # outputs
-        sums: wp.array(dtype=float),
-    ):  # fmt: skip
-        task = begin + wp.tid()
-        base = task * segment
-        end = wp.min(base + segment, rgb.shape[0])
-        s = values()
-        while base < end:
-            o = wp.max(base, 0)
-            base += lanes
-            if base <= end:
-                for lane in range(lanes):
-                    p = rgb[o + lane]
-                    d = wp.where(p < 0.0, 0.0, wp.where(p > 1.0, 1.0, p)) - target[o + lane]  # a NaN stays one
-                    s[lane] = s[lane] + d * d
-            else:
-                for lane in range(end - o):
-                    p = rgb[o + lane]
-                    d = wp.where(p < 0.0, 0.0, wp.where(p > 1.0, 1.0, p)) - target[o + lane]
-                    s[lane] = s[lane] + d * d
-        total = float(0.0)
-        for lane in range(lanes):
-            total += s[lane]
-        sums[task] = total
 
-    return squared_errors
+error_values = wp.types.vector(ERROR_LANES, wp.float32)
+
+
+@wp.kernel(enable_backward=False, module="unique", module_options=ROLLED)
+def squared_errors(
+    begin: int, rgb: wp.array(dtype=float), target: wp.array(dtype=float),
+    # outputs
+    sums: wp.array(dtype=float),
+):  # fmt: skip
+    """Sum squared errors on a CPU, one task per `ERROR_SEGMENT` elements."""
+    task = begin + wp.tid()
+    base = task * ERROR_SEGMENT
+    end = wp.min(base + ERROR_SEGMENT, rgb.shape[0])
+    s = error_values()
+    while base < end:
+        o = wp.max(base, 0)
+        base += ERROR_LANES
+        if base <= end:
+            for lane in range(ERROR_LANES):
+                p = rgb[o + lane]
+                d = wp.where(p < 0.0, 0.0, wp.where(p > 1.0, 1.0, p)) - target[o + lane]  # a NaN stays one
+                s[lane] = s[lane] + d * d
+        else:
+            for lane in range(end - o):
+                p = rgb[o + lane]
+                d = wp.where(p < 0.0, 0.0, wp.where(p > 1.0, 1.0, p)) - target[o + lane]
+                s[lane] = s[lane] + d * d
+    total = float(0.0)
+    for lane in range(ERROR_LANES):
+        total += s[lane]
+    sums[task] = total
 
 
 def squared_error(rgb: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
@@ -139,7 +131,7 @@ def squared_error(rgb: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
         return torch.nn.functional.mse_loss(rgb.clamp(0, 1), target, reduction="sum")
     tasks = -(-rgb.numel() // ERROR_SEGMENT)
     sums = rgb.new_empty(tasks)
-    launch.launch(make_errors(), tasks, [rgb.contiguous(), target.contiguous(), sums], rgb.device, cost=ERROR_SEGMENT // 10)
+    launch.launch(squared_errors, tasks, [rgb.contiguous(), target.contiguous(), sums], rgb.device, cost=ERROR_SEGMENT // 10)
     return sums.sum()
 
 
@@ -154,7 +146,7 @@ def begin_step(
     )  # fmt: skip
     rows = [t.view(len(t), -1) for t in (lr_rows, setting_rows, viewmats, Ks, targets)]
     count = max(16, *(t.numel() for t in found))
-    launch.launch(make_step_kernels().begin_step, count, [counter, view_rows, *rows, *found], counter.device)
+    launch.launch(begin_kernel, count, [counter, view_rows, *rows, *found], counter.device)
     return found
 
 
@@ -163,7 +155,7 @@ def end_step(
 ) -> torch.Tensor:
     """Store a step's loss and error in ``history`` [B, 2]; count the step if ``stop`` [1] is 0, and return that, bool, [1]."""
     going = torch.empty(1, dtype=torch.bool, device=loss.device)
-    launch.launch(make_step_kernels().end_step, 1, [loss, mse, counter, stop, history, going], loss.device)
+    launch.launch(end_kernel, 1, [loss, mse, counter, stop, history, going], loss.device)
     return going
 
 
@@ -178,8 +170,9 @@ SEGMENT = 4096
 
 
 @functools.cache
-def make_functions(real):
-    """Make the update of one element, in three functions."""
+def make_adam_kernel(real, split: bool, lanes: int):
+    """Make the update kernel; ``split`` where the first numbers of each row have a learning rate of their own."""
+    values = wp.types.vector(lanes, real)
 
     @wp.func
     def decayed(m: real, g: real, beta1: real, rest1: real) -> real:
@@ -195,15 +188,6 @@ def make_functions(real):
     def moved(p: real, m: real, s: real, lr: real, root_correction2: real, eps: real) -> real:
         """Return the parameter after the step."""
         return p - lr * m / (wp.sqrt(s) / root_correction2 + eps)
-
-    return SimpleNamespace(decayed=decayed, decayed_square=decayed_square, moved=moved)
-
-
-@functools.cache
-def make_adam_kernel(real, split: bool, lanes: int):
-    """Make the update kernel; ``split`` where the first numbers of each row have a learning rate of their own."""
-    values = wp.types.vector(lanes, real)
-    f = make_functions(real)
 
     @wp.kernel(enable_backward=False, module="unique", module_options=ROLLED)
     def update(
@@ -226,14 +210,14 @@ def make_adam_kernel(real, split: bool, lanes: int):
                 for lane in range(lanes):
                     i = base + lane
                     g = gradient[i]
-                    m[lane] = f.decayed(mean[i], g, beta1, rest1)
-                    s[lane] = f.decayed_square(square[i], g, beta2, rest2)
+                    m[lane] = decayed(mean[i], g, beta1, rest1)
+                    s[lane] = decayed_square(square[i], g, beta2, rest2)
                     step = lr
                     if wp.static(split):
                         # position in the row, from its middle, so that rounding cannot change the entry
                         place = (phase + real(lane)) / real(row)
                         step = wp.where((place - wp.floor(place)) * real(row) < real(head), head_lr, lr)
-                    p[lane] = f.moved(parameter[i], m[lane], s[lane], step, root_correction2, eps)
+                    p[lane] = moved(parameter[i], m[lane], s[lane], step, root_correction2, eps)
                 for lane in range(lanes):
                     parameter[base + lane] = p[lane]
                     mean[base + lane] = m[lane]
@@ -241,29 +225,25 @@ def make_adam_kernel(real, split: bool, lanes: int):
             else:
                 for i in range(base, end):
                     g = gradient[i]
-                    mean[i] = f.decayed(mean[i], g, beta1, rest1)
-                    square[i] = f.decayed_square(square[i], g, beta2, rest2)
+                    mean[i] = decayed(mean[i], g, beta1, rest1)
+                    square[i] = decayed_square(square[i], g, beta2, rest2)
                     step = lr
                     if wp.static(split):
                         step = wp.where(i % row < head, head_lr, lr)
-                    parameter[i] = f.moved(parameter[i], mean[i], square[i], step, root_correction2, eps)
+                    parameter[i] = moved(parameter[i], mean[i], square[i], step, root_correction2, eps)
 
     return update
 
 
-@functools.cache
-def make_scheduled_kernel():
-    """Make the CUDA update kernel in float32: four elements per thread, learning rates in memory, so a graph can replay it."""
-
-    @cuda_kernel(source("adam_update.cu"), "wp.tid()", "warpgs.kernels.adam.scheduled")
-    def update(
-        four: int, gradient: wp.array(dtype=float), row: int, head: int, lrs: wp.array(dtype=float),
-        beta1: float, beta2: float, rest1: float, rest2: float, eps: float, skip: wp.array(dtype=int),
-        # outputs
-        parameter: wp.array(dtype=float), mean: wp.array(dtype=float), square: wp.array(dtype=float),
-    ): ...  # fmt: skip
-
-    return update
+@cuda_kernel(source("adam_update.cu"), "wp.tid()", "warpgs.kernels.adam.scheduled")
+def scheduled_update(
+    four: int, gradient: wp.array(dtype=float), row: int, head: int, lrs: wp.array(dtype=float),
+    beta1: float, beta2: float, rest1: float, rest2: float, eps: float, skip: wp.array(dtype=int),
+    # outputs
+    parameter: wp.array(dtype=float), mean: wp.array(dtype=float), square: wp.array(dtype=float),
+):  # fmt: skip
+    """Update four elements per thread, with learning rates in memory, so that a graph can replay it."""
+    ...
 
 
 def scheduled_lrs(lr: float, step: int, betas: tuple[float, float] = BETAS, head_lr: float | None = None) -> list[float]:
@@ -287,7 +267,7 @@ def adam_scheduled(
         grad.contiguous(), param[0].numel(), head, lrs, *betas, 1 - betas[0], 1 - betas[1], eps, skip,
         param, exp_avg, exp_avg_sq,
     ]  # fmt: skip
-    launch.launch(make_scheduled_kernel(), -(-param.numel() // 4), inputs, param.device)
+    launch.launch(scheduled_update, -(-param.numel() // 4), inputs, param.device)
 
 
 def _update(param, grad, exp_avg, exp_avg_sq, lrs: list[float], head: int, betas: tuple[float, float], eps: float) -> None:
@@ -342,26 +322,21 @@ def adam_step(
 # After Binocular3DGS (Han et al. 2024, section 3.3), which multiplies by 0.995.
 
 
-@functools.cache
-def make_decay_kernel():
-    """Make the kernel."""
-
-    @wp.kernel(enable_backward=False, module="warpgs.kernels.opacity_decay")
-    def decay(
-        begin: int, logits: wp.array(dtype=float), factor: wp.float64,
-        # outputs
-        decayed: wp.array(dtype=float),
-    ):  # fmt: skip
-        i = begin + wp.tid()
-        # in float64, since the rounding of float32's logarithm depends on the processor
-        one, x = wp.float64(1.0), wp.float64(logits[i])
-        # f o / (1 - f o) with o = 1 / (1 + exp(-x)); each form where its exponential is at most 1
-        value = x + wp.log(factor) - wp.log(one + (one - factor) * wp.exp(wp.min(x, wp.float64(0.0))))
-        if x > wp.float64(0.0):
-            value = wp.log(factor) - wp.log(one - factor + wp.exp(-x))
-        decayed[i] = wp.where(wp.isnan(x), logits[i], wp.float32(value))
-
-    return decay
+@wp.kernel(enable_backward=False, module="warpgs.kernels.opacity_decay")
+def decay(
+    begin: int, logits: wp.array(dtype=float), factor: wp.float64,
+    # outputs
+    decayed: wp.array(dtype=float),
+):  # fmt: skip
+    """Multiply the opacity of a logit."""
+    i = begin + wp.tid()
+    # in float64, since the rounding of float32's logarithm depends on the processor
+    one, x = wp.float64(1.0), wp.float64(logits[i])
+    # f o / (1 - f o) with o = 1 / (1 + exp(-x)); each form where its exponential is at most 1
+    value = x + wp.log(factor) - wp.log(one + (one - factor) * wp.exp(wp.min(x, wp.float64(0.0))))
+    if x > wp.float64(0.0):
+        value = wp.log(factor) - wp.log(one - factor + wp.exp(-x))
+    decayed[i] = wp.where(wp.isnan(x), logits[i], wp.float32(value))
 
 
 def opacity_decay(logits: torch.Tensor, factor: float) -> torch.Tensor:
@@ -370,30 +345,25 @@ def opacity_decay(logits: torch.Tensor, factor: float) -> torch.Tensor:
     if not 0 < factor < 1:
         raise ValueError(f"factor must be above 0 and below 1, not {factor}")
     decayed = torch.empty_like(logits)
-    launch.launch(make_decay_kernel(), len(logits), [logits, float(factor), decayed], logits.device)
+    launch.launch(decay, len(logits), [logits, float(factor), decayed], logits.device)
     return decayed
 
 
 # Opacity dropout: hide random Gaussians for a step and make the others more opaque (DropGaussian, Park et al. 2025).
 
 
-@functools.cache
-def make_dropout_kernel():
-    """Make the kernel; its settings are in memory, so that a CUDA graph can replay it."""
-
-    @wp.kernel(enable_backward=False, module="warpgs.kernels.dropout")
-    def sample(
-        begin: int, settings: wp.array(dtype=float), seed: int,
-        # outputs
-        factors: wp.array(dtype=float),
-    ):  # fmt: skip
-        i = begin + wp.tid()
-        p = settings[Setting.DROPOUT]
-        # one stream of numbers for each seed and step, one number of it for each Gaussian
-        state = wp.rand_init(wp.randi(wp.rand_init(seed, int(settings[Setting.NUMBER]))), i)
-        factors[i] = wp.where(wp.randf(state) >= p, 1.0 / (1.0 - p), 0.0)
-
-    return sample
+@wp.kernel(enable_backward=False, module="warpgs.kernels.dropout")
+def sample(
+    begin: int, settings: wp.array(dtype=float), seed: int,
+    # outputs
+    factors: wp.array(dtype=float),
+):  # fmt: skip
+    """Draw a factor; the settings are in memory, so that a CUDA graph can replay it."""
+    i = begin + wp.tid()
+    p = settings[Setting.DROPOUT]
+    # one stream of numbers for each seed and step, one number of it for each Gaussian
+    state = wp.rand_init(wp.randi(wp.rand_init(seed, int(settings[Setting.NUMBER]))), i)
+    factors[i] = wp.where(wp.randf(state) >= p, 1.0 / (1.0 - p), 0.0)
 
 
 def opacity_dropout(count: int, settings: torch.Tensor, seed: int) -> torch.Tensor:
@@ -402,5 +372,5 @@ def opacity_dropout(count: int, settings: torch.Tensor, seed: int) -> torch.Tens
     # device and in a resumed fit.
     launch.check(settings=(settings, str(len(Setting))))
     factors = torch.empty(count, dtype=torch.float32, device=settings.device)
-    launch.launch(make_dropout_kernel(), count, [settings, seed, factors], settings.device)
+    launch.launch(sample, count, [settings, seed, factors], settings.device)
     return factors

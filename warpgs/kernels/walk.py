@@ -25,9 +25,9 @@ def make_walk(real, tile_size: int, make_visit):
     f, visit = make_functions(real), make_visit(real)
     tile_reals = wp.types.vector(tile_size * (tile_size + 1), real)
     strip_reals = wp.types.vector(STRIP, real)
-    side = wp.constant(tile_size)
-    strip = wp.constant(STRIP)
-    parts = wp.constant(tile_size // STRIP)
+    side = tile_size
+    strip = STRIP
+    parts = tile_size // STRIP
 
     @wp.kernel(enable_backward=False, module="unique", module_options=ROLLED)
     def walk(
@@ -150,17 +150,6 @@ def make_contributions(real):
     return visit
 
 
-def _walk(make_visit, projected: torch.Tensor, tiles: Tiles, settings: Pass, k: int, *outputs: torch.Tensor) -> None:
-    """Launch the generic kernel of a visitor over projected Gaussians [C, N, 12]; outputs may be fewer than its three."""
-    ints = tiles.ranges.new_empty(0)
-    inputs = [
-        settings.struct(tiles.size, launch.real_of(projected)), projected, tiles.ranges, tiles.gaussian_ids, tiles.slots,
-        projected.shape[1], k, *outputs, *[ints] * (3 - len(outputs)),
-    ]  # fmt: skip
-    kernel = make_walk(launch.real_of(projected), tiles.size, make_visit)
-    launch.launch(kernel, len(tiles.ranges), inputs, projected.device, cost=10_000, block_dim=32)
-
-
 @functools.cache
 def make_native(tile_size: int):
     """Make the CUDA kernels in float32 for one tile size, a thread block per tile."""
@@ -187,11 +176,18 @@ def make_native(tile_size: int):
     return SimpleNamespace(median=median, heaviest=heaviest)
 
 
-def _launch_native(kernel, projected: torch.Tensor, tiles: Tiles, settings: Pass, *rest: object) -> None:
-    """Launch a kernel of `make_native`."""
-    inputs = [settings.struct(tiles.size, wp.float32), projected, tiles.ranges, tiles.gaussian_ids, *rest]
-    pixels = tiles.size * tiles.size
-    launch.launch(kernel, len(tiles.ranges) * pixels, inputs, projected.device, block_dim=pixels)
+def _walk(make_visit, projected: torch.Tensor, tiles: Tiles, settings: Pass, k: int, *outputs: torch.Tensor) -> None:
+    """Launch the kernel of a visitor over projected Gaussians [C, N, 12]; outputs may be fewer than its three."""
+    real, device, pixels = launch.real_of(projected), projected.device, tiles.size * tiles.size
+    inputs = [settings.struct(tiles.size, real), projected, tiles.ranges, tiles.gaussian_ids]
+    if is_native(projected):
+        kernels, numbers = make_native(tiles.size), (projected.shape[1], k)
+        kernel, inputs = (kernels.heaviest, [*inputs, *numbers]) if k else (kernels.median, inputs)
+        launch.launch(kernel, len(tiles.ranges) * pixels, [*inputs, *outputs], device, block_dim=pixels)
+        return
+    inputs += [tiles.slots, projected.shape[1], k, *outputs, *[tiles.ranges.new_empty(0)] * (3 - len(outputs))]
+    kernel = make_walk(real, tiles.size, make_visit)
+    launch.launch(kernel, len(tiles.ranges), inputs, device, cost=10_000, block_dim=32)
 
 
 def median_depth(
@@ -203,10 +199,7 @@ def median_depth(
     check_tiles(projected, tiles, width, height)
     projected = projected.detach().contiguous()
     settings, depths = Pass((width, height), (*origin, width, height), rule), projected.new_zeros(len(projected), height, width)
-    if is_native(projected):
-        _launch_native(make_native(tiles.size).median, projected, tiles, settings, depths)
-    else:
-        _walk(make_median, projected, tiles, settings, 0, depths)
+    _walk(make_median, projected, tiles, settings, 0, depths)
     return depths
 
 
@@ -224,11 +217,7 @@ def heaviest(
     weights = projected.new_zeros(*shape, k)
     ids = torch.full((*shape, k), -1, dtype=torch.int32, device=projected.device)
     counts = torch.zeros(shape, dtype=torch.int32, device=projected.device)
-    if is_native(projected):
-        rest = projected.shape[1], k, weights, ids, counts
-        _launch_native(make_native(tiles.size).heaviest, projected, tiles, settings, *rest)
-    else:
-        _walk(make_heaviest, projected, tiles, settings, k, weights, ids, counts)
+    _walk(make_heaviest, projected, tiles, settings, k, weights, ids, counts)
     return ids, weights, counts
 
 

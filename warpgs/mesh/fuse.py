@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -12,8 +13,8 @@ import torch
 from warpgs.device import available_bytes, format_bytes
 from warpgs.errors import DataError, ResourceError, UsageError
 from warpgs.kernels.launch import MAX_SIZE
-from warpgs.kernels.tsdf import DistanceGrid, empty_grid, gather_colors, integrate
-from warpgs.mesh.views import DEPTHS, SAMPLES, DepthMap, SurfaceViews, agreed, depth_map, neighbours, sample_surface
+from warpgs.kernels.tsdf import gather_colors, integrate
+from warpgs.mesh.views import DEPTHS, SAMPLES, SurfaceViews, agreed, depth_map, neighbours, sample_surface
 from warpgs.render.options import RasterizeOptions
 from warpgs.scene import Camera, Gaussians, Mesh
 
@@ -29,6 +30,7 @@ QUANTILES = (0.005, 0.995)
 """Quantiles of the surface points' coordinates; they bound the grid along each axis, unless `FENCE` bounds it more tightly."""
 GRID_BYTES = 8
 """Bytes of a grid point on the device: distance and weight."""
+CPU = torch.device("cpu")
 HOST_BYTES = 14
 """Bytes of a grid point in main memory while triangles are made: two copies of the distances, the weights, and two masks."""
 
@@ -69,40 +71,34 @@ def plan_grid(
 ) -> GridPlan:
     """Choose the grid for points [N, 3] [u] with pixels ``footprints`` [N] [u] wide, by ``voxel`` [u] or ``resolution``."""
     if not len(points):
-        raise DataError(
-            "no training view shows a surface: alpha is below 0.5 or depth uncertain everywhere; fit again with more steps"
-        )
+        raise DataError("no training view shows a surface: alpha is below 0.5 or depth uncertain everywhere; take more steps")
     low, high = find_box(points)
     longest = float((high - low).max())
     if voxel is None:
-        voxel = longest / (RESOLUTION if resolution is None else resolution)
+        voxel = longest / (resolution or RESOLUTION)
         if resolution is None:
             voxel = max(voxel, float(np.median(footprints)) / 2)
     if not (voxel > 0 and longest / voxel <= 2**20):
         raise UsageError("--voxel must be at least a millionth of the longest side of the scene")
     margin = 2 * TRUNCATION * voxel
-    shape = tuple(int(n) for n in np.ceil((high - low + 2 * margin) / voxel) + 1)
+    shape: Any = tuple(int(n) for n in np.ceil((high - low + 2 * margin) / voxel) + 1)
+    origin: Any = tuple((low - margin).tolist())
     inside = ((points >= low - margin) & (points <= high + margin)).all(1).mean()
-    x, y, z = low - margin
-    return GridPlan((float(x), float(y), float(z)), voxel, (shape[0], shape[1], shape[2]), float(inside))
+    return GridPlan(origin, voxel, shape, float(inside))
 
 
 def check_memory(plan: GridPlan, device: torch.device) -> str:
     """Return how much memory a grid takes, as text, before it is allocated."""
-    cpu = torch.device("cpu")
     needs = {device: plan.points * GRID_BYTES}
-    needs[cpu] = needs.get(cpu, 0) + plan.points * HOST_BYTES
-    sizes = " x ".join(map(str, plan.shape))
-    remedy = "give a larger --voxel or a smaller --resolution"
+    needs[CPU] = needs.get(CPU, 0) + plan.points * HOST_BYTES
+    sizes, remedy = " x ".join(map(str, plan.shape)), "give a larger --voxel or a smaller --resolution"
     if plan.points > MAX_SIZE:
         raise ResourceError(f"a grid of {sizes} points is beyond the {MAX_SIZE:,} that kernels can index; {remedy}")
     for where, needed in needs.items():
         free = available_bytes(where)
         if needed > 0.8 * free:
-            raise ResourceError(
-                f"a grid of {sizes} points takes {format_bytes(needed)} of memory on {where}, more than 80 % of the free "
-                f"{format_bytes(free)}; {remedy}"
-            )
+            most = f"{format_bytes(needed)} of memory on {where}, more than 80 % of the free {format_bytes(free)}"
+            raise ResourceError(f"a grid of {sizes} points takes {most}; {remedy}")
     return format_bytes(sum(needs.values()))
 
 
@@ -111,10 +107,7 @@ MAX_JUMP = 1.1
 A smaller limit leaves out surfaces at grazing angles; with a larger one, false triangles extend behind depth edges. The limit
 and the truncation were chosen on a demo scene with another seed than the scene of the results
 (docs/decisions/019-thresholds.md)."""
-NO_SURFACE = (
-    "no surface inside the grid; give a larger --voxel (a smaller one if voxels are as large as the scene), or fit "
-    "with more steps"
-)
+NO_SURFACE = "no surface inside the grid; give a larger --voxel (smaller if they are as large as the scene), or more steps"
 """Message for a grid without a surface."""
 MIN_PART = 0.002
 """Smallest fraction of all triangles that a connected part needs to be kept; smaller parts float in front of surfaces."""
@@ -125,13 +118,13 @@ def _grey(vertices: np.ndarray, faces: np.ndarray) -> Mesh:
     return Mesh(vertices, faces.astype(np.int32), np.full(vertices.shape, 0.5, np.float32))
 
 
-def extract(grid: DistanceGrid) -> Mesh:
-    """Return the surface where distances are 0, without colours, open where no view looked and at jumps of the distance."""
+def extract(plan: GridPlan, distance_grid: torch.Tensor, weight_grid: torch.Tensor) -> Mesh:
+    """Return the surface where distances [X, Y, Z] are 0, open where no view looked and at jumps of the distance."""
     # The surface is left open where no view looked: a triangle is kept only if both grid points beside each of its vertices
     # were seen. No triangle is made where the distance jumps from in front of one surface to behind another, as at depth edges.
     from skimage.measure import marching_cubes
 
-    distances, weights = grid.distances.cpu().numpy(), grid.weights.cpu().numpy()
+    distances, weights = distance_grid.cpu().numpy(), weight_grid.cpu().numpy()
     seen = weights > 0
     values = np.where(seen, distances, np.float32(1))
     if not (values < 0).any() or min(values.shape) < 2:
@@ -143,7 +136,7 @@ def extract(grid: DistanceGrid) -> Mesh:
     faces = faces[kept[faces].all(1)]
     if not len(faces):
         raise DataError(NO_SURFACE)
-    return _compact(_grey(np.array(grid.origin) + grid.voxel * corners.astype(np.float64), faces))
+    return _compact(_grey(np.array(plan.origin) + plan.voxel * corners.astype(np.float64), faces))
 
 
 def _compact(mesh: Mesh) -> Mesh:
@@ -159,8 +152,7 @@ def parts(mesh: Mesh) -> tuple[int, np.ndarray]:
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
-    ends = mesh.faces[:, [0, 1, 1, 2]].reshape(-1, 2)
-    count = len(mesh.vertices)
+    ends, count = mesh.faces[:, [0, 1, 1, 2]].reshape(-1, 2), len(mesh.vertices)
     graph = coo_array((np.ones(len(ends), np.int8), (ends[:, 0], ends[:, 1])), (count, count))
     number, labels = connected_components(graph, directed=False)
     return number, labels[mesh.faces[:, 0]]
@@ -171,14 +163,12 @@ def remove_small_parts(mesh: Mesh, fraction: float = MIN_PART) -> tuple[Mesh, in
     number, part = parts(mesh)
     sizes = np.bincount(part, minlength=number)
     keep = sizes >= max(1.0, fraction * len(mesh.faces))
-    left = Mesh(mesh.vertices, mesh.faces[keep[part]], mesh.colors)
-    return _compact(left), int((~keep).sum())
+    return _compact(replace(mesh, faces=mesh.faces[keep[part]])), int((~keep).sum())
 
 
 def decimate(mesh: Mesh, max_faces: int) -> Mesh:
     """Return a mesh of at most about ``max_faces`` triangles, without colours, by quadric error (Garland and Heckbert 1997)."""
-    # VTK collapses edges in the order of their quadric error (Garland and Heckbert 1997). This part of VTK needs no graphics
-    # library.
+    # This part of VTK needs no graphics library.
     if len(mesh.faces) <= max_faces:
         return mesh
     import pyvista
@@ -217,7 +207,7 @@ class MeshOptions:
             raise UsageError(f"--depth {self.depth!r} is not one of {', '.join(DEPTHS)}")
         if self.voxel is not None and not 0 < self.voxel < math.inf:
             raise UsageError(f"--voxel must be a number above 0, not {self.voxel:g}")
-        if self.voxel is not None and self.resolution is not None:
+        if None not in (self.voxel, self.resolution):
             raise UsageError("--voxel and --resolution exclude each other; give one of them")
         if self.resolution is not None and not MIN_RESOLUTION <= self.resolution <= MAX_RESOLUTION:
             raise UsageError(f"--resolution must be {MIN_RESOLUTION} to {MAX_RESOLUTION} voxels, not {self.resolution}")
@@ -243,21 +233,6 @@ class FusedMesh:
     """Number of vertices that no view saw; each has the colour of the nearest vertex that was seen."""
 
 
-def integrate_views(views: SurfaceViews, plan: GridPlan, maps: Sequence[DepthMap], like: torch.Tensor) -> DistanceGrid:
-    """Return the grid, typed as ``like``, into which the depth of all views was fused, in the order of the cameras."""
-    grid, confirmed = empty_grid(plan.origin, plan.voxel, plan.shape, plan.truncation, like), False
-    for view, others in zip(views("fusing depth"), neighbours(maps)):
-        view = agreed(view, [maps[i] for i in others])
-        confirmed = confirmed or bool(((view.depth > 0) & torch.isfinite(view.depth)).any())
-        integrate(grid, view.camera, view.depth, view.weights)
-    if not confirmed:
-        raise DataError(
-            "no depth of a training view is confirmed by another view, so there is no surface to mesh; fit again with more "
-            "steps, or with more photographs that show the same surfaces"
-        )
-    return grid
-
-
 def fuse(
     gaussians: Gaussians, cameras: Sequence[Camera], render: RasterizeOptions, options: MeshOptions = MeshOptions(), *,
     stage: Callable[[str], object] = lambda line: None, planned: Callable[[GridPlan, str], object] = lambda plan, memory: None,
@@ -268,19 +243,25 @@ def fuse(
     # Otherwise each use renders them again, one at a time, and only depths are kept.
     if not cameras:
         raise UsageError("fuse needs at least one camera that sees the surfaces")
-    samples, maps = [], []
+    samples, maps, like = [], [], gaussians.means
     views = SurfaceViews(gaussians, cameras, render, options.depth, stage)
     for view in views("finding surfaces"):
         samples.append(sample_surface(view, max(1, SAMPLES // len(cameras))))
         maps.append(depth_map(view, len(cameras)))
     plan = plan_grid(*map(np.concatenate, zip(*samples)), options.voxel, options.resolution)
-    planned(plan, check_memory(plan, gaussians.means.device))
-    grid = integrate_views(views, plan, maps, gaussians.means)
+    planned(plan, check_memory(plan, like.device))
+    distances, weights, confirmed = like.new_zeros(plan.shape), like.new_zeros(plan.shape), False
+    for view, others in zip(views("fusing depth"), neighbours(maps)):
+        view = agreed(view, [maps[i] for i in others])
+        confirmed = confirmed or bool(((view.depth > 0) & torch.isfinite(view.depth)).any())
+        integrate(distances, weights, plan.origin, plan.voxel, plan.truncation, view.camera, view.depth, view.weights)
     del maps
-    unseen = 1 - np.count_nonzero(grid.weights.cpu().numpy()) / plan.points
+    if not confirmed:
+        raise DataError("no depth of a training view is confirmed by another view; fit with more steps, or more photographs")
+    unseen = 1 - np.count_nonzero(weights.cpu().numpy()) / plan.points
     stage("finding triangles: marching cubes")
-    whole = extract(grid)
-    del grid
+    whole = extract(plan, distances, weights)
+    del distances, weights
     cleaned, removed = remove_small_parts(whole)
     if len(cleaned.faces) > options.max_faces:
         stage(f"simplifying: {len(cleaned.faces):,} triangles")

@@ -9,7 +9,6 @@ import numpy as np
 import torch
 
 from warpgs.constants import NEAR
-from warpgs.errors import UsageError
 from warpgs.geometry import back_project, pinhole_of, relative_pose, rotation_matrices
 from warpgs.kernels.tsdf import face_cosines
 from warpgs.priors.sweep import matching_views, shared_sight
@@ -62,6 +61,13 @@ def weighted_median(depths: torch.Tensor, weights: torch.Tensor) -> torch.Tensor
     return depths.gather(1, order.gather(1, half))[:, 0]
 
 
+def _pixel_axes(camera: Camera, like: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return x [W] and y [H] of the rays with z = 1 through the centres of a pinhole camera's pixels, typed as ``like``."""
+    x, y = (torch.arange(n, dtype=like.dtype, device=like.device) + 0.5 for n in (camera.width, camera.height))
+    K = camera.K
+    return (x - float(K[0, 2])) / float(K[0, 0]), (y - float(K[1, 2])) / float(K[1, 1])
+
+
 def surface_depth(
     gaussians: Gaussians, camera: Camera, ids: torch.Tensor, weights: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
@@ -70,20 +76,16 @@ def surface_depth(
     if not len(gaussians):
         return weights.new_zeros(height, width), weights.new_zeros(height, width)
     matrices, means = whitening(gaussians, camera)
-    rows, columns = (torch.arange(n, dtype=means.dtype, device=means.device) + 0.5 for n in (height, width))
-    x = (columns - float(camera.K[0, 2])) / float(camera.K[0, 0])
-    y = (rows - float(camera.K[1, 2])) / float(camera.K[1, 1])
+    x, y = _pixel_axes(camera, means)
     rays = torch.stack([x.repeat(height), y.repeat_interleave(width), x.new_ones(height * width)], 1)
-    found = []
-    for first in range(0, len(rays), BLOCK):
-        part = slice(first, first + BLOCK)
-        w, i = weights.reshape(-1, k)[part], ids.reshape(-1, k)[part].clamp_min(0).long()
-        depths, sums = densest_depths(matrices, means, rays[part], i), w.sum(1)
+    blocks = []
+    for r, w, i in zip(*(t.split(BLOCK) for t in (rays, weights.reshape(-1, k), ids.reshape(-1, k).clamp_min(0)))):
+        depths, sums = densest_depths(matrices, means, r, i.long()), w.sum(1)
         median = weighted_median(depths, w)
         near = (depths - median[:, None]).abs() <= BAND * median[:, None]
         share = torch.where(near, w, 0).sum(1) / torch.where(sums > 0, sums, 1)
-        found.append(torch.stack([torch.where(sums > 0, median, 0), share]))
-    depth, share = torch.cat(found, 1).reshape(2, height, width)
+        blocks.append(torch.stack([torch.where(sums > 0, median, 0), share]))
+    depth, share = torch.cat(blocks, 1).reshape(2, height, width)
     return depth, share
 
 
@@ -116,8 +118,6 @@ class SurfaceView:
 @torch.no_grad()
 def surface_view(gaussians: Gaussians, camera: Camera, options: RasterizeOptions, depth: str = "median") -> SurfaceView:
     """Render what a camera sees of the surface, by one of `DEPTHS`; a lens is replaced by the pinhole of the same K."""
-    if depth not in DEPTHS:
-        raise UsageError(f"depth {depth!r} is not one of {', '.join(DEPTHS)}")
     camera = pinhole_of(camera)
     r = rasterize(gaussians, camera, replace(options, heaviest=CONTRIBUTORS if depth == "median" else 0))
     z = r.depth
@@ -185,18 +185,10 @@ BOUNDS = (0.02, 0.98)
 """Quantiles of a view's depths that are used as the depths of the nearest and farthest surface."""
 
 
-@dataclass(frozen=True)
-class DepthMap:
-    """Depth of one view, kept to compare other views with."""
-
-    camera: Camera
-    """Pinhole camera of the whole image, arrays of numpy."""
-    depth: torch.Tensor
-    """z-depth [u] of every ``step``-th pixel of every ``step``-th row, 0 without a surface, shape [h, w]."""
-    step: int
-    """Pixels from one stored depth to the next."""
-    bounds: tuple[float, float]
-    """Smallest and largest depth [u] of the surface, without outliers (`BOUNDS`)."""
+DepthMap = tuple[Camera, torch.Tensor, int, tuple[float, float]]
+"""Depth of one view, kept to compare other views with: the pinhole camera of the whole image (numpy); z-depth [u] of every
+``step``-th pixel of every ``step``-th row, 0 without a surface, shape [h, w]; the step [px]; and the smallest and largest depth
+of the surface, without outliers (`BOUNDS`)."""
 
 
 def depth_map(view: SurfaceView, views: int) -> DepthMap:
@@ -205,14 +197,14 @@ def depth_map(view: SurfaceView, views: int) -> DepthMap:
     depth = view.depth[step // 2 :: step, step // 2 :: step]
     depth = torch.where(torch.isfinite(depth), depth, 0).contiguous()
     known = depth[depth > 0].cpu().numpy()
-    near, far = np.quantile(known, BOUNDS) if len(known) else (1.0, 1.0)
-    return DepthMap(view.camera, depth, step, (float(near), max(float(far), float(near) * 1.01)))
+    near, far = map(float, np.quantile(known, BOUNDS) if len(known) else (1.0, 1.0))
+    return view.camera, depth, step, (near, max(far, near * 1.01))
 
 
 def neighbours(maps: Sequence[DepthMap]) -> list[list[int]]:
     """Return the views that each view is compared with, by index, nearest first."""
-    cameras = [m.camera for m in maps]
-    sight = shared_sight(cameras, [m.bounds for m in maps])
+    cameras = [camera for camera, *_ in maps]
+    sight = shared_sight(cameras, [bounds for *_, bounds in maps])
     return [matching_views(sight, cameras, i, NEIGHBOURS, range(len(maps))) for i in range(len(maps))]
 
 
@@ -223,9 +215,8 @@ def agreed(view: SurfaceView, others: Sequence[DepthMap]) -> SurfaceView:
     # depths.
     shown = torch.isfinite(view.depth) & (view.depth > 0)
     confirmed, questioned = torch.zeros_like(shown), torch.zeros_like(shown)
-    for other in others:
-        depth = torch.where(shown, view.depth, 0)
-        _, _, difference = depth_difference(depth, view.camera, other.camera, other.depth, other.step)
+    for camera, depth, step, _ in others:
+        _, _, difference = depth_difference(torch.where(shown, view.depth, 0), view.camera, camera, depth, step)
         confirmed |= difference <= TOLERANCE
         questioned |= torch.isfinite(difference)
     kept = confirmed | ~questioned | ~shown
@@ -237,10 +228,7 @@ def seen_from(depth: torch.Tensor, camera: Camera, other: Camera) -> tuple[torch
     # No product of matrices is used, because its bits would depend on the processor. For points behind the other view, columns
     # and rows are undefined.
     rotation, translation = relative_pose(camera, other)
-    height, width = depth.shape
-    rows, columns = (torch.arange(n, dtype=depth.dtype, device=depth.device) + 0.5 for n in (height, width))
-    x = (columns - float(camera.K[0, 2])) / float(camera.K[0, 0])
-    y = (rows - float(camera.K[1, 2])) / float(camera.K[1, 1])
+    x, y = _pixel_axes(camera, depth)
     px, py, z = (
         depth * (x[None] * float(r[0]) + (y[:, None] * float(r[1]) + float(r[2]))) + float(t)
         for r, t in zip(rotation, translation)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import math
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -27,11 +27,11 @@ from warpgs.files import (
 from warpgs.io.folder import all_readers
 from warpgs.io.image_files import MAX_PIXELS, unread_note
 from warpgs.poses.mapping import EXHAUSTIVE, LEARNED, Mapping, camera_groups, cameras_of, check_installed, find_model
-from warpgs.poses.matching import Matcher, open_matcher, write_matches
+from warpgs.poses.matching import Matcher, write_matches
 from warpgs.poses.photographs import (
     Photograph,
+    Progress,
     find_photographs,
-    folder_notes,
     image_root,
     is_heic,
     is_video,
@@ -54,25 +54,19 @@ MAX_ADVICE = 8
 """Number of pieces of advice that are given, the most urgent first."""
 
 
-def partners(found: Mapping, i: int) -> list[tuple[int, int]]:
-    """Return the photographs that photograph ``i`` matches, each with the number of matches, most matches first."""
-    return sorted(found.links.get(i, ()), key=lambda link: (-link[1], link[0]))
-
-
 def reason(found: Mapping, i: int, names: Sequence[str]) -> str:
     """Return why a photograph has no pose, in words that follow its name."""
     keypoints = found.keypoints[i]
     if keypoints < MIN_KEYPOINTS:
         return f"has {keypoints} keypoints, too few to match: a blank wall, darkness or blur"
-    best = partners(found, i)
+    best = found.links[i]
     if not best:
         return f"has {keypoints:,} keypoints and matches no other photograph"
     j, n = best[0]
     matched = f"has {keypoints:,} keypoints and {n} matches with {names[j]}"
     if j in found.views:
         return f"{matched}, too few of them at places of known depth"
-    group = next((g for g in found.groups[1:] if i in g), ())
-    together = f", in a separate group of {len(group)}" if group else ""
+    together = next((f", in a separate group of {len(group)}" for group in found.groups[1:] if i in group), "")
     return f"{matched}, which has no pose either{together}"
 
 
@@ -94,25 +88,22 @@ def neighbours(found: Mapping) -> list[tuple[int, int, float]]:
 def advice(found: Mapping, names: Sequence[str]) -> list[str]:
     """Return what to photograph next, a sentence each, the most urgent first; empty if nothing is missing."""
     said = []
-    for i in range(len(names)):
-        if i not in found.views:
-            best = partners(found, i)
-            if found.keypoints[i] < MIN_KEYPOINTS:
-                said.append(f"take {names[i]} again: sharp, in good light, with a textured object in view")
-            elif best:
-                said.append(f"take two or three photographs between {names[i]} and {names[best[0][0]]}, in small steps")
-            else:
-                said.append(f"take photographs from {names[i]} to the others, each overlapping the previous one by two thirds")
-    tree = neighbours(found)
-    for i, j, angle in sorted(tree, key=lambda t: -t[2]):
+    for i in (i for i in range(len(names)) if i not in found.views):
+        best = found.links[i]
+        if found.keypoints[i] < MIN_KEYPOINTS:
+            said.append(f"take {names[i]} again: sharp, in good light, with a textured object in view")
+        elif best:
+            said.append(f"take two or three photographs between {names[i]} and {names[best[0][0]]}, in small steps")
+        else:
+            said.append(f"take photographs from {names[i]} to the others, each overlapping the previous one by two thirds")
+    for i, j, angle in sorted(neighbours(found), key=lambda t: -t[2]):
         if angle > WIDE_ANGLE:
-            said.append(
-                f"take one or two photographs between {names[i]} and {names[j]}, whose axes differ by {angle:.0f} degrees"
-            )
+            pair = f"{names[i]} and {names[j]}"
+            said.append(f"take one or two photographs between {pair}, whose axes differ by {angle:.0f} degrees")
     for i in found.views:
-        best = [(n, j) for j, n in partners(found, i) if j in found.views]
-        if best and best[0][0] < WEAK_MATCHES:
-            said.append(f"take a photograph between {names[i]} and {names[best[0][1]]}, which share only {best[0][0]} matches")
+        j, n = next((link for link in found.links[i] if link[0] in found.views), (i, WEAK_MATCHES))
+        if n < WEAK_MATCHES:
+            said.append(f"take a photograph between {names[i]} and {names[j]}, which share only {n} matches")
     more = len(said) - MAX_ADVICE
     return said[:MAX_ADVICE] + ([f"and {more} more; begin with those above"] if more > 0 else [])
 
@@ -152,21 +143,26 @@ def record_of(found: Mapping, photographs: Sequence[Photograph], digest: str, no
         rows.append({
             "name": p.name, "sha256": p.digest, "registered": registered, "keypoints": found.keypoints[i],
             "points": found.views[i][1] if registered else 0,
-            "matches": {names[j]: n for j, n in partners(found, i)[:SHOWN_PARTNERS]},
+            "matches": {names[j]: n for j, n in found.links[i][:SHOWN_PARTNERS]},
             "reason": None if registered else reason(found, i, names),
         })  # fmt: skip
-    remarks = [summary(found, len(names))]
+    focal = ", ".join(f"{c['focal']:.0f} px of {max(c['width'], c['height'])}" for c in found.cameras)
+    count = f"{len(found.views)} photographs"
+    remarks = [
+        f"poses found for {len(found.views)} of {len(names)} photographs from {found.points:,} points, mean reprojection error "
+        f"{found.error:.2f} px, {found.method} mapping, focal length {focal}"
+    ]
     if found.kept_focal:
-        remarks.append(f"the focal length is taken from EXIF, because {len(found.views)} photographs cannot improve it")
+        remarks.append(f"the focal length is taken from EXIF, because {count} cannot improve it")
     elif found.kept_focal is False:
         remarks.append(
-            f"the EXIF focal length does not fit the {len(found.views)} photographs, which may be cropped; the focal length "
-            "was estimated instead. Such an estimate is often 5 % off, at worst 20 % or more"
+            f"the EXIF focal length does not fit the {count}, which may be cropped; the focal length was estimated instead. "
+            "Such an estimate is often 5 % off, at worst 20 % or more"
         )
     elif len(found.views) <= FEW and any(photographs[i].focal is None for i in found.views):
         remarks.append(
-            f"EXIF holds no focal length. An estimate from {len(found.views)} photographs is often 5 % off, at worst 20 % or "
-            "more, and so is depth. Add photographs from more directions"
+            f"EXIF holds no focal length. An estimate from {count} is often 5 % off, at worst 20 % or more, and so is depth. "
+            "Add photographs from more directions"
         )
     if found.method == "global":
         remarks.append(
@@ -174,21 +170,11 @@ def record_of(found: Mapping, photographs: Sequence[Photograph], digest: str, no
             "differ a little from run to run"
         )
     return {
-        "format": FORMAT, "source_sha256": digest, "photographs": rows,
-        "notes": [*notes, *remarks],
+        "format": FORMAT, "source_sha256": digest, "photographs": rows, "notes": [*notes, *remarks],
         "advice": advice(found, names), "mean_reprojection_error_px": found.error, "points": found.points,
-        "method": found.method, "pairs_tried": found.tried, "pairs_matched": len([n for n in found.matches.values() if n]),
+        "method": found.method, "pairs_tried": found.tried, "pairs_matched": sum(n > 0 for n in found.matches.values()),
         "cameras": list(found.cameras), "pycolmap": found.version,
     }  # fmt: skip
-
-
-def summary(found: Mapping, count: int) -> str:
-    """Return a sentence on how many of ``count`` photographs have a pose, and how well they fit."""
-    focal = ", ".join(f"{c['focal']:.0f} px of {max(c['width'], c['height'])}" for c in found.cameras)
-    return (
-        f"poses found for {len(found.views)} of {count} photographs from {found.points:,} points, mean reprojection error "
-        f"{found.error:.2f} px, {found.method} mapping, focal length {focal}"
-    )
 
 
 def report_lines(record: dict[str, Any]) -> list[str]:
@@ -198,17 +184,10 @@ def report_lines(record: dict[str, Any]) -> list[str]:
     lines = [*record["notes"], ""]
     for p in rows:
         best = ", ".join(f"{name} ({n})" for name, n in list(p["matches"].items())[:2])
-        if p["registered"]:
-            lines.append(
-                f"{p['name']:<{width}}  pose    {p['keypoints']:>6,} keypoints, {p['points']:>5,} points, matches {best}"
-            )
-        else:
-            lines.append(f"{p['name']:<{width}}  NO POSE: it {p['reason']}")
-    lines += [
-        "",
-        "What to photograph next:" if record["advice"] else "Nothing more is needed: all photographs are well linked.",
-    ]
-    return lines + [f"- {a}" for a in record["advice"]]
+        pose = f"pose    {p['keypoints']:>6,} keypoints, {p['points']:>5,} points, matches {best}"
+        lines.append(f"{p['name']:<{width}}  {pose if p['registered'] else 'NO POSE: it ' + str(p['reason'])}")
+    next_step = "What to photograph next:" if record["advice"] else "Nothing more is needed: all photographs are well linked."
+    return [*lines, "", next_step, *(f"- {a}" for a in record["advice"])]
 
 
 def read_poses_record(folder: Path) -> dict[str, Any]:
@@ -237,28 +216,27 @@ def needs_poses(path: Path) -> bool:
     try:
         if is_video(path):
             return True
-        return path.is_dir() and all(r.probe(path) is None for r in all_readers()) and bool(find_photographs(path))
+        return path.is_dir() and all(r.probe(path) is None for r in all_readers()) and bool(find_photographs(path)[0])
     except OSError:  # the scene reader reports the error
         return False
 
 
 def source_digest(source: Path, allow_outside: bool = False) -> str:
     """Return the SHA-256 over the names and contents of a source's photographs, or of a video."""
-    total = hashlib.sha256()
+
+    def digest(path: Path) -> str:
+        try:
+            return input_digest(path)
+        except OSError as e:
+            raise DataError(f"{path}: cannot be read ({unread_reason(e)}); fix its permissions or copy it again") from e
+
     if is_video(source):
-        return _digest(source)
-    root = image_root(source)
+        return digest(source)
+    root, total = image_root(source), hashlib.sha256()
     for path in photographs_inside(source, allow_outside):
         name = path.relative_to(root).as_posix().encode("utf-8", "surrogateescape")
-        total.update(name + b"\0" + bytes.fromhex(_digest(path)))
+        total.update(name + b"\0" + bytes.fromhex(digest(path)))
     return total.hexdigest()
-
-
-def _digest(path: Path) -> str:
-    try:
-        return input_digest(path)
-    except OSError as e:
-        raise DataError(f"{path}: cannot be read ({unread_reason(e)}); fix its permissions or copy it again") from e
 
 
 def find_poses(
@@ -270,13 +248,13 @@ def find_poses(
     max_pixels: int = MAX_PIXELS,
     allow_outside: bool = False,
     matcher: str | Path | None = None,
-    progress: Callable[[str], object] = lambda line: None,
+    progress: Progress = lambda line: None,
 ) -> dict[str, Any]:
     """Find the poses of photographs or of a video's sharpest frames; write a scene folder, whole or not at all."""
     source, out = Path(source), Path(out)
     _check(source, out, allow_outside)
     check_installed()
-    network = None if matcher is None else open_matcher(matcher, threads)
+    network = None if matcher is None else Matcher(matcher, threads)
     with filling(out) as scene:
         work, kind = scene / "work", "video" if is_video(source) else "photographs"
         digest = source_digest(source, allow_outside)  # before anything is written, which may be below the source
@@ -303,7 +281,7 @@ def find_poses(
 
 def _with_network(
     network: Matcher, found: Mapping, photographs: list[Photograph], names: list[str], kind: str, work: Path,
-    progress: Callable[[str], object], threads: int,
+    progress: Progress, threads: int,
 ) -> tuple[Mapping, list[str]]:  # fmt: skip
     """Return the model from the network's matches if it has more photographs than SIFT's, and notes."""
     # the network, which is less accurate, runs only if SIFT leaves photographs without a pose
@@ -338,15 +316,16 @@ def _something_else(folder: Path) -> str:
 def _check(source: Path, out: Path, allow_outside: bool) -> None:
     """Raise an error for an unusable source or target, before any work."""
     try:
-        if not is_video(source) and not source.is_dir():
-            there = NOT_REGULAR if source.exists() else "does not exist"
-            what = "is not a supported video (mp4, mov, m4v, avi, mkv, webm)" if source.is_file() else there
-            raise DataError(f"{source}: {what}; give a folder of photographs, or a video")
-        if not is_video(source) and (other := _something_else(source)):
-            raise UsageError(f"{source}: {other}")
-        if not is_video(source) and not photographs_inside(source, allow_outside):
-            none = "holds no supported image (JPEG, PNG, BMP, TIFF, WebP, AVIF or HEIC); give the folder of photographs"
-            raise DataError(f"{source}: {unread_note(source) or none}")
+        if not is_video(source):
+            if not source.is_dir():
+                there = NOT_REGULAR if source.exists() else "does not exist"
+                what = "is not a supported video (mp4, mov, m4v, avi, mkv, webm)" if source.is_file() else there
+                raise DataError(f"{source}: {what}; give a folder of photographs, or a video")
+            if other := _something_else(source):
+                raise UsageError(f"{source}: {other}")
+            if not photographs_inside(source, allow_outside):
+                none = "holds no supported image (JPEG, PNG, BMP, TIFF, WebP, AVIF or HEIC); give the folder of photographs"
+                raise DataError(f"{source}: {unread_note(source) or none}")
         if out.exists() and not (out.is_dir() and is_empty(out)):
             raise UsageError(f"{out} exists already; choose another --out, or remove it")
     except OSError as e:
@@ -354,7 +333,7 @@ def _check(source: Path, out: Path, allow_outside: bool) -> None:
 
 
 def _prepared(
-    source: Path, work: Path, frames: int, max_pixels: int, progress: Callable[[str], object]
+    source: Path, work: Path, frames: int, max_pixels: int, progress: Progress
 ) -> tuple[list[Photograph], list[str], list[str]]:
     """Return the photographs of a source, the names of their copies in ``work``/small, and notes for the user."""
     notes, root = [], source
@@ -365,8 +344,8 @@ def _prepared(
         taken = min(frames, total)
         notes.append(f"{taken} of {total} frames are used: the sharpest frame of each of {taken} equal parts of the video")
     root = image_root(root)
-    paths, unread = find_photographs(root), unread_note(root)
-    notes += folder_notes(root)
+    (paths, about), unread = find_photographs(root), unread_note(root)
+    notes += about
     if unread:
         notes.append(f"left out: {unread}")
     if len(paths) < MIN_PHOTOGRAPHS:
@@ -408,7 +387,7 @@ def _links(found: Mapping, photographs: list[Photograph]) -> str:
     """Return which pairs match best, and which photographs match none; fewest matches first."""
     pairs: dict[tuple[int, ...], int] = {}
     for i in range(len(photographs)):
-        best = partners(found, i)[:1]
+        best = found.links[i][:1]
         pairs[tuple(sorted((i, best[0][0]))) if best else (i,)] = best[0][1] if best else 0
     order = sorted(pairs, key=lambda pair: (pairs[pair], pair))
     words = []
@@ -426,18 +405,17 @@ def _check_found(source: Path, found: Mapping, photographs: list[Photograph]) ->
     count, blank = len(photographs), sum(k < MIN_KEYPOINTS for k in found.keypoints)
     largest = max(found.matches.values(), default=0)
     if 2 * blank >= count:
-        most = max(found.keypoints)
         why = (
             f"{blank} of {count} photographs show almost nothing that can be matched (fewer than {MIN_KEYPOINTS} keypoints; "
-            f"the best one has {most:,}): a blank wall, darkness or blur. Take sharp photographs of textured things, in good "
-            "light"
+            f"the best one has {max(found.keypoints):,}): a blank wall, darkness or blur. Take sharp photographs of textured "
+            "things, in good light"
         )
     elif not largest:
         why = f"no two of {count} photographs could be matched. Take photographs that overlap by two thirds, in small steps"
     else:
         why = (
             f"at most {len(found.views)} of {count} photographs fit together, and {MIN_PHOTOGRAPHS} are needed. Take "
-            f"photographs that overlap by two thirds, moving the camera, not only turning it. "
+            "photographs that overlap by two thirds, moving the camera, not only turning it. "
             f"So far {_links(found, photographs)}"
         )
     raise DataError(f"{source}: no poses: {why}")

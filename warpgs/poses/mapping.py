@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import importlib.util
+import itertools
 import json
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -17,17 +18,18 @@ from warpgs.device import usable_cores
 from warpgs.errors import ResourceError, UsageError, install_extras
 from warpgs.files import disk_is_full, write_json, write_text
 from warpgs.poses.matching import choose_pairs
-from warpgs.poses.photographs import MATCHING_SIDE, Photograph
+from warpgs.poses.photographs import MATCHING_SIDE, Photograph, Progress
 from warpgs.process import ProcessFailed, answer, end_with_parent, python_lines
 
 EXHAUSTIVE = 60
 """Largest number of photographs of which all pairs are matched; for more photographs, pairs are chosen."""
-JOB = "job.json"
-"""Name of the file with the worker's input."""
-LEARNED = "learned.npz"
-"""Name of the file with keypoints and matches of a network."""
+JOB, LEARNED = "job.json", "learned.npz"
+"""Names of the files with the worker's input, and with keypoints and matches of a network."""
+IMAGES, DATABASE, PAIRS, MODELS, MODEL = "small", "matches.db", "pairs.txt", "models", "model"
+"""Names in the folder that the worker runs in: relative, since pycolmap takes names in UTF-8 alone."""
 LAST_WORDS = 500
 """Number of letters of pycolmap's last message that an error shows."""
+Json = dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -61,13 +63,13 @@ class Mapping:
 
     @cached_property
     def links(self) -> dict[int, list[tuple[int, int]]]:
-        """Photographs that each photograph matches, with the number of matches."""
-        links: dict[int, list[tuple[int, int]]] = {}
+        """Photographs that each photograph matches, each with the number of matches, most matches first."""
+        links: dict[int, list[tuple[int, int]]] = {i: [] for i in range(len(self.keypoints))}
         for (a, b), n in self.matches.items():
             if n > 0:
-                links.setdefault(a, []).append((b, n))
-                links.setdefault(b, []).append((a, n))
-        return links
+                links[a].append((b, n))
+                links[b].append((a, n))
+        return {i: sorted(some, key=lambda link: (-link[1], link[0])) for i, some in links.items()}
 
 
 def check_installed() -> None:
@@ -84,15 +86,11 @@ def camera_groups(photographs: list[Photograph]) -> list[int]:
 
 def cameras_of(photographs: list[Photograph], groups: list[int]) -> list[Photograph]:
     """Return the first photograph of each camera, in the order of the camera numbers (``groups``, from `camera_groups`)."""
-    first: dict[int, Photograph] = {}
-    for number, photograph in zip(groups, photographs):
-        first.setdefault(number, photograph)
+    first = dict(zip(groups[::-1], photographs[::-1]))
     return [first[number] for number in range(len(first))]
 
 
-def _job(
-    photographs: list[Photograph], names: list[str], kind: str, folder: Path, threads: int, learned: bool
-) -> dict[str, Any]:
+def _job(photographs: list[Photograph], names: list[str], kind: str, folder: Path, threads: int, learned: bool) -> Json:
     """Return the worker's input."""
     of = camera_groups(photographs)
     cameras = []
@@ -101,17 +99,14 @@ def _job(
         width, height = round(scale * p.width), round(scale * p.height)
         focal = None if p.focal is None else p.focal * max(width, height)
         cameras.append({"focal": focal, "width": width, "height": height})
-    (folder / "models").mkdir()
+    (folder / MODELS).mkdir()
     return {
         "names": names, "camera_of": of, "cameras": cameras, "kind": kind, "threads": threads, "exhaustive": EXHAUSTIVE,
-        "sizes": [(p.width, p.height) for p in photographs], "scene_names": [p.name for p in photographs],
-        # relative to the folder that the worker runs in: pycolmap takes names in UTF-8 alone
-        "images": "small", "database": "matches.db", "pairs": "pairs.txt", "models": "models", "model": "model",
-        "learned": LEARNED if learned else None,
+        "sizes": [(p.width, p.height) for p in photographs], "scene_names": [p.name for p in photographs], "learned": learned,
     }  # fmt: skip
 
 
-def _lines(job: dict[str, Any], folder: Path) -> Iterator[dict[str, Any]]:
+def _lines(job: Json, folder: Path) -> Iterator[Json]:
     """Yield the worker's messages; end the worker when the reader stops."""
     write_json(folder / JOB, job)
     try:
@@ -125,10 +120,8 @@ def _lines(job: dict[str, Any], folder: Path) -> Iterator[dict[str, Any]]:
                 f"{folder.parents[1]}: its disk is full, so pycolmap cannot write features and matches. Free some disk space, "
                 "or choose another --out"
             ) from e
-        last = e.errors[-LAST_WORDS:].replace("\n", " ")
-        raise ResourceError(
-            f"pycolmap ended with code {e.code}; it may have had too little memory. Its last message: {last}"
-        ) from e
+        why = f"pycolmap ended with code {e.code}; it may have had too little memory"
+        raise ResourceError(f"{why}. Its last message: {e.errors[-LAST_WORDS:].replace(chr(10), ' ')}") from e
 
 
 def find_model(
@@ -136,12 +129,12 @@ def find_model(
     names: list[str],
     kind: str,
     folder: Path,
-    progress: Callable[[str], object],
+    progress: Progress,
     threads: int = 0,
     learned: bool = False,
 ) -> Mapping:
     """Find poses of photographs and write the model of those that fit together into ``folder``/model, in COLMAP's files."""
-    result: dict[str, Any] | None = None
+    result: Json | None = None
     for said in _lines(_job(photographs, names, kind, folder, threads or usable_cores(), learned), folder):
         if "progress" in said:
             progress(said["progress"])
@@ -192,33 +185,42 @@ def _say(**values: Any) -> None:
     answer(json.dumps(values))
 
 
-def import_photographs(pycolmap: Any, job: dict[str, Any]) -> None:
+def _in_steps(items: list, words: str, least: int = 1) -> Iterator[list]:
+    """Yield a list in about twenty parts, each after a line of progress."""
+    step = max(least, len(items) // 20)
+    for begin in range(0, len(items), step):
+        _say(progress=f"{words} {begin + 1} of {len(items)}")
+        yield items[begin : begin + step]
+
+
+def _write_pairs(pairs: list[tuple[int, int]], job: Json) -> None:
+    """Write the list of pairs of photographs that pycolmap reads."""
+    write_text(Path(PAIRS), "".join(f"{job['names'][i]} {job['names'][j]}\n" for i, j in pairs))
+
+
+def import_photographs(pycolmap: Any, job: Json) -> None:
     """Write cameras and photographs into a new database; numbers follow the order of the job."""
-    pycolmap.Database.open(job["database"]).close()
-    arguments = (job["database"], job["images"])
+    pycolmap.Database.open(DATABASE).close()
     for number, camera in enumerate(job["cameras"]):
         names = [n for n, c in zip(job["names"], job["camera_of"], strict=True) if c == number]
         reader = pycolmap.ImageReaderOptions()
         reader.camera_model = CAMERA_MODEL
         if camera["focal"] is not None:
             reader.camera_params = ",".join(map(repr, (camera["focal"], camera["width"] / 2, camera["height"] / 2, 0.0)))
-        pycolmap.import_images(*arguments, pycolmap.CameraMode.SINGLE, names, reader)
+        pycolmap.import_images(DATABASE, IMAGES, pycolmap.CameraMode.SINGLE, names, reader)
 
 
-def extract(pycolmap: Any, job: dict[str, Any]) -> None:
+def extract(pycolmap: Any, job: Json) -> None:
     """Write the SIFT features of the photographs into the database."""
     options = pycolmap.FeatureExtractionOptions()
     options.num_threads, options.use_gpu, options.sift.peak_threshold = job["threads"], False, PEAK
-    arguments = (job["database"], job["images"])
-    step = max(job["threads"], len(job["names"]) // 20)  # each thread processes one photograph
-    for begin in range(0, len(job["names"]), step):
-        _say(progress=f"finding features: photograph {begin + 1} of {len(job['names'])}")
-        mode, reader = pycolmap.CameraMode.AUTO, pycolmap.ImageReaderOptions()
-        names = job["names"][begin : begin + step]
-        pycolmap.extract_features(*arguments, names, mode, reader, options, pycolmap.Device.cpu)
+    mode, reader = pycolmap.CameraMode.AUTO, pycolmap.ImageReaderOptions()
+    # each thread processes one photograph
+    for names in _in_steps(job["names"], "finding features: photograph", job["threads"]):
+        pycolmap.extract_features(DATABASE, IMAGES, names, mode, reader, options, pycolmap.Device.cpu)
 
 
-def numbers_of(database: Any, job: dict[str, Any]) -> list[int]:
+def numbers_of(database: Any, job: Json) -> list[int]:
     """Return the database's id of each photograph, in the order of the job."""
     numbers = {image.name: image.image_id for image in database.read_all_images()}
     return [numbers[name] for name in job["names"]]
@@ -231,26 +233,23 @@ def verification_options(pycolmap: Any) -> Any:
     return options
 
 
-def verify_learned(pycolmap: Any, job: dict[str, Any]) -> dict[str, Any]:
+def verify_learned(pycolmap: Any, job: Json) -> Json:
     """Write the keypoints and matches of a network into the database and verify them; return the result of `matched`."""
-    with np.load(job["learned"], allow_pickle=False) as learned:
+    with np.load(LEARNED, allow_pickle=False) as learned:
         pairs, ends = learned["pairs"], np.cumsum(learned["counts"])
         matches = np.split(learned["matches"], ends[:-1])
         keypoints = np.split(learned["keypoints"], np.cumsum(learned["per_photograph"])[:-1])
-    with pycolmap.Database.open(job["database"]) as database:
+    with pycolmap.Database.open(DATABASE) as database:
         order = numbers_of(database, job)
         for number, positions in zip(order, keypoints, strict=True):
             database.write_keypoints(number, positions)
         for (i, j), rows in zip(pairs, matches, strict=True):
             if len(rows):
                 database.write_matches(order[i], order[j], rows)
-    step = max(1, len(pairs) // 20)
-    for begin in range(0, len(pairs), step):
-        _say(progress=f"verifying matches: pair {begin + 1} of {len(pairs)}")
-        names = [(job["names"][i], job["names"][j]) for i, j in pairs[begin : begin + step]]
-        write_text(Path(job["pairs"]), "".join(f"{a} {b}\n" for a, b in names))
-        pycolmap.verify_matches(job["database"], job["pairs"], verification_options(pycolmap))
-    with pycolmap.Database.open(job["database"]) as database:
+    for some in _in_steps(pairs, "verifying matches: pair"):
+        _write_pairs(some, job)
+        pycolmap.verify_matches(DATABASE, PAIRS, verification_options(pycolmap))
+    with pycolmap.Database.open(DATABASE) as database:
         for (i, j), rows in zip(pairs, matches, strict=True):
             numbers = order[i], order[j]
             if database.exists_two_view_geometry(*numbers):
@@ -260,28 +259,26 @@ def verify_learned(pycolmap: Any, job: dict[str, Any]) -> dict[str, Any]:
     return matched(pycolmap, job, len(pairs))
 
 
-def match(pycolmap: Any, job: dict[str, Any]) -> dict[str, Any]:
+def match(pycolmap: Any, job: Json) -> Json:
     """Match pairs of photographs; return the result of `matched`."""
-    with pycolmap.Database.open(job["database"]) as database:
+    with pycolmap.Database.open(DATABASE) as database:
         order = numbers_of(database, job)
         few = len(order) <= job["exhaustive"]
         found = [] if few else [database.read_descriptors(i).data for i in order]
     pairs = choose_pairs(found, job["kind"], SEED) if found else [(i, j) for j in range(len(order)) for i in range(j)]
     matching, verification = pycolmap.FeatureMatchingOptions(), verification_options(pycolmap)
     matching.num_threads, matching.use_gpu = job["threads"], False
-    listed, chosen = Path(job["pairs"]), pycolmap.ImportedPairingOptions()
-    chosen.match_list_path = str(listed)
-    step = max(1, len(pairs) // 20)
-    for begin in range(0, len(pairs), step):
-        _say(progress=f"matching: pair {begin + 1} of {len(pairs)}")
-        write_text(listed, "".join(f"{job['names'][i]} {job['names'][j]}\n" for i, j in pairs[begin : begin + step]))
-        pycolmap.match_image_pairs(job["database"], matching, chosen, verification, pycolmap.Device.cpu)
+    chosen = pycolmap.ImportedPairingOptions()
+    chosen.match_list_path = PAIRS
+    for some in _in_steps(pairs, "matching: pair"):
+        _write_pairs(some, job)
+        pycolmap.match_image_pairs(DATABASE, matching, chosen, verification, pycolmap.Device.cpu)
     return matched(pycolmap, job, len(pairs))
 
 
-def matched(pycolmap: Any, job: dict[str, Any], tried: int) -> dict[str, Any]:
+def matched(pycolmap: Any, job: Json, tried: int) -> Json:
     """Return the number of keypoints of each photograph, and for each pair the number of matches that agree with one motion."""
-    with pycolmap.Database.open(job["database"]) as database:
+    with pycolmap.Database.open(DATABASE) as database:
         order = numbers_of(database, job)
         keypoints = [database.num_keypoints_for_image(i) for i in order]
         ids, geometries = database.read_two_view_geometries()
@@ -293,7 +290,7 @@ def matched(pycolmap: Any, job: dict[str, Any], tried: int) -> dict[str, Any]:
     return {"keypoints": keypoints, "pairs": sorted(agreed), "tried": tried}
 
 
-def map_incrementally(pycolmap: Any, job: dict[str, Any], keep_focal: bool = False) -> list[Any]:
+def map_incrementally(pycolmap: Any, job: Json, keep_focal: bool = False) -> list[Any]:
     """Return the models that grow photograph by photograph from a good pair; ``keep_focal`` keeps EXIF's focal lengths."""
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads = options.mapper.num_threads = 1  # else the rounding depends on which thread finishes first
@@ -302,16 +299,15 @@ def map_incrementally(pycolmap: Any, job: dict[str, Any], keep_focal: bool = Fal
     options.mapper.abs_pose_min_num_inliers = MIN_INLIERS
     options.triangulation.ignore_two_view_tracks = False  # with few photographs most points are seen by only two
     options.ba_refine_focal_length = options.ba_refine_extra_params = not keep_focal
-    registered = [2]
+    registered, count = itertools.count(3), len(job["names"])
 
     def on_next() -> None:
-        registered[0] += 1
-        _say(progress=f"finding poses: photograph {min(registered[0], len(job['names']))} of {len(job['names'])}")
+        _say(progress=f"finding poses: photograph {min(next(registered), count)} of {count}")
 
-    folder = Path(job["models"]) / ("kept_focal" if keep_focal else "incremental")
+    folder = Path(MODELS) / ("kept_focal" if keep_focal else "incremental")
     folder.mkdir()
-    arguments = job["database"], job["images"], str(folder)
-    return list(pycolmap.incremental_mapping(*arguments, options, next_image_callback=on_next).values())
+    models = pycolmap.incremental_mapping(DATABASE, IMAGES, str(folder), options, next_image_callback=on_next)
+    return list(models.values())
 
 
 def believes_exif(kept: list[Any], free: list[Any]) -> bool:
@@ -324,22 +320,22 @@ def believes_exif(kept: list[Any], free: list[Any]) -> bool:
     return bool(best.num_reg_images() >= other.num_reg_images() and as_well)
 
 
-def map_globally(pycolmap: Any, job: dict[str, Any]) -> list[Any]:
+def map_globally(pycolmap: Any, job: Json) -> list[Any]:
     """Return the models in which all poses are found at once."""
     _say(progress="finding poses: all photographs at once")
-    if not pycolmap.calibrate_view_graph(job["database"]):
+    if not pycolmap.calibrate_view_graph(DATABASE):
         return []
     options = pycolmap.GlobalPipelineOptions()
     options.num_threads = options.mapper.num_threads = options.mapper.bundle_adjustment.ceres.solver_options.num_threads = 1
     mapper = options.mapper
     for part in (options, mapper, mapper.rotation_averaging, mapper.global_positioning, mapper.retriangulation):
         part.random_seed = SEED
-    folder = Path(job["models"]) / "global"
+    folder = Path(MODELS) / "global"
     folder.mkdir()
-    return list(pycolmap.global_mapping(job["database"], job["images"], str(folder), options).values())
+    return list(pycolmap.global_mapping(DATABASE, IMAGES, str(folder), options).values())
 
 
-def finish(model: Any, job: dict[str, Any]) -> dict[str, Any]:
+def finish(model: Any, job: Json) -> Json:
     """Give a model the names and sizes of the scene's images and write it; return its description."""
     error, index = model.compute_mean_reprojection_error(), {name: i for i, name in enumerate(job["names"])}
     views = {}
@@ -357,8 +353,8 @@ def finish(model: Any, job: dict[str, Any]) -> dict[str, Any]:
         used = [i for i, v in views.items() if v["camera"] == camera.camera_id]
         if used:
             camera.rescale(*job["sizes"][used[0]])
-    Path(job["model"]).mkdir(parents=True)
-    model.write_binary(job["model"])
+    Path(MODEL).mkdir(parents=True)
+    model.write_binary(MODEL)
     cameras = {c.camera_id: {"focal": c.mean_focal_length(), "distortion": c.params[-1], "width": c.width, "height": c.height}
                for c in model.cameras.values() if any(v["camera"] == c.camera_id for v in views.values())}  # fmt: skip
     return {"views": views, "cameras": cameras, "points": model.num_points3D(), "error": error}
@@ -372,12 +368,11 @@ def main(path: str) -> None:
     job = json.loads(Path(path).read_text("utf-8"))
     pycolmap.set_random_seed(SEED)
     import_photographs(pycolmap, job)
-    if job["learned"] is None:
+    if job["learned"]:
+        result = verify_learned(pycolmap, job)
+    else:
         extract(pycolmap, job)
         result = match(pycolmap, job)
-    else:
-        result = verify_learned(pycolmap, job)
-    result |= {"version": pycolmap.__version__}
     models: list[Any] = map_incrementally(pycolmap, job) if result["pairs"] else []
     kept_focal = None
     if result["pairs"] and len(job["names"]) <= KEEP_FOCAL and all(c["focal"] is not None for c in job["cameras"]):
@@ -392,7 +387,7 @@ def main(path: str) -> None:
             models, method, kept_focal = others, "global", None
     models.sort(key=lambda m: (-m.num_reg_images(), -m.num_points3D()))
     groups = [sorted(m.image(i).name for i in m.reg_image_ids()) for m in models]
-    result |= {"method": method, "kept_focal": kept_focal, "groups": groups}
+    result |= {"version": pycolmap.__version__, "method": method, "kept_focal": kept_focal, "groups": groups}
     _say(result=result | {"model": finish(models[0], job) if models else None})
 
 

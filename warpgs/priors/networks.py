@@ -8,21 +8,17 @@ import json
 import os
 import sys
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from warpgs import schema
-from warpgs.errors import DataError, ResourceError, UsageError
+from warpgs.errors import DataError, ResourceError
 from warpgs.files import read_input, unread_reason, write_bytes
 from warpgs.folders import cache_home, private_folder
-from warpgs.onnx import PROVIDERS, first_line, read_model, start_session
+from warpgs.onnx import Model, fixed_size
 from warpgs.process import say
-
-if TYPE_CHECKING:
-    from onnxruntime import InferenceSession
 
 
 @contextlib.contextmanager
@@ -50,39 +46,35 @@ def without_ipp() -> None:
 TYPES = {"tensor(float)": np.float32, "tensor(float16)": np.float16}
 
 
-@dataclass(frozen=True)
-class Network:
-    """An opened model with one image as input and one map as output."""
+class Network(Model):
+    """An opened network with one image as input and one map as output.
 
-    path: Path
-    """File of the model."""
-    sha256: str
-    """SHA-256 of the file, hexadecimal."""
-    session: InferenceSession
-    """The onnxruntime session."""
-    layout: str
-    """Order of the input's axes: nchw or nhwc."""
-    size: tuple[int, int] | None
-    """Height and width [px] that the graph fixes; None where both are free."""
-    type: type
-    """Scalar type of the input."""
+    ``layout`` is nchw or nhwc; ``size`` are height and width [px] that the graph fixes, None where both are free.
+    """
 
-    @property
-    def title(self) -> str:
-        """File name and first digits of the hash, for reports."""
-        return f"{self.path.name} (SHA-256 {self.sha256[:12]})"
+    def __init__(self, path: str | Path, provider: str = "cpu", threads: int = 0):
+        super().__init__(path, provider, threads)
+        for what, names in (("input", [name for name, _, _ in self.inputs]), ("output", self.outputs)):
+            if len(names) != 1:
+                raise DataError(f"{path}: it has {len(names)} {what}s ({', '.join(names)}); export it with only one")
+        ((_, kind, shape),) = self.inputs
+        if kind not in TYPES:
+            raise DataError(f"{path}: its input is a {kind}; float or float16 is needed")
+        dims, text = [d if isinstance(d, int) and d > 0 else None for d in shape], " x ".join(map(str, shape))
+        if len(dims) != 4 or dims[0] not in (1, None):
+            needed = "one image, 1 x 3 x height x width or 1 x height x width x 3, is needed"
+            raise DataError(f"{path}: its input is {text}; {needed}")
+        self.layout = "nchw" if dims[1] == 3 or (dims[1] is None and dims[3] != 3) else "nhwc"
+        if self.layout == "nhwc" and dims[3] != 3:
+            raise DataError(
+                f"{path}: neither the second nor the last axis of its input, {text}, has the 3 channels of an image"
+            )
+        self.type = TYPES[kind]
+        self.size = fixed_size(self.path, dims[2:] if self.layout == "nchw" else dims[1:3])
 
     def run(self, image: np.ndarray) -> np.ndarray:
         """Return the output, float32 of any shape, for one prepared image [h, w, 3]."""
-        batch = image[None] if self.layout == "nhwc" else image.transpose(2, 0, 1)[None]
-        feed = {self.session.get_inputs()[0].name: np.ascontiguousarray(batch, dtype=self.type)}
-        try:
-            (output,) = self.session.run(None, feed)
-        except Exception as e:  # onnxruntime's errors share no base but Exception
-            shape = " x ".join(map(str, batch.shape))
-            raise DataError(f"{self.path}: onnxruntime cannot run it on an input of {shape} ({first_line(e)}); see --help for "
-                            "the flags that set its input") from e  # fmt: skip
-        output = np.asarray(output)
+        (output,) = self.outputs_of((image if self.layout == "nhwc" else image.transpose(2, 0, 1))[None].astype(self.type))
         if output.dtype.kind != "f":
             raise DataError(f"{self.path}: its output is of type {output.dtype}, not scores; leave argmax out of the export")
         output = output.astype(np.float32)
@@ -91,45 +83,6 @@ class Network:
         if output.size == 0 or not output.max() > output.min():
             raise DataError(f"{self.path}: its output is the same number everywhere; check the model's weights")
         return output
-
-
-def _input_axes(path: Path, shape: list) -> tuple[str, tuple[int, int] | None]:
-    """Return layout and fixed size (height, width) of an input shape; names and None stand for free axes."""
-    dims = [d if isinstance(d, int) and d > 0 else None for d in shape]
-    text = " x ".join(str(d) for d in shape)
-    if len(dims) != 4 or dims[0] not in (1, None):
-        raise DataError(f"{path}: its input is {text}; one image, 1 x 3 x height x width or 1 x height x width x 3, is needed")
-    if dims[1] in (3, None) and (dims[1] == 3 or dims[3] != 3):
-        layout, sides = "nchw", (dims[2], dims[3])
-    elif dims[3] == 3:
-        layout, sides = "nhwc", (dims[1], dims[2])
-    else:
-        raise DataError(f"{path}: neither the second nor the last axis of its input, {text}, has the 3 channels of an image")
-    if (sides[0] is None) != (sides[1] is None):
-        raise DataError(f"{path}: its input, {text}, fixes only one side of the image; export it with both fixed or both free")
-    return layout, None if sides[0] is None else sides
-
-
-def open_network(path: str | Path, *, provider: str = "cpu", threads: int = 0) -> Network:
-    """Open an ONNX file, with its weights inside, and check that it maps one image to one output."""
-    if provider not in PROVIDERS:
-        raise UsageError(f"onnx-provider {provider!r} is not one of {', '.join(PROVIDERS)}")
-    path = Path(path)
-    data = read_model(path)
-    session = start_session(data, path, provider, threads)
-    try:
-        inputs = [(i.name, i.type, i.shape) for i in session.get_inputs()]  # names that are not UTF-8 fail here
-        names = {"input": [name for name, _, _ in inputs], "output": [o.name for o in session.get_outputs()]}
-    except UnicodeDecodeError as e:
-        raise DataError(f"{path}: the name of an input or an output is not UTF-8; export the network again") from e
-    for what, found in names.items():
-        if len(found) != 1:
-            raise DataError(f"{path}: it has {len(found)} {what}s ({', '.join(found)}); export it with only one")
-    _, kind, shape = inputs[0]
-    if kind not in TYPES:
-        raise DataError(f"{path}: its input is a {kind}; float or float16 is needed")
-    layout, size = _input_axes(path, shape)
-    return Network(path, hashlib.sha256(data).hexdigest(), session, layout, size, TYPES[kind])
 
 
 IMAGENET = ((0.485, 0.456, 0.406), (0.229, 0.224, 0.225))
@@ -178,29 +131,11 @@ def resize(image: np.ndarray, height: int, width: int) -> np.ndarray:
     return np.dstack([cv2.resize(p, (width, height), interpolation=method) for p in parts])
 
 
-def _numbers(value: object) -> bool:
-    real = isinstance(value, (list, tuple)) and all(isinstance(v, (int, float)) and not isinstance(v, bool) for v in value)
-    return real and len(value) == 3 and all(abs(v) < 1e6 for v in value)
-
-
-def _whole(value: object) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool) and 1 <= value <= 16384
-
-
-KEYS: dict[str, tuple[str, Callable[[object], bool]]] = {
-    "size": ("a whole number of pixels", _whole),
-    "multiple": ("a whole number of pixels", _whole),
-    "mean": ("three numbers", _numbers),
-    "std": ("three numbers above 0", lambda v: _numbers(v) and all(x > 0 for x in v)),
-    "output": ("disparity, depth or classes", lambda v: v in ("disparity", "depth", "classes")),
-}
-
-
-def check_value(key: str, value: object, where: str, error: type[Exception] = UsageError) -> None:
-    """Raise ``error`` unless a value may describe a network's input or output."""
-    wanted, good = KEYS[key]
-    if not good(value):
-        raise error(f"{where}: {key} must be {wanted}, not {value!r}")
+KEYS: dict[str, schema.Schema] = {
+    "size": schema.whole(1, 16384), "multiple": schema.whole(1, 16384), "mean": schema.items(schema.number(), 3),
+    "std": schema.items(schema.number(above=0), 3), "output": schema.one_of("disparity", "depth", "classes"),
+}  # fmt: skip
+_DESCRIPTION = schema.fields({}, KEYS, others=False)
 
 
 def side_file(model: Path) -> Path:
@@ -214,16 +149,11 @@ def read_side_file(model: Path) -> dict:
     if not os.path.lexists(path):
         return {}
     try:
-        values = schema.read(path)
+        values: dict = schema.read(path)
+        _DESCRIPTION(values, "")
     except (OSError, schema.SchemaError) as e:
         why = unread_reason(e) if isinstance(e, OSError) else e
-        raise DataError(f"{path}: cannot be read ({why}); fix or remove it") from e
-    if not isinstance(values, dict):
-        raise DataError(f"{path}: holds no JSON object; write one with the keys {', '.join(KEYS)}")
-    for key, value in values.items():
-        if key not in KEYS:
-            raise DataError(f"{path}: the key {key!r} is unknown; {', '.join(KEYS)} are supported")
-        check_value(key, value, str(path), DataError)
+        raise DataError(f"{path}: cannot be read ({why}); fix it, with keys out of {', '.join(KEYS)}, or remove it") from e
     return values
 
 
@@ -260,28 +190,21 @@ def cache_folder() -> Path:
     return home / "warpgs" / "Cache" if sys.platform == "win32" else home / "warpgs"
 
 
-@dataclass
 class MapCache:
-    """A folder of maps. Damaged entries are computed again; notes report them, and report if the folder cannot be written."""
+    """A folder of maps; ``notes`` report damaged entries, which are computed again, and a folder that cannot be written."""
 
-    folder: Path
-    """Folder of the entries."""
-    notes: list[str] = field(default_factory=list)
-    """Messages for the user: entries that were damaged, a folder that cannot be written."""
-    found: int = 0
-    """Number of entries read from disk."""
-    made: int = 0
-    """Number of entries computed."""
+    def __init__(self, folder: Path):
+        self.folder, self.notes, self.found, self.made = folder, list[str](), 0, 0
 
     def maps(
         self, image: np.ndarray, names: tuple[str, ...], decided_by: dict, make: Callable[[], tuple[np.ndarray, ...]]
     ) -> tuple[np.ndarray, ...]:
         """Return one map per name, float32 [H, W], of an image [H, W, 3], read from disk or computed by ``make``."""
         path = self._path(image, names, decided_by)
-        stored = self._read(path, names, image.shape[:2])
-        if stored is not None:
+        maps = self._read(path, names, image.shape[:2])
+        if maps is not None:
             self.found += 1
-            return stored
+            return maps
         maps = make()
         self.made += 1
         self._write(path, names, maps)
@@ -317,9 +240,8 @@ class MapCache:
             path.parent.mkdir(parents=True, exist_ok=True)
             write_bytes(path, save({n: np.ascontiguousarray(m) for n, m in zip(names, maps)}))
         except (OSError, ResourceError) as e:
-            note = f"maps are not cached ({e}); set WARPGS_CACHE to another folder"
             if not any(n.startswith("maps are not cached") for n in self.notes):
-                self.notes.append(note)
+                self.notes.append(f"maps are not cached ({e}); set WARPGS_CACHE to another folder")
 
 
 DEFAULTS = Preprocessing(384, 32, *HALF, output="disparity")
@@ -371,30 +293,24 @@ def complete_disparity(image: np.ndarray, depth: np.ndarray, valid: np.ndarray, 
     """Fill the gaps of a depth map [u] in inverse depth, not across colour edges; return [H, W] in [0, 1]."""
     # The ratio of smoothed w / z and smoothed w, by the fast global smoother (Min et al. 2014), which the image guides. The
     # weight w is small where 1 / z changes much when the match shifts by one pixel.
+    import cv2
+
     valid = valid & (depth > 0) & np.isfinite(depth)
     if not valid.any():
         raise DataError("no pixel has a depth, so there is nothing to complete; use --depth-model, or other views")
-    inverse = np.zeros(depth.shape, np.float64)
-    inverse[valid] = 1 / depth[valid].astype(np.float64)
-    inverse[valid] = np.clip(inverse[valid], *np.percentile(inverse[valid], CLIP))
-    low, high = inverse[valid].min(), inverse[valid].max()
+    inverse = 1 / depth[valid].astype(np.float64)
+    inverse = np.clip(inverse, *np.percentile(inverse, CLIP))
+    low, high = inverse.min(), inverse.max()
     if not high > low:
         return np.zeros(depth.shape, np.float32)
-    error = sensitivity[valid] * inverse[valid] ** 2  # |d(1/z)/dpx|
+    error = sensitivity[valid] * inverse**2  # |d(1/z)/dpx|
     known = error[np.isfinite(error)]
     scale = max(float(np.median(known)) if len(known) else 0.0, 1e-6 * high)
     ratio = np.minimum(np.where(np.isfinite(error), error, np.inf) / scale, MAX_ERROR_RATIO)
-    weight = np.zeros(depth.shape, np.float32)
-    weight[valid] = 1 / (1 + ratio**2)
-    return unit_range(_spread(image, ((inverse - low) / (high - low)).astype(np.float32), weight))
-
-
-def _spread(image: np.ndarray, values: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Return values [H, W] smoothed by weight: from nearby pixels if these have weight, else from farther ones."""
-    import cv2
-
+    values, weight = np.zeros((2, *depth.shape), np.float32)
+    values[valid], weight[valid] = (inverse - low) / (high - low), 1 / (1 + ratio**2)
     guide = np.round(np.clip(image, 0, 1) * 255).astype(np.uint8)
-    received = np.full(values.shape, MEAN_WEIGHT)
+    received = np.full(depth.shape, MEAN_WEIGHT)
     total = received * np.average(values, weights=weight)
     with single_threaded_opencv():
         for reach, fraction in REACHES:
@@ -402,4 +318,4 @@ def _spread(image: np.ndarray, values: np.ndarray, weight: np.ndarray) -> np.nda
             smoother = cv2.ximgproc.createFastGlobalSmootherFilter(guide, reach**2, COLOR_SIGMA)
             total += fraction * smoother.filter(weight * values)
             received += fraction * smoother.filter(weight)
-    return total / received
+    return unit_range(total / received)

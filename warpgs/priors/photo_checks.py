@@ -92,7 +92,7 @@ def _places(view: View) -> Places:
     import cv2
 
     features = sift_features(view, MAX_PIXELS, MAX_FEATURES)
-    columns, rows = features.pixels.astype(int).T
+    columns, rows = features[0].astype(int).T
     gray = cv2.cvtColor(view.image, cv2.COLOR_RGB2GRAY)
     fine, coarse = (cv2.GaussianBlur(gray, (0, 0), sigma) for sigma in (FINE, COARSE))
     bands = [cv2.blur((a - b) ** 2, (PATCH, PATCH))[rows, columns].astype(float) for a, b in ((gray, fine), (fine, coarse))]
@@ -171,25 +171,20 @@ def _check(name: str, differences: list[np.ndarray]) -> PhotoCheck:
 
 def photo_notes(checks: Sequence[PhotoCheck]) -> list[str]:
     """Return notes on photographs with faults, and on photographs that could not be compared; an empty list without any."""
-    notes = []
     blurred = sorted((c for c in checks if c.blurred), key=lambda c: c.sharpness)
-    if blurred:
-        notes.append(
-            "less detail than in other photographs of the same places, probably blur: "
-            f"{_listed([f'{c.name} ({c.sharpness:.2f} x as sharp)' for c in blurred])}; look at them, and remove blurred ones"
-        )
     exposed = sorted((c for c in checks if c.exposed_otherwise), key=lambda c: -abs(math.log(c.brightness)))
-    if exposed:
-        factors = [f"{c.name} ({c.brightness:.2f} x as bright)" for c in exposed]
-        notes.append(f"exposure differs from neighbouring photographs: {_listed(factors)}; {REMEDY}")
-    tinted = [c for c in checks if c.tinted]
-    if tinted:
-        factors = [f"{c.name} (red {c.channels[0]:.2f}, green {c.channels[1]:.2f}, blue {c.channels[2]:.2f} x)" for c in tinted]
-        notes.append(f"white balance differs from neighbouring photographs: {_listed(factors)}; {REMEDY}")
+    tints = [(c.name, *c.channels) for c in checks if c.tinted]
+    faults = (
+        ("less detail than in other photographs of the same places, probably blur", "look at them, and remove blurred ones",
+         [f"{c.name} ({c.sharpness:.2f} x as sharp)" for c in blurred]),
+        ("exposure differs from neighbouring photographs", REMEDY,
+         [f"{c.name} ({c.brightness:.2f} x as bright)" for c in exposed]),
+        ("white balance differs from neighbouring photographs", REMEDY,
+         [f"{name} (red {red:.2f}, green {green:.2f}, blue {blue:.2f} x)" for name, red, green, blue in tints]),
+    )  # fmt: skip
+    notes = [f"{what}: {_listed(named)}; {remedy}" for what, remedy, named in faults if named]
     alone = [c.name for c in checks if not c.compared_with]
-    if alone:
-        notes.append(f"blur and exposure not checked, too few matches: {_listed(alone)}")
-    return notes
+    return [*notes, *([f"blur and exposure not checked, too few matches: {_listed(alone)}"] if alone else [])]
 
 
 def _listed(words: list[str]) -> str:

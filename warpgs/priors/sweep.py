@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import torch
 
 from warpgs import geometry
 from warpgs.device import format_bytes, installed_bytes
-from warpgs.errors import UsageError
 from warpgs.geometry import check_pinhole, matmul
 from warpgs.kernels.sweep import NEUTRAL, best_inverses, check_round_trip, plane_costs, scanline_costs
-from warpgs.priors.flow import homogeneous
+from warpgs.priors.flow import homogeneous, no_depth
 from warpgs.priors.networks import single_threaded_opencv
 from warpgs.scene import Camera, View, ViewDepth
 
@@ -135,54 +134,29 @@ EDGE = 0.06
 UNIT = 4096
 """Integer that stands for cost 1 in cost volumes of 16 bits. Such volumes need half the memory of float32; the first access
 to memory takes as long as the computation."""
-MAX_LARGE_STEP = 0.99
-"""Largest penalty P2 at which the sum of four path costs, each at most 1 + P2, stays below 2^15 in units of 1 / `UNIT`."""
 PLANES_AT_ONCE = 16
 """Number of planes per launch on the GPU."""
 
 
-@dataclass(frozen=True)
-class SweepConfig:
-    """Settings of the planes, of the smoothing of costs and of the consistency check."""
-
-    near_count: int = 4
-    """Number of other views with which each view is compared: the nearest that see the same surfaces."""
-    max_views: int = 30
-    """Largest number of views that are swept: those that together see most of the scene. All others serve only for
-    comparison."""
-    window: int = 7
-    """Side of the square in which pixels are correlated [px]: 3, 5 or 7."""
-    spacing: float = 0.5
-    """Largest step of a match from one plane to the next [px], if `max_planes` allows it."""
-    max_planes: int = 256
-    """Largest number of planes, at least 8; memory is about 5 bytes per pixel and plane."""
-    max_pixels: int = 200_000
-    """Largest number of pixels of an image; larger ones are swept at a reduced size."""
-    small_step: float = 0.03
-    """Penalty for a depth one plane off the neighbouring pixel's (P1); costs are in [0, 1]."""
-    large_step: float = 0.5
-    """Penalty for any other depth (P2) where the image is uniform; less across the image's edges, but at least 1.5 P1."""
-    max_round_trip: float = 0.6
-    """Largest error [px] when a pixel is projected into another view and back by that view's depth."""
-    min_parallax: float = 0.5
-    """Smallest angle between the two rays [deg]; below it depth is noise."""
-
-    def __post_init__(self):
-        if self.window not in (3, 5, 7):  # kernels add up squares in 32 bits
-            raise UsageError(f"sweep window {self.window} must be 3, 5 or 7")
-        if not (self.max_planes >= 8 and self.near_count >= 1 and self.max_pixels >= 1 and self.max_views >= 2):
-            raise UsageError(
-                "sweep max-planes must be at least 8, near-count and max-pixels at least 1, max-views at least 2; found "
-                f"{self.max_planes}, {self.near_count}, {self.max_pixels}, {self.max_views}"
-            )
-        for name in ("spacing", "small_step", "large_step", "max_round_trip", "min_parallax"):
-            if not getattr(self, name) > 0:
-                raise UsageError(f"sweep {name.replace('_', '-')} must be above 0, not {getattr(self, name)}")
-        if not max(self.large_step, 1.5 * self.small_step) <= MAX_LARGE_STEP:
-            raise UsageError(
-                f"sweep large-step and 1.5 times small-step must be at most {MAX_LARGE_STEP}, not {self.large_step} and "
-                f"{1.5 * self.small_step:g}"
-            )
+NEAR_COUNT = 4
+"""Number of other views with which each view is compared: the nearest that see the same surfaces."""
+MAX_VIEWS = 30
+"""Largest number of views that are swept: those that together see most of the scene. All others serve only for comparison."""
+WINDOW = 7
+"""Side of the square in which pixels are correlated [px]; kernels, which add up squares in 32 bits, take 3, 5 or 7."""
+SPACING, MAX_PLANES = 0.5, 256
+"""Largest step of a match from one plane to the next [px], if the largest number of planes allows it; memory is about 5 bytes
+per pixel and plane."""
+MAX_PIXELS = 200_000
+"""Largest number of pixels of an image; larger ones are swept at a reduced size."""
+SMALL_STEP, LARGE_STEP = 0.03, 0.5
+"""Penalty for a depth one plane off the neighbouring pixel's (P1), and for any other depth (P2) in a uniform area. P2 is
+less across the image's edges, but at least 1.5 P1. The sum of four path costs, each at most 1 + P2, stays below 2^15 in units
+of 1 / `UNIT`. Costs are in [0, 1]."""
+MAX_ROUND_TRIP = 0.6
+"""Largest error [px] when a pixel is projected into another view and back by that view's depth."""
+MIN_PARALLAX = 0.5
+"""Smallest angle between the two rays [deg]; below it depth is noise."""
 
 
 def project_inverse(first: Camera, second: Camera, pixels: np.ndarray, inverse: np.ndarray) -> np.ndarray:
@@ -197,7 +171,7 @@ def project_inverse(first: Camera, second: Camera, pixels: np.ndarray, inverse: 
 
 
 def plane_inverses(
-    first: Camera, others: Sequence[Camera], bounds: tuple[float, float], spacing: float, max_planes: int
+    first: Camera, others: Sequence[Camera], bounds: tuple[float, float], max_planes: int = MAX_PLANES
 ) -> np.ndarray:
     """Return 8 to ``max_planes`` inverse depths [1/u], evenly spaced and ascending, from the far to the near bound [u]."""
     near, far = bounds
@@ -210,7 +184,7 @@ def plane_inverses(
         inside = (found >= 0).all(-1) & (found[..., 0] < other.width) & (found[..., 1] < other.height)  # False for NaN
         steps = np.linalg.norm(np.diff(found, axis=0), axis=2)[inside[1:] & inside[:-1]]
         longest = max(longest, float(steps.max(initial=0)) * (len(ladder) - 1))
-    return np.linspace(1 / far, 1 / near, int(np.clip(np.ceil(longest / spacing) + 1, 8, max_planes)))
+    return np.linspace(1 / far, 1 / near, int(np.clip(np.ceil(longest / SPACING) + 1, 8, max_planes)))
 
 
 def plane_homography(first: Camera, second: Camera, inverse: float) -> np.ndarray:
@@ -237,19 +211,21 @@ def gray_of(view: View) -> np.ndarray:
     return (0.299 * red + 0.587 * green + 0.114 * blue).astype(np.float32)
 
 
-def step_limits(colors: np.ndarray, small_step: float, large_step: float) -> np.ndarray:
+def step_limits(colors: np.ndarray, small_step: float = SMALL_STEP, large_step: float = LARGE_STEP) -> np.ndarray:
     """Return P2 of the steps along the first axis of an image [L, B, 3], in units of 1 / `UNIT`, int16, shape [L - 1, B]."""
     jumps = np.abs(np.diff(colors, axis=0)).max(2).astype(float)  # the rounding of float32's exp depends on the processor
     return np.rint(np.maximum(large_step * np.exp(-jumps / EDGE), 1.5 * small_step) * UNIT).astype(np.int16)
 
 
-def matching_costs_cpu(view: View, others: Sequence[View], inverses: np.ndarray, window: int) -> torch.Tensor:
+def matching_costs_cpu(view: View, others: Sequence[View], inverses: np.ndarray, window: int = WINDOW) -> torch.Tensor:
     """Return the disagreement of views at D inverse depths [1/u] in units of 1 / `UNIT`, as `plane_costs` does."""
     homographies = plane_homographies(view.camera, [o.camera for o in others], inverses)
     return plane_costs(gray_of(view), [gray_of(o) for o in others], homographies, window, NOISE, UNIT)
 
 
-def path_costs(costs: torch.Tensor, image: np.ndarray, small_step: float, large_step: float) -> torch.Tensor:
+def path_costs(
+    costs: torch.Tensor, image: np.ndarray, small_step: float = SMALL_STEP, large_step: float = LARGE_STEP
+) -> torch.Tensor:
     """Return the sum of the semi-global path costs from four sides, int16 [H, W, D], in units of 1 / `UNIT`."""
     down, across = (
         torch.from_numpy(step_limits(colors, small_step, large_step).astype(np.int32)).to(costs.device)
@@ -258,10 +234,9 @@ def path_costs(costs: torch.Tensor, image: np.ndarray, small_step: float, large_
     return scanline_costs(costs, down, across.T, round(small_step * UNIT))
 
 
-def inverse_depths_cpu(view: View, others: Sequence[View], planes: np.ndarray, config: SweepConfig) -> np.ndarray:
+def inverse_depths_cpu(view: View, others: Sequence[View], planes: np.ndarray) -> np.ndarray:
     """Return inverse depths [1/u] of a view, float64, shape [H, W], by sweeping planes against other views."""
-    costs = matching_costs_cpu(view, others, planes, config.window)
-    return best_inverses(path_costs(costs, view.image, config.small_step, config.large_step), planes)
+    return best_inverses(path_costs(matching_costs_cpu(view, others, planes), view.image), planes)
 
 
 MAPS = 24
@@ -274,7 +249,7 @@ def needed_bytes(view: View, planes: int) -> int:
 
 
 def matching_costs_cuda(
-    view: View, others: Sequence[View], inverses: np.ndarray, window: int, device: torch.device
+    view: View, others: Sequence[View], inverses: np.ndarray, device: torch.device, window: int = WINDOW
 ) -> torch.Tensor:
     """Return the costs of `matching_costs_cpu`, without its padding planes, int16, shape [H, W, D], on the device."""
 
@@ -322,12 +297,9 @@ def best_inverse(costs: torch.Tensor, inverses: np.ndarray) -> np.ndarray:
 
 
 @torch.no_grad()
-def inverse_depths_cuda(
-    view: View, others: Sequence[View], planes: np.ndarray, config: SweepConfig, device: torch.device
-) -> np.ndarray:
+def inverse_depths_cuda(view: View, others: Sequence[View], planes: np.ndarray, device: torch.device) -> np.ndarray:
     """Return inverse depths [1/u] of a view, float64, shape [H, W], by sweeping planes against at least one other view."""
-    costs = matching_costs_cuda(view, others, planes, config.window, device)
-    return best_inverse(path_costs(costs, view.image, config.small_step, config.large_step), planes)
+    return best_inverse(path_costs(matching_costs_cuda(view, others, planes, device), view.image), planes)
 
 
 # Plane-sweep depth: agreement with other views at every depth, smoothed along scanlines, then cross-checked.
@@ -342,12 +314,12 @@ GPU_FRACTION = 0.25
 """Fraction of a GPU's memory that a sweep may take."""
 
 
-def _reduced(view: View, max_pixels: int) -> View:
-    """Return the view, resized to at most ``max_pixels`` where it is larger."""
+def _reduced(view: View) -> View:
+    """Return the view, resized to at most `MAX_PIXELS` where it is larger."""
     import cv2
 
     c = view.camera
-    shrink = min(1.0, (max_pixels / (c.width * c.height)) ** 0.5)
+    shrink = min(1.0, (MAX_PIXELS / (c.width * c.height)) ** 0.5)
     if shrink == 1.0:
         return view
     width, height = max(1, int(c.width * shrink)), max(1, int(c.height * shrink))
@@ -357,7 +329,7 @@ def _reduced(view: View, max_pixels: int) -> View:
 
 
 def consistent_depth(
-    views: Mapping[int, View], inverses: Mapping[int, np.ndarray], index: int, others: Sequence[int], config: SweepConfig
+    views: Mapping[int, View], inverses: Mapping[int, np.ndarray], index: int, others: Sequence[int]
 ) -> ViewDepth:
     """Return the depth of one view where it is geometrically consistent with the depth of at least one other view."""
     # a point returns to its pixel by the other view's depth; the sensitivity is the smallest among the consistent views
@@ -365,8 +337,8 @@ def consistent_depth(
     sensitivity = np.full(own.shape, np.inf)
     for j in others:
         agrees = check_round_trip(
-            views[index].camera, views[j].camera, own, inverses[j], sensitivity, most=config.max_round_trip,
-            min_parallax=config.min_parallax,
+            views[index].camera, views[j].camera, own, inverses[j], sensitivity, most=MAX_ROUND_TRIP,
+            min_parallax=MIN_PARALLAX,
         )  # fmt: skip
         if not agrees.any():
             notes.append(f"no depth agrees with {views[j].name}")
@@ -374,20 +346,15 @@ def consistent_depth(
     return ViewDepth(np.where(valid, 1 / own, 0).astype(np.float32), valid, sensitivity.astype(np.float32), tuple(notes))
 
 
-def _backend(
-    views: Mapping[int, View], planes: Mapping[int, np.ndarray], config: SweepConfig, device: torch.device
-) -> tuple[Callable[[View, Sequence[View], np.ndarray], np.ndarray], list[str]]:
-    """Return the function that sweeps a view on the device, or on the CPU if the device cannot, and messages on this."""
-    notes: list[str] = []
-    if device.type == "cuda":
-        needed = max(needed_bytes(views[i], len(p)) for i, p in planes.items())
-        smallest = min(min(v.image.shape[:2]) for v in views.values())
-        # not by the free memory: a resumed fit must find the same depths again
-        if needed > GPU_FRACTION * installed_bytes(device):
-            notes.append(f"depth is swept on the CPU, since a GPU needs {format_bytes(needed / GPU_FRACTION)} of memory")
-        elif smallest > config.window // 2:  # torch mirrors no border wider than the image
-            return lambda view, others, p: inverse_depths_cuda(view, others, p, config, device), notes
-    return lambda view, others, p: inverse_depths_cpu(view, others, p, config), notes
+def _on_gpu(views: Mapping[int, View], planes: Mapping[int, np.ndarray], device: torch.device) -> tuple[bool, list[str]]:
+    """Return whether the device sweeps, which a GPU may not be able to, and notes on this."""
+    if device.type != "cuda":
+        return False, []
+    needed = max(needed_bytes(views[i], len(p)) for i, p in planes.items())
+    # not by the free memory: a resumed fit must find the same depths again
+    if needed > GPU_FRACTION * installed_bytes(device):
+        return False, [f"depth is swept on the CPU, since a GPU needs {format_bytes(needed / GPU_FRACTION)} of memory"]
+    return min(min(v.image.shape[:2]) for v in views.values()) > WINDOW // 2, []  # torch mirrors no border wider than the image
 
 
 def _at_size(found: ViewDepth, small: View, view: View, notes: Sequence[str]) -> ViewDepth:
@@ -405,41 +372,34 @@ def _at_size(found: ViewDepth, small: View, view: View, notes: Sequence[str]) ->
     return ViewDepth(np.where(valid, depth, 0), valid, np.where(valid, sensitivity, np.inf), (*notes, *found.notes))
 
 
-def no_depth(view: View, *notes: str, searched: bool = True) -> ViewDepth:
-    """Return the depth of a view of which none is known."""
-    shape = view.image.shape[:2]
-    return ViewDepth(np.zeros(shape, np.float32), np.zeros(shape, bool), np.full(shape, np.inf, np.float32), notes, searched)
-
-
 def sweep_depths(
-    views: Sequence[View], bounds: Sequence[tuple[float, float]], config: SweepConfig, device: torch.device = CPU,
-    progress: Callable[[int, int], object] = lambda done, total: None,
+    views: Sequence[View], bounds: Sequence[tuple[float, float]], device: torch.device = CPU,
+    progress: Callable[[int, int], object] = lambda done, total: None, max_planes: int = MAX_PLANES,
 ) -> list[ViewDepth]:  # fmt: skip
     """Return the depth of every view, at its own size, by sweeping planes against views that see the same surfaces."""
     cameras = [v.camera for v in views]
     sight = shared_sight(cameras, bounds)
-    swept = spread_views(sight, config.max_views)
-    others = {i: matching_views(sight, cameras, i, config.near_count, range(len(views))) for i in swept}
+    swept = spread_views(sight, MAX_VIEWS)
+    others = {i: matching_views(sight, cameras, i, NEAR_COUNT, range(len(views))) for i in swept}
     with single_threaded_opencv():
-        small = {i: _reduced(views[i], config.max_pixels) for i in sorted({*swept, *(j for o in others.values() for j in o)})}
+        small = {i: _reduced(views[i]) for i in sorted({*swept, *(j for o in others.values() for j in o)})}
         planes = {
-            i: plane_inverses(
-                small[i].camera, [small[j].camera for j in others[i]], bounds[i], config.spacing, config.max_planes
-            )
-            for i in swept
+            i: plane_inverses(small[i].camera, [small[j].camera for j in others[i]], bounds[i], max_planes) for i in swept
         }
-        find, messages = _backend(small, planes, config, device)
+        on_gpu, messages = _on_gpu(small, planes, device)
         inverses = {}
         for done, i in enumerate(swept, 1):
-            if others[i]:
-                inverses[i] = find(small[i], [small[j] for j in others[i]], planes[i])
-            else:
+            compared = [small[j] for j in others[i]]
+            if not compared:
                 inverses[i] = np.full(small[i].image.shape[:2], planes[i][0])
+            elif on_gpu:
+                inverses[i] = inverse_depths_cuda(small[i], compared, planes[i], device)
+            else:
+                inverses[i] = inverse_depths_cpu(small[i], compared, planes[i])
             progress(done, len(swept))
         note = f"not swept: the {len(swept)} swept views (of {len(views)}) see most of the scene"
         out = [no_depth(v, note, searched=False) for v in views]
         for i in swept:
-            partners = matching_views(sight, cameras, i, config.near_count, swept)
-            found = consistent_depth(small, inverses, i, partners, config)
+            found = consistent_depth(small, inverses, i, matching_views(sight, cameras, i, NEAR_COUNT, swept))
             out[i] = _at_size(found, small[i], views[i], messages if i == swept[0] else ())
     return out

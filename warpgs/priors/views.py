@@ -6,7 +6,6 @@ import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
@@ -19,10 +18,10 @@ from warpgs.priors.networks import (
     MapCache,
     Network,
     Preprocessing,
+    cache_folder,
     complete_disparity,
     describe,
     network_disparity,
-    open_network,
     resize,
     single_threaded_opencv,
     without_ipp,
@@ -59,13 +58,8 @@ EDGE_LOW, EDGE_HIGH = 100.0, 250.0
 """Canny's thresholds on the smoothed image: sums of absolute Sobel derivatives of 8-bit colours."""
 
 
-@dataclass(frozen=True)
-class SemanticMaps:
-    """The semantic maps of `warpgs.scene.Prior`: float32, shape [H, W], in [0, 1]."""
-
-    confidence: np.ndarray
-    boundary: np.ndarray
-    foreground: np.ndarray
+Maps = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""Confidence, boundary and foreground of `warpgs.scene.Prior`: float32, shape [H, W], in [0, 1]."""
 
 
 def class_probabilities(network: Network, preprocessing: Preprocessing, image: np.ndarray) -> np.ndarray:
@@ -88,11 +82,10 @@ def class_probabilities(network: Network, preprocessing: Preprocessing, image: n
 def boundary_weight(labels: np.ndarray) -> np.ndarray:
     """Return omega_boundary of a label map [H, W]: exp(-d^2 / 2 s^2) of the distance d [px] to another label, float32."""
     edge = np.zeros(labels.shape, bool)
-    across, down = labels[:, 1:] != labels[:, :-1], labels[1:] != labels[:-1]
-    edge[:, 1:] |= across
-    edge[:, :-1] |= across
-    edge[1:] |= down
-    edge[:-1] |= down
+    for differs, sides in ((labels[:, 1:] != labels[:, :-1], (edge[:, 1:], edge[:, :-1])),
+                           (labels[1:] != labels[:-1], (edge[1:], edge[:-1]))):  # fmt: skip
+        for side in sides:
+            side |= differs
     return _falloff(edge)
 
 
@@ -107,27 +100,20 @@ def _falloff(edge: np.ndarray) -> np.ndarray:
     return np.exp(-0.5 / (BOUNDARY_WIDTH * edge.shape[1]) ** 2 * squares).astype(np.float32)
 
 
-def network_semantics(network: Network, preprocessing: Preprocessing, image: np.ndarray) -> SemanticMaps:
+def network_semantics(network: Network, preprocessing: Preprocessing, image: np.ndarray) -> Maps:
     """Return the maps of an image [H, W, 3] in [0, 1] by a segmentation network."""
     p = class_probabilities(network, preprocessing, image)
-    foreground = np.clip(1 - p[..., 0], 0, 1)
-    return SemanticMaps(np.clip(p.max(-1), 0, 1), boundary_weight(p.argmax(-1)), foreground)
+    return np.clip(p.max(-1), 0, 1), boundary_weight(p.argmax(-1)), np.clip(1 - p[..., 0], 0, 1)
 
 
 def _fast_length(length: int) -> int:
     """Return the largest number up to ``length`` [px] with the prime factors 2, 3 and 5 only, for fast Fourier transforms."""
-    while length > 1:
-        rest = length
-        for factor in (2, 3, 5):
-            while rest % factor == 0:
-                rest //= factor
-        if rest == 1:
-            break
+    while 30**16 % length:
         length -= 1
     return length
 
 
-def classical_semantics(image: np.ndarray) -> SemanticMaps:
+def classical_semantics(image: np.ndarray) -> Maps:
     """Return saliency as foreground and edges as boundaries of an image [H, W, 3] in [0, 1], without a network."""
     import cv2
 
@@ -135,8 +121,8 @@ def classical_semantics(image: np.ndarray) -> SemanticMaps:
     shrink = (MAX_PIXELS / (height * width)) ** 0.5
     if shrink < 1:
         small = classical_semantics(resize(image, *(_fast_length(max(1, int(shrink * n))) for n in (height, width))))
-        parts = (np.clip(resize(part, height, width), 0, 1) for part in (small.confidence, small.boundary, small.foreground))
-        return SemanticMaps(*parts)
+        confidence, boundary, foreground = (np.clip(resize(part, height, width), 0, 1) for part in small)
+        return confidence, boundary, foreground
     pixels = np.round(np.clip(image, 0, 1) * 255).astype(np.uint8)
     flat = np.clip(cv2.ximgproc.l0Smooth(pixels, None, L0_WEIGHT, L0_GROWTH), 0, 255).astype(np.uint8)
     boundary = _falloff(cv2.Canny(flat, EDGE_LOW, EDGE_HIGH) > 0)
@@ -146,21 +132,21 @@ def classical_semantics(image: np.ndarray) -> SemanticMaps:
     even = cv2.ximgproc.fastGlobalSmootherFilter(flat, saliency.astype(np.float32), SMOOTHING, 8.0)
     low, high = np.percentile(even, [2, 98])
     foreground = np.clip((even - low) / max(high - low, 1e-6), 0, 1).astype(np.float32)
-    return SemanticMaps(np.maximum(foreground, 1 - foreground), boundary, foreground)
+    return np.maximum(foreground, 1 - foreground), boundary, foreground
 
 
-def classical_maps(images: Sequence[np.ndarray], tell: Callable[[str], object] = lambda line: None) -> list[SemanticMaps]:
+def classical_maps(images: Sequence[np.ndarray], tell: Callable[[str], object] = lambda line: None) -> list[Maps]:
     """Return `classical_semantics` of each image, each by one thread, so that results do not depend on their number."""
     with single_threaded_opencv(), ThreadPoolExecutor(os.cpu_count() or 1, initializer=without_ipp) as pool:
         made = [pool.submit(classical_semantics, image) for image in images]
         return [m.result() for m in counted(made, tell, "finding salient regions", "views")]
 
 
-def knows_foreground(maps: SemanticMaps) -> bool:
-    """Return whether the maps separate an object from its background."""
+def knows_foreground(boundary: np.ndarray, foreground: np.ndarray) -> bool:
+    """Return whether maps separate an object from its background."""
     # a network finds nothing in tabletop scans, which hold no VOC class
-    mean = float(maps.foreground.mean())
-    return mean >= MIN_FOREGROUND and (bool(maps.boundary.any()) or mean >= 0.5)
+    mean = float(foreground.mean())
+    return mean >= MIN_FOREGROUND and (bool(boundary.any()) or mean >= 0.5)
 
 
 MIN_CONSISTENT = 50
@@ -188,34 +174,39 @@ class PriorConfig(Checked):
             raise UsageError("--depth-guides requires --depth-model; for maps from files, give --depths instead")
 
 
-DisparitySource = Callable[[int], tuple[np.ndarray, str]]
-"""Function from the index of a view to its disparity, float32 [H, W], and a phrase on its source."""
+Source = Callable[[int], tuple[tuple[np.ndarray, ...], str]]
+"""Function from the index of a view to its maps, float32 [H, W] each, and a phrase on their source."""
 
 
-def _depth_network(views: Sequence[View], config: PriorConfig, threads: int, cache: MapCache | None, notes: list[str]):
-    network = open_network(config.depth_model, provider=config.onnx_provider, threads=threads)
-    how, messages = describe(network, networks.DEFAULTS, "depth")
-    if how.output not in ("disparity", "depth"):
-        raise DataError(f"{network.path}: its output is {how.output}, not depth; check --depth-model")
-    notes += [f"depth: {network.title} gives {how.output}", *messages]
+def _by_network(
+    kind: str, views: Sequence[View], config: PriorConfig, threads: int, cache: MapCache, notes: list[str]
+) -> Source:
+    """Return the source of the disparity, or of the semantic maps, of a network."""
+    is_depth = kind == "depth"
+    network = Network(getattr(config, f"{kind}_model"), config.onnx_provider, threads)
+    how, messages = describe(network, networks.DEFAULTS if is_depth else DEFAULTS, kind)
+    if (how.output == "classes") is is_depth:
+        raise DataError(f"{network.path}: its output is {how.output}, which is not for --{kind}-model; check the flags")
+    notes += [f"{'depth' if is_depth else 'semantics'}: {network.title} gives {how.output}", *messages]
     decided_by = {"model": network.sha256, "provider": config.onnx_provider, **asdict(how)}
+    names = ("disparity",) if is_depth else ("confidence", "boundary", "foreground")
 
-    def disparity(i: int) -> tuple[np.ndarray, str]:
+    def maps(i: int) -> tuple[tuple[np.ndarray, ...], str]:
         image = views[i].image
 
-        def make() -> tuple[np.ndarray]:
-            return (network_disparity(network, how, image),)
+        def make() -> tuple[np.ndarray, ...]:
+            return (network_disparity(network, how, image),) if is_depth else network_semantics(network, how, image)
 
-        (found,) = make() if cache is None else cache.maps(image, ("disparity",), decided_by, make)
-        return found, f"{how.output} by {network.title}"
+        return cache.maps(image, names, decided_by, make), f"{how.output} by {network.title}"
 
-    return disparity
+    return maps
 
 
-def _depth_views(views: Sequence[View], depths: Sequence[ViewDepth] | None, notes: list[str]) -> DisparitySource:
+def _by_views(views: Sequence[View], depths: Sequence[ViewDepth] | None, notes: list[str]) -> Source:
+    """Return the source of disparity from the depth that other views confirm."""
     if depths is None:
         notes.append("depth: neither a network nor other views gave depth, so the importance has no geometry score")
-        return lambda i: (np.zeros(views[i].image.shape[:2], np.float32), "none")
+        return lambda i: ((np.zeros(views[i].image.shape[:2], np.float32),), "none")
     fractions = [float(d.valid.mean()) for d in depths]
     span = f"{min(fractions):.1%} to {max(fractions):.1%}"
     notes.append(Detail(f"depth: from the other views, {span} of a view's pixels, then filled in"))
@@ -223,73 +214,34 @@ def _depth_views(views: Sequence[View], depths: Sequence[ViewDepth] | None, note
     if poor:
         notes.append(f"no consistent depth in {', '.join(poor)}, so there is no geometry score there; --depth-model adds depth")
 
-    def disparity(i: int) -> tuple[np.ndarray, str]:
+    def disparity(i: int) -> tuple[tuple[np.ndarray, ...], str]:
         view, d = views[i], depths[i]
         if d.valid.sum() < MIN_CONSISTENT:
-            return np.zeros(d.depth.shape, np.float32), "none"
-        found = complete_disparity(view.image, d.depth, d.valid, d.sensitivity)
-        return found, f"depth consistent with other views at {fractions[i]:.1%} of the pixels, completed"
+            return (np.zeros(d.depth.shape, np.float32),), "none"
+        completed = complete_disparity(view.image, d.depth, d.valid, d.sensitivity)
+        return (completed,), f"depth consistent with other views at {fractions[i]:.1%} of the pixels, completed"
 
     return disparity
 
 
-SemanticsSource = Callable[[int], tuple[SemanticMaps, str]]
-"""Function from the index of a view to its semantic maps and a phrase on their source."""
-
-
-def _segmentation_network(views: Sequence[View], config: PriorConfig, threads: int, cache: MapCache | None, notes: list[str]):
-    network = open_network(config.segmentation_model, provider=config.onnx_provider, threads=threads)
-    how, messages = describe(network, DEFAULTS, "segmentation")
-    if how.output != "classes":
-        raise DataError(f"{network.path}: its output is {how.output}, not a segmentation; check the flags")
-    notes += [f"semantics: {network.title}, {CLASSES} classes", *messages]
-    decided_by = {"model": network.sha256, "provider": config.onnx_provider, **asdict(how)}
-
-    def maps(i: int) -> tuple[SemanticMaps, str]:
-        image = views[i].image
-
-        def make() -> tuple[np.ndarray, ...]:
-            m = network_semantics(network, how, image)
-            return m.confidence, m.boundary, m.foreground
-
-        found = make() if cache is None else cache.maps(image, ("confidence", "boundary", "foreground"), decided_by, make)
-        return SemanticMaps(*found), f"classes by {network.title}"
-
-    return maps
-
-
-def _classical(views: Sequence[View], notes: list[str], tell: Callable[[str], object]) -> SemanticsSource:
-    words = "semantics: no network, so saliency is used as foreground and edges as boundaries"
-    notes.append(Detail(f"{words}; --segmentation-model adds a network"))
-
-    found = classical_maps([v.image for v in views], tell)
-    return lambda i: (found[i], "saliency and edges")
-
-
-def _stands_out(region: np.ndarray | None) -> bool:
-    """Return whether a region shows an object; False if a mask only cuts off a frame or a passer-by."""
-    return region is not None and 0 < float(region.mean()) <= MAX_OBJECT_FRACTION
-
-
-def _fall_back(found: list[tuple[SemanticMaps, str]], views: Sequence[View], regions, classical: bool, notes: list[str]):
-    """Replace an unknown foreground by the region of the view, or by zeros if the view has no region."""
+def _fall_back(found: list, views: Sequence[View], regions: Sequence[np.ndarray | None], classical: bool, notes: list[str]):
+    """Return maps and sources, an unknown foreground replaced by the region of the view, or by zeros without a region."""
     replaced, empty, result = [], [], []
-    for (maps, source), view, region in zip(found, views, regions):
-        if _stands_out(region) and (classical or not knows_foreground(maps)):
+    for ((confidence, boundary, foreground), source), view, region in zip(found, views, regions):
+        known = knows_foreground(boundary, foreground)
+        # a region that covers nearly all only shows that a mask cuts off a frame or a passer-by
+        if region is not None and 0 < float(region.mean()) <= MAX_OBJECT_FRACTION and (classical or not known):
             replaced.append(view.name)
             foreground, source = region.astype(np.float32), f"{source}; foreground from the view's mask or black background"
             if classical:  # saliency is an estimate, a region is known
-                maps = SemanticMaps(np.ones_like(foreground), maps.boundary, foreground)
+                confidence = np.ones_like(foreground)
             else:
-                maps = SemanticMaps(maps.confidence, boundary_weight(region), foreground)
-        elif not knows_foreground(maps):
+                boundary = boundary_weight(region)
+        elif not known:
             empty.append(view.name)
-            zeros = np.zeros_like(maps.foreground)
-            maps, source = (
-                SemanticMaps(maps.confidence, zeros, zeros),
-                "none: almost no foreground and no object mask",
-            )
-        result.append((maps, source))
+            boundary = foreground = np.zeros_like(foreground)
+            source = "none: almost no foreground and no object mask"
+        result.append((confidence, boundary, foreground, source))
     reason = "a mask is more reliable than saliency" if classical else "the network finds hardly any foreground"
     if replaced:
         words = f"semantics: {reason}, so the object's mask or its black background gave the foreground of {_names(replaced)}"
@@ -310,29 +262,29 @@ def view_priors(
     depths: Callable[[], Sequence[ViewDepth] | None] = lambda: None,
     regions: Sequence[np.ndarray | None] | None = None,
     threads: int = 0,
-    cache: Path | None = None,
     tell: Callable[[str], object] = lambda line: None,
 ) -> tuple[list[Prior], list[str]]:
     """Return a prior for the pixels of each view before anything is fitted, and notes on choices and assumptions."""
-    store = None if cache is None else MapCache(Path(cache))
     notes: list[str] = []
+    classical = config.segmentation_model is None
+    cache = MapCache(cache_folder())
     # both are opened before either runs: a wrong file is found at once
-    disparity = None if config.depth_model is None else _depth_network(views, config, threads, store, notes)
-    if config.segmentation_model is not None:
-        maps = _segmentation_network(views, config, threads, store, notes)
+    opened = None if config.depth_model is None else _by_network("depth", views, config, threads, cache, notes)
+    if classical:
+        words = "semantics: no network, so saliency is used as foreground and edges as boundaries"
+        notes.append(Detail(f"{words}; --segmentation-model adds a network"))
+        found = [(maps, "saliency and edges") for maps in classical_maps([v.image for v in views], tell)]
     else:
-        maps = _classical(views, notes, tell)
-    found = [maps(i) for i in counted(range(len(views)), tell, "finding salient regions", "views")]
-    found = _fall_back(found, views, regions or [None] * len(views), config.segmentation_model is None, notes)
-    if disparity is None:
-        disparity = _depth_views(views, depths(), notes)
+        semantics = _by_network("segmentation", views, config, threads, cache, notes)
+        found = [semantics(i) for i in counted(range(len(views)), tell, "finding salient regions", "views")]
+    maps = _fall_back(found, views, regions or [None] * len(views), classical, notes)
+    disparity = opened or _by_views(views, depths(), notes)
     priors = []
     for i in counted(range(len(views)), tell, "finding disparity", "views"):
-        (m, source), (d, where) = found[i], disparity(i)
-        priors.append(Prior(d, m.confidence, m.boundary, m.foreground, where, source))
-    if store is not None:
-        notes += store.notes
-        if store.found:
-            words = f"priors: {store.found} of {store.found + store.made} maps were read from the cache {store.folder}"
-            notes.append(Detail(words))
+        (confidence, boundary, foreground, source), ((d,), where) = maps[i], disparity(i)
+        priors.append(Prior(d, confidence, boundary, foreground, where, source))
+    notes += cache.notes
+    if cache.found:
+        words = f"priors: {cache.found} of {cache.found + cache.made} maps were read from the cache {cache.folder}"
+        notes.append(Detail(words))
     return priors, notes

@@ -15,7 +15,6 @@ import math
 import os
 import threading
 import weakref
-from typing import NamedTuple
 
 import torch
 import warp as wp
@@ -25,9 +24,9 @@ from warpgs.kernels import blend, launch, project
 from warpgs.kernels.cameras import CAMERA_MODELS
 from warpgs.kernels.ellipse import ProjectInputs
 from warpgs.kernels.falloff import Pass
-from warpgs.kernels.graphs import MIN_REPLAYS, GraphedFunction, GraphPool
-from warpgs.kernels.launch import Allocator, fetch, first_order, keep, kept
-from warpgs.kernels.tiles import BYTES_PER_INSTANCE, InstanceMemory, Tiles, Visible, grid, running_counts, split_sum, sums_fit
+from warpgs.kernels.graphs import MIN_REPLAYS, Allocator, GraphedFunction, GraphPool, fetch
+from warpgs.kernels.launch import first_order, keep, kept
+from warpgs.kernels.tiles import BYTES_PER_INSTANCE, InstanceMemory, Tiles, grid, running_counts, split_sum, sums_fit
 from warpgs.means2d import count_passes
 from warpgs.render.compose import composite_into
 
@@ -45,59 +44,37 @@ MAX_MEMORY_FRACTION = 0.05
 """Largest fraction of the free memory that instances may take; calls that need more are not captured."""
 
 
-class Capacity(NamedTuple):
-    """Numbers of Gaussians and instances for which a render allocates memory."""
-
-    visible: int
-    """Number of Gaussians that touch a tile."""
-    instances: int
-    """Number of (Gaussian, tile) instances."""
-
-    def within(self, other: Capacity) -> bool:
-        """Return whether neither number exceeds that of ``other``."""
-        return self.visible <= other.visible and self.instances <= other.instances
-
-    def or_more(self, other: Capacity) -> Capacity:
-        """Return the larger value of each number."""
-        return Capacity(max(self.visible, other.visible), max(self.instances, other.instances))
+Counts = tuple[int, int]
+"""Numbers of Gaussians that touch a tile, and of (Gaussian, tile) instances: those that a render needs, or has memory for."""
 
 
 class GraphedRasterizer:
     """Render and gradients of one set of tensors for any camera, as four functions with graphs (`GraphedFunction`)."""
 
-    def __init__(
-        self, settings: Pass, cameras: int, capacity: Capacity, graphs: GraphPool, gradients: bool = True
-    ):  # fmt: skip
+    def __init__(self, settings: Pass, cameras: int, capacity: Counts, graphs: GraphPool, gradients: bool = True):
         """Prepare the functions for C ``cameras``; nothing is rendered yet."""
         self.settings, self.cameras, self.capacity, self.device = settings, cameras, capacity, graphs.device
-        self.gradients = gradients
+        self.gradients, self.needed = gradients, (0, 0)  # numbers that the last call needed
         self._coefficients = CAMERA_MODELS.find(settings.camera_model).coefficients
         self.rendered = 0
         """Number of renders within the capacity."""
-        self.needed = Capacity(0, 0)
-        """Numbers that the last call needed."""
         on_gpu = self.device.type == "cuda"
         self._host_total = wp.zeros(1, dtype=wp.int64, device="cpu", pinned=on_gpu)
         self._total, self._stream = self._host_total.numpy(), graphs.stream
         self._total_ready = torch.cuda.Event() if on_gpu else None
         self._table = wp.zeros(3, dtype=wp.uint64, device="cpu", pinned=on_gpu)
         self._addresses = self._table.numpy()
-        # by proxy, so that this object and its graphs are freed with the last reference
-        functions = [
-            functools.partial(f, weakref.proxy(self))
-            for f in (
-                GraphedRasterizer._project_and_count,
-                GraphedRasterizer._bin_and_blend,
-                GraphedRasterizer._blend_gradients,
-                GraphedRasterizer._project_gradients,
-            )
-        ]
+        own = weakref.proxy(self)  # so that this object and its graphs are freed with the last reference
         self._forward_project, self._forward_blend, self._backward_blend, self._backward_project = (
-            GraphedFunction(f, graphs) for f in functions
+            GraphedFunction(functools.partial(getattr(GraphedRasterizer, name), own), graphs)
+            for name in ("_project_and_count", "_bin_and_blend", "_blend_gradients", "_project_gradients")
         )
         self._sums: torch.Tensor | None = None
         self._no_factors = torch.empty(0, dtype=torch.float32, device=self.device)
-        self._black: torch.Tensor | None = None
+
+    @functools.cached_property
+    def _black(self) -> torch.Tensor:
+        return torch.zeros(self.cameras, 3, dtype=torch.float32, device=self.device)
 
     def render(self, inputs: ProjectInputs, backgrounds: torch.Tensor | None):
         """Return images, projected Gaussians [C, N, 12] and tile counts [C, N]; None if the call exceeds the capacity."""
@@ -106,11 +83,7 @@ class GraphedRasterizer:
         (cameras, *projection), _ = self._forward_project(*inputs[:5])
         if self._total_ready is not None:
             self._total_ready.record(self._stream)
-        if backgrounds is None:
-            if self._black is None:
-                self._black = torch.zeros(self.cameras, 3, dtype=torch.float32, device=self.device)
-            backgrounds = self._black
-        backgrounds = backgrounds.contiguous()
+        backgrounds = self._black if backgrounds is None else backgrounds.contiguous()
         images, block = self._forward_blend(*projection, backgrounds.detach())
         projected = projection[0]
         if self.gradients:
@@ -120,8 +93,8 @@ class GraphedRasterizer:
             count_passes(projected, passes)
         if self._total_ready is not None:
             self._total_ready.synchronize()  # only now, so that the device works meanwhile
-        self.needed = Capacity(*split_sum(int(self._total[0]), projection[1].numel()))
-        if not self.needed.within(self.capacity):
+        self.needed = split_sum(int(self._total[0]), projection[1].numel())
+        if self.needed[0] > self.capacity[0] or self.needed[1] > self.capacity[1]:
             return None
         self.rendered += 1
         return images, projected, projection[1]
@@ -140,14 +113,13 @@ class GraphedRasterizer:
         _, counts = project.project_tensors(self._inputs(gaussians, cameras), self.settings, allocator)
         self._sums = running_counts(counts.view(-1), wp.float32, out=self._sums)  # no copy: used only within the call
         with launch.stream_of(self.device):
-            wp.copy(self._host_total, launch.view(self._sums[-1:], wp.int64).array())
+            wp.copy(self._host_total, wp.from_torch(self._sums[-1:]))
         return ()
 
     def _bin_and_blend(self, allocator: Allocator, projected, counts, backgrounds) -> tuple[torch.Tensor, ...]:
         overflow = allocator.workspace((1,), torch.int32, self.device)  # not read, since the sums show it first
-        memory = InstanceMemory(
-            None, self.capacity.instances, overflow, allocator, Visible(self._sums, self.capacity.visible)
-        )  # fmt: skip
+        visible, instances = self.capacity
+        memory = InstanceMemory(None, instances, overflow, allocator, (self._sums, visible))
         tiles, (_, _, _, *saved) = composite_into(projected, counts, backgrounds, self.settings, memory, self.gradients)
         if not self.gradients:
             return ()
@@ -162,10 +134,8 @@ class GraphedRasterizer:
 
     def _project_gradients(self, allocator: Allocator, *inputs: torch.Tensor) -> tuple[()]:
         *gaussians, cameras, projected, counts, v_projected = inputs
-        project.project_gradients(
-            self._inputs(gaussians, cameras)[:8], self.settings, projected, counts, v_projected,
-            wants_camera=False, allocator=allocator,
-        )  # fmt: skip
+        given = self._inputs(gaussians, cameras)[:8], self.settings, projected, counts, v_projected
+        project.project_gradients(*given, wants_camera=False, allocator=allocator)
         return ()
 
     def blend_gradients(self, saved: tuple[torch.Tensor, ...], v_images, wants_backgrounds: bool):
@@ -181,14 +151,8 @@ class GraphedRasterizer:
         """Return the gradients of the seven tensors that `project` takes, in their shapes [...]."""
         *gaussians, cameras, projected, counts = saved
         if v_projected is None or wants_camera:
-            return project.project_gradients(
-                self._inputs(gaussians, cameras)[:8],
-                self.settings,
-                projected,
-                counts,
-                v_projected,
-                wants_camera=wants_camera,
-            )
+            inputs = self._inputs(gaussians, cameras)[:8]
+            return project.project_gradients(inputs, self.settings, projected, counts, v_projected, wants_camera=wants_camera)
         found, _ = self._backward_project(*saved, v_projected.contiguous())
         return *found, None, None
 
@@ -244,8 +208,8 @@ class Recorder:
         self.min_calls = MIN_CALLS
         """Number of equal calls in a row before kernels are captured."""
         self._key, self._calls, self._too_large = None, 0, False
-        self._exceeded: tuple[tuple | None, Capacity] = (None, Capacity(0, 0))
-        """Key of the last call that exceeded its capacity, and the capacity that this call needed."""
+        self._exceeded: tuple[tuple | None, Counts] = (None, (0, 0))
+        """Key of the last call that exceeded its capacity, and the numbers that this call needed."""
 
     def render(self, inputs: ProjectInputs, backgrounds: torch.Tensor | None, settings: Pass):
         """Return the result of `GraphedRasterizer.render`, over ``backgrounds`` [C, 3]; None if no graphs can be used."""
@@ -260,7 +224,7 @@ class Recorder:
             if self._calls < self.min_calls or self._too_large:
                 return None
             if self.rasterizer is None:
-                self._make(inputs, settings)
+                self.rasterizer = self._made(inputs, settings)
             if self.rasterizer is None:
                 return None
             try:
@@ -278,18 +242,16 @@ class Recorder:
         finally:
             self.graphs.lock.release()
 
-    def _make(self, inputs: ProjectInputs, settings: Pass) -> None:
-        """Make the rasterizer, unless its instances would take too much memory."""
-        needed = count_needed(inputs, settings)
-        if self._exceeded[0] == self._key:
-            needed = needed.or_more(self._exceeded[1])
-        budget = MAX_MEMORY_FRACTION * available_bytes(self.graphs.device)
-        self._too_large = CAPACITY_FACTOR * needed.instances * BYTES_PER_INSTANCE > budget
-        if not self._too_large:
-            visible, instances = (int(CAPACITY_FACTOR * n) + SPARE for n in needed)
-            cameras = len(inputs.viewmats)
-            capacity = Capacity(min(visible, cameras * len(inputs.means)), instances)
-            self.rasterizer = GraphedRasterizer(settings, cameras, capacity, self.graphs, self.gradients)
+    def _made(self, inputs: ProjectInputs, settings: Pass) -> GraphedRasterizer | None:
+        """Return a rasterizer, unless its instances would take too much memory."""
+        before = self._exceeded[1] if self._exceeded[0] == self._key else (0, 0)
+        visible, instances = (CAPACITY_FACTOR * max(n, m) for n, m in zip(count_needed(inputs, settings), before))
+        self._too_large = instances * BYTES_PER_INSTANCE > MAX_MEMORY_FRACTION * available_bytes(self.graphs.device)
+        if self._too_large:
+            return None
+        cameras = len(inputs.viewmats)
+        capacity = min(int(visible) + SPARE, cameras * len(inputs.means)), int(instances) + SPARE
+        return GraphedRasterizer(settings, cameras, capacity, self.graphs, self.gradients)
 
     def _drop(self) -> None:
         if self.rasterizer is not None:
@@ -301,35 +263,31 @@ class Recorder:
         with self.graphs.lock:
             self._drop()
             self.graphs.release()
-            self.min_calls, self._exceeded = MIN_CALLS, (None, Capacity(0, 0))
+            self.min_calls, self._exceeded = MIN_CALLS, (None, (0, 0))
 
 
 @torch.no_grad()
-def count_needed(inputs: ProjectInputs, settings: Pass) -> Capacity:
-    """Return the numbers of visible Gaussians and of instances of a render."""
+def count_needed(inputs: ProjectInputs, settings: Pass) -> Counts:
+    """Return the numbers that a render needs."""
     counts = project.project_inputs(inputs, settings)[1]
-    return Capacity(*torch.stack([(counts > 0).sum(), counts.sum()]).tolist())
+    visible, instances = torch.stack([(counts > 0).sum(), counts.sum()]).tolist()
+    return visible, instances
 
 
-def call_key(
-    inputs: ProjectInputs, backgrounds: torch.Tensor | None, settings: Pass, gradients: bool = True
-) -> tuple | None:  # fmt: skip
+def call_key(inputs: ProjectInputs, backgrounds: torch.Tensor | None, settings: Pass, gradients: bool = True) -> tuple | None:
     """Return what calls must have in common to use one rasterizer; None for calls that cannot be captured, or gain nothing."""
     means, viewmats = inputs.means, inputs.viewmats
     cameras = viewmats.shape[0]  # len of a tensor takes ten times as long
     projected, tiles = means.shape[0] * cameras, math.prod(grid(*settings.window[2:], settings.tile_size))
-    # without gradients in the main thread alone: a viewer renders in another one, beside a loop that may wait for the device
     small = 0 < projected <= MAX_PROJECTED and sums_fit(projected, tiles)
-    fit = means.dtype == torch.float32 and (gradients or threading.current_thread() is threading.main_thread())
-    if not (small and fit) or torch.is_inference_mode_enabled() or not _can_capture(means.device):
+    # without gradients in the main thread alone: a viewer renders in another one, beside a loop that may wait for the device
+    here = gradients or threading.current_thread() is threading.main_thread()
+    fit = all(t.is_contiguous() and t.dtype == torch.float32 and t.device == means.device for t in inputs[:5])
+    if backgrounds is not None:
+        fit = fit and tuple(backgrounds.shape) == (cameras, 3)
+    if not (small and fit and here) or torch.is_inference_mode_enabled() or not _can_capture(means.device):
         return None
-    if backgrounds is not None and tuple(backgrounds.shape) != (cameras, 3):
-        return None
-    places = []
-    for t in inputs[:5]:
-        if not (t.is_contiguous() and t.dtype == torch.float32 and t.device == means.device):
-            return None
-        places.append((t.data_ptr(), t.shape))
+    places = [(t.data_ptr(), t.shape) for t in inputs[:5]]
     return *places, viewmats.shape, inputs.Ks.shape, inputs.distortion.shape, backgrounds is None, settings
 
 

@@ -115,9 +115,8 @@ class RasterizeOptions:
             value = getattr(self, name)
             if not (_is_whole(value) or (value is None and name not in ("tile_size", "heaviest"))):
                 raise UsageError(f"{name} must be a whole number, not {value!r}")
-        for name in ("sh_degree", "memory_budget", "capacity", "heaviest"):
-            if (getattr(self, name) or 0) < 0:
-                raise UsageError(f"{name} must be at least 0, not {getattr(self, name)}")
+            if (value or 0) < 0 and name not in ("tile_size", "max_instances"):
+                raise UsageError(f"{name} must be at least 0, not {value}")
         for name in ("near", "far"):
             value = getattr(self, name)
             if value is not None and (isinstance(value, bool) or not isinstance(value, Real)):

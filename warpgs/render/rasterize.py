@@ -53,7 +53,10 @@ def check_arrays(camera: Camera) -> None:
             continue
         listed = given.tolist()  # Python numbers take a third of the time of tensors
         for i, matrix in enumerate(listed if given.ndim == 3 else (listed,)):
-            check(matrix, f"camera.{name}[{i}]" if given.ndim == 3 else f"camera.{name}")
+            where = f"camera.{name}[{i}]" if given.ndim == 3 else f"camera.{name}"
+            if not all(math.isfinite(value) for row in matrix for value in row):
+                raise ValueError(f"{where} has non-finite values: {matrix}")
+            check(matrix, where)
     distortion: Any = camera.distortion
     if distortion is not None:
         _check_type("distortion", distortion)
@@ -62,8 +65,7 @@ def check_arrays(camera: Camera) -> None:
         if not (getattr(distortion, "is_cuda", False) or all(map(math.isfinite, distortion.reshape(-1).tolist()))):
             raise ValueError(f"camera.distortion has non-finite values: {distortion.tolist()}")
     for name in ("width", "height"):
-        size = getattr(camera, name)
-        if not isinstance(size, (int, np.integer)):
+        if not isinstance(size := getattr(camera, name), (int, np.integer)):
             raise TypeError(f"camera.{name} must be a whole number of pixels, not {size!r}")
 
 
@@ -73,24 +75,20 @@ def _check_type(name: str, array: Any) -> None:
         raise TypeError(
             f"camera.{name} must be a numpy array or a tensor, not {type(array).__name__}; numpy.array or torch.stack makes one"
         )
+    kind = str(array.dtype).removeprefix("torch.")
     if isinstance(array, torch.Tensor):
         launch.check_device(f"camera.{name}", array)
         if array.layout != torch.strided:
             raise TypeError(f"camera.{name} must be dense, not {array.layout}; camera.{name}.to_dense() converts it")
-    if str(array.dtype).removeprefix("torch.") in ("float16", "bfloat16"):
+    if kind in ("float16", "bfloat16"):
         raise TypeError(f"camera.{name} must be float32 or float64, not {array.dtype}: its rounding would shift the image")
-    real = not array.is_complex() if isinstance(array, torch.Tensor) else array.dtype.kind in "fiub"
-    if not real:
+    if not kind.startswith(("float", "int", "uint", "bool")):
         raise TypeError(f"camera.{name} must hold real numbers, not {array.dtype}")
 
 
 def _check_intrinsics(matrix: list[list[float]], where: str) -> None:
-    """Raise ValueError where the intrinsics are non-finite, or have a skew, a focal length of 0, or a wrong last row."""
-    (fx, skew, cx), (below, fy, cy), (left, middle, last) = matrix
-    off = abs(skew) + abs(below) + abs(left) + abs(middle) + abs(last - 1) + 0 * (fx + cx + fy + cy)
-    if fx and fy and off <= K_TOLERANCE:  # a NaN or an infinity is not; few matrices get further
-        return
-    _check_finite(matrix, where)
+    """Raise ValueError where the intrinsics have a skew, a focal length of 0, or a wrong last row."""
+    (fx, skew, _), (below, fy, _), (left, middle, last) = matrix
     if not (fx and fy):
         raise ValueError(f"{where} must have focal lengths other than 0, not {fx:g} and {fy:g}")
     if max(map(abs, (left, middle, last - 1))) > K_TOLERANCE:
@@ -104,38 +102,19 @@ def _check_intrinsics(matrix: list[list[float]], where: str) -> None:
 
 def _check_pose(matrix: list[list[float]], where: str) -> None:
     """Raise ValueError where the pose is not rigid; a reflection is allowed, since the mirrored image is correct."""
-    (a, b, c, x), (d, e, f, y), (g, h, i, z), (p, q, r, s) = matrix
+    (a, b, c, _), (d, e, f, _), (g, h, i, _), (p, q, r, s) = matrix
+    if max(map(abs, (p, q, r, s - 1))) > POSE_TOLERANCE:
+        raise ValueError(f"{where} must have the last row 0, 0, 0, 1, not {p:g}, {q:g}, {r:g}, {s:g}; is it transposed?")
     products = (
         a * a + b * b + c * c - 1, d * d + e * e + f * f - 1, g * g + h * h + i * i - 1,
         a * d + b * e + c * f, a * g + b * h + c * i, d * g + e * h + f * i,
     )  # fmt: skip
-    if sum(map(abs, products)) + abs(p) + abs(q) + abs(r) + abs(s - 1) + 0 * (x + y + z) <= POSE_TOLERANCE:
-        return  # as in `_check_intrinsics`
-    _check_finite(matrix, where)
-    if max(map(abs, (p, q, r, s - 1))) > POSE_TOLERANCE:
-        raise ValueError(f"{where} must have the last row 0, 0, 0, 1, not {p:g}, {q:g}, {r:g}, {s:g}; is it transposed?")
     off = max(map(abs, products))
     if not off <= POSE_TOLERANCE:  # products of huge numbers overflow
         raise ValueError(
             f"{where} scales or shears: R R^T is off by {off:.2g} from the identity, where R is the upper left 3 x 3 block. "
             "Give a rotation. If the pose is scaled, divide its first three rows by the scale; this also divides depths"
         )
-
-
-def _check_finite(matrix: list[list[float]], where: str) -> None:
-    """Raise ValueError where a number of the matrix is not finite."""
-    if not all(math.isfinite(value) for row in matrix for value in row):
-        raise ValueError(f"{where} has non-finite values: {matrix}")
-
-
-def for_each(cameras: Sequence[Camera], *, gaussians: Any, options: Any) -> list[tuple[Any, ...]]:
-    """Return Gaussians, camera and options of each of C cameras; single values are shared by all."""
-    columns = []
-    for name, given in (("gaussians", gaussians), ("options", options)):
-        columns.append(given if isinstance(given, (list, tuple)) else [given] * len(cameras))
-        if len(columns[-1]) != len(cameras):
-            raise ValueError(f"{len(columns[-1])} {name} for {len(cameras)} cameras: give one for all, or one for each camera")
-    return list(zip(columns[0], cameras, columns[1], strict=True))
 
 
 INTEGERS = (torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64)
@@ -292,10 +271,10 @@ def _layer(name: str, background: Any, colors: torch.Tensor | None, inputs: Proj
         background = like.new_zeros(channels)
     try:
         values = _as_tensor(background)
+        if values.is_complex():
+            raise TypeError(values.dtype)
     except (RuntimeError, TypeError, ValueError) as e:
         raise TypeError(f"{name} must be numbers, shape [{channels}] or [C, {channels}], not {background!r}") from e
-    if values.is_complex():
-        raise TypeError(f"{name} must be numbers, shape [{channels}] or [C, {channels}], not {values.dtype}")
     if values.layout != torch.strided:
         raise TypeError(f"{name} must be dense, not {values.layout}; {name}.to_dense() converts it")
     values = values.to(like)
@@ -350,9 +329,12 @@ def rasterize(
         eager: Render | list[Render] = torch.compiler.disable(rasterize)(gaussians, camera, options)
         return eager
     if isinstance(camera, (list, tuple)):
-        return [_render(*each) for each in for_each(camera, gaussians=gaussians, options=options)]
-    one: tuple[Any, ...] = (gaussians, camera, options)
-    return _render(*one)
+        each = [given if isinstance(given, (list, tuple)) else [given] * len(camera) for given in (gaussians, options)]
+        for name, given in zip(("gaussians", "options"), each):
+            if len(given) != len(camera):
+                raise ValueError(f"{len(given)} {name} for {len(camera)} cameras: give one for all, or one for each camera")
+        return [_render(*one) for one in zip(each[0], camera, each[1])]
+    return _render(gaussians, camera, options)  # type: ignore[arg-type]
 
 
 def _render(gaussians: RasterizedGaussians, camera: Camera, options: RasterizeOptions) -> Render:
@@ -395,17 +377,12 @@ def _render(gaussians: RasterizedGaussians, camera: Camera, options: RasterizeOp
         render = replace(render, error_bound=_error_bound(render.rgb.detach(), gaussians, camera, options))
     if options.absgrad:
         render = replace(render, absgrad=True)
-    return _refusing_gradients(render)
-
-
-def _refusing_gradients(render: Render) -> Render:
-    """Return the render; a gradient through an output that has none becomes an error."""
     refusing: dict[str, Any] = {}
-    for name in WITHOUT_GRADIENT:
-        values, source = getattr(render, name), render.rgb if name == "error_bound" else render.projected
-        if values is not None:
+    for name in WITHOUT_GRADIENT:  # a gradient through an output that has none becomes an error
+        if (values := getattr(render, name)) is not None:
+            source = render.rgb if name == "error_bound" else render.projected
             refusing[name] = without_gradient(name, values, source)
-    return replace(render, **refusing) if refusing else render
+    return replace(render, **refusing)
 
 
 @torch.no_grad()

@@ -43,12 +43,6 @@ def _pixels(path: Path, frames: Iterable[np.ndarray]) -> list[np.ndarray]:
     return result
 
 
-def _durations(count: int, fps: int, unit: int) -> list[int]:
-    """Return how long each frame is shown, in multiples of ``unit`` [ms], so that the sum is right to half a unit."""
-    ends = np.round(np.arange(count + 1) * 1000 / (fps * unit)).astype(int) * unit
-    return [int(d) for d in np.diff(ends)]
-
-
 def _with_one_palette(pixels: list[np.ndarray]) -> list:
     """Return frames as Pillow images with one palette, so that colours do not flicker, and with dithering against banding."""
     from PIL import Image
@@ -68,11 +62,10 @@ def write_animation(path: Path, frames: Iterable[np.ndarray], fps: int) -> int:
         raise UsageError(f"{path}: browsers show at most {MAX_FPS} frames per second of an animated image, not {fps}")
     pixels, gif = _pixels(path, frames), path.suffix.lower() == ".gif"
     images = _with_one_palette(pixels) if gif else [Image.fromarray(p) for p in pixels]
-    durations = _durations(len(images), fps, 10 if gif else 1)
-    choices = {"optimize": False} if gif else {"quality": QUALITY, "method": 4}
-
+    unit = 10 if gif else 1  # [ms]; the sum of the durations is right to half a unit
+    durations = [int(d) for d in np.diff(np.round(np.arange(len(images) + 1) * 1000 / (fps * unit)).astype(int) * unit)]
+    kind, choices = ("GIF", {"optimize": False}) if gif else ("WEBP", {"quality": QUALITY, "method": 4})
     data = io.BytesIO()
-    kind = "GIF" if gif else "WEBP"
     try:
         images[0].save(data, format=kind, save_all=True, append_images=images[1:], duration=durations, loop=0, **choices)
     except (OSError, ValueError, KeyError) as e:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import textwrap
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,12 +21,16 @@ MAX_WEBP_SIDE = 16383
 
 def png(image: np.ndarray) -> bytes:
     """Encode colours in [0, 1], [H, W, 3] or with straight alpha [H, W, 4], as 8-bit PNG; values outside are clamped."""
+    pixels = np.round(np.clip(image, 0, 1) * 255).astype(np.uint8)
+    return _encoded(".png", pixels[..., [2, 1, 0, 3][: pixels.shape[2]]])
+
+
+def _encoded(suffix: str, pixels: np.ndarray, options: Sequence[int] = ()) -> bytes:
     import cv2
 
-    pixels = np.round(np.clip(image, 0, 1) * 255).astype(np.uint8)
-    done, data = cv2.imencode(".png", pixels[..., [2, 1, 0, 3][: pixels.shape[2]]])
+    done, data = cv2.imencode(suffix, pixels, options)
     if not done:
-        raise ResourceError(f"an image of {image.shape[1]} x {image.shape[0]} px could not be encoded as PNG")
+        raise ResourceError(f"an image of {pixels.shape[1]} x {pixels.shape[0]} px could not be encoded as {suffix}")
     return data.tobytes()
 
 
@@ -41,10 +46,7 @@ def webp(image: np.ndarray | bytes, width: int = PAGE_WIDTH, quality: int = 82) 
     if factor < 1:
         size = [max(1, round(factor * side)) for side in pixels.shape[1::-1]]
         pixels = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)
-    done, data = cv2.imencode(".webp", pixels, [cv2.IMWRITE_WEBP_QUALITY, quality])
-    if not done:
-        raise ResourceError(f"an image of {pixels.shape[1]} x {pixels.shape[0]} px could not be encoded as WebP")
-    return data.tobytes()
+    return _encoded(".webp", pixels, [cv2.IMWRITE_WEBP_QUALITY, quality])
 
 
 def straight_alpha(image: np.ndarray, alpha: np.ndarray, background: tuple[float, float, float]) -> np.ndarray:
@@ -89,10 +91,8 @@ def depth_map(depth: np.ndarray, alpha: np.ndarray) -> np.ndarray:
 
 def side_by_side(images: list[np.ndarray], gap: int = 4) -> np.ndarray:
     """Return images [H, W, 3] of one height in a row, with ``gap`` white columns between them."""
-    height = images[0].shape[0]
-    bar = np.ones((height, gap, 3), np.float32)
-    row = [part for image in images for part in (image, bar)][:-1]
-    return np.concatenate(row, axis=1)
+    bar = np.ones((images[0].shape[0], gap, 3), np.float32)
+    return np.concatenate([part for image in images for part in (image, bar)][:-1], axis=1)
 
 
 def frame_sheet(frames: list[np.ndarray], columns: int = 3, gap: int = 4) -> np.ndarray:
@@ -165,78 +165,53 @@ CELL = (180, 480)
 GAP, MARGIN, HEAD, CAPTION = 8, 20, 38, 32
 
 
-@dataclass(frozen=True)
-class Cell:
-    """One image of a row."""
-
-    image: np.ndarray
-    """Colours in [0, 1], [H, W, 3]; all images of a row have one size."""
-    caption: str
-    """Text below the image."""
-
-
-@dataclass(frozen=True)
-class Strip:
-    """One row: the images of a view by every method."""
-
-    title: str
-    """Text above the row."""
-    cells: tuple[Cell, ...]
-    crops: tuple[tuple[int, int, int, int], ...]
-    """Crops to enlarge: x, y, width, height [px]."""
-
-
-def _column(count: int, widest: int) -> int:
-    available = (MAX_WIDTH - 2 * MARGIN + GAP) // count - GAP
-    return max(CELL[0], min(CELL[1], available, max(widest, 320)))
+Strip = tuple[str, list[tuple[np.ndarray, str]], list[tuple[int, int, int, int]]]
+"""One row of a figure: title; colours [H, W, 3] in [0, 1] and caption of the image by each method, all of one size; crops to
+enlarge: x, y, width, height [px]."""
 
 
 def sheet(headings: list[str], strips: list[Strip]) -> bytes:
     """Return a figure with a cell for each heading and strip as bytes of an RGB PNG; images have the width of a column."""
     from PIL import Image, ImageDraw, ImageFont
 
-    column = _column(len(headings), max(s.cells[0].image.shape[1] for s in strips))
+    available = (MAX_WIDTH - 2 * MARGIN + GAP) // len(headings) - GAP
+    column = max(CELL[0], min(CELL[1], available, max(320, *(cells[0][0].shape[1] for _, cells, _ in strips))))
     bold, small = (ImageFont.load_default(max(least, column / part)) for least, part in ((17, 22), (14, 30)))
 
-    def fitted(text: str, font, width: int) -> str:
-        while text and font.getlength(text) > width:
+    def fitted(text: str, font) -> str:
+        while text and font.getlength(text) > column:
             text = text[:-2].rstrip("…") + "…" if len(text) > 2 else ""
         return text
 
-    heights = []
-    for s in strips:
-        H, W = s.cells[0].image.shape[:2]
-        zoom = 0
-        if s.crops:
-            inner = (column - GAP * (len(s.crops) - 1)) // len(s.crops)
-            zoom = GAP + max(round(inner * h / w) for _, _, w, h in s.crops)
-        heights.append((round(column * H / W), zoom))
+    rows = []
+    for title, cells, boxes in strips:
+        H, W = cells[0][0].shape[:2]
+        inner = (column - GAP * (len(boxes) - 1)) // max(len(boxes), 1)
+        zoom = GAP + max(round(inner * h / w) for _, _, w, h in boxes) if boxes else 0
+        rows.append((title, cells, boxes, inner, round(column * H / W), zoom))
     width = 2 * MARGIN + len(headings) * (column + GAP) - GAP
-    height = MARGIN + HEAD + sum(HEAD + a + b + CAPTION for a, b in heights) + MARGIN // 2
+    height = MARGIN + HEAD + sum(HEAD + tall + zoom + CAPTION for *_, tall, zoom in rows) + MARGIN // 2
     canvas = Image.new("RGB", (width, height), PAPER)
     draw = ImageDraw.Draw(canvas)
     for i, heading in enumerate(headings):
         middle = MARGIN + i * (column + GAP) + column / 2
-        draw.text((middle, MARGIN + 18), fitted(heading, bold, column), INK, bold, anchor="ms")
+        draw.text((middle, MARGIN + 18), fitted(heading, bold), INK, bold, anchor="ms")
     y = MARGIN + HEAD
-    for s, (tall, zoom) in zip(strips, heights):
+    for title, cells, boxes, inner, tall, zoom in rows:
         draw.line((MARGIN, y, width - MARGIN, y), (217, 220, 225))
-        draw.text((MARGIN, y + 10), s.title, SOFT, small)
+        draw.text((MARGIN, y + 10), title, SOFT, small)
         y += HEAD
-        factor = column / s.cells[0].image.shape[1]
-        for i, cell in enumerate(s.cells):
-            x = MARGIN + i * (column + GAP)
-            canvas.paste(resized(cell.image, column, tall), (x, y))
-            for k, (cx, cy, w, h) in enumerate(s.crops):
-                inner = (column - GAP * (len(s.crops) - 1)) // len(s.crops)
-                color = BOXES[k % len(BOXES)]
+        for i, (image, caption) in enumerate(cells):
+            x, factor = MARGIN + i * (column + GAP), column / image.shape[1]
+            canvas.paste(resized(image, column, tall), (x, y))
+            for k, (cx, cy, w, h) in enumerate(boxes):
+                color, high = BOXES[k % len(BOXES)], round(inner * h / w)
                 box = [x + cx * factor, y + cy * factor, x + (cx + w) * factor - 1, y + (cy + h) * factor - 1]
                 draw.rectangle([round(v) for v in box], outline=color, width=3)
                 left, top = x + k * (inner + GAP), y + tall + GAP
-                canvas.paste(resized(cell.image[cy : cy + h, cx : cx + w], inner, round(inner * h / w)), (left, top))
-                draw.rectangle([left, top, left + inner - 1, top + round(inner * h / w) - 1], outline=color, width=3)
-            words = fitted(cell.caption, small, column)
-            draw.text((x + column / 2, y + tall + zoom + 20), words, SOFT, small, anchor="ms")
+                canvas.paste(resized(image[cy : cy + h, cx : cx + w], inner, high), (left, top))
+                draw.rectangle([left, top, left + inner - 1, top + high - 1], outline=color, width=3)
+            draw.text((x + column / 2, y + tall + zoom + 20), fitted(caption, small), SOFT, small, anchor="ms")
         y += tall + zoom + CAPTION
     out = io.BytesIO()
     canvas.save(out, "PNG")
@@ -313,10 +288,8 @@ def contact_sheet(
     fonts = {s: ImageFont.load_default(s) for s in (label_size, text_size, title_size)}
     draw.text((CONTACT_MARGIN, CONTACT_MARGIN - 4), title, CONTACT_INK, fonts[title_size])
     for i in range(len(tiles) + 1):
-        x, y = (
-            CONTACT_MARGIN + (i % columns) * (tile_width + CONTACT_GAP),
-            top + (i // columns) * (head + tile_height + CONTACT_GAP),
-        )
+        x = CONTACT_MARGIN + (i % columns) * (tile_width + CONTACT_GAP)
+        y = top + (i // columns) * (head + tile_height + CONTACT_GAP)
         if i == len(tiles):
             draw.line((x, y + head, x + tile_width - 1, y + head), CONTACT_LINE)
             characters = int(tile_width / (0.5 * text_size))
@@ -328,14 +301,10 @@ def contact_sheet(
         sheet.paste(_tile_image(tile, (tile_width, tile_height)), (x, y + head))
         if tile.values.ndim == 2:
             middle, right = y + head // 2, x + tile_width
-            largest = f"{tile.largest:g}"
-            text_width = round(draw.textlength(largest, fonts[text_size]))
-            bar = Tile(
-                "", np.linspace(0, 1, CONTACT_LEGEND[0], dtype=np.float32)[None].repeat(CONTACT_LEGEND[1], 0), tile.colors
-            )
-            draw.text((right, middle), largest, CONTACT_SOFT, fonts[text_size], anchor="rm")
-            sheet.paste(
-                _tile_image(bar, CONTACT_LEGEND), (right - text_width - 6 - CONTACT_LEGEND[0], middle - CONTACT_LEGEND[1] // 2)
-            )
-            draw.text((right - text_width - 12 - CONTACT_LEGEND[0], middle), "0", CONTACT_SOFT, fonts[text_size], anchor="rm")
+            largest, small = f"{tile.largest:g}", fonts[text_size]
+            values = np.linspace(0, 1, CONTACT_LEGEND[0], dtype=np.float32)[None].repeat(CONTACT_LEGEND[1], 0)
+            left = right - round(draw.textlength(largest, small)) - 6 - CONTACT_LEGEND[0]
+            draw.text((right, middle), largest, CONTACT_SOFT, small, anchor="rm")
+            sheet.paste(_tile_image(Tile("", values, tile.colors), CONTACT_LEGEND), (left, middle - CONTACT_LEGEND[1] // 2))
+            draw.text((left - 6, middle), "0", CONTACT_SOFT, small, anchor="rm")
     return np.asarray(sheet, np.float32) / 255

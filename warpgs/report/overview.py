@@ -6,7 +6,7 @@ import io
 import json
 import math
 import subprocess
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -45,8 +45,8 @@ def run_pyvista(code: str, *arguments: str) -> tuple[bool, str]:
         return False, f"no process can be started for pyvista ({e.strerror or e})"
     if done.returncode == 0:
         return True, ""
-    last = done.stderr.strip().splitlines()
-    return False, f"pyvista ended with code {done.returncode}" + (f" ({last[-1][:100]})" if last else "")
+    last = "".join(f" ({line[:100]})" for line in done.stderr.strip().splitlines()[-1:])
+    return False, f"pyvista ended with code {done.returncode}{last}"
 
 
 def remedy_for(why: str) -> str:
@@ -197,28 +197,6 @@ p.screenshot(sys.argv[3])
 """
 
 
-@dataclass(frozen=True)
-class ScenePlot:
-    """Contents of a plot, in one system of units [u]."""
-
-    points: np.ndarray
-    """Positions [u], shape [N, 3], at least one."""
-    colors: np.ndarray
-    """Colours in [0, 1], shape [N, 3]."""
-    axes: np.ndarray | None
-    """Principal axes of Gaussians, as columns as long as a standard deviation [u], shape [N, 3, 3]; None for plain points."""
-    train: list[Camera]
-    """Cameras of the training views; may be empty."""
-    test: list[Camera]
-    """Cameras of the held-out views; may be empty."""
-    up: np.ndarray
-    """Upward direction, shape [3]."""
-    direction: np.ndarray
-    """Direction from the scene to the eye, any length, shape [3]."""
-    legend: list[tuple[str, str]]
-    """Text and colour (#rrggbb) of each entry besides the cameras."""
-
-
 def _extent(points: np.ndarray, cameras: list[Camera]) -> tuple[np.ndarray, float]:
     """Return points [N, 3] and centres of cameras [C, 3] together, shape [N + C, 3], and the radius around their mean [u]."""
     everything = np.concatenate([points, np.array([c.center for c in cameras]).reshape(-1, 3)])
@@ -252,28 +230,41 @@ def _with_legend(data: bytes, entries: list[tuple[str, str]], size: tuple[int, i
         draw.rectangle((x, y - side / 2, x + side, y + side / 2), color)
         draw.text((x + side + 0.5 * gap, y), words, INK[background], font, anchor="lm")
         x += side + 1.5 * gap + font.getlength(words)
-    pixels = np.asarray(canvas, np.float32) / 255
-    return png(pixels)
+    return png(np.asarray(canvas, np.float32) / 255)
 
 
-def render_plot(plot: ScenePlot, size: tuple[int, int], background: str) -> bytes:
-    """Render a plot as PNG bytes of ``size`` [px], on white or black; points far outside are left out."""
-    inside = within(plot.points, OUTSIDE)
-    points, colors = plot.points[inside], plot.colors[inside]
+def render_plot(
+    points: np.ndarray, colors: np.ndarray, axes: np.ndarray | None, train: list[Camera], test: list[Camera], up: np.ndarray,
+    direction: np.ndarray, legend: list[tuple[str, str]], size: tuple[int, int], background: str,
+) -> bytes:  # fmt: skip
+    """Render cameras and points [N, 3] [u] with colours [N, 3] in [0, 1] as PNG bytes; points far outside are left out.
+
+    Args:
+        points: At least one.
+        colors: Colours of the points.
+        axes: Principal axes of Gaussians [N, 3, 3], as columns as long as a standard deviation [u]; None for plain points.
+        train: Cameras of the training views.
+        test: Cameras of the held-out views.
+        up: Upward direction [3].
+        direction: Direction [3] from the scene to the eye, of any length.
+        legend: Text and colour (#rrggbb) of each entry besides the cameras.
+        size: Width and height [px].
+        background: white or black.
+    """
+    inside = within(points, OUTSIDE)
+    points, colors = points[inside], colors[inside]
     core = points[within(points, EDGE)]
-    cameras = [*plot.train, *plot.test]
-    everything, reach = _extent(core if len(core) else points, cameras)
-    length = _frustum_size(cameras, reach)
-    arrays = {"train": frusta(plot.train, length), "test": frusta(plot.test, length), "points": points.astype(np.float32)}
-    if plot.axes is not None:
-        lengths = np.sqrt((plot.axes[inside] ** 2).sum(1))
+    everything, reach = _extent(core if len(core) else points, [*train, *test])
+    length = _frustum_size([*train, *test], reach)
+    arrays = {"train": frusta(train, length), "test": frusta(test, length), "points": points.astype(np.float32)}
+    if axes is not None:
+        lengths = np.sqrt((axes[inside] ** 2).sum(1))
         shrink = np.minimum(1.0, 0.02 * reach / np.maximum(SHOWN_SIGMAS * lengths, 1e-30))  # the far background would hide all
-        arrays["axes"] = (SHOWN_SIGMAS * shrink[:, None] * plot.axes[inside]).astype(np.float32)
-    entries = [("training cameras", TRAIN_COLOR)] * bool(plot.train) + [("held-out cameras", TEST_COLOR)] * bool(plot.test)
-    entries += plot.legend
+        arrays["axes"] = (SHOWN_SIGMAS * shrink[:, None] * axes[inside]).astype(np.float32)
+    entries = [("training cameras", TRAIN_COLOR)] * bool(train) + [("held-out cameras", TEST_COLOR)] * bool(test) + legend
     height = size[1] - (round(LEGEND_HEIGHT * size[1]) if entries else 0)
     shown = np.concatenate([everything, arrays["train"].reshape(-1, 3), arrays["test"].reshape(-1, 3)])
-    arrays["view"] = framing(shown, plot.direction, plot.up, size[0] / height)
+    arrays["view"] = framing(shown, direction, up, size[0] / height)
     arrays["colors"] = np.round(255 * np.clip(colors, 0, 1)).astype(np.uint8)
     words = {
         "size": [size[0], height], "background": background, "point_size": max(2.0, 0.005 * size[1]),

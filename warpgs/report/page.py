@@ -10,7 +10,6 @@ import re
 import unicodedata
 from collections import Counter
 from collections.abc import Iterable
-from dataclasses import dataclass
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from urllib.parse import quote
 
@@ -48,12 +47,9 @@ def image_names(views: Iterable[str]) -> dict[str, str]:
 def renaming_notes(names: dict[str, str]) -> list[str]:
     """Return notes on views with other names for their images."""
     changed = [f"{view} is {name}.png" for view, name in names.items() if name != _own_name(view)]
-    if not changed:
-        return []
     words = ", ".join(changed[:3]) + (f", and {len(changed) - 3} more" if len(changed) > 3 else "")
-    return [
-        f"images of some views have other names, because view names are alike, long, or not allowed on every system: {words}"
-    ]
+    why = "because view names are alike, long, or not allowed on every system"
+    return [f"images of some views have other names, {why}: {words}"] if changed else []
 
 
 def _own_name(view: str) -> str:
@@ -112,43 +108,19 @@ def curve(title: str, xs: list[float], ys: list[float], unit: str = "") -> str:
         px = LEFT + (x - x0) / (x1 - x0) * (WIDTH - LEFT - RIGHT)
         return px, TOP + (y1 - y) / (y1 - y0) * (HEIGHT - TOP - BOTTOM)
 
-    parts = [head]
     for tick in ticks(y0, y1):
         _, py = place(x0, tick)
-        parts.append(f'<line class="grid" x1="{LEFT}" x2="{WIDTH - RIGHT}" y1="{py:.1f}" y2="{py:.1f}"/>')
-        parts.append(f'<text x="{LEFT - 6}" y="{py + 4:.1f}" text-anchor="end">{tick_label(tick)}</text>')
+        head += f'<line class="grid" x1="{LEFT}" x2="{WIDTH - RIGHT}" y1="{py:.1f}" y2="{py:.1f}"/>'
+        head += f'<text x="{LEFT - 6}" y="{py + 4:.1f}" text-anchor="end">{tick_label(tick)}</text>'
     for tick in ticks(x0, x1):
-        px, _ = place(tick, y0)
-        parts.append(f'<text x="{px:.1f}" y="{HEIGHT - 8}" text-anchor="middle">{tick_label(tick)}</text>')
+        head += f'<text x="{place(tick, y0)[0]:.1f}" y="{HEIGHT - 8}" text-anchor="middle">{tick_label(tick)}</text>'
     line = " ".join(f"{px:.1f},{py:.1f}" for px, py in (place(*p) for p in points))
-    parts.append(f'<polyline class="line" points="{line}"/></svg>')
-    return "".join(parts)
+    return f'{head}<polyline class="line" points="{line}"/></svg>'
 
 
-@dataclass(frozen=True)
-class ViewImages:
-    """Images of one view, as bytes of WebP or PNG files."""
-
-    name: str
-    caption: str
-    render: bytes
-    reference: bytes
-    error: bytes
-    depth: bytes
-
-
-@dataclass(frozen=True)
-class Section:
-    """Section of the page on the sampling events of a fit, or on coverage."""
-
-    words: str
-    """Sentences that explain the images."""
-    images: list[tuple[str, bytes]]
-    """Caption and image file of each image."""
-    table: list[list[str]]
-    """Header row, then rows."""
-    legend: str = ""
-    """Meaning of the patterns in the images."""
+Section = tuple[str, list[tuple[str, bytes]], list[list[str]], str]
+"""Section of the page on sampling events or on coverage: sentences; caption and file of each image; rows of a table, the head
+first; the meaning of the patterns in the images."""
 
 
 def rendered(template: str, **contents: object) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import json
 import math
@@ -10,15 +11,18 @@ import re
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import BinaryIO
+from typing import TYPE_CHECKING, BinaryIO
 
 from warpgs import schema
 from warpgs.errors import DataError, ResourceError
 from warpgs.files import appending, read_input, unread_reason, write_bytes
 from warpgs.folders import RefusedError
 from warpgs.process import careful, printable, say
+
+if TYPE_CHECKING:
+    from rich.console import Console
 
 PLAIN_INTERVAL = 10.0
 """Seconds between two plain lines on the steps of a fit."""
@@ -33,17 +37,23 @@ COUNTED = re.compile(r"(?P<done>[\d,]+) of (?P<total>[\d,]+)")
 def duration(seconds: float) -> str:
     """Return a time span in words: 8 s, 2 min 05 s, 1 h 10 min."""
     seconds = int(round(seconds))
-    if seconds < 60:
-        return f"{seconds} s"
-    if seconds < 3600:
-        return f"{seconds // 60} min {seconds % 60:02d} s"
-    return f"{seconds // 3600} h {seconds % 3600 // 60:02d} min"
+    minutes, hours = seconds // 60, seconds // 3600
+    if hours:
+        return f"{hours} h {minutes % 60:02d} min"
+    return f"{minutes} min {seconds % 60:02d} s" if minutes else f"{seconds} s"
 
 
 def is_live() -> bool:
     """Return whether stdout is a terminal in which a line can be overwritten."""
     stdout = getattr(sys.stdout, "rich_proxied_file", sys.stdout)  # while a line is shown, rich wraps stdout
     return stdout is not None and stdout.isatty() and os.environ.get("TERM") != "dumb"
+
+
+def _console() -> tuple[Console, bool]:
+    """Return rich's console, and whether stderr is a terminal, too: redirected errors do not disturb a line."""
+    from rich.console import Console
+
+    return Console(file=careful(sys.stdout)), sys.stderr is not None and sys.stderr.isatty()
 
 
 class _StatusLine:
@@ -81,17 +91,15 @@ class _StatusLine:
 
     def _started(self):
         """Return rich's display of one task, which draws itself eight times a second until it is stopped."""
-        from rich.console import Console
         from rich.progress import BarColumn, SpinnerColumn, TextColumn, TimeElapsedColumn
         from rich.progress import Progress as Display
 
-        console = Console(file=careful(sys.stdout))
+        console, own = _console()
         columns = (
             SpinnerColumn("dots" if (console.encoding or "").startswith("utf") else "line"),
             TextColumn("{task.description}", markup=False), BarColumn(24), TextColumn("{task.fields[detail]}", markup=False),
             TimeElapsedColumn(),
         )  # fmt: skip
-        own = sys.stderr is not None and sys.stderr.isatty()  # redirected errors do not disturb the line
         display = Display(*columns, console=console, transient=True, refresh_per_second=8, redirect_stderr=own)
         display.start()
         return display
@@ -125,16 +133,12 @@ class Stages:
 
     def __call__(self, line: str) -> None:
         """Show a line; a plain line is skipped if its stage had one a moment ago."""
+        stage, now = line.rpartition(":")[0] or line, time.perf_counter()
         if self.live and _PANELS:
             _PANELS[-1].doing = line
         elif self.live:
             _STATUS.show(line)
-        else:
-            self._print(line)
-
-    def _print(self, line: str) -> None:
-        stage, now = line.rpartition(":")[0] or line, time.perf_counter()
-        if line not in self.shown and now - self.printed.get(stage, -STAGE_INTERVAL) >= STAGE_INTERVAL:
+        elif line not in self.shown and now - self.printed.get(stage, -STAGE_INTERVAL) >= STAGE_INTERVAL:
             self.printed[stage] = now
             self.shown.add(line)
             self.show(line)
@@ -168,14 +172,12 @@ class Progress:
     def __enter__(self) -> Progress:
         """Start the display."""
         if self.live:
-            from rich.console import Console
             from rich.live import Live
             from rich.spinner import Spinner
 
             _STATUS.clear()
             self.spinner = Spinner("dots" if (sys.stdout.encoding or "").lower().startswith("utf") else "line")
-            own = sys.stderr is not None and sys.stderr.isatty()
-            console = Console(file=careful(sys.stdout))
+            console, own = _console()
             self.display = Live(console=console, get_renderable=self._panel, refresh_per_second=8, redirect_stderr=own)
             self.display.__enter__()
             _PANELS.append(self)
@@ -263,40 +265,36 @@ class EventLog:
         """Drop the events of all steps after ``step``; 0 empties the log."""
         if self._file is not None:
             self.close()
-        try:
+        with self._writing():
             kept = [e for e in read_events(self.path) if e["step"] <= step] if step and self.path.is_file() else []
             # The old log stays until the shortened one is on the disk.
             write_bytes(self.path, *(_line(e) for e in kept))
             self._file = appending(self.path)
-        except OSError as e:
-            raise self._failure(e) from e
 
     def write(self, *, step: int, **values: object) -> None:
         """Append the event of one step; NaN and infinity become null."""
-        try:
+        with self._writing():
             self._file.write(_line({"step": step, **values}))
-        except OSError as e:
-            raise self._failure(e) from e
 
     def flush(self) -> None:
         """Flush the log and sync it to the disk, so that it never lags behind a checkpoint."""
-        try:
+        with self._writing():
             self._file.flush()
             os.fsync(self._file.fileno())
-        except OSError as e:
-            raise self._failure(e) from e
 
     def close(self) -> None:
         """Flush and close the log, which takes no further events."""
-        try:
+        with self._writing():
             self._file.close()
-        except OSError as e:
-            raise self._failure(e) from e
 
-    def _failure(self, error: OSError) -> ResourceError:
-        if isinstance(error, RefusedError):
-            return ResourceError(f"{self.path}: cannot be written, as {error}")
-        return ResourceError(f"{self.path}: cannot be written ({error.strerror or error}). Free some disk space")
+    @contextlib.contextmanager
+    def _writing(self) -> Iterator[None]:
+        try:
+            yield
+        except RefusedError as e:
+            raise ResourceError(f"{self.path}: cannot be written, as {e}") from e
+        except OSError as e:
+            raise ResourceError(f"{self.path}: cannot be written ({e.strerror or e}). Free some disk space") from e
 
 
 def read_events(path: Path) -> list[dict]:

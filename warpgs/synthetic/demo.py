@@ -15,6 +15,7 @@ from warpgs.geometry import look_at, matmul
 from warpgs.process import counted
 from warpgs.scene import Camera
 from warpgs.synthetic import raycast
+from warpgs.synthetic.raycast import Box, Cylinder, Light, Plane, Shape, Sphere, Texture, Torus
 
 # The demo scene: a textured still life, ray cast here and written as a COLMAP folder, so that a fit needs no download.
 #
@@ -27,10 +28,11 @@ MIN_VIEWS = 8
 MIN_SIDE = 32  # [px]; below that nothing of the texture is left
 CANDIDATES = 4800  # surface points tried at 320 x 240; fewer in smaller images, in proportion to the pixels
 TAU = 2 * np.pi
+CRISPNESS = 2.8  # gain before the tanh that rounds the checker's edges
 
 
-def checker_texture(rng: np.random.Generator, low: str, high: str, period: float, kind: str = "solid") -> raycast.Texture:
-    """Return a checker of ``period`` [u] in two colours (hexadecimal), with five waves of 0.6 to 2.2 times its period."""
+def checker_texture(rng: np.random.Generator, low: str, high: str, period: float, kind: str = "solid") -> Texture:
+    """Return a rounded checker of ``period`` [u] in two colours (hexadecimal), with five waves of 0.6 to 2.2 times that."""
     directions = rng.normal(size=(5, 3))
     if kind == "flat":
         directions[:, 2] = 0
@@ -38,12 +40,23 @@ def checker_texture(rng: np.random.Generator, low: str, high: str, period: float
     octaves = np.geomspace(0.45, 1.6, 5)
     tints = rng.normal(size=(5, 3))
     tints *= 0.15 * np.sqrt(octaves[0] / octaves)[:, None] / np.linalg.norm(tints, axis=1, keepdims=True)
-    colors = [tuple(int(c[i : i + 2], 16) / 255 for i in (0, 2, 4)) for c in (low, high)]
-    checker = (TAU / period, TAU / period, 0.0 if kind == "flat" else TAU / period)
+    waves = directions * (octaves * TAU / period)[:, None]
+    colors = np.array([[int(c[i : i + 2], 16) / 255 for i in (0, 2, 4)] for c in (low, high)])
     phases = rng.uniform(0, TAU, 8)
     if kind == "box":
         phases[:3] = TAU / 4
-    return raycast.Texture(*colors, checker, directions * (octaves * TAU / period)[:, None], tints, phases)
+
+    def albedo(p: np.ndarray) -> np.ndarray:
+        dt = p.dtype
+        product = np.ones(len(p), dt)
+        for axis in range(2 if kind == "flat" else 3):
+            product *= np.sin(p[:, axis] * dt.type(TAU / period) + dt.type(phases[axis]))
+        mix = (0.5 + 0.5 * np.tanh(dt.type(CRISPNESS) * product))[:, None]
+        dark, bright = colors.astype(dt)
+        ripple = matmul(np.sin(matmul(p, waves.T.astype(dt)) + phases[3:].astype(dt)), tints.astype(dt))
+        return np.clip(dark + mix * (bright - dark) + ripple, 0.0, 1.0)
+
+    return albedo
 
 
 def _turn(x: float = 0.0, y: float = 0.0) -> np.ndarray:
@@ -52,20 +65,20 @@ def _turn(x: float = 0.0, y: float = 0.0) -> np.ndarray:
     return matmul(np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]]), np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]]))
 
 
-def still_life(seed: int = 0) -> list[raycast.Shape]:
+def still_life(seed: int = 0) -> list[Shape]:
     """Return the scene's shapes: four planes that fill the frame, then six objects that hide one another."""
     surface = functools.partial(checker_texture, np.random.default_rng(seed))
     return [
-        raycast.Plane((0, 0, 6.4), surface("1a3a5f", "f7e6c6", 0.92, "flat")),
-        raycast.Plane((-3.3, 0, 0), surface("7a2a22", "f5be78", 1.1, "flat"), _turn(y=-90)),
-        raycast.Plane((3.3, 0, 0), surface("1a5c4d", "c2e4a0", 1.1, "flat"), _turn(y=90)),
-        raycast.Plane((0, 1.3, 0), surface("3a2a24", "f2dfc0", 0.9, "flat"), _turn(x=-90)),
-        raycast.Sphere((-0.85, 0.6, 4.3), surface("143a9e", "facc40", 0.6), size=0.7),
-        raycast.Box((0.95, 0.65, 4.9), surface("b22433", "fadbb4", 0.6, "box"), _turn(y=32), half=(0.6, 0.65, 0.6)),
-        raycast.Torus((0.3, 1.08, 3.5), surface("0d6b66", "faed8c", 0.42), ring=0.5, tube=0.22),
-        raycast.Cylinder((-2.1, 0.3, 5.3), surface("5c1a75", "f5c4dc", 0.7), size=0.42, half_height=1.0),
-        raycast.Sphere((0.95, -0.33, 4.9), surface("1a6629", "f2f2bf", 0.42), size=0.33),
-        raycast.Box((2.05, 0.9, 3.9), surface("1f2973", "b2e6fa", 0.4, "box"), _turn(y=-20), half=(0.4, 0.4, 0.4)),
+        Plane((0, 0, 6.4), surface("1a3a5f", "f7e6c6", 0.92, "flat")),
+        Plane((-3.3, 0, 0), surface("7a2a22", "f5be78", 1.1, "flat"), _turn(y=-90)),
+        Plane((3.3, 0, 0), surface("1a5c4d", "c2e4a0", 1.1, "flat"), _turn(y=90)),
+        Plane((0, 1.3, 0), surface("3a2a24", "f2dfc0", 0.9, "flat"), _turn(x=-90)),
+        Sphere((-0.85, 0.6, 4.3), surface("143a9e", "facc40", 0.6), size=0.7),
+        Box((0.95, 0.65, 4.9), surface("b22433", "fadbb4", 0.6, "box"), _turn(y=32), half=(0.6, 0.65, 0.6)),
+        Torus((0.3, 1.08, 3.5), surface("0d6b66", "faed8c", 0.42), ring=0.5, tube=0.22),
+        Cylinder((-2.1, 0.3, 5.3), surface("5c1a75", "f5c4dc", 0.7), size=0.42, half_height=1.0),
+        Sphere((0.95, -0.33, 4.9), surface("1a6629", "f2f2bf", 0.42), size=0.33),
+        Box((2.05, 0.9, 3.9), surface("1f2973", "b2e6fa", 0.4, "box"), _turn(y=-20), half=(0.4, 0.4, 0.4)),
     ]
 
 
@@ -77,14 +90,8 @@ def camera_path(views: int, width: int, height: int) -> list[Camera]:
     for u in np.linspace(0, 1, views):
         sweep, wave = 2 * u - 1, np.cos(np.pi * (TRAIN_VIEWS - 1) * u)
         center = np.array([1.6 * sweep, -0.55 - 0.45 * wave, 0.2 * sweep**2])
-        forward = np.array([0.4 * center[0], 0.35 + 0.35 * center[1], 5.0]) - center
-        forward /= np.linalg.norm(forward)
-        right = np.cross([0, 1, 0], forward)
-        right /= np.linalg.norm(right)
-        R = np.stack([right, np.cross(forward, right), forward])
-        viewmat = np.eye(4)
-        viewmat[:3, :3], viewmat[:3, 3] = R, -matmul(R, center)
-        out.append(Camera(viewmat, K, width, height))
+        target = np.array([0.4 * center[0], 0.35 + 0.35 * center[1], 5.0])
+        out.append(Camera(look_at(center, target, np.array([0, -1, 0])), K, width, height))
     return out
 
 
@@ -108,7 +115,7 @@ def _project(camera: Camera, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return xy, p[:, 2]
 
 
-def _sees(shapes: list[raycast.Shape], camera: Camera, x: np.ndarray, index: np.ndarray) -> np.ndarray:
+def _sees(shapes: list[Shape], camera: Camera, x: np.ndarray, index: np.ndarray) -> np.ndarray:
     """Return whether a camera sees surface points [N, 3] [u] of the shapes ``index`` [N] well enough for a feature detector."""
     xy, depth = _project(camera, x)
     size = np.array([camera.width, camera.height])
@@ -125,7 +132,7 @@ def _sees(shapes: list[raycast.Shape], camera: Camera, x: np.ndarray, index: np.
 
 
 def surface_points(
-    shapes: list[raycast.Shape], light: raycast.Light, cameras: list[Camera], rng: np.random.Generator
+    shapes: list[Shape], light: Light, cameras: list[Camera], rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return points [N, 3] [u] that at least two cameras see, colours [N, 3], and which cameras see them [N, C]."""
     width, height = cameras[0].width, cameras[0].height
@@ -190,34 +197,26 @@ def colmap_text(cameras: list[Camera], x: np.ndarray, colors: np.ndarray, seen: 
     return {name: "\n".join(lines) + "\n" for name, lines in named.items()}
 
 
-def _check(folder: Path, width: int, height: int) -> None:
-    """Raise a UsageError for a demo that cannot be written, before any file is written."""
-    if min(width, height) < MIN_SIDE:
-        raise UsageError(f"a demo image must be at least {MIN_SIDE} px on each side, not {width} x {height}")
+def _colmap(shapes: list[Shape], light: Light, cameras: list[Camera], seed: int, most: int = CANDIDATES) -> dict[str, bytes]:
+    """Return the files of a COLMAP model with at most ``most`` points, by their path in the scene."""
+    x, colors, seen = surface_points(shapes, light, cameras, np.random.default_rng([seed, 1]))
+    some = np.linspace(0, len(x) - 1, min(most, len(x))).astype(int)
+    texts = colmap_text(cameras, x[some], colors[some], seen[some])
+    return {f"sparse/0/{name}": text.encode() for name, text in texts.items()}
+
+
+def _write(folder: Path, views: int, least: int, train: int, size: tuple[int, int], contents: Callable[[], dict[str, bytes]]):
+    """Write the files of a demo into a new or empty folder, all or none."""
+    if views < least:
+        raise UsageError(f"a demo of this kind needs at least {least} views ({train} to fit, the rest held out), not {views}")
+    if min(size) < MIN_SIDE:
+        raise UsageError(f"a demo image must be at least {MIN_SIDE} px on each side, not {size[0]} x {size[1]}")
     try:
-        if folder.exists() and not folder.is_dir():
-            raise UsageError(f"{folder} is a file; name a new or an empty folder for the demo")
-        if folder.exists() and not is_empty(folder):
-            raise UsageError(f"{folder} is not empty, and the demo overwrites nothing; name a new or an empty folder")
+        if folder.exists() and not (folder.is_dir() and is_empty(folder)):
+            what = "is not empty, and the demo overwrites nothing" if folder.is_dir() else "is a file"
+            raise UsageError(f"{folder} {what}; name a new or an empty folder")
     except OSError as e:
         raise ResourceError(f"{folder} cannot be read ({e.strerror or e}); name a folder that you may write to") from e
-
-
-def _files(views: int, width: int, height: int, seed: int, tell: Callable[[str], object]) -> dict[str, bytes]:
-    """Return the contents of the demo folder by relative path, all at once, so that an interruption leaves no partial scene."""
-    shapes, light = still_life(seed), raycast.Light()
-    cameras = camera_path(views, width, height)
-    files = {}
-    for i, camera in enumerate(counted(cameras, tell, "rendering", "views")):
-        files[f"images/{i:03d}.png"] = _png(raycast.render(shapes, light, camera.K, camera.viewmat, width, height))
-    tell("finding points")
-    texts = colmap_text(cameras, *surface_points(shapes, light, cameras, np.random.default_rng([seed, 1])))
-    return files | {f"sparse/0/{name}": text.encode() for name, text in texts.items()}
-
-
-def write_files(folder: Path, size: tuple[int, int], contents: Callable[[], dict[str, bytes]]) -> None:
-    """Write the files of a demo into a new or empty folder, all or none."""
-    _check(folder, *size)
     with filling(folder) as temporary:  # before the work: a folder that cannot be made is reported at once
         for path, content in contents().items():
             make_folder((temporary / path).parent)
@@ -247,9 +246,16 @@ def write_demo(
         UsageError: The folder is not empty, or the sizes are too small.
         ResourceError: The folder cannot be written.
     """
-    if views < MIN_VIEWS:
-        raise UsageError(f"a demo needs at least {MIN_VIEWS} views ({TRAIN_VIEWS} to fit, the rest held out), not {views}")
-    write_files(Path(folder), (width, height), lambda: _files(views, width, height, seed, tell))
+
+    def contents() -> dict[str, bytes]:
+        shapes, light, cameras = still_life(seed), Light(), camera_path(views, width, height)
+        files = {}
+        for i, c in enumerate(counted(cameras, tell, "rendering", "views")):
+            files[f"images/{i:03d}.png"] = _png(raycast.render(shapes, light, c.K, c.viewmat, width, height))
+        tell("finding points")
+        return files | _colmap(shapes, light, cameras, seed)
+
+    _write(Path(folder), views, MIN_VIEWS, TRAIN_VIEWS, (width, height), contents)
     return split_spec(views)
 
 
@@ -270,14 +276,14 @@ SAMPLES = 4
 """Number of rays along each side of a pixel: alpha has 17 levels."""
 MAX_POINTS = 300
 """Largest number of points of a COLMAP folder: as few as a reconstruction finds on a small object."""
-LIGHT = raycast.Light(direction=(0.5, -0.35, 0.85), sun=0.55, ambient=0.6)
+LIGHT = Light(direction=(0.5, -0.35, 0.85), sun=0.55, ambient=0.6)
 PALETTE = (
     ("143a9e", "facc40"), ("b22433", "fadbb4"), ("0d6b66", "faed8c"), ("5c1a75", "f5c4dc"), ("1a6629", "f2f2bf"),
     ("7a2a22", "f5be78"), ("1f2973", "b2e6fa"), ("8a3d0f", "cfe8f0"), ("2b2b33", "f0d9b8"), ("0f5a8a", "ffd7c2"),
 )  # fmt: skip
 """Pairs of colours of a texture, as six hexadecimal digits."""
 
-Surface = Callable[..., raycast.Texture]
+Surface = Callable[..., Texture]
 
 
 def _frame(axis: np.ndarray, near: tuple[float, float, float] = (0.31, 0.23, 0.92)) -> np.ndarray:
@@ -293,28 +299,25 @@ def _around(angle: float, radius: float, z: float) -> np.ndarray:
     return np.array([radius * np.cos(angle), radius * np.sin(angle), z])
 
 
-def _rod(a: np.ndarray, b: np.ndarray, size: float, texture: raycast.Texture) -> raycast.Shape:
+def _rod(a: np.ndarray, b: np.ndarray, size: float, texture: Texture) -> Shape:
     """Return a thin cylinder of radius ``size`` [u] from ``a`` to ``b``, both [3] [u]."""
-    return raycast.Cylinder(
-        tuple((a + b) / 2), texture, _frame(b - a), shading=0, size=size, half_height=float(np.linalg.norm(b - a)) / 2
-    )
+    half = float(np.linalg.norm(b - a)) / 2
+    return Cylinder(tuple((a + b) / 2), texture, _frame(b - a), shading=0, size=size, half_height=half)
 
 
-def _body(rng: np.random.Generator, surface: Surface) -> raycast.Shape:
+def _body(rng: np.random.Generator, surface: Surface) -> Shape:
     """Return the bulky shape in the middle: a ball, a box or a drum within 0.71 u of the vertical axis."""
     size, turn = rng.uniform(0.4, 0.5), rng.uniform(0, TAU)
     kind = rng.integers(3)
     if kind == 0:
-        return raycast.Sphere((0, 0, 0), surface(0.5), size=size)
+        return Sphere((0, 0, 0), surface(0.5), size=size)
     if kind == 1:
         half = (0.8 * size, 0.85 * size, 0.8 * size)
-        return raycast.Box(
-            (0, 0, 0), surface(0.45), matmul(_frame((0, 0, 1)), _frame(_around(turn, 1, 0), (0, 1, 0))), half=half
-        )
-    return raycast.Cylinder((0, 0, 0), surface(0.45), _frame((0, 0, 1)), shading=0.6, size=0.85 * size, half_height=size)
+        return Box((0, 0, 0), surface(0.45), matmul(_frame((0, 0, 1)), _frame(_around(turn, 1, 0), (0, 1, 0))), half=half)
+    return Cylinder((0, 0, 0), surface(0.45), _frame((0, 0, 1)), shading=0.6, size=0.85 * size, half_height=size)
 
 
-def _stand(rng: np.random.Generator, surface: Surface) -> list[raycast.Shape]:
+def _stand(rng: np.random.Generator, surface: Surface) -> list[Shape]:
     """Return three to five slanted rods below the body, and a thin ring or balls at their feet."""
     count, first, size = int(rng.integers(3, 6)), rng.uniform(0, TAU), rng.uniform(0.026, 0.04)
     spread, texture = rng.uniform(0.5, 0.75), surface(0.35)
@@ -322,38 +325,36 @@ def _stand(rng: np.random.Generator, surface: Surface) -> list[raycast.Shape]:
     feet = [_around(a, spread, -0.95) for a in angles]
     shapes = [_rod(_around(a, 0.22, -0.3), foot, size, texture) for a, foot in zip(angles, feet)]
     if rng.random() < 0.5:
-        return [*shapes, raycast.Torus((0, 0, -0.9), surface(0.4), _frame((0, 0, 1)), shading=0, ring=spread, tube=1.1 * size)]
-    return [*shapes, *(raycast.Sphere(tuple(f), texture, shading=0, size=0.085) for f in feet)]
+        return [*shapes, Torus((0, 0, -0.9), surface(0.4), _frame((0, 0, 1)), shading=0, ring=spread, tube=1.1 * size)]
+    return [*shapes, *(Sphere(tuple(f), texture, shading=0, size=0.085) for f in feet)]
 
 
-def _ring(rng: np.random.Generator, surface: Surface) -> raycast.Shape:
+def _ring(rng: np.random.Generator, surface: Surface) -> Shape:
     """Return a ring to see through: upright on top of the body, or tilted around it."""
     tube, turn = rng.uniform(0.04, 0.065), rng.uniform(0, TAU)
     if rng.random() < 0.5:
         ring = rng.uniform(0.3, 0.38)
-        return raycast.Torus((0, 0, 0.38 + ring), surface(0.4), _frame(_around(turn, 1, 0)), shading=0, ring=ring, tube=tube)
+        return Torus((0, 0, 0.38 + ring), surface(0.4), _frame(_around(turn, 1, 0)), shading=0, ring=ring, tube=tube)
     tilt = rng.uniform(0.25, 0.6)
     axis = _around(turn, np.sin(tilt), np.cos(tilt))
-    return raycast.Torus((0, 0, 0), surface(0.5), _frame(axis), shading=0, ring=rng.uniform(0.8, 0.95), tube=tube)
+    return Torus((0, 0, 0), surface(0.5), _frame(axis), shading=0, ring=rng.uniform(0.8, 0.95), tube=tube)
 
 
-def _grid(rng: np.random.Generator, surface: Surface) -> list[raycast.Shape]:
+def _grid(rng: np.random.Generator, surface: Surface) -> list[Shape]:
     """Return an upright grid of crossing bars beside the body, held by a rod."""
     turn, size, texture = rng.uniform(0, TAU), rng.uniform(0.02, 0.03), surface(0.3)
     width, height, low = rng.uniform(0.65, 0.9), rng.uniform(0.5, 0.8), rng.uniform(-0.5, -0.2)
     middle, along = _around(turn, 0.72, low), _around(turn + TAU / 4, 1, 0)
     up = np.array([0, 0, 1.0])
-    shapes = []
-    for s in np.linspace(-0.5, 0.5, int(rng.integers(4, 6))):
-        foot = middle + s * width * along
-        shapes.append(_rod(foot, foot + height * up, size, texture))
-    for s in np.linspace(0, 1, int(rng.integers(3, 5))):
-        center = middle + s * height * up
-        shapes.append(_rod(center - 0.53 * width * along, center + 0.53 * width * along, size, texture))
-    return [*shapes, _rod(_around(turn, 0.2, 0), _around(turn, 0.72, max(0.0, low)), size, texture)]
+    feet = [middle + s * width * along for s in np.linspace(-0.5, 0.5, int(rng.integers(4, 6)))]
+    centers = [middle + s * height * up for s in np.linspace(0, 1, int(rng.integers(3, 5)))]
+    bars = [(foot, foot + height * up) for foot in feet]
+    bars += [(center - 0.53 * width * along, center + 0.53 * width * along) for center in centers]
+    bars.append((_around(turn, 0.2, 0), _around(turn, 0.72, max(0.0, low))))
+    return [_rod(a, b, size, texture) for a, b in bars]
 
 
-def _plates(rng: np.random.Generator, surface: Surface, turn: float) -> list[raycast.Shape]:
+def _plates(rng: np.random.Generator, surface: Surface, turn: float) -> list[Shape]:
     """Return two or three thin radial plates at the side of the body, the first at angle ``turn`` [rad]."""
     count, thin = int(rng.integers(2, 4)), rng.uniform(0.012, 0.02)
     long, high = rng.uniform(0.22, 0.3), rng.uniform(0.2, 0.32)
@@ -363,26 +364,26 @@ def _plates(rng: np.random.Generator, surface: Surface, turn: float) -> list[ray
         outward = _around(angle, 1, 0)
         frame = np.stack([outward, [0, 0, 1], np.cross(outward, [0, 0, 1])], axis=1)
         center = tuple(_around(angle, 0.4 + long, rng.uniform(-0.1, 0.25)))
-        shapes.append(raycast.Box(center, surface(0.3, "flat"), frame, shading=0, half=(long, high, thin)))
+        shapes.append(Box(center, surface(0.3, "flat"), frame, shading=0, half=(long, high, thin)))
     return shapes
 
 
-def _antennas(rng: np.random.Generator, surface: Surface) -> list[raycast.Shape]:
+def _antennas(rng: np.random.Generator, surface: Surface) -> list[Shape]:
     """Return two thin rods that rise from the body, each with a ball at its end."""
-    shapes: list[raycast.Shape] = []
+    shapes: list[Shape] = []
     for angle in rng.uniform(0, TAU) + np.array([0, rng.uniform(1.5, 3.0)]):
         end = _around(angle, rng.uniform(0.4, 0.65), rng.uniform(0.75, 0.95))
         shapes.append(_rod(_around(angle, 0.15, 0.25), end, 0.022, surface(0.3)))
-        shapes.append(raycast.Sphere(tuple(end), surface(0.2), shading=0, size=rng.uniform(0.08, 0.11)))
+        shapes.append(Sphere(tuple(end), surface(0.2), shading=0, size=rng.uniform(0.08, 0.11)))
     return shapes
 
 
-def cut_out_object(seed: int = 0) -> list[raycast.Shape]:
+def cut_out_object(seed: int = 0) -> list[Shape]:
     """Return an object's shapes, within `REACH`: a body on legs, a ring and a grid, thin plates, rods with balls."""
     rng = np.random.default_rng([seed, 2])
     order = iter(np.tile(rng.permutation(len(PALETTE)), 4))
 
-    def surface(period: float, kind: str = "solid") -> raycast.Texture:
+    def surface(period: float, kind: str = "solid") -> Texture:
         return checker_texture(rng, *PALETTE[next(order)], period, kind)
 
     shapes = [_body(rng, surface), *_stand(rng, surface), _ring(rng, surface), *_grid(rng, surface)]
@@ -399,11 +400,6 @@ def ring_cameras(views: int, width: int, height: int) -> list[Camera]:
         center = DISTANCE * _around(TAU * u, np.cos(rise), np.sin(rise))
         cameras.append(Camera(look_at(center, np.zeros(3), np.array([0, 0, 1.0])), K, width, height))
     return cameras
-
-
-def object_split_spec(views: int) -> str:
-    """Return the split of an object with that many views: eight evenly spaced training views, all others held out."""
-    return _split(views, {i * views // OBJECT_TRAIN_VIEWS for i in range(OBJECT_TRAIN_VIEWS)})
 
 
 def _png(image: np.ndarray) -> bytes:
@@ -425,27 +421,6 @@ def _transforms(cameras: list[Camera]) -> str:
     return json.dumps({"camera_angle_x": angle, "w": first.width, "h": first.height, "frames": frames}, indent=1)
 
 
-def _object_files(form: str, views: int, size: tuple[int, int], seed: int, tell: Callable[[str], object]) -> dict[str, bytes]:
-    """Return the contents of the folder by relative path."""
-    shapes, cameras = cut_out_object(seed), ring_cameras(views, *size)
-    files = {}
-    for i, camera in enumerate(counted(cameras, tell, "rendering", "views")):
-        over_black = raycast.render_rgba(shapes, LIGHT, camera.K, camera.viewmat, *size, SAMPLES)
-        alpha = over_black[..., 3:]
-        color = np.divide(over_black[..., :3], alpha, out=np.zeros_like(over_black[..., :3]), where=alpha > 0)
-        if form == "transforms":
-            files[f"images/{i:03d}.png"] = _png(np.concatenate([color, alpha], axis=2))
-        else:
-            files[f"images/{i:03d}.png"] = _png(np.where(alpha > 0, color, np.float32(0.5)))
-            files[f"masks/{i:03d}.png"] = _png(alpha[..., 0])
-    if form == "transforms":
-        return files | {"transforms.json": _transforms(cameras).encode()}
-    x, colors, seen = surface_points(shapes, LIGHT, cameras, np.random.default_rng([seed, 1]))
-    some = np.linspace(0, len(x) - 1, min(MAX_POINTS, len(x))).astype(int)
-    texts = colmap_text(cameras, x[some], colors[some], seen[some])
-    return files | {f"sparse/0/{name}": text.encode() for name, text in texts.items()}
-
-
 def write_object(
     folder: Path, *, form: str = "transforms", views: int = 24, width: int = 320, height: int = 240, seed: int = 0,
     tell: Callable[[str], object] = lambda line: None,
@@ -453,10 +428,21 @@ def write_object(
     """Write an object as a scene folder: RGBA images with straight colours, or RGB images with soft masks."""
     if form not in FORMATS:
         raise UsageError(f"a demo object is written as {' or '.join(FORMATS)}, not as {form!r}")
-    if views < OBJECT_MIN_VIEWS:
-        raise UsageError(
-            f"a demo object needs {OBJECT_MIN_VIEWS} views or more ({OBJECT_TRAIN_VIEWS} to fit, the rest held out), "
-            f"not {views}"
-        )
-    write_files(Path(folder), (width, height), lambda: _object_files(form, views, (width, height), seed, tell))
-    return object_split_spec(views)
+
+    def contents() -> dict[str, bytes]:
+        shapes, cameras, files = cut_out_object(seed), ring_cameras(views, width, height), {}
+        for i, c in enumerate(counted(cameras, tell, "rendering", "views")):
+            over_black, name = raycast.render_rgba(shapes, LIGHT, c.K, c.viewmat, width, height, SAMPLES), f"{i:03d}.png"
+            color, alpha = over_black[..., :3], over_black[..., 3:]
+            color = np.divide(color, alpha, out=np.zeros_like(color), where=alpha > 0)
+            if form == "transforms":
+                files[f"images/{name}"] = _png(np.concatenate([color, alpha], axis=2))
+            else:
+                files[f"images/{name}"] = _png(np.where(alpha > 0, color, np.float32(0.5)))
+                files[f"masks/{name}"] = _png(alpha[..., 0])
+        if form == "transforms":
+            return files | {"transforms.json": _transforms(cameras).encode()}
+        return files | _colmap(shapes, LIGHT, cameras, seed, MAX_POINTS)
+
+    _write(Path(folder), views, OBJECT_MIN_VIEWS, OBJECT_TRAIN_VIEWS, (width, height), contents)
+    return _split(views, {i * views // OBJECT_TRAIN_VIEWS for i in range(OBJECT_TRAIN_VIEWS)})

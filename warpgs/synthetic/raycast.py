@@ -10,8 +10,8 @@ Axes as in an OpenCV camera: +x right, +y down, +z away from the viewer. Lengths
 from __future__ import annotations
 
 import abc
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -19,58 +19,26 @@ from warpgs.geometry import matmul
 
 BAND_RAYS = 40_000
 """Number of rays cast at once: the working set of a band stays in the second-level cache."""
+EDGE = 5.0
+"""Steepness of a shadow's edge, per unit of clearance over distance."""
+Texture = Callable[[np.ndarray], np.ndarray]
+"""Albedo [N, 3] in [0, 1] at local positions [N, 3] [u]."""
+Vector = tuple[float, float, float]
 
 
-@dataclass(frozen=True)
-class Texture:
-    """A solid texture: a smoothed checker between two colours, plus plane waves that tint it."""
-
-    low: tuple[float, float, float]
-    """Colour of one half of the checker, in [0, 1]."""
-    high: tuple[float, float, float]
-    """Colour of the other half, in [0, 1]."""
-    checker: tuple[float, float, float]
-    """Angular frequencies of the checker along the local axes [rad/u]; 0 leaves an axis out."""
-    waves: np.ndarray
-    """Angular wave vectors [rad/u], shape [W, 3]."""
-    tints: np.ndarray
-    """RGB amplitude of every wave, shape [W, 3]."""
-    phases: np.ndarray
-    """Phases [rad]: the three of the checker, then one for every wave, shape [3 + W]."""
-    softness: float = 2.8
-    """Gain before the tanh that rounds the checker's edges: a larger gain makes crisper edges."""
-
-    def __call__(self, p: np.ndarray) -> np.ndarray:
-        """Return the albedo [N, 3] in [0, 1] at local positions [N, 3] [u]."""
-        dt = p.dtype
-        product = np.ones(len(p), dt)
-        for axis, frequency in enumerate(self.checker):
-            if frequency:
-                product *= np.sin(p[:, axis] * dt.type(frequency) + dt.type(self.phases[axis]))
-        mix = (0.5 + 0.5 * np.tanh(dt.type(self.softness) * product))[:, None]
-        low, high = np.asarray(self.low, dt), np.asarray(self.high, dt)
-        ripple = matmul(np.sin(matmul(p, self.waves.T.astype(dt)) + self.phases[3:].astype(dt)), self.tints.astype(dt))
-        return np.clip(low + mix * (high - low) + ripple, 0.0, 1.0)
-
-
-@dataclass(frozen=True)
 class Shape(abc.ABC):
-    """A textured shape at a place; subclasses give its geometry in the local frame ``x_local = R^T (x - center)``."""
+    """A textured shape at a place; subclasses give its geometry in the local frame ``x_local = R^T (x - center)``.
 
-    center: tuple[float, float, float]
-    """Origin of the local frame in the world [u]."""
-    texture: Texture
-    """Albedo as a function of local position."""
-    rotation: np.ndarray = field(default_factory=lambda: np.eye(3))
-    """Rotation world_from_local, shape [3, 3]."""
-    shading: float = 0.8
-    """Radius of the sphere that casts the shadow of the shape, divided by the radius of its bounding sphere; 0 for thin shapes,
-    which cast no shadow, because a sphere's shadow would be too large."""
+    ``radius`` is that of the bounding sphere around ``center`` [u], infinite without one. ``shading`` is the radius of the
+    sphere that casts the shadow of the shape, divided by ``radius``; 0 for thin shapes, which cast no shadow, because a
+    sphere's shadow would be too large.
+    """
 
-    @property
-    def radius(self) -> float:
-        """Radius of the bounding sphere around ``center`` [u]; infinite without one."""
-        return np.inf
+    def __init__(
+        self, center: Vector, texture: Texture, rotation: np.ndarray | None = None, shading: float = 0.8, radius: float = np.inf
+    ):
+        self.center, self.texture, self.shading, self.radius = center, texture, shading, radius
+        self.rotation = np.eye(3) if rotation is None else rotation  # world_from_local
 
     def local(self, x: np.ndarray) -> np.ndarray:
         """Return world positions [u], shape [N, 3], in the local frame."""
@@ -99,17 +67,12 @@ class Plane(Shape):
         return np.broadcast_to(np.array([0, 0, -1], p.dtype), p.shape)
 
 
-@dataclass(frozen=True)
 class Sphere(Shape):
-    """A sphere around ``center``."""
+    """A sphere of radius ``size`` [u]."""
 
-    size: float = 1.0
-    """Radius of the shape [u]."""
-
-    @property
-    def radius(self) -> float:
-        """See ``Shape.radius``."""
-        return self.size
+    def __init__(self, *place, size: float, **more):
+        super().__init__(*place, radius=size, **more)
+        self.size = size
 
     def hit(self, o: np.ndarray, d: np.ndarray) -> np.ndarray:
         """See ``Shape.hit``."""
@@ -123,17 +86,12 @@ class Sphere(Shape):
         return p / np.linalg.norm(p, axis=1, keepdims=True)
 
 
-@dataclass(frozen=True)
 class Box(Shape):
-    """A box around ``center``, its edges along the local axes."""
+    """A box with edges along the local axes; ``half`` are half their lengths [u]."""
 
-    half: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    """Half edge lengths [u]."""
-
-    @property
-    def radius(self) -> float:
-        """See ``Shape.radius``."""
-        return float(np.linalg.norm(self.half))
+    def __init__(self, *place, half: Vector, **more):
+        super().__init__(*place, radius=float(np.linalg.norm(half)), **more)
+        self.half = half
 
     def hit(self, o: np.ndarray, d: np.ndarray) -> np.ndarray:
         """See ``Shape.hit``."""
@@ -153,19 +111,12 @@ class Box(Shape):
         return n
 
 
-@dataclass(frozen=True)
 class Cylinder(Shape):
-    """An upright cylinder (axis: local y) with flat caps."""
+    """An upright cylinder (axis: local y) with flat caps, of radius ``size`` and height 2 ``half_height`` [u]."""
 
-    size: float = 1.0
-    """Radius of the shape [u]."""
-    half_height: float = 1.0
-    """Half the height of the shape [u]."""
-
-    @property
-    def radius(self) -> float:
-        """See ``Shape.radius``."""
-        return float(np.hypot(self.size, self.half_height))
+    def __init__(self, *place, size: float, half_height: float, **more):
+        super().__init__(*place, radius=float(np.hypot(size, half_height)), **more)
+        self.size, self.half_height = size, half_height
 
     def hit(self, o: np.ndarray, d: np.ndarray) -> np.ndarray:
         """See ``Shape.hit``."""
@@ -185,25 +136,17 @@ class Cylinder(Shape):
         across = np.hypot(p[:, 0], p[:, 2])
         side = across / self.size > np.abs(p[:, 1]) / self.half_height
         n = np.zeros_like(p)
-        n[:, 0] = np.where(side, p[:, 0] / np.maximum(across, 1e-6), 0)
+        n[:, [0, 2]] = np.where(side[:, None], p[:, [0, 2]] / np.maximum(across, 1e-6)[:, None], 0)
         n[:, 1] = np.where(side, 0, np.sign(p[:, 1]))
-        n[:, 2] = np.where(side, p[:, 2] / np.maximum(across, 1e-6), 0)
         return n
 
 
-@dataclass(frozen=True)
 class Torus(Shape):
-    """A torus around the local y axis."""
+    """A torus around the local y axis: a tube of radius ``tube`` around a circle of radius ``ring`` [u]."""
 
-    ring: float = 1.0
-    """Radius of the circle in the middle of the tube [u]."""
-    tube: float = 0.3
-    """Radius of the tube [u]."""
-
-    @property
-    def radius(self) -> float:
-        """See ``Shape.radius``."""
-        return self.ring + self.tube
+    def __init__(self, *place, ring: float, tube: float, **more):
+        super().__init__(*place, radius=ring + tube, **more)
+        self.ring, self.tube = ring, tube
 
     def _distance(self, p: np.ndarray) -> np.ndarray:
         """Return the signed distance to the surface [u], shape [N], of local positions [N, 3]."""
@@ -241,14 +184,12 @@ class Torus(Shape):
 class Light:
     """A distant soft light, and ambient light of the surroundings."""
 
-    direction: tuple[float, float, float] = (-0.45, -0.75, -0.5)
+    direction: Vector = (-0.45, -0.75, -0.5)
     """Direction towards the light, any length."""
     sun: float = 0.62
     """Brightness of a surface that faces the light, above the ambient."""
     ambient: float = 0.6
     """Brightness where the light does not reach."""
-    sharpness: float = 5.0
-    """Steepness of a shadow's edge, per unit of clearance over distance."""
 
 
 def cast(shapes: Sequence[Shape], origin: np.ndarray, dirs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -295,7 +236,7 @@ def shade(shapes: Sequence[Shape], light: Light, x: np.ndarray, index: np.ndarra
         open_sky[rows] *= 1 - 0.85 * facing * np.minimum(bulk**2 / square, 1)
         along = matmul(away, to_light)
         clearance = (np.sqrt(np.maximum(square - along * along, 0)) - bulk) / np.maximum(along, 1e-3)
-        edge = np.clip(0.5 + light.sharpness * clearance, 0, 1)
+        edge = np.clip(0.5 + EDGE * clearance, 0, 1)
         lit[rows] *= np.where(along > 0, edge * edge * (3 - 2 * edge), 1)
     brightness = light.ambient * open_sky + light.sun * lit * np.maximum(matmul(normals, to_light), 0)
     return np.clip(rgb * brightness[:, None], 0, 1)

@@ -7,7 +7,6 @@ import math
 import os
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,7 +18,7 @@ from warpgs.errors import DataError
 from warpgs.files import write_text
 from warpgs.geometry import convert_camera, convert_gaussians, look_at, matmul, quaternions, rotation_matrices
 from warpgs.locks import hold_file
-from warpgs.pipeline.films.paths import up_of
+from warpgs.pipeline.films.paths import fov_y, up_of
 from warpgs.pipeline.run.export import NO_FILTERS, Filters, file_gaussians, filtered, rotate_camera
 from warpgs.pipeline.run.folder import open_run
 from warpgs.scene import Camera, Gaussians, base_colors
@@ -38,11 +37,6 @@ def wxyz_of(camera: Camera) -> np.ndarray:
     return quaternions(torch.from_numpy(np.asarray(camera.viewmat)[None, :3, :3].transpose(0, 2, 1).copy()))[0].numpy()
 
 
-def fov_y(camera: Camera, aspect: float = math.inf) -> float:
-    """Return the vertical field of view [rad] at which a window shows a camera's whole image, centred."""
-    return 2 * math.atan(max(0.5 * camera.height / float(camera.K[1, 1]), 0.5 * camera.width / float(camera.K[0, 0]) / aspect))
-
-
 def distance_ahead(camera: Camera, gaussians: Gaussians) -> float:
     """Return the median depth [u] of the means that a camera sees, or 1 if it sees none; the view turns about this depth."""
     means = gaussians.means.detach().cpu().double().numpy()
@@ -59,6 +53,10 @@ def camera_at(wxyz: Any, position: Any, fov: float, width: int, height: int) -> 
     rotation = rotation_matrices(np.asarray(wxyz, np.float64)).T
     viewmat = np.eye(4)
     viewmat[:3, :3], viewmat[:3, 3] = rotation, -matmul(rotation, np.asarray(position, np.float64))
+    return _pinhole(viewmat, fov, width, height)
+
+
+def _pinhole(viewmat: np.ndarray, fov: float, width: int, height: int) -> Camera:
     focal = 0.5 * height / math.tan(0.5 * fov)
     return Camera(viewmat, np.array([[focal, 0, 0.5 * width], [0, focal, 0.5 * height], [0, 0, 1.0]]), width, height)
 
@@ -69,9 +67,7 @@ def camera_before(gaussians: Gaussians, width: int = 960, height: int = 720) -> 
     low, high = np.percentile(means, [5, 95], axis=0)
     middle, radius = (low + high) / 2, max(0.5 * float(np.linalg.norm(high - low)), 1e-6)
     center = middle - np.array([0, 0, radius / math.sin(0.5 * FIELD_OF_VIEW)])
-    focal = 0.5 * height / math.tan(0.5 * FIELD_OF_VIEW)
-    K = np.array([[focal, 0, 0.5 * width], [0, focal, 0.5 * height], [0, 0, 1.0]])
-    return Camera(look_at(center, middle, np.array([0.0, -1, 0])), K, width, height)
+    return _pinhole(look_at(center, middle, np.array([0.0, -1, 0])), FIELD_OF_VIEW, width, height)
 
 
 def stands_at(camera: Camera, other: Camera, near: float) -> bool:
@@ -87,26 +83,12 @@ MEDIAN_AXIS = 1.0
 are at least 6.1e-5, the smallest normal number: for axes from 1/128 of the median to 255 times the median."""
 
 
-@dataclass(frozen=True)
-class Packed:
-    """N Gaussians of one colour each, in their own units; one such unit is ``scale`` scene units."""
+def packed(gaussians: Gaussians) -> tuple[tuple[np.ndarray, ...], float, int]:
+    """Return N Gaussians for the browser, scene units per stored unit, and the number of those that are shown shorter.
 
-    centers: np.ndarray
-    """Positions in stored units, float32, shape [N, 3]."""
-    covariances: np.ndarray
-    """Covariances in squared stored units, float32 within half precision, shape [N, 3, 3]."""
-    colors: np.ndarray
-    """Colours of degree 0, uint8, shape [N, 3]."""
-    opacities: np.ndarray
-    """Opacities, uint8, shape [N, 1]."""
-    scale: float
-    """Scene units [u] per stored unit."""
-    shortened: int
-    """Number of Gaussians that are too long for half precision, and are shown shorter."""
-
-
-def packed(gaussians: Gaussians) -> Packed:
-    """Return Gaussians for the browser."""
+    Positions [N, 3] and covariances [N, 3, 3] are float32 in stored units, within half precision; colours of degree 0 [N, 3]
+    and opacities [N, 1] are uint8.
+    """
     # Half precision is too coarse for covariances in scene units: an axis of 0.001 u has the square 1e-6, of which four
     # bits remain; the square of an axis below 0.00017 u becomes 0. In units in which the median of the longest axes is
     # 1, nearly all squares keep eleven bits.
@@ -118,16 +100,10 @@ def packed(gaussians: Gaussians) -> Packed:
     axes = np.exp(np.minimum(relative, longest))
     rotations = rotation_matrices(quats / np.linalg.norm(quats, axis=1, keepdims=True))
     covariances = np.einsum("nij,nj,nkj->nik", rotations, axes**2, rotations)
-    colors = np.clip(base_colors(sh), 0, 1)
-    opacities = torch.sigmoid(torch.from_numpy(logits)).numpy()[:, None]
-    return Packed(
-        (means / scale).astype(np.float32), covariances.astype(np.float32), _bytes(colors), _bytes(opacities), scale,
-        int((relative > longest).any(1).sum()),
-    )  # fmt: skip
-
-
-def _bytes(values: np.ndarray) -> np.ndarray:
-    return np.round(255 * values).astype(np.uint8)
+    shown = np.clip(base_colors(sh), 0, 1), torch.sigmoid(torch.from_numpy(logits)).numpy()[:, None]
+    colors, opacities = (np.round(255 * values).astype(np.uint8) for values in shown)
+    arrays = (means / scale).astype(np.float32), covariances.astype(np.float32), colors, opacities
+    return arrays, scale, int((relative > longest).any(1).sum())
 
 
 POLICY = (
@@ -181,15 +157,19 @@ ALL_ROUND = math.radians(150)
 """Angle to one side above which a page may turn all round [rad]."""
 
 
-def place_first_camera(server: viser.ViserServer, camera: Camera, gaussians: Gaussians, cameras: Sequence[Camera]) -> None:
-    """Set the camera at which pages start, with the upward direction of films."""
-    forward = np.asarray(camera.viewmat[2, :3])
-    server.scene.set_up_direction(up_of(list(cameras), gaussians.means.detach().cpu().double().numpy()))
+def place_first_camera(
+    server: viser.ViserServer, camera: Camera, gaussians: Gaussians, cameras: Sequence[Camera]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Set the camera at which pages start; return its target [3] [u] and the upward direction [3] of films."""
+    target = camera.center + distance_ahead(camera, gaussians) * np.asarray(camera.viewmat[2, :3])
+    up = up_of(list(cameras), gaussians.means.detach().cpu().double().numpy())
+    server.scene.set_up_direction(up)
     server.initial_camera.position = camera.center
-    server.initial_camera.look_at = camera.center + distance_ahead(camera, gaussians) * forward
+    server.initial_camera.look_at = target
     server.initial_camera.up = -np.asarray(camera.viewmat[1, :3])
     server.initial_camera.fov = fov_y(camera)
     server.initial_camera.far = 1e5  # else content beyond 1000 u is clipped
+    return target, up
 
 
 def middle_first(cameras: Sequence[Camera]) -> list[Camera]:
@@ -224,49 +204,6 @@ def plain_background(color: Sequence[float]) -> np.ndarray:
     return np.full((2, 2, 3), np.round(255 * np.clip(color, 0, 1)), np.uint8)
 
 
-def page_of(
-    gaussians: Gaussians,
-    cameras: Sequence[Camera] = (),
-    background: Sequence[float] = (0.0, 0.0, 0.0),
-    title: str = "warpgs",
-) -> tuple[str, list[str]]:
-    """Return the page as text, and notes for the user on differences from a render."""
-    # The page holds the Gaussians in their own units (`packed`), with colours of degree 0 only. It contains no name of
-    # a file, a view or a machine, except ``title``.
-    if not len(gaussians):
-        raise DataError("a page needs at least one Gaussian; fit the scene for longer")
-    stored = packed(gaussians)
-    cameras = cameras or [camera_before(gaussians)]
-    server = open_server(port=0)
-    try:
-        place_first_camera(server, cameras[0], gaussians, cameras)
-        server.scene.set_background_image(plain_background(background), format="png")
-        server.scene.add_gaussian_splats(
-            "/gaussians", stored.centers, stored.covariances, stored.colors, stored.opacities, scale=stored.scale
-        )
-        text = server.get_scene_serializer().as_html(dark_mode=True)
-    finally:
-        stop_server(server)
-    head = f'<head><meta http-equiv="Content-Security-Policy" content="{POLICY}" />'
-    head += f"<script>{NO_PARAMETERS}{NO_TEXT_AS_CODE}</script>{SORT_FROM_DISK}{NO_REMARKS}{NO_SCENE_TREE}"
-    text = re.sub(r"<title>[^<]*</title>", lambda _: f"<title>{html.escape(title)}</title>", text, count=1)
-    notes = ["the page shows no view-dependent colours; the run and its PLY keep them"]
-    if gaussians.sh_degree == 0:
-        notes.clear()
-    if stored.shortened:
-        notes.append(f"{stored.shortened:,} Gaussians are longer than the page can store, and are shown shorter")
-    text, end, rest = text.replace("<head>", head, 1).replace("<body>", f"<body>{LOADING}", 1).rpartition("</body>")
-    wide = 0.5 * cameras[0].width / float(cameras[0].K[0, 0])
-    first, up = cameras[0], up_of(list(cameras), gaussians.means.detach().cpu().double().numpy())
-    target = first.center + distance_ahead(first, gaussians) * np.asarray(first.viewmat[2, :3])
-    limits = zip(("SIDE", "TILT"), turning_limits(cameras, target, up), strict=True)
-    values = {"OWN": fov_y(first), "WIDE": wide, **dict(limits)}
-    script = WHOLE_IMAGE
-    for name, value in values.items():
-        script = script.replace(name, f"{value:.8f}")
-    return f"{text}{HELP}{script}{end}{rest}", notes
-
-
 def write_html(
     path: str | os.PathLike[str],
     gaussians: Gaussians,
@@ -274,10 +211,32 @@ def write_html(
     background: Sequence[float] = (0.0, 0.0, 0.0),
     title: str = "warpgs",
 ) -> list[str]:
-    """Write a model as one HTML file, which appears whole or not at all; returns notes for the user (`page_of`)."""
-    text, notes = page_of(gaussians, cameras, background, title)
-    write_text(Path(path), text)
-    return notes
+    """Write a model as one HTML file, which appears whole or not at all; return notes on differences from a render."""
+    # The page holds the Gaussians in their own units (`packed`), with colours of degree 0 only. It contains no name of
+    # a file, a view or a machine, except ``title``.
+    if not len(gaussians):
+        raise DataError("a page needs at least one Gaussian; fit the scene for longer")
+    arrays, scale, shortened = packed(gaussians)
+    cameras = cameras or [camera_before(gaussians)]
+    first, server = cameras[0], open_server(port=0)
+    try:
+        target, up = place_first_camera(server, first, gaussians, cameras)
+        server.scene.set_background_image(plain_background(background), format="png")
+        server.scene.add_gaussian_splats("/gaussians", *arrays, scale=scale)
+        text = server.get_scene_serializer().as_html(dark_mode=True)
+    finally:
+        stop_server(server)
+    head = f'<head><meta http-equiv="Content-Security-Policy" content="{POLICY}" />'
+    head += f"<script>{NO_PARAMETERS}{NO_TEXT_AS_CODE}</script>{SORT_FROM_DISK}{NO_REMARKS}{NO_SCENE_TREE}"
+    text = re.sub(r"<title>[^<]*</title>", lambda _: f"<title>{html.escape(title)}</title>", text, count=1)
+    text, end, rest = text.replace("<head>", head, 1).replace("<body>", f"<body>{LOADING}", 1).rpartition("</body>")
+    side, tilt = turning_limits(cameras, target, up)
+    script, wide = WHOLE_IMAGE, 0.5 * first.width / float(first.K[0, 0])
+    for name, value in (("OWN", fov_y(first)), ("WIDE", wide), ("SIDE", side), ("TILT", tilt)):
+        script = script.replace(name, f"{value:.8f}")
+    write_text(Path(path), f"{text}{HELP}{script}{end}{rest}")
+    notes = ["the page shows no view-dependent colours; the run and its PLY keep them"] if gaussians.sh_degree else []
+    return notes + [f"{shortened:,} Gaussians are longer than the page can store, and are shown shorter"] * bool(shortened)
 
 
 def export_html(folder: Path, target: Path, filters: Filters = NO_FILTERS) -> list[str]:
@@ -291,8 +250,8 @@ def export_html(folder: Path, target: Path, filters: Filters = NO_FILTERS) -> li
     if rotation is not None:
         cameras = [rotate_camera(c, rotation) for c in cameras]
     gaussians = convert_gaussians(gaussians, found, "file", "scene")
+    cameras = [convert_camera(c, found, "file", "scene") for c in cameras]
     with hold_file(target) as held:
-        cameras = [convert_camera(c, found, "file", "scene") for c in cameras]
         title = target.stem.encode("utf-8", "replace").decode()  # ? for bytes that are not UTF-8
         notes = write_html(target, gaussians, middle_first(cameras), run.background, title)
     if run.antialiased:

@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import dataclasses
 import functools
+import importlib.util
 import io
 import logging
 import math
@@ -14,7 +15,6 @@ import socket
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from http import HTTPStatus
-from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
 
 from warpgs import schema
@@ -147,19 +147,16 @@ def read_frame(frame: bytes | str) -> dict[str, Any]:
         message = msgspec.msgpack.decode(frame)
     except (ValueError, TypeError, RecursionError) as e:
         raise DataError(f"a message is not MessagePack: {e}") from e
-    if not isinstance(message, dict) or not isinstance(message.get("type"), str):
-        raise DataError("a message has no type")
-    kind = message["type"]
-    if kind not in MESSAGES:
-        raise DataError(f"a message has the unknown type {kind[:60]!r}")
-    fields = {name: value for name, value in message.items() if name != "type"}
-    if not all(isinstance(name, str) for name in fields):
-        raise DataError(f"{kind}: a field's name is not text")
+    if not isinstance(message, dict) or not all(isinstance(name, str) for name in message):
+        raise DataError("a message is not an object with names")
+    kind = message.pop("type", None)
+    if not isinstance(kind, str) or kind not in MESSAGES:
+        raise DataError(f"a message has the unknown type {str(kind)[:60]!r}")
     try:
-        MESSAGES[kind](fields, kind)
+        MESSAGES[kind](message, kind)
     except SchemaError as e:
         raise DataError(f"a message is malformed: {e}") from e
-    return {"type": kind, **fields}
+    return {"type": kind, **message}
 
 
 def write_frame(message: Mapping[str, Any]) -> bytes:
@@ -172,13 +169,12 @@ def write_frame(message: Mapping[str, Any]) -> bytes:
 def control_value(value: Any, control: Any) -> Any:
     """Return a message's value as a value for a control, clamped to the control's limits."""
     present = True if control is None else control.value
-    options = getattr(control, "options", None)
     low, high = getattr(control, "min", None), getattr(control, "max", None)
     if isinstance(present, bool):
         if isinstance(value, bool):
             return value
-    elif isinstance(present, str) and options is not None:
-        if value in options:
+    elif isinstance(present, str):
+        if value in (getattr(control, "options", None) or ()):
             return value
     elif isinstance(present, (int, float)):
         if _is_number(value):
@@ -194,8 +190,7 @@ def _is_number(value: Any) -> bool:
 
 
 def _limited(value: float, low: float | None, high: float | None) -> float:
-    value = value if low is None else max(value, low)
-    return value if high is None else min(value, high)
+    return min(max(value, -math.inf if low is None else low), math.inf if high is None else high)
 
 
 MAX_BROWSERS = 16
@@ -309,13 +304,6 @@ def connection_class(rules: Rules) -> type:
     return Connection
 
 
-def _silent() -> logging.Logger:
-    """Return a logger that writes nothing: websockets would print tracebacks of invalid requests."""
-    logger = logging.Logger("warpgs.viewer", logging.CRITICAL + 1)
-    logger.addHandler(logging.NullHandler())
-    return logger
-
-
 def _failed(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
     """Print an error of viser's own in one line."""
     error = context.get("exception")
@@ -339,7 +327,8 @@ def guarded_server(rules: Rules, bound: socket.socket, protocol: str) -> Iterato
                     say(f"the viewer closed the connection of a browser ({said(e)})", error=True)
 
             asyncio.get_running_loop().set_exception_handler(_failed)
-            limits = {"max_size": MAX_FRAME, "server_header": None, "logger": _silent()}
+            # websockets would print tracebacks of invalid requests
+            limits = {"max_size": MAX_FRAME, "server_header": None, "logger": logging.Logger("silent", logging.CRITICAL + 1)}
             return serve(
                 handle, sock=bound, create_connection=connection_class(rules), process_response=rules.add_headers,
                 process_request=lambda connection, request: rules.answer(process_request, protocol, connection, request),
@@ -361,10 +350,8 @@ OTHER_PORT = "choose another port with --port (fit: --view-port), or 0 for any f
 
 def require_viser() -> None:
     """Check that viser is installed."""
-    try:
-        version("viser")
-    except PackageNotFoundError:
-        raise ResourceError(f"the viewer and scene.html need viser, which is not installed; {REMEDY}") from None
+    if importlib.util.find_spec("viser") is None:
+        raise ResourceError(f"the viewer and scene.html need viser, which is not installed; {REMEDY}")
 
 
 def _refuses_others(port: int) -> bool:
@@ -373,11 +360,6 @@ def _refuses_others(port: int) -> bool:
     with socket.create_connection((HOST, port), timeout=10) as stream:
         stream.sendall(request.encode())
         return stream.recv(64).startswith(b"HTTP/1.1 403 ")
-
-
-def _control_of(server: viser.ViserServer, uuid: str) -> Any:
-    """Return the shared control with an identifier; None for buttons of a single browser."""
-    return server.gui._gui_input_handle_from_uuid.get(uuid)  # viser has no public way to it
 
 
 def open_server(port: int = PORT, label: str = "warpgs") -> viser.ViserServer:
@@ -401,7 +383,8 @@ def open_server(port: int = PORT, label: str = "warpgs") -> viser.ViserServer:
         stop_server(server)
         why = "because requests to its server cannot be checked"
         raise ResourceError(f"viser {viser.__version__} is not supported, {why}; {REMEDY}")
-    rules.control_of = lambda uuid: _control_of(server, uuid)
+    # viser has no public way to the shared control with an identifier; buttons of a single browser are not there
+    rules.control_of = server.gui._gui_input_handle_from_uuid.get
     server.gui.configure_theme(show_share_button=False, show_logo=False, dark_mode=True, control_width="medium")
     return server
 

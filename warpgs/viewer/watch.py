@@ -37,12 +37,12 @@ def view(path: Path, port: int = PORT, device: str = "auto", reader: str | None 
         read_record(path)
     elif path.suffix.lower() in (".html", ".htm") and path.is_file():
         raise DataError(f"{path}: is a web page; open this file in a browser")
-    elif not path.name.lower().endswith(tuple(suffixes())) or not path.is_file():
-        known = ", ".join(suffixes())
-        what = f"is neither a run folder ({CONFIG} in it) nor a file of Gaussians ({known})"
+    elif not path.exists():
         near = similar_folder(path) or "give a run folder or a file of Gaussians"
-        remedy = "give one of these" if path.exists() else near
-        raise DataError(f"{path}: {what if path.exists() else 'no such file or folder'}; {remedy}")
+        raise DataError(f"{path}: no such file or folder; {near}")
+    elif not path.name.lower().endswith(tuple(suffixes())) or not path.is_file():
+        what = f"a run folder ({CONFIG} in it) nor a file of Gaussians ({', '.join(suffixes())})"
+        raise DataError(f"{path}: is neither {what}; give one of these")
     require_viser()
     with contextlib.suppress(KeyboardInterrupt):
         server = open_server(port)
@@ -55,19 +55,17 @@ def view(path: Path, port: int = PORT, device: str = "auto", reader: str | None 
 
 def _follow(server: viser.ViserServer, path: Path, device: str, reader: str | None) -> None:
     """Show the present state, and every later checkpoint."""
-    window, seen, stages = None, None, waiting()
-    if path.is_dir() and modified(path) is None:
+    window, seen, stages, is_run = None, None, waiting(), path.is_dir()
+    if is_run and modified(path) is None:
         stages("waiting")
         say("waiting for the first checkpoint of the fit")
     while True:
-        found = modified(path) if path.is_dir() else 0.0
+        found = modified(path) if is_run else 0.0
         if found is not None and found != seen:
             seen = found
             if window is None:
                 stages(f"reading {path}")
-                content = (
-                    content_of_run(path, device) if path.is_dir() else content_of_file(path, choose_device(device)[0].type)
-                )
+                content = content_of_run(path, device) if is_run else content_of_file(path, choose_device(device)[0].type)
                 views, notes = views_of(content, reader)
                 for note in notes:
                     say(f"  {note}")
@@ -75,23 +73,17 @@ def _follow(server: viser.ViserServer, path: Path, device: str, reader: str | No
                 stages.clear()
                 say(f"  {content.title}: {len(content.model.gaussians()):,} Gaussians")
             else:
-                _update(window, path, device)
+                try:
+                    window.show(content_of_run(path, device, window.content.views))
+                    say(f"  step {window.content.model.step}: {len(window.content.model.gaussians()):,} Gaussians")
+                except WarpgsError as e:  # the previous checkpoint stays
+                    say(f"  {e}", error=True)
         _pause()
 
 
 def _pause() -> None:
     """Wait until the next check."""
     time.sleep(POLL)
-
-
-def _update(window: Window, path: Path, device: str) -> None:
-    """Show the newest checkpoint; report an unreadable one and keep the previous one."""
-    try:
-        window.show(content_of_run(path, device, window.content.views))
-    except WarpgsError as e:
-        say(f"  {e}", error=True)
-    else:
-        say(f"  step {window.content.model.step}: {len(window.content.model.gaussians()):,} Gaussians")
 
 
 class LiveView:
@@ -129,27 +121,21 @@ class LiveView:
             self._window.close()
 
     def _draw(self) -> None:
+        """Show each state that comes, until `close`."""
         try:
-            self._draw_states()
+            while self._wake.wait() and self._open:
+                self._wake.clear()
+                model, self._latest = self._latest, None
+                if model is None or not len(model.gaussians()):
+                    continue
+                content = Content(self.title, model, self.folder)
+                if self._window is None:
+                    self._window = Window(self.server, content, maps=False)
+                else:
+                    self._window.show(content)
+                self._shown.set()
         except Exception as e:  # errors of viser, too, so that the fit continues
             say(f"the viewer stopped ({type(e).__name__}: {e}); the fit continues", error=True)
-
-    def _draw_states(self) -> None:
-        """Show each state that comes, until `close`."""
-        while True:
-            self._wake.wait()
-            self._wake.clear()
-            if not self._open:
-                return
-            model, self._latest = self._latest, None
-            if model is None or not len(model.gaussians()):
-                continue
-            content = Content(self.title, model, self.folder)
-            if self._window is None:
-                self._window = Window(self.server, content, maps=False)
-            else:
-                self._window.show(content)
-            self._shown.set()
 
 
 @contextlib.contextmanager

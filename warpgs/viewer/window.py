@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,6 +19,7 @@ from warpgs.files import read_file, readable, remove_leftovers, write_json
 from warpgs.geometry import camera_extent, convert_camera, convert_gaussians, matmul, rotation_matrices
 from warpgs.io.image_files import decode
 from warpgs.mesh.views import MIN_ALPHA
+from warpgs.pipeline.films.paths import fov_y
 from warpgs.pipeline.metrics.coverage import DepthView, classes_of, coverage_map, depth_views
 from warpgs.pipeline.model.table import FittedModel
 from warpgs.pipeline.run.commands import RULE, scene_of
@@ -33,7 +34,6 @@ from warpgs.viewer.html import (
     camera_at,
     camera_before,
     distance_ahead,
-    fov_y,
     middle_first,
     packed,
     place_first_camera,
@@ -72,14 +72,11 @@ class Content:
 def content_of_run(folder: Path, device: str = "cpu", views: Mapping[str, View] | None = None) -> Content:
     """Read a run, finished or still going."""
     run = open_run(folder, device)
-    level = load_checkpoint(folder)[0].get("columns.level")
+    means, level = run.gaussians().means, load_checkpoint(folder)[0].get("columns.level")
     # a fit that continues may have written another checkpoint in between
-    fine = level == FINE if level is not None and level.shape == (len(run.gaussians()),) else None
-    sheets = sorted((folder / "sampling").glob("*.png"))
-    return Content(
-        folder.resolve().name, run, folder, None if fine is None else fine.to(run.gaussians().means.device), views or {},
-        sheets[-1] if sheets else None,
-    )  # fmt: skip
+    fine = (level == FINE).to(means.device) if level is not None and level.shape == (len(means),) else None
+    sheet = max((folder / "sampling").glob("*.png"), default=None)
+    return Content(folder.resolve().name, run, folder, fine, views or {}, sheet)
 
 
 def views_of(content: Content, reader: str | None = None) -> tuple[dict[str, View], list[str]]:
@@ -123,31 +120,21 @@ MAX_KEYFRAMES = 1000
 """Largest number of keyframes of a path: half an hour at the default of 2 s between them."""
 
 
-@dataclass(frozen=True)
-class CropBox:
-    """A box in scene units [u], turned about its centre."""
+CropBox = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""Centre [3] and lengths of the sides [3] of a box [u], and the rotation [3, 3] from its axes to the world's."""
 
-    center: np.ndarray
-    """Centre [u], shape [3]."""
-    size: np.ndarray
-    """Lengths of the box's sides [u], shape [3]."""
-    rotation: np.ndarray
-    """Rotation from the box's axes to the world's, shape [3, 3]."""
 
-    def contains(self, means: torch.Tensor) -> torch.Tensor:
-        """Return which points [N, 3] are inside, bool, shape [N]."""
-        offsets = means.detach().cpu().double() - torch.from_numpy(self.center)
-        inside = ((offsets[:, :, None] * torch.from_numpy(self.rotation)).sum(1).abs() <= torch.from_numpy(self.size / 2)).all(
-            1
-        )
-        return inside.to(means.device)
+def inside(box: CropBox, means: torch.Tensor) -> torch.Tensor:
+    """Return which points [N, 3] [u] are in a box, bool, shape [N]."""
+    center, size, rotation = map(torch.from_numpy, box)
+    offsets = means.detach().cpu().double() - center
+    return ((offsets[:, :, None] * rotation).sum(1).abs() <= size / 2).all(1).to(means.device)
 
-    def to_json(self, normalization: Normalization) -> dict[str, Any]:
-        """Return the box in file units: ``center`` [3], ``size`` [3], and ``rotation`` [3, 3] from its axes to the world's."""
-        return {
-            "center": (self.center / normalization.scale + normalization.offset).tolist(),
-            "size": (self.size / normalization.scale).tolist(), "rotation": self.rotation.tolist(),
-        }  # fmt: skip
+
+def box_json(box: CropBox, normalization: Normalization) -> dict[str, Any]:
+    """Return a box in file units: ``center`` [3], ``size`` [3], and ``rotation`` [3, 3] from its axes to the world's."""
+    center, size = box[0] / normalization.scale + normalization.offset, box[1] / normalization.scale
+    return {"center": center.tolist(), "size": size.tolist(), "rotation": box[2].tolist()}
 
 
 def keyframe(camera: Camera, seconds: float, normalization: Normalization) -> dict[str, Any]:
@@ -187,40 +174,33 @@ class Maps:
     @torch.no_grad()
     def image(self, kind: str, camera: Camera, gaussians: Gaussians, sh_degree: int) -> tuple[np.ndarray, str]:
         """Return an image as uint8, shape [H, W, 3], and its description."""
-        options = dataclasses.replace(self.content.model.options(), sh_degree=min(sh_degree, gaussians.sh_degree), record=False)
-        drawn: dict[str, Callable[..., tuple[np.ndarray, str]]] = {
-            RENDER: self._render, DEPTH: self._depth, COVERAGE: self._coverage, ERROR: self._error,
-        }  # fmt: skip
-        colors, note = drawn[kind](camera, gaussians, options)
+        model, note = self.content.model, MAPS[kind]
+        options = dataclasses.replace(model.options(), sh_degree=min(sh_degree, gaussians.sh_degree), record=False)
+        name = self.view_at(camera) if kind == ERROR else None
+        view = self.content.views.get(name or "")
+        if kind == COVERAGE and not model.train:
+            kind, note = RENDER, "a file of Gaussians has no training cameras; open its run"
+        elif kind == ERROR and view is None:
+            why = "the photographs cannot be read" if name else "step into a camera, by a click or by its name"
+            kind, note = RENDER, f"the error map cannot be shown: {why}"
+        r = rasterize(gaussians, camera if kind != ERROR or view is None else view.camera, options)
+        colors = r.rgb.cpu().numpy()
+        if kind == DEPTH:
+            colors = depth_map(r.depth.cpu().numpy(), r.alpha.cpu().numpy())
+        elif kind == COVERAGE:
+            depth = torch.where(r.alpha >= MIN_ALPHA, r.depth, 0)
+            seen = classes_of(coverage_map(depth, camera, self._depth_views(options))[0], (depth <= 0) & model.transparent)
+            colors = coverage_image(colors, seen["0"], seen["1"])
+        elif view is not None:
+            colors, note = placed(error_map(colors, view.image), view.camera, camera), f"{name}: {note}"
         return np.round(255 * np.clip(colors, 0, 1)).astype(np.uint8), note
 
-    def _render(self, camera: Camera, gaussians: Gaussians, options: RasterizeOptions) -> tuple[np.ndarray, str]:
-        return rasterize(gaussians, camera, options).rgb.cpu().numpy(), MAPS[RENDER]
-
-    def _depth(self, camera: Camera, gaussians: Gaussians, options: RasterizeOptions) -> tuple[np.ndarray, str]:
-        r = rasterize(gaussians, camera, options)
-        return depth_map(r.depth.cpu().numpy(), r.alpha.cpu().numpy()), MAPS[DEPTH]
-
-    def _coverage(self, camera: Camera, gaussians: Gaussians, options: RasterizeOptions) -> tuple[np.ndarray, str]:
-        model = self.content.model
-        if not model.train:
-            return self._render(camera, gaussians, options)[0], "a file of Gaussians has no training cameras; open its run"
+    def _depth_views(self, options: RasterizeOptions) -> list[DepthView]:
         if self._depths is None:
-            cameras = model.cameras()
-            masks = [v.mask if (v := self.content.views.get(n)) else None for n in model.train]
-            self._depths = depth_views(model.gaussians(), [cameras[n] for n in model.train], options, masks)
-        r = rasterize(gaussians, camera, options)
-        seen = classes_of(coverage_map(torch.where(r.alpha >= MIN_ALPHA, r.depth, 0), camera, self._depths), model.transparent)
-        return coverage_image(r.rgb.cpu().numpy(), seen["0"], seen["1"]), MAPS[COVERAGE]
-
-    def _error(self, camera: Camera, gaussians: Gaussians, options: RasterizeOptions) -> tuple[np.ndarray, str]:
-        name = self.view_at(camera)
-        view = self.content.views.get(name or "")
-        if view is None:
-            why = "the photographs cannot be read" if name else "step into a camera, by a click or by its name"
-            return self._render(camera, gaussians, options)[0], f"the error map cannot be shown: {why}"
-        render = rasterize(gaussians, view.camera, options).rgb.cpu().numpy()
-        return placed(error_map(render, view.image), view.camera, camera), f"{name}: {MAPS[ERROR]}"
+            model, views = self.content.model, self.content.views
+            masks = [v.mask if (v := views.get(n)) else None for n in model.train]
+            self._depths = depth_views(model.gaussians(), [model.cameras()[n] for n in model.train], options, masks)
+        return self._depths
 
 
 def placed(image: np.ndarray, own: Camera, camera: Camera) -> np.ndarray:
@@ -230,8 +210,7 @@ def placed(image: np.ndarray, own: Camera, camera: Camera) -> np.ndarray:
     K = matmul(np.asarray(camera.K), np.linalg.inv(own.K))  # pixel centres lie at +0.5 here, and at whole numbers in OpenCV
     K[:2, 2] += 0.5 * (np.diag(K)[:2] - 1)
     size = (camera.width, camera.height)
-    placed: np.ndarray = cv2.warpAffine(image, K[:2], size, flags=cv2.INTER_LINEAR, borderValue=(0.25, 0.25, 0.25))
-    return placed
+    return np.asarray(cv2.warpAffine(image, K[:2], size, flags=cv2.INTER_LINEAR, borderValue=(0.25, 0.25, 0.25)))
 
 
 ALL_LAYERS, COARSE_LAYER, FINE_LAYER = "all", "coarse", "fine"
@@ -250,18 +229,18 @@ class Panel:
         self._lock = threading.Lock()
         gui = server.gui
         self._status = gui.add_markdown("")
-        self._kind = gui.add_dropdown("show", (GAUSSIANS, *MAPS) if maps else (GAUSSIANS,), initial_value=GAUSSIANS)
+        self.kind = gui.add_dropdown("show", (GAUSSIANS, *MAPS) if maps else (GAUSSIANS,), initial_value=GAUSSIANS)
         degree = content.model.gaussians().sh_degree
-        self._degree = gui.add_slider(
+        self.degree = gui.add_slider(
             "SH degree", 0, max(degree, 1), 1, degree, disabled=degree == 0, visible=maps,
             hint="spherical-harmonics degree of a render; Gaussians that the browser draws have degree 0",
         )  # fmt: skip
-        self._layer = gui.add_dropdown(
+        self.layer = gui.add_dropdown(
             "layer", (ALL_LAYERS, COARSE_LAYER, FINE_LAYER), initial_value=ALL_LAYERS, visible=content.fine is not None
         )
-        self._cameras = gui.add_checkbox("cameras", True, visible=bool(content.model.scene_cameras))
+        self.cameras = gui.add_checkbox("cameras", True, visible=bool(content.model.scene_cameras))
         self._note = gui.add_markdown("", visible=False)
-        for control in (self._kind, self._degree, self._layer, self._cameras):
+        for control in (self.kind, self.degree, self.layer, self.cameras):
             control.on_update(guarded(lambda _: self.window.redraw()))
         self._add_stepping()
         self._add_sampling()
@@ -269,28 +248,12 @@ class Panel:
         self._add_keyframes()
         self.tell(content)
 
-    def kind(self) -> str:
-        """Return the choice of image: `GAUSSIANS` or one of `MAPS`."""
-        return str(self._kind.value)
-
-    def sh_degree(self) -> int:
-        """Return the degree of the colours of renders."""
-        return int(self._degree.value)
-
-    def layer(self) -> str:
-        """Return the layer to be shown."""
-        return str(self._layer.value)
-
-    def shows_cameras(self) -> bool:
-        """Return whether cameras are to be shown."""
-        return bool(self._cameras.value)
-
     def crop_box(self) -> CropBox | None:
         """Return the box outside of which nothing is to be shown; None for everything."""
         if not self._crop.value:
             return None
-        size = np.asarray(self._size.value, np.float64)
-        return CropBox(np.asarray(self._gizmo.position, np.float64), size, rotation_matrices(np.asarray(self._gizmo.wxyz)))
+        center, size = np.asarray(self._gizmo.position, np.float64), np.asarray(self._size.value, np.float64)
+        return center, size, rotation_matrices(np.asarray(self._gizmo.wxyz))
 
     def tell(self, content: Content) -> None:
         """Write title, number of Gaussians, step and number of cameras."""
@@ -316,7 +279,7 @@ class Panel:
 
             chooser.on_update(guarded(step))
         reset = self.server.gui.add_button("Reset", hint="back to the first camera")
-        reset.on_click(guarded(lambda event: self.window.reset(event.client)))
+        reset.on_click(guarded(lambda event: self.window.move(self.window.first, event.client)))
 
     def _add_sampling(self) -> None:
         """Add the fit's image of the places where fine Gaussians were placed."""
@@ -347,10 +310,8 @@ class Panel:
         self._gizmo = scene.add_transform_controls(GIZMO, scale=length, position=tuple((low + high) / 2), visible=False)
 
         def draw(_: Any = None) -> None:
-            self._gizmo.visible = bool(self._crop.value)
-            scene.add_box(
-                BOX, dimensions=self._size.value, wireframe=True, color=(240, 200, 60), visible=bool(self._crop.value)
-            )
+            self._gizmo.visible = shown = bool(self._crop.value)
+            scene.add_box(BOX, dimensions=self._size.value, wireframe=True, color=(240, 200, 60), visible=shown)
             self.window.redraw()
 
         self._crop.on_update(guarded(draw))
@@ -361,7 +322,7 @@ class Panel:
             box = self.crop_box()
             if box is None:
                 return self.explain("no crop box yet: tick crop, and move the box")
-            self._save(CROP, box.to_json(self.content.model.normalization))
+            self._save(CROP, box_json(box, self.content.model.normalization))
 
         save.on_click(guarded(store))
 
@@ -431,10 +392,10 @@ class Window:
         """Show a model."""
         self.server, self.content = server, content
         cameras = list(content.model.scene_cameras.values())
-        self.first = self._first_camera()
-        self.extent = (
-            camera_extent(cameras) if len(cameras) > 1 else 0.1 * distance_ahead(self.first, content.model.gaussians())
-        )
+        train = [content.model.scene_cameras[n] for n in content.model.train]
+        self.first = [*middle_first(train or cameras), camera_before(content.model.gaussians())][0]
+        ahead = distance_ahead(self.first, content.model.gaussians())
+        self.extent = camera_extent(cameras) if len(cameras) > 1 else 0.1 * ahead
         self.maps = Maps(content, self.extent)
         self._frusta: dict[str, Any] = {}
         self._drawn: dict[int, tuple[Any, ...]] = {}
@@ -447,12 +408,6 @@ class Window:
         server.on_client_connect(guarded(self._connected))
         self._thread = threading.Thread(target=self._render_maps, name="viewer maps", daemon=True)
         self._thread.start()
-
-    def _first_camera(self) -> Camera:
-        """Return the middle training camera, or a camera in front of a model without cameras."""
-        model = self.content.model
-        cameras = middle_first([model.scene_cameras[n] for n in model.train] or list(model.scene_cameras.values()))
-        return cameras[0] if cameras else camera_before(model.gaussians())
 
     def show(self, content: Content) -> None:
         """Show another state of the model, with the same cameras."""
@@ -469,23 +424,21 @@ class Window:
 
     def shown(self) -> Gaussians:
         """Return the Gaussians of the layer and the crop box selected in the panel."""
-        gaussians, fine = self.content.model.gaussians(), self.content.fine
+        gaussians, fine, layer = self.content.model.gaussians(), self.content.fine, self.panel.layer.value
         keep = torch.ones(len(gaussians), dtype=torch.bool, device=gaussians.means.device)
-        if fine is not None and self.panel.layer() != ALL_LAYERS:
-            keep &= fine if self.panel.layer() == FINE_LAYER else ~fine
+        if fine is not None and layer != ALL_LAYERS:
+            keep &= fine if layer == FINE_LAYER else ~fine
         box = self.panel.crop_box()
         if box is not None:
-            keep &= box.contains(gaussians.means)
+            keep &= inside(box, gaussians.means)
         return Gaussians(**{n: t.detach()[keep] for n, t in gaussians.tensors().items()})
 
     def redraw(self) -> None:
         """Send the current view to the browsers: the Gaussians, or images at each browser's camera."""
         with self._lock, self.server.atomic():
-            if self.panel.kind() == GAUSSIANS:
-                s = packed(self.shown())
-                self.server.scene.add_gaussian_splats(
-                    "/gaussians", s.centers, s.covariances, s.colors, s.opacities, scale=s.scale
-                )
+            if self.panel.kind.value == GAUSSIANS:
+                arrays, scale, _ = packed(self.shown())
+                self.server.scene.add_gaussian_splats("/gaussians", *arrays, scale=scale)
             else:
                 self.server.scene.remove_by_name("/gaussians")
             self._hide_near()
@@ -510,14 +463,10 @@ class Window:
 
     def step_into(self, name: str, client: viser.ClientHandle | None) -> None:
         """Give a browser, or all browsers if ``client`` is None, the pose and field of view of a camera of the model."""
-        self._move(self.content.model.scene_cameras[name], client)
+        self.move(self.content.model.scene_cameras[name], client)
 
-    def reset(self, client: viser.ClientHandle | None) -> None:
-        """Move the camera of a browser, or of all browsers if ``client`` is None, back to where it started."""
-        self._move(self.first, client)
-
-    def _move(self, camera: Camera, client: viser.ClientHandle | None) -> None:
-        """Give a browser, or all browsers if ``client`` is None, the pose of ``camera``, and show its whole image."""
+    def move(self, camera: Camera, client: viser.ClientHandle | None) -> None:
+        """Give a browser, or all browsers if ``client`` is None, the pose of a camera, and show its whole image."""
         forward, up = np.asarray(camera.viewmat[2, :3]), -np.asarray(camera.viewmat[1, :3])
         ahead = distance_ahead(camera, self.content.model.gaussians())
         for c in [client] if client is not None else list(self.server.get_clients().values()):
@@ -531,10 +480,9 @@ class Window:
     def camera_of(self, client: viser.ClientHandle, side: int | None = None) -> Camera:
         """Return a browser's camera in scene units, at its own size, or with a longer side of at most ``side`` [px]."""
         state = client.camera
-        width, height = max(int(state.image_width), 16), max(int(state.image_height), 16)
-        factor = 1.0 if side is None else min(1.0, side / max(width, height))
-        size = max(16, round(factor * width)), max(16, round(factor * height))
-        return camera_at(state.wxyz, state.position, state.fov, *size)
+        size = max(int(state.image_width), 16), max(int(state.image_height), 16)
+        factor = 1.0 if side is None else min(1.0, side / max(size))
+        return camera_at(state.wxyz, state.position, state.fov, *(max(16, round(factor * length)) for length in size))
 
     def _connected(self, client: viser.ClientHandle) -> None:
         client.camera.fov = fov_y(self.first, client.camera.aspect)
@@ -547,8 +495,8 @@ class Window:
         for name, frustum in self._frusta.items():
             center = self.content.model.scene_cameras[name].center
             hidden = any(np.linalg.norm(eye - center) < HIDDEN * frustum.scale for eye in eyes)
-            if frustum.visible != (self.panel.shows_cameras() and not hidden):
-                frustum.visible = not frustum.visible
+            if frustum.visible != (visible := bool(self.panel.cameras.value) and not hidden):
+                frustum.visible = visible
 
     def _eyes(self) -> list[np.ndarray]:
         """Return the position [3] of each browser's camera; until a browser sends it, the position of the first camera."""
@@ -578,8 +526,7 @@ class Window:
 
     def _render_for(self, client: viser.ClientHandle) -> None:
         """Put the image that the panel selects behind a browser's scene, unless it is there already."""
-        kind, degree = self.panel.kind(), self.panel.sh_degree()
-        state = client.camera
+        kind, degree, state = self.panel.kind.value, int(self.panel.degree.value), client.camera
         asked = (kind, degree, tuple(state.position), tuple(state.wxyz), state.fov, state.image_width, state.image_height)
         asked = (kind,) if kind == GAUSSIANS else asked
         if self._drawn.get(client.client_id) == asked:
@@ -599,4 +546,5 @@ class Window:
 def _small(image: np.ndarray) -> np.ndarray:
     """Return a photograph as uint8 with a longer side of at most `PHOTO_SIDE`."""
     factor = min(1.0, PHOTO_SIDE / max(image.shape[:2]))
-    return np.asarray(resized(image, max(1, round(factor * image.shape[1])), max(1, round(factor * image.shape[0]))))
+    height, width = (max(1, round(factor * side)) for side in image.shape[:2])
+    return np.asarray(resized(image, width, height))

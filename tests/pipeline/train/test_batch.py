@@ -9,11 +9,11 @@ import pytest
 import torch
 
 from tests.pipeline.test_paper import CONFIG as METHOD
+from tests.pipeline.train.fits import advanced, continued, same_bits
 from tests.scenes import photos, priors, seeds
 from warpgs.errors import NotFiniteError, UsageError
 from warpgs.kernels.update import Setting, scheduled_lrs
 from warpgs.pipeline.model.start import InitConfig
-from warpgs.pipeline.train import batch
 from warpgs.pipeline.train import batch as train_slots
 from warpgs.pipeline.train.batch import BatchSteps, SlotSums, Tree, check_ranks, check_renders, own_slots
 from warpgs.pipeline.train.presets import PRESETS
@@ -108,19 +108,13 @@ def test_rows_of_a_large_tensor_are_divided_and_means_are_sums_over_slots(monkey
             assert all(torch.equal(a, b) for a, b in zip(alone, found, strict=True))
 
 
-@pytest.mark.parametrize(("batch", "ranks"), [(8, 1), (8, 3), (7, 4), (5, 5)])
-def test_every_slot_is_in_one_process_and_one_node(batch, ranks):
-    """The slots of the processes, and those of the nodes that they sum, are all slots from the first to the last."""
-    assert [s for r in range(ranks) for s in own_slots(batch, ranks, r)] == list(range(batch))
-    tree = Tree(batch, Thread(ranks - 1, ranks, [], threading.Barrier(1)))
-    assert [s for nodes in tree.nodes for first, end in nodes for s in range(first, end)] == list(range(batch))
-
-
-@pytest.mark.parametrize(("batch", "ranks"), [(12, 2), (24, 4), (32, 3)])
-def test_every_process_plans_the_same_memory(batch, ranks):
+@pytest.mark.parametrize(("batch", "ranks"), [(5, 5), (7, 4), (12, 2), (32, 3)])
+def test_every_process_plans_the_same_memory_and_every_slot_is_in_one(batch, ranks):
     """Also where processes sum different subtrees: with a memory limit, different plans would end in different models."""
     trees = [Tree(batch, Thread(r, ranks, [], threading.Barrier(1))) for r in range(ranks)]
     assert len({tree.buffers for tree in trees}) == 1
+    assert [s for r in range(ranks) for s in own_slots(batch, ranks, r)] == list(range(batch))
+    assert [s for nodes in trees[0].nodes for first, end in nodes for s in range(first, end)] == list(range(batch))
 
 
 def test_a_process_without_a_view_is_refused():
@@ -137,22 +131,12 @@ CPU = torch.device("cpu")
 PLAIN = FitConfig(steps=20, init=InitConfig(source="points"), density=DensityConfig(start=100))
 
 
-def advanced(fit: Trainer, until: int) -> Trainer:
-    while fit.step < until:
-        fit.advance(100)
-    return fit
-
-
-def same_bits(a: Trainer, b: Trainer, but: tuple[str, ...] = ()) -> bool:
-    mine, theirs = a.state()[0], b.state()[0]
-    return all(torch.equal(mine[n], theirs[n]) for n in mine if n not in but)
-
-
 def test_a_batch_of_one_view_is_a_step_of_one_view():
     """Through dropout, sampling events, layers and protection: the same bits by way of the sums."""
     views = photos(3)
     one, batch = (Trainer(views, seeds(61), METHOD, CPU, priors=priors(views)) for _ in range(2))
-    batch.taker.batched = BatchSteps(batch.learned, batch.buffers, batch.context.render_options(), Tree(1, ALONE))
+    t = batch.taker
+    batch.taker = BatchSteps(t.table, t.views, t.strategy, t.cameras, t.options, t.dropout_seed, Tree(1, ALONE))
     advanced(one, 24), advanced(batch, 24)
     assert len(one.strategy.events) > 1 and same_bits(one, batch)
 
@@ -181,14 +165,17 @@ def test_rates_follow_the_square_root_of_the_batch():
     assert [fit.settings(3, slot)[Setting.STEP] for slot in range(4)] == [3] * 4
 
 
-def test_a_fit_with_batches_continues_with_the_same_bits():
+def test_a_fit_with_batches_continues_with_the_same_bits(tmp_path):
     """From a state between two epochs, and through changes of the set."""
     config = dataclasses.replace(
         PLAIN, steps=12, batch=5, dropout=0.3, density=DensityConfig(start=2, every=3, gradient=1e-5, reset_every=6)
     )
-    whole, first, second = (Trainer(photos(3), seeds(61), config, CPU) for _ in range(3))
-    second.load(*advanced(first, 7).state())
-    assert same_bits(advanced(whole, 12), advanced(second, 12)) and len(whole.table) > 61
+
+    def begun() -> Trainer:
+        return Trainer(photos(3), seeds(61), config, CPU)
+
+    whole, again = advanced(begun()), continued(begun, 7, tmp_path)
+    assert same_bits(whole, again) and len(whole.table) > 61
 
 
 def test_a_loss_that_is_no_number_names_its_view_and_harms_nothing():
@@ -206,9 +193,9 @@ def test_a_loss_that_is_no_number_names_its_view_and_harms_nothing():
 
 def in_series(fit: Trainer) -> Trainer:
     """Have a fit take several steps before it reads their results, as on CUDA, but without graphs."""
-    fit.layout = dataclasses.replace(fit.layout, graphs=1)
-    fit.buffers = StepBuffers(CPU, fit.buffers.lr_rows.shape[1], MAX_STEPS)
-    fit.taker.batched = BatchSteps(fit.learned, fit.buffers, fit.context.render_options(), fit.taker.batched.tree)
+    fit.layout.graphs = 1
+    fit.taker.buffers = StepBuffers(CPU, fit.taker.buffers.lr_rows.shape[1], MAX_STEPS)
+    fit.taker.clear()
     return fit
 
 
@@ -245,16 +232,16 @@ def test_a_view_beyond_the_capacity_ends_a_series_which_is_taken_up_again(monkey
     """It stops steps in the middle of a series, as a graph with too little capacity does: their bits do not change."""
     config = dataclasses.replace(PLAIN, batch=3, dropout=0.3, steps=12)
     one, many = (Trainer(photos(3), seeds(61), config, CPU) for _ in range(2))
-    honest, calls = batch.view_gradients, []
+    honest, calls = BatchSteps.view_gradients, []
 
-    def overflowing(learned, views, buffers, *rest):
+    def overflowing(taker, views, buffers, *rest):
         calls.append(1)
-        found = honest(learned, views, buffers, *rest)
+        found = honest(taker, views, buffers, *rest)
         if len(calls) in (8, 30):
             buffers.stop.fill_(1)
         return found
 
-    monkeypatch.setattr(batch, "view_gradients", overflowing)
+    monkeypatch.setattr(BatchSteps, "view_gradients", overflowing)
     steps = [r.step for _ in range(12) if many.step < 12 for r in in_series(many).advance(100)]
     monkeypatch.undo()
     assert steps == list(range(1, 13)) and len(calls) > 36 and same_bits(advanced(one, 12), many, ("generator",))
@@ -287,7 +274,7 @@ def test_ranks_that_divide_the_coefficients_have_the_bits_of_one(monkeypatch):
     alone = advanced(Trainer(photos(3), seeds(61), config, CPU), 10)
     for count in (2, 3):
         fits = by_threads(lambda ranks: advanced(Trainer(photos(3), seeds(61), config, CPU, ranks=ranks), 10), count)
-        assert 0 < fits[0].taker.batched.sums.divided < len(alone.table) and all(same_bits(alone, fit) for fit in fits)
+        assert 0 < fits[0].taker.sums.divided < len(alone.table) and all(same_bits(alone, fit) for fit in fits)
 
 
 @pytest.mark.parametrize("stopped", [None, 5])
@@ -316,7 +303,7 @@ def test_ranks_that_divide_the_coefficients_take_several_steps_at_once(monkeypat
     alone.order = list(order)
     advanced(alone, 10 if stopped is None else stopped - 1)
     fits = by_threads(fitted, 2)
-    assert all(0 < fit.taker.batched.sums.divided for fit in fits)
+    assert all(0 < fit.taker.sums.divided for fit in fits)
     assert all(same_bits(alone, fit, () if stopped is None else ("generator",)) for fit in fits)
 
 

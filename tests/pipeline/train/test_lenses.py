@@ -12,6 +12,7 @@ from PIL import Image
 import warpgs
 from tests.io.scenes import save
 from tests.parallel_camera import NAME
+from tests.pipeline.train.fits import advanced
 from tests.scenes import photos, ring, seeds, three_gaussians
 from warpgs import geometry
 from warpgs.app.cli import main
@@ -27,10 +28,9 @@ from warpgs.pipeline.metrics.scores import fitted_region, score
 from warpgs.pipeline.model import limits
 from warpgs.pipeline.model import start as init
 from warpgs.pipeline.model.depth_points import carve, hull_points, in_empty_region, silhouettes
-from warpgs.pipeline.model.limits import LimitConfig, TrainingCameras
+from warpgs.pipeline.model.limits import LimitConfig, camera_rows
 from warpgs.pipeline.model.start import InitConfig, initial_points, random_points
 from warpgs.pipeline.run.commands import open_file
-from warpgs.pipeline.run.folder import _camera, camera_values
 from warpgs.pipeline.train import step, trainer
 from warpgs.pipeline.train.loss import AlphaDifference, LossConfig, LossInputs, Target
 from warpgs.pipeline.train.memory import most_instances
@@ -104,16 +104,16 @@ def test_a_step_renders_by_the_views_own_camera(fit, captured):
     plan = fit.plan_of(1)
     (stack,) = fit.stacks.values()
     for number in range(4):
-        fit.buffers.load([number], [[0.0] * fit.buffers.lr_rows.shape[1]], [fit.settings(1)])
+        fit.taker.buffers.load([number], [[0.0] * fit.taker.buffers.lr_rows.shape[1]], [fit.settings(1)])
         if captured:
             capacity = step.instance_capacity(fit.gaussians, stack, plan.degree, fit.context.render_options())
-            render = step.captured_renderer(fit.context.render_options(), capacity, fit.buffers.stop)
+            render = step.captured_renderer(fit.context.render_options(), capacity, fit.taker.buffers.stop)
         else:
             render = step.eager_renderer(fit.context.render_options(), None)
-        step.view_gradients(fit.learned, stack, fit.buffers, plan, render)
+        fit.taker.view_gradients(stack, fit.taker.buffers, plan, render)
         image = torch.as_tensor(views()[number].image)
         wanted = ((rendered_alone(fit, number) - image) ** 2).mean()
-        _, _, history = fit.buffers.result()
+        _, _, history = fit.taker.buffers.result()
         assert history[0][1] == pytest.approx(float(wanted), rel=1e-6) and float(wanted) > 1e-3
 
 
@@ -147,18 +147,8 @@ def test_half_size_views_and_stacks_keep_the_model(fit):
         for camera in (shown.camera, half_size(shown).camera):
             assert camera.model == NAME and np.allclose(camera.distortion, view.camera.distortion)
     mixed = Trainer([*views(2), *photos(2, 40, 32)], seeds(), CONFIG, CPU)
-    assert sorted(s.model for s in mixed.stacks.values()) == ["pinhole", NAME]
-    for stack in mixed.stacks.values():
-        for camera, number in zip(stack.cameras(), stack.numbers):
-            assert camera.model == mixed.views[number].camera.model
-
-
-def test_run_folders_keep_the_model():
-    """config.json holds model and coefficients, and a pinhole's record has none."""
-    camera = views()[1].camera
-    back = _camera(json.loads(json.dumps(camera_values(camera))))
-    assert back.model == NAME and np.array_equal(back.distortion, camera.distortion) and np.array_equal(back.K, camera.K)
-    assert "distortion" not in camera_values(photos(1)[0].camera)
+    assert sorted(s.camera.model for s in mixed.stacks.values()) == ["pinhole", NAME]
+    assert all(mixed.views[i].camera.model == s.camera.model for s in mixed.stacks.values() for i in s.numbers)
 
 
 def test_what_cannot_be_rendered_is_refused_before_the_first_step():
@@ -235,7 +225,7 @@ def test_depth_found_in_other_views_is_that_of_the_lens(lens_run):
     scene = warpgs.load_scene(lens_run.parent / "scene", lenses="native")
     config, _ = settings_by_views(FitConfig(steps=2, init=InitConfig(source="sweep")), list(scene.views), "cpu")
     cpu, generator = torch.device("cpu"), np.random.default_rng(0)
-    depths = prepare(list(scene.views), None, config, generator, cpu, [], lambda: None).start.depths
+    depths = prepare(list(scene.views), None, config, generator, cpu, [], lambda: None)[1].depths
     errors = []
     for view, found in zip(scene.views, depths, strict=True):
         own = np.array([view.name in t for t in scene.points.tracks])
@@ -339,13 +329,13 @@ def test_a_step_renders_with_the_filter(device, captured):
     fit = Trainer(photos(4), seeds(), FILTERED_CONFIG, device)
     options, plan, view = fit.context.render_options(), fit.plan_of(1), fit.views[1]
     (stack,) = fit.stacks.values()
-    fit.buffers.load([1], [[0.0] * fit.buffers.lr_rows.shape[1]], [fit.settings(1)])
+    fit.taker.buffers.load([1], [[0.0] * fit.taker.buffers.lr_rows.shape[1]], [fit.settings(1)])
     render = step.eager_renderer(options, None)
     if captured:
-        render = step.captured_renderer(options, 10_000, fit.buffers.stop)
-    step.view_gradients(fit.learned, stack, fit.buffers, plan, render)
+        render = step.captured_renderer(options, 10_000, fit.taker.buffers.stop)
+    fit.taker.view_gradients(stack, fit.taker.buffers, plan, render)
     errors = [((filtered(fit.gaussians, view.camera, a) - photos(4)[1].image) ** 2).mean() for a in (True, False)]
-    assert fit.buffers.result()[2][0][1] == pytest.approx(errors[0], rel=1e-5)
+    assert fit.taker.buffers.result()[2][0][1] == pytest.approx(errors[0], rel=1e-5)
     assert abs(errors[0] - errors[1]) > 1e-3 * errors[0]
     cameras = [v.camera for v in fit.views]
     wanted = [
@@ -354,18 +344,6 @@ def test_a_step_renders_with_the_filter(device, captured):
     ]
     assert most_instances(fit.gaussians, cameras, options) == wanted[0] != wanted[1]
     assert step.instance_capacity(fit.gaussians, stack, 0, options) == int(step.CAPACITY_FACTOR * wanted[0]) + 1024
-
-
-@pytest.mark.usefixtures("free")
-@pytest.mark.cuda
-def test_captured_steps_are_the_eager_ones(device):
-    """The same Gaussians, to the bit, with CUDA graphs and without."""
-    fits = [Trainer(photos(4), seeds(), dataclasses.replace(FILTERED_CONFIG, cuda_graph=g), device) for g in (True, False)]
-    for fit in fits:
-        while fit.step < FILTERED_CONFIG.steps:
-            fit.advance(FILTERED_CONFIG.steps)
-    for name, t in fits[0].gaussians.tensors().items():
-        assert torch.equal(t, fits[1].gaussians.tensors()[name]), name
 
 
 @pytest.mark.usefixtures("free")
@@ -387,37 +365,16 @@ def test_scores_models_and_images_have_the_filter(filtered_run):
 
 
 @pytest.mark.usefixtures("free")
-def test_a_continued_fit_equals_one_in_one_go(filtered_run, tmp_path):
-    """A run that stopped half-way, to the bit; and not without the setting, which is another fit."""
-
-    def stop(report):
-        if report.step == FILTERED_CONFIG.steps // 2:
-            raise KeyboardInterrupt
-
-    whole, _ = filtered_run
-    how = {"split": SPLIT, "out": tmp_path / "run", "device": "cpu", "verbose": False}
-    config = dataclasses.replace(FILTERED_CONFIG, checkpoint_every=1, checkpoint_seconds=0.0)
-    with pytest.raises(KeyboardInterrupt):
-        warpgs.fit(scene(), config, on_step=stop, **how)
-    with pytest.raises(warpgs.errors.UsageError, match="antialiased"):
-        warpgs.fit(scene(), dataclasses.replace(config, antialiased=False), resume=True, **how)
-    result = warpgs.fit(scene(), config, resume=True, **how)
-    for name, t in result.gaussians().tensors().items():
-        assert torch.equal(t, getattr(whole.gaussians(), name)), name
-
-
-@pytest.mark.usefixtures("free")
 def test_no_axis_is_below_what_cameras_resolve(monkeypatch):
     """With the default limit every axis ends at 0.45 px or above of the finest camera; without the flag many are below."""
     monkeypatch.setattr(limits, "MIN_PIXELS", 0.2**0.5)
-    rows = TrainingCameras.of(ring(4), CPU).rows
+    rows = camera_rows(ring(4), CPU)
     below = []
     for antialiased in (True, False):
         fit = Trainer(
             photos(4), seeds(), dataclasses.replace(FILTERED_CONFIG, limits=LimitConfig(), antialiased=antialiased), CPU
         )
-        while fit.step < FILTERED_CONFIG.steps:
-            fit.advance()
+        advanced(fit)
         smallest = pixel_size(fit.gaussians.means, rows, 0.2**0.5)
         below.append(int((fit.gaussians.log_scales < smallest[:, None] - 1e-5).sum()))
     assert below[0] == 0 < below[1]
@@ -479,11 +436,8 @@ def balls(count: int = 8, side: int = 40) -> list[View]:
     return views
 
 
-def fitted(views: list[View], loss: LossConfig, steps: int = CUTOUT.steps, points: PointCloud | None = None) -> Trainer:
-    fit = Trainer(views, points or seeds(), dataclasses.replace(CUTOUT, loss=loss), CPU, WHITE)
-    for _ in range(steps):
-        fit.advance()
-    return fit
+def fitted(views: list[View], loss: LossConfig, steps: int | None = None, points: PointCloud | None = None) -> Trainer:
+    return advanced(Trainer(views, points or seeds(), dataclasses.replace(CUTOUT, loss=loss), CPU, WHITE), steps)
 
 
 def alpha_errors(fit: Trainer, views: list[View]) -> tuple[float, float]:
@@ -552,24 +506,12 @@ def test_either_way_empties_what_is_empty(loss, monkeypatch):
     assert empty < 0.3 * plain and missing < (0.1 if loss.alpha_weight else 1)  # by colour alone it takes more steps
 
 
-def test_a_continued_fit_equals_an_uninterrupted_one():
-    """The colour behind a step depends on seed and step alone; opaque views have none."""
-    whole, half = fitted(cutouts(), LossConfig()), fitted(cutouts(), LossConfig(), 30)
-    other = fitted(cutouts(), LossConfig(), 0)
-    other.load(*half.state())
-    while other.step < CUTOUT.steps:
-        other.advance()
-    assert all(torch.equal(a, b) for a, b in zip(whole.gaussians.tensors().values(), other.gaussians.tensors().values()))
-    opaque = fitted([dataclasses.replace(v, alpha=None) for v in cutouts()], LossConfig(), 1)
-    assert opaque.settings(5)[SHIFT] == (0, 0, 0) != whole.settings(5)[SHIFT]
-    assert [t.name for t in opaque.terms] == ["photometric"]
-
-
-def test_an_estimated_opacity_is_no_target():
-    """It says where Gaussians start and are sampled; the loss is that of opaque views."""
-    views = [dataclasses.replace(v, alpha_estimated=True) for v in cutouts()]
-    fit = fitted(views, LossConfig(), 1)
-    assert [t.name for t in fit.terms] == ["photometric"] and fit.settings(5)[SHIFT] == (0, 0, 0)
+def test_opaque_views_have_no_shift_and_an_estimated_opacity_is_no_target():
+    """An estimated one says where Gaussians start and are sampled; the loss is that of opaque views."""
+    assert fitted(cutouts(), LossConfig(), 0).settings(5)[SHIFT] != (0, 0, 0)
+    for change in ({"alpha": None}, {"alpha_estimated": True}):
+        fit = fitted([dataclasses.replace(v, **change) for v in cutouts()], LossConfig(), 1)
+        assert [t.name for t in fit.terms] == ["photometric"] and fit.settings(5)[SHIFT] == (0, 0, 0)
     assert fit.views[0].countable is not None and fit.layout.sizes.cutout
 
 

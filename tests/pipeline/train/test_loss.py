@@ -9,13 +9,13 @@ import pytest
 import torch
 
 from tests.example_terms import DepthCorrelation, NormalSmoothness
+from tests.pipeline.train.fits import advanced
 from tests.pipeline.train.test_memory import STEADY, instances, measured
 from tests.priors.rigs import still_life
 from tests.scenes import photos, priors, seeds, three_gaussians, view_stub
 from warpgs.errors import UsageError
 from warpgs.geometry import depth_normals
 from warpgs.pipeline.model.start import InitConfig
-from warpgs.pipeline.run.folder import load_checkpoint, save_checkpoint
 from warpgs.pipeline.train.loss import (
     BOUND,
     CONFIRMED,
@@ -23,7 +23,6 @@ from warpgs.pipeline.train.loss import (
     LOSS_TERMS,
     AlphaDifference,
     GivenDepthDifference,
-    GivenNormalsDifference,
     LossConfig,
     LossInputs,
     LossTerm,
@@ -40,7 +39,7 @@ from warpgs.pipeline.train.loss import (
 )
 from warpgs.pipeline.train.presets import PRESETS
 from warpgs.pipeline.train.settings import FEW, SMOOTH_STEPS, FitConfig, settings_by_views, steps_by_views
-from warpgs.pipeline.train.step import StepPlan, eager_renderer, total_loss, view_gradients
+from warpgs.pipeline.train.step import StepPlan, eager_renderer, total_loss
 from warpgs.pipeline.train.strategies.base import Strategy
 from warpgs.pipeline.train.strategies.clone_split import DensityConfig
 from warpgs.pipeline.train.trainer import Trainer
@@ -72,7 +71,6 @@ def maps(dtype: torch.dtype = torch.float64) -> tuple[torch.Tensor, torch.Tensor
     return depth.to(dtype), (0.3 + 0.7 * alpha).to(dtype), disparity.to(dtype), (kept > 0.3).to(dtype)
 
 
-@pytest.mark.usefixtures("registry_as_it_was")
 @pytest.mark.parametrize("shape", [(70_001,), (300, 401), (3, 40, 50, 3), (5,)])
 def test_a_total_has_the_same_bits_for_any_number_of_threads(shape):
     """Of values per Gaussian, and of images."""
@@ -86,7 +84,6 @@ def test_a_total_has_the_same_bits_for_any_number_of_threads(shape):
     assert len(set(found)) == 1 and found[0] == pytest.approx(float(values.double().sum()), rel=1e-6)
 
 
-@pytest.mark.usefixtures("registry_as_it_was")
 def test_total_loss_is_the_sum_of_terms_and_of_what_the_strategy_adds():
     """The photometric loss alone, to the bit; then another term; then a regularisation."""
     depth, alpha, disparity, mask = maps(torch.float32)
@@ -103,14 +100,6 @@ def test_total_loss_is_the_sum_of_terms_and_of_what_the_strategy_adds():
     assert float(both - plain) == pytest.approx(float(DepthCorrelation(0.25)(inputs)), abs=1e-6) and float(both - plain) > 0.01
     strategy.regularisation = lambda phase, gaussians: torch.tensor(2.0)
     assert torch.equal(loss(Photometric(), DepthCorrelation(0.25)), both + 2)
-
-
-@pytest.mark.usefixtures("registry_as_it_was")
-def test_built_in_terms_follow_from_the_weights():
-    """An opacity term where views know theirs and it has a weight."""
-    assert built_in_terms(LossConfig()) == (Photometric(0.2),)
-    assert built_in_terms(LossConfig(alpha_weight=0.3), True) == (Photometric(0.2), AlphaDifference(0.3))
-    assert built_in_terms(LossConfig(alpha_weight=0), True) == (Photometric(0.2),)
 
 
 @pytest.mark.usefixtures("registry_as_it_was")
@@ -137,32 +126,6 @@ def test_a_term_reads_the_outputs_that_it_asks_for_alone():
 
 
 @pytest.mark.usefixtures("registry_as_it_was")
-def test_depth_has_a_gradient_where_a_term_reads_it(monkeypatch):
-    """Else the backward pass of blending is not asked for one, which costs time."""
-    seen = []
-    gradients = torch.autograd.grad
-
-    def noted(loss, wanted, *args, **more):
-        names, nodes = set(), [loss.grad_fn]
-        while nodes:
-            node = nodes.pop()
-            if node is not None and node.name() not in names | {"_BlendBackward"}:
-                names.add(node.name())
-            for parent, place in () if node is None else node.next_functions:
-                if parent is not None and parent.name() == "_BlendBackward":
-                    seen[-1].add(place)
-                else:
-                    nodes.append(parent)
-        return gradients(loss, wanted, *args, **more)
-
-    monkeypatch.setattr(torch.autograd, "grad", noted)
-    for terms in ((), (DepthCorrelation(),)):
-        seen.append(set())
-        Trainer(photos(2), seeds(), dataclasses.replace(PLAIN, loss_terms=terms), CPU, priors=priors(photos(2))).advance()
-    assert seen == [{0}, {0, 2}]
-
-
-@pytest.mark.usefixtures("registry_as_it_was")
 @pytest.mark.parametrize("batch", [1, 3])
 def test_a_term_sees_camera_and_step(batch):
     """Those of each view of the step, at the size of its image; all views of a step have its number."""
@@ -186,8 +149,7 @@ def test_a_term_sees_camera_and_step(batch):
 
     config = dataclasses.replace(PLAIN, batch=batch, loss_terms=(Witness(),), half_resolution=0.5)
     fit = Trainer(photos(3), seeds(), config, CPU)
-    while fit.step < 8:
-        fit.advance()
+    advanced(fit)
     camera = photos(1)[0].camera
     small, large = (20, camera.K[0, 0] / 2), (40, camera.K[0, 0])
     sizes = [(k, *(small if k <= 4 else large)) for k in range(1, 9) for _ in range(batch)]
@@ -208,11 +170,12 @@ def test_a_refined_pose_learns_from_a_term():
     config = dataclasses.replace(PLAIN, view_modules=(RefinePoses(),), loss_terms=(Puller(),))
     fit = Trainer(photos(3), seeds(), config, CPU)
     plan = fit.plan_of(1)
-    fit.learned.views.table.params[ROTATION].data[1] = torch.tensor([0.0, 0.2, 0.0])
+    fit.learned.table.params[ROTATION].data[1] = torch.tensor([0.0, 0.2, 0.0])
     (stack,) = fit.stacks.values()
-    fit.buffers.load([1], [[0.0] * fit.buffers.lr_rows.shape[1]], [fit.settings(1)])
-    found = view_gradients(fit.learned, stack, fit.buffers, plan, eager_renderer(fit.context.render_options(), None))
-    rotation = found.gradients[len(fit.table.params) + list(fit.learned.views.table.params).index(ROTATION)]
+    fit.taker.buffers.load([1], [[0.0] * fit.taker.buffers.lr_rows.shape[1]], [fit.settings(1)])
+    render = eager_renderer(fit.context.render_options(), None)
+    gradients, *_ = fit.taker.view_gradients(stack, fit.taker.buffers, plan, render)
+    rotation = gradients[len(fit.table.params) + list(fit.learned.table.params).index(ROTATION)]
     assert float(rotation[1].abs().max()) > 10 and not bool(rotation[[0, 2]].any())
 
 
@@ -223,18 +186,6 @@ SMOOTH = FitConfig(
     steps=24, init=InitConfig(source="points", opacity=0.9), sh_degree=0, density=DensityConfig(start=6, every=6),
     half_resolution=0.5, loss_terms=(NormalSmoothness(2.0, growth=10),),
 )  # fmt: skip
-
-
-def normals_example_fitted(config: FitConfig, device: torch.device = CPU, until: int = 24) -> Trainer:
-    fit = Trainer(photos(4), seeds(), config, device)
-    while fit.step < until:
-        fit.advance(until - fit.step)
-    return fit
-
-
-def same_bits(a: Trainer, b: Trainer) -> bool:
-    (tensors, _), (others, _) = a.state(), b.state()
-    return tensors.keys() == others.keys() and all(torch.equal(t, others[n]) for n, t in tensors.items())
 
 
 def test_unevenness_is_a_weighted_mean_of_angles():
@@ -250,59 +201,41 @@ def test_unevenness_is_a_weighted_mean_of_angles():
     assert torch.autograd.gradcheck(lambda n: unevenness(n, image), random)
 
 
-def test_normals_example_a_fit_with_the_term_is_smoother_and_continues(tmp_path):
-    """On a CPU: smoother than without, and the same bits where it is continued from a checkpoint."""
-    whole, plain = normals_example_fitted(SMOOTH), normals_example_fitted(dataclasses.replace(SMOOTH, loss_terms=()))
-
-    def found(fit: Trainer) -> float:
+def test_normals_example_a_fit_with_the_term_is_smoother():
+    def found(config: FitConfig) -> float:
+        fit = advanced(Trainer(photos(4), seeds(), config, CPU))
         renders = [(v, rasterize(fit.gaussians, v.camera)) for v in fit.views]
         depths = [(v, torch.where(r.alpha > 0.5, r.depth, 0)) for v, r in renders]
         return sum(float(unevenness(depth_normals(v.camera, d), v.image)) for v, d in depths)
 
-    assert found(whole) < 0.8 * found(plain)
-    save_checkpoint(tmp_path, *normals_example_fitted(SMOOTH, until=13).state())
-    stored, values = load_checkpoint(tmp_path)
-    resumed = Trainer(photos(4), seeds(), FitConfig.from_json(values["config"]), CPU)
-    resumed.load(stored, values)
-    while resumed.step < 24:
-        resumed.advance()
-    assert same_bits(resumed, whole)
+    assert found(SMOOTH) < 0.8 * found(dataclasses.replace(SMOOTH, loss_terms=()))
 
 
-def test_the_weight_grows_over_the_first_steps():
-    """By the number of the step: a tenth of it in the first of ten."""
-    fit = Trainer(photos(4), seeds(), dataclasses.replace(SMOOTH, half_resolution=0.0), CPU)
-    term, steps = fit.terms[-1], []
-
-    class Noted(NormalSmoothness):
-        def __call__(self, inputs):
-            with torch.no_grad():
-                whole = NormalSmoothness(2.0, growth=1)(inputs)
-                steps.append(float(NormalSmoothness.__call__(self, inputs) / whole))
-            return super().__call__(inputs)
-
-    fit.terms = (*fit.terms[:-1], Noted(term.weight, term.growth))
-    while fit.step < 12:
-        fit.advance()
-    assert steps == pytest.approx([min(1, k / 10) for k in range(1, 13)])
-
-
-@pytest.mark.parametrize("bad", [{"weight": -1.0}, {"weight": float("nan")}, {"growth": 0}])
-def test_settings_out_of_range_are_refused(bad):
-    """By name, with the range."""
-    with pytest.raises(UsageError, match=f"{next(iter(bad))} .* must"):
-        NormalSmoothness(**bad)
+@pytest.mark.parametrize(
+    ("kind", "bad"),
+    [
+        (LossConfig, {"depth_weight": -1}), (LossConfig, {"normal_weight": math.nan}), (LossConfig, {"smooth_weight": 1001}),
+        (SmoothDepth, {"weight": math.nan}), (NormalSmoothness, {"growth": 0}), (DepthCorrelation, {"until": 2}),
+    ],
+)  # fmt: skip
+def test_weights_out_of_range_are_refused(kind, bad):
+    """In the settings and in the terms, by name."""
+    with pytest.raises(UsageError, match=next(iter(bad)).replace("_", "-")):
+        kind(**bad)
 
 
 @pytest.mark.cuda
 @pytest.mark.parametrize("batch", [1, 2])
-def test_recorded_steps_with_the_term_equal_single_steps(batch):
-    """On CUDA: the step's number is read on the device, so that a replayed step has its own weight."""
-    config = dataclasses.replace(SMOOTH, batch=batch)
-    device = torch.device("cuda", 0)
-    recorded, single = (normals_example_fitted(dataclasses.replace(config, cuda_graph=g), device) for g in (True, False))
-    without = normals_example_fitted(dataclasses.replace(config, loss_terms=()), device)
-    assert same_bits(recorded, single) and not torch.equal(recorded.gaussians.means[:10], without.gaussians.means[:10])
+@pytest.mark.parametrize("given", [False, True], ids=["weight by step", "given maps"])
+def test_recorded_steps_with_terms_equal_single_steps(batch, given):
+    """On CUDA: the step's number and maps are read on the device, so that a replayed step has its own."""
+    config = dataclasses.replace(CONFIG if given else SMOOTH, steps=24, batch=batch)
+    views, device = mapped() if given else photos(4), torch.device("cuda", 0)
+    without = dataclasses.replace(config, loss_terms=(), loss=LossConfig(depth_weight=0, normal_weight=0))
+    configs = *(dataclasses.replace(config, cuda_graph=g) for g in (True, False)), without
+    recorded, single, plain = (advanced(Trainer(views, seeds(), c, device)) for c in configs)
+    assert all(torch.equal(t, single.state()[0][n]) for n, t in recorded.state()[0].items())
+    assert not torch.equal(recorded.gaussians.means[:10], plain.gaussians.means[:10])
 
 
 # Loss terms on given depth and normals: values, gradients, half size, memory, and fits that continue with the same
@@ -324,13 +257,6 @@ def mapped(count: int = 4, width: int = 40, height: int = 32, normals: bool = Tr
         vectors = depth_normals(camera, depth).numpy() if normals else None
         found.append(dataclasses.replace(v, depth=GivenDepth(depth.numpy()), normals=vectors))
     return [*found, views[-1]]
-
-
-def given_terms_fitted(config: FitConfig = CONFIG, until: int = 60) -> Trainer:
-    fit = Trainer(mapped(), seeds(), config, CPU)
-    while fit.step < until:
-        fit.advance(until - fit.step)
-    return fit
 
 
 def target_of(term, **fields) -> torch.Tensor:
@@ -393,46 +319,30 @@ def test_half_size_keeps_weighted_means():
 
 def test_terms_follow_from_the_views_and_the_weights():
     assert [t.name for t in Trainer(mapped(2), seeds(), CONFIG, CPU).terms] == ["photometric", "given_depth", "given_normals"]
-    assert [t.name for t in Trainer(photos(2), seeds(), CONFIG, CPU).terms] == ["photometric"]
-    assert len(built_in_terms(LossConfig(depth_weight=0, normal_weight=0), False, True, True)) == 1
-    for bad in ({"depth_weight": -1}, {"normal_weight": float("nan")}):
-        with pytest.raises(UsageError, match=r"loss\.(depth|normal)-weight must be in \[0, 1000\]"):
-            LossConfig(**bad)
+    assert built_in_terms(LossConfig()) == (Photometric(0.2),)
+    assert built_in_terms(LossConfig(alpha_weight=0.3), True) == (Photometric(0.2), AlphaDifference(0.3))
+    assert built_in_terms(LossConfig(alpha_weight=0, depth_weight=0, normal_weight=0), True, True, True) == (Photometric(0.2),)
 
 
-def test_a_fit_with_maps_is_nearer_to_them_and_continues(tmp_path):
-    """Rendered depth comes nearer to the given one than without; a continued fit has the same bits as an uninterrupted one."""
-    whole, plain = (
-        given_terms_fitted(),
-        given_terms_fitted(dataclasses.replace(CONFIG, loss=LossConfig(depth_weight=0, normal_weight=0))),
-    )
-
-    def off(fit: Trainer) -> float:
-        found = []
+def test_a_fit_with_maps_is_nearer_to_them():
+    def off(loss: LossConfig) -> float:
+        fit, found = advanced(Trainer(mapped(), seeds(), dataclasses.replace(CONFIG, loss=loss), CPU)), []
         for v in mapped()[:-1]:
             r, given = rasterize(fit.gaussians, v.camera), torch.as_tensor(v.depth.values)
             at = (given > 0) & (r.alpha > 0.5)
             found.append(float((r.depth[at] / given[at] - 1).abs().mean()))
         return float(np.mean(found))
 
-    assert off(whole) < 0.85 * off(plain)
-    part = given_terms_fitted(until=25)
-    save_checkpoint(tmp_path, *part.state())
-    again = Trainer(mapped(), seeds(), CONFIG, CPU)
-    again.load(*load_checkpoint(tmp_path))
-    while again.step < 60:
-        again.advance(60 - again.step)
-    assert same_bits(whole, again)
+    assert off(CONFIG.loss) < 0.85 * off(LossConfig(depth_weight=0, normal_weight=0))
 
 
-@pytest.mark.parametrize("normals", [False, True])
-def test_plan_covers_the_terms(normals):
+@pytest.mark.parametrize("term", ["depth", "normals", "smooth"])
+def test_plan_covers_the_terms(term):
     """The maps that stay, and what the terms and their gradients take."""
-    views = mapped(2, 400, 300, normals)
-    fit = Trainer(views, seeds(60), STEADY, CPU)
+    views = photos(2, 400, 300) if term == "smooth" else mapped(2, 400, 300, term == "normals")
+    fit = Trainer(views, seeds(60), dataclasses.replace(STEADY, loss=LossConfig(smooth_weight=float(term == "smooth"))), CPU)
     fit.advance()
-    found = measured(fit, 2)
-    planned = fit.layout.step(60, instances(fit))
+    found, planned = measured(fit, 2), fit.layout.step(60, instances(fit))
     assert found <= planned <= 1.25 * found + 20_000, (found, planned)
 
 
@@ -451,22 +361,6 @@ def test_depth_by_a_network_takes_the_same_way():
         assert at.mean() > 0.9 and np.median(np.abs(q[at] / scaled[at] / true[at] - 1)) < 0.005
     with pytest.raises(UsageError, match="--depth-guides requires --depth-model"):
         PriorConfig(depth_guides=True)
-
-
-@pytest.mark.cuda
-@pytest.mark.parametrize("batch", [1, 2])
-def test_recorded_steps_equal_single_steps(batch):
-    """On CUDA: maps are taken from the stacks by number, and the bits are those of steps one by one."""
-    config, device = dataclasses.replace(CONFIG, batch=batch), torch.device("cuda", 0)
-    fits = [Trainer(mapped(), seeds(), dataclasses.replace(config, cuda_graph=g), device) for g in (True, False)]
-    for fit in fits:
-        while fit.step < 24:
-            fit.advance(24 - fit.step)
-    assert same_bits(*fits)
-
-
-def test_names_of_the_terms_are_registered():
-    assert LOSS_TERMS.find("given_depth") is GivenDepthDifference and LOSS_TERMS.find("given_normals") is GivenNormalsDifference
 
 
 # Smoothness of rendered depth: values, gradients, when it is chosen, memory, and fits.
@@ -520,10 +414,7 @@ def test_confirmed_pixels_count_less():
     assert torch.equal(found, torch.where(consistent > 0, CONFIRMED, 1.0))
 
 
-@pytest.mark.parametrize(
-    ("views", "alpha", "weight"),
-    [(3, None, 1.0), (4, None, 1.0), (5, None, 0.0), (3, 1.0, 0.5), (8, 1.0, 0.5), (9, 1.0, 0.0)],
-)
+@pytest.mark.parametrize(("views", "alpha", "weight"), [(4, None, 1.0), (5, None, 0.0), (8, 1.0, 0.5), (9, 1.0, 0.0)])
 def test_few_views_have_the_term(views, alpha, weight):
     """In fits of at least 3000 steps, so not where a CPU limits them; what is given holds, and other presets have none."""
     train = [view_stub(alpha=alpha)] * views
@@ -543,52 +434,19 @@ def test_few_views_have_the_term(views, alpha, weight):
     assert settings_by_views(given, train, "cpu")[0].loss.smooth_weight == 0.2
 
 
-def test_wrong_weights_are_refused():
-    """In the settings and in the term."""
-    for wrong in (-1, math.nan, 1001):
-        for kind, name in ((LossConfig, "smooth_weight"), (SmoothDepth, "weight")):
-            with pytest.raises(UsageError, match=r"(loss\.smooth-|smooth-depth\.)weight must be in \[0, 1000\]"):
-                kind(**{name: wrong})
-
-
-def test_smooth_depth_a_fit_with_the_term_is_smoother_and_continues(tmp_path):
-    """Rendered depth is less rough than without; a continued fit has the same bits as an uninterrupted one."""
-
-    def fit(weight: float, until: int = 40) -> Trainer:
+def test_smooth_depth_a_fit_with_the_term_is_smoother():
+    def rough(weight: float) -> float:
         config = FitConfig(
             steps=40, init=InitConfig(source="points", opacity=0.9), sh_degree=0, half_resolution=0.5,
             loss=LossConfig(smooth_weight=weight),
         )  # fmt: skip
-        trainer = Trainer(photos(3, 40, 32), seeds(), config, CPU)
-        while trainer.step < until:
-            trainer.advance(until - trainer.step)
-        return trainer
-
-    def rough(trainer: Trainer) -> float:
-        found = []
-        for v in photos(3, 40, 32):
-            r = rasterize(trainer.gaussians, v.camera)
-            image = torch.as_tensor(v.image, dtype=torch.float32)
+        fit, found = advanced(Trainer(photos(3), seeds(), config, CPU)), []
+        for v in photos(3):
+            r, image = rasterize(fit.gaussians, v.camera), torch.as_tensor(v.image, dtype=torch.float32)
             found.append(float(depth_roughness(r.depth, r.alpha, image, torch.ones_like(r.depth), None)))
         return sum(found)
 
-    whole, half = fit(30.0), fit(30.0, 20)
-    assert rough(whole) < 0.9 * rough(fit(0.0))
-    save_checkpoint(tmp_path, *half.state())
-    again = fit(30.0, 0)
-    again.load(*load_checkpoint(tmp_path))
-    while again.step < 40:
-        again.advance(40 - again.step)
-    assert same_bits(whole, again)
-
-
-def test_plan_covers_the_term():
-    """The weights that stay, and what the term and its gradient take."""
-    config = dataclasses.replace(STEADY, loss=LossConfig(smooth_weight=1.0))
-    fit = Trainer(photos(2, 400, 300), seeds(60), config, CPU)
-    fit.advance()
-    found, planned = measured(fit, 2), fit.layout.step(60, instances(fit))
-    assert found <= planned <= 1.25 * found + 20_000, (found, planned)
+    assert rough(30.0) < 0.9 * rough(0.0)
 
 
 # The depth term of `examples/`: a correlation with the prior, nothing without one, and what a fit makes of it.
@@ -633,7 +491,7 @@ def test_gradient_of_the_depth_term(masked):
     assert bool((gradient[hidden] == 0).all()) and bool((gradient[~hidden] != 0).all()) and not bool(none.any())
 
 
-@pytest.mark.parametrize("scale", [1e-30, 1e-12, 1.0, 1e12, 1e30])
+@pytest.mark.parametrize("scale", [1e-30, 1.0, 1e30])
 def test_depth_term_has_no_unit(scale):
     """In float32, for depths in any unit, value and gradient are those of float64."""
     depth, alpha, disparity, mask = maps()
@@ -677,56 +535,31 @@ def test_depth_term_hides_no_nan():
     assert math.isnan(float(depth_disagreement(*nothing, mask)))
 
 
-def test_depth_term_reaches_the_gaussians():
-    """The whole way from means to the term, in float64, against central differences along a random direction."""
-    view, prior = photos(1)[0], priors(photos(1))[0]
-    fit = Trainer(
-        [view], seeds(), dataclasses.replace(GUIDED, init=InitConfig(source="points", opacity=0.9)), CPU, priors=[prior]
-    )
-    tensors = {n: t.double() for n, t in fit.gaussians.tensors().items()}
-    disparity = torch.as_tensor(prior.disparity, dtype=torch.float64)
-
-    def term(means: torch.Tensor) -> torch.Tensor:
-        r = rasterize(type(fit.gaussians)(**{**tensors, "means": means}), view.camera)
-        return depth_disagreement(r.depth, torch.ones_like(r.alpha), disparity, (r.alpha.detach() > 0.9).double())
-
-    means, towards = tensors["means"].requires_grad_(), torch.randn(60, 3, generator=torch.Generator().manual_seed(1)).double()
-    (gradient,) = torch.autograd.grad(term(means), means)
-    with torch.no_grad():
-        step = 1e-7 * towards
-        slope = float((term(means + step) - term(means - step)) / 2e-7)
-    assert abs(slope) > 0.1 and float((gradient * towards).sum()) == pytest.approx(slope, rel=1e-4)
-
-
-def depth_example_fitted(config: FitConfig, found: list[Prior] | None = None) -> Trainer:
-    views = photos(3)
-    fit = Trainer(views, seeds(), config, CPU, priors=priors(views) if found is None else found)
-    for _ in range(config.steps):
-        fit.advance()
-    return fit
-
-
 def agreement(fit: Trainer, wanted: list[Prior]) -> float:
     """Mean correlation of a fit's depths with given disparities."""
     renders = [rasterize(fit.gaussians, v.camera) for v in fit.views]
     return float(np.mean([correlation(r.depth, r.alpha, torch.as_tensor(p.disparity), None) for r, p in zip(renders, wanted)]))
 
 
+def guided(config: FitConfig, given: list[Prior]) -> Trainer:
+    return advanced(Trainer(photos(3), seeds(), config, CPU, priors=given))
+
+
 def test_a_fit_follows_its_priors():
     """Whichever way round the prior is: depth comes nearer to it than it began, and than under the other."""
     straight = priors(photos(3))
     turned = [dataclasses.replace(p, disparity=1 - p.disparity) for p in straight]
-    start = depth_example_fitted(dataclasses.replace(GUIDED, steps=1), straight)
-    fits = [depth_example_fitted(GUIDED, given) for given in (straight, turned)]
+    start = guided(dataclasses.replace(GUIDED, steps=1), straight)
+    fits = [guided(GUIDED, given) for given in (straight, turned)]
     for given, own, other in ((straight, *fits), (turned, *reversed(fits))):
         assert agreement(own, given) > max(agreement(start, given), agreement(other, given)) + 0.1
 
 
 def test_term_ends_when_it_should():
     """Off from the first step on it is as if it had no weight, to the bit; while it is on it is not."""
-    plain = depth_example_fitted(dataclasses.replace(GUIDED, loss_terms=()))
+    plain = guided(dataclasses.replace(GUIDED, loss_terms=()), priors(photos(3)))
     for until, same in ((0.0, True), (0.5, False)):
-        fit = depth_example_fitted(dataclasses.replace(GUIDED, loss_terms=(DepthCorrelation(0.5, until),)))
+        fit = guided(dataclasses.replace(GUIDED, loss_terms=(DepthCorrelation(0.5, until),)), priors(photos(3)))
         assert torch.equal(fit.gaussians.means, plain.gaussians.means) == same
     assert [len(fit.plan_of(s).terms) for s in (1, 20, 21, 40)] == [2, 2, 1, 1]
 
@@ -741,10 +574,3 @@ def test_half_size_views_keep_their_disparity():
     assert torch.allclose(half["disparity"], disparity.reshape(16, 2, 20, 2).mean((1, 3)), atol=1e-6)
     assert torch.allclose(half["two"][..., 1], 1 - half["disparity"], atol=1e-6) and half["two"].shape == (16, 20, 2)
     assert half_size(TrainingView.of(view, CPU)).maps == {}
-
-
-@pytest.mark.parametrize("bad", [{"weight": -1}, {"weight": math.nan}, {"weight": math.inf}, {"until": 2}])
-def test_bad_weights_are_refused(bad):
-    """At once, by name."""
-    with pytest.raises(UsageError, match=f"{next(iter(bad))} {next(iter(bad.values()))}"):
-        DepthCorrelation(**bad)

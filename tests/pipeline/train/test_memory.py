@@ -11,6 +11,7 @@ import torch
 from tests.allocations import Allocations
 from tests.example_terms import DepthCorrelation
 from tests.gaussians import camera, cloud, leaves
+from tests.pipeline.train.fits import same_bits
 from tests.pipeline.train.test_trainer import BUSY, fitted
 from tests.scenes import photos, priors, seeds
 from warpgs.app.cli import main
@@ -19,12 +20,12 @@ from warpgs.errors import OutOfMemoryError, ResourceError
 from warpgs.kernels import blend, project, tiles
 from warpgs.pipeline.model.start import InitConfig
 from warpgs.pipeline.paper.strategy import PaperConfig
-from warpgs.pipeline.train import batch
 from warpgs.pipeline.train import trainer as trainer_module
 from warpgs.pipeline.train.loss import LOSS_TERMS, LossTerm
-from warpgs.pipeline.train.memory import most_instances, plan
+from warpgs.pipeline.train.memory import most_instances, plan, plan_summary
 from warpgs.pipeline.train.schedule import PhaseConfig
 from warpgs.pipeline.train.settings import FitConfig
+from warpgs.pipeline.train.step import StepTaker
 from warpgs.pipeline.train.stopping import StoppingConfig
 from warpgs.pipeline.train.strategies import sampling
 from warpgs.pipeline.train.strategies.clone_split import DensityConfig
@@ -60,48 +61,24 @@ def measured(fit: Trainer, steps: int) -> int:
     return allocations.peak
 
 
+@pytest.mark.parametrize(
+    ("size", "count", "changes"),
+    [
+        ((40, 32), 60, {}), ((400, 300), 60, {}), ((40, 32), 5000, {}), ((40, 32), 5000, {"batch": 3}),
+        ((40, 32), 5000, {"batch": 8}), ((400, 300), 60, {"loss_terms": (DepthCorrelation(0.1),)}),
+        ((40, 32), 20_000, {"view_modules": (RefinePoses(),)}), ((400, 300), 60, {"view_modules": (Exposure(),)}),
+    ],
+)  # fmt: skip
 @pytest.mark.parametrize("change", [list, masked])
-@pytest.mark.parametrize("size", [(40, 32), (400, 300)])
-@pytest.mark.parametrize("count", [60, 5000])
-def test_plan_covers_a_step_and_not_much_more(change, size, count):
-    """From few Gaussians on many pixels to many on few, with and without masks."""
-    fit = Trainer(change(photos(2, *size)), seeds(count), STEADY, CPU)
+def test_plan_covers_a_step_and_not_much_more(change, size, count, changes):
+    """From few Gaussians on many pixels to many on few, with and without masks, terms on depth, and view modules."""
+    views = change(photos(2, *size))
+    fit = Trainer(views, seeds(count), dataclasses.replace(STEADY, **changes), CPU, priors=priors(views))
     fit.advance()
     found = measured(fit, 2)
     planned = fit.layout.step(count, instances(fit))
-    assert fit.memory.planned >= 0.95 * planned and found <= planned <= 1.25 * found + 20_000
-
-
-@pytest.mark.parametrize("batch", [3, 8])
-def test_plan_covers_the_sums_of_several_views(batch):
-    """Their gradients and statistics, of many Gaussians on few pixels."""
-    fit = Trainer(photos(2), seeds(5000), dataclasses.replace(STEADY, batch=batch), CPU)
-    fit.advance()
-    found = measured(fit, 2)
-    planned = fit.layout.step(5000, instances(fit))
-    assert fit.layout.sums == {3: 1, 8: 3}[batch] and found <= planned <= 1.1 * found
-
-
-@pytest.mark.parametrize("change", [list, masked])
-def test_plan_covers_the_depth_term(change):
-    """A disparity a pixel that stays, and what a correlation and its gradient take."""
-    views = change(photos(2, 400, 300))
-    config = dataclasses.replace(STEADY, loss_terms=(DepthCorrelation(0.1),))
-    fit = Trainer(views, seeds(60), config, CPU, priors=priors(views))
-    fit.advance()
-    found = measured(fit, 2)
-    planned = fit.layout.step(60, instances(fit))
-    assert fit.layout.sizes.depth and found <= planned <= 1.25 * found + 20_000
-
-
-@pytest.mark.parametrize(("module", "size", "count"), [(RefinePoses(), (40, 32), 20_000), (Exposure(), (400, 300), 60)])
-def test_plan_covers_what_is_learned_of_views(module, size, count):
-    """A gradient of the camera for each Gaussian, and renders with and without their exposure."""
-    fit = Trainer(photos(2, *size), seeds(count), dataclasses.replace(STEADY, view_modules=(module,)), CPU)
-    fit.advance()
-    found = measured(fit, 2)
-    planned = fit.layout.step(count, instances(fit))
-    assert found <= planned <= 1.25 * found + 20_000
+    assert fit.layout.sums == {1: 0, 3: 1, 8: 3}[fit.batch] and fit.layout.sizes.depth == ("loss_terms" in changes)
+    assert fit.memory["planned"] >= 0.95 * planned and found <= planned <= 1.25 * found + 20_000
 
 
 def test_plan_covers_density_events():
@@ -152,7 +129,7 @@ def test_plan_counts_what_lasts(strategy, stops):
     tensors = list(fit.table.state().values())
     for v in (*fit.views, *fit.stacks.values(), *fit.stopping.whole):
         for name, value in (*vars(v).items(), *v.maps.items()):
-            if name not in ("viewmats", "Ks", "numbers"):
+            if name != "numbers":
                 tensors += [t for t in (value if isinstance(value, tuple) else [value]) if isinstance(t, torch.Tensor)]
     tensors += [t for s in fit.stacks.values() for rows in s.maps.values() for t in rows]
     assert fit.layout.held(500) == bytes_of_tensors(tensors)
@@ -246,18 +223,18 @@ def test_fit_keeps_to_its_limit(tmp_path):
         STEADY, steps=24, sh_every=12, density=DensityConfig(start=5, every=5, gradient=2e-5), max_gaussians=4000
     )
     free = Trainer(views, seeds(1200), config, CPU)
-    whole = free.layout.step(1200, free.memory.instances)
+    whole = free.layout.step(1200, free.memory["instances"])
     need = (whole + free.layout.smallest(1200)) // 2
     limited = Trainer(views, seeds(1200), dataclasses.replace(config, memory_limit=need), CPU)
-    said = limited.memory.summary()
-    assert limited.memory.cap < 4000 and f"at most {limited.memory.cap:,} Gaussians, not 4,000" in said and "chunks" in said
-    assert limited.memory.planned <= need and limited.memory.planned_at_cap <= need
+    said, cap = plan_summary(limited.memory), limited.memory["cap"]
+    assert cap < 4000 and f"at most {cap:,} Gaussians, not 4,000" in said and "chunks" in said
+    assert limited.memory["planned"] <= need and limited.memory["planned_at_cap"] <= need
     peak = 0
     for _ in range(config.steps):
         free.advance()
         peak = max(peak, measured(limited, 1))
     assert peak <= need < whole
-    assert 1200 < len(limited.gaussians) <= limited.memory.cap
+    assert 1200 < len(limited.gaussians) <= limited.memory["cap"]
     ends = []
     for fit in (free, limited):
         renders = [
@@ -279,18 +256,23 @@ def test_limit_below_the_smallest_step_says_what_is_needed(tmp_path, capsys):
 
 def test_captured_steps_are_given_up_where_they_need_more():
     """On CUDA a graph has capacity to spare; a limit between the two ways is kept by the smaller one."""
-    made = Trainer(photos(3, 504, 378), seeds(60), STEADY, CPU).layout
-    layout = dataclasses.replace(made, sizes=dataclasses.replace(made.sizes, cuda=True), graphs=1)
-    single = dataclasses.replace(layout, graphs=0)
-    many = {"count": 20_000, "instances": 200_000, "most": 20_000, "available": 2**40}
-    wide, _ = plan(layout, **many, limit=2**33, capacity_factor=1.3)
-    assert not wide.graph_refused and not wide.chunked
-    needed = single.step(20_000, 200_000)
-    tight, chosen = plan(layout, **many, limit=needed, capacity_factor=1.3)
-    assert tight.graph_refused and chosen == single and not tight.chunked and "without a CUDA graph" in tight.summary()
-    assert plan(layout, **many, limit=needed - 2**20, capacity_factor=1.3)[0].chunked
-    open_end, _ = plan(layout, **{**many, "most": 10**6, "available": 2**29}, limit=None)
-    assert "set --memory-limit" in open_end.summary() and open_end.lowered_from is None
+    layout = Trainer(photos(3, 504, 378), seeds(60), STEADY, CPU).layout
+    layout.sizes = dataclasses.replace(layout.sizes, cuda=True)
+    many = {"count": 20_000, "instances": 200_000, "most": 20_000, "available": 2**40, "capacity_factor": 1.3}
+
+    def planned(limit: int | None, **other) -> dict:
+        layout.graphs = 1
+        return plan(layout, **many | other, limit=limit)
+
+    wide = planned(2**33)
+    assert not wide["graph_refused"] and not wide["chunked"] and layout.graphs == 1
+    needed = layout.step(20_000, 200_000)
+    assert layout.step(9, 99, graphs=3) - layout.held(9) == 3 * (layout.step(9, 99) - layout.held(9))
+    tight = planned(needed)
+    assert tight["graph_refused"] and layout.graphs == 0 and not tight["chunked"]
+    assert "without a CUDA graph" in plan_summary(tight) and planned(needed - 2**20)["chunked"]
+    open_end = planned(None, most=10**6, available=2**29)
+    assert "set --memory-limit" in plan_summary(open_end) and open_end["lowered_from"] is None
 
 
 @pytest.mark.cuda
@@ -301,7 +283,7 @@ def test_limit_holds_on_cuda(captured):
     views = photos(4, 160, 120)
     config = dataclasses.replace(STEADY, steps=60, density=DensityConfig(start=10, every=10, gradient=2e-5), max_gaussians=4000)
     free = Trainer(views, seeds(1200), dataclasses.replace(config, cuda_graph=captured), device)
-    most = 4 * free.memory.planned_at_cap if captured else free.layout.smallest(1500)
+    most = 4 * free.memory["planned_at_cap"] if captured else free.layout.smallest(1500)
     del free
     torch.cuda.synchronize()
     before = torch.cuda.memory_allocated(device)
@@ -358,38 +340,33 @@ def finished(fit: Trainer, states: list) -> list[int]:
     return seen
 
 
-def same(a: Trainer, b: Trainer) -> bool:
-    tensors, others = a.state()[0], b.state()[0]
-    return tensors.keys() == others.keys() and all(torch.equal(tensors[k], others[k]) for k in tensors)
-
-
 def test_a_step_is_tried_again_and_nothing_else_changes(monkeypatch):
     """The same bits as without the lack; it is said once for each."""
     reference = fitted(BUSY, 60)
     fit = fitted(BUSY, 0)
-    failing(monkeypatch, batch, "step", {3, 30})
+    failing(monkeypatch, StepTaker, "step", {3, 30})
     assert finished(fit, []) == list(range(1, 61))
-    assert same(fit, reference)
+    assert same_bits(fit, reference)
     assert len(fit.messages) == 2 and "step 3 ran out of memory" in fit.messages[0]
 
 
 def test_a_step_that_fails_twice_ends_the_fit_and_is_saved(monkeypatch):
     """The state saved is that before the step, with its view still to come; a fit that continues from it is the same."""
     reference, fit, states = fitted(BUSY, 60), fitted(BUSY, 0), []
-    failing(monkeypatch, batch, "step", {26, 27})
+    failing(monkeypatch, StepTaker, "step", {26, 27})
     with pytest.raises(OutOfMemoryError, match=r"step 26 .*--memory-limit.*--downscale.*--resume") as found:
         finished(fit, states)
     assert found.value.exit_code == 4 and states[-1][1]["step"] == 25
     again = fitted(BUSY, 0)
     again.load(*states[-1])
     finished(again, [])
-    assert same(again, reference)
+    assert same_bits(again, reference)
 
 
 def test_where_not_even_the_smallest_step_fits_the_state_is_saved(monkeypatch):
     """Nothing is free when the step is to be tried again."""
     fit, states = fitted(BUSY, 0), []
-    failing(monkeypatch, batch, "step", {26})
+    failing(monkeypatch, StepTaker, "step", {26})
     monkeypatch.setattr(trainer_module, "available_bytes", lambda _: 0)
     with pytest.raises(ResourceError, match="smallest step needs") as found:
         finished(fit, states)
@@ -408,25 +385,21 @@ def test_a_change_of_the_set_starts_from_the_last_saved_state(monkeypatch, calls
         return
     seen = finished(fit, states)
     assert set(seen) == set(range(1, 61)) and len(seen) >= 60
-    assert same(fit, reference)
+    assert same_bits(fit, reference)
 
 
-def test_a_change_with_nothing_saved_before_ends_the_fit(monkeypatch):
+def test_a_change_with_nothing_saved_before_ends_the_fit_and_other_errors_pass(monkeypatch):
     fit = fitted(BUSY, 0)
     failing(monkeypatch, fit.table, "apply", {1})
     with pytest.raises(OutOfMemoryError):
         run(fit, lambda _: None, lambda _: None, lambda: False)
 
-
-def test_other_errors_pass(monkeypatch):
-    fit = fitted(BUSY, 0)
-
     def broken(*_):
         raise RuntimeError("something else")
 
-    monkeypatch.setattr(batch, "step", broken)
+    monkeypatch.setattr(StepTaker, "step", broken)
     with pytest.raises(RuntimeError, match="something else"):
-        finished(fit, [])
+        finished(fitted(BUSY, 0), [])
 
 
 class OtherProgram:

@@ -80,29 +80,21 @@ def test_a_file_has_settings_of_the_strategy_and_of_loss_terms(tmp_path):
     [
         ("stpes = 3", "my.toml: unknown setting 'stpes'; did you mean steps?"),
         ("[init]\nopacty = 3", "unknown setting 'init.opacty'; did you mean init.opacity?"),
-        ("opacity = 0.1", "unknown setting 'opacity'; did you mean init.opacity?"),
         ('strategy = "mcmc"\n[top-split]\nevery = 3', "unknown setting 'top_split.every'; did you mean mcmc.every?"),
         ('strategy = "mcmc"\n[densty]\nevery = 3', "unknown setting 'densty.every'; did you mean density.every?"),
-        ('steps = "many"', "my.toml: steps must be a whole number of 64 bits, not 'many'"),
         ("steps = 3.5", "steps must be a whole number of 64 bits, not 3.5"),
-        ("steps = true", "steps must be a whole number of 64 bits, not True"),
         ("steps = 0", "my.toml: steps must be at least 1, not 0"),
         ("seed = 99999999999999999999999", "seed must be a whole number"),
         ("steps = 2024-01-01", "steps must be a whole number of 64 bits, not date"),
         ("dropout = nan", "dropout must be a finite number, not nan"),
-        ("init.opacity = -inf", "init.opacity must be a finite number, not -inf"),
         ('cuda-graph = "yes"', "cuda_graph must be true or false"),
-        ("rule = 3", "rule must be text"),
         ('memory-limit = "2 cows"', "memory limit '2 cows' is not a size"),
         ("init = 3", "init is a group of settings"),
-        ("[steps]\nx = 1", "unknown setting 'steps.x'"),
         ("depth-mean = [0.1, 0.2, 0.3]", "the setting depth-mean was removed: give it in FILE.onnx.json"),
         ('strategy = "best"', "my.toml: unknown strategy 'best'"),
-        ("strategy = 3", "3 is not a strategy"),
         ('strategy = "json:JSONDecoder"', 'in a study, use a preset in a .py file with "strategy": JSONDecoder'),
         ('loss-terms = "json:JSONDecoder"', "does not load your code"),
         ('base = "json:dumps"', "is code; a preset file never loads code"),
-        ('base = "best"', "base 'best' is not one of"),
         ("base = 3", "base must be text, not 3"),
         ('base = "my.toml"', "is circular"),
         ('preset = "quick"', "unknown setting 'preset'"),
@@ -120,10 +112,8 @@ def test_a_wrong_setting_is_named(tmp_path, text, said):
     [
         (b"steps = ", "not valid TOML"),
         (b"steps = 1\nseed = = 2", "at line 2"),
-        (b"steps = 1\nsteps = 2", "not valid TOML"),
         (b"\xff\xfe", "not valid TOML"),
         (b"x = " + b"[" * 5000 + b"]" * 5000, "nested deeper"),
-        (b"a = " + b"[" * 20 + b"]" * 20, "nested deeper"),
         (b"#" * (MAX_BYTES + 1), "larger than"),
         (b"a = 1\n" + b"a." * (MAX_DOTS + 1) + b"a = 1", "more than 100 dots in a line"),
         (None, "cannot be read"),
@@ -154,7 +144,8 @@ def test_objects_and_mappings_are_presets(own):
         preset_settings(3)
 
 
-def test_a_registered_preset_is_taken_by_name(monkeypatch):
+def test_presets_are_listed_and_a_registered_one_is_taken_by_name(monkeypatch):
+    assert list(warpgs.PRESETS) == ["default", "3dgs", "mcmc", "paper-literal", "quick"]
     monkeypatch.setattr(PRESETS, "_made", dict(PRESETS._made))
     PRESETS.register("mine", FitConfig(steps=3), "three steps")
     assert preset_settings("mine")[0].steps == 3 and "mine" in PRESETS and PRESETS.described()["mine"] == "three steps"
@@ -259,12 +250,6 @@ def test_the_command_line_takes_files_and_objects(own, tmp_path, capsys):
         assert said in text and len(text.splitlines()) == 1
     assert main(["compare", *base, "--presets", f"default,{tmp_path}/broken.py:X"]) == 2
     assert f"the preset '{tmp_path}/broken.py:X' cannot be loaded" in capsys.readouterr().err
-
-
-def test_presets_are_listed():
-    """As a mapping: names, number, membership."""
-    assert list(warpgs.PRESETS) == ["default", "3dgs", "mcmc", "paper-literal", "quick"]
-    assert len(warpgs.PRESETS) == 5 and "quick" in warpgs.PRESETS
 
 
 # Settings and sizes of images that are chosen for the user.

@@ -9,12 +9,12 @@ import pytest
 import torch
 
 from tests.gaussians import cloud
+from tests.pipeline.train.fits import advanced, continued, same_bits
 from tests.scenes import photos, seeds
 from warpgs.errors import UsageError
 from warpgs.geometry import quaternions, rotation_matrices
-from warpgs.pipeline.model.edit import OPAQUE, covariances, merges
+from warpgs.pipeline.model.edit import OPAQUE, covariances, merged_pairs, merges
 from warpgs.pipeline.model.start import InitConfig
-from warpgs.pipeline.run.folder import load_checkpoint, save_checkpoint
 from warpgs.pipeline.train.loss import LOSS_TERMS, LossTerm
 from warpgs.pipeline.train.schedule import OptimizerConfig
 from warpgs.pipeline.train.settings import FitConfig
@@ -24,6 +24,8 @@ from warpgs.pipeline.train.strategies.clone_split import DensityConfig, refine
 from warpgs.pipeline.train.strategies.mcmc import MAX_COPIES, MCMCConfig, perturb, relocated
 from warpgs.pipeline.train.trainer import Trainer
 from warpgs.scene import Gaussians
+
+CPU = torch.device("cpu")
 
 # Clone, split and prune, and how fast scales may change meanwhile.
 
@@ -90,20 +92,6 @@ def test_one_gaussian_always_survives():
     assert run(gaussians_of([0.1] * 3, [0.001, 0.003, 0.002]), [0, 0, 0]).keep.tolist() == [1]
 
 
-def test_same_seed_same_children():
-    """Splitting is repeatable, and another seed gives other children."""
-    g = gaussians_of([0.5] * 3, [0.5] * 3)
-    a, b, c = (run(g, [1.0] * 3, seed=s).added["means"] for s in (1, 1, 2))
-    assert torch.equal(a, b) and not torch.equal(a, c)
-
-
-@pytest.mark.parametrize("bad", [{"every": 0}, {"start": -1}, {"stop_fraction": 1.5}, {"reset_opacity": 0}])
-def test_bad_settings_are_refused(bad):
-    """A setting that cannot work is an error at once."""
-    with pytest.raises(UsageError):
-        DensityConfig(**bad)
-
-
 def test_protected_are_not_pruned_and_only_the_growing_grow(monkeypatch):
     """Two faint ones, one of them protected; two that are pulled at, one of which may grow."""
     monkeypatch.setattr(clone_split, "CLONE_SIZE", 1.0)
@@ -129,9 +117,16 @@ def test_rates_of_scales_may_fall():
     assert OptimizerConfig(scales_lr=0.1).lrs(1.0, 1.0)["log_scales"] == pytest.approx(0.1)
 
 
+def test_growth_begins_after_a_quarter_of_a_short_fit():
+    """And ends when phase 3 begins, or after the fraction that is asked for in a fit without phases."""
+    for strategy, ends in (("clone_split", 20), ("mcmc", 33)):
+        config = FitConfig(steps=40, init=InitConfig(source="points"), strategy=strategy)
+        growth = Trainer(photos(2), seeds(), config, CPU).strategy.growth()
+        assert growth[:2] == (10, ends) and [s for s in range(41) if growth.due(s, 7)] == [*range(14, ends + 1, 7)]
+
+
 # The MCMC strategy: its formulas against the paper's, and what it does to a fit.
 
-CPU = torch.device("cpu")
 CONFIG = FitConfig(
     steps=40, sh_every=10, strategy="mcmc", strategy_config=MCMCConfig(start=4, every=5, min_opacity=0.05),
     init=InitConfig(source="points", opacity=0.3), max_gaussians=75,
@@ -139,10 +134,7 @@ CONFIG = FitConfig(
 
 
 def trained(config: FitConfig = CONFIG, steps: int = 40, device: torch.device = CPU) -> Trainer:
-    trainer = Trainer(photos(4), seeds(61), config, device)
-    while trainer.step < steps:
-        trainer.advance(steps - trainer.step)
-    return trainer
+    return advanced(Trainer(photos(4), seeds(61), config, device), steps)
 
 
 @pytest.mark.parametrize("copies", [1, 2, 5, MAX_COPIES])
@@ -210,29 +202,19 @@ def test_the_dead_are_relocated_and_the_set_grows_to_its_cap():
 
 def test_a_continued_fit_gives_the_same_bits(tmp_path):
     """Noise and sampling go on as if the fit had never stopped."""
-    straight, broken = trained(), trained(steps=17)
-    save_checkpoint(tmp_path, *broken.state())
-    resumed = Trainer(photos(4), seeds(61), CONFIG, CPU)
-    resumed.load(*load_checkpoint(tmp_path))
-    while resumed.step < 40:
-        resumed.advance()
-    a, b = straight.state()[0], resumed.state()[0]
-    assert a.keys() == b.keys() and all(torch.equal(a[k], b[k]) for k in a)
+    assert same_bits(trained(), continued(lambda: trained(steps=0), 17, tmp_path))
 
 
 @pytest.mark.cuda
 def test_captured_steps_equal_single_steps():
     """On CUDA, noise and regularisation included."""
     device = torch.device("cuda", 0)
-    single, captured = (trained(dataclasses.replace(CONFIG, cuda_graph=g), device=device) for g in (False, True))
-    a, b = single.state()[0], captured.state()[0]
-    assert all(torch.equal(a[k], b[k]) for k in a)
+    single, captured = (trained(dataclasses.replace(CONFIG, cuda_graph=g), device=device).state()[0] for g in (False, True))
+    assert all(torch.equal(t, captured[n]) for n, t in single.items())
 
 
 def test_settings_survive_json_and_bad_ones_are_refused():
     """The strategy's own settings stand in the configuration; numbers that cannot work are refused."""
-    from warpgs.errors import UsageError
-
     assert FitConfig.from_json(CONFIG.to_json()) == CONFIG
     assert FitConfig(strategy="mcmc").strategy_config == MCMCConfig()
     for bad in ({"every": 0}, {"growth": -1.0}, {"noise_lr": math.nan}, {"min_opacity": 0.9}):
@@ -260,15 +242,15 @@ def test_rotations_there_and_back():
 def test_moments_of_a_pair():
     """Mean, covariance and colours of the mixture; what the pair covers stays."""
     g = cloud(2, seed=3)
-    pairs = merges(g, torch.ones(2), torch.zeros(2), odd=False)
-    assert sorted([*pairs.first.tolist(), *pairs.second.tolist()]) == [0, 1]
+    pairs, merged = merges(g, torch.ones(2), odd=False)
+    assert sorted(pairs.flatten().tolist()) == [0, 1]
     areas = g.log_scales.double().exp().sort(1).values[:, 1:].prod(1)
     mass = g.logit_opacities.double().sigmoid() * areas
     fraction = (mass / mass.sum())[:, None]
     mean = (fraction * g.means.double()).sum(0)
     apart = g.means.double() - mean
     cov = covariances(g.quats.double(), g.log_scales.double()) + apart[:, :, None] * apart[:, None, :]
-    merged = {n: t.double() for n, t in pairs.merged.items()}
+    merged = {n: t.double() for n, t in merged.items()}
     assert torch.allclose(merged["means"][0], mean, atol=1e-6)
     assert torch.allclose(covariances(merged["quats"], merged["log_scales"])[0], (fraction[:, None] * cov).sum(0), atol=1e-6)
     assert torch.allclose(merged["sh"][0], (fraction[:, None] * g.sh.double()).sum(0), atol=1e-6)
@@ -302,7 +284,7 @@ def test_a_pair_covers_what_it_covered(apart, opacity):
         return float((1 - left).sum()) * 1e-4
 
     g = flat_pair(apart, opacity)
-    merged = merges(g, torch.ones(2), torch.zeros(2), odd=False).merged
+    _, merged = merges(g, torch.ones(2), odd=False)
     assert covered(merged) == pytest.approx(covered(g.tensors()), rel=1e-3)
     assert float(merged["logit_opacities"].sigmoid()) <= OPAQUE + 1e-6
 
@@ -312,27 +294,24 @@ def test_a_gaussian_in_two_halves_becomes_one_again():
     g = cloud(1)
     rows = {n: t[[0, 0]] for n, t in g.tensors().items()}
     rows["logit_opacities"] = torch.logit(torch.full((2,), 0.02))
-    pairs = merges(Gaussians(**rows), torch.ones(2), torch.zeros(2), odd=False)
-    assert torch.allclose(pairs.merged["logit_opacities"].sigmoid(), torch.tensor([0.04 - 0.5 * 0.02**2]), atol=1e-5)
-    assert torch.allclose(pairs.merged["means"], g.means, atol=1e-6) and torch.allclose(pairs.merged["sh"], g.sh)
+    _, merged = merges(Gaussians(**rows), torch.ones(2), odd=False)
+    assert torch.allclose(merged["logit_opacities"].sigmoid(), torch.tensor([0.04 - 0.5 * 0.02**2]), atol=1e-5)
+    assert torch.allclose(merged["means"], g.means, atol=1e-6) and torch.allclose(merged["sh"], g.sh)
 
 
-def test_pairs_are_disjoint_cheapest_first_and_of_one_kind():
-    """No row twice; other kinds stay apart; like neighbours come before unlike ones; a change has a parent for every row."""
+def test_pairs_are_disjoint_and_cheapest_first():
+    """No row twice; like neighbours come before unlike ones; a pair that is taken becomes one row."""
     g = cloud(101)
-    kinds = torch.arange(101) % 2
     for odd in (False, True):
-        pairs = merges(g, torch.ones(101), kinds, odd)
-        rows = torch.cat([pairs.first, pairs.second])
-        assert len(rows) == len(rows.unique()) > 20 and bool((kinds[pairs.first] == kinds[pairs.second]).all())
+        rows = merges(g, torch.ones(101), odd)[0].flatten()
+        assert len(rows) == len(rows.unique()) == 100
     means = torch.tensor([[0.0, 0, 1], [0.01, 0, 1], [5, 5, 1], [5.01, 5, 1]])
     four = {n: t[[0, 0, 0, 0]].clone() for n, t in cloud(1).tensors().items()} | {"means": means}
     four["sh"][2] += 1
-    pairs = merges(Gaussians(**four), torch.ones(4), torch.zeros(4), odd=False)
-    assert {int(pairs.first[0]), int(pairs.second[0])} == {0, 1} and len(pairs.first) == 2
-    change = pairs.change(4, 1)
-    assert change.keep.tolist() == [2, 3] and change.parents.tolist() == pairs.first[:1].tolist()
-    assert all(len(t) == 1 for t in change.added.values())
+    pairs, merged = merges(Gaussians(**four), torch.ones(4), odd=False)
+    assert set(pairs[0].tolist()) == {0, 1} and len(pairs) == 2
+    fewer = merged_pairs(Gaussians(**four), pairs, merged, 1)
+    assert torch.equal(fewer.means, torch.cat([means[2:], merged["means"][:1]])) and len(fewer.sh) == 3
 
 
 # Parts of a user's own in a fit: loss terms, and a density strategy.
@@ -348,17 +327,6 @@ def registries_as_they_were(monkeypatch):
         monkeypatch.setattr(registry, "_classes", dict(registry._classes))
 
 
-def advanced(fit: Trainer, until: int) -> Trainer:
-    while fit.step < until:
-        fit.advance()
-    return fit
-
-
-def same_bits(a: Trainer, b: Trainer) -> bool:
-    (tensors, plain), (others, again) = a.state(), b.state()
-    return tensors.keys() == others.keys() and all(torch.equal(t, others[n]) for n, t in tensors.items()) and plain == again
-
-
 @dataclass(frozen=True)
 class Gray(LossTerm):
     """Mean squared difference of the render from a gray."""
@@ -368,21 +336,6 @@ class Gray(LossTerm):
     def __call__(self, inputs):
         """See the class."""
         return self.weight * (inputs.outputs["rgb"] - 0.5).square().mean()
-
-
-@pytest.mark.usefixtures("registries_as_they_were")
-def test_a_term_that_is_not_active_changes_no_bit():
-    """One that is active does."""
-
-    class Never(Gray):
-        def active(self, step, steps):
-            return False
-
-    plain, active, never = (
-        advanced(Trainer(photos(2), seeds(), dataclasses.replace(PLAIN, loss_terms=terms), CPU), 6).gaussians.tensors()
-        for terms in ((), (LOSS_TERMS.register("gray")(Gray)(),), (LOSS_TERMS.register("never")(Never)(),))
-    )
-    assert all(torch.equal(t, never[n]) for n, t in plain.items()) and not torch.equal(active["sh"], plain["sh"])
 
 
 @pytest.mark.usefixtures("registries_as_they_were")
@@ -420,32 +373,6 @@ def test_two_terms_with_one_name_for_a_map_are_refused():
     config = dataclasses.replace(PLAIN, loss_terms=(First(), Second()))
     with pytest.raises(UsageError, match="'first' and 'second' both have a map 'shared'; rename"):
         Trainer(photos(2), seeds(), config, CPU)
-
-
-@pytest.mark.usefixtures("registries_as_they_were")
-def test_a_term_sees_the_maps_that_it_asked_for():
-    """Those of the step's own view, at the size at which it is fitted; and what it returns is trained on."""
-    seen = []
-
-    @LOSS_TERMS.register("number")
-    @dataclass(frozen=True)
-    class Number(LossTerm):
-        def needs(self, view, prior):
-            assert prior is None
-            return {"red": view.image[..., 0], "pair": view.image[..., 1:]}
-
-        def __call__(self, inputs):
-            target, gaussians = inputs.target, inputs.gaussians
-            seen.append(tuple(target.image.shape))
-            assert torch.allclose(target.maps["red"], target.image[..., 0], atol=1e-6)
-            assert torch.allclose(target.maps["pair"], target.image[..., 1:], atol=1e-6)
-            return 0.1 * gaussians.log_scales.square().mean()
-
-    config = dataclasses.replace(PLAIN, loss_terms=(Number(),), half_resolution=0.5, steps=8)
-    fit, plain = (Trainer(photos(3), seeds(), c, CPU) for c in (config, dataclasses.replace(config, loss_terms=())))
-    advanced(fit, 8), advanced(plain, 8)
-    assert seen == [(16, 20, 3)] * 4 + [(32, 40, 3)] * 4
-    assert not torch.equal(fit.gaussians.log_scales, plain.gaussians.log_scales)
 
 
 OWN = """
@@ -504,11 +431,8 @@ def test_a_strategy_of_ones_own(tmp_path, named):
     assert [r.count for r in reports] == [60] * 4 + [61] * 5 + [62] * 3
     assert fit.table.columns["came"].tolist() == [0] * 60 + [5, 10] and fit.strategy.asked == (60, 2)
 
-    save_checkpoint(tmp_path, *advanced(Trainer(photos(2), seeds(), config, CPU), 7).state())
-    stored, values = load_checkpoint(tmp_path)
-    resumed = Trainer(photos(2), seeds(), FitConfig.from_json(values["config"]), CPU)
-    resumed.load(stored, values)
-    assert same_bits(advanced(resumed, 12), fit)
+    stored = FitConfig.from_json(config.to_json())
+    assert same_bits(continued(lambda: Trainer(photos(2), seeds(), stored, CPU), 7, tmp_path), fit)
 
     often = dataclasses.replace(config, strategy_config=cls.Config(every=2))
     assert FitConfig.from_json(often.to_json()) == often

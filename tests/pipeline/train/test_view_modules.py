@@ -9,6 +9,7 @@ import torch
 
 import warpgs
 from tests import scenes
+from tests.pipeline.train.fits import advanced, continued, same_bits
 from tests.scenes import photos, seeds
 from warpgs.app.cli import main
 from warpgs.app.fit import request_of
@@ -33,11 +34,9 @@ from warpgs.pipeline.train.view_modules import (
     exposed,
     exposure_of,
     increments,
-    moved,
     pose_figures,
     refined_cameras,
     similarity,
-    zoomed,
 )
 from warpgs.pipeline.train.views import current, half_size
 from warpgs.render.options import RasterizeOptions
@@ -124,12 +123,6 @@ def vignetted(views, falloffs):
     return found
 
 
-def advanced(fit: Trainer, until: int) -> Trainer:
-    while fit.step < until:
-        fit.advance()
-    return fit
-
-
 def test_its_parameters_are_learned_shown_and_kept(own):
     """What was made is found; strategies and a failed step see it; both sizes share it; a continued fit has the same bits."""
     vignetting = VIEW_MODULES.load(f"{own}:Vignetting")
@@ -179,19 +172,25 @@ def test_a_run_with_one_of_ones_own(own, tmp_path, capsys):
 
 
 def test_cameras_of_now_are_those_that_steps_render_from(own):
-    """Intrinsics too, at both sizes; stacks keep what was given."""
-    zoom = VIEW_MODULES.load(f"{own}:Zoom")()
-    fit = advanced(Trainer(photos(3), seeds(), dataclasses.replace(PLAIN, view_modules=(zoom,), half_resolution=0.5), CPU), 20)
-    factors = 1 + fit.learned.views.table.params["zoom"].detach()[:, 0]
-    assert (factors != 1).all()
-    given = [float(v.camera.K[0, 0]) for v in photos(3)]
+    """At both sizes; stacks keep what was given, so views that are set again do not get their increments twice."""
+    modules, given = (VIEW_MODULES.load(f"{own}:Zoom")(), RefinePoses(0.0, 2e-3, 2e-3)), noisy(photos(4))
+    config = dataclasses.replace(PLAIN, view_modules=modules, half_resolution=0.5)
+    fit = advanced(Trainer(given, seeds(), config, CPU), 35)
     fit.show_learned()
-    torch.testing.assert_close(torch.stack([v.camera.K[0, 0] for v in fit.views]), torch.tensor(given) * factors)
+    factors, focal = 1 + fit.learned.table.params["zoom"].detach()[:, 0], float(given[0].camera.K[0, 0])
+    shown, Ks = (torch.stack([getattr(v.camera, n) for v in fit.views]) for n in ("viewmat", "K"))
+    first = torch.stack([torch.as_tensor(v.camera.viewmat, dtype=torch.float32) for v in given])
+    assert torch.equal(shown[0], first[0]) and not torch.equal(shown[1], first[1]) and (factors != 1).all()
+    torch.testing.assert_close(Ks[:, 0, 0], focal * factors)
     fit.set_views(fit.views)
     for stack in fit.stacks.values():
-        half = stack.size[0] / photos(1)[0].camera.width
-        torch.testing.assert_close(stack.Ks[:, 0, 0], torch.tensor(given) * half)
-        torch.testing.assert_close(current(stack, fit.learned.views).Ks[:, 0, 0], torch.tensor(given) * half * factors)
+        half = stack.camera.width / given[0].camera.width
+        now = current(stack, fit.learned).camera  # by which a captured step finds its capacity
+        assert torch.equal(stack.camera.viewmat, first[stack.numbers]) and torch.equal(now.viewmat, shown[stack.numbers])
+        torch.testing.assert_close(stack.camera.K[:, 0, 0], torch.full((4,), focal * half))
+        torch.testing.assert_close(now.K[:, 0, 0], focal * half * factors)
+    fit.show_learned()
+    assert all(torch.equal(v.camera.viewmat, a) for v, a in zip(fit.views, shown))
 
 
 def test_each_of_ours_has_a_flag(own):
@@ -277,67 +276,19 @@ def test_photographs_of_many_exposures_make_one_model(tmp_path):
     np.testing.assert_allclose([r["gain"] for r in figures["views"]], made, atol=0.05)
 
 
-def exposure_fitted(views, steps, config):
-    trainer = Trainer(views, scenes.seeds(), dataclasses.replace(config, steps=steps), CPU)
-    while trainer.step < steps:
-        trainer.advance()
-    return trainer
-
-
-@pytest.mark.slow
-def test_exposure_steps_on_any_number_of_threads_and_continued_ones_have_the_same_bits():
-    views, whole = dimmed(scenes.photos(4), [0.6, 1, 0.8, 0.9]), None
-    config = FitConfig(steps=40, half_resolution=0.25, view_modules=(Exposure(), RefinePoses()))
-    before = torch.get_num_threads()
-    for threads in (1, 2):
-        torch.set_num_threads(threads)
-        try:
-            found = exposure_fitted(views, 40, config).state()[0]
-        finally:
-            torch.set_num_threads(before)
-        whole = whole or found
-        assert all(torch.equal(t, found[n]) for n, t in whole.items())
-    first, second = (Trainer(views, scenes.seeds(), config, CPU) for _ in range(2))
-    while first.step < 20:
-        first.advance()
-    second.load(*first.state())
-    while second.step < 40:
-        second.advance()
-    assert whole[f"views.params.{EXPOSURE}"].any()
-    assert all(torch.equal(t, whole[n]) for n, t in second.state()[0].items())
-
-
 def test_strategies_see_the_exposures_of_now():
     """Held-out blocks are compared with renders under the exposure of their view: else growth would end too early."""
     views = dimmed(scenes.photos(4), [0.6, 1, 0.8, 0.9])
     trainer = Trainer(views, scenes.seeds(), FitConfig(steps=40, view_modules=(Exposure(),), half_resolution=0.0), CPU)
     shown = [v.learned.values[EXPOSURE] for v in trainer.views]
     assert not torch.stack(shown).any()
-    trainer.learned.views.table.params[EXPOSURE].data[0] = 0.3
+    trainer.learned.table.params[EXPOSURE].data[0] = 0.3
     trainer.show_learned()
     assert torch.stack(shown).abs().min() > 0.05 and torch.stack(shown).mean(0).abs().max() < 1e-6
     options = RasterizeOptions(background=trainer.background)
     plain = rasterize(trainer.gaussians, trainer.views[0].camera, options).rgb
     assert torch.equal(rendered(trainer.gaussians, trainer.views[0], options), exposed(plain, shown[0]))
     assert half_size(trainer.views[0]).learned.values[EXPOSURE] is shown[0]
-
-
-def test_runs_tell_their_exposures(tmp_path):
-    """metrics.json and the report; `eval` scores without exposures, as the fit did; a resumed run has the same figures."""
-    write_demo(tmp_path / "scene", views=8, width=32, height=32)
-    flags = ["--preset", "3dgs", "--steps", "8", "--init.source", "random", "--init.random-count", "60", "--device", "cpu"]
-    words = ["fit", str(tmp_path / "scene"), "--out", str(tmp_path / "run"), *flags, "--split", split_spec(8), "--exposure"]
-    assert main(words) == 0
-    metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
-    rows, summary = (metrics["view_modules"]["exposure"][key] for key in ("views", "summary"))
-    assert len(rows) == 6 and np.shape(rows[0]["affine"]) == (3, 4) and rows[0]["gain"] != 1
-    assert "scores use renders without learned exposures" in summary
-    assert summary in (tmp_path / "run" / "report.html").read_text()
-    assert main(["eval", str(tmp_path / "run"), "--device", "cpu"]) == 0
-    scores = json.loads((tmp_path / "run" / "eval.json").read_text())
-    assert scores["test"] == metrics["test"] and scores["train"] == metrics["train"]
-    assert main([*words, "--resume"]) == 0
-    assert json.loads((tmp_path / "run" / "metrics.json").read_text())["view_modules"] == metrics["view_modules"]
 
 
 def test_views_that_know_their_opacity_have_no_exposure():
@@ -399,23 +350,6 @@ def test_increments_are_rigid_and_their_gradients_are_right():
     torch.testing.assert_close(rendered_from(w, t)[1:], increments(w, t)[1:] @ V[1:])
 
 
-def test_a_gradient_through_the_rasterizer_is_that_of_differences():
-    gaussians, camera = scenes.three_gaussians(), scenes.ring(2)[1]
-    gaussians = dataclasses.replace(gaussians, **{n: x.double() for n, x in gaussians.tensors().items()})
-    V, K = (torch.tensor(x, dtype=torch.float64) for x in (camera.viewmat, camera.K))
-    weights = torch.rand(camera.height, camera.width, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-
-    def value(p):
-        now = moved(V[None], p[None, :3], p[None, 3:])[0]
-        return (rasterize(gaussians, dataclasses.replace(camera, viewmat=now, K=K)).rgb * weights).sum()
-
-    p = torch.tensor([0.01, -0.02, 0.015, 0.02, 0.01, -0.03], dtype=torch.float64, requires_grad=True)
-    (gradient,) = torch.autograd.grad(value(p), p)
-    eye = 1e-6 * torch.eye(6, dtype=torch.float64)
-    differences = torch.stack([(value(p.detach() + e) - value(p.detach() - e)) / 2e-6 for e in eye])
-    torch.testing.assert_close(gradient, differences, rtol=1e-4, atol=1e-4)
-
-
 def test_a_focal_length_s_gradient_is_right_and_shared_by_the_views_of_a_camera():
     """Against differences, in the module and through the rasterizer; a second camera has a factor of its own."""
     views = [
@@ -438,19 +372,6 @@ def test_a_focal_length_s_gradient_is_right_and_shared_by_the_views_of_a_camera(
     assert torch.equal(intrinsics(z)[:, :, 2], K[:, :, 2])
     (gradient,) = torch.autograd.grad(intrinsics(z)[0].sum(), z)
     assert gradient[0] == gradient[2] != 0 and gradient[1] == 0
-
-    gaussians, camera = scenes.three_gaussians(), scenes.ring(2)[1]
-    gaussians = dataclasses.replace(gaussians, **{n: x.double() for n, x in gaussians.tensors().items()})
-    V, K = (torch.tensor(x, dtype=torch.float64) for x in (camera.viewmat, camera.K))
-    weights = torch.rand(camera.height, camera.width, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-
-    def value(s):
-        return (rasterize(gaussians, dataclasses.replace(camera, viewmat=V, K=zoomed(K[None], s)[0])).rgb * weights).sum()
-
-    s = torch.tensor([1.02], dtype=torch.float64, requires_grad=True)
-    (gradient,) = torch.autograd.grad(value(s), s)
-    differences = (value(s.detach() + 1e-6) - value(s.detach() - 1e-6)) / 2e-6
-    torch.testing.assert_close(gradient[0], differences, rtol=1e-4, atol=1e-4)
 
 
 def test_held_out_cameras_have_the_focal_length_of_their_camera():
@@ -480,17 +401,6 @@ def similar(camera):
     return dataclasses.replace(camera, viewmat=viewmat)
 
 
-def fitted_config(steps):
-    return FitConfig(steps=steps, half_resolution=0.25, view_modules=(RefinePoses(rotation_lr=2e-3, translation_lr=2e-3),))
-
-
-def refine_poses_fitted(views, steps=240):
-    trainer = Trainer(views, scenes.seeds(), fitted_config(steps), CPU)
-    while trainer.step < steps:
-        trainer.advance()
-    return trainer
-
-
 @pytest.mark.slow
 def test_a_fit_finds_poses_back(tmp_path):
     """Of a ray-cast scene with poses that are off, a good part of the error goes, at the rates of the default."""
@@ -498,16 +408,15 @@ def test_a_fit_finds_poses_back(tmp_path):
     scene = warpgs.load_scene(tmp_path)
     truth = list(scene.views)
     given, names = noisy(truth), [v.name for v in truth]
-    trainer = Trainer(given, scene.points, FitConfig(steps=400, half_resolution=0.25, view_modules=(RefinePoses(),)), CPU)
-    while trainer.step < 400:
-        trainer.advance()
-    cameras = refined_cameras({v.name: v.camera for v in given}, names, (), trainer.learned.views.table.params)
+    config = FitConfig(steps=400, half_resolution=0.25, view_modules=(RefinePoses(),))
+    trainer = advanced(Trainer(given, scene.points, config, CPU))
+    cameras = refined_cameras({v.name: v.camera for v in given}, names, (), trainer.learned.table.params)
     assert np.array_equal(cameras[names[0]].viewmat, given[0].camera.viewmat)
     found = [dataclasses.replace(v, camera=cameras[v.name]) for v in given]
     before, after = errors(given, truth), errors(found, truth)
     assert (after < 0.8 * before).all(), (before, after)
     for name in (ROTATION, TRANSLATION):
-        assert not trainer.learned.views.table.params[name][0].any()
+        assert not trainer.learned.table.params[name][0].any()
 
 
 @pytest.mark.slow
@@ -518,50 +427,26 @@ def test_a_fit_finds_a_focal_length_back(tmp_path):
     longer = [[1.05, 1, 1], [1, 1.05, 1], [1, 1, 1]]
     given = [dataclasses.replace(v, camera=dataclasses.replace(v.camera, K=v.camera.K * longer)) for v in scene.views]
     config = FitConfig(steps=400, half_resolution=0.25, view_modules=(RefinePoses(focal_lr=1e-3),))
-    trainer = Trainer(given, scene.points, config, CPU)
-    while trainer.step < 400:
-        trainer.advance()
+    trainer = advanced(Trainer(given, scene.points, config, CPU))
     names = [v.name for v in given]
-    cameras = refined_cameras({v.name: v.camera for v in given}, names, (), trainer.learned.views.table.params)
+    cameras = refined_cameras({v.name: v.camera for v in given}, names, (), trainer.learned.table.params)
     ratios = {float(cameras[v.name].K[0, 0] / v.camera.K[0, 0]) for v in scene.views}
     assert len(ratios) == 1 and abs(ratios.pop() - 1) < 0.03
 
 
-def test_refine_poses_steps_on_any_number_of_threads_and_continued_ones_have_the_same_bits():
-    views, whole = noisy(scenes.photos(4)), None
-    before = torch.get_num_threads()
+def test_steps_on_any_number_of_threads_and_continued_ones_have_the_same_bits(tmp_path):
+    views = dimmed(noisy(scenes.photos(4)), [0.6, 1, 0.8, 0.9])
+    modules = Exposure(), RefinePoses(rotation_lr=2e-3, translation_lr=2e-3)
+    config = FitConfig(steps=40, half_resolution=0.25, view_modules=modules)
+    fits, before = [], torch.get_num_threads()
     for threads in (1, 2):
         torch.set_num_threads(threads)
         try:
-            found = refine_poses_fitted(views, 40).state()[0]
+            fits.append(advanced(Trainer(views, scenes.seeds(), config, CPU)))
         finally:
             torch.set_num_threads(before)
-        whole = whole or found
-        assert all(torch.equal(t, found[n]) for n, t in whole.items())
-    first, second = (Trainer(views, scenes.seeds(), fitted_config(40), CPU) for _ in range(2))
-    while first.step < 20:
-        first.advance()
-    second.load(*first.state())
-    while second.step < 40:
-        second.advance()
-    assert all(torch.equal(t, whole[n]) for n, t in second.state()[0].items())
-
-
-def test_strategies_see_the_poses_of_now_and_steps_count_from_the_given_ones():
-    """Views that are set again, as a strategy or a lack of memory asks for, do not get their increments twice."""
-    given = noisy(scenes.photos(4))
-    trainer = refine_poses_fitted(given, 30)
-    trainer.show_learned()
-    shown = [v.camera.viewmat.clone() for v in trainer.views]
-    first = torch.stack([torch.as_tensor(v.camera.viewmat, dtype=torch.float32) for v in given])
-    assert torch.equal(shown[0], first[0]) and not torch.equal(shown[1], first[1])
-    trainer.set_views(trainer.views)
-    for stack in trainer.stacks.values():
-        assert torch.equal(stack.viewmats, first[stack.numbers])
-        now = current(stack, trainer.learned.views)  # by which a captured step finds its capacity
-        assert torch.equal(now.viewmats, torch.stack(shown)[stack.numbers])
-    trainer.show_learned()
-    assert all(torch.equal(v.camera.viewmat, a) for v, a in zip(trainer.views, shown))
+    assert fits[0].learned.table.params[EXPOSURE].any() and same_bits(*fits)
+    assert same_bits(fits[0], continued(lambda: Trainer(views, scenes.seeds(), config, CPU), 20, tmp_path))
 
 
 def test_held_out_cameras_follow_the_similarity_of_the_training_cameras():
@@ -576,19 +461,27 @@ def test_held_out_cameras_follow_the_similarity_of_the_training_cameras():
     assert np.array_equal(found["0"].viewmat, cameras["0"].viewmat)
     # cameras that turn about their own centres leave the similarity a mean turn: between none and the largest
     row = pose_figures(cameras, found, ["3"], False, 1.0)["views"][0]
-    assert 0 < row["degrees"] < max(r["degrees"] for r in pose_figures(cameras, found, train, False, 1.0)["views"])
+    assert 1e-3 < row["degrees"] < max(r["degrees"] for r in pose_figures(cameras, found, train, False, 1.0)["views"])
     R, scale, t = similarity(list(cameras.values()), [similar(c) for c in cameras.values()])
     np.testing.assert_allclose(R, TURN, atol=1e-12)
     np.testing.assert_allclose([scale, *t], [1.1, 0.3, -0.2, 0.1], atol=1e-12)
 
 
-def test_runs_keep_refined_poses(tmp_path):
-    """The report's figures, a run opened, scored again, continued and pruned: all have the cameras that were found."""
+def test_runs_keep_refined_poses_and_tell_their_exposures(tmp_path):
+    """The report's figures, a run opened, scored again, continued and pruned: all have the cameras that were found.
+
+    Exposures are in metrics.json and the report, and no score uses them.
+    """
     write_demo(tmp_path / "scene", views=8, width=32, height=32)
     flags = ["--preset", "3dgs", "--steps", "8", "--init.source", "random", "--init.random-count", "60", "--device", "cpu"]
-    words = ["fit", str(tmp_path / "scene"), "--out", str(tmp_path / "run"), *flags, "--split", split_spec(8), "--refine-poses"]
+    words = ["fit", str(tmp_path / "scene"), "--out", str(tmp_path / "run"), *flags, "--split", split_spec(8)]
+    words += ["--refine-poses", "--exposure"]
     assert main(words) == 0
     metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    rows, summary = (metrics["view_modules"]["exposure"][key] for key in ("views", "summary"))
+    assert len(rows) == 6 and np.shape(rows[0]["affine"]) == (3, 4) and rows[0]["gain"] != 1
+    assert "scores use renders without learned exposures" in summary
+    assert summary in (tmp_path / "run" / "report.html").read_text()
     rows, summary = (metrics["view_modules"]["refine_poses"][key] for key in ("views", "summary"))
     assert rows[0]["degrees"] < 1e-9 and rows[0]["units"] < 1e-9 and all(r["degrees"] > 0 for r in rows[1:])
     assert "moved by the similarity that best maps" in summary
@@ -604,4 +497,4 @@ def test_runs_keep_refined_poses(tmp_path):
     pruned = warpgs.open_run(tmp_path / "pruned", "cpu").scene_cameras
     assert all(np.array_equal(pruned[n].viewmat, c.viewmat) for n, c in run.scene_cameras.items())
     assert main([*words, "--resume"]) == 0
-    assert json.loads((tmp_path / "run" / "metrics.json").read_text())["view_modules"]["refine_poses"]["views"] == rows
+    assert json.loads((tmp_path / "run" / "metrics.json").read_text())["view_modules"] == metrics["view_modules"]

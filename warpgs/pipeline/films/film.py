@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import collections
-import dataclasses
+import itertools
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -29,7 +29,7 @@ from warpgs.pipeline.films.paths import (
     tour_of,
     upright,
 )
-from warpgs.pipeline.metrics.coverage import DepthView, classes_of, coverage_map, depth_views, fraction_outside
+from warpgs.pipeline.metrics.coverage import classes_of, coverage_map, depth_views, fraction_outside
 from warpgs.pipeline.model.table import FittedModel
 from warpgs.process import say
 from warpgs.render.options import RasterizeOptions
@@ -52,58 +52,37 @@ OUTSIDE = 0.1
 
 def _ranges(numbers: list[int]) -> str:
     """Return ascending numbers as text such as "3 to 7, 9 and 12 to 20"; after five ranges, the number of the others."""
-    runs: list[list[int]] = []
-    for n in numbers:
-        if runs and n == runs[-1][1] + 1:
-            runs[-1][1] = n
-        else:
-            runs.append([n, n])
-    words = [str(a) if a == b else f"{a} to {b}" for a, b in runs[:5]]
-    if len(runs) > 5:
-        words.append(f"{sum(b - a + 1 for a, b in runs[5:])} more")
-    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"
+    runs = [[n for _, n in run] for _, run in itertools.groupby(enumerate(numbers), lambda pair: pair[1] - pair[0])]
+    words = [f"{r[0]} to {r[-1]}" if len(r) > 1 else str(r[0]) for r in runs[:5]]
+    words += [f"{sum(map(len, runs[5:]))} more"] if len(runs) > 5 else []
+    return " and ".join(part for part in (", ".join(words[:-1]), words[-1]) if part)
 
 
-@dataclass
-class FrameCheck:
-    """Faults of the frames of a film, noticed while they are rendered."""
+NEARLY_NOTHING, ARE_BLACK = "show nearly nothing", "are black"
+ARE_OUTSIDE = f"have over {OUTSIDE:.0%} of their pixels outside all photographs"
 
-    coverage: float
-    """Mean alpha of the training views' renders; 0 if unknown."""
-    empty: list[int] = field(default_factory=list)
-    """Numbers of the frames that show nearly nothing."""
-    black: list[int] = field(default_factory=list)
-    """Numbers of the other frames that are black."""
-    outside: list[int] = field(default_factory=list)
-    """Numbers of the other frames of which a fraction above `OUTSIDE` is outside all photographs."""
-    count: int = 0
-    """Number of checked frames."""
 
-    def look(self, image: np.ndarray, alpha: np.ndarray, outside: float = 0.0) -> None:
-        """Check the next frame: image [H, W, 3] and alpha [H, W] in [0, 1], and its fraction outside all photographs."""
-        if float(alpha.mean(dtype=np.float64)) < max(EMPTY * self.coverage, MIN_COVERAGE):
-            self.empty.append(self.count)
-        elif float(image.max(2).mean(dtype=np.float64)) < BLACK:
-            self.black.append(self.count)
-        elif outside > OUTSIDE:
-            self.outside.append(self.count)
-        self.count += 1
+def fault_of(image: np.ndarray, alpha: np.ndarray, coverage: float, outside: float = 0.0) -> str:
+    """Return the fault of a frame [H, W, 3] with alpha [H, W] and a fraction outside all photographs; empty for none."""
+    if float(alpha.mean(dtype=np.float64)) < max(EMPTY * coverage, MIN_COVERAGE):
+        return NEARLY_NOTHING
+    if float(image.max(2).mean(dtype=np.float64)) < BLACK:
+        return ARE_BLACK
+    return ARE_OUTSIDE if outside > OUTSIDE else ""
 
-    def notes(self, remedy: str, nearer: str) -> list[str]:
-        """Return a line for the user on each fault, with advice: ``nearer`` for frames outside photographs, else ``remedy``."""
-        return [
-            f"{len(numbers)} of {self.count} frames {words} (frames {_ranges(numbers)}): {advice}"
-            for numbers, words, advice in (
-                (self.empty, "show nearly nothing", f"the path leaves the captured area; {remedy}"),
-                (self.black, "are black", f"the camera is inside geometry, or the scene is unlit; {remedy}"),
-                (
-                    self.outside,
-                    f"have over {OUTSIDE:.0%} of their pixels outside all photographs",
-                    f"expect artefacts there; {nearer}",
-                ),
-            )
-            if numbers
-        ]
+
+def fault_notes(faults: list[str], remedy: str, nearer: str) -> list[str]:
+    """Return a line for the user on each fault, with advice: ``nearer`` for frames outside photographs, else ``remedy``."""
+    advice = {
+        NEARLY_NOTHING: f"the path leaves the captured area; {remedy}",
+        ARE_BLACK: f"the camera is inside geometry, or the scene is unlit; {remedy}",
+        ARE_OUTSIDE: f"expect artefacts there; {nearer}",
+    }
+    frames = {fault: [i for i, f in enumerate(faults) if f == fault] for fault in advice}
+    return [
+        f"{len(numbers)} of {len(faults)} frames {fault} (frames {_ranges(numbers)}): {advice[fault]}"
+        for fault, numbers in frames.items() if numbers
+    ]  # fmt: skip
 
 
 PATHS = ("auto", "views", "turntable", "spiral", "interpolate")
@@ -195,12 +174,11 @@ def _tour(rig: Rig, train: list[Camera], settings: FilmSettings) -> tuple[list[C
     frames = settings.count(min(max(SECONDS, VIEW_SECONDS * len(train)), MAX_SECONDS))
     cameras = [upright(rig, c) for c in train]
     reaches = [rig.reach(c) for c in train]
-    tour = tour_of(cameras, reaches, frames / settings.fps, max(2, frames // MIN_FRAMES_PER_VIEW))
-    count = len(tour.keyframes) - tour.closed
-    words = "in the given order" if tour.by_name else "from neighbour to neighbour"
-    back = ", and back to the first" if tour.closed else ""
-    cameras = through(tour.keyframes, frames, closed=tour.closed)
-    return cameras, f"path: interpolate, through {count} of {len(train)} cameras {words}{back}"
+    keyframes, closed, by_name = tour_of(cameras, reaches, frames / settings.fps, max(2, frames // MIN_FRAMES_PER_VIEW))
+    words = "in the given order" if by_name else "from neighbour to neighbour"
+    words += ", and back to the first" if closed else ""
+    count = f"{len(keyframes) - closed} of {len(train)} cameras"
+    return through(keyframes, frames, closed=closed), f"path: interpolate, through {count} {words}"
 
 
 def _keyframes(model: FittedModel, path: Path, rig: Rig, first: Camera, settings: FilmSettings) -> tuple[list[Camera], str]:
@@ -278,13 +256,6 @@ COVERAGE = "coverage"
 """Subfolder for images that mark regions by the number of training views that saw them."""
 
 
-def _covered(image: np.ndarray, depth: torch.Tensor, camera: Camera, training: list[DepthView], cut_out: bool) -> bytes:
-    """Return the PNG of an image [H, W, 3] that marks regions that no training view saw, and regions that one view saw."""
-    seen = coverage_map(depth, camera, training)
-    classes = classes_of(seen, cut_out)
-    return png(coverage_image(image, classes["0"], classes["1"]))
-
-
 def _check_plan(plan: FilmPlan, out: Path, coverage: bool, sheet: bool) -> tuple[bool, bool]:
     """Return whether ``out`` is a film and not a folder, and whether all frames have one size."""
     if not plan.cameras:
@@ -308,34 +279,23 @@ def sheet_path(out: Path) -> Path:
 
 
 def _frames(
-    model: FittedModel, plan: FilmPlan, files: Sequence[Path], settings: FilmSettings, coverage: bool | Sequence[View],
-    check: FrameCheck, tell: Callable[[str], object] | None,
-) -> Iterator[np.ndarray]:  # fmt: skip
-    """Render, check and write the frames of a plan, with coverage images in a subfolder; yields each image [H, W, 3]."""
+    model: FittedModel, cameras: Sequence[Camera], settings: FilmSettings, coverage: bool | Sequence[View]
+) -> Iterator[tuple[np.ndarray, np.ndarray, float, np.ndarray | None]]:
+    """Yield each frame's image [H, W, 3], alpha [H, W], fraction outside all photographs, and coverage image (or None)."""
     gaussians, options = model.gaussians(), model.options()
     if settings.background is not None:
-        options = dataclasses.replace(options, background=gaussians.means.new_tensor(settings.background))
-    straight = model.transparent and settings.background is None
-    photographs = [model.cameras()[n] for n in model.train]
-    training = None
-    if coverage:
-        views = coverage if isinstance(coverage, Sequence) else None
-        cameras = photographs if views is None else [v.camera for v in views]
-        training = depth_views(gaussians, cameras, options, None if views is None else [v.mask for v in views])
-    cut_out = isinstance(coverage, Sequence) and any(v.alpha is not None for v in coverage)
-    for i, (_, camera) in enumerate(plan.cameras):
-        if tell is not None:
-            tell(f"rendering: {i + 1} of {len(plan.cameras)} frames")
+        options = replace(options, background=gaussians.means.new_tensor(settings.background))
+    photographs, views = [model.cameras()[n] for n in model.train], coverage if isinstance(coverage, Sequence) else []
+    cut_out, masks = any(v.alpha is not None for v in views), [v.mask for v in views] or None
+    training = depth_views(gaussians, [v.camera for v in views] or photographs, options, masks) if coverage else None
+    for camera in cameras:
         with torch.no_grad():
             r = rasterize(gaussians, camera, options)
-        image, alpha = r.rgb.cpu().numpy(), r.alpha.cpu().numpy()
-        surface = torch.where(r.alpha >= MIN_ALPHA, r.depth, 0)
-        check.look(image, alpha, fraction_outside(surface, camera, photographs, not model.transparent))
-        if files:
-            write_bytes(files[i], png(straight_alpha(image, alpha, model.background) if straight else image))
+        image, surface, covered = r.rgb.cpu().numpy(), torch.where(r.alpha >= MIN_ALPHA, r.depth, 0), None
         if training is not None:
-            write_bytes(files[i].parent / COVERAGE / files[i].name, _covered(image, surface, camera, training, cut_out))
-        yield image
+            classes = classes_of(coverage_map(surface, camera, training)[0], (surface <= 0) & cut_out)
+            covered = coverage_image(image, classes["0"], classes["1"])
+        yield image, r.alpha.cpu().numpy(), fraction_outside(surface, camera, photographs, not model.transparent), covered
 
 
 def render_film(
@@ -346,7 +306,7 @@ def render_film(
     *,
     coverage: bool | Sequence[View] = False,
     sheet: bool = False,
-    tell: Callable[[str], object] | None = None,
+    tell: Callable[[str], object] = lambda line: None,
 ) -> tuple[list[Path], list[str]]:
     """Render a plan to PNG files and film.mp4, or to a film alone; ``sheet`` adds six frames in one image. Files and notes."""
     alone, one_size = _check_plan(plan, out, bool(coverage), sheet)
@@ -355,16 +315,23 @@ def render_film(
         check_file_path(out)
     files = [] if alone else [folder / f"{name}.png" for name, _ in plan.cameras]
     older = [] if alone else [p for p in folder.glob("*.png") if p not in files and p.name != SHEET]
-    left = [f"{len(older)} older images are also in {folder}: remove them, or give a new folder"] if older else []
-    check, chosen, count = FrameCheck(plan.coverage), [], len(plan.cameras)
-    in_sheet = {i * count // SHEET_FRAMES for i in range(SHEET_FRAMES)} if sheet else set()
+    faults: list[str] = []
+    chosen, count, straight = [], len(plan.cameras), model.transparent and settings.background is None
 
     def images() -> Iterator[np.ndarray]:
-        for i, image in enumerate(_frames(model, plan, files, settings, coverage, check, tell)):
-            if i in in_sheet:
+        frames = _frames(model, [c for _, c in plan.cameras], settings, coverage)
+        for i in range(count):
+            tell(f"rendering: {i + 1} of {count} frames")
+            image, alpha, outside, covered = next(frames)
+            faults.append(fault_of(image, alpha, plan.coverage, outside))
+            if files:
+                write_bytes(files[i], png(straight_alpha(image, alpha, model.background) if straight else image))
+            if covered is not None:
+                write_bytes(out / COVERAGE / files[i].name, png(covered))
+            if i in {k * count // SHEET_FRAMES for k in range(SHEET_FRAMES)}:
                 chosen.append(image)
             yield image
-        if one_size and tell is not None:
+        if one_size:
             tell(f"writing {film.name}")
 
     with hold_folder(folder, *([] if alone else [COVERAGE])) as notes:
@@ -376,7 +343,8 @@ def render_film(
             collections.deque(images(), maxlen=0)
         if sheet:
             write_bytes(sheet_path(out), png(frame_sheet(chosen)))
-    notes = [*notes, *plan.notes, *check.notes(plan.remedy, plan.nearer), *left]
+    notes = [*notes, *plan.notes, *fault_notes(faults, plan.remedy, plan.nearer)]
+    notes += [f"{len(older)} older images are also in {folder}: remove them, or give a new folder"] if older else []
     return [*files, film] if one_size else files, notes
 
 
@@ -426,8 +394,8 @@ def render_path(
     if isinstance(path, str):
         plan = plan_film(model, path, settings)
     else:
-        own = [(f"{i:04d}", convert_camera(c, model.normalization, units, "scene")) for i, c in enumerate(path)]
-        plan = FilmPlan(own, 0.0, "check the poses and the units of the cameras", [])
+        own = [convert_camera(c, model.normalization, units, "scene") for c in path]
+        plan = FilmPlan(_numbered(own), 0.0, "check the poses and the units of the cameras", [])
     files, notes = render_film(model, plan, Path(out), settings, coverage=coverage)
     for note in notes:
         say(f"warpgs: {note}", error=True)

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from warpgs import schema
-from warpgs.errors import DataError, UsageError
+from warpgs.errors import DataError
 from warpgs.files import read_input, unread_reason
 from warpgs.geometry import (
     convert_camera,
@@ -26,12 +26,11 @@ from warpgs.geometry import (
 )
 from warpgs.scene import Camera, Normalization
 
-KINDS = ("forward", "ring", "room", "free")
 NAMES = {
     "forward": "on one side of the scene", "ring": "around the scene", "room": "looking outwards, as in a room",
     "free": "without a known layout",
 }  # fmt: skip
-"""Description of each kind, to follow "training cameras"."""
+"""Kinds of rigs, with descriptions that follow "training cameras"."""
 MIN_AGREEMENT = 0.8
 """Fraction of the cameras that must look at one point, or away from it."""
 MIN_COSINE = 0.8
@@ -60,7 +59,7 @@ class Rig:
     """An arrangement of cameras for films: the point of interest, the upward direction, and the positions of the cameras."""
 
     kind: str
-    """One of `KINDS`: forward (from one side), ring (around a point), room (outwards from a place), free (none of these)."""
+    """One of `NAMES`: forward (from one side), ring (around a point), room (outwards from a place), free (none of these)."""
     center: np.ndarray
     """Point that the film looks at, or from which it looks around in a room [u], shape [3]."""
     up: np.ndarray
@@ -80,10 +79,10 @@ class Rig:
 
     def describe(self) -> str:
         """Return a phrase on the positions of the cameras."""
+        words = NAMES[self.kind]
         if self.span is None:
-            return f"{NAMES[self.kind]}, from all sides" if self.kind == "ring" else NAMES[self.kind]
-        degrees = math.degrees(self.span[1] - self.span[0])
-        return f"{NAMES[self.kind]}, over {degrees:.0f} of 360 degrees" if self.kind != "free" else NAMES[self.kind]
+            return f"{words}, from all sides" if self.kind == "ring" else words
+        return words if self.kind == "free" else f"{words}, over {math.degrees(self.span[1] - self.span[0]):.0f} of 360 degrees"
 
     def direction(self, azimuth: float, elevation: float) -> np.ndarray:
         """Return the unit vector [3] at an azimuth and an elevation [rad]."""
@@ -93,7 +92,7 @@ class Rig:
     def is_watched(self, cameras: list[Camera]) -> bool:
         """Return whether the rig is around or in front of its centre, and all cameras look at the centre."""
         to_center = [self.center - c.center for c in cameras]
-        cosines = [(d * c.viewmat[2, :3]).sum() / max(math.sqrt((d * d).sum()), 1e-12) for c, d in zip(cameras, to_center)]
+        cosines = [(d * c.viewmat[2, :3]).sum() / max(_length(d), 1e-12) for c, d in zip(cameras, to_center)]
         return self.kind in ("ring", "forward") and min(cosines) > MIN_COSINE
 
     def reach(self, camera: Camera) -> float:
@@ -103,8 +102,12 @@ class Rig:
         return max(0.0, float(((self.center - camera.center) * camera.viewmat[2, :3]).sum()))
 
 
+def _length(v: np.ndarray) -> float:
+    return math.sqrt((v * v).sum())
+
+
 def _unit(v: np.ndarray) -> np.ndarray:
-    return v / math.sqrt((v * v).sum())
+    return v / _length(v)
 
 
 def _normal_of(vectors: np.ndarray, largest: float) -> np.ndarray | None:
@@ -134,8 +137,7 @@ def _upward(cameras: list[Camera], looked_at: np.ndarray) -> tuple[np.ndarray, b
     # lower than the others. Else it is the mean of the cameras' own upward directions.
     rights, ups, forwards = (sign * np.array([c.viewmat[i, :3] for c in cameras]) for i, sign in ((0, 1), (1, -1), (2, 1)))
     centers = np.array([c.center for c in cameras])
-    mean = ups.mean(0)
-    length = math.sqrt((mean * mean).sum())
+    mean, length = ups.mean(0), _length(ups.mean(0))
     normal = _normal_of(centers - centers.mean(0), FLAT) if len(cameras) > 2 else None
     if normal is not None and np.abs(matmul(forwards, normal)).mean() < 0.9:
         upright, lying = matmul(ups, normal), matmul(rights, normal)
@@ -168,16 +170,14 @@ def _azimuths(directions: np.ndarray, up: np.ndarray) -> tuple[np.ndarray, np.nd
     """Return azimuths [N] and elevations [N] of directions [N, 3] about ``up`` [rad], and the direction [3] of azimuth 0."""
     heights = matmul(directions, up)
     level = directions - heights[:, None] * up
-    first = (
-        level[0] if (level[0] ** 2).sum() > 1e-12 * (directions[0] ** 2).sum() else np.cross(up, np.eye(3)[np.abs(up).argmin()])
-    )
-    first = _unit(first)
+    flat = (level[0] ** 2).sum() > 1e-12 * (directions[0] ** 2).sum()
+    first = _unit(level[0] if flat else np.cross(up, np.eye(3)[np.abs(up).argmin()]))
     azimuths = np.arctan2(matmul(level, np.cross(up, first)), matmul(level, first))
     return azimuths, np.arctan2(heights, np.sqrt((level * level).sum(1))), first
 
 
 def _kind(cameras: list[Camera], focus: np.ndarray, depth: float) -> str:
-    """Return one of `KINDS`; a ring may still turn out to be from one side."""
+    """Return one of `NAMES`; a ring may still turn out to be from one side."""
     centers, forwards = np.array([c.center for c in cameras]), np.array([c.viewmat[2, :3] for c in cameras])
     to_focus = focus - centers
     distances = np.sqrt((to_focus * to_focus).sum(1))
@@ -186,9 +186,8 @@ def _kind(cameras: list[Camera], focus: np.ndarray, depth: float) -> str:
         return "ring"
     offsets = centers - centers.mean(0)
     mean = forwards.mean(0)
-    length = math.sqrt((mean * mean).sum())
-    if length > MIN_FORWARD:
-        along = np.abs(matmul(offsets, mean / length)).max()
+    if _length(mean) > MIN_FORWARD:
+        along = np.abs(matmul(offsets, _unit(mean))).max()
         return "forward" if along < depth else "free"
     spread = math.sqrt((offsets * offsets).sum(1).max())
     outwards = (cosines < -MIN_COSINE).mean() >= MIN_AGREEMENT
@@ -203,16 +202,13 @@ def rig_of(cameras: list[Camera], depth: float) -> Rig:
     focus = focus_point(cameras)
     kind = _kind(cameras, focus, depth)
     if kind == "ring":
-        up, turned = _upward(cameras, focus)
-        span = _span(_azimuths(centers - focus, up)[0])
-        if span is not None and span[1] - span[0] < MIN_RING:
-            kind = "forward"
+        span = _span(_azimuths(centers - focus, _upward(cameras, focus)[0])[0])
+        kind = "forward" if span is not None and span[1] - span[0] < MIN_RING else kind
     if kind == "forward":
         focus = centers.mean(0) + depth * _unit(forwards.mean(0))
-        up, turned = _upward(cameras, focus)
     elif kind != "ring":
         focus = centers.mean(0) if kind == "room" else (centers + depth * forwards).mean(0)
-        up, turned = _upward(cameras, focus)
+    up, turned = _upward(cameras, focus)
     directions = forwards if kind == "room" else centers - focus
     azimuths, elevations, first = _azimuths(directions, up)
     distances = np.sqrt(((centers - focus) ** 2).sum(1))
@@ -257,16 +253,11 @@ def framed(camera: Camera, size: tuple[int, int] | None = None, fov_y: float | N
         K, width, height = K[[1, 0, 2]][:, [1, 0, 2]], height, width
     if size is None and fov_y is None:
         return replace(camera, K=K, width=width, height=height)
-    new_width, new_height = size or (width, height)
-    if fov_y is not None:
-        fy = 0.5 * new_height / math.tan(0.5 * fov_y)
-    else:
-        fy = K[1, 1] * new_height / height
+    new = size or (width, height)
+    fy = K[1, 1] * new[1] / height if fov_y is None else 0.5 * new[1] / math.tan(0.5 * fov_y)
     fx, zoom = fy * K[0, 0] / K[1, 1], fy / K[1, 1]
-    cx, cy = (
-        0.5 * new + zoom * (K[i, 2] - 0.5 * old) for i, (new, old) in enumerate(((new_width, width), (new_height, height)))
-    )
-    return replace(camera, K=np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]]), width=new_width, height=new_height)
+    cx, cy = (0.5 * new[i] + zoom * (K[i, 2] - 0.5 * old) for i, old in enumerate((width, height)))
+    return replace(camera, K=np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]]), width=new[0], height=new[1])
 
 
 def path_of(rig: Rig) -> str:
@@ -286,11 +277,8 @@ def upright(rig: Rig, camera: Camera) -> Camera:
 def _spiral_to_one_side(rig: Rig, cameras: list[Camera], frames: int) -> list[np.ndarray]:
     """Return poses along two turns that widen and narrow again among the cameras, all looking at the rig's centre."""
     center = np.mean([c.center for c in cameras], axis=0)
-    forward = rig.center - center
-    depth = math.sqrt((forward * forward).sum())
-    forward = forward / depth
-    side = np.cross(forward, rig.up)
-    side /= math.sqrt((side * side).sum())
+    depth, forward = _length(rig.center - center), _unit(rig.center - center)
+    side = _unit(np.cross(forward, rig.up))
     up = np.cross(side, forward)
     offsets = np.array([c.center for c in cameras]) - center
     spans = [max(0.7 * float(np.abs(matmul(offsets, axis)).max()), 0.03 * depth) for axis in (side, up)]
@@ -322,10 +310,6 @@ def _turn(rig: Rig, frames: int, turns: int, rise: float) -> list[np.ndarray]:
 
 def camera_path(kind: str, rig: Rig, cameras: list[Camera], frames: int) -> list[Camera]:
     """Return cameras on a closed path, turntable or spiral, with size and intrinsics of the first of ``cameras``."""
-    if kind not in ("turntable", "spiral"):
-        raise UsageError(f"path {kind!r} is neither turntable nor spiral")
-    if frames < 1:
-        raise UsageError(f"a film needs at least 1 frame, not {frames}")
     if kind == "turntable":
         poses = _turn(rig, frames, 1, 0.0)
     elif rig.kind == "forward":
@@ -359,8 +343,9 @@ class Keyframe:
     """Distance along the optical axis to the point that the camera looks at [u]; 0 if unknown."""
 
 
-def _fov_y(camera: Camera) -> float:
-    return 2 * math.atan(0.5 * camera.height / camera.K[1, 1])
+def fov_y(camera: Camera, aspect: float = math.inf) -> float:
+    """Return the vertical field of view [rad] at which a window shows a camera's whole image, centred."""
+    return 2 * math.atan(max(0.5 * camera.height / float(camera.K[1, 1]), 0.5 * camera.width / float(camera.K[0, 0]) / aspect))
 
 
 def _row(keyframe: Keyframe) -> np.ndarray:
@@ -368,7 +353,7 @@ def _row(keyframe: Keyframe) -> np.ndarray:
     camera = keyframe.camera
     rotation = torch.from_numpy(np.ascontiguousarray(camera.viewmat[:3, :3].T, dtype=np.float64))
     point = camera.center + keyframe.reach * camera.viewmat[2, :3]
-    return np.concatenate([point, quaternions(rotation[None])[0].numpy(), [_fov_y(camera), keyframe.reach]])
+    return np.concatenate([point, quaternions(rotation[None])[0].numpy(), [fov_y(camera), keyframe.reach]])
 
 
 def _spline(rows: np.ndarray, times: np.ndarray, at: np.ndarray, closed: bool) -> np.ndarray:
@@ -401,8 +386,6 @@ def through(keyframes: list[Keyframe], frames: int, *, closed: bool = False) -> 
     # One spline interpolates the points looked at, the distances to them, rotations and fields of view. So an object that all
     # cameras look at stays in place while they go around it. Rotations are quaternions, normalised at each frame: between
     # neighbours they turn nearly as evenly as by spherical interpolation, and they do not jerk at a keyframe.
-    if frames < 1:
-        raise UsageError(f"a film needs at least 1 frame, not {frames}")
     if len(keyframes) == 1:
         return [keyframes[0].camera] * frames
     rows = np.array([_row(k) for k in keyframes])
@@ -417,7 +400,7 @@ def through(keyframes: list[Keyframe], frames: int, *, closed: bool = False) -> 
         viewmat = np.eye(4)
         viewmat[:3, :3], viewmat[:3, 3] = rotation, -matmul(rotation, row[:3] - row[8] * rotation[2])
         camera = replace(template, viewmat=viewmat)
-        same = abs(row[7] - _fov_y(template)) < 1e-9
+        same = abs(row[7] - fov_y(template)) < 1e-9
         cameras.append(camera if same else framed(camera, None, float(np.clip(row[7], 0.01, 3.1))))
     return cameras
 
@@ -491,33 +474,23 @@ def _neighbour_tour(distances: list[list[float]]) -> list[int]:
     while left:
         order.append(min(left, key=lambda j: (distances[order[-1]][j], j)))
         left.remove(order[-1])
+
+    def leg(i: int, j: int) -> float:
+        return distances[order[i]][order[j]] if i >= 0 and j < count else 0.0
+
     improved = count <= MAX_IMPROVED
     while improved:
         improved = False
         for i in range(count - 1):
             for j in range(i + 1, count):
-                before = distances[order[i - 1]][order[i]] if i else 0.0
-                after = distances[order[j]][order[j + 1]] if j + 1 < count else 0.0
-                new_before = distances[order[i - 1]][order[j]] if i else 0.0
-                new_after = distances[order[i]][order[j + 1]] if j + 1 < count else 0.0
-                if new_before + new_after < before + after - 1e-9:
+                if leg(i - 1, j) + leg(i, j + 1) < leg(i - 1, i) + leg(j, j + 1) - 1e-9:
                     order[i : j + 1] = order[i : j + 1][::-1]
                     improved = True
     return order
 
 
-@dataclass(frozen=True)
-class Tour:
-    """A path through training views."""
-
-    keyframes: list[Keyframe]
-    closed: bool
-    by_name: bool
-    """True if the views are passed in the order of their names."""
-
-
-def tour_of(cameras: list[Camera], reaches: list[float], seconds: float, most: int) -> Tour:
-    """Return a path through at most ``most`` training views at an even pace; ``reaches`` [u] are depths of their subjects."""
+def tour_of(cameras: list[Camera], reaches: list[float], seconds: float, most: int) -> tuple[list[Keyframe], bool, bool]:
+    """Return a path through at most ``most`` views at an even pace, whether it is closed, and whether it is by their names."""
     # The views are passed in the order of their names if this path is not much longer than one from neighbour to neighbour:
     # then the names probably follow the order of capture. The path is closed if its ends are neighbours.
     distances = _distances(cameras)
@@ -534,5 +507,4 @@ def tour_of(cameras: list[Camera], reaches: list[float], seconds: float, most: i
         order = [*order, order[0]]
     times = np.concatenate([[0.0], np.cumsum(legs)])
     times = times * (seconds / times[-1]) if len(order) > 1 else times
-    keyframes = [Keyframe(cameras[i], float(t), reaches[i]) for i, t in zip(order, times)]
-    return Tour(keyframes, closed, by_name)
+    return [Keyframe(cameras[i], float(t), reaches[i]) for i, t in zip(order, times)], closed, by_name

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from warpgs.geometry import check_pinhole, pinhole_of
 from warpgs.io.image_files import decode
 from warpgs.kernels.ssim import ssim
 from warpgs.mesh.views import MIN_ALPHA, TOLERANCE, depth_difference, seen_from
-from warpgs.pipeline.metrics.scores import over_white, psnr_of, render_view, scored_region, to_8_bit
+from warpgs.pipeline.metrics.scores import psnr_of, render_view, scored_pair
 from warpgs.priors.given_depth import pinhole_view
 from warpgs.process import counted
 from warpgs.render.options import RasterizeOptions
@@ -26,51 +27,32 @@ from warpgs.report.images import COVERAGE_LEGEND, coverage_image, png, webp
 from warpgs.report.page import Section
 from warpgs.scene import Camera, Gaussians, View
 
-MAX_COUNT = 255
-"""Largest number of views that is stored for a pixel; higher counts are clamped."""
 GRID = 32
 """Number of points along the longer side of an image that `fraction_outside` checks."""
 MAX_PIXELS = 2**26
 """Largest total number of pixels of all depth maps, 256 MiB; above it, maps are rendered at a smaller size."""
 
 
-@dataclass(frozen=True)
-class DepthView:
-    """Depth of the model at the pixels of one training view."""
-
-    camera: Camera
-    """Camera, arrays of numpy, at the size of ``depth``."""
-    depth: torch.Tensor
-    """Expected z-depth [u], float32, shape [H, W]; 0 where the model shows no surface, or the mask of the view hides it."""
+DepthView = tuple[Camera, torch.Tensor]
+"""A training view's pinhole camera (numpy) at the size of the depth, and the model's expected z-depth [u], float32, shape
+[H, W]; 0 where the model shows no surface, or the mask of the view hides it."""
 
 
 @torch.no_grad()
-def depth_of(gaussians: Gaussians, camera: Camera, options: RasterizeOptions) -> torch.Tensor:
-    """Render the expected z-depth [u] of a view, shape [H, W]; 0 where less than `MIN_ALPHA` of a pixel is covered."""
-    r = rasterize(gaussians, camera, options)
-    return torch.where(r.alpha >= MIN_ALPHA, r.depth, 0)
-
-
 def depth_views(
-    gaussians: Gaussians,
-    cameras: Sequence[Camera],
-    options: RasterizeOptions,
-    masks: Sequence[np.ndarray | None] | None = None,
-    max_pixels: int = MAX_PIXELS,
+    gaussians: Gaussians, cameras: Sequence[Camera], options: RasterizeOptions, masks: Sequence[np.ndarray | None] | None = None
 ) -> list[DepthView]:
-    """Render the depth of every training view once, 0 outside ``masks`` [H, W]; smaller if all maps exceed ``max_pixels``."""
-    pixels = sum(c.width * c.height for c in cameras)
-    factor = min(1.0, (max_pixels / max(1, pixels)) ** 0.5)
+    """Render the depth of every training view once, 0 outside ``masks`` [H, W]; smaller if all maps exceed `MAX_PIXELS`."""
+    factor = min(1.0, (MAX_PIXELS / max(1, sum(c.width * c.height for c in cameras))) ** 0.5)
     views = []
-    for i, camera in enumerate(cameras):
+    for camera, mask in zip(cameras, masks or [None] * len(cameras)):
         small = _resized(pinhole_of(camera), factor)
-        depth = depth_of(gaussians, small, options)
-        mask = None if masks is None else masks[i]
+        r = rasterize(gaussians, small, options)
+        depth = torch.where(r.alpha >= MIN_ALPHA, r.depth, 0)
         if mask is not None:
             counts = torch.as_tensor(mask, dtype=torch.float32, device=depth.device)[None, None]
-            counts = torch.nn.functional.interpolate(counts, depth.shape, mode="area")[0, 0]
-            depth = torch.where(counts > 0.5, depth, 0)
-        views.append(DepthView(small, depth))
+            depth = torch.where(interpolate(counts, depth.shape, mode="area")[0, 0] > 0.5, depth, 0)
+        views.append((small, depth))
     return views
 
 
@@ -83,36 +65,21 @@ def _resized(camera: Camera, factor: float) -> Camera:
     return replace(camera, K=scale * camera.K, width=width, height=height)
 
 
-def match(depth: torch.Tensor, camera: Camera, other: DepthView) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Return column and row [px] of a pinhole view's points in another view, and least difference of depths, [H, W] each."""
-    check_pinhole(camera)
-    return depth_difference(depth, camera, other.camera, other.depth)
+def coverage_map(depth: torch.Tensor, camera: Camera, training: Sequence[DepthView]) -> tuple[torch.Tensor, torch.Tensor]:
+    """Count the training views that saw the point at each pixel of a render with depth [H, W] [u], 0 for no surface.
 
-
-@dataclass(frozen=True)
-class Coverage:
-    """Coverage of the pixels of one render; tensors of shape [H, W]."""
-
-    counts: torch.Tensor
-    """Number of training views that saw the point, at most `MAX_COUNT`, uint8; 0 where the render shows no surface."""
-    difference: torch.Tensor
-    """Least difference of depths to a training view, as of `match`; infinite where the point is in no training image."""
-    empty: torch.Tensor
-    """True where the render shows no surface, bool."""
-
-
-def coverage_map(depth: torch.Tensor, camera: Camera, training: Sequence[DepthView], tolerance: float = TOLERANCE) -> Coverage:
-    """Count the training views that saw the point at each pixel of a render with depth [H, W] [u], 0 for no surface."""
+    Returns the counts, int32, and the least difference of depths to a training view, infinite in no training image; [H, W].
+    """
     # A view saw a point that is in its image, inside its mask, and on its rendered surface: neither behind the surface
     # (occluded) nor in front of it (the view looks through). Counts use the model's depth, so they are as accurate as the
     # model's geometry.
-    counts = torch.zeros(depth.shape, dtype=torch.int32, device=depth.device)
-    least = torch.full_like(depth, torch.inf)
+    check_pinhole(camera)
+    counts, least = torch.zeros_like(depth, dtype=torch.int32), torch.full_like(depth, torch.inf)
     for view in training:
-        _, _, difference = match(depth, camera, view)
-        counts += difference <= tolerance
+        _, _, difference = depth_difference(depth, camera, *view)
+        counts += difference <= TOLERANCE
         least = torch.minimum(least, difference)
-    return Coverage(counts.clamp_max(MAX_COUNT).to(torch.uint8), least, depth <= 0)
+    return counts, least
 
 
 def fraction_outside(depth: torch.Tensor, camera: Camera, photographs: Sequence[Camera], empty: bool = True) -> float:
@@ -154,37 +121,34 @@ def photo_errors(train: Sequence[View], training: Sequence[DepthView]) -> np.nda
     # result estimates the error of a pixel from its least depth difference to a training view. The estimate uses the data that
     # the model was fitted to. It includes differences between the photographs, such as reflections and exposure.
     chosen = np.unique(np.linspace(0, len(train) - 1, min(PROBED, len(train))).round().astype(int))
-    photos = {i: _photo(train[i], training[i]) for i in chosen}
+    photos = {i: _photo(train[i], training[i][1]) for i in chosen}
     total, count = np.zeros(len(BINS)), np.zeros(len(BINS))
-    for i in chosen:
-        for j in chosen:
-            if i == j:
-                continue
-            u, v, difference = match(training[i].depth, training[i].camera, training[j])
-            inside = torch.isfinite(difference)
-            error = (_sampled(photos[j], u[inside], v[inside]) - photos[i][inside]).double().square().mean(1)
-            index = _bin(difference[inside].cpu().numpy())
-            total += np.bincount(index, error.cpu().numpy(), len(BINS))
-            count += np.bincount(index, minlength=len(BINS))
+    for i, j in itertools.permutations(chosen, 2):
+        u, v, difference = depth_difference(training[i][1], training[i][0], *training[j])
+        inside = torch.isfinite(difference)
+        error = (_sampled(photos[j], u[inside], v[inside]) - photos[i][inside]).double().square().mean(1)
+        index = _bin(difference[inside])
+        total += np.bincount(index, error.cpu().numpy(), len(BINS))
+        count += np.bincount(index, minlength=len(BINS))
     if not count.any():
         return None
-    found = np.divide(total, count, out=np.full(len(BINS), np.nan), where=count > 0)
+    errors = np.divide(total, count, out=np.full(len(BINS), np.nan), where=count > 0)
     known = np.flatnonzero(count)
-    filled: np.ndarray = found[known[np.maximum(np.searchsorted(known, np.arange(len(BINS)), "right") - 1, 0)]]
+    filled: np.ndarray = errors[known[np.maximum(np.searchsorted(known, np.arange(len(BINS)), "right") - 1, 0)]]
     return filled
 
 
-def _bin(difference: np.ndarray) -> np.ndarray:
+def _bin(difference: torch.Tensor) -> np.ndarray:
     """Return the class of `BINS` of each difference."""
-    return np.searchsorted(np.asarray(BINS, np.float32), difference)
+    return np.searchsorted(np.asarray(BINS, np.float32), difference.cpu().numpy())
 
 
-def _photo(view: View, at: DepthView) -> torch.Tensor:
-    """Return the image of a view at the size of its depth, on the device of the depth, shape [H, W, 3]."""
-    image = torch.as_tensor(view.image, dtype=torch.float32, device=at.depth.device)
-    if image.shape[:2] == at.depth.shape:
+def _photo(view: View, depth: torch.Tensor) -> torch.Tensor:
+    """Return the image of a view at the size and on the device of its depth, shape [H, W, 3]."""
+    image = torch.as_tensor(view.image, dtype=torch.float32, device=depth.device)
+    if image.shape[:2] == depth.shape:
         return image
-    return interpolate(image.permute(2, 0, 1)[None], at.depth.shape, mode="area")[0].permute(1, 2, 0)
+    return interpolate(image.permute(2, 0, 1)[None], depth.shape, mode="area")[0].permute(1, 2, 0)
 
 
 def _sampled(image: torch.Tensor, u: torch.Tensor, v: torch.Tensor) -> torch.Tensor:
@@ -199,19 +163,16 @@ def _sampled(image: torch.Tensor, u: torch.Tensor, v: torch.Tensor) -> torch.Ten
     return (1 - b) * above + b * below
 
 
-def classes_of(coverage: Coverage, transparent: bool) -> dict[str, np.ndarray]:
-    """Return the pixels of each class of `CLASSES`, bool [H, W]; none is background if ``transparent``, else unseen."""
-    counts, empty = coverage.counts.cpu().numpy(), coverage.empty.cpu().numpy() & transparent
+def classes_of(counts: torch.Tensor, empty: torch.Tensor) -> dict[str, np.ndarray]:
+    """Return the pixels of each class of `CLASSES`, bool [H, W]; those of ``empty`` are background."""
+    counts, empty = counts.cpu().numpy(), empty.cpu().numpy()
     return {"0": (counts == 0) & ~empty, "1": counts == 1, "2+": counts >= 2, "background": empty}
 
 
 def _sums(view: View, image: np.ndarray, classes: dict[str, np.ndarray], expected: np.ndarray | None) -> dict[str, np.ndarray]:
     """Return for each class the number of scored pixels and the sums over them of squared error, SSIM and expected error."""
-    region, kind = scored_region(view)
-    image, target = to_8_bit(image), to_8_bit(view.image)
+    image, target, region, _ = scored_pair(view, image)
     error = np.square(image.astype(np.float64) - target).mean(-1)
-    if region is not None and kind != "foreground":
-        image, target = over_white(image, region), over_white(target, region)
     similarity = ssim(torch.from_numpy(image), torch.from_numpy(target)).numpy().astype(np.float64).mean(-1)
     maps = [np.ones_like(error), error, similarity, np.zeros_like(error) if expected is None else expected]
     inside = {c: m if region is None else m & region for c, m in classes.items()}
@@ -233,47 +194,6 @@ def _row(sums: dict[str, np.ndarray], expected: bool) -> dict[str, dict[str, Any
     return rows
 
 
-def score_by_coverage(
-    gaussians: Gaussians,
-    train: Sequence[View],
-    test: Sequence[View],
-    options: RasterizeOptions,
-    show: Callable[[View, np.ndarray, dict[str, np.ndarray]], object] = lambda *_: None,
-    tell: Callable[[str], object] = lambda line: None,
-) -> dict[str, Any]:
-    """Return scores of held-out views by the number of training views that saw each pixel; ``show`` gets render and classes."""
-    tell("checking coverage")
-    train, test = ([pinhole_view(v) for v in views] for views in (train, test))
-    training = depth_views(gaussians, [v.camera for v in train], options, [v.mask for v in train])
-    errors = photo_errors(train, training)
-    transparent = any(v.alpha is not None for v in (*train, *test))
-    views, total = [], {c: np.zeros(4) for c in CLASSES}
-    for view in counted(test, tell, "checking coverage", "views"):
-        image, depth, alpha = render_view(gaussians, view, options)
-        surface = torch.from_numpy(np.where(alpha >= MIN_ALPHA, depth, 0)).to(gaussians.means.device)
-        found = coverage_map(surface, view.camera, training)
-        classes = classes_of(found, transparent)
-        expected = None if errors is None else errors[_bin(found.difference.cpu().numpy())]
-        sums = _sums(view, image, classes, expected)
-        show(view, image, classes)
-        views.append({"name": view.name, "classes": _row(sums, errors is not None)})
-        total = {c: total[c] + sums[c] for c in CLASSES}
-    pooled = _row(total, errors is not None)
-    return {
-        "classes": pooled, "views": views, "tolerance": TOLERANCE, "depth_differences": list(BINS[:-1]),
-        "photo_psnr": None if errors is None else [psnr_of(e) for e in errors.tolist()], "summary": _summary(pooled),
-    }  # fmt: skip
-
-
-def _summary(rows: dict[str, dict[str, Any]]) -> str:
-    """Return a sentence for the user: the fraction of pixels that no training view saw, and the fraction of the error there."""
-    unseen = rows.get("0")
-    if unseen is None:
-        return "every held-out pixel was seen by a training view"
-    pixels, error = (f"{100 * unseen[f'share_of_{what}']:.3g} %" for what in ("pixels", "error"))
-    return f"{pixels} of the held-out pixels were seen by no training view; they account for {error} of the squared error"
-
-
 FOLDER = "coverage"
 """Folder in a run folder with an image of each held-out view."""
 EXPECTED = (
@@ -284,24 +204,38 @@ EXPECTED = (
 
 
 def coverage_of_run(
-    out: Path | None,
-    gaussians: Gaussians,
-    train: list[View],
-    test: list[View],
-    options: RasterizeOptions,
-    *,
-    names: Mapping[str, str],
-    tell: Callable[[str], object] = lambda line: None,
-) -> dict[str, Any]:
+    out: Path | None, gaussians: Gaussians, train: Sequence[View], test: Sequence[View], options: RasterizeOptions, *,
+    names: Mapping[str, str], tell: Callable[[str], object] = lambda line: None,
+) -> dict[str, Any]:  # fmt: skip
     """Split the scores of held-out views by coverage, and save an image of each view in ``out``, if any."""
+    tell("checking coverage")
     if out is not None:
         make_folder(out / FOLDER)
-
-    def show(view: View, image: np.ndarray, classes: dict[str, np.ndarray]) -> None:
+    train, test = ([pinhole_view(v) for v in views] for views in (train, test))
+    training = depth_views(gaussians, [v.camera for v in train], options, [v.mask for v in train])
+    errors = photo_errors(train, training)
+    transparent = any(v.alpha is not None for v in (*train, *test))
+    views, total = [], {c: np.zeros(4) for c in CLASSES}
+    for view in counted(test, tell, "checking coverage", "views"):
+        image, depth, alpha = render_view(gaussians, view, options)
+        surface = torch.from_numpy(np.where(alpha >= MIN_ALPHA, depth, 0)).to(gaussians.means.device)
+        counts, difference = coverage_map(surface, view.camera, training)
+        classes = classes_of(counts, (surface <= 0) & transparent)
+        sums = _sums(view, image, classes, None if errors is None else errors[_bin(difference)])
         if out is not None:
             write_bytes(out / FOLDER / f"{names[view.name]}.png", png(coverage_image(image, classes["0"], classes["1"])))
-
-    return score_by_coverage(gaussians, train, test, options, show, tell)
+        views.append({"name": view.name, "classes": _row(sums, errors is not None)})
+        total = {c: total[c] + sums[c] for c in CLASSES}
+    pooled = _row(total, errors is not None)
+    unseen = pooled.get("0")
+    summary = "every held-out pixel was seen by a training view"
+    if unseen:
+        pixels, loss = (f"{100 * unseen[f'share_of_{what}']:.3g} %" for what in ("pixels", "error"))
+        summary = f"{pixels} of the held-out pixels were seen by no training view; they account for {loss} of the squared error"
+    return {
+        "classes": pooled, "views": views, "tolerance": TOLERANCE, "depth_differences": list(BINS[:-1]),
+        "photo_psnr": None if errors is None else [psnr_of(e) for e in errors.tolist()], "summary": summary,
+    }  # fmt: skip
 
 
 def coverage_table(coverage: dict[str, Any]) -> list[list[str]]:
@@ -327,7 +261,7 @@ def coverage_section(out: Path, coverage: dict[str, Any], shown: list[str], name
     """Return the section of the report page, with the images of the views ``shown``."""
     files = {n: out / FOLDER / f"{names[n]}.png" for n in shown}
     head, *rows = coverage_table(coverage)
-    return Section(
+    return (
         f"{coverage['summary'][0].upper()}{coverage['summary'][1:]}. {EXPECTED}",
         [(n, webp(decode(f, data=read_file(f, out))[0], 640)) for n, f in files.items() if f.is_file()],
         [head[1:], *(r[1:] for r in rows if r[0] == "all views")],

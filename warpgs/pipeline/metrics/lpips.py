@@ -25,6 +25,10 @@ MAX_PICKLE = 2**20
 """Largest size of a .pth file without its tensors [bytes]; published files have a few KiB. torch copies these bytes twice."""
 
 
+TAP = ("tap",)
+"""A layer whose features are compared."""
+
+
 @dataclass(frozen=True)
 class Net:
     """The convolutional layers of a classifier, with the numbers of torchvision (`features.N`)."""
@@ -44,25 +48,21 @@ class Net:
     @property
     def channels(self) -> tuple[int, ...]:
         """Channels of the five compared layers."""
-        pairs = zip(self.layers, self.layers[1:])
-        return tuple(layer[3] for layer, after in pairs if after == ("tap",))
+        return tuple(layer[3] for layer, after in zip(self.layers, self.layers[1:]) if after == TAP)
 
     def shapes(self) -> dict[str, tuple[int, ...]]:
         """Return the names of all tensors of a converted file with their shapes."""
-        found: dict[str, tuple[int, ...]] = {}
-        for layer in self.layers:
-            if layer[0] == "conv":
-                _, number, inputs, outputs, kernel, _, _ = layer
-                found[f"features.{number}.weight"] = (outputs, inputs, kernel, kernel)
-                found[f"features.{number}.bias"] = (outputs,)
-        return found | {f"lin{i}.model.1.weight": (1, c, 1, 1) for i, c in enumerate(self.channels)}
+        shapes: dict[str, tuple[int, ...]] = {}
+        for _, number, inputs, outputs, kernel, _, _ in (layer for layer in self.layers if layer[0] == "conv"):
+            shapes[f"features.{number}.weight"] = (outputs, inputs, kernel, kernel)
+            shapes[f"features.{number}.bias"] = (outputs,)
+        return shapes | {f"lin{i}.model.1.weight": (1, c, 1, 1) for i, c in enumerate(self.channels)}
 
 
 def _conv(number: int, inputs: int, outputs: int, kernel: int = 3, stride: int = 1, padding: int = 1) -> tuple[Any, ...]:
     return ("conv", number, inputs, outputs, kernel, stride, padding)
 
 
-TAP = ("tap",)
 NETS = {
     # Simonyan and Zisserman 2015, network D; compared after the last rectification of each block
     "vgg": Net(
@@ -101,8 +101,6 @@ def _read_state(path: Path) -> tuple[dict[str, torch.Tensor], str]:
     """Return the tensors of a .pth file by name, and the file's SHA-256."""
     try:
         file = open_input(path)
-    except FileNotFoundError as e:
-        raise DataError(f"{path}: no such file; give a .pth file with a state dict") from e
     except OSError as e:
         raise DataError(f"{path}: cannot be read ({unread_reason(e)}); give a .pth file with a state dict") from e
     with file:
@@ -111,10 +109,8 @@ def _read_state(path: Path) -> tuple[dict[str, torch.Tensor], str]:
             # weights_only: tensors and plain containers, nothing that could run
             state = torch.load(_mapped(file), map_location="cpu", weights_only=True, mmap=_mapped(file) is not file)
         except Exception as e:  # torch, pickle and zipfile raise a dozen types on malformed files
-            reason = str(e).splitlines()[0][:120] if str(e) else ""
-            raise DataError(
-                f"{path}: cannot be read as a torch state dict ({type(e).__name__}: {reason}); download it again"
-            ) from e
+            reason = f"{type(e).__name__}: {str(e).partition(os.linesep)[0][:120]}"
+            raise DataError(f"{path}: cannot be read as a torch state dict ({reason}); download it again") from e
         file.seek(0)
         digest = hashlib.file_digest(file, "sha256").hexdigest()
     if not isinstance(state, dict):
@@ -152,10 +148,7 @@ def _net_of(heads: dict[str, torch.Tensor], path: Path) -> Net:
     for net in NETS.values():
         if shapes == {k: v for k, v in net.shapes().items() if k.startswith("lin")}:
             return net
-    raise DataError(
-        f"{path}: heads of an unsupported network; warpgs measures LPIPS with VGG16 (vgg.pth) and AlexNet (alex.pth) "
-        "from the folder lpips/weights of PerceptualSimilarity"
-    )
+    raise DataError(f"{path}: heads of an unsupported network; give PerceptualSimilarity's vgg.pth or alex.pth")
 
 
 def convert_lpips(backbone: Path, heads: Path, out: Path) -> list[str]:
@@ -172,11 +165,8 @@ def convert_lpips(backbone: Path, heads: Path, out: Path) -> list[str]:
         source, path = (head_state, heads) if name.startswith("lin") else (state, backbone)
         value = source.get(name)
         if not isinstance(value, torch.Tensor) or tuple(value.shape) != shape:
-            found = f"is {list(value.shape)}" if isinstance(value, torch.Tensor) else "is missing"
-            raise DataError(
-                f"{path}: {name} {found}, expected {list(shape)} of {net.title}; the heads belong to {net.title}, so give "
-                "torchvision's weights of that network"
-            )
+            fault = f"is {list(value.shape)}" if isinstance(value, torch.Tensor) else "is missing"
+            raise DataError(f"{path}: {name} {fault}, expected {list(shape)}; give torchvision's weights of {net.title}")
         if not bool(torch.isfinite(value).all()):
             raise DataError(f"{path}: {name} is not finite; download it again from its source")
         tensors[name] = value.float().contiguous()
@@ -199,25 +189,23 @@ def read_lpips(path: Path) -> tuple[Net, dict[str, torch.Tensor], dict[str, str]
     from safetensors import SafetensorError
     from safetensors.torch import load
 
+    fix = "write the file again with `warpgs convert-lpips`"
     try:
         data = read_input(path)
-    except FileNotFoundError as e:
-        raise DataError(f"{path}: no such file; `warpgs convert-lpips` makes one from published weights") from e
-    except OSError as e:
-        raise DataError(f"{path}: cannot be read ({unread_reason(e)}); write one with `warpgs convert-lpips`") from e
-    try:
         tensors = load(data)
         metadata = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")]).get("__metadata__") or {}
+    except OSError as e:
+        raise DataError(f"{path}: cannot be read ({unread_reason(e)}); `warpgs convert-lpips` writes one") from e
     except (SafetensorError, ValueError) as e:
-        raise DataError(f"{path}: damaged or not a safetensors file ({e}); write it again with `warpgs convert-lpips`") from e
+        raise DataError(f"{path}: damaged or not a safetensors file ({e}); {fix}") from e
     if metadata.get("format") != FORMAT or metadata.get("net") not in NETS:
-        raise DataError(f"{path}: holds no LPIPS weights; `warpgs convert-lpips` writes one from published weights")
+        raise DataError(f"{path}: holds no LPIPS weights; {fix}")
     net = NETS[metadata["net"]]
     for name, shape in net.shapes().items():
         if name not in tensors or tuple(tensors[name].shape) != shape:
-            raise DataError(f"{path}: no {name} of shape {list(shape)}; write the file again with `warpgs convert-lpips`")
+            raise DataError(f"{path}: no {name} of shape {list(shape)}; {fix}")
         if tensors[name].dtype != torch.float32 or not bool(torch.isfinite(tensors[name]).all()):
-            raise DataError(f"{path}: {name} is not finite float32; write the file again with `warpgs convert-lpips`")
+            raise DataError(f"{path}: {name} is not finite float32; {fix}")
     return net, tensors, {**metadata, "sha256": hashlib.sha256(data).hexdigest()}
 
 
@@ -232,16 +220,13 @@ NORM_FLOOR = 1e-10
 """Added to the length of a feature vector before dividing by it (PerceptualSimilarity, normalize_tensor)."""
 
 
-@dataclass(frozen=True)
 class Lpips:
     """A network with its heads, ready to measure."""
 
-    net: Net
-    tensors: dict[str, torch.Tensor]
-    version: str
-    """Version of the heads: 0.0, 0.1, or unknown."""
-    sha256: str
-    """SHA-256 of the file that the weights came from, hexadecimal."""
+    def __init__(self, path: Path, device: torch.device):
+        """Load the weights of a file that `warpgs convert-lpips` wrote."""
+        self.net, tensors, self.header = read_lpips(path)
+        self.tensors = {n: t.to(device) for n, t in tensors.items()}
 
     def _features(self, images: torch.Tensor) -> Iterator[torch.Tensor]:
         """Yield the compared activations of images [2, 3, H, W], each of unit length along its channels."""
@@ -279,12 +264,7 @@ class Lpips:
 
     def variants(self) -> dict[str, str]:
         """Return the definition of each score, for result files and reports."""
-        base = f"{self.net.title}, heads {self.version}, weights SHA-256 {self.sha256[:12]}, inputs in "
+        version, digest = self.header.get("version", "unknown"), self.header["sha256"][:12]
+        base = f"{self.net.title}, heads {version}, weights SHA-256 {digest}, inputs in "
         inputs = {"legacy": "[0, 1] (un-rescaled, as in the code of 3D Gaussian splatting)", "standard": "[-1, 1]"}
         return {f"lpips_{self.net.name}_{mode}": base + inputs[mode] for mode in MODES}
-
-
-def load_lpips(path: Path, device: torch.device) -> Lpips:
-    """Load LPIPS with the weights of a file that `warpgs convert-lpips` wrote."""
-    net, tensors, header = read_lpips(path)
-    return Lpips(net, {n: t.to(device) for n, t in tensors.items()}, header.get("version", "unknown"), header["sha256"])

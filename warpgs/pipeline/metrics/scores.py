@@ -6,7 +6,7 @@ import math
 import warnings
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -26,12 +26,8 @@ def quantiles(values: torch.Tensor, *fractions: float) -> list[torch.Tensor]:
     """Return quantiles of numbers [N], N at least 1, for fractions in [0, 1], linear between neighbours; a NaN ranks last."""
     # torch.quantile rejects more than 2^24 numbers, and photographs may have more pixels.
     ordered = values.sort().values
-    found = []
-    for fraction in fractions:
-        rank = fraction * (len(ordered) - 1)
-        below = int(rank)
-        found.append(torch.lerp(ordered[below], ordered[min(below + 1, len(ordered) - 1)], rank - below))
-    return found
+    ranks = [fraction * (len(ordered) - 1) for fraction in fractions]
+    return [torch.lerp(ordered[int(r)], ordered[min(int(r) + 1, len(ordered) - 1)], r - int(r)) for r in ranks]
 
 
 OPAQUE = 0.5
@@ -77,14 +73,15 @@ def psnr_of(mse: float) -> float:
 
 def psnr(image: np.ndarray, target: np.ndarray, region: np.ndarray | None = None) -> float:
     """Return the PSNR [dB] of two images in [0, 1], over all channels of the pixels in ``region`` [H, W]; infinite if equal."""
+    shape = list(image.shape)
     if image.shape != target.shape:
-        raise ValueError(f"psnr: both images must have one shape, not {list(image.shape)} and {list(target.shape)}; resize one")
-    if region is not None and region.dtype != bool:
-        raise TypeError(f"psnr: region must be bool, not {region.dtype}; give region > 0")
-    if region is not None and region.shape != image.shape[:2]:
-        raise ValueError(f"psnr: region must have shape {list(image.shape[:2])}, not {list(region.shape)}; resize it")
+        raise ValueError(f"psnr: both images must have one shape, not {shape} and {list(target.shape)}; resize one")
     difference = image.astype(np.float64) - target
     if region is not None:
+        if region.dtype != bool:
+            raise TypeError(f"psnr: region must be bool, not {region.dtype}; give region > 0")
+        if region.shape != image.shape[:2]:
+            raise ValueError(f"psnr: region must have shape {shape[:2]}, not {list(region.shape)}; resize it")
         difference = difference[region]
     mse = float((difference**2).mean())
     # numpy's logarithm, which sometimes rounds differently from math.log10: published figures stay the same
@@ -133,8 +130,10 @@ class ViewMetrics:
 
     def row(self) -> dict[str, Any]:
         """Return all scores by name, flat, as in result files."""
-        plain: dict[str, Any] = asdict(self)
-        return {k: v for k, v in plain.items() if k not in ("lpips", "opacity")} | self.opacity | self.lpips
+        row: dict[str, Any] = asdict(self)
+        for scores in (row.pop("opacity"), row.pop("lpips")):
+            row |= scores
+        return row
 
 
 def to_8_bit(image: np.ndarray) -> np.ndarray:
@@ -146,6 +145,17 @@ def to_8_bit(image: np.ndarray) -> np.ndarray:
 def over_white(image: np.ndarray, region: np.ndarray) -> np.ndarray:
     """Return the image [H, W, 3] with white where ``region`` [H, W] is False."""
     return np.where(region[..., None], image, np.float32(1))
+
+
+def scored_pair(view: View, image: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray | None, str]:
+    """Return a render of a view and its photograph as they are compared, in 8 bits; the scored pixels, and their name."""
+    # Masks are used as in DTU's protocol (Niemeyer et al. 2022 and later papers): PSNR over the mask's pixels alone, SSIM and
+    # LPIPS on both images with white outside the mask.
+    region, name = scored_region(view)
+    image, target = to_8_bit(image), to_8_bit(view.image)
+    if region is not None and name != "foreground":
+        image, target = over_white(image, region), over_white(target, region)
+    return image, target, region, name
 
 
 def _opacity_scores(
@@ -162,32 +172,21 @@ def _opacity_scores(
 
 def score(view: View, image: np.ndarray, lpips: Lpips | None = None, alpha: np.ndarray | None = None) -> ViewMetrics:
     """Compare a rendered image [H, W, 3], and its alpha [H, W] if the view has an alpha channel, with the image of its view."""
-    # Masks are used as in DTU's protocol (Niemeyer et al. 2022 and later papers): PSNR over the mask's pixels alone, SSIM and
-    # LPIPS on both images with white outside the mask.
     from skimage.metrics import structural_similarity
 
-    region, name = scored_region(view)
-    image, target = to_8_bit(image), to_8_bit(view.image)
+    opacity = {}
+    if alpha is not None and view.alpha is not None:
+        opacity = _opacity_scores(to_8_bit(image), to_8_bit(view.image), alpha, view.alpha, view.mask)
+    image, target, region, name = scored_pair(view, image)
     decibels = psnr(image, target, region)
-    opacity = {} if alpha is None or view.alpha is None else _opacity_scores(image, target, alpha, view.alpha, view.mask)
-    if region is not None and name != "foreground":
-        image, target = over_white(image, region), over_white(target, region)
     similarity = float(ssim(torch.from_numpy(image), torch.from_numpy(target)).mean())
+    cropped = float("nan")  # where the window does not fit
     if min(image.shape[:2]) >= SSIM_WINDOW:
         cropped = structural_similarity(  # type: ignore[no-untyped-call]
             image, target, gaussian_weights=True, sigma=1.5, use_sample_covariance=False, data_range=1, channel_axis=-1
         )
-    else:
-        cropped = float("nan")  # the window does not fit
     distances = {} if lpips is None else lpips.measure(image, target)
     return ViewMetrics(view.name, decibels, similarity, float(cropped), name, distances, opacity)
-
-
-def options_for(
-    rule: str, background: tuple[float, float, float], gaussians: Gaussians, antialiased: bool = False
-) -> RasterizeOptions:
-    """Return the rasterizer's options for a model: its cut-offs, its background, and whether it is antialiased."""
-    return RasterizeOptions(rule=rule, background=gaussians.means.new_tensor(background), antialiased=antialiased)
 
 
 @torch.no_grad()
@@ -206,7 +205,7 @@ def evaluate(
         gaussians: N Gaussians in the units of the views' cameras: scene units for the views of a `Scene`.
         views: Views with images; use held-out views for a meaningful score.
         options: Options of the rasterizer, such as `FitResult.options`; None for the defaults.
-        lpips: Network for LPIPS (`load_lpips`); None to skip LPIPS.
+        lpips: `Lpips`, the network with its weights; None to skip LPIPS.
 
     Returns:
         The scores of each view, in order; `summarize` gives their means.
@@ -214,8 +213,7 @@ def evaluate(
     Raises:
         DataError: A field of a view is invalid; the message names the view, the field and the fix.
     """
-    views = checked_views(views)
-    options = RasterizeOptions() if options is None else options
+    views, options = checked_views(views), RasterizeOptions() if options is None else options
     rendered = ((v, render_view(gaussians, v, options)) for v in views)
     return [score(v, image, lpips, alpha) for v, (image, _, alpha) in rendered]
 
@@ -259,26 +257,20 @@ RIDGE = 1e-6
 """Added to the variances of the colours, so that an image of one colour has a map, too: a deviation of 0.001 of full range."""
 
 
-def affine_map(rendered: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the least-squares matrix [3, 3] and offset [3] that map rendered colours to target colours, [N, 3] each."""
-    a, b = rendered.astype(np.float64), target.astype(np.float64)
-    of_a, of_b = a.mean(0), b.mean(0)
-    a, b = a - of_a, b - of_b
-    matrix = matmul(matmul(b.T, a) / len(a), inverse(matmul(a.T, a) / len(a) + RIDGE * np.eye(3)))
-    return matrix, of_b - matmul(matrix, of_a)
-
-
 def matched_psnr(view: View, image: np.ndarray) -> float:
     """Return the PSNR [dB] of a render [H, W, 3] of a view by `MATCHED_RULE`; NaN if a half has no scored pixel."""
     region, _ = scored_region(view)
-    counted = np.ones(view.image.shape[:2], bool) if region is None else region
-    left, right = counted.copy(), counted.copy()
-    middle = counted.shape[1] // 2
+    left = np.ones(view.image.shape[:2], bool) if region is None else region.copy()
+    right, middle = left.copy(), left.shape[1] // 2
     left[:, middle:], right[:, :middle] = False, False
     if not (left.any() and right.any()):
         return float("nan")
-    matrix, offset = affine_map(image[left], view.image[left])
-    mapped = matmul(image[right].astype(np.float64), matrix.T) + offset
+    # the map in least squares
+    a, b = image[left].astype(np.float64), view.image[left].astype(np.float64)
+    of_a, of_b = a.mean(0), b.mean(0)
+    a, b = a - of_a, b - of_b
+    matrix = matmul(matmul(b.T, a) / len(a), inverse(matmul(a.T, a) / len(a) + RIDGE * np.eye(3)))
+    mapped = matmul(image[right].astype(np.float64), matrix.T) + (of_b - matmul(matrix, of_a))
     return psnr(to_8_bit(mapped), to_8_bit(view.image[right]))
 
 
@@ -312,103 +304,79 @@ SMOOTHING = 32
 """Image width divided by the side of the square in which residuals are averaged."""
 
 
-class Rendered(NamedTuple):
-    """Render of a training view."""
-
-    rgb: np.ndarray
-    """Colours, shape [H, W, 3]."""
-    depth: np.ndarray
-    """z-depth [u], 0 for empty pixels; shape [H, W]."""
-    alpha: np.ndarray
-    """Opacity in [0, 1], shape [H, W]."""
+_Small = tuple[Camera, np.ndarray, np.ndarray, np.ndarray]
+"""A view reduced to `MAX_PIXELS`: its camera, residuals, depths and the mask of its pixels that count, [H, W] each."""
 
 
-class _Small(NamedTuple):
-    """A view reduced to `MAX_PIXELS`."""
-
-    camera: Camera
-    residual: np.ndarray
-    depth: np.ndarray
-    counts: np.ndarray
-
-
-def _reduced(view: View, render: Rendered) -> _Small:
-    """Return the residuals of a view beyond what a shift by one pixel explains, shape [H, W], at a small size."""
+def _reduced(view: View, rgb: np.ndarray, depth: np.ndarray, alpha: np.ndarray) -> _Small:
+    """Return the small view of a render; its residuals are those beyond what a shift by one pixel explains."""
     import cv2
 
     c = view.camera
     shrink = min(1.0, (MAX_PIXELS / (c.width * c.height)) ** 0.5)
-    width, height = max(1, int(c.width * shrink)), max(1, int(c.height * shrink))
-    image, rgb = (
-        cv2.resize(a.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
-        for a in (view.image, np.clip(render.rgb, 0, 1))
-    )
-    depth, alpha = (
-        cv2.resize(a.astype(np.float32), (width, height), interpolation=cv2.INTER_NEAREST) for a in (render.depth, render.alpha)
-    )
+    size = width, height = max(1, int(c.width * shrink)), max(1, int(c.height * shrink))
+    colors = (view.image, np.clip(rgb, 0, 1))
+    image, rgb = (cv2.resize(a.astype(np.float32), size, interpolation=cv2.INTER_AREA) for a in colors)
+    mask = np.ones(alpha.shape) if view.mask is None else view.mask
+    depth, alpha, mask = (cv2.resize(a.astype(np.float32), size, interpolation=cv2.INTER_NEAREST) for a in (depth, alpha, mask))
     around = np.ones((3, 3), np.uint8)
     beyond = np.maximum(np.maximum(cv2.erode(image, around) - rgb, rgb - cv2.dilate(image, around)), 0).mean(-1)
     side = max(3, round(width / SMOOTHING) | 1)
-    counts = (alpha > 0.5) & (depth > 0)
-    if view.mask is not None:
-        counts &= cv2.resize(view.mask.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST) > 0
     K = np.diag([width / c.width, height / c.height, 1]) @ c.K
-    return _Small(replace(c, K=K, width=width, height=height), cv2.blur(beyond, (side, side)), depth, counts)
+    small = replace(c, K=K, width=width, height=height)
+    return small, cv2.blur(beyond, (side, side)), depth, (alpha > 0.5) & (depth > 0) & (mask > 0)
 
 
 def _residuals_elsewhere(small: Sequence[_Small], index: int, others: Sequence[int]) -> np.ndarray:
     """Return the residuals of other views at the points of one view, NaN where they do not show it, shape [others, H * W]."""
-    own = small[index]
-    depths = np.where(own.counts, own.depth, 1).ravel().astype(float)
-    points = back_project(own.camera, pixel_grid(own.camera), depths)
+    camera, _, depth, counts = small[index]
+    points = back_project(camera, pixel_grid(camera), np.where(counts, depth, 1).ravel().astype(float))
     found = np.full((len(others), len(points)), np.nan)
-    for row, j in enumerate(others):
-        other = small[j]
-        pixels, z = project_points(other.camera, points)
-        size = np.array([other.camera.width, other.camera.height])
-        inside = np.flatnonzero((z > 0) & (pixels >= 1).all(1) & (pixels < size - 1).all(1))
+    for row, j in zip(found, others):
+        other, residual, depth, _ = small[j]
+        pixels, z = project_points(other, points)
+        inside = np.flatnonzero((z > 0) & (pixels >= 1).all(1) & (pixels < [other.width - 1, other.height - 1]).all(1))
         x, y = pixels[inside].astype(int).T
-        shown = np.abs(other.depth[y, x] - z[inside]) < MAX_DEPTH_ERROR * z[inside]
-        found[row, inside[shown]] = other.residual[y[shown], x[shown]]
+        shown = np.abs(depth[y, x] - z[inside]) < MAX_DEPTH_ERROR * z[inside]
+        row[inside[shown]] = residual[y[shown], x[shown]]
     return found
 
 
-def moved_fractions(views: Sequence[View], renders: Iterable[Rendered]) -> list[float]:
-    """Return the fraction of each training view's pixels, in [0, 1], in regions that other views show differently."""
+def moved_fractions(views: Sequence[View], renders: Iterable[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> list[float]:
+    """Return the fraction of each training view's pixels, in [0, 1], in regions that other views show differently.
+
+    Renders are those of `render_view`.
+    """
     # A pixel is included if the view's residual is much larger than the residuals of other views at the same point, and at
     # least two other views show this point. All fractions are 0 for fewer than `MIN_TRAINING` views, and for an unconverged
     # fit.
     import cv2
 
+    fractions = [0.0] * len(views)
     if len(views) < MIN_TRAINING:
-        return [0.0] * len(views)
-    small = [_reduced(v, r) for v, r in zip(views, renders, strict=True)]
-    misfits = [float(np.median(s.residual)) for s in small]
+        return fractions
+    small = [_reduced(v, *r) for v, r in zip(views, renders, strict=True)]
+    misfits = [float(np.median(residual)) for _, residual, _, _ in small]
     usual = float(np.median(misfits))
-    fractions = []
-    for i, s in enumerate(small):
-        others = nearest_views(views, i, NEIGHBORS)
+    for i, (_, residual, _, counts) in enumerate(small):
         if usual > HIGH_MISFIT or misfits[i] > MAX_MISFIT * max(usual, LOW_MISFIT):
-            fractions.append(0.0)
             continue
-        elsewhere = _residuals_elsewhere(small, i, others)
+        elsewhere = _residuals_elsewhere(small, i, nearest_views(views, i, NEIGHBORS))
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", RuntimeWarning)  # points that no other view shows
-            typical = np.nanmedian(elsewhere, axis=0).reshape(s.residual.shape)
-        shown = (np.isfinite(elsewhere).sum(0) >= MIN_VIEWS).reshape(s.residual.shape)
-        differs = s.counts & shown & (s.residual > MIN_RESIDUAL)
-        differs &= s.residual > MIN_FACTOR * np.maximum(np.nan_to_num(typical), FLOOR)
+            typical = np.nanmedian(elsewhere, axis=0).reshape(residual.shape)
+        shown = (np.isfinite(elsewhere).sum(0) >= MIN_VIEWS).reshape(residual.shape)
+        differs = counts & shown & (residual > MIN_RESIDUAL)
+        differs &= residual > MIN_FACTOR * np.maximum(np.nan_to_num(typical), FLOOR)
         _, _, statistics, _ = cv2.connectedComponentsWithStats(differs.astype(np.uint8))
-        areas = statistics[1:, cv2.CC_STAT_AREA] / s.residual.size
-        fractions.append(round(float(areas[areas >= MIN_AREA].sum()), 4))
+        areas = statistics[1:, cv2.CC_STAT_AREA] / residual.size
+        fractions[i] = round(float(areas[areas >= MIN_AREA].sum()), 4)
     return fractions
 
 
 def moved_notes(fractions: dict[str, float]) -> list[str]:
     """Return a note that names the views with moved regions, the largest fraction of moved pixels first; empty without any."""
     named = sorted(((f, name) for name, f in fractions.items() if f > 0), reverse=True)
-    if not named:
-        return []
     words = ", ".join(f"{name} ({f:.1%} of its pixels)" for f, name in named[:6])
     more = f" and {len(named) - 6} more" if len(named) > 6 else ""
-    return [f"moving or changing objects in {words}{more}; mask them out"]
+    return [f"moving or changing objects in {words}{more}; mask them out"] if named else []

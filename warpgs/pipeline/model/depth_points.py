@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -64,20 +64,13 @@ def merge_cells(points: np.ndarray, widths: np.ndarray) -> np.ndarray:
 
 
 def merge(points: np.ndarray, colors: np.ndarray, cells: np.ndarray) -> PointCloud:
-    """Return the mean point and colour of every cell, in the order of the cells' numbers.
-
-    Args:
-        points: Positions [u], shape [N, 3].
-        colors: Colours in [0, 1], shape [N, 3].
-        cells: Number of each point's cell, int64, shape [N].
-    """
+    """Return the mean point [u] and colour of every cell, in the order of the cells' numbers, which are ``cells`` [N]."""
     _, cells, counts = np.unique(cells, return_inverse=True, return_counts=True)
-    counts = counts[:, None]
-
-    def mean(values: np.ndarray) -> np.ndarray:
-        return np.stack([np.bincount(cells, v, len(counts)) for v in values.T.astype(float)], 1) / counts
-
-    return PointCloud(mean(points), mean(colors).astype(np.float32))
+    points, colors = (
+        np.stack([np.bincount(cells, v, len(counts)) for v in values.T.astype(float)], 1) / counts[:, None]
+        for values in (points, colors)
+    )
+    return PointCloud(points, colors.astype(np.float32))
 
 
 def in_free_space(points: np.ndarray, views: Sequence[View], depths: Sequence[np.ndarray], without: int) -> np.ndarray:
@@ -103,93 +96,65 @@ def focal_length(camera: Camera) -> float:
     return float(np.sqrt(camera.K[0, 0] * camera.K[1, 1]))
 
 
-@dataclass(frozen=True)
-class KnownPoints:
-    """Points of a reconstruction that at least two views saw."""
+def _tracked(points: PointCloud, views: Sequence[View]) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[Any]]:
+    """Return the points that at least two views saw, [N, 3] [u], none without tracks; and what the views know of them.
 
-    cloud: PointCloud
-    """Points and colours, N of them."""
-    widths: np.ndarray
-    """Width of a pixel at the depth of each point in the nearest view that saw it [u], shape [N]."""
-    pixels: list[tuple[np.ndarray, np.ndarray, np.ndarray]]
-    """Rows, columns and z-depths [u] of the points that each view saw, the farthest first; shape [S] each."""
-
-    @staticmethod
-    def of(points: PointCloud, views: Sequence[View]) -> KnownPoints:
-        """Return the points with at least two of the views in their tracks; none if tracks are unknown."""
-        names = {v.name for v in views}
-        keep = [t is not None and len(names & t) >= 2 for t in points.tracks or ()] or [False] * len(points)
-        chosen, tracks = np.nonzero(keep)[0], [t for t, k in zip(points.tracks or (), keep) if k]
-        cloud = PointCloud(points.points[chosen], points.colors[chosen])
-        widths, pixels = np.full(len(cloud), np.inf), []
-        for view in views:
-            tracked = np.array([view.name in t for t in tracks], bool)
-            own = np.nonzero(tracked)[0]
-            seen, rows, columns, z = geometry.seen_pixels(view.camera, cloud.points[own])
-            widths[own[seen]] = np.minimum(widths[own[seen]], z / focal_length(view.camera))
-            order = np.argsort(-z, kind="stable")  # of two in one pixel the nearer is written last
-            pixels.append((rows[order], columns[order], z[order]))
-        inside = np.isfinite(widths)
-        return KnownPoints(PointCloud(cloud.points[inside], cloud.colors[inside]), widths[inside], pixels)
-
-    def with_depths(self, i: int, depth: np.ndarray, sure: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return depth and mask of view ``i``, both [H, W], with the depths of these points where the mask was False."""
-        rows, columns, z = self.pixels[i]
-        new = ~sure[rows, columns]
-        depth, more = depth.copy(), sure.copy()
-        depth[rows[new], columns[new]], more[rows[new], columns[new]] = z[new], True
-        return depth, more
+    Colours [N, 3]; widths [N] of a pixel at each point in the nearest view that saw it [u]; rows, columns and z-depths [u] of
+    the points that each view saw, the farthest first.
+    """
+    cloud = points.seen_by({v.name for v in views}, 2) if points.tracks else NOTHING
+    widths, pixels = np.full(len(cloud), np.inf), []
+    for view in views:
+        own = np.flatnonzero([view.name in t for t in cloud.tracks or ()])
+        seen, rows, columns, z = geometry.seen_pixels(view.camera, cloud.points[own])
+        widths[own[seen]] = np.minimum(widths[own[seen]], z / focal_length(view.camera))
+        order = np.argsort(-z, kind="stable")  # of two in one pixel the nearer is written last
+        pixels.append((rows[order], columns[order], z[order]))
+    inside = np.isfinite(widths)
+    return cloud.points[inside], cloud.colors[inside], widths[inside], pixels
 
 
 def coarse_points(
     views: Sequence[View], depths: Sequence[ViewDepth], *, merge_px: float, fill_px: float, source: str,
     known: PointCloud = NOTHING,
 ) -> tuple[PointCloud, list[str]]:  # fmt: skip
-    """Return the points of the coarse start, and notes on them.
+    """Return the points of the coarse start, and notes on them: one for each view, and one on the merged cloud.
 
-    Args:
-        views: Training views.
-        depths: Geometrically consistent depth of each view, confirmed by other views.
-        merge_px: Width of the cells in which consistent points are merged into one [px]; 0 keeps every pixel.
-        fill_px: Width of the cells of filled points, where no depth is consistent [px]; 0 for no filled points. `complete`
-            gives the depths of filled points. No filled point is in space that another view sees through, or in the cell of a
-            consistent point. Views without estimated depth get no filled points, to bound the work for each view.
-        source: Name of the source in the notes, such as sweep or flow.
-        known: Points of a reconstruction. A point is used if at least two of the views see it and no depth is consistent there;
-            depth around such points is interpolated from them.
-
-    Returns:
-        The cloud: consistent points first, then points of the reconstruction, then filled points. And notes: one per view
-        ("image001.png: 71 % of pixels by flow, 20 % filled") and one on the merged cloud.
+    The cloud has first the pixels of the consistent ``depths``, merged in cells of ``merge_px`` [px] (0 keeps every pixel).
+    Then points of the reconstruction ``known`` that at least two of the views see, where no depth is consistent. Last, filled
+    points with the depths of `complete`, which interpolates from ``known``, too, in cells of ``fill_px`` [px] (0 for none). No
+    filled point is in space that another view sees through, or in the cell of a consistent point. Views without estimated
+    depth get no filled points, to bound the work for each view. ``source`` names the depths in the notes.
     """
     regions = [fitted_region(v) for v in views]
     consistent = [d.valid if r is None else d.valid & r for d, (r, _) in zip(depths, regions)]
-    seen = KnownPoints.of(known, views)
-    completed = {
-        i: complete(*seen.with_depths(i, depths[i].depth, consistent[i]), view.image)
-        for i, view in enumerate(views)
-        if fill_px > 0 and depths[i].searched
-    }
+    *reconstructed, pixels_of = _tracked(known, views)
+    completed = {}
+    for i, view in enumerate(views):
+        if fill_px > 0 and depths[i].searched:
+            depth, sure, (rows, columns, z) = depths[i].depth.copy(), consistent[i].copy(), pixels_of[i]
+            new = ~sure[rows, columns]
+            depth[rows[new], columns[new]], sure[rows[new], columns[new]] = z[new], True
+            completed[i] = complete(depth, sure, view.image)
     searched = [views[i] for i in completed], list(completed.values())
-    found, filled_in, notes = [], [], []
+    lifted, filled_in, notes = [], [], []
     for i, (view, depth, sure, (region, name)) in enumerate(zip(views, depths, consistent, regions)):
-        found.append(_lift(view, depth.depth, sure))
-        total = sure.size if region is None else region.sum()
-        text = f"{view.name}: {_fraction(sure.sum(), total)} of {'pixels' if region is None else f'the {name}'} by {source}"
+        lifted.append(_lift(view, depth.depth, sure))
+        counted = np.ones_like(sure) if region is None else region
+        total = max(1, counted.sum())
+        text = f"{view.name}: {100 * sure.sum() / total:.0f} % of {'pixels' if region is None else f'the {name}'} by {source}"
         if i in completed:
-            free = ~sure & (completed[i] > 0) if region is None else ~sure & region & (completed[i] > 0)
-            points, colors, widths = _lift(view, completed[i], free)
-            keep = ~in_free_space(points, *searched, list(completed).index(i))
-            filled_in.append((points[keep], colors[keep], widths[keep]))
-            text += f", {_fraction(keep.sum(), total)} filled"
+            rows = _lift(view, completed[i], ~sure & counted & (completed[i] > 0))
+            keep = ~in_free_space(rows[0], *searched, list(completed).index(i))
+            filled_in.append([row[keep] for row in rows])
+            text += f", {100 * keep.sum() / total:.0f} % filled"
         notes.append("; ".join((text, *depth.notes)))
-    points, colors, widths = (np.concatenate(a) for a in zip(*found))
+    points, colors, widths = (np.concatenate(a) for a in zip(*lifted))
     cloud = merge(points, colors, merge_cells(points, merge_px * widths) if merge_px > 0 else np.arange(len(points)))
     pixels, added, filled = len(points), NOTHING, NOTHING
     if merge_px > 0:
-        own = (seen.cloud.points, seen.cloud.colors, seen.widths)
-        added, new = _elsewhere(points, widths, *own, merge_px)
-        points, widths = np.concatenate([points, own[0][new]]), np.concatenate([widths, own[2][new]])
+        added, new = _elsewhere(points, widths, *reconstructed, merge_px)
+        points, widths = np.concatenate([points, reconstructed[0][new]]), np.concatenate([widths, reconstructed[2][new]])
     if filled_in:
         filled, _ = _elsewhere(points, widths, *(np.concatenate(a) for a in zip(*filled_in)), fill_px)
     more = f"{len(added):,} from the reconstruction, " if len(added) else ""
@@ -208,10 +173,6 @@ def _elsewhere(
     cells, taken = cells[len(points) :], cells[: len(points)]
     alone = ~np.isin(cells, taken)
     return merge(more[alone], colors[alone], cells[alone]), alone
-
-
-def _fraction(part: int, whole: int) -> str:
-    return f"{100 * part / max(1, whole):.0f} %"
 
 
 # Extrapolated points where no view looks: beyond the images, and behind the near side of depth edges.
@@ -241,20 +202,15 @@ def extrapolated_points(views: Sequence[View], depths: Sequence[ViewDepth]) -> P
     """Return extrapolated points: first points beyond the images of pinhole cameras, then points behind edges of depth.
 
     There are none if any view has a mask, an alpha channel or a black background, since the border of a masked region is not
-    the border of the image.
-
-    Args:
-        views: Training views.
-        depths: Geometrically consistent depth of each.
+    the border of the image. ``depths`` are the consistent depths of the views.
     """
     if not all_count(views):
         return NOTHING
     known = [i for i, d in enumerate(depths) if d.searched and d.valid.any()]
     filled = {i: complete(depths[i].depth, depths[i].valid, views[i].image) for i in known}
-    found = [_beyond(views, i, filled[i]) for i in known if views[i].camera.model == "pinhole"]
-    confirmed = [d.depth for d in depths]
-    found += [_behind(views, i, filled[i], confirmed) for i in known]
-    return joined((NOTHING, *found))
+    clouds = [_beyond(views, i, filled[i]) for i in known if views[i].camera.model == "pinhole"]
+    clouds += [_behind(views, i, filled[i], [d.depth for d in depths]) for i in known]
+    return joined((NOTHING, *clouds))
 
 
 def all_count(views: Sequence[View]) -> bool:
@@ -269,8 +225,7 @@ def _beyond(views: Sequence[View], i: int, depth: np.ndarray) -> PointCloud:
     pad = int(BEYOND * width)
     inverse = _mean_around(np.pad(1 / depth, pad, "edge"), DEPTH_PX)
     image = _mean_around(np.pad(view.image, ((pad, pad), (pad, pad), (0, 0)), "edge"), COLOR_PX)
-    half = BEYOND_PX // 2
-    rows, columns = np.mgrid[half : height + 2 * pad : BEYOND_PX, half : width + 2 * pad : BEYOND_PX].reshape(2, -1)
+    rows, columns = np.mgrid[BEYOND_PX // 2 : height + 2 * pad : BEYOND_PX, BEYOND_PX // 2 : width + 2 * pad : BEYOND_PX]
     outside = (rows < pad) | (rows >= height + pad) | (columns < pad) | (columns >= width + pad)
     rows, columns = rows[outside], columns[outside]
     pixels = np.stack([columns, rows], 1) - pad + 0.5
@@ -280,13 +235,9 @@ def _beyond(views: Sequence[View], i: int, depth: np.ndarray) -> PointCloud:
 
 
 def _behind(views: Sequence[View], i: int, depth: np.ndarray, confirmed: Sequence[np.ndarray]) -> PointCloud:
-    """Return points of far surfaces behind near ones in view ``i``; none occludes confirmed depth of another view.
+    """Return points of far surfaces behind near ones in view ``i`` of z-depth [u], known everywhere, [H, W].
 
-    Args:
-        views: All views.
-        i: Index of the view.
-        depth: Its z-depth [u], known everywhere, shape [H, W].
-        confirmed: Consistent depth of each view, 0 where there is none, shape [H, W] each.
+    None occludes ``confirmed`` depth of another view, 0 where there is none.
     """
     import cv2
 
@@ -299,8 +250,7 @@ def _behind(views: Sequence[View], i: int, depth: np.ndarray, confirmed: Sequenc
             beside, its_source = (_neighbour(t, axis, direction) for t in (far, source))
             ends = beside > STEP * far
             far, source = np.where(ends, beside, far), np.where(ends, its_source, source)
-    half = BEHIND_PX // 2
-    rows, columns = np.mgrid[half : depth.shape[0] : BEHIND_PX, half : depth.shape[1] : BEHIND_PX].reshape(2, -1)
+    rows, columns = np.mgrid[BEHIND_PX // 2 : depth.shape[0] : BEHIND_PX, BEHIND_PX // 2 : depth.shape[1] : BEHIND_PX]
     hidden = far[rows, columns] > EDGE * depth[rows, columns]
     rows, columns = rows[hidden], columns[hidden]
     pixels = np.stack([columns, rows], 1) + 0.5
@@ -320,11 +270,9 @@ def _neighbour(values: np.ndarray, axis: int, direction: int) -> np.ndarray:
 def _mean_around(values: np.ndarray, reach: int) -> np.ndarray:
     """Return the mean over the square of ``reach`` pixels to each side, border pixels repeated outwards, shape [H, W, ...]."""
     for axis in (0, 1):
-        count, pads = values.shape[axis], [(0, 0)] * values.ndim
-        pads[axis] = (reach, reach)
-        padded = np.pad(values, pads, "edge")
-        parts = [slice(None)] * axis
-        values = sum(padded[(*parts, slice(k, k + count))] for k in range(2 * reach + 1)) / (2 * reach + 1)
+        count = values.shape[axis]
+        padded = np.pad(values, [(reach * (a == axis),) * 2 for a in range(values.ndim)], "edge")
+        values = sum(padded.take(range(k, k + count), axis) for k in range(2 * reach + 1)) / (2 * reach + 1)
     return values
 
 
@@ -373,10 +321,7 @@ class Silhouette:
     def look(self, points: np.ndarray, radius: np.ndarray | float, pixels: float = 0.0) -> tuple[np.ndarray, ...]:
         """Return three masks [N] for balls around points [N, 3]: all pixels empty; all pixels opaque; the ball in view.
 
-        Args:
-            points: Centres of the balls [u].
-            radius: Radius of each ball, shape [N], or one radius for all [u].
-            pixels: Distance that is added to each radius in the image [px].
+        The ``radius`` of the balls [u] has shape [N], or is one for all; ``pixels`` are added to each radius in the image [px].
         """
         at, z = geometry.project_points(self.view.camera, points)
         before = z > radius  # the camera is not in the ball, and the ball not behind it
@@ -408,9 +353,6 @@ def carve(shapes: Sequence[Silhouette]) -> tuple[np.ndarray, float]:
 
     A cell is empty if more views than `TOLERANT` allows show nothing there, and inside if all views that see it show only the
     object. Other cells are divided until they are `FINEST` px wide in the views, or `PROJECTIONS` is reached.
-
-    Args:
-        shapes: At least two silhouettes.
     """
     cameras = [s.view.camera for s in shapes]
     focus = geometry.focus_point(cameras)
@@ -435,14 +377,12 @@ def _surface(cells: np.ndarray, half: float, shapes: Sequence[Silhouette]) -> np
     """Return the cells [N, 3] that are neither empty nor inside; ``half`` is half the width of a cell [u]."""
     empty, inside, seen = (np.zeros(len(cells), int) for _ in range(3))
     at = np.arange(len(cells))
-    for k, shape in enumerate(shapes):
+    for shape in shapes:
         nothing, full, there = shape.look(cells[at], 3**0.5 * half)
         empty[at] += nothing
         inside[at] += full | ~there
         seen[at] += there
         at = at[empty[at] <= len(shapes) // TOLERANT]
-        if k + 1 == len(shapes):
-            break
     kept = (seen[at] >= max(2.0, SEEN * len(shapes))) & (inside[at] < len(shapes))
     return cells[at[kept]]
 
@@ -453,7 +393,8 @@ def _seen_colors(shapes: Sequence[Silhouette], cells: np.ndarray, width: float) 
     A cell is kept if at least `LEAST_VIEWS` views see it at an opaque pixel, unoccluded by other cells, and in similar colours;
     other cells may be empty parts of the hull.
     """
-    total, squares, counts = np.zeros((len(cells), 3)), np.zeros((len(cells), 3)), np.zeros(len(cells), int)
+    total, squares = np.zeros((2, len(cells), 3))
+    counts = np.zeros(len(cells), int)
     for shape in shapes:
         view = shape.view
         there, rows, columns, z = geometry.seen_pixels(view.camera, cells)
@@ -467,28 +408,24 @@ def _seen_colors(shapes: Sequence[Silhouette], cells: np.ndarray, width: float) 
         total[seen] += colors
         squares[seen] += colors**2
         counts[seen] += 1
-    mean = total / np.maximum(counts, 1)[:, None]
-    variance = squares / np.maximum(counts, 1)[:, None] - mean**2
-    return mean, (counts >= LEAST_VIEWS) & (variance.max(1) <= LIKE**2)
+    counts = counts[:, None]
+    mean = total / np.maximum(counts, 1)
+    variance = squares / np.maximum(counts, 1) - mean**2
+    return mean, (counts[:, 0] >= LEAST_VIEWS) & (variance.max(1) <= LIKE**2)
 
 
 def hull_points(views: Sequence[View], merge_px: float) -> tuple[PointCloud, str]:
     """Return points on the surface of the visual hull with the colours of the views that see them, and a sentence on them.
 
-    Args:
-        views: Training views; those with an alpha channel carve.
-        merge_px: Width of the cells in which points are merged into one [px]; 0 merges none.
-
-    Returns:
-        The cloud, empty if fewer than two views have an alpha channel or the silhouettes do not overlap.
+    Views with an alpha channel carve; without two of them, or if the silhouettes do not overlap, there are no points. Points
+    are merged in cells of ``merge_px`` [px]; 0 merges none.
     """
     shapes = silhouettes(views)
-    nothing = PointCloud(np.zeros((0, 3)), np.zeros((0, 3), np.float32))
     if len(shapes) < 2:
-        return nothing, f"no hull: {len(shapes)} of {len(views)} views have an alpha channel; at least two are needed"
+        return NOTHING, f"no hull: {len(shapes)} of {len(views)} views have an alpha channel; at least two are needed"
     cells, width = carve(shapes)
     if not len(cells):
-        return nothing, "no hull: the silhouettes do not overlap in space; check that the poses belong to the images"
+        return NOTHING, "no hull: the silhouettes do not overlap in space; check that the poses belong to the images"
     colors, kept = _seen_colors(shapes, cells, width)
     total, cells, colors = len(cells), cells[kept], colors[kept]
     wide = max(width, merge_px * _footprint([s.view.camera for s in shapes], cells))

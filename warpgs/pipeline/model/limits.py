@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any
 
 import numpy as np
 import torch
@@ -39,26 +39,23 @@ class Limits:
     """Smallest standard deviation of an axis [px], in the camera that samples the Gaussian most finely; 0 for no such limit."""
 
     @torch.no_grad()
-    def hold(self, params: dict[str, torch.Tensor], cameras: TrainingCameras, going: torch.Tensor | None = None) -> None:
-        """Bring logarithms of axes [N, 3] within the limits, in place; a second call changes nothing.
+    def hold(
+        self, params: dict[str, torch.Tensor], cameras: tuple[torch.Tensor, torch.Tensor], going: torch.Tensor | None = None
+    ) -> None:
+        """Bring ``log_scales`` [N, 3] of Gaussians at ``means`` [N, 3] within the limits, in place; twice is as once.
 
         Axes are raised to the smallest size, then cut to the largest, which has priority. If the longest axis is then too long
         for the middle one, the middle one grows. A flat disk stays flat. Moments of Adam do not change. The call may be part of
-        a captured step.
-
-        Args:
-            params: ``means`` [N, 3] and ``log_scales`` [N, 3] of `Gaussians`.
-            cameras: Training cameras.
-            going: Whether the step is taken, bool, shape [1]; if False, nothing changes. None stands for True.
+        a captured step. ``cameras`` are `camera_centers` and `camera_rows`. If ``going`` [1] is False, nothing changes.
         """
         if self == NO_LIMITS:
             return
         new = old = params["log_scales"].detach()
         if self.pixels > 0:
-            new = torch.maximum(new, pixel_size(params["means"].detach(), cameras.rows, self.pixels)[:, None])
+            new = torch.maximum(new, pixel_size(params["means"].detach(), cameras[1], self.pixels)[:, None])
         new = new.clamp(max=math.log(self.largest))
         if self.reach > 0:
-            new = torch.minimum(new, camera_reach(params["means"].detach(), cameras.centers, self.reach)[:, None])
+            new = torch.minimum(new, camera_reach(params["means"].detach(), cameras[0], self.reach)[:, None])
         new = torch.where(old.isinf(), old, new)  # non-finite values stay visible
         if self.ratio < math.inf:
             longest, middle = (x[:, None] for x in long_axes(new))
@@ -68,8 +65,6 @@ class Limits:
 
 NO_LIMITS = Limits()
 """Limits that change nothing."""
-
-
 MIN_PIXELS = 0.2**0.5
 """Smallest standard deviation of an axis in an antialiased fit, in pixels of the training camera that samples the Gaussian most
 finely: the 3D filter of Mip-Splatting (Yu et al. 2024), which it replaces, has a variance of 0.2 pixels squared."""
@@ -91,50 +86,32 @@ class LimitConfig(Checked, group="limits."):
     views."""
 
     def at(self, progress: float, radius: float, antialiased: bool = False) -> Limits:
-        """Return the limits of a step.
+        """Return the limits of a step in a scene of a ``radius`` [u] (`scene_radius`).
 
-        Args:
-            progress: Fraction of the fit that is done before the step, in [0, 1]; 1 for the last step, which has all limits.
-            radius: Result of `scene_radius` [u].
-            antialiased: True in an antialiased fit.
+        ``progress`` is the fraction of the fit that is done before the step; 1 for the last step, which has all limits.
         """
         held = self.max_ratio > 0 and (progress > RATIO_FROM or progress == 1)
         largest = self.max_size * radius if self.max_size > 0 else math.inf
         return Limits(largest, self.max_ratio if held else math.inf, self.max_reach, MIN_PIXELS if antialiased else 0.0)
 
 
-class TrainingCameras(NamedTuple):
-    """Tensors of the training cameras, for limits of sizes."""
-
-    centers: torch.Tensor
-    """Result of `camera_centers`, shape [K, 3]."""
-    rows: torch.Tensor
-    """All cameras as `pixel_size` takes them, float32, shape [C, 9]."""
-
-    @staticmethod
-    def of(cameras: Sequence[Camera], device: torch.device) -> TrainingCameras:
-        """Return the tensors of at least one camera on a device."""
-        rows = np.stack([_camera_row(c) for c in cameras])
-        return TrainingCameras(camera_centers(cameras, device), torch.as_tensor(rows, dtype=torch.float32, device=device))
-
-
-def _camera_row(camera: Camera) -> np.ndarray:
-    """Return a camera as `pixel_size` takes it, shape [9]; its cone holds eight points of the border of the image.
+def camera_rows(cameras: Sequence[Camera], device: torch.device) -> torch.Tensor:
+    """Return the cameras as `pixel_size` takes them, float32 [C, 9]; the cone of each holds eight points of its image's border.
 
     If the lens does not reach one of these points, the cone is the whole field of view of the lens. For a camera model without
     a centre, pixels have size 0 and limit nothing.
     """
-    f, center = np.array([camera.K[0, 0], camera.K[1, 1]]), camera.K[:2, 2]
-    ends = np.array([(x, y) for x in (0, 0.5, 1) for y in (0, 0.5, 1) if (x, y) != (0.5, 0.5)])
-    points = (ends * (camera.width, camera.height) - center) / f
-    by_distance, central = camera.model == "fisheye", camera.model in geometry.CENTRAL
-    cosine = -1.0 if by_distance else 0.0
-    if central:
-        rays = geometry.from_plane(camera.model, camera.distortion, points)
-        cosines = rays[:, 2] / np.linalg.norm(rays, axis=1)
-        cosine = float(cosines.min()) if np.isfinite(cosines).all() else cosine
-    focal = f.max() if central else math.inf
-    return np.array([*camera.center, *camera.viewmat[2, :3], focal, cosine, by_distance])
+    rows, ends = [], np.array([(x, y) for x in (0, 0.5, 1) for y in (0, 0.5, 1) if (x, y) != (0.5, 0.5)])
+    for camera in cameras:
+        f, by_distance, central = camera.K[[0, 1], [0, 1]], camera.model == "fisheye", camera.model in geometry.CENTRAL
+        cosine = -1.0 if by_distance else 0.0
+        if central:
+            points = (ends * (camera.width, camera.height) - camera.K[:2, 2]) / f
+            rays = geometry.from_plane(camera.model, camera.distortion, points)
+            cosines = rays[:, 2] / np.linalg.norm(rays, axis=1)
+            cosine = float(cosines.min()) if np.isfinite(cosines).all() else cosine
+        rows.append([*camera.center, *camera.viewmat[2, :3], f.max() if central else math.inf, cosine, by_distance])
+    return torch.as_tensor(np.array(rows), dtype=torch.float32, device=device)
 
 
 def camera_centers(cameras: Sequence[Camera], device: torch.device) -> torch.Tensor:
@@ -164,21 +141,13 @@ def scene_radius(cameras: list[Camera], cloud: PointCloud) -> float:
 def shape_figures(
     gaussians: Gaussians, config: LimitConfig, radius: float, extent: float, cameras: Sequence[Camera]
 ) -> dict[str, Any]:
-    """Return the figures of size and shape of a model for metrics.json.
+    """Return the figures of size and shape of a model for metrics.json; at least one camera, a limit of 0 is never exceeded.
 
-    Args:
-        gaussians: N Gaussians.
-        config: Limits; a limit of 0 is never exceeded.
-        radius: Result of `scene_radius` [u].
-        extent: Result of `scene_extent` [u].
-        cameras: Training cameras, at least one.
-
-    Returns:
-        ``radius`` and ``extent`` [u]; the ``largest`` standard deviation [u], and its ratios to the radius and to the extent;
-        the largest ratio of a standard deviation to the distance of the nearest camera, among the cameras that `camera_centers`
-        chooses; ``needles``, the fraction of Gaussians whose longest axis is more than `NEEDLE` times the middle one;
-        ``needles_by_opacity``, this fraction weighted by opacity; ``thin``, the fraction whose longest axis is more than
-        `NEEDLE` times the shortest; and the number of Gaussians ``beyond`` the limits.
+    ``radius`` and ``extent`` [u] (`scene_radius`, `scene_extent`); the ``largest`` standard deviation [u], and its ratios to
+    both; the largest ratio of a standard deviation to the distance of the nearest of `camera_centers`; ``needles``, the
+    fraction of Gaussians whose longest axis is more than `NEEDLE` times the middle one; ``needles_by_opacity``, this fraction
+    weighted by opacity; ``thin``, the fraction whose longest axis is more than `NEEDLE` times the shortest; and the number of
+    Gaussians ``beyond`` the limits.
     """
     scales = gaussians.log_scales.detach().cpu().double()
     longest, middle = long_axes(scales)
@@ -186,10 +155,9 @@ def shape_figures(
     needle = longest - middle > math.log(NEEDLE) + ROUNDING
     thin = longest - scales.amin(1) > math.log(NEEDLE) + ROUNDING
     at = config.at(1.0, radius)
-    largest = math.log(at.largest) + ROUNDING, math.log(at.ratio) + ROUNDING
     means, centers = gaussians.means.detach().cpu().float(), camera_centers(cameras, torch.device("cpu"))
     over = longest - camera_reach(means, centers, 1.0).double()
-    beyond = (longest > largest[0]) | (longest - middle > largest[1])
+    beyond = (longest > math.log(at.largest) + ROUNDING) | (longest - middle > math.log(at.ratio) + ROUNDING)
     if at.reach > 0:
         beyond |= over > math.log(at.reach) + ROUNDING
     count, sigma = max(1, len(gaussians)), float(longest.max().exp()) if len(gaussians) else 0.0
@@ -203,12 +171,11 @@ def shape_figures(
     }  # fmt: skip
 
 
-def shape_summary(figures: dict[str, Any]) -> str:
+def shape_summary(f: dict[str, Any]) -> str:
     """Return the values of `shape_figures` as one line for the user."""
-    f = figures
     return (
-        f"shape: the largest axis is {f['largest_over_radius']:.2g} of the scene's radius, "
-        f"{f['largest_over_extent']:.2g} of the cameras' extent, and {f['largest_over_distance']:.2g} of the distance to the "
-        f"nearest camera; {f['needles']:.1%} of the Gaussians are needles, more than "
-        f"{NEEDLE:g} times as long as wide ({f['needles_by_opacity']:.1%} by opacity); {f['beyond']:,} exceed the limits"
+        f"shape: the largest axis is {f['largest_over_radius']:.2g} of the scene's radius, {f['largest_over_extent']:.2g} of "
+        f"the cameras' extent, and {f['largest_over_distance']:.2g} of the distance to the nearest camera; {f['needles']:.1%} "
+        f"of the Gaussians are needles, more than {NEEDLE:g} times as long as wide ({f['needles_by_opacity']:.1%} by opacity); "
+        f"{f['beyond']:,} exceed the limits"
     )

@@ -27,9 +27,9 @@ from warpgs.pipeline.model.depth_points import (
     joined,
     silhouettes,
 )
-from warpgs.priors.flow import EpipolarConfig, flow_between, flow_depth, triangulate_matches
+from warpgs.priors.flow import flow_between, flow_depth, triangulate_matches
 from warpgs.priors.given_depth import any_given, with_given_depth
-from warpgs.priors.sweep import CPU, SweepConfig, sweep_depths
+from warpgs.priors.sweep import CPU, sweep_depths
 from warpgs.scene import Camera, Gaussians, PointCloud, View, ViewDepth, base_coefficients
 from warpgs.schema import Checked, Within
 
@@ -45,6 +45,10 @@ DEPTH_SPREAD = 0.1
 """Standard deviation of the logarithm of depth around a matched point."""
 
 
+Device, Say = Callable[[], torch.device], Callable[[str], object]
+"""A function that waits until the device to sweep on may be used, and returns it; one that shows a line of progress."""
+
+
 def camera_depths(views: list[View]) -> tuple[float, float]:
     """Return the default near and far depth [u]: 0.1 and 10 times the distance to the cameras' focus point.
 
@@ -58,13 +62,13 @@ def camera_depths(views: list[View]) -> tuple[float, float]:
 
 def nearest(points: np.ndarray, queries: np.ndarray, count: int) -> np.ndarray:
     """Return the rows of the ``count`` points [P, 2] nearest to each query [Q, 2], the nearest first, int64 [Q, count]."""
-    known, asked = torch.from_numpy(points), torch.from_numpy(queries)
-    found = []
+    known = torch.from_numpy(points)
+    rows = []
     # every pair, some rows at a time: a few hundred points take less time than importing a library of search trees
-    for rows in asked.split(max(1, PAIRS // max(1, len(known)))):
-        squares = sum((rows[:, i, None] - known[None, :, i]) ** 2 for i in range(2))
-        found.append(squares.topk(count, largest=False).indices)
-    return torch.cat(found).numpy()
+    for asked in torch.from_numpy(queries).split(max(1, PAIRS // max(1, len(known)))):
+        squares = sum((asked[:, i, None] - known[None, :, i]) ** 2 for i in range(2))
+        rows.append(squares.topk(count, largest=False).indices)
+    return torch.cat(rows).numpy()
 
 
 class _Depths:
@@ -113,14 +117,13 @@ def random_points(views: list[View], count: int, generator: np.random.Generator)
         DataError: Masks leave no pixel of any training view.
     """
     regions = [fitted_region(v) for v in views]
-    matched = triangulate_matches(views)
-    bounds = camera_depths(views)
+    matched, bounds = triangulate_matches(views), camera_depths(views)
     sources = [_Depths(v, matched, bounds) for v in views]
+    objects, cut_out = (sum(name == of for _, name in regions) for of in OBJECTS)
     points, colors = [], []
-    for i, (view, source) in enumerate(zip(views, sources)):
+    for i, (view, source, (region, _)) in enumerate(zip(views, sources, regions)):
         wanted = (i + 1) * count // len(views) - i * count // len(views)
-        free = np.ones(view.image.shape[:2], bool) if regions[i][0] is None else regions[i][0]
-        rows, columns = np.nonzero(free)
+        rows, columns = np.nonzero(np.ones(view.image.shape[:2], bool) if region is None else region)
         if len(rows) == 0:
             continue
         chosen = generator.integers(len(rows), size=8 * wanted)
@@ -128,27 +131,20 @@ def random_points(views: list[View], count: int, generator: np.random.Generator)
         pixels = np.stack([columns, rows], 1) + 0.5
         elsewhere = not source.has_matches and len(views) > 1
         # where all are equally good, the first are taken, and the others need no depth
-        useful = len(pixels) if elsewhere or any(name in OBJECTS for _, name in regions) else wanted
+        useful = len(pixels) if elsewhere or objects or cut_out else wanted
         candidates = geometry.back_project(view.camera, pixels[:useful], source.sample(pixels, useful, generator))
         worse = empty_votes(views, regions, candidates)
         if elsewhere:
             worse += sum(geometry.in_image(v.camera, candidates).astype(int) for v in views) < 2
-        order = np.argsort(worse, kind="stable")
-        candidates, rows, columns = candidates[order], rows[order], columns[order]
-        points.append(candidates[:wanted])
-        colors.append(view.image[rows[:wanted], columns[:wanted]])
+        best = np.argsort(worse, kind="stable")[:wanted]
+        points.append(candidates[best])
+        colors.append(view.image[rows[best], columns[best]])
     if not points:
-        raise DataError(
-            "no random start: all pixels of the training views are masked out or transparent; check --mask-keeps and the alpha "
-            "channel of the images"
-        )
+        raise DataError("no random start: masks or alpha hide all pixels of the views; check --mask-keeps and the images")
     with_matches = sum(s.has_matches for s in sources)
     how = f"{count:,} random points, {with_matches} of {len(views)} views with depths from {len(matched):,} matched points"
-    objects, cut_out = (sum(name == of for _, name in regions) for of in OBJECTS)
-    if objects:
-        how += f", on the object ({objects} views show it on black)"
-    if cut_out:
-        how += f", in the opaque areas of {cut_out} views"
+    how += f", on the object ({objects} views show it on black)" if objects else ""
+    how += f", in the opaque areas of {cut_out} views" if cut_out else ""
     return PointCloud(np.concatenate(points), np.concatenate(colors)), how
 
 
@@ -202,40 +198,29 @@ class Start(NamedTuple):
 
 
 def consistent_depths(
-    views: list[View], known: PointCloud, config: InitConfig, device: Callable[[], torch.device] = lambda: CPU,
-    progress: Callable[[str], object] = lambda line: None,
-) -> list[ViewDepth]:  # fmt: skip
+    views: list[View], known: PointCloud, config: InitConfig, device: Device = lambda: CPU, progress: Say = lambda line: None
+) -> list[ViewDepth]:
     """Return the geometrically consistent depth of each of at least two views, by flow or by sweeping planes.
 
-    Args:
-        views: Training views.
-        known: Points that bound the planes.
-        config: Source and its settings.
-        device: Function that waits until the device to sweep on may be used, and returns it.
-        progress: Called with a line for the user about the current work.
+    ``known`` points bound the planes.
     """
     if config.source == "flow":
         between = flow_between(views, config.flow)
-        return [flow_depth(views, i, between, EpipolarConfig()) for i in range(len(views))]
+        return [flow_depth(views, i, between) for i in range(len(views))]
     points = np.concatenate([known.points, triangulate_matches(views).points])
     bounds = [depth_bounds(v, points, camera_depths(views)) for v in views]
-    return sweep_depths(
-        views, bounds, SweepConfig(), device(),
-        lambda done, total: progress(f"finding depth: {done} of {total} views"),
-    )  # fmt: skip
+    return sweep_depths(views, bounds, device(), lambda n, of: progress(f"finding depth: {n} of {of} views"))
 
 
 def consistent_points(
-    views: list[View], points: PointCloud, config: InitConfig, generator: np.random.Generator,
-    device: Callable[[], torch.device], progress: Callable[[str], object],
-) -> Start:  # fmt: skip
+    views: list[View], points: PointCloud, config: InitConfig, generator: np.random.Generator, device: Device, progress: Say
+) -> Start:
     """Return points behind pixels whose depth other views confirm, and a line on each view.
 
     If fewer than `MIN_POINTS` points are found, the start is random, with a note.
     """
-    reason, depths, given, source = "depth needs at least two views", None, [], config.source
-    if len(views) > 1:
-        depths = consistent_depths(views, points, config, device, progress)
+    depths = consistent_depths(views, points, config, device, progress) if len(views) > 1 else None
+    reason, given, source = "depth needs at least two views", [], config.source
     if any_given(views):
         source, (depths, given) = f"given depth and {source}", with_given_depth(views, depths, points)
     if depths is not None:
@@ -244,21 +229,16 @@ def consistent_points(
         )
         if len(cloud) >= MIN_POINTS:
             extrapolated = extrapolated_points(views, depths) if config.extrapolate else NOTHING
-            if config.extrapolate:
-                notes[-1] += f", {_number_extrapolated(views, len(extrapolated))}"
+            if len(extrapolated):
+                notes[-1] += f", {len(extrapolated):,} extrapolated where no view looks"
+            elif config.extrapolate:
+                why = "" if all_count(views) else ", because masks, an alpha channel or a black background hide parts of views"
+                notes[-1] += f", none extrapolated{why}"
             how = "\n".join((notes[-1], *given, *(f"    {n}" for n in notes[:-1])))
             return Start(joined((cloud, extrapolated)), how, depths, len(extrapolated))
         reason = f"only {len(cloud)} points survived the checks ({' | '.join(notes[:-1])}); do the views overlap?"
     cloud, how = random_points(views, config.random_count, generator)
     return Start(cloud, f"{how}, instead of --init.source {config.source}: {reason}", depths)
-
-
-def _number_extrapolated(views: list[View], count: int) -> str:
-    """Describe, for the user, how many points are extrapolated, or why there are none."""
-    if count:
-        return f"{count:,} extrapolated where no view looks"
-    hidden = "" if all_count(views) else ", because masks, an alpha channel or a black background hide parts of the views"
-    return f"none extrapolated{hidden}"
 
 
 def seen_points(views: list[View], points: PointCloud | None) -> PointCloud:
@@ -283,16 +263,9 @@ def extrapolates(config: InitConfig, views: list[View]) -> bool:
 
 
 def check_points(views: list[View], points: PointCloud | None, config: InitConfig) -> None:
-    """Check that a start from points has points that the training views saw.
-
-    Raises:
-        DataError: The training views saw no points, and ``config`` needs them.
-    """
+    """Check that a start from points has points that the training views saw; DataError if it has none."""
     if config.source == "points" and len(seen_points(views, points)) == 0:
-        raise DataError(
-            "--init.source points needs 3D points that the training views saw, but the scene has none; use --init.source "
-            "random, or give a reconstruction with points"
-        )
+        raise DataError("--init.source points needs 3D points that training views saw; give them, or use --init.source random")
 
 
 def on_object(start: Start, views: list[View]) -> Start:
@@ -300,12 +273,9 @@ def on_object(start: Start, views: list[View]) -> Start:
 
     If fewer than `MIN_POINTS` points would be left, the start is unchanged.
     """
-    shapes = silhouettes(views)
-    if not shapes:
-        return start
-    cloud = start.cloud
+    cloud, shapes = start.cloud, silhouettes(views)
     keep = ~in_empty_region(shapes, cloud.points)
-    if keep.all():
+    if not shapes or keep.all():
         return start
     count = int(keep.sum())
     if count < MIN_POINTS:
@@ -317,16 +287,9 @@ def on_object(start: Start, views: list[View]) -> Start:
 
 def initial_points(
     views: list[View], points: PointCloud | None, config: InitConfig, generator: np.random.Generator,
-    device: Callable[[], torch.device] = lambda: CPU, progress: Callable[[str], object] = lambda line: None,
+    device: Device = lambda: CPU, progress: Say = lambda line: None,
 ) -> Start:  # fmt: skip
-    """Return the points to start from.
-
-    ``device`` waits until the device to sweep on may be used, and returns it; ``progress`` is called with lines about the
-    current work.
-
-    Raises:
-        DataError: The training views saw no points, and ``config`` needs them; or masks leave no pixel for a random start.
-    """
+    """Return the points to start from; DataError if there are none. Arguments are those of `consistent_depths`."""
     check_points(views, points, config)
     if config.source == "hull":
         cloud, how = hull_points(views, config.merge_px)
@@ -334,28 +297,23 @@ def initial_points(
             return Start(cloud, how)
         cloud, made = random_points(views, config.random_count, generator)
         return Start(cloud, f"{made}, instead of --init.source hull: {how}")
-    found = on_object(_found_points(views, points, config, generator, device, progress), views)
-    if config.extrapolate and found.depths is None:
-        return found._replace(how=f"{found.how}\nno extrapolated points: they need --init.source sweep or flow")
-    return found
-
-
-def _found_points(
-    views: list[View], points: PointCloud | None, config: InitConfig, generator: np.random.Generator,
-    device: Callable[[], torch.device], progress: Callable[[str], object],
-) -> Start:  # fmt: skip
-    """Return the points of a source other than the hull."""
     usable = seen_points(views, points)
+    by_depth = config.source in ("sweep", "flow")
     if config.source == "auto" and (sweeps(config, len(views)) or any_given(views)):
-        return consistent_points(views, usable, dataclasses.replace(config, source="sweep"), generator, device, progress)
-    if config.source in ("sweep", "flow"):
-        return consistent_points(views, usable, config, generator, device, progress)
-    if config.source == "points" or (config.source == "auto" and len(usable) >= MIN_POINTS):
-        return Start(usable, f"{len(usable):,} points of the reconstruction that the training views saw")
-    cloud, how = random_points(views, config.random_count, generator)
-    if config.source == "auto" and points is not None:
-        how += f" (the reconstruction has only {len(usable)} points that the training views saw)"
-    return Start(cloud, how)
+        by_depth, config = True, dataclasses.replace(config, source="sweep")
+    if by_depth:
+        start = consistent_points(views, usable, config, generator, device, progress)
+    elif config.source == "points" or (config.source == "auto" and len(usable) >= MIN_POINTS):
+        start = Start(usable, f"{len(usable):,} points of the reconstruction that the training views saw")
+    else:
+        start = Start(*random_points(views, config.random_count, generator))
+        if config.source == "auto" and points is not None:
+            few = f"{start.how} (the reconstruction has only {len(usable)} points that the training views saw)"
+            start = start._replace(how=few)
+    start = on_object(start, views)
+    if config.extrapolate and start.depths is None:
+        return start._replace(how=f"{start.how}\nno extrapolated points: they need --init.source sweep or flow")
+    return start
 
 
 def subsample(start: Start, most: int, generator: np.random.Generator) -> Start:
@@ -381,16 +339,8 @@ def initial_gaussians(
 ) -> Gaussians:
     """Return one isotropic Gaussian per point; widths follow the root mean square distance to the three nearest points.
 
-    Args:
-        cloud: At least one point.
-        config: Opacity, and the factor from distances to widths.
-        sh_degree: Degree of the spherical harmonics, 0 to 4.
-        extent: Size of the scene [u]; the distances are limited to 1e-6 to 0.1 of the size, also for coincident or lone points.
-        device: Device of the tensors, float32.
-        extrapolated: Number of extrapolated points, which are the last of the cloud and start with `EXTRAPOLATED_OPACITY`.
-
-    Returns:
-        The Gaussians.
+    There is at least one point. The distances are limited to 1e-6 to 0.1 of the ``extent`` of the scene [u], also for
+    coincident or lone points. The last ``extrapolated`` points start with `EXTRAPOLATED_OPACITY`. Tensors are float32.
     """
     points = torch.as_tensor(cloud.points, dtype=torch.float32, device=device)
     colors = torch.as_tensor(cloud.colors, dtype=torch.float32, device=device)
@@ -400,14 +350,7 @@ def initial_gaussians(
     scales = config.scale_factor * distances.clamp(1e-6 * extent, 0.1 * extent)
     sh = points.new_zeros(count, coefficient_count(sh_degree), 3)
     sh[:, 0] = base_coefficients(colors)
-    quats = points.new_zeros(count, 4)
-    quats[:, 0] = 1
+    quats = points.new_tensor([1, 0, 0, 0]).repeat(count, 1)
     logits = points.new_full((count,), geometry.logit(config.opacity))
     logits[count - extrapolated :] = geometry.logit(EXTRAPOLATED_OPACITY)
-    return Gaussians(
-        means=points,
-        quats=quats,
-        log_scales=scales.log().to(points.dtype)[:, None].repeat(1, 3),
-        logit_opacities=logits,
-        sh=sh,
-    )
+    return Gaussians(points, quats, scales.log().to(points.dtype)[:, None].repeat(1, 3), logits, sh)

@@ -18,7 +18,6 @@ from warpgs.geometry import check_stored, checked_normalization, convert_camera,
 from warpgs.kernels.neighbours import morton_codes
 from warpgs.kernels.sh import MAX_DEGREE
 from warpgs.kernels.update import BETAS, adam_scheduled, scheduled_lrs
-from warpgs.pipeline.metrics.scores import options_for
 from warpgs.render.options import RasterizeOptions
 from warpgs.scene import Camera, Gaussians, Normalization
 from warpgs.version import __version__
@@ -39,36 +38,23 @@ def truncated(sh: torch.Tensor, degrees: torch.Tensor) -> torch.Tensor:
 
 
 def pack(sh: torch.Tensor, degrees: torch.Tensor) -> torch.Tensor:
-    """Pack coefficients, given as [N, K, 3], up to each Gaussian's degree [N], Gaussian by Gaussian, into one vector [M].
-
-    Raises:
-        ValueError: The degrees do not ascend; Gaussians are stored sorted by degree, so that equal degrees make one block.
-    """
+    """Pack coefficients [N, K, 3] up to each Gaussian's degree [N], which ascend, into one vector [M]."""
     if bool((degrees.diff() < 0).any()):
         raise ValueError("degrees must ascend; sort the Gaussians by degree first")
-    blocks = [sh[degrees == d, : (d + 1) ** 2].reshape(-1) for d in range(MAX_DEGREE + 1)]
-    return torch.cat(blocks)
+    return torch.cat([sh[degrees == d, : (d + 1) ** 2].reshape(-1) for d in range(MAX_DEGREE + 1)])
 
 
 def unpack(packed: torch.Tensor, degrees: torch.Tensor) -> torch.Tensor:
-    """Return coefficients [N, K, 3] from the vector [M] of `pack`: K for the highest degree, 0 above each Gaussian's degree.
-
-    Raises:
-        ValueError: The degrees are not integers from 0 to 4, or do not match the packed coefficients.
-    """
+    """Return coefficients [N, K, 3] from the vector [M] of `pack`: K for the highest degree, 0 above each Gaussian's degree."""
     whole = degrees.ndim == 1 and not degrees.is_floating_point() and bool(((degrees >= 0) & (degrees <= MAX_DEGREE)).all())
-    count = 3 * int((degrees.long() + 1).square().sum()) if whole else -1
-    if packed.shape != (count,):
-        raise ValueError(
-            f"{list(packed.shape)} packed coefficients do not match {list(degrees.shape)} degrees from 0 to {MAX_DEGREE}"
-        )
+    if packed.shape != (3 * int((degrees.long() + 1).square().sum()) if whole else -1,):
+        raise ValueError(f"coefficients {list(packed.shape)} do not fit degrees {list(degrees.shape)}, 0 to {MAX_DEGREE}")
     highest = int(degrees.max()) if len(degrees) else 0
     sh, at = packed.new_zeros(len(degrees), (highest + 1) ** 2, 3), 0
     for d in range(highest + 1):
-        rows = degrees == d
-        size = 3 * (d + 1) ** 2 * int(rows.sum())
-        sh[rows, : (d + 1) ** 2] = packed[at : at + size].reshape(-1, (d + 1) ** 2, 3)
-        at += size
+        block = sh[degrees == d, : (d + 1) ** 2]
+        sh[degrees == d, : (d + 1) ** 2] = packed[at : at + block.numel()].view_as(block)
+        at += block.numel()
     return sh
 
 
@@ -128,8 +114,7 @@ class Table:
         """
         self.device = device
         self.params = {n: t.detach().clone().contiguous().requires_grad_() for n, t in params.items()}
-        self.exp_avg = {n: torch.zeros_like(t) for n, t in self.params.items()}
-        self.exp_avg_sq = {n: torch.zeros_like(t) for n, t in self.params.items()}
+        self.exp_avg, self.exp_avg_sq = ({n: torch.zeros_like(t) for n, t in self.params.items()} for _ in range(2))
         self.kinds: dict[str, Column] = {}
         self.columns: dict[str, torch.Tensor] = {}
         self.count = count
@@ -223,21 +208,25 @@ class Table:
         Raises:
             UsageError: A parameter is missing, or the numbers of new rows and parents differ.
         """
-        none = {} if update.added or len(update.parents) else {n: t.detach()[:0] for n, t in self.params.items()}
-        new_rows, keep, parents = none or update.added, update.keep, update.parents.to(self.device)
-        rows = {n: len(new_rows[n]) if n in new_rows else None for n in self.params}
+        added, keep, parents = update.added, update.keep, update.parents.to(self.device)
+        if not added and not len(parents):
+            added = {n: t.detach()[:0] for n, t in self.params.items()}
+        rows = {n: len(added[n]) if n in added else None for n in self.params}
         if any(count != len(parents) for count in rows.values()):
             raise UsageError(
                 f"a DensityUpdate has {len(parents)} parents but adds {rows} rows: each parameter needs one row for "
                 "each entry of parents (-1 for a row without a parent)"
             )
         if update.overwritten is not None:
-            self._overwrite(update.overwritten, update.values)
+            for name, value in update.values.items():
+                self.params[name].detach()[update.overwritten] = value.to(self.params[name].dtype)
+            for t in (*self.exp_avg.values(), *self.exp_avg_sq.values()):
+                t[update.overwritten] = 0
         for name in self.params:  # each old tensor is freed before the next is allocated
-            added = new_rows[name].to(self.params[name].dtype)
-            self.params[name] = torch.cat([self.params[name].detach()[keep], added]).requires_grad_()
+            new = added[name].to(self.params[name].dtype)
+            self.params[name] = torch.cat([self.params[name].detach()[keep], new]).requires_grad_()
             for moments in (self.exp_avg, self.exp_avg_sq):
-                moments[name] = torch.cat([moments[name][keep], torch.zeros_like(added)])
+                moments[name] = torch.cat([moments[name][keep], torch.zeros_like(new)])
         for name, kind in self.kinds.items():
             old = self.columns[name]
             new = old.new_full((len(parents),), update.columns.get(name, kind.fill))
@@ -246,17 +235,10 @@ class Table:
             self.columns[name] = torch.cat([old[keep], new])
         self.count = len(keep) + len(parents)
 
-    def _overwrite(self, rows: torch.Tensor, values: Mapping[str, torch.Tensor]) -> None:
-        for name, value in values.items():
-            self.params[name].detach()[rows] = value.to(self.params[name].dtype)
-        for moments in (self.exp_avg, self.exp_avg_sq):
-            for t in moments.values():
-                t[rows] = 0
-
     @torch.no_grad()
     def reorder(self, order: torch.Tensor) -> None:
         """Move row ``order[i]`` to row i; ``order`` is int64, shape [N]."""
-        for group in (self.params, self.exp_avg, self.exp_avg_sq, self.columns):
+        for group in self._groups().values():
             for name in group:
                 group[name] = group[name].detach()[order]
         for param in self.params.values():
@@ -270,8 +252,8 @@ class Table:
         """Limit every opacity to this value in (0, 1), and reset the moments of all opacities (the reset of 3DGS)."""
         limit = logit(opacity)  # in float64: the smallest float32 opacity would be 0
         self.params["logit_opacities"] = self.params["logit_opacities"].detach().clamp(max=limit).requires_grad_()
-        self.exp_avg["logit_opacities"].zero_()
-        self.exp_avg_sq["logit_opacities"].zero_()
+        for moments in (self.exp_avg, self.exp_avg_sq):
+            moments["logit_opacities"].zero_()
 
     def _groups(self) -> dict[str, dict[str, torch.Tensor]]:
         return {"params": self.params, "exp_avg": self.exp_avg, "exp_avg_sq": self.exp_avg_sq, "columns": self.columns}
@@ -286,23 +268,21 @@ class Table:
         Raises:
             DataError: Columns or parameters are missing, unknown, or of the wrong shape or type.
         """
-        own, stored = set(self.state()), {n for n in state if n.partition(".")[0] in self._groups()}
-        if own != stored:
+        own = self.state()
+        stored = {n: t for n, t in state.items() if n.partition(".")[0] in self._groups()}
+        if own.keys() != stored.keys():
             raise DataError(
-                f"the stored table has other columns or parameters: {', '.join(sorted(own ^ stored))}; continue with the "
-                "code and the settings that the run was started with"
+                f"the stored table has other columns or parameters: {', '.join(sorted(own.keys() ^ stored.keys()))}; continue "
+                "with the code and the settings that the run was started with"
             )
-        rows = {state[n].shape[:1] for n in stored}
-        for name, own_tensor in self.state().items():
-            t = state[name]
-            if len(rows) > 1 or t.shape[1:] != own_tensor.shape[1:] or t.dtype != own_tensor.dtype:
-                raise DataError(
-                    f"the stored table is inconsistent: {name} has shape {list(t.shape)} and type {t.dtype}, expected "
-                    f"[N, {', '.join(map(str, own_tensor.shape[1:]))}] and {own_tensor.dtype}, with one N for all tensors"
-                )
+        same_rows = len({t.shape[:1] for t in stored.values()}) <= 1
+        for name, t in stored.items():
+            if not same_rows or t.shape[1:] != own[name].shape[1:] or t.dtype != own[name].dtype:
+                wanted = f"[N, {', '.join(map(str, own[name].shape[1:]))}] and {own[name].dtype}, with one N for all tensors"
+                raise DataError(f"the stored {name} has shape {list(t.shape)} and type {t.dtype}, expected {wanted}")
         for group, tensors in self._groups().items():
             for name in tensors:
-                tensors[name] = state[f"{group}.{name}"].to(self.device).contiguous()
+                tensors[name] = stored[f"{group}.{name}"].to(self.device).contiguous()
         for t in self.params.values():
             t.requires_grad_()
         self.count = len(next(iter(self.params.values()))) if self.params else self.count
@@ -357,7 +337,8 @@ class FittedModel(Model):
 
     def options(self) -> RasterizeOptions:
         """Return the rasterizer's options of the fit: rule, background and antialiasing."""
-        return options_for(self.rule, self.background, self.scene_gaussians, self.antialiased)
+        background = self.scene_gaussians.means.new_tensor(self.background)
+        return RasterizeOptions(rule=self.rule, background=background, antialiased=self.antialiased)
 
 
 def save(path: str | Path, gaussians: Gaussians, normalization: Normalization | None = None, units: str = "scene") -> None:
@@ -381,17 +362,14 @@ def save(path: str | Path, gaussians: Gaussians, normalization: Normalization | 
     """
     from safetensors.torch import save as to_bytes
 
-    check_stored(gaussians)
-    _check_type(gaussians)
-    normalization = checked_normalization(normalization, units, f"{path}: not written")
-    tensors = {n: t.detach().cpu().contiguous() for n, t in gaussians.tensors().items()}
-    for name, t in tensors.items():
-        if not bool(torch.isfinite(t).all()):
-            raise DataError(f"{path}: not written, {name} holds non-finite values; save an earlier state of the model")
+    where = f"{path}: not written"
+    _check_values(gaussians, where)
+    normalization = checked_normalization(normalization, units, where)
     header = {
         "format": FORMAT, "version": __version__, "units": units, "scale": repr(float(normalization.scale)),
         "offset": json.dumps([float(v) for v in normalization.offset]),
     }  # fmt: skip
+    tensors = {n: t.detach().cpu().contiguous() for n, t in gaussians.tensors().items()}
     write_bytes(Path(path), to_bytes(tensors, header))
 
 
@@ -422,43 +400,34 @@ def load(path: str | Path, device: str | torch.device = "cpu") -> Model:
     try:
         offset = schema.parse(header["offset"])
         schema.items(schema.number(), 3)(offset, "offset")
-        found = Normalization(np.array(offset, np.float64), float(header["scale"]))
-        normalization = checked_normalization(found, units := header["units"], str(path))
+        similarity = Normalization(np.array(offset, np.float64), float(header["scale"]))
+        normalization = checked_normalization(similarity, units := header["units"], str(path))
     except (KeyError, ValueError, UsageError) as e:
         raise DataError(f"{path}: its header is damaged ({e}); write it again with warpgs.save") from e
-    gaussians = checked_gaussians(tensors, str(path))
-    gaussians = gaussians.to(device)
+    gaussians = checked_gaussians(tensors, str(path)).to(device)
     return Model(convert_gaussians(gaussians, normalization, units, "scene"), normalization)
 
 
 def checked_gaussians(tensors: Mapping[str, torch.Tensor], where: str) -> Gaussians:
-    """Return stored tensors as Gaussians.
-
-    Args:
-        tensors: Fields of `Gaussians` by name, of any shape [...].
-        where: Path of their file, for messages.
-
-    Raises:
-        DataError: A tensor is missing or not finite, or shapes or types do not match.
-    """
+    """Return the tensors of a file as Gaussians; DataError that begins with ``where`` if they are not."""
     names = Gaussians.__dataclass_fields__
     missing = [n for n in names if n not in tensors]
     if missing:
         raise DataError(f"{where}: {', '.join(missing)} missing; restore the file, or write it again")
     gaussians = Gaussians(**{n: tensors[n] for n in names})
     try:
-        check_stored(gaussians)
-        _check_type(gaussians)
+        _check_values(gaussians, where)
     except (TypeError, ValueError) as e:
         raise DataError(f"{where}: {e}; restore the file, or write it again") from e
-    for name, t in gaussians.tensors().items():
-        if not bool(torch.isfinite(t).all()):
-            raise DataError(f"{where}: {name} holds non-finite values; restore the file, or write it again")
     return gaussians
 
 
-def _check_type(gaussians: Gaussians) -> None:
-    """Raise TypeError if tensors are not all float32 or all float64."""
+def _check_values(gaussians: Gaussians, where: str) -> None:
+    """Check that stored Gaussians have matching shapes, one type, float32 or float64, and finite values."""
+    check_stored(gaussians)
     for name, t in gaussians.tensors().items():
         if t.dtype not in (torch.float32, torch.float64) or t.dtype != gaussians.means.dtype:
             raise TypeError(f"{name} is {t.dtype}; give all tensors as float32 or all as float64")
+    for name, t in gaussians.tensors().items():
+        if not bool(torch.isfinite(t).all()):
+            raise DataError(f"{where}: {name} holds non-finite values; use an earlier state of the model")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import torch
 
@@ -54,29 +53,17 @@ def normalized(score: torch.Tensor, valid: torch.Tensor | None = None) -> torch.
     return ((score - low) / (high - low)).clamp(0, 1)
 
 
-def _slopes(image: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return central differences [1/px] along x and y, one-sided at the border."""
-    dy, dx = torch.gradient(image)
-    return dx, dy
-
-
 def geometry_score(disparity: torch.Tensor, valid: torch.Tensor | None = None) -> torch.Tensor:
     """Compute S_geometry: length of the disparity's gradient plus `CURVATURE` times the norm of its second derivatives.
 
-    Both are scaled to [0, 1] before they are added, and so is the sum, since relative disparity has no unit.
-
-    Args:
-        disparity: Relative inverse depth, shape [H, W].
-        valid: Pixels that determine the range, bool, shape [H, W]; None for all.
-
-    Returns:
-        Score in [0, 1], shape [H, W].
+    Both are scaled to [0, 1] over valid pixels [H, W] before they are added, and so is the sum, since relative disparity [H, W]
+    has no unit.
     """
     if min(disparity.shape) < 2:
         return torch.zeros_like(disparity)
     smooth = blur(disparity)
-    dx, dy = _slopes(smooth)
-    (dxx, dxy), (_, dyy) = _slopes(dx), _slopes(dy)
+    dy, dx = torch.gradient(smooth)  # central differences [1/px], one-sided at the border
+    (dxy, dxx), (dyy, _) = torch.gradient(dx), torch.gradient(dy)
     bend = (dxx**2 + 2 * dxy**2 + dyy**2).double().sqrt().to(smooth.dtype)
     return normalized(normalized(torch.hypot(dx, dy), valid) + CURVATURE * normalized(bend, valid), valid)
 
@@ -115,31 +102,18 @@ HIDDEN = 1.05
 """A point is hidden in a view if its depth exceeds the rendered depth by this factor."""
 
 
-class Residual(NamedTuple):
-    """Residual of one view, averaged over the footprint of a Gaussian."""
-
-    camera: Camera
-    """Camera of the view, tensors."""
-    blurred: torch.Tensor
-    """I - C (three channels) and (I - C) . C of image I and render C, blurred by the footprint, shape [H, W, 4]."""
-    depth: torch.Tensor
-    """Rendered z-depth [u], shape [H, W]."""
+Residual = tuple[Camera, torch.Tensor, torch.Tensor]
+"""Camera of a view with tensors; I - C (three channels) and (I - C) . C of image I and render C, blurred by the footprint of a
+Gaussian, shape [H, W, 4]; and rendered z-depth [u], shape [H, W]."""
 
 
 def residual_of(view: TrainingView, rgb: torch.Tensor, depth: torch.Tensor, footprint: float) -> Residual:
-    """Return the residual of a view; it is 0 at masked and transparent pixels.
-
-    Args:
-        view: The view.
-        rgb: Rendered colours after the view modules of the fit, shape [H, W, 3].
-        depth: Rendered depth [u], shape [H, W].
-        footprint: Standard deviation of a Gaussian in the image [px].
-    """
+    """Return the residual of a view's render, 0 at masked and transparent pixels, for a footprint [px]."""
     residual = view.image - rgb
     if view.countable is not None:
         residual = residual * view.countable[..., None]
     channels = (*residual.unbind(-1), (residual * rgb).sum(-1))
-    return Residual(view.camera, torch.stack([blur(c.contiguous(), footprint) for c in channels], -1), depth)
+    return view.camera, torch.stack([blur(c.contiguous(), footprint) for c in channels], -1), depth
 
 
 def gains(points: torch.Tensor, colors: torch.Tensor, residuals: Sequence[Residual]) -> torch.Tensor:
@@ -148,11 +122,6 @@ def gains(points: torch.Tensor, colors: torch.Tensor, residuals: Sequence[Residu
     A Gaussian of colour c, opacity o and footprint w in front of a colour C changes C to C + o w (c - C). The squared error to
     the image I falls by 2 o sum w (I - C) . (c - C) to first order. The sum is c times the blurred residual, minus the blurred
     (I - C) . C. The gain adds the sums of all views in which the point is not hidden.
-
-    Args:
-        points: World points [u], shape [S, 3].
-        colors: Their colours, shape [S, 3].
-        residuals: Residual of each view.
     """
     total = torch.zeros_like(points[:, 0])
     for camera, blurred, depth in residuals:
@@ -167,14 +136,7 @@ def gains(points: torch.Tensor, colors: torch.Tensor, residuals: Sequence[Residu
 
 
 def gain_map(view: TrainingView, depth: torch.Tensor, valid: torch.Tensor, residuals: Sequence[Residual]) -> torch.Tensor:
-    """Return the gain of a Gaussian behind each pixel, in the pixel's colour, negative gains as 0, shape [H, W].
-
-    Args:
-        view: The view with the pixels.
-        depth: Depth that Gaussians are placed at [u], shape [H, W].
-        valid: Pixels with a depth, bool, shape [H, W].
-        residuals: Residual of each view.
-    """
+    """Return the gain of a Gaussian behind each valid pixel, in the pixel's colour, negative gains as 0, shape [H, W]."""
     at = torch.nonzero(valid[::EVERY, ::EVERY])
     rows, columns = (EVERY * at).unbind(1)
     points = back_project_tensors(view.camera, torch.stack([columns, rows], 1).to(depth.dtype) + 0.5, depth[rows, columns])
@@ -189,17 +151,9 @@ SUPPORT = 4
 
 
 def geometry_gate(geometry: torch.Tensor, valid: torch.Tensor, quantile: float, wanted: int) -> tuple[torch.Tensor, float]:
-    """Return M_reliable, the valid pixels with a geometric score above a quantile over valid pixels, and the quantile used.
+    """Return M_reliable, the valid pixels with S_geometry [H, W] above a quantile (tau_geometry), and the quantile used.
 
-    Args:
-        geometry: S_geometry, shape [H, W].
-        valid: Pixels that may be sampled at all, bool, shape [H, W].
-        quantile: tau_geometry as a quantile, in [0, 1).
-        wanted: Number of pixels to be sampled; the gate is widened until `SUPPORT` times this number, or all valid pixels,
-            pass.
-
-    Returns:
-        The gate, bool, shape [H, W], and the quantile that was used; if the score is constant, all valid pixels pass.
+    The gate is widened until `SUPPORT` times the ``wanted`` number of pixels, or all valid ones, pass.
     """
     values = geometry[valid]
     while quantile > 0 and len(values) > 0:

@@ -4,29 +4,17 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from itertools import accumulate
+from typing import Any
 
 import torch
 
 from warpgs.errors import UsageError
-from warpgs.kernels.graphs import CapturedGraph
 from warpgs.kernels.update import end_step
-from warpgs.pipeline.train.step import (
-    Capacities,
-    Learned,
-    StepBuffers,
-    StepGraphs,
-    StepPlan,
-    ViewGradients,
-    descend,
-    eager_renderer,
-    settle,
-    step,
-    steps_at_once,
-    view_gradients,
-)
-from warpgs.pipeline.train.views import Kind, ViewStack
+from warpgs.pipeline.model.table import Table
+from warpgs.pipeline.train.step import StepBuffers, StepPlan, StepTaker, steps_at_once
+from warpgs.pipeline.train.strategies.base import Strategy
+from warpgs.pipeline.train.views import Kind, LearnedViews, ViewStack
 from warpgs.ranks import Ranks
 from warpgs.render.options import RasterizeOptions
 
@@ -54,11 +42,7 @@ MAX_RENDERS = 2**24
 
 
 def check_ranks(batch: int, ranks: Ranks) -> None:
-    """Check that every process has a view in each step of ``batch`` views.
-
-    Raises:
-        UsageError: A step has fewer views than processes.
-    """
+    """Check that every process has a view in each step of ``batch`` views."""
     if batch < ranks.count:
         raise UsageError(
             f"--batch {batch} is less than the number of ranks, {ranks.count}; give --batch {ranks.count} or a multiple "
@@ -67,11 +51,7 @@ def check_ranks(batch: int, ranks: Ranks) -> None:
 
 
 def check_renders(batch: int, steps: int) -> None:
-    """Check that the number of renders in ``steps`` of ``batch`` views is below `MAX_RENDERS`.
-
-    Raises:
-        UsageError: The number is too large.
-    """
+    """Check that the number of renders in ``steps`` of ``batch`` views is below `MAX_RENDERS`."""
     if batch > 1 and steps * batch >= MAX_RENDERS:
         raise UsageError(f"{steps:,} steps of {batch} views are more than {MAX_RENDERS:,} renders; lower --steps or --batch")
 
@@ -115,44 +95,25 @@ def finished(node: Node, known: Mapping[Node, torch.Tensor]) -> torch.Tensor:
     return left.add_(right)
 
 
-@dataclass(frozen=True)
 class Tree:
     """The tree over the slots of a step, and the part that each process adds."""
 
-    batch: int
-    """Number of slots B."""
-    ranks: Ranks
-    """The processes."""
-
-    @property
-    def slots(self) -> range:
+    def __init__(self, batch: int, ranks: Ranks):
+        """Divide ``batch`` slots among the processes."""
+        self.batch, self.ranks = batch, ranks
+        of_ranks = [own_slots(batch, ranks.count, rank) for rank in range(ranks.count)]
+        self.slots = of_ranks[ranks.rank]
         """Slots of this process."""
-        return own_slots(self.batch, self.ranks.count, self.ranks.rank)
-
-    @property
-    def nodes(self) -> list[list[Node]]:
+        self.nodes = [subtrees(slots, (0, batch)) for slots in of_ranks]
         """Subtrees that each process sums."""
-        count, whole = self.ranks.count, (0, self.batch)
-        return [subtrees(own_slots(self.batch, count, rank), whole) for rank in range(count)]
-
-    @property
-    def width(self) -> int:
+        self.width = max(map(len, self.nodes))
         """Largest number of subtrees that a process sums."""
-        return max(map(len, self.nodes))
-
-    @property
-    def rows(self) -> int:
-        """Number of sums that a process keeps side by side: partial sums, and at least one for each exchanged sum.
-
-        This is the largest number that any process needs, so that all processes plan the same memory and so the same limits.
-        """
-        return max(self.width, *(k + depth(node) for nodes in self.nodes for k, node in enumerate(nodes)))
-
-    @property
-    def buffers(self) -> int:
+        self.rows = max(self.width, *(k + depth(node) for nodes in self.nodes for k, node in enumerate(nodes)))
+        """Number of sums that a process keeps side by side: partial sums, and at least one for each exchanged sum. It is the
+        largest that any process needs, so that all plan the same memory and so the same limits."""
+        exchanged = 0 if ranks.count == 1 else self.width + (self.width if self.width > 1 else 0)
+        self.buffers = self.rows + exchanged
         """Total number of sums that a process keeps, including copies for the exchange."""
-        exchanged = 0 if self.ranks.count == 1 else self.width + (self.width if self.width > 1 else 0)
-        return self.rows + exchanged
 
 
 class SlotSums:
@@ -165,15 +126,7 @@ class SlotSums:
     def __init__(
         self, tree: Tree, shapes: Sequence[tuple[int, ...]], device: torch.device, *, means: int = 0, large: int | None = None
     ):
-        """Allocate memory for the sums.
-
-        Args:
-            tree: The tree.
-            shapes: Shape of each tensor.
-            device: Where sums are kept.
-            means: Number of leading tensors whose sums become means over the slots.
-            large: Index of the tensor whose rows are divided if it has at least `DIVIDED_BYTES`; None for no such tensor.
-        """
+        """Allocate memory; sums of the first ``means`` tensors become means, and rows of tensor ``large`` may be divided."""
         self.tree, self.shapes = tree, [tuple(s) for s in shapes]
         counts, unit = [torch.Size(s).numel() for s in self.shapes], ALIGNMENT * tree.ranks.count
         order = sorted(range(len(counts)), key=lambda k: k != large)
@@ -206,14 +159,8 @@ class SlotSums:
     def add_up(self, slot: Callable[[int, list[torch.Tensor], bool], None]) -> list[torch.Tensor]:
         """Add the slots of all processes; every process gets the same sums of the tensors, in their shapes [...].
 
-        Divided rows then hold the sum of this process's slots only, until `sum_own_rows` is called.
-
-        Args:
-            slot: Function of a slot's number, the tensors of a sum, and a flag: True to add to the tensors, False to overwrite
-                them.
-
-        Raises:
-            ResourceError: Another process was lost.
+        ``slot`` is a function of a slot's number, the tensors of a sum, and a flag: True to add to them, False to overwrite
+        them. Divided rows then hold the sum of this process's slots only, until `sum_own_rows` is called.
         """
         own = self.tree.nodes[self.tree.ranks.rank]
         for row, node in enumerate(own):
@@ -276,296 +223,150 @@ STOP, FLAGS = 2, 3
 and the first slot's reason to stop the step."""
 
 
-class SumUpdate:
-    """The update of a step by sums over its slots."""
-
-    def __init__(
-        self, learned: Learned, plan: StepPlan, buffers: StepBuffers, sums: SlotSums, names: Sequence[str], large: str,
-        said: torch.Tensor,
-    ):  # fmt: skip
-        """Keep the parts of the update.
-
-        Args:
-            learned: Tables and strategy that the step changes.
-            plan: Fixed choices of the step.
-            buffers: Settings of the steps, and their results.
-            sums: Means of gradients, and sums of statistics and of the slots' losses and flags.
-            names: Names of the statistics.
-            large: Parameter whose rows the sums may divide among processes.
-            said: Sums of losses and flags in the last step, or in the step that a slot stopped, [`FLAGS` + B]; written by the
-                update.
-        """
-        self.learned, self.plan, self.buffers, self.sums, self.large, self.said = learned, plan, buffers, sums, large, said
-        parts = sums.parts()
-        self.gradients, self.statistics = parts[: -1 - len(names)], dict(zip(names, parts[-1 - len(names) : -1], strict=True))
-        self.lrs, self.settings = torch.zeros_like(buffers.lr_rows[0]), torch.zeros_like(buffers.setting_rows[0])
-        self.going = torch.zeros(1, dtype=torch.bool, device=buffers.device)
-
-    def functions(self, captured: Callable[[Callable[[], object]], Callable[[], object]]) -> list[Callable[[], object]]:
-        """Return the functions of the update in their order; ``captured`` converts a function, such as to a graph."""
-        names = list(self.learned.table.params)
-        if not self.sums.divided:
-            return [captured(functools.partial(self._whole, names))]
-        coefficients, sums = self.learned.table.params[self.large].detach(), self.sums
-        return [
-            captured(functools.partial(self._common, [n for n in names if n != self.large])),
-            sums.sum_own_rows,
-            captured(functools.partial(self._descend, [self.large], sums.own_rows)),
-            functools.partial(sums.share, coefficients),
-            captured(self._settle),
-        ]
-
-    @torch.no_grad()
-    def _whole(self, names: list[str]) -> None:
-        self._begin()
-        self._descend(names)
-        self._settle()
-
-    @torch.no_grad()
-    def _common(self, names: list[str]) -> None:
-        """Update what every process updates: all rows of these parameters, and undivided rows of the large parameter."""
-        self._begin()
-        self._descend(names)
-        self._descend([self.large], slice(self.sums.divided, None))
-
-    @torch.no_grad()
-    def _begin(self) -> None:
-        """Check whether a slot stops the step; if not, count the step; load its settings."""
-        b = self.buffers
-        self.said.copy_(torch.where(b.stop == 0, self.sums.parts()[-1], self.said))
-        b.stop.copy_(torch.maximum(b.stop, self.said[FLAGS:].max().int()))
-        self.lrs.copy_(b.lr_rows.index_select(0, b.counter)[0])
-        self.settings.copy_(b.setting_rows.index_select(0, b.counter)[0])
-        loss, mse = self.said[:STOP] / self.sums.tree.batch
-        self.going.copy_(end_step(loss, mse, b.counter, b.stop, b.history))
-
-    def _descend(self, names: list[str], rows: slice = slice(None)) -> None:
-        found = ViewGradients(self.gradients, {}, self.lrs, self.settings, self.going)
-        descend(self.learned, self.plan, found, self.buffers.stop, names, rows)
-
-    @torch.no_grad()
-    def _settle(self) -> None:
-        statistics = {n: torch.where(self.going, t, 0) for n, t in self.statistics.items()}
-        settle(self.learned, self.plan, ViewGradients(self.gradients, statistics, self.lrs, self.settings, self.going))
-
-    def complete(self) -> None:
-        """Send all processes the moments of divided rows, which only the updating process has."""
-        if self.sums.divided:
-            for moments in (self.learned.table.exp_avg, self.learned.table.exp_avg_sq):
-                self.sums.share(moments[self.large])
-
-
-class BatchSteps:
+class BatchSteps(StepTaker):
     """Steps of B views each."""
 
-    def __init__(self, learned: Learned, buffers: StepBuffers, options: RasterizeOptions, tree: Tree):
-        """Begin without memory for sums.
-
-        Args:
-            learned: Tables and strategy that steps change.
-            buffers: Settings and results of steps.
-            options: Rule, background [3] and antialiasing of the fit.
-            tree: The slots and their order.
-        """
-        self.learned, self.buffers, self.tree, self.options = learned, buffers, tree, options
-        self.slots = StepBuffers(buffers.device, 1, steps_at_once(tree.batch) * len(tree.slots))
+    def __init__(
+        self, table: Table, views: LearnedViews, strategy: Strategy, cameras: Sequence[torch.Tensor],
+        options: RasterizeOptions, dropout_seed: int | None, tree: Tree,
+    ):  # fmt: skip
+        """Begin without memory for sums."""
+        super().__init__(table, views, strategy, cameras, options, dropout_seed)
+        b = self.buffers
+        self.tree, self.kept_sums = tree, tree.buffers
+        self.slots = StepBuffers(b.device, 1, steps_at_once(tree.batch) * len(tree.slots))
         """Settings and results of this process's slots, step by step."""
-        self.said = torch.zeros(FLAGS + tree.batch, device=buffers.device, dtype=torch.float32)
+        self.said = torch.zeros(FLAGS + tree.batch, device=b.device, dtype=torch.float32)
         """Sums of the slots' losses, errors and flags in the last step, or in the step that a slot stopped."""
         self.told_to_stop = False
         """True if this process was asked to stop; the next step tells all other processes."""
         self.sums: SlotSums | None = None
-        """Sums over slots, with the shapes of the last step."""
-        self._capacities = Capacities(learned, options)
-        self._graphs = self._updates = None
-        if buffers.device.type == "cuda":
-            self._graphs = StepGraphs(learned, self.slots, options, view_gradients)
-            self._graphs.capacities = self._capacities  # a kind that is captured later keeps the capacity that all agreed on
-            self._updates = StepGraphs(learned, buffers, options)
-        self._update: tuple[SumUpdate, list[Callable[[], object]]] | None = None
+        """Means of gradients, and sums of statistics and of ``said``, with the shapes of the last step."""
+        self.large = ""
+        """Parameter whose rows the sums may divide among processes."""
+        self._update: tuple[StepPlan, list[Callable[[], object]]] | None = None
+        self._lrs, self._settings = torch.zeros_like(b.lr_rows[0]), torch.zeros_like(b.setting_rows[0])
+        self._going = torch.zeros(1, dtype=torch.bool, device=b.device)
 
     def clear(self) -> None:
         """Drop all graphs, because the tensors that they refer to have changed."""
         self._update = None
-        self._capacities.clear()
-        if self._graphs is not None:
-            self._graphs.clear()
+        super().clear()
 
     def take(
-        self, places: Sequence[tuple[Kind, int]], settings: Sequence[tuple[float, ...]], stacks: Mapping[Kind, ViewStack],
-        plan: StepPlan, max_instances: int | None, *, captured: bool,
+        self, places: list[tuple[Kind, int]], settings: Callable[[], Sequence[tuple[float, ...]]],
+        stacks: Mapping[Kind, ViewStack], plan: StepPlan, max_instances: int | None, *, captured: bool,
     ) -> None:  # fmt: skip
-        """Take the steps of `buffers`, with their learning rates and settings.
-
-        Args:
-            places: Kind and row of each slot's view, for the slots of all processes, step by step.
-            settings: Settings of each slot, as `StepBuffers` takes them.
-            stacks: Views by kind.
-            plan: Fixed choices of the steps.
-            max_instances: Largest number of (Gaussian, tile) instances of a view at a time; None for no limit.
-            captured: Whether CUDA graphs are used.
-
-        Raises:
-            OverLimitError: The capacity of a graph would be above ``max_instances``; nothing was changed.
-            ResourceError: The instances would not fit into memory, or another process is gone.
-        """
+        """Take the steps of `buffers`; places and settings are those of the slots of all processes, step by step."""
         slots, batch = self.tree.slots, self.tree.batch
         if captured and max_instances is not None:  # in all processes, or one alone would go on without graphs
-            self._capacities.of([kind for kind, _ in places], stacks, plan, max_instances)
-        own = [i for i in range(len(places)) if i % batch in slots]
-        self.slots.load([places[i][1] for i in own], [[1.0]] * len(own), [settings[i] for i in own])
-        works = self._works([places[i][0] for i in own], stacks, plan, max_instances, captured)
+            for kind in dict.fromkeys(kind for kind, _ in places):
+                self.capacity(kind, stacks, plan, max_instances)
+        own, rows = [i for i in range(len(places)) if i % batch in slots], settings()
+        self.slots.load([places[i][1] for i in own], [[1.0]] * len(own), [rows[i] for i in own])
+        kinds = [places[i][0] for i in own]
+        works = self.works(self.view_gradients, kinds, self.slots, stacks, plan, max_instances, captured=captured)
         update: list[Callable[[], object]] = []
         for begin in range(0, len(own), len(slots)):  # a step each
-            first = [self._found(begin, works)]  # the strategy's statistics determine the sums
-            update = update or self._prepared(first[0], plan, captured)
+            first = [self._contribution(begin, works)]  # the strategy's statistics determine the sums
+            if not update:
+                sums, update = self._prepared(*first[0], plan, captured)
 
             def add(slot: int, parts: list[torch.Tensor], adds: bool) -> None:
                 place = begin + slot - slots.start  # noqa: B023
-                found = first.pop() if first else self._found(place, works)  # noqa: B023
-                self._add(slot, place, found, parts, adds)
+                self._add(slot, place, *(first.pop() if first else self._contribution(place, works)), parts, adds)  # noqa: B023
 
-            assert self.sums is not None
-            self.sums.add_up(add)
+            sums.add_up(add)
             for work in update:
                 work()
-        assert self._update is not None
-        self._update[0].complete()
+        if sums.divided:  # only the process that updates a row has its moments
+            for moments in (self.table.exp_avg, self.table.exp_avg_sq):
+                sums.share(moments[self.large])
 
-    def _found(self, place: int, works: Sequence[Callable[[], ViewGradients]]) -> ViewGradients:
-        """Return the contribution of a view; ``place`` counts this process's slots of all steps."""
+    def _contribution(self, place: int, works: list[Callable[[], Any]]) -> tuple[list[torch.Tensor], dict[str, torch.Tensor]]:
+        """Return the gradients and statistics of a view; ``place`` counts this process's slots of all steps."""
         self.slots.counter.fill_(place)
         self.slots.stop.zero_()
-        return works[place]()
-
-    def _works(
-        self, kinds: list[Kind], stacks: Mapping[Kind, ViewStack], plan: StepPlan, max_instances: int | None, captured: bool
-    ) -> list[Callable[[], ViewGradients]]:
-        """Return each slot's function for its gradients; ``kinds`` lists the kinds of view for this process's slots."""
-        if captured and self._graphs is not None:
-            return [_replayed(graph) for graph in self._graphs.capture_all(kinds, stacks, plan, max_instances)]
-        render = eager_renderer(self.options, max_instances)
-        return [functools.partial(view_gradients, self.learned, stacks[k], self.slots, plan, render) for k in kinds]
+        gradients, statistics, *_ = works[place]()
+        return gradients, statistics
 
     @torch.no_grad()
-    def _add(self, slot: int, place: int, found: ViewGradients, parts: list[torch.Tensor], adds: bool) -> None:
-        """Add the contribution of a slot to the parts of a sum, or overwrite the parts; ``place`` is as in `_found`."""
+    def _add(
+        self, slot: int, place: int, gradients: list[torch.Tensor], statistics: Mapping[str, torch.Tensor],
+        parts: list[torch.Tensor], adds: bool,
+    ) -> None:  # fmt: skip
+        """Add the contribution of a slot to the parts of a sum, or overwrite the parts; ``place`` as in `_contribution`."""
         said = parts[-1]
         if not adds:
             said.zero_()
-        for part, value in zip(parts[:-1], (*found.gradients, *found.statistics.values()), strict=True):
+        for part, value in zip(parts[:-1], (*gradients, *statistics.values()), strict=True):
             part.add_(value) if adds else part.copy_(value)
         said[:STOP] += self.slots.history[place]
         said[FLAGS + slot : FLAGS + slot + 1].copy_(self.slots.stop)
         if self.told_to_stop and slot == self.tree.slots.start:
             said[STOP : STOP + 1].fill_(1.0)
 
-    def _prepared(self, first: ViewGradients, plan: StepPlan, captured: bool) -> list[Callable[[], object]]:
-        """Return the functions that update by the sums; ``first`` determines the shapes of the sums."""
-        table, tensors = self.learned.table, (*first.gradients, *first.statistics.values())
-        shapes = [*(tuple(t.shape) for t in tensors), (FLAGS + self.tree.batch,)]
-        large = max(table.params, key=lambda n: table.params[n].numel())
+    def _prepared(
+        self, gradients: list[torch.Tensor], statistics: Mapping[str, torch.Tensor], plan: StepPlan, captured: bool
+    ) -> tuple[SlotSums, list[Callable[[], object]]]:
+        """Return sums, and the functions that update by them; their shapes are those of a view's contribution."""
+        shapes = [*(tuple(t.shape) for t in (*gradients, *statistics.values())), (FLAGS + self.tree.batch,)]
         if self.sums is None or self.sums.shapes != shapes:
             self.sums = self._update = None
-            place = list(table.params).index(large)
-            self.sums = SlotSums(self.tree, shapes, self.buffers.device, means=len(first.gradients), large=place)
-        if self._update is None or self._update[0].plan != plan:
-            update, graphs = (
-                SumUpdate(self.learned, plan, self.buffers, self.sums, tuple(first.statistics), large, self.said),
-                self._updates,
-            )
-            if captured and graphs is not None:
-                self._update = (update, update.functions(lambda work: graphs.capture(work).replay))
+            params = self.table.params
+            self.large = max(params, key=lambda n: params[n].numel())
+            place = list(params).index(self.large)
+            self.sums = SlotSums(self.tree, shapes, self.buffers.device, means=len(gradients), large=place)
+        if self._update is None or self._update[0] != plan:
+            parts, count = self.sums.parts(), len(gradients)
+            functions = self._functions(plan, self.sums, parts[:count], dict(zip(statistics, parts[count:-1], strict=True)))
+            if captured and self.cuda:  # all but the exchanges between processes
+                functions = [f if k % 2 else self.capture(f, self.buffers).replay for k, f in enumerate(functions)]
+            self._update = plan, functions
+        return self.sums, self._update[1]
+
+    def _functions(
+        self, plan: StepPlan, sums: SlotSums, gradients: list[torch.Tensor], statistics: dict[str, torch.Tensor]
+    ) -> list[Callable[[], object]]:
+        """Return the functions of an update by sums; every second one is an exchange between processes."""
+        b, lrs, divided = self.buffers, self._lrs, sums.divided
+
+        def descend(names: list[str], rows: slice = slice(None)) -> None:
+            self.descend(plan, gradients, lrs, b.stop, names, rows)
+
+        @torch.no_grad()
+        def common() -> None:
+            """Check whether a slot stops the step; if not, count it; update what every process updates."""
+            self.said.copy_(torch.where(b.stop == 0, sums.parts()[-1], self.said))
+            b.stop.copy_(torch.maximum(b.stop, self.said[FLAGS:].max().int()))
+            lrs.copy_(b.lr_rows.index_select(0, b.counter)[0])
+            self._settings.copy_(b.setting_rows.index_select(0, b.counter)[0])
+            loss, mse = self.said[:STOP] / self.tree.batch
+            self._going.copy_(end_step(loss, mse, b.counter, b.stop, b.history))
+            descend([n for n in self.table.params if not divided or n != self.large])
+            if divided:
+                descend([self.large], slice(divided, None))
             else:
-                self._update = (update, update.functions(lambda work: work))
-        return self._update[1]
+                settle()
 
-    def result(self) -> tuple[int, bool]:
-        """Return the first slot that stopped the steps (0 if none did), and whether a process was asked to stop."""
-        said = self.said.tolist()
-        return said.index(max(said[FLAGS:]), FLAGS) - FLAGS, said[STOP] > 0
+        @torch.no_grad()
+        def settle() -> None:
+            counted = {n: torch.where(self._going, t, 0) for n, t in statistics.items()}
+            self.settle(plan, gradients, counted, self._settings, self._going)
 
+        if not divided:
+            return [common]
+        share = functools.partial(sums.share, self.table.params[self.large].detach())
+        return [common, sums.sum_own_rows, functools.partial(descend, [self.large], sums.own_rows), share, settle]
 
-def _replayed(graph: CapturedGraph) -> Callable[[], ViewGradients]:
-    def work() -> ViewGradients:
-        graph.replay()
-        assert isinstance(graph.result, ViewGradients)
-        return graph.result
-
-    return work
-
-
-class StepTaker:
-    """Steps of one fit."""
-
-    def __init__(
-        self, learned: Learned, buffers: StepBuffers, options: RasterizeOptions, batch: int, ranks: Ranks
-    ):  # fmt: skip
-        """Begin without captured steps.
-
-        Args:
-            learned: Tables and strategy that steps change.
-            buffers: Settings and results of steps.
-            options: Rule, background [3] and antialiasing of the fit.
-            batch: Views of a step.
-            ranks: Processes that share the views of a step.
-        """
-        self.learned, self.buffers, self.options, self.ranks = learned, buffers, options, ranks
-        own = (learned, buffers, options)
-        self.graphs = StepGraphs(*own) if buffers.device.type == "cuda" else None
-        self.batched = BatchSteps(*own, Tree(batch, ranks)) if batch > 1 else None
-
-    @property
-    def sums(self) -> int:
-        """Number of sums of gradients that a step of several views keeps."""
-        return 0 if self.batched is None else self.batched.tree.buffers
-
-    @property
     def stopped_slot(self) -> int:
-        """First slot that stopped the last steps; 0 if none did, or in steps of one view."""
-        return 0 if self.batched is None else self.batched.result()[0]
-
-    def clear(self) -> None:
-        """Drop all graphs; they are captured again."""
-        for graphs in (self.graphs, self.batched):
-            if graphs is not None:
-                graphs.clear()
-
-    def take(
-        self, places: list[tuple[Kind, int]], settings: Callable[[], Sequence[tuple[float, ...]]],
-        stacks: Mapping[Kind, ViewStack], plan: StepPlan, max_instances: int | None, *, captured: bool,
-    ) -> None:  # fmt: skip
-        """Take the steps whose learning rates and settings the buffers hold.
-
-        Args:
-            places: Kind and row of each step's view; in steps of several views, kind and row of each slot's view, step by step.
-            settings: Returns the settings of each slot, step by step.
-            stacks: Views by kind.
-            plan: Fixed choices of the steps.
-            max_instances: Largest number of (Gaussian, tile) instances of a view at a time; None for no limit.
-            captured: Whether CUDA graphs are used.
-
-        Raises:
-            OverLimitError: The capacity of a graph would be above ``max_instances``; nothing was changed.
-            ResourceError: The instances would not fit into memory, or another process is gone.
-        """
-        kinds = [kind for kind, _ in places]
-        if self.batched is not None:
-            self.batched.take(places, settings(), stacks, plan, max_instances, captured=captured)
-        elif captured and self.graphs is not None:
-            for graph in self.graphs.capture_all(kinds, stacks, plan, max_instances):
-                graph.replay()
-        else:
-            render = eager_renderer(self.options, max_instances)
-            for kind in kinds:
-                step(self.learned, stacks[kind], self.buffers, plan, render)
+        """Return the first slot that stopped the last steps; 0 if none did."""
+        flags = self.said[FLAGS:].tolist()
+        return flags.index(max(flags))
 
     def agreed(self, stopped: bool) -> bool:
-        """Return whether to end after the last step; all processes get the same answer.
-
-        A request to stop reaches one process first, and the others with the next steps.
-        """
-        if self.batched is None or self.ranks.count == 1:
+        """Return whether to end after the last step: a request reaches one process first, the others with the next steps."""
+        if self.tree.ranks.count == 1:
             return stopped
-        self.batched.told_to_stop = stopped
-        return self.batched.result()[1]
+        self.told_to_stop = stopped
+        return float(self.said[STOP]) > 0

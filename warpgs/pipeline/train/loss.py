@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Annotated, ClassVar, TypeVar
+from typing import Annotated, ClassVar
 
 import torch
 
@@ -74,10 +74,6 @@ class LossInputs:
     """Number of the step, from 1: an integer as float32, shape []. It is a tensor, because a captured step is replayed
     for later steps; `LossTerm.active` gets the number on the host."""
 
-    def of(self, term: LossTerm) -> LossInputs:
-        """Return the inputs of one term, with only the outputs that it needs."""
-        return replace(self, outputs=_Outputs(term, self.outputs))
-
 
 @dataclass(frozen=True)
 class LossTerm(Checked):
@@ -127,12 +123,8 @@ register = LOSS_TERMS.register
 
 
 def term_values(terms: Sequence[LossTerm], inputs: LossInputs) -> list[torch.Tensor]:
-    """Compute each term from the outputs that it needs; returns values of shape [], in the order of the terms.
-
-    Raises:
-        UsageError: A term reads an output that it does not name in `LossTerm.needs_outputs`.
-    """
-    return [term(inputs.of(term)) for term in terms]
+    """Compute each term from the outputs that it needs; returns values of shape [], in the order of the terms."""
+    return [term(replace(inputs, outputs=_Outputs(term, inputs.outputs))) for term in terms]
 
 
 def outputs_of(terms: Sequence[LossTerm]) -> tuple[str, ...]:
@@ -156,51 +148,26 @@ def total(values: torch.Tensor) -> torch.Tensor:
     return values.flatten(1).sum(1).sum()
 
 
-Part = TypeVar("Part")
-
-
-def check_terms(terms: Sequence[LossTerm]) -> None:
-    """Check that a run folder can name the class of each loss term, and that a render has all outputs that they need.
-
-    Raises:
-        UsageError: An object is not a loss term, its class is not registered, or it needs an unknown output.
-    """
+def check_outputs(terms: Sequence[LossTerm]) -> None:
+    """Check that a render has all outputs that loss terms need."""
     for term in terms:
-        kind = type(term)
-        if not isinstance(term, LossTerm):
-            raise UsageError(f"{term!r} is not a loss term: give an instance of a class that derives from warpgs.LossTerm")
-        if not LOSS_TERMS.has(kind):
-            raise UsageError(LOSS_TERMS.unnamed(kind))
-        unknown = [n for n in term.needs_outputs if n not in OUTPUTS]
-        if unknown:
-            raise UsageError(
-                f"the loss term {term.name!r} needs the output {unknown[0]!r}, which no render has; choose needs_outputs from "
-                + ", ".join(OUTPUTS)
-            )
+        for name in term.needs_outputs:
+            if name not in OUTPUTS:
+                needs = f"the loss term {term.name!r} needs the output {name!r}, which no render has"
+                raise UsageError(f"{needs}; choose needs_outputs from {', '.join(OUTPUTS)}")
 
 
-def collect(terms: Sequence[LossTerm], parts: Callable[[LossTerm], Mapping[str, Part]], what: str) -> dict[str, Part]:
-    """Return the named parts of all terms in one dictionary.
-
-    Args:
-        terms: Loss terms.
-        parts: Function that returns the parts of a term by name.
-        what: Word for a part, for the message.
-
-    Raises:
-        UsageError: Two terms have a part of the same name.
-    """
-    found: dict[str, Part] = {}
-    owners: dict[str, LossTerm] = {}
+def maps_of(terms: Sequence[LossTerm], view: TrainingView, prior: Prior | None) -> dict[str, torch.Tensor]:
+    """Return the maps of a view that terms need, by name, each of shape [H, W] or [H, W, C]."""
+    owners: dict[str, str] = {}
+    maps: dict[str, torch.Tensor] = {}
     for term in terms:
-        for name, part in parts(term).items():
-            if name in found:
-                raise UsageError(
-                    f"the loss terms {owners[name].name!r} and {term.name!r} both have a {what} {name!r}; rename it in one of "
-                    "them"
-                )
-            found[name], owners[name] = part, term
-    return found
+        for name, values in term.needs(view, prior).items():
+            if name in maps:
+                both = f"{owners[name]!r} and {term.name!r}"
+                raise UsageError(f"the loss terms {both} both have a map {name!r}; rename it in one of them")
+            maps[name], owners[name] = values, term.name
+    return maps
 
 
 # The photometric loss: 0.8 L1 + 0.2 (1 - SSIM), as in the paper's preliminaries and Kerbl et al. 2023, eq. 7.
@@ -306,12 +273,8 @@ def inverse_depth_difference(
 ) -> torch.Tensor:
     """Compute the weighted mean absolute difference of relative inverse depths, shape []; 0 if no pixel is compared.
 
-    Args:
-        depth: Rendered z-depth [u], positive where alpha is, shape [H, W].
-        alpha: Rendered opacity, shape [H, W].
-        target: Weight times q / d, weight, and weight times q [u], for given depth d and its median q, shape [H, W, 3].
-            Averages of pixels keep the weighted means.
-        mask: 1 for unmasked pixels, 0 for masked ones, shape [H, W]; None without a mask.
+    ``target`` [H, W, 3] is weight times q / d, weight, and weight times q [u], for given depth d and its median q: averages of
+    pixels keep the weighted means. All other maps are [H, W].
     """
     shown = ~(alpha <= GIVEN_MIN_ALPHA)  # True for a NaN, so that it reaches the loss
     shown = shown if mask is None else shown & (mask > 0)
@@ -352,13 +315,9 @@ class GivenDepthDifference(LossTerm, group="given-depth."):
 
 
 def normal_difference(normals: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None) -> torch.Tensor:
-    """Compute the weighted mean of 1 - cos of the angle between normals, shape [], in [0, 2]; 0 if no pixel has both.
+    """Compute the weighted mean of 1 - cos of the angle between normals [H, W, 3], shape [], in [0, 2]; 0 if no pixel has both.
 
-    Args:
-        normals: Unit normals, 0 for missing values, shape [H, W, 3].
-        target: Given normals, 0 for missing values, shape [H, W, 3]; the weight is their length, which is below 1 for averages
-            over pixels.
-        mask: 1 for unmasked pixels, 0 for masked ones, shape [H, W]; None without a mask.
+    Missing normals are 0. The weight is the length of the given normals, which is below 1 for averages over pixels.
     """
     shown = ~(normals.detach().square().sum(-1) <= 0.5)  # of a NaN too
     shown = shown if mask is None else shown & (mask > 0)
@@ -421,14 +380,7 @@ def depth_roughness(
     """Compute the roughness of depth: the weighted sum of min(|z/z' + z/z'' - 2|, `BOUND`) divided by pixel count, shape [].
 
     z' and z'' are the depths of the two neighbours of a pixel of depth z, in its row and again in its column. The sum is over
-    pixels that, like both neighbours, are unmasked and more opaque than `SMOOTH_MIN_ALPHA`.
-
-    Args:
-        depth: Rendered z-depth [u], positive where alpha is, shape [H, W].
-        alpha: Rendered opacity, shape [H, W].
-        image: Photographed colours in [0, 1], whose edges weaken the term, shape [H, W, 3].
-        weight: Weights of the pixels, shape [H, W].
-        mask: 1 for unmasked pixels, 0 for masked ones, shape [H, W]; None without a mask.
+    pixels that, like both neighbours, are unmasked and more opaque than `SMOOTH_MIN_ALPHA`. Edges of the ``image`` weaken it.
     """
     shown = ~(alpha <= SMOOTH_MIN_ALPHA)  # True for a NaN, so that it reaches the loss
     shown = shown if mask is None else shown & (mask > 0)
@@ -490,14 +442,7 @@ class LossConfig(Checked, group="loss."):
 def built_in_terms(
     config: LossConfig, cutout: bool = False, depth: bool = False, normals: bool = False
 ) -> tuple[LossTerm, ...]:
-    """Return the built-in terms of a fit, by its settings and its views.
-
-    Args:
-        config: Weights.
-        cutout: True if a view has an alpha channel.
-        depth: True if a view has given depth.
-        normals: True if a view has given normals.
-    """
+    """Return the built-in terms of a fit, by its weights and by whether a view has an alpha channel, depth or normals."""
     terms: list[LossTerm] = [Photometric()]
     if cutout and config.alpha_weight > 0:
         terms.append(AlphaDifference(config.alpha_weight))

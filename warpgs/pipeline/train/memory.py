@@ -10,12 +10,12 @@ rates and losses (`StepBuffers`).
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import torch
 
-from warpgs.device import FLOAT, SAMPLING, Needs, StepSizes, add_needs, format_bytes
+from warpgs.device import FLOAT, SAMPLING, StepSizes, add_needs, format_bytes
 from warpgs.errors import UsageError
 from warpgs.kernels import blend, project, tiles
 from warpgs.kernels.tiles import MAX_INSTANCES
@@ -35,24 +35,28 @@ RENDER = (project.step_bytes, tiles.step_bytes, blend.step_bytes, training_views
 """Functions that return the bytes of a part of every step, at each moment of the step."""
 
 
-@dataclass(frozen=True)
 class Layout:
     """Parts of a fit that, together with the numbers of Gaussians and instances, determine the memory of a step."""
 
-    sizes: StepSizes
-    """Sizes of every step, without the numbers of Gaussians and instances."""
-    parts: tuple[Callable[[StepSizes], Needs], ...]
-    """Functions that return the bytes of a part of a step, at each moment of the step."""
-    table: Table
-    """The Gaussians with their columns."""
-    view_bytes: int
-    """Bytes of all views, including data kept beside them."""
-    graphs: int = 0
-    """CUDA graphs that exist at a time, one for each size of view; 0 if steps are not captured."""
-    sums: int = 0
-    """Number of sums of gradients and statistics that a step of several views keeps (`warpgs.pipeline.train.batch`)."""
-    averaged: bool = False
-    """True if the parameters of the last steps are summed (`warpgs.pipeline.train.trainer`)."""
+    def __init__(
+        self, table: Table, views: Sequence[TrainingView], terms: Sequence[LossTerm] = (), strategy: Strategy | None = None,
+        modules: Sequence[ViewModule] = (), *, kept: Sequence[TrainingView] = (), captured: bool = False, sums: int = 0,
+        averaged: bool = False,
+    ):  # fmt: skip
+        """Find the sizes of steps, with ``kept`` views beside those that are trained on."""
+        largest = max((v.camera for v in views), key=lambda c: c.width * c.height)
+        self.table, self.sums, self.averaged, cuda = table, sums, averaged, table.device.type == "cuda"
+        self.sizes = StepSizes(
+            largest.width, largest.height, table.row_bytes, len(views), masked=any(v.mask is not None for v in views),
+            cutout=any(v.alpha is not None for v in views), depth="depth" in outputs_of(terms), cuda=cuda,
+        )  # fmt: skip
+        """Sizes of every step, without the numbers of Gaussians and instances."""
+        self.parts = (*(t.bytes for t in terms), *(m.bytes for m in modules), *(() if strategy is None else (strategy.bytes,)))
+        """Functions that return the bytes of a part of a step, at each moment of the step."""
+        self.view_bytes = training_views.view_bytes([*views, *kept])
+        """Bytes of all views, including data kept beside them."""
+        self.graphs = len({v.kind for v in views}) if cuda and captured else 0
+        """CUDA graphs that exist at a time, one for each size of view; 0 if steps are not captured."""
 
     def held(self, count: int) -> int:
         """Return the bytes that persist between steps: parameters, their moments and sums, columns, sums over slots, views."""
@@ -71,14 +75,14 @@ class Layout:
         """Return the bytes in addition to ``held(after)`` while Gaussians are added."""
         return self.table.growth_bytes(before, after)
 
-    def step(self, count: int, instances: int, chunked: bool = False) -> int:
+    def step(self, count: int, instances: int, chunked: bool = False, graphs: int | None = None) -> int:
         """Return the bytes at the heaviest moment of a step; each CUDA graph keeps memory of its own."""
-        heaviest = max(1, self.graphs) * max(self.moments(count, instances, chunked).values())
-        return self.held(count) + heaviest
+        copies = max(1, self.graphs if graphs is None else graphs)
+        return self.held(count) + copies * max(self.moments(count, instances, chunked).values())
 
     def smallest(self, count: int) -> int:
-        """Return the bytes of the smallest step: a chunk of one tile, with at most one instance for each Gaussian."""
-        return max(self.step(count, count, chunked) for chunked in (False, True))
+        """Return the bytes of the smallest step: a chunk of one tile, at most one instance a Gaussian, without graphs."""
+        return max(self.step(count, count, chunked, graphs=0) for chunked in (False, True))
 
     def most_instances(self, count: int, limit: int) -> int:
         """Return the largest number of instances, in an image or in a chunk of one, at which a step stays within a limit."""
@@ -102,79 +106,6 @@ def _largest(low: int, high: int, fits: Callable[[int], bool]) -> int:
     return low
 
 
-@dataclass(frozen=True)
-class MemoryPlan:
-    """Predicted memory of a fit, and the means by which it keeps to its limit."""
-
-    limit: int | None
-    """Bytes that the fit may take; None without a limit."""
-    available: int
-    """Bytes that the device had free."""
-    gaussians: int
-    """Number of Gaussians at the start."""
-    instances: int
-    """Largest number of (Gaussian, tile) instances of a view at the start."""
-    planned: int
-    """Bytes of the first steps."""
-    cap: int
-    """Number of Gaussians that densification may reach."""
-    planned_at_cap: int
-    """Bytes of steps at the cap, if each Gaussian then touches as many tiles as at the start."""
-    lowered_from: int | None = None
-    """Requested cap, if the limit lowered it; else None."""
-    chunked: bool = False
-    """True if the first steps render images in chunks."""
-    chunked_at_cap: bool = False
-    """True if steps at the cap render images in chunks."""
-    graph_refused: bool = False
-    """True if captured steps would exceed the limit, so that steps are not captured."""
-
-    def to_json(self) -> dict[str, Any]:
-        """Return plain values for metrics.json."""
-        return asdict(self)
-
-    def summary(self) -> str:
-        """Return one line for the user."""
-        text = f"memory: a step takes {format_bytes(self.planned)} now"
-        if self.chunked:
-            text += ", with the image in chunks"
-        if self.cap > self.gaussians:
-            about = "" if self.limit is not None else "about "
-            text += f", {about}{format_bytes(self.planned_at_cap)} at {self.cap:,} Gaussians"
-            if self.chunked_at_cap and not self.chunked:
-                text += ", then in chunks"
-        if self.limit is None:
-            if self.planned_at_cap > self.available:
-                fraction = (self.available - self.planned) / max(1, self.planned_at_cap - self.planned)
-                reached = int(self.gaussians + max(0.0, fraction) * (self.cap - self.gaussians))
-                text += f"; the free {format_bytes(self.available)} suffice for about {reached:,} Gaussians; set --memory-limit"
-                return text
-            return text if self.chunked else Detail(text)
-        text += f"; limit {format_bytes(self.limit)}"
-        if self.lowered_from is not None:
-            text += f", so there will be at most {self.cap:,} Gaussians, not {self.lowered_from:,}"
-        if self.graph_refused:
-            text += ", and steps run without a CUDA graph, which would need more"
-        return text
-
-
-def layout_of(
-    table: Table, views: Sequence[TrainingView], terms: Sequence[LossTerm] = (), strategy: Strategy | None = None,
-    modules: Sequence[ViewModule] = (), *, kept: Sequence[TrainingView] = (), captured: bool = False, sums: int = 0,
-    averaged: bool = False,
-) -> Layout:  # fmt: skip
-    """Return the layout of steps of a fit."""
-    largest = max((v.camera for v in views), key=lambda c: c.width * c.height)
-    cuda = table.device.type == "cuda"
-    sizes = StepSizes(
-        largest.width, largest.height, table.row_bytes, len(views), masked=any(v.mask is not None for v in views),
-        cutout=any(v.alpha is not None for v in views), depth="depth" in outputs_of(terms), cuda=cuda,
-    )  # fmt: skip
-    parts = (*(t.bytes for t in terms), *(m.bytes for m in modules), *(() if strategy is None else (strategy.bytes,)))
-    graphs = len({v.kind for v in views}) if cuda and captured else 0
-    return Layout(sizes, parts, table, training_views.view_bytes([*views, *kept]), graphs, sums, averaged)
-
-
 @torch.no_grad()
 def most_instances(gaussians: Gaussians, cameras: list[Camera], options: RasterizeOptions) -> int:
     """Return the number of (Gaussian, tile) instances for the camera that has the most; cameras hold tensors."""
@@ -183,21 +114,27 @@ def most_instances(gaussians: Gaussians, cameras: list[Camera], options: Rasteri
 
 def plan(
     layout: Layout, *, count: int, instances: int, most: int, limit: int | None, available: int, capacity_factor: float = 1.0
-) -> tuple[MemoryPlan, Layout]:
-    """Plan a fit of ``count`` Gaussians and ``instances`` in the heaviest view, growing to ``most``; return its layout, too."""
+) -> dict[str, Any]:
+    """Plan a fit of ``count`` Gaussians and ``instances`` in the heaviest view, growing to ``most``, for metrics.json.
+
+    If captured steps would exceed the limit, the layout is changed to steps without graphs. The result has the ``limit`` and
+    the ``available`` memory of the device [bytes]; Gaussians and instances at the start; bytes of the first steps
+    (``planned``), and whether they render in chunks (``chunked``); and the number of Gaussians that densification may reach
+    (``cap``), bytes and chunks there, if each Gaussian then touches as many tiles as at the start.
+    """
     cap, refused = max(most, count), False
-    single = replace(layout, graphs=0)
     if limit is not None:
-        if not single.smallest(count) <= limit:
+        smallest = layout.smallest(count)
+        if not smallest <= limit:
             raise UsageError(
-                f"--memory-limit {format_bytes(limit)} is less than the {format_bytes(single.smallest(count))} that the "
-                f"smallest step needs with {count:,} Gaussians and {layout.sizes.width} x {layout.sizes.height} px; raise "
-                "the limit, start with fewer points (--max-gaussians N), or --downscale the views"
+                f"--memory-limit {format_bytes(limit)} is less than the {format_bytes(smallest)} that the smallest step needs "
+                f"with {count:,} Gaussians and {layout.sizes.width} x {layout.sizes.height} px; raise the limit, start with "
+                "fewer points (--max-gaussians N), or --downscale the views"
             )
-        cap = single.largest_count(limit, count, cap)
+        cap = layout.largest_count(limit, count, cap)
         graphs = layout.step(cap, int(capacity_factor * instances / count * cap))
-        if layout.graphs and max(graphs, layout.held(cap) + layout.event(cap // 2, cap)) > limit:
-            layout, refused = single, True
+        refused = layout.graphs > 0 and max(graphs, layout.held(cap) + layout.event(cap // 2, cap)) > limit
+        layout.graphs *= not refused
 
     def needed(at: int) -> tuple[int, bool]:
         there = int(instances / count * at * (capacity_factor if layout.graphs else 1))
@@ -207,6 +144,29 @@ def plan(
         return layout.step(at, min(there, layout.most_instances(at, limit)), chunked=True), True
 
     (now, chunked), (then, chunked_then) = needed(count), needed(cap)
-    lowered = most if cap < most else None
-    made = MemoryPlan(limit, available, count, instances, now, cap, then, lowered, chunked, chunked_then, refused)
-    return made, layout
+    return {
+        "limit": limit, "available": available, "gaussians": count, "instances": instances, "planned": now, "cap": cap,
+        "planned_at_cap": then, "lowered_from": most if cap < most else None, "chunked": chunked,
+        "chunked_at_cap": chunked_then, "graph_refused": refused,
+    }  # fmt: skip
+
+
+def plan_summary(figures: dict[str, Any]) -> str:
+    """Return the result of `plan` as one line for the user."""
+    limit, available, count, _, now, cap, then, lowered_from, chunked, chunked_then, refused = figures.values()
+    text = f"memory: a step takes {format_bytes(now)} now"
+    if chunked:
+        text += ", with the image in chunks"
+    if cap > count:
+        text += f", {'about ' if limit is None else ''}{format_bytes(then)} at {cap:,} Gaussians"
+        if chunked_then and not chunked:
+            text += ", then in chunks"
+    if limit is None:
+        if then <= available:
+            return text if chunked else Detail(text)
+        reached = int(count + max(0.0, (available - now) / max(1, then - now)) * (cap - count))
+        return f"{text}; the free {format_bytes(available)} suffice for about {reached:,} Gaussians; set --memory-limit"
+    text += f"; limit {format_bytes(limit)}"
+    if lowered_from is not None:
+        text += f", so there will be at most {cap:,} Gaussians, not {lowered_from:,}"
+    return f"{text}, and steps run without a CUDA graph, which would need more" if refused else text

@@ -96,14 +96,9 @@ PRESETS = Presets(FOLDER)
 def preset_settings(preset: FitConfig | Mapping[str, Any] | str | Path | None) -> tuple[FitConfig, str]:
     """Return the settings of a preset, and a note on their source.
 
-    Args:
-        preset: Name of a preset; path of a .toml file; ``module:NAME`` or ``path/to/file.py:NAME`` of a `FitConfig` or a
-            mapping (this runs the code); a `FitConfig` or mapping itself; or None for the default preset. The keys of a mapping
-            or a file are the names of flags; the key ``base`` names the preset to start from, by default the default preset.
-
-    Raises:
-        DataError: The file cannot be read or is not TOML.
-        UsageError: The preset is unknown, or one of its settings is unknown, has the wrong type or is out of range.
+    It is the name of a preset; the path of a .toml file; ``module:NAME`` or ``path/to/file.py:NAME`` of a `FitConfig` or a
+    mapping (this runs the code); a `FitConfig` or mapping itself; or None for the default preset. The keys of a mapping or a
+    file are the names of flags; the key ``base`` names the preset to start from, by default the default preset.
     """
     from warpgs.pipeline.train.settings import FitConfig
 
@@ -129,12 +124,7 @@ def preset_settings(preset: FitConfig | Mapping[str, Any] | str | Path | None) -
 def chosen_settings(
     preset: FitConfig | Mapping[str, Any] | str | Path | None, overrides: Mapping[str, object]
 ) -> tuple[FitConfig, list[str]]:
-    """Return the settings of a preset, some of them replaced, and a note on their source; arguments are as in `warpgs.fit`.
-
-    Raises:
-        DataError: The file of a preset cannot be read or is not TOML.
-        UsageError: The preset is unknown, or a setting is unknown, has the wrong type or is out of range.
-    """
+    """Return the settings of a preset, some of them replaced, and a note on their source; arguments are as in `warpgs.fit`."""
     from warpgs.pipeline.train.settings import FitConfig, with_settings
 
     start, origin = preset_settings(preset)
@@ -165,11 +155,7 @@ def _named(name: str) -> tuple[FitConfig, str]:
 
 
 def _read(path: Path) -> tuple[dict[str, Any], str]:
-    """Return the values of a TOML file, and the first digits of its SHA-256.
-
-    Raises:
-        DataError: The file cannot be read, is too large or too deeply nested, or is not TOML.
-    """
+    """Return the values of a TOML file, and the first digits of its SHA-256."""
     remedy = "give a file of settings such as `steps = 300` (docs/presets.md)"
     try:
         data = read_input(path, MAX_BYTES)

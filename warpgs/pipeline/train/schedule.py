@@ -156,27 +156,6 @@ def plan_phases(config: PhaseConfig, steps: int) -> Phases:
     return Phases(refine, stable_start, tuple(events), steps, steps)
 
 
-@dataclass(frozen=True)
-class EventTimes:
-    """Events at equal intervals, in steps done."""
-
-    after: int
-    """Step after which events begin."""
-    every: int
-    """Steps between two events; events are at multiples of this number."""
-    until: int
-    """Step after which there are no more events."""
-
-    @staticmethod
-    def of_fit(start: int, every: int, stop_fraction: float, steps: int) -> EventTimes:
-        """Return the times for a fit of that many steps; in a short fit events start after a quarter of its length."""
-        return EventTimes(min(start, steps // 4), every, int(stop_fraction * steps))
-
-    def due(self, step: int) -> bool:
-        """Return whether there is an event after a step."""
-        return self.after < step <= self.until and step % self.every == 0
-
-
 Color = tuple[float, float, float]
 """Red, green and blue in [0, 1]."""
 NAMED: dict[str, Color] = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
@@ -189,14 +168,7 @@ LEVELS = 2**16 - 1
 
 
 def color_of(text: str) -> Color | None:
-    """Return the colour that a text names; None for a colour that depends on the scene.
-
-    Args:
-        text: auto, mean, scene, black, white, ``#rrggbb``, or three numbers in [0, 1] as ``r,g,b``.
-
-    Raises:
-        UsageError: The colour is invalid.
-    """
+    """Return the colour that a text names, as `FitConfig.background`; None for a colour that depends on the scene."""
     if text in CHOSEN:
         return None
     if text in NAMED:
@@ -226,16 +198,7 @@ def mean_color(views: list[View]) -> Color:
 
 
 def choose_background(wish: str, scene: Scene, train: list[View]) -> tuple[Color, str]:
-    """Return the colour behind a scene, and a note for the user; no note if opaque views keep the scene's own background.
-
-    Args:
-        wish: As `FitConfig.background`.
-        scene: The scene.
-        train: Its training views.
-
-    Raises:
-        UsageError: ``wish`` is not a colour.
-    """
+    """Return the colour behind a scene, and a note for the user; no note if opaque views keep the scene's own background."""
     color = color_of(wish)
     if color is not None:
         return color, f"background: {wish}, {_words(color)}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import hashlib
 import json
@@ -23,13 +24,13 @@ from warpgs.errors import UsageError, did_you_mean
 from warpgs.kernels.sh import MAX_DEGREE
 from warpgs.pipeline.model.limits import LimitConfig
 from warpgs.pipeline.model.start import InitConfig, extrapolates
-from warpgs.pipeline.train.loss import LOSS_TERMS, SSIM_WEIGHT, LossConfig, LossTerm, check_terms, photometric_loss
+from warpgs.pipeline.train.loss import LOSS_TERMS, SSIM_WEIGHT, LossConfig, LossTerm, check_outputs, photometric_loss
 from warpgs.pipeline.train.schedule import OptimizerConfig, PhaseConfig, color_of, plan_phases
 from warpgs.pipeline.train.stopping import StoppingConfig
 from warpgs.pipeline.train.strategies.base import STRATEGIES, Settings, find_strategy
 from warpgs.pipeline.train.strategies.clone_split import DensityConfig
 from warpgs.pipeline.train.strategies.sampling import MethodConfig
-from warpgs.pipeline.train.view_modules import VIEW_MODULES, ViewModule, check_modules
+from warpgs.pipeline.train.view_modules import VIEW_MODULES, ViewModule
 from warpgs.plugins import Registry, flag_group, own_code
 from warpgs.priors.views import PriorConfig
 from warpgs.process import Detail
@@ -75,9 +76,8 @@ class FitConfig(Checked):
     """Dropout: probability that a Gaussian is hidden in a step. It grows linearly from 0 to this value at the last step
     (DropGaussian, Park et al. 2025), and falls in proportion to the number of training views above 3."""
     checkpoint_every: Annotated[int, Within(1)] = 1000
-    """Number of steps between checkpoints; the last step always writes a checkpoint."""
-    checkpoint_seconds: Annotated[float, Within(0)] = 20.0
-    """Least time between checkpoints [s], because writing takes time. This setting does not affect results."""
+    """Number of steps between checkpoints; the last step always writes a checkpoint. Because writing takes time, checkpoints at
+    every 1000 steps or more are also at least 20 s apart."""
     memory_limit: Annotated[int | None, Within(1)] = None
     """Memory limit for the tensors of the fit on its device during steps [bytes]; None for no limit. Densification stops before
     a step would exceed the limit, and images are rendered in chunks if a whole image would exceed the limit."""
@@ -122,8 +122,17 @@ class FitConfig(Checked):
         super().__post_init__()
         rule_named(self.rule)
         color_of(self.background)
-        check_terms(self.loss_terms)
-        check_modules(self.view_modules)
+        for field, registry in PARTS.items():
+            for part in getattr(self, field):
+                if not isinstance(part, registry.base):
+                    kind, base = registry.kind, registry.base.__name__
+                    raise UsageError(f"{part!r} is not a {kind}: give an instance of a class that derives from warpgs.{base}")
+                if not registry.has(type(part)):
+                    raise UsageError(registry.unnamed(type(part)))
+        check_outputs(self.loss_terms)
+        names = [m.name for m in self.view_modules]
+        if twice := [n for n in names if names.count(n) > 1]:
+            raise UsageError(f"the view module {twice[0]!r} is given twice; remove one")
         if isinstance(self.strategy, type):
             object.__setattr__(self, "strategy", STRATEGIES.name_of(self.strategy))
         own = find_strategy(self.strategy).Config if STRATEGIES.knows(self.strategy) else None
@@ -142,34 +151,31 @@ class FitConfig(Checked):
     def plugged_in(self) -> list[type]:
         """Return the classes of the strategy (if this process has loaded it), loss terms and view modules."""
         strategy = [find_strategy(self.strategy)] if STRATEGIES.knows(self.strategy) else []
-        return [*strategy, *(type(part) for name in _PARTS for part in getattr(self, name))]
+        return [*strategy, *(type(part) for name in PARTS for part in getattr(self, name))]
 
     def to_json(self) -> dict[str, Any]:
         """Return nested plain values, as stored in a run folder."""
-        parts = {n: [{"name": p.name, **dataclasses.asdict(p)} for p in getattr(self, n)] for n in _PARTS}
+        parts = {n: [{"name": p.name, **dataclasses.asdict(p)} for p in getattr(self, n)] for n in PARTS}
         return dataclasses.asdict(dataclasses.replace(self, loss_terms=(), view_modules=())) | parts
 
     @staticmethod
     def from_json(values: dict[str, Any]) -> FitConfig:
-        """Return the configuration that `to_json` stored.
-
-        Raises:
-            SchemaError: A value has the wrong type for its field.
-            UsageError: A field is unknown, a value is out of range, or a user-defined class is not loaded.
-        """
+        """Return the configuration that `to_json` stored; SchemaError for a wrong type, UsageError for other faults."""
         mapping(anything)(values, "config")
         try:
             values, lost = upgraded(values)
             if lost:
                 raise UsageError(f"this version does not have the settings {', '.join(lost)}")
-            parts = {n: tuple(_part(registry, dict(p), n) for p in values.pop(n)) for n, registry in _PARTS.items()}
+            parts = {}
+            for field, registry in PARTS.items():
+                stored = [(registry.find(p["name"]), {n: v for n, v in p.items() if n != "name"}) for p in values.pop(field)]
+                parts[field] = tuple(_compose(kind, own, field) for kind, own in stored)
             own = values.pop("strategy_config")
             kind = find_strategy(values["strategy"]).Config
             if own is not None and kind is None:
                 raise SchemaError(f"strategy_config must be null for strategy {values['strategy']}")
             own = own if kind is None or own is None else _compose(kind, own, "strategy_config")
-            config: FitConfig = _compose(FitConfig, values | parts | {"strategy_config": own}, "config")
-            return config
+            return _compose(FitConfig, values | parts | {"strategy_config": own}, "config")
         except (TypeError, KeyError) as e:
             raise UsageError(f"the configuration was stored by another version of warpgs ({e})") from e
 
@@ -183,28 +189,19 @@ def fingerprint(config: Mapping[str, Any]) -> str:
     return hashlib.sha256(json.dumps(config, sort_keys=True).encode()).hexdigest()[:12]
 
 
-_PARTS: dict[str, Registry[Any]] = {"loss_terms": LOSS_TERMS, "view_modules": VIEW_MODULES}
-"""Fields of `FitConfig` that hold parts of a registry, each with its settings."""
-
-
-def _part(registry: Registry[Any], values: dict[str, Any], field: str) -> Any:
-    """Return a part of a registry from its stored name and settings."""
-    return _compose(registry.find(values.pop("name")), values, field)
+PARTS: dict[str, Registry[Any]] = {"loss_terms": LOSS_TERMS, "view_modules": VIEW_MODULES}
+"""Fields of `FitConfig` that hold parts of a registry, each with settings of its own."""
 
 
 def _compose(kind: type, values: dict[str, Any], place: str) -> Any:
-    """Return a settings dataclass from nested plain values; its fields that are dataclasses are composed in turn.
-
-    Raises:
-        SchemaError: A value has the wrong type for its field.
-    """
+    """Return a settings dataclass from nested plain values; its fields that are dataclasses are composed in turn."""
     mapping(anything)(values, place)
     kinds, composed = typing.get_type_hints(kind), {}
     for name, value in values.items():
         where, of = f"{place}.{name}", kinds.get(name, Any)
         if isinstance(of, type) and dataclasses.is_dataclass(of):
             composed[name] = _compose(of, value, where)
-        elif name not in (*_PARTS, "strategy_config"):  # these are composed before
+        elif name not in (*PARTS, "strategy_config"):  # these are composed before
             of_type(of)(list(value) if isinstance(value, tuple) else value, where)
             listed = any(typing.get_origin(part) is tuple for part in (of, *typing.get_args(of)))
             composed[name] = tuple(value) if listed and isinstance(value, list) else value
@@ -216,6 +213,7 @@ def _compose(kind: type, values: dict[str, Any], place: str) -> Any:
 SIDE_FILE = "give it in FILE.onnx.json, beside the network (docs/priors.md)"
 PAPER = "--strategy paper --paper.{}"
 REMOVED: dict[str, tuple[Any, str]] = {
+    "checkpoint_seconds": (20.0, "--checkpoint-every below 1000 writes each checkpoint"),
     "dropout_views": (3, ""),
     "stopping.fraction": (0.03, ""), "stopping.measurements": (12, ""), "stopping.noise": (1.0, ""),
     "init.near_views": (4, ""), "init.max_residual": (1.0, ""), "init.blend": ("least_sensitive", ""),
@@ -225,6 +223,7 @@ REMOVED: dict[str, tuple[Any, str]] = {
     "density.clone_size": (0.01, ""), "density.prune_opacity": (0.005, ""), "density.morton_order": (True, ""),
     "limits.min_pixels": (0.2**0.5, ""), "limits.ratio_from": (0.7, ""),
     "phases.every": (100.0, ""), "phases.growth": (4.0, ""),
+    "method.keep": (1.0, "use `warpgs prune` on the finished run"),
     "method.events": (True, "use --strategy clone_split for a fit without sampling events"),
     **{f"method.{n}": (v, f"use {PAPER.format(n.replace('_', '-'))}") for n, v in {
         "s_render": False, "s_semantic": False, "s_geometry": False, "ra": True, "agp": True, "pm": True}.items()},
@@ -257,9 +256,10 @@ def removed_note(name: str) -> str:
 
 def upgraded(config: Mapping[str, Any]) -> tuple[dict[str, Any], list[str]]:
     """Return stored settings by their present names, and each removed setting with a value that fits no longer have."""
-    values = _copied(config)
+    values = copy.deepcopy(dict(config))
     method, importance, sampler = (_group(values, n) for n in ("method", "method.importance", "method.sampler"))
     _group(values, "loss").pop("exposure_weight", None)  # had no effect
+    values.pop("checkpoint_seconds", None)  # affected no result
     homes = dict.fromkeys(("s_render", "s_semantic", "s_geometry", "ra", "agp", "pm"), method)
     homes |= {"residual": importance, "depth": sampler, "gate_quantile": sampler}
     if "events" in method and all(n in home for n, home in homes.items()):
@@ -281,11 +281,6 @@ def upgraded(config: Mapping[str, Any]) -> tuple[dict[str, Any], list[str]]:
     return values, lost
 
 
-def _copied(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return nested mappings whose groups may be changed."""
-    return {n: _copied(v) if isinstance(v, dict) else v for n, v in values.items()}
-
-
 def _group(values: dict[str, Any], name: str) -> dict[str, Any]:
     """Return a group of stored settings; an empty one if it is missing or no mapping, which `FitConfig.from_json` refuses."""
     for part in filter(None, name.split(".")):
@@ -298,8 +293,6 @@ Path = tuple[str, ...]
 """Path from a `FitConfig` to a setting, as names of fields; a number is the index of a loss term or a view module."""
 WITHOUT_PREFIX = "priors"
 """Group without a prefix in its flags."""
-PARTS: dict[str, Registry[Any]] = {"loss_terms": LOSS_TERMS, "view_modules": VIEW_MODULES}
-"""Fields that hold parts of a registry, each with settings of its own."""
 OTHERS = ("preset", "strategy", "strategy_config", *PARTS)
 """Fields whose values are converted in their own way, such as by looking up a name."""
 
@@ -320,42 +313,31 @@ def flag(name: str) -> str:
 
 
 def with_settings(config: FitConfig, values: Mapping[str, Any], place: str, *, keywords: bool = False) -> FitConfig:
-    """Return settings with some of them replaced.
+    """Return settings with some of them replaced; messages name ``place``, a file or the function that was called.
 
-    Args:
-        config: Settings to start from.
-        values: New values by name of the flag (``init.opacity``), by names in nested mappings, or by keyword
-            (``init_opacity``).
-        place: Source of the values, for messages: a file, or the function that was called.
-        keywords: True for keywords of a call in Python. Only then may ``strategy``, ``loss_terms`` and ``view_modules`` name
-            ``module:Class`` or ``file.py:Class``, which is imported.
-
-    Raises:
-        UsageError: A name is unknown, or a value has the wrong type or is out of range; the message names the setting.
+    Values are given by name of the flag (``init.opacity``), by names in nested mappings, or by keyword (``init_opacity``).
+    Only in ``keywords`` of a call in Python may ``strategy``, ``loss_terms`` and ``view_modules`` name ``module:Class`` or
+    ``file.py:Class``, which is imported.
     """
-    given = {name.replace("-", "_"): value for name, value in _flat(values, place)}
     try:
+        given = {name.replace("-", "_"): value for name, value in _flat(values)}
         config = _with_parts(config, given, keywords)
+        leaves = _leaves(config)
+        names = {keyword(n): n for n in leaves} | {n: n for n in leaves}
+        changes: dict[str, Any] = {}
+        for name, value in given.items():
+            if name in ("strategy", *PARTS, *VIEW_MODULES.names()):
+                continue
+            if name not in names:
+                raise UsageError(_unknown(name, config, keywords))
+            path, hint = leaves[names[name]]
+            inner = changes
+            for part in path[:-1]:
+                inner = inner.setdefault(part, {})
+            inner[path[-1]] = _typed(value, hint, name)
+        return _replaced(config, changes)
     except (UsageError, SchemaError) as e:
         raise UsageError(f"{place}: {e}") from e
-    leaves = _leaves(config)
-    names = {keyword(n): n for n in leaves} | {n: n for n in leaves}
-    changes: dict[str, Any] = {}
-    for name, value in given.items():
-        if name == "strategy" or name in PARTS or name in VIEW_MODULES.names():
-            continue
-        if name not in names:
-            raise UsageError(_unknown(name, place, config, keywords))
-        path, hint = leaves[names[name]]
-        try:
-            _put(changes, path, _typed(value, hint, name))
-        except (UsageError, SchemaError) as e:
-            raise UsageError(f"{place}: {e}") from e
-    try:
-        changed: FitConfig = _replaced(config, changes)
-    except UsageError as e:
-        raise UsageError(f"{place}: {e}") from e
-    return changed
 
 
 def changed_settings(before: FitConfig, after: FitConfig) -> list[str]:
@@ -369,18 +351,21 @@ def _values(config: FitConfig) -> Iterator[tuple[str, Any]]:
     for field in PARTS:
         yield field, [part.name for part in getattr(config, field)]
     for name, (path, _) in _leaves(config).items():
-        yield name, _value(config, path)
+        value: Any = config
+        for part in path:
+            value = value[int(part)] if isinstance(value, tuple) else getattr(value, part)
+        yield name, value
 
 
-def _flat(values: Mapping[str, Any], place: str, prefix: str = "") -> Iterator[tuple[str, Any]]:
+def _flat(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
     """Yield values by their dotted names."""
     for name, value in values.items():
         if not isinstance(name, str):
-            raise UsageError(f"{place}: {name!r} is not a setting's name; write names as text")
+            raise UsageError(f"{name!r} is not a setting's name; write names as text")
         if isinstance(value, Mapping):
-            yield from _flat(value, place, f"{prefix}{name}.")
+            yield from _flat(value, f"{prefix}{name}.")
         elif dataclasses.is_dataclass(value) and not isinstance(value, (type, LossTerm, ViewModule)):
-            yield from _flat({f.name: getattr(value, f.name) for f in dataclasses.fields(value)}, place, f"{prefix}{name}.")
+            yield from _flat({f.name: getattr(value, f.name) for f in dataclasses.fields(value)}, f"{prefix}{name}.")
         else:
             yield prefix + name, value
 
@@ -444,19 +429,6 @@ def _below(kind: type, prefix: str, path: Path) -> Iterator[tuple[str, tuple[Pat
             yield prefix + f.name, (here, hint)
 
 
-def _value(part: Any, path: Path) -> Any:
-    for name in path:
-        part = part[int(name)] if isinstance(part, tuple) else getattr(part, name)
-    return part
-
-
-def _put(changes: dict[str, Any], path: Path, value: Any) -> None:
-    """Put a value at a path into nested dictionaries."""
-    for name in path[:-1]:
-        changes = changes.setdefault(name, {})
-    changes[path[-1]] = value
-
-
 def _replaced(part: Any, changes: dict[str, Any]) -> Any:
     """Return a dataclass, or a tuple of dataclasses, with fields replaced; each is built once, with all its changes."""
     if isinstance(part, tuple):
@@ -486,22 +458,20 @@ def _typed(value: Any, hint: Any, name: str) -> Any:
     return float(value) if hint is float else value
 
 
-def _unknown(name: str, place: str, config: FitConfig, keywords: bool) -> str:
+def _unknown(name: str, config: FitConfig, keywords: bool) -> str:
     """Return the message on an unknown setting, with the most similar name in the user's spelling."""
     known = {keyword(n) if keywords else n: n for n in setting_names(config)}
     groups = {n.partition(".")[0] for n in known.values() if "." in n}
     if note := removed_note(name):
-        return f"{place}: {note}"
+        return note
     if name in groups:
-        return (
-            f"{place}: {name} is a group of settings; give a mapping such as {{{name}: {{...}}}}, or name one of its settings"
-        )
+        return f"{name} is a group of settings; give a mapping such as {{{name}: {{...}}}}, or name one of its settings"
     last = [k for k, n in known.items() if n.rpartition(".")[2] == name.rpartition(".")[2]]  # `opacity` for `init.opacity`
     if "." in name:  # `other.every` for `mcmc.every`, but only if `other` is not similar to a group
         own = {n for n, (path, _) in _leaves(config).items() if path[0] in ("strategy_config", *PARTS)}
         last = [k for k in last if known[k] in own and not did_you_mean(name.partition(".")[0], groups)]
     hint = f"did you mean {last[0]}?" if last else did_you_mean(name, known) or "`warpgs fit --help-all` lists all"
-    return f"{place}: unknown setting {name[:60]!r}; {hint}"
+    return f"unknown setting {name[:60]!r}; {hint}"
 
 
 # Settings that follow from the number of training views and their size: one rule from 3 photographs to 300, on any
@@ -565,26 +535,13 @@ def steps_by_views(views: int, opaque: bool = True) -> int:
     return min(MAX_STEPS, round(MIN_STEPS * max(1.0, views / FEW) ** STEPS_POWER))
 
 
-def cpu_seconds(views: int) -> float:
-    """Return the default time limit for the steps of a fit on a CPU [s]."""
-    least, each, most = CPU_SECONDS
-    return min(least + each * views, most)
-
-
-def pixels_of_steps(steps: int, half_resolution: float, pixels: int) -> float:
-    """Return the number of pixels that ``steps`` render; views have ``pixels``, or a quarter of them at half size."""
-    return steps * pixels * (1 - 0.75 * half_resolution)
-
-
 def steps_on_cpu(wanted: int, views: int, pixels: float) -> tuple[int, str]:
     """Return how many steps fit into the time limit on a CPU, and a sentence for the user; it is empty if all steps fit.
 
-    Args:
-        wanted: Steps of the fit without a limit.
-        views: Number of training views.
-        pixels: Pixels that the wanted steps render, weighted by the time for a pixel.
+    ``pixels`` are those that the ``wanted`` steps render, weighted by the time for a pixel.
     """
-    seconds, most = pixels / CPU_PIXELS, cpu_seconds(views)
+    least, each, upper = CPU_SECONDS
+    seconds, most = pixels / CPU_PIXELS, min(least + each * views, upper)
     if seconds <= most:
         return wanted, ""
     steps = max(1, int(wanted * most / seconds))
@@ -598,84 +555,51 @@ def steps_on_cpu(wanted: int, views: int, pixels: float) -> tuple[int, str]:
 def settings_by_views(config: FitConfig, train: list[View], device: str) -> tuple[FitConfig, list[str]]:
     """Return the settings with all automatic ones (None) chosen, and sentences on the choices.
 
-    Args:
-        config: Settings.
-        train: Training views.
-        device: Kind of device, cpu or cuda: on a CPU the steps are limited to a time, unless ``cpu_limit`` is off.
+    On a ``device`` of kind cpu the steps are limited to a time, unless ``cpu_limit`` is off.
     """
-    views = len(train)
-    opaque = all(v.alpha is None for v in train)
+
+    def given(value: Any, other: Any) -> Any:
+        return other if value is None else value
+
+    views, opaque = len(train), all(v.alpha is None for v in train)
     one_layer = views <= ONE_LAYER_VIEWS
-    method = config.method
-    if method.hier is None:
-        method = dataclasses.replace(method, hier=not one_layer)
-    degree = config.sh_degree
-    if degree is None:
-        degree = sum(views >= n for n in DEGREES)
-    half = config.half_resolution
-    if half is None:
-        half = float(f"{HALF_RESOLUTION * min(1.0, HALF_VIEWS / views):.2g}")
-    wanted, limit = config.steps, ""
-    if wanted is None:
-        wanted = min(steps_by_views(views, opaque), config.max_steps)
-    steps = wanted
+    hier = given(config.method.hier, not one_layer)
+    degree = given(config.sh_degree, sum(views >= n for n in DEGREES))
+    half = given(config.half_resolution, float(f"{HALF_RESOLUTION * min(1.0, HALF_VIEWS / views):.2g}"))
+    steps = wanted = given(config.steps, min(steps_by_views(views, opaque), config.max_steps))
+    limit, sh_every = "", config.sh_every
     if config.steps is None and config.cpu_limit and device == "cpu":
-        pixels = config.batch * max(v.camera.width * v.camera.height for v in train)
-        steps, limit = steps_on_cpu(wanted, views, pixels_of_steps(wanted, half, pixels) * (1.0 if method.hier else ONE_LAYER))
-    optimizer = _rates_by_views(config.optimizer, views, bool(limit))
+        pixels = wanted * (config.batch * max(v.camera.width * v.camera.height for v in train))
+        pixels *= 1 - 0.75 * half  # half the size is a quarter of the pixels
+        steps, limit = steps_on_cpu(wanted, views, pixels * (1.0 if hier else ONE_LAYER))
     init = config.init
     if init.extrapolate is None:
         init = dataclasses.replace(init, extrapolate=opaque and views <= EXTRAPOLATED_VIEWS and steps >= SMOOTH_STEPS)
         init = dataclasses.replace(init, extrapolate=extrapolates(init, train))
-    if optimizer.opacities_decay is None:
-        decay = EXTRAPOLATED_DECAY if extrapolates(init, train) else OPACITIES_DECAY
-        optimizer = dataclasses.replace(optimizer, opacities_decay=decay if one_layer else 0.0)
-    stopping, sh_every = config.stopping, config.sh_every
-    if stopping.min_gain_db is None:
-        stopping = dataclasses.replace(stopping, min_gain_db=0.0 if limit else MIN_GAIN_DB)
-        if limit and degree:  # as with held-out blocks, all degrees are in use when growth begins
-            sh_every = min(sh_every, max(1, plan_phases(config.phases, steps).refine // degree))
-    loss = config.loss
-    if loss.smooth_weight is None:
-        loss = dataclasses.replace(loss, smooth_weight=_smooth_weight_by_views(views, opaque, steps))
+    decay = EXTRAPOLATED_DECAY if extrapolates(init, train) else OPACITIES_DECAY
+    factor = CPU_RATES if limit and views > CPU_RATES_VIEWS else 1.0
+    rates = {
+        "scales_lr": SCALES_LR * min(1.0, SCALES_VIEWS / views) ** SCALES_POWER,
+        "opacities_lr": min(MAX_OPACITIES_LR, OPACITIES_LR * math.sqrt(views / 3)),
+        "means_lr": factor * MEANS_LR, "sh_lr": factor * SH_LR, "opacities_decay": decay if one_layer else 0.0,
+        "average_last": AVERAGE_LAST if views >= AVERAGED_VIEWS else 0.0,
+    }  # fmt: skip
+    rates = {n: given(getattr(config.optimizer, n), float(f"{v:.3g}")) for n, v in rates.items()}
+    if limit and degree and config.stopping.min_gain_db is None:
+        # as with held-out blocks, all degrees are in use when growth begins
+        sh_every = min(sh_every, max(1, plan_phases(config.phases, steps).refine // degree))
+    smooth, most = (SMOOTH_WEIGHT, SMOOTH_VIEWS) if opaque else (ALPHA_SMOOTH_WEIGHT, ALPHA_SMOOTH_VIEWS)
+    smooth = given(config.loss.smooth_weight, smooth if views <= most and steps >= SMOOTH_STEPS else 0.0)
+    min_gain = given(config.stopping.min_gain_db, 0.0 if limit else MIN_GAIN_DB)
     made = dataclasses.replace(
-        config, steps=steps, sh_degree=degree, sh_every=sh_every, half_resolution=half, init=init, optimizer=optimizer,
-        method=method, loss=loss, stopping=stopping,
+        config, steps=steps, sh_degree=degree, sh_every=sh_every, half_resolution=half, init=init,
+        optimizer=dataclasses.replace(config.optimizer, **rates), method=dataclasses.replace(config.method, hier=hier),
+        loss=dataclasses.replace(config.loss, smooth_weight=smooth),
+        stopping=dataclasses.replace(config.stopping, min_gain_db=min_gain),
     )  # fmt: skip
     words = _words_of_choices(config, made, wanted)
     named = Detail(f"settings for {views} views: {', '.join(words)}") if words else ""
     return made, [note for note in (named, limit) if note]
-
-
-def _rates_by_views(optimizer: OptimizerConfig, views: int, limited: bool) -> OptimizerConfig:
-    """Return the settings with the automatic learning rates and the fraction of averaged steps chosen.
-
-    Args:
-        optimizer: Settings.
-        views: Number of training views.
-        limited: Whether the time limit on a CPU shortens the fit.
-    """
-    factor = CPU_RATES if limited and views > CPU_RATES_VIEWS else 1.0
-    chosen = {
-        "scales_lr": SCALES_LR * min(1.0, SCALES_VIEWS / views) ** SCALES_POWER,
-        "opacities_lr": min(MAX_OPACITIES_LR, OPACITIES_LR * math.sqrt(views / 3)),
-        "means_lr": factor * MEANS_LR,
-        "sh_lr": factor * SH_LR,
-        "average_last": AVERAGE_LAST if views >= AVERAGED_VIEWS else 0.0,
-    }
-    return dataclasses.replace(optimizer, **{n: float(f"{v:.3g}") for n, v in chosen.items() if getattr(optimizer, n) is None})
-
-
-def _smooth_weight_by_views(views: int, opaque: bool, steps: int) -> float:
-    """Return the weight of the roughness of rendered depth.
-
-    Args:
-        views: Number of training views.
-        opaque: Whether no view has an alpha channel.
-        steps: Planned steps of the fit.
-    """
-    weight, most = (SMOOTH_WEIGHT, SMOOTH_VIEWS) if opaque else (ALPHA_SMOOTH_WEIGHT, ALPHA_SMOOTH_VIEWS)
-    return weight if views <= most and steps >= SMOOTH_STEPS else 0.0
 
 
 def _words_of_choices(config: FitConfig, made: FitConfig, wanted: int) -> list[str]:
@@ -744,20 +668,7 @@ def probe_seconds(width: int, height: int, device: torch.device) -> float:
 
 
 def within_budget(config: FitConfig, seconds: float, views: list[View], device: torch.device) -> tuple[FitConfig, str]:
-    """Choose the largest number of steps that is predicted to fit into a time budget, set-up included.
-
-    Args:
-        config: Settings; the steps are replaced.
-        seconds: Budget [s].
-        views: Training views.
-        device: Device of the fit.
-
-    Returns:
-        The configuration with its steps, and a note on the choice.
-
-    Raises:
-        UsageError: The budget is not a positive, finite number, or too short for the shortest fit.
-    """
+    """Return settings with the largest number of steps predicted to fit into a time [s], set-up included, and a note on it."""
     check_budget(seconds)
     largest = max((v.camera for v in views), key=lambda c: c.width * c.height)
     probe = probe_seconds(largest.width, largest.height, device)
@@ -781,10 +692,6 @@ def within_budget(config: FitConfig, seconds: float, views: list[View], device: 
 
 
 def check_budget(seconds: float) -> None:
-    """Check a time budget [s].
-
-    Raises:
-        UsageError: The budget is not a positive, finite number.
-    """
+    """Check that a time budget [s] is a positive, finite number."""
     if not 0 < seconds < float("inf"):
         raise UsageError(f"time-budget must be a positive number of seconds, not {seconds}")

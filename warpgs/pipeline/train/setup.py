@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -15,52 +14,24 @@ from warpgs.geometry import CENTRAL
 from warpgs.kernels.cameras import check_camera
 from warpgs.pipeline.metrics.scores import fitted_region
 from warpgs.pipeline.model.start import Start, check_points, initial_points, seen_points, subsample
-from warpgs.pipeline.train.loss import LossTerm, built_in_terms, collect
+from warpgs.pipeline.train.loss import LossTerm, built_in_terms, maps_of
 from warpgs.pipeline.train.settings import FitConfig
 from warpgs.pipeline.train.strategies.base import find_strategy
-from warpgs.pipeline.train.views import TrainingView, with_alpha
+from warpgs.pipeline.train.views import TrainingView, there, with_alpha
 from warpgs.priors.given_depth import any_given, check_given, lens_depth, pinhole_view, with_given_depth
-from warpgs.priors.networks import cache_folder
 from warpgs.priors.views import view_priors
 from warpgs.process import Detail
-from warpgs.scene import GivenDepth, PointCloud, Prior, View, ViewDepth
-
-
-@dataclass(frozen=True)
-class Preparation:
-    """Points, priors and notes, found before the first step."""
-
-    views: list[View]
-    """The views to fit, with depth from a network if depth guides the fit."""
-    start: Start
-    """The initial points, and the depths that other views confirm."""
-    priors: list[Prior] | None
-    """Prior of each view; None if not needed."""
-    notes: list[str]
-    """Notes on choices, assumptions and missing inputs."""
+from warpgs.scene import GivenDepth, PointCloud, Prior, View
 
 
 def prepare(
     train: list[View], points: PointCloud | None, config: FitConfig, generator: np.random.Generator, device: torch.device,
     priors: list[Prior] | None, ready: Callable[[], object], progress: Callable[[str], object] = lambda line: None,
-) -> Preparation:  # fmt: skip
-    """Find the initial points, and compute priors if sampling or a loss term needs them and they are not given.
+) -> tuple[list[View], Start, list[Prior] | None, list[str]]:  # fmt: skip
+    """Return views (with depth from a network if it guides the fit), initial points, priors (if needed), and notes.
 
-    Args:
-        train: The views to fit.
-        points: The reconstruction's points, or None.
-        config: Settings.
-        generator: Generator of random points.
-        device: Device to sweep on; with a memory limit the CPU sweeps, since a sweep may need more memory than a step.
-        priors: Prior of each view; None to compute them if they are needed.
-        ready: Called before the device is used, and in any case before this function returns.
-        progress: Called with a line for the user about the current work.
-
-    Raises:
-        DataError: The scene gives no initial points.
-        UsageError: A view's camera cannot be rendered: its model is unknown, or the number of coefficients is wrong. A given
-            map has the wrong size or is not finite. The start or the strategy compares views, and a camera model has no pinhole
-            equivalent with the same K.
+    With a memory limit the CPU sweeps, since a sweep may need more memory than a step. ``ready`` is called before the device is
+    used, and in any case before this function returns.
     """
     for view in train:
         check_camera(view.camera)
@@ -80,23 +51,21 @@ def prepare(
 
     notes = []
     if priors is None and needs_priors(config):
-        regions, cache = [fitted_region(v)[0] for v in train], cache_folder()
+        regions = [fitted_region(v)[0] for v in train]
         # semantics come first: they are found while the device is made ready; depth by a network comes before the start
-        priors, notes = view_priors(
-            train, config.priors, depths=lambda: start().depths, regions=regions, cache=cache, tell=progress
-        )
+        priors, notes = view_priors(train, config.priors, depths=lambda: start().depths, regions=regions, tell=progress)
     elif priors is None:
         notes = _unused_networks(config)
     if config.priors.depth_guides and priors is not None:
         train = [
-            v if v.depth is not None else dataclasses.replace(v, depth=GivenDepth(p.disparity, "disparity"))
+            v if v.depth is not None else replace(v, depth=GivenDepth(p.disparity, "disparity"))
             for v, p in zip(train, priors, strict=True)
         ]
     found = start()
     ready()
     lines = f"start: {found.how}".splitlines()
     # lines on single views are indented
-    return Preparation(train, found, priors, [*(Detail(n.strip()) if n.startswith(" ") else n for n in lines), *notes])
+    return train, found, priors, [*(Detail(n.strip()) if n.startswith(" ") else n for n in lines), *notes]
 
 
 def _start_of(
@@ -139,51 +108,29 @@ def needs_priors(config: FitConfig) -> bool:
 
 
 def terms_of(config: FitConfig, cutout: bool = False, depth: bool = False, normals: bool = False) -> tuple[LossTerm, ...]:
-    """Return all loss terms of a fit by its settings.
-
-    Args:
-        config: Settings.
-        cutout: True if a view has an alpha channel.
-        depth: True if a view has given depth.
-        normals: True if a view has given normals.
-    """
+    """Return all loss terms of a fit by its settings, and by whether a view has an alpha channel, given depth or normals."""
     return (*built_in_terms(config.loss, cutout, depth, normals), *config.loss_terms)
 
 
 def prepared_views(
-    train: list[View], made: Preparation, config: FitConfig, terms: tuple[LossTerm, ...], device: torch.device
-) -> tuple[list[TrainingView], list[np.ndarray]]:
-    """Return the training views on the device, with their scores and the maps of loss terms.
+    train: list[View], start: Start, priors: list[Prior] | None, config: FitConfig, terms: tuple[LossTerm, ...],
+    device: torch.device,
+) -> tuple[list[TrainingView], list[np.ndarray]]:  # fmt: skip
+    """Return the training views on the device, with consistent depth if the strategy samples, and the maps of loss terms.
 
     If the strategy samples and the views have priors, also returns each view's disparity (relative inverse depth in [0, 1],
     shape [H, W]), which is only shown in images of sampling events.
-
-    Raises:
-        UsageError: Two loss terms need a map of the same name.
     """
-    views, disparities = [TrainingView.of(v, device) for v in with_alpha(train)], []
-    priors, depths = made.priors or [None] * len(train), made.start.depths or [None] * len(train)
-    if find_strategy(config.strategy).samples:
-        disparities = [p.disparity for p in made.priors or ()]
-        views = [
-            v if d is None or not d.valid.any() else dataclasses.replace(
-                v, consistent=torch.as_tensor(np.where(d.valid, d.depth, 0), dtype=torch.float32, device=device)
-            )
-            for v, d in zip(views, depths, strict=True)
-        ]  # fmt: skip
-    found = []
-    for view, given, depth, prior in zip(views, train, depths, priors, strict=True):
-        mapped = dataclasses.replace(view, **_given_maps(given, depth, device))
-        maps = collect(terms, lambda term, view=mapped, prior=prior: term.needs(view, prior), "map")
-        found.append(dataclasses.replace(view, maps=maps))
-    return found, disparities
-
-
-def _given_maps(view: View, found: ViewDepth | None, device: torch.device) -> dict[str, torch.Tensor | None]:
-    """Return the fields of a training view that hold given maps."""
-    used = found is not None and found.given is not None
-    maps = {
-        "depth": found.given if used else None,
-        "depth_weight": view.depth.confidence if used and view.depth is not None else None, "normals": view.normals,
-    }  # fmt: skip
-    return {n: None if m is None else torch.as_tensor(m, dtype=torch.float32, device=device) for n, m in maps.items()}
+    samples, views = find_strategy(config.strategy).samples, []
+    depths, each = start.depths or [None] * len(train), priors or [None] * len(train)
+    for given, depth, prior in zip(with_alpha(train), depths, each, strict=True):
+        view = TrainingView.of(given, device)
+        if samples and depth is not None and depth.valid.any():
+            view = replace(view, consistent=there(np.where(depth.valid, depth.depth, 0), device))
+        used = depth is not None and depth.given is not None
+        mapped = replace(
+            view, depth=there(depth.given, device) if used else None, normals=there(given.normals, device),
+            depth_weight=there(given.depth.confidence, device) if used and given.depth is not None else None,
+        )  # fmt: skip
+        views.append(replace(view, maps=maps_of(terms, mapped, prior)))
+    return views, [p.disparity for p in priors or ()] if samples else []

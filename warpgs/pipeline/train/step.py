@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 
@@ -14,12 +15,12 @@ from warpgs.kernels.graphs import CapturedGraph, GraphMemory
 from warpgs.kernels.tiles import BYTES_PER_INSTANCE, MAX_INSTANCES, InstanceMemory
 from warpgs.kernels.update import NOT_FINITE, SHIFT, Setting, begin_step, end_step, opacity_decay, opacity_dropout
 from warpgs.pipeline.metrics.scores import masked_mse
-from warpgs.pipeline.model.limits import NO_LIMITS, Limits, TrainingCameras
+from warpgs.pipeline.model.limits import NO_LIMITS, Limits
 from warpgs.pipeline.model.table import Table
 from warpgs.pipeline.train.loss import LossInputs, LossTerm, Target, outputs_of, term_values
 from warpgs.pipeline.train.schedule import over
 from warpgs.pipeline.train.strategies.base import Strategy
-from warpgs.pipeline.train.views import Kind, LearnedViews, Rows, ViewStack, current, seen
+from warpgs.pipeline.train.views import Kind, LearnedViews, Rows, ViewStack, camera_at, current, seen
 from warpgs.render.compose import compose, count_instances, inputs_of
 from warpgs.render.options import RasterizeOptions, image_settings
 from warpgs.render.rasterize import rasterize
@@ -37,14 +38,7 @@ LEAST_LOGIT = -15.0
 
 @torch.no_grad()
 def decay_opacities(logits: torch.Tensor, fraction: float, going: torch.Tensor, used: torch.Tensor | None = None) -> None:
-    """Lower every opacity by a fraction, in place; the call may be part of a captured step.
-
-    Args:
-        logits: Logits of opacities, float32, shape [N].
-        fraction: Fraction by which an opacity is lowered, in [0, 1); 0 changes nothing.
-        going: Whether the step is taken, bool, shape [1]; if False, nothing changes.
-        used: Gaussians whose opacities change, bool, shape [N]; None for all.
-    """
+    """Lower opacities (logits [N]) by a fraction in place, of Gaussians ``used`` [N] or all, if ``going`` [1] is True."""
     kept = 1 - fraction
     if kept == 1:  # also a fraction below the rounding of float64
         return
@@ -118,9 +112,8 @@ class StepBuffers:
         """Upload view rows, learning rates and settings (7 each) of the next steps, at most as many as were allocated."""
         self.counter.zero_()
         self.stop.zero_()
-        self.view_rows[: len(rows)] = torch.tensor(rows, dtype=torch.int64, device="cpu").to(self.device)
-        self.lr_rows[: len(lrs)] = torch.tensor(lrs, dtype=torch.float32, device="cpu").to(self.device)
-        self.setting_rows[: len(settings)] = torch.tensor(settings, dtype=torch.float32, device="cpu").to(self.device)
+        for tensor, values in ((self.view_rows, rows), (self.lr_rows, lrs), (self.setting_rows, settings)):
+            tensor[: len(values)] = torch.tensor(values, dtype=tensor.dtype, device="cpu").to(self.device)
 
     def result(self) -> tuple[int, int, list[list[float]]]:
         """Return the number of steps taken, the stop flag, and the losses and errors of these steps and of the next one."""
@@ -129,11 +122,12 @@ class StepBuffers:
 
     def begin(self, views: ViewStack) -> tuple[torch.Tensor, ...]:
         """Return learning rates, settings [7], viewmat [1, 4, 4], K [1, 3, 3] and image [H, W, 3] of the current step."""
+        cameras = views.camera
         if self.device.type == "cpu":  # no copies
             step, row = int(self.counter), int(self.view_rows[int(self.counter)])
-            view = views.viewmats[row : row + 1], views.Ks[row : row + 1], views.images[row]
+            view = cameras.viewmat[row : row + 1], cameras.K[row : row + 1], views.images[row]
             return self.lr_rows[step], self.setting_rows[step], *view
-        rows = (self.view_rows, self.lr_rows, self.setting_rows, views.viewmats, views.Ks, views.images)
+        rows = (self.view_rows, self.lr_rows, self.setting_rows, cameras.viewmat, cameras.K, views.images)
         return begin_step(self.counter, *rows)
 
     def of_view(self, maps: Rows) -> torch.Tensor:
@@ -186,181 +180,11 @@ def _single(batch: Render) -> Render:
     return replace(batch, **{n: getattr(batch, n).squeeze(0) for n in ("rgb", "alpha", "depth")})
 
 
-@dataclass(frozen=True)
-class Learned:
-    """The tables and the strategy that steps change."""
-
-    table: Table
-    """The Gaussians."""
-    views: LearnedViews
-    """View modules with their parameters; often none."""
-    strategy: Strategy
-    """Density strategy."""
-    dropout_seed: int | None
-    """Seed of the opacity dropout; None without dropout."""
-    cameras: TrainingCameras
-    """Training cameras, for limits of sizes."""
-
-    @property
-    def params(self) -> dict[str, torch.Tensor]:
-        """All parameters by name, of any shape [...]: of the Gaussians, and of view modules as ``views.NAME``."""
-        return self.table.params | {f"views.{n}": t for n, t in self.views.table.params.items()}
-
-
-@dataclass(frozen=True)
-class ViewGradients:
-    """Contribution of one view to a step."""
-
-    gradients: list[torch.Tensor]
-    """Gradients of the loss by the parameters of the Gaussians, then by those of view modules, in the order of the tables."""
-    statistics: Mapping[str, torch.Tensor]
-    """Result of `Strategy.statistics`."""
-    lrs: torch.Tensor
-    """Learning rates of the step, shape [R]."""
-    settings: torch.Tensor
-    """Settings of the step, shape [7]."""
-    going: torch.Tensor
-    """True if nothing stops the step, bool, shape [1]."""
-
-
-@dataclass(frozen=True)
-class Forward:
-    """Forward pass of a step, up to the inputs of the loss."""
-
-    rendered: Render
-    """The render, with its colours as changed by view modules."""
-    inputs: LossInputs
-    """Inputs of the terms of the loss."""
-    of_views: Mapping[str, torch.Tensor]
-    """Terms that view modules add, by module name, shape [] each."""
-    lrs: torch.Tensor
-    """Learning rates of the step, shape [R]."""
-    settings: torch.Tensor
-    """Settings of the step, shape [7]."""
-
-
-def step(learned: Learned, views: ViewStack, buffers: StepBuffers, plan: StepPlan, render: Renderer) -> None:
-    """Take one training step: render the next view, compute the loss, update all parameters.
-
-    If the render overflows or the loss is not finite, no parameter changes, and ``buffers.stop`` is set.
-
-    Args:
-        learned: Tables and strategy that the step changes.
-        views: Views of one kind.
-        buffers: Settings of the steps, and their results.
-        plan: Fixed choices of the step.
-        render: Renderer.
-    """
-    found = view_gradients(learned, views, buffers, plan, render)
-    update(learned, plan, found, buffers.stop)
-
-
-def view_gradients(learned: Learned, views: ViewStack, buffers: StepBuffers, plan: StepPlan, render: Renderer) -> ViewGradients:
-    """Render the next view; return its gradients and statistics. Loss and stop flag go to ``buffers``.
-
-    Arguments are those of `step`.
-    """
-    table, strategy = learned.table, learned.strategy
-    found = forward(table.gaussians, learned.views, learned.dropout_seed, views, buffers, plan, render)
-    loss = total_loss(plan, found.inputs, strategy, tuple(found.of_views.values()))
-
-    rendered, target = found.rendered, found.inputs.target
-    params = [*table.params.values(), *learned.views.table.params.values()]
-    *gradients, v_projected = torch.autograd.grad(loss, [*params, rendered.projected], buffers.one, materialize_grads=True)
-    with torch.no_grad():
-        mse = masked_mse(rendered.rgb, target.image, target.mask)
-        going = end_step(loss, mse, buffers.counter, buffers.stop, buffers.history)
-        statistics = strategy.statistics(plan.phase, v_projected, rendered.visible & going, views.size)
-    return ViewGradients(gradients, statistics, found.lrs, found.settings, going)
-
-
-def forward(
-    gaussians: Gaussians, learned: LearnedViews, dropout_seed: int | None, views: ViewStack, buffers: StepBuffers,
-    plan: StepPlan, render: Renderer,
-) -> Forward:  # fmt: skip
-    """Render the next view, and gather the inputs of the loss terms.
-
-    Args:
-        gaussians: The Gaussians.
-        learned: View modules with their parameters.
-        dropout_seed: Seed of the opacity dropout; None without dropout.
-        views: Views of one kind.
-        buffers: Settings of the steps.
-        plan: Fixed choices of the step.
-        render: Renderer.
-    """
-    lrs, settings, viewmat, K, image = buffers.begin(views)
-    mask = None if views.masks is None else buffers.of_view(views.masks)
-    number = buffers.of_view(views.numbers).view(1)
-    values = learned.values(number)
-    alpha = shift = None
-    if views.alphas is not None:
-        alpha, shift = buffers.of_view(views.alphas), settings[SHIFT]
-        image = over(image, alpha, shift)
-    target = Target(image, mask, {n: buffers.of_view(t) for n, t in views.maps.items()}, alpha)
-    factors = None
-    if dropout_seed is not None:
-        factors = opacity_dropout(len(gaussians), settings, dropout_seed)
-    given = views.camera(viewmat, K, buffers.of_view(views.distortions)[None] if views.distortions.numel() else None)
-    camera = learned.before_render(given, values)
-    rendered = render(gaussians, camera, plan.degree, factors, shift)
-    of_view = {n: t[0] for n, t in values.items()}
-    rendered = replace(rendered, rgb=seen(learned.modules, rendered.rgb, of_view))
-    outputs = {n: getattr(rendered, n) for n in outputs_of(plan.terms)}
-    lens = None if camera.distortion is None else camera.distortion[0]
-    single = replace(camera, viewmat=camera.viewmat[0], K=camera.K[0], distortion=lens)
-    inputs = LossInputs(outputs, target, gaussians, single, settings[Setting.STEP])
-    return Forward(rendered, inputs, learned.regularisation(of_view), lrs, settings)
-
-
 def total_loss(plan: StepPlan, inputs: LossInputs, strategy: Strategy, of_views: Sequence[torch.Tensor] = ()) -> torch.Tensor:
     """Return the sum of the loss terms, the terms of view modules (``of_views`` [] each) and the strategy's term, shape []."""
     values = [*term_values(plan.terms, inputs), *of_views]
     extra = strategy.regularisation(plan.phase, inputs.gaussians)
     return sum(values[1:] if extra is None else [*values[1:], extra], values[0])
-
-
-@torch.no_grad()
-def update(learned: Learned, plan: StepPlan, found: ViewGradients, stop: torch.Tensor) -> None:
-    """Update all parameters and columns; nothing changes if ``stop`` (int32, [1]) is not 0."""
-    descend(learned, plan, found, stop, list(learned.table.params))
-    settle(learned, plan, found)
-
-
-@torch.no_grad()
-def descend(
-    learned: Learned, plan: StepPlan, found: ViewGradients, stop: torch.Tensor, names: list[str], rows: slice = slice(None)
-) -> None:
-    """Update parameters by Adam; nothing changes if ``stop`` (int32, [1]) is not 0.
-
-    Args:
-        learned: Tables that the step changes.
-        plan: Fixed choices of the step.
-        found: Gradients and learning rates.
-        stop: Not 0 to change nothing, int32, shape [1].
-        names: Parameters of the Gaussians. The parameters of view modules are updated together with the means.
-        rows: Gaussians to update.
-    """
-    table, views = learned.table, learned.views.table
-    split = 3 * len(table.params)
-    own, of_views = dict(zip(table.params, found.gradients)), found.gradients[len(table.params) :]
-    factors = learned.strategy.lr_factors(plan.phase) if "means" in names else None
-    table.adam_step({n: own[n] for n in names}, found.lrs[:split], stop, factors, rows)
-    if "means" in names:
-        views.adam_step(dict(zip(views.params, of_views)), found.lrs[split:], stop)
-
-
-@torch.no_grad()
-def settle(learned: Learned, plan: StepPlan, found: ViewGradients) -> None:
-    """Apply the changes after Adam: opacity decay, the strategy's own changes, limits, statistics."""
-    table, strategy = learned.table, learned.strategy
-    gradient = found.gradients[list(table.params).index("logit_opacities")]
-    used = gradient != 0 if plan.spares_unused else None
-    decay_opacities(table.params["logit_opacities"].detach(), plan.opacity_decay, found.going, used)
-    strategy.after_step(plan.phase, found.settings, found.going)
-    plan.limits.hold(table.params, learned.cameras, found.going)
-    for name, value in found.statistics.items():
-        table.columns[name] += value
 
 
 CAPACITY_FACTOR = 1.3
@@ -373,112 +197,160 @@ class OverLimitError(ResourceError):
     """A captured step would exceed the memory limit of the fit."""
 
 
-class Capacities:
-    """Capacities of captured steps for instances, by kind of view and plan."""
+class StepTaker:
+    """Parts of a fit that steps change, and its steps of one view, from Python or captured for a plan and kind of view."""
 
-    def __init__(self, learned: Learned, options: RasterizeOptions):
-        """Compute nothing yet.
-
-        Args:
-            learned: Tables that steps change.
-            options: Rule, background [3] and antialiasing of the fit.
-        """
-        self.learned, self.options = learned, options
-        self._known: dict[tuple[Hashable, StepPlan], int] = {}
-
-    def clear(self) -> None:
-        """Drop all capacities, because the Gaussians have changed."""
-        self._known.clear()
-
-    def of(
-        self, kinds: Sequence[Kind], stacks: Mapping[Kind, ViewStack], plan: StepPlan, max_instances: int | None
-    ) -> dict[Kind, int]:
-        """Return the capacity for each kind, computed at its first use.
-
-        Args:
-            kinds: Kinds of views.
-            stacks: Views by kind.
-            plan: Fixed choices of the steps.
-            max_instances: Largest capacity; None for no limit.
-
-        Raises:
-            OverLimitError: A capacity would be above ``max_instances``.
-            ResourceError: The instances would not fit into memory.
-        """
-        self._known = {k: c for k, c in self._known.items() if k[1] == plan}
-        found = {}
-        for kind in dict.fromkeys(kinds):
-            if (kind, plan) not in self._known:
-                now = current(stacks[kind], self.learned.views)
-                self._known[kind, plan] = instance_capacity(self.learned.table.gaussians, now, plan.degree, self.options)
-            found[kind] = self._known[kind, plan]
-            if max_instances is not None and found[kind] > max_instances:
-                raise OverLimitError(
-                    f"a captured step would need capacity for {found[kind]:,} instances, but the limit allows {max_instances:,}"
-                )
-        return found
-
-
-class StepGraphs:
-    """Captured steps, one for each plan and kind of view, captured at first use."""
+    kept_sums = 0
+    """Number of sums of gradients that a step of several views keeps."""
 
     def __init__(
-        self, learned: Learned, buffers: StepBuffers, options: RasterizeOptions,
-        work: Callable[[Learned, ViewStack, StepBuffers, StepPlan, Renderer], object] = step,
+        self, table: Table, views: LearnedViews, strategy: Strategy, cameras: Sequence[torch.Tensor],
+        options: RasterizeOptions, dropout_seed: int | None = None,
     ):  # fmt: skip
-        """Begin without captured steps.
+        """Begin without captured steps; ``cameras`` are for limits of sizes, and without a seed there is no dropout."""
+        self.table, self.views, self.strategy, self.cameras = table, views, strategy, cameras
+        self.options, self.dropout_seed, device = options, dropout_seed, table.device
+        self.buffers = StepBuffers(device, 3 * (len(table.params) + len(views.table.params)))
+        self.cuda = device.type == "cuda"
+        if self.cuda:
+            self.stream = torch.cuda.Stream(device)
+            """Stream of captures, always the same one: torch reuses freed memory only on the stream that used it before."""
+            self.memory = GraphMemory(device)
+            """Account of the memory that torch keeps for deleted graphs."""
+        self._graphs: dict[tuple[Kind, StepPlan], CapturedGraph] = {}
+        self._capacities: dict[tuple[Kind, StepPlan], int] = {}
 
-        Args:
-            learned: Tables and strategy that steps change.
-            buffers: Settings and results of steps.
-            options: Rule, background [3] and antialiasing of the fit.
-            work: Function that is captured.
+    @property
+    def params(self) -> dict[str, torch.Tensor]:
+        """All parameters by name, of any shape [...]: of the Gaussians, and of view modules as ``views.NAME``."""
+        return self.table.params | {f"views.{n}": t for n, t in self.views.table.params.items()}
+
+    def step(self, views: ViewStack, buffers: StepBuffers, plan: StepPlan, render: Renderer) -> None:
+        """Render the next of some views of one kind, compute the loss, and update all parameters.
+
+        If the render overflows or the loss is not finite, no parameter changes, and ``buffers.stop`` is set.
         """
-        self.work = work
-        self.learned, self.buffers, self.options = learned, buffers, options
-        device = buffers.device
-        self.stream = torch.cuda.Stream(device)
-        """Stream of captures, always the same one, since torch reuses freed memory only on the stream that used it before."""
-        self.memory = GraphMemory(device)
-        """Account of the memory that torch keeps for deleted graphs."""
-        self.capacities = Capacities(learned, options)
-        """Capacities of the graphs."""
-        self._graphs: dict[tuple[Hashable, StepPlan], CapturedGraph] = {}
+        gradients, statistics, lrs, settings, going = self.view_gradients(views, buffers, plan, render)
+        self.descend(plan, gradients, lrs, buffers.stop, list(self.table.params))
+        self.settle(plan, gradients, statistics, settings, going)
 
-    def clear(self) -> None:
-        """Drop all graphs, because the tensors that they refer to have changed."""
-        self._graphs.clear()
-        self.capacities.clear()
+    def view_gradients(
+        self, views: ViewStack, buffers: StepBuffers, plan: StepPlan, render: Renderer
+    ) -> tuple[list[torch.Tensor], Mapping[str, torch.Tensor], torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Render the next view; return its gradients and statistics, learning rates, settings [7], and whether it goes on [1].
 
-    def capture_all(
-        self, kinds: Sequence[Kind], stacks: Mapping[Kind, ViewStack], plan: StepPlan, max_instances: int | None
-    ) -> list[CapturedGraph]:
-        """Return a graph for each of several steps with the same plan; missing graphs are captured first.
-
-        Args:
-            kinds: Kind of each step's view.
-            stacks: Views by kind.
-            plan: Fixed choices of the steps.
-            max_instances: Largest capacity for instances; None for no limit.
-
-        Raises:
-            OverLimitError: The capacity of a graph would be above ``max_instances``.
-            ResourceError: The instances would not fit into memory.
+        Gradients are in the order of the parameters. Loss and stop flag go to ``buffers``.
         """
+        rendered, inputs, of_views, lrs, settings = self.forward(views, buffers, plan, render)
+        loss = total_loss(plan, inputs, self.strategy, tuple(of_views.values()))
+        leaves = [*self.params.values(), rendered.projected]
+        *gradients, v_projected = torch.autograd.grad(loss, leaves, buffers.one, materialize_grads=True)
+        with torch.no_grad():
+            mse = masked_mse(rendered.rgb, inputs.target.image, inputs.target.mask)
+            going = end_step(loss, mse, buffers.counter, buffers.stop, buffers.history)
+            size = views.camera.width, views.camera.height
+            statistics = self.strategy.statistics(plan.phase, v_projected, rendered.visible & going, size)
+        return gradients, statistics, lrs, settings, going
+
+    def forward(
+        self, views: ViewStack, buffers: StepBuffers, plan: StepPlan, render: Renderer
+    ) -> tuple[Render, LossInputs, Mapping[str, torch.Tensor], torch.Tensor, torch.Tensor]:
+        """Render the next view; return the render, inputs of the loss, terms of view modules, learning rates and settings."""
+        gaussians = self.table.gaussians
+        lrs, settings, viewmat, K, image = buffers.begin(views)
+        mask = None if views.masks is None else buffers.of_view(views.masks)
+        values = self.views.values(buffers.of_view(views.numbers).view(1))
+        alpha = shift = None
+        if views.alphas is not None:
+            alpha, shift = buffers.of_view(views.alphas), settings[SHIFT]
+            image = over(image, alpha, shift)
+        target = Target(image, mask, {n: buffers.of_view(t) for n, t in views.maps.items()}, alpha)
+        factors = None
+        if self.dropout_seed is not None:
+            factors = opacity_dropout(len(gaussians), settings, self.dropout_seed)
+        distortion = None if views.camera.distortion is None else buffers.of_view(views.camera.distortion)[None]
+        camera = self.views.before_render(replace(views.camera, viewmat=viewmat, K=K, distortion=distortion), values)
+        rendered = render(gaussians, camera, plan.degree, factors, shift)
+        of_view = {n: t[0] for n, t in values.items()}
+        rendered = replace(rendered, rgb=seen(self.views.modules, rendered.rgb, of_view))
+        outputs = {n: getattr(rendered, n) for n in outputs_of(plan.terms)}
+        inputs = LossInputs(outputs, target, gaussians, camera_at(camera, 0), settings[Setting.STEP])
+        return rendered, inputs, self.views.regularisation(of_view), lrs, settings
+
+    @torch.no_grad()
+    def descend(
+        self, plan: StepPlan, gradients: list[torch.Tensor], lrs: torch.Tensor, stop: torch.Tensor, names: list[str],
+        rows: slice = slice(None),
+    ) -> None:  # fmt: skip
+        """Update rows of named parameters of the Gaussians by Adam, and view modules with the means, if ``stop`` [1] is 0."""
+        table, views = self.table, self.views.table
+        split, own = 3 * len(table.params), dict(zip(table.params, gradients))
+        factors = self.strategy.lr_factors(plan.phase) if "means" in names else None
+        table.adam_step({n: own[n] for n in names}, lrs[:split], stop, factors, rows)
+        if "means" in names:
+            views.adam_step(dict(zip(views.params, gradients[len(own) :])), lrs[split:], stop)
+
+    @torch.no_grad()
+    def settle(
+        self, plan: StepPlan, gradients: list[torch.Tensor], statistics: Mapping[str, torch.Tensor], settings: torch.Tensor,
+        going: torch.Tensor,
+    ) -> None:  # fmt: skip
+        """Apply the changes after Adam: opacity decay, the strategy's own changes, limits, statistics."""
+        table = self.table
+        used = gradients[list(table.params).index("logit_opacities")] != 0 if plan.spares_unused else None
+        decay_opacities(table.params["logit_opacities"].detach(), plan.opacity_decay, going, used)
+        self.strategy.after_step(plan.phase, settings, going)
+        plan.limits.hold(table.params, self.cameras, going)
+        for name, value in statistics.items():
+            table.columns[name] += value
+
+    def take(
+        self, places: list[tuple[Kind, int]], settings: Callable[[], Sequence[tuple[float, ...]]],
+        stacks: Mapping[Kind, ViewStack], plan: StepPlan, max_instances: int | None, *, captured: bool,
+    ) -> None:  # fmt: skip
+        """Take the steps whose learning rates and settings the buffers hold, with the views at these kinds and rows.
+
+        With several views in a step, ``places`` and ``settings`` list those of each slot, step by step. A view has at most
+        ``max_instances`` (Gaussian, tile) instances at a time; if a graph would exceed them, OverLimitError is raised, and
+        nothing was changed.
+        """
+        kinds = [kind for kind, _ in places]
+        for work in self.works(self.step, kinds, self.buffers, stacks, plan, max_instances, captured=captured):
+            work()
+
+    def works(
+        self, function: Callable[[ViewStack, StepBuffers, StepPlan, Renderer], object], kinds: Sequence[Kind],
+        buffers: StepBuffers, stacks: Mapping[Kind, ViewStack], plan: StepPlan, max_instances: int | None, *, captured: bool,
+    ) -> list[Callable[[], Any]]:  # fmt: skip
+        """Return the work of ``function`` for a view of each of some kinds; missing graphs are captured first."""
+        if not (captured and self.cuda):
+            render = eager_renderer(self.options, max_instances)
+            return [functools.partial(function, stacks[kind], buffers, plan, render) for kind in kinds]
         self._graphs = {k: g for k, g in self._graphs.items() if k[1] == plan}
         for kind in dict.fromkeys(kinds):
-            if (kind, plan) in self._graphs:
-                continue
-            capacity = self.capacities.of([kind], stacks, plan, max_instances)[kind]
-            self.memory.give_back(0 if max_instances is not None else DEAD_BYTES)
-            render = captured_renderer(self.options, capacity, self.buffers.stop)
-            work = functools.partial(self.work, self.learned, stacks[kind], self.buffers, plan, render)
-            self._graphs[kind, plan] = self.capture(work)
-        return [self._graphs[kind, plan] for kind in kinds]
+            if (kind, plan) not in self._graphs:
+                capacity = self.capacity(kind, stacks, plan, max_instances)
+                self.memory.give_back(0 if max_instances is not None else DEAD_BYTES)
+                render = captured_renderer(self.options, capacity, buffers.stop)
+                work = functools.partial(function, stacks[kind], buffers, plan, render)
+                self._graphs[kind, plan] = self.capture(work, buffers)
+        return [functools.partial(_replay, self._graphs[kind, plan]) for kind in kinds]
 
-    def capture(self, work: Callable[[], object]) -> CapturedGraph:
+    def capacity(self, kind: Kind, stacks: Mapping[Kind, ViewStack], plan: StepPlan, max_instances: int | None) -> int:
+        """Return the capacity of captured steps with a kind of view, or raise OverLimitError above ``max_instances``."""
+        self._capacities = {k: c for k, c in self._capacities.items() if k[1] == plan}
+        if (kind, plan) not in self._capacities:
+            now = current(stacks[kind], self.views)
+            self._capacities[kind, plan] = instance_capacity(self.table.gaussians, now, plan.degree, self.options)
+        wanted = self._capacities[kind, plan]
+        if max_instances is not None and wanted > max_instances:
+            raise OverLimitError(
+                f"a captured step would need capacity for {wanted:,} instances, but the limit allows {max_instances:,}"
+            )
+        return wanted
+
+    def capture(self, work: Callable[[], object], buffers: StepBuffers) -> CapturedGraph:
         """Return the graph of a function that changes nothing if the stop flag is set."""
-        buffers = self.buffers
         here, loaded = torch.cuda.current_stream(buffers.device), buffers.view_rows.clone()
         self.stream.wait_stream(here)
         with torch.cuda.stream(self.stream):
@@ -493,15 +365,31 @@ class StepGraphs:
         here.wait_stream(self.stream)
         return captured
 
+    def clear(self) -> None:
+        """Drop all graphs, because the tensors that they refer to have changed; they are captured again."""
+        self._graphs.clear()
+        self._capacities.clear()
+
+    def agreed(self, stopped: bool) -> bool:
+        """Return whether to end after the last step; all processes get the same answer."""
+        return stopped
+
+    def stopped_slot(self) -> int:
+        """Return the first slot that stopped the last steps; 0 if none did, or in steps of one view."""
+        return 0
+
+
+def _replay(graph: CapturedGraph) -> object:
+    """Replay a graph, and return what its work returned."""
+    graph.replay()
+    return graph.result
+
 
 @torch.no_grad()
 def instance_capacity(gaussians: Gaussians, views: ViewStack, degree: int, options: RasterizeOptions) -> int:
-    """Return the capacity of a captured step for (Gaussian, tile) instances, over all views of a stack.
-
-    Raises:
-        ResourceError: The instances would not fit into memory.
-    """
-    counts = [count_instances(inputs_of(gaussians, c), image_settings(c, degree, options)) for c in views.cameras()]
+    """Return the capacity of a captured step for (Gaussian, tile) instances, over all views of a stack."""
+    cameras = [camera_at(views.camera, i) for i in range(len(views.numbers))]
+    counts = [count_instances(inputs_of(gaussians, c), image_settings(c, degree, options)) for c in cameras]
     wanted = int(CAPACITY_FACTOR * int(torch.stack(counts).max())) + 1024
     budget = available_bytes(gaussians.means.device) * 4 // 5
     if wanted > MAX_INSTANCES or wanted * BYTES_PER_INSTANCE > budget:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Annotated, Any
 
 import torch
@@ -38,24 +38,8 @@ MAX_FRACTION = 0.1
 """Largest fraction of the pixels that may be held out in small images to reach `MIN_BLOCKS`, even if less was requested."""
 
 
-@dataclass(frozen=True)
-class Blocks:
-    """Held-out squares of one view."""
-
-    side: int
-    """Width and height [px]."""
-    corners: torch.Tensor
-    """Row and column of the first pixel of each block, int64 on the CPU, shape [B, 2]; no two blocks overlap."""
-
-    def __len__(self) -> int:
-        """Return the number of squares."""
-        return len(self.corners)
-
-    def pixels(self, device: torch.device) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return rows and columns of all pixels, int64, each of shape [B, side, side] once broadcast."""
-        along = torch.arange(self.side, device="cpu")
-        rows, columns = (self.corners[:, i, None] + along for i in range(2))
-        return rows[:, :, None].to(device), columns[:, None, :].to(device)
+Blocks = tuple[torch.Tensor, torch.Tensor]
+"""Rows [B, side, 1] and columns [B, 1, side] of the pixels of squares of one view, int64 on its device; no two overlap."""
 
 
 def sample_blocks(views: list[TrainingView], fraction: float, seed: int) -> list[Blocks]:
@@ -63,23 +47,24 @@ def sample_blocks(views: list[TrainingView], fraction: float, seed: int) -> list
 
     In small images the fraction is larger, see `MAX_FRACTION`.
     """
-    found = []
+    sampled = []
     for number, view in enumerate(views):
         generator = torch.Generator().manual_seed((seed << 16) + number)
         height, width = view.image.shape[:2]
         short = min(height, width)
         side = max(1, min(max(SIDES[0], min(SIDES[1], round(short / 16))), short // 8))
         first = torch.stack([torch.randint(n % side + 1, (), generator=generator, device="cpu") for n in (height, width)])
-        rows, columns = (torch.arange(n // side, device="cpu") for n in (height, width))
-        cells = torch.cartesian_prod(rows, columns) * side + first
+        grid = torch.cartesian_prod(*(torch.arange(n // side, device="cpu") for n in (height, width)))
+        rows, columns = ((grid * side + first)[:, :, None] + torch.arange(side, device="cpu")).to(view.image.device).unbind(1)
+        rows, columns = rows[:, :, None], columns[:, None, :]
         if view.mask is not None:
-            rows, columns = Blocks(side, cells).pixels(view.mask.device)
-            cells = cells[(view.mask[rows, columns].mean((1, 2)) > 0.5).cpu()]
-        least = min(math.ceil(MIN_BLOCKS / len(views)), int(MAX_FRACTION * len(cells)))
-        wanted = min(len(cells), max(1, least, round(fraction * len(cells))))
-        chosen = torch.randperm(len(cells), generator=generator, device="cpu")[:wanted].sort().values
-        found.append(Blocks(side, cells[chosen]))
-    return found
+            shown = view.mask[rows, columns].mean((1, 2)) > 0.5
+            rows, columns = rows[shown], columns[shown]
+        least = min(math.ceil(MIN_BLOCKS / len(views)), int(MAX_FRACTION * len(rows)))
+        wanted = min(len(rows), max(1, least, round(fraction * len(rows))))
+        chosen = torch.randperm(len(rows), generator=generator, device="cpu")[:wanted].sort().values.to(rows.device)
+        sampled.append((rows[chosen], columns[chosen]))
+    return sampled
 
 
 def rendered(gaussians: Gaussians, view: TrainingView, options: RasterizeOptions) -> torch.Tensor:
@@ -87,17 +72,10 @@ def rendered(gaussians: Gaussians, view: TrainingView, options: RasterizeOptions
     return view.seen(rasterize(gaussians, view.camera, options).rgb)
 
 
-def hide(view: TrainingView, blocks: Blocks) -> TrainingView:
-    """Return the view with a mask that leaves out the blocks."""
-    mask = torch.ones_like(view.image[..., 0]) if view.mask is None else view.mask.clone()
-    mask[blocks.pixels(mask.device)] = 0
-    return replace(view, mask=mask)
-
-
-def only(view: TrainingView, blocks: Blocks) -> TrainingView:
-    """Return the view with a mask that leaves out all but the blocks."""
-    mask = torch.zeros_like(view.image[..., 0])
-    mask[blocks.pixels(mask.device)] = 1
+def masked(view: TrainingView, blocks: Blocks, *, inside: bool) -> TrainingView:
+    """Return the view with a mask that leaves out all pixels but those inside of blocks, or outside of them."""
+    mask = torch.full_like(view.image[..., 0], not inside)
+    mask[blocks] = inside
     return replace(view, mask=mask if view.mask is None else mask * view.mask)
 
 
@@ -105,23 +83,14 @@ def only(view: TrainingView, blocks: Blocks) -> TrainingView:
 def block_errors(
     gaussians: Gaussians, views: list[TrainingView], blocks: list[Blocks], options: RasterizeOptions
 ) -> torch.Tensor:
-    """Return the mean squared error of every block over its unmasked pixels, float64 on the CPU, shape [B] over all views.
-
-    Args:
-        gaussians: The model.
-        views: Views without the masks of `hide`.
-        blocks: Blocks of each view.
-        options: Settings of the rasterizer.
-    """
-    errors = []
+    """Return the mean squared error of every block over its unmasked pixels, float64 on the CPU, shape [B] over all views."""
+    errors = [torch.zeros(0, dtype=torch.float64, device="cpu")]
     for view, held in zip(views, blocks, strict=True):
-        if len(held) == 0:
-            continue
-        difference = (rendered(gaussians, view, options).clamp(0, 1) - view.image).square().mean(2)
-        where = held.pixels(difference.device)
-        weights = torch.ones_like(difference) if view.mask is None else view.mask
-        errors.append(((difference * weights)[where].sum((1, 2)) / weights[where].sum((1, 2))).double().cpu())
-    return torch.cat(errors) if errors else torch.zeros(0, dtype=torch.float64, device="cpu")
+        if len(held[0]):
+            difference = (rendered(gaussians, view, options).clamp(0, 1) - view.image).square().mean(2)
+            weights = torch.ones_like(difference) if view.mask is None else view.mask
+            errors.append(((difference * weights)[held].sum((1, 2)) / weights[held].sum((1, 2))).double().cpu())
+    return torch.cat(errors)
 
 
 def decibels(errors: torch.Tensor) -> float:
@@ -129,34 +98,20 @@ def decibels(errors: torch.Tensor) -> float:
     return psnr_of(float(errors.mean()) + FLOOR) if len(errors) else math.nan
 
 
-@dataclass(frozen=True)
-class Gain:
-    """Gain of a change on the left-out blocks."""
+def gain(before: torch.Tensor, after: torch.Tensor) -> tuple[float, float]:
+    """Return the mean decrease of the errors of blocks [B] by a change, and its standard error [dB].
 
-    mean: float
-    """Mean decrease of the error of a block [dB]."""
-    noise: float
-    """Standard error of ``mean`` [dB]; infinite with fewer than two blocks. Blocks of a view are not independent, so the true
-    error may be larger."""
-
-    def upper_bound_below(self, least: float, noises: float) -> bool:
-        """Return whether the mean plus ``noises`` standard errors is below ``least`` [dB]; True for a gain that is NaN.
-
-        With few blocks the noise is large, so a fit whose gain is uncertain continues.
-        """
-        return not self.mean + noises * self.noise >= least
-
-
-def gain(before: torch.Tensor, after: torch.Tensor) -> Gain:
-    """Compute the gain from the errors of blocks before and after a change, shape [B] each.
-
-    The gain of a block is ten times the decimal logarithm of the ratio of its errors, with the floor added to both.
+    The gain of a block is ten times the decimal logarithm of the ratio of its errors, with the floor added to both. The
+    standard error is infinite with fewer than two blocks; blocks of a view are not independent, so it may be too small.
     """
     each = 10 * torch.log10((before + FLOOR) / (after + FLOOR))
     count = len(each)
-    if count == 0:
-        return Gain(math.nan, math.inf)
-    return Gain(float(each.mean()), float(each.std() / math.sqrt(count)) if count > 1 else math.inf)
+    return float(each.mean()) if count else math.nan, float(each.std() / math.sqrt(count)) if count > 1 else math.inf
+
+
+def falls_short(mean: float, noise: float, least: float) -> bool:
+    """Return whether a gain plus its noise is below ``least`` [dB]; a NaN is, while a gain of few blocks hardly ever is."""
+    return not mean + NOISES * noise >= least
 
 
 LATELY = 1.5
@@ -183,27 +138,12 @@ class StoppingConfig(Checked, group="stopping."):
     0.1, or 0 if --cpu-limit shortens the fit."""
 
 
-@dataclass(frozen=True)
-class Measurement:
-    """Left-out blocks at one time, and their gain since the previous measurement; plain values for metrics.json."""
-
-    step: int
-    """Steps done."""
-    count: int
-    """Gaussians at that step."""
-    held_out_psnr: float
-    """PSNR of the left-out blocks, including the error floor [dB]."""
-    gain: float
-    """Mean decrease of the blocks' error since the previous measurement, by growth and training together [dB]."""
-    noise: float
-    """Standard error of ``gain`` over the blocks [dB]."""
-
-
 _COUNT = schema.whole(0)
-_MEASUREMENT = {f.name: _COUNT if f.name in ("step", "count") else schema.real for f in fields(Measurement)}
 STATE = schema.fields({
     "ended": schema.or_null(_COUNT), "why": schema.text, "measured": schema.items(_COUNT),
-    "measurements": schema.items(schema.fields(_MEASUREMENT, others=False)),
+    "measurements": schema.items(schema.fields({
+        "step": _COUNT, "count": _COUNT, "held_out_psnr": schema.real, "gain": schema.real, "noise": schema.real,
+    }, others=False)),
 })  # fmt: skip
 """Schema of the plain values in a checkpoint."""
 
@@ -224,8 +164,9 @@ class Stopping:
         """Steps done when growth ended; None before."""
         self.why = ""
         """Reason why growth ended, for the user."""
-        self.measurements: list[Measurement] = []
-        """All measurements except the first, which has no gain."""
+        self.measurements: list[dict[str, Any]] = []
+        """All measurements except the first, for metrics.json: steps done, Gaussians, PSNR of the blocks, including the error
+        floor [dB], and the gain since the previous measurement, by growth and training together, with its noise [dB]."""
         self.whole: list[TrainingView] = []
         """Views without hidden blocks; empty if nothing is held out."""
         self.blocks: list[Blocks] = []
@@ -238,24 +179,16 @@ class Stopping:
         """For every measurement, the steps done and the errors of the blocks [B]."""
 
     def begin(self, context: StrategyContext, strategy: Strategy, half_resolution: float) -> list[str]:
-        """Choose the blocks and the times of measurements, and return notes for the user.
-
-        Args:
-            context: Parts of the fit, with its views.
-            strategy: Density strategy.
-            half_resolution: Fraction of the planned steps, from the first step on, in which views have half size.
-        """
-        assert self.config.min_gain_db is not None  # `settings_by_views` has chosen
+        """Choose the blocks and the times of measurements, and return notes; the first steps have views of half size."""
         if self.config.min_gain_db == 0:
             return []
         planned, (begins, ends, times) = context.phases.planned, strategy.growth()
         self.earliest = half_resolution * planned
-        count = MEASUREMENTS
-        marks = {max(1, begins + round(k * (ends - begins) / count)) for k in range(count + 1)}
+        marks = {max(1, begins + round(k * (ends - begins) / MEASUREMENTS)) for k in range(MEASUREMENTS + 1)}
         if times:
             marks = {next((t for t in times if t >= m), ends) for m in marks}
         self.marks, self.blocks = sorted(marks), sample_blocks(context.views, FRACTION, context.seed)
-        held = sum(map(len, self.blocks))
+        held = self.held
         self.active = held >= MIN_BLOCKS and ends < planned and len(marks) > 1
         if not self.active:
             few = f"the images have only {held} blocks" if held < MIN_BLOCKS else "growth lasts to the end of the fit"
@@ -265,13 +198,18 @@ class Stopping:
         return [Detail(f"stopping: {held} blocks, {pixels:.1%} of the pixels, are left out until growth ends, by step {ends}")]
 
     @property
+    def held(self) -> int:
+        """Number of blocks."""
+        return sum(len(rows) for rows, _ in self.blocks)
+
+    @property
     def held_pixels(self) -> int:
         """Number of pixels in all blocks."""
-        return sum(len(b) * b.side**2 for b in self.blocks)
+        return sum(rows.numel() * rows.shape[1] for rows, _ in self.blocks)
 
     def hidden(self) -> list[TrainingView]:
         """Return the views with their held-out blocks masked."""
-        return [hide(v, b) for v, b in zip(self.whole, self.blocks)]
+        return [masked(v, b, inside=False) for v, b in zip(self.whole, self.blocks)]
 
     def sh_every(self, every: int, highest: int) -> int:
         """Return the steps between rises of the degree, at most ``every``, so that ``highest`` is in use when growth begins."""
@@ -284,19 +222,13 @@ class Stopping:
         return self.active and self.ended is None and step in self.marks
 
     def changes(self, step: int, strategy: Strategy, context: StrategyContext, degree: int) -> Iterator[DensityUpdate]:
-        """Yield the strategy's changes of the Gaussians after a step, and its last changes when growth ends.
-
-        Args:
-            step: Steps done.
-            strategy: Density strategy.
-            context: Parts of the fit; when growth ends, the fit's third phase begins.
-            degree: Degree of the harmonics in use.
-        """
+        """Yield the strategy's changes after a step, and its last ones when growth ends and the third phase begins."""
         if self.due(step) and self._measured(step, strategy, context, degree):
             self.ended, ends = step, strategy.growth().ends
             if step < ends:
                 context.phases = context.phases.stable_from(step, ends)
-            yield from strategy.catch_up(step, [only(v, b) for v, b in zip(self.whole, self.blocks)], self.held_pixels)
+            held = [masked(v, b, inside=True) for v, b in zip(self.whole, self.blocks)]
+            yield from strategy.catch_up(step, held, self.held_pixels)
         if self.ended is None and strategy.due(step):
             yield from strategy.update(step)
 
@@ -308,53 +240,44 @@ class Stopping:
         options = replace(context.render_options(), sh_degree=degree)
         errors = block_errors(context.gaussians, self.whole, self.blocks, options)
         if self.measured:
-            found, psnr = gain(self.measured[-1][1], errors), decibels(errors)
-            self.measurements.append(Measurement(step, len(context.table), psnr, found.mean, found.noise))
+            mean, noise = gain(self.measured[-1][1], errors)
+            count, psnr = len(context.table), decibels(errors)
+            self.measurements.append({"step": step, "count": count, "held_out_psnr": psnr, "gain": mean, "noise": noise})
             self.why = self._reason(step, errors)
         self.measured.append((step, errors))
         return self.why != ""
 
     def _reason(self, step: int, errors: torch.Tensor) -> str:
         """Return why growth ends after a step with these errors of the blocks [B]; empty if growth continues."""
-        c = self.config
-        assert c.min_gain_db is not None
         since, earlier = next((m for m in reversed(self.measured) if m[0] * LATELY <= step), (0, None))
-        lately = Gain(math.inf, 0.0) if earlier is None or self._is_early(step) else gain(earlier, errors)
-        if lately.upper_bound_below(c.min_gain_db, NOISES):
-            return (
-                f"left-out pixels no longer improve ({lately.mean:+.3f} dB in the last {step - since:,} steps, noise "
-                f"{lately.noise:.3f} dB)"
-            )
+        # in the first third of its time, or while views are half their size, it is too early
+        if earlier is not None and 3 * step >= self.marks[-1] and step > self.earliest:
+            mean, noise = gain(earlier, errors)
+            if falls_short(mean, noise, self.config.min_gain_db):
+                lately = f"{mean:+.3f} dB in the last {step - since:,} steps, noise {noise:.3f} dB"
+                return f"left-out pixels no longer improve ({lately})"
         if step == self.marks[-1]:
-            return f"all its planned steps are done ({self.measurements[-1].gain:+.3f} dB since the previous measurement)"
+            return f"all its planned steps are done ({self.measurements[-1]['gain']:+.3f} dB since the previous measurement)"
         return ""
-
-    def _is_early(self, step: int) -> bool:
-        """Return whether it is too early to end growth: in the first third of its time, or while views are half their size."""
-        return 3 * step < self.marks[-1] or step <= self.earliest
 
     def state(self) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
         """Return the errors of the blocks at every measurement, shape [M, B], and plain values, for resuming."""
         tensors = {"stopping.measured": torch.stack([e for _, e in self.measured])} if self.measured else {}
         return tensors, {
             "ended": self.ended, "why": self.why, "measured": [s for s, _ in self.measured],
-            "measurements": [asdict(m) for m in self.measurements],
+            "measurements": list(self.measurements),
         }  # fmt: skip
 
     def load(self, tensors: Mapping[str, torch.Tensor], plain: dict[str, Any]) -> None:
-        """Load what `state` returned, ``tensors`` of shape [...] by name.
-
-        Raises:
-            DataError: The errors do not belong to these blocks.
-        """
-        shape = (len(plain["measured"]), sum(map(len, self.blocks)) if self.active else 0)
+        """Load what `state` returned, or raise DataError if the errors do not belong to these blocks."""
+        shape = (len(plain["measured"]), self.held if self.active else 0)
         measured = tensors.get("stopping.measured", torch.zeros(0, shape[1], dtype=torch.float32, device="cpu"))
         if measured.shape != shape:
             raise DataError(
                 f"the stored errors of the left-out blocks have shape {list(measured.shape)}, not {list(shape)}; fit again"
             )
         self.ended, self.why = plain["ended"], plain["why"]
-        self.measurements = [Measurement(**m) for m in plain["measurements"]]
+        self.measurements = list(plain["measurements"])
         self.measured = list(zip(plain["measured"], measured))
 
     def figures(self) -> dict[str, Any]:
@@ -363,6 +286,6 @@ class Stopping:
             return {}
         return {
             "held_out": True, "why": self.why, "ended": self.ended,
-            "marginal_db": self.measurements[-1].gain if self.measurements else None,
-            "measurements": [asdict(m) for m in self.measurements],
+            "marginal_db": self.measurements[-1]["gain"] if self.measurements else None,
+            "measurements": self.measurements,
         }  # fmt: skip

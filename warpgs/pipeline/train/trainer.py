@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import math
 import threading
 import time
@@ -20,19 +19,19 @@ from warpgs.errors import DataError, NotFiniteError, OutOfMemoryError, ResourceE
 from warpgs.kernels.update import NOT_FINITE, Setting
 from warpgs.pipeline.metrics.scores import psnr_of, render_view, score
 from warpgs.pipeline.model.edit import stored_degrees
-from warpgs.pipeline.model.limits import TrainingCameras, scene_radius
-from warpgs.pipeline.model.start import Start, initial_gaussians, scene_extent, sweeps
+from warpgs.pipeline.model.limits import camera_centers, camera_rows, scene_radius
+from warpgs.pipeline.model.start import initial_gaussians, scene_extent, sweeps
 from warpgs.pipeline.model.table import Table, model_bytes
-from warpgs.pipeline.train.batch import StepTaker
-from warpgs.pipeline.train.memory import Layout, layout_of, most_instances, plan
+from warpgs.pipeline.train.batch import BatchSteps, Tree
+from warpgs.pipeline.train.memory import Layout, most_instances, plan
 from warpgs.pipeline.train.schedule import Phases, StepReport, plan_phases, random_shift, sh_degree
 from warpgs.pipeline.train.settings import FitConfig
 from warpgs.pipeline.train.setup import prepare, prepared_views, terms_of
-from warpgs.pipeline.train.step import CAPACITY_FACTOR, Learned, OverLimitError, StepBuffers, StepPlan, steps_at_once
+from warpgs.pipeline.train.step import CAPACITY_FACTOR, OverLimitError, StepPlan, StepTaker, steps_at_once
 from warpgs.pipeline.train.stopping import STATE, Stopping
 from warpgs.pipeline.train.strategies.base import StrategyContext, find_strategy
-from warpgs.pipeline.train.views import Kind, LearnedViews, TrainingView, half_size, show_learned, stack_views, with_learned
-from warpgs.priors.sweep import SweepConfig, sweep_depths
+from warpgs.pipeline.train.views import LearnedViews, TrainingView, half_size, show_learned, stack_views, with_learned
+from warpgs.priors.sweep import sweep_depths
 from warpgs.process import Detail
 from warpgs.ranks import ALONE, Ranks
 from warpgs.scene import Camera, Gaussians, PointCloud, Prior, Scene, View
@@ -44,6 +43,8 @@ from warpgs.schema import Schema, SchemaError, anything, fields, items, mapping,
 # The mean over many steps does not (Polyak and Juditsky 1992; Izmailov et al. 2018, arXiv 1803.05407).
 # docs/decisions/029-mean-of-the-last-steps.md has measurements.
 
+ALL_SAVED, CHECKPOINT_SECONDS = 1000, 20.0
+"""Steps between checkpoints below which each is written; least time between others [s]."""
 SAMPLES = 32
 """Least number of samples of a mean; a shorter mean takes every step."""
 PREFIX = "mean."
@@ -73,23 +74,11 @@ class ParameterMean:
 
     @torch.no_grad()
     def update(self, step: int, steps: int, params: Mapping[str, torch.Tensor]) -> bool:
-        """Take a sample if it is due; after the last step, replace the parameters by the mean.
-
-        Args:
-            step: Steps taken.
-            steps: Steps of the fit.
-            params: Parameters by name, of any shape [...]; replaced in place.
-
-        Returns:
-            Whether the parameters were replaced.
-        """
+        """Take a sample if it is due; after the last step, replace the parameters by the mean in place, and return True."""
         if step not in self.samples(steps):
             return False
         for name, value in params.items():
-            if self.count:
-                self.sums[name] += value
-            else:
-                self.sums[name] = value.detach().clone()
+            self.sums[name] = self.sums[name].add_(value) if self.count else value.detach().clone()
         self.count += 1
         if step < steps:
             return False
@@ -110,28 +99,19 @@ class ParameterMean:
         return {f"{PREFIX}{n}": t for n, t in self.sums.items()} | {f"{PREFIX}count": count}
 
     def load(self, tensors: Mapping[str, torch.Tensor], params: Mapping[str, torch.Tensor]) -> None:
-        """Load what `state` returned.
-
-        Args:
-            tensors: Tensors by name, of any shape [...]; other names are ignored.
-            params: Current parameters by name, of the shapes [...] of the sums.
-
-        Raises:
-            DataError: A sum is missing, unknown, or of another shape or type than its parameter, or the count is invalid.
-        """
+        """Load what `state` returned, for these current parameters, or raise DataError."""
         self.restart()
         stored = {n.removeprefix(PREFIX): t for n, t in tensors.items() if n.startswith(PREFIX)}
         if not stored:
             return
         count = stored.pop("count", None)
         kinds = {n: (t.shape, t.dtype) for n, t in stored.items()}
-        whole = count is not None and count.shape == (1,) and count.dtype == torch.int64 and int(count) > 0
-        if not whole or kinds != {n: (t.shape, t.dtype) for n, t in params.items()}:
+        counted = count is not None and count.shape == (1,) and count.dtype == torch.int64 and int(count) > 0
+        if not counted or kinds != {n: (t.shape, t.dtype) for n, t in params.items()}:
             raise DataError(
                 "the stored mean of the parameters is damaged, or does not belong to these parameters; restore the file, or "
                 "fit the scene again"
             )
-        assert count is not None
         self.count = int(count)
         self.sums = {n: t.to(params[n].device).clone() for n, t in stored.items()}
 
@@ -139,19 +119,7 @@ class ParameterMean:
 def check_state(
     tensors: Mapping[str, torch.Tensor], plain: dict[str, Any], *, views: int, steps: int, strategy: Schema, stopping: Schema
 ) -> None:
-    """Check the parts of a stored state that are not rows of a table; `Table.load` checks the rows.
-
-    Args:
-        tensors: Tensors by name, of any shape [...].
-        plain: Plain values.
-        views: Number of training views.
-        steps: Number of steps of the fit.
-        strategy: Schema of the strategy's own values.
-        stopping: Schema of the values of early stopping.
-
-    Raises:
-        DataError: A value is missing or invalid.
-    """
+    """Raise DataError unless the parts of a stored state that are not rows of a table are valid; `Table.load` checks rows."""
     state = fields({
         "step": whole(0, steps), "order": items(whole(0, views - 1)), "extent": number(above=0), "notes": items(text),
         "strategy": mapping(anything), "stopping": stopping, "stable_start": whole(0, steps), "steps": whole(1, steps),
@@ -188,66 +156,45 @@ class Trainer:
     ):  # fmt: skip
         """Set up the initial Gaussians.
 
-        Args:
-            train: The views to fit, at least one.
-            points: The reconstruction's points, or None.
-            config: Settings without automatic ones (None): `warpgs.pipeline.train.settings.settings_by_views` chooses those.
-            device: Device of the fit.
-            background: Colour behind the scene.
-            priors: Prior of each view; None to compute them if sampling or a loss term needs them.
-            ready: Called before the device is used.
-            progress: Called with a line for the user about the work before the first step.
-            ranks: Processes that share the views of a step; the fit has the same bits for any number of them.
-
-        Raises:
-            DataError: There is no training view, or the scene gives no initial points.
-            UsageError: A camera cannot be rendered, the memory limit is below the smallest step, a plug-in is missing, two loss
-                terms have a map of the same name, two view modules have a parameter of the same name, or a view module does
-                not support the views.
+        Automatic settings are chosen already (`warpgs.pipeline.train.settings.settings_by_views`). Priors are computed if they
+        are None, and sampling or a loss term needs them. ``ready`` is called before the device is used, and ``progress`` with
+        lines on the work before the first step. A fit has the same bits for any number of ``ranks``, which share the views of a
+        step.
         """
         if not train:
             raise DataError("there is no training view; leave at least one in --split")
         for module in config.view_modules:
             module.check(train)
-        self.config, self.device, self.ranks, self.batch = config, device, ranks, config.batch
-        self.generator = torch.Generator().manual_seed(config.seed)
-        made = prepare(train, points, config, np.random.default_rng(config.seed), device, priors, ready, progress)
-        train = made.views
-        self.notes: list[str] = made.notes
+        c, self.config, self.device, self.ranks, self.batch = config, config, device, ranks, config.batch
+        self.generator = torch.Generator().manual_seed(c.seed)
+        self.notes: list[str]
         """Notes on choices made before the first step, for the user."""
+        train, start, priors, self.notes = prepare(
+            train, points, c, np.random.default_rng(c.seed), device, priors, ready, progress
+        )
         self.messages: list[str] = []
         """Messages for the user that were not shown yet."""
-        cloud, cameras = made.start.cloud, [v.camera for v in train]
-        self.radius = scene_radius(cameras, cloud)
+        cameras = [v.camera for v in train]
+        extent, self.radius = scene_extent(cameras, start.cloud), scene_radius(cameras, start.cloud)
         """Radius of the scene [u], as `scene_radius` measures it."""
         self.scene_background, self.background = background, torch.tensor(background, dtype=torch.float32, device=device)
-        assert config.half_resolution is not None  # `settings_by_views` has chosen
-        self.half_resolution = config.half_resolution
+        self.half_resolution = c.half_resolution or 0.0
         """Fraction of the planned steps, from the first step on, in which views have half size."""
-        self.dropout = config.dropout * min(1.0, DROPOUT_VIEWS / len(train))
+        self.dropout = c.dropout * min(1.0, DROPOUT_VIEWS / len(train))
         """Dropout probability at the last step."""
         self.cutout = any(v.alpha is not None and not v.alpha_estimated for v in train)  # then every view gets one
         given = {n: any(getattr(v, n) is not None for v in train) for n in ("depth", "normals")}
-        self.terms = terms_of(config, self.cutout, **given)
+        self.terms = terms_of(c, self.cutout, **given)
         self.step = 0  # taken
-        self.memory_limit, self.captured = config.memory_limit, config.cuda_graph
+        self.memory_limit, self.captured = c.memory_limit, c.cuda_graph
         """Memory limit of steps [bytes], None for no limit; and whether steps may be captured. `spare_memory` changes both."""
         self.order: list[int] = []
         """Views still to come in the current pass over all views, in reverse order."""
-        self.extrapolated = made.start.extrapolated > 0
+        self.extrapolated = start.extrapolated > 0
         """True if the start has extrapolated points: opacity decay then spares Gaussians that a step does not use."""
-        self._make_parts(train, made.start, scene_extent(cameras, cloud))
-        self.layout: Layout
-        views, self.disparities = prepared_views(train, made, config, self.terms, device)
-        self.context.priors = made.priors or []
-        self._begin(with_learned(views, self.learned.views))
-
-    def _make_parts(self, train: list[View], start: Start, extent: float) -> None:
-        """Make the Gaussians, the strategy, the parameters of view modules, and the `StepTaker`; ``extent`` is in [u]."""
-        c, device = self.config, self.device
-        assert c.steps is not None and c.sh_degree is not None and c.optimizer.average_last is not None  # chosen by now
-        first = initial_gaussians(start.cloud, c.init, c.sh_degree, extent, device, start.extrapolated)
-        self.table = Table.of_gaussians(first, {})
+        self.table = Table.of_gaussians(
+            initial_gaussians(start.cloud, c.init, c.sh_degree, extent, device, start.extrapolated), {}
+        )
         self.context = StrategyContext(
             c.groups(), c.strategy_config, self.table, self.generator, c.seed, plan_phases(c.phases, c.steps), extent, c.rule,
             self.background, antialiased=c.antialiased,
@@ -255,17 +202,16 @@ class Trainer:
         """The parts of the fit that the strategy works with: views, phases, the scene's size and others."""
         self.strategy, self.stopping = find_strategy(c.strategy)(self.context), Stopping(c.stopping)
         self.table.add_columns(self.strategy.columns())
-        views = LearnedViews.first(c.view_modules, train, device)
-        self.table.batch = views.table.batch = self.batch
-        seed, cameras = c.seed if self.dropout > 0 else None, TrainingCameras.of([v.camera for v in train], device)
-        self.learned = Learned(self.table, views, self.strategy, seed, cameras)
+        self.learned = LearnedViews(c.view_modules, train, device)
+        """View modules with their parameters."""
+        self.table.batch = self.learned.table.batch = c.batch
         self.mean = ParameterMean(c.optimizer.average_last)
-        self.buffers = StepBuffers(device, 3 * (len(self.table.params) + len(views.table.params)))
-        self.taker = StepTaker(self.learned, self.buffers, self.context.render_options(), self.batch, self.ranks)
-
-    def _begin(self, views: list[TrainingView]) -> None:
-        """Train on these views, without the blocks that early stopping holds out."""
-        self.set_views(views)
+        limiting, seed = (camera_centers(cameras, device), camera_rows(cameras, device)), c.seed if self.dropout > 0 else None
+        parts = self.table, self.learned, self.strategy, limiting, self.context.render_options(), seed
+        self.taker = StepTaker(*parts) if c.batch == 1 else BatchSteps(*parts, Tree(c.batch, ranks))
+        views, self.disparities = prepared_views(train, start, priors, c, self.terms, device)
+        self.context.priors = priors or []
+        self.set_views(with_learned(views, self.learned))
         self.strategy.setup()
         self.notes += self.stopping.begin(self.context, self.strategy, self.half_resolution)
         if self.stopping.active:
@@ -297,19 +243,17 @@ class Trainer:
 
     def degree(self, step: int) -> int:
         """Return the degree of the harmonics in use at a step."""
-        highest = self.config.sh_degree
-        assert highest is not None  # `settings_by_views` has chosen
-        return sh_degree(step, self.stopping.sh_every(self.config.sh_every, highest), highest)
+        c = self.config
+        return sh_degree(step, self.stopping.sh_every(c.sh_every, c.sh_degree), c.sh_degree)
 
     def plan_of(self, step: int) -> StepPlan:
         """Return the plan of step number ``step``, from 1."""
         c = self.config
         terms = tuple(t for t in self.terms if t.active(step, self.phases.planned))
-        strategy, half = self.strategy, step <= self.half_resolution * self.phases.planned
+        half = step <= self.half_resolution * self.phases.planned
         limits = c.limits.at(1.0 if step >= self.steps else self.progress(step), self.radius, c.antialiased)
-        decay = c.optimizer.opacities_decay
-        assert decay is not None  # `settings_by_views` has chosen
-        return StepPlan(self.degree(step), half, terms, strategy.phase(step), limits, decay, self.extrapolated)
+        phase, decay = self.strategy.phase(step), c.optimizer.opacities_decay
+        return StepPlan(self.degree(step), half, terms, phase, limits, decay, self.extrapolated)
 
     def next_view(self) -> int:
         """Return the index of the next view. The order is random; each view comes once before any view comes again."""
@@ -321,34 +265,26 @@ class Trainer:
         """Take up to ``limit`` steps, and let the strategy change the set of Gaussians after the last step if a change is due.
 
         On CUDA, steps are replayed as graphs, several at a time, up to the next step after which the host has work. On a CPU,
-        or if a memory limit does not allow graphs, one step is taken.
-
-        Raises:
-            NotFiniteError: A loss is not finite; the Gaussians are as before that step.
-            OutOfMemoryError: A step, or a change of the set of Gaussians, ran out of memory.
-            ResourceError: The instances would not fit into memory, or another process is gone.
+        or if a memory limit does not allow graphs, one step is taken. After a NotFiniteError the Gaussians are as before.
         """
-        try:
+        with self._out_of_memory():
             return self._advance(limit)
+
+    @contextlib.contextmanager
+    def _out_of_memory(self) -> Iterator[None]:
+        """Raise OutOfMemoryError for a lack of memory. If no step of the series was taken, its views come again."""
+        try:
+            yield
         except (MemoryError, RuntimeError) as e:
             if not is_out_of_memory(e):
                 raise
-            raise self._no_memory(e) from e
-
-    def _no_memory(self, error: Exception) -> OutOfMemoryError:
-        """Return the error for a step that ran out of memory. If no step of the series was taken, its views come again."""
-        chosen, self.chosen = self.chosen, None
-        intact = chosen is not None and int(self.buffers.counter) == 0
-        if chosen is not None and intact:
-            self.order += reversed(chosen)
-        return OutOfMemoryError(no_memory_message(error, f" for step {self.step + 1}"), intact)
+            chosen, self.chosen = self.chosen, None
+            intact = chosen is not None and int(self.taker.buffers.counter) == 0
+            self.order += reversed(chosen if intact else [])
+            raise OutOfMemoryError(no_memory_message(e, f" for step {self.step + 1}"), intact) from e
 
     def spare_memory(self) -> None:
-        """Free unused memory, and run all further steps without graphs, in chunks that fit into the free memory.
-
-        Raises:
-            ResourceError: Not even the smallest step fits.
-        """
+        """Free unused memory, and run all further steps without graphs, in chunks that fit into the free memory."""
         self.taker.clear()
         if self.device.type == "cuda":
             torch.cuda.empty_cache()
@@ -357,13 +293,10 @@ class Trainer:
         if self.config.memory_limit is not None:
             self.memory_limit = min(self.memory_limit, self.config.memory_limit)
         try:
-            self.set_views(self.views)
+            with self._out_of_memory():
+                self.set_views(self.views)
         except UsageError as e:
             raise ResourceError(str(e)) from e
-        except (MemoryError, RuntimeError) as e:
-            if not is_out_of_memory(e):
-                raise
-            raise self._no_memory(e) from e
         self.messages.append(
             f"memory: step {self.step + 1} ran out of memory; from now on, steps run without CUDA graphs, within "
             f"{format_bytes(self.memory_limit)}"
@@ -371,7 +304,7 @@ class Trainer:
 
     def _advance(self, limit: int) -> list[StepReport]:
         """Take steps as `advance` does."""
-        begin, first = time.perf_counter(), self.step + 1
+        begin, first, buffers = time.perf_counter(), self.step + 1, self.taker.buffers
         plan, count = self.plan_of(first), 1
         if self.layout.graphs:
             most = min(limit, steps_at_once(self.batch), self.mean.wait(self.step, self.steps))
@@ -380,38 +313,8 @@ class Trainer:
         chosen = [self.next_view() for _ in range(count * self.batch)]
         places = [self.places[i + plan.half_size * len(self.views)] for i in chosen]
         steps = range(first, first + count)
-        self.buffers.load(
-            [row for _, row in places[:count]], [self._lr_row(s) for s in steps], [self.settings(s) for s in steps]
-        )
+        buffers.load([row for _, row in places[:count]], [self._lr_row(s) for s in steps], [self.settings(s) for s in steps])
         self.chosen = chosen
-        if not self._take(places, steps, plan):
-            self.order += reversed(chosen)
-            return self._advance(1)
-        self.chosen = None
-        done, stop, history = self.buffers.result()
-        self.order += reversed(chosen[done * self.batch :])  # views of steps that were not taken come again
-        self.step += done
-        if stop == NOT_FINITE:
-            error = NotFiniteError(f"the loss became {history[done][0]} at step {self.step + 1}")
-            error.slot = self.taker.stopped_slot
-            error.view = chosen[done * self.batch + error.slot]
-            raise error
-        if stop:
-            self.taker.clear()  # they are captured again with more capacity
-        counts = [len(self.table)] * done
-        if done == count:
-            self._update()
-            if self.mean.update(self.step, self.steps, self.learned.params):
-                self.plan_of(self.step).limits.hold(self.table.params, self.learned.cameras)
-            counts[-1] = len(self.table)
-        seconds = (time.perf_counter() - begin) / max(1, done)
-        return [
-            StepReport(first + k, loss, psnr_of(max(mse, 1e-12)), counts[k], seconds)
-            for k, (loss, mse) in enumerate(history[:done])
-        ]
-
-    def _take(self, places: list[tuple[Kind, int]], steps: range, plan: StepPlan) -> bool:
-        """Take steps with views at these places; return False, and take none, if graphs would need too much memory."""
         try:
             self.taker.take(
                 places, lambda: [self.settings(step, slot) for step in steps for slot in range(self.batch)],
@@ -419,17 +322,42 @@ class Trainer:
             )  # fmt: skip
         except OverLimitError as e:
             self.taker.clear()
-            self.layout = dataclasses.replace(self.layout, graphs=0)
+            self.layout.graphs = 0
             self.count_changed()
             self.messages.append(f"memory: from now on, steps run without CUDA graphs, because {e}")
-            return False
-        return True
+            self.order += reversed(chosen)
+            return self._advance(1)
+        self.chosen = None
+        done, stop, history = buffers.result()
+        self.order += reversed(chosen[done * self.batch :])  # views of steps that were not taken come again
+        self.step += done
+        if stop == NOT_FINITE:
+            error = NotFiniteError(f"the loss became {history[done][0]} at step {self.step + 1}")
+            error.slot = self.taker.stopped_slot()
+            error.view = chosen[done * self.batch + error.slot]
+            raise error
+        if stop:
+            self.taker.clear()  # they are captured again with more capacity
+        counts = [len(self.table)] * done
+        if done == count:
+            self._update()
+            if self.mean.update(self.step, self.steps, self.taker.params):
+                self._hold()
+            counts[-1] = len(self.table)
+        seconds = (time.perf_counter() - begin) / max(1, done)
+        return [
+            StepReport(first + k, loss, psnr_of(max(mse, 1e-12)), counts[k], seconds)
+            for k, (loss, mse) in enumerate(history[:done])
+        ]
+
+    def _hold(self) -> None:
+        """Hold all Gaussians to the limits of the last step."""
+        self.plan_of(self.step).limits.hold(self.table.params, self.taker.cameras)
 
     def _lr_row(self, step: int) -> list[float]:
         """Return the learning rates of a step as `StepBuffers` holds them: of the Gaussians, then of view modules."""
-        row = self.table.lr_row(self.lrs(step), step, self.config.optimizer.head_lrs)
-        views = self.learned.views
-        return row + views.table.lr_row(views.lrs(self.progress(step), self.context.extent), step, {})
+        own, lrs = self.lrs(step), self.learned.lrs(self.progress(step), self.context.extent)
+        return self.table.lr_row(own, step, self.config.optimizer.head_lrs) + self.learned.table.lr_row(lrs, step, {})
 
     def lrs(self, step: int) -> dict[str, float]:
         """Return the learning rate of each parameter of the Gaussians at a step."""
@@ -467,11 +395,11 @@ class Trainer:
                 self.messages.append(f"early stopping: left-out pixels no longer improve; {self.steps:,} steps in all")
             words = f"stopping: growth ended at step {step} with {len(self.table):,} Gaussians, because {stopping.why}"
             self.messages.append(Detail(f"{words}; from now on, training uses all pixels"))
-        self.plan_of(self.step).limits.hold(self.table.params, self.learned.cameras)
+        self._hold()
 
     def show_learned(self) -> None:
         """Write the current values of view modules into the views."""
-        show_learned(self.views, self.stacks, self.places, self.learned.views)
+        show_learned(self.views, self.stacks, self.places, self.learned)
 
     def set_views(self, views: list[TrainingView]) -> None:
         """Set the training views, and plan the memory of steps."""
@@ -480,16 +408,17 @@ class Trainer:
         shown = [*views, *(half_size(v) for v in views if self.half_resolution > 0)]
         shown, self.stacks, self.places = stack_views(shown, len(views))
         self.context.views = shown[: len(views)]
-        layout = layout_of(
+        self.layout = Layout(
             self.table, shown, self.terms, self.strategy, c.view_modules, kept=self.stopping.whole, captured=self.captured,
-            sums=self.taker.sums, averaged=self.mean.fraction > 0,
+            sums=self.taker.kept_sums, averaged=self.mean.fraction > 0,
         )  # fmt: skip
         most = most_instances(self.gaussians, [v.camera for v in shown], self.context.render_options())
-        self.memory, self.layout = plan(
-            layout, count=len(self.table), instances=most, most=c.max_gaussians, limit=self.memory_limit,
+        self.memory = plan(
+            self.layout, count=len(self.table), instances=most, most=c.max_gaussians, limit=self.memory_limit,
             available=available_bytes(self.device), capacity_factor=CAPACITY_FACTOR,
         )  # fmt: skip
-        self.context.capacity = min(c.max_gaussians, self.memory.cap)
+        """Planned memory, for metrics.json."""
+        self.context.capacity = min(c.max_gaussians, self.memory["cap"])
         self.count_changed()
 
     def count_changed(self) -> None:
@@ -500,7 +429,7 @@ class Trainer:
     def state(self) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
         """Return tensors by name, of any shape [...], and plain values from which the fit continues with the same bits."""
         (tensors, strategy), (errors, stopping) = self.strategy.state(), self.stopping.state()
-        views = {f"views.{n}": t for n, t in self.learned.views.table.state().items()}
+        views = {f"views.{n}": t for n, t in self.learned.table.state().items()}
         tensors = {**self.table.state(), **views, **self.mean.state(), **tensors, **errors}
         tensors["generator"] = self.generator.get_state()
         plain = {
@@ -511,22 +440,18 @@ class Trainer:
         return tensors, plain
 
     def load(self, tensors: dict[str, torch.Tensor], plain: dict[str, Any]) -> None:
-        """Load what `state` returned, ``tensors`` of shape [...] by name.
-
-        Raises:
-            DataError: The values are not a result of `state`.
-        """
+        """Load what `state` returned, ``tensors`` of shape [...] by name, or raise DataError."""
         check_state(
             tensors, plain, views=len(self.views), steps=self.phases.planned, strategy=self.strategy.STATE, stopping=STATE
         )
         self.step, self.order = plain["step"], list(plain["order"])
-        self.context.phases = dataclasses.replace(self.phases, stable_start=plain["stable_start"], steps=plain["steps"])
+        self.context.phases = replace(self.phases, stable_start=plain["stable_start"], steps=plain["steps"])
         self.context.extent = plain["extent"]
         self.notes = [*map(Detail, plain["notes"])]  # shown when the fit began
         self.table.load(tensors)
         of_views = {n.removeprefix("views."): t for n, t in tensors.items() if n.startswith("views.")}
-        self.learned.views.table.load(of_views)
-        self.mean.load(tensors, self.learned.params)
+        self.learned.table.load(of_views)
+        self.mean.load(tensors, self.taker.params)
         self.strategy.load(tensors, plain["strategy"])
         self.stopping.load(tensors, plain["stopping"])
         self.set_views(self.views if self.stopping.ended is None else self.stopping.whole)
@@ -548,21 +473,9 @@ def run(
     """Take all remaining steps; report each, and save at intervals and at the end.
 
     A step that runs out of memory is tried once more with less memory (`Trainer.spare_memory`). If the state is incomplete, for
-    example during a change of the set of Gaussians, the fit continues from the last saved state. With several processes there
-    is no second try, because one process would be alone in that step.
-
-    Args:
-        trainer: The fit.
-        on_step: Called after each step.
-        save: Saves the state.
-        stopped: Returns whether to end after the current step.
-        restore: Loads the last saved state; returns False without one.
-
-    Raises:
-        NotFiniteError: The loss, or the state to save, is not finite; the state is not saved.
-        OutOfMemoryError: A step ran out of memory, and a second try failed or was not possible; a complete state before the
-            step is saved.
-        KeyboardInterrupt: ``stopped`` returned True after a step; the state after it is saved.
+    example during a change of the set of Gaussians, the fit continues from the last saved state, which ``restore`` loads; it
+    returns False without one. With several processes there is no second try, because one process would be alone in that step.
+    A state that is not finite is not saved. If ``stopped`` returns True after a step, KeyboardInterrupt is raised.
     """
     every, saved, ran_out = trainer.config.checkpoint_every, time.monotonic(), -1
     while trainer.step < trainer.steps:
@@ -586,7 +499,7 @@ def run(
         for report in reports:
             on_step(report)
         stop = trainer.taker.agreed(stopped())
-        due = trainer.step % every == 0 and time.monotonic() - saved >= trainer.config.checkpoint_seconds
+        due = trainer.step % every == 0 and (every < ALL_SAVED or time.monotonic() - saved >= CHECKPOINT_SECONDS)
         if stop or due or trainer.step == trainer.steps:
             save(trainer)
             saved = time.monotonic()
@@ -625,32 +538,18 @@ SIDE, POINTS, PLANES = 48, 200, 8
 """Side of the tiny fit's views [px], number of its points, and number of its sweep planes."""
 
 
-def _views(generator: np.random.Generator) -> list[View]:
-    K = np.array([[SIDE, 0, SIDE / 2], [0, SIDE, SIDE / 2], [0, 0, 1.0]])
-    cameras = []
-    for x in (-0.2, 0.2):
-        viewmat = np.eye(4)
-        viewmat[0, 3] = x
-        cameras.append(Camera(viewmat, K, SIDE, SIDE))
-    return [View(f"{i}", c, generator.random((SIDE, SIDE, 3), np.float32)) for i, c in enumerate(cameras)]
-
-
 def warm_up(config: FitConfig, device: torch.device, stopped: Callable[[], bool] = lambda: False) -> Trainer:
     """Fit noise in two small views with the settings of the real fit, including refinement and sampling; score one view.
 
-    Args:
-        config: Settings of the real fit. If that fit sweeps on the device, these views are swept, too.
-        device: Device to work on.
-        stopped: Returns, after each step, whether to stop.
-
-    Returns:
-        The trainer, after its last step.
-
-    Raises:
-        KeyboardInterrupt: ``stopped`` returned True.
+    If the real fit sweeps on the device, these views are swept, too. Returns the trainer after its last step; if ``stopped``
+    returns True after a step, KeyboardInterrupt is raised.
     """
-    generator = np.random.default_rng(0)
-    views = _views(generator)
+    generator, views = np.random.default_rng(0), []
+    K = np.array([[SIDE, 0, SIDE / 2], [0, SIDE, SIDE / 2], [0, 0, 1.0]])
+    for x in (-0.2, 0.2):
+        viewmat = np.eye(4)
+        viewmat[0, 3] = x
+        views.append(View(f"{x}", Camera(viewmat, K, SIDE, SIDE), generator.random((SIDE, SIDE, 3), np.float32)))
     points = generator.uniform([-1, -1, 2], [1, 1, 4], (POINTS, 3))
     cloud = PointCloud(points, generator.random((POINTS, 3), np.float32))
     maps = [generator.random((SIDE, SIDE), np.float32) for _ in range(4)]
@@ -661,10 +560,9 @@ def warm_up(config: FitConfig, device: torch.device, stopped: Callable[[], bool]
     )  # fmt: skip
     if hasattr(small.strategy_config, "every"):  # a strategy with events of its own, such as mcmc: it has some, too
         small = replace(small, strategy_config=replace(small.strategy_config, every=1))
-    black = (0.0, 0.0, 0.0)
     if sweeps(config.init, len(views)) and config.memory_limit is None:
-        sweep_depths(views, [(2, 4)] * len(views), SweepConfig(max_planes=PLANES), device)
-    fit = Trainer(views, cloud, small, device, black, [Prior(*maps, "noise", "noise") for _ in views])
+        sweep_depths(views, [(2, 4)] * len(views), device, max_planes=PLANES)
+    fit = Trainer(views, cloud, small, device, priors=[Prior(*maps, "noise", "noise") for _ in views])
     run(fit, lambda _: None, lambda _: None, stopped)
     score(views[0], render_view(fit.gaussians, views[0], fit.context.render_options())[0])
     fit.taker.clear()  # their memory is for the fit that follows

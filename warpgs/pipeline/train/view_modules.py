@@ -150,24 +150,6 @@ VIEW_MODULES = Registry("view module", ViewModule, __name__)
 register = VIEW_MODULES.register
 
 
-def check_modules(modules: Sequence[ViewModule]) -> None:
-    """Check that a run folder can name the class of each view module.
-
-    Raises:
-        UsageError: An object is not a view module, its class is not registered, or two have the same class.
-    """
-    for i, module in enumerate(modules):
-        kind = type(module)
-        if not isinstance(module, ViewModule):
-            raise UsageError(
-                f"{module!r} is not a view module: give an instance of a class that derives from warpgs.ViewModule"
-            )
-        if not VIEW_MODULES.has(kind):
-            raise UsageError(VIEW_MODULES.unnamed(kind))
-        if any(type(m) is kind for m in modules[:i]):
-            raise UsageError(f"the view module {module.name!r} is given twice; remove one")
-
-
 # Exposure of training views: an affine map of rendered colours for each view, learned with the Gaussians.
 #
 # A camera with automatic exposure and white balance changes the colours between photographs. With exposures a step
@@ -237,11 +219,7 @@ class Exposure(ViewModule, group="exposure."):
     """Weight of the squared difference between each view's exposure and the identity, in [0, 1000]."""
 
     def check(self, views: Sequence[View]) -> None:
-        """Check that no view has an alpha channel: an exposure would change the background with the object.
-
-        Raises:
-            UsageError: A view has an alpha channel.
-        """
+        """Check that no view has an alpha channel: an exposure would change the background with the object."""
         for v in views:
             if v.alpha is not None:
                 raise UsageError(
@@ -277,10 +255,9 @@ class Exposure(ViewModule, group="exposure."):
     def figures(self, fitted: FittedViews) -> dict[str, Any]:
         """Return the learned exposures and their effect.
 
-        Returns:
-            ``views``, for each training view [A | b] as 3 rows of 4, and ``gain``, the mean over channels of a middle gray
-            after exposure, divided by that gray; ``matched_psnr``, the mean PSNR of held-out views after colour matching [dB],
-            None without held-out views; ``summary``.
+        ``views`` has for each training view [A | b] as 3 rows of 4, and ``gain``, the mean over channels of a middle gray after
+        exposure, divided by that gray. ``matched_psnr`` is the mean PSNR of held-out views after colour matching [dB], None
+        without held-out views.
         """
         rows = fitted.params[EXPOSURE].double()
         numbers = exposure_of(rows, rows).detach().cpu().numpy().reshape(-1, CHANNELS, CHANNELS + 1)
@@ -340,13 +317,7 @@ def increments(rotation: torch.Tensor, translation: torch.Tensor) -> torch.Tenso
 
 
 def moved(viewmats: torch.Tensor, rotation: torch.Tensor, translation: torch.Tensor) -> torch.Tensor:
-    """Return camera_from_world [B, 4, 4] of views after their increments; differentiable.
-
-    Args:
-        viewmats: camera_from_world as given, shape [B, 4, 4].
-        rotation: w of each view [rad], shape [B, 3].
-        translation: t of each view [u], shape [B, 3].
-    """
+    """Return camera_from_world [B, 4, 4] of views after their increments w [rad] and t [u], [B, 3] each; differentiable."""
     motion = increments(rotation, translation)
     # four products, since the order of summation in a matrix product depends on the library
     products = [motion[..., k : k + 1] * viewmats[..., k : k + 1, :] for k in range(4)]
@@ -388,27 +359,6 @@ def similarity(given: Sequence[Camera], refined: Sequence[Camera]) -> tuple[np.n
     return R, scale, b.mean(0) - scale * matmul(R, a.mean(0))
 
 
-def similar_cameras(
-    cameras: Mapping[str, Camera], given: Sequence[Camera], refined: Sequence[Camera], names: Sequence[str]
-) -> dict[str, Camera]:
-    """Return the named cameras after the similarity that best maps given cameras to refined ones, by name.
-
-    Args:
-        cameras: Cameras by name, in the world of the given ones.
-        given: Cameras before refinement.
-        refined: The same cameras after refinement, in the same order.
-        names: Names of the cameras to return.
-    """
-    R, scale, t = similarity(given, refined)
-    found = {}
-    for name in names:
-        turned, center = matmul(cameras[name].viewmat[:3, :3], R.T), scale * matmul(R, cameras[name].center) + t
-        viewmat = np.eye(4)
-        viewmat[:3, :3], viewmat[:3, 3] = turned, -matmul(turned, center)
-        found[name] = replace(cameras[name], viewmat=viewmat)
-    return found
-
-
 def refined_cameras(
     given: Mapping[str, Camera], train: Sequence[str], test: Sequence[str], params: Tensors
 ) -> dict[str, Camera]:
@@ -416,18 +366,17 @@ def refined_cameras(
 
     If focal lengths are learned, a held-out view has the focal length of the training views of its camera. If no training view
     has its intrinsics, the mean factor over all training views is used.
-
-    Args:
-        given: Cameras as given, in scene units, by name.
-        train: Names of the training views, in the order of the fit.
-        test: Names of the held-out views.
-        params: Parameters of the training views.
     """
     motions = increments(*(params[n].detach().cpu().double() for n in (ROTATION, TRANSLATION))).numpy()
     found = dict(given)
     for name, motion in zip(train, motions, strict=True):
         found[name] = replace(given[name], viewmat=matmul(motion, given[name].viewmat))
-    found |= similar_cameras(given, [given[n] for n in train], [found[n] for n in train], test)
+    R, scale, t = similarity([given[n] for n in train], [found[n] for n in train])
+    for name in test:
+        turned, center = matmul(given[name].viewmat[:3, :3], R.T), scale * matmul(R, given[name].center) + t
+        viewmat = np.eye(4)
+        viewmat[:3, :3], viewmat[:3, 3] = turned, -matmul(turned, center)
+        found[name] = replace(given[name], viewmat=viewmat)
     if FOCAL not in params:
         return found
     exact = {n: params[n].detach().cpu().double() for n in (FOCAL, CAMERA_NUMBER)}
@@ -443,18 +392,10 @@ def refined_cameras(
 def pose_figures(
     given: Mapping[str, Camera], refined: Mapping[str, Camera], train: Sequence[str], held_out: bool, scale: float
 ) -> dict[str, Any]:
-    """Return the changes by refinement, for metrics.json.
+    """Return the changes by refinement, for metrics.json; ``scale`` is scene units per unit of the scene's files.
 
-    Args:
-        given: Cameras before refinement, in scene units.
-        refined: Cameras after refinement.
-        train: Names of the training views.
-        held_out: Whether there are held-out views.
-        scale: Scene units per unit of the scene's files.
-
-    Returns:
-        ``views``, the turn [degrees] and the shift of the centre [units of the files] of each training view; ``cameras``, the
-        focal length [px] of each camera before and after, if any changed; and ``summary``.
+    ``views`` has the turn [degrees] and the shift of the centre [units of the files] of each training view; ``cameras`` the
+    focal length [px] of each camera before and after, if any changed.
     """
     rows = []
     for name in train:

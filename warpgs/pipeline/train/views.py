@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -16,6 +16,11 @@ from warpgs.pipeline.metrics.scores import OPAQUE
 from warpgs.pipeline.model.table import Table
 from warpgs.pipeline.train.view_modules import Tensors, ViewModule
 from warpgs.scene import Camera, View
+
+
+def there(array: Any, device: torch.device) -> Any:
+    """Return an array as a float32 tensor on a device; None stays None."""
+    return None if array is None else torch.as_tensor(array, dtype=torch.float32, device=device)
 
 
 def seen(modules: Sequence[ViewModule], rgb: torch.Tensor, values: Tensors) -> torch.Tensor:
@@ -40,22 +45,13 @@ class LearnedView:
 class LearnedViews:
     """The view modules of a fit and the table of their parameters, which has a row for each training view."""
 
-    def __init__(self, modules: Sequence[ViewModule], params: Sequence[Tensors], device: torch.device, count: int):
-        """Begin with the parameters of each module.
-
-        Args:
-            modules: View modules.
-            params: Parameters of each of them, by name, shape [V, ...].
-            device: Where parameters are kept.
-            count: Number V of training views.
-
-        Raises:
-            UsageError: Two modules have a parameter of the same name.
-        """
+    def __init__(self, modules: Sequence[ViewModule], views: Sequence[View], device: torch.device):
+        """Begin with the initial parameters of each module for training views."""
         self.modules = tuple(modules)
         self._names: list[tuple[str, ...]] = []
         first: dict[str, torch.Tensor] = {}
-        for module, own in zip(modules, params, strict=True):
+        for module in modules:
+            own = module.parameters(views)
             for name in own.keys() & first.keys():
                 other = next(m.name for m, names in zip(modules, self._names) if name in names)
                 raise UsageError(
@@ -63,13 +59,8 @@ class LearnedViews:
                 )
             first |= {n: t.to(device, torch.float32) for n, t in own.items()}
             self._names.append(tuple(own))
-        self.table = Table(first, {}, device, count)
+        self.table = Table(first, {}, device, len(views))
         """Parameters with their Adam moments."""
-
-    @classmethod
-    def first(cls, modules: Sequence[ViewModule], views: Sequence[View], device: torch.device) -> LearnedViews:
-        """Return the modules with their initial parameters for training views."""
-        return cls(modules, [m.parameters(views) for m in modules], device, len(views))
 
     def params_of(self, module: ViewModule) -> dict[str, torch.Tensor]:
         """Return the parameters of one of the modules, by name, shape [V, ...]."""
@@ -91,8 +82,7 @@ class LearnedViews:
 
     def regularisation(self, values: Tensors) -> dict[str, torch.Tensor]:
         """Return the terms that modules add to the loss of a view with these values [...], shape [] each, by module name."""
-        found = {m.name: m.regularisation(values) for m in self.modules}
-        return {n: t for n, t in found.items() if t is not None}
+        return {m.name: t for m in self.modules if (t := m.regularisation(values)) is not None}
 
     def cameras(self, given: Mapping[str, Camera], train: Sequence[str], test: Sequence[str]) -> Mapping[str, Camera]:
         """Return the current cameras of all views, by name; arguments are those of `ViewModule.cameras`."""
@@ -135,15 +125,11 @@ class TrainingView:
     @staticmethod
     def of(view: View, device: torch.device) -> TrainingView:
         """Return a view's pixels, mask, opacity and camera in float32 on a device."""
-
-        def there(array):
-            return torch.as_tensor(array, dtype=torch.float32, device=device)
-
         c = view.camera
-        distortion = None if c.distortion is None else there(c.distortion)
-        camera = replace(c, viewmat=there(c.viewmat), K=there(c.K), distortion=distortion)
-        mask, alpha = (None if a is None else there(a) for a in (view.mask, view.alpha))
-        return TrainingView(camera, there(view.image), mask, alpha=alpha)
+        lens = c.distortion if c.distortion is not None and len(c.distortion) else None
+        arrays = (c.viewmat, c.K, lens, view.image, view.mask, view.alpha)
+        viewmat, K, distortion, image, mask, alpha = (there(a, device) for a in arrays)
+        return TrainingView(replace(c, viewmat=viewmat, K=K, distortion=distortion), image, mask, alpha=alpha)
 
     @property
     def kind(self) -> Kind:
@@ -231,14 +217,8 @@ Rows = torch.Tensor | tuple[torch.Tensor, ...]
 class ViewStack:
     """Training views of one kind, stacked, from which a step takes its view."""
 
-    viewmats: torch.Tensor
-    """camera_from_world as given, shape [V, 4, 4]."""
-    Ks: torch.Tensor
-    """Intrinsics [px] as given, shape [V, 3, 3]."""
-    distortions: torch.Tensor
-    """Coefficients of the camera model, shape [V, P]."""
-    model: str
-    """Camera model of all views."""
+    camera: Camera
+    """Cameras as given: viewmat [V, 4, 4], K [V, 3, 3], and coefficients [V, P] or None."""
     images: Rows
     """Colours in [0, 1], shape [V, H, W, 3]."""
     masks: Rows | None
@@ -250,25 +230,11 @@ class ViewStack:
     alphas: Rows | None = None
     """Opacity of the subject, shape [V, H, W]; None if no training view has one."""
 
-    @property
-    def size(self) -> tuple[int, int]:
-        """Width and height [px]."""
-        height, width = self.images[0].shape[:2]
-        return width, height
 
-    def camera(self, viewmat: torch.Tensor, K: torch.Tensor, distortion: torch.Tensor | None) -> Camera:
-        """Return the camera of views of this stack, with their camera model.
-
-        Args:
-            viewmat: camera_from_world, shape [..., 4, 4].
-            K: Intrinsics [px], shape [..., 3, 3].
-            distortion: Coefficients of the camera model, shape [..., P]; None for a model without.
-        """
-        return Camera(viewmat, K, *self.size, self.model, distortion)
-
-    def cameras(self) -> Iterator[Camera]:
-        """Yield the camera of each view."""
-        yield from map(self.camera, self.viewmats, self.Ks, self.distortions)
+def camera_at(cameras: Camera, i: int) -> Camera:
+    """Return camera ``i`` of a batch."""
+    distortion = None if cameras.distortion is None else cameras.distortion[i]
+    return replace(cameras, viewmat=cameras.viewmat[i], K=cameras.K[i], distortion=distortion)
 
 
 def stacked(tensors: Sequence[torch.Tensor]) -> Rows:
@@ -289,49 +255,37 @@ def stacked(tensors: Sequence[torch.Tensor]) -> Rows:
     return first.as_strided((len(tensors), *first.shape), (first.numel(), *first.stride()))
 
 
-def _coefficients(camera: Camera) -> torch.Tensor:
-    """Return the coefficients of a camera with tensors, shape [P]; [0] for a model without."""
-    return camera.K.new_empty(0) if camera.distortion is None else camera.distortion
-
-
 def stack_views(
     views: list[TrainingView], count: int
 ) -> tuple[list[TrainingView], dict[Kind, ViewStack], list[tuple[Kind, int]]]:
     """Stack views by size, by whether they have a mask, and by camera model.
 
-    Args:
-        views: Views in the order of their indices; views after the first ``count`` are the same views at another size.
-        count: Number of training views.
-
-    Returns:
-        The views, whose pixels are parts of the stacks, without copies; the stacks by kind; and the kind and the row of each
-        view in its stack.
+    Views after the first ``count`` are the same views at another size. Returns the views, whose pixels are parts of the stacks,
+    without copies; the stacks by kind; and the kind and the row of each view in its stack.
     """
-    kinds = [v.kind for v in views]
+    rows: dict[Kind, list[int]] = {}
+    places = []
+    for i, view in enumerate(views):
+        before = rows.setdefault(view.kind, [])
+        places.append((view.kind, len(before)))
+        before.append(i)
     stacks, shared = {}, list(views)
-    for kind in dict.fromkeys(kinds):
-        numbers = [i for i, k in enumerate(kinds) if k == kind]
+    for kind, numbers in rows.items():
         same = [views[i] for i in numbers]
-        device = same[0].image.device
-        stack = ViewStack(
-            torch.stack([v.given.viewmat for v in same]), torch.stack([v.given.K for v in same]),
-            torch.stack([_coefficients(v.given) for v in same]), kind[3],
-            stacked([v.image for v in same]), stacked([v.mask for v in same]) if kind[2] else None,
-            {n: stacked([v.maps[n] for v in same]) for n in same[0].maps},
-            torch.tensor([i % count for i in numbers], device=device, dtype=torch.int64),
-            None if same[0].alpha is None else stacked([v.alpha for v in same]),
+        given, first = [v.given for v in same], same[0]
+        distortion = None if first.given.distortion is None else torch.stack([c.distortion for c in given])
+        viewmats, Ks = torch.stack([c.viewmat for c in given]), torch.stack([c.K for c in given])
+        stacks[kind] = stack = ViewStack(
+            replace(first.given, viewmat=viewmats, K=Ks, distortion=distortion),
+            stacked([v.image for v in same]), None if first.mask is None else stacked([v.mask for v in same]),
+            {n: stacked([v.maps[n] for v in same]) for n in first.maps},
+            torch.tensor([i % count for i in numbers], device=first.image.device, dtype=torch.int64),
+            None if first.alpha is None else stacked([v.alpha for v in same]),
         )  # fmt: skip
         for row, i in enumerate(numbers):
+            mask, alpha = (None if t is None else t[row] for t in (stack.masks, stack.alphas))
             maps = {n: t[row] for n, t in stack.maps.items()}
-            mask = None if stack.masks is None else stack.masks[row]
-            alpha = None if stack.alphas is None else stack.alphas[row]
             shared[i] = replace(views[i], image=stack.images[row], mask=mask, maps=maps, alpha=alpha)
-        stacks[kind] = stack
-    seen: Counter[object] = Counter()
-    places = []
-    for k in kinds:
-        places.append((k, seen[k]))
-        seen[k] += 1
     return shared, stacks, places
 
 
@@ -339,43 +293,31 @@ def with_learned(views: list[TrainingView], learned: LearnedViews) -> list[Train
     """Return the views with cameras and values of their own, which `show_learned` overwrites."""
     if not learned.modules:
         return views
-    values, found = learned.values(torch.arange(len(views), device=views[0].image.device)), []
+    values, shown = learned.values(torch.arange(len(views), device=views[0].image.device)), []
     for i, v in enumerate(views):
         camera = replace(v.camera, viewmat=v.camera.viewmat.clone(), K=v.camera.K.clone())
         own = LearnedView(learned.modules, v.camera, {n: t[i].detach().clone() for n, t in values.items()})
-        found.append(replace(v, camera=camera, learned=own))
-    return found
+        shown.append(replace(v, camera=camera, learned=own))
+    return shown
 
 
 @torch.no_grad()
 def current(stack: ViewStack, learned: LearnedViews) -> ViewStack:
     """Return a stack with the current cameras of its views."""
-    if not learned.modules:
-        return stack
-    camera = stack.camera(stack.viewmats, stack.Ks, stack.distortions if stack.distortions.numel() else None)
-    camera = learned.before_render(camera, learned.values(stack.numbers))
-    return replace(stack, viewmats=camera.viewmat, Ks=camera.K)
+    return replace(stack, camera=learned.before_render(stack.camera, learned.values(stack.numbers)))
 
 
 @torch.no_grad()
 def show_learned(
     views: list[TrainingView], stacks: Mapping[Kind, ViewStack], places: list[tuple[Kind, int]], learned: LearnedViews
 ) -> None:
-    """Write the current learned values into the views of `with_learned`; density strategies render these views.
-
-    Args:
-        views: Training views.
-        stacks: Their stacks by kind.
-        places: Kind and row of each view in its stack; further entries are ignored.
-        learned: View modules with their parameters.
-    """
+    """Write the current learned values into the views of `with_learned`; density strategies render these views."""
     if not learned.modules:
         return
-    now = {kind: current(stack, learned) for kind, stack in stacks.items()}
+    now = {kind: current(stack, learned).camera for kind, stack in stacks.items()}
     values = learned.values(torch.arange(len(views), device=views[0].image.device))
     for i, (view, (kind, row)) in enumerate(zip(views, places, strict=False)):
-        view.camera.viewmat.copy_(now[kind].viewmats[row])
-        view.camera.K.copy_(now[kind].Ks[row])
-        assert view.learned is not None
+        view.camera.viewmat.copy_(now[kind].viewmat[row])
+        view.camera.K.copy_(now[kind].K[row])
         for name, value in view.learned.values.items():
             value.copy_(values[name][i])

@@ -44,6 +44,10 @@ class Growth(NamedTuple):
     """Steps, ascending, at which many Gaussians are added at once. Early stopping measures the model right before them. Empty
     if early stopping may measure at any step."""
 
+    def due(self, step: int, every: int) -> bool:
+        """Return whether growth at all multiples of ``every`` adds Gaussians after a step."""
+        return self.begins < step <= self.ends and step % every == 0
+
 
 @dataclass
 class StrategyContext:

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Hashable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar
 
 import torch
 
 from warpgs import geometry, schema
 from warpgs.pipeline.model.table import Column, DensityUpdate
-from warpgs.pipeline.train.schedule import EventTimes, PhaseConfig
+from warpgs.pipeline.train.schedule import PhaseConfig
 from warpgs.pipeline.train.strategies.base import Growth, Strategy, StrategyContext, register
 from warpgs.scene import Gaussians
 from warpgs.schema import Checked, Within
@@ -51,10 +51,6 @@ class DensityConfig(Checked, group="density."):
     reset_opacity: Annotated[float, Within(0, 1, "()")] = 0.01
     """Largest opacity after a reset."""
 
-    def times(self, steps: int) -> EventTimes:
-        """Return the times of events in a fit of that many steps."""
-        return EventTimes.of_fit(self.start, self.every, self.stop_fraction, steps)
-
 
 def _exp(x: torch.Tensor) -> torch.Tensor:
     """Return e^x computed in float64, since rounding in float32 depends on the processor (MKL)."""
@@ -76,32 +72,14 @@ def _split(gaussians: dict[str, torch.Tensor], ids: torch.Tensor, generator: tor
 
 
 def refine(
-    gaussians: Gaussians,
-    pull: torch.Tensor,
-    config: DensityConfig,
-    *,
-    extent: float,
-    capacity: int,
-    after_reset: bool,
-    generator: torch.Generator,
-    growing: torch.Tensor | None = None,
-    protected: torch.Tensor | None = None,
-) -> DensityUpdate:
+    gaussians: Gaussians, pull: torch.Tensor, config: DensityConfig, *, extent: float, capacity: int, after_reset: bool,
+    generator: torch.Generator, growing: torch.Tensor | None = None, protected: torch.Tensor | None = None,
+) -> DensityUpdate:  # fmt: skip
     """Clone small Gaussians and split large ones where the gradient of the mean is large; prune transparent and huge ones.
 
-    Args:
-        gaussians: The current set, N rows.
-        pull: Mean norm of the gradient of each projected mean, in half image widths and heights, shape [N].
-        config: Thresholds.
-        extent: Size of the scene [u].
-        capacity: Largest number of Gaussians after the change.
-        after_reset: True once opacities were reset; only then are huge Gaussians pruned.
-        generator: CPU generator of the children's positions, the same numbers on every device.
-        growing: Gaussians that may be cloned and split, bool, shape [N]; None for all.
-        protected: Gaussians that are not pruned, bool, shape [N]; None for none.
-
-    Returns:
-        The change. If all Gaussians would be pruned, the most opaque one is kept.
+    ``pull`` [N] is the mean norm of the gradient of each projected mean, in half image widths and heights. Only ``growing``
+    Gaussians [N] grow, up to ``capacity`` in all; ``protected`` ones [N] are not pruned. Huge ones are pruned only once
+    opacities were reset. If all would be pruned, the most opaque one is kept. ``generator`` is on the CPU.
     """
     with torch.no_grad():
         tensors = {n: t.detach() for n, t in gaussians.tensors().items()}
@@ -151,21 +129,17 @@ class GradientGrowth:
         """Return the columns for each projected mean: the sum of its gradient norms, and the number of renders that show it."""
         return {"grad_sum": Column(0.0, inherited=False), "seen_count": Column(0.0, inherited=False)}
 
-    @property
-    def times(self) -> EventTimes:
-        """Times of refinement by the current phases: until the third phase, in a fit with phases."""
-        phases, planned = self.context.phases, self.context.settings[PhaseConfig]
-        times = self.config.times(phases.planned)
-        until = phases.stable_start if planned.coarse + planned.stable > 0 else min(times.until, phases.stable_start)
-        return replace(times, until=until)
+    def growth(self) -> Growth:
+        """Return the times of refinement by the current phases: until the third phase, in a fit with phases."""
+        c, phases, lengths = self.config, self.context.phases, self.context.settings[PhaseConfig]
+        fraction = 1.0 if lengths.coarse + lengths.stable > 0 else c.stop_fraction
+        return Growth(min(c.start, phases.planned // 4), min(int(fraction * phases.planned), phases.stable_start))
 
     def gathers(self, step: int) -> bool:
         """Return whether gradients are gathered in a step."""
-        return step <= self.times.until
+        return step <= self.growth().ends
 
-    def statistics(
-        self, v_projected: torch.Tensor, visible: torch.Tensor, size: tuple[int, int]
-    ) -> dict[str, torch.Tensor]:  # fmt: skip
+    def statistics(self, v_projected: torch.Tensor, visible: torch.Tensor, size: tuple[int, int]) -> dict[str, torch.Tensor]:
         """Return the norm of each projected mean's gradient, and 1 for each mean that the view sees, else 0, shape [N] each.
 
         The unit is half image widths and heights; arguments are those of `Strategy.statistics`.
@@ -177,24 +151,19 @@ class GradientGrowth:
 
     def refines(self, step: int) -> bool:
         """Return whether the set is refined after a step."""
-        return self.times.due(step)
+        return self.growth().due(step, self.config.every)
 
     def resets(self, step: int) -> bool:
         """Return whether opacities are reset after a step."""
         every = self.config.reset_every
-        return every > 0 and step <= self.times.until - RESET_FREE_STEPS and step % every == 0
+        return every > 0 and step <= self.growth().ends - RESET_FREE_STEPS and step % every == 0
 
     def due(self, step: int) -> bool:
         """Return whether the set is refined or opacities are reset after a step."""
         return self.refines(step) or self.resets(step)
 
     def refine(self, growing: torch.Tensor | None = None, protected: torch.Tensor | None = None) -> Iterator[DensityUpdate]:
-        """Yield the change by `refine`, then order the Gaussians and reset the statistics.
-
-        Args:
-            growing: Gaussians that may be cloned and split, bool, shape [N]; None for all.
-            protected: Gaussians that are not pruned, bool, shape [N]; None for none.
-        """
+        """Yield the change by `refine`, then order the Gaussians and reset the statistics."""
         t, columns = self.context, self.context.table.columns
         pull = columns["grad_sum"] / columns["seen_count"].clamp_min(1)
         yield refine(
@@ -239,7 +208,7 @@ class CloneSplit(Strategy):
 
     def growth(self) -> Growth:
         """Return the times of refinement."""
-        return Growth(self.gradients.times.after, self.gradients.times.until)
+        return self.gradients.growth()
 
     def phase(self, step: int) -> Hashable:
         """Return whether gradients are gathered in a step."""

@@ -18,7 +18,6 @@ import warp as wp
 from warpgs.kernels import launch
 from warpgs.kernels.update import Setting
 from warpgs.pipeline.model.table import DensityUpdate
-from warpgs.pipeline.train.schedule import EventTimes
 from warpgs.pipeline.train.strategies.base import Growth, Strategy, register
 from warpgs.scene import Gaussians
 from warpgs.schema import Checked, Within
@@ -62,14 +61,7 @@ def relocated(opacities: torch.Tensor, copies: torch.Tensor) -> tuple[torch.Tens
 
     The new opacity is 1 - (1 - o)^(1/N), so that the N Gaussians together are as opaque at the centre as the original. The
     scales shrink such that the integral over a line through the centre is unchanged. Both are computed in float64, since the
-    sum alternates.
-
-    Args:
-        opacities: o of each original Gaussian, in (0, 1), shape [M].
-        copies: N of each original, integers from 1 to `MAX_COPIES`, shape [M].
-
-    Returns:
-        New opacities and factors of the scales, shape [M] each, of the type of ``opacities``.
+    sum alternates. ``opacities`` o [M] are in (0, 1), and ``copies`` N [M] from 1 to `MAX_COPIES`.
     """
     o, N = opacities.double(), copies.double()
     new = -torch.expm1(torch.log1p(-o) / N)
@@ -110,24 +102,14 @@ def make_kernel() -> wp.Kernel:
     return perturb
 
 
-def perturb(
-    gaussians: Gaussians, settings: torch.Tensor, going: torch.Tensor, *, seed: int, noise_lr: float
-) -> None:  # fmt: skip
+def perturb(gaussians: Gaussians, settings: torch.Tensor, going: torch.Tensor, *, seed: int, noise_lr: float) -> None:
     """Add noise, multiplied by each Gaussian's covariance, to its mean, in place; opaque Gaussians get less noise (eq. 8).
 
-    The noise depends only on seed, step and row, so it is the same on every device and in a resumed fit.
-
-    Args:
-        gaussians: N Gaussians, float32.
-        settings: Settings of the step (`Setting`), float32, shape [7]; step number and learning rate are read.
-        going: False to change nothing, bool, shape [1].
-        seed: Any 32-bit integer.
-        noise_lr: Factor of the learning rate.
+    The noise depends only on seed, step and row, so it is the same on every device and in a resumed fit. Step number and
+    learning rate are read from ``settings`` [7]; if ``going`` [1] is False, nothing changes.
     """
     g = {n: t.detach() for n, t in gaussians.tensors().items()}
-    inputs = [
-        settings, seed, noise_lr, going, g["quats"], g["log_scales"], g["logit_opacities"], g["means"],
-    ]  # fmt: skip
+    inputs = [settings, seed, noise_lr, going, g["quats"], g["log_scales"], g["logit_opacities"], g["means"]]
     launch.launch(make_kernel(), len(gaussians), inputs, settings.device)
 
 
@@ -142,15 +124,10 @@ class MCMC(Strategy):
         """Return the settings with an event after every step."""
         return dataclasses.replace(own, start=0, every=1)
 
-    @property
-    def times(self) -> EventTimes:
-        """Times of relocation and addition."""
-        c = self.config
-        return EventTimes.of_fit(c.start, c.every, c.stop_fraction, self.context.phases.planned)
-
     def growth(self) -> Growth:
         """Return the times of relocation and addition."""
-        return Growth(self.times.after, self.times.until)
+        steps = self.context.phases.planned
+        return Growth(min(self.config.start, steps // 4), int(self.config.stop_fraction * steps))
 
     def regularisation(self, phase, gaussians):
         """Return the weighted mean opacity plus the weighted mean axis length, shape []; unneeded Gaussians fade."""
@@ -166,7 +143,7 @@ class MCMC(Strategy):
 
     def due(self, step: int) -> bool:
         """Return whether Gaussians are relocated and added after a step."""
-        return self.times.due(step)
+        return self.growth().due(step, self.config.every)
 
     def update(self, step: int) -> Iterator[DensityUpdate]:
         """Relocate dead Gaussians, then add new ones."""

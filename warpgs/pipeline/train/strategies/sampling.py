@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Hashable, Iterator, Mapping
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Any, NamedTuple
 
@@ -61,9 +61,6 @@ class MethodConfig(Checked, group="method."):
     hier: bool | None = False
     """Two layers: from phase 2 on, the coarse layer is neither cloned nor split, and its means move slowly. None: chosen by the
     number of views."""
-    keep: Annotated[float, Within(0, 1, "(")] = 1.0
-    """Fraction of the Gaussians that is kept when phase 3 begins, in (0, 1]: those with the largest sums of blending weights
-    over at most 32 training views."""
     sampler: SamplerConfig = field(default_factory=SamplerConfig)
 
 
@@ -83,14 +80,6 @@ class SampledView:
     """Quantile of a score that the gate used, as `Strategy` of the paper does; 0 for none."""
     at: torch.Tensor
     """Rows and columns of the sampled pixels, int64, shape [S, 2]."""
-
-
-class Event(NamedTuple):
-    """One sampling event: the change, the number of fine Gaussians removed for new ones, and the samples of each view."""
-
-    change: DensityUpdate
-    evicted: int
-    views: tuple[SampledView, ...]
 
 
 class Rendered(NamedTuple):
@@ -172,59 +161,6 @@ def weight_sums(gaussians: Gaussians, cameras: list[Camera], options: RasterizeO
     return total
 
 
-@torch.no_grad()
-def keep_contributors(gaussians: Gaussians, count: int, views: list[TrainingView], options: RasterizeOptions) -> DensityUpdate:
-    """Return the change that keeps the ``count`` Gaussians with the largest sums of blending weights over the views."""
-    total = weight_sums(gaussians, [v.camera for v in views], options)
-    ids = torch.topk(total, min(count, len(gaussians))).indices.sort().values
-    return DensityUpdate(ids, {n: t[:0] for n, t in gaussians.tensors().items()}, ids[:0])
-
-
-@torch.no_grad()
-def added_within(
-    gaussians: Gaussians, added: dict[str, torch.Tensor], fine: torch.Tensor, protected: torch.Tensor,
-    views: list[TrainingView], max_fraction: float, *, step: int, capacity: int, options: RasterizeOptions,
-    generator: torch.Generator,
-) -> tuple[DensityUpdate, int]:  # fmt: skip
-    """Return the change that adds fine Gaussians within the limits of their number, and how many others are evicted.
-
-    If the fine layer reaches ``max_fraction`` of the coarse one, or the set its capacity, the unprotected fine Gaussians that
-    contribute least to the training views are evicted. New Gaussians beyond these limits are not added.
-
-    Args:
-        gaussians: The current set, N rows.
-        added: Rows of new Gaussians, [S, ...] each.
-        fine: Gaussians of the fine layer, bool, shape [N].
-        protected: Gaussians that are not evicted, bool, shape [N].
-        views: Training views.
-        max_fraction: Largest ratio of fine to coarse Gaussians.
-        step: Steps done.
-        capacity: Number of Gaussians that may be added.
-        options: Settings of the rasterizer.
-        generator: CPU generator, the same numbers on every device.
-    """
-    count, fine_count = len(added["means"]), int(fine.sum())
-    over = max(fine_count + count - int(max_fraction * (len(gaussians) - fine_count)), count - capacity)
-    keep = torch.ones(len(gaussians), dtype=torch.bool, device=fine.device)
-    evicted = 0
-    if over > 0:
-        # half size suffices to rank the Gaussians
-        total = weight_sums(gaussians, [half_size_camera(v.camera) for v in views], options)
-        candidates = fine & ~protected
-        total = torch.where(candidates, total, torch.inf)
-        ids = torch.topk(total, min(over, int(candidates.sum())), largest=False).indices
-        keep[ids] = False
-        evicted = len(ids)
-        if over > evicted:  # spread over the views, as they were sampled
-            order = torch.randperm(count, generator=generator, device="cpu")
-            left = order[: max(0, count - (over - evicted))].sort().values.to(fine.device)
-            added = {name: t[left] for name, t in added.items()}
-            count = len(left)
-    parents = torch.full((count,), -1, dtype=torch.int64, device=fine.device)
-    columns = {"level": FINE, "created_step": step}
-    return DensityUpdate(torch.nonzero(keep).squeeze(1), added, parents, columns), evicted
-
-
 _COUNT = schema.whole(0)
 EVENT = schema.fields({"step": _COUNT, "added": _COUNT, "evicted": _COUNT, "quantiles": schema.items(schema.real)})
 """Schema of a stored event."""
@@ -261,8 +197,8 @@ class Sampling(Strategy):
         """Settings."""
         self.events: list[dict[str, Any]] = []
         """Step of each sampling event, Gaussians added and evicted, and the quantile of the gate in each view."""
-        self.on_event: Callable[[int, Event], None] | None = None
-        """Function that is called with the step and the event after each event."""
+        self.on_event: Callable[[int, list[SampledView]], None] | None = None
+        """Function that is called with the step and the samples of each view after each event."""
 
     def before_event(self, views: Mapping[int, TrainingView], rendered: Mapping[int, Rendered]) -> None:
         """Prepare an event in some views, by their index among the training views."""
@@ -287,8 +223,11 @@ class Sampling(Strategy):
         return Rendered(view.seen(render.rgb), render.depth, depth, valid_pixels(alpha, depth, view.countable))
 
     @torch.no_grad()
-    def sample(self, step: int, views: Mapping[int, TrainingView], fraction: float, max_fraction: float) -> Event:
-        """Return a sampling event on views, by their index among the training views (docs/decisions/008-method.md)."""
+    def sample(
+        self, step: int, views: Mapping[int, TrainingView], fraction: float, max_fraction: float
+    ) -> tuple[DensityUpdate, int, list[SampledView]]:
+        """Return the change by an event on views by index, the number of evicted Gaussians, and the samples of each view."""
+        # docs/decisions/008-method.md
         t, generator = self.context, self.context.generator
         numbers = list(views)
         if len(numbers) > MAX_VIEWS:
@@ -306,12 +245,35 @@ class Sampling(Strategy):
             footprint, coefficients = self.method.sampler.footprint, t.gaussians.sh.shape[1]
             rows.append(fine_gaussians(view.camera, view.image, r.depth, at, footprint, coefficients))
             sampled.append(SampledView(i, r.rgb, scores, gate, quantile, at))
-        change, evicted = added_within(
-            t.gaussians, {n: torch.cat([r[n] for r in rows]) for n in rows[0]}, self.fine,
-            self.is_protected(step) if self.protects else torch.zeros_like(self.fine), [*views.values()], max_fraction,
-            step=step, capacity=t.capacity - len(t.table), options=t.render_options(), generator=generator,
-        )  # fmt: skip
-        return Event(change, evicted, tuple(sampled))
+        added = {n: torch.cat([r[n] for r in rows]) for n in rows[0]}
+        return *self._within_limits(step, added, views.values(), max_fraction), sampled
+
+    def _within_limits(
+        self, step: int, added: dict[str, torch.Tensor], views: Iterable[TrainingView], max_fraction: float
+    ) -> tuple[DensityUpdate, int]:
+        """Return the change that adds rows [S, ...] within the limits of their number, and how many others are evicted.
+
+        If the fine layer reaches ``max_fraction`` of the coarse one, or the set its capacity, the unprotected fine Gaussians
+        that contribute least to the views are evicted. New Gaussians beyond these limits are not added.
+        """
+        t, fine, total = self.context, self.fine, len(self.context.table)
+        count, evicted, fine_count = len(added["means"]), 0, int(fine.sum())
+        over = max(fine_count + count - int(max_fraction * (total - fine_count)), count - (t.capacity - total))
+        keep = torch.ones_like(fine)
+        if over > 0:
+            # half size suffices to rank the Gaussians
+            weights = weight_sums(t.gaussians, [half_size_camera(v.camera) for v in views], t.render_options())
+            candidates = fine & ~self.is_protected(step) if self.protects else fine
+            weights = torch.where(candidates, weights, torch.inf)
+            ids = torch.topk(weights, min(over, int(candidates.sum())), largest=False).indices
+            keep[ids], evicted = False, len(ids)
+            if over > evicted:  # spread over the views, as they were sampled
+                order = torch.randperm(count, generator=t.generator, device="cpu")
+                left = order[: max(0, count - (over - evicted))].sort().values.to(fine.device)
+                added = {name: rows[left] for name, rows in added.items()}
+        parents = torch.full((len(added["means"]),), -1, dtype=torch.int64, device=fine.device)
+        columns = {"level": FINE, "created_step": step}
+        return DensityUpdate(torch.nonzero(keep).squeeze(1), added, parents, columns), evicted
 
     def bytes(self, sizes: StepSizes) -> Needs:
         """Return the bytes that an event keeps for its views: render, three scores and their sum."""
@@ -338,7 +300,7 @@ class Sampling(Strategy):
     def growth(self) -> Growth:
         """Return the times of refinement and sampling; events are listed, since they lower PSNR by up to 3 dB for a while."""
         phases = self.context.phases
-        return Growth(phases.refine, self.gradients.times.until, phases.events)
+        return Growth(phases.refine, self.gradients.growth().ends, phases.events)
 
     def phase(self, step: int) -> Hashable:
         """Return whether gradients are gathered, and whether the coarse layer moves slowly."""
@@ -363,19 +325,10 @@ class Sampling(Strategy):
 
     def due(self, step: int) -> bool:
         """Return whether the set changes after a step."""
-        return self.gradients.due(step) or step in self.context.phases.events or self.shrinks_after(step)
-
-    def shrinks_after(self, step: int) -> bool:
-        """Return whether the Gaussians that contribute least are removed after a step: after the last step of phase 2."""
-        return self.method.keep < 1 and step == self.context.phases.stable_start
-
-    def shrink(self, views: list[TrainingView]) -> DensityUpdate:
-        """Return the change that keeps the fraction ``method.keep`` of the Gaussians."""
-        t = self.context
-        return keep_contributors(t.gaussians, max(1, round(self.method.keep * len(t.table))), views, t.render_options())
+        return self.gradients.due(step) or step in self.context.phases.events
 
     def update(self, step: int) -> Iterator[DensityUpdate]:
-        """Refine, reset opacities, sample and shrink the set, each if it is due.
+        """Refine, reset opacities and sample, each if it is due.
 
         With two layers, only the fine layer grows from phase 2 on. Protected Gaussians are not pruned.
         """
@@ -387,28 +340,22 @@ class Sampling(Strategy):
             self.gradients.reset_opacities()
         if step in self.context.phases.events:
             sampler = self.method.sampler
-            event = self.sample(step, dict(enumerate(views)), sampler.fraction, sampler.max_fraction)
-            yield event.change
-            self.events.append({
-                "step": step, "added": len(event.change.parents), "evicted": event.evicted,
-                "quantiles": [v.quantile for v in event.views],
-            })  # fmt: skip
+            change, evicted, sampled = self.sample(step, dict(enumerate(views)), sampler.fraction, sampler.max_fraction)
+            yield change
+            quantiles = [v.quantile for v in sampled]
+            self.events.append({"step": step, "added": len(change.parents), "evicted": evicted, "quantiles": quantiles})
             if self.on_event is not None:
-                self.on_event(step, event)
-        if self.shrinks_after(step):
-            yield self.shrink(views)
+                self.on_event(step, sampled)
 
     def catch_up(self, step: int, views: list[TrainingView], held: int) -> Iterator[DensityUpdate]:
-        """Shrink the set; then sample fine Gaussians in the blocks that were held out, as many per pixel as elsewhere."""
-        if self.method.keep < 1:
-            yield self.shrink(views)
+        """Sample fine Gaussians in the blocks that were held out, as many per pixel as elsewhere."""
         pixels = sum(v.image[..., 0].numel() for v in views)
         fraction = int(self.fine.sum()) / (pixels - held) * held / pixels
         if not fraction * pixels >= 1:
             return
         for first in range(0, len(views), MAX_VIEWS):
             some = {i: views[i] for i in range(first, min(first + MAX_VIEWS, len(views)))}
-            yield self.sample(step, some, min(1.0, fraction), 1e6).change
+            yield self.sample(step, some, min(1.0, fraction), 1e6)[0]
 
     def state(self) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
         """Return no tensors [...], and the events so far."""
