@@ -45,7 +45,7 @@ MAX_VALUES = 300_000
 """Largest number of commas in a document: each separates two values, which take up to a hundred bytes."""
 SUPPORTED = {EXTENSION, "KHR_mesh_quantization"}
 """Extensions that a file may require; the second one permits integers as positions."""
-MAX_COPIES = 64
+MAX_COPIES = 32
 """Largest number of nodes that may show the Gaussians: each makes a copy of them."""
 MAX_SHEAR = 1e-4
 """Largest difference of a node's transformation from a similarity, relative to its scale; float32 leaves 1e-6."""
