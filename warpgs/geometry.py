@@ -515,6 +515,66 @@ def convert_gaussians(gaussians: Gaussians, normalization: Normalization, source
     return replace(gaussians, means=means.to(kind), log_scales=(gaussians.log_scales.double() + longer).to(kind))
 
 
+_NODES = ((0.0, 0.5688888888888889), (0.5384693101056831, 0.47862867049936647), (0.906179845938664, 0.23692688505618908))
+"""Nodes and weights of the Gauss-Legendre rule with five points, the last two also mirrored: exact to degree 9."""
+_AZIMUTHS = 10
+"""Number of azimuths of the quadrature rule, exact to order 9; products of harmonics of degree 4 have degree 8."""
+
+
+def harmonics(directions: np.ndarray) -> np.ndarray:
+    """Return the 25 harmonics of degrees 0 to 4 (docs/sh.md) at unit directions [N, 3], float64 [N, 25]."""
+    x, y, z = np.asarray(directions, np.float64).T
+    values = []
+    for degree in range(5):
+        for order in range(-degree, degree + 1):
+            m = abs(order)
+            square = (2 * degree + 1) * (2 if m else 1) * math.factorial(degree - m) / math.factorial(degree + m)
+            turn, polar = (x + 1j * y) ** m, np.polynomial.Legendre.basis(degree).deriv(m)(z)
+            values.append((-1) ** m * math.sqrt(square / (4 * math.pi)) * polar * (turn.imag if order < 0 else turn.real))
+    return np.stack(values, 1)
+
+
+def harmonics_rotation(rotation: np.ndarray) -> torch.Tensor:
+    """Return the matrix that turns coefficients with the scene, float64 [25, 25] (Wigner's D for degrees 0 to 4, real).
+
+    Entry (j, k) is the integral over the sphere of Y_j(d) Y_k(R^T d), exact by a product rule of 50 points.
+
+    Args:
+        rotation: A rotation or a reflection, shape [3, 3].
+    """
+    import torch
+
+    points, weights = [], []
+    for z, weight in (*_NODES, *((-z, w) for z, w in _NODES[1:])):
+        for i in range(_AZIMUTHS):
+            angle, radius = 2 * math.pi * i / _AZIMUTHS, math.sqrt(1 - z * z)
+            points.append([radius * math.cos(angle), radius * math.sin(angle), z])
+            weights.append(weight * 2 * math.pi / _AZIMUTHS)
+    d = np.array(points)
+    here, there = harmonics(d), harmonics(matmul(d, np.asarray(rotation, np.float64)))
+    return torch.from_numpy(np.einsum("i,ij,ik->jk", np.array(weights), here, there))
+
+
+def rotate(gaussians: Gaussians, rotation: np.ndarray) -> Gaussians:
+    """Return Gaussians turned about the origin by [3, 3]: means, shapes and the directions that colours depend on.
+
+    The matrix may be a reflection, since an ellipsoid is its own mirror image.
+    """
+    import torch
+
+    means, quats, k = gaussians.means, gaussians.quats, gaussians.sh.shape[1]
+    turn = torch.tensor(np.asarray(rotation), dtype=torch.float64, device=means.device)
+    coefficients = harmonics_rotation(rotation).to(means.device)[:k, :k]
+    axes = torch.as_tensor(rotation_matrices(torch.nn.functional.normalize(quats.double(), dim=1)))
+    proper = turn if np.linalg.det(rotation) > 0 else -turn
+    return replace(
+        gaussians,
+        means=torch.einsum("ij,nj->ni", turn, means.double()).to(means.dtype),
+        quats=quaternions(torch.einsum("ij,njk->nik", proper, axes)).to(quats.dtype),
+        sh=torch.einsum("jk,nkc->njc", coefficients, gaussians.sh.double()).to(gaussians.sh.dtype),
+    )
+
+
 def convert_mesh(mesh: Mesh, normalization: Normalization, source: str, target: str) -> Mesh:
     """Return a mesh in other units: its vertices change, triangles and colours are shared."""
     if _same_units(source, target):

@@ -13,7 +13,7 @@ MODELS = {
 FORMATS = {
     ".ply": ("Kerbl et al. 2023, float32", "0 to 4", "every tool"),
     ".compressed.ply": ("PlayCanvas, 8 to 11 bits", "0 to 3", "SuperSplat, PlayCanvas"),
-    ".spz": ("Niantic, fixed point and 8 bits, gzip", "0 to 3", "Scaniverse, Babylon.js, SuperSplat"),
+    ".spz": ("Niantic, fixed point and 8 bits, gzip", "0 to 4", "Scaniverse, Babylon.js, SuperSplat"),
     ".sog": ("PlayCanvas, 8-bit images in a zip archive", "0 to 3", "SuperSplat, PlayCanvas"),
     ".glb": ("glTF 2.0, `KHR_gaussian_splatting`, float32", "0 to 3", "Cesium, 3D engines"),
     ".gltf": ("the same as text", "0 to 3", "Cesium, 3D engines"),

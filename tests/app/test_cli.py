@@ -20,11 +20,15 @@ from warpgs.app import cli
 from warpgs.app.cli import COMMANDS, GROUPS, main
 from warpgs.app.fit import request_of
 from warpgs.app.flags import REMOVED, parse_flags
+from warpgs.errors import UsageError
+from warpgs.export.meshes_and_cameras import write_cameras
 from warpgs.export.ply import read_ply
 from warpgs.io.folder import READERS, Reader
 from warpgs.io.load import SPECS
+from warpgs.io.transforms import read_cameras
 from warpgs.kernels.cameras import CAMERA_MODELS, CameraModel
 from warpgs.pipeline.metrics.lpips import NETS, convert_lpips
+from warpgs.pipeline.run.folder import open_run
 from warpgs.pipeline.train.loss import LOSS_TERMS, LossTerm
 from warpgs.pipeline.train.presets import PRESETS
 from warpgs.pipeline.train.settings import FitConfig
@@ -174,6 +178,42 @@ def test_a_terminal_names_the_file_being_written(run, tmp_path, monkeypatch, com
     assert main(["export", str(run), "--to", str(tmp_path / "x.ply")]) == 0
     assert (tmp_path / "x.ply").read_bytes() == (run / "point_cloud.ply").read_bytes()
     assert lines[:2] == [f"starting {command}", "writing x.spz"]
+
+
+@pytest.mark.parametrize("name", ["cameras.json", "transforms.json", "sparse"])
+@pytest.mark.parametrize("flags", [[], ["--keep-names"], ["--keep-names", "--rotate", "0,0,1,90"]])
+def test_cameras_for_other_trainers(run, scene, tmp_path, capsys, name, flags):
+    """With the names of the photographs, if wanted; COLMAP's files have points, the most opaque Gaussians, rotated too."""
+    target = tmp_path / name
+    assert main(["export", str(run), "--to", str(target), *flags]) == 0
+    found = [Path(n).name for n in read_cameras(target if name != "sparse" else tmp_path)[0]]
+    photographs = sorted(p.name for p in (scene / "images").iterdir())
+    numbers = [f"{i:04d}" + (".png" if name != "cameras.json" else "") for i in range(len(photographs))]
+    assert found == (photographs if flags else numbers)
+    said = capsys.readouterr().out
+    assert ("their names are kept" if flags else "their names are numbers") in said
+    if name == "sparse":
+        made = read_ply(run / "point_cloud.ply")
+        wanted = made.means.double().numpy()[made.logit_opacities.argsort(descending=True, stable=True)]
+        wanted = wanted @ np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1]]) if "--rotate" in flags else wanted
+        rows = np.loadtxt(target / "0" / "points3D.txt")
+        assert np.allclose(rows[:, 1:4], wanted, atol=1e-5) and f"of {len(made):,} Gaussians, for trainers" in said
+        colors = np.clip(0.28209479 * made.sh[:, 0].numpy() + 0.5, 0, 1)[
+            made.logit_opacities.argsort(descending=True, stable=True)
+        ]
+        assert np.abs(rows[:, 4:7] - 255 * colors).max() <= 0.51
+        pycolmap = pytest.importorskip("pycolmap")
+        model = pycolmap.Reconstruction(str(target / "0"))
+        assert len(model.points3D) == len(made) and sorted(i.name for i in model.images.values()) == found
+
+
+def test_names_that_files_cannot_hold(run, tmp_path, capsys):
+    camera = next(iter(open_run(run, "cpu").cameras("file").values()))
+    with pytest.raises(UsageError, match=r"cannot hold the name 'a b\.png'; leave out --keep-names"):
+        write_cameras(tmp_path / "sparse", [camera], ["images/a b.png"])
+    write_cameras(tmp_path / "transforms.json", [camera], ["images/a b.png"])
+    assert list(read_cameras(tmp_path / "transforms.json")[0]) == ["images/a b.png"] and not (tmp_path / "sparse").exists()
+    assert "--keep-names requires cameras" in failure(capsys, 2, "export", str(run), "--to", "a.spz", "--keep-names")
 
 
 def failure(capsys, code: int, *arguments: str) -> str:

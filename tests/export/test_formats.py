@@ -31,7 +31,8 @@ from warpgs.export.base import (
     suffixes,
     write_gaussians,
 )
-from warpgs.export.meshes_and_cameras import linear, rotation_to_y, write_mesh
+from warpgs.export.gltf import linear
+from warpgs.export.meshes_and_cameras import rotation_to_y, write_mesh
 from warpgs.export.ply import read_ply
 from warpgs.geometry import rotation_matrices
 from warpgs.kernels.sh import basis
@@ -80,18 +81,19 @@ QUANTA = {  # half a step of each attribute, with a little room for rounding in 
 def test_degree_4_is_refused_where_a_format_lacks_it(tmp_path):
     """The error names the remedies, and nothing is written; PLY holds it, and .splat holds colours alone."""
     made = model(n=5, degree=4)
-    for suffix in (".compressed.ply", ".spz", ".sog", ".glb", ".gltf"):
+    for suffix in (".compressed.ply", ".sog", ".glb", ".gltf"):
         path = tmp_path / f"a{suffix}"
         with pytest.raises(DataError, match=r"up to degree 3, not 4\. Drop .*--sh-degree 3.*sh\[:, :16\], or write \.ply"):
             write_gaussians(path, made, units="file")
         assert not path.exists()
-    for suffix, count in ((".ply", 25), (".splat", 1)):
+    for suffix, count in ((".ply", 25), (".spz", 25), (".splat", 1)):
         write_gaussians(tmp_path / f"a{suffix}", made, units="file")
         assert read_gaussians(tmp_path / f"a{suffix}").sh.shape == (5, count, 3)
 
 
-@pytest.mark.parametrize("degree", [0, 1, 2, 3])
-@pytest.mark.parametrize("suffix", SUFFIXES)
+@pytest.mark.parametrize(
+    "suffix,degree", [(s, d) for s in SUFFIXES for d in range(5) if d <= 3 or format_of(f"a{s}").max_degree == 4]
+)
 def test_round_trip_is_within_the_quantum(suffix, degree, tmp_path):
     made = model(degree=degree)
     write_gaussians(tmp_path / f"a{suffix}", made, units="file")
@@ -119,15 +121,56 @@ def test_versions_of_spz(version, tmp_path):
         spz.encode(arrays_of(made), 5)
 
 
+AXES = {"R": (1, 0, 0), "L": (-1, 0, 0), "D": (0, 1, 0), "U": (0, -1, 0), "F": (0, 0, 1), "B": (0, 0, -1)}  # in those of PLY
+
+
+@pytest.mark.parametrize("version", [3, 4])
+@pytest.mark.parametrize(
+    "system,name", [*enumerate("LDB RDB LUB RUB LDF RDF LUF RUF".split(), 1), (0, "RUB"), (11, "LFU"), (12, "RFU"), (14, "RBD")]
+)
+def test_extensions_of_spz(version, system, name, tmp_path):
+    """One names the axes of the file, with or without a mirror; others and a cut end are skipped, as by Niantic's library."""
+    if version == 4:
+        pytest.importorskip("zstandard")
+    made, path = model(20, degree=4), tmp_path / "a.spz"
+    matrix = np.array([AXES[letter] for letter in name], float)  # from the axes of PLY to those of the file
+    stored = {name: array.copy() for name, array in arrays_of(made).items()}
+    base.transform_in_place(stored, matrix, np.zeros(3))
+    data = b"".join(spz.encode(half_turn(stored, "x"), version))
+    records = struct.pack("<III", 0xADBE0002, 4, 9) + struct.pack("<IIIII", 7, 0, 0xADBE0003, 4, system) + b"\1\2\3"
+
+    def written(records):
+        if version == 3:
+            plain = bytearray(gzip.decompress(data))
+            plain[14] |= 2
+            path.write_bytes(gzip.compress(plain + records))
+        else:
+            head = bytearray(data[:32])
+            head[14] |= 2
+            head[16:20] = struct.pack("<I", 32 + len(records))
+            path.write_bytes(head + records + data[32:])
+
+    written(records)
+    back = read_gaussians(path)
+    found = differences(made, back)
+    assert found["means"] < 2e-6 and found["rest"] <= 0.51 / 128 * 3 and found["dc"] <= QUANTA[".spz"][4]
+    axes = [torch.as_tensor(rotation_matrices(torch.nn.functional.normalize(g.quats.double(), dim=1))) for g in (made, back)]
+    shapes = [a @ torch.diag_embed((2 * g.log_scales.double()).exp()) @ a.mT for a, g in zip(axes, (made, back))]
+    assert torch.allclose(*shapes, rtol=0.3, atol=0.02 * float(shapes[0].abs().max()))
+    written(records.replace(struct.pack("<II", 4, system), struct.pack("<II", 4, 17)))
+    with pytest.raises(DataError, match="coordinate system 17 is unknown"):
+        read_gaussians(path)
+
+
 @pytest.mark.parametrize("axis", ["x", "z"])
 def test_a_half_turn_turns_colours_and_shapes(axis):
-    made = arrays_of(model(degree=3))
+    made = arrays_of(model(degree=4))
     turned = half_turn(made, axis)
     signs = torch.tensor([1.0 if a == axis else -1.0 for a in "xyz"])
     directions = torch.nn.functional.normalize(torch.randn(7, 3, generator=torch.Generator().manual_seed(1)), dim=1)
     for d in directions:
-        before = torch.einsum("k,nkc->nc", basis(d[None])[0, :16], torch.from_numpy(made["sh"]))
-        after = torch.einsum("k,nkc->nc", basis((d * signs)[None])[0, :16], torch.from_numpy(turned["sh"]))
+        before = torch.einsum("k,nkc->nc", basis(d[None])[0], torch.from_numpy(made["sh"]))
+        after = torch.einsum("k,nkc->nc", basis((d * signs)[None])[0], torch.from_numpy(turned["sh"]))
         assert torch.allclose(before, after, atol=1e-5)
     for name, array in half_turn(turned, axis).items():
         assert np.array_equal(array, made[name])
@@ -262,6 +305,39 @@ def test_changed_bytes_end_in_a_sentence_or_in_gaussians(suffix, tmp_path):
             assert "\n" not in str(e)
 
 
+def with_a_bad_one(suffix, own):
+    """Return a file with numbers that are not finite, ours or not, and how many Gaussians have them."""
+    if suffix == ".sog":
+
+        def change(meta, members):
+            meta["scales"]["codebook"][255] = float("nan")
+            meta["asset"]["generator"] = "warpgs" if own else "else"
+
+        return repacked(change), 1
+    arrays = arrays_of(model(300, degree=1))
+    arrays["means"][7, 1] = np.inf
+    with np.errstate(all="ignore"):
+        data = b"".join(format_of(f"a{suffix}").encode(arrays))
+    other = (b'"warpgs"', b'"warpgx"') if suffix in (".glb", ".gltf") else (b"comment antialiased 0\n", b"")
+    return data if own else data.replace(*other), 256 if suffix == ".compressed.ply" else 1
+
+
+@pytest.mark.parametrize("suffix", [s for s in SUFFIXES if s not in (".ply", ".spz")])  # SPZ has no such numbers
+def test_gaussians_with_bad_numbers_are_left_out_of_any_format(suffix, tmp_path):
+    """Of another program's file, with their number; one of ours is damaged. Compressed PLY loses the whole chunk."""
+    path = tmp_path / f"a{suffix}"
+    data, count = with_a_bad_one(suffix, own=False)
+    path.write_bytes(data)
+    with pytest.warns(UserWarning, match=rf"{count} of \d+ Gaussians left out.* is not finite") as caught:
+        back = read_gaussians(path)
+    assert len(caught) == 1 and len(back) == (4 if suffix == ".sog" else 300 - count)
+    assert any(f" {count} of " in line and "left out" in line for line in convert(path, tmp_path / "b.ply"))
+    with pytest.raises(DataError, match="is not finite"):
+        read_gaussians(path, strict=True)
+    if suffix != ".splat":  # which does not tell its program
+        refused(path, with_a_bad_one(suffix, own=True)[0], "is not finite")
+
+
 def test_counts_beyond_the_size_are_refused(tmp_path):
     head = spz.HEADER.pack(spz.MAGIC, 3, 2**31, 3, 12, 0, 0)
     refused(tmp_path / "a.spz", gzip.compress(head + bytes(1000)), "2147483648 Gaussians in")
@@ -362,7 +438,16 @@ EXTENSION = ("meshes", 0, "primitives", 0, "extensions", "KHR_gaussian_splatting
         (at("buffers", 0, "uri", value="http://example.org/a.bin"), "another file"),
         (at(*EXTENSION, "kernel", value="box"), "kernel 'box'"),
         (at(*EXTENSION, "colorSpace", value="lin_rec709_display"), "lin_rec709"),
-        (at("nodes", 0, value={"mesh": 0, "scale": [2, 2, 2]}), "transforms its mesh"),
+        (at("nodes", 0, value={"mesh": 0, "scale": [2, 2, 3]}), "node 0 scales the Gaussians by different factors"),
+        (at("nodes", 0, value={"mesh": 0, "scale": [0, 0, 0]}), "node 0 scales the Gaussians by different factors, by 0"),
+        (at("nodes", 0, value={"mesh": 0, "rotation": [0, 0, 0, 0]}), "node 0 scales the Gaussians"),
+        (at("nodes", 0, value={"mesh": 0, "matrix": [1, 2, 3]}), "content is invalid"),
+        (at("nodes", 0, value={"mesh": 0, "children": [0]}), "node 0 has two parents"),
+        (at("nodes", 0, value={"mesh": 0, "children": [7]}), "nodes 7 does not exist"),
+        (at("nodes", 0, value={"mesh": 0, "extensions": {"EXT_mesh_gpu_instancing": {}}}), "EXT_mesh_gpu_instancing"),
+        (at("scenes", 0, "nodes", value=[]), "shows the Gaussians 0 times"),
+        (lambda d: d.update(nodes=[{"mesh": 0}] * 33, scenes=[{"nodes": list(range(33))}]), "shows the Gaussians 33 times"),
+        (at("extensionsRequired", value=["KHR_gaussian_splatting", "EXT_unknown"]), "requires the extension EXT_unknown"),
         (at("asset", value=[0] * 300_001), "values"),
         (lambda d: d["meshes"].append(d["meshes"][0]), "2 primitives"),
         (lambda d: d["meshes"][0]["primitives"][0]["attributes"].pop("POSITION"), "POSITION is missing"),
@@ -370,6 +455,100 @@ EXTENSION = ("meshes", 0, "primitives", 0, "extensions", "KHR_gaussian_splatting
 )
 def test_documents_that_lie(change, match, tmp_path):
     refused(tmp_path / "a.glb", with_document(change), match)
+
+
+TURN = {"rotation": [0.5, -0.1, 0.3, 0.8], "scale": [2, 2, 2], "translation": [1, 2, 3]}
+MIRROR = {"matrix": [-1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 5, 0, 0, 1]}
+HALF = {"rotation": [1, 0, 0, 0]}
+
+
+def placed(node):
+    """Return the matrix [4, 4] of a node."""
+    if "matrix" in node:
+        return np.array(node["matrix"], float).reshape(4, 4).T
+    turn = rotation_matrices(np.array(node["rotation"], float)[[3, 0, 1, 2]] / np.linalg.norm(node["rotation"]))
+    matrix = np.eye(4)
+    matrix[:3] = np.concatenate(
+        [turn * np.array(node.get("scale", 1)), np.reshape(node.get("translation", [0] * 3), (3, 1))], 1
+    )
+    return matrix
+
+
+@pytest.mark.parametrize(
+    "nodes,roots,wanted",
+    [
+        ([{"mesh": 0, "matrix": np.eye(4).ravel().tolist()}], [0], [np.eye(4)]),
+        ([{"mesh": 0, "translation": [0, 0, 0]}, {"camera": 0, "scale": [1, 2, 3]}], [0, 1], [np.eye(4)]),
+        ([{"mesh": 0, **TURN}], [0], [placed(TURN)]),
+        ([{"mesh": 0, **MIRROR}], [0], [placed(MIRROR)]),
+        ([{"mesh": 0, **TURN}, {"children": [0], **HALF}], [1], [placed(HALF) @ placed(TURN)]),
+        ([{"mesh": 0, **HALF}, {"mesh": 0}, {"mesh": 0, **TURN}], [0, 1], [placed(HALF), np.eye(4)]),
+        ([{"mesh": 0, **HALF, "children": [1]}, {"mesh": 0, **TURN}], None, [placed(HALF), placed(HALF) @ placed(TURN)]),
+    ],
+    ids=["identity", "camera", "turned", "mirrored", "parent", "two of the scene", "no scene"],
+)
+def test_nodes_place_gaussians(nodes, roots, wanted, tmp_path):
+    """Means, shapes and colours follow all nodes above the mesh; each node that shows it has a copy of it."""
+
+    def change(document):
+        document.update(nodes=nodes, scenes=[{"nodes": roots}] if roots else [])
+
+    (tmp_path / "a.glb").write_bytes(with_document(change))
+    plain, back = gltf.decode(Path("a.glb"), encoded(".glb")), read_gaussians(tmp_path / "a.glb")
+    made = gaussians_of(Path("a.glb"), plain)
+    if len(wanted) == 1 and np.array_equal(wanted[0], np.eye(4)):
+        assert all(torch.equal(t, getattr(made, name)) for name, t in back.tensors().items())
+    flip = torch.diag(torch.tensor([-1.0, -1, 1, 1], dtype=torch.float64))  # glTF's axes
+    d = torch.nn.functional.normalize(torch.randn(9, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(2)), dim=1)
+
+    def described(g):
+        axes = torch.as_tensor(rotation_matrices(torch.nn.functional.normalize(g.quats.double(), dim=1)))
+        return axes @ torch.diag_embed((2 * g.log_scales.double()).exp()) @ axes.mT
+
+    for i, matrix in enumerate(wanted):
+        m = flip @ torch.from_numpy(matrix) @ flip
+        part = type(back)(**{name: t[5 * i : 5 * i + 5] for name, t in back.tensors().items()})
+        assert torch.allclose(part.means.double(), made.means.double() @ m[:3, :3].T + m[:3, 3], atol=1e-5)
+        assert torch.allclose(described(part), m[:3, :3] @ described(made) @ m[:3, :3].T, rtol=1e-4, atol=1e-7)
+        turned = torch.nn.functional.normalize(d @ m[:3, :3].T, dim=1)
+        before, after = (torch.einsum("dk,nkc->dnc", basis(v)[:, :4], g.sh.double()) for v, g in ((d, made), (turned, part)))
+        assert torch.allclose(before, after, atol=1e-5)
+    assert len(back) == 5 * len(wanted)
+
+
+def test_rotations_of_zero_length_stay(tmp_path):
+    """A turned model still tells which Gaussians have no rotation."""
+    made = arrays_of(model(5, 1))
+    made["quats"][2] = 0
+    base.transform_in_place(made, placed(TURN)[:3, :3], np.zeros(3))
+    with pytest.raises(DataError, match="the rotation of Gaussian 2 has zero length"):
+        gaussians_of(tmp_path, made)
+
+
+def test_integers_and_points_of_gltf(tmp_path):
+    """Scales and positions may be plain integers; programs without Gaussians show points in linear colours, with opacities."""
+    path, made = tmp_path / "a.glb", arrays_of(model(5, 1))
+    document, body = gltf._split(path, encoded(".glb"))
+    color = document["accessors"][document["meshes"][0]["primitives"][0]["attributes"]["COLOR_0"]]
+    assert (color["componentType"], color["type"], color["normalized"]) == (5123, "VEC4", True)
+    view = document["bufferViews"][color["bufferView"]]
+    colors = np.frombuffer(body, "<u2", 20, view["byteOffset"]).reshape(5, 4) / 65535
+    wanted = linear(0.28209479 * made["sh"][:, 0] + 0.5)
+    assert np.allclose(colors[:, :3], wanted, atol=1e-5) and np.allclose(
+        colors[:, 3], base.sigmoid(made["logit_opacities"]), atol=1e-5
+    )
+
+    def change(document):
+        document["accessors"][2] |= {"componentType": 5121}
+        document["accessors"][0] |= {"componentType": 5122}
+        document["extensionsRequired"] = ["KHR_mesh_quantization"]
+
+    path.write_bytes(with_document(change))
+    scales, means = body[document["bufferViews"][2]["byteOffset"] :][:15], body[document["bufferViews"][0]["byteOffset"] :][:30]
+    back = read_gaussians(path)
+    lengths = np.frombuffer(scales, "u1").reshape(5, 3).astype("f4")
+    assert np.allclose(back.log_scales.exp(), np.maximum(lengths, gltf._TINY), rtol=1e-5)
+    assert np.array_equal(back.means, np.frombuffer(means, "<i2").reshape(5, 3) * [-1, -1, 1])
 
 
 def test_chunks_and_numbers_that_lie(tmp_path):

@@ -8,6 +8,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from warpgs.errors import DataError, ResourceError
+from warpgs.export.base import read_gaussians, write_gaussians
 from warpgs.export.ply import MAX_HEADER_BYTES, read_ply, write_ply
 from warpgs.scene import Gaussians, Normalization
 
@@ -144,15 +145,62 @@ def test_unknown_properties_and_elements_are_ignored(tmp_path):
     assert read_ply(path).means.tolist() == [[1, 2, 3]] and read_ply(path).log_scales.tolist() == [[8, 9, 10]]
 
 
+def TEXT(lines):
+    return ply(lines).replace(b"binary_little_endian", b"ascii")
+
+
+@pytest.mark.parametrize("form", ["ascii", "binary_big_endian", "binary_little_endian"])
+@pytest.mark.parametrize("eol", [b"\n", b"\r\n"])
+def test_files_of_other_programs(tmp_path, form, eol):
+    """Text and either byte order, with a blank at the end of lines, comments in any encoding, and an element before."""
+    model, path = make(5, 2), tmp_path / "a.ply"
+    write_ply(path, model, Normalization())
+    lines, body = split(path)
+    values = np.frombuffer(body, "<f4").reshape(5, -1)
+    comments = ["comment J\u00f6rg\u2028", "comment", "comment LATIN caf\u00e9", "obj_info \x0b "]
+    lines[1:4] = [f"format {form} 1.0 ", *comments, "element camera 1", "property uchar f"]
+    header = eol.join(line.encode("latin-1" if "LATIN" in line else "utf-8") for line in [*lines, "end_header ", ""])
+    data = {"ascii": b"7" + eol + eol.join(" ".join(map(repr, row)).encode() for row in values.tolist())}
+    data |= {"binary_big_endian": b"\7" + values.astype(">f4").tobytes(), "binary_little_endian": b"\7" + body}
+    path.write_bytes(header + data[form])
+    back = read_ply(path)
+    for name, tensor in model.tensors().items():
+        assert torch.equal(getattr(back, name), tensor), name
+
+
+@pytest.mark.parametrize("own", [False, True])
+def test_gaussians_with_bad_numbers_are_left_out(tmp_path, own):
+    """With a warning; in our own file, or if the caller is strict, they are an error."""
+    model, path = make(7), tmp_path / "a.ply"
+    write_ply(path, model, Normalization())
+    lines, body = split(path)
+    values = np.frombuffer(body, "<f4").reshape(7, -1).copy()
+    values[1, 20], values[2, -6], values[4, -4:], values[5, 0] = np.nan, np.inf, 0, -np.inf
+    path.write_bytes(
+        "\n".join([line for line in lines if own or "comment" not in line] + ["end_header\n"]).encode() + values.tobytes()
+    )
+    with pytest.raises(DataError, match="f_rest_11 of Gaussian 1 is not finite"):
+        read_gaussians(path, strict=True)
+    if own:
+        with pytest.raises(DataError, match="f_rest_11 of Gaussian 1 is not finite"):
+            read_ply(path)
+        return
+    for read in (read_ply, read_gaussians):
+        with pytest.warns(UserWarning, match=r"4 of 7 Gaussians left out.*\(f_rest_11 of Gaussian 1 is not finite") as caught:
+            back = read(path)
+        assert len(caught) == 1 and caught[0].filename == __file__ and torch.equal(back.means, model.means[[0, 3, 6]])
+
+
 RESET_FREE_STEPS = [f"property float f_rest_{i}" for i in range(9)]
 MALFORMED = {
     "empty": (b"", "start with 'ply'"),
     "not ply": (b"solid cube\n", "start with 'ply'"),
     "no end": (b"ply\nformat binary_little_endian 1.0\n", "no 'end_header'"),
     "long header": (b"ply\n" + b"comment a\n" * (MAX_HEADER_BYTES // 10) + b"end_header\n", "no 'end_header'"),
-    "not ascii": (ply(["comment \u00e9"]), "not ASCII"),
-    "ascii format": (ply([]).replace(b"binary_little_endian", b"ascii"), "its format is ascii"),
-    "big endian": (ply([]).replace(b"little", b"big"), "its format is binary_big_endian"),
+    "other format": (ply([]).replace(b"little", b"middle"), "its format is binary_middle_endian 1.0, not one of"),
+    "short text": (TEXT(["element vertex 2", *PROPERTIES]) + b"1 2 3\n" * 20, "Gaussians 0 to 1 are not rows of 14 numbers"),
+    "words": (TEXT(["element vertex 1", *PROPERTIES]) + b"one " * 14, "convert string 'one'"),
+    "huge text": (TEXT(["element vertex 999999999", *PROPERTIES]) + b"1 " * 14, "truncated"),
     "no format": (b"ply\nelement vertex 0\nend_header\n", "not given"),
     "no vertex": (ply(["element face 0"]), "one 'element vertex'"),
     "two vertices": (ply(["element vertex 0", "element vertex 0"]), "one 'element vertex'"),
@@ -182,6 +230,12 @@ def test_malformed_files_are_told_with_path_and_remedy(tmp_path, name):
     with pytest.raises(DataError, match=message) as error:
         read_ply(path)
     assert str(path) in str(error.value) and "Export" in str(error.value)
+
+
+def test_compressed_files_name_their_reader(tmp_path):
+    write_gaussians(tmp_path / "a.compressed.ply", make(5, 1), units="file")
+    with pytest.raises(DataError, match=r"is a compressed PLY file.*use warpgs\.export\.read_gaussians"):
+        read_ply(tmp_path / "a.compressed.ply")
 
 
 def test_infinite_logits_and_axes_without_length(tmp_path):

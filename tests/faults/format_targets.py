@@ -96,6 +96,10 @@ def spz_files(root: Path) -> list[Path]:
     for version in spz.VERSIONS if importlib.util.find_spec("zstandard") else (2, 3):
         paths.append(root / f"v{version}.spz")
         paths[-1].write_bytes(b"".join(spz.encode(arrays_of(gaussians(5)), version)))
+    plain = bytearray(gzip.decompress(paths[1].read_bytes()))
+    plain[14] |= spz.EXTENDED
+    paths.append(root / "axes.spz")
+    paths[-1].write_bytes(gzip.compress(plain + struct.pack("<IIIII", 7, 0, spz.COORDINATE_SYSTEM, 4, 12)))
     return paths
 
 
@@ -126,7 +130,7 @@ def spz_streams(data: bytes, rng: np.random.Generator) -> bytes:
     return data[:place] + toc + b"".join(p for p, _ in parts)
 
 
-SPZ = (spz.decode, spz._checked, spz._streams, spz._unpack)
+SPZ = (spz.decode, spz._checked, spz._streams, spz._unpack, spz._coordinate_system)
 SPZ_CHANGES = (rarely(spz_bomb, inside_gzip(header_number)), inside_gzip(number), inside_gzip(damage), spz_streams)
 add("SPZ", ".spz", SPZ, SPZ_CHANGES, spz_files)
 
@@ -200,7 +204,7 @@ add("SOG", ".sog", SOG, (sog_member, sog_member, rarely(sog_image, rarely(zip_bo
 
 
 def gltf_files(root: Path) -> list[Path]:
-    """Write both kinds, and one whose opacities and rotations are fractions in integers."""
+    """Write both kinds, and one whose opacities and rotations are fractions in integers, shown by two nodes."""
     paths = [*written(".glb")(root), *written(".gltf")(root), root / "c.glb"]
     document, part = gltf._split(paths[0], paths[0].read_bytes())
     body = bytes(part)
@@ -212,6 +216,7 @@ def gltf_files(root: Path) -> list[Path]:
         document["accessors"][1 + 2 * i] = accessor | {"type": kind}
         body += values.tobytes()
     document["buffers"][0]["byteLength"] = len(body)
+    document["nodes"] = [{"mesh": 0, "children": [1], "scale": [2, 2, 2]}, {"mesh": 0, "rotation": [0, 0.6, 0, 0.8]}]
     paths[-1].write_bytes(glb(json.dumps(document).encode(), body))
     return paths
 
@@ -248,7 +253,7 @@ def gltf_numbers(data: bytes, rng: np.random.Generator) -> bytes:
         return data
 
 
-GLTF = (gltf.decode, gltf._split, gltf._inside, gltf._primitive, gltf._accessor)
+GLTF = (gltf.decode, gltf._split, gltf._inside, gltf._primitive, gltf._accessor, gltf._places, gltf._matrix_of)
 add("glTF", ".glb", GLTF, (gltf_document, gltf_document, gltf_numbers), gltf_files)
 
 # ---- cameras and boxes -------------------------------------------------------------------------------------------------

@@ -65,7 +65,11 @@ def ply_files(root: Path) -> list[Path]:
     (root / "b.ply").write_bytes(
         before.replace(b"\nend_header", b"\nelement tail 1\nproperty list uchar int x\nend_header") + bytes(1)
     )
-    return [root / "a.ply", root / "b.ply"]
+    head, _, body = text.partition(b"end_header\n")
+    rows = np.frombuffer(body, "<f4").reshape(len(gaussians()), -1).tolist()
+    lines = "".join(" ".join(map(repr, row)) + "\n" for row in rows)
+    (root / "c.ply").write_bytes(head.replace(b"binary_little_endian", b"ascii") + b"end_header\n" + lines.encode())
+    return [root / "a.ply", root / "b.ply", root / "c.ply"]
 
 
 PLY = (ply._read, parse_header, ply._locate_vertices, ply._check_properties, ply._assemble, ply_error)

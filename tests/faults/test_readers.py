@@ -110,7 +110,7 @@ READERS = {
     "export/base.py": {"reading": "splat"},
     "export/ply.py": {"_read": "ply"},
     "export/gltf.py": {"_split": "glTF"},
-    "export/sog.py": {"SOG.is_antialiased": "SOG", "decode": "SOG", "_member": "SOG", "_meta": "SOG", "_pixels": "SOG"},
+    "export/sog.py": {"SOG._meta_of": "SOG", "decode": "SOG", "_member": "SOG", "_meta": "SOG", "_pixels": "SOG"},
     "io/transforms.py": {"_json": "cameras"},
     "io/colmap.py": {"_BinaryFile.__init__": "colmap", "_lines": "colmap", "read_ply_points": "colmap"},
     "io/image_files.py": {"_raster": "any image", "read_image_file": "any image"},
@@ -152,7 +152,7 @@ DIGEST = "reads bytes that it does not look into"
 SYSTEM = "reads what the system says"
 LAYER = "opens for others, which are named here"
 REASONS = {
-    "export/sog.py": {"SOG.is_antialiased": "SOG", "encode": "writes"},
+    "export/sog.py": {"SOG._meta_of": "SOG", "encode": "writes"},
     "files.py": {"appending": "writes", "read_file": LAYER,
         "open_input": LAYER, "read_input": LAYER, "read_start": LAYER, "input_digest": LAYER},
     "folders.py": {"Folder.__init__": LAYER, "Folder.open": LAYER, "Folder.open_regular": LAYER,

@@ -20,7 +20,7 @@ from warpgs.export.base import read_gaussians, write_gaussians
 from warpgs.export.meshes_and_cameras import NAMES, write_cameras
 from warpgs.export.ply import read_ply
 from warpgs.files import make_folder
-from warpgs.geometry import look_at, rotation_matrices
+from warpgs.geometry import harmonics, look_at, rotate, rotation_matrices
 from warpgs.io.transforms import read_cameras
 from warpgs.kernels.sh import basis
 from warpgs.pipeline.films.film import FilmSettings
@@ -46,6 +46,7 @@ from warpgs.render.options import RasterizeOptions
 from warpgs.render.rasterize import rasterize
 from warpgs.scene import Camera, Gaussians, PointCloud
 from warpgs.synthetic.demo import split_spec, write_demo
+from warpgs.viewer.window import content_of_file
 
 # The table of what training learns: everything that goes by row stays together, whatever happens to the rows.
 
@@ -332,12 +333,14 @@ def covariances(g):
     return axes @ torch.diag_embed((2 * g.log_scales.double()).exp()) @ axes.mT
 
 
+@pytest.mark.parametrize("matrix", [TURN, TURN * [-1, 1, 1]], ids=["rotation", "reflection"])
 @pytest.mark.parametrize("degree", [0, 1, 4])
-def test_colours_and_shapes_turn_with_the_scene(degree):
+def test_colours_and_shapes_turn_with_the_scene(degree, matrix):
     made = cloud(40, degree=degree)
-    turned, turn = edit.rotate(made, TURN), torch.from_numpy(TURN)
+    turned, turn = rotate(made, matrix), torch.from_numpy(matrix)
     d = torch.nn.functional.normalize(torch.randn(9, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(2)), dim=1)
     k = made.sh.shape[1]
+    assert np.allclose(harmonics(d.numpy()), basis(d), atol=1e-14)
     before = torch.einsum("dk,nkc->dnc", basis(d)[:, :k], made.sh.double())
     after = torch.einsum("dk,nkc->dnc", basis(d @ turn.T)[:, :k], turned.sh.double())
     assert torch.allclose(before, after, atol=1e-6)
@@ -643,6 +646,17 @@ def test_files_that_hold_no_cameras(text, match, tmp_path):
     (tmp_path / "cameras.json").write_text(text)
     with pytest.raises(DataError, match=match):
         read_cameras(tmp_path / "cameras.json")
+
+
+def test_commands_count_what_a_file_loses(tmp_path, capsys):
+    """Renders and the viewer, as an export does."""
+    path = tmp_path / "a.splat"
+    write_gaussians(path, cloud(50), units="file")
+    path.write_bytes(np.array([np.nan], "<f4").tobytes() + path.read_bytes()[4:])
+    write_cameras(tmp_path / "cameras.json", make_cameras())
+    model, notes = open_file(path, tmp_path / "cameras.json", "inria", "cpu")
+    assert len(model.gaussians()) == 49 and any("1 of 50 Gaussians left out" in note for note in notes)
+    assert len(content_of_file(path).model.gaussians()) == 49 and "1 of 50 Gaussians left out" in capsys.readouterr().out
 
 
 def test_a_file_renders_antialiased(tmp_path):

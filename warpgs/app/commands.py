@@ -324,23 +324,26 @@ def export(arguments: list[str]) -> Command:
     """Return `warpgs export`."""
     from warpgs.app.format_flags import chosen_formats, filters_of, format_flags, format_lines
 
-    def write(run: Positional[Path], *, to: Path, flags: Annotated[format_flags(arguments), arg(name="")]) -> list[str]:
+    def write(
+        run: Positional[Path], *, to: Path, keep_names: bool = False, flags: Annotated[format_flags(arguments), arg(name="")]
+    ) -> list[str]:
         """Write a run's Gaussians or cameras.
 
         Args:
             run: Run folder of `warpgs fit`.
             to: File to write; its suffix chooses the format. For cameras: cameras.json, transforms.json, or sparse (COLMAP).
+            keep_names: Name the images of cameras as the photographs, not by numbers.
             flags: Filters and options of formats.
         """
         formats, filters = chosen_formats(flags, to), filters_of(flags)
         waiting()(f"writing {to.name}")
-        if to.suffix.lower() == ".html" and not formats:
+        if to.suffix.lower() == ".html" and not formats and not keep_names:
             from warpgs.viewer.html import export_html
 
             return export_html(run, to, filters)
         from warpgs.pipeline.run import export
 
-        return export.export(run, to, filters, formats[0] if formats else None)
+        return export.export(run, to, filters, formats[0] if formats else None, keep_names)
 
     return write, f"{format_lines()}\n  .html: a page that shows the model in any browser"
 

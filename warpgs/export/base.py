@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import io
+import math
 import os
 import re
 import struct
@@ -19,7 +20,7 @@ import numpy as np
 
 from warpgs.errors import DataError, UsageError
 from warpgs.files import open_input, read_input, unread_reason, write_bytes
-from warpgs.geometry import checked_normalization, convert_gaussians
+from warpgs.geometry import checked_normalization, convert_gaussians, rotate
 from warpgs.plugins import Registry
 from warpgs.scene import Gaussians, Normalization, base_coefficients, base_colors
 
@@ -31,7 +32,10 @@ Arrays = dict[str, np.ndarray]
 SH_SIZES = (1, 4, 9, 16)
 """Numbers of spherical-harmonics coefficients of degrees 0 to 3."""
 SQRT2 = 1.4142135623730951
-_AXES = ("", "y", "z", "x", "xy", "yz", "", "xz", "", "y", "xyz", "y", "z", "x", "z", "x")
+_AXES = (
+    "", "y", "z", "x", "xy", "yz", "", "xz", "", "y", "xyz", "y", "z", "x", "z", "x",
+    "xy", "yz", "xy", "yz", "", "xz", "", "xz", "",
+)  # fmt: skip
 """Axes that flip the sign of each harmonic, in the order of docs/sh.md."""
 
 
@@ -78,22 +82,45 @@ def arrays_to_write(path: Path, gaussians: Gaussians, normalization: Normalizati
     return arrays
 
 
-def gaussians_of(path: Path, arrays: Arrays) -> Gaussians:
-    """Return Gaussians of decoded arrays, as float32 tensors."""
-    import torch
-
+def gaussians_of(
+    path: Path, arrays: Arrays, strict: Callable[[], bool] = lambda: True, notes: list[str] | None = None
+) -> Gaussians:
+    """Return Gaussians of decoded arrays, as float32 tensors; see `usable`."""
     with np.errstate(over="ignore", invalid="ignore"):  # values beyond float32 become infinities, which the error below names
         single = {name: np.ascontiguousarray(array, dtype=np.float32) for name, array in arrays.items()}
+    bad, reason = np.zeros(len(single["means"]), bool), ""
     for name, array in single.items():
         for part in parts(len(array)):
-            bad = ~np.isfinite(array[part])
-            if bad.any():
-                row = part.start + int(np.argwhere(bad)[0][0])
-                raise malformed(path, f"{name} of Gaussian {row} is not finite in float32")
+            rows = ~np.isfinite(array[part]).reshape(len(array[part]), -1).all(axis=1)
+            if rows.any():
+                reason = reason or f"{name} of Gaussian {part.start + int(rows.argmax())} is not finite in float32"
+                bad[part] |= rows
     zero = ~single["quats"].any(axis=1)
     if zero.any():
-        raise malformed(path, f"the rotation of Gaussian {int(np.argmax(zero))} has zero length")
-    return Gaussians(**{name: torch.from_numpy(array) for name, array in single.items()})
+        reason = reason or f"the rotation of Gaussian {int(zero.argmax())} has zero length"
+    return usable(path, single, bad | zero, reason, strict, notes)
+
+
+def usable(
+    path: Path, arrays: Arrays, bad: np.ndarray, reason: str, strict: Callable[[], bool], notes: list[str] | None,
+    error: Callable[[Path, str], DataError] = malformed,
+) -> Gaussians:  # fmt: skip
+    """Return the Gaussians of float32 arrays without the ``bad`` rows [N], which get a note.
+
+    The ``reason`` of the first bad row is an error if `strict` asks for it, or if no Gaussian is left.
+    """
+    import torch
+
+    if count := int(bad.sum()):
+        if count == len(bad) or strict():
+            raise error(path, reason)
+        if notes is not None:
+            notes.append(
+                f"{path}: {count:,} of {len(bad):,} Gaussians left out, with a number that is not finite or a rotation of zero "
+                f"length ({reason})"
+            )
+        arrays = {name: array[~bad] for name, array in arrays.items()}
+    return Gaussians(**{name: torch.from_numpy(array) for name, array in arrays.items()})
 
 
 def sigmoid(logits: np.ndarray) -> np.ndarray:
@@ -150,6 +177,20 @@ def half_turn_in_place(arrays: Arrays, axis: str) -> None:
     arrays["means"] *= signs
     arrays["quats"] *= np.concatenate([[1], signs]).astype(np.float32)
     arrays["sh"] *= harmonics[:, None]
+
+
+def transform_in_place(arrays: Arrays, matrix: np.ndarray, offset: np.ndarray) -> None:
+    """Map arrays of a float type by a similarity or a mirrored one: ``matrix`` [3, 3] and ``offset`` [3]."""
+    import torch
+
+    size = abs(np.linalg.det(matrix)) ** (1 / 3)
+    for part in parts(len(arrays["means"])):
+        rows = {name: np.asarray(array[part], np.float32) for name, array in arrays.items()}
+        turned = rotate(Gaussians(**{name: torch.from_numpy(array) for name, array in rows.items()}), matrix / size)
+        arrays["means"][part] = np.einsum("ij,nj->ni", matrix, rows["means"].astype(np.float64)) + offset
+        arrays["quats"][part] = turned.quats.numpy() * rows["quats"].any(axis=1, keepdims=True)  # 0 stays 0
+        arrays["log_scales"][part] += math.log(size)
+        arrays["sh"][part] = turned.sh.numpy()
 
 
 def rounded(values: np.ndarray, most: int) -> np.ndarray:
@@ -214,6 +255,10 @@ class Format:
         """The options."""
         self.antialiased = False
         """True while an antialiased model is written."""
+        self.strict = False
+        """True to refuse a file with a Gaussian that cannot be rendered, instead of leaving the Gaussian out."""
+        self.notes: list[str] = []
+        """Notes for the user on the last file that was read."""
 
     def encode(self, arrays: Arrays) -> Iterable[bytes]:
         """Return the bytes of a file, in pieces.
@@ -245,6 +290,10 @@ class Format:
         Raises:
             DataError: The file is missing or malformed.
         """
+        return False
+
+    def is_own(self, path: Path) -> bool:
+        """Return whether warpgs wrote a file, so that bad numbers mean damage; False if the format cannot tell."""
         return False
 
     def fits(self, path: str | os.PathLike[str]) -> bool:
@@ -279,7 +328,9 @@ class Format:
         normalization = checked_normalization(normalization, units, str(path))
         with reading(path, whole=not self.archive) as file:
             arrays = self.decode(path, file if self.archive else file.read())
-        return convert_gaussians(gaussians_of(path, arrays), normalization, "file", units)
+        self.notes = []
+        gaussians = gaussians_of(path, arrays, lambda: self.strict or self.is_own(path), self.notes)
+        return convert_gaussians(gaussians, normalization, "file", units)
 
 
 def warn_of_antialiasing(path: Path) -> None:
@@ -439,35 +490,43 @@ def read_gaussians(
     *,
     units: str = "file",
     format: str | type[Format] | Format | None = None,
+    strict: bool = False,
 ) -> Gaussians:
     """Read Gaussians from a file, in the format of its suffix; a .ply file may be compressed.
 
-    A file that declares antialiasing causes a warning: render it with `RasterizeOptions.antialiased`.
+    A file that declares antialiasing causes a warning: render it with `RasterizeOptions.antialiased`. In files of other
+    programs, Gaussians with a NaN, with an infinity that `read_ply` does not replace, or with a rotation of zero length are
+    left out, with a warning that counts them. In files that name warpgs as their program they are an error.
 
     Args:
         path: The file.
         normalization: Similarity from file to scene units; needed where ``units`` is scene.
         units: Units of the result: file as stored, or scene to go with a scene's cameras.
         format: As in `write_gaussians`.
+        strict: True to refuse every file with such a Gaussian.
 
     Returns:
         N Gaussians, torch float32 tensors on the CPU.
 
     Raises:
-        warpgs.DataError: The file is missing, malformed, truncated, declares more data than its size allows, or contains
-            a NaN, an infinity that `read_ply` does not replace, or a rotation of zero length.
+        warpgs.DataError: The file is missing, malformed, truncated, declares more data than its size allows, has no usable
+            Gaussian, or has one that is not usable although it is ``strict`` or a file of warpgs.
         warpgs.UsageError: The suffix, the format or the units are unknown, or scene units are given without a
             normalization.
     """
-    gaussians, antialiased = read_with_antialiasing(Path(path), normalization, units, format)
+    gaussians, antialiased, notes = read_with_antialiasing(Path(path), normalization, units, format, strict)
     if antialiased:
         warn_of_antialiasing(Path(path))
+    for note in notes:
+        warnings.warn(note, stacklevel=2)
     return gaussians
 
 
 def read_with_antialiasing(
-    path: Path, normalization: Normalization | None, units: str, format: str | type[Format] | Format | None = None
-) -> tuple[Gaussians, bool]:
-    """Return the result of `read_gaussians`, and whether the file declares antialiasing."""
-    chosen = format_of(path, format)
-    return chosen.read(path, normalization, units), chosen.is_antialiased(path)
+    path: Path, normalization: Normalization | None, units: str, format: str | type[Format] | Format | None = None,
+    strict: bool = False,
+) -> tuple[Gaussians, bool, list[str]]:  # fmt: skip
+    """Return the result of `read_gaussians`, whether the file declares antialiasing, and notes for the user."""
+    chosen = copy.copy(format_of(path, format))
+    chosen.strict, chosen.notes = strict, []
+    return chosen.read(path, normalization, units), chosen.is_antialiased(path), chosen.notes

@@ -26,10 +26,15 @@ from warpgs.export.base import (
     logits,
     malformed,
     parts,
+    reading,
     register,
+    rounded,
     sigmoid,
+    transform_in_place,
     unit_quats,
 )
+from warpgs.geometry import rotation_matrices
+from warpgs.scene import base_colors
 
 EXTENSION = "KHR_gaussian_splatting"
 COLOR_SPACE = "srgb_rec709_display"
@@ -38,9 +43,21 @@ MAX_PARTS = 100_000
 """Largest number of lists and objects in a document; each takes some thirty times as much memory as its text."""
 MAX_VALUES = 300_000
 """Largest number of commas in a document: each separates two values, which take up to a hundred bytes."""
+SUPPORTED = {EXTENSION, "KHR_mesh_quantization"}
+"""Extensions that a file may require; the second one permits integers as positions."""
+MAX_COPIES = 32
+"""Largest number of nodes that may show the Gaussians: each makes a copy of them."""
+MAX_SHEAR = 1e-4
+"""Largest difference of a node's transformation from a similarity, relative to its scale; float32 leaves 1e-6."""
 _KINDS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 _TINY = 1e-37
+
+
+def linear(colors: np.ndarray) -> np.ndarray:
+    """Return sRGB colours in [0, 1] as linear colours (IEC 61966-2-1), which glTF stores; the shape is unchanged."""
+    c = np.clip(colors.astype(np.float64), 0, 1)
+    return np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)
 
 
 def encode_glb(arrays: Arrays) -> list[bytes]:
@@ -77,14 +94,19 @@ def _document(arrays: Arrays) -> tuple[dict[str, Any], bytes]:
     for k in range(a["sh"].shape[1]):
         degree = math.isqrt(k)
         attributes[f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{k - degree * degree}"] = ("VEC3", a["sh"][:, k])
+    # for programs that show Gaussians as points
+    opacities, colors = attributes[f"{EXTENSION}:OPACITY"][1][:, None], linear(base_colors(a["sh"][:, :1]))
+    attributes["COLOR_0"] = ("VEC4", rounded(65535 * np.concatenate([colors, opacities], 1), 65535).astype("<u2"))
     views: list[dict] = []
     accessors: list[dict] = []
     parts_of_body: list[bytes] = []
     start = 0
     for name, (kind, given) in attributes.items():
-        values = np.ascontiguousarray(given, "<f4")
+        values = np.ascontiguousarray(given, "<u2" if name == "COLOR_0" else "<f4")
         views.append({"buffer": 0, "byteOffset": start, "byteLength": values.nbytes, "target": 34962})
         accessor = {"bufferView": len(accessors), "componentType": 5126, "count": len(values), "type": kind}
+        if name == "COLOR_0":
+            accessor |= {"componentType": 5123, "normalized": True}
         if name == "POSITION":  # glTF requires the bounds of positions
             accessor |= {"min": values.min(0).tolist(), "max": values.max(0).tolist()}
         accessors.append(accessor)
@@ -114,13 +136,13 @@ def decode(path: Path, data: bytes) -> Arrays:
         raise malformed(path, "it does not have exactly one buffer")
     if (uri := buffers[0].get("uri")) is not None:
         body = _inside(path, uri)
-    primitive = _primitive(path, document)
-    names = primitive["attributes"]
+    primitive, mesh = _primitive(path, document)
+    names, places = primitive["attributes"], _places(path, document, mesh)
 
     def values(name: str) -> np.ndarray:
         if name not in names:
             raise malformed(path, f"the attribute {name} is missing")
-        return _accessor(path, document, body, names[name])
+        return _accessor(path, document, body, names[name], whole=name in ("POSITION", f"{EXTENSION}:SCALE"))
 
     degrees = [d for d in range(4) if f"{EXTENSION}:SH_DEGREE_{d}_COEF_0" in names]
     if degrees != list(range(len(degrees))) or not degrees:
@@ -153,8 +175,57 @@ def decode(path: Path, data: bytes) -> Arrays:
         "log_scales": by_rows(n, (3,), logs),
         "logit_opacities": by_rows(n, (), lambda p: logits(_rows(opacities, p)[:, 0], 2.0**-22)),
     }
+    copies = [arrays, *({name: array.copy() for name, array in arrays.items()} for _ in places[1:])]
+    for copy, place in zip(copies, places):
+        if not np.array_equal(place, np.eye(4)):
+            transform_in_place(copy, place[:3, :3], place[:3, 3])
+    if places[1:]:
+        arrays = {name: np.concatenate([copy[name] for copy in copies]) for name in arrays}
     half_turn_in_place(arrays, "z")
     return arrays
+
+
+def _places(path: Path, document: dict[str, Any], mesh: int) -> list[np.ndarray]:
+    """Return the transformation [4, 4] of each node that shows a mesh, with those of its parents."""
+    nodes = document.get("nodes", [])
+    if not isinstance(nodes, list) or not all(isinstance(n, dict) and isinstance(n.get("children", []), list) for n in nodes):
+        raise malformed(path, "its nodes are invalid")
+    below = {str(child) for n in nodes for child in n.get("children", [])}
+    roots = [i for i in range(len(nodes)) if str(i) not in below]
+    if document.get("scenes"):
+        roots = list(_item(path, document, "scenes", document.get("scene", 0)).get("nodes", []))
+    left, seen, found = [(i, np.eye(4)) for i in reversed(roots)], set(), []
+    while left:
+        i, above = left.pop()
+        node, place = _item(path, document, "nodes", i), above @ _matrix_of(_item(path, document, "nodes", i))
+        if i in seen:
+            raise malformed(path, f"node {i} has two parents")
+        seen.add(i)
+        left += [(child, place) for child in reversed(node.get("children", []))]
+        if node.get("mesh") == mesh:
+            if "EXT_mesh_gpu_instancing" in (node.get("extensions") or ()):
+                raise malformed(path, f"node {i} repeats the Gaussians with EXT_mesh_gpu_instancing, which is not supported")
+            product = place[:3, :3].T @ place[:3, :3]
+            square = np.trace(product) / 3
+            if not (square > 0 and np.isfinite(place).all() and np.abs(product / square - np.eye(3)).max() <= MAX_SHEAR):
+                raise malformed(
+                    path, f"node {i} scales the Gaussians by different factors, by 0 or with shear; apply it in another program"
+                )
+            found.append(place)
+    if len(found) > MAX_COPIES or (not found and any(n.get("mesh") == mesh for n in nodes)):
+        raise malformed(path, f"its scene shows the Gaussians {len(found)} times (supported: 1 to {MAX_COPIES})")
+    return found or [np.eye(4)]
+
+
+def _matrix_of(node: dict[str, Any]) -> np.ndarray:
+    """Return the transformation [4, 4] of a node, float64."""
+    if "matrix" in node:
+        return np.array(node["matrix"], np.float64).reshape(4, 4).T
+    place, turn = np.eye(4), np.array(node.get("rotation", [0, 0, 0, 1]), np.float64)[[3, 0, 1, 2]]
+    scales = np.array(node.get("scale", [1, 1, 1]), np.float64).reshape(3)
+    place[:3, :3] = rotation_matrices(turn / np.sqrt((turn * turn).sum())) * scales
+    place[:3, 3] = np.array(node.get("translation", [0, 0, 0]), np.float64).reshape(3)
+    return place
 
 
 def _rows(block: np.ndarray, part: slice) -> np.ndarray:
@@ -207,15 +278,19 @@ def _inside(path: Path, uri: object) -> bytes:
         raise malformed(path, "its base64 numbers cannot be read") from e
 
 
-def _primitive(path: Path, document: dict[str, Any]) -> dict[str, Any]:
-    """Return the one primitive of Gaussians; DataError for features that are not supported."""
-    meshes, nodes = document.get("meshes"), document.get("nodes", [])
-    found = []
-    for mesh in meshes if isinstance(meshes, list) else []:
+def _primitive(path: Path, document: dict[str, Any]) -> tuple[dict[str, Any], int]:
+    """Return the one primitive of Gaussians and the number of its mesh; DataError for features that are not supported."""
+    required = document.get("extensionsRequired", [])
+    if unknown := [str(e)[:40] for e in (required if isinstance(required, list) else [required]) if e not in SUPPORTED]:
+        raise malformed(path, f"it requires the extension {unknown[0]}, which is not supported")
+    meshes = document.get("meshes")
+    found, number = [], 0
+    for i, mesh in enumerate(meshes if isinstance(meshes, list) else []):
         primitives = mesh.get("primitives") if isinstance(mesh, dict) else None
         for p in primitives if isinstance(primitives, list) else []:
             if isinstance(p, dict) and isinstance(p.get("extensions"), dict) and EXTENSION in p["extensions"]:
                 found.append(p)
+                number = i
     if len(found) != 1:
         raise malformed(path, f"it has {len(found)} primitives with {EXTENSION}; exactly one is supported")
     extension = found[0]["extensions"][EXTENSION]
@@ -227,20 +302,20 @@ def _primitive(path: Path, document: dict[str, Any]) -> dict[str, Any]:
         raise malformed(path, "its Gaussians are compressed by a further extension; export them uncompressed")
     if not isinstance(found[0].get("attributes"), dict):
         raise malformed(path, "its primitive has no attributes")
-    moved = {"matrix", "translation", "rotation", "scale"}
-    if any(not isinstance(n, dict) or moved & n.keys() for n in (nodes if isinstance(nodes, list) else [None])):
-        raise malformed(path, "a node transforms its mesh; apply the transformations, and export again")
-    return found[0]
+    return found[0], number
 
 
-def _accessor(path: Path, document: dict[str, Any], body: bytes | memoryview, index: object) -> np.ndarray:
-    """Return the numbers of an accessor, checked to lie in the file."""
+def _item(path: Path, document: dict[str, Any], table: str, at: object) -> dict[str, Any]:
+    """Return an object of a list of the document."""
+    rows = document.get(table)
+    if not isinstance(rows, list) or type(at) is not int or not 0 <= at < len(rows) or not isinstance(rows[at], dict):
+        raise malformed(path, f"{table} {str(at)[:20]} does not exist")
+    row: dict[str, Any] = rows[at]
+    return row
 
-    def item(table: str, at: object) -> dict[str, Any]:
-        rows = document.get(table)
-        if not isinstance(rows, list) or type(at) is not int or not 0 <= at < len(rows) or not isinstance(rows[at], dict):
-            raise malformed(path, f"{table} {str(at)[:20]} does not exist")
-        return rows[at]
+
+def _accessor(path: Path, document: dict[str, Any], body: bytes | memoryview, index: object, whole: bool) -> np.ndarray:
+    """Return the numbers of an accessor, checked to lie in the file; ``whole`` to allow integers that are not normalised."""
 
     def count(row: dict[str, Any], key: str, default: int | None = None) -> int:
         value = row.get(key, default)
@@ -248,12 +323,13 @@ def _accessor(path: Path, document: dict[str, Any], body: bytes | memoryview, in
             raise malformed(path, f"{key} {str(value)[:20]!r} does not fit into the {len(body)} bytes of its buffer")
         return value
 
-    accessor = item("accessors", index)
-    view = item("bufferViews", accessor.get("bufferView"))
+    accessor = _item(path, document, "accessors", index)
+    view = _item(path, document, "bufferViews", accessor.get("bufferView"))
     kind, width = _KINDS.get(accessor.get("componentType")), _WIDTHS.get(accessor.get("type"))
     if kind is None or width is None or "sparse" in accessor or view.get("buffer") != 0:
         raise malformed(path, f"accessor {index} has an unsupported type")
-    if kind != "<f4" and accessor.get("normalized") is not True:
+    normalized = accessor.get("normalized") is True
+    if kind != "<f4" and not (normalized or whole):
         raise malformed(path, f"accessor {index} contains integers that are not normalised")
     dtype = np.dtype(kind)
     size, rows = dtype.itemsize * width, count(accessor, "count")
@@ -263,7 +339,8 @@ def _accessor(path: Path, document: dict[str, Any], body: bytes | memoryview, in
         raise malformed(path, f"accessor {index} reaches beyond its {length} bytes")
     if not rows:
         return np.empty((0, width), np.float32)
-    return np.ndarray((rows, width), dtype, body, start + offset, (stride, dtype.itemsize))
+    numbers = np.ndarray((rows, width), dtype, body, start + offset, (stride, dtype.itemsize))
+    return numbers if kind == "<f4" or normalized else numbers.astype(np.float32)
 
 
 @register("glb")
@@ -275,12 +352,16 @@ class BinaryGltf(Format):
     encode = staticmethod(encode_glb)
     decode = staticmethod(decode)
 
+    def is_own(self, path: Path) -> bool:
+        """Return whether the document names warpgs as its generator."""
+        with reading(path, whole=True) as file:
+            return bool(_split(path, file.read())[0].get("asset") == {"version": "2.0", "generator": "warpgs"})
+
 
 @register("gltf")
-class TextGltf(Format):
+class TextGltf(BinaryGltf):
     """Text glTF."""
 
     suffix = ".gltf"
     description = "glTF 2.0 with KHR_gaussian_splatting, text with embedded numbers"
     encode = staticmethod(encode_gltf)
-    decode = staticmethod(decode)

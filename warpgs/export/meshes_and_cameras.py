@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from warpgs.errors import DataError, UsageError
-from warpgs.export.gltf import glb
+from warpgs.export.gltf import glb, linear
 from warpgs.files import filling, is_empty, make_folder, write_bytes, write_json, write_text
 from warpgs.geometry import pinhole_of, quaternions
 from warpgs.scene import Camera, Mesh
@@ -54,12 +55,6 @@ def _ply(mesh: Mesh) -> list[bytes]:
     faces = np.empty(len(mesh.faces), [("count", "u1"), ("vertices", "<i4", 3)])
     faces["count"], faces["vertices"] = 3, mesh.faces
     return [header.encode("ascii"), vertices.tobytes(), faces.tobytes()]
-
-
-def linear(colors: np.ndarray) -> np.ndarray:
-    """Return sRGB colours in [0, 1] as linear colours (IEC 61966-2-1), which glTF stores; the shape is unchanged."""
-    c = np.clip(colors.astype(np.float64), 0, 1)
-    return np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)
 
 
 def rotation_to_y(up: np.ndarray) -> list[float]:
@@ -117,7 +112,7 @@ def _glb(path: Path, mesh: Mesh, up: np.ndarray | None) -> list[bytes]:
 # Cameras as files for other programs: cameras.json of the INRIA 3DGS code, which splat editors read, transforms.json,
 # COLMAP.
 #
-# Images are named by number, so that the files contain no name or path of the user.
+# Images are named by number, so that the files contain no name or path of the user, unless the user asks for the names.
 
 NAMES = ("cameras.json", "transforms.json", "sparse")
 """Names of files, and of a folder, that determine the format."""
@@ -130,24 +125,37 @@ def holds_cameras(path: Path) -> bool:
     return path.name in NAMES
 
 
-def write_cameras(path: Path, cameras: list[Camera]) -> list[str]:
-    """Write cameras in the format of the file name; returns notes for the user."""
+def write_cameras(
+    path: Path, cameras: list[Camera], names: Sequence[str] | None = None, points: tuple[np.ndarray, np.ndarray] | None = None
+) -> list[str]:  # fmt: skip
+    """Write cameras in the format of the file name; returns notes for the user.
+
+    Args:
+        path: The file, or a folder named sparse.
+        cameras: N cameras in file units.
+        names: Names of their N images, relative to the folder of the images; None for numbers.
+        points: Positions [P, 3] and colours [P, 3], 0 to 1, which only COLMAP's files hold: other trainers start from them.
+    """
     if not holds_cameras(path):
         raise UsageError(f"{path}: cameras go to {' or '.join(NAMES[:2])}, or to a folder named {NAMES[2]} (COLMAP)")
     bent = sum(c.model != "pinhole" for c in cameras)
     notes = [f"{bent} of {len(cameras)} cameras are written without their lens distortion, as pinholes"] if bent else []
     cameras = [pinhole_of(c) for c in cameras]
+    images = [f"{i:04d}.png" for i in range(len(cameras))] if names is None else [n.removeprefix("images/") for n in names]
     if path.name == "transforms.json":
-        write_json(path, {"camera_model": "PINHOLE", "frames": [_frame(i, c) for i, c in enumerate(cameras)]})
+        write_json(path, {"camera_model": "PINHOLE", "frames": [_frame(n, c) for n, c in zip(images, cameras)]})
     elif path.name == "sparse":
         if path.exists() and not (path.is_dir() and is_empty(path)):
             raise UsageError(f"{path}: exists already and may be a reconstruction; give another folder")
+        if spaced := [name for name in images if len(name.split()) != 1]:
+            raise UsageError(f"{path}: COLMAP's text files cannot hold the name {spaced[0]!r}; leave out --keep-names")
         with filling(path) as temporary:
             make_folder(temporary / "0")
-            for name, text in _colmap(cameras).items():
+            for name, text in _colmap(images, cameras, points).items():
                 write_text(temporary / "0" / name, text)
     else:
-        write_json(path, [_inria(i, c) for i, c in enumerate(cameras)])
+        stems = images if names is not None else [name.removesuffix(".png") for name in images]
+        write_json(path, [_inria(i, n, c) for i, (n, c) in enumerate(zip(stems, cameras))])
         off = max((max(abs(c.K[0, 2] - c.width / 2), abs(c.K[1, 2] - c.height / 2)) for c in cameras), default=0.0)
         if off > MAX_OFF_CENTER:
             notes.append(
@@ -165,29 +173,31 @@ def _world_from_camera(camera: Camera) -> np.ndarray:
     return pose
 
 
-def _inria(number: int, camera: Camera) -> dict[str, object]:
+def _inria(number: int, name: str, camera: Camera) -> dict[str, object]:
     """Return the row of a camera; the format has no principal point."""
     pose = _world_from_camera(camera)
     return {
-        "id": number, "img_name": f"{number:04d}", "width": camera.width, "height": camera.height,
+        "id": number, "img_name": name, "width": camera.width, "height": camera.height,
         "position": pose[:3, 3].tolist(), "rotation": pose[:3, :3].tolist(),
         "fy": float(camera.K[1, 1]), "fx": float(camera.K[0, 0]),
     }  # fmt: skip
 
 
-def _frame(number: int, camera: Camera) -> dict[str, object]:
+def _frame(name: str, camera: Camera) -> dict[str, object]:
     """Return the frame of a camera, with the axes of OpenGL."""
     pose = _world_from_camera(camera)
     pose[:3, 1:3] *= -1
     return {
-        "file_path": f"images/{number:04d}.png", "w": camera.width, "h": camera.height,
+        "file_path": f"images/{name}", "w": camera.width, "h": camera.height,
         "fl_x": float(camera.K[0, 0]), "fl_y": float(camera.K[1, 1]), "cx": float(camera.K[0, 2]), "cy": float(camera.K[1, 2]),
         "transform_matrix": pose.tolist(),
     }  # fmt: skip
 
 
-def _colmap(cameras: list[Camera]) -> dict[str, str]:
-    """Return COLMAP's text files by name: a camera for each lens, images without points, and no points."""
+def _colmap(
+    names: list[str], cameras: list[Camera], points: tuple[np.ndarray, np.ndarray] | None
+) -> dict[str, str]:  # fmt: skip
+    """Return COLMAP's text files by name: a camera for each lens, images, and points that no image names."""
     import torch
 
     lenses: dict[tuple, int] = {}
@@ -197,9 +207,15 @@ def _colmap(cameras: list[Camera]) -> dict[str, str]:
         lens = (c.width, c.height, *(float(v) for v in (c.K[0, 0], c.K[1, 1], c.K[0, 2], c.K[1, 2])))
         number = lenses.setdefault(lens, len(lenses) + 1)
         values = [*quat, *(float(v) for v in c.viewmat[:3, 3])]
-        rows.append(f"{i} {' '.join(map(repr, values))} {number} {i - 1:04d}.png\n\n")  # the second line would hold its points
+        name = names[i - 1]
+        rows.append(f"{i} {' '.join(map(repr, values))} {number} {name}\n\n")  # the second line would hold its points
+    positions, colors = (np.empty((0, 3)),) * 2 if points is None else points
+    levels = np.round(255 * np.clip(colors, 0, 1)).astype(int).tolist()
     return {
         "cameras.txt": "".join(f"{n} PINHOLE {' '.join(map(repr, lens))}\n" for lens, n in lenses.items()),
         "images.txt": "".join(rows),
-        "points3D.txt": "",
+        "points3D.txt": "".join(
+            f"{i} {' '.join(map(repr, place))} {' '.join(map(str, color))} 0\n"
+            for i, (place, color) in enumerate(zip(positions.tolist(), levels), 1)
+        ),
     }

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import functools
+import itertools
 import math
 import os
 import re
+import warnings
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -29,6 +31,7 @@ from warpgs.export.base import (
     rounded,
     sigmoid,
     smallest_three,
+    usable,
     warn_of_antialiasing,
 )
 from warpgs.files import writing
@@ -44,6 +47,9 @@ _TYPES = {
     "int": "<i4", "int32": "<i4", "uint": "<u4", "uint32": "<u4", "float": "<f4", "float32": "<f4", "double": "<f8",
     "float64": "<f8",
 }  # fmt: skip
+_FORMATS = {"binary_little_endian 1.0": "<", "binary_big_endian 1.0": ">", "ascii 1.0": "<"}
+"""Formats that are read, with their byte order in numpy; the numbers of an ASCII file do not need one."""
+ASCII = re.compile(rb"^format[ \t]+ascii", re.MULTILINE)
 
 
 Element = tuple[str, int, list[tuple[str, str]]]
@@ -57,10 +63,15 @@ def mode_comments(antialiased: bool) -> tuple[str, str]:
     return f"comment SplatRenderMode: {'mip' if antialiased else 'default'}", f"comment antialiased {int(antialiased)}"
 
 
+def is_own(head: bytes) -> bool:
+    """Return whether a header has both comments of `mode_comments`, of which other programs write one or none."""
+    return any("\n".join(mode_comments(antialiased)).encode() in head for antialiased in (True, False))
+
+
 def is_antialiased(head: bytes) -> bool:
     """Return whether a parsed header declares antialiasing; the last such comment decides."""
     found = False
-    for line in head.partition(b"end_header")[0].decode("ascii").lower().replace(":", " ").splitlines():
+    for line in head.partition(b"end_header")[0].decode("utf-8", "replace").lower().replace(":", " ").splitlines():
         match line.split():
             case ["comment", "splatrendermode", mode]:
                 found = mode == "mip"
@@ -76,15 +87,12 @@ def ply_error(path: Path, what: str) -> DataError:
 
 def parse_header(path: Path, head: bytes) -> tuple[list[Element], int]:
     """Return the elements of the header in the first bytes of a file, and the offset [bytes] of the data behind it."""
-    if not re.match(rb"ply\r?\n", head):
+    if not re.match(rb"ply[ \t]*\r?\n", head):
         raise ply_error(path, "it does not start with 'ply'")
-    end = re.search(rb"^end_header\r?\n", head, re.MULTILINE)
+    end = re.search(rb"^end_header[ \t]*\r?\n", head, re.MULTILINE)
     if end is None:
         raise ply_error(path, f"no 'end_header' line within the first {MAX_HEADER_BYTES} bytes")
-    try:
-        lines = head[: end.start()].decode("ascii").splitlines()[1:]
-    except UnicodeDecodeError as e:
-        raise ply_error(path, f"byte {e.start} of the header is not ASCII") from e
+    lines = head[: end.start()].decode("utf-8", "replace").split("\n")[1:]  # comments may have any encoding
 
     elements: list[Element] = []
     formats = []
@@ -109,8 +117,11 @@ def parse_header(path: Path, head: bytes) -> tuple[list[Element], int]:
                 elements[-1][2].append((name, _TYPES[kind]))
             case _:
                 raise ply_error(path, f"header line {line[:80]!r} is invalid")
-    if formats != ["binary_little_endian 1.0"]:
-        raise ply_error(path, f"its format is {' and '.join(formats)[:80] or 'not given'}, not binary_little_endian 1.0")
+    if len(formats) != 1 or formats[0] not in _FORMATS:
+        given = " and ".join(formats)[:80] or "not given"
+        raise ply_error(path, f"its format is {given}, not one of {', '.join(_FORMATS)}")
+    order = _FORMATS[formats[0]]
+    elements = [(name, n, [(key, kind.replace("<", order)) for key, kind in given]) for name, n, given in elements]
     return elements, end.end()
 
 
@@ -177,6 +188,8 @@ def is_compressed(path: Path, data: bytes) -> bool:
 def decode(path: Path, data: bytes) -> Arrays:
     """Return the Gaussians of a file's bytes."""
     elements, start = parse_header(path, data[:MAX_HEADER_BYTES])
+    if ASCII.search(data[:start]):
+        raise malformed(path, "it is compressed, but in ASCII")
     tables = {}
     for element in elements:
         name, _, properties = element
@@ -302,6 +315,10 @@ class CompressedPLY(Format):
         """Return whether the header declares antialiasing."""
         return is_antialiased(start_of(path))
 
+    def is_own(self, path: Path) -> bool:
+        """Return whether the header has the comments of warpgs."""
+        return is_own(start_of(path))
+
 
 # Gaussians as a PLY file in the layout of the INRIA 3DGS code, which splat viewers and editors read.
 #
@@ -360,12 +377,13 @@ def write_ply(
 
 
 def read_ply(path: str | os.PathLike[str], normalization: Normalization | None = None, *, units: str = "file") -> Gaussians:
-    """Read Gaussians from a PLY file in the INRIA 3DGS layout, binary little endian.
+    """Read Gaussians from a PLY file in the INRIA 3DGS layout, binary or ASCII; `read_gaussians` also reads compressed ones.
 
     Properties and elements outside the layout are ignored. Other programs write opacities of 0 and 1 as infinite logits, and
-    axes of length 0 as log scales of -inf. These become finite numbers that look the same (`OPAQUE`, `FLAT`). The number of
-    rows is checked against the file size before memory is allocated. A file that declares antialiasing causes a warning: render
-    it with `RasterizeOptions.antialiased`.
+    axes of length 0 as log scales of -inf. These become finite numbers that look the same (`OPAQUE`, `FLAT`). Their Gaussians
+    with a NaN, another infinity or a rotation of zero length are left out with a warning; `read_gaussians` can refuse them
+    (``strict``). The number of rows is checked against the file size before memory is allocated. A file that declares
+    antialiasing causes a warning: render it with `RasterizeOptions.antialiased`.
 
     Args:
         path: The file, written by `write_ply` or by another program with the same layout.
@@ -377,31 +395,51 @@ def read_ply(path: str | os.PathLike[str], normalization: Normalization | None =
         opacities [N], spherical harmonics [N, K, 3] with K in {1, 4, 9, 16, 25}.
 
     Raises:
-        warpgs.DataError: The file is missing, malformed, truncated, or contains a NaN, another infinity or a rotation of
-            zero length; the message names the place.
+        warpgs.DataError: The file is missing, malformed, truncated or compressed, has no usable Gaussian, or is of warpgs and
+            has one that is not usable; the message names the place.
         warpgs.UsageError: The units are unknown, or scene units are requested without a normalization.
     """
     path = Path(path)
-    gaussians = _read(path, normalization, units)
+    notes: list[str] = []
+    gaussians = _read(path, normalization, units, False, notes)
     if is_antialiased(start_of(path)):
         warn_of_antialiasing(path)
+    for note in notes:
+        warnings.warn(note, stacklevel=2)
     return gaussians
 
 
-def _read(path: Path, normalization: Normalization | None, units: str) -> Gaussians:
-    """Return what `read_ply` does, without a warning."""
+def _read(path: Path, normalization: Normalization | None, units: str, strict: bool, notes: list[str]) -> Gaussians:
+    """Return what `read_ply` does, with notes instead of warnings."""
     normalization = checked_normalization(normalization, units, str(path))
     with reading(path) as file:
         size = os.fstat(file.fileno()).st_size
-        elements, start = parse_header(path, file.read(MAX_HEADER_BYTES))
-        (_, n, properties), start = _locate_vertices(path, elements, start)
+        head = file.read(MAX_HEADER_BYTES)
+        elements, start = parse_header(path, head)
+        file.seek(start)
+        text, own = ASCII.search(head[:start]), is_own(head[:start])
+        vertex, start = _locate_vertices(path, elements, start)
+        _, n, properties = vertex
         rest = _check_properties(path, [name for name, _ in properties])
         dtype = np.dtype(properties)
-        end = start + n * dtype.itemsize
+        width = 2 * len(properties) if text else dtype.itemsize  # a number of one digit and a space
+        end = file.tell() + n * width - 1 if text else start + n * width
         if end > size:
-            needed = f"{n} Gaussians of {dtype.itemsize} bytes end at byte {end}"
+            needed = f"{n} Gaussians of {width} bytes end at byte {end}"
             raise ply_error(path, f"truncated: {needed}, but the file has {size} bytes")
-        file.seek(start)
+        lines = (line.decode("ascii", "replace") for line in file if line.strip())
+        if text:
+            before = sum(count for _, count, _ in elements[: elements.index(vertex)])
+            next(itertools.islice(lines, before, before), None)
+        else:
+            file.seek(start)
+
+        def numbers(part: slice) -> np.ndarray:
+            found = list(itertools.islice(lines, part.stop - part.start))
+            values = np.loadtxt(found, ndmin=2, comments=None) if found else np.empty((0, len(properties)))
+            if values.shape != (part.stop - part.start, len(properties)):
+                raise ply_error(path, f"Gaussians {part.start} to {part.stop - 1} are not rows of {len(properties)} numbers")
+            return values.view([(name, "f8") for name, _ in properties])[:, 0]
 
         def rows(part: slice) -> np.ndarray:
             found = np.fromfile(file, dtype=dtype, count=part.stop - part.start)
@@ -409,7 +447,7 @@ def _read(path: Path, normalization: Normalization | None, units: str) -> Gaussi
                 raise ply_error(path, f"truncated: {n} Gaussians announced, {part.start + len(found)} read")
             return found
 
-        gaussians = _assemble(path, rows, n, rest)
+        gaussians = _assemble(path, numbers if text else rows, n, rest, strict or own, notes)
     return convert_gaussians(gaussians, normalization, "file", units)
 
 
@@ -460,6 +498,8 @@ def _check_properties(path: Path, names: list[str]) -> int:
         raise ply_error(path, f"it has {rest} f_rest properties, but degrees 0 to 4 have 0, 9, 24, 45 or 72")
     # Normals are unused, and some tools leave them out.
     missing = sorted(set(_names(rest)) - set(names) - {"nx", "ny", "nz"})
+    if "packed_position" in names:
+        raise DataError(f"{path}: is a compressed PLY file, which read_ply does not read; use warpgs.export.read_gaussians")
     if missing == ["scale_2"]:
         raise ply_error(path, "its Gaussians are flat (2DGS, no scale_2), which is not supported")
     if missing:
@@ -467,17 +507,19 @@ def _check_properties(path: Path, names: list[str]) -> int:
     return rest
 
 
-def _assemble(path: Path, read: Callable[[slice], np.ndarray], n: int, rest: int) -> Gaussians:
-    """Return N Gaussians from structured rows, which are read in their order; DataError where a value cannot be used."""
-    import torch
-
+def _assemble(
+    path: Path, read: Callable[[slice], np.ndarray], n: int, rest: int, strict: bool, notes: list[str]
+) -> Gaussians:  # fmt: skip
+    """Return the Gaussians of N structured rows, which are read in their order; see `usable`."""
     k = rest // 3
     shapes = {"means": (3,), "quats": (4,), "log_scales": (3,), "logit_opacities": (), "sh": (1 + k, 3)}
     arrays = {name: np.empty((n, *shape), np.float32) for name, shape in shapes.items()}
+    bad = np.zeros(n, bool)
+    reasons: list[str] = []
     for part in parts(n):
         rows = read(part)
 
-        columns = functools.partial(_columns, path, rows, part.start)
+        columns = functools.partial(_columns, rows, part.start, bad[part], reasons)
         arrays["sh"][part, 0] = columns(_DC)
         if rest:
             above = columns([f"f_rest_{i}" for i in range(rest)])
@@ -485,30 +527,33 @@ def _assemble(path: Path, read: Callable[[slice], np.ndarray], n: int, rest: int
         quats = arrays["quats"][part] = columns(_ROTATION)
         zero = ~quats.any(axis=1)
         if zero.any():
-            raise ply_error(path, f"the rotation of Gaussian {part.start + int(np.argmax(zero))} has zero length")
+            reasons.append(f"the rotation of Gaussian {part.start + int(np.argmax(zero))} has zero length")
+            bad[part] |= zero
         arrays["means"][part] = columns(_POSITION)
         arrays["log_scales"][part] = columns(_SCALE, least=FLAT)
         arrays["logit_opacities"][part] = columns(["opacity"], -OPAQUE, OPAQUE)[:, 0]
-    return Gaussians(**{name: torch.from_numpy(array) for name, array in arrays.items()})
+    return usable(path, arrays, bad, next(iter(reasons), ""), lambda: strict, notes, ply_error)
 
 
 def _columns(
-    path: Path, rows: np.ndarray, first: int, names: list[str] | tuple[str, ...], least: float = -np.inf, most: float = np.inf
-) -> np.ndarray:
+    rows: np.ndarray, first: int, bad: np.ndarray, reasons: list[str], names: Sequence[str], least: float = -np.inf,
+    most: float = np.inf,
+) -> np.ndarray:  # fmt: skip
     """Return columns of structured rows, float32 [N, C]; infinities become ``least`` and ``most``.
 
-    ``first`` is the number of the first row, for messages.
+    Rows with other numbers are marked as ``bad`` [N], with a reason, in which ``first`` is the number of the first row.
     """
     out = np.empty((len(rows), len(names)), np.float32)
-    # A double beyond float32 becomes an infinity, and the check below names it.
+    # A double beyond float32 becomes an infinity, and the check below finds it.
     with np.errstate(over="ignore", invalid="ignore"):
         for i, name in enumerate(names):
             out[:, i] = rows[name]
     out[out == -np.inf], out[out == np.inf] = least, most
-    bad = ~np.isfinite(out)
-    if bad.any():
-        row, column = np.argwhere(bad)[0]
-        raise ply_error(path, f"{names[column]} of Gaussian {first + row} is not finite in float32")
+    finite = np.isfinite(out)
+    if not finite.all():
+        row, column = np.argwhere(~finite)[0]
+        reasons.append(f"{names[column]} of Gaussian {first + row} is not finite in float32")
+        bad |= ~finite.all(axis=1)
     return out
 
 
@@ -529,8 +574,13 @@ class PLY(Format):
     def read(self, path: Path, normalization: Normalization | None, units: str) -> Gaussians:
         """Read Gaussians with `read_ply`, or with `CompressedPLY` if the header announces that format."""
         if is_compressed(path, start_of(path)):
-            return CompressedPLY().read(path, normalization, units)
-        return _read(path, normalization, units)
+            packed = CompressedPLY()
+            packed.strict = self.strict
+            gaussians = packed.read(path, normalization, units)
+            self.notes = packed.notes
+            return gaussians
+        self.notes = []
+        return _read(path, normalization, units, self.strict, self.notes)
 
     def is_antialiased(self, path: Path) -> bool:
         """Return whether the header declares antialiasing."""

@@ -342,5 +342,13 @@ class SOG(Format):
 
     def is_antialiased(self, path: Path) -> bool:
         """Return whether meta.json declares antialiasing."""
+        return self._meta_of(path).get("model") == "antialiased"
+
+    def is_own(self, path: Path) -> bool:
+        """Return whether meta.json names warpgs."""
+        return bool(self._meta_of(path).get("asset") == {"generator": "warpgs"})
+
+    def _meta_of(self, path: Path) -> dict[str, Any]:
+        """Return meta.json of a file."""
         with reading(path) as file, zipfile.ZipFile(file) as archive:
-            return _meta(path, archive).get("model") == "antialiased"
+            return _meta(path, archive)

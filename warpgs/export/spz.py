@@ -21,7 +21,6 @@ import numpy as np
 
 from warpgs.errors import DataError, UsageError, install_extras
 from warpgs.export.base import (
-    SH_SIZES,
     SQRT2,
     Arrays,
     Format,
@@ -37,6 +36,7 @@ from warpgs.export.base import (
     rounded,
     sigmoid,
     smallest_three,
+    transform_in_place,
     unit_quats,
 )
 
@@ -50,6 +50,12 @@ MAGIC = 0x5053474E
 HEADER, HEADER_4 = struct.Struct("<IIIBBBB"), struct.Struct("<IIIBBBBI12x")
 COLOR = 0.15 * 255
 MAX_FRACTIONAL_BITS = 24
+ANTIALIASED, EXTENDED = 1, 2
+"""Flags of the header."""
+COORDINATE_SYSTEM, RUB = 0xADBE0003, 4
+"""Type of the extension that names the axes, and the number of its default."""
+MAX_EXTENSIONS = 65536
+"""Largest size of the extensions [bytes]; real ones have some ten."""
 MAX_WINDOW = 2**26
 """Largest window of a zstd stream [bytes]."""
 MAX_RATIO, SMALL = 32, 65536
@@ -121,19 +127,49 @@ def decode(path: Path, data: bytes) -> Arrays:
         head = _inflated(path, stream, HEADER.size)
         if len(head) < HEADER.size:
             raise malformed(path, "its header is truncated")
-        magic, version, n, degree, bits, _, _ = HEADER.unpack(head)
+        magic, version, n, degree, bits, flags, _ = HEADER.unpack(head)
         sizes = _checked(path, len(data), (magic, version, n, degree, bits), (2, 3))
-        sections = _parts_of_gzip(path, stream, n, sizes)
+        extensions = bytearray()
+        sections = _parts_of_gzip(path, stream, n, sizes, extensions if flags & EXTENDED else None)
     else:
         if len(data) < HEADER_4.size:
             raise malformed(path, "its header is truncated")
-        magic, version, n, degree, bits, _, count, place = HEADER_4.unpack_from(data)
+        magic, version, n, degree, bits, flags, count, place = HEADER_4.unpack_from(data)
         sizes = _checked(path, len(data), (magic, version, n, degree, bits), (4,))
+        extensions = bytearray(data[HEADER_4.size : place] if flags & EXTENDED else b"")
         sections = _streams(path, data, sizes, count, place)
     arrays = _unpack(sections, n, degree, bits, version)
     next(sections, None)  # checks the end of the last section
-    half_turn_in_place(arrays, "x")
+    if (system := _coordinate_system(path, extensions)) == RUB:
+        half_turn_in_place(arrays, "x")
+    else:
+        transform_in_place(arrays, to_ply(system), np.zeros(3))
     return arrays
+
+
+def to_ply(system: int) -> np.ndarray:
+    """Return the matrix [3, 3] from one of the 16 coordinate systems to the axes of PLY, as Niantic's library has it.
+
+    The bits of the number less 1 are right, up and front. From 9 on, the library then turns by a quarter about x, so that its
+    names of 9 and 10 (front, down) and of 15 and 16 (back, up) are those of each other's axes; files follow the library.
+    """
+    bits = system - 1
+    signs = np.diag([1.0 if bits & 1 else -1.0, -1.0 if bits & 2 else 1.0, 1.0 if bits & 4 else -1.0])
+    return signs[[0, 2, 1]] * [[1], [1], [-1]] if bits & 8 else signs
+
+
+def _coordinate_system(path: Path, extensions: bytes | bytearray) -> int:
+    """Return the number of the coordinate system that the extensions name; others are skipped, as is a truncated end."""
+    at = 0
+    while at + 8 <= len(extensions):
+        kind, size = struct.unpack_from("<II", extensions, at)
+        at += 8 + size
+        if kind == COORDINATE_SYSTEM and size >= 4 and at <= len(extensions):
+            system = int.from_bytes(extensions[at - size : at - size + 4], "little")
+            if system > 16:
+                raise malformed(path, f"its coordinate system {system} is unknown (known: 1 to 16)")
+            return system or RUB
+    return RUB
 
 
 def _inflated(path: Path, stream: gzip.GzipFile, size: int) -> bytes:
@@ -146,8 +182,10 @@ def _inflated(path: Path, stream: gzip.GzipFile, size: int) -> bytes:
         raise malformed(path, f"its compressed content is damaged ({str(e)[:80]})") from e
 
 
-def _parts_of_gzip(path: Path, stream: gzip.GzipFile, n: int, sizes: list[int]) -> Iterator[Section]:
-    """Yield the sections of a file of version 2 or 3, each to be read to its end before the next."""
+def _parts_of_gzip(
+    path: Path, stream: gzip.GzipFile, n: int, sizes: list[int], extensions: bytearray | None
+) -> Iterator[Section]:  # fmt: skip
+    """Yield the sections of a file of version 2 or 3, each to be read to its end before the next; then fill ``extensions``."""
 
     def read(size: int) -> bytes:
         data = _inflated(path, stream, size)
@@ -158,6 +196,8 @@ def _parts_of_gzip(path: Path, stream: gzip.GzipFile, n: int, sizes: list[int]) 
     for _ in sizes:
         yield read
     try:
+        if extensions is not None:
+            extensions += stream.read(MAX_EXTENSIONS)
         more = stream.read(1)  # at its end the checksum has been compared
     except (EOFError, OSError, zlib.error) as e:
         raise malformed(path, f"its compressed content is damaged ({str(e)[:80]}), or its end is cut off") from e
@@ -172,11 +212,11 @@ def _checked(path: Path, size: int, header: tuple[int, ...], versions: tuple[int
         raise malformed(path, "it does not start with the SPZ signature")
     if version not in versions:
         raise malformed(path, f"version {version} is not supported here (supported: {', '.join(map(str, versions))})")
-    if degree > 3:
-        raise malformed(path, f"harmonics of degree {degree} are not supported (supported: 0 to 3)")
+    if degree > 4:
+        raise malformed(path, f"harmonics of degree {degree} are not supported (supported: 0 to 4)")
     if bits > MAX_FRACTIONAL_BITS:
         raise malformed(path, f"its coordinates have {bits} fractional bits, more than {MAX_FRACTIONAL_BITS}")
-    sizes = [9 * n, n, 3 * n, 3 * n, (3 if version == 2 else 4) * n, 3 * (SH_SIZES[degree] - 1) * n]
+    sizes = [9 * n, n, 3 * n, 3 * n, (3 if version == 2 else 4) * n, 3 * degree * (degree + 2) * n]
     if sum(sizes) > MAX_RATIO * size + SMALL:
         raise malformed(path, f"it announces {n} Gaussians in only {size} bytes")
     return sizes
@@ -225,7 +265,7 @@ def _unpack(sections: Iterator[Section], n: int, degree: int, bits: int, version
 
     means = take(9, (3,), lambda data: _fixed(data) / 2.0**bits)
     opacities = take(1, (), lambda data: logits(data[:, 0] / 255, 1 / 255))
-    k = SH_SIZES[degree] - 1
+    k = degree * (degree + 2)
     read, sh = next(sections), np.empty((n, k + 1, 3), np.float32)
     for p in parts(n):
         sh[p, 0] = (np.frombuffer(read((p.stop - p.start) * 3), "u1").reshape(-1, 3) - 127.5) / COLOR
@@ -285,6 +325,7 @@ class SPZ(Format):
     Config = SPZConfig
     sorted = True
     declares = True
+    max_degree = 4
     note = (
         "SPZ files have y up, as Niantic defines it. SuperSplat, splat-transform 3, gsply and gaussforge take y as down, so "
         "models appear upside down: for files to or from these programs, pass --rotate 1,0,0,180"
@@ -301,4 +342,4 @@ class SPZ(Format):
             packed = file.read(2) == b"\x1f\x8b"
             file.seek(0)
             head = _inflated(path, gzip.GzipFile(fileobj=file), HEADER.size) if packed else file.read(HEADER.size)
-            return bool(HEADER.unpack(head)[5] & 1)
+            return bool(HEADER.unpack(head)[5] & ANTIALIASED)

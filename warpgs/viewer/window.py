@@ -92,7 +92,9 @@ def views_of(content: Content, reader: str | None = None) -> tuple[dict[str, Vie
 
 def content_of_file(path: Path, device: str = "cpu") -> Content:
     """Read a file of Gaussians of any format; it is centred and scaled for the viewer."""
-    stored, antialiased = read_with_antialiasing(path, None, "file")
+    stored, antialiased, notes = read_with_antialiasing(path, None, "file")
+    for note in notes:
+        say(f"  {note}")
     if not len(stored):
         raise DataError(f"{path}: contains no Gaussians; export the model again")
     means = stored.means.double().numpy()

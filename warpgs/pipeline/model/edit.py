@@ -17,7 +17,7 @@ from warpgs.errors import DataError, UsageError
 from warpgs.files import read_input, unread_reason
 from warpgs.geometry import matmul, quaternions, rotation_matrices
 from warpgs.kernels.neighbours import morton_codes
-from warpgs.kernels.sh import MAX_DEGREE, basis
+from warpgs.kernels.sh import MAX_DEGREE
 from warpgs.pipeline.model.limits import NEEDLE, ROUNDING, long_axes
 from warpgs.pipeline.model.table import truncated
 from warpgs.render.options import RasterizeOptions
@@ -157,10 +157,6 @@ hairs and edges of a good model. With a tenth instead, removal costs up to 0.08 
 (docs/decisions/014-formats.md)."""
 MAX_BOX_BYTES = 65536
 """Largest size of a file that describes a box [bytes]."""
-_NODES = ((0.0, 0.5688888888888889), (0.5384693101056831, 0.47862867049936647), (0.906179845938664, 0.23692688505618908))
-"""Nodes and weights of the Gauss-Legendre rule with five points, the last two also mirrored: exact to degree 9."""
-_AZIMUTHS = 10
-"""Number of azimuths of the quadrature rule, exact to order 9; products of harmonics of degree 4 have degree 8."""
 
 
 Box = tuple[np.ndarray, np.ndarray, np.ndarray]
@@ -252,36 +248,6 @@ def limit_degree(gaussians: Gaussians, degree: int) -> Gaussians:
     if not 0 <= degree <= MAX_DEGREE:
         raise UsageError(f"--sh-degree {degree}: harmonics have degrees 0 to {MAX_DEGREE}")
     return replace(gaussians, sh=gaussians.sh[:, : (degree + 1) ** 2].contiguous())
-
-
-def harmonics_rotation(rotation: np.ndarray) -> torch.Tensor:
-    """Return the matrix [25, 25] (float64) that rotates coefficients with the scene: Wigner's D for degrees 0 to 4, real.
-
-    Entry (j, k) is the integral over the sphere of Y_j(d) Y_k(R^T d), exact by a product rule of 50 points.
-    """
-    points, weights = [], []
-    for z, weight in [*_NODES, *((-z, w) for z, w in _NODES[1:])]:
-        for i in range(_AZIMUTHS):
-            angle, radius = 2 * math.pi * i / _AZIMUTHS, math.sqrt(1 - z * z)
-            points.append([radius * math.cos(angle), radius * math.sin(angle), z])
-            weights.append(weight * 2 * math.pi / _AZIMUTHS)
-    d = np.array(points)
-    here, there = (basis(torch.from_numpy(p)).numpy() for p in (d, matmul(d, np.asarray(rotation, np.float64))))
-    return torch.from_numpy(np.einsum("i,ij,ik->jk", np.array(weights), here, there))
-
-
-def rotate(gaussians: Gaussians, rotation: np.ndarray) -> Gaussians:
-    """Return Gaussians rotated about the origin by [3, 3]: means, shapes and the directions that colours depend on."""
-    means, quats, k = gaussians.means, gaussians.quats, gaussians.sh.shape[1]
-    turn = torch.tensor(np.asarray(rotation), dtype=torch.float64, device=means.device)
-    harmonics = harmonics_rotation(rotation).to(means.device)[:k, :k]
-    axes = torch.as_tensor(rotation_matrices(torch.nn.functional.normalize(quats.double(), dim=1)))
-    return replace(
-        gaussians,
-        means=torch.einsum("ij,nj->ni", turn, means.double()).to(means.dtype),
-        quats=quaternions(torch.einsum("ij,njk->nik", turn, axes)).to(quats.dtype),
-        sh=torch.einsum("jk,nkc->njc", harmonics, gaussians.sh.double()).to(gaussians.sh.dtype),
-    )
 
 
 def rotation_about(axis: np.ndarray, angle: float) -> np.ndarray:

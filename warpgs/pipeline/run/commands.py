@@ -85,7 +85,8 @@ def open_file(
             )
     # the unit stays that of the file, since the near plane of a rule is in that unit
     normalization = Normalization(np.mean([c.center for c in found.values()], axis=0))
-    gaussians, declared = read_with_antialiasing(path, normalization, "scene")
+    gaussians, declared, lost = read_with_antialiasing(path, normalization, "scene")
+    notes += lost
     if note := format_of(path).note:
         notes.append(note)
     if declared:

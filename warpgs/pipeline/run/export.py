@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import shlex
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -15,7 +15,7 @@ from warpgs.device import format_bytes
 from warpgs.errors import DataError, UsageError
 from warpgs.export.base import Format, find_format, format_of, read_with_antialiasing, write_gaussians
 from warpgs.export.meshes_and_cameras import check_suffix, holds_cameras, write_cameras, write_mesh
-from warpgs.geometry import convert_gaussians, convert_mesh, matmul
+from warpgs.geometry import convert_gaussians, convert_mesh, matmul, rotate
 from warpgs.io.transforms import read_cameras
 from warpgs.kernels.neighbours import morton_codes
 from warpgs.locks import hold_file
@@ -29,13 +29,12 @@ from warpgs.pipeline.model.edit import (
     inside,
     levelling,
     limit_degree,
-    rotate,
     rotation_about,
     select,
 )
 from warpgs.pipeline.run.folder import CONFIG, StoredRun, open_run
 from warpgs.pipeline.run.request import choose_device
-from warpgs.scene import Camera, Gaussians
+from warpgs.scene import Camera, Gaussians, base_colors
 
 
 @dataclass(frozen=True)
@@ -130,6 +129,8 @@ def rotate_camera(camera: Camera, rotation: np.ndarray) -> Camera:
     return replace(camera, viewmat=viewmat)
 
 
+MAX_POINTS = 100_000
+"""Largest number of points that COLMAP's files get: as many as a reconstruction of some hundred photographs."""
 ROUNDING = 1e-4
 """Smallest change of a log scale that is reported: a hundredth of a percent."""
 
@@ -141,7 +142,7 @@ def convert(
     if holds_cameras(target):
         _check_for_cameras(filters, formats)
         found, notes = read_cameras(source)
-        return [*notes, *_cameras_written(list(found.values()), list(found.values()), target, filters)]
+        return [*notes, *_cameras_written(found, list(found.values()), target, filters)]
     given = [find_format(f) for f in formats]
     for unused in (f for f in given if not (f.fits(source) or f.fits(target))):
         format_of(target, unused)  # says that its name is another
@@ -151,19 +152,23 @@ def convert(
         )
     read, kind = (format_of(p, next((f for f in given if f.fits(p)), None)) for p in (source, target))
     rotation_of(filters.rotate, None)  # before anything is read
-    gaussians, antialiased = read_with_antialiasing(source, None, "file", read)
-    lines = _written(gaussians, None, target, kind, filters, antialiased)
+    gaussians, antialiased, notes = read_with_antialiasing(source, None, "file", read)
+    lines = [*notes, *_written(gaussians, None, target, kind, filters, antialiased)]
     return [read.note, *lines] if read.note and not kind.note else lines
 
 
 def export(
-    folder: Path, target: Path, filters: Filters = NO_FILTERS, format: str | type[Format] | Format | None = None
-) -> list[str]:
+    folder: Path, target: Path, filters: Filters = NO_FILTERS, format: str | type[Format] | Format | None = None,
+    keep_names: bool = False,
+) -> list[str]:  # fmt: skip
     """Write a run's Gaussians, or its cameras, in file units, in the format of the suffix; returns lines for the user."""
     if holds_cameras(target):
         _check_for_cameras(filters, () if format is None else (format,))
         stored = open_run(folder, torch.device("cpu"))
-        return _cameras_written(list(stored.cameras("file").values()), training_cameras(stored), target, filters)
+        level = training_cameras(stored)
+        return _cameras_written(stored.cameras("file"), level, target, filters, keep_names, file_gaussians(stored))
+    if keep_names:
+        raise UsageError(f"{target}: --keep-names requires cameras; name the file cameras.json, transforms.json or sparse")
     kind = format_of(target, format)
     stored = open_run(folder, torch.device("cpu"))
     return _written(file_gaussians(stored), stored, target, kind, filters, stored.antialiased)
@@ -193,7 +198,7 @@ def _written(
     with hold_file(target) as notes:
         write_gaussians(target, gaussians, units="file", format=kind, antialiased=antialiased)
     if type(kind).decode is not Format.decode:  # the rounding errors, measured on the file
-        back, _ = read_with_antialiasing(target, None, "file", kind)
+        back, *_ = read_with_antialiasing(target, None, "file", kind)
         moved = float((back.means.double() - gaussians.means.double()).abs().max())
         scales = (back.log_scales.double() - gaussians.log_scales.double()).abs().amax(1)
         other = int((scales > 0.1).sum())
@@ -212,17 +217,34 @@ def _check_for_cameras(filters: Filters, formats: Sequence[object]) -> None:
         raise UsageError("--crop, --clean and --sh-degree do not apply to cameras; use --rotate only")
 
 
-def _cameras_written(cameras: list[Camera], level: list[Camera], target: Path, filters: Filters) -> list[str]:
-    """Rotate cameras in file units, and write them; ``level`` are the cameras that define up. Returns lines for the user."""
-    rotation, lines = rotation_of(filters.rotate, level), []
+def _cameras_written(
+    named: Mapping[str, Camera], level: list[Camera], target: Path, filters: Filters, keep_names: bool = False,
+    gaussians: Gaussians | None = None,
+) -> list[str]:  # fmt: skip
+    """Rotate cameras in file units, and write them; ``level`` are the cameras that define up. Returns lines for the user.
+
+    The most opaque of the Gaussians become COLMAP's points.
+    """
+    rotation, lines, points, cameras = rotation_of(filters.rotate, level), [], None, list(named.values())
     if rotation is not None:
         cameras = [rotate_camera(c, rotation) for c in cameras]
         lines.append(turned_line(rotation))
+    if gaussians is not None and target.name == "sparse":
+        shown = gaussians.logit_opacities.argsort(descending=True, stable=True)[:MAX_POINTS]
+        turned = gaussians if rotation is None else rotate(gaussians, rotation)
+        points = turned.means[shown].numpy(), base_colors(gaussians.sh[shown]).numpy()
+        lines.append(
+            f"points3D.txt has the positions and colours of {len(shown):,} Gaussians, for trainers that start from points"
+        )
     with hold_file(target) as notes:
-        lines += write_cameras(target, cameras)
+        lines += write_cameras(target, cameras, list(named) if keep_names else None, points)
     sizes = sorted({(c.width, c.height) for c in cameras})
     some = ", ".join(f"{w} x {h}" for w, h in sizes[:3]) + (" ..." if len(sizes) > 3 else "")
-    return [*notes, *lines, f"{len(cameras):,} cameras for images of {some} px in {target}; their names are numbers"]
+    return [
+        *notes,
+        *lines,
+        f"{len(cameras):,} cameras for images of {some} px in {target}; their names are {'kept' if keep_names else 'numbers'}",
+    ]
 
 
 def mesh(
