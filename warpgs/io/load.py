@@ -16,6 +16,7 @@ import numpy as np
 from warpgs.errors import DataError, UsageError, similar_folder
 from warpgs.geometry import camera_extent, matmul
 from warpgs.io.folder import (
+    Probe,
     Reader,
     SceneFolder,
     all_readers,
@@ -27,6 +28,7 @@ from warpgs.io.folder import (
 from warpgs.io.image_files import MAX_PIXELS, READ, unread_note
 from warpgs.io.images import ReadOptions, SceneOptions, cut_from_black, image_scale, list_images
 from warpgs.io.maps import check_found
+from warpgs.plugins import returned
 from warpgs.scene import Normalization, PointCloud, Scene, View, checked_scene
 
 MIN_EXTENT = 1e-9
@@ -487,7 +489,7 @@ def _check_folder(root: Path) -> None:
 
 def _accepted(root: Path, reader: Reader) -> Reader:
     """Return a reader that the user chose; DataError where its format is not in the folder or not complete."""
-    probe = reader.probe(root)
+    probe = returned(reader, "probe", reader.probe(root), (Probe, type(None)), "a Probe, or None")
     if probe is None:
         others = [p.found for r in all_readers() if (p := r.probe(root)) is not None]
         there = f"; the folder holds {' and '.join(others)}" if others else ""
@@ -501,9 +503,7 @@ def _accepted(root: Path, reader: Reader) -> Reader:
 def _finished(root: Path, reader: Reader, scene: Scene, notes: list[str], options: ReadOptions) -> Scene:
     """Check a scene that a reader returned; return it sorted, in scene coordinates, with score masks and fingerprint."""
     own = f"the reader {reader.name} must return a Scene in file coordinates, without a Normalization; fix it"
-    if not isinstance(scene, Scene):
-        raise UsageError(own)
-    scene = checked_scene(scene, f"{root}, ")
+    scene = checked_scene(returned(reader, "read", scene, Scene, "a Scene"), f"{root}, ")
     if scene.normalization.scale != 1 or scene.normalization.offset.any():
         raise UsageError(own)
     views, points, more = list(scene.views), scene.points, scene.notes

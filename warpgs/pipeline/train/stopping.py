@@ -13,7 +13,7 @@ from warpgs import schema
 from warpgs.errors import DataError
 from warpgs.pipeline.metrics.scores import psnr_of
 from warpgs.pipeline.model.table import DensityUpdate
-from warpgs.pipeline.train.strategies.base import Strategy, StrategyContext
+from warpgs.pipeline.train.strategies.base import Strategy, StrategyContext, changes_of
 from warpgs.pipeline.train.views import TrainingView
 from warpgs.process import Detail
 from warpgs.render.options import RasterizeOptions
@@ -228,9 +228,9 @@ class Stopping:
             if step < ends:
                 context.phases = context.phases.stable_from(step, ends)
             held = [masked(v, b, inside=True) for v, b in zip(self.whole, self.blocks)]
-            yield from strategy.catch_up(step, held, self.held_pixels)
+            yield from changes_of(strategy, "catch_up", strategy.catch_up(step, held, self.held_pixels))
         if self.ended is None and strategy.due(step):
-            yield from strategy.update(step)
+            yield from changes_of(strategy, "update", strategy.update(step))
 
     def _measured(self, step: int, strategy: Strategy, context: StrategyContext, degree: int) -> bool:
         """Measure the blocks if the set changed since the previous mark, and at the last mark; return whether growth ends."""
