@@ -232,7 +232,8 @@ def evaluate(
     """
     views, unknown = checked_views(views), False
     if not isinstance(gaussians, Gaussians):
-        gaussians, options = gaussians.gaussians(), gaussians.options() if options is None else options
+        options = gaussians.options() if options is None else options
+        gaussians = gaussians.gaussians()
     elif options is None:
         options, unknown = RasterizeOptions(), True
     scores, behind = [], 0.0

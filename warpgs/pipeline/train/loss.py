@@ -128,10 +128,11 @@ def term_values(terms: Sequence[LossTerm], inputs: LossInputs) -> list[torch.Ten
     A term of a user's own whose value is constant, but not 0, has no effect, and raises UsageError.
     """
     values = []
+    trained = torch.is_grad_enabled() and any(t.requires_grad for t in inputs.outputs.values())
     for term in terms:
         value = term(replace(inputs, outputs=_Outputs(term, inputs.outputs)))
         values.append(returned(term, "__call__", value, torch.Tensor, "a tensor of shape []", shape=()))
-        if value.requires_grad or not torch.is_grad_enabled() or is_ours(type(term)):
+        if value.requires_grad or is_ours(type(term)) or not trained:
             continue
         if not (value.is_cuda and torch.cuda.is_current_stream_capturing()) and bool(value != 0):
             raise UsageError(

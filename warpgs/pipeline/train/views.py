@@ -55,13 +55,13 @@ class LearnedViews:
         for module in modules:
             own, what = module.parameters(views), "tensors [V, ...] by name, with a row for each training view"
             returned(module, "parameters", own, Mapping, what, each=torch.Tensor, shape=(len(views),))
-            rates = {n: module.lrs(0.0, 1.0).get(n) for n in own}
-            returned(module, "lrs", rates, Mapping, "a rate for each of its parameters, by name", each=(int, float))
             for name in own.keys() & first.keys():
                 other = next(m.name for m, names in zip(modules, self._names) if name in names)
                 raise UsageError(
                     f"the view modules {other!r} and {module.name!r} both have a parameter {name!r}; rename it in one of them"
                 )
+            rates = returned(module, "lrs", module.lrs(0.0, 1.0), Mapping, what := "a rate for each parameter, by name")
+            returned(module, "lrs", {n: rates.get(n) for n in own}, Mapping, what, each=(int, float))
             first |= {n: t.to(device, torch.float32) for n, t in own.items()}
             self._names.append(tuple(own))
         self.table = Table(first, {}, device, len(views))
