@@ -314,9 +314,11 @@ ARRAYS = {n: t.numpy() for n, t in three_gaussians().tensors().items()}
 
 @pytest.mark.parametrize(
     "method, found",
-    [("encode", None), ("encode", "text"), ("encode", [1]), ("decode", None), ("decode", {}), ("decode", {"means": ARRAYS["means"]}),
-     ("decode", ARRAYS | {"sh": [1]}), ("decode", ARRAYS | {"other": ARRAYS["sh"]})],
-)  # fmt: skip
+    [
+        *(("encode", v) for v in (None, "text", [1])),
+        *(("decode", v) for v in (None, {}, ARRAYS | {"sh": [1]}, ARRAYS | {"other": ARRAYS["sh"]})),
+    ],
+)
 def test_a_wrong_result_of_a_format_is_named(method, found, tmp_path):
     """Its bytes, and its five arrays; a file that could not be encoded is not written."""
     own = type("Own", (Format,), {"suffix": ".own", "encode": always([b"x"]), "decode": always(ARRAYS), method: always(found)})

@@ -215,7 +215,7 @@ def returned(
     elif wanted is not None and size != wanted:
         wrong = f"shape {list(size)}"
     if wrong:
-        raise UsageError(f"{type(plugin).__qualname__}.{method} must return {what}; it returned {wrong}. Correct the class")
+        raise UsageError(f"{type(plugin).__name__}.{method} must return {what}; it returned {wrong}. Correct the class")
     return value
 
 

@@ -459,7 +459,7 @@ def read_folder(
 def detect(root: Path) -> tuple[Reader, list[str]]:
     """Return the reader of the first complete format of a scene folder, and notes on the formats passed over."""
     readers = all_readers()
-    found = [(r, p) for r in readers if (p := r.probe(root)) is not None]
+    found = [(r, p) for r in readers if (p := _probe(r, root)) is not None]
     complete = [r for r, p in found if not p.missing]
     broken = [f"{p.found} lacks {p.missing}" for _, p in found if p.missing]
     if not complete and broken:
@@ -487,11 +487,17 @@ def _check_folder(root: Path) -> None:
         raise DataError(f"{root}: no such folder; {hint}")
 
 
+def _probe(reader: Reader, root: Path) -> Probe | None:
+    """Return what a reader finds in a folder."""
+    found: Probe | None = returned(reader, "probe", reader.probe(root), (Probe, type(None)), "a Probe, or None")
+    return found
+
+
 def _accepted(root: Path, reader: Reader) -> Reader:
     """Return a reader that the user chose; DataError where its format is not in the folder or not complete."""
-    probe = returned(reader, "probe", reader.probe(root), (Probe, type(None)), "a Probe, or None")
+    probe = _probe(reader, root)
     if probe is None:
-        others = [p.found for r in all_readers() if (p := r.probe(root)) is not None]
+        others = [p.found for r in all_readers() if (p := _probe(r, root)) is not None]
         there = f"; the folder holds {' and '.join(others)}" if others else ""
         wanted = f" ({reader.description})" if reader.description else ""
         raise DataError(f"{root}: the reader {reader.name} finds no scene of its format{wanted}{there}. Choose another reader")

@@ -447,7 +447,7 @@ def overwriting(context, rows, value=0.0):
 def test_an_update_that_damages_the_table_is_refused_by_name(make, message, device):
     """Whatever the strategy: the set keeps to its capacity, its rows are finite and come from rows that exist."""
     fit = Trainer(photos(2), seeds(), own_update(make), device)
-    with pytest.raises(UsageError, match=rf"^the strategy own_update\.<locals>\.Own, after step 2: .*{message}"):
+    with pytest.raises(UsageError, match=rf"^the strategy Own, after step 2: .*{message}"):
         advanced(fit)
     assert len(fit.table) == 60
     fit = Trainer(photos(2), seeds(), own_update(lambda c: grown(c, 40)), device)

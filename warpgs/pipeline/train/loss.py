@@ -136,7 +136,7 @@ def term_values(terms: Sequence[LossTerm], inputs: LossInputs) -> list[torch.Ten
             continue
         if not (value.is_cuda and torch.cuda.is_current_stream_capturing()) and bool(value != 0):
             raise UsageError(
-                f"the loss term {term.name!r} has no gradient, so it changes nothing: {type(term).__qualname__}.__call__ must "
+                f"the loss term {term.name!r} has no gradient, so it changes nothing: {type(term).__name__}.__call__ must "
                 "compute it from inputs.outputs, without detach(), item() or no_grad; return 0 in views where it does not apply"
             )
     return values

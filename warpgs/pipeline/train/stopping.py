@@ -13,8 +13,9 @@ from warpgs import schema
 from warpgs.errors import DataError
 from warpgs.pipeline.metrics.scores import psnr_of
 from warpgs.pipeline.model.table import DensityUpdate
-from warpgs.pipeline.train.strategies.base import Strategy, StrategyContext, changes_of
+from warpgs.pipeline.train.strategies.base import Growth, Strategy, StrategyContext, changes_of
 from warpgs.pipeline.train.views import TrainingView
+from warpgs.plugins import returned
 from warpgs.process import Detail
 from warpgs.render.options import RasterizeOptions
 from warpgs.render.rasterize import rasterize
@@ -182,7 +183,8 @@ class Stopping:
         """Choose the blocks and the times of measurements, and return notes; the first steps have views of half size."""
         if self.config.min_gain_db == 0:
             return []
-        planned, (begins, ends, times) = context.phases.planned, strategy.growth()
+        begins, ends, times = returned(strategy, "growth", strategy.growth(), Growth, "a Growth")
+        planned = context.phases.planned
         self.earliest = half_resolution * planned
         marks = {max(1, begins + round(k * (ends - begins) / MEASUREMENTS)) for k in range(MEASUREMENTS + 1)}
         if times:

@@ -394,7 +394,7 @@ class Trainer:
             try:
                 self.table.apply(change, self.context.capacity)
             except UsageError as e:
-                raise UsageError(f"the strategy {type(self.strategy).__qualname__}, after step {step}: {e}") from e
+                raise UsageError(f"the strategy {type(self.strategy).__name__}, after step {step}: {e}") from e
             self.count_changed()
         if stopping.ended == step:
             self.set_views(stopping.whole)
@@ -436,7 +436,10 @@ class Trainer:
 
     def state(self) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
         """Return tensors by name, of any shape [...], and plain values from which the fit continues with the same bits."""
-        (tensors, strategy), (errors, stopping) = self.strategy.state(), self.stopping.state()
+        own = returned(
+            self.strategy, "state", self.strategy.state(), tuple, "tensors by name, and plain values, two dictionaries"
+        )
+        (tensors, strategy), (errors, stopping) = own, self.stopping.state()
         views = {f"views.{n}": t for n, t in self.learned.table.state().items()}
         tensors = {**self.table.state(), **views, **self.mean.state(), **tensors, **errors}
         tensors["generator"] = self.generator.get_state()
