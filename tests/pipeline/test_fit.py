@@ -3,6 +3,7 @@
 import dataclasses
 import html
 import json
+import warnings
 
 import cv2
 import numpy as np
@@ -89,12 +90,16 @@ def test_a_result_is_scored_over_the_background_of_its_fit(folder, recwarn):
     scored = warpgs.evaluate(result, views)
     assert summarize(scored)["psnr"] == result.metrics["test"]["psnr"] and not recwarn.list
     assert warpgs.evaluate(result, views, warpgs.RasterizeOptions()) != scored
-    with pytest.warns(UserWarning, match="of a view shows the background, taken as black. Give the result of the fit") as told:
+    with pytest.warns(UserWarning, match="of view .* shows the background, taken as black; give the result of the fit") as told:
         assert warpgs.evaluate(result.gaussians(), views) != scored
     assert told[0].filename == __file__
-    cut_out = [dataclasses.replace(v, alpha=np.ones(v.image.shape[:2], np.float32)) for v in views]
-    warpgs.evaluate(result.gaussians(), cut_out)  # its colours know their background
     assert len(told) == 1
+    alpha = np.pad(np.ones((20, 20), np.float32), ((6, 6), (10, 10)))
+    for color, count in (1.0, 0), (0.0, 1):
+        cut_out = [dataclasses.replace(v, alpha=alpha, image=np.where(alpha[..., None] > 0, v.image, color)) for v in views]
+        with warnings.catch_warnings(record=True) as said:
+            warpgs.evaluate(result, cut_out)
+        assert ["is over another background than the render" in str(w.message) for w in said] == [True] * count
 
 
 @pytest.mark.parametrize("mode", [torch.no_grad, torch.inference_mode])

@@ -230,26 +230,36 @@ def evaluate(
     Raises:
         DataError: A field of a view is invalid; the message names the view, the field and the fix.
     """
-    views, unknown = checked_views(views), False
+    views, known = checked_views(views), options is not None or not isinstance(gaussians, Gaussians)
     if not isinstance(gaussians, Gaussians):
         options = gaussians.options() if options is None else options
         gaussians = gaussians.gaussians()
-    elif options is None:
-        options, unknown = RasterizeOptions(), True
-    scores, behind = [], 0.0
+    options = RasterizeOptions() if options is None else options
+    scores, doubts = [], []
     for v in views:
         image, _, alpha = render_view(gaussians, v, options)
         scores.append(score(v, image, lpips, alpha))
-        region, name = scored_region(v)
-        if v.alpha is None and name != "foreground":
-            behind = max(behind, float(1 - (alpha if region is None else alpha[region]).mean()))
-    if unknown and behind > NOTICED:
-        warnings.warn(
-            f"evaluate: {behind:.1%} of a view shows the background, taken as black. Give the result of the fit instead of its "
-            "Gaussians, or options with the background of the fit",
-            stacklevel=2,
-        )
+        doubts += _doubts(v, alpha, options, known)
+    if doubts:
+        warnings.warn(f"evaluate: {doubts[0]}", stacklevel=2)
     return scores
+
+
+def _doubts(view: View, alpha: np.ndarray, options: RasterizeOptions, known: bool) -> list[str]:
+    """Return a reason to doubt the background of a render with this alpha [H, W], if any; ``known`` if it was given."""
+    region, name = scored_region(view)
+    if view.alpha is not None:
+        empty, behind = view.alpha < EMPTY, torch.zeros(3) if options.background is None else options.background
+        colors = view.image[empty] - torch.as_tensor(behind).detach().cpu().numpy()
+        if empty.any() and float(np.abs(colors.mean(0)).max()) > EMPTY:
+            fix = "give options with the background of the views"
+            return [f"view {view.name} is over another background than the render, so colours differ; {fix}"]
+    elif not known and name != "foreground":
+        shown = 1 - float((alpha if region is None else alpha[region]).mean())
+        if shown > NOTICED:
+            fix = "give the result of the fit instead of its Gaussians, or options with the background of the fit"
+            return [f"{shown:.1%} of view {view.name} shows the background, taken as black; {fix}"]
+    return []
 
 
 def baselines(train: list[View], test: list[View]) -> dict[str, float]:
