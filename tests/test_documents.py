@@ -55,7 +55,8 @@ def test_named_files_and_tests_are_there():
 def test_named_flags_are_there():
     """Every flag in code font or in a command has a name that the code knows, and --no- only where the parser takes it."""
     folders = ("warpgs", "bench", "tools", "tests", "examples")
-    known = {w for folder in folders for p in (ROOT / folder).rglob("*.py") for w in re.findall(r"\w+", p.read_text("utf-8"))}
+    code = "".join(p.read_text("utf-8") for folder in folders for p in (ROOT / folder).rglob("*.py"))
+    known = {*re.findall(r"\w+", code), *(flag.replace("-", "_") for flag in re.findall(r"--([a-z][a-z-]+)", code))}
     missing, settings = [], get_type_hints(FitConfig)
     for page in [*PAGES, *sorted((ROOT / "docs/decisions").glob("*.md"))]:
         flags = set(re.findall(r"(?<![\w-])--([a-z][a-z0-9.-]*[a-z0-9])", page.read_text("utf-8"))) - GONE_FLAGS

@@ -3,38 +3,29 @@
 from __future__ import annotations
 
 import contextlib
+import csv
 import errno
 import hashlib
+import io
 import json
 import os
 import re
 import shutil
 import stat
-import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import BinaryIO
 
 from warpgs.errors import DataError, ResourceError, UsageError
 from warpgs.folders import NAMES as OWN_NAMES
-from warpgs.folders import (
-    Folder,
-    RefusedError,
-    TemporaryFile,
-    TemporaryFolder,
-    is_below,
-    open_file,
-    open_folder,
-    output_folder,
-    sweep,
-)
+from warpgs.folders import WINDOWS, Folder, RefusedError, Temporary, is_below, open_folder, output_folder, sweep, temporary_file
 
 # Opening of input files: only regular files of bounded size, so that no pipe hangs a command and no device fills its
 # memory.
 #
 # Every untrusted file is opened here. An unreadable file raises an OSError with the reason as its ``strerror``. Callers
-# then raise a `DataError` with the text of `unread_reason` and a remedy.
+# then raise a `DataError` with the text of `unread_reason` and a remedy, as `read_file` does.
 
 MAX_BYTES = 2**34
 """Default size of the largest file that is read into memory [bytes]."""
@@ -45,17 +36,18 @@ PIECE = 1 << 20
 
 
 def open_input(path: str | os.PathLike[str], below: Path | None = None) -> BinaryIO:
-    """Open a regular file for reading in binary mode."""
+    """Open a regular file for reading in binary mode; from a folder ``below`` to the file there must be no link."""
     if below is not None:
-        return open_file(Path(path), below)
+        path = Path(path)
+        with output_folder(below), open_folder(path.parent) as folder:
+            return os.fdopen(folder.open_regular(path.name, os.O_RDONLY), "rb")
     path = os.fspath(path)
     _check_kind(os.stat(path).st_mode, path)  # a device is not even opened
-    flags = os.O_RDONLY | getattr(os, "O_BINARY", 0) | getattr(os, "O_CLOEXEC", 0)
     # a pipe that took the file's place since then must not block
-    descriptor = os.open(path, flags | getattr(os, "O_NONBLOCK", 0))
+    descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_BINARY", 0) | getattr(os, "O_NONBLOCK", 0))
     try:
         _check_kind(os.fstat(descriptor).st_mode, path)
-        if hasattr(os, "O_NONBLOCK"):
+        if not WINDOWS:
             os.set_blocking(descriptor, True)
         return os.fdopen(descriptor, "rb")
     except BaseException:
@@ -64,25 +56,20 @@ def open_input(path: str | os.PathLike[str], below: Path | None = None) -> Binar
 
 
 def _check_kind(mode: int, path: str) -> None:
-    if stat.S_ISDIR(mode):
-        raise IsADirectoryError(errno.EISDIR, "is a folder", path)
     if not stat.S_ISREG(mode):
-        raise OSError(errno.EINVAL, NOT_REGULAR, path)
+        raise OSError(errno.EINVAL, "is a folder" if stat.S_ISDIR(mode) else NOT_REGULAR, path)
 
 
 def read_input(path: str | os.PathLike[str], most: int = MAX_BYTES, below: Path | None = None) -> bytes:
     """Return the contents of a regular file of at most ``most`` bytes; ``below`` as in `open_input`."""
     with open_input(path, below) as file:
         size = os.fstat(file.fileno()).st_size
-        if size > most:
-            raise _too_large(path, most)
-        data = file.read(size + 1)
-        while len(data) > size and (more := file.read(PIECE)):  # files of /proc have no size, logs grow
+        data = file.read(size + 1) if size <= most else b""
+        while size < len(data) <= most and (more := file.read(PIECE)):  # files of /proc have no size, logs grow
             data += more
-            if len(data) > most:
-                break
-    if len(data) > most:
-        raise _too_large(path, most)
+    if max(size, len(data)) > most:
+        limit = f"{most // 2**20:,} MiB" if most >= 2**20 else f"{most:,} bytes"
+        raise OSError(errno.EFBIG, f"is larger than {limit}", str(Path(path)))
     return data
 
 
@@ -90,6 +77,14 @@ def read_start(path: str | os.PathLike[str], count: int) -> bytes:
     """Return the first bytes of a regular file, at most ``count``."""
     with open_input(path) as file:
         return file.read(count)
+
+
+def read_file(path: Path, below: Path | None = None, most: int = MAX_BYTES, fix: str = "restore it, or make it again") -> bytes:
+    """Return what `read_input` does, or raise a DataError with a remedy."""
+    try:
+        return read_input(path, most, below)
+    except OSError as e:
+        raise DataError(f"{path}: cannot be read ({unread_reason(e)}); {fix}") from e
 
 
 def input_digest(path: str | os.PathLike[str], below: Path | None = None) -> str:
@@ -103,19 +98,10 @@ def unread_reason(error: OSError) -> str:
     return error.strerror or str(error)
 
 
-def _too_large(path: str | os.PathLike[str], most: int) -> OSError:
-    return OSError(errno.EFBIG, f"is larger than {_size(most)}", str(Path(path)))
-
-
-def _size(most: int) -> str:
-    return f"{most // 2**20:,} MiB" if most >= 2**20 else f"{most:,} bytes"
-
-
 LOCK = ".warpgs.lock"
 """Name of the file that a process holds while it writes into a folder."""
 UNDECODABLE = re.compile("[\udc80-\udcff]")
 """Characters that Python puts in the place of bytes that are not UTF-8."""
-WINDOWS = sys.platform == "win32"
 PAUSES = (0.05, 0.1, 0.2, 0.4, 0.8)
 """Pauses between attempts to replace a file on Windows [s]: a virus scanner holds a new file open for about that long."""
 FULL = (errno.ENOSPC, errno.EDQUOT)
@@ -148,43 +134,50 @@ def replacing(
     # The temporary file is synced to the disk and checked first; the folder is synced afterwards. On any error,
     # including one in the block, the temporary file is removed and an old file stays unchanged. If ``path`` is a link,
     # the link is replaced.
-    with _replaced(path, size, check, suffix) as (temporary, folder):
-        yield _reachable(folder) / temporary.name
+    with _replaced(path, size, check, suffix) as (_, temporary):
+        yield temporary
 
 
 @contextlib.contextmanager
 def writing(path: Path, size: int | None = None) -> Iterator[BinaryIO]:
     """Give a temporary file to write to; at the end of the block it replaces ``path``, as in `replacing`."""
-    with _replaced(path, size) as (temporary, _), open(temporary.descriptor, "wb", closefd=False) as file:
+    with _replaced(path, size) as (file, _):
         yield file
 
 
 @contextlib.contextmanager
 def _replaced(
     path: Path, size: int | None, check: Callable[[Path], object] | None = None, suffix: str = ""
-) -> Iterator[tuple[TemporaryFile, Folder]]:
-    """Give a temporary file and its folder; after the block the file is synced and checked, and replaces ``path``."""
+) -> Iterator[tuple[BinaryIO, Path]]:
+    """Give a temporary file, open and by its path; after the block the file is synced and checked, and replaces ``path``."""
     amount = "" if size is None else f"{size / 2**20:.1f} MiB " if size >= 2**20 else f"{size:,} bytes "
-    with writable(path, amount=amount, note="; the old file is untouched"):
-        with open_folder(path.parent) as folder:
-            with TemporaryFile(folder, suffix) as temporary:
-                yield temporary, folder
-                os.fsync(temporary.descriptor)
-                written = os.fstat(temporary.descriptor)
-                if not os.path.samestat(written, folder.lstat(temporary.name)):
-                    raise OSError(errno.EIO, "another file took the place of the temporary one")
-                if size is not None and written.st_size != size:  # some file systems report no error
-                    raise OSError(errno.EIO, f"only {written.st_size} of {size} bytes were written")
-                if check is not None:
-                    check(_reachable(folder) / temporary.name)
-                _replace(folder, temporary, path.name)
-            _sync(folder)
-
-
-def _reachable(folder: Folder) -> Path:
-    """Return a path to an open folder that libraries can use: the path of its descriptor, where the system has such paths."""
-    shown = DESCRIPTORS / str(folder.descriptor)
-    return shown if folder.descriptor is not None and shown.is_dir() else folder.path
+    with (
+        writable(path, amount=amount, note="; the old file is untouched"),
+        open_folder(path.parent) as folder,
+        temporary_file(folder, suffix) as (name, file),
+    ):
+        shown = DESCRIPTORS / str(folder.descriptor)  # a path that libraries can use, where the system has such paths
+        reachable = (shown if folder.descriptor is not None and shown.is_dir() else folder.path) / name
+        yield file, reachable
+        file.flush()
+        os.fsync(file.fileno())
+        written = os.fstat(file.fileno())
+        if not os.path.samestat(written, folder.lstat(name)):
+            raise OSError(errno.EIO, "another file took the place of the temporary one")
+        if size is not None and written.st_size != size:  # some file systems report no error
+            raise OSError(errno.EIO, f"only {written.st_size} of {size} bytes were written")
+        if check is not None:
+            check(reachable)
+        if WINDOWS:  # where no open file can be replaced
+            file.close()
+        for pause in PAUSES if WINDOWS else ():
+            with contextlib.suppress(PermissionError):
+                folder.replace(name, path.name)
+                break
+            time.sleep(pause)
+        else:
+            folder.replace(name, path.name)
+        _sync(folder)
 
 
 @contextlib.contextmanager
@@ -194,34 +187,20 @@ def filling(folder: Path) -> Iterator[Path]:
     if os.path.realpath(target) == os.path.realpath(Path.cwd()):
         raise UsageError(f"{folder}: refusing to replace the current directory; choose another path")
     make_folder(target.parent)
-    with writable(folder, done="created"):
-        above = open_folder(target.parent)
-        sweep(above)
-        temporary = TemporaryFolder(above)
-    with temporary:
-        path = target.parent / temporary.name
-        with output_folder(path):
-            yield path
+    with contextlib.ExitStack() as stack:
         with writable(folder, done="created"):
-            if above.is_link(target.name) or target.is_dir():
-                with above.folder(target.name) as inside:
-                    sweep(inside)  # leftovers of killed writers
+            above = stack.enter_context(open_folder(target.parent))
+            sweep(above)
+            temporary = stack.enter_context(Temporary(above))
+            above.mkdir(temporary.name)
+        with output_folder(temporary.path):
+            yield temporary.path
+        with writable(folder, done="created"):
+            with contextlib.suppress(FileNotFoundError), above.folder(target.name) as inside:
+                sweep(inside)  # leftovers of killed writers
                 above.rmdir(target.name)
-            above.rename(temporary.name, target.name)
+            above.replace(temporary.name, target.name)
         _sync(above)
-
-
-def _replace(folder: Folder, temporary: TemporaryFile, name: str) -> None:
-    """Replace a file by another; on Windows, where no open file can be replaced, try a few times."""
-    if WINDOWS:
-        temporary.close()
-    for pause in PAUSES if WINDOWS else ():
-        try:
-            folder.replace(temporary.name, name)
-            return
-        except PermissionError:
-            time.sleep(pause)
-    folder.replace(temporary.name, name)
 
 
 def _sync(folder: Folder) -> None:
@@ -247,6 +226,13 @@ def write_text(path: Path, text: str) -> None:
     write_bytes(path, readable(text).encode())
 
 
+def write_csv(path: Path, rows: Iterable[Iterable[object]]) -> None:
+    """Replace a CSV file as `write_text` does."""
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows(rows)
+    write_text(path, text.getvalue())
+
+
 def readable(text: str) -> str:
     r"""Return text in which undecodable bytes of file names, and lone surrogates, are escaped: ``b\xe4r``."""
     escaped = UNDECODABLE.sub(lambda byte: f"\\x{ord(byte[0]) - 0xDC00:02x}", text)
@@ -269,14 +255,6 @@ def plain(value: object) -> object:
     return value
 
 
-def read_file(path: Path, below: Path) -> bytes:
-    """Return the contents of a file that a command has written, such as one of a run."""
-    try:
-        return read_input(path, below=below)
-    except OSError as e:
-        raise DataError(f"{path}: cannot be read ({unread_reason(e)}); restore it, or make it again") from e
-
-
 def appending(path: Path) -> BinaryIO:
     """Open a file to append to, made if it is missing; a link is not followed."""
     with open_folder(path.parent) as folder:
@@ -295,7 +273,7 @@ def move_folder(folder: Path, name: str) -> Path:
     """Rename a folder within its parent folder, and return the new path."""
     with open_folder(folder.parent) as above:
         above.folder(folder.name).close()
-        above.rename(folder.name, name)
+        above.replace(folder.name, name)
     return folder.with_name(name)
 
 

@@ -9,21 +9,15 @@ import json
 import os
 import platform
 import shlex
-import shutil
 import stat
 import sys
-import tempfile
-import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import BinaryIO
-
-from filelock import FileLock, Timeout, lock_descriptor
 
 from warpgs import schema
 from warpgs.errors import FolderHeldError, ResourceError, UsageError
 from warpgs.files import LOCK, remove_leftovers, writable, writing_into
-from warpgs.folders import NO_LOCKS, Folder, cache_home, open_folder, sweep_temporary_files
+from warpgs.folders import Folder, Temporary, cache_home, lock, open_folder, sweep, sweep_temporary_files, unlock
 
 
 def open_to_others(folder: Path, depth: int = 0) -> Path | None:
@@ -64,16 +58,12 @@ def _is_own_group(gid: int) -> bool:
     import grp
     import pwd
 
-    try:
-        name = pwd.getpwuid(os.getuid()).pw_name
-        group = grp.getgrgid(gid)
-    except KeyError:
-        return False
-    return set(group.gr_mem) <= {name} and (gid == os.getuid() or group.gr_name == name)
+    with contextlib.suppress(KeyError):
+        name, group = pwd.getpwuid(os.getuid()).pw_name, grp.getgrgid(gid)
+        return set(group.gr_mem) <= {name} and (gid == os.getuid() or group.gr_name == name)
+    return False
 
 
-SIGNED_WITHIN = 50
-"""Number of attempts to read the signature of a lock's holder, a hundredth of a second apart."""
 MOST_LETTERS = 200
 """Length at which a command is cut short in a message."""
 
@@ -124,95 +114,62 @@ def check_file_path(path: Path) -> None:
 def check_free(folder: Path) -> None:
     """Check, without writing, that no process holds a folder; a folder that cannot be read counts as free."""
     with contextlib.suppress(OSError), open_folder(folder) as opened:
-        with os.fdopen(opened.open_regular(LOCK, os.O_RDWR), "r+b", buffering=0) as file:
-            _lock(file, folder)
+        os.close(_locked(opened, os.O_RDWR)[0])
 
 
 @contextlib.contextmanager
 def _held(folder: Folder) -> Iterator[bool]:
     """Hold the lock of a folder; yields whether the file system has locks."""
     while True:
-        file = _open(folder)
-        try:
-            locked = _lock(file, folder.path)
-            # the last holder may have removed the lock file between the two calls; then other processes lock a new file
-            if not locked or os.fstat(file.fileno()).st_nlink:
-                break
-        except BaseException:
-            file.close()
-            raise
-        file.close()
+        with writable(folder.path, f"make the folder and its lock {LOCK} writable, or choose another folder"):
+            descriptor, locked = _locked(folder, os.O_RDWR | os.O_CREAT)
+        # the last holder may have removed the lock file between the two calls; then other processes lock a new file
+        if not locked or os.fstat(descriptor).st_nlink:
+            break
+        os.close(descriptor)
     try:
-        with contextlib.suppress(OSError):  # a full disk: the lock holds all the same
-            _sign(file)
-        yield locked
+        # a full disk: the lock holds all the same
+        with contextlib.suppress(OSError), open(descriptor, "r+b", buffering=0, closefd=False) as file:
+            file.truncate(0)
+            file.write(_signature())
+        yield bool(locked)
     finally:
-        # Windows cannot remove an open file; other systems must remove it while the lock is held
-        if sys.platform == "win32":
-            file.close()
-        try:
-            with contextlib.suppress(OSError):
-                folder.unlink(LOCK)
-        finally:
-            file.close()
+        unlock(folder, LOCK, descriptor)
 
 
-def _open(folder: Folder) -> BinaryIO:
-    """Open a lock file to read and write, made if it is missing."""
-    with writable(folder.path, f"make the folder and its lock {LOCK} writable, or choose another folder"):
-        return os.fdopen(folder.open_regular(LOCK, os.O_RDWR | os.O_CREAT), "r+b", buffering=0)
-
-
-def _lock(file: BinaryIO, folder: Path) -> bool:
-    """Lock an open file; return False where its file system has no locks."""
+def _locked(folder: Folder, flags: int) -> tuple[int, bool | None]:
+    """Open and lock the lock file of a folder; return its descriptor, and None where its file system has no locks."""
+    descriptor = folder.open_regular(LOCK, flags)
     try:
-        if lock_descriptor(file.fileno(), blocking=False):
-            return True
-    except OSError as e:
-        if e.errno in NO_LOCKS:
-            return False
-        raise ResourceError(f"{folder}: cannot be locked ({e.strerror or e}); choose another folder") from e
-    raise FolderHeldError(
-        f"{folder}: {_holder(file)} is writing there. Wait until that process ends, end it, or choose another folder"
-    )
+        locked = lock(descriptor)
+        if locked is False:
+            os.lseek(descriptor, 1, os.SEEK_SET)
+            raise FolderHeldError(
+                f"{folder.path}: {_signed(os.read(descriptor, 2**16)) or 'another process'} is writing there. Wait until that "
+                "process ends, end it, or choose another folder"
+            )
+        return descriptor, locked
+    except BaseException:
+        os.close(descriptor)
+        raise
 
 
-def _sign(file: BinaryIO) -> None:
-    """Write the owner into a lock file; Windows locks its first byte, which no other process may then read."""
+def _signature() -> bytes:
+    """Return the text of a lock file, which names its owner; Windows locks its first byte, which no other process may read."""
     program = Path(sys.argv[0])
     name = program.parent.name if program.name == "__main__.py" else program.name  # of `python -m warpgs`
-    command = shlex.join([name, *sys.argv[1:]])
     now = datetime.datetime.now().astimezone().isoformat(" ", "seconds")
-    values = {"process": os.getpid(), "host": platform.node(), "since": now, "command": command}
-    file.truncate(0)
-    file.seek(0)
-    file.write(b"\n" + json.dumps(values).encode())
+    values = {"process": os.getpid(), "host": platform.node(), "since": now, "command": shlex.join([name, *sys.argv[1:]])}
+    return b"\n" + json.dumps(values).encode()
 
 
-def _holder(file: BinaryIO) -> str:
-    """Return a text that names the holder of a lock file; wait briefly for the signature, since the lock may be new."""
-    for _ in range(SIGNED_WITHIN):
-        words = _signed(file)
-        if words is not None:
-            return words
-        time.sleep(0.01)
-    return "another process"
-
-
-def _signed(file: BinaryIO) -> str | None:
+def _signed(text: bytes) -> str | None:
     """Return who signed a lock file; None if the signature is missing or incomplete."""
-    try:
-        file.seek(1)
-        found = schema.parse(file.read(schema.MAX_BYTES))
+    with contextlib.suppress(ValueError, KeyError, TypeError):
+        found = schema.parse(text)
         command = found["command"] if len(found["command"]) <= MOST_LETTERS else f"{found['command'][:MOST_LETTERS]}..."
         return f"process {found['process']} on {found['host']}, since {found['since']}, `{command}`,"
-    except (OSError, ValueError, KeyError, TypeError):
-        return None
-
-
-PRIVATE_LOCK = "lock"
-WAIT_FOR_OTHERS = 60.0
-"""Longest wait while another farm makes its own folder [s]."""
+    return None
 
 
 @contextlib.contextmanager
@@ -222,41 +179,23 @@ def private_shared_folder(base: Path | None) -> Iterator[Path]:
     if base is None and home is None:
         raise UsageError("--engine slurm needs a home folder for its job files; name another folder with --slurm-folder")
     base = (base or home / "warpgs" / "slurm").absolute()
-    try:
-        base.mkdir(mode=0o700, parents=True, exist_ok=True)
-        base = base.resolve()
-        others = open_to_others(base)
-        if others is not None:
-            raise UsageError(
-                f"{base}: not safe for Slurm's job files: other users can write to {others} and could run code as you; "
-                "name a private folder that all nodes see with --slurm-folder"
-            )
-        with FileLock(
-            base / PRIVATE_LOCK, timeout=WAIT_FOR_OTHERS, mode=0o600
-        ):  # no other farm is between making and locking its own
-            _sweep(base)
-            made = Path(tempfile.mkdtemp(dir=base))
-            lock = FileLock(made / PRIVATE_LOCK, mode=0o600)
-            lock.acquire()
-    except (OSError, NotImplementedError, Timeout) as e:
-        raise ResourceError(
-            f"{base}: Slurm's job files cannot be written ({getattr(e, 'strerror', None) or e}); name another private folder "
-            "that all nodes see with --slurm-folder"
-        ) from e
-    try:
-        yield made
-    finally:
-        lock.release()
-        shutil.rmtree(made, ignore_errors=True)
-
-
-def _sweep(base: Path) -> None:
-    """Remove the folders of farms that have ended."""
-    for old in base.iterdir():
-        if old.is_dir() and not old.is_symlink():
-            try:
-                with FileLock(old / PRIVATE_LOCK, blocking=False):
-                    pass
-            except Timeout:
-                continue
-            shutil.rmtree(old, ignore_errors=True)
+    with contextlib.ExitStack() as stack:
+        try:
+            base.mkdir(mode=0o700, parents=True, exist_ok=True)
+            base = base.resolve()
+            others = open_to_others(base)
+            if others is not None:
+                raise UsageError(
+                    f"{base}: not safe for Slurm's job files: other users can write to {others} and could run code as you; "
+                    "name a private folder that all nodes see with --slurm-folder"
+                )
+            above = stack.enter_context(open_folder(base))
+            sweep(above)
+            made = stack.enter_context(Temporary(above))
+            above.mkdir(made.name, 0o700)
+        except OSError as e:
+            raise ResourceError(
+                f"{base}: Slurm's job files cannot be written ({e.strerror or e}); name another private folder that all nodes "
+                "see with --slurm-folder"
+            ) from e
+        yield made.path

@@ -61,16 +61,10 @@ def check_parts(text: str | bytes) -> None:
 def check_depth(value: Any, most: int) -> None:
     """Check that at most ``most`` lists and objects are nested, without recursion."""
     level, depth = [value], 0
-    while level := [part for outer in level for part in _parts(outer)]:
+    while level := [p for v in level for p in (v.values() if isinstance(v, dict) else v if isinstance(v, list) else ())]:
         depth += 1
         if depth > most:
             raise SchemaError(f"is nested deeper than {most} lists and objects")
-
-
-def _parts(value: Any) -> list[Any]:
-    if isinstance(value, dict):
-        return list(value.values())
-    return value if isinstance(value, list) else []
 
 
 def read(path: Path, below: Path | None = None) -> Any:

@@ -48,7 +48,7 @@ def demo_scenes(folder: Path, count: int) -> dict[str, Path]:
 def jobs_of(scenes: dict[str, Path], out: Path, config: FitConfig) -> list[FarmJob]:
     """Return the jobs of demo scenes."""
     return [
-        FarmJob(n, FitRequest(SceneRequest(str(p), split_spec(VIEWS)), out / n / "run", config, "cpu"), out / n)
+        FarmJob(n, FitRequest(SceneRequest(str(p), split_spec(VIEWS)), out / n / "run", config, "cpu"), out / n, out)
         for n, p in scenes.items()
     ]
 
@@ -146,7 +146,7 @@ def pack(scene: SceneRequest, config: FitConfig, out: Path, slots: list[Slot], f
 
     def jobs(kind: str, count: int, settings: FitConfig) -> list[FarmJob]:
         return [
-            FarmJob(n, FitRequest(scene, out / n / "run", dataclasses.replace(settings, seed=i), "cuda"), out / n)
+            FarmJob(n, FitRequest(scene, out / n / "run", dataclasses.replace(settings, seed=i), "cuda"), out / n, out)
             for i, n in enumerate(f"{kind}{i}" for i in range(count))
         ]
 

@@ -7,7 +7,7 @@ import statistics
 from collections import defaultdict
 
 from bench.lib.tables import markdown, mean_sd
-from warpgs.pipeline.study.tables import Difference, paired_difference
+from warpgs.pipeline.study.tables import Sample, paired_difference
 
 LIMIT = 0.1
 """Largest allowed loss against the best rival [dB]."""
@@ -31,7 +31,7 @@ def by_seed(rows: list[dict]) -> dict[tuple[str, str], dict[int, dict]]:
     return dict(found)
 
 
-def rival(scores: dict[str, dict[int, float]], base: str) -> tuple[Difference, list[str]]:
+def rival(scores: dict[str, dict[int, float]], base: str) -> tuple[Sample, list[str]]:
     """Return the paired difference of the base to the best of the others, and the names of the best.
 
     For each seed with results for all presets, the rival is the preset with the best mean over the other seeds, which avoids

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 from unittest import mock
 
-from warpgs import folders, locks
+from warpgs import folders
 from warpgs.report.progress import EventLog
 
 KINDS = ("open", "write", "fsync", "replace", "unlink", "mkdir", "rmdir", "lock", "truncate", "step")
@@ -192,7 +192,6 @@ def numbered(root: Path, before: Callable[[Call], int | None], talker: Any = Non
             (os, "rmdir", _on_path(calls, "rmdir", os.rmdir)),
             (os, "truncate", _on_path(calls, "truncate", os.truncate)),
             (os, "fsync", _on_descriptor(calls, "fsync", os.fsync)),
-            (locks, "lock_descriptor", _on_descriptor(calls, "lock", locks.lock_descriptor)),
             (folders, "lock_descriptor", _on_descriptor(calls, "lock", folders.lock_descriptor)),
             (EventLog, "write", _step(calls, EventLog.write)),
         ):

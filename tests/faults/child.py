@@ -50,14 +50,15 @@ class OneProcess:
 
     def wait(self, seconds: float) -> list[Event]:
         job = self.jobs.pop(0)
-        return [Event(job.name, run_job(job_text(job)))]
+        return [(job.name, run_job(job_text(job)), "")]
 
     def close(self) -> None:
         """Do nothing."""
 
 
-def plain_plot(contents: object, size: tuple[int, int], background: str) -> bytes:
+def plain_plot(*contents) -> bytes:
     """Stand in for the renderer of plots, which takes seconds."""
+    size = contents[-2]
     return png(np.zeros((*size[::-1], 3), np.float32))
 
 
@@ -65,7 +66,7 @@ def plain_plot(contents: object, size: tuple[int, int], background: str) -> byte
 def saving_viewer():
     """Have `warpgs view` save a crop box and a path once it shows something, and end."""
     from warpgs.viewer import watch
-    from warpgs.viewer.window import CROP, PATH, keyframe
+    from warpgs.viewer.window import CROP, PATH, box_json, keyframe
 
     windows: list = []
 
@@ -77,7 +78,7 @@ def saving_viewer():
         (shown,) = windows
         panel, model = shown.panel, shown.content.model
         panel._crop.value = True
-        panel._save(CROP, panel.crop_box().to_json(model.normalization))
+        panel._save(CROP, box_json(panel.crop_box(), model.normalization))
         panel._save(PATH, [keyframe(model.scene_cameras[n], float(i), model.normalization) for i, n in enumerate(model.train)])
         raise KeyboardInterrupt
 

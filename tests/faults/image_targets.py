@@ -25,7 +25,7 @@ Pixels = tuple[np.ndarray, np.ndarray | None]
 
 def read(folder: Path, path: Path) -> Pixels:
     pixels = image_files.decode(path, MAX_PIXELS)
-    assert images.exif_orientation(path) in range(1, 9)
+    assert image_files.read_exif(path.read_bytes())[0] in range(1, 9)
     return pixels
 
 
@@ -151,7 +151,7 @@ def interlaced() -> bytes:
 PNG_MODES = ("RGB", "RGBA", "L", "LA", "P", "1", "I;16")
 add(
     "png", {m.replace(";", ""): encoded("PNG", m) for m in PNG_MODES} | {"interlaced": interlaced()},
-    (image_files._png_chunks, image_files._loaded),
+    (image_files._opened, image_files._loaded),
     (png_rows, rarely(png_bomb, png_rows)), repair=png_checksums, unexplained=same,
 )  # fmt: skip
 

@@ -31,14 +31,8 @@ from warpgs.scene import Gaussians, Normalization
 
 def gaussians(count: int = 3) -> Gaussians:
     generator = torch.Generator().manual_seed(0)
-    shapes = {
-        "means": (count, 3),
-        "quats": (count, 4),
-        "log_scales": (count, 3),
-        "logit_opacities": (count,),
-        "sh": (count, 4, 3),
-    }
-    return Gaussians(**{n: torch.randn(s, generator=generator) for n, s in shapes.items()})
+    shapes = {"means": (3,), "quats": (4,), "log_scales": (3,), "logit_opacities": (), "sh": (4, 3)}
+    return Gaussians(**{n: torch.randn((count, *s), generator=generator) for n, s in shapes.items()})
 
 
 def nonsense(g: Gaussians) -> str:

@@ -66,30 +66,14 @@ add("keyframes", "path.json", PATH, cameras_of_path, KEYFRAMES, nonsense=path_no
 
 # ---- scores of a run ---------------------------------------------------------------------------------------------------
 
-CLASSES = {
-    k: {"pixels": 10, "share_of_pixels": 0.2, "share_of_error": 0.3, "psnr": 20.5, "ssim": None, "expected_psnr": 21.0}
-    for k in ("0", "1")
-}
 SCORES = {
     "test": {"psnr": 24.5, "ssim": 0.8}, "train": {"psnr": 30.25, "ssim": None}, "views": [{"name": "a.png", "psnr": 24.5}],
     "variants": {"lpips": "vgg 0.1"}, "config_hash": "ab12", "steps": 500, "gaussians": 7, "batch": 1, "ranks": 1,
     "seconds": {"total": 12.5},
     "protocol": {"split": "llff:8", "training_views": 3, "held_out_views": 1, "ground_truth": "as stored",
         "resolution": ["16 x 12"], "score_masks": 0},
-    "photographs": [{"name": "a.png", "compared_with": 2, "sharpness": 1.5, "brightness": None,
-         "channels": [1.0, 0.5, 2.0], "moved": 0.25}],
-    "view_modules": {"refine_poses": {"views": [{"name": "a.png", "degrees": 0.5}], "summary": "moved a little"}},
-    "coverage": {"classes": CLASSES, "views": [{"name": "a.png", "classes": CLASSES}], "tolerance": 0.01,
-        "depth_differences": [0.5], "photo_psnr": [None, 20.5], "summary": "all seen"},
 }  # fmt: skip
-add(
-    "scores",
-    "metrics.json",
-    SCORES,
-    lambda root, path: work._scores(path),
-    (work._scores, schema, folder),
-    lines=0.6,
-)
+add("scores", "metrics.json", SCORES, lambda root, path: work._scores(path), (work._scores, schema, folder), lines=0.6)
 
 # ---- farms -------------------------------------------------------------------------------------------------------------
 
@@ -123,7 +107,7 @@ def one_line(change: Change) -> Change:
 
 
 LINE_CHANGES = (one_line(json_value), one_line(json_value), one_line(text_number), text_line)
-LISTING = (job.list_jobs, job._read, job._job, job._flag)
+LISTING = (job.list_jobs, job._read, job._flag)
 register(Target("list of jobs", job_files, lambda root, path: job.list_jobs(str(path)), LISTING, LINE_CHANGES))
 
 
@@ -158,13 +142,8 @@ def pose_lines(root: Path, path: Path) -> list[str]:
     return poses_record.report_lines(poses_record.read_poses_record(root))
 
 
-add(
-    "record of poses",
-    poses_record.JSON,
-    FOUND,
-    pose_lines,
-    (poses_record.read_poses_record, poses_record.report_lines, schema.items),
-)
+PARSER = (poses_record.read_poses_record, poses_record.report_lines, schema.items)
+add("record of poses", poses_record.JSON, FOUND, pose_lines, PARSER)
 
 
 def event_files(root: Path) -> list[Path]:
@@ -192,11 +171,7 @@ def events_nonsense(found: list[dict]) -> str:
 
 
 EVENTS = (progress.read_events, progress.EventLog.rewind)
-register(
-    Target(
-        "events", event_files, events_of, EVENTS, LINE_CHANGES, nonsense=events_nonsense, lines=0.75
-    )
-)  # fmt: skip
+register(Target("events", event_files, events_of, EVENTS, LINE_CHANGES, nonsense=events_nonsense, lines=0.75))
 
 
 def lock_files(root: Path) -> list[Path]:
@@ -207,7 +182,7 @@ def lock_files(root: Path) -> list[Path]:
 
 def holder(root: Path, path: Path) -> str | None:
     data = path.read_bytes() if path.is_file() else b""
-    return locks._signed(io.BytesIO(data))
+    return locks._signed(data[1:])
 
 
 register(Target("signature of a lock", lock_files, holder, (locks._signed,), (one_line(json_value), text_number)))

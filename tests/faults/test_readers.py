@@ -98,9 +98,9 @@ def test_defects_are_noticed(data, kind, tmp_path):
 
 PACKAGE = Path(warpgs.__file__).parent
 OPENING = {
-    "open", "open_file", "open_input", "read_bytes", "read_file", "read_input", "read_start", "read_text", "input_digest",
+    "open", "open_input", "read_bytes", "read_file", "read_input", "read_start", "read_text", "input_digest",
     "fromfile", "imdecode", "imread", "safe_open", "HeifImageFile", "InferenceSession", "VideoCapture",
-    "ZipFile",
+    "ZipFile", "fdopen", "memmap", "loadtxt", "genfromtxt", "load_file", "open_memmap",
 }  # fmt: skip
 """Names of functions and classes that open a file or decode what one holds."""
 PARSING = {"json.load", "json.loads", "np.load", "schema.parse", "schema.read", "torch.load", "msgspec.msgpack.decode"}
@@ -108,7 +108,7 @@ PARSING = {"json.load", "json.loads", "np.load", "schema.parse", "schema.read", 
 
 READERS = {
     "export/base.py": {"reading": "splat"},
-    "export/ply.py": {"start_of": "ply", "_read": "ply"},
+    "export/ply.py": {"_read": "ply"},
     "export/gltf.py": {"_split": "glTF"},
     "export/sog.py": {"SOG.is_antialiased": "SOG", "decode": "SOG", "_member": "SOG", "_meta": "SOG", "_pixels": "SOG"},
     "io/transforms.py": {"_json": "cameras"},
@@ -153,20 +153,19 @@ SYSTEM = "reads what the system says"
 LAYER = "opens for others, which are named here"
 REASONS = {
     "export/sog.py": {"SOG.is_antialiased": "SOG", "encode": "writes"},
-    "files.py": {"appending": "writes", "writing": "writes", "read_file": LAYER,
+    "files.py": {"appending": "writes", "read_file": LAYER,
         "open_input": LAYER, "read_input": LAYER, "read_start": LAYER, "input_digest": LAYER},
-    "folders.py": {"Folder.open": LAYER, "Folder.open_regular": LAYER, "_opened": LAYER,
-        "_own_file": "writes"},
+    "folders.py": {"Folder.__init__": LAYER, "Folder.open": LAYER, "Folder.open_regular": LAYER,
+        "_locked": "writes", "temporary_file": "writes"},
+    "locks.py": {"_held": "writes"},
     "pipeline/farm/work.py": {"_with_lpips": OWN},
     "pipeline/farm/slurm.py": {"main": PRIVATE,
-        "SlurmEngine._answered": PRIVATE, "SlurmEngine._output": PRIVATE},
+        "SlurmEngine._ended": PRIVATE},
     "pipeline/farm/job.py": {"job_of": PIPE,
         "file_digest": DIGEST},
-    "pipeline/farm/farm.py": {"LocalEngine._compile": PIPE, "LocalEngine.wait": PIPE},
+    "pipeline/farm/farm.py": {"LocalEngine._serve": PIPE},
     "pipeline/farm/worker.py": {"main": PIPE},
     "pipeline/metrics/coverage.py": {"coverage_section": OWN},
-    "pipeline/run/commands.py": {"render": "opens a writer of a film"},
-    "pipeline/run/folder.py": {"check_same": "copies a value"},
     "pipeline/run/results.py": {"sampling_report_of": "reads images for `webp`, which is named here"},
     "plugins.py": {"module_digest": DIGEST},
     "poses/find.py": {"find_poses": OWN, "source_digest": DIGEST},
@@ -289,23 +288,18 @@ def test_an_endless_loop_is_a_hang(tmp_path, monkeypatch):
         for s, handler in zip((bounds.signal.SIGPROF, bounds.signal.SIGALRM), before):
             bounds.signal.signal(s, handler)
     assert list(made.tally.kinds) == ["hang"]
-
-
-def test_slow_code_that_swallows_the_exception_is_a_hang(tmp_path, monkeypatch):
-    monkeypatch.setattr(fuzzer, "LIMIT", -1)
+    monkeypatch.setattr(fuzzer, "LIMIT", -1)  # slow code that swallows the exception
     made = worker(tmp_path, b"ok")
     made.run(0)
     assert list(made.tally.kinds) == ["hang"]
 
 
-@pytest.mark.parametrize("data, past", [(b"", 0), (b"xx", 0), (b"ok", 1), (b"ok more", 1)])
-def test_the_first_check_is_told_from_later_ones(data, past, tmp_path):
-    made = worker(tmp_path, data)
-    made.run(0)
-    assert made.tally.past == past and not made.tally.failures
-
-
-def test_too_few_past_the_first_check_fail():
+def test_the_first_check_is_told_from_later_ones(tmp_path):
+    """Too few inputs past it fail."""
+    for data, past in ((b"", 0), (b"xx", 0), (b"ok", 1), (b"ok more", 1)):
+        made = worker(tmp_path, data)
+        made.run(0)
+        assert made.tally.past == past and not made.tally.failures
     assert shallow(Tally("a", inputs=100, past=9)) and not shallow(Tally("a", inputs=100, past=10))
     assert not shallow(Tally("a", inputs=JUDGED - 1)) and shallow(Tally("a", inputs=JUDGED))
 

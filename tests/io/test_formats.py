@@ -27,24 +27,26 @@ def by_index(scene):
 
 
 @pytest.mark.parametrize("kind", scenes.WRITERS)
-def test_a_point_lands_on_the_same_pixel_in_every_format(kind, tmp_path):
-    scene = load_scene(scenes.WRITERS[kind](tmp_path))
-    assert len(scene.views) == scenes.VIEWS
-    point = scenes.POINT
-    if kind == "dtu":
-        point = (np.linalg.inv(scenes.SCALE_MAT) @ [*point, 1])[:3]
-    for i, j in enumerate(by_index(scene)):
-        np.testing.assert_allclose(landing(scene, j, point), scenes.pixel(i), atol=1e-8)
-
-
-@pytest.mark.parametrize("kind", scenes.WRITERS)
-def test_pixels_arrive_as_rgb(kind, tmp_path):
-    scene = load_scene(scenes.WRITERS[kind](tmp_path))
-    for i, j in enumerate(by_index(scene)):
-        view = scene.views[j]
-        assert view.image.dtype == np.float32 and view.image.shape == (scenes.HEIGHT, scenes.WIDTH, 3)
-        right = (slice(None), slice(scenes.WIDTH // 2, None))  # Blender's left halves are transparent
-        np.testing.assert_allclose(view.image[right], scenes.image(i)[right] / 255, atol=1e-6)
+def test_every_format_gives_the_same_scene(kind, tmp_path):
+    """A point lands on the same pixel, at every scale; pixels are RGB; the scene is centred and of unit size."""
+    scenes.WRITERS[kind](tmp_path)
+    point = scenes.POINT if kind != "dtu" else (np.linalg.inv(scenes.SCALE_MAT) @ [*scenes.POINT, 1])[:3]
+    for downscale in (1, 2, 3):
+        scene = load_scene(tmp_path, downscale=downscale)
+        centers = np.array([v.camera.center for v in scene.views])
+        assert len(scene.views) == scenes.VIEWS and scene.views[0].camera.viewmat.dtype == np.float64
+        np.testing.assert_allclose(centers.mean(0), 0, atol=1e-12)
+        assert np.linalg.norm(centers, axis=1).max() == pytest.approx(1 / 1.1)
+        assert downscale == 1 or any(f"by {downscale}" in n for n in scene.notes)
+        for i, j in enumerate(by_index(scene)):
+            view, camera = scene.views[j], scene.views[j].camera
+            assert (camera.width, camera.height) == (round(16 / downscale), round(12 / downscale))
+            expected = scenes.pixel(i) * [camera.width / 16, camera.height / 12]
+            np.testing.assert_allclose(landing(scene, j, point), expected, atol=1e-8)
+            assert view.image.dtype == np.float32 and view.image.shape == (camera.height, camera.width, 3)
+            if downscale == 1:
+                right = (slice(None), slice(scenes.WIDTH // 2, None))  # Blender's left halves are transparent
+                np.testing.assert_allclose(view.image[right], scenes.image(i)[right] / 255, atol=1e-6)
 
 
 @pytest.mark.parametrize("kind", scenes.WRITERS)
@@ -59,28 +61,6 @@ def test_images_over_the_longest_side_are_reduced_and_that_is_said(kind, tmp_pat
         np.testing.assert_allclose(a.camera.K[:2] * (b.camera.width / 8), b.camera.K[:2])
     assert whole.views[0].camera.width == load_scene(tmp_path, downscale=1).views[0].camera.width == 16
     assert not any("reduced" in n for n in whole.notes)
-
-
-@pytest.mark.parametrize("kind", scenes.WRITERS)
-@pytest.mark.parametrize("downscale", [2, 3])
-def test_downscaling_keeps_the_point_at_the_same_part_of_the_image(kind, downscale, tmp_path):
-    scene = load_scene(scenes.WRITERS[kind](tmp_path), downscale=downscale)
-    point = scenes.POINT if kind != "dtu" else (np.linalg.inv(scenes.SCALE_MAT) @ [*scenes.POINT, 1])[:3]
-    for i, j in enumerate(by_index(scene)):
-        camera = scene.views[j].camera
-        assert (camera.width, camera.height) == (round(16 / downscale), round(12 / downscale))
-        expected = scenes.pixel(i) * [camera.width / 16, camera.height / 12]
-        np.testing.assert_allclose(landing(scene, j, point), expected, atol=1e-8)
-    assert any(f"by {downscale}" in n for n in scene.notes)
-
-
-@pytest.mark.parametrize("kind", scenes.WRITERS)
-def test_scene_is_centred_and_of_unit_size(kind, tmp_path):
-    scene = load_scene(scenes.WRITERS[kind](tmp_path))
-    centers = np.array([v.camera.center for v in scene.views])
-    np.testing.assert_allclose(centers.mean(0), 0, atol=1e-12)
-    assert np.linalg.norm(centers, axis=1).max() == pytest.approx(1 / 1.1)
-    assert scene.views[0].camera.viewmat.dtype == np.float64
 
 
 @pytest.mark.parametrize("kind", ["colmap", "colmap text"])
@@ -116,7 +96,8 @@ def test_transforms_per_frame_intrinsics_and_mask_path(tmp_path):
     content = scenes.transforms_json()
     content["frames"][2] |= {"fl_x": 25.0, "cx": 7.0, "mask_path": "m/two.png"}
     scenes.save(tmp_path / "m" / "two.png", np.tile(np.array([0, 255], np.uint8).repeat(8), (12, 1)))
-    scene = load_scene(scenes.write_transforms(tmp_path, content))
+    scene = load_scene(scenes.write_transforms(tmp_path, content | {"ply_file_path": "sparse_pc.ply"}))
+    assert scene.points is None and any("sparse_pc.ply" in n for n in scene.notes)
     assert scene.views[2].camera.K[0, 0] == 25 and scene.views[2].camera.K[0, 2] == 7
     assert scene.views[1].camera.K[0, 0] == 20 and scene.views[1].mask is None
     assert not scene.views[2].mask[:, :8].any() and scene.views[2].mask[:, 8:].all()
@@ -129,11 +110,6 @@ def test_transforms_skip_frames_without_a_file(tmp_path):
     assert len(scene.views) == 4 and any("1 of 5 frames" in n and "photo3.png" in n for n in scene.notes)
     with pytest.raises(DataError, match=r"1 of 5 frames.*photo3.png.*--strict"):
         load_scene(tmp_path, strict=True)
-
-
-def test_ply_points_of_nerfstudio_are_left_with_a_note(tmp_path):
-    scene = load_scene(scenes.write_transforms(tmp_path, scenes.transforms_json(ply_file_path="sparse_pc.ply")))
-    assert scene.points is None and any("sparse_pc.ply" in n for n in scene.notes)
 
 
 def test_fingerprint_follows_the_data(tmp_path):
@@ -166,25 +142,22 @@ def test_small_images_of_other_names_are_matched(other, tmp_path):
     np.testing.assert_allclose(np.diff(blues), 0.2, atol=0.08)  # JPEG is not exact
 
 
-@pytest.mark.parametrize("downscale,size,note", [(1, (8, 6), "images_2"), (2, (8, 6), "images_2"), (4, None, "--downscale")])
-def test_llff_with_only_small_images(downscale, size, note, tmp_path):
+def test_llff_with_only_small_images(tmp_path):
+    """They are taken, and resampled further where that leaves enough."""
     scenes.write_llff(tmp_path)
     (tmp_path / "images").rename(tmp_path / "gone")
     scenes.save_images(tmp_path / "images_2", width=8, height=6)
-    if size is None:  # 2 x 2 px would be left
-        with pytest.raises(UsageError, match=note):
-            load_scene(tmp_path, downscale=downscale)
-        return
-    scene = load_scene(tmp_path, downscale=downscale)
-    assert (scene.views[0].camera.width, scene.views[0].camera.height) == size
-    assert scene.views[0].camera.K[0, 0] == 10 and any(note in n for n in scene.notes)
-
-
-def test_llff_small_images_are_resampled_further(tmp_path):
+    for downscale in (1, 2):
+        scene = load_scene(tmp_path, downscale=downscale)
+        assert (scene.views[0].camera.width, scene.views[0].camera.height) == (8, 6)
+        assert scene.views[0].camera.K[0, 0] == 10 and any("images_2" in n for n in scene.notes)
+    with pytest.raises(UsageError, match="--downscale"):  # 2 x 2 px would be left
+        load_scene(tmp_path, downscale=4)
     rows = scenes.llff_rows()
     rows[:, [4, 9, 14]] *= 4  # made for 64 x 48
     np.save(tmp_path / "poses_bounds.npy", rows)
-    scenes.save_images(tmp_path / "images_4")
+    (tmp_path / "gone").rename(tmp_path / "images_4")
+    (tmp_path / "images_2").rename(tmp_path / "elsewhere")
     scene = load_scene(tmp_path, downscale=2)
     assert scene.views[0].camera.width == 8 and scene.views[0].camera.K[0, 0] == 10
     assert any("images_4, area-resampled by 2" in n for n in scene.notes)
@@ -207,18 +180,15 @@ def test_windows_line_ends_and_byte_order_mark(kind, tmp_path):
     assert load_scene(tmp_path).fingerprint == plain
 
 
-def test_rigs_and_frames_are_ignored(tmp_path):
+def test_other_files_of_a_reconstruction(tmp_path):
+    """Rigs and frames are not read; images without a pose are counted."""
     scenes.write_colmap(tmp_path)
     for name in ("rigs.bin", "frames.bin"):
         (tmp_path / "sparse" / "0" / name).write_bytes(b"\xff" * 9)
-    assert len(load_scene(tmp_path).views) == 5
-
-
-def test_images_without_a_pose_are_counted(tmp_path):
-    scenes.write_colmap(tmp_path)
-    scenes.save(tmp_path / "images" / "extra.png", scenes.image(0))
-    scenes.save(tmp_path / "images" / "._photo0.png", scenes.image(0))
-    assert any(n.startswith("1 files in images have no pose") for n in load_scene(tmp_path).notes)
+    for name in ("extra.png", "._photo0.png"):
+        scenes.save(tmp_path / "images" / name, scenes.image(0))
+    scene = load_scene(tmp_path)
+    assert len(scene.views) == 5 and any(n.startswith("1 files in images have no pose") for n in scene.notes)
 
 
 def test_outside_images_need_permission_and_get_harmless_names(tmp_path):
@@ -281,6 +251,9 @@ def test_colmap_lenses_are_kept(name, write, tmp_path):
     parameters, model, terms = COLMAP[name]
     scene = load_scene(write(tmp_path, model=name, parameters=parameters), lenses="native")
     lands(scene, model, terms)
+    if len(parameters) > 3 and parameters[:2] == (F, F):  # both focal lengths are read
+        write(tmp_path, model=name, parameters=(F, F + 1, *parameters[2:]))
+        assert np.diag(load_scene(tmp_path, lenses="native").views[0].camera.K).tolist() == [F, F + 1, 1]
     notes = [n for n in scene.notes if "lens" in n]
     assert notes == ([] if model == "pinhole" else [f"5 images kept with the distortion of their lens ({name})"])
 
@@ -372,16 +345,16 @@ def test_dark_pixels_around_objects_and_in_holes_are_transparent(tmp_path):
     assert not any("object on black" in n for n in plain.notes) and scene.fingerprint != plain.fingerprint
 
 
-@pytest.mark.parametrize("what", ["a bright image", "a mask", "an alpha channel"])
-def test_one_view_that_differs_leaves_all_as_they_are(what, tmp_path):
-    write(tmp_path, [ring(i) for i in range(5)])
-    if what == "a bright image":
-        scenes.save(tmp_path / scenes.NAMES[4], np.full((36, 48, 3), 90, np.uint8))
-    elif what == "a mask":
-        scenes.save(tmp_path / "masks" / "photo4.png", np.full((36, 48), 255, np.uint8))
-    else:
-        alpha = np.full((36, 48, 1), 255, np.uint8)
-        alpha[0] = 9
-        scenes.save(tmp_path / scenes.NAMES[4], np.concatenate([ring(4), alpha], axis=2))
-    scene = load_scene(tmp_path)
-    assert all(v.alpha is None for v in scene.views[:4]) and not any("object on black" in n for n in scene.notes)
+def test_one_view_that_differs_leaves_all_as_they_are(tmp_path):
+    """By a bright image, an alpha channel, or a mask."""
+    alpha = np.full((36, 48, 1), 255, np.uint8)
+    alpha[0] = 9
+    for name, image in (
+        (scenes.NAMES[4], np.full((36, 48, 3), 90, np.uint8)),
+        (scenes.NAMES[4], np.concatenate([ring(4), alpha], axis=2)),
+        ("masks/photo4.png", np.full((36, 48), 255, np.uint8)),
+    ):
+        write(tmp_path, [ring(i) for i in range(5)])
+        scenes.save(tmp_path / name, image)
+        scene = load_scene(tmp_path)
+        assert all(v.alpha is None for v in scene.views[:4]) and not any("object on black" in n for n in scene.notes)

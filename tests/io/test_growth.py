@@ -102,22 +102,19 @@ def test_cameras_keep_all_names_unique(tmp_path):
     assert list(found) == ["a", "a-2", "a-3", "a-4", "a-2-2", "b"]
 
 
-def test_points_and_poses_of_colmap(tmp_path):
-    def make(n):
+def test_points_of_colmap_and_parameters_of_middlebury(tmp_path):
+    def points(n):
         path = tmp_path / f"{n}.txt"
         path.write_text("".join(f"{i} 0 0 1 9 9 9 0.1 1 0 2 0\n" for i in range(n)))
         return lambda: colmap.read_points(path, {1: "a", 2: "b"})
 
-    grows(make)
-
-
-def test_parameters_of_middlebury(tmp_path):
-    def make(n):
+    def parameters(n):
         path = tmp_path / f"{n}_par.txt"
         path.write_text(f"{n}\n" + "".join(f"{i}.png {'1 ' * 21}\n" for i in range(n)))
         return lambda: others.read_camera_rows(path)
 
-    grows(make)
+    grows(points)
+    grows(parameters)
 
 
 def scene(n):
@@ -144,14 +141,14 @@ def test_splits_by_names(form):
     ("c.png", "could be any of a/b/c.png, b/c.png"), ("/c.png", "no view"), ("", "no view"), ("f" * 9999, "no view"),
 ])  # fmt: skip
 def test_names_are_found_by_their_ends(wanted, found):
-    from warpgs.io.load import _Names
+    from warpgs.io.load import _finder
 
-    names = _Names(["a/b/c.png", "b/c.png", "x/d/e.png", "f" * 5000], "s")
+    find = _finder(["a/b/c.png", "b/c.png", "x/d/e.png", "f" * 5000], "s")
     if " " in found:
         with pytest.raises(DataError, match=found):
-            names.find(wanted)
+            find(wanted)
     else:
-        assert names.find(wanted) == found
+        assert find(wanted) == found
 
 
 def test_views_of_a_scene():

@@ -8,7 +8,7 @@ import zlib
 import cv2
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, ImageOps
 
 from tests.io import scenes
 from warpgs.errors import DataError, ResourceError, UsageError
@@ -50,15 +50,13 @@ def test_every_kind_of_png_is_decoded(mode, tmp_path):
     np.testing.assert_allclose(color, expected, atol=1e-6)
 
 
-@pytest.mark.parametrize("suffix", ["JPEG", "PNG", "BMP", "TIFF", "WEBP"])
-@pytest.mark.parametrize("kept", [0.0, 0.02, 0.5, 0.9])
-def test_truncated_images_are_named(suffix, kept, tmp_path):
-    data = io.BytesIO()
-    Image.fromarray(np.random.default_rng(0).integers(0, 255, (48, 64, 3), np.uint8)).save(data, suffix)
-    path = tmp_path / f"a.{suffix.lower()}"
-    path.write_bytes(data.getvalue()[: int(kept * len(data.getvalue()))])
-    with pytest.raises(DataError, match=rf"{path.name}: the image cannot be decoded.*Restore"):
-        decode(path)
+@pytest.mark.parametrize("kind", ["JPEG", "PNG", "BMP", "TIFF", "WEBP", "AVIF"])
+def test_truncated_images_are_named(kind, tmp_path):
+    path, data = tmp_path / f"a.{kind.lower()}", encoded(kind)
+    for kept in (0.0, 0.02, 0.5, 0.9, 0.999):
+        path.write_bytes(data[: int(kept * len(data))])
+        with pytest.raises(DataError, match=rf"{path.name}: the image cannot be decoded: \w.*Restore"):
+            decode(path)
 
 
 def test_missing_and_non_finite_images(tmp_path):
@@ -70,23 +68,15 @@ def test_missing_and_non_finite_images(tmp_path):
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))
-def test_exif_never_turns_a_raster_that_fits(orientation, tmp_path):
-    exif = Image.Exif()
-    exif[0x112] = orientation
-    Image.fromarray(scenes.image(0)).save(tmp_path / "a.png", exif=exif)
-    loaded = load_image(tmp_path / "a.png", lens(16, 12), ReadOptions())
-    np.testing.assert_allclose(loaded.image, scenes.image(0) / 255, atol=1e-6)
-    assert loaded.done == ()
-
-
-@pytest.mark.parametrize("orientation", range(1, 9))
 def test_exif_turns_only_what_fits_turned(orientation, tmp_path):
-    from PIL import ImageOps
-
+    """A raster that fits its camera as it is stored is never turned."""
     exif = Image.Exif()
     exif[0x112] = orientation
     path = tmp_path / "a.png"
     Image.fromarray(scenes.image(0)).save(path, exif=exif)
+    loaded = load_image(path, lens(16, 12), ReadOptions())
+    np.testing.assert_allclose(loaded.image, scenes.image(0) / 255, atol=1e-6)
+    assert loaded.done == ()
     mask = np.arange(12 * 16).reshape(12, 16) % 3 > 0
     if orientation < 5:
         with pytest.raises(DataError, match=r"a.png: the image is 16 x 12 px, its camera 12 x 16.*Give the images"):
@@ -120,16 +110,11 @@ def test_resampling_is_an_area_mean_with_exact_intrinsics(factor, tmp_path):
     np.testing.assert_allclose(loaded.K[[0, 1, 0, 1], [0, 1, 2, 2]], np.array([30, 30, 18, 12]) / factor)
 
 
-def test_uneven_resampling_scales_each_axis_by_itself(tmp_path):
-    scenes.save(tmp_path / "a.png", scenes.image(0, 35, 26))
-    loaded = load_image(tmp_path / "a.png", lens(35, 26), ReadOptions(downscale=3))
-    assert loaded.image.shape == (9, 12, 3)
-    np.testing.assert_allclose(loaded.K[[0, 1], [0, 1]], [20 * 12 / 35, 20 * 9 / 26])
-
-
-@pytest.mark.parametrize("downscale,side,size", [(1, 17, (17, 13)), (2, 17, (17, 13)), (2, 18, (18, 13)), (1, 0, (35, 26))])
-def test_a_longest_side_bounds_an_image_and_scales_each_axis_of_its_camera(downscale, side, size, tmp_path):
-    """It holds after the factor; an image within it is untouched by it, and nothing is said."""
+@pytest.mark.parametrize(
+    "downscale,side,size", [(1, 17, (17, 13)), (2, 17, (17, 13)), (2, 18, (18, 13)), (3, 0, (12, 9)), (1, 0, (35, 26))]
+)
+def test_a_factor_and_a_longest_side_scale_each_axis_of_the_camera(downscale, side, size, tmp_path):
+    """The side holds after the factor; an image within it is untouched by it, and nothing is said."""
     scenes.save(tmp_path / "a.png", scenes.image(0, 35, 26))
     loaded = load_image(tmp_path / "a.png", lens(35, 26), ReadOptions(downscale=downscale, max_side=side))
     assert loaded.image.shape == (*size[::-1], 3)
@@ -137,12 +122,9 @@ def test_a_longest_side_bounds_an_image_and_scales_each_axis_of_its_camera(downs
         loaded.K[[0, 1, 0, 1], [0, 1, 2, 2]], [20 * size[0] / 35, 20 * size[1] / 26, *np.array(size) / 2]
     )
     assert any("17 px on the longer side; change it with --max-side" in d for d in loaded.done) == (side == 17)
-
-
-def test_a_longest_side_that_leaves_nothing_is_refused(tmp_path):
-    scenes.save(tmp_path / "a.png", scenes.image(0, 35, 26))
-    with pytest.raises(UsageError, match=r"--max-side 4 leaves 4 x 3 px of .*a\.png"):
-        load_image(tmp_path / "a.png", lens(35, 26), ReadOptions(max_side=4))
+    for wrong, flag in (({"max_side": 4}, "--max-side 4 leaves 4 x 3"), ({"downscale": 9}, "--downscale 9 leaves 4 x 3")):
+        with pytest.raises(UsageError, match=rf"{flag} px of .*a\.png.*Choose a smaller factor"):
+            load_image(tmp_path / "a.png", lens(35, 26), ReadOptions(**wrong))
 
 
 def distort(x, y, k1, k2, p1, p2, k3=0.0):
@@ -191,33 +173,6 @@ def test_a_lens_that_folds_back_is_masked_there(tmp_path):
     assert not loaded.mask[radius2 > 1 / 1.5].any() and loaded.mask[radius2 < 0.6].all()
 
 
-@pytest.mark.parametrize(
-    "model,parameters,terms",
-    [
-        ("SIMPLE_PINHOLE", (20, 8, 6), ()),
-        ("PINHOLE", (20, 21, 8, 6), ()),
-        ("SIMPLE_RADIAL", (20, 8, 6, 0.1), (0.1, 0, 0, 0)),
-        ("RADIAL", (20, 8, 6, 0.1, 0.2), (0.1, 0.2, 0, 0)),
-        ("OPENCV", (20, 21, 8, 6, 0.1, 0.2, 0.01, 0.02), (0.1, 0.2, 0.01, 0.02)),
-    ],
-)
-@pytest.mark.parametrize("files", [scenes.colmap_bin, scenes.colmap_txt])
-def test_colmap_models(model, parameters, terms, files, tmp_path):
-    from warpgs.io.colmap import read_cameras
-
-    scenes.write_files(tmp_path, files(model, parameters))
-    (found,) = read_cameras(next(tmp_path.glob("cameras.*"))).values()
-    fy = 21.0 if model in ("PINHOLE", "OPENCV") else 20.0
-    np.testing.assert_array_equal(found.K, [[20, 0, 8], [0, fy, 6], [0, 0, 1]])
-    assert (found.distortion, found.width, found.height) == (terms, 16, 12)
-
-
-def test_distortion_is_noted_once_per_model(tmp_path):
-    scene = load_scene(scenes.write_colmap(tmp_path, model="SIMPLE_RADIAL", parameters=(20, 8, 6, 0.5)))
-    assert "5 images undistorted (SIMPLE_RADIAL)" in scene.notes
-    assert scene.views[0].mask is not None
-
-
 @pytest.mark.parametrize("name", ["photo0.png", "photo0.png.png"])
 @pytest.mark.parametrize("keeps", ["white", "black"])
 def test_masks_folder(name, keeps, tmp_path):
@@ -228,11 +183,8 @@ def test_masks_folder(name, keeps, tmp_path):
     scene = load_scene(tmp_path, mask_keeps=keeps)
     assert (scene.views[0].mask == ((mask > 0) == (keeps == "white"))).all() and scene.views[1].mask is None
     assert "1 image masked by a mask file" in scene.notes
-    kept = "75.0%" if keeps == "white" else "25.0%"
-    assert (
-        f"masks keep {kept} of the pixels, the {keeps} ones (--mask-keeps {keeps}); the others are ignored (--masks ignore)"
-        in (scene.notes)
-    )
+    kept = f"masks keep {'75.0%' if keeps == 'white' else '25.0%'} of the pixels, the {keeps} ones (--mask-keeps {keeps})"
+    assert f"{kept}; the others are ignored (--masks ignore)" in scene.notes
     half = load_scene(tmp_path, downscale=2, mask_keeps=keeps).views[0].mask
     assert (half == ((mask[::2, ::2] > 0) == (keeps == "white"))).all()
 
@@ -315,12 +267,6 @@ def test_alpha_is_freed_of_distortion_with_its_image(tmp_path):
     assert np.abs(straight.alpha - loaded.alpha)[0].max() > 0.5 and loaded.mask is not None
 
 
-def test_an_image_that_shows_nothing_is_named(tmp_path):
-    scenes.write_colmap(tmp_path)
-    scenes.save(tmp_path / "images" / "photo0.png", rgba(0, np.zeros((12, 16), np.uint8)))
-    assert "1 image wholly transparent, showing nothing" in load_scene(tmp_path).notes
-
-
 def test_masks_cut_out(tmp_path):
     """Gray is transparent in part; an alpha channel counts too; masks that keep nothing or everything are named."""
     scenes.write_colmap(tmp_path)
@@ -370,15 +316,10 @@ def test_masks_that_cannot_be_used(tmp_path):
     assert load_scene(tmp_path).views[0].mask.all()
 
 
-@pytest.mark.parametrize("downscale", [0, -1, 2.0, True, "2"])
-def test_downscale_must_be_a_positive_whole_number(downscale, tmp_path):
-    with pytest.raises(UsageError, match="--downscale must be a whole number of at least 1"):
-        load_scene(scenes.write_colmap(tmp_path), downscale=downscale)
-
-
-def test_downscale_that_leaves_nothing(tmp_path):
-    with pytest.raises(UsageError, match=r"--downscale 8 leaves 2 x 2 px of .*photo0.png.*Choose a smaller factor"):
-        load_scene(scenes.write_colmap(tmp_path), downscale=8)
+def test_downscale_must_be_a_positive_whole_number(tmp_path):
+    for downscale in (0, -1, 2.0, True, "2"):
+        with pytest.raises(UsageError, match="--downscale must be a whole number of at least 1"):
+            load_scene(tmp_path, downscale=downscale)
 
 
 # Images are taken whole or not at all: damage that a checksum, a decoder or the sizes in the file show is refused.
@@ -484,17 +425,17 @@ def test_big_tiff_and_tiles_are_read(order, tmp_path):
 
 
 @pytest.mark.parametrize("options", [{}, {"progressive": True}, {"restart_marker_blocks": 8}])
-@pytest.mark.parametrize("part", [(0.4, 0.6), (0.5, 0.99)])
-def test_a_jpeg_whose_coded_data_is_zeroed(options, part, tmp_path):
+def test_a_jpeg_whose_coded_data_is_zeroed_or_ends_early_or_is_of_another_size(options, tmp_path):
     data = encoded("JPEG", **options)
-    refused(tmp_path, zeroed(data[:-2], *part) + data[-2:], "decoded")
-
-
-@pytest.mark.parametrize("kept", [0.5, 0.9, 0.99])
-@pytest.mark.parametrize("options", [{}, {"progressive": True}])
-def test_a_jpeg_that_lacks_coded_data_behind_a_kept_end_marker(options, kept, tmp_path):
-    data = encoded("JPEG", **options)
-    refused(tmp_path, data[: int(kept * len(data))] + data[-2:], "decoded")
+    for part in ((0.4, 0.6), (0.5, 0.99)):
+        refused(tmp_path, zeroed(data[:-2], *part) + data[-2:], "decoded")
+    if "restart_marker_blocks" in options:
+        return
+    for kept in (0.5, 0.9, 0.99):
+        refused(tmp_path, data[: int(kept * len(data))] + data[-2:], "decoded")
+    at = data.index(b"\xff\xc2" if options else b"\xff\xc0") + 5
+    for height, width in ((72, 96), (48, 96), (64, 128), (64, 80)):
+        refused(tmp_path, data[:at] + struct.pack(">HH", height, width) + data[at + 4 :], "decoded")
 
 
 def test_a_progressive_jpeg_that_lacks_scans(tmp_path):
@@ -505,26 +446,10 @@ def test_a_progressive_jpeg_that_lacks_scans(tmp_path):
         refused(tmp_path, data[:at] + b"\xff\xd9", "some of its scans are missing")
 
 
-@pytest.mark.parametrize("height,width", [(72, 96), (48, 96), (64, 128), (64, 80)])
-@pytest.mark.parametrize("options", [{}, {"progressive": True}])
-def test_a_jpeg_of_another_size_than_its_header_says(height, width, options, tmp_path):
-    data = bytearray(encoded("JPEG", **options))
-    at = data.index(b"\xff\xc2" if options else b"\xff\xc0") + 5
-    data[at : at + 4] = struct.pack(">HH", height, width)
-    refused(tmp_path, bytes(data), "decoded")
-
-
 # ---- PNG, BMP, WebP --------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("at", [0.1, 0.3, 0.5, 0.7, 0.9])
-def test_a_png_with_one_wrong_bit(at, tmp_path):
-    data = bytearray(encoded("PNG"))
-    data[int(at * len(data))] ^= 4
-    refused(tmp_path, bytes(data), "checksum of its part IDAT does not match")
-
-
-def test_a_png_that_lacks_a_part_or_whose_pixels_have_another_checksum(tmp_path):
+def test_a_png_that_lacks_a_part_or_has_a_wrong_bit_or_checksum(tmp_path):
     rows = bytes(13) * 8
     good = png(12, 8, rows)
     (tmp_path / "a.png").write_bytes(good)
@@ -534,8 +459,13 @@ def test_a_png_that_lacks_a_part_or_whose_pixels_have_another_checksum(tmp_path)
     refused(tmp_path, good.replace(whole, b""), "pixels are damaged")
     refused(tmp_path, good.replace(whole, chunk(b"IDAT", packed[:-5])), "decoded")
     refused(tmp_path, good.replace(whole, chunk(b"IDAT", packed[:-1] + b"\x77")), "decoded")
+    refused(tmp_path, good.replace(whole, whole[:-1] + b"\x77"), "decoded")
     refused(tmp_path, png(12, 9, rows), "decoded")
-    refused(tmp_path, good[:-12], "it ends early")
+    refused(tmp_path, good[:-12], "decoded")
+    for at in (0.1, 0.3, 0.5, 0.7, 0.9):
+        data = bytearray(encoded("PNG"))
+        data[int(at * len(data))] ^= 4
+        refused(tmp_path, bytes(data), "decoded")
 
 
 def test_a_bmp_or_webp_that_is_shorter_than_its_header_says(tmp_path):
@@ -552,12 +482,9 @@ def test_a_bmp_or_webp_that_is_shorter_than_its_header_says(tmp_path):
 # ---- TIFF ------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("compression", ["tiff_lzw", "tiff_adobe_deflate", "tiff_deflate"])
-def test_a_compressed_tiff_with_a_zeroed_middle(compression, tmp_path):
-    refused(tmp_path, zeroed(encoded("TIFF", compression=compression), 0.4, 0.6), "damaged")
-
-
-def test_a_compressed_tiff_of_16_bits_with_a_zeroed_middle(tmp_path):
+def test_a_compressed_tiff_with_a_zeroed_middle(tmp_path):
+    for compression in ("tiff_lzw", "tiff_adobe_deflate", "tiff_deflate"):
+        refused(tmp_path, zeroed(encoded("TIFF", compression=compression), 0.4, 0.6), "damaged")
     ok, data = cv2.imencode(".tif", np.asarray(photo()).astype(np.uint16) * 257, [cv2.IMWRITE_TIFF_COMPRESSION, 5])
     assert ok
     refused(tmp_path, zeroed(data.tobytes(), 0.4, 0.6), "decoded")
@@ -636,9 +563,9 @@ def test_no_memory_for_an_image_is_no_damage(tmp_path, monkeypatch):
         decode(path)
 
 
-@pytest.mark.parametrize("data", [b"", b"P5 2 2 255 abcd", b"GIF89a" + bytes(20)])
-def test_other_files_are_no_images(data, tmp_path):
-    refused(tmp_path, data, "it is (empty|not a JPEG, PNG, BMP, TIFF, WebP or AVIF file)")
+def test_other_files_are_no_images(tmp_path):
+    for data in (b"", b"P5 2 2 255 abcd", b"GIF89a" + bytes(20)):
+        refused(tmp_path, data, "it is (empty|not a JPEG, PNG, BMP, TIFF, WebP or AVIF file)")
 
 
 # AVIF: decoded whole or not at all, with what EXIF says of the lens and nothing of it in the copy.
@@ -660,34 +587,17 @@ def avif(orientation: int = 1, alpha: int | None = None) -> bytes:
     return out.getvalue()
 
 
-def test_colours_are_those_of_the_photograph(tmp_path):
-    (tmp_path / "a.jpg").write_bytes(avif())  # the first bytes decide
-    color, alpha = decode(tmp_path / "a.jpg")
-    assert color.shape == (64, 96, 3) and color.dtype == np.float32 and alpha is None
-    np.testing.assert_allclose(color[4:28, 4:44].mean((0, 1)), RED, atol=0.04)
-    np.testing.assert_allclose(color[36:, 4:44].mean((0, 1)), GRAY, atol=0.04)
-    np.testing.assert_allclose(color[4:28, 52:].mean((0, 1)), GRAY, atol=0.04)
-
-
-def test_alpha_is_straight(tmp_path):
-    (tmp_path / "a.avif").write_bytes(avif(alpha=128))
-    color, alpha = decode(tmp_path / "a.avif")
-    np.testing.assert_allclose(alpha, 128 / 255, atol=0.01)
-    np.testing.assert_allclose(color[4:28, 4:44].mean((0, 1)), RED, atol=0.04)
-
-
-@pytest.mark.parametrize("part", [0.02, 0.1, 0.5, 0.999])
-def test_a_file_that_ends_early_is_refused(tmp_path, part):
-    whole = avif()
-    (tmp_path / "a.avif").write_bytes(whole[: int(part * len(whole))])
-    with pytest.raises(DataError, match=r"a\.avif: the image cannot be decoded: \w.*Restore it"):
-        decode(tmp_path / "a.avif")
-
-
-def test_too_many_pixels_are_refused_by_the_header(tmp_path):
-    (tmp_path / "a.avif").write_bytes(avif())
+def test_an_avif_has_its_colours_and_straight_alpha_and_is_bounded(tmp_path):
+    path = tmp_path / "a.jpg"  # the first bytes decide
+    for given in (None, 128):
+        path.write_bytes(avif(alpha=given))
+        color, alpha = decode(path)
+        assert color.shape == (64, 96, 3) and color.dtype == np.float32 and (alpha is None) == (given is None)
+        assert alpha is None or np.abs(alpha - 128 / 255).max() < 0.01
+        for part, wanted in ((color[4:28, 4:44], RED), (color[36:, 4:44], GRAY), (color[4:28, 52:], GRAY)):
+            np.testing.assert_allclose(part.mean((0, 1)), wanted, atol=0.04)
     with pytest.raises(DataError, match=r"96 x 64 px, more than the limit of 100 pixels"):
-        decode(tmp_path / "a.avif", 100)
+        decode(path, 100)
 
 
 def test_a_photograph_is_copied_upright_without_what_it_says_of_its_owner(tmp_path):
@@ -715,23 +625,16 @@ def test_a_photograph_is_copied_upright_without_what_it_says_of_its_owner(tmp_pa
 FTYP = b"\0\0\0\x1cftyp"
 
 
-@pytest.mark.parametrize(
-    "name,data,words",
-    [
-        (
-            "a.heic",
-            FTYP + b"heic\0\0\0\0mif1heic" + bytes(40),
-            "a HEIC photograph, which is supported only for finding poses.*JPEG",
-        ),
+def test_the_format_and_its_remedy_are_named(tmp_path):
+    for name, data, words in (
+        ("a.heic", FTYP + b"heic\0\0\0\0mif1heic" + bytes(40), "a HEIC photograph, .* only for finding poses.*JPEG"),
         ("a.jpg", FTYP + b"mif1", "a HEIC photograph"),  # truncated, under another name
         ("a.DNG", b"II*\0" + bytes(60), "a RAW file.*convert"),
         ("a.cr3", FTYP + b"crx ", "a RAW file"),
-    ],
-)
-def test_the_format_and_its_remedy_are_named(name, data, words, tmp_path):
-    (tmp_path / name).write_bytes(data)
-    with pytest.raises(DataError, match=rf"{name}: is {words}"):
-        decode(tmp_path / name)
+    ):
+        (tmp_path / name).write_bytes(data)
+        with pytest.raises(DataError, match=rf"{name}: is {words}"):
+            decode(tmp_path / name)
 
 
 def test_a_folder_of_raw_files_is_told_from_an_empty_one(tmp_path):

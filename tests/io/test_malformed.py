@@ -28,38 +28,25 @@ def test_folders_that_hold_no_scene(tmp_path):
     refused(tmp_path / "a.txt", "a.txt: is a file; give a folder")
 
 
-@pytest.mark.parametrize("kind", ["cameras", "images"])
-def test_a_lone_broken_colmap_names_what_is_missing(kind, tmp_path):
-    scenes.write_colmap(tmp_path)
-    (tmp_path / "sparse" / "0" / f"{kind}.bin").unlink()
-    refused(tmp_path, rf"the COLMAP reconstruction in sparse/0 lacks {kind}.bin, and no other format was found. Copy")
-
-
 def test_the_complete_format_is_taken_with_a_note(tmp_path):
+    """Of several complete ones, the first; alone, what a broken one lacks is named."""
     scenes.write_colmap(tmp_path)
     (tmp_path / "sparse" / "0" / "images.bin").unlink()
+    refused(tmp_path, "the COLMAP reconstruction in sparse/0 lacks images.bin, and no other format was found. Copy")
     scenes.write_llff(tmp_path)
     scene = load_scene(tmp_path)
     assert scene.format == "llff"
     assert scene.notes[0] == "the COLMAP reconstruction in sparse/0 lacks images.bin; llff is complete and is used instead"
-
-
-def test_a_complete_reconstruction_elsewhere_is_found(tmp_path):
-    scenes.write_files(tmp_path / "sparse" / "0", {"points3D.bin": b""})
     scenes.write_colmap_txt(tmp_path)
-    assert colmap.model_folder(tmp_path) == tmp_path / "sparse" and detect(tmp_path)[0].name == "colmap"
+    assert colmap.reconstruction(tmp_path)[0] == tmp_path / "sparse"
+    reader, notes = detect(tmp_path)
+    assert (reader.name, notes) == ("colmap", ["the folder also holds llff: colmap is used"])
 
 
 def test_the_folder_itself_may_be_the_reconstruction(tmp_path):
     scenes.write_files(tmp_path, scenes.colmap_bin())
     scenes.save_images(tmp_path / "images")
     assert len(load_scene(tmp_path).views) == 5
-
-
-def test_formats_passed_over_are_noted(tmp_path):
-    scenes.write_transforms(scenes.write_colmap(tmp_path))
-    reader, notes = detect(tmp_path)
-    assert (reader.name, notes) == ("colmap", ["the folder also holds transforms: colmap is used"])
 
 
 @pytest.mark.parametrize("kind,lack", [("colmap", "images"), ("llff", "images"), ("dtu", "image")])
@@ -89,41 +76,30 @@ def test_every_truncation_is_noticed(name, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["cameras.bin", "images.bin", "points3D.bin"])
-@pytest.mark.parametrize("count", [100, 2**40, 2**64 - 1])
-def test_counts_that_the_file_cannot_hold(name, count, tmp_path):
+def test_counts_that_the_file_does_not_hold(name, tmp_path):
+    """Too many are refused before a record is read; too few leave bytes over."""
     files = scenes.colmap_bin()
-    files[name] = struct.pack("<Q", count) + files[name][8:]
-    scenes.write_files(tmp_path, files)
-    # refused at once, before a single record is read
-    with pytest.raises(DataError, match=rf"{name}: announces {count:,} records but holds bytes for at most \d+"):
-        read_all(tmp_path, "bin")
-
-
-@pytest.mark.parametrize("name", ["cameras.bin", "images.bin", "points3D.bin"])
-def test_counts_that_leave_bytes_over(name, tmp_path):
-    files = scenes.colmap_bin()
-    (count,) = struct.unpack_from("<Q", files[name])
-    files[name] = struct.pack("<Q", count - 1) + files[name][8:]
-    scenes.write_files(tmp_path, files)
-    with pytest.raises(DataError, match=rf"{name}: \d+ bytes follow the last record, so its count of records is wrong. Copy"):
-        read_all(tmp_path, "bin")
-
-
-def test_track_and_observation_lengths_are_bounded(tmp_path):
-    files = scenes.colmap_bin()
+    (right,) = struct.unpack_from("<Q", files[name])
+    for count, words in (
+        *((c, rf"announces {c:,} records but holds bytes for at most \d+") for c in (100, 2**40, 2**64 - 1)),
+        (right - 1, r"\d+ bytes follow the last record, so its count of records is wrong. Copy"),
+    ):
+        scenes.write_files(tmp_path, files | {name: struct.pack("<Q", count) + files[name][8:]})
+        with pytest.raises(DataError, match=f"{name}: {words}"):
+            read_all(tmp_path, "bin")
     points = bytearray(files["points3D.bin"])
-    points[8 + 43 : 8 + 51] = struct.pack("<Q", 2**62)
+    points[8 + 43 : 8 + 51] = struct.pack("<Q", 2**62)  # the length of a track
     scenes.write_files(tmp_path, files | {"points3D.bin": bytes(points)})
     with pytest.raises(DataError, match=r"points3D.bin: the file ends in the middle of a record"):
         read_all(tmp_path, "bin")
 
 
-@pytest.mark.parametrize("model,name", [(5, "OPENCV_FISHEYE"), (77, "77"), (-1, "-1")])
-def test_unknown_lens_models(model, name, tmp_path):
+def test_unknown_lens_models(tmp_path):
     scenes.write_colmap(tmp_path)
     path = tmp_path / "sparse" / "0" / "cameras.bin"
-    path.write_bytes(path.read_bytes()[:12] + struct.pack("<i", model) + path.read_bytes()[16:])
-    refused(tmp_path, rf"cameras.bin: camera model {name} is not supported \(supported: SIMPLE_PINHOLE.*image_undistorter")
+    for model, name in ((5, "OPENCV_FISHEYE"), (77, "77"), (-1, "-1")):
+        path.write_bytes(path.read_bytes()[:12] + struct.pack("<i", model) + path.read_bytes()[16:])
+        refused(tmp_path, rf"cameras.bin: camera model {name} is not supported \(supported: SIMPLE_PINHOLE.*image_undistorter")
 
 
 @pytest.mark.parametrize(
@@ -131,7 +107,10 @@ def test_unknown_lens_models(model, name, tmp_path):
     [
         ((0, 20, 8, 6), (16, 12), "focal lengths"),
         ((np.nan, 20, 8, 6), (16, 12), "focal lengths"),
-        ((20, -20, 8, 6), (16, 12), "focal lengths"),
+        ((20, -20, 8, 6), (16, 12), "focal lengths .* calibrate again"),
+        ((1e-320, 20, 8, 6), (16, 12), "focal lengths"),
+        ((1e-3, 20, 8, 6), (16, 12), "focal lengths"),
+        ((1e300, 20, 8, 6), (16, 12), "focal lengths"),
         ((20, 20, np.inf, 6), (16, 12), "principal point"),
         ((20, 20, 8, 6), (0, 12), "image size 0 x 12"),
         ((20, 20, 8, 6), (2**63, 12), "image size 9223372036854775808 x 12"),
@@ -143,31 +122,23 @@ def test_impossible_cameras(write, parameters, size, message, tmp_path):
     refused(write(tmp_path, parameters=parameters, size=size), rf"(cameras\.(bin|txt).*camera 1: .*|photo0.png: .*){message}")
 
 
-def test_impossible_distortion(tmp_path):
+def test_distortion_of_nothing_and_of_too_much(tmp_path):
     scenes.write_colmap(tmp_path, model="SIMPLE_RADIAL", parameters=(20, 8, 6, 1e300))
     refused(tmp_path, r"camera 1: distortion .*1e\+300")
+    for k1 in (1e-320, 5e-324, -1e-320, 1e-100):
+        scene = load_scene(scenes.write_colmap(tmp_path, model="SIMPLE_RADIAL", parameters=(20, 8, 6, k1)))
+        assert scene.views[0].mask is None
+        np.testing.assert_allclose(scene.views[0].image, scenes.image(0) / 255, atol=1e-6)
 
 
-@pytest.mark.parametrize("k1", [1e-320, 5e-324, -1e-320, 1e-100])
-def test_distortion_next_to_nothing(k1, tmp_path):
-    scene = load_scene(scenes.write_colmap(tmp_path, model="SIMPLE_RADIAL", parameters=(20, 8, 6, k1)))
-    assert scene.views[0].mask is None
-    np.testing.assert_allclose(scene.views[0].image, scenes.image(0) / 255, atol=1e-6)
-
-
-@pytest.mark.parametrize("focal", [1e-320, 1e-3, 1e300])
-def test_focal_lengths_of_no_camera(focal, tmp_path):
-    refused(scenes.write_colmap(tmp_path, parameters=(focal, 20, 8, 6)), r"camera 1: focal lengths .* calibrate again")
-
-
-@pytest.mark.parametrize("far", [1.7e308, -1.7e308, 1e30])
-def test_points_beyond_all_measure(far, tmp_path):
+def test_points_beyond_all_measure(tmp_path):
     scenes.write_colmap(tmp_path)
     path = tmp_path / "sparse" / "0" / "points3D.bin"
-    data = bytearray(path.read_bytes())
-    data[16:24] = struct.pack("<d", far)
-    path.write_bytes(data)
-    refused(tmp_path, r"1 of 3 points are not finite, or farther than 1e\+12 times the extent of the cameras; remove them")
+    for far in (1.7e308, -1.7e308, 1e30):
+        data = bytearray(path.read_bytes())
+        data[16:24] = struct.pack("<d", far)
+        path.write_bytes(data)
+        refused(tmp_path, r"1 of 3 points are not finite, or farther than 1e\+12 times the extent of the cameras; remove them")
 
 
 def test_no_points_are_a_note(tmp_path):
@@ -228,6 +199,7 @@ def test_broken_poses_in_text(changes, message, tmp_path):
         ("cameras.txt", b"\xff\xfe", r"cameras.txt, line 1: cannot be understood"),
         ("images.txt", "1 1 0 0 0 0 0 3 1 photo0.png\n2 1 0 0 0 0 0 3 1 photo1.png\n", r"images.txt, line 2: expected"),
         ("images.txt", "", r"has 0 usable views.*at least 2"),
+        ("images.txt", "1 1 0 0 0 0 0 3 1 photo0.png\n\n", r"has 1 usable view.*at least 2. Add images"),
     ],
 )
 def test_broken_text_files(name, content, message, tmp_path):
@@ -245,10 +217,6 @@ def test_names_that_are_not_utf8(tmp_path):
     if sys.platform == "linux":  # where any bytes are a name
         image.rename(image.with_name("phot\udcff3.png"))
         assert "phot\udcff3.png" in [v.name for v in load_scene(tmp_path).views]
-
-
-def test_one_view_is_too_few(tmp_path):
-    refused(scenes.write_colmap(tmp_path, names=scenes.NAMES[:1]), r"the scene has 1 usable view.*at least 2. Add images")
 
 
 # ---- transforms ------------------------------------------------------------------------------------------------------
@@ -299,32 +267,28 @@ def test_broken_frames(changes, message, tmp_path):
     refused(broken_frame(tmp_path, **changes), message)
 
 
-@pytest.mark.parametrize("number", ["NaN", "Infinity", "-Infinity", "1e999"])
-def test_json_numbers_that_are_none(number, tmp_path):
-    scenes.write_transforms(tmp_path)
-    path = tmp_path / "transforms.json"
-    path.write_text(path.read_text().replace('"fl_x": 20.0', f'"fl_x": {number}'))
-    refused(tmp_path, r"transforms.json.*not a finite number")
-
-
 @pytest.mark.parametrize(
-    "text", ["", "{", "[]", "{}", '{"frames": 3}', "[" * 100000, '{"frames": [1]}', "\xff", '{"frames": []}']
-)
+    "text",
+    [
+        "", "{", "[]", "{}", '{"frames": 3}', "[" * 100000, '{"frames": [1]}', "\xff", '{"frames": []}',
+        *(f'{{"fl_x": {n}, "frames": []}}' for n in ("NaN", "Infinity", "-Infinity", "1e999")),
+    ],
+)  # fmt: skip
 def test_json_that_is_no_scene(text, tmp_path):
     (tmp_path / "transforms.json").write_bytes(text.encode("latin-1"))
-    refused(tmp_path, r"transforms.json|0 usable views")
+    refused(tmp_path, r"not a finite number" if "N" in text or "I" in text else r"transforms.json|0 usable views")
 
 
 NESTED = '{"a":' * 900 + "1" + "}" * 900
 
 
-@pytest.mark.parametrize("key", ["file_path", "mask_path", "transform_matrix", "fl_x", "camera_model", "ply_file_path", "x"])
-def test_json_that_is_nested_deep_or_huge(key, tmp_path, monkeypatch):
+def test_json_that_is_nested_deep_or_huge(tmp_path, monkeypatch):
     scenes.write_transforms(tmp_path)
     path = tmp_path / "transforms.json"
     text = path.read_text()
-    path.write_text(text.replace('"frames": [{', f'"{key}": {NESTED}, "frames": [{{"{key}": {NESTED}, ', 1))
-    refused(tmp_path, r"transforms.json: is nested deeper than 16 levels|transforms.json: cannot be read as JSON")
+    for key in ("file_path", "mask_path", "transform_matrix", "fl_x", "camera_model", "ply_file_path", "x"):
+        path.write_text(text.replace('"frames": [{', f'"{key}": {NESTED}, "frames": [{{"{key}": {NESTED}, ', 1))
+        refused(tmp_path, r"transforms.json: is nested deeper than 16 levels|transforms.json: cannot be read as JSON")
     path.write_text(text)
     monkeypatch.setattr("warpgs.io.transforms.MAX_BYTES", 100)
     refused(tmp_path, r"transforms.json: cannot be read .is larger than 100 bytes")
@@ -337,11 +301,9 @@ def test_no_focal_length(tmp_path):
     refused(tmp_path, r"frame 0 .*camera_angle_x is 4.0 rad, not between 0 and pi")
 
 
-def test_names_too_long_for_the_file_system(tmp_path):
+def test_names_that_no_file_has(tmp_path):
+    """Too long for the file system, and of half a character; the message is text all the same."""
     refused(broken_frame(tmp_path, file_path="x" * 300 + ".png"), r"cannot be read|usable views|no image file")
-
-
-def test_messages_are_json_safe(tmp_path):
     with pytest.raises(DataError) as caught:
         load_scene(broken_frame(tmp_path, file_path="\ud800.png"))
     json.dumps(str(caught.value)).encode()
@@ -349,20 +311,6 @@ def test_messages_are_json_safe(tmp_path):
 
 
 # Broken LLFF, DTU and Middlebury scenes, and broken images in any format, end in a message.
-
-
-def test_llff_counts_must_agree(tmp_path):
-    scenes.write_llff(tmp_path)
-    (tmp_path / "images" / "photo4.png").unlink()
-    refused(tmp_path, r"poses_bounds.npy: has 5 poses, but .*images holds 4 images.*Copy the scene again")
-
-
-def llff_with(tmp_path, row, column, value):
-    scenes.write_llff(tmp_path)
-    rows = scenes.llff_rows()
-    rows[row, column] = value
-    np.save(tmp_path / "poses_bounds.npy", rows)
-    return tmp_path
 
 
 @pytest.mark.parametrize(
@@ -373,25 +321,24 @@ def llff_with(tmp_path, row, column, value):
         (14, 0.0, r"'photo2.png': focal lengths"),
         (4, -12.0, r"'photo2.png': the camera's image size"),
         (9, 99.0, r"photo2.png: the image is 16 x 12 px, its camera 99 x 12"),
+        ([0, 5, 10], "mirrored", r"'photo2.png': the pose mirrors the scene \(determinant -1\); two axes are probably swapped"),
     ],
 )
 def test_llff_rows(column, value, message, tmp_path):
-    refused(llff_with(tmp_path, 2, column, value), message)
-
-
-def test_llff_mirrored(tmp_path):
     scenes.write_llff(tmp_path)
     rows = scenes.llff_rows()
-    rows[:, [0, 5, 10]] *= -1
+    rows[2, column] = -rows[2, column] if value == "mirrored" else value
     np.save(tmp_path / "poses_bounds.npy", rows)
-    refused(tmp_path, r"image 'photo0.png': the pose mirrors the scene \(determinant -1\); two axes are probably swapped")
+    refused(tmp_path, message)
 
 
-@pytest.mark.parametrize("array", [np.zeros((5, 16)), np.zeros(17), np.array([["a"] * 17] * 5), np.zeros((5, 17), complex)])
-def test_llff_arrays_of_another_kind(array, tmp_path):
+def test_llff_arrays_of_another_kind_or_length(tmp_path):
     scenes.write_llff(tmp_path)
-    np.save(tmp_path / "poses_bounds.npy", array)
-    refused(tmp_path, r"poses_bounds.npy: must be an array \[n, 17\] of numbers")
+    np.save(tmp_path / "poses_bounds.npy", scenes.llff_rows()[:4])
+    refused(tmp_path, r"poses_bounds.npy: has 4 poses, but .*images holds 5 images.*Copy the scene again")
+    for array in (np.zeros((5, 16)), np.zeros(17), np.array([["a"] * 17] * 5), np.zeros((5, 17), complex)):
+        np.save(tmp_path / "poses_bounds.npy", array)
+        refused(tmp_path, r"poses_bounds.npy: must be an array \[n, 17\] of numbers")
 
 
 @pytest.mark.parametrize("name,write", [("poses_bounds.npy", scenes.write_llff), ("cameras.npz", scenes.write_dtu)])
@@ -411,27 +358,17 @@ def test_numpy_files_that_are_none(name, write, tmp_path):
         refused(tmp_path, "is an archive of arrays, not one array")
 
 
-def test_numpy_headers_that_announce_more_than_there_is(tmp_path):
+def test_numpy_files_that_announce_more_than_there_is(tmp_path):
+    """Of an archive, zipfile makes ten times its size of a table of contents."""
     scenes.write_llff(tmp_path)
     with (tmp_path / "poses_bounds.npy").open("wb") as f:
         np.lib.format.write_array_header_1_0(f, {"descr": "<f8", "fortran_order": False, "shape": (10**13, 17)})
         f.write(b"\0" * 64)
     refused(tmp_path, r"poses_bounds.npy: cannot be read as a numpy array")
-
-
-def test_archives_beyond_any_number_of_cameras(tmp_path):
-    """zipfile makes ten times its size of a table of contents."""
-    scenes.write_dtu(tmp_path)
-    with (tmp_path / "cameras.npz").open("wb") as f:
+    scenes.write_dtu(tmp_path / "dtu")
+    with (tmp_path / "dtu" / "cameras.npz").open("wb") as f:
         f.truncate(2**24 + 1)
-    refused(tmp_path, r"cameras.npz: cannot be read as an archive of arrays \(OSError: .*is larger than 16 MiB")
-
-
-def dtu_with(tmp_path, **changes):
-    scenes.write_dtu(tmp_path)
-    matrices = {k: v for k, v in (scenes.dtu_matrices() | changes).items() if v is not None}
-    np.savez(tmp_path / "cameras.npz", **matrices)
-    return tmp_path
+    refused(tmp_path / "dtu", r"cameras.npz: cannot be read as an archive of arrays \(OSError: .*is larger than 16 MiB")
 
 
 SKEW = np.block([[np.array([[20, 5, 8], [0, 20, 6], [0, 0, 1.0]]), np.zeros((3, 1))], [np.zeros((1, 3)), np.ones((1, 1))]])
@@ -449,7 +386,10 @@ SKEW = np.block([[np.array([[20, 5, 8], [0, 20, 6], [0, 0, 1.0]]), np.zeros((3, 
     ],
 )
 def test_dtu_archives(changes, message, tmp_path):
-    refused(dtu_with(tmp_path, **changes), message)
+    scenes.write_dtu(tmp_path)
+    matrices = {k: v for k, v in (scenes.dtu_matrices() | changes).items() if v is not None}
+    np.savez(tmp_path / "cameras.npz", **matrices)
+    refused(tmp_path, message)
 
 
 @pytest.mark.parametrize(
@@ -480,4 +420,4 @@ def test_corrupt_images_are_named(kind, tmp_path):
     scenes.WRITERS[kind](tmp_path)
     path = sorted(tmp_path.rglob("*.png"))[2]
     path.write_bytes(path.read_bytes()[:60])
-    refused(tmp_path, rf"{path.name}: the image cannot be decoded: it ends within a chunk. Restore it")
+    refused(tmp_path, rf"{path.name}: the image cannot be decoded: .*Restore it")

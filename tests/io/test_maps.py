@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from tests.io import scenes
+from tests.io.scenes import refused
 from warpgs.errors import DataError, UsageError
 from warpgs.io.folder import image_ids
 from warpgs.io.images import LoadedImage, turn_upright
@@ -55,7 +56,7 @@ def test_depths_of_every_format_are_in_scene_units(kind, tmp_path):
 
 
 def test_missing_views_units_and_kinds(tmp_path):
-    """Views without a map have none; --depth-unit counts for all numbers; relative maps keep theirs."""
+    """Views without a map have none; --depth-unit counts for all numbers; relative maps keep theirs; NaN is no depth."""
     scene = scenes.write_colmap(tmp_path / "scene")
     write_maps(tmp_path / "maps", RAMP.astype(np.float32), scenes.NAMES[:2], ".npy")
     maps = tmp_path / "maps"
@@ -66,13 +67,13 @@ def test_missing_views_units_and_kinds(tmp_path):
     assert np.allclose(load_scene(scene, depths=maps, depth_unit=0.5).views[1].depth.values, 0.5 * RAMP * scale)
     relative = load_scene(scene, depths=maps, depth_kind="disparity").views[0].depth
     assert relative.kind == "disparity" and (relative.values == RAMP).all()
-
-
-def test_what_is_not_finite_or_zero_is_no_depth(tmp_path):
-    scene, values = scenes.write_colmap(tmp_path / "scene"), RAMP.astype(np.float32)
+    values = RAMP.astype(np.float32)
     values[0], values[1], values[2] = np.nan, np.inf, 0
-    found = load_scene(scene, depths=write_maps(tmp_path / "maps", values, suffix=".npy")).views[0].depth.values
+    found = load_scene(scene, depths=write_maps(tmp_path / "gaps", values, suffix=".npy")).views[0].depth.values
     assert (found[:3] == 0).all() and (found[3:] > 0).all()
+    for wrong in ({"depth_kind": "deep"}, {"normal_axes": "blender"}, {"depth_unit": 0}, {"depth_unit": float("nan")}):
+        with pytest.raises(UsageError):
+            load_scene(scene, **wrong)
 
 
 @pytest.mark.parametrize(("raw", "wanted"), [(np.float32(0.25), 0.25), (np.uint8(51), 0.2), (np.uint8(1), 0.5)])
@@ -85,6 +86,10 @@ def test_confidence_lies_beside_the_map(tmp_path, raw, wanted):
     found = load_scene(scene, depths=maps)
     assert found.views[0].depth.confidence is None
     assert np.allclose(found.views[1].depth.confidence[1:], wanted) and (found.views[1].depth.values[0] == 0).all()
+    for values, reason in ((np.full(SHAPE, 2.5, np.float32), "must be in"), (np.ones((2, 2), np.float32), "make both equal")):
+        np.save(maps / "photo1.confidence.npy", values)
+        with pytest.raises(DataError, match=f"photo1.confidence.npy.*{reason}"):
+            load_scene(scene, depths=maps)
 
 
 @pytest.mark.parametrize("suffix", [".png", ".npy"])
@@ -131,42 +136,24 @@ def test_a_bad_map_is_refused_with_view_and_reason(case, tmp_path):
         load_scene(scene, **{"normals" if normals else "depths": maps})
 
 
-def test_bad_confidence_is_refused(tmp_path):
-    scene, maps = scenes.write_colmap(tmp_path / "scene"), write_maps(tmp_path / "maps")
-    for values, reason in (
-        (np.full(SHAPE, 2.5, np.float32), "must be in"),
-        (np.ones((2, 2), np.float32), "make both equal in size"),
-    ):
-        np.save(maps / "photo1.confidence.npy", values)
-        with pytest.raises(DataError, match=f"photo1.confidence.npy.*{reason}"):
-            load_scene(scene, depths=maps)
-
-
 def test_folders_without_maps(tmp_path):
     """A missing folder, an empty one, other formats, other names, two files for one image, and objects that numpy pickles."""
     scene, maps = scenes.write_colmap(tmp_path / "scene"), tmp_path / "maps"
-    with pytest.raises(DataError, match="no such folder"):
-        load_scene(scene, depths=maps)
+    refused(scene, "no such folder", depths=maps)
     maps.mkdir()
-    with pytest.raises(DataError, match="holds no maps; add NPY"):
-        load_scene(scene, depths=maps)
+    refused(scene, "holds no maps; add NPY", depths=maps)
     (maps / "photo0.exr").write_bytes(b"v/1\1")
-    with pytest.raises(DataError, match=r"it holds \.exr files, which are not read"):
-        load_scene(scene, depths=maps)
+    refused(scene, r"it holds \.exr files, which are not read", depths=maps)
     write_maps(maps, names=("else.png",))
-    with pytest.raises(DataError, match="none of its 1 maps has the name of an image"):
-        load_scene(scene, depths=maps)
+    refused(scene, "none of its 1 maps has the name of an image", depths=maps)
     write_maps(maps)
     np.save(maps / "photo0.npy", RAMP)
-    with pytest.raises(DataError, match="is for the same image"):
-        load_scene(scene, depths=maps)
+    refused(scene, "is for the same image", depths=maps)
     (maps / "photo0.png").unlink()
     np.save(maps / "photo0.npy", np.array([{}], object))
-    with pytest.raises(DataError, match="cannot be read as a numpy array"):
-        load_scene(scene, depths=maps)
+    refused(scene, "cannot be read as a numpy array", depths=maps)
     (maps / "photo0.npy").rename(maps / "photo0.png")
-    with pytest.raises(DataError, match="is not a PNG"):
-        load_scene(scene, depths=maps)
+    refused(scene, "is not a PNG", depths=maps)
 
 
 def test_sizes_beyond_the_limit_and_links_are_refused(tmp_path):
@@ -186,13 +173,6 @@ def test_sizes_beyond_the_limit_and_links_are_refused(tmp_path):
         (maps / "photo0.npy").unlink()
         os.mkfifo(maps / "photo0.npy")
         assert load_scene(scene, depths=maps).views[0].depth is None  # no file, so no map
-
-
-def test_choices(tmp_path):
-    scene = scenes.write_colmap(tmp_path)
-    for wrong in ({"depth_kind": "deep"}, {"normal_axes": "blender"}, {"depth_unit": 0}, {"depth_unit": float("nan")}):
-        with pytest.raises(UsageError):
-            load_scene(scene, **wrong)
 
 
 def write_named(root, unit=None):
@@ -298,66 +278,49 @@ def black_rows(scene):
     return [np.flatnonzero(~v.score_mask.any(1)).tolist() for v in scene.views]
 
 
-@pytest.mark.parametrize("inner", ["", "mask"])
 @pytest.mark.parametrize("names", [scenes.NAMES, RECT])
-def test_masks_of_a_scene_folder_are_found_and_matched_by_id(tmp_path, names, inner):
-    """`idrmasks` in the scene folder, with or without DTU's inner `mask`; the fit keeps every pixel."""
-    scenes.write_colmap(tmp_path, names=names)
-    write_masks(tmp_path / "idrmasks" / inner)
-    scene = load_scene(tmp_path)
-    assert black_rows(scene) == [[i] for i in range(scenes.VIEWS)]
-    assert all(v.mask is None for v in scene.views)
-    assert any("matched by image id" in n for n in scene.notes)
-
-
-def test_masks_elsewhere_of_more_views_than_there_are(tmp_path):
-    """Masks of 64 images serve a scan of five, also from a folder elsewhere."""
-    scenes.write_colmap(tmp_path / "scene", names=RECT)
+def test_masks_of_a_scene_folder_are_found_and_matched_by_id(tmp_path, names):
+    """`idrmasks`, with or without DTU's inner `mask`, or a folder elsewhere with more masks; the fit keeps every pixel."""
+    scenes.write_colmap(tmp_path / "scene", names=names)
+    plain = load_scene(tmp_path / "scene")
     write_masks(tmp_path / "scan8" / "mask", range(8), "{:05d}.png")
-    scene = load_scene(tmp_path / "scene", score_masks=tmp_path / "scan8")
-    assert black_rows(scene) == [[i] for i in range(scenes.VIEWS)]
-    assert load_scene(tmp_path / "scene").views[0].score_mask is None
+    elsewhere = load_scene(tmp_path / "scene", score_masks=tmp_path / "scan8")
+    assert plain.views[0].score_mask is None
+    for inner in ("mask", ""):
+        write_masks(tmp_path / "scene" / "idrmasks" / inner)
+        scene = load_scene(tmp_path / "scene")
+        shutil.rmtree(tmp_path / "scene" / "idrmasks")
+        assert black_rows(scene) == black_rows(elsewhere) == [[i] for i in range(scenes.VIEWS)]
+        assert all(v.mask is None for v in scene.views) and any("matched by image id" in n for n in scene.notes)
+        assert scene.fingerprint == elsewhere.fingerprint != plain.fingerprint  # scores over other pixels do not compare
 
 
-def test_a_missing_mask_is_named_by_its_id(tmp_path):
-    """Matching by sorted order would give every later view its neighbour's mask."""
-    scenes.write_colmap(tmp_path, names=RECT)
-    write_masks(tmp_path / "idrmasks", [0, 1, 3, 4])
-    with pytest.raises(DataError, match=r"no mask for image id 2 .* rect_001_... is id 0"):
-        load_scene(tmp_path)
-
-
-def test_counting_from_one_is_not_guessed(tmp_path):
-    """Images 1 to 5 and masks 0 to 5 can be matched in two ways, so the scene is refused."""
-    scenes.write_colmap(tmp_path, names=tuple(f"{i + 1:03d}.png" for i in range(scenes.VIEWS)))
-    write_masks(tmp_path / "idrmasks", range(6))
-    with pytest.raises(DataError, match="off by one"):
-        load_scene(tmp_path)
-    shutil.rmtree(tmp_path / "idrmasks")
-    write_masks(tmp_path / "idrmasks", range(5))
-    with pytest.raises(DataError, match="no mask for image id 5"):
-        load_scene(tmp_path)
+def test_ids_are_not_guessed(tmp_path):
+    """Matching by sorted order would give later views their neighbour's mask; images 1 to 5 and masks 0 to 5 match twice."""
+    scenes.write_colmap(tmp_path / "dtu", names=RECT)
+    write_masks(tmp_path / "dtu" / "idrmasks", [0, 1, 3, 4])
+    refused(tmp_path / "dtu", r"no mask for image id 2 .* rect_001_... is id 0")
+    scene = scenes.write_colmap(tmp_path / "own", names=tuple(f"{i + 1:03d}.png" for i in range(scenes.VIEWS)))
+    write_masks(scene / "idrmasks", range(6))
+    refused(scene, "off by one")
+    shutil.rmtree(scene / "idrmasks")
+    write_masks(scene / "idrmasks", range(5))
+    refused(scene, "no mask for image id 5")
 
 
 def test_masks_that_cannot_be_used_are_named(tmp_path):
     """No masks, masks without numbers, of another shape, or all black."""
-    scenes.write_colmap(tmp_path / "scene")
-    folder = tmp_path / "m"
-
-    def refused(message):
-        with pytest.raises(DataError, match=message):
-            load_scene(tmp_path / "scene", score_masks=folder)
-
-    refused("contains no masks")
+    scene, folder = scenes.write_colmap(tmp_path / "scene"), tmp_path / "m"
+    refused(scene, "contains no masks", score_masks=folder)
     for name in "abcde":
         scenes.save(folder / f"{name}.png", mask_of(0))
-    refused("no distinct numbers")
+    refused(scene, "no distinct numbers", score_masks=folder)
     shutil.rmtree(folder)
     write_masks(folder)
     scenes.save(folder / "002.png", np.full((20, 20), 255, np.uint8))
-    refused("002.png: the mask is 20 x 20 px, its image photo2.png 16 x 12")
+    refused(scene, "002.png: the mask is 20 x 20 px, its image photo2.png 16 x 12", score_masks=folder)
     scenes.save(folder / "002.png", np.zeros((12, 16), np.uint8))
-    refused("leaves no pixel of photo2.png")
+    refused(scene, "leaves no pixel of photo2.png", score_masks=folder)
 
 
 def test_larger_masks_shrink_with_the_images(tmp_path):
@@ -369,27 +332,16 @@ def test_larger_masks_shrink_with_the_images(tmp_path):
     assert load_scene(tmp_path, downscale=2).views[0].score_mask.shape == (6, 8)
 
 
-def test_masks_belong_to_the_fingerprint(tmp_path):
-    """Scores over other pixels do not compare, so the fingerprint differs."""
-    scenes.write_colmap(tmp_path)
-    plain = load_scene(tmp_path).fingerprint
-    write_masks(tmp_path / "idrmasks")
-    assert load_scene(tmp_path).fingerprint != plain
-
-
-@pytest.mark.parametrize(
-    "names,ids",
-    [
+def test_ids_of_names():
+    """The id is the number that differs from name to name."""
+    for names, ids in (
         (["rect_001_3_r5000.png", "rect_026_3_r5000.png"], [0, 25]),
         (["a/000003.png", "a/000010.png"], [3, 10]),
         (["cam2_07.png", "cam2_09.png"], [7, 9]),
         (["x.png", "y.png"], None),
         (["1_2.png", "1_2.jpg"], None),
-    ],
-)
-def test_ids_of_names(names, ids):
-    """The id is the number that differs from name to name."""
-    assert image_ids(names) == ids
+    ):
+        assert image_ids(names) == ids, names
 
 
 def test_where_pixels_come_from(tmp_path):

@@ -63,15 +63,11 @@ def test_a_reader_of_ones_own_is_given_as_class_object_or_name(own, folder):
     assert np.linalg.norm(centers, axis=1).max() == pytest.approx(1 / 1.1)
 
 
-def test_the_named_format_is_read_where_a_folder_holds_several(tmp_path):
-    scenes.write_transforms(scenes.write_colmap(tmp_path))
-    assert load_scene(tmp_path).format == "colmap"
-    named = load_scene(tmp_path, reader="transforms")
-    assert named.format == "transforms" and not any("is taken" in n for n in named.notes)
-
-
 def test_a_reader_that_does_not_find_its_format_is_refused(tmp_path):
-    scenes.write_llff(tmp_path)
+    """Where a folder holds several formats, the one that is named is read."""
+    scenes.write_transforms(scenes.write_llff(tmp_path))
+    assert load_scene(tmp_path).format == "transforms" and load_scene(tmp_path, reader="llff").format == "llff"
+    (tmp_path / "transforms.json").unlink()
     refused(tmp_path, r"reader colmap finds no scene of its format \(sparse/0.*; the folder holds poses_b", reader="colmap")
     refused(tmp_path, r"reader memory finds no scene of its format \(cameras.mem", reader=Cameras())
     (tmp_path / "cameras.mem").touch()
@@ -88,32 +84,17 @@ def test_camera_models_arrive_and_change_the_fingerprint(folder):
     assert {v.camera.model for v in other.views} == {"fisheye"} and plain.fingerprint != other.fingerprint
 
 
-def with_view(**changes):
-    return lambda scene: replace(scene, views=(replace(scene.views[0], **changes), *scene.views[1:]))
-
-
-@pytest.mark.parametrize(
-    "change,message",
-    [
-        (
-            with_view(image=np.zeros((3, 4, 3), np.float32)),
-            r"'9.png': image must be float32, in \[0, 1\], shape \[12, 16, 3\]; got shape \[3, 4, 3\]",
-        ),
-        (with_view(image=np.zeros((12, 16, 3), np.uint8)), r"'9.png': image must be float32.* got uint8"),
-        (with_view(mask=np.ones((12, 16))), r"'9.png': mask must be bool.* got float64; give mask > 0"),
-        (with_view(camera=Camera(np.diag([2.0, 2, 2, 1]), scenes.K, 16, 12)), r"'9.png': camera.viewmat must be rigid"),
-        (with_view(name="5.png"), r"view '5.png': name must be unique"),
-        (lambda scene: replace(scene, views=scene.views[:1]), r"1 usable view \(made in memory\)"),
-    ],
-)
-def test_what_a_reader_returns_is_checked(change, message, folder):
-    refused(folder, message, reader=Cameras(change))
-
-
-@pytest.mark.parametrize("change", [lambda s: None, lambda s: replace(s, normalization=Normalization(np.zeros(3), 2.0))])
-def test_a_reader_must_return_a_scene_in_file_coordinates(change, folder):
+def test_what_a_reader_returns_is_checked(folder):
+    """By the checks of `test_scene_checks`; too few views, too."""
+    changes = {"image": np.zeros((3, 4, 3), np.float32)}
+    spoil = lambda scene: replace(scene, views=(replace(scene.views[0], **changes), *scene.views[1:]))  # noqa: E731
+    refused(folder, r"'9.png': image must be float32, in \[0, 1\], shape \[12, 16, 3\]; got shape", reader=Cameras(spoil))
+    few = Cameras(lambda scene: replace(scene, views=scene.views[:1]))
+    refused(folder, r"1 usable view \(made in memory\)", reader=few)
+    with pytest.raises(UsageError, match=r"Cameras\.read must return a Scene; it returned NoneType"):
+        load_scene(folder, reader=Cameras(lambda s: None))
     with pytest.raises(UsageError, match="reader memory must return a Scene in file coordinates"):
-        load_scene(folder, reader=Cameras(change))
+        load_scene(folder, reader=Cameras(lambda s: replace(s, normalization=Normalization(np.zeros(3), 2.0))))
 
 
 @pytest.mark.parametrize(
@@ -138,18 +119,15 @@ def test_the_example_reads_back_what_it_writes(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", [str(EXAMPLE), "--out", str(tmp_path / "shots")])
     runpy.run_path(str(EXAMPLE), run_name="__main__")
     assert "shots: 8 views read" in capsys.readouterr().out
+    monkeypatch.setattr(sys, "argv", [str(EXAMPLE), "--help"])
+    with pytest.raises(SystemExit, match="0"):
+        runpy.run_path(str(EXAMPLE), run_name="__main__")
+    assert "--reader examples/06_own_format.py:ShotsReader" in capsys.readouterr().out
     scene = load_scene(tmp_path / "shots", reader=f"{EXAMPLE}:ShotsReader")
     assert isinstance(scene, Scene) and scene.format == "shots" and len(scene.views) == 8
     csv = tmp_path / "shots" / "shots.csv"
     csv.write_text(csv.read_text().replace("shot3.png, ", "shot3.png, far, "))
     refused(tmp_path / "shots", r"shots.csv, line 4: cannot be understood", reader=f"{EXAMPLE}:ShotsReader")
-
-
-def test_the_example_explains_itself(monkeypatch, capsys):
-    monkeypatch.setattr(sys, "argv", [str(EXAMPLE), "--help"])
-    with pytest.raises(SystemExit, match="0"):
-        runpy.run_path(str(EXAMPLE), run_name="__main__")
-    assert "--reader examples/06_own_format.py:ShotsReader" in capsys.readouterr().out
 
 
 # Links lead out of a scene only where the user allows it, in every format, for images, masks and score masks.
@@ -204,22 +182,20 @@ def test_files_of_cameras_and_points_that_are_links(kind, tmp_path):
         (tmp_path / "elsewhere" / path.name).rename(path)
 
 
-@pytest.mark.parametrize("kind", ["colmap", "colmap text", "transforms", "llff", "dtu"])
-def test_an_image_folder_that_is_a_link(kind, tmp_path):
-    scene = scenes.WRITERS[kind](tmp_path / "scene")
-    moved_out(scene, scene / ("image" if kind == "dtu" else "images"))
-    asks(scene)
-
-
-@pytest.mark.parametrize("kind", ["colmap", "transforms", "llff", "dtu", "middlebury"])
-@pytest.mark.parametrize("whole", [False, True])
-def test_masks_that_are_links(kind, whole, tmp_path):
-    scene = scenes.WRITERS[kind](tmp_path / "scene")
-    mask = scene / "masks" / ("000000.png" if kind == "dtu" else "photo0.png")
-    scenes.save(mask, np.full((12, 16), 255, np.uint8))
-    assert any("masked by a mask file" in n for n in load_scene(scene).notes)
-    moved_out(scene, mask.parent if whole else mask)
-    asks(scene)
+@pytest.mark.parametrize("kind", FORMATS)
+def test_folders_of_images_and_masks_that_are_links(kind, tmp_path):
+    """And a mask alone."""
+    for whole in (False, True):
+        scene = scenes.WRITERS[kind](tmp_path / f"{whole}" / "scene")
+        mask = scene / "masks" / ("000000.png" if kind == "dtu" else "photo0.png")
+        scenes.save(mask, np.full((12, 16), 255, np.uint8))
+        assert any("masked by a mask file" in n for n in load_scene(scene).notes)
+        moved_out(scene, mask.parent if whole else mask)
+        asks(scene)
+    if kind != "middlebury":  # whose images are in the scene's own folder
+        scene = scenes.WRITERS[kind](tmp_path / "images" / "scene")
+        moved_out(scene, scene / ("image" if kind == "dtu" else "images"))
+        asks(scene)
 
 
 def test_score_masks_that_are_links(tmp_path):

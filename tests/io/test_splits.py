@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from tests.io import scenes
 from warpgs.errors import DataError, UsageError
-from warpgs.io.load import Split, coincident_views, held_out_split, load_scene, split_views
+from warpgs.io.load import Split, coincident_views, held_out_split, split_views
 from warpgs.scene import Camera
 
 
@@ -26,24 +26,6 @@ def ids(names):
     return [int(n[:3]) for n in names]
 
 
-@pytest.mark.parametrize("kind", ["llff", "mip360"])
-@pytest.mark.parametrize(
-    "views,k,train",
-    [
-        (20, 3, [1, 10, 19]),  # fern
-        (62, 3, [1, 30, 61]),  # horns
-        (26, 3, [1, 12, 25]),  # leaves
-        (20, 1, [1]),
-        (20, 2, [1, 19]),
-        (9, 7, [1, 2, 3, 4, 5, 6, 7]),
-    ],
-)
-def test_llff_protocol(kind, views, k, train):
-    split = split_views(numbered(views), f"{kind}:{k}")
-    assert ids(split.train) == train
-    assert ids(split.test) == list(range(0, views, 8))
-
-
 LLFF = {
     "fern": (20, 3, [1, 10, 19]), "flower": (34, 5, [1, 17, 33]), "fortress": (42, 6, [1, 21, 41]),
     "horns": (62, 8, [1, 30, 61]), "leaves": (26, 4, [1, 12, 25]), "orchids": (25, 4, [1, 12, 23]),
@@ -51,39 +33,28 @@ LLFF = {
 }  # fmt: skip
 """Photographs, held-out views and 3-view training ids of the eight scenes; rounding half up would give others for horns and
 leaves, whose middle falls on 26.5 and 10.5 of the pool."""
+EVEN = [
+    *((f"{kind}:3", views, train) for views, _, train in LLFF.values() for kind in ("llff", "mip360")),
+    ("llff:1", 20, [1]), ("llff:2", 20, [1, 19]), ("llff:7", 9, [1, 2, 3, 4, 5, 6, 7]),
+    ("llff:3", 7, [1, 3, 6]),  # a pool of 6: its middle, 2.5, goes to 2, the third
+    ("llff:6", 20, [1, 4, 7, 12, 15, 19]),  # places 0, 3.2, 6.4, 9.6, 12.8, 16 of 1-7, 9-15, 17-19
+    ("llff:9", 20, [1, 3, 5, 7, 10, 12, 14, 17, 19]),
+    ("mip360:24", 185, [
+        1, 9, 17, 25, 33, 41, 49, 57, 65, 73, 81, 89, 95, 103, 111, 119, 127, 135, 143, 151, 159, 167, 175, 183,
+    ]),  # garden
+    ("mip360:12", 185, [1, 18, 34, 51, 67, 84, 100, 117, 133, 150, 166, 183]),
+]  # fmt: skip
 
 
-@pytest.mark.parametrize("name", LLFF)
-def test_llff_tables(name):
-    views, held_out, train = LLFF[name]
-    split = split_views(numbered(views), "llff:3")
-    assert ids(split.train) == train and len(split.test) == held_out
-
-
-@pytest.mark.parametrize(
-    "spec,views,train",
-    [
-        ("llff:6", 20, [1, 4, 7, 12, 15, 19]),  # places 0, 3.2, 6.4, 9.6, 12.8, 16 of 1-7, 9-15, 17-19
-        ("llff:9", 20, [1, 3, 5, 7, 10, 12, 14, 17, 19]),
-        ("mip360:24", 185, [
-            1, 9, 17, 25, 33, 41, 49, 57, 65, 73, 81, 89, 95, 103, 111, 119, 127, 135, 143, 151, 159, 167, 175, 183,
-        ]),  # garden
-        ("mip360:12", 185, [1, 18, 34, 51, 67, 84, 100, 117, 133, 150, 166, 183]),
-    ],
-)  # fmt: skip
-def test_more_views_come_from_the_same_pool(spec, views, train):
-    split = split_views(numbered(views), spec)
+@pytest.mark.parametrize("spec,views,train", EVEN)
+def test_every_8th_is_held_out_and_the_others_are_evenly_spaced(spec, views, train):
+    """Whatever the order of the views."""
+    scene = numbered(views)
+    split = split_views(scene, spec)
     assert ids(split.train) == train and ids(split.test) == list(range(0, views, 8))
-
-
-def test_llff_rounds_half_to_even():
-    # pool of 6 (1..6 of 7 views): linspace(0, 5, 3) has 2.5 in the middle, which goes to 2, the third of the pool
-    assert ids(split_views(numbered(7), "llff:3").train) == [1, 3, 6]
-
-
-def test_llff_sorts_by_name_whatever_the_order_of_the_views():
-    names = [f"{i:03d}.png" for i in range(20)]
-    assert split_views(scene_of(names[::-1]), "llff:3") == split_views(scene_of(names), "llff:3")
+    assert (views, len(split.test)) in [(20, 3), (9, 2), (7, 1), (185, 24), *(v[:2] for v in LLFF.values())]
+    scene.views.reverse()
+    assert split_views(scene, spec) == split
 
 
 @pytest.mark.parametrize("views", [49, 64])
@@ -95,25 +66,21 @@ def test_dtu_protocol(views):
         assert ids(split.train) == train[:k] and ids(split.test) == test
 
 
-@pytest.mark.parametrize("form", ["rect_{:03d}_3_r5000.png", "images/{:03d}.png"])
-def test_dtu_ids_are_those_of_the_names(form):
-    """DTU's own names, and files renamed to count from one, give the same views as files that count from zero."""
-    split = split_views(scene_of([form.format(i + 1) for i in range(49)]), "dtu:3")
-    assert split.train == tuple(form.format(i + 1) for i in (25, 22, 28)) and split.test[0] == form.format(2)
+def test_dtu_ids_are_those_of_the_names():
+    """DTU's own names, and files renamed to count from one, give the same views as files that count from zero.
 
-
-def test_dtu_scan_with_a_gap_is_refused():
-    """64 images less one would still be enough, with every id after the gap shifted by one."""
+    Names without numbers are counted in sorted order; a gap is refused: every id after it would be shifted by one.
+    """
+    for form in ("rect_{:03d}_3_r5000.png", "images/{:03d}.png"):
+        split = split_views(scene_of([form.format(i + 1) for i in range(49)]), "dtu:3")
+        assert split.train == tuple(form.format(i + 1) for i in (25, 22, 28)) and split.test[0] == form.format(2)
+    names = [a + b for a in "abcdefg" for b in "abcdefg"]
+    assert split_views(scene_of(names), "dtu:3").train == (names[25], names[22], names[28])
     names = [f"rect_{i + 1:03d}_3_r5000.png" for i in range(64)]
     with pytest.raises(DataError, match=r"with the ids 10 are missing .* rect_001_3_r5000.png to rect_064"):
         split_views(scene_of(names[:10] + names[11:]), "dtu:3")
     with pytest.raises(DataError, match=r"with the ids 0 are missing"):
         split_views(scene_of(names[1:]), "dtu:3")
-
-
-def test_dtu_names_without_numbers_are_counted_in_sorted_order():
-    names = [a + b for a in "abcdefg" for b in "abcdefg"]
-    assert split_views(scene_of(names), "dtu:3").train == (names[25], names[22], names[28])
 
 
 def test_blender_protocol_counts_frames_not_names():
@@ -127,6 +94,7 @@ def test_every_and_all():
     split = split_views(numbered(7), "every:3")
     assert ids(split.test) == [0, 3, 6] and ids(split.train) == [1, 2, 4, 5]
     assert split_views(numbered(3), "all") == Split(("000.png", "001.png", "002.png"), ())
+    assert split_views(scene_of(scenes.NAMES), "llff:3") == Split(("photo1.png", "photo3.png", "photo4.png"), ("photo0.png",))
 
 
 NAMES = ["a/x.png", "b/x.png", "b/y.png", "z.jpg"]
@@ -183,11 +151,6 @@ def test_a_study_without_a_split_holds_views_out(views, held_out, words):
     spec, note = held_out_split(numbered(views))
     split = split_views(numbered(views), spec)
     assert ids(split.test) == held_out and len(split.train) == views - len(held_out) and words in note
-
-
-def test_a_split_of_a_real_folder(tmp_path):
-    scene = load_scene(scenes.write_llff(tmp_path))
-    assert split_views(scene, "llff:3") == Split(("photo1.png", "photo3.png", "photo4.png"), ("photo0.png",))
 
 
 def test_coincident_views_are_views_from_one_place():

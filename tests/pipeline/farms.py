@@ -24,7 +24,7 @@ def jobs_of(scenes: Path, out: Path, **settings) -> list[FarmJob]:
     """A job for each scene of a folder."""
     config = dataclasses.replace(CONFIG, **settings)
     return [
-        FarmJob(p.name, FitRequest(SceneRequest(str(p), split_spec(8)), out / p.name / "run", config, "cpu"), out / p.name)
+        FarmJob(p.name, FitRequest(SceneRequest(str(p), split_spec(8)), out / p.name / "run", config, "cpu"), out / p.name, out)
         for p in sorted(scenes.iterdir())
     ]
 
@@ -47,7 +47,7 @@ class HereEngine:
         """Run the oldest job; the function's result is its state, or its whole event."""
         job = self.started.pop(0)
         done = self.work(job_text(job))
-        return [done if isinstance(done, Event) else Event(job.name, done)]
+        return [(job.name, done, "") if isinstance(done, str) else done]
 
     def close(self) -> None:
         """Do nothing."""

@@ -16,7 +16,6 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-from filelock import FileLock
 
 from tests.pipeline.fake_slurm import install_slurm
 from tests.pipeline.farms import HereEngine, jobs_of, write_scenes
@@ -31,9 +30,7 @@ from warpgs.pipeline.farm.job import (
     CHECKED,
     LOG,
     PLY,
-    RECORD,
     THUMBNAIL,
-    Event,
     JobRecord,
     file_digest,
     finished,
@@ -45,10 +42,10 @@ from warpgs.pipeline.farm.job import (
 )
 from warpgs.pipeline.farm.ray import RayEngine
 from warpgs.pipeline.farm.slurm import SlurmEngine
-from warpgs.pipeline.farm.work import Outcome, run_job
+from warpgs.pipeline.farm.work import run_job
 from warpgs.pipeline.run.fit import fit_request
 from warpgs.pipeline.train.loss import LOSS_TERMS
-from warpgs.pipeline.train.presets import PRESETS, preset_settings
+from warpgs.pipeline.train.presets import preset_settings
 from warpgs.pipeline.train.strategies.base import STRATEGIES
 from warpgs.process import run_python
 from warpgs.ranks import is_loopback, listeners
@@ -88,7 +85,7 @@ def unfitted(monkeypatch):
         make_folder(request.out)
         for name in CHECKED:
             (request.out / name).write_text(request.scene.path)
-        return Outcome("fitted", {"test": {}, "steps": 1})
+        return "fitted", {"test": {}, "steps": 1}, ""
 
     monkeypatch.setattr(work, "ensure_run", pretend)
     monkeypatch.setattr(work, "_wanted", lambda *_: ("", None, None))
@@ -150,8 +147,8 @@ def test_processes_give_the_bytes_of_single_fits_and_one_that_is_killed_is_repla
     assert (tmp_path / "out" / "s1" / THUMBNAIL).is_file()
 
 
-def test_a_rerun_skips_what_is_finished_and_valid(scenes, single, results):
-    """Nothing is started; a changed byte, setting or photograph starts that job alone."""
+def test_a_rerun_skips_what_is_finished_and_valid(scenes, single, results, tmp_path):
+    """A changed byte starts that job alone; other times of files are no other data; another setting is another run."""
     engine = HereEngine()
     assert [s.state for s in run_farm(jobs_of(scenes, results), engine)] == ["done", "done"] and engine.begun == []
     ply = results / "s1" / "run" / PLY
@@ -161,6 +158,15 @@ def test_a_rerun_skips_what_is_finished_and_valid(scenes, single, results):
     statuses = run_farm(jobs_of(scenes, results), engine)
     assert engine.begun == ["s1"] and digests(statuses) == single
     assert [s.record.how for s in statuses] == ["fitted", "continued"]
+    copied = shutil.copytree(scenes, tmp_path / "scenes")
+    moved = [replace(j, request=replace(j.request, scene=replace(j.request.scene, path=str(copied / j.name))))
+             for j in jobs_of(scenes, results)]  # fmt: skip
+    assert all(finished(j) is None for j in moved)
+    assert [s.record.how for s in run_farm(moved, HereEngine())] == ["kept", "kept"] and finished(moved[0])
+    os.utime(copied / "s0" / "images" / "000.png", (0, 0))
+    assert finished(moved[0]) is None and finished(moved[1])
+    (status,) = run_farm(jobs_of(scenes, results, steps=4)[:1], HereEngine())
+    assert (status.record.how, status.record.steps) == ("redone", 4) and (results / "s0" / "run.old1").is_dir()
 
 
 def test_links_that_double_a_scene_at_each_level_are_not_listed(tmp_path, monkeypatch):
@@ -176,61 +182,35 @@ def test_links_that_double_a_scene_at_each_level_are_not_listed(tmp_path, monkey
     assert record.source_stamp(tmp_path / "3") and not record.source_stamp(tmp_path / "0")  # 31 folders, and 255
 
 
-def test_touched_photographs_are_read_again_and_the_run_is_kept(scenes, results, tmp_path):
-    """Other times of files are no other data; another setting is another run, and the old one is moved aside."""
-    copied = shutil.copytree(scenes, tmp_path / "scenes")
-    moved = [replace(j, request=replace(j.request, scene=replace(j.request.scene, path=str(copied / j.name))))
-             for j in jobs_of(scenes, results)]  # fmt: skip
-    assert all(finished(j) is None for j in moved)
-    assert [s.record.how for s in run_farm(moved, HereEngine())] == ["kept", "kept"]
-    (status,) = run_farm(jobs_of(scenes, results, steps=4)[:1], HereEngine())
-    assert (status.record.how, status.record.steps) == ("redone", 4)
-    assert (results / "s0" / "run.old1").is_dir()
-
-
 def test_settings_that_follow_from_the_views_are_the_same_settings(scenes, tmp_path):
-    """The default preset leaves some open, which the record of a run has as chosen: finished runs are kept all the same."""
-    assert PRESETS["default"].half_resolution is None
-    (job, _) = jobs_of(scenes, tmp_path)
-    open_job = replace(job, request=replace(job.request, config=replace(job.request.config, half_resolution=None)))
-    run_farm([open_job], HereEngine())
-    (tmp_path / "s0" / RECORD).unlink()
-    (status,) = run_farm([open_job], HereEngine())
+    """The record of a run has settings that were left open as chosen: the finished run is kept all the same."""
+    (job, _) = jobs_of(scenes, tmp_path, half_resolution=None)
+    run_farm([job], HereEngine())
+    (tmp_path / "s0" / record.RECORD).unlink()
+    (status,) = run_farm([job], HereEngine())
     assert status.record.how == "kept"
-
-
-def test_a_second_farm_on_the_folder_takes_over_what_the_first_one_does(scenes, unfitted, tmp_path):
-    """While the first farm is in the middle of a job, the second one does the other and waits; neither job is done twice."""
-    jobs, second, states = jobs_of(scenes, tmp_path), HereEngine(), []
-
-    def meanwhile(text):
-        inner = run_farm_until_alone(jobs, second, states)
-        assert inner == "waits"
-        return run_job(text)
-
-    first = HereEngine(meanwhile)
-    statuses = run_farm(jobs, first)
-    assert first.begun == ["s0"] and second.begun == ["s1"]
-    assert states[-1] == ["elsewhere", "done"] and [s.state for s in statuses] == ["done", "done"]
-    again = HereEngine()
-    assert digests(run_farm(jobs, again)) == digests(statuses) and again.begun == []
 
 
 class Alone(Exception):
     """The second farm has nothing left but jobs of the first."""
 
 
-def run_farm_until_alone(jobs, engine, states):
+def test_a_second_farm_on_the_folder_takes_over_what_the_first_one_does(scenes, unfitted, tmp_path):
+    """While the first farm is in the middle of a job, the second one does the other and waits; neither job is done twice."""
+    jobs, second = jobs_of(scenes, tmp_path), HereEngine()
+
     def show(statuses):
-        states.append([s.state for s in statuses])
-        if states[-1] == ["elsewhere", "done"]:
+        if [s.state for s in statuses] == ["elsewhere", "done"]:
             raise Alone
 
-    try:
-        run_farm(jobs, engine, show, poll=0)
-    except Alone:
-        return "waits"
-    return "ended"
+    def meanwhile(text):
+        with pytest.raises(Alone):
+            run_farm(jobs, second, show, poll=0)
+        return run_job(text)
+
+    first = HereEngine(meanwhile)
+    statuses = run_farm(jobs, first)
+    assert first.begun == ["s0"] and second.begun == ["s1"] and [s.state for s in statuses] == ["done", "done"]
 
 
 def test_what_another_farm_finishes_is_taken_over_when_its_lock_is_gone(scenes, unfitted, tmp_path):
@@ -364,7 +344,7 @@ def test_engines_of_clusters_give_the_same_bytes(scenes, single, tmp_path, monke
         address = sys.modules["ray"].get_runtime_context().gcs_address
         stranger = run_python(JOIN, address, timeout=120, environment={"RAY_AUTH_TOKEN": "0" * 64})
         assert stranger.stdout == "refused\n", stranger.stderr
-        engine.use(_die_once(str(killed)))
+        engine._task = engine._ray.remote(**engine._options)(_die_once(str(killed)))
     else:
         install_slurm(tmp_path / "bin", tmp_path / "cluster")
         monkeypatch.setenv("PATH", f"{tmp_path / 'bin'}{os.pathsep}{os.environ['PATH']}")
@@ -377,7 +357,7 @@ def test_engines_of_clusters_give_the_same_bytes(scenes, single, tmp_path, monke
         engine.close()
     assert [s.state for s in statuses] == ["done", "done"] and digests(statuses) == single
     assert killed.exists() == (kind == "ray")
-    assert kind == "ray" or [p.name for p in (tmp_path / "private").iterdir()] == ["lock"]
+    assert kind == "ray" or not list((tmp_path / "private").iterdir())
 
 
 JOIN = """
@@ -416,66 +396,40 @@ def test_folders_and_globs(tmp_path):
     assert [j[0] for j in list_jobs(f"{tmp_path}/*/scene")] == ["a-scene", "b-scene"]
     with pytest.raises(UsageError, match="no scene found"):
         list_jobs(f"{tmp_path}/*/nothing")
-
-
-def test_a_scene_is_no_folder_of_scenes(tmp_path):
-    write_scenes(tmp_path, 1)
+    write_scenes(tmp_path / "more", 1)
     with pytest.raises(UsageError, match="is a single scene: fit it with `warpgs fit`"):
-        list_jobs(str(tmp_path / "s0"))
+        list_jobs(str(tmp_path / "more" / "s0"))
 
 
 def test_lines_are_flags_of_fit(tmp_path):
-    """Relative paths are from the file; booleans are switches, in groups too."""
-    path = tmp_path / "jobs.jsonl"
-    path.write_text('{"scene": "x", "steps": 5, "refine_poses": true, "method.pm": false}\n\n{"scene": "/y", "name": "z"}')
+    """Relative paths are from the file; booleans are switches, in groups too; the longest name is one of a folder."""
+    path, long = tmp_path / "jobs.jsonl", 66 * "写"
+    line = '{"scene": "x", "steps": 5, "refine_poses": true, "method.pm": false}'
+    path.write_text(f"{line}\n\n{json.dumps({'scene': '/y', 'name': long})}", "utf-8")
     first, second = list_jobs(str(path))
     assert first == ("x", tmp_path / "x", ("--steps=5", "--refine-poses", "--method.no-pm"))
-    assert second == ("z", Path("/y"), ())
-
-
-@pytest.mark.parametrize(
-    ("line", "word"),
-    [
-        ("{", "not valid JSON"),
-        ("[]", "must be an object"),
-        ('{"name": "a"}', "scene is missing"),
-        ('{"scene": 3}', "scene must be text"),
-        ('{"scene": "a", "name": "../b"}', "is not a valid name"),
-        ('{"scene": "a", "name": "index.html"}', "is not a valid name"),
-        ('{"scene": "a", "out": "/b"}', "cannot be set for a single job"),
-        ('{"scene": "a", "allow_outside": true}', "cannot be set"),
-        ('{"scene": "a", "strategy": "evil.py:Evil"}', "names user code"),
-        ('{"scene": "a", "view_modules": "evil.py:Evil"}', "names user code"),
-        ('{"scene": "a", "steps": [1]}', "must be text"),
-        ('{"scene": "a", "--steps": 1}', "cannot be set"),
-        ('{"scene": "a\\u0000"}', "without a zero byte"),
-        ('{"scene": "a", "name": ".b"}', "is not a valid name"),
-        ('{"scene": "a", "name": "%s"}' % (100 * "写"), "has 300 bytes, but a job's name may have at most 200"),
-        ('{"scene": "a", "name": "%s"}' % (101 * "x"), "is not a valid name"),
-        ("[" * 60 + "]" * 60, "nested deeper"),
-    ],
-)
-def test_lines_that_are_no_jobs(tmp_path, line, word):
-    """One sentence, with the number of the line where it is the line's fault."""
-    path = tmp_path / "jobs.jsonl"
-    path.write_text(line, "utf-8")
-    with pytest.raises(DataError, match=word):
-        list_jobs(str(path))
-
-
-def test_the_longest_name(tmp_path):
-    """It is a folder, beside which one with a longer name can lie."""
-    path = tmp_path / "jobs.jsonl"
-    path.write_text('{"scene": "a", "name": "%s"}' % (66 * "写"), "utf-8")
-    ((name, _, _),) = list_jobs(str(path))
-    (tmp_path / f"{name}.old1").mkdir()
-
-
-def test_two_jobs_need_two_names(tmp_path):
-    path = tmp_path / "jobs.jsonl"
+    assert second == (long, Path("/y"), ())
+    (tmp_path / f"{long}.old1").mkdir()
     path.write_text('{"scene": "a/x"}\n{"scene": "b/X"}')
     with pytest.raises(UsageError, match=r"jobs\.jsonl: two jobs have the name 'X'"):
         list_jobs(str(path))
+
+
+def test_lines_that_are_no_jobs(tmp_path):
+    """One sentence, with the number of the line where it is the line's fault."""
+    path = tmp_path / "jobs.jsonl"
+    for word, values in {
+        "is not a valid name": [{"name": n} for n in ("../b", "index.html", ".b", 101 * "x")], "must be text": [{"steps": [1]}],
+        "has 300 bytes, but a job's name may have at most 200": [{"name": 100 * "写"}], "scene must be text": [{"scene": 3}],
+        "cannot be set for a single job": [{"out": "/b"}, {"allow_outside": True}, {"--steps": 1}],
+        "names user code": [{"strategy": "evil.py:Evil"}, {"view_modules": "evil.py:Evil"}],
+        "without a zero byte": [{"scene": "a\0"}], "not valid JSON": ["{"], "must be an object": ["[]"],
+        "scene is missing": ['{"name": "a"}'], "nested deeper": ["[" * 60 + "]" * 60],
+    }.items():  # fmt: skip
+        for value in values:
+            path.write_text(value if isinstance(value, str) else json.dumps({"scene": "a"} | value), "utf-8")
+            with pytest.raises(DataError, match=word):
+                list_jobs(str(path))
 
 
 # Slurm's engine: private files, nothing unpickled, and each way in which a job of Slurm can end.
@@ -586,13 +540,12 @@ def test_a_folder_that_others_can_write_to_is_refused(cluster, tmp_path):
     base = tmp_path / "a" / "slurm"
     with private_shared_folder(base) as first:
         assert first.is_dir()
-    (base / "old").mkdir()
-    (base / "old" / "lock").touch()
+    old, link = (base / f".warpgs-{i:016x}.tmp" for i in range(2))
+    old.mkdir()
     (tmp_path / "precious").mkdir()
-    (base / "link").symlink_to(tmp_path / "precious")
-    (base / "busy").mkdir()
-    with FileLock(base / "busy" / "lock"), private_shared_folder(base):
-        assert not (base / "old").exists() and (base / "busy").exists()
+    link.symlink_to(tmp_path / "precious")
+    with private_shared_folder(base) as busy, private_shared_folder(base):
+        assert not old.exists() and busy.exists()
     assert list((tmp_path / "precious").iterdir()) == []
     for folder in (base, base.parent):
         folder.chmod(0o777)
@@ -605,34 +558,28 @@ def test_a_folder_that_others_can_write_to_is_refused(cluster, tmp_path):
 
 
 @with_slurm
-@pytest.mark.parametrize("state", ["done", "failed", "held"])
-def test_an_answer_is_an_event(cluster, job, state):
+def test_each_end_of_a_job_is_an_event(cluster, job, capsys):
+    """An answer; none, once Slurm has not listed the job three times; where Slurm does not answer, nothing is known."""
     engine = SlurmEngine("cpu", 1)
-    engine.start(job)
-    assert engine.wait(0) == []
-    cluster.end("70", state)
-    assert engine.wait(0) == [Event(job.name, state)]
-    assert [p.name for p in engine._folder.iterdir()] == ["lock"]
-    engine.close()
-
-
-@with_slurm
-def test_a_job_that_ends_without_an_answer_has_crashed(cluster, job, capsys):
-    """Once Slurm has not listed it three times; where Slurm does not answer, nothing is known of any job."""
-    engine = SlurmEngine("cpu", 1)
+    for number, state in enumerate(("done", "failed", "held"), 70):
+        engine.start(job)
+        assert engine.wait(0) == []
+        cluster.end(str(number), state)
+        assert engine.wait(0) == [(job.name, state, "")]
+    assert not list(engine._folder.iterdir())
     engine.start(job)
     cluster.fail["squeue"] = "slurmctld is away"
     assert [engine.wait(0) for _ in range(5)] == [[]] * 5
     assert capsys.readouterr().err.count("slurmctld is away") == 1
     del cluster.fail["squeue"]
-    cluster.end("70", log="error: *** JOB 70 CANCELLED DUE TO TIME LIMIT ***\n\n")
+    cluster.end("73", log="error: *** JOB 73 CANCELLED DUE TO TIME LIMIT ***\n\n")
     assert engine.wait(0) == engine.wait(0) == []
-    (event,) = engine.wait(0)
-    assert event.state == "crashed" and "70 ended without an answer: error: *** JOB 70 CANCELLED DUE" in event.message
+    ((_, state, reason),) = engine.wait(0)
+    assert state == "crashed" and "73 ended without an answer: error: *** JOB 73 CANCELLED DUE" in reason
     engine.start(job)
-    cluster.end("71", "gone wild")
-    (event,) = engine.wait(0)
-    assert event.state == "crashed" and "unknown answer" in event.message
+    cluster.end("74", "gone wild")
+    ((_, state, reason),) = engine.wait(0)
+    assert state == "crashed" and "unknown answer" in reason
     engine.close()
 
 
@@ -656,34 +603,29 @@ def test_what_slurm_refuses_is_said(cluster, job, monkeypatch, capsys):
 def test_the_process_of_a_job_answers_with_its_state(tmp_path, monkeypatch, capsys):
     """Nothing where it is interrupted; a reason on stderr where the job cannot begin."""
     (tmp_path / "job").write_text("TEXT")
-    monkeypatch.setattr(slurm, "run_job", lambda text, threads: f"{text} {threads}")
-    assert slurm.main(str(tmp_path / "job"), str(tmp_path / "answer"), "2") == 0
-    assert (tmp_path / "answer").read_text() == "TEXT 2"
 
-    def stop(*_):
-        raise KeyboardInterrupt
+    for error, code in ((None, 0), (KeyboardInterrupt(), 130), (UsageError("the loss term is not there"), 1)):
 
-    monkeypatch.setattr(slurm, "run_job", stop)
-    assert slurm.main(str(tmp_path / "job"), str(tmp_path / "none"), "2") == 130 and not (tmp_path / "none").exists()
+        def work(text, threads, error=error):
+            if error is not None:
+                raise error
+            return f"{text} {threads}"
 
-    def refuse(*_):
-        raise UsageError("the loss term is not there")
-
-    monkeypatch.setattr(slurm, "run_job", refuse)
-    assert slurm.main(str(tmp_path / "job"), str(tmp_path / "none"), "2") == 1 and not (tmp_path / "none").exists()
-    assert capsys.readouterr().err == "the loss term is not there\n"
+        monkeypatch.setattr(slurm, "run_job", work)
+        answer = tmp_path / str(code)
+        assert slurm.main(str(tmp_path / "job"), str(answer), "2") == code and answer.exists() == (code == 0)
+    assert (tmp_path / "0").read_text() == "TEXT 2" and capsys.readouterr().err == "the loss term is not there\n"
 
 
 @with_slurm
-@pytest.mark.parametrize("name", ["sbatch", "squeue"])
-def test_commands_are_called_without_a_shell(tmp_path, monkeypatch, name):
+def test_commands_are_called_without_a_shell(tmp_path, monkeypatch):
     """Their environment names no folder to import from but the package's, and hides no jobs; a missing one is a failure."""
     monkeypatch.setenv("SQUEUE_STATES", "RUNNING")
     monkeypatch.setenv("PATH", str(tmp_path))
-    assert slurm._call(name)[0] == 1
-    (tmp_path / name).write_text('#!/bin/sh\nread -r line\necho "$1 $line $PYTHONSAFEPATH $SQUEUE_STATES."\n')
-    (tmp_path / name).chmod(0o755)
-    assert slurm._call(name, "$(id)", script="text\n")[1] == "$(id) text 1 .\n"
+    assert slurm._call("squeue")[0] == 1
+    (tmp_path / "squeue").write_text('#!/bin/sh\nread -r line\necho "$1 $line $PYTHONSAFEPATH $SQUEUE_STATES."\n')
+    (tmp_path / "squeue").chmod(0o755)
+    assert slurm._call("squeue", "$(id)", script="text\n")[1] == "$(id) text 1 .\n"
 
 
 # Ray's engine joins the cluster that is named, or starts a private one; it takes none that another user could have
@@ -712,14 +654,12 @@ def test_a_cluster_of_our_own_is_private(started):
 
 
 @pytest.mark.parametrize("by_variable", [True, False])
-def test_a_cluster_that_is_named_is_joined(started, by_variable):
+def test_a_cluster_that_is_named_is_joined(started, monkeypatch, by_variable):
     if by_variable:
         os.environ["RAY_ADDRESS"] = "head:6379"
     RayEngine("cpu", 1, 1, address=None if by_variable else "head:6379")
     assert started["address"] == "head:6379" and "_temp_dir" not in started and "RAY_AUTH_TOKEN" not in os.environ
 
-
-def test_a_cluster_that_does_not_answer(started, monkeypatch):
     def fail(**_):
         raise ConnectionError("no route")
 

@@ -19,15 +19,13 @@ from tests.priors.rigs import exact_depth
 from warpgs.app.cli import main
 from warpgs.errors import DataError, UsageError
 from warpgs.export.base import read_gaussians
-from warpgs.geometry import convert_camera
 from warpgs.io.load import load_scene
 from warpgs.pipeline.films.film import render_path
 from warpgs.pipeline.metrics import scores
 from warpgs.pipeline.metrics.scores import score, summarize
 from warpgs.pipeline.model.start import InitConfig
-from warpgs.pipeline.run import folder as schemas
 from warpgs.pipeline.run.commands import scene_of
-from warpgs.pipeline.run.folder import open_run
+from warpgs.pipeline.run.folder import METRICS, open_run
 from warpgs.pipeline.run.request import NO_SCORES, SceneRequest
 from warpgs.pipeline.run.results import score_line
 from warpgs.pipeline.train.presets import PRESETS
@@ -197,24 +195,17 @@ def test_nothing_is_written_or_printed_unless_asked_for(folder, tmp_path, monkey
     assert not list(tmp_path.iterdir())
 
 
-def test_units_lead_from_the_fit_to_its_files_and_back(folder, fitted):
-    """In file units the Gaussians are those of the PLY, the cameras those of the reconstruction."""
+def test_units_lead_from_the_fit_to_its_files_and_back(folder, fitted, tmp_path):
+    """In file units the Gaussians are those of the PLY; a camera in either units gives the same render, that of its view."""
     result, _ = fitted
-    ply = warpgs.read_ply(folder / "run" / "point_cloud.ply")
-    torch.testing.assert_close(result.gaussians("file").means, ply.means, rtol=0, atol=0)
-    again = warpgs.read_ply(folder / "run" / "point_cloud.ply", result.normalization, units="scene")
+    ply = folder / "run" / "point_cloud.ply"
+    torch.testing.assert_close(result.gaussians("file").means, warpgs.read_ply(ply).means, rtol=0, atol=0)
+    again = warpgs.read_ply(ply, result.normalization, units="scene")
     torch.testing.assert_close(again.means, result.gaussians().means, rtol=1e-5, atol=1e-5)
-    name, camera = next(iter(result.cameras("file").items()))
-    scene = warpgs.load_scene(folder / "scene")
+    name, scene = result.test[0], warpgs.load_scene(folder / "scene")
+    camera, in_file = result.cameras()[name], result.cameras("file")[name]
     wanted = (scene.view(name).camera.center / scene.normalization.scale) + scene.normalization.offset
-    np.testing.assert_allclose(camera.center, wanted, atol=1e-9)
-
-
-def test_render_path_takes_own_cameras_in_either_units(folder, fitted, tmp_path):
-    """The same camera in scene and in file units gives the same PNG, which is the view's render; a film comes with them."""
-    result, _ = fitted
-    camera = result.cameras()[result.test[0]]
-    in_file = convert_camera(camera, result.normalization, "scene", "file")
+    np.testing.assert_allclose(in_file.center, wanted, atol=1e-9)
     *scene_files, film = warpgs.render_path(result, [camera, camera], out=tmp_path / "a")
     file_files = warpgs.render_path(result, [in_file], out=tmp_path / "b", units="file")
     assert film.name == "film.mp4" and len(scene_files) == 2 and len(file_files) == 2
@@ -246,11 +237,8 @@ def test_a_run_of_a_scene_from_python_is_complete_but_for_the_scene(folder, tmp_
 
 def test_degree_4_is_fitted_and_stored(folder, tmp_path, capsys):
     """All five degrees learn; the run, the model file and PLY hold them, SPZ holds degree 3, and the output says so."""
-    config, scene, out = (
-        dataclasses.replace(CONFIG, sh_degree=4, sh_every=2),
-        warpgs.load_scene(folder / "scene"),
-        tmp_path / "run",
-    )
+    config, out = dataclasses.replace(CONFIG, sh_degree=4, sh_every=2), tmp_path / "run"
+    scene = warpgs.load_scene(folder / "scene")
     result = warpgs.fit(scene, config, split=SPLIT, device="cpu", out=out, verbose=False)
     made = result.gaussians()
     assert made.sh.shape[1] == 25 and bool(made.sh[:, 16:].any())
@@ -297,10 +285,8 @@ def test_a_run_says_and_keeps_what_was_given(given_folder, capsys):
     """Notes before the first step and after the last, figures of each view, and the settings by which the scene is read."""
     record, metrics = (json.loads((given_folder / "run" / f).read_text()) for f in ("config.json", "metrics.json"))
     notes = html.unescape((given_folder / "run" / "report.html").read_text())
-    assert (
-        "depth maps: 7 of 8 views, 100.0% of their pixels, metric (a unit is 0.001 for integers" in notes
-        and "given depth: used in 5 of 6 views" in notes
-    )
+    assert "depth maps: 7 of 8 views, 100.0% of their pixels, metric (a unit is 0.001 for integers" in notes
+    assert "given depth: used in 5 of 6 views" in notes
     assert "median difference of rendered depth" in notes and "start: " in notes and "by given depth and sweep" in notes
     assert record["scene"]["depths"] == str(given_folder / "depths") and record["scene"]["depth_kind"] == "metric"
     rows = metrics["given"]["depth"]["views"]
@@ -341,8 +327,7 @@ def test_a_wrong_unit_is_named_before_the_first_step(given_folder, tmp_path, cap
     assert main(command(given_folder, out, "--depths", "nowhere")) == 3 and "no such folder" in capsys.readouterr().err
 
 
-def test_scenes_from_python(given_folder):
-    """`load_scene(depths=...)` and fit; a weight of 0 leaves the loss out."""
+def test_a_weight_of_0_leaves_the_loss_of_given_depth_out(given_folder):
     scene = warpgs.load_scene(given_folder / "scene", depths=given_folder / "depths")
     fitted = warpgs.fit(scene, "3dgs", split=GIVEN_SPLIT, steps=2, device="cpu", verbose=False, loss_depth_weight=0.0)
     assert fitted.metrics["given"] == {} and any("given depth: used in 5" in n for n in fitted.notes)
@@ -401,30 +386,24 @@ def test_without_networks_the_notes_say_what_stands_in(scene, tmp_path, capsys, 
     assert not (tmp_path / "cache").exists()
 
 
-def failure(capsys, code, *arguments):
-    """Run a command that must fail with that code and one line on stderr; returns the line."""
-    assert main(list(arguments)) == code
-    text = capsys.readouterr().err.strip()
-    assert text.startswith("warpgs: ") and "internal error" not in text and len(text.splitlines()) == 1
-    return text
-
-
 @pytest.mark.usefixtures("own_cache")
 def test_mistakes_get_one_line(scene, tmp_path, capsys):
     """2 usage, 3 data, 4 resources."""
-    out = tmp_path / "out"
-    assert "give show or export" in failure(capsys, 2, "priors")
-    assert "give show or export" in failure(capsys, 2, "priors", "draw")
-    assert "source 'lidar' is not one of sweep, flow" in failure(capsys, 2, *show(scene, "--out", out, "--source", "lidar"))
-    assert "--threads must be a number from 0" in failure(capsys, 2, *show(scene, "--out", out, "--threads", -1))
-    assert "depth-size was removed: give it in FILE.onnx.json" in failure(
-        capsys, 2, *show(scene, "--out", out, "--depth-size", 64)
-    )
-    (tmp_path / "x.onnx").write_text("no network")
-    assert "not an ONNX model" in failure(capsys, 3, *show(scene, "--out", out, "--depth-model", tmp_path / "x.onnx"))
-    assert "cannot be read" in failure(capsys, 3, *show(scene, "--out", out, "--segmentation-model", tmp_path / "none.onnx"))
-    below = scene / "images" / "000.png" / "sheets"
-    assert "choose another folder" in failure(capsys, 4, *show(scene, "--out", below))
+    out, file = tmp_path / "out", tmp_path / "x.onnx"
+    file.write_text("no network")
+    shown = show(scene, "--out", out)
+    for code, word, words in (
+        (2, "give show or export", ["priors"]), (2, "give show or export", ["priors", "draw"]),
+        (2, "source 'lidar' is not one of sweep, flow", [*shown, "--source", "lidar"]),
+        (2, "--threads must be a number from 0", [*shown, "--threads", "-1"]),
+        (2, "depth-size was removed: give it in FILE.onnx.json", [*shown, "--depth-size", "64"]),
+        (3, "not an ONNX model", [*shown, "--depth-model", str(file)]),
+        (3, "cannot be read", [*shown, "--segmentation-model", str(tmp_path / "none.onnx")]),
+        (4, "choose another folder", show(scene, "--out", scene / "images" / "000.png" / "sheets")),
+    ):  # fmt: skip
+        assert main(words) == code, words
+        text = capsys.readouterr().err.strip()
+        assert word in text and text.startswith("warpgs: ") and "internal error" not in text and len(text.splitlines()) == 1
     assert not out.exists() or not list(out.iterdir())
     assert main(["priors", "--help"]) == 0 and "priors export" in capsys.readouterr().out
 
@@ -432,19 +411,13 @@ def test_mistakes_get_one_line(scene, tmp_path, capsys):
 # The colour behind a scene: named, chosen, shown by renders, and kept by the run folder.
 
 
-@pytest.mark.parametrize(
-    "text,color",
-    [("black", (0, 0, 0)), ("white", (1, 1, 1)), ("#ff8000", (1, 128 / 255, 0)), ("0.25,1,.5", (0.25, 1, 0.5)),
-     ("auto", None), ("mean", None), ("scene", None)],
-)  # fmt: skip
-def test_colours_by_name_and_by_number(text, color):
-    assert color_of(text) == color and FitConfig(background=text).background == text
-
-
-@pytest.mark.parametrize("text", ["", "grey", "#fff", "#gggggg", "1,1", "1,1,2", "nan,0,0", "1.5,0,0", "-0.1,0,0", "1e-1,0,0"])
-def test_what_is_no_colour_is_refused(text):
-    with pytest.raises(UsageError, match=r"is not a colour: give auto, mean, scene, black, white, #rrggbb, or r,g,b"):
-        FitConfig(background=text)
+def test_colours_by_name_and_by_number():
+    named = {"black": (0, 0, 0), "white": (1, 1, 1), "#ff8000": (1, 128 / 255, 0), "0.25,1,.5": (0.25, 1, 0.5), "auto": None}
+    for text, color in named.items():
+        assert color_of(text) == color and FitConfig(background=text).background == text
+    for text in ("", "grey", "#fff", "#gggggg", "1,1", "nan,0,0", "1.5,0,0", "-0.1,0,0"):
+        with pytest.raises(UsageError, match=r"is not a colour: give auto, mean, scene, black, white, #rrggbb, or r,g,b"):
+            FitConfig(background=text)
 
 
 def test_the_mean_colour_is_of_training_pixels_that_count(tmp_path):
@@ -491,17 +464,8 @@ def test_a_run_keeps_its_background(tmp_path, capsys):
     """config.json holds the colour; scoring and continuing put the scene over it, and no colour makes another scene of it."""
     scenes.write_blender(tmp_path / "scene")
     flags = ["--init.source", "random", "--init.random-count", "20", "--preset", "3dgs", "--steps", "2", "--device", "cpu"]
-    fit = [
-        "fit",
-        str(tmp_path / "scene"),
-        "--out",
-        str(tmp_path / "run"),
-        "--split",
-        "every:8",
-        "--background",
-        "0.5,0.25,0",
-        *flags,
-    ]
+    fit = ["fit", str(tmp_path / "scene"), "--out", str(tmp_path / "run"), "--split", "every:8", *flags]
+    fit += ["--background", "0.5,0.25,0"]
     assert main(fit) == 0
     assert "background: 0.5,0.25,0, #804000" in capsys.readouterr().out
     record = json.loads((tmp_path / "run" / "config.json").read_text())
@@ -512,8 +476,8 @@ def test_a_run_keeps_its_background(tmp_path, capsys):
     assert stored.options().background.tolist() == [0.5, 0.25, 0] and scene.background == (0.5, 0.25, 0)
     np.testing.assert_allclose(test[0].image[0, 0], [0.5, 0.25, 0], atol=1e-6)
     assert main(["eval", str(tmp_path / "run"), "--device", "cpu"]) == 0
-    scores = [json.loads((tmp_path / "run" / n).read_text())["test"]["psnr"] for n in ("metrics.json", "eval.json")]
-    assert scores[0] == scores[1]
+    first, second = (json.loads((tmp_path / "run" / n).read_text())["test"]["psnr"] for n in ("metrics.json", "eval.json"))
+    assert first == second
     assert main([*fit, "--resume"]) == 0
 
 
@@ -541,7 +505,7 @@ def test_scores_of_opacity_are_over_the_pixels_of_each_kind():
     assert m.opacity["alpha_empty"] == pytest.approx(0.25) and m.opacity["alpha_object"] == pytest.approx(0.9)
     assert m.opacity["psnr_whole"] == pytest.approx(10 * np.log10(4 * 25)) and m.opacity["psnr_foreground"] == np.inf
     assert score(view(), image, alpha=rendered).opacity == {} == score(view(alpha), image).opacity
-    assert set(m.opacity) == set(scores.ALPHA_VARIANTS) == set(schemas.OPACITY)
+    assert set(m.opacity) == set(scores.ALPHA_VARIANTS)
 
 
 def test_means_are_over_the_views_that_have_such_pixels():
@@ -560,11 +524,11 @@ def test_straight_alpha_shows_the_image_again_over_any_background():
     rng = np.random.default_rng(0)
     colors, alpha = rng.uniform(0, 1, (6, 7, 3)).astype(np.float32), rng.uniform(0, 1, (6, 7)).astype(np.float32)
     alpha[0] = 0
-    over = {b: colors * alpha[..., None] + (1 - alpha[..., None]) * np.float32(b) for b in ((0, 0, 0), (1, 0.5, 0.2))}
-    for background, image in over.items():
-        made = straight_alpha(image, alpha, background)
+    on_black = colors * alpha[..., None]
+    for background in ((0, 0, 0), (1, 0.5, 0.2)):
+        made = straight_alpha(on_black + (1 - alpha[..., None]) * np.float32(background), alpha, background)
         assert (made[0] == 0).all()
-        np.testing.assert_allclose(made[1:, :, :3] * alpha[1:, :, None], over[0, 0, 0][1:], atol=1e-5)
+        np.testing.assert_allclose(made[1:, :, :3] * alpha[1:, :, None], on_black[1:], atol=1e-5)
     decoded = cv2.imdecode(np.frombuffer(png(made), np.uint8), cv2.IMREAD_UNCHANGED)[..., [2, 1, 0, 3]]
     np.testing.assert_array_equal(decoded, np.round(made * 255))
 
@@ -582,9 +546,9 @@ def run(tmp_path_factory):
 
 def test_metrics_config_and_report_speak_of_opacity(run):
     metrics, record = (json.loads((run / n).read_text()) for n in ("metrics.json", "config.json"))
-    assert set(schemas.OPACITY) <= set(metrics["test"]) & set(metrics["views"][0]) & set(metrics["variants"])
+    assert set(scores.ALPHA_VARIANTS) <= set(metrics["test"]) & set(metrics["views"][0]) & set(metrics["variants"])
     assert metrics["test"]["psnr"] == metrics["test"]["psnr_whole"] and record["transparent"] is True
-    schemas.METRICS(metrics, "")
+    METRICS(metrics, "")
     assert "alpha where empty" in (run / "report.html").read_text()
     assert open_run(run, "cpu").transparent
 

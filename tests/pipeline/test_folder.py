@@ -1,6 +1,7 @@
 """Run folders: one fit each, other versions, links that lead nowhere, names of images."""
 
 import dataclasses
+import hashlib
 import json
 import os
 import shutil
@@ -16,9 +17,8 @@ from tests.pipeline.farms import HereEngine, jobs_of, write_scenes
 from tests.scenes import photos, seeds
 from warpgs.app.cli import main
 from warpgs.errors import DataError, FolderHeldError, ResourceError, UsageError
-from warpgs.files import LOCK
+from warpgs.files import LOCK, writing_into
 from warpgs.locks import hold_folder
-from warpgs.pipeline.farm import work
 from warpgs.pipeline.farm.farm import run_farm
 from warpgs.pipeline.films.film import FilmSettings
 from warpgs.pipeline.model.start import InitConfig, initial_gaussians
@@ -26,11 +26,10 @@ from warpgs.pipeline.run import fit as fit_module
 from warpgs.pipeline.run.commands import evaluate, render
 from warpgs.pipeline.run.export import export
 from warpgs.pipeline.run.folder import FORMAT, TENSORS, load_checkpoint, open_run
-from warpgs.pipeline.run.request import FitRequest, SceneRequest
 from warpgs.pipeline.run.results import evaluate_run
 from warpgs.render.options import RasterizeOptions
 from warpgs.report.page import image_names, renaming_notes
-from warpgs.synthetic.demo import split_spec, write_demo
+from warpgs.synthetic.demo import write_demo
 
 # A run folder belongs to one fit at a time, and to one fit for good.
 
@@ -111,18 +110,6 @@ def test_export_and_prune_remove_what_killed_ones_left(folder, tmp_path):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.ply", "b", "own.tmp"]
 
 
-def test_a_study_leaves_a_run_in_progress_alone(folder, tmp_path):
-    """It neither moves it aside nor writes into it, and says whose it is."""
-    out = tmp_path / "study" / "0"
-    shutil.copytree(folder / "run", out)
-    scene = warpgs.load_scene(folder / "scene")
-    request = FitRequest(SceneRequest(str(folder / "scene")), out, dataclasses.replace(CONFIG, steps=3), "cpu")
-    with hold_folder(out):
-        outcome = work.ensure_run(request, scene.fingerprint, warpgs.open_run(out, "cpu"), "cpu", {})
-    assert outcome.state == "failed" and "is writing there" in outcome.note
-    assert [p.name for p in out.parent.iterdir()] == ["0"]
-
-
 @pytest.mark.parametrize("key", ["config", "fingerprint"])
 def test_a_checkpoint_of_another_fit_is_not_continued(folder, tmp_path, key):
     """It was copied from a run with another seed, or on other data: nothing of either run is lost."""
@@ -141,7 +128,7 @@ def test_a_checkpoint_of_another_fit_is_not_continued(folder, tmp_path, key):
 
 
 def test_a_folder_in_use_names_its_user_and_does_not_advise_to_resume(folder, tmp_path):
-    """Whether it holds a run already or not; a lock file that nobody holds is no user."""
+    """A lock file that nobody holds is no user."""
     shutil.copytree(folder / "run", tmp_path / "run")
     with hold_folder(tmp_path / "run"), pytest.raises(FolderHeldError, match=f"process {os.getpid()} on .* is writing there"):
         fit(folder, tmp_path / "run")
@@ -151,18 +138,17 @@ def test_a_folder_in_use_names_its_user_and_does_not_advise_to_resume(folder, tm
 
 
 def test_commands_on_a_run_that_has_not_ended_print_that(folder, tmp_path):
-    """Render, export, page, evaluation and plot; none does for a finished run."""
-    shutil.copytree(folder / "run", tmp_path / "run")
-    commands = {
-        "export": lambda: export(tmp_path / "run", tmp_path / "a.ply"),
-        "eval": lambda: evaluate(tmp_path / "run", "cpu"),
-        "render": lambda: render(tmp_path / "run", "views", tmp_path / "film", FilmSettings(), "cpu"),
-    }
-    assert not [line for c in commands.values() for line in c() if ": unfinished," in line]
-    (tmp_path / "run" / "metrics.json").unlink()
-    for name, command in commands.items():
-        lines = [line for line in command() if "the fit stopped after step 2" in line]
-        assert len(lines) == 1 and "--resume" in lines[0], name
+    """Render, export and evaluation; none does for a finished run."""
+    run = shutil.copytree(folder / "run", tmp_path / "run")
+    commands = [
+        lambda: export(run, tmp_path / "a.ply"), lambda: evaluate(run, "cpu"),
+        lambda: render(run, "views", tmp_path / "film", FilmSettings(), "cpu"),
+    ]  # fmt: skip
+    assert not [line for c in commands for line in c() if "the fit stopped" in line]
+    (run / "metrics.json").unlink()
+    for command in commands:
+        (line,) = [line for line in command() if "the fit stopped after step 2" in line]
+        assert "--resume" in line
 
 
 def test_a_fit_that_was_killed_before_it_had_a_record_can_be_begun_again(folder, tmp_path):
@@ -205,39 +191,16 @@ def test_a_folder_that_cannot_be_made_or_read_is_the_users_matter(folder, tmp_pa
 
 # Run folders of another version: one clear sentence from every command, and no traceback.
 
-OLD_CONFIG = {
-    "scene": {
-        "path": "/scene", "split": None, "downscale": 1, "strict": False, "allow_outside": False, "invert_masks": False,
-        "score_masks": None,
-    },
-    "format": "colmap", "fingerprint": "0" * 64, "train": ["000.png"], "test": [], "notes": [],
-    "normalization": {"offset": [0.0, 0.0, 0.0], "scale": 1.0}, "background": [0.0, 0.0, 0.0],
-    "config": {"preset": "quick", "steps": 600, "half": 0.0, "rule": "exact"}, "config_hash": "3be867cbcc33", "device": "cpu",
-    "versions": {"warpgs": "0.1.0", "python": "3.11.9"},
-    "cameras": {"000.png": {"viewmat": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]],
-                            "K": [[1, 0, 1], [0, 1, 1], [0, 0, 1]], "width": 2, "height": 2}},
-}  # fmt: skip
-"""config.json as version 0.1.0 wrote it, shortened."""
-
-
-@pytest.fixture(scope="module")
-def run(tmp_path_factory):
-    """A scene and a short run on it."""
-    folder = tmp_path_factory.mktemp("formats")
-    write_demo(folder / "scene", views=8, width=32, height=32)
-    flags = ["--steps", "4", "--device", "cpu", "--init.source", "random", "--init.random-count", "50", "--preset", "3dgs"]
-    assert main(["fit", str(folder / "scene"), "--out", str(folder / "run"), *flags]) == 0
-    return folder / "run", ["fit", str(folder / "scene"), *flags]
-
 
 @pytest.mark.parametrize("command", ["resume", "eval", "render", "export", "prune"])
-def test_runs_of_version_0_1_0_are_refused_by_name(run, tmp_path, capsys, command):
+def test_runs_of_version_0_1_0_are_refused_by_name(folder, tmp_path, capsys, command):
     """The sentence names the file, both versions and the way out; nothing is written."""
     old = tmp_path / "old"
     old.mkdir()
-    (old / "config.json").write_text(json.dumps(OLD_CONFIG))
+    record = {"format": "colmap", "config": {"preset": "quick", "steps": 600, "half": 0.0}, "versions": {"warpgs": "0.1.0"}}
+    (old / "config.json").write_text(json.dumps(record))
     arguments = {
-        "resume": [*run[1], "--out", str(old), "--resume"],
+        "resume": ["fit", str(folder / "scene"), "--preset", "3dgs", "--device", "cpu", "--out", str(old), "--resume"],
         "export": ["export", str(old), "--to", f"{tmp_path}/a.ply"],
     }
     assert main(arguments.get(command, [command, str(old)])) == 3
@@ -247,47 +210,26 @@ def test_runs_of_version_0_1_0_are_refused_by_name(run, tmp_path, capsys, comman
     assert [p.name for p in old.iterdir()] == ["config.json"] and not (tmp_path / "a.ply").exists()
 
 
-def test_the_format_is_a_number_in_both_files(run, tmp_path):
+def test_the_format_is_a_number_in_both_files(folder, tmp_path):
     """config.json and the header of the checkpoint carry it; a checkpoint of another one is refused by its version."""
-    import hashlib
-
-    record = json.loads((run[0] / "config.json").read_text())
-    assert record["format"] == FORMAT == 2 and record["scene_format"] == "colmap"
-    assert open_run(run[0], "cpu").step == 4
-    copy = tmp_path / "run"
-    shutil.copytree(run[0], copy)
-    body = (
-        (copy / TENSORS).read_bytes()[:-32].replace(b'"format": "2", "version": "0.2.0"', b'"format": "9", "version": "7.0.0"')
+    copy = shutil.copytree(folder / "run", tmp_path / "run")
+    record = json.loads((copy / "config.json").read_text())
+    assert record["format"] == FORMAT == 2 and record["scene_format"] == "colmap" and open_run(copy, "cpu").step == 2
+    body, ours, other = (
+        (copy / TENSORS).read_bytes()[:-32],
+        b'"format": "2", "version": "0.2.0"',
+        b'"format": "9", "version": "7.0.0"',
     )
+    body = body.replace(ours, other)
     (copy / TENSORS).write_bytes(body + hashlib.sha256(body).digest())
     with pytest.raises(DataError, match=r"warpgs 7\.0\.0 wrote this checkpoint, in a format that warpgs 0\.2\.0 does not read"):
         load_checkpoint(copy)
-    with pytest.raises(DataError, match="not a record of a fit"):
-        (copy / "config.json").write_text("[1]")
-        open_run(copy)
 
 
 # Links in runs and results lead nowhere: not what is written, and not what is read; nor does a folder put in a run's
 # place.
 
 with_links = pytest.mark.skipif(os.name == "nt", reason="links need a right that users of Windows often lack")
-LINKS_CONFIG = warpgs.FitConfig(
-    steps=6, checkpoint_every=2, init=InitConfig(source="random", random_count=50)
-)  # fmt: skip
-
-
-@pytest.fixture(scope="module")
-def links_folder(tmp_path_factory):
-    """A scene and a run on it."""
-    folder = tmp_path_factory.mktemp("links")
-    write_demo(folder / "scene", views=8, width=48, height=36)
-    warpgs.fit(folder / "scene", LINKS_CONFIG, split=split_spec(8), out=folder / "run", device="cpu", verbose=False)
-    return folder
-
-
-def links_contents(folder):
-    """Every file with its bytes."""
-    return {p.relative_to(folder): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
 
 
 def linked(run, name, outside):
@@ -295,31 +237,29 @@ def linked(run, name, outside):
     outside.mkdir(exist_ok=True)
     (run / name).rename(outside / name)
     (run / name).symlink_to(outside / name)
-    return links_contents(outside)
+    return contents(outside)
 
 
 @with_links
 @pytest.mark.parametrize("name", ["renders", "depth"])
-def test_a_run_s_folder_that_is_a_link_is_refused_before_any_work(links_folder, tmp_path, capsys, name):
+def test_a_run_s_folder_that_is_a_link_is_refused_before_any_work(folder, tmp_path, capsys, name):
     """A second time under a link to the run itself, which is followed."""
-    run, outside = tmp_path / "run", tmp_path / "outside"
-    shutil.copytree(links_folder / "run", run)
+    run, outside = shutil.copytree(folder / "run", tmp_path / "run"), tmp_path / "outside"
     before = linked(run, name, outside)
     (tmp_path / "linked").symlink_to(run)
     for path in (run, tmp_path / "linked"):
         assert main(["eval", str(path), "--device", "cpu"]) == 4
         said = capsys.readouterr()
         assert f"{path / name}: is a link, and links inside of a results folder are not followed" in said.err
-        assert "scoring" not in said.out and links_contents(outside) == before
+        assert "scoring" not in said.out and contents(outside) == before
     (run / name).unlink()
     assert main(["eval", str(tmp_path / "linked"), "--device", "cpu"]) == 0 and (run / name).is_dir()
 
 
 @with_links
 @pytest.mark.parametrize("name", ["config.json", "checkpoint.safetensors"])
-def test_a_run_s_file_that_is_a_link_is_not_read(links_folder, tmp_path, capsys, name):
-    run = tmp_path / "run"
-    shutil.copytree(links_folder / "run", run)
+def test_a_run_s_file_that_is_a_link_is_not_read(folder, tmp_path, capsys, name):
+    run = shutil.copytree(folder / "run", tmp_path / "run")
     linked(run, name, tmp_path / "outside")
     assert main(["export", str(run), "--to", str(tmp_path / "a.ply")]) == 3
     assert "is a link" in capsys.readouterr().err and not (tmp_path / "a.ply").exists()
@@ -329,10 +269,9 @@ def test_a_run_s_file_that_is_a_link_is_not_read(links_folder, tmp_path, capsys,
 
 
 @with_links
-def test_a_render_below_a_run_is_not_led_out(links_folder, tmp_path, capsys):
+def test_a_render_below_a_run_is_not_led_out(folder, tmp_path, capsys):
     """The default folder of a path is below the run; one that the user names may be a link."""
-    run, outside = tmp_path / "run", tmp_path / "outside"
-    shutil.copytree(links_folder / "run", run)
+    run, outside = shutil.copytree(folder / "run", tmp_path / "run"), tmp_path / "outside"
     outside.mkdir()
     (run / "path-views").symlink_to(outside)
     words = ["render", str(run), "--path", "views", "--device", "cpu"]
@@ -341,59 +280,39 @@ def test_a_render_below_a_run_is_not_led_out(links_folder, tmp_path, capsys):
 
 
 @with_links
-@pytest.mark.parametrize("name", ["log.txt", "run", "job.json", "thumbnail.jpg", "."])
+@pytest.mark.parametrize("name", ["log.txt", "run", "job.json", "."])
 def test_a_farm_s_job_writes_below_the_results_alone(tmp_path, name):
-    """A log is appended to and a run set aside, so links are refused; records and images replace a link; the others go on."""
+    """A log is appended to and a run set aside, so links are refused; records replace a link; the others go on."""
     scenes, results, outside = write_scenes(tmp_path / "scenes"), tmp_path / "results", tmp_path / "outside"
     outside.mkdir()
     (outside / "canary").write_bytes(b"the user's own")
-    target = outside / "canary" if name.endswith((".txt", ".json", ".jpg")) else outside
-    (results / "s0" / name).parent.mkdir(parents=True)
-    if name == ".":
-        (results / "s0").symlink_to(target)
-    else:
-        (results / "s0" / name).symlink_to(target)
-    jobs = [dataclasses.replace(j, results=results) for j in jobs_of(scenes, results)]
-    if name in ("log.txt", "."):
-        with pytest.raises(ResourceError, match=f"{'s0' if name == '.' else name}: is a link"):
-            _farm(jobs, results)
-    else:
-        first, second = _farm(jobs, results)
-        assert second.state == "done" and first.state == ("failed" if name == "run" else "done")
-        assert name != "run" or "run: is a link" in first.record.message
-    assert links_contents(outside) == {(outside / "canary").relative_to(outside): b"the user's own"}
-    assert [p.name for p in outside.iterdir()] == ["canary"] and outside.is_dir()
-
-
-def _farm(jobs, results):
-    from warpgs.files import writing_into
-
+    link = results / "s0" if name == "." else results / "s0" / name
+    link.parent.mkdir(parents=True)
+    link.symlink_to(outside / "canary" if "." in name[1:] else outside)
     with writing_into(results):
-        return run_farm(jobs, HereEngine(), poll=0.01)
+        if name in ("log.txt", "."):
+            with pytest.raises(ResourceError, match=f"{link.name}: is a link"):
+                run_farm(jobs_of(scenes, results), HereEngine(), poll=0.01)
+        else:
+            first, second = run_farm(jobs_of(scenes, results), HereEngine(), poll=0.01)
+            assert second.state == "done" and first.state == ("failed" if name == "run" else "done")
+            assert name != "run" or "run: is a link" in first.record.message
+    assert [*contents(outside).values()] == [b"the user's own"] and [p.name for p in outside.iterdir()] == ["canary"]
 
 
 @with_links
-def test_a_run_folder_that_is_replaced_in_mid_fit_is_left_alone(links_folder, tmp_path):
+def test_a_run_folder_that_is_replaced_in_mid_fit_is_left_alone(folder, tmp_path):
     """The fit stops before its next write; what stands in its place keeps its own contents."""
-    out = tmp_path / "run"
+    out, config = tmp_path / "run", dataclasses.replace(CONFIG, steps=6, checkpoint_every=2, seed=3)
 
     def replace(report):
         if report.step == 3:
             out.rename(tmp_path / "moved")
-            shutil.copytree(links_folder / "run", out)
+            shutil.copytree(folder / "run", out)
 
     with pytest.raises(ResourceError, match="run: the folder was moved, removed or replaced while this command wrote into it"):
-        warpgs.fit(
-            links_folder / "scene",
-            dataclasses.replace(LINKS_CONFIG, seed=3),
-            split=split_spec(8),
-            out=out,
-            device="cpu",
-            verbose=False,
-            on_step=replace,
-        )
-    assert links_contents(out) == links_contents(links_folder / "run")
-    assert (tmp_path / "moved" / "checkpoint.safetensors").is_file()
+        fit(folder, out, config, on_step=replace)
+    assert contents(out) == contents(folder / "run") and (tmp_path / "moved" / "checkpoint.safetensors").is_file()
 
 
 # Each view has image files of its own, whatever the views are called and whichever system they lie on.

@@ -1,5 +1,6 @@
 """What a fit leaves and says: scores, pictures, errors that it traded, and figures of sampling events."""
 
+import contextlib
 import dataclasses
 import math
 
@@ -40,23 +41,25 @@ from warpgs.render.rasterize import rasterize
 from warpgs.report.images import CONTACT_GAP, CONTACT_HEAD, CONTACT_MARGIN, DOT, TITLE_SIZE, colored, webp
 from warpgs.scene import Gaussians, View
 
-# What a fit leaves: scores in the order of the views, a picture of each, and errors that are said.
+CPU = torch.device("cpu")
 
 
 @pytest.fixture(scope="module")
 def scene():
     """Gaussians, and more views than there are threads and pictures at a time."""
-    import torch
+    return initial_gaussians(seeds(), InitConfig(), 3, 1.0, CPU), photos(12)
 
-    return initial_gaussians(seeds(), InitConfig(), 3, 1.0, torch.device("cpu")), photos(12)
+
+def full(path, data):
+    """Stand in for a write to a full disk."""
+    raise ResourceError(f"{path.name}: no space left")
 
 
 def test_scores_are_those_of_their_views(scene, tmp_path):
     """Each row is the score of its view, whoever finished first; means are over these; every held-out view has its files."""
     gaussians, views = scene
-    test, train = views[:10], views[10:]
-    found = evaluate_run(tmp_path, gaussians, train, test, RasterizeOptions())
-    options = RasterizeOptions()
+    test, train, options = views[:10], views[10:], RasterizeOptions()
+    found = evaluate_run(tmp_path, gaussians, train, test, options)
     wanted = [score(v, render_view(gaussians, v, options)[0]).row() for v in views]
     assert found["views"] == wanted[:10] and len({r["psnr"] for r in wanted}) == 12
     assert found["train"]["psnr"] == pytest.approx(sum(r["psnr"] for r in wanted[10:]) / 2)
@@ -65,23 +68,16 @@ def test_scores_are_those_of_their_views(scene, tmp_path):
         assert sorted(p.stem for p in (tmp_path / folder).iterdir()) == sorted(v.name.removesuffix(".png") for v in test)
 
 
-def test_without_held_out_views_training_views_are_pictured(scene, tmp_path):
-    """And no score is called held-out."""
+def test_without_held_out_views_training_views_are_pictured(scene, tmp_path, monkeypatch):
+    """No score is called held-out; a full disk ends the evaluation with its error, although another thread met it."""
     gaussians, views = scene
-    found = evaluate_run(tmp_path, gaussians, views[:2], [], RasterizeOptions())
+    options = RasterizeOptions()
+    found = evaluate_run(tmp_path, gaussians, views[:2], [], options)
     assert found["test"] == {} and found["views"] == [] and found["baselines"] == {} and found["train"]["psnr"] > 5
     assert len(list((tmp_path / "renders").iterdir())) == 2
-
-
-def test_a_picture_that_cannot_be_written_is_said(scene, tmp_path, monkeypatch):
-    """A full disk ends the evaluation with its error, although another thread met it."""
-
-    def full(path, data):
-        raise ResourceError(f"{path.name}: no space left")
-
     monkeypatch.setattr(results, "write_bytes", full)
     with pytest.raises(ResourceError, match="no space left"):
-        evaluate_run(tmp_path, scene[0], scene[1][:1], scene[1][1:3], RasterizeOptions())
+        evaluate_run(tmp_path, gaussians, views[:1], views[1:3], options)
 
 
 def test_a_fit_ends_with_its_score_its_size_its_time_and_what_to_do_next(tmp_path):
@@ -91,31 +87,23 @@ def test_a_fit_ends_with_its_score_its_size_its_time_and_what_to_do_next(tmp_pat
         "baselines": {"mean_photo": 12.0, "nearest_photo": 13.5}, "gaussians": 1234, "complexity": {"bytes": 2**20},
         "seconds": {"total": 75.0, "compiling": 20.0},
     }  # fmt: skip
-    lines = result_lines(metrics, tmp_path / "my run")
+    out = tmp_path / "my run"
+    lines = result_lines(metrics, out)
     assert lines[0].startswith("held-out PSNR 24.50 dB, SSIM 0.800") and lines[0].endswith("(2 views)")
     assert "the nearest photograph 13.50 dB" in lines[1] and "all seen" in lines[2]
     assert lines[3] == "1,234 Gaussians, 1.0 MiB, in 1 min 15 s, of which 20 s to compile kernels, once on this machine"
-    assert lines[4] == f"report: {tmp_path / 'my run' / 'report.html'}"
-    assert [line.split("  ")[1] for line in lines[6:]] == [
-        f"warpgs {words}" for words in (
-            f"view '{tmp_path}/my run'", f"render '{tmp_path}/my run'", f"export '{tmp_path}/my run' --to scene.html"
-        )
-    ]  # fmt: skip
+    assert lines[4] == f"report: {out / 'report.html'}"
+    commands = [f"view '{out}'", f"render '{out}'", f"export '{out}' --to scene.html"]
+    assert [line.split("  ")[1] for line in lines[6:]] == [f"warpgs {words}" for words in commands]
     unscored = result_lines(metrics | {"test": {}, "seconds": {"total": 5.0}}, None)
     assert unscored[0] == "training PSNR 30.25 dB (no score of new views: no view is held out)"
-    assert unscored[1].endswith("1.0 MiB, in 5 s")
-    assert "held-out" not in " ".join(unscored) and "next:" not in unscored
+    assert unscored[1].endswith("1.0 MiB, in 5 s") and "held-out" not in " ".join(unscored) and "next:" not in unscored
 
 
 # What a fit says it traded: errors that are true, the same for the same seed, and quick to find.
 
-CPU = torch.device("cpu")
 BACKGROUND = torch.tensor([0.2, 0.4, 0.6])
 EXACT = RasterizeOptions(background=BACKGROUND)
-
-
-def views(count: int = 5, width: int = 150, height: int = 100) -> list[View]:
-    return photos(count, width, height)
 
 
 def crowd(device) -> Gaussians:
@@ -123,18 +111,16 @@ def crowd(device) -> Gaussians:
     base, many = three_gaussians(), cloud(800, degree=0)
     means = (many.means - torch.tensor([0.0, 0, 4.0])) * 0.3
     many = dataclasses.replace(many, means=means, logit_opacities=many.logit_opacities - 2)
-    tensors = {n: torch.cat([t, many.tensors()[n]]).to(device) for n, t in base.tensors().items()}
-    return Gaussians(**tensors)
+    return Gaussians(**{n: torch.cat([t, many.tensors()[n]]).to(device) for n, t in base.tensors().items()})
 
 
 def test_error_is_the_difference_of_the_pictures(device):
     """For a coarse rule the figures are those of its pictures and exact's, whole pictures in float32, within float32."""
-    g, seen = crowd(device), views(2, 60, 48)  # smaller than a part: the parts are the pictures
+    g, seen = crowd(device), photos(2, 60, 48)  # smaller than a part: the parts are the pictures
     for rule in ("fast", "gsplat-1.5"):
         found = rule_report_of(g, seen, RasterizeOptions(rule=rule, background=BACKGROUND), seed=0)
-        options = EXACT
         pairs = [
-            [rasterize(g, v.camera, dataclasses.replace(options, rule=r)).rgb.flatten() for r in (rule, "exact")] for v in seen
+            [rasterize(g, v.camera, dataclasses.replace(EXACT, rule=r)).rgb.flatten() for r in (rule, "exact")] for v in seen
         ]
         off = torch.cat([(a - b).abs() for a, b in pairs]).cpu()
         assert found["mean"] == pytest.approx(float(off.mean()), rel=1e-2, abs=2e-6)
@@ -142,18 +128,23 @@ def test_error_is_the_difference_of_the_pictures(device):
         assert found["psnr"] == pytest.approx(-10 * math.log10(float((off**2).mean())), abs=0.2)
         assert found["render_ms"] > 0 and found["exact_ms"] > 0 and f"images by rule {rule} differ" in found["summary"]
     assert float(off.max()) > 0
+    with pytest.raises(UsageError, match=", ".join(RULES)):
+        FitConfig(rule="quick")
 
 
 def test_nothing_traded_is_said_and_is_as_small_as_float32(device):
-    """Rule exact: the arithmetic alone, and no second time."""
-    found = rule_report_of(crowd(device), views(), EXACT, seed=3)
+    """Rule exact: the arithmetic alone, and no second time; kernels and truth leave out a Gaussian that is no number."""
+    found = rule_report_of(crowd(device), photos(5, 150, 100), EXACT, seed=3)
     assert 0 < found["mean"] < 2e-6 and "exact_ms" not in found and found["psnr"] > 90
     assert "has no cut-offs" in found["summary"] and "random training views" in found["summary"]
+    g = crowd(CPU)
+    g.means[5] = float("nan")
+    assert rule_report_of(g, photos(1, 150, 100), EXACT, seed=0)["mean"] < 2e-6
 
 
 def test_the_seed_draws_views_and_parts():
     """Three views, parts of 64 px on tile edges or the picture's, others for another seed."""
-    g, seen = crowd(CPU), views(6)
+    g, seen = crowd(CPU), photos(6, 150, 100)
     first, again, other = (rule_report_of(g, seen, EXACT, seed=s) for s in (0, 0, 1))
     assert first["views"] == again["views"] and first["mean"] == again["mean"] and first["views"] != other["views"]
     assert len(first["views"]) == 3
@@ -162,23 +153,13 @@ def test_the_seed_draws_views_and_parts():
         assert all(side % TILE_SIZE == 0 or end == whole for side, end, whole in ((w, x + w, 150), (h, y + h, 100)))
 
 
-def test_a_gaussian_that_is_no_number_changes_nothing():
-    """The kernels leave it out, and so does the truth."""
-    g = crowd(CPU)
-    bad = g.means.clone()
-    bad[5] = float("nan")
-    found = rule_report_of(dataclasses.replace(g, means=bad), views(1), EXACT, seed=0)
-    assert found["mean"] < 2e-6
-
-
 @pytest.mark.parametrize("size", [(40, 32), (41, 33), (1, 1)])
 def test_halved_views(size):
     """Means of the pixels covered, a camera that sees the same, and a mask that counts whole pixels alone."""
     width, height = size
-    image = np.random.default_rng(0).random((height, width, 3)).astype(np.float32)
-    mask = np.ones((height, width), bool)
+    image, mask = np.random.default_rng(0).random((height, width, 3)).astype(np.float32), np.ones((height, width), bool)
     mask[0, -1] = False
-    camera = dataclasses.replace(views(1, width, height)[0].camera, model="fisheye")
+    camera = dataclasses.replace(photos(1, width, height)[0].camera, model="fisheye")
     view = TrainingView.of(View("a", camera, image, mask), CPU)
     half = half_size(view)
     assert view.camera.model == half.camera.model == "fisheye"
@@ -187,8 +168,7 @@ def test_halved_views(size):
     if size == (40, 32):
         assert torch.allclose(half.image[3, 5], view.image[6:8, 10:12].mean((0, 1)))
         assert half.mask.sum() == w * h - 1 and half.mask[0, -1] == 0
-    corner = torch.tensor([width, height, 1.0], dtype=torch.float64)
-    ray = torch.linalg.solve(view.camera.K.double(), corner)
+    ray = torch.linalg.solve(view.camera.K.double(), torch.tensor([width, height, 1.0], dtype=torch.float64))
     # entries of K are rounded once each, so at most 2^-24 of a side, twice
     assert torch.allclose(half.camera.K.double() @ ray, torch.tensor([w, h, 1.0], dtype=torch.float64), rtol=1e-6)
 
@@ -206,19 +186,11 @@ def test_a_fit_starts_at_half_size_and_ends_whole(device):
         sizes.append(fit.stacks[kind].camera.width)
         (report,) = fit.advance()
         assert math.isfinite(report.loss)
-    assert sizes == [20] * 4 + [40] * 4
-    assert len(fit.stacks) == 2 and len(fit.places) == 6
+    assert sizes == [20] * 4 + [40] * 4 and len(fit.stacks) == 2 and len(fit.places) == 6
     plain = Trainer(photos(3), seeds(), dataclasses.replace(config, half_resolution=0.0), device)
     assert len(plain.stacks) == 1 and len(plain.places) == 3
     with pytest.raises(UsageError, match="half-resolution"):
         dataclasses.replace(config, half_resolution=float("nan"))
-
-
-def test_every_rule_can_be_asked_of_a_fit():
-    """And a name that is none is refused with the names there are."""
-    assert all(FitConfig(rule=name).rule == name for name in RULES)
-    with pytest.raises(UsageError, match=", ".join(RULES)):
-        FitConfig(rule="quick")
 
 
 # Images and figures of sampling events: they show what the event saw, and say what it did.
@@ -240,21 +212,20 @@ def tiny():
         yield
 
 
-def fitted(config: FitConfig, steps: int) -> Trainer:
-    """Some steps of a fit of three views."""
+def fitted(config: FitConfig = CONFIG, steps: int = 0, out=None) -> Trainer:
+    """Some steps of a fit of three views, with images of its events in ``out``."""
     views = photos(3)
     fit = Trainer(views, seeds(), config, CPU, priors=priors(views))
-    for _ in range(steps):
-        fit.advance()
+    with contextlib.nullcontext() if out is None else images_kept(fit, NAMES, out):
+        for _ in range(steps):
+            fit.advance()
     return fit
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     """A finished fit with its folder, and the first event."""
-    out, seen = tmp_path_factory.mktemp("run"), []
-    views = photos(3)
-    fit = Trainer(views, seeds(), CONFIG, CPU, priors=priors(views))
+    out, seen, fit = tmp_path_factory.mktemp("run"), [], fitted()
     with images_kept(fit, NAMES, out):
         draw = fit.strategy.on_event
         fit.strategy.on_event = lambda step, views: (draw(step, views), seen.append((step, views)))
@@ -272,23 +243,18 @@ def tile(sheet: np.ndarray, index: int, view, text: float = 1.25, width: int = 3
 
 
 @pytest.mark.usefixtures("tiny")
-def test_two_events_are_shown_steps():
-    """The first, and the first of the second half of phase 2; the same one where there is but one; none without events."""
+def test_two_events_are_shown_steps(run):
+    """The first, and the first of the second half of phase 2; each has a file with a sheet for each of the three views."""
     phases = plan_phases(PhaseConfig(2000, 3000), 10_000)
     first, middle = sorted(shown_steps(phases))
     assert first == 2000 and 4500 <= middle < 4800 and middle in phases.events
     assert shown_steps(dataclasses.replace(phases, events=(2000,))) == {2000}
     assert shown_steps(dataclasses.replace(phases, events=())) == set()
-
-
-@pytest.mark.usefixtures("tiny")
-def test_pictures_lie_in_the_run_folder(run):
-    """A picture per pictured event with a sheet for each of the three views, and no other file."""
     fit, out, _ = run
     files = sorted((out / "sampling").iterdir())
     assert [int(f.stem) for f in files] == sorted(shown_steps(fit.phases)) and len(files) == 2
-    first = cv2.imread(str(files[0]))
-    assert first.shape[0] % 3 == 0 and first.shape[1] == 2 * CONTACT_MARGIN + 5 * 320 + 4 * CONTACT_GAP
+    image = cv2.imread(str(files[0]))
+    assert image.shape[0] % 3 == 0 and image.shape[1] == 2 * CONTACT_MARGIN + 5 * 320 + 4 * CONTACT_GAP
 
 
 @pytest.mark.usefixtures("tiny")
@@ -319,21 +285,14 @@ def test_tiles_show_what_the_event_saw(run):
 def test_uniform_events_show_no_scores(tmp_path):
     """Nor a disparity, as no prior was made; the words say that nothing was scored."""
     fit, seen = Trainer(photos(3), seeds(), dataclasses.replace(CONFIG, strategy="sampling"), CPU), []
-    with images_kept(fit, NAMES, tmp_path):
-        fit.strategy.on_event = lambda step, views: seen.append(views)
-        while not seen:
-            fit.advance()
+    fit.strategy.on_event = lambda step, views: seen.append(views)
+    while not seen:
+        fit.advance()
     drawn, view = seen[0][1], fit.views[1]
     assert fit.disparities == [] and not drawn.scores
     sheet = view_sheet("01.png", 8, view, None, drawn, fit.strategy)
-    one_row = (
-        tile(np.zeros((10**4, 10**4)), 0, view).shape[0]
-        + round(1.25 * CONTACT_HEAD)
-        + 2 * CONTACT_MARGIN
-        + round(1.25 * TITLE_SIZE)
-        + 18
-    )
-    assert sheet.shape[0] == one_row  # render, image, gate, pixels, words
+    one_row = tile(np.zeros((10**4, 10**4)), 0, view).shape[0] + round(1.25 * CONTACT_HEAD) + round(1.25 * TITLE_SIZE)
+    assert sheet.shape[0] == one_row + 2 * CONTACT_MARGIN + 18  # render, image, gate, pixels, words
     words = sampling_report_of(fit, tmp_path)[0]
     assert "uniformly at random" in words and "All scores have weight 0, so no score is shown." in words
 
@@ -361,44 +320,37 @@ def test_story_follows_the_switches(run, tmp_path):
     (out / "sampling" / "own.png").unlink()
     assert "sampled at random" in story[0] and "above its 0.6 quantile" in story[0] and "rendered depth" in story[0]
     assert [c for c, _ in story[1]] == [f"sampling after step {s}" for s in sorted(shown_steps(fit.phases))]
-    assert story[1][0][1] == webp(next(iter(sorted((out / "sampling").iterdir()))).read_bytes(), SHEET_WIDTH, 70)
-    assert dict(zip(*story[2]))["sampling events"] == str(len(fit.strategy.events))
-    method = dataclasses.replace(METHOD, sampler=dataclasses.replace(METHOD.sampler, fraction=0.2))
-    base, own = dataclasses.replace(CONFIG, method=method), PaperConfig(agp=False, depth="consistent")
-    other = fitted(dataclasses.replace(base, strategy_config=own), steps=8)
-    words = sampling_report_of(other, tmp_path)[0]
+    assert story[1][0][1] == webp(min((out / "sampling").iterdir()).read_bytes(), SHEET_WIDTH, 70)
+    assert dict(zip(*story[2]))["sampling events"] == str(len(fit.strategy.events)) and "widened" not in story[0]
+
+    def words_of(own, fraction=0.2):
+        method = dataclasses.replace(METHOD, sampler=dataclasses.replace(METHOD.sampler, fraction=fraction))
+        return sampling_report_of(fitted(dataclasses.replace(CONFIG, method=method, strategy_config=own), 8), tmp_path)[0]
+
+    own = PaperConfig(agp=False, depth="consistent")
+    words = words_of(own)
     assert "the highest in S_importance" in words and "other views confirm and with S_geometry" in words
-    assert "In 3 of 3 samplings the gate was widened" in words and "widened" not in story[0]
-    free = fitted(dataclasses.replace(base, strategy_config=dataclasses.replace(own, ra=False)), steps=8)
-    assert "all pixels that Gaussians cover" in sampling_report_of(free, tmp_path)[0]
-    alike = PaperConfig(s_render=False, s_semantic=False, s_geometry=False)
-    words = sampling_report_of(fitted(dataclasses.replace(CONFIG, strategy_config=alike), steps=8), tmp_path)[0]
+    assert "In 3 of 3 samplings the gate was widened" in words
+    assert "all pixels that Gaussians cover" in words_of(dataclasses.replace(own, ra=False))
+    words = words_of(PaperConfig(s_render=False, s_semantic=False, s_geometry=False), 0.01)
     assert "sampled uniformly at random" in words and "All scores have weight 0" in words
-    assert (
-        sampling_report_of(fitted(dataclasses.replace(CONFIG, strategy="clone_split", strategy_config=None), steps=1), tmp_path)
-        is None
-    )
+    plain = fitted(dataclasses.replace(CONFIG, strategy="clone_split", strategy_config=None), 1)
+    assert sampling_report_of(plain, tmp_path) is None
 
 
 @pytest.mark.usefixtures("tiny")
 def test_first_picture_outlives_a_continuation(run, tmp_path):
     """Stopped after the first event and continued: the same pictures, byte for byte, as of the fit that never stopped."""
-    views = photos(3)
-
-    def go_on(until: int, begin=None) -> Trainer:
-        fit = Trainer(views, seeds(), CONFIG, CPU, priors=priors(views))
-        if begin is not None:
-            fit.load(*begin)
+    for until, count in ((10, 1), (CONFIG.steps, 2)):
+        fit = fitted()
+        if count == 2:
+            fit.load(*load_checkpoint(tmp_path))
         with images_kept(fit, NAMES, tmp_path) as images_written:
             while fit.step < until:
                 fit.advance()
             images_written()
-            assert len(list((tmp_path / "sampling").glob("*.png"))) == (1 if begin is None else 2)
-        return fit
-
-    save_checkpoint(tmp_path, *go_on(10).state())
-    assert len(list((tmp_path / "sampling").iterdir())) == 1
-    go_on(CONFIG.steps, load_checkpoint(tmp_path))
+            assert len(list((tmp_path / "sampling").iterdir())) == count
+        save_checkpoint(tmp_path, *fit.state())
     straight, continued = ({f.name: f.read_bytes() for f in (d / "sampling").iterdir()} for d in (run[1], tmp_path))
     assert straight == continued and len(straight) == 2
 
@@ -407,19 +359,11 @@ def test_first_picture_outlives_a_continuation(run, tmp_path):
 @pytest.mark.parametrize("cause", ["folder", "disk"])
 def test_images_that_cannot_be_written_end_no_fit(tmp_path, monkeypatch, cause):
     """A file stands where their folder should be, or the disk is full: said once, and the fit takes all its steps."""
-
-    def full(path, data):
-        raise ResourceError(f"{path.name}: no space left")
-
     if cause == "disk":
         monkeypatch.setattr(results, "write_bytes", full)
     else:
         (tmp_path / "sampling").write_text("in the way")
-    views = photos(3)
-    fit = Trainer(views, seeds(), CONFIG, CPU, priors=priors(views))
-    with images_kept(fit, NAMES, tmp_path):
-        while fit.step < CONFIG.steps:
-            fit.advance()
+    fit = fitted(CONFIG, CONFIG.steps, tmp_path)
     assert fit.strategy.on_event is None and len(fit.messages) == 1
     assert "images of sampling events are missing from the report" in fit.messages[0]
     assert ("no space left" if cause == "disk" else "cannot be created") in fit.messages[0]
@@ -429,8 +373,5 @@ def test_images_that_cannot_be_written_end_no_fit(tmp_path, monkeypatch, cause):
 def test_an_error_of_ours_in_an_image_is_not_hidden(tmp_path, monkeypatch):
     """Only what the disk does is a note."""
     monkeypatch.setattr(results, "write_bytes", lambda path, data: 1 / 0)
-    views = photos(3)
-    fit = Trainer(views, seeds(), CONFIG, CPU, priors=priors(views))
-    with pytest.raises(ZeroDivisionError), images_kept(fit, NAMES, tmp_path):
-        while fit.step < CONFIG.steps:
-            fit.advance()
+    with pytest.raises(ZeroDivisionError):
+        fitted(CONFIG, CONFIG.steps, tmp_path)

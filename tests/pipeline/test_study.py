@@ -22,7 +22,7 @@ from tests.pipeline.farms import HereEngine
 from warpgs.app.cli import main
 from warpgs.errors import DataError, UsageError
 from warpgs.files import LOCK
-from warpgs.pipeline.farm.job import Event, job_of
+from warpgs.pipeline.farm.job import job_of
 from warpgs.pipeline.farm.work import ensure_run
 from warpgs.pipeline.metrics.lpips import NETS, convert_lpips
 from warpgs.pipeline.model.start import InitConfig
@@ -30,12 +30,12 @@ from warpgs.pipeline.paper.strategy import UNIFORM, PaperConfig
 from warpgs.pipeline.run.fit import fit_request
 from warpgs.pipeline.run.folder import TENSORS
 from warpgs.pipeline.run.request import CPU_MAX_SIDE, FitRequest, SceneRequest, read_scene
+from warpgs.pipeline.study import study
 from warpgs.pipeline.study.study import (
     ABLATION_ROWS,
     FILES,
     SWITCHES,
     StudyRequest,
-    _places,
     ablation_variants,
     preset_variants,
     run_folder,
@@ -45,10 +45,8 @@ from warpgs.pipeline.study.tables import (
     BETTER,
     UNDECIDED,
     WORSE,
-    Metric,
-    Row,
     Table,
-    csv_text,
+    csv_rows,
     family_confidence,
     forest,
     interval,
@@ -66,21 +64,17 @@ from warpgs.synthetic.demo import split_spec, write_demo
 
 # Tables of a study: the figures that were measured, in three notations that agree.
 
-PSNR, SSIM, LPIPS = Metric("psnr", "PSNR", True, 2), Metric("ssim", "SSIM", True, 3), Metric("lpips", "LPIPS", False, 3)
 BASE, OTHER = [20.0, 20.2, 20.1], [20.6, 20.7, 20.8]
+GAP = paired_difference(OTHER, BASE)
 
 
-def table_files_table(**changes) -> Table:
-    marks = ((True, True), (False, True)) if "switches" in changes else ((), ())
-    rows = (
-        Row("full", {"psnr": sample(BASE), "ssim": sample([0.8, 0.8, 0.8])}, {}, marks[0]),
-        Row(
-            "no a_b|c", {"psnr": sample(OTHER), "ssim": sample([0.7, 0.8, 0.6])},
-            {"psnr": paired_difference(OTHER, BASE), "ssim": paired_difference([0.7, 0.8, 0.6], [0.8, 0.8, 0.8]),
-             "lpips": paired_difference([], [])}, marks[1],
-        ),
-    )  # fmt: skip
-    return Table(**{"caption": "A study of 100 %", "base": "full", "metrics": (PSNR, SSIM, LPIPS), "rows": rows} | changes)
+def table_of(**changes) -> Table:
+    """A table of two variants; the second is better and has a name that breaks tables."""
+    differences = {"psnr": GAP, "ssim": paired_difference([0.7, 0.8, 0.6], [0.8] * 3), "lpips": paired_difference([], [])}
+    figures = {"psnr": sample(BASE), "ssim": sample([0.8] * 3), "gaussians": sample([12000, 12001, 12005])}
+    samples = {"full": figures, "no a_b|c": {"psnr": sample(OTHER), "ssim": sample([0.7, 0.8, 0.6])}}
+    table = Table("A study of 100 %", ("psnr", "ssim", "lpips"), samples, {"no a_b|c": differences})
+    return dataclasses.replace(table, **changes)
 
 
 def cells(text: str) -> list[list[list[str]]]:
@@ -96,74 +90,52 @@ def cells(text: str) -> list[list[list[str]]]:
 
 
 def test_markdown_holds_means_deviations_and_differences():
-    """Two whole tables; the best of a column is bold; an interval that spares 0 is marked."""
-    figures, gaps = cells(markdown(table_files_table()))
-    assert figures[0] == ["method", "PSNR ↑", "SSIM ↑", "LPIPS ↓", "seeds"]
-    assert figures[2] == ["full", "20.10 ± 0.10", "**0.800 ± 0.000**", "-", "3"]
-    assert figures[3] == ["no a_b|c", "**20.70 ± 0.10**", "0.700 ± 0.100", "-", "3"]
-    d = paired_difference(OTHER, BASE)
-    assert gaps[2][:2] == ["no a_b|c", f"+0.60 [{d.low:+.2f}, {d.high:+.2f}] \\*"]
+    """The best of a column is bold; an interval without 0 is marked; a figure without a spread stands alone."""
+    text = markdown(table_of())
+    assert text.startswith("Scores of held-out views: mean ± standard deviation over seeds, the best mean in bold:")
+    figures, gaps = cells(text)
+    assert figures[0] == ["method", "PSNR ↑", "SSIM ↑", "LPIPS ↓", "Gaussians", "seeds"]
+    assert figures[2] == ["full", "20.10 ± 0.10", "**0.800 ± 0.000**", "-", "12,002", "3"]
+    assert figures[3] == ["no a_b|c", "**20.70 ± 0.10**", "0.700 ± 0.100", "-", "-", "3"]
+    assert gaps[2][:2] == ["no a_b|c", f"+0.60 [{GAP.low:+.2f}, {GAP.high:+.2f}] \\*"]
     assert not gaps[2][2].endswith("*") and gaps[2][3:] == ["-", "3"] and len(gaps) == 3
     assert len({len(r) for r in figures}) == len({len(r) for r in gaps}) == 1
-
-
-def test_markdown_holds_the_number_of_gaussians():
-    """The mean over seeds, without a best one; a row without a result has none."""
-    rows = (Row("a", {"psnr": sample(BASE), "gaussians": sample([12000, 12001, 12005])}, {}), Row("b", {}, {}))
-    figures, _ = cells(markdown(table_files_table(rows=rows, base="a", metrics=(PSNR,))))
-    assert figures[0] == ["method", "PSNR ↑", "Gaussians", "seeds"]
-    assert figures[2] == ["a", "**20.10 ± 0.10**", "12,002", "3"] and figures[3] == ["b", "-", "-", "0"]
+    one = {"a": {"psnr": sample([20.0])}, "b": {"psnr": sample([21.0])}}
+    gaps = {"b": {"psnr": paired_difference([21.0], [20.0])}}
+    figures, gaps = cells(markdown(table_of(samples=one, differences=gaps, metrics=("psnr",))))
+    assert figures[2][1] == "20.00" and gaps[2][1] == "+1.00"
 
 
 def test_ablation_has_check_marks_in_every_notation():
-    """The columns of the paper's second table."""
-    t = table_files_table(switches=("Hier", "S_{rend}"))
+    t = table_of(switches=("Hier", "S_{rend}"), marks={"full": (True, True), "no a_b|c": (False, True)})
     figures, _ = cells(markdown(t))
     assert figures[0][:3] == ["row", "Hier", "S_rend"] and [r[1:3] for r in figures[2:]] == [["✓", "✓"], ["✗", "✓"]]
     tex = latex(t)
     assert "$Hier$ & $S_{rend}$ & PSNR$\\uparrow$" in tex and "$\\times$ & $\\checkmark$ & $\\mathbf{20.70 \\pm 0.10}$" in tex
-    rows = list(csv.DictReader(io.StringIO(csv_text(t))))
-    assert [(r["Hier"], r["S_rend"]) for r in rows if r["metric"] == "psnr"] == [("1", "1"), ("0", "1")]
+    head, *rows = csv_rows(t)
+    assert head[1:3] == ["Hier", "S_rend"] and [r[1:3] for r in rows if r[3] == "psnr"] == [[1, 1], [0, 1]]
 
 
 def test_csv_keeps_every_digit():
     """What was not measured is empty, not zero."""
-    rows = {(r["row"], r["metric"]): r for r in csv.DictReader(io.StringIO(csv_text(table_files_table())))}
-    d = paired_difference(OTHER, BASE)
+    head, *rows = csv_rows(table_of())
+    rows = {(r[0], r[1]): dict(zip(head, r, strict=True)) for r in rows}
     r = rows["no a_b|c", "psnr"]
-    assert [float(r[k]) for k in ("mean", "sd", "difference", "low95", "high95")] == [
-        sample(OTHER).mean, sample(OTHER).sd, d.mean, d.low, d.high,
-    ]  # fmt: skip
-    assert rows["full", "psnr"]["difference"] == "" and rows["full", "lpips"]["mean"] == "" and len(rows) == 6
+    found = [float(r[k]) for k in ("mean", "sd", "difference", "low95", "high95")]
+    assert found == [sample(OTHER).mean, sample(OTHER).sd, GAP.mean, GAP.low, GAP.high] and r["pairs"] == 3
+    assert rows["full", "psnr"]["difference"] == rows["full", "psnr"]["pairs"] == rows["full", "lpips"]["mean"] == ""
+    assert len(rows) == 6
 
 
 def test_latex_is_balanced_and_escaped():
-    """Braces and dollars pair up, names cannot break the table, every line has the same columns."""
-    tex = latex(table_files_table())
-    assert tex.count("{") == tex.count("}") and tex.count("$") % 2 == 0
-    assert "no a\\_b|c" in tex and "100 \\%" in tex
+    """Names cannot break the table: TeX reads ^^5c as a backslash, and an empty line as the end of a paragraph."""
+    tex = latex(table_of())
+    assert tex.count("{") == tex.count("}") and tex.count("$") % 2 == 0 and "\\begin{tabular}{lcccr}" in tex
+    assert "no a\\_b|c" in tex and "100 \\%" in tex and "paired by seed, with a 95 \\% t int" in tex
     lines = [line for line in tex.splitlines() if line.endswith("\\\\")]
     assert len(lines) == 3 and {len(re.split(r"(?<!\\)&", line)) for line in lines} == {5}
-    assert "\\begin{tabular}{lcccr}" in tex
-
-
-def test_a_scene_s_name_is_no_latex():
-    """TeX reads ^^5c as a backslash, and an empty line as the end of a paragraph."""
-    caption = next(
-        line for line in latex(table_files_table(caption="\\a^^5cinput{b}~c\n\nd")).splitlines() if "caption" in line
-    )
-    assert caption.startswith(
-        "  \\caption{\\textbackslash{}a\\textasciicircum{}\\textasciicircum{}5cinput\\{b\\}\\textasciitilde{}c  d. "
-    )
-
-
-def test_the_tables_say_what_their_figures_are():
-    """For a reader who has the table alone."""
-    text, tex = markdown(table_files_table()), latex(table_files_table())
-    assert text.startswith("Scores of held-out views: mean ± standard deviation over seeds, the best mean in bold:")
-    assert (
-        "mean $\\pm$ standard deviation over seeds. $\\Delta$: difference to full, paired by seed, with a 95 \\% t int" in tex
-    )
+    words = "\\caption{\\textbackslash{}a\\textasciicircum{}\\textasciicircum{}5cinput\\{b\\}\\textasciitilde{}c  d. "
+    assert words in latex(table_of(caption="\\a^^5cinput{b}~c\n\nd"))
 
 
 def test_small_differences_keep_their_digits():
@@ -172,21 +144,10 @@ def test_small_differences_keep_their_digits():
     assert interval(paired_difference([19.9986, 19.9988], [20.0, 20.0]), 2) == "-0.00130 [-0.00257, -0.00003]"
 
 
-def test_one_seed_has_no_deviation():
-    """A figure without a spread is printed alone, a difference without an interval likewise."""
-    rows = (
-        Row("a", {"psnr": sample([20.0])}, {}), Row("b", {"psnr": sample([21.0])}, {"psnr": paired_difference([21.0], [20.0])}),
-    )  # fmt: skip
-    figures, gaps = cells(markdown(table_files_table(rows=rows, base="a", metrics=(PSNR,))))
-    assert figures[2][1] == "20.00" and gaps[2][1] == "+1.00"
-
-
-@pytest.mark.parametrize("upwards,best", [(True, 21.0), (False, 20.0)])
-def test_best_follows_the_direction_and_what_is_printed(upwards, best):
+def test_best_follows_the_direction_and_what_is_printed():
     """Equal when printed is equally best; nothing measured has no best."""
-    metric = Metric("psnr", "PSNR", upwards, 2)
-    rows = tuple(Row(str(v), {"psnr": sample([v])}, {}) for v in (20.001, 20.004, 21.0))
-    assert table_files_table(rows=rows).best(metric) == best and math.isnan(table_files_table(rows=rows).best(LPIPS))
+    table = table_of(samples={str(v): {m: sample([v]) for m in ("psnr", "lpips")} for v in (20.0001, 20.0004, 21.0)})
+    assert [table.best("psnr"), table.best("lpips")] == [21.0, 20.0] and math.isnan(table.best("ssim"))
 
 
 # Studies: paired, resumable, honest about what is missing.
@@ -210,30 +171,35 @@ def finished(scene, tmp_path_factory):
     return request, run_study(request)
 
 
-def test_a_study_without_a_split_holds_a_view_out_and_its_fits_do_the_same(scene, tmp_path, capsys):
+def test_a_study_without_a_split_holds_a_view_out_and_its_fits_do_the_same(scene, capsys):
     """A fit of its own would train on every view."""
     wanted = dataclasses.replace(scene, split=None)
-    request = StudyRequest((wanted,), {"a": A, "b": B}, 1, tmp_path / "out", "cpu")
-    (place,) = _places(request, "cpu")
-    assert place.split.test == ("004.png",) and "no --split given: 004.png is held out" in capsys.readouterr().out
-    assert read_scene(place.request)[1] == place.split and place.request.max_side == CPU_MAX_SIDE
+    asked, _, split = study._place(wanted, "cpu")
+    assert split.test == ("004.png",) and "no --split given: 004.png is held out" in capsys.readouterr().out
+    assert read_scene(asked)[1] == split and asked.max_side == CPU_MAX_SIDE
 
 
 def metrics_of(request, variant, seed):
     return json.loads((run_folder(request, "still", variant, seed) / "metrics.json").read_text())
 
 
-def test_every_run_is_an_ordinary_run_folder_with_its_own_seed(finished):
-    """SCENE/VARIANT/SEED, and what `warpgs fit` leaves in it."""
+def test_every_run_is_an_ordinary_run_folder_and_every_file_of_the_study_is_there(finished):
+    """SCENE/VARIANT/SEED; the figure shows both settings and the held-out photographs."""
     request, _ = finished
     for variant, steps in (("a", 8), ("b b", 16)):
         for seed in (0, 1):
             folder = request.out / "still" / variant.replace(" ", "-") / str(seed)
-            assert all(
-                (folder / n).is_file() for n in ("config.json", "metrics.json", "report.html", TENSORS, "point_cloud.ply")
-            )
+            files = "config.json", "metrics.json", "report.html", TENSORS, "point_cloud.ply"
+            assert all((folder / n).is_file() for n in files)
             m = metrics_of(request, variant, seed)
             assert (m["seed"], m["steps"]) == (seed, steps)
+    assert all((request.out / f).is_file() for f in FILES)
+    image = Image.open(request.out / "figure.png")
+    assert image.width > 3 * 180 and image.height > 200
+    record = json.loads((request.out / "study.json").read_text())
+    assert (
+        record["seeds"] == 2 and set(record["variants"]) == {"a", "b b"} and len(record["scenes"]["still"]["fingerprint"]) == 64
+    )
 
 
 def test_table_is_of_these_runs(finished):
@@ -257,26 +223,12 @@ def test_table_is_of_these_runs(finished):
     assert [float(r["psnr"]) for r in rows if r["variant"] == "a"] == psnr["a"]
 
 
-def test_all_files_are_there_and_the_figure_has_a_column_per_setting(finished):
-    """Two settings and the photograph, of the views that were held out."""
-    request, _ = finished
-    assert all((request.out / f).is_file() for f in FILES)
-    image = Image.open(request.out / "figure.png")
-    assert image.width > 3 * 180 and image.height > 200
-    study = json.loads((request.out / "study.json").read_text())
-    assert study["seeds"] == 2 and set(study["variants"]) == {"a", "b b"} and len(study["scenes"]["still"]["fingerprint"]) == 64
-
-
-def copied(finished, out, **changes):
+def copy_of(finished, tmp_path, **changes):
     """The request of the finished study with changes, in a copy of its folder, which is made once."""
-    request, _ = finished
+    request, out = finished[0], tmp_path / "out"
     if not out.exists():
         shutil.copytree(request.out, out)
     return dataclasses.replace(request, out=out, **changes)
-
-
-def copy_of(finished, tmp_path, **changes):
-    return copied(finished, tmp_path / "out", **changes)
 
 
 def states(request):
@@ -284,7 +236,7 @@ def states(request):
 
 
 def test_finished_runs_are_kept_and_half_finished_ones_continued(finished, tmp_path, capsys):
-    """Nothing is fitted twice; one run without its scores goes on from its checkpoint and gives the same scores."""
+    """Nothing is fitted twice; a run without its scores goes on from its checkpoint; more seeds are added to what is there."""
     request = copy_of(finished, tmp_path)
     times = {p: p.stat().st_mtime_ns for p in request.out.glob("still/*/*/point_cloud.ply")}
     before = metrics_of(request, "a", 1)["test"]
@@ -300,14 +252,10 @@ def test_finished_runs_are_kept_and_half_finished_ones_continued(finished, tmp_p
     assert [p.parent for p, t in times.items() if p.stat().st_mtime_ns != t] == [half]
     assert "continued from the last checkpoint" in capsys.readouterr().out
     assert "still, a, seed 1: was interrupted" in (request.out / "table.md").read_text()
-
-
-def test_more_seeds_fit_only_what_is_new(finished, tmp_path):
-    """A study grows: the pairs that are there stay."""
-    request = copy_of(finished, tmp_path, seeds=3)
-    run_study(request)
-    assert states(request) == ["kept"] * 4 + ["fitted"] * 2
-    assert cells((request.out / "table.md").read_text())[0][2][-1] == "3"
+    grown = dataclasses.replace(request, seeds=3)
+    run_study(grown)
+    assert states(grown) == ["kept"] * 4 + ["fitted"] * 2
+    assert cells((grown.out / "table.md").read_text())[0][2][-1] == "3"
 
 
 def test_runs_of_another_kind_are_moved_aside_and_said(finished, tmp_path):
@@ -331,23 +279,22 @@ def test_a_strategy_whose_code_was_edited_is_fitted_again(finished, tmp_path, mo
     path = tmp_path / "mine.py"
     code = "from warpgs import Strategy\nclass Mine(Strategy):\n    rate = {}\nmine = {{'base': 'quick', 'strategy': Mine}}\n"
 
-    def study(rate):
+    def study_of(rate):
         path.write_text(code.format(rate))
         for name in [n for n, m in sys.modules.items() if getattr(m, "__file__", None) == str(path)]:
             del sys.modules[name]  # as in a new process
         mine, origin = preset_settings(f"{path}:mine")
         digest = hashlib.sha256(path.read_bytes()).hexdigest()
         assert f"(SHA-256 {digest[:12]})" in origin
-        request = copied(
-            finished, tmp_path / "out", seeds=1, variants={"a": A, "mine": dataclasses.replace(A, strategy=mine.strategy)}
-        )
+        variants = {"a": A, "mine": dataclasses.replace(A, strategy=mine.strategy)}
+        request = copy_of(finished, tmp_path, seeds=1, variants=variants)
         run_study(request)
         record = json.loads((run_folder(request, "still", "mine", 0) / "config.json").read_text())
         assert record["own_code"] == {mine.strategy: digest}
         return states(request), (request.out / "table.md").read_text()
 
-    assert study(1)[0] == ["kept", "fitted"] and study(1)[0] == ["kept", "kept"]
-    again, text = study(2)
+    assert study_of(1)[0] == ["kept", "fitted"] and study_of(1)[0] == ["kept", "kept"]
+    again, text = study_of(2)
     assert again == ["kept", "redone"] and "differs in user code; moved to 0.old1" in text
 
 
@@ -369,8 +316,8 @@ def test_what_makes_a_run_another_run(finished, tmp_path, monkeypatch, key, valu
     (folder / "config.json").write_text(json.dumps(record))
     _, split, _ = read_scene(request.scenes[0])
     fit = FitRequest(request.scenes[0], folder, A, "cpu")
-    outcome = ensure_run(fit, metrics_of(request, "a", 1)["fingerprint"], split, "cpu", {})
-    assert outcome.state == "redone" and word in outcome.note and outcome.metrics == {"fitted": False}
+    state, metrics, note = ensure_run(fit, metrics_of(request, "a", 1)["fingerprint"], split, "cpu", {})
+    assert state == "redone" and word in note and metrics == {"fitted": False}
 
 
 def test_a_failed_run_is_left_out_of_its_pairs_and_named(finished, tmp_path, monkeypatch):
@@ -430,10 +377,9 @@ def test_several_scenes_are_averaged_by_seed(finished, scene, tmp_path):
     tables = cells((request.out / "table.md").read_text())
     assert len(tables) == 6
     rows = list(csv.DictReader(io.StringIO((request.out / "runs.csv").read_text())))
-    psnr = {
-        v: [np.mean([float(r["psnr"]) for r in rows if (r["variant"], r["seed"]) == (v, s)]) for s in "01"]
-        for v in ("a", "b b")
-    }
+    psnr = {"a": [], "b b": []}
+    for variant, seed in (("a", "0"), ("a", "1"), ("b b", "0"), ("b b", "1")):
+        psnr[variant].append(np.mean([float(r["psnr"]) for r in rows if (r["variant"], r["seed"]) == (variant, seed)]))
     assert tables[0][3][1].strip("*") == f"{np.mean(psnr['b b']):.2f} ± {np.std(psnr['b b'], ddof=1):.2f}"
     d = paired_difference(psnr["b b"], psnr["a"])
     assert tables[1][2][1].removesuffix(" \\*") == f"{d.mean:+.2f} [{d.low:+.2f}, {d.high:+.2f}]"
@@ -456,23 +402,21 @@ def test_a_study_on_a_farm_is_the_same_study(finished, tmp_path, monkeypatch):
 
 
 def fail(text):
-    return Event(job_of(text).name, "crashed", "its process ended")
+    return job_of(text).name, "crashed", "its process ended"
 
 
 def test_requests_that_make_no_sense(scene, tmp_path):
     """Found out before anything is fitted."""
-    with pytest.raises(UsageError, match="--seeds must be a number from 1 to 1000"):
-        StudyRequest((scene,), {"a": A, "b": B}, 0, tmp_path)
-    with pytest.raises(UsageError, match="at least two settings"):
-        StudyRequest((scene,), {"a": A}, 2, tmp_path)
-    with pytest.raises(UsageError, match="have the same name"):
-        StudyRequest((scene, scene), {"a": A, "b": B}, 2, tmp_path)
-    with pytest.raises(UsageError, match="name at least one scene"):
-        StudyRequest((), {"a": A, "b": B}, 2, tmp_path)
-    with pytest.raises(UsageError, match="preset 'x' is not one of"):
-        preset_variants(["x"], None)
-    with pytest.raises(UsageError, match="appears twice"):
-        preset_variants([next(iter(PRESETS))] * 2, None)
+    both = {"a": A, "b": B}
+    for words, scenes, variants, seeds in (
+        ("--seeds must be a number from 1 to 1000", (scene,), both, 0), ("at least two settings", (scene,), {"a": A}, 2),
+        ("have the same name", (scene, scene), both, 2), ("name at least one scene", (), both, 2),
+    ):  # fmt: skip
+        with pytest.raises(UsageError, match=words):
+            StudyRequest(scenes, variants, seeds, tmp_path)
+    for words, names in (("preset 'x' is not one of", ["x"]), ("appears twice", ["quick", "quick"])):
+        with pytest.raises(UsageError, match=words):
+            preset_variants(names, None)
     with pytest.raises(DataError, match="no view is held out"):
         run_study(StudyRequest((dataclasses.replace(scene, split="all"),), {"a": A, "b": B}, 1, tmp_path / "x", "cpu"))
     assert not (tmp_path / "x").exists()
@@ -486,10 +430,8 @@ def test_command_compares_presets(scene, tmp_path, capsys, monkeypatch):
     assert main(["compare", scene.path, "--split", scene.split, *flags]) == 0
     out = capsys.readouterr().out
     lines = out.splitlines()
-    first, second = (
-        next(i for i, line in enumerate(lines) if line.startswith(f"[{k}/2] still, {n}, seed 0"))
-        for k, n in ((1, "a"), (2, "b"))
-    )
+    heads = "[1/2] still, a, seed 0", "[2/2] still, b, seed 0"
+    first, second = (next(i for i, line in enumerate(lines) if line.startswith(head)) for head in heads)
     assert sum("2 steps" in line for line in lines[first:second]) == 1 and lines[second - 1].startswith("  PSNR ")
     assert "next:" not in out and "one seed" in out and "table.tex" in out and "1 seed:" in out
     assert main(["compare", scene.path, "--out", str(tmp_path / "y"), "--presets", "a,zzz"]) == 2
@@ -498,13 +440,7 @@ def test_command_compares_presets(scene, tmp_path, capsys, monkeypatch):
 
 # `warpgs ablate`: a row for each part that is switched off or on, and a table with check marks.
 
-FULL = FitConfig(
-    steps=8,
-    init=InitConfig(source="random", random_count=200),
-    preset="whole",
-    strategy="paper",
-    method=MethodConfig(hier=True),
-)
+FULL = dataclasses.replace(A, preset="whole", strategy="paper", method=MethodConfig(hier=True))
 
 
 def test_ablation_rows_switch_off_one_part_each():
@@ -564,7 +500,7 @@ def test_command_ablates(tmp_path, capsys, monkeypatch):
     figures, gaps = cells((tmp_path / "out" / "table.md").read_text())
     assert figures[0][1:9] == ["Hier", "S_rend", "S_sem", "S_geo", "RA", "AGP", "PM", "Events"]
     assert [r[1:9] for r in figures[2:]] == [["✓"] * 8, ["✓"] * 6 + ["✗", "✓"]]
-    assert gaps[2] == ["no pm", "not exercised", "not exercised", "not exercised", "1"]  # two steps end before any event
+    assert gaps[2] == ["no pm", "not exercised", "not exercised", "not exercised", "-"]  # two steps end before any event
     assert asked == [(0, PaperConfig()), (0, PaperConfig(pm=False))]
     assert main(["ablate", str(scene), "--out", str(tmp_path / "y"), "--preset", "3dgs"]) == 2
     assert "ablate a preset with them" in capsys.readouterr().err
@@ -573,58 +509,27 @@ def test_command_ablates(tmp_path, capsys, monkeypatch):
 # Means, deviations and paired intervals against scipy and by simulation.
 
 
-@pytest.mark.parametrize("n", [2, 3, 5, 40])
-@pytest.mark.parametrize("confidence", [0.8, 0.95, 0.99])
+@pytest.mark.parametrize("n", [2, 5, 40])
+@pytest.mark.parametrize("confidence", [0.8, 0.95])
 def test_interval_equals_scipys_paired_t(n, confidence):
-    """Mean, both ends and the verdict on zero, for few and many pairs."""
+    """Mean, deviation, both ends and the verdict on zero, for few and many pairs."""
     rng = np.random.default_rng(n)
     base = 20 + rng.standard_normal(n)
     ours = base + 0.1 + 0.1 * rng.standard_normal(n)
     expected = stats.ttest_rel(ours, base).confidence_interval(confidence)
     d = paired_difference(list(ours), list(base), confidence)
-    assert d.mean == pytest.approx(np.mean(ours - base)) and d.count == n
+    assert (d.mean, d.sd, d.count) == pytest.approx((np.mean(ours - base), np.std(ours - base, ddof=1), n))
     assert (d.low, d.high) == pytest.approx((expected.low, expected.high), rel=1e-9)
     assert d.excludes_zero == (stats.ttest_rel(ours, base).pvalue < 1 - confidence)
 
 
-def test_interval_holds_the_truth_as_often_as_it_says():
-    """Of 2000 studies with five pairs each about 95 of a hundred contain the true difference."""
-    rng = np.random.default_rng(1)
-    hits = 0
-    for _ in range(2000):
-        base = rng.standard_normal(5)
-        d = paired_difference(base + 0.3 + 0.2 * rng.standard_normal(5), base)
-        hits += d.low <= 0.3 <= d.high
-    assert abs(hits / 2000 - 0.95) < 0.02
-
-
-def test_sample_equals_numpy_and_few_are_no_number():
-    """Bessel's correction; one measurement has no deviation, none no mean; one pair no interval."""
-    values = [20.1, 19.7, 20.4, 20.0]
-    s = sample(values)
-    assert (s.mean, s.sd, s.count) == pytest.approx((np.mean(values), np.std(values, ddof=1), 4))
-    assert math.isnan(sample([1.0]).sd) and math.isnan(sample([]).mean)
+def test_few_measurements_have_no_spread_and_unpaired_ones_are_refused():
     d = paired_difference([2.0], [1.0])
-    assert d.mean == 1 and math.isnan(d.low) and not d.excludes_zero
-    assert paired_difference([1.0, 2.0], [0.0, 1.0]).low == 1.0
-
-
-def test_unpaired_measurements_are_refused():
-    """A missing measurement is not dropped in silence."""
+    assert d.mean == 1 and math.isnan(d.sd) and math.isnan(d.low) and not d.excludes_zero
+    assert family_confidence(1) == 0.95 and family_confidence(10) == pytest.approx(0.995)
+    assert math.isnan(sample([]).mean) and paired_difference([1.0, 2.0], [0.0, 1.0]).low == 1.0
     with pytest.raises(ValueError):
         paired_difference([1.0, 2.0], [1.0])
-
-
-def test_intervals_of_several_rows_hold_together():
-    """Of ten null effects with five seeds, one has an interval without 0 in at most 5 % of all tables."""
-    rng = np.random.default_rng(0)
-    found = {1: 0, 10: 0}
-    for _ in range(300):
-        base = rng.standard_normal(5)
-        rows = [base + rng.standard_normal(5) for _ in range(10)]
-        for count in found:
-            found[count] += any(paired_difference(r, base, family_confidence(count)).excludes_zero for r in rows)
-    assert found[10] <= 25 and found[1] >= 75  # 15 +- 3.8 expected, 25 is 2.7 standard deviations above; 120 without
 
 
 # The plot of a study and its figure: every number is shown, nothing leaves its frame, crops lie where pictures differ.
@@ -632,18 +537,16 @@ def test_intervals_of_several_rows_hold_together():
 SVG = "{http://www.w3.org/2000/svg}"
 
 
-def row(name, *pairs, base=False, metric="m"):
-    return Row(name, {}, {} if base else {metric: paired_difference(list(pairs), [0.0] * len(pairs))})
-
-
-def study_plots_table(upwards=True, title="t"):
-    rows = (row("a", base=True), row("b", 0.9, 1.0, 1.1), row("c", -0.9, -1.0, -1.1), row("d", -1.0, 1.0))
-    return Table(title, "a", (Metric("m", "PSNR", upwards, 2),), rows)
+def forest_of(metric="psnr", title="t"):
+    """The plot of a base and three variants, of which two differ from it."""
+    values = {"b": (0.9, 1.0, 1.1), "c": (-0.9, -1.0, -1.1), "d": (-1.0, 1.0)}
+    gaps = {n: {metric: paired_difference(v, [0.0] * len(v))} for n, v in values.items()}
+    return ElementTree.fromstring(forest(Table(title, (metric,), {n: {} for n in "abcd"}, gaps)))
 
 
 def test_forest_draws_every_seed_and_prints_every_interval():
     """Small dots for seeds, a large one for each mean, words for the ends; all inside the frame."""
-    root = ElementTree.fromstring(forest(study_plots_table(title="t <&>")))
+    root = forest_of(title="t <&>")
     width, height = (float(root.get(k)) for k in ("width", "height"))
     circles = root.findall(f"{SVG}circle")
     small, large = ([c for c in circles if c.get("r") == r] for r in ("2.8", "5.5"))
@@ -654,24 +557,22 @@ def test_forest_draws_every_seed_and_prints_every_interval():
     assert f"+1.00  [{d.low:+.2f}, {d.high:+.2f}]" in words and {"a", "b", "c", "d", "the base", "t <&>"} <= set(words)
     xs = [float(c.get("cx")) for c in large]
     assert xs[1] < xs[2] < xs[0] and xs[0] - xs[2] == pytest.approx(xs[2] - xs[1], abs=0.2)
-
-
-@pytest.mark.parametrize("upwards,colors", [(True, [BETTER, WORSE, UNDECIDED]), (False, [WORSE, BETTER, UNDECIDED])])
-def test_forest_colours_follow_the_direction(upwards, colors):
-    """More PSNR is better, more LPIPS is worse, and what the interval does not decide is neither."""
-    root = ElementTree.fromstring(forest(study_plots_table(upwards)))
-    assert [c.get("fill") for c in root.findall(f"{SVG}circle") if c.get("r") == "5.5"] == colors
+    # more PSNR is better, more LPIPS is worse, and what the interval does not decide is neither
+    assert [c.get("fill") for c in large] == [BETTER, WORSE, UNDECIDED]
+    assert [c.get("fill") for c in forest_of("lpips").findall(f"{SVG}circle") if c.get("r") == "5.5"] == [
+        WORSE,
+        BETTER,
+        UNDECIDED,
+    ]
 
 
 def test_forest_of_one_seed_and_of_none():
     """Without an interval the dot stands alone; a metric that nobody measured has no panel."""
-    metrics = Metric("m", "PSNR", True, 2), Metric("n", "LPIPS", False, 3)
-    one = Row("b", {}, row("b", 0.5).differences | row("b", metric="n").differences)
-    root = ElementTree.fromstring(forest(Table("t", "a", metrics, (row("a", base=True), one))))
+    one = {"b": {"psnr": paired_difference([0.5], [0.0]), "lpips": paired_difference([], [])}}
+    root = ElementTree.fromstring(forest(Table("t", ("psnr", "lpips"), {"a": {}, "b": {}}, one)))
     words = [t.text for t in root.findall(f"{SVG}text")]
     assert "+0.50" in words and not any("LPIPS" in w for w in words)
-    none = Table("t", "a", metrics[1:], (row("a", base=True), row("b", metric="n")))
-    assert "no pair of runs to compare" in forest(none)
+    assert "no pair of runs to compare" in forest(Table("t", ("lpips",), {"a": {}, "b": {}}, one))
 
 
 def test_crops_find_where_pictures_differ():
@@ -686,12 +587,8 @@ def test_crops_find_where_pictures_differ():
     (x0, y0), (x1, y1) = crops(values, 12, 8, 2)
     assert x0 <= 44 and x0 + 12 >= 54 and y0 <= 30 and y0 + 8 >= 36
     assert x1 <= 4 and x1 + 12 >= 14 and y1 <= 4 and y1 + 8 >= 10
-
-
-def test_crops_of_equal_pictures_and_of_small_ones():
-    """Nothing differs: the middle. Windows larger than the picture: one, the whole."""
-    assert crops(np.zeros((20, 30)), 10, 8, 1) == [(10, 6)]
-    assert crops(np.ones((6, 5)), 9, 9, 3) == [(0, 0)]
+    # nothing differs: the middle; windows larger than the picture: one, the whole
+    assert crops(np.zeros((20, 30)), 10, 8, 1) == [(10, 6)] and crops(np.ones((6, 5)), 9, 9, 3) == [(0, 0)]
     many = crops(np.random.default_rng(0).random((20, 20)), 10, 10, 9)
     assert 1 <= len(many) <= 4
     assert all(abs(a - c) >= 10 or abs(b - d) >= 10 for i, (a, b) in enumerate(many) for c, d in many[:i])
@@ -707,12 +604,8 @@ def test_sheet_shows_every_picture_and_its_crops():
     areas = [int((image == np.round(np.array(c) * 255).astype(np.uint8)).all(-1).sum()) for c in colors]
     assert min(areas) > 0.9 * max(areas) > 0
     assert all((image == box).all(-1).sum() > 100 for box in BOXES[:2])
+    cell = (np.zeros((24, 32, 3), np.float32), "")
+    wide = Image.open(io.BytesIO(sheet([str(i) for i in range(10)], [("s", [cell] * 10, [])])))
+    assert wide.width <= 2600 and math.isclose(wide.width / 10, 256, rel_tol=0.2)  # ten columns share the width
     # what is left of the page is paper, so the labels have not grown over the pictures
     assert (image[:4] == 255).all() and (image[:, :8] == 255).all()
-
-
-def test_sheet_of_many_columns_stays_printable():
-    """Nine settings and the photograph share the width."""
-    cell = (np.zeros((24, 32, 3), np.float32), "")
-    image = Image.open(io.BytesIO(sheet([str(i) for i in range(10)], [("s", [cell] * 10, [])])))
-    assert image.width <= 2600 and math.isclose(image.width / 10, 256, rel_tol=0.2)

@@ -3,7 +3,6 @@
 import dataclasses
 import json
 import sys
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -342,7 +341,8 @@ def test_a_folder_that_cannot_be_written_is_done_without(tmp_path):
 
 def test_where_the_cache_lies(monkeypatch, tmp_path):
     home, system = tmp_path / "home", tmp_path / "system"
-    monkeypatch.setattr(Path, "home", lambda: home)
+    for name in ("HOME", "USERPROFILE"):
+        monkeypatch.setenv(name, str(home))
     for name in ("WARPGS_CACHE", "XDG_CACHE_HOME", "LOCALAPPDATA"):
         monkeypatch.delenv(name, raising=False)
     linux, apple, windows = home / ".cache" / "warpgs", home / "Library" / "Caches" / "warpgs", home / "AppData" / "Local"

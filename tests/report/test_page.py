@@ -5,6 +5,7 @@ import io
 import json
 import math
 import re
+from dataclasses import replace
 from html.parser import HTMLParser
 
 import cv2
@@ -15,7 +16,7 @@ from rich.console import Console
 from warpgs.errors import ResourceError
 from warpgs.files import write_json
 from warpgs.process import Detail
-from warpgs.report.farm import FarmTable, JobCard, JobRow, farm_page
+from warpgs.report.farm import FarmTable, JobRow, farm_page
 from warpgs.report.images import png, webp
 from warpgs.report.page import curve, write_page
 from warpgs.report.progress import EventLog, read_events
@@ -253,7 +254,7 @@ ROWS = [
 
 def test_failures_are_counted_by_message():
     """The name of the scene in it makes no other message; nothing of a name is markup."""
-    page = farm_page("a & b", [JobCard(r, thumbnail="x y/t.jpg" if r.name == "a" else "") for r in ROWS], 90)
+    page = farm_page("a & b", [replace(r, thumbnail="x y/t.jpg" if r.name == "a" else "") for r in ROWS], 90)
     assert "<td>SCENE: no images &lt;b&gt;</td><td>2</td><td>d, e</td>" in page and "<h1>a &amp; b</h1>" in page
     assert 'src="x%20y/t.jpg"' in page and "2 jobs are not done yet" in page and "25.50 dB" in page
 

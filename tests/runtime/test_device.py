@@ -364,7 +364,8 @@ def test_no_folder_is_ever_called_tilde(monkeypatch, tmp_path):
 def test_the_place_on_each_system(monkeypatch, tmp_path, system):
     """Where Warp keeps its kernels by itself, so that what is compiled there is found."""
     monkeypatch.setattr(sys, "platform", system)
-    monkeypatch.setattr(Path, "home", lambda: tmp_path)
+    for name in ("HOME", "USERPROFILE"):
+        monkeypatch.setenv(name, str(tmp_path))
     for name in ("XDG_CACHE_HOME", "LOCALAPPDATA", "WARP_CACHE_PATH"):
         monkeypatch.delenv(name, raising=False)
     wanted = {"linux": ".cache/warp", "darwin": "Library/Caches/warp", "win32": "AppData/Local/NVIDIA/warp/Cache"}[system]

@@ -158,7 +158,7 @@ def plot(
     """
     from warpgs.pipeline.run import commands
 
-    return commands.plot(run, out, commands.PlotSettings(points, color, background, size, cameras), device)
+    return commands.plot(run, out, device, points=points, color=color, background=background, size=size, cameras=cameras)
 
 
 def mesh(

@@ -65,15 +65,19 @@ def arrays_of(gaussians: Gaussians) -> Arrays:
     return {name: t.detach().cpu().numpy() for name, t in gaussians.tensors().items()}
 
 
-def check_finite(path: Path, arrays: Arrays) -> None:
-    """Check the values before they are written."""
-    for name, array in arrays.items():
-        bad = array.size - int(np.isfinite(array).sum())
-        if bad:
-            raise DataError(
-                f"{path}: not written, {bad} of {array.size} values of {name} are not finite, and no viewer can show them. "
-                "Export an earlier checkpoint, or fit again with a lower learning rate."
-            )
+def arrays_to_write(path: Path, gaussians: Gaussians, normalization: Normalization | None, units: str) -> Arrays:
+    """Return the tensors of Gaussians in file units, checked before and after the conversion: it may overflow float32."""
+    normalization = checked_normalization(normalization, units, f"{path}: not written")
+    for g in (gaussians, convert_gaussians(gaussians, normalization, units, "file")):
+        arrays = arrays_of(g)
+        for name, array in arrays.items():
+            bad = array.size - int(np.isfinite(array).sum())
+            if bad:
+                raise DataError(
+                    f"{path}: not written, {bad} of {array.size} values of {name} are not finite, and no viewer can show them. "
+                    "Export an earlier checkpoint, or fit again with a lower learning rate."
+                )
+    return arrays
 
 
 def gaussians_of(path: Path, arrays: Arrays) -> Gaussians:
@@ -257,10 +261,7 @@ class Format:
         """
         if not len(gaussians):
             raise DataError(f"{path}: not written, the model holds no Gaussian. Use .ply for an empty model")
-        normalization = checked_normalization(normalization, units, f"{path}: not written")
-        for g in (gaussians, convert_gaussians(gaussians, normalization, units, "file")):
-            arrays = arrays_of(g)
-            check_finite(path, arrays)
+        arrays = arrays_to_write(path, gaussians, normalization, units)
         if self.max_degree == 0:
             arrays["sh"] = arrays["sh"][:, :1]
         elif gaussians.sh_degree > self.max_degree:

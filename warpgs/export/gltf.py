@@ -45,16 +45,16 @@ _TINY = 1e-37
 
 def encode_glb(arrays: Arrays) -> list[bytes]:
     """Return the bytes of a .glb file."""
-    document, body = _document(arrays)
+    return glb(*_document(arrays))
+
+
+def glb(document: dict[str, Any], *body: bytes) -> list[bytes]:
+    """Return the bytes of a .glb file of a document and the parts of its buffer."""
     text = json.dumps(document, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 4)
-    total = 12 + 8 + len(text) + 8 + len(body)
-    return [
-        struct.pack("<IIIII", GLB, 2, total, len(text), JSON_CHUNK),
-        text,
-        struct.pack("<II", len(body), BINARY_CHUNK),
-        body,
-    ]
+    size = sum(map(len, body))
+    head = struct.pack("<IIIII", GLB, 2, 28 + len(text) + size, len(text), JSON_CHUNK)
+    return [head, text, struct.pack("<II", size, BINARY_CHUNK), *body]
 
 
 def encode_gltf(arrays: Arrays) -> list[bytes]:
@@ -64,11 +64,11 @@ def encode_gltf(arrays: Arrays) -> list[bytes]:
     return [json.dumps(document, separators=(",", ":")).encode()]
 
 
-def _attributes(arrays: Arrays) -> dict[str, tuple[str, np.ndarray]]:
-    """Return the attributes of the primitive by name, each with its type, float32."""
+def _document(arrays: Arrays) -> tuple[dict[str, Any], bytes]:
+    """Return the glTF document and its binary buffer."""
     a = half_turn({k: np.asarray(v) for k, v in arrays.items()}, "z")
     scales = np.clip(np.exp(a["log_scales"].astype(np.float64)), _TINY, 3e38)
-    out = {
+    attributes = {
         "POSITION": ("VEC3", a["means"]),
         f"{EXTENSION}:ROTATION": ("VEC4", unit_quats(a["quats"])[:, [1, 2, 3, 0]]),
         f"{EXTENSION}:SCALE": ("VEC3", scales),
@@ -76,22 +76,19 @@ def _attributes(arrays: Arrays) -> dict[str, tuple[str, np.ndarray]]:
     }
     for k in range(a["sh"].shape[1]):
         degree = math.isqrt(k)
-        out[f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{k - degree * degree}"] = ("VEC3", a["sh"][:, k])
-    return {name: (kind, np.ascontiguousarray(values, "<f4")) for name, (kind, values) in out.items()}
-
-
-def _document(arrays: Arrays) -> tuple[dict[str, Any], bytes]:
-    """Return the glTF document and its binary buffer."""
-    attributes = _attributes(arrays)
+        attributes[f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{k - degree * degree}"] = ("VEC3", a["sh"][:, k])
     views: list[dict] = []
     accessors: list[dict] = []
+    parts_of_body: list[bytes] = []
     start = 0
-    for name, (kind, values) in attributes.items():
+    for name, (kind, given) in attributes.items():
+        values = np.ascontiguousarray(given, "<f4")
         views.append({"buffer": 0, "byteOffset": start, "byteLength": values.nbytes, "target": 34962})
         accessor = {"bufferView": len(accessors), "componentType": 5126, "count": len(values), "type": kind}
         if name == "POSITION":  # glTF requires the bounds of positions
             accessor |= {"min": values.min(0).tolist(), "max": values.max(0).tolist()}
         accessors.append(accessor)
+        parts_of_body.append(values.tobytes())
         start += values.nbytes
     extension = {"kernel": "ellipse", "colorSpace": COLOR_SPACE, "sortingMethod": "cameraDistance", "projection": "perspective"}
     names = {name: i for i, name in enumerate(attributes)}
@@ -106,7 +103,7 @@ def _document(arrays: Arrays) -> tuple[dict[str, Any], bytes]:
         "bufferViews": views,
         "accessors": accessors,
     }
-    return document, b"".join(values.tobytes() for _, values in attributes.values())
+    return document, b"".join(parts_of_body)
 
 
 def decode(path: Path, data: bytes) -> Arrays:

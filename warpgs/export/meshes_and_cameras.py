@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import os
-import struct
 from pathlib import Path
 
 import numpy as np
 
 from warpgs.errors import DataError, UsageError
+from warpgs.export.gltf import glb
 from warpgs.files import filling, is_empty, make_folder, write_bytes, write_json, write_text
 from warpgs.geometry import pinhole_of, quaternions
 from warpgs.scene import Camera, Mesh
@@ -17,8 +16,8 @@ from warpgs.version import __version__
 
 SUFFIXES = (".ply", ".glb")
 """Suffixes of the files that can be written."""
-MAX_BYTES = 2**32 - 1
-"""Largest glTF file: its lengths are 32-bit numbers."""
+MAX_BYTES = 2**32 - 2**16
+"""Largest buffer of a glTF file: its lengths are 32-bit numbers, and some are of its document."""
 
 
 def check_suffix(path: str | os.PathLike[str]) -> None:
@@ -108,15 +107,11 @@ def _glb(path: Path, mesh: Mesh, up: np.ndarray | None) -> list[bytes]:
             for i, (kind, form, count, more) in enumerate(kinds)
         ],
     }  # fmt: skip
-    document = json.dumps(text, separators=(",", ":")).encode()
-    document += b" " * (-len(document) % 4)
-    size = 12 + 8 + len(document) + 8 + starts[-1]
-    if size > MAX_BYTES:
+    if starts[-1] > MAX_BYTES:
         raise DataError(
-            f"{path}: a mesh of {size:,} bytes is beyond the 4 GiB of a .glb file; ask for fewer triangles, or write .ply"
+            f"{path}: a mesh of {starts[-1]:,} bytes is beyond the 4 GiB of a .glb file; ask for fewer triangles, or write .ply"
         )
-    head = struct.pack("<4sII", b"glTF", 2, size) + struct.pack("<I4s", len(document), b"JSON")
-    return [head, document, struct.pack("<I4s", starts[-1], b"BIN\0"), *arrays]
+    return glb(text, *arrays)
 
 
 # Cameras as files for other programs: cameras.json of the INRIA 3DGS code, which splat editors read, transforms.json,

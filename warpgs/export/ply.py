@@ -8,7 +8,6 @@ import os
 import re
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -19,20 +18,20 @@ from warpgs.export.base import (
     SQRT2,
     Arrays,
     Format,
-    arrays_of,
+    arrays_to_write,
     by_rows,
-    check_finite,
     from_smallest_three,
     logits,
     malformed,
     parts,
+    reading,
     register,
     rounded,
     sigmoid,
     smallest_three,
     warn_of_antialiasing,
 )
-from warpgs.files import open_input, read_start, unread_reason, writing
+from warpgs.files import writing
 from warpgs.geometry import checked_normalization, convert_gaussians
 from warpgs.scene import Gaussians, Normalization, base_coefficients, base_colors
 
@@ -47,16 +46,10 @@ _TYPES = {
 }  # fmt: skip
 
 
-@dataclass
-class Element:
-    """One element of a PLY header."""
-
-    name: str
-    count: int
-    properties: list[tuple[str, str]] = field(default_factory=list)
-    """Pairs (name, numpy type) in file order."""
-    has_list: bool = False
-    """True where a property is a list, so that rows differ in length."""
+Element = tuple[str, int, list[tuple[str, str]]]
+"""Name and number of rows of an element, and pairs (name, numpy type) of its properties in file order."""
+LIST = "list"
+"""Type of a property that is a list, so that rows differ in length."""
 
 
 def mode_comments(antialiased: bool) -> tuple[str, str]:
@@ -98,33 +91,27 @@ def parse_header(path: Path, head: bytes) -> tuple[list[Element], int]:
     for line in lines:
         match line.split():
             case ["comment", *words]:
-                _check_comment(path, words)
+                mode = " ".join(words).lower().replace(":", " ").split()
+                if mode[:1] == ["splatrendermode"] and len(mode) == 2 and mode[1] not in ("default", "mip"):
+                    raise DataError(
+                        f"{path}: its Gaussians need the render mode {mode[1][:40]!r}, which is not supported. Train or export "
+                        "them in the mode 'default' or 'mip'."
+                    )
             case [] | ["obj_info", *_]:
                 pass
             case ["format", *words]:
                 formats.append(" ".join(words))
             case ["element", name, count] if re.fullmatch(r"[0-9]{1,18}", count):
-                elements.append(Element(name, int(count)))
-            case ["property", "list", count, item, _] if elements and count in _TYPES and item in _TYPES:
-                elements[-1].has_list = True
+                elements.append((name, int(count), []))
+            case ["property", "list", count, item, name] if elements and count in _TYPES and item in _TYPES:
+                elements[-1][2].append((name, LIST))
             case ["property", kind, name] if elements and kind in _TYPES:
-                elements[-1].properties.append((name, _TYPES[kind]))
+                elements[-1][2].append((name, _TYPES[kind]))
             case _:
                 raise ply_error(path, f"header line {line[:80]!r} is invalid")
     if formats != ["binary_little_endian 1.0"]:
         raise ply_error(path, f"its format is {' and '.join(formats)[:80] or 'not given'}, not binary_little_endian 1.0")
     return elements, end.end()
-
-
-def _check_comment(path: Path, words: list[str]) -> None:
-    """Raise a DataError where a comment names an unsupported render mode."""
-    text = " ".join(words).lower().replace(":", " ").split()
-    match text:
-        case ["splatrendermode", mode] if mode not in ("default", "mip"):
-            raise DataError(
-                f"{path}: its Gaussians need the render mode {mode[:40]!r}, which is not supported. Train or export them in "
-                "the mode 'default' or 'mip'."
-            )
 
 
 # The compressed PLY of PlayCanvas and SuperSplat: 16 bytes a Gaussian, and one more byte per harmonic and channel.
@@ -144,7 +131,7 @@ _VERTEX_NAMES = ["packed_position", "packed_rotation", "packed_scale", "packed_c
 _BITS = (11, 10, 11)
 
 
-def encode(arrays: Arrays, antialiased: bool = False) -> list[bytes]:
+def encode(arrays: Arrays, antialiased: bool) -> list[bytes]:
     """Return the bytes of a file, with antialiasing declared in its header; harmonics above degree 0 are clamped to +-4."""
     n, k = arrays["sh"].shape[:2]
     chunks = np.arange(n) // CHUNK
@@ -175,10 +162,8 @@ def encode(arrays: Arrays, antialiased: bool = False) -> list[bytes]:
 
 def start_of(path: Path) -> bytes:
     """Return the first `MAX_HEADER_BYTES` bytes of a PLY file, or the whole file if it is shorter, and check its header."""
-    try:
-        head = read_start(path, MAX_HEADER_BYTES)
-    except OSError as e:
-        raise DataError(f"{path}: cannot be read ({unread_reason(e)}). Check the path and its permissions.") from e
+    with reading(path) as file:
+        head = file.read(MAX_HEADER_BYTES)
     parse_header(path, head)
     return head
 
@@ -186,7 +171,7 @@ def start_of(path: Path) -> bytes:
 def is_compressed(path: Path, data: bytes) -> bool:
     """Return whether the header of a .ply file announces this format; DataError if the file has no header."""
     elements, _ = parse_header(path, data[:MAX_HEADER_BYTES])
-    return any(e.name == "vertex" and "packed_position" in dict(e.properties) for e in elements)
+    return any(name == "vertex" and "packed_position" in dict(properties) for name, _, properties in elements)
 
 
 def decode(path: Path, data: bytes) -> Arrays:
@@ -194,9 +179,10 @@ def decode(path: Path, data: bytes) -> Arrays:
     elements, start = parse_header(path, data[:MAX_HEADER_BYTES])
     tables = {}
     for element in elements:
-        if element.name in tables or element.has_list or not element.properties:
-            raise malformed(path, f"its element {element.name[:40]!r} is invalid")
-        tables[element.name], start = _table(path, data, element, start)
+        name, _, properties = element
+        if name in tables or not properties or LIST in dict(properties).values():
+            raise malformed(path, f"its element {name[:40]!r} is invalid")
+        tables[name], start = _table(path, data, element, start)
     chunk, vertex, sh = tables.get("chunk"), tables.get("vertex"), tables.get("sh")
     if chunk is None or vertex is None:
         raise malformed(path, "the element chunk or vertex is missing")
@@ -261,15 +247,15 @@ def _harmonics(path: Path, sh: np.ndarray, n: int) -> tuple[Callable[[slice], np
 
 def _table(path: Path, data: bytes, element: Element, start: int) -> tuple[np.ndarray, int]:
     """Return the rows of an element that begins at byte ``start`` of the file, and the byte at which the next one begins."""
-    names = [name for name, _ in element.properties]
-    if len(set(names)) < len(names):
-        raise malformed(path, f"a property of {element.name[:40]!r} appears twice")
-    dtype = np.dtype(element.properties)
-    end = start + element.count * dtype.itemsize
+    name, count, properties = element
+    if len(dict(properties)) < len(properties):
+        raise malformed(path, f"a property of {name[:40]!r} appears twice")
+    dtype = np.dtype(properties)
+    end = start + count * dtype.itemsize
     if end > len(data):
-        rows = f"{element.count} rows of {element.name[:40]!r}"
+        rows = f"{count} rows of {name[:40]!r}"
         raise malformed(path, f"truncated: {rows} end at byte {end}, but the file has {len(data)} bytes")
-    return np.frombuffer(data, dtype, element.count, start), end
+    return np.frombuffer(data, dtype, count, start), end
 
 
 def _column(path: Path, table: np.ndarray, name: str, kind: str) -> np.ndarray:
@@ -364,12 +350,7 @@ def write_ply(
         ValueError: A tensor has the wrong shape.
     """
     path = Path(path)
-    normalization = checked_normalization(normalization, units, f"{path}: not written")
-    in_file = convert_gaussians(gaussians, normalization, units, "file")
-    for g in (gaussians, in_file):  # finite numbers may overflow float32 in the conversion
-        arrays = arrays_of(g)
-        check_finite(path, arrays)
-
+    arrays = arrays_to_write(path, gaussians, normalization, units)
     n, k = arrays["sh"].shape[:2]
     header = _header(n, 3 * (k - 1), antialiased)
     with writing(path, len(header) + 4 * n * (14 + 3 * k)) as file:
@@ -410,28 +391,25 @@ def read_ply(path: str | os.PathLike[str], normalization: Normalization | None =
 def _read(path: Path, normalization: Normalization | None, units: str) -> Gaussians:
     """Return what `read_ply` does, without a warning."""
     normalization = checked_normalization(normalization, units, str(path))
-    try:
-        with open_input(path) as file:
-            size = os.fstat(file.fileno()).st_size
-            elements, start = parse_header(path, file.read(MAX_HEADER_BYTES))
-            vertex, start = _locate_vertices(path, elements, start)
-            rest = _check_properties(path, vertex)
-            dtype = np.dtype(vertex.properties)
-            end = start + vertex.count * dtype.itemsize
-            if end > size:
-                needed = f"{vertex.count} Gaussians of {dtype.itemsize} bytes end at byte {end}"
-                raise ply_error(path, f"truncated: {needed}, but the file has {size} bytes")
-            file.seek(start)
+    with reading(path) as file:
+        size = os.fstat(file.fileno()).st_size
+        elements, start = parse_header(path, file.read(MAX_HEADER_BYTES))
+        (_, n, properties), start = _locate_vertices(path, elements, start)
+        rest = _check_properties(path, [name for name, _ in properties])
+        dtype = np.dtype(properties)
+        end = start + n * dtype.itemsize
+        if end > size:
+            needed = f"{n} Gaussians of {dtype.itemsize} bytes end at byte {end}"
+            raise ply_error(path, f"truncated: {needed}, but the file has {size} bytes")
+        file.seek(start)
 
-            def rows(part: slice) -> np.ndarray:
-                found = np.fromfile(file, dtype=dtype, count=part.stop - part.start)
-                if len(found) != part.stop - part.start:
-                    raise ply_error(path, f"truncated: {vertex.count} Gaussians announced, {part.start + len(found)} read")
-                return found
+        def rows(part: slice) -> np.ndarray:
+            found = np.fromfile(file, dtype=dtype, count=part.stop - part.start)
+            if len(found) != part.stop - part.start:
+                raise ply_error(path, f"truncated: {n} Gaussians announced, {part.start + len(found)} read")
+            return found
 
-            gaussians = _assemble(path, rows, vertex.count, rest)
-    except OSError as e:
-        raise DataError(f"{path}: cannot be read ({unread_reason(e)}). Check the path and its permissions.") from e
+        gaussians = _assemble(path, rows, n, rest)
     return convert_gaussians(gaussians, normalization, "file", units)
 
 
@@ -460,20 +438,20 @@ def _rows(arrays: dict[str, np.ndarray]) -> np.ndarray:
 
 def _locate_vertices(path: Path, elements: list[Element], start: int) -> tuple[Element, int]:
     """Return the vertex element and the offset [bytes] of its rows, behind the rows of any elements before it."""
-    if [e.name for e in elements].count("vertex") != 1:
+    if [name for name, *_ in elements].count("vertex") != 1:
         raise ply_error(path, "the header must have one 'element vertex'")
     for element in elements:
-        if element.has_list and (element.count or element.name == "vertex"):
-            raise ply_error(path, f"element {element.name[:40]!r} has list properties, so the Gaussians cannot be located")
-        if element.name == "vertex":
+        name, count, properties = element
+        if LIST in (kinds := [kind for _, kind in properties]) and (count or name == "vertex"):
+            raise ply_error(path, f"element {name[:40]!r} has list properties, so the Gaussians cannot be located")
+        if name == "vertex":
             break
-        start += element.count * sum(np.dtype(kind).itemsize for _, kind in element.properties)
+        start += count * sum(np.dtype(kind).itemsize for kind in kinds if count)
     return element, start
 
 
-def _check_properties(path: Path, vertex: Element) -> int:
+def _check_properties(path: Path, names: list[str]) -> int:
     """Return the number of coefficients above degree 0; DataError where the layout is incomplete."""
-    names = [name for name, _ in vertex.properties]
     if len(set(names)) < len(names):
         twice = Counter(names).most_common(1)[0][0]
         raise ply_error(path, f"property {twice[:40]!r} appears twice")

@@ -13,7 +13,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from warpgs.errors import DataError
-from warpgs.files import read_input, unread_reason
+from warpgs.files import read_file
 from warpgs.io.folder import (
     Probe,
     Reader,
@@ -26,7 +26,7 @@ from warpgs.io.folder import (
     view_name,
 )
 from warpgs.io.images import Lens, ReadOptions, list_images
-from warpgs.scene import PointCloud, Scene, View
+from warpgs.scene import PointCloud, Scene
 
 MODELS = {0: ("SIMPLE_PINHOLE", 3), 1: ("PINHOLE", 4), 2: ("SIMPLE_RADIAL", 4), 3: ("RADIAL", 5), 4: ("OPENCV", 8)}
 """Name and number of parameters by model number."""
@@ -47,31 +47,21 @@ class _BinaryFile:
     """A binary file that is read front to back; every read is checked against the bytes that are left."""
 
     def __init__(self, path: Path):
-        self.path, self.at = path, 0
-        try:
-            self.data = read_input(path)
-        except OSError as e:
-            raise DataError(f"{path}: cannot be read ({unread_reason(e)}); fix its permissions or copy it again") from e
+        self.path, self.at, self.data = path, 0, read_file(path, fix="fix its permissions or copy it again")
 
-    def _need(self, size: int) -> None:
+    def raw(self, size: int) -> bytes:
+        """Return the next bytes unchanged."""
         if size > len(self.data) - self.at:
             raise DataError(
                 f"{self.path}: the file ends in the middle of a record, at byte {len(self.data)}; "
                 "it is truncated. Copy it again"
             )
+        self.at += size
+        return self.data[self.at - size : self.at]
 
     def take(self, layout: str) -> tuple:
         """Return the next values, little endian."""
-        size = struct.calcsize("<" + layout)
-        self._need(size)
-        self.at += size
-        return struct.unpack_from("<" + layout, self.data, self.at - size)
-
-    def raw(self, size: int) -> bytes:
-        """Return the next bytes unchanged."""
-        self._need(size)
-        self.at += size
-        return self.data[self.at - size : self.at]
+        return struct.unpack("<" + layout, self.raw(struct.calcsize("<" + layout)))
 
     def count(self, smallest: int) -> int:
         """Return a record count; DataError where the bytes that are left cannot hold so many records."""
@@ -103,10 +93,7 @@ class _BinaryFile:
 
 def _lines(path: Path) -> Iterator[tuple[int, str]]:
     """Yield the numbered lines of a text file; only line feeds end a line, since names may hold other separators."""
-    try:
-        text = read_input(path).decode("utf-8-sig", "surrogateescape")
-    except OSError as e:
-        raise DataError(f"{path}: cannot be read ({unread_reason(e)}); fix its permissions or copy it again") from e
+    text = read_file(path, fix="fix its permissions or copy it again").decode("utf-8-sig", "surrogateescape")
     at, number = 0, 1
     while (end := text.find("\n", at)) >= 0:  # one at a time: a list takes a hundred bytes for each empty line
         yield number, text[at:end].removesuffix("\r")
@@ -261,33 +248,18 @@ def read_points(path: Path, names: dict[int, str]) -> PointCloud:
     return PointCloud(positions, np.array(colors, np.float32).reshape(-1, 3) / 255, tuple(tracks))
 
 
-def complete_kind(folder: Path) -> str | None:
-    """Return bin or txt, whichever has both cameras and images (bin first); None if neither is complete."""
-    for kind in ("bin", "txt"):
-        if not _missing(folder, kind):
-            return kind
-    return None
+def reconstruction(root: Path) -> tuple[Path, str, list[str]] | None:
+    """Return folder, kind (bin or txt) and missing files of a reconstruction; None if there is no COLMAP file.
 
-
-def _missing(folder: Path, kind: str) -> list[str]:
-    return [f"{stem}.{kind}" for stem in STEMS[:2] if not (folder / f"{stem}.{kind}").is_file()]
-
-
-def missing_parts(folder: Path) -> list[str]:
-    """Return the names of the files that a complete reconstruction needs and this folder lacks."""
-    if complete_kind(folder):
-        return []
-    return min((_missing(folder, kind) for kind in ("bin", "txt")), key=len)
-
-
-def model_folder(root: Path) -> Path | None:
-    """Return the folder of the reconstruction: sparse/0, sparse, or the root; None if none contains a COLMAP file.
-
-    The first complete folder is taken, else the first with any COLMAP file, for the error message.
+    Of sparse/0, sparse and the root, the first complete folder is taken, else the first with any COLMAP file.
     """
-    folders = (root / "sparse" / "0", root / "sparse", root)
-    partial = [f for f in folders if any((f / f"{s}.{k}").is_file() for s in STEMS for k in ("bin", "txt"))]
-    return next((f for f in partial if complete_kind(f)), partial[0] if partial else None)
+    partial, kinds = [], ("bin", "txt")
+    for folder in (root / "sparse" / "0", root / "sparse", root):
+        lacks = {k: [n for s in STEMS[:2] if not (folder / (n := f"{s}.{k}")).is_file()] for k in kinds}
+        if any((folder / f"{s}.{k}").is_file() for s in STEMS for k in kinds):
+            kind = min(kinds, key=lambda k: len(lacks[k]))
+            partial.append((folder, kind, lacks[kind]))
+    return next((p for p in partial if not p[2]), partial[0] if partial else None)
 
 
 def _image_paths(scene: SceneFolder, images: Path, names: list[str], where: str) -> tuple[dict[str, Path], str]:
@@ -307,11 +279,8 @@ def _image_paths(scene: SceneFolder, images: Path, names: list[str], where: str)
         return paths | found, f"{len(lost)} images of {images.name} matched by their names without suffix"
     if len(lost) == len(names) == len(files):
         pairs = dict(zip(sorted(names), files))
-        first = min(names)
-        return (
-            pairs,
-            f"images of {images.name} matched in sorted order, because their names differ ({first} is {pairs[first].name})",
-        )
+        order = f"images of {images.name} matched in sorted order, because their names differ"
+        return pairs, f"{order} ({min(names)} is {pairs[min(names)].name})"
     return paths, ""  # the missing file is named when it is read
 
 
@@ -324,24 +293,33 @@ class ColmapReader(Reader):
 
     def probe(self, folder: Path) -> Probe | None:
         """See `Reader.probe`."""
-        model = model_folder(folder)
+        model = reconstruction(folder)
         if model is None:
             return None
-        found = f"the COLMAP reconstruction in {model.relative_to(folder).as_posix()}"
-        if missing := missing_parts(model):
-            return Probe(found, " and ".join(missing))
-        return Probe(found, "" if has_folder(folder, "images", "images_*") else "its image folder, images")
+        images = [] if has_folder(folder, "images", "images_*") else ["its image folder, images"]
+        return Probe(
+            f"the COLMAP reconstruction in {model[0].relative_to(folder).as_posix()}", " and ".join(model[2] or images)
+        )
 
     def read(self, folder: Path, options: ReadOptions) -> Scene:
         """See `Reader.read`."""
-        model = model_folder(folder)
-        kind = None if model is None else complete_kind(model)
-        if model is None or kind is None:
-            lacks = "cameras and images" if model is None else " and ".join(missing_parts(model))
-            raise DataError(f"{model or folder}: the COLMAP reconstruction lacks {lacks}; copy the whole folder")
-        scene = SceneFolder(folder, options)
-        poses = read_poses(scene.inside(model / f"images.{kind}"))
-        views, notes = _read_views(scene, model, kind, poses)
+        model, kind, lacks = reconstruction(folder) or (folder, "", ["cameras and images"])
+        if lacks:
+            raise DataError(f"{model}: the COLMAP reconstruction lacks {' and '.join(lacks)}; copy the whole folder")
+        scene, file = SceneFolder(folder, options), model / f"images.{kind}"
+        poses = read_poses(scene.inside(file))
+        lenses = read_cameras(scene.inside(model / f"cameras.{kind}"), options.lenses == "native")
+        images, factor, chosen = scene.images()
+        paths, matched = _image_paths(scene, images, [name for name, *_ in poses.values()], str(file))
+        notes, views = [note for note in (chosen, matched) if note], ViewList()
+        for name, lens, viewmat in posed_lenses(poses, lenses, file):
+            view = views.claim(view_name(name), f"{file}, image {name!r}")
+            mask = scene.find_mask(paths[name], images)
+            views.add(view, viewmat, scene.image(paths[name], lens, downscale=factor, mask=mask))
+        unposed = len(set(list_images(images)) - set(paths.values()))
+        if unposed:
+            notes.append(f"{unposed} files in {images.name} have no pose in the reconstruction and are left out")
+        notes += views.notes(options)
         points_path, points = model / f"points3D.{kind}", None
         if not points_path.is_file():
             notes.append(f"{points_path.name} is missing, so there are no points to start from")
@@ -349,22 +327,4 @@ class ColmapReader(Reader):
             points = read_points(scene.inside(points_path), {n: view_name(p[0]) for n, p in poses.items()})
             if len(points) == 0:
                 notes.append(f"{points_path.name} holds no points")
-        return self.scene(folder, views, notes, points=points, pixels=scene.pixel_source(by_folder=True))
-
-
-def _read_views(scene: SceneFolder, model: Path, kind: str, poses: dict[int, Pose]) -> tuple[list[View], list[str]]:
-    """Return the views of a reconstruction in file coordinates, sorted by the names in the file, and notes."""
-    lenses = read_cameras(scene.inside(model / f"cameras.{kind}"), scene.options.lenses == "native")
-    file = model / f"images.{kind}"
-    images, factor, note = scene.images()
-    notes = [note] if note else []
-    paths, note = _image_paths(scene, images, [name for name, *_ in poses.values()], str(file))
-    notes += [note] if note else []
-    views = ViewList()
-    for name, lens, viewmat in posed_lenses(poses, lenses, file):
-        view = views.claim(view_name(name), f"{file}, image {name!r}")
-        views.add(view, viewmat, scene.image(paths[name], lens, downscale=factor, mask=scene.find_mask(paths[name], images)))
-    unposed = len(set(list_images(images)) - set(paths.values()))
-    if unposed:
-        notes.append(f"{unposed} files in {images.name} have no pose in the reconstruction and are left out")
-    return views.views, notes + views.notes(scene.options)
+        return self.scene(folder, views.views, notes, points=points, pixels=scene.pixel_source(by_folder=True))

@@ -110,16 +110,6 @@ def find_reader(choice: str | type[Reader] | Reader) -> Reader:
     return cls()
 
 
-def _numbers(names: list[str]) -> list[int] | None:
-    """Return the number that distinguishes each name: the first group of digits that differs between all names; or None."""
-    groups = [re.findall(r"[0-9]{1,12}", PurePosixPath(n).stem) for n in names]
-    for place in range(min(map(len, groups), default=0)):
-        values = [int(g[place]) for g in groups]
-        if len(set(values)) == len(values):
-            return values
-    return None
-
-
 def named_by_dtu(names: list[str]) -> bool:
     """Return True where all names are DTU's own, `rect_001_3_r5000.png`, which count from 1."""
     return all(re.search(r"rect_[0-9]+_", n) for n in names)
@@ -130,10 +120,11 @@ def image_ids(names: list[str]) -> list[int] | None:
 
     DTU's own names, `rect_001_3_r5000.png`, count from 1, so number 1 is id 0; other numbers are used unchanged.
     """
-    values = _numbers(names)
-    if values is None:
-        return None
-    return [v - 1 for v in values] if named_by_dtu(names) else values
+    groups = [re.findall(r"[0-9]{1,12}", PurePosixPath(n).stem) for n in names]
+    for place in zip(*groups):  # the first group of digits that differs between all names
+        if len(values := [int(digits) for digits in place]) == len(set(values)):
+            return [v - 1 for v in values] if named_by_dtu(names) else values
+    return None
 
 
 def protocol_ids(names: list[str], wanted: tuple[int, ...], least: int, where: str) -> dict[int, str]:
@@ -210,24 +201,6 @@ def has_folder(root: Path, *patterns: str) -> bool:
     return any(p.is_dir() for pattern in patterns for p in root.glob(pattern))
 
 
-def child(folder: Path, name: object, where: str, *, root: Path | None = None, allow_outside: bool = False) -> Path:
-    """Return the path of a file that a scene names."""
-    usable = isinstance(name, str) and name.strip("/\\. ") and "\0" not in name and len(name) < MAX_NAME_LENGTH
-    if usable:
-        try:
-            name.encode("utf-8", "surrogateescape")
-        except UnicodeEncodeError:
-            usable = False
-    if not usable:
-        raise DataError(f"{where}: {str(name)[:80]!r} is not a file name; name an image file")
-    path = folder / name
-    if "\\" in name and not path.is_file():
-        path = folder / name.replace("\\", "/")  # written on Windows
-    if not allow_outside and not is_within(path, root or folder):
-        raise DataError(f"{where}: {name!r} points outside the scene folder; move the file inside, or pass --allow-outside")
-    return path
-
-
 def view_name(name: str) -> str:
     """Return the normalised name of a view from a file name: "./a//b.png" gives "a/b.png".
 
@@ -261,8 +234,24 @@ class SceneFolder:
         return path if self.options.allow_outside else inside(path, self.root, "the scene folder")
 
     def child(self, folder: Path, name: object, where: str, *, root: Path | None = None) -> Path:
-        """Return the path of a file that the scene names (see the function `child`)."""
-        return child(folder, name, where, root=root, allow_outside=self.options.allow_outside)
+        """Return the path of a file that the scene names, in ``root`` (by default ``folder``) unless others are allowed.
+
+        Raises:
+            DataError: The name cannot be one of a file, or points outside.
+        """
+        usable = isinstance(name, str) and name.strip("/\\. ") and "\0" not in name and len(name) < MAX_NAME_LENGTH
+        try:
+            encoded = usable and str(name).encode("utf-8", "surrogateescape")
+        except UnicodeEncodeError:
+            encoded = b""
+        if not encoded:
+            raise DataError(f"{where}: {str(name)[:80]!r} is not a file name; name an image file")
+        path = folder / str(name)
+        if "\\" in str(name) and not path.is_file():
+            path = folder / str(name).replace("\\", "/")  # written on Windows
+        if not self.options.allow_outside and not is_within(path, root or folder):
+            raise DataError(f"{where}: {name!r} points outside the scene folder; move the file inside, or pass --allow-outside")
+        return path
 
     def image(
         self,
@@ -328,8 +317,21 @@ class SceneFolder:
         Raises:
             DataError: There is no image folder, or it is a link that points outside the scene folder.
         """
-        folder, factor, note = _image_folder(self.root, self.options.downscale, base)
-        return self.inside(folder), factor, note
+        downscale, folder = self.options.downscale, self.root / base
+        ready = self.root / f"{base}_{downscale}"
+        if downscale > 1 and ready.is_dir() and list_images(ready):
+            return self.inside(ready), 1, f"images taken from {ready.name}"
+        how = f"area-resampled by {downscale}" if downscale > 1 else ""
+        if folder.is_dir() and list_images(folder):
+            return self.inside(folder), downscale, how and f"images {how}"
+        sizes = ((p.name[len(base) + 1 :], p) for p in self.root.glob(f"{base}_*"))
+        others = {int(n): p for n, p in sizes if n.isdecimal() and list_images(p)}
+        if not others:
+            note = unread_note(folder) or "missing, or without images; put the images into it"
+            raise DataError(f"{folder}: {note}")
+        largest = others[min(others)]
+        note = f"no full-size folder '{base}': images taken from {largest.name}{how and ', '}{how}"
+        return self.inside(largest), downscale, note
 
     def pixel_source(self, by_folder: bool) -> str:
         """Return the source of a scene's pixels, for result files: the folder, and "as stored" or the kind of resampling.
@@ -352,22 +354,6 @@ def read_mask(path: Path, keeps: str = "white", max_pixels: int = MAX_PIXELS) ->
     """Return the weight of each pixel from a mask file, float32 [H, W] in [0, 1]; ``keeps`` is the colour of kept pixels."""
     gray = np.ascontiguousarray(decode(path, max_pixels)[0][..., 0])
     return gray if keeps == "white" else 1 - gray
-
-
-def _image_folder(root: Path, downscale: int, base: str) -> tuple[Path, int, str]:
-    ready = root / f"{base}_{downscale}"
-    if downscale > 1 and ready.is_dir() and list_images(ready):
-        return ready, 1, f"images taken from {ready.name}"
-    full = root / base
-    if full.is_dir() and list_images(full):
-        return full, downscale, f"images area-resampled by {downscale}" if downscale > 1 else ""
-    others = {int(n): p for p in root.glob(f"{base}_*") if (n := p.name[len(base) + 1 :]).isdecimal() and list_images(p)}
-    if not others:
-        unread = unread_note(full)
-        raise DataError(f"{full}: {unread}" if unread else f"{full}: missing, or without images; put the images into it")
-    largest = others[min(others)]
-    how = f", area-resampled by {downscale}" if downscale > 1 else ""
-    return largest, downscale, f"no full-size folder '{base}': images taken from {largest.name}{how}"
 
 
 def resampling_note(downscale: int) -> list[str]:
@@ -407,18 +393,15 @@ class ViewList:
 
     def notes(self, options: ReadOptions | None = None) -> list[str]:
         """Return notes on changes to the pixels; with ``options`` also assumptions about masks."""
-        done = [f"{n} image{'s' if n != 1 else ''} {what}" for what, n in sorted(self._done.items())]
-        return done + ([] if options is None else self._mask_notes(options))
-
-    def _mask_notes(self, options: ReadOptions) -> list[str]:
-        cutout = options.masks == "cutout"
-        if not self._kept:
-            return ["--masks cutout changes nothing: no image has a mask file"] if cutout else []
+        notes = [f"{n} image{'s' if n != 1 else ''} {what}" for what, n in sorted(self._done.items())]
+        cutout = options is not None and options.masks == "cutout"
+        if options is None or not self._kept:
+            return [*notes, "--masks cutout changes nothing: no image has a mask file"] if cutout else notes
         mean = math.fsum(self._kept.values()) / len(self._kept)
-        notes = [
+        notes.append(
             f"masks keep {mean:.1%} of the pixels, the {options.mask_keeps} ones (--mask-keeps {options.mask_keeps}); "
             f"the others {'are transparent' if cutout else 'are ignored'} (--masks {options.masks})"
-        ]
+        )
         for fraction, what in ((0.0, "keep no pixel"), (1.0, "keep every pixel")):
             names = [n for n, kept in self._kept.items() if kept == fraction]
             if names:

@@ -16,7 +16,6 @@ import struct
 import warnings
 import zlib
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -84,12 +83,8 @@ def unread_format(path: Path, head: bytes) -> str | None:
 
 def unread_note(folder: Path) -> str:
     """Return a sentence on the RAW files of a folder, known by their suffix; empty for none."""
-    files = (
-        sorted(p for p in folder.glob("*") if p.suffix.lower() in RAW_SUFFIXES and p.name[0] != ".") if folder.is_dir() else []
-    )
-    if not files:
-        return ""
-    return f"{files[0].name} is {RAW}" if len(files) == 1 else f"{files[0].name} is {RAW} ({len(files)} such files)"
+    files = sorted(p for p in folder.glob("*") if p.suffix.lower() in RAW_SUFFIXES and p.name[0] != ".")
+    return f"{files[0].name} is {RAW}{f' ({len(files)} such files)' * (len(files) > 1)}" if files else ""
 
 
 MAX_PIXELS = 100_000_000
@@ -107,14 +102,12 @@ def read_image_file(path: Path, max_pixels: int = MAX_PIXELS, start: int | None 
             return read_start(path, start)
         return read_input(path, FILE_BYTES_PER_PIXEL * max_pixels + EXTRA_FILE_BYTES)
     except OSError as e:
-        raise _unreadable(path, e) from e
-
-
-def _unreadable(path: Path, error: OSError) -> DataError:
-    if not os.path.exists(path):  # False for broken and circular links
-        what = "is a broken link" if path.is_symlink() else "the image file is missing"
-        return DataError(f"{path}: {what}; restore it, or remove its camera from the scene")
-    return DataError(f"{path}: the image cannot be read ({unread_reason(error)}); fix its permissions or copy it again")
+        if os.path.exists(path):  # False for broken and circular links
+            what = f"the image cannot be read ({unread_reason(e)}); fix its permissions or copy it again"
+        else:
+            what = "is a broken link" if path.is_symlink() else "the image file is missing"
+            what += "; restore it, or remove its camera from the scene"
+        raise DataError(f"{path}: {what}") from e
 
 
 # Size and damage. Functions take the bytes of a file, and raise a ValueError with the reason as part of a sentence.
@@ -179,13 +172,9 @@ def _decoded(name: str, data: bytes) -> np.ndarray | None:
     if name == "WEBP":
         if not any(kind in WEBP_PIXELS for kind, _ in _webp_chunks(data)):
             raise ValueError("it holds no pixels")
-    elif name == "PNG":
-        for _ in _png_chunks(data):  # their checksums
-            pass
-        _loaded(_opened(name, data)).close()
-    elif name == "BMP":
+    elif name in ("PNG", "BMP"):
         with _opened(name, data) as image:
-            if image.info.get("compression") in BMP_RLE:
+            if name == "BMP" and image.info.get("compression") in BMP_RLE:
                 raise ValueError("its pixels are compressed, so damage would not be detected; save it as PNG")
             _loaded(image)
     else:
@@ -273,22 +262,6 @@ def _decoded_jpeg(data: bytes) -> np.ndarray | None:
         return None
     pixels: np.ndarray = simplejpeg.decode_jpeg(data, "GRAY" if colors == "Gray" else "BGR", strict=True)
     return pixels
-
-
-def _png_chunks(data: bytes) -> Iterator[tuple[bytes, memoryview]]:
-    """Yield kind and contents of each chunk of a PNG up to the last, after a check of its checksum."""
-    at, view, kind = len(PNG_START), memoryview(data), b""
-    while kind != b"IEND":
-        if at + 12 > len(data):
-            raise ValueError("it ends early")
-        length, kind = struct.unpack_from(">I4s", data, at)
-        end = at + 8 + length
-        if end + 4 > len(data):
-            raise ValueError("it ends within a chunk")
-        if zlib.crc32(view[at + 4 : end]) != struct.unpack_from(">I", data, end)[0]:
-            raise ValueError(f"the checksum of its part {kind.decode('ascii', 'replace')} does not match")
-        yield kind, view[at + 8 : end]
-        at = end + 4
 
 
 WEBP_PIXELS = (b"VP8 ", b"VP8L", b"ANMF")
@@ -450,8 +423,7 @@ def _raster(path: Path, data: bytes, max_pixels: int) -> np.ndarray:
     import cv2
 
     pixels = 0
-    unread = unread_format(path, data[:32])
-    if unread is not None:
+    if unread := unread_format(path, data[:32]):
         raise DataError(f"{path}: is {unread}")
     try:
         name = format_of(data)
@@ -538,23 +510,9 @@ PREFIX = b"Exif\0\0"
 """First bytes of EXIF in JPEG, and in some WebP files."""
 
 
-@dataclass(frozen=True)
-class Exif:
-    """Values of EXIF; missing values have the defaults."""
-
-    orientation: int = 1
-    """Orientation of the stored raster, 1 to 8."""
-    maker: str = ""
-    """Maker of the device."""
-    model: str = ""
-    """Model of the device."""
-    focal: float | None = None
-    """Focal length [mm] that gives the same field of view on 35 mm film."""
-
-    @property
-    def device(self) -> str:
-        """Maker and model, as far as known."""
-        return " ".join(filter(None, (self.maker, self.model)))[:MAX_TEXT]
+Exif = tuple[int, str, str, float | None]
+"""Orientation of the stored raster, 1 to 8; maker and model of the device; equivalent focal length on 35 mm film [mm]."""
+NO_EXIF: Exif = (1, "", "", None)
 
 
 def read_exif(data: bytes) -> Exif:
@@ -562,36 +520,33 @@ def read_exif(data: bytes) -> Exif:
     try:
         return parse_exif(_block(data))
     except ValueError:
-        return Exif()
+        return NO_EXIF
 
 
 def parse_exif(block: bytes) -> Exif:
     """Return the values of a block of EXIF, which begins as a TIFF file does; damaged values count as missing."""
     block = block.removeprefix(PREFIX)
     if block[:4] not in (b"II*\0", b"MM\0*"):
-        return Exif()
+        return NO_EXIF
     try:
         first = _Directory(block)
-        orientation, place = first.number(ORIENTATION), first.number(EXPOSURE)
+        orientation, place = first.number(ORIENTATION) or 1, first.number(EXPOSURE)
         maker, model = first.text(MAKE), first.text(MODEL)
         focal = None if place is None else _Directory(block, place).number(FOCAL_35MM)
     except ValueError:
-        return Exif()
-    if orientation is None or not 1 <= orientation <= 8:
-        orientation = 1
-    return Exif(orientation, maker, model, float(focal) if focal and focal <= MAX_FOCAL else None)
+        return NO_EXIF
+    return orientation if orientation <= 8 else 1, maker, model, float(focal) if focal and focal <= MAX_FOCAL else None
 
 
 def _block(data: bytes) -> bytes:
     """Return the bytes of EXIF in an image file, which begin as a TIFF file does; maybe empty."""
     name = format_of(data)
-    if name == "TIFF":
-        return data
-    if name == "AVIF":
-        with _opened(name, data) as image:
-            return bytes(image.info.get("exif", b""))
     if name == "JPEG":
         head = itertools.takewhile(lambda segment: segment[0] != SOS, _segments(data))
         return next((body for marker, body in head if marker == APP1 and body.startswith(PREFIX)), b"")
-    chunks = {"PNG": _png_chunks, "WEBP": _webp_chunks}.get(name, lambda data: iter(()))
-    return bytes(next((body for kind, body in chunks(data) if kind.upper() == b"EXIF"), b""))
+    if name == "WEBP":
+        return bytes(next((body for kind, body in _webp_chunks(data) if kind == b"EXIF"), b""))
+    if name in ("PNG", "AVIF"):
+        with _opened(name, data) as image:
+            return bytes(image.info.get("exif", b""))
+    return data if name == "TIFF" else b""

@@ -192,11 +192,6 @@ def list_images(folder: Path) -> list[Path]:
     return sorted(files, key=lambda p: p.relative_to(folder).as_posix())
 
 
-def exif_orientation(path: Path) -> int:
-    """Return the EXIF orientation, 1 to 8; 1 where the file has none."""
-    return read_exif(read_image_file(path)).orientation
-
-
 def turn_upright(array: np.ndarray, orientation: int) -> np.ndarray:
     """Rotate or mirror a raster [H, W, ...] upright by its EXIF orientation."""
     if orientation in (5, 6, 7, 8):
@@ -272,8 +267,6 @@ def _undistort(loaded: LoadedImage, lens: Lens) -> LoadedImage:
     map_x, map_y = undistortion_maps(loaded.K, lens, width, height)
     K = loaded.K.copy()
     K[:2, 2] -= 0.5
-    image = nearest_unmasked(loaded.image, loaded.mask)
-    image = cv2.remap(image, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     inside = (map_x >= -0.5) & (map_x <= width - 0.5) & (map_y >= -0.5) & (map_y <= height - 0.5)
     # beyond the fold of the polynomial, the map returns into the image, but to the pixel of another ray
     x2 = ((np.arange(width) - K[0, 2]) / K[0, 0]) ** 2
@@ -281,12 +274,14 @@ def _undistort(loaded: LoadedImage, lens: Lens) -> LoadedImage:
     inside &= y2[:, None] + x2 < _fold_radius2(lens.distortion)
     if loaded.mask is not None:
         inside &= cv2.remap(loaded.mask.astype(np.float32), map_x, map_y, cv2.INTER_LINEAR) > 0.5
-    alpha = None
-    if loaded.alpha is not None:
-        alpha = nearest_unmasked(loaded.alpha, loaded.mask)
-        alpha = cv2.remap(alpha, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    edge = cv2.BORDER_REPLICATE
+
+    def moved(raster: np.ndarray) -> np.ndarray:
+        return cv2.remap(nearest_unmasked(raster, loaded.mask), map_x, map_y, cv2.INTER_LINEAR, borderMode=edge)
+
+    image, alpha = moved(loaded.image), None if loaded.alpha is None else moved(loaded.alpha)
     done = (*loaded.done, f"undistorted ({lens.model})")
-    return LoadedImage(image, None if inside.all() else inside, loaded.K, done, alpha, loaded.kept)
+    return replace(loaded, image=image, mask=None if inside.all() else inside, done=done, alpha=alpha)
 
 
 @functools.lru_cache(maxsize=4)
@@ -355,11 +350,11 @@ def _fit_mask(path: Path, mask: np.ndarray, stored: tuple[int, int], upright: tu
     return resized > 0.5 if mask.dtype == bool else resized
 
 
-def _upright(path: Path, lens: Lens, image: np.ndarray) -> int:
+def _upright(path: Path, lens: Lens, image: np.ndarray, data: bytes) -> int:
     """Return the EXIF orientation to apply: 1 (none) where the raster fits the camera as stored, else the tag's."""
     if _fits(image.shape, lens):
         return 1
-    orientation = exif_orientation(path)
+    orientation = read_exif(data)[0]
     if orientation not in (5, 6, 7, 8) or not _fits(image.shape[1::-1], lens):
         raise DataError(
             f"{path}: the image is {image.shape[1]} x {image.shape[0]} px, its camera {lens.width} x {lens.height}: the "
@@ -413,11 +408,12 @@ def load_image(
     Colours are resampled in proportion to their opacity, so that the colours of transparent pixels do not affect others.
     """
     cutout, native = options.masks == "cutout", options.lenses == "native"
-    image, alpha = decode(path, options.max_pixels)
+    data = read_image_file(path, options.max_pixels)
+    image, alpha = decode(path, options.max_pixels, data)
     stored = image.shape[:2]
     if not isinstance(lens, Lens):
         lens = lens(stored[1], stored[0])
-    orientation = _upright(path, lens, image)
+    orientation = _upright(path, lens, image, data)
     if orientation != 1:
         image, alpha = turn_upright(image, orientation), None if alpha is None else turn_upright(alpha, orientation)
     height, width = image.shape[:2]

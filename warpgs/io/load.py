@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import functools
 import hashlib
 import itertools
 import re
@@ -170,42 +171,35 @@ def _blender(names: list[str], count: int, spec: str) -> Split:
     return Split(tuple(train[i] for i in BLENDER_TRAIN), tuple(test[::8]))
 
 
-class _Names:
-    """Names of views, to be found by their ends."""
+def _finder(names: list[str], spec: str) -> Callable[[str], str]:
+    """Return a function that finds views by name or name end, with suffix or without; the strictest kind of match decides."""
+    bare = {n: str(PurePosixPath(n).with_suffix("")) for n in names}
 
-    def __init__(self, names: list[str], spec: str):
-        self.names, self.spec = names, spec
-        self.bare = {n: str(PurePosixPath(n).with_suffix("")) for n in names}
-        self._ends: dict[tuple[bool, int], dict[str, list[str]]] = {}
+    @functools.cache
+    def by_end(plain: bool, count: int) -> dict[str, list[str]]:
+        """Return names of more than ``count`` parts by their last ``count`` parts; if it is 0, all names by the whole name."""
+        table: dict[str, list[str]] = {}
+        for name in names:
+            head, *tail = (bare[name] if plain else name).rsplit("/", count) if count else (bare[name] if plain else name,)
+            if len(tail) == count:
+                table.setdefault("/".join(tail) if count else head, []).append(name)
+        return table
 
-    def find(self, wanted: str) -> str:
-        """Return the view with the wanted name or name end, with suffix or without; the strictest kind of match decides."""
-        parts = wanted.count("/") + 1
-        for count in (0, parts):
-            for bare in (False, True):
-                matches = self._by_end(bare, count).get(wanted, [])
+    def find(wanted: str) -> str:
+        for count in (0, wanted.count("/") + 1):
+            for plain in (False, True):
+                matches = by_end(plain, count).get(wanted, [])
                 if len(matches) == 1:
                     return matches[0]
                 if matches:
-                    some = ", ".join(matches[:5])
-                    raise DataError(f"split {self.spec}: {wanted!r} could be any of {some}; give the whole name")
-        forms = {f: n for n in self.names for f in (PurePosixPath(n).stem, PurePosixPath(n).name, self.bare[n], n)}
+                    raise DataError(f"split {spec}: {wanted!r} could be any of {', '.join(matches[:5])}; give the whole name")
+        forms = {f: n for n in names for f in (PurePosixPath(n).stem, PurePosixPath(n).name, bare[n], n)}
         short = [f for f in forms if len(f) <= MAX_COMPARED]  # the comparison takes the product of both lengths
-        near = list(dict.fromkeys(forms[f] for f in difflib.get_close_matches(wanted[:MAX_COMPARED], short, 4, 0.3)))[:3]
-        some = ", ".join(near or self.names[:3])
-        raise DataError(f"split {self.spec}: no view {wanted!r}; the nearest names are {some}")
+        near = dict.fromkeys(forms[f] for f in difflib.get_close_matches(wanted[:MAX_COMPARED], short, 4, 0.3))
+        some = ", ".join(list(near)[:3] or names[:3])
+        raise DataError(f"split {spec}: no view {wanted!r}; the nearest names are {some}")
 
-    def _by_end(self, bare: bool, count: int) -> dict[str, list[str]]:
-        """Return names of more than ``count`` parts by their last ``count`` parts; if it is 0, all names by the whole name."""
-        if (bare, count) not in self._ends:
-            table: dict[str, list[str]] = {}
-            for name in self.names:
-                form = self.bare[name] if bare else name
-                head, *tail = form.rsplit("/", count) if count else (form,)
-                if len(tail) == count:
-                    table.setdefault("/".join(tail) if count else head, []).append(name)
-            self._ends[bare, count] = table
-        return self._ends[bare, count]
+    return find
 
 
 def check_spec(spec: str) -> None:
@@ -231,18 +225,16 @@ def _named(spec: str) -> dict[str, str]:
 
 def _explicit(names: list[str], spec: str) -> Split:
     parts: dict[str, tuple[str, ...]] = {}
-    known = _Names(names, spec)
+    find = _finder(names, spec)
     for key, values in _named(spec).items():
-        found = [known.find(v.strip()) for v in values.split(",") if v.strip()]
+        found = [find(v.strip()) for v in values.split(",") if v.strip()]
         twice = sorted(n for n, count in Counter(found).items() if count > 1)
         if twice:
             raise DataError(f"split {spec}: {key} names {twice[0]} twice; name every view once")
         parts[key] = tuple(found)
-    held = set(parts.get("test", ()))
-    train = parts.get("train", tuple(n for n in names if n not in held))
-    trained = set(train)
-    test = parts.get("test", tuple(n for n in names if n not in trained))
-    return Split(train, test)
+    named = {name for part in parts.values() for name in part}
+    others = tuple(n for n in names if n not in named)
+    return Split(parts.get("train", others), parts.get("test", others))
 
 
 def split_views(scene: Scene, spec: str) -> Split:
@@ -300,13 +292,6 @@ ASPECT_TOLERANCE = 0.02
 """Largest relative difference of aspects: undistorted DTU images differ by about a percent from the originals' masks."""
 
 
-def _by_id(files: list[Path], folder: Path) -> dict[int, Path]:
-    ids = image_ids([f.name for f in files])
-    if ids is None:
-        raise DataError(f"{folder}: the masks have no distinct numbers; name them 000.png, 001.png, ... by id")
-    return dict(zip(ids, files))
-
-
 def _fit(path: Path, mask: np.ndarray, view: View) -> np.ndarray:
     import cv2
 
@@ -337,7 +322,10 @@ def add_score_masks(views: list[View], folder: Path, scene: SceneFolder) -> tupl
     files = list_images(folder) if folder.is_dir() else []
     if not files:
         raise DataError(f"{folder}: contains no masks; name the folder that contains 000.png, 001.png, ... with --score-masks")
-    masks, ids = _by_id(files, folder), image_ids([v.name for v in views])
+    numbers, ids = image_ids([f.name for f in files]), image_ids([v.name for v in views])
+    if numbers is None:
+        raise DataError(f"{folder}: the masks have no distinct numbers; name them 000.png, 001.png, ... by id")
+    masks = dict(zip(numbers, files))
     if ids is None:
         raise DataError(
             f"{folder}: masks are matched by image id, but the images ({views[0].name}, ...) have no numbers that tell "
@@ -448,7 +436,10 @@ def read_folder(
     given = {f.name: getattr(options, f.name) for f in fields(SceneOptions)}
     checked = ReadOptions(**given | {"downscale": factor, "max_side": side, "on_image": on_image})
     try:
-        _check_folder(root)
+        if root.is_file() or not root.is_dir():
+            fix = "give a folder of photographs, or of images with their cameras"
+            found = f"is a file; {fix}" if root.is_file() else f"no such folder; {similar_folder(root) or fix}"
+            raise DataError(f"{root}: {found}")
         chosen, notes = detect(root) if reader is None else (_accepted(root, find_reader(reader)), [])
         return _finished(root, chosen, chosen.read(root, checked), notes, checked)
     except OSError as e:
@@ -477,14 +468,6 @@ def detect(root: Path) -> tuple[Reader, list[str]]:
     if others:
         notes.append(f"the folder also holds {' and '.join(r.name for r in others)}: {taken.name} is used")
     return taken, notes
-
-
-def _check_folder(root: Path) -> None:
-    if root.is_file():
-        raise DataError(f"{root}: is a file; give a folder of photographs, or of images with their cameras")
-    if not root.is_dir():
-        hint = similar_folder(root) or "give a folder of photographs, or of images with their cameras"
-        raise DataError(f"{root}: no such folder; {hint}")
 
 
 def _probe(reader: Reader, root: Path) -> Probe | None:

@@ -34,58 +34,36 @@ MAX_STRAY = 0.05
 """Largest fraction of a map's normals that may have another length, or face away from the camera."""
 
 
-class MapFolder:
-    """The maps of a folder, found by the names of images."""
-
-    def __init__(self, folder: Path, flag: str, allow_outside: bool):
-        """List a folder; links in it may point outside the folder only with ``allow_outside``."""
-        self.folder, self.flag = folder, flag
-        if not folder.is_dir():
-            raise DataError(f"{folder}: no such folder; name the folder of maps with {flag}")
-        self._files: dict[str, Path] = {}
-        others: set[str] = set()
-        for file in sorted(folder.rglob("*")):
-            suffix = file.suffix.lower()
-            if file.name[0] == "." or (suffix in SUFFIXES and not file.is_file()):
-                continue
-            if suffix in UNREAD:
-                others.add(suffix)
-            if suffix not in SUFFIXES:
-                continue
+def map_files(folder: Path, flag: str, allow_outside: bool) -> dict[str, Path]:
+    """Return the maps of a folder by the names of their images; links in it point outside only with ``allow_outside``."""
+    if not folder.is_dir():
+        raise DataError(f"{folder}: no such folder; name the folder of maps with {flag}")
+    files: dict[str, Path] = {}
+    paths = [p for p in sorted(folder.rglob("*")) if p.name[0] != "."]
+    for file in paths:
+        if file.suffix.lower() in SUFFIXES and file.is_file():
             key = file.relative_to(folder).with_suffix("").as_posix()
-            if key in self._files:
-                raise DataError(f"{file}: {self._files[key].name} is for the same image; remove one of them")
-            self._files[key] = file if allow_outside else inside(file, folder, "the folder of maps")
-        if not any(not key.endswith(CONFIDENCE) for key in self._files):
-            found = f"it holds {' and '.join(sorted(others))} files, which are not read; convert them to" if others else "add"
-            raise DataError(f"{folder}: holds no maps; {found} NPY (float32) or 16-bit PNG, named like the images")
-
-    def find(self, image: Path) -> tuple[Path | None, Path | None]:
-        """Return the files of map and confidence of an image; None for a missing one.
-
-        A map is named by the end of the image's path: for `a/b.jpg` it is `a/b.png` or `b.png`; the longest match is used.
-        """
-        for i in range(1 if image.is_absolute() else 0, len(image.parts)):
-            tail = PurePosixPath(*image.parts[i:])
-            for key in (tail.with_suffix("").as_posix(), tail.as_posix()):
-                if key in self._files and not key.endswith(CONFIDENCE):
-                    return self._files[key], self._files.get(key + CONFIDENCE)
-        return None, None
-
-    def unmatched(self) -> DataError:
-        """Return the error for a folder in which no image found a map."""
-        names = [key for key in self._files if not key.endswith(CONFIDENCE)]
-        return DataError(
-            f"{self.folder}: none of its {len(names)} maps has the name of an image (the first is {names[0]!r}); name each "
-            f"map like its image, with .png or .npy, or give another {self.flag}"
-        )
+            if key in files:
+                raise DataError(f"{file}: {files[key].name} is for the same image; remove one of them")
+            files[key] = file if allow_outside else inside(file, folder, "the folder of maps")
+    if all(key.endswith(CONFIDENCE) for key in files):
+        others = sorted({p.suffix.lower() for p in paths} & set(UNREAD))
+        found = f"it holds {' and '.join(others)} files, which are not read; convert them to" if others else "add"
+        raise DataError(f"{folder}: holds no maps; {found} NPY (float32) or 16-bit PNG, named like the images")
+    return files
 
 
-def read_numbers(path: Path, max_pixels: int = MAX_PIXELS) -> np.ndarray:
-    """Return the numbers of a PNG or NPY file, uint8, uint16 or float32, shape [H, W] or [H, W, C]."""
-    if path.suffix.lower() == ".npy":
-        return _read_array(path, max_pixels)
-    return decode_png(path, max_pixels)
+def _find(files: dict[str, Path], image: Path) -> tuple[Path | None, Path | None]:
+    """Return the files of map and confidence of an image; None for a missing one.
+
+    A map is named by the end of the image's path: for `a/b.jpg` it is `a/b.png` or `b.png`; the longest match is used.
+    """
+    for i in range(1 if image.is_absolute() else 0, len(image.parts)):
+        tail = PurePosixPath(*image.parts[i:])
+        for key in (tail.with_suffix("").as_posix(), tail.as_posix()):
+            if key in files and not key.endswith(CONFIDENCE):
+                return files[key], files.get(key + CONFIDENCE)
+    return None, None
 
 
 def mapped_array(path: Path, fix: str) -> np.ndarray:
@@ -102,7 +80,10 @@ def mapped_array(path: Path, fix: str) -> np.ndarray:
     return found
 
 
-def _read_array(path: Path, max_pixels: int) -> np.ndarray:
+def read_numbers(path: Path, max_pixels: int = MAX_PIXELS) -> np.ndarray:
+    """Return the numbers of a PNG or NPY file, uint8, uint16 or float32, shape [H, W] or [H, W, C]."""
+    if path.suffix.lower() != ".npy":
+        return decode_png(path, max_pixels)
     found = mapped_array(path, "save the map alone")
     if found.dtype.kind not in "fu" or found.dtype.itemsize > 8:
         raise DataError(f"{path}: its numbers are {found.dtype}; save float32, or uint16 in millimetres")
@@ -115,10 +96,8 @@ def _read_array(path: Path, max_pixels: int) -> np.ndarray:
             f"{path}: the map is {found.shape[1]} x {found.shape[0]} px, more than the limit of {max_pixels:,} pixels; shrink "
             "it, or raise the limit with --max-pixels"
         )
-    if found.dtype in (np.uint8, np.uint16):
-        return np.array(found)
     with np.errstate(over="ignore", invalid="ignore"):
-        return np.asarray(found, np.float32)
+        return np.array(found, found.dtype if found.dtype in (np.uint8, np.uint16) else np.float32)
 
 
 def _gray(path: Path, raw: np.ndarray, what: str) -> np.ndarray:
@@ -301,22 +280,19 @@ class GivenMaps:
     def __init__(self, options: ReadOptions):
         """List the files of the folders in ``options``."""
         self.options = options
-
-        def folder(path: str | None, flag: str) -> MapFolder | None:
-            return MapFolder(Path(path), flag, options.allow_outside) if path not in (None, NONE) else None
-
-        self.depths, self.normals = folder(options.depths, DEPTHS), folder(options.normals, NORMALS)
+        self.depths, self.normals = (
+            {} if path in (None, NONE) else map_files(Path(path), flag, options.allow_outside)
+            for path, flag in ((options.depths, DEPTHS), (options.normals, NORMALS))
+        )
 
     def attached(self, loaded: LoadedImage, image: Path, named: NamedMaps = NOTHING_NAMED) -> LoadedImage:
         """Return an image with its maps, at the image's size; the user's folder has priority over maps named in the scene."""
         depth, confidence, options = named.depth, None, self.options
         if options.depths is not None:
-            depth, confidence = self.depths.find(image) if self.depths is not None else (None, None)
+            depth, confidence = _find(self.depths, image)
         elif depth is not None and options.depth_unit is None:
             options = replace(options, depth_unit=named.unit)
-        normals = named.normals
-        if options.normals is not None:
-            normals = self.normals.find(image)[0] if self.normals is not None else None
+        normals = named.normals if options.normals is None else _find(self.normals, image)[0]
         if depth is not None:
             loaded = replace(loaded, depth=self._depth(loaded, depth, confidence, options))
         return loaded if normals is None else replace(loaded, normals=self._normals(loaded, normals))
@@ -372,23 +348,22 @@ def check_found(views: Sequence[View], options: ReadOptions) -> list[str]:
     for name, (path, flag) in flags.items():
         having = [v for v in views if getattr(v, name) is not None]
         if path not in (None, NONE) and not having:
-            raise MapFolder(Path(path), flag, options.allow_outside).unmatched()
+            names = [key for key in map_files(Path(path), flag, True) if not key.endswith(CONFIDENCE)]
+            raise DataError(
+                f"{path}: none of its {len(names)} maps has the name of an image (the first is {names[0]!r}); name each map "
+                f"like its image, with .png or .npy, or give another {flag}"
+            )
         if not having:
             continue
         where = f"from {Path(path)}" if path is not None else f"listed in the scene's file; to ignore them, use {flag} none"
-        what = "normals" if name == "normals" else "depth maps"
-        notes.append(f"{what}: {len(having)} of {len(views)} views, {_about(name, having, options)}, {where}")
+        what, about = "normals", f"{'OpenCV' if options.normal_axes == 'opencv' else 'OpenGL'} axes"
+        if name == "depth":
+            share = float(np.mean([(v.depth.values > 0).mean() for v in having if v.depth is not None]))
+            unit = "a unit is 0.001 for integers, else 1" if options.depth_unit is None else f"a unit is {options.depth_unit:g}"
+            kinds = {
+                "metric": f"metric ({unit}; change it with --depth-unit)", "relative": "depth of unknown scale and shift",
+                "disparity": "inverse depth of unknown scale and shift",
+            }  # fmt: skip
+            what, about = "depth maps", f"{share:.1%} of their pixels, {kinds[options.depth_kind]}"
+        notes.append(f"{what}: {len(having)} of {len(views)} views, {about}, {where}")
     return notes
-
-
-def _about(name: str, views: Sequence[View], options: ReadOptions) -> str:
-    """Return a description of the values of the maps, for a note."""
-    if name == "normals":
-        return f"{'OpenCV' if options.normal_axes == 'opencv' else 'OpenGL'} axes"
-    share = float(np.mean([(v.depth.values > 0).mean() for v in views if v.depth is not None]))
-    unit = "a unit is 0.001 for integers, else 1" if options.depth_unit is None else f"a unit is {options.depth_unit:g}"
-    words = {
-        "metric": f"metric ({unit}; change it with --depth-unit)", "relative": "depth of unknown scale and shift",
-        "disparity": "inverse depth of unknown scale and shift",
-    }  # fmt: skip
-    return f"{share:.1%} of their pixels, {words[options.depth_kind]}"

@@ -5,14 +5,14 @@ from __future__ import annotations
 import functools
 import json
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from warpgs.errors import DataError
-from warpgs.files import read_input, unread_reason
+from warpgs.files import read_file
 from warpgs.io import colmap
 from warpgs.io.folder import (
     Probe,
@@ -60,18 +60,16 @@ def _reject_constant(name: str):
 def _json(path: Path, fix: str, constants: Callable[[str], object] | None = None) -> Any:
     """Return the values of a JSON file of bounded size."""
     try:
-        text = read_input(path, MAX_BYTES).decode("utf-8-sig", "surrogateescape")
+        text = read_file(path, None, MAX_BYTES, fix).decode("utf-8-sig", "surrogateescape")
         check_parts(text)
         return json.loads(text, parse_constant=constants)
-    except OSError as e:
-        raise DataError(f"{path}: cannot be read ({unread_reason(e)}){fix}") from e
     except (ValueError, RecursionError) as e:
-        raise DataError(f"{path}: cannot be read as JSON ({str(e)[:80]}){fix}") from e
+        raise DataError(f"{path}: cannot be read as JSON ({str(e)[:80]}); {fix}") from e
 
 
 def read_json(path: Path) -> dict:
     """Return the parsed file with its list of frames."""
-    values = _json(path, "; write it again", _reject_constant)
+    values = _json(path, "write it again", _reject_constant)
     try:
         check_depth(values, MAX_DEPTH)
     except SchemaError as e:  # else the error message could not name its values
@@ -123,9 +121,7 @@ def lens_of(frame: dict, shared: dict, width: int, height: int, where: str, nati
         unread = [k for k in UNSUPPORTED_TERMS if not (fisheye and k in ("k4", "is_fisheye"))]
         other = [k for k in (*unread, *(("p1", "p2") if fisheye else ())) if frame.get(k, shared.get(k))]
         if other:
-            why = (
-                "is not supported for a fisheye" if fisheye else "belongs to a fisheye or rational lens, which is not supported"
-            )
+            why = "is not supported for a fisheye" if fisheye else "belongs to a fisheye or rational lens, not supported here"
             raise ValueError(f"{other[0]} {why}. Undistort the images{kept if other[0] == 'is_fisheye' else ''}")
     except ValueError as e:
         raise DataError(f"{where}: {e}") from e
@@ -237,26 +233,38 @@ class TransformsReader(Reader):
         return self.scene(folder, views.views, notes, background=background, pixels=pixels)
 
 
+Row = tuple[str, np.ndarray, Lens]
+"""Name, camera_from_world [4, 4] and lens of a camera."""
+
+
 def read_cameras(path: Path) -> tuple[dict[str, Camera], list[str]]:
     """Return the cameras of a file or of a COLMAP folder by name, in file units, and notes for the user.
 
-    Lenses become pinholes, because renders have no distortion; a note reports lenses with distortion.
+    Lenses become pinholes, because renders have no distortion; a note reports lenses with distortion. A repeated name gets a
+    number.
     """
     if path.is_dir():
-        found = _colmap(path)
+        rows = _colmap(path)
     else:
-        values = _json(path, ". Check the path, or write the file again")
-        found = _inria(path, values) if isinstance(values, list) else _transforms(path)
+        values = _json(path, "check the path, or write the file again")
+        rows = _inria(path, values) if isinstance(values, list) else _transforms(path)
+    found: dict[str, Camera] = {}
+    numbers: dict[str, int] = {}
+    bent = 0
+    for name, viewmat, lens in rows:
+        free, number = name, numbers.get(name, 2)
+        while free in found:  # each number of a name is tried once
+            free, number = f"{name}-{number}", number + 1
+        numbers[name] = number
+        found[free] = Camera(viewmat, lens.K, lens.width, lens.height)
+        bent += any(lens.distortion)
     if not found:
         raise DataError(f"{path}: holds no camera. Give cameras.json, transforms.json, or the folder of a scene")
-    bent = sum(any(lens.distortion) for _, lens in found.values())
-    notes = [f"the lens distortion of {bent} of {len(found)} cameras is not rendered"] if bent else []
-    return {name: Camera(viewmat, lens.K, lens.width, lens.height) for name, (viewmat, lens) in found.items()}, notes
+    return found, [f"the lens distortion of {bent} of {len(found)} cameras is not rendered"] if bent else []
 
 
-def _inria(path: Path, rows: list[Any]) -> dict[str, tuple[np.ndarray, Lens]]:
-    """Return pose and lens of each row; a row has a camera-to-world rotation in OpenCV axes and the camera centre."""
-    found = _Names()
+def _inria(path: Path, rows: list[Any]) -> Iterator[Row]:
+    """Yield the cameras of rows with a camera-to-world rotation in OpenCV axes and the camera centre."""
     for i, row in enumerate(rows):
         where = f"{path}, camera {i}"
         try:
@@ -269,14 +277,12 @@ def _inria(path: Path, rows: list[Any]) -> dict[str, tuple[np.ndarray, Lens]]:
             name = str(row.get("img_name", i))
         except (KeyError, TypeError, ValueError, OverflowError, AttributeError) as e:
             raise DataError(f"{where}: needs rotation, position, width, height, fx and fy as numbers; correct the entry") from e
-        found.add(name, from_camera_to_world(pose, where, opengl=False), lens.checked(where))
-    return found
+        yield name, from_camera_to_world(pose, where, opengl=False), lens.checked(where)
 
 
-def _transforms(path: Path) -> dict[str, tuple[np.ndarray, Lens]]:
-    """Return pose and lens of each frame; the file must give its image size."""
+def _transforms(path: Path) -> Iterator[Row]:
+    """Yield the cameras of frames; the file must give its image size."""
     shared = read_json(path)
-    found = _Names()
     for i, frame in enumerate(shared["frames"]):
         where = f"{path}, frame {i}"
         if not isinstance(frame, dict):
@@ -284,41 +290,19 @@ def _transforms(path: Path) -> dict[str, tuple[np.ndarray, Lens]]:
         if any(frame.get(key, shared.get(key)) is None for key in ("w", "h")):
             raise DataError(f"{where}: gives no w and h, so the image size is unknown. Add them, or give the scene's folder")
         lens = lens_of(frame, shared, 0, 0, where)
-        viewmat = from_camera_to_world(matrix_of(frame, where), where, opengl=True)
-        found.add(str(frame.get("file_path", i)), viewmat, lens)
-    return found
+        yield str(frame.get("file_path", i)), from_camera_to_world(matrix_of(frame, where), where, opengl=True), lens
 
 
-def colmap_folder(folder: Path) -> Path | None:
-    """Return the folder of the reconstruction in a scene folder, sparse or sparse/0; None without one."""
-    found = colmap.model_folder(folder)
-    return colmap.model_folder(folder / "0") if found is None else found
+def colmap_folder(folder: Path) -> tuple[Path, str, list[str]] | None:
+    """Return the `colmap.reconstruction` in a scene folder, sparse or sparse/0; None without one."""
+    return colmap.reconstruction(folder) or colmap.reconstruction(folder / "0")
 
 
-def _colmap(folder: Path) -> dict[str, tuple[np.ndarray, Lens]]:
-    """Return pose and lens of each image of a reconstruction, sorted by name."""
-    model = colmap_folder(folder)
-    kind = None if model is None else colmap.complete_kind(model)
-    if model is None or kind is None:
+def _colmap(folder: Path) -> Iterator[Row]:
+    """Yield the cameras of a reconstruction, sorted by name."""
+    model, kind, lacks = colmap_folder(folder) or (folder, "", ["all"])
+    if lacks:
         raise DataError(f"{folder}: lacks COLMAP's files cameras and images. Give cameras.json, transforms.json or a scene")
-    lenses = colmap.read_cameras(model / f"cameras.{kind}")
-    found = _Names()
-    poses = colmap.read_poses(model / f"images.{kind}")
+    lenses, poses = colmap.read_cameras(model / f"cameras.{kind}"), colmap.read_poses(model / f"images.{kind}")
     for name, lens, viewmat in colmap.posed_lenses(poses, lenses, model / f"images.{kind}"):
-        found.add(name, viewmat, lens)
-    return found
-
-
-class _Names(dict[str, tuple[np.ndarray, Lens]]):
-    """Poses and lenses by unique names: a repeated name gets a number."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self._next: dict[str, int] = {}
-
-    def add(self, name: str, viewmat: np.ndarray, lens: Lens) -> None:
-        free, number = name, self._next.get(name, 2)
-        while free in self:  # each number of a name is tried once
-            free, number = f"{name}-{number}", number + 1
-        self._next[name] = number
-        self[free] = viewmat, lens
+        yield name, viewmat, lens

@@ -28,6 +28,7 @@ from warpgs.io.image_files import (
     MAKE,
     MARKER,
     MAX_PIXELS,
+    MAX_TEXT,
     MODEL,
     NEXT_MARKER,
     PNG_START,
@@ -234,10 +235,10 @@ def _coded_again(source: Path, max_pixels: int) -> bytes:
         width, height = image.size
         if width * height > max_pixels:
             raise ValueError(f"{width} x {height} px are more than the limit of {max_pixels:,} pixels (--max-pixels)")
-        found, kept = parse_exif(image.info.get("exif") or b""), Image.Exif()
-        kept.update({tag: text for tag, text in ((MAKE, found.maker), (MODEL, found.model)) if text})
-        if found.focal is not None:
-            kept.get_ifd(EXPOSURE)[FOCAL_35MM] = int(found.focal)
+        (_, *names, film), kept = parse_exif(image.info.get("exif") or b""), Image.Exif()
+        kept.update({tag: text for tag, text in zip((MAKE, MODEL), names) if text})
+        if film is not None:
+            kept.get_ifd(EXPOSURE)[FOCAL_35MM] = int(film)
         pixels = io.BytesIO()
         image.convert("RGB").save(pixels, "JPEG", quality=JPEG_QUALITY, subsampling=0, exif=kept)
     return pixels.getvalue()
@@ -352,8 +353,8 @@ def prepare(path: Path, root: Path, small: Path, max_pixels: int = MAX_PIXELS) -
 
     data = read_image_file(path, max_pixels)
     name, colors = path.relative_to(root).as_posix(), decode(path, max_pixels, data)[0]
-    exif = read_exif(data)  # decode has checked that the file is an image within the limits
-    image = turn_upright(colors, exif.orientation)
+    orientation, *names, film = read_exif(data)  # decode has checked that the file is an image within the limits
+    image = turn_upright(colors, orientation)
     del colors
     height, width = image.shape[:2]
     scale = min(1.0, MATCHING_SIDE / max(width, height))
@@ -362,11 +363,10 @@ def prepare(path: Path, root: Path, small: Path, max_pixels: int = MAX_PIXELS) -
         image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
     _, png = cv2.imencode(".png", np.round(255 * image[..., ::-1]).astype(np.uint8), [cv2.IMWRITE_PNG_COMPRESSION, 1])
     write_bytes(small, png.tobytes())
-    film = exif.focal
     focal = None if film is None else film / DIAGONAL_35MM * math.hypot(width, height) / max(width, height)
-    device = exif.device if film is None else f"{exif.device} {film:g} mm"
+    device = " ".join(filter(None, names))[:MAX_TEXT] + ("" if film is None else f" {film:g} mm")
     digest = hashlib.sha256(data).hexdigest()
-    return Photograph(scene_name(name, data), path, width, height, exif.orientation, device, focal, digest)
+    return Photograph(scene_name(name, data), path, width, height, orientation, device, focal, digest)
 
 
 def write_copy(photograph: Photograph, folder: Path, max_pixels: int = MAX_PIXELS) -> None:

@@ -8,11 +8,9 @@ import textwrap
 import time
 from collections import Counter, defaultdict
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from warpgs.device import format_bytes
-from warpgs.files import write_text
 from warpgs.process import careful, printable, say
 from warpgs.report.page import rendered
 from warpgs.report.progress import PLAIN_INTERVAL, duration, is_live, waiting
@@ -45,6 +43,14 @@ class JobRow:
     gaussians: int = 0
     message: str = ""
     """Reason of a failure, or a note."""
+    ssim: float | None = None
+    """Mean SSIM over held-out views."""
+    ply_bytes: int = 0
+    """Size of the PLY file."""
+    thumbnail: str = ""
+    """Path of the job's image, relative to the page; empty without one."""
+    report: str = ""
+    """Path of the job's report, relative to the page; empty without one."""
 
 
 def row_values(row: JobRow) -> tuple[str, ...]:
@@ -64,7 +70,7 @@ class FarmTable:
         self.began = self.printed = time.monotonic()
         self.rows: list[JobRow] = []
         self.left: float | None = None
-        self.order: dict[str, None] = {}
+        self.ended: dict[str, JobRow] = {}
         self.display: Any = None
 
     def __enter__(self) -> FarmTable:
@@ -88,8 +94,8 @@ class FarmTable:
 
     def update(self, rows: list[JobRow], left: float | None) -> None:
         """Show the jobs, and the time left [s] where it is known."""
-        ended = [r for r in rows if r.state in ("done", "failed") and r.name not in self.order]
-        self.order |= dict.fromkeys(r.name for r in ended)
+        ended = [r for r in rows if r.state in ("done", "failed") and r.name not in self.ended]
+        self.ended |= {r.name: r for r in ended}
         self.rows, self.left = rows, left
         if self.display is not None:
             self.display.update(self.panel())
@@ -117,20 +123,16 @@ class FarmTable:
         table = Table(box=None, padding=(0, 2, 0, 0), header_style="dim")
         for name in ("scene", "state", "step", "time", "PSNR", "Gaussians"):
             table.add_column(name, justify="left" if name in ("scene", "state") else "right", no_wrap=True)
-        by_name = {r.name: r for r in self.rows}
-        last = [by_name[n] for n in list(self.order)[-LAST:] if n in by_name]
-        running = [r for r in self.rows if r.state == "running"]
-        for row in [*running[:MOST_RUNNING], *reversed(last)]:
-            cells = [Text(printable(c)) for c in row_values(row)[:-1]]
-            table.add_row(*cells, style=STYLES.get(row.state, ""))
-        done = sum(r.state in ("done", "failed") for r in self.rows)
+        last, running = [*self.ended.values()][: -LAST - 1 : -1], [r for r in self.rows if r.state == "running"]
+        for row in [*running[:MOST_RUNNING], *last]:
+            table.add_row(*(Text(printable(c)) for c in row_values(row)[:-1]), style=STYLES.get(row.state, ""))
         bar = Table.grid()  # alone, the bar does not end its line
-        bar.add_row(ProgressBar(total=max(1, len(self.rows)), completed=done, width=78))
+        bar.add_row(ProgressBar(total=max(1, len(self.rows)), completed=len(self.ended), width=78))
         more = len(running) - MOST_RUNNING
         rest = [Text(f"and {more} more running", style="dim")] if more > 0 else []
         messages = [
             Text(printable(f"{r.name}: {r.message}"), style="dim", no_wrap=True, overflow="ellipsis")
-            for r in reversed(last) if r.message
+            for r in last if r.message
         ]  # fmt: skip
         return Group(bar, Text(self.summary(), style="bold"), table, *rest, *messages)
 
@@ -139,60 +141,37 @@ SHORT = 120
 """Largest number of letters of a message on a card; the table of failures shows the whole message."""
 
 
-@dataclass(frozen=True)
-class JobCard:
-    """A job on the page."""
-
-    row: JobRow
-    ssim: float | None = None
-    """Mean SSIM over held-out views."""
-    ply_bytes: int = 0
-    """Size of the PLY file."""
-    thumbnail: str = ""
-    """Path of the job's image, relative to the page; empty without one."""
-    report: str = ""
-    """Path of the job's report, relative to the page; empty without one."""
-
-
-def _facts(card: JobCard) -> str:
+def _facts(row: JobRow) -> str:
     """Return a card's text: scores and sizes, the message of a failure, or the state."""
-    row, failed = card.row, card.row.state == "failed"
+    _, _, _, seconds, psnr, gaussians, message = row_values(row)
+    failed = row.state == "failed"
     facts = [
-        "" if row.psnr is None else f"PSNR {row.psnr:.2f} dB", "" if card.ssim is None else f"SSIM {card.ssim:.3f}",
-        f"{row.gaussians:,} Gaussians" if row.gaussians else "", format_bytes(card.ply_bytes) if card.ply_bytes else "",
-        duration(row.seconds) if row.seconds and not failed else "",
-        textwrap.shorten(row.message, SHORT, placeholder=" ...") if failed else "",
+        psnr and f"PSNR {psnr}", "" if row.ssim is None else f"SSIM {row.ssim:.3f}", gaussians and f"{gaussians} Gaussians",
+        format_bytes(row.ply_bytes) if row.ply_bytes else "", "" if failed else seconds,
+        textwrap.shorten(message, SHORT, placeholder=" ...") if failed else "",
     ]  # fmt: skip
     return ", ".join(filter(None, facts)) or row.state
 
 
-def _failures(cards: list[JobCard]) -> list[tuple[str, list[str]]]:
+def _failures(rows: list[JobRow]) -> list[tuple[str, list[str]]]:
     """Return each message of failed jobs with the names of the jobs, the most frequent first."""
     by_message: dict[str, list[str]] = defaultdict(list)
-    for card in cards:
-        if card.row.state == "failed":
-            name = rf"(?<!\w){re.escape(card.row.name)}(?!\w)"
-            message = re.sub(name, "SCENE", card.row.message)  # messages that differ only in the job's name count as one
-            by_message[message].append(card.row.name)
+    for row in rows:
+        if row.state == "failed":  # messages that differ only in the job's name count as one
+            by_message[re.sub(rf"(?<!\w){re.escape(row.name)}(?!\w)", "SCENE", row.message)].append(row.name)
     return sorted(by_message.items(), key=lambda item: -len(item[1]))
 
 
-def farm_page(title: str, cards: list[JobCard], seconds: float) -> str:
+def farm_page(title: str, rows: list[JobRow], seconds: float) -> str:
     """Return the page of a farm, with its jobs in the order given, ``seconds`` after it began."""
-    states = [c.row.state for c in cards]
-    scores = [c.row.psnr for c in cards if c.row.psnr is not None]
+    states = Counter(r.state for r in rows)
+    scores = [r.psnr for r in rows if r.psnr is not None]
     figures = [
-        ("scenes", f"{len(cards):,}"), ("done", f"{states.count('done'):,}"), ("failed", f"{states.count('failed'):,}"),
+        ("scenes", f"{len(rows):,}"), ("done", f"{states['done']:,}"), ("failed", f"{states['failed']:,}"),
         ("mean held-out PSNR", f"{sum(scores) / len(scores):.2f} dB" if scores else "-"),
-        ("all PLY files", format_bytes(sum(c.ply_bytes for c in cards))), ("time", duration(seconds)),
+        ("all PLY files", format_bytes(sum(r.ply_bytes for r in rows))), ("time", duration(seconds)),
     ]  # fmt: skip
-    open_jobs = len(cards) - states.count("done") - states.count("failed")
-    line = f"{open_jobs:,} jobs are not done yet; load the page again later." if open_jobs else "All jobs have ended."
-    return rendered(
-        "farm.html", title=title, line=line, figures=figures, failures=_failures(cards), cards=[(c, _facts(c)) for c in cards]
-    )
-
-
-def write_farm_page(path: Path, title: str, cards: list[JobCard], seconds: float) -> None:
-    """Write the page of `farm_page`, with links to images and reports."""
-    write_text(path, farm_page(title, cards, seconds))
+    left = len(rows) - states["done"] - states["failed"]
+    line = f"{left:,} jobs are not done yet; load the page again later." if left else "All jobs have ended."
+    cards = [(r, _facts(r)) for r in rows]
+    return rendered("farm.html", title=title, line=line, figures=figures, failures=_failures(rows), cards=cards)

@@ -432,7 +432,7 @@ def test_the_device_is_asked_for_last(changes, monkeypatch):
     order = []
     views = photos(3)
     monkeypatch.setattr(setup, "view_priors", lambda *a, depths, **k: (order.append("semantics"), depths(), ([], []))[-1])
-    monkeypatch.setattr(start, "sweep_depths", lambda v, b, c, device, progress: (order.append(str(device)), consistent(v))[1])
+    monkeypatch.setattr(start, "sweep_depths", lambda v, b, device, progress: (order.append(str(device)), consistent(v))[1])
     config = dataclasses.replace(PRESETS["default"], strategy="paper", strategy_config=None, **changes)
     _, begun, *_ = prepare(views, None, config, np.random.default_rng(0), CUDA, None, lambda: order.append("ready"))
     swept = ["ready", "cpu" if "memory_limit" in changes else "cuda"] if "init" not in changes else []
@@ -479,7 +479,7 @@ def test_missing_points_and_views_are_said_before_anything_takes_time(monkeypatc
 def test_only_fits_that_sweep_warm_up_a_sweep(preset, monkeypatch):
     """And none under a memory limit, which leaves the sweep to the CPU."""
     swept = []
-    monkeypatch.setattr(warmups, "sweep_depths", lambda views, *_: swept.append(len(views)))
+    monkeypatch.setattr(warmups, "sweep_depths", lambda views, *_, **__: swept.append(len(views)))
     warm_up(CHOSEN[preset], WARMUP_CPU)
     warm_up(dataclasses.replace(CHOSEN[preset], memory_limit=10**9), WARMUP_CPU)
     assert swept == ([2] if preset == "default" else [])

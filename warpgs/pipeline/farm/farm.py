@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import csv
-import io
 import json
 import os
 import queue
@@ -12,11 +10,12 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from warpgs.errors import FolderHeldError, ResourceError, UsageError
-from warpgs.files import remove_leftovers, write_text, writing_into
+from warpgs.files import remove_leftovers, write_csv, write_text, writing_into
 from warpgs.locks import hold_folder
 from warpgs.pipeline.farm.job import (
     PLY,
@@ -32,7 +31,7 @@ from warpgs.pipeline.farm.job import (
 )
 from warpgs.pipeline.run.request import choose_device
 from warpgs.process import PythonWorker, say
-from warpgs.report.farm import FarmTable, JobCard, JobRow, write_farm_page
+from warpgs.report.farm import FarmTable, JobRow, farm_page
 
 WORKER = "warpgs.pipeline.farm.worker"
 SECONDS_TO_SAVE = 60.0
@@ -65,120 +64,84 @@ def local_slots(device: str, slots: int | None, per_gpu: int) -> list[Slot]:
     return [("cuda", threads, {"CUDA_VISIBLE_DEVICES": names[i % gpus]}) for i in range(count)]
 
 
-class _Process:
-    """A worker process of a slot, and the job it works on."""
-
-    def __init__(self, slot: Slot, news: queue.SimpleQueue[tuple[_Process, str | None]]):
-        """Start the process; its lines go to ``news``, then None when it ends."""
-        self.slot, self.job = slot, ""
-        self.worker = PythonWorker(WORKER, environment={"OMP_NUM_THREADS": str(slot[1]), **slot[2]})
-        threading.Thread(target=self._listen, args=(news,), daemon=True).start()
-
-    def _listen(self, news: queue.SimpleQueue[tuple[_Process, str | None]]) -> None:
-        for line in self.worker.lines():
-            news.put((self, line))
-        news.put((self, None))
-
-
 class LocalEngine:
     """Runs each job in the process of a slot; the process runs job after job until a job fails or the process dies."""
 
     name = "local"
 
     def __init__(self, slots: list[Slot]):
-        """Prepare the slots; processes start with the first job."""
-        self.slots = len(slots)
-        self._free = list(reversed(slots))
-        self._idle: list[_Process] = []
-        self._busy: dict[str, _Process] = {}
-        self._news: queue.SimpleQueue[tuple[_Process, str | None]] = queue.SimpleQueue()
-        self._compiled = False
-
-    def _prepare(self) -> None:
-        """Compile kernels once for all processes, in a process that sees all devices."""
-        self._compiled = True
-        device, threads, _ = self._free[-1]
-        alone = self.slots == 1 or device == "cpu"  # that process can serve its slot afterwards
-        process = _Process(self._free.pop() if alone else (device, threads, {}), self._news)
-        try:
-            self._compile(process, device)
-        except BaseException:
-            process.worker.end(0)
-            raise
-        if alone:
-            self._idle.append(process)
-        else:
-            process.worker.end(SECONDS_TO_SAVE)
-
-    def _compile(self, process: _Process, device: str) -> None:
-        """Compile kernels of all devices that a process sees."""
-        process.worker.send(json.dumps({"kernels": device}))
-        _, line = self._news.get()
-        if line is None or json.loads(line).get("state") != "done":
-            code, errors = process.worker.end(0)
-            last = (errors.splitlines() or ["no message"])[-1]
-            raise ResourceError(
-                f"kernels could not be compiled: the process ended with exit code {code} ({last}); run `warpgs doctor` to "
-                "check this machine"
-            )
+        """Start a thread for each slot; processes start with the first jobs."""
+        self.slots, self._closing, self._lock = len(slots), False, threading.Lock()
+        self._jobs: queue.SimpleQueue[tuple[str, str] | None] = queue.SimpleQueue()
+        self._news: queue.SimpleQueue[Event] = queue.SimpleQueue()
+        self._workers: dict[str, PythonWorker] = {}
+        self._threads = [threading.Thread(target=self._serve, args=(slot,), daemon=True) for slot in slots]
+        for thread in self._threads:
+            thread.start()
 
     def workers(self) -> dict[str, int]:
         """Return the numbers of the processes at work, by job."""
-        return {name: process.worker.number for name, process in self._busy.items()}
+        return {name: worker.number for name, worker in self._workers.items()}
 
     def start(self, job: FarmJob) -> None:
-        """Start a job in an idle process, or in a new one; before the first job, kernels are compiled."""
-        if not self._compiled:
-            self._prepare()
-        process = self._idle.pop() if self._idle else _Process(self._free.pop(), self._news)
-        process.job = job.name
-        self._busy[job.name] = process
-        process.worker.send(json.dumps({"job": job_text(job), "threads": process.slot[1]}))
+        """Start a job in an idle process, or in a new one."""
+        self._jobs.put((job.name, job_text(job)))
 
     def wait(self, seconds: float) -> list[Event]:
-        """Return the new events of all processes."""
+        """Return the next event of all processes, if any."""
         try:
-            process, line = self._news.get(timeout=seconds)
+            return [self._news.get(timeout=seconds)]
         except queue.Empty:
             return []
-        if line is None:
-            return self._ended(process)
-        values = json.loads(line)
-        if "state" not in values:
-            return [Event(process.job, "running", step=values["step"])]
-        name, state = process.job, values["state"]
-        del self._busy[name]
-        process.job = ""
-        if state == "failed":  # the process ends and frees its memory
-            process.worker.end(SECONDS_TO_SAVE)
-            self._free.append(process.slot)
-        else:
-            self._idle.append(process)
-        return [Event(name, state)]
 
-    def _ended(self, process: _Process) -> list[Event]:
-        """Record that a process has ended."""
-        code, errors = process.worker.end(SECONDS_TO_SAVE)
-        if not process.job:
-            if process in self._idle:
-                self._idle.remove(process)
-                self._free.append(process.slot)
-            return []
-        del self._busy[process.job]
-        self._free.append(process.slot)
-        how = f"was killed by signal {-code}" if code < 0 else f"ended with exit code {code}"
-        last = "".join(f": {line}" for line in errors.splitlines()[-1:])
-        return [Event(process.job, "crashed", f"its process {how}{last}")]
+    def _serve(self, slot: Slot) -> None:
+        """Run jobs in the process of a slot, one after another."""
+        (_, threads, environment), worker = slot, None
+        lines: Iterator[str] = iter(())
+        while (job := self._jobs.get()) is not None:
+            (name, text), state, reason = job, "crashed", ""
+            try:
+                if worker is None:
+                    worker = PythonWorker(WORKER, environment={"OMP_NUM_THREADS": str(threads), **environment})
+                    lines = worker.lines()
+            except OSError as e:
+                self._news.put((name, state, str(e)))
+                continue
+            with self._lock:
+                if self._closing:
+                    break
+                self._workers[name] = worker
+                worker.send(json.dumps({"job": text, "threads": threads}))
+            while state == "crashed" and (line := next(lines, None)) is not None:
+                values = json.loads(line)
+                if "step" in values:
+                    self._news.put((name, "running", values["step"]))
+                else:
+                    state = values["state"]
+            with self._lock:
+                del self._workers[name]
+                if self._closing:
+                    return  # `close` ends the process
+            if state in ("failed", "crashed"):  # after a failure, too, the process ends, and frees its memory
+                code, errors = worker.end(SECONDS_TO_SAVE)
+                how = f"was killed by signal {-code}" if code < 0 else f"ended with exit code {code}"
+                reason = f"its process {how}{''.join(f': {line}' for line in errors.splitlines()[-1:])}"
+                worker = None
+            self._news.put((name, state, reason if state == "crashed" else ""))
+        if worker is not None:
+            worker.end(SECONDS_TO_SAVE)
 
     def close(self) -> None:
         """Ask all processes to save and stop, and kill those that do not."""
-        processes = [*self._busy.values(), *self._idle]
-        threads = [threading.Thread(target=p.worker.end, args=(SECONDS_TO_SAVE,)) for p in processes]
-        for thread in threads:
-            thread.start()
-        for thread in threads:
+        with self._lock:
+            self._closing, workers = True, list(self._workers.values())
+        for _ in range(self.slots):
+            self._jobs.put(None)
+        with ThreadPoolExecutor(self.slots) as pool:
+            for worker in workers:
+                pool.submit(worker.end, SECONDS_TO_SAVE)
+        for thread in self._threads:
             thread.join()
-        self._busy, self._idle = {}, []
 
 
 ATTEMPTS = 2
@@ -218,56 +181,49 @@ class JobStatus:
 def run_farm(
     jobs: list[FarmJob], engine: Engine, show: Callable[[list[JobStatus]], object] = lambda _: None, *, poll: float = POLL
 ) -> list[JobStatus]:
-    """Run jobs until each is done or has failed."""
+    """Run jobs until each is done or has failed; ``show`` gets their status after each change."""
     # A finished, valid job is skipped. If the process of a job dies or runs out of memory, the job is started once more
     # after the others, from its checkpoint. The folder of a running job is locked. A job whose folder another farm has
     # locked is checked again later, and its result is used.
-    return _Farm(jobs, engine, show, poll).run()
+    farm = _Farm(jobs, engine)
+    show(farm.all)
+    try:
+        while farm.left:
+            farm.start()
+            events = engine.wait(poll) if farm.running else []
+            if not farm.running and farm.waiting:
+                time.sleep(poll)  # all jobs that are left are locked by other farms
+            for event in events:
+                farm.take(*event)
+            show(farm.all)
+    finally:
+        for lock in farm.held.values():
+            lock.close()
+    return farm.all
 
 
 class _Farm:
     """The jobs of a farm and the locks of their folders."""
 
-    def __init__(self, jobs: list[FarmJob], engine: Engine, show: Callable[[list[JobStatus]], object], poll: float):
+    def __init__(self, jobs: list[FarmJob], engine: Engine):
         self.all = [JobStatus(job, before=read_job_record(job.folder)) for job in jobs]
-        self.engine, self.show, self.poll = engine, show, poll
-        self.by_name = {s.job.name: s for s in self.all}
+        self.engine, self.by_name = engine, {s.job.name: s for s in self.all}
         self.held: dict[str, contextlib.ExitStack] = {}
         self.left, self.running = len(jobs), 0  # counted, since there may be a million
-
-    def run(self) -> list[JobStatus]:
-        """Run all jobs."""
         for status in self.all:
             record = finished(status.job)
             if record is not None:
                 self._end(status, record)
-        self.show(self.all)
-        waiting = deque(s for s in self.all if not s.ended)
-        try:
-            while self.left:
-                self._start(waiting)
-                for event in self.engine.wait(self.poll) if self.running else self._pause(waiting):
-                    self._take(event, waiting)
-                self.show(self.all)
-        finally:
-            for lock in self.held.values():
-                lock.close()
-        return self.all
+        self.waiting = deque(s for s in self.all if not s.ended)
 
-    def _pause(self, waiting: deque[JobStatus]) -> Iterator[Event]:
-        """Wait a while if all jobs that are left are locked by other farms."""
-        if waiting:
-            time.sleep(self.poll)
-        return iter(())
-
-    def _start(self, waiting: deque[JobStatus]) -> None:
+    def start(self) -> None:
         """Start as many jobs as the engine takes; those of another farm go to the end of the queue."""
-        for _ in range(len(waiting)):
+        for _ in range(len(self.waiting)):
             if self.running >= self.engine.slots:
                 return
-            status = waiting.popleft()
+            status = self.waiting.popleft()
             if not self._claim(status):
-                waiting.append(status)
+                self.waiting.append(status)
             elif not status.ended:
                 status.state, status.began, status.attempts = "running", time.monotonic(), status.attempts + 1
                 self.running += 1
@@ -275,66 +231,60 @@ class _Farm:
 
     def _claim(self, status: JobStatus) -> bool:
         """Lock the folder of a job; return False if another farm holds it; end the job if it was finished meanwhile."""
-        if status.job.name not in self.held:
-            with contextlib.ExitStack() as stack:
-                try:
-                    notes = stack.enter_context(hold_folder(status.job.folder))
-                except FolderHeldError:
-                    status.state = "elsewhere"
-                    return False
-                self.held[status.job.name] = stack.pop_all()
-                status.notes += [n for n in notes if n not in status.notes]
-        record = read_job_record(status.job.folder)
+        job = status.job
+        try:
+            stack = contextlib.ExitStack()
+            notes = stack.enter_context(hold_folder(job.folder))
+        except FolderHeldError:
+            status.state = "elsewhere"
+            return False
+        self.held[job.name] = stack
+        status.notes += [n for n in notes if n not in status.notes]
+        record = read_job_record(job.folder)
         if status.attempts == 0 and record is not None and record != status.before:
-            same = record.identity == status.job.identity()
-            taken = finished(status.job) if record.state == "done" else record if same and not record.again else None
+            same = record.identity == job.identity() and not record.again
+            taken = finished(job) if record.state == "done" else record if same else None
             if taken is not None:
                 self._end(status, taken)
         return True
 
-    def _take(self, event: Event, waiting: deque[JobStatus]) -> None:
+    def take(self, name: str, state: str, detail: str | int) -> None:
         """Record an event of a job."""
-        status = self.by_name[event.name]
-        if event.state == "running":
-            status.step = event.step
+        status = self.by_name[name]
+        if state == "running":
+            status.step = int(detail)
             return
         self.running -= 1
         status.seconds += time.monotonic() - status.began
-        record = read_job_record(status.job.folder)
-        if event.state == "held":  # a process that a farm left behind works on it
-            self._release(status)
-            status.state, status.attempts = "elsewhere", status.attempts - 1
-            waiting.append(status)
-        elif event.state == "crashed" or record is None or (record.state == "failed" and record.again):
-            reason = event.message or (record.message if record is not None else "the job left no record")
+        job, record = status.job, read_job_record(status.job.folder)
+        if state == "held":  # a process that a farm left behind works on it
+            status.attempts -= 1
+            self._wait(status, "elsewhere")
+        elif state != "crashed" and record is not None and not (record.state == "failed" and record.again):
+            self._end(status, record)
+        else:
+            reason = detail or (record.message if record is not None else "the job left no record")
             status.notes.append(f"attempt {status.attempts}: {reason}")
             if status.attempts < ATTEMPTS:
-                status.state = "waiting"
-                self._release(status)
-                waiting.append(status)
-            else:
-                self._fail(status, reason)
-        else:
+                self._wait(status, "waiting")
+                return
+            message = f"{reason} ({status.attempts} attempts)"
+            record = JobRecord(job.name, job.identity(), "failed", "failed", message, True, seconds=status.seconds)
+            write_record(job.folder, record)
             self._end(status, record)
 
-    def _fail(self, status: JobStatus, reason: str) -> None:
-        """End a job that failed each time."""
-        message = f"{reason} ({status.attempts} attempts)"
-        record = JobRecord(status.job.name, status.job.identity(), "failed", "failed", message, True, seconds=status.seconds)
-        write_record(status.job.folder, record)
-        self._end(status, record)
+    def _wait(self, status: JobStatus, state: str) -> None:
+        """Put a job at the end of the queue."""
+        status.state = state
+        self.held.pop(status.job.name).close()
+        self.waiting.append(status)
 
     def _end(self, status: JobStatus, record: JobRecord) -> None:
         """End a job with its record."""
         status.state, status.record = record.state, record
         self.left -= 1
-        self._release(status)
-
-    def _release(self, status: JobStatus) -> None:
-        """Release the lock of the folder of a job."""
-        lock = self.held.pop(status.job.name, None)
-        if lock is not None:
-            lock.close()
+        if status.job.name in self.held:
+            self.held.pop(status.job.name).close()
 
 
 def seconds_left(statuses: list[JobStatus], slots: int) -> float | None:
@@ -357,44 +307,31 @@ COLUMNS = (
 
 def row_of(status: JobStatus) -> JobRow:
     """Return the row of a job in tables."""
-    record = status.record
-    if record is None:
+    r, note = status.record, status.notes[-1] if status.notes else ""
+    if r is None:
         took = time.monotonic() - status.began if status.state == "running" else 0.0
-        return JobRow(status.job.name, status.state, status.step, took, message=status.notes[-1] if status.notes else "")
-    message = record.message if record.state == "failed" else "" if status.attempts else "finished before"
-    return JobRow(
-        record.name, status.state, record.steps, record.seconds, record.psnr, record.gaussians,
-        message or (status.notes[-1] if status.notes else ""),
-    )  # fmt: skip
+        return JobRow(status.job.name, status.state, status.step, took, message=note)
+    message = (r.message if r.state == "failed" else "" if status.attempts else "finished before") or note
+    return JobRow(r.name, status.state, r.steps, r.seconds, r.psnr, r.gaussians, message, r.ssim, r.ply_bytes)
 
 
 def write_index(folder: Path, statuses: list[JobStatus], seconds: float) -> None:
     """Write index.html and results.csv of a farm."""
-    cards = []
+    rows: list[JobRow] = []
+    lines: list[tuple[object, ...]] = [COLUMNS]
     for status in statuses:
-        record, job = status.record, status.job
-        row = row_of(status)
-        shown = replace(
-            row, message=row.message.replace(f"{Path(job.request.scene.path).parent}{os.sep}", "")
-        )  # a page is sent
-        thumbnail, report = job.folder / THUMBNAIL, job.request.out / "report.html"
-        cards.append(JobCard(
-            shown, record.ssim if record else None, record.ply_bytes if record else 0,
-            thumbnail.relative_to(folder).as_posix() if thumbnail.is_file() else "",
-            report.relative_to(folder).as_posix() if report.is_file() else "",
-        ))  # fmt: skip
-    write_farm_page(folder / INDEX, folder.resolve().name, cards, seconds)
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(COLUMNS)
-    for status in statuses:
-        r, scene = status.record, status.job.request.scene.path
+        r, job, scene, row = status.record, status.job, status.job.request.scene.path, row_of(status)
+        files = [p if p.is_file() else None for p in (job.folder / THUMBNAIL, job.request.out / "report.html")]
+        thumbnail, report = ("" if p is None else p.relative_to(folder).as_posix() for p in files)
+        message = row.message.replace(f"{Path(scene).parent}{os.sep}", "")  # a page is sent
+        rows.append(replace(row, message=message, thumbnail=thumbnail, report=report))
         if r is None:
-            writer.writerow([status.job.name, scene, status.state, *[""] * (len(COLUMNS) - 3)])
-            continue
-        sizes = ["" if v is None else v for v in (r.psnr, r.ssim, r.gaussians, r.steps, r.ply_bytes, round(r.seconds, 3))]
-        writer.writerow([r.name, scene, r.state, r.how, *sizes, r.files.get(PLY, ""), r.message])
-    write_text(folder / TABLE, text.getvalue())
+            lines.append((job.name, scene, status.state, *[""] * (len(COLUMNS) - 3)))
+        else:  # csv writes None as an empty field
+            figures = r.psnr, r.ssim, r.gaussians, r.steps, r.ply_bytes, round(r.seconds, 3)
+            lines.append((r.name, scene, r.state, r.how, *figures, r.files.get(PLY, ""), r.message))
+    write_text(folder / INDEX, farm_page(folder.resolve().name, rows, seconds))
+    write_csv(folder / TABLE, lines)
 
 
 ENGINES = ("local", "ray", "slurm")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import glob
 import hashlib
 import json
@@ -10,7 +9,7 @@ import os
 import re
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, get_type_hints
 
 from warpgs import schema
 from warpgs.errors import DataError, ResourceError, UsageError
@@ -36,14 +35,14 @@ class FarmJob:
     """The fit; ``out`` is its run folder."""
     folder: Path
     """Folder of the job's record, log and thumbnail, which is locked while a farm works on it."""
-    results: Path | None = None
-    """Folder of all results, which contains ``folder``; links below it are not followed. None if it is ``folder`` itself."""
+    results: Path
+    """Folder of all results, which contains ``folder``; links below it are not followed."""
 
     def identity(self) -> str:
         """Return an identifier of all inputs except the images: the first 16 hexadecimal digits of their SHA-256."""
         r = self.request
         weights = None if r.lpips_weights is None else str(r.lpips_weights)
-        values = [dataclasses.asdict(r.scene), r.config.to_json(), weights, r.device]
+        values = [asdict(r.scene), r.config.to_json(), weights, r.device]
         if own := r.config.own_code():
             values.append(own)
         return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()[:16]
@@ -52,53 +51,39 @@ class FarmJob:
 def job_text(job: FarmJob) -> str:
     """Return a job as one line of JSON."""
     r = job.request
-    request = {
-        "scene": dataclasses.asdict(r.scene), "out": str(r.out.absolute()), "config": r.config.to_json(), "device": r.device,
+    return json.dumps({
+        "name": job.name, "folder": str(job.folder.absolute()), "results": str(job.results.absolute()),
+        "scene": asdict(r.scene), "out": str(r.out.absolute()), "config": r.config.to_json(), "device": r.device,
         "lpips_weights": None if r.lpips_weights is None else str(r.lpips_weights.resolve()), "notes": r.notes,
         "own_code": own_places(r.config.plugged_in()),
-    }  # fmt: skip
-    places = {"folder": str(job.folder.absolute()), "results": None if job.results is None else str(job.results.absolute())}
-    return json.dumps({"name": job.name, **places, "request": request})
+    })  # fmt: skip
 
 
 def job_of(text: str) -> FarmJob:
     """Return the job of `job_text`; user code that the job names is imported, as in the process that wrote the text."""
-    values = schema.parse(text)
-    r = values["request"]
-    scene, config = SceneRequest(**r["scene"]), r["config"]
+    v = schema.parse(text)
+    scene, config = SceneRequest(**v["scene"]), v["config"]
     if scene.reader is not None:
         READERS.load(scene.reader)
-    for place in r["own_code"]:  # a class of a preset's file cannot be imported by its name
+    for place in v["own_code"]:  # a class of a preset's file cannot be imported by its name
         try:
             module_of(place)
         except (ImportError, OSError) as e:
             raise UsageError(f"your code {place} cannot be imported ({e}); put it where all processes can import it") from e
     STRATEGIES.load(config["strategy"])
-    for term in config["loss_terms"]:
-        LOSS_TERMS.load(term["name"])
-    for module in config["view_modules"]:
-        VIEW_MODULES.load(module["name"])
-    weights = None if r["lpips_weights"] is None else Path(r["lpips_weights"])
+    for registry, key in ((LOSS_TERMS, "loss_terms"), (VIEW_MODULES, "view_modules")):
+        for part in config[key]:
+            registry.load(part["name"])
+    weights = None if v["lpips_weights"] is None else Path(v["lpips_weights"])
     request = FitRequest(
-        scene, Path(r["out"]), FitConfig.from_json(config), r["device"], lpips_weights=weights, notes=tuple(r["notes"])
+        scene, Path(v["out"]), FitConfig.from_json(config), v["device"], lpips_weights=weights, notes=tuple(v["notes"])
     )
-    results = None if values["results"] is None else Path(values["results"])
-    return FarmJob(values["name"], request, Path(values["folder"]), results)
+    return FarmJob(v["name"], request, Path(v["folder"]), Path(v["results"]))
 
 
-@dataclass(frozen=True)
-class Event:
-    """A change of the state of a job."""
-
-    name: str
-    """Name of the job."""
-    state: str
-    """running; or, as the last event of the job: done, failed, held (another process works on it) or crashed (its process
-    ended)."""
-    message: str = ""
-    """Reason of a crash."""
-    step: int = 0
-    """Steps done; 0 if unknown."""
+Event = tuple[str, str, str | int]
+"""A change of a job: its name; its state: running, or at its end done, failed, held (another process works on it) or crashed
+(its process ended); and the number of steps done, or the reason of a crash."""
 
 
 class Engine(Protocol):
@@ -153,15 +138,13 @@ def list_jobs(jobs: str) -> list[ListedJob]:
         raise UsageError(f"{jobs}: no scene found; give a folder of scenes, a glob in quotes, or a .jsonl file")
     taken: set[str] = set()
     for name, _, _ in found:
+        size, wrong = len(os.fsencode(name)), ""
         if not NAME.fullmatch(name) or name.endswith((".", " ")) or name in OWN_FILES:
-            raise DataError(
-                f"{jobs}: {name[:100]!r} is not a valid name for a job and its folder; give another name in a .jsonl file"
-            )
-        if (size := len(os.fsencode(name))) > MOST_BYTES:
-            raise DataError(
-                f"{jobs}: {name[:100]!r} has {size} bytes, but a job's name may have at most {MOST_BYTES}; give another "
-                "name in a .jsonl file"
-            )
+            wrong = "is not a valid name for a job and its folder"
+        elif size > MOST_BYTES:
+            wrong = f"has {size} bytes, but a job's name may have at most {MOST_BYTES}"
+        if wrong:
+            raise DataError(f"{jobs}: {name[:100]!r} {wrong}; give another name in a .jsonl file")
         if name.casefold() in taken:
             raise UsageError(f"{jobs}: two jobs have the name {name!r}; give each line of a .jsonl file its own name")
         taken.add(name.casefold())
@@ -185,41 +168,38 @@ def _read(path: Path) -> list[ListedJob]:
         raise DataError(
             f"{path}: cannot be read ({unread_reason(e)}); give a file with one line of JSON per job, and split a large one"
         ) from e
-    found = []
+    found: list[ListedJob] = []
     for number, line in enumerate(data.splitlines(), 1):
-        if line.strip():
-            try:
-                found.append(_job(schema.parse(line), path.parent))
-            except schema.SchemaError as e:
-                raise DataError(f'{path}, line {number}: {e}; write {{"scene": FOLDER, "steps": 500}}') from e
+        if not line.strip():
+            continue
+        try:
+            values = schema.parse(line)
+            _LINE(values, "")
+            scene = Path(os.path.abspath(path.parent / values.pop("scene")))
+            name = values.pop("name", scene.name)
+            found.append((name, scene, tuple(_flag(key, value) for key, value in values.items())))
+        except schema.SchemaError as e:
+            raise DataError(f'{path}, line {number}: {e}; write {{"scene": FOLDER, "steps": 500}}') from e
     return found
 
 
 _LINE = schema.fields({"scene": schema.text}, {"name": schema.text})
 
 
-def _job(values: Any, folder: Path) -> ListedJob:
-    """Return the job of a line; SchemaError if it is not a job."""
-    _LINE(values, "")
-    scene = Path(os.path.abspath(folder / values["scene"]))
-    flags = [word for key, value in values.items() if key not in ("scene", "name") for word in _flag(key, value)]
-    return values.get("name", scene.name), scene, tuple(flags)
-
-
-def _flag(key: str, value: Any) -> list[str]:
-    """Return a setting of a line as arguments of a command line."""
+def _flag(key: str, value: Any) -> str:
+    """Return a setting of a line as an argument of a command line."""
     name = key.replace("_", "-")
     if not re.fullmatch(r"[a-zA-Z][a-zA-Z0-9.-]{0,99}", name) or name in FARM_FLAGS:
         raise schema.SchemaError(f"{key[:40]!r} cannot be set for a single job")
     if isinstance(value, bool):
         group, dot, last = name.rpartition(".")
-        return [f"--{name}" if value else f"--{group}{dot}no-{last}"]
+        return f"--{name}" if value else f"--{group}{dot}no-{last}"
     if not isinstance(value, (str, int, float)):
         raise schema.SchemaError(f"{key[:40]} must be text, a number, true or false")
     schema.text(str(value), key[:40])
     if name in PLUGINS and ":" in str(value):
         raise schema.SchemaError(f"{key} names user code; give it as --{name} on the command line of the farm")
-    return [f"--{name}={value}"]
+    return f"--{name}={value}"
 
 
 RECORD = "job.json"
@@ -232,18 +212,6 @@ CHECKED = (PLY, "metrics.json", CONFIG)
 FORMAT = 1
 MOST_FILES = 100_000
 """Largest number of files and folders of a scene to list. Changes of a larger scene are detected only when a fit reads it."""
-
-_DIGEST = schema.text
-_SCHEMA = schema.fields(
-    {
-        "name": schema.text, "identity": schema.text, "state": schema.one_of("done", "failed"), "how": schema.text,
-        "message": schema.text, "again": schema.flag, "source": schema.text, "seconds": schema.number(0),
-        "psnr": schema.or_null(schema.real), "ssim": schema.or_null(schema.real), "gaussians": schema.whole(0),
-        "steps": schema.whole(0), "ply_bytes": schema.whole(0), "files": schema.mapping(_DIGEST), "version": schema.text,
-        "format": schema.one_of(FORMAT),
-    },
-    others=False,
-)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -280,6 +248,14 @@ class JobRecord:
     format: int = FORMAT
 
 
+_SCHEMA = schema.fields(
+    {name: schema.of_type(hint) for name, hint in get_type_hints(JobRecord).items()}
+    | {"state": schema.one_of("done", "failed"), "files": schema.mapping(schema.text), "format": schema.one_of(FORMAT)}
+    | dict.fromkeys(("psnr", "ssim"), schema.or_null(schema.real)),
+    others=False,
+)
+
+
 def write_record(folder: Path, record: JobRecord) -> None:
     """Write the record of a job."""
     write_json(folder / RECORD, asdict(record))
@@ -305,23 +281,18 @@ def file_digest(path: Path) -> str:
 
 def source_stamp(scene: Path) -> str:
     """Return the SHA-256 of the names, sizes and times of a scene's files; empty if they cannot be listed or are too many."""
-    rows = []
+    paths = [scene] if scene.is_file() else []
+    for count, (folder, _, names) in enumerate(os.walk(scene, followlinks=True)):
+        paths += [Path(folder, name) for name in names]
+        if max(count, len(paths)) > MOST_FILES:  # links may show a folder in many places
+            return ""
     try:
-        if scene.is_file():
-            found = scene.stat()
-            rows.append((scene.name, found.st_size, found.st_mtime_ns))
-        for count, (folder, _, names) in enumerate(os.walk(scene, followlinks=True)):
-            if count > MOST_FILES:  # links may show a folder in many places
-                return ""
-            for name in names:
-                path = Path(folder, name)
-                found = path.stat()
-                rows.append((path.relative_to(scene).as_posix(), found.st_size, found.st_mtime_ns))
-                if len(rows) > MOST_FILES:
-                    return ""
+        found = [(p, p.stat()) for p in paths]
     except OSError:  # the fit reports the error
         return ""
-    return hashlib.sha256(json.dumps(sorted(rows)).encode()).hexdigest() if rows else ""
+    above = scene.parent if scene.is_file() else scene
+    rows = sorted((p.relative_to(above).as_posix(), s.st_size, s.st_mtime_ns) for p, s in found)
+    return hashlib.sha256(json.dumps(rows).encode()).hexdigest() if rows else ""
 
 
 def is_whole(folder: Path, record: JobRecord) -> bool:

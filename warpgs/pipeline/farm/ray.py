@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import os
 import secrets
-from collections.abc import Callable
 from typing import Any
 
 from warpgs.errors import ResourceError, UsageError, install_extras
@@ -45,18 +44,10 @@ class RayEngine:
             raise UsageError(
                 f"no job of {threads} threads and {gpus:g} GPUs fits into Ray's cluster ({found}); give fewer --threads"
             )
-        self._options = {
-            "num_cpus": threads,
-            "num_gpus": gpus,
-            "max_retries": 1,
-            "runtime_env": {"env_vars": {"PYTHONSAFEPATH": "1"}},
-        }
+        environment = {"env_vars": {"PYTHONSAFEPATH": "1"}}
+        self._options = {"num_cpus": threads, "num_gpus": gpus, "max_retries": 1, "runtime_env": environment}
         self._running: dict[Any, str] = {}
-        self.use(run_job)
-
-    def use(self, work: Callable[[str, int], str]) -> None:
-        """Run jobs by a function other than `run_job`, with the same arguments and result."""
-        self._task = self._ray.remote(**self._options)(work)
+        self._task = ray.remote(**self._options)(run_job)
 
     def start(self, job: FarmJob) -> None:
         """Send a job."""
@@ -69,9 +60,9 @@ class RayEngine:
 
     def _event(self, name: str, reference: Any) -> Event:
         try:
-            return Event(name, self._ray.get(reference))
+            return name, self._ray.get(reference), ""
         except self._ray.exceptions.RayError as e:  # its process died twice, or a record could not be written
-            return Event(name, "crashed", str(e).strip().splitlines()[-1])
+            return name, "crashed", str(e).strip().splitlines()[-1]
 
     def close(self) -> None:
         """Stop all running jobs, and leave the cluster."""

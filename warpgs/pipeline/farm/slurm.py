@@ -1,4 +1,4 @@
-"""Farms on Slurm: jobs are submitted as arrays of tasks; each task runs this module."""
+"""Farms on Slurm: a Slurm job for each scene, by sbatch, squeue and scancel; each runs this module."""
 
 from __future__ import annotations
 
@@ -18,8 +18,6 @@ from warpgs.pipeline.farm.job import Event, FarmJob, job_text
 from warpgs.pipeline.farm.work import run_job
 from warpgs.process import interrupting_signals, run_program, say
 
-# The engine for Slurm clusters: a Slurm job for each scene, by sbatch, squeue and scancel.
-#
 # A job is sent to its node as JSON, and its state comes back as one word, both in a private folder. All other results
 # are in the job's record.
 
@@ -34,10 +32,10 @@ MISSED = 3
 late."""
 NAME = "warpgs"
 STATES = ("done", "failed", "held")
+SUFFIXES = (".json", ".answer", ".log")
+"""Suffixes of the files of a job in the private folder: its description, its answer, its output."""
 SECONDS_TO_SAVE = 120
 """Time before the end of a job's time limit at which Slurm interrupts the job, so that the fit saves its state [s]."""
-LAST_BYTES = 2000
-"""Number of bytes at the end of a job's output that are searched for its last line."""
 PATIENCE = 60.0
 """Time limit of a command of Slurm [s]."""
 
@@ -70,17 +68,16 @@ class SlurmEngine:
         self._stack = contextlib.ExitStack()
         self._folder = self._stack.enter_context(private_shared_folder(folder))
         self._numbers = itertools.count()
-        self._running: dict[str, tuple[str, int]] = {}
-        """Slurm's identifier, and the number in the names of the files in the private folder, by job."""
+        self._running: dict[str, tuple[str, Path]] = {}
+        """Slurm's identifier, and the path of the files in the private folder without their suffix, by job."""
         self._missed: dict[str, int] = {}
-        """Number of calls of squeue that did not list a job."""
-        self._asked = float("-inf")
-        self._told = False
+        """Number of calls of squeue in a row that did not list a job."""
+        self._asked, self._told = float("-inf"), False
 
     def start(self, job: FarmJob) -> None:
         """Hand a job to Slurm."""
-        number = next(self._numbers)
-        text, answer, log = (self._folder / f"{number}.{kind}" for kind in ("json", "answer", "log"))
+        base = self._folder / str(next(self._numbers))
+        text, answer, log = (base.with_suffix(s) for s in SUFFIXES)
         write_text(text, job_text(job))
         command = [sys.executable, "-P", "-m", "warpgs.pipeline.farm.slurm", str(text), str(answer), str(self._threads)]
         script = f"#!/bin/sh\nexec {shlex.join(command)}\n"
@@ -88,64 +85,44 @@ class SlurmEngine:
         slurm_id = output.strip().partition(";")[0]
         if code or not slurm_id.isdecimal():
             raise ResourceError(f"sbatch rejected job {job.name}: {_last_line(errors + output)}")
-        self._running[job.name], self._missed[job.name] = (slurm_id, number), 0
+        self._running[job.name], self._missed[job.name] = (slurm_id, base), 0
 
     def wait(self, seconds: float) -> list[Event]:
         """Return the jobs that have ended; answer files are checked once a second, and squeue is called four times a minute."""
         last = time.monotonic() + seconds
-        while True:
-            ended = self._ended()
-            if ended or time.monotonic() >= last:
-                return ended
+        while not (ended := self._ended()) and time.monotonic() < last:
             time.sleep(min(ASK_EVERY, seconds))
+        return ended
 
     def _ended(self) -> list[Event]:
         """Return the jobs with an answer, and those that Slurm no longer has."""
         if time.monotonic() - self._asked >= QUEUE_EVERY:
             self._asked = time.monotonic()
-            self._count_missed()
+            code, output, errors = _call("squeue", "--noheader", "--me", f"--name={NAME}", "--format=%A")
+            if code and not self._told:  # Slurm is busy or away: nothing is known, and answers still count
+                say(f"squeue failed; trying again: {_last_line(errors)}", error=True)
+                self._told = True
+            for name, (slurm_id, _) in self._running.items() if not code else ():
+                self._missed[name] = 0 if slurm_id in output.split() else self._missed[name] + 1
         self._folder.chmod(0o700)  # makes network file systems show files that are new
         there = set(os.listdir(self._folder))
-        events = []
-        for name, (slurm_id, number) in self._running.items():
-            if f"{number}.answer" in there:
-                events.append(self._answered(name, slurm_id, number))
+        events: list[Event] = []
+        for name, (slurm_id, base) in self._running.items():
+            if f"{base.name}.answer" in there:
+                state = base.with_suffix(".answer").read_text("utf-8")
+                if state in STATES:
+                    for suffix in SUFFIXES:
+                        base.with_suffix(suffix).unlink(missing_ok=True)
+                    events.append((name, state, ""))
+                else:
+                    events.append((name, "crashed", f"Slurm's job {slurm_id} ended with an unknown answer"))
             elif self._missed[name] >= MISSED:
-                reason = _last_line(self._output(number)) or "no output"
-                events.append(Event(name, "crashed", f"Slurm's job {slurm_id} ended without an answer: {reason}"))
-        for event in events:
-            del self._running[event.name]
+                log = base.with_suffix(".log")  # missing if the job never began
+                reason = _last_line(log.read_text("utf-8", "replace") if log.is_file() else "") or "no output"
+                events.append((name, "crashed", f"Slurm's job {slurm_id} ended without an answer: {reason}"))
+        for name, _, _ in events:
+            del self._running[name]
         return events
-
-    def _count_missed(self) -> None:
-        """Ask Slurm which jobs it has."""
-        code, output, errors = _call("squeue", "--noheader", "--me", f"--name={NAME}", "--format=%A")
-        if code:  # Slurm is busy or away: nothing is known, and answers still count
-            if not self._told:
-                self._told = True
-                say(f"squeue failed; trying again: {_last_line(errors)}", error=True)
-            return
-        there = set(output.split())
-        for name, (slurm_id, _) in self._running.items():
-            self._missed[name] = 0 if slurm_id in there else self._missed[name] + 1
-
-    def _answered(self, name: str, slurm_id: str, number: int) -> Event:
-        state = (self._folder / f"{number}.answer").read_text("utf-8")
-        if state not in STATES:
-            return Event(name, "crashed", f"Slurm's job {slurm_id} ended with an unknown answer")
-        for kind in ("json", "answer", "log"):
-            (self._folder / f"{number}.{kind}").unlink(missing_ok=True)
-        return Event(name, state)
-
-    def _output(self, number: int) -> str:
-        """Return the end of the output that Slurm wrote for a job."""
-        try:
-            with (self._folder / f"{number}.log").open("rb") as f:
-                f.seek(0, os.SEEK_END)
-                f.seek(max(0, f.tell() - LAST_BYTES))
-                return f.read().decode("utf-8", "replace")
-        except OSError:  # the job never began
-            return ""
 
     def close(self) -> None:
         """Stop running jobs, drop queued ones, and remove the private folder; running fits save their state."""

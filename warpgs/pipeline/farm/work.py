@@ -7,8 +7,8 @@ import gc
 import os
 import time
 import traceback
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -59,19 +59,9 @@ from warpgs.pipeline.train.trainer import train_views
 from warpgs.process import output_to, say
 from warpgs.version import __version__
 
-
-@dataclass(frozen=True)
-class Outcome:
-    """Outcome of one run."""
-
-    state: str
-    """kept, continued, fitted, redone or failed."""
-    metrics: dict[str, Any] | None
-    """Contents of metrics.json, or of eval.json if LPIPS was measured later; None if the run failed."""
-    note: str = ""
-    """Note on this run for readers of the study; empty if there is none."""
-    error: WarpgsError | None = None
-    """Error that ended the run, if any."""
+Outcome = tuple[str, dict[str, Any] | None, str]
+"""State of one run: kept, continued, fitted, redone or failed; contents of its metrics.json, or of eval.json if LPIPS was
+measured later, None if it failed; and a note for readers of the results, empty if there is none."""
 
 
 def _scores(path: Path) -> dict[str, Any] | None:
@@ -111,12 +101,12 @@ def _set_aside(folder: Path) -> Path:
 
 def _with_lpips(metrics: dict[str, Any], folder: Path, request: FitRequest, variants: dict[str, str]) -> dict[str, Any]:
     """Return the scores of a finished run with LPIPS for the requested weights; LPIPS is measured now if it is missing."""
-    for found in (metrics, _scores(folder / "eval.json")):
-        if found and found.get("config_hash") == metrics["config_hash"] and variants.items() <= found["variants"].items():
-            return metrics | {k: found[k] for k in ("test", "views", "variants")}
-    evaluate(folder, request.device, request.lpips_weights)
-    written = schema.read(folder / "eval.json", folder)
-    return metrics | {k: written[k] for k in ("test", "views", "variants")}
+    there = [m for m in (metrics, _scores(folder / "eval.json")) if m and m["config_hash"] == metrics["config_hash"]]
+    found = next((m for m in there if variants.items() <= m["variants"].items()), None)
+    if found is None:
+        evaluate(folder, request.device, request.lpips_weights)
+        found = schema.read(folder / "eval.json", folder)
+    return metrics | {k: found[k] for k in ("test", "views", "variants")}
 
 
 def ensure_run(
@@ -128,64 +118,41 @@ def ensure_run(
     resolved: FitConfig | None = None,
     **others: Any,
 ) -> Outcome:
-    """Ensure that a run folder holds the finished run that is requested."""
+    """Ensure that a run folder holds the finished run that is requested; ``others`` are arguments of `fit_request`."""
     # A finished run with the same configuration, user code, data, views, kind of device and version is kept. An
     # interrupted run is continued from its checkpoint. Any other folder is moved aside, and the run is repeated.
-    try:
-        record, why = _stored(request.out)
-        gap = "" if record is None else _difference(record, resolved or request.config, fingerprint, split, device)
-        return _outcome(request, record, gap, why, variants, others)
-    except WarpgsError as e:
-        return Outcome("failed", None, str(e), e)
+    out, state, note, record, why = request.out, "fitted", "", None, "old results: not a run folder"
 
-
-def _stored(folder: Path) -> tuple[dict[str, Any] | None, str]:
-    """Return the record of a run folder, or None and the reason why there is no record."""
-    try:
-        return (read_record(folder) if (folder / CONFIG).exists() else None), "not a run folder"
-    except DataError as e:
-        return None, f"unusable ({e})"
-
-
-def _outcome(
-    request: FitRequest, record: dict[str, Any] | None, gap: str, why: str, variants: dict[str, str], others: dict[str, Any]
-) -> Outcome:
-    """Return the outcome of `ensure_run`, or raise the error that prevents a start."""
-    folder, note, state, resume = request.out, "", "fitted", False
-    if record is not None:
-        # the report is what a fit writes last
-        metrics = _scores(folder / "metrics.json") if (folder / "report.html").is_file() else None
-        if gap:
-            note = f"the old run differs in {gap}; moved to {_set_aside(folder).name}, and the scene was fitted again"
-            state = "redone"
-        elif metrics is not None:
-            if (folder / LOCK).exists():  # left by a fit that was killed after its last file, like other leftovers
-                with contextlib.suppress(FolderHeldError), hold_folder(folder):
-                    pass
-            try:
-                scores = _with_lpips(metrics, folder, request, variants) if variants else metrics
-            except WarpgsError as e:
-                return Outcome("failed", None, f"scoring the finished run failed: {e}", e)
-            return Outcome("kept", scores)
-        else:
-            resume, state, note = True, "continued", "was interrupted; continued from the last checkpoint"
-    elif os.path.exists(folder) and not is_empty(folder):
-        note = f"old results: {why}; moved to {_set_aside(folder).name}, and the scene was fitted again"
-        state = "redone"
-
-    def fit(go_on: bool) -> dict[str, Any]:
-        return fit_request(replace(request, resume=go_on), **others).metrics
+    def redo(why: str) -> tuple[str, str]:
+        return "redone", f"{why}; moved to {_set_aside(out).name}, and the scene was fitted again"
 
     try:
         try:
-            return Outcome(state, fit(resume), note)
-        except (DataError, UsageError) as e:
-            if not resume:
-                raise
-            note = f"could not be continued ({e}); moved to {_set_aside(folder).name}, and the scene was fitted again"
-            return Outcome("redone", fit(False), note)
+            record = read_record(out) if (out / CONFIG).exists() else None
+        except DataError as e:
+            why = f"old results: unusable ({e})"
+        if record is None:
+            if os.path.exists(out) and not is_empty(out):
+                state, note = redo(why)
+        elif gap := _difference(record, resolved or request.config, fingerprint, split, device):
+            state, note = redo(f"the old run differs in {gap}")
+        elif (out / "report.html").is_file() and (metrics := _scores(out / "metrics.json")):  # the report is written last
+            if (out / LOCK).exists():  # left by a fit that was killed after its last file, like other leftovers
+                with contextlib.suppress(FolderHeldError), hold_folder(out):
+                    pass
+            note = "the finished run was to be scored"
+            return "kept", _with_lpips(metrics, out, request, variants) if variants else metrics, ""
+        else:
+            state, note = "continued", "was interrupted; continued from the last checkpoint"
+            try:
+                return state, fit_request(replace(request, resume=True), **others).metrics, note
+            except (DataError, UsageError) as e:
+                state, note = redo(f"could not be continued ({e})")
+        return state, fit_request(replace(request, resume=False), **others).metrics, note
     except WarpgsError as e:
-        return Outcome("failed", None, f"{note + '; then ' if note else ''}{e}", e)
+        if note:
+            e.add_note(note)
+        raise
 
 
 THUMBNAIL_SIDE = 480
@@ -197,49 +164,43 @@ def run_job(text: str, threads: int = 0, on_step: Callable[[StepReport], object]
     if threads:
         set_threads(threads)
     job = job_of(text)
-    above = job.folder if job.results is None else job.results
-    with writing_into(above):
+    with writing_into(job.results):
         make_folder(job.folder)
-        with _logged(job.folder / LOG):
+        with writable(job.folder / LOG):
+            file = appending(job.folder / LOG)
+        with file, output_to(file.fileno()):  # of native libraries, too
             return fit_job(job, on_step)
-
-
-@contextlib.contextmanager
-def _logged(path: Path) -> Iterator[None]:
-    """Append all output of the block to a log, including that of native libraries."""
-    with writable(path):
-        file = appending(path)
-    with file, output_to(file.fileno()):
-        yield
 
 
 def fit_job(job: FarmJob, on_step: Callable[[StepReport], object] | None = None) -> str:
     """Fit or continue a job, or keep a finished one, and write its record; returns the state as `run_job` does."""
-    began, again, message = time.perf_counter(), False, ""
-    source = source_stamp(Path(job.request.scene.path))
+    began, source, out = time.perf_counter(), source_stamp(Path(job.request.scene.path)), job.request.out
+    error: Exception | None = None
+    again = False
     try:
-        outcome = _ensure(job, on_step)
-        error: Exception | None = outcome.error
+        how, metrics, message = _ensure(job, on_step)
     except Exception as e:  # whatever a fit raises is a result of this one job: the others go on
-        outcome, error = Outcome("failed", None, str(e)), e
+        error, how, metrics, message = e, "failed", None, str(e)
     if isinstance(error, FolderHeldError):
         say(str(error))
         return "held"
     if error is not None:
-        again = is_out_of_memory(error) or not isinstance(error, WarpgsError)
-        message = str(error)
-        if is_out_of_memory(error) and not isinstance(error, WarpgsError):
-            message = no_memory_message(error)
-        elif not isinstance(error, WarpgsError):
-            message = f"internal error, {type(error).__name__}: {error}"
+        ours, full = isinstance(error, WarpgsError), is_out_of_memory(error)
+        again = full or not ours
+        if not ours:
+            message = no_memory_message(error) if full else f"internal error, {type(error).__name__}: {error}"
         for line in "".join(traceback.format_exception(error)).splitlines():
             say(line)
     record = JobRecord(
-        job.name, job.identity(), "done" if error is None else "failed", outcome.state, message or outcome.note, again, source,
-        time.perf_counter() - began,
-    )  # fmt: skip
-    if error is None:
-        record = _with_results(job, record, outcome.metrics or {})
+        job.name, job.identity(), "failed" if error else "done", how, message, again, source, time.perf_counter() - began
+    )
+    if metrics is not None:
+        write_thumbnail(out / "renders", job.folder / THUMBNAIL)
+        record = replace(
+            record, psnr=metrics["test"].get("psnr"), ssim=metrics["test"].get("ssim"), steps=metrics["steps"],
+            gaussians=metrics.get("gaussians", 0), ply_bytes=(out / PLY).stat().st_size,
+            files={n: file_digest(out / n) for n in CHECKED},
+        )  # fmt: skip
     write_record(job.folder, record)
     gc.collect()  # a fit and its recorded steps refer to each other: without this their device memory is not freed
     return record.state
@@ -268,16 +229,6 @@ def _wanted(request: FitRequest, device: str) -> tuple[str, Split | None, FitCon
         return str(e), None, request.config
     scene, split, _ = read_scene(found)
     return scene.fingerprint, split, settings_by_views(request.config, train_views(scene, split.train), device)[0]
-
-
-def _with_results(job: FarmJob, record: JobRecord, metrics: dict[str, Any]) -> JobRecord:
-    """Write the thumbnail of a finished run; return a record with its figures and checksums."""
-    out, test = job.request.out, metrics["test"]
-    write_thumbnail(out / "renders", job.folder / THUMBNAIL)
-    return replace(
-        record, psnr=test.get("psnr"), ssim=test.get("ssim"), gaussians=metrics.get("gaussians", 0), steps=metrics["steps"],
-        ply_bytes=(out / PLY).stat().st_size, files={n: file_digest(out / n) for n in CHECKED},
-    )  # fmt: skip
 
 
 def write_thumbnail(renders: Path, path: Path) -> None:

@@ -220,7 +220,7 @@ def select(gaussians: Gaussians, keep: torch.Tensor) -> Gaussians:
 def inside(gaussians: Gaussians, box: Box) -> torch.Tensor:
     """Return whether each mean is in a box, bool [N]; box and Gaussians are in the same units."""
     center, size, rotation = box
-    offsets = gaussians.means.double() - torch.tensor(center, device=gaussians.means.device)
+    offsets = gaussians.means.double() - torch.tensor(center, dtype=torch.float64, device=gaussians.means.device)
     out = torch.ones(len(gaussians), dtype=torch.bool, device=offsets.device)
     for direction, side in zip(rotation.T, size):
         out &= sum(float(d) * offsets[:, i] for i, d in enumerate(direction)).abs() <= float(side) / 2

@@ -8,7 +8,7 @@ import math
 import os
 import shlex
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +36,7 @@ from warpgs.pipeline.films.film import (
     render_film,
     sheet_path,
 )
-from warpgs.pipeline.films.paths import Rig, rig_of
+from warpgs.pipeline.films.paths import rig_of
 from warpgs.pipeline.metrics.coverage import coverage_lines, coverage_of_run
 from warpgs.pipeline.metrics.lpips import Lpips
 from warpgs.pipeline.metrics.scores import counted_region, psnr, render_view, scored_region, to_8_bit
@@ -86,16 +86,16 @@ def open_file(
     # the unit stays that of the file, since the near plane of a rule is in that unit
     normalization = Normalization(np.mean([c.center for c in found.values()], axis=0))
     gaussians, declared = read_with_antialiasing(path, normalization, "scene")
-    gaussians = gaussians.to(where)
-    notes += [note] if (note := format_of(path).note) else []
+    if note := format_of(path).note:
+        notes.append(note)
     if declared:
         notes.append(f"{path.name} declares an antialiased model; renders use a pixel filter of {LOW_PASS:g} px²")
     if rule is None:
         notes.append(f"rendered with the cut-offs of {RULE}; for models of gsplat, give --rule gsplat-1.6 or gsplat-1.5")
+    notes.append(f"{len(gaussians):,} Gaussians, {len(found)} cameras")
     in_scene = {name: convert_camera(c, normalization, "file", "scene") for name, c in found.items()}
     shown = (in_scene, tuple(in_scene), (), rule or RULE, (0.0, 0.0, 0.0), 0)
-    model = FittedModel(gaussians, normalization, *shown, antialiased=antialiased or declared)
-    return model, [*notes, f"{len(gaussians):,} Gaussians, {len(found)} cameras"]
+    return FittedModel(gaussians.to(where), normalization, *shown, antialiased=antialiased or declared), notes
 
 
 def _cameras_of(path: Path) -> tuple[dict[str, Camera], list[str]]:
@@ -111,8 +111,6 @@ VP9 = (
     "ffmpeg -i {} -c:v libx264 -pix_fmt yuv420p film-h264.mp4"
 )
 """Note on a film in .mp4; {} stands for its path."""
-ALPHAS = {"alpha_empty": "where empty", "alpha_object": "in the object"}
-"""Scores of the rendered alpha, with their names in the line of a view."""
 
 
 def scene_of(
@@ -140,32 +138,27 @@ def evaluate(
     lpips = None if lpips_weights is None else Lpips(lpips_weights, device)
     stored, tell = open_run(folder, device), waiting()
     scene, train, test = scene_of(stored, reader, tell)
-    request = stored.scene_request(reader)
-    with hold_folder(folder, *IMAGE_FOLDERS) as notes:
-        names = image_names(v.name for v in scene.views)
-        metrics = evaluate_run(folder, stored.gaussians(), train, test, stored.options(), lpips, names=names, tell=tell)
+    request, names = stored.scene_request(reader), image_names(v.name for v in scene.views)
+    scored = (folder, stored.gaussians(), train, test, stored.options())
+    with hold_folder(folder, *IMAGE_FOLDERS) as held:
+        metrics = evaluate_run(*scored, lpips, names=names, tell=tell)
         if by_coverage and test:
-            metrics["coverage"] = coverage_of_run(
-                folder, stored.gaussians(), train, test, stored.options(), names=names, tell=tell
-            )
+            metrics["coverage"] = coverage_of_run(*scored, names=names, tell=tell)
         metrics |= {
             "protocol": protocol_of(scene, request.split, request.downscale, train, test),
             "config_hash": stored.record["config_hash"], "steps": stored.step,
         }  # fmt: skip
         write_json(folder / "eval.json", metrics)
-    notes = [*stored.notes(), *notes, *renaming_notes(names)]
+    lines = [*stored.notes(), *held, *renaming_notes(names)]
     if not test:
-        return [*notes, f"no view is held out; training PSNR {metrics['train']['psnr']:.2f} dB"]
-    lines = [_view_line(r) for r in metrics["views"]]
+        return [*lines, f"no view is held out; training PSNR {metrics['train']['psnr']:.2f} dB"]
+    for row in metrics["views"]:
+        kinds = {"alpha_empty": "where empty", "alpha_object": "in the object"}
+        alphas = [f", alpha {row[k]:.3f} {words}" for k, words in kinds.items() if not math.isnan(row.get(k, math.nan))]
+        region = "" if row["region"] == "all" else f" (over {row['region']})"
+        lines.append(f"{row['name']}: PSNR {row['psnr']:.2f} dB, SSIM {row['ssim']:.3f}{''.join(alphas)}{region}")
     lines += coverage_lines(metrics["coverage"]) if by_coverage else []
-    return [*notes, *lines, f"mean of {len(test)} held-out views: {score_line(metrics['test'])}"]
-
-
-def _view_line(row: dict[str, Any]) -> str:
-    """Return the scores of a view as a line for the user."""
-    alphas = [f", alpha {row[k]:.3f} {words}" for k, words in ALPHAS.items() if not math.isnan(row.get(k, math.nan))]
-    region = "" if row["region"] == "all" else f" (over {row['region']})"
-    return f"{row['name']}: PSNR {row['psnr']:.2f} dB, SSIM {row['ssim']:.3f}{''.join(alphas)}{region}"
+    return [*lines, f"mean of {len(test)} held-out views: {score_line(metrics['test'])}"]
 
 
 def render(
@@ -178,9 +171,8 @@ def render(
     color = color_of(background)
     if color is None and background != "auto":
         raise UsageError(f"--background {background}: expected auto, black, white, #rrggbb or r,g,b")
-    home, named = folder if file_of is None else folder.parent, out is not None
-    out = home / f"path-{Path(path).stem.replace('.', '-')}" if out is None else out
-    notes: list[str] = []
+    home = folder if file_of is None else folder.parent
+    named, out = out is not None, out or home / f"path-{Path(path).stem.replace('.', '-')}"
     stored: FittedModel
     if file_of is None:
         stored = open_run(folder, device_name)
@@ -214,13 +206,9 @@ def render(
 
 def mean_psnr(gaussians: Gaussians, views: list[View], options: RasterizeOptions) -> float:
     """Return the mean PSNR [dB] over views as in `warpgs eval`: rounded to 8 bits, over scored pixels; NaN without views."""
-    if not views:
-        return math.nan
-    scores = []
-    for v in views:
-        image = to_8_bit(render_view(gaussians, v, options)[0])
-        scores.append(psnr(image, to_8_bit(v.image), scored_region(v)[0]))
-    return float(np.mean(scores))
+    images = ((v, to_8_bit(render_view(gaussians, v, options)[0])) for v in views)
+    scores = [psnr(image, to_8_bit(v.image), scored_region(v)[0]) for v, image in images]
+    return float(np.mean(scores)) if views else math.nan
 
 
 def _new_folder(folder: Path, out: Path | None) -> Path:
@@ -258,56 +246,49 @@ def prune(
     stored = open_run(folder, device)
     out = _new_folder(folder, out)
     _, train, test = scene_of(stored, reader, tell)
-    before, options = stored.gaussians(), stored.options()
+    before, options, tried = stored.gaussians(), stored.options(), itertools.count(1)
     tell("ranking Gaussians")
-    made = _pruned(stored, train, options, keep_psnr, tell)
-    tell("scoring the smaller model")
-
-    degrees = [edit.stored_degrees(g.sh) for g in (before, made)]
-    sizes = [model_bytes(d) for d in degrees]
-    scores = [(mean_psnr(before, v, options), mean_psnr(made, v, options)) for v in (train, test)]
-    figures: dict[str, Any] = {
-        "source": str(folder.resolve()), "keep_psnr": keep_psnr, "count": [len(before), len(made)], "bytes": sizes,
-        "mean_degree": [float(d.double().mean()) for d in degrees],
-        "train_psnr": scores[0], "test_psnr": scores[1] if test else None,
-    }  # fmt: skip
-    # the new checkpoint has no increments of poses: its record holds the cameras after them
-    record = stored.record | {"pruned": figures, "cameras": {n: camera_values(c) for n, c in stored.scene_cameras.items()}}
-    notes = _write(out, record, made, stored.step, stored.normalization)
-    lines = [
-        *stored.notes(),
-        *notes,
-        f"{len(before):,} -> {len(made):,} Gaussians, mean SH degree {figures['mean_degree'][0]:.2f} -> "
-        f"{figures['mean_degree'][1]:.2f}",
-        f"{format_bytes(sizes[0])} -> {format_bytes(sizes[1])} uncompressed, {sizes[0] / sizes[1]:.2f} times smaller",
-        f"training PSNR {scores[0][0]:.2f} -> {scores[0][1]:.2f} dB over {len(train)} views",
-    ]
-    if test:
-        lines.append(f"held-out PSNR {scores[1][0]:.2f} -> {scores[1][1]:.2f} dB over {len(test)} views")
-    run = shlex.quote(str(out))
-    return [*lines, f"in {out}: checkpoint, PLY; `warpgs eval {run}` scores it, `warpgs render {run}` renders it"]
-
-
-def _pruned(
-    stored: StoredRun, train: list[View], options: RasterizeOptions, keep_psnr: float, tell: Callable[[str], object]
-) -> Gaussians:
-    """Prune the model of a run; DataError if its PSNR on the training views is not finite."""
-    before = stored.gaussians()
     whole = mean_psnr(before, train, options)
     if not math.isfinite(whole):
         raise DataError(f"{stored.folder}: training PSNR is {whole} dB, so its loss cannot be limited; fit again")
-    cameras = [TrainingView.of(v, before.means.device).camera for v in train]
-    tried = itertools.count(1)
 
     def accepted(gaussians: Gaussians, fraction: float) -> bool:
         tell(f"trying smaller models: number {next(tried)}, {len(gaussians):,} Gaussians")
         return mean_psnr(gaussians, train, options) >= whole - fraction * keep_psnr
 
-    return edit.drop_unused_sh(edit.prune_model(before, cameras, options, stored.record["config"]["seed"], accepted))
+    cameras = [TrainingView.of(v, device).camera for v in train]
+    made = edit.drop_unused_sh(edit.prune_model(before, cameras, options, stored.record["config"]["seed"], accepted))
+    tell("scoring the smaller model")
+    degrees = [edit.stored_degrees(g.sh) for g in (before, made)]
+    counts, sizes = [len(d) for d in degrees], [model_bytes(d) for d in degrees]
+    means = [float(d.double().mean()) for d in degrees]
+    scores = [
+        (whole, mean_psnr(made, train, options)), tuple(mean_psnr(g, test, options) for g in (before, made))
+    ]  # fmt: skip
+    figures: dict[str, Any] = {
+        "source": str(folder.resolve()), "keep_psnr": keep_psnr, "count": counts, "bytes": sizes, "mean_degree": means,
+        "train_psnr": scores[0], "test_psnr": scores[1] if test else None,
+    }  # fmt: skip
+    # the new checkpoint has no increments of poses: its record holds the cameras after them
+    record = stored.record | {"pruned": figures, "cameras": {n: camera_values(c) for n, c in stored.scene_cameras.items()}}
+    held, run = _write(out, record, made, stored.step, stored.normalization), shlex.quote(str(out))
+    return [
+        *stored.notes(),
+        *held,
+        f"{counts[0]:,} -> {counts[1]:,} Gaussians, mean SH degree {means[0]:.2f} -> {means[1]:.2f}",
+        f"{format_bytes(sizes[0])} -> {format_bytes(sizes[1])} uncompressed, {sizes[0] / sizes[1]:.2f} times smaller",
+        *(
+            f"{kind} PSNR {old:.2f} -> {new:.2f} dB over {len(views)} views"
+            for kind, (old, new), views in zip(("training", "held-out"), scores, (train, test))
+            if views
+        ),
+        f"in {out}: checkpoint, PLY; `warpgs eval {run}` scores it, `warpgs render {run}` renders it",
+    ]
 
 
 PLOT = "plot.png"
-POINTS, COLORS, BACKGROUNDS = ("gaussians", "start"), ("own", "coverage"), ("white", "black")
+CHOICES = {"--points": ("gaussians", "start"), "--color": ("own", "coverage"), "--background": ("white", "black")}
+"""Values of the flags of a plot."""
 SIZES = (64, 8192)
 """Smallest and largest side of a plot [px]."""
 MIN_OPACITY = 0.1
@@ -321,93 +302,67 @@ CLASSES = (
 """Least number of training views, description and colour of each class of coverage."""
 
 
-@dataclass(frozen=True)
-class PlotSettings:
-    """Settings of a plot."""
-
-    points: str = "gaussians"
-    """Points shown: gaussians, or start (the points of the scene's reconstruction)."""
-    color: str = "own"
-    """Colour of the points: own, or coverage (how many training views see a Gaussian)."""
-    background: str = "white"
-    """Background: white or black."""
-    size: tuple[int, int] = (1600, 1000)
-    """Width and height [px]."""
-    cameras: bool = True
-    """True to show cameras."""
-
-    def __post_init__(self) -> None:
-        """Check what can be checked before any work."""
-        for flag, value, known in (
-            ("--points", self.points, POINTS), ("--color", self.color, COLORS), ("--background", self.background, BACKGROUNDS),
-        ):  # fmt: skip
-            if value not in known:
-                raise UsageError(f"{flag} {value}: give one of {', '.join(known)}")
-        if not all(SIZES[0] <= s <= SIZES[1] for s in self.size):
-            raise UsageError(f"--size {self.size[0]} {self.size[1]}: each side must have {SIZES[0]} to {SIZES[1]} px")
-        if self.points == "start" and self.color == "coverage":
-            raise UsageError("--color coverage needs Gaussians; leave out --points start")
-
-
 def _gaussians(stored: StoredRun, train: list[Camera], by_coverage: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return positions [N, 3], colours [N, 3] and axes [N, 3, 3] of the Gaussians that can be seen."""
     gaussians = stored.gaussians()
     shown = (torch.sigmoid(gaussians.logit_opacities) >= MIN_OPACITY).cpu()
-    if not by_coverage:
-        colors = np.clip(base_colors(gaussians.sh[:, :1].cpu().numpy()), 0, 1)
-    else:
+    colors = np.clip(base_colors(gaussians.sh[:, :1].cpu().numpy()), 0, 1)
+    if by_coverage:
         tensors = [replace(c, viewmat=gaussians.means.new_tensor(c.viewmat), K=gaussians.means.new_tensor(c.K)) for c in train]
         views = coverage(gaussians, tensors, stored.options())[1].cpu().numpy()
-        lowest, palette = np.array([c[0] for c in CLASSES]), [c[2] for c in CLASSES]
-        values = np.array([[int(c[i : i + 2], 16) / 255 for i in (1, 3, 5)] for c in palette])
-        colors = values[np.searchsorted(lowest, views, side="right") - 1]
-    means, quats, log_scales = (t.detach().cpu().double() for t in (gaussians.means, gaussians.quats, gaussians.log_scales))
-    rotations = rotation_matrices(torch.nn.functional.normalize(quats[shown], dim=1).numpy())
-    return means[shown].numpy(), colors[shown.numpy()], rotations * np.exp(log_scales[shown].numpy())[:, None]
+        palette = np.array([[int(color[i : i + 2], 16) / 255 for i in (1, 3, 5)] for _, _, color in CLASSES])
+        colors = palette[np.searchsorted([least for least, _, _ in CLASSES], views, side="right") - 1]
+    means, quats, log_scales = (
+        t.detach().cpu().double()[shown] for t in (gaussians.means, gaussians.quats, gaussians.log_scales)
+    )
+    rotations = rotation_matrices(torch.nn.functional.normalize(quats, dim=1).numpy())
+    return means.numpy(), colors[shown.numpy()], rotations * np.exp(log_scales.numpy())[:, None]
 
 
-def _start(stored: StoredRun) -> tuple[np.ndarray, np.ndarray, None]:
-    """Return positions [N, 3] and colours [N, 3] of the points of the scene's reconstruction."""
-    scene, _, _ = scene_of(stored)
-    if scene.points is None or not len(scene.points):
-        raise DataError(f"{scene.path}: its format ({scene.format}) has no points; leave out --points start")
-    return scene.points.points, scene.points.colors, None
-
-
-def _eye(rig: Rig) -> np.ndarray:
-    """Return the direction [3] from the scene to the viewer: from above at an angle, behind cameras that look to one side."""
-    azimuth = 0.0 if rig.span is None else 0.5 * (rig.span[0] + rig.span[1])
-    return rig.direction(azimuth + 0.7, max(rig.elevation + 0.35, 0.5))
-
-
-def plot(folder: Path, out: Path | None, settings: PlotSettings, device_name: str = "auto") -> list[str]:
-    """Write a plot of a run as PNG; returns lines for the user."""
+def plot(
+    folder: Path, out: Path | None, device_name: str = "auto", *, points: str = "gaussians", color: str = "own",
+    background: str = "white", size: tuple[int, int] = (1600, 1000), cameras: bool = True,
+) -> list[str]:  # fmt: skip
+    """Write a plot of a run as PNG, with the options of `warpgs plot`; returns lines for the user."""
+    for (name, known), value in zip(CHOICES.items(), (points, color, background)):
+        if value not in known:
+            raise UsageError(f"{name} {value}: give one of {', '.join(known)}")
+    if not all(SIZES[0] <= s <= SIZES[1] for s in size):
+        raise UsageError(f"--size {size[0]} {size[1]}: each side must have {SIZES[0]} to {SIZES[1]} px")
+    start, by_coverage = points == "start", color == "coverage"
+    if start and by_coverage:
+        raise UsageError("--color coverage needs Gaussians; leave out --points start")
     out = folder / PLOT if out is None else out
     if out.suffix.lower() != ".png":
         raise UsageError(f"{out}: a plot is a .png file; give a name that ends in .png")
     stored, tell = open_run(folder, device_name), waiting()
     tell("rendering depth")
-    cameras = stored.cameras()
-    train, test = ([cameras[n] for n in names] for names in (stored.train, stored.test))
-    depth, _ = depth_and_coverage(stored.gaussians(), train, stored.options())
-    rig = rig_of(train, depth)
-    by_coverage = settings.color == "coverage"
-    points, colors, axes = _start(stored) if settings.points == "start" else _gaussians(stored, train, by_coverage)
-    if not len(points):
+    found = stored.cameras()
+    train, test = ([found[n] for n in names] for names in (stored.train, stored.test))
+    rig = rig_of(train, depth_and_coverage(stored.gaussians(), train, stored.options())[0])
+    azimuth = 0.0 if rig.span is None else 0.5 * (rig.span[0] + rig.span[1])
+    eye = rig.direction(azimuth + 0.7, max(rig.elevation + 0.35, 0.5))  # from above at an angle, behind cameras of one side
+    if start:
+        scene, _, _ = scene_of(stored)
+        if scene.points is None or not len(scene.points):
+            raise DataError(f"{scene.path}: its format ({scene.format}) has no points; leave out --points start")
+        at, colors, axes = scene.points.points, scene.points.colors, None
+    else:
+        at, colors, axes = _gaussians(stored, train, by_coverage)
+    if not len(at):
         raise DataError(f"{folder}: no Gaussian has an opacity of {MIN_OPACITY} or more; there is nothing to show")
-    most = MAX_POINTS[settings.points]
-    notes = stored.notes() + ([] if len(points) <= most else [f"showing a random sample of {most:,} of {len(points):,}"])
-    chosen = np.sort(np.random.default_rng(0).permutation(len(points))[:most])
-    shown = (train, test) if settings.cameras else ([], [])
+    most = MAX_POINTS[points]
+    notes = stored.notes() + ([] if len(at) <= most else [f"showing a random sample of {most:,} of {len(at):,}"])
+    chosen = np.sort(np.random.default_rng(0).permutation(len(at))[:most])
+    shown = (train, test) if cameras else ([], [])
     legend = [(words, color) for _, words, color in CLASSES] if by_coverage else []
     axes = None if axes is None else axes[chosen]
-    contents = points[chosen], colors[chosen], axes, *shown, rig.up, _eye(rig), legend
+    contents = at[chosen], colors[chosen], axes, *shown, rig.up, eye, legend
     with hold_file(out) as held:
         tell("rendering the plot")
-        write_bytes(out, render_plot(*contents, settings.size, settings.background))
-    faint = f"Gaussians of opacity {MIN_OPACITY:g} or more"
-    what = "points of the reconstruction" if settings.points == "start" else faint
-    return [*held, *notes, f"{len(points):,} {what}, {len(train)} training and {len(test)} held-out cameras in {out}"]
+        write_bytes(out, render_plot(*contents, size, background))
+    what = "points of the reconstruction" if start else f"Gaussians of opacity {MIN_OPACITY:g} or more"
+    return [*held, *notes, f"{len(at):,} {what}, {len(train)} training and {len(test)} held-out cameras in {out}"]
 
 
 SOURCES = ("sweep", "flow")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 import shlex
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -20,7 +19,7 @@ from warpgs.geometry import convert_gaussians, convert_mesh, matmul
 from warpgs.io.transforms import read_cameras
 from warpgs.kernels.neighbours import morton_codes
 from warpgs.locks import hold_file
-from warpgs.mesh.fuse import FusedMesh, GridPlan, MeshOptions, fuse
+from warpgs.mesh.fuse import GridPlan, MeshOptions, fuse
 from warpgs.pipeline.films.paths import common_up
 from warpgs.pipeline.model.edit import (
     box_of,
@@ -61,14 +60,20 @@ NO_FILTERS = Filters()
 def filtered(
     gaussians: Gaussians, stored: StoredRun | None, filters: Filters, cleaned: bool
 ) -> tuple[Gaussians, np.ndarray | None, list[str]]:
-    """Filter Gaussians in file units."""
+    """Filter Gaussians in file units; returns them with the rotation, if any, and lines for the user."""
     rotation = rotation_of(filters.rotate, None if stored is None else training_cameras(stored))
     keep, lines = torch.ones(len(gaussians), dtype=torch.bool, device="cpu"), []
     if filters.crop is not None:
         keep = inside(gaussians, box_of(filters.crop))
         lines.append(f"{int((~keep).sum()):,} Gaussians outside the box are left out")
     if cleaned if filters.clean is None else filters.clean:
-        removed = disturbing(gaussians, None if stored is None else _maxima(stored))
+        maxima = None
+        if stored is not None:  # the largest blending weight of each Gaussian over the training views
+            model = stored.gaussians()
+            like = model.means.new_tensor
+            views = [replace(c, viewmat=like(c.viewmat), K=like(c.K)) for c in training_cameras(stored)]
+            maxima = coverage(model, views, stored.options())[0]
+        removed = disturbing(gaussians, maxima)
         counts = {reason: int((where & keep).sum()) for reason, where in removed.items()}
         if words := [f"{count:,} {reason}" for reason, count in counts.items() if count]:
             lines.append(f"removed Gaussians: {', '.join(words)} (--no-clean keeps them)")
@@ -78,9 +83,9 @@ def filtered(
     if rotation is not None:
         gaussians = rotate(gaussians, rotation)
         lines.append(turned_line(rotation))
-    if filters.sh_degree is not None and filters.sh_degree < gaussians.sh_degree:
-        lines.append(f"harmonics above degree {filters.sh_degree} are left out (--sh-degree)")
     if filters.sh_degree is not None:
+        if filters.sh_degree < gaussians.sh_degree:
+            lines.append(f"harmonics above degree {filters.sh_degree} are left out (--sh-degree)")
         gaussians = limit_degree(gaussians, filters.sh_degree)
     return gaussians, rotation, lines
 
@@ -95,14 +100,6 @@ def training_cameras(stored: StoredRun) -> list[Camera]:
     return [stored.scene_cameras[name] for name in stored.train]
 
 
-def _maxima(stored: StoredRun) -> torch.Tensor:
-    """Return the largest blending weight of each Gaussian of a run over its training views, shape [N]."""
-    gaussians = stored.gaussians()
-    like = gaussians.means.new_tensor
-    tensors = [replace(c, viewmat=like(c.viewmat), K=like(c.K)) for c in training_cameras(stored)]
-    return coverage(gaussians, tensors, stored.options())[0]
-
-
 def rotation_of(wish: str | None, cameras: list[Camera] | None) -> np.ndarray | None:
     """Return the rotation [3, 3] that a user's text specifies; None for no rotation."""
     if wish is None:
@@ -110,8 +107,7 @@ def rotation_of(wish: str | None, cameras: list[Camera] | None) -> np.ndarray | 
     if wish == "level":
         if cameras is None:
             raise UsageError("--rotate level needs the cameras of a run: use warpgs export RUN, or give x,y,z,degrees")
-        up = common_up(cameras)
-        if up is None:
+        if (up := common_up(cameras)) is None:
             raise UsageError("--rotate level: the cameras do not agree on an upward direction; give x,y,z,degrees")
         return levelling(up)
     try:
@@ -196,21 +192,16 @@ def _written(
         gaussians = select(gaussians, torch.argsort(morton_codes(gaussians.means), stable=True))
     with hold_file(target) as notes:
         write_gaussians(target, gaussians, units="file", format=kind, antialiased=antialiased)
-    lines += _changes(target, gaussians, kind) if type(kind).decode is not Format.decode else []
+    if type(kind).decode is not Format.decode:  # the rounding errors, measured on the file
+        back, _ = read_with_antialiasing(target, None, "file", kind)
+        moved = float((back.means.double() - gaussians.means.double()).abs().max())
+        scales = (back.log_scales.double() - gaussians.log_scales.double()).abs().amax(1)
+        other = int((scales > 0.1).sum())
+        if moved or not float(scales.max()) < ROUNDING:
+            more = f"; axis lengths of {other:,} Gaussians change by more than 10 %" if other else ""
+            lines.append(f"the format rounds positions, by at most {moved:.2g} units of the scene's files{more}")
     lines += [kind.note] if kind.note else []
     return [*notes, *lines, f"{len(gaussians):,} Gaussians in {target}, {format_bytes(target.stat().st_size)}"]
-
-
-def _changes(target: Path, gaussians: Gaussians, kind: Format) -> list[str]:
-    """Return a line on the rounding errors of the format, measured on the file; none for a format in float32."""
-    back, _ = read_with_antialiasing(target, None, "file", kind)
-    moved = float((back.means.double() - gaussians.means.double()).abs().max())
-    scales = (back.log_scales.double() - gaussians.log_scales.double()).abs().amax(1)
-    if moved == 0 and float(scales.max()) < ROUNDING:
-        return []
-    other = int((scales > 0.1).sum())
-    text = f"the format rounds positions, by at most {moved:.2g} units of the scene's files"
-    return [text + (f"; axis lengths of {other:,} Gaussians change by more than 10 %" if other else "")]
 
 
 def _check_for_cameras(filters: Filters, formats: Sequence[object]) -> None:
@@ -244,7 +235,7 @@ def mesh(
     run = open_run(folder, device)
     if not run.train:
         raise DataError(f"{folder}: the run has no training views, so coverage is unknown; fit again")
-    cameras, scale = [run.scene_cameras[n] for n in run.train], run.normalization.scale
+    cameras, scale = training_cameras(run), run.normalization.scale
     if options.voxel is not None:
         options = replace(options, voxel=options.voxel * scale)
 
@@ -257,25 +248,16 @@ def mesh(
 
     with hold_file(target) as notes:
         found = fuse(run.scene_gaussians, cameras, run.options(), options, stage=stage, planned=planned)
-        made = convert_mesh(found.mesh, run.normalization, "scene", "file")
-        up = common_up(cameras)
+        made, up = convert_mesh(found.mesh, run.normalization, "scene", "file"), common_up(cameras)
         write_mesh(target, made, up)
-    if up is None and target.suffix.lower() == ".glb":
-        notes = [*notes, "the cameras have no common upward direction, so the mesh may be tilted in a viewer"]
-    return [*run.notes(), *notes, *_lines(found, len(cameras)), f"{target}: {format_bytes(os.path.getsize(target))}"]
-
-
-def _lines(found: FusedMesh, views: int) -> list[str]:
-    """Return lines for the user on the size and the coverage of a mesh."""
-    mesh, lines = found.mesh, []
-    lines.append(
-        f"{found.extracted:,} triangles extracted, {found.removed:,} small parts removed; "
-        f"the mesh has {len(mesh.faces):,} triangles and {len(mesh.vertices):,} vertices"
-    )
-    lines.append(
-        f"{100 * found.unseen:.1f} % of the volume, such as backs and insides, was not observed by the {views} training views; "
-        "the mesh is open there"
-    )
+    lines = [
+        f"{found.extracted:,} triangles extracted, {found.removed:,} small parts removed; the mesh has "
+        f"{len(made.faces):,} triangles and {len(made.vertices):,} vertices",
+        f"{100 * found.unseen:.1f} % of the volume, such as backs and insides, was not observed by the {len(cameras)} training "
+        "views; the mesh is open there",
+    ]
     if found.uncolored:
         lines.append(f"{found.uncolored:,} vertices without an observed colour take the colour of the nearest coloured vertex")
-    return lines
+    if up is None and target.suffix.lower() == ".glb":
+        notes = [*notes, "the cameras have no common upward direction, so the mesh may be tilted in a viewer"]
+    return [*run.notes(), *notes, *lines, f"{target}: {format_bytes(target.stat().st_size)}"]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import json
 import time
 from collections.abc import Callable, Mapping
@@ -35,8 +34,6 @@ from warpgs.pipeline.run.folder import (
     cameras_of,
     check_checkpoint,
     check_same,
-    learned_cameras,
-    learned_figures,
     load_checkpoint,
     read_record,
     record_of,
@@ -64,6 +61,7 @@ from warpgs.pipeline.train.schedule import StepReport, choose_background, over_b
 from warpgs.pipeline.train.settings import FitConfig, settings_by_views, within_budget
 from warpgs.pipeline.train.step import StepBuffers, eager_renderer
 from warpgs.pipeline.train.trainer import Trainer, background_warmup, complexity_figures, complexity_summary, run, train_views
+from warpgs.pipeline.train.view_modules import FittedViews
 from warpgs.plugins import is_ours
 from warpgs.poses.find import JSON, TEXT, find_poses, needs_poses, read_poses_record, source_digest
 from warpgs.priors.photo_checks import PhotoCheck, check_photos, photo_notes
@@ -117,27 +115,22 @@ class FitJob:
         if self.verbose is True:
             say(line)
 
-    def note(self, line: str) -> None:
-        """Keep a line for the report, and print it unless it is a detail."""
-        self.notes.append(line)
-        if not isinstance(line, Detail):
-            self.say(f"  {line}")
-
-    def announce(self, notes: list[str]) -> None:
-        """Print the scene and all automatic choices so far, ``notes`` last."""
-        before, self.notes = self.notes, []
-        camera = self.train[0].camera
-        size = f"{camera.width} x {camera.height} px"
-        counts = f"{len(self.train)} views to fit, {len(self.test)} held out"
-        self.say(f"{self.scene.path}: {self.scene.format}, {counts}, {size}, {self.where}")
-        for note in [*before, *notes]:
-            self.note(note)
+    def note(self, *lines: str) -> None:
+        """Keep lines for the report, and print those that are no details."""
+        for line in lines:
+            self.notes.append(line)
+            if not isinstance(line, Detail):
+                self.say(f"  {line}")
 
     def tell(self, trainer: Trainer) -> None:
         """Print the messages of the trainer, and keep them for the report, that of a continued run, too."""
         while trainer.messages:
             trainer.notes.append(trainer.messages.pop(0))
             self.note(trainer.notes[-1])
+
+    def cameras(self, trainer: Trainer) -> Mapping[str, Camera]:
+        """Return the cameras of all views after the view modules, by name."""
+        return trainer.learned.cameras(cameras_of(self.scene), self.split.train, self.split.test)
 
     def model(self, trainer: Trainer) -> dict[str, Any]:
         """Return the fields of the current `FittedModel`, by name."""
@@ -149,26 +142,26 @@ class FitJob:
         }  # fmt: skip
 
 
-def take_steps(job: FitJob, trainer: Trainer, images_written: Callable[[], None]) -> None:
-    """Take all remaining steps, with log and checkpoints if there is a run folder; images are written before a checkpoint."""
-    log = None if job.out is None else EventLog(job.out / "metrics.jsonl", trainer.step)
+def take_steps(job: FitJob, trainer: Trainer) -> None:
+    """Take all remaining steps, with log, images of events and checkpoints if there is a run folder."""
+    out = job.out
+    log = None if out is None else EventLog(out / "metrics.jsonl", trainer.step)
     slow = compiled = -1  # the last step that was slow because it compiled kernels; the number of kernels compiled by then
 
     def save(trainer: Trainer) -> None:
-        if job.out is None or log is None:
+        if out is None or log is None:
             return
         log.flush()
-        images_written()
+        images_written()  # a fit that continues from the checkpoint does not write them
         tensors, state = trainer.state()
         if trainer.config.view_modules:  # by which a run is opened without their code
-            cameras = learned_cameras(job.scene, job.split, trainer.learned)
-            state["cameras"] = {n: camera_values(c) for n, c in cameras.items()}
-        save_checkpoint(job.out, tensors, state | {"fingerprint": job.scene.fingerprint, "train": job.split.train})
+            state["cameras"] = {n: camera_values(c) for n, c in job.cameras(trainer).items()}
+        save_checkpoint(out, tensors, state | {"fingerprint": job.scene.fingerprint, "train": job.split.train})
 
     def restore(trainer: Trainer) -> bool:
-        if job.out is None or log is None or not (job.out / TENSORS).is_file():
+        if out is None or log is None or not (out / TENSORS).is_file():
             return False
-        trainer.load(*load_checkpoint(job.out))
+        trainer.load(*load_checkpoint(out))
         log.rewind(trainer.step)
         return True
 
@@ -189,9 +182,10 @@ def take_steps(job: FitJob, trainer: Trainer, images_written: Callable[[], None]
             job.on_model(FittedModel(**job.model(trainer)))
 
     with contextlib.ExitStack() as stack:
-        progress = stack.enter_context(Progress(trainer.steps, trainer.step)) if job.verbose else None
-        if log is not None:
+        if out is not None and log is not None:
+            images_written = stack.enter_context(images_kept(trainer, list(job.split.train), out))
             stack.callback(log.close)
+        progress = stack.enter_context(Progress(trainer.steps, trainer.step)) if job.verbose else None
         try:
             run(trainer, report, save, stack.enter_context(noted_signals()), restore)
         except NotFiniteError as e:
@@ -200,17 +194,17 @@ def take_steps(job: FitJob, trainer: Trainer, images_written: Callable[[], None]
             if not job.ranks.first:
                 job.ranks.leave()  # all ranks have this loss; the first reports it
                 raise
-            explained = _explained(job, trainer, e)
+            explained = _explained(job, trainer, e, e.view)
             save(trainer)
             raise explained from e
+    job.tell(trainer)  # of images that were written last
 
 
-def _explained(job: FitJob, trainer: Trainer, error: NotFiniteError) -> NotFiniteError:
+def _explained(job: FitJob, trainer: Trainer, error: NotFiniteError, view: int) -> NotFiniteError:
     """Return the error for the user on a step with a non-finite loss: view, loss terms, tensors, and what to do."""
-    assert error.view is not None
-    broken, tensors = non_finite_parts(trainer, error.view, error.slot)
+    broken, tensors = non_finite_parts(trainer, view, error.slot)
     own = [t.name for t in trainer.terms if f"the loss term {t.name}" in broken and not is_ours(type(t))]
-    text = f"{error}, on {job.split.train[error.view]}{', in ' if broken else ''}{' and '.join(broken)}; "
+    text = f"{error}, on {job.split.train[view]}{', in ' if broken else ''}{' and '.join(broken)}; "
     text += f"not finite: {', '.join(tensors)}" if tensors else "all of its inputs and renders are finite"
     fix = f"correct {' and '.join(own)}, and fit again" if own else "fit again with lower learning rates"
     report = "" if own else "; if that fails, report this message"
@@ -243,25 +237,6 @@ def non_finite_parts(trainer: Trainer, view: int, slot: int) -> tuple[list[str],
     )
 
 
-def check_batched(
-    scene: Scene | SceneRequest | str | Path, config: FitConfig, ranks: Ranks, time_budget: float | None, resume: bool
-) -> None:
-    """Refuse ranks without a view each, and ranks that would find their own poses or measure their own speed."""
-    check_ranks(config.batch, ranks)
-    if ranks.count == 1:
-        return
-    path = None if isinstance(scene, Scene) else Path(scene.path if isinstance(scene, SceneRequest) else scene)
-    if path is not None and not resume and needs_poses(path):
-        raise UsageError(
-            f"{path}: has no cameras, and each of {ranks.count} ranks would find its own poses; run `warpgs poses {path} --out "
-            "SCENE` first, and fit SCENE"
-        )
-    if time_budget is not None:
-        raise UsageError(
-            f"--time-budget: each of {ranks.count} ranks would measure its own speed and choose other steps; give --steps"
-        )
-
-
 def check_equal(record: dict[str, Any], step: int | None, ranks: Ranks) -> None:
     """Refuse, in every process, ranks whose scene, settings, code or checkpoint (``step``) differ from those of rank 0."""
     if ranks.count == 1:
@@ -273,8 +248,7 @@ def check_equal(record: dict[str, Any], step: int | None, ranks: Ranks) -> None:
         "different settings": ([record["config"], record["own_code"]], "start all ranks with the same flags and the same code"),
         "a different checkpoint": (step, "give all ranks the same --out, on a file system that all machines share"),
     }
-    own = {name: hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest() for name, (value, _) in parts.items()}
-    first, *others = map(json.loads, ranks.texts(json.dumps(own)))
+    first, *others = map(json.loads, ranks.texts(json.dumps({name: value for name, (value, _) in parts.items()})))
     for rank, other in enumerate(others, 1):
         for name, (_, fix) in parts.items():
             if other.get(name) != first.get(name):
@@ -283,22 +257,21 @@ def check_equal(record: dict[str, Any], step: int | None, ranks: Ranks) -> None:
 
 def batched_notes(config: FitConfig, ranks: Ranks) -> list[str]:
     """Return sentences on views and processes of a step; empty if a step has one view."""
-    if config.batch == 1:
-        return []
-    notes = [
+    views = (
         f"batch: each of the {config.steps:,} steps renders {config.batch} views and averages their gradients; "
         f"learning rates are {config.batch**0.5:.3g} times those for one view"
-    ]
-    if ranks.count > 1:
-        counts = sorted({len(own_slots(config.batch, ranks.count, rank)) for rank in range(ranks.count)})
-        notes.append(
-            f"ranks: {ranks.count} processes ({ranks.backend}); each renders {' or '.join(map(str, counts))} views of a step; "
-            "the model has the same bits for any number of ranks"
-        )
-    return notes
+    )
+    counts = sorted({len(own_slots(config.batch, ranks.count, rank)) for rank in range(ranks.count)})
+    processes = (
+        f"ranks: {ranks.count} processes ({ranks.backend}); each renders {' or '.join(map(str, counts))} views of a step; "
+        "the model has the same bits for any number of ranks"
+    )
+    return [views] * (config.batch > 1) + [processes] * (ranks.count > 1)
 
 
-def with_poses(request: SceneRequest, out: Path | None, progress: Callable[[str], object]) -> tuple[SceneRequest, list[str]]:
+def with_poses(
+    request: SceneRequest, out: Path | None, progress: Callable[[str], object], ranks: int = 1
+) -> tuple[SceneRequest, list[str]]:
     """Find the poses of photographs without cameras, or read them from the run folder ``out``; returns request and notes."""
     source = Path(request.path)
     if request.reader is not None or not request.path or not needs_poses(source):
@@ -312,33 +285,31 @@ def with_poses(request: SceneRequest, out: Path | None, progress: Callable[[str]
         record = read_poses_record(scene)
         if record["source_sha256"] != source_digest(source, request.allow_outside):
             raise UsageError(f"{scene} holds poses of other photographs than {source}; give another --out")
+    elif ranks > 1:
+        raise UsageError(
+            f"{source}: has no cameras, and each of {ranks} ranks would find its own poses; run `warpgs poses {source} --out "
+            "SCENE` first, and fit SCENE"
+        )
     else:
         progress(f"{source} has no cameras: finding the poses of its photographs, to store them in {scene}")
-        threads = torch.get_num_threads()
         record = find_poses(
-            source, scene, threads=threads, max_pixels=request.max_pixels, allow_outside=request.allow_outside,
+            source, scene, threads=torch.get_num_threads(), max_pixels=request.max_pixels, allow_outside=request.allow_outside,
             matcher=request.matcher, progress=progress,
         )  # fmt: skip
-    return replace(request, path=str(scene), matcher=None), _notes(record)
+    lost = [f"no pose: {p['name']} {p['reason']}" for p in record["photographs"] if not p["registered"]]
+    notes = [*record["notes"], *lost[:5], *([f"and {len(lost) - 5} more without a pose"] if len(lost) > 5 else [])]
+    notes += [f"{POSED_SCENE}/{TEXT} in the run folder lists what to photograph next"] if record["advice"] else []
+    return replace(request, path=str(scene), matcher=None), notes
 
 
 def lost_lines(out: Path | None) -> list[str]:
     """Return a line on the photographs without a pose, which a run leaves out; an empty list if all have one."""
     if out is None or not (out / POSED_SCENE / JSON).is_file():
         return []
-    rows = read_poses_record(out / POSED_SCENE)["photographs"]
+    rows, why = read_poses_record(out / POSED_SCENE)["photographs"], out / POSED_SCENE / TEXT
     lost = sum(not p["registered"] for p in rows)
-    why = out / POSED_SCENE / TEXT
-    return (
-        [f"{lost} of {len(rows)} photographs have no pose and were not used: {why} lists reasons and remedies"] if lost else []
-    )
-
-
-def _notes(record: dict[str, Any]) -> list[str]:
-    """Return the report's notes on found poses: the method, and photographs without a pose."""
-    lost = [f"no pose: {p['name']} {p['reason']}" for p in record["photographs"] if not p["registered"]]
-    where = [f"{POSED_SCENE}/{TEXT} in the run folder lists what to photograph next"] if record["advice"] else []
-    return [*record["notes"], *lost[:5], *([f"and {len(lost) - 5} more without a pose"] if len(lost) > 5 else []), *where]
+    line = f"{lost} of {len(rows)} photographs have no pose and were not used: {why} lists reasons and remedies"
+    return [line] if lost else []
 
 
 COMPILING = "compiling kernels, once on this machine, for a minute or two"
@@ -421,7 +392,11 @@ def fit(
     spec = scene.split if split is None and isinstance(scene, SceneRequest) else split
     if spec is not None:
         check_spec(spec)
-    check_batched(scene, config, ranks, time_budget, resume)
+    check_ranks(config.batch, ranks)
+    if time_budget is not None and ranks.count > 1:
+        raise UsageError(
+            f"--time-budget: each of {ranks.count} ranks would measure its own speed and choose other steps; give --steps"
+        )
     verbose, own = ranks.first and verbose, out if ranks.first else None
     folder = contextlib.nullcontext(list[str]()) if own is None else run_folder(own, resume)
     stages = Stages() if verbose else Stages(lambda line: None)
@@ -438,7 +413,15 @@ def fit(
         chosen, where = choose_device(device)
         began = time.perf_counter()
         lpips = None if lpips_weights is None else Lpips(Path(lpips_weights), chosen)
-        request, read, parts, found = _scene_of(scene, split, out, chosen.type, progress)
+        if isinstance(scene, Scene):
+            (parts, found), read = choose_split(scene, split), scene
+            request, found = SceneRequest("", split, downscale=1).with_scale(chosen.type), [*scene.notes, *found]
+        else:
+            request = scene if isinstance(scene, SceneRequest) else SceneRequest(str(scene))
+            request, poses = with_poses(replace(request, split=spec).with_scale(chosen.type), out, progress, ranks.count)
+            progress(f"reading {request.path}")
+            read, parts, found = read_scene(request, progress)
+            found = [*poses, *found]
         renamed = [] if out is None else renaming_notes(image_names(v.name for v in read.views))
         job = FitJob(
             scene=read, request=request, split=parts, config=config, device=chosen, where=where, out=own, lpips=lpips,
@@ -446,10 +429,10 @@ def fit(
             began=began, progress=progress, compiled=compiled,
         )  # fmt: skip
         _settle(job, time_budget)
-        trainer, state, record, checks = _prepare(job, out if resume else None)
+        trainer, record, checks = _prepare(job, out if resume else None)
         if own is not None and not resume:
             write_json(own / CONFIG, record)
-        result = _finish(job, trainer, state, record, checks)
+        result = _finish(job, trainer, record, checks)
     ranks.leave()
     return result
 
@@ -482,30 +465,8 @@ def fit_request(request: FitRequest, **others: Any) -> FitResult:
         raise KeyboardInterrupt(again) from e
 
 
-def _scene_of(
-    scene: Scene | SceneRequest | str | Path,
-    spec: str | None,
-    out: Path | None,
-    device: str,
-    progress: Callable[[str], object],
-) -> tuple[SceneRequest, Scene, Split, list[str]]:
-    """Read and split a scene that is given in one of four ways; returns request, scene, split and notes."""
-    if isinstance(scene, Scene):
-        split, notes = choose_split(scene, spec)
-        return SceneRequest("", spec, downscale=1).with_scale(device), scene, split, [*scene.notes, *notes]
-    request = (scene if isinstance(scene, SceneRequest) else SceneRequest(str(scene))).with_scale(device)
-    if spec is not None:
-        request = replace(request, split=spec)
-    request, found = with_poses(request, out, progress)
-    progress(f"reading {request.path}")
-    read, parts, notes = read_scene(request, progress)
-    return request, read, parts, [*found, *notes]
-
-
-def _prepare(
-    job: FitJob, resumed: Path | None
-) -> tuple[Trainer, tuple[dict[str, torch.Tensor], dict[str, Any]] | None, dict[str, Any], list[PhotoCheck]]:
-    """Return the trainer, the state to continue the run ``resumed`` from, the record of the run, and checks of photographs."""
+def _prepare(job: FitJob, resumed: Path | None) -> tuple[Trainer, dict[str, Any], list[PhotoCheck]]:
+    """Return the trainer, which continues the run ``resumed``, the record of the run, and checks of photographs."""
     record, state = record_of(job.request, job.config, job.scene, job.split, job.notes, job.device), None
     if resumed is not None:
         stored = read_record(resumed)
@@ -527,46 +488,43 @@ def _prepare(
         trainer = Trainer(*of, ready=ready, progress=job.progress, ranks=job.ranks)
     if job.device.type == "cuda":
         torch.cuda.reset_peak_memory_stats(job.device)  # report the steps' memory, not that of the start or of an earlier fit
-    return trainer, state, record, checks
-
-
-def _finish(
-    job: FitJob, trainer: Trainer, state: tuple[dict[str, torch.Tensor], dict[str, Any]] | None, record: dict[str, Any],
-    checks: list[PhotoCheck],
-) -> FitResult:  # fmt: skip
-    """Take the steps, score the model, and write the run folder, if any."""
     if state is not None:
         try:
             trainer.load(*state)
         except DataError as e:
-            raise DataError(f"{job.out}/{TENSORS}: {e}") from e
+            raise DataError(f"{resumed}/{TENSORS}: {e}") from e
         job.notes.append(f"continued from step {trainer.step}; this run's times count from there")
-    shared = batched_notes(job.config, job.ranks)
-    job.announce([*photo_notes(checks), *trainer.notes, *shared, plan_summary(trainer.memory)])
+    return trainer, record, checks
+
+
+def _finish(job: FitJob, trainer: Trainer, record: dict[str, Any], checks: list[PhotoCheck]) -> FitResult:
+    """Print the scene and all automatic choices, take the steps, score the model, and write the run folder, if any."""
+    chosen, camera = [*job.notes, *photo_notes(checks), *trainer.notes], job.train[0].camera
+    counts = f"{len(job.train)} views to fit, {len(job.test)} held out"
+    job.say(f"{job.scene.path}: {job.scene.format}, {counts}, {camera.width} x {camera.height} px, {job.where}")
+    job.notes = []
+    job.note(*chosen, *batched_notes(job.config, job.ranks), plan_summary(trainer.memory))
     setup = time.perf_counter() - job.began
-    images = images_kept(trainer, list(job.split.train), job.out) if job.out else contextlib.nullcontext(lambda: None)
-    with images as images_written:
-        take_steps(job, trainer, images_written)
-    job.tell(trainer)  # of images that were written last
-    training = time.perf_counter() - job.began - setup
+    take_steps(job, trainer)
+    seconds = {"setup": setup, "training": time.perf_counter() - job.began - setup}
     job.ranks.part()
-    if not job.ranks.first:
-        return FitResult(**job.model(trainer), config=job.config, metrics={}, notes=tuple(job.notes), folder=None)
-    given = cameras_of(job.scene)
-    job.scene = with_cameras(job.scene, learned_cameras(job.scene, job.split, trainer.learned))
-    if job.out is not None:
-        model = drop_unused_sh(trainer.gaussians)
-        write_ply(job.out / "point_cloud.ply", model, job.scene.normalization, antialiased=job.config.antialiased)
-    metrics = _score(job, trainer, {"setup": setup, "training": training}, given, checks)
-    if job.out is not None:
-        write_json(job.out / METRICS_FILE, metrics)
-        record["notes"] = job.notes
-        write_report(
-            job.out, job.scene, job.split, trainer.gaussians, trainer.context.render_options(), metrics, record,
-            sampling=sampling_report_of(trainer, job.out), tell=job.progress,
-        )  # fmt: skip
-    for line in [*lost_lines(job.out), *result_lines(metrics, job.out)]:
-        job.say(line)
+    metrics: dict[str, Any] = {}
+    if job.ranks.first:
+        given = cameras_of(job.scene)
+        job.scene = with_cameras(job.scene, job.cameras(trainer))
+        if job.out is not None:
+            model = drop_unused_sh(trainer.gaussians)
+            write_ply(job.out / "point_cloud.ply", model, job.scene.normalization, antialiased=job.config.antialiased)
+        metrics = _score(job, trainer, seconds, given, checks)
+        if job.out is not None:
+            write_json(job.out / METRICS_FILE, metrics)
+            options, record["notes"] = trainer.context.render_options(), job.notes
+            write_report(
+                job.out, job.scene, job.split, trainer.gaussians, options, metrics, record,
+                sampling=sampling_report_of(trainer, job.out), tell=job.progress,
+            )  # fmt: skip
+        for line in [*lost_lines(job.out), *result_lines(metrics, job.out)]:
+            job.say(line)
     return FitResult(**job.model(trainer), config=job.config, metrics=metrics, notes=tuple(job.notes), folder=job.out)
 
 
@@ -575,37 +533,39 @@ def _score(
 ) -> dict[str, Any]:
     """Score the finished fit, with the ``given`` cameras from before it; returns the contents of metrics.json."""
     c, scene, train, test, gaussians = job.config, job.scene, job.train, job.test, trainer.gaussians
-    on_cuda = job.device.type == "cuda"
-    peak = {"peak_torch_bytes": torch.cuda.max_memory_allocated(job.device)} if on_cuda else {}
-    names = image_names(v.name for v in scene.views)
-    options, tell = trainer.context.render_options(), job.progress
+    peak = {"peak_torch_bytes": torch.cuda.max_memory_allocated(job.device)} if job.device.type == "cuda" else {}
+    names, learned = image_names(v.name for v in scene.views), trainer.learned
+    options, tell, compare = trainer.context.render_options(), job.progress, not job.other_models
     scored = (job.out, gaussians, train, test, options)
     metrics = evaluate_run(*scored, job.lpips, names=names, tell=tell)
-    if test and not job.other_models:
+    if test and compare:
         metrics["coverage"] = coverage_of_run(*scored, names=names, tell=tell)
     tell("checking float32 accuracy")
     rule = rule_report_of(gaussians, train, options, seed=c.seed, half_resolution=trainer.half_resolution)
     shape = shape_figures(gaussians, c.limits, trainer.radius, trainer.context.extent, [v.camera for v in train])
     moved: dict[str, float] = {}
-    if not job.other_models:
+    if compare:
         shown = counted(train, tell, "checking for moving objects", "views")
         fractions = moved_fractions(train, (render_view(gaussians, v, options) for v in shown))
         moved = {v.name: f for v, f in zip(train, fractions, strict=True)}
-    complexity = complexity_figures(trainer)
-    learned = learned_figures(trainer.learned, scene, job.split, given, test, gaussians, options)
+    complexity, cameras, scale = complexity_figures(trainer), cameras_of(scene), scene.normalization.scale
+    modules = {
+        m.name: m.figures(
+            FittedViews(learned.params_of(m), job.split.train, test, given, cameras, scale, gaussians, options)
+        ) for m in learned.modules
+    }  # fmt: skip
     mapped = given_figures(train, trainer.views, gaussians, options)
     table: list[tuple[dict[str, Any], list[str]]] = [  # figures of metrics.json, and their sentences in the report
         ({"rule": rule}, [Detail(rule["summary"])]),
         ({"shape": shape}, [Detail(shape_summary(shape))]),
         (complexity, [Detail(complexity_summary(complexity))]),
         ({"photographs": [vars(p) | {"moved": moved.get(p.name)} for p in checks]}, moved_notes(moved)),
-        ({"view_modules": learned}, [e["summary"] for e in learned.values()]),
+        ({"view_modules": modules}, [e["summary"] for e in modules.values()]),
         ({"given": mapped}, [e["summary"] for e in mapped.values()]),
     ]
     for figures, sentences in table:
         metrics |= figures
-        for sentence in sentences:
-            job.note(sentence)
+        job.note(*sentences)
     compiling = {"compiling": sum(job.compiled)} if job.compiled else {}
     return metrics | peak | event_figures(trainer) | {
         "protocol": protocol_of(scene, job.request.split, job.request.downscale or 1, train, test),

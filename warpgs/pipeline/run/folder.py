@@ -10,10 +10,10 @@ import math
 import os
 import platform
 import shlex
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Any, get_type_hints
 
 import numpy as np
 import torch
@@ -29,12 +29,9 @@ from warpgs.locks import check_free, hold_folder
 from warpgs.pipeline.model.table import FittedModel, checked_gaussians, unpack
 from warpgs.pipeline.run.request import FitRequest, SceneRequest, choose_device
 from warpgs.pipeline.train.settings import FitConfig, fingerprint, upgraded
-from warpgs.pipeline.train.view_modules import FittedViews
-from warpgs.pipeline.train.views import LearnedViews
 from warpgs.poses.find import JSON as POSES
-from warpgs.render.options import RasterizeOptions
-from warpgs.scene import Camera, Gaussians, Normalization, Scene, View
-from warpgs.schema import Schema, SchemaError, fields, flag, items, mapping, number, one_of, or_null, real, text, whole
+from warpgs.scene import Camera, Normalization, Scene
+from warpgs.schema import SchemaError, fields, flag, items, mapping, number, one_of, or_null, real, text, whole
 from warpgs.version import __version__
 
 MAX_SIDE = 2**16
@@ -53,52 +50,21 @@ def _view_name(value: Any, place: str) -> None:
         raise SchemaError(f"{place} must be the relative path of an image, not {value[:60]!r}")
 
 
-def _matrix(rows: int) -> Schema:
-    return items(items(number(), rows), rows)
-
-
-def _intrinsics(value: Any, place: str) -> None:
-    """Allow intrinsics without skew, as `rasterize` needs them."""
-    _matrix(3)(value, place)
-    fixed = ((0, 1, 0), (1, 0, 0), (2, 0, 0), (2, 1, 0), (2, 2, 1))
-    if any(abs(value[i][j] - wanted) > K_TOLERANCE for i, j, wanted in fixed):
-        raise SchemaError(f"{place} must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]")
-    least, most = FOCAL_LENGTHS
-    if not all(least <= abs(value[i][i]) <= most for i in (0, 1)):
-        raise SchemaError(f"{place} must have focal lengths from {least:g} to {most:g} px")
-
-
-def _pose(value: Any, place: str) -> None:
-    """Allow rigid poses, as `rasterize` needs them."""
-    _matrix(4)(value, place)
-    pose = np.array(value, np.float64)
-    with np.errstate(over="ignore", invalid="ignore"):
-        errors = [pose[:3, :3] @ pose[:3, :3].T - np.eye(3), pose[3:] - (0, 0, 0, 1)]
-    near = np.abs(pose[:3, 3]).max() <= MAX_TRANSLATION
-    if not (near and all(np.abs(e).max() <= POSE_TOLERANCE for e in errors)):  # also where products overflow
-        raise SchemaError(
-            f"{place} must be a rotation and a translation within {MAX_TRANSLATION:g}, without scale, above the row 0, 0, 0, 1"
-        )
-
-
 _CAMERA = fields(
-    {"viewmat": _pose, "K": _intrinsics, "width": whole(1, MAX_SIDE), "height": whole(1, MAX_SIDE)},
+    {
+        "viewmat": items(items(number(), 4), 4), "K": items(items(number(), 3), 3), "width": whole(1, MAX_SIDE),
+        "height": whole(1, MAX_SIDE),
+    },
     {"model": text, "distortion": items(number())},
     others=False,
-)
-_SCENE = fields(
-    {
-        "path": or_null(text), "split": or_null(text), "downscale": whole(1), "strict": flag, "allow_outside": flag,
-        **{name: one_of(*choices) for name, choices in CHOICES.items()}, "black_is_empty": flag,
-        "score_masks": or_null(text), "reader": or_null(text),
-    },
-    {
-        "max_pixels": whole(1), "max_side": whole(0),
-        "depths": or_null(text), "normals": or_null(text),
-        "depth_unit": or_null(number(above=0)), "matcher": or_null(text),
-    },
-    others=False,
 )  # fmt: skip
+_SCENE = fields(
+    {"path": or_null(text)},
+    {name: schema.of_type(hint) for name, hint in get_type_hints(SceneRequest).items() if name != "path"}
+    | {name: one_of(*choices) for name, choices in CHOICES.items()}
+    | {"downscale": whole(1)},
+    others=False,
+)
 _PARTS = items(fields({"name": text}))
 _RECORD = fields(
     {
@@ -115,71 +81,31 @@ _RECORD = fields(
 )  # fmt: skip
 
 
-def check_record(record: Any) -> None:
-    """Check the contents of config.json."""
-    _RECORD(record, "")
-    if not record["train"]:
-        raise SchemaError("train must name a view")
-    for name in [*record["train"], *record["test"]]:
-        if name not in record["cameras"]:
-            raise SchemaError(f"cameras lacks the view {name[:60]!r}")
-
-
 MODEL_STATE = fields({"step": whole(0)}, {"cameras": mapping(_CAMERA, _view_name)})
 """Schema of a checkpoint's plain values from which a model is read."""
-_SHAPE = fields(
-    {n: number(0) for n in ("largest", "largest_over_radius", "largest_over_extent", "largest_over_distance")}
-    | {n: number(0) for n in ("needles", "needles_by_opacity", "thin")}
-    | {"radius": number(above=0), "extent": number(above=0), "beyond": whole(0)}
-)
-_PHOTOGRAPH = fields({
-    "name": _view_name, "compared_with": whole(0), "sharpness": or_null(number(0)), "brightness": or_null(number(0)),
-    "channels": or_null(items(number(0), 3)), "moved": or_null(number(0)),
-})  # fmt: skip
-_COVERED = mapping(
-    fields({
-        "pixels": whole(0), "share_of_pixels": number(0), "share_of_error": number(0), "psnr": or_null(real),
-        "ssim": or_null(real), "expected_psnr": or_null(real),
-    }),
-    one_of("0", "1", "2+", "background"),
-)  # fmt: skip
-OPACITY = ("psnr_whole", "psnr_foreground", "alpha_empty", "alpha_object")
-"""Scores of views with an alpha channel, defined in `warpgs.pipeline.metrics.scores`."""
 METRICS = fields(
     {
         "test": mapping(or_null(real)), "train": mapping(or_null(real)),
-        "views": items(fields({"name": text, "psnr": or_null(real)}, dict.fromkeys(OPACITY, or_null(real)))),
-        "variants": mapping(text), "config_hash": text, "steps": whole(0),
+        "views": items(fields({"name": text, "psnr": or_null(real)})), "variants": mapping(text), "config_hash": text,
+        "steps": whole(0),
         "protocol": fields({
             "split": text, "training_views": whole(0), "held_out_views": whole(0), "ground_truth": text,
             "resolution": items(text), "score_masks": whole(0),
         }),
     },
-    {
-        "gaussians": whole(0), "batch": whole(1), "ranks": whole(1), "seconds": fields({"total": number(0)}), "shape": _SHAPE,
-        "photographs": items(_PHOTOGRAPH),
-        "view_modules": mapping(fields({"summary": text})),
-        "coverage": fields({
-            "classes": _COVERED, "views": items(fields({"name": text, "classes": _COVERED})), "tolerance": number(0),
-            "depth_differences": items(number(0)), "photo_psnr": or_null(items(or_null(real))), "summary": text,
-        }),
-    },
+    {"gaussians": whole(0), "seconds": fields({"total": number(0)})},
 )  # fmt: skip
-"""Schema of metrics.json and of eval.json."""
+"""Schema of what is read of metrics.json and eval.json."""
 
 
 TENSORS = "checkpoint.safetensors"
 FORMAT = 2
 """Version of the format of run folders: config.json and the checkpoint. warpgs 0.1.0 wrote version 1."""
 DTYPES = {
-    torch.float64: "F64",
-    torch.float32: "F32",
-    torch.int64: "I64",
-    torch.int32: "I32",
-    torch.uint8: "U8",
-    torch.bool: "BOOL",
-}
+    torch.float64: "F64", torch.float32: "F32", torch.int64: "I64", torch.int32: "I32", torch.uint8: "U8", torch.bool: "BOOL",
+}  # fmt: skip
 """Names of scalar types in the format."""
+RESTORE = "restore the file, or fit the scene again"
 
 
 def safetensors_chunks(tensors: dict[str, torch.Tensor], metadata: dict[str, str]) -> list[memoryview | bytes]:
@@ -208,8 +134,7 @@ def save_checkpoint(folder: Path, tensors: dict[str, torch.Tensor], state: dict[
                 "--resume would repeat the same steps; fit again into a new --out with lower learning rates"
             )
     metadata = {"format": str(FORMAT), "version": __version__, "state": json.dumps(state)}
-    chunks = safetensors_chunks(tensors, metadata)
-    digest = hashlib.sha256()
+    chunks, digest = safetensors_chunks(tensors, metadata), hashlib.sha256()
     for chunk in chunks:
         digest.update(chunk)
     write_bytes(path, *chunks, digest.digest())
@@ -226,30 +151,29 @@ def load_checkpoint(folder: Path) -> tuple[dict[str, torch.Tensor], dict[str, An
         with open_input(path, folder) as file:
             body = file.read(max(0, os.fstat(file.fileno()).st_size - 32))
             digest = file.read(33)
+        if hashlib.sha256(body).digest() != digest:
+            raise ValueError("the checksum does not match: the file was truncated or altered")
+        tensors = load(body)
+        metadata = json.loads(body[8 : 8 + int.from_bytes(body[:8], "little")])["__metadata__"] or {}
+        if metadata.get("format") != str(FORMAT):
+            raise DataError(_other_version(f"{path}: warpgs {metadata.get('version', '0.1.0')} wrote this checkpoint"))
+        state = schema.parse(metadata["state"])
+        schema.mapping(schema.anything)(state, "")
     except FileNotFoundError as e:
         raise DataError(f"{folder} holds no {TENSORS}: no checkpoint yet; run `warpgs fit` first") from e
     except OSError as e:
-        raise DataError(f"{path}: cannot be read ({unread_reason(e)}); restore the file, or fit again") from e
-    if hashlib.sha256(body).digest() != digest:
-        raise DataError(f"{path}: the checksum does not match: the file was truncated or altered; restore it, or fit again")
-    try:
-        tensors = load(body)
-        length = int.from_bytes(body[:8], "little")
-        metadata = json.loads(body[8 : 8 + length])["__metadata__"] or {}
+        raise DataError(f"{path}: cannot be read ({unread_reason(e)}); {RESTORE}") from e
     except (SafetensorError, KeyError, ValueError) as e:
-        raise DataError(f"{path} is not a warpgs checkpoint ({e})") from e
-    if metadata.get("format") != str(FORMAT):
-        version = metadata.get("version", "0.1.0")
-        raise DataError(
-            f"{path}: warpgs {version} wrote this checkpoint, in a format that warpgs {__version__} does not read. Open it "
-            f"with warpgs {version}, or fit the scene again into a new --out"
-        )
-    try:
-        state = schema.parse(metadata["state"])
-        schema.mapping(schema.anything)(state, "")
-    except (KeyError, schema.SchemaError) as e:
-        raise DataError(f"{path}: the stored state is incomplete or damaged ({e}); restore the file, or fit again") from e
+        raise DataError(f"{path}: not a whole checkpoint ({e}); {RESTORE}") from e
     return tensors, state
+
+
+def _other_version(words: str) -> str:
+    """Return a message on a file of another version; ``words`` say which version wrote which file."""
+    return (
+        f"{words}, in a format that warpgs {__version__} does not read. Open it with that version, or fit the scene again into "
+        "a new --out; point_cloud.ply stays readable"
+    )
 
 
 def cameras_of(scene: Scene) -> dict[str, Camera]:
@@ -257,26 +181,9 @@ def cameras_of(scene: Scene) -> dict[str, Camera]:
     return {v.name: v.camera for v in scene.views}
 
 
-def learned_cameras(scene: Scene, split: Split, learned: LearnedViews) -> Mapping[str, Camera]:
-    """Return the cameras of all views of a scene after the view modules, by name."""
-    return learned.cameras(cameras_of(scene), split.train, split.test)
-
-
 def with_cameras(scene: Scene, cameras: Mapping[str, Camera]) -> Scene:
     """Return a scene in which the views named in a mapping have the mapping's cameras; other views are unchanged."""
     return replace(scene, views=tuple(replace(v, camera=cameras.get(v.name, v.camera)) for v in scene.views))
-
-
-def learned_figures(
-    learned: LearnedViews, scene: Scene, split: Split, given: Mapping[str, Camera], test: Sequence[View],
-    gaussians: Gaussians, options: RasterizeOptions,
-) -> dict[str, dict[str, Any]]:  # fmt: skip
-    """Return the figures of each view module by its name, for metrics.json; ``given`` are the cameras before the fit."""
-    cameras, scale = cameras_of(scene), scene.normalization.scale
-    return {
-        m.name: m.figures(FittedViews(learned.params_of(m), split.train, test, given, cameras, scale, gaussians, options))
-        for m in learned.modules
-    }
 
 
 CONFIG = "config.json"
@@ -329,20 +236,28 @@ def camera_values(camera: Camera) -> dict[str, Any]:
     return values if camera.distortion is not None else {n: v for n, v in values.items() if n != "distortion"}
 
 
-def _camera(values: dict[str, Any]) -> Camera:
-    """Return the camera from the result of `camera_values`; UsageError if its camera model is not supported."""
-    arrays = {k: np.array(values[k], np.float64) for k in ("viewmat", "K", "distortion") if values.get(k) is not None}
-    camera = Camera(**(values | arrays))
-    check_camera(camera)
-    return camera
-
-
 def _cameras(stored: dict[str, Any], path: Path) -> dict[str, Camera]:
-    """Return the cameras of a file by name; DataError if a camera model is not supported."""
-    try:
-        return {n: _camera(c) for n, c in stored.items()}
-    except UsageError as e:
-        raise DataError(f"{path}: {e}") from e
+    """Return the cameras of a file, from `camera_values`, by name; DataError if `rasterize` would refuse one."""
+    found = {}
+    for name, values in stored.items():
+        arrays = {k: np.array(values[k], np.float64) for k in ("viewmat", "K", "distortion") if values.get(k) is not None}
+        camera = found[name] = Camera(**(values | arrays))
+        pose, K, (least, most) = arrays["viewmat"], arrays["K"], FOCAL_LENGTHS
+        off = max(abs(K[0, 1]), abs(K[1, 0]), *np.abs(K[2] - (0, 0, 1)))
+        with np.errstate(over="ignore", invalid="ignore"):  # where products overflow, no comparison is true
+            rigid = np.abs(pose[:3, :3] @ pose[:3, :3].T - np.eye(3)).max() <= POSE_TOLERANCE
+        rigid &= np.abs(pose[3] - (0, 0, 0, 1)).max() <= POSE_TOLERANCE and np.abs(pose[:3, 3]).max() <= MAX_TRANSLATION
+        try:
+            check_camera(camera)
+            if not rigid:
+                raise UsageError(f"viewmat must be a rotation and a translation within {MAX_TRANSLATION:g}, above 0, 0, 0, 1")
+            if not (off <= K_TOLERANCE and all(least <= abs(f) <= most for f in (K[0, 0], K[1, 1]))):
+                raise UsageError(
+                    f"K must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], with focal lengths in {least:g} to {most:g}"
+                )
+        except UsageError as e:
+            raise DataError(f"{path}: incomplete or damaged: cameras.{name[:60]}: {e}; {RESTORE}") from e
+    return found
 
 
 def record_of(
@@ -367,33 +282,43 @@ def read_record(folder: Path) -> dict[str, Any]:
     path = folder / CONFIG
     try:
         record = schema.read(path, folder)
-    except FileNotFoundError as e:
-        lack = f"holds no run ({CONFIG} is missing)" if folder.is_dir() else "no such folder"
-        near = "" if folder.is_dir() else similar_folder(folder)
+    except (FileNotFoundError, NotADirectoryError) as e:
+        lack, near = f"holds no run ({CONFIG} is missing)", ""
+        if not folder.is_dir():
+            lack = "is a file, not the folder of a run" if folder.is_file() else "no such folder"
+            near = similar_folder(folder)
         raise DataError(f"{folder}: {lack}; {near or 'give a folder that `warpgs fit --out` filled'}") from e
-    except NotADirectoryError as e:
-        raise DataError(f"{folder}: is a file, not the folder of a run; give a folder that `warpgs fit --out` filled") from e
-    except (OSError, schema.SchemaError) as e:
+    except (OSError, SchemaError) as e:
         raise DataError(f"{path}: cannot be read ({e}); give a folder that `warpgs fit --out` filled") from e
     if not isinstance(record, dict) or "config" not in record:
         raise DataError(f"{path}: not a record of a fit; give a folder that `warpgs fit --out` wrote")
     if record.get("format") != FORMAT:  # version 0.1.0 stored no number
         stored = record.get("versions")
         version = stored.get("warpgs", "unknown") if isinstance(stored, dict) else "unknown"
-        raise DataError(
-            f"{path}: warpgs {version} wrote this run, in a format that warpgs {__version__} does not read. Open it with "
-            f"warpgs {version}, or fit the scene again into a new --out; its point_cloud.ply stays readable"
-        )
+        raise DataError(_other_version(f"{path}: warpgs {version} wrote this run"))
     try:
-        check_record(record)
-    except schema.SchemaError as e:
-        raise DataError(f"{path}: incomplete or damaged: {e}; restore the file, or fit the scene again into a new --out") from e
+        _RECORD(record, "")
+        if not record["train"]:
+            raise SchemaError("train must name a view")
+        for name in [*record["train"], *record["test"]]:
+            if name not in record["cameras"]:
+                raise SchemaError(f"cameras lacks the view {name[:60]!r}")
+    except SchemaError as e:
+        raise DataError(f"{path}: incomplete or damaged: {e}; {RESTORE}") from e
     stored, (record["config"], lost) = record["config"], upgraded(record["config"])
     if lost:
         record["lost"] = lost
     elif record["config"] != stored:
         record["config_hash"] = fingerprint(record["config"])
     return record
+
+
+SAME = {
+    "fingerprint": "the scene (its images, cameras, points or maps, or a flag that changes them, like --downscale)",
+    "train": "the set of training views", "test": "the set of held-out views", "config": "config", "device": "device",
+    "own_code": "the code",
+}  # fmt: skip
+"""Parts of config.json that stay the same in a continued run, as text for the user."""
 
 
 def check_same(record: dict[str, Any], stored: dict[str, Any], out: Path) -> None:
@@ -405,27 +330,25 @@ def check_same(record: dict[str, Any], stored: dict[str, Any], out: Path) -> Non
         )
     _check_lost(stored, out)
     _check_named_again(record["config"], stored["config"], out)
-    for key in ("fingerprint", "train", "test", "config", "device", "own_code"):
-        now, then = json.loads(json.dumps(record[key])), stored.get(key, {} if key == "own_code" else None)
-        if now != then:
-            if key == "own_code":
-                raise UsageError(
-                    f"--resume: the code of {', '.join(now or then or {})} has changed since the run in {out} began, or the "
-                    "run did not record its version; restore the code, or give a new --out"
-                )
-            if isinstance(now, dict) and isinstance(then, dict):
-                changed = [k for k in now if now[k] != then.get(k)]
-                key = f"{key} ({', '.join(changed)})"
-            words = {
-                "fingerprint": "the scene (its images, cameras, points or maps, or a flag that changes them, like --downscale)",
-                "train": "the set of training views", "test": "the set of held-out views",
-            }  # fmt: skip
-            options = [f"{k} was {stored['scene'].get(k)}" for k, v in record["scene"].items() if stored["scene"].get(k) != v]
-            was = f" ({', '.join(o for o in options if not o.startswith('path '))})" if key != "device" else ""
+    for key, words in SAME.items():
+        now: Any = plain(record[key])
+        then = stored.get(key, {})
+        if now == then:
+            continue
+        if key == "own_code":
             raise UsageError(
-                f"--resume: {words.get(key, key)} differs from the run in {out}{was if len(was) > 3 else ''}. To continue with "
-                f"the run's own flags, give only --out {shlex.quote(str(out))} --resume; for other flags, give a new --out"
+                f"--resume: the code of {', '.join(now or then)} has changed since the run in {out} began, or the run did not "
+                "record its version; restore the code, or give a new --out"
             )
+        if isinstance(now, dict):
+            words += f" ({', '.join(k for k in now | then if now.get(k) != then.get(k))})"
+        scene = record["scene"].items() if key != "device" else ()
+        was = [f"{k} was {stored['scene'].get(k)}" for k, v in scene if k != "path" and stored["scene"].get(k) != v]
+        were = f" ({', '.join(was)})" if was else ""
+        raise UsageError(
+            f"--resume: {words} differs from the run in {out}{were}. To continue with the run's own flags, give only --out "
+            f"{shlex.quote(str(out))} --resume; for other flags, give a new --out"
+        )
 
 
 def _check_lost(stored: dict[str, Any], out: Path) -> None:
@@ -454,18 +377,16 @@ def check_checkpoint(state: dict[str, Any], stored: dict[str, Any], out: Path) -
 
 def _check_named_again(now: dict[str, Any], then: dict[str, Any], out: Path) -> None:
     """Raise a UsageError if a run used code from outside warpgs that is not named again."""
-
-    def outside(config: dict[str, Any]) -> dict[str, list[str]]:
-        names = {"--strategy": [config.get("strategy")]}
-        for field in ("loss_terms", "view_modules"):
-            names[f"--{field.replace('_', '-')}"] = [part["name"] for part in config.get(field, [])]
-        return {option: [n for n in found if isinstance(n, str) and ":" in n] for option, found in names.items()}
-
-    for option, names in outside(then).items():
-        if set(names) - set(outside(now)[option]):
+    for field in ("strategy", "loss_terms", "view_modules"):
+        named, needed = (
+            [value] if isinstance(value := config.get(field, []), str) else [part["name"] for part in value]
+            for config in (now, then)
+        )
+        outside = [name for name in needed if ":" in name]
+        if set(outside) - set(named):
             raise UsageError(
                 f"--resume: the run in {out} was fitted with user code. A run folder never decides which code is loaded; give "
-                f"{option} {','.join(names)} again"
+                f"--{field.replace('_', '-')} {','.join(outside)} again"
             )
 
 
@@ -529,8 +450,8 @@ def stored_request(folder: Path) -> FitRequest:
         raise UsageError(f"{e}, with the scene and all other flags of the run") from e
     try:
         config = FitConfig.from_json(record["config"])
-    except (UsageError, schema.SchemaError) as e:
-        raise DataError(f"{folder / CONFIG}: invalid settings ({e}); restore the file, or fit the scene again") from e
+    except (UsageError, SchemaError) as e:
+        raise DataError(f"{folder / CONFIG}: invalid settings ({e}); {RESTORE}") from e
     return FitRequest(scene, folder, config, record["device"], resume=True)
 
 
@@ -547,32 +468,22 @@ def open_run(folder: str | Path, device: str | torch.device = "auto") -> StoredR
         UsageError: The name of the device is unknown.
     """
     folder = Path(folder)
-    where, _ = choose_device(device)
+    path, (where, _) = folder / TENSORS, choose_device(device)
     record = read_record(folder)
-    offset, scale = record["normalization"]["offset"], record["normalization"]["scale"]
-    red, green, blue = map(float, record["background"])
     tensors, state = load_checkpoint(folder)
-    gaussians, step = _model_of(tensors, state, folder / TENSORS)
-    cameras = _cameras(record["cameras"], folder / CONFIG) | _cameras(state.get("cameras", {}), folder / TENSORS)
-    train, test, rule = tuple(record["train"]), tuple(record["test"]), record["config"]["rule"]
-    return StoredRun(
-        gaussians.to(where),
-        Normalization(np.array(offset, np.float64), float(scale)),
-        cameras, train, test, rule, (red, green, blue), step, folder, record, transparent=record.get("transparent", False),
-        antialiased=record["config"].get("antialiased", False),
-    )  # fmt: skip
-
-
-def _model_of(tensors: dict[str, torch.Tensor], state: dict[str, Any], path: Path) -> tuple[Gaussians, int]:
-    """Return the Gaussians of a checkpoint and the number of steps done; DataError if either is missing."""
+    found = {n.removeprefix("params."): t for n, t in tensors.items() if n.startswith("params.")}
     try:
         MODEL_STATE(state, "")
-    except schema.SchemaError as e:
-        raise DataError(f"{path}: stored state incomplete or damaged: {e}; restore the file, or fit the scene again") from e
-    found = {n.removeprefix("params."): t for n, t in tensors.items() if n.startswith("params.")}
-    if "sh_packed" in found and "degrees" in tensors:
-        try:
+        if "sh_packed" in found and "degrees" in tensors:
             found["sh"] = unpack(found.pop("sh_packed"), tensors["degrees"])
-        except ValueError as e:
-            raise DataError(f"{path}: incomplete or damaged: {e}; restore the file, or fit the scene again") from e
-    return checked_gaussians(found, str(path)), state["step"]
+    except ValueError as e:
+        raise DataError(f"{path}: incomplete or damaged: {e}; {RESTORE}") from e
+    gaussians = checked_gaussians(found, str(path)).to(where)
+    normalization, (red, green, blue) = record["normalization"], map(float, record["background"])
+    return StoredRun(
+        gaussians,
+        Normalization(np.array(normalization["offset"], np.float64), float(normalization["scale"])),
+        _cameras(record["cameras"], folder / CONFIG) | _cameras(state.get("cameras", {}), path),
+        tuple(record["train"]), tuple(record["test"]), record["config"]["rule"], (red, green, blue), state["step"], folder,
+        record, transparent=record.get("transparent", False), antialiased=record["config"].get("antialiased", False),
+    )  # fmt: skip

@@ -45,46 +45,40 @@ def fit_kernels(cuda: bool) -> list[tuple[wp.Kernel, int]]:
     """Return a kernel of each module that a fit on CUDA or on the CPU launches, with the block size of the launches."""
     # On CUDA a module is compiled once for each block size. Scores are computed on the CPU for fits on any device.
     real = wp.float32
-    common = [
-        (tiles.make_kernels(real, cuda).pack_counts, THREADS),
-        *(((tiles.make_emit if cuda else tiles.make_emit_cpu)(real, slotted), THREADS) for slotted in (True, False)),
-        *((tiles.make_find_ranges(slotted, cuda), THREADS) for slotted in (True, False)),
-        (neighbours.make_knn_kernels(real).search, THREADS), (update.sample, THREADS),
-        (neighbours.make_reach_kernel(), THREADS), (update.decay, THREADS),
-        (update.end_kernel, THREADS), (mcmc.make_kernel(), THREADS),
+    plain = [
+        tiles.make_kernels(real, cuda).pack_counts,
+        *((tiles.make_emit if cuda else tiles.make_emit_cpu)(real, slotted) for slotted in (True, False)),
+        *(tiles.make_find_ranges(slotted, cuda) for slotted in (True, False)),
+        neighbours.make_knn_kernels(real).search, neighbours.make_reach_kernel(), update.sample,
+        update.decay, update.end_kernel, mcmc.make_kernel(),
+        blend.make_segments(real).gather_weights,
     ]  # fmt: skip
     if not cuda:
-        blending, scoring = (
-            blend_cpu.make_kernels(real, TILE_SIZE),
-            [ssim.make_kernels(real, summed) for summed in (True, False)],
-        )
-        without_depth = blend_cpu.make_kernels(real, TILE_SIZE, deep=False)
-        updates = [update.make_adam_kernel(real, split, update.LANES) for split in (True, False)]
-        variant = CAMERA_MODEL, "stored", False, sh.BASES
-        own = [
+        blending, variant = blend_cpu.make_kernels(real, TILE_SIZE), (CAMERA_MODEL, "stored", False, sh.BASES)
+        scoring = [ssim.make_kernels(real, summed) for summed in (True, False)]
+        plain += [
             project_cpu.make_forward(real, *variant), project_cpu.make_backward(real, *variant, False),
-            blending.forward, blending.backward, without_depth.backward,
+            blending.forward, blending.backward, blend_cpu.make_kernels(real, TILE_SIZE, deep=False).backward,
             walk.make_walk(real, TILE_SIZE, walk.make_contributions),
-            blend.make_segments(real, VALUES, 9 + COLORS).sum_gradients, blend.make_segments(real).gather_weights,
-            update.squared_errors,
-            sweep.match, sweep.best, sweep.follow_cpu,
-            *(k for s in scoring for k in (s.forward, s.backward)), *updates,
+            blend.make_segments(real, VALUES, 9 + COLORS).sum_gradients, update.squared_errors, sweep.match,
+            sweep.best, sweep.follow_cpu,
+            *(k for s in scoring for k in (s.forward, s.backward)),
+            *(update.make_adam_kernel(real, split, update.LANES) for split in (True, False)),
         ]  # fmt: skip
-        return [(kernel, 1) for kernel in [*(k for k, _ in common), *own]]
+        return [(kernel, 1) for kernel in plain]
     blending, warps = blend_cuda.make_kernels(TILE_SIZE), 32 * blend_cuda.WARPS
-    own = [
-        (project_cuda.make_forward(wp.float32, CAMERA_MODEL), BLOCK),
-        (project_cuda.make_backward(wp.float32, CAMERA_MODEL), BLOCK),
-    ]
-    own += [(blend_cuda.make_forward(TILE_SIZE, save, per), warps) for save in (True, False) for per in (1, 2)]
-    own += [(graphs.make_fetch(), THREADS), (blending.order_tiles, blend_cuda.ORDER_THREADS)]
-    own += [(blending.contributions, TILE_SIZE * TILE_SIZE)]
-    own += [(blend.make_segments(real).gather_weights, THREADS), (sweep.follow, sweep.BLOCK)]
+    others = [
+        (project_cuda.make_forward(real, CAMERA_MODEL), BLOCK), (project_cuda.make_backward(real, CAMERA_MODEL), BLOCK),
+        *((blend_cuda.make_forward(TILE_SIZE, save, per), warps) for save in (True, False) for per in (1, 2)),
+        (blending.order_tiles, blend_cuda.ORDER_THREADS), (blending.contributions, TILE_SIZE * TILE_SIZE),
+        (sweep.follow, sweep.BLOCK), (ssim.make_cuda_kernels().forward, ssim.THREADS),
+    ]  # fmt: skip
+    plain += [graphs.make_fetch(), update.scheduled_update]
     for depth, chunk in itertools.product((False, True), blend_cuda.CHUNKS):  # with a loss term that reads depth, and without
         passes = blend_cuda.make_backward(TILE_SIZE, depth, chunk, False)
-        own += [(passes.backward, warps), (passes.gather, THREADS)]
-    own += [(ssim.make_cuda_kernels().forward, ssim.THREADS), (update.scheduled_update, THREADS)]
-    return common + own
+        plain.append(passes.gather)
+        others.append((passes.backward, warps))
+    return [*((kernel, THREADS) for kernel in plain), *others]
 
 
 def _load(device: torch.device, kernel: wp.Kernel, block: int) -> tuple[str, str, int, bool, float]:
@@ -98,10 +92,11 @@ def precompile_kernels(devices: list[torch.device] | None = None) -> Iterator[tu
     """Compile the modules that are not cached, by default for the CPU and all CUDA devices; yield `_load` of each when done."""
     if devices is None:
         devices = [torch.device("cpu"), *(torch.device("cuda", i) for i in range(torch.cuda.device_count()))]
-    jobs = {}
-    for device in devices:
-        for kernel, block in fit_kernels(device.type == "cuda"):
-            jobs[device, kernel.module, block] = device, kernel, block
+    jobs = {
+        (device, kernel.module, block): (device, kernel, block)
+        for device in devices
+        for kernel, block in fit_kernels(device.type == "cuda")
+    }
     # Warp's own force_load also uses threads, but does not report the time of each module
     with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
         for done in as_completed([pool.submit(_load, *job) for job in jobs.values()]):

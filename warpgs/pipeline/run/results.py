@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import math
 import shlex
 import time
@@ -11,7 +10,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -52,54 +51,50 @@ from warpgs.report.page import Section, curve, image_names, write_page
 from warpgs.report.progress import duration, read_events
 from warpgs.scene import Camera, Gaussians, Scene, View
 
-DEPTH, NORMALS = "given_depth", "given_normals"
-"""Names of the maps of the loss terms."""
+T = TypeVar("T")
+GIVEN = {
+    "given_depth": ("depth", "given depth: median difference of rendered depth {:.2%} (worst view {:.2%})"),
+    "given_normals": (
+        "normals", "given normals: median difference of the normals of rendered depth {:.1f} degrees (worst view {:.1f})"
+    ),
+}  # fmt: skip
+"""Name in metrics.json, and summary, of each map of the loss terms."""
 
 
 def given_figures(
     train: Sequence[View], views: Sequence[TrainingView], gaussians: Gaussians, options: RasterizeOptions
 ) -> dict[str, Any]:
     """Compare the model with given depth and normals: rows by view and a summary, for each kind that a loss term compared."""
-    rows: dict[str, list[dict[str, Any]]] = {"depth": [], "normals": []}
+    rows: dict[str, list[dict[str, Any]]] = {name: [] for name in GIVEN}
     for view, mapped in zip(train, views, strict=True):
-        maps = {n: t.cpu().numpy() for n, t in mapped.maps.items() if n in (DEPTH, NORMALS) and bool(t.any())}
+        maps = {n: t.cpu().numpy() for n, t in mapped.maps.items() if n in GIVEN and bool(t.any())}
         if not maps:
             continue
         _, depth, alpha = render_view(gaussians, view, options)
         shown = alpha > GIVEN_MIN_ALPHA
-        if DEPTH in maps:
-            scaled, weight, unit = np.moveaxis(maps[DEPTH], -1, 0)
-            at = weight > 0
-            both = at & shown
-            off = np.abs(depth[both] * scaled[both] / unit[both] - 1)
-            rows["depth"].append(_row(view.name, at, off))
-        if NORMALS in maps:
-            given = maps[NORMALS]
-            K = torch.from_numpy(view.camera.K).float()
-            camera = replace(view.camera, viewmat=torch.eye(4, dtype=torch.float32, device="cpu"), K=K)
-            found = depth_normals(camera, torch.as_tensor(np.where(shown, depth, 0), dtype=torch.float32)).numpy()
-            at = given.any(-1)
-            both = at & found.any(-1)
-            cosine = (given[both] * found[both]).sum(-1).clip(-1, 1)
-            rows["normals"].append(_row(view.name, at, np.degrees(np.arccos(cosine))))
-    words = {
-        "depth": "given depth: median difference of rendered depth {:.2%} (worst view {:.2%})",
-        "normals": "given normals: median difference of the normals of rendered depth {:.1f} degrees (worst view {:.1f})",
-    }
-    found = {}
-    for name, own in rows.items():
-        if not own:
-            continue
-        off = [r["difference"] for r in own if np.isfinite(r["difference"])] or [float("nan")]
-        share = float(np.mean([r["coverage"] for r in own]))
-        summary = f"{words[name].format(float(np.median(off)), max(off))}, over {share:.1%} of the pixels of {len(own)} views"
-        found[name] = {"views": own, "summary": summary}
-    return found
-
-
-def _row(name: str, at: np.ndarray, off: np.ndarray) -> dict[str, Any]:
-    difference = float(np.median(off)) if len(off) else float("nan")
-    return {"name": name, "coverage": float(at.mean()), "difference": difference}
+        for name, given in maps.items():
+            if name == "given_depth":
+                scaled, weight, unit = np.moveaxis(given, -1, 0)
+                at = weight > 0
+                both = at & shown
+                off = np.abs(depth[both] * scaled[both] / unit[both] - 1)
+            else:
+                K = torch.from_numpy(view.camera.K).float()
+                camera = replace(view.camera, viewmat=torch.eye(4, dtype=torch.float32, device="cpu"), K=K)
+                found = depth_normals(camera, torch.as_tensor(np.where(shown, depth, 0), dtype=torch.float32)).numpy()
+                at = given.any(-1)
+                both = at & found.any(-1)
+                off = np.degrees(np.arccos((given[both] * found[both]).sum(-1).clip(-1, 1)))
+            difference = float(np.median(off)) if len(off) else math.nan
+            rows[name].append({"name": view.name, "coverage": float(at.mean()), "difference": difference})
+    figures = {}
+    for name, (kind, words) in GIVEN.items():
+        if own := rows[name]:
+            off = [r["difference"] for r in own if np.isfinite(r["difference"])] or [math.nan]
+            share = float(np.mean([r["coverage"] for r in own]))
+            summary = f"{words.format(float(np.median(off)), max(off))}, over {share:.1%} of the pixels of {len(own)} views"
+            figures[kind] = {"views": own, "summary": summary}
+    return figures
 
 
 VIEWS = 3
@@ -110,27 +105,13 @@ SIDE = 64
 
 def _window(camera: Camera, generator: np.random.Generator) -> tuple[int, int, int, int]:
     """Sample a part of an image, [left, top, width, height], with edges at tile edges or image edges."""
-    sides = []
-    for length in (camera.width, camera.height):
-        first = TILE_SIZE * int(generator.integers(max(0, length - SIDE) // TILE_SIZE + 1))
-        sides.append((first, min(SIDE, length - first)))
-    (x, width), (y, height) = sides
-    return x, y, width, height
+    sizes = camera.width, camera.height
+    x, y = (TILE_SIZE * int(generator.integers(max(0, size - SIDE) // TILE_SIZE + 1)) for size in sizes)
+    return x, y, min(SIDE, camera.width - x), min(SIDE, camera.height - y)
 
 
-@contextlib.contextmanager
-def _one_thread() -> Iterator[None]:
-    """Compute on one thread in the block: for many small tensors, threads wait for each other longer than they compute."""
-    count = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(count)
-
-
-def _seconds(render: Callable[[], object], device: torch.device) -> float:
-    """Return the wall time of the second of two calls [s]: the first loads kernels and allocates."""
+def _milliseconds(render: Callable[[], object], device: torch.device) -> float:
+    """Return the wall time of the second of two calls [ms]: the first loads kernels and allocates."""
     for _ in range(2):
         if device.type == "cuda":
             torch.cuda.synchronize(device)
@@ -138,7 +119,7 @@ def _seconds(render: Callable[[], object], device: torch.device) -> float:
         render()
         if device.type == "cuda":
             torch.cuda.synchronize(device)
-    return time.perf_counter() - began
+    return 1000 * (time.perf_counter() - began)
 
 
 @torch.no_grad()
@@ -149,40 +130,40 @@ def rule_report_of(
     # Three random views are rendered with the rule, as in the fit. 64 x 64 px of each are compared with the image of rule
     # `exact` in float64. That image is computed by `warpgs.render.reference` without the kernels, or by the kernels if
     # `warpgs.geometry` does not have the camera model.
-    generator = np.random.default_rng(seed)
+    generator, device = np.random.default_rng(seed), gaussians.means.device
     chosen = [views[i] for i in sorted(generator.permutation(len(views))[:VIEWS])]
-    device = gaussians.means.device
     assert options.background is not None
-    options = dataclasses.replace(options, background=options.background.to(gaussians.means))
-    rule, exact = options.rule, dataclasses.replace(options, rule="exact")
-    errors, windows = [], {}
+    options = replace(options, background=options.background.to(gaussians.means))
+    exact, errors, windows = replace(options, rule="exact"), [], {}
     for view in chosen:
         window = windows[view.name] = _window(view.camera, generator)
-        found = rasterize(gaussians, view.camera, dataclasses.replace(options, window=window)).rgb
+        found = rasterize(gaussians, view.camera, replace(options, window=window)).rgb
         # what reaches the part under `exact`; tiles are listed with a margin
-        near = rasterize(gaussians, view.camera, dataclasses.replace(exact, window=window)).visible[0]
+        near = rasterize(gaussians, view.camera, replace(exact, window=window)).visible[0]
         part = Gaussians(**{n: t[near] for n, t in gaussians.tensors().items()})
-        wanted = _wanted(part, view.camera, window, exact)
-        errors.append((found.double() - wanted).abs().flatten())
-    error = torch.cat(errors)
-    whole = chosen[0].camera
+        errors.append((found.double() - _wanted(part, view.camera, window, exact)).abs().flatten())
+    error, camera = torch.cat(errors), chosen[0].camera
     result = {
-        "rule": rule, "max": float(error.max()), "mean": float(error.mean()), "psnr": psnr_of(float((error**2).mean())),
+        "rule": options.rule, "max": float(error.max()), "mean": float(error.mean()), "psnr": psnr_of(float((error**2).mean())),
         "views": {n: list(w) for n, w in windows.items()}, "half_resolution": half_resolution,
-        "render_ms": 1000 * _seconds(lambda: rasterize(gaussians, whole, options), device),
+        "render_ms": _milliseconds(lambda: rasterize(gaussians, camera, options), device),
     }  # fmt: skip
-    if rule != "exact":
-        result["exact_ms"] = 1000 * _seconds(lambda: rasterize(gaussians, whole, exact), device)
+    if options.rule != "exact":
+        result["exact_ms"] = _milliseconds(lambda: rasterize(gaussians, camera, exact), device)
     return result | {"summary": _summary(result)}
 
 
 def _wanted(part: Gaussians, camera: Camera, window: tuple[int, int, int, int], exact: RasterizeOptions) -> torch.Tensor:
     """Return a part of an image under `exact` in float64; by the kernels for camera models that the reference lacks."""
-    if camera.model in MODELS:
-        with _one_thread():
-            return reference_image(part, camera, window, exact.background, part.sh_degree, exact.antialiased)
-    doubled = Gaussians(**{n: t.double() for n, t in part.tensors().items()})
-    return rasterize(doubled, camera, dataclasses.replace(exact, background=exact.background.double(), window=window)).rgb
+    if camera.model not in MODELS:
+        doubled = Gaussians(**{n: t.double() for n, t in part.tensors().items()})
+        return rasterize(doubled, camera, replace(exact, background=exact.background.double(), window=window)).rgb
+    count = torch.get_num_threads()
+    torch.set_num_threads(1)  # for many small tensors, threads wait for each other longer than they compute
+    try:
+        return reference_image(part, camera, window, exact.background, part.sh_degree, exact.antialiased)
+    finally:
+        torch.set_num_threads(count)
 
 
 def _summary(r: dict[str, Any]) -> str:
@@ -190,9 +171,8 @@ def _summary(r: dict[str, Any]) -> str:
     sizes = {f"{w} x {h} px" for _, _, w, h in r["views"].values()}
     where = f"on {' or '.join(sorted(sizes))} of {len(r['views'])} random training view{'s' if len(r['views']) > 1 else ''}"
     error = f"{r['mean']:.1e} on average and {r['max']:.1e} at most, {r['psnr']:.0f} dB, {where}"
-    if r["rule"] == "exact":
-        words = f"rule exact has no cut-offs; float32 differs from float64 by {error}"
-    else:
+    words = f"rule exact has no cut-offs; float32 differs from float64 by {error}"
+    if r["rule"] != "exact":
         ratio = r["render_ms"] / r["exact_ms"]
         words = (
             f"images by rule {r['rule']} differ from images by rule exact in float64 by {error}; a view took "
@@ -219,8 +199,7 @@ FADED = 0.45
 def shown_steps(phases: Phases) -> set[int]:
     """Return the steps of the events that get an image: the first event, and the first event in the second half of phase 2."""
     middle = 0.5 * (phases.refine + phases.stable_start)
-    late = [e for e in phases.events if e >= middle]
-    return {*phases.events[:1], *late[:1]}
+    return {*phases.events[:1], *[e for e in phases.events if e >= middle][:1]}
 
 
 def _open_pixels(strategy: Sampling, consistent: bool, quantile: float) -> str:
@@ -234,18 +213,16 @@ def view_sheet(
     name: str, step: int, view: TrainingView, disparity: np.ndarray | None, sampled: SampledView, strategy: Sampling
 ) -> np.ndarray:
     """Return a sheet of one view at one event, colours [rows, columns, 3]: images, gate, samples, scores of weight above 0."""
-    image, rendered = (t.cpu().numpy() for t in (view.image, sampled.rendered))
-    at, gate = sampled.at.cpu().numpy(), sampled.gate.cpu().numpy()
-    # each score is shown below its inputs
-    tiles = [
-        Tile("render before", rendered),
+    image, at, gate = (t.cpu().numpy() for t in (view.image, sampled.at, sampled.gate))
+    scores = {n: score.cpu().numpy() for n, score in sampled.scores.items()}
+    tiles = [  # each score is shown below its inputs
+        Tile("render before", sampled.rendered.cpu().numpy()),
         Tile("image", image),
         *([] if disparity is None else [Tile("disparity, near is 1", disparity, "TURBO")]),
         Tile("gate", np.where(gate[..., None], OPEN, CLOSED).astype(np.float32)),
         Tile("sampled pixels", 1 - FADED * (1 - image.mean(-1, keepdims=True).repeat(3, -1)), dots=at),
+        *(Tile(n, score) for n, score in scores.items()),
     ]
-    scores = {n: score.cpu().numpy() for n, score in sampled.scores.items()}
-    tiles += [Tile(n, score) for n, score in scores.items()]
     asked = strategy.asked_quantile
     widened = f"; too few passed at the {asked:g} quantile" if sampled.quantile < asked else ""
     lines = [
@@ -259,24 +236,22 @@ def view_sheet(
     return contact_sheet(f"{name}, step {step:,}", lines, tiles, columns=5, tile_width=320, text=1.25)
 
 
-def _shown(views: Sequence[SampledView]) -> list[SampledView]:
-    """Return up to three of an event's views, evenly spaced."""
-    count = len(views)
-    return [views[i] for i in np.unique(np.linspace(0, count - 1, min(SHOWN, count)).round().astype(int))]
+def evenly_spaced(values: Sequence[T], most: int) -> list[T]:
+    """Return up to ``most`` of some values."""
+    return [values[i] for i in np.unique(np.linspace(0, len(values) - 1, min(most, len(values))).round().astype(int))]
 
 
 def _on_host(sampled: SampledView) -> SampledView:
     """Return a copy with its maps in host memory."""
     maps = {n: getattr(sampled, n).cpu() for n in ("rendered", "gate", "at")}
-    return dataclasses.replace(sampled, scores={n: t.cpu() for n, t in sampled.scores.items()}, **maps)
+    return replace(sampled, scores={n: t.cpu() for n, t in sampled.scores.items()}, **maps)
 
 
 @contextlib.contextmanager
 def images_kept(fit: Trainer, names: list[str], out: Path) -> Iterator[Callable[[], None]]:
     """Write images of some events, ``sampling/STEP.png``, in a thread during the block; yields a function that awaits them."""
-    # A separate thread writes the images. The end of the block waits for the images, and so does the yielded function. Call
-    # this function before a checkpoint, since a fit that continues from the checkpoint does not write earlier images. If an
-    # image cannot be written, the fit continues, with one message in ``fit.messages``.
+    # Call the function before a checkpoint, since a fit that continues from it does not write earlier images. If an image
+    # cannot be written, the fit continues, with one message in ``fit.messages``.
     steps, strategy = shown_steps(fit.phases), fit.strategy
     disparities = fit.disparities or [None] * len(names)
     lost: list[int] = []
@@ -300,18 +275,14 @@ def images_kept(fit: Trainer, names: list[str], out: Path) -> Iterator[Callable[
                 fit.messages.append(f"images of sampling events are missing from the report: {e}")
             lost.append(step)
 
+    def on_event(step: int, sampled: Sequence[SampledView]) -> None:
+        if step in steps:
+            # the thread must not use the device, since steps may be captured at that time
+            kept = [_on_host(d) for d in evenly_spaced(sampled, SHOWN)]
+            views = [replace(fit.views[d.view], image=fit.views[d.view].image.cpu()) for d in kept]
+            writing.append(thread.submit(write, step, views, kept))
+
     with ThreadPoolExecutor(1) as thread:
-
-        def on_event(step: int, sampled: Sequence[SampledView]) -> None:
-            for sheet in writing:
-                if sheet.done():
-                    sheet.result()  # or what went wrong
-            if step in steps:
-                # the thread must not use the device, since steps may be captured at that time
-                kept = [_on_host(d) for d in _shown(sampled)]
-                views = [dataclasses.replace(fit.views[d.view], image=fit.views[d.view].image.cpu()) for d in kept]
-                writing.append(thread.submit(write, step, views, kept))
-
         strategy.on_event = on_event
         try:
             yield written
@@ -340,17 +311,17 @@ def sampling_report_of(fit: Trainer, out: Path) -> Section | None:
     events, layers = figures["events"], figures["layers"]
     if not events["count"]:
         return None
-    how = "sampled at random in proportion to S_importance," if strategy.scored else "sampled uniformly at random,"
+    how, after = "sampled uniformly at random", "All scores have weight 0, so no score is shown."
+    if strategy.scored:
+        how = "sampled at random in proportion to S_importance"
+        after = "S_importance is the weighted sum of the three scores; each score is shown below its source."
     if not strategy.at_random:
         how = "the highest in S_importance"
-    gate = _open_pixels(strategy, True, strategy.asked_quantile)
     depth = "consistent" if strategy.consistent else "rendered"
     words = (
-        f"Each dot is a pixel behind which a fine Gaussian was added at the {depth} depth, while the layer had "
-        f"capacity. These pixels are {how} among {gate} (the gate). "
-        + ("S_importance is the weighted sum of the three scores; each score is shown below its source."
-           if strategy.scored else "All scores have weight 0, so no score is shown.")
-    )  # fmt: skip
+        f"Each dot is a pixel behind which a fine Gaussian was added at the {depth} depth, while the layer had capacity. These "
+        f"pixels are {how}, among {_open_pixels(strategy, True, strategy.asked_quantile)} (the gate). {after}"
+    )
     if events["widened"]:
         words += (
             f" In {events['widened']:,} of {events['samplings']:,} samplings the gate was widened, because fewer than "
@@ -385,12 +356,11 @@ RENDER_WORKERS = 4
 
 def score_line(scores: dict[str, float]) -> str:
     """Return mean scores as one line for the user."""
-    distances = [f", {LABELS[k]} {v:.3f}" for k, v in scores.items() if k.startswith("lpips")]
-    opacity = [f", {LABELS[k]} {v:.3f}" for k, v in scores.items() if k.startswith("alpha")]
+    parts = [f"PSNR {scores['psnr']:.2f} dB", f"SSIM {scores['ssim']:.3f}"]
     if "psnr_foreground" in scores:
-        opacity.insert(0, f", PSNR of the foreground {scores['psnr_foreground']:.2f} dB")
-    lpips = "".join(distances) or ", LPIPS not measured"
-    return f"PSNR {scores['psnr']:.2f} dB, SSIM {scores['ssim']:.3f}{''.join(opacity)}{lpips}"
+        parts.append(f"PSNR of the foreground {scores['psnr_foreground']:.2f} dB")
+    parts += [f"{LABELS[k]} {v:.3f}" for kind in ("alpha", "lpips") for k, v in scores.items() if k.startswith(kind)]
+    return ", ".join([*parts, *([] if any(k.startswith("lpips") for k in scores) else ["LPIPS not measured"])])
 
 
 def summary_line(metrics: dict[str, Any]) -> str:
@@ -401,28 +371,25 @@ def summary_line(metrics: dict[str, Any]) -> str:
 
 def result_lines(metrics: dict[str, Any], out: Path | None) -> list[str]:
     """Return the final lines of a fit from metrics.json: scores, size, time, report, next steps."""
+    lines = [f"training PSNR {metrics['train']['psnr']:.2f} dB (no score of new views: no view is held out)"]
     if metrics["test"]:
+        lines = [f"held-out {score_line(metrics['test'])} ({len(metrics['views'])} views)"]
         best = ", ".join(f"{BASELINES.get(name, name)} {value:.2f} dB" for name, value in metrics["baselines"].items())
-        lines = [
-            f"held-out {score_line(metrics['test'])} ({len(metrics['views'])} views)",
-            *([f"  for comparison, without a fit: {best}"] if best else []),
-            *([f"  {metrics['coverage']['summary']}"] if "coverage" in metrics else []),
-        ]
-    else:
-        lines = [f"training PSNR {metrics['train']['psnr']:.2f} dB (no score of new views: no view is held out)"]
+        lines += [f"  for comparison, without a fit: {best}"] if best else []
+        lines += [f"  {metrics['coverage']['summary']}"] if "coverage" in metrics else []
     compiling = metrics["seconds"].get("compiling", 0.0)
     once = f", of which {duration(compiling)} to compile kernels, once on this machine" if compiling >= 1 else ""
     size = format_bytes(metrics["complexity"]["bytes"])
     lines.append(f"{metrics['gaussians']:,} Gaussians, {size}, in {duration(metrics['seconds']['total'])}{once}")
     if out is None:
         return [*lines, "nothing was written to disk, because no run folder (out) was given"]
-    run = shlex.quote(str(out))
-    commands = {
-        f"warpgs view {run}": "to look around in a browser", f"warpgs render {run}": "for a film",
-        f"warpgs export {run} --to scene.html": "for one file that opens anywhere",
-    }  # fmt: skip
-    width = max(map(len, commands))
-    following = [f"  {command:<{width}}  {purpose}" for command, purpose in commands.items()]
+    run, file = shlex.quote(str(out)), " --to scene.html"
+    width = len(f"warpgs export {run}{file}")
+    following = [
+        f"  {f'warpgs view {run}':<{width}}  to look around in a browser",
+        f"  {f'warpgs render {run}':<{width}}  for a film",
+        f"  warpgs export {run}{file}  for one file that opens anywhere",
+    ]
     return [*lines, f"report: {out / 'report.html'}", "next:", *following]
 
 
@@ -450,26 +417,23 @@ def evaluate_run(
     """Score held-out and training views, and save a render and depth map of each held-out (else training) view in ``out``."""
     for folder in () if out is None else ("renders", "depth"):
         make_folder(out / folder)
-    files = names or image_names(v.name for v in [*train, *test])
+    files, held_out = names or image_names(v.name for v in [*train, *test]), {v.name for v in test}
 
     def finish(view: View, image: np.ndarray, depth: np.ndarray, alpha: np.ndarray) -> ViewMetrics:
-        if out is not None:
+        if out is not None and (view.name in held_out or not test):
             row = side_by_side([np.clip(image, 0, 1), view.image, error_map(image, view.image)])
             write_bytes(out / "renders" / f"{files[view.name]}.png", png(row))
             write_bytes(out / "depth" / f"{files[view.name]}.png", png(depth_map(depth, alpha)))
-        return score(view, image, lpips if test else None, alpha)
+        return score(view, image, lpips if view.name in held_out else None, alpha)
 
-    def compare(view: View, image: np.ndarray, depth: np.ndarray, alpha: np.ndarray) -> ViewMetrics:
-        return score(view, image, alpha=alpha)
-
-    tasks, jobs = [(finish, v) for v in test or train] + [(compare, v) for v in train if test], []
+    jobs: list[Future[ViewMetrics]] = []
     with ThreadPoolExecutor(RENDER_WORKERS if lpips is None else 1) as render_workers:  # LPIPS needs much memory for each view
-        for work, view in counted(tasks, tell, "scoring", "views"):
-            jobs.append(render_workers.submit(work, view, *render_view(gaussians, view, options)))
+        for view in counted([*test, *train], tell, "scoring", "views"):
+            jobs.append(render_workers.submit(finish, view, *render_view(gaussians, view, options)))
             if len(jobs) > RENDER_WORKERS:
                 jobs[-RENDER_WORKERS].result()  # not all images at once
         found = [j.result() for j in jobs]
-    rows, train_rows = found[: len(test)], found[-len(train) :]
+    rows, train_rows = found[: len(test)], found[len(test) :]
     return {
         "test": summarize(rows), "train": summarize(train_rows),
         "views": [r.row() for r in rows],
@@ -482,14 +446,14 @@ def _images(
     views: list[View], gaussians: Gaussians, options: RasterizeOptions, rows: dict[str, Any], tell: Callable[[str], object]
 ) -> list[tuple[Any, ...]]:
     """Render up to `SHOWN_VIEWS` of the views, evenly spaced, and encode their images for the page."""
-    chosen = [views[i] for i in np.unique(np.linspace(0, len(views) - 1, min(SHOWN_VIEWS, len(views))).round().astype(int))]
     result = []
     with ThreadPoolExecutor(RENDER_WORKERS) as render_workers:
-        for view in counted(chosen, tell, "making the report", "views"):
+        for view in counted(evenly_spaced(views, SHOWN_VIEWS), tell, "making the report", "views"):
             image, depth, alpha = render_view(gaussians, view, options)
-            row = rows.get(view.name)
-            region = f", over {row['region']}" if row and row["region"] != "all" else ""
-            caption = f"PSNR {row['psnr']:.2f} dB{region}, SSIM {row['ssim']:.3f}" if row else "training view"
+            row, caption = rows.get(view.name), "training view"
+            if row:
+                region = f", over {row['region']}" if row["region"] != "all" else ""
+                caption = f"PSNR {row['psnr']:.2f} dB{region}, SSIM {row['ssim']:.3f}"
             parts = (image, view.image, error_map(image, view.image), depth_map(depth, alpha))
             result.append((view.name, caption, render_workers.map(webp, parts)))
     return [(name, caption, *parts) for name, caption, parts in result]
@@ -497,29 +461,21 @@ def _images(
 
 def _figures(metrics: dict[str, Any]) -> list[tuple[str, str]]:
     """Return the main figures of the page as pairs of label and value."""
-    held_out = []
-    if metrics["test"]:
-        best = max(metrics["baselines"].values(), default=float("nan"))
+    test, training = metrics["test"], f"{metrics['train']['psnr']:.2f} dB"
+    held_out = [("training PSNR: no score of new views", training)]
+    if test:
+        best = max(metrics["baselines"].values(), default=math.nan)
         held_out = [
-            ("held-out PSNR", f"{metrics['test']['psnr']:.2f} dB"), ("held-out SSIM", f"{metrics['test']['ssim']:.3f}"),
+            ("held-out PSNR", f"{test['psnr']:.2f} dB"), ("held-out SSIM", f"{test['ssim']:.3f}"),
             ("best baseline without a fit", f"{best:.2f} dB"),
+            *((LABELS[k], f"{test[k]:.3f}") for k in ("alpha_empty", "alpha_object") if k in test),
+            ("training PSNR", training),
         ]  # fmt: skip
-        alphas = [k for k in ("alpha_empty", "alpha_object") if k in metrics["test"]]
-        held_out += [(LABELS[k], f"{metrics['test'][k]:.3f}") for k in alphas]
+    size, seconds = format_bytes(metrics["complexity"]["bytes"]), duration(metrics["seconds"]["total"])
     return [
-        *held_out,
-        ("training PSNR" if held_out else "training PSNR: no score of new views", f"{metrics['train']['psnr']:.2f} dB"),
-        ("Gaussians", f"{metrics['gaussians']:,}"),
-        ("model", format_bytes(metrics["complexity"]["bytes"])),
-        ("steps", f"{metrics['steps']:,}"), ("time", duration(metrics["seconds"]["total"])),
+        *held_out, ("Gaussians", f"{metrics['gaussians']:,}"), ("model", size), ("steps", f"{metrics['steps']:,}"),
+        ("time", seconds),
     ]  # fmt: skip
-
-
-def _protocol(metrics: dict[str, Any]) -> dict[str, str]:
-    """Return the conditions and the definitions of the scores, as text of the page."""
-    words = {k.replace("_", " "): ", ".join(v) if isinstance(v, list) else str(v) for k, v in metrics["protocol"].items()}
-    words["configuration"] = f"{metrics['config_hash']}, step {metrics['steps']:,}"
-    return words | {LABELS.get(k, k): v for k, v in metrics["variants"].items()}
 
 
 def write_report(
@@ -541,29 +497,29 @@ def write_report(
     up = up_of(cameras[0], gaussians.means.detach().cpu().numpy().astype(np.float64))
     overview = render_overview(gaussians, options, *cameras, up)
     events = read_events(out / "metrics.jsonl")
-    steps = [e["step"] for e in events]
     curves = [
-        curve(title, steps, [e.get(name, math.nan) for e in events], unit)
+        curve(title, [e["step"] for e in events], [e.get(name, math.nan) for e in events], unit)
         for title, name, unit in (("Training loss", "loss", ""), ("Training PSNR", "psnr", "dB"), ("Gaussians", "count", ""))
     ]
     keys = [k for k in LABELS if k in metrics["test"]]
-    table = [["view", *(LABELS.get(k, k) for k in keys), "pixels"]] + [
+    table = [["view", *(LABELS[k] for k in keys), "pixels"]] + [
         [r["name"], *(f"{r.get(k, math.nan):.{2 if k.startswith('psnr') else 4}f}" for k in keys), r["region"]]
         for r in metrics["views"]
     ]
     images = _images(test or train, gaussians, options, {r["name"]: r for r in metrics["views"]}, tell)
-    covered = None
+    covered, camera = None, train[0].camera
     if "coverage" in metrics:
         names = image_names(v.name for v in scene.views)
         covered = coverage_section(out, metrics["coverage"], [name for name, *_ in images], names)
-    camera = train[0].camera
+    protocol = {k.replace("_", " "): ", ".join(v) if isinstance(v, list) else str(v) for k, v in metrics["protocol"].items()}
+    protocol["configuration"] = f"{metrics['config_hash']}, step {metrics['steps']:,}"
     write_page(
         out / "report.html",
         title=(out if Path(scene.path).parent == out else Path(scene.path)).resolve().name,  # not "scene" for found poses
         subtitle=f"preset {metrics['preset']}, {len(train)} training views, {len(test)} held out, "
         f"{camera.width} x {camera.height} px, {metrics['device']}",
         figures=_figures(metrics), notes=record["notes"], scores=table, views=images, curves=curves, sampling=sampling,
-        overview=None if overview is None else webp(overview), held_out=bool(test),
-        record={k: v for k, v in record.items() if k != "cameras"}, protocol=_protocol(metrics),
-        coverage=covered,
+        overview=None if overview is None else webp(overview), held_out=bool(test), coverage=covered,
+        record={k: v for k, v in record.items() if k != "cameras"},
+        protocol=protocol | {LABELS.get(k, k): v for k, v in metrics["variants"].items()},
     )  # fmt: skip

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
 from html import escape
 
 from warpgs.report.page import ticks
@@ -22,60 +20,46 @@ def family_confidence(count: int, confidence: float = CONFIDENCE) -> float:
 
 @dataclass(frozen=True)
 class Sample:
-    """Mean and spread of repeated measurements."""
+    """Repeated measurements, or their paired differences, taken as normally distributed."""
 
-    mean: float
+    values: tuple[float, ...]
+    mean: float = math.nan
     """Arithmetic mean; NaN without measurements."""
-    sd: float
-    """Standard deviation with n - 1 in the denominator; NaN with fewer than two measurements."""
-    count: int
-    """Number of measurements."""
-
-
-@dataclass(frozen=True)
-class Difference:
-    """Mean of paired differences, and an interval for its true value; the differences are taken as normally distributed."""
-
-    mean: float
-    """Mean difference; NaN without pairs."""
-    low: float
-    """Lower end of the interval; NaN with fewer than two pairs."""
-    high: float
-    """Upper end of the interval; NaN with fewer than two pairs."""
-    pairs: tuple[float, ...]
-    """The differences."""
+    sd: float = math.nan
+    """Standard deviation with n - 1 in the denominator; like the interval, NaN with fewer than two measurements."""
+    low: float = math.nan
+    high: float = math.nan
+    """Ends of an interval for the true mean."""
 
     @property
     def count(self) -> int:
-        """Number of pairs."""
-        return len(self.pairs)
+        """Number of measurements."""
+        return len(self.values)
 
     @property
     def excludes_zero(self) -> bool:
-        """True if the interval does not contain 0; never with fewer than two pairs."""
+        """True if the interval does not contain 0; never with fewer than two measurements."""
         return self.low > 0 or self.high < 0
 
 
-def sample(values: Sequence[float]) -> Sample:
-    """Return mean and standard deviation (Bessel's correction) of measurements."""
-    n = len(values)
-    mean = math.fsum(values) / n if n else math.nan
-    sd = math.sqrt(math.fsum((v - mean) ** 2 for v in values) / (n - 1)) if n > 1 else math.nan
-    return Sample(mean, sd, n)
-
-
-def paired_difference(ours: Sequence[float], base: Sequence[float], confidence: float = CONFIDENCE) -> Difference:
-    """Return Student's interval of the mean of ``ours - base`` over pairs (Student 1908): mean ± t s / sqrt(n)."""
-    # Here t is the quantile for n - 1 degrees of freedom. Pairing removes the common effect of seed and scene, which is most of
-    # the spread between runs.
+def sample(values: Sequence[float], confidence: float = CONFIDENCE) -> Sample:
+    """Return mean, standard deviation (Bessel's correction) and Student's interval (Student 1908), mean ± t s / sqrt(n)."""
     from scipy.special import stdtrit
 
-    pairs = tuple(a - b for a, b in zip(ours, base, strict=True))
-    d = sample(pairs)
-    if d.count < 2:
-        return Difference(d.mean, math.nan, math.nan, pairs)
-    half = float(stdtrit(d.count - 1, 0.5 + confidence / 2)) * d.sd / math.sqrt(d.count)
-    return Difference(d.mean, d.mean - half, d.mean + half, pairs)
+    n, values = len(values), tuple(values)
+    if not n:
+        return Sample(values)
+    mean = math.fsum(values) / n
+    if n == 1:
+        return Sample(values, mean)
+    sd = math.sqrt(math.fsum((v - mean) ** 2 for v in values) / (n - 1))
+    half = float(stdtrit(n - 1, 0.5 + confidence / 2)) * sd / math.sqrt(n)  # t is the quantile for n - 1 degrees of freedom
+    return Sample(values, mean, sd, mean - half, mean + half)
+
+
+def paired_difference(ours: Sequence[float], base: Sequence[float], confidence: float = CONFIDENCE) -> Sample:
+    """Return ``ours - base``; pairing removes the common effect of seed and scene, which is most of the spread of runs."""
+    return sample([a - b for a, b in zip(ours, base, strict=True)], confidence)
 
 
 GAUSSIANS = "gaussians"
@@ -86,67 +70,56 @@ MAX_DIGITS = 6
 """Largest number of digits after the point of a difference."""
 NOT_EXERCISED = "not exercised"
 """Text in place of a difference if both variants gave the same files."""
-
-
-@dataclass(frozen=True)
-class Metric:
-    """A column of figures."""
-
-    key: str
-    """Name in result files."""
-    label: str
-    """Name in tables."""
-    upwards: bool
-    """True if larger values are better."""
-    digits: int
-    """Digits after the point."""
-
-    @property
-    def arrow(self) -> str:
-        """Arrow in the direction that is better."""
-        return "↑" if self.upwards else "↓"
-
-
-@dataclass(frozen=True)
-class Row:
-    """Measurements of one variant."""
-
-    name: str
-    """Name of the variant."""
-    samples: dict[str, Sample]
-    """Mean and deviation by metric, and of the number of Gaussians; one that is missing was not measured."""
-    differences: dict[str, Difference]
-    """Paired difference to the table's base by metric; empty for the base itself."""
-    marks: tuple[bool, ...] = ()
-    """Check marks, one for each of the table's switches."""
-    exercised: bool = True
-    """False if every run gave the same file as the base, so that the settings made no difference."""
+METRICS = {
+    "psnr": ("PSNR", True, 2), "ssim": ("SSIM", True, 3), "lpips_vgg_legacy": ("LPIPS-VGG", False, 3),
+    "lpips_alex_legacy": ("LPIPS-Alex", False, 3), "lpips": ("LPIPS", False, 3),
+}  # fmt: skip
+"""Name in tables, whether larger values are better, and digits after the point, by the name in result files."""
 
 
 @dataclass(frozen=True)
 class Table:
-    """Rows of a study, ready to print."""
+    """Figures of a study, ready to print."""
 
     caption: str
     """Title."""
-    base: str
-    """Name of the row that the others are compared with."""
-    metrics: tuple[Metric, ...]
-    """Columns of figures."""
-    rows: tuple[Row, ...]
-    """Variants, including the base."""
+    metrics: tuple[str, ...]
+    """Columns of figures: keys of `METRICS`."""
+    samples: dict[str, dict[str, Sample]]
+    """Measurements by variant, the base first, and by metric or `GAUSSIANS`; one that is missing was not measured."""
+    differences: dict[str, dict[str, Sample] | None]
+    """Paired differences of the other variants to the base, by variant and metric; None if every run gave the same file as the
+    base, so that the settings made no difference."""
     switches: tuple[str, ...] = ()
     """Headings of the columns of check marks, in LaTeX without dollar signs; empty for a table of methods."""
+    marks: dict[str, tuple[bool, ...]] = field(default_factory=dict)
+    """Check marks by variant, one for each switch."""
 
-    def __post_init__(self) -> None:
-        if any(len(r.marks) != len(self.switches) for r in self.rows):
-            raise ValueError("every row needs one check mark per switch")
+    @property
+    def base(self) -> str:
+        """Name of the variant that the others are compared with."""
+        return next(iter(self.samples))
 
-    def best(self, metric: Metric) -> float:
+    def best(self, metric: str) -> float:
         """Return the best mean of a column as printed; NaN if nothing was measured."""
-        means = [round(r.samples[metric.key].mean, metric.digits) for r in self.rows if metric.key in r.samples]
-        means = [m for m in means if math.isfinite(m)]
-        return (max if metric.upwards else min)(means, default=math.nan)
+        _, upwards, digits = METRICS[metric]
+        means = [round(own[metric].mean, digits) for own in self.samples.values() if metric in own]
+        return (max if upwards else min)((m for m in means if math.isfinite(m)), default=math.nan)
+
+    def cell(self, name: str, metric: str, bold: str) -> str:
+        """Return mean and deviation as text, the best in the form ``bold``; a dash if not measured."""
+        found, digits = self.samples[name].get(metric), METRICS[metric][2]
+        if found is None or not math.isfinite(found.mean):
+            return NONE
+        text = f"{found.mean:.{digits}f}" + (f" ± {found.sd:.{digits}f}" if math.isfinite(found.sd) else "")
+        return bold.format(text) if round(found.mean, digits) == self.best(metric) else text
+
+    def gap(self, name: str, metric: str) -> str:
+        """Return the difference of a variant to the base as text."""
+        if name == self.base:
+            return NONE
+        own = self.differences[name]
+        return NOT_EXERCISED if own is None else interval(own.get(metric), METRICS[metric][2])
 
 
 SCORES = "Scores of held-out views: mean ± standard deviation over seeds"
@@ -155,15 +128,7 @@ INTERVALS = ("a 95 % t interval", "simultaneous 95 % t intervals per column (Bon
 """Description of the intervals of a table with one difference, or with several."""
 
 
-def figure(sample: Sample | None, digits: int, plus_minus: str = " ± ") -> str:
-    """Return mean and deviation as text; a dash if not measured, the mean alone without a deviation."""
-    if sample is None or not math.isfinite(sample.mean):
-        return NONE
-    spread = f"{plus_minus}{sample.sd:.{digits}f}" if math.isfinite(sample.sd) else ""
-    return f"{sample.mean:.{digits}f}{spread}"
-
-
-def interval(d: Difference | None, digits: int) -> str:
+def interval(d: Sample | None, digits: int) -> str:
     """Return a paired difference, signed, with its interval, as text; a dash if there is none."""
     if d is None or not math.isfinite(d.mean):
         return NONE
@@ -188,110 +153,78 @@ def _grid(head: list[str], body: list[list[str]], left: int) -> list[str]:
 
 def _plain(heading: str) -> str:
     """Return a LaTeX heading for readers without LaTeX: S_{render} becomes S_render."""
-    return heading.replace("\\mathit", "").replace("{", "").replace("}", "")
+    return heading.replace("{", "").replace("}", "")
+
+
+def _labels(table: Table, arrows: str = "↑↓") -> list[str]:
+    return [f"{label} {arrows[not upwards]}" for label, upwards, _ in (METRICS[m] for m in table.metrics)]
 
 
 def markdown(table: Table) -> str:
     """Return two tables: means ± deviations over seeds, the best in bold; and differences to the base with intervals."""
-
-    def cell(row: Row, m: Metric) -> str:
-        s = row.samples.get(m.key)
-        text = figure(s, m.digits)
-        return f"**{text}**" if s is not None and round(s.mean, m.digits) == table.best(m) else text
-
-    def count(row: Row) -> str:
-        return f"{row.samples[GAUSSIANS].mean:,.0f}" if GAUSSIANS in row.samples else NONE
-
     marks = [_plain(s) for s in table.switches]
-    counts = ["Gaussians"] if any(GAUSSIANS in r.samples for r in table.rows) else []
-    head = ["row" if marks else "method", *marks, *(f"{m.label} {m.arrow}" for m in table.metrics), *counts, "seeds"]
-    body = [
-        [r.name, *("✓" if m else "✗" for m in r.marks), *(cell(r, m) for m in table.metrics), *(count(r) for _ in counts),
-         str(max((s.count for s in r.samples.values()), default=0))]
-        for r in table.rows
-    ]  # fmt: skip
-    lines = [f"{SCORES}, the best mean in bold:", "", *_grid(head, body, 1 + len(marks)), ""]
-    rows = [r for r in table.rows if r.differences]
-    lines += [
-        f"Difference to {table.base}, paired by seed, with {INTERVALS[len(rows) > 1]}; \\* marks an interval without 0:",
-        "",
-    ]
-
-    def gap(row: Row, m: Metric) -> str:
-        if not row.exercised:
-            return NOT_EXERCISED
-        d = row.differences.get(m.key)
-        return interval(d, m.digits) + (" \\*" if d is not None and d.excludes_zero else "")
-
-    body = [[r.name, *(gap(r, m) for m in table.metrics), str(max(d.count for d in r.differences.values()))] for r in rows]
-    return "\n".join([*lines, *_grid([head[0], *(f"Δ {m.label}" for m in table.metrics), "pairs"], body, 1)]) + "\n"
+    counts = ["Gaussians"] if any(GAUSSIANS in own for own in table.samples.values()) else []
+    head, body = ["row" if marks else "method", *marks, *_labels(table), *counts, "seeds"], []
+    for name, own in table.samples.items():
+        count = f"{own[GAUSSIANS].mean:,.0f}" if GAUSSIANS in own else NONE
+        checks = ("✓" if m else "✗" for m in table.marks.get(name, ()))
+        seeds = str(max((s.count for s in own.values()), default=0))
+        body.append([name, *checks, *(table.cell(name, m, "**{}**") for m in table.metrics), *(count for _ in counts), seeds])
+    lines, rows = [f"{SCORES}, the best mean in bold:", "", *_grid(head, body, 1 + len(marks)), ""], []
+    for name, gaps in table.differences.items():
+        sure = {m for m, d in (gaps or {}).items() if d.excludes_zero}
+        pairs = NONE if gaps is None else str(max(d.count for d in gaps.values()))
+        rows.append([name, *(table.gap(name, m) + " \\*" * (m in sure) for m in table.metrics), pairs])
+    intervals = INTERVALS[len(rows) > 1]
+    lines += [f"Difference to {table.base}, paired by seed, with {intervals}; \\* marks an interval without 0:", ""]
+    return "\n".join([*lines, *_grid([head[0], *(f"Δ {METRICS[m][0]}" for m in table.metrics), "pairs"], rows, 1)]) + "\n"
 
 
-def csv_text(table: Table) -> str:
-    """Return CSV with one line for each row and metric. Numbers have full precision; missing numbers are empty fields."""
-    out = io.StringIO()
+def csv_rows(table: Table) -> Iterator[list[str | int]]:
+    """Yield a row for each variant and metric, after the head. Numbers have full precision; missing numbers are empty."""
     names = [_plain(s) for s in table.switches]
-    writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(["row", *names, "metric", "mean", "sd", "seeds", "difference", "low95", "high95", "pairs"])
-
-    def number(value: float) -> str:
-        return repr(value) if math.isfinite(value) else ""
-
-    for row in table.rows:
+    yield ["row", *names, "metric", "mean", "sd", "seeds", "difference", "low95", "high95", "pairs"]
+    for name, own in table.samples.items():
         for m in table.metrics:
-            s, d = row.samples.get(m.key), row.differences.get(m.key)
-            measured = ["", "", 0] if s is None else [number(s.mean), number(s.sd), s.count]
-            paired = ["", "", "", ""]
-            if d is not None and row.exercised:
-                paired = [number(d.mean), number(d.low), number(d.high), d.count]
-            writer.writerow([row.name, *(int(x) for x in row.marks), m.key, *measured, *paired])
-    return out.getvalue()
+            s, d = own.get(m, Sample(())), (table.differences.get(name) or {}).get(m)
+            gaps = [math.nan] * 3 if d is None else [d.mean, d.low, d.high]
+            mean, sd, *gaps = (repr(v) if math.isfinite(v) else "" for v in (s.mean, s.sd, *gaps))
+            yield [name, *map(int, table.marks.get(name, ())), m, mean, sd, s.count, *gaps, "" if d is None else d.count]
 
 
 _LATEX = str.maketrans(
     {sign: f"\\{sign}" for sign in "&%$#_{}"}
     | {"\\": "\\textbackslash{}", "^": "\\textasciicircum{}", "~": "\\textasciitilde{}", "\n": " ", "\r": " "}
 )
-"""LaTeX of each sign."""
-
-
-def _escape(text: str) -> str:
-    """Escape LaTeX's special characters, since names of scenes are arbitrary."""
-    return text.translate(_LATEX)
+"""LaTeX of each sign; names of scenes are arbitrary."""
 
 
 def latex(table: Table) -> str:
     """Return a booktabs table: check marks or methods, means ± deviations, and the paired difference of the first metric."""
-    first, space = table.metrics[0], "\\,["
+    first = table.metrics[0]
 
-    def cell(row: Row, m: Metric) -> str:
-        s = row.samples.get(m.key)
-        text = figure(s, m.digits, " \\pm ")
-        if text == NONE:
-            return "--"
-        return f"$\\mathbf{{{text}}}$" if s is not None and round(s.mean, m.digits) == table.best(m) else f"${text}$"
+    def math_of(text: str) -> str:
+        text = text.replace(" ± ", " \\pm ").replace(" [", "\\,[")
+        return {NONE: "--", NOT_EXERCISED: text}.get(text, f"${text}$")
 
-    def gap(row: Row) -> str:
-        if not row.exercised:
-            return NOT_EXERCISED
-        text = interval(row.differences.get(first.key), first.digits)
-        return "--" if text == NONE else f"${text.replace(' [', space)}$"
-
-    scores, pairs = SCORES.replace("±", "$\\pm$"), sum(bool(r.differences) for r in table.rows)
-    about = f"{scores}. $\\Delta$: difference to {_escape(table.base)}, paired by seed, with {_escape(INTERVALS[pairs > 1])}."
+    scores, intervals = SCORES.replace("±", "$\\pm$"), INTERVALS[len(table.differences) > 1]
+    base, intervals, caption = (text.translate(_LATEX) for text in (table.base, intervals, table.caption))
+    about = f"{scores}. $\\Delta$: difference to {base}, paired by seed, with {intervals}."
     head = [f"${s}$" for s in table.switches] or ["Method"]
-    arrows = {"↑": "$\\uparrow$", "↓": "$\\downarrow$"}
-    head += [f"{m.label}{arrows[m.arrow]}" for m in table.metrics] + [f"$\\Delta$ {first.label} [95\\,\\%]"]
+    head += [label.replace(" ↑", "$\\uparrow$").replace(" ↓", "$\\downarrow$") for label in _labels(table)]
+    head.append(f"$\\Delta$ {METRICS[first][0]} [95\\,\\%]")
     lines = [
         "% needs \\usepackage{booktabs, amssymb}",
-        "\\begin{table}[htbp]", "  \\centering", f"  \\caption{{{_escape(table.caption)}. {about}}}",
+        "\\begin{table}[htbp]", "  \\centering", f"  \\caption{{{caption}. {about}}}",
         f"  \\begin{{tabular}}{{{'c' * len(table.switches) or 'l'}{'c' * len(table.metrics)}r}}", "    \\toprule",
         f"    {' & '.join(head)} \\\\", "    \\midrule",
     ]  # fmt: skip
-    for row in table.rows:
-        words = ["$\\checkmark$" if m else "$\\times$" for m in row.marks] or [_escape(row.name)]
-        note = f"  % {row.name}" if row.marks else ""
-        lines.append(f"    {' & '.join([*words, *(cell(row, m) for m in table.metrics), gap(row)])} \\\\{note}")
+    for name in table.samples:
+        words = ["$\\checkmark$" if m else "$\\times$" for m in table.marks.get(name, ())]
+        note = f"  % {name}" if words else ""
+        words = words or [name.translate(_LATEX)]
+        words += [math_of(table.cell(name, m, "\\mathbf{{{}}}")) for m in table.metrics]
+        lines.append(f"    {' & '.join([*words, math_of(table.gap(name, first))])} \\\\{note}")
     return "\n".join([*lines, "    \\bottomrule", "  \\end{tabular}", "\\end{table}"]) + "\n"
 
 
@@ -312,46 +245,46 @@ def _text(x: float, y: float, words: str, size: int = 12, anchor: str = "start",
     )
 
 
-def _reach(differences: list[Difference], digits: int) -> float:
+def _dot(x: float, y: float, radius: float, color: str, more: str = "") -> str:
+    return f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{radius}" fill="{color}"{more}/>'
+
+
+def _reach(differences: list[Sample], digits: int) -> float:
     """Return half the width of a metric's axis, which is centred on 0 so that both signs have the same scale."""
-    values = [abs(v) for d in differences for v in (*d.pairs, d.low, d.high)]
-    largest = max((v for v in values if math.isfinite(v)), default=0.0)
-    return 1.08 * largest or 10.0**-digits
+    values = [abs(v) for d in differences for v in (*d.values, d.low, d.high) if math.isfinite(v)]
+    return 1.08 * max(values, default=0.0) or 10.0**-digits
 
 
-def _line(metric: Metric, row: Row, y: float, x0: float, px: Callable[[float], float]) -> list[str]:
+def _line(table: Table, name: str, metric: str, y: float, x0: float, px: Callable[[float], float]) -> list[str]:
     """Return the elements of one variant and metric at height ``y`` [px]; ``px`` maps values to x [px]."""
-    d, right = row.differences.get(metric.key), x0 + PANEL + 12
-    if d is None:
-        return [_text(right, y + 7, "the base", 11, color=SOFT)]
-    if not row.exercised:
-        return [_text(right, y + 7, "not exercised", 11, color=SOFT)]
-    if not math.isfinite(d.mean):
-        return [_text(right, y + 7, "not measured", 11, color=SOFT)]
-    good = d.mean > 0 if metric.upwards else d.mean < 0
-    color = (BETTER if good else WORSE) if d.excludes_zero else UNDECIDED
-    parts = [f'<circle cx="{px(v):.1f}" cy="{y + 10:.1f}" r="2.8" fill="{color}" fill-opacity="0.45"/>' for v in d.pairs]
-    words = f"{d.mean:+.{metric.digits}f}"
+    own, right, (_, upwards, digits) = table.differences.get(name, {}), x0 + PANEL + 12, METRICS[metric]
+    d = None if own is None else own.get(metric)
+    if d is None or not math.isfinite(d.mean):
+        words = NOT_EXERCISED if own is None else "not measured" if own else "the base"
+        return [_text(right, y + 7, words, 11, color=SOFT)]
+    color = (BETTER if (d.mean > 0) == upwards else WORSE) if d.excludes_zero else UNDECIDED
+    parts = [_dot(px(v), y + 10, 2.8, color, ' fill-opacity="0.45"') for v in d.values]
+    words = f"{d.mean:+.{digits}f}"
     if math.isfinite(d.low):
         parts.append(
             f'<path d="M{px(d.low):.1f} {y - 6:.1f}v12m0 -6H{px(d.high):.1f}m0 -6v12" fill="none" stroke="{color}" '
             'stroke-width="2"/>'
         )
-        words += f"  [{d.low:+.{metric.digits}f}, {d.high:+.{metric.digits}f}]"
-    parts.append(f'<circle cx="{px(d.mean):.1f}" cy="{y:.1f}" r="5.5" fill="{color}" stroke="#ffffff" stroke-width="1.5"/>')
+        words += f"  [{d.low:+.{digits}f}, {d.high:+.{digits}f}]"
+    parts.append(_dot(px(d.mean), y, 5.5, color, ' stroke="#ffffff" stroke-width="1.5"'))
     return [*parts, _text(right, y + 7, words, 11, color=color, weight=600 if d.excludes_zero else 400)]
 
 
 def forest(table: Table) -> str:
     """Return an SVG of every variant's paired differences to the base; metrics without a measured difference are left out."""
     base = table.base
-    measured = {m: [r.differences[m.key] for r in table.rows if m.key in r.differences] for m in table.metrics}
-    panels = {m: differences for m, differences in measured.items() if any(d.pairs for d in differences)}
-    names = [r.name for r in table.rows] if panels else []
+    gaps = [own for own in table.differences.values() if own is not None]
+    measured = {m: [own[m] for own in gaps if m in own] for m in table.metrics}
+    panels = {m: differences for m, differences in measured.items() if any(d.count for d in differences)}
+    names = list(table.samples) if panels else []
     left = MARGIN + max([90.0, *(LETTER * len(n) + 18 for n in names)])
     step = PANEL + VALUES + GAP
-    width = max(left + step * len(panels) - GAP + MARGIN, 560)
-    bottom = TOP + ROW * len(names)
+    width, bottom = max(left + step * len(panels) - GAP + MARGIN, 560), TOP + ROW * len(names)
     height = bottom + BOTTOM
     out = [
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width:.0f} {height:.0f}" width="{width:.0f}" '
@@ -365,31 +298,27 @@ def forest(table: Table) -> str:
             out.append(f'<rect x="{MARGIN - 8}" y="{y}" width="{width - 2 * MARGIN + 16:.0f}" height="{ROW}" fill="{BAND}"/>')
         out.append(_text(MARGIN, y + ROW / 2 + 4, name, 13, weight=600 if name == base else 400))
     for k, (metric, differences) in enumerate(panels.items()):
-        x0, reach = left + k * step, _reach(differences, metric.digits)
+        label, upwards, digits = METRICS[metric]
+        x0, reach = left + k * step, _reach(differences, digits)
 
         def px(value: float, x0: float = x0, reach: float = reach) -> float:
             return x0 + PANEL * (value + reach) / (2 * reach)
 
-        better = "right is better" if metric.upwards else "left is better"
-        label = metric.label + (" [dB]" if metric.key == "psnr" else "")
-        out.append(_text(x0, TOP - 30, f"Δ {label}", 13, weight=600))
-        out.append(_text(x0, TOP - 12, f"to {base}, {better}", 11, color=SOFT))
+        out.append(_text(x0, TOP - 30, f"Δ {label}{' [dB]' * (metric == 'psnr')}", 13, weight=600))
+        out.append(_text(x0, TOP - 12, f"to {base}, {'right' if upwards else 'left'} is better", 11, color=SOFT))
         for tick in ticks(-reach, reach):
             heavy = abs(tick) < 1e-9 * reach
-            out.append(
-                f'<path d="M{px(tick):.1f} {TOP}V{bottom}" stroke="{INK if heavy else RULE}" '
-                f'stroke-width="{1.2 if heavy else 1}"/>'
-            )
+            line = f'stroke="{INK if heavy else RULE}" stroke-width="{1.2 if heavy else 1}"'
+            out.append(f'<path d="M{px(tick):.1f} {TOP}V{bottom}" {line}/>')
             out.append(_text(px(tick), bottom + 18, "0" if heavy else f"{tick:+g}", 11, "middle", SOFT))
-        for i, row in enumerate(table.rows):
-            out += _line(metric, row, TOP + ROW * (i + 0.5) - 3, x0, px)
+        for i, name in enumerate(names):
+            out += _line(table, name, metric, TOP + ROW * (i + 0.5) - 3, x0, px)
     if not panels:
         out.append(_text(MARGIN, 66, "no pair of runs to compare", 13, color=SOFT))
     words = f"large dot: mean; bar: {'joint ' if len(names) > 2 else ''}95 % t interval; small dots: seeds"
     out.append(_text(MARGIN, height - 18, words, 11, color=SOFT))
     x = MARGIN + 6.0 * len(words) + 8
     for color, meaning in ((BETTER, "better"), (WORSE, "worse"), (UNDECIDED, "undecided: the interval contains 0")):
-        out.append(f'<circle cx="{x:.1f}" cy="{height - 22:.1f}" r="4.5" fill="{color}"/>')
-        out.append(_text(x + 9, height - 18, meaning, 11, color=SOFT))
+        out += [_dot(x, height - 22, 4.5, color), _text(x + 9, height - 18, meaning, 11, color=SOFT)]
         x += 6.0 * len(meaning) + 28
     return "\n".join([*out, "</svg>"]) + "\n"
