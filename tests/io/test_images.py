@@ -189,7 +189,9 @@ def test_masks_folder(name, keeps, tmp_path):
     assert (half == ((mask[::2, ::2] > 0) == (keeps == "white"))).all()
 
 
-@pytest.mark.parametrize("focal, distortion, downscale", [(20.0, (), 2), (60.0, (0.3, 0.0, 0.0, 0.0), 1)])
+@pytest.mark.parametrize(
+    "focal, distortion, downscale", [(20.0, (), 2), (60.0, (0.3, 0.0, 0.0, 0.0), 1), (60.0, (0.3, 0.0, 0.0, 0.0), 2)]
+)
 @pytest.mark.parametrize("alpha", [False, True])
 def test_masked_pixels_do_not_run_into_others(focal, distortion, downscale, alpha, tmp_path):
     """Where an image is resampled, a pixel that is kept has the colours of unmasked pixels alone."""

@@ -281,7 +281,7 @@ def _undistort(loaded: LoadedImage, lens: Lens) -> LoadedImage:
 
     image, alpha = moved(loaded.image), None if loaded.alpha is None else moved(loaded.alpha)
     done = (*loaded.done, f"undistorted ({lens.model})")
-    return replace(loaded, image=image, mask=None if inside.all() else inside, done=done, alpha=alpha)
+    return replace(loaded, image=image, mask=None if inside.all() else inside, done=done, alpha=alpha, undone=lens)
 
 
 @functools.lru_cache(maxsize=4)
@@ -325,8 +325,9 @@ def _shrink(path: Path, loaded: LoadedImage, downscale: int, max_side: int) -> L
         )
     K = np.diag([small_w / width, small_h / height, 1.0]) @ loaded.K
     mask = None if loaded.mask is None else _resize(loaded.mask.astype(np.float32), small_w, small_h) > 0.5
-    alpha = None if loaded.alpha is None else _resize(nearest_unmasked(loaded.alpha, loaded.mask), small_w, small_h)
-    image = _resize(nearest_unmasked(loaded.image, loaded.mask), small_w, small_h)
+    hides = loaded.mask if loaded.undone is None else None  # what the mask of an undistorted image hides is filled already
+    image = _resize(nearest_unmasked(loaded.image, hides), small_w, small_h)
+    alpha = None if loaded.alpha is None else _resize(nearest_unmasked(loaded.alpha, hides), small_w, small_h)
     return LoadedImage(image, mask, K, done, alpha, loaded.kept)
 
 
