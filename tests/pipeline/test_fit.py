@@ -92,6 +92,8 @@ def test_a_result_is_scored_over_the_background_of_its_fit(folder, recwarn):
         assert warpgs.evaluate(result.gaussians(), views) != scored
     assert told[0].filename == __file__
     assert len(told) == 1
+    with pytest.raises(TypeError, match="gaussians must be an instance of Gaussians"):
+        warpgs.evaluate(3, views)
     alpha = np.pad(np.ones((20, 20), np.float32), ((6, 6), (10, 10)))
     for color, count in (1.0, 0), (0.0, 1):
         cut_out = [dataclasses.replace(v, alpha=alpha, image=np.where(alpha[..., None] > 0, v.image, color)) for v in views]

@@ -6,7 +6,7 @@ import math
 import warnings
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -196,6 +196,7 @@ def render_view(gaussians: Gaussians, view: View, options: RasterizeOptions) -> 
     return r.rgb.cpu().numpy(), r.depth.cpu().numpy(), r.alpha.cpu().numpy()
 
 
+@runtime_checkable
 class Fitted(Protocol):
     """Gaussians with the options of their fit, such as `FittedModel`."""
 
@@ -230,8 +231,8 @@ def evaluate(
     Raises:
         DataError: A field of a view is invalid; the message names the view, the field and the fix.
     """
-    views, known = checked_views(views), options is not None or not isinstance(gaussians, Gaussians)
-    if not isinstance(gaussians, Gaussians):
+    views, known = checked_views(views), options is not None or isinstance(gaussians, Fitted)
+    if isinstance(gaussians, Fitted):
         options = gaussians.options() if options is None else options
         gaussians = gaussians.gaussians()
     options = RasterizeOptions() if options is None else options

@@ -78,7 +78,7 @@ class Column:
 
 @dataclass(frozen=True)
 class DensityUpdate:
-    """A change of the set of Gaussians: rows that stay, rows that are overwritten, rows that are appended."""
+    """A change of the set of Gaussians: rows that stay, rows that are overwritten, rows that are appended; all are finite."""
 
     keep: torch.Tensor
     """Indices of the surviving rows in ascending order, int64, shape [S]."""

@@ -106,7 +106,7 @@ class LossTerm(Checked):
         return {LOSS: 4 * FLOAT * sizes.pixels if "depth" in self.needs_outputs else 0}
 
     def __call__(self, inputs: LossInputs) -> torch.Tensor:
-        """Compute the term, a differentiable value of shape []; it must not read back from the device.
+        """Compute the term, a differentiable value of shape [], or 0; it must not read back from the device.
 
         Args:
             inputs: The render's outputs that the term needs, the view, the Gaussians, the camera and the number of the step.

@@ -79,7 +79,7 @@ class StrategyContext:
     views: list[TrainingView] = field(default_factory=list)
     """Training views; empty before `Strategy.setup`."""
     capacity: int = 0
-    """Number of Gaussians that settings and memory limit allow; 0 before `Strategy.setup`."""
+    """Number of Gaussians that settings and memory limit allow, which no update may exceed; 0 before `Strategy.setup`."""
     max_instances: int | None = None
     """Largest number of (Gaussian, tile) instances of a render at a time; None for no limit."""
     antialiased: bool = False
