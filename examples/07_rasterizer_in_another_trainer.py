@@ -62,7 +62,7 @@ def main(arguments: list[str] | None = None) -> float:
     gaussians = initial_gaussians(scene, a.count, device)
     optimizer = torch.optim.Adam([{"params": [t], "lr": LRS[n]} for n, t in gaussians.tensors().items()], eps=1e-15)
     order = torch.Generator().manual_seed(0)
-    first = warpgs.evaluate(gaussians, [held_out])[0].psnr
+    first = warpgs.evaluate(gaussians, [held_out], warpgs.RasterizeOptions())[0].psnr
     for _ in range(a.steps):
         i = int(torch.randint(len(train), (1,), generator=order))
         rgb = warpgs.rasterize(gaussians, train[i].camera).rgb
@@ -71,7 +71,7 @@ def main(arguments: list[str] | None = None) -> float:
         loss.backward()
         optimizer.step()
 
-    last = warpgs.evaluate(gaussians, [held_out])[0].psnr
+    last = warpgs.evaluate(gaussians, [held_out], warpgs.RasterizeOptions())[0].psnr
     with torch.no_grad():
         result = warpgs.rasterize(gaussians, held_out.camera).rgb.clamp(0, 1).cpu().numpy()
     Image.fromarray((np.concatenate([held_out.image, result], 1) * 255).round().astype(np.uint8)).save(a.out)

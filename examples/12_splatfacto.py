@@ -132,7 +132,7 @@ def main(arguments: list[str] | None = None) -> float:
     def gaussians() -> warpgs.Gaussians:
         return warpgs.Gaussians(**{name: p for name, p in params.items() if name != "twists"})
 
-    first = warpgs.evaluate(gaussians(), [held_out])[0].psnr
+    first = warpgs.evaluate(gaussians(), [held_out], warpgs.RasterizeOptions())[0].psnr
     for step in range(1, a.steps + 1):
         i = int(torch.randint(len(train), ()))
         camera = train[i].camera
@@ -152,7 +152,7 @@ def main(arguments: list[str] | None = None) -> float:
             densify(params, optimizer, pull / seen.clamp_min(1), size)
             pull = seen = torch.zeros(len(params["means"]), device=device)
 
-    last = warpgs.evaluate(gaussians(), [held_out])[0].psnr
+    last = warpgs.evaluate(gaussians(), [held_out], warpgs.RasterizeOptions())[0].psnr
     with torch.no_grad():
         result = warpgs.rasterize(gaussians(), held_out.camera).rgb.clamp(0, 1).cpu().numpy()
     Image.fromarray((np.concatenate([held_out.image, result], 1) * 255).round().astype(np.uint8)).save(a.out)

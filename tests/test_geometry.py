@@ -257,7 +257,10 @@ def test_gradient_of_normals():
     assert float(gradient[2, 3]) == 0 and bool(gradient.isfinite().all()) and bool(gradient.any())
     depth[4, 4] = torch.nan
     assert bool(normals(depth, cam.viewmat, cam.K).isnan().any())
-    assert not bool(geometry.depth_normals(cam, depth[:2]).any())
+    assert not bool(geometry.depth_normals(dataclasses.replace(cam, height=2), depth[:2]).any())
+    for other in (depth[:5], depth.T, depth[None]):
+        with pytest.raises(UsageError, match=r"depth must have the shape \[6, 7\] of the camera's image, not .*scale"):
+            geometry.depth_normals(cam, other)
 
 
 @pytest.mark.parametrize("model", LENSES)

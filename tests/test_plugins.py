@@ -1,16 +1,27 @@
 """Parts that plug in: found by name, loaded when asked to, and never because a file names them."""
 
 import dataclasses
+import functools
 import sys
 
 import pytest
+import torch
 
+import warpgs
+from tests.scenes import photos, seeds, three_gaussians
 from warpgs.app.cli import main
 from warpgs.errors import UsageError
+from warpgs.export.base import Format, read_gaussians, write_gaussians
+from warpgs.io.folder import Probe, Reader
+from warpgs.pipeline.model.start import InitConfig
+from warpgs.pipeline.model.table import Column
 from warpgs.pipeline.run.folder import check_same
 from warpgs.pipeline.train.loss import LOSS_TERMS, LossTerm
 from warpgs.pipeline.train.settings import FitConfig
 from warpgs.pipeline.train.strategies.base import STRATEGIES, Strategy
+from warpgs.pipeline.train.trainer import Trainer
+from warpgs.pipeline.train.view_modules import VIEW_MODULES, ViewModule
+from warpgs.pipeline.train.views import LearnedViews
 from warpgs.plugins import Registry, load_object
 from warpgs.synthetic.demo import split_spec, write_demo
 
@@ -218,3 +229,100 @@ def test_an_error_in_own_code_names_its_file(tmp_path, capsys):
     assert main(["fit", str(tmp_path / "scene"), "--out", str(tmp_path / "run"), *flags]) == 2
     said = capsys.readouterr().err
     assert "my own bug" in said and f"{own}, line 6" in said and "defect of warpgs" not in said
+
+
+def of_strategy(**methods):
+    return {"strategy": type("Own", (Strategy,), methods)}
+
+
+def of_term(**methods):
+    return {
+        "loss_terms": (dataclasses.dataclass(frozen=True)(LOSS_TERMS.register("own")(type("Own", (LossTerm,), methods)))(),)
+    }
+
+
+def of_module(**methods):
+    learned = {
+        "parameters": lambda self, views: {"p": torch.zeros(len(views))},
+        "lrs": lambda self, progress, extent: {"p": 0.1},
+    }
+    cls = VIEW_MODULES.register("own")(type("Own", (ViewModule,), learned | methods))
+    return {"view_modules": (dataclasses.dataclass(frozen=True)(cls)(),)}
+
+
+def always(value):
+    """A method that returns a value, whatever its arguments."""
+    return lambda self, *_: value
+
+
+DUE = {"due": always(True)}
+
+
+@pytest.mark.parametrize(
+    "part, method, found, others",
+    [
+        *((of_strategy, "update", v, DUE) for v in (None, 3, [None], ["row"])),
+        *(
+            (of_strategy, "statistics", v, {})
+            for v in (None, 3, {"seen": 1}, {"unknown": torch.zeros(60)}, {1: torch.zeros(60)})
+        ),
+        (of_strategy, "statistics", {"seen": torch.zeros(59)}, {"columns": always({"seen": Column(0)})}),
+        *((of_strategy, "columns", v, {}) for v in (None, {"seen": 0.0})),
+        *((of_strategy, "regularisation", v, {}) for v in (1.0, torch.ones(2))),
+        *((of_strategy, "lr_factors", v, {}) for v in (1.0, torch.ones(59))),
+        (of_strategy, "phase", [], {}),
+        *((of_term, "__call__", v, {}) for v in (None, 1.0, torch.ones(2))),
+        *((of_term, "needs", v, {}) for v in (None, {"map": 1}, {"map": torch.ones(3, 3)})),
+        *((of_module, "parameters", v, {}) for v in (None, {"p": 1.0}, {"p": torch.zeros(9)})),
+        *((of_module, "lrs", v, {}) for v in (None, {}, {"p": "0.1"})),
+        *((of_module, "values", v, {}) for v in (None, {"p": 1.0}, {"p": torch.zeros(9, 2)})),
+        (of_module, "before_render", None, {}),
+        *((of_module, "after_render", v, {}) for v in (None, torch.ones(3))),
+        *((of_module, "regularisation", v, {}) for v in (1.0, torch.ones(2))),
+    ],
+)
+def test_a_wrong_result_of_a_part_names_its_class_and_method(part, method, found, others, registry, monkeypatch, device):
+    """Not with an error of torch or Python from inside a step."""
+    for known in (LOSS_TERMS, VIEW_MODULES):
+        known.names()
+        monkeypatch.setattr(known, "_classes", dict(known._classes))
+    moved = found.to(device) if isinstance(found, torch.Tensor) else found
+    settings = part(**{method: always(moved)} | others)
+    if "strategy" in settings:
+        registry.register("own")(settings["strategy"])
+        settings["strategy"] = "own"
+    config = FitConfig(steps=3, sh_degree=0, init=InitConfig(source="points"), cuda_graph=False, **settings)
+    with pytest.raises(UsageError, match=rf"Own\.{method} must return .*; it returned .*\. Correct the class"):
+        Trainer(photos(2), seeds(), config, device).advance()
+
+
+@pytest.mark.parametrize("method, found", [("probe", True), ("read", None), ("read", []), ("cameras", None)])
+def test_a_wrong_result_of_a_reader_or_module_after_the_fit_is_named(method, found, tmp_path):
+    """A reader says what it found; a module returns a camera for each view."""
+    if method == "cameras":
+        module = type("Own", (ViewModule,), {"cameras": always(found)})()
+        call = functools.partial(LearnedViews([module], photos(2), torch.device("cpu")).cameras, {}, (), ())
+    else:
+        methods = {"probe": always(Probe("own files")), "read": always(None)} | {method: always(found)}
+        call = functools.partial(warpgs.load_scene, tmp_path, reader=type("Own", (Reader,), methods))
+    with pytest.raises(UsageError, match=rf"Own\.{method} must return .*; it returned"):
+        call()
+
+
+ARRAYS = {n: t.numpy() for n, t in three_gaussians().tensors().items()}
+
+
+@pytest.mark.parametrize(
+    "method, found",
+    [
+        *(("encode", v) for v in (None, "text", [1])),
+        *(("decode", v) for v in (None, {}, ARRAYS | {"sh": [1]}, ARRAYS | {"other": ARRAYS["sh"]})),
+    ],
+)
+def test_a_wrong_result_of_a_format_is_named(method, found, tmp_path):
+    """Its bytes, and its five arrays; a file that could not be encoded is not written."""
+    own = type("Own", (Format,), {"suffix": ".own", "encode": always([b"x"]), "decode": always(ARRAYS), method: always(found)})
+    with pytest.raises(UsageError, match=rf"Own\.{method} must return .*; it returned"):
+        write_gaussians(tmp_path / "a.own", three_gaussians(), units="file", format=own)
+        read_gaussians(tmp_path / "a.own", format=own)
+    assert (tmp_path / "a.own").exists() is (method == "decode")

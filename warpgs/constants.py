@@ -18,6 +18,9 @@ TRANSMITTANCE_STOP = 1e-4
 ALPHA_MAX = 0.99
 """Largest alpha of one Gaussian, so that 1 / (1 - alpha) in the backward pass stays below 100."""
 
+LARGEST_ALPHA = 1 - 2.0**-24
+"""Largest value of ``Rule.alpha_max``: the largest float32 below 1. The backward pass divides by 1 - alpha."""
+
 LOW_PASS = 0.3
 """Variance added to a projected Gaussian along both image axes [px^2]: the variance of a pixel's box filter, 1/12, plus a
 margin against aliasing."""
@@ -86,7 +89,7 @@ class Rule:
     alpha_cut: float = ALPHA_CUT
     """Smallest alpha that is blended, 1/255 by default. With 0 all are blended, and every Gaussian touches every tile."""
     alpha_max: float = ALPHA_MAX
-    """Largest alpha; larger values are clamped to it and have no gradient."""
+    """Largest alpha, at most 1 - 2^-24; larger values are clamped to it and have no gradient."""
     transmittance_stop: float = TRANSMITTANCE_STOP
     """Transmittance below which a pixel is finished."""
     inclusive_stop: bool = True
@@ -115,8 +118,11 @@ class Rule:
         for name in ("alpha_cut", "transmittance_stop"):
             if not 0 <= getattr(self, name) < 1:
                 raise UsageError(f"Rule.{name} must be at least 0 and below 1, not {getattr(self, name)}")
-        if not 0 < self.alpha_max <= 1:
-            raise UsageError(f"Rule.alpha_max must be above 0 and at most 1, not {self.alpha_max}")
+        if not 0 < self.alpha_max <= LARGEST_ALPHA:
+            raise UsageError(
+                f"Rule.alpha_max must be above 0 and below 1 in float32, at most 1 - 2^-24, not {self.alpha_max}: gradients "
+                f"are divided by 1 - alpha; give {ALPHA_MAX} or 0.999"
+            )
         for name in ("low_pass", "square_sigma"):
             if not 0 <= getattr(self, name) < math.inf:
                 raise UsageError(f"Rule.{name} must be a finite number of at least 0, not {getattr(self, name)}")

@@ -344,11 +344,16 @@ def depth_normals(camera: Camera, depth: torch.Tensor) -> torch.Tensor:
         one of its four neighbours has no depth.
 
     Raises:
-        UsageError: The camera is not a pinhole.
+        UsageError: The camera is not a pinhole, or its size is not that of the map.
     """
     import torch
 
     check_pinhole(camera)
+    if tuple(depth.shape) != (camera.height, camera.width):
+        raise UsageError(
+            f"depth must have the shape [{camera.height}, {camera.width}] of the camera's image, not {list(depth.shape)}; "
+            "scale width, height and K of the camera to the map"
+        )
     height, width = depth.shape
     if min(height, width) < 3:
         return depth.new_zeros(height, width, 3)

@@ -10,10 +10,10 @@ import os
 import pkgutil
 import re
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from types import ModuleType
-from typing import ClassVar, Generic, Protocol, TypeVar
+from typing import Any, ClassVar, Generic, Protocol, TypeVar
 
 from warpgs.errors import UsageError
 from warpgs.files import input_digest
@@ -190,6 +190,34 @@ def module_digest(module: ModuleType | None) -> str:
 def is_ours(cls: type) -> bool:
     """Return whether a class belongs to warpgs, not to the user."""
     return cls.__module__.startswith("warpgs.")
+
+
+def returned(
+    plugin: object, method: str, value: Any, kind: Any, what: str, *, each: Any = object, shape: Iterable[int] | None = None,
+    names: Iterable[str] | None = None,
+) -> Any:  # fmt: skip
+    """Return what a method of a plug-in returned; UsageError that names class and method if it is wrong.
+
+    ``what`` is the type in words. ``shape`` is that of a tensor, or the first axes of the tensors of a mapping, whose values
+    are of type ``each``; ``names`` are the names that a mapping may have.
+    """
+    wrong, wanted = "", None if shape is None else tuple(shape)
+    size = tuple(getattr(value, "shape", wanted or ()))
+    if not isinstance(value, kind):
+        wrong = type(value).__name__
+    elif isinstance(value, Mapping):
+        for n, v in value.items():
+            if not isinstance(n, str) or (names is not None and n not in names):
+                wrong = f"the name {n!r}"
+            elif not isinstance(v, each):
+                wrong = f"{type(v).__name__} for {n!r}"
+            elif wanted is not None and tuple(v.shape[: len(wanted)]) != wanted:
+                wrong = f"shape {list(v.shape)} for {n!r}"
+    elif wanted is not None and size != wanted:
+        wrong = f"shape {list(size)}"
+    if wrong:
+        raise UsageError(f"{type(plugin).__name__}.{method} must return {what}; it returned {wrong}. Correct the class")
+    return value
 
 
 def _line_about(cls: type) -> str:

@@ -189,6 +189,27 @@ def test_masks_folder(name, keeps, tmp_path):
     assert (half == ((mask[::2, ::2] > 0) == (keeps == "white"))).all()
 
 
+@pytest.mark.parametrize(
+    "focal, distortion, downscale", [(20.0, (), 2), (60.0, (0.3, 0.0, 0.0, 0.0), 1), (60.0, (0.3, 0.0, 0.0, 0.0), 2)]
+)
+@pytest.mark.parametrize("alpha", [False, True])
+def test_masked_pixels_do_not_run_into_others(focal, distortion, downscale, alpha, tmp_path):
+    """Where an image is resampled, a pixel that is kept has the colours of unmasked pixels alone."""
+    mask = np.ones((48, 64), bool)
+    mask[9:30, 21:44] = False
+    for name, junk in (("black", 0), ("noise", np.random.default_rng(0).integers(0, 256, (48, 64, 4)))):
+        pixels = np.where(mask[..., None], np.full(4, 153), junk).astype(np.uint8)
+        Image.fromarray(pixels if alpha else pixels[..., :3].copy()).save(tmp_path / f"{name}.png")
+    options, of_lens = ReadOptions(downscale=downscale), lens(64, 48, focal, distortion)
+    black, noise = (load_image(tmp_path / f"{n}.png", of_lens, options, mask=mask) for n in ("black", "noise"))
+    assert black.mask is not None and np.array_equal(black.mask, noise.mask) and not black.mask.all()
+    assert np.array_equal(black.image[black.mask], noise.image[black.mask])
+    assert np.ptp(black.image[black.mask]) < 1e-6
+    assert (black.alpha is not None) is alpha and (
+        not alpha or np.array_equal(black.alpha[black.mask], noise.alpha[black.mask])
+    )
+
+
 def test_masks_of_middlebury_lie_in_the_scene_folder(tmp_path):
     scenes.write_middlebury(tmp_path / "scene")
     mask = np.full((12, 16), 255, np.uint8)

@@ -3,6 +3,7 @@
 import dataclasses
 import html
 import json
+import warnings
 
 import cv2
 import numpy as np
@@ -77,6 +78,82 @@ def test_command_and_function_are_one_fit(folder, fitted):
     assert (result.train, result.test) == (run.train, run.test) and len(result.test) > 0
     views = [warpgs.load_scene(folder / "scene").view(n) for n in result.test]
     assert warpgs.evaluate(result.gaussians(), views, result.options())[0].psnr == stored["views"][0]["psnr"]
+
+
+def test_a_result_is_scored_over_the_background_of_its_fit(folder, recwarn):
+    """As the page on Python shows; Gaussians alone know no background, which is said where it shows."""
+    scene = warpgs.load_scene(folder / "scene")
+    result = warpgs.fit(scene, CONFIG, split=SPLIT, background="white", device="cpu", verbose=False)
+    views = [scene.view(n) for n in result.test]
+    scored = warpgs.evaluate(result, views)
+    assert summarize(scored)["psnr"] == result.metrics["test"]["psnr"] and not recwarn.list
+    assert warpgs.evaluate(result, views, warpgs.RasterizeOptions()) != scored
+    with pytest.warns(UserWarning, match="of view .* shows the background, taken as black; give the result of the fit") as told:
+        assert warpgs.evaluate(result.gaussians(), views) != scored
+    assert told[0].filename == __file__
+    assert len(told) == 1
+    with pytest.raises(TypeError, match="gaussians must be an instance of Gaussians"):
+        warpgs.evaluate(3, views)
+    alpha = np.pad(np.ones((20, 20), np.float32), ((6, 6), (10, 10)))
+    for color, count in (1.0, 0), (0.0, 1):
+        cut_out = [dataclasses.replace(v, alpha=alpha, image=np.where(alpha[..., None] > 0, v.image, color)) for v in views]
+        with warnings.catch_warnings(record=True) as said:
+            warpgs.evaluate(result, cut_out)
+        assert ["is over another background than the render" in str(w.message) for w in said] == [True] * count
+
+
+@pytest.mark.parametrize("mode", [torch.no_grad, torch.inference_mode])
+def test_a_fit_trains_within_a_mode_of_its_caller(folder, fitted, mode, device):
+    """Where gradients are off: the same bits, and tensors that can be used afterwards."""
+    with mode():
+        result = warpgs.fit(folder / "scene", CONFIG, split=SPLIT, device=device, verbose=False)
+        assert not torch.is_grad_enabled()
+    assert not result.gaussians().means.is_inference()
+    if device.type == "cpu":
+        assert all(torch.equal(t, fitted[0].gaussians().tensors()[n]) for n, t in result.gaussians().tensors().items())
+
+
+def hidden(scene, fill, given):
+    """A scene with masks in all views; what they hide is ``fill``, in all of the ``given`` arrays."""
+    views = []
+    for k, v in enumerate(scene.views):
+        mask, size = np.ones(v.image.shape[:2], bool), v.image.shape[:2]
+        mask[5:17, 4 + 2 * k : 16 + 2 * k] = False
+        mask[-3:] = False
+        junk = fill(k, (*size, 3)).astype(np.float32)
+        arrays = {"image": np.where(mask[..., None], v.image, junk)}
+        if "alpha" in given:
+            arrays["alpha"] = np.where(mask, np.float32(1), junk[..., 0])
+        if "maps" in given:
+            arrays["depth"] = warpgs.GivenDepth(np.where(mask, np.float32(2.9), 1 + junk[..., 1]))
+            arrays["normals"] = np.float32([0, 0, -1]) * (mask | (junk[..., 2] > 0.5))[..., None]
+        views.append(dataclasses.replace(v, mask=mask, **arrays))
+    return dataclasses.replace(scene, views=tuple(views))
+
+
+@pytest.mark.parametrize(
+    "preset, given, settings",
+    [
+        ("default", "", {"steps": 30}),
+        ("default", "", {"steps": 30, "init": {"source": "flow"}}),
+        ("3dgs", "", {"steps": 12, "init": {"source": "random"}, "background": "mean"}),
+        ("default", "alpha", {"steps": 12, "init": {"source": "hull"}}),
+        ("default", "maps", {"steps": 12}),
+    ],
+    ids=["sweep", "flow", "random", "alpha", "maps"],
+)
+def test_what_a_mask_hides_has_no_influence(folder, preset, given, settings, device):
+    """Two scenes that differ only under their masks: the same Gaussians to the bit, scores and notes."""
+    scene, results = warpgs.load_scene(folder / "scene"), []
+    for fill in (lambda k, shape: np.zeros(shape), lambda k, shape: np.random.default_rng(k).random(shape)):
+        made = hidden(scene, fill, given)
+        results.append(warpgs.fit(made, preset, split=SPLIT, device=device, verbose=False, **settings))
+    a, b = results
+    assert a.notes == b.notes
+    assert all(torch.equal(t, b.gaussians().tensors()[n]) for n, t in a.gaussians().tensors().items())
+    assert {k: a.metrics[k] for k in ("test", "baselines", "photographs")} == {
+        k: b.metrics[k] for k in ("test", "baselines", "photographs")
+    }
 
 
 def test_every_photograph_trains_by_default_and_a_run_remembers_its_scale(folder, tmp_path, capsys, monkeypatch):

@@ -14,7 +14,7 @@ import torch
 from torch.utils.checkpoint import checkpoint
 
 from tests.reference.project import project_reference
-from warpgs.constants import Rule
+from warpgs.constants import LARGEST_ALPHA, Rule
 
 PAIRS = 1 << 22
 """Gaussian-pixel pairs at a time: pixels are worked on in parts, each computed again for its gradient, to bound memory."""
@@ -84,8 +84,9 @@ class Layers(NamedTuple):
 def model(rule: Rule) -> Rule:
     """A rule without its cut-offs. Near plane and pixel filter stay: without them the model is not defined."""
     return dataclasses.replace(
-        rule, name="model", alpha_cut=0.0, alpha_max=1.0, transmittance_stop=0.0, inclusive_stop=True, square_sigma=0.0
-    )
+        rule, name="model", alpha_cut=0.0, alpha_max=LARGEST_ALPHA, transmittance_stop=0.0,
+        inclusive_stop=True, square_sigma=0.0,
+    )  # fmt: skip
 
 
 def projected_of(inputs: Inputs, frame: Frame, rule: Rule) -> ProjectedGaussians:

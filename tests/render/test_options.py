@@ -27,7 +27,7 @@ from warpgs.scene import Camera, Gaussians
     "field, values",
     {
         "alpha_cut": (-1, 1, math.nan, "0.1"),
-        "alpha_max": (0, 1.01, 2, math.nan, None),
+        "alpha_max": (0, 1, 1 - 2.0**-25, 1.01, 2, math.nan, None),
         "transmittance_stop": (-0.1, 1, 2, math.nan),
         "low_pass": (-1, math.nan, math.inf, "0.1"),
         "square_sigma": (-1, math.nan, math.inf),

@@ -14,8 +14,9 @@ from tests.reference.blend import blend_reference
 from tests.reference.project import project_reference
 from tests.scenes import ring, three_gaussians
 from tests.tolerances import close
-from warpgs.constants import ALPHA_CUT, FAR, RULES
+from warpgs.constants import ALPHA_CUT, FAR, LARGEST_ALPHA, RULES, Rule
 from warpgs.errors import ResourceError, UsageError
+from warpgs.kernels.tiles import BYTES_PER_INSTANCE
 from warpgs.render.options import RasterizeOptions
 from warpgs.render.rasterize import rasterize
 from warpgs.scene import ActivatedGaussians, Camera, CovarianceGaussians, Gaussians
@@ -388,3 +389,55 @@ def test_planes_that_bound_nothing_are_refused(planes):
     for options in ({"near": near, "far": far}, {"rule": own}):
         with pytest.raises(ValueError, match=r"near .* and far .*: give 0 <= near < far <= 1e\+10"):
             RasterizeOptions(**options)
+
+
+@pytest.mark.parametrize("layers", [1, 40])
+def test_gradients_at_the_largest_alpha_are_finite(device, layers):
+    """Opaque Gaussians one behind the other, at the largest alpha that a rule may have."""
+    g = cloud(layers).to(device)
+    g = dataclasses.replace(g, means=torch.zeros_like(g.means), logit_opacities=torch.full_like(g.logit_opacities, 30.0))
+    g.means[:, 2] = torch.linspace(2, 3, layers)
+    g.log_scales.fill_(12.0)  # far wider than the image: an alpha of 1 before it is limited
+    inputs = {n: t.detach().clone().requires_grad_() for n, t in g.tensors().items()}
+    rule = Rule("own", alpha_max=LARGEST_ALPHA, transmittance_stop=0.0)
+    render = rasterize(type(g)(**inputs), camera(), RasterizeOptions(rule=rule))
+    (render.rgb.square().sum() + render.depth.sum()).backward()
+    assert float(render.alpha.detach().max()) > 0.999
+    assert all(bool(t.grad.isfinite().all()) for t in inputs.values())
+
+
+@pytest.mark.parametrize("name", ["viewmat", "K", "background", "distortion"])
+def test_an_array_edited_before_the_backward_pass_changes_no_gradient(device, name):
+    """Cameras and backgrounds as numpy arrays of the Gaussians' own type, which torch would share."""
+    lens = {"model": "opencv", "distortion": np.zeros(8)} if name == "distortion" else {}
+    gradients = []
+    for edited in (False, True):
+        cam = camera()
+        cam = Camera(cam.viewmat.double().numpy().copy(), cam.K.double().numpy().copy(), cam.width, cam.height, **lens)
+        if lens:
+            cam = dataclasses.replace(cam, distortion=np.full(8, 0.01))
+        background = np.full(3, 0.5)
+        inputs = {n: t.double().to(device).requires_grad_() for n, t in cloud(20).tensors().items()}
+        render = rasterize(Gaussians(**inputs), cam, RasterizeOptions(background=background))
+        if edited:
+            array = background if name == "background" else getattr(cam, name)
+            array *= 1.1
+        (render.rgb.square().sum() + render.alpha.sum()).backward()
+        gradients.append({n: t.grad for n, t in inputs.items()})
+    assert all(torch.equal(t, gradients[1][n]) for n, t in gradients[0].items())
+    assert bool(gradients[0]["means"].any())
+
+
+def test_chunks_keep_to_the_memory_budget_too(device):
+    """The smaller of both limits divides the image, with the same bits; a budget below one tile is an error."""
+    g, cam = cloud(60).to(device), camera(80, 64)
+    whole = rasterize(g, cam)
+    instances = int(whole.tile_counts.sum())
+    budget = instances // 3 * BYTES_PER_INSTANCE
+    with pytest.raises(ResourceError, match="instances need"):
+        rasterize(g, cam, RasterizeOptions(memory_budget=budget))
+    for most in (instances // 2, instances, 10 * instances):
+        found = rasterize(g, cam, RasterizeOptions(memory_budget=budget, max_instances=most, median_depth=True))
+        assert torch.equal(found.rgb, whole.rgb) and torch.equal(found.depth, whole.depth)
+        with pytest.raises(ResourceError, match="instances need"):
+            rasterize(g, cam, RasterizeOptions(memory_budget=1, max_instances=most))

@@ -11,7 +11,7 @@ import struct
 import warnings
 import zipfile
 import zlib
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO, ClassVar
@@ -21,9 +21,11 @@ import numpy as np
 from warpgs.errors import DataError, UsageError
 from warpgs.files import open_input, read_input, unread_reason, write_bytes
 from warpgs.geometry import checked_normalization, convert_gaussians, rotate
-from warpgs.plugins import Registry
+from warpgs.plugins import Registry, returned
 from warpgs.scene import Gaussians, Normalization, base_coefficients, base_colors
 
+BYTES = (bytes, bytearray, memoryview)
+"""Types of the pieces of a file."""
 ROWS = 16384
 """Number of Gaussians decoded at a time, so that float64 copies of a whole model never exist."""
 Arrays = dict[str, np.ndarray]
@@ -317,7 +319,8 @@ class Format:
                 f"{gaussians.sh_degree}. Drop higher degrees with --sh-degree {self.max_degree}, in Python with "
                 f"sh[:, :{(self.max_degree + 1) ** 2}], or write .ply"
             )
-        write_bytes(path, *self.encode(arrays))
+        pieces = returned(self, "encode", self.encode(arrays), Iterable, "an iterable of bytes")
+        write_bytes(path, *(returned(self, "encode", p, BYTES, "an iterable of bytes") for p in pieces))
 
     def read(self, path: Path, normalization: Normalization | None, units: str) -> Gaussians:
         """Read Gaussians, with the arguments of `warpgs.export.read_gaussians`.
@@ -328,6 +331,9 @@ class Format:
         normalization = checked_normalization(normalization, units, str(path))
         with reading(path, whole=not self.archive) as file:
             arrays = self.decode(path, file if self.archive else file.read())
+            what, names = "an array for each tensor of Gaussians, by name", Gaussians.__dataclass_fields__
+            returned(self, "decode", arrays, Mapping, what, each=np.ndarray, names=names)
+            returned(self, "decode", {n: arrays.get(n) for n in names}, Mapping, what, each=np.ndarray)
         self.notes = []
         gaussians = gaussians_of(path, arrays, lambda: self.strict or self.is_own(path), self.notes)
         return convert_gaussians(gaussians, normalization, "file", units)

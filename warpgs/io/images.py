@@ -257,6 +257,32 @@ def undistortion_maps(K: np.ndarray, lens: Lens, width: int, height: int) -> tup
     return cv2.initUndistortRectifyMap(K, np.array(lens.distortion), None, K, (width, height), cv2.CV_32FC1)
 
 
+def nearest_unmasked(raster: np.ndarray, mask: np.ndarray | None) -> np.ndarray:
+    """Return a raster [H, W, ...] whose masked pixels have the value of the nearest unmasked one; unchanged without a mask."""
+    import cv2
+
+    if mask is None or mask.all():
+        return raster
+    masked = (~mask).astype(np.uint8)
+    labels = cv2.distanceTransformWithLabels(masked, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)[1]
+    places = np.zeros(labels.max() + 1, np.int64)
+    places[labels[mask]] = np.flatnonzero(mask)
+    filled: np.ndarray = raster.reshape(-1, *raster.shape[2:])[places[labels]]
+    return filled
+
+
+def without_masked(view: View) -> View:
+    """Return a view without what is under its mask: the nearest unmasked colours and opacities, no depth, no normals."""
+    mask, depth = view.mask, view.depth
+    if mask is None or mask.all():
+        return view
+    alpha = None if view.alpha is None else nearest_unmasked(view.alpha, mask)
+    normals = None if view.normals is None else np.where(mask[..., None], view.normals, 0)
+    if depth is not None:
+        depth = replace(depth, values=np.where(mask, depth.values, 0))
+    return replace(view, image=nearest_unmasked(view.image, mask), alpha=alpha, depth=depth, normals=normals)
+
+
 def _undistort(loaded: LoadedImage, lens: Lens) -> LoadedImage:
     """Resample to a pinhole of the same K; pixels that the lens never saw are masked out."""
     import cv2
@@ -273,10 +299,13 @@ def _undistort(loaded: LoadedImage, lens: Lens) -> LoadedImage:
     if loaded.mask is not None:
         inside &= cv2.remap(loaded.mask.astype(np.float32), map_x, map_y, cv2.INTER_LINEAR) > 0.5
     edge = cv2.BORDER_REPLICATE
-    image = cv2.remap(loaded.image, map_x, map_y, cv2.INTER_LINEAR, borderMode=edge)
-    alpha = None if loaded.alpha is None else cv2.remap(loaded.alpha, map_x, map_y, cv2.INTER_LINEAR, borderMode=edge)
+
+    def moved(raster: np.ndarray) -> np.ndarray:
+        return cv2.remap(nearest_unmasked(raster, loaded.mask), map_x, map_y, cv2.INTER_LINEAR, borderMode=edge)
+
+    image, alpha = moved(loaded.image), None if loaded.alpha is None else moved(loaded.alpha)
     done = (*loaded.done, f"undistorted ({lens.model})")
-    return replace(loaded, image=image, mask=None if inside.all() else inside, done=done, alpha=alpha)
+    return replace(loaded, image=image, mask=None if inside.all() else inside, done=done, alpha=alpha, undone=lens)
 
 
 @functools.lru_cache(maxsize=4)
@@ -320,8 +349,10 @@ def _shrink(path: Path, loaded: LoadedImage, downscale: int, max_side: int) -> L
         )
     K = np.diag([small_w / width, small_h / height, 1.0]) @ loaded.K
     mask = None if loaded.mask is None else _resize(loaded.mask.astype(np.float32), small_w, small_h) > 0.5
-    alpha = None if loaded.alpha is None else _resize(loaded.alpha, small_w, small_h)
-    return LoadedImage(_resize(loaded.image, small_w, small_h), mask, K, done, alpha, loaded.kept)
+    hides = loaded.mask if loaded.undone is None else None  # what the mask of an undistorted image hides is filled already
+    image = _resize(nearest_unmasked(loaded.image, hides), small_w, small_h)
+    alpha = None if loaded.alpha is None else _resize(nearest_unmasked(loaded.alpha, hides), small_w, small_h)
+    return LoadedImage(image, mask, K, done, alpha, loaded.kept)
 
 
 def _fit_mask(path: Path, mask: np.ndarray, stored: tuple[int, int], upright: tuple[int, int], orientation: int) -> np.ndarray:

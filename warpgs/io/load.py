@@ -17,6 +17,7 @@ import numpy as np
 from warpgs.errors import DataError, UsageError, similar_folder
 from warpgs.geometry import camera_extent, matmul
 from warpgs.io.folder import (
+    Probe,
     Reader,
     SceneFolder,
     all_readers,
@@ -29,6 +30,7 @@ from warpgs.io.folder import (
 from warpgs.io.image_files import MAX_PIXELS, READ, unread_note
 from warpgs.io.images import ReadOptions, SceneOptions, cut_from_black, image_scale, list_images, matches
 from warpgs.io.maps import check_found
+from warpgs.plugins import returned
 from warpgs.scene import Normalization, PointCloud, Scene, View, checked_scene
 
 MIN_EXTENT = 1e-9
@@ -466,7 +468,7 @@ def read_folder(
 def detect(root: Path) -> tuple[Reader, list[str]]:
     """Return the reader of the first complete format of a scene folder, and notes on the formats passed over."""
     readers = all_readers()
-    found = [(r, p) for r in readers if (p := r.probe(root)) is not None]
+    found = [(r, p) for r in readers if (p := _probe(r, root)) is not None]
     complete = [r for r, p in sorted(found, key=lambda row: row[1].fallback) if not p.missing]
     broken = [f"{p.found} lacks {p.missing}" for _, p in found if p.missing]
     if not complete and broken:
@@ -486,11 +488,17 @@ def detect(root: Path) -> tuple[Reader, list[str]]:
     return taken, notes
 
 
+def _probe(reader: Reader, root: Path) -> Probe | None:
+    """Return what a reader finds in a folder."""
+    found: Probe | None = returned(reader, "probe", reader.probe(root), (Probe, type(None)), "a Probe, or None")
+    return found
+
+
 def _accepted(root: Path, reader: Reader) -> Reader:
     """Return a reader that the user chose; DataError where its format is not in the folder or not complete."""
-    probe = reader.probe(root)
+    probe = _probe(reader, root)
     if probe is None:
-        others = [p.found for r in all_readers() if (p := r.probe(root)) is not None]
+        others = [p.found for r in all_readers() if (p := _probe(r, root)) is not None]
         there = f"; the folder holds {' and '.join(others)}" if others else ""
         wanted = f" ({reader.description})" if reader.description else ""
         raise DataError(f"{root}: the reader {reader.name} finds no scene of its format{wanted}{there}. Choose another reader")
@@ -513,9 +521,7 @@ def _exclusions(options: ReadOptions, names: list[str]) -> list[str]:
 def _finished(root: Path, reader: Reader, scene: Scene, notes: list[str], options: ReadOptions) -> Scene:
     """Check a scene that a reader returned; return it sorted, in scene coordinates, with score masks and fingerprint."""
     own = f"the reader {reader.name} must return a Scene in file coordinates, without a Normalization; fix it"
-    if not isinstance(scene, Scene):
-        raise UsageError(own)
-    scene = checked_scene(scene, f"{root}, ")
+    scene = checked_scene(returned(reader, "read", scene, Scene, "a Scene"), f"{root}, ")
     if scene.normalization.scale != 1 or scene.normalization.offset.any():
         raise UsageError(own)
     views, points, more = [v for v in scene.views if not options.excludes(v.name)], scene.points, scene.notes

@@ -11,6 +11,7 @@ from warpgs.kernels.ellipse import ProjectInputs
 from warpgs.kernels.falloff import Pass
 from warpgs.kernels.launch import first_order, keep, kept
 from warpgs.kernels.project import project_inputs
+from warpgs.kernels.tiles import AS_NEEDED, InstanceMemory
 from warpgs.render.compose import Images, bin_and_blend, bin_projected, further_of
 
 
@@ -49,13 +50,13 @@ def _place(settings: Pass, part: Pass) -> tuple[slice, slice, slice]:
 
 class _BlendChunked(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, projected, backgrounds, colors, settings, most, *inputs):
+    def forward(ctx, projected, backgrounds, colors, settings, most, memory, *inputs):
         _, _, width, height = settings.window
         images = [projected.new_empty(len(projected), height, width, *rest) for rest in (backgrounds.shape[1:], (), ())]
         values = None if colors is None else colors.detach()
-        ctx.settings, ctx.parts = settings, []
+        ctx.settings, ctx.memory, ctx.parts = settings, memory, []
         for part, counts in chunks(settings, most, ProjectInputs(*inputs)):
-            pieces = bin_and_blend(projected.detach(), counts, backgrounds.detach(), part, colors=values)
+            pieces = bin_and_blend(projected.detach(), counts, backgrounds.detach(), part, memory, colors=values)
             for image, piece in zip(images, pieces):
                 image[_place(settings, part)] = piece
             ctx.parts.append(part)
@@ -75,32 +76,33 @@ class _BlendChunked(torch.autograd.Function):
             counts = project_inputs(inputs, part)[1]
             with torch.enable_grad():
                 own = [t.detach().requires_grad_() for t in blended]
-                pieces = bin_and_blend(own[0], counts, own[1], part, colors=None if colors is None else own[2])
+                pieces = bin_and_blend(own[0], counts, own[1], part, ctx.memory, colors=None if colors is None else own[2])
             place = _place(ctx.settings, part)
             images, v_images = zip(*[(p, v[place]) for p, v in zip(pieces, upstream) if v is not None])
             for total, gradient in zip(gradients, torch.autograd.grad(images, own, v_images)):
                 total += gradient
-        return *gradients, *(None for _ in range(3 + 2 + len(inputs) - len(gradients)))
+        return *gradients, *(None for _ in range(3 + 3 + len(inputs) - len(gradients)))
 
 
 def blend_chunked(
     projected: torch.Tensor, backgrounds: torch.Tensor, settings: Pass, most: int, inputs: ProjectInputs,
-    colors: torch.Tensor | None = None,
+    memory: InstanceMemory = AS_NEEDED, colors: torch.Tensor | None = None,
 ) -> Images:  # fmt: skip
     """Composite [C, N, 12] chunk by chunk, to the bits of `images_of`; the backward pass renders each chunk again."""
     # only the inputs are saved; about 1.5 times the time of `blend`, with memory for one chunk's instances
-    images: Images = _BlendChunked.apply(projected, backgrounds, colors, settings, most, *inputs.detached())
+    images: Images = _BlendChunked.apply(projected, backgrounds, colors, settings, most, memory, *inputs.detached())
     return images
 
 
 def further_chunked(
-    projected: torch.Tensor, settings: Pass, most: int, inputs: ProjectInputs, contributions: bool, median: bool, k: int
-) -> dict[str, torch.Tensor]:
+    projected: torch.Tensor, settings: Pass, most: int, inputs: ProjectInputs, memory: InstanceMemory, contributions: bool,
+    median: bool, k: int,
+) -> dict[str, torch.Tensor]:  # fmt: skip
     """Return what `further_of` does for projected Gaussians [C, N, 12], chunk by chunk; images have the same bits."""
     found: dict[str, torch.Tensor] = {}
     _, _, width, height = settings.window
     for part, counts in chunks(settings, most, inputs.detached()):
-        tiles = bin_projected(projected, counts, part, slotted=contributions)
+        tiles = bin_projected(projected, counts, part, memory, contributions)
         for name, values in further_of(projected, tiles, part, contributions, median, k).items():
             if name == "weight_sums":
                 found[name] = found[name] + values if name in found else values

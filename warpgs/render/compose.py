@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from typing import Any
 
+import numpy as np
 import torch
 
 from warpgs.constants import Rule
@@ -28,6 +29,8 @@ Images = tuple[torch.Tensor, torch.Tensor, torch.Tensor]
 def as_batch(array: Any, like: torch.Tensor, axes: int = 2) -> torch.Tensor:
     """Return an array as a tensor [C, ...] of the type and device of ``like``; ``axes`` is the array's ndim for one camera."""
     tensor: torch.Tensor = array
+    if isinstance(array, np.ndarray):
+        array = array.copy()  # the backward pass reads it, and an edit of an array would go unnoticed
     if not (isinstance(array, torch.Tensor) and array.dtype == like.dtype and array.device == like.device):
         tensor = torch.as_tensor(array, dtype=like.dtype, device=like.device)
     return tensor[None] if tensor.ndim == axes else tensor

@@ -67,7 +67,8 @@ class RasterizeOptions:
     render under `exact`, plus the rounding of float64. So the bound covers both cut-offs and float32 rounding. The float64
     render takes several times as long as one in float32 (docs/numerics.md). Not with ``capacity``."""
     memory_budget: int | None = None
-    """Bytes that the (Gaussian, tile) instances may take; None for four fifths of the free memory."""
+    """Bytes that the (Gaussian, tile) instances may take at a time; None for four fifths of the free memory. With
+    ``max_instances``, the chunks keep to both limits."""
     deterministic: bool = True
     """True to sum gradients in a fixed order, so that the same inputs give the same bits. False takes less memory on CUDA."""
     absgrad: bool = False

@@ -20,7 +20,7 @@ from warpgs.kernels.ellipse import ProjectInputs
 from warpgs.kernels.falloff import WIDTHS, Pass
 from warpgs.kernels.launch import refuse_transforms, without_gradient
 from warpgs.kernels.project import project_inputs
-from warpgs.kernels.tiles import InstanceMemory, grid
+from warpgs.kernels.tiles import BYTES_PER_INSTANCE, InstanceMemory, grid
 from warpgs.means2d import count_passes
 from warpgs.render import graphed
 from warpgs.render.chunked import blend_chunked, further_chunked
@@ -260,7 +260,8 @@ and what is behind the scene, shape [C, D]."""
 
 
 def _as_tensor(values: Any) -> torch.Tensor:
-    """Return numbers as a tensor, where they are or on the CPU, whatever torch's default device."""
+    """Return numbers as a tensor, where they are or on the CPU, whatever torch's default device; an array is copied."""
+    values = values.copy() if isinstance(values, np.ndarray) else values
     return torch.as_tensor(values, device=getattr(values, "device", "cpu"))
 
 
@@ -410,13 +411,16 @@ def _rasterize(
     """Return images, projected Gaussians [C, N, 12], tile counts [C, N], and the further fields of `Render` by name."""
     projected, tile_counts = project_inputs(inputs, settings)
     further = options.contributions, options.median_depth, options.heaviest
-    if options.max_instances is not None and int(tile_counts.sum()) > options.max_instances:
-        frame = settings, options.max_instances, inputs
+    most, budget = options.max_instances, options.memory_budget
+    if most is not None and budget is not None:
+        most = min(most, budget // BYTES_PER_INSTANCE)
+    if most is not None and int(tile_counts.sum()) > most:
+        frame = settings, most, inputs, InstanceMemory(budget)
         images = [blend_chunked(projected, backgrounds, *frame, colors) for colors, backgrounds in layers]
         maps = further_chunked(projected, *frame, *further) if any(further) else {}
     else:
         overflow = None if options.capacity is None else torch.zeros(1, dtype=torch.int32, device=projected.device)
-        memory = InstanceMemory(options.memory_budget, options.capacity, overflow)
+        memory = InstanceMemory(budget, options.capacity, overflow)
         slotted = options.contributions or needs_slots([projected, *(t for layer in layers for t in layer)])
         listed = None if pixels is None else listed_tiles(pixels, settings, len(projected))
         tiles = bin_projected(projected, tile_counts, settings, memory, slotted, listed)

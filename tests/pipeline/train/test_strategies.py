@@ -15,11 +15,12 @@ from warpgs.errors import UsageError
 from warpgs.geometry import quaternions, rotation_matrices
 from warpgs.pipeline.model.edit import OPAQUE, covariances, merged_pairs, merges
 from warpgs.pipeline.model.start import InitConfig
+from warpgs.pipeline.model.table import DensityUpdate
 from warpgs.pipeline.train.loss import LOSS_TERMS, LossTerm
 from warpgs.pipeline.train.schedule import OptimizerConfig
 from warpgs.pipeline.train.settings import FitConfig
 from warpgs.pipeline.train.strategies import clone_split
-from warpgs.pipeline.train.strategies.base import STRATEGIES
+from warpgs.pipeline.train.strategies.base import STRATEGIES, Strategy
 from warpgs.pipeline.train.strategies.clone_split import DensityConfig, refine
 from warpgs.pipeline.train.strategies.mcmc import MAX_COPIES, MCMCConfig, perturb, relocated
 from warpgs.pipeline.train.trainer import Trainer
@@ -373,6 +374,84 @@ def test_two_terms_with_one_name_for_a_map_are_refused():
     config = dataclasses.replace(PLAIN, loss_terms=(First(), Second()))
     with pytest.raises(UsageError, match="'first' and 'second' both have a map 'shared'; rename"):
         Trainer(photos(2), seeds(), config, CPU)
+
+
+@pytest.mark.usefixtures("registries_as_they_were")
+def test_a_term_without_a_gradient_is_refused_at_its_first_step(device):
+    """Detached, it would change nothing without a word; 0 says that it does not apply to a view."""
+
+    @LOSS_TERMS.register("constant")
+    @dataclass(frozen=True)
+    class Constant(Gray):
+        def __call__(self, inputs):
+            return super().__call__(inputs).detach()
+
+    config = dataclasses.replace(PLAIN, steps=4, cuda_graph=False)
+    with pytest.raises(UsageError, match=r"'constant' has no gradient, so it changes nothing: Constant\.__call__ must"):
+        Trainer(photos(2), seeds(), dataclasses.replace(config, loss_terms=(Constant(),)), device).advance()
+    nothing = advanced(Trainer(photos(2), seeds(), dataclasses.replace(config, loss_terms=(Constant(0.0),)), device))
+    assert nothing.step == 4
+
+
+def own_update(make):
+    """A strategy that makes one update after the second step, by a function of the context."""
+
+    class Own(Strategy):
+        def due(self, step):
+            return step == 2
+
+        def update(self, step):
+            yield make(self.context)
+
+    STRATEGIES.register("own")(Own)
+    return dataclasses.replace(PLAIN, strategy="own", steps=4, max_gaussians=100)
+
+
+def grown(context, count, parent=0, value=None, keep=None):
+    """An update with ``count`` copies of a Gaussian."""
+    rows = {n: t[:1].repeat(count, *[1] * (t.dim() - 1)) for n, t in context.gaussians.tensors().items()}
+    if value is not None:
+        rows["means"][-1, 0] = value
+    keep = range(len(context.table)) if keep is None else keep
+    keep, parents = (torch.tensor(list(i), dtype=torch.int64, device=context.device) for i in (keep, [parent] * count))
+    return DensityUpdate(keep, rows, parents)
+
+
+def overwriting(context, rows, value=0.0):
+    """An update that overwrites means."""
+    means, keep = (
+        torch.full((len(rows), 3), value, device=context.device),
+        torch.arange(len(context.table), device=context.device),
+    )
+    return DensityUpdate(keep, overwritten=torch.tensor(rows, device=context.device), values={"means": means})
+
+
+@pytest.mark.usefixtures("registries_as_they_were")
+@pytest.mark.parametrize(
+    "make, message",
+    [
+        (lambda c: grown(c, 41), "makes 101 Gaussians of 60, but max_gaussians and the memory limit allow 100; add at most"),
+        (lambda c: grown(c, 2, value=math.nan), r"added\['means'\] has 1 non-finite values"),
+        (lambda c: grown(c, 2, value=math.inf), r"added\['means'\] has 1 non-finite values"),
+        (lambda c: grown(c, 1, keep=[0, 1, 1, 2]), "keep must ascend, each row once"),
+        (lambda c: grown(c, 1, keep=[2, 1]), "keep must ascend, each row once"),
+        (lambda c: grown(c, 1, keep=[0, 60]), "keep must be from 0 to 59"),
+        (lambda c: grown(c, 1, keep=[-1, 0]), "keep must be from 0 to 59"),
+        (lambda c: grown(c, 1, parent=60), "parents must be from -1 to 59"),
+        (lambda c: overwriting(c, [3, 3]), "overwritten holds a row twice"),
+        (lambda c: overwriting(c, [60]), "overwritten must be from 0 to 59"),
+        (lambda c: overwriting(c, [1], math.nan), r"values\['means'\] has 3 non-finite values"),
+        (lambda c: DensityUpdate(torch.ones(60, dtype=torch.bool)), "keep must be an int64 tensor of one axis"),
+    ],
+)
+def test_an_update_that_damages_the_table_is_refused_by_name(make, message, device):
+    """Whatever the strategy: the set keeps to its capacity, its rows are finite and come from rows that exist."""
+    fit = Trainer(photos(2), seeds(), own_update(make), device)
+    with pytest.raises(UsageError, match=rf"^the strategy Own, after step 2: .*{message}"):
+        advanced(fit)
+    assert len(fit.table) == 60
+    fit = Trainer(photos(2), seeds(), own_update(lambda c: grown(c, 40)), device)
+    assert len(advanced(fit).table) == 100
 
 
 OWN = """

@@ -16,6 +16,7 @@ from warpgs.constants import NEAR
 from warpgs.files import make_folder, read_file, write_bytes
 from warpgs.geometry import check_pinhole, pinhole_of
 from warpgs.io.image_files import decode
+from warpgs.io.images import without_masked
 from warpgs.kernels.ssim import ssim
 from warpgs.mesh.views import MIN_ALPHA, TOLERANCE, depth_difference, seen_from
 from warpgs.pipeline.metrics.scores import psnr_of, render_view, scored_pair
@@ -145,7 +146,7 @@ def _bin(difference: torch.Tensor) -> np.ndarray:
 
 def _photo(view: View, depth: torch.Tensor) -> torch.Tensor:
     """Return the image of a view at the size and on the device of its depth, shape [H, W, 3]."""
-    image = torch.as_tensor(view.image, dtype=torch.float32, device=depth.device)
+    image = torch.as_tensor(without_masked(view).image, dtype=torch.float32, device=depth.device)
     if image.shape[:2] == depth.shape:
         return image
     return interpolate(image.permute(2, 0, 1)[None], depth.shape, mode="area")[0].permute(1, 2, 0)

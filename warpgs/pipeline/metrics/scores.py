@@ -6,13 +6,13 @@ import math
 import warnings
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch
 
 from warpgs.geometry import back_project, inverse, matmul, project_points
-from warpgs.io.images import dark_pixels
+from warpgs.io.images import dark_pixels, without_masked
 from warpgs.kernels.ssim import ssim
 from warpgs.kernels.update import squared_error
 from warpgs.pipeline.metrics.lpips import Lpips
@@ -196,15 +196,33 @@ def render_view(gaussians: Gaussians, view: View, options: RasterizeOptions) -> 
     return r.rgb.cpu().numpy(), r.depth.cpu().numpy(), r.alpha.cpu().numpy()
 
 
+@runtime_checkable
+class Fitted(Protocol):
+    """Gaussians with the options of their fit, such as `FittedModel`."""
+
+    def gaussians(self) -> Gaussians:
+        """Return the Gaussians in scene units."""
+
+    def options(self) -> RasterizeOptions:
+        """Return the options that the fit renders with."""
+
+
+NOTICED = 0.5 / 255
+"""Mean part of the background in a view's pixels above which it matters which one it is: half a level of an 8-bit image."""
+
+
 def evaluate(
-    gaussians: Gaussians, views: Sequence[View], options: RasterizeOptions | None = None, lpips: Lpips | None = None
-) -> list[ViewMetrics]:
+    gaussians: Gaussians | Fitted, views: Sequence[View], options: RasterizeOptions | None = None,
+    lpips: Lpips | None = None,
+) -> list[ViewMetrics]:  # fmt: skip
     """Render views and score each against its image, as a fit does.
 
     Args:
-        gaussians: N Gaussians in the units of the views' cameras: scene units for the views of a `Scene`.
+        gaussians: A fitted model, such as the result of `fit`, which has the options of its fit; or N Gaussians in the units of
+            the views' cameras: scene units for the views of a `Scene`.
         views: Views with images; use held-out views for a meaningful score.
-        options: Options of the rasterizer, such as `FitResult.options`; None for the defaults.
+        options: Options of the rasterizer; None for those of the fitted model. With Gaussians alone, None is a black background
+            and the rule exact, with a warning if an opaque view shows much of the background.
         lpips: `Lpips`, the network with its weights; None to skip LPIPS.
 
     Returns:
@@ -213,15 +231,43 @@ def evaluate(
     Raises:
         DataError: A field of a view is invalid; the message names the view, the field and the fix.
     """
-    views, options = checked_views(views), RasterizeOptions() if options is None else options
-    rendered = ((v, render_view(gaussians, v, options)) for v in views)
-    return [score(v, image, lpips, alpha) for v, (image, _, alpha) in rendered]
+    views, known = checked_views(views), options is not None or isinstance(gaussians, Fitted)
+    if isinstance(gaussians, Fitted):
+        options = gaussians.options() if options is None else options
+        gaussians = gaussians.gaussians()
+    options = RasterizeOptions() if options is None else options
+    scores, doubts = [], []
+    for v in views:
+        image, _, alpha = render_view(gaussians, v, options)
+        scores.append(score(v, image, lpips, alpha))
+        doubts += _doubts(v, alpha, options, known)
+    if doubts:
+        warnings.warn(f"evaluate: {doubts[0]}", stacklevel=2)
+    return scores
+
+
+def _doubts(view: View, alpha: np.ndarray, options: RasterizeOptions, known: bool) -> list[str]:
+    """Return a reason to doubt the background of a render with this alpha [H, W], if any; ``known`` if it was given."""
+    region, name = scored_region(view)
+    if view.alpha is not None:
+        empty, behind = view.alpha < EMPTY, torch.zeros(3) if options.background is None else options.background
+        colors = view.image[empty] - torch.as_tensor(behind).detach().cpu().numpy()
+        if empty.any() and float(np.abs(colors.mean(0)).max()) > EMPTY:
+            fix = "give options with the background of the views"
+            return [f"view {view.name} is over another background than the render, so colours differ; {fix}"]
+    elif not known and name != "foreground":
+        shown = 1 - float((alpha if region is None else alpha[region]).mean())
+        if shown > NOTICED:
+            fix = "give the result of the fit instead of its Gaussians, or options with the background of the fit"
+            return [f"{shown:.1%} of view {view.name} shows the background, taken as black; {fix}"]
+    return []
 
 
 def baselines(train: list[View], test: list[View]) -> dict[str, float]:
     """Return the mean PSNR [dB] over the test views of two predictions without 3D, which any useful fit beats."""
     # ``mean_photo``: the mean of the training images; ``nearest_photo``: the image of the nearest training camera. Training
     # images whose size differs from the test view's are left out, and so is a baseline without any score.
+    train = [without_masked(v) for v in train]
     scores: dict[str, list[float]] = {"mean_photo": [], "nearest_photo": []}
     for view in test:
         same = [v for v in train if v.image.shape == view.image.shape]
@@ -315,9 +361,9 @@ def _reduced(view: View, rgb: np.ndarray, depth: np.ndarray, alpha: np.ndarray) 
     c = view.camera
     shrink = min(1.0, (MAX_PIXELS / (c.width * c.height)) ** 0.5)
     size = width, height = max(1, int(c.width * shrink)), max(1, int(c.height * shrink))
-    colors = (view.image, np.clip(rgb, 0, 1))
+    photo, mask = without_masked(view).image, np.ones(alpha.shape) if view.mask is None else view.mask
+    colors = (photo, np.clip(rgb, 0, 1))
     image, rgb = (cv2.resize(a.astype(np.float32), size, interpolation=cv2.INTER_AREA) for a in colors)
-    mask = np.ones(alpha.shape) if view.mask is None else view.mask
     depth, alpha, mask = (cv2.resize(a.astype(np.float32), size, interpolation=cv2.INTER_NEAREST) for a in (depth, alpha, mask))
     around = np.ones((3, 3), np.uint8)
     beyond = np.maximum(np.maximum(cv2.erode(image, around) - rgb, rgb - cv2.dilate(image, around)), 0).mean(-1)

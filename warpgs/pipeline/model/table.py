@@ -78,7 +78,7 @@ class Column:
 
 @dataclass(frozen=True)
 class DensityUpdate:
-    """A change of the set of Gaussians: rows that stay, rows that are overwritten, rows that are appended."""
+    """A change of the set of Gaussians: rows that stay, rows that are overwritten, rows that are appended; all are finite."""
 
     keep: torch.Tensor
     """Indices of the surviving rows in ascending order, int64, shape [S]."""
@@ -202,12 +202,14 @@ class Table:
             means.copy_(torch.where(factors[:, None] == 1, means, before + factors[:, None] * (means - before)))
 
     @torch.no_grad()
-    def apply(self, update: DensityUpdate) -> None:
+    def apply(self, update: DensityUpdate, capacity: int | None = None) -> None:
         """Apply a change of the set: kept rows keep everything, new rows start with zero moments.
 
         Raises:
-            UsageError: A parameter is missing, or the numbers of new rows and parents differ.
+            UsageError: A parameter is missing or not finite, the numbers of new rows and parents differ, indices are wrong, or
+                the set grows beyond ``capacity``.
         """
+        self._check(update, capacity)
         added, keep, parents = update.added, update.keep, update.parents.to(self.device)
         if not added and not len(parents):
             added = {n: t.detach()[:0] for n, t in self.params.items()}
@@ -234,6 +236,32 @@ class Table:
                 new = torch.where(parents >= 0, old[parents.clamp_min(0)], new)
             self.columns[name] = torch.cat([old[keep], new])
         self.count = len(keep) + len(parents)
+
+    def _check(self, update: DensityUpdate, capacity: int | None) -> None:
+        """Check the indices and values of a change, and the size of the set after it."""
+        indices = {"keep": update.keep, "overwritten": update.overwritten, "parents": update.parents}
+        for name, rows in indices.items():
+            if rows is None:
+                continue
+            if not isinstance(rows, torch.Tensor) or rows.dtype != torch.int64 or rows.ndim != 1:
+                raise UsageError(f"DensityUpdate.{name} must be an int64 tensor of one axis; give indices of rows")
+            low = -1 if name == "parents" else 0
+            if len(rows) and not low <= int(rows.min()) <= int(rows.max()) < self.count:
+                raise UsageError(f"DensityUpdate.{name} must be from {low} to {self.count - 1}, the rows before the change")
+            if name == "keep" and bool((rows.diff() <= 0).any()):
+                raise UsageError("DensityUpdate.keep must ascend, each row once; sort it, and copy rows through added")
+            if name == "overwritten" and len(rows.unique()) < len(rows):
+                raise UsageError("DensityUpdate.overwritten holds a row twice; give each row once")
+        for where, rows_of in (("added", update.added), ("values", update.values)):
+            for name, t in rows_of.items():
+                if bad := t.numel() - int(torch.isfinite(t).sum()):
+                    raise UsageError(f"DensityUpdate.{where}[{name!r}] has {bad:,} non-finite values; give finite ones")
+        after = len(update.keep) + len(update.parents)
+        if capacity is not None and after > max(capacity, self.count):
+            raise UsageError(
+                f"a DensityUpdate makes {after:,} Gaussians of {self.count:,}, but max_gaussians and the memory limit allow "
+                f"{capacity:,}; add at most context.capacity - len(context.table), or raise --max-gaussians"
+            )
 
     @torch.no_grad()
     def reorder(self, order: torch.Tensor) -> None:

@@ -16,6 +16,7 @@ from warpgs.errors import DataError, NotFiniteError, UsageError
 from warpgs.export.ply import write_ply
 from warpgs.files import write_json
 from warpgs.geometry import CENTRAL
+from warpgs.io.images import without_masked
 from warpgs.io.load import Split, check_spec
 from warpgs.kernels.native import told_of_compiling
 from warpgs.pipeline.metrics.coverage import coverage_of_run
@@ -399,7 +400,13 @@ def fit(
     verbose, own = ranks.first and verbose, out if ranks.first else None
     folder = contextlib.nullcontext(list[str]()) if own is None else run_folder(own, resume)
     stages = Stages() if verbose else Stages(lambda line: None)
-    with folder as held, stages as progress, told_of_compiling(lambda name: progress(COMPILING)) as compiled:
+    with (
+        torch.inference_mode(False),  # a caller's own mode would end the first step
+        torch.enable_grad(),
+        folder as held,
+        stages as progress,
+        told_of_compiling(lambda name: progress(COMPILING)) as compiled,
+    ):
         resume = resume and out is not None and (out / CONFIG).is_file()  # else the folder holds only found poses
         if out is not None and resume:
             read_record(out)  # a run of another version is refused before anything takes time
@@ -476,7 +483,7 @@ def _prepare(job: FitJob, resumed: Path | None) -> tuple[Trainer, dict[str, Any]
             models = " and ".join(job.other_models)
             job.notes.append(f"camera model {models}: views cannot be compared, so blur, exposure and coverage are not checked")
         else:
-            checks = check_photos([*job.train, *job.test], job.progress)
+            checks = check_photos([without_masked(v) for v in (*job.train, *job.test)], job.progress)
         of = job.train, job.scene.points, job.config, job.device, job.scene.background
         trainer = Trainer(*of, ready=ready, progress=job.progress, ranks=job.ranks)
     if job.device.type == "cuda":

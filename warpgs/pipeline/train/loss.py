@@ -15,7 +15,7 @@ from warpgs.errors import UsageError
 from warpgs.geometry import depth_normals
 from warpgs.kernels.ssim import difference_bytes, differences
 from warpgs.pipeline.train.views import TrainingView
-from warpgs.plugins import Registry
+from warpgs.plugins import Registry, is_ours, returned
 from warpgs.scene import Camera, Gaussians, Prior
 from warpgs.schema import Checked, Within
 
@@ -106,7 +106,7 @@ class LossTerm(Checked):
         return {LOSS: 4 * FLOAT * sizes.pixels if "depth" in self.needs_outputs else 0}
 
     def __call__(self, inputs: LossInputs) -> torch.Tensor:
-        """Compute the term, a differentiable value of shape []; it must not read back from the device.
+        """Compute the term, a differentiable value of shape [], or 0; it must not read back from the device.
 
         Args:
             inputs: The render's outputs that the term needs, the view, the Gaussians, the camera and the number of the step.
@@ -123,8 +123,23 @@ register = LOSS_TERMS.register
 
 
 def term_values(terms: Sequence[LossTerm], inputs: LossInputs) -> list[torch.Tensor]:
-    """Compute each term from the outputs that it needs; returns values of shape [], in the order of the terms."""
-    return [term(replace(inputs, outputs=_Outputs(term, inputs.outputs))) for term in terms]
+    """Compute each term from the outputs that it needs; returns values of shape [], in the order of the terms.
+
+    A term of a user's own whose value is constant, but not 0, has no effect, and raises UsageError.
+    """
+    values = []
+    trained = torch.is_grad_enabled() and any(t.requires_grad for t in inputs.outputs.values())
+    for term in terms:
+        value = term(replace(inputs, outputs=_Outputs(term, inputs.outputs)))
+        values.append(returned(term, "__call__", value, torch.Tensor, "a tensor of shape []", shape=()))
+        if value.requires_grad or is_ours(type(term)) or not trained:
+            continue
+        if not (value.is_cuda and torch.cuda.is_current_stream_capturing()) and bool(value != 0):
+            raise UsageError(
+                f"the loss term {term.name!r} has no gradient, so it changes nothing: {type(term).__name__}.__call__ must "
+                "compute it from inputs.outputs, without detach(), item() or no_grad; return 0 in views where it does not apply"
+            )
+    return values
 
 
 def outputs_of(terms: Sequence[LossTerm]) -> tuple[str, ...]:
@@ -162,7 +177,9 @@ def maps_of(terms: Sequence[LossTerm], view: TrainingView, prior: Prior | None) 
     owners: dict[str, str] = {}
     maps: dict[str, torch.Tensor] = {}
     for term in terms:
-        for name, values in term.needs(view, prior).items():
+        own, size = term.needs(view, prior), view.image.shape[:2]
+        returned(term, "needs", own, Mapping, "maps [H, W] or [H, W, C] by name", each=torch.Tensor, shape=size)
+        for name, values in own.items():
             if name in maps:
                 both = f"{owners[name]!r} and {term.name!r}"
                 raise UsageError(f"the loss terms {both} both have a map {name!r}; rename it in one of them")

@@ -21,6 +21,7 @@ from warpgs.pipeline.train.loss import LossInputs, LossTerm, Target, outputs_of,
 from warpgs.pipeline.train.schedule import over
 from warpgs.pipeline.train.strategies.base import Strategy
 from warpgs.pipeline.train.views import Kind, LearnedViews, Rows, ViewStack, camera_at, current, seen
+from warpgs.plugins import returned
 from warpgs.render.compose import compose, count_instances, inputs_of
 from warpgs.render.options import RasterizeOptions, image_settings
 from warpgs.render.rasterize import rasterize
@@ -184,6 +185,7 @@ def total_loss(plan: StepPlan, inputs: LossInputs, strategy: Strategy, of_views:
     """Return the sum of the loss terms, the terms of view modules (``of_views`` [] each) and the strategy's term, shape []."""
     values = [*term_values(plan.terms, inputs), *of_views]
     extra = strategy.regularisation(plan.phase, inputs.gaussians)
+    returned(strategy, "regularisation", extra, (torch.Tensor, type(None)), "a tensor of shape [], or None", shape=())
     return sum(values[1:] if extra is None else [*values[1:], extra], values[0])
 
 
@@ -250,6 +252,9 @@ class StepTaker:
             going = end_step(loss, mse, buffers.counter, buffers.stop, buffers.history)
             size = views.camera.width, views.camera.height
             statistics = self.strategy.statistics(plan.phase, v_projected, rendered.visible & going, size)
+            what, names = "a tensor [N] for each of some of its columns, by name", self.table.columns
+            sizes = {"each": torch.Tensor, "shape": (len(self.table),), "names": names}
+            returned(self.strategy, "statistics", statistics, Mapping, what, **sizes)
         return gradients, statistics, lrs, settings, going
 
     def forward(
@@ -286,6 +291,8 @@ class StepTaker:
         table, views = self.table, self.views.table
         split, own = 3 * len(table.params), dict(zip(table.params, gradients))
         factors = self.strategy.lr_factors(plan.phase) if "means" in names else None
+        what = "factors, shape [N], or None"
+        returned(self.strategy, "lr_factors", factors, (torch.Tensor, type(None)), what, shape=(len(table),))
         table.adam_step({n: own[n] for n in names}, lrs[:split], stop, factors, rows)
         if "means" in names:
             views.adam_step(dict(zip(views.params, gradients[len(own) :])), lrs[split:], stop)

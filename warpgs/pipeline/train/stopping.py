@@ -13,8 +13,9 @@ from warpgs import schema
 from warpgs.errors import DataError
 from warpgs.pipeline.metrics.scores import psnr_of
 from warpgs.pipeline.model.table import DensityUpdate
-from warpgs.pipeline.train.strategies.base import Strategy, StrategyContext
+from warpgs.pipeline.train.strategies.base import Growth, Strategy, StrategyContext, changes_of
 from warpgs.pipeline.train.views import TrainingView
+from warpgs.plugins import returned
 from warpgs.process import Detail
 from warpgs.render.options import RasterizeOptions
 from warpgs.render.rasterize import rasterize
@@ -182,7 +183,8 @@ class Stopping:
         """Choose the blocks and the times of measurements, and return notes; the first steps have views of half size."""
         if self.config.min_gain_db == 0:
             return []
-        planned, (begins, ends, times) = context.phases.planned, strategy.growth()
+        begins, ends, times = returned(strategy, "growth", strategy.growth(), Growth, "a Growth")
+        planned = context.phases.planned
         self.earliest = half_resolution * planned
         marks = {max(1, begins + round(k * (ends - begins) / MEASUREMENTS)) for k in range(MEASUREMENTS + 1)}
         if times:
@@ -228,9 +230,9 @@ class Stopping:
             if step < ends:
                 context.phases = context.phases.stable_from(step, ends)
             held = [masked(v, b, inside=True) for v, b in zip(self.whole, self.blocks)]
-            yield from strategy.catch_up(step, held, self.held_pixels)
+            yield from changes_of(strategy, "catch_up", strategy.catch_up(step, held, self.held_pixels))
         if self.ended is None and strategy.due(step):
-            yield from strategy.update(step)
+            yield from changes_of(strategy, "update", strategy.update(step))
 
     def _measured(self, step: int, strategy: Strategy, context: StrategyContext, degree: int) -> bool:
         """Measure the blocks if the set changed since the previous mark, and at the last mark; return whether growth ends."""

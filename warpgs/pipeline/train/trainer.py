@@ -6,7 +6,7 @@ import contextlib
 import math
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Hashable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import Any
@@ -16,12 +16,13 @@ import torch
 
 from warpgs.device import available_bytes, format_bytes, is_out_of_memory, no_memory_message
 from warpgs.errors import DataError, NotFiniteError, OutOfMemoryError, ResourceError, UsageError
+from warpgs.io.images import without_masked
 from warpgs.kernels.update import NOT_FINITE, Setting
 from warpgs.pipeline.metrics.scores import psnr_of, render_view, score
 from warpgs.pipeline.model.edit import stored_degrees
 from warpgs.pipeline.model.limits import camera_centers, camera_rows, scene_radius
 from warpgs.pipeline.model.start import initial_gaussians, scene_extent, sweeps
-from warpgs.pipeline.model.table import Table, model_bytes
+from warpgs.pipeline.model.table import Column, Table, model_bytes
 from warpgs.pipeline.train.batch import BatchSteps, Tree
 from warpgs.pipeline.train.memory import Layout, most_instances, plan
 from warpgs.pipeline.train.schedule import Phases, StepReport, plan_phases, random_shift, sh_degree
@@ -31,6 +32,7 @@ from warpgs.pipeline.train.step import CAPACITY_FACTOR, OverLimitError, StepPlan
 from warpgs.pipeline.train.stopping import STATE, Stopping
 from warpgs.pipeline.train.strategies.base import StrategyContext, find_strategy
 from warpgs.pipeline.train.views import LearnedViews, TrainingView, half_size, show_learned, stack_views, with_learned
+from warpgs.plugins import returned
 from warpgs.priors.sweep import sweep_depths
 from warpgs.process import Detail
 from warpgs.ranks import ALONE, Ranks
@@ -165,6 +167,7 @@ class Trainer:
             raise DataError("there is no training view; leave at least one in --split")
         for module in config.view_modules:
             module.check(train)
+        train = [without_masked(v) for v in train]  # so that no pixel under a mask has an influence
         c, self.config, self.device, self.ranks, self.batch = config, config, device, ranks, config.batch
         self.generator = torch.Generator().manual_seed(c.seed)
         self.notes: list[str]
@@ -201,7 +204,8 @@ class Trainer:
         )  # fmt: skip
         """The parts of the fit that the strategy works with: views, phases, the scene's size and others."""
         self.strategy, self.stopping = find_strategy(c.strategy)(self.context), Stopping(c.stopping)
-        self.table.add_columns(self.strategy.columns())
+        columns = returned(self.strategy, "columns", self.strategy.columns(), Mapping, "columns by name", each=Column)
+        self.table.add_columns(columns)
         self.learned = LearnedViews(c.view_modules, train, device)
         """View modules with their parameters."""
         self.table.batch = self.learned.table.batch = c.batch
@@ -252,7 +256,8 @@ class Trainer:
         terms = tuple(t for t in self.terms if t.active(step, self.phases.planned))
         half = step <= self.half_resolution * self.phases.planned
         limits = c.limits.at(1.0 if step >= self.steps else self.progress(step), self.radius, c.antialiased)
-        phase, decay = self.strategy.phase(step), c.optimizer.opacities_decay
+        phase = returned(self.strategy, "phase", self.strategy.phase(step), Hashable, "a hashable value")
+        decay = c.optimizer.opacities_decay
         return StepPlan(self.degree(step), half, terms, phase, limits, decay, self.extrapolated)
 
     def next_view(self) -> int:
@@ -386,7 +391,10 @@ class Trainer:
         self.show_learned()
         stopping, step = self.stopping, self.step
         for change in stopping.changes(step, self.strategy, self.context, self.degree(step)):
-            self.table.apply(change)
+            try:
+                self.table.apply(change, self.context.capacity)
+            except UsageError as e:
+                raise UsageError(f"the strategy {type(self.strategy).__name__}, after step {step}: {e}") from e
             self.count_changed()
         if stopping.ended == step:
             self.set_views(stopping.whole)
@@ -428,7 +436,10 @@ class Trainer:
 
     def state(self) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
         """Return tensors by name, of any shape [...], and plain values from which the fit continues with the same bits."""
-        (tensors, strategy), (errors, stopping) = self.strategy.state(), self.stopping.state()
+        own = returned(
+            self.strategy, "state", self.strategy.state(), tuple, "tensors by name, and plain values, two dictionaries"
+        )
+        (tensors, strategy), (errors, stopping) = own, self.stopping.state()
         views = {f"views.{n}": t for n, t in self.learned.table.state().items()}
         tensors = {**self.table.state(), **views, **self.mean.state(), **tensors, **errors}
         tensors["generator"] = self.generator.get_state()

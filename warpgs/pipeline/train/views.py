@@ -15,6 +15,7 @@ from warpgs.errors import UsageError
 from warpgs.pipeline.metrics.scores import OPAQUE
 from warpgs.pipeline.model.table import Table
 from warpgs.pipeline.train.view_modules import Tensors, ViewModule
+from warpgs.plugins import returned
 from warpgs.scene import Camera, View
 
 
@@ -26,7 +27,8 @@ def there(array: Any, device: torch.device) -> Any:
 def seen(modules: Sequence[ViewModule], rgb: torch.Tensor, values: Tensors) -> torch.Tensor:
     """Apply view modules to rendered colours [H, W, 3]; ``values`` are the modules' values for the view, by name, [...]."""
     for module in modules:
-        rgb = module.after_render(rgb, values)
+        shown = module.after_render(rgb, values)
+        rgb = returned(module, "after_render", shown, torch.Tensor, "colours [H, W, 3]", shape=rgb.shape)
     return rgb
 
 
@@ -51,12 +53,15 @@ class LearnedViews:
         self._names: list[tuple[str, ...]] = []
         first: dict[str, torch.Tensor] = {}
         for module in modules:
-            own = module.parameters(views)
+            own, what = module.parameters(views), "tensors [V, ...] by name, with a row for each training view"
+            returned(module, "parameters", own, Mapping, what, each=torch.Tensor, shape=(len(views),))
             for name in own.keys() & first.keys():
                 other = next(m.name for m, names in zip(modules, self._names) if name in names)
                 raise UsageError(
                     f"the view modules {other!r} and {module.name!r} both have a parameter {name!r}; rename it in one of them"
                 )
+            rates = returned(module, "lrs", module.lrs(0.0, 1.0), Mapping, what := "a rate for each parameter, by name")
+            returned(module, "lrs", {n: rates.get(n) for n in own}, Mapping, what, each=(int, float))
             first |= {n: t.to(device, torch.float32) for n, t in own.items()}
             self._names.append(tuple(own))
         self.table = Table(first, {}, device, len(views))
@@ -72,22 +77,33 @@ class LearnedViews:
 
     def values(self, numbers: torch.Tensor) -> dict[str, torch.Tensor]:
         """Return the values of all modules for views with these indices [B], by name, shape [B, ...]; differentiable."""
-        return {n: t for m in self.modules for n, t in m.values(self.params_of(m), numbers).items()}
+        values: dict[str, torch.Tensor] = {}
+        for m in self.modules:
+            own = m.values(self.params_of(m), numbers)
+            what, size = "tensors [B, ...] by name", numbers.shape
+            values |= returned(m, "values", own, Mapping, what, each=torch.Tensor, shape=size)
+        return values
 
     def before_render(self, camera: Camera, values: Tensors) -> Camera:
         """Return the camera that views are rendered from; arguments are those of `ViewModule.before_render`."""
         for module in self.modules:
-            camera = module.before_render(camera, values)
+            shown = module.before_render(camera, values)
+            camera = returned(module, "before_render", shown, Camera, "a Camera")
         return camera
 
     def regularisation(self, values: Tensors) -> dict[str, torch.Tensor]:
         """Return the terms that modules add to the loss of a view with these values [...], shape [] each, by module name."""
-        return {m.name: t for m in self.modules if (t := m.regularisation(values)) is not None}
+        terms = {m.name: (m, m.regularisation(values)) for m in self.modules}
+        what = "a tensor of shape [], or None"
+        return {
+            n: returned(m, "regularisation", t, torch.Tensor, what, shape=()) for n, (m, t) in terms.items() if t is not None
+        }
 
     def cameras(self, given: Mapping[str, Camera], train: Sequence[str], test: Sequence[str]) -> Mapping[str, Camera]:
         """Return the current cameras of all views, by name; arguments are those of `ViewModule.cameras`."""
         for module in self.modules:
-            given = module.cameras(given, train, test, self.params_of(module))
+            new = module.cameras(given, train, test, self.params_of(module))
+            given = returned(module, "cameras", new, Mapping, "the Camera of each view by name", each=Camera)
         return given
 
 

@@ -12,7 +12,7 @@ from warpgs.device import Needs, StepSizes
 from warpgs.pipeline.model.table import Column, DensityUpdate, Table
 from warpgs.pipeline.train.schedule import Phases
 from warpgs.pipeline.train.views import TrainingView
-from warpgs.plugins import Registry
+from warpgs.plugins import Registry, returned
 from warpgs.render.options import RasterizeOptions
 from warpgs.scene import Gaussians, Prior
 from warpgs.schema import anything
@@ -79,7 +79,7 @@ class StrategyContext:
     views: list[TrainingView] = field(default_factory=list)
     """Training views; empty before `Strategy.setup`."""
     capacity: int = 0
-    """Number of Gaussians that settings and memory limit allow; 0 before `Strategy.setup`."""
+    """Number of Gaussians that settings and memory limit allow, which no update may exceed; 0 before `Strategy.setup`."""
     max_instances: int | None = None
     """Largest number of (Gaussian, tile) instances of a render at a time; None for no limit."""
     antialiased: bool = False
@@ -232,6 +232,13 @@ class Strategy:
 
     def load(self, tensors: Mapping[str, torch.Tensor], plain: dict[str, Any]) -> None:
         """Load what `state` returned."""
+
+
+def changes_of(strategy: Strategy, method: str, changes: Any) -> Iterator[DensityUpdate]:
+    """Yield the changes that a method of a strategy returned, each of them checked."""
+    what = "an iterator of DensityUpdate, which yield makes"
+    for change in returned(strategy, method, changes, Iterable, what):
+        yield returned(strategy, method, change, DensityUpdate, what)
 
 
 STRATEGIES: Registry[Strategy] = Registry("strategy", Strategy, __package__, "warpgs.pipeline.paper")
