@@ -250,7 +250,7 @@ def _doubts(view: View, alpha: np.ndarray, options: RasterizeOptions, known: boo
     """Return a reason to doubt the background of a render with this alpha [H, W], if any; ``known`` if it was given."""
     region, name = scored_region(view)
     if view.alpha is not None:
-        empty, behind = view.alpha < EMPTY, torch.zeros(3) if options.background is None else options.background
+        empty, behind = view.alpha < EMPTY, np.zeros(3) if options.background is None else options.background
         colors = view.image[empty] - torch.as_tensor(behind).detach().cpu().numpy()
         if empty.any() and float(np.abs(colors.mean(0)).max()) > EMPTY:
             fix = "give options with the background of the views"

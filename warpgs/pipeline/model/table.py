@@ -248,10 +248,8 @@ class Table:
             low = -1 if name == "parents" else 0
             if len(rows) and not low <= int(rows.min()) <= int(rows.max()) < self.count:
                 raise UsageError(f"DensityUpdate.{name} must be from {low} to {self.count - 1}, the rows before the change")
-            if name == "keep" and bool((rows.diff() <= 0).any()):
-                raise UsageError("DensityUpdate.keep must ascend, each row once; sort it, and copy rows through added")
-            if name == "overwritten" and len(rows.unique()) < len(rows):
-                raise UsageError("DensityUpdate.overwritten holds a row twice; give each row once")
+            if name != "parents" and len(rows.unique()) < len(rows):
+                raise UsageError(f"DensityUpdate.{name} holds a row twice; give each row once, and copies through added")
         for where, rows_of in (("added", update.added), ("values", update.values)):
             for name, t in rows_of.items():
                 if bad := t.numel() - int(torch.isfinite(t).sum()):
