@@ -13,7 +13,7 @@ import torch
 
 from bench.lib import inputs
 from warpgs import RasterizeOptions, rasterize
-from warpgs.constants import Rule
+from warpgs.constants import LARGEST_ALPHA, Rule
 from warpgs.scene import Camera, Gaussians
 
 OURS = "warpgs"
@@ -24,7 +24,7 @@ GSPLAT_PACKED = "gsplat packed"
 FASTER_GS = "Faster-GS"
 GSWARP = "gswarp"
 
-FASTER_GS_RULE = Rule("Faster-GS", alpha_max=1.0)
+FASTER_GS_RULE = Rule("Faster-GS", alpha_max=LARGEST_ALPHA)
 """Faster-GS at 3cb0b75: no clamp of alpha; the Gaussian that crosses the stop is blended."""
 
 
