@@ -504,7 +504,8 @@ def convert_gaussians(gaussians: Gaussians, normalization: Normalization, source
     """Return Gaussians in other units; tensors that do not change are shared.
 
     Means and log scales change; quaternions, opacities and spherical harmonics do not, because the similarity has no rotation.
-    Sums are taken in float64: with georeferenced offsets of 10^6 m, float32 would lose millimetres.
+    Sums are taken in float64. In file units, all tensors are float64 if the normalization has an `origin`: float32 would round
+    map coordinates to decimetres.
     """
     check_stored(gaussians)
     if _same_units(source, target):
@@ -512,6 +513,8 @@ def convert_gaussians(gaussians: Gaussians, normalization: Normalization, source
     means, kind = gaussians.means.double(), gaussians.means.dtype
     means = _converted(means, means.new_tensor(np.asarray(normalization.offset, np.float64)), normalization.scale, target)
     longer = math.log(normalization.scale) * (-1 if target == "file" else 1)
+    if target == "file" and normalization.origin.any():
+        gaussians, kind = Gaussians(**{name: t.double() for name, t in gaussians.tensors().items()}), means.dtype
     return replace(gaussians, means=means.to(kind), log_scales=(gaussians.log_scales.double() + longer).to(kind))
 
 

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import math
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,7 +17,7 @@ from tests.pipeline.tables import adam_step
 from tests.scenes import photos, ring, seeds
 from warpgs.app.cli import main
 from warpgs.errors import DataError, UsageError
-from warpgs.export.base import read_gaussians, write_gaussians
+from warpgs.export.base import read_gaussians, suffixes, write_gaussians
 from warpgs.export.meshes_and_cameras import NAMES, write_cameras
 from warpgs.export.ply import read_ply
 from warpgs.files import make_folder
@@ -36,7 +37,7 @@ from warpgs.pipeline.model.limits import (
 from warpgs.pipeline.model.start import InitConfig
 from warpgs.pipeline.model.table import Column, DensityUpdate, Table, model_bytes, pack, truncated, unpack
 from warpgs.pipeline.run.commands import _new_folder, open_file, prune, render
-from warpgs.pipeline.run.export import Filters, convert
+from warpgs.pipeline.run.export import Filters, convert, export
 from warpgs.pipeline.run.folder import load_checkpoint, open_run
 from warpgs.pipeline.train.schedule import OptimizerConfig
 from warpgs.pipeline.train.settings import FitConfig
@@ -480,6 +481,53 @@ def run(tmp_path_factory):
     write_demo(folder / "scene", views=8, width=64, height=48)
     assert main(["fit", str(folder / "scene"), "--out", str(folder / "run"), *FLAGS]) == 0
     return folder / "run"
+
+
+def moved(run, folder, offset):
+    """Return a copy of a run whose scene is elsewhere on the map."""
+    shutil.copytree(run, folder, ignore=shutil.ignore_patterns("report*", "*.ply"))
+    record = json.loads((folder / "config.json").read_text())
+    record["normalization"]["offset"] = (np.array(record["normalization"]["offset"]) + offset).tolist()
+    (folder / "config.json").write_text(json.dumps(record))
+    return folder
+
+
+def loss(a, b):
+    """Return the PSNR [dB] of two images."""
+    return -10 * math.log10(max(float((a - b).square().mean()), 1e-12))
+
+
+@pytest.mark.parametrize("offset", [(1e4, 0, 0), (441_000.4, 5_500_000.7, 130), (-4e6, 5.5e6, 4.9e6)])
+@pytest.mark.parametrize("cameras", NAMES)
+def test_exports_at_map_coordinates(run, tmp_path, offset, cameras):
+    """Files of every format render as at the origin, with cameras of every format, by the point that they state."""
+    renders = {}
+    for name, place in (("near", np.zeros(3)), ("far", np.array(offset))):
+        there = moved(run, tmp_path / name, place)
+        lines = export(there, there / cameras)
+        stored = open_run(there, "cpu")
+        camera = torch_camera(list(stored.cameras().values())[1])
+        wanted = rasterize(stored.gaussians(), camera, stored.options()).rgb
+        assert any("are relative to" in line for line in lines) == (name == "far")
+        for suffix in suffixes():
+            lines = export(there, there / f"a{suffix}", Filters(clean=False))
+            assert any("are relative to" in line and "exported" not in line for line in lines) == (name == "far")
+            convert(there / f"a{suffix}", there / f"b{suffix}", Filters(clean=False))
+            for file in (f"a{suffix}", f"b{suffix}"):
+                model, _ = open_file(there / file, there / cameras, stored.rule, "cpu")
+                view = torch_camera(list(model.cameras().values())[1])
+                back = rasterize(model.gaussians(), view, model.options()).rgb
+                renders[name, file] = loss(back, wanted)
+            absolute = read_gaussians(there / f"a{suffix}")
+            known = read_gaussians(there / f"a{suffix}", stored.normalization, units="scene")
+            middle = (absolute.means.double().mean(0).numpy() - stored.normalization.offset) * stored.normalization.scale
+            assert np.allclose(known.means.double().mean(0).numpy(), middle, atol=1e-4) and known.means.dtype == torch.float32
+            if suffix == ".ply":
+                write_gaussians(there / "c.ply", absolute, units="file")  # Gaussians in file units, from Python
+                again = read_gaussians(there / "c.ply", stored.normalization, units="scene")
+                assert torch.allclose(again.means, known.means, atol=1e-5)
+    for (name, file), psnr in renders.items():
+        assert psnr >= min(50, renders["near", file] - 0.2), (name, file, psnr)
 
 
 def test_prune_keeps_its_promise(run, tmp_path, capsys):

@@ -19,6 +19,7 @@ from warpgs.io.folder import (
     Reader,
     SceneFolder,
     ViewList,
+    about,
     has_folder,
     quat_rotation,
     register,
@@ -26,7 +27,7 @@ from warpgs.io.folder import (
     view_name,
 )
 from warpgs.io.images import Lens, ReadOptions, list_images
-from warpgs.scene import PointCloud, Scene
+from warpgs.scene import ORIGIN, PointCloud, Scene, checked_origin
 
 MODELS = {0: ("SIMPLE_PINHOLE", 3), 1: ("PINHOLE", 4), 2: ("SIMPLE_RADIAL", 4), 3: ("RADIAL", 5), 4: ("OPENCV", 8)}
 """Name and number of parameters by model number."""
@@ -105,6 +106,12 @@ def _rows(path: Path) -> Iterator[tuple[int, list[str]]]:
     for number, line in _lines(path):
         if line.strip() and not line.lstrip().startswith("#"):
             yield number, line.split()
+
+
+def _origin(path: Path) -> np.ndarray:
+    """Return the origin [3] that the first line of a text file of ours states, 0 without one."""
+    words = next(_lines(path))[1].split() if path.suffix == ".txt" else []
+    return checked_origin(words[2:], str(path)) if words[:2] == ["#", ORIGIN] else np.zeros(3)
 
 
 @contextmanager
@@ -211,13 +218,14 @@ def read_poses(path: Path) -> dict[int, Pose]:
 
 def posed_lenses(poses: dict[int, Pose], lenses: dict[int, Lens], file: Path) -> Iterator[tuple[str, Lens, np.ndarray]]:
     """Yield name, lens and camera_from_world [4, 4] of each image, sorted by name; ``file`` holds the poses."""
+    origin = _origin(file)
     for name, camera, quat, translation in sorted(poses.values(), key=lambda pose: pose[0]):
         where = f"{file}, image {name!r}"
         if camera not in lenses:
             raise DataError(f"{where}: camera {camera} is missing from cameras{file.suffix}; export the cameras again")
         viewmat = np.eye(4)
         viewmat[:3, :3], viewmat[:3, 3] = quat_rotation(quat, where), translation
-        yield name, lenses[camera], rigid(viewmat, where)
+        yield name, lenses[camera], about(rigid(viewmat, where), origin)
 
 
 def read_points(path: Path, names: dict[int, str]) -> PointCloud:
@@ -245,7 +253,7 @@ def read_points(path: Path, names: dict[int, str]) -> PointCloud:
     bad = int((~np.isfinite(positions).all(axis=1)).sum())
     if bad:
         raise DataError(f"{path}: {bad} of {len(positions)} points are not finite; reconstruct again, or remove them")
-    return PointCloud(positions, np.array(colors, np.float32).reshape(-1, 3) / 255, tuple(tracks))
+    return PointCloud(positions + _origin(path), np.array(colors, np.float32).reshape(-1, 3) / 255, tuple(tracks))
 
 
 def reconstruction(root: Path) -> tuple[Path, str, list[str]] | None:

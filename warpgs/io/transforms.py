@@ -19,6 +19,7 @@ from warpgs.io.folder import (
     Reader,
     SceneFolder,
     ViewList,
+    about,
     from_camera_to_world,
     register,
     resampling_note,
@@ -27,7 +28,7 @@ from warpgs.io.folder import (
 from warpgs.io.images import BLACK, SUFFIXES, Lens, ReadOptions
 from warpgs.io.maps import SUFFIXES as MAPS
 from warpgs.io.maps import NamedMaps
-from warpgs.scene import Camera, Scene
+from warpgs.scene import ORIGIN, Camera, Scene, checked_origin
 from warpgs.schema import SchemaError, check_depth, check_parts
 
 BLENDER_FILES = tuple(f"transforms_{split}.json" for split in ("train", "val", "test"))
@@ -146,6 +147,11 @@ def matrix_of(frame: dict, where: str) -> np.ndarray:
     return matrix
 
 
+def _origin(values: dict, where: str) -> np.ndarray:
+    """Return the origin [3] that a file of ours states, 0 without one."""
+    return checked_origin(values.get(ORIGIN, (0, 0, 0)), where)
+
+
 def _image_path(scene: SceneFolder, folder: Path, name: object, where: str) -> Path:
     """Return the image file of a frame; Blender's file names have no suffix."""
     path = scene.child(folder, name, where, root=scene.root)
@@ -200,6 +206,7 @@ class TransformsReader(Reader):
         for file in files_of(folder):
             shared = read_json(scene.inside(file))
             total += len(shared["frames"])
+            origin = _origin(shared, str(file))
             for number, frame in enumerate(shared["frames"]):
                 where = f"{file}, frame {number}"
                 if not isinstance(frame, dict):
@@ -210,7 +217,7 @@ class TransformsReader(Reader):
                     continue
                 name = views.claim(view_name_of(path, folder), where)
                 where = f"{where} ({name})"
-                viewmat = from_camera_to_world(matrix_of(frame, where), where, opengl=True)
+                viewmat = about(from_camera_to_world(matrix_of(frame, where), where, opengl=True), origin)
                 if frame.get("mask_path"):
                     mask = scene.mask(scene.child(file.parent, frame["mask_path"], f"{where}, mask", root=folder))
                 else:
@@ -274,15 +281,16 @@ def _inria(path: Path, rows: list[Any]) -> Iterator[Row]:
             width, height, fx, fy = (float(row[key]) for key in ("width", "height", "fx", "fy"))
             K = np.array([[fx, 0, width / 2], [0, fy, height / 2], [0, 0, 1]])
             lens = Lens(K, int(width), int(height))
-            name = str(row.get("img_name", i))
+            name, origin = str(row.get("img_name", i)), _origin(row, where)
         except (KeyError, TypeError, ValueError, OverflowError, AttributeError) as e:
             raise DataError(f"{where}: needs rotation, position, width, height, fx and fy as numbers; correct the entry") from e
-        yield name, from_camera_to_world(pose, where, opengl=False), lens.checked(where)
+        yield name, about(from_camera_to_world(pose, where, opengl=False), origin), lens.checked(where)
 
 
 def _transforms(path: Path) -> Iterator[Row]:
     """Yield the cameras of frames; the file must give its image size."""
     shared = read_json(path)
+    origin = _origin(shared, str(path))
     for i, frame in enumerate(shared["frames"]):
         where = f"{path}, frame {i}"
         if not isinstance(frame, dict):
@@ -290,7 +298,8 @@ def _transforms(path: Path) -> Iterator[Row]:
         if any(frame.get(key, shared.get(key)) is None for key in ("w", "h")):
             raise DataError(f"{where}: gives no w and h, so the image size is unknown. Add them, or give the scene's folder")
         lens = lens_of(frame, shared, 0, 0, where)
-        yield str(frame.get("file_path", i)), from_camera_to_world(matrix_of(frame, where), where, opengl=True), lens
+        viewmat = from_camera_to_world(matrix_of(frame, where), where, opengl=True)
+        yield str(frame.get("file_path", i)), about(viewmat, origin), lens
 
 
 def colmap_folder(folder: Path) -> tuple[Path, str, list[str]] | None:

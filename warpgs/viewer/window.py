@@ -101,7 +101,7 @@ def content_of_file(path: Path, device: str = "cpu") -> Content:
     low, high = np.percentile(means, [5, 95], axis=0)
     normalization = Normalization((low + high) / 2, 1 / max(0.5 * float(np.linalg.norm(high - low)), 1e-12))
     gaussians = convert_gaussians(stored, normalization, "file", "scene")
-    gaussians = dataclasses.replace(gaussians, **{n: t.to(device) for n, t in gaussians.tensors().items()})
+    gaussians = dataclasses.replace(gaussians, **{n: t.float().to(device) for n, t in gaussians.tensors().items()})
     model = FittedModel(gaussians, normalization, {}, (), (), RULE, (0.0, 0.0, 0.0), 0, antialiased=antialiased)
     return Content(path.name, model, path.with_suffix(""))
 
