@@ -415,9 +415,33 @@ def seen_pixels(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndar
     return seen, rows, columns, z[seen]
 
 
-def camera_extent(cameras: list[Camera]) -> float:
-    """Return 1.1 times the largest distance from a camera to the mean centre [u] (Kerbl et al. 2023); 0 for one camera."""
+FAR_OFF = 8.0
+"""Distance from the middle of all cameras, in median distances, beyond which a camera is an outlier: paths end at about 2."""
+
+
+def near_cameras(centers: np.ndarray, points: np.ndarray | None = None) -> np.ndarray:
+    """Return which of the camera centres [N, 3] are not far off the rest and from the points [P, 3], bool [N].
+
+    Cameras closer to each other than to the scene are no outliers. Without points, four cameras are too few to tell.
+    """
+    middle = np.median(centers, axis=0)
+    distances = np.linalg.norm(centers - middle, axis=1)
+    limit = FAR_OFF * float(np.median(distances))
+    if points is not None and len(points):
+        with np.errstate(over="ignore"):
+            limit = max(limit, 2 * float(np.median(np.linalg.norm(points - middle, axis=1))))
+    elif len(centers) < 5:
+        limit = math.inf
+    return np.asarray((distances <= limit) | (limit < 1e-9))
+
+
+def camera_extent(cameras: list[Camera], points: np.ndarray | None = None) -> float:
+    """Return 1.1 times the largest distance from a camera to the mean centre [u] (Kerbl et al. 2023); 0 for one camera.
+
+    Outliers are ignored (`near_cameras`, with the scene's points [P, 3]).
+    """
     centers = np.array([c.center for c in cameras])
+    centers = centers[near_cameras(centers, points)]
     return 1.1 * float(np.linalg.norm(centers - centers.mean(0), axis=1).max())
 
 
