@@ -296,6 +296,7 @@ def test_other_camera_models_are_refused():
     [
         ([0, 1, 2, 3, 4], None, []), ([0, 1, 2, 3, 300], None, [4]), ([0, 0, 0, 0, 1], None, []),
         ([0, 0.05, 0.1, 2], [4.0], []), ([0, 0.05, 0.1, 2], None, []), ([0, 0.05, 0.1, 20], [4.0], [3]), ([0, 1e6], None, []),
+        ([0, 1e-3, 2e-3, 3e-3, 1, 2], None, []),
     ],
 )  # fmt: skip
 def test_cameras_far_off_the_rest(xs, points, far):

@@ -289,8 +289,7 @@ def coincident_views(scene: Scene, split: Split) -> list[tuple[str, str]]:
 
     Two cameras count as the same if all entries of their poses differ by less than a thousandth; lengths are in camera extents.
     """
-    points = None if scene.points is None else scene.points.points
-    extent = max(camera_extent([v.camera for v in scene.views], points), 1e-9)
+    extent = max(camera_extent([v.camera for v in scene.views]), 1e-9)
     unit = np.array([[1, 1, 1, 1 / extent]] * 3 + [[1] * 4])
     poses = {v.name: v.camera.viewmat * unit for v in scene.views}
     trained = np.stack([poses[b] for b in split.train])
