@@ -422,8 +422,8 @@ FAR_OFF = 8.0
 def near_cameras(centers: np.ndarray, points: np.ndarray | None = None) -> np.ndarray:
     """Return which of the camera centres [N, 3] are not far off the rest and from the points [P, 3], bool [N].
 
-    Cameras closer to each other than to the scene are no outliers, nor is more than a quarter of all cameras. Without points, four
-    cameras are too few to tell.
+    Cameras closer to each other than to the scene are no outliers, nor is more than a quarter of all cameras. Without points,
+    four cameras are too few to tell.
     """
     middle = np.median(centers, axis=0)
     distances = np.linalg.norm(centers - middle, axis=1)

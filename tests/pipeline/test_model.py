@@ -530,6 +530,32 @@ def test_exports_at_map_coordinates(run, tmp_path, offset, cameras):
         assert psnr >= min(50, renders["near", file] - 0.2), (name, file, psnr)
 
 
+def test_files_with_small_units(run, tmp_path, capsys):
+    """A scene of centimetres: our files render as the run does; others name the near plane instead of the path."""
+    folder = moved(run, tmp_path / "run", np.zeros(3))
+    record = json.loads((folder / "config.json").read_text())
+    record["normalization"]["scale"] *= 100
+    (folder / "config.json").write_text(json.dumps(record))
+    stored, cameras = open_run(folder, "cpu"), folder / "transforms.json"
+    wanted = rasterize(stored.gaussians(), torch_camera(list(stored.cameras().values())[1]), stored.options()).rgb
+    export(folder, cameras)
+    for name, rule, near in (("a.ply", None, None), ("a.glb", None, None), ("a.ply", "exact", 1e-4), ("a.spz", "exact", 1e-4)):
+        export(folder, folder / name, Filters(clean=False))
+        model, _ = open_file(folder / name, cameras, rule, "cpu", near=near)
+        back = rasterize(model.gaussians(), torch_camera(list(model.cameras().values())[1]), model.options()).rgb
+        assert loss(back, wanted) >= (50 if name != "a.spz" else 30), (name, rule)
+    words = ["render", str(folder / "a.spz"), "--cameras", str(cameras), "--path", "views", "--device", "cpu", "--out"]
+    assert main([*words, str(tmp_path / "black")]) == 0
+    said = capsys.readouterr().out
+    assert (
+        "% of the Gaussians in front of the cameras are nearer than the near plane, 0.2 units" in said and "--near 0.0" in said
+    )
+    assert "the path leaves" not in said
+    assert main([*words, str(tmp_path / "near"), "--near", "1e-4"]) == 0
+    assert "nearly nothing" not in capsys.readouterr().out
+    assert main(["render", str(folder), "--near", "1"]) == UsageError.exit_code
+
+
 def test_prune_keeps_its_promise(run, tmp_path, capsys):
     """Smaller by more than a little, no more than the allowed loss, the old run untouched, the new one whole and usable."""
     before = {p: p.read_bytes() for p in run.rglob("*") if p.is_file()}

@@ -622,3 +622,7 @@ class PLY(Format):
     def is_antialiased(self, path: Path) -> bool:
         """Return whether the header declares antialiasing."""
         return is_antialiased(start_of(path))
+
+    def is_own(self, path: Path) -> bool:
+        """Return whether the header has the comments of warpgs."""
+        return is_own(start_of(path))
