@@ -338,7 +338,11 @@ class Format:
     def origin_in(self, path: Path) -> object:
         """Return the origin that a file states; None without one. By default it is in a side file."""
         side = side_file(path)
-        return json.loads(read_input(side, 4096)).get(ORIGIN) if side.is_file() else None
+        if not side.is_file():
+            return None
+        with reading(side, whole=True) as file:
+            values = json.loads(file.read())
+        return values.get(ORIGIN, values) if isinstance(values, dict) else values
 
     def is_own(self, path: Path) -> bool:
         """Return whether warpgs wrote a file, so that bad numbers mean damage; False if the format cannot tell."""
