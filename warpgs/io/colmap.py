@@ -13,7 +13,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from warpgs.errors import DataError
-from warpgs.files import read_file
+from warpgs.files import open_input, read_file
 from warpgs.io.folder import (
     Probe,
     Reader,
@@ -110,7 +110,10 @@ def _rows(path: Path) -> Iterator[tuple[int, list[str]]]:
 
 def _origin(path: Path) -> np.ndarray:
     """Return the origin [3] that the first line of a text file of ours states, 0 without one."""
-    words = next(_lines(path))[1].split() if path.suffix == ".txt" else []
+    if path.suffix != ".txt":
+        return np.zeros(3)
+    with open_input(path) as file:
+        words = file.readline(4096).decode("utf-8", "replace").split()
     return checked_origin(words[2:], str(path)) if words[:2] == ["#", ORIGIN] else np.zeros(3)
 
 

@@ -515,6 +515,9 @@ def _finished(root: Path, reader: Reader, scene: Scene, notes: list[str], option
     more = (*more, *check_found(views, options))
     n: Normalization = normalization_of(views, points, str(root))
     more = (*more, *far_off_note(views, points))
+    if n.origin.any():
+        at = ", ".join(f"{v:.12g}" for v in n.origin)
+        more = (*more, f"map coordinates: files of Gaussians, meshes and cameras are relative to {at}, which they state")
     views = [normalize_view(v, n) for v in sorted(views, key=lambda v: v.name)]
     if points is not None:
         points = normalize_points(points, n, str(root))
