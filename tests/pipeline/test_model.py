@@ -22,7 +22,7 @@ from warpgs.export.meshes_and_cameras import NAMES, write_cameras
 from warpgs.export.ply import read_ply
 from warpgs.files import make_folder
 from warpgs.geometry import harmonics, look_at, rotate, rotation_matrices
-from warpgs.io.transforms import read_cameras
+from warpgs.io.transforms import read_cameras, stated_origin
 from warpgs.kernels.sh import basis
 from warpgs.pipeline.films.film import FilmSettings
 from warpgs.pipeline.model import edit
@@ -509,6 +509,12 @@ def test_exports_at_map_coordinates(run, tmp_path, offset, cameras):
         camera = torch_camera(list(stored.cameras().values())[1])
         wanted = rasterize(stored.gaussians(), camera, stored.options()).rgb
         assert any("are relative to" in line for line in lines) == (name == "far")
+        other = there / "other" / ("sparse" if cameras != "sparse" else "cameras.json")
+        lines = convert(there / cameras, other)  # keeps the origin, which other programs need
+        assert any(f"are relative to {', '.join(f'{v:.12g}' for v in stored.normalization.origin)}" in x for x in lines) == (
+            name == "far"
+        )
+        assert np.allclose(stated_origin(other), stored.normalization.origin, rtol=0, atol=0)
         for suffix in suffixes():
             lines = export(there, there / f"a{suffix}", Filters(clean=False))
             assert any("are relative to" in line and "exported" not in line for line in lines) == (name == "far")

@@ -108,7 +108,7 @@ def _rows(path: Path) -> Iterator[tuple[int, list[str]]]:
             yield number, line.split()
 
 
-def _origin(path: Path) -> np.ndarray:
+def origin_stated(path: Path) -> np.ndarray:
     """Return the origin [3] that the first line of a text file of ours states, 0 without one."""
     if path.suffix != ".txt":
         return np.zeros(3)
@@ -221,7 +221,7 @@ def read_poses(path: Path) -> dict[int, Pose]:
 
 def posed_lenses(poses: dict[int, Pose], lenses: dict[int, Lens], file: Path) -> Iterator[tuple[str, Lens, np.ndarray]]:
     """Yield name, lens and camera_from_world [4, 4] of each image, sorted by name; ``file`` holds the poses."""
-    origin = _origin(file)
+    origin = origin_stated(file)
     for name, camera, quat, translation in sorted(poses.values(), key=lambda pose: pose[0]):
         where = f"{file}, image {name!r}"
         if camera not in lenses:
@@ -256,7 +256,7 @@ def read_points(path: Path, names: dict[int, str]) -> PointCloud:
     bad = int((~np.isfinite(positions).all(axis=1)).sum())
     if bad:
         raise DataError(f"{path}: {bad} of {len(positions)} points are not finite; reconstruct again, or remove them")
-    return PointCloud(positions + _origin(path), np.array(colors, np.float32).reshape(-1, 3) / 255, tuple(tracks))
+    return PointCloud(positions + origin_stated(path), np.array(colors, np.float32).reshape(-1, 3) / 255, tuple(tracks))
 
 
 def reconstruction(root: Path) -> tuple[Path, str, list[str]] | None:

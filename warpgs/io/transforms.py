@@ -270,6 +270,16 @@ def read_cameras(path: Path) -> tuple[dict[str, Camera], list[str]]:
     return found, [f"the lens distortion of {bent} of {len(found)} cameras is not rendered"] if bent else []
 
 
+def stated_origin(path: Path) -> np.ndarray:
+    """Return the origin [3] that a file or a COLMAP folder of cameras states, 0 without one."""
+    if path.is_dir():
+        model, kind, _ = colmap_folder(path) or (path, "", [])
+        return colmap.origin_stated(model / f"images.{kind}")
+    values = _json(path, "check the path, or write the file again")
+    first = values[0] if isinstance(values, list) and values else values
+    return _origin(first if isinstance(first, dict) else {}, str(path))
+
+
 def _inria(path: Path, rows: list[Any]) -> Iterator[Row]:
     """Yield the cameras of rows with a camera-to-world rotation in OpenCV axes and the camera centre."""
     for i, row in enumerate(rows):

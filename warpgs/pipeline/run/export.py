@@ -17,7 +17,7 @@ from warpgs.errors import DataError, UsageError
 from warpgs.export.base import Format, find_format, format_of, origin_of, write_gaussians
 from warpgs.export.meshes_and_cameras import check_suffix, holds_cameras, write_cameras, write_mesh
 from warpgs.geometry import convert_camera, convert_gaussians, convert_mesh, matmul, rotate
-from warpgs.io.transforms import read_cameras
+from warpgs.io.transforms import read_cameras, stated_origin
 from warpgs.kernels.neighbours import morton_codes
 from warpgs.locks import hold_file
 from warpgs.mesh.fuse import GridPlan, MeshOptions, fuse
@@ -153,7 +153,10 @@ def convert(
     if holds_cameras(target):
         _check_for_cameras(filters, formats)
         found, notes = read_cameras(source)
-        return [*notes, *_cameras_written(found, list(found.values()), target, filters)]
+        origin = stated_origin(source)
+        if not origin.any():
+            origin = origin_of(np.array([c.center for c in found.values()]))
+        return [*notes, *_cameras_written(found, list(found.values()), target, filters, origin)]
     given = [find_format(f) for f in formats]
     for unused in (f for f in given if not (f.fits(source) or f.fits(target))):
         format_of(target, unused)  # says that its name is another
@@ -179,7 +182,7 @@ def export(
         stored = open_run(folder, torch.device("cpu"))
         level = training_cameras(stored)
         origin, models = stored.normalization.origin, file_gaussians(stored)
-        return _cameras_written(stored.cameras("file"), level, target, filters, keep_names, models, origin)
+        return _cameras_written(stored.cameras("file"), level, target, filters, origin, keep_names, models)
     if keep_names:
         raise UsageError(f"{target}: --keep-names requires cameras; name the file cameras.json, transforms.json or sparse")
     kind = format_of(target, format)
@@ -236,16 +239,14 @@ def _check_for_cameras(filters: Filters, formats: Sequence[object]) -> None:
 
 
 def _cameras_written(
-    named: Mapping[str, Camera], level: list[Camera], target: Path, filters: Filters, keep_names: bool = False,
-    gaussians: Gaussians | None = None, origin: np.ndarray | None = None,
+    named: Mapping[str, Camera], level: list[Camera], target: Path, filters: Filters, origin: np.ndarray,
+    keep_names: bool = False, gaussians: Gaussians | None = None,
 ) -> list[str]:  # fmt: skip
     """Rotate cameras about an origin in file units, and write them; ``level`` are those that define up. Returns lines.
 
     The most opaque of the Gaussians become COLMAP's points.
     """
     rotation, lines, points, cameras = rotation_of(filters.rotate, level), [], None, list(named.values())
-    if origin is None:
-        origin = origin_of(np.array([c.center for c in cameras]))
     if origin.any():
         cameras = [convert_camera(c, Normalization(origin), "file", "scene") for c in cameras]
     if rotation is not None:
