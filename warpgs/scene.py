@@ -174,7 +174,7 @@ def checked_origin(values: object, where: str) -> np.ndarray:
     """Return the origin [3] that a file of ours states, float64; DataError if it is not three numbers."""
     try:
         origin = np.array(values, np.float64).reshape(3)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         origin = np.full(3, np.nan)
     if not np.isfinite(origin).all():
         raise DataError(f"{where}: {ORIGIN} must be three numbers, not {str(values)[:80]}; export the file again")
