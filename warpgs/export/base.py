@@ -572,7 +572,7 @@ def read_gaussians(
         strict: True to refuse every file with such a Gaussian.
 
     Returns:
-        N Gaussians, torch float32 tensors on the CPU.
+        N Gaussians, torch tensors on the CPU: float32, or float64 for map coordinates in file units.
 
     Raises:
         warpgs.DataError: The file is missing, malformed, truncated, declares more data than its size allows, has no usable

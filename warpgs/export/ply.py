@@ -364,8 +364,9 @@ def write_ply(
     """Write Gaussians to a PLY file in the units of the scene's files.
 
     Means become ``mean / scale + offset`` [file units] and log scales ``log_scale - log(scale)``, computed in float64 and
-    stored as float32; rotations, logit opacities and spherical harmonics are stored unchanged. The write is atomic: the file is
-    written under a temporary name beside ``path`` and then renamed.
+    stored as float32; map coordinates are stored about an origin that the header states (docs/formats.md). Rotations, logit
+    opacities and spherical harmonics are stored unchanged. The write is atomic: the file is written under a temporary name
+    beside ``path`` and then renamed.
 
     Args:
         path: The file; an existing one is replaced.
@@ -417,8 +418,8 @@ def read_ply(path: str | os.PathLike[str], normalization: Normalization | None =
         units: Units of the result: file as stored, or scene to go with a scene's cameras.
 
     Returns:
-        N Gaussians, torch float32 tensors on the CPU: means [N, 3], quats wxyz as stored [N, 4], log scales [N, 3], logit
-        opacities [N], spherical harmonics [N, K, 3] with K in {1, 4, 9, 16, 25}.
+        N Gaussians, torch tensors on the CPU, float32, or float64 for map coordinates in file units: means [N, 3], quats wxyz
+        as stored [N, 4], log scales [N, 3], logit opacities [N], spherical harmonics [N, K, 3] with K in {1, 4, 9, 16, 25}.
 
     Raises:
         warpgs.DataError: The file is missing, malformed, truncated or compressed, has no usable Gaussian, or is of warpgs and

@@ -301,7 +301,10 @@ class Model:
     """Similarity from file to scene units."""
 
     def gaussians(self, units: str = "scene") -> Gaussians:
-        """Return the Gaussians in ``scene`` units, those of a `Scene`, or in ``file`` units, those of the scene's files."""
+        """Return the Gaussians in ``scene`` units, those of a `Scene`, or in ``file`` units, those of the scene's files.
+
+        Map coordinates in file units are float64.
+        """
         return convert_gaussians(self.scene_gaussians, self.normalization, "scene", units)
 
 
