@@ -162,7 +162,7 @@ def test_a_run_of_a_scene_from_python_is_complete_but_for_the_scene(folder, tmp_
 
 
 def test_degree_4_is_fitted_and_stored(folder, tmp_path, capsys):
-    """All five degrees learn; the run, the model file and PLY hold them, SPZ holds degree 3, and the output says so."""
+    """All five degrees learn; the run, the model file, PLY and SPZ hold them, glTF holds degree 3, and the output says so."""
     config, out = dataclasses.replace(CONFIG, sh_degree=4, sh_every=2), tmp_path / "run"
     scene = warpgs.load_scene(folder / "scene")
     result = warpgs.fit(scene, config, split=SPLIT, device="cpu", out=out, verbose=False)
@@ -171,7 +171,7 @@ def test_degree_4_is_fitted_and_stored(folder, tmp_path, capsys):
     warpgs.save(tmp_path / "model.safetensors", made, scene.normalization)
     stored = warpgs.open_run(out, "cpu").gaussians(), warpgs.load(tmp_path / "model.safetensors").gaussians()
     assert all(torch.equal(g.sh, made.sh) for g in stored)
-    for suffix, count in ((".ply", 25), (".spz", 16)):
+    for suffix, count in ((".ply", 25), (".spz", 25), (".glb", 16)):
         capsys.readouterr()
         assert main(["export", str(out), "--to", str(tmp_path / f"a{suffix}"), "--no-clean", "--rotate", "0,0,1,30"]) == 0
         assert ("harmonics above degree 3 are dropped" in capsys.readouterr().out) == (count == 16)
