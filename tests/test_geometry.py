@@ -12,7 +12,7 @@ from tests.gaussians import LENSES, SMOOTH, camera, cloud, hand_placed, lens_cam
 from warpgs import Normalization, geometry, load, rasterize, read_ply, save, write_ply
 from warpgs.errors import DataError, UsageError
 from warpgs.export.base import write_gaussians
-from warpgs.geometry import convert_camera, convert_gaussians
+from warpgs.geometry import convert_camera, convert_gaussians, near_cameras
 from warpgs.io.load import normalize_view
 from warpgs.render.options import RasterizeOptions
 from warpgs.scene import Camera, View
@@ -292,3 +292,18 @@ def test_other_camera_models_are_refused():
         geometry.back_project(arrays, np.zeros((1, 2)), np.ones(1))
     with pytest.raises(UsageError, match="undistort"):
         geometry.back_project_tensors(dataclasses.replace(cam, model="own"), torch.zeros(1, 2), torch.ones(1))
+
+
+@pytest.mark.parametrize(
+    "xs,points,far",
+    [
+        ([0, 1, 2, 3, 4], None, []), ([0, 1, 2, 3, 300], None, [4]), ([0, 0, 0, 0, 1], None, []),
+        ([0, 0.05, 0.1, 2], [4.0], []), ([0, 0.05, 0.1, 2], None, []), ([0, 0.05, 0.1, 20], [4.0], [3]), ([0, 1e6], None, []),
+        ([0, 1e-3, 2e-3, 3e-3, 1, 2], None, []),
+    ],
+)  # fmt: skip
+def test_cameras_far_off_the_rest(xs, points, far):
+    """Cameras that are close to each other compared with the scene, or in one place, are no reason to leave another one out."""
+    centers = np.stack([np.array(xs, float), np.zeros(len(xs)), np.zeros(len(xs))], 1)
+    cloud = None if points is None else np.array([[0, 0, z] for z in points])
+    assert np.flatnonzero(~near_cameras(centers, cloud)).tolist() == far

@@ -420,9 +420,35 @@ def seen_pixels(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndar
     return seen, rows, columns, z[seen]
 
 
-def camera_extent(cameras: list[Camera]) -> float:
-    """Return 1.1 times the largest distance from a camera to the mean centre [u] (Kerbl et al. 2023); 0 for one camera."""
+FAR_OFF = 8.0
+"""Distance from the middle of all cameras, in median distances, beyond which a camera is an outlier: paths end at about 2."""
+
+
+def near_cameras(centers: np.ndarray, points: np.ndarray | None = None) -> np.ndarray:
+    """Return which of the camera centres [N, 3] are not far off the rest and from the points [P, 3], bool [N].
+
+    Cameras closer to each other than to the scene are no outliers, nor is more than a quarter of all cameras. Without points,
+    four cameras are too few to tell.
+    """
+    middle = np.median(centers, axis=0)
+    distances = np.linalg.norm(centers - middle, axis=1)
+    limit = FAR_OFF * float(np.median(distances))
+    if points is not None and len(points):
+        with np.errstate(over="ignore"):
+            limit = max(limit, 2 * float(np.median(np.linalg.norm(points - middle, axis=1))))
+    elif len(centers) < 5:
+        limit = math.inf
+    near = distances <= limit
+    return near if limit > 1e-9 and 4 * int((~near).sum()) <= len(near) else np.ones(len(near), bool)
+
+
+def camera_extent(cameras: list[Camera], points: np.ndarray | None = None) -> float:
+    """Return 1.1 times the largest distance from a camera to the mean centre [u] (Kerbl et al. 2023); 0 for one camera.
+
+    Outliers are ignored (`near_cameras`, with the scene's points [P, 3]).
+    """
     centers = np.array([c.center for c in cameras])
+    centers = centers[near_cameras(centers, points)]
     return 1.1 * float(np.linalg.norm(centers - centers.mean(0), axis=1).max())
 
 
@@ -509,7 +535,8 @@ def convert_gaussians(gaussians: Gaussians, normalization: Normalization, source
     """Return Gaussians in other units; tensors that do not change are shared.
 
     Means and log scales change; quaternions, opacities and spherical harmonics do not, because the similarity has no rotation.
-    Sums are taken in float64: with georeferenced offsets of 10^6 m, float32 would lose millimetres.
+    Sums are taken in float64. In file units, all tensors are float64 if the normalization has an `origin`: float32 would round
+    map coordinates to decimetres.
     """
     check_stored(gaussians)
     if _same_units(source, target):
@@ -517,6 +544,8 @@ def convert_gaussians(gaussians: Gaussians, normalization: Normalization, source
     means, kind = gaussians.means.double(), gaussians.means.dtype
     means = _converted(means, means.new_tensor(np.asarray(normalization.offset, np.float64)), normalization.scale, target)
     longer = math.log(normalization.scale) * (-1 if target == "file" else 1)
+    if target == "file" and normalization.origin.any():
+        gaussians, kind = Gaussians(**{name: t.double() for name, t in gaussians.tensors().items()}), means.dtype
     return replace(gaussians, means=means.to(kind), log_scales=(gaussians.log_scales.double() + longer).to(kind))
 
 

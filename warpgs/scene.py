@@ -135,6 +135,12 @@ class PointCloud:
         return PointCloud(self.points[keep], self.colors[keep], tracks)
 
 
+ORIGIN = "warpgs_origin"
+"""Name of the point [file units] that positions in a file are relative to (`Normalization.origin`), in comments and JSON."""
+MAX_STEP = 1e-5
+"""Largest step of float32 coordinates [u] in files without an origin: about a hundredth of a pixel at the cameras' distance."""
+
+
 @dataclass(frozen=True)
 class Normalization:
     """Similarity from file coordinates to scene coordinates: ``x_scene = scale * (x_file - offset)``."""
@@ -143,6 +149,36 @@ class Normalization:
     """Offset [file units], float64, shape [3]."""
     scale: float = 1.0
     """Scene units per file unit."""
+
+    @property
+    def origin(self) -> np.ndarray:
+        """Return the point [file units], shape [3], about which files are written: 0 unless float32 is too coarse.
+
+        Map coordinates (UTM, ECEF) have steps of up to 0.5 m in float32. The point is in whole file units, or in decimal parts
+        of them if the scene is smaller.
+        """
+        offset = np.asarray(self.offset, np.float64)
+        with np.errstate(over="ignore"):
+            step = float(np.spacing(np.abs(offset).max().astype(np.float32)))
+        if not step * self.scale > MAX_STEP:
+            return np.zeros(3)
+        return np.asarray(np.round(offset, max(0, math.ceil(math.log10(self.scale)))) + 0.0)
+
+    @property
+    def local(self) -> Normalization:
+        """Return the similarity to scene units from file units about the `origin`."""
+        return Normalization(np.asarray(self.offset, np.float64) - self.origin, self.scale)
+
+
+def checked_origin(values: object, where: str) -> np.ndarray:
+    """Return the origin [3] that a file of ours states, float64; DataError if it is not three numbers."""
+    try:
+        origin = np.array(values, np.float64).reshape(3)
+    except (TypeError, ValueError, OverflowError):
+        origin = np.full(3, np.nan)
+    if not np.isfinite(origin).all():
+        raise DataError(f"{where}: {ORIGIN} must be three numbers, not {str(values)[:80]}; export the file again")
+    return origin
 
 
 @document_fields

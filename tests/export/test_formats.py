@@ -242,6 +242,41 @@ FOREIGN = {  # name of the file: limits on means, log scales, opacity, entries o
 """Files that splat-transform 3.7.0 wrote of the same Gaussians. Its SPZ has harmonics of 4 bits above degree 1."""
 
 
+@pytest.mark.parametrize("suffix", [".spz", ".splat"])
+def test_side_files(suffix, tmp_path):
+    """A format without a place for the origin has a side file, which a later file near the origin removes."""
+    made, path, side = model(50), tmp_path / f"a{suffix}", tmp_path / f"a{suffix}.origin.json"
+    there = Normalization(np.array([441_000.5, 5_500_000.25, 130]), 0.2)
+    write_gaussians(path, made, there)
+    assert json.loads(side.read_text()) == {"warpgs_origin": [441_000.0, 5_500_000.0, 130.0]}  # half to even
+    assert torch.allclose(read_gaussians(path, there, units="scene").means, made.means, atol=1e-5)
+    for bad in ("[", "[1]", "{}", '{"warpgs_origin": [1, 2]}'):
+        side.write_text(bad)
+        with pytest.raises(DataError, match=r"(?i)export the "):
+            read_gaussians(path)
+    write_gaussians(path, made, Normalization())
+    assert not side.exists() and read_gaussians(path).means.dtype == torch.float32
+
+
+def test_nodes_in_map_coordinates(tmp_path):
+    """The translation of a glTF node is added in float64."""
+    made = model(50)
+    document, body = gltf._document(arrays_of(made), None)
+    document["nodes"][0]["translation"] = [441_000.25, 5_500_000.5, 130.0]
+    (tmp_path / "a.glb").write_bytes(b"".join(gltf.glb(document, body)))
+    back = read_gaussians(tmp_path / "a.glb").means
+    wanted = made.means.double() + torch.tensor([-441_000.25, -5_500_000.5, 130.0], dtype=torch.float64)
+    assert back.dtype == torch.float64 and torch.allclose(back, wanted, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".glb"])
+def test_meshes_state_their_origin(tmp_path, suffix):
+    made = Mesh(np.eye(3), np.array([[0, 1, 2]], np.int32), np.zeros((3, 3), np.float32))
+    write_mesh(tmp_path / f"a{suffix}", made, None, np.array([441_000.0, 5_500_000.0, 130.0]))
+    start = (tmp_path / f"a{suffix}").read_bytes()[:1500]
+    assert (b"comment warpgs_origin 441000.0 5500000.0 130.0\n" if suffix == ".ply" else b'"warpgs_origin":[441000.0,') in start
+
+
 @pytest.mark.parametrize("name", FOREIGN)
 def test_files_of_splat_transform(name):
     """In any order, with any quaternion of the same shape; its SPZ is in the axes of PLY."""

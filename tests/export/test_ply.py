@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from warpgs.errors import DataError, ResourceError
 from warpgs.export.base import read_gaussians, write_gaussians
 from warpgs.export.ply import MAX_HEADER_BYTES, read_ply, write_ply
+from warpgs.pipeline.run.export import convert
 from warpgs.scene import Gaussians, Normalization
 
 
@@ -73,17 +74,44 @@ def test_layout_on_disk(tmp_path):
 
 
 def test_file_coordinates_are_restored_in_float64(tmp_path):
-    """An offset of 5e6 m: the result must be the float64 sum rounded once, not a float32 sum."""
+    """An offset of 5e6 m: float32 numbers about an origin that the header states, and float64 Gaussians."""
     model = make(50)
     normalization = Normalization(np.array([5e6, -3e5, 0.25]), 0.04)
     write_ply(tmp_path / "a.ply", model, normalization)
     back = read_ply(tmp_path / "a.ply")
     want = model.means.numpy().astype(np.float64) / 0.04 + normalization.offset
-    np.testing.assert_array_equal(back.means.numpy(), want.astype(np.float32))
+    assert "comment warpgs_origin 5000000.0 -300000.0 0.0" in split(tmp_path / "a.ply")[0]
+    assert {t.dtype for t in back.tensors().values()} == {torch.float64}
+    np.testing.assert_allclose(back.means.numpy(), want, rtol=0, atol=1e-5)
     scales = np.exp(model.log_scales.numpy().astype(np.float64)) / 0.04
     np.testing.assert_allclose(np.exp(back.log_scales.numpy()), scales, rtol=2e-6)
     for name in ("quats", "logit_opacities", "sh"):
         assert torch.equal(getattr(back, name), getattr(model, name))
+
+
+@pytest.mark.parametrize("text", [False, True])
+def test_doubles_in_map_coordinates(tmp_path, text):
+    """Doubles of other programs keep their digits, in both units, and in the file that they are converted to."""
+    rows = np.random.default_rng(0).normal(size=(50, 14))
+    rows[:, :3] += [441_000, 5_500_000, 130]
+    header = ["element vertex 50", *(f"property double {n}" for n in NAMES)]
+    body = "".join(" ".join(map(repr, row)) + "\n" for row in rows.tolist()).encode() if text else rows.astype("<f8").tobytes()
+    data = ply(header, body)
+    (tmp_path / "a.ply").write_bytes(data.replace(b"binary_little_endian", b"ascii") if text else data)
+    normalization = Normalization(np.array([441_000.5, 5_500_000.25, 130]), 0.2)
+    convert(tmp_path / "a.ply", tmp_path / "b.ply")
+    for name in ("a.ply", "b.ply"):
+        back, scene = read_ply(tmp_path / name), read_gaussians(tmp_path / name, normalization, units="scene")
+        np.testing.assert_allclose(back.means.numpy(), rows[:, :3], rtol=0, atol=1e-6)
+        assert back.means.dtype == torch.float64 and scene.means.dtype == torch.float32
+        np.testing.assert_allclose(scene.means.numpy(), 0.2 * (rows[:, :3] - normalization.offset), rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("words", ["1 2", "1 2 nan", "a b c", "1 2 3 4"])
+def test_origins_that_are_none(tmp_path, words):
+    (tmp_path / "a.ply").write_bytes(ply([f"comment warpgs_origin {words}", "element vertex 1", *PROPERTIES], ROW))
+    with pytest.raises(DataError, match=r"a\.ply: warpgs_origin must be three numbers.*export the file again"):
+        read_ply(tmp_path / "a.ply")
 
 
 @pytest.mark.parametrize("name", ["means", "quats", "log_scales", "logit_opacities", "sh"])

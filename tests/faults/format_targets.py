@@ -37,6 +37,7 @@ from warpgs.export.base import arrays_of, gaussians_of
 from warpgs.io import transforms
 from warpgs.io.colmap import read_cameras, read_poses
 from warpgs.pipeline.model import edit
+from warpgs.scene import Normalization, checked_origin
 
 
 def written(suffix: str):
@@ -133,6 +134,19 @@ def spz_streams(data: bytes, rng: np.random.Generator) -> bytes:
 SPZ = (spz.decode, spz._checked, spz._streams, spz._unpack, spz._coordinate_system)
 SPZ_CHANGES = (rarely(spz_bomb, inside_gzip(header_number)), inside_gzip(number), inside_gzip(damage), spz_streams)
 add("SPZ", ".spz", SPZ, SPZ_CHANGES, spz_files)
+
+
+def side_files(root: Path) -> list[Path]:
+    base.write_gaussians(root / "a.spz", gaussians(5), Normalization(np.array([441_000.0, 5_500_000, 130])))
+    return [base.side_file(root / "a.spz")]
+
+
+register(
+    Target(
+        "origin", side_files, lambda root, path: base.read_gaussians(root / "a.spz"), (base.Format.origin_in, checked_origin),
+        (json_value, json_value, text_number), None, nonsense,
+    )
+)  # fmt: skip
 
 # ---- archives ----------------------------------------------------------------------------------------------------------
 

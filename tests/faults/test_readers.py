@@ -107,12 +107,17 @@ PARSING = {"json.load", "json.loads", "np.load", "schema.parse", "schema.read", 
 """The same with their modules."""
 
 READERS = {
-    "export/base.py": {"reading": "splat"},
+    "export/base.py": {"reading": "splat", "Format.origin_in": "origin"},
     "export/ply.py": {"_read": "ply"},
     "export/gltf.py": {"_split": "glTF"},
     "export/sog.py": {"SOG._meta_of": "SOG", "decode": "SOG", "_member": "SOG", "_meta": "SOG", "_pixels": "SOG"},
     "io/transforms.py": {"_json": "cameras"},
-    "io/colmap.py": {"_BinaryFile.__init__": "colmap", "_lines": "colmap", "read_ply_points": "colmap"},
+    "io/colmap.py": {
+        "_BinaryFile.__init__": "colmap",
+        "_lines": "colmap",
+        "read_ply_points": "colmap",
+        "origin_stated": "cameras",
+    },
     "io/image_files.py": {"_raster": "any image", "read_image_file": "any image"},
     "io/others.py": {"_read_matrices": "dtu", "read_camera_rows": "middlebury"},
     "io/maps.py": {"mapped_array": "given maps"},

@@ -1,5 +1,6 @@
 """Readers: built-in ones and a user's own; links lead out of a scene only where the user allows it."""
 
+import json
 import os
 import runpy
 import sys
@@ -226,3 +227,24 @@ def test_links_that_lead_round_in_circles(kind, tmp_path):
     message = r"images.*Copy the scene again|counts must agree|is a broken link; restore it"
     with pytest.raises(DataError, match=message):
         load_scene(scene)
+
+
+@pytest.mark.parametrize("kind", ["colmap", "transforms"])
+def test_our_cameras_state_an_origin(tmp_path, kind):
+    """A scene of cameras that `warpgs export` wrote is where the first scene was; a note names the point of its files."""
+    root, origin = tmp_path / "a", np.array([441_000.0, 5_500_000.0, 130.0])
+    names = ["transforms.json"] if kind == "transforms" else ["images.txt", "points3D.txt"]
+    (scenes.write_transforms if kind == "transforms" else scenes.write_colmap_txt)(root)
+    near = load_scene(root)
+    for file in (p for name in names for p in root.rglob(name)):
+        text = file.read_text()
+        stated = {"warpgs_origin": origin.tolist()}
+        line = f"# warpgs_origin {' '.join(map(repr, origin.tolist()))}\n"
+        file.write_text(json.dumps(json.loads(text) | stated) if kind == "transforms" else line + text)
+    far = load_scene(root)
+    assert np.allclose(far.normalization.offset, near.normalization.offset + origin, rtol=0, atol=1e-6)
+    for a, b in zip(near.views, far.views):
+        assert np.allclose(a.camera.viewmat, b.camera.viewmat, atol=1e-6)
+    assert near.points is None or np.allclose(near.points.points, far.points.points, atol=1e-6)
+    said = [n for n in far.notes if n.startswith("map coordinates") and "are relative to 441000" in n]
+    assert len(said) == 1 and not any("map coordinates" in n for n in near.notes)

@@ -3,6 +3,7 @@
 import dataclasses
 import html
 import json
+import shutil
 import warnings
 
 import cv2
@@ -24,7 +25,7 @@ from warpgs.pipeline.films.film import render_path
 from warpgs.pipeline.metrics import scores
 from warpgs.pipeline.metrics.scores import score, summarize
 from warpgs.pipeline.model.start import InitConfig
-from warpgs.pipeline.run.commands import scene_of
+from warpgs.pipeline.run.commands import mean_psnr, scene_of
 from warpgs.pipeline.run.folder import METRICS, open_run
 from warpgs.pipeline.run.request import NO_SCORES, SceneRequest
 from warpgs.pipeline.run.results import score_line
@@ -238,7 +239,7 @@ def test_a_run_of_a_scene_from_python_is_complete_but_for_the_scene(folder, tmp_
 
 
 def test_degree_4_is_fitted_and_stored(folder, tmp_path, capsys):
-    """All five degrees learn; the run, the model file and PLY hold them, SPZ holds degree 3, and the output says so."""
+    """All five degrees learn; the run, the model file, PLY and SPZ hold them, glTF holds degree 3, and the output says so."""
     config, out = dataclasses.replace(CONFIG, sh_degree=4, sh_every=2), tmp_path / "run"
     scene = warpgs.load_scene(folder / "scene")
     result = warpgs.fit(scene, config, split=SPLIT, device="cpu", out=out, verbose=False)
@@ -247,7 +248,7 @@ def test_degree_4_is_fitted_and_stored(folder, tmp_path, capsys):
     warpgs.save(tmp_path / "model.safetensors", made, scene.normalization)
     stored = warpgs.open_run(out, "cpu").gaussians(), warpgs.load(tmp_path / "model.safetensors").gaussians()
     assert all(torch.equal(g.sh, made.sh) for g in stored)
-    for suffix, count in ((".ply", 25), (".spz", 16)):
+    for suffix, count in ((".ply", 25), (".spz", 25), (".glb", 16)):
         capsys.readouterr()
         assert main(["export", str(out), "--to", str(tmp_path / f"a{suffix}"), "--no-clean", "--rotate", "0,0,1,30"]) == 0
         assert ("harmonics above degree 3 are dropped" in capsys.readouterr().out) == (count == 16)
@@ -573,3 +574,40 @@ def test_renders_are_transparent_unless_a_colour_is_named(run, tmp_path, capsys)
     opaque = dataclasses.replace(stored, transparent=False)
     file, film = render_path(opaque, [stored.scene_cameras[stored.train[0]]], out=tmp_path / "opaque")
     assert cv2.imread(str(file), cv2.IMREAD_UNCHANGED).shape[2] == 3 and film.name == "film.mp4"
+
+
+def move_camera(scene, name, distance):
+    """Move the camera of an image along x, in COLMAP's text."""
+    file = scene / "sparse" / "0" / "images.txt"
+    lines = file.read_text().split("\n")
+    i = next(i for i, line in enumerate(lines) if line.endswith(f" {name}"))
+    words = lines[i].split()
+    w, x, y, z = map(float, words[1:5])
+    column = np.array([1 - 2 * (y * y + z * z), 2 * (x * y + z * w), 2 * (x * z - y * w)])
+    words[5:8] = map(repr, (np.array(words[5:8], float) - distance * column).tolist())
+    file.write_text("\n".join([*lines[:i], " ".join(words), *lines[i + 1 :]]))
+
+
+@pytest.mark.parametrize("distance", [30.0, 1000.0, 1e6])
+def test_a_camera_far_off_does_not_set_the_scale(tmp_path, distance):
+    """The scale is that of the other cameras, to the bit, a note names the camera, and the others train as without it."""
+    write_demo(tmp_path / "a", views=8, width=64, height=48)
+    shutil.copytree(tmp_path / "a", tmp_path / "b")
+    move_camera(tmp_path / "b", "007.png", distance)
+    scene, moved = load_scene(tmp_path / "a"), load_scene(tmp_path / "b")
+    others = np.stack([v.camera.center / scene.normalization.scale + scene.normalization.offset for v in scene.views[:-1]])
+    extent = 1.1 * np.linalg.norm(others - others.mean(0), axis=1).max()
+    assert moved.normalization.scale == pytest.approx(1 / extent, rel=1e-12)
+    assert any("1 of 8 cameras are far off" in n and "007.png" in n for n in moved.notes)
+    assert not any("far off" in n for n in scene.notes)
+    split = "train=" + ",".join(v.name for v in scene.views)
+    flags = ["--steps", "60", "--device", "cpu", "--preset", "3dgs", "--split"]
+    psnr = []
+    for name, views in (("a", split.removesuffix(",007.png")), ("b", split)):
+        run = tmp_path / f"run-{name}"
+        test = ";test=007.png" if name == "a" else ""
+        assert main(["fit", str(tmp_path / name), "--out", str(run), *flags, views + test]) == 0
+        stored = open_run(run, "cpu")
+        train = [v for v in scene_of(stored)[1] if v.name != "007.png"]
+        psnr.append(mean_psnr(stored.gaussians(), train, stored.options()))
+    assert psnr[1] > psnr[0] - 0.5, psnr

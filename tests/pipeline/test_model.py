@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import math
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,12 +17,12 @@ from tests.pipeline.tables import adam_step
 from tests.scenes import photos, ring, seeds
 from warpgs.app.cli import main
 from warpgs.errors import DataError, UsageError
-from warpgs.export.base import read_gaussians, write_gaussians
+from warpgs.export.base import read_gaussians, suffixes, write_gaussians
 from warpgs.export.meshes_and_cameras import NAMES, write_cameras
 from warpgs.export.ply import read_ply
 from warpgs.files import make_folder
 from warpgs.geometry import harmonics, look_at, rotate, rotation_matrices
-from warpgs.io.transforms import read_cameras
+from warpgs.io.transforms import read_cameras, stated_origin
 from warpgs.kernels.sh import basis
 from warpgs.pipeline.films.film import FilmSettings
 from warpgs.pipeline.model import edit
@@ -36,7 +37,7 @@ from warpgs.pipeline.model.limits import (
 from warpgs.pipeline.model.start import InitConfig
 from warpgs.pipeline.model.table import Column, DensityUpdate, Table, model_bytes, pack, truncated, unpack
 from warpgs.pipeline.run.commands import _new_folder, open_file, prune, render
-from warpgs.pipeline.run.export import Filters, convert
+from warpgs.pipeline.run.export import Filters, convert, export
 from warpgs.pipeline.run.folder import load_checkpoint, open_run
 from warpgs.pipeline.train.schedule import OptimizerConfig
 from warpgs.pipeline.train.settings import FitConfig
@@ -480,6 +481,85 @@ def run(tmp_path_factory):
     write_demo(folder / "scene", views=8, width=64, height=48)
     assert main(["fit", str(folder / "scene"), "--out", str(folder / "run"), *FLAGS]) == 0
     return folder / "run"
+
+
+def moved(run, folder, offset):
+    """Return a copy of a run whose scene is elsewhere on the map."""
+    shutil.copytree(run, folder, ignore=shutil.ignore_patterns("report*", "*.ply"))
+    record = json.loads((folder / "config.json").read_text())
+    record["normalization"]["offset"] = (np.array(record["normalization"]["offset"]) + offset).tolist()
+    (folder / "config.json").write_text(json.dumps(record))
+    return folder
+
+
+def loss(a, b):
+    """Return the PSNR [dB] of two images."""
+    return -10 * math.log10(max(float((a - b).square().mean()), 1e-12))
+
+
+@pytest.mark.parametrize("offset", [(1e4, 0, 0), (441_000.4, 5_500_000.7, 130), (-4e6, 5.5e6, 4.9e6)])
+@pytest.mark.parametrize("cameras", NAMES)
+def test_exports_at_map_coordinates(run, tmp_path, offset, cameras):
+    """Files of every format render as at the origin, with cameras of every format, by the point that they state."""
+    renders = {}
+    for name, place in (("near", np.zeros(3)), ("far", np.array(offset))):
+        there = moved(run, tmp_path / name, place)
+        lines = export(there, there / cameras)
+        stored = open_run(there, "cpu")
+        camera = torch_camera(list(stored.cameras().values())[1])
+        wanted = rasterize(stored.gaussians(), camera, stored.options()).rgb
+        assert any("are relative to" in line for line in lines) == (name == "far")
+        other = there / "other" / ("sparse" if cameras != "sparse" else "cameras.json")
+        lines = convert(there / cameras, other)  # keeps the origin, which other programs need
+        assert any(f"are relative to {', '.join(f'{v:.12g}' for v in stored.normalization.origin)}" in x for x in lines) == (
+            name == "far"
+        )
+        assert np.allclose(stated_origin(other), stored.normalization.origin, rtol=0, atol=0)
+        for suffix in suffixes():
+            lines = export(there, there / f"a{suffix}", Filters(clean=False))
+            assert any("are relative to" in line and "exported" not in line for line in lines) == (name == "far")
+            convert(there / f"a{suffix}", there / f"b{suffix}", Filters(clean=False))
+            for file in (f"a{suffix}", f"b{suffix}"):
+                model, _ = open_file(there / file, there / cameras, stored.rule, "cpu")
+                view = torch_camera(list(model.cameras().values())[1])
+                back = rasterize(model.gaussians(), view, model.options()).rgb
+                renders[name, file] = loss(back, wanted)
+            absolute = read_gaussians(there / f"a{suffix}")
+            known = read_gaussians(there / f"a{suffix}", stored.normalization, units="scene")
+            middle = (absolute.means.double().mean(0).numpy() - stored.normalization.offset) * stored.normalization.scale
+            assert np.allclose(known.means.double().mean(0).numpy(), middle, atol=1e-4) and known.means.dtype == torch.float32
+            if suffix == ".ply":
+                write_gaussians(there / "c.ply", absolute, units="file")  # Gaussians in file units, from Python
+                again = read_gaussians(there / "c.ply", stored.normalization, units="scene")
+                assert torch.allclose(again.means, known.means, atol=1e-5)
+    for (name, file), psnr in renders.items():
+        assert psnr >= min(50, renders["near", file] - 0.2), (name, file, psnr)
+
+
+def test_files_with_small_units(run, tmp_path, capsys):
+    """A scene of centimetres: our files render as the run does; others name the near plane instead of the path."""
+    folder = moved(run, tmp_path / "run", np.zeros(3))
+    record = json.loads((folder / "config.json").read_text())
+    record["normalization"]["scale"] *= 100
+    (folder / "config.json").write_text(json.dumps(record))
+    stored, cameras = open_run(folder, "cpu"), folder / "transforms.json"
+    wanted = rasterize(stored.gaussians(), torch_camera(list(stored.cameras().values())[1]), stored.options()).rgb
+    export(folder, cameras)
+    for name, rule, near in (("a.ply", None, None), ("a.glb", None, None), ("a.ply", "exact", 1e-4), ("a.spz", "exact", 1e-4)):
+        export(folder, folder / name, Filters(clean=False))
+        model, _ = open_file(folder / name, cameras, rule, "cpu", near=near)
+        back = rasterize(model.gaussians(), torch_camera(list(model.cameras().values())[1]), model.options()).rgb
+        assert loss(back, wanted) >= (50 if name != "a.spz" else 30), (name, rule)
+    words = ["render", str(folder / "a.spz"), "--cameras", str(cameras), "--path", "views", "--device", "cpu", "--out"]
+    assert main([*words, str(tmp_path / "black")]) == 0
+    said = capsys.readouterr().out
+    assert (
+        "% of the Gaussians in front of the cameras are nearer than the near plane, 0.2 units" in said and "--near 0.0" in said
+    )
+    assert "the path leaves" not in said
+    assert main([*words, str(tmp_path / "near"), "--near", "1e-4"]) == 0
+    assert "nearly nothing" not in capsys.readouterr().out
+    assert main(["render", str(folder), "--near", "1"]) == UsageError.exit_code
 
 
 def test_prune_keeps_its_promise(run, tmp_path, capsys):

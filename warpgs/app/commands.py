@@ -102,14 +102,15 @@ def render(
     run: Positional[Path], *, cameras: Path | None = None, rule: str | None = None, antialiased: bool = False,
     path: str = "auto", out: Path | None = None, seconds: float | None = None, fps: int = 30, frames: int | None = None,
     size: tuple[int, int] | None = None, fov: float | None = None, background: str = "auto", sheet: bool = False,
-    device: str = "auto", coverage: bool = False,
+    device: str = "auto", coverage: bool = False, near: float | None = None,
 ) -> list[str]:  # fmt: skip
     """Render a run or a file of Gaussians.
 
     Args:
         run: Run folder of `warpgs fit`, or a file of Gaussians from any program, in a format of `warpgs convert`.
         cameras: Cameras for a file of Gaussians: cameras.json, transforms.json, a COLMAP folder, or a scene.
-        rule: Cut-offs with which a file of Gaussians was trained: inria (default), gsplat-1.6, gsplat-1.5 or exact.
+        rule: Cut-offs with which a file of Gaussians was trained: inria, gsplat-1.6, gsplat-1.5 or exact. Default: exact for
+            files that name warpgs, else inria.
         antialiased: Render a file of Gaussians with antialiasing. Needed for antialiased models (gsplat's rasterize_mode
             antialiased) if the file does not declare this.
         path: auto (chosen from the cameras), turntable, spiral, interpolate (through the training views), views (every view of
@@ -126,10 +127,13 @@ def render(
         sheet: Also write six frames in one image: sheet.png.
         device: auto, cpu or cuda.
         coverage: Also write images of the coverage by training views, into the subfolder coverage.
+        near: Nearest depth that is rendered of a file of Gaussians, in its units. Default: that of the rule (inria: 0.2).
     """
     check_range("--fps", fps, 1, 1000)
-    if run.is_dir() and (cameras is not None or rule is not None or antialiased):
-        raise UsageError("--cameras, --rule and --antialiased are for files of Gaussians; leave them out for a run")
+    if near is not None:
+        check_range("--near", near, 0, 1e9)
+    if run.is_dir() and (cameras is not None or rule is not None or antialiased or near is not None):
+        raise UsageError("--cameras, --rule, --antialiased and --near are for files of Gaussians; leave them out for a run")
     from warpgs.pipeline.films.film import FilmSettings
     from warpgs.pipeline.run import commands
 
@@ -137,6 +141,7 @@ def render(
     return commands.render(
         run, path, out, settings, device, background=background, coverage=coverage, sheet=sheet,
         file_of=(cameras, rule) if run.is_file() or cameras is not None else None, antialiased=antialiased,
+        near=near,
     )  # fmt: skip
 
 

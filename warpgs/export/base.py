@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import io
+import json
 import math
 import os
 import re
@@ -13,16 +14,17 @@ import zipfile
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, BinaryIO, ClassVar
 
 import numpy as np
 
 from warpgs.errors import DataError, UsageError
-from warpgs.files import open_input, read_input, unread_reason, write_bytes
+from warpgs.files import open_input, read_input, unread_reason, write_bytes, write_json
 from warpgs.geometry import checked_normalization, convert_gaussians, rotate
 from warpgs.plugins import Registry, returned
-from warpgs.scene import Gaussians, Normalization, base_coefficients, base_colors
+from warpgs.scene import ORIGIN, Gaussians, Normalization, base_coefficients, base_colors, checked_origin
 
 BYTES = (bytes, bytearray, memoryview)
 """Types of the pieces of a file."""
@@ -69,10 +71,47 @@ def arrays_of(gaussians: Gaussians) -> Arrays:
     return {name: t.detach().cpu().numpy() for name, t in gaussians.tensors().items()}
 
 
-def arrays_to_write(path: Path, gaussians: Gaussians, normalization: Normalization | None, units: str) -> Arrays:
-    """Return the tensors of Gaussians in file units, checked before and after the conversion: it may overflow float32."""
+def origin_of(points: np.ndarray) -> np.ndarray:
+    """Return the `Normalization.origin` [3] of points [N, 3] in file units, float64; 0 unless float32 is too coarse."""
+    points = points[np.isfinite(points).all(1)]
+    if not len(points):
+        return np.zeros(3)
+    low, high = np.percentile(points, [5, 95], axis=0)
+    return Normalization((low + high) / 2, 1 / (float(np.linalg.norm(high - low)) or 1.0)).origin
+
+
+def side_file(path: Path) -> Path:
+    """Return the file that holds the origin of a file in a format without a place for it."""
+    return path.with_name(f"{path.name}.origin.json")
+
+
+def from_origin(gaussians: Gaussians, origin: np.ndarray, normalization: Normalization, units: str) -> Gaussians:
+    """Return Gaussians in file units about an ``origin`` [3] in scene units, or in file units: float64 unless it is 0."""
+    if units == "file" and origin.any():
+        tensors = {name: t.double() for name, t in gaussians.tensors().items()}
+        return Gaussians(**tensors | {"means": tensors["means"] + tensors["means"].new_tensor(origin)})
+    offset = np.asarray(normalization.offset, np.float64) - origin
+    return convert_gaussians(gaussians, Normalization(offset, normalization.scale), "file", units)
+
+
+def arrays_to_write(
+    path: Path, gaussians: Gaussians, normalization: Normalization | None, units: str, origin: np.ndarray | None = None
+) -> tuple[Arrays, np.ndarray]:
+    """Return the tensors of Gaussians in file units about an origin, and the origin [3], for Gaussians not about it already.
+
+    The tensors are checked before and after the conversion: it may overflow float32.
+    """
     normalization = checked_normalization(normalization, units, f"{path}: not written")
-    for g in (gaussians, convert_gaussians(gaussians, normalization, units, "file")):
+    local = convert_gaussians(gaussians, normalization.local, units, "file")
+    if origin is None:
+        origin = normalization.origin
+        if units == "file":
+            # float32 has lost the digits that an origin would keep
+            exact = gaussians.means.element_size() > 4
+            origin = origin_of(arrays_of(gaussians)["means"]) if exact else np.zeros(3)
+            moved = gaussians.means - gaussians.means.new_tensor(origin) if origin.any() else gaussians.means
+            local = replace(gaussians, means=moved)
+    for g in (gaussians, local):
         arrays = arrays_of(g)
         for name, array in arrays.items():
             bad = array.size - int(np.isfinite(array).sum())
@@ -81,7 +120,9 @@ def arrays_to_write(path: Path, gaussians: Gaussians, normalization: Normalizati
                     f"{path}: not written, {bad} of {array.size} values of {name} are not finite, and no viewer can show them. "
                     "Export an earlier checkpoint, or fit again with a lower learning rate."
                 )
-    return arrays
+    if origin.any():
+        arrays = {name: array.astype(np.float32) for name, array in arrays.items()}
+    return arrays, origin
 
 
 def gaussians_of(
@@ -261,6 +302,8 @@ class Format:
         """True to refuse a file with a Gaussian that cannot be rendered, instead of leaving the Gaussian out."""
         self.notes: list[str] = []
         """Notes for the user on the last file that was read."""
+        self.origin: np.ndarray | None = None
+        """Point [3] in file units about which the Gaussians are that are written or were last read; None to choose one."""
 
     def encode(self, arrays: Arrays) -> Iterable[bytes]:
         """Return the bytes of a file, in pieces.
@@ -294,6 +337,15 @@ class Format:
         """
         return False
 
+    def origin_in(self, path: Path) -> object:
+        """Return the origin that a file states; None without one. By default it is in a side file."""
+        side = side_file(path)
+        if not side.is_file():
+            return None
+        with reading(side, whole=True) as file:
+            values = json.loads(file.read())
+        return values.get(ORIGIN, values) if isinstance(values, dict) else values
+
     def is_own(self, path: Path) -> bool:
         """Return whether warpgs wrote a file, so that bad numbers mean damage; False if the format cannot tell."""
         return False
@@ -310,7 +362,7 @@ class Format:
         """
         if not len(gaussians):
             raise DataError(f"{path}: not written, the model holds no Gaussian. Use .ply for an empty model")
-        arrays = arrays_to_write(path, gaussians, normalization, units)
+        arrays, self.origin = arrays_to_write(path, gaussians, normalization, units, self.origin)
         if self.max_degree == 0:
             arrays["sh"] = arrays["sh"][:, :1]
         elif gaussians.sh_degree > self.max_degree:
@@ -321,6 +373,11 @@ class Format:
             )
         pieces = returned(self, "encode", self.encode(arrays), Iterable, "an iterable of bytes")
         write_bytes(path, *(returned(self, "encode", p, BYTES, "an iterable of bytes") for p in pieces))
+        if type(self).origin_in is Format.origin_in:
+            if self.origin.any():
+                write_json(side_file(path), {ORIGIN: self.origin.tolist()})
+            else:
+                side_file(path).unlink(missing_ok=True)
 
     def read(self, path: Path, normalization: Normalization | None, units: str) -> Gaussians:
         """Read Gaussians, with the arguments of `warpgs.export.read_gaussians`.
@@ -329,14 +386,23 @@ class Format:
             DataError: The file is missing or malformed.
         """
         normalization = checked_normalization(normalization, units, str(path))
+        gaussians = self.read_stored(path)
+        return from_origin(gaussians, np.zeros(3) if self.origin is None else self.origin, normalization, units)
+
+    def read_stored(self, path: Path) -> Gaussians:
+        """Read Gaussians in file units about `origin`, which this sets, as float32."""
         with reading(path, whole=not self.archive) as file:
             arrays = self.decode(path, file if self.archive else file.read())
             what, names = "an array for each tensor of Gaussians, by name", Gaussians.__dataclass_fields__
             returned(self, "decode", arrays, Mapping, what, each=np.ndarray, names=names)
             returned(self, "decode", {n: arrays.get(n) for n in names}, Mapping, what, each=np.ndarray)
+        with reading(path):
+            stated = self.origin_in(path)
         self.notes = []
-        gaussians = gaussians_of(path, arrays, lambda: self.strict or self.is_own(path), self.notes)
-        return convert_gaussians(gaussians, normalization, "file", units)
+        self.origin = np.zeros(3) if stated is None else checked_origin(stated, str(path))
+        if (means := arrays["means"]).dtype == np.float64 and (middle := origin_of(means)).any():
+            arrays, self.origin = arrays | {"means": means - middle}, self.origin + middle
+        return gaussians_of(path, arrays, lambda: self.strict or self.is_own(path), self.notes)
 
 
 def warn_of_antialiasing(path: Path) -> None:
@@ -512,7 +578,7 @@ def read_gaussians(
         strict: True to refuse every file with such a Gaussian.
 
     Returns:
-        N Gaussians, torch float32 tensors on the CPU.
+        N Gaussians, torch tensors on the CPU: float32, or float64 for map coordinates in file units.
 
     Raises:
         warpgs.DataError: The file is missing, malformed, truncated, declares more data than its size allows, has no usable
@@ -534,5 +600,5 @@ def read_with_antialiasing(
 ) -> tuple[Gaussians, bool, list[str]]:  # fmt: skip
     """Return the result of `read_gaussians`, whether the file declares antialiasing, and notes for the user."""
     chosen = copy.copy(format_of(path, format))
-    chosen.strict, chosen.notes = strict, []
+    chosen.strict, chosen.notes, chosen.origin = strict, [], None
     return chosen.read(path, normalization, units), chosen.is_antialiased(path), chosen.notes

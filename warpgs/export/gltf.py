@@ -34,7 +34,7 @@ from warpgs.export.base import (
     unit_quats,
 )
 from warpgs.geometry import rotation_matrices
-from warpgs.scene import base_colors
+from warpgs.scene import ORIGIN, base_colors
 
 EXTENSION = "KHR_gaussian_splatting"
 COLOR_SPACE = "srgb_rec709_display"
@@ -60,9 +60,9 @@ def linear(colors: np.ndarray) -> np.ndarray:
     return np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)
 
 
-def encode_glb(arrays: Arrays) -> list[bytes]:
+def encode_glb(arrays: Arrays, origin: np.ndarray | None = None) -> list[bytes]:
     """Return the bytes of a .glb file."""
-    return glb(*_document(arrays))
+    return glb(*_document(arrays, origin))
 
 
 def glb(document: dict[str, Any], *body: bytes) -> list[bytes]:
@@ -74,14 +74,14 @@ def glb(document: dict[str, Any], *body: bytes) -> list[bytes]:
     return [head, text, struct.pack("<II", size, BINARY_CHUNK), *body]
 
 
-def encode_gltf(arrays: Arrays) -> list[bytes]:
+def encode_gltf(arrays: Arrays, origin: np.ndarray | None = None) -> list[bytes]:
     """Return the bytes of a .gltf file, with its numbers embedded as base64."""
-    document, body = _document(arrays)
+    document, body = _document(arrays, origin)
     document["buffers"][0]["uri"] = "data:application/octet-stream;base64," + base64.b64encode(body).decode()
     return [json.dumps(document, separators=(",", ":")).encode()]
 
 
-def _document(arrays: Arrays) -> tuple[dict[str, Any], bytes]:
+def _document(arrays: Arrays, origin: np.ndarray | None) -> tuple[dict[str, Any], bytes]:
     """Return the glTF document and its binary buffer."""
     a = half_turn({k: np.asarray(v) for k, v in arrays.items()}, "z")
     scales = np.clip(np.exp(a["log_scales"].astype(np.float64)), _TINY, 3e38)
@@ -125,6 +125,8 @@ def _document(arrays: Arrays) -> tuple[dict[str, Any], bytes]:
         "bufferViews": views,
         "accessors": accessors,
     }
+    if origin is not None and origin.any():
+        document["extras"] = {ORIGIN: origin.tolist()}
     return document, b"".join(parts_of_body)
 
 
@@ -178,6 +180,7 @@ def decode(path: Path, data: bytes) -> Arrays:
     copies = [arrays, *({name: array.copy() for name, array in arrays.items()} for _ in places[1:])]
     for copy, place in zip(copies, places):
         if not np.array_equal(place, np.eye(4)):
+            copy["means"] = copy["means"].astype(np.float64)  # a translation may be in map coordinates
             transform_in_place(copy, place[:3, :3], place[:3, 3])
     if places[1:]:
         arrays = {name: np.concatenate([copy[name] for copy in copies]) for name in arrays}
@@ -349,8 +352,17 @@ class BinaryGltf(Format):
 
     suffix = ".glb"
     description = "glTF 2.0 with KHR_gaussian_splatting, binary, float32; Cesium, 3D engines"
-    encode = staticmethod(encode_glb)
     decode = staticmethod(decode)
+
+    def encode(self, arrays: Arrays) -> list[bytes]:
+        """Return the bytes of a file."""
+        return encode_glb(arrays, self.origin)
+
+    def origin_in(self, path: Path) -> object:
+        """Return the origin in the document's extras."""
+        with reading(path, whole=True) as file:
+            extras = _split(path, file.read())[0].get("extras")
+        return extras.get(ORIGIN) if isinstance(extras, dict) else None
 
     def is_own(self, path: Path) -> bool:
         """Return whether the document names warpgs as its generator."""
@@ -364,4 +376,7 @@ class TextGltf(BinaryGltf):
 
     suffix = ".gltf"
     description = "glTF 2.0 with KHR_gaussian_splatting, text with embedded numbers"
-    encode = staticmethod(encode_gltf)
+
+    def encode(self, arrays: Arrays) -> list[bytes]:
+        """Return the bytes of a file."""
+        return encode_gltf(arrays, self.origin)

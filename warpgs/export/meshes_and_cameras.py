@@ -12,7 +12,7 @@ from warpgs.errors import DataError, UsageError
 from warpgs.export.gltf import glb, linear
 from warpgs.files import filling, is_empty, make_folder, write_bytes, write_json, write_text
 from warpgs.geometry import pinhole_of, quaternions
-from warpgs.scene import Camera, Mesh
+from warpgs.scene import ORIGIN, Camera, Mesh
 from warpgs.version import __version__
 
 SUFFIXES = (".ply", ".glb")
@@ -28,24 +28,37 @@ def check_suffix(path: str | os.PathLike[str]) -> None:
         raise UsageError(f"{path}: format {suffix or '(none)'} is not supported; use {' or '.join(SUFFIXES)}")
 
 
-def write_mesh(path: str | os.PathLike[str], mesh: Mesh, up: np.ndarray | None = None) -> None:
-    """Write a mesh to a .ply or .glb file, atomically."""
-    path = Path(path)
+def write_mesh(
+    path: str | os.PathLike[str], mesh: Mesh, up: np.ndarray | None = None, origin: np.ndarray | None = None
+) -> None:
+    """Write a mesh to a .ply or .glb file, atomically; the file states the ``origin`` [3] that its vertices are about."""
+    path, origin = Path(path), np.zeros(3) if origin is None else origin
     check_suffix(path)
     if not (np.isfinite(mesh.vertices).all() and np.isfinite(mesh.colors).all()):
         raise DataError(f"{path}: not written, the mesh holds numbers that are not finite; make it again")
     if mesh.faces.size and not (mesh.faces.min() >= 0 and mesh.faces.max() < len(mesh.vertices)):
         raise DataError(f"{path}: not written, a triangle refers to a missing vertex; make the mesh again")
     if path.suffix.lower() == ".ply":
-        write_bytes(path, *_ply(mesh))
+        write_bytes(path, *_ply(mesh, origin))
     else:
-        write_bytes(path, *_glb(path, mesh, up))
+        write_bytes(path, *_glb(path, mesh, up, origin))
 
 
-def _ply(mesh: Mesh) -> list[bytes]:
+def _comment(start: str, origin: np.ndarray) -> str:
+    """Return the line of a text file that states an origin [3]; empty for 0."""
+    return f"{start} {ORIGIN} {' '.join(map(repr, origin.tolist()))}\n" if origin.any() else ""
+
+
+def _stated(origin: np.ndarray) -> dict[str, object]:
+    """Return the JSON member that states an origin [3]; none for 0."""
+    return {ORIGIN: origin.tolist()} if origin.any() else {}
+
+
+def _ply(mesh: Mesh, origin: np.ndarray) -> list[bytes]:
     """Return header, vertices and faces: float32 positions, 8-bit colours, lists of three int32."""
     header = (
-        f"ply\nformat binary_little_endian 1.0\ncomment warpgs {__version__}\nelement vertex {len(mesh.vertices)}\n"
+        f"ply\nformat binary_little_endian 1.0\ncomment warpgs {__version__}\n{_comment('comment', origin)}"
+        f"element vertex {len(mesh.vertices)}\n"
         "property float x\nproperty float y\nproperty float z\n"
         "property uchar red\nproperty uchar green\nproperty uchar blue\n"
         f"element face {len(mesh.faces)}\nproperty list uchar int vertex_indices\nend_header\n"
@@ -67,7 +80,7 @@ def rotation_to_y(up: np.ndarray) -> list[float]:
     return unit
 
 
-def _glb(path: Path, mesh: Mesh, up: np.ndarray | None) -> list[bytes]:
+def _glb(path: Path, mesh: Mesh, up: np.ndarray | None, origin: np.ndarray) -> list[bytes]:
     """Return the chunks of a glTF 2.0 file: one node, one unlit mesh, positions, colours and triangles.
 
     Positions are float32 relative to their middle, the node's translation, because float32 is coarse far from the origin.
@@ -102,6 +115,8 @@ def _glb(path: Path, mesh: Mesh, up: np.ndarray | None) -> list[bytes]:
             for i, (kind, form, count, more) in enumerate(kinds)
         ],
     }  # fmt: skip
+    if origin.any():
+        text["extras"] = _stated(origin)
     if starts[-1] > MAX_BYTES:
         raise DataError(
             f"{path}: a mesh of {starts[-1]:,} bytes is beyond the 4 GiB of a .glb file; ask for fewer triangles, or write .ply"
@@ -126,16 +141,19 @@ def holds_cameras(path: Path) -> bool:
 
 
 def write_cameras(
-    path: Path, cameras: list[Camera], names: Sequence[str] | None = None, points: tuple[np.ndarray, np.ndarray] | None = None
+    path: Path, cameras: list[Camera], names: Sequence[str] | None = None, points: tuple[np.ndarray, np.ndarray] | None = None,
+    origin: np.ndarray | None = None,
 ) -> list[str]:  # fmt: skip
     """Write cameras in the format of the file name; returns notes for the user.
 
     Args:
         path: The file, or a folder named sparse.
-        cameras: N cameras in file units.
+        cameras: N cameras in file units, about the origin.
         names: Names of their N images, relative to the folder of the images; None for numbers.
         points: Positions [P, 3] and colours [P, 3], 0 to 1, which only COLMAP's files hold: other trainers start from them.
+        origin: Point [3] that the cameras are about, which the files state; None for 0.
     """
+    origin = np.zeros(3) if origin is None else origin
     if not holds_cameras(path):
         raise UsageError(f"{path}: cameras go to {' or '.join(NAMES[:2])}, or to a folder named {NAMES[2]} (COLMAP)")
     bent = sum(c.model != "pinhole" for c in cameras)
@@ -143,7 +161,8 @@ def write_cameras(
     cameras = [pinhole_of(c) for c in cameras]
     images = [f"{i:04d}.png" for i in range(len(cameras))] if names is None else [n.removeprefix("images/") for n in names]
     if path.name == "transforms.json":
-        write_json(path, {"camera_model": "PINHOLE", "frames": [_frame(n, c) for n, c in zip(images, cameras)]})
+        frames = [_frame(n, c) for n, c in zip(images, cameras)]
+        write_json(path, {"camera_model": "PINHOLE", "frames": frames} | _stated(origin))
     elif path.name == "sparse":
         if path.exists() and not (path.is_dir() and is_empty(path)):
             raise UsageError(f"{path}: exists already and may be a reconstruction; give another folder")
@@ -152,10 +171,10 @@ def write_cameras(
         with filling(path) as temporary:
             make_folder(temporary / "0")
             for name, text in _colmap(images, cameras, points).items():
-                write_text(temporary / "0" / name, text)
+                write_text(temporary / "0" / name, _comment("#", origin) + text)
     else:
         stems = images if names is not None else [name.removesuffix(".png") for name in images]
-        write_json(path, [_inria(i, n, c) for i, (n, c) in enumerate(zip(stems, cameras))])
+        write_json(path, [_inria(i, n, c) | _stated(origin) for i, (n, c) in enumerate(zip(stems, cameras))])
         off = max((max(abs(c.K[0, 2] - c.width / 2), abs(c.K[1, 2] - c.height / 2)) for c in cameras), default=0.0)
         if off > MAX_OFF_CENTER:
             notes.append(

@@ -22,9 +22,11 @@ from warpgs.export.base import (
     Format,
     arrays_to_write,
     by_rows,
+    from_origin,
     from_smallest_three,
     logits,
     malformed,
+    origin_of,
     parts,
     reading,
     register,
@@ -35,8 +37,8 @@ from warpgs.export.base import (
     warn_of_antialiasing,
 )
 from warpgs.files import writing
-from warpgs.geometry import checked_normalization, convert_gaussians
-from warpgs.scene import Gaussians, Normalization, base_coefficients, base_colors
+from warpgs.geometry import checked_normalization
+from warpgs.scene import ORIGIN, Gaussians, Normalization, base_coefficients, base_colors, checked_origin
 
 MAX_HEADER_BYTES = 65536
 """Largest accepted header [bytes]; real headers have some two thousand."""
@@ -61,6 +63,17 @@ LIST = "list"
 def mode_comments(antialiased: bool) -> tuple[str, str]:
     """Return the comments of Brush and Postshot that declare antialiasing."""
     return f"comment SplatRenderMode: {'mip' if antialiased else 'default'}", f"comment antialiased {int(antialiased)}"
+
+
+def origin_comment(origin: np.ndarray | None) -> list[str]:
+    """Return the comment that states an origin [3], if it is not 0."""
+    return [] if origin is None or not origin.any() else [f"comment {ORIGIN} {' '.join(map(repr, origin.tolist()))}"]
+
+
+def origin_stated(head: bytes) -> list[str] | None:
+    """Return the words of the comment that `origin_comment` made; None without one."""
+    line = re.search(rf"^comment {ORIGIN} (.*)$".encode(), head.partition(b"end_header")[0], re.MULTILINE)
+    return None if line is None else line[1].decode("utf-8", "replace").split()
 
 
 def is_own(head: bytes) -> bool:
@@ -142,7 +155,7 @@ _VERTEX_NAMES = ["packed_position", "packed_rotation", "packed_scale", "packed_c
 _BITS = (11, 10, 11)
 
 
-def encode(arrays: Arrays, antialiased: bool) -> list[bytes]:
+def encode(arrays: Arrays, antialiased: bool, origin: np.ndarray | None = None) -> list[bytes]:
     """Return the bytes of a file, with antialiasing declared in its header; harmonics above degree 0 are clamped to +-4."""
     n, k = arrays["sh"].shape[:2]
     chunks = np.arange(n) // CHUNK
@@ -162,7 +175,8 @@ def encode(arrays: Arrays, antialiased: bool) -> list[bytes]:
     rows = np.stack([position, rotation, scale, _pack(rgba, (8, 8, 8, 8))], 1).astype("<u4")
     rest = arrays["sh"][:, 1:].astype(np.float64).transpose(0, 2, 1).reshape(n, -1)
     harmonics = np.clip(np.floor((rest / SH_RANGE + 0.5) * 256), 0, 255).astype("u1")
-    lines = ["ply", "format binary_little_endian 1.0", *mode_comments(antialiased), f"element chunk {len(bounds[0])}"]
+    lines = ["ply", "format binary_little_endian 1.0", *mode_comments(antialiased), *origin_comment(origin)]
+    lines.append(f"element chunk {len(bounds[0])}")
     lines += [f"property float {name}" for name in _CHUNK_NAMES]
     lines += [f"element vertex {n}", *(f"property uint {name}" for name in _VERTEX_NAMES)]
     if k > 1:
@@ -309,7 +323,11 @@ class CompressedPLY(Format):
 
     def encode(self, arrays: Arrays) -> list[bytes]:
         """Return the bytes of a file."""
-        return encode(arrays, self.antialiased)
+        return encode(arrays, self.antialiased, self.origin)
+
+    def origin_in(self, path: Path) -> object:
+        """Return the origin in the header's comments."""
+        return origin_stated(start_of(path))
 
     def is_antialiased(self, path: Path) -> bool:
         """Return whether the header declares antialiasing."""
@@ -346,8 +364,9 @@ def write_ply(
     """Write Gaussians to a PLY file in the units of the scene's files.
 
     Means become ``mean / scale + offset`` [file units] and log scales ``log_scale - log(scale)``, computed in float64 and
-    stored as float32; rotations, logit opacities and spherical harmonics are stored unchanged. The write is atomic: the file is
-    written under a temporary name beside ``path`` and then renamed.
+    stored as float32; map coordinates are stored about an origin that the header states (docs/formats.md). Rotations, logit
+    opacities and spherical harmonics are stored unchanged. The write is atomic: the file is written under a temporary name
+    beside ``path`` and then renamed.
 
     Args:
         path: The file; an existing one is replaced.
@@ -367,9 +386,17 @@ def write_ply(
         ValueError: A tensor has the wrong shape.
     """
     path = Path(path)
-    arrays = arrays_to_write(path, gaussians, normalization, units)
+    _write(path, gaussians, normalization, units, antialiased, None)
+
+
+def _write(
+    path: Path, gaussians: Gaussians, normalization: Normalization | None, units: str, antialiased: bool,
+    origin: np.ndarray | None,
+) -> None:  # fmt: skip
+    """Write Gaussians as `write_ply` does, about an ``origin`` [3] if one is given."""
+    arrays, origin = arrays_to_write(path, gaussians, normalization, units, origin)
     n, k = arrays["sh"].shape[:2]
-    header = _header(n, 3 * (k - 1), antialiased)
+    header = _header(n, 3 * (k - 1), antialiased, origin)
     with writing(path, len(header) + 4 * n * (14 + 3 * k)) as file:
         file.write(header)
         for start in range(0, n, CHUNK_ROWS):
@@ -391,8 +418,8 @@ def read_ply(path: str | os.PathLike[str], normalization: Normalization | None =
         units: Units of the result: file as stored, or scene to go with a scene's cameras.
 
     Returns:
-        N Gaussians, torch float32 tensors on the CPU: means [N, 3], quats wxyz as stored [N, 4], log scales [N, 3], logit
-        opacities [N], spherical harmonics [N, K, 3] with K in {1, 4, 9, 16, 25}.
+        N Gaussians, torch tensors on the CPU, float32, or float64 for map coordinates in file units: means [N, 3], quats wxyz
+        as stored [N, 4], log scales [N, 3], logit opacities [N], spherical harmonics [N, K, 3] with K in {1, 4, 9, 16, 25}.
 
     Raises:
         warpgs.DataError: The file is missing, malformed, truncated or compressed, has no usable Gaussian, or is of warpgs and
@@ -401,7 +428,8 @@ def read_ply(path: str | os.PathLike[str], normalization: Normalization | None =
     """
     path = Path(path)
     notes: list[str] = []
-    gaussians = _read(path, normalization, units, False, notes)
+    normalization = checked_normalization(normalization, units, str(path))
+    gaussians = from_origin(*_read(path, False, notes), normalization, units)
     if is_antialiased(start_of(path)):
         warn_of_antialiasing(path)
     for note in notes:
@@ -409,9 +437,8 @@ def read_ply(path: str | os.PathLike[str], normalization: Normalization | None =
     return gaussians
 
 
-def _read(path: Path, normalization: Normalization | None, units: str, strict: bool, notes: list[str]) -> Gaussians:
-    """Return what `read_ply` does, with notes instead of warnings."""
-    normalization = checked_normalization(normalization, units, str(path))
+def _read(path: Path, strict: bool, notes: list[str]) -> tuple[Gaussians, np.ndarray]:
+    """Return the Gaussians in file units about an origin, and the origin [3]; fills ``notes``."""
     with reading(path) as file:
         size = os.fstat(file.fileno()).st_size
         head = file.read(MAX_HEADER_BYTES)
@@ -447,8 +474,9 @@ def _read(path: Path, normalization: Normalization | None, units: str, strict: b
                 raise ply_error(path, f"truncated: {n} Gaussians announced, {part.start + len(found)} read")
             return found
 
-        gaussians = _assemble(path, numbers if text else rows, n, rest, strict or own, notes)
-    return convert_gaussians(gaussians, normalization, "file", units)
+        stated = origin_stated(head[:start])
+        origin = np.zeros(3) if stated is None else checked_origin(stated, str(path))
+        return _assemble(path, numbers if text else rows, n, rest, strict or own, notes, origin)
 
 
 def _names(rest: int) -> list[str]:
@@ -456,10 +484,10 @@ def _names(rest: int) -> list[str]:
     return [*_POSITION, "nx", "ny", "nz", *_DC, *(f"f_rest_{i}" for i in range(rest)), "opacity", *_SCALE, *_ROTATION]
 
 
-def _header(n: int, rest: int, antialiased: bool) -> bytes:
+def _header(n: int, rest: int, antialiased: bool, origin: np.ndarray) -> bytes:
     """Return the header of a file with ``n`` Gaussians and ``rest`` coefficients above degree 0."""
-    lines = ["ply", "format binary_little_endian 1.0", *mode_comments(antialiased), f"element vertex {n}"]
-    lines += [f"property float {name}" for name in _names(rest)]
+    lines = ["ply", "format binary_little_endian 1.0", *mode_comments(antialiased), *origin_comment(origin)]
+    lines += [f"element vertex {n}", *(f"property float {name}" for name in _names(rest))]
     return ("\n".join([*lines, "end_header"]) + "\n").encode("ascii")
 
 
@@ -508,9 +536,13 @@ def _check_properties(path: Path, names: list[str]) -> int:
 
 
 def _assemble(
-    path: Path, read: Callable[[slice], np.ndarray], n: int, rest: int, strict: bool, notes: list[str]
-) -> Gaussians:  # fmt: skip
-    """Return the Gaussians of N structured rows, which are read in their order; see `usable`."""
+    path: Path, read: Callable[[slice], np.ndarray], n: int, rest: int, strict: bool, notes: list[str], origin: np.ndarray
+) -> tuple[Gaussians, np.ndarray]:  # fmt: skip
+    """Return the Gaussians of N structured rows, which are read in their order, and their ``origin`` [3]; see `usable`.
+
+    Doubles far from 0 become float32 about a point near the first rows, which is added to the origin.
+    """
+    middle = np.zeros(3)
     k = rest // 3
     shapes = {"means": (3,), "quats": (4,), "log_scales": (3,), "logit_opacities": (), "sh": (1 + k, 3)}
     arrays = {name: np.empty((n, *shape), np.float32) for name, shape in shapes.items()}
@@ -518,7 +550,8 @@ def _assemble(
     reasons: list[str] = []
     for part in parts(n):
         rows = read(part)
-
+        if part.start == 0 and all(rows.dtype[name].itemsize == 8 for name in _POSITION):
+            middle = origin_of(np.stack([rows[name] for name in _POSITION], 1).astype(np.float64))
         columns = functools.partial(_columns, rows, part.start, bad[part], reasons)
         arrays["sh"][part, 0] = columns(_DC)
         if rest:
@@ -529,17 +562,17 @@ def _assemble(
         if zero.any():
             reasons.append(f"the rotation of Gaussian {part.start + int(np.argmax(zero))} has zero length")
             bad[part] |= zero
-        arrays["means"][part] = columns(_POSITION)
+        arrays["means"][part] = columns(_POSITION, shift=middle)
         arrays["log_scales"][part] = columns(_SCALE, least=FLAT)
         arrays["logit_opacities"][part] = columns(["opacity"], -OPAQUE, OPAQUE)[:, 0]
-    return usable(path, arrays, bad, next(iter(reasons), ""), lambda: strict, notes, ply_error)
+    return usable(path, arrays, bad, next(iter(reasons), ""), lambda: strict, notes, ply_error), origin + middle
 
 
 def _columns(
     rows: np.ndarray, first: int, bad: np.ndarray, reasons: list[str], names: Sequence[str], least: float = -np.inf,
-    most: float = np.inf,
+    most: float = np.inf, shift: Sequence[float] | np.ndarray = (),
 ) -> np.ndarray:  # fmt: skip
-    """Return columns of structured rows, float32 [N, C]; infinities become ``least`` and ``most``.
+    """Return columns of structured rows less a ``shift``, float32 [N, C]; infinities become ``least`` and ``most``.
 
     Rows with other numbers are marked as ``bad`` [N], with a reason, in which ``first`` is the number of the first row.
     """
@@ -547,7 +580,7 @@ def _columns(
     # A double beyond float32 becomes an infinity, and the check below finds it.
     with np.errstate(over="ignore", invalid="ignore"):
         for i, name in enumerate(names):
-            out[:, i] = rows[name]
+            out[:, i] = rows[name] - shift[i] if np.any(shift) else rows[name]
     out[out == -np.inf], out[out == np.inf] = least, most
     finite = np.isfinite(out)
     if not finite.all():
@@ -569,19 +602,28 @@ class PLY(Format):
 
     def write(self, path: Path, gaussians: Gaussians, normalization: Normalization | None, units: str) -> None:
         """Write Gaussians with `write_ply`."""
-        write_ply(path, gaussians, normalization, units=units, antialiased=self.antialiased)
+        _write(path, gaussians, normalization, units, self.antialiased, self.origin)
 
-    def read(self, path: Path, normalization: Normalization | None, units: str) -> Gaussians:
-        """Read Gaussians with `read_ply`, or with `CompressedPLY` if the header announces that format."""
+    def origin_in(self, path: Path) -> object:
+        """Return the origin in the header's comments."""
+        return origin_stated(start_of(path))
+
+    def read_stored(self, path: Path) -> Gaussians:
+        """Read Gaussians as `read_ply` does, or with `CompressedPLY` if the header announces that format."""
         if is_compressed(path, start_of(path)):
             packed = CompressedPLY()
             packed.strict = self.strict
-            gaussians = packed.read(path, normalization, units)
-            self.notes = packed.notes
+            gaussians = packed.read_stored(path)
+            self.notes, self.origin = packed.notes, packed.origin
             return gaussians
         self.notes = []
-        return _read(path, normalization, units, self.strict, self.notes)
+        gaussians, self.origin = _read(path, self.strict, self.notes)
+        return gaussians
 
     def is_antialiased(self, path: Path) -> bool:
         """Return whether the header declares antialiasing."""
         return is_antialiased(start_of(path))
+
+    def is_own(self, path: Path) -> bool:
+        """Return whether the header has the comments of warpgs."""
+        return is_own(start_of(path))

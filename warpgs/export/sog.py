@@ -35,6 +35,7 @@ from warpgs.export.base import (
     sigmoid,
     smallest_three,
 )
+from warpgs.scene import ORIGIN
 
 LEVELS = 256
 """Number of entries of a codebook."""
@@ -57,13 +58,14 @@ MAX_PALETTE_PIXELS = 2**20
 _DATE = (1980, 1, 1, 0, 0, 0)
 
 
-def encode(arrays: Arrays, antialiased: bool = False) -> list[bytes]:
+def encode(arrays: Arrays, antialiased: bool = False, origin: np.ndarray | None = None) -> list[bytes]:
     """Return the bytes of a file, with antialiasing declared in meta.json."""
     n, k = arrays["sh"].shape[:2]
     width = 4 * math.ceil(math.sqrt(n) / 4)
     height = 4 * math.ceil(n / width / 4)
     meta: dict[str, Any] = {"version": 2, "asset": {"generator": "warpgs"}, "count": n}
     meta |= {"model": "antialiased"} if antialiased else {}
+    meta |= {} if origin is None or not origin.any() else {ORIGIN: origin.tolist()}
     files: dict[str, bytes] = {}
 
     def image(name: str, *columns: np.ndarray) -> None:
@@ -338,7 +340,11 @@ class SOG(Format):
 
     def encode(self, arrays: Arrays) -> list[bytes]:
         """Return the bytes of a file."""
-        return encode(arrays, self.antialiased)
+        return encode(arrays, self.antialiased, self.origin)
+
+    def origin_in(self, path: Path) -> object:
+        """Return the origin in meta.json."""
+        return self._meta_of(path).get(ORIGIN)
 
     def is_antialiased(self, path: Path) -> bool:
         """Return whether meta.json declares antialiasing."""

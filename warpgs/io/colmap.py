@@ -16,12 +16,13 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 import numpy as np
 
 from warpgs.errors import DataError
-from warpgs.files import read_file
+from warpgs.files import open_input, read_file
 from warpgs.io.folder import (
     Probe,
     Reader,
     SceneFolder,
     ViewList,
+    about,
     has_folder,
     missing_note,
     quat_rotation,
@@ -30,7 +31,7 @@ from warpgs.io.folder import (
     view_name,
 )
 from warpgs.io.images import SUFFIXES, Lens, ReadOptions, list_images
-from warpgs.scene import PointCloud, Scene
+from warpgs.scene import ORIGIN, PointCloud, Scene, checked_origin
 
 MODELS = {0: ("SIMPLE_PINHOLE", 3), 1: ("PINHOLE", 4), 2: ("SIMPLE_RADIAL", 4), 3: ("RADIAL", 5), 4: ("OPENCV", 8)}
 """Name and number of parameters by model number."""
@@ -118,6 +119,15 @@ def _rows(path: Path) -> Iterator[tuple[int, list[str]]]:
     for number, line in _lines(path):
         if line.strip() and not line.lstrip().startswith("#"):
             yield number, line.split()
+
+
+def origin_stated(path: Path) -> np.ndarray:
+    """Return the origin [3] that the first line of a text file of ours states, 0 without one."""
+    if path.suffix != ".txt":
+        return np.zeros(3)
+    with open_input(path) as file:
+        words = file.readline(4096).decode("utf-8", "replace").split()
+    return checked_origin(words[2:], str(path)) if words[:2] == ["#", ORIGIN] else np.zeros(3)
 
 
 @contextmanager
@@ -235,13 +245,14 @@ def read_poses(path: Path) -> dict[int, Pose]:
 
 def posed_lenses(poses: dict[int, Pose], lenses: dict[int, Lens], file: Path) -> Iterator[tuple[str, Lens, np.ndarray]]:
     """Yield name, lens and camera_from_world [4, 4] of each image, sorted by name; ``file`` holds the poses."""
+    origin = origin_stated(file)
     for name, camera, quat, translation in sorted(poses.values(), key=lambda pose: pose[0]):
         where = f"{file}, image {name!r}"
         if camera not in lenses:
             raise DataError(f"{where}: camera {camera} is missing from cameras{file.suffix}; export the cameras again")
         viewmat = np.eye(4)
         viewmat[:3, :3], viewmat[:3, 3] = quat_rotation(quat, where), translation
-        yield name, lenses[camera], rigid(viewmat, where)
+        yield name, lenses[camera], about(rigid(viewmat, where), origin)
 
 
 def read_points(path: Path, names: dict[int, str]) -> PointCloud:
@@ -265,7 +276,8 @@ def read_points(path: Path, names: dict[int, str]) -> PointCloud:
                 points.append(tuple(float(w) for w in words[1:4]))
                 colors.append(tuple(float(w) for w in words[4:7]))
                 tracks.append(frozenset(names[i] for w in words[8::2] if (i := int(w)) in names))
-    return _cloud(path, np.array(points, np.float64).reshape(-1, 3), np.array(colors, np.float64).reshape(-1, 3), tuple(tracks))
+    positions = np.array(points, np.float64).reshape(-1, 3) + origin_stated(path)
+    return _cloud(path, positions, np.array(colors, np.float64).reshape(-1, 3), tuple(tracks))
 
 
 def _cloud(

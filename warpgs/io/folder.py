@@ -195,6 +195,15 @@ def from_camera_to_world(matrix: np.ndarray, where: str, *, opengl: bool) -> np.
     return result
 
 
+def about(viewmat: np.ndarray, origin: np.ndarray) -> np.ndarray:
+    """Return camera_from_world [4, 4] in file units from one in file units about an ``origin`` [3]."""
+    if not origin.any():
+        return viewmat
+    moved = viewmat.copy()
+    moved[:3, 3] -= matmul(viewmat[:3, :3], origin)
+    return moved
+
+
 MAX_NAME_LENGTH = 4096
 
 

@@ -15,7 +15,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from warpgs.errors import DataError, UsageError, similar_folder
-from warpgs.geometry import camera_extent, matmul
+from warpgs.geometry import FAR_OFF, camera_extent, matmul, near_cameras
 from warpgs.io.folder import (
     Probe,
     Reader,
@@ -39,9 +39,21 @@ MAX_COORDINATE = 1e12
 """Largest coordinate of a camera centre [file units] and of a point [u]; a file with a larger one is rejected."""
 
 
+def far_off_note(views: list[View], points: PointCloud | None) -> list[str]:
+    """Return a note that names the cameras far off the rest, if there are any."""
+    near = near_cameras(np.array([v.camera.center for v in views]), None if points is None else points.points)
+    names = [v.name for v, n in zip(views, near) if not n]
+    some = f"{', '.join(names[:5])}{' ...' if len(names) > 5 else ''}"
+    return [
+        f"{len(names)} of {len(views)} cameras are far off the rest ({FAR_OFF:g} times the median distance) and do not set the "
+        f"scale: {some}. Their poses may be wrong: estimate them again, or remove these images"
+    ] * bool(names)
+
+
 def normalization_of(views: list[View], points: PointCloud | None, where: str) -> Normalization:
     """Return the similarity that puts the mean camera centre at the origin and the farthest camera at a distance of 1 / 1.1.
 
+    Cameras far off the rest are ignored (`near_cameras`): otherwise, one wrong pose would put the scene before the near plane.
     If all cameras are in one place, points set the scale: the median of their largest offsets along an axis becomes 1. Without
     points the scale is unchanged.
     """
@@ -53,6 +65,7 @@ def normalization_of(views: list[View], points: PointCloud | None, where: str) -
             f"{where}, image {views[worst].name!r}: its camera centre {centers[worst].tolist()} is beyond "
             f"{MAX_COORDINATE:.0e} units, so the scene cannot be scaled; estimate its pose again, or remove the image"
         )
+    centers = centers[near_cameras(centers, None if points is None else points.points)]
     offset = centers.mean(0)
     extent = 1.1 * float(np.linalg.norm(centers - offset, axis=1).max())
     if extent < MIN_EXTENT:
@@ -537,6 +550,10 @@ def _finished(root: Path, reader: Reader, scene: Scene, notes: list[str], option
         more = (*more, note) if note else more
     more = (*more, *check_found(views, options))
     n: Normalization = normalization_of(views, points, str(root))
+    more = (*more, *far_off_note(views, points))
+    if n.origin.any():
+        at = ", ".join(f"{v:.12g}" for v in n.origin)
+        more = (*more, f"map coordinates: files of Gaussians, meshes and cameras are relative to {at}, which they state")
     views = [normalize_view(v, n) for v in sorted(views, key=lambda v: v.name)]
     if points is not None:
         points = normalize_points(points, n, str(root))

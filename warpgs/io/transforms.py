@@ -20,6 +20,7 @@ from warpgs.io.folder import (
     Reader,
     SceneFolder,
     ViewList,
+    about,
     from_camera_to_world,
     missing_note,
     register,
@@ -29,7 +30,7 @@ from warpgs.io.folder import (
 from warpgs.io.images import BLACK, SUFFIXES, Lens, ReadOptions
 from warpgs.io.maps import SUFFIXES as MAPS
 from warpgs.io.maps import NamedMaps
-from warpgs.scene import Camera, PointCloud, Scene, View
+from warpgs.scene import ORIGIN, Camera, PointCloud, Scene, View, checked_origin
 from warpgs.schema import SchemaError, check_depth, check_parts
 
 BLENDER_FILES = tuple(f"transforms_{split}.json" for split in ("train", "val", "test"))
@@ -148,6 +149,11 @@ def matrix_of(frame: dict, where: str) -> np.ndarray:
     return matrix
 
 
+def _origin(values: dict, where: str) -> np.ndarray:
+    """Return the origin [3] that a file of ours states, 0 without one."""
+    return checked_origin(values.get(ORIGIN, (0, 0, 0)), where)
+
+
 def _image_path(scene: SceneFolder, folder: Path, name: object, where: str) -> Path:
     """Return the image file of a frame; Blender's file names have no suffix."""
     path = scene.child(folder, name, where, root=scene.root)
@@ -248,6 +254,7 @@ class TransformsReader(Reader):
         for file in files_of(folder):
             shared = read_json(scene.inside(file))
             total += len(shared["frames"])
+            origin = _origin(shared, str(file))
             for number, frame in enumerate(shared["frames"]):
                 where = f"{file}, frame {number}"
                 if not isinstance(frame, dict):
@@ -260,7 +267,7 @@ class TransformsReader(Reader):
                     continue
                 name = views.claim(view_name_of(path, folder), where)
                 where = f"{where} ({name})"
-                viewmat = from_camera_to_world(matrix_of(frame, where), where, opengl=True)
+                viewmat = about(from_camera_to_world(matrix_of(frame, where), where, opengl=True), origin)
                 if frame.get("mask_path"):
                     mask = scene.mask(scene.child(file.parent, frame["mask_path"], f"{where}, mask", root=folder))
                 else:
@@ -309,6 +316,16 @@ def read_cameras(path: Path) -> tuple[dict[str, Camera], list[str]]:
     return found, [f"the lens distortion of {bent} of {len(found)} cameras is not rendered"] if bent else []
 
 
+def stated_origin(path: Path) -> np.ndarray:
+    """Return the origin [3] that a file or a COLMAP folder of cameras states, 0 without one."""
+    if path.is_dir():
+        model, kind, _ = colmap_folder(path) or (path, "", [])
+        return colmap.origin_stated(model / f"images.{kind}")
+    values = _json(path, "check the path, or write the file again")
+    first = values[0] if isinstance(values, list) and values else values
+    return _origin(first if isinstance(first, dict) else {}, str(path))
+
+
 def _inria(path: Path, rows: list[Any]) -> Iterator[Row]:
     """Yield the cameras of rows with a camera-to-world rotation in OpenCV axes and the camera centre."""
     for i, row in enumerate(rows):
@@ -320,15 +337,16 @@ def _inria(path: Path, rows: list[Any]) -> Iterator[Row]:
             width, height, fx, fy = (float(row[key]) for key in ("width", "height", "fx", "fy"))
             K = np.array([[fx, 0, width / 2], [0, fy, height / 2], [0, 0, 1]])
             lens = Lens(K, int(width), int(height))
-            name = str(row.get("img_name", i))
+            name, origin = str(row.get("img_name", i)), _origin(row, where)
         except (KeyError, TypeError, ValueError, OverflowError, AttributeError) as e:
             raise DataError(f"{where}: needs rotation, position, width, height, fx and fy as numbers; correct the entry") from e
-        yield name, from_camera_to_world(pose, where, opengl=False), lens.checked(where)
+        yield name, about(from_camera_to_world(pose, where, opengl=False), origin), lens.checked(where)
 
 
 def _transforms(path: Path) -> Iterator[Row]:
     """Yield the cameras of frames; the file must give its image size."""
     shared = read_json(path)
+    origin = _origin(shared, str(path))
     for i, frame in enumerate(shared["frames"]):
         where = f"{path}, frame {i}"
         if not isinstance(frame, dict):
@@ -336,7 +354,8 @@ def _transforms(path: Path) -> Iterator[Row]:
         if any(frame.get(key, shared.get(key)) is None for key in ("w", "h")):
             raise DataError(f"{where}: gives no w and h, so the image size is unknown. Add them, or give the scene's folder")
         lens = lens_of(frame, shared, 0, 0, where)
-        yield str(frame.get("file_path", i)), from_camera_to_world(matrix_of(frame, where), where, opengl=True), lens
+        viewmat = from_camera_to_world(matrix_of(frame, where), where, opengl=True)
+        yield str(frame.get("file_path", i)), about(viewmat, origin), lens
 
 
 def colmap_folder(folder: Path) -> tuple[Path, str, list[str]] | None:

@@ -243,10 +243,11 @@ def export_html(folder: Path, target: Path, filters: Filters = NO_FILTERS) -> li
     """Write a run as one HTML file that starts at the middle training camera; returns lines for the user."""
     require_viser()
     run = open_run(folder, "cpu")
-    gaussians, rotation, lines = filtered(file_gaussians(run), run, filters, cleaned=True)
+    gaussians, rotation, lines = filtered(file_gaussians(run), run, filters, True, run.normalization.origin)
     if not len(gaussians):
         raise DataError(f"{target}: not written, no Gaussian is left. Give a larger box, or --no-clean")
-    cameras, found = [run.cameras("file")[n] for n in run.train], run.normalization
+    found = run.normalization.local
+    cameras = [convert_camera(run.scene_cameras[n], found, "scene", "file") for n in run.train]
     if rotation is not None:
         cameras = [rotate_camera(c, rotation) for c in cameras]
     gaussians = convert_gaussians(gaussians, found, "file", "scene")

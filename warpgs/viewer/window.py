@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from warpgs.errors import DataError, WarpgsError
-from warpgs.export.base import read_with_antialiasing
+from warpgs.export.base import format_of, read_with_antialiasing
 from warpgs.files import read_file, readable, remove_leftovers, write_json
 from warpgs.geometry import camera_extent, convert_camera, convert_gaussians, matmul, rotation_matrices
 from warpgs.io.image_files import decode
@@ -24,6 +24,7 @@ from warpgs.pipeline.metrics.coverage import DepthView, classes_of, coverage_map
 from warpgs.pipeline.model.table import FittedModel
 from warpgs.pipeline.run.commands import RULE, scene_of
 from warpgs.pipeline.run.folder import TENSORS, StoredRun, load_checkpoint, open_run
+from warpgs.pipeline.train.settings import FitConfig
 from warpgs.pipeline.train.strategies.sampling import FINE
 from warpgs.process import say
 from warpgs.render.options import RasterizeOptions
@@ -101,8 +102,9 @@ def content_of_file(path: Path, device: str = "cpu") -> Content:
     low, high = np.percentile(means, [5, 95], axis=0)
     normalization = Normalization((low + high) / 2, 1 / max(0.5 * float(np.linalg.norm(high - low)), 1e-12))
     gaussians = convert_gaussians(stored, normalization, "file", "scene")
-    gaussians = dataclasses.replace(gaussians, **{n: t.to(device) for n, t in gaussians.tensors().items()})
-    model = FittedModel(gaussians, normalization, {}, (), (), RULE, (0.0, 0.0, 0.0), 0, antialiased=antialiased)
+    gaussians = dataclasses.replace(gaussians, **{n: t.float().to(device) for n, t in gaussians.tensors().items()})
+    rule = FitConfig.rule if format_of(path).is_own(path) else RULE
+    model = FittedModel(gaussians, normalization, {}, (), (), rule, (0.0, 0.0, 0.0), 0, antialiased=antialiased)
     return Content(path.name, model, path.with_suffix(""))
 
 

@@ -71,10 +71,22 @@ def fault_of(image: np.ndarray, alpha: np.ndarray, coverage: float, outside: flo
     return ARE_OUTSIDE if outside > OUTSIDE else ""
 
 
-def fault_notes(faults: list[str], remedy: str, nearer: str) -> list[str]:
+def cut_advice(model: FittedModel, cameras: Sequence[Camera]) -> str:
+    """Return advice where the near plane cuts most of the Gaussians in front of the cameras off; else an empty text."""
+    means, near = model.gaussians().means.double().cpu().numpy(), model.options().cut_offs().near
+    depths = np.concatenate([means @ np.asarray(c.viewmat, np.float64)[2, :3] + float(c.viewmat[2, 3]) for c in cameras])
+    depths = depths[depths > 0]
+    share = float((depths < near).mean()) if len(depths) else 0.0
+    return (
+        f"{share:.0%} of the Gaussians in front of the cameras are nearer than the near plane, {near:g} units; "
+        f"lower it, such as with --near {np.median(depths) / 100:.1g}"
+    ) * (share > 0.5)
+
+
+def fault_notes(faults: list[str], remedy: str, nearer: str, cut: str = "") -> list[str]:
     """Return a line for the user on each fault, with advice: ``nearer`` for frames outside photographs, else ``remedy``."""
     advice = {
-        NEARLY_NOTHING: f"the path leaves the captured area; {remedy}",
+        NEARLY_NOTHING: cut or f"the path leaves the captured area; {remedy}",
         ARE_BLACK: f"the camera is inside geometry, or the scene is unlit; {remedy}",
         ARE_OUTSIDE: f"expect artefacts there; {nearer}",
     }
@@ -343,7 +355,8 @@ def render_film(
             collections.deque(images(), maxlen=0)
         if sheet:
             write_bytes(sheet_path(out), png(frame_sheet(chosen)))
-    notes = [*notes, *plan.notes, *fault_notes(faults, plan.remedy, plan.nearer)]
+    cut = cut_advice(model, [c for _, c in plan.cameras]) if NEARLY_NOTHING in faults else ""
+    notes = [*notes, *plan.notes, *fault_notes(faults, plan.remedy, plan.nearer, cut)]
     notes += [f"{len(older)} older images are also in {folder}: remove them, or give a new folder"] if older else []
     return [*files, film] if one_size else files, notes
 

@@ -133,9 +133,10 @@ def scene_radius(cameras: list[Camera], cloud: PointCloud) -> float:
     `scene_extent` differs: it is the size of the camera set, unless all cameras coincide. The photographed scene may be much
     larger or smaller.
     """
-    center = np.mean([c.center for c in cameras], axis=0)
+    centers = np.array([c.center for c in cameras])
+    center = centers[geometry.near_cameras(centers, cloud.points)].mean(0)
     reach = float(np.quantile(np.linalg.norm(cloud.points - center, axis=1), WITHIN)) if len(cloud) else 0.0
-    return max(reach, geometry.camera_extent(cameras), 1e-6)
+    return max(reach, geometry.camera_extent(cameras, cloud.points), 1e-6)
 
 
 def shape_figures(

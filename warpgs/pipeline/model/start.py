@@ -329,7 +329,7 @@ def subsample(start: Start, most: int, generator: np.random.Generator) -> Start:
 
 def scene_extent(cameras: list[Camera], cloud: PointCloud) -> float:
     """Return the size of the scene [u]: the extent of the cameras, or a tenth of the cloud's spread if all cameras coincide."""
-    extent = geometry.camera_extent(cameras)
+    extent = geometry.camera_extent(cameras, cloud.points)
     spread = float(np.linalg.norm(np.std(cloud.points, axis=0)))
     return max(extent, 0.1 * spread if extent < 1e-3 * spread else 0.0, 1e-6)
 

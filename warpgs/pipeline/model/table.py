@@ -327,7 +327,10 @@ class Model:
     """Similarity from file to scene units."""
 
     def gaussians(self, units: str = "scene") -> Gaussians:
-        """Return the Gaussians in ``scene`` units, those of a `Scene`, or in ``file`` units, those of the scene's files."""
+        """Return the Gaussians in ``scene`` units, those of a `Scene`, or in ``file`` units, those of the scene's files.
+
+        Map coordinates in file units are float64.
+        """
         return convert_gaussians(self.scene_gaussians, self.normalization, "scene", units)
 
 
@@ -351,6 +354,8 @@ class FittedModel(Model):
     """True if the scene's images have an alpha channel, so that renders are transparent."""
     antialiased: bool = field(default=False, kw_only=True)
     """True if renders are antialiased (`RasterizeOptions.antialiased`)."""
+    near: float | None = field(default=None, kw_only=True)
+    """Nearest depth rendered [u] (`RasterizeOptions.near`); None for that of the rule."""
 
     def __repr__(self) -> str:
         """Describe the model in one line."""
@@ -364,7 +369,7 @@ class FittedModel(Model):
     def options(self) -> RasterizeOptions:
         """Return the rasterizer's options of the fit: rule, background and antialiasing."""
         background = self.scene_gaussians.means.new_tensor(self.background)
-        return RasterizeOptions(rule=self.rule, background=background, antialiased=self.antialiased)
+        return RasterizeOptions(rule=self.rule, background=background, antialiased=self.antialiased, near=self.near)
 
 
 def save(path: str | Path, gaussians: Gaussians, normalization: Normalization | None = None, units: str = "scene") -> None:

@@ -21,7 +21,7 @@ from warpgs.errors import DataError, UsageError, WarpgsError
 from warpgs.export.base import format_of, read_with_antialiasing
 from warpgs.export.ply import write_ply
 from warpgs.files import filling, write_bytes, write_json, writing_into
-from warpgs.geometry import convert_camera, rotation_matrices
+from warpgs.geometry import camera_extent, convert_camera, rotation_matrices
 from warpgs.io.image_files import MAX_PIXELS
 from warpgs.io.load import Split, load_scene
 from warpgs.io.transforms import colmap_folder, read_cameras
@@ -49,6 +49,7 @@ from warpgs.pipeline.run.folder import CONFIG, IMAGE_FOLDERS, StoredRun, camera_
 from warpgs.pipeline.run.request import NO_SCORES, SceneRequest, choose_device, read_scene
 from warpgs.pipeline.run.results import evaluate_run, protocol_of, score_line
 from warpgs.pipeline.train.schedule import color_of, over_background
+from warpgs.pipeline.train.settings import FitConfig
 from warpgs.pipeline.train.trainer import train_views
 from warpgs.pipeline.train.views import TrainingView
 from warpgs.priors.views import PriorConfig, view_priors
@@ -69,8 +70,12 @@ def open_file(
     rule: str | None = None,
     device: str = "auto",
     antialiased: bool = False,
+    near: float | None = None,
 ) -> tuple[FittedModel, list[str]]:
-    """Read a file of Gaussians, and cameras from a file or a scene folder; ``rule`` None is inria. Returns model and notes."""
+    """Read a file of Gaussians, and cameras from a file or a scene folder; returns model and notes.
+
+    ``rule`` None is exact for files that name warpgs, else inria; ``near`` [file units] None is that of the rule.
+    """
     if cameras is None:
         raise UsageError(
             f"{path}: a file of Gaussians has no cameras; give --cameras cameras.json, transforms.json, or a scene"
@@ -83,20 +88,25 @@ def open_file(
             raise DataError(
                 f"{cameras}, {name}: an image of {c.width} x {c.height} px has over {MAX_PIXELS:,} pixels; give a smaller size"
             )
-    # the unit stays that of the file, since the near plane of a rule is in that unit
-    normalization = Normalization(np.mean([c.center for c in found.values()], axis=0))
+    # the unit stays that of the file, since the near plane of a rule is in that unit; our fits have that of `load_scene`
+    own = rule is None and format_of(path).is_own(path)
+    extent = camera_extent(list(found.values())) if own else 0.0
+    normalization = Normalization(np.mean([c.center for c in found.values()], axis=0), 1 / extent if extent > 0 else 1.0)
     gaussians, declared, lost = read_with_antialiasing(path, normalization, "scene")
     notes += lost
     if note := format_of(path).note:
         notes.append(note)
     if declared:
         notes.append(f"{path.name} declares an antialiased model; renders use a pixel filter of {LOW_PASS:g} px²")
-    if rule is None:
+    if own:
+        notes.append(f"rendered with the cut-offs of {FitConfig.rule}, as warpgs fits; --rule chooses others")
+    elif rule is None:
         notes.append(f"rendered with the cut-offs of {RULE}; for models of gsplat, give --rule gsplat-1.6 or gsplat-1.5")
     notes.append(f"{len(gaussians):,} Gaussians, {len(found)} cameras")
     in_scene = {name: convert_camera(c, normalization, "file", "scene") for name, c in found.items()}
-    shown = (in_scene, tuple(in_scene), (), rule or RULE, (0.0, 0.0, 0.0), 0)
-    return FittedModel(gaussians.to(where), normalization, *shown, antialiased=antialiased or declared), notes
+    shown = (in_scene, tuple(in_scene), (), rule or (FitConfig.rule if own else RULE), (0.0, 0.0, 0.0), 0)
+    cut = None if near is None else near * normalization.scale
+    return FittedModel(gaussians.to(where), normalization, *shown, antialiased=antialiased or declared, near=cut), notes
 
 
 def _cameras_of(path: Path) -> tuple[dict[str, Camera], list[str]]:
@@ -166,7 +176,7 @@ def render(
     folder: Path, path: str, out: Path | None, settings: FilmSettings, device_name: str, *,
     background: str = "auto", coverage: bool = False, sheet: bool = False,
     file_of: tuple[Path | None, str | None] | None = None,
-    antialiased: bool = False,
+    antialiased: bool = False, near: float | None = None,
 ) -> list[str]:  # fmt: skip
     """Render a run, or a file of Gaussians with ``file_of`` (cameras, rule), to images and a film; returns lines."""
     color = color_of(background)
@@ -179,7 +189,7 @@ def render(
         stored = open_run(folder, device_name)
         notes = stored.notes()
     else:
-        stored, notes = open_file(folder, *file_of, device_name, antialiased)
+        stored, notes = open_file(folder, *file_of, device_name, antialiased, near)
         notes += ["the background is black; choose another colour with --background"] if color is None else []
     tell = Stages()
     settings = replace(settings, background=color)

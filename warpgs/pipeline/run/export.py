@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 import shlex
 from collections.abc import Callable, Mapping, Sequence
@@ -13,10 +14,10 @@ import torch
 
 from warpgs.device import format_bytes
 from warpgs.errors import DataError, UsageError
-from warpgs.export.base import Format, find_format, format_of, read_with_antialiasing, write_gaussians
+from warpgs.export.base import Format, find_format, format_of, origin_of, write_gaussians
 from warpgs.export.meshes_and_cameras import check_suffix, holds_cameras, write_cameras, write_mesh
-from warpgs.geometry import convert_gaussians, convert_mesh, matmul, rotate
-from warpgs.io.transforms import read_cameras
+from warpgs.geometry import convert_camera, convert_gaussians, convert_mesh, matmul, rotate
+from warpgs.io.transforms import read_cameras, stated_origin
 from warpgs.kernels.neighbours import morton_codes
 from warpgs.locks import hold_file
 from warpgs.mesh.fuse import GridPlan, MeshOptions, fuse
@@ -34,7 +35,7 @@ from warpgs.pipeline.model.edit import (
 )
 from warpgs.pipeline.run.folder import CONFIG, StoredRun, open_run
 from warpgs.pipeline.run.request import choose_device
-from warpgs.scene import Camera, Gaussians, base_colors
+from warpgs.scene import Camera, Gaussians, Normalization, base_colors
 
 
 @dataclass(frozen=True)
@@ -57,13 +58,14 @@ NO_FILTERS = Filters()
 
 
 def filtered(
-    gaussians: Gaussians, stored: StoredRun | None, filters: Filters, cleaned: bool
+    gaussians: Gaussians, stored: StoredRun | None, filters: Filters, cleaned: bool, origin: np.ndarray
 ) -> tuple[Gaussians, np.ndarray | None, list[str]]:
-    """Filter Gaussians in file units; returns them with the rotation, if any, and lines for the user."""
+    """Filter Gaussians in file units about an origin [3]; returns them with the rotation, if any, and lines for the user."""
     rotation = rotation_of(filters.rotate, None if stored is None else training_cameras(stored))
     keep, lines = torch.ones(len(gaussians), dtype=torch.bool, device="cpu"), []
     if filters.crop is not None:
-        keep = inside(gaussians, box_of(filters.crop))
+        center, *rest = box_of(filters.crop)
+        keep = inside(gaussians, (center - origin, *rest))
         lines.append(f"{int((~keep).sum()):,} Gaussians outside the box are left out")
     if cleaned if filters.clean is None else filters.clean:
         maxima = None
@@ -90,8 +92,17 @@ def filtered(
 
 
 def file_gaussians(stored: StoredRun) -> Gaussians:
-    """Return the Gaussians of a run in file units, without harmonics that are all zero."""
-    return convert_gaussians(drop_unused_sh(stored.gaussians()), stored.normalization, "scene", "file")
+    """Return the Gaussians of a run in file units about its origin, without harmonics that are all zero."""
+    return convert_gaussians(drop_unused_sh(stored.gaussians()), stored.normalization.local, "scene", "file")
+
+
+def origin_line(origin: np.ndarray) -> list[str]:
+    """Return a line for the user on the origin [3] of a file, if it is not 0."""
+    at = ", ".join(f"{v:.12g}" for v in origin)
+    return [
+        f"coordinates in the file are relative to {at}, because float32 is too coarse for map coordinates; the file states "
+        "this point. Other programs need cameras relative to it, too: `warpgs export RUN --to transforms.json`"
+    ] * bool(origin.any())
 
 
 def training_cameras(stored: StoredRun) -> list[Camera]:
@@ -142,7 +153,10 @@ def convert(
     if holds_cameras(target):
         _check_for_cameras(filters, formats)
         found, notes = read_cameras(source)
-        return [*notes, *_cameras_written(found, list(found.values()), target, filters)]
+        origin = stated_origin(source)
+        if not origin.any():
+            origin = origin_of(np.array([c.center for c in found.values()]))
+        return [*notes, *_cameras_written(found, list(found.values()), target, filters, origin)]
     given = [find_format(f) for f in formats]
     for unused in (f for f in given if not (f.fits(source) or f.fits(target))):
         format_of(target, unused)  # says that its name is another
@@ -152,8 +166,9 @@ def convert(
         )
     read, kind = (format_of(p, next((f for f in given if f.fits(p)), None)) for p in (source, target))
     rotation_of(filters.rotate, None)  # before anything is read
-    gaussians, antialiased, notes = read_with_antialiasing(source, None, "file", read)
-    lines = [*notes, *_written(gaussians, None, target, kind, filters, antialiased)]
+    read = copy.copy(read)
+    gaussians, antialiased = read.read_stored(source), read.is_antialiased(source)
+    lines = [*read.notes, *_written(gaussians, None, target, kind, filters, antialiased, read.origin)]
     return [read.note, *lines] if read.note and not kind.note else lines
 
 
@@ -166,19 +181,23 @@ def export(
         _check_for_cameras(filters, () if format is None else (format,))
         stored = open_run(folder, torch.device("cpu"))
         level = training_cameras(stored)
-        return _cameras_written(stored.cameras("file"), level, target, filters, keep_names, file_gaussians(stored))
+        origin, models = stored.normalization.origin, file_gaussians(stored)
+        return _cameras_written(stored.cameras("file"), level, target, filters, origin, keep_names, models)
     if keep_names:
         raise UsageError(f"{target}: --keep-names requires cameras; name the file cameras.json, transforms.json or sparse")
     kind = format_of(target, format)
     stored = open_run(folder, torch.device("cpu"))
-    return _written(file_gaussians(stored), stored, target, kind, filters, stored.antialiased)
+    origin = stored.normalization.origin
+    return _written(file_gaussians(stored), stored, target, kind, filters, stored.antialiased, origin)
 
 
 def _written(
-    gaussians: Gaussians, stored: StoredRun | None, target: Path, kind: Format, filters: Filters, antialiased: bool
-) -> list[str]:
-    """Filter Gaussians in file units, and write them; returns lines for the user."""
-    gaussians, _, lines = filtered(gaussians, stored, filters, kind.cleaned)
+    gaussians: Gaussians, stored: StoredRun | None, target: Path, kind: Format, filters: Filters, antialiased: bool,
+    origin: np.ndarray | None,
+) -> list[str]:  # fmt: skip
+    """Filter Gaussians in file units about an origin [3], and write them; returns lines for the user."""
+    origin = np.zeros(3) if origin is None else origin
+    gaussians, _, lines = filtered(gaussians, stored, filters, kind.cleaned, origin)
     if not len(gaussians):
         raise DataError(f"{target}: not written, because no Gaussian is left; give a larger --crop, or --no-clean")
     if kind.max_degree < gaussians.sh_degree:
@@ -195,17 +214,19 @@ def _written(
         )
     if kind.sorted:
         gaussians = select(gaussians, torch.argsort(morton_codes(gaussians.means), stable=True))
+    kind = copy.copy(kind)
+    kind.origin = origin
     with hold_file(target) as notes:
         write_gaussians(target, gaussians, units="file", format=kind, antialiased=antialiased)
     if type(kind).decode is not Format.decode:  # the rounding errors, measured on the file
-        back, *_ = read_with_antialiasing(target, None, "file", kind)
+        back = kind.read_stored(target)
         moved = float((back.means.double() - gaussians.means.double()).abs().max())
         scales = (back.log_scales.double() - gaussians.log_scales.double()).abs().amax(1)
         other = int((scales > 0.1).sum())
         if moved or not float(scales.max()) < ROUNDING:
             more = f"; axis lengths of {other:,} Gaussians change by more than 10 %" if other else ""
             lines.append(f"the format rounds positions, by at most {moved:.2g} units of the scene's files{more}")
-    lines += [kind.note] if kind.note else []
+    lines += ([kind.note] if kind.note else []) + origin_line(origin)
     return [*notes, *lines, f"{len(gaussians):,} Gaussians in {target}, {format_bytes(target.stat().st_size)}"]
 
 
@@ -218,14 +239,16 @@ def _check_for_cameras(filters: Filters, formats: Sequence[object]) -> None:
 
 
 def _cameras_written(
-    named: Mapping[str, Camera], level: list[Camera], target: Path, filters: Filters, keep_names: bool = False,
-    gaussians: Gaussians | None = None,
+    named: Mapping[str, Camera], level: list[Camera], target: Path, filters: Filters, origin: np.ndarray,
+    keep_names: bool = False, gaussians: Gaussians | None = None,
 ) -> list[str]:  # fmt: skip
-    """Rotate cameras in file units, and write them; ``level`` are the cameras that define up. Returns lines for the user.
+    """Rotate cameras about an origin in file units, and write them; ``level`` are those that define up. Returns lines.
 
     The most opaque of the Gaussians become COLMAP's points.
     """
     rotation, lines, points, cameras = rotation_of(filters.rotate, level), [], None, list(named.values())
+    if origin.any():
+        cameras = [convert_camera(c, Normalization(origin), "file", "scene") for c in cameras]
     if rotation is not None:
         cameras = [rotate_camera(c, rotation) for c in cameras]
         lines.append(turned_line(rotation))
@@ -237,7 +260,8 @@ def _cameras_written(
             f"points3D.txt has the positions and colours of {len(shown):,} Gaussians, for trainers that start from points"
         )
     with hold_file(target) as notes:
-        lines += write_cameras(target, cameras, list(named) if keep_names else None, points)
+        lines += write_cameras(target, cameras, list(named) if keep_names else None, points, origin)
+    lines += origin_line(origin)
     sizes = sorted({(c.width, c.height) for c in cameras})
     some = ", ".join(f"{w} x {h}" for w, h in sizes[:3]) + (" ..." if len(sizes) > 3 else "")
     return [
@@ -270,8 +294,8 @@ def mesh(
 
     with hold_file(target) as notes:
         found = fuse(run.scene_gaussians, cameras, run.options(), options, stage=stage, planned=planned)
-        made, up = convert_mesh(found.mesh, run.normalization, "scene", "file"), common_up(cameras)
-        write_mesh(target, made, up)
+        made, up = convert_mesh(found.mesh, run.normalization.local, "scene", "file"), common_up(cameras)
+        write_mesh(target, made, up, run.normalization.origin)
     lines = [
         f"{found.extracted:,} triangles extracted, {found.removed:,} small parts removed; the mesh has "
         f"{len(made.faces):,} triangles and {len(made.vertices):,} vertices",
@@ -282,4 +306,5 @@ def mesh(
         lines.append(f"{found.uncolored:,} vertices without an observed colour take the colour of the nearest coloured vertex")
     if up is None and target.suffix.lower() == ".glb":
         notes = [*notes, "the cameras have no common upward direction, so the mesh may be tilted in a viewer"]
+    lines += origin_line(run.normalization.origin)
     return [*run.notes(), *notes, *lines, f"{target}: {format_bytes(target.stat().st_size)}"]
