@@ -15,7 +15,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from warpgs.constants import POSE_TOLERANCE
-from warpgs.errors import DataError, UsageError
+from warpgs.errors import DataError, UsageError, shortened
 from warpgs.files import inside, is_within
 from warpgs.geometry import matmul, nearest_rotation, rotation_matrices
 from warpgs.io.image_files import MAX_PIXELS, decode, unread_note
@@ -80,7 +80,7 @@ class Reader(abc.ABC):
 
     def scene(self, folder: Path, views: list[View], notes: list[str], **fields: Any) -> Scene:
         """Return a `Scene` of this format; ``fields`` are further fields (points, background, pixels)."""
-        return Scene(str(folder), self.name, tuple(views), notes=tuple(notes), **fields)
+        return Scene(str(folder), self.name, tuple(views), notes=tuple(map(shortened, notes)), **fields)
 
 
 READERS: Registry[Reader] = Registry("reader", Reader, __package__)  # type: ignore[type-abstract]
