@@ -282,7 +282,7 @@ def test_rates_rise_where_the_time_of_a_cpu_limits_many_views():
     rates, notes = chosen(10, "cpu")
     assert rates == (4e-4, 6.25e-3)
     assert chosen(10, "cpu", means_lr=1e-3, sh_lr=2e-3)[0] == (1e-3, 2e-3)
-    assert "--no-cpu-limit takes all, about 11 min, and raises PSNR by at least 0.5 dB" in notes[-1]
+    assert "--no-cpu-limit takes all, about 11 min, and raised PSNR by 0.3 to 1.6 dB" in notes[-1]
 
 
 def test_one_layer_has_fewer_steps_in_the_time_of_a_cpu():
