@@ -324,7 +324,9 @@ class ColmapReader(Reader):
         if not points_path.is_file():
             notes.append(f"{points_path.name} is missing, so there are no points to start from")
         else:
-            points = read_points(scene.inside(points_path), {n: view_name(p[0]) for n, p in poses.items()})
+            there = {v.name for v in views.views}  # without those that are left out
+            names = {n: view_name(p[0]) for n, p in poses.items() if view_name(p[0]) in there}
+            points = read_points(scene.inside(points_path), names)
             if len(points) == 0:
                 notes.append(f"{points_path.name} holds no points")
         return self.scene(folder, views.views, notes, points=points, pixels=scene.pixel_source(by_folder=True))
