@@ -384,7 +384,7 @@ def load_image(
         image, alpha = turn_upright(image, orientation), None if alpha is None else turn_upright(alpha, orientation)
     height, width = image.shape[:2]
     K = np.diag([width / lens.width, height / lens.height, 1.0]) @ lens.K
-    done = () if orientation == 1 else ("rotated by the EXIF orientation",)
+    done: tuple[str, ...] = () if orientation == 1 else ("rotated by the EXIF orientation",)
     if not 0.99 < (ratio := lens.width / width) < 1.01:
         done += (f"of {1 / ratio:.3g} times the size of their camera: the intrinsics are scaled to the image",)
     if mask is not None:
