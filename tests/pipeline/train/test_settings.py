@@ -96,6 +96,7 @@ def test_a_file_has_settings_of_the_strategy_and_of_loss_terms(tmp_path):
         ('loss-terms = "json:JSONDecoder"', "does not load your code"),
         ('base = "json:dumps"', "is code; a preset file never loads code"),
         ('base = "../a.toml"', "is outside the folder of the file"),
+        ("init.random-count = 99999999", "init.random-count must be in [1, 1e+07]"),
         ("base = 3", "base must be text, not 3"),
         ('base = "my.toml"', "is circular"),
         ('preset = "quick"', "unknown setting 'preset'"),
