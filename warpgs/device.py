@@ -183,6 +183,19 @@ def no_memory_message(error: BaseException, purpose: str = "", *, fitting: bool 
     return f"out of memory{purpose} ({reason[:200]}). {remedy}"
 
 
+LIMITS = {
+    "failed to map segment": "a library cannot be loaded: raise the limit of memory (`ulimit -v`), end other programs, or "
+    "install warpgs on a disk that is not mounted noexec",
+    "can't start new thread": "too many threads: end other programs, or raise the limit of processes (`ulimit -u`)",
+}
+"""Remedies for limits of the system, by a part of the error."""
+
+
+def exhausted_limit(error: BaseException) -> str:
+    """Return the message for a limit of the system that an error reports; empty for other errors."""
+    return next((f"{remedy} ({str(error)[:200]})" for part, remedy in LIMITS.items() if part in str(error)), "")
+
+
 @functools.cache
 def installed_bytes(device: torch.device) -> int:
     """Return the memory of a device [bytes], on a CPU at most the limit of the container; queried once."""

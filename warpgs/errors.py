@@ -13,6 +13,18 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TypeVar
 
+MOST_LETTERS = 4000
+"""Longest error or note: a text of an untrusted file that it quotes may be as long as the file."""
+Text = TypeVar("Text", bound=str)
+
+
+def shortened(text: Text) -> Text:
+    """Return an error or a note with the middle left out if it is too long; the fix, at its end, stays."""
+    if len(text) <= MOST_LETTERS:
+        return text
+    half = MOST_LETTERS // 2
+    return type(text)(f"{text[:half]} [{len(text) - 2 * half:,} letters left out] {text[-half:]}")
+
 
 class WarpgsError(Exception):
     """Base of every error shown to a user without a traceback.
@@ -22,6 +34,10 @@ class WarpgsError(Exception):
 
     exit_code = 5
     """Exit code of `warpgs` after this error."""
+
+    def __init__(self, message: object = "", *more: object):
+        """Take a message; a long one is `shortened`."""
+        super().__init__(shortened(message) if isinstance(message, str) else message, *more)
 
 
 class UsageError(WarpgsError):

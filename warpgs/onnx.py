@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -24,7 +25,9 @@ if TYPE_CHECKING:
 DOMAINS = ("", "ai.onnx", "ai.onnx.ml", "com.microsoft")
 """Operator sets that onnxruntime contains; any other needs a library of foreign code, or a function in the file."""
 MAX_NESTING = 32
-"""Largest depth of graphs within graphs (If, Loop, Scan) that is accepted."""
+"""Largest depth of graphs within graphs (If, Loop, Scan), and of functions that call functions, that is accepted."""
+MAX_NODES = 100_000
+"""Largest number of nodes once functions are inlined, which onnxruntime does while it loads a file."""
 
 PARTS: dict[str, dict[int, str]] = {
     "model": {7: "graph", 20: "training", 25: "function"},
@@ -102,8 +105,26 @@ def check_onnx(data: bytes, path: Path) -> None:
             raise ValueError("it has several graphs, or names no operator set" if graphs else "it has no graph")
         # exporters store compositions of standard operators as functions in the file
         functions = [_message(v) for n, v in model if n == MODEL_FUNCTION and isinstance(v, memoryview)]
-        own = {(_text(f, FUNCTION_DOMAIN), _text(f, FUNCTION_NAME)) for f in functions}
+        own: dict[tuple[str, str], list[Message]] = {}
+        for f in functions:
+            nodes = own.setdefault((_text(f, FUNCTION_DOMAIN), _text(f, FUNCTION_NAME)), [])
+            nodes += [part for kind, part in _walk("function", f) if kind == "node"]
+        sizes: dict[tuple[str, str], int] = {}
+
+        def size(part: Message, above: int = 0) -> int:
+            """Return the number of nodes of which a node consists once its function is inlined."""
+            operator = _text(part, NODE_DOMAIN), _text(part, NODE_TYPE)
+            if operator not in sizes:
+                if above > MAX_NESTING:
+                    raise ValueError(f"functions nested deeper than {MAX_NESTING}, or that call themselves")
+                sizes[operator] = sum(size(inner, above + 1) for inner in own[operator]) if operator in own else 1
+            return sizes[operator]
+
+        count = 0
         for kind, part in _walk("model", model):
+            count += size(part) if kind == "node" else 0
+            if count > MAX_NODES:
+                raise ValueError(f"more than {MAX_NODES:,} nodes once its functions are inlined")
             if kind == "tensor" and any(n == TENSOR_EXTERNAL or (n == TENSOR_LOCATION and v != 0) for n, v in part):
                 raise DataError(
                     f"{path}: the weights of {_text(part, TENSOR_NAME) or 'a constant'!r} are in another file, which is not "
@@ -120,7 +141,8 @@ def check_onnx(data: bytes, path: Path) -> None:
 
 
 PROVIDERS = {"cpu": "CPUExecutionProvider", "cuda": "CUDAExecutionProvider"}
-ERRORS_ONLY = 3
+SILENT = 4
+"""Severity of fatal errors alone: onnxruntime prints others raw, with the names in the file, before it raises them."""
 MAX_MODEL_BYTES = 2**31
 """Largest model [bytes]: the largest message of protobuf."""
 
@@ -155,7 +177,7 @@ def start_session(data: bytes, path: Path, provider: str, threads: int) -> Infer
     options = ort.SessionOptions()
     options.intra_op_num_threads = threads or usable_cores()
     options.inter_op_num_threads = 1
-    options.log_severity_level = ERRORS_ONLY
+    options.log_severity_level = SILENT
     options.use_deterministic_compute = True
     try:
         # without onnxruntime's own second try on the CPU, which it prints
@@ -200,9 +222,19 @@ class Model:
 
     def outputs_of(self, *images: np.ndarray, names: Sequence[str] | None = None) -> list[np.ndarray]:
         """Return the outputs for batches of images, one for each input."""
+        from onnxruntime import RunOptions
+
         feed = {name: np.ascontiguousarray(image) for (name, _, _), image in zip(self.inputs, images, strict=True)}
+        options = RunOptions()
         try:
-            return [np.asarray(output) for output in self.session.run(names, feed)]
+            # in a thread: the main thread can handle Ctrl-C and SIGTERM only while it runs Python, and a Loop may be endless
+            with ThreadPoolExecutor(1) as pool:
+                run = pool.submit(self.session.run, names, feed, options)
+                try:
+                    return [np.asarray(output) for output in run.result()]
+                except BaseException:
+                    options.terminate = True
+                    raise
         except Exception as e:  # onnxruntime's errors share no base but Exception
             shape = " x ".join(map(str, images[0].shape))
             raise DataError(

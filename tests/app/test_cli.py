@@ -355,6 +355,43 @@ def test_numbers_at_their_extremes(tmp_path, capsys, monkeypatch, command, flag)
     assert [p.name for p in tmp_path.iterdir()] == ["scene"]
 
 
+@pytest.mark.parametrize(
+    ("error", "words"),
+    [
+        (ImportError("libx.so: failed to map segment from shared object"), "a library cannot be loaded"),
+        (RuntimeError("can't start new thread"), "too many threads"),
+    ],
+)
+def test_limits_of_the_system_are_no_defects(error, words, capsys, monkeypatch):
+    def full(*_):
+        raise error
+
+    monkeypatch.setattr("warpgs.pipeline.run.export.export", full)
+    line = failure(capsys, 4, "export", "run", "--to", "x.ply")
+    assert words in line and "ulimit" in line and str(error) in line
+
+
+@pytest.mark.parametrize("program", [["-m", "warpgs"], ["-c", "import sys; from warpgs.app.cli import main; sys.exit(main())"]])
+def test_a_deleted_working_folder_is_named(program, tmp_path):
+    gone = tmp_path / "gone"
+    gone.mkdir()
+    line = 'rmdir "$PWD"; exec "$@"'
+    words = [sys.executable, "-P", *program, "fit", "scene", "--out", "run"]
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])}
+    done = subprocess.run(
+        ["sh", "-c", line, "sh", *words], cwd=gone, env=environment, capture_output=True, text=True, timeout=300, check=False
+    )
+    assert (done.returncode, done.stderr) == (2, "warpgs: the current folder was deleted; change to another one\n")
+
+
+@pytest.mark.parametrize("columns", ["3", "0", "200"])
+def test_help_of_a_narrow_terminal_ends(columns, monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", columns)
+    with pytest.raises(SystemExit) as end:
+        main(["render", "--help"])
+    assert not end.value.code and "--fps" in capsys.readouterr().out and os.environ["COLUMNS"] == columns
+
+
 def test_defects_are_called_defects(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("warpgs.pipeline.run.export.export", lambda *a: 1 / 0)
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))

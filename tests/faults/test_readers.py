@@ -120,7 +120,7 @@ READERS = {
     },
     "io/image_files.py": {"_raster": "any image", "read_image_file": "any image"},
     "io/others.py": {"_read_matrices": "dtu", "read_camera_rows": "middlebury"},
-    "io/maps.py": {"mapped_array": "given maps"},
+    "io/maps.py": {"mapped_array": "given maps", "array_numbers": "given maps"},
     "pipeline/farm/work.py": {"_scores": "scores", "write_thumbnail": "render of a job"},
     "pipeline/farm/job.py": {"_read": "list of jobs", "read_job_record": "record of a job"},
     "pipeline/films/paths.py": {"read_keyframes": "keyframes"},

@@ -305,9 +305,12 @@ def test_cutting_out_without_masks_is_said_and_words_are_checked(tmp_path):
 def test_masks_that_cannot_be_used(tmp_path):
     scenes.write_colmap(tmp_path)
     path = tmp_path / "masks" / "photo0.png"
-    scenes.save(path, np.zeros((12, 16), np.uint8))
-    with pytest.raises(DataError, match=r"photo0.png: its mask leaves no pixel.*--mask-keeps"):
+    for i in range(scenes.VIEWS):
+        scenes.save(path.with_name(f"photo{i}.png"), np.zeros((12, 16), np.uint8))
+    with pytest.raises(DataError, match=r"has 0 usable views \(.*masks that keep no pixel.*--mask-keeps.*photo0.png"):
         load_scene(tmp_path)
+    for i in range(1, scenes.VIEWS):
+        path.with_name(f"photo{i}.png").unlink()
     scenes.save(path, np.full((12, 30), 255, np.uint8))
     with pytest.raises(DataError, match=r"photo0.png: its mask is 30 x 12 px, the image 16 x 12"):
         load_scene(tmp_path)

@@ -4,6 +4,7 @@ import json
 import os
 import struct
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,6 +14,8 @@ from tests.io.scenes import refused
 from warpgs.errors import DataError
 from warpgs.io import colmap
 from warpgs.io.load import detect, load_scene
+from warpgs.io.transforms import TransformsReader
+from warpgs.process import Detail
 
 # Broken scenes end in a message that names the file, the reason and the remedy, never in a traceback.
 
@@ -205,6 +208,25 @@ def test_broken_text_files(name, content, message, tmp_path):
     scenes.write_colmap_txt(tmp_path)
     (tmp_path / "sparse" / name).write_bytes(content if isinstance(content, bytes) else content.encode())
     refused(tmp_path, message)
+
+
+@pytest.mark.parametrize("kind", ["colmap", "transforms"])
+def test_a_long_text_of_a_file_is_shortened(kind, tmp_path):
+    """In errors, which go into the files of a run or a farm; the file is still named."""
+    long = "x" * 1_000_000
+    if kind == "colmap":
+        patched_pose(tmp_path, _2=long)
+    else:
+        scenes.write_transforms(tmp_path, scenes.transforms_json(fl_x=long))
+    with pytest.raises(DataError) as raised:
+        load_scene(tmp_path)
+    text = str(raised.value)
+    assert text.startswith(str(tmp_path)) and "x [" in text and "letters left out] x" in text and len(text) < 4100
+
+
+def test_a_long_note_is_shortened():
+    notes = TransformsReader().scene(Path("a"), [], ["x" * 9000 + " end", Detail("y" * 9000)]).notes
+    assert len(notes[0]) < 4200 and notes[0].endswith("x end") and isinstance(notes[1], Detail) and len(notes[1]) < 4200
 
 
 def test_names_that_are_not_utf8(tmp_path):

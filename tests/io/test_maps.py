@@ -10,11 +10,13 @@ import pytest
 from tests.io import scenes
 from tests.io.scenes import refused
 from warpgs.errors import DataError, UsageError
+from warpgs.io import maps
 from warpgs.io.folder import image_ids
 from warpgs.io.images import LoadedImage, turn_upright
 from warpgs.io.load import load_scene
 from warpgs.io.maps import in_pixels_of, resized
 from warpgs.pipeline.metrics.scores import score
+from warpgs.process import run_python
 
 # Maps of depth and normals: found by the names of images, in their pixels and units; bad ones are refused with a
 # reason.
@@ -90,6 +92,45 @@ def test_confidence_lies_beside_the_map(tmp_path, raw, wanted):
         np.save(maps / "photo1.confidence.npy", values)
         with pytest.raises(DataError, match=f"photo1.confidence.npy.*{reason}"):
             load_scene(scene, depths=maps)
+
+
+SHORTER = """
+import os, sys
+from pathlib import Path
+import numpy as np
+from warpgs.errors import DataError
+from warpgs.io import maps, others
+load = np.load
+def cut(path, **named):
+    found = load(path, **named)
+    os.truncate(path, 4096)
+    return found
+np.load = cut
+try:
+    {"maps": maps.read_numbers, "others": others.read_poses_bounds}[sys.argv[1]](Path(sys.argv[2]))
+except DataError as e:
+    print(e)
+"""
+
+
+@pytest.mark.parametrize("room", ["maps", "others"])
+def test_an_array_that_gets_shorter_while_it_is_read_is_an_error(room, tmp_path):
+    """Where the file was mapped into memory, SIGBUS ended the process."""
+    path = tmp_path / "a.npy"
+    np.save(path, np.zeros((9000, 17)))
+    done = run_python(SHORTER, room, str(path), timeout=60)
+    assert done.returncode == 0 and f"{path}: cannot be read" in done.stdout and "shorter" in done.stdout, done.stderr
+
+
+@pytest.mark.parametrize(("order", "kind"), [("C", "<f4"), ("F", ">f8"), ("F", ">u2"), ("C", "u1")])
+def test_numbers_of_every_layout(order, kind, tmp_path, monkeypatch):
+    monkeypatch.setattr(maps, "PIECE", 64)
+    wanted = np.arange(7 * 9 * 3).reshape(1, 7, 9, 3).astype(kind)
+    np.save(tmp_path / "a.npy", np.asarray(wanted, order=order))
+    found = maps.read_numbers(tmp_path / "a.npy")
+    assert (found == wanted[0]).all() and found.dtype == {"f": np.float32, "u": np.dtype(kind).newbyteorder("=")}[
+        wanted.dtype.kind
+    ]
 
 
 @pytest.mark.parametrize("suffix", [".png", ".npy"])

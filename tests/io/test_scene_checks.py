@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 
 import numpy as np
 import pytest
@@ -228,3 +229,47 @@ def test_tensors_as_cameras_and_views_in_any_order_score_the_same():
     views = (scene.views[3], dataclasses.replace(scene.views[1], camera=camera), scene.views[0], scene.views[2])
     other = dataclasses.replace(scene, views=views)
     assert fitted(other, split="every:4").metrics["test"]["psnr"] == fitted(scene, split="every:4").metrics["test"]["psnr"]
+
+
+DOUBTS = {
+    "lens": (r"leaves few", r"leaves few pixels of 5 images, \d+% of images/photo"),
+    "principal point": ("principal point", r"principal point of 5 of 5 views is outside the image, .*: 40, 6 of 16 x 12 px"),
+    "size": ("size of their camera", r"5 images of 0.25 times the size of their camera"),
+    "rotation": ("one place", r"all cameras are within .* units of one place"),
+    "binary masks": ("0 and 1", r"1 image with a mask of the values 0 and 1, read as 0 and 255"),
+    "empty mask": ("keep no", r"masks that keep no pixel, so that their views are left out .*--mask-keeps.*photo1.png \(1\)"),
+    "equal": ("equal pixels", r"2 of 5 photographs have equal pixels, such as .*photo0.png and .*photo1.png"),
+    "none": ("no such words", ""),
+}
+"""Words of the note of each case that no other case has, and the whole note."""
+
+
+def doubtful(case: str, root) -> Scene:
+    """Write a scene that is possible but most likely wrong; return it."""
+    values = scenes.transforms_json()
+    if case == "lens":
+        values |= {"k1": -9.0, "k2": 0.0}
+    elif case == "principal point":
+        values |= {"cx": 40.0}
+    elif case == "size":
+        values |= {key: 4 * values[key] for key in ("w", "h", "fl_x", "fl_y", "cx", "cy")}
+    elif case == "rotation":
+        for frame in values["frames"]:
+            frame["transform_matrix"] = [[*row[:3], 1.0] for row in frame["transform_matrix"][:3]] + [[0, 0, 0, 1.0]]
+    scenes.write_transforms(root, values)
+    mask = np.zeros((scenes.HEIGHT, scenes.WIDTH), np.uint8)
+    mask[:, :8] = case == "binary masks"
+    if "mask" in case:
+        scenes.save(root / "masks" / "photo1.png", mask)
+    if case == "equal":
+        scenes.save(root / "images" / scenes.NAMES[1], scenes.image(0))
+    return load_scene(root)
+
+
+@pytest.mark.parametrize("case", DOUBTS)
+def test_doubtful_data_are_a_note_with_the_number(case, tmp_path):
+    scene = doubtful(case, tmp_path)
+    assert any(re.search(DOUBTS[case][1], n) for n in (*scene.notes, "")), scene.notes
+    assert not any(own in n for n in scene.notes for name, (own, _) in DOUBTS.items() if name != case), scene.notes
+    assert len(scene.views) == (4 if case == "empty mask" else 5)
+    assert case != "binary masks" or next(v for v in scene.views if v.name.endswith("photo1.png")).mask.mean() == 0.5

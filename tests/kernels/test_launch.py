@@ -604,6 +604,34 @@ def test_a_listener_hears_of_modules_that_the_cache_lacks(cache, monkeypatch):
     assert not native._LISTENERS and took == [1, 0]
 
 
+def test_a_long_wait_for_modules_is_announced_once(cache, monkeypatch):
+    """Where no listener tells of it, as in `rasterize` from Python: modules in a row are one wait, later ones are another."""
+    said, came = [], threading.Event()
+    monkeypatch.setattr(native, "say", lambda line, error: (said.append((line, error)), came.set()))
+
+    class Slow:
+        def get_module_identifier(self, block_dim):
+            return f"slow_{len(said)}"
+
+        def load(self, device, block_dim):
+            assert came.wait(20)
+
+    def load(clock):
+        monkeypatch.setattr(native.time, "perf_counter", lambda: clock)
+        native.load_module(Slow(), wp.get_device("cpu"), 1)
+
+    monkeypatch.setattr(native, "SILENT", 0.01)
+    load(1e9)
+    load(1e9 + 0.005)
+    assert [error for _, error in said] == [True] and "compiling kernels" in said[0][0]
+    came.clear()
+    load(2e9)
+    assert len(said) == 2
+    with native.told_of_compiling(lambda name: came.set()):
+        load(3e9)
+    assert len(said) == 2
+
+
 def test_a_lock_that_is_not_supported_is_no_obstacle_and_one_without_a_file_has_a_remedy(tmp_path, monkeypatch):
     def refuse(_):
         raise OSError(95, "not supported")

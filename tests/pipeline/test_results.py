@@ -136,7 +136,7 @@ def test_nothing_traded_is_said_and_is_as_small_as_float32(device):
     """Rule exact: the arithmetic alone, and no second time; kernels and truth leave out a Gaussian that is no number."""
     found = rule_report_of(crowd(device), photos(5, 150, 100), EXACT, seed=3)
     assert 0 < found["mean"] < 2e-6 and "exact_ms" not in found and found["psnr"] > 90
-    assert "has no cut-offs" in found["summary"] and "random training views" in found["summary"]
+    assert "has the cut-offs of 3DGS" in found["summary"] and "random training views" in found["summary"]
     g = crowd(CPU)
     g.means[5] = float("nan")
     assert rule_report_of(g, photos(1, 150, 100), EXACT, seed=0)["mean"] < 2e-6

@@ -442,5 +442,8 @@ def test_reasons_and_advice():
         said, ("between d and c", "take e again", "b and c, whose axes differ by 50", "only 40 matches"), strict=True
     ):
         assert words in line
+    joined = found_mapping(matches={(0, 1): 200, (1, 2): 90, (2, 3): 9, (3, 4): 300}, keypoints=(900, 800, 700, 600, 500))
+    assert "between d and c" in advice(joined, names)[0] and "photographs from e to the others" in advice(joined, names)[1]
+    assert len(advice(joined, names)) == 2, "b and c match well, though their axes differ"
     well = found_mapping(keypoints=(900, 800), matches={(0, 1): 200}, views=dict(list(found.views.items())[:2]))
     assert advice(well, ["a", "b"]) == []

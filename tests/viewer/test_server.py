@@ -203,6 +203,12 @@ def test_numbers_are_bounded(monkeypatch, capfd):
             stream.sendall(5 * framed(write_frame(CAMERA)))
             assert closes(stream)
         assert "messages a second" in capfd.readouterr().err
+        monkeypatch.setattr(connections, "MAX_CONNECTIONS", 2)
+        with (
+            socket.create_connection((HOST, server.get_port())) as idle,
+            opened(server),
+        ):  # two: the place of a third is the idle's
+            assert answer(server, f"/{server.rules.guard.token}/", upgrade=False).startswith(b"HTTP/1.1 200 ") and closes(idle)
         monkeypatch.setattr(connections, "MAX_CONNECTIONS", 0)
         with socket.create_connection((HOST, server.get_port())) as stream:
             assert closes(stream)

@@ -6,7 +6,7 @@ import os
 import sys
 from collections.abc import Sequence
 
-from warpgs.device import is_out_of_memory, no_memory_message
+from warpgs.device import exhausted_limit, is_out_of_memory, no_memory_message
 from warpgs.errors import ResourceError, UsageError, WarpgsError, did_you_mean
 from warpgs.folders import system_folder
 from warpgs.pipeline.train.presets import DEFAULT_PRESET, PRESETS
@@ -205,6 +205,10 @@ def _run(arguments: list[str]) -> int:
         return 0
     name = arguments[0]
     try:
+        try:
+            os.getcwd()
+        except OSError as e:  # torch's libraries end the process there
+            raise UsageError("the current folder was deleted; change to another one") from e
         if name not in COMMANDS:
             hint = did_you_mean(name, COMMANDS) or f"choose one of {', '.join(COMMANDS)}"
             raise UsageError(f"unknown command {name!r}; {hint}")
@@ -228,6 +232,8 @@ def _run(arguments: list[str]) -> int:
     except Exception as e:
         if is_out_of_memory(e):
             return last_words(f"warpgs: {no_memory_message(e, fitting=name in FITTING)}", ResourceError.exit_code)
+        if limit := exhausted_limit(e):
+            return last_words(f"warpgs: {limit}", ResourceError.exit_code)
         return report_defect(e, arguments)
 
 

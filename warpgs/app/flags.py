@@ -4,10 +4,12 @@ import contextlib
 import dataclasses
 import functools
 import io
+import os
+import shutil
 import traceback
 import types
 import typing
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Annotated, Any, TypeVar
 
 from warpgs.errors import UsageError, WarpgsError, field_docs
@@ -17,6 +19,8 @@ REMOVED = {"--repeat": "the error of the fit itself names step, view, loss term 
 """What replaces flags that are gone, by their names with dashes."""
 MAX_THREADS = 4096
 """Most threads that a flag takes."""
+MIN_COLUMNS = 40
+"""Smallest width of the help [columns]."""
 MAX_WHOLE = 2**31 - 1
 """Largest number of steps and factor of a size: the largest integer of 32 bits."""
 
@@ -55,6 +59,20 @@ def _open_value(info: Any) -> Any:
     )  # fmt: skip
 
 
+@contextlib.contextmanager
+def _columns() -> Iterator[None]:
+    """Give tyro a terminal of at least `MIN_COLUMNS` columns: it wraps its help for narrower ones without end."""
+    before = os.environ.get("COLUMNS")
+    if shutil.get_terminal_size().columns < MIN_COLUMNS:
+        os.environ["COLUMNS"] = str(MIN_COLUMNS)
+    try:
+        yield
+    finally:
+        os.environ.pop("COLUMNS", None)
+        if before is not None:
+            os.environ["COLUMNS"] = before
+
+
 def parse_flags(kind: Callable[..., Any], arguments: list[str], program: str, description: str) -> Any:
     """Return the instance of a dataclass of flags for the arguments of a command line."""
     import tyro
@@ -63,7 +81,7 @@ def parse_flags(kind: Callable[..., Any], arguments: list[str], program: str, de
     complaint, registry = io.StringIO(), tyro.constructors.ConstructorRegistry()
     registry.primitive_rule(_open_value)
     try:
-        with contextlib.redirect_stderr(complaint):
+        with contextlib.redirect_stderr(complaint), _columns():
             return tyro.cli(kind, args=words, prog=program, description=description, registry=registry)
     except SystemExit as e:
         if not e.code:  # after the help

@@ -526,7 +526,9 @@ class ColmapReader(Reader):
         if unposed:
             notes.append(f"{unposed} files in {images.name} have no pose in the reconstruction and are left out")
         notes += missing_note(missing, len(poses), "images", file, options.strict) + views.notes(options)
-        points, more = self._points(scene, model, kind, {n: named[p[0]] for n, p in poses.items() if p[0] in named})
+        there = {v.name for v in views.views}  # without those that are left out
+        names = {n: named[p[0]] for n, p in poses.items() if named.get(p[0]) in there}
+        points, more = self._points(scene, model, kind, names)
         pixels = scene.pixel_source(by_folder=True)
         return self.scene(folder, views.views, notes + more, points=points, pixels=pixels)
 

@@ -15,7 +15,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from warpgs.constants import POSE_TOLERANCE
-from warpgs.errors import DataError, UsageError
+from warpgs.errors import DataError, UsageError, shortened
 from warpgs.files import inside, is_within
 from warpgs.geometry import matmul, nearest_rotation, rotation_matrices
 from warpgs.io.image_files import MAX_PIXELS, decode, unread_note
@@ -82,7 +82,7 @@ class Reader(abc.ABC):
 
     def scene(self, folder: Path, views: list[View], notes: list[str], **fields: Any) -> Scene:
         """Return a `Scene` of this format; ``fields`` are further fields (points, background, pixels)."""
-        return Scene(str(folder), self.name, tuple(views), notes=tuple(notes), **fields)
+        return Scene(str(folder), self.name, tuple(views), notes=tuple(map(shortened, notes)), **fields)
 
 
 READERS: Registry[Reader] = Registry("reader", Reader, __package__)  # type: ignore[type-abstract]
@@ -233,7 +233,7 @@ class SceneFolder:
 
     def __init__(self, root: Path, options: ReadOptions):
         self.root, self.options = root, options
-        self._reduced = False
+        self._reduced = self._binary = False
         self._base = "images"
         self._maps = GivenMaps(options)
 
@@ -298,12 +298,20 @@ class SceneFolder:
             self.options.on_image(path)
         options = self.options if downscale is None else replace(self.options, downscale=downscale)
         loaded = load_image(self.inside(path), lens, options, mask, background)
+        if self._binary and mask is not None:
+            loaded = replace(loaded, done=(*loaded.done, "with a mask of the values 0 and 1, read as 0 and 255"))
+        self._binary = False
+        if loaded.mask is not None and not loaded.mask.any():  # left out by `ViewList.add`
+            return loaded
         self._reduced = self._reduced or any(words.startswith(REDUCED) for words in loaded.done)
         return self._maps.attached(loaded, path, named)
 
     def mask(self, path: Path) -> np.ndarray:
         """Return the weights of a mask file of the scene: float32 [H, W], 1 to keep a pixel, 0 to mask it out."""
-        return read_mask(self.inside(path), self.options.mask_keeps, self.options.max_pixels)
+        gray = read_mask(self.inside(path), "white", self.options.max_pixels)
+        self._binary = 0 < float(gray.max()) < 1.5 / 255
+        gray = (gray > 0).astype(np.float32) if self._binary else gray
+        return gray if self.options.mask_keeps == "white" else 1 - gray
 
     def find_mask(self, image: Path, images_root: Path, folder: Path | None = None) -> np.ndarray | None:
         """Return the mask [H, W] of an image, or None without one.
@@ -393,6 +401,10 @@ def missing_note(missing: list[str], total: int, noun: str, file: Path, strict: 
     return [f"skipped: {text}"]
 
 
+MIN_SEEN = 0.5
+"""Smallest fraction of the pixels of an image that a usual lens leaves."""
+
+
 class ViewList:
     """Views of a scene in the order of reading, and counts of changes to their pixels."""
 
@@ -400,6 +412,7 @@ class ViewList:
         self.views: list[View] = []
         self._done: Counter[str] = Counter()
         self._kept: dict[str, float] = {}
+        self._narrow: dict[str, float] = {}
         self._names: set[str] = set()
 
     def claim(self, name: str, where: str) -> str:
@@ -415,17 +428,29 @@ class ViewList:
 
     def add(self, name: str, viewmat: np.ndarray, loaded: LoadedImage) -> None:
         """Append a view of an image at its final size; ``viewmat`` is camera_from_world [4, 4] in file units, rigid."""
+        if loaded.kept is not None:
+            self._kept[name] = loaded.kept
+        if loaded.mask is not None:
+            if not loaded.mask.any():
+                return
+            left = float(loaded.mask.mean()) / (loaded.kept or 1 if "masked by a mask file" in loaded.done else 1)
+            if left < MIN_SEEN and any("distort" in words for words in loaded.done):
+                self._narrow[name] = left
         height, width = loaded.image.shape[:2]
         camera = Camera(viewmat, loaded.K, width, height, loaded.camera_model, loaded.distortion)
         maps = {"depth": loaded.depth, "normals": loaded.normals}
         self.views.append(View(name, camera, loaded.image, loaded.mask, alpha=loaded.alpha, **maps))
         self._done.update(loaded.done)
-        if loaded.kept is not None:
-            self._kept[name] = loaded.kept
 
     def notes(self, options: ReadOptions | None = None) -> list[str]:
         """Return notes on changes to the pixels; with ``options`` also assumptions about masks."""
         notes = [f"{n} image{'s' if n != 1 else ''} {what}" for what, n in sorted(self._done.items())]
+        if self._narrow:
+            name, left = min(self._narrow.items(), key=lambda item: item[1])
+            notes.append(
+                f"the lens distortion leaves few pixels of {len(self._narrow)} images, {left:.0%} of {name}; check the "
+                "distortion, or use --lenses native"
+            )
         cutout = options is not None and options.masks == "cutout"
         if options is None or not self._kept:
             return [*notes, "--masks cutout changes nothing: no image has a mask file"] if cutout else notes
@@ -434,7 +459,8 @@ class ViewList:
             f"masks keep {mean:.1%} of the pixels, the {options.mask_keeps} ones (--mask-keeps {options.mask_keeps}); "
             f"the others {'are transparent' if cutout else 'are ignored'} (--masks {options.masks})"
         )
-        for fraction, what in ((0.0, "keep no pixel"), (1.0, "keep every pixel")):
+        out = "" if cutout else ", so that their views are left out (see --mask-keeps)"
+        for fraction, what in ((0.0, f"keep no pixel{out}"), (1.0, "keep every pixel")):
             names = [n for n, kept in self._kept.items() if kept == fraction]
             if names:
                 notes.append(f"masks that {what}: {', '.join(names[:5])}{' ...' if len(names) > 5 else ''} ({len(names)})")

@@ -404,10 +404,6 @@ def _with_mask(path: Path, loaded: LoadedImage, cutout: bool) -> LoadedImage:
             done.append("transparent in part, by the alpha channel")
     else:
         alpha = None
-    if mask is not None and not mask.any():
-        raise DataError(
-            f"{path}: its mask leaves no pixel; set --mask-keeps to the mask's colour of kept pixels, white or black"
-        )
     return LoadedImage(image, mask, loaded.K, tuple(done), alpha, kept)
 
 
@@ -443,7 +439,9 @@ def load_image(
         image, alpha = turn_upright(image, orientation), None if alpha is None else turn_upright(alpha, orientation)
     height, width = image.shape[:2]
     K = np.diag([width / lens.width, height / lens.height, 1.0]) @ lens.K
-    done = () if orientation == 1 else ("rotated by the EXIF orientation",)
+    done: tuple[str, ...] = () if orientation == 1 else ("rotated by the EXIF orientation",)
+    if not 0.99 < (ratio := lens.width / width) < 1.01:
+        done += (f"of {1 / ratio:.3g} times the size of their camera: the intrinsics are scaled to the image",)
     if mask is not None:
         mask = _fit_mask(path, mask if cutout else mask > 0.5, stored, (height, width), orientation)
     loaded = _with_mask(path, LoadedImage(image, mask, K, done, alpha), cutout)
@@ -455,7 +453,7 @@ def load_image(
     loaded = _shrink(path, loaded, options.downscale, options.max_side)
     if native and (lens.fisheye or any(lens.distortion)):
         loaded = _native(loaded, lens)
-    if loaded.mask is not None and not loaded.mask.any():
+    if loaded.mask is not None and not loaded.mask.any() and loaded.kept != 0:
         raise DataError(f"{path}: no pixel is left after its mask, its lens distortion and --downscale; check all three")
     loaded = replace(loaded, orientation=orientation, full_size=(height, width), undone=undone)
     return _over_background(loaded, background)

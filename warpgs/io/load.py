@@ -531,6 +531,44 @@ def _exclusions(options: ReadOptions, names: list[str]) -> list[str]:
     return [f"left out by --exclude: {len(out)} image{'s' if len(out) != 1 else ''}: {listed(out)}"] if out else []
 
 
+MIN_BASELINE = 1e-3
+"""Spread of the cameras, as a fraction of their distance from the points, below which parallax is less than a pixel."""
+
+
+def doubtful_notes(views: list[View], points: PointCloud | None) -> list[str]:
+    """Return notes on cameras and photographs, in file units, that are possible but most likely wrong."""
+    notes = []
+    centers = np.array([v.camera.center for v in views])
+    middle = centers.mean(0)
+    spread = float(np.linalg.norm(centers - middle, axis=1).max())
+    with np.errstate(over="ignore", invalid="ignore"):
+        distance = (
+            0.0 if points is None or not len(points) else float(np.median(np.linalg.norm(points.points - middle, axis=1)))
+        )
+    if spread < max(MIN_EXTENT, MIN_BASELINE * min(distance, MAX_COORDINATE)):
+        notes.append(
+            f"all cameras are within {spread:.2g} units of one place: pure rotation gives no depth; move the camera between "
+            "photographs"
+        )
+    off = [v for v in views if not all(0 <= v.camera.K[i, 2] <= n for i, n in ((0, v.camera.width), (1, v.camera.height)))]
+    if off:
+        x, y = off[0].camera.K[:2, 2]
+        notes.append(
+            f"the principal point of {len(off)} of {len(views)} views is outside the image, as in {off[0].name}: {x:.0f}, "
+            f"{y:.0f} of {off[0].camera.width} x {off[0].camera.height} px; the intrinsics may be those of another size"
+        )
+    equal: dict[bytes, list[str]] = {}
+    for v in (v for v in views if v.image.min() < v.image.max()):  # views that show nothing are alike
+        equal.setdefault(hashlib.sha256(np.ascontiguousarray(v.image).data).digest(), []).append(v.name)
+    same = [names for names in equal.values() if len(names) > 1]
+    if same:
+        count = sum(map(len, same))
+        notes.append(
+            f"{count} of {len(views)} photographs have equal pixels, such as {same[0][0]} and {same[0][1]}; remove copies"
+        )
+    return notes
+
+
 def _finished(root: Path, reader: Reader, scene: Scene, notes: list[str], options: ReadOptions) -> Scene:
     """Check a scene that a reader returned; return it sorted, in scene coordinates, with score masks and fingerprint."""
     own = f"the reader {reader.name} must return a Scene in file coordinates, without a Normalization; fix it"
@@ -548,7 +586,7 @@ def _finished(root: Path, reader: Reader, scene: Scene, notes: list[str], option
     if options.black_is_empty and not any(scene.background):
         views, note = cut_from_black(views)
         more = (*more, note) if note else more
-    more = (*more, *check_found(views, options))
+    more = (*more, *check_found(views, options), *doubtful_notes(views, points))
     n: Normalization = normalization_of(views, points, str(root))
     more = (*more, *far_off_note(views, points))
     if n.origin.any():

@@ -9,7 +9,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from warpgs.errors import DataError, UsageError
-from warpgs.files import inside, open_input, unread_reason
+from warpgs.files import PIECE, inside, open_input, unread_reason
 from warpgs.geometry import CENTRAL
 from warpgs.io.image_files import MAX_PIXELS, decode_png
 from warpgs.io.images import LoadedImage, ReadOptions, turn_upright, undistortion_maps
@@ -66,18 +66,36 @@ def _find(files: dict[str, Path], image: Path) -> tuple[Path | None, Path | None
     return None, None
 
 
-def mapped_array(path: Path, fix: str) -> np.ndarray:
-    """Return the array of an NPY file, which stays in the file: numpy compares its shape with the file's size first."""
+def mapped_array(path: Path, fix: str) -> np.memmap:
+    """Return the array of an NPY file, which stays in the file, for its shape and type alone; `array_numbers` reads it."""
+    # numpy compares the shape with the file's size
     try:
         open_input(path).close()
         found = np.load(path, mmap_mode="r", allow_pickle=False)
     except Exception as e:  # numpy raises a dozen types on malformed files
         why = unread_reason(e) if isinstance(e, OSError) else f"{type(e).__name__}: {e}"
         raise DataError(f"{path}: cannot be read as a numpy array ({why}); {fix}") from e
-    if not isinstance(found, np.ndarray):
+    if not isinstance(found, np.memmap):
         found.close()
         raise DataError(f"{path}: is an archive of arrays, not one array; {fix}")
     return found
+
+
+def array_numbers(path: Path, found: np.memmap, kind: type | np.dtype, fix: str) -> np.ndarray:
+    """Return the numbers of an array of `mapped_array` as ``kind``, read by pieces."""
+    # a read of mapped memory ends the process (SIGBUS) if the file has become shorter, or its disk fails
+    numbers = np.empty(found.shape, kind, order="C" if found.flags.c_contiguous else "F")
+    flat, size, step = numbers.reshape(-1, order="A"), found.dtype.itemsize, PIECE // found.dtype.itemsize
+    try:
+        with open_input(path) as file, np.errstate(over="ignore", invalid="ignore"):
+            file.seek(found.offset)
+            for at in range(0, flat.size, step):
+                part = flat[at : at + step]
+                part[:] = np.frombuffer(file.read(part.size * size), found.dtype)
+    except (OSError, ValueError) as e:
+        why = unread_reason(e) if isinstance(e, OSError) else "it has become shorter while it was read"
+        raise DataError(f"{path}: cannot be read as a numpy array ({why}); {fix}") from e
+    return numbers
 
 
 def read_numbers(path: Path, max_pixels: int = MAX_PIXELS) -> np.ndarray:
@@ -96,8 +114,9 @@ def read_numbers(path: Path, max_pixels: int = MAX_PIXELS) -> np.ndarray:
             f"{path}: the map is {found.shape[1]} x {found.shape[0]} px, more than the limit of {max_pixels:,} pixels; shrink "
             "it, or raise the limit with --max-pixels"
         )
-    with np.errstate(over="ignore", invalid="ignore"):
-        return np.array(found, found.dtype if found.dtype in (np.uint8, np.uint16) else np.float32)
+    native = found.dtype.newbyteorder("=")
+    kind = native if native in (np.uint8, np.uint16) else np.float32
+    return array_numbers(path, found, kind, "save the map alone")
 
 
 def _gray(path: Path, raw: np.ndarray, what: str) -> np.ndarray:

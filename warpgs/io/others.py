@@ -25,7 +25,7 @@ from warpgs.io.folder import (
     view_name,
 )
 from warpgs.io.images import Lens, ReadOptions, list_images
-from warpgs.io.maps import mapped_array
+from warpgs.io.maps import array_numbers, mapped_array
 from warpgs.scene import Scene
 
 # LLFF scenes: poses_bounds.npy, one row of 17 numbers per image in sorted-name order (Mildenhall et al. 2019).
@@ -42,7 +42,7 @@ def read_poses_bounds(path: Path) -> np.ndarray:
         raise DataError(f"{path}: must be an array [n, 17] of numbers, not {list(rows.shape)} of {rows.dtype}; make it again")
     if len(rows) > MAX_ROWS:
         raise DataError(f"{path}: has {len(rows):,} rows; at most {MAX_ROWS:,} are supported. Make it again")
-    return rows.astype(np.float64)
+    return array_numbers(path, rows, np.float64, "make it again")
 
 
 @register("llff")

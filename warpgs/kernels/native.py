@@ -4,7 +4,9 @@ import contextlib
 import functools
 import importlib.resources
 import inspect
+import math
 import re
+import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -16,6 +18,7 @@ from filelock import lock_descriptor, unlock_descriptor
 from warpgs.device import REMEDY
 from warpgs.errors import ResourceError
 from warpgs.files import make_folder
+from warpgs.process import say
 
 FOLDER = importlib.resources.files("warpgs") / "kernels" / "cuda"
 """Folder of the files."""
@@ -152,6 +155,39 @@ def told_of_compiling(listener: Callable[[str], object]) -> Iterator[list[float]
         _LISTENERS.remove(entry)
 
 
+SILENT = 2.0
+"""Seconds of compiling after which a line is printed, if no listener is told; modules with shorter gaps count as one."""
+_since = _until = -math.inf
+_said = False
+
+
+def _say_compiling() -> None:
+    global _said
+    if not _said:
+        _said = True
+        say(
+            "warpgs: compiling kernels, once on this machine, for up to a minute or two; `warpgs doctor --warm` does it",
+            error=True,
+        )
+
+
+@contextlib.contextmanager
+def _announced() -> Iterator[None]:
+    """Print a line on stderr if the body, with the bodies just before it, takes more than `SILENT`."""
+    global _since, _until, _said
+    now = time.perf_counter()
+    if now - _until > SILENT:
+        _since, _said = now, False
+    timer = threading.Timer(max(0.0, _since + SILENT - now), _say_compiling)
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
+        _until = time.perf_counter()
+
+
 def load_module(module: wp.Module, device: wp.Device, block_dim: int):
     """Load a module for blocks of ``block_dim`` threads and return Warp's handle; compile it where the cache lacks it."""
     # Fits that start at once on a fresh machine need the same modules: a file lock makes one compile, and the others find the
@@ -167,7 +203,8 @@ def load_module(module: wp.Module, device: wp.Device, block_dim: int):
         told = tuple(_LISTENERS) if compiles else ()
         for listener, _ in told:
             listener(name)
-        loaded = module.load(device, block_dim=block_dim)
+        with _announced() if compiles and not told else contextlib.nullcontext():
+            loaded = module.load(device, block_dim=block_dim)
         for _, seconds in told:
             seconds.append(time.perf_counter() - began)
     _LOADED.add(key)

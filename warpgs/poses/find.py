@@ -90,15 +90,15 @@ def advice(found: Mapping, names: Sequence[str]) -> list[str]:
     """Return what to photograph next, a sentence each, the most urgent first; empty if nothing is missing."""
     said = []
     for i in (i for i in range(len(names)) if i not in found.views):
-        best = found.links[i]
+        weak = [names[j] for j, n in found.links[i] if n < WEAK_MATCHES]  # pairs that match well need no photograph between
         if found.keypoints[i] < MIN_KEYPOINTS:
             said.append(f"take {names[i]} again: sharp, in good light, with a textured object in view")
-        elif best:
-            said.append(f"take two or three photographs between {names[i]} and {names[best[0][0]]}, in small steps")
+        elif weak:
+            said.append(f"take two or three photographs between {names[i]} and {weak[0]}, in small steps")
         else:
             said.append(f"take photographs from {names[i]} to the others, each overlapping the previous one by two thirds")
     for i, j, angle in sorted(neighbours(found), key=lambda t: -t[2]):
-        if angle > WIDE_ANGLE:
+        if angle > WIDE_ANGLE and dict(found.links[i]).get(j, 0) < WEAK_MATCHES:
             pair = f"{names[i]} and {names[j]}"
             said.append(f"take one or two photographs between {pair}, whose axes differ by {angle:.0f} degrees")
     for i in found.views:

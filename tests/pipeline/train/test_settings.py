@@ -95,6 +95,8 @@ def test_a_file_has_settings_of_the_strategy_and_of_loss_terms(tmp_path):
         ('strategy = "json:JSONDecoder"', 'in a study, use a preset in a .py file with "strategy": JSONDecoder'),
         ('loss-terms = "json:JSONDecoder"', "does not load your code"),
         ('base = "json:dumps"', "is code; a preset file never loads code"),
+        ('base = "../a.toml"', "is outside the folder of the file"),
+        ("init.random-count = 99999999", "init.random-count must be in [1, 1e+07]"),
         ("base = 3", "base must be text, not 3"),
         ('base = "my.toml"', "is circular"),
         ('preset = "quick"', "unknown setting 'preset'"),
@@ -281,7 +283,7 @@ def test_rates_rise_where_the_time_of_a_cpu_limits_many_views():
     rates, notes = chosen(10, "cpu")
     assert rates == (4e-4, 6.25e-3)
     assert chosen(10, "cpu", means_lr=1e-3, sh_lr=2e-3)[0] == (1e-3, 2e-3)
-    assert "--no-cpu-limit takes all, about 11 min, and raises PSNR by at least 0.5 dB" in notes[-1]
+    assert "--no-cpu-limit takes all, about 11 min, and raised PSNR by 0.3 to 1.6 dB" in notes[-1]
 
 
 def test_one_layer_has_fewer_steps_in_the_time_of_a_cpu():

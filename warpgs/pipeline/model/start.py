@@ -164,8 +164,8 @@ class InitConfig(Checked, group="init."):
     If views have an alpha channel, points in an empty area of a view are left out."""
     sweep_up_to: Annotated[int, Within(0)] = 0
     """auto: largest number of training views for a start by sweep, which takes about a second per view on two cores."""
-    random_count: Annotated[int, Within(1)] = 20_000
-    """Number of random points."""
+    random_count: Annotated[int, Within(1, 10_000_000)] = 20_000
+    """Number of random points, at most ten million."""
     opacity: Annotated[float, Within(0, 1, "()")] = 0.1
     """Initial opacity, in (0, 1)."""
     scale_factor: Annotated[float, Within(1e-3, 10)] = 1.0

@@ -298,8 +298,13 @@ def with_poses(
         )  # fmt: skip
     lost = [f"no pose: {p['name']} {p['reason']}" for p in record["photographs"] if not p["registered"]]
     notes = [*record["notes"], *lost[:5], *([f"and {len(lost) - 5} more without a pose"] if len(lost) > 5 else [])]
-    notes += [f"{POSED_SCENE}/{TEXT} in the run folder lists what to photograph next"] if record["advice"] else []
+    notes += [f"to photograph next: {a}" for a in record["advice"][:SHOWN_ADVICE]]
+    notes += [f"{POSED_SCENE}/{TEXT} in the run folder lists the reasons for it"] if record["advice"] else []
     return replace(request, path=str(scene), matcher=None), notes
+
+
+SHOWN_ADVICE = 3
+"""Largest number of pieces of advice on further photographs that a fit prints."""
 
 
 def lost_lines(out: Path | None) -> list[str]:

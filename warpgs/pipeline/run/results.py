@@ -171,7 +171,7 @@ def _summary(r: dict[str, Any]) -> str:
     sizes = {f"{w} x {h} px" for _, _, w, h in r["views"].values()}
     where = f"on {' or '.join(sorted(sizes))} of {len(r['views'])} random training view{'s' if len(r['views']) > 1 else ''}"
     error = f"{r['mean']:.1e} on average and {r['max']:.1e} at most, {r['psnr']:.0f} dB, {where}"
-    words = f"rule exact has no cut-offs; float32 differs from float64 by {error}"
+    words = f"rule exact has the cut-offs of 3DGS (docs/conventions.md); within them, float32 differs from float64 by {error}"
     if r["rule"] != "exact":
         ratio = r["render_ms"] / r["exact_ms"]
         words = (

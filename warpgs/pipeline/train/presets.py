@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from warpgs.errors import DataError, UsageError
-from warpgs.files import read_input, unread_reason
+from warpgs.files import is_within, read_input, unread_reason
 from warpgs.plugins import load_object, module_digest, module_of
 from warpgs.process import Detail
 from warpgs.schema import SchemaError, check_depth
@@ -193,6 +193,8 @@ def _config_of(values: Mapping[str, Any], place: str, above: int, folder: Path |
         start, origin = FitConfig(), "the defaults of FitConfig"
     elif base.endswith(SUFFIX):
         path = (Path() if folder is None else folder) / base
+        if folder is not None and not is_within(path, folder):
+            raise UsageError(f"{place}: base {base!r:.200} is outside the folder of the file; put the base beside it")
         if above >= MAX_BASES:
             raise UsageError(f"{place}: base {base!r} is circular, or a chain of over {MAX_BASES} files; give another base")
         start, origin = _config_of_file(path, path.name, above)
