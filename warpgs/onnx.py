@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
+import queue
+import threading
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -226,15 +228,28 @@ class Model:
 
         feed = {name: np.ascontiguousarray(image) for (name, _, _), image in zip(self.inputs, images, strict=True)}
         options = RunOptions()
+        answers: queue.SimpleQueue[list[np.ndarray] | Exception] = queue.SimpleQueue()
+
+        def run() -> None:
+            try:
+                answers.put(self.session.run(names, feed, options))
+            except Exception as e:  # onnxruntime's errors share no base but Exception
+                answers.put(e)
+
         try:
-            # in a thread: the main thread can handle Ctrl-C and SIGTERM only while it runs Python, and a Loop may be endless
-            with ThreadPoolExecutor(1) as pool:
-                run = pool.submit(self.session.run, names, feed, options)
-                try:
-                    return [np.asarray(output) for output in run.result()]
-                except BaseException:
-                    options.terminate = True
-                    raise
+            # in a thread: the main one handles Ctrl-C and SIGTERM only while it runs Python, and a Loop may be endless. A raw
+            # queue: after an interrupt, locks of concurrent.futures may stay locked (docs/decisions/030-threads-of-a-launch.md)
+            threading.Thread(target=run, daemon=True).start()
+            answer = answers.get()
+        except BaseException:
+            options.terminate = True
+            with contextlib.suppress(queue.Empty):
+                answers.get(timeout=5)  # a run that is not ended would use the session while the process ends
+            raise
+        try:
+            if isinstance(answer, Exception):
+                raise answer
+            return [np.asarray(output) for output in answer]
         except Exception as e:  # onnxruntime's errors share no base but Exception
             shape = " x ".join(map(str, images[0].shape))
             raise DataError(
