@@ -19,8 +19,6 @@ from warpgs.geometry import matmul
 
 BAND_RAYS = 40_000
 """Number of rays cast at once: the working set of a band stays in the second-level cache."""
-EDGE = 5.0
-"""Steepness of a shadow's edge, per unit of clearance over distance."""
 Texture = Callable[[np.ndarray], np.ndarray]
 """Albedo [N, 3] in [0, 1] at local positions [N, 3] [u]."""
 Vector = tuple[float, float, float]
@@ -190,6 +188,8 @@ class Light:
     """Brightness of a surface that faces the light, above the ambient."""
     ambient: float = 0.6
     """Brightness where the light does not reach."""
+    sharpness: float = 5.0
+    """Steepness of a shadow's edge, per unit of clearance over distance."""
 
 
 def cast(shapes: Sequence[Shape], origin: np.ndarray, dirs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -236,7 +236,7 @@ def shade(shapes: Sequence[Shape], light: Light, x: np.ndarray, index: np.ndarra
         open_sky[rows] *= 1 - 0.85 * facing * np.minimum(bulk**2 / square, 1)
         along = matmul(away, to_light)
         clearance = (np.sqrt(np.maximum(square - along * along, 0)) - bulk) / np.maximum(along, 1e-3)
-        edge = np.clip(0.5 + EDGE * clearance, 0, 1)
+        edge = np.clip(0.5 + light.sharpness * clearance, 0, 1)
         lit[rows] *= np.where(along > 0, edge * edge * (3 - 2 * edge), 1)
     brightness = light.ambient * open_sky + light.sun * lit * np.maximum(matmul(normals, to_light), 0)
     return np.clip(rgb * brightness[:, None], 0, 1)
