@@ -234,8 +234,8 @@ def _with_legend(data: bytes, entries: list[tuple[str, str]], size: tuple[int, i
 
 
 def render_plot(
-    points: np.ndarray, colors: np.ndarray, axes: np.ndarray | None, train: list[Camera], test: list[Camera], up: np.ndarray,
-    direction: np.ndarray, legend: list[tuple[str, str]], size: tuple[int, int], background: str,
+    points: np.ndarray, colors: np.ndarray, *, axes: np.ndarray | None, train: list[Camera], test: list[Camera],
+    up: np.ndarray, direction: np.ndarray, legend: list[tuple[str, str]], size: tuple[int, int], background: str,
 ) -> bytes:  # fmt: skip
     """Render cameras and points [N, 3] [u] with colours [N, 3] in [0, 1] as PNG bytes; points far outside are left out.
 

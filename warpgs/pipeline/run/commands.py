@@ -365,13 +365,14 @@ def plot(
     most = MAX_POINTS[points]
     notes = stored.notes() + ([] if len(at) <= most else [f"showing a random sample of {most:,} of {len(at):,}"])
     chosen = np.sort(np.random.default_rng(0).permutation(len(at))[:most])
-    shown = (train, test) if cameras else ([], [])
     legend = [(words, color) for _, words, color in CLASSES] if by_coverage else []
-    axes = None if axes is None else axes[chosen]
-    contents = at[chosen], colors[chosen], axes, *shown, rig.up, eye, legend
     with hold_file(out) as held:
         tell("rendering the plot")
-        write_bytes(out, render_plot(*contents, size, background))
+        plot = render_plot(
+            at[chosen], colors[chosen], axes=None if axes is None else axes[chosen], train=train if cameras else [],
+            test=test if cameras else [], up=rig.up, direction=eye, legend=legend, size=size, background=background,
+        )  # fmt: skip
+        write_bytes(out, plot)
     what = "points of the reconstruction" if start else f"Gaussians of opacity {MIN_OPACITY:g} or more"
     return [*held, *notes, f"{len(at):,} {what}, {len(train)} training and {len(test)} held-out cameras in {out}"]
 

@@ -384,24 +384,8 @@ def fit(
         WarpgsError: Any other error that a user can fix, before the first step if possible.
     """
     out = None if out is None else Path(out)
-    if resume and out is None:
-        raise UsageError("resume requires out, the run folder to continue")
-    check_overrides(overrides)
-    if isinstance(scene, Scene):
-        scene = checked_scene(scene)
-    elif not isinstance(scene, (SceneRequest, str, Path)):
-        raise UsageError(
-            f"scene must be a warpgs.Scene or a folder, not {type(scene).__name__}; give Scene(path, format, views)"
-        )
-    config, origin = chosen_settings(preset, overrides)
-    spec = scene.split if split is None and isinstance(scene, SceneRequest) else split
-    if spec is not None:
-        check_spec(spec)
-    check_ranks(config.batch, ranks)
-    if time_budget is not None and ranks.count > 1:
-        raise UsageError(
-            f"--time-budget: each of {ranks.count} ranks would measure its own speed and choose other steps; give --steps"
-        )
+    config, origin = _checked_settings(preset, overrides, out, resume, time_budget, ranks)
+    scene = _checked_source(scene, split)
     verbose, own = ranks.first and verbose, out if ranks.first else None
     folder = contextlib.nullcontext(list[str]()) if own is None else run_folder(own, resume)
     stages = Stages() if verbose else Stages(lambda line: None)
@@ -418,19 +402,10 @@ def fit(
         chosen, where = choose_device(device)
         began = time.perf_counter()
         lpips = None if lpips_weights is None else Lpips(Path(lpips_weights), chosen)
-        if isinstance(scene, Scene):
-            (parts, found), read = choose_split(scene, split), scene
-            request, found = SceneRequest("", split, downscale=1).with_scale(chosen.type), [*scene.notes, *found]
-        else:
-            request = scene if isinstance(scene, SceneRequest) else SceneRequest(str(scene))
-            request, poses = with_poses(replace(request, split=spec).with_scale(chosen.type), out, progress, ranks.count)
-            progress(f"reading {request.path}")
-            read, parts, found = read_scene(request, progress)
-            found = [*poses, *found]
-        renamed = [] if out is None else renaming_notes(image_names(v.name for v in read.views))
+        read, request, parts, found = _read(scene, split, chosen, out, progress, ranks)
         job = FitJob(
             scene=read, request=request, split=parts, config=config, device=chosen, where=where, out=own, lpips=lpips,
-            notes=[*notes, *origin, *held, *found, *renamed], verbose=verbose, on_step=on_step, on_model=on_model, ranks=ranks,
+            notes=[*notes, *origin, *held, *found], verbose=verbose, on_step=on_step, on_model=on_model, ranks=ranks,
             began=began, progress=progress, compiled=compiled,
         )  # fmt: skip
         _settle(job, time_budget)
@@ -440,6 +415,55 @@ def fit(
         result = _finish(job, trainer, record, checks)
     ranks.leave()
     return result
+
+
+def _checked_settings(
+    preset: FitConfig | Mapping[str, Any] | str | Path | None, overrides: dict[str, object], out: Path | None, resume: bool,
+    time_budget: float | None, ranks: Ranks,
+) -> tuple[FitConfig, list[str]]:  # fmt: skip
+    """Return the settings and notes on their origin; refuse arguments of `fit` that do not go together."""
+    if resume and out is None:
+        raise UsageError("resume requires out, the run folder to continue")
+    check_overrides(overrides)
+    config, origin = chosen_settings(preset, overrides)
+    check_ranks(config.batch, ranks)
+    if time_budget is not None and ranks.count > 1:
+        raise UsageError(
+            f"--time-budget: each of {ranks.count} ranks would measure its own speed and choose other steps; give --steps"
+        )
+    return config, origin
+
+
+def _checked_source(scene: Scene | SceneRequest | str | Path, split: str | None) -> Scene | SceneRequest:
+    """Return a checked scene, or the request to read one, with its split."""
+    if isinstance(scene, (str, Path)):
+        scene = SceneRequest(str(scene))
+    if not isinstance(scene, (Scene, SceneRequest)):
+        raise UsageError(
+            f"scene must be a warpgs.Scene or a folder, not {type(scene).__name__}; give Scene(path, format, views)"
+        )
+    if isinstance(scene, SceneRequest):
+        scene = replace(scene, split=scene.split if split is None else split)
+        split = scene.split
+    if split is not None:
+        check_spec(split)
+    return checked_scene(scene) if isinstance(scene, Scene) else scene
+
+
+def _read(
+    scene: Scene | SceneRequest, split: str | None, device: torch.device, out: Path | None,
+    progress: Callable[[str], object], ranks: Ranks,
+) -> tuple[Scene, SceneRequest, Split, list[str]]:  # fmt: skip
+    """Read a scene, and find its poses where it has none; return it with its request, its split and notes."""
+    if isinstance(scene, Scene):
+        parts, notes = choose_split(scene, split)
+        read, request, notes = scene, SceneRequest("", split, downscale=1).with_scale(device.type), [*scene.notes, *notes]
+    else:
+        request, poses = with_poses(scene.with_scale(device.type), out, progress, ranks.count)
+        progress(f"reading {request.path}")
+        read, parts, notes = read_scene(request, progress)
+        notes = [*poses, *notes]
+    return read, request, parts, notes + ([] if out is None else renaming_notes(image_names(v.name for v in read.views)))
 
 
 def _settle(job: FitJob, time_budget: float | None) -> None:
