@@ -72,6 +72,7 @@ def program(tmp_path):
 
 
 FIT = ["--split", split_spec(8), "--steps", "2", "--device", "cpu", "--init.source", "random", "--init.random-count", "50"]
+SIZE = ["--views", "8", "--width", "32", "--height", "32"]
 STUDY = ["--split", split_spec(8), "--steps", "2", "--device", "cpu", "--seeds", "1"]
 
 
@@ -90,9 +91,22 @@ def test_the_program_runs_nothing_from_the_current_folder(trap, program):
     for name in EARLY:
         (folder / f"{name}.py").write_text((folder / "json.py").read_text())
     for command in ([program], ["-P", "-m", "warpgs"]):
-        done = run(*command, "demo", f"new{len(command)}", "--views", "8", "--width", "32", "--height", "32")
+        done = run(*command, "demo", f"new{len(command)}", *SIZE)
         assert done.returncode == 0 and (folder / f"new{len(command)}" / "images").is_dir(), done.stderr
         assert not mark.exists(), mark.read_text()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="locales and file names of Linux")
+@pytest.mark.parametrize("early", [True, False])
+def test_python_that_starts_again_runs_nothing_from_the_current_folder(trap, program, early):
+    """In a locale whose file names are ASCII: the second Python is as safe as the first."""
+    folder, mark = trap
+    for name in EARLY if early else ():
+        (folder / f"{name}.py").write_text((folder / "json.py").read_text())
+    for command in ([program], ["-P", "-m", "warpgs"]) if early else (["-m", "warpgs"],):
+        done = run(*command, "demo", f"new{len(command)}", *SIZE, LC_ALL="C", PYTHONUTF8="0")
+        assert done.returncode == 0 and (folder / f"new{len(command)}" / "images").is_dir(), done.stderr
+        assert "started again" in done.stderr and not mark.exists(), mark.read_text()
 
 
 @pytest.mark.fault
