@@ -15,6 +15,7 @@ from tests.priors.rigs import still_life
 from tests.scenes import photos, priors, seeds, three_gaussians, view_stub
 from warpgs.errors import UsageError
 from warpgs.geometry import depth_normals
+from warpgs.kernels import blend
 from warpgs.pipeline.model.start import InitConfig
 from warpgs.pipeline.train.loss import (
     BOUND,
@@ -123,6 +124,21 @@ def test_a_term_reads_the_outputs_that_it_asks_for_alone():
     Silent.needs_outputs = ("normals",)
     with pytest.raises(UsageError, match=r"'silent' needs the output 'normals', which .* rgb, alpha, depth"):
         dataclasses.replace(PLAIN, loss_terms=(Silent(),))
+
+
+def test_depth_has_a_gradient_only_where_a_term_reads_it(monkeypatch):
+    """Otherwise the backward pass of blending computes none, since that takes time."""
+    upstream, composite_gradients = [], blend.composite_gradients
+
+    def noted(projected, tiles, backgrounds, settings, saved, v_images, *others):
+        upstream.append([v is not None for v in v_images])
+        return composite_gradients(projected, tiles, backgrounds, settings, saved, v_images, *others)
+
+    monkeypatch.setattr(blend, "composite_gradients", noted)
+    for terms in ((), (SmoothDepth(0.5),)):
+        config = dataclasses.replace(PLAIN, loss=LossConfig(smooth_weight=0), loss_terms=terms)
+        Trainer(photos(2), seeds(), config, CPU).advance()
+    assert upstream == [[True, False, False], [True, False, True]]  # colour, alpha, depth
 
 
 @pytest.mark.usefixtures("registry_as_it_was")
