@@ -15,7 +15,7 @@ import stat
 import time
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 from warpgs.errors import DataError, ResourceError, UsageError
 from warpgs.folders import NAMES as OWN_NAMES
@@ -85,6 +85,18 @@ def read_file(path: Path, below: Path | None = None, most: int = MAX_BYTES, fix:
         return read_input(path, most, below)
     except OSError as e:
         raise DataError(f"{path}: cannot be read ({unread_reason(e)}); {fix}") from e
+
+
+def read_tensors(data: bytes) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return the tensors [...] of a safetensors file by name, on the CPU, and its metadata; ValueError if it is damaged."""
+    from safetensors import SafetensorError
+    from safetensors.torch import load
+
+    try:
+        tensors = load(data)
+    except SafetensorError as e:
+        raise ValueError(str(e)) from e
+    return tensors, json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")]).get("__metadata__") or {}
 
 
 def input_digest(path: str | os.PathLike[str], below: Path | None = None) -> str:

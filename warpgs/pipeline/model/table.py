@@ -13,7 +13,7 @@ import torch
 
 from warpgs import schema
 from warpgs.errors import DataError, UsageError
-from warpgs.files import read_input, unread_reason, write_bytes
+from warpgs.files import read_input, read_tensors, unread_reason, write_bytes
 from warpgs.geometry import check_stored, checked_normalization, convert_camera, convert_gaussians, logit
 from warpgs.kernels.neighbours import morton_codes
 from warpgs.kernels.sh import MAX_DEGREE
@@ -327,7 +327,7 @@ class Model:
     """Similarity from file to scene units."""
 
     def gaussians(self, units: str = "scene") -> Gaussians:
-        """Return the Gaussians in ``scene`` units, those of a `Scene`, or in ``file`` units, those of the scene's files.
+        """Return the Gaussians in ``scene`` units, as in a `Scene`, or in ``file`` units, as in the scene's files.
 
         Map coordinates in file units are float64.
         """
@@ -414,17 +414,12 @@ def load(path: str | Path, device: str | torch.device = "cpu") -> Model:
     Raises:
         DataError: The file is missing, damaged, or not a model.
     """
-    from safetensors import SafetensorError
-    from safetensors.torch import load as from_bytes
-
     path = Path(path)
     try:
-        data = read_input(path)
-        tensors = from_bytes(data)
-        header = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")]).get("__metadata__") or {}
+        tensors, header = read_tensors(read_input(path))
     except OSError as e:
         raise DataError(f"{path}: cannot be read ({unread_reason(e)}); check the path and its permissions") from e
-    except (SafetensorError, ValueError) as e:
+    except ValueError as e:
         raise DataError(f"{path}: damaged or not a safetensors file ({e}); write it again with warpgs.save") from e
     if header.get("format") != FORMAT or tensors.keys() != Gaussians.__dataclass_fields__.keys():
         raise DataError(f"{path}: not a model of format {FORMAT}; write it with warpgs.save, or read PLY with warpgs.read_ply")

@@ -21,7 +21,7 @@ import torch
 from warpgs import schema
 from warpgs.constants import K_TOLERANCE, POSE_TOLERANCE, RULES
 from warpgs.errors import DataError, NotFiniteError, UsageError, similar_folder
-from warpgs.files import is_empty, open_input, plain, unread_reason, write_bytes
+from warpgs.files import is_empty, open_input, plain, read_tensors, unread_reason, write_bytes
 from warpgs.io.images import CHOICES
 from warpgs.io.load import Split
 from warpgs.kernels.cameras import check_camera
@@ -143,9 +143,6 @@ def save_checkpoint(folder: Path, tensors: dict[str, torch.Tensor], state: dict[
 
 def load_checkpoint(folder: Path) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
     """Read tensors by name, on the CPU, and state; refuse a damaged checkpoint or one of another format."""
-    from safetensors import SafetensorError
-    from safetensors.torch import load
-
     path = folder / TENSORS
     try:
         with open_input(path, folder) as file:
@@ -153,8 +150,7 @@ def load_checkpoint(folder: Path) -> tuple[dict[str, torch.Tensor], dict[str, An
             digest = file.read(33)
         if hashlib.sha256(body).digest() != digest:
             raise ValueError("the checksum does not match: the file was truncated or altered")
-        tensors = load(body)
-        metadata = json.loads(body[8 : 8 + int.from_bytes(body[:8], "little")])["__metadata__"] or {}
+        tensors, metadata = read_tensors(body)
         if metadata.get("format") != str(FORMAT):
             raise DataError(_other_version(f"{path}: warpgs {metadata.get('version', '0.1.0')} wrote this checkpoint"))
         state = schema.parse(metadata["state"])
@@ -163,7 +159,7 @@ def load_checkpoint(folder: Path) -> tuple[dict[str, torch.Tensor], dict[str, An
         raise DataError(f"{folder} holds no {TENSORS}: no checkpoint yet; run `warpgs fit` first") from e
     except OSError as e:
         raise DataError(f"{path}: cannot be read ({unread_reason(e)}); {RESTORE}") from e
-    except (SafetensorError, KeyError, ValueError) as e:
+    except (KeyError, ValueError) as e:
         raise DataError(f"{path}: not a whole checkpoint ({e}); {RESTORE}") from e
     return tensors, state
 
