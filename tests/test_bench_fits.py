@@ -120,7 +120,7 @@ def test_its_own_unit_is_that_of_its_parser():
     assert gsplat_trainer.scene_scale(cameras, 0.5) == pytest.approx(1.1 * 0.5 * 2)
 
 
-# Presets side by side: rows and what is left out of them, the worker processes, one fit, and the tables.
+# Presets side by side: rows and their left-out views, the worker processes, one fit, and the tables.
 
 
 @pytest.fixture(scope="module")
@@ -141,7 +141,7 @@ def test_rows_are_named_or_given():
 
 
 def test_training_views_are_left_out_and_held_out_ones_are_not_read(demo):
-    """Up to four views one by one, of more some between the ends; what is scored is no held-out view."""
+    """Up to four views one by one, of more some between the ends; scored views are not held-out views."""
     assert left_out(("a", "b", "c"), 2) == [("a",), ("b",), ("c",)]
     assert left_out(tuple("abcdefghi"), 1) == [("e",)] and left_out(tuple("abcdefghi"), 3) == [("c", "e", "g")]
     with pytest.raises(UsageError, match="at least two"):

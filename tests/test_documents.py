@@ -1,4 +1,4 @@
-"""The documents: what they name is there, what they show runs, and what they quote is printed."""
+"""The documents: names exist, code runs, and quoted messages are printed."""
 
 import ast
 import dataclasses

@@ -24,9 +24,9 @@ from warpgs.errors import ResourceError
 
 # Folders that this process writes into: the folder that the user names may be a link; below it no link is followed.
 #
-# `output_folder` opens such a folder for a block. Everything below it is then reached from its descriptor, folder by
-# folder, without following links, so that no other program can redirect a write or a read. Below nested open folders, a
-# path is followed from the outermost one. Windows has no descriptors of folders: there each part of a path is checked
+# `output_folder` opens such a folder for a block. Every path below it is then opened from its descriptor, folder by
+# folder, without following links. So no other program can redirect a write or a read. With nested open folders, a path
+# is opened from the outermost one. Windows has no descriptors of folders: there each part of a path is checked
 # for links before it is used.
 
 WINDOWS = sys.platform == "win32"

@@ -19,7 +19,7 @@ class ProjectedMeans(torch.Tensor):
     __torch_function__ = torch._C._disabled_torch_function_impl
 
     def __getattr__(self, name: str) -> Any:
-        """Raise AttributeError; for ``absgrad`` the message names what is missing."""
+        """Raise AttributeError; for ``absgrad``, the message names the missing option and backward pass."""
         if name != "absgrad":
             raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
         raise AttributeError("means2d has no absgrad yet: it needs RasterizeOptions(absgrad=True) and a backward pass")

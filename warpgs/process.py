@@ -52,7 +52,7 @@ def _send_to_null(number: int) -> None:
 
 
 def _lost(error: BaseException, remedy: str) -> None:
-    """Print on stderr, if that is possible, why stdout cannot be written, and what follows."""
+    """Print to stderr, if possible, why stdout cannot be written and what happens next."""
     reason = (isinstance(error, OSError) and error.strerror) or str(error)
     line = f"warpgs: stdout cannot be written ({reason}); {remedy}"
     if sys.stderr is not None:

@@ -187,7 +187,7 @@ def go(process: subprocess.Popen) -> None:
 def test_one_of_two_gets_the_folder(reference: Reference, tmp_path, one, other, index):
     work = tmp_path / "work"
     reference.before("fit" if one == other == "fit" else "resume", work)
-    # of two seeds, so that what is mixed shows; a continued run has the seed it was started with
+    # with two seeds, mixed results are visible; a continued run has the seed it was started with
     seeds = ["1", "2"] if one == other == "fit" else ["0", "0"]
     processes = [started([*words_of(c, reference.scene, work), "--seed", s]) for c, s in zip((one, other), seeds)]
     try:

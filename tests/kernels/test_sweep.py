@@ -74,7 +74,7 @@ def test_the_dearest_costs_fit(device):
 
 @pytest.mark.parametrize("wrong", ["costs", "down", "across"])
 def test_wrong_arguments_are_named(device, wrong):
-    """A type or a shape that does not fit: which, what was wanted and what was found."""
+    """The error names the argument, and its expected and actual type or shape."""
     good = dict(zip(("costs", "down", "across"), (torch.from_numpy(a).to(device) for a in problem((5, 8, 6)))))
     with pytest.raises(ValueError, match=f"{wrong} must be"):
         scanline_costs(**(good | {wrong: good[wrong].float()}), small=1)

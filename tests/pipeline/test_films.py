@@ -316,7 +316,7 @@ def test_a_ring_is_circled_level_whatever_way_the_photographs_lie(kind, roll):
 
 @pytest.mark.parametrize("rolls", [(90, -90), (92, 92), (180, 0)])
 def test_up_is_the_side_that_people_stand_on(rolls):
-    """Where photographs do not agree on what is up, cameras stand above what they look at; also in a world upside down."""
+    """If photographs disagree on the upward direction, cameras are above their subject, also in a world upside down."""
     cameras = [rolled(c, rolls[i % 2]) for i, c in enumerate(around(np.arange(0, 360, 24)))]
     flip = np.diag([1.0, -1, -1, 1])
     flipped = [Camera(c.viewmat @ flip, c.K, c.width, c.height) for c in cameras]

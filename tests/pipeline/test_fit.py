@@ -590,7 +590,7 @@ def move_camera(scene, name, distance):
 
 @pytest.mark.parametrize("distance", [30.0, 1000.0, 1e6])
 def test_a_camera_far_off_does_not_set_the_scale(tmp_path, distance):
-    """The scale is that of the other cameras, to the bit, a note names the camera, and the others train as without it."""
+    """The scale equals that without the camera, a note names it, and the other views train as without it."""
     write_demo(tmp_path / "a", views=8, width=64, height=48)
     shutil.copytree(tmp_path / "a", tmp_path / "b")
     move_camera(tmp_path / "b", "007.png", distance)

@@ -226,8 +226,7 @@ def test_the_format_is_a_number_in_both_files(folder, tmp_path):
         load_checkpoint(copy)
 
 
-# Links in runs and results lead nowhere: not what is written, and not what is read; nor does a folder put in a run's
-# place.
+# Links in runs and results are not followed, neither for writing nor for reading, nor is a folder put in a run's place.
 
 with_links = pytest.mark.skipif(os.name == "nt", reason="links need a right that users of Windows often lack")
 

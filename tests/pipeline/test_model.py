@@ -109,7 +109,7 @@ def test_columns_are_inherited_or_filled():
 
 
 def test_overwritten_rows_start_again_before_rows_come_and_go():
-    """Numbers are those before the change; what is not named stays as it is, all moments of the row are 0, columns stay."""
+    """Indices refer to rows before the change. Parameters that are not named and columns stay; moments of the row become 0."""
     made = table()
     before = snapshot(made)
     means = torch.full((2, 3), 7.0)
@@ -191,7 +191,7 @@ def params(log_scales: torch.Tensor) -> dict[str, torch.Tensor]:
 
 
 def test_axes_are_cut_and_needles_thickened():
-    """The middle axis follows the longest, the shortest stays; what is within the limits stays as it is; twice is as once."""
+    """The middle axis follows the longest, the shortest stays. Gaussians within the limits do not change; twice equals once."""
     found = params(torch.log(torch.tensor([[900.0, 1e-6, 1.0], [2.0, 1.0, 1e-9], [1e-3, 3.0, 0.05], [40.0, 40.0, 40.0]])))
     limits = Limits(30.0, 30.0)
     limits.hold(found, CAMERAS, YES)

@@ -313,7 +313,7 @@ def test_figures_add_up(run):
 
 @pytest.mark.usefixtures("tiny")
 def test_story_follows_the_switches(run, tmp_path):
-    """What is said of gate, draw and depth is what was asked for, and a widened gate is told; no events, no story."""
+    """The report names gate, draw and depth as set, and a widened gate; without events it has no such section."""
     fit, out, _ = run
     (out / "sampling" / "own.png").write_bytes(b"an image of the user's own")
     story = sampling_report_of(fit, out)

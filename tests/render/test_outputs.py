@@ -412,7 +412,7 @@ def test_gradcheck(device, model, kind, antialiased):
     ],
 )
 def test_windows_and_chunks_have_the_bits_of_every_output(device, dtype, model, kind, antialiased, rule):
-    """In every image; gradients of what they show are those of the whole, but for the order of sums in chunks."""
+    """In every image. Gradients are those of the whole image; in chunks, sums have another order."""
     given = of_kind(kind, cloud(200, dtype, device))
     cam = seen_by(model, *COMBINATIONS_SIZE, cameras=2, dtype=dtype, device=device)
     own = [some(200, 2, like=given.means), some(2, like=given.means, seed=1), torch.linspace(0.5, 1, 200).to(given.means)]

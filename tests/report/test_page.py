@@ -1,4 +1,4 @@
-"""The report page, what it is told by events, and the index of a farm."""
+"""The report page, with sampling events, and the index of a farm."""
 
 import base64
 import hashlib

@@ -362,7 +362,7 @@ def test_no_folder_is_ever_called_tilde(monkeypatch, tmp_path):
 
 @pytest.mark.parametrize("system", ["linux", "darwin", "win32"])
 def test_the_place_on_each_system(monkeypatch, tmp_path, system):
-    """Where Warp keeps its kernels by itself, so that what is compiled there is found."""
+    """Warp's own default, so that kernels compiled there are found."""
     monkeypatch.setattr(sys, "platform", system)
     for name in ("HOME", "USERPROFILE"):
         monkeypatch.setenv(name, str(tmp_path))

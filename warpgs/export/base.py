@@ -566,23 +566,23 @@ def read_gaussians(
 ) -> Gaussians:
     """Read Gaussians from a file, in the format of its suffix; a .ply file may be compressed.
 
-    A file that declares antialiasing causes a warning: render it with `RasterizeOptions.antialiased`. In files of other
-    programs, Gaussians with a NaN, with an infinity that `read_ply` does not replace, or with a rotation of zero length are
-    left out, with a warning that counts them. In files that name warpgs as their program they are an error.
+    A file that declares antialiasing causes a warning: render it with `RasterizeOptions.antialiased`. A Gaussian is not
+    usable if it has a NaN, an infinity that `read_ply` does not replace, or a rotation of zero length. In files of other
+    programs, such Gaussians are left out, and a warning counts them. In files of warpgs, they are an error.
 
     Args:
         path: The file.
         normalization: Similarity from file to scene units; needed where ``units`` is scene.
         units: Units of the result: file as stored, or scene to go with a scene's cameras.
         format: As in `write_gaussians`.
-        strict: True to refuse every file with such a Gaussian.
+        strict: True to refuse every file with a Gaussian that is not usable.
 
     Returns:
         N Gaussians, torch tensors on the CPU: float32, or float64 for map coordinates in file units.
 
     Raises:
-        warpgs.DataError: The file is missing, malformed, truncated, declares more data than its size allows, has no usable
-            Gaussian, or has one that is not usable although it is ``strict`` or a file of warpgs.
+        warpgs.DataError: The file is missing, malformed or truncated; it declares more data than its size allows; or it has
+            no usable Gaussian. For files of warpgs, and with ``strict``, also: a Gaussian is not usable.
         warpgs.UsageError: The suffix, the format or the units are unknown, or scene units are given without a
             normalization.
     """

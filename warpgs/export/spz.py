@@ -150,8 +150,8 @@ def decode(path: Path, data: bytes) -> Arrays:
 def to_ply(system: int) -> np.ndarray:
     """Return the matrix [3, 3] from one of the 16 coordinate systems to the axes of PLY, as Niantic's library has it.
 
-    The bits of the number less 1 are right, up and front. From 9 on, the library then turns by a quarter about x, so that its
-    names of 9 and 10 (front, down) and of 15 and 16 (back, up) are those of each other's axes; files follow the library.
+    The bits of the number less 1 are right, up and front. From 9 on, the library then adds a quarter turn about x. As a
+    result, its names of 9 and 10 (front, down), and of 15 and 16 (back, up), are swapped; files follow the library.
     """
     bits = system - 1
     signs = np.diag([1.0 if bits & 1 else -1.0, -1.0 if bits & 2 else 1.0, 1.0 if bits & 4 else -1.0])

@@ -156,7 +156,7 @@ def told_of_compiling(listener: Callable[[str], object]) -> Iterator[list[float]
 
 
 SILENT = 2.0
-"""Seconds of compiling after which a line is printed, if no listener is told; modules with shorter gaps count as one."""
+"""Time of compiling after which a line is printed if there is no listener [s]; modules with shorter gaps count as one."""
 _since = _until = -math.inf
 _said = False
 

@@ -256,7 +256,7 @@ def _check_memory(window: Window, layers: list[Layer], heaviest: int, like: torc
 
 Layer = tuple[torch.Tensor | None, torch.Tensor]
 """Values that are blended into one image: channels of each Gaussian [1, N, D] or [C, N, D], None for the spherical harmonics;
-and what is behind the scene, shape [C, D]."""
+and backgrounds [C, D]."""
 
 
 def _as_tensor(values: Any) -> torch.Tensor:
@@ -318,8 +318,8 @@ def rasterize(
     Raises:
         ResourceError: The images, or the tiles that the Gaussians touch, need more memory than is available.
         TypeError: An argument has the wrong type; or a scalar type is neither float32 nor float64, or scalar types differ.
-        UsageError: The rule, the tile size or the camera model is unknown, the window cuts tiles, options exclude each other or
-            are out of range, a transform of torch.func is active, or a second derivative is requested.
+        UsageError: The rule, the tile size or the camera model is unknown; the window cuts tiles; options exclude each other or
+            are out of range; a transform of torch.func is active; or a second derivative is requested.
         ValueError: A shape or device is wrong (the message names argument, expected and found); the near or far plane is out
             of range; a pixel is outside the image; or lists differ in length. For cameras that are not on a GPU, also: an array
             has a non-finite number, ``K`` has a skew or a focal length of 0, ``viewmat`` scales or shears, or either matrix has

@@ -448,7 +448,7 @@ def alpha_errors(fit: Trainer, views: list[View]) -> tuple[float, float]:
 
 
 def test_an_image_over_another_background():
-    """What is opaque stays, what is empty shows the other colour, and both sides of the loss mean the same."""
+    """Opaque pixels stay, empty ones show the other colour, and render and photograph have the same background."""
     view = cutouts(1)[0]
     shift = torch.tensor([-0.9, -0.3, 0.0])
     black = rasterize(three_gaussians(), view.camera, RasterizeOptions(background=1 + shift)).rgb

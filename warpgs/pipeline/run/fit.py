@@ -379,8 +379,8 @@ def fit(
 
     Raises:
         DataError: The file of a preset cannot be read, or a field of the scene is invalid; the message names view and field.
-        UsageError: A setting is unknown, of the wrong type or out of range, a preset or a split is invalid, ``out`` is not
-            empty, or ``resume`` is given without ``out``.
+        UsageError: A setting is unknown, of the wrong type or out of range; a preset or a split is invalid; ``out`` is not
+            empty; or ``resume`` is given without ``out``.
         WarpgsError: Any other error that a user can fix, before the first step if possible.
     """
     out = None if out is None else Path(out)

@@ -35,7 +35,7 @@ ALIGNMENT = 16
 FLOAT_BYTES = 4
 """Size of a float [bytes]."""
 DIVIDED_BYTES = 2**26
-"""Least size of a tensor whose rows are divided among processes [bytes]: for a smaller tensor, the update takes less time than
+"""Least size of a tensor whose rows are divided among processes [bytes]: the update of a smaller tensor takes less time than
 the start of two more exchanges."""
 MAX_RENDERS = 2**24
 """Upper bound of the number of renders of a fit: the random numbers of a render depend on its index, a float32."""

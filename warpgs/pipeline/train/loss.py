@@ -125,7 +125,7 @@ register = LOSS_TERMS.register
 def term_values(terms: Sequence[LossTerm], inputs: LossInputs) -> list[torch.Tensor]:
     """Compute each term from the outputs that it needs; returns values of shape [], in the order of the terms.
 
-    A term of a user's own whose value is constant, but not 0, has no effect, and raises UsageError.
+    A user-defined term with a constant value other than 0 has no effect, and raises UsageError.
     """
     values = []
     trained = torch.is_grad_enabled() and any(t.requires_grad for t in inputs.outputs.values())
@@ -374,10 +374,10 @@ class GivenNormalsDifference(LossTerm, group="given-normals."):
 
 # Smoothness of rendered depth, for few views: ambiguous depth becomes planar instead of fog.
 #
-# On a plane, inverse depth is a linear function of the pixel. So the term sums |z/z' + z/z'' - 2| over the pixels, with
-# the depths z' and z'' of a pixel's two neighbours in its row, adds the same for its column, and divides by the number
-# of pixels. The term has no unit. Weights are lower at edges of colour and at pixels with consistent depth. A bound
-# allows depth to jump where colour does not (docs/decisions/024-smooth-depth.md).
+# On a plane, inverse depth is a linear function of the pixel. So a pixel of depth z costs |z/z' + z/z'' - 2|, with the
+# depths z' and z'' of its two neighbours in the row, and again with those in the column. The term is the sum of these
+# costs, divided by the number of pixels. It has no unit. Weights are lower at edges of colour and at pixels with
+# consistent depth. A bound allows depth to jump where colour does not (docs/decisions/024-smooth-depth.md).
 
 SMOOTH_MIN_ALPHA = 0.3
 """Opacity above which the depth of a pixel is used."""

@@ -119,7 +119,7 @@ def prepared_views(
     """Return the training views on the device, with consistent depth if the strategy samples, and the maps of loss terms.
 
     If the strategy samples and the views have priors, also returns each view's disparity (relative inverse depth in [0, 1],
-    shape [H, W]), which is only shown in images of sampling events.
+    shape [H, W]) for the images of sampling events.
     """
     samples, views = find_strategy(config.strategy).samples, []
     depths, each = start.depths or [None] * len(train), priors or [None] * len(train)

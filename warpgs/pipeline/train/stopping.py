@@ -166,8 +166,8 @@ class Stopping:
         self.why = ""
         """Reason why growth ended, for the user."""
         self.measurements: list[dict[str, Any]] = []
-        """All measurements except the first, for metrics.json: steps done, Gaussians, PSNR of the blocks, including the error
-        floor [dB], and the gain since the previous measurement, by growth and training together, with its noise [dB]."""
+        """All measurements except the first, for metrics.json: steps done, Gaussians, PSNR of the blocks with the error floor
+        [dB], and the gain of growth and training together since the previous measurement, with its noise [dB]."""
         self.whole: list[TrainingView] = []
         """Views without hidden blocks; empty if nothing is held out."""
         self.blocks: list[Blocks] = []
