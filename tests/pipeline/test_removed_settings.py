@@ -129,5 +129,6 @@ def test_other_values_open_with_a_note_and_do_not_resume(tmp_path):
     (note,) = open_run(run).notes()
     assert "optimizer.quats-lr 0.5" in note
     for resumed in (lambda: stored_request(run), lambda: check_same(same, read_record(run), run)):
-        with pytest.raises(UsageError, match=r"--resume: .* does not have: optimizer\.quats-lr 0\.5"):
+        words = r"--resume: .* does not have: optimizer\.quats-lr 0\.5\. Resume it with the code that began it \(warpgs \d"
+        with pytest.raises(UsageError, match=words):
             resumed()

@@ -147,20 +147,6 @@ def test_few_views_have_one_layer_and_decay(views, alpha, few):
     assert settings_by_views(given, train, "cuda")[0].optimizer.opacities_decay == 0.02
 
 
-@pytest.mark.parametrize("extrapolated", [True, False])
-def test_decay_spares_what_a_step_does_not_use(extrapolated):
-    """A Gaussian out of sight of the step's view keeps its opacity if the start has extrapolated points."""
-    config = dataclasses.replace(plain(CONFIG), optimizer=OptimizerConfig(opacities_decay=0.1))
-    fit = Trainer(photos(1), seeds(), config, CPU)
-    fit.extrapolated = extrapolated
-    fit.taker.params["means"].data[0] = torch.tensor([0.0, -30.0, 0.0])
-    logits = fit.taker.params["logit_opacities"]
-    before = logits.detach().sigmoid()
-    fit.advance()
-    lost = 1 - logits.detach().sigmoid() / before
-    assert float(lost[0]) == pytest.approx(0.0 if extrapolated else 0.1, abs=OPACITY_DECAY) and float(lost[1:].max()) > 0.05
-
-
 # Mean of the parameters over the last steps: its samples, its bits, fits that are continued, and when it is chosen.
 
 CONFIG = FitConfig(

@@ -351,8 +351,9 @@ def _check_lost(stored: dict[str, Any], out: Path) -> None:
     """Raise a UsageError if a run has settings that this version lacks."""
     if lost := stored.get("lost"):
         raise UsageError(
-            f"--resume: the run in {out} has settings that warpgs {__version__} does not have: {', '.join(lost)}. Resume it "
-            f"with warpgs {stored['versions'].get('warpgs', 'of that time')}, or fit again into a new --out"
+            f"--resume: the run in {out} has settings that this version of warpgs does not have: {', '.join(lost)}. Resume it "
+            f"with the code that began it (warpgs {stored['versions'].get('warpgs', 'of that time')}), or fit again into a new "
+            "--out"
         )
 
 
