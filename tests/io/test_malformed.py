@@ -233,7 +233,7 @@ def test_names_that_are_not_utf8(tmp_path):
     scenes.write_colmap(tmp_path)
     path = tmp_path / "sparse" / "0" / "images.bin"
     path.write_bytes(path.read_bytes().replace(b"photo3", b"phot\xff3"))
-    refused(tmp_path, r"1 of 5 images have no image file: phot\udcff3.png", strict=True)
+    refused(tmp_path, r"1 of 5 images have no image file: phot\udcff3.png \(1 of the names are not UTF-8; rename", strict=True)
     image = tmp_path / "images" / "photo3.png"
     if sys.platform == "linux":  # where any bytes are a name
         image.rename(image.with_name("phot\udcff3.png"))

@@ -239,6 +239,7 @@ DOUBTS = {
     "binary masks": ("0 and 1", r"1 image with a mask of the values 0 and 1, read as 0 and 255"),
     "empty mask": ("keep no", r"masks that keep no pixel, so that their views are left out .*--mask-keeps.*photo1.png \(1\)"),
     "equal": ("equal pixels", r"2 of 5 photographs have equal pixels, such as .*photo0.png and .*photo1.png"),
+    "blank": ("single colour", r"1 of 5 photographs have a single colour, such as .*photo1.png; leave them out \(--exclude\)"),
     "none": ("no such words", ""),
 }
 """Words of the note of each case that no other case has, and the whole note."""
@@ -261,6 +262,8 @@ def doubtful(case: str, root) -> Scene:
     mask[:, :8] = case == "binary masks"
     if "mask" in case:
         scenes.save(root / "masks" / "photo1.png", mask)
+    if case == "blank":
+        scenes.save(root / "images" / scenes.NAMES[1], np.zeros_like(scenes.image(0)))
     if case == "equal":
         scenes.save(root / "images" / scenes.NAMES[1], scenes.image(0))
     return load_scene(root)
