@@ -263,7 +263,7 @@ def doubtful(case: str, root) -> Scene:
     if "mask" in case:
         scenes.save(root / "masks" / "photo1.png", mask)
     if case == "blank":
-        scenes.save(root / "images" / scenes.NAMES[1], np.zeros_like(scenes.image(0)))
+        scenes.save(root / "images" / scenes.NAMES[1], np.full_like(scenes.image(0), (200, 30, 10)))
     if case == "equal":
         scenes.save(root / "images" / scenes.NAMES[1], scenes.image(0))
     return load_scene(root)

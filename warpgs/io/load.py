@@ -560,7 +560,7 @@ def doubtful_notes(views: list[View], points: PointCloud | None) -> list[str]:
     equal: dict[bytes, list[str]] = {}
     for v in (v for v in views if v.image.min() < v.image.max()):  # views that show nothing are alike
         equal.setdefault(hashlib.sha256(np.ascontiguousarray(v.image).data).digest(), []).append(v.name)
-    blank = [v.name for v in views if not v.image.min() < v.image.max()]
+    blank = [v.name for v in views if not (v.image.min((0, 1)) < v.image.max((0, 1))).any()]
     if blank:
         notes.append(
             f"{len(blank)} of {len(views)} photographs have a single colour, such as {blank[0]}; leave them out (--exclude)"
