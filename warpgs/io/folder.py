@@ -425,9 +425,7 @@ def missing_note(missing: list[str], total: int, noun: str, file: Path, strict: 
         return []
     text = f"{len(missing)} of {total} {noun} have no image file: {listed(missing)}"
     if count := sum(any("\ud800" <= letter <= "\udfff" for letter in name) for name in missing):
-        text += (
-            f" ({count} of the names are not UTF-8; name the photographs with English letters and digits, and find poses again)"
-        )
+        text += f" ({count} of the names are not UTF-8; rename the photographs to letters of ASCII, and find poses again)"
     if strict:
         raise DataError(f"{file}: {text}. Restore them, or leave out --strict to go on without them")
     return [f"skipped: {text}"]
