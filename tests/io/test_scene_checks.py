@@ -240,6 +240,10 @@ DOUBTS = {
     "empty mask": ("keep no", r"masks that keep no pixel, so that their views are left out .*--mask-keeps.*photo1.png \(1\)"),
     "equal": ("equal pixels", r"2 of 5 photographs have equal pixels, such as .*photo0.png and .*photo1.png"),
     "blank": ("single colour", r"1 of 5 photographs have a single colour, such as .*photo1.png; leave them out \(--exclude\)"),
+    "focal length": (
+        "focal length",
+        r"the focal length of 5 of 5 views is over 100 times .*photo0.png: 2000 px at 16 x 12",
+    ),
     "none": ("no such words", ""),
 }
 """Words of the note of each case that no other case has, and the whole note."""
@@ -252,6 +256,8 @@ def doubtful(case: str, root) -> Scene:
         values |= {"k1": -9.0, "k2": 0.0}
     elif case == "principal point":
         values |= {"cx": 40.0}
+    elif case == "focal length":
+        values |= {"fl_x": 2000.0, "fl_y": 2000.0}
     elif case == "size":
         values |= {key: 4 * values[key] for key in ("w", "h", "fl_x", "fl_y", "cx", "cy")}
     elif case == "rotation":
