@@ -6,9 +6,9 @@ import contextlib
 import hashlib
 import queue
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
@@ -165,6 +165,37 @@ def _first_line(error: Exception) -> str:
     return lines[0][:200] if lines else type(error).__name__
 
 
+T = TypeVar("T")
+PATIENCE = 5.0
+"""Longest time [s] to wait for onnxruntime to end after a signal."""
+
+
+def _interruptible(call: Callable[[], T], cancel: Callable[[], object]) -> T:
+    """Return the result of a ``call`` of onnxruntime, which ``cancel`` ends at Ctrl-C or SIGTERM."""
+    answers: queue.SimpleQueue[tuple[T] | Exception] = queue.SimpleQueue()
+
+    def run() -> None:
+        try:
+            answers.put((call(),))
+        except Exception as e:  # onnxruntime's errors share no base but Exception
+            answers.put(e)
+
+    try:
+        # in a thread: the main one handles signals only while it runs Python; a Loop may be endless, and constants take long to
+        # fold. A raw queue: after an interrupt, locks of concurrent.futures may stay locked
+        # (docs/decisions/030-threads-of-a-launch.md)
+        threading.Thread(target=run, daemon=True).start()
+        answer = answers.get()
+    except BaseException:
+        cancel()
+        with contextlib.suppress(queue.Empty):
+            answers.get(timeout=PATIENCE)  # a run that is not ended would use the session while the process ends
+        raise
+    if isinstance(answer, Exception):
+        raise answer
+    return answer[0]
+
+
 def start_session(data: bytes, path: Path, provider: str, threads: int) -> InferenceSession:
     """Return a session for the bytes of a checked ONNX file."""
     try:
@@ -183,7 +214,10 @@ def start_session(data: bytes, path: Path, provider: str, threads: int) -> Infer
     options.use_deterministic_compute = True
     try:
         # without onnxruntime's own second try on the CPU, which it prints
-        session = ort.InferenceSession(data, options, providers=[PROVIDERS[provider]], enable_fallback=0)
+        session = _interruptible(
+            lambda: ort.InferenceSession(data, options, providers=[PROVIDERS[provider]], enable_fallback=0),
+            lambda: options.set_load_cancellation_flag(True),
+        )
     except Exception as e:
         if provider != "cpu":
             start_session(data, path, "cpu", threads)  # DataError where the file is at fault
@@ -228,27 +262,8 @@ class Model:
 
         feed = {name: np.ascontiguousarray(image) for (name, _, _), image in zip(self.inputs, images, strict=True)}
         options = RunOptions()
-        answers: queue.SimpleQueue[list[np.ndarray] | Exception] = queue.SimpleQueue()
-
-        def run() -> None:
-            try:
-                answers.put(self.session.run(names, feed, options))
-            except Exception as e:  # onnxruntime's errors share no base but Exception
-                answers.put(e)
-
         try:
-            # in a thread: the main one handles Ctrl-C and SIGTERM only while it runs Python, and a Loop may be endless. A raw
-            # queue: after an interrupt, locks of concurrent.futures may stay locked (docs/decisions/030-threads-of-a-launch.md)
-            threading.Thread(target=run, daemon=True).start()
-            answer = answers.get()
-        except BaseException:
-            options.terminate = True
-            with contextlib.suppress(queue.Empty):
-                answers.get(timeout=5)  # a run that is not ended would use the session while the process ends
-            raise
-        try:
-            if isinstance(answer, Exception):
-                raise answer
+            answer = _interruptible(lambda: self.session.run(names, feed, options), lambda: setattr(options, "terminate", True))
             return [np.asarray(output) for output in answer]
         except Exception as e:  # onnxruntime's errors share no base but Exception
             shape = " x ".join(map(str, images[0].shape))

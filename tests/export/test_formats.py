@@ -5,6 +5,7 @@ import gzip
 import importlib.util
 import io
 import json
+import re
 import struct
 import sys
 import warnings
@@ -174,6 +175,16 @@ def test_a_half_turn_turns_colours_and_shapes(axis):
         assert torch.allclose(before, after, atol=1e-5)
     for name, array in half_turn(turned, axis).items():
         assert np.array_equal(array, made[name])
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".glb", ".gltf", ".splat"])
+def test_the_page_names_the_bytes_of_a_gaussian(suffix, tmp_path):
+    """Of formats whose size does not depend on the values."""
+    n, path = 10_000, tmp_path / f"a{suffix}"
+    write_gaussians(path, model(n), units="file")
+    page = (Path(__file__).parents[2] / "docs" / "formats.md").read_text("utf-8")
+    named = re.search(rf"^\| `{re.escape(suffix)}` \|[^|]*\|[^|]*\| (\d+) \|", page, re.MULTILINE)
+    assert abs(path.stat().st_size / n - int(named[1])) < 1
 
 
 def test_axes_on_disk(tmp_path):

@@ -1,5 +1,8 @@
 import os
+import re
 import struct
+import warnings
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -217,6 +220,21 @@ def test_gaussians_with_bad_numbers_are_left_out(tmp_path, own):
         with pytest.warns(UserWarning, match=r"4 of 7 Gaussians left out.*\(f_rest_11 of Gaussian 1 is not finite") as caught:
             back = read(path)
         assert len(caught) == 1 and caught[0].filename == __file__ and torch.equal(back.means, model.means[[0, 3, 6]])
+
+
+@pytest.mark.parametrize("n,final", [(200, True), (200, False), (50, True)])
+def test_final_opacities_and_lengths_get_a_note(tmp_path, n, final):
+    """Some programs store them in place of logits and logarithms; a few Gaussians may have such numbers by chance."""
+    model, path = make(n), tmp_path / "a.ply"
+    if final:
+        model = replace(model, logit_opacities=model.logit_opacities.sigmoid(), log_scales=model.log_scales.exp())
+    write_ply(path, model, Normalization())
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        back = read_ply(path)
+    assert torch.equal(back.log_scales, model.log_scales)
+    words = "all opacities are from 0.0.* to 0.9.* and all log scales above 0, as if stored after the sigmoid"
+    assert [bool(re.search(words, str(w.message))) for w in caught] == [True] * (final and n == 200)
 
 
 RESET_FREE_STEPS = [f"property float f_rest_{i}" for i in range(9)]

@@ -292,6 +292,43 @@ def test_names_are_matched_to_the_only_file_that_fits(kind, tmp_path):
         assert "0.jpg, 0.tif" in str([n for n in load_scene(tmp_path).notes if n.startswith("skipped")])
 
 
+FRAMES = {
+    "suffix": "images/{}.jpg", "case": "Images/{}.PNG", "absolute": "/home/me/images/{}.png", "other folder": "/home/me/{}.PNG",
+    "windows": r"C:\me\scan\images\{}.png", "outside": r"./..\data\scan\images/{}.png", "no suffix": "/home/me/images/{}",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", FRAMES)
+def test_names_of_frames_are_matched_to_the_only_file_that_fits(kind, tmp_path):
+    """And to none where two files fit, or two names one file; a file of exactly this name comes first."""
+    plain = load_scene(scenes.write_transforms(tmp_path))
+    stems = [PurePosixPath(name).stem for name in scenes.NAMES]
+    content = scenes.transforms_json()
+
+    def named(*names: str) -> list[str]:
+        for frame, name in zip(content["frames"], names):
+            frame["file_path"] = name
+        (tmp_path / "transforms.json").write_text(json.dumps(content))
+        return [v.name for v in load_scene(tmp_path).views]
+
+    names = [FRAMES[kind].format(stem) for stem in stems]
+    scenes.save_images(tmp_path / "images_2", scenes.NAMES, 8, 6)
+    assert named(*names) == [v.name for v in plain.views]
+    scene = load_scene(tmp_path)
+    assert scene.fingerprint == plain.fingerprint
+    assert scene.notes[0].startswith("5 images of transforms.json matched by their names")
+    assert scene.notes[0].endswith(f"({names[0]} is images/photo0.png)")
+    scenes.save(tmp_path / "images" / "photo1.bmp", scenes.image(4))
+    left = [v.name for v in plain.views if kind not in ("suffix", "case") or "photo1" not in v.name]
+    if kind == "other folder":
+        refused(tmp_path, r"frame 1: '/home/me/photo1.PNG' points outside the scene folder; .*--allow-outside")
+    else:
+        assert named(*names) == left
+    (tmp_path / "images" / "photo1.bmp").unlink()
+    if kind == "suffix":
+        assert named("images/photo0.tif", *names[:1], *names[2:]) == [v.name for v in plain.views][2:]
+
+
 @pytest.mark.parametrize("kind", scenes.WRITERS)
 def test_photographs_are_left_out_by_name_before_they_are_decoded(kind, tmp_path):
     root = scenes.WRITERS[kind](tmp_path)
@@ -325,6 +362,15 @@ def test_missing_photographs_are_skipped_and_all_named(kind, tmp_path):
         assert set().union(*scene.points.tracks) == {v.name for v in scene.views}
     refused(root, "2 of 5 .* have no image file: .*photo1.png.*photo3.png. Restore", strict=True)
     assert len(load_scene(root, strict=True, exclude="photo1, photo3.png").views) == 3
+
+
+@pytest.mark.parametrize(
+    "more", [*({"camera_model": m} for m in ("opencv", "PERSPECTIVE", "FULL_OPENCV")), {"sharpness": np.nan}]
+)
+def test_frames_of_other_programs_that_mean_the_same(more, tmp_path):
+    """Names of lenses that say nothing more, and a NaN that no scene needs."""
+    plain = load_scene(scenes.write_transforms(tmp_path / "a")).fingerprint
+    assert load_scene(scenes.write_transforms(tmp_path / "b", scenes.transforms_json(**more))).fingerprint == plain
 
 
 # Points of PLY files.

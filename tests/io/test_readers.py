@@ -36,9 +36,9 @@ class Cameras(Reader):
         return Probe("cameras.mem", self.missing) if (folder / "cameras.mem").is_file() else None
 
     def read(self, folder, options):
-        image = np.full((scenes.HEIGHT, scenes.WIDTH, 3), 0.5, np.float32)
+        images = [(scenes.image(i) / 255).astype(np.float32) for i in range(scenes.VIEWS)]
         cameras = [Camera(m, scenes.K, scenes.WIDTH, scenes.HEIGHT) for m in scenes.VIEWMATS]
-        views = [View(f"{9 - i}.png", c, image) for i, c in enumerate(cameras)]
+        views = [View(f"{9 - i}.png", c, images[i]) for i, c in enumerate(cameras)]
         return self.change(self.scene(folder, views, ["made in memory"], pixels=f"downscale {options.downscale}"))
 
 

@@ -239,6 +239,11 @@ DOUBTS = {
     "binary masks": ("0 and 1", r"1 image with a mask of the values 0 and 1, read as 0 and 255"),
     "empty mask": ("keep no", r"masks that keep no pixel, so that their views are left out .*--mask-keeps.*photo1.png \(1\)"),
     "equal": ("equal pixels", r"2 of 5 photographs have equal pixels, such as .*photo0.png and .*photo1.png"),
+    "blank": ("single colour", r"1 of 5 photographs have a single colour, such as .*photo1.png; leave them out \(--exclude\)"),
+    "focal length": (
+        "focal length",
+        r"the focal length of 5 of 5 views is over 100 times .*photo0.png: 2000 px at 16 x 12",
+    ),
     "none": ("no such words", ""),
 }
 """Words of the note of each case that no other case has, and the whole note."""
@@ -251,6 +256,8 @@ def doubtful(case: str, root) -> Scene:
         values |= {"k1": -9.0, "k2": 0.0}
     elif case == "principal point":
         values |= {"cx": 40.0}
+    elif case == "focal length":
+        values |= {"fl_x": 2000.0, "fl_y": 2000.0}
     elif case == "size":
         values |= {key: 4 * values[key] for key in ("w", "h", "fl_x", "fl_y", "cx", "cy")}
     elif case == "rotation":
@@ -261,6 +268,8 @@ def doubtful(case: str, root) -> Scene:
     mask[:, :8] = case == "binary masks"
     if "mask" in case:
         scenes.save(root / "masks" / "photo1.png", mask)
+    if case == "blank":
+        scenes.save(root / "images" / scenes.NAMES[1], np.full_like(scenes.image(0), (200, 30, 10)))
     if case == "equal":
         scenes.save(root / "images" / scenes.NAMES[1], scenes.image(0))
     return load_scene(root)

@@ -6,6 +6,7 @@ import re
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -197,25 +198,44 @@ def endless() -> bytes:
     return nw.model(nw.graph([loop], [yes], [nw.value("x", image)], [nw.value("y", image)]))
 
 
+def slow_to_load(count: int) -> bytes:
+    """Return a network with constants that take long to fold: matrices are multiplied while it is loaded."""
+    image = (1, 3, "h", "w")
+    products = [nw.node("MatMul", ["c", "r"], ["m0"])]
+    products += [nw.node("MatMul", [f"m{i}", "m0"], [f"m{i + 1}"]) for i in range(count)]
+    products += [nw.node("ReduceMean", [f"m{count}"], ["k"]), nw.node("Mul", ["x", "k"], ["y"])]
+    constants = [nw.tensor("c", np.full((2000, 1), 1 / 2000)), nw.tensor("r", np.ones((1, 2000)))]
+    return nw.model(nw.graph(products, constants, [nw.value("x", image)], [nw.value("y", image)]))
+
+
 RUN = """
 import sys
 import numpy as np
+import onnxruntime
 from warpgs.priors.networks import Network
 from warpgs.process import interrupting_signals
-network = Network(sys.argv[1])
+load = onnxruntime.InferenceSession
+def loading(*args, **kwargs):
+    print("loads", flush=True)
+    return load(*args, **kwargs)
 with interrupting_signals():
-    print("begins", flush=True)
+    onnxruntime.InferenceSession = loading
+    network = Network(sys.argv[1])
+    print("runs", flush=True)
     network.run(np.ones((4, 4, 3), np.float32))
 """
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_ends_an_endless_network(number, tmp_path):
-    path = nw.write(tmp_path / "m.onnx", endless())
+@pytest.mark.parametrize("state", ["loads", "runs"])
+def test_a_signal_ends_an_endless_network(number, state, tmp_path):
+    """While it is loaded, and while it runs."""
+    path = nw.write(tmp_path / "m.onnx", slow_to_load(2000) if state == "loads" else endless())
     with subprocess.Popen(
         [sys.executable, "-c", RUN, path], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     ) as child:
-        assert child.stdout.readline() == "begins\n"
+        assert child.stdout.readline() == "loads\n" and (state == "loads" or child.stdout.readline() == "runs\n")
+        time.sleep(1)  # so that the work outside Python has begun
         child.send_signal(number)
         try:
             assert "KeyboardInterrupt" in child.communicate(timeout=60)[1]

@@ -350,6 +350,9 @@ OPAQUE = 30.0
 FLAT = math.log(1e-37)
 """Log scale that replaces minus infinity, an axis of length 0: float32 still holds its exponential."""
 
+LEAST_JUDGED = 100
+"""Least number of Gaussians from whose ranges of values a note is made."""
+
 _POSITION = ("x", "y", "z")
 _DC = ("f_dc_0", "f_dc_1", "f_dc_2")
 _SCALE = ("scale_0", "scale_1", "scale_2")
@@ -565,6 +568,13 @@ def _assemble(
         arrays["means"][part] = columns(_POSITION, shift=middle)
         arrays["log_scales"][part] = columns(_SCALE, least=FLAT)
         arrays["logit_opacities"][part] = columns(["opacity"], -OPAQUE, OPAQUE)[:, 0]
+    logits, scales = arrays["logit_opacities"], arrays["log_scales"]
+    if n >= LEAST_JUDGED and logits.min() >= 0 and logits.max() <= 1 and scales.min() > 0:
+        notes.append(
+            f"{path}: all opacities are from {logits.min():.2g} to {logits.max():.2g} and all log scales above 0, as if stored "
+            "after the sigmoid and the exponential; they are read as logits and logarithms. If images are foggy, export the "
+            "model again without activations"
+        )
     return usable(path, arrays, bad, next(iter(reasons), ""), lambda: strict, notes, ply_error), origin + middle
 
 

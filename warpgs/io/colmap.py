@@ -5,13 +5,11 @@ Other files of a reconstruction (rigs, frames, project.ini) hold nothing that a 
 
 from __future__ import annotations
 
-import re
 import struct
-import unicodedata
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path, PurePosixPath, PureWindowsPath
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 
@@ -23,8 +21,12 @@ from warpgs.io.folder import (
     SceneFolder,
     ViewList,
     about,
+    by_key,
     has_folder,
+    is_absolute,
+    matched_note,
     missing_note,
+    name_key,
     quat_rotation,
     register,
     rigid,
@@ -406,23 +408,6 @@ def image_base(root: Path, model: Path) -> str | None:
     return None
 
 
-def _key(name: str) -> str:
-    """Return a name without suffix, with / between folders, in one spelling of its letters."""
-    plain = re.sub(r"(?<=[^/])\.[^./]*$", "", name.replace("\\", "/"))
-    return unicodedata.normalize("NFC", plain).casefold()
-
-
-def _by_key(files: dict[Path, str]) -> dict[str, Path]:
-    """Return the files by the key of their names, without those that share one."""
-    keys = {path: _key(name) for path, name in files.items()}
-    counts = Counter(keys.values())
-    return {key: path for path, key in keys.items() if counts[key] == 1}
-
-
-def _is_absolute(name: str) -> bool:
-    return PurePosixPath(name).is_absolute() or PureWindowsPath(name).is_absolute()
-
-
 def _image_paths(
     scene: SceneFolder, images: Path, base: str, names: list[str], files: list[Path], where: str
 ) -> tuple[dict[str, Path], list[str]]:
@@ -432,26 +417,26 @@ def _image_paths(
     name, if only one file fits. Files of reduced images (images_8) may also have other names (LLFF's image000.png): they are
     matched in sorted order if the counts agree.
     """
-    outside = {n for n in names if _is_absolute(n) and not (scene.options.allow_outside and (images / n).is_file())}
+    outside = {n for n in names if is_absolute(n) and not (scene.options.allow_outside and (images / n).is_file())}
     paths = {n: scene.child(images, n, where) for n in names if n not in outside}
     used = {n: p for n, p in paths.items() if p.is_file()}
     lost, taken = [n for n in names if n not in used], set(used.values())
     if not lost:
         return paths, []
     free = {p: p.relative_to(images).as_posix() for p in files if p not in taken}
-    by_path, by_name = _by_key(free), _by_key({p: p.name for p in free})
+    by_path, by_name = by_key(free), by_key({p: p.name for p in free})
     found: dict[str, Path] = {}
     for n in lost:
         plain = n.replace("\\", "/").removeprefix("./")
         inner = plain.removeprefix(f"{base}/")
         if n in outside:
-            match = by_name.get(_key(plain.rpartition("/")[2]))
+            match = by_name.get(name_key(plain.rpartition("/")[2]))
         elif inner != plain and (images / inner).is_file():
             match = scene.child(images, inner, where)
         elif images == scene.root / base and (scene.root / plain).is_file():
             match = scene.child(scene.root, plain, where)
         else:
-            match = by_path.get(_key(plain)) or by_path.get(_key(inner))
+            match = by_path.get(name_key(plain)) or by_path.get(name_key(inner))
         if match is not None:
             found[n] = match
     claims = Counter(found.values())
@@ -462,10 +447,7 @@ def _image_paths(
         order = f"images of {images.name} matched in sorted order, because their names differ"
         return pairs, [f"{order} ({min(names)} is {pairs[min(names)].name})"]
     paths |= {n: scene.child(images, n, where) for n in outside if n not in found}  # refuses those that point outside
-    first = min(found, default="")
-    some = f"{len(found)} image{'s' if len(found) != 1 else ''} of {images.name} matched by their names without"
-    note = f"{some} suffix, case or folder ({first} is {found[first].relative_to(scene.root)})" if found else ""
-    return paths | found, [note] if note else []
+    return paths | found, matched_note(found, images.name, scene.root)
 
 
 @register("colmap")
@@ -513,7 +495,7 @@ class ColmapReader(Reader):
         named: dict[str, str] = {}  # names of the views by name of the reconstruction
         for name, lens, viewmat in posed_lenses(poses, lenses, file):
             path = paths[name]
-            view = view_name(path.relative_to(images).as_posix() if _is_absolute(name) and images in path.parents else name)
+            view = view_name(path.relative_to(images).as_posix() if is_absolute(name) and images in path.parents else name)
             if options.excludes(view):
                 continue
             if not path.is_file():

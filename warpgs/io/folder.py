@@ -6,10 +6,11 @@ import abc
 import math
 import posixpath
 import re
+import unicodedata
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from pathlib import Path, PurePosixPath
+from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any, ClassVar
 
 import numpy as np
@@ -381,6 +382,33 @@ def resampling_note(downscale: int) -> list[str]:
     return [f"images area-resampled by {downscale}"] if downscale > 1 else []
 
 
+def name_key(name: str) -> str:
+    """Return a name without suffix, with / between folders, in one spelling of its letters."""
+    plain = re.sub(r"(?<=[^/])\.[^./]*$", "", name.replace("\\", "/"))
+    return unicodedata.normalize("NFC", plain).casefold()
+
+
+def by_key(files: dict[Path, str]) -> dict[str, Path]:
+    """Return the files by the key of their names, without those that share one."""
+    keys = {path: name_key(name) for path, name in files.items()}
+    counts = Counter(keys.values())
+    return {key: path for path, key in keys.items() if counts[key] == 1}
+
+
+def is_absolute(name: str) -> bool:
+    """Return whether a name is an absolute path, of this machine or of another one."""
+    return PurePosixPath(name).is_absolute() or PureWindowsPath(name).is_absolute()
+
+
+def matched_note(found: dict[str, Path], place: str, root: Path) -> list[str]:
+    """Return the note on names that another file than that of their spelling was ``found`` for; [] for none."""
+    if not found:
+        return []
+    first, count = min(found), f"{len(found)} image{'s' if len(found) != 1 else ''}"
+    how = "matched by their names without suffix, case or folder"
+    return [f"{count} of {place} {how} ({first} is {found[first].relative_to(root)})"]
+
+
 SHOWN = 100
 """Largest number of names in a note."""
 
@@ -396,6 +424,8 @@ def missing_note(missing: list[str], total: int, noun: str, file: Path, strict: 
     if not missing:
         return []
     text = f"{len(missing)} of {total} {noun} have no image file: {listed(missing)}"
+    if count := sum(any("\ud800" <= letter <= "\udfff" for letter in name) for name in missing):
+        text += f" ({count} of the names are not UTF-8; rename the photographs to letters of ASCII, and find poses again)"
     if strict:
         raise DataError(f"{file}: {text}. Restore them, or leave out --strict to go on without them")
     return [f"skipped: {text}"]

@@ -531,6 +531,8 @@ def _exclusions(options: ReadOptions, names: list[str]) -> list[str]:
     return [f"left out by --exclude: {len(out)} image{'s' if len(out) != 1 else ''}: {listed(out)}"] if out else []
 
 
+MAX_FOCAL = 100
+"""Largest usual focal length as a multiple of the longer side: a field of view of 0.6 degrees."""
 MIN_BASELINE = 1e-3
 """Spread of the cameras, as a fraction of their distance from the points, below which parallax is less than a pixel."""
 
@@ -557,9 +559,21 @@ def doubtful_notes(views: list[View], points: PointCloud | None) -> list[str]:
             f"the principal point of {len(off)} of {len(views)} views is outside the image, as in {off[0].name}: {x:.0f}, "
             f"{y:.0f} of {off[0].camera.width} x {off[0].camera.height} px; the intrinsics may be those of another size"
         )
+    narrow = [v for v in views if not v.camera.K[0, 0] <= MAX_FOCAL * max(v.camera.width, v.camera.height)]
+    if narrow:
+        v = narrow[0]
+        notes.append(
+            f"the focal length of {len(narrow)} of {len(views)} views is over {MAX_FOCAL} times the longer side, as {v.name}: "
+            f"{v.camera.K[0, 0]:.0f} px at {v.camera.width} x {v.camera.height} px; calibrate again"
+        )
     equal: dict[bytes, list[str]] = {}
     for v in (v for v in views if v.image.min() < v.image.max()):  # views that show nothing are alike
         equal.setdefault(hashlib.sha256(np.ascontiguousarray(v.image).data).digest(), []).append(v.name)
+    blank = [v.name for v in views if not (v.image.min((0, 1)) < v.image.max((0, 1))).any()]
+    if blank:
+        notes.append(
+            f"{len(blank)} of {len(views)} photographs have a single colour, such as {blank[0]}; leave them out (--exclude)"
+        )
     same = [names for names in equal.values() if len(names) > 1]
     if same:
         count = sum(map(len, same))

@@ -5,7 +5,9 @@ from __future__ import annotations
 import functools
 import json
 import math
-from collections.abc import Callable, Iterator
+import posixpath
+from collections import Counter
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -21,20 +23,25 @@ from warpgs.io.folder import (
     SceneFolder,
     ViewList,
     about,
+    by_key,
     from_camera_to_world,
+    is_absolute,
+    matched_note,
     missing_note,
+    name_key,
     register,
     resampling_note,
     view_name_of,
 )
-from warpgs.io.images import BLACK, SUFFIXES, Lens, ReadOptions
+from warpgs.io.images import BLACK, SUFFIXES, Lens, ReadOptions, list_images
 from warpgs.io.maps import SUFFIXES as MAPS
 from warpgs.io.maps import NamedMaps
 from warpgs.scene import ORIGIN, Camera, PointCloud, Scene, View, checked_origin
 from warpgs.schema import SchemaError, check_depth, check_parts
 
 BLENDER_FILES = tuple(f"transforms_{split}.json" for split in ("train", "val", "test"))
-MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
+MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "FULL_OPENCV", "PERSPECTIVE")
+"""Lenses of the five distortion terms of OpenCV. FULL_OPENCV has no others here; PERSPECTIVE is nerfstudio's name for all."""
 FISHEYE = "OPENCV_FISHEYE"
 UNSUPPORTED_TERMS = ("k4", "k5", "k6", "is_fisheye", "fisheye_crop_radius")
 """Keys of lens models that the five distortion terms of OpenCV cannot express; for native lenses, a fisheye's k4 is read."""
@@ -43,6 +50,8 @@ MAX_BYTES = 32 * 2**20
 """Largest file [bytes]; ten thousand frames take about ten million bytes."""
 MAX_DEPTH = 16
 """Largest depth of nested lists and objects; real files have six."""
+MAX_FOLDERS = 16
+"""Largest number of names of a path that are compared with those in the scene folder."""
 
 
 def files_of(root: Path) -> list[Path]:
@@ -56,23 +65,19 @@ def is_blender(root: Path) -> bool:
     return not (root / "transforms.json").is_file() and bool(files_of(root))
 
 
-def _reject_constant(name: str):
-    raise ValueError(f"{name} is not a finite number")
-
-
-def _json(path: Path, fix: str, constants: Callable[[str], object] | None = None) -> Any:
+def _json(path: Path, fix: str) -> Any:
     """Return the values of a JSON file of bounded size."""
     try:
         text = read_file(path, None, MAX_BYTES, fix).decode("utf-8-sig", "surrogateescape")
         check_parts(text)
-        return json.loads(text, parse_constant=constants)
+        return json.loads(text)
     except (ValueError, RecursionError) as e:
         raise DataError(f"{path}: cannot be read as JSON ({str(e)[:80]}); {fix}") from e
 
 
 def read_json(path: Path) -> dict:
     """Return the parsed file with its list of frames."""
-    values = _json(path, "write it again", _reject_constant)
+    values = _json(path, "write it again")
     try:
         check_depth(values, MAX_DEPTH)
     except SchemaError as e:  # else the error message could not name its values
@@ -89,7 +94,7 @@ def _number(frame: dict, shared: dict, key: str) -> float | None:
         return None
     try:
         if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
-            raise ValueError(f"{key} is {value!r}, not a finite number")
+            raise ValueError(f"{key} is {value!r}, not a finite number; write it as one, without quotes")
     except OverflowError as e:
         raise ValueError(f"{key} is too large") from e
     return float(value)
@@ -97,7 +102,7 @@ def _number(frame: dict, shared: dict, key: str) -> float | None:
 
 def lens_of(frame: dict, shared: dict, width: int, height: int, where: str, native: bool = False) -> Lens:
     """Return the intrinsics of a frame; the frame's own values override the shared values of the file."""
-    model = str(frame.get("camera_model", shared.get("camera_model", "OPENCV")))
+    model = str(frame.get("camera_model", shared.get("camera_model", "OPENCV"))).upper()
     kept = ", or fit them with --lenses native" if not native else ""
     known = (*MODELS, FISHEYE) if native else MODELS
     if model not in known:
@@ -161,6 +166,47 @@ def _image_path(scene: SceneFolder, folder: Path, name: object, where: str) -> P
         return path
     candidates = [path.with_name(path.name + s) for s in SUFFIXES]
     return next((c for c in candidates if c.is_file()), candidates[0])
+
+
+def _inner_names(name: str) -> list[str]:
+    """Return the names in a scene folder that a name outside of it may mean: the ends of its path, longest first."""
+    parts = [p for p in posixpath.normpath(name.replace("\\", "/")).split("/")[-MAX_FOLDERS:] if p not in ("", ".", "..")]
+    ends = ["/".join(parts[i:]) for i in range(len(parts))]
+    ends += [f"images/{parts[-1]}"] if parts else []
+    return [e if Path(e).suffix.lower() in SUFFIXES else f"{e}.png" for e in ends]
+
+
+def _image_paths(scene: SceneFolder, file: Path, frames: list[Any]) -> tuple[dict[str, Path], list[str]]:
+    """Return the image file by name of the frames, and notes for the user; missing files keep the path of their name.
+
+    Names without a file are matched without suffix and case, and those of another machine by the end of their path, if only
+    one file fits.
+    """
+    folder, paths, refused = file.parent, dict[str, Path](), dict[str, DataError]()
+    for number, frame in enumerate(frames):
+        where = f"{file}, frame {number}"
+        if not isinstance(frame, dict):
+            raise DataError(f"{where}: expected an object with file_path and transform_matrix; write the file again")
+        name = frame.get("file_path")
+        try:
+            paths[name] = _image_path(scene, folder, name, where)
+        except DataError as e:
+            if not isinstance(name, str):
+                raise
+            refused[name] = e
+    taken = {p for p in paths.values() if p.is_file()}
+    lost = [*(n for n, p in paths.items() if p not in taken), *refused]
+    files = {p: p.relative_to(folder).as_posix() for p in list_images(folder)} if lost else {}
+    found, fits = dict[str, Path](), by_key({p: n for p, n in files.items() if p not in taken})
+    for n in lost:
+        names = _inner_names(n) if n in refused or is_absolute(n) else [view_name_of(paths[n], folder)]
+        matches = [folder / e if folder / e in files else fits.get(name_key(e)) for e in names]
+        found |= dict([(n, p) for p in matches if p is not None][:1])
+    claims = Counter(found.values())
+    found = {n: p for n, p in found.items() if claims[p] == 1 and p not in taken}
+    if still := [e for n, e in refused.items() if n not in found]:
+        raise still[0]
+    return paths | found, matched_note(found, file.name, scene.root)
 
 
 def _named_maps(scene: SceneFolder, folder: Path, shared: dict, frame: dict, where: str) -> NamedMaps:
@@ -255,11 +301,10 @@ class TransformsReader(Reader):
             shared = read_json(scene.inside(file))
             total += len(shared["frames"])
             origin = _origin(shared, str(file))
+            paths, matched = _image_paths(scene, file, shared["frames"])
+            notes += matched
             for number, frame in enumerate(shared["frames"]):
-                where = f"{file}, frame {number}"
-                if not isinstance(frame, dict):
-                    raise DataError(f"{where}: expected an object with file_path and transform_matrix; write the file again")
-                path = _image_path(scene, file.parent, frame.get("file_path"), where)
+                where, path = f"{file}, frame {number}", paths[frame["file_path"]]
                 if options.excludes(view_name_of(path, folder)):
                     continue
                 if not path.is_file():
@@ -269,7 +314,10 @@ class TransformsReader(Reader):
                 where = f"{where} ({name})"
                 viewmat = about(from_camera_to_world(matrix_of(frame, where), where, opengl=True), origin)
                 if frame.get("mask_path"):
-                    mask = scene.mask(scene.child(file.parent, frame["mask_path"], f"{where}, mask", root=folder))
+                    mask_file = scene.child(file.parent, frame["mask_path"], f"{where}, mask", root=folder)
+                    if not mask_file.is_file():
+                        raise DataError(f"{where}: its mask {mask_file} is missing; restore it, or remove mask_path")
+                    mask = scene.mask(mask_file)
                 else:
                     mask = scene.find_mask(path, folder / "images")
                 lens = functools.partial(lens_of, frame, shared, where=where, native=options.lenses == "native")
