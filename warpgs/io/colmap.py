@@ -525,7 +525,7 @@ class ColmapReader(Reader):
         unposed = len(set(files) - set(paths.values()))
         if unposed:
             notes.append(f"{unposed} files in {images.name} have no pose in the reconstruction and are left out")
-        notes += missing_note(missing, len(poses), "images", file, options.strict) + views.notes(options)
+        notes += missing_note(missing, len(poses), "images", file, options.strict) + views.notes(options) + scene.mask_notes()
         there = {v.name for v in views.views}  # without those that are left out
         names = {n: named[p[0]] for n, p in poses.items() if named.get(p[0]) in there}
         points, more = self._points(scene, model, kind, names)

@@ -281,7 +281,7 @@ class TransformsReader(Reader):
         notes += missing_note(missing, total, "frames", files_of(folder)[0], options.strict)
         if outside := sum(v.name.startswith("outside/") for v in views.views):
             notes.append(f"{outside} images are outside the scene folder; their views are named outside/...")
-        notes += resampling_note(options.downscale) + views.notes(options)
+        notes += resampling_note(options.downscale) + views.notes(options) + scene.mask_notes()
         pixels = scene.pixel_source(by_folder=False)
         return self.scene(folder, views.views, notes, background=background, pixels=pixels, points=points)
 
