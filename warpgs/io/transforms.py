@@ -196,9 +196,11 @@ def _points(scene: SceneFolder, file: Path, shared: dict, views: list[View]) -> 
         return None, f"no points to start from: {e}"
     if not path.is_file():
         return None, f"{str(name)[:80]} is missing, so there are no points to start from"
-    points = colmap.read_ply_points(path)
+    bad: list[str] | None = None if scene.options.strict else []
+    points = colmap.read_ply_points(path, bad)
+    taken = "; ".join([f"points taken from {path.name}", *(bad or [])])
     if shared.get("applied_transform") is None or not len(points):
-        return points, f"points taken from {path.name}"
+        return points, taken
     matrix = matrix_of({"transform_matrix": shared["applied_transform"]}, f"{file}, applied_transform")[:3]
     try:
         scale = _number({}, shared, "applied_scale")
@@ -207,8 +209,8 @@ def _points(scene: SceneFolder, file: Path, shared: dict, views: list[View]) -> 
     moved = (1.0 if scale is None else scale) * (matmul(points.points, matrix[:, :3].T) + matrix[:, 3])
     other = PointCloud(moved, points.colors)
     if _disagreement(other, views) < CLEARLY * _disagreement(points, views):
-        return other, f"points taken from {path.name}, moved by applied_transform, since the colours of the images agree then"
-    return points, f"points taken from {path.name}, without applied_transform, since the colours of the images agree so"
+        return other, f"{taken}, moved by applied_transform, since the colours of the images agree then"
+    return points, f"{taken}, without applied_transform, since the colours of the images agree so"
 
 
 CLEARLY = 0.8
