@@ -15,6 +15,7 @@ from warpgs.geometry import project_points
 from warpgs.io.load import load_scene, split_views
 from warpgs.pipeline.metrics.scores import counted_region
 from warpgs.poses.find import needs_poses
+from warpgs.scene import base_coefficients
 
 # The same cameras and images give the same scene, whatever the format.
 
@@ -373,6 +374,7 @@ def test_points_of_a_ply_file_are_read(form, kind, tmp_path):
     np.testing.assert_allclose(points.points / n.scale + n.offset, CLOUD, atol=1e-9)
     np.testing.assert_allclose(points.colors, 127 / 255 if kind is None else colors / 255, atol=1e-6)
     assert points.tracks is None and "points taken from points3D.ply, because points3D.bin is missing" in scene.notes
+    assert ("they have no colours and start gray" in scene.notes) == (kind is None)
 
 
 @pytest.mark.parametrize(
@@ -396,6 +398,21 @@ def test_malformed_ply_files(data, message, tmp_path):
     (tmp_path / "sparse" / "0" / "points3D.bin").unlink()
     (tmp_path / "sparse" / "0" / "points3D.ply").write_bytes(data)
     refused(tmp_path, message)
+
+
+@pytest.mark.parametrize("names", ["diffuse_red diffuse_green diffuse_blue", "f_dc_0 f_dc_1 f_dc_2", "label part segment"])
+def test_colours_of_points_have_other_names(names, tmp_path):
+    """Of MeshLab and of Gaussians, whose positions and colours may be where a fit starts; without colours there is a note."""
+    colors = cloud_colors()
+    data = ply(CLOUD, base_coefficients(colors / 255), kind="double") if "f_dc" in names else ply(CLOUD, colors)
+    for old, new in zip(("red", "green", "blue"), names.split()):
+        data = data.replace(f" {old}\n".encode(), f" {new}\n".encode())
+    scenes.write_transforms(tmp_path, scenes.transforms_json(ply_file_path="pc.ply"))
+    (tmp_path / "pc.ply").write_bytes(data)
+    scene = load_scene(tmp_path)
+    gray = "label" in names
+    np.testing.assert_allclose(scene.points.colors, 127 / 255 if gray else colors / 255, atol=1e-6)
+    assert f"points taken from pc.ply{'; they have no colours and start gray' if gray else ''}" in scene.notes
 
 
 @pytest.mark.parametrize("stored", ["with the transform", "without it", "no transform"])

@@ -32,7 +32,7 @@ from warpgs.io.folder import (
     view_name,
 )
 from warpgs.io.images import SUFFIXES, Lens, ReadOptions, list_images
-from warpgs.scene import ORIGIN, PointCloud, Scene, checked_origin
+from warpgs.scene import ORIGIN, PointCloud, Scene, base_colors, checked_origin
 
 MODELS = {0: ("SIMPLE_PINHOLE", 3), 1: ("PINHOLE", 4), 2: ("SIMPLE_RADIAL", 4), 3: ("RADIAL", 5), 4: ("OPENCV", 8)}
 """Name and number of parameters by model number."""
@@ -341,6 +341,9 @@ PLY_TYPES = {
 }  # fmt: skip
 PLY_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 
+COLORS = [c.split() for c in ("red green blue", "r g b", "diffuse_red diffuse_green diffuse_blue", "f_dc_0 f_dc_1 f_dc_2")]
+"""Names of the colours of points; the last are coefficients of Gaussians."""
+
 
 def read_ply_points(path: Path, notes: list[str] | None = None) -> PointCloud:
     """Return the points of a PLY file, text or binary; points without colours are gray, and no views are known.
@@ -370,9 +373,13 @@ def read_ply_points(path: Path, notes: list[str] | None = None) -> PointCloud:
             values = dict(zip(kinds, words.reshape(count, len(kinds)).T))
     except (ValueError, KeyError, IndexError, OverflowError, StopIteration) as e:
         raise DataError(f"{path}: the points cannot be understood ({e}); export them again as PLY, or remove the file") from e
-    rgb = next((c for c in (("red", "green", "blue"), ("r", "g", "b")) if kinds.keys() >= set(c)), ())
+    rgb = next((c for c in COLORS if kinds.keys() >= set(c)), [])
     colors = np.stack([values[c] for c in rgb], 1) if rgb else np.full((count, 3), 127.0)
-    if rgb and kinds[rgb[0]] == "u2":
+    if not rgb and notes is not None:
+        notes.append("they have no colours and start gray")
+    if "f_dc_0" in rgb:
+        colors = 255 * np.asarray(base_colors(colors[:, None]))
+    elif rgb and kinds[rgb[0]] == "u2":
         colors = colors / 257
     elif rgb and kinds[rgb[0]][0] == "f" and colors.size and colors.max() <= 1:
         colors = colors * 255
