@@ -302,7 +302,8 @@ def read_cameras(path: Path) -> tuple[dict[str, Camera], list[str]]:
         rows = _colmap(path)
     else:
         values = _json(path, "check the path, or write the file again")
-        rows = _inria(path, values) if isinstance(values, list) else _transforms(path)
+        drawn = isinstance(values, dict) and isinstance(values.get("camera_path"), list)
+        rows = _inria(path, values) if isinstance(values, list) else _drawn(path, values) if drawn else _transforms(path)
     found: dict[str, Camera] = {}
     numbers: dict[str, int] = {}
     bent = 0
@@ -343,6 +344,25 @@ def _inria(path: Path, rows: list[Any]) -> Iterator[Row]:
         except (KeyError, TypeError, ValueError, OverflowError, AttributeError) as e:
             raise DataError(f"{where}: needs rotation, position, width, height, fx and fy as numbers; correct the entry") from e
         yield name, about(from_camera_to_world(pose, where, opengl=False), origin), lens.checked(where)
+
+
+def _drawn(path: Path, values: dict[str, Any]) -> Iterator[Row]:
+    """Yield the cameras of a path of nerfstudio's viewer: camera-to-world in OpenGL axes, vertical field of view [deg]."""
+    if (kind := values.get("camera_type", "perspective")) != "perspective":
+        raise DataError(f"{path}: camera_type is {str(kind)[:40]}, but renders are pinholes; export a perspective path")
+    for i, frame in enumerate(values["camera_path"]):
+        where = f"{path}, camera_path {i}"
+        try:
+            pose = np.array(frame["camera_to_world"], np.float64).reshape(4, 4)
+            width, height, fov = int(values["render_width"]), int(values["render_height"]), float(frame["fov"])
+            if not 0 < fov < 180:
+                raise ValueError("fov")
+        except (KeyError, TypeError, ValueError, OverflowError) as e:
+            needs = "camera_to_world (16 numbers), fov, and render_width and render_height of the file"
+            raise DataError(f"{where}: needs {needs}; export the path again") from e
+        focal = 0.5 * height / math.tan(0.5 * math.radians(fov))
+        lens = Lens(np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]]), width, height)
+        yield f"{i:05d}", from_camera_to_world(pose, where, opengl=True), lens.checked(where)
 
 
 def _transforms(path: Path) -> Iterator[Row]:
