@@ -236,6 +236,16 @@ def transform_in_place(arrays: Arrays, matrix: np.ndarray, offset: np.ndarray) -
         arrays["sh"][part] = turned.sh.numpy()
 
 
+FLATTEST = -20.0
+"""Least log scale that a format with steps stores, or as far below the largest: 2e-9 of a length is nothing to see, as in
+splat-transform. Lower ones, of axes without length, would take the steps of the others."""
+
+
+def with_least_scale(log_scales: np.ndarray) -> np.ndarray:
+    """Return log scales [N, 3], at least `FLATTEST`."""
+    return np.maximum(log_scales, min(FLATTEST, float(log_scales.max()) + FLATTEST), dtype=log_scales.dtype)
+
+
 def rounded(values: np.ndarray, most: int) -> np.ndarray:
     """Return values [N, ...] rounded to integers and clamped to 0 .. ``most``, int64."""
     return np.clip(np.floor(values + 0.5), 0, most).astype(np.int64)

@@ -35,6 +35,7 @@ from warpgs.export.base import (
     smallest_three,
     usable,
     warn_of_antialiasing,
+    with_least_scale,
 )
 from warpgs.files import writing
 from warpgs.geometry import checked_normalization
@@ -161,7 +162,7 @@ def encode(arrays: Arrays, antialiased: bool, origin: np.ndarray | None = None) 
     chunks = np.arange(n) // CHUNK
     colors = base_colors(arrays["sh"][:, :1].astype(np.float64))
     bounds, fractions = [], []
-    for values in (arrays["means"], arrays["log_scales"], colors):
+    for values in (arrays["means"], with_least_scale(arrays["log_scales"]), colors):
         starts = np.arange(0, n, CHUNK)
         low = np.minimum.reduceat(values, starts).astype("<f4")
         high = np.maximum.reduceat(values, starts).astype("<f4")
