@@ -216,6 +216,10 @@ def test_names_say_the_format(tmp_path):
     assert format_of("A.Compressed.PLY").name == "compressed_ply" and format_of("a.b.ply").name == "ply"
     with pytest.raises(UsageError, match=r"format \.obj is not supported; use one of"):
         format_of("a.obj")
+    (tmp_path / "meta.json").touch()
+    for unpacked in (tmp_path, tmp_path / "meta.json"):
+        with pytest.raises(UsageError, match="is an unpacked SOG model; pack its folder into one file, with `zip -j"):
+            read_gaussians(unpacked)
     with pytest.raises(DataError, match="holds no Gaussian"):
         write_gaussians(tmp_path / "a.sog", model(n=0), units="file")
     with pytest.raises(DataError, match="cannot be read"):

@@ -57,6 +57,9 @@ def test_scenes_without_images(kind, lack, tmp_path):
     scenes.WRITERS[kind](tmp_path)
     (tmp_path / lack).rename(tmp_path / "elsewhere")
     refused(tmp_path, rf"lacks its image folder, {lack}")
+    (tmp_path / lack).mkdir()
+    (tmp_path / lack / "photo0.exr").write_bytes(b"v/1\1")
+    refused(tmp_path, r"missing, or without images \(JPEG, PNG, .*\); put|but .* holds 0 images")
 
 
 # ---- COLMAP, binary --------------------------------------------------------------------------------------------------

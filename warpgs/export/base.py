@@ -243,7 +243,8 @@ splat-transform. Lower ones, of axes without length, would take the steps of the
 
 def with_least_scale(log_scales: np.ndarray) -> np.ndarray:
     """Return log scales [N, 3], at least `FLATTEST`."""
-    return np.maximum(log_scales, min(FLATTEST, float(log_scales.max()) + FLATTEST), dtype=log_scales.dtype)
+    raised: np.ndarray = np.maximum(log_scales, min(FLATTEST, float(log_scales.max()) + FLATTEST), dtype=log_scales.dtype)
+    return raised
 
 
 def rounded(values: np.ndarray, most: int) -> np.ndarray:
@@ -523,6 +524,9 @@ def format_of(path: str | os.PathLike[str], choice: str | type[Format] | Format 
     name = Path(path).name.lower()
     if name.endswith(".htm"):
         raise UsageError(f"{path}: format .htm is not supported; did you mean {path}l?")
+    if name == "meta.json" or (Path(path) / "meta.json").is_file():
+        pack = "zip -j scene.sog FOLDER/meta.json FOLDER/*.webp"
+        raise UsageError(f"{path}: is an unpacked SOG model; pack its folder into one file, with `{pack}`, and give that")
     cameras = "; cameras are named cameras.json, transforms.json or sparse" if name.endswith(".json") else ""
     raise UsageError(
         f"{path}: format {Path(path).suffix or '(none)'} is not supported; use one of {', '.join(k.suffix for k in known)}, or "

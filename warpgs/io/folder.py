@@ -19,7 +19,7 @@ from warpgs.constants import POSE_TOLERANCE
 from warpgs.errors import DataError, UsageError, shortened
 from warpgs.files import inside, is_within
 from warpgs.geometry import matmul, nearest_rotation, rotation_matrices
-from warpgs.io.image_files import MAX_PIXELS, decode, unread_note
+from warpgs.io.image_files import MAX_PIXELS, READ, decode, unread_note
 from warpgs.io.images import BLACK, REDUCED, SUFFIXES, Lens, LoadedImage, ReadOptions, list_images, load_image
 from warpgs.io.maps import NOTHING_NAMED, GivenMaps, NamedMaps
 from warpgs.plugins import Registry
@@ -360,8 +360,8 @@ class SceneFolder:
             near = {p for place in places for p in place.iterdir() if p.name.casefold() in ("mask", "masks") and p.is_dir()}
             for other in sorted(near - {*self._masks}):
                 if list_images(other):
-                    names = (p.relative_to(self.root).as_posix() for p in (other, folder))
-                    notes.append("the folder {} is not read; masks are read from {}".format(*names))
+                    where, there = (p.relative_to(self.root).as_posix() for p in (other, folder))
+                    notes.append(f"the folder {where} is not read; masks are read from {there}")
             files = list_images(folder) if folder.is_dir() else []
             known = {_plain(p.relative_to(images).as_posix()) for p in list_images(images)} if files and unmasked else set()
             lone = [
@@ -394,7 +394,7 @@ class SceneFolder:
         sizes = ((p.name[len(folder.name) + 1 :], p) for p in folder.parent.glob(f"{folder.name}_*"))
         others = {int(n): p for n, p in sizes if n.isdecimal() and list_images(p)}
         if not others:
-            note = unread_note(folder) or "missing, or without images; put the images into it"
+            note = unread_note(folder) or f"missing, or without images ({READ}); put the images into it"
             raise DataError(f"{folder}: {note}")
         largest = others[min(others)]
         note = f"no full-size folder '{base}': images taken from {largest.name}{how and ', '}{how}"
