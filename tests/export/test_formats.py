@@ -34,7 +34,7 @@ from warpgs.export.base import (
 )
 from warpgs.export.gltf import linear
 from warpgs.export.meshes_and_cameras import rotation_to_y, write_mesh
-from warpgs.export.ply import read_ply
+from warpgs.export.ply import FLAT, read_ply
 from warpgs.geometry import rotation_matrices
 from warpgs.kernels.sh import basis
 from warpgs.pipeline.run.export import convert
@@ -108,6 +108,20 @@ def test_round_trip_is_within_the_quantum(suffix, degree, tmp_path):
         stored, back = read_gaussians(tmp_path / f"a{suffix}"), read_gaussians(tmp_path / f"a{suffix}", n, units="scene")
         assert torch.allclose(stored.means.double(), made.means.double() / 2 + torch.tensor([1.0, -2.0, 3.0]), atol=5e-3)
         assert torch.allclose(back.log_scales, made.log_scales, atol=0.05)
+
+
+@pytest.mark.parametrize("unit", [0.0, -40.0])
+@pytest.mark.parametrize("suffix,limit", [(".compressed.ply", 0.51 * 23 / 1023), (".sog", 0.03)])
+def test_an_axis_without_length_leaves_its_neighbours(suffix, limit, unit, tmp_path):
+    """Other programs write such Gaussians, which took the steps of the scales around them; at any unit of the file."""
+    made = arrays_of(model(degree=0))
+    made["log_scales"] = made["log_scales"] + np.float32(unit)
+    made["log_scales"][3, 1] = FLAT
+    write_gaussians(tmp_path / f"a{suffix}", gaussians_of(tmp_path, made), units="file")
+    back = arrays_of(read_gaussians(tmp_path / f"a{suffix}"))["log_scales"]
+    assert back[3, 1] < unit - 15
+    back[3, 1] = FLAT
+    assert np.abs(back - made["log_scales"]).max() <= limit
 
 
 @pytest.mark.parametrize("version", spz.VERSIONS)
@@ -213,6 +227,10 @@ def test_names_say_the_format(tmp_path):
     assert format_of("A.Compressed.PLY").name == "compressed_ply" and format_of("a.b.ply").name == "ply"
     with pytest.raises(UsageError, match=r"format \.obj is not supported; use one of"):
         format_of("a.obj")
+    (tmp_path / "meta.json").touch()
+    for unpacked in (tmp_path, tmp_path / "meta.json"):
+        with pytest.raises(UsageError, match="is an unpacked SOG model; pack its folder into one file, with `zip -j"):
+            read_gaussians(unpacked)
     with pytest.raises(DataError, match="holds no Gaussian"):
         write_gaussians(tmp_path / "a.sog", model(n=0), units="file")
     with pytest.raises(DataError, match="cannot be read"):

@@ -14,7 +14,7 @@ from warpgs.errors import DataError, ResourceError
 from warpgs.export.base import read_gaussians, write_gaussians
 from warpgs.export.ply import MAX_HEADER_BYTES, read_ply, write_ply
 from warpgs.pipeline.run.export import convert
-from warpgs.scene import Gaussians, Normalization
+from warpgs.scene import Gaussians, Normalization, base_colors
 
 
 def make(n=7, degree=3, seed=0):
@@ -197,6 +197,27 @@ def test_files_of_other_programs(tmp_path, form, eol):
     back = read_ply(path)
     for name, tensor in model.tensors().items():
         assert torch.equal(getattr(back, name), tensor), name
+
+
+@pytest.mark.parametrize("form", ["ascii", "binary_little_endian", "binary_big_endian"])
+@pytest.mark.parametrize("rest", [0, 9])
+def test_colours_in_bytes(tmp_path, form, rest):
+    """Nerfstudio and others write red, green and blue in the place of f_dc; where both stand, f_dc is the colour."""
+    kinds = {n: "u1" if n in ("red", "green", "blue") else "f4" for n in ("x", "y", "z", "red", "green", "blue")}
+    kinds |= dict.fromkeys([*(f"f_rest_{i}" for i in range(rest)), *NAMES[6:]], "f4")
+    rows = np.ones(2, [(n, {"binary_big_endian": ">"}.get(form, "<") + k) for n, k in kinds.items()])
+    rows["red"], rows["green"], rows["blue"] = (0, 255), (51, 102), (255, 0)
+    words = {"u1": "uchar", "f4": "float"}
+    lines = ["ply", f"format {form} 1.0", "element vertex 2", *(f"property {words[k]} {n}" for n, k in kinds.items())]
+    text = "".join(" ".join(f"{v:g}" for v in row) + "\n" for row in rows.tolist()).encode()
+    path = tmp_path / "a.ply"
+    path.write_bytes("\n".join([*lines, "end_header\n"]).encode() + (text if form == "ascii" else rows.tobytes()))
+    gaussians = read_ply(path)
+    wanted = torch.tensor([[0, 0.2, 1], [1, 0.4, 0]])
+    assert torch.allclose(base_colors(gaussians.sh), wanted, atol=1e-6) and gaussians.sh.shape[1] == 1 + rest // 3
+    path.write_bytes(path.read_bytes().replace(b"uchar red", b"char red"))
+    with pytest.raises(DataError, match="properties missing: f_dc_0, f_dc_1, f_dc_2"):
+        read_ply(path)
 
 
 @pytest.mark.parametrize("own", [False, True])

@@ -13,8 +13,10 @@ from warpgs import geometry
 from warpgs.errors import DataError, UsageError
 from warpgs.geometry import project_points
 from warpgs.io.load import load_scene, split_views
+from warpgs.io.transforms import read_cameras
 from warpgs.pipeline.metrics.scores import counted_region
 from warpgs.poses.find import needs_poses
+from warpgs.scene import base_coefficients
 
 # The same cameras and images give the same scene, whatever the format.
 
@@ -419,6 +421,7 @@ def test_points_of_a_ply_file_are_read(form, kind, tmp_path):
     np.testing.assert_allclose(points.points / n.scale + n.offset, CLOUD, atol=1e-9)
     np.testing.assert_allclose(points.colors, 127 / 255 if kind is None else colors / 255, atol=1e-6)
     assert points.tracks is None and "points taken from points3D.ply, because points3D.bin is missing" in scene.notes
+    assert ("they have no colours and start gray" in scene.notes) == (kind is None)
 
 
 @pytest.mark.parametrize(
@@ -442,6 +445,21 @@ def test_malformed_ply_files(data, message, tmp_path):
     (tmp_path / "sparse" / "0" / "points3D.bin").unlink()
     (tmp_path / "sparse" / "0" / "points3D.ply").write_bytes(data)
     refused(tmp_path, message)
+
+
+@pytest.mark.parametrize("names", ["diffuse_red diffuse_green diffuse_blue", "f_dc_0 f_dc_1 f_dc_2", "label part segment"])
+def test_colours_of_points_have_other_names(names, tmp_path):
+    """Of MeshLab and of Gaussians, whose positions and colours may be where a fit starts; without colours there is a note."""
+    colors = cloud_colors()
+    data = ply(CLOUD, base_coefficients(colors / 255), kind="double") if "f_dc" in names else ply(CLOUD, colors)
+    for old, new in zip(("red", "green", "blue"), names.split()):
+        data = data.replace(f" {old}\n".encode(), f" {new}\n".encode())
+    scenes.write_transforms(tmp_path, scenes.transforms_json(ply_file_path="pc.ply"))
+    (tmp_path / "pc.ply").write_bytes(data)
+    scene = load_scene(tmp_path)
+    gray = "label" in names
+    np.testing.assert_allclose(scene.points.colors, 127 / 255 if gray else colors / 255, atol=1e-6)
+    assert f"points taken from pc.ply{'; they have no colours and start gray' if gray else ''}" in scene.notes
 
 
 @pytest.mark.parametrize("stored", ["with the transform", "without it", "no transform"])
@@ -662,3 +680,51 @@ def test_one_view_that_differs_leaves_all_as_they_are(tmp_path):
         scenes.save(tmp_path / name, image)
         scene = load_scene(tmp_path)
         assert all(v.alpha is None for v in scene.views[:4]) and not any("object on black" in n for n in scene.notes)
+
+
+# Camera files of other programs.
+
+
+def viewer_path(**changes) -> dict:
+    """Return the cameras of the scenes as nerfstudio's viewer writes a path."""
+    fov = 2 * np.degrees(np.arctan(scenes.HEIGHT / 2 / scenes.FOCAL))
+    frames = [
+        {"camera_to_world": np.ravel(scenes.opengl(i)).tolist(), "fov": fov, "aspect": 4 / 3} for i in range(scenes.VIEWS)
+    ]
+    return {
+        "render_width": scenes.WIDTH,
+        "render_height": float(scenes.HEIGHT),
+        "keyframes": [],
+        "camera_path": frames,
+    } | changes
+
+
+def test_cameras_of_a_path_of_nerfstudio(tmp_path):
+    """Their field of view is vertical, and in degrees."""
+    path = tmp_path / "camera_path.json"
+    path.write_text(json.dumps(viewer_path(camera_type="perspective", fps=24)))
+    cameras, notes = read_cameras(path)
+    assert list(cameras) == [f"{i:05d}" for i in range(scenes.VIEWS)] and not notes
+    for camera, viewmat in zip(cameras.values(), scenes.VIEWMATS):
+        np.testing.assert_allclose(camera.viewmat, viewmat, atol=1e-12)
+        np.testing.assert_allclose(camera.K, scenes.K, atol=1e-12)
+        assert (camera.width, camera.height) == (scenes.WIDTH, scenes.HEIGHT)
+
+
+@pytest.mark.parametrize(
+    "changes,message",
+    [
+        ({"camera_type": "equirectangular"}, "camera_type is equirectangular, but renders are pinholes"),
+        ({"render_width": None}, "camera_path 0: needs camera_to_world .16 numbers., fov, and render_width"),
+        ({"camera_path": [{"camera_to_world": [1, 0], "fov": 50}]}, "camera_path 0: needs camera_to_world"),
+        ({"camera_path": [{"camera_to_world": np.eye(4).ravel().tolist(), "fov": 0}]}, "camera_path 0: needs .* fov"),
+        ({"camera_path": [{"camera_to_world": [2.0] * 16, "fov": 50}]}, "camera_path 0: the last row of the pose"),
+        ({"camera_path": ["images"]}, "camera_path 0: needs camera_to_world"),
+        ({"camera_path": []}, "holds no camera"),
+    ],
+)
+def test_paths_of_nerfstudio_that_cannot_be_used(changes, message, tmp_path):
+    path = tmp_path / "camera_path.json"
+    path.write_text(json.dumps(viewer_path(**changes)))
+    with pytest.raises(DataError, match=message):
+        read_cameras(path)

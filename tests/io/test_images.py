@@ -189,6 +189,49 @@ def test_masks_folder(name, keeps, tmp_path):
     assert (half == ((mask[::2, ::2] > 0) == (keeps == "white"))).all()
 
 
+NAMES_OF_MASKS = [
+    "photo0.jpg",
+    "PHOTO0.PNG",
+    "photo0_mask.png",
+    "photo0.mask.png",
+    "photo0.png.mask.png",
+    "photo0-mask.tif",
+    "photo0.JPG_mask.png",
+]
+
+
+@pytest.mark.parametrize("name", NAMES_OF_MASKS)
+def test_masks_by_the_names_of_other_programs(name, tmp_path):
+    """An exact name comes first, two files for one image are none, and an image may itself be called a mask."""
+    scenes.write_colmap(tmp_path, names=("photo0.png", "face_mask.png", "c.png", "d.png", "e.png"))
+    mask = np.zeros((12, 16), np.uint8)
+    mask[:, 4:] = 255
+    scenes.save(tmp_path / "masks" / name, mask)
+    views = {v.name: v for v in load_scene(tmp_path).views}
+    kept = views["photo0.png"].mask
+    assert kept is not None and np.abs(kept.astype(int) - (mask > 0)).sum() <= 12 and views["face_mask.png"].mask is None
+    scenes.save(tmp_path / "masks" / "face_mask.PNG", mask)
+    scenes.save(tmp_path / "masks" / "c.tif", mask)
+    scenes.save(tmp_path / "masks" / "c_mask.png", mask)
+    scenes.save(tmp_path / "masks" / "photo0.png", np.full_like(mask, 255))
+    scene = load_scene(tmp_path)
+    assert [v.name for v in scene.views if v.mask is not None and not v.mask.all()] == ["face_mask.png"]
+    assert [n for n in scene.notes if "masks" in n and "match" in n] == [
+        "2 of 5 files in masks match no image or several, such as c.tif; name a mask like its image: c.png or c.png.png"
+    ]
+
+
+@pytest.mark.parametrize("folder", ["Masks", "mask", "images/masks"])
+@pytest.mark.parametrize("write", [scenes.write_colmap, scenes.write_transforms, scenes.write_llff])
+def test_masks_that_are_not_read_are_a_note(write, folder, tmp_path):
+    write(tmp_path)
+    notes = load_scene(tmp_path).notes
+    assert not any("mask" in n for n in notes)
+    scenes.save(tmp_path / folder / "photo0.png", np.full((12, 16), 255, np.uint8))
+    if write is not scenes.write_llff or folder != "images/masks":  # there it is one image too many
+        assert f"the folder {folder} is not read; masks are read from masks" in load_scene(tmp_path).notes
+
+
 @pytest.mark.parametrize(
     "focal, distortion, downscale", [(20.0, (), 2), (60.0, (0.3, 0.0, 0.0, 0.0), 1), (60.0, (0.3, 0.0, 0.0, 0.0), 2)]
 )

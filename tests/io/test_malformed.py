@@ -57,6 +57,9 @@ def test_scenes_without_images(kind, lack, tmp_path):
     scenes.WRITERS[kind](tmp_path)
     (tmp_path / lack).rename(tmp_path / "elsewhere")
     refused(tmp_path, rf"lacks its image folder, {lack}")
+    (tmp_path / lack).mkdir()
+    (tmp_path / lack / "photo0.exr").write_bytes(b"v/1\1")
+    refused(tmp_path, r"missing, or without images \(JPEG, PNG, .*\); put|but .* holds 0 images")
 
 
 # ---- COLMAP, binary --------------------------------------------------------------------------------------------------
@@ -186,7 +189,64 @@ def patched_pose(tmp_path, **changes):
     ],
 )
 def test_broken_poses_in_text(changes, message, tmp_path):
-    refused(patched_pose(tmp_path, **changes), message)
+    refused(patched_pose(tmp_path, **changes), message, strict=True)
+
+
+NOT_FINITE = ["nan", "-nan(ind)", "inf", "1.#QNAN", "-1.#IND00"]
+
+
+@pytest.mark.parametrize("kind", ["txt", "bin"])
+@pytest.mark.parametrize("what", ["pose", "camera"])
+@pytest.mark.parametrize("number", NOT_FINITE)
+def test_images_without_a_finite_pose_or_camera_are_left_out(number, what, kind, tmp_path):
+    """Some programs write unaligned photographs so, on Windows in the spelling of its library."""
+    write, value = (scenes.write_colmap, scenes.write_colmap_txt)[kind == "txt"], np.inf if number == "inf" else np.nan
+    folder = write(tmp_path) / ("sparse/0" if kind == "bin" else "sparse")
+    images, cameras = folder / f"images.{kind}", folder / f"cameras.{kind}"
+    data = images.read_bytes()
+    if kind == "txt":
+        rows = data.decode().split("\n")
+        words = rows[5].split()
+        words[8], words[5:8] = ("2", words[5:8]) if what == "camera" else (words[8], [number] * 3)
+        rows[5] = " ".join(words)
+        images.write_text("\n".join(rows))
+        bad = " ".join([number] * 4) if what == "camera" else "20 20 8 6"
+        cameras.write_text(cameras.read_text() + f"2 PINHOLE 16 12 {bad}\n")
+    else:
+        end = data.index(b"photo2.png")
+        pose, camera = (b"", struct.pack("<i", 2)) if what == "camera" else (struct.pack("<3d", *[value] * 3), b"")
+        images.write_bytes(data[: end - (len(pose) + 4 if pose else 4)] + pose + (camera or data[end - 4 : end]) + data[end:])
+        lens = [value] * 4 if what == "camera" else [20, 20, 8, 6]
+        cameras.write_bytes(struct.pack("<Q", 2) + cameras.read_bytes()[8:] + struct.pack("<iiQQ4d", 2, 1, 16, 12, *lens))
+    scene = load_scene(tmp_path)
+    assert [v.name for v in scene.views] == [n for n in scenes.NAMES if n != "photo2.png"]
+    note = f"left out: 1 of 5 images of images.{kind} have a pose or camera that is not finite: photo2.png"
+    assert note in scene.notes and len(scene.points) == 3
+    refused(tmp_path, "the pose is not finite" if what == "pose" else r"camera 2: focal lengths \[(nan|inf)", strict=True)
+
+
+@pytest.mark.parametrize("kind", ["txt", "bin", "ply"])
+def test_points_that_are_not_finite_are_left_out(kind, tmp_path):
+    """With the others of the same track; strict refuses them."""
+    folder = (scenes.write_colmap_txt if kind == "txt" else scenes.write_colmap)(tmp_path)
+    path = folder / ("sparse" if kind == "txt" else "sparse/0") / f"points3D.{kind}"
+    if kind == "txt":
+        rows = path.read_text().split("\n")
+        rows[2] = " ".join(["2", "-nan(ind)", *rows[2].split()[2:]])
+        path.write_text("\n".join(rows))
+    elif kind == "bin":
+        data = bytearray(path.read_bytes())
+        data[16:24] = struct.pack("<d", np.nan)
+        path.write_bytes(data)
+    else:
+        path.with_suffix(".bin").unlink()
+        head = "ply\nformat ascii 1.0\nelement vertex 3\n" + "".join(f"property float {n}\n" for n in ("x", "y", "z", "nx"))
+        path.write_text(head + "end_header\n0 0 0 -nan(ind)\nnan 0 0 0\n0 1 0 0\n")
+    scene = load_scene(tmp_path)
+    assert len(scene.points) == 2 and np.isfinite(scene.points.points).all()
+    assert scene.points.tracks is None or len(scene.points.tracks) == 2
+    assert f"1 of 3 points of points3D.{kind} are not finite and are left out" in scene.notes
+    refused(tmp_path, rf"points3D.{kind}: 1 of 3 points are not finite", strict=True)
 
 
 @pytest.mark.parametrize(

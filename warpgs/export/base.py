@@ -236,6 +236,17 @@ def transform_in_place(arrays: Arrays, matrix: np.ndarray, offset: np.ndarray) -
         arrays["sh"][part] = turned.sh.numpy()
 
 
+FLATTEST = -20.0
+"""Least log scale that a format with steps stores, or as far below the largest: 2e-9 of a length is nothing to see, as in
+splat-transform. Lower ones, of axes without length, would take the steps of the others."""
+
+
+def with_least_scale(log_scales: np.ndarray) -> np.ndarray:
+    """Return log scales [N, 3], at least `FLATTEST`."""
+    raised: np.ndarray = np.maximum(log_scales, min(FLATTEST, float(log_scales.max()) + FLATTEST), dtype=log_scales.dtype)
+    return raised
+
+
 def rounded(values: np.ndarray, most: int) -> np.ndarray:
     """Return values [N, ...] rounded to integers and clamped to 0 .. ``most``, int64."""
     return np.clip(np.floor(values + 0.5), 0, most).astype(np.int64)
@@ -513,6 +524,9 @@ def format_of(path: str | os.PathLike[str], choice: str | type[Format] | Format 
     name = Path(path).name.lower()
     if name.endswith(".htm"):
         raise UsageError(f"{path}: format .htm is not supported; did you mean {path}l?")
+    if name == "meta.json" or (Path(path) / "meta.json").is_file():
+        pack = "zip -j scene.sog FOLDER/meta.json FOLDER/*.webp"
+        raise UsageError(f"{path}: is an unpacked SOG model; pack its folder into one file, with `{pack}`, and give that")
     cameras = "; cameras are named cameras.json, transforms.json or sparse" if name.endswith(".json") else ""
     raise UsageError(
         f"{path}: format {Path(path).suffix or '(none)'} is not supported; use one of {', '.join(k.suffix for k in known)}, or "

@@ -35,6 +35,7 @@ from warpgs.export.base import (
     smallest_three,
     usable,
     warn_of_antialiasing,
+    with_least_scale,
 )
 from warpgs.files import writing
 from warpgs.geometry import checked_normalization
@@ -161,7 +162,7 @@ def encode(arrays: Arrays, antialiased: bool, origin: np.ndarray | None = None) 
     chunks = np.arange(n) // CHUNK
     colors = base_colors(arrays["sh"][:, :1].astype(np.float64))
     bounds, fractions = [], []
-    for values in (arrays["means"], arrays["log_scales"], colors):
+    for values in (arrays["means"], with_least_scale(arrays["log_scales"]), colors):
         starts = np.arange(0, n, CHUNK)
         low = np.minimum.reduceat(values, starts).astype("<f4")
         high = np.maximum.reduceat(values, starts).astype("<f4")
@@ -355,6 +356,7 @@ LEAST_JUDGED = 100
 
 _POSITION = ("x", "y", "z")
 _DC = ("f_dc_0", "f_dc_1", "f_dc_2")
+_RGB = ("red", "green", "blue")
 _SCALE = ("scale_0", "scale_1", "scale_2")
 _ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
 _REST_COUNTS = (0, 9, 24, 45, 72)
@@ -450,7 +452,7 @@ def _read(path: Path, strict: bool, notes: list[str]) -> tuple[Gaussians, np.nda
         text, own = ASCII.search(head[:start]), is_own(head[:start])
         vertex, start = _locate_vertices(path, elements, start)
         _, n, properties = vertex
-        rest = _check_properties(path, [name for name, _ in properties])
+        rest = _check_properties(path, properties)
         dtype = np.dtype(properties)
         width = 2 * len(properties) if text else dtype.itemsize  # a number of one digit and a space
         end = file.tell() + n * width - 1 if text else start + n * width
@@ -519,8 +521,9 @@ def _locate_vertices(path: Path, elements: list[Element], start: int) -> tuple[E
     return element, start
 
 
-def _check_properties(path: Path, names: list[str]) -> int:
+def _check_properties(path: Path, properties: list[tuple[str, str]]) -> int:
     """Return the number of coefficients above degree 0; DataError where the layout is incomplete."""
+    names = [name for name, _ in properties]
     if len(set(names)) < len(names):
         twice = Counter(names).most_common(1)[0][0]
         raise ply_error(path, f"property {twice[:40]!r} appears twice")
@@ -529,6 +532,8 @@ def _check_properties(path: Path, names: list[str]) -> int:
         raise ply_error(path, f"it has {rest} f_rest properties, but degrees 0 to 4 have 0, 9, 24, 45 or 72")
     # Normals are unused, and some tools leave them out.
     missing = sorted(set(_names(rest)) - set(names) - {"nx", "ny", "nz"})
+    if missing[:3] == [*_DC] and all((name, "u1") in properties for name in _RGB):
+        missing = missing[3:]  # nerfstudio's export with colours, not coefficients
     if "packed_position" in names:
         raise DataError(f"{path}: is a compressed PLY file, which read_ply does not read; use warpgs.export.read_gaussians")
     if missing == ["scale_2"]:
@@ -556,7 +561,10 @@ def _assemble(
         if part.start == 0 and all(rows.dtype[name].itemsize == 8 for name in _POSITION):
             middle = origin_of(np.stack([rows[name] for name in _POSITION], 1).astype(np.float64))
         columns = functools.partial(_columns, rows, part.start, bad[part], reasons)
-        arrays["sh"][part, 0] = columns(_DC)
+        if _DC[0] in (rows.dtype.names or ()):
+            arrays["sh"][part, 0] = columns(_DC)
+        else:
+            arrays["sh"][part, 0] = base_coefficients(columns(_RGB) / 255)
         if rest:
             above = columns([f"f_rest_{i}" for i in range(rest)])
             arrays["sh"][part, 1:] = above.reshape(len(rows), 3, k).transpose(0, 2, 1)

@@ -34,6 +34,7 @@ from warpgs.export.base import (
     rounded,
     sigmoid,
     smallest_three,
+    with_least_scale,
 )
 from warpgs.scene import ORIGIN
 
@@ -84,7 +85,7 @@ def encode(arrays: Arrays, antialiased: bool = False, origin: np.ndarray | None 
     largest, others = smallest_three(arrays["quats"])
     meta["quats"] = {"files": ["quats.webp"]}
     image("quats.webp", *rounded(255 * (others / SQRT2 + 0.5), 255).T, largest + 252)
-    book, labels = codebook(arrays["log_scales"])
+    book, labels = codebook(with_least_scale(arrays["log_scales"]))
     meta["scales"] = {"codebook": book.tolist(), "files": ["scales.webp"]}
     image("scales.webp", *labels.T)
     book, labels = codebook(arrays["sh"][:, 0])

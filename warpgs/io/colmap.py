@@ -24,6 +24,7 @@ from warpgs.io.folder import (
     by_key,
     has_folder,
     is_absolute,
+    listed,
     matched_note,
     missing_note,
     name_key,
@@ -33,7 +34,7 @@ from warpgs.io.folder import (
     view_name,
 )
 from warpgs.io.images import SUFFIXES, Lens, ReadOptions, list_images
-from warpgs.scene import ORIGIN, PointCloud, Scene, checked_origin
+from warpgs.scene import ORIGIN, PointCloud, Scene, base_colors, checked_origin
 
 MODELS = {0: ("SIMPLE_PINHOLE", 3), 1: ("PINHOLE", 4), 2: ("SIMPLE_RADIAL", 4), 3: ("RADIAL", 5), 4: ("OPENCV", 8)}
 """Name and number of parameters by model number."""
@@ -141,6 +142,15 @@ def _understood(path: Path, line: int):
         raise DataError(f"{path}, line {line}: cannot be understood ({e}); write the file again") from e
 
 
+NAN = re.compile(rb"[-+]?(?:nan\([a-z]*\)|1\.#(?:ind|qnan|snan)\d*)", re.IGNORECASE)
+"""How Microsoft's C library writes a NaN, which Python's float does not read."""
+
+
+def _number(word: str) -> float:
+    """Return the number of a word, also a NaN in Microsoft's spelling."""
+    return float("nan" if "n" in word.lower() and NAN.fullmatch(word.encode()) else word)
+
+
 def _expect(condition: bool, message: str) -> None:
     """Raise a ValueError for `_understood` where a line breaks a rule."""
     if not condition:
@@ -165,7 +175,8 @@ def _lens(where: str, model: str, width: int, height: int, p: tuple[float, ...],
         if distortion and not fisheye:  # SIMPLE_RADIAL has k1, RADIAL k1 and k2
             distortion = (*distortion, *[0.0] * (4 - len(distortion)))
     K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
-    return Lens(K, width, height, tuple(distortion), model, fisheye).checked(where)
+    lens = Lens(K, width, height, tuple(distortion), model, fisheye)
+    return lens.checked(where) if np.isfinite(p).all() else lens  # the images of other lenses are left out
 
 
 def _unknown_model(path: Path, model: object, known: dict[int, tuple[str, int]]) -> DataError:
@@ -203,7 +214,7 @@ def read_cameras(path: Path, native: bool = False) -> dict[int, Lens]:
     counts = dict(readable.values())
     for line, words in _rows(path):
         with _understood(path, line):
-            number, model, parameters = int(words[0]), words[1], tuple(float(w) for w in words[4:])
+            number, model, parameters = int(words[0]), words[1], tuple(_number(w) for w in words[4:])
             allow(model, parameters)
             _expect(len(parameters) == counts[model], f"{model} has {counts[model]} parameters, not {len(parameters)}")
             where = f"{path}, line {line}, camera {number}"
@@ -232,7 +243,7 @@ def read_poses(path: Path) -> dict[int, Pose]:
             continue
         with _understood(path, line):
             words = text.split(maxsplit=9)
-            values = tuple(float(w) for w in words[1:8])
+            values = tuple(_number(w) for w in words[1:8])
             pose = (words[9].rstrip(), int(words[8]), values[:4], values[4:])
             _store(poses, int(words[0]), pose, f"{path}, line {line}")
         # the line of observations always follows, but may be empty
@@ -245,6 +256,27 @@ def read_poses(path: Path) -> dict[int, Pose]:
     return poses
 
 
+def without_unaligned(
+    poses: dict[int, Pose], lenses: dict[int, Lens], file: Path, strict: bool
+) -> tuple[dict[int, Pose], list[str]]:
+    """Return the poses without those that are not finite, or whose lens is not, and a note; unchanged if none is left.
+
+    Some programs write photographs so that they could not align. `posed_lenses` refuses what is not left out.
+    """
+
+    def finite(pose: Pose) -> bool:
+        lens = lenses.get(pose[1])
+        numbers = () if lens is None else (*lens.K.flat, *lens.distortion)
+        return bool(np.isfinite([*pose[2], *pose[3], *numbers]).all())
+
+    kept = {number: pose for number, pose in poses.items() if finite(pose)}
+    if strict or not kept or len(kept) == len(poses):
+        return poses, []
+    names = listed(sorted(pose[0] for number, pose in poses.items() if number not in kept))
+    count = f"{len(poses) - len(kept)} of {len(poses)} images of {file.name}"
+    return kept, [f"left out: {count} have a pose or camera that is not finite: {names}"]
+
+
 def posed_lenses(poses: dict[int, Pose], lenses: dict[int, Lens], file: Path) -> Iterator[tuple[str, Lens, np.ndarray]]:
     """Yield name, lens and camera_from_world [4, 4] of each image, sorted by name; ``file`` holds the poses."""
     origin = origin_stated(file)
@@ -254,11 +286,15 @@ def posed_lenses(poses: dict[int, Pose], lenses: dict[int, Lens], file: Path) ->
             raise DataError(f"{where}: camera {camera} is missing from cameras{file.suffix}; export the cameras again")
         viewmat = np.eye(4)
         viewmat[:3, :3], viewmat[:3, 3] = quat_rotation(quat, where), translation
-        yield name, lenses[camera], about(rigid(viewmat, where), origin)
+        yield (
+            name,
+            lenses[camera].checked(f"{file.with_stem('cameras')}, camera {camera}"),
+            about(rigid(viewmat, where), origin),
+        )
 
 
-def read_points(path: Path, names: dict[int, str]) -> PointCloud:
-    """Return points, with the views that saw them, from points3D.bin or points3D.txt."""
+def read_points(path: Path, names: dict[int, str], notes: list[str] | None = None) -> PointCloud:
+    """Return points, with the views that saw them, from points3D.bin or points3D.txt; see `_cloud` for ``notes``."""
     points: list[tuple[float, ...]] = []
     colors: list[tuple[float, ...]] = []
     tracks: list[frozenset[str]] = []
@@ -275,20 +311,28 @@ def read_points(path: Path, names: dict[int, str]) -> PointCloud:
         for line, words in _rows(path):
             with _understood(path, line):
                 _expect(len(words) >= 8 and len(words) % 2 == 0, "a point needs 8 numbers, then pairs IMAGE OBSERVATION")
-                points.append(tuple(float(w) for w in words[1:4]))
-                colors.append(tuple(float(w) for w in words[4:7]))
+                points.append(tuple(_number(w) for w in words[1:4]))
+                colors.append(tuple(_number(w) for w in words[4:7]))
                 tracks.append(frozenset(names[i] for w in words[8::2] if (i := int(w)) in names))
     positions = np.array(points, np.float64).reshape(-1, 3) + origin_stated(path)
-    return _cloud(path, positions, np.array(colors, np.float64).reshape(-1, 3), tuple(tracks))
+    return _cloud(path, positions, np.array(colors, np.float64).reshape(-1, 3), notes, tuple(tracks))
 
 
 def _cloud(
-    path: Path, positions: np.ndarray, colors: np.ndarray, tracks: tuple[frozenset[str], ...] | None = None
-) -> PointCloud:
-    """Return points [N, 3] with colours of 0 to 255, or of 0 to 1 if they are fractions."""
-    bad = int((~np.isfinite(np.concatenate([positions, colors], axis=1)).all(axis=1)).sum())
-    if bad:
-        raise DataError(f"{path}: {bad} of {len(positions)} points are not finite; reconstruct again, or remove them")
+    path: Path, positions: np.ndarray, colors: np.ndarray, notes: list[str] | None,
+    tracks: tuple[frozenset[str], ...] | None = None,
+) -> PointCloud:  # fmt: skip
+    """Return points [N, 3] with colours of 0 to 255, or of 0 to 1 if they are fractions.
+
+    Points that are not finite are left out with a note; without ``notes``, or if there are no others, they are an error.
+    """
+    finite = np.isfinite(np.concatenate([positions, colors], axis=1)).all(axis=1)
+    if bad := int((~finite).sum()):
+        if notes is None or bad == len(finite):
+            raise DataError(f"{path}: {bad} of {len(finite)} points are not finite; reconstruct again, or remove them")
+        notes.append(f"{bad:,} of {len(finite):,} points of {path.name} are not finite and are left out")
+        positions, colors = positions[finite], colors[finite]
+        tracks = None if tracks is None else tuple(track for track, kept in zip(tracks, finite) if kept)
     fractions = bool((colors % 1).any()) and colors.max() <= 1
     return PointCloud(positions, np.clip(colors, 0, 255).astype(np.float32) / np.float32(1 if fractions else 255), tracks)
 
@@ -299,9 +343,15 @@ PLY_TYPES = {
 }  # fmt: skip
 PLY_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 
+COLORS = [c.split() for c in ("red green blue", "r g b", "diffuse_red diffuse_green diffuse_blue", "f_dc_0 f_dc_1 f_dc_2")]
+"""Names of the colours of points; the last are coefficients of Gaussians."""
 
-def read_ply_points(path: Path) -> PointCloud:
-    """Return the points of a PLY file, text or binary; points without colours are gray, and no views are known."""
+
+def read_ply_points(path: Path, notes: list[str] | None = None) -> PointCloud:
+    """Return the points of a PLY file, text or binary; points without colours are gray, and no views are known.
+
+    See `_cloud` for ``notes``.
+    """
     data = read_file(path, fix="fix its permissions or copy it again")
     head, mark, rest = data[: 2**16].partition(b"end_header")
     try:
@@ -320,18 +370,22 @@ def read_ply_points(path: Path) -> PointCloud:
             table = np.frombuffer(body, np.dtype([(n, order + k) for n, k in kinds.items()]), count)
             values = {n: table[n].astype(np.float64) for n in kinds}
         else:
-            words = np.array([row.split()[: len(kinds)] for row in body.splitlines()[:count]], np.float64)
+            words = np.array([row.split()[: len(kinds)] for row in NAN.sub(b"nan", body).splitlines()[:count]], np.float64)
             _expect(count == len(words), f"it lists {len(words)} of {count} points")
             values = dict(zip(kinds, words.reshape(count, len(kinds)).T))
     except (ValueError, KeyError, IndexError, OverflowError, StopIteration) as e:
         raise DataError(f"{path}: the points cannot be understood ({e}); export them again as PLY, or remove the file") from e
-    rgb = next((c for c in (("red", "green", "blue"), ("r", "g", "b")) if kinds.keys() >= set(c)), ())
+    rgb = next((c for c in COLORS if kinds.keys() >= set(c)), [])
     colors = np.stack([values[c] for c in rgb], 1) if rgb else np.full((count, 3), 127.0)
-    if rgb and kinds[rgb[0]] == "u2":
+    if not rgb and notes is not None:
+        notes.append("they have no colours and start gray")
+    if "f_dc_0" in rgb:
+        colors = 255 * np.asarray(base_colors(colors[:, None]))
+    elif rgb and kinds[rgb[0]] == "u2":
         colors = colors / 257
     elif rgb and kinds[rgb[0]][0] == "f" and colors.size and colors.max() <= 1:
         colors = colors * 255
-    return _cloud(path, np.stack([values[c] for c in "xyz"], 1), colors)
+    return _cloud(path, np.stack([values[c] for c in "xyz"], 1), colors, notes)
 
 
 def _found(folder: Path) -> Model | None:
@@ -483,6 +537,7 @@ class ColmapReader(Reader):
         scene, file = SceneFolder(folder, options), model / f"images.{kind}"
         poses = read_poses(scene.inside(file))
         lenses = read_cameras(scene.inside(model / f"cameras.{kind}"), options.lenses == "native")
+        poses, unaligned = without_unaligned(poses, lenses, file, options.strict)
         base = image_base(folder, model) or "images"
         images, factor, resized = scene.images(base)
         flat = PurePosixPath(base).name not in IMAGES
@@ -491,7 +546,7 @@ class ColmapReader(Reader):
         place = model.relative_to(folder).as_posix() if model.is_relative_to(folder) else str(model)
         if not chosen and (base != "images" or place not in ("sparse/0", "sparse", ".")):
             chosen = f"cameras taken from {place}, images from {base}"
-        notes, views, missing = [note for note in (chosen, resized) if note] + notes, ViewList(), []
+        notes, views, missing = [note for note in (chosen, resized, *unaligned) if note] + notes, ViewList(), []
         named: dict[str, str] = {}  # names of the views by name of the reconstruction
         for name, lens, viewmat in posed_lenses(poses, lenses, file):
             path = paths[name]
@@ -507,7 +562,7 @@ class ColmapReader(Reader):
         unposed = len(set(files) - set(paths.values()))
         if unposed:
             notes.append(f"{unposed} files in {images.name} have no pose in the reconstruction and are left out")
-        notes += missing_note(missing, len(poses), "images", file, options.strict) + views.notes(options)
+        notes += missing_note(missing, len(poses), "images", file, options.strict) + views.notes(options) + scene.mask_notes()
         there = {v.name for v in views.views}  # without those that are left out
         names = {n: named[p[0]] for n, p in poses.items() if named.get(p[0]) in there}
         points, more = self._points(scene, model, kind, names)
@@ -516,10 +571,11 @@ class ColmapReader(Reader):
 
     def _points(self, scene: SceneFolder, model: Path, kind: str, names: dict[int, str]) -> tuple[PointCloud | None, list[str]]:
         """Return the points of a reconstruction, else those of points3D.ply beside it, and notes."""
-        path, ply = model / f"points3D.{kind}", model / "points3D.ply"
+        path, ply, bad = model / f"points3D.{kind}", model / "points3D.ply", None if scene.options.strict else list[str]()
         if path.is_file():
-            points = read_points(scene.inside(path), names)
-            return points, [] if len(points) else [f"{path.name} holds no points"]
+            points = read_points(scene.inside(path), names, bad)
+            return points, bad or ([] if len(points) else [f"{path.name} holds no points"])
         if ply.is_file():
-            return read_ply_points(scene.inside(ply)), [f"points taken from {ply.name}, because {path.name} is missing"]
+            points = read_ply_points(scene.inside(ply), bad)
+            return points, [f"points taken from {ply.name}, because {path.name} is missing", *(bad or [])]
         return None, [f"{path.name} is missing, so there are no points to start from"]

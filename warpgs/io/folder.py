@@ -19,8 +19,8 @@ from warpgs.constants import POSE_TOLERANCE
 from warpgs.errors import DataError, UsageError, shortened
 from warpgs.files import inside, is_within
 from warpgs.geometry import matmul, nearest_rotation, rotation_matrices
-from warpgs.io.image_files import MAX_PIXELS, decode, unread_note
-from warpgs.io.images import BLACK, REDUCED, Lens, LoadedImage, ReadOptions, list_images, load_image
+from warpgs.io.image_files import MAX_PIXELS, READ, decode, unread_note
+from warpgs.io.images import BLACK, REDUCED, SUFFIXES, Lens, LoadedImage, ReadOptions, list_images, load_image
 from warpgs.io.maps import NOTHING_NAMED, GivenMaps, NamedMaps
 from warpgs.plugins import Registry
 from warpgs.scene import Camera, Scene, View
@@ -229,6 +229,18 @@ def view_name_of(path: Path, root: Path) -> str:
     return view_name(plain[len(base) + 1 :] if Path(plain).is_relative_to(base) else plain)
 
 
+def _plain(name: str) -> str:
+    """Return the name of an image without suffix and case, in one spelling of its letters."""
+    stem, dot, suffix = unicodedata.normalize("NFC", name).casefold().rpartition(".")
+    return stem if f".{suffix}" in SUFFIXES else stem + dot + suffix
+
+
+def _images_of(mask: str) -> set[str]:
+    """Return the plain names of the images to which a mask file may belong: photo.jpg.mask.png and photo_mask.png to photo."""
+    stems = {_plain(mask), re.sub(r"[._-]mask$", "", _plain(mask))}
+    return stems | {_plain(stem) for stem in stems}
+
+
 class SceneFolder:
     """A scene folder with the options for reading it. Readers open all images and masks through it."""
 
@@ -236,6 +248,8 @@ class SceneFolder:
         self.root, self.options = root, options
         self._reduced = self._binary = False
         self._base = "images"
+        # by folder of masks: the folder of its images, the masks by plain name of an image, and the images without one
+        self._masks: dict[Path, tuple[Path, dict[str, list[Path]], dict[str, Path]]] = {}
         self._maps = GivenMaps(options)
 
     def inside(self, path: Path) -> Path:
@@ -318,16 +332,48 @@ class SceneFolder:
         """Return the mask [H, W] of an image, or None without one.
 
         The mask is in ``folder``, by default `masks` beside the image folder. For photo.jpg it is photo.png, photo.jpg.png or
-        photo.jpg.
+        photo.jpg, else the only file of the names of `_images_of`.
         """
         folder = folder or images_root.parent / "masks"
-        if not image.is_relative_to(images_root) or not folder.is_dir():
+        if not image.is_relative_to(images_root):
             return None
+        _, masks, unmasked = self._masks.setdefault(folder, (images_root, {}, {}))
         relative = image.relative_to(images_root)
-        for candidate in (folder / relative.with_suffix(".png"), folder / f"{relative.as_posix()}.png", folder / relative):
-            if candidate.is_file():
-                return self.mask(candidate)
+        if folder.is_dir():
+            for candidate in (folder / relative.with_suffix(".png"), folder / f"{relative.as_posix()}.png", folder / relative):
+                if candidate.is_file():
+                    return self.mask(candidate)
+            for file in [] if masks else list_images(folder):
+                for name in _images_of(file.relative_to(folder).as_posix()):
+                    masks.setdefault(name, []).append(file)
+            files = masks.get(_plain(relative.as_posix()), [])
+            if len(files) == 1:
+                return self.mask(*files)
+        unmasked[_plain(relative.as_posix())] = relative
         return None
+
+    def mask_notes(self) -> list[str]:
+        """Return notes on mask files that no image got, and on folders whose name says masks, but which are not read."""
+        notes = []
+        for folder, (images, _, unmasked) in self._masks.items():
+            places = [p for p in (images, images.parent, self.root) if p.is_relative_to(self.root)]
+            near = {p for place in places for p in place.iterdir() if p.name.casefold() in ("mask", "masks") and p.is_dir()}
+            for other in sorted(near - {*self._masks}):
+                if list_images(other):
+                    where, there = (p.relative_to(self.root).as_posix() for p in (other, folder))
+                    notes.append(f"the folder {where} is not read; masks are read from {there}")
+            files = list_images(folder) if folder.is_dir() else []
+            known = {_plain(p.relative_to(images).as_posix()) for p in list_images(images)} if files and unmasked else set()
+            lone = [
+                f for f in files if (names := _images_of(f.relative_to(folder).as_posix())) & {*unmasked} or not names & known
+            ]
+            if lone and unmasked:
+                image = min(unmasked.values())
+                notes.append(
+                    f"{len(lone)} of {len(files)} files in {folder.name} match no image or several, such as "
+                    f"{lone[0].relative_to(folder)}; name a mask like its image: {image.with_suffix('.png')} or {image}.png"
+                )
+        return notes
 
     def images(self, base: str = "images") -> tuple[Path, int, str]:
         """Choose the image folder: `images_N` for a factor N, else the full-size folder, whose images are then resampled.
@@ -348,7 +394,7 @@ class SceneFolder:
         sizes = ((p.name[len(folder.name) + 1 :], p) for p in folder.parent.glob(f"{folder.name}_*"))
         others = {int(n): p for n, p in sizes if n.isdecimal() and list_images(p)}
         if not others:
-            note = unread_note(folder) or "missing, or without images; put the images into it"
+            note = unread_note(folder) or f"missing, or without images ({READ}); put the images into it"
             raise DataError(f"{folder}: {note}")
         largest = others[min(others)]
         note = f"no full-size folder '{base}': images taken from {largest.name}{how and ', '}{how}"

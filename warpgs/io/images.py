@@ -50,7 +50,7 @@ class SceneOptions:
     downscale: int | None = None
     """Factor by which both image sides shrink; None for 1."""
     strict: bool = False
-    """Treat a frame without an image file as an error."""
+    """Treat a frame without an image file, or with a pose or camera that is not finite, as an error."""
     reconstruction: str | None = None
     """Folder of the COLMAP reconstruction inside the scene folder, such as sparse/1. None: the largest at the usual places."""
     exclude: str | None = None

@@ -401,7 +401,7 @@ def load_scene(
         downscale: Factor by which both image sides shrink; a folder `images_N` is used if it exists. None for 1.
         max_side: Largest image side [px], 0 for no limit; larger images are reduced to it, and the intrinsics with them. None
             means 1600 if ``downscale`` is None, too, and no limit otherwise.
-        strict: True to treat a frame without an image file as an error instead of a note.
+        strict: True to treat a frame without an image file, or numbers that are not finite, as an error instead of a note.
         reconstruction: Folder of the COLMAP reconstruction inside the scene folder, such as ``sparse/1``. None for the largest
             one at the usual places (docs/scenes.md).
         exclude: Images to leave out: names or patterns such as ``blurry*``, with or without folder and suffix, separated by

@@ -85,7 +85,7 @@ class LLFFReader(Reader):
             pose = np.stack([matrix[:, 1], matrix[:, 0], -matrix[:, 2], matrix[:, 3]], axis=1)
             loaded = scene.image(file, lens.checked(where), downscale=factor, mask=scene.find_mask(file, images))
             views.add(name, from_camera_to_world(pose, where, opengl=False), loaded)
-        notes = ([note] if note else []) + views.notes(options)
+        notes = ([note] if note else []) + views.notes(options) + scene.mask_notes()
         return self.scene(folder, views.views, notes, pixels=scene.pixel_source(by_folder=True))
 
 
@@ -287,5 +287,5 @@ class MiddleburyReader(Reader):
             file, view = scene.child(folder, name, where), views.claim(view_name(name), where)
             mask = scene.find_mask(file, folder, folder / "masks")
             views.add(view, viewmat, scene.image(file, _lens(K, where), mask=mask))
-        notes += resampling_note(options.downscale) + views.notes(options)
+        notes += resampling_note(options.downscale) + views.notes(options) + scene.mask_notes()
         return self.scene(folder, views.views, notes, pixels=scene.pixel_source(by_folder=False))

@@ -242,9 +242,11 @@ def _points(scene: SceneFolder, file: Path, shared: dict, views: list[View]) -> 
         return None, f"no points to start from: {e}"
     if not path.is_file():
         return None, f"{str(name)[:80]} is missing, so there are no points to start from"
-    points = colmap.read_ply_points(path)
+    bad: list[str] | None = None if scene.options.strict else []
+    points = colmap.read_ply_points(path, bad)
+    taken = "; ".join([f"points taken from {path.name}", *(bad or [])])
     if shared.get("applied_transform") is None or not len(points):
-        return points, f"points taken from {path.name}"
+        return points, taken
     matrix = matrix_of({"transform_matrix": shared["applied_transform"]}, f"{file}, applied_transform")[:3]
     try:
         scale = _number({}, shared, "applied_scale")
@@ -253,8 +255,8 @@ def _points(scene: SceneFolder, file: Path, shared: dict, views: list[View]) -> 
     moved = (1.0 if scale is None else scale) * (matmul(points.points, matrix[:, :3].T) + matrix[:, 3])
     other = PointCloud(moved, points.colors)
     if _disagreement(other, views) < CLEARLY * _disagreement(points, views):
-        return other, f"points taken from {path.name}, moved by applied_transform, since the colours of the images agree then"
-    return points, f"points taken from {path.name}, without applied_transform, since the colours of the images agree so"
+        return other, f"{taken}, moved by applied_transform, since the colours of the images agree then"
+    return points, f"{taken}, without applied_transform, since the colours of the images agree so"
 
 
 CLEARLY = 0.8
@@ -329,7 +331,7 @@ class TransformsReader(Reader):
         notes += missing_note(missing, total, "frames", files_of(folder)[0], options.strict)
         if outside := sum(v.name.startswith("outside/") for v in views.views):
             notes.append(f"{outside} images are outside the scene folder; their views are named outside/...")
-        notes += resampling_note(options.downscale) + views.notes(options)
+        notes += resampling_note(options.downscale) + views.notes(options) + scene.mask_notes()
         pixels = scene.pixel_source(by_folder=False)
         return self.scene(folder, views.views, notes, background=background, pixels=pixels, points=points)
 
@@ -348,7 +350,8 @@ def read_cameras(path: Path) -> tuple[dict[str, Camera], list[str]]:
         rows = _colmap(path)
     else:
         values = _json(path, "check the path, or write the file again")
-        rows = _inria(path, values) if isinstance(values, list) else _transforms(path)
+        drawn = isinstance(values, dict) and isinstance(values.get("camera_path"), list)
+        rows = _inria(path, values) if isinstance(values, list) else _drawn(path, values) if drawn else _transforms(path)
     found: dict[str, Camera] = {}
     numbers: dict[str, int] = {}
     bent = 0
@@ -389,6 +392,25 @@ def _inria(path: Path, rows: list[Any]) -> Iterator[Row]:
         except (KeyError, TypeError, ValueError, OverflowError, AttributeError) as e:
             raise DataError(f"{where}: needs rotation, position, width, height, fx and fy as numbers; correct the entry") from e
         yield name, about(from_camera_to_world(pose, where, opengl=False), origin), lens.checked(where)
+
+
+def _drawn(path: Path, values: dict[str, Any]) -> Iterator[Row]:
+    """Yield the cameras of a path of nerfstudio's viewer: camera-to-world in OpenGL axes, vertical field of view [deg]."""
+    if (kind := values.get("camera_type", "perspective")) != "perspective":
+        raise DataError(f"{path}: camera_type is {str(kind)[:40]}, but renders are pinholes; export a perspective path")
+    for i, frame in enumerate(values["camera_path"]):
+        where = f"{path}, camera_path {i}"
+        try:
+            pose = np.array(frame["camera_to_world"], np.float64).reshape(4, 4)
+            width, height, fov = int(values["render_width"]), int(values["render_height"]), float(frame["fov"])
+            if not 0 < fov < 180:
+                raise ValueError("fov")
+        except (KeyError, TypeError, ValueError, OverflowError) as e:
+            needs = "camera_to_world (16 numbers), fov, and render_width and render_height of the file"
+            raise DataError(f"{where}: needs {needs}; export the path again") from e
+        focal = 0.5 * height / math.tan(0.5 * math.radians(fov))
+        lens = Lens(np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]]), width, height)
+        yield f"{i:05d}", from_camera_to_world(pose, where, opengl=True), lens.checked(where)
 
 
 def _transforms(path: Path) -> Iterator[Row]:
