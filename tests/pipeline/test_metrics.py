@@ -5,6 +5,7 @@ import dataclasses
 import hashlib
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -73,6 +74,24 @@ def test_scores_are_of_the_saved_picture():
     m = score(view, view.image + 1e-4)
     assert m.psnr > 50 and m.ssim > 0.999 and m.ssim_skimage > 0.999
     assert np.array_equal(to_8_bit(np.array([-1.0, 0.5, 2.0])), np.float32([0, 128 / 255, 1]))
+
+
+@pytest.mark.parametrize("height, width", [(11, 11), (40, 57), (10, 30)])
+def test_ssim_without_the_border_is_scikit_images(height, width):
+    """To the rounding of scikit-image, which sums in float32 here; NaN where the window does not fit."""
+    from skimage.metrics import structural_similarity
+
+    generator, camera = np.random.default_rng(0), photos(1)[0].camera
+    smooth = np.add.outer(np.linspace(0, 0.7, height), np.linspace(0, 0.3, width))[..., None].repeat(3, 2).astype(np.float32)
+    noise = generator.random((height, width, 3), np.float32)
+    for a, b in ((noise, noise[::-1]), (smooth, smooth + 0.1 * noise), (np.ones_like(noise), smooth), (smooth, smooth)):
+        a, b = to_8_bit(a), to_8_bit(b)
+        found = score(View("a", replace(camera, width=width, height=height), a), b).ssim_skimage
+        if height < 11:
+            assert math.isnan(found)
+            continue
+        given = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False, "data_range": 1, "channel_axis": -1}
+        assert found == pytest.approx(structural_similarity(a.astype(float), b.astype(float), **given), abs=2e-6)
 
 
 def test_counted_region():

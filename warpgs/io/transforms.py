@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import functools
 import json
 import math
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -269,12 +269,13 @@ class TransformsReader(Reader):
                 where = f"{where} ({name})"
                 viewmat = about(from_camera_to_world(matrix_of(frame, where), where, opengl=True), origin)
                 if frame.get("mask_path"):
-                    mask = scene.mask(scene.child(file.parent, frame["mask_path"], f"{where}, mask", root=folder))
+                    mask = partial(scene.mask, scene.child(file.parent, frame["mask_path"], f"{where}, mask", root=folder))
                 else:
-                    mask = scene.find_mask(path, folder / "images")
-                lens = functools.partial(lens_of, frame, shared, where=where, native=options.lenses == "native")
+                    mask = partial(scene.find_mask, path, folder / "images")
+                lens = partial(lens_of, frame, shared, where=where, native=options.lenses == "native")
                 named = _named_maps(scene, file.parent, shared, frame, where)
-                views.add(name, viewmat, scene.image(path, lens, mask=mask, background=background, named=named))
+                load = partial(scene.image, path, lens, mask=mask, background=background, named=named)
+                views.add(name, viewmat, load)
             if shared.get("ply_file_path"):
                 points, note = _points(scene, file, shared, views.views)
                 notes.append(note)
