@@ -15,6 +15,7 @@ from typing import Any, TypeVar
 import numpy as np
 import torch
 
+from warpgs.clock import largest, times_line
 from warpgs.constants import TILE_SIZE
 from warpgs.device import format_bytes
 from warpgs.errors import ResourceError
@@ -41,7 +42,7 @@ from warpgs.pipeline.train.schedule import Phases
 from warpgs.pipeline.train.strategies.sampling import SampledView, Sampling
 from warpgs.pipeline.train.trainer import Trainer
 from warpgs.pipeline.train.views import TrainingView
-from warpgs.process import counted
+from warpgs.process import Detail, counted
 from warpgs.render.options import RasterizeOptions
 from warpgs.render.rasterize import rasterize
 from warpgs.render.reference import reference_image
@@ -380,7 +381,8 @@ def result_lines(metrics: dict[str, Any], out: Path | None) -> list[str]:
     compiling = metrics["seconds"].get("compiling", 0.0)
     once = f", of which {duration(compiling)} to compile kernels, once on this machine" if compiling >= 1 else ""
     size = format_bytes(metrics["complexity"]["bytes"])
-    lines.append(f"{metrics['gaussians']:,} Gaussians, {size}, in {duration(metrics['seconds']['total'])}{once}")
+    times = metrics["wall_seconds"]
+    lines.append(f"{metrics['gaussians']:,} Gaussians, {size}, in {duration(times['total'])}{once}: {largest(times)}")
     if out is None:
         return [*lines, "nothing was written to disk, because no run folder (out) was given"]
     run, file = shlex.quote(str(out)), " --to scene.html"
@@ -459,7 +461,7 @@ def _images(
     return [(name, caption, *parts) for name, caption, parts in result]
 
 
-def _figures(metrics: dict[str, Any]) -> list[tuple[str, str]]:
+def _figures(metrics: dict[str, Any], seconds: float) -> list[tuple[str, str]]:
     """Return the main figures of the page as pairs of label and value."""
     test, training = metrics["test"], f"{metrics['train']['psnr']:.2f} dB"
     held_out = [("training PSNR: no score of new views", training)]
@@ -471,10 +473,10 @@ def _figures(metrics: dict[str, Any]) -> list[tuple[str, str]]:
             *((LABELS[k], f"{test[k]:.3f}") for k in ("alpha_empty", "alpha_object") if k in test),
             ("training PSNR", training),
         ]  # fmt: skip
-    size, seconds = format_bytes(metrics["complexity"]["bytes"]), duration(metrics["seconds"]["total"])
+    size = format_bytes(metrics["complexity"]["bytes"])
     return [
         *held_out, ("Gaussians", f"{metrics['gaussians']:,}"), ("model", size), ("steps", f"{metrics['steps']:,}"),
-        ("time", seconds),
+        ("time", duration(seconds)),
     ]  # fmt: skip
 
 
@@ -488,6 +490,7 @@ def write_report(
     record: dict[str, Any],
     *,
     sampling: Section | None,
+    times: Callable[[], dict[str, float]],
     tell: Callable[[str], object] = lambda line: None,
 ) -> None:
     """Write report.html of a scored run, from metrics.json, config.json (``record``), metrics.jsonl and new renders."""
@@ -513,13 +516,15 @@ def write_report(
         covered = coverage_section(out, metrics["coverage"], [name for name, *_ in images], names)
     protocol = {k.replace("_", " "): ", ".join(v) if isinstance(v, list) else str(v) for k, v in metrics["protocol"].items()}
     protocol["configuration"] = f"{metrics['config_hash']}, step {metrics['steps']:,}"
+    picture, spent = None if overview is None else webp(overview), times()
+    notes = [*record["notes"], Detail(times_line(spent))]
     write_page(
         out / "report.html",
         title=(out if Path(scene.path).parent == out else Path(scene.path)).resolve().name,  # not "scene" for found poses
         subtitle=f"preset {metrics['preset']}, {len(train)} training views, {len(test)} held out, "
         f"{camera.width} x {camera.height} px, {metrics['device']}",
-        figures=_figures(metrics), notes=record["notes"], scores=table, views=images, curves=curves, sampling=sampling,
-        overview=None if overview is None else webp(overview), held_out=bool(test), coverage=covered,
+        figures=_figures(metrics, spent["total"]), notes=notes, scores=table, views=images, curves=curves, sampling=sampling,
+        overview=picture, held_out=bool(test), coverage=covered,
         record={k: v for k, v in record.items() if k != "cameras"},
         protocol=protocol | {LABELS.get(k, k): v for k, v in metrics["variants"].items()},
     )  # fmt: skip
