@@ -22,7 +22,7 @@ from warpgs.io.load import Split, check_spec
 from warpgs.kernels.native import told_of_compiling
 from warpgs.pipeline.metrics.coverage import coverage_of_run
 from warpgs.pipeline.metrics.lpips import Lpips
-from warpgs.pipeline.metrics.scores import moved_fractions, moved_notes, render_view
+from warpgs.pipeline.metrics.scores import Renders, moved_fractions, moved_notes
 from warpgs.pipeline.model.edit import drop_unused_sh
 from warpgs.pipeline.model.limits import shape_figures, shape_summary
 from warpgs.pipeline.model.table import FittedModel
@@ -530,8 +530,9 @@ def _finish(job: FitJob, trainer: Trainer, record: dict[str, Any], checks: list[
             model = drop_unused_sh(trainer.gaussians)
             with section("writing"):
                 write_ply(job.out / "point_cloud.ply", model, job.scene.normalization, antialiased=job.config.antialiased)
+        renders = Renders(trainer.gaussians, trainer.context.render_options())
         with section("checks"):
-            metrics = _score(job, trainer, seconds, given, checks)
+            metrics = _score(job, trainer, seconds, given, checks, renders)
         metrics["wall_seconds"] = job.clock.seconds()
         if job.out is not None:
             write_json(job.out / METRICS_FILE, metrics)
@@ -539,7 +540,8 @@ def _finish(job: FitJob, trainer: Trainer, record: dict[str, Any], checks: list[
             with section("report"):
                 write_report(
                     job.out, job.scene, job.split, trainer.gaussians, options, metrics, record,
-                    sampling=sampling_report_of(trainer, job.out), times=job.clock.seconds, tell=job.progress,
+                    sampling=sampling_report_of(trainer, job.out), renders=renders, times=job.clock.seconds,
+                    tell=job.progress,
                 )  # fmt: skip
             metrics["wall_seconds"] = job.clock.seconds()
             write_json(job.out / METRICS_FILE, metrics)  # again, with the time of the report
@@ -549,7 +551,12 @@ def _finish(job: FitJob, trainer: Trainer, record: dict[str, Any], checks: list[
 
 
 def _score(
-    job: FitJob, trainer: Trainer, seconds: dict[str, float], given: dict[str, Camera], checks: list[PhotoCheck]
+    job: FitJob,
+    trainer: Trainer,
+    seconds: dict[str, float],
+    given: dict[str, Camera],
+    checks: list[PhotoCheck],
+    renders: Renders,
 ) -> dict[str, Any]:
     """Score the finished fit, with the ``given`` cameras from before it; returns the contents of metrics.json."""
     c, scene, train, test, gaussians = job.config, job.scene, job.train, job.test, trainer.gaussians
@@ -558,17 +565,17 @@ def _score(
     options, tell, compare = trainer.context.render_options(), job.progress, not job.other_models
     scored = (job.out, gaussians, train, test, options)
     with section("scoring"):
-        metrics = evaluate_run(*scored, job.lpips, names=names, tell=tell)
+        metrics = evaluate_run(*scored, job.lpips, names=names, renders=renders, tell=tell)
     if test and compare:
         with section("coverage"):
-            metrics["coverage"] = coverage_of_run(*scored, names=names, tell=tell)
+            metrics["coverage"] = coverage_of_run(*scored, names=names, renders=renders, tell=tell)
     tell("checking float32 accuracy")
     rule = rule_report_of(gaussians, train, options, seed=c.seed, half_resolution=trainer.half_resolution)
     shape = shape_figures(gaussians, c.limits, trainer.radius, trainer.context.extent, [v.camera for v in train])
     moved: dict[str, float] = {}
     if compare:
         shown = counted(train, tell, "checking for moving objects", "views")
-        fractions = moved_fractions(train, (render_view(gaussians, v, options) for v in shown))
+        fractions = moved_fractions(train, (renders(v.camera) for v in shown))
         moved = {v.name: f for v, f in zip(train, fractions, strict=True)}
     complexity, cameras, scale = complexity_figures(trainer), cameras_of(scene), scene.normalization.scale
     modules = {
@@ -576,7 +583,7 @@ def _score(
             FittedViews(learned.params_of(m), job.split.train, test, given, cameras, scale, gaussians, options)
         ) for m in learned.modules
     }  # fmt: skip
-    mapped = given_figures(train, trainer.views, gaussians, options)
+    mapped = given_figures(train, trainer.views, renders)
     table: list[tuple[dict[str, Any], list[str]]] = [  # figures of metrics.json, and their sentences in the report
         ({"rule": rule}, [Detail(rule["summary"])]),
         ({"shape": shape}, [Detail(shape_summary(shape))]),

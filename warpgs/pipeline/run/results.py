@@ -28,6 +28,7 @@ from warpgs.pipeline.metrics.coverage import coverage_section
 from warpgs.pipeline.metrics.lpips import Lpips
 from warpgs.pipeline.metrics.scores import (
     ALPHA_VARIANTS,
+    Renders,
     ViewMetrics,
     baselines,
     psnr_of,
@@ -62,16 +63,14 @@ GIVEN = {
 """Name in metrics.json, and summary, of each map of the loss terms."""
 
 
-def given_figures(
-    train: Sequence[View], views: Sequence[TrainingView], gaussians: Gaussians, options: RasterizeOptions
-) -> dict[str, Any]:
+def given_figures(train: Sequence[View], views: Sequence[TrainingView], renders: Renders) -> dict[str, Any]:
     """Compare the model with given depth and normals: rows by view and a summary, for each kind that a loss term compared."""
     rows: dict[str, list[dict[str, Any]]] = {name: [] for name in GIVEN}
     for view, mapped in zip(train, views, strict=True):
         maps = {n: t.cpu().numpy() for n, t in mapped.maps.items() if n in GIVEN and bool(t.any())}
         if not maps:
             continue
-        _, depth, alpha = render_view(gaussians, view, options)
+        _, depth, alpha = renders(view.camera)
         shown = alpha > GIVEN_MIN_ALPHA
         for name, given in maps.items():
             if name == "given_depth":
@@ -414,6 +413,7 @@ def evaluate_run(
     lpips: Lpips | None = None,
     *,
     names: dict[str, str] | None = None,
+    renders: Renders | None = None,
     tell: Callable[[str], object] = lambda line: None,
 ) -> dict[str, Any]:
     """Score held-out and training views, and save a render and depth map of each held-out (else training) view in ``out``."""
@@ -431,7 +431,8 @@ def evaluate_run(
     jobs: list[Future[ViewMetrics]] = []
     with ThreadPoolExecutor(RENDER_WORKERS if lpips is None else 1) as render_workers:  # LPIPS needs much memory for each view
         for view in counted([*test, *train], tell, "scoring", "views"):
-            jobs.append(render_workers.submit(finish, view, *render_view(gaussians, view, options)))
+            images = renders(view.camera) if renders else render_view(gaussians, view, options)
+            jobs.append(render_workers.submit(finish, view, *images))
             if len(jobs) > RENDER_WORKERS:
                 jobs[-RENDER_WORKERS].result()  # not all images at once
         found = [j.result() for j in jobs]
@@ -444,14 +445,12 @@ def evaluate_run(
     }  # fmt: skip
 
 
-def _images(
-    views: list[View], gaussians: Gaussians, options: RasterizeOptions, rows: dict[str, Any], tell: Callable[[str], object]
-) -> list[tuple[Any, ...]]:
+def _images(views: list[View], renders: Renders, rows: dict[str, Any], tell: Callable[[str], object]) -> list[tuple[Any, ...]]:
     """Render up to `SHOWN_VIEWS` of the views, evenly spaced, and encode their images for the page."""
     result = []
     with ThreadPoolExecutor(RENDER_WORKERS) as render_workers:
         for view in counted(evenly_spaced(views, SHOWN_VIEWS), tell, "making the report", "views"):
-            image, depth, alpha = render_view(gaussians, view, options)
+            image, depth, alpha = renders(view.camera)
             row, caption = rows.get(view.name), "training view"
             if row:
                 region = f", over {row['region']}" if row["region"] != "all" else ""
@@ -490,6 +489,7 @@ def write_report(
     record: dict[str, Any],
     *,
     sampling: Section | None,
+    renders: Renders,
     times: Callable[[], dict[str, float]],
     tell: Callable[[str], object] = lambda line: None,
 ) -> None:
@@ -509,7 +509,7 @@ def write_report(
         [r["name"], *(f"{r.get(k, math.nan):.{2 if k.startswith('psnr') else 4}f}" for k in keys), r["region"]]
         for r in metrics["views"]
     ]
-    images = _images(test or train, gaussians, options, {r["name"]: r for r in metrics["views"]}, tell)
+    images = _images(test or train, renders, {r["name"]: r for r in metrics["views"]}, tell)
     covered, camera = None, train[0].camera
     if "coverage" in metrics:
         names = image_names(v.name for v in scene.views)
