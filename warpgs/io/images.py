@@ -267,7 +267,8 @@ def nearest_unmasked(raster: np.ndarray, mask: np.ndarray | None) -> np.ndarray:
     labels = cv2.distanceTransformWithLabels(masked, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)[1]
     places = np.zeros(labels.max() + 1, np.int64)
     places[labels[mask]] = np.flatnonzero(mask)
-    filled: np.ndarray = raster.reshape(-1, *raster.shape[2:])[places[labels]]
+    filled = raster.copy()
+    filled[~mask] = raster.reshape(-1, *raster.shape[2:])[places[labels[~mask]]]  # an unmasked pixel is its own nearest one
     return filled
 
 
