@@ -1,18 +1,15 @@
 """Benches of whole fits: presets, rivals, objects, meshes, and gsplat's trainer."""
 
 import functools
-import json
 import math
 import sys
 from dataclasses import dataclass
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 
-from bench.fits import turns
 from bench.lib import gsplat_trainer, one_fit, pool, result_file, surfaces
 from bench.lib.arms import ABLATION, ARMS, LADDER, RIVALS, Arm, chosen_steps
 from bench.lib.backgrounds import ply_scores
@@ -21,7 +18,7 @@ from bench.lib.one_fit import Fit, config_of, is_peer, peer_settings
 from bench.lib.pool import finished
 from bench.lib.preset_table import rival, sizes_table, tables
 from bench.lib.rivals_page import arms_table, other_steps_table
-from bench.lib.scenes import ROWS, Row, folds, left_out, row_of, scene_at
+from bench.lib.scenes import PHOTOGRAPHS, ROWS, Row, folds, left_out, photographs, row_of, scene_at
 from tests import gaussians as sets
 from tests.scenes import photos
 from warpgs import RasterizeOptions, rasterize
@@ -141,6 +138,18 @@ def test_rows_are_named_or_given():
     for name in ("fern:4", "a@", "@llff:3", "a@all@0"):
         with pytest.raises(UsageError, match="fern:17"):
             row_of(name)
+
+
+def test_a_row_without_cameras_has_some_photographs_and_nothing_else(tmp_path):
+    """They are evenly spaced, the first and the last among them; each call makes a new folder."""
+    folder, count, flags = PHOTOGRAPHS["fern:3:film"]
+    source = tmp_path / folder
+    source.mkdir(parents=True)
+    for n in range(20):
+        (source / f"{n:02d}.png").write_bytes(b"")
+    one, other = (photographs(source, count, tmp_path) for _ in range(2))
+    assert sorted(p.name for p in one.iterdir()) == ["00.png", "09.png", "19.png"] and one != other and flags == ""
+    assert (one.name, one.parent.parent) == ("fern", tmp_path)
 
 
 def test_training_views_are_left_out_and_held_out_ones_are_not_read(demo):
@@ -436,32 +445,3 @@ def test_samples_and_distances_of_triangles():
     assert (
         row["x_mean"] == row["x_mean_of_radius"] == 0.25 and row["x_median"] == 0.015 and row["x_within_0.01_of_radius"] == 0.5
     )
-
-
-# Whole commands in turn.
-
-
-def test_a_command_is_measured_from_photographs_to_its_film(tmp_path, monkeypatch):
-    """A row without cameras has a folder of some photographs alone, no split, and a second command for the film."""
-    source = tmp_path / "data" / "llff/fern/images_8"
-    source.mkdir(parents=True)
-    for n in range(20):
-        (source / f"{n:02d}.png").write_bytes(b"")
-    label, scene, split, flags = turns.case("fern:3:film", tmp_path / "data", tmp_path, "llff:3")
-    assert (label, split, flags) == ("fern:3:film", "", "")
-    assert sorted(p.name for p in Path(scene).iterdir()) == ["00.png", "09.png", "19.png"]
-    asked = turns.case(str(tmp_path / "own") + "@every:8", tmp_path, tmp_path, "llff:3")
-    assert asked == ("own every:8", str(tmp_path / "own"), "every:8", "")
-    assert turns.case("fox:8", tmp_path, tmp_path, "")[2:] == ("llff:8", "--downscale 4")
-
-    out, ran = tmp_path / "run", []
-    out.mkdir()
-    seconds = {"seconds": {"setup": 1, "training": 2, "total": 3}}
-    metrics = seconds | {"steps": 9, "test": {}, "train": {"psnr": 30.0}, "gaussians": 5}
-    (out / "metrics.json").write_text(json.dumps(metrics | {"wall_seconds": {"import": 1.5, "other": 0.5, "total": 2.0}}))
-    monkeypatch.setattr(turns.subprocess, "run", lambda words, **_: ran.append(words[1:4]) or SimpleNamespace(returncode=0))
-    words = turns.command(scene, split, 0, "cpu", flags, out, "")
-    row = turns.timed(words, tmp_path, {}, out, film=True)
-    assert "--split" not in words and [w[2] for w in ran] == ["fit", "render"] and row["psnr"] == 30.0
-    rows = [row | {"scene": label, "side": s, "round": n} for s in turns.SIDES for n in range(2)]
-    assert "| import | 1.50 | 1.50 |" in turns.sections(rows) and "| total | 2.00 | 2.00 |" in turns.sections(rows)

@@ -12,7 +12,6 @@ from __future__ import annotations
 import json
 import os
 import shlex
-import shutil
 import statistics
 import subprocess
 import sys
@@ -26,22 +25,11 @@ import torch
 
 from bench.lib import result_file
 from bench.lib.arguments import parse
-from bench.lib.scenes import ROWS, made
+from bench.lib.scenes import PHOTOGRAPHS, ROWS, made, photographs
 from bench.lib.tables import markdown
 
 WHAT = "the whole command warpgs fit from two checkouts in turn"
 SIDES = ("old", "new")
-PHOTOGRAPHS = {"fern:3:film": ("llff/fern/images_8", 3, ""), "fox:30": ("fox/images", 30, "--max-side 1333")}
-"""Rows without cameras: folder of photographs, number of them, evenly spaced, and flags. The name says if a film is made."""
-
-
-def photographs(folder: Path, count: int, work: Path) -> Path:
-    """Return a new folder with some of the photographs of a folder and nothing else."""
-    files, made = sorted(p for p in folder.iterdir() if p.is_file()), Path(tempfile.mkdtemp(dir=work)) / folder.parent.name
-    made.mkdir()
-    for k in range(count):
-        shutil.copy(files[k * (len(files) - 1) // max(1, count - 1)], made)
-    return made
 
 
 def case(name: str, data: Path, work: Path, split: str) -> tuple[str, str, str, str]:
