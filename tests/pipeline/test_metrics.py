@@ -17,6 +17,7 @@ from tests.scenes import photos, ring, three_gaussians
 from warpgs.app.cli import main
 from warpgs.errors import DataError
 from warpgs.geometry import camera_extent, focus_point, look_at
+from warpgs.pipeline.metrics import scores
 from warpgs.pipeline.metrics.coverage import (
     BINS,
     classes_of,
@@ -346,6 +347,20 @@ def test_masks_hide_and_many_pixels_are_rendered_smaller(monkeypatch):
     seen = whole > 0
     counts = coverage_map(whole, cameras[0], small)[0]
     assert (counts[seen] > 0).float().mean() > 0.8
+
+
+def test_a_render_is_made_once_while_there_is_room(monkeypatch):
+    """The same arrays come again; a render without room is made again, with the same bits; coverage and scores share them."""
+    views, g, made = photos(3), three_gaussians(), []
+    monkeypatch.setattr(scores, "rasterize", lambda *a: made.append(a[1]) or rasterize(*a))
+    monkeypatch.setattr(scores, "KEPT_BYTES", 5 * 4 * views[0].image[..., 0].size * 2)
+    renders = scores.Renders(g, RasterizeOptions())
+    first = [renders(v.camera) for v in views]
+    again = [renders(v.camera) for v in views]
+    assert [a is b for a, b in zip(first, again)] == [True, True, False] and len(made) == 4
+    assert all(np.array_equal(a, b) for a, b in zip(first[2], again[2]))
+    coverage_of_run(None, g, views[:1], views[1:2], RasterizeOptions(), names={}, renders=renders)
+    assert len(made) == 4
 
 
 def test_photographs_tell_the_error_to_expect():

@@ -182,11 +182,35 @@ def score(view: View, image: np.ndarray, lpips: Lpips | None = None, alpha: np.n
     return ViewMetrics(view.name, decibels, float(similarity.mean()), float(cropped), name, distances, opacity)
 
 
-@torch.no_grad()
+KEPT_BYTES = 2**29
+"""Most host memory of renders that are kept [bytes]: 140 of 504 x 378 px, 20 of 1333 x 1000 px."""
+
+
+class Renders:
+    """Renders of a finished model by camera, each made once while all fit into `KEPT_BYTES`."""
+
+    def __init__(self, gaussians: Gaussians, options: RasterizeOptions):
+        """Begin without a render."""
+        self._parts, self._left = (gaussians, options), KEPT_BYTES
+        self._kept: dict[int, tuple[Camera, tuple[np.ndarray, np.ndarray, np.ndarray]]] = {}
+
+    @torch.no_grad()
+    def __call__(self, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return colours [H, W, 3], depth [u] [H, W] and alpha [H, W] as numpy arrays, which nobody may change."""
+        if id(camera) in self._kept:  # a kept camera lives, so no other has its id
+            return self._kept[id(camera)][1]
+        gaussians, options = self._parts
+        r = rasterize(gaussians, camera, options)
+        images = r.rgb.cpu().numpy(), r.depth.cpu().numpy(), r.alpha.cpu().numpy()
+        if (size := sum(a.nbytes for a in images)) <= self._left:
+            self._left -= size
+            self._kept[id(camera)] = camera, images
+        return images
+
+
 def render_view(gaussians: Gaussians, view: View, options: RasterizeOptions) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Render a view; returns colours [H, W, 3], depth [u] [H, W] and alpha [H, W] as numpy arrays."""
-    r = rasterize(gaussians, view.camera, options)
-    return r.rgb.cpu().numpy(), r.depth.cpu().numpy(), r.alpha.cpu().numpy()
+    return Renders(gaussians, options)(view.camera)
 
 
 @runtime_checkable

@@ -106,7 +106,6 @@ class StepBuffers:
         """0 while steps continue, else the reason why they stopped."""
         self.history = torch.zeros(rows, 2, device=device, dtype=torch.float32)
         """Loss and mean squared error of each step."""
-        """Gradient of the loss."""
 
     def load(self, rows: list[int], lrs: list[list[float]], settings: list[tuple[float, ...]]) -> None:
         """Upload view rows, learning rates and settings (7 each) of the next steps, at most as many as were allocated."""
@@ -245,7 +244,7 @@ class StepTaker:
         rendered, inputs, of_views, lrs, settings = self.forward(views, buffers, plan, render)
         loss = total_loss(plan, inputs, self.strategy, tuple(of_views.values()))
         leaves = [*self.params.values(), rendered.projected]
-        # without a gradient of the loss, which is 1: to check the shape of a given one, torch imports SymPy
+        # without a gradient of the loss: to check one, torch imports sympy, for 0.2 s
         *gradients, v_projected = torch.autograd.grad(loss, leaves, materialize_grads=True)
         with torch.no_grad():
             mse = masked_mse(rendered.rgb, inputs.target.image, inputs.target.mask)
