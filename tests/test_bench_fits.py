@@ -18,7 +18,7 @@ from bench.lib.one_fit import Fit, config_of, is_peer, peer_settings
 from bench.lib.pool import finished
 from bench.lib.preset_table import rival, sizes_table, tables
 from bench.lib.rivals_page import arms_table, other_steps_table
-from bench.lib.scenes import ROWS, Row, folds, left_out, row_of, scene_at
+from bench.lib.scenes import PHOTOGRAPHS, ROWS, Row, folds, left_out, photographs, row_of, scene_at
 from tests import gaussians as sets
 from tests.scenes import photos
 from warpgs import RasterizeOptions, rasterize
@@ -138,6 +138,18 @@ def test_rows_are_named_or_given():
     for name in ("fern:4", "a@", "@llff:3", "a@all@0"):
         with pytest.raises(UsageError, match="fern:17"):
             row_of(name)
+
+
+def test_a_row_without_cameras_has_some_photographs_and_nothing_else(tmp_path):
+    """They are evenly spaced, the first and the last among them; each call makes a new folder."""
+    folder, count, flags = PHOTOGRAPHS["fern:3:film"]
+    source = tmp_path / folder
+    source.mkdir(parents=True)
+    for n in range(20):
+        (source / f"{n:02d}.png").write_bytes(b"")
+    one, other = (photographs(source, count, tmp_path) for _ in range(2))
+    assert sorted(p.name for p in one.iterdir()) == ["00.png", "09.png", "19.png"] and one != other and flags == ""
+    assert (one.name, one.parent.parent) == ("fern", tmp_path)
 
 
 def test_training_views_are_left_out_and_held_out_ones_are_not_read(demo):

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import functools
 import re
+import shutil
+import tempfile
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -48,6 +50,10 @@ ROWS = {
 """Named rows. fern and horns are 504 x 378 px, fox is 270 x 480, temple 640 x 480, the demo 320 x 240."""
 
 
+PHOTOGRAPHS = {"fern:3:film": ("llff/fern/images_8", 3, ""), "fox:30": ("fox/images", 30, "--max-side 1333")}
+"""Rows without cameras: folder of photographs, number of them, evenly spaced, and flags. The name says if a film is made."""
+
+
 def row_of(name: str) -> Row:
     """Return a named row, or that of ``FOLDER@SPLIT`` or ``FOLDER@SPLIT@DOWNSCALE``."""
     if name in ROWS:
@@ -66,6 +72,15 @@ def made(data: Path, row: Row, work: Path) -> str:
     if not folder.is_dir():
         write_demo(folder, views=DEMO_VIEWS)
     return str(folder)
+
+
+def photographs(folder: Path, count: int, work: Path) -> Path:
+    """Return a new folder with some of the photographs of a folder and nothing else."""
+    files, made = sorted(p for p in folder.iterdir() if p.is_file()), Path(tempfile.mkdtemp(dir=work)) / folder.parent.name
+    made.mkdir()
+    for k in range(count):
+        shutil.copy(files[k * (len(files) - 1) // max(1, count - 1)], made)
+    return made
 
 
 @functools.lru_cache(maxsize=32)

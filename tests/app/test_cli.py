@@ -64,16 +64,17 @@ def test_help_imports_nothing_heavy(words, said):
 
 
 def test_a_fit_starts_without_libraries_that_it_does_not_need_yet(scene, tmp_path):
-    """Up to the first step: no search trees, no metrics, no 3D overview, no networks, no compiler of torch's."""
+    """After the first step: no search trees, no metrics, no 3D overview, no networks, no compiler of torch's, no algebra."""
     code = (
         "import sys\n"
         "from warpgs.app.cli import main\n"
         "from warpgs.pipeline.train import trainer\n"
-        "def stop(*_): raise KeyboardInterrupt\n"
-        "trainer.Trainer.advance = stop\n"
+        "advance = trainer.Trainer.advance\n"
+        "def once(*a): advance(*a); raise KeyboardInterrupt\n"
+        "trainer.Trainer.advance = once\n"
         f"flags = ['--out', {str(tmp_path / 'run')!r}, '--device', 'cpu', '--init.source', 'random']\n"
         f"code = main(['fit', {str(scene)!r}, *flags])\n"
-        "late = {'scipy', 'skimage', 'pyvista', 'onnxruntime', 'torch._dynamo', 'torch._inductor'}\n"
+        "late = {'scipy', 'skimage', 'sympy', 'pyvista', 'onnxruntime', 'torch._dynamo', 'torch._inductor'}\n"
         "print(code, sorted(late & set(sys.modules)))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

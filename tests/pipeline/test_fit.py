@@ -81,6 +81,19 @@ def test_command_and_function_are_one_fit(folder, fitted):
     assert warpgs.evaluate(result.gaussians(), views, result.options())[0].psnr == stored["views"][0]["psnr"]
 
 
+def test_a_fit_tells_where_its_time_went(folder, fitted):
+    """The parts sum to the total, which is more than the fit's own count; only a command has imports before its fit."""
+    stored = json.loads((folder / "run" / "metrics.json").read_text())
+    for metrics in (stored, fitted[0].metrics):
+        times = dict(metrics["wall_seconds"])
+        total = times.pop("total")
+        assert total == pytest.approx(sum(times.values())) and total >= metrics["seconds"]["total"]
+        assert {"kernels", "photo checks", "first points", "steps (phase 2)", "scoring", "checks", "other"} <= times.keys()
+    assert {"import", "reading", "report", "writing"} <= stored["wall_seconds"].keys()
+    assert not {"import", "reading", "report"} & fitted[0].metrics["wall_seconds"].keys()
+    assert "<li>wall time until this page was written: " in (folder / "run" / "report.html").read_text()
+
+
 def test_a_result_is_scored_over_the_background_of_its_fit(folder, recwarn):
     """As the page on Python shows; Gaussians alone know no background, which is said where it shows."""
     scene = warpgs.load_scene(folder / "scene")

@@ -5,6 +5,7 @@ import dataclasses
 import hashlib
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from tests.scenes import photos, ring, three_gaussians
 from warpgs.app.cli import main
 from warpgs.errors import DataError
 from warpgs.geometry import camera_extent, focus_point, look_at
+from warpgs.pipeline.metrics import scores
 from warpgs.pipeline.metrics.coverage import (
     BINS,
     classes_of,
@@ -73,6 +75,24 @@ def test_scores_are_of_the_saved_picture():
     m = score(view, view.image + 1e-4)
     assert m.psnr > 50 and m.ssim > 0.999 and m.ssim_skimage > 0.999
     assert np.array_equal(to_8_bit(np.array([-1.0, 0.5, 2.0])), np.float32([0, 128 / 255, 1]))
+
+
+@pytest.mark.parametrize("height, width", [(11, 11), (40, 57), (10, 30)])
+def test_ssim_without_the_border_is_scikit_images(height, width):
+    """To the rounding of scikit-image, which sums in float32 here; NaN where the window does not fit."""
+    from skimage.metrics import structural_similarity
+
+    generator, camera = np.random.default_rng(0), photos(1)[0].camera
+    smooth = np.add.outer(np.linspace(0, 0.7, height), np.linspace(0, 0.3, width))[..., None].repeat(3, 2).astype(np.float32)
+    noise = generator.random((height, width, 3), np.float32)
+    for a, b in ((noise, noise[::-1]), (smooth, smooth + 0.1 * noise), (np.ones_like(noise), smooth), (smooth, smooth)):
+        a, b = to_8_bit(a), to_8_bit(b)
+        found = score(View("a", replace(camera, width=width, height=height), a), b).ssim_skimage
+        if height < 11:
+            assert math.isnan(found)
+            continue
+        given = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False, "data_range": 1, "channel_axis": -1}
+        assert found == pytest.approx(structural_similarity(a.astype(float), b.astype(float), **given), abs=2e-6)
 
 
 def test_counted_region():
@@ -327,6 +347,20 @@ def test_masks_hide_and_many_pixels_are_rendered_smaller(monkeypatch):
     seen = whole > 0
     counts = coverage_map(whole, cameras[0], small)[0]
     assert (counts[seen] > 0).float().mean() > 0.8
+
+
+def test_a_render_is_made_once_while_there_is_room(monkeypatch):
+    """The same arrays come again; a render without room is made again, with the same bits; coverage and scores share them."""
+    views, g, made = photos(3), three_gaussians(), []
+    monkeypatch.setattr(scores, "rasterize", lambda *a: made.append(a[1]) or rasterize(*a))
+    monkeypatch.setattr(scores, "KEPT_BYTES", 5 * 4 * views[0].image[..., 0].size * 2)
+    renders = scores.Renders(g, RasterizeOptions())
+    first = [renders(v.camera) for v in views]
+    again = [renders(v.camera) for v in views]
+    assert [a is b for a, b in zip(first, again)] == [True, True, False] and len(made) == 4
+    assert all(np.array_equal(a, b) for a, b in zip(first[2], again[2]))
+    coverage_of_run(None, g, views[:1], views[1:2], RasterizeOptions(), names={}, renders=renders)
+    assert len(made) == 4
 
 
 def test_photographs_tell_the_error_to_expect():

@@ -85,19 +85,23 @@ def test_a_fit_ends_with_its_score_its_size_its_time_and_what_to_do_next(tmp_pat
     metrics = {
         "test": {"psnr": 24.5, "ssim": 0.8}, "train": {"psnr": 30.25}, "views": [{}, {}], "coverage": {"summary": "all seen"},
         "baselines": {"mean_photo": 12.0, "nearest_photo": 13.5}, "gaussians": 1234, "complexity": {"bytes": 2**20},
-        "seconds": {"total": 75.0, "compiling": 20.0},
+        "seconds": {"total": 70.0, "compiling": 20.0},
+        "wall_seconds": {"import": 3.0, "kernels": 20.0, "steps (phase 1)": 40.0, "scoring": 12.0, "other": 0.2, "total": 75.2},
     }  # fmt: skip
     out = tmp_path / "my run"
     lines = result_lines(metrics, out)
     assert lines[0].startswith("held-out PSNR 24.50 dB, SSIM 0.800") and lines[0].endswith("(2 views)")
     assert "the nearest photograph 13.50 dB" in lines[1] and "all seen" in lines[2]
-    assert lines[3] == "1,234 Gaussians, 1.0 MiB, in 1 min 15 s, of which 20 s to compile kernels, once on this machine"
+    compiled = "in 1 min 15 s, of which 20 s to compile kernels, once on this machine"
+    assert lines[3] == f"1,234 Gaussians, 1.0 MiB, {compiled}: steps 40 s, kernels 20 s, scoring 12 s"
     assert lines[4] == f"report: {out / 'report.html'}"
     commands = [f"view '{out}'", f"render '{out}'", f"export '{out}' --to scene.html"]
     assert [line.split("  ")[1] for line in lines[6:]] == [f"warpgs {words}" for words in commands]
-    unscored = result_lines(metrics | {"test": {}, "seconds": {"total": 5.0}}, None)
+    quick = {"seconds": {"total": 4.0}, "wall_seconds": {"import": 5.0, "total": 5.0}}
+    unscored = result_lines(metrics | {"test": {}} | quick, None)
     assert unscored[0] == "training PSNR 30.25 dB (no score of new views: no view is held out)"
-    assert unscored[1].endswith("1.0 MiB, in 5 s") and "held-out" not in " ".join(unscored) and "next:" not in unscored
+    assert unscored[1].endswith("1.0 MiB, in 5 s: import 5 s")
+    assert "held-out" not in " ".join(unscored) and "next:" not in unscored
 
 
 # What a fit says it traded: errors that are true, the same for the same seed, and quick to find.

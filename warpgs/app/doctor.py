@@ -48,7 +48,7 @@ PACKAGES = (
     ("warp-lang", "warp", True, "the rasterizer's kernels"),
     ("numpy", "numpy", True, "reading scenes"),
     ("scipy", "scipy", True, "rotations and neighbours"),
-    ("scikit-image", "skimage", True, "metrics"),
+    ("scikit-image", "skimage", False, "`warpgs mesh`"),
     ("opencv-contrib-python-headless", "cv2", True, "images, matches, video"),
     ("psutil", "psutil", False, "free memory"),
     ("safetensors", "safetensors", True, "checkpoints"),

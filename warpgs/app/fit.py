@@ -19,6 +19,7 @@ from warpgs.app.flags import (
     settings_of,
     word_after,
 )
+from warpgs.clock import Clock, section, since_start, timed
 from warpgs.device import parse_bytes
 from warpgs.errors import UsageError
 from warpgs.io.folder import READERS
@@ -266,15 +267,17 @@ def run(arguments: list[str], about: str) -> int:
     """Run the command; ``about`` describes it in its help."""
     if place()[0] > 0:
         be_quiet()
-    request = request_of(arguments, about)
-    with fast_imports():
-        from warpgs.pipeline.run.fit import fit_request
-    ranks = join(request.device)
-    if request.view_port is None or not ranks.first:
-        fit_request(request, ranks=ranks)
-        return 0
-    from warpgs.viewer.watch import live_view
+    with timed(Clock(since_start())):
+        with section("import"):
+            request = request_of(arguments, about)
+            with fast_imports():
+                from warpgs.pipeline.run.fit import fit_request
+        ranks = join(request.device)
+        if request.view_port is None or not ranks.first:
+            fit_request(request, ranks=ranks)
+            return 0
+        from warpgs.viewer.watch import live_view
 
-    with live_view(request.out, request.view_port) as live:
-        fit_request(request, on_model=live.look, ranks=ranks)
+        with live_view(request.out, request.view_port) as live:
+            fit_request(request, on_model=live.look, ranks=ranks)
     return 0

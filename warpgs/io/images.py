@@ -267,7 +267,8 @@ def nearest_unmasked(raster: np.ndarray, mask: np.ndarray | None) -> np.ndarray:
     labels = cv2.distanceTransformWithLabels(masked, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)[1]
     places = np.zeros(labels.max() + 1, np.int64)
     places[labels[mask]] = np.flatnonzero(mask)
-    filled: np.ndarray = raster.reshape(-1, *raster.shape[2:])[places[labels]]
+    filled = raster.copy()
+    filled[~mask] = raster.reshape(-1, *raster.shape[2:])[places[labels[~mask]]]  # an unmasked pixel is its own nearest one
     return filled
 
 
@@ -473,9 +474,11 @@ def dark_pixels(image: np.ndarray) -> np.ndarray | None:
 
     In such an image, at least `DARK_FRACTION` of the pixels and half of the border are dark, but not all pixels.
     """
+    border = np.concatenate([image[0], image[-1], image[:, 0], image[:, -1]]).max(-1) < DARK
+    if border.mean() < 0.5:  # as in most photographs, whose other pixels take 40 ms per million
+        return None
     dark: np.ndarray = image.max(-1) < DARK
-    border = np.concatenate([dark[0], dark[-1], dark[:, 0], dark[:, -1]])
-    return dark if dark.mean() >= DARK_FRACTION and border.mean() >= 0.5 and not dark.all() else None
+    return dark if dark.mean() >= DARK_FRACTION and not dark.all() else None
 
 
 def empty_pixels(dark: np.ndarray) -> np.ndarray:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import re
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -83,8 +84,8 @@ class LLFFReader(Reader):
             lens = Lens(np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]]), int(width), int(height))
             # columns: down, right, back, centre
             pose = np.stack([matrix[:, 1], matrix[:, 0], -matrix[:, 2], matrix[:, 3]], axis=1)
-            loaded = scene.image(file, lens.checked(where), downscale=factor, mask=scene.find_mask(file, images))
-            views.add(name, from_camera_to_world(pose, where, opengl=False), loaded)
+            viewmat, mask = from_camera_to_world(pose, where, opengl=False), scene.mask_of(file, images)
+            views.add(name, viewmat, partial(scene.image, file, lens.checked(where), downscale=factor, mask=mask))
         notes = ([note] if note else []) + views.notes(options) + scene.mask_notes()
         return self.scene(folder, views.views, notes, pixels=scene.pixel_source(by_folder=True))
 
@@ -210,8 +211,8 @@ class DTUReader(Reader):
             if world is None:
                 raise DataError(f"{where}: world_mat_{i} is missing; copy the archive again")
             K, viewmat = decompose(matmul(world, scale)[:3], where)
-            mask = scene.mask(masks[file]) if file in masks else None
-            views.add(name, viewmat, scene.image(file, _lens(K, where), mask=mask))
+            mask = partial(scene.mask, masks[file]) if file in masks else None
+            views.add(name, viewmat, partial(scene.image, file, _lens(K, where), mask=mask))
         notes = resampling_note(options.downscale) + views.notes(options)
         return self.scene(folder, views.views, notes, pixels=scene.pixel_source(by_folder=False))
 
@@ -285,7 +286,7 @@ class MiddleburyReader(Reader):
             viewmat[:3, :3], viewmat[:3, 3] = values[9:18].reshape(3, 3), values[18:21]
             viewmat = rigid(viewmat, where)
             file, view = scene.child(folder, name, where), views.claim(view_name(name), where)
-            mask = scene.find_mask(file, folder, folder / "masks")
-            views.add(view, viewmat, scene.image(file, _lens(K, where), mask=mask))
+            mask = scene.mask_of(file, folder, folder / "masks")
+            views.add(view, viewmat, partial(scene.image, file, _lens(K, where), mask=mask))
         notes += resampling_note(options.downscale) + views.notes(options) + scene.mask_notes()
         return self.scene(folder, views.views, notes, pixels=scene.pixel_source(by_folder=False))

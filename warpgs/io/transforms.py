@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import functools
 import json
 import math
 import posixpath
 from collections import Counter
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -319,12 +319,13 @@ class TransformsReader(Reader):
                     mask_file = scene.child(file.parent, frame["mask_path"], f"{where}, mask", root=folder)
                     if not mask_file.is_file():
                         raise DataError(f"{where}: its mask {mask_file} is missing; restore it, or remove mask_path")
-                    mask = scene.mask(mask_file)
+                    mask = partial(scene.mask, mask_file)
                 else:
-                    mask = scene.find_mask(path, folder / "images")
-                lens = functools.partial(lens_of, frame, shared, where=where, native=options.lenses == "native")
+                    mask = scene.mask_of(path, folder / "images")
+                lens = partial(lens_of, frame, shared, where=where, native=options.lenses == "native")
                 named = _named_maps(scene, file.parent, shared, frame, where)
-                views.add(name, viewmat, scene.image(path, lens, mask=mask, background=background, named=named))
+                load = partial(scene.image, path, lens, mask=mask, background=background, named=named)
+                views.add(name, viewmat, load)
             if shared.get("ply_file_path"):
                 points, note = _points(scene, file, shared, views.views)
                 notes.append(note)

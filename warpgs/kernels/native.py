@@ -15,6 +15,7 @@ from types import SimpleNamespace
 import warp as wp
 from filelock import lock_descriptor, unlock_descriptor
 
+from warpgs.clock import section
 from warpgs.device import REMEDY
 from warpgs.errors import ResourceError
 from warpgs.files import make_folder
@@ -198,7 +199,7 @@ def load_module(module: wp.Module, device: wp.Device, block_dim: int):
     cache, name = Path(wp.config.kernel_cache_dir), module.get_module_identifier(block_dim)
     locks = cache / "locks"
     make_folder(locks)
-    with exclusive(locks / f"{name}.{device.is_cuda:d}"):
+    with section("kernels"), exclusive(locks / f"{name}.{device.is_cuda:d}"):
         compiles, began = not (cache / name).is_dir(), time.perf_counter()
         told = tuple(_LISTENERS) if compiles else ()
         for listener, _ in told:

@@ -7,11 +7,14 @@ import hashlib
 import json
 import os
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any, TypeVar
 
 import numpy as np
+import torch
 
 from warpgs import schema
 from warpgs.errors import DataError, ResourceError
@@ -19,6 +22,8 @@ from warpgs.files import read_input, unread_reason, write_bytes
 from warpgs.folders import cache_home, private_folder
 from warpgs.onnx import Model, fixed_size
 from warpgs.process import say
+
+T = TypeVar("T")
 
 
 @contextlib.contextmanager
@@ -34,6 +39,12 @@ def single_threaded_opencv() -> Iterator[None]:
         yield
     finally:
         cv2.setNumThreads(before)
+
+
+def in_threads(function: Callable[..., T], *items: Iterable[Any]) -> list[T]:
+    """Return the results of a function for each item, in their order, by as many threads as torch uses."""
+    with single_threaded_opencv(), ThreadPoolExecutor(torch.get_num_threads()) as pool:
+        return list(pool.map(function, *items))
 
 
 def without_ipp() -> None:

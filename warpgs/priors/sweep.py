@@ -213,7 +213,9 @@ def gray_of(view: View) -> np.ndarray:
 
 def step_limits(colors: np.ndarray, small_step: float = SMALL_STEP, large_step: float = LARGE_STEP) -> np.ndarray:
     """Return P2 of the steps along the first axis of an image [L, B, 3], in units of 1 / `UNIT`, int16, shape [L - 1, B]."""
-    jumps = np.abs(np.diff(colors, axis=0)).max(2).astype(float)  # the rounding of float32's exp depends on the processor
+    red, green, blue = np.moveaxis(np.abs(np.diff(colors, axis=0)), 2, 0)
+    largest = np.maximum(np.maximum(red, green), blue)  # six times as fast as max(2)
+    jumps = largest.astype(float)  # the rounding of float32's exp depends on the processor
     return np.rint(np.maximum(large_step * np.exp(-jumps / EDGE), 1.5 * small_step) * UNIT).astype(np.int16)
 
 

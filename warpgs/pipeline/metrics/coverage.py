@@ -19,7 +19,7 @@ from warpgs.io.image_files import decode
 from warpgs.io.images import without_masked
 from warpgs.kernels.ssim import ssim
 from warpgs.mesh.views import MIN_ALPHA, TOLERANCE, depth_difference, seen_from
-from warpgs.pipeline.metrics.scores import psnr_of, render_view, scored_pair
+from warpgs.pipeline.metrics.scores import Renders, psnr_of, scored_pair
 from warpgs.priors.given_depth import pinhole_view
 from warpgs.process import counted
 from warpgs.render.options import RasterizeOptions
@@ -41,15 +41,20 @@ DepthView = tuple[Camera, torch.Tensor]
 
 @torch.no_grad()
 def depth_views(
-    gaussians: Gaussians, cameras: Sequence[Camera], options: RasterizeOptions, masks: Sequence[np.ndarray | None] | None = None
-) -> list[DepthView]:
+    gaussians: Gaussians, cameras: Sequence[Camera], options: RasterizeOptions,
+    masks: Sequence[np.ndarray | None] | None = None, renders: Renders | None = None,
+) -> list[DepthView]:  # fmt: skip
     """Render the depth of every training view once, 0 outside ``masks`` [H, W]; smaller if all maps exceed `MAX_PIXELS`."""
     factor = min(1.0, (MAX_PIXELS / max(1, sum(c.width * c.height for c in cameras))) ** 0.5)
     views = []
     for camera, mask in zip(cameras, masks or [None] * len(cameras)):
         small = _resized(pinhole_of(camera), factor)
-        r = rasterize(gaussians, small, options)
-        depth = torch.where(r.alpha >= MIN_ALPHA, r.depth, 0)
+        if renders is None:
+            r = rasterize(gaussians, small, options)
+            depth, alpha = r.depth, r.alpha
+        else:
+            _, depth, alpha = (torch.from_numpy(a).to(gaussians.means.device) for a in renders(small))
+        depth = torch.where(alpha >= MIN_ALPHA, depth, 0)
         if mask is not None:
             counts = torch.as_tensor(mask, dtype=torch.float32, device=depth.device)[None, None]
             depth = torch.where(interpolate(counts, depth.shape, mode="area")[0, 0] > 0.5, depth, 0)
@@ -206,19 +211,20 @@ EXPECTED = (
 
 def coverage_of_run(
     out: Path | None, gaussians: Gaussians, train: Sequence[View], test: Sequence[View], options: RasterizeOptions, *,
-    names: Mapping[str, str], tell: Callable[[str], object] = lambda line: None,
+    names: Mapping[str, str], renders: Renders | None = None, tell: Callable[[str], object] = lambda line: None,
 ) -> dict[str, Any]:  # fmt: skip
     """Split the scores of held-out views by coverage, and save an image of each view in ``out``, if any."""
     tell("checking coverage")
     if out is not None:
         make_folder(out / FOLDER)
+    renders = renders or Renders(gaussians, options)
     train, test = ([pinhole_view(v) for v in views] for views in (train, test))
-    training = depth_views(gaussians, [v.camera for v in train], options, [v.mask for v in train])
+    training = depth_views(gaussians, [v.camera for v in train], options, [v.mask for v in train], renders)
     errors = photo_errors(train, training)
     transparent = any(v.alpha is not None for v in (*train, *test))
     views, total = [], {c: np.zeros(4) for c in CLASSES}
     for view in counted(test, tell, "checking coverage", "views"):
-        image, depth, alpha = render_view(gaussians, view, options)
+        image, depth, alpha = renders(view.camera)
         surface = torch.from_numpy(np.where(alpha >= MIN_ALPHA, depth, 0)).to(gaussians.means.device)
         counts, difference = coverage_map(surface, view.camera, training)
         classes = classes_of(counts, (surface <= 0) & transparent)

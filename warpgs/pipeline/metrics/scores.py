@@ -13,7 +13,7 @@ import torch
 
 from warpgs.geometry import back_project, inverse, matmul, project_points
 from warpgs.io.images import dark_pixels, without_masked
-from warpgs.kernels.ssim import ssim
+from warpgs.kernels.ssim import RADIUS, ssim
 from warpgs.kernels.update import squared_error
 from warpgs.pipeline.metrics.lpips import Lpips
 from warpgs.priors.flow import nearest_views, pixel_grid
@@ -105,8 +105,6 @@ EMPTY, HALF, OBJECT = 0.02, 0.5, 0.98
 """Opacity below which a pixel is empty, above which it shows the object, and above which it shows only the object."""
 MASKED = "where a view has a mask, SSIM and LPIPS compare both images with white outside of it"
 NO_LPIPS = "not measured: no --lpips-weights were given"
-SSIM_WINDOW = 11
-"""Side of the window of SSIM [px]."""
 
 
 @dataclass(frozen=True)
@@ -172,28 +170,47 @@ def _opacity_scores(
 
 def score(view: View, image: np.ndarray, lpips: Lpips | None = None, alpha: np.ndarray | None = None) -> ViewMetrics:
     """Compare a rendered image [H, W, 3], and its alpha [H, W] if the view has an alpha channel, with the image of its view."""
-    from skimage.metrics import structural_similarity
-
     opacity = {}
     if alpha is not None and view.alpha is not None:
         opacity = _opacity_scores(to_8_bit(image), to_8_bit(view.image), alpha, view.alpha, view.mask)
     image, target, region, name = scored_pair(view, image)
     decibels = psnr(image, target, region)
-    similarity = float(ssim(torch.from_numpy(image), torch.from_numpy(target)).mean())
-    cropped = float("nan")  # where the window does not fit
-    if min(image.shape[:2]) >= SSIM_WINDOW:
-        cropped = structural_similarity(  # type: ignore[no-untyped-call]
-            image, target, gaussian_weights=True, sigma=1.5, use_sample_covariance=False, data_range=1, channel_axis=-1
-        )
+    similarity = ssim(torch.from_numpy(image), torch.from_numpy(target))
+    # both variants have one window: they differ only where it reaches beyond the border; NaN where it does not fit
+    cropped = similarity[RADIUS:-RADIUS, RADIUS:-RADIUS].mean(dtype=torch.float64)
     distances = {} if lpips is None else lpips.measure(image, target)
-    return ViewMetrics(view.name, decibels, similarity, float(cropped), name, distances, opacity)
+    return ViewMetrics(view.name, decibels, float(similarity.mean()), float(cropped), name, distances, opacity)
 
 
-@torch.no_grad()
+KEPT_BYTES = 2**29
+"""Most host memory of renders that are kept [bytes]: 140 of 504 x 378 px, 20 of 1333 x 1000 px."""
+
+
+class Renders:
+    """Renders of a finished model by camera, each made once while all fit into `KEPT_BYTES`."""
+
+    def __init__(self, gaussians: Gaussians, options: RasterizeOptions):
+        """Begin without a render."""
+        self._parts, self._left = (gaussians, options), KEPT_BYTES
+        self._kept: dict[int, tuple[Camera, tuple[np.ndarray, np.ndarray, np.ndarray]]] = {}
+
+    @torch.no_grad()
+    def __call__(self, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return colours [H, W, 3], depth [u] [H, W] and alpha [H, W] as numpy arrays, which nobody may change."""
+        if id(camera) in self._kept:  # a kept camera lives, so no other has its id
+            return self._kept[id(camera)][1]
+        gaussians, options = self._parts
+        r = rasterize(gaussians, camera, options)
+        images = r.rgb.cpu().numpy(), r.depth.cpu().numpy(), r.alpha.cpu().numpy()
+        if (size := sum(a.nbytes for a in images)) <= self._left:
+            self._left -= size
+            self._kept[id(camera)] = camera, images
+        return images
+
+
 def render_view(gaussians: Gaussians, view: View, options: RasterizeOptions) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Render a view; returns colours [H, W, 3], depth [u] [H, W] and alpha [H, W] as numpy arrays."""
-    r = rasterize(gaussians, view.camera, options)
-    return r.rgb.cpu().numpy(), r.depth.cpu().numpy(), r.alpha.cpu().numpy()
+    return Renders(gaussians, options)(view.camera)
 
 
 @runtime_checkable

@@ -10,7 +10,7 @@ import numpy as np
 
 from warpgs import geometry
 from warpgs.pipeline.metrics.scores import fitted_region
-from warpgs.priors.networks import single_threaded_opencv
+from warpgs.priors.networks import in_threads, single_threaded_opencv
 from warpgs.priors.sweep import complete
 from warpgs.scene import Camera, PointCloud, View, ViewDepth
 
@@ -83,7 +83,11 @@ def in_free_space(points: np.ndarray, views: Sequence[View], depths: Sequence[np
     return hides
 
 
-def _lift(view: View, depth: np.ndarray, where: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+Lifted = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""Points [N, 3] [u], colours [N, 3] and widths [N] [u] of pixels."""
+
+
+def _lift(view: View, depth: np.ndarray, where: np.ndarray) -> Lifted:
     """Return world points [N, 3] [u], colours [N, 3] and pixel footprints [N] [u] of the pixels of a mask ``where`` [H, W]."""
     rows, columns = np.nonzero(where)
     z = depth[rows, columns].astype(float)
@@ -129,27 +133,33 @@ def coarse_points(
     regions = [fitted_region(v) for v in views]
     consistent = [d.valid if r is None else d.valid & r for d, (r, _) in zip(depths, regions)]
     *reconstructed, pixels_of = _tracked(known, views)
-    completed = {}
-    for i, view in enumerate(views):
-        if fill_px > 0 and depths[i].searched:
-            depth, sure, (rows, columns, z) = depths[i].depth.copy(), consistent[i].copy(), pixels_of[i]
-            new = ~sure[rows, columns]
-            depth[rows[new], columns[new]], sure[rows[new], columns[new]] = z[new], True
-            completed[i] = complete(depth, sure, view.image)
-    searched = [views[i] for i in completed], list(completed.values())
-    lifted, filled_in, notes = [], [], []
-    for i, (view, depth, sure, (region, name)) in enumerate(zip(views, depths, consistent, regions)):
-        lifted.append(_lift(view, depth.depth, sure))
+    searched = [i for i, d in enumerate(depths) if fill_px > 0 and d.searched]
+
+    def completed(i: int) -> np.ndarray:
+        depth, sure, (rows, columns, z) = depths[i].depth.copy(), consistent[i].copy(), pixels_of[i]
+        new = ~sure[rows, columns]
+        depth[rows[new], columns[new]], sure[rows[new], columns[new]] = z[new], True
+        return complete(depth, sure, views[i].image)
+
+    filled_depths = dict(zip(searched, in_threads(completed, searched)))
+    others = [views[i] for i in searched], list(filled_depths.values())
+
+    def lifted(i: int) -> tuple[Lifted, Lifted | None, str]:
+        view, sure, (region, name) = views[i], consistent[i], regions[i]
         counted = np.ones_like(sure) if region is None else region
         total = max(1, counted.sum())
         text = f"{view.name}: {100 * sure.sum() / total:.0f} % of {'pixels' if region is None else f'the {name}'} by {source}"
-        if i in completed:
-            rows = _lift(view, completed[i], ~sure & counted & (completed[i] > 0))
-            keep = ~in_free_space(rows[0], *searched, list(completed).index(i))
-            filled_in.append([row[keep] for row in rows])
+        more = None
+        if i in filled_depths:
+            rows = _lift(view, filled_depths[i], ~sure & counted & (filled_depths[i] > 0))
+            keep = ~in_free_space(rows[0], *others, searched.index(i))
+            more = rows[0][keep], rows[1][keep], rows[2][keep]
             text += f", {100 * keep.sum() / total:.0f} % filled"
-        notes.append("; ".join((text, *depth.notes)))
-    points, colors, widths = (np.concatenate(a) for a in zip(*lifted))
+        return _lift(view, depths[i].depth, sure), more, "; ".join((text, *depths[i].notes))
+
+    known_rows, filled_rows, notes = (list(a) for a in zip(*in_threads(lifted, range(len(views)))))
+    filled_in = [rows for rows in filled_rows if rows is not None]
+    points, colors, widths = (np.concatenate(a) for a in zip(*known_rows))
     cloud = merge(points, colors, merge_cells(points, merge_px * widths) if merge_px > 0 else np.arange(len(points)))
     pixels, added, filled = len(points), NOTHING, NOTHING
     if merge_px > 0:
@@ -207,9 +217,10 @@ def extrapolated_points(views: Sequence[View], depths: Sequence[ViewDepth]) -> P
     if not all_count(views):
         return NOTHING
     known = [i for i, d in enumerate(depths) if d.searched and d.valid.any()]
-    filled = {i: complete(depths[i].depth, depths[i].valid, views[i].image) for i in known}
-    clouds = [_beyond(views, i, filled[i]) for i in known if views[i].camera.model == "pinhole"]
-    clouds += [_behind(views, i, filled[i], [d.depth for d in depths]) for i in known]
+    filled = dict(zip(known, in_threads(lambda i: complete(depths[i].depth, depths[i].valid, views[i].image), known)))
+    plain = [i for i in known if views[i].camera.model == "pinhole"]
+    clouds = in_threads(lambda i: _beyond(views, i, filled[i]), plain)
+    clouds += in_threads(lambda i: _behind(views, i, filled[i], [d.depth for d in depths]), known)
     return joined((NOTHING, *clouds))
 
 

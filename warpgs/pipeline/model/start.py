@@ -11,6 +11,7 @@ import numpy as np
 import torch
 
 from warpgs import geometry
+from warpgs.clock import section
 from warpgs.errors import DataError
 from warpgs.kernels.neighbours import mean_square_distances
 from warpgs.kernels.sh import coefficient_count
@@ -205,11 +206,14 @@ def consistent_depths(
     ``known`` points bound the planes.
     """
     if config.source == "flow":
-        between = flow_between(views, config.flow)
-        return [flow_depth(views, i, between) for i in range(len(views))]
-    points = np.concatenate([known.points, triangulate_matches(views).points])
+        with section("depth"):
+            between = flow_between(views, config.flow)
+            return [flow_depth(views, i, between) for i in range(len(views))]
+    with section("matches"):
+        points = np.concatenate([known.points, triangulate_matches(views).points])
     bounds = [depth_bounds(v, points, camera_depths(views)) for v in views]
-    return sweep_depths(views, bounds, device(), lambda n, of: progress(f"finding depth: {n} of {of} views"))
+    with section("depth"):
+        return sweep_depths(views, bounds, device(), lambda n, of: progress(f"finding depth: {n} of {of} views"))
 
 
 def consistent_points(

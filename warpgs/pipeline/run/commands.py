@@ -39,7 +39,7 @@ from warpgs.pipeline.films.film import (
 from warpgs.pipeline.films.paths import rig_of
 from warpgs.pipeline.metrics.coverage import coverage_lines, coverage_of_run
 from warpgs.pipeline.metrics.lpips import Lpips
-from warpgs.pipeline.metrics.scores import counted_region, psnr, render_view, scored_region, to_8_bit
+from warpgs.pipeline.metrics.scores import Renders, counted_region, psnr, render_view, scored_region, to_8_bit
 from warpgs.pipeline.model import edit
 from warpgs.pipeline.model.edit import coverage
 from warpgs.pipeline.model.start import InitConfig, consistent_depths, seen_points
@@ -151,10 +151,11 @@ def evaluate(
     scene, train, test = scene_of(stored, reader, tell)
     request, names = stored.scene_request(reader), image_names(v.name for v in scene.views)
     scored = (folder, stored.gaussians(), train, test, stored.options())
+    renders = Renders(stored.gaussians(), stored.options())
     with hold_folder(folder, *IMAGE_FOLDERS) as held:
-        metrics = evaluate_run(*scored, lpips, names=names, tell=tell)
+        metrics = evaluate_run(*scored, lpips, names=names, renders=renders, tell=tell)
         if by_coverage and test:
-            metrics["coverage"] = coverage_of_run(*scored, names=names, tell=tell)
+            metrics["coverage"] = coverage_of_run(*scored, names=names, renders=renders, tell=tell)
         metrics |= {
             "protocol": protocol_of(scene, request.split, request.downscale, train, test),
             "config_hash": stored.record["config_hash"], "steps": stored.step,

@@ -12,6 +12,7 @@ from typing import Any, Literal
 
 import torch
 
+from warpgs.clock import Clock, section, timed
 from warpgs.errors import DataError, NotFiniteError, UsageError
 from warpgs.export.ply import write_ply
 from warpgs.files import write_json
@@ -21,7 +22,7 @@ from warpgs.io.load import Split, check_spec
 from warpgs.kernels.native import told_of_compiling
 from warpgs.pipeline.metrics.coverage import coverage_of_run
 from warpgs.pipeline.metrics.lpips import Lpips
-from warpgs.pipeline.metrics.scores import moved_fractions, moved_notes, render_view
+from warpgs.pipeline.metrics.scores import Renders, moved_fractions, moved_notes
 from warpgs.pipeline.model.edit import drop_unused_sh
 from warpgs.pipeline.model.limits import shape_figures, shape_summary
 from warpgs.pipeline.model.table import FittedModel
@@ -91,6 +92,7 @@ class FitJob:
     on_model: Callable[[FittedModel], object] | None
     ranks: Ranks
     began: float
+    clock: Clock
     progress: Callable[[str], object]
     compiled: list[float]
     """Time of each compilation so far [s]."""
@@ -151,12 +153,13 @@ def take_steps(job: FitJob, trainer: Trainer) -> None:
     def save(trainer: Trainer) -> None:
         if out is None or log is None:
             return
-        log.flush()
-        images_written()  # a fit that continues from the checkpoint does not write them
-        tensors, state = trainer.state()
-        if trainer.config.view_modules:  # by which a run is opened without their code
-            state["cameras"] = {n: camera_values(c) for n, c in job.cameras(trainer).items()}
-        save_checkpoint(out, tensors, state | {"fingerprint": job.scene.fingerprint, "train": job.split.train})
+        with section("writing"):
+            log.flush()
+            images_written()  # a fit that continues from the checkpoint does not write them
+            tensors, state = trainer.state()
+            if trainer.config.view_modules:  # by which a run is opened without their code
+                state["cameras"] = {n: camera_values(c) for n, c in job.cameras(trainer).items()}
+            save_checkpoint(out, tensors, state | {"fingerprint": job.scene.fingerprint, "train": job.split.train})
 
     def restore(trainer: Trainer) -> bool:
         if out is None or log is None or not (out / TENSORS).is_file():
@@ -392,6 +395,7 @@ def fit(
     with (
         torch.inference_mode(False),  # a caller's own mode would end the first step
         torch.enable_grad(),
+        timed() as clock,
         folder as held,
         stages as progress,
         told_of_compiling(lambda name: progress(COMPILING)) as compiled,
@@ -399,14 +403,15 @@ def fit(
         resume = resume and out is not None and (out / CONFIG).is_file()  # else the folder holds only found poses
         if out is not None and resume:
             read_record(out)  # a run of another version is refused before anything takes time
-        chosen, where = choose_device(device)
+        with clock("kernels"):
+            chosen, where = choose_device(device)
         began = time.perf_counter()
         lpips = None if lpips_weights is None else Lpips(Path(lpips_weights), chosen)
         read, request, parts, found = _read(scene, split, chosen, out, progress, ranks)
         job = FitJob(
             scene=read, request=request, split=parts, config=config, device=chosen, where=where, out=own, lpips=lpips,
             notes=[*notes, *origin, *held, *found], verbose=verbose, on_step=on_step, on_model=on_model, ranks=ranks,
-            began=began, progress=progress, compiled=compiled,
+            began=began, clock=clock, progress=progress, compiled=compiled,
         )  # fmt: skip
         _settle(job, time_budget)
         trainer, record, checks = _prepare(job, out if resume else None)
@@ -459,9 +464,11 @@ def _read(
         parts, notes = choose_split(scene, split)
         read, request, notes = scene, SceneRequest("", split, downscale=1).with_scale(device.type), [*scene.notes, *notes]
     else:
-        request, poses = with_poses(scene.with_scale(device.type), out, progress, ranks.count)
+        with section("poses"):
+            request, poses = with_poses(scene.with_scale(device.type), out, progress, ranks.count)
         progress(f"reading {request.path}")
-        read, parts, notes = read_scene(request, progress)
+        with section("reading"):
+            read, parts, notes = read_scene(request, progress)
         notes = [*poses, *notes]
     return read, request, parts, notes + ([] if out is None else renaming_notes(image_names(v.name for v in read.views)))
 
@@ -512,9 +519,11 @@ def _prepare(job: FitJob, resumed: Path | None) -> tuple[Trainer, dict[str, Any]
             models = " and ".join(job.other_models)
             job.notes.append(f"camera model {models}: views cannot be compared, so blur, exposure and coverage are not checked")
         else:
-            checks = check_photos([without_masked(v) for v in (*job.train, *job.test)], job.progress)
+            with section("photo checks"):
+                checks = check_photos([without_masked(v) for v in (*job.train, *job.test)], job.progress)
         of = job.train, job.scene.points, job.config, job.device, job.scene.background
-        trainer = Trainer(*of, ready=ready, progress=job.progress, ranks=job.ranks)
+        with section("set-up"):
+            trainer = Trainer(*of, ready=ready, progress=job.progress, ranks=job.ranks)
     if job.device.type == "cuda":
         torch.cuda.reset_peak_memory_stats(job.device)  # report the steps' memory, not that of the start or of an earlier fit
     if state is not None:
@@ -543,22 +552,35 @@ def _finish(job: FitJob, trainer: Trainer, record: dict[str, Any], checks: list[
         job.scene = with_cameras(job.scene, job.cameras(trainer))
         if job.out is not None:
             model = drop_unused_sh(trainer.gaussians)
-            write_ply(job.out / "point_cloud.ply", model, job.scene.normalization, antialiased=job.config.antialiased)
-        metrics = _score(job, trainer, seconds, given, checks)
+            with section("writing"):
+                write_ply(job.out / "point_cloud.ply", model, job.scene.normalization, antialiased=job.config.antialiased)
+        renders = Renders(trainer.gaussians, trainer.context.render_options())
+        with section("checks"):
+            metrics = _score(job, trainer, seconds, given, checks, renders)
+        metrics["wall_seconds"] = job.clock.seconds()
         if job.out is not None:
             write_json(job.out / METRICS_FILE, metrics)
             options, record["notes"] = trainer.context.render_options(), job.notes
-            write_report(
-                job.out, job.scene, job.split, trainer.gaussians, options, metrics, record,
-                sampling=sampling_report_of(trainer, job.out), tell=job.progress,
-            )  # fmt: skip
+            with section("report"):
+                write_report(
+                    job.out, job.scene, job.split, trainer.gaussians, options, metrics, record,
+                    sampling=sampling_report_of(trainer, job.out), renders=renders, times=job.clock.seconds,
+                    tell=job.progress,
+                )  # fmt: skip
+            metrics["wall_seconds"] = job.clock.seconds()
+            write_json(job.out / METRICS_FILE, metrics)  # again, with the time of the report
         for line in [*lost_lines(job.out), *result_lines(metrics, job.out)]:
             job.say(line)
     return FitResult(**job.model(trainer), config=job.config, metrics=metrics, notes=tuple(job.notes), folder=job.out)
 
 
 def _score(
-    job: FitJob, trainer: Trainer, seconds: dict[str, float], given: dict[str, Camera], checks: list[PhotoCheck]
+    job: FitJob,
+    trainer: Trainer,
+    seconds: dict[str, float],
+    given: dict[str, Camera],
+    checks: list[PhotoCheck],
+    renders: Renders,
 ) -> dict[str, Any]:
     """Score the finished fit, with the ``given`` cameras from before it; returns the contents of metrics.json."""
     c, scene, train, test, gaussians = job.config, job.scene, job.train, job.test, trainer.gaussians
@@ -566,16 +588,18 @@ def _score(
     names, learned = image_names(v.name for v in scene.views), trainer.learned
     options, tell, compare = trainer.context.render_options(), job.progress, not job.other_models
     scored = (job.out, gaussians, train, test, options)
-    metrics = evaluate_run(*scored, job.lpips, names=names, tell=tell)
+    with section("scoring"):
+        metrics = evaluate_run(*scored, job.lpips, names=names, renders=renders, tell=tell)
     if test and compare:
-        metrics["coverage"] = coverage_of_run(*scored, names=names, tell=tell)
+        with section("coverage"):
+            metrics["coverage"] = coverage_of_run(*scored, names=names, renders=renders, tell=tell)
     tell("checking float32 accuracy")
     rule = rule_report_of(gaussians, train, options, seed=c.seed, half_resolution=trainer.half_resolution)
     shape = shape_figures(gaussians, c.limits, trainer.radius, trainer.context.extent, [v.camera for v in train])
     moved: dict[str, float] = {}
     if compare:
         shown = counted(train, tell, "checking for moving objects", "views")
-        fractions = moved_fractions(train, (render_view(gaussians, v, options) for v in shown))
+        fractions = moved_fractions(train, (renders(v.camera) for v in shown))
         moved = {v.name: f for v, f in zip(train, fractions, strict=True)}
     complexity, cameras, scale = complexity_figures(trainer), cameras_of(scene), scene.normalization.scale
     modules = {
@@ -583,7 +607,7 @@ def _score(
             FittedViews(learned.params_of(m), job.split.train, test, given, cameras, scale, gaussians, options)
         ) for m in learned.modules
     }  # fmt: skip
-    mapped = given_figures(train, trainer.views, gaussians, options)
+    mapped = given_figures(train, trainer.views, renders)
     table: list[tuple[dict[str, Any], list[str]]] = [  # figures of metrics.json, and their sentences in the report
         ({"rule": rule}, [Detail(rule["summary"])]),
         ({"shape": shape}, [Detail(shape_summary(shape))]),

@@ -15,8 +15,9 @@ from typing import Any, TypeVar
 import numpy as np
 import torch
 
+from warpgs.clock import largest, times_line
 from warpgs.constants import TILE_SIZE
-from warpgs.device import format_bytes
+from warpgs.device import format_bytes, usable_cores
 from warpgs.errors import ResourceError
 from warpgs.files import make_folder, read_file, write_bytes
 from warpgs.geometry import MODELS, depth_normals
@@ -27,6 +28,7 @@ from warpgs.pipeline.metrics.coverage import coverage_section
 from warpgs.pipeline.metrics.lpips import Lpips
 from warpgs.pipeline.metrics.scores import (
     ALPHA_VARIANTS,
+    Renders,
     ViewMetrics,
     baselines,
     psnr_of,
@@ -41,7 +43,7 @@ from warpgs.pipeline.train.schedule import Phases
 from warpgs.pipeline.train.strategies.sampling import SampledView, Sampling
 from warpgs.pipeline.train.trainer import Trainer
 from warpgs.pipeline.train.views import TrainingView
-from warpgs.process import counted
+from warpgs.process import Detail, counted
 from warpgs.render.options import RasterizeOptions
 from warpgs.render.rasterize import rasterize
 from warpgs.render.reference import reference_image
@@ -61,16 +63,14 @@ GIVEN = {
 """Name in metrics.json, and summary, of each map of the loss terms."""
 
 
-def given_figures(
-    train: Sequence[View], views: Sequence[TrainingView], gaussians: Gaussians, options: RasterizeOptions
-) -> dict[str, Any]:
+def given_figures(train: Sequence[View], views: Sequence[TrainingView], renders: Renders) -> dict[str, Any]:
     """Compare the model with given depth and normals: rows by view and a summary, for each kind that a loss term compared."""
     rows: dict[str, list[dict[str, Any]]] = {name: [] for name in GIVEN}
     for view, mapped in zip(train, views, strict=True):
         maps = {n: t.cpu().numpy() for n, t in mapped.maps.items() if n in GIVEN and bool(t.any())}
         if not maps:
             continue
-        _, depth, alpha = render_view(gaussians, view, options)
+        _, depth, alpha = renders(view.camera)
         shown = alpha > GIVEN_MIN_ALPHA
         for name, given in maps.items():
             if name == "given_depth":
@@ -350,7 +350,7 @@ BASELINES = {"mean_photo": "the mean photograph", "nearest_photo": "the nearest 
 """Images that are scored without a fit, as text for the user."""
 SHOWN_VIEWS = 6
 """Held-out views with images in the report; all have files in the run folder."""
-RENDER_WORKERS = 4
+RENDER_WORKERS = max(2, min(8, usable_cores()))
 """Threads that score and encode images while others are rendered."""
 
 
@@ -380,7 +380,8 @@ def result_lines(metrics: dict[str, Any], out: Path | None) -> list[str]:
     compiling = metrics["seconds"].get("compiling", 0.0)
     once = f", of which {duration(compiling)} to compile kernels, once on this machine" if compiling >= 1 else ""
     size = format_bytes(metrics["complexity"]["bytes"])
-    lines.append(f"{metrics['gaussians']:,} Gaussians, {size}, in {duration(metrics['seconds']['total'])}{once}")
+    times = metrics["wall_seconds"]
+    lines.append(f"{metrics['gaussians']:,} Gaussians, {size}, in {duration(times['total'])}{once}: {largest(times)}")
     if out is None:
         return [*lines, "nothing was written to disk, because no run folder (out) was given"]
     run, file = shlex.quote(str(out)), " --to scene.html"
@@ -412,6 +413,7 @@ def evaluate_run(
     lpips: Lpips | None = None,
     *,
     names: dict[str, str] | None = None,
+    renders: Renders | None = None,
     tell: Callable[[str], object] = lambda line: None,
 ) -> dict[str, Any]:
     """Score held-out and training views, and save a render and depth map of each held-out (else training) view in ``out``."""
@@ -429,7 +431,8 @@ def evaluate_run(
     jobs: list[Future[ViewMetrics]] = []
     with ThreadPoolExecutor(RENDER_WORKERS if lpips is None else 1) as render_workers:  # LPIPS needs much memory for each view
         for view in counted([*test, *train], tell, "scoring", "views"):
-            jobs.append(render_workers.submit(finish, view, *render_view(gaussians, view, options)))
+            images = renders(view.camera) if renders else render_view(gaussians, view, options)
+            jobs.append(render_workers.submit(finish, view, *images))
             if len(jobs) > RENDER_WORKERS:
                 jobs[-RENDER_WORKERS].result()  # not all images at once
         found = [j.result() for j in jobs]
@@ -442,14 +445,12 @@ def evaluate_run(
     }  # fmt: skip
 
 
-def _images(
-    views: list[View], gaussians: Gaussians, options: RasterizeOptions, rows: dict[str, Any], tell: Callable[[str], object]
-) -> list[tuple[Any, ...]]:
+def _images(views: list[View], renders: Renders, rows: dict[str, Any], tell: Callable[[str], object]) -> list[tuple[Any, ...]]:
     """Render up to `SHOWN_VIEWS` of the views, evenly spaced, and encode their images for the page."""
     result = []
     with ThreadPoolExecutor(RENDER_WORKERS) as render_workers:
         for view in counted(evenly_spaced(views, SHOWN_VIEWS), tell, "making the report", "views"):
-            image, depth, alpha = render_view(gaussians, view, options)
+            image, depth, alpha = renders(view.camera)
             row, caption = rows.get(view.name), "training view"
             if row:
                 region = f", over {row['region']}" if row["region"] != "all" else ""
@@ -459,7 +460,7 @@ def _images(
     return [(name, caption, *parts) for name, caption, parts in result]
 
 
-def _figures(metrics: dict[str, Any]) -> list[tuple[str, str]]:
+def _figures(metrics: dict[str, Any], seconds: float) -> list[tuple[str, str]]:
     """Return the main figures of the page as pairs of label and value."""
     test, training = metrics["test"], f"{metrics['train']['psnr']:.2f} dB"
     held_out = [("training PSNR: no score of new views", training)]
@@ -471,10 +472,10 @@ def _figures(metrics: dict[str, Any]) -> list[tuple[str, str]]:
             *((LABELS[k], f"{test[k]:.3f}") for k in ("alpha_empty", "alpha_object") if k in test),
             ("training PSNR", training),
         ]  # fmt: skip
-    size, seconds = format_bytes(metrics["complexity"]["bytes"]), duration(metrics["seconds"]["total"])
+    size = format_bytes(metrics["complexity"]["bytes"])
     return [
         *held_out, ("Gaussians", f"{metrics['gaussians']:,}"), ("model", size), ("steps", f"{metrics['steps']:,}"),
-        ("time", seconds),
+        ("time", duration(seconds)),
     ]  # fmt: skip
 
 
@@ -488,6 +489,8 @@ def write_report(
     record: dict[str, Any],
     *,
     sampling: Section | None,
+    renders: Renders,
+    times: Callable[[], dict[str, float]],
     tell: Callable[[str], object] = lambda line: None,
 ) -> None:
     """Write report.html of a scored run, from metrics.json, config.json (``record``), metrics.jsonl and new renders."""
@@ -506,20 +509,22 @@ def write_report(
         [r["name"], *(f"{r.get(k, math.nan):.{2 if k.startswith('psnr') else 4}f}" for k in keys), r["region"]]
         for r in metrics["views"]
     ]
-    images = _images(test or train, gaussians, options, {r["name"]: r for r in metrics["views"]}, tell)
+    images = _images(test or train, renders, {r["name"]: r for r in metrics["views"]}, tell)
     covered, camera = None, train[0].camera
     if "coverage" in metrics:
         names = image_names(v.name for v in scene.views)
         covered = coverage_section(out, metrics["coverage"], [name for name, *_ in images], names)
     protocol = {k.replace("_", " "): ", ".join(v) if isinstance(v, list) else str(v) for k, v in metrics["protocol"].items()}
     protocol["configuration"] = f"{metrics['config_hash']}, step {metrics['steps']:,}"
+    picture, spent = None if overview is None else webp(overview), times()
+    notes = [*record["notes"], Detail(times_line(spent))]
     write_page(
         out / "report.html",
         title=(out if Path(scene.path).parent == out else Path(scene.path)).resolve().name,  # not "scene" for found poses
         subtitle=f"preset {metrics['preset']}, {len(train)} training views, {len(test)} held out, "
         f"{camera.width} x {camera.height} px, {metrics['device']}",
-        figures=_figures(metrics), notes=record["notes"], scores=table, views=images, curves=curves, sampling=sampling,
-        overview=None if overview is None else webp(overview), held_out=bool(test), coverage=covered,
+        figures=_figures(metrics, spent["total"]), notes=notes, scores=table, views=images, curves=curves, sampling=sampling,
+        overview=picture, held_out=bool(test), coverage=covered,
         record={k: v for k, v in record.items() if k != "cameras"},
         protocol=protocol | {LABELS.get(k, k): v for k, v in metrics["variants"].items()},
     )  # fmt: skip

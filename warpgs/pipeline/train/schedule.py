@@ -127,6 +127,10 @@ class Phases:
     steps: int
     """Number of steps; fewer than planned if phase 3 begins early."""
 
+    def number(self, step: int) -> int:
+        """Return the phase of the step after ``step`` steps: 1, 2 or 3."""
+        return 1 + (step >= self.refine) + (step >= self.stable_start)
+
     def progress(self, step: int) -> float:
         """Return the finished fraction of the fit before a step counted from 1, in [0, 1]; phase 3 ends with 1."""
         planned = max(1, self.planned - 1)

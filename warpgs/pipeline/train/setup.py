@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 
+from warpgs.clock import section
 from warpgs.errors import UsageError
 from warpgs.geometry import CENTRAL
 from warpgs.kernels.cameras import check_camera
@@ -41,19 +42,22 @@ def prepare(
     where = device if config.memory_limit is None else torch.device("cpu")
 
     def usable() -> torch.device:
-        ready()
+        with section("kernels"):  # in the thread of the warmup
+            ready()
         return where
 
     @functools.cache
     def start() -> Start:
         progress("finding initial points")
-        return _start_of(train, points, config, generator, usable, progress)
+        with section("first points"):
+            return _start_of(train, points, config, generator, usable, progress)
 
     notes = []
     if priors is None and needs_priors(config):
         regions = [fitted_region(v)[0] for v in train]
         # semantics come first: they are found while the device is made ready; depth by a network comes before the start
-        priors, notes = view_priors(train, config.priors, depths=lambda: start().depths, regions=regions, tell=progress)
+        with section("priors"):
+            priors, notes = view_priors(train, config.priors, depths=lambda: start().depths, regions=regions, tell=progress)
     elif priors is None:
         notes = _unused_networks(config)
     if config.priors.depth_guides and priors is not None:
@@ -62,7 +66,7 @@ def prepare(
             for v, p in zip(train, priors, strict=True)
         ]
     found = start()
-    ready()
+    usable()
     lines = f"start: {found.how}".splitlines()
     # lines on single views are indented
     return train, found, priors, [*(Detail(n.strip()) if n.startswith(" ") else n for n in lines), *notes]

@@ -106,8 +106,6 @@ class StepBuffers:
         """0 while steps continue, else the reason why they stopped."""
         self.history = torch.zeros(rows, 2, device=device, dtype=torch.float32)
         """Loss and mean squared error of each step."""
-        self.one = torch.ones((), device=device, dtype=torch.float32)
-        """Gradient of the loss."""
 
     def load(self, rows: list[int], lrs: list[list[float]], settings: list[tuple[float, ...]]) -> None:
         """Upload view rows, learning rates and settings (7 each) of the next steps, at most as many as were allocated."""
@@ -246,7 +244,8 @@ class StepTaker:
         rendered, inputs, of_views, lrs, settings = self.forward(views, buffers, plan, render)
         loss = total_loss(plan, inputs, self.strategy, tuple(of_views.values()))
         leaves = [*self.params.values(), rendered.projected]
-        *gradients, v_projected = torch.autograd.grad(loss, leaves, buffers.one, materialize_grads=True)
+        # without a gradient of the loss: to check one, torch imports sympy, for 0.2 s
+        *gradients, v_projected = torch.autograd.grad(loss, leaves, materialize_grads=True)
         with torch.no_grad():
             mse = masked_mse(rendered.rgb, inputs.target.image, inputs.target.mask)
             going = end_step(loss, mse, buffers.counter, buffers.stop, buffers.history)

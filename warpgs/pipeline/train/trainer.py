@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from warpgs.clock import section
 from warpgs.device import available_bytes, format_bytes, is_out_of_memory, no_memory_message
 from warpgs.errors import DataError, NotFiniteError, OutOfMemoryError, ResourceError, UsageError
 from warpgs.io.images import without_masked
@@ -492,7 +493,8 @@ def run(
     while trainer.step < trainer.steps:
         reports, failure = [], None
         try:
-            reports = trainer.advance(every - trainer.step % every)
+            with section(f"steps (phase {trainer.phases.number(trainer.step)})"):
+                reports = trainer.advance(every - trainer.step % every)
         except OutOfMemoryError as e:
             failure = e.with_traceback(None)  # whose frames hold tensors
             failure.__cause__ = failure.__context__ = None
