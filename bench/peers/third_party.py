@@ -2,7 +2,7 @@
 
 PATHS are runs, exported in every format, and files from elsewhere. NODE_PATH lists folders of npm packages, each version of
 splat-transform in its own; --python is an interpreter with the Python packages; --browser runs `third_party.mjs`. Numbers are
-in file units, about the file's origin: rotations up to sign and half turns about an ellipsoid's own axes, logarithms of lengths.
+in file units about the file's origin; rotations up to sign and half turns about an ellipsoid's own axes; logs of lengths.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ PYTHON = {
     "c = m.read_spz(s) if s.endswith('spz') else g.sogread(s) if s.endswith('sog') else m.plyread(s); "
     "m.write_spz(d, c) if d.endswith('spz') else m.plywrite(d, c, compressed='.compressed' in d)",
     "plyfile": "c = m.PlyData.read(s); c.text = '.text' in d; c.write(d)",
-    "open3d": "import numpy; numpy.savez(d, vertices=m.io.read_triangle_mesh(s).vertices)",
+    "open3d": "import numpy; c = m.io.read_triangle_mesh(s); numpy.savez(d, vertices=c.vertices, faces=c.triangles)",
     "pycolmap": "import numpy; c = m.Reconstruction(s).images.values(); "
     "numpy.savez(d, **{i.name: i.camera.calibration_matrix() @ i.cam_from_world().matrix() for i in c})",
 }
@@ -70,7 +70,8 @@ STEPS = {
 Spark holds half floats, clips harmonics to a power of two, and takes rotations of .splat without a length of 1."""
 VALIDATE = (
     "require('gltf-validator').validateBytes(new Uint8Array(require('fs').readFileSync(process.argv[1])))"
-    ".then((r) => console.log(r.issues.messages.filter((m) => !m.severity && m.code !== 'MESH_PRIMITIVE_INVALID_ATTRIBUTE').length))"
+    ".then((r) => console.log(r.issues.messages.filter((m) => !m.severity && "
+    "m.code !== 'MESH_PRIMITIVE_INVALID_ATTRIBUTE').length))"
 )
 """Number of errors but those for attributes of extensions, which the validator does not know."""
 
@@ -220,13 +221,14 @@ def exported(run: Path, work: Path) -> list[str]:
 
 def others(work: Path, program: str, command: list[str], bodies: dict) -> Iterator[tuple[str, float, float]]:
     """Yield file, difference and step of meshes, cameras and valid glTF files."""
-    name = program.split(maxsplit=1)[0]
-    head, data = (work / "mesh.ply").read_bytes().split(b"end_header\n", 1)
-    table = np.frombuffer(data, [("xyz", "<f4", 3), ("rgb", "u1", 3)], int(head.split(b"element vertex ")[1].split()[0]))
-    points = table["xyz"].astype(np.float64)
+    name, pieces = program.split(maxsplit=1)[0], (work / "mesh.ply").read_bytes().split(b"end_header\n", 1)
+    n, f = (int(pieces[0].split(kind, 1)[1].split(maxsplit=1)[0]) for kind in (b"element vertex ", b"element face "))
+    points = np.frombuffer(pieces[1], [("xyz", "<f4", 3), ("rgb", "u1", 3)], n)["xyz"]
+    corners = points[np.frombuffer(pieces[1], [("n", "u1"), ("abc", "<i4", 3)], f, 15 * n)["abc"]].astype(np.float64)
     for file in MESHES if name in ("open3d", "three.js") else ():
         read = bodies.get((name, file)) or np.load(convert(command, work / file, work / "out.npz"))
-        yield file, rigid(points, np.reshape(read["vertices"], (-1, 3))), 4 * float(np.spacing(np.abs(table["xyz"]).max()))
+        theirs = np.reshape(read["vertices"], (-1, 3))[np.reshape(read["faces"], -1)]
+        yield file, rigid(corners.reshape(-1, 3), theirs), 4 * float(np.spacing(np.abs(points).max()))
     if name == "pycolmap":
         stored, theirs = format_of(work / "m.ply"), np.load(convert(command, work / "sparse/0", work / "out.npz"))
         stored.read_stored(work / "m.ply")
