@@ -50,7 +50,7 @@ READS = {
 }  # fmt: skip
 WRITES: dict[str, tuple[tuple[str, ...], ...]] = {
     "spz": ((".spz",),), "gsply": ((".ply",), (".compressed.ply",), (".spz",)), "plyfile": ((".ply",), (".text.ply",)),
-    "splat-transform": ((".ply",), (".compressed.ply",), (".spz",), (".sog", "-g", "cpu"), (".glb",)),
+    "splat-transform": ((".ply",), (".compressed.ply",), (".spz",), (".sog", "-g", "cpu", "-i", "1"), (".glb",)),
 }  # fmt: skip
 """Suffixes that a program writes, each with further arguments."""
 PACKAGES = {"splat-transform": "@playcanvas/splat-transform", "Spark": "@sparkjsdev/spark", "three.js": "three"}
