@@ -66,7 +66,7 @@ STEPS = {
     ".splat": (0, 1 / 128, 1e-5, 1 / 255, 1, 0), ".spz": (2.0**-12, 1 / 361, 1 / 16, 1 / 255, 1 / 38, 1 / 8),
     ".sog": (1e-3, 1 / 180, 0.1, 1 / 255, 0.05, 0.05), "Spark": (1e-5, 1 / 8, 1 / 128, 1 / 255, 1 / 64, 1 / 32),
 }  # fmt: skip
-"""Steps by `NAMES`, if coarser than those of warpgs's own file: bytes of SPZ at its fewest bits, typical codebooks of SOG.
+"""Steps by `NAMES`, if above twice the difference of warpgs's own file: SPZ at its fewest bits, typical codebooks of SOG.
 Spark holds half floats, clips harmonics to a power of two, and takes rotations of .splat without a length of 1."""
 VALIDATE = (
     "require('gltf-validator').validateBytes(new Uint8Array(require('fs').readFileSync(process.argv[1])))"
@@ -268,7 +268,7 @@ def rows_of(files: list[str], work: Path, commands: dict[str, list[str]], browse
             least = compared(model, own(work / mine), steps)["largest"]
             try:
                 theirs = own(convert([*commands[program], *words], work / "m.ply", work / f"theirs{suffix}"))
-                facts = compared(model, theirs, {k: max(v, 1.01 * least.get(k, 0)) for k, v in steps.items()})
+                facts = compared(model, theirs, {k: max(v, 2 * least.get(k, 0)) for k, v in steps.items()})
             except DataError as e:
                 facts = {"verdict": f"not read: {str(e).replace(f'{work}/', '')}"}
             yield {"direction": "from", "program": program, "format": suffix} | facts
