@@ -74,16 +74,13 @@ def programs() -> str:
         cells, exceptions = [program], {}
         for way in ("to", "from"):
             rows = [r for r in result["rows"] if (r["program"], r["direction"]) == (program, way) and r["scene"] != "files"]
-            names = [
-                re.sub(r"^v(\d)\.spz", r".spz \1", r["format"].removeprefix("m") if r["format"][1] == "." else r["format"])
-                for r in rows
-            ]
+            names = [re.sub(r"^(m|v\d)(?=\.)", "", r["format"]) for r in rows]
             steps = [d / (r["steps"][k] or 1) for r in rows if r["verdict"] == "same" for k, d in r["largest"].items()]
             same = dict.fromkeys(f"`{n}`" for n, r in zip(names, rows) if r["verdict"] == "same")
             cells += [", ".join(same), f"{max(steps):.2g}" if steps else ""]
             for n, r in zip(names, rows):
                 if r["verdict"] != "same":
-                    exceptions.setdefault(r["verdict"], {})[f"`{n}`"] = None
+                    exceptions.setdefault(r["verdict"], {})[f"`{r['format'] if 'read' in r['verdict'] else n}`"] = None
         body.append([*cells, "; ".join(f"{', '.join(n)} {verdict}" for verdict, n in exceptions.items())])
-    head = ["program", "reads", "difference [steps]", "writes", "differences [steps]", "exceptions"]
+    head = ["program", "reads", "steps", "writes", "steps ", "exceptions"]
     return markdown(head, body, ("program", "reads", "writes", "exceptions")) + source
