@@ -11,7 +11,7 @@ DOCS = result_file.ROOT / "docs"
 PARTS: dict[str, Callable[[], dict[str, str]]] = {
     "numerics.md": accuracy_page.parts,
     "farm.md": lambda: {"packing": use_pages.packing()},
-    "formats.md": lambda: {"formats": use_pages.formats()},
+    "formats.md": lambda: {"formats": use_pages.formats(), "programs": use_pages.programs()},
     "many-gpus.md": lambda: {"ranks": use_pages.ranks()},
     "method.md": lambda: {"scores": results_page.scores()},
     "performance.md": performance_page.parts,

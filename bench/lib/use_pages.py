@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 from bench.lib import result_file
 from bench.lib.results_page import table
 from bench.lib.tables import markdown
@@ -64,3 +66,23 @@ def formats() -> str:
     body.append(["`.html`", "compressed, with a viewer of 0.8 MB", "0", "about 35", "", "any browser"])
     head = ["file", "encoding", "SH degrees", "bytes per Gaussian", "loss [dB]", "opens in"]
     return markdown(head, body, ("file", "encoding", "SH degrees", "opens in")) + source
+
+
+def programs() -> str:
+    """Return the table of other programs: formats in both directions, largest differences in steps, and exceptions."""
+    result, source = _result("third_party")
+    body = []
+    for program in (name for name, state in result["programs"].items() if not state.startswith("not run")):
+        cells, exceptions = [program], {}
+        for way in ("to", "from"):
+            rows = [r for r in result["rows"] if (r["program"], r["direction"]) == (program, way) and r["scene"] != "files"]
+            names = [re.sub(r"^(m|v\d)(?=\.)", "", r["format"]) for r in rows]
+            steps = [d / (r["steps"][k] or 1) for r in rows if r["verdict"] == "same" for k, d in r["largest"].items()]
+            same = dict.fromkeys(f"`{n}`" for n, r in zip(names, rows) if r["verdict"] == "same")
+            cells += [", ".join(same), f"{max(steps):.2g}" if steps else ""]
+            for n, r in zip(names, rows):
+                if r["verdict"] != "same":
+                    exceptions.setdefault(r["verdict"], {})[f"`{r['format'] if 'read' in r['verdict'] else n}`"] = None
+        body.append([*cells, "; ".join(f"{', '.join(n)} {verdict}" for verdict, n in exceptions.items())])
+    head = ["program", "reads", "steps", "writes", "steps ", "exceptions"]
+    return markdown(head, body, ("program", "reads", "writes", "exceptions")) + source
