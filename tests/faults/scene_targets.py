@@ -23,7 +23,7 @@ def read_scene(folder: Path, path: Path) -> Scene:
     root = folder / path.relative_to(folder).parts[0]
     return load.load_scene(
         root, max_pixels=MAX_PIXELS, downscale=2 if "small" in root.name else 1,
-        lenses="native" if "native" in root.name else "undistort", exclude="*4*" if "without 4" in root.name else None,
+        lenses="native" if "native" in root.name else "undistort",
     )  # fmt: skip
 
 
@@ -181,7 +181,7 @@ COLMAP = {
 }  # fmt: skip
 FRAMES = {
     "own": write_frames, "ngp": scenes.write_ngp, "blender": scenes.write_blender, "ply": write_nerfstudio,
-    "native": write_native, "native without 4": write_frames, "points": write_points,
+    "native": write_native, "native frames": write_frames, "points": write_points,
     "exr": write_exr,
 }  # fmt: skip
 FRAMES_PARSER = (
@@ -193,10 +193,9 @@ DTU = (others.decompose, others._centred, others._lens, others._read_matrices, o
 MIDDLEBURY = (others.files_of, others.read_camera_rows, others._centred, others._lens, others.MiddleburyReader)
 add("colmap", COLMAP, (colmap,), TEXT)
 add("transforms", FRAMES, FRAMES_PARSER, (rarely(many_rows, json_value), json_value, text_number))
-LLFF = {"a": scenes.write_llff, "without 4": scenes.write_llff}
-add("llff", LLFF, (others.read_poses_bounds, others.LLFFReader), (matrices_changed,))
-add("dtu", {"a": write_dtu, "without 4": scenes.write_dtu}, DTU, (matrices_changed,))
-add("middlebury", {"a": scenes.write_middlebury, "without 4": scenes.write_middlebury}, MIDDLEBURY, TEXT)
+add("llff", {"a": scenes.write_llff}, (others.read_poses_bounds, others.LLFFReader), (matrices_changed,))
+add("dtu", {"a": write_dtu}, DTU, (matrices_changed,))
+add("middlebury", {"a": scenes.write_middlebury}, MIDDLEBURY, TEXT)
 
 
 def write_maps(folder: Path) -> list[Path]:
