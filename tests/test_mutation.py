@@ -206,8 +206,11 @@ def test_claims_are_refused(tmp_path):
 
 
 @pytest.mark.audit
-def test_ends_of_a_test_run(tmp_path):
-    """A planted module under planted tests: passes, fails, does not import, crashes, never ends, has no test for a device."""
+def test_ends_of_a_test_run(tmp_path, monkeypatch):
+    """A planted module under planted tests: passes, fails, does not import, crashes, never ends, has no test for a device.
+
+    Processes that tests start find the mutant, and packages wherever this process finds them.
+    """
     tree = tmp_path / "tree"
     (tree / "tests").mkdir(parents=True)
     (tree / "warpgs").mkdir()
@@ -218,6 +221,12 @@ def test_ends_of_a_test_run(tmp_path):
     for name, marks in {"value": "", "cuda": cuda, "skipped": cuda + skip}.items():
         (tree / f"tests/test_{name}.py").write_text(test.format(marks))
 
+    (tmp_path / "packages").mkdir()
+    (tmp_path / "packages/elsewhere.py").write_text("")
+    monkeypatch.syspath_prepend(tmp_path / "packages")
+    started = "import subprocess, sys\n\ndef test_process():\n    subprocess.run([sys.executable, '-c', {!r}], check=True)\n"
+    (tree / "tests/test_process.py").write_text(started.format("import elsewhere, warpgs.value as v; assert v.VALUE == 1"))
+
     def job(name, source=None, tests=("value",), cuda=False, patience=1.0):
         file, source = ("warpgs/value.py", source.encode()) if source else (None, b"")
         return Job(name, tuple(f"tests/test_{t}.py" for t in tests), cuda, file, source, patience=patience)
@@ -225,10 +234,11 @@ def test_ends_of_a_test_run(tmp_path):
     endless = "class Slow:\n    def __eq__(self, other):\n        while True:\n            pass\n\nVALUE = Slow()\n"
     forever, two, device = "while True:\n    pass\n", "VALUE = 2\n", True
     jobs = {
-        "survived": [job("unmutated"), job("equivalent", "VALUE = 2 - 1\n"), job("both", None, ("value", "cuda"), device)],
+        "survived": [job("unmutated"), job("equivalent", "VALUE = 2 - 1\n"), job("both", None, ("value", "cuda"), device),
+                     job("in a process", None, ("process",))],
         "killed": [
             job("fails", two), job("no import", "VALUE = = 1\n"), job("crash", "import os\nos.abort()\n"),
-            job("fails on CUDA", two, ("value", "cuda"), device),
+            job("fails on CUDA", two, ("value", "cuda"), device), job("fails in a process", two, ("process",)),
         ],
         # limits that a mutant which ends would keep on the busiest machine
         "timeout": [job("endless import", forever, patience=0.05), job("endless test", endless, patience=0.05)],

@@ -280,11 +280,12 @@ def camera_paths(root: Path) -> list[Path]:
         camera_writers.write_cameras(root / name, list(found.values()))
     camera_writers.write_cameras(root / "text" / "sparse", list(found.values()))
     tables = [root / "text" / "sparse" / "0" / f"{n}.txt" for n in ("cameras", "images")]
+    tables += [root / "sparse" / "0" / f"{n}.bin" for n in ("cameras", "images")]
     return [root / camera_writers.NAMES[0], root / camera_writers.NAMES[1], *tables]
 
 
 def read_any(root: Path, path: Path) -> dict:
-    return transforms.read_cameras(path if path.suffix == ".json" else root / "text" / "sparse")[0]
+    return transforms.read_cameras(path if path.suffix == ".json" else path.parents[1])[0]
 
 
 def camera_nonsense(found: dict) -> str:
@@ -293,9 +294,13 @@ def camera_nonsense(found: dict) -> str:
     return bad or ("" if sound and found else "a camera is none")
 
 
-CAMERAS = (transforms, read_cameras, read_poses)
+CAMERAS = (
+    transforms.read_cameras, transforms._inria, transforms._transforms, transforms.colmap_folder, transforms._colmap,
+    transforms._json, transforms.read_json, transforms._number, transforms.lens_of, transforms.matrix_of, transforms._origin,
+    read_cameras, read_poses,
+)  # fmt: skip
 CAMERA_CHANGES = (rarely(many_rows, json_value), json_value, text_number, text_line)
-register(Target("cameras", camera_paths, read_any, CAMERAS, CAMERA_CHANGES, nonsense=camera_nonsense, lines=0.75))
+register(Target("cameras", camera_paths, read_any, CAMERAS, CAMERA_CHANGES, nonsense=camera_nonsense))
 
 
 def box_files(root: Path) -> list[Path]:

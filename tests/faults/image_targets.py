@@ -270,7 +270,10 @@ WEBPS = {
 add("webp", WEBPS, (image_files._webp_chunks, image_files._webp_size), (webp_chunk, header))
 
 ANY = {"png": encoded("PNG", "LA"), "float": encoded("TIFF", "F"), "double": by_opencv(".tif", COLORS[..., 0] / 255.0)}
-ANY |= {"jpeg": JPEGS["4440"], "gif": encoded("GIF", "P")}
+ANY |= {"jpeg": JPEGS["4440"], "gif": encoded("GIF", "P"), "avif": encoded("AVIF", "RGBA"), "webp": WEBPS["alpha"]}
+ANY |= {"bmp": encoded("BMP", "L"), "heic": struct.pack(">I8s", 12, b"ftypheic")}
+RLE, NO_PIXELS = struct.pack("<I", 1), b"WEBPVP8X" + struct.pack("<IIHI", 10, 0, 4, 0)
+ANY |= {"packed": ANY["bmp"][:30] + RLE + ANY["bmp"][34:], "no pixels": b"RIFF" + struct.pack("<I", 22) + NO_PIXELS}
 add(
     "any image",
     ANY,

@@ -298,9 +298,36 @@ def run_nonsense(run: folder.StoredRun) -> str:
     return "".join(bad) or ("" if whole else "a camera is none")
 
 
+def runs(root: Path) -> list[Path]:
+    """Write the records of runs: of this version, of earlier ones with settings of then, and what others refuse."""
+    (root / "own").mkdir()
+    record = json.loads(run_files(root / "own")[0].read_bytes())
+    config = record["config"]
+    records = {
+        "own": record, "earlier": record | {"config": config | {"checkpoint_seconds": 60}},
+        "lost": record | {"config": config | {"priors": config["priors"] | {"cache": False}}},
+        "untrained": record | {"train": []}, "bare": {"format": folder.FORMAT},
+    }  # fmt: skip
+    for name, values in records.items():
+        (root / name).mkdir(exist_ok=True)
+        write_json(root / name / folder.CONFIG, values)
+    made, degrees = gaussians().tensors(), torch.tensor([0, 1, 1])
+    tensors = {f"params.{n}": t for n, t in made.items() if n != "sh"}
+    tensors |= {"params.sh_packed": table.pack(made["sh"], degrees), "degrees": degrees}  # as `warpgs prune` leaves it
+    packed = folder.save_checkpoint(root / "earlier", tensors, {"step": 7})
+    checkpoints(root / "lost")
+    return [*(root / name / folder.CONFIG for name in records), packed]
+
+
+def run_changed(data: bytes, rng: np.random.Generator) -> bytes:
+    """Change a record, or a checkpoint whose digest stays right."""
+    changes = (json_value, json_value, text_number) if data.startswith(b"{") else CHECKPOINT_CHANGES
+    return changes[int(rng.integers(len(changes)))](data, rng)
+
+
 register(
     Target(
-        "run record", run_files, lambda root, path: folder.open_run(root, "cpu"), (folder.read_record, folder.open_run),
-        (json_value, json_value, text_number), nonsense=run_nonsense,
+        "run record", runs, lambda root, path: folder.open_run(path.parent, "cpu"), (folder.read_record, folder.open_run),
+        (run_changed,), nonsense=run_nonsense,
     )
 )  # fmt: skip

@@ -16,6 +16,7 @@ from warpgs import onnx
 from warpgs.pipeline.metrics import lpips
 from warpgs.poses import matching
 from warpgs.priors import flow, networks
+from warpgs.scene import Camera, View
 
 # ---- weights of LPIPS as others publish them ---------------------------------------------------------------------------
 
@@ -108,16 +109,27 @@ register(
 
 
 def flow_networks(root: Path) -> list[Path]:
-    shape = (1, 3, 8, 8)
-    nodes = [nw.node("Add", ["a", "b"], ["y"])]
-    graph = nw.graph(nodes, [], [nw.value("a", shape), nw.value("b", shape)], [nw.value("y", shape)])
-    (root / "flow.onnx").write_bytes(nw.model(graph))
-    return [root / "flow.onnx"]
+    """Write a network of flow for images of one size, one for any size, and one whose output is no flow."""
+    for name, (size, count) in {"fixed": ((8, 8), 2), "any": (("h", "w"), 2), "image": ((8, 8), 3)}.items():
+        nodes = [nw.node("Sub", ["a", "b"], ["x"]), nw.node("Conv", ["x", "W"], ["y"])]
+        tensors = [nw.tensor("W", np.ones((count, 3, 1, 1)))]
+        images = [nw.value(n, (1, 3, *size)) for n in "ab"]
+        (root / f"{name}.onnx").write_bytes(nw.model(nw.graph(nodes, tensors, images, [nw.value("y", (1, count, *size))])))
+    return sorted(root.glob("*.onnx"))
+
+
+def flow_by_network(root: Path, path: Path) -> np.ndarray:
+    camera = Camera(np.eye(4), np.array([[8.0, 0, 4], [0, 8, 4], [0, 0, 1]]), 9, 6)
+    return flow._network(path)(View("a", camera, IMAGE), View("b", camera, 1 - IMAGE))
+
+
+def flow_nonsense(found: np.ndarray) -> str:
+    return "" if found.shape == (6, 9, 2) and found.dtype == np.float32 else "no flow"
 
 
 register(
     Target(
-        "flow network", flow_networks, lambda root, path: flow._network(path), (flow._network,),
-        (onnx_field, onnx_field, onnx_field), lines=0.45, share=0.3,
+        "flow network", flow_networks, flow_by_network, (flow._network,), (onnx_field, onnx_field, onnx_field),
+        nonsense=flow_nonsense, share=0.3,
     )
 )  # fmt: skip

@@ -79,6 +79,8 @@ def photo_files(root: Path) -> list[Path]:
         for orientation in (1, 6) if suffix in ("jpg", "png") else (1 + i,):
             paths.append(root / "in" / f"{orientation}.{suffix}")
             paths[-1].write_bytes(encoded(kind, "RGB", exif=exif(orientation)))
+    paths.append(root / "in" / "long.png")  # is matched at a smaller size
+    photo("L", size=(photographs.MATCHING_SIDE + 50, 9)).save(paths[-1])
     return paths
 
 
@@ -111,7 +113,10 @@ def photo_nonsense(found: tuple[photographs.Photograph, np.ndarray]) -> str:
     return "" if photograph.focal is None or 0 < photograph.focal < 1000 else "a focal length is none"
 
 
-PHOTOGRAPHS = (photographs.prepare, photographs.write_copy, photographs)
+PHOTOGRAPHS = (
+    photographs.prepare, photographs.write_copy, photographs.scene_name, photographs._format,
+    photographs.without_jpeg_metadata, photographs.without_png_metadata,
+)  # fmt: skip
 register(
     Target(
         "photograph", photo_files, read_photograph, PHOTOGRAPHS, (exif_tag, rarely(png_bomb, exif_tag), jpeg_segments),

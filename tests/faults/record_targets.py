@@ -73,7 +73,13 @@ SCORES = {
     "protocol": {"split": "llff:8", "training_views": 3, "held_out_views": 1, "ground_truth": "as stored",
         "resolution": ["16 x 12"], "score_masks": 0},
 }  # fmt: skip
-add("scores", "metrics.json", SCORES, lambda root, path: work._scores(path), (work._scores, schema, folder), lines=0.6)
+SCHEMA = (
+    schema.parse, schema.check_parts, schema.check_depth, schema.read, schema.text, schema.real, schema.whole(),
+    schema.number(), schema.or_null(schema.text), schema.items(schema.text), schema.mapping(schema.text), schema.fields({}),
+    schema._refuse,
+)  # fmt: skip
+"""What reads JSON and checks values, without what only makes a schema, once, when warpgs is imported."""
+add("scores", "metrics.json", SCORES, lambda root, path: work._scores(path), (work._scores, *SCHEMA))
 
 # ---- farms -------------------------------------------------------------------------------------------------------------
 

@@ -19,9 +19,12 @@ MAX_PIXELS = 10_000
 
 
 def read_scene(folder: Path, path: Path) -> Scene:
-    """Read the scene that the changed file belongs to; small images are asked of the one whose folder says so."""
+    """Read the scene that the changed file belongs to, with the options that the name of its folder asks for."""
     root = folder / path.relative_to(folder).parts[0]
-    return load.load_scene(root, max_pixels=MAX_PIXELS, downscale=2 if "small" in root.name else 1)
+    return load.load_scene(
+        root, max_pixels=MAX_PIXELS, downscale=2 if "small" in root.name else 1,
+        lenses="native" if "native" in root.name else "undistort",
+    )  # fmt: skip
 
 
 def nonsense(scene: Scene) -> str:
@@ -102,6 +105,29 @@ def write_frames(root: Path) -> Path:
     return scenes.write_transforms(root, content)
 
 
+def write_native(root: Path) -> Path:
+    """Write a transforms scene of a fisheye whose frames name their maps."""
+    content = scenes.transforms_json(camera_model="OPENCV_FISHEYE", k1=0.01, k4=0.001, depth_unit_scale_factor=0.5)
+    content["frames"][0] |= {"depth_file_path": "d.npy", "normal_file_path": "n.npy"}
+    root.mkdir()
+    np.save(root / "d.npy", np.ones((scenes.HEIGHT, scenes.WIDTH), np.float32))
+    np.save(root / "n.npy", np.tile(np.float32([0, 0, -1]), (scenes.HEIGHT, scenes.WIDTH, 1)))
+    return scenes.write_transforms(root, content)
+
+
+def write_points(root: Path) -> None:
+    """Write one whose points have no applied_transform."""
+    scenes.write_transforms(root, scenes.transforms_json(ply_file_path="pc.ply"))
+    (root / "pc.ply").write_bytes(PLY)
+
+
+def write_exr(root: Path) -> None:
+    """Write one whose first depth map is of a kind that is not read."""
+    content = scenes.transforms_json()
+    content["frames"][0] |= {"depth_file_path": "d.exr"}
+    scenes.write_transforms(root, content)
+
+
 def write_dtu(root: Path) -> Path:
     scenes.save(root / "mask" / "003.png", np.tile(np.array([0, 255], np.uint8).repeat(8), (12, 1)))
     return scenes.write_dtu(root)
@@ -153,12 +179,23 @@ COLMAP = {
     "small stems": functools.partial(write_small, names=tuple(f"photo{i}.bmp" for i in range(scenes.VIEWS))),
     "ply": write_ply, "small order": functools.partial(write_small, names=tuple(f"image{i}.bmp" for i in range(scenes.VIEWS))),
 }  # fmt: skip
-FRAMES = {"own": write_frames, "ngp": scenes.write_ngp, "blender": scenes.write_blender, "ply": write_nerfstudio}
+FRAMES = {
+    "own": write_frames, "ngp": scenes.write_ngp, "blender": scenes.write_blender, "ply": write_nerfstudio,
+    "native": write_native, "native frames": write_frames, "points": write_points,
+    "exr": write_exr,
+}  # fmt: skip
+FRAMES_PARSER = (
+    transforms.files_of, transforms.is_blender, transforms._reject_constant, transforms._json, transforms.read_json,
+    transforms._number, transforms.lens_of, transforms.matrix_of, transforms._origin, transforms._image_path,
+    transforms._named_maps, transforms._points, transforms._disagreement, transforms.TransformsReader,
+)  # fmt: skip
+DTU = (others.decompose, others._centred, others._lens, others._read_matrices, others._number, others._masks, others.DTUReader)
+MIDDLEBURY = (others.files_of, others.read_camera_rows, others._centred, others._lens, others.MiddleburyReader)
 add("colmap", COLMAP, (colmap,), TEXT)
-add("transforms", FRAMES, (transforms,), (rarely(many_rows, json_value), json_value, text_number))
-add("llff", {"a": scenes.write_llff}, (others,), (matrices_changed,))
-add("dtu", {"a": write_dtu}, (others,), (matrices_changed,))
-add("middlebury", {"a": scenes.write_middlebury}, (others,), TEXT)
+add("transforms", FRAMES, FRAMES_PARSER, (rarely(many_rows, json_value), json_value, text_number))
+add("llff", {"a": scenes.write_llff}, (others.read_poses_bounds, others.LLFFReader), (matrices_changed,))
+add("dtu", {"a": write_dtu}, DTU, (matrices_changed,))
+add("middlebury", {"a": scenes.write_middlebury}, MIDDLEBURY, TEXT)
 
 
 def write_maps(folder: Path) -> list[Path]:

@@ -102,8 +102,9 @@ def words_of(command: str, scene: Path, work: Path) -> list[str]:
 
 def environment() -> dict[str, str]:
     """Return the environment of a process that runs our commands."""
+    search = os.pathsep.join([str(ROOT), *filter(None, sys.path)])  # packages, too, wherever this process found them
     return os.environ | {
-        "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", "CUDA_VISIBLE_DEVICES": "", "PYTHONUTF8": "1",
+        "PYTHONPATH": search, "OMP_NUM_THREADS": "1", "CUDA_VISIBLE_DEVICES": "", "PYTHONUTF8": "1",
         "PYTHONDONTWRITEBYTECODE": "1",
     }  # fmt: skip
 

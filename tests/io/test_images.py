@@ -8,10 +8,11 @@ import zlib
 import cv2
 import numpy as np
 import pytest
-from PIL import Image, ImageOps
+from PIL import Image, ImageFile, ImageOps
 
 from tests.io import scenes
 from warpgs.errors import DataError, ResourceError, UsageError
+from warpgs.io import image_files
 from warpgs.io.image_files import decode
 from warpgs.io.images import Lens, ReadOptions, list_images, load_image
 from warpgs.io.load import fingerprint, load_scene
@@ -595,6 +596,40 @@ def test_the_limit_holds_for_images_masks_and_score_masks(tmp_path):
         assert len(load_scene(tmp_path, max_pixels=4 * size).views) == scenes.VIEWS
         with pytest.raises(DataError, match=rf"{folder}.*: the image is 32 x 24 px, more than the limit of 192 pixels"):
             load_scene(tmp_path, max_pixels=size)
+
+
+def test_a_second_size_or_a_chunk_beyond_the_file_is_refused_before_any_pixel_is_decoded(tmp_path, monkeypatch):
+    """Pillow and OpenCV would take the memory that these announce: 4 GB for a file of 100 bytes."""
+    good, strip = png(12, 8, bytes(13) * 8), tiff(16, 8, [(0, 128)], bytes(128))
+    entry = struct.Struct("<HHII")
+    wide, header = entry.pack(256, 4, 1, 12000), chunk(b"IHDR", struct.pack(">IIBBBBB", 12000, 12000, 8, 0, 0, 0, 0))
+    for name in ("imdecode", "imread"):
+        monkeypatch.setattr(cv2, name, lambda *_: pytest.fail("decoded"))
+    monkeypatch.setattr(ImageFile.ImageFile, "load", lambda *_: pytest.fail("decoded"))
+    refused(tmp_path, good[:33] + header + good[33:], "it has two headers")
+    refused(tmp_path, strip.replace(entry.pack(277, 4, 1, 1), wide), "it has two values of a tag")
+    for length in (bytes(4), struct.pack(">I", 2**32 - 1)):
+        refused(tmp_path, good[:-12] + length + b"IEND", "it ends within a chunk")
+    at = good.index(b"IDAT") - 4
+    refused(tmp_path, good[:at] + struct.pack(">I", 2**31 - 1) + good[at + 4 :], "it ends within a chunk")
+
+
+def test_any_error_of_a_decoder_is_damage_of_the_file(tmp_path, monkeypatch):
+    """Pillow raises an OverflowError at a width of 2**31, and types that no list of ours has foreseen."""
+    header = chunk(b"IHDR", struct.pack(">IIBBBBB", 2**31, 1, 8, 0, 0, 0, 0))
+    with pytest.raises(ValueError, match="its pixels are damaged"):
+        image_files._loaded(image_files._opened("PNG", png(1, 1, bytes(2))[:33] + header + chunk(b"IDAT", b"")))
+    (tmp_path / "photo.img").write_bytes(encoded("PNG"))
+    for error in (OverflowError, ZeroDivisionError, Image.DecompressionBombError, cv2.error):
+
+        def fails(*_, error=error):
+            raise error("signed integer is greater than maximum")
+
+        monkeypatch.setattr(ImageFile.ImageFile, "load", fails)
+        refused(tmp_path, encoded("PNG"), "its pixels are damaged .signed integer is greater than maximum")
+    monkeypatch.setattr(ImageFile.ImageFile, "load", lambda *_: np.empty(2**50))
+    with pytest.raises(ResourceError, match=r"photo.img: decoding the image needs 0.0 GiB"):
+        decode(tmp_path / "photo.img")
 
 
 def test_no_memory_for_an_image_is_no_damage(tmp_path, monkeypatch):

@@ -572,7 +572,7 @@ def cache(tmp_path, monkeypatch):
 
 def test_two_processes_compile_a_module_once(cache):
     """The other process waits for the one that has the lock, finds the compiled module, and runs it."""
-    environment = os.environ | {"PYTHONPATH": str(ROOT), "CUDA_VISIBLE_DEVICES": ""}
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), *sys.path]), "CUDA_VISIBLE_DEVICES": ""}
     name, cpu = load_module_mark.module.get_module_identifier(1), wp.get_device("cpu")
     (cache / "locks").mkdir(parents=True)
     with native.exclusive(cache / "locks" / f"{name}.0"):

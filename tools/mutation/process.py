@@ -98,7 +98,8 @@ def _child(job: Job, tree: Path, root: Path, cache: Path, test_timeout: float) -
     os.chdir(tree)
     sys.path[:] = [str(tree), *(p for p in sys.path if Path(p or ".").resolve() != root)]
     sys.dont_write_bytecode = True
-    os.environ |= {"WARP_CACHE_PATH": str(cache), "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1", "PYTHONPATH": str(tree)}
+    search = os.pathsep.join(filter(None, sys.path))  # processes that tests start find what this one finds
+    os.environ |= {"WARP_CACHE_PATH": str(cache), "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1", "PYTHONPATH": search}
     torch.set_num_threads(1)  # some tests set their own number
     clock = _Clock(test_timeout)
     mark = f"not slow and {'cuda' if job.cuda else 'not cuda'}"

@@ -7,6 +7,7 @@ and AVIF, have no checksum: damage that leaves a valid code of the same length i
 
 from __future__ import annotations
 
+import contextlib
 import io
 import itertools
 import math
@@ -112,8 +113,17 @@ def read_image_file(path: Path, max_pixels: int = MAX_PIXELS, start: int | None 
 
 # Size and damage. Functions take the bytes of a file, and raise a ValueError with the reason as part of a sentence.
 
-BROKEN = (OSError, SyntaxError, RuntimeError, EOFError, LookupError, AttributeError, TypeError, ValueError, struct.error)
-"""Errors that Pillow raises about malformed files, as fuzzing shows."""
+
+@contextlib.contextmanager
+def _decoder(words: str) -> Iterator[None]:
+    """Run a decoder without its warnings; its errors become a ValueError with ``words``, but not a lack of memory."""
+    try:
+        with warnings.catch_warnings(action="ignore"):
+            yield
+    except MemoryError:
+        raise
+    except Exception as e:  # Pillow raises a dozen types on malformed files
+        raise ValueError(words.format(e)) from e
 
 
 def _opened(name: str, data: bytes) -> ImageFile.ImageFile:
@@ -124,21 +134,15 @@ def _opened(name: str, data: bytes) -> ImageFile.ImageFile:
         "AVIF": AvifImagePlugin.AvifImageFile, "BMP": BmpImagePlugin.BmpImageFile, "PNG": PngImagePlugin.PngImageFile,
         "TIFF": TiffImagePlugin.TiffImageFile,
     }  # fmt: skip
-    try:
-        with warnings.catch_warnings(action="ignore"):
-            # not Image.open, which has a limit of its own on the number of pixels
-            return types[name](io.BytesIO(data), "image")
-    except BROKEN as e:
-        raise ValueError(f"its decoder says: {e}") from e
+    with _decoder("its decoder says: {}"):
+        # not Image.open, which has a limit of its own on the number of pixels
+        return types[name](io.BytesIO(data), "image")
 
 
 def _loaded(image: ImageFile.ImageFile) -> ImageFile.ImageFile:
     """Return an image after decoding all its pixels."""
-    try:
-        with warnings.catch_warnings(action="ignore"):
-            image.load()
-    except BROKEN as e:
-        raise ValueError(f"its pixels are damaged ({e})") from e
+    with _decoder("its pixels are damaged ({})"):
+        image.load()
     return image
 
 
@@ -147,12 +151,11 @@ def _size(name: str, data: bytes) -> tuple[int, int]:
     if name == "JPEG":
         import simplejpeg
 
-        height, width, *_ = simplejpeg.decode_jpeg_header(data)
+        with _decoder("{}"):
+            height, width, *_ = simplejpeg.decode_jpeg_header(data)
         return width, height
     if name == "PNG":  # Pillow would unpack texts first
-        if len(data) < 33 or data[12:16] != b"IHDR":
-            raise ValueError("it has no header")
-        return struct.unpack_from(">II", data, 16)
+        return _png_size(data)
     if name == "WEBP":
         return _webp_size(data)
     if name == "TIFF":
@@ -161,12 +164,27 @@ def _size(name: str, data: bytes) -> tuple[int, int]:
         return image.size
 
 
+def _png_size(data: bytes) -> tuple[int, int]:
+    """Return width and height [px] of a PNG, whose chunks must lie in the file: OpenCV takes the memory that each announces."""
+    if len(data) < 33 or data[12:16] != b"IHDR":
+        raise ValueError("it has no header")
+    at, kind = len(PNG_START), b""
+    while kind != b"IEND" and at < len(data):
+        length, kind = struct.unpack_from(">I4s", data, at) if at + 8 <= len(data) else (len(data), b"")
+        if at + 12 + length > len(data):
+            raise ValueError("it ends within a chunk")
+        if kind == b"IHDR" and at > len(PNG_START):
+            raise ValueError("it has two headers")  # the second may announce another size
+        at += 12 + length
+    return struct.unpack_from(">II", data, 16)
+
+
 def _decoded(name: str, data: bytes) -> np.ndarray | None:
     """Check a file for damage; return its pixels in BGR or BGRA where the check has decoded them, else None for OpenCV."""
     if name == "JPEG":
         return _decoded_jpeg(data)
     if name == "AVIF":
-        with _loaded(_opened(name, data)) as image:
+        with _loaded(_opened(name, data)) as image, _decoder("its pixels are damaged ({})"):
             pixels = np.asarray(image.convert("RGBA" if "A" in image.getbands() else "RGB"))
         return np.ascontiguousarray(pixels[..., [2, 1, 0, 3][: pixels.shape[2]]])
     if name == "WEBP":
@@ -255,12 +273,13 @@ def _decoded_jpeg(data: bytes) -> np.ndarray | None:
     import simplejpeg
 
     _check_scans(data)
-    colors = simplejpeg.decode_jpeg_header(data, strict=True)[2]
-    if colors in ("CMYK", "YCCK"):
-        # all codes are read, though only every eighth pixel is made
-        simplejpeg.decode_jpeg(data, "CMYK", min_height=1, min_width=1, min_factor=8, strict=True)
-        return None
-    pixels: np.ndarray = simplejpeg.decode_jpeg(data, "GRAY" if colors == "Gray" else "BGR", strict=True)
+    with _decoder("{}"):
+        colors = simplejpeg.decode_jpeg_header(data, strict=True)[2]
+        if colors in ("CMYK", "YCCK"):
+            # all codes are read, though only every eighth pixel is made
+            simplejpeg.decode_jpeg(data, "CMYK", min_height=1, min_width=1, min_factor=8, strict=True)
+            return None
+        pixels: np.ndarray = simplejpeg.decode_jpeg(data, "GRAY" if colors == "Gray" else "BGR", strict=True)
     return pixels
 
 
@@ -327,9 +346,10 @@ class _Directory:
         (count,) = self._unpack("Q" if big else "H", at)
         if count > MAX_ENTRIES:
             raise ValueError(f"its directory announces {count} tags")
-        at, room = at + (8 if big else 2), len(block)
+        at, room, self.repeats = at + (8 if big else 2), len(block), False
         for _ in range(count):
             tag, kind, length = self._unpack(entry, at)
+            self.repeats |= tag in self.entries
             place = at + struct.calcsize("=" + entry)
             at = place + self.slot
             self.entries[tag] = kind, length, place
@@ -368,6 +388,8 @@ class _Directory:
 def _tiff_tags(data: bytes) -> _Directory:
     """Return the tags of a TIFF; ValueError if they overlap, because Pillow and libtiff would copy each of them."""
     tags = _Directory(data)
+    if tags.repeats:
+        raise ValueError("it has two values of a tag")  # decoders differ in which of two sizes they take
     if tags.overlaps:
         raise ValueError("its tags overlap, or lie outside of the file")
     return tags
