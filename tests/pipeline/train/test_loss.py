@@ -12,7 +12,7 @@ from tests.example_terms import DepthCorrelation, NormalSmoothness
 from tests.pipeline.train.fits import advanced
 from tests.pipeline.train.test_memory import STEADY, instances, measured
 from tests.priors.rigs import still_life
-from tests.scenes import photos, priors, seeds, three_gaussians, view_stub
+from tests.scenes import photos, priors, seeds, three_gaussians
 from warpgs.errors import UsageError
 from warpgs.geometry import depth_normals
 from warpgs.pipeline.model.start import InitConfig
@@ -37,8 +37,7 @@ from warpgs.pipeline.train.loss import (
     photometric_loss,
     total,
 )
-from warpgs.pipeline.train.presets import PRESETS
-from warpgs.pipeline.train.settings import FEW, SMOOTH_STEPS, FitConfig, settings_by_views, steps_by_views
+from warpgs.pipeline.train.settings import FitConfig
 from warpgs.pipeline.train.step import StepPlan, eager_renderer, total_loss
 from warpgs.pipeline.train.strategies.base import Strategy
 from warpgs.pipeline.train.strategies.clone_split import DensityConfig
@@ -412,26 +411,6 @@ def test_confirmed_pixels_count_less():
     consistent[1] = 2.0
     found = SmoothDepth().needs(TrainingView(view.camera, view.image, consistent=consistent), None)["smooth_depth"]
     assert torch.equal(found, torch.where(consistent > 0, CONFIRMED, 1.0))
-
-
-@pytest.mark.parametrize(("views", "alpha", "weight"), [(4, None, 1.0), (5, None, 0.0), (8, 1.0, 0.5), (9, 1.0, 0.0)])
-def test_few_views_have_the_term(views, alpha, weight):
-    """In fits of at least 3000 steps, so not where a CPU limits them; what is given holds, and other presets have none."""
-    train = [view_stub(alpha=alpha)] * views
-    default = PRESETS["default"]
-    config, _ = settings_by_views(default, train, "cuda")
-    assert config.loss.smooth_weight == weight
-    few = 3000 if alpha else 4500
-    assert config.steps == (few if views <= FEW else steps_by_views(views))
-    assert [t.name for t in built_in_terms(config.loss)] == ["photometric", "smooth_depth"][: 1 + (weight > 0)]
-    short = dataclasses.replace(default, steps=SMOOTH_STEPS - 1), PRESETS["quick"], PRESETS["3dgs"]
-    assert all(settings_by_views(c, train, "cuda")[0].loss.smooth_weight == 0 for c in short)
-    limited, _ = settings_by_views(default, train, "cpu")
-    assert limited.steps < SMOOTH_STEPS and limited.loss.smooth_weight == 0
-    unlimited = dataclasses.replace(default, cpu_limit=False)
-    assert settings_by_views(unlimited, train, "cpu")[0].loss.smooth_weight == weight
-    given = dataclasses.replace(default, loss=LossConfig(smooth_weight=0.2))
-    assert settings_by_views(given, train, "cpu")[0].loss.smooth_weight == 0.2
 
 
 def test_smooth_depth_a_fit_with_the_term_is_smoother():

@@ -1,7 +1,9 @@
 """Settings of a fit: presets, files, mappings and keywords, all checked; and those that are chosen for the user."""
 
 import dataclasses
+import functools
 import inspect
+import itertools
 import json
 import sys
 
@@ -16,11 +18,22 @@ from warpgs.errors import DataError, UsageError
 from warpgs.pipeline.model.start import InitConfig
 from warpgs.pipeline.run.fit import fit
 from warpgs.pipeline.run.request import SceneRequest
-from warpgs.pipeline.train.loss import AlphaDifference
+from warpgs.pipeline.train.loss import AlphaDifference, built_in_terms
 from warpgs.pipeline.train.presets import MAX_BYTES, MAX_DOTS, PRESETS, preset_settings
 from warpgs.pipeline.train.schedule import plan_phases
-from warpgs.pipeline.train.settings import ONE_LAYER, FitConfig, keyword, setting_names, settings_by_views, with_settings
-from warpgs.pipeline.train.stopping import StoppingConfig
+from warpgs.pipeline.train.settings import (
+    AVERAGED_VIEWS,
+    EXTRAPOLATED_VIEWS,
+    ONE_LAYER,
+    ONE_LAYER_VIEWS,
+    SMOOTH_STEPS,
+    FitConfig,
+    keyword,
+    setting_names,
+    settings_by_views,
+    steps_by_views,
+    with_settings,
+)
 from warpgs.pipeline.train.strategies.mcmc import MCMCConfig
 from warpgs.scene import Scene
 
@@ -257,61 +270,107 @@ def test_the_command_line_takes_files_and_objects(own, tmp_path, capsys):
 # Settings and sizes of images that are chosen for the user.
 
 
+PARTLY, FULL, DARK = np.eye(6, 8) > 0, np.ones((6, 8), bool), np.zeros((6, 8, 3))
+DARK[3, 3] = 1
+OPAQUE, CUT = {}, {"alpha": 1.0}
+LAYERS, UNSEEN, DECAY, SMOOTH = "method.hier", "init.extrapolate", "optimizer.opacities_decay", "loss.smooth_weight"
+LAST, GAIN, MEANS, SH = "optimizer.average_last", "stopping.min_gain_db", "optimizer.means_lr", "optimizer.sh_lr"
+
+
+def chosen(views: int, device: str = "cuda", view=OPAQUE, preset: str = "default", **given):
+    """The settings for a number of alike views, and the notes; settings that are given, by keyword."""
+    config = with_settings(PRESETS[preset], given, "here", keywords=True)
+    config, notes = settings_by_views(config, [view_stub(**view)] * views, device)
+    return config, " ".join(notes)
+
+
+def value(config: FitConfig, name: str):
+    return functools.reduce(getattr, name.split("."), config)
+
+
+@pytest.mark.parametrize(
+    ("views", "view", "device", "given", "wanted"),
+    [
+        # up to 54 views have one layer and decay, up to 4 opaque ones points where no view looks, and more decay with them
+        (1, OPAQUE, "cuda", {}, {UNSEEN: False, DECAY: 0.001, LAYERS: False}),
+        *((n, OPAQUE, "cuda", {}, {UNSEEN: True, DECAY: 0.0015}) for n in (2, EXTRAPOLATED_VIEWS)),
+        (EXTRAPOLATED_VIEWS + 1, OPAQUE, "cuda", {}, {UNSEEN: False, DECAY: 0.001, LAYERS: False}),
+        *((ONE_LAYER_VIEWS, v, "cuda", {}, {DECAY: 0.001, LAYERS: False}) for v in (OPAQUE, CUT)),
+        *((ONE_LAYER_VIEWS + 1, v, "cuda", {}, {DECAY: 0.0, LAYERS: True}) for v in (OPAQUE, CUT)),
+        (3, CUT, "cuda", {}, {UNSEEN: False, DECAY: 0.001, LAYERS: False}), (3, OPAQUE, "cpu", {}, {UNSEEN: False}),
+        # not where a part of a view does not count, nor where no depth is searched for; decay, even where points are asked for
+        (3, {"mask": FULL}, "cuda", {}, {UNSEEN: True, DECAY: 0.0015}),
+        *((3, v, "cuda", {}, {UNSEEN: False, DECAY: 0.001}) for v in ({"mask": PARTLY}, {"image": DARK})),
+        *((3, v, "cuda", {"init_extrapolate": True}, {DECAY: 0.001}) for v in ({"mask": PARTLY}, {"image": DARK})),
+        *((n, OPAQUE, "cuda", {"init_source": s} | asked, {DECAY: 0.001, UNSEEN: bool(asked)})
+          for n, s in ((3, "hull"), (1, "sweep")) for asked in ({}, {"init_extrapolate": True})),
+        (3, OPAQUE, "cuda", {"init_extrapolate": False}, {DECAY: 0.001, UNSEEN: False}),
+        # few views have smooth depth, in fits of at least 3000 steps, so not where a CPU limits them
+        (4, OPAQUE, "cuda", {}, {SMOOTH: 1.0, "steps": 4500}), (5, OPAQUE, "cuda", {}, {SMOOTH: 0.0, "steps": steps_by_views(5)}),
+        (8, CUT, "cuda", {}, {SMOOTH: 0.5, "steps": steps_by_views(8)}), (9, CUT, "cuda", {}, {SMOOTH: 0.0}),
+        (4, CUT, "cuda", {}, {SMOOTH: 0.5, "steps": 3000}), (4, OPAQUE, "cuda", {"steps": SMOOTH_STEPS - 1}, {SMOOTH: 0.0}),
+        (4, OPAQUE, "cpu", {}, {SMOOTH: 0.0}), (4, OPAQUE, "cpu", {"cpu_limit": False}, {SMOOTH: 1.0}),
+        *((4, OPAQUE, "cuda", {"preset": name}, {SMOOTH: 0.0}) for name in ("quick", "3dgs")),
+        # many views have a mean of the last steps
+        *((n, OPAQUE, "cuda", {}, {LAST: 0.0}) for n in (3, AVERAGED_VIEWS - 1)),
+        *((n, OPAQUE, "cuda", {}, {LAST: 0.05}) for n in (AVERAGED_VIEWS, 300)),
+        # rates rise with more than nine views where the time of a CPU limits them, and nothing is held out
+        *((n, OPAQUE, d, {}, {MEANS: 1.6e-4, SH: 2.5e-3}) for n, d in ((9, "cpu"), (10, "cuda"))),
+        (10, OPAQUE, "cpu", {}, {MEANS: 4e-4, SH: 6.25e-3}),
+        *((n, OPAQUE, d, {}, {GAIN: gain}) for n in (3, 12) for d, gain in (("cpu", 0.0), ("cuda", 0.1))),
+        (12, OPAQUE, "cpu", {"steps": 100}, {GAIN: 0.1}),
+    ],
+)  # fmt: skip
+def test_settings_are_chosen_by_the_views(views, view, device, given, wanted):
+    """And the notes name the choices."""
+    config, notes = chosen(views, device, view, **given)
+    assert {name: value(config, name) for name in wanted} == wanted
+    if not given:
+        assert ("one layer" in notes) != config.method.hier and ("no extrapolated points" in notes) != config.init.extrapolate
+        assert ("mean of the last 5% of the steps" in notes) == (config.optimizer.average_last > 0)
+    smooth = ["smooth_depth"] * (config.loss.smooth_weight > 0)
+    assert [t.name for t in built_in_terms(config.loss)] == ["photometric", *smooth]
+
+
+@pytest.mark.parametrize(
+    ("name", "given"),
+    [
+        (DECAY, 0.02),
+        (LAST, 0.5),
+        (SMOOTH, 0.2),
+        (MEANS, 1e-3),
+        (SH, 2e-3),
+        (GAIN, 0.2),
+        (UNSEEN, True),
+        (LAYERS, True),
+        ("steps", 700),
+    ],
+)
+def test_what_is_given_holds(name, given):
+    """Whatever the views and the device, in every preset that has the setting."""
+    for views, device, preset in itertools.product((3, 12, 60), ("cpu", "cuda"), ("default", "quick")):
+        assert value(chosen(views, device, preset=preset, **{keyword(name): given})[0], name) == given
+    assert chosen(12, "cpu", stopping_min_gain_db=0.2)[0].sh_every == 500
+
+
 @pytest.mark.parametrize("device", ["cpu", "cuda"])
 @pytest.mark.parametrize(("views", "width", "height"), [(3, 126, 94), (3, 504, 378), (10, 900, 1600), (54, 504, 378)])
 def test_quick_is_never_slower_than_default(device, views, width, height):
-    """At most 600 steps, and on a CPU at most as many as its time has for the default; a number that is given holds."""
-    train = [view_stub(width, height)] * views
-    quick, default = (settings_by_views(PRESETS[name], train, device)[0].steps for name in ("quick", "default"))
+    """At most 600 steps, and on a CPU at most as many as its time has for the default."""
+    view = {"width": width, "height": height}
+    quick, default = (chosen(views, device, view, preset)[0].steps for preset in ("quick", "default"))
     assert 0 < quick == min(600, default)
-    given = dataclasses.replace(PRESETS["quick"], steps=700)
-    assert settings_by_views(given, train, device)[0].steps == 700
 
 
-def test_rates_rise_where_the_time_of_a_cpu_limits_many_views():
-    """With more than nine views, and only where steps are left out; rates that are given hold, and the loss is said."""
-
-    def chosen(views, device, **optimizer):
-        train = [view_stub()] * views
-        config = PRESETS["default"]
-        config = dataclasses.replace(config, optimizer=dataclasses.replace(config.optimizer, **optimizer))
-        found, notes = settings_by_views(config, train, device)
-        return (found.optimizer.means_lr, found.optimizer.sh_lr), notes
-
-    usual = (1.6e-4, 2.5e-3)
-    assert chosen(9, "cpu")[0] == chosen(10, "cuda")[0] == usual
-    rates, notes = chosen(10, "cpu")
-    assert rates == (4e-4, 6.25e-3)
-    assert chosen(10, "cpu", means_lr=1e-3, sh_lr=2e-3)[0] == (1e-3, 2e-3)
-    assert "--no-cpu-limit takes all, about 11 min, and raised PSNR by 0.3 to 1.6 dB" in notes[-1]
-
-
-def test_one_layer_has_fewer_steps_in_the_time_of_a_cpu():
-    """Its steps take longer, so that both take the same time."""
-    train = [view_stub()] * 3
-    config = PRESETS["default"]
-    one, two = (
-        settings_by_views(dataclasses.replace(config, method=dataclasses.replace(config.method, hier=hier)), train, "cpu")[0]
-        for hier in (False, True)
-    )
-    assert abs(ONE_LAYER * one.steps - two.steps) < 2 and one.steps < two.steps
-
-
-def test_nothing_is_held_out_where_the_time_of_a_cpu_limits_the_steps():
-    """All degrees of the harmonics are in use when growth begins, as with held-out blocks; a gain that is given holds."""
-
-    def chosen(views, device, config=PRESETS["default"]):
-        train = [view_stub()] * views
-        return settings_by_views(config, train, device)[0]
-
+def test_the_time_of_a_cpu_limits_the_steps():
+    """All degrees of the harmonics are in use when growth begins; one layer has fewer steps; the loss of quality is said."""
     for views in (3, 12):
-        limited, whole = chosen(views, "cpu"), chosen(views, "cuda")
-        assert limited.stopping.min_gain_db == 0 and whole.stopping.min_gain_db == 0.1
-        assert limited.steps < whole.steps and whole.sh_every == 500
+        (limited, notes), (whole, _) = chosen(views, "cpu"), chosen(views)
+        assert limited.steps < SMOOTH_STEPS <= whole.steps and whole.sh_every == 500
         assert limited.sh_degree * limited.sh_every <= plan_phases(limited.phases, limited.steps).refine
-    assert chosen(12, "cpu", dataclasses.replace(PRESETS["default"], steps=100)).stopping.min_gain_db == 0.1
-    given = dataclasses.replace(PRESETS["default"], stopping=StoppingConfig(min_gain_db=0.2))
-    assert chosen(12, "cpu", given).stopping.min_gain_db == 0.2 and chosen(12, "cpu", given).sh_every == 500
+    assert "--no-cpu-limit takes all, about" in notes and "and raised PSNR by 0.3 to 1.6 dB" in notes
+    one, two = (chosen(3, "cpu", method_hier=hier)[0].steps for hier in (False, True))
+    assert abs(ONE_LAYER * one - two) < 2 and one < two
 
 
 def test_a_fit_on_a_cpu_has_smaller_images_unless_told():
