@@ -84,7 +84,7 @@ def test_a_skipped_step_changes_no_bit_and_rows_are_reordered_together():
 
 
 def test_kept_rows_keep_everything_and_new_rows_start_anew():
-    """Survivors keep all bits; new rows have moments of 0, and columns by their parent, by what the change says, or by the fill."""
+    """Survivors keep all bits; new rows have moments of 0, and columns of their parent, of the change, or the fill."""
     made = table()
     before, keep = snapshot(made), [0, 3, 4]
     added = {n: t[:2] + 1 for n, t in cloud(5).tensors().items()}
@@ -180,7 +180,7 @@ def params(log_scales: torch.Tensor) -> dict[str, torch.Tensor]:
 
 
 def test_axes_are_cut_and_needles_thickened():
-    """In any order; the middle axis follows the longest; what is within the limits stays; twice is as once; no step changes nothing."""
+    """In any order: the middle axis follows the longest, what is within the limits stays, and twice is as once."""
     found = params(torch.log(torch.tensor([[900.0, 1e-6, 1.0], [2.0, 1.0, 1e-9], [1e-3, 3.0, 0.05], [40.0, 40.0, 40.0]])))
     limits = Limits(30.0, 30.0)
     limits.hold(found, CAMERAS, YES)

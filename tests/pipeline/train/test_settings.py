@@ -5,22 +5,26 @@ import functools
 import inspect
 import itertools
 import json
+import math
 import sys
 
 import numpy as np
 import pytest
 
 import warpgs
+from tests.example_terms import DepthCorrelation, NormalSmoothness
 from tests.scenes import photos, seeds, view_stub
 from warpgs.app.cli import main
 from warpgs.app.fit import request_of
 from warpgs.errors import DataError, UsageError
+from warpgs.pipeline.model.limits import LimitConfig
 from warpgs.pipeline.model.start import InitConfig
+from warpgs.pipeline.paper.strategy import PaperConfig
 from warpgs.pipeline.run.fit import fit
 from warpgs.pipeline.run.request import SceneRequest
-from warpgs.pipeline.train.loss import AlphaDifference, built_in_terms
+from warpgs.pipeline.train.loss import AlphaDifference, LossConfig, SmoothDepth, built_in_terms
 from warpgs.pipeline.train.presets import MAX_BYTES, MAX_DOTS, PRESETS, preset_settings
-from warpgs.pipeline.train.schedule import plan_phases
+from warpgs.pipeline.train.schedule import OptimizerConfig, plan_phases
 from warpgs.pipeline.train.settings import (
     AVERAGED_VIEWS,
     EXTRAPOLATED_VIEWS,
@@ -34,8 +38,12 @@ from warpgs.pipeline.train.settings import (
     steps_by_views,
     with_settings,
 )
+from warpgs.pipeline.train.stopping import StoppingConfig
 from warpgs.pipeline.train.strategies.mcmc import MCMCConfig
+from warpgs.pipeline.train.view_modules import Exposure, RefinePoses
 from warpgs.scene import Scene
+
+NAN = math.nan
 
 # Presets and settings from outside: files, objects, mappings and keywords, all of them checked and typed.
 
@@ -201,6 +209,29 @@ def test_keywords_replace_settings():
             with_settings(FitConfig(), wrong, "x")
 
 
+@pytest.mark.parametrize(
+    ("kind", "bad", "flag"),
+    [
+        *((LossConfig, {n: v}, "loss.") for n, v in (("depth_weight", -1), ("normal_weight", NAN), ("smooth_weight", 1001))),
+        (LossConfig, {"alpha_weight": NAN}, "loss."), (AlphaDifference, {"weight": -1.0}, "alpha."),
+        (SmoothDepth, {"weight": NAN}, ""), (NormalSmoothness, {"growth": 0}, ""),
+        (DepthCorrelation, {"until": 2}, ""), (FitConfig, {"half_resolution": NAN}, ""),
+        *((StoppingConfig, {"min_gain_db": v}, "stopping.") for v in (math.inf, NAN)),
+        *((OptimizerConfig, b, "optimizer.") for b in ({"opacities_decay": 0.2}, {"average_last": -0.1})),
+        *((LimitConfig, b, "limits.") for b in ({"max_size": -1}, {"max_reach": -1}, {"max_ratio": 0.5}, {"max_size": NAN})),
+        *((MCMCConfig, b, "mcmc.") for b in ({"every": 0}, {"growth": -1.0}, {"noise_lr": NAN}, {"min_opacity": 0.9})),
+        *((PaperConfig, b, "paper.") for b in ({"residual": "error"}, {"depth": "mean"}, {"gate_quantile": 1})),
+        *((Exposure, b, "exposure.") for b in ({"lr": 0.0}, {"decay": 2e6}, {"weight": -1.0})),
+        *((RefinePoses, b, "refine-poses.") for b in ({"rotation_lr": NAN}, {"start": 1.0})),
+    ],
+)  # fmt: skip
+def test_a_value_out_of_range_is_refused_by_its_flag(kind, bad, flag):
+    """With the range or the choices."""
+    ((name, value),) = bad.items()
+    with pytest.raises(UsageError, match=rf"{flag}{name.replace('_', '-')}.*{value}"):
+        kind(**bad)
+
+
 def test_view_modules_are_switched_and_set_by_keyword():
     """By their own names, as flags do, and by the list; each has settings."""
     config = with_settings(
@@ -306,7 +337,8 @@ def value(config: FitConfig, name: str):
           for n, s in ((3, "hull"), (1, "sweep")) for asked in ({}, {"init_extrapolate": True})),
         (3, OPAQUE, "cuda", {"init_extrapolate": False}, {DECAY: 0.001, UNSEEN: False}),
         # few views have smooth depth, in fits of at least 3000 steps, so not where a CPU limits them
-        (4, OPAQUE, "cuda", {}, {SMOOTH: 1.0, "steps": 4500}), (5, OPAQUE, "cuda", {}, {SMOOTH: 0.0, "steps": steps_by_views(5)}),
+        (4, OPAQUE, "cuda", {}, {SMOOTH: 1.0, "steps": 4500}),
+        (5, OPAQUE, "cuda", {}, {SMOOTH: 0.0, "steps": steps_by_views(5)}),
         (8, CUT, "cuda", {}, {SMOOTH: 0.5, "steps": steps_by_views(8)}), (9, CUT, "cuda", {}, {SMOOTH: 0.0}),
         (4, CUT, "cuda", {}, {SMOOTH: 0.5, "steps": 3000}), (4, OPAQUE, "cuda", {"steps": SMOOTH_STEPS - 1}, {SMOOTH: 0.0}),
         (4, OPAQUE, "cpu", {}, {SMOOTH: 0.0}), (4, OPAQUE, "cpu", {"cpu_limit": False}, {SMOOTH: 1.0}),
