@@ -10,7 +10,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from tests.gaussians import cloud
-from tests.pipeline import tables
+from tests.pipeline.train import fits
 from tests.reference.neighbours import mean_square_distances_reference
 from tests.scenes import photos, priors, seeds
 from warpgs.errors import DataError, NotFiniteError, UsageError
@@ -117,7 +117,7 @@ def test_a_set_of_none_is_legal(device):
     """No rows: a step, refinement, a change of the set and columns work on nothing."""
     g = cloud(0, device=device)
     table = Table.of_gaussians(g, {"seen": Column(0.0)})
-    tables.adam_step(table, {n: torch.zeros_like(t) for n, t in table.params.items()})
+    fits.adam_step(table, {n: torch.zeros_like(t) for n, t in table.params.items()})
     none = torch.zeros(0, dtype=torch.int64, device=device)
     table.apply(DensityUpdate(none, g.tensors(), none))
     change = refine(

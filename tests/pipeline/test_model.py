@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 import torch
 
-from tests.gaussians import cloud
+from tests.gaussians import cloud, shapes_of
 from tests.io import scenes
-from tests.pipeline.tables import adam_step
+from tests.pipeline.train.fits import adam_step
 from tests.scenes import photos, ring, seeds
 from warpgs.app.cli import main
 from warpgs.errors import DataError, UsageError
@@ -21,7 +21,7 @@ from warpgs.export.base import read_gaussians, suffixes, write_gaussians
 from warpgs.export.meshes_and_cameras import NAMES, write_cameras
 from warpgs.export.ply import read_ply
 from warpgs.files import make_folder
-from warpgs.geometry import harmonics, look_at, rotate, rotation_matrices
+from warpgs.geometry import harmonics, look_at, rotate
 from warpgs.io.transforms import read_cameras, stated_origin
 from warpgs.kernels.sh import basis
 from warpgs.pipeline.films.film import FilmSettings
@@ -309,11 +309,6 @@ def test_coefficients_above_the_degree_vanish_and_are_not_stored():
 TURN = edit.rotation_about(np.array([1.0, -2.0, 0.5]), 1.1)
 
 
-def covariances(g):
-    axes = torch.as_tensor(rotation_matrices(torch.nn.functional.normalize(g.quats.double(), dim=1)))
-    return axes @ torch.diag_embed((2 * g.log_scales.double()).exp()) @ axes.mT
-
-
 @pytest.mark.parametrize("matrix", [TURN, TURN * [-1, 1, 1]], ids=["rotation", "reflection"])
 @pytest.mark.parametrize("degree", [0, 1, 4])
 def test_colours_and_shapes_turn_with_the_scene(degree, matrix):
@@ -325,7 +320,7 @@ def test_colours_and_shapes_turn_with_the_scene(degree, matrix):
     before = torch.einsum("dk,nkc->dnc", basis(d)[:, :k], made.sh.double())
     after = torch.einsum("dk,nkc->dnc", basis(d @ turn.T)[:, :k], turned.sh.double())
     assert torch.allclose(before, after, atol=1e-6)
-    assert torch.allclose(covariances(turned), turn @ covariances(made) @ turn.T, rtol=1e-4, atol=1e-9)
+    assert torch.allclose(shapes_of(turned), turn @ shapes_of(made) @ turn.T, rtol=1e-4, atol=1e-9)
     assert torch.allclose(turned.means.double(), made.means.double() @ turn.T, atol=1e-6)
 
 

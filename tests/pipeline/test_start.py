@@ -198,7 +198,7 @@ def card(shift: float = 0.0) -> tuple[View, ViewDepth]:
     return View(f"{shift}", camera, image), depth_of(np.where(near, NEAR, FAR))
 
 
-def test_an_image_goes_on_beyond_its_border():
+def test_images_go_on_beyond_their_border_and_walls_behind_the_edge_of_a_card():
     view, depth = card()
     cloud = extrapolated_points([view], [depth])
     pixels, z = project_points(view.camera, cloud.points)
@@ -212,11 +212,6 @@ def test_an_image_goes_on_beyond_its_border():
     shown = [in_image(v.camera, both.points) for v in (view, beside[0])]
     beyond = ~(shown[0] | shown[1])
     assert 0 < beyond.sum() < 2 * outside.sum()
-
-
-def test_a_wall_goes_on_behind_the_edge_of_a_card():
-    view, depth = card()
-    cloud = extrapolated_points([view], [depth])
     inside = in_image(view.camera, cloud.points)
     pixels, z = project_points(view.camera, cloud.points[inside])
     red, _, blue = cloud.colors[inside].T
