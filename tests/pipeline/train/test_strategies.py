@@ -209,12 +209,6 @@ def test_captured_steps_equal_single_steps():
     assert all(torch.equal(t, captured[n]) for n, t in single.items())
 
 
-def test_settings_survive_json():
-    """The strategy's own settings stand in the configuration."""
-    assert FitConfig.from_json(CONFIG.to_json()) == CONFIG
-    assert FitConfig(strategy="mcmc").strategy_config == MCMCConfig()
-
-
 # Merging with moments, against the mixture's own.
 
 
