@@ -14,7 +14,7 @@ import pytest
 import torch
 
 from tests.faults import format_targets
-from tests.gaussians import cloud
+from tests.gaussians import cloud, shapes_of
 from warpgs.app.cli import main
 from warpgs.errors import DataError, UsageError
 from warpgs.export import base, gltf, sog, spz
@@ -46,12 +46,6 @@ SUFFIXES = suffixes()
 
 def model(n=300, degree=3, seed=0):
     return cloud(n, seed=seed, degree=degree)
-
-
-def shapes_of(g):
-    """Return the covariances [N, 3, 3] in float64."""
-    axes = torch.as_tensor(rotation_matrices(torch.nn.functional.normalize(g.quats.double(), dim=1)))
-    return axes @ torch.diag_embed((2 * g.log_scales.double()).exp()) @ axes.mT
 
 
 def same_rotation(a, b):
