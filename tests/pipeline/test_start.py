@@ -212,6 +212,8 @@ def test_images_go_on_beyond_their_border_and_walls_behind_the_edge_of_a_card():
     shown = [in_image(v.camera, both.points) for v in (view, beside[0])]
     beyond = ~(shown[0] | shown[1])
     assert 0 < beyond.sum() < 2 * outside.sum()
+    elsewhere = cloud.points[outside & in_image(beside[0].camera, cloud.points)]
+    assert len(elsewhere) and not (elsewhere[:, None] == both.points).all(2).any()
     inside = in_image(view.camera, cloud.points)
     pixels, z = project_points(view.camera, cloud.points[inside])
     red, _, blue = cloud.colors[inside].T

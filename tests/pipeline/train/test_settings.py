@@ -227,7 +227,7 @@ def test_keywords_replace_settings():
         *((LimitConfig, b, "limits.") for b in ({"max_size": -1}, {"max_reach": -1}, {"max_ratio": 0.5}, {"max_size": NAN})),
         *((MCMCConfig, b, "mcmc.") for b in ({"every": 0}, {"growth": -1.0}, {"noise_lr": NAN}, {"min_opacity": 0.9})),
         *((PaperConfig, b, "paper.") for b in ({"residual": "error"}, {"depth": "mean"}, {"gate_quantile": 1})),
-        *((Exposure, b, "exposure.") for b in ({"lr": 0.0}, {"decay": 2e6}, {"weight": -1.0})),
+        *((Exposure, b, "exposure.") for b in ({"lr": 0.0}, {"decay": 2e6}, {"weight": -1.0}, {"weight": 1001})),
         *((RefinePoses, b, "refine-poses.") for b in ({"rotation_lr": NAN}, {"start": 1.0})),
     ],
 )  # fmt: skip
@@ -356,7 +356,7 @@ def value(config: FitConfig, name: str):
         *((n, OPAQUE, d, {}, {MEANS: 1.6e-4, SH: 2.5e-3}) for n, d in ((9, "cpu"), (10, "cuda"))),
         (10, OPAQUE, "cpu", {}, {MEANS: 4e-4, SH: 6.25e-3}),
         *((n, OPAQUE, d, {}, {GAIN: gain}) for n in (3, 12) for d, gain in (("cpu", 0.0), ("cuda", 0.1))),
-        (12, OPAQUE, "cpu", {"steps": 100}, {GAIN: 0.1}),
+        (12, OPAQUE, "cpu", {"steps": 100}, {GAIN: 0.1, "sh_every": 500}),
     ],
 )  # fmt: skip
 def test_settings_are_chosen_by_the_views(views, view, device, given, wanted):
