@@ -216,25 +216,29 @@ def test_keywords_replace_settings():
 
 
 @pytest.mark.parametrize(
-    ("kind", "bad", "flag"),
+    ("kind", "bad", "said"),
     [
-        *((LossConfig, {n: v}, "loss.") for n, v in (("depth_weight", -1), ("normal_weight", NAN), ("smooth_weight", 1001))),
-        (LossConfig, {"alpha_weight": NAN}, "loss."), (AlphaDifference, {"weight": -1.0}, "alpha."),
-        (SmoothDepth, {"weight": NAN}, ""), (NormalSmoothness, {"growth": 0}, ""),
-        (DepthCorrelation, {"until": 2}, ""), (FitConfig, {"half_resolution": NAN}, ""),
-        *((StoppingConfig, {"min_gain_db": v}, "stopping.") for v in (math.inf, NAN)),
-        *((OptimizerConfig, b, "optimizer.") for b in ({"opacities_decay": 0.2}, {"average_last": -0.1})),
-        *((LimitConfig, b, "limits.") for b in ({"max_size": -1}, {"max_reach": -1}, {"max_ratio": 0.5}, {"max_size": NAN})),
-        *((MCMCConfig, b, "mcmc.") for b in ({"every": 0}, {"growth": -1.0}, {"noise_lr": NAN}, {"min_opacity": 0.9})),
-        *((PaperConfig, b, "paper.") for b in ({"residual": "error"}, {"depth": "mean"}, {"gate_quantile": 1})),
-        *((Exposure, b, "exposure.") for b in ({"lr": 0.0}, {"decay": 2e6}, {"weight": -1.0}, {"weight": 1001})),
-        *((RefinePoses, b, "refine-poses.") for b in ({"rotation_lr": NAN}, {"start": 1.0})),
+        *((LossConfig, {n: v}, "loss.{} must be in") for n, v in (("depth_weight", -1), ("normal_weight", NAN))),
+        *((LossConfig, {n: v}, "loss.{} must be in") for n, v in (("smooth_weight", 1001), ("alpha_weight", NAN))),
+        (AlphaDifference, {"weight": -1.0}, "alpha.{} must be in"), (SmoothDepth, {"weight": NAN}, "{} must be in"),
+        (NormalSmoothness, {"growth": 0}, "{}"), (DepthCorrelation, {"until": 2}, "{}"),
+        (FitConfig, {"half_resolution": NAN}, "{} must be in"),
+        *((StoppingConfig, {"min_gain_db": v}, "stopping.{} must be at least 0 and finite") for v in (math.inf, NAN)),
+        *((OptimizerConfig, b, "optimizer.{} must be in") for b in ({"opacities_decay": 0.2}, {"average_last": -0.1})),
+        *((LimitConfig, b, "limits.{} must be in") for b in ({"max_size": -1}, {"max_reach": -1}, {"max_size": NAN})),
+        (LimitConfig, {"max_ratio": 0.5}, "limits.{} must be"), (MCMCConfig, {"every": 0}, "mcmc.{} must be at least 1"),
+        *((MCMCConfig, b, "mcmc.{} must be in") for b in ({"growth": -1.0}, {"noise_lr": NAN}, {"min_opacity": 0.9})),
+        (PaperConfig, {"residual": "error"}, "paper.{} must be one of length, gain, not"),
+        (PaperConfig, {"depth": "mean"}, "paper.{} must be one of"),
+        (PaperConfig, {"gate_quantile": 1}, r"paper.{} must be in \[0, 1\), not"),
+        *((Exposure, b, "exposure.{} must be in") for b in ({"lr": 0.0}, {"decay": 2e6}, {"weight": -1.0}, {"weight": 1001})),
+        *((RefinePoses, b, "refine-poses.{} must be in") for b in ({"rotation_lr": NAN}, {"start": 1.0})),
     ],
 )  # fmt: skip
-def test_a_value_out_of_range_is_refused_by_its_flag(kind, bad, flag):
+def test_a_value_out_of_range_is_refused_by_its_flag(kind, bad, said):
     """With the range or the choices."""
     ((name, value),) = bad.items()
-    with pytest.raises(UsageError, match=rf"{flag}{name.replace('_', '-')}.*{value}"):
+    with pytest.raises(UsageError, match=rf"{said.format(name.replace('_', '-'))}.*{value}"):
         kind(**bad)
 
 
