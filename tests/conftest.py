@@ -89,6 +89,18 @@ def no_overview_in_reports():
     patch.undo()
 
 
+@pytest.fixture
+def registries_as_they_were(monkeypatch):
+    """Forget what a test registers."""
+    from warpgs.pipeline.train.loss import LOSS_TERMS
+    from warpgs.pipeline.train.strategies.base import STRATEGIES
+    from warpgs.pipeline.train.view_modules import VIEW_MODULES
+
+    for registry in (STRATEGIES, LOSS_TERMS, VIEW_MODULES):
+        registry.names()
+        monkeypatch.setattr(registry, "_classes", dict(registry._classes))
+
+
 @pytest.fixture(autouse=True)
 def keep_thread_count():
     """Put torch's number of threads back after a test that changes it."""

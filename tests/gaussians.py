@@ -7,7 +7,8 @@ import numpy as np
 import torch
 
 from warpgs.constants import RULES
-from warpgs.scene import Camera, Gaussians
+from warpgs.geometry import rotation_matrices
+from warpgs.scene import ActivatedGaussians, Camera, CovarianceGaussians, Gaussians
 
 # Hand-placed and random scenes for the rasterizer's tests.
 
@@ -67,6 +68,31 @@ def camera(width: int = 18, height: int = 17, cameras: int | None = None, dtype=
 def leaves(gaussians: Gaussians) -> Gaussians:
     """A copy whose tensors are leaves that require gradients."""
     return Gaussians(**{n: t.detach().clone().requires_grad_() for n, t in gaussians.tensors().items()})
+
+
+def of_kind(kind: str, stored: Gaussians):
+    """Return Gaussians held another way: stored, activated or covariances; they require gradients."""
+    t = {n: v.detach() for n, v in stored.tensors().items()}
+    scales, opacities = t["log_scales"].exp(), t["logit_opacities"].sigmoid()
+    if kind == "covariances":
+        half = rotation_matrices(torch.nn.functional.normalize(t["quats"])) * scales[:, None]
+        values = (CovarianceGaussians, t["means"], half @ half.mT, opacities, t["sh"])
+    elif kind == "activated":
+        values = (ActivatedGaussians, t["means"], t["quats"], scales, opacities, t["sh"])
+    else:
+        values = (Gaussians, *t.values())
+    return values[0](*(v.clone().requires_grad_() for v in values[1:]))
+
+
+def shapes_of(g: Gaussians) -> torch.Tensor:
+    """Return the covariances [N, 3, 3] in float64."""
+    axes = torch.as_tensor(rotation_matrices(torch.nn.functional.normalize(g.quats.double(), dim=1)))
+    return axes @ torch.diag_embed((2 * g.log_scales.double()).exp()) @ axes.mT
+
+
+def finite(*tensors) -> bool:
+    """Whether no number of any tensor is NaN or infinite."""
+    return all(bool(torch.isfinite(t).all()) for t in tensors)
 
 
 # Cameras with each lens, and the same lens by OpenCV.

@@ -7,9 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 
+from tests.gaussians import cloud
 from warpgs.errors import DataError, ResourceError
 from warpgs.export.base import read_gaussians, write_gaussians
 from warpgs.export.ply import MAX_HEADER_BYTES, read_ply, write_ply
@@ -17,16 +16,8 @@ from warpgs.pipeline.run.export import convert
 from warpgs.scene import Gaussians, Normalization, base_colors
 
 
-def make(n=7, degree=3, seed=0):
-    g = torch.Generator().manual_seed(seed)
-    k = (degree + 1) ** 2
-    return Gaussians(
-        means=torch.randn(n, 3, generator=g),
-        quats=torch.randn(n, 4, generator=g),
-        log_scales=torch.randn(n, 3, generator=g) - 4,
-        logit_opacities=torch.randn(n, generator=g),
-        sh=torch.randn(n, k, 3, generator=g),
-    )
+def make(n=7, degree=3):
+    return cloud(n, degree=degree)
 
 
 def split(path):
@@ -321,37 +312,3 @@ def test_infinite_logits_and_axes_without_length(tmp_path):
         path.write_bytes(header + row.tobytes())
         with pytest.raises(DataError, match=f"{name} of Gaussian 0 is not finite"):
             read_ply(path)
-
-
-@pytest.fixture(scope="module")
-def good(tmp_path_factory):
-    path = tmp_path_factory.mktemp("ply") / "good.ply"
-    write_ply(path, make(3, 1), Normalization())
-    return path.read_bytes()
-
-
-@settings(
-    max_examples=10 * settings.default.max_examples, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
-)
-@given(
-    edits=st.lists(st.tuples(st.integers(0, 10_000), st.integers(0, 255)), max_size=6),
-    cut=st.one_of(st.none(), st.integers(0, 10_000)),
-    insert=st.tuples(st.integers(0, 700), st.binary(max_size=12)),
-)
-def test_damaged_bytes_give_gaussians_or_a_data_error(good, tmp_path, edits, cut, insert):
-    """So does noise behind the first lines."""
-    (tmp_path / "noise.ply").write_bytes(b"ply\nformat binary_little_endian 1.0\n" + insert[1])
-    with pytest.raises(DataError):
-        read_ply(tmp_path / "noise.ply")
-    data = bytearray(good)
-    for place, value in edits:
-        data[place % len(data)] = value
-    data[insert[0] : insert[0]] = insert[1]
-    path = tmp_path / "fuzz.ply"
-    path.write_bytes(bytes(data[:cut]))
-    try:
-        model = read_ply(path)
-    except DataError:
-        return
-    assert all(torch.isfinite(t).all() for t in model.tensors().values())
-    assert len(model) * 56 <= len(data)

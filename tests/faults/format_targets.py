@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tests.faults.model_targets import gaussians, nonsense, ply_body, ply_header
+from tests.faults.model_targets import nonsense, ply_body, ply_header
 from tests.faults.mutations import (
     Change,
     damage,
@@ -29,6 +29,7 @@ from tests.faults.mutations import (
     zip_bomb,
 )
 from tests.faults.targets import Target, not_finite, register
+from tests.gaussians import cloud
 from tests.io import scenes
 from warpgs.errors import DataError
 from warpgs.export import base, gltf, ply, sog, spz
@@ -44,7 +45,7 @@ def written(suffix: str):
     """Return the function that writes the valid files of a format: with harmonics and without."""
 
     def prepare(root: Path) -> list[Path]:
-        made = gaussians(5)
+        made = cloud(5)
         paths = [root / f"a{suffix}", root / f"b{suffix}"]
         base.write_gaussians(paths[0], made, units="file")
         base.write_gaussians(paths[1], type(made)(**made.tensors() | {"sh": made.sh[:, :1]}), units="file")
@@ -96,7 +97,7 @@ def spz_files(root: Path) -> list[Path]:
     paths = []
     for version in spz.VERSIONS if importlib.util.find_spec("zstandard") else (2, 3):
         paths.append(root / f"v{version}.spz")
-        paths[-1].write_bytes(b"".join(spz.encode(arrays_of(gaussians(5)), version)))
+        paths[-1].write_bytes(b"".join(spz.encode(arrays_of(cloud(5)), version)))
     plain = bytearray(gzip.decompress(paths[1].read_bytes()))
     plain[14] |= spz.EXTENDED
     paths.append(root / "axes.spz")
@@ -137,7 +138,7 @@ add("SPZ", ".spz", SPZ, SPZ_CHANGES, spz_files)
 
 
 def side_files(root: Path) -> list[Path]:
-    base.write_gaussians(root / "a.spz", gaussians(5), Normalization(np.array([441_000.0, 5_500_000, 130])))
+    base.write_gaussians(root / "a.spz", cloud(5), Normalization(np.array([441_000.0, 5_500_000, 130])))
     return [base.side_file(root / "a.spz")]
 
 

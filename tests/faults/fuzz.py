@@ -1,12 +1,11 @@
 """Fuzzer of all readers: changed files are read in processes of their own, with bounded memory and time.
 
-Run it with `python -m tests.faults.fuzz --inputs 200000 --seed 5 --processes 2`; a seed gives the same inputs everywhere.
-One input again: `python -m tests.faults.fuzz --reader png --first 1234 --inputs 1 --keep folder`.
+`FUZZ=200000 FUZZ_SEED=5 make test-fault` reads as many inputs; a seed gives the same inputs everywhere. To see one input again,
+`python -m tests.faults.fuzz png 5 1234 FOLDER` writes that of reader, seed and number into a new folder.
 """
 
 from __future__ import annotations
 
-import argparse
 import functools
 import multiprocessing
 import os
@@ -18,8 +17,6 @@ import time
 import traceback
 import zlib
 from collections import Counter
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -325,42 +322,7 @@ def missed(tally: Tally) -> dict[str, list[int]]:
     return {f: numbers for f, numbers in found.items() if numbers}
 
 
-def fuzz_all(inputs: dict[str, int], seed: int, first: int, processes: int, tell: Callable[[Tally], object]) -> list[Tally]:
-    """Fuzz readers, several at a time; ``tell`` is given each tally as it is there."""
-
-    def one(name: str) -> Tally:
-        tally = fuzz(name, inputs[name], seed, first)
-        tell(tally)
-        return tally
-
-    with ThreadPoolExecutor(processes) as pool:
-        return list(pool.map(one, inputs))
-
-
-def main() -> int:
-    """Fuzz the named readers, all without a name; print a table and every failure."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--inputs", type=int, default=10_000, help="over all readers")
-    parser.add_argument("--reader", action="append")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--first", type=int, default=0)
-    parser.add_argument("--processes", type=int, default=1)
-    parser.add_argument("--keep", type=Path, help="write the first input of the first reader to this folder, and stop")
-    a = parser.parse_args()
-    names = a.reader or list(all_targets())
-    if a.keep:
-        a.keep.mkdir(parents=True)
-        print(Worker(all_targets()[names[0]], a.seed, a.keep).put(a.first)[0])
-        return 0
-
-    def tell(t: Tally) -> None:
-        print(table([t]).splitlines()[1], *t.failures, f"    lines not reached: {missed(t)}", sep="\n", flush=True)
-
-    tallies = fuzz_all(shares(names, a.inputs), a.seed, a.first, a.processes, tell)
-    print(table(tallies), *filter(None, map(shallow, tallies)), sep="\n")
-    print(f"{sum(t.inputs for t in tallies):,} inputs, {sum(sum(t.kinds.values()) for t in tallies)} failures")
-    return 1 if any(t.failures or shallow(t) for t in tallies) else 0
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    name, seed, index, place = sys.argv[1:]
+    Path(place).mkdir(parents=True)
+    print(Worker(all_targets()[name], int(seed), Path(place)).put(int(index))[0])

@@ -141,16 +141,21 @@ PASSES = ((0, 0, 8, 8), (4, 0, 8, 8), (0, 4, 4, 8), (2, 0, 4, 4), (0, 2, 2, 4), 
 """First column, first row and steps of the passes of an interlaced image."""
 
 
-def interlaced() -> bytes:
-    gray = np.asarray(photo("L"))
-    rows = [b"\0" + r.tobytes() for x, y, dx, dy in PASSES for r in gray[y::dy, x::dx] if r.size]
-    header = struct.pack(">IIBBBBB", gray.shape[1], gray.shape[0], 8, 0, 0, 0, 1)
-    return joined([(b"IHDR", header), (b"IDAT", zlib.compress(b"".join(rows))), (b"IEND", b"")])
+def gray_png(width: int, height: int, rows: bytes, interlaced: int = 0) -> bytes:
+    """Return a gray PNG of 8 bits from its rows with their filter bytes."""
+    header = struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, interlaced)
+    return joined([(b"IHDR", header), (b"IDAT", zlib.compress(rows)), (b"IEND", b"")])
+
+
+def interlaced(gray: np.ndarray, rows: int | None = None) -> bytes:
+    """Return an interlaced PNG of a gray image, or of its first rows in the order of the file."""
+    found = [b"\0" + r.tobytes() for x, y, dx, dy in PASSES for r in gray[y::dy, x::dx] if r.size]
+    return gray_png(*gray.shape[::-1], b"".join(found[:rows]), 1)
 
 
 PNG_MODES = ("RGB", "RGBA", "L", "LA", "P", "1", "I;16")
 add(
-    "png", {m.replace(";", ""): encoded("PNG", m) for m in PNG_MODES} | {"interlaced": interlaced()},
+    "png", {m.replace(";", ""): encoded("PNG", m) for m in PNG_MODES} | {"interlaced": interlaced(np.asarray(photo("L")))},
     (image_files._opened, image_files._loaded),
     (png_rows, rarely(png_bomb, png_rows)), repair=png_checksums, unexplained=same,
 )  # fmt: skip
@@ -244,14 +249,15 @@ TIFFS |= {c: encoded("TIFF", "RGB", compression=c) for c in PACKED} | {"group4":
 TIFFS |= {f"deep{c}": by_opencv(".tif", DEEP, cv2.IMWRITE_TIFF_COMPRESSION, c) for c in (1, 5, 8)}
 
 
-def big_tiled(order: str = "<") -> bytes:
-    """Return a big TIFF of two tiles of 16 x 16 px."""
+def big_tiled(gray: np.ndarray, order: str = "<") -> bytes:
+    """Return a big TIFF of a gray image of 16 bits, in two tiles of 16 x 16 px."""
     tags = [(256, 3, 32), (257, 3, 16), (258, 3, 16), (259, 3, 1), (262, 3, 1), (277, 3, 1), (322, 3, 16), (323, 3, 16)]
     start = 16 + 8 + 20 * 10 + 8
     entries = b"".join(struct.pack(order + "HHQ", t, k, 1) + struct.pack(order + "H6x", v) for t, k, v in tags)
     entries += struct.pack(order + "HHQQ", 324, 16, 2, start) + struct.pack(order + "HHQQ", 325, 16, 2, start + 16)
-    head = b"II+\0" + struct.pack(order + "HHQQ", 8, 0, 16, 10)
-    return head + entries + bytes(8) + struct.pack(order + "4Q", start + 32, start + 544, 512, 512) + bytes(range(256)) * 4
+    head = {"<": b"II+\0", ">": b"MM\0+"}[order] + struct.pack(order + "HHQQ", 8, 0, 16, 10)
+    places = struct.pack(order + "4Q", start + 32, start + 544, 512, 512)
+    return head + entries + bytes(8) + places + b"".join(gray[:, i : i + 16].astype(order + "u2").tobytes() for i in (0, 16))
 
 
 TIFF_PARSER = (
@@ -261,7 +267,7 @@ TIFF_PARSER = (
     image_files._check_tiff,
     image_files.unpacked_size,
 )
-add("tiff", TIFFS | {"big": big_tiled()}, TIFF_PARSER, (tiff_tag, tiff_tag))
+add("tiff", TIFFS | {"big": big_tiled(np.arange(512).reshape(16, 32))}, TIFF_PARSER, (tiff_tag, tiff_tag))
 
 WEBPS = {
     "lossy": encoded("WEBP", "RGB"), "lossless": encoded("WEBP", "RGB", lossless=True),
@@ -287,9 +293,7 @@ def other_size(data: bytes, rng: np.random.Generator) -> bytes:
     scale = int(rng.integers(1, 4))
     width, height = (16 * scale, 12 * scale) if rng.random() < 0.7 else (int(v) for v in rng.integers(1, 40, 2))
     rows = (b"\0" + bytes(width // 2) + b"\xff" * (width - width // 2)) * height
-    return joined(
-        [(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)), (b"IDAT", zlib.compress(rows)), (b"IEND", b"")]
-    )
+    return gray_png(width, height, rows)
 
 
 MASKS = (

@@ -12,6 +12,7 @@ import torch
 
 from tests.faults.mutations import Change, damage, json_value, number, text_line, text_number
 from tests.faults.targets import Target, not_finite, register
+from tests.gaussians import cloud
 from tests.io import scenes
 from tests.priors import networks as nw
 from warpgs import onnx
@@ -27,12 +28,6 @@ from warpgs.pipeline.run.request import SceneRequest
 from warpgs.pipeline.train.presets import PRESETS
 from warpgs.priors import flow, networks
 from warpgs.scene import Gaussians, Normalization
-
-
-def gaussians(count: int = 3) -> Gaussians:
-    generator = torch.Generator().manual_seed(0)
-    shapes = {"means": (3,), "quats": (4,), "log_scales": (3,), "logit_opacities": (), "sh": (4, 3)}
-    return Gaussians(**{n: torch.randn((count, *s), generator=generator) for n, s in shapes.items()})
 
 
 def nonsense(g: Gaussians) -> str:
@@ -58,7 +53,7 @@ def ply_body(data: bytes, rng: np.random.Generator) -> bytes:
 
 
 def ply_files(root: Path) -> list[Path]:
-    ply.write_ply(root / "a.ply", gaussians(), Normalization())
+    ply.write_ply(root / "a.ply", cloud(3), Normalization())
     text = (root / "a.ply").read_bytes()
     more = b"element face 2\nproperty uchar material\nelement vertex"
     before = text.replace(b"element vertex", more, 1).replace(b"end_header\n", b"end_header\n\1\2", 1)
@@ -66,7 +61,7 @@ def ply_files(root: Path) -> list[Path]:
         before.replace(b"\nend_header", b"\nelement tail 1\nproperty list uchar int x\nend_header") + bytes(1)
     )
     head, _, body = text.partition(b"end_header\n")
-    rows = np.frombuffer(body, "<f4").reshape(len(gaussians()), -1).tolist()
+    rows = np.frombuffer(body, "<f4").reshape(3, -1).tolist()
     lines = "".join(" ".join(map(repr, row)) + "\n" for row in rows)
     (root / "c.ply").write_bytes(head.replace(b"binary_little_endian", b"ascii") + b"end_header\n" + lines.encode())
     return [root / "a.ply", root / "b.ply", root / "c.ply"]
@@ -123,7 +118,7 @@ def within_digest(change: Change) -> Change:
 
 def model_files(root: Path) -> list[Path]:
     path = root / "m.safetensors"
-    table.save(path, gaussians(), Normalization(np.array([1.0, 2, 3]), 0.5))
+    table.save(path, cloud(3), Normalization(np.array([1.0, 2, 3]), 0.5))
     path.write_bytes(in_order(path.read_bytes()))
     return [path]
 
@@ -138,7 +133,7 @@ register(
 
 def checkpoints(root: Path) -> list[Path]:
     state = {"step": 7, "random": [1, 2, 3], "rates": {"means": 0.1}}
-    return [folder.save_checkpoint(root, {f"params.{n}": t for n, t in gaussians().tensors().items()}, state)]
+    return [folder.save_checkpoint(root, {f"params.{n}": t for n, t in cloud(3).tensors().items()}, state)]
 
 
 def checkpoint_nonsense(loaded: tuple) -> str:

@@ -58,12 +58,7 @@ OWNER = "Jane Owner"
 
 def exif(orientation: int) -> Image.Exif:
     found = Image.Exif()
-    found[photographs.MAKE if hasattr(photographs, "MAKE") else 0x010F], found[0x0110], found[0x0112] = (
-        "ACME",
-        "Phone 7",
-        orientation,
-    )
-    found[0x013B] = OWNER
+    found[0x010F], found[0x0110], found[0x0112], found[0x013B] = "ACME", "Phone 7", orientation, OWNER
     found.get_ifd(0x8825).update({1: "N", 2: (48.0, 8.0, 30.0)})
     found.get_ifd(0x8769)[0xA405] = 28
     return found

@@ -42,8 +42,7 @@ class Target:
 
 
 MODULES = (
-    "format_targets", "image_targets", "model_targets", "network_targets", "photo_targets", "record_targets", "scene_targets",
-    "viewer_targets",
+    "format_targets", "image_targets", "model_targets", "photo_targets", "record_targets", "scene_targets", "viewer_targets",
 )  # fmt: skip
 """Modules of this folder that register readers."""
 TARGETS: dict[str, Target] = {}

@@ -237,6 +237,14 @@ WRITERS = {
 }
 
 
+def link(path: Path, target: Path) -> None:
+    """Make a link, or skip where the system or the user may not."""
+    try:
+        path.symlink_to(target, target_is_directory=target.is_dir())
+    except OSError:
+        pytest.skip("this system does not let the user make links")
+
+
 def refused(root: Path, message: str, **options) -> None:
     """Assert that the scene ends in a DataError whose text matches."""
     with pytest.raises(DataError, match=message):

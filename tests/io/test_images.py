@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image, ImageFile, ImageOps
 
+from tests.faults.image_targets import big_tiled, chunk, gray_png, interlaced
 from tests.io import scenes
 from warpgs.errors import DataError, ResourceError, UsageError
 from warpgs.io import image_files
@@ -400,16 +401,6 @@ def refused(tmp_path, data: bytes, reason: str, **options) -> None:
         decode(path, **options)
 
 
-def chunk(kind: bytes, body: bytes) -> bytes:
-    return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
-
-
-def png(width: int, height: int, rows: bytes, interlaced: int = 0) -> bytes:
-    """Return a gray PNG of 8 bits from its rows with their filter bytes."""
-    header = struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, interlaced)
-    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(rows)) + chunk(b"IEND", b"")
-
-
 def tiff(width: int, height: int, strips: list[tuple[int, int]], pixels: bytes, compression: int = 1, rows: int = 0) -> bytes:
     """Return a gray TIFF of 8 bits whose strips, pairs (offset into the pixels, length), are of ``rows`` rows each."""
     count = len(strips)
@@ -445,28 +436,17 @@ def test_pixels_of_a_jpeg_are_those_of_opencv(mode, options, tmp_path):
 
 
 def test_an_interlaced_png_is_read(tmp_path):
-    gray = np.arange(11 * 9, dtype=np.uint8).reshape(9, 11)
-    parts = ((0, 0, 8, 8), (4, 0, 8, 8), (0, 4, 4, 8), (2, 0, 4, 4), (0, 2, 2, 4), (1, 0, 2, 2), (0, 1, 1, 2))
-    rows = [b"\0" + row.tobytes() for x, y, dx, dy in parts for row in gray[y::dy, x::dx] if row.size]
-    path = tmp_path / "a.png"
-    path.write_bytes(png(11, 9, b"".join(rows), interlaced=1))
+    gray, path = np.arange(11 * 9, dtype=np.uint8).reshape(9, 11), tmp_path / "a.png"
+    path.write_bytes(interlaced(gray))
     assert (decode(path)[0][..., 0] == gray / np.float32(255)).all()
-    refused(tmp_path, png(11, 9, b"".join(rows[:-1]), interlaced=1), "decoded")
+    refused(tmp_path, interlaced(gray, -1), "decoded")
 
 
 @pytest.mark.parametrize("order", ["<", ">"])
 def test_big_tiff_and_tiles_are_read(order, tmp_path):
-    gray = (99 * np.arange(32 * 16).reshape(16, 32)).astype(order + "u2")
-    tags = [(256, 3, 32), (257, 3, 16), (258, 3, 16), (259, 3, 1), (262, 3, 1), (277, 3, 1), (322, 3, 16), (323, 3, 16)]
-    start = 16 + 8 + 20 * 10 + 8
-    offsets, lengths = struct.pack(order + "2Q", start + 32, start + 32 + 512), struct.pack(order + "2Q", 512, 512)
-    entries = b"".join(struct.pack(order + "HHQ", t, k, 1) + struct.pack(order + "H6x", v) for t, k, v in tags)
-    entries += struct.pack(order + "HHQQ", 324, 16, 2, start) + struct.pack(order + "HHQQ", 325, 16, 2, start + 16)
-    magic = {"<": b"II+\0", ">": b"MM\0+"}[order]
-    data = magic + struct.pack(order + "HHQQ", 8, 0, 16, 10) + entries + bytes(8) + offsets + lengths
-    path = tmp_path / "a.tif"
-    path.write_bytes(data + gray[:, :16].tobytes() + gray[:, 16:].tobytes())
-    assert (decode(path)[0][..., 0] == gray / np.float32(65535)).all()
+    gray, path = 99 * np.arange(32 * 16).reshape(16, 32), tmp_path / "a.tif"
+    path.write_bytes(big_tiled(gray, order))
+    assert (decode(path)[0][..., 0] == gray.astype(np.float32) / 65535).all()
     refused(tmp_path, path.read_bytes()[:-1], "lie outside of the file")
 
 
@@ -500,7 +480,7 @@ def test_a_progressive_jpeg_that_lacks_scans(tmp_path):
 
 def test_a_png_that_lacks_a_part_or_has_a_wrong_bit_or_checksum(tmp_path):
     rows = bytes(13) * 8
-    good = png(12, 8, rows)
+    good = gray_png(12, 8, rows)
     (tmp_path / "a.png").write_bytes(good)
     assert decode(tmp_path / "a.png")[0].shape == (8, 12, 3)
     packed = zlib.compress(rows)
@@ -509,7 +489,7 @@ def test_a_png_that_lacks_a_part_or_has_a_wrong_bit_or_checksum(tmp_path):
     refused(tmp_path, good.replace(whole, chunk(b"IDAT", packed[:-5])), "decoded")
     refused(tmp_path, good.replace(whole, chunk(b"IDAT", packed[:-1] + b"\x77")), "decoded")
     refused(tmp_path, good.replace(whole, whole[:-1] + b"\x77"), "decoded")
-    refused(tmp_path, png(12, 9, rows), "decoded")
+    refused(tmp_path, gray_png(12, 9, rows), "decoded")
     refused(tmp_path, good[:-12], "decoded")
     for at in (0.1, 0.3, 0.5, 0.7, 0.9):
         data = bytearray(encoded("PNG"))
@@ -559,7 +539,7 @@ def test_strips_that_hold_too_little(tmp_path):
 def announcing(kind: str, width: int, height: int) -> bytes:
     """Return a small file whose header announces an image of another size."""
     if kind == "PNG":
-        return png(width, height, bytes(100))
+        return gray_png(width, height, bytes(100))
     if kind == "TIFF":
         return tiff(width, height, [(0, 100)], bytes(100))
     data = bytearray(encoded(kind))

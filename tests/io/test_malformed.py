@@ -46,12 +46,6 @@ def test_the_complete_format_is_taken_with_a_note(tmp_path):
     assert (reader.name, notes) == ("colmap", ["the folder also holds llff: colmap is used"])
 
 
-def test_the_folder_itself_may_be_the_reconstruction(tmp_path):
-    scenes.write_files(tmp_path, scenes.colmap_bin())
-    scenes.save_images(tmp_path / "images")
-    assert len(load_scene(tmp_path).views) == 5
-
-
 @pytest.mark.parametrize("kind,lack", [("colmap", "images"), ("llff", "images"), ("dtu", "image")])
 def test_scenes_without_images(kind, lack, tmp_path):
     scenes.WRITERS[kind](tmp_path)
@@ -497,11 +491,3 @@ def test_middlebury_files(old, new, message, tmp_path):
     assert old in text
     path.write_text(text.replace(old, new, 1))
     refused(tmp_path, message)
-
-
-@pytest.mark.parametrize("kind", scenes.WRITERS)
-def test_corrupt_images_are_named(kind, tmp_path):
-    scenes.WRITERS[kind](tmp_path)
-    path = sorted(tmp_path.rglob("*.png"))[2]
-    path.write_bytes(path.read_bytes()[:60])
-    refused(tmp_path, rf"{path.name}: the image cannot be decoded: .*Restore it")

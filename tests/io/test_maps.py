@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tests.io import scenes
-from tests.io.scenes import refused
+from tests.io.scenes import link, refused
 from warpgs.errors import DataError, UsageError
 from warpgs.io import maps
 from warpgs.io.folder import image_ids
@@ -203,10 +203,7 @@ def test_sizes_beyond_the_limit_and_links_are_refused(tmp_path):
     with pytest.raises(DataError, match="80 x 60 px, more than the limit of 200 pixels"):
         load_scene(scene, depths=maps, max_pixels=200)
     (maps / "photo0.npy").rename(tmp_path / "outside.npy")
-    try:
-        (maps / "photo0.npy").symlink_to(tmp_path / "outside.npy")
-    except OSError:
-        pytest.skip("this system does not let the user make links")
+    link(maps / "photo0.npy", tmp_path / "outside.npy")
     with pytest.raises(DataError, match=r"photo0\.npy: a link points outside the folder of maps"):
         load_scene(scene, depths=maps)
     assert load_scene(scene, depths=maps, allow_outside=True).views[0].depth is not None

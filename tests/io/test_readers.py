@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from tests.io import scenes
-from tests.io.scenes import refused
+from tests.io.scenes import link, refused
 from warpgs.errors import DataError, UsageError
 from warpgs.io.folder import Probe, Reader, all_readers, find_reader
 from warpgs.io.load import load_scene
@@ -132,14 +132,6 @@ def test_the_example_reads_back_what_it_writes(tmp_path, monkeypatch, capsys):
 
 
 # Links lead out of a scene only where the user allows it, in every format, for images, masks and score masks.
-
-
-def link(path, target):
-    """Make a link, or skip where the system or the user may not."""
-    try:
-        path.symlink_to(target, target_is_directory=target.is_dir())
-    except OSError:
-        pytest.skip("this system does not let the user make links")
 
 
 def moved_out(scene, path):

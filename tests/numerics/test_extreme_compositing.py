@@ -9,7 +9,7 @@ import torch
 import warp as wp
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from tests.gaussians import camera, cloud, leaves
+from tests.gaussians import camera, cloud, finite, leaves
 from tests.kernels.test_blend import drawn, stack_of
 from warpgs.constants import RULES
 from warpgs.kernels import blend_cuda, launch
@@ -37,10 +37,6 @@ def images(gaussians, cam, rule=EXACT, background=0.0):
 
 def gradients(loss, gaussians):
     return dict(zip(gaussians.tensors(), torch.autograd.grad(loss, list(gaussians.tensors().values()))))
-
-
-def finite(*tensors) -> bool:
-    return all(bool(torch.isfinite(t).all()) for t in tensors)
 
 
 @pytest.mark.parametrize("count", [16, 5000])

@@ -10,7 +10,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from tests.gaussians import cloud
-from tests.pipeline import tables
+from tests.pipeline.train import fits
 from tests.reference.neighbours import mean_square_distances_reference
 from tests.scenes import photos, priors, seeds
 from warpgs.errors import DataError, NotFiniteError, UsageError
@@ -117,7 +117,7 @@ def test_a_set_of_none_is_legal(device):
     """No rows: a step, refinement, a change of the set and columns work on nothing."""
     g = cloud(0, device=device)
     table = Table.of_gaussians(g, {"seen": Column(0.0)})
-    tables.adam_step(table, {n: torch.zeros_like(t) for n, t in table.params.items()})
+    fits.adam_step(table, {n: torch.zeros_like(t) for n, t in table.params.items()})
     none = torch.zeros(0, dtype=torch.int64, device=device)
     table.apply(DensityUpdate(none, g.tensors(), none))
     change = refine(
@@ -273,7 +273,7 @@ def test_views_of_which_nothing_counts(device):
 @pytest.mark.parametrize("fraction", [0.0, 0.2, 1.0])
 @pytest.mark.parametrize("masked", ["all", "all but one"])
 def test_masks_that_leave_nothing_or_one_pixel(device, fraction, masked):
-    """The mean is over what counts, and over nothing it is 0; gradients stay at what counts, or near it for similarity."""
+    """The mean is over what counts, over nothing it is 0, and what is hidden may be anything; gradients stay at what counts."""
     mask = torch.zeros(12, 13, device=device)
     if masked == "all but one":
         mask[5, 6] = 1
@@ -286,6 +286,10 @@ def test_masks_that_leave_nothing_or_one_pixel(device, fraction, masked):
     moved = torch.nonzero(leaf.grad.abs().sum(-1)).tolist()
     assert moved == ([] if masked == "all" else [[5, 6]])
     assert (float(loss.detach()) == 0) == (masked == "all")
+    if masked == "all but one" and fraction == 0:
+        assert float(loss.detach()) == pytest.approx(float((image - target).detach().abs()[5, 6].mean()), rel=1e-6)
+    other = (torch.where(mask[..., None] > 0, t.detach(), 1 - t.detach()) for t in (image, target))
+    assert torch.equal(photometric_loss(*other, mask, fraction), loss.detach())
 
 
 NUMBERS = [math.nan, math.inf, -1, 0, 1e-300, 1, 3, 1e300]

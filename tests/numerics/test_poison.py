@@ -4,8 +4,7 @@ import pytest
 import torch
 
 from tests.gaussians import camera, cloud
-from tests.numerics.fuzz import REFERENCE_LIMIT, fuzz
-from tests.numerics.poison import SLOTS, VALUES, Case, failures, make_case, non_finite, reference_error
+from tests.numerics.fuzz import REFERENCE_LIMIT, SLOTS, VALUES, Case, failures, fuzz, make_case, non_finite, reference_error
 from warpgs.scene import Gaussians
 
 
@@ -58,15 +57,12 @@ def test_a_failure_is_counted_and_named(monkeypatch, capsys):
     assert "make_case(5, 0, 100)" in out and out.splitlines()[-1].startswith("1 failures in ")
 
 
-def test_the_fuzz_sees_a_gaussian_that_is_painted():
+def test_the_fuzz_sees_a_gaussian_that_is_painted(monkeypatch):
     """The checks themselves: a Gaussian taken for non-finite although it is drawn is reported in every picture."""
     case = make_case(0, 3, 200)
     quiet = Gaussians(**{n: t.nan_to_num(0.1, 0.1, 0.1) for n, t in case.gaussians.tensors().items()})
     assert failures(Case(quiet, case.poisoned, case.camera, case.rule), "cpu")[0] == []
-    from tests.numerics import poison as module
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(module, "non_finite", lambda g: torch.arange(len(g)) % 2 == 0)
-        wrong, _ = failures(Case(quiet, case.poisoned, case.camera, case.rule), "cpu")
+    monkeypatch.setattr("tests.numerics.fuzz.non_finite", lambda g: torch.arange(len(g)) % 2 == 0)
+    wrong, _ = failures(Case(quiet, case.poisoned, case.camera, case.rule), "cpu")
     assert any("were drawn" in w for w in wrong) and any("rgb changes" in w for w in wrong)
     assert any("v_means is not zero" in w for w in wrong)

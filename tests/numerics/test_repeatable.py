@@ -144,19 +144,14 @@ KERNELS = sorted((Path(__file__).parents[2] / "warpgs/kernels").glob("*.py"))
 
 def is_kernel(decorator: ast.expr) -> bool:
     """Whether a decorator is wp.kernel or a partial of it."""
-    call = decorator.func if isinstance(decorator, ast.Call) else decorator
-    return ast.unparse(call) in ("wp.kernel", "kernel")
+    return ast.unparse(getattr(decorator, "func", decorator)) in ("wp.kernel", "kernel")
 
 
-def warp_functions(path: Path) -> list[ast.FunctionDef]:
+def warp_functions(tree: ast.AST) -> list[ast.FunctionDef]:
     """Functions that Warp compiles: its kernels and functions, but not the stubs of native ones."""
-    found = []
-    for node in ast.walk(ast.parse(path.read_text("utf-8"))):
-        if isinstance(node, ast.FunctionDef):
-            names = [ast.unparse(d.func if isinstance(d, ast.Call) else d) for d in node.decorator_list]
-            if any(n in ("wp.func", "wp.kernel", "kernel") for n in names):
-                found.append(node)
-    return found
+    functions = [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)]
+    names = ("wp.func", "wp.kernel", "kernel")
+    return [f for f in functions if any(ast.unparse(getattr(d, "func", d)) in names for d in f.decorator_list)]
 
 
 def test_no_adjoint_is_generated():
@@ -164,7 +159,7 @@ def test_no_adjoint_is_generated():
     count = 0
     for path in KERNELS:
         text = path.read_text("utf-8")
-        for f in warp_functions(path):
+        for f in warp_functions(ast.parse(text)):
             for d in f.decorator_list:
                 if is_kernel(d):
                     count += 1
@@ -191,13 +186,9 @@ def test_no_constant_is_hidden_float32():
     for path in KERNELS:
         for maker in ast.walk(ast.parse(path.read_text("utf-8"))):
             if isinstance(maker, ast.FunctionDef) and any(a.arg == "real" for a in maker.args.args):
-                for f in ast.walk(maker):
-                    if isinstance(f, ast.FunctionDef) and any(
-                        ast.unparse(d.func if isinstance(d, ast.Call) else d) in ("wp.func", "wp.kernel", "kernel")
-                        for d in f.decorator_list
-                    ):
-                        checked += 1
-                        assert not bare_floats(f), f"{path.name}: {f.name}, lines {bare_floats(f)}"
+                for f in warp_functions(maker):
+                    checked += 1
+                    assert not bare_floats(f), f"{path.name}: {f.name}, lines {bare_floats(f)}"
     assert checked >= 50
 
 

@@ -17,8 +17,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from tests.pipeline.fake_slurm import install_slurm
-from tests.pipeline.farms import HereEngine, jobs_of, write_scenes
+from tests.pipeline.farms import HereEngine, install_slurm, jobs_of, write_scenes
 from warpgs.app.cli import main
 from warpgs.errors import DataError, ResourceError, UsageError
 from warpgs.files import make_folder

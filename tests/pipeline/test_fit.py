@@ -1,10 +1,12 @@
 """Fits from Python and by commands: run folders, given maps, backgrounds, objects cut out, previews."""
 
+import ast
 import dataclasses
 import html
 import json
 import shutil
 import warnings
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -17,6 +19,7 @@ from tests.io import scenes
 from tests.io.scenes import save
 from tests.priors import networks as nw
 from tests.priors.rigs import exact_depth
+from tests.scenes import photos, seeds
 from warpgs.app.cli import main
 from warpgs.errors import DataError, UsageError
 from warpgs.export.base import read_gaussians
@@ -31,10 +34,10 @@ from warpgs.pipeline.run.request import NO_SCORES, SceneRequest
 from warpgs.pipeline.run.results import score_line
 from warpgs.pipeline.train.presets import PRESETS
 from warpgs.pipeline.train.schedule import choose_background, color_of, over_background
-from warpgs.pipeline.train.settings import FitConfig
+from warpgs.pipeline.train.settings import FitConfig, probe_seconds
 from warpgs.process import Detail
 from warpgs.report.images import png, straight_alpha
-from warpgs.scene import Camera, View
+from warpgs.scene import Camera, Scene, View
 from warpgs.synthetic import demo
 from warpgs.synthetic.demo import split_spec, write_demo
 
@@ -624,3 +627,66 @@ def test_a_camera_far_off_does_not_set_the_scale(tmp_path, distance):
         train = [v for v in scene_of(stored)[1] if v.name != "007.png"]
         psnr.append(mean_psnr(stored.gaussians(), train, stored.options()))
     assert psnr[1] > psnr[0] - 0.5, psnr
+
+
+# A fit under another default type or device of torch: the same bits.
+
+ROOT = Path(warpgs.__file__).parent
+REAL = {"zeros", "ones", "full", "empty", "rand", "randn", "eye", "linspace", "tensor"}
+"""Functions of torch that make numbers of the default type on the default device."""
+WHOLE = {"arange", "randint", "randperm"}
+"""Functions of torch that make integers on the default device."""
+
+
+@pytest.fixture(params=["float64", "meta"])
+def other_default(request):
+    """Set another default, as a user's program may, and set the usual one again."""
+
+    def switch():
+        if request.param == "meta":
+            torch.set_default_device("meta")
+        else:
+            torch.set_default_dtype(torch.float64)
+
+    yield switch
+    torch.set_default_device(None)
+    torch.set_default_dtype(torch.float32)
+
+
+def gaussians_of(preset: str, scene: Scene, device: torch.device, **changes) -> list[torch.Tensor]:
+    """The Gaussians of a short fit."""
+    result = warpgs.fit(scene, preset, steps=12, split="every:4", device=device, verbose=False, **changes)
+    return list(result.gaussians().tensors().values())
+
+
+@pytest.mark.parametrize(
+    ("preset", "changes"),
+    [
+        ("default", {"exposure": True, "refine_poses": True}), ("mcmc", {}), ("3dgs", {}),
+        *(pytest.param(p, {}, marks=pytest.mark.slow) for p in ("quick", "paper-literal")),
+    ],
+)  # fmt: skip
+def test_a_fit_makes_its_own_types_and_devices(other_default, device, preset, changes):
+    """The second of two fits in one process, whose launches were recorded by the first."""
+    scene = Scene("three Gaussians", "test", tuple(photos(6)), seeds())
+    first = gaussians_of(preset, scene, device, **changes)
+    other_default()
+    second = gaussians_of(preset, scene, device, **changes)
+    assert all(torch.equal(a, b) for a, b in zip(first, second, strict=True))
+
+
+def test_the_step_of_a_time_budget_too(other_default, device):
+    """It is made of numbers of its own."""
+    other_default()
+    assert probe_seconds(20, 16, device) > 0
+
+
+def test_new_tensors_name_their_type_and_device():
+    """In the whole package, since a fit meets only part of it."""
+    for path in ROOT.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+            if isinstance(node, ast.Call) and ast.unparse(node.func).removeprefix("torch.") in REAL | WHOLE:
+                name = ast.unparse(node.func)
+                named = {k.arg for k in node.keywords}
+                wanted = {"device"} | ({"dtype"} if name.removeprefix("torch.") in REAL else set())
+                assert not name.startswith("torch.") or wanted <= named or None in named, f"{path}:{node.lineno}"

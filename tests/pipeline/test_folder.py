@@ -80,8 +80,9 @@ def test_whatever_writes_into_a_run_waits_for_nobody(folder, tmp_path, capsys):
     shutil.copytree(folder / "run", run)
     before = contents(run)
     with hold_folder(run), hold_folder(run / "path-views"), hold_folder(tmp_path / "priors"):
-        with pytest.raises(ResourceError, match="is writing there"):
-            fit(folder, run, resume=True)
+        for resume in (True, False):
+            with pytest.raises(FolderHeldError, match=f"process {os.getpid()} on .* is writing there"):
+                fit(folder, run, resume=resume)
         for words in (
             ["eval", str(run), *cpu],
             ["render", str(run), "--path", "views", *cpu],
@@ -96,6 +97,9 @@ def test_whatever_writes_into_a_run_waits_for_nobody(folder, tmp_path, capsys):
         assert warpgs.open_run(run, "cpu").step == 2
     shutil.rmtree(run / "path-views", ignore_errors=True)
     assert contents(run) == before
+    (run / LOCK).write_text("")  # which nobody holds
+    with pytest.raises(UsageError, match="exists already; choose another --out, or continue that run with --resume"):
+        fit(folder, run)
 
 
 def test_export_and_prune_remove_what_killed_ones_left(folder, tmp_path):
@@ -125,16 +129,6 @@ def test_a_checkpoint_of_another_fit_is_not_continued(folder, tmp_path, key):
     with pytest.raises(DataError, match=f"and config.json beside it belong to different fits: {word} differs"):
         fit(folder, tmp_path / "run", resume=True)
     assert contents(tmp_path / "run") == before
-
-
-def test_a_folder_in_use_names_its_user_and_does_not_advise_to_resume(folder, tmp_path):
-    """A lock file that nobody holds is no user."""
-    shutil.copytree(folder / "run", tmp_path / "run")
-    with hold_folder(tmp_path / "run"), pytest.raises(FolderHeldError, match=f"process {os.getpid()} on .* is writing there"):
-        fit(folder, tmp_path / "run")
-    (tmp_path / "run" / LOCK).write_text("")
-    with pytest.raises(UsageError, match="exists already; choose another --out, or continue that run with --resume"):
-        fit(folder, tmp_path / "run")
 
 
 def test_commands_on_a_run_that_has_not_ended_print_that(folder, tmp_path):

@@ -71,10 +71,16 @@ def test_psnr_of_known_errors():
 
 
 def test_scores_are_of_the_saved_picture():
+    """LPIPS joins the figures where it is measured."""
     view = photos(1)[0]
     m = score(view, view.image + 1e-4)
     assert m.psnr > 50 and m.ssim > 0.999 and m.ssim_skimage > 0.999
     assert np.array_equal(to_8_bit(np.array([-1.0, 0.5, 2.0])), np.float32([0, 128 / 255, 1]))
+    m = score(view, view.image, Witness())
+    assert m.row()["lpips_vgg_legacy"] == 0.25 and "lpips" not in m.row()
+    assert summarize([m, m])["lpips_vgg_legacy"] == 0.25
+    assert "lpips_vgg_legacy" not in summarize([score(view, view.image)])
+    assert "not measured" in variants(None)["lpips"]
 
 
 @pytest.mark.parametrize("height, width", [(11, 11), (40, 57), (10, 30)])
@@ -143,15 +149,6 @@ def test_masked_view_is_scored_by_the_dtu_recipe(kind):
 
     pair = [torch.from_numpy(np.where(mask[..., None], to_8_bit(i), 1)).double() for i in (image, view.image)]
     assert a.ssim == pytest.approx(float(ssim_reference(*pair).mean()), abs=1e-5)
-
-
-def test_lpips_joins_the_figures():
-    view = photos(1)[0]
-    m = score(view, view.image, Witness())
-    assert m.row()["lpips_vgg_legacy"] == 0.25 and "lpips" not in m.row()
-    assert summarize([m, m])["lpips_vgg_legacy"] == 0.25
-    assert "lpips_vgg_legacy" not in summarize([score(view, view.image)])
-    assert "not measured" in variants(None)["lpips"]
 
 
 def test_guesses():

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 import torch
 
-from tests.gaussians import cloud
+from tests.gaussians import cloud, shapes_of
 from tests.io import scenes
-from tests.pipeline.tables import adam_step
+from tests.pipeline.train.fits import adam_step
 from tests.scenes import photos, ring, seeds
 from warpgs.app.cli import main
 from warpgs.errors import DataError, UsageError
@@ -21,7 +21,7 @@ from warpgs.export.base import read_gaussians, suffixes, write_gaussians
 from warpgs.export.meshes_and_cameras import NAMES, write_cameras
 from warpgs.export.ply import read_ply
 from warpgs.files import make_folder
-from warpgs.geometry import harmonics, look_at, rotate, rotation_matrices
+from warpgs.geometry import harmonics, look_at, rotate
 from warpgs.io.transforms import read_cameras, stated_origin
 from warpgs.kernels.sh import basis
 from warpgs.pipeline.films.film import FilmSettings
@@ -72,15 +72,19 @@ def update(keep, added: dict, parents, **more) -> DensityUpdate:
     return DensityUpdate(torch.tensor(keep, dtype=torch.int64), added, torch.tensor(parents, dtype=torch.int64), **more)
 
 
-def test_a_step_that_is_skipped_changes_no_bit():
+def test_a_skipped_step_changes_no_bit_and_rows_are_reordered_together():
     made = table()
     before = snapshot(made)
     adam_step(made, {n: torch.ones_like(t) for n, t in made.params.items()}, step=2, skip=1)
     assert all(torch.equal(t, before[n]) for n, t in made.state().items())
+    order = torch.tensor([3, 0, 4, 2, 1])
+    made.reorder(order)
+    assert all(torch.equal(t, before[n][order]) for n, t in made.state().items())
+    assert all(t.requires_grad and t.is_leaf for t in made.params.values())
 
 
 def test_kept_rows_keep_everything_and_new_rows_start_anew():
-    """Survivors keep parameters, moments and columns bit for bit; new rows have the given parameters and moments of 0."""
+    """Survivors keep all bits; new rows have moments of 0, and columns of their parent, of the change, or the fill."""
     made = table()
     before, keep = snapshot(made), [0, 3, 4]
     added = {n: t[:2] + 1 for n, t in cloud(5).tensors().items()}
@@ -94,10 +98,6 @@ def test_kept_rows_keep_everything_and_new_rows_start_anew():
         elif group != "columns":
             assert bool(before[name].any()) and not bool(t[3:].any())
     assert all(t.requires_grad and t.is_leaf and t.is_contiguous() for t in made.params.values())
-
-
-def test_columns_are_inherited_or_filled():
-    """By the parent where there is one and the column is inherited, else by what the change says, else by the fill."""
     made = table()
     added = {n: t[:3] for n, t in cloud(5).tensors().items()}
     made.apply(update([4, 0], added, [3, -1, 0]))
@@ -123,14 +123,6 @@ def test_overwritten_rows_start_again_before_rows_come_and_go():
         assert torch.equal(t[same], before[name][kept][same]), name
         if name.startswith("exp_avg"):
             assert bool(before[name][3].any()) and not bool(t[2].any()), name
-
-
-def test_rows_are_reordered_together():
-    made = table()
-    before, order = snapshot(made), torch.tensor([3, 0, 4, 2, 1])
-    made.reorder(order)
-    assert all(torch.equal(t, before[n][order]) for n, t in made.state().items())
-    assert all(t.requires_grad and t.is_leaf for t in made.params.values())
 
 
 def test_opacity_reset_caps_and_forgets():
@@ -162,9 +154,6 @@ def test_state_comes_back_bit_for_bit():
     del state["columns.age"]
     with pytest.raises(DataError, match=r"columns\.age"):
         again.load(state)
-
-
-def test_a_table_may_have_no_parameters():
     empty = Table({}, {}, torch.device("cpu"), 3)
     adam_step(empty, {})
     empty.load(empty.state())
@@ -191,7 +180,7 @@ def params(log_scales: torch.Tensor) -> dict[str, torch.Tensor]:
 
 
 def test_axes_are_cut_and_needles_thickened():
-    """The middle axis follows the longest, the shortest stays. Gaussians within the limits do not change; twice equals once."""
+    """In any order: the middle axis follows the longest, what is within the limits stays, and twice is as once."""
     found = params(torch.log(torch.tensor([[900.0, 1e-6, 1.0], [2.0, 1.0, 1e-9], [1e-3, 3.0, 0.05], [40.0, 40.0, 40.0]])))
     limits = Limits(30.0, 30.0)
     limits.hold(found, CAMERAS, YES)
@@ -200,9 +189,6 @@ def test_axes_are_cut_and_needles_thickened():
     once = found["log_scales"].clone()
     limits.hold(found, CAMERAS, YES)
     assert torch.equal(found["log_scales"], once)
-
-
-def test_any_order_of_the_axes():
     scales = torch.cat([torch.randn(200, 3), torch.tensor([[1.0, 1, 0], [0, 1, 1], [1, 0, 1], [2, 2, 2]])])
     ordered = scales.sort(1, descending=True).values
     longest, middle = long_axes(scales)
@@ -210,9 +196,6 @@ def test_any_order_of_the_axes():
     Limits(ratio=2.0).hold({"log_scales": scales}, CAMERAS)
     longest, middle = long_axes(scales)
     assert float((longest - middle).max()) <= math.log(2) + 1e-6 and torch.equal(longest, ordered[:, 0])
-
-
-def test_a_step_that_is_not_taken_changes_nothing():
     found = params(torch.tensor([[9.0, 0.0, 0.0], [math.nan, 0.0, 1.0]]))
     before = {n: t.clone() for n, t in found.items()}
     limits = Limits(1.0, 2.0)
@@ -300,9 +283,6 @@ def test_the_ratio_is_held_from_its_time_on_and_at_the_last_step():
     assert [config.at(p, 2.0).ratio for p in (0.0, 0.7, 0.71, 1.0)] == [math.inf, math.inf, 30, 30]
     assert config.at(0.0, 3.0).largest == 3.0
     assert LimitConfig(0.0, 0.0, 0.0).at(1.0, 2.0) == Limits()
-    for wrong in ({"max_size": -1}, {"max_reach": -1}, {"max_ratio": 0.5}, {"max_size": math.nan}):
-        with pytest.raises(UsageError, match="limits"):
-            LimitConfig(**wrong)
 
 
 def test_coefficients_above_the_degree_vanish_and_are_not_stored():
@@ -329,11 +309,6 @@ def test_coefficients_above_the_degree_vanish_and_are_not_stored():
 TURN = edit.rotation_about(np.array([1.0, -2.0, 0.5]), 1.1)
 
 
-def covariances(g):
-    axes = torch.as_tensor(rotation_matrices(torch.nn.functional.normalize(g.quats.double(), dim=1)))
-    return axes @ torch.diag_embed((2 * g.log_scales.double()).exp()) @ axes.mT
-
-
 @pytest.mark.parametrize("matrix", [TURN, TURN * [-1, 1, 1]], ids=["rotation", "reflection"])
 @pytest.mark.parametrize("degree", [0, 1, 4])
 def test_colours_and_shapes_turn_with_the_scene(degree, matrix):
@@ -345,7 +320,7 @@ def test_colours_and_shapes_turn_with_the_scene(degree, matrix):
     before = torch.einsum("dk,nkc->dnc", basis(d)[:, :k], made.sh.double())
     after = torch.einsum("dk,nkc->dnc", basis(d @ turn.T)[:, :k], turned.sh.double())
     assert torch.allclose(before, after, atol=1e-6)
-    assert torch.allclose(covariances(turned), turn @ covariances(made) @ turn.T, rtol=1e-4, atol=1e-9)
+    assert torch.allclose(shapes_of(turned), turn @ shapes_of(made) @ turn.T, rtol=1e-4, atol=1e-9)
     assert torch.allclose(turned.means.double(), made.means.double() @ turn.T, atol=1e-6)
 
 
@@ -356,7 +331,8 @@ def test_up_becomes_minus_y(up):
     assert np.allclose(rotation @ rotation.T, np.eye(3)) and np.linalg.det(rotation) > 0
 
 
-def test_boxes():
+def test_boxes(tmp_path):
+    """Of numbers, of JSON and of files; turned ones, too."""
     made = cloud(200)
     plain = edit.inside(made, edit.box_of("-1,-1,3,1,1,5"))
     assert torch.equal(plain, (made.means - torch.tensor([0.0, 0, 4])).abs().amax(1) <= 1)
@@ -365,6 +341,19 @@ def test_boxes():
     turned = json.dumps({"center": [0, 0, 4], "size": [2, 1, 4], "rotation": turn.tolist()})
     local = (made.means.double() - torch.tensor([0.0, 0, 4])) @ torch.from_numpy(turn)
     assert torch.equal(edit.inside(made, edit.box_of(turned)), (local.abs() <= torch.tensor([1.0, 0.5, 2])).all(1))
+    path = tmp_path / "crop.json"
+    path.write_text('{"center": [1, 0, 4], "size": [2, 4, 4]}')
+    assert all(map(np.array_equal, edit.box_of(str(path)), edit.box_of('{"center": [1, 0, 4], "size": [2, 4, 4]}')))
+    write_gaussians(tmp_path / "a.ply", made, units="file")
+    lines = convert(tmp_path / "a.ply", tmp_path / "b.ply", Filters(crop=str(path), rotate="0,0,1,180"))
+    assert f"{int((made.means[:, 0] < 0).sum())} Gaussians outside the box" in lines[0]
+    assert float(read_gaussians(tmp_path / "b.ply").means[:, 0].max()) <= 0
+    for text, match in (("[1, 2]", "a JSON object"), ('{"center": 1}', "center takes 3"), (" " * 70000, "larger than 65,536")):
+        path.write_text(text)
+        with pytest.raises(DataError, match=match):
+            edit.box_of(str(path))
+    with pytest.raises(DataError, match="cannot be read as a box"):
+        edit.box_of(str(tmp_path / "none.json"))
 
 
 @pytest.mark.parametrize(
@@ -417,22 +406,6 @@ def test_convert_says_what_it_did(tmp_path):
     with pytest.raises(DataError, match="no Gaussian is left"):
         convert(tmp_path / "a.ply", tmp_path / "f.glb", Filters(crop="90,90,90,91,91,91"))
     assert not (tmp_path / "f.glb").exists()
-
-
-def test_boxes_of_files(tmp_path):
-    made, path = cloud(100), tmp_path / "crop.json"
-    path.write_text('{"center": [1, 0, 4], "size": [2, 4, 4]}')
-    assert all(map(np.array_equal, edit.box_of(str(path)), edit.box_of('{"center": [1, 0, 4], "size": [2, 4, 4]}')))
-    write_gaussians(tmp_path / "a.ply", made, units="file")
-    lines = convert(tmp_path / "a.ply", tmp_path / "b.ply", Filters(crop=str(path), rotate="0,0,1,180"))
-    assert f"{int((made.means[:, 0] < 0).sum())} Gaussians outside the box" in lines[0]
-    assert float(read_gaussians(tmp_path / "b.ply").means[:, 0].max()) <= 0
-    for text, match in (("[1, 2]", "a JSON object"), ('{"center": 1}', "center takes 3"), (" " * 70000, "larger than 65,536")):
-        path.write_text(text)
-        with pytest.raises(DataError, match=match):
-            edit.box_of(str(path))
-    with pytest.raises(DataError, match="cannot be read as a box"):
-        edit.box_of(str(tmp_path / "none.json"))
 
 
 @pytest.mark.parametrize(

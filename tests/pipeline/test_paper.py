@@ -15,7 +15,6 @@ from tests.pipeline.train.fits import advanced
 from tests.scenes import photos, priors, ring, seeds, three_gaussians
 from tests.tolerances import GAIN
 from warpgs.constants import LOW_PASS, Rule
-from warpgs.errors import UsageError
 from warpgs.pipeline import paper
 from warpgs.pipeline.model.start import InitConfig
 from warpgs.pipeline.paper import scores
@@ -327,17 +326,6 @@ def test_gain_draws_where_all_views_ask_for_colour(tiny):
         away = (change.added["means"] - whole.means[2]).norm(dim=1)
         fraction.append(float((away < 0.45).float().mean()))
     assert fraction[0] > 0.9 > 0.6 > fraction[1]
-
-
-def test_wrong_settings_are_refused():
-    """The message names the flag and its choices."""
-    for wrong, words in (
-        ({"residual": "error"}, "paper.residual must be one of length, gain, not 'error'"),
-        ({"depth": "mean"}, "paper.depth must be one of"),
-        ({"gate_quantile": 1}, r"paper.gate-quantile must be in \[0, 1\), not 1"),
-    ):
-        with pytest.raises(UsageError, match=words):
-            PaperConfig(**wrong)
 
 
 def test_the_room_of_the_paper_uses_public_names_alone():

@@ -10,6 +10,8 @@ import pytest
 import torch
 
 from tests.gaussians import cloud
+from tests.pipeline.test_sampling import CONFIG as UNIFORM
+from tests.pipeline.test_sampling import METHOD
 from tests.scenes import photos, priors, seeds, three_gaussians
 from warpgs.constants import RULES, TILE_SIZE
 from warpgs.errors import ResourceError, UsageError
@@ -32,8 +34,6 @@ from warpgs.pipeline.run.results import (
 from warpgs.pipeline.train.schedule import PhaseConfig, plan_phases
 from warpgs.pipeline.train.settings import FitConfig
 from warpgs.pipeline.train.strategies import sampling
-from warpgs.pipeline.train.strategies.clone_split import DensityConfig
-from warpgs.pipeline.train.strategies.sampling import MethodConfig, SamplerConfig
 from warpgs.pipeline.train.trainer import Trainer
 from warpgs.pipeline.train.views import TrainingView, half_size
 from warpgs.render.options import RasterizeOptions
@@ -193,18 +193,12 @@ def test_a_fit_starts_at_half_size_and_ends_whole(device):
     assert sizes == [20] * 4 + [40] * 4 and len(fit.stacks) == 2 and len(fit.places) == 6
     plain = Trainer(photos(3), seeds(), dataclasses.replace(config, half_resolution=0.0), device)
     assert len(plain.stacks) == 1 and len(plain.places) == 3
-    with pytest.raises(UsageError, match="half-resolution"):
-        dataclasses.replace(config, half_resolution=float("nan"))
 
 
 # Images and figures of sampling events: they show what the event saw, and say what it did.
 
 NAMES = ["00.png", "01.png", "02.png"]
-METHOD = MethodConfig(hier=True, sampler=SamplerConfig(fraction=0.01))
-CONFIG = FitConfig(
-    steps=40, sh_every=10, dropout=0.2, init=InitConfig(source="points"), sh_degree=1, strategy="paper",
-    density=DensityConfig(start=2, every=8, gradient=1e-5), phases=PhaseConfig(160, 240), method=METHOD,
-)  # fmt: skip
+CONFIG = dataclasses.replace(UNIFORM, strategy="paper", strategy_config=None)
 
 
 @pytest.fixture(scope="module")

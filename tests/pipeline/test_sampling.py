@@ -8,7 +8,7 @@ import pytest
 import torch
 from scipy.stats import chisquare
 
-from tests.pipeline.train.fits import advanced, continued, same_bits
+from tests.pipeline.train.fits import advanced
 from tests.scenes import photos, ring, seeds
 from warpgs import geometry
 from warpgs.kernels.update import Setting
@@ -219,11 +219,6 @@ def test_full_fine_layer_frees_its_least_contributors():
     change, evicted, _ = event_of(fit, fit.views, 500, max_fraction=most)
     assert evicted == len(change.parents) == cap
     assert bool((~fit.strategy.fine)[change.keep].all())
-
-
-def test_continued_fit_equals_uninterrupted_one(tmp_path):
-    """Saved between two sampling events: the same bits at the end, layers and events included."""
-    assert same_bits(fitted(), continued(lambda: fitted(steps=0), 17, tmp_path))
 
 
 @pytest.mark.parametrize("gated", [True, False])

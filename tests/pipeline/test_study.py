@@ -545,7 +545,7 @@ def forest_of(metric="psnr", title="t"):
 
 
 def test_forest_draws_every_seed_and_prints_every_interval():
-    """Small dots for seeds, a large one for each mean, words for the ends; all inside the frame."""
+    """Small dots for seeds, a large one for each mean, words for the ends, all in the frame; nothing unmeasured."""
     root = forest_of(title="t <&>")
     width, height = (float(root.get(k)) for k in ("width", "height"))
     circles = root.findall(f"{SVG}circle")
@@ -564,10 +564,6 @@ def test_forest_draws_every_seed_and_prints_every_interval():
         BETTER,
         UNDECIDED,
     ]
-
-
-def test_forest_of_one_seed_and_of_none():
-    """Without an interval the dot stands alone; a metric that nobody measured has no panel."""
     one = {"b": {"psnr": paired_difference([0.5], [0.0]), "lpips": paired_difference([], [])}}
     root = ElementTree.fromstring(forest(Table("t", ("psnr", "lpips"), {"a": {}, "b": {}}, one)))
     words = [t.text for t in root.findall(f"{SVG}text")]

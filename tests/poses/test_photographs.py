@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from tests.io.scenes import link
 from tests.poses.conftest import film, with_exif
 from tests.test_files import special
 from warpgs.errors import DataError, UsageError
@@ -30,14 +31,6 @@ from warpgs.process import ProcessFailed
 
 BOMB = bytes.fromhex("524946461a0000005745425056503 84c0e0000002ffebfff0f071011fd0f4444ff03".replace(" ", ""))
 """A lossless WebP file of 34 bytes that unpacks to 16,383 x 16,383 px of one colour."""
-
-
-def link(path, target):
-    """Make a link, or skip where the system or the user may not."""
-    try:
-        path.symlink_to(target, target_is_directory=target.is_dir())
-    except OSError:
-        pytest.skip("this system does not let the user make links")
 
 
 @pytest.fixture

@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from tests.gaussians import camera, cloud, leaves
+from tests.kernels.test_graphs import Full
 from warpgs.constants import RULES
 from warpgs.errors import UsageError
 from warpgs.kernels.ellipse import ProjectInputs
@@ -43,14 +44,6 @@ class Counted:
         return "images" if fits else None
 
 
-class NoGraphPool(GraphPool):
-    """A pool whose captures run out of memory at the end."""
-
-    def capture(self, work):
-        work()
-        raise torch.OutOfMemoryError
-
-
 @pytest.fixture
 def surroundings(monkeypatch):
     """Treat calls on a CPU as ones that can be captured."""
@@ -69,7 +62,7 @@ def recorder(monkeypatch, surroundings) -> Recorder:
 @pytest.fixture
 def small(surroundings):
     """Fifty Gaussians, a recorder without graphs, and a camera."""
-    return leaves(cloud(50)), Recorder(NoGraphPool(CPU)), camera(70, 50, 1, torch.float32)
+    return leaves(cloud(50)), Recorder(Full(CPU)), camera(70, 50, 1, torch.float32)
 
 
 def batch(**size) -> ProjectInputs:
@@ -173,7 +166,7 @@ def results(gaussians, cam, background, recorder=None):
 
 def test_a_graphed_rasterizer_gives_the_same_bits(surroundings):
     """Batches, backgrounds and gradients of cameras are included; nothing can be captured here."""
-    g, own = leaves(cloud(300)), Recorder(NoGraphPool(CPU))
+    g, own = leaves(cloud(300)), Recorder(Full(CPU))
     cams = camera(70, 50, 3, torch.float32)
     backgrounds = torch.rand(3, 3, generator=torch.Generator().manual_seed(3))
     found = [results(g, cams, backgrounds, own) for _ in range(MIN_CALLS + 1)]
@@ -185,7 +178,7 @@ def test_a_graphed_rasterizer_gives_the_same_bits(surroundings):
 
 def test_images_without_gradients_have_the_same_bits(surroundings):
     """And keep nothing for a backward pass."""
-    g, own = leaves(cloud(300)), Recorder(NoGraphPool(CPU), gradients=False)
+    g, own = leaves(cloud(300)), Recorder(Full(CPU), gradients=False)
     cam = camera(70, 50, 2, torch.float32)
     settings = pass_of(cam, g.sh_degree, RULES["exact"])
     with torch.no_grad():
@@ -199,7 +192,7 @@ def test_images_without_gradients_have_the_same_bits(surroundings):
 
 def test_other_planes_are_another_graph(surroundings):
     """Near and far plane of the rule count, in the image and in gradients."""
-    g, cam, own = leaves(cloud(200)), camera(64, 48, dtype=torch.float32), Recorder(NoGraphPool(CPU))
+    g, cam, own = leaves(cloud(200)), camera(64, 48, dtype=torch.float32), Recorder(Full(CPU))
     for planes in ({}, {"near": 3.5, "far": 4.5}, {"far": 4.0}):
         settings = dataclasses.replace(SETTINGS, size=(64, 48), window=(0, 0, 64, 48))
         settings = dataclasses.replace(settings, rule=dataclasses.replace(RULES["exact"], **planes))
@@ -214,7 +207,7 @@ def test_other_planes_are_another_graph(surroundings):
 @pytest.mark.parametrize("short", [(1, 0), (0, 1)], ids=["visible", "instances"])
 def test_a_rasterizer_that_is_too_small_says_so(surroundings, short):
     """The call runs without graphs, and the next rasterizer has the capacity."""
-    g, own = leaves(cloud(300)), Recorder(NoGraphPool(CPU))
+    g, own = leaves(cloud(300)), Recorder(Full(CPU))
     cam = camera(70, 50, 1, torch.float32)
     sources = inputs_of(g, cam)
     settings = pass_of(cam, g.sh_degree, RULES["exact"])

@@ -8,9 +8,8 @@ import pytest
 import torch
 import torch.utils.checkpoint
 
-from tests.gaussians import camera, cloud, leaves
+from tests.gaussians import camera, cloud, leaves, of_kind
 from tests.scenes import photos, seeds
-from warpgs.geometry import rotation_matrices
 from warpgs.pipeline.model.start import InitConfig
 from warpgs.pipeline.train.settings import FitConfig
 from warpgs.pipeline.train.strategies.clone_split import DensityConfig
@@ -20,7 +19,7 @@ from warpgs.render import graphed
 from warpgs.render.graphed import MIN_CALLS
 from warpgs.render.options import RasterizeOptions
 from warpgs.render.rasterize import rasterize
-from warpgs.scene import Camera, CovarianceGaussians, Gaussians
+from warpgs.scene import Camera, Gaussians
 
 # Calls that repeat are replayed on CUDA, with the same bits, whatever a loop does with the results.
 
@@ -100,10 +99,7 @@ def test_packed_covariances_and_degree_4_are_replayed(fresh, kind):
     def steps(record):
         g, cams = leaves(cloud(400, device=CUDA, degree=4 if kind == "degree 4" else 1)), scene()[1]
         if kind == "covariances":
-            t = {n: v.detach() for n, v in g.tensors().items()}
-            axes = rotation_matrices(torch.nn.functional.normalize(t["quats"], dim=1)) * t["log_scales"].exp()[:, None]
-            given = (t["means"], axes @ axes.mT, t["logit_opacities"].sigmoid(), t["sh"])
-            g = CovarianceGaussians(*(v.clone().requires_grad_() for v in given))
+            g = of_kind(kind, g)
         params, seen = list(g.tensors().values()), []
         for step in range(9):
             r = rasterize(g, cams[step % 4], RasterizeOptions(record=record))

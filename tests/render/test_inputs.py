@@ -1,13 +1,14 @@
 """What a call takes: activated parameters, covariances, degree 4, batches of cameras, lists."""
 
 import dataclasses
+import functools
 import itertools
 import math
 
 import pytest
 import torch
 
-from tests.gaussians import SMOOTH, camera, cloud, hand_placed, leaves
+from tests.gaussians import SMOOTH, camera, cloud, hand_placed, leaves, of_kind
 from tests.reference.project import rotations
 from tests.tolerances import close
 from warpgs.errors import UsageError
@@ -16,19 +17,7 @@ from warpgs.render.options import RasterizeOptions
 from warpgs.render.rasterize import rasterize
 from warpgs.scene import ActivatedGaussians, CovarianceGaussians
 
-
-def activated(gaussians):
-    """The same Gaussians by scales and opacities, as leaves."""
-    g = gaussians.tensors()
-    tensors = g["means"], g["quats"], g["log_scales"].exp(), g["logit_opacities"].sigmoid(), g["sh"]
-    return ActivatedGaussians(*(t.detach().clone().requires_grad_() for t in tensors))
-
-
-def with_covariances(gaussians):
-    """The same Gaussians by covariances, as leaves."""
-    given = activated(gaussians)
-    tensors = given.means, covariances(given), given.opacities, given.sh
-    return CovarianceGaussians(*(t.detach().clone().requires_grad_() for t in tensors))
+activated, with_covariances = (functools.partial(of_kind, kind) for kind in ("activated", "covariances"))
 
 
 def covariances(given):

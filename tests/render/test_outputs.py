@@ -11,13 +11,12 @@ import numpy as np
 import pytest
 import torch
 
-from tests.gaussians import LENSES, SMOOTH, camera, cloud, hand_placed, leaves, lens_camera
+from tests.gaussians import LENSES, SMOOTH, camera, cloud, hand_placed, leaves, lens_camera, of_kind
 from tests.tolerances import close
 from warpgs.errors import UsageError
-from warpgs.geometry import rotation_matrices
 from warpgs.render.options import RasterizeOptions
 from warpgs.render.rasterize import rasterize
-from warpgs.scene import ActivatedGaussians, Camera, CovarianceGaussians, Gaussians, Render
+from warpgs.scene import Camera, Render
 
 OUTPUTS = [f.name for f in dataclasses.fields(Render) if f.name not in ("absgrad", "overflow")]
 DIFFERENTIABLE = ("rgb", "alpha", "depth", "features", "projected")
@@ -346,20 +345,6 @@ EVERYTHING = {"contributions": True, "median_depth": True, "heaviest": 3, "error
 COMBINATIONS_DIFFERENTIABLE = ("rgb", "alpha", "depth", "features")
 IMAGES = (*COMBINATIONS_DIFFERENTIABLE, "median_depth", "error_bound", "heaviest_ids", "heaviest_weights", "blend_counts")
 COMBINATIONS_SIZE = (50, 37)
-
-
-def of_kind(kind: str, stored: Gaussians):
-    """Return Gaussians held another way; they require gradients."""
-    t = {n: v.detach() for n, v in stored.tensors().items()}
-    scales, opacities = t["log_scales"].exp(), t["logit_opacities"].sigmoid()
-    if kind == "covariances":
-        half = rotation_matrices(torch.nn.functional.normalize(t["quats"])) * scales[:, None]
-        values = (CovarianceGaussians, t["means"], half @ half.mT, opacities, t["sh"])
-    elif kind == "activated":
-        values = (ActivatedGaussians, t["means"], t["quats"], scales, opacities, t["sh"])
-    else:
-        values = (Gaussians, *t.values())
-    return values[0](*(v.clone().requires_grad_() for v in values[1:]))
 
 
 def tensors_of(gaussians) -> list[torch.Tensor]:

@@ -11,7 +11,7 @@ import torch
 
 from tests.example_terms import DepthCorrelation
 from tests.pipeline.train.fits import advanced, continued, same_bits
-from tests.scenes import photos, priors, seeds, three_gaussians, view_stub
+from tests.scenes import photos, priors, seeds, three_gaussians
 from tests.tolerances import OPACITY_DECAY
 from warpgs.app.cli import main
 from warpgs.errors import DataError, UsageError
@@ -21,12 +21,8 @@ from warpgs.pipeline.train.memory import Layout
 from warpgs.pipeline.train.presets import PRESETS
 from warpgs.pipeline.train.schedule import OptimizerConfig, PhaseConfig
 from warpgs.pipeline.train.settings import (
-    AVERAGED_VIEWS,
-    EXTRAPOLATED_VIEWS,
     MIN_TIMED_STEPS,
-    ONE_LAYER_VIEWS,
     FitConfig,
-    settings_by_views,
     steps_by_views,
     within_budget,
 )
@@ -128,23 +124,6 @@ def test_a_step_that_is_not_taken_changes_nothing():
         now = logits.clone()
         decay_opacities(now, fraction, going)
         assert torch.equal(now, logits)
-
-
-@pytest.mark.parametrize(
-    ("views", "alpha", "few"),
-    [
-        (EXTRAPOLATED_VIEWS + 1, None, True), (ONE_LAYER_VIEWS, None, True), (ONE_LAYER_VIEWS + 1, None, False),
-        (3, 1.0, True), (ONE_LAYER_VIEWS, 1.0, True), (ONE_LAYER_VIEWS + 1, 1.0, False),
-    ],
-)  # fmt: skip
-def test_few_views_have_one_layer_and_decay(views, alpha, few):
-    """The choice is named; what is given holds."""
-    train = [view_stub(alpha=alpha)] * views
-    config, notes = settings_by_views(PRESETS["default"], train, "cuda")
-    assert (config.optimizer.opacities_decay, config.method.hier) == ((0.001, False) if few else (0.0, True))
-    assert ("one layer" in " ".join(notes)) == few
-    given = dataclasses.replace(config, optimizer=dataclasses.replace(config.optimizer, opacities_decay=0.02))
-    assert settings_by_views(given, train, "cuda")[0].optimizer.opacities_decay == 0.02
 
 
 # Mean of the parameters over the last steps: its samples, its bits, fits that are continued, and when it is chosen.
@@ -268,17 +247,6 @@ def test_the_memory_plan_counts_the_sums():
     summed, without = (Layout(fit.table, fit.views, averaged=averaged) for averaged in (True, False))
     assert fit.layout.averaged and not trainer(plain(CONFIG)).layout.averaged
     assert summed.held(100) == without.held(100) + 100 * fit.table.row_bytes
-
-
-@pytest.mark.parametrize(("views", "fraction"), [(3, 0.0), (AVERAGED_VIEWS - 1, 0.0), (AVERAGED_VIEWS, 0.05), (300, 0.05)])
-def test_many_views_have_a_mean(views, fraction):
-    """The choice is named; what is given holds."""
-    train = [view_stub()] * views
-    config, notes = settings_by_views(PRESETS["default"], train, "cuda")
-    assert config.optimizer.average_last == fraction
-    assert ("mean of the last 5% of the steps" in " ".join(notes)) == (fraction > 0)
-    given = dataclasses.replace(config, optimizer=dataclasses.replace(config.optimizer, average_last=0.5))
-    assert settings_by_views(given, train, "cuda")[0].optimizer.average_last == 0.5
 
 
 @pytest.mark.cuda
@@ -417,18 +385,6 @@ def test_only_the_product_presets_stop_early():
     """The baselines and the paper take their planned steps; the default's strategy samples."""
     stops = {name for name, c in PRESETS.items() if c.stopping.min_gain_db != 0}
     assert stops == {"default", "quick"} and {PRESETS[n].strategy for n in stops} == {"sampling"}
-
-
-@pytest.mark.parametrize(
-    ("kind", "bad"),
-    [
-        (StoppingConfig, {"min_gain_db": math.inf}), (StoppingConfig, {"min_gain_db": math.nan}),
-        (OptimizerConfig, {"opacities_decay": 0.2}), (OptimizerConfig, {"average_last": -0.1}),
-    ],
-)  # fmt: skip
-def test_bad_settings_are_refused(kind, bad):
-    with pytest.raises(UsageError, match=next(iter(bad)).replace("_", "-")):
-        kind(**bad)
 
 
 @pytest.mark.usefixtures("tiny")

@@ -1,28 +1,55 @@
-"""Settings of a fit: presets, files, mappings and keywords, all checked; and those that are chosen for the user."""
+"""Settings of a fit: presets, files, mappings and keywords, all checked; those chosen for the user; those of old versions."""
 
+import copy
 import dataclasses
+import functools
 import inspect
+import itertools
 import json
+import math
 import sys
 
 import numpy as np
 import pytest
 
 import warpgs
+from tests.example_terms import DepthCorrelation, NormalSmoothness
 from tests.scenes import photos, seeds, view_stub
 from warpgs.app.cli import main
 from warpgs.app.fit import request_of
 from warpgs.errors import DataError, UsageError
+from warpgs.pipeline.model.limits import LimitConfig
 from warpgs.pipeline.model.start import InitConfig
+from warpgs.pipeline.paper.strategy import PaperConfig
 from warpgs.pipeline.run.fit import fit
+from warpgs.pipeline.run.folder import CONFIG, check_same, open_run, read_record, stored_request
 from warpgs.pipeline.run.request import SceneRequest
-from warpgs.pipeline.train.loss import AlphaDifference
+from warpgs.pipeline.train.loss import AlphaDifference, LossConfig, SmoothDepth, built_in_terms
 from warpgs.pipeline.train.presets import MAX_BYTES, MAX_DOTS, PRESETS, preset_settings
-from warpgs.pipeline.train.schedule import plan_phases
-from warpgs.pipeline.train.settings import ONE_LAYER, FitConfig, keyword, setting_names, settings_by_views, with_settings
+from warpgs.pipeline.train.schedule import OptimizerConfig, plan_phases
+from warpgs.pipeline.train.settings import (
+    AVERAGED_VIEWS,
+    EXTRAPOLATED_VIEWS,
+    ONE_LAYER,
+    ONE_LAYER_VIEWS,
+    REMOVED,
+    SMOOTH_STEPS,
+    FitConfig,
+    keyword,
+    removed_note,
+    setting_names,
+    settings_by_views,
+    steps_by_views,
+    upgraded,
+    with_settings,
+)
 from warpgs.pipeline.train.stopping import StoppingConfig
 from warpgs.pipeline.train.strategies.mcmc import MCMCConfig
+from warpgs.pipeline.train.view_modules import Exposure, RefinePoses
 from warpgs.scene import Scene
+from warpgs.schema import SchemaError
+
+NAN = math.nan
 
 # Presets and settings from outside: files, objects, mappings and keywords, all of them checked and typed.
 
@@ -188,6 +215,33 @@ def test_keywords_replace_settings():
             with_settings(FitConfig(), wrong, "x")
 
 
+@pytest.mark.parametrize(
+    ("kind", "bad", "said"),
+    [
+        *((LossConfig, {n: v}, "loss.{} must be in") for n, v in (("depth_weight", -1), ("normal_weight", NAN))),
+        *((LossConfig, {n: v}, "loss.{} must be in") for n, v in (("smooth_weight", 1001), ("alpha_weight", NAN))),
+        (AlphaDifference, {"weight": -1.0}, "alpha.{} must be in"), (SmoothDepth, {"weight": NAN}, "{} must be in"),
+        (NormalSmoothness, {"growth": 0}, "{}"), (DepthCorrelation, {"until": 2}, "{}"),
+        (FitConfig, {"half_resolution": NAN}, "{} must be in"),
+        *((StoppingConfig, {"min_gain_db": v}, "stopping.{} must be at least 0 and finite") for v in (math.inf, NAN)),
+        *((OptimizerConfig, b, "optimizer.{} must be in") for b in ({"opacities_decay": 0.2}, {"average_last": -0.1})),
+        *((LimitConfig, b, "limits.{} must be in") for b in ({"max_size": -1}, {"max_reach": -1}, {"max_size": NAN})),
+        (LimitConfig, {"max_ratio": 0.5}, "limits.{} must be"), (MCMCConfig, {"every": 0}, "mcmc.{} must be at least 1"),
+        *((MCMCConfig, b, "mcmc.{} must be in") for b in ({"growth": -1.0}, {"noise_lr": NAN}, {"min_opacity": 0.9})),
+        (PaperConfig, {"residual": "error"}, "paper.{} must be one of length, gain, not"),
+        (PaperConfig, {"depth": "mean"}, "paper.{} must be one of"),
+        (PaperConfig, {"gate_quantile": 1}, r"paper.{} must be in \[0, 1\), not"),
+        *((Exposure, b, "exposure.{} must be in") for b in ({"lr": 0.0}, {"decay": 2e6}, {"weight": -1.0}, {"weight": 1001})),
+        *((RefinePoses, b, "refine-poses.{} must be in") for b in ({"rotation_lr": NAN}, {"start": 1.0})),
+    ],
+)  # fmt: skip
+def test_a_value_out_of_range_is_refused_by_its_flag(kind, bad, said):
+    """With the range or the choices."""
+    ((name, value),) = bad.items()
+    with pytest.raises(UsageError, match=rf"{said.format(name.replace('_', '-'))}.*{value}"):
+        kind(**bad)
+
+
 def test_view_modules_are_switched_and_set_by_keyword():
     """By their own names, as flags do, and by the list; each has settings."""
     config = with_settings(
@@ -257,61 +311,108 @@ def test_the_command_line_takes_files_and_objects(own, tmp_path, capsys):
 # Settings and sizes of images that are chosen for the user.
 
 
+PARTLY, FULL, DARK = np.eye(6, 8) > 0, np.ones((6, 8), bool), np.zeros((6, 8, 3))
+DARK[3, 3] = 1
+OPAQUE, CUT = {}, {"alpha": 1.0}
+LAYERS, UNSEEN, DECAY, SMOOTH = "method.hier", "init.extrapolate", "optimizer.opacities_decay", "loss.smooth_weight"
+LAST, GAIN, MEANS, SH = "optimizer.average_last", "stopping.min_gain_db", "optimizer.means_lr", "optimizer.sh_lr"
+
+
+def chosen(views: int, device: str = "cuda", view=OPAQUE, preset: str = "default", **given):
+    """The settings for a number of alike views, and the notes; settings that are given, by keyword."""
+    config = with_settings(PRESETS[preset], given, "here", keywords=True)
+    config, notes = settings_by_views(config, [view_stub(**view)] * views, device)
+    return config, " ".join(notes)
+
+
+def value(config: FitConfig, name: str):
+    return functools.reduce(getattr, name.split("."), config)
+
+
+@pytest.mark.parametrize(
+    ("views", "view", "device", "given", "wanted"),
+    [
+        # up to 54 views have one layer and decay, up to 4 opaque ones points where no view looks, and more decay with them
+        (1, OPAQUE, "cuda", {}, {UNSEEN: False, DECAY: 0.001, LAYERS: False}),
+        *((n, OPAQUE, "cuda", {}, {UNSEEN: True, DECAY: 0.0015}) for n in (2, EXTRAPOLATED_VIEWS)),
+        (EXTRAPOLATED_VIEWS + 1, OPAQUE, "cuda", {}, {UNSEEN: False, DECAY: 0.001, LAYERS: False}),
+        *((ONE_LAYER_VIEWS, v, "cuda", {}, {DECAY: 0.001, LAYERS: False}) for v in (OPAQUE, CUT)),
+        *((ONE_LAYER_VIEWS + 1, v, "cuda", {}, {DECAY: 0.0, LAYERS: True}) for v in (OPAQUE, CUT)),
+        (3, CUT, "cuda", {}, {UNSEEN: False, DECAY: 0.001, LAYERS: False}), (3, OPAQUE, "cpu", {}, {UNSEEN: False}),
+        # not where a part of a view does not count, nor where no depth is searched for; decay, even where points are asked for
+        (3, {"mask": FULL}, "cuda", {}, {UNSEEN: True, DECAY: 0.0015}),
+        *((3, v, "cuda", {}, {UNSEEN: False, DECAY: 0.001}) for v in ({"mask": PARTLY}, {"image": DARK})),
+        *((3, v, "cuda", {"init_extrapolate": True}, {DECAY: 0.001}) for v in ({"mask": PARTLY}, {"image": DARK})),
+        *((n, OPAQUE, "cuda", {"init_source": s} | asked, {DECAY: 0.001, UNSEEN: bool(asked)})
+          for n, s in ((3, "hull"), (1, "sweep")) for asked in ({}, {"init_extrapolate": True})),
+        (3, OPAQUE, "cuda", {"init_extrapolate": False}, {DECAY: 0.001, UNSEEN: False}),
+        # few views have smooth depth, in fits of at least 3000 steps, so not where a CPU limits them
+        (4, OPAQUE, "cuda", {}, {SMOOTH: 1.0, "steps": 4500}),
+        (5, OPAQUE, "cuda", {}, {SMOOTH: 0.0, "steps": steps_by_views(5)}),
+        (8, CUT, "cuda", {}, {SMOOTH: 0.5, "steps": steps_by_views(8)}), (9, CUT, "cuda", {}, {SMOOTH: 0.0}),
+        (4, CUT, "cuda", {}, {SMOOTH: 0.5, "steps": 3000}), (4, OPAQUE, "cuda", {"steps": SMOOTH_STEPS - 1}, {SMOOTH: 0.0}),
+        (4, OPAQUE, "cpu", {}, {SMOOTH: 0.0}), (4, OPAQUE, "cpu", {"cpu_limit": False}, {SMOOTH: 1.0}),
+        *((4, OPAQUE, "cuda", {"preset": name}, {SMOOTH: 0.0}) for name in ("quick", "3dgs")),
+        # many views have a mean of the last steps
+        *((n, OPAQUE, "cuda", {}, {LAST: 0.0}) for n in (3, AVERAGED_VIEWS - 1)),
+        *((n, OPAQUE, "cuda", {}, {LAST: 0.05}) for n in (AVERAGED_VIEWS, 300)),
+        # rates rise with more than nine views where the time of a CPU limits them, and nothing is held out
+        *((n, OPAQUE, d, {}, {MEANS: 1.6e-4, SH: 2.5e-3}) for n, d in ((9, "cpu"), (10, "cuda"))),
+        (10, OPAQUE, "cpu", {}, {MEANS: 4e-4, SH: 6.25e-3}),
+        *((n, OPAQUE, d, {}, {GAIN: gain}) for n in (3, 12) for d, gain in (("cpu", 0.0), ("cuda", 0.1))),
+        (12, OPAQUE, "cpu", {"steps": 100}, {GAIN: 0.1, "sh_every": 500}),
+    ],
+)  # fmt: skip
+def test_settings_are_chosen_by_the_views(views, view, device, given, wanted):
+    """And the notes name the choices."""
+    config, notes = chosen(views, device, view, **given)
+    assert {name: value(config, name) for name in wanted} == wanted
+    if not given:
+        assert ("one layer" in notes) != config.method.hier and ("no extrapolated points" in notes) != config.init.extrapolate
+        assert ("mean of the last 5% of the steps" in notes) == (config.optimizer.average_last > 0)
+    smooth = ["smooth_depth"] * (config.loss.smooth_weight > 0)
+    assert [t.name for t in built_in_terms(config.loss)] == ["photometric", *smooth]
+
+
+@pytest.mark.parametrize(
+    ("name", "given"),
+    [
+        (DECAY, 0.02),
+        (LAST, 0.5),
+        (SMOOTH, 0.2),
+        (MEANS, 1e-3),
+        (SH, 2e-3),
+        (GAIN, 0.2),
+        (UNSEEN, True),
+        (LAYERS, True),
+        ("steps", 700),
+    ],
+)
+def test_what_is_given_holds(name, given):
+    """Whatever the views and the device, in every preset that has the setting."""
+    for views, device, preset in itertools.product((3, 12, 60), ("cpu", "cuda"), ("default", "quick")):
+        assert value(chosen(views, device, preset=preset, **{keyword(name): given})[0], name) == given
+    assert chosen(12, "cpu", stopping_min_gain_db=0.2)[0].sh_every == 500
+
+
 @pytest.mark.parametrize("device", ["cpu", "cuda"])
 @pytest.mark.parametrize(("views", "width", "height"), [(3, 126, 94), (3, 504, 378), (10, 900, 1600), (54, 504, 378)])
 def test_quick_is_never_slower_than_default(device, views, width, height):
-    """At most 600 steps, and on a CPU at most as many as its time has for the default; a number that is given holds."""
-    train = [view_stub(width, height)] * views
-    quick, default = (settings_by_views(PRESETS[name], train, device)[0].steps for name in ("quick", "default"))
+    """At most 600 steps, and on a CPU at most as many as its time has for the default."""
+    view = {"width": width, "height": height}
+    quick, default = (chosen(views, device, view, preset)[0].steps for preset in ("quick", "default"))
     assert 0 < quick == min(600, default)
-    given = dataclasses.replace(PRESETS["quick"], steps=700)
-    assert settings_by_views(given, train, device)[0].steps == 700
 
 
-def test_rates_rise_where_the_time_of_a_cpu_limits_many_views():
-    """With more than nine views, and only where steps are left out; rates that are given hold, and the loss is said."""
-
-    def chosen(views, device, **optimizer):
-        train = [view_stub()] * views
-        config = PRESETS["default"]
-        config = dataclasses.replace(config, optimizer=dataclasses.replace(config.optimizer, **optimizer))
-        found, notes = settings_by_views(config, train, device)
-        return (found.optimizer.means_lr, found.optimizer.sh_lr), notes
-
-    usual = (1.6e-4, 2.5e-3)
-    assert chosen(9, "cpu")[0] == chosen(10, "cuda")[0] == usual
-    rates, notes = chosen(10, "cpu")
-    assert rates == (4e-4, 6.25e-3)
-    assert chosen(10, "cpu", means_lr=1e-3, sh_lr=2e-3)[0] == (1e-3, 2e-3)
-    assert "--no-cpu-limit takes all, about 11 min, and raised PSNR by 0.3 to 1.6 dB" in notes[-1]
-
-
-def test_one_layer_has_fewer_steps_in_the_time_of_a_cpu():
-    """Its steps take longer, so that both take the same time."""
-    train = [view_stub()] * 3
-    config = PRESETS["default"]
-    one, two = (
-        settings_by_views(dataclasses.replace(config, method=dataclasses.replace(config.method, hier=hier)), train, "cpu")[0]
-        for hier in (False, True)
-    )
-    assert abs(ONE_LAYER * one.steps - two.steps) < 2 and one.steps < two.steps
-
-
-def test_nothing_is_held_out_where_the_time_of_a_cpu_limits_the_steps():
-    """All degrees of the harmonics are in use when growth begins, as with held-out blocks; a gain that is given holds."""
-
-    def chosen(views, device, config=PRESETS["default"]):
-        train = [view_stub()] * views
-        return settings_by_views(config, train, device)[0]
-
+def test_the_time_of_a_cpu_limits_the_steps():
+    """All degrees of the harmonics are in use when growth begins; one layer has fewer steps; the loss of quality is said."""
     for views in (3, 12):
-        limited, whole = chosen(views, "cpu"), chosen(views, "cuda")
-        assert limited.stopping.min_gain_db == 0 and whole.stopping.min_gain_db == 0.1
-        assert limited.steps < whole.steps and whole.sh_every == 500
+        limited, whole = (chosen(views, device)[0] for device in ("cpu", "cuda"))
+        assert limited.steps < SMOOTH_STEPS <= whole.steps and whole.sh_every == 500
         assert limited.sh_degree * limited.sh_every <= plan_phases(limited.phases, limited.steps).refine
-    assert chosen(12, "cpu", dataclasses.replace(PRESETS["default"], steps=100)).stopping.min_gain_db == 0.1
-    given = dataclasses.replace(PRESETS["default"], stopping=StoppingConfig(min_gain_db=0.2))
-    assert chosen(12, "cpu", given).stopping.min_gain_db == 0.2 and chosen(12, "cpu", given).sh_every == 500
+    assert "--no-cpu-limit takes all, about 11 min, and raised PSNR by 0.3 to 1.6 dB" in chosen(10, "cpu")[1]
+    one, two = (chosen(3, "cpu", method_hier=hier)[0].steps for hier in (False, True))
+    assert abs(ONE_LAYER * one - two) < 2 and one < two
 
 
 def test_a_fit_on_a_cpu_has_smaller_images_unless_told():
@@ -322,3 +423,122 @@ def test_a_fit_on_a_cpu_has_smaller_images_unless_told():
         assert SceneRequest("scene", max_side=1200).with_scale(device).max_side == 1200
         assert SceneRequest("scene", downscale=2).with_scale(device).max_side == 0
         assert chosen.with_scale("cpu") == chosen == chosen.with_scale("cuda")
+
+
+# Settings of earlier versions: what replaces them, and runs that were stored with them.
+
+
+def old(config: FitConfig, **method) -> dict:
+    """Stored settings as version 0.2.0 wrote them, with the values that every fit has now, but for those of ``method``."""
+    values = copy.deepcopy(config.to_json())
+    for name, (value, _) in REMOVED.items():
+        *path, last = name.split(".")
+        group = values
+        for part in path:
+            group = group.setdefault(part, {})
+        group[last] = value
+    if config.strategy in ("sampling", "paper"):
+        values |= {"strategy": "importance_sampling", "strategy_config": None}
+    for name, value in method.items():
+        group, _, last = name.rpartition("__")
+        (values["method"][group] if group else values["method"])[last] = value
+    return values
+
+
+@pytest.mark.parametrize("name", REMOVED)
+def test_a_removed_setting_names_what_replaces_it(name, tmp_path):
+    """The same sentence for a flag, a key of a TOML file, a mapping and a keyword; no present setting has the name."""
+    short = name.removeprefix("priors.")
+    note = removed_note(short)
+    assert short.replace("_", "-") in note and short not in setting_names(PRESETS["default"])
+    group, _, last = short.rpartition(".")
+    (tmp_path / "my.toml").write_text(f"[{group}]\n{last} = 1\n" if group else f"{last} = 1\n")
+    for given in (lambda: preset_settings(tmp_path / "my.toml"), lambda: preset_settings({short: 1}),
+                  lambda: with_settings(FitConfig(), {keyword(short): 1}, "x", keywords=True)):  # fmt: skip
+        with pytest.raises(UsageError) as error:
+            given()
+        assert note in str(error.value)
+    with pytest.raises(UsageError) as error:
+        request_of(["scene", "--out", "run", f"--{short.replace('_', '-')}", "1"], "")
+    assert note in str(error.value)
+
+
+def test_a_time_between_checkpoints_changes_no_result():
+    assert upgraded(FitConfig().to_json() | {"checkpoint_seconds": 0.0}) == (FitConfig().to_json(), [])
+
+
+def test_flags_that_switched_off_and_the_old_strategy_are_named(capsys):
+    for flag, words in (("--density.no-morton-order", "morton-order was removed"), ("--no-cache", "WARPGS_CACHE"),
+                        ("--method.no-events", "--strategy clone_split")):  # fmt: skip
+        assert main(["fit", "scene", "--out", "run", flag]) == 2
+        assert words in capsys.readouterr().err
+    with pytest.raises(UsageError, match="now sampling, or paper"):
+        with_settings(FitConfig(), {"strategy": "importance_sampling"}, "x")
+
+
+@pytest.mark.parametrize("preset", ["default", "3dgs", "mcmc"])
+def test_stored_settings_are_those_of_the_preset(preset):
+    """Without loss, and with the same fingerprint; of a strategy that sampled uniformly, nothing else is left."""
+    config = PRESETS[preset]
+    values, lost = upgraded(old(config))
+    assert not lost and values == config.to_json() and FitConfig.from_json(values) == config
+    assert upgraded(config.to_json()) == (config.to_json(), []) and FitConfig.from_json(old(config)) == config
+    values["method"]["colour"] = 1
+    with pytest.raises(UsageError, match="another version"):
+        FitConfig.from_json(values)
+
+
+def test_strategies_follow_from_the_switches():
+    """Scores, a gate, rendered depth or no protection were the paper's; without events it was clone_split."""
+    base = PRESETS["paper-literal"]
+    paper = {
+        "s_render": True,
+        "s_semantic": True,
+        "s_geometry": True,
+        "sampler__depth": "rendered",
+        "sampler__gate_quantile": 0.6,
+    }
+    assert upgraded(old(base, **paper)) == (base.to_json(), [])
+    values, lost = upgraded(old(PRESETS["default"], pm=False, importance__residual="gain"))
+    config = FitConfig.from_json(values)
+    uniform = {"s_render": False, "s_semantic": False, "s_geometry": False, "depth": "consistent", "gate_quantile": 0.0}
+    assert (
+        not lost and config.strategy == "paper" and config.strategy_config == PaperConfig(**uniform, pm=False, residual="gain")
+    )
+    values, lost = upgraded(old(PRESETS["default"], events=False))
+    assert (values["strategy"], values["strategy_config"], lost) == ("clone_split", None, [])
+
+
+@pytest.mark.parametrize("value", [None, 5, "x", []])
+@pytest.mark.parametrize("group", ["method", "method.importance", "method.sampler", "loss", "priors", "strategy"])
+def test_malformed_settings_of_an_earlier_version_are_refused_in_words(group, value):
+    """Whatever stands in the place of a group; the stored values stay as they are."""
+    values = old(PRESETS["default"])
+    *path, last = group.split(".")
+    (values[path[0]] if path else values)[last] = value
+    before = copy.deepcopy(values)
+    with pytest.raises((UsageError, SchemaError)):
+        FitConfig.from_json(values)
+    assert values == before
+
+
+def test_other_values_open_with_a_note_and_do_not_resume(tmp_path):
+    """A stored value that no fit has now: the model opens, and --resume names the setting."""
+    scene = Scene("memory", "none", tuple(photos(3)), points=seeds())
+    run = tmp_path / "run"
+    warpgs.fit(scene, "quick", steps=3, init_source="points", out=run, device="cpu", verbose=False)
+    record = json.loads((run / CONFIG).read_text())
+    same = read_record(run)
+    record["config"] = old(FitConfig.from_json(record["config"]))
+    (run / CONFIG).write_text(json.dumps(record))
+    stored = read_record(run)
+    assert stored == same and not open_run(run).notes()
+    check_same(same, stored, run)
+    record["config"]["optimizer"]["quats_lr"] = 0.5
+    (run / CONFIG).write_text(json.dumps(record))
+    (note,) = open_run(run).notes()
+    assert "optimizer.quats-lr 0.5" in note
+    for resumed in (lambda: stored_request(run), lambda: check_same(same, read_record(run), run)):
+        words = r"--resume: .* does not have: optimizer\.quats-lr 0\.5\. Resume it with the code that began it \(warpgs \d"
+        with pytest.raises(UsageError, match=words):
+            resumed()

@@ -201,26 +201,12 @@ def test_the_dead_are_relocated_and_the_set_grows_to_its_cap():
     assert len(trained().table) == 75
 
 
-def test_a_continued_fit_gives_the_same_bits(tmp_path):
-    """Noise and sampling go on as if the fit had never stopped."""
-    assert same_bits(trained(), continued(lambda: trained(steps=0), 17, tmp_path))
-
-
 @pytest.mark.cuda
 def test_captured_steps_equal_single_steps():
     """On CUDA, noise and regularisation included."""
     device = torch.device("cuda", 0)
     single, captured = (trained(dataclasses.replace(CONFIG, cuda_graph=g), device=device).state()[0] for g in (False, True))
     assert all(torch.equal(t, captured[n]) for n, t in single.items())
-
-
-def test_settings_survive_json_and_bad_ones_are_refused():
-    """The strategy's own settings stand in the configuration; numbers that cannot work are refused."""
-    assert FitConfig.from_json(CONFIG.to_json()) == CONFIG
-    assert FitConfig(strategy="mcmc").strategy_config == MCMCConfig()
-    for bad in ({"every": 0}, {"growth": -1.0}, {"noise_lr": math.nan}, {"min_opacity": 0.9}):
-        with pytest.raises(UsageError, match="mcmc"):
-            MCMCConfig(**bad)
 
 
 # Merging with moments, against the mixture's own.
@@ -269,7 +255,7 @@ def flat_pair(apart: float, opacity: float, widths=(0.3, 0.2)) -> Gaussians:
     return Gaussians(**rows)
 
 
-@pytest.mark.parametrize("apart, opacity", [(0.1, 0.4), (0.4, 0.6), (0.5, 0.97), (0.05, 0.97)])
+@pytest.mark.parametrize("apart, opacity", [(0.0, 0.02), (0.1, 0.4), (0.4, 0.6), (0.5, 0.97), (0.05, 0.97)])
 def test_a_pair_covers_what_it_covered(apart, opacity):
     """The integral of alpha, added up pixel by pixel, is that of the pair, also where opacity has no more room."""
     x, y = torch.meshgrid(*[torch.linspace(-3, 3, 601, dtype=torch.float64)] * 2, indexing="ij")
@@ -290,16 +276,6 @@ def test_a_pair_covers_what_it_covered(apart, opacity):
     assert float(merged["logit_opacities"].sigmoid()) <= OPAQUE + 1e-6
 
 
-def test_a_gaussian_in_two_halves_becomes_one_again():
-    """Two faint ones in the same place are one of nearly twice the opacity, in the same place."""
-    g = cloud(1)
-    rows = {n: t[[0, 0]] for n, t in g.tensors().items()}
-    rows["logit_opacities"] = torch.logit(torch.full((2,), 0.02))
-    _, merged = merges(Gaussians(**rows), torch.ones(2), odd=False)
-    assert torch.allclose(merged["logit_opacities"].sigmoid(), torch.tensor([0.04 - 0.5 * 0.02**2]), atol=1e-5)
-    assert torch.allclose(merged["means"], g.means, atol=1e-6) and torch.allclose(merged["sh"], g.sh)
-
-
 def test_pairs_are_disjoint_and_cheapest_first():
     """No row twice; like neighbours come before unlike ones; a pair that is taken becomes one row."""
     g = cloud(101)
@@ -318,14 +294,6 @@ def test_pairs_are_disjoint_and_cheapest_first():
 # Parts of a user's own in a fit: loss terms, and a density strategy.
 
 PLAIN = FitConfig(steps=40, sh_every=15, init=InitConfig(source="points"), sh_degree=0)
-
-
-@pytest.fixture
-def registries_as_they_were(monkeypatch):
-    """What a test registers is gone after it."""
-    for registry in (STRATEGIES, LOSS_TERMS):
-        registry.names()
-        monkeypatch.setattr(registry, "_classes", dict(registry._classes))
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ import pytest
 import torch
 
 import warpgs
-from tests.pipeline.train.fits import advanced, continued, same_bits
+from tests.pipeline.train.fits import advanced
 from tests.scenes import photos, priors, seeds
 from warpgs.errors import DataError, NotFiniteError, UsageError
 from warpgs.geometry import look_at
@@ -99,12 +99,6 @@ def test_same_seed_same_bits_and_threads_do_not_matter():
     assert not torch.equal(first["params.means"][:10], other["params.means"][:10])
 
 
-def test_continued_fit_equals_uninterrupted_one(tmp_path):
-    """Saved in the middle of densification, loaded elsewhere, continued: the same bits at the end."""
-    straight = fitted(BUSY, 60)
-    assert same_bits(straight, continued(lambda: fitted(BUSY, 0), 27, tmp_path)) and len(straight.gaussians) != len(seeds())
-
-
 def test_order_of_the_gaussians_changes_nothing_but_their_order(monkeypatch):
     """Sorted along the curve at each event or not: the same rows with their moments, bit for bit, as long as none splits."""
     results = []
@@ -118,24 +112,6 @@ def test_order_of_the_gaussians_changes_nothing_but_their_order(monkeypatch):
         tensors = [t.flatten(1) if t.ndim > 1 else t[:, None] for t in fit.table.state().values()]
         results.append(sorted(map(tuple, torch.cat(tensors, 1).tolist())))
     assert len(results[0]) > 2 * len(seeds()) and results[0] == results[1]
-
-
-def test_masked_pixels_do_not_count():
-    """What a mask hides may hold anything, even NaN-free nonsense, without changing the fit."""
-    views = photos(2)
-    mask = np.ones(views[0].image.shape[:2], bool)
-    mask[:, :8] = False
-    results = []
-    for filling in (0.0, 1.0):
-        changed = []
-        for v in views:
-            image = v.image.copy()
-            image[~mask] = filling
-            changed.append(View(v.name, v.camera, image, mask))
-        fit = Trainer(changed, seeds(), FitConfig(steps=5, init=InitConfig(source="points")), CPU)
-        reports = [r for _ in range(5) for r in fit.advance()]
-        results.append((fit.gaussians.means, [r.psnr for r in reports]))
-    assert torch.equal(results[0][0], results[1][0]) and results[0][1] == results[1][1]
 
 
 def test_loss_of_known_images():
