@@ -306,7 +306,7 @@ def runs(root: Path) -> list[Path]:
     for name, values in records.items():
         (root / name).mkdir(exist_ok=True)
         write_json(root / name / folder.CONFIG, values)
-    made, degrees = gaussians().tensors(), torch.tensor([0, 1, 1])
+    made, degrees = cloud(3).tensors(), torch.tensor([0, 1, 1])
     tensors = {f"params.{n}": t for n, t in made.items() if n != "sh"}
     tensors |= {"params.sh_packed": table.pack(made["sh"], degrees), "degrees": degrees}  # as `warpgs prune` leaves it
     packed = folder.save_checkpoint(root / "earlier", tensors, {"step": 7})

@@ -580,7 +580,7 @@ def test_the_limit_holds_for_images_masks_and_score_masks(tmp_path):
 
 def test_a_second_size_or_a_chunk_beyond_the_file_is_refused_before_any_pixel_is_decoded(tmp_path, monkeypatch):
     """Pillow and OpenCV would take the memory that these announce: 4 GB for a file of 100 bytes."""
-    good, strip = png(12, 8, bytes(13) * 8), tiff(16, 8, [(0, 128)], bytes(128))
+    good, strip = gray_png(12, 8, bytes(13) * 8), tiff(16, 8, [(0, 128)], bytes(128))
     entry = struct.Struct("<HHII")
     wide, header = entry.pack(256, 4, 1, 12000), chunk(b"IHDR", struct.pack(">IIBBBBB", 12000, 12000, 8, 0, 0, 0, 0))
     for name in ("imdecode", "imread"):
@@ -598,7 +598,7 @@ def test_any_error_of_a_decoder_is_damage_of_the_file(tmp_path, monkeypatch):
     """Pillow raises an OverflowError at a width of 2**31, and types that no list of ours has foreseen."""
     header = chunk(b"IHDR", struct.pack(">IIBBBBB", 2**31, 1, 8, 0, 0, 0, 0))
     with pytest.raises(ValueError, match="its pixels are damaged"):
-        image_files._loaded(image_files._opened("PNG", png(1, 1, bytes(2))[:33] + header + chunk(b"IDAT", b"")))
+        image_files._loaded(image_files._opened("PNG", gray_png(1, 1, bytes(2))[:33] + header + chunk(b"IDAT", b"")))
     (tmp_path / "photo.img").write_bytes(encoded("PNG"))
     for error in (OverflowError, ZeroDivisionError, Image.DecompressionBombError, cv2.error):
 
