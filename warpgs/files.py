@@ -79,12 +79,14 @@ def read_start(path: str | os.PathLike[str], count: int) -> bytes:
         return file.read(count)
 
 
-def read_file(path: Path, below: Path | None = None, most: int = MAX_BYTES, fix: str = "restore it, or make it again") -> bytes:
-    """Return what `read_input` does, or raise a DataError with a remedy."""
+def read_file(
+    path: Path, below: Path | None = None, most: int = MAX_BYTES, fix: str = "restore it, or make it again", what: str = ""
+) -> bytes:
+    """Return what `read_input` does, or raise a DataError with a remedy, in which ``what`` names the contents."""
     try:
         return read_input(path, most, below)
     except OSError as e:
-        raise DataError(f"{path}: cannot be read ({unread_reason(e)}); {fix}") from e
+        raise DataError(f"{path}: {what}cannot be read ({unread_reason(e)}); {fix}") from e
 
 
 def input_digest(path: str | os.PathLike[str], below: Path | None = None) -> str:
@@ -93,9 +95,9 @@ def input_digest(path: str | os.PathLike[str], below: Path | None = None) -> str
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def unread_reason(error: OSError) -> str:
+def unread_reason(error: Exception) -> str:
     """Return why a file could not be read, in words for the middle of a message."""
-    return error.strerror or str(error)
+    return getattr(error, "strerror", None) or str(error)
 
 
 LOCK = ".warpgs.lock"

@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
+from bench.lib.kernel_calls import project
 from tests.gaussians import SMOOTH, camera, cloud, hand_placed, leaves
 from tests.reference.blend import blend_channels_reference, blend_reference
 from tests.reference.project import project_reference
@@ -14,7 +15,6 @@ from tests.tolerances import close
 from warpgs.constants import RULES
 from warpgs.kernels.blend import _width, blend, blend_channels, composite, width_of
 from warpgs.kernels.falloff import Pass
-from warpgs.kernels.project import project
 from warpgs.kernels.tiles import Tiles, bin_tiles
 from warpgs.kernels.walk import contributions
 

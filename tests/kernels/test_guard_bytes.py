@@ -4,13 +4,12 @@ import pytest
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from bench.lib.kernel_calls import adam_step, project
 from tests.gaussians import camera, cloud, leaves
 from warpgs.constants import RULES
 from warpgs.kernels.blend import blend
-from warpgs.kernels.project import project
 from warpgs.kernels.ssim import differences, ssim
 from warpgs.kernels.tiles import InstanceMemory, bin_tiles
-from warpgs.kernels.update import adam_step
 from warpgs.kernels.walk import contributions, median_depth
 
 GUARD = 64

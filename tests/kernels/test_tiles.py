@@ -4,6 +4,7 @@ import pytest
 import torch
 import warp as wp
 
+from bench.lib.kernel_calls import project
 from tests.gaussians import SMOOTH, camera, cloud
 from tests.reference.project import project_reference
 from tests.reference.tiles import touched_reference
@@ -11,7 +12,6 @@ from warpgs.constants import RULES
 from warpgs.errors import ResourceError
 from warpgs.kernels import launch
 from warpgs.kernels.blend import blend
-from warpgs.kernels.project import project
 from warpgs.kernels.tiles import (
     EACH,
     InstanceMemory,

@@ -5,13 +5,13 @@ import dataclasses
 import pytest
 import torch
 
+from bench.lib.kernel_calls import project
 from tests.gaussians import SMOOTH, camera, cloud, hand_placed
 from tests.reference.project import project_reference
 from tests.reference.walk import heaviest_reference, median_depth_reference
 from tests.tolerances import close
 from warpgs.constants import RULES, Rule
 from warpgs.kernels.blend import blend
-from warpgs.kernels.project import project
 from warpgs.kernels.tiles import Tiles, bin_tiles
 from warpgs.kernels.walk import heaviest, median_depth
 from warpgs.render.options import RasterizeOptions

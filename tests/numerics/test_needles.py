@@ -5,9 +5,9 @@ import math
 
 import torch
 
+from bench.lib.kernel_calls import project
 from tests.reference.low_precision import Frame, Inputs, projected_of
 from warpgs.constants import RULES
-from warpgs.kernels.project import project
 
 SIDE = 256
 """Width and height of the image [px]."""

@@ -5,9 +5,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
-from warpgs.app.flags import flags_of, listed, load_own, settings_of, word_after
+from warpgs.app.flags import flags_of, listed, settings_of, word_after
 from warpgs.errors import UsageError
-from warpgs.export.base import FORMATS, Format, all_formats, find_format
+from warpgs.export.base import Format, all_formats, find_format
 from warpgs.pipeline.run.export import Filters
 from warpgs.plugins import flag_group
 
@@ -55,7 +55,6 @@ def _with_options(own: str | None) -> dict[str, type]:
 
 def _found(choice: str) -> Format:
     """Return the format that --format names."""
-    load_own(FORMATS.kind, choice, lambda: FORMATS.load(choice))
     return find_format(choice)
 
 

@@ -247,10 +247,9 @@ def read_camera_rows(path: Path) -> list[tuple[int, str, np.ndarray]]:
                 )
             rows.append((number, words[0], values))
     except (OSError, ValueError) as e:
-        why = unread_reason(e) if isinstance(e, OSError) else e
         raise DataError(
-            f"{path}: cannot be understood ({why}); expected a count of images in the first line, then a line with a name "
-            "and 21 numbers for each image. Copy the file again"
+            f"{path}: cannot be understood ({unread_reason(e)}); expected a count of images in the first line, then a line "
+            "with a name and 21 numbers for each image. Copy the file again"
         ) from e
     if count != len(rows):
         raise DataError(f"{path}: announces {count or 0} images and lists {len(rows)}; it is truncated. Copy it again")

@@ -418,10 +418,9 @@ def read_keyframes(path: Path, template: Camera, normalization: Normalization) -
     except FileNotFoundError as e:
         raise DataError(f"{path}: no such file; give a .json file of keyframes, as the viewer saves it") from e
     except (OSError, schema.SchemaError) as e:
-        why = unread_reason(e) if isinstance(e, OSError) else e
         raise DataError(
-            f"{path}: cannot be read as keyframes ({why}); give a JSON list of objects with c2w (4 rows of 4), fov_y [rad] and "
-            "seconds"
+            f"{path}: cannot be read as keyframes ({unread_reason(e)}); give a JSON list of objects with c2w (4 rows of 4), "
+            "fov_y [rad] and seconds"
         ) from e
     if not 1 <= len(values) <= MAX_KEYFRAMES:
         raise DataError(f"{path}: holds {len(values)} keyframes; a path needs 1 to {MAX_KEYFRAMES:,}")

@@ -18,7 +18,7 @@ import torch.nn.functional as F
 
 from warpgs import files
 from warpgs.errors import DataError, UsageError
-from warpgs.files import open_input, read_input, remove_leftovers, unread_reason, write_bytes
+from warpgs.files import open_input, read_file, remove_leftovers, unread_reason, write_bytes
 
 FORMAT = "warpgs-lpips-1"
 MAX_PICKLE = 2**20
@@ -190,12 +190,10 @@ def read_lpips(path: Path) -> tuple[Net, dict[str, torch.Tensor], dict[str, str]
     from safetensors.torch import load
 
     fix = "write the file again with `warpgs convert-lpips`"
+    data = read_file(path, fix="`warpgs convert-lpips` writes one")
     try:
-        data = read_input(path)
         tensors = load(data)
         metadata = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")]).get("__metadata__") or {}
-    except OSError as e:
-        raise DataError(f"{path}: cannot be read ({unread_reason(e)}); `warpgs convert-lpips` writes one") from e
     except (SafetensorError, ValueError) as e:
         raise DataError(f"{path}: damaged or not a safetensors file ({e}); {fix}") from e
     if metadata.get("format") != FORMAT or metadata.get("net") not in NETS:

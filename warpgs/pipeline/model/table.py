@@ -13,7 +13,7 @@ import torch
 
 from warpgs import schema
 from warpgs.errors import DataError, UsageError
-from warpgs.files import read_input, unread_reason, write_bytes
+from warpgs.files import read_file, write_bytes
 from warpgs.geometry import check_stored, checked_normalization, convert_camera, convert_gaussians, logit
 from warpgs.kernels.neighbours import morton_codes
 from warpgs.kernels.sh import MAX_DEGREE
@@ -418,12 +418,10 @@ def load(path: str | Path, device: str | torch.device = "cpu") -> Model:
     from safetensors.torch import load as from_bytes
 
     path = Path(path)
+    data = read_file(path, fix="check the path and its permissions")
     try:
-        data = read_input(path)
         tensors = from_bytes(data)
         header = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")]).get("__metadata__") or {}
-    except OSError as e:
-        raise DataError(f"{path}: cannot be read ({unread_reason(e)}); check the path and its permissions") from e
     except (SafetensorError, ValueError) as e:
         raise DataError(f"{path}: damaged or not a safetensors file ({e}); write it again with warpgs.save") from e
     if header.get("format") != FORMAT or tensors.keys() != Gaussians.__dataclass_fields__.keys():
