@@ -5,11 +5,47 @@ from __future__ import annotations
 import torch
 
 from warpgs.constants import Rule
-from warpgs.kernels import sh
+from warpgs.kernels import blend as blending
+from warpgs.kernels import sh, tiles, walk
 from warpgs.kernels.ellipse import ProjectInputs, checked_factors
 from warpgs.kernels.falloff import Pass
 from warpgs.kernels.project import project_inputs
 from warpgs.kernels.update import BETAS, EPS, adam_scheduled, scheduled_lrs, update_rows
+
+
+def _pass(width: int, height: int, rule: Rule, origin: tuple[int, int] = (0, 0), **others) -> Pass:
+    """Return the settings of a window at ``origin`` [px]."""
+    return Pass((width, height), (*origin, width, height), rule, **others)
+
+
+def bin_tiles(projected, tile_counts, *, memory=tiles.AS_NEEDED, slotted=True, listed=None, **window) -> tiles.Tiles:
+    """Return the result of `tiles.bin_tiles` for a window of some size, rule, origin and size of tiles."""
+    return tiles.bin_tiles(projected, tile_counts, _pass(**window), memory, slotted, listed)
+
+
+def blend(projected, made, backgrounds, **window):
+    """Return the result of `blend.blend` for a window."""
+    return blending.blend(projected, made, backgrounds, _pass(**window))
+
+
+def blend_channels(projected, made, colors, backgrounds, **window):
+    """Return the result of `blend.blend_channels` for a window."""
+    return blending.blend_channels(projected, made, colors, backgrounds, _pass(**window))
+
+
+def median_depth(projected, made, **window):
+    """Return the result of `walk.median_depth` for a window."""
+    return walk.median_depth(projected, made, _pass(**window))
+
+
+def heaviest(projected, made, k, **window):
+    """Return the result of `walk.heaviest` for a window."""
+    return walk.heaviest(projected, made, k, _pass(**window))
+
+
+def contributions(projected, made, **window):
+    """Return the result of `walk.contributions` for a window."""
+    return walk.contributions(projected, made, _pass(**window))
 
 
 def project(

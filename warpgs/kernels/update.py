@@ -257,8 +257,8 @@ def adam_scheduled(
     skip: torch.Tensor, *, head: int, betas: tuple[float, float] = BETAS, eps: float = EPS,
 ) -> None:  # fmt: skip
     """Update rows [N, ...] and their moments in place, as `torch.optim.Adam` does, unless ``skip`` [1] is not 0."""
-    # ``lrs`` [3] are those of `scheduled_lrs`; the first ``head`` numbers of each row take the first. All tensors are float32 and
-    # contiguous.
+    # ``lrs`` [3] are those of `scheduled_lrs`; the first ``head`` numbers of each row take the first. All tensors are float32
+    # and contiguous.
     if param.numel() == 0:
         return
     if param.device.type == "cpu":

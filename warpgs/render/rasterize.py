@@ -20,12 +20,11 @@ from warpgs.kernels.ellipse import ProjectInputs
 from warpgs.kernels.falloff import WIDTHS, Pass
 from warpgs.kernels.launch import refuse_transforms, without_gradient
 from warpgs.kernels.project import project_inputs
-from warpgs.kernels.tiles import BYTES_PER_INSTANCE, InstanceMemory, grid
+from warpgs.kernels.tiles import BYTES_PER_INSTANCE, InstanceMemory, bin_tiles, grid
 from warpgs.means2d import count_passes
 from warpgs.render import graphed
 from warpgs.render.chunked import blend_chunked, further_chunked
 from warpgs.render.compose import (
-    bin_projected,
     further_of,
     images_of,
     inputs_of,
@@ -423,7 +422,7 @@ def _rasterize(
         memory = InstanceMemory(budget, options.capacity, overflow)
         slotted = options.contributions or needs_slots([projected, *(t for layer in layers for t in layer)])
         listed = None if pixels is None else listed_tiles(pixels, settings, len(projected))
-        tiles = bin_projected(projected, tile_counts, settings, memory, slotted, listed)
+        tiles = bin_tiles(projected, tile_counts, settings, memory, slotted, listed)
         images = [images_of(projected, tiles, backgrounds, settings, colors) for colors, backgrounds in layers]
         maps = further_of(projected, tiles, settings, *further)
         if overflow is not None:
