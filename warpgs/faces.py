@@ -4,8 +4,6 @@ The faces are `warpgs`, `warpgs.train`, `warpgs.kernels`, `warpgs.io` and `warpg
 package, names are imported from the modules that define them, so that faces make no circle.
 """
 
-from __future__ import annotations
-
 import importlib
 import sys
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Files: read with a bounded size, written whole or not at all."""
 
-from __future__ import annotations
-
 import contextlib
 import csv
 import errno

@@ -1,7 +1,5 @@
 """Parts that plug in: classes found by name, built-in or a user's own."""
 
-from __future__ import annotations
-
 import functools
 import hashlib
 import importlib

@@ -1,7 +1,5 @@
 """This process and its children: output, the terminal, signals, and Python modules in processes of their own."""
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import gc

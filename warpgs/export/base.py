@@ -1,7 +1,5 @@
 """Formats of files of Gaussians: the interface, the arrays, the formats by suffix, and .splat."""
 
-from __future__ import annotations
-
 import copy
 import io
 import json

@@ -4,8 +4,6 @@ Axis lengths are stored without a logarithm, opacities after the sigmoid, rotati
 about z from those of PLY.
 """
 
-from __future__ import annotations
-
 import base64
 import binascii
 import json

@@ -1,7 +1,5 @@
 """Files of meshes and of cameras for other programs."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """PLY files of Gaussians, plain and compressed."""
 
-from __future__ import annotations
-
 import functools
 import itertools
 import math

@@ -4,8 +4,6 @@ Versions 2 and 3 are one gzip stream; version 4 has a plain header and one zstd 
 are RUB (x right, y up, z back), a half turn about x from those of PLY.
 """
 
-from __future__ import annotations
-
 import functools
 import gzip
 import io

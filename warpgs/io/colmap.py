@@ -3,8 +3,6 @@
 Other files of a reconstruction (rigs, frames, project.ini) hold nothing that a scene needs and are not read.
 """
 
-from __future__ import annotations
-
 import re
 import struct
 import unicodedata

@@ -1,7 +1,5 @@
 """Scenes as the data sets LLFF, DTU and Middlebury store them."""
 
-from __future__ import annotations
-
 import io
 import re
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Fusion of depth into a grid of signed distances, and its zero surface as triangles."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace

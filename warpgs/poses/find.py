@@ -1,7 +1,5 @@
 """`find_poses`: photographs become a scene folder, with a record of how, and advice where it fails."""
 
-from __future__ import annotations
-
 import hashlib
 import math
 import shutil

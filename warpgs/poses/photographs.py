@@ -1,7 +1,5 @@
 """Photographs and videos that poses are found for: which they are, and their copies as images."""
 
-from __future__ import annotations
-
 import functools
 import hashlib
 import importlib.util

@@ -1,7 +1,5 @@
 """Matches between views: epipolar geometry, optical flow, and the points that they triangulate."""
 
-from __future__ import annotations
-
 import functools
 import itertools
 from collections.abc import Callable, Sequence

@@ -1,7 +1,5 @@
 """Chunked rendering: windows of an image, each with at most a given number of (Gaussian, tile) pairs, called instances."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 

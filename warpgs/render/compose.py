@@ -1,7 +1,5 @@
 """One pass of the rasterizer: the tensors and settings of a render, projection, binning and blending."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Files of films: MP4 and animated images."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 from collections.abc import Iterable

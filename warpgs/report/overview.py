@@ -1,7 +1,5 @@
 """A scene with its cameras in one image: the overview of a report, and plots, which VTK draws in a process of its own."""
 
-from __future__ import annotations
-
 import io
 import json
 import math

@@ -1,7 +1,5 @@
 """The demo scenes: a room to fit, and an object cut out."""
 
-from __future__ import annotations
-
 import functools
 import json
 from collections.abc import Callable

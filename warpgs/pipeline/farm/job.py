@@ -1,7 +1,5 @@
 """A job of a farm: its description, the list that it comes from, its record, and the interface of an engine."""
 
-from __future__ import annotations
-
 import glob
 import hashlib
 import json

@@ -1,7 +1,5 @@
 """The work of a job: a run that is there already is kept, a missing one is made."""
 
-from __future__ import annotations
-
 import contextlib
 import gc
 import os

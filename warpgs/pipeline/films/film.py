@@ -1,7 +1,5 @@
 """Films of a model: what they show, rendered frame by frame."""
 
-from __future__ import annotations
-
 import collections
 import itertools
 import math

@@ -1,7 +1,5 @@
 """Paths of cameras: around a scene, through its views, along keyframes."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """LPIPS, and the weights that it needs."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import math

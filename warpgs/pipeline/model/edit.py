@@ -1,7 +1,5 @@
 """Edits of a finished model: filters, merging and compression."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Callable

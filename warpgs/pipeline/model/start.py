@@ -1,7 +1,5 @@
 """The first Gaussians of a fit: from points, depth or random places."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass

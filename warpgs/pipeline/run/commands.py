@@ -1,7 +1,5 @@
 """What commands do with a finished run: score, render, prune, plot; and the preview of priors."""
 
-from __future__ import annotations
-
 import contextlib
 import itertools
 import math

@@ -1,7 +1,5 @@
 """Files from a run: filtered Gaussians, cameras, meshes."""
 
-from __future__ import annotations
-
 import copy
 import math
 import shlex

@@ -1,7 +1,5 @@
 """The run folder: its files, what they must hold, and how they are opened."""
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import importlib.metadata

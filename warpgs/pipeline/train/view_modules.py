@@ -1,7 +1,5 @@
 """View modules: they learn parameters of each training view together with the Gaussians."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated, Any, ClassVar
