@@ -30,7 +30,7 @@ from warpgs.export.base import (
     transform_in_place,
     unit_quats,
 )
-from warpgs.geometry import rotation_matrices
+from warpgs.geometry import pose_of, rotation_matrices
 from warpgs.scene import ORIGIN, base_colors
 
 EXTENSION = "KHR_gaussian_splatting"
@@ -207,11 +207,9 @@ def _matrix_of(node: dict[str, Any]) -> np.ndarray:
     """Return the transformation [4, 4] of a node, float64."""
     if "matrix" in node:
         return np.array(node["matrix"], np.float64).reshape(4, 4).T
-    place, turn = np.eye(4), np.array(node.get("rotation", [0, 0, 0, 1]), np.float64)[[3, 0, 1, 2]]
-    scales = np.array(node.get("scale", [1, 1, 1]), np.float64).reshape(3)
-    place[:3, :3] = rotation_matrices(turn / np.sqrt((turn * turn).sum())) * scales
-    place[:3, 3] = np.array(node.get("translation", [0, 0, 0]), np.float64).reshape(3)
-    return place
+    turn = np.array(node.get("rotation", [0, 0, 0, 1]), np.float64)[[3, 0, 1, 2]]
+    scales, translation = (np.array(node.get(k, [v] * 3), np.float64).reshape(3) for k, v in (("scale", 1), ("translation", 0)))
+    return pose_of(rotation_matrices(turn / np.sqrt((turn * turn).sum())) * scales, translation)
 
 
 def _rows(block: np.ndarray, part: slice) -> np.ndarray:

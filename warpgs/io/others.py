@@ -9,7 +9,7 @@ import numpy as np
 
 from warpgs.errors import DataError
 from warpgs.files import read_input, unread_reason
-from warpgs.geometry import matmul
+from warpgs.geometry import matmul, pose_of
 from warpgs.io.folder import (
     Probe,
     Reader,
@@ -113,9 +113,7 @@ def decompose(P: np.ndarray, where: str) -> tuple[np.ndarray, np.ndarray]:
     if np.linalg.det(R) < 0:  # P is given up to sign
         R, t = -R, -t
     K = K / K[2, 2]
-    viewmat = np.eye(4)
-    viewmat[:3, :3], viewmat[:3, 3] = R, t
-    return _centred(K, where), rigid(viewmat, where)
+    return _centred(K, where), rigid(pose_of(R, t), where)
 
 
 def _centred(K: np.ndarray, where: str) -> np.ndarray:
@@ -275,12 +273,11 @@ class MiddleburyReader(Reader):
             if options.excludes(view_name(name)):
                 continue
             where = f"{path}, line {number}, image {name!r}"
-            K, viewmat = _centred(values[:9].reshape(3, 3).copy(), where), np.eye(4)
+            K = _centred(values[:9].reshape(3, 3).copy(), where)
             if not np.allclose(K[[1, 2, 2, 2], [0, 0, 1, 2]], (0, 0, 0, 1)):
                 lower = "its lower rows are not 0 fy cy, 0 0 1"
                 raise DataError(f"{where}: K is not a matrix of intrinsics ({lower}); calibrate again")
-            viewmat[:3, :3], viewmat[:3, 3] = values[9:18].reshape(3, 3), values[18:21]
-            viewmat = rigid(viewmat, where)
+            viewmat = rigid(pose_of(values[9:18].reshape(3, 3), values[18:21]), where)
             file, view = scene.child(folder, name, where), views.claim(view_name(name), where)
             mask = scene.find_mask(file, folder, folder / "masks")
             views.add(view, viewmat, scene.image(file, _lens(K, where), mask=mask))

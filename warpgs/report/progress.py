@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, BinaryIO
 
 from warpgs import schema
 from warpgs.errors import ResourceError
-from warpgs.files import appending, read_file, write_bytes
+from warpgs.files import appending, plain, read_file, write_bytes
 from warpgs.folders import RefusedError
 from warpgs.process import careful, printable, say
 
@@ -313,5 +313,4 @@ def read_events(path: Path) -> list[dict]:
 
 def _line(event: dict) -> bytes:
     """Return an event as a line; numbers that are not finite become null, because JSON cannot hold them."""
-    plain = {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in event.items()}
-    return (json.dumps(plain, allow_nan=False) + "\n").encode()
+    return (json.dumps(plain(event)) + "\n").encode()

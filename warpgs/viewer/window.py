@@ -16,7 +16,7 @@ import torch
 from warpgs.errors import DataError, WarpgsError
 from warpgs.export.base import format_of, read_with_antialiasing
 from warpgs.files import read_file, readable, remove_leftovers, write_json
-from warpgs.geometry import camera_extent, convert_camera, convert_gaussians, matmul, rotation_matrices
+from warpgs.geometry import camera_extent, convert_camera, convert_gaussians, matmul, pose_of, rotation_matrices
 from warpgs.io.image_files import decode
 from warpgs.mesh.views import MIN_ALPHA
 from warpgs.pipeline.films.paths import fov_y
@@ -132,9 +132,7 @@ def box_json(box: CropBox, normalization: Normalization) -> dict[str, Any]:
 def keyframe(camera: Camera, seconds: float, normalization: Normalization) -> dict[str, Any]:
     """Return a camera of a path as JSON."""
     viewmat = convert_camera(camera, normalization, "scene", "file").viewmat
-    c2w = np.eye(4)
-    c2w[:3, :3] = viewmat[:3, :3].T
-    c2w[:3, 3] = -(viewmat[:3, :3] * viewmat[:3, 3:]).sum(0)
+    c2w = pose_of(viewmat[:3, :3].T, -(viewmat[:3, :3] * viewmat[:3, 3:]).sum(0))
     return {"c2w": c2w.tolist(), "fov_y": fov_y(camera), "seconds": seconds}
 
 
