@@ -13,7 +13,7 @@ import stat
 import time
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 from warpgs.errors import DataError, ResourceError, UsageError
 from warpgs.folders import NAMES as OWN_NAMES
@@ -85,6 +85,18 @@ def read_file(
         return read_input(path, most, below)
     except OSError as e:
         raise DataError(f"{path}: {what}cannot be read ({unread_reason(e)}); {fix}") from e
+
+
+def read_tensors(path: Path, fix: str, again: str) -> tuple[dict[str, Any], dict[str, str], bytes]:
+    """Return tensors and metadata by name of a safetensors file, and the file; ``again`` is the remedy for a damaged one."""
+    from safetensors import SafetensorError
+    from safetensors.torch import load
+
+    data = read_file(path, fix=fix)
+    try:
+        return load(data), json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")]).get("__metadata__") or {}, data
+    except (SafetensorError, ValueError) as e:
+        raise DataError(f"{path}: damaged or not a safetensors file ({e}); {again}") from e
 
 
 def input_digest(path: str | os.PathLike[str], below: Path | None = None) -> str:

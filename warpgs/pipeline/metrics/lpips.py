@@ -1,7 +1,6 @@
 """LPIPS, and the weights that it needs."""
 
 import hashlib
-import json
 import math
 import os
 import zipfile
@@ -16,7 +15,7 @@ import torch.nn.functional as F
 
 from warpgs import files
 from warpgs.errors import DataError, UsageError
-from warpgs.files import open_input, read_file, remove_leftovers, unread_reason, write_bytes
+from warpgs.files import open_input, read_tensors, remove_leftovers, unread_reason, write_bytes
 
 FORMAT = "warpgs-lpips-1"
 MAX_PICKLE = 2**20
@@ -184,16 +183,8 @@ def convert_lpips(backbone: Path, heads: Path, out: Path) -> list[str]:
 
 def read_lpips(path: Path) -> tuple[Net, dict[str, torch.Tensor], dict[str, str]]:
     """Read a converted file: the network, its tensors by name (float32, CPU), and the header with the file's SHA-256."""
-    from safetensors import SafetensorError
-    from safetensors.torch import load
-
     fix = "write the file again with `warpgs convert-lpips`"
-    data = read_file(path, fix="`warpgs convert-lpips` writes one")
-    try:
-        tensors = load(data)
-        metadata = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")]).get("__metadata__") or {}
-    except (SafetensorError, ValueError) as e:
-        raise DataError(f"{path}: damaged or not a safetensors file ({e}); {fix}") from e
+    tensors, metadata, data = read_tensors(path, "`warpgs convert-lpips` writes one", fix)
     if metadata.get("format") != FORMAT or metadata.get("net") not in NETS:
         raise DataError(f"{path}: holds no LPIPS weights; {fix}")
     net = NETS[metadata["net"]]

@@ -13,7 +13,7 @@ import torch
 
 from warpgs import schema
 from warpgs.errors import DataError, UsageError
-from warpgs.files import read_file, write_bytes
+from warpgs.files import read_tensors, write_bytes
 from warpgs.geometry import check_stored, checked_normalization, convert_camera, convert_gaussians, logit
 from warpgs.kernels.neighbours import morton_codes
 from warpgs.kernels.sh import MAX_DEGREE
@@ -414,16 +414,8 @@ def load(path: str | Path, device: str | torch.device = "cpu") -> Model:
     Raises:
         DataError: The file is missing, damaged, or not a model.
     """
-    from safetensors import SafetensorError
-    from safetensors.torch import load as from_bytes
-
     path = Path(path)
-    data = read_file(path, fix="check the path and its permissions")
-    try:
-        tensors = from_bytes(data)
-        header = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")]).get("__metadata__") or {}
-    except (SafetensorError, ValueError) as e:
-        raise DataError(f"{path}: damaged or not a safetensors file ({e}); write it again with warpgs.save") from e
+    tensors, header, _ = read_tensors(path, "check the path and its permissions", "write it again with warpgs.save")
     if header.get("format") != FORMAT or tensors.keys() != Gaussians.__dataclass_fields__.keys():
         raise DataError(f"{path}: not a model of format {FORMAT}; write it with warpgs.save, or read PLY with warpgs.read_ply")
     try:
