@@ -98,7 +98,7 @@ def test_defects_are_noticed(data, kind, tmp_path):
 
 PACKAGE = Path(warpgs.__file__).parent
 OPENING = {
-    "open", "open_input", "read_bytes", "read_file", "read_input", "read_start", "read_text", "input_digest",
+    "open", "open_input", "read_bytes", "read_file", "read_input", "read_start", "read_text", "read_tensors", "input_digest",
     "fromfile", "imdecode", "imread", "safe_open", "HeifImageFile", "InferenceSession", "VideoCapture",
     "ZipFile", "fdopen", "memmap", "loadtxt", "genfromtxt", "load_file", "open_memmap",
 }  # fmt: skip
@@ -158,7 +158,7 @@ SYSTEM = "reads what the system says"
 LAYER = "opens for others, which are named here"
 REASONS = {
     "export/sog.py": {"SOG._meta_of": "SOG", "encode": "writes"},
-    "files.py": {"appending": "writes", "read_file": LAYER,
+    "files.py": {"appending": "writes", "read_file": LAYER, "read_tensors": LAYER,
         "open_input": LAYER, "read_input": LAYER, "read_start": LAYER, "input_digest": LAYER},
     "folders.py": {"Folder.__init__": LAYER, "Folder.open": LAYER, "Folder.open_regular": LAYER,
         "_locked": "writes", "temporary_file": "writes"},
