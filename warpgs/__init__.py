@@ -110,37 +110,4 @@ if TYPE_CHECKING:
     )
     from warpgs.synthetic.demo import write_demo
 else:
-    __getattr__, __dir__ = lazy(
-        __name__,
-        ("warpgs.constants", "Rule"),
-        ("warpgs.errors", "DataError", "NotFiniteError", "ResourceError", "UsageError", "WarpgsError"),
-        ("warpgs.export.base", "Format"),
-        ("warpgs.export.ply", "read_ply", "write_ply"),
-        ("warpgs.geometry", "depth_normals", "gaussian_normals", "look_at"),
-        ("warpgs.io.load", "load_scene"),
-        ("warpgs.io.folder", "Reader"),
-        ("warpgs.mesh.fuse", "MeshOptions", "fuse as fuse_mesh"),
-        ("warpgs.pipeline.films.film", "render_path"),
-        ("warpgs.pipeline.metrics.scores", "ViewMetrics", "evaluate"),
-        ("warpgs.pipeline.model.table", "Model", "load", "save"),
-        ("warpgs.pipeline.run.fit", "FitResult", "fit"),
-        ("warpgs.pipeline.run.folder", "StoredRun", "open_run"),
-        ("warpgs.pipeline.train.settings", "FitConfig"),
-        ("warpgs.pipeline.train.loss", "LossTerm"),
-        ("warpgs.pipeline.train.presets", "PRESETS"),
-        ("warpgs.pipeline.train.schedule", "StepReport"),
-        ("warpgs.pipeline.train.strategies.base", "Strategy"),
-        ("warpgs.pipeline.train.view_modules", "ViewModule"),
-        ("warpgs.render.graphed", "clear_graph_cache"),
-        ("warpgs.render.options", "RasterizeOptions"),
-        ("warpgs.render.rasterize", "rasterize"),
-        ("warpgs.render.rasterize", "select_rule"),
-        ("warpgs.constants", "rule_named"),
-        ("warpgs.scene", "ActivatedGaussians", "Camera", "CovarianceGaussians", "Gaussians", "GivenDepth"),
-        ("warpgs.scene", "Normalization", "PointCloud", "Render", "Scene", "View"),
-        ("warpgs.synthetic.demo", "write_demo"),
-        ("warpgs.export",),
-        ("warpgs.io",),
-        ("warpgs.kernels",),
-        ("warpgs.train",),
-    )
+    __getattr__, __dir__ = lazy(__name__)

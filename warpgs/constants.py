@@ -1,7 +1,5 @@
 """Numbers of the rasterizer, and the rules that choose among them."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from numbers import Real

@@ -4,8 +4,7 @@ The faces are `warpgs`, `warpgs.train`, `warpgs.kernels`, `warpgs.io` and `warpg
 package, names are imported from the modules that define them, so that faces make no circle.
 """
 
-from __future__ import annotations
-
+import functools
 import importlib
 import sys
 from collections.abc import Callable
@@ -70,33 +69,33 @@ OLD = {
 """Names that older pages and examples imported, by their module below ``warpgs``, each with the name that replaces it."""
 
 
-def lazy(face: str, *homes: tuple[str, ...]) -> tuple[Callable[[str], object], Callable[[], list[str]]]:
-    """Return ``__getattr__`` and ``__dir__`` of a face, whose names load on first use.
+def lazy(face: str) -> tuple[Callable[[str], object], Callable[[], list[str]]]:
+    """Return ``__getattr__`` and ``__dir__`` of a face: the names that it imports for type checkers load on first use."""
+    # Importing torch and Warp at once would delay `warpgs --help` by seconds. The imports are read from the face's
+    # source, which is always there: Warp compiles kernels from their source, too.
 
-    Importing torch and Warp at once would delay `warpgs --help` by seconds.
+    @functools.cache
+    def places() -> dict[str, tuple[str, str]]:
+        """Return the module of each public name, and the name there."""
+        import ast
 
-    Args:
-        face: Name of the face's module.
-        homes: Rows of a module's dotted name and its public names, each as ``name`` or ``name as public_name``. A module
-            without names is itself an attribute of the face, by the last part of its dotted name.
-    """
-    places: dict[str, tuple[str, str]] = {}
-    for home, *names in homes:
-        for name in names or [f" as {home.rpartition('.')[2]}"]:
-            attribute, _, public = name.partition(" as ")
-            places[public or attribute] = (home, attribute)
+        spec: Any = sys.modules[face].__spec__
+        (block,) = (n for n in ast.parse(spec.loader.get_source(face)).body if isinstance(n, ast.If))
+        rows = [n for n in block.body if isinstance(n, ast.ImportFrom)]
+        return {a.asname or a.name: (n.module or "", a.name) for n in rows for a in n.names}
 
     def get(name: str) -> object:
         """Import a public name on first use."""
-        if name not in places:
+        if name not in places():
             raise AttributeError(f"module {face!r} has no attribute {name!r}")
-        home, attribute = places[name]
-        module = importlib.import_module(home)
-        return getattr(module, attribute) if attribute else module
+        home, attribute = places()[name]
+        if home == face:  # a face below this one
+            return importlib.import_module(f"{face}.{attribute}")
+        return getattr(importlib.import_module(home), attribute)
 
     def names_of_face() -> list[str]:
         """Return the public names and those with two underscores."""
-        return sorted([*places, *(n for n in vars(sys.modules[face]) if n.startswith("__"))])
+        return sorted([*places(), *(n for n in vars(sys.modules[face]) if n.startswith("__"))])
 
     return get, names_of_face
 

@@ -1,7 +1,5 @@
 """Files: read with a bounded size, written whole or not at all."""
 
-from __future__ import annotations
-
 import contextlib
 import csv
 import errno
@@ -79,15 +77,17 @@ def read_start(path: str | os.PathLike[str], count: int) -> bytes:
         return file.read(count)
 
 
-def read_file(path: Path, below: Path | None = None, most: int = MAX_BYTES, fix: str = "restore it, or make it again") -> bytes:
-    """Return what `read_input` does, or raise a DataError with a remedy."""
+def read_file(
+    path: Path, below: Path | None = None, most: int = MAX_BYTES, fix: str = "restore it, or make it again", what: str = ""
+) -> bytes:
+    """Return what `read_input` does, or raise a DataError with a remedy, in which ``what`` names the contents."""
     try:
         return read_input(path, most, below)
     except OSError as e:
-        raise DataError(f"{path}: cannot be read ({unread_reason(e)}); {fix}") from e
+        raise DataError(f"{path}: {what}cannot be read ({unread_reason(e)}); {fix}") from e
 
 
-def read_tensors(data: bytes) -> tuple[dict[str, Any], dict[str, Any]]:
+def tensors_of(data: bytes) -> tuple[dict[str, Any], dict[str, Any]]:
     """Return the tensors [...] of a safetensors file by name, on the CPU, and its metadata; ValueError if it is damaged."""
     from safetensors import SafetensorError
     from safetensors.torch import load
@@ -99,15 +99,24 @@ def read_tensors(data: bytes) -> tuple[dict[str, Any], dict[str, Any]]:
     return tensors, json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")]).get("__metadata__") or {}
 
 
+def read_tensors(path: Path, fix: str, again: str) -> tuple[dict[str, Any], dict[str, Any], bytes]:
+    """Return what `tensors_of` returns, and the file itself; ``again`` is the remedy for a damaged one."""
+    data = read_file(path, fix=fix)
+    try:
+        return *tensors_of(data), data
+    except ValueError as e:
+        raise DataError(f"{path}: damaged or not a safetensors file ({e}); {again}") from e
+
+
 def input_digest(path: str | os.PathLike[str], below: Path | None = None) -> str:
     """Return the SHA-256 of a regular file, hexadecimal; ``below`` as in `open_input`."""
     with open_input(path, below) as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def unread_reason(error: OSError) -> str:
+def unread_reason(error: Exception) -> str:
     """Return why a file could not be read, in words for the middle of a message."""
-    return error.strerror or str(error)
+    return getattr(error, "strerror", None) or str(error)
 
 
 LOCK = ".warpgs.lock"

@@ -466,16 +466,24 @@ def focus_point(cameras: list[Camera]) -> np.ndarray:
     return matmul(inverse(normal + weight * np.eye(3)), right + weight * mean)
 
 
+def pose_of(rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:
+    """Return the pose [4, 4] of a rotation [3, 3] and a translation [3], float64."""
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation, translation
+    return pose
+
+
+def pose_at(rotation: np.ndarray, center: np.ndarray) -> np.ndarray:
+    """Return camera_from_world [4, 4] of a camera at ``center`` [3] whose axes are the rows of ``rotation`` [3, 3]."""
+    return pose_of(rotation, -matmul(rotation, center))
+
+
 def look_at(center: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
     """Return camera_from_world [4, 4] of a camera at ``center`` that looks at ``target`` with ``up`` (all [3]) upwards."""
     z = (target - center) / np.linalg.norm(target - center)
     x = np.cross(-up, z)
     x /= np.linalg.norm(x)
-    rotation = np.stack([x, np.cross(z, x), z])
-    viewmat = np.eye(4)
-    viewmat[:3, :3] = rotation
-    viewmat[:3, 3] = -matmul(rotation, center)
-    return viewmat
+    return pose_at(np.stack([x, np.cross(z, x), z]), center)
 
 
 # The two systems of units that Gaussians and cameras come in, and the similarity between them.

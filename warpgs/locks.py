@@ -1,7 +1,5 @@
 """Who may write: one writer a folder, and folders that only their owner can read."""
 
-from __future__ import annotations
-
 import contextlib
 import datetime
 import errno

@@ -14,7 +14,7 @@ import numpy as np
 
 from warpgs.device import usable_cores
 from warpgs.errors import DataError, ResourceError
-from warpgs.files import read_input, unread_reason
+from warpgs.files import read_file
 
 if TYPE_CHECKING:
     from onnxruntime import InferenceSession
@@ -151,10 +151,7 @@ MAX_MODEL_BYTES = 2**31
 
 def read_model(path: Path) -> bytes:
     """Return the bytes of an ONNX file, checked to need no other files."""
-    try:
-        data = read_input(path, MAX_MODEL_BYTES)
-    except OSError as e:
-        raise DataError(f"{path}: the model cannot be read ({unread_reason(e)}); give the path of an ONNX file") from e
+    data = read_file(path, most=MAX_MODEL_BYTES, fix="give the path of an ONNX file", what="the model ")
     check_onnx(data, path)
     return data
 

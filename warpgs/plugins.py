@@ -1,7 +1,5 @@
 """Parts that plug in: classes found by name, built-in or a user's own."""
 
-from __future__ import annotations
-
 import functools
 import hashlib
 import importlib
@@ -10,12 +8,13 @@ import os
 import pkgutil
 import re
 import sys
+import traceback
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from types import ModuleType
 from typing import Any, ClassVar, Generic, Protocol, TypeVar
 
-from warpgs.errors import UsageError
+from warpgs.errors import UsageError, WarpgsError
 from warpgs.files import input_digest
 
 
@@ -142,10 +141,15 @@ LOADED: set[str] = set()
 
 
 def load_object(kind: str, spec: str) -> object:
-    """Import ``module:NAME`` or ``path/to/file.py:NAME``, which runs its code; return the object."""
+    """Import ``module:NAME`` or ``path/to/file.py:NAME``, which runs its code; return the object.
+
+    An error in that code becomes one that names the ``kind`` and ``spec`` of the object, and the line.
+    """
     where, _, name = spec.rpartition(":")
     try:
         module = module_of(where)
+    except WarpgsError:
+        raise
     except (ImportError, OSError) as e:
         advice = f"give path/to/file.py:{name or 'NAME'}"
         if where.endswith(".py") and isinstance(e, ModuleNotFoundError) and e.name:
@@ -153,6 +157,13 @@ def load_object(kind: str, spec: str) -> object:
             if path.with_name(f"{e.name}.py").is_file():
                 advice = f"set PYTHONPATH={path.parent} and give {path.stem}:{name or 'NAME'}, or use one file"
         raise UsageError(f"the {kind} {spec!r} cannot be imported ({e}); {advice}") from e
+    except Exception as e:  # whatever a user's module raises
+        last = traceback.extract_tb(e.__traceback__)[-1]
+        what, at = (e.msg, e) if isinstance(e, SyntaxError) else (e, last)
+        raise UsageError(
+            f"the {kind} {spec!r} cannot be loaded: {type(e).__name__}: {what} ({at.filename}, line {at.lineno}); correct that "
+            f"code, or omit the {kind}"
+        ) from e
     if not hasattr(module, name):
         raise UsageError(f"the {kind} {spec!r} does not exist: {where} does not define {name}; give a name that it defines")
     LOADED.add(module.__name__)
@@ -237,11 +248,10 @@ def flag_group(name: str) -> str:
 
 def own_frame(error: BaseException) -> str:
     """Return file and line of the last frame of a user's own code in an error's traceback; empty if it has no such frame."""
-    place, traceback = "", error.__traceback__
-    while traceback is not None:
-        if traceback.tb_frame.f_globals.get("__name__") in LOADED:
-            place = f"{traceback.tb_frame.f_code.co_filename}, line {traceback.tb_lineno}"
-        traceback = traceback.tb_next
+    place = ""
+    for frame, line in traceback.walk_tb(error.__traceback__):
+        if frame.f_globals.get("__name__") in LOADED:
+            place = f"{frame.f_code.co_filename}, line {line}"
     return place
 
 

@@ -1,7 +1,5 @@
 """This process and its children: output, the terminal, signals, and Python modules in processes of their own."""
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import gc
@@ -256,11 +254,7 @@ def _flush(*numbers: int) -> None:
 
 def is_utf8(text: str) -> bool:
     """Return whether text can be written as UTF-8."""
-    try:
-        text.encode("utf-8")
-    except UnicodeEncodeError:
-        return False
-    return True
+    return readable(text) == text
 
 
 def use_utf8_names() -> None:
@@ -349,7 +343,7 @@ def interrupting_signals() -> Iterator[None]:
     def interrupt(*_: object) -> None:
         raise KeyboardInterrupt
 
-    def unraisable(thrown: sys.UnraisableHookArgs) -> None:
+    def unraisable(thrown: "sys.UnraisableHookArgs") -> None:
         if thrown.exc_type is not KeyboardInterrupt:
             before(thrown)
         elif numbers:  # from a thread: a signal sent here would interrupt this function

@@ -4,8 +4,6 @@ A schema is a function of a value and of its place in the file. It returns nothi
 value.
 """
 
-from __future__ import annotations
-
 import functools
 import json
 import math

@@ -77,29 +77,4 @@ if TYPE_CHECKING:
     from warpgs.schema import Checked, Within
     from warpgs.schema import fields as state_schema
 else:
-    __getattr__, __dir__ = lazy(
-        __name__,
-        ("warpgs.kernels.ssim", "ssim"),
-        ("warpgs.kernels.update", "Setting"),
-        ("warpgs.pipeline.model.start", "InitConfig"),
-        ("warpgs.pipeline.model.table", "Column", "DensityUpdate", "Table"),
-        ("warpgs.pipeline.train.strategies.base", "Growth", "Settings", "StrategyContext"),
-        ("warpgs.pipeline.train.views", "LearnedView"),
-        ("warpgs.pipeline.train.loss", "LossInputs", "LossTerm", "Target", "register as register_loss_term", "total"),
-        ("warpgs.pipeline.train.loss", "photometric_loss"),
-        ("warpgs.pipeline.train.memory", "most_instances"),
-        ("warpgs.pipeline.train.schedule", "OptimizerConfig", "Phases"),
-        ("warpgs.pipeline.train.step", "captured_renderer", "eager_renderer"),
-        ("warpgs.pipeline.train.strategies.base", "Strategy", "register as register_strategy"),
-        ("warpgs.pipeline.train.strategies.clone_split", "CloneSplit"),
-        ("warpgs.pipeline.train.strategies.clone_split", "GradientGrowth"),
-        ("warpgs.pipeline.train.strategies.sampling", "Rendered", "Sampling"),
-        ("warpgs.geometry", "back_project_tensors", "project_tensors"),
-        ("warpgs.pipeline.metrics.scores", "quantiles"),
-        ("warpgs.pipeline.train.view_modules", "FittedViews", "Tensors", "ViewModule", "register as register_view_module"),
-        ("warpgs.pipeline.train.views", "TrainingView"),
-        ("warpgs.ranks", "join as join_ranks"),
-        ("warpgs.device", "STEP", "Needs", "StepSizes"),
-        ("warpgs.scene", "Prior"),
-        ("warpgs.schema", "Checked", "Within", "fields as state_schema"),
-    )
+    __getattr__, __dir__ = lazy(__name__)

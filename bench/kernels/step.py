@@ -11,15 +11,13 @@ import torch
 
 from bench.lib import result_file
 from bench.lib.arguments import SCENE, parse
+from bench.lib.kernel_calls import bin_tiles, blend, project
 from bench.lib.tables import named
 from bench.lib.timing import measure
 from bench.lib.training import Trainer, make_trainer, one_step, step_parts
 from warpgs import load_scene
 from warpgs.constants import RULES
 from warpgs.io.load import split_views
-from warpgs.kernels.blend import blend
-from warpgs.kernels.project import project
-from warpgs.kernels.tiles import bin_tiles
 from warpgs.pipeline.model.start import InitConfig
 from warpgs.pipeline.run.request import choose_device
 from warpgs.pipeline.train.loss import photometric_loss

@@ -9,10 +9,10 @@ import torch
 import warp as wp
 from torch.autograd.function import once_differentiable
 
+from bench.lib.kernel_calls import bin_tiles, project
 from warpgs.constants import RULES, Rule
 from warpgs.kernels import launch
-from warpgs.kernels.project import project
-from warpgs.kernels.tiles import Tiles, bin_tiles, grid
+from warpgs.kernels.tiles import Tiles, grid
 from warpgs.scene import Camera, Gaussians
 
 

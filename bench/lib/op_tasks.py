@@ -12,20 +12,17 @@ import numpy as np
 import torch
 
 from bench.lib import inputs, peers, roofline, training
+from bench.lib.kernel_calls import adam_step, bin_tiles, blend, blend_channels, heaviest, median_depth, project
 from bench.lib.pairs import binned, image_costs, instances_and_pairs
 from bench.lib.points import Point
 from bench.lib.timing import OURS, Task, passes
 from warpgs import rasterize
 from warpgs.constants import RULES
-from warpgs.kernels.blend import blend, blend_channels
 from warpgs.kernels.neighbours import camera_reach, mean_square_distances, pixel_size
-from warpgs.kernels.project import project
 from warpgs.kernels.ssim import ssim
 from warpgs.kernels.sweep import best_inverses, plane_costs, scanline_costs
-from warpgs.kernels.tiles import bin_tiles
 from warpgs.kernels.tsdf import integrate
-from warpgs.kernels.update import Setting, adam_step, begin_step, end_step, opacity_decay, opacity_dropout
-from warpgs.kernels.walk import heaviest, median_depth
+from warpgs.kernels.update import Setting, begin_step, end_step, opacity_decay, opacity_dropout
 from warpgs.priors.sweep import UNIT, step_limits
 from warpgs.scene import Camera
 

@@ -8,12 +8,11 @@ import torch
 import warp as wp
 
 from bench.lib import inputs, roofline
+from bench.lib.kernel_calls import bin_tiles, blend, project
 from bench.lib.points import Point
 from warpgs.constants import RULES, Rule
 from warpgs.kernels import launch
-from warpgs.kernels.blend import blend
-from warpgs.kernels.project import project
-from warpgs.kernels.tiles import Tiles, bin_tiles
+from warpgs.kernels.tiles import Tiles
 
 
 @wp.kernel(enable_backward=False)

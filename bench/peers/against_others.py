@@ -18,12 +18,12 @@ from bench.lib import rasterizers, result_file
 from bench.lib.arguments import parse
 from bench.lib.gpu_times import TRACES, gpu_times, peak_memory
 from bench.lib.inputs import first_camera, garden_inputs
+from bench.lib.kernel_calls import project
 from bench.lib.peers import torch_ssim
 from bench.lib.rasterizers import ATOMIC, GSPLAT, MANY_CHANNELS, OURS, UNRECORDED, Drawing
 from bench.lib.timing import measure_in_turn
 from bench.lib.training import Steps
 from warpgs.constants import RULES
-from warpgs.kernels.project import project
 from warpgs.scene import Camera, Gaussians
 
 WHAT = "images, gradients and training steps beside other rasterizers on the same inputs in the same run"

@@ -6,6 +6,7 @@ import contextlib
 import os
 import signal
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -133,7 +134,7 @@ SEEDS = (0, 1)
 
 
 class Reached:
-    """Trace of the lines of some files that run in a block, in this thread."""
+    """Trace of the lines of some files that run in a block, in this thread and those that it starts."""
 
     def __init__(self, lines: dict[str, set[int]]):
         """Trace these lines, by file."""
@@ -141,13 +142,16 @@ class Reached:
         self._seen: set[Line] = set()
 
     def __enter__(self) -> Reached:
-        self._before = sys.gettrace()
+        self._before = sys.gettrace(), threading.gettrace()
         self._seen.clear()
         sys.settrace(self._called)
+        threading.settrace(self._called)
         return self
 
     def __exit__(self, *_: object) -> None:
-        sys.settrace(self._before)
+        here, started = self._before
+        sys.settrace(here)
+        threading.settrace(started)  # type: ignore[arg-type]  # None for no trace
 
     def _called(self, frame: FrameType, event: str, argument: object) -> Callable | None:
         return self._ran if frame.f_code.co_filename in self._wanted else None

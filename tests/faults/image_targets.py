@@ -186,7 +186,7 @@ def jpeg_segments(data: bytes, rng: np.random.Generator) -> bytes:
     return data[:2] + head + data[at:]
 
 
-JPEG_PARSER = (image_files._segments, image_files._check_scans, image_files._decoded_jpeg)
+JPEG_PARSER = (image_files.jpeg_segments, image_files._check_scans, image_files._decoded_jpeg)
 JPEGS = {
     f"{sub[0]}{sub[1]}{sub[2]}{p}": encoded("JPEG", "RGB", subsampling=":".join(sub), progressive=bool(p))
     for sub in ("444", "420") for p in (0, 1)

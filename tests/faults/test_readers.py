@@ -3,6 +3,7 @@
 import ast
 import os
 import sys
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -98,7 +99,7 @@ def test_defects_are_noticed(data, kind, tmp_path):
 
 PACKAGE = Path(warpgs.__file__).parent
 OPENING = {
-    "open", "open_input", "read_bytes", "read_file", "read_input", "read_start", "read_text", "input_digest",
+    "open", "open_input", "read_bytes", "read_file", "read_input", "read_start", "read_text", "read_tensors", "input_digest",
     "fromfile", "imdecode", "imread", "safe_open", "HeifImageFile", "InferenceSession", "VideoCapture",
     "ZipFile", "fdopen", "memmap", "loadtxt", "genfromtxt", "load_file", "open_memmap",
 }  # fmt: skip
@@ -158,7 +159,7 @@ SYSTEM = "reads what the system says"
 LAYER = "opens for others, which are named here"
 REASONS = {
     "export/sog.py": {"SOG._meta_of": "SOG", "encode": "writes"},
-    "files.py": {"appending": "writes", "read_file": LAYER,
+    "files.py": {"appending": "writes", "read_file": LAYER, "read_tensors": LAYER, "tensors_of": LAYER,
         "open_input": LAYER, "read_input": LAYER, "read_start": LAYER, "input_digest": LAYER},
     "folders.py": {"Folder.__init__": LAYER, "Folder.open": LAYER, "Folder.open_regular": LAYER,
         "_locked": "writes", "temporary_file": "writes"},
@@ -185,6 +186,7 @@ REASONS = {
     "report/overview.py": {"_rendered": OWN, "_with_legend": OWN},
     "kernels/native.py": {"source": "reads a file of the package",
         "exclusive": "opens a lock"},
+    "clock.py": {"_age": SYSTEM},
     "device.py": {"_text": SYSTEM,
         "processor_name": SYSTEM},
     "process.py": {"utf8_name": "opens by another name for readers that are named here",
@@ -232,11 +234,13 @@ def test_the_fuzzer_calls_the_reader(target, tmp_path, monkeypatch):
         if event == "call":
             called.add((frame.f_code.co_filename, frame.f_code.co_qualname))
 
+    threading.setprofile(note)  # images load in threads
     sys.setprofile(note)
     try:
         Worker(all_targets()[target], 0, tmp_path)
     finally:
         sys.setprofile(None)
+        threading.setprofile(None)
     assert {(str(PACKAGE / f), n) for f, n in BY_TARGET[target]} <= called
 
 

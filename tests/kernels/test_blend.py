@@ -7,16 +7,15 @@ from types import SimpleNamespace
 import pytest
 import torch
 
+from bench.lib.kernel_calls import bin_tiles, blend, blend_channels, contributions, project
 from tests.gaussians import SMOOTH, camera, cloud, hand_placed, leaves
 from tests.reference.blend import blend_channels_reference, blend_reference
 from tests.reference.project import project_reference
 from tests.tolerances import close
 from warpgs.constants import RULES
-from warpgs.kernels.blend import _width, blend, blend_channels, composite, width_of
+from warpgs.kernels.blend import _width, composite, width_of
 from warpgs.kernels.falloff import Pass
-from warpgs.kernels.project import project
-from warpgs.kernels.tiles import Tiles, bin_tiles
-from warpgs.kernels.walk import contributions
+from warpgs.kernels.tiles import Tiles
 
 EXACT = RULES["exact"]
 
@@ -330,22 +329,3 @@ def test_no_gaussians_show_the_background(device, dtype):
         assert not bool(alpha.any()) and not bool(depth.any())
     v_colors, v_behind = torch.autograd.grad(image.sum(), [colors, behind])
     assert v_colors.shape == (1, 0, 5) and bool((v_behind == 200).all())
-
-
-def test_wrong_shapes_are_refused():
-    """Another number of Gaussians, cameras or background channels, and none at all."""
-    projected, tiles, size = binned(cloud(5), camera(40, 30, cameras=2, dtype=torch.float32), EXACT)
-    for colors, behind, words in [
-        (torch.zeros(2, 4, 7), torch.zeros(2, 7), r"colors must have shape \[C, N, D\]"),
-        (torch.zeros(3, 5, 7), torch.zeros(2, 7), r"colors must have shape \[C, N, D\]"),
-        (torch.zeros(2, 5, 7), torch.zeros(2, 3), r"backgrounds must have shape \[C, D\]"),
-        (torch.zeros(2, 5, 0), torch.zeros(2, 0), "at least one channel"),
-    ]:
-        with pytest.raises(ValueError, match=words):
-            blend_channels(projected, tiles, colors, behind, **size)
-    with pytest.raises(ValueError, match="tiles were made for another image"):
-        blend(projected, tiles, torch.zeros(2, 3), width=80, height=30, rule=EXACT)
-    with pytest.raises(ValueError, match="backgrounds"):
-        blend(projected, tiles, torch.zeros(1, 3), **size)
-    with pytest.raises(TypeError, match=r"colors is torch\.float64 but projected is torch\.float32"):
-        blend_channels(projected, tiles, torch.zeros(2, 5, 7).double(), torch.zeros(2, 7), **size)

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 import torch
 
+from bench.lib.kernel_calls import project
 from tests.gaussians import COEFFICIENTS, LENSES, SMOOTH, camera, cloud, hand_placed, leaves, lens_camera, opencv_pixels
 from tests.parallel_camera import NAME
 from warpgs import geometry
 from warpgs.constants import RULES
 from warpgs.errors import UsageError
-from warpgs.kernels.project import project
 from warpgs.render.options import RasterizeOptions
 from warpgs.render.rasterize import rasterize
 from warpgs.render.reference import reference_image

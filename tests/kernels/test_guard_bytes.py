@@ -4,14 +4,11 @@ import pytest
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from bench.lib.kernel_calls import adam_step, bin_tiles, blend, contributions, median_depth, project
 from tests.gaussians import camera, cloud, leaves
 from warpgs.constants import RULES
-from warpgs.kernels.blend import blend
-from warpgs.kernels.project import project
 from warpgs.kernels.ssim import differences, ssim
-from warpgs.kernels.tiles import InstanceMemory, bin_tiles
-from warpgs.kernels.update import adam_step
-from warpgs.kernels.walk import contributions, median_depth
+from warpgs.kernels.tiles import InstanceMemory
 
 GUARD = 64
 """Entries before and behind each tensor; a multiple of 16 bytes."""

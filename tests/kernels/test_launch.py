@@ -14,13 +14,14 @@ import torch
 import warp as wp
 from torch._subclasses.fake_tensor import FakeTensorMode
 
+from bench.lib.kernel_calls import adam_step
 from tests.gaussians import camera, cloud
 from tests.kernels.test_guard_bytes import rendering, similarity
 from warpgs.errors import ResourceError
 from warpgs.kernels import launch, native
 from warpgs.kernels.graphs import ALIGNMENT, TORCH, Arena, CapturedGraph, SizingAllocator, fetch, part
 from warpgs.kernels.neighbours import mean_square_distances
-from warpgs.kernels.update import Setting, adam_step, opacity_dropout
+from warpgs.kernels.update import Setting, opacity_dropout
 from warpgs.render.rasterize import rasterize
 from warpgs.scene import Gaussians
 

@@ -77,12 +77,10 @@ def test_it_is_the_fraction_of_the_distance_to_the_nearest(device, cameras):
 
 
 def test_camera_reach_at_a_camera_and_without_gaussians(device):
-    """The smallest size; nothing from nothing; a wrong shape is refused."""
+    """The smallest size; nothing from nothing."""
     center = torch.tensor([[1.0, 2.0, 3.0]], device=device)
     assert float(camera_reach(center, center, 0.5)) == pytest.approx(math.log(SMALLEST_REACH))
     assert camera_reach(center[:0], center, 0.5).shape == (0,)
-    with pytest.raises(ValueError, match="centers"):
-        camera_reach(center, center[:, :2], 0.5)
 
 
 # Sizes of a pixel at Gaussians, against angles and depths in float64.
@@ -134,11 +132,9 @@ def test_a_row_says_what_a_camera_sees(device):
 
 
 def test_pixel_size_at_a_camera_and_without_gaussians(device):
-    """The smallest size; nothing from nothing; a NaN is seen by none; a wrong shape is refused."""
+    """The smallest size; nothing from nothing; a NaN is seen by none."""
     given = rows(1).to(device)
     assert float(pixel_size(given[:, :3].contiguous(), given, 0.5)) == pytest.approx(math.log(SMALLEST_PIXEL))
     assert pixel_size(given[:0, :3], given, 0.5).shape == (0,)
     broken = torch.full((1, 3), math.nan, device=device)
     assert float(pixel_size(broken, given, 0.5)) == pytest.approx(math.log(SMALLEST_PIXEL))
-    with pytest.raises(ValueError, match="cameras"):
-        pixel_size(given[:, :3].contiguous(), given[:, :4], 0.5)

@@ -6,11 +6,11 @@ import math
 import pytest
 import torch
 
+from bench.lib.kernel_calls import project
 from tests.gaussians import SMOOTH, camera, cloud, hand_placed, leaves
 from tests.reference.project import project_reference
 from tests.tolerances import close
 from warpgs.constants import FAR, FARTHEST_PIXEL, LARGEST_COEFFICIENT, RULES, SHORTEST_QUAT
-from warpgs.kernels.project import project
 from warpgs.scene import C0, Gaussians
 
 # Projection against the paper's matrices: values, gradients, culling, extremes.

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 import torch
 
+from bench.lib.kernel_calls import project
 from tests.reference.sh import basis_reference, colors_reference
 from tests.tolerances import close
 from warpgs.constants import RULES
 from warpgs.geometry import look_at
 from warpgs.kernels import sh
-from warpgs.kernels.project import project
 
 COUNT = 24
 

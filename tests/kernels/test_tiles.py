@@ -4,18 +4,16 @@ import pytest
 import torch
 import warp as wp
 
+from bench.lib.kernel_calls import bin_tiles, blend, contributions, project
 from tests.gaussians import SMOOTH, camera, cloud
 from tests.reference.project import project_reference
 from tests.reference.tiles import touched_reference
 from warpgs.constants import RULES
 from warpgs.errors import ResourceError
 from warpgs.kernels import launch
-from warpgs.kernels.blend import blend
-from warpgs.kernels.project import project
 from warpgs.kernels.tiles import (
     EACH,
     InstanceMemory,
-    bin_tiles,
     make_find_ranges,
     make_kernels,
     running_counts,
@@ -23,7 +21,6 @@ from warpgs.kernels.tiles import (
     sum_bits,
     sum_entries,
 )
-from warpgs.kernels.walk import contributions
 
 EXACT = RULES["exact"]
 SIZES = [(1, 1), (1, 17), (17, 1), (15, 15), (16, 16), (17, 17), (33, 47), (97, 129)]
@@ -101,18 +98,6 @@ def test_budget_is_checked_in_64_bits_before_allocation(device):
         bin_tiles(projected, torch.full_like(counts, 1_000_000_000), width=40, height=30, rule=EXACT)
     with pytest.raises(ResourceError, match=r"instances need 444 B, and the limit is 10 B\. Many"):
         binned(gaussians, cam, memory=InstanceMemory(10))
-
-
-def test_bad_input_names_the_argument():
-    """Counts of another shape or type are refused."""
-    gaussians, cam = cloud(3), camera(40, 30, cameras=1, dtype=torch.float32)
-    projected, counts, _ = binned(gaussians, cam)
-    with pytest.raises(ValueError, match="tile_counts"):
-        bin_tiles(projected, counts[:, :2], width=40, height=30, rule=EXACT)
-    with pytest.raises(ValueError, match="tile_counts"):
-        bin_tiles(projected, counts.long(), width=40, height=30, rule=EXACT)
-    with pytest.raises(ValueError, match="projected"):
-        bin_tiles(projected[..., :9], counts, width=40, height=30, rule=EXACT)
 
 
 def test_lists_without_slots_are_the_same(device):

@@ -133,11 +133,6 @@ def test_depths_as_far_apart_as_the_truncation_are_two_surfaces(device, dtype):
     assert found == pytest.approx([0.5, 0.35], abs=1e-3)
 
 
-def test_bad_input_is_refused():
-    """Another camera model, and shapes that disagree."""
-    c, depth = cameras(1)[0], torch.ones(SIZE[1], SIZE[0])
-    grid = *empty((2, 2, 2), torch.float32, "cpu"), (0, 0, 0), 1, 1
+def test_another_camera_model_is_refused():
     with pytest.raises(UsageError, match="pinhole"):
-        integrate(*grid, dataclasses.replace(c, model="fisheye"), depth, depth)
-    with pytest.raises(ValueError, match="pixel_weights"):
-        integrate(*grid, c, depth, depth[1:])
+        face_cosines(torch.ones(SIZE[1], SIZE[0]), dataclasses.replace(cameras(1)[0], model="fisheye"))

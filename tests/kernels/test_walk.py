@@ -5,15 +5,13 @@ import dataclasses
 import pytest
 import torch
 
+from bench.lib.kernel_calls import bin_tiles, blend, heaviest, median_depth, project
 from tests.gaussians import SMOOTH, camera, cloud, hand_placed
 from tests.reference.project import project_reference
 from tests.reference.walk import heaviest_reference, median_depth_reference
 from tests.tolerances import close
 from warpgs.constants import RULES, Rule
-from warpgs.kernels.blend import blend
-from warpgs.kernels.project import project
-from warpgs.kernels.tiles import Tiles, bin_tiles
-from warpgs.kernels.walk import heaviest, median_depth
+from warpgs.kernels.tiles import Tiles
 from warpgs.render.options import RasterizeOptions
 from warpgs.render.rasterize import rasterize
 
@@ -136,15 +134,6 @@ def test_all_of_them_weigh_alpha(device, dtype):
     plain = rasterize(gaussians, cam, RasterizeOptions(contributions=True))
     assert plain.heaviest_ids is plain.median_depth is None
     close("image", seen, plain.weight_maxima)
-
-
-def test_what_cannot_be_is_refused():
-    """A number below 1, and tiles of another image."""
-    projected, tiles = layers([0.5], "cpu")
-    with pytest.raises(ValueError, match="at least 1"):
-        heaviest(projected, tiles, 0, width=16, height=16, rule=EXACT)
-    with pytest.raises(ValueError, match="tiles were made for another image"):
-        median_depth(projected, tiles, width=17, height=16, rule=EXACT)
 
 
 @pytest.mark.cuda

@@ -197,7 +197,7 @@ def test_a_voxel_is_what_is_asked_for():
     ("options", "words"),
     [
         ({"voxel": 0.0}, "above 0"), ({"voxel": float("nan")}, "above 0"), ({"voxel": 1e-9}, "at least a millionth"),
-        ({"voxel": 1.0, "resolution": 9}, "one of them"), ({"resolution": 7}, "8 to 4096"), ({"resolution": 4097}, "8 to 4096"),
+        ({"voxel": 1.0, "resolution": 9}, "one of them"), ({"resolution": 7}, "8, 4096"), ({"resolution": 4097}, "8, 4096"),
     ],
 )  # fmt: skip
 def test_what_makes_no_grid_is_refused(options, words):

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 import torch
 
+from bench.lib.kernel_calls import bin_tiles, project
 from tests.gaussians import camera, cloud, leaves
 from warpgs.constants import RULES
 from warpgs.errors import ResourceError
 from warpgs.kernels import launch
-from warpgs.kernels.project import project
-from warpgs.kernels.tiles import InstanceMemory, bin_tiles
+from warpgs.kernels.tiles import InstanceMemory
 from warpgs.render.rasterize import rasterize
 from warpgs.scene import Camera, Gaussians
 

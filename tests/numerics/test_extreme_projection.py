@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from bench.lib.kernel_calls import project
 from tests.gaussians import SMOOTH, camera, cloud, finite, leaves
 from tests.io.scenes import transforms_json, write_transforms
 from tests.numerics.fuzz import documented
@@ -16,7 +17,6 @@ from tests.scenes import three_gaussians
 from warpgs.constants import FAR, FARTHEST_PIXEL, LARGEST_AXIS, LARGEST_COEFFICIENT, RULES, SHORTEST_QUAT
 from warpgs.export.ply import read_ply, write_ply
 from warpgs.io.load import load_scene
-from warpgs.kernels.project import project
 from warpgs.pipeline.model.start import InitConfig
 from warpgs.pipeline.train.settings import FitConfig
 from warpgs.pipeline.train.trainer import Trainer

@@ -9,6 +9,7 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from bench.lib.kernel_calls import adam_step
 from tests.gaussians import cloud
 from tests.pipeline.train import fits
 from tests.reference.neighbours import mean_square_distances_reference
@@ -18,7 +19,6 @@ from warpgs.export.ply import write_ply
 from warpgs.io.load import normalization_of, normalize_points, normalize_view
 from warpgs.kernels.neighbours import mean_square_distances
 from warpgs.kernels.ssim import differences, ssim
-from warpgs.kernels.update import adam_step
 from warpgs.pipeline.metrics.scores import quantiles
 from warpgs.pipeline.model.limits import LimitConfig
 from warpgs.pipeline.model.start import InitConfig, initial_gaussians

@@ -13,11 +13,9 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from bench.lib.kernel_calls import bin_tiles, blend, project
 from tests.gaussians import SMOOTH, camera, cloud, leaves
 from warpgs.constants import RULES
-from warpgs.kernels.blend import blend
-from warpgs.kernels.project import project
-from warpgs.kernels.tiles import bin_tiles
 from warpgs.render.options import RasterizeOptions
 from warpgs.render.rasterize import rasterize
 from warpgs.scene import C0, Camera, Gaussians, Render

@@ -12,11 +12,12 @@ import numpy as np
 import pytest
 import torch
 
+from bench.lib.kernel_calls import adam_step
 from tests.gaussians import camera, cloud
 from warpgs.kernels.neighbours import mean_square_distances
 from warpgs.kernels.ssim import differences, ssim
 from warpgs.kernels.tsdf import integrate
-from warpgs.kernels.update import adam_step, squared_error
+from warpgs.kernels.update import squared_error
 from warpgs.render.options import RasterizeOptions
 from warpgs.render.rasterize import rasterize
 from warpgs.scene import Camera, Gaussians
@@ -196,7 +197,7 @@ DEBUG = """
 import sys, torch, warp as wp
 wp.config.mode = "debug"
 from tests.gaussians import camera, cloud, leaves
-from warpgs.kernels.update import adam_step
+from bench.lib.kernel_calls import adam_step
 from warpgs.kernels.neighbours import mean_square_distances
 from warpgs.kernels.ssim import differences
 from warpgs.render.rasterize import RasterizeOptions, rasterize

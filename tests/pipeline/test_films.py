@@ -112,7 +112,7 @@ def test_what_was_chosen_is_said(model, monkeypatch):
     plan = plan_film(model, "interpolate", FilmSettings(frames=13))
     assert plan.notes[-1].startswith("path: interpolate, through 3 of 5 cameras in the given order")
     assert [n for n, _ in plan_film(model, "views", FilmSettings()).cameras] == [f"{i}" for i in range(5)]
-    monkeypatch.setattr("warpgs.pipeline.films.film.path_of", lambda rig: "interpolate")
+    monkeypatch.setattr("warpgs.pipeline.films.paths.path_of", lambda rig: "interpolate")
     named = [plan_film(model, path, FilmSettings()).notes[-1].endswith("is calmer") for path in ("auto", "interpolate")]
     assert named == [True, False]
     with pytest.raises(UsageError, match="path 'orbit'; choose one of auto, views, turntable, spiral, interpolate, or give"):

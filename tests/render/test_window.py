@@ -9,7 +9,6 @@ from tests.gaussians import camera, cloud, leaves
 from warpgs.constants import RULES
 from warpgs.errors import UsageError
 from warpgs.kernels import tiles
-from warpgs.render import compose
 from warpgs.render.chunked import chunks
 from warpgs.render.compose import inputs_of, pass_of
 from warpgs.render.options import RasterizeOptions
@@ -134,7 +133,7 @@ def test_tiles_without_a_pixel_are_empty(device, monkeypatch):
         made.append(tiles.bin_tiles(*arguments, **named))
         return made[-1]
 
-    monkeypatch.setattr(compose, "bin_tiles", bin_tiles)
+    monkeypatch.setattr("warpgs.render.rasterize.bin_tiles", bin_tiles)
     pixels = torch.tensor([[20, 20], [60, 20]], device=device)
     r = rasterize(gaussians, cam, RasterizeOptions(pixels=pixels))
     lengths = made[0].ranges.diff(dim=1).flatten().tolist()

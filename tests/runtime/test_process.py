@@ -342,11 +342,9 @@ def test_more_signals_while_the_program_ends(monkeypatch, capsys):
         finally:
             signal.raise_signal(signal.SIGINT)
 
-    from warpgs.app import cli
-
     monkeypatch.setattr("warpgs.pipeline.run.export.export", tidy)
-    say = cli.say
-    monkeypatch.setattr(cli, "say", lambda *a, **k: (signal.raise_signal(signal.SIGINT), say(*a, **k)))
+    say = process.say
+    monkeypatch.setattr(process, "say", lambda *a, **k: (signal.raise_signal(signal.SIGINT), say(*a, **k)))
     try:
         code = main(["export", "run", "--to", "x.ply"])
     except KeyboardInterrupt:  # which would end pytest

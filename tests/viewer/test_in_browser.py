@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from tests.scenes import ring, three_gaussians
+from tests.viewer import wait_shown
 from warpgs.geometry import look_at
 from warpgs.render.rasterize import rasterize
 from warpgs.synthetic.demo import split_spec, write_demo
@@ -237,7 +238,7 @@ def viewing(folder, kind):
     if kind == "fit --view":
         with live_view(folder / "run", port=0) as live:
             live.look(content.model)
-            assert live.wait_shown(60)
+            wait_shown(live)
             yield live.server
         return
     server = open_server(0)

@@ -14,6 +14,7 @@ import torch
 from PIL import Image
 
 import warpgs
+from tests.viewer import wait_shown
 from warpgs.app.cli import main
 from warpgs.errors import DataError
 from warpgs.geometry import convert_gaussians
@@ -55,7 +56,7 @@ def folder(tmp_path_factory):
     write_demo(folder / "scene", views=8, width=SIZE[0], height=SIZE[1])
     with watch.live_view(folder / "run", port=0) as live:
         fit(folder, "run", live.look)
-        assert live.wait_shown(60)
+        wait_shown(live)
     return folder
 
 

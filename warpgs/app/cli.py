@@ -7,20 +7,12 @@ import sys
 from collections.abc import Sequence
 
 import warpgs.clock  # noqa: F401, whose import is the first line of a process
+from warpgs import process
 from warpgs.device import exhausted_limit, is_out_of_memory, no_memory_message
 from warpgs.errors import ResourceError, UsageError, WarpgsError, did_you_mean
 from warpgs.folders import system_folder
 from warpgs.pipeline.train.presets import DEFAULT_PRESET, PRESETS
 from warpgs.plugins import own_frame
-from warpgs.process import (
-    accept_all_letters,
-    careful_output,
-    fast_imports,
-    ignored_signals,
-    interrupting_signals,
-    say,
-    use_utf8_names,
-)
 from warpgs.ranks import last_words
 from warpgs.report.progress import waiting
 from warpgs.version import __version__
@@ -53,7 +45,7 @@ def report_defect(error: Exception, arguments: list[str]) -> int:
         where = f"in {f.name}"
     except OSError:  # no folder can be written
         for line in details.splitlines():
-            say(line, error=True)
+            process.say(line, error=True)
         where = "above"
     said = f"{type(error).__name__}: {error}"
     if own := own_frame(error):
@@ -179,15 +171,15 @@ def _help() -> str:
 def main(arguments: list[str] | None = None) -> int:
     """Run one command; returns its exit code: 0 done, 2 usage, 3 data, 4 resources, 5 defect or NaN, 130 interrupted."""
     if arguments is None:
-        use_utf8_names()
+        process.use_utf8_names()
     with contextlib.suppress(OSError):  # no folder for temporary files: a command that needs one raises the error
         system_folder()
     words = sys.argv[1:] if arguments is None else arguments
     prints = words[:1] in ([], *([name] for name in PRINTING)) and "--warm" not in words
-    with careful_output(prints or bool(ASKING & {*words})) as exit_code:
-        accept_all_letters()
+    with process.careful_output(prints or bool(ASKING & {*words})) as exit_code:
+        process.accept_all_letters()
         try:
-            with interrupting_signals():
+            with process.interrupting_signals():
                 return exit_code(_run(words))
         except SystemExit as e:  # after the help of a command
             if e.code or not (code := exit_code(0)):
@@ -199,10 +191,10 @@ def _run(arguments: list[str]) -> int:
     """Run one command; an error becomes one line and an exit code."""
     if not arguments or arguments[0] in ("-h", "--help", "help"):
         for line in _help().splitlines():
-            say(line)
+            process.say(line)
         return 0 if arguments else 2
     if arguments[0] in ("--version", "-V"):
-        say(f"warpgs {__version__}")
+        process.say(f"warpgs {__version__}")
         return 0
     name = arguments[0]
     try:
@@ -215,20 +207,20 @@ def _run(arguments: list[str]) -> int:
             raise UsageError(f"unknown command {name!r}; {hint}")
         if name == "fit" and {"-h", "--help"} & {*arguments}:  # before the import, which costs seconds
             for line in help_lines(COMMANDS[name]):
-                say(line)
+                process.say(line)
             return 0
         with waiting() as wait:
             if not ASKING & {*arguments} and os.environ.get("RANK", "0") == "0":  # until the command reports its own progress
                 wait(f"starting {name}")
             own = name in OWN_FILES
-            with fast_imports():
+            with process.fast_imports():
                 module = importlib.import_module(f"warpgs.app.{name if own else 'commands'}")
             code: int = module.run(*(() if own else (name,)), arguments[1:], COMMANDS[name])
         return code
     except WarpgsError as e:
         return last_words(f"warpgs: {e}", e.exit_code)
     except KeyboardInterrupt as e:
-        with ignored_signals():
+        with process.ignored_signals():
             return last_words("; ".join(["warpgs: interrupted", *map(str, e.args)]), 130)
     except Exception as e:
         if is_out_of_memory(e):

@@ -1,6 +1,5 @@
 """Commands: each is a function whose arguments are its flags and whose docstring is its help; it calls and prints, no logic."""
 
-import functools
 import shlex
 from collections.abc import Callable
 from dataclasses import dataclass, field, make_dataclass
@@ -10,7 +9,7 @@ from typing import Annotated, Any, Literal
 
 from tyro.conf import OmitArgPrefixes, Positional, arg  # noqa: TID253 - flags are annotations, and only a command imports this file
 
-from warpgs.app.flags import MAX_THREADS, call, check_range, listed, load_own
+from warpgs.app.flags import MAX_THREADS, call, check_range, listed
 from warpgs.errors import UsageError
 from warpgs.io.image_files import MAX_PIXELS
 from warpgs.process import say
@@ -419,7 +418,7 @@ def run_study_of(a: Any, variants: dict, marks: dict) -> list[str]:
 def compare(arguments: list[str]) -> Command:
     """Return `warpgs compare`."""
     from warpgs.pipeline.study.study import preset_variants
-    from warpgs.pipeline.train.presets import PRESETS, preset_settings
+    from warpgs.pipeline.train.presets import PRESETS
 
     def study(flags: OmitArgPrefixes[study_flags()], *, presets: str = ",".join(PRESETS)) -> list[str]:
         """Fit presets to scenes.
@@ -429,8 +428,6 @@ def compare(arguments: list[str]) -> Command:
             presets: Presets as for `warpgs fit --preset`, separated by commas; the others are compared with the first.
         """
         names = [n.strip() for n in presets.split(",") if n.strip()]
-        for name in names:  # so that an error names its preset
-            load_own("preset", name, functools.partial(preset_settings, name))
         return run_study_of(flags, preset_variants(names, flags.steps), {})
 
     return study, listed("presets", PRESETS.described())
@@ -448,7 +445,7 @@ def ablate(arguments: list[str]) -> Command:
             flags: Scenes and runs.
             preset: Preset, as for `warpgs fit --preset`; one part is changed at a time.
         """
-        (config,) = load_own("preset", preset, lambda: preset_variants([preset], flags.steps)).values()
+        (config,) = preset_variants([preset], flags.steps).values()
         return run_study_of(flags, *ablation_variants(config))
 
     return study, listed("presets", PRESETS.described())

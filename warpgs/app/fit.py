@@ -14,7 +14,6 @@ from warpgs.app.flags import (
     check_range,
     flags_of,
     listed,
-    load_own,
     parse_flags,
     settings_of,
     word_after,
@@ -29,7 +28,7 @@ from warpgs.kernels.launch import set_threads
 from warpgs.pipeline.run.request import FitRequest, SceneRequest
 from warpgs.pipeline.train.loss import LOSS_TERMS
 from warpgs.pipeline.train.presets import PRESETS, origin_note, preset_settings
-from warpgs.pipeline.train.settings import FitConfig, check_budget
+from warpgs.pipeline.train.settings import FitConfig, check_budget, parts_named
 from warpgs.pipeline.train.strategies.base import STRATEGIES
 from warpgs.pipeline.train.view_modules import VIEW_MODULES
 from warpgs.plugins import Registry, flag_group
@@ -51,8 +50,7 @@ def scene_of(flags: Any, path: str) -> SceneRequest:
     if asked.downscale is not None:
         check_range("--downscale", asked.downscale, 1, MAX_WHOLE)
     if asked.reader is not None:
-        reader = asked.reader
-        load_own(READERS.kind, reader, lambda: READERS.load(reader))
+        READERS.load(asked.reader)
     named = {n: getattr(asked, n) for n in ("score_masks", "matcher", "depths", "normals")}
     found = {n: p if p is None or (p == NONE and n in ("depths", "normals")) else os.path.realpath(p) for n, p in named.items()}
     return dataclasses.replace(asked, path=path, **found)
@@ -90,31 +88,17 @@ class Request:
     """Port of --view; 0 for any free one."""
 
 
-def _load(registry: Registry[Any], name: str) -> type[Any]:
-    """Return the class of a plug-in; the user's own code, named by module or file, is imported."""
-    return load_own(registry.kind, name, lambda: registry.load(name))
-
-
 Parts = dict[str, Any]
 """Loss terms or view modules by the name of their flags."""
 
 
 def _parts(registry: Registry[Any], flag: str, arguments: list[str], base: tuple[Any, ...]) -> Parts:
     """Return the parts of a registry that a flag names, with default settings; ``base`` if the flag is not given."""
-    given = word_after(arguments, flag)
-    if given is None:
-        return {flag_group(p.name): p for p in base}
-    parts: Parts = {}
-    for name in filter(None, (n.strip() for n in ("" if given == "none" else given).split(","))):
-        if flag_group(name) in parts:
-            raise UsageError(f"{flag} {given}: two of these names define the flags --{flag_group(name)}; leave one out")
-        kind = _load(registry, name)
-        try:
-            parts[flag_group(name)] = kind()
-        except TypeError as e:
-            raise UsageError(
-                f"the {registry.kind} {name!r} has a setting without a default ({e}); give every field a default"
-            ) from e
+    given, parts = word_after(arguments, flag), Parts()
+    for part in base if given is None else parts_named(registry, flag, given, True):
+        if (group := flag_group(part.name)) in parts:
+            raise UsageError(f"{flag} {given}: two of these names define the flags --{group}; leave one out")
+        parts[group] = part
     return parts
 
 
@@ -134,11 +118,11 @@ def _view_modules(arguments: list[str], base: FitConfig) -> Parts:
 def _preset(arguments: list[str]) -> tuple[FitConfig, str]:
     """Return the settings that the flags start from, and a description of their source."""
     name = word_after(arguments, "--preset")
-    base, origin = load_own("preset", str(name), lambda: preset_settings(name))
+    base, origin = preset_settings(name)
     strategy = word_after(arguments, "--strategy")
     if strategy is None or strategy == base.strategy:
         return base, origin
-    own = _load(STRATEGIES, strategy).Config
+    own = STRATEGIES.load(strategy).Config
     return dataclasses.replace(base, strategy=strategy, strategy_config=None if own is None else own()), origin
 
 

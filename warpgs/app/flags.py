@@ -6,13 +6,12 @@ import functools
 import io
 import os
 import shutil
-import traceback
 import types
 import typing
 from collections.abc import Callable, Iterator, Mapping
 from typing import Annotated, Any, TypeVar
 
-from warpgs.errors import UsageError, WarpgsError, field_docs
+from warpgs.errors import UsageError, field_docs
 from warpgs.process import say
 
 REMOVED = {"--repeat": "the error of the fit itself names step, view, loss term and tensors"}
@@ -25,7 +24,6 @@ MAX_WHOLE = 2**31 - 1
 """Largest number of steps and factor of a size: the largest integer of 32 bits."""
 
 Settings = TypeVar("Settings")
-Loaded = TypeVar("Loaded")
 
 
 def call(command: Callable[..., Any], arguments: list[str], program: str, description: str) -> Any:
@@ -148,18 +146,3 @@ def word_after(arguments: list[str], flag: str) -> str | None:
         elif i + 1 < len(arguments):
             found = arguments[i + 1]
     return found
-
-
-def load_own(kind: str, spec: str, load: Callable[[], Loaded]) -> Loaded:
-    """Return what ``load`` returns; an error in imported code names the ``kind`` and ``spec`` of the object, and the line."""
-    try:
-        return load()
-    except WarpgsError:
-        raise
-    except Exception as e:  # whatever a user's module raises
-        last = traceback.extract_tb(e.__traceback__)[-1]
-        syntax = isinstance(e, SyntaxError)
-        what, where = (e.msg, f"{e.filename}, line {e.lineno}") if syntax else (e, f"{last.filename}, line {last.lineno}")
-        raise UsageError(
-            f"the {kind} {spec!r} cannot be loaded: {type(e).__name__}: {what} ({where}); correct that code, or omit the {kind}"
-        ) from e

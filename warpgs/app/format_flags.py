@@ -5,9 +5,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
-from warpgs.app.flags import flags_of, listed, load_own, settings_of, word_after
+from warpgs.app.flags import flags_of, listed, settings_of, word_after
 from warpgs.errors import UsageError
-from warpgs.export.base import FORMATS, Format, all_formats, find_format
+from warpgs.export.base import Format, all_formats, find_format
 from warpgs.pipeline.run.export import Filters
 from warpgs.plugins import flag_group
 
@@ -48,20 +48,14 @@ def format_flags(arguments: list[str]) -> type:
 def _with_options(own: str | None) -> dict[str, type]:
     """Return the options of formats by the group of their flags, including the user's ``own`` format."""
     kinds = [type(f) for f in all_formats()]
-    if own is not None and (kind := type(_found(own))) not in kinds:
+    if own is not None and (kind := type(find_format(own))) not in kinds:
         kinds.append(kind)
     return {flag_group(k.name): k.Config for k in kinds if k.Config is not None}
 
 
-def _found(choice: str) -> Format:
-    """Return the format that --format names."""
-    load_own(FORMATS.kind, choice, lambda: FORMATS.load(choice))
-    return find_format(choice)
-
-
 def chosen_formats(a: Any, target: Path) -> list[Format]:
     """Return formats to prefer: the target file's format if it has options, then the format of --format if given."""
-    named = [] if a.format is None else [_found(a.format)]
+    named = [] if a.format is None else [find_format(a.format)]
     written = next((type(f) for f in [*named, *all_formats()] if f.fits(target)), Format)
     for group, config in _with_options(a.format).items():
         if settings_of(config, getattr(a, group)) != config() and config is not written.Config:

@@ -18,9 +18,4 @@ if TYPE_CHECKING:
     from warpgs.export.base import Arrays, Format, read_gaussians, write_gaussians
     from warpgs.export.base import register as register_format
 else:
-    __getattr__, __dir__ = lazy(
-        __name__,
-        ("warpgs.export.base", "Arrays"),
-        ("warpgs.export.base", "Format", "register as register_format"),
-        ("warpgs.export.base", "read_gaussians", "write_gaussians"),
-    )
+    __getattr__, __dir__ = lazy(__name__)

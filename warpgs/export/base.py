@@ -1,7 +1,5 @@
 """Formats of files of Gaussians: the interface, the arrays, the formats by suffix, and .splat."""
 
-from __future__ import annotations
-
 import copy
 import io
 import json
@@ -258,8 +256,8 @@ def rounded(values: np.ndarray, most: int) -> np.ndarray:
 # as ``module:Class`` or ``path/to/file.py:Class``.
 
 BROKEN = (
-    struct.error, zlib.error, zipfile.BadZipFile, EOFError, ValueError, KeyError, TypeError, IndexError, OverflowError,
-    NotImplementedError, RecursionError, RuntimeError, OSError,
+    struct.error, zlib.error, zipfile.BadZipFile, EOFError, ValueError, AttributeError, KeyError, TypeError, IndexError,
+    OverflowError, NotImplementedError, RecursionError, RuntimeError, OSError,
 )  # fmt: skip
 """Errors of decoders (standard library, zstandard, our own) about invalid content: zipfile reports encryption as RuntimeError,
 unknown methods as NotImplementedError, and seeks before the start as OSError."""

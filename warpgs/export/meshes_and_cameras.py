@@ -1,7 +1,5 @@
 """Files of meshes and of cameras for other programs."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,7 +9,7 @@ import numpy as np
 from warpgs.errors import DataError, UsageError
 from warpgs.export.gltf import glb, linear
 from warpgs.files import filling, is_empty, make_folder, write_bytes, write_json, write_text
-from warpgs.geometry import pinhole_of, quaternions
+from warpgs.geometry import pinhole_of, pose_of, quaternions
 from warpgs.scene import ORIGIN, Camera, Mesh
 from warpgs.version import __version__
 
@@ -184,17 +182,9 @@ def write_cameras(
     return notes
 
 
-def _world_from_camera(camera: Camera) -> np.ndarray:
-    """Return the pose [4, 4] from the camera's axes to the world's."""
-    pose = np.eye(4)
-    pose[:3, :3] = camera.viewmat[:3, :3].T
-    pose[:3, 3] = camera.center
-    return pose
-
-
 def _inria(number: int, name: str, camera: Camera) -> dict[str, object]:
     """Return the row of a camera; the format has no principal point."""
-    pose = _world_from_camera(camera)
+    pose = pose_of(camera.viewmat[:3, :3].T, camera.center)
     return {
         "id": number, "img_name": name, "width": camera.width, "height": camera.height,
         "position": pose[:3, 3].tolist(), "rotation": pose[:3, :3].tolist(),
@@ -204,7 +194,7 @@ def _inria(number: int, name: str, camera: Camera) -> dict[str, object]:
 
 def _frame(name: str, camera: Camera) -> dict[str, object]:
     """Return the frame of a camera, with the axes of OpenGL."""
-    pose = _world_from_camera(camera)
+    pose = pose_of(camera.viewmat[:3, :3].T, camera.center)
     pose[:3, 1:3] *= -1
     return {
         "file_path": f"images/{name}", "w": camera.width, "h": camera.height,

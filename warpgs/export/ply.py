@@ -1,7 +1,5 @@
 """PLY files of Gaussians, plain and compressed."""
 
-from __future__ import annotations
-
 import functools
 import itertools
 import math
@@ -312,19 +310,10 @@ def _unpack(packed: np.ndarray, bits: tuple[int, ...]) -> np.ndarray:
     return np.stack(columns[::-1], 1)
 
 
-@register("compressed_ply")
-class CompressedPLY(Format):
-    """The compressed PLY format."""
+class _HeadedFormat(Format):
+    """A format whose header says in comments what a file declares."""
 
-    suffix = ".compressed.ply"
-    description = "PlayCanvas, 8 to 11 bits within chunks of 256; SuperSplat"
-    sorted = True
     declares = True
-    decode = staticmethod(decode)
-
-    def encode(self, arrays: Arrays) -> list[bytes]:
-        """Return the bytes of a file."""
-        return encode(arrays, self.antialiased, self.origin)
 
     def origin_in(self, path: Path) -> object:
         """Return the origin in the header's comments."""
@@ -337,6 +326,20 @@ class CompressedPLY(Format):
     def is_own(self, path: Path) -> bool:
         """Return whether the header has the comments of warpgs."""
         return is_own(start_of(path))
+
+
+@register("compressed_ply")
+class CompressedPLY(_HeadedFormat):
+    """The compressed PLY format."""
+
+    suffix = ".compressed.ply"
+    description = "PlayCanvas, 8 to 11 bits within chunks of 256; SuperSplat"
+    sorted = True
+    decode = staticmethod(decode)
+
+    def encode(self, arrays: Arrays) -> list[bytes]:
+        """Return the bytes of a file."""
+        return encode(arrays, self.antialiased, self.origin)
 
 
 # Gaussians as a PLY file in the layout of the INRIA 3DGS code, which splat viewers and editors read.
@@ -609,22 +612,17 @@ def _columns(
 
 
 @register("ply")
-class PLY(Format):
+class PLY(_HeadedFormat):
     """The PLY format; such a file may be compressed."""
 
     suffix = ".ply"
     description = "layout of Kerbl et al. 2023, float32; every tool"
     cleaned = False
-    declares = True
     max_degree = 4
 
     def write(self, path: Path, gaussians: Gaussians, normalization: Normalization | None, units: str) -> None:
         """Write Gaussians with `write_ply`."""
         _write(path, gaussians, normalization, units, self.antialiased, self.origin)
-
-    def origin_in(self, path: Path) -> object:
-        """Return the origin in the header's comments."""
-        return origin_stated(start_of(path))
 
     def read_stored(self, path: Path) -> Gaussians:
         """Read Gaussians as `read_ply` does, or with `CompressedPLY` if the header announces that format."""
@@ -637,11 +635,3 @@ class PLY(Format):
         self.notes = []
         gaussians, self.origin = _read(path, self.strict, self.notes)
         return gaussians
-
-    def is_antialiased(self, path: Path) -> bool:
-        """Return whether the header declares antialiasing."""
-        return is_antialiased(start_of(path))
-
-    def is_own(self, path: Path) -> bool:
-        """Return whether the header has the comments of warpgs."""
-        return is_own(start_of(path))

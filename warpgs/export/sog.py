@@ -5,8 +5,6 @@ are entries of codebooks of 256 values. Harmonics above degree 0 have a palette 
 this number of Gaussians keeps all rows. Axes are those of PLY.
 """
 
-from __future__ import annotations
-
 import io
 import json
 import math

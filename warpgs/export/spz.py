@@ -4,14 +4,11 @@ Versions 2 and 3 are one gzip stream; version 4 has a plain header and one zstd 
 are RUB (x right, y up, z back), a half turn about x from those of PLY.
 """
 
-from __future__ import annotations
-
 import functools
 import gzip
 import io
 import math
 import struct
-import zlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -124,7 +121,7 @@ def decode(path: Path, data: bytes) -> Arrays:
     """Return the Gaussians of a file's bytes, in the axes of PLY."""
     if data[:2] == b"\x1f\x8b":
         stream = gzip.GzipFile(fileobj=io.BytesIO(data))
-        head = _inflated(path, stream, HEADER.size)
+        head = stream.read(HEADER.size)
         if len(head) < HEADER.size:
             raise malformed(path, "its header is truncated")
         magic, version, n, degree, bits, flags, _ = HEADER.unpack(head)
@@ -172,36 +169,22 @@ def _coordinate_system(path: Path, extensions: bytes | bytearray) -> int:
     return RUB
 
 
-def _inflated(path: Path, stream: gzip.GzipFile, size: int) -> bytes:
-    """Return the next bytes of a gzip stream, fewer where it is cut off."""
-    try:
-        return stream.read(size)
-    except EOFError:
-        return b""
-    except (OSError, zlib.error) as e:  # a wrong checksum is an OSError here
-        raise malformed(path, f"its compressed content is damaged ({str(e)[:80]})") from e
-
-
 def _parts_of_gzip(
     path: Path, stream: gzip.GzipFile, n: int, sizes: list[int], extensions: bytearray | None
 ) -> Iterator[Section]:  # fmt: skip
     """Yield the sections of a file of version 2 or 3, each to be read to its end before the next; then fill ``extensions``."""
 
     def read(size: int) -> bytes:
-        data = _inflated(path, stream, size)
+        data = stream.read(size)
         if len(data) != size:
-            raise malformed(path, f"{n} Gaussians need {sum(sizes)} bytes, but the file has fewer, or its end is cut off")
+            raise malformed(path, f"{n} Gaussians need {sum(sizes)} bytes, but the file has fewer")
         return data
 
     for _ in sizes:
         yield read
-    try:
-        if extensions is not None:
-            extensions += stream.read(MAX_EXTENSIONS)
-        more = stream.read(1)  # at its end the checksum has been compared
-    except (EOFError, OSError, zlib.error) as e:
-        raise malformed(path, f"its compressed content is damaged ({str(e)[:80]}), or its end is cut off") from e
-    if more:
+    if extensions is not None:
+        extensions += stream.read(MAX_EXTENSIONS)
+    if stream.read(1):  # at its end the checksum has been compared
         raise malformed(path, f"{n} Gaussians need {sum(sizes)} bytes, but the file has more")
 
 
@@ -341,5 +324,5 @@ class SPZ(Format):
         with reading(path) as file:
             packed = file.read(2) == b"\x1f\x8b"
             file.seek(0)
-            head = _inflated(path, gzip.GzipFile(fileobj=file), HEADER.size) if packed else file.read(HEADER.size)
+            head = (gzip.GzipFile(fileobj=file) if packed else file).read(HEADER.size)
             return bool(HEADER.unpack(head)[5] & ANTIALIASED)

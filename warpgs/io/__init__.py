@@ -25,10 +25,4 @@ if TYPE_CHECKING:
     from warpgs.io.images import Lens, LoadedImage, ReadOptions
     from warpgs.io.maps import NamedMaps
 else:
-    __getattr__, __dir__ = lazy(
-        __name__,
-        ("warpgs.io.folder", "SceneFolder", "ViewList", "view_name"),
-        ("warpgs.io.maps", "NamedMaps"),
-        ("warpgs.io.images", "Lens", "LoadedImage", "ReadOptions"),
-        ("warpgs.io.folder", "Probe", "Reader", "register as register_reader"),
-    )
+    __getattr__, __dir__ = lazy(__name__)

@@ -3,8 +3,6 @@
 Other files of a reconstruction (rigs, frames, project.ini) hold nothing that a scene needs and are not read.
 """
 
-from __future__ import annotations
-
 import re
 import struct
 from collections import Counter
@@ -17,6 +15,7 @@ import numpy as np
 
 from warpgs.errors import DataError
 from warpgs.files import open_input, read_file
+from warpgs.geometry import pose_of
 from warpgs.io.folder import (
     Probe,
     Reader,
@@ -286,13 +285,8 @@ def posed_lenses(poses: dict[int, Pose], lenses: dict[int, Lens], file: Path) ->
         where = f"{file}, image {name!r}"
         if camera not in lenses:
             raise DataError(f"{where}: camera {camera} is missing from cameras{file.suffix}; export the cameras again")
-        viewmat = np.eye(4)
-        viewmat[:3, :3], viewmat[:3, 3] = quat_rotation(quat, where), translation
-        yield (
-            name,
-            lenses[camera].checked(f"{file.with_stem('cameras')}, camera {camera}"),
-            about(rigid(viewmat, where), origin),
-        )
+        viewmat = rigid(pose_of(quat_rotation(quat, where), translation), where)
+        yield name, lenses[camera].checked(f"{file.with_stem('cameras')}, camera {camera}"), about(viewmat, origin)
 
 
 def read_points(path: Path, names: dict[int, str], notes: list[str] | None = None) -> PointCloud:

@@ -1,7 +1,5 @@
 """Scene folders: the interface of a reader, and what all readers do alike."""
 
-from __future__ import annotations
-
 import abc
 import math
 import posixpath

@@ -215,14 +215,14 @@ MAX_SCANS = 100
 """Largest number of scans, each of which passes over the whole image; progressive files have about ten."""
 
 
-def _segments(data: bytes) -> Iterator[tuple[int, bytes]]:
-    """Yield marker and contents of each segment of a JPEG up to the end of the image; coded data is skipped."""
+def jpeg_segments(data: bytes) -> Iterator[tuple[int, bytes, bytes]]:
+    """Yield marker, contents and all bytes, with any coded data behind it, of each segment of a JPEG before the image's end."""
     at = 2
     while True:
         found = MARKER.match(data, at)
         if found is None:
             raise ValueError("it ends early" if at >= len(data) - 1 else f"no marker at byte {at}")
-        marker, at = found[1][0], found.end()
+        begin, marker, at = at, found[1][0], found.end()
         if marker == EOI:
             return
         if marker in LONE:
@@ -232,20 +232,21 @@ def _segments(data: bytes) -> Iterator[tuple[int, bytes]]:
         (length,) = struct.unpack_from(">H", data, at)
         if length < 2 or at + length > len(data):
             raise ValueError(f"it ends within a segment, at byte {len(data)}")
-        yield marker, data[at + 2 : at + length]
+        contents = data[at + 2 : at + length]
         at += length
         if marker == SOS:
             found = NEXT_MARKER.search(data, at)
             if found is None:
                 raise ValueError("it ends within its coded data")
             at = found.start()
+        yield marker, contents, data[begin:at]
 
 
 def _check_scans(data: bytes) -> None:
     """Check that the scans bring every coefficient of every component of a JPEG to its full precision."""
     missing: dict[int, list[int]] = {}
     scans = 0
-    for marker, body in _segments(data):
+    for marker, body, _ in jpeg_segments(data):
         if marker in OTHER_SOF:
             raise ValueError("it is lossless, hierarchical or arithmetically coded; save it as PNG")
         if marker in SOF:
@@ -568,8 +569,8 @@ def _block(data: bytes) -> bytes:
     """Return the bytes of EXIF in an image file, which begin as a TIFF file does; maybe empty."""
     name = format_of(data)
     if name == "JPEG":
-        head = itertools.takewhile(lambda segment: segment[0] != SOS, _segments(data))
-        return next((body for marker, body in head if marker == APP1 and body.startswith(PREFIX)), b"")
+        head = itertools.takewhile(lambda segment: segment[0] != SOS, jpeg_segments(data))
+        return next((body for marker, body, _ in head if marker == APP1 and body.startswith(PREFIX)), b"")
     if name == "WEBP":
         return bytes(next((body for kind, body in _webp_chunks(data) if kind == b"EXIF"), b""))
     if name in ("PNG", "AVIF"):

@@ -1,7 +1,5 @@
 """`load_scene`: a folder becomes a scene, recentred and rescaled, with its views split."""
 
-from __future__ import annotations
-
 import difflib
 import functools
 import hashlib

@@ -1,7 +1,5 @@
 """Maps beside the photographs: depth, normals and masks that the user gives."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath

@@ -1,7 +1,5 @@
 """Scenes as the data sets LLFF, DTU and Middlebury store them."""
 
-from __future__ import annotations
-
 import io
 import re
 from collections.abc import Callable
@@ -12,7 +10,7 @@ import numpy as np
 
 from warpgs.errors import DataError
 from warpgs.files import read_input, unread_reason
-from warpgs.geometry import matmul
+from warpgs.geometry import matmul, pose_of
 from warpgs.io.folder import (
     Probe,
     Reader,
@@ -116,9 +114,7 @@ def decompose(P: np.ndarray, where: str) -> tuple[np.ndarray, np.ndarray]:
     if np.linalg.det(R) < 0:  # P is given up to sign
         R, t = -R, -t
     K = K / K[2, 2]
-    viewmat = np.eye(4)
-    viewmat[:3, :3], viewmat[:3, 3] = R, t
-    return _centred(K, where), rigid(viewmat, where)
+    return _centred(K, where), rigid(pose_of(R, t), where)
 
 
 def _centred(K: np.ndarray, where: str) -> np.ndarray:
@@ -248,10 +244,9 @@ def read_camera_rows(path: Path) -> list[tuple[int, str, np.ndarray]]:
                 )
             rows.append((number, words[0], values))
     except (OSError, ValueError) as e:
-        why = unread_reason(e) if isinstance(e, OSError) else e
         raise DataError(
-            f"{path}: cannot be understood ({why}); expected a count of images in the first line, then a line with a name "
-            "and 21 numbers for each image. Copy the file again"
+            f"{path}: cannot be understood ({unread_reason(e)}); expected a count of images in the first line, then a line "
+            "with a name and 21 numbers for each image. Copy the file again"
         ) from e
     if count != len(rows):
         raise DataError(f"{path}: announces {count or 0} images and lists {len(rows)}; it is truncated. Copy it again")
@@ -279,12 +274,11 @@ class MiddleburyReader(Reader):
             if options.excludes(view_name(name)):
                 continue
             where = f"{path}, line {number}, image {name!r}"
-            K, viewmat = _centred(values[:9].reshape(3, 3).copy(), where), np.eye(4)
+            K = _centred(values[:9].reshape(3, 3).copy(), where)
             if not np.allclose(K[[1, 2, 2, 2], [0, 0, 1, 2]], (0, 0, 0, 1)):
                 lower = "its lower rows are not 0 fy cy, 0 0 1"
                 raise DataError(f"{where}: K is not a matrix of intrinsics ({lower}); calibrate again")
-            viewmat[:3, :3], viewmat[:3, 3] = values[9:18].reshape(3, 3), values[18:21]
-            viewmat = rigid(viewmat, where)
+            viewmat = rigid(pose_of(values[9:18].reshape(3, 3), values[18:21]), where)
             file, view = scene.child(folder, name, where), views.claim(view_name(name), where)
             mask = scene.mask_of(file, folder, folder / "masks")
             views.add(view, viewmat, partial(scene.image, file, _lens(K, where), mask=mask))

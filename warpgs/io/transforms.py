@@ -1,7 +1,5 @@
 """Scenes in a transforms.json, and files of cameras alone."""
 
-from __future__ import annotations
-
 import json
 import math
 import posixpath

@@ -15,7 +15,4 @@ if TYPE_CHECKING:
     from warpgs.kernels.cameras import CameraModel
     from warpgs.kernels.cameras import register as register_camera_model
 else:
-    __getattr__, __dir__ = lazy(
-        __name__,
-        ("warpgs.kernels.cameras", "CameraModel", "register as register_camera_model"),
-    )
+    __getattr__, __dir__ = lazy(__name__)

@@ -7,14 +7,13 @@ from types import SimpleNamespace
 import torch
 import warp as wp
 
-from warpgs.constants import Rule
 from warpgs.device import BINNING, BLENDING, FLOAT, LOSS, PROJECTION, SAMPLING, Needs, StepSizes
 from warpgs.kernels import blend_cpu, blend_cuda, launch
 from warpgs.kernels.falloff import COLORS, VALUES, WIDTHS, Pass
 from warpgs.kernels.graphs import TORCH, Allocator
 from warpgs.kernels.launch import first_order, keep, kept
 from warpgs.kernels.native import ROLLED
-from warpgs.kernels.tiles import Tiles, grid
+from warpgs.kernels.tiles import Tiles
 
 
 def step_bytes(sizes: StepSizes) -> Needs:
@@ -205,36 +204,14 @@ def check_slots(tiles: Tiles) -> None:
         raise ValueError("gradients and contributions need tiles with slots: make the tiles with bin_tiles(slotted=True)")
 
 
-def check_tiles(projected: torch.Tensor, tiles: Tiles, width: int, height: int, **backgrounds) -> None:
-    """Raise TypeError or ValueError unless tiles fit images of ``width`` x ``height`` px and projected Gaussians [C, N, 12]."""
-    sizes = launch.check(projected=(projected, "C N 12"), **backgrounds)
-    columns, rows = grid(width, height, tiles.size)
-    if len(tiles.ranges) != sizes["C"] * columns * rows:
-        raise ValueError(
-            f"tiles were made for another image: found {len(tiles.ranges)} tiles, but {sizes['C']} images of {width} x "
-            f"{height} px have {sizes['C'] * columns * rows} tiles of {tiles.size} px"
-        )
-
-
 def blend(
-    projected: torch.Tensor,
-    tiles: Tiles,
-    backgrounds: torch.Tensor,
-    *,
-    width: int,
-    height: int,
-    rule: Rule,
-    deterministic: bool = True,
-    origin: tuple[int, int] = (0, 0),
-    absgrad: bool = False,
+    projected: torch.Tensor, tiles: Tiles, backgrounds: torch.Tensor, settings: Pass
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Composite C images of H x W pixels (Kerbl et al. 2023, eq. 3): return rgb [C, H, W, 3], alpha and depth [C, H, W]."""
     # Differentiable in the first ten values of ``projected`` [C, N, 12] and in ``backgrounds`` [C, 3]; a clamped alpha has
     # gradient zero. Derivation: docs/blend.md. Depth is the mean [u] under the blending weights, 0 where they sum to less than
     # SMALLEST_WEIGHT. ``deterministic=False`` adds gradients atomically on CUDA in float32. ``absgrad`` puts sums of magnitudes
     # of the mean's gradient in the place of the gradient of the last two values of ``projected``.
-    check_tiles(projected, tiles, width, height, backgrounds=(backgrounds, "C 3"))
-    settings = Pass((width, height), (*origin, width, height), rule, deterministic=deterministic, absgrad=absgrad)
     return _Blend.apply(*without_gradients(projected, backgrounds), tiles, settings)
 
 
@@ -385,24 +362,9 @@ class _BlendChannels(torch.autograd.Function):
 
 
 def blend_channels(
-    projected: torch.Tensor,
-    tiles: Tiles,
-    colors: torch.Tensor,
-    backgrounds: torch.Tensor,
-    *,
-    width: int,
-    height: int,
-    rule: Rule,
-    deterministic: bool = True,
-    origin: tuple[int, int] = (0, 0),
-    absgrad: bool = False,
+    projected: torch.Tensor, tiles: Tiles, colors: torch.Tensor, backgrounds: torch.Tensor, settings: Pass
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Composite images [C, H, W, D] of any number of channels; colors [C or 1, N, D], backgrounds [C, D]; else as `blend`."""
     # Differentiable in ``colors``, ``backgrounds`` and the projected Gaussians, except their colours and boxes. Gradients are
     # summed over the passes in a fixed order; with ``absgrad``, so are magnitudes.
-    shared = "1" if len(colors) == 1 else "C"
-    check_tiles(projected, tiles, width, height, colors=(colors, f"{shared} N D"), backgrounds=(backgrounds, "C D"))
-    if colors.shape[-1] == 0:
-        raise ValueError(f"colors must have at least one channel, not shape {list(colors.shape)}")
-    settings = Pass((width, height), (*origin, width, height), rule, deterministic=deterministic, absgrad=absgrad)
     return _BlendChannels.apply(*without_gradients(projected, colors, backgrounds), tiles, settings)

@@ -3,8 +3,6 @@
 `CapturedGraph` is one graph. `GraphedFunction` captures a function of tensors once for each set of addresses, and replays it.
 """
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import gc

@@ -1,7 +1,5 @@
 """Torch and Warp side by side: tensors as arrays, devices and streams, launches, derivatives."""
 
-from __future__ import annotations
-
 import _thread
 import contextlib
 import ctypes

@@ -173,7 +173,6 @@ def make_reach_kernel():
 
 def camera_reach(means: torch.Tensor, centers: torch.Tensor, fraction: float) -> torch.Tensor:
     """Return log(``fraction`` x distance of means [N, 3] to the nearest of centers [C, 3]), from log(`SMALLEST_REACH`)."""
-    launch.check(means=(means, "N 3"), centers=(centers, "C 3"))
     return _log_sizes(make_reach_kernel(), means, centers, fraction)
 
 
@@ -220,5 +219,4 @@ def pixel_size(means: torch.Tensor, cameras: torch.Tensor, fraction: float) -> t
     """Return log(``fraction`` x smallest pixel size at means [N, 3]) over cameras [C, 9] (`COLUMNS`) that see them, [N]."""
     # The pixel size of a camera is depth / focal length, or distance / focal length for a fisheye (Yu et al. 2024,
     # Mip-Splatting, section 4.1). A camera sees the points in the cone around its image.
-    launch.check(means=(means, "N 3"), cameras=(cameras, "C 9"))
     return _log_sizes(make_pixel_kernel(), means, cameras, fraction)

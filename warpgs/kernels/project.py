@@ -6,12 +6,11 @@ from collections.abc import Sequence
 import torch
 import warp as wp
 
-from warpgs.constants import Rule
 from warpgs.device import BINNING, BLENDING, FLOAT, LOSS, PROJECTION, SAMPLING, Needs, StepSizes
 from warpgs.errors import UsageError
-from warpgs.kernels import launch, project_cpu, project_cuda, sh
+from warpgs.kernels import launch, project_cpu, project_cuda
 from warpgs.kernels.cameras import CAMERA_MODELS
-from warpgs.kernels.ellipse import PROJECTED_SIZE, ProjectInputs, checked_factors
+from warpgs.kernels.ellipse import PROJECTED_SIZE, ProjectInputs
 from warpgs.kernels.falloff import Pass
 from warpgs.kernels.graphs import TORCH, Allocator
 from warpgs.kernels.launch import first_order, keep, kept
@@ -110,40 +109,11 @@ def project_gradients(
     return [*found, *(v.sum(1, dtype=torch.float64).to(v.dtype) for v in (v_viewmats, v_Ks))]
 
 
-def project(
-    means: torch.Tensor,
-    quats: torch.Tensor,
-    log_scales: torch.Tensor,
-    logit_opacities: torch.Tensor,
-    sh_coefficients: torch.Tensor,
-    viewmats: torch.Tensor,
-    Ks: torch.Tensor,
-    *,
-    width: int,
-    height: int,
-    degree: int,
-    rule: Rule,
-    tile_size: int = 16,
-    opacity_factors: torch.Tensor | None = None,
-    window: tuple[int, int, int, int] | None = None,
-    camera_model: str = "pinhole",
-    distortion: torch.Tensor | None = None,
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Project Gaussians into C cameras (EWA, first order): return rows [C, N, 12] (`PROJECTED_SIZE`), tile counts [C, N]."""
-    # Differentiable in the seven tensors (docs/project.md). A Gaussian is culled, with results and gradients zero, if its depth
-    # is below ``rule.near`` or above ``rule.far``, its opacity is below the cut-off, its box is outside the image, or a
-    # parameter that is read is non-finite or outside the ranges of docs/conventions.md. ``window`` is left, top, width and
-    # height of the part to render [px].
-    if distortion is None:
-        distortion = viewmats.new_empty(len(viewmats), 0)
-    factors = checked_factors(means, opacity_factors)
-    inputs = ProjectInputs(means, quats, log_scales, logit_opacities, sh_coefficients, viewmats, Ks, distortion, factors)
-    count, window = sh.coefficient_count(degree), window or (0, 0, width, height)
-    return project_inputs(inputs, Pass((width, height), window, rule, count, tile_size, camera_model))
-
-
 def project_inputs(inputs: ProjectInputs, settings: Pass) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return projected Gaussians [C, N, 12] and tile counts [C, N], int32, as `project` does."""
+    """Project Gaussians into C cameras (EWA, first order): return rows [C, N, 12] (`PROJECTED_SIZE`), tile counts [C, N]."""
+    # Differentiable in the first seven tensors (docs/project.md). A Gaussian is culled, with results and gradients zero, if its
+    # depth is below ``rule.near`` or above ``rule.far``, its opacity is below the cut-off, its box is outside the window, or a
+    # parameter that is read is non-finite or outside the ranges of docs/conventions.md.
     model = CAMERA_MODELS.find(settings.camera_model)
     scales, opacities = ("log_scales", "logit_opacities") if settings.parameters == "stored" else ("scales", "opacities")
     sizes = launch.check(

@@ -524,15 +524,6 @@ def scanline_costs(costs: torch.Tensor, down: torch.Tensor, across: torch.Tensor
     # limit) - min_i L(k-1, i), with the limit of the step from k - 1 to k (Hirschmüller 2008, eq. 13). Costs, penalties: at
     # most `LARGEST`.
     height, width, planes = costs.shape
-    for name, tensor, dtype, shape in (
-        ("costs", costs, torch.int16, (height, width, planes)),
-        ("down", down, torch.int32, (height - 1, width)), ("across", across, torch.int32, (height, width - 1)),
-    ):  # fmt: skip
-        if tensor.dtype != dtype or tuple(tensor.shape) != shape or tensor.device != costs.device:
-            raise ValueError(
-                f"{name} must be {dtype} of shape {list(shape)} on {costs.device}, "
-                f"not {tensor.dtype} of shape {list(tensor.shape)} on {tensor.device}"
-            )
     cpu = costs.device.type == "cpu"
     more = -planes % LANES if cpu else 0
     if more:  # extra planes with the worst cost, which no path prefers

@@ -3,11 +3,12 @@
 import functools
 from dataclasses import dataclass
 from types import SimpleNamespace
+from typing import Any
 
 import torch
 import warp as wp
 
-from warpgs.constants import TILE_SIZE, Rule
+from warpgs.constants import TILE_SIZE
 from warpgs.device import (
     BINNING,
     BLENDING,
@@ -577,19 +578,14 @@ def _depth_order(
 
 
 def bin_tiles(
-    projected: torch.Tensor, tile_counts: torch.Tensor, *, width: int, height: int, rule: Rule, tile_size: int = TILE_SIZE,
-    origin: tuple[int, int] = (0, 0), memory: InstanceMemory = AS_NEEDED, slotted: bool = True,
-    listed: torch.Tensor | None = None,
+    projected: torch.Tensor, tile_counts: torch.Tensor, settings: Any, memory: InstanceMemory = AS_NEEDED,
+    slotted: bool = True, listed: torch.Tensor | None = None,
 ) -> Tiles:  # fmt: skip
-    """Return for every tile the Gaussians [C, N, 12] that touch it, front to back. Not differentiable."""
-    # ``origin`` is left and top [px] of the window given to `project`, multiples of ``tile_size``. Without ``slotted``, which
-    # gradients and `contributions` need, slots stay empty. ``listed`` [C * tiles] is True for the tiles that get instances;
-    # None for all.
-    sizes = launch.check(projected=(projected, "C N 12"))
-    cameras, per_camera = sizes["C"], sizes["N"]
-    if tuple(tile_counts.shape) != (cameras, per_camera) or tile_counts.dtype != torch.int32:
-        wanted, found = [cameras, per_camera], list(tile_counts.shape)
-        raise ValueError(f"tile_counts must be int32 of shape {wanted}, not {tile_counts.dtype} of shape {found}")
+    """Return for every tile of the window the Gaussians [C, N, 12] that touch it, front to back. Not differentiable."""
+    # ``settings`` are a `falloff.Pass`. Without ``slotted``, which gradients and `contributions` need, slots stay empty.
+    # ``listed`` [C * tiles] is True for the tiles that get instances; None for all.
+    cameras, per_camera, _ = projected.shape
+    (*origin, width, height), tile_size, rule = settings.window, settings.tile_size, settings.rule
     columns, rows = grid(width, height, tile_size)
     no_tile = cameras * columns * rows
     if no_tile > launch.MAX_SIZE:

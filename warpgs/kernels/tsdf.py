@@ -178,10 +178,6 @@ def integrate(
     """Add one view's signed distances to a grid [X, Y, Z], except at points more than ``truncation`` [u] behind the surface."""
     # Distances are means in front of the surface divided by the truncation, in [-1, 1], undefined at weight 0; weights are the
     # sums over the views that saw the point. Both are changed in place.
-    check_pinhole(camera)
-    launch.check(
-        depth=(depth, "H W"), pixel_weights=(pixel_weights, "H W"), distances=(distances, "X Y Z"), weights=(weights, "X Y Z")
-    )
     inputs = [
         depth.new_tensor([origin]), voxel, truncation, *distances.shape[1:], *_pose(camera, depth), depth, pixel_weights,
         distances, weights,
@@ -195,11 +191,6 @@ def gather_colors(
     image: torch.Tensor, sums: torch.Tensor, weights: torch.Tensor,
 ) -> None:  # fmt: skip
     """Add one view's weighted colours in place to the points [N, 3] on the surface that it sees, within ``tolerance`` [u]."""
-    check_pinhole(camera)
-    launch.check(
-        points=(points, "N 3"), depth=(depth, "H W"), pixel_weights=(pixel_weights, "H W"), image=(image, "H W 3"),
-        sums=(sums, "N 3"), weights=(weights, "N"),
-    )  # fmt: skip
     inputs = [points, tolerance, *_pose(camera, points), depth, pixel_weights, image, sums, weights]
     kernels = make_kernels(launch.real_of(points))
     launch.launch(kernels.gather, len(points), inputs, points.device, cost=5)

@@ -256,12 +256,14 @@ def adam_scheduled(
     param: torch.Tensor, grad: torch.Tensor, exp_avg: torch.Tensor, exp_avg_sq: torch.Tensor, lrs: torch.Tensor,
     skip: torch.Tensor, *, head: int, betas: tuple[float, float] = BETAS, eps: float = EPS,
 ) -> None:  # fmt: skip
-    """Update as `adam_step` does, in float32, with learning rates [3] in memory, unless ``skip`` [1] is not 0."""
+    """Update rows [N, ...] and their moments in place, as `torch.optim.Adam` does, unless ``skip`` [1] is not 0."""
+    # ``lrs`` [3] are those of `scheduled_lrs`; the first ``head`` numbers of each row take the first. All tensors are float32
+    # and contiguous.
     if param.numel() == 0:
         return
     if param.device.type == "cpu":
         if int(skip) == 0:
-            _update(param, grad, exp_avg, exp_avg_sq, lrs.tolist(), head, betas, eps)
+            update_rows(param, grad, exp_avg, exp_avg_sq, lrs.tolist(), head, betas, eps)
         return
     inputs = [
         grad.contiguous(), param[0].numel(), head, lrs, *betas, 1 - betas[0], 1 - betas[1], eps, skip,
@@ -270,7 +272,7 @@ def adam_scheduled(
     launch.launch(scheduled_update, -(-param.numel() // 4), inputs, param.device)
 
 
-def _update(param, grad, exp_avg, exp_avg_sq, lrs: list[float], head: int, betas: tuple[float, float], eps: float) -> None:
+def update_rows(param, grad, exp_avg, exp_avg_sq, lrs: list[float], head: int, betas: tuple[float, float], eps: float) -> None:
     """Launch the generic kernel, which is used on a CPU and for float64."""
     real, device = launch.real_of(param), param.device
     length, lanes = (SEGMENT, LANES) if device.type == "cpu" else (1, 1)
@@ -282,39 +284,6 @@ def _update(param, grad, exp_avg, exp_avg_sq, lrs: list[float], head: int, betas
         ]  # fmt: skip
         kernel = make_adam_kernel(real, head > 0, lanes)
         launch.launch(kernel, -(-param.numel() // length), inputs, device, cost=max(1, length // 16))
-
-
-def adam_step(
-    param: torch.Tensor,
-    grad: torch.Tensor,
-    exp_avg: torch.Tensor,
-    exp_avg_sq: torch.Tensor,
-    *,
-    lr: float,
-    step: int,
-    betas: tuple[float, float] = BETAS,
-    eps: float = EPS,
-    head_lr: float | None = None,
-    head: int = 0,
-) -> None:
-    """Update a parameter [N, ...] and its moments in place, with bias correction as in `torch.optim.Adam`."""
-    # The first ``head`` numbers of each of the N rows take the learning rate ``head_lr``.
-    pattern = " ".join(str(s) for s in param.shape)
-    launch.check(param=(param, pattern), grad=(grad, pattern), exp_avg=(exp_avg, pattern), exp_avg_sq=(exp_avg_sq, pattern))
-    if not (param.is_contiguous() and exp_avg.is_contiguous() and exp_avg_sq.is_contiguous()):
-        raise ValueError("param, exp_avg and exp_avg_sq are updated in place and must be contiguous")
-    if step < 1:
-        raise ValueError(f"step must be at least 1, not {step}")
-    if param.numel() == 0:
-        return
-    lrs = scheduled_lrs(lr, step, betas, head_lr)
-    if param.is_cuda and param.dtype == torch.float32:
-        # one kernel for this and for captured steps, so that both give the same bits
-        skip = torch.zeros(1, dtype=torch.int32, device=param.device)
-        on_device = torch.tensor(lrs, device=param.device, dtype=torch.float32)
-        adam_scheduled(param, grad, exp_avg, exp_avg_sq, on_device, skip, betas=betas, eps=eps, head=head)
-        return
-    _update(param, grad, exp_avg, exp_avg_sq, lrs, head, betas, eps)
 
 
 # Opacity decay: multiply every opacity by a factor, so that only Gaussians that the views support stay opaque.

@@ -6,9 +6,8 @@ from types import SimpleNamespace
 import torch
 import warp as wp
 
-from warpgs.constants import Rule
 from warpgs.kernels import blend_cuda, launch
-from warpgs.kernels.blend import check_slots, check_tiles, composite, is_native, make_segments
+from warpgs.kernels.blend import check_slots, composite, is_native, make_segments
 from warpgs.kernels.blend_cuda import SCALE
 from warpgs.kernels.ellipse import PROJECTED_SIZE
 from warpgs.kernels.falloff import STRIP, Pass, make_functions, make_struct
@@ -190,30 +189,22 @@ def _walk(make_visit, projected: torch.Tensor, tiles: Tiles, settings: Pass, k: 
     launch.launch(kernel, len(tiles.ranges), inputs, device, cost=10_000, block_dim=32)
 
 
-def median_depth(
-    projected: torch.Tensor, tiles: Tiles, *, width: int, height: int, rule: Rule, origin: tuple[int, int] = (0, 0)
-) -> torch.Tensor:
+def median_depth(projected: torch.Tensor, tiles: Tiles, settings: Pass) -> torch.Tensor:
     """Return the depth [u] of the Gaussian at which a pixel's transmittance falls to 1/2 or below, else 0, [C, H, W]."""
     # This is the weighted median of depth; the background has the rest of the weight. At an edge it does not mix both surfaces,
     # unlike the mean depth of `blend`. Not differentiable. Results repeat bit for bit with any number of threads.
-    check_tiles(projected, tiles, width, height)
     projected = projected.detach().contiguous()
-    settings, depths = Pass((width, height), (*origin, width, height), rule), projected.new_zeros(len(projected), height, width)
+    depths = projected.new_zeros(len(projected), *settings.window[:1:-1])
     _walk(make_median, projected, tiles, settings, 0, depths)
     return depths
 
 
-def heaviest(
-    projected: torch.Tensor, tiles: Tiles, k: int, *, width: int, height: int, rule: Rule, origin: tuple[int, int] = (0, 0)
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+def heaviest(projected: torch.Tensor, tiles: Tiles, k: int, settings: Pass) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Return ids [C, H, W, k] of the Gaussians of largest weight alpha * T in each pixel, the weights, and counts [C, H, W]."""
     # Heaviest first; equal weights nearest first; id -1 with weight 0 where fewer than k have a weight. The count is of all
     # that were blended. Not differentiable. Results repeat bit for bit with any number of threads.
-    check_tiles(projected, tiles, width, height)
-    if k < 1:
-        raise ValueError(f"the number of heaviest Gaussians must be at least 1, not {k}")
     projected = projected.detach().contiguous()
-    settings, shape = Pass((width, height), (*origin, width, height), rule), (len(projected), height, width)
+    shape = len(projected), *settings.window[:1:-1]
     weights = projected.new_zeros(*shape, k)
     ids = torch.full((*shape, k), -1, dtype=torch.int32, device=projected.device)
     counts = torch.zeros(shape, dtype=torch.int32, device=projected.device)
@@ -221,14 +212,11 @@ def heaviest(
     return ids, weights, counts
 
 
-def contributions(
-    projected: torch.Tensor, tiles: Tiles, *, width: int, height: int, rule: Rule, origin: tuple[int, int] = (0, 0)
-) -> tuple[torch.Tensor, torch.Tensor]:
+def contributions(projected: torch.Tensor, tiles: Tiles, settings: Pass) -> tuple[torch.Tensor, torch.Tensor]:
     """Return sum and maximum of each Gaussian's blending weights alpha * T over pixels, [C, N] each. Not differentiable."""
-    check_tiles(projected, tiles, width, height)
     check_slots(tiles)
     projected = projected.detach().contiguous()
-    settings, weights = Pass((width, height), (*origin, width, height), rule), projected.new_zeros(len(tiles.slots), 2)
+    weights = projected.new_zeros(len(tiles.slots), 2)
     if is_native(projected):
         ends = composite(projected, tiles, projected.new_zeros(len(projected), 3), settings, save=False)[5]
         blend_cuda.instance_weights(projected, tiles, settings, ends, weights)

@@ -1,11 +1,9 @@
 """Fusion of depth into a grid of signed distances, and its zero surface as triangles."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
@@ -17,6 +15,7 @@ from warpgs.kernels.tsdf import gather_colors, integrate
 from warpgs.mesh.views import DEPTHS, SAMPLES, SurfaceViews, agreed, depth_map, neighbours, sample_surface
 from warpgs.render.options import RasterizeOptions
 from warpgs.scene import Camera, Gaussians, Mesh
+from warpgs.schema import Checked, Within
 
 RESOLUTION = 256
 """Voxels along the longest side of the box around the surfaces, if neither ``voxel`` nor ``resolution`` is given."""
@@ -189,30 +188,23 @@ MIN_FACES = 4
 
 
 @dataclass(frozen=True)
-class MeshOptions:
+class MeshOptions(Checked, group="--"):
     """Options of `fuse`."""
 
-    voxel: float | None = None
+    voxel: Annotated[float | None, Within(0, math.inf, "()")] = None
     """Distance between neighbouring grid points [u]; None to derive it from ``resolution``."""
-    resolution: int | None = None
+    resolution: Annotated[int | None, Within(MIN_RESOLUTION, MAX_RESOLUTION)] = None
     """Voxels along the longest side of the box around the surfaces; None for 256, or fewer if the images resolve less."""
-    max_faces: int = 200_000
+    max_faces: Annotated[int, Within(MIN_FACES)] = 200_000
     """Largest number of triangles; larger meshes are simplified."""
-    depth: str = "median"
+    depth: Annotated[str, DEPTHS] = "median"
     """Rendered depth that is fused: median, or mean (expected depth), which mixes surfaces at edges."""
 
     def __post_init__(self) -> None:
         """Check the options, before any view is rendered."""
-        if self.depth not in DEPTHS:
-            raise UsageError(f"--depth {self.depth!r} is not one of {', '.join(DEPTHS)}")
-        if self.voxel is not None and not 0 < self.voxel < math.inf:
-            raise UsageError(f"--voxel must be a number above 0, not {self.voxel:g}")
+        super().__post_init__()
         if None not in (self.voxel, self.resolution):
             raise UsageError("--voxel and --resolution exclude each other; give one of them")
-        if self.resolution is not None and not MIN_RESOLUTION <= self.resolution <= MAX_RESOLUTION:
-            raise UsageError(f"--resolution must be {MIN_RESOLUTION} to {MAX_RESOLUTION} voxels, not {self.resolution}")
-        if self.max_faces < MIN_FACES:
-            raise UsageError(f"--max-faces must be at least {MIN_FACES}, not {self.max_faces}")
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,5 @@
 """Depth of a model's surface as many views see it, and where the views agree."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 

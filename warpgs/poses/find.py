@@ -1,7 +1,5 @@
 """`find_poses`: photographs become a scene folder, with a record of how, and advice where it fails."""
 
-from __future__ import annotations
-
 import hashlib
 import math
 import shutil
@@ -11,19 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from warpgs import schema
+from warpgs import files, schema
 from warpgs.errors import DataError, UsageError
-from warpgs.files import (
-    NOT_REGULAR,
-    filling,
-    input_digest,
-    is_empty,
-    make_folder,
-    unread_reason,
-    write_bytes,
-    write_json,
-    write_text,
-)
 from warpgs.io.folder import all_readers
 from warpgs.io.image_files import MAX_PIXELS, unread_note
 from warpgs.poses.mapping import EXHAUSTIVE, LEARNED, Mapping, camera_groups, cameras_of, check_installed, find_model
@@ -227,9 +214,9 @@ def source_digest(source: Path, allow_outside: bool = False) -> str:
 
     def digest(path: Path) -> str:
         try:
-            return input_digest(path)
+            return files.input_digest(path)
         except OSError as e:
-            raise DataError(f"{path}: cannot be read ({unread_reason(e)}); fix its permissions or copy it again") from e
+            raise DataError(f"{path}: cannot be read ({files.unread_reason(e)}); fix its permissions or copy it again") from e
 
     if is_video(source):
         return digest(source)
@@ -256,10 +243,10 @@ def find_poses(
     _check(source, out, allow_outside)
     check_installed()
     network = None if matcher is None else Matcher(matcher, threads)
-    with filling(out) as scene:
+    with files.filling(out) as scene:
         work, kind = scene / "work", "video" if is_video(source) else "photographs"
         digest = source_digest(source, allow_outside)  # before anything is written, which may be below the source
-        make_folder(work / "small")
+        files.make_folder(work / "small")
         photographs, names, notes = _prepared(source, work, frames, max_pixels, progress)
         found = find_model(photographs, names, kind, work, progress, threads)
         if network is not None:
@@ -270,12 +257,12 @@ def find_poses(
         for done, i in enumerate(found.views):
             progress(f"writing images: {done + 1} of {len(found.views)}")
             write_copy(photographs[i], scene / "images", max_pixels)
-        make_folder(scene / "sparse" / "0")
+        files.make_folder(scene / "sparse" / "0")
         for name in MODEL_FILES:
             if (work / "model" / name).is_file():
-                write_bytes(scene / "sparse" / "0" / name, (work / "model" / name).read_bytes())
-        write_json(scene / JSON, record)
-        write_text(scene / TEXT, "\n".join(report_lines(record)) + "\n")
+                files.write_bytes(scene / "sparse" / "0" / name, (work / "model" / name).read_bytes())
+        files.write_json(scene / JSON, record)
+        files.write_text(scene / TEXT, "\n".join(report_lines(record)) + "\n")
         shutil.rmtree(work)
     return record
 
@@ -290,7 +277,7 @@ def _with_network(
     if count == len(photographs):
         return found, [f"{network.title} is not used: SIFT finds the poses of all photographs, and is more accurate"]
     small, second = [work / "small" / n for n in names], work / "network"
-    make_folder(second)
+    files.make_folder(second)
     turned = write_matches(network, small, second / LEARNED, kind, EXHAUSTIVE, progress)
     (work / "small").rename(second / "small")
     other = find_model(photographs, names, kind, second, progress, threads, learned=True)
@@ -323,7 +310,7 @@ def _check(source: Path, out: Path, allow_outside: bool) -> None:
     try:
         if not is_video(source):
             if not source.is_dir():
-                there = NOT_REGULAR if source.exists() else "does not exist"
+                there = files.NOT_REGULAR if source.exists() else "does not exist"
                 what = "is not a supported video (mp4, mov, m4v, avi, mkv, webm)" if source.is_file() else there
                 raise DataError(f"{source}: {what}; give a folder of photographs, or a video")
             if other := _something_else(source):
@@ -331,7 +318,7 @@ def _check(source: Path, out: Path, allow_outside: bool) -> None:
             if not photographs_inside(source, allow_outside):
                 none = "holds no supported image (JPEG, PNG, BMP, TIFF, WebP, AVIF or HEIC); give the folder of photographs"
                 raise DataError(f"{source}: {unread_note(source) or none}")
-        if out.exists() and not (out.is_dir() and is_empty(out)):
+        if out.exists() and not (out.is_dir() and files.is_empty(out)):
             raise UsageError(f"{out} exists already; choose another --out, or remove it")
     except OSError as e:
         raise UsageError(f"{e.filename or out}: cannot be read ({e.strerror or e}); choose another folder") from e
@@ -344,7 +331,7 @@ def _prepared(
     notes, root = [], source
     if is_video(source):
         root = work / "frames"
-        make_folder(root)
+        files.make_folder(root)
         total = write_frames(source, root, frames, progress)
         taken = min(frames, total)
         notes.append(f"{taken} of {total} frames are used: the sharpest frame of each of {taken} equal parts of the video")

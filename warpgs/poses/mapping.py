@@ -1,7 +1,5 @@
 """Structure from motion in a process of its own: what pycolmap is asked, and what it answers."""
 
-from __future__ import annotations
-
 import importlib.util
 import itertools
 import json

@@ -1,7 +1,5 @@
 """Matches between photographs: which pairs, and the network that matches them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 

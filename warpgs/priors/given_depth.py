@@ -1,7 +1,5 @@
 """Depth that the user gives: its scale in the scene, and views without distortion."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

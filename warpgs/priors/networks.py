@@ -1,7 +1,5 @@
 """Networks of the priors: input, session, cache of results, and monocular depth."""
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import json

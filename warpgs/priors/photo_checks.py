@@ -4,8 +4,6 @@ Two photographs are compared at points that both show: SIFT matches that agree w
 differences in blur and colour, not in content (docs/scenes.md, "Photograph checks").
 """
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Callable, Sequence

@@ -1,7 +1,5 @@
 """Depth by plane sweep: which views to compare, which planes, and the depth that fits best."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Chunked rendering: windows of an image, each with at most a given number of (Gaussian, tile) pairs, called instances."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 
@@ -11,8 +9,8 @@ from warpgs.kernels.ellipse import ProjectInputs
 from warpgs.kernels.falloff import Pass
 from warpgs.kernels.launch import first_order, keep, kept
 from warpgs.kernels.project import project_inputs
-from warpgs.kernels.tiles import AS_NEEDED, InstanceMemory
-from warpgs.render.compose import Images, bin_and_blend, bin_projected, further_of
+from warpgs.kernels.tiles import AS_NEEDED, InstanceMemory, bin_tiles
+from warpgs.render.compose import Images, bin_and_blend, further_of
 
 
 def halves(settings: Pass) -> tuple[Pass, ...]:
@@ -102,7 +100,7 @@ def further_chunked(
     found: dict[str, torch.Tensor] = {}
     _, _, width, height = settings.window
     for part, counts in chunks(settings, most, inputs.detached()):
-        tiles = bin_projected(projected, counts, part, memory, contributions)
+        tiles = bin_tiles(projected, counts, part, memory, contributions)
         for name, values in further_of(projected, tiles, part, contributions, median, k).items():
             if name == "weight_sums":
                 found[name] = found[name] + values if name in found else values

@@ -1,7 +1,5 @@
 """One pass of the rasterizer: the tensors and settings of a render, projection, binning and blending."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from typing import Any
 
@@ -78,21 +76,6 @@ def pass_of(camera: Camera, degree: int, rule: Rule, **others: Any) -> Pass:
     return Pass(size, rule=rule, sh_count=sh.coefficient_count(degree), **named)
 
 
-def of_window(settings: Pass) -> dict[str, Any]:
-    """Return the window's size and position, and the rule, as keyword arguments of the kernels' public functions."""
-    x, y, width, height = settings.window
-    return {"width": width, "height": height, "rule": settings.rule, "origin": (x, y)}
-
-
-def bin_projected(
-    projected: torch.Tensor, tile_counts: torch.Tensor, settings: Pass, memory: InstanceMemory = AS_NEEDED,
-    slotted: bool = True, listed: torch.Tensor | None = None,
-) -> Tiles:  # fmt: skip
-    """Return for each tile of the window the Gaussians [C, N, 12] that touch it, front to back (`bin_tiles`)."""
-    named = {"memory": memory, "slotted": slotted, "listed": listed, **of_window(settings)}
-    return bin_tiles(projected, tile_counts, tile_size=settings.tile_size, **named)
-
-
 def compose(
     inputs: ProjectInputs, backgrounds: torch.Tensor, settings: Pass, memory: InstanceMemory = AS_NEEDED
 ) -> tuple[Images, torch.Tensor, torch.Tensor]:
@@ -106,7 +89,7 @@ def bin_and_blend(
     memory: InstanceMemory = AS_NEEDED, colors: torch.Tensor | None = None,
 ) -> Images:  # fmt: skip
     """Bin and blend projected Gaussians [C, N, 12]; ``colors`` as in `images_of`."""
-    tiles = bin_projected(projected, tile_counts, settings, memory, needs_slots((projected, backgrounds, colors)))
+    tiles = bin_tiles(projected, tile_counts, settings, memory, needs_slots((projected, backgrounds, colors)))
     return images_of(projected, tiles, backgrounds, settings, colors)
 
 
@@ -119,23 +102,22 @@ def images_of(
     projected: torch.Tensor, tiles: Tiles, backgrounds: torch.Tensor, settings: Pass, colors: torch.Tensor | None = None
 ) -> Images:
     """Return the images of binned Gaussians: in their own colours, or in channels [1, N, D] or [C, N, D] of ``colors``."""
-    named = {"deterministic": settings.deterministic, "absgrad": settings.absgrad, **of_window(settings)}
     if colors is None:
-        return blend(projected, tiles, backgrounds, **named)
-    return blend_channels(projected, tiles, colors, backgrounds, **named)
+        return blend(projected, tiles, backgrounds, settings)
+    return blend_channels(projected, tiles, colors, backgrounds, settings)
 
 
 def further_of(
     projected: torch.Tensor, tiles: Tiles, settings: Pass, weights: bool, median: bool, k: int
 ) -> dict[str, torch.Tensor]:
     """Return further fields of `Render` by name: weights [C, N], median depth [C, H, W], and the ``k`` heaviest Gaussians."""
-    found, window = {}, of_window(settings)
+    found = {}
     if weights:
-        found["weight_sums"], found["weight_maxima"] = contributions(projected, tiles, **window)
+        found["weight_sums"], found["weight_maxima"] = contributions(projected, tiles, settings)
     if median:
-        found["median_depth"] = median_depth(projected, tiles, **window)
+        found["median_depth"] = median_depth(projected, tiles, settings)
     if k:
-        found |= dict(zip(("heaviest_ids", "heaviest_weights", "blend_counts"), heaviest(projected, tiles, k, **window)))
+        found |= dict(zip(("heaviest_ids", "heaviest_weights", "blend_counts"), heaviest(projected, tiles, k, settings)))
     return found
 
 
@@ -150,5 +132,5 @@ def composite_into(
     save: bool = True,
 ) -> tuple[Tiles, Sequence[torch.Tensor]]:  # fmt: skip
     """Bin and blend [C, N, 12] without autograd, in the allocator's memory; also return the backward pass's tensors."""
-    tiles = bin_projected(projected, tile_counts, settings, memory, save)
+    tiles = bin_tiles(projected, tile_counts, settings, memory, save)
     return tiles, blending.composite(projected, tiles, backgrounds, settings, save=save, allocator=memory.allocator)

@@ -7,8 +7,6 @@ capture; otherwise the kernels are launched one by one. Both give the same bits.
 capacity for instances.
 """
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import math

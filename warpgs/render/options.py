@@ -1,7 +1,5 @@
 """Options of the rasterizer."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from numbers import Real
 

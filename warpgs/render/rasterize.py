@@ -20,19 +20,10 @@ from warpgs.kernels.ellipse import ProjectInputs
 from warpgs.kernels.falloff import WIDTHS, Pass
 from warpgs.kernels.launch import refuse_transforms, without_gradient
 from warpgs.kernels.project import project_inputs
-from warpgs.kernels.tiles import BYTES_PER_INSTANCE, InstanceMemory, grid
+from warpgs.kernels.tiles import BYTES_PER_INSTANCE, InstanceMemory, bin_tiles, grid
 from warpgs.means2d import count_passes
-from warpgs.render import graphed
+from warpgs.render import compose, graphed
 from warpgs.render.chunked import blend_chunked, further_chunked
-from warpgs.render.compose import (
-    bin_projected,
-    further_of,
-    images_of,
-    inputs_of,
-    needs_slots,
-    parameters_of,
-    pass_of,
-)
 from warpgs.render.options import RasterizeOptions
 from warpgs.scene import ActivatedGaussians, Camera, CovarianceGaussians, Gaussians, RasterizedGaussians, Render
 
@@ -343,7 +334,7 @@ def _render(gaussians: RasterizedGaussians, camera: Camera, options: RasterizeOp
     refuse_transforms()
     _check_arguments(gaussians, camera, options)
     check_camera(camera)
-    inputs = inputs_of(gaussians, camera, options.opacity_factors)
+    inputs = compose.inputs_of(gaussians, camera, options.opacity_factors)
     degree = gaussians.sh_degree if options.sh_degree is None else options.sh_degree
     degree = degree if options.colors is None else 0  # unused harmonics: read as few as possible
     pixels = None
@@ -351,7 +342,9 @@ def _render(gaussians: RasterizedGaussians, camera: Camera, options: RasterizeOp
         pixels = checked_pixels(options.pixels, len(inputs.viewmats), inputs.means.device)
     window = _checked_window(camera, options) if pixels is None else window_of(pixels, camera, options.tile_size)
     shared = {n: getattr(options, n) for n in ("tile_size", "absgrad", "antialiased", "deterministic")}
-    settings = pass_of(camera, degree, options.cut_offs(), window=window, parameters=parameters_of(gaussians), **shared)
+    settings = compose.pass_of(
+        camera, degree, options.cut_offs(), window=window, parameters=compose.parameters_of(gaussians), **shared
+    )
     colors = _checked_channels("colors", options.colors, inputs)
     features = _checked_channels("features", options.features, inputs)
     if options.absgrad and (features is not None or (colors is not None and colors.shape[-1] > WIDTHS[-1])):
@@ -360,7 +353,7 @@ def _render(gaussians: RasterizedGaussians, camera: Camera, options: RasterizeOp
         )
     if inputs.means.is_cuda and options.repeatable():
         backgrounds = None if options.background is None else _layer("background", options.background, None, inputs)[1]
-        gradients = needs_slots((*inputs, backgrounds))
+        gradients = compose.needs_slots((*inputs, backgrounds))
         found = graphed.recorder(inputs.means.device, gradients).render(inputs, backgrounds, settings)
         if found is not None:
             return _as_render(camera, *found)
@@ -421,11 +414,11 @@ def _rasterize(
     else:
         overflow = None if options.capacity is None else torch.zeros(1, dtype=torch.int32, device=projected.device)
         memory = InstanceMemory(budget, options.capacity, overflow)
-        slotted = options.contributions or needs_slots([projected, *(t for layer in layers for t in layer)])
+        slotted = options.contributions or compose.needs_slots([projected, *(t for layer in layers for t in layer)])
         listed = None if pixels is None else listed_tiles(pixels, settings, len(projected))
-        tiles = bin_projected(projected, tile_counts, settings, memory, slotted, listed)
-        images = [images_of(projected, tiles, backgrounds, settings, colors) for colors, backgrounds in layers]
-        maps = further_of(projected, tiles, settings, *further)
+        tiles = bin_tiles(projected, tile_counts, settings, memory, slotted, listed)
+        images = [compose.images_of(projected, tiles, backgrounds, settings, colors) for colors, backgrounds in layers]
+        maps = compose.further_of(projected, tiles, settings, *further)
         if overflow is not None:
             maps["overflow"] = overflow
     if len(images) > 1:

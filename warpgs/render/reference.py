@@ -1,7 +1,5 @@
 """Reference image of rule ``exact`` in float64, computed without the kernels: errors are measured against it."""
 
-from __future__ import annotations
-
 import torch
 
 from warpgs import geometry

@@ -1,10 +1,8 @@
 """Files of films: MP4 and animated images."""
 
-from __future__ import annotations
-
 import contextlib
 import io
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -24,22 +22,29 @@ PALETTE_PIXELS = 2**18
 """Number of pixels, taken from all frames, from which a GIF's palette is chosen."""
 
 
+def _checked(path: Path, frames: Iterable[np.ndarray]) -> Iterator[np.ndarray]:
+    """Yield frames as 8-bit values; a DataError if their sizes differ, as OpenCV drops such frames, or there are none."""
+    first = None
+    for i, frame in enumerate(frames):
+        first = first or frame.shape[:2]
+        if frame.shape[:2] != first:
+            (h, w), (height, width) = first, frame.shape[:2]
+            raise DataError(f"{path}: frame {i} is {width} x {height} px, the first {w} x {h} px")
+        yield np.round(np.clip(frame, 0, 1) * 255).astype(np.uint8)
+    if first is None:
+        raise DataError(f"{path}: there are no frames to write")
+
+
 def _pixels(path: Path, frames: Iterable[np.ndarray]) -> list[np.ndarray]:
     """Return frames as 8-bit values, after checking their number and size."""
     result: list[np.ndarray] = []
-    for frame in frames:
-        pixels = np.round(np.clip(frame, 0, 1) * 255).astype(np.uint8)
-        if result and pixels.shape != result[0].shape:
-            (h, w), (height, width) = result[0].shape[:2], pixels.shape[:2]
-            raise DataError(f"{path}: frame {len(result)} is {width} x {height} px, the first {w} x {h} px")
+    for pixels in _checked(path, frames):
         result.append(pixels)
         if len(result) * pixels.nbytes > MAX_BYTES:
             raise UsageError(
                 f"{path}: an animated image takes at most {MAX_BYTES // pixels.nbytes} frames of this size; write .mp4 or "
                 ".webm, or fewer or smaller frames"
             )
-    if not result:
-        raise DataError(f"{path}: there are no frames to write")
     return result
 
 
@@ -111,8 +116,8 @@ def _encode(path: Path, temporary: str, frames: Iterable[np.ndarray], fps: int, 
 
     writer = None
     try:
-        for frame in frames:
-            height, width = (s // 2 * 2 for s in frame.shape[:2])
+        for pixels in _checked(path, frames):
+            height, width = (s // 2 * 2 for s in pixels.shape[:2])
             if writer is None:
                 # for .webm OpenCV warns on stderr of an unknown tag, but writes VP9
                 with hidden_stderr() if path.suffix.lower() == ".webm" else contextlib.nullcontext():
@@ -120,17 +125,10 @@ def _encode(path: Path, temporary: str, frames: Iterable[np.ndarray], fps: int, 
                 if not writer.isOpened():
                     raise ResourceError(f"{path}: cannot be written; the folder is not writable, or OpenCV lacks a VP9 encoder")
             sizes.append((width, height))
-            # OpenCV drops a frame of another size silently.
-            if sizes[-1] != sizes[0]:
-                w, h = sizes[0]
-                raise DataError(f"{path}: frame {len(sizes) - 1} is {width} x {height} px, the first {w} x {h} px")
-            pixels = np.round(np.clip(frame[:height, :width], 0, 1) * 255).astype(np.uint8)
-            writer.write(np.ascontiguousarray(pixels[..., ::-1]))
+            writer.write(np.ascontiguousarray(pixels[:height, :width, ::-1]))
     finally:
         if writer is not None:
             writer.release()
-    if not sizes:
-        raise DataError(f"{path}: there are no frames to write")
 
 
 def _decoded_sizes(path: Path) -> list[tuple[int, int]]:

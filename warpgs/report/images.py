@@ -1,7 +1,5 @@
 """Images of a report: colour maps, crops, sheets."""
 
-from __future__ import annotations
-
 import io
 import textwrap
 from collections.abc import Sequence

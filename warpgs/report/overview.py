@@ -1,7 +1,5 @@
 """A scene with its cameras in one image: the overview of a report, and plots, which VTK draws in a process of its own."""
 
-from __future__ import annotations
-
 import io
 import json
 import math
@@ -15,6 +13,7 @@ from PIL import ImageColor
 from warpgs.errors import ResourceError
 from warpgs.files import disk_is_full
 from warpgs.folders import system_folder, temporary_folder
+from warpgs.geometry import pose_of
 from warpgs.process import run_python
 from warpgs.render.options import RasterizeOptions
 from warpgs.render.rasterize import rasterize
@@ -124,9 +123,8 @@ def render_overview(
     eye, focus, top = framing(shown, direction, up)
     axis = (focus - eye) / np.linalg.norm(focus - eye)
     right = np.cross(axis, top) / np.linalg.norm(np.cross(axis, top))
-    viewmat = np.eye(4)
-    viewmat[:3, :3] = right, np.cross(axis, right), axis
-    viewmat[:3, 3] = -viewmat[:3, :3] @ eye
+    rotation = np.stack([right, np.cross(axis, right), axis])
+    viewmat = pose_of(rotation, -rotation @ eye)
     focal = HEIGHT / 2 / math.tan(math.radians(VIEW_ANGLE / 2))
     camera = Camera(viewmat, np.array([[focal, 0, WIDTH / 2], [0, focal, HEIGHT / 2], [0, 0, 1]]), WIDTH, HEIGHT)
     near = torch.from_numpy(within(points, OUTSIDE)).to(gaussians.means.device)

@@ -1,7 +1,5 @@
 """The HTML page of a run, with its curves."""
 
-from __future__ import annotations
-
 import base64
 import hashlib
 import json

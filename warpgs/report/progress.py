@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
 
 from warpgs import schema
-from warpgs.errors import DataError, ResourceError
-from warpgs.files import appending, read_input, unread_reason, write_bytes
+from warpgs.errors import ResourceError
+from warpgs.files import appending, plain, read_file, write_bytes
 from warpgs.folders import RefusedError
 from warpgs.process import careful, printable, say
 
@@ -300,11 +300,7 @@ class EventLog:
 def read_events(path: Path) -> list[dict]:
     """Return all events of a log in file order; null is NaN, and an invalid line, as a killed run may leave, is skipped."""
     events = []
-    try:
-        data = read_input(path, MAX_BYTES, path.parent)
-    except OSError as e:
-        raise DataError(f"{path}: cannot be read ({unread_reason(e)}); restore it, or fit again") from e
-    for line in io.BytesIO(data):
+    for line in io.BytesIO(read_file(path, path.parent, MAX_BYTES, "restore it, or fit again")):
         try:
             event = schema.parse(line)
             _SERIES(event, "")
@@ -317,5 +313,4 @@ def read_events(path: Path) -> list[dict]:
 
 def _line(event: dict) -> bytes:
     """Return an event as a line; numbers that are not finite become null, because JSON cannot hold them."""
-    plain = {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in event.items()}
-    return (json.dumps(plain, allow_nan=False) + "\n").encode()
+    return (json.dumps(plain(event)) + "\n").encode()

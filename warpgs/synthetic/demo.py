@@ -1,7 +1,5 @@
 """The demo scenes: a room to fit, and an object cut out."""
 
-from __future__ import annotations
-
 import functools
 import json
 from collections.abc import Callable
@@ -11,7 +9,7 @@ import numpy as np
 
 from warpgs.errors import ResourceError, UsageError
 from warpgs.files import filling, is_empty, make_folder, write_bytes
-from warpgs.geometry import look_at, matmul
+from warpgs.geometry import look_at, matmul, pose_of
 from warpgs.process import counted
 from warpgs.scene import Camera
 from warpgs.synthetic import raycast
@@ -414,8 +412,7 @@ def _transforms(cameras: list[Camera]) -> str:
     """Return the text of a transforms.json: camera-to-world with OpenGL axes, the lens as a horizontal angle."""
     first, frames = cameras[0], []
     for i, camera in enumerate(cameras):
-        pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = camera.viewmat[:3, :3].T * np.array([1, -1, -1]), camera.center
+        pose = pose_of(camera.viewmat[:3, :3].T * np.array([1, -1, -1]), camera.center)
         frames.append({"file_path": f"images/{i:03d}.png", "transform_matrix": np.round(pose, 12).tolist()})
     angle = 2 * float(np.arctan(first.width / (2 * first.K[0, 0])))
     return json.dumps({"camera_angle_x": angle, "w": first.width, "h": first.height, "frames": frames}, indent=1)

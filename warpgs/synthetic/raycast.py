@@ -7,8 +7,6 @@ from the same intersection code. Shading is diffuse: a surface point has one col
 Axes as in an OpenCV camera: +x right, +y down, +z away from the viewer. Lengths in scene units [u].
 """
 
-from __future__ import annotations
-
 import abc
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

@@ -16,7 +16,7 @@ import torch
 from warpgs.device import format_bytes
 from warpgs.errors import DataError
 from warpgs.files import write_text
-from warpgs.geometry import convert_camera, convert_gaussians, look_at, matmul, quaternions, rotation_matrices
+from warpgs.geometry import convert_camera, convert_gaussians, look_at, matmul, pose_at, quaternions, rotation_matrices
 from warpgs.locks import hold_file
 from warpgs.pipeline.films.paths import fov_y, up_of
 from warpgs.pipeline.run.export import NO_FILTERS, Filters, file_gaussians, filtered, rotate_camera
@@ -51,9 +51,7 @@ def distance_ahead(camera: Camera, gaussians: Gaussians) -> float:
 def camera_at(wxyz: Any, position: Any, fov: float, width: int, height: int) -> Camera:
     """Return the pinhole camera of a camera-to-world rotation, position [u] and vertical field of view [rad]."""
     rotation = rotation_matrices(np.asarray(wxyz, np.float64)).T
-    viewmat = np.eye(4)
-    viewmat[:3, :3], viewmat[:3, 3] = rotation, -matmul(rotation, np.asarray(position, np.float64))
-    return _pinhole(viewmat, fov, width, height)
+    return _pinhole(pose_at(rotation, np.asarray(position, np.float64)), fov, width, height)
 
 
 def _pinhole(viewmat: np.ndarray, fov: float, width: int, height: int) -> Camera:

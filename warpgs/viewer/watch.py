@@ -94,7 +94,7 @@ class LiveView:
         self.server, self.title, self.folder = server, title, folder
         self._latest: FittedModel | None = None
         self._next = -math.inf
-        self._wake, self._shown, self._open = threading.Event(), threading.Event(), True
+        self._wake, self._open = threading.Event(), True
         self._window: Window | None = None
         self._thread = threading.Thread(target=self._draw, name="live view", daemon=True)
         self._thread.start()
@@ -107,10 +107,6 @@ class LiveView:
         self._latest = replace(model, scene_gaussians=Gaussians(**copy))
         self._next = time.monotonic() + POLL
         self._wake.set()
-
-    def wait_shown(self, seconds: float) -> bool:
-        """Wait up to ``seconds`` until a state was shown; return whether one was."""
-        return self._shown.wait(seconds)
 
     def close(self) -> None:
         """Stop showing states."""
@@ -133,7 +129,6 @@ class LiveView:
                     self._window = Window(self.server, content, maps=False)
                 else:
                     self._window.show(content)
-                self._shown.set()
         except Exception as e:  # errors of viser, too, so that the fit continues
             say(f"the viewer stopped ({type(e).__name__}: {e}); the fit continues", error=True)
 

@@ -16,7 +16,7 @@ import torch
 from warpgs.errors import DataError, WarpgsError
 from warpgs.export.base import format_of, read_with_antialiasing
 from warpgs.files import read_file, readable, remove_leftovers, write_json
-from warpgs.geometry import camera_extent, convert_camera, convert_gaussians, matmul, rotation_matrices
+from warpgs.geometry import camera_extent, convert_camera, convert_gaussians, matmul, pose_of, rotation_matrices
 from warpgs.io.image_files import decode
 from warpgs.mesh.views import MIN_ALPHA
 from warpgs.pipeline.films.paths import fov_y
@@ -31,17 +31,7 @@ from warpgs.render.options import RasterizeOptions
 from warpgs.render.rasterize import rasterize
 from warpgs.report.images import coverage_image, depth_map, error_map, resized
 from warpgs.scene import Camera, Gaussians, Normalization, View
-from warpgs.viewer.html import (
-    camera_at,
-    camera_before,
-    distance_ahead,
-    middle_first,
-    packed,
-    place_first_camera,
-    plain_background,
-    stands_at,
-    wxyz_of,
-)
+from warpgs.viewer import html
 from warpgs.viewer.server import guarded, said
 
 if TYPE_CHECKING:
@@ -142,9 +132,7 @@ def box_json(box: CropBox, normalization: Normalization) -> dict[str, Any]:
 def keyframe(camera: Camera, seconds: float, normalization: Normalization) -> dict[str, Any]:
     """Return a camera of a path as JSON."""
     viewmat = convert_camera(camera, normalization, "scene", "file").viewmat
-    c2w = np.eye(4)
-    c2w[:3, :3] = viewmat[:3, :3].T
-    c2w[:3, 3] = -(viewmat[:3, :3] * viewmat[:3, 3:]).sum(0)
+    c2w = pose_of(viewmat[:3, :3].T, -(viewmat[:3, :3] * viewmat[:3, 3:]).sum(0))
     return {"c2w": c2w.tolist(), "fov_y": fov_y(camera), "seconds": seconds}
 
 
@@ -171,7 +159,7 @@ class Maps:
     def view_at(self, camera: Camera) -> str | None:
         """Return the name of the model's camera at nearly the pose of ``camera``; None if there is no such camera."""
         cameras = self.content.model.scene_cameras.items()
-        return next((n for n, c in cameras if stands_at(camera, c, NEAR * self.extent)), None)
+        return next((n for n, c in cameras if html.stands_at(camera, c, NEAR * self.extent)), None)
 
     @torch.no_grad()
     def image(self, kind: str, camera: Camera, gaussians: Gaussians, sh_degree: int) -> tuple[np.ndarray, str]:
@@ -395,15 +383,15 @@ class Window:
         self.server, self.content = server, content
         cameras = list(content.model.scene_cameras.values())
         train = [content.model.scene_cameras[n] for n in content.model.train]
-        self.first = [*middle_first(train or cameras), camera_before(content.model.gaussians())][0]
-        ahead = distance_ahead(self.first, content.model.gaussians())
+        self.first = [*html.middle_first(train or cameras), html.camera_before(content.model.gaussians())][0]
+        ahead = html.distance_ahead(self.first, content.model.gaussians())
         self.extent = camera_extent(cameras) if len(cameras) > 1 else 0.1 * ahead
         self.maps = Maps(content, self.extent)
         self._frusta: dict[str, Any] = {}
         self._drawn: dict[int, tuple[Any, ...]] = {}
         self._lock, self._wake, self._open = threading.RLock(), threading.Event(), True
-        place_first_camera(server, self.first, content.model.gaussians(), cameras or [self.first])
-        server.scene.set_background_image(plain_background(content.model.background), format="png")
+        html.place_first_camera(server, self.first, content.model.gaussians(), cameras or [self.first])
+        server.scene.set_background_image(html.plain_background(content.model.background), format="png")
         self.panel = Panel(server, content, self, maps)
         self._draw_cameras()
         self.redraw()
@@ -439,7 +427,7 @@ class Window:
         """Send the current view to the browsers: the Gaussians, or images at each browser's camera."""
         with self._lock, self.server.atomic():
             if self.panel.kind.value == GAUSSIANS:
-                arrays, scale, _ = packed(self.shown())
+                arrays, scale, _ = html.packed(self.shown())
                 self.server.scene.add_gaussian_splats("/gaussians", *arrays, scale=scale)
             else:
                 self.server.scene.remove_by_name("/gaussians")
@@ -458,7 +446,7 @@ class Window:
             frustum = self.server.scene.add_camera_frustum(
                 f"/cameras/{number}", fov_y(camera), camera.width / camera.height, scale=size, thickness=0.02 * size,
                 color=TEST_COLOR if name in model.test else TRAIN_COLOR, image=None if view is None else _small(view.image),
-                format="jpeg", wxyz=wxyz_of(camera), position=camera.center, cast_shadow=False, receive_shadow=False,
+                format="jpeg", wxyz=html.wxyz_of(camera), position=camera.center, cast_shadow=False, receive_shadow=False,
             )  # fmt: skip
             frustum.on_click(guarded(lambda event, name=name: self.step_into(name, event.client)))
             self._frusta[name] = frustum
@@ -470,7 +458,7 @@ class Window:
     def move(self, camera: Camera, client: viser.ClientHandle | None) -> None:
         """Give a browser, or all browsers if ``client`` is None, the pose of a camera, and show its whole image."""
         forward, up = np.asarray(camera.viewmat[2, :3]), -np.asarray(camera.viewmat[1, :3])
-        ahead = distance_ahead(camera, self.content.model.gaussians())
+        ahead = html.distance_ahead(camera, self.content.model.gaussians())
         for c in [client] if client is not None else list(self.server.get_clients().values()):
             with c.atomic():
                 c.camera.position = camera.center
@@ -484,7 +472,7 @@ class Window:
         state = client.camera
         size = max(int(state.image_width), 16), max(int(state.image_height), 16)
         factor = 1.0 if side is None else min(1.0, side / max(size))
-        return camera_at(state.wxyz, state.position, state.fov, *(max(16, round(factor * length)) for length in size))
+        return html.camera_at(state.wxyz, state.position, state.fov, *(max(16, round(factor * length)) for length in size))
 
     def _connected(self, client: viser.ClientHandle) -> None:
         client.camera.fov = fov_y(self.first, client.camera.aspect)
@@ -536,7 +524,7 @@ class Window:
         with self._lock:
             self._drawn[client.client_id] = asked
             if kind == GAUSSIANS:
-                client.scene.set_background_image(plain_background(self.content.model.background), format="png")
+                client.scene.set_background_image(html.plain_background(self.content.model.background), format="png")
                 self.panel.explain("")
                 return
             camera = self.camera_of(client, MAP_SIDE[self.content.model.gaussians().means.device.type])

@@ -1,7 +1,5 @@
 """A farm: jobs, the engine of this machine, and the index page of their runs."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

@@ -1,7 +1,5 @@
 """A job of a farm: its description, the list that it comes from, its record, and the interface of an engine."""
 
-from __future__ import annotations
-
 import glob
 import hashlib
 import json
@@ -13,7 +11,7 @@ from typing import Any, Protocol, get_type_hints
 
 from warpgs import schema
 from warpgs.errors import DataError, ResourceError, UsageError
-from warpgs.files import input_digest, read_input, unread_reason, write_json
+from warpgs.files import input_digest, read_file, unread_reason, write_json
 from warpgs.io.folder import READERS, all_readers
 from warpgs.pipeline.run.folder import CONFIG
 from warpgs.pipeline.run.request import FitRequest, SceneRequest
@@ -162,12 +160,7 @@ def _named(scenes: list[Path]) -> list[ListedJob]:
 
 def _read(path: Path) -> list[ListedJob]:
     """Read a file of jobs: ``{"scene": FOLDER}`` per line, optionally with a ``name`` and flags of `warpgs fit`."""
-    try:
-        data = read_input(path, schema.MAX_BYTES)
-    except OSError as e:
-        raise DataError(
-            f"{path}: cannot be read ({unread_reason(e)}); give a file with one line of JSON per job, and split a large one"
-        ) from e
+    data = read_file(path, most=schema.MAX_BYTES, fix="give a file with one line of JSON per job, and split a large one")
     found: list[ListedJob] = []
     for number, line in enumerate(data.splitlines(), 1):
         if not line.strip():

@@ -5,8 +5,6 @@ module starts listens at the loopback address and accepts only processes with it
 whether there is a token.
 """
 
-from __future__ import annotations
-
 import os
 import secrets
 from typing import Any

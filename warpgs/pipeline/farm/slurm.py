@@ -1,7 +1,5 @@
 """Farms on Slurm: a Slurm job for each scene, by sbatch, squeue and scancel; each runs this module."""
 
-from __future__ import annotations
-
 import contextlib
 import itertools
 import os

@@ -1,7 +1,5 @@
 """The work of a job: a run that is there already is kept, a missing one is made."""
 
-from __future__ import annotations
-
 import contextlib
 import gc
 import os
@@ -14,22 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from warpgs import schema
+from warpgs import files, schema
 from warpgs.device import is_out_of_memory, no_memory_message
 from warpgs.errors import DataError, FolderHeldError, UsageError, WarpgsError
-from warpgs.files import (
-    LOCK,
-    appending,
-    is_empty,
-    make_folder,
-    move_folder,
-    read_file,
-    remove_file,
-    remove_leftovers,
-    writable,
-    write_bytes,
-    writing_into,
-)
 from warpgs.io.image_files import decode
 from warpgs.io.load import Split
 from warpgs.kernels.launch import set_threads
@@ -95,8 +80,8 @@ def _set_aside(folder: Path) -> Path:
     number = 1
     while os.path.lexists(target := folder.with_name(f"{folder.name}.old{number}")):
         number += 1
-    with writable(folder, "move it by hand", f"moved to {target.name}"):
-        return move_folder(folder, target.name)
+    with files.writable(folder, "move it by hand", f"moved to {target.name}"):
+        return files.move_folder(folder, target.name)
 
 
 def _with_lpips(metrics: dict[str, Any], folder: Path, request: FitRequest, variants: dict[str, str]) -> dict[str, Any]:
@@ -132,12 +117,12 @@ def ensure_run(
         except DataError as e:
             why = f"old results: unusable ({e})"
         if record is None:
-            if os.path.exists(out) and not is_empty(out):
+            if os.path.exists(out) and not files.is_empty(out):
                 state, note = redo(why)
         elif gap := _difference(record, resolved or request.config, fingerprint, split, device):
             state, note = redo(f"the old run differs in {gap}")
         elif (out / "report.html").is_file() and (metrics := _scores(out / "metrics.json")):  # the report is written last
-            if (out / LOCK).exists():  # left by a fit that was killed after its last file, like other leftovers
+            if (out / files.LOCK).exists():  # left by a fit that was killed after its last file, like other leftovers
                 with contextlib.suppress(FolderHeldError), hold_folder(out):
                     pass
             note = "the finished run was to be scored"
@@ -164,10 +149,10 @@ def run_job(text: str, threads: int = 0, on_step: Callable[[StepReport], object]
     if threads:
         set_threads(threads)
     job = job_of(text)
-    with writing_into(job.results):
-        make_folder(job.folder)
-        with writable(job.folder / LOG):
-            file = appending(job.folder / LOG)
+    with files.writing_into(job.results):
+        files.make_folder(job.folder)
+        with files.writable(job.folder / LOG):
+            file = files.appending(job.folder / LOG)
         with file, output_to(file.fileno()):  # of native libraries, too
             return fit_job(job, on_step)
 
@@ -211,10 +196,10 @@ def _ensure(job: FarmJob, on_step: Callable[[StepReport], object] | None) -> Out
     request = job.request
     device, _ = choose_device(request.device)
     lpips = {} if request.lpips_weights is None else Lpips(request.lpips_weights, device).variants()
-    remove_leftovers(job.folder)
+    files.remove_leftovers(job.folder)
     before = read_job_record(job.folder)
     if before is not None and before.state == "done" and not is_whole(request.out, before):
-        remove_file(request.out / "metrics.json")  # continued from its checkpoint, it writes all files again
+        files.remove_file(request.out / "metrics.json")  # continued from its checkpoint, it writes all files again
     fingerprint, split, resolved = "", None, request.config
     if (request.out / CONFIG).is_file():
         fingerprint, split, resolved = _wanted(request, device.type)
@@ -238,10 +223,10 @@ def write_thumbnail(renders: Path, path: Path) -> None:
     first = min(renders.glob("*.png"), default=None)
     if first is None:
         return
-    image = np.round(255 * decode(first, data=read_file(first, renders.parent))[0][..., ::-1]).astype(np.uint8)
+    image = np.round(255 * decode(first, data=files.read_file(first, renders.parent))[0][..., ::-1]).astype(np.uint8)
     pair = image[:, : image.shape[1] * 2 // 3]  # render, photograph, error
     scale = min(1.0, THUMBNAIL_SIDE / max(pair.shape[:2]))
     size = max(1, round(pair.shape[1] * scale)), max(1, round(pair.shape[0] * scale))
     done, data = cv2.imencode(".jpg", cv2.resize(pair, size, interpolation=cv2.INTER_AREA), [cv2.IMWRITE_JPEG_QUALITY, 85])
     if done:
-        write_bytes(path, data.tobytes())
+        files.write_bytes(path, data.tobytes())

@@ -1,7 +1,5 @@
 """Films of a model: what they show, rendered frame by frame."""
 
-from __future__ import annotations
-
 import collections
 import itertools
 import math
@@ -17,18 +15,7 @@ from warpgs.files import make_folder, write_bytes
 from warpgs.geometry import convert_camera
 from warpgs.locks import check_file_path, hold_folder
 from warpgs.mesh.views import MIN_ALPHA
-from warpgs.pipeline.films.paths import (
-    LIMITS,
-    Rig,
-    camera_path,
-    framed,
-    path_of,
-    read_keyframes,
-    rig_of,
-    through,
-    tour_of,
-    upright,
-)
+from warpgs.pipeline.films import paths
 from warpgs.pipeline.metrics.coverage import classes_of, coverage_map, depth_views, fraction_outside
 from warpgs.pipeline.model.table import FittedModel
 from warpgs.process import say
@@ -132,14 +119,12 @@ class FilmSettings:
 
     def __post_init__(self) -> None:
         """Check what can be checked before any work."""
-        low, high = LIMITS["width"]
+        low, high = paths.LIMITS["width"]
         if self.size is not None and not all(low <= s <= high for s in self.size):
             raise UsageError(f"each side of a film must have {low} to {high} px, not {self.size[0]} x {self.size[1]}")
-        narrow, wide = (math.radians(v) for v in LIMITS["fov"])
-        if self.fov_y is not None and not narrow <= self.fov_y <= wide:
-            raise UsageError(
-                f"--fov must be {LIMITS['fov'][0]:g} to {LIMITS['fov'][1]:g} degrees, not {math.degrees(self.fov_y):g}"
-            )
+        low, high = paths.LIMITS["fov"]
+        if self.fov_y is not None and not math.radians(low) <= self.fov_y <= math.radians(high):
+            raise UsageError(f"--fov must be {low:g} to {high:g} degrees, not {math.degrees(self.fov_y):g}")
         if self.seconds is not None and not 0 < self.seconds * self.fps <= MAX_FRAMES:
             raise UsageError(f"a film must be longer than 0 s and have at most {MAX_FRAMES:,} frames, not {self.seconds:g} s")
         if self.frames is not None and not 1 <= self.frames <= MAX_FRAMES:
@@ -181,27 +166,29 @@ def depth_and_coverage(gaussians: Gaussians, cameras: list[Camera], options: Ras
     return float(np.median(values)) if len(values) else 1.0, float(np.median(alphas))
 
 
-def _tour(rig: Rig, train: list[Camera], settings: FilmSettings) -> tuple[list[Camera], str]:
+def _tour(rig: paths.Rig, train: list[Camera], settings: FilmSettings) -> tuple[list[Camera], str]:
     """Return the cameras of a film through training views, and a description of the path."""
     frames = settings.count(min(max(SECONDS, VIEW_SECONDS * len(train)), MAX_SECONDS))
-    cameras = [upright(rig, c) for c in train]
+    cameras = [paths.upright(rig, c) for c in train]
     reaches = [rig.reach(c) for c in train]
-    keyframes, closed, by_name = tour_of(cameras, reaches, frames / settings.fps, max(2, frames // MIN_FRAMES_PER_VIEW))
+    keyframes, closed, by_name = paths.tour_of(cameras, reaches, frames / settings.fps, max(2, frames // MIN_FRAMES_PER_VIEW))
     words = "in the given order" if by_name else "from neighbour to neighbour"
     words += ", and back to the first" if closed else ""
     count = f"{len(keyframes) - closed} of {len(train)} cameras"
-    return through(keyframes, frames, closed=closed), f"path: interpolate, through {count} {words}"
+    return paths.through(keyframes, frames, closed=closed), f"path: interpolate, through {count} {words}"
 
 
-def _keyframes(model: FittedModel, path: Path, rig: Rig, first: Camera, settings: FilmSettings) -> tuple[list[Camera], str]:
+def _keyframes(
+    model: FittedModel, path: Path, rig: paths.Rig, first: Camera, settings: FilmSettings
+) -> tuple[list[Camera], str]:
     """Return the cameras of a film through the keyframes of a file, and a description of the path."""
     if settings.fov_y is not None:
         raise UsageError(f"{path}: keyframes have their own fields of view; leave out --fov")
-    keyframes = read_keyframes(path, framed(first, settings.size), model.normalization)
+    keyframes = paths.read_keyframes(path, paths.framed(first, settings.size), model.normalization)
     if rig.is_watched([k.camera for k in keyframes]):  # then the path goes around it, and not across
         keyframes = [replace(k, reach=rig.reach(k.camera)) for k in keyframes]
     last = keyframes[-1].seconds
-    cameras = through(keyframes, settings.count(last + 1 / settings.fps))
+    cameras = paths.through(keyframes, settings.count(last + 1 / settings.fps))
     return cameras, f"path: {len(keyframes)} keyframes over {last:g} s"
 
 
@@ -217,9 +204,9 @@ def plan_film(model: FittedModel, path: str, settings: FilmSettings) -> FilmPlan
         if settings.frames is not None or settings.seconds is not None:
             raise UsageError("--path views gives one image for each view; leave out --frames and --seconds")
         names = image_names(scene)
-        shown = [(names[n], framed(c, settings.size, settings.fov_y)) for n, c in scene.items()]
+        shown = [(names[n], paths.framed(c, settings.size, settings.fov_y)) for n, c in scene.items()]
         return FilmPlan(shown, coverage, EMPTY_VIEW, [], _nearer([c for _, c in shown], train, "--coverage marks these places"))
-    rig = rig_of(train, depth)
+    rig = paths.rig_of(train, depth)
     if path.lower().endswith(".json"):
         cameras, words = _keyframes(model, Path(path), rig, train[0], settings)
         remedy = "c2w of keyframes is camera-to-world in OpenCV axes, in the units of the scene's files"
@@ -228,18 +215,18 @@ def plan_film(model: FittedModel, path: str, settings: FilmSettings) -> FilmPlan
     notes = [f"{len(train)} {'training ' if model.test else ''}cameras {rig.describe()}"]
     if rig.turned:
         notes.append("the photographs are rotated; the film takes its upward direction from the common plane of the cameras")
-    kind = path_of(rig) if path == "auto" else path
+    kind = paths.path_of(rig) if path == "auto" else path
     if kind == "interpolate":
         cameras, words = _tour(rig, train, settings)
         if path == "auto" and rig.kind == "forward":
             words += "; --path turntable is calmer"
         remedy, nearer = EMPTY_VIEW, "--coverage marks these places"
     else:
-        cameras = camera_path(kind, rig, train, settings.count(SECONDS))
+        cameras = paths.camera_path(kind, rig, train, settings.count(SECONDS))
         there_and_back = ", there and back over the captured area" if rig.span is not None and kind == "turntable" else ""
         words = f"path: {kind}{there_and_back}"
         remedy = nearer = "--path interpolate stays at the training views"
-    cameras = [framed(c, settings.size, settings.fov_y) for c in cameras]
+    cameras = [paths.framed(c, settings.size, settings.fov_y) for c in cameras]
     return FilmPlan(_numbered(cameras), coverage, remedy, [*notes, words], _nearer(cameras, train, nearer))
 
 

@@ -1,7 +1,5 @@
 """Paths of cameras: around a scene, through its views, along keyframes."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from dataclasses import dataclass, replace
@@ -10,20 +8,9 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from warpgs import schema
+from warpgs import geometry, schema
 from warpgs.errors import DataError
 from warpgs.files import read_input, unread_reason
-from warpgs.geometry import (
-    convert_camera,
-    focus_point,
-    inverse,
-    look_at,
-    matmul,
-    nearest_rotation,
-    pinhole_of,
-    quaternions,
-    rotation_matrices,
-)
 from warpgs.scene import Camera, Normalization
 
 NAMES = {
@@ -119,12 +106,12 @@ def _normal_of(vectors: np.ndarray, largest: float) -> np.ndarray | None:
     total = float(np.trace(covariance))
     if not total > 0:
         return None
-    power = inverse(covariance / total + 1e-9 * np.eye(3))
+    power = geometry.inverse(covariance / total + 1e-9 * np.eye(3))
     for _ in range(12):
-        power = matmul(power, power)
+        power = geometry.matmul(power, power)
         power = power / np.trace(power)
     normal = _unit(power[:, int(np.diagonal(power).argmax())])
-    least = float((normal * matmul(covariance, normal)).sum())
+    least = float((normal * geometry.matmul(covariance, normal)).sum())
     minors = 0.5 * (total**2 - float((covariance * covariance).sum()))  # sum of the products of pairs of eigenvalues
     both, product = total - least, minors - least * (total - least)
     return normal if least < largest * both and product > 0.05 * both**2 else None
@@ -139,17 +126,17 @@ def _upward(cameras: list[Camera], looked_at: np.ndarray) -> tuple[np.ndarray, b
     centers = np.array([c.center for c in cameras])
     mean, length = ups.mean(0), _length(ups.mean(0))
     normal = _normal_of(centers - centers.mean(0), FLAT) if len(cameras) > 2 else None
-    if normal is not None and np.abs(matmul(forwards, normal)).mean() < 0.9:
-        upright, lying = matmul(ups, normal), matmul(rights, normal)
+    if normal is not None and np.abs(geometry.matmul(forwards, normal)).mean() < 0.9:
+        upright, lying = geometry.matmul(ups, normal), geometry.matmul(rights, normal)
         few = len(cameras) < 5  # any three centres lie in a plane: it must be that of the photographs, too
         turned = bool((np.abs(lying) > 0.9).all()) if few else float(np.abs(lying).mean()) > 0.8
         level = None if few or turned else _normal_of(rights, ROLLED)
         if level is not None and abs(float((normal * level).sum())) < MIN_SAME:
-            normal, upright = level, matmul(ups, level)
+            normal, upright = level, geometry.matmul(ups, level)
         if turned or (not few and np.abs(upright).mean() > 0.5):
             sign = float(upright.mean())
             if abs(sign) < 0.3:  # cameras disagree; people photograph from above
-                height = float(matmul(centers - looked_at, normal).mean())
+                height = float(geometry.matmul(centers - looked_at, normal).mean())
                 sign = height if height else float(lying.mean())
             return (normal if sign >= 0 else -normal), turned
     return (mean / length if length > 0.2 else ups[0]), False
@@ -168,11 +155,11 @@ def _span(azimuths: np.ndarray) -> tuple[float, float] | None:
 
 def _azimuths(directions: np.ndarray, up: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return azimuths [N] and elevations [N] of directions [N, 3] about ``up`` [rad], and the direction [3] of azimuth 0."""
-    heights = matmul(directions, up)
+    heights = geometry.matmul(directions, up)
     level = directions - heights[:, None] * up
     flat = (level[0] ** 2).sum() > 1e-12 * (directions[0] ** 2).sum()
     first = _unit(level[0] if flat else np.cross(up, np.eye(3)[np.abs(up).argmin()]))
-    azimuths = np.arctan2(matmul(level, np.cross(up, first)), matmul(level, first))
+    azimuths = np.arctan2(geometry.matmul(level, np.cross(up, first)), geometry.matmul(level, first))
     return azimuths, np.arctan2(heights, np.sqrt((level * level).sum(1))), first
 
 
@@ -187,7 +174,7 @@ def _kind(cameras: list[Camera], focus: np.ndarray, depth: float) -> str:
     offsets = centers - centers.mean(0)
     mean = forwards.mean(0)
     if _length(mean) > MIN_FORWARD:
-        along = np.abs(matmul(offsets, _unit(mean))).max()
+        along = np.abs(geometry.matmul(offsets, _unit(mean))).max()
         return "forward" if along < depth else "free"
     spread = math.sqrt((offsets * offsets).sum(1).max())
     outwards = (cosines < -MIN_COSINE).mean() >= MIN_AGREEMENT
@@ -199,7 +186,7 @@ def rig_of(cameras: list[Camera], depth: float) -> Rig:
     # If the optical axes meet, the subject is the point nearest to all axes. If the cameras see it from one side, or the axes
     # are nearly parallel, the subject is ``depth`` in front of their mean centre.
     centers, forwards = np.array([c.center for c in cameras]), np.array([c.viewmat[2, :3] for c in cameras])
-    focus = focus_point(cameras)
+    focus = geometry.focus_point(cameras)
     kind = _kind(cameras, focus, depth)
     if kind == "ring":
         span = _span(_azimuths(centers - focus, _upward(cameras, focus)[0])[0])
@@ -220,14 +207,16 @@ def rig_of(cameras: list[Camera], depth: float) -> Rig:
 
 def up_of(cameras: list[Camera], points: np.ndarray) -> np.ndarray:
     """Return the upward unit vector [3] of a scene for films, from training cameras and points [N, 3] [u]."""
-    depths = np.concatenate([matmul(points - c.center, c.viewmat[2, :3]) for c in cameras[:: max(1, len(cameras) // 5)]])
+    depths = np.concatenate(
+        [geometry.matmul(points - c.center, c.viewmat[2, :3]) for c in cameras[:: max(1, len(cameras) // 5)]]
+    )
     ahead = depths[depths > 0]
     return rig_of(cameras, float(np.median(ahead)) if len(ahead) else 1.0).up
 
 
 def common_up(cameras: list[Camera]) -> np.ndarray | None:
     """Return the upward unit vector [3] that cameras agree on, as films use it; None if they do not agree."""
-    up, turned = _upward(cameras, focus_point(cameras))
+    up, turned = _upward(cameras, geometry.focus_point(cameras))
     mean = np.mean([c.viewmat[1, :3] for c in cameras], axis=0)
     return up if turned or (mean * mean).sum() >= MIN_UP**2 else None
 
@@ -247,7 +236,7 @@ LIMITS = {"width": (16, 8192), "fov": (1.0, 170.0)}
 
 def framed(camera: Camera, size: tuple[int, int] | None = None, fov_y: float | None = None, turned: bool = False) -> Camera:
     """Return a pinhole camera with the size [px] and field of view [rad] of a film; ``turned`` swaps width and height."""
-    camera = pinhole_of(camera)
+    camera = geometry.pinhole_of(camera)
     K, width, height = camera.K, camera.width, camera.height
     if turned:
         K, width, height = K[[1, 0, 2]][:, [1, 0, 2]], height, width
@@ -270,7 +259,7 @@ def upright(rig: Rig, camera: Camera) -> Camera:
     """Return an upright camera with the same centre and axis, for rotated photographs."""
     if not rig.turned:
         return camera
-    pose = look_at(camera.center, camera.center + camera.viewmat[2, :3], rig.up)
+    pose = geometry.look_at(camera.center, camera.center + camera.viewmat[2, :3], rig.up)
     return replace(framed(camera, turned=True), viewmat=pose)
 
 
@@ -281,13 +270,13 @@ def _spiral_to_one_side(rig: Rig, cameras: list[Camera], frames: int) -> list[np
     side = _unit(np.cross(forward, rig.up))
     up = np.cross(side, forward)
     offsets = np.array([c.center for c in cameras]) - center
-    spans = [max(0.7 * float(np.abs(matmul(offsets, axis)).max()), 0.03 * depth) for axis in (side, up)]
+    spans = [max(0.7 * float(np.abs(geometry.matmul(offsets, axis)).max()), 0.03 * depth) for axis in (side, up)]
     poses = []
     for t in np.arange(frames) / frames:
         # not nearer, where Gaussians look like needles; not farther, where the image border shows unobserved areas
         angle, radius = 4 * np.pi * t, np.sin(np.pi * t)
         eye = center + radius * (spans[0] * np.cos(angle) * side + spans[1] * np.sin(angle) * up)
-        poses.append(look_at(eye, rig.center, up))
+        poses.append(geometry.look_at(eye, rig.center, up))
     return poses
 
 
@@ -302,9 +291,9 @@ def _turn(rig: Rig, frames: int, turns: int, rise: float) -> list[np.ndarray]:
         elevation = float(np.clip(rig.elevation + rise * math.sin(2 * np.pi * t), -MAX_ELEVATION, MAX_ELEVATION))
         direction = rig.direction(azimuth, elevation)
         if rig.kind == "room":
-            poses.append(look_at(rig.center, rig.center + direction, rig.up))
+            poses.append(geometry.look_at(rig.center, rig.center + direction, rig.up))
         else:
-            poses.append(look_at(rig.center + rig.distance * direction, rig.center, rig.up))
+            poses.append(geometry.look_at(rig.center + rig.distance * direction, rig.center, rig.up))
     return poses
 
 
@@ -353,7 +342,7 @@ def _row(keyframe: Keyframe) -> np.ndarray:
     camera = keyframe.camera
     rotation = torch.from_numpy(np.ascontiguousarray(camera.viewmat[:3, :3].T, dtype=np.float64))
     point = camera.center + keyframe.reach * camera.viewmat[2, :3]
-    return np.concatenate([point, quaternions(rotation[None])[0].numpy(), [fov_y(camera), keyframe.reach]])
+    return np.concatenate([point, geometry.quaternions(rotation[None])[0].numpy(), [fov_y(camera), keyframe.reach]])
 
 
 def _spline(rows: np.ndarray, times: np.ndarray, at: np.ndarray, closed: bool) -> np.ndarray:
@@ -396,10 +385,8 @@ def through(keyframes: list[Keyframe], frames: int, *, closed: bool = False) -> 
     at = times[0] + (times[-1] - times[0]) * np.arange(frames) / max(frames if closed else frames - 1, 1)
     template, cameras = keyframes[0].camera, []
     for row in _spline(rows, times, at, closed):
-        rotation = rotation_matrices(row[3:7] / math.sqrt((row[3:7] ** 2).sum())).T
-        viewmat = np.eye(4)
-        viewmat[:3, :3], viewmat[:3, 3] = rotation, -matmul(rotation, row[:3] - row[8] * rotation[2])
-        camera = replace(template, viewmat=viewmat)
+        rotation = geometry.rotation_matrices(row[3:7] / math.sqrt((row[3:7] ** 2).sum())).T
+        camera = replace(template, viewmat=geometry.pose_at(rotation, row[:3] - row[8] * rotation[2]))
         same = abs(row[7] - fov_y(template)) < 1e-9
         cameras.append(camera if same else framed(camera, None, float(np.clip(row[7], 0.01, 3.1))))
     return cameras
@@ -418,19 +405,18 @@ def read_keyframes(path: Path, template: Camera, normalization: Normalization) -
     except FileNotFoundError as e:
         raise DataError(f"{path}: no such file; give a .json file of keyframes, as the viewer saves it") from e
     except (OSError, schema.SchemaError) as e:
-        why = unread_reason(e) if isinstance(e, OSError) else e
         raise DataError(
-            f"{path}: cannot be read as keyframes ({why}); give a JSON list of objects with c2w (4 rows of 4), fov_y [rad] and "
-            "seconds"
+            f"{path}: cannot be read as keyframes ({unread_reason(e)}); give a JSON list of objects with c2w (4 rows of 4), "
+            "fov_y [rad] and seconds"
         ) from e
     if not 1 <= len(values) <= MAX_KEYFRAMES:
         raise DataError(f"{path}: holds {len(values)} keyframes; a path needs 1 to {MAX_KEYFRAMES:,}")
     K = np.array([[template.K[0, 0], 0, 0.5 * template.width], [0, template.K[1, 1], 0.5 * template.height], [0, 0, 1.0]])
-    template, result = replace(pinhole_of(template), K=K), []
+    template, result = replace(geometry.pinhole_of(template), K=K), []
     for i, value in enumerate(values):
         matrix = np.array(value["c2w"], np.float64)
         rotation = np.clip(matrix[:3, :3], -2, 2)  # so that no square overflows
-        square = matmul(rotation, rotation.T)
+        square = geometry.matmul(rotation, rotation.T)
         right_handed = float((np.cross(rotation[0], rotation[1]) * rotation[2]).sum()) > 0
         rigid = np.abs(square - np.eye(3)).max() <= MAX_SKEW and right_handed and (matrix[3] == (0, 0, 0, 1)).all()
         if not rigid or np.abs(matrix[:3, 3]).max() > MAX_REACH:
@@ -445,9 +431,8 @@ def read_keyframes(path: Path, template: Camera, normalization: Normalization) -
                 f"{path}: seconds of keyframe {i} must be {MIN_SECONDS:g} to {MAX_SECONDS:g} above those of keyframe {i - 1}; "
                 "sort the keyframes by time"
             )
-        viewmat, rotation = np.eye(4), nearest_rotation(rotation)
-        viewmat[:3, :3], viewmat[:3, 3] = rotation.T, -matmul(rotation.T, matrix[:3, 3])
-        camera = convert_camera(replace(template, viewmat=viewmat), normalization, "file", "scene")
+        viewmat = geometry.pose_at(geometry.nearest_rotation(rotation).T, matrix[:3, 3])
+        camera = geometry.convert_camera(replace(template, viewmat=viewmat), normalization, "file", "scene")
         result.append(Keyframe(framed(camera, None, value["fov_y"]), value["seconds"] - values[0]["seconds"]))
     return result
 
@@ -462,7 +447,7 @@ def _distances(cameras: list[Camera]) -> list[list[float]]:
     """Return how far apart cameras are, N x N: distance in units of their extent, plus the angle between their poses [rad]."""
     centers, rotations = np.array([c.center for c in cameras]), np.array([c.viewmat[:3, :3] for c in cameras]).reshape(-1, 9)
     apart = np.sqrt(((centers[:, None] - centers[None]) ** 2).sum(-1))
-    cosines = np.clip((matmul(rotations, rotations.T) - 1) / 2, -1, 1)
+    cosines = np.clip((geometry.matmul(rotations, rotations.T) - 1) / 2, -1, 1)
     distances: list[list[float]] = (apart / max(float(apart.max()), 1e-12) + np.arccos(cosines) + 1e-6).tolist()
     return distances
 

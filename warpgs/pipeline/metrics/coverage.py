@@ -1,7 +1,5 @@
 """Scores by coverage: how many training views saw the surface of each pixel."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace

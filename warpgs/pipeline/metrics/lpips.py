@@ -1,7 +1,5 @@
 """LPIPS, and the weights that it needs."""
 
-from __future__ import annotations
-
 import hashlib
 import math
 import os
@@ -17,7 +15,7 @@ import torch.nn.functional as F
 
 from warpgs import files
 from warpgs.errors import DataError, UsageError
-from warpgs.files import open_input, read_input, read_tensors, remove_leftovers, unread_reason, write_bytes
+from warpgs.files import open_input, read_tensors, remove_leftovers, unread_reason, write_bytes
 
 FORMAT = "warpgs-lpips-1"
 MAX_PICKLE = 2**20
@@ -186,13 +184,7 @@ def convert_lpips(backbone: Path, heads: Path, out: Path) -> list[str]:
 def read_lpips(path: Path) -> tuple[Net, dict[str, torch.Tensor], dict[str, str]]:
     """Read a converted file: the network, its tensors by name (float32, CPU), and the header with the file's SHA-256."""
     fix = "write the file again with `warpgs convert-lpips`"
-    try:
-        data = read_input(path)
-        tensors, metadata = read_tensors(data)
-    except OSError as e:
-        raise DataError(f"{path}: cannot be read ({unread_reason(e)}); `warpgs convert-lpips` writes one") from e
-    except ValueError as e:
-        raise DataError(f"{path}: damaged or not a safetensors file ({e}); {fix}") from e
+    tensors, metadata, data = read_tensors(path, "`warpgs convert-lpips` writes one", fix)
     if metadata.get("format") != FORMAT or metadata.get("net") not in NETS:
         raise DataError(f"{path}: holds no LPIPS weights; {fix}")
     net = NETS[metadata["net"]]

@@ -1,7 +1,5 @@
 """Scores of rendered views: PSNR, SSIM and LPIPS within the scored region, after matching of colours, and moved cameras."""
 
-from __future__ import annotations
-
 import math
 import warnings
 from collections.abc import Iterable, Sequence

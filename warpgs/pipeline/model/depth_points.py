@@ -1,7 +1,5 @@
 """First points from depth: from maps, beyond them, and on the visual hull."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import Any

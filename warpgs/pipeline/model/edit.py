@@ -1,7 +1,5 @@
 """Edits of a finished model: filters, merging and compression."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Callable
@@ -204,8 +202,7 @@ def _box_of_file(path: Path) -> Box:
             raise UsageError("expected a JSON object with center and size")
         return box_of(text)
     except (OSError, UnicodeDecodeError, UsageError) as e:
-        why = unread_reason(e) if isinstance(e, OSError) else e
-        raise DataError(f"{path}: cannot be read as a box ({why}); save the box again in the viewer") from e
+        raise DataError(f"{path}: cannot be read as a box ({unread_reason(e)}); save the box again in the viewer") from e
 
 
 def select(gaussians: Gaussians, keep: torch.Tensor) -> Gaussians:

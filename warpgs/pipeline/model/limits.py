@@ -1,7 +1,5 @@
 """Limits of the size and the shape of every Gaussian, applied in each step of a fit; and statistics of sizes and shapes."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

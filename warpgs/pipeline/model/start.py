@@ -1,7 +1,5 @@
 """The first Gaussians of a fit: from points, depth or random places."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -16,18 +14,7 @@ from warpgs.errors import DataError
 from warpgs.kernels.neighbours import mean_square_distances
 from warpgs.kernels.sh import coefficient_count
 from warpgs.pipeline.metrics.scores import fitted_region
-from warpgs.pipeline.model.depth_points import (
-    EXTRAPOLATED_OPACITY,
-    NOTHING,
-    all_count,
-    coarse_points,
-    depth_bounds,
-    extrapolated_points,
-    hull_points,
-    in_empty_region,
-    joined,
-    silhouettes,
-)
+from warpgs.pipeline.model import depth_points
 from warpgs.priors.flow import flow_between, flow_depth, triangulate_matches
 from warpgs.priors.given_depth import any_given, with_given_depth
 from warpgs.priors.sweep import CPU, sweep_depths
@@ -211,7 +198,7 @@ def consistent_depths(
             return [flow_depth(views, i, between) for i in range(len(views))]
     with section("matches"):
         points = np.concatenate([known.points, triangulate_matches(views).points])
-    bounds = [depth_bounds(v, points, camera_depths(views)) for v in views]
+    bounds = [depth_points.depth_bounds(v, points, camera_depths(views)) for v in views]
     with section("depth"):
         return sweep_depths(views, bounds, device(), lambda n, of: progress(f"finding depth: {n} of {of} views"))
 
@@ -228,18 +215,22 @@ def consistent_points(
     if any_given(views):
         source, (depths, given) = f"given depth and {source}", with_given_depth(views, depths, points)
     if depths is not None:
-        cloud, notes = coarse_points(
+        cloud, notes = depth_points.coarse_points(
             views, depths, merge_px=config.merge_px, fill_px=config.fill_px, source=source, known=points
         )
         if len(cloud) >= MIN_POINTS:
-            extrapolated = extrapolated_points(views, depths) if config.extrapolate else NOTHING
+            extrapolated = depth_points.extrapolated_points(views, depths) if config.extrapolate else depth_points.NOTHING
             if len(extrapolated):
                 notes[-1] += f", {len(extrapolated):,} extrapolated where no view looks"
             elif config.extrapolate:
-                why = "" if all_count(views) else ", because masks, an alpha channel or a black background hide parts of views"
+                why = (
+                    ""
+                    if depth_points.all_count(views)
+                    else ", because masks, an alpha channel or a black background hide parts of views"
+                )
                 notes[-1] += f", none extrapolated{why}"
             how = "\n".join((notes[-1], *given, *(f"    {n}" for n in notes[:-1])))
-            return Start(joined((cloud, extrapolated)), how, depths, len(extrapolated))
+            return Start(depth_points.joined((cloud, extrapolated)), how, depths, len(extrapolated))
         reason = f"only {len(cloud)} points survived the checks ({' | '.join(notes[:-1])}); do the views overlap?"
     cloud, how = random_points(views, config.random_count, generator)
     return Start(cloud, f"{how}, instead of --init.source {config.source}: {reason}", depths)
@@ -250,7 +241,7 @@ def seen_points(views: list[View], points: PointCloud | None) -> PointCloud:
 
     A point that only one of several views saw was triangulated with held-out views.
     """
-    return NOTHING if points is None else points.seen_by({v.name for v in views}, min(2, len(views)))
+    return depth_points.NOTHING if points is None else points.seen_by({v.name for v in views}, min(2, len(views)))
 
 
 def sweeps(config: InitConfig, views: int) -> bool:
@@ -263,7 +254,7 @@ def extrapolates(config: InitConfig, views: list[View]) -> bool:
     if not config.extrapolate or len(views) < 2:
         return False
     searches = config.source == "flow" or sweeps(config, len(views)) or (config.source == "auto" and any_given(views))
-    return searches and all_count(views)
+    return searches and depth_points.all_count(views)
 
 
 def check_points(views: list[View], points: PointCloud | None, config: InitConfig) -> None:
@@ -277,8 +268,8 @@ def on_object(start: Start, views: list[View]) -> Start:
 
     If fewer than `MIN_POINTS` points would be left, the start is unchanged.
     """
-    cloud, shapes = start.cloud, silhouettes(views)
-    keep = ~in_empty_region(shapes, cloud.points)
+    cloud, shapes = start.cloud, depth_points.silhouettes(views)
+    keep = ~depth_points.in_empty_region(shapes, cloud.points)
     if not shapes or keep.all():
         return start
     count = int(keep.sum())
@@ -296,7 +287,7 @@ def initial_points(
     """Return the points to start from; DataError if there are none. Arguments are those of `consistent_depths`."""
     check_points(views, points, config)
     if config.source == "hull":
-        cloud, how = hull_points(views, config.merge_px)
+        cloud, how = depth_points.hull_points(views, config.merge_px)
         if len(cloud) >= MIN_POINTS:
             return Start(cloud, how)
         cloud, made = random_points(views, config.random_count, generator)
@@ -356,5 +347,5 @@ def initial_gaussians(
     sh[:, 0] = base_coefficients(colors)
     quats = points.new_tensor([1, 0, 0, 0]).repeat(count, 1)
     logits = points.new_full((count,), geometry.logit(config.opacity))
-    logits[count - extrapolated :] = geometry.logit(EXTRAPOLATED_OPACITY)
+    logits[count - extrapolated :] = geometry.logit(depth_points.EXTRAPOLATED_OPACITY)
     return Gaussians(points, quats, scales.log().to(points.dtype)[:, None].repeat(1, 3), logits, sh)

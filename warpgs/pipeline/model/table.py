@@ -13,7 +13,7 @@ import torch
 
 from warpgs import schema
 from warpgs.errors import DataError, UsageError
-from warpgs.files import read_input, read_tensors, unread_reason, write_bytes
+from warpgs.files import read_tensors, write_bytes
 from warpgs.geometry import check_stored, checked_normalization, convert_camera, convert_gaussians, logit
 from warpgs.kernels.neighbours import morton_codes
 from warpgs.kernels.sh import MAX_DEGREE
@@ -415,12 +415,7 @@ def load(path: str | Path, device: str | torch.device = "cpu") -> Model:
         DataError: The file is missing, damaged, or not a model.
     """
     path = Path(path)
-    try:
-        tensors, header = read_tensors(read_input(path))
-    except OSError as e:
-        raise DataError(f"{path}: cannot be read ({unread_reason(e)}); check the path and its permissions") from e
-    except ValueError as e:
-        raise DataError(f"{path}: damaged or not a safetensors file ({e}); write it again with warpgs.save") from e
+    tensors, header, _ = read_tensors(path, "check the path and its permissions", "write it again with warpgs.save")
     if header.get("format") != FORMAT or tensors.keys() != Gaussians.__dataclass_fields__.keys():
         raise DataError(f"{path}: not a model of format {FORMAT}; write it with warpgs.save, or read PLY with warpgs.read_ply")
     try:

@@ -1,7 +1,5 @@
 """The paper's importance of pixels: three scores, their sum, and the gate (Multi-Modal Importance Assessment)."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import torch

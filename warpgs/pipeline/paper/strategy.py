@@ -1,7 +1,5 @@
 """The paper's strategy: pixels are sampled in proportion to importance, within a gate (Geometric-Aware Sampling)."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated

@@ -1,7 +1,5 @@
 """What commands do with a finished run: score, render, prune, plot; and the preview of priors."""
 
-from __future__ import annotations
-
 import contextlib
 import itertools
 import math
@@ -26,16 +24,7 @@ from warpgs.io.image_files import MAX_PIXELS
 from warpgs.io.load import Split, load_scene
 from warpgs.io.transforms import colmap_folder, read_cameras
 from warpgs.locks import hold_file, hold_folder
-from warpgs.pipeline.films.film import (
-    COVERAGE,
-    FILM,
-    SHEET_FRAMES,
-    FilmSettings,
-    depth_and_coverage,
-    plan_film,
-    render_film,
-    sheet_path,
-)
+from warpgs.pipeline.films import film
 from warpgs.pipeline.films.paths import rig_of
 from warpgs.pipeline.metrics.coverage import coverage_lines, coverage_of_run
 from warpgs.pipeline.metrics.lpips import Lpips
@@ -174,7 +163,7 @@ def evaluate(
 
 
 def render(
-    folder: Path, path: str, out: Path | None, settings: FilmSettings, device_name: str, *,
+    folder: Path, path: str, out: Path | None, settings: film.FilmSettings, device_name: str, *,
     background: str = "auto", coverage: bool = False, sheet: bool = False,
     file_of: tuple[Path | None, str | None] | None = None,
     antialiased: bool = False, near: float | None = None,
@@ -194,7 +183,7 @@ def render(
         notes += ["the background is black; choose another colour with --background"] if color is None else []
     tell = Stages()
     settings = replace(settings, background=color)
-    plan = plan_film(stored, path, settings)
+    plan = film.plan_film(stored, path, settings)
     training: list[View] | bool = False
     if coverage:
         try:
@@ -202,17 +191,19 @@ def render(
         except WarpgsError as e:
             training = True
             notes.append(f"masked-out regions are shown as seen, since the scene cannot be read: {e}")
-        notes.append(f"images in {out / COVERAGE}: {COVERAGE_LEGEND}")
+        notes.append(f"images in {out / film.COVERAGE}: {COVERAGE_LEGEND}")
     with contextlib.nullcontext() if named else writing_into(home):
-        files, faults = render_film(stored, plan, out, settings, coverage=training, sheet=sheet, tell=tell)
+        files, faults = film.render_film(stored, plan, out, settings, coverage=training, sheet=sheet, tell=tell)
     *others, last = files
     if last.suffix.lower() == ".mp4":
         notes.append(VP9.format(shlex.quote(str(last))))
-    notes += faults + ([f"sheet of {min(SHEET_FRAMES, len(plan.cameras))} frames in {sheet_path(out)}"] if sheet else [])
+    notes += faults + (
+        [f"sheet of {min(film.SHEET_FRAMES, len(plan.cameras))} frames in {film.sheet_path(out)}"] if sheet else []
+    )
     if last == out:
         return [*notes, f"{len(plan.cameras)} frames in {out}"]
-    if last.name == FILM:
-        return [*notes, f"{len(others)} images and {FILM} in {out}"]
+    if last.name == film.FILM:
+        return [*notes, f"{len(others)} images and {film.FILM} in {out}"]
     return [*notes, f"{len(files)} images in {out}; no film, since the views differ in size"]
 
 
@@ -351,7 +342,7 @@ def plot(
     tell("rendering depth")
     found = stored.cameras()
     train, test = ([found[n] for n in names] for names in (stored.train, stored.test))
-    rig = rig_of(train, depth_and_coverage(stored.gaussians(), train, stored.options())[0])
+    rig = rig_of(train, film.depth_and_coverage(stored.gaussians(), train, stored.options())[0])
     azimuth = 0.0 if rig.span is None else 0.5 * (rig.span[0] + rig.span[1])
     eye = rig.direction(azimuth + 0.7, max(rig.elevation + 0.35, 0.5))  # from above at an angle, behind cameras of one side
     if start:

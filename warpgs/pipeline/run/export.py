@@ -1,7 +1,5 @@
 """Files from a run: filtered Gaussians, cameras, meshes."""
 
-from __future__ import annotations
-
 import copy
 import math
 import shlex
@@ -22,17 +20,7 @@ from warpgs.kernels.neighbours import morton_codes
 from warpgs.locks import hold_file
 from warpgs.mesh.fuse import GridPlan, MeshOptions, fuse
 from warpgs.pipeline.films.paths import common_up
-from warpgs.pipeline.model.edit import (
-    box_of,
-    coverage,
-    disturbing,
-    drop_unused_sh,
-    inside,
-    levelling,
-    limit_degree,
-    rotation_about,
-    select,
-)
+from warpgs.pipeline.model import edit
 from warpgs.pipeline.run.folder import CONFIG, StoredRun, open_run
 from warpgs.pipeline.run.request import choose_device
 from warpgs.scene import Camera, Gaussians, Normalization, base_colors
@@ -64,8 +52,8 @@ def filtered(
     rotation = rotation_of(filters.rotate, None if stored is None else training_cameras(stored))
     keep, lines = torch.ones(len(gaussians), dtype=torch.bool, device="cpu"), []
     if filters.crop is not None:
-        center, *rest = box_of(filters.crop)
-        keep = inside(gaussians, (center - origin, *rest))
+        center, *rest = edit.box_of(filters.crop)
+        keep = edit.inside(gaussians, (center - origin, *rest))
         lines.append(f"{int((~keep).sum()):,} Gaussians outside the box are left out")
     if cleaned if filters.clean is None else filters.clean:
         maxima = None
@@ -73,27 +61,27 @@ def filtered(
             model = stored.gaussians()
             like = model.means.new_tensor
             views = [replace(c, viewmat=like(c.viewmat), K=like(c.K)) for c in training_cameras(stored)]
-            maxima = coverage(model, views, stored.options())[0]
-        removed = disturbing(gaussians, maxima)
+            maxima = edit.coverage(model, views, stored.options())[0]
+        removed = edit.disturbing(gaussians, maxima)
         counts = {reason: int((where & keep).sum()) for reason, where in removed.items()}
         if words := [f"{count:,} {reason}" for reason, count in counts.items() if count]:
             lines.append(f"removed Gaussians: {', '.join(words)} (--no-clean keeps them)")
         for where in removed.values():
             keep &= ~where
-    gaussians = select(gaussians, keep)
+    gaussians = edit.select(gaussians, keep)
     if rotation is not None:
         gaussians = rotate(gaussians, rotation)
         lines.append(turned_line(rotation))
     if filters.sh_degree is not None:
         if filters.sh_degree < gaussians.sh_degree:
             lines.append(f"harmonics above degree {filters.sh_degree} are left out (--sh-degree)")
-        gaussians = limit_degree(gaussians, filters.sh_degree)
+        gaussians = edit.limit_degree(gaussians, filters.sh_degree)
     return gaussians, rotation, lines
 
 
 def file_gaussians(stored: StoredRun) -> Gaussians:
     """Return the Gaussians of a run in file units about its origin, without harmonics that are all zero."""
-    return convert_gaussians(drop_unused_sh(stored.gaussians()), stored.normalization.local, "scene", "file")
+    return convert_gaussians(edit.drop_unused_sh(stored.gaussians()), stored.normalization.local, "scene", "file")
 
 
 def origin_line(origin: np.ndarray) -> list[str]:
@@ -119,12 +107,12 @@ def rotation_of(wish: str | None, cameras: list[Camera] | None) -> np.ndarray | 
             raise UsageError("--rotate level needs the cameras of a run: use warpgs export RUN, or give x,y,z,degrees")
         if (up := common_up(cameras)) is None:
             raise UsageError("--rotate level: the cameras do not agree on an upward direction; give x,y,z,degrees")
-        return levelling(up)
+        return edit.levelling(up)
     try:
         x, y, z, degrees = map(float, wish.split(","))
     except ValueError as e:
         raise UsageError(f"--rotate {wish[:60]}: give x,y,z,degrees, or level") from e
-    return rotation_about(np.array([x, y, z]), math.radians(degrees))
+    return edit.rotation_about(np.array([x, y, z]), math.radians(degrees))
 
 
 def turned_line(rotation: np.ndarray) -> str:
@@ -202,7 +190,7 @@ def _written(
         raise DataError(f"{target}: not written, because no Gaussian is left; give a larger --crop, or --no-clean")
     if kind.max_degree < gaussians.sh_degree:
         lines.append(f"harmonics above degree {kind.max_degree} are dropped, because {kind.suffix} files cannot store them")
-        gaussians = limit_degree(gaussians, kind.max_degree)
+        gaussians = edit.limit_degree(gaussians, kind.max_degree)
     if stored is not None:
         lines = [*stored.notes(), *lines]
     if stored is not None and any(stored.background):
@@ -213,7 +201,7 @@ def _written(
             f"{kind.suffix} files cannot declare that the model is antialiased; choose the antialiased mode in your viewer"
         )
     if kind.sorted:
-        gaussians = select(gaussians, torch.argsort(morton_codes(gaussians.means), stable=True))
+        gaussians = edit.select(gaussians, torch.argsort(morton_codes(gaussians.means), stable=True))
     kind = copy.copy(kind)
     kind.origin = origin
     with hold_file(target) as notes:

@@ -1,7 +1,5 @@
 """`fit`: a scene becomes a run."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import time

@@ -1,7 +1,5 @@
 """The run folder: its files, what they must hold, and how they are opened."""
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import importlib.metadata
@@ -21,7 +19,7 @@ import torch
 from warpgs import schema
 from warpgs.constants import K_TOLERANCE, POSE_TOLERANCE, RULES
 from warpgs.errors import DataError, NotFiniteError, UsageError, similar_folder
-from warpgs.files import is_empty, open_input, plain, read_tensors, unread_reason, write_bytes
+from warpgs.files import is_empty, open_input, plain, tensors_of, unread_reason, write_bytes
 from warpgs.io.images import CHOICES
 from warpgs.io.load import Split
 from warpgs.kernels.cameras import check_camera
@@ -150,7 +148,7 @@ def load_checkpoint(folder: Path) -> tuple[dict[str, torch.Tensor], dict[str, An
             digest = file.read(33)
         if hashlib.sha256(body).digest() != digest:
             raise ValueError("the checksum does not match: the file was truncated or altered")
-        tensors, metadata = read_tensors(body)
+        tensors, metadata = tensors_of(body)
         if metadata.get("format") != str(FORMAT):
             raise DataError(_other_version(f"{path}: warpgs {metadata.get('version', '0.1.0')} wrote this checkpoint"))
         state = schema.parse(metadata["state"])

@@ -1,7 +1,5 @@
 """Compile the kernels that a fit uses before it needs them, several modules at a time, into Warp's cache."""
 
-from __future__ import annotations
-
 import itertools
 import os
 import time

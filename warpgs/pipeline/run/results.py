@@ -1,7 +1,5 @@
 """Results of a fit: figures, images and notes, for metrics.json and the report."""
 
-from __future__ import annotations
-
 import contextlib
 import math
 import shlex

@@ -1,7 +1,5 @@
 """Studies: presets on scenes with several seeds."""
 
-from __future__ import annotations
-
 import dataclasses
 import gc
 import math

@@ -1,7 +1,5 @@
 """Tables and plots of a study, with its statistics."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """Steps of several views: slots, ranks, and the mean of their gradients."""
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Callable, Mapping, Sequence
 from itertools import accumulate

@@ -7,8 +7,6 @@ compiled kernels need additional memory. Small parts are not counted: parameters
 rates and losses (`StepBuffers`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from warpgs.errors import DataError, UsageError
-from warpgs.files import is_within, read_input, unread_reason
+from warpgs.files import is_within, read_file
 from warpgs.plugins import load_object, module_digest, module_of
 from warpgs.process import Detail
 from warpgs.schema import SchemaError, check_depth
@@ -157,14 +157,12 @@ def _named(name: str) -> tuple[FitConfig, str]:
 def _read(path: Path) -> tuple[dict[str, Any], str]:
     """Return the values of a TOML file, and the first digits of its SHA-256."""
     remedy = "give a file of settings such as `steps = 300` (docs/presets.md)"
+    data = read_file(path, most=MAX_BYTES, fix=remedy)
     try:
-        data = read_input(path, MAX_BYTES)
         if any(line.count(b".") > MAX_DOTS for line in data.split(b"\n")):
             raise ValueError(f"more than {MAX_DOTS} dots in a line")
         values = tomllib.loads(data.decode("utf-8"))
         check_depth(values, MAX_DEPTH)
-    except OSError as e:
-        raise DataError(f"{path}: cannot be read ({unread_reason(e)}); {remedy}") from e
     except (SchemaError, RecursionError) as e:
         raise DataError(f"{path}: nested deeper than {MAX_DEPTH} tables and lists; {remedy}") from e
     except ValueError as e:  # no TOML, or no UTF-8

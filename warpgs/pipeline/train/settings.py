@@ -380,7 +380,7 @@ def _with_parts(config: FitConfig, given: Mapping[str, Any], own_code: bool) -> 
         )
     for field, registry in PARTS.items():
         if field in given:
-            changes: dict[str, Any] = {field: _parts(registry, field, given[field], own_code)}
+            changes: dict[str, Any] = {field: parts_named(registry, field, given[field], own_code)}
             config = dataclasses.replace(config, **changes)
     for name in VIEW_MODULES.names():
         if name in given:
@@ -391,13 +391,20 @@ def _with_parts(config: FitConfig, given: Mapping[str, Any], own_code: bool) -> 
     return config
 
 
-def _parts(registry: Registry[Any], field: str, names: Any, own_code: bool) -> tuple[Any, ...]:
+def parts_named(registry: Registry[Any], field: str, names: Any, own_code: bool) -> tuple[Any, ...]:
     """Return the given parts: objects unchanged, names as parts with default settings."""
     if isinstance(names, str):
         names = [n.strip() for n in names.split(",") if n.strip() not in ("", "none")]
     if not isinstance(names, (list, tuple)):
         raise UsageError(f"{field} must be names separated by commas, not {names!r}")
-    return tuple(p if isinstance(p, registry.base) else _found(registry, p, own_code)() for p in names)
+    return tuple(p if isinstance(p, registry.base) else _by_default(_found(registry, p, own_code), p) for p in names)
+
+
+def _by_default(kind: type[Any], name: Any) -> Any:
+    try:
+        return kind()
+    except TypeError as e:
+        raise UsageError(f"{name} has a setting without a default ({e}); give every field a default") from e
 
 
 def _found(registry: Registry[Any], name: Any, own_code: bool) -> type[Any]:

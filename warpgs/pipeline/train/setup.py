@@ -1,7 +1,5 @@
 """Preparation of a fit: its initial points, priors of its views, and the views on the device."""
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Callable
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """One step: render, loss, gradients, update; eager, or captured as a CUDA graph."""
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """When a fit stops: scores of held-out blocks of pixels."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """The trainer: its loop, its stored state, and what runs before and after it."""
 
-from __future__ import annotations
-
 import contextlib
 import math
 import threading

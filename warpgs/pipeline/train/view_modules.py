@@ -1,7 +1,5 @@
 """View modules: they learn parameters of each training view together with the Gaussians."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated, Any, ClassVar
@@ -11,7 +9,7 @@ import torch
 
 from warpgs.device import FLOAT, LOSS, PROJECTION, Needs, StepSizes
 from warpgs.errors import UsageError
-from warpgs.geometry import matmul, nearest_rotation
+from warpgs.geometry import matmul, nearest_rotation, pose_at
 from warpgs.kernels.launch import first_order
 from warpgs.pipeline.metrics.scores import MATCHED_RULE, matched_psnr, render_view
 from warpgs.pipeline.train.schedule import LearningRate, log_linear
@@ -374,9 +372,7 @@ def refined_cameras(
     R, scale, t = similarity([given[n] for n in train], [found[n] for n in train])
     for name in test:
         turned, center = matmul(given[name].viewmat[:3, :3], R.T), scale * matmul(R, given[name].center) + t
-        viewmat = np.eye(4)
-        viewmat[:3, :3], viewmat[:3, 3] = turned, -matmul(turned, center)
-        found[name] = replace(given[name], viewmat=viewmat)
+        found[name] = replace(given[name], viewmat=pose_at(turned, center))
     if FOCAL not in params:
         return found
     exact = {n: params[n].detach().cpu().double() for n in (FOCAL, CAMERA_NUMBER)}

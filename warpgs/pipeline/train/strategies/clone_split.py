@@ -1,7 +1,5 @@
 """Clone and split: Gaussians grow where their screen gradients are large."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Hashable, Iterator, Mapping
 from dataclasses import dataclass

@@ -3,8 +3,6 @@
 "3D Gaussian Splatting as Markov Chain Monte Carlo", arXiv 2404.09591. Equation numbers are that paper's.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import math

@@ -1,7 +1,5 @@
 """Sampling: fine Gaussians are added behind pixels of the training views, in two layers, and protected for some steps."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping
