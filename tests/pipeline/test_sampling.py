@@ -14,6 +14,7 @@ from warpgs import geometry
 from warpgs.kernels.update import Setting
 from warpgs.pipeline.model.start import InitConfig, initial_points
 from warpgs.pipeline.model.table import DensityUpdate
+from warpgs.pipeline.paper.strategy import Paper
 from warpgs.pipeline.train.schedule import PhaseConfig, plan_phases
 from warpgs.pipeline.train.settings import FitConfig
 from warpgs.pipeline.train.strategies import sampling
@@ -202,11 +203,29 @@ def test_coarse_layer_is_stable_and_fine_layer_grows():
     assert [e["step"] for e in fit.strategy.events] == list(fit.phases.events)
 
 
-def test_phase_three_leaves_the_set_alone():
-    """From the end of phase 2 on rows neither come nor go."""
+def test_nothing_is_added_in_phase_three(monkeypatch):
+    """From the end of phase 2 on no rows come, and without a removal none goes."""
     fit = fitted(steps=29)
     before = fit.table.columns["created_step"].clone()
+    monkeypatch.setattr(fit.strategy, "prunes_unseen", False)
     assert fit.phases.stable_start == 28 and torch.equal(advanced(fit).table.columns["created_step"], before)
+
+
+def test_gaussians_that_no_view_shows_are_removed(monkeypatch):
+    """Faint and hidden ones go, young fine ones stay; at steps in phase 2 and 3; but the paper's strategy removes none."""
+    fit = fitted(steps=0)
+    fit.table.apply(grown(fit, 3, [-1, -1], columns={"level": FINE, "created_step": 7}))
+    fit.table.apply(grown(fit, 5, [0]))
+    fit.table.params["logit_opacities"].detach()[[0, 3, 5]] = torch.tensor([-10.0, -10.0, 3.0])
+    fit.table.params["means"].detach()[5] = 100.0  # behind all cameras
+    (change,) = fit.strategy.prune(12)
+    assert change.keep.tolist() == [1, 2, 3, 4] and len(change.parents) == 0
+    (change,) = fit.strategy.prune(30)
+    assert change.keep.tolist() == [1, 2, 4]
+    fit.table.params["logit_opacities"].detach()[:] = -10.0
+    assert not [*fit.strategy.prune(30)]  # a model of nothing is no help
+    assert [s for s in range(41) if fit.strategy.prunes(s)] == [12, 16, 20, 24, 28, 31, 35]
+    assert not any(Paper(fit.context).prunes(s) for s in range(41))
 
 
 def test_full_fine_layer_frees_its_least_contributors():

@@ -77,6 +77,7 @@ class Paper(Sampling):
         super().__init__(context)
         c = self.config
         self.consistent, self.gated, self.at_random, self.protects = c.depth == "consistent", c.ra, c.agp, c.pm
+        self.prunes_unseen = c == UNIFORM
         self.scored, self.asked_quantile = sum(c.weights()) > 0, c.asked_quantile
         self.semantic: list[torch.Tensor | None] = []
         """S_semantic of each training view, [H, W] in [0, 1]; None where its prior has no semantics."""

@@ -222,7 +222,7 @@ class Stopping:
         return self.active and self.ended is None and step in self.marks
 
     def changes(self, step: int, strategy: Strategy, context: StrategyContext, degree: int) -> Iterator[DensityUpdate]:
-        """Yield the strategy's changes after a step, and its last ones when growth ends and the third phase begins."""
+        """Yield the strategy's changes after a step, with its last additions when growth ends and the third phase begins."""
         if self.due(step) and self._measured(step, strategy, context, degree):
             self.ended, ends = step, strategy.growth().ends
             if step < ends:
@@ -231,6 +231,8 @@ class Stopping:
             yield from changes_of(strategy, "catch_up", strategy.catch_up(step, held, self.held_pixels))
         if self.ended is None and strategy.due(step):
             yield from changes_of(strategy, "update", strategy.update(step))
+        if strategy.prunes(step):
+            yield from changes_of(strategy, "prune", strategy.prune(step))
 
     def _measured(self, step: int, strategy: Strategy, context: StrategyContext, degree: int) -> bool:
         """Measure the blocks if the set changed since the previous mark, and at the last mark; return whether growth ends."""

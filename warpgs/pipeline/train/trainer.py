@@ -379,7 +379,8 @@ class Trainer:
 
     def is_due(self, step: int) -> bool:
         """Return whether the set of Gaussians changes, or left-out blocks are measured, after a step."""
-        return self.stopping.due(step) or (self.stopping.ended is None and self.strategy.due(step))
+        grows = self.stopping.ended is None and self.strategy.due(step)
+        return self.stopping.due(step) or grows or self.strategy.prunes(step)
 
     def _update(self) -> None:
         """Change the set of Gaussians after the last step, if a change is due."""

@@ -213,6 +213,14 @@ class Strategy:
         """Yield changes of the Gaussians after a step; each is applied to the table before the next is requested."""
         return iter(())
 
+    def prunes(self, step: int) -> bool:
+        """Return whether `prune` removes Gaussians after a step, before or after the end of growth."""
+        return False
+
+    def prune(self, step: int) -> Iterator[DensityUpdate]:
+        """Yield changes that only remove Gaussians, after those of `update` and `catch_up`."""
+        return iter(())
+
     def catch_up(self, step: int, views: list[TrainingView], held: int) -> Iterator[DensityUpdate]:
         """Yield changes, when early stopping ends growth, for the pixels that early stopping held out.
 

@@ -12,6 +12,7 @@ from warpgs import schema
 from warpgs.device import FLOAT, SAMPLING, Needs, StepSizes
 from warpgs.geometry import back_project_tensors, logit
 from warpgs.kernels.update import Setting
+from warpgs.pipeline.model.edit import SEEN, coverage
 from warpgs.pipeline.model.table import Column, DensityUpdate
 from warpgs.pipeline.train.strategies.base import Growth, Strategy, StrategyContext, register
 from warpgs.pipeline.train.strategies.clone_split import GradientGrowth
@@ -36,6 +37,9 @@ OPACITY = 0.1
 PROTECTED_STEPS, PROTECTED_OPACITY = 500, 0.05
 """Age up to which a sampled Gaussian is protected [steps] (T_protect, five densification intervals), and its smallest opacity
 (alpha_minimum, ten times the pruning threshold). The paper gives neither value."""
+PRUNE_EVERY, PRUNE_LATE = 500, (0, 1 / 4, 5 / 8)
+"""Steps between removals of unseen Gaussians while the set grows, at most a tenth of the fit; and times of the last removals as
+fractions of phase 3, all before the steps over which parameters are averaged."""
 COARSE_LR_FACTOR = 0.1
 """Factor on the learning rate of the coarse layer's means from phase 2 on, with two layers."""
 
@@ -182,6 +186,8 @@ class Sampling(Strategy):
     """Whether pixels are sampled in proportion to their importance; otherwise the most important ones are taken."""
     protects: bool = True
     """Whether young fine Gaussians are protected."""
+    prunes_unseen: bool = True
+    """Whether Gaussians that no training view shows are removed."""
     scored: bool = False
     """Whether importance is not the same everywhere."""
     asked_quantile: float = 0.0
@@ -344,6 +350,22 @@ class Sampling(Strategy):
             self.events.append({"step": step, "added": len(change.parents), "evicted": evicted, "quantiles": quantiles})
             if self.on_event is not None:
                 self.on_event(step, sampled)
+
+    def prunes(self, step: int) -> bool:
+        """Return whether unseen Gaussians are removed after a step."""
+        p = self.context.phases
+        late = [p.stable_start + int(part * (p.steps - p.stable_start)) for part in PRUNE_LATE]
+        while_growing = p.refine < step < p.stable_start and step % max(1, min(PRUNE_EVERY, p.planned // 10)) == 0
+        return self.prunes_unseen and (while_growing or (step in late and step < p.steps))
+
+    def prune(self, step: int) -> Iterator[DensityUpdate]:
+        """Remove the Gaussians whose blending weight is below `SEEN` in all training views, but no protected ones."""
+        t = self.context
+        seen = coverage(t.gaussians, [v.camera for v in t.views], t.render_options())[0] >= SEEN
+        if self.protects:
+            seen |= self.is_protected(step)
+        if not bool(seen.all()) and bool(seen.any()):
+            yield DensityUpdate(torch.nonzero(seen).squeeze(1))
 
     def catch_up(self, step: int, views: list[TrainingView], held: int) -> Iterator[DensityUpdate]:
         """Sample fine Gaussians in the blocks that were held out, as many per pixel as elsewhere."""
