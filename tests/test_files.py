@@ -241,7 +241,7 @@ def writers(tree: ast.AST) -> set[str]:
             found.add(name)
         elif last in ("open", "fdopen") and modes:
             found.add(f"open {modes[0]}")
-        elif "." in name and last in WRITERS:
+        elif "." in name and last in WRITERS and name != f"files.{last}":
             found.add(last)
     return found
 
