@@ -542,7 +542,7 @@ def test_starting_again_keeps_the_command(monkeypatch):
 
 # No file of the product calls what only some systems have, but for those whose tests stand in for the others.
 
-TESTED = {f"warpgs/{n}.py" for n in ("files", "device", "process", "kernels/launch", "locks", "ranks", "folders")}
+TESTED = {f"warpgs/{n}.py" for n in ("files", "device", "process", "kernels/launch", "locks", "ranks", "folders", "clock")}
 FILES = [p for p in sorted((ROOT / "warpgs").rglob("*.py")) if p.relative_to(ROOT).as_posix() not in TESTED]
 MODULES = {"fcntl", "grp", "pty", "pwd", "resource", "syslog", "termios", "msvcrt", "winreg"}
 NAMES = {

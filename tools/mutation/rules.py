@@ -88,13 +88,13 @@ ROOMS = {
 """Entries of the table above for files that hold several ops."""
 
 CUDA_OPS = {
-    "adam": [GUARDS, "pipeline/train/test_step.py"],
+    "adam": [GUARDS, "pipeline/train/test_batch.py"],
     "blend_cuda": [BODIES, GUARDS, "render/test_outputs.py"], "cameras/": [GUARDS],
-    "cuda_graph": ["render/test_graphed_cuda.py", "pipeline/train/test_step.py"],
-    "interop": [BODIES, "kernels/test_project.py", "pipeline/train/test_step.py"],
+    "cuda_graph": ["render/test_graphed_cuda.py", "pipeline/train/test_batch.py"],
+    "interop": [BODIES, "kernels/test_project.py", "pipeline/train/test_batch.py"],
     "median_depth": [GUARDS], "native": [BODIES, GUARDS], "project": [GUARDS],
     "project_backward": [GUARDS], "project_cuda": [BODIES, GUARDS], "ssim": [GUARDS],
-    "tiles": [BODIES, GUARDS, "pipeline/train/test_step.py"],
+    "tiles": [BODIES, GUARDS, "pipeline/train/test_batch.py"],
 }  # fmt: skip
 """Further tests for CUDA: single bodies, memory next to a tensor, captured steps."""
 
