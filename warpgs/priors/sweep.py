@@ -43,6 +43,8 @@ def complete(depth: np.ndarray, valid: np.ndarray, image: np.ndarray) -> np.ndar
             filled_now = left & (fraction > MIN_FRACTION)
             filled[filled_now] = smoother.filter(inverse)[filled_now] / fraction[filled_now]
             left &= ~filled_now
+            if not left.any():
+                break
     low, high = inverse[valid].min(), inverse[valid].max()
     return np.where(valid, depth, 1 / filled.clip(low, high)).astype(np.float32)
 
