@@ -244,6 +244,7 @@ DOUBTS = {
         "focal length",
         r"the focal length of 5 of 5 views is over 100 times .*photo0.png: 2000 px at 16 x 12",
     ),
+    "one other pixel": ("no such words", ""),
     "none": ("no such words", ""),
 }
 """Words of the note of each case that no other case has, and the whole note."""
@@ -270,8 +271,10 @@ def doubtful(case: str, root) -> Scene:
         scenes.save(root / "masks" / "photo1.png", mask)
     if case == "blank":
         scenes.save(root / "images" / scenes.NAMES[1], np.full_like(scenes.image(0), (200, 30, 10)))
-    if case == "equal":
-        scenes.save(root / "images" / scenes.NAMES[1], scenes.image(0))
+    if case in ("equal", "one other pixel"):
+        pixels = scenes.image(0)
+        pixels[5, 7] ^= case != "equal"
+        scenes.save(root / "images" / scenes.NAMES[1], pixels)
     return load_scene(root)
 
 

@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 import torch
 
-from tests.priors.rigs import still_life
+from tests.priors.rigs import rig, still_life
 from tests.reference import sweep as plane_costs
 from tests.reference.sweep import best_inverse
 from tests.reference.sweep import scanline_costs as defined
-from warpgs.kernels.sweep import LARGEST, best_inverses, scanline_costs
+from warpgs.geometry import back_project, seen_pixels
+from warpgs.kernels.sweep import LARGEST, best_inverses, lifted_pixels, occluding, scanline_costs
 from warpgs.priors.sweep import UNIT, matching_costs_cpu
 from warpgs.scene import Camera, View
 
@@ -70,3 +71,23 @@ def test_the_dearest_costs_fit(device):
     limits = np.full((5, 6), penalty, np.int32), np.full((6, 5), penalty, np.int32)
     found = computed(device, costs, *limits, penalty)
     assert np.array_equal(found, defined(costs, *limits, penalty)) and found.min() >= 0 and found.max() > 3 * 2**13
+
+
+def test_lifted_and_occluding_points_are_those_of_geometry():
+    """Lenses with skew, too; points behind a camera and outside of its image occlude nothing."""
+    first, second, third = rig()
+    second.K[0, 1] = 3.0
+    generator = np.random.default_rng(5)
+    pixels = generator.permutation(64 * 48)[:500]
+    depths = generator.uniform(2, 6, 500).astype(np.float32)
+    points = lifted_pixels(second, pixels, depths)
+    at = np.stack([pixels % 64, pixels // 64], 1) + 0.5
+    assert np.allclose(points, back_project(second, at, depths.astype(float)), rtol=1e-14, atol=1e-14)
+    points = np.concatenate([points, generator.uniform(-9, 9, (500, 3))])
+    maps = [generator.uniform(0, 8, (48, 64)).astype(np.float32) for _ in range(2)]
+    wanted = np.zeros(1000, bool)
+    for camera, depth in zip((second, third), maps):
+        seen, rows, columns, z = seen_pixels(camera, points)
+        wanted[seen] |= z < 0.9 * depth[rows, columns]
+    assert np.array_equal(occluding((second, third), maps, points, 0.9), wanted) and 0.1 < wanted.mean() < 0.9
+    assert not occluding((), (), points, 0.9).any() and len(occluding((first,), maps[:1], points[:0], 0.9)) == 0

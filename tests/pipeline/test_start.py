@@ -17,6 +17,7 @@ from warpgs.pipeline.metrics.scores import render_view, score
 from warpgs.pipeline.model.depth_points import (
     BEYOND,
     BEYOND_PX,
+    CHUNK,
     EXTRAPOLATED_OPACITY,
     REACH,
     STEP,
@@ -99,16 +100,34 @@ def test_points_of_the_reconstruction_fill_what_no_depth_confirms():
 
 def test_merging_takes_the_mean_of_a_cell():
     points = np.array([[0.1, 0.1, 0.1], [0.3, 0.3, 0.3], [1.2, 0.1, 0.1], [0.2, 0.2, 0.2]])
-    cells = merge_cells(points, np.array([1.0, 1.1, 0.9, 4.0]))
+    (cells,) = merge_cells([points], [np.array([1.0, 1.1, 0.9, 4.0])])
     assert cells[0] == cells[1] and len(set(cells.tolist())) == 3
-    cloud = merge(points, points.astype(np.float32), cells)
+    cloud = merge([points], [points.astype(np.float32)], [cells])
     assert len(cloud) == 3 and np.abs(cloud.points - 0.2).sum(1).min() < 1e-12
     assert np.allclose(cloud.points, cloud.colors)
     # an outlier so far away that cells have no single number each: the others share cells as they did without it
     points = np.random.default_rng(0).uniform(-1, 1, (200, 3))
-    near = merge_cells(points, np.full(200, 0.25))
-    far = merge_cells(np.concatenate([points, [[1e14, -1e14, 1e14]]]), np.full(201, 0.25))
+    (near,) = merge_cells([points], [np.full(200, 0.25)])
+    far = np.concatenate(merge_cells([points, np.array([[1e14, -1e14, 1e14]])], [np.full(200, 0.25), np.full(1, 0.25)]))
     assert np.array_equal(far[:200][:, None] == far[:200], near[:, None] == near) and (far[200] != far[:200]).all()
+
+
+def test_merging_in_parts_gives_the_bits_of_one_sum():
+    """Points of a cell are added up in their order, whatever the parts and chunks; cells come in the order of their place."""
+    generator = np.random.default_rng(0)
+    points, colors = generator.uniform(-2, 2, (CHUNK + 500, 3)), generator.uniform(size=(CHUNK + 500, 3)).astype(np.float32)
+    widths = generator.uniform(0.2, 0.5, len(points))
+    level = np.round(np.log2(0.5 * widths))
+    rows = np.column_stack([level, np.floor(points / np.exp2(level)[:, None])])
+    _, wanted, counts = np.unique(rows, axis=0, return_inverse=True, return_counts=True)
+    means = [
+        np.stack([np.bincount(wanted.ravel(), v) for v in values.T.astype(float)], 1) / counts[:, None]
+        for values in (points, colors)
+    ]
+    for ends in ([], [0, 7, CHUNK + 500], [300, 301, 20_000]):
+        parts = [np.split(a, ends) for a in (points, colors, widths)]
+        cloud = merge(*parts[:2], merge_cells(parts[0], parts[2], 0.5))
+        assert np.array_equal(cloud.points, means[0]) and np.array_equal(cloud.colors, means[1].astype(np.float32))
 
 
 def test_filled_points_come_last_and_hide_nothing():

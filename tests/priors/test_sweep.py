@@ -205,7 +205,7 @@ def test_parabola_agrees(device):
     costs = generator.integers(0, 1000, (6, 5, 40)).astype(np.float32)
     costs[0], costs[1, :, 0], costs[2, :, -1] = 7.0, -1.0, -1.0
     wanted = best_inverse(costs, PLANES)
-    assert np.allclose(sweep.best_inverse(torch.from_numpy(costs).to(device), PLANES), wanted, rtol=1e-12)
+    assert np.allclose(sweep.best_inverse(torch.from_numpy(costs).to(device), PLANES).cpu(), wanted, rtol=1e-12)
 
 
 def test_depths_agree(device):
@@ -214,7 +214,7 @@ def test_depths_agree(device):
     others = [views[0], views[2]]
     planes = plane_inverses(views[1].camera, [o.camera for o in others], (2, 12))
     wanted = inverse_depths_cpu(views[1], others, planes)
-    found = sweep.inverse_depths_cuda(views[1], others, planes, device)
+    found = sweep.inverse_depths_cuda(views[1], others, planes, device).cpu().numpy()
     assert found.shape == depths[1].shape and np.quantile(np.abs(found / wanted - 1), 0.95) < 2e-4
     error = np.abs(1 / (found * depths[1]) - 1)
     assert np.median(error) < 0.008

@@ -265,10 +265,9 @@ def nearest_unmasked(raster: np.ndarray, mask: np.ndarray | None) -> np.ndarray:
         return raster
     masked = (~mask).astype(np.uint8)
     labels = cv2.distanceTransformWithLabels(masked, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)[1]
-    places = np.zeros(labels.max() + 1, np.int64)
-    places[labels[mask]] = np.flatnonzero(mask)
+    places = np.flatnonzero(mask)[labels[~mask] - 1]  # labels count the unmasked pixels row by row, from 1
     filled = raster.copy()
-    filled[~mask] = raster.reshape(-1, *raster.shape[2:])[places[labels[~mask]]]  # an unmasked pixel is its own nearest one
+    filled[~mask] = raster.reshape(-1, *raster.shape[2:])[places]
     return filled
 
 

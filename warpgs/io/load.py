@@ -535,6 +535,15 @@ MIN_BASELINE = 1e-3
 """Spread of the cameras, as a fraction of their distance from the points, below which parallax is less than a pixel."""
 
 
+SPARSE = 16
+"""Distance of the pixels that are compared first where all pixels of photographs are compared [px]."""
+
+
+def _varies(image: np.ndarray) -> bool:
+    """Return whether an image [H, W, 3] has more than one colour."""
+    return bool((image.min((0, 1)) < image.max((0, 1))).any())
+
+
 def doubtful_notes(views: list[View], points: PointCloud | None) -> list[str]:
     """Return notes on cameras and photographs, in file units, that are possible but most likely wrong."""
     notes = []
@@ -564,10 +573,14 @@ def doubtful_notes(views: list[View], points: PointCloud | None) -> list[str]:
             f"the focal length of {len(narrow)} of {len(views)} views is over {MAX_FOCAL} times the longer side, as {v.name}: "
             f"{v.camera.K[0, 0]:.0f} px at {v.camera.width} x {v.camera.height} px; calibrate again"
         )
+    # most photographs differ, and vary, in a few pixels already
     equal: dict[bytes, list[str]] = {}
-    for v in (v for v in views if v.image.min() < v.image.max()):  # views that show nothing are alike
+    few = [v.image[::SPARSE, ::SPARSE] for v in views]
+    often = Counter(pixels.tobytes() for pixels in few)
+    for v in (v for v, pixels in zip(views, few) if often[pixels.tobytes()] > 1 and v.image.min() < v.image.max()):
+        # views that show nothing are alike
         equal.setdefault(hashlib.sha256(np.ascontiguousarray(v.image).data).digest(), []).append(v.name)
-    blank = [v.name for v in views if not (v.image.min((0, 1)) < v.image.max((0, 1))).any()]
+    blank = [v.name for v, pixels in zip(views, few) if not (_varies(pixels) or _varies(v.image))]
     if blank:
         notes.append(
             f"{len(blank)} of {len(views)} photographs have a single colour, such as {blank[0]}; leave them out (--exclude)"

@@ -91,6 +91,72 @@ def check(
     agrees[row, column] = wp.uint8(good)
 
 
+@wp.kernel(enable_backward=False, module="warpgs.kernels.plane_depths")
+def lift(
+    begin: int, pixels: wp.array(dtype=wp.int64), width: wp.int64, depths: wp.array(dtype=wp.float32), to_ray: wp.mat33d,
+    turn: wp.mat33d, shift: wp.vec3d,
+    # outputs
+    points: wp.array2d(dtype=wp.float64),
+):  # fmt: skip
+    """Find the world point at the centre of a pixel and at its z-depth."""
+    i = begin + wp.tid()
+    row = pixels[i] // width
+    x = wp.float64(pixels[i] - row * width) + wp.float64(0.5)
+    y = wp.float64(row) + wp.float64(0.5)
+    z = wp.float64(depths[i])
+    p = wp.vec3d()
+    for k in range(3):
+        p[k] = z * (x * to_ray[k, 0] + y * to_ray[k, 1] + to_ray[k, 2]) - shift[k]
+    for k in range(3):  # sums in the order of `geometry.back_project`
+        points[i, k] = p[0] * turn[0, k] + p[1] * turn[1, k] + p[2] * turn[2, k]
+
+
+@wp.kernel(enable_backward=False, module="warpgs.kernels.plane_depths")
+def occlude(
+    begin: int, points: wp.array2d(dtype=wp.float64), cameras: wp.array2d(dtype=wp.float64), camera: int,
+    depths: wp.array2d(dtype=wp.float32), fraction: float,
+    # outputs
+    hides: wp.array(dtype=wp.uint8),
+):  # fmt: skip
+    """Set the flag of a point at less than a fraction of the depth of its pixel."""
+    i = begin + wp.tid()
+    if hides[i] == wp.uint8(0):
+        p = wp.vec3d()
+        for k in range(3):  # sums in the order of `geometry.project_points`
+            row = cameras[camera]
+            p[k] = points[i, 0] * row[4 * k] + points[i, 2] * row[4 * k + 2] + points[i, 1] * row[4 * k + 1] + row[4 * k + 3]
+        if p[2] > wp.float64(0.0):
+            x = p[0] / p[2] * cameras[camera, 12] + cameras[camera, 14] + p[1] / p[2] * cameras[camera, 13]
+            y = p[0] / p[2] * cameras[camera, 15] + cameras[camera, 17] + p[1] / p[2] * cameras[camera, 16]
+            inside = x >= wp.float64(0.0) and y >= wp.float64(0.0)
+            if inside and x < wp.float64(depths.shape[1]) and y < wp.float64(depths.shape[0]):
+                if p[2] < wp.float64(fraction * depths[int(y), int(x)]):
+                    hides[i] = wp.uint8(1)
+
+
+def lifted_pixels(camera: Camera, pixels: np.ndarray, depths: np.ndarray) -> np.ndarray:
+    """Return the world points [N, 3] [u] of a pinhole's pixels, int64 [N], counted row by row, at z-depths [N] [u], float32."""
+    geometry.check_pinhole(camera)
+    points = torch.empty(len(pixels), 3, dtype=torch.float64, device="cpu")
+    pose = wp.mat33d(*camera.viewmat[:3, :3].ravel()), wp.vec3d(*camera.viewmat[:3, 3])
+    numbers, depths = (torch.from_numpy(np.ascontiguousarray(a)) for a in (pixels, depths))
+    inputs = [numbers, camera.width, depths, wp.mat33d(*geometry.inverse(camera.K).ravel()), *pose, points]
+    launch.launch(lift, len(pixels), inputs, points.device)
+    return points.numpy()
+
+
+def occluding(cameras: Sequence[Camera], depths: Sequence[np.ndarray], points: np.ndarray, fraction: float) -> np.ndarray:
+    """Return a mask [N], True for points [N, 3] at less than a fraction of a pinhole's z-depths [H, W] [u], 0 if unknown."""
+    hides = torch.zeros(len(points), dtype=torch.uint8, device="cpu")
+    positions = torch.from_numpy(np.ascontiguousarray(points))
+    rows = torch.from_numpy(np.array([(*c.viewmat[:3].ravel(), *c.K[:2].ravel()) for c in cameras], float).reshape(-1, 18))
+    for i, (camera, depth) in enumerate(zip(cameras, depths, strict=True)):
+        geometry.check_pinhole(camera)
+        shown = torch.from_numpy(np.ascontiguousarray(depth, np.float32))
+        launch.launch(occlude, len(points), [positions, rows, i, shown, fraction, hides], hides.device)
+    return hides.numpy().astype(bool)
+
+
 def best_inverses(costs: torch.Tensor, inverses: np.ndarray) -> np.ndarray:
     """Return each pixel's inverse depth [1/u] of least cost, refined by a parabola, float64 [H, W], from costs [H, W, P]."""
     height, width, _ = costs.shape

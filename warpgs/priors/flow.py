@@ -12,6 +12,7 @@ from warpgs.errors import DataError, UsageError
 from warpgs.files import read_file
 from warpgs.geometry import check_pinhole
 from warpgs.onnx import Model
+from warpgs.priors.networks import in_threads
 from warpgs.scene import Camera, PointCloud, View, ViewDepth
 
 # Depth from optical flow between views with known poses: epipolar lines, checks, and the blending of source views.
@@ -169,6 +170,8 @@ MIN_ANGLE = 1.0
 """Smallest angle between the two rays [deg]; below it depth is noise."""
 MAX_PAIRS = 30
 """Largest number of pairs of views that are matched, nearest first."""
+PIXELS_AT_ONCE = 8_000_000
+"""Number of pixels of the images whose features are found at a time; SIFT takes about 250 bytes of memory a pixel."""
 
 
 Features = tuple[np.ndarray, np.ndarray | None]
@@ -245,10 +248,12 @@ def triangulate_matches(views: list[View]) -> PointCloud:
     centers = [v.camera.center for v in views]
     pairs = sorted(itertools.combinations(range(len(views)), 2), key=lambda p: np.linalg.norm(centers[p[0]] - centers[p[1]]))
     pairs = pairs[:MAX_PAIRS]
-    features = {i: sift_features(views[i]) for i in sorted({i for pair in pairs for i in pair})}
+    chosen = sorted({i for pair in pairs for i in pair})
+    most = max(1, PIXELS_AT_ONCE // max((v.camera.width * v.camera.height for v in views), default=1))
+    features = dict(zip(chosen, in_threads(lambda i: sift_features(views[i]), chosen, most=most)))
+    matched = in_threads(lambda p: agreeing_matches(*(views[i] for i in p), *(features[i] for i in p)), pairs)
     points, colors = [np.zeros((0, 3))], [np.zeros((0, 3), np.float32)]
-    for i, j in pairs:
-        ids, found = agreeing_matches(views[i], views[j], features[i], features[j])
+    for (i, _), (ids, found) in zip(pairs, matched):
         at = features[i][0][ids[:, 0]].astype(int)
         points.append(found)
         colors.append(views[i].image[at[:, 1], at[:, 0]])

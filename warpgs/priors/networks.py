@@ -39,9 +39,9 @@ def single_threaded_opencv() -> Iterator[None]:
         cv2.setNumThreads(before)
 
 
-def in_threads(function: Callable[..., T], *items: Iterable[Any]) -> list[T]:
-    """Return the results of a function for each item, in their order, by as many threads as torch uses."""
-    with single_threaded_opencv(), ThreadPoolExecutor(torch.get_num_threads()) as pool:
+def in_threads(function: Callable[..., T], *items: Iterable[Any], most: int = 1 << 16) -> list[T]:
+    """Return the results of a function for each item, in their order, by as many threads as torch uses, or at ``most`` that."""
+    with single_threaded_opencv(), ThreadPoolExecutor(min(most, torch.get_num_threads())) as pool:
         return list(pool.map(function, *items))
 
 

@@ -11,7 +11,7 @@ from warpgs.device import format_bytes, installed_bytes
 from warpgs.geometry import check_pinhole, matmul
 from warpgs.kernels.sweep import NEUTRAL, best_inverses, check_round_trip, plane_costs, scanline_costs
 from warpgs.priors.flow import homogeneous, no_depth
-from warpgs.priors.networks import single_threaded_opencv
+from warpgs.priors.networks import in_threads, single_threaded_opencv
 from warpgs.scene import Camera, View, ViewDepth
 
 SMOOTHNESS = (1e2, 1e4, 1e6)
@@ -41,6 +41,8 @@ def complete(depth: np.ndarray, valid: np.ndarray, image: np.ndarray) -> np.ndar
             filled_now = left & (fraction > MIN_FRACTION)
             filled[filled_now] = smoother.filter(inverse)[filled_now] / fraction[filled_now]
             left &= ~filled_now
+            if not left.any():
+                break
     low, high = inverse[valid].min(), inverse[valid].max()
     return np.where(valid, depth, 1 / filled.clip(low, high)).astype(np.float32)
 
@@ -185,15 +187,19 @@ def plane_inverses(
     return np.linspace(1 / far, 1 / near, int(np.clip(np.ceil(longest / SPACING) + 1, 8, max_planes)))
 
 
-def plane_homography(first: Camera, second: Camera, inverse: float) -> np.ndarray:
-    """Return H [3, 3] from first to second by the plane z = 1 / inverse, for pixel centres at integers (OpenCV)."""
+def plane_homography(first: Camera, second: Camera, inverse: float | np.ndarray) -> np.ndarray:
+    """Return H [..., 3, 3] from first to second by planes z = 1 / inverse [...], for pixel centres at integers (OpenCV)."""
     check_pinhole(first)
     check_pinhole(second)
     rotation, translation = geometry.relative_pose(first, second)
-    moved = rotation + inverse * np.outer(translation, [0, 0, 1])
-    H = matmul(matmul(second.K, moved), geometry.inverse(first.K))
+    H = rotation + np.asarray(inverse)[..., None, None] * np.outer(translation, [0, 0, 1])
     back, shift = (np.array([[1, 0, s], [0, 1, s], [0, 0, 1]]) for s in (-0.5, 0.5))
-    return matmul(matmul(back, H), shift)
+    return _product(_product(back, _product(_product(second.K, H), geometry.inverse(first.K))), shift)
+
+
+def _product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return the products of matrices [..., 3, 3], added up in one order on every processor (`geometry.matmul`)."""
+    return a[..., :1] * b[..., :1, :] + a[..., 1:2] * b[..., 1:2, :] + a[..., 2:] * b[..., 2:, :]
 
 
 def plane_homographies(first: Camera, others: Sequence[Camera], inverses: np.ndarray) -> np.ndarray:
@@ -264,17 +270,19 @@ def matching_costs_cuda(
     mean = box(own)
     variance = (box(own * own) - mean * mean).clamp(min=0) + NOISE
     costs = torch.empty(height, width, len(inverses), dtype=torch.int16, device=device)
+    # all planes at once, since each copy from the host waits for the device
+    to_others = np.stack([plane_homography(view.camera, other.camera, inverses) for other in others])
+    homographies = torch.from_numpy(to_others).to(device, torch.float32)[..., None, None]  # [N, D, 3, 3, 1, 1]
     for first in range(0, len(inverses), PLANES_AT_ONCE):
-        chosen, least, total = inverses[first : first + PLANES_AT_ONCE], None, 0
-        for other, gray in zip(others, grays):
-            to_other = np.stack([plane_homography(view.camera, other.camera, w) for w in chosen])
-            H = torch.from_numpy(to_other).to(device, torch.float32)[..., None, None]  # [P, 3, 3, 1, 1]
+        least, total = None, 0
+        for other, gray, planes in zip(others, grays, homographies):
+            H = planes[first : first + PLANES_AT_ONCE]
             p = [H[:, i, 0] * x + H[:, i, 1] * y + H[:, i, 2] for i in range(3)]
             sides = (other.camera.width, other.camera.height)
             # with centres as grid_sample has them without align_corners; with it, torch would load cuDNN
             at = torch.stack([(2 * p[i] / p[2] + 1) / n - 1 for i, n in enumerate(sides)], -1)  # [P, H, W, 2]
             # outside is -1, which is less than any colour, also where a pixel is partly outside
-            raised = (gray + 1).expand(len(chosen), -1, -1, -1)
+            raised = (gray + 1).expand(len(H), -1, -1, -1)
             warped = torch.nn.functional.grid_sample(raised, at, align_corners=False) - 1
             m = box(warped)
             v = (box(warped * warped) - m * m).clamp(min=0) + NOISE
@@ -283,22 +291,22 @@ def matching_costs_cuda(
             total = total + cost
             least = cost if least is None else torch.minimum(least, cost)
         found = (0.5 * least + total * (0.5 / len(others))).clamp(0, 1) * UNIT
-        costs[..., first : first + len(chosen)] = found.round()[:, 0].permute(1, 2, 0).to(torch.int16)
+        costs[..., first : first + PLANES_AT_ONCE] = found.round()[:, 0].permute(1, 2, 0).to(torch.int16)
     return costs
 
 
-def best_inverse(costs: torch.Tensor, inverses: np.ndarray) -> np.ndarray:
-    """Return inverse depths [1/u] as `best_inverses` does, float64, shape [H, W], on the host."""
+def best_inverse(costs: torch.Tensor, inverses: np.ndarray) -> torch.Tensor:
+    """Return inverse depths [1/u] as `best_inverses` does, float64, shape [H, W], on the device."""
     k = costs.argmin(2, keepdim=True).clamp(1, len(inverses) - 2)
     left, middle, right = (costs.gather(2, k + o).double() for o in (-1, 0, 1))
     bend = left - 2 * middle + right
     offset = torch.where(bend > 1e-9, 0.5 * (left - right) / bend.clamp(min=1e-9), 0).clamp(-1, 1)
-    return (inverses[0] + (k + offset) * (inverses[1] - inverses[0]))[..., 0].cpu().numpy()
+    return (inverses[0] + (k + offset) * (inverses[1] - inverses[0]))[..., 0]
 
 
 @torch.no_grad()
-def inverse_depths_cuda(view: View, others: Sequence[View], planes: np.ndarray, device: torch.device) -> np.ndarray:
-    """Return inverse depths [1/u] of a view, float64, shape [H, W], by sweeping planes against at least one other view."""
+def inverse_depths_cuda(view: View, others: Sequence[View], planes: np.ndarray, device: torch.device) -> torch.Tensor:
+    """Return inverse depths [1/u] of a view, float64, [H, W], by sweeping planes against at least one other view."""
     return best_inverse(path_costs(matching_costs_cuda(view, others, planes, device), view.image), planes)
 
 
@@ -397,9 +405,15 @@ def sweep_depths(
             else:
                 inverses[i] = inverse_depths_cpu(small[i], compared, planes[i])
             progress(done, len(swept))
+        # only now, so that a GPU works on one view while the next is prepared
+        inverses = {i: torch.as_tensor(found).cpu().numpy() for i, found in inverses.items()}
         note = f"not swept: the {len(swept)} swept views (of {len(views)}) see most of the scene"
         out = [no_depth(v, note, searched=False) for v in views]
-        for i in swept:
+
+        def checked(i: int) -> ViewDepth:
             found = consistent_depth(small, inverses, i, matching_views(sight, cameras, i, NEAR_COUNT, swept))
-            out[i] = _at_size(found, small[i], views[i], messages if i == swept[0] else ())
+            return _at_size(found, small[i], views[i], messages if i == swept[0] else ())
+
+        for i, found in zip(swept, in_threads(checked, swept)):
+            out[i] = found
     return out

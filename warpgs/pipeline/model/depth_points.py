@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from warpgs import geometry
+from warpgs.kernels.sweep import lifted_pixels, occluding
 from warpgs.pipeline.metrics.scores import fitted_region
 from warpgs.priors.networks import in_threads, single_threaded_opencv
 from warpgs.priors.sweep import complete
@@ -26,6 +27,8 @@ view's depth."""
 NEAR_FRACTION, FAR_FRACTION = 1 / 1.3, 3.0
 """Factors of the 2nd and the 98th percentile of known depths: the planes of a sweep lie between the two products. Few of the
 planes are at distant surfaces, many at near ones."""
+CHUNK = 2**15
+"""Number of points whose cells are computed at a time: their arrays stay in a core's cache."""
 MIN_KNOWN = 10
 """Fewest known points of a view from which its range of depths is taken."""
 
@@ -45,40 +48,72 @@ def depth_bounds(view: View, known: np.ndarray, default: tuple[float, float]) ->
     return NEAR_FRACTION * float(low), FAR_FRACTION * float(high)
 
 
-def merge_cells(points: np.ndarray, widths: np.ndarray) -> np.ndarray:
-    """Return the number of the grid cell of each point [N, 3], int64 [N].
+Parts = Sequence[np.ndarray]
+"""An array in parts, such as one for each view. No large arrays are joined: first touches of memory take most of the time."""
 
-    Cells are as wide as ``widths`` [N] [u], rounded to a power of two. Points of unequal width (far and near ones) lie on grids
-    of unequal fineness, so every cell is a few pixels wide.
+
+def merge_cells(points: Parts, widths: Parts, cell: float = 1.0) -> list[np.ndarray]:
+    """Return the number of the grid cell of each point [N, 3], int64 [N]; numbers ascend with the place, and have gaps.
+
+    Cells are ``cell`` times as wide as ``widths`` [N] [u], rounded to a power of two. Points of unequal width (far and near
+    ones) lie on grids of unequal fineness, so every cell is a few pixels wide.
     """
-    level = np.round(np.log2(widths)).astype(np.int64)
-    cells = np.column_stack([level, np.floor(points / np.exp2(level)[:, None]).astype(np.int64)])
-    if len(cells):
-        cells -= cells.min(0)
-        sides = [int(s) for s in cells.max(0) + 1]
-        if math.prod(sides) < 2**62:  # one number for all four sorts much faster than rows do, and in the same order
-            return np.unique(np.ravel_multi_index(cells.T, sides), return_inverse=True)[1].ravel()
-    return np.unique(cells, axis=0, return_inverse=True)[1].ravel()
+    cells = [np.zeros(len(p), np.int64) for p in points]
+    chunks = [
+        [array[k : k + CHUNK] for array in part] for part in zip(points, widths, cells) for k in range(0, len(part[0]), CHUNK)
+    ]
+
+    def grid(points: np.ndarray, widths: np.ndarray) -> list[np.ndarray]:  # [N] each: the level, and three coordinates in it
+        level = np.round(np.log2(cell * widths)).astype(np.int64)
+        sizes = np.exp2(level)
+        return [level, *(np.floor(values / sizes).astype(np.int64) for values in points.T)]
+
+    def number(points: np.ndarray, widths: np.ndarray, numbers: np.ndarray) -> None:
+        for values, least, side in zip(grid(points, widths), low, sides):
+            numbers *= side
+            numbers += values - least
+
+    if chunks:
+        # twice computed, which takes less time than the memory for all
+        bounds = in_threads(lambda chunk: [(values.min(), values.max()) for values in grid(*chunk[:2])], chunks)
+        low, high = np.min(bounds, 0)[:, 0], np.max(bounds, 0)[:, 1]
+        sides = [int(s) for s in high - low + 1]
+        if math.prod(sides) >= 2**62:  # one number for all four sorts much faster than rows do, and in the same order
+            rows = np.concatenate([np.stack(grid(*part), 1) for part in zip(points, widths)])
+            ends = np.cumsum([len(p) for p in points])[:-1]
+            return np.split(np.unique(rows, axis=0, return_inverse=True)[1].ravel(), ends)
+        in_threads(lambda chunk: number(*chunk), chunks)
+    return cells
 
 
-def merge(points: np.ndarray, colors: np.ndarray, cells: np.ndarray) -> PointCloud:
+def _ranks(cells: Parts) -> tuple[int, list[np.ndarray]]:
+    """Return how many numbers of cells there are, and the rank of each one's number, int64 [N]."""
+    # neighbouring pixels often share a cell: only the first of a run is sorted
+    firsts = [np.flatnonzero(np.diff(c, prepend=c[:1] - 1)) for c in cells]
+    numbers, ranks = np.unique(np.concatenate([c[f] for c, f in zip(cells, firsts)]), return_inverse=True)
+    parts = np.split(ranks, np.cumsum([len(f) for f in firsts])[:-1])
+    return len(numbers), [np.repeat(r, np.diff(f, append=len(c))) for r, f, c in zip(parts, firsts, cells)]
+
+
+def merge(points: Parts, colors: Parts, cells: Parts) -> PointCloud:
     """Return the mean point [u] and colour of every cell, in the order of the cells' numbers, which are ``cells`` [N]."""
-    _, cells, counts = np.unique(cells, return_inverse=True, return_counts=True)
-    points, colors = (
-        np.stack([np.bincount(cells, v, len(counts)) for v in values.T.astype(float)], 1) / counts[:, None]
-        for values in (points, colors)
-    )
-    return PointCloud(points, colors.astype(np.float32))
+    count, ranks = _ranks(cells)
+    counts = sum(np.bincount(r, minlength=count) for r in ranks)
+
+    def mean(parts: Parts, channel: int) -> np.ndarray:
+        total = np.zeros(count)
+        for values, rank in zip(parts, ranks):
+            np.add.at(total, rank, values[:, channel].astype(float))
+        return total / counts
+
+    means = in_threads(mean, [points] * 3 + [colors] * 3, [0, 1, 2] * 2)
+    return PointCloud(np.stack(means[:3], 1), np.stack(means[3:], 1).astype(np.float32))
 
 
 def in_free_space(points: np.ndarray, views: Sequence[View], depths: Sequence[np.ndarray], without: int) -> np.ndarray:
     """Return a mask [N], True if a point [N, 3] occludes the depths [H, W] (0 if unknown) of a view other than ``without``."""
-    hides = np.zeros(len(points), bool)
-    for j, (view, depth) in enumerate(zip(views, depths)):
-        if j != without:
-            seen, rows, columns, z = geometry.seen_pixels(view.camera, points)
-            hides[seen] |= z < FREE_SPACE * depth[rows, columns]
-    return hides
+    others = [j for j in range(len(views)) if j != without]
+    return occluding([views[j].camera for j in others], [depths[j] for j in others], points, FREE_SPACE)
 
 
 Lifted = tuple[np.ndarray, np.ndarray, np.ndarray]
@@ -87,10 +122,10 @@ Lifted = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 def _lift(view: View, depth: np.ndarray, where: np.ndarray) -> Lifted:
     """Return world points [N, 3] [u], colours [N, 3] and pixel footprints [N] [u] of the pixels of a mask ``where`` [H, W]."""
-    rows, columns = np.nonzero(where)
-    z = depth[rows, columns].astype(float)
-    points = geometry.back_project(view.camera, np.stack([columns, rows], 1) + 0.5, z)
-    return points, view.image[rows, columns], z / focal_length(view.camera)
+    pixels = np.flatnonzero(where)
+    z = depth.ravel()[pixels]
+    points = lifted_pixels(view.camera, pixels, z)
+    return points, view.image.reshape(-1, 3)[pixels], z.astype(float) / focal_length(view.camera)
 
 
 def focal_length(camera: Camera) -> float:
@@ -157,30 +192,38 @@ def coarse_points(
 
     known_rows, filled_rows, notes = (list(a) for a in zip(*in_threads(lifted, range(len(views)))))
     filled_in = [rows for rows in filled_rows if rows is not None]
-    points, colors, widths = (np.concatenate(a) for a in zip(*known_rows))
-    cloud = merge(points, colors, merge_cells(points, merge_px * widths) if merge_px > 0 else np.arange(len(points)))
-    pixels, added, filled = len(points), NOTHING, NOTHING
+    points, colors, widths = zip(*known_rows)
+    pixels, added, filled = sum(map(len, points)), NOTHING, NOTHING
     if merge_px > 0:
-        added, new = _elsewhere(points, widths, *reconstructed, merge_px)
-        points, widths = np.concatenate([points, reconstructed[0][new]]), np.concatenate([widths, reconstructed[2][new]])
+        cloud = merge(points, colors, merge_cells(points, widths, merge_px))
+        added, (new,) = _elsewhere(points, widths, *([r] for r in reconstructed), merge_px)
+        points, widths = (*points, reconstructed[0][new]), (*widths, reconstructed[2][new])
+    else:
+        cloud = PointCloud(np.concatenate(points), np.concatenate(colors))
     if filled_in:
-        filled, _ = _elsewhere(points, widths, *(np.concatenate(a) for a in zip(*filled_in)), fill_px)
+        filled, _ = _elsewhere(points, widths, *zip(*filled_in), fill_px)
     more = f"{len(added):,} from the reconstruction, " if len(added) else ""
     notes.append(f"{len(cloud):,} points from {pixels:,} pixels by {source}, {more}{len(filled):,} filled in")
     return joined((cloud, added, filled)), notes
 
 
 def _elsewhere(
-    points: np.ndarray, widths: np.ndarray, more: np.ndarray, colors: np.ndarray, more_widths: np.ndarray, cell: float
-) -> tuple[PointCloud, np.ndarray]:
+    points: Parts, widths: Parts, more: Parts, colors: Parts, more_widths: Parts, cell: float
+) -> tuple[PointCloud, list[np.ndarray]]:
     """Merge points ``more`` [M, 3] in cells without ``points`` [N, 3]; return the merged points and a mask of used ones [M].
 
     ``widths`` [N] and ``more_widths`` [M] are widths of a pixel at each point [u]; ``cell`` is the width of a cell [px].
     """
-    cells = merge_cells(np.concatenate([points, more]), cell * np.concatenate([widths, more_widths]))
-    cells, taken = cells[len(points) :], cells[: len(points)]
-    alone = ~np.isin(cells, taken)
-    return merge(more[alone], colors[alone], cells[alone]), alone
+    if not any(map(len, more)):
+        return NOTHING, [np.zeros(0, bool) for _ in more]
+    cells = merge_cells([*points, *more], [*widths, *more_widths], cell)
+    count, ranks = _ranks(cells)
+    free = np.ones(count, bool)
+    for rank in ranks[: len(points)]:
+        free[rank] = False
+    alone = [free[rank] for rank in ranks[len(points) :]]
+    kept = ([p[a] for p, a in zip(parts, alone)] for parts in (more, colors, cells[len(points) :]))
+    return merge(*kept), alone
 
 
 # Extrapolated points where no view looks: beyond the images, and behind the near side of depth edges.
@@ -202,8 +245,8 @@ its colour is averaged [px]."""
 STEP, EDGE = 1.02, 1.15
 """Ratios of the far to the near depth of two neighbouring pixels. Above the first ratio, a surface ends between them; above the
 second, points are added behind the near one."""
-SIDES = ((0, 1), (0, -1), (1, 1), (1, -1))
-"""Axis and direction of the four neighbours of a pixel."""
+SIDES = [(np.s_[1:], np.s_[:-1]), (np.s_[:-1], np.s_[1:]), (np.s_[:, 1:], np.s_[:, :-1]), (np.s_[:, :-1], np.s_[:, 1:])]
+"""Pixels that have a neighbour on one of the four sides, and these neighbours."""
 
 
 def extrapolated_points(views: Sequence[View], depths: Sequence[ViewDepth]) -> PointCloud:
@@ -232,12 +275,12 @@ def _beyond(views: Sequence[View], i: int, depth: np.ndarray) -> PointCloud:
     view = views[i]
     height, width = depth.shape
     pad = int(BEYOND * width)
-    inverse = _mean_around(np.pad(1 / depth, pad, "edge"), DEPTH_PX)
-    image = _mean_around(np.pad(view.image, ((pad, pad), (pad, pad), (0, 0)), "edge"), COLOR_PX)
-    rows, columns = np.mgrid[BEYOND_PX // 2 : height + 2 * pad : BEYOND_PX, BEYOND_PX // 2 : width + 2 * pad : BEYOND_PX]
-    outside = (rows < pad) | (rows >= height + pad) | (columns < pad) | (columns >= width + pad)
-    rows, columns = rows[outside], columns[outside]
-    pixels = np.stack([columns, rows], 1) - pad + 0.5
+    down, across = (np.arange(BEYOND_PX // 2 - pad, n + pad, BEYOND_PX) for n in (height, width))
+    inverse = _mean_around(1 / depth, DEPTH_PX, down, across)
+    image = _mean_around(view.image, COLOR_PX, down, across)
+    outside = ((down < 0) | (down >= height))[:, None] | (across < 0) | (across >= width)
+    rows, columns = np.nonzero(outside)
+    pixels = np.stack([across[columns], down[rows]], 1) + 0.5
     points = geometry.back_project(view.camera, pixels, 1 / inverse[rows, columns].astype(float))
     unseen = ~np.any([geometry.in_image(v.camera, points) for v in views], axis=0)
     return PointCloud(points[unseen], image[rows, columns][unseen].astype(np.float32))
@@ -253,35 +296,30 @@ def _behind(views: Sequence[View], i: int, depth: np.ndarray, confirmed: Sequenc
     view = views[i]
     with single_threaded_opencv():
         depth = cv2.medianBlur(depth, 5)
-    far, source = depth, np.arange(depth.size).reshape(depth.shape)
+    far, source = depth.copy(), np.arange(depth.size, dtype=np.int32).reshape(depth.shape)
     for _ in range(REACH):
-        for axis, direction in SIDES:
-            beside, its_source = (_neighbour(t, axis, direction) for t in (far, source))
-            ends = beside > STEP * far
-            far, source = np.where(ends, beside, far), np.where(ends, its_source, source)
+        for here, beside in SIDES:
+            ends = far[beside] > STEP * far[here]
+            for values in (far, source):
+                np.copyto(values[here], values[beside], where=ends)
     rows, columns = np.mgrid[BEHIND_PX // 2 : depth.shape[0] : BEHIND_PX, BEHIND_PX // 2 : depth.shape[1] : BEHIND_PX]
     hidden = far[rows, columns] > EDGE * depth[rows, columns]
     rows, columns = rows[hidden], columns[hidden]
     pixels = np.stack([columns, rows], 1) + 0.5
     points = geometry.back_project(view.camera, pixels, far[rows, columns].astype(float))
-    image = _mean_around(view.image, BEHIND_COLOR_PX).reshape(-1, 3)
+    image = _mean_around(view.image, BEHIND_COLOR_PX, *map(np.arange, depth.shape)).reshape(-1, 3)
     keep = ~in_free_space(points, views, confirmed, i)
     return PointCloud(points[keep], image[source[rows, columns]][keep].astype(np.float32))
 
 
-def _neighbour(values: np.ndarray, axis: int, direction: int) -> np.ndarray:
-    """Return the value of each pixel's neighbour on one side of it, shape [H, W]; 0 beyond the border."""
-    shifted = np.roll(values, direction, axis)
-    shifted[(slice(None),) * axis + (0 if direction > 0 else -1,)] = 0
-    return shifted
+def _mean_around(values: np.ndarray, reach: int, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
+    """Return the means over the squares of ``reach`` pixels to each side of rows [R] x columns [C], shape [R, C, ...].
 
-
-def _mean_around(values: np.ndarray, reach: int) -> np.ndarray:
-    """Return the mean over the square of ``reach`` pixels to each side, border pixels repeated outwards, shape [H, W, ...]."""
-    for axis in (0, 1):
-        count = values.shape[axis]
-        padded = np.pad(values, [(reach * (a == axis),) * 2 for a in range(values.ndim)], "edge")
-        values = sum(padded.take(range(k, k + count), axis) for k in range(2 * reach + 1)) / (2 * reach + 1)
+    Border pixels are repeated outwards.
+    """
+    for axis, at in enumerate((rows, columns)):
+        last = values.shape[axis] - 1
+        values = sum(values.take((at + k).clip(0, last), axis) for k in range(-reach, reach + 1)) / (2 * reach + 1)
     return values
 
 
@@ -438,5 +476,5 @@ def hull_points(views: Sequence[View], merge_px: float) -> tuple[PointCloud, str
     colors, kept = _seen_colors(shapes, cells, width)
     total, cells, colors = len(cells), cells[kept], colors[kept]
     wide = max(width, merge_px * _footprint([s.view.camera for s in shapes], cells))
-    cloud = merge(cells, colors, merge_cells(cells, np.full(len(cells), wide)))
+    cloud = merge([cells], [colors], merge_cells([cells], [np.full(len(cells), wide)]))
     return cloud, f"{len(cloud):,} points on the hull of {len(shapes)} silhouettes, from {len(cells):,} of {total:,} cells"

@@ -63,6 +63,7 @@ from warpgs.pipeline.train.trainer import Trainer, background_warmup, complexity
 from warpgs.pipeline.train.view_modules import FittedViews
 from warpgs.plugins import is_ours
 from warpgs.poses.find import JSON, TEXT, find_poses, needs_poses, read_poses_record, source_digest
+from warpgs.priors.networks import in_threads
 from warpgs.priors.photo_checks import PhotoCheck, check_photos, photo_notes
 from warpgs.process import Detail, counted, noted_signals, say
 from warpgs.ranks import ALONE, Ranks
@@ -518,7 +519,7 @@ def _prepare(job: FitJob, resumed: Path | None) -> tuple[Trainer, dict[str, Any]
             job.notes.append(f"camera model {models}: views cannot be compared, so blur, exposure and coverage are not checked")
         else:
             with section("photo checks"):
-                checks = check_photos([without_masked(v) for v in (*job.train, *job.test)], job.progress)
+                checks = check_photos(in_threads(without_masked, (*job.train, *job.test)), job.progress)
         of = job.train, job.scene.points, job.config, job.device, job.scene.background
         with section("set-up"):
             trainer = Trainer(*of, ready=ready, progress=job.progress, ranks=job.ranks)

@@ -14,6 +14,7 @@ import torch
 
 from warpgs.errors import UsageError
 from warpgs.pipeline.metrics.scores import counted_region
+from warpgs.priors.networks import in_threads
 from warpgs.scene import Scene, View
 from warpgs.schema import Checked, Within
 
@@ -192,11 +193,15 @@ def color_of(text: str) -> Color | None:
 
 def mean_color(views: list[View]) -> Color:
     """Return the mean colour of all unmasked pixels of views; it has the same bits on every machine."""
-    total, count = np.zeros(3, np.int64), 0
-    for v in views:
-        pixels = v.image.reshape(-1, 3) if v.mask is None else v.image[v.mask]
-        total += np.rint(pixels.astype(np.float64) * LEVELS).astype(np.int64).sum(axis=0)
-        count += len(pixels)
+
+    def levels_of(view: View) -> tuple[np.ndarray, int]:
+        levels = np.rint(view.image * np.float64(LEVELS))  # whole numbers, also their sums
+        if view.mask is not None:
+            levels[~view.mask] = 0
+        return levels.sum(0).sum(0), levels[..., 0].size if view.mask is None else int(view.mask.sum())
+
+    rows = in_threads(levels_of, views)
+    total, count = sum((row[0] for row in rows), np.zeros(3)), sum(row[1] for row in rows)
     red, green, blue = (int(t) / (LEVELS * max(count, 1)) for t in total)
     return red, green, blue
 

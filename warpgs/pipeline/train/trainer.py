@@ -32,6 +32,7 @@ from warpgs.pipeline.train.stopping import STATE, Stopping
 from warpgs.pipeline.train.strategies.base import StrategyContext, find_strategy
 from warpgs.pipeline.train.views import LearnedViews, TrainingView, half_size, show_learned, stack_views, with_learned
 from warpgs.plugins import returned
+from warpgs.priors.networks import in_threads
 from warpgs.priors.sweep import sweep_depths
 from warpgs.process import Detail
 from warpgs.ranks import ALONE, Ranks
@@ -166,7 +167,7 @@ class Trainer:
             raise DataError("there is no training view; leave at least one in --split")
         for module in config.view_modules:
             module.check(train)
-        train = [without_masked(v) for v in train]  # so that no pixel under a mask has an influence
+        train = in_threads(without_masked, train)  # so that no pixel under a mask has an influence
         c, self.config, self.device, self.ranks, self.batch = config, config, device, ranks, config.batch
         self.generator = torch.Generator().manual_seed(c.seed)
         self.notes: list[str]
