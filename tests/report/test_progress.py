@@ -1,4 +1,5 @@
 import io
+import itertools
 
 import pytest
 
@@ -60,6 +61,44 @@ def test_time_left_is_that_of_the_steps_to_come(capsys, clock):
         first, second = capsys.readouterr().out.splitlines()
     assert "step 401 of 1,000" in first and first.endswith("per step -  left -")
     assert "step 410 of 1,000" in second and "per step 2000 ms" in second and "left 19 min 40 s" in second
+
+
+def shown_left(line: str) -> float:
+    """Return the time left on a line of progress [s]."""
+    words = line.rpartition("left ")[2].split()
+    return sum(float(n) * {"s": 1, "min": 60, "h": 3600}[unit] for n, unit in zip(words[::2], words[1::2], strict=True))
+
+
+@pytest.mark.parametrize("speed", [0.5, 2.0])
+def test_time_left_counts_the_growth_to_come_and_does_not_rise(capsys, clock, speed):
+    """A fit whose steps become three times as slow, on a machine of another speed, with noise and with slow events."""
+    planned = [0.1 + 0.2 * min(1.0, max(0.0, (k - 100) / 150)) + 3.0 * (k in (100, 140, 180)) for k in range(600)]
+    noise = [(50.0 if k == 0 else (1.0, 1.3, 0.8, 0.9)[k % 4]) * speed for k in range(600)]
+    took = [p * n for p, n in zip(planned, noise, strict=True)]
+    with Progress(600, planned=planned, live=False) as progress:
+        for step, seconds in enumerate(took, 1):
+            clock[0] += seconds
+            progress.update(step=step, loss=0.1, psnr=30.0, count=5, seconds=seconds)
+    first, *lines = capsys.readouterr().out.splitlines()
+    left = [(int(line.split()[1]), shown_left(line)) for line in lines]
+    assert first.endswith("left -")  # the first step waits for memory and caches
+    assert all(later <= earlier for (_, earlier), (_, later) in itertools.pairwise(left))
+    for step, seconds in left[:-1]:
+        assert abs(seconds / sum(took[step:]) - 1) < 0.25 or abs(seconds - sum(took[step:])) < 5
+    assert len(left) > 7 and left[-1] == (600, 0)
+
+
+def test_time_left_rises_where_the_machine_becomes_much_slower(capsys, clock):
+    """By less than a quarter it stays: that is noise; more is told, since a time that stands still is wrong."""
+    with Progress(1000, live=False) as progress:
+        for step in range(1, 301):
+            seconds = 1.0 if step <= 100 else 1.15 if step <= 200 else 3.0
+            clock[0] += seconds
+            progress.update(step=step, loss=0.1, psnr=30.0, count=5, seconds=seconds)
+    left = {int(line.split()[1]): shown_left(line) for line in capsys.readouterr().out.splitlines()[1:]}
+    noisy = [left[s] for s in sorted(left) if s <= 200]
+    assert noisy == sorted(noisy, reverse=True)
+    assert max(left[s] for s in left if 200 < s <= 300) > 1800
 
 
 def test_nothing_done_prints_nothing(capsys):

@@ -11,7 +11,7 @@ import re
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
 
@@ -30,6 +30,10 @@ STAGE_INTERVAL = 5.0
 """Seconds between two plain lines on one stage."""
 SMOOTHING = 0.05
 """Weight of the newest value in the running means that are shown."""
+FORGETTING = 0.98
+"""Weight of a step's time in the time left, relative to that of the next step."""
+NOISE = 0.25
+"""Fraction by which the time left may rise without being shown, since the load of a machine varies."""
 COUNTED = re.compile(r"(?P<done>[\d,]+) of (?P<total>[\d,]+)")
 """Part of a line with the progress of a stage."""
 
@@ -160,9 +164,17 @@ class Progress:
     Times exclude steps that compile kernels; no time is shown before the first step without compilation.
     """
 
-    def __init__(self, total: int, done: int = 0, *, live: bool | None = None):
-        """Prepare for ``total`` steps, of which ``done`` are already done; ``live`` None shows the panel only in a terminal."""
+    def __init__(self, total: int, done: int = 0, *, planned: Sequence[float] | None = None, live: bool | None = None):
+        """Prepare for ``total`` steps, of which ``done`` are already done; ``live`` None shows the panel only in a terminal.
+
+        ``planned`` is the expected time of each step, in any unit; None: all are equal.
+        """
         self.total, self.told, self.step = total, done, done
+        self.planned = [1.0] * total if planned is None else planned
+        self.took = self.expected = 0.0
+        """Sums of measured and planned times of the last steps, with falling weights."""
+        self.left: float | None = None
+        """Time left [s]."""
         self.live = is_live() if live is None else live
         self.loss = self.psnr = self.seconds = None
         self.count, self.began, self.printed = 0, time.perf_counter(), 0.0
@@ -194,9 +206,16 @@ class Progress:
 
     def update(self, *, step: int, loss: float, psnr: float, count: int, seconds: float | None = None) -> None:
         """Show the numbers of one finished step; ``seconds`` is its time, None if later steps will take another time."""
+        seconds = None if self.loss is None else seconds  # the first step waits for memory and caches
         self.step, self.count, self.doing = step, count, ""
         self.loss, self.psnr = _mean(self.loss, loss), _mean(self.psnr, psnr)
-        self.seconds = self.seconds if seconds is None else _mean(self.seconds, seconds)
+        if seconds is not None:
+            self.seconds = _mean(self.seconds, seconds)
+            self.took = FORGETTING * self.took + seconds
+            self.expected = FORGETTING * self.expected + self.planned[step - 1]
+            left = self.took / self.expected * sum(self.planned[step : self.total])
+            if self.left is None or not self.left < left < (1 + NOISE) * self.left:
+                self.left = left
         now = time.perf_counter()
         if self.display is None and now - self.printed >= PLAIN_INTERVAL:
             self.printed, self.told = now, step
@@ -209,7 +228,7 @@ class Progress:
             ("train PSNR", "-" if self.psnr is None else f"{self.psnr:.2f} dB"),
             ("Gaussians", f"{self.count:,}"),
             ("per step", "-" if self.seconds is None else f"{1000 * self.seconds:.0f} ms"),
-            ("left", "-" if self.seconds is None else duration(self.seconds * (self.total - self.step))),
+            ("left", "-" if self.left is None else duration(self.left)),
         ]
 
     def _line(self) -> str:

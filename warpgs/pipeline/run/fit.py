@@ -3,7 +3,7 @@
 import contextlib
 import json
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -57,8 +57,9 @@ from warpgs.pipeline.train.loss import term_values
 from warpgs.pipeline.train.memory import plan_summary
 from warpgs.pipeline.train.presets import chosen_settings
 from warpgs.pipeline.train.schedule import StepReport, choose_background, over_background
-from warpgs.pipeline.train.settings import FitConfig, settings_by_views, within_budget
+from warpgs.pipeline.train.settings import FitConfig, settings_by_views, step_times, within_budget
 from warpgs.pipeline.train.step import StepBuffers, eager_renderer
+from warpgs.pipeline.train.strategies.base import find_strategy
 from warpgs.pipeline.train.trainer import Trainer, background_warmup, complexity_figures, complexity_summary, run, train_views
 from warpgs.pipeline.train.view_modules import FittedViews
 from warpgs.plugins import is_ours
@@ -68,7 +69,7 @@ from warpgs.priors.photo_checks import PhotoCheck, check_photos, photo_notes
 from warpgs.process import Detail, counted, noted_signals, say
 from warpgs.ranks import ALONE, Ranks
 from warpgs.report.page import image_names, renaming_notes
-from warpgs.report.progress import EventLog, Progress, Stages
+from warpgs.report.progress import EventLog, Progress, Stages, duration
 from warpgs.scene import Camera, Scene, View, checked_scene
 
 
@@ -187,7 +188,8 @@ def take_steps(job: FitJob, trainer: Trainer) -> None:
         if out is not None and log is not None:
             images_written = stack.enter_context(images_kept(trainer, list(job.split.train), out))
             stack.callback(log.close)
-        progress = stack.enter_context(Progress(trainer.steps, trainer.step)) if job.verbose else None
+        planned = planned_times(job, trainer)[0]
+        progress = stack.enter_context(Progress(trainer.steps, trainer.step, planned=planned)) if job.verbose else None
         try:
             run(trainer, report, save, stack.enter_context(noted_signals()), restore)
         except NotFiniteError as e:
@@ -200,6 +202,19 @@ def take_steps(job: FitJob, trainer: Trainer) -> None:
             save(trainer)
             raise explained from e
     job.tell(trainer)  # of images that were written last
+
+
+def planned_times(job: FitJob, trainer: Trainer) -> tuple[Sequence[float] | None, list[str]]:
+    """Return the expected time of each step on two cores, and a sentence on it; elsewhere None, since steps are alike."""
+    if job.device.type != "cpu" or not find_strategy(job.config.strategy).samples:
+        return None, []
+    pixels, config = max(v.camera.width * v.camera.height for v in job.train), job.config
+    config = replace(config, max_gaussians=min(config.max_gaussians, trainer.context.capacity))
+    times, counts = step_times(config, len(job.train), pixels, len(trainer.table), trainer.step)
+    took = f"{len(times) - trainer.step:,} steps take about {duration(times[trainer.step :].sum())} on two idle cores"
+    return times.tolist(), [
+        f"{took}, besides start and report; they end with about {float(f'{counts[-1]:.2g}'):,.0f} Gaussians"
+    ]
 
 
 def _explained(job: FitJob, trainer: Trainer, error: NotFiniteError, view: int) -> NotFiniteError:
@@ -540,7 +555,8 @@ def _finish(job: FitJob, trainer: Trainer, record: dict[str, Any], checks: list[
     counts = f"{len(job.train)} views to fit, {len(job.test)} held out"
     job.say(f"{job.scene.path}: {job.scene.format}, {counts}, {camera.width} x {camera.height} px, {job.where}")
     job.notes = []
-    job.note(*chosen, *batched_notes(job.config, job.ranks), plan_summary(trainer.memory))
+    planned = planned_times(job, trainer)[1]
+    job.note(*chosen, *batched_notes(job.config, job.ranks), plan_summary(trainer.memory), *planned)
     setup = time.perf_counter() - job.began
     take_steps(job, trainer)
     seconds = {"setup": setup, "training": time.perf_counter() - job.began - setup}

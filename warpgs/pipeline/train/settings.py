@@ -12,10 +12,12 @@ import statistics
 import time
 import types
 import typing
+from bisect import bisect_right
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any
 
+import numpy as np
 import torch
 
 from warpgs.constants import rule_named
@@ -29,7 +31,7 @@ from warpgs.pipeline.train.schedule import OptimizerConfig, PhaseConfig, color_o
 from warpgs.pipeline.train.stopping import StoppingConfig
 from warpgs.pipeline.train.strategies.base import STRATEGIES, Settings, find_strategy
 from warpgs.pipeline.train.strategies.clone_split import DensityConfig
-from warpgs.pipeline.train.strategies.sampling import MethodConfig
+from warpgs.pipeline.train.strategies.sampling import MAX_VIEWS, MAX_WEIGHED, MethodConfig
 from warpgs.pipeline.train.view_modules import VIEW_MODULES, ViewModule
 from warpgs.plugins import Registry, flag_group, own_code
 from warpgs.priors.views import PriorConfig
@@ -54,8 +56,8 @@ class FitConfig(Checked):
     """Number of views that each step renders; their gradients are averaged. Learning rates are multiplied by the square root of
     this number (docs/many-gpus.md). Several GPUs share the views of a step."""
     cpu_limit: bool = True
-    """Limit the steps on a CPU, if --steps is None: at most as many as two cores finish in 1 to 20 minutes, depending on the
-    number of views."""
+    """Limit steps and Gaussians on a CPU, if --steps is None: at most as many as two cores finish in 1 to 20 minutes, depending
+    on the number of views and on --max-steps."""
     seed: Annotated[int, Within(0, 2**31 - 1)] = 0
     """Seed of all random numbers; the same seed, data and kind of device give the same bytes."""
     rule: str = "exact"
@@ -84,7 +86,7 @@ class FitConfig(Checked):
     cuda_graph: bool = True
     """CUDA graphs: steps are captured once and replayed, which is faster and gives the same bytes."""
     max_gaussians: Annotated[int, Within(1)] = 1_000_000
-    """Largest number of Gaussians at any step, including the start."""
+    """Largest number of Gaussians at any step, including the start; --cpu-limit may lower it."""
     background: str = "scene"
     """Background colour, behind all Gaussians: mean (mean colour of the training views), scene (colour of the files: white for
     Blender, else black), auto (mean if the training views are opaque and show no object on black, else scene), black, white,
@@ -526,6 +528,15 @@ CPU_PIXELS = 1.55e6
 times as many pixels."""
 CPU_SECONDS = 45.0, 4.0, 1200.0
 """Default time limit of a fit on a CPU [s]: constant part, part for each view, and upper bound of the sum."""
+CPU_TIMES = 8e-8, 3.6e-7, 1.4e-8
+"""Time of a step on two idle cores of 2.5 GHz: for a pixel, for a Gaussian, and for each coefficient of the harmonics of a
+Gaussian [s]. Measured as processor time over two threads (docs/decisions/025-time-on-a-cpu.md)."""
+EVENT_TIMES = 1.0, 0.8
+"""Time of a sampling event, in steps: for each view that is sampled, and for each view that ranks Gaussians for eviction."""
+SWEPT_VIEWS = 30
+"""Views whose pixels, over the area of a merged cell, give about the number of first points; more add no points."""
+FIRST_LOOK = 0.1
+"""Upper bound of the time limit on a CPU for each of ``max_steps`` [s]: one minute for the 600 of preset `quick`."""
 ONE_LAYER = 1.1
 """Time of a step on a CPU with one layer of Gaussians, relative to a step with two layers, where there are fewer Gaussians."""
 MEANS_LR, SH_LR, CPU_RATES, CPU_RATES_VIEWS = 1.6e-4, 2.5e-3, 2.5, 9
@@ -542,20 +553,53 @@ def steps_by_views(views: int, opaque: bool = True) -> int:
     return min(MAX_STEPS, round(MIN_STEPS * max(1.0, views / FEW) ** STEPS_POWER))
 
 
-def steps_on_cpu(wanted: int, views: int, pixels: float) -> tuple[int, str]:
-    """Return how many steps fit into the time limit on a CPU, and a sentence for the user; it is empty if all steps fit.
+def step_times(config: FitConfig, views: int, pixels: float, start: int, done: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Return the expected time of each step on two cores [s], and the expected number of Gaussians in it, shape [steps] each.
 
-    ``pixels`` are those that the ``wanted`` steps render, weighted by the time for a pixel.
+    There are ``start`` Gaussians after ``done`` steps; sampling events add more up to the limits. ``pixels`` are those of a
+    view.
     """
+    assert config.steps is not None and config.half_resolution is not None  # `settings_by_views` has chosen
+    assert config.sh_degree is not None
+    (of_pixel, of_gaussian, of_coefficient), sampler, steps = CPU_TIMES, config.method.sampler, np.arange(1, config.steps + 1)
+    events = np.array(plan_phases(config.phases, config.steps).events if find_strategy(config.strategy).samples else [])
+    due = (events[:, None] == steps).any(0)
+    added = sampler.fraction * pixels * min(views, MAX_VIEWS)
+    wanted = start + added * np.cumsum(due & (steps > done))
+    most = max(start, min(config.max_gaussians, (1 + sampler.max_fraction) * start))
+    counts, weighed = np.minimum(wanted, most), np.where(wanted > most, len(range(0, views, -(-views // MAX_WEIGHED))), 0)
+    full = of_pixel * pixels + (of_gaussian + of_coefficient * (config.sh_degree + 1) ** 2) * counts
+    half = 0.75 * of_pixel * pixels * (steps <= config.half_resolution * config.steps)
+    events_in_steps = due * (EVENT_TIMES[0] * min(views, MAX_VIEWS) + EVENT_TIMES[1] * weighed)
+    return config.batch * (full - half) + events_in_steps * full, counts
+
+
+def limited_on_cpu(config: FitConfig, views: int, pixels: float) -> tuple[int, int, str]:
+    """Return how many steps and Gaussians fit into the time limit on a CPU, and a sentence for the user, empty if all fit.
+
+    ``pixels`` are those of a view.
+    """
+    assert config.steps is not None and config.half_resolution is not None
     least, each, upper = CPU_SECONDS
-    seconds, most = pixels / CPU_PIXELS, min(least + each * views, upper)
-    if seconds <= most:
-        return wanted, ""
-    steps = max(1, int(wanted * most / seconds))
-    return steps, (
-        f"to save time on a CPU, the fit takes {steps:,} of {wanted:,} steps: about {most / 60:.1f} min on two cores, besides "
-        f"start and report; --no-cpu-limit takes all, about {seconds / 60:.0f} min, and raised PSNR by {GAIN_DB}"
-    )
+    limit, most = min(least + each * views, upper, FIRST_LOOK * config.max_steps), config.max_gaussians
+    rendered = pixels * config.batch * (1 - 0.75 * config.half_resolution)  # half the size is a quarter of the pixels
+    seconds = config.steps * rendered * (1.0 if config.method.hier else ONE_LAYER) / CPU_PIXELS
+    steps = max(1, int(config.steps * min(1.0, limit / seconds)))
+    start = round(min(views, SWEPT_VIEWS) * pixels / max(1.0, config.init.merge_px) ** 2)
+
+    def planned(most: int) -> float:
+        fit = dataclasses.replace(config, steps=steps, max_gaussians=most)
+        return float(step_times(fit, views, pixels, start)[0].sum())
+
+    if planned(most) > limit:
+        most = min(most, 1000 * max(1, bisect_right(range(1000, most, 1000), limit, key=planned)))
+    if (steps, most) == (config.steps, config.max_gaussians):
+        return steps, most, ""
+    capped = f", with at most {most:,} Gaussians" if most < config.max_gaussians else ""
+    return steps, most, (
+        f"to save time on a CPU, the fit takes {steps:,} of {config.steps:,} steps{capped}; --no-cpu-limit takes all, about "
+        f"{seconds / 60:.0f} min, and raised PSNR by {GAIN_DB}"
+    )  # fmt: skip
 
 
 def settings_by_views(config: FitConfig, train: list[View], device: str) -> tuple[FitConfig, list[str]]:
@@ -572,18 +616,20 @@ def settings_by_views(config: FitConfig, train: list[View], device: str) -> tupl
     hier = given(config.method.hier, not one_layer)
     degree = given(config.sh_degree, sum(views >= n for n in DEGREES))
     half = given(config.half_resolution, float(f"{HALF_RESOLUTION * min(1.0, HALF_VIEWS / views):.2g}"))
-    steps = wanted = given(config.steps, min(steps_by_views(views, opaque), config.max_steps))
-    limit, sh_every = "", config.sh_every
+    wanted = given(config.steps, min(steps_by_views(views, opaque), config.max_steps))
+    limit, sh_every, most, steps = "", config.sh_every, config.max_gaussians, wanted
     if config.steps is None and config.cpu_limit and device == "cpu":
-        pixels = wanted * (config.batch * max(v.camera.width * v.camera.height for v in train))
-        pixels *= 1 - 0.75 * half  # half the size is a quarter of the pixels
-        steps, limit = steps_on_cpu(wanted, views, pixels * (1.0 if hier else ONE_LAYER))
+        pixels = max(v.camera.width * v.camera.height for v in train)
+        method = dataclasses.replace(config.method, hier=hier)
+        asked = dataclasses.replace(config, steps=wanted, half_resolution=half, sh_degree=degree, method=method)
+        steps, most, limit = limited_on_cpu(asked, views, pixels)
+    limited = steps < wanted
     init = config.init
     if init.extrapolate is None:
         init = dataclasses.replace(init, extrapolate=opaque and views <= EXTRAPOLATED_VIEWS and steps >= SMOOTH_STEPS)
         init = dataclasses.replace(init, extrapolate=extrapolates(init, train))
     decay = EXTRAPOLATED_DECAY if extrapolates(init, train) else OPACITIES_DECAY
-    factor = CPU_RATES if limit and views > CPU_RATES_VIEWS else 1.0
+    factor = CPU_RATES if limited and views > CPU_RATES_VIEWS else 1.0
     rates = {
         "scales_lr": SCALES_LR * min(1.0, SCALES_VIEWS / views) ** SCALES_POWER,
         "opacities_lr": min(MAX_OPACITIES_LR, OPACITIES_LR * math.sqrt(views / 3)),
@@ -591,14 +637,14 @@ def settings_by_views(config: FitConfig, train: list[View], device: str) -> tupl
         "average_last": AVERAGE_LAST if views >= AVERAGED_VIEWS else 0.0,
     }  # fmt: skip
     rates = {n: given(getattr(config.optimizer, n), float(f"{v:.3g}")) for n, v in rates.items()}
-    if limit and degree and config.stopping.min_gain_db is None:
+    if limited and degree and config.stopping.min_gain_db is None:
         # as with held-out blocks, all degrees are in use when growth begins
         sh_every = min(sh_every, max(1, plan_phases(config.phases, steps).refine // degree))
-    smooth, most = (SMOOTH_WEIGHT, SMOOTH_VIEWS) if opaque else (ALPHA_SMOOTH_WEIGHT, ALPHA_SMOOTH_VIEWS)
-    smooth = given(config.loss.smooth_weight, smooth if views <= most and steps >= SMOOTH_STEPS else 0.0)
-    min_gain = given(config.stopping.min_gain_db, 0.0 if limit else MIN_GAIN_DB)
+    smooth, few = (SMOOTH_WEIGHT, SMOOTH_VIEWS) if opaque else (ALPHA_SMOOTH_WEIGHT, ALPHA_SMOOTH_VIEWS)
+    smooth = given(config.loss.smooth_weight, smooth if views <= few and steps >= SMOOTH_STEPS else 0.0)
+    min_gain = given(config.stopping.min_gain_db, 0.0 if limited else MIN_GAIN_DB)
     made = dataclasses.replace(
-        config, steps=steps, sh_degree=degree, sh_every=sh_every, half_resolution=half, init=init,
+        config, steps=steps, max_gaussians=most, sh_degree=degree, sh_every=sh_every, half_resolution=half, init=init,
         optimizer=dataclasses.replace(config.optimizer, **rates), method=dataclasses.replace(config.method, hier=hier),
         loss=dataclasses.replace(config.loss, smooth_weight=smooth),
         stopping=dataclasses.replace(config.stopping, min_gain_db=min_gain),
