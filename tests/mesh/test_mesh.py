@@ -12,6 +12,7 @@ from tests.mesh.balls import ALL_SIDES, CENTER, RADIUS, RED, ball, cameras
 from warpgs import rasterize
 from warpgs.app.cli import main
 from warpgs.errors import DataError, ResourceError, UsageError
+from warpgs.geometry import rotation_matrices
 from warpgs.mesh import fuse as fusing
 from warpgs.mesh import views
 from warpgs.mesh.fuse import (
@@ -41,7 +42,6 @@ from warpgs.mesh.views import (
     whitening,
 )
 from warpgs.pipeline.films.paths import common_up
-from warpgs.pipeline.model.edit import covariances as covariances_of
 from warpgs.pipeline.run import export as run_mesh
 from warpgs.pipeline.run.folder import METRICS_FILE, StoredRun
 from warpgs.render.options import RasterizeOptions
@@ -368,7 +368,9 @@ def test_the_densest_point_of_a_ray():
     matrices, means = whitening(gaussians, one)
     found = densest_depths(matrices, means, rays, torch.arange(40).expand(2, 40))
     rotation, translation = (torch.as_tensor(a, dtype=torch.float64) for a in (one.viewmat[:3, :3], one.viewmat[:3, 3]))
-    covariances = rotation @ covariances_of(gaussians.quats, gaussians.log_scales) @ rotation.T
+    quats = torch.nn.functional.normalize(gaussians.quats, dim=1)
+    axes = rotation @ rotation_matrices(quats) * gaussians.log_scales.exp()[:, None]
+    covariances = axes @ axes.mT
     centers = gaussians.means @ rotation.T + translation
     assert torch.allclose(means, centers)
     t = torch.linspace(1e-3, 20, 40_001, dtype=torch.float64)

@@ -28,7 +28,7 @@ from warpgs.pipeline.films.film import render_path
 from warpgs.pipeline.metrics import scores
 from warpgs.pipeline.metrics.scores import score, summarize
 from warpgs.pipeline.model.start import InitConfig
-from warpgs.pipeline.run.commands import mean_psnr, scene_of
+from warpgs.pipeline.run.commands import scene_of, view_psnrs
 from warpgs.pipeline.run.folder import METRICS, open_run
 from warpgs.pipeline.run.request import NO_SCORES, SceneRequest
 from warpgs.pipeline.run.results import score_line
@@ -625,7 +625,7 @@ def test_a_camera_far_off_does_not_set_the_scale(tmp_path, distance):
         assert main(["fit", str(tmp_path / name), "--out", str(run), *flags, views + test]) == 0
         stored = open_run(run, "cpu")
         train = [v for v in scene_of(stored)[1] if v.name != "007.png"]
-        psnr.append(mean_psnr(stored.gaussians(), train, stored.options()))
+        psnr.append(view_psnrs(stored.gaussians(), train, stored.options()).mean())
     assert psnr[1] > psnr[0] - 0.5, psnr
 
 

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import math
+import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -424,25 +425,48 @@ def test_files_for_strangers_are_cleaned_unless_asked_otherwise(suffix, flags, c
     assert main([*words, "--clean", "--no-clean"]) == UsageError.exit_code
 
 
-def test_largest_share():
-    """Within the last interval of what is accepted, never above it; all and nothing are found; what comes back was accepted."""
-    for limit in (0.3, 0.77, 0.0001):
-        fraction = edit.largest_fraction(limit.__ge__)
-        assert limit - 2**-edit.ROUNDS <= fraction <= limit
-    assert edit.largest_fraction(lambda s: True) == 1 and edit.largest_fraction(lambda s: False) == 0
+@pytest.mark.parametrize("steepness", [1, 8, 20])
+@pytest.mark.parametrize("limit", [0.1, 0.3, 0.77])
+def test_largest_share(limit, steepness):
+    """At nearly the whole limit, never above it, after few tries; within the last of the intervals at a step."""
     asked = []
-    odd = edit.largest_fraction(lambda s: asked.append(s) or int(s * 32) % 3 == 0)
-    assert odd == 0 or (odd in asked and int(odd * 32) % 3 == 0)
+    fraction = edit.largest_fraction(lambda s: asked.append(s) or math.exp(steepness * (s - limit)), 1.0)
+    assert edit.AIM <= math.exp(steepness * (fraction - limit)) <= 1 and len(asked) <= edit.TRIES
+    fraction = edit.largest_fraction(lambda s: asked.append(s) or 1e3 * (s > limit), 1.0)
+    assert limit - 2 ** (1 - edit.TRIES) <= fraction <= limit and len(asked) <= 2 * edit.TRIES
 
 
-def test_one_goes_only_where_both_scores_agree():
-    """The later of the two places decides: neither the faint that matters nor the strong that does not goes first."""
-    maxima = torch.tensor([0.0, 0.9, 0.1, 0.8, 0.2])
-    sensitivity = torch.tensor([9.0, 0.0, 0.2, 8.0, 0.1])
-    order = edit.prune_order(maxima, sensitivity).tolist()
-    assert order[:2] == [2, 4] and sorted(order) == [*range(5)]
+def test_a_share_is_0_or_was_tried():
+    """Also where losses are negative, equal, undefined or do not grow with the fraction."""
+    assert edit.largest_fraction(lambda s: -1.0, 0.1) == 1
+    for loss in (1.0, math.nan, math.inf):
+        assert edit.largest_fraction(lambda s, loss=loss: loss, 0.1) == 0
+    for seed in range(20):
+        draw, asked = np.random.default_rng(seed), {0.0: -1.0}
+        fraction = edit.largest_fraction(lambda s, a=asked, d=draw: a.setdefault(s, d.uniform(-0.1, 0.4)), 0.1)
+        assert asked[fraction] <= 0.1 and all(0 <= s <= 1 for s in asked)
+
+
+def test_the_last_of_an_order_stay():
     assert edit.keep_last(torch.tensor([3, 1, 0, 2]), 0.5).tolist() == [0, 2]
     assert edit.keep_last(torch.tensor([3, 1, 0, 2]), 1.0).tolist() == [2]
+
+
+@pytest.mark.parametrize("hidden", [0.5, 1, 2, 6, 1e9])
+def test_few_views_do_not_decide_alone(hidden):
+    """A model whose loss on all views is too large is refused, and a larger one taken; at worst the whole one."""
+    whole, tries = cloud(400, degree=1), {True: [], False: []}
+    cameras = [torch_camera(c) for c in ring(3, 40, 30)]
+
+    def loss(made, on_all):
+        tries[on_all].append(made)
+        removed = 1 - len(made) / len(whole)
+        return 0.01 * math.exp(5 * removed) * (hidden if on_all else 1)
+
+    made, lost = edit.prune_model(whole, cameras, RasterizeOptions(), 0, loss, 0.1)
+    assert lost <= 0.1 and (lost == 0 if hidden == 1e9 else made is tries[True][-1] and lost == loss(made, True))
+    assert (len(made) == len(whole)) == (hidden == 1e9)
+    assert len(tries[True]) <= edit.REPEATS + 1 and len(tries[False]) <= edit.TRIES * (edit.REPEATS + 1)
 
 
 FLAGS = f"--split {split_spec(8)} --steps 80 --device cpu --preset 3dgs --sh-every 20 --init.random-count 600".split()
@@ -543,6 +567,7 @@ def test_prune_keeps_its_promise(run, tmp_path, capsys):
     assert "Gaussians, mean SH degree" in words and "times smaller" in words and "held-out PSNR" in words
     assert f"`warpgs eval '{tmp_path}/a small one'` scores it" in words and f"`warpgs render '{tmp_path}/a small one'`" in words
     assert "trying smaller models: number 1" in words and "scoring the smaller model" in words
+    assert len(re.findall("trying smaller models: number", words)) <= 2 * edit.TRIES + 1, "one search for each step"
     assert before == {p: p.read_bytes() for p in run.rglob("*") if p.is_file()}
     record = json.loads((tmp_path / "a small one" / "config.json").read_text())["pruned"]
     whole, small = (open_run(f, CPU).gaussians() for f in (run, tmp_path / "a small one"))
@@ -606,10 +631,11 @@ def test_only_the_mirror_keeps_its_harmonics():
     cameras = [torch_camera(c) for c in ring(6, 80, 60)]
     photos = [rasterize(g, c).rgb for c in cameras]
 
-    def accepted(model) -> bool:
-        return all(float((rasterize(model, c).rgb - p).square().mean()) < 1e-6 for c, p in zip(cameras, photos))
+    def loss(model) -> float:
+        return max(float((rasterize(model, c).rgb - p).square().mean()) for c, p in zip(cameras, photos))
 
-    degrees = edit.stored_degrees(edit.lower_degrees(g, edit.coverage(g, cameras, RasterizeOptions())[0], accepted).sh)
+    need = edit.sensitivities(g, cameras, RasterizeOptions(), 0)[2]
+    degrees = edit.stored_degrees(edit.lower_degrees(g, need, loss, 1e-6).sh)
     assert bool((degrees[~right] == 0).all()) and float(degrees[right].float().mean()) > 0.8
 
 

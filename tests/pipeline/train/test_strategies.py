@@ -1,4 +1,4 @@
-"""Density strategies: clone and split, MCMC, merging with moments, and parts of a user's own."""
+"""Density strategies: clone and split, MCMC, and parts of a user's own."""
 
 import dataclasses
 import math
@@ -13,7 +13,6 @@ from tests.pipeline.train.fits import advanced, continued, same_bits
 from tests.scenes import photos, seeds
 from warpgs.errors import UsageError
 from warpgs.geometry import quaternions, rotation_matrices
-from warpgs.pipeline.model.edit import OPAQUE, covariances, merged_pairs, merges
 from warpgs.pipeline.model.start import InitConfig
 from warpgs.pipeline.model.table import DensityUpdate
 from warpgs.pipeline.train.loss import LOSS_TERMS, LossTerm
@@ -209,9 +208,6 @@ def test_captured_steps_equal_single_steps():
     assert all(torch.equal(t, captured[n]) for n, t in single.items())
 
 
-# Merging with moments, against the mixture's own.
-
-
 def test_rotations_there_and_back():
     """Every quaternion, also a half turn about an axis, gives its rotation, and the rotation gives it back up to its sign."""
     q = torch.nn.functional.normalize(
@@ -224,71 +220,6 @@ def test_rotations_there_and_back():
     assert torch.allclose((quaternions(r) * q).sum(1).abs(), torch.ones(len(r), dtype=torch.float64), atol=1e-12)
     turn = rotation_matrices(torch.tensor([[math.cos(0.3), 0, 0, math.sin(0.3)]]))[0]
     assert torch.allclose(turn[:2, 0], torch.tensor([math.cos(0.6), math.sin(0.6)]))
-
-
-def test_moments_of_a_pair():
-    """Mean, covariance and colours of the mixture; what the pair covers stays."""
-    g = cloud(2, seed=3)
-    pairs, merged = merges(g, torch.ones(2), odd=False)
-    assert sorted(pairs.flatten().tolist()) == [0, 1]
-    areas = g.log_scales.double().exp().sort(1).values[:, 1:].prod(1)
-    mass = g.logit_opacities.double().sigmoid() * areas
-    fraction = (mass / mass.sum())[:, None]
-    mean = (fraction * g.means.double()).sum(0)
-    apart = g.means.double() - mean
-    cov = covariances(g.quats.double(), g.log_scales.double()) + apart[:, :, None] * apart[:, None, :]
-    merged = {n: t.double() for n, t in merged.items()}
-    assert torch.allclose(merged["means"][0], mean, atol=1e-6)
-    assert torch.allclose(covariances(merged["quats"], merged["log_scales"])[0], (fraction[:, None] * cov).sum(0), atol=1e-6)
-    assert torch.allclose(merged["sh"][0], (fraction[:, None] * g.sh.double()).sum(0), atol=1e-6)
-    new = merged["logit_opacities"].sigmoid() * merged["log_scales"].exp().sort(1).values[:, 1:].prod(1)
-    assert 0.5 * float(mass.sum()) < float(new) < float(mass.sum()) * (1 + 1e-6)
-
-
-def flat_pair(apart: float, opacity: float, widths=(0.3, 0.2)) -> Gaussians:
-    """Two thin discs in the plane z = 0."""
-    rows = {n: t[[0, 0]].clone() for n, t in cloud(1).tensors().items()}
-    rows["means"] = torch.tensor([[0.0, 0, 0], [apart, 0, 0]])
-    rows["quats"] = torch.tensor([[1.0, 0, 0, 0]] * 2)
-    rows["log_scales"] = torch.log(torch.tensor([[widths[0], widths[1], 1e-3]] * 2))
-    rows["logit_opacities"] = torch.logit(torch.full((2,), opacity))
-    return Gaussians(**rows)
-
-
-@pytest.mark.parametrize("apart, opacity", [(0.0, 0.02), (0.1, 0.4), (0.4, 0.6), (0.5, 0.97), (0.05, 0.97)])
-def test_a_pair_covers_what_it_covered(apart, opacity):
-    """The integral of alpha, added up pixel by pixel, is that of the pair, also where opacity has no more room."""
-    x, y = torch.meshgrid(*[torch.linspace(-3, 3, 601, dtype=torch.float64)] * 2, indexing="ij")
-
-    def covered(rows) -> float:
-        left = torch.ones_like(x)
-        for mean, scale, logit in zip(rows["means"].double(), rows["log_scales"].double().exp(), rows["logit_opacities"]):
-            flat = scale.sort().values  # the long axis is x in both
-            left = left * (
-                1
-                - logit.double().sigmoid() * torch.exp(-0.5 * (((x - mean[0]) / flat[2]) ** 2 + ((y - mean[1]) / flat[1]) ** 2))
-            )
-        return float((1 - left).sum()) * 1e-4
-
-    g = flat_pair(apart, opacity)
-    _, merged = merges(g, torch.ones(2), odd=False)
-    assert covered(merged) == pytest.approx(covered(g.tensors()), rel=1e-3)
-    assert float(merged["logit_opacities"].sigmoid()) <= OPAQUE + 1e-6
-
-
-def test_pairs_are_disjoint_and_cheapest_first():
-    """No row twice; like neighbours come before unlike ones; a pair that is taken becomes one row."""
-    g = cloud(101)
-    for odd in (False, True):
-        rows = merges(g, torch.ones(101), odd)[0].flatten()
-        assert len(rows) == len(rows.unique()) == 100
-    means = torch.tensor([[0.0, 0, 1], [0.01, 0, 1], [5, 5, 1], [5.01, 5, 1]])
-    four = {n: t[[0, 0, 0, 0]].clone() for n, t in cloud(1).tensors().items()} | {"means": means}
-    four["sh"][2] += 1
-    pairs, merged = merges(Gaussians(**four), torch.ones(4), odd=False)
-    assert set(pairs[0].tolist()) == {0, 1} and len(pairs) == 2
-    fewer = merged_pairs(Gaussians(**four), pairs, merged, 1)
-    assert torch.equal(fewer.means, torch.cat([means[2:], merged["means"][:1]])) and len(fewer.sh) == 3
 
 
 # Parts of a user's own in a fit: loss terms, and a density strategy.

@@ -1,10 +1,9 @@
-"""Edits of a finished model: filters, merging and compression."""
+"""Edits of a finished model: filters and compression."""
 
 import json
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,20 +12,19 @@ import torch
 
 from warpgs.errors import DataError, UsageError
 from warpgs.files import read_input, unread_reason
-from warpgs.geometry import matmul, quaternions, rotation_matrices
-from warpgs.kernels.neighbours import morton_codes
+from warpgs.geometry import matmul
 from warpgs.kernels.sh import MAX_DEGREE
 from warpgs.pipeline.model.limits import NEEDLE, ROUNDING, long_axes
 from warpgs.pipeline.model.table import truncated
 from warpgs.render.options import RasterizeOptions
 from warpgs.render.rasterize import rasterize
-from warpgs.scene import C0, Camera, Gaussians
+from warpgs.scene import Camera, Gaussians
 
 SEEN = 4 / 255
 """Least blending weight at which a view sees a Gaussian: with less, the Gaussian changes no pixel by more than 4 of 255
 levels."""
-PROBES = 2
-"""Random images per view for the Fisher sensitivity."""
+PROBES = 16
+"""Least number of random images over all views for the sensitivities."""
 
 
 @torch.no_grad()
@@ -45,106 +43,35 @@ def coverage(gaussians: Gaussians, cameras: list[Camera], options: RasterizeOpti
 
 
 @torch.enable_grad()  # the caller may have switched gradients off
-def fisher(gaussians: Gaussians, cameras: list[Camera], options: RasterizeOptions, seed: int) -> torch.Tensor:
-    """Estimate the change of the images when a Gaussian moves by its own width or its axes grow, at least 0, shape [N].
+def sensitivities(
+    gaussians: Gaussians, cameras: list[Camera], options: RasterizeOptions, seed: int
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Estimate three squared changes of the images for each Gaussian, summed over pixels, at least 0, shape [N].
 
-    The result is the trace of PUP-3DGS' sensitivity, in units of the Gaussian's width (arXiv 2406.10219, eq. 6: the sum over
+    The first is the trace of PUP-3DGS' sensitivity, in units of the Gaussian's width (arXiv 2406.10219, eq. 6: the sum over
     pixels of the outer product of the colour's gradient with respect to mean and scale). PUP uses the log-determinant instead.
-    With random signs e, the same on every device, as the gradient of an image, the backward pass gives J^T e; the mean of the
-    squares of J^T e is the diagonal of J^T J.
+    The second is the change when it is removed, since a pixel is linear in each opacity. The third is the change when its
+    harmonics above degree 0 are removed. With random signs e, the same on every device, as the gradient of an image, the
+    backward pass gives J^T e; the mean of the squares of J^T e is the diagonal of J^T J.
     """
-    leaves = {n: t.detach().clone().requires_grad_(n in ("means", "log_scales")) for n, t in gaussians.tensors().items()}
+    wanted = ("means", "log_scales", "logit_opacities", "sh")
+    leaves = {n: t.detach().clone().requires_grad_(n in wanted) for n, t in gaussians.tensors().items()}
     width = leaves["log_scales"].detach().exp().amax(1, keepdim=True)
-    generator = torch.Generator().manual_seed(seed)
-    total = width.new_zeros(len(width))
+    clear = (-leaves["logit_opacities"].detach()).sigmoid().clamp_min(ROUNDING)  # d opacity / d logit = opacity * clear
+    harmonics = leaves["sh"].detach().flatten(1)[:, 3:]
+    generator, probes = torch.Generator().manual_seed(seed), -(-PROBES // len(cameras))
+    total = width.new_zeros(3, len(width))
     for camera in cameras:
         rgb = rasterize(Gaussians(**leaves), camera, options).rgb
-        for probe in range(PROBES):
+        for probe in range(probes):
             signs = (2 * torch.randint(2, rgb.shape, generator=generator, device="cpu") - 1).to(rgb)
-            wanted = [leaves["means"], leaves["log_scales"]]
-            v_means, v_scales = torch.autograd.grad(rgb, wanted, signs, retain_graph=probe + 1 < PROBES)
-            total += ((v_means * width).square().sum(1) + v_scales.square().sum(1)) / PROBES
-    return total
-
-
-OPAQUE = 0.99
-"""Largest opacity of a merged Gaussian: the largest that the rasterizer blends."""
-
-
-def covariances(quats: torch.Tensor, log_scales: torch.Tensor) -> torch.Tensor:
-    """Return covariances [N, 3, 3] [u^2] from quaternions wxyz [N, 4] and log scales [N, 3] [ln u]."""
-    axes = rotation_matrices(torch.nn.functional.normalize(quats, dim=1)) * log_scales.exp()[:, None, :]
-    return axes @ axes.transpose(1, 2)
-
-
-def _area(log_scales: torch.Tensor) -> torch.Tensor:
-    """Return the product of the two longer axes [u^2], the area that a Gaussian covers when seen face on, shape [N]."""
-    return (log_scales.sum(1) - log_scales.amin(1)).exp()
-
-
-def _covered(opacity: torch.Tensor, area: torch.Tensor, own: torch.Tensor, means: torch.Tensor) -> torch.Tensor:
-    """Return 1 / (2 pi) times the integral of 1 - (1 - a G)(1 - b H) over the plane that both face [u^2], shape [P].
-
-    The opacities a and b and both areas have shape [P, 2]; the covariances ``own`` of G and H [P, 2, 3, 3]; means [P, 2, 3].
-    """
-    squares, axes = torch.linalg.eigh(own.sum(1))
-    squares = squares.clamp_min(1e-30)
-    apart = (axes.transpose(1, 2) @ (means[:, 0] - means[:, 1])[..., None]).squeeze(-1)
-    together = torch.exp(-0.5 * (apart.square() / squares).sum(1)) / squares[:, 1:].prod(1).sqrt()
-    return (opacity * area).sum(1) - opacity.prod(1) * area.prod(1) * together
-
-
-@torch.no_grad()
-def merges(
-    gaussians: Gaussians, maxima: torch.Tensor, odd: bool, shift: float = 0.0
-) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-    """Pair neighbours along the Morton curve; return the rows of each pair [P, 2] and the merged Gaussians, cheapest first.
-
-    Mean, covariance and colours are those of the mixture, weighted by opacity times face-on area. The product of the new
-    opacity and the new area is the area that the pair covers face on; the overlap counts once. If this needs an opacity above
-    `OPAQUE`, the two longer axes grow instead: otherwise a surface of opaque Gaussians would get holes. The cost of a pair is
-    its largest blending weight (``maxima`` [N]) times the sum of three terms. They are the difference of the colours; the
-    logarithm of new over old covered area, since distant pairs or pairs of different planes bulge; and the logarithm of the
-    factor by which the area had to grow. ``odd`` pairs the second with the third, and so on. ``shift`` moves the curve by a
-    fraction of the cloud's size, so that neighbours in two large cells can be paired.
-    """
-    low, high = gaussians.means.amin(0), gaussians.means.amax(0)
-    boxed = torch.cat([gaussians.means, (low - shift * (high - low))[None]])
-    order = torch.argsort(morton_codes(boxed)[:-1], stable=True)[int(odd) :]
-    order = order[: len(order) // 2 * 2].reshape(-1, 2)
-    g = {n: t.detach()[order].double().cpu() for n, t in gaussians.tensors().items()}
-    opacity = g["logit_opacities"].sigmoid()
-    area = torch.stack([_area(g["log_scales"][:, i]) for i in range(2)], 1)
-    mass = opacity * area
-    fraction = mass / mass.sum(1, keepdim=True)
-    means = (fraction[..., None] * g["means"]).sum(1)
-    apart = g["means"] - means[:, None]
-    own = torch.stack([covariances(g["quats"][:, i], g["log_scales"][:, i]) for i in range(2)], 1)
-    both = (fraction[..., None, None] * (own + apart[..., :, None] * apart[..., None, :])).sum(1)
-    squares, axes = torch.linalg.eigh(both)  # in float64 on the CPU: the same on every device
-    axes = axes * torch.linalg.det(axes)[:, None, None].sign()
-    log_scales = 0.5 * squares.clamp_min(1e-30).log()
-    wanted = _covered(opacity, area, own, g["means"]) / _area(log_scales)
-    grown = (wanted / OPAQUE).clamp_min(1).log()
-    log_scales[:, 1:] += 0.5 * grown[:, None]  # eigenvalues ascend
-    merged = {
-        "means": means, "quats": quaternions(axes), "log_scales": log_scales,
-        "logit_opacities": wanted.clamp(1e-6, OPAQUE).logit(), "sh": (fraction[..., None, None] * g["sh"]).sum(1),
-    }  # fmt: skip
-    colour = (C0 * (g["sh"][:, 0, 0] - g["sh"][:, 1, 0])).abs().amax(1)
-    bulge = (_area(log_scales) / area.sum(1)).log().clamp_min(0)
-    cost = maxima.detach()[order].amax(1).double().cpu() * (colour + bulge + grown)
-    ranks = torch.argsort(torch.where(torch.isfinite(cost), cost, torch.inf), stable=True)
-    ranks = ranks[torch.isfinite(cost[ranks])]
-    means = gaussians.means
-    return order[ranks.to(means.device)], {n: t[ranks].to(means.device, means.dtype) for n, t in merged.items()}
-
-
-def merged_pairs(gaussians: Gaussians, pairs: torch.Tensor, merged: dict[str, torch.Tensor], taken: int) -> Gaussians:
-    """Return the set in which each of the first ``taken`` pairs of `merges` is one Gaussian."""
-    stays = torch.ones(len(gaussians), dtype=torch.bool, device=pairs.device)
-    stays[pairs[:taken].flatten()] = False
-    return Gaussians(**{n: torch.cat([t[stays], merged[n][:taken]]) for n, t in gaussians.tensors().items()})
+            means, scales, logits, sh = torch.autograd.grad(
+                rgb, [leaves[n] for n in wanted], signs, retain_graph=probe + 1 < probes
+            )
+            total[0] += ((means * width).square().sum(1) + scales.square().sum(1)) / probes
+            total[1] += (logits / clear).square() / probes
+            total[2] += torch.einsum("nk,nk->n", sh.flatten(1)[:, 3:], harmonics).square() / probes  # fast on a CPU
+    return total[0], total[1], total[2]
 
 
 INNER = 0.02
@@ -265,46 +192,42 @@ def levelling(up: np.ndarray) -> np.ndarray:
     return rotation_about(axis if angle % math.pi > 1e-12 else np.array([1.0, 0.0, 0.0]), angle)
 
 
-ROUNDS = 5
-"""Number of bisection steps in the search for the largest fraction."""
-PASSES = 8
-"""Largest number of rounds of merging: up to 2^8 neighbours become one."""
-DEGREES_FRACTION, MERGE_FRACTION = 1 / 3, 2 / 3
-"""Fractions of the allowed loss: the loss may reach the first after degrees are lowered, and the second after neighbours are
-merged. Removal may use up the rest."""
-RAMP = 3
-"""Number of rounds over which the loss allowed for merging grows to its full value."""
-WORTHWHILE = 0.02
-"""Least fraction of the Gaussians that a round must merge away; merging ends after two rounds in a row with less."""
+TRIES = 8
+"""Largest number of steps in the search for the largest fraction."""
+AIM = 0.9
+"""A search ends at this part of the allowed loss; it costs about 1 % of the Gaussians that could be removed."""
+FAR_APART = 50
+"""Ratio of the losses at both ends of a search above which it goes on in the middle."""
+DEGREES_FRACTION = 1 / 3
+"""Part of the allowed loss that lower degrees may use up. Removal may use up the rest."""
+REPEATS = 3
+"""Largest number of searches for a model that keeps the limit on all views."""
 
 
-Accepted = Callable[[Gaussians, float], bool]
-"""Whether a model is good enough when a fraction in [0, 1] of the allowed loss may be spent."""
+Loss = Callable[[Gaussians, bool], float]
+"""The loss of a model, on all views or on a few."""
 
 
-def largest_fraction(accepted: Callable[[float], bool]) -> float:
-    """Return the largest accepted fraction in [0, 1], by bisection; 1 is tried first, 0 needs no test.
+def largest_fraction(loss: Callable[[float], float], allowed: float) -> float:
+    """Return the largest fraction in [0, 1] that was tried and has at most the allowed loss; 1 is tried first, 0 needs no test.
 
-    The result itself was accepted, or is 0; if acceptance is not monotone, a larger fraction may be accepted, too.
+    The logarithm of the loss is nearly linear in the fraction, so the next one is on the line through the losses at both ends;
+    if these are far apart, as at a step, it is the middle.
     """
-    if accepted(1.0):
-        return 1.0
-    low, high = 0.0, 1.0
-    for _ in range(ROUNDS):
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if accepted(middle) else (low, middle)
+    low, high, at = 0.0, 1.0, 1.0
+    below = above = least = 0.01 * allowed
+    for _ in range(TRIES):
+        lost = loss(at)
+        if lost <= allowed:
+            low, below = at, max(lost, least)
+        else:
+            high, above = at, lost
+        if low == 1 or AIM * allowed <= lost <= allowed:
+            break
+        steep = not above < FAR_APART * below  # or not finite
+        part = 0.5 if steep else math.log(math.sqrt(AIM) * allowed / below) / math.log(above / below)
+        at = low + (high - low) * min(0.9, max(0.1, part))
     return low
-
-
-def prune_order(maxima: torch.Tensor, sensitivity: torch.Tensor) -> torch.Tensor:
-    """Return the rows of the Gaussians in the order in which they may be removed, int64 [N].
-
-    Gaussians are ranked by largest blending weight [N] and by the sensitivity of `fisher` [N], equal values by row; the higher
-    of both ranks decides. So a Gaussian is removed only if both scores are low; thin Gaussians and wide faint ones stay if one
-    score is high.
-    """
-    ranks = (torch.argsort(torch.argsort(values, stable=True)) for values in (maxima, sensitivity))
-    return torch.argsort(torch.maximum(*ranks), stable=True)
 
 
 def keep_last(order: torch.Tensor, fraction: float) -> torch.Tensor:
@@ -318,65 +241,45 @@ def stored_degrees(sh: torch.Tensor) -> torch.Tensor:
     return torch.where((sh != 0).any(2), bands, 0).amax(1)
 
 
+def by_degree(gaussians: Gaussians) -> Gaussians:
+    """Return the Gaussians by ascending degree, without degrees that none of them uses."""
+    return drop_unused_sh(select(gaussians, torch.argsort(stored_degrees(gaussians.sh), stable=True)))
+
+
 def drop_unused_sh(gaussians: Gaussians) -> Gaussians:
     """Return the Gaussians without degrees that none of them uses; a file stores equally many coefficients for all."""
     return limit_degree(gaussians, int(stored_degrees(gaussians.sh).max()) if len(gaussians) else 0)
 
 
-def lower_degrees(gaussians: Gaussians, maxima: torch.Tensor, accepted: Callable[[Gaussians], bool]) -> Gaussians:
-    """Return the set without harmonics above degree 0 in as many Gaussians as ``accepted`` allows, the least needed first.
-
-    The need is the norm of the coefficients above degree 0, times the largest blending weight [N]. In an orthonormal basis,
-    this norm is proportional to the standard deviation of the colour over directions.
-    """
-    order = torch.argsort(gaussians.sh[:, 1:].square().sum((1, 2)).sqrt() * maxima, stable=True)
-    degrees = stored_degrees(gaussians.sh)
+def lower_degrees(gaussians: Gaussians, need: torch.Tensor, loss: Callable[[Gaussians], float], allowed: float) -> Gaussians:
+    """Return the set without harmonics above degree 0 in as many Gaussians as the allowed loss permits, least need first."""
+    order, degrees = torch.argsort(need, stable=True), stored_degrees(gaussians.sh)
 
     def lowered(fraction: float) -> Gaussians:
         some = degrees.clone()
         some[order[: int(fraction * len(order))]] = 0
         return replace(gaussians, sh=truncated(gaussians.sh, some))
 
-    return lowered(largest_fraction(lambda s: accepted(lowered(s))))
-
-
-def merge_neighbours(gaussians: Gaussians, maxima_of: Callable[[Gaussians], torch.Tensor], accepted: Accepted) -> Gaussians:
-    """Merge pairs, cheapest first, in rounds while they are worthwhile; return the smaller set.
-
-    The allowed loss grows over the first `RAMP` rounds, because the cheapest pairs of one round cost less than the last merged
-    pairs of the round before.
-    """
-    idle = 0
-    for number in range(PASSES):
-        part = min(1.0, (number + 1) / RAMP)
-        pairs, merged = merges(gaussians, maxima_of(gaussians), odd=bool(number % 2), shift=number / PASSES)
-        after = partial(merged_pairs, gaussians, pairs, merged)
-        count = len(pairs)
-        share = largest_fraction(lambda s, after=after, count=count, part=part: accepted(after(int(s * count)), part))
-        taken = int(count * share)
-        gaussians = after(taken)
-        idle = 0 if taken > WORTHWHILE * len(gaussians) else idle + 1
-        if (idle >= 2 and part == 1) or len(gaussians) < 2:
-            break
-    return gaussians
+    return lowered(largest_fraction(lambda s: loss(lowered(s)), allowed))
 
 
 def prune_model(
-    gaussians: Gaussians, cameras: list[Camera], options: RasterizeOptions, seed: int, accepted: Accepted
-) -> Gaussians:
-    """Lower degrees, merge neighbours, then remove Gaussians as far as ``accepted`` allows; return them by ascending degree.
+    gaussians: Gaussians, cameras: list[Camera], options: RasterizeOptions, seed: int, loss: Loss, allowed: float
+) -> tuple[Gaussians, float]:
+    """Lower degrees, then remove Gaussians; return the smaller set, by ascending degree, and its loss on all views.
 
-    The result was accepted with fraction 1, or nothing could be removed. ``cameras`` are those of the training views, tensors.
+    The loss is at most ``allowed``. A search on few views is repeated for less if the loss on all views is too large.
+    ``cameras`` are those of all training views, tensors. The first to go have the least product of PUP-3DGS' sensitivity and of
+    the change without them; by one of both alone, fewer could go at the same loss.
     """
-
-    def maxima_of(model: Gaussians) -> torch.Tensor:
-        return coverage(model, cameras, options)[0]
-
-    model, begin = gaussians, DEGREES_FRACTION
-    if bool((stored_degrees(model.sh) > 0).any()):
-        model = lower_degrees(model, maxima_of(model), lambda g: accepted(g, DEGREES_FRACTION))
-    model = merge_neighbours(model, maxima_of, lambda g, part: accepted(g, begin + part * (MERGE_FRACTION - begin)))
-    order = prune_order(maxima_of(model), fisher(model, cameras, options, seed))
-    fraction = largest_fraction(lambda s: accepted(select(model, keep_last(order, s)), 1.0))
-    model = select(model, keep_last(order, fraction))
-    return select(model, torch.argsort(stored_degrees(model.sh), stable=True))
+    space, removal, harmonics = sensitivities(gaussians, cameras, options, seed)
+    order, lowered, aim = torch.argsort(space.sqrt() * removal.sqrt(), stable=True), gaussians, allowed
+    if bool((stored_degrees(gaussians.sh) > 0).any()):
+        lowered = lower_degrees(gaussians, harmonics, lambda g: loss(g, False), DEGREES_FRACTION * allowed)
+    for _ in range(REPEATS):
+        fraction = largest_fraction(lambda s: loss(select(lowered, keep_last(order, s)), False), aim)
+        model = by_degree(select(lowered, keep_last(order, fraction)))
+        if (lost := loss(model, True)) <= allowed:
+            return model, lost
+        aim *= AIM * allowed / lost
+    return by_degree(gaussians), 0.0

@@ -207,11 +207,14 @@ def render(
     return [*notes, f"{len(files)} images in {out}; no film, since the views differ in size"]
 
 
-def mean_psnr(gaussians: Gaussians, views: list[View], options: RasterizeOptions) -> float:
-    """Return the mean PSNR [dB] over views as in `warpgs eval`: rounded to 8 bits, over scored pixels; NaN without views."""
+def view_psnrs(gaussians: Gaussians, views: list[View], options: RasterizeOptions) -> np.ndarray:
+    """Return the PSNR [dB] of each view as in `warpgs eval`: rounded to 8 bits, over scored pixels."""
     images = ((v, to_8_bit(render_view(gaussians, v, options)[0])) for v in views)
-    scores = [psnr(image, to_8_bit(v.image), scored_region(v)[0]) for v, image in images]
-    return float(np.mean(scores)) if views else math.nan
+    return np.array([psnr(image, to_8_bit(v.image), scored_region(v)[0]) for v, image in images])
+
+
+TRIED_VIEWS = 8
+"""Number of training views, evenly chosen, on which smaller models are tried."""
 
 
 def _new_folder(folder: Path, out: Path | None) -> Path:
@@ -251,23 +254,24 @@ def prune(
     _, train, test = scene_of(stored, reader, tell)
     before, options, tried = stored.gaussians(), stored.options(), itertools.count(1)
     tell("ranking Gaussians")
-    whole = mean_psnr(before, train, options)
-    if not math.isfinite(whole):
+    psnrs = view_psnrs(before, train, options)
+    if not math.isfinite(whole := float(np.mean(psnrs))):
         raise DataError(f"{stored.folder}: training PSNR is {whole} dB, so its loss cannot be limited; fit again")
+    few = sorted({round(i) for i in np.linspace(0, len(train) - 1, TRIED_VIEWS).tolist()})
 
-    def accepted(gaussians: Gaussians, fraction: float) -> bool:
-        tell(f"trying smaller models: number {next(tried)}, {len(gaussians):,} Gaussians")
-        return mean_psnr(gaussians, train, options) >= whole - fraction * keep_psnr
+    def loss(gaussians: Gaussians, on_all: bool) -> float:
+        rows = range(len(train)) if on_all else few
+        tell(f"trying smaller models: number {next(tried)}, {len(gaussians):,} Gaussians, {len(rows)} views")
+        return float(np.mean(psnrs[rows] - view_psnrs(gaussians, [train[i] for i in rows], options)))
 
     cameras = [TrainingView.of(v, device).camera for v in train]
-    made = edit.drop_unused_sh(edit.prune_model(before, cameras, options, stored.record["config"]["seed"], accepted))
+    made, lost = edit.prune_model(before, cameras, options, stored.record["config"]["seed"], loss, keep_psnr)
     tell("scoring the smaller model")
     degrees = [edit.stored_degrees(g.sh) for g in (before, made)]
     counts, sizes = [len(d) for d in degrees], [model_bytes(d) for d in degrees]
     means = [float(d.double().mean()) for d in degrees]
-    scores = [
-        (whole, mean_psnr(made, train, options)), tuple(mean_psnr(g, test, options) for g in (before, made))
-    ]  # fmt: skip
+    held_out = tuple(float(np.mean(view_psnrs(g, test, options))) if test else math.nan for g in (before, made))
+    scores = [(whole, whole - lost), held_out]
     figures: dict[str, Any] = {
         "source": str(folder.resolve()), "keep_psnr": keep_psnr, "count": counts, "bytes": sizes, "mean_degree": means,
         "train_psnr": scores[0], "test_psnr": scores[1] if test else None,
