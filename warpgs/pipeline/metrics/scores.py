@@ -392,10 +392,10 @@ def _reduced(view: View, rgb: np.ndarray, depth: np.ndarray, alpha: np.ndarray) 
     return small, cv2.blur(beyond, (side, side)), depth, (alpha > 0.5) & (depth > 0) & (mask > 0)
 
 
-def _residuals_elsewhere(small: Sequence[_Small], index: int, others: Sequence[int]) -> np.ndarray:
-    """Return the residuals of other views at the points of one view, NaN where they do not show it, shape [others, H * W]."""
-    camera, _, depth, counts = small[index]
-    points = back_project(camera, pixel_grid(camera), np.where(counts, depth, 1).ravel().astype(float))
+def _residuals_elsewhere(small: Sequence[_Small], index: int, others: Sequence[int], at: np.ndarray) -> np.ndarray:
+    """Return the residuals of other views at the points of pixels ``at`` [P] of one view, NaN where not shown, [others, P]."""
+    camera, _, depth, _ = small[index]
+    points = back_project(camera, pixel_grid(camera)[at], depth.ravel()[at].astype(float))
     found = np.full((len(others), len(points)), np.nan)
     for row, j in zip(found, others):
         other, residual, depth, _ = small[j]
@@ -426,19 +426,19 @@ def moved_fractions(views: Sequence[View], renders: Iterable[tuple[np.ndarray, n
 
     def fraction(i: int) -> float:
         _, residual, _, counts = small[i]
-        elsewhere = _residuals_elsewhere(small, i, nearest_views(views, i, NEIGHBORS))
-        typical = np.nanmedian(elsewhere, axis=0).reshape(residual.shape)
-        shown = (np.isfinite(elsewhere).sum(0) >= MIN_VIEWS).reshape(residual.shape)
-        differs = counts & shown & (residual > MIN_RESIDUAL)
-        differs &= residual > MIN_FACTOR * np.maximum(np.nan_to_num(typical), FLOOR)
+        at = np.flatnonzero(counts & (residual > MIN_RESIDUAL))
+        elsewhere = np.sort(_residuals_elsewhere(small, i, nearest_views(views, i, NEIGHBORS), at), axis=0)  # NaN last
+        shown = np.isfinite(elsewhere).sum(0)
+        low, high = (np.take_along_axis(elsewhere, n[None], 0)[0] for n in (np.maximum(shown - 1, 0) // 2, shown // 2))
+        typical = np.nan_to_num((low + high) / 2)  # the median
+        differs = np.zeros(residual.shape, bool)
+        differs.flat[at] = (shown >= MIN_VIEWS) & (residual.flat[at] > MIN_FACTOR * np.maximum(typical, FLOOR))
         _, _, statistics, _ = cv2.connectedComponentsWithStats(differs.astype(np.uint8))
         areas = statistics[1:, cv2.CC_STAT_AREA] / residual.size
         return round(float(areas[areas >= MIN_AREA].sum()), 4)
 
     compared = [i for i, m in enumerate(misfits) if usual <= HIGH_MISFIT and m <= MAX_MISFIT * max(usual, LOW_MISFIT)]
-    with warnings.catch_warnings():  # outside of the threads, which share the filters
-        warnings.simplefilter("ignore", RuntimeWarning)  # points that no other view shows
-        found = in_background(fraction, ((i,) for i in compared))
+    found = in_background(fraction, ((i,) for i in compared))
     for i, value in zip(compared, found):
         fractions[i] = value
     return fractions

@@ -12,6 +12,7 @@ from typing import Annotated
 import numpy as np
 import torch
 
+from warpgs.device import in_background
 from warpgs.errors import UsageError
 from warpgs.pipeline.metrics.scores import counted_region
 from warpgs.scene import Scene, View
@@ -192,12 +193,17 @@ def color_of(text: str) -> Color | None:
 
 def mean_color(views: list[View]) -> Color:
     """Return the mean colour of all unmasked pixels of views; it has the same bits on every machine."""
-    total, count = np.zeros(3, np.int64), 0
-    for v in views:
-        pixels = v.image.reshape(-1, 3) if v.mask is None else v.image[v.mask]
-        total += np.rint(pixels.astype(np.float64) * LEVELS).astype(np.int64).sum(axis=0)
-        count += len(pixels)
-    red, green, blue = (int(t) / (LEVELS * max(count, 1)) for t in total)
+
+    def sums(v: View) -> np.ndarray:
+        levels = np.multiply(v.image, LEVELS, dtype=np.float64)
+        np.rint(levels, out=levels)
+        if v.mask is not None:
+            levels[~v.mask] = 0
+        rows = levels.reshape(len(levels), -1).sum(axis=0)  # exact below 2^53
+        return np.array([*rows.reshape(-1, 3).sum(axis=0), v.image[..., 0].size if v.mask is None else v.mask.sum()])
+
+    *total, count = sum(in_background(sums, ((v,) for v in views)), np.zeros(4))
+    red, green, blue = (float(t) / (LEVELS * max(float(count), 1)) for t in total)
     return red, green, blue
 
 
