@@ -37,7 +37,7 @@ def usable_cores() -> int:
         return os.cpu_count() or 1
 
 
-MAX_THREADS = 16
+MAX_THREADS = 8
 """Most threads of `in_background`: each holds the images of one view."""
 
 
