@@ -13,7 +13,7 @@ import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from warpgs.errors import ResourceError, UsageError
 from warpgs.folders import cache_home, private_folder
@@ -22,6 +22,8 @@ from warpgs.process import say
 
 if TYPE_CHECKING:
     import torch
+
+T = TypeVar("T")
 
 
 CPU_INFO = Path("/proc/cpuinfo")
@@ -33,6 +35,24 @@ def usable_cores() -> int:
         return len(os.sched_getaffinity(0)) or 1  # missing on macOS and Windows
     except (AttributeError, OSError):
         return os.cpu_count() or 1
+
+
+MAX_THREADS = 8
+"""Most threads of `in_background`: each holds the images of one view."""
+
+
+def in_background(function: Callable[..., T], arguments: Iterable[tuple[Any, ...]], threads: int = 0) -> list[T]:
+    """Return a function's results in order, computed by threads while further arguments are made; few arguments wait."""
+    from concurrent.futures import Future, ThreadPoolExecutor
+
+    jobs: list[Future[T]] = []
+    threads = threads or max(2, min(MAX_THREADS, usable_cores()))
+    with ThreadPoolExecutor(threads) as pool:
+        for own in arguments:
+            jobs.append(pool.submit(function, *own))
+            if len(jobs) > threads:
+                jobs[-threads].result()  # not all arguments in memory at once
+    return [j.result() for j in jobs]
 
 
 def processor_name() -> str:

@@ -180,6 +180,8 @@ def test_every_photograph_trains_by_default_and_a_run_remembers_its_scale(folder
     result = warpgs.fit(folder / "scene", few, out=out, device="cpu")
     assert len(result.train) == 8 and result.test == () and not result.metrics["test"]
     printed = capsys.readouterr().out
+    lines = printed.splitlines()
+    assert lines.index(f"model: {out / 'point_cloud.ply'}; scores and report follow") < lines.index("scoring: 0 of 8 views")
     assert printed.count(NO_SCORES) == 1 and "no score of new views: no view is held out" in printed
     assert NO_SCORES in result.notes and NO_SCORES in (out / "report.html").read_text()
     protocol = result.metrics["protocol"]

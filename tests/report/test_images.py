@@ -4,6 +4,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import cv2
 import numpy as np
+import pytest
 
 from warpgs.files import write_bytes
 from warpgs.report.images import (
@@ -14,6 +15,7 @@ from warpgs.report.images import (
     GRAY,
     TITLE_SIZE,
     Tile,
+    channel_mean,
     colored,
     contact_sheet,
     depth_map,
@@ -84,6 +86,14 @@ def test_png_decodes_to_the_rounded_pixels_in_rgb_order():
     assert data.startswith(b"\x89PNG")
     np.testing.assert_array_equal(decode(data), np.round(np.clip(image, 0, 1) * 255).astype(np.uint8))
     assert decode(png(np.array([[[1.0, 0.5, 0.0]]])))[0, 0].tolist() == [255, 128, 0]
+
+
+@pytest.mark.parametrize("kind", [np.float32, np.float64])
+def test_mean_over_channels_has_the_bits_of_numpy(kind):
+    image = np.random.default_rng(0).uniform(-0.2, 1.2, (40, 70, 3)).astype(kind)
+    for own in (image, image[:, ::-1], image.transpose(1, 0, 2), image[5:6]):
+        assert channel_mean(own).dtype == kind
+        np.testing.assert_array_equal(channel_mean(own), own.mean(-1))
 
 
 def test_error_map_is_black_without_error_and_brighter_with_more():

@@ -4,6 +4,7 @@ import os
 import platform
 import subprocess
 import sys
+import threading
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -16,11 +17,38 @@ from warpgs.device import (
     choose_kernel_cache,
     container_memory,
     format_bytes,
+    in_background,
     installed_bytes,
     machine_memory,
     parse_bytes,
 )
 from warpgs.errors import UsageError
+
+# Work in threads.
+
+
+def test_results_keep_the_order_of_their_arguments_which_are_made_late():
+    """At most twice as many arguments as threads are made before the first of them is done; an error reaches the caller."""
+    made, ahead, go = [], [], threading.Event()
+
+    def arguments():
+        for i in range(9):
+            made.append(i)
+            if len(made) == 3:
+                go.set()
+            yield i, 1
+
+    def work(i, one):
+        go.wait(10)
+        ahead.append(len(made) - len(ahead))
+        return i + one
+
+    assert in_background(work, arguments(), 2) == [*range(1, 10)]
+    assert max(ahead) <= 4
+    with pytest.raises(ZeroDivisionError):
+        in_background(lambda i: 1 // i, ((1,), (0,)))
+    assert in_background(work, ()) == []
+
 
 # Sizes in bytes: what is read, what is refused, what is written.
 

@@ -68,12 +68,20 @@ def colored(values: np.ndarray, name: str) -> np.ndarray:
     import cv2
 
     table = cv2.applyColorMap(np.arange(256, dtype=np.uint8)[:, None], getattr(cv2, f"COLORMAP_{name}"))[:, 0, ::-1]
-    return table[np.round(np.clip(values, 0, 1) * 255).astype(np.uint8)].astype(np.float32) / 255
+    return np.take(table.astype(np.float32) / 255, np.round(np.clip(values, 0, 1) * 255).astype(np.uint8), axis=0)
+
+
+def channel_mean(image: np.ndarray) -> np.ndarray:
+    """Return the mean over the channels of an image [H, W, 3], [H, W]: as ``image.mean(-1)``, in a tenth of its time."""
+    total = image[..., 0] + image[..., 1]
+    total += image[..., 2]
+    total /= 3
+    return total
 
 
 def error_map(image: np.ndarray, reference: np.ndarray, largest: float = 0.3) -> np.ndarray:
     """Return colours [H, W, 3] of the absolute error averaged over channels; ``largest`` and above is the brightest."""
-    return colored(np.abs(np.clip(image, 0, 1) - reference).mean(-1) / largest, "INFERNO")
+    return colored(channel_mean(np.abs(np.clip(image, 0, 1) - reference)) / largest, "INFERNO")
 
 
 def depth_map(depth: np.ndarray, alpha: np.ndarray) -> np.ndarray:
@@ -141,16 +149,17 @@ STRIPES = 90
 
 def coverage_image(image: np.ndarray, unseen: np.ndarray, once: np.ndarray) -> np.ndarray:
     """Return a render [H, W, 3] with magenta stripes where ``unseen`` [H, W], and an amber tint where ``once`` [H, W]."""
-    image = np.clip(image, 0, 1).astype(np.float32)
+    image = np.ascontiguousarray(np.clip(image, 0, 1), np.float32)
     height, width = unseen.shape
     period = max(4, round(max(height, width) / STRIPES))
-    rows, columns = np.mgrid[:height, :width]
-    stripe = (rows + columns) % period < period / 2
-    shade = np.where(unseen, np.where(stripe, 0.75, 0.3), np.where(once, 0.45, 0)).astype(np.float32)[..., None]
-    tint = np.where(unseen[..., None], np.float32(UNSEEN), np.float32(ONCE))
-    # gray beneath the tint: the colours of the image would change its hue
-    gray = image.mean(-1, keepdims=True)
-    return np.where(shade > 0, (1 - shade) * gray + shade * tint, image)
+    diagonals = np.arange(height + width - 1) % period < period / 2
+    stripe = np.lib.stride_tricks.sliding_window_view(diagonals, width)
+    for pixels, share, tint in ((unseen & stripe, 0.75, UNSEEN), (unseen & ~stripe, 0.3, UNSEEN), (once & ~unseen, 0.45, ONCE)):
+        at, shade = np.flatnonzero(pixels), np.float32(share)
+        # gray beneath the tint: the colours of the image would change its hue
+        gray = channel_mean(image.reshape(-1, 3).take(at, axis=0))
+        image.reshape(-1, 3)[at] = (1 - shade) * gray[:, None] + shade * np.float32(tint)
+    return image
 
 
 INK, SOFT, PAPER = (27, 29, 33), (102, 108, 118), (255, 255, 255)

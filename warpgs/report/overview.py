@@ -82,17 +82,20 @@ def framing(shown: np.ndarray, direction: np.ndarray, up: np.ndarray, aspect: fl
     axes = np.stack([right / np.linalg.norm(right), np.zeros(3), forward])
     axes[1] = np.cross(axes[0], forward)
     slope = np.tan(np.radians(VIEW_ANGLE / 2)) / 1.06
-    seen = shown @ axes.T
-    low, high = seen.min(0), seen.max(0)
+    seen = np.ascontiguousarray((shown @ axes.T).T)
+    low, high = seen.min(1), seen.max(1)
     eye, focus = (low + high) / 2, (low + high) / 2
     eye[2] -= max(float((high - low).max()), 1e-6) * 2
+    half = (seen.shape[1] - 1) // 2, seen.shape[1] // 2
+    middles = np.partition(seen[2], half)[[*half]]  # whose mean is the median
     for _ in range(20):  # move the camera until the content touches the edges: near content looks larger
-        depth = np.maximum(seen[:, 2] - eye[2], 1e-9)
-        x, y = (seen[:, 0] - eye[0]) / depth, (seen[:, 1] - eye[1]) / depth
-        nearest, middle = float(depth.min()), float(np.median(depth))
-        half = max((y.max() - y.min()) / slope, (x.max() - x.min()) / (slope * aspect)) / 2
-        eye[:2] += 0.5 * middle * np.array([x.max() + x.min(), y.max() + y.min()]) / 2
-        eye[2] -= max((half - 1) * middle, -0.5 * nearest)
+        depth = np.maximum(seen[2] - eye[2], 1e-9)
+        x, y = (seen[0] - eye[0]) / depth, (seen[1] - eye[1]) / depth
+        nearest, middle = float(depth.min()), float(np.maximum(middles - eye[2], 1e-9).mean())
+        (left, right), (top, bottom) = ((float(a.min()), float(a.max())) for a in (x, y))
+        size = max((bottom - top) / slope, (right - left) / (slope * aspect)) / 2
+        eye[:2] += 0.5 * middle * np.array([right + left, bottom + top]) / 2
+        eye[2] -= max((size - 1) * middle, -0.5 * nearest)
     focus[:2] = eye[:2]
     focus[2] = max(focus[2], eye[2] + 1e-6)
     return np.stack([eye @ axes, focus @ axes, axes[1]])

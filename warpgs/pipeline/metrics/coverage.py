@@ -1,7 +1,7 @@
 """Scores by coverage: how many training views saw the surface of each pixel."""
 
 import itertools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,6 +11,7 @@ import torch
 from torch.nn.functional import interpolate
 
 from warpgs.constants import NEAR
+from warpgs.device import in_background
 from warpgs.files import make_folder, read_file, write_bytes
 from warpgs.geometry import check_pinhole, pinhole_of
 from warpgs.io.image_files import decode
@@ -22,7 +23,7 @@ from warpgs.priors.given_depth import pinhole_view
 from warpgs.process import counted
 from warpgs.render.options import RasterizeOptions
 from warpgs.render.rasterize import rasterize
-from warpgs.report.images import COVERAGE_LEGEND, coverage_image, png, webp
+from warpgs.report.images import COVERAGE_LEGEND, channel_mean, coverage_image, png, webp
 from warpgs.report.page import Section
 from warpgs.scene import Camera, Gaussians, View
 
@@ -126,14 +127,19 @@ def photo_errors(train: Sequence[View], training: Sequence[DepthView]) -> np.nda
     # the model was fitted to. It includes differences between the photographs, such as reflections and exposure.
     chosen = np.unique(np.linspace(0, len(train) - 1, min(PROBED, len(train))).round().astype(int))
     photos = {i: _photo(train[i], training[i][1]) for i in chosen}
-    total, count = np.zeros(len(BINS)), np.zeros(len(BINS))
-    for i, j in itertools.permutations(chosen, 2):
-        u, v, difference = depth_difference(training[i][1], training[i][0], *training[j])
-        inside = torch.isfinite(difference)
-        error = (_sampled(photos[j], u[inside], v[inside]) - photos[i][inside]).double().square().mean(1)
-        index = _bin(difference[inside])
-        total += np.bincount(index, error.cpu().numpy(), len(BINS))
-        count += np.bincount(index, minlength=len(BINS))
+
+    def compared() -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        for i, j in itertools.permutations(chosen, 2):
+            u, v, difference = (t.flatten() for t in depth_difference(training[i][1], training[i][0], *training[j]))
+            at = torch.isfinite(difference).nonzero()[:, 0]
+            own = photos[i].reshape(-1, 3).index_select(0, at)
+            error = (_sampled(photos[j], u[at], v[at]) - own).double().square().mean(1)
+            yield _bin(difference[at]), error.cpu().numpy()
+
+    def sums(index: np.ndarray, error: np.ndarray) -> np.ndarray:
+        return np.stack([np.bincount(index, error, len(BINS)), np.bincount(index, minlength=len(BINS))])
+
+    total, count = sum(in_background(sums, compared()), np.zeros((2, len(BINS))))
     if not count.any():
         return None
     errors = np.divide(total, count, out=np.full(len(BINS), np.nan), where=count > 0)
@@ -143,8 +149,10 @@ def photo_errors(train: Sequence[View], training: Sequence[DepthView]) -> np.nda
 
 
 def _bin(difference: torch.Tensor) -> np.ndarray:
-    """Return the class of `BINS` of each difference."""
-    return np.searchsorted(np.asarray(BINS, np.float32), difference.cpu().numpy())
+    """Return the class of `BINS` of each difference, uint8."""
+    bounds = torch.tensor(BINS, dtype=torch.float32, device=difference.device)
+    classes: np.ndarray = torch.bucketize(difference, bounds, out_int32=True).to(torch.uint8).cpu().numpy()
+    return classes
 
 
 def _photo(view: View, depth: torch.Tensor) -> torch.Tensor:
@@ -162,8 +170,9 @@ def _sampled(image: torch.Tensor, u: torch.Tensor, v: torch.Tensor) -> torch.Ten
     left, top = x.long(), y.long()
     right, bottom = (left + 1).clamp(max=width - 1), (top + 1).clamp(max=height - 1)
     a, b = (x - left)[:, None], (y - top)[:, None]
-    above = (1 - a) * image[top, left] + a * image[top, right]
-    below = (1 - a) * image[bottom, left] + a * image[bottom, right]
+    flat, top, bottom = image.reshape(-1, 3), top * width, bottom * width
+    above = (1 - a) * flat.index_select(0, top + left) + a * flat.index_select(0, top + right)
+    below = (1 - a) * flat.index_select(0, bottom + left) + a * flat.index_select(0, bottom + right)
     return (1 - b) * above + b * below
 
 
@@ -176,11 +185,11 @@ def classes_of(counts: torch.Tensor, empty: torch.Tensor) -> dict[str, np.ndarra
 def _sums(view: View, image: np.ndarray, classes: dict[str, np.ndarray], expected: np.ndarray | None) -> dict[str, np.ndarray]:
     """Return for each class the number of scored pixels and the sums over them of squared error, SSIM and expected error."""
     image, target, region, _ = scored_pair(view, image)
-    error = np.square(image.astype(np.float64) - target).mean(-1)
-    similarity = ssim(torch.from_numpy(image), torch.from_numpy(target)).numpy().astype(np.float64).mean(-1)
-    maps = [np.ones_like(error), error, similarity, np.zeros_like(error) if expected is None else expected]
-    inside = {c: m if region is None else m & region for c, m in classes.items()}
-    return {c: np.array([values[m].sum() for values in maps]) for c, m in inside.items()}
+    error = channel_mean(np.square(image.astype(np.float64) - target))
+    similarity = channel_mean(ssim(torch.from_numpy(image), torch.from_numpy(target)).numpy().astype(np.float64))
+    maps = [error, similarity, *([] if expected is None else [expected])]
+    inside = {c: np.flatnonzero(m if region is None else m & region) for c, m in classes.items()}
+    return {c: np.array([len(at), *(m.take(at).sum() for m in maps), *([0.0] * (3 - len(maps)))]) for c, at in inside.items()}
 
 
 def _row(sums: dict[str, np.ndarray], expected: bool) -> dict[str, dict[str, Any]]:
@@ -220,17 +229,23 @@ def coverage_of_run(
     training = depth_views(gaussians, [v.camera for v in train], options, [v.mask for v in train], renders)
     errors = photo_errors(train, training)
     transparent = any(v.alpha is not None for v in (*train, *test))
-    views, total = [], {c: np.zeros(4) for c in CLASSES}
-    for view in counted(test, tell, "checking coverage", "views"):
-        image, depth, alpha = renders(view.camera)
-        surface = torch.from_numpy(np.where(alpha >= MIN_ALPHA, depth, 0)).to(gaussians.means.device)
-        counts, difference = coverage_map(surface, view.camera, training)
-        classes = classes_of(counts, (surface <= 0) & transparent)
-        sums = _sums(view, image, classes, None if errors is None else errors[_bin(difference)])
+
+    def covered() -> Iterator[tuple[View, np.ndarray, torch.Tensor, torch.Tensor, np.ndarray]]:
+        for view in counted(test, tell, "checking coverage", "views"):
+            image, depth, alpha = renders(view.camera)
+            surface = torch.from_numpy(np.where(alpha >= MIN_ALPHA, depth, 0)).to(gaussians.means.device)
+            counts, difference = coverage_map(surface, view.camera, training)
+            yield view, image, counts.cpu(), ((surface <= 0) & transparent).cpu(), _bin(difference)
+
+    def finish(view: View, image: np.ndarray, counts: torch.Tensor, empty: torch.Tensor, index: np.ndarray) -> dict[str, Any]:
+        classes = classes_of(counts, empty)
         if out is not None:
             write_bytes(out / FOLDER / f"{names[view.name]}.png", png(coverage_image(image, classes["0"], classes["1"])))
-        views.append({"name": view.name, "classes": _row(sums, errors is not None)})
-        total = {c: total[c] + sums[c] for c in CLASSES}
+        return _sums(view, image, classes, None if errors is None else errors.take(index))
+
+    sums = in_background(finish, covered())
+    views = [{"name": v.name, "classes": _row(own, errors is not None)} for v, own in zip(test, sums)]
+    total = {c: sum((own[c] for own in sums), np.zeros(4)) for c in CLASSES}
     pooled = _row(total, errors is not None)
     unseen = pooled.get("0")
     summary = "every held-out pixel was seen by a training view"
@@ -264,11 +279,12 @@ def coverage_lines(coverage: dict[str, Any]) -> list[str]:
 
 def coverage_section(out: Path, coverage: dict[str, Any], shown: list[str], names: Mapping[str, str]) -> Section:
     """Return the section of the report page, with the images of the views ``shown``."""
-    files = {n: out / FOLDER / f"{names[n]}.png" for n in shown}
+    files = {n: f for n in shown if (f := out / FOLDER / f"{names[n]}.png").is_file()}
+    images = in_background(lambda f: webp(decode(f, data=read_file(f, out))[0], 640), ((f,) for f in files.values()))
     head, *rows = coverage_table(coverage)
     return (
         f"{coverage['summary'][0].upper()}{coverage['summary'][1:]}. {EXPECTED}",
-        [(n, webp(decode(f, data=read_file(f, out))[0], 640)) for n, f in files.items() if f.is_file()],
+        list(zip(files, images)),
         [head[1:], *(r[1:] for r in rows if r[0] == "all views")],
         f"{COVERAGE_LEGEND[0].upper()}{COVERAGE_LEGEND[1:]}.",
     )

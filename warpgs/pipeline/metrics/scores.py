@@ -9,6 +9,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 import torch
 
+from warpgs.device import in_background
 from warpgs.geometry import back_project, inverse, matmul, project_points
 from warpgs.io.images import dark_pixels, without_masked
 from warpgs.kernels.ssim import RADIUS, ssim
@@ -80,8 +81,8 @@ def psnr(image: np.ndarray, target: np.ndarray, region: np.ndarray | None = None
             raise TypeError(f"psnr: region must be bool, not {region.dtype}; give region > 0")
         if region.shape != image.shape[:2]:
             raise ValueError(f"psnr: region must have shape {shape[:2]}, not {list(region.shape)}; resize it")
-        difference = difference[region]
-    mse = float((difference**2).mean())
+        difference = np.compress(region.ravel(), difference.reshape(region.size, *image.shape[2:]), axis=0)
+    mse = float(np.square(difference, out=difference).mean())
     # numpy's logarithm, which sometimes rounds differently from math.log10: published figures stay the same
     return float("inf") if mse == 0 else -10 * float(np.log10(mse))
 
@@ -134,8 +135,9 @@ class ViewMetrics:
 
 def to_8_bit(image: np.ndarray) -> np.ndarray:
     """Round an image in [0, 1] to the values that an 8-bit file can hold, float32."""
-    levels: np.ndarray = np.round(np.clip(image, 0, 1) * 255).astype(np.float32)
-    return levels / 255
+    levels: np.ndarray = np.round(np.clip(image, 0, 1) * 255).astype(np.float32, copy=False)
+    levels /= 255
+    return levels
 
 
 def over_white(image: np.ndarray, region: np.ndarray) -> np.ndarray:
@@ -282,17 +284,17 @@ def baselines(train: list[View], test: list[View]) -> dict[str, float]:
     """Return the mean PSNR [dB] over the test views of two predictions without 3D, which any useful fit beats."""
     # ``mean_photo``: the mean of the training images; ``nearest_photo``: the image of the nearest training camera. Training
     # images whose size differs from the test view's are left out, and so is a baseline without any score.
-    train = [without_masked(v) for v in train]
-    scores: dict[str, list[float]] = {"mean_photo": [], "nearest_photo": []}
-    for view in test:
-        same = [v for v in train if v.image.shape == view.image.shape]
-        if not same:
-            continue
-        region, _ = scored_region(view)
-        nearest = min(same, key=lambda v: float(np.linalg.norm(v.camera.center - view.camera.center)))
-        scores["mean_photo"].append(psnr(to_8_bit(np.mean([v.image for v in same], axis=0)), view.image, region))
-        scores["nearest_photo"].append(psnr(nearest.image, view.image, region))
-    return {name: float(np.mean(values)) for name, values in scores.items() if values}
+    train = in_background(without_masked, ((v,) for v in train))
+    same = {s: [v for v in train if v.image.shape == s] for s in {v.image.shape for v in test}}
+    means = {s: to_8_bit(np.asarray(sum(v.image for v in own) / np.float32(len(own)))) for s, own in same.items() if own}
+
+    def scores(view: View) -> tuple[float, float]:
+        shape, (region, _) = view.image.shape, scored_region(view)
+        nearest = min(same[shape], key=lambda v: float(np.linalg.norm(v.camera.center - view.camera.center)))
+        return psnr(means[shape], view.image, region), psnr(nearest.image, view.image, region)
+
+    rows = in_background(scores, ((v,) for v in test if v.image.shape in means))
+    return {name: float(np.mean(values)) for name, values in zip(("mean_photo", "nearest_photo"), zip(*rows))}
 
 
 def summarize(metrics: list[ViewMetrics]) -> dict[str, float]:
@@ -388,10 +390,10 @@ def _reduced(view: View, rgb: np.ndarray, depth: np.ndarray, alpha: np.ndarray) 
     return small, cv2.blur(beyond, (side, side)), depth, (alpha > 0.5) & (depth > 0) & (mask > 0)
 
 
-def _residuals_elsewhere(small: Sequence[_Small], index: int, others: Sequence[int]) -> np.ndarray:
-    """Return the residuals of other views at the points of one view, NaN where they do not show it, shape [others, H * W]."""
-    camera, _, depth, counts = small[index]
-    points = back_project(camera, pixel_grid(camera), np.where(counts, depth, 1).ravel().astype(float))
+def _residuals_elsewhere(small: Sequence[_Small], index: int, others: Sequence[int], at: np.ndarray) -> np.ndarray:
+    """Return the residuals of other views at the points of pixels ``at`` [P] of one view, NaN where not shown, [others, P]."""
+    camera, _, depth, _ = small[index]
+    points = back_project(camera, pixel_grid(camera)[at], depth.ravel()[at].astype(float))
     found = np.full((len(others), len(points)), np.nan)
     for row, j in zip(found, others):
         other, residual, depth, _ = small[j]
@@ -416,22 +418,27 @@ def moved_fractions(views: Sequence[View], renders: Iterable[tuple[np.ndarray, n
     fractions = [0.0] * len(views)
     if len(views) < MIN_TRAINING:
         return fractions
-    small = [_reduced(v, *r) for v, r in zip(views, renders, strict=True)]
+    small = in_background(_reduced, ((v, *r) for v, r in zip(views, renders, strict=True)))
     misfits = [float(np.median(residual)) for _, residual, _, _ in small]
     usual = float(np.median(misfits))
-    for i, (_, residual, _, counts) in enumerate(small):
-        if usual > HIGH_MISFIT or misfits[i] > MAX_MISFIT * max(usual, LOW_MISFIT):
-            continue
-        elsewhere = _residuals_elsewhere(small, i, nearest_views(views, i, NEIGHBORS))
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", RuntimeWarning)  # points that no other view shows
-            typical = np.nanmedian(elsewhere, axis=0).reshape(residual.shape)
-        shown = (np.isfinite(elsewhere).sum(0) >= MIN_VIEWS).reshape(residual.shape)
-        differs = counts & shown & (residual > MIN_RESIDUAL)
-        differs &= residual > MIN_FACTOR * np.maximum(np.nan_to_num(typical), FLOOR)
+
+    def fraction(i: int) -> float:
+        _, residual, _, counts = small[i]
+        at = np.flatnonzero(counts & (residual > MIN_RESIDUAL))
+        elsewhere = np.sort(_residuals_elsewhere(small, i, nearest_views(views, i, NEIGHBORS), at), axis=0)  # NaN last
+        shown = np.isfinite(elsewhere).sum(0)
+        low, high = (np.take_along_axis(elsewhere, n[None], 0)[0] for n in (np.maximum(shown - 1, 0) // 2, shown // 2))
+        typical = np.nan_to_num((low + high) / 2)  # the median
+        differs = np.zeros(residual.shape, bool)
+        differs.flat[at] = (shown >= MIN_VIEWS) & (residual.flat[at] > MIN_FACTOR * np.maximum(typical, FLOOR))
         _, _, statistics, _ = cv2.connectedComponentsWithStats(differs.astype(np.uint8))
         areas = statistics[1:, cv2.CC_STAT_AREA] / residual.size
-        fractions[i] = round(float(areas[areas >= MIN_AREA].sum()), 4)
+        return round(float(areas[areas >= MIN_AREA].sum()), 4)
+
+    compared = [i for i, m in enumerate(misfits) if usual <= HIGH_MISFIT and m <= MAX_MISFIT * max(usual, LOW_MISFIT)]
+    found = in_background(fraction, ((i,) for i in compared))
+    for i, value in zip(compared, found):
+        fractions[i] = value
     return fractions
 
 

@@ -5,6 +5,7 @@ import json
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -566,9 +567,10 @@ def _finish(job: FitJob, trainer: Trainer, record: dict[str, Any], checks: list[
         given = cameras_of(job.scene)
         job.scene = with_cameras(job.scene, job.cameras(trainer))
         if job.out is not None:
-            model = drop_unused_sh(trainer.gaussians)
+            model, path = drop_unused_sh(trainer.gaussians), job.out / "point_cloud.ply"
             with section("writing"):
-                write_ply(job.out / "point_cloud.ply", model, job.scene.normalization, antialiased=job.config.antialiased)
+                write_ply(path, model, job.scene.normalization, antialiased=job.config.antialiased)
+            job.say(f"model: {path}; scores and report follow")
         renders = Renders(trainer.gaussians, trainer.context.render_options())
         with section("checks"):
             metrics = _score(job, trainer, seconds, given, checks, renders)
@@ -579,7 +581,7 @@ def _finish(job: FitJob, trainer: Trainer, record: dict[str, Any], checks: list[
             with section("report"):
                 write_report(
                     job.out, job.scene, job.split, trainer.gaussians, options, metrics, record,
-                    sampling=sampling_report_of(trainer, job.out), renders=renders, times=job.clock.seconds,
+                    sampling=partial(sampling_report_of, trainer, job.out), renders=renders, times=job.clock.seconds,
                     tell=job.progress,
                 )  # fmt: skip
             metrics["wall_seconds"] = job.clock.seconds()

@@ -15,7 +15,7 @@ import torch
 
 from warpgs.clock import largest, times_line
 from warpgs.constants import TILE_SIZE
-from warpgs.device import format_bytes, usable_cores
+from warpgs.device import format_bytes, in_background
 from warpgs.errors import ResourceError
 from warpgs.files import make_folder, read_file, write_bytes
 from warpgs.geometry import MODELS, depth_normals
@@ -330,10 +330,8 @@ def sampling_report_of(fit: Trainer, out: Path) -> Section | None:
         [f"{n:,}" for n in (events["count"], events["added"], events["evicted"], layers["coarse"], layers["fine"])],
     ]
     files = sorted(p for p in (out / FOLDER).glob("*.png") if p.stem.isdecimal())  # others are not ours
-    images = [
-        (f"sampling after step {int(p.stem):,}", webp(decode(p, data=read_file(p, out))[0], SHEET_WIDTH, 70)) for p in files
-    ]
-    return words, images, table, ""
+    images = in_background(lambda p: webp(decode(p, data=read_file(p, out))[0], SHEET_WIDTH, 70), ((p,) for p in files))
+    return words, [(f"sampling after step {int(p.stem):,}", image) for p, image in zip(files, images)], table, ""
 
 
 LABELS = {
@@ -348,8 +346,6 @@ BASELINES = {"mean_photo": "the mean photograph", "nearest_photo": "the nearest 
 """Images that are scored without a fit, as text for the user."""
 SHOWN_VIEWS = 6
 """Held-out views with images in the report; all have files in the run folder."""
-RENDER_WORKERS = max(2, min(8, usable_cores()))
-"""Threads that score and encode images while others are rendered."""
 
 
 def score_line(scores: dict[str, float]) -> str:
@@ -426,36 +422,43 @@ def evaluate_run(
             write_bytes(out / "depth" / f"{files[view.name]}.png", png(depth_map(depth, alpha)))
         return score(view, image, lpips if view.name in held_out else None, alpha)
 
-    jobs: list[Future[ViewMetrics]] = []
-    with ThreadPoolExecutor(RENDER_WORKERS if lpips is None else 1) as render_workers:  # LPIPS needs much memory for each view
-        for view in counted([*test, *train], tell, "scoring", "views"):
-            images = renders(view.camera) if renders else render_view(gaussians, view, options)
-            jobs.append(render_workers.submit(finish, view, *images))
-            if len(jobs) > RENDER_WORKERS:
-                jobs[-RENDER_WORKERS].result()  # not all images at once
-        found = [j.result() for j in jobs]
+    with ThreadPoolExecutor(1) as thread:
+        plain = thread.submit(lambda: baselines(train, test) if test else {})
+        shown = counted([*test, *train], tell, "scoring", "views")
+        rendered = ((v, *(renders(v.camera) if renders else render_view(gaussians, v, options))) for v in shown)
+        found = in_background(finish, rendered, 0 if lpips is None else 1)  # LPIPS needs much memory for each view
     rows, train_rows = found[: len(test)], found[len(test) :]
     return {
         "test": summarize(rows), "train": summarize(train_rows),
         "views": [r.row() for r in rows],
         "variants": variants(lpips) | (ALPHA_VARIANTS if any(r.opacity for r in found) else {}),
-        "baselines": baselines(train, test) if test else {},
+        "baselines": plain.result(),
     }  # fmt: skip
 
 
-def _images(views: list[View], renders: Renders, rows: dict[str, Any], tell: Callable[[str], object]) -> list[tuple[Any, ...]]:
-    """Render up to `SHOWN_VIEWS` of the views, evenly spaced, and encode their images for the page."""
-    result = []
-    with ThreadPoolExecutor(RENDER_WORKERS) as render_workers:
-        for view in counted(evenly_spaced(views, SHOWN_VIEWS), tell, "making the report", "views"):
+def _encoded(draw: Callable[..., np.ndarray], *parts: np.ndarray) -> bytes:
+    """Draw an image of a view and encode it for the page."""
+    return webp(draw(*parts))
+
+
+def _images(shown: list[View], renders: Renders, rows: dict[str, Any], tell: Callable[[str], object]) -> list[tuple[Any, ...]]:
+    """Render the views that the page shows, and encode their images."""
+    captions = []
+    for view in shown:
+        row, caption = rows.get(view.name), "training view"
+        if row:
+            region = f", over {row['region']}" if row["region"] != "all" else ""
+            caption = f"PSNR {row['psnr']:.2f} dB{region}, SSIM {row['ssim']:.3f}"
+        captions.append(caption)
+
+    def parts() -> Iterator[tuple[Any, ...]]:
+        for view in counted(shown, tell, "making the report", "views"):
             image, depth, alpha = renders(view.camera)
-            row, caption = rows.get(view.name), "training view"
-            if row:
-                region = f", over {row['region']}" if row["region"] != "all" else ""
-                caption = f"PSNR {row['psnr']:.2f} dB{region}, SSIM {row['ssim']:.3f}"
-            parts = (image, view.image, error_map(image, view.image), depth_map(depth, alpha))
-            result.append((view.name, caption, render_workers.map(webp, parts)))
-    return [(name, caption, *parts) for name, caption, parts in result]
+            yield from ((np.asarray, a) for a in (image, view.image))
+            yield from ((error_map, image, view.image), (depth_map, depth, alpha))
+
+    files = iter(in_background(_encoded, parts()))
+    return [(v.name, caption, *images) for v, caption, images in zip(shown, captions, zip(*[files] * 4))]
 
 
 def _figures(metrics: dict[str, Any], seconds: float) -> list[tuple[str, str]]:
@@ -486,7 +489,7 @@ def write_report(
     metrics: dict[str, Any],
     record: dict[str, Any],
     *,
-    sampling: Section | None,
+    sampling: Callable[[], Section | None],
     renders: Renders,
     times: Callable[[], dict[str, float]],
     tell: Callable[[str], object] = lambda line: None,
@@ -496,7 +499,15 @@ def write_report(
     tell("making the report")
     cameras = [v.camera for v in train], [v.camera for v in test]
     up = up_of(cameras[0], gaussians.means.detach().cpu().numpy().astype(np.float64))
-    overview = render_overview(gaussians, options, *cameras, up)
+    covered, shown = None, evenly_spaced(test or train, SHOWN_VIEWS)
+    with ThreadPoolExecutor() as threads:  # images are encoded while others are rendered
+        sampled = threads.submit(sampling)
+        if "coverage" in metrics:
+            names = image_names(v.name for v in scene.views)
+            covered = threads.submit(coverage_section, out, metrics["coverage"], [v.name for v in shown], names)
+        overview = render_overview(gaussians, options, *cameras, up)
+        picture = None if overview is None else threads.submit(webp, overview)
+        images = _images(shown, renders, {r["name"]: r for r in metrics["views"]}, tell)
     events = read_events(out / "metrics.jsonl")
     curves = [
         curve(title, [e["step"] for e in events], [e.get(name, math.nan) for e in events], unit)
@@ -507,22 +518,19 @@ def write_report(
         [r["name"], *(f"{r.get(k, math.nan):.{2 if k.startswith('psnr') else 4}f}" for k in keys), r["region"]]
         for r in metrics["views"]
     ]
-    images = _images(test or train, renders, {r["name"]: r for r in metrics["views"]}, tell)
-    covered, camera = None, train[0].camera
-    if "coverage" in metrics:
-        names = image_names(v.name for v in scene.views)
-        covered = coverage_section(out, metrics["coverage"], [name for name, *_ in images], names)
+    camera = train[0].camera
     protocol = {k.replace("_", " "): ", ".join(v) if isinstance(v, list) else str(v) for k, v in metrics["protocol"].items()}
     protocol["configuration"] = f"{metrics['config_hash']}, step {metrics['steps']:,}"
-    picture, spent = None if overview is None else webp(overview), times()
+    spent = times()
     notes = [*record["notes"], Detail(times_line(spent))]
     write_page(
         out / "report.html",
         title=(out if Path(scene.path).parent == out else Path(scene.path)).resolve().name,  # not "scene" for found poses
         subtitle=f"preset {metrics['preset']}, {len(train)} training views, {len(test)} held out, "
         f"{camera.width} x {camera.height} px, {metrics['device']}",
-        figures=_figures(metrics, spent["total"]), notes=notes, scores=table, views=images, curves=curves, sampling=sampling,
-        overview=picture, held_out=bool(test), coverage=covered,
+        figures=_figures(metrics, spent["total"]), notes=notes, scores=table, views=images, curves=curves,
+        sampling=sampled.result(), overview=picture and picture.result(), coverage=covered and covered.result(),
+        held_out=bool(test),
         record={k: v for k, v in record.items() if k != "cameras"},
         protocol=protocol | {LABELS.get(k, k): v for k, v in metrics["variants"].items()},
     )  # fmt: skip

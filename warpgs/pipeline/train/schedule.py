@@ -12,9 +12,9 @@ from typing import Annotated
 import numpy as np
 import torch
 
+from warpgs.device import in_background
 from warpgs.errors import UsageError
 from warpgs.pipeline.metrics.scores import counted_region
-from warpgs.priors.networks import in_threads
 from warpgs.scene import Scene, View
 from warpgs.schema import Checked, Within
 
@@ -194,15 +194,16 @@ def color_of(text: str) -> Color | None:
 def mean_color(views: list[View]) -> Color:
     """Return the mean colour of all unmasked pixels of views; it has the same bits on every machine."""
 
-    def levels_of(view: View) -> tuple[np.ndarray, int]:
-        levels = np.rint(view.image * np.float64(LEVELS))  # whole numbers, also their sums
-        if view.mask is not None:
-            levels[~view.mask] = 0
-        return levels.sum(0).sum(0), levels[..., 0].size if view.mask is None else int(view.mask.sum())
+    def sums(v: View) -> np.ndarray:
+        levels = np.multiply(v.image, LEVELS, dtype=np.float64)
+        np.rint(levels, out=levels)
+        if v.mask is not None:
+            levels[~v.mask] = 0
+        rows = levels.reshape(len(levels), -1).sum(axis=0)  # exact below 2^53
+        return np.array([*rows.reshape(-1, 3).sum(axis=0), v.image[..., 0].size if v.mask is None else v.mask.sum()])
 
-    rows = in_threads(levels_of, views)
-    total, count = sum((row[0] for row in rows), np.zeros(3)), sum(row[1] for row in rows)
-    red, green, blue = (int(t) / (LEVELS * max(count, 1)) for t in total)
+    *total, count = sum(in_background(sums, ((v,) for v in views)), np.zeros(4))
+    red, green, blue = (float(t) / (LEVELS * max(float(count), 1)) for t in total)
     return red, green, blue
 
 
