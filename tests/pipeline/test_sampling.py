@@ -213,6 +213,7 @@ def test_nothing_is_added_in_phase_three(monkeypatch):
 
 def test_gaussians_that_no_view_shows_are_removed(monkeypatch):
     """Faint and hidden ones go, young fine ones stay; at steps in phase 2 and 3; but the paper's strategy removes none."""
+    monkeypatch.setattr(sampling, "PRUNE_VIEWS", 1)
     fit = fitted(steps=0)
     fit.table.apply(grown(fit, 3, [-1, -1], columns={"level": FINE, "created_step": 7}))
     fit.table.apply(grown(fit, 5, [0]))

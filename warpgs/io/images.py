@@ -258,11 +258,13 @@ def undistortion_maps(K: np.ndarray, lens: Lens, width: int, height: int) -> tup
 
 
 def nearest_unmasked(raster: np.ndarray, mask: np.ndarray | None) -> np.ndarray:
-    """Return a raster [H, W, ...] whose masked pixels have the value of the nearest unmasked one; unchanged without a mask."""
+    """Return a raster [H, W, ...] whose masked pixels have the value of the nearest unmasked one, or 0 if all are masked."""
     import cv2
 
     if mask is None or mask.all():
         return raster
+    if not mask.any():
+        return np.zeros_like(raster)
     masked = (~mask).astype(np.uint8)
     labels = cv2.distanceTransformWithLabels(masked, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)[1]
     places = np.flatnonzero(mask)[labels[~mask] - 1]  # labels count the unmasked pixels row by row, from 1

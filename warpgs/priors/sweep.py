@@ -406,7 +406,7 @@ def sweep_depths(
                 inverses[i] = inverse_depths_cpu(small[i], compared, planes[i])
             progress(done, len(swept))
         # only now, so that a GPU works on one view while the next is prepared
-        inverses = {i: torch.as_tensor(found).cpu().numpy() for i, found in inverses.items()}
+        inverses = {i: t.cpu().numpy() if isinstance(t, torch.Tensor) else t for i, t in inverses.items()}
         note = f"not swept: the {len(swept)} swept views (of {len(views)}) see most of the scene"
         out = [no_depth(v, note, searched=False) for v in views]
 

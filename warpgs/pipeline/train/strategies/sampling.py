@@ -37,9 +37,10 @@ OPACITY = 0.1
 PROTECTED_STEPS, PROTECTED_OPACITY = 500, 0.05
 """Age up to which a sampled Gaussian is protected [steps] (T_protect, five densification intervals), and its smallest opacity
 (alpha_minimum, ten times the pruning threshold). The paper gives neither value."""
-PRUNE_EVERY, PRUNE_LATE = 500, (0, 1 / 4, 5 / 8)
-"""Steps between removals of unseen Gaussians while the set grows, at most a tenth of the fit; and times of the last removals as
-fractions of phase 3, all before the steps over which parameters are averaged."""
+PRUNE_EVERY, PRUNE_VIEWS, PRUNE_LATE = 500, 40, (0, 1 / 4, 5 / 8)
+"""Steps between removals of unseen Gaussians while the set grows: at most a tenth of the fit, but for each view as many steps as
+the second number, since a removal renders all views. And times of the last removals as fractions of phase 3, all before the
+steps over which parameters are averaged."""
 COARSE_LR_FACTOR = 0.1
 """Factor on the learning rate of the coarse layer's means from phase 2 on, with two layers."""
 
@@ -355,8 +356,9 @@ class Sampling(Strategy):
         """Return whether unseen Gaussians are removed after a step."""
         p = self.context.phases
         late = [p.stable_start + int(part * (p.steps - p.stable_start)) for part in PRUNE_LATE]
-        while_growing = p.refine < step < p.stable_start and step % max(1, min(PRUNE_EVERY, p.planned // 10)) == 0
-        return self.prunes_unseen and (while_growing or (step in late and step < p.steps))
+        every = max(1, min(PRUNE_EVERY, p.planned // 10), PRUNE_VIEWS * len(self.context.views))
+        grows = p.refine < step < p.stable_start
+        return self.prunes_unseen and ((grows and step % every == 0) or (step in late and step < p.steps))
 
     def prune(self, step: int) -> Iterator[DensityUpdate]:
         """Remove the Gaussians whose blending weight is below `SEEN` in all training views, but no protected ones."""
