@@ -20,7 +20,7 @@ EXTRAS ?= dev,formats,poses,ray,view
 export WARPGS_EXTRAS_INSTALLED := 1
 endif
 
-.PHONY: demo install lint types docs docs-links docs-run test test-slow test-fault test-browser test-audit test-cuda clean
+.PHONY: demo install lint types docs docs-links docs-run test test-slow test-fault test-browser test-audit test-cuda release clean
 
 # LOCKED=1: only files whose hashes stand in requirements.lock; else, from wherever pip is told, the versions of constraints.txt
 $(VENV)/installed: pyproject.toml constraints.txt requirements.lock
@@ -90,5 +90,11 @@ test-slow test-fault test-browser test-audit test-cuda: test-%: install
 	$(if $(filter slow,$*),$(PYTEST) -m "not slow and not cuda" --hypothesis-profile=many $(PROPERTIES))
 PROPERTIES := $(addprefix tests/,numerics/test_properties.py numerics/test_extreme_training.py io/test_splits.py export/test_ply.py)
 
+# The wheel and the sdist, in dist/.
+release: install
+	rm -rf dist
+	$(BIN)/python -m hatchling build
+	@echo "to install: pip install dist/*.whl"
+
 clean:
-	rm -rf runs site .coverage .pytest_cache .ruff_cache .mypy_cache
+	rm -rf dist runs site .coverage .pytest_cache .ruff_cache .mypy_cache

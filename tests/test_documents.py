@@ -12,6 +12,7 @@ from typing import get_type_hints
 
 import pytest
 import torch
+from PIL import Image
 
 from bench.lib import result_file
 from tests.scenes import view_stub
@@ -308,6 +309,14 @@ def test_links_lead_somewhere():
         text = (ROOT / document).read_text("utf-8")
         for target in re.findall(r"\]\((?!http)([^)#]+)\)", text):
             assert ((ROOT / document).parent / target).exists(), f"{document}: {target}"
+
+
+def test_the_first_picture_of_the_readme_is_large_and_loads_fast():
+    """It comes before all text, at 640 px or more, in at most 300 kB."""
+    name = re.match(r"# warpgs\n\n!\[[^]]+\]\(([^)]+)\)", (ROOT / "README.md").read_text("utf-8"))[1]
+    with Image.open(ROOT / name) as picture:
+        assert min(picture.size) >= 640
+    assert (ROOT / name).stat().st_size <= 300_000
 
 
 def test_the_hosted_checks_are_those_of_the_readme():
