@@ -5,6 +5,7 @@ import http.server
 import json
 import threading
 from contextlib import contextmanager
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,7 +16,15 @@ from warpgs.geometry import look_at
 from warpgs.render.rasterize import rasterize
 from warpgs.synthetic.demo import split_spec, write_demo
 from warpgs.viewer import server as connections
-from warpgs.viewer.html import SORT_FROM_DISK, distance_ahead, middle_first, seen_at, turning_limits, write_html
+from warpgs.viewer.html import (
+    SORT_FROM_DISK,
+    distance_ahead,
+    middle_first,
+    place_first_camera,
+    seen_at,
+    turning_limits,
+    write_html,
+)
 from warpgs.viewer.server import address, open_server, stop_server
 from warpgs.viewer.watch import live_view
 from warpgs.viewer.window import CROP, PATH, Window, content_of_run
@@ -79,6 +88,18 @@ def test_a_page_turns_as_far_as_the_photographs():
     around = degrees([looking(np.radians(a), 0.5) for a in range(0, 360, 45)])
     np.testing.assert_allclose(around, [np.inf, np.inf, 0, 0, 15], atol=1e-9)
     np.testing.assert_array_equal(degrees(arc[:1])[:4], np.inf)
+
+
+def test_a_page_turns_about_the_upward_direction_of_the_scene():
+    """Not about that of a camera that looks down: half a turn about it would end below the ground."""
+    server = SimpleNamespace(scene=SimpleNamespace(set_up_direction=lambda up: None), initial_camera=SimpleNamespace())
+    cameras = [looking(np.radians(a), 0.7) for a in range(0, 360, 45)]
+    up = place_first_camera(server, cameras[0], three_gaussians(), cameras)[1]
+    np.testing.assert_allclose(server.initial_camera.up, up)
+    np.testing.assert_allclose(up, UP, atol=1e-6)
+    down = dataclasses.replace(cameras[0], viewmat=look_at(np.array([0.0, -4, 0]), TARGET, np.array([0.0, 0, 1])))
+    up = place_first_camera(server, down, three_gaussians(), cameras)[1]  # the scene's is in the middle of its image
+    np.testing.assert_allclose(up, [0, 0, 1], atol=1e-6)
 
 
 def test_a_page_shows_what_the_photographs_saw():
