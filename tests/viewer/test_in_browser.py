@@ -122,7 +122,7 @@ def test_a_page_stops_where_the_photographs_end(browser, tmp_path):
     """Softly; one window width of drag is the whole range, and a button switches the limits and the frame off."""
     path, cameras = tmp_path / "scene.html", [looking(np.radians(a)) for a in (0, -6, 10)]
     g = three_gaussians()
-    write_html(path, dataclasses.replace(g, means=g.means - g.means.mean(0)), cameras)
+    write_html(path, dataclasses.replace(g, means=g.means - g.means.mean(0)), cameras, background=(1.0, 0.2, 0.0))
     browser.resize(WIDTH, HEIGHT)
     browser.open(path.as_uri())
     turned = "window.__viserMutable?.cameraControl?.rotate(0, 0, false)"
@@ -141,6 +141,8 @@ def test_a_page_stops_where_the_photographs_end(browser, tmp_path):
     browser.value("dispatchEvent(new KeyboardEvent('keydown', {key: 'r', bubbles: true}))")
     browser.wait(f"Math.abs({TURNED} - {first}) < 1e-3")
     assert browser.value("document.querySelector('#warpgs-frame').checkVisibility()")
+    color = browser.value("getComputedStyle(document.querySelector('#warpgs-frame')).boxShadow")
+    assert color.startswith("rgba(255, 51, 0, 0.9)")
     browser.value("document.querySelector('#warpgs-limits').click()")
     assert not browser.value("document.querySelector('#warpgs-frame').checkVisibility()")
     assert rotated(60) == pytest.approx(60, abs=0.05)

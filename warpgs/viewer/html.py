@@ -143,7 +143,8 @@ SORT_FROM_DISK = (
 are blended in the order of the file. The script hides the blob, so viser's page starts the worker from a data:
 address, which works."""
 WHOLE_IMAGE = (
-    "<style>#warpgs-frame{position:fixed;inset:0;margin:auto;z-index:1;pointer-events:none;box-shadow:0 0 0 9999px #111d}"
+    "<style>#warpgs-frame{position:fixed;inset:0;margin:auto;z-index:1;pointer-events:none;"
+    "box-shadow:0 0 0 9999px rgb(BACK/.9)}"
     '.warpgs-free #warpgs-frame{display:none}</style><div id="warpgs-frame"></div>'
     "<script>{let fov=OWN,reach=0;const degrees=180/Math.PI,box=document.querySelector('#warpgs-frame').style,frame=()=>{"
     "const m=window.__viserMutable,k=1.1*innerHeight*reach/m.cameraControl.distance/Math.tan(m.camera.fov/degrees/2);"
@@ -156,7 +157,8 @@ WHOLE_IMAGE = (
 )
 """Script that widens the vertical field of view OWN [rad] in a browser window narrower than the first camera's image,
 such as a phone's; otherwise the sides would be cut off. SIDE is half the width of the image at distance 1. Whatever is
-outside 1.1 times WIDE and TALL, the results of `seen_at`, is dimmed; zooming in opens this frame."""
+outside 1.1 times WIDE and TALL, the results of `seen_at`, fades into the background's colour BACK; zooming in widens this
+frame."""
 LEAST_MARGIN, LARGEST_MARGIN = math.radians(2), math.radians(15)
 """Limits of the angle that a page may turn beyond the photographs [rad]; between them it is a quarter of the captured arc."""
 ALL_ROUND = math.radians(100)
@@ -272,6 +274,7 @@ def write_html(
     script, side = WHOLE_IMAGE, 0.5 * first.width / float(first.K[0, 0])
     for name, value in (("OWN", fov_y(first)), ("SIDE", side), ("WIDE", wide), ("TALL", tall)):
         script = script.replace(name, f"{value:.8f}")
+    script = script.replace("BACK", " ".join(map(str, plain_background(background)[0, 0])))
     write_text(Path(path), f"{text}{HELP}{script}{end}{rest}")
     notes = ["the page shows no view-dependent colours; the run and its PLY keep them"] if gaussians.sh_degree else []
     return notes + [f"{shortened:,} Gaussians are longer than the page can store, and are shown shorter"] * bool(shortened)
