@@ -5,6 +5,7 @@ import http.server
 import json
 import threading
 from contextlib import contextmanager
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,7 +16,15 @@ from warpgs.geometry import look_at
 from warpgs.render.rasterize import rasterize
 from warpgs.synthetic.demo import split_spec, write_demo
 from warpgs.viewer import server as connections
-from warpgs.viewer.html import MARGIN, SORT_FROM_DISK, middle_first, turning_limits, write_html
+from warpgs.viewer.html import (
+    SORT_FROM_DISK,
+    distance_ahead,
+    middle_first,
+    place_first_camera,
+    seen_at,
+    turning_limits,
+    write_html,
+)
 from warpgs.viewer.server import address, open_server, stop_server
 from warpgs.viewer.watch import live_view
 from warpgs.viewer.window import CROP, PATH, Window, content_of_run
@@ -49,37 +58,96 @@ def test_the_middle_of_the_cameras_comes_first():
     assert [c.center[0] for c in middle_first(cameras)] == [1.5, 4.0, 0.0, 1.0] and middle_first([]) == []
 
 
+UP, TARGET = np.array([0.0, -1, 0]), np.zeros(3)
+
+
+def looking(azimuth, height=0.0):
+    """A camera 4 u from the origin, at an azimuth to its right and a tangent of the elevation, that looks at it."""
+    eye = 4 * np.array([np.sin(azimuth), -height, -np.cos(azimuth)])
+    return dataclasses.replace(ring(1)[0], viewmat=look_at(eye, TARGET, UP))
+
+
+def degrees(cameras, target=TARGET):
+    """Captured arc to the left, right, top and bottom, and the margin beyond it, in degrees."""
+    arc, margin = turning_limits(cameras, target, UP)
+    return *np.degrees(arc), np.degrees(margin)
+
+
 def test_a_page_turns_as_far_as_the_photographs():
-    """Around an arc, along a row of parallel cameras and in one place; all round there is no limit, nor with one camera."""
-    up, target = np.array([0.0, -1, 0]), np.zeros(3)
-
-    def looking(azimuth, height=0.0):
-        eye = 4 * np.array([np.sin(azimuth), -height, -np.cos(azimuth)])
-        return dataclasses.replace(ring(1)[0], viewmat=look_at(eye, target, up))
-
+    """To each side, with a margin of a quarter of the arc; all round there is no limit in yaw, and none with one camera."""
+    narrow = [looking(np.radians(a)) for a in (0, -6, -3, 10)]
+    np.testing.assert_allclose(degrees(narrow), [6, 10, 0, 0, 4], atol=1e-9)
     arc = [looking(np.radians(a), h) for a, h in ((0, 0), (-30, 0), (40, 0), (0, np.tan(np.radians(20))))]
-    np.testing.assert_allclose(turning_limits(arc, target, up), np.radians([40, 20]) + MARGIN, atol=1e-9)
+    np.testing.assert_allclose(degrees(arc), [30, 40, 20, 0, 15], atol=1e-9)
+    wide = [looking(np.radians(a)) for a in (0, 30, 80, 130, 180, 220)]  # further to one side than half a turn
+    np.testing.assert_allclose(degrees(wide), [0, 220, 0, 0, 15], atol=1e-9)
     row = [moved(0.0), moved(2.0), moved(-1.0)]
-    side, tilt = turning_limits(row, row[0].center + np.array([0, 0, 4.0]), up)
-    assert side == pytest.approx(np.arctan2(2, 4) + MARGIN) and tilt == pytest.approx(MARGIN)
-    ways = [looking(np.radians(a)) for a in range(0, 360, 45)]
-    assert turning_limits(ways, target, up)[0] == np.pi and turning_limits(arc[:1], target, up) == (np.pi, np.pi)
+    left, right = np.degrees(np.arctan2([1, 2], 4))
+    np.testing.assert_allclose(degrees(row, row[0].center + np.array([0, 0, 4.0])), [left, right, 0, 0, (left + right) / 4])
+    np.testing.assert_allclose(degrees([moved(0.0), moved(1e-3)])[4], 2)  # never stuck
+    around = degrees([looking(np.radians(a), 0.5) for a in range(0, 360, 45)])
+    np.testing.assert_allclose(around, [np.inf, np.inf, 0, 0, 15], atol=1e-9)
+    np.testing.assert_array_equal(degrees(arc[:1])[:4], np.inf)
+
+
+def test_a_page_turns_about_the_upward_direction_of_the_scene():
+    """Not about that of a camera that looks down: half a turn about it would end below the ground."""
+    server = SimpleNamespace(scene=SimpleNamespace(set_up_direction=lambda up: None), initial_camera=SimpleNamespace())
+    cameras = [looking(np.radians(a), 0.7) for a in range(0, 360, 45)]
+    up = place_first_camera(server, cameras[0], three_gaussians(), cameras)[1]
+    np.testing.assert_allclose(server.initial_camera.up, up)
+    np.testing.assert_allclose(up, UP, atol=1e-6)
+    down = dataclasses.replace(cameras[0], viewmat=look_at(np.array([0.0, -4, 0]), TARGET, np.array([0.0, 0, 1])))
+    up = place_first_camera(server, down, three_gaussians(), cameras)[1]  # the scene's is in the middle of its image
+    np.testing.assert_allclose(up, [0, 0, 1], atol=1e-6)
+
+
+def test_a_page_shows_what_the_photographs_saw():
+    """A portrait photograph sees its own width; cameras beside it add what they see of the plane through the target."""
+    first = moved(0.0)
+    K = np.array([[100.0, 0, 30], [0, 100, 60], [0, 0, 1]])
+    portrait = dataclasses.replace(first, K=K, width=60, height=120)
+    target = np.array([0, 0, 4.0])
+    np.testing.assert_allclose(seen_at([portrait], target), [0.3, 0.6])
+    row = [dataclasses.replace(portrait, viewmat=moved(x).viewmat) for x in (0.0, -1.0, 2.0)]
+    np.testing.assert_allclose(seen_at(row, target), [0.3 + 1 / 4, 0.6])
+
+
+TURNED = "(()=>{const t=__viserMutable.cameraControl;t.update(9);return t.azimuthAngle})()"
+"""Azimuth of the page's camera at the end of its motion, in JavaScript [rad]."""
 
 
 @pytest.mark.browser
 def test_a_page_stops_where_the_photographs_end(browser, tmp_path):
-    path, cameras = tmp_path / "scene.html", middle_first(ring(3))
-    write_html(path, crowd(), cameras)
+    """Softly; one window width of drag is the whole range, and a button switches the limits and the frame off."""
+    path, cameras = tmp_path / "scene.html", [looking(np.radians(a)) for a in (0, -6, 10)]
+    g = three_gaussians()
+    write_html(path, dataclasses.replace(g, means=g.means - g.means.mean(0)), cameras, background=(1.0, 0.2, 0.0))
+    browser.resize(WIDTH, HEIGHT)
     browser.open(path.as_uri())
-    angle = "window.__viserMutable?.cameraControl?.azimuthAngle"
-    browser.wait("Number.isFinite(window.__viserMutable?.cameraControl?.maxAzimuthAngle)")
-    first = browser.value(angle)
-    for way in (1, -1):
-        browser.value(f"void __viserMutable.cameraControl.rotate({way} * 2.5, 0, false)")
-        browser.wait(f"Math.abs({angle} - {first}) > 0.1")
-        assert abs(browser.value(angle) - first) < np.radians(60)
-        browser.value("dispatchEvent(new KeyboardEvent('keydown', {key: 'r', bubbles: true}))")
-        browser.wait(f"Math.abs({angle} - {first}) < 1e-3")
+    turned = "window.__viserMutable?.cameraControl?.rotate(0, 0, false)"
+    browser.wait(f"({turned}, (window.__viserMutable?.cameraControl?.azimuthRotateSpeed ?? 1) < 0.2)")
+    first = browser.value(TURNED)
+
+    def rotated(angle):
+        browser.value(f"void __viserMutable.cameraControl.rotate({np.radians(angle)}, 0, false)")
+        return np.degrees(browser.value(TURNED) - first)
+
+    speed = browser.value("__viserMutable.cameraControl.azimuthRotateSpeed")
+    assert speed * 360 * WIDTH / HEIGHT == pytest.approx(6 + 10 + 2 * 4, rel=1e-3)
+    assert rotated(8) == pytest.approx(8, abs=0.01) and rotated(-4) == pytest.approx(4, abs=0.01)  # free in the captured arc
+    assert 12 < rotated(10) < 13 and 13.5 < rotated(90) < 14  # resistance, then the end
+    assert rotated(-60) == pytest.approx(-6 - 4 * 0.95, abs=0.05)
+    browser.value("dispatchEvent(new KeyboardEvent('keydown', {key: 'r', bubbles: true}))")
+    browser.wait(f"Math.abs({TURNED} - {first}) < 1e-3")
+    assert browser.value("document.querySelector('#warpgs-frame').checkVisibility()")
+    color = browser.value("getComputedStyle(document.querySelector('#warpgs-frame')).boxShadow")
+    assert color.startswith("rgba(255, 51, 0, 0.9)")
+    browser.value("document.querySelector('#warpgs-limits').click()")
+    assert not browser.value("document.querySelector('#warpgs-frame').checkVisibility()")
+    assert rotated(60) == pytest.approx(60, abs=0.05)
+    browser.value("document.querySelector('#warpgs-limits').click()")
+    browser.wait(f"Math.abs({TURNED} - {first + np.radians(10 + 4 * 0.95)}) < 1e-3")
 
 
 def moved(x):
@@ -288,6 +356,33 @@ def test_the_viewer_works_under_its_policy(folder, browser, capfd):
             assert browser.value(f"typeof {code}") == "undefined"
         assert trouble(browser) == []
     assert "Traceback" not in capfd.readouterr().err
+
+
+@pytest.mark.browser
+def test_the_viewer_has_the_limits_of_the_page(folder, browser):
+    """Also in a browser that is there before the model; the panel switches them off."""
+    content = content_of_run(folder / "run")
+    server = open_server(0)
+    browser.open(address(server))
+    browser.wait("window.__viserMutable?.cameraControl != null")
+    window = Window(server, content)
+    try:
+        tilt = "window.__viserMutable?.nodeRefFromName?.['/limits/tilt']?.position"
+        browser.wait(f"{tilt}?.z === 1")
+        ahead = distance_ahead(window.first, content.model.gaussians())
+        browser.wait(f"({TURNED}, Math.abs(__viserMutable.cameraControl.distance - {ahead}) < 1e-3)")
+        first = browser.value(TURNED)
+        browser.value("void __viserMutable.cameraControl.rotate(2, 0, false)")
+        arc, margin = turning_limits(window._rig, window._target, window._up)
+        assert np.degrees(browser.value(TURNED) - first) == pytest.approx(np.degrees(arc[1] + 0.95 * margin), abs=0.1)
+        window.panel.limits.value = False
+        browser.wait(f"{tilt}?.z === 0")
+        browser.value("void __viserMutable.cameraControl.rotate(1, 0, false)")
+        assert browser.value(TURNED) - first == pytest.approx(arc[1] + 0.95 * margin + 1, abs=0.002)
+        assert trouble(browser) == []
+    finally:
+        window.close()
+        stop_server(server)
 
 
 @pytest.mark.browser

@@ -22,7 +22,7 @@ from warpgs.pipeline.films.paths import fov_y, up_of
 from warpgs.pipeline.run.export import NO_FILTERS, Filters, file_gaussians, filtered, rotate_camera
 from warpgs.pipeline.run.folder import open_run
 from warpgs.scene import Camera, Gaussians, base_colors
-from warpgs.viewer.server import NO_PARAMETERS, NO_TEXT_AS_CODE, open_server, require_viser, stop_server
+from warpgs.viewer.server import LIMITS, NO_PARAMETERS, NO_TEXT_AS_CODE, TURNING, open_server, require_viser, stop_server
 
 if TYPE_CHECKING:
     import viser
@@ -116,12 +116,17 @@ NO_SCENE_TREE = '<style>:has(>[aria-label$="scene tree"]){display:none!important
 HELP = (
     "<style>#warpgs-help{position:fixed;top:.8em;right:.8em;z-index:2;font:13px sans-serif;color:#fff;text-shadow:0 0 3px #000}"
     "#warpgs-help button{font:inherit;margin-left:.5em;cursor:pointer}</style>"
-    '<div id="warpgs-help">Drag to turn, scroll or pinch to zoom<button>Reset (R)</button></div>'
+    '<div id="warpgs-help">Drag to turn, scroll or pinch to zoom<button>Reset (R)</button>'
+    '<button id="warpgs-limits" title="Stay where the photographs show the scene">Limits: on</button></div>'
     "<script>{const back=()=>{const m=window.__viserMutable;m?.resetCameraPose?m.resetCameraPose(true):location.reload()};"
     "document.querySelector('#warpgs-help button').addEventListener('click',back);"
+    "document.querySelector('#warpgs-limits').addEventListener('click',e=>{"
+    "const free=document.body.classList.toggle('warpgs-free');e.target.textContent='Limits: '+(free?'off':'on');"
+    "window.__viserMutable?.cameraControl?.rotate(0,0,true)});"
     "addEventListener('keydown',e=>{if(e.key.toLowerCase()==='r'&&!e.ctrlKey&&!e.metaKey&&!e.altKey)back()})}</script>"
 )
-"""Line of help, with a button that returns to the first view; without viser's reset function, the page is reloaded."""
+"""Line of help, with a button that returns to the first view; without viser's reset function, the page is reloaded. Another
+button switches the limits of `TURNING` off, and the frame of `WHOLE_IMAGE` with them."""
 LOADING = (
     '<div id="warpgs-loading" style="position:fixed;inset:0;z-index:2;display:grid;place-items:center;pointer-events:none;'
     'font:16px sans-serif;color:#888">Loading the scene ...</div>'
@@ -138,21 +143,26 @@ SORT_FROM_DISK = (
 are blended in the order of the file. The script hides the blob, so viser's page starts the worker from a data:
 address, which works."""
 WHOLE_IMAGE = (
-    "<script>{let fov=OWN,first=true;const degrees=180/Math.PI,show=()=>{const m=window.__viserMutable,c=m?.camera,"
-    "t=m?.cameraControl;if(!t||!c||Math.abs(c.fov-fov*degrees)>1e-3)return requestAnimationFrame(show);"
-    "if(first){first=false;const a=t.azimuthAngle,p=t.polarAngle;"
-    "if(SIDE<Math.PI){t.minAzimuthAngle=a-SIDE;t.maxAzimuthAngle=a+SIDE}"
-    "t.minPolarAngle=Math.max(0,p-TILT);t.maxPolarAngle=Math.min(Math.PI,p+TILT)}"
-    "fov=2*Math.atan(Math.max(Math.tan(OWN/2),WIDE*innerHeight/innerWidth));c.fov=fov*degrees;c.updateProjectionMatrix()};"
-    "show();addEventListener('resize',show)}</script>"
+    "<style>#warpgs-frame{position:fixed;inset:0;margin:auto;z-index:1;pointer-events:none;"
+    "box-shadow:0 0 0 9999px rgb(BACK/.9)}"
+    '.warpgs-free #warpgs-frame{display:none}</style><div id="warpgs-frame"></div>'
+    "<script>{let fov=OWN,reach=0;const degrees=180/Math.PI,box=document.querySelector('#warpgs-frame').style,frame=()=>{"
+    "const m=window.__viserMutable,k=1.1*innerHeight*reach/m.cameraControl.distance/Math.tan(m.camera.fov/degrees/2);"
+    "box.width=Math.min(WIDE*k,1e5)+'px';box.height=Math.min(TALL*k,1e5)+'px'},show=()=>{"
+    "const m=window.__viserMutable,c=m?.camera,t=m?.cameraControl;"
+    "if(!t||!c||Math.abs(c.fov-fov*degrees)>1e-3)return requestAnimationFrame(show);"
+    "if(!reach){reach=t.distance;t.addEventListener('update',frame)}"
+    "fov=2*Math.atan(Math.max(Math.tan(OWN/2),SIDE*innerHeight/innerWidth));c.fov=fov*degrees;c.updateProjectionMatrix();"
+    "frame()};show();addEventListener('resize',show)}</script>"
 )
 """Script that widens the vertical field of view OWN [rad] in a browser window narrower than the first camera's image,
-such as a phone's; otherwise the sides would be cut off. WIDE is half the width of the image at distance 1. The script also
-limits how far the page turns from its first view: SIDE and TILT are results of `turning_limits`."""
-MARGIN = math.radians(15)
-"""Angle that a page may turn beyond the photographs [rad]."""
-ALL_ROUND = math.radians(150)
-"""Angle to one side above which a page may turn all round [rad]."""
+such as a phone's; otherwise the sides would be cut off. SIDE is half the width of the image at distance 1. Whatever is
+outside 1.1 times WIDE and TALL, the results of `seen_at`, fades into the background's colour BACK; zooming in widens this
+frame."""
+LEAST_MARGIN, LARGEST_MARGIN = math.radians(2), math.radians(15)
+"""Limits of the angle that a page may turn beyond the photographs [rad]; between them it is a quarter of the captured arc."""
+ALL_ROUND = math.radians(100)
+"""Largest gap between the azimuths of photographs all round [rad]; four around an object have 90 degrees."""
 
 
 def place_first_camera(
@@ -160,11 +170,12 @@ def place_first_camera(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Set the camera at which pages start; return its target [3] [u] and the upward direction [3] of films."""
     target = camera.center + distance_ahead(camera, gaussians) * np.asarray(camera.viewmat[2, :3])
-    up = up_of(list(cameras), gaussians.means.detach().cpu().double().numpy())
+    up, own = up_of(list(cameras), gaussians.means.detach().cpu().double().numpy()), -np.asarray(camera.viewmat[1, :3])
+    up = up if (up * own).sum() > 0.5 else own  # the camera looks along it, or lies on its side
     server.scene.set_up_direction(up)
     server.initial_camera.position = camera.center
     server.initial_camera.look_at = target
-    server.initial_camera.up = -np.asarray(camera.viewmat[1, :3])
+    server.initial_camera.up = up  # the page turns about it: about the camera's own, a half turn would end below the ground
     server.initial_camera.fov = fov_y(camera)
     server.initial_camera.far = 1e5  # else content beyond 1000 u is clipped
     return target, up
@@ -179,22 +190,52 @@ def middle_first(cameras: Sequence[Camera]) -> list[Camera]:
     return [cameras[nearest], *cameras[:nearest], *cameras[nearest + 1 :]]
 
 
-def turning_limits(cameras: Sequence[Camera], target: np.ndarray, up: np.ndarray) -> tuple[float, float]:
-    """Return how far a page may turn from the first camera around a target, to each side and up or down [rad]."""
-    # The page turns as far as the photographs do, plus `MARGIN`: beyond, the model shows places that no photograph saw.
-    # With one camera, and with photographs all round, the result is pi: no limit.
+def turning_limits(cameras: Sequence[Camera], target: np.ndarray, up: np.ndarray) -> tuple[np.ndarray, float]:
+    """Return the captured arc around a target, to the left, right, top and bottom of the first camera, and the margin [rad]."""
+    # Beyond the margin, the model shows places that no photograph saw. One camera says nothing about an arc, and
+    # photographs all round leave no end to the left and right: infinity.
+    arc = np.full(4, math.inf)
     if len(cameras) < 2:
-        return math.pi, math.pi
+        return arc, LARGEST_MARGIN
     # as seen from the target, and by the axis: cameras in a row look in parallel, those in a room outwards
     ways = np.array([w for c in cameras for w in (c.center - target, -np.asarray(c.viewmat[2, :3]))])
     ways /= np.maximum(np.linalg.norm(ways, axis=1, keepdims=True), 1e-12)
     heights = np.clip((ways * up).sum(1), -1, 1)
     flat = ways - heights[:, None] * up
     side = np.cross(up, flat[0])
-    azimuths = np.arctan2((flat * side).sum(1), (flat * flat[0]).sum(1))
-    elevations = np.arcsin(heights)
-    turn, tilt = (float(np.abs(a).max()) + MARGIN for a in (azimuths, elevations - elevations[0]))
-    return math.pi if turn > ALL_ROUND else turn, min(tilt, math.pi)
+    level = np.abs(heights) < max(0.95, abs(heights[0]) + 1e-9)  # straight down there is no azimuth
+    azimuths = np.sort(np.arctan2((flat * side).sum(1), (flat * flat[0]).sum(1))[level])
+    gaps = np.diff(azimuths, append=azimuths[0] + 2 * math.pi)
+    widest = int(np.argmax(gaps))  # the arc is all but the widest gap, and has the first camera at 0
+    if gaps[widest] > ALL_ROUND:
+        arc[:2] = -azimuths[(widest + 1) % len(azimuths)] % (2 * math.pi), azimuths[widest] % (2 * math.pi)
+    elevations = np.arcsin(heights) - np.arcsin(heights[0])
+    arc[2:] = elevations.max(), -elevations.min()
+    return arc, float(np.clip(max(arc[:2].sum(), arc[2:].sum()) / 4, LEAST_MARGIN, LARGEST_MARGIN))
+
+
+def add_limits(
+    server: viser.ViserServer, cameras: Sequence[Camera], target: np.ndarray, up: np.ndarray, on: bool = True
+) -> None:
+    """Give pages the limits of cameras, the first of which they start at, as positions of nodes that draw nothing."""
+    (left, right, above, below), margin = turning_limits(cameras, target, up)
+    positions = {"": cameras[0].center - target, "/sides": (left, right, margin), "/tilt": (above, below, on)}
+    for name, position in positions.items():
+        server.scene.add_frame(LIMITS + name, show_axes=False, position=np.minimum(position, 1e3).astype(float))
+
+
+def seen_at(cameras: Sequence[Camera], target: np.ndarray) -> tuple[float, float]:
+    """Return half the width and height, at distance 1 from the first camera, of what cameras see at the target's depth."""
+    first, points = cameras[0], []
+    axis = np.asarray(first.viewmat[2, :3])
+    for c in cameras:
+        corners = np.array([[x, y, 1.0] for x in (0, c.width) for y in (0, c.height)])
+        rays = matmul(matmul(corners, np.linalg.inv(c.K).T), np.asarray(c.viewmat[:3, :3]))
+        slopes = (rays * axis).sum(1)
+        depths = ((target - c.center) * axis).sum() / np.where(slopes > 0.3, slopes, math.inf)  # not along the plane
+        points.append(c.center + depths[depths > 0, None] * rays[depths > 0])
+    x, y, z = matmul(np.concatenate(points) - first.center, np.asarray(first.viewmat[:3, :3]).T).T
+    return float(min((x / z).max(), -(x / z).min())), float(min((y / z).max(), -(y / z).min()))
 
 
 def plain_background(color: Sequence[float]) -> np.ndarray:
@@ -215,23 +256,25 @@ def write_html(
     if not len(gaussians):
         raise DataError("a page needs at least one Gaussian; fit the scene for longer")
     arrays, scale, shortened = packed(gaussians)
-    cameras = cameras or [camera_before(gaussians)]
+    known, cameras = bool(cameras), cameras or [camera_before(gaussians)]
     first, server = cameras[0], open_server(port=0)
     try:
         target, up = place_first_camera(server, first, gaussians, cameras)
         server.scene.set_background_image(plain_background(background), format="png")
+        add_limits(server, cameras, target, up)
         server.scene.add_gaussian_splats("/gaussians", *arrays, scale=scale)
         text = server.get_scene_serializer().as_html(dark_mode=True)
     finally:
         stop_server(server)
     head = f'<head><meta http-equiv="Content-Security-Policy" content="{POLICY}" />'
-    head += f"<script>{NO_PARAMETERS}{NO_TEXT_AS_CODE}</script>{SORT_FROM_DISK}{NO_REMARKS}{NO_SCENE_TREE}"
+    head += f"<script>{NO_PARAMETERS}{NO_TEXT_AS_CODE}{TURNING}</script>{SORT_FROM_DISK}{NO_REMARKS}{NO_SCENE_TREE}"
     text = re.sub(r"<title>[^<]*</title>", lambda _: f"<title>{html.escape(title)}</title>", text, count=1)
     text, end, rest = text.replace("<head>", head, 1).replace("<body>", f"<body>{LOADING}", 1).rpartition("</body>")
-    side, tilt = turning_limits(cameras, target, up)
-    script, wide = WHOLE_IMAGE, 0.5 * first.width / float(first.K[0, 0])
-    for name, value in (("OWN", fov_y(first)), ("WIDE", wide), ("SIDE", side), ("TILT", tilt)):
+    wide, tall = seen_at(cameras, target) if known else (1e3, 1e3)
+    script, side = WHOLE_IMAGE, 0.5 * first.width / float(first.K[0, 0])
+    for name, value in (("OWN", fov_y(first)), ("SIDE", side), ("WIDE", wide), ("TALL", tall)):
         script = script.replace(name, f"{value:.8f}")
+    script = script.replace("BACK", " ".join(map(str, plain_background(background)[0, 0])))
     write_text(Path(path), f"{text}{HELP}{script}{end}{rest}")
     notes = ["the page shows no view-dependent colours; the run and its PLY keep them"] if gaussians.sh_degree else []
     return notes + [f"{shortened:,} Gaussians are longer than the page can store, and are shown shorter"] * bool(shortened)

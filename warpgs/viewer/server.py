@@ -62,10 +62,36 @@ _MARK_LOADED = (
 )
 """JavaScript that gives the nonce to the one script that viser's page unpacks."""
 
+LIMITS = "/limits"
+"""Scene node with the limits of `TURNING`, as positions: of itself the way from the target to the first camera [u], of
+``sides`` the captured arc to the left and right, and the margin, of ``tilt`` that above and below [rad], and 1 for on."""
+TURNING = (
+    "{const turn=2*Math.PI,begin=()=>{const m=window.__viserMutable,t=m?.cameraControl,root=m?.nodeRefFromName?.[''];"
+    "if(!t||!root||!m.camera)return requestAnimationFrame(begin);const free=t.rotateTo,"
+    "limits=()=>{const [away,a,b]=['','/sides','/tilt'].map(n=>m.nodeRefFromName['LIMITS'+n]?.position);"
+    "return !b?.z||document.body.classList.contains('warpgs-free')?null:"
+    "{away,left:a.x,right:a.y,margin:a.z,above:b.x,below:b.y}},"
+    "pace=()=>{const l=limits(),range=l?Math.min(l.left+l.right+2*l.margin,turn):turn;"
+    "t.azimuthRotateSpeed=t.polarRotateSpeed=range/turn*m.canvas.clientHeight/m.canvas.clientWidth},"
+    "soft=(x,low,high,m)=>x>high?high+m*(1-Math.exp((high-x)/m)):x<low?-soft(-x,-high,-low,m):x,"
+    "pulled=(x,low,high,m)=>x>high?high-m*Math.log(Math.max(1-(x-high)/m,.05)):x<low?-pulled(-x,-high,-low,m):x,"
+    "moved=(x,by,low,high,m)=>soft(Math.min(Math.max(pulled(x,low,high,m)+by,low-3*m),high+3*m),low,high,m)-x;"
+    "t.rotateTo=(a,p,smooth)=>{const l=limits();pace();if(!l)return free(a,p,smooth);"
+    "const end=t.getSpherical({copy:s=>s}),c=m.camera,up=c.up.clone(),middle=(l.right-l.left)/2,"
+    "q=c.quaternion.clone().setFromUnitVectors(up,up.clone().set(0,1,0)),"
+    "v=l.away.clone().applyQuaternion(root.quaternion).applyQuaternion(q).normalize(),"
+    "off=end.theta-Math.atan2(v.x,v.z)-middle,x=middle+off-turn*Math.round(off/turn),y=Math.acos(v.y)-end.phi;"
+    "return free(end.theta+moved(x,a-end.theta,-l.left,l.right,l.margin),"
+    "end.phi-moved(y,end.phi-p,-l.below,l.above,l.margin),smooth)};"
+    "t.addEventListener('controlstart',pace);pace()};begin()}"
+).replace("LIMITS", LIMITS)
+"""JavaScript that keeps the camera where photographs show the scene: it turns freely within the captured arc, and ever less
+in the margin beyond. A drag over the width of the window turns through the whole range."""
+
 
 def live_page(text: str, nonce: str) -> str:
     """Return viser's page for a content policy that only runs scripts with a nonce."""
-    own = f"<script>{NO_PARAMETERS}{NO_TEXT_AS_CODE}{_MARK_LOADED.replace('NONCE', nonce)}</script>"
+    own = f"<script>{NO_PARAMETERS}{NO_TEXT_AS_CODE}{_MARK_LOADED.replace('NONCE', nonce)}{TURNING}</script>"
     return text.replace("<head>", f"<head>{own}", 1).replace("<script", f'<script nonce="{nonce}"')
 
 

@@ -229,6 +229,10 @@ class Panel:
             "layer", (ALL_LAYERS, COARSE_LAYER, FINE_LAYER), initial_value=ALL_LAYERS, visible=content.fine is not None
         )
         self.cameras = gui.add_checkbox("cameras", True, visible=bool(content.model.scene_cameras))
+        self.limits = gui.add_checkbox(
+            "limits", True, hint="stay where photographs show the scene", visible=len(content.model.scene_cameras) > 1
+        )
+        self.limits.on_update(guarded(lambda _: self.window.limit()))
         self._note = gui.add_markdown("", visible=False)
         for control in (self.kind, self.degree, self.layer, self.cameras):
             control.on_update(guarded(lambda _: self.window.redraw()))
@@ -383,16 +387,19 @@ class Window:
         self.server, self.content = server, content
         cameras = list(content.model.scene_cameras.values())
         train = [content.model.scene_cameras[n] for n in content.model.train]
-        self.first = [*html.middle_first(train or cameras), html.camera_before(content.model.gaussians())][0]
+        # the limits include all cameras, because the user can step into each
+        self._rig = [*html.middle_first(train or cameras), *cameras] or [html.camera_before(content.model.gaussians())]
+        self.first = self._rig[0]
         ahead = html.distance_ahead(self.first, content.model.gaussians())
         self.extent = camera_extent(cameras) if len(cameras) > 1 else 0.1 * ahead
         self.maps = Maps(content, self.extent)
         self._frusta: dict[str, Any] = {}
         self._drawn: dict[int, tuple[Any, ...]] = {}
         self._lock, self._wake, self._open = threading.RLock(), threading.Event(), True
-        html.place_first_camera(server, self.first, content.model.gaussians(), cameras or [self.first])
+        self._target, self._up = html.place_first_camera(server, self.first, content.model.gaussians(), cameras or [self.first])
         server.scene.set_background_image(html.plain_background(content.model.background), format="png")
         self.panel = Panel(server, content, self, maps)
+        self.limit()
         self._draw_cameras()
         self.redraw()
         server.on_client_connect(guarded(self._connected))
@@ -434,6 +441,10 @@ class Window:
             self._hide_near()
             self._drawn.clear()
         self._wake.set()
+
+    def limit(self) -> None:
+        """Send the limits of turning to the browsers, as the panel switches them."""
+        html.add_limits(self.server, self._rig, self._target, self._up, bool(self.panel.limits.value))
 
     def _draw_cameras(self) -> None:
         """Draw the cameras with their photographs; a click steps into one."""
