@@ -38,9 +38,9 @@ PROTECTED_STEPS, PROTECTED_OPACITY = 500, 0.05
 """Age up to which a sampled Gaussian is protected [steps] (T_protect, five densification intervals), and its smallest opacity
 (alpha_minimum, ten times the pruning threshold). The paper gives neither value."""
 PRUNE_EVERY, PRUNE_VIEWS, PRUNE_LATE = 500, 40, (0, 1 / 4, 5 / 8)
-"""Steps between removals of unseen Gaussians while the set grows: at most a tenth of the fit, but at least the second number for
-each view, since a removal renders all of them. And times of the last removals as fractions of phase 3, all before the steps over
-which parameters are averaged."""
+"""Steps between removals of unseen Gaussians while the set grows: at most a tenth of the fit, but at least the second number
+for each view, since a removal renders all of them. And times of the last removals as fractions of phase 3, all before the steps
+over which parameters are averaged."""
 COARSE_LR_FACTOR = 0.1
 """Factor on the learning rate of the coarse layer's means from phase 2 on, with two layers."""
 
