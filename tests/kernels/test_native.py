@@ -1,11 +1,9 @@
 """CUDA text: where it lies, that it compiles without a GPU, and the contracts between its bodies."""
 
 import ast
-import fnmatch
 import functools
 import itertools
 import math
-import tomllib
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -253,11 +251,3 @@ def test_names_are_replaced_and_files_included(tmp_path):
     text = source(str(tmp_path / "body.cu"), SIDE=8)
     assert text.startswith("// Declarations") and "WIDE = 8 / 8" in text and text.endswith("int SIDES = 8;\n")
     assert "#include" not in text
-
-
-def test_a_wheel_holds_all_cuda_text():
-    """A wheel takes all files of the package that git does not ignore."""
-    wheel = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["tool"]["hatch"]["build"]["targets"]["wheel"]
-    assert wheel == {"packages": ["warpgs"]}
-    ignored = [line for line in (ROOT / ".gitignore").read_text("utf-8").splitlines() if line and not line.startswith("#")]
-    assert not [n for n in FILES for pattern in ignored if fnmatch.fnmatch(n, pattern.strip("/"))]
