@@ -3,7 +3,9 @@
 import dataclasses
 import io
 import struct
+import warnings
 import zlib
+from concurrent.futures import ThreadPoolExecutor
 
 import cv2
 import numpy as np
@@ -576,6 +578,15 @@ def test_the_limit_holds_for_images_masks_and_score_masks(tmp_path):
         assert len(load_scene(tmp_path, max_pixels=4 * size).views) == scenes.VIEWS
         with pytest.raises(DataError, match=rf"{folder}.*: the image is 32 x 24 px, more than the limit of 192 pixels"):
             load_scene(tmp_path, max_pixels=size)
+
+
+def test_threads_that_decode_leave_the_filters_of_warnings(tmp_path):
+    """Of two that put the filters back, the later could put back the other's, and no warning would show any more."""
+    (tmp_path / "a.jpg").write_bytes(encoded("JPEG"))
+    before = [*warnings.filters]
+    with ThreadPoolExecutor(4) as pool:
+        assert len([*pool.map(decode, [tmp_path / "a.jpg"] * 200)]) == 200
+    assert warnings.filters == before
 
 
 def test_a_second_size_or_a_chunk_beyond_the_file_is_refused_before_any_pixel_is_decoded(tmp_path, monkeypatch):

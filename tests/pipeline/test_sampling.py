@@ -227,6 +227,10 @@ def test_gaussians_that_no_view_shows_are_removed(monkeypatch):
     assert not [*fit.strategy.prune(30)]  # a model of nothing is no help
     assert [s for s in range(41) if fit.strategy.prunes(s)] == [12, 16, 20, 24, 28, 31, 35]
     assert not any(Paper(fit.context).prunes(s) for s in range(41))
+    monkeypatch.setattr(sampling, "PRUNE_VIEWS", 14)  # one removal has time among 40 steps of three views
+    assert [s for s in range(41) if fit.strategy.prunes(s)] == [28]
+    resets = dataclasses.replace(CONFIG, density=dataclasses.replace(CONFIG.density, reset_every=3))
+    assert not any(fitted(resets, 0).strategy.prunes(s) for s in range(41))  # after a reset nothing is seen
 
 
 def test_full_fine_layer_frees_its_least_contributors():

@@ -27,6 +27,7 @@ from warpgs.io.folder import (
     is_absolute,
     listed,
     matched_note,
+    missing_name,
     missing_note,
     name_key,
     quat_rotation,
@@ -496,7 +497,9 @@ def _image_paths(
         pairs = dict(zip(sorted(names), files))
         order = f"images of {images.name} matched in sorted order, because their names differ"
         return pairs, [f"{order} ({min(names)} is {pairs[min(names)].name})"]
-    paths |= {n: scene.child(images, n, where) for n in outside if n not in found}  # refuses those that point outside
+    for n in (n for n in outside if n not in found):
+        elsewhere = is_absolute(n) and not Path(n).exists()
+        paths[n] = images / missing_name(n) if elsewhere else scene.child(images, n, where)  # which refuses
     return paths | found, matched_note(found, images.name, scene.root)
 
 

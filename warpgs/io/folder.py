@@ -6,6 +6,7 @@ import posixpath
 import re
 import threading
 import unicodedata
+import warnings
 from collections import Counter
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -321,7 +322,8 @@ class SceneFolder:
         self._thread.binary = False
         if loaded.mask is not None and not loaded.mask.any():  # left out by `ViewList.add`
             return loaded
-        self._reduced = self._reduced or any(words.startswith(REDUCED) for words in loaded.done)
+        if any(words.startswith(REDUCED) for words in loaded.done):
+            self._reduced = True
         return self._maps.attached(loaded, path, named)
 
     def mask(self, path: Path) -> np.ndarray:
@@ -368,7 +370,8 @@ class SceneFolder:
             near = {p for place in places for p in place.iterdir() if p.name.casefold() in ("mask", "masks") and p.is_dir()}
             for other in sorted(near - {*self._masks}):
                 if list_images(other):
-                    where, there = (p.relative_to(self.root).as_posix() for p in (other, folder))
+                    inner = (p.relative_to(self.root) if p.is_relative_to(self.root) else p for p in (other, folder))
+                    where, there = (p.as_posix() for p in inner)
                     notes.append(f"the folder {where} is not read; masks are read from {there}")
             files = list_images(folder) if folder.is_dir() else []
             known = {_plain(p.relative_to(images).as_posix()) for p in list_images(images)} if files and unmasked else set()
@@ -454,6 +457,11 @@ def is_absolute(name: str) -> bool:
     return PurePosixPath(name).is_absolute() or PureWindowsPath(name).is_absolute()
 
 
+def missing_name(name: str) -> str:
+    """Return a name below a folder for the file of an absolute path that is not there."""
+    return posixpath.normpath(name.replace("\\", "/")).replace(":", "").lstrip("/")
+
+
 def matched_note(found: dict[str, Path], place: str, root: Path) -> list[str]:
     """Return the note on names that another file than that of their spelling was ``found`` for; [] for none."""
     if not found:
@@ -531,7 +539,7 @@ class ViewList:
     def _load(self) -> None:
         """Load the images that wait; an error is that of the first image that has one."""
         waiting, self._waiting = self._waiting, []
-        with ThreadPoolExecutor(min(LOADERS, usable_cores())) as pool:
+        with warnings.catch_warnings(action="ignore"), ThreadPoolExecutor(min(LOADERS, usable_cores())) as pool:
             for (name, viewmat, _), loaded in zip(waiting, pool.map(lambda row: row[2](), waiting)):
                 self._append(name, viewmat, loaded)
 

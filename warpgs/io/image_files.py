@@ -14,6 +14,7 @@ import math
 import os
 import re
 import struct
+import threading
 import warnings
 import zlib
 from collections.abc import Iterator
@@ -117,8 +118,10 @@ def read_image_file(path: Path, max_pixels: int = MAX_PIXELS, start: int | None 
 @contextlib.contextmanager
 def _decoder(words: str) -> Iterator[None]:
     """Run a decoder without its warnings; its errors become a ValueError with ``words``, but not a lack of memory."""
+    # filters belong to the process: of two threads, the later could restore the other's
+    alone = threading.current_thread() is threading.main_thread()
     try:
-        with warnings.catch_warnings(action="ignore"):
+        with warnings.catch_warnings(action="ignore") if alone else contextlib.nullcontext():
             yield
     except MemoryError:
         raise

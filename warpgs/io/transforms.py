@@ -25,6 +25,7 @@ from warpgs.io.folder import (
     from_camera_to_world,
     is_absolute,
     matched_note,
+    missing_name,
     missing_note,
     name_key,
     register,
@@ -202,8 +203,10 @@ def _image_paths(scene: SceneFolder, file: Path, frames: list[Any]) -> tuple[dic
         found |= dict([(n, p) for p in matches if p is not None][:1])
     claims = Counter(found.values())
     found = {n: p for n, p in found.items() if claims[p] == 1 and p not in taken}
-    if still := [e for n, e in refused.items() if n not in found]:
-        raise still[0]
+    for n, error in refused.items():
+        if n not in found and (not is_absolute(n) or Path(n).exists()):
+            raise error
+        paths[n] = folder / missing_name(n)
     return paths | found, matched_note(found, file.name, scene.root)
 
 

@@ -5,6 +5,7 @@ import hashlib
 import json
 import os
 import sys
+import threading
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
@@ -24,6 +25,10 @@ from warpgs.process import say
 T = TypeVar("T")
 
 
+_OPENCV, _entered = threading.Lock(), list[int]()
+"""Lock and entries of `single_threaded_opencv` by all threads: OpenCV's threads before the first, then 1 for each."""
+
+
 @contextlib.contextmanager
 def single_threaded_opencv() -> Iterator[None]:
     """Keep OpenCV from starting threads in this process; our own threads call OpenCV in parallel."""
@@ -31,12 +36,18 @@ def single_threaded_opencv() -> Iterator[None]:
     # distanceTransform uses IPP's code (see `without_ipp`), and the fast global smoother cuts an image into fewer stripes.
     import cv2
 
-    before = cv2.getNumThreads()
-    cv2.setNumThreads(1)
+    with _OPENCV:
+        if not _entered:
+            _entered.append(cv2.getNumThreads())
+            cv2.setNumThreads(1)
+        _entered.append(1)
     try:
         yield
     finally:
-        cv2.setNumThreads(before)
+        with _OPENCV:
+            _entered.pop()
+            if len(_entered) == 1:
+                cv2.setNumThreads(_entered.pop())
 
 
 def in_threads(function: Callable[..., T], *items: Iterable[Any], most: int = 1 << 16) -> list[T]:

@@ -419,6 +419,7 @@ def test_the_time_of_a_cpu_limits_the_steps():
 
 
 @pytest.mark.parametrize(("preset", "views", "width", "height", "start", "seconds"), [
+    ("quick", 30, 1333, 1000, 200_000, 60),
     ("quick", 40, 967, 541, 180_000, 60), ("quick", 40, 800, 450, 106_000, 60), ("quick", 300, 800, 600, 225_000, 60),
     ("default", 26, 970, 543, 200_000, 149), ("default", 43, 800, 450, 112_000, 217), ("default", 9, 504, 378, 27_000, 81),
 ])  # fmt: skip

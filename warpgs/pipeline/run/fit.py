@@ -212,10 +212,9 @@ def planned_times(job: FitJob, trainer: Trainer) -> tuple[Sequence[float] | None
     pixels, config = max(v.camera.width * v.camera.height for v in job.train), job.config
     config = replace(config, max_gaussians=min(config.max_gaussians, trainer.context.capacity))
     times, counts = step_times(config, len(job.train), pixels, len(trainer.table), trainer.step)
-    took = f"{len(times) - trainer.step:,} steps take about {duration(times[trainer.step :].sum())} on two idle cores"
-    return times.tolist(), [
-        f"{took}, besides start and report; they end with about {float(f'{counts[-1]:.2g}'):,.0f} Gaussians"
-    ]
+    left, last = times[trainer.step : trainer.steps], counts[trainer.steps - 1]
+    took = f"{len(left):,} steps take about {duration(left.sum())} on two idle cores"
+    return times.tolist(), [f"{took}, besides start and report; they end with about {float(f'{last:.2g}'):,.0f} Gaussians"]
 
 
 def _explained(job: FitJob, trainer: Trainer, error: NotFiniteError, view: int) -> NotFiniteError:

@@ -589,7 +589,7 @@ def limited_on_cpu(config: FitConfig, views: int, pixels: float) -> tuple[int, i
 
     def planned(most: int) -> float:
         fit = dataclasses.replace(config, steps=steps, max_gaussians=most)
-        return float(step_times(fit, views, pixels, start)[0].sum())
+        return float(step_times(fit, views, pixels, min(start, most))[0].sum())
 
     if planned(most) > limit:
         most = min(most, 1000 * max(1, bisect_right(range(1000, most, 1000), limit, key=planned)))

@@ -355,10 +355,13 @@ class Sampling(Strategy):
     def prunes(self, step: int) -> bool:
         """Return whether unseen Gaussians are removed after a step."""
         p = self.context.phases
-        late = [p.stable_start + int(part * (p.steps - p.stable_start)) for part in PRUNE_LATE]
+        most = p.planned // (PRUNE_VIEWS * max(1, len(self.context.views)))
+        late = [p.stable_start + int(part * (p.steps - p.stable_start)) for part in PRUNE_LATE[: most or 1]]
         every = max(1, min(PRUNE_EVERY, p.planned // 10), PRUNE_VIEWS * len(self.context.views))
         grows = p.refine < step < p.stable_start
-        return self.prunes_unseen and ((grows and step % every == 0) or (step in late and step < p.steps))
+        due = (grows and step % every == 0) or (step in late and step < p.steps)
+        # after opacities were reset, no view shows any Gaussian
+        return self.prunes_unseen and not self.gradients.config.reset_every and due
 
     def prune(self, step: int) -> Iterator[DensityUpdate]:
         """Remove the Gaussians whose blending weight is below `SEEN` in all training views, but no protected ones."""
