@@ -1,1 +1,0 @@
-"""Mutation check of the kernels: `python -m tools.mutation` (docs/mutation.md)."""
