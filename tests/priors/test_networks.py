@@ -10,6 +10,7 @@ import time
 from pathlib import Path
 
 import numpy as np
+import psutil
 import pytest
 
 from tests.priors import networks as nw
@@ -226,6 +227,14 @@ with interrupting_signals():
 """
 
 
+def work_for(child: subprocess.Popen, seconds: float) -> None:
+    """Wait until a process has worked so long [s of the processor], however busy the machine is, or has ended."""
+    process = psutil.Process(child.pid)
+    begun = process.cpu_times().user
+    while child.poll() is None and process.cpu_times().user < begun + seconds:
+        time.sleep(0.01)
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.parametrize("state", ["loads", "runs"])
 def test_a_signal_ends_an_endless_network(number, state, tmp_path):
@@ -235,7 +244,7 @@ def test_a_signal_ends_an_endless_network(number, state, tmp_path):
         [sys.executable, "-c", RUN, path], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     ) as child:
         assert child.stdout.readline() == "loads\n" and (state == "loads" or child.stdout.readline() == "runs\n")
-        time.sleep(1)  # so that the work outside Python has begun
+        work_for(child, 0.3)  # so that the work outside Python has begun
         child.send_signal(number)
         try:
             assert "KeyboardInterrupt" in child.communicate(timeout=60)[1]

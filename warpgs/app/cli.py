@@ -6,7 +6,7 @@ import os
 import sys
 from collections.abc import Sequence
 
-import warpgs.clock  # noqa: F401, whose import is the first line of a process
+import warpgs.clock  # noqa: F401, imported first: its time stands for the start of the process
 from warpgs import process
 from warpgs.device import exhausted_limit, is_out_of_memory, no_memory_message
 from warpgs.errors import ResourceError, UsageError, WarpgsError, did_you_mean

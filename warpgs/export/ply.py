@@ -311,7 +311,7 @@ def _unpack(packed: np.ndarray, bits: tuple[int, ...]) -> np.ndarray:
 
 
 class _HeadedFormat(Format):
-    """A format whose header says in comments what a file declares."""
+    """A format with declarations of a file as comments in its header."""
 
     declares = True
 
@@ -355,7 +355,7 @@ FLAT = math.log(1e-37)
 """Log scale that replaces minus infinity, an axis of length 0: float32 still holds its exponential."""
 
 LEAST_JUDGED = 100
-"""Least number of Gaussians from whose ranges of values a note is made."""
+"""Files with fewer Gaussians get no note on the range of their values."""
 
 _POSITION = ("x", "y", "z")
 _DC = ("f_dc_0", "f_dc_1", "f_dc_2")

@@ -261,9 +261,9 @@ def read_poses(path: Path) -> dict[int, Pose]:
 def without_unaligned(
     poses: dict[int, Pose], lenses: dict[int, Lens], file: Path, strict: bool
 ) -> tuple[dict[int, Pose], list[str]]:
-    """Return the poses without those that are not finite, or whose lens is not, and a note; unchanged if none is left.
+    """Return the poses with finite numbers and a finite lens, and a note on the others; all poses if none is finite.
 
-    Some programs write photographs so that they could not align. `posed_lenses` refuses what is not left out.
+    Some programs write NaN for photographs that they could not align. `posed_lenses` refuses the poses that stay.
     """
 
     def finite(pose: Pose) -> bool:

@@ -363,7 +363,7 @@ class SceneFolder:
         return None
 
     def mask_notes(self) -> list[str]:
-        """Return notes on mask files that no image got, and on folders whose name says masks, but which are not read."""
+        """Return notes on mask files without an image, and on folders named mask or masks that are not read."""
         notes = []
         for folder, (images, _, unmasked) in self._masks.items():
             places = [p for p in (images, images.parent, self.root) if p.is_relative_to(self.root)]
