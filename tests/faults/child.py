@@ -22,6 +22,7 @@ from pathlib import Path
 from unittest import mock
 
 import numpy as np
+import warp
 
 from tests.faults.calls import Call, numbered
 from warpgs.app.cli import OWN_FILES, main
@@ -137,6 +138,7 @@ def serve() -> None:
 
     for name in ("commands", *OWN_FILES):
         importlib.import_module(f"warpgs.app.{name}")
+    warp.config.use_precompiled_headers = False  # kernels that are not in the cache would leave them in the folder
     if sys.platform.startswith("linux"):
         ctypes.CDLL(None).prctl(SUBREAPER, 1, 0, 0, 0)
     for line in sys.stdin:
