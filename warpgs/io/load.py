@@ -261,8 +261,12 @@ def split_views(scene: Scene, spec: str) -> Split:
     and ``blender:8``: the published ids. ``every:N``: every Nth is held out, the others train. ``all``: none is held out.
     ``train=a,b;test=c``: names, with or without suffix; if one part is missing, it consists of all other views.
     """
+    return split_names(sorted(v.name for v in scene.views), spec)
+
+
+def split_names(names: list[str], spec: str) -> Split:
+    """Return the split of views with these sorted names, as `split_views` does."""
     check_spec(spec)
-    names = sorted(v.name for v in scene.views)
     if spec == "all":
         return Split(tuple(names), ())
     if "=" in spec:
