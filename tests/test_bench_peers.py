@@ -140,5 +140,5 @@ def test_the_judge_of_other_programs_finds_what_differs():
     assert (verdict(**about_x), verdict("x", **about_x)) == ("turned about x", "same")
     assert verdict("x") == "turned about x"
     assert verdict(means=ours["means"][:39]) == "39 instead of 40 Gaussians"
-    points = ours["means"]
-    assert third_party.rigid(points, points[:, [1, 2, 0]] + 5) < 1e-9 < 0.1 < third_party.rigid(points, points * (1, 1, -1))
+    turned, mirrored = ours["means"][:, [1, 2, 0]] + 5, ours["means"] * (1, 1, -1)
+    assert third_party.rigid(ours["means"], turned) < 1e-9 < 0.1 < third_party.rigid(ours["means"], mirrored)

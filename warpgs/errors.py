@@ -108,9 +108,8 @@ def install_extras(*names: str) -> str:
         rows = importlib.metadata.requires("warpgs") or []
     except importlib.metadata.PackageNotFoundError:  # a copy of the repository that is not installed
         return f"`pip install '.[{','.join(names)}]'` in your copy of the repository"
-    parts = [row.partition("; extra == ") for row in rows]
-    packages = [repr(package) for package, _, extra in parts if extra.strip("'\"") in names]
-    return f"`pip install {' '.join(packages)}`"
+    wanted = [repr(package) for package, _, extra in (r.partition("; extra == ") for r in rows) if extra.strip("'\"") in names]
+    return f"`pip install {' '.join(wanted)}`"
 
 
 Kind = TypeVar("Kind", bound=type)

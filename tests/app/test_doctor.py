@@ -39,11 +39,7 @@ def test_missing_extras_are_named_with_what_they_are_for(monkeypatch):
     (found,) = doctor._extras()
     assert found.status == NOTE and "view; not installed: poses (photographs without cameras), formats" in found.detail
     assert found.remedy == "`pip install 'zstandard<1,>=0.25' 'pi-heif<2,>=1.1' 'pycolmap<5,>=4.2'`"
-
-    def missing(name):
-        raise importlib.metadata.PackageNotFoundError(name)
-
-    monkeypatch.setattr(importlib.metadata, "requires", missing)
+    monkeypatch.setattr(importlib.metadata, "requires", lambda _: importlib.metadata.distribution("not-installed"))
     (found,) = doctor._extras()
     assert found.remedy == "`pip install '.[poses,formats]'` in your copy of the repository"
 

@@ -115,8 +115,7 @@ def test_nothing_beside_a_tensor_is_written_or_used(device, work, guarded, numbe
 
 
 LAST = """
-import ctypes, mmap
-import torch
+import ctypes, mmap, torch
 from bench.lib.kernel_calls import bin_tiles, blend, project
 from tests.gaussians import camera, cloud, leaves
 from warpgs.constants import RULES

@@ -309,9 +309,9 @@ def with_poses(
             "SCENE` first, and fit SCENE"
         )
     else:
-        if ":" in (request.split or "") and not is_video(source):  # refused here if even all photographs are too few
+        if "=" not in (spec := request.split or "all") and not is_video(source):  # refuse what all photographs are too few for
             root = image_root(source)
-            split_names([p.relative_to(root).as_posix() for p in find_photographs(source)[0]], request.split or "")
+            split_names([p.relative_to(root).as_posix() for p in find_photographs(source)[0]], spec)
         progress(f"{source} has no cameras: finding the poses of its photographs, to store them in {scene}")
         record = find_poses(
             source, scene, threads=torch.get_num_threads(), max_pixels=request.max_pixels, allow_outside=request.allow_outside,
