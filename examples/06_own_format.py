@@ -49,7 +49,7 @@ class ShotsReader(Reader):
     def read(self, folder: Path, options: ReadOptions) -> warpgs.Scene:
         """Return the scene in file coordinates; an invalid line raises a DataError with the line's number."""
         path = folder / "shots.csv"
-        scene, views = SceneFolder(folder, options), ViewList()
+        scene, views = SceneFolder(folder, options), ViewList(options)
         with path.open(newline="", encoding="utf-8") as file:
             for number, row in enumerate(csv.reader(file), 1):
                 where = f"{path}, line {number}"

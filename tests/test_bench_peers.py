@@ -4,12 +4,14 @@ import dataclasses
 import sys
 from types import SimpleNamespace
 
+import numpy as np
 import torch
 
-from bench.lib import inputs, peers, rasterizers, rasterizers_page
+from bench.lib import inputs, judge, peers, rasterizers, rasterizers_page
 from bench.lib.rasterizers import Drawing
 from warpgs import RasterizeOptions, rasterize
 from warpgs.constants import RULES, Rule
+from warpgs.export.base import half_turn
 from warpgs.scene import Camera, Gaussians
 
 CPU = torch.device("cpu")
@@ -110,3 +112,31 @@ def test_tables_of_other_rasterizers():
     assert "| 1k, 320 x 240 | Faster-GS | 1.25 | 6.25 | 2.5 | 12.5 | 3.5 |" in made
     assert made.count("gsplat dense") == 1, "only rows with three channels"
     assert "| 1k, 320 x 240 | 2 | 8 | 0.250 |" in rasterizers_page.steps_table(result)
+
+
+def test_the_judge_of_other_programs_finds_what_differs():
+    """Order, sign of a quaternion and half turns about own axes are the same; each value by more than its step is not."""
+    generator = np.random.default_rng(0)
+    ours = {n: generator.normal(size=(40, k)) for n, k in (("means", 3), ("quats", 4), ("log_scales", 3))}
+    ours |= {"logit_opacities": generator.normal(size=40), "sh": generator.normal(size=(40, 4, 3))}
+    steps = dict.fromkeys(judge.NAMES, 1e-5)
+
+    def verdict(turned="", **changes) -> str:
+        return judge.compared(ours, ours | changes, steps, turned)["verdict"]
+
+    w, x, y, z = ours["quats"].T
+    assert verdict() == "same"
+    mixed = judge.compared(ours, {n: a[::-1] for n, a in ours.items()}, steps)
+    assert (mixed["verdict"], mixed["order"]) == ("same", "other")
+    assert verdict(quats=-2 * ours["quats"]) == verdict(quats=np.stack([-x, w, z, -y], 1)) == "same"
+    for name in steps:
+        stored = {"opacities": "logit_opacities", "sh0": "sh"}.get(name, name)
+        for change in (1e-3,) if name == "means" else (1e-3, np.nan):  # a position that is none stops the program
+            values = ours[stored].copy()
+            values[(7, *{"sh0": (0, 1), "sh": (2, 1)}.get(name, (1,) * (values.ndim - 1)))] += change
+            assert verdict(**{stored: values}) == f"other values: {name}", (name, change)
+    about_x = half_turn(ours, "x")
+    assert (verdict(**about_x), verdict("x", **about_x), verdict("x")) == ("turned about x", "same", "turned about x")
+    assert verdict(means=ours["means"][:39]) == "39 instead of 40 Gaussians"
+    turned, mirrored = ours["means"][:, [1, 2, 0]] + 5, ours["means"] * (1, 1, -1)
+    assert judge.rigid(ours["means"], turned) < 1e-9 < 0.1 < judge.rigid(ours["means"], mirrored)

@@ -1,5 +1,6 @@
 """The report on the machine: never raises, names a remedy for what is missing, reads well in 80 columns."""
 
+import importlib.metadata
 import importlib.util
 import io
 import os
@@ -35,8 +36,13 @@ def test_missing_extras_are_named_with_what_they_are_for(monkeypatch):
     (found,) = doctor._extras()
     assert (found.status, found.detail, found.remedy) == (OK, "poses, view, formats", "")
     there -= {"pycolmap", "zstandard"}
+    rows = ["numpy>=2", 'pycolmap<5; extra == "poses"', "viser; extra == 'view'", "zstandard<1; extra == 'formats'"]
+    monkeypatch.setattr(importlib.metadata, "requires", lambda _: rows)
     (found,) = doctor._extras()
     assert found.status == NOTE and "view; not installed: poses (photographs without cameras), formats" in found.detail
+    assert found.remedy == "`pip install 'pycolmap<5' 'zstandard<1'`"
+    monkeypatch.setattr(importlib.metadata, "requires", lambda _: importlib.metadata.distribution("not-installed"))
+    (found,) = doctor._extras()
     assert found.remedy == "`pip install '.[poses,formats]'` in your copy of the repository"
 
 

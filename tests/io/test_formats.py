@@ -1,6 +1,7 @@
 """Formats of scenes: the same cameras, lenses and images whatever the format; objects on black."""
 
 import json
+import threading
 from pathlib import PurePosixPath
 
 import numpy as np
@@ -102,9 +103,12 @@ def test_dtu_masks_match_by_number_and_can_be_inverted(tmp_path):
 def test_transforms_per_frame_intrinsics_and_mask_path(tmp_path):
     content = scenes.transforms_json()
     content["frames"][2] |= {"fl_x": 25.0, "cx": 7.0, "mask_path": "m/two.png"}
+    content |= {"train_filenames": ["images/photo0.png"], "test_filenames": ["images/photo1.png"], "val_filenames": []}
     scenes.save(tmp_path / "m" / "two.png", np.tile(np.array([0, 255], np.uint8).repeat(8), (12, 1)))
     scene = load_scene(scenes.write_transforms(tmp_path, content | {"ply_file_path": "sparse_pc.ply"}))
     assert scene.points is None and any("sparse_pc.ply" in n for n in scene.notes)
+    unused = "train_filenames and test_filenames of transforms.json choose no views; --split 'train=NAMES;test=NAMES' does"
+    assert unused in scene.notes
     assert scene.views[2].camera.K[0, 0] == 25 and scene.views[2].camera.K[0, 2] == 7
     assert scene.views[1].camera.K[0, 0] == 20 and scene.views[1].mask is None
     assert not scene.views[2].mask[:, :8].any() and scene.views[2].mask[:, 8:].all()
@@ -324,6 +328,10 @@ def test_names_of_frames_are_matched_to_the_only_file_that_fits(kind, tmp_path):
         (tmp_path / "images" / "photo1.png").unlink()
         assert named(*names) == [v.name for v in plain.views if "photo1" not in v.name]
         assert f"skipped: 1 of 5 frames have no image file: {names[1]}" in load_scene(tmp_path).notes
+    if kind == "other folder":  # of two photographs of one name, one is there: the other must not take a third
+        scenes.save(tmp_path / "a" / "photo3.png", scenes.image(3))
+        left = ["a/photo3.png", *(v.name for v in plain.views if v.name[-5] in "024")]
+        assert named(names[0], "/home/me/a/photo3.png", names[2], "/home/me/b/photo3.png", names[4]) == left
     if kind == "suffix":
         assert named("images/photo0.tif", *names[:1], *names[2:]) == [v.name for v in plain.views][2:]
 
@@ -346,6 +354,13 @@ def test_photographs_are_left_out_by_name_before_they_are_decoded(kind, tmp_path
         f"--exclude x{scene.views[0].name}: no view has this name; the nearest names are {scene.views[0].name}",
         exclude=f"x{scene.views[0].name},{name}",
     )
+
+
+@pytest.mark.parametrize("kind", scenes.WRITERS)
+def test_progress_comes_in_order_from_the_thread_that_reads(kind, tmp_path):
+    lines = []
+    load_scene(scenes.WRITERS[kind](tmp_path), progress=lambda line: lines.append((threading.get_ident(), line)))
+    assert lines == [(threading.get_ident(), f"reading {tmp_path}: image {i + 1}") for i in range(5)]
 
 
 @pytest.mark.parametrize("kind", ["colmap", "colmap text", "transforms"])

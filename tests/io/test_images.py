@@ -234,6 +234,20 @@ def test_masks_that_are_not_read_are_a_note(write, folder, tmp_path):
     scenes.save(tmp_path / folder / "photo0.png", np.full((12, 16), 255, np.uint8))
     if write is not scenes.write_llff or folder != "images/masks":  # there it is one image too many
         assert f"the folder {folder} is not read; masks are read from masks" in load_scene(tmp_path).notes
+    if folder == "Masks":  # two spellings of one folder, as on macOS
+        scenes.link(tmp_path / "masks", tmp_path / "Masks")
+        assert not any("is not read" in n for n in load_scene(tmp_path).notes)
+
+
+def test_a_mask_with_the_suffix_of_its_photograph_is_of_no_other(tmp_path):
+    """Whether or not its own photograph has a mask that comes first; without that photograph, it is that of the other."""
+    scenes.write_colmap(tmp_path, names=("a.png", "a.jpg", "b.png", "b.JPG", "c.png"))
+    for name, gray in (("a.jpg.png", 0), ("a.png", 255), ("B.jpg_mask.png", 0), ("c.jpg.png", 0)):
+        scenes.save(tmp_path / "masks" / name, np.tile(np.array([gray, 255], np.uint8).repeat(8), (12, 1)))
+    scene = load_scene(tmp_path)
+    kept = {v.name: v.mask is not None and not v.mask.all() for v in scene.views}
+    assert kept == {"a.jpg": True, "a.png": False, "b.JPG": True, "b.png": False, "c.png": True}
+    assert not any("match no image" in n for n in scene.notes)
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ from tests.io.scenes import refused
 from warpgs.errors import DataError
 from warpgs.io import colmap
 from warpgs.io.load import detect, load_scene
-from warpgs.io.transforms import TransformsReader
+from warpgs.io.transforms import TransformsReader, read_cameras
 from warpgs.process import Detail
 
 # Broken scenes end in a message that names the file, the reason and the remedy, never in a traceback.
@@ -215,7 +215,8 @@ def test_images_without_a_finite_pose_or_camera_are_left_out(number, what, kind,
     scene = load_scene(tmp_path)
     assert [v.name for v in scene.views] == [n for n in scenes.NAMES if n != "photo2.png"]
     note = f"left out: 1 of 5 images of images.{kind} have a pose or camera that is not finite: photo2.png"
-    assert note in scene.notes and len(scene.points) == 3
+    assert note in scene.notes and len(scene.points) == 3 and not any("have no pose" in n for n in scene.notes)
+    assert (len((read := read_cameras(folder))[0]), read[1]) == (4, [note])
     refused(tmp_path, "the pose is not finite" if what == "pose" else r"camera 2: focal lengths \[(nan|inf)", strict=True)
 
 

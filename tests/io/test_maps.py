@@ -225,7 +225,7 @@ def write_named(root, unit=None):
 
 
 def test_maps_that_transforms_json_names(tmp_path):
-    """`depth_file_path`, `normal_file_path` and `depth_unit_scale_factor`; flags come before them, and `none` skips them."""
+    """By nerfstudio's keys, also by the end of a path that is no photograph; flags come before them, and `none` skips them."""
     root = write_named(tmp_path / "a")
     found = load_scene(root)
     assert np.allclose(found.views[1].depth.values, RAMP * 0.001 * found.normalization.scale)
@@ -238,6 +238,20 @@ def test_maps_that_transforms_json_names(tmp_path):
     assert bare.views[0].depth is None and bare.views[0].normals is None
     file = root / "transforms.json"
     content = json.loads(file.read_text())
+    moved = json.loads(file.read_text())
+    for i, frame in enumerate(moved["frames"]):
+        frame["mask_path"] = f"masks/{i}.png"
+        frame |= {k: f"/home/me/a/{v}" if i else f"C:\\a\\{v}" for k, v in frame.items() if k.endswith("_path")}
+        scenes.save(root / "masks" / f"{i}.png", np.full((12, 16), 255, np.uint8))
+    file.write_text(json.dumps(moved))
+    elsewhere = load_scene(root)
+    assert np.array_equal(elsewhere.views[1].depth.values, found.views[1].depth.values)
+    assert np.array_equal(elsewhere.views[1].normals, found.views[1].normals)
+    assert sum(n.startswith(("5 images of", "15 files of")) and "matched by their" in n for n in elsewhere.notes) == 2
+    moved["frames"][1]["mask_path"] = "/gone/images/photo1.png"
+    file.write_text(json.dumps(moved))
+    with pytest.raises(DataError, match="points outside"):
+        load_scene(root)
     for name, reason in (
         ("../x.png", "points outside"),
         ("x.exr", "maps must be .png or .npy"),

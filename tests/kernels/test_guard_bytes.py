@@ -1,5 +1,8 @@
 """Kernels touch no memory but what they were given: all that torch allocates stands between fences."""
 
+import subprocess
+import sys
+
 import pytest
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
@@ -109,6 +112,31 @@ def test_nothing_beside_a_tensor_is_written_or_used(device, work, guarded, numbe
     assert len(guards.kept) >= guarded and guards.intact()
     for i, (a, b) in enumerate(zip(found, wanted, strict=True)):
         assert torch.equal(a, b), i
+
+
+LAST = """
+import ctypes, mmap, torch
+from bench.lib.kernel_calls import bin_tiles, blend, project
+from tests.gaussians import camera, cloud, leaves
+from warpgs.constants import RULES
+
+PAGE, size, side = mmap.PAGESIZE, {"width": 12, "height": 12, "rule": RULES["exact"]}, {"tile_size": 8}
+block = mmap.mmap(-1, 2 * PAGE)
+start = ctypes.addressof(ctypes.c_char.from_buffer(block))
+assert ctypes.CDLL(None).mprotect(ctypes.c_void_p(start + PAGE), ctypes.c_size_t(PAGE), 0) == 0
+g, cam = leaves(cloud(60)), camera(12, 12, cameras=1, dtype=torch.float32)
+projected, counts = project(*g.tensors().values(), cam.viewmat, cam.K, degree=1, **size, **side)
+rgb = blend(projected, bin_tiles(projected, counts, **size, **side), torch.ones(1, 3), **size)[0]
+upstream = torch.frombuffer(block, dtype=torch.float32, count=rgb.numel(), offset=PAGE - 4 * rgb.numel()).view_as(rgb)
+upstream.fill_(1.0)
+print(bool(torch.autograd.grad(rgb, projected, upstream)[0].any()))
+"""
+
+
+def test_gradients_are_not_read_beyond_the_last_pixel():
+    """Behind the image's gradient lies a page that nobody may read; the last tile reaches over both edges of the image."""
+    found = subprocess.run([sys.executable, "-c", LAST], check=False, capture_output=True, text=True)
+    assert found.stdout.endswith("True\n") and found.returncode == 0, (found.returncode, found.stderr)
 
 
 @pytest.mark.cuda

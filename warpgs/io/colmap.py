@@ -534,18 +534,18 @@ class ColmapReader(Reader):
         if lacks:
             raise DataError(f"{model}: the COLMAP reconstruction lacks {' and '.join(lacks)}; copy the whole folder")
         scene, file = SceneFolder(folder, options), model / f"images.{kind}"
-        poses = read_poses(scene.inside(file))
+        stored = read_poses(scene.inside(file))
         lenses = read_cameras(scene.inside(model / f"cameras.{kind}"), options.lenses == "native")
-        poses, unaligned = without_unaligned(poses, lenses, file, options.strict)
+        poses, unaligned = without_unaligned(stored, lenses, file, options.strict)
         base = image_base(folder, model) or "images"
         images, factor, resized = scene.images(base)
         flat = PurePosixPath(base).name not in IMAGES
         files = [p for p in list_images(images) if not flat or p.parent == images]
-        paths, notes = _image_paths(scene, images, base, [name for name, *_ in poses.values()], files, str(file))
+        paths, notes = _image_paths(scene, images, base, [name for name, *_ in stored.values()], files, str(file))
         place = model.relative_to(folder).as_posix() if model.is_relative_to(folder) else str(model)
         if not chosen and (base != "images" or place not in ("sparse/0", "sparse", ".")):
             chosen = f"cameras taken from {place}, images from {base}"
-        notes, views, missing = [note for note in (chosen, resized, *unaligned) if note] + notes, ViewList(), []
+        notes, views, missing = [note for note in (chosen, resized, *unaligned) if note] + notes, ViewList(options), []
         named: dict[str, str] = {}  # names of the views by name of the reconstruction
         for name, lens, viewmat in posed_lenses(poses, lenses, file):
             path = paths[name]

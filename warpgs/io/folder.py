@@ -232,16 +232,24 @@ def view_name_of(path: Path, root: Path) -> str:
     return view_name(plain[len(base) + 1 :] if Path(plain).is_relative_to(base) else plain)
 
 
+def _folded(name: str) -> str:
+    """Return a name without case, in one spelling of its letters."""
+    return unicodedata.normalize("NFC", name).casefold()
+
+
 def _plain(name: str) -> str:
-    """Return the name of an image without suffix and case, in one spelling of its letters."""
-    stem, dot, suffix = unicodedata.normalize("NFC", name).casefold().rpartition(".")
+    """Return the name of an image without suffix, as `_folded` does."""
+    stem, dot, suffix = _folded(name).rpartition(".")
     return stem if f".{suffix}" in SUFFIXES else stem + dot + suffix
 
 
-def _images_of(mask: str) -> set[str]:
-    """Return the plain names of the images to which a mask file may belong: photo.jpg.mask.png and photo_mask.png to photo."""
+def _images_of(mask: str, images: set[str]) -> set[str]:
+    """Return the images to which a mask file may belong: photo.jpg.mask.png to photo.jpg, photo_mask.png to photo.
+
+    If the mask names one of the ``images`` with its suffix, that one alone; else plain names.
+    """
     stems = {_plain(mask), re.sub(r"[._-]mask$", "", _plain(mask))}
-    return stems | {_plain(stem) for stem in stems}
+    return stems & images or stems | {_plain(stem) for stem in stems}
 
 
 class SceneFolder:
@@ -312,8 +320,6 @@ class SceneFolder:
             ResourceError: There is not enough memory to decode the image.
             UsageError: A side becomes too small, or the camera model does not support a map.
         """
-        if self.options.on_image is not None:
-            self.options.on_image(path)
         options = self.options if downscale is None else replace(self.options, downscale=downscale)
         weights = mask() if callable(mask) else mask
         loaded = load_image(self.inside(path), lens, options, weights, background)
@@ -336,7 +342,7 @@ class SceneFolder:
     def find_mask(self, image: Path, images_root: Path, folder: Path | None = None) -> np.ndarray | None:
         """Return the mask [H, W] of an image, or None without one.
 
-        The mask is in ``folder``, by default `masks` beside the image folder. For photo.jpg it is photo.png, photo.jpg.png or
+        The mask is in ``folder``, by default `masks` beside the image folder. For photo.jpg it is photo.jpg.png, photo.png or
         photo.jpg, else the only file of the names of `_images_of`.
         """
         mask = self.mask_of(image, images_root, folder)
@@ -349,36 +355,37 @@ class SceneFolder:
             return None
         _, masks, unmasked = self._masks.setdefault(folder, (images_root, {}, {}))
         relative = image.relative_to(images_root)
+        names = _folded(relative.as_posix()), _plain(relative.as_posix())
         if folder.is_dir():
-            for candidate in (folder / relative.with_suffix(".png"), folder / f"{relative.as_posix()}.png", folder / relative):
+            for candidate in (folder / f"{relative.as_posix()}.png", folder / relative.with_suffix(".png"), folder / relative):
                 if candidate.is_file():
                     return partial(self.mask, candidate)
-            for file in [] if masks else list_images(folder):
-                for name in _images_of(file.relative_to(folder).as_posix()):
+            files = [] if masks else list_images(folder)
+            images = {_folded(p.relative_to(images_root).as_posix()) for p in list_images(images_root) if files}
+            for file in files:
+                for name in _images_of(file.relative_to(folder).as_posix(), images):
                     masks.setdefault(name, []).append(file)
-            files = masks.get(_plain(relative.as_posix()), [])
+            files = masks.get(names[0]) or masks.get(names[1], [])
             if len(files) == 1:
                 return partial(self.mask, *files)
-        unmasked[_plain(relative.as_posix())] = relative
+        unmasked |= dict.fromkeys(names, relative)
         return None
 
     def mask_notes(self) -> list[str]:
         """Return notes on mask files without an image, and on folders named mask or masks that are not read."""
         notes = []
-        for folder, (images, _, unmasked) in self._masks.items():
+        for folder, (images, masks, unmasked) in self._masks.items():
             places = [p for p in (images, images.parent, self.root) if p.is_relative_to(self.root)]
             near = {p for place in places for p in place.iterdir() if p.name.casefold() in ("mask", "masks") and p.is_dir()}
-            for other in sorted(near - {*self._masks}):
-                if list_images(other):
+            for other in sorted(near):  # two spellings may be one folder
+                if not any(read.is_dir() and other.samefile(read) for read in self._masks) and list_images(other):
                     inner = (p.relative_to(self.root) if p.is_relative_to(self.root) else p for p in (other, folder))
                     where, there = (p.as_posix() for p in inner)
                     notes.append(f"the folder {where} is not read; masks are read from {there}")
-            files = list_images(folder) if folder.is_dir() else []
-            known = {_plain(p.relative_to(images).as_posix()) for p in list_images(images)} if files and unmasked else set()
-            lone = [
-                f for f in files if (names := _images_of(f.relative_to(folder).as_posix())) & {*unmasked} or not names & known
-            ]
-            if lone and unmasked:
+            files = list_images(folder) if folder.is_dir() and unmasked else []
+            known = {form(p.relative_to(images).as_posix()) for p in list_images(images) if files for form in (_folded, _plain)}
+            of_unmasked, of_known = ({f for n in names for f in masks.get(n, [])} for names in (unmasked, known))
+            if lone := [f for f in files if f in of_unmasked or f not in of_known]:
                 image = min(unmasked.values())
                 notes.append(
                     f"{len(lone)} of {len(files)} files in {folder.name} match no image or several, such as "
@@ -462,11 +469,11 @@ def missing_name(name: str) -> str:
     return posixpath.normpath(name.replace("\\", "/")).replace(":", "").lstrip("/")
 
 
-def matched_note(found: dict[str, Path], place: str, root: Path) -> list[str]:
+def matched_note(found: dict[str, Path], place: str, root: Path, noun: str = "image") -> list[str]:
     """Return the note on names that another file than that of their spelling was ``found`` for; [] for none."""
     if not found:
         return []
-    first, count = min(found), f"{len(found)} image{'s' if len(found) != 1 else ''}"
+    first, count = min(found), f"{len(found)} {noun}{'s' if len(found) != 1 else ''}"
     how = "matched by their names without suffix, case or folder"
     return [f"{count} of {place} {how} ({first} is {found[first].relative_to(root)})"]
 
@@ -498,13 +505,18 @@ MIN_SEEN = 0.5
 
 
 LOADERS = 4
-"""Threads that load images: each needs memory for one at its full size."""
+"""Largest number of threads that load images; each needs 15 bytes a pixel of one at full size, 30 with lens distortion."""
 
 
 class ViewList:
-    """Views of a scene in the order of reading, and counts of changes to their pixels."""
+    """Views of a scene in the order of reading, and counts of changes to their pixels.
 
-    def __init__(self) -> None:
+    Args:
+        options: Options for reading the scene, whose ``on_image`` is called; None for no call.
+    """
+
+    def __init__(self, options: ReadOptions | None = None) -> None:
+        self._on_image = options and options.on_image
         self._views: list[View] = []
         self._waiting: list[tuple[str, np.ndarray, Callable[[], LoadedImage]]] = []
         self._done: Counter[str] = Counter()
@@ -541,6 +553,8 @@ class ViewList:
         waiting, self._waiting = self._waiting, []
         with warnings.catch_warnings(action="ignore"), ThreadPoolExecutor(min(LOADERS, usable_cores())) as pool:
             for (name, viewmat, _), loaded in zip(waiting, pool.map(lambda row: row[2](), waiting)):
+                if self._on_image is not None:
+                    self._on_image(name)
                 self._append(name, viewmat, loaded)
 
     def _append(self, name: str, viewmat: np.ndarray, loaded: LoadedImage) -> None:

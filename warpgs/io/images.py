@@ -94,8 +94,8 @@ class ReadOptions(SceneOptions):
     """Factor, at least 1, by which both image sides shrink."""
     max_side: int = 0
     """Largest image side [px], after ``downscale``; 0 for no limit."""
-    on_image: Callable[[Path], object] | None = None
-    """Called with the file of each image before it is decoded; None for no call."""
+    on_image: Callable[[str], object] | None = None
+    """Called by a `ViewList` with the name of each view, in order, once its image is decoded; None for no call."""
     excluded: list[str] = field(default_factory=list)
     """Names of the views that ``exclude`` has left out so far."""
 

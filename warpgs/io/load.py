@@ -261,8 +261,12 @@ def split_views(scene: Scene, spec: str) -> Split:
     and ``blender:8``: the published ids. ``every:N``: every Nth is held out, the others train. ``all``: none is held out.
     ``train=a,b;test=c``: names, with or without suffix; if one part is missing, it consists of all other views.
     """
+    return split_names(sorted(v.name for v in scene.views), spec)
+
+
+def split_names(names: list[str], spec: str) -> Split:
+    """Return the split of views with these sorted names, as `split_views` does."""
     check_spec(spec)
-    names = sorted(v.name for v in scene.views)
     if spec == "all":
         return Split(tuple(names), ())
     if "=" in spec:
@@ -423,7 +427,7 @@ def load_scene(
         depth_unit: Length of one unit of a metric depth map in units of the cameras; None means 0.001 for integers and 1 for
             floats.
         normal_axes: Axes of the normals: opencv (y down, z forward) or opengl (y up, z back) of the camera.
-        progress: Called with a line for the user before each image is decoded; None for no messages.
+        progress: Called with a line for the user for each image, by the thread that called; None for no messages.
 
     Returns:
         The scene.
@@ -452,11 +456,7 @@ def read_folder(
 ) -> Scene:
     """Read a scene folder, as `load_scene` does."""
     root, (factor, side), numbers = Path(path), image_scale(options.downscale, options.max_side), itertools.count(1)
-
-    def on_image(file: Path) -> None:
-        if progress is not None:
-            progress(f"reading {root}: image {next(numbers)}")
-
+    on_image = None if progress is None else lambda name: progress(f"reading {root}: image {next(numbers)}")
     given = {f.name: getattr(options, f.name) for f in fields(SceneOptions)}
     checked = ReadOptions(**given | {"downscale": factor, "max_side": side, "on_image": on_image})
     try:

@@ -69,7 +69,7 @@ class LLFFReader(Reader):
                 f"{path}: has {len(rows)} poses, but {images} holds {len(files)} images. They are matched in sorted order, so "
                 "one missing or extra file would give every image the wrong pose. Copy the scene again, or remake the array."
             )
-        views = ViewList()
+        views = ViewList(options)
         for file, row in zip(files, rows):
             name = file.relative_to(images).as_posix()
             if options.excludes(name):
@@ -197,7 +197,7 @@ class DTUReader(Reader):
                 f"{path}: has {cameras} cameras, but {images} holds {len(files)} images. They are matched in sorted order, so "
                 "the counts must agree. Copy the scene again"
             )
-        masks, views = _masks(folder, files), ViewList()
+        masks, views = _masks(folder, files), ViewList(options)
         for i, file in enumerate(files):
             name = file.relative_to(images).as_posix()
             if options.excludes(name):
@@ -269,7 +269,7 @@ class MiddleburyReader(Reader):
         """See `Reader.read`."""
         path, *others = files_of(folder)
         notes = [f"cameras taken from {path.name}; {', '.join(p.name for p in others)} ignored"] if others else []
-        scene, views = SceneFolder(folder, options), ViewList()
+        scene, views = SceneFolder(folder, options), ViewList(options)
         for number, name, values in read_camera_rows(scene.inside(path)):
             if options.excludes(view_name(name)):
                 continue

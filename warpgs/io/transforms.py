@@ -4,7 +4,7 @@ import json
 import math
 import posixpath
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from warpgs.errors import DataError
-from warpgs.files import read_file
+from warpgs.files import is_within, read_file
 from warpgs.geometry import matmul, seen_pixels
 from warpgs.io import colmap
 from warpgs.io.folder import (
@@ -172,7 +172,7 @@ def _inner_names(name: str) -> list[str]:
     parts = [p for p in posixpath.normpath(name.replace("\\", "/")).split("/")[-MAX_FOLDERS:] if p not in ("", ".", "..")]
     ends = ["/".join(parts[i:]) for i in range(len(parts))]
     ends += [f"images/{parts[-1]}"] if parts else []
-    return [e if Path(e).suffix.lower() in SUFFIXES else f"{e}.png" for e in ends]
+    return [e if Path(e).suffix.lower() in (*SUFFIXES, *MAPS, ".ply") else f"{e}.png" for e in ends]
 
 
 def _image_paths(scene: SceneFolder, file: Path, frames: list[Any]) -> tuple[dict[str, Path], list[str]]:
@@ -197,9 +197,11 @@ def _image_paths(scene: SceneFolder, file: Path, frames: list[Any]) -> tuple[dic
     lost = [*(n for n, p in paths.items() if p not in taken), *refused]
     files = {p: p.relative_to(folder).as_posix() for p in list_images(folder)} if lost else {}
     found, fits = dict[str, Path](), by_key({p: n for p, n in files.items() if p not in taken})
+    ends = Counter(end for n in (*paths, *refused) for end in {*map(name_key, _inner_names(n))}) if lost else Counter()
     for n in lost:
         names = _inner_names(n) if n in refused or is_absolute(n) else [view_name_of(paths[n], folder)]
-        matches = [folder / e if folder / e in files else fits.get(name_key(e)) for e in names]
+        unique = (e for e in names if ends[name_key(e)] < 2)  # an end of two names is neither's
+        matches = [folder / e if folder / e in files else fits.get(name_key(e)) for e in unique]
         found |= dict([(n, p) for p in matches if p is not None][:1])
     claims = Counter(found.values())
     found = {n: p for n, p in found.items() if claims[p] == 1 and p not in taken}
@@ -210,13 +212,27 @@ def _image_paths(scene: SceneFolder, file: Path, frames: list[Any]) -> tuple[dic
     return paths | found, matched_note(found, file.name, scene.root)
 
 
-def _named_maps(scene: SceneFolder, folder: Path, shared: dict, frame: dict, where: str) -> NamedMaps:
+Named = Callable[[object, str], Path]
+"""A function that returns the path of a file other than a photograph from its name and the place of that name."""
+
+
+def _named_file(scene: SceneFolder, folder: Path, taken: set[Path], moved: dict[str, Path], name: object, where: str) -> Path:
+    """Return the path of a `Named` file; one outside of the scene is found by the end of its path, and stored in ``moved``."""
+    ends = [p for e in _inner_names(str(name))[:-1] if (p := folder / e).is_file() and p not in taken]
+    path = folder / str(name).replace("\\", "/")
+    if ends and not path.is_file() and (is_absolute(str(name)) or not is_within(path, scene.root)):
+        moved[str(name)] = ends[0]
+        return ends[0]
+    return scene.child(folder, name, where, root=scene.root)
+
+
+def _named_maps(scene: SceneFolder, named: Named, shared: dict, frame: dict, where: str) -> NamedMaps:
     """Return the maps that a frame names under nerfstudio's keys."""
 
     def path(key: str, flag: str) -> Path | None:
         if not frame.get(key) or getattr(scene.options, flag) is not None:
             return None
-        found = scene.inside(scene.child(folder, frame[key], f"{where}, {key}", root=scene.root))
+        found = scene.inside(named(frame[key], f"{where}, {key}"))
         if found.suffix.lower() not in MAPS:
             raise DataError(f"{where}: {key} is {found.name}, but maps must be {' or '.join(MAPS)}; --{flag} none skips it")
         return found
@@ -230,7 +246,7 @@ def _named_maps(scene: SceneFolder, folder: Path, shared: dict, frame: dict, whe
     return NamedMaps(path("depth_file_path", "depths"), path("normal_file_path", "normals"), unit)
 
 
-def _points(scene: SceneFolder, file: Path, shared: dict, views: list[View]) -> tuple[PointCloud | None, str]:
+def _points(scene: SceneFolder, file: Path, named: Named, shared: dict, views: list[View]) -> tuple[PointCloud | None, str]:
     """Return the points that the file names, in the coordinates of its cameras, and a note.
 
     The cameras include ``applied_transform``. nerfstudio's first versions stored points without it, later ones with it, under
@@ -238,7 +254,7 @@ def _points(scene: SceneFolder, file: Path, shared: dict, views: list[View]) -> 
     """
     where, name = f"{file}, ply_file_path", shared["ply_file_path"]
     try:
-        path = scene.inside(scene.child(file.parent, name, where, root=scene.root))
+        path = scene.inside(named(name, where))
     except DataError as e:
         return None, f"no points to start from: {e}"
     if not path.is_file():
@@ -297,7 +313,7 @@ class TransformsReader(Reader):
     def read(self, folder: Path, options: ReadOptions) -> Scene:
         """See `Reader.read`."""
         background = WHITE if is_blender(folder) else BLACK
-        scene, views, notes = SceneFolder(folder, options), ViewList(), []
+        scene, views, notes = SceneFolder(folder, options), ViewList(options), []
         missing: list[str] = []
         total, points = 0, None
         for file in files_of(folder):
@@ -305,7 +321,8 @@ class TransformsReader(Reader):
             total += len(shared["frames"])
             origin = _origin(shared, str(file))
             paths, matched = _image_paths(scene, file, shared["frames"])
-            notes += matched
+            moved = dict[str, Path]()
+            named = partial(_named_file, scene, file.parent, {*paths.values()}, moved)
             for number, frame in enumerate(shared["frames"]):
                 where, path = f"{file}, frame {number}", paths[frame["file_path"]]
                 if options.excludes(view_name_of(path, folder)):
@@ -317,19 +334,22 @@ class TransformsReader(Reader):
                 where = f"{where} ({name})"
                 viewmat = about(from_camera_to_world(matrix_of(frame, where), where, opengl=True), origin)
                 if frame.get("mask_path"):
-                    mask_file = scene.child(file.parent, frame["mask_path"], f"{where}, mask", root=folder)
+                    mask_file = named(frame["mask_path"], f"{where}, mask")
                     if not mask_file.is_file():
                         raise DataError(f"{where}: its mask {mask_file} is missing; restore it, or remove mask_path")
                     mask = partial(scene.mask, mask_file)
                 else:
                     mask = scene.mask_of(path, folder / "images")
                 lens = partial(lens_of, frame, shared, where=where, native=options.lenses == "native")
-                named = _named_maps(scene, file.parent, shared, frame, where)
-                load = partial(scene.image, path, lens, mask=mask, background=background, named=named)
+                maps = _named_maps(scene, named, shared, frame, where)
+                load = partial(scene.image, path, lens, mask=mask, background=background, named=maps)
                 views.add(name, viewmat, load)
             if shared.get("ply_file_path"):
-                points, note = _points(scene, file, shared, views.views)
+                points, note = _points(scene, file, named, shared, views.views)
                 notes.append(note)
+            notes += matched + matched_note(moved, file.name, folder, "file")
+            if unused := [key for s in ("train", "val", "test") if shared.get(key := f"{s}_filenames")]:  # of nerfstudio
+                notes.append(f"{' and '.join(unused)} of {file.name} choose no views; --split 'train=NAMES;test=NAMES' does")
         notes += missing_note(missing, total, "frames", files_of(folder)[0], options.strict)
         if outside := sum(v.name.startswith("outside/") for v in views.views):
             notes.append(f"{outside} images are outside the scene folder; their views are named outside/...")
@@ -348,8 +368,9 @@ def read_cameras(path: Path) -> tuple[dict[str, Camera], list[str]]:
     Lenses become pinholes, because renders have no distortion; a note reports lenses with distortion. A repeated name gets a
     number.
     """
+    notes = list[str]()
     if path.is_dir():
-        rows = _colmap(path)
+        rows = _colmap(path, notes)
     else:
         values = _json(path, "check the path, or write the file again")
         drawn = isinstance(values, dict) and isinstance(values.get("camera_path"), list)
@@ -366,7 +387,7 @@ def read_cameras(path: Path) -> tuple[dict[str, Camera], list[str]]:
         bent += any(lens.distortion)
     if not found:
         raise DataError(f"{path}: holds no camera. Give cameras.json, transforms.json, or the folder of a scene")
-    return found, [f"the lens distortion of {bent} of {len(found)} cameras is not rendered"] if bent else []
+    return found, notes + ([f"the lens distortion of {bent} of {len(found)} cameras is not rendered"] if bent else [])
 
 
 def stated_origin(path: Path) -> np.ndarray:
@@ -435,11 +456,12 @@ def colmap_folder(folder: Path) -> tuple[Path, str, list[str]] | None:
     return colmap.reconstruction(folder)[0] or colmap.reconstruction(folder / "0")[0]
 
 
-def _colmap(folder: Path) -> Iterator[Row]:
-    """Yield the cameras of a reconstruction, sorted by name."""
+def _colmap(folder: Path, notes: list[str]) -> Iterator[Row]:
+    """Yield the cameras of a reconstruction, sorted by name; ``notes`` get a note on those that are left out."""
     model, kind, lacks = colmap_folder(folder) or (folder, "", ["all"])
     if lacks:
         raise DataError(f"{folder}: lacks COLMAP's files cameras and images. Give cameras.json, transforms.json or a scene")
-    lenses, poses = colmap.read_cameras(model / f"cameras.{kind}"), colmap.read_poses(model / f"images.{kind}")
-    for name, lens, viewmat in colmap.posed_lenses(poses, lenses, model / f"images.{kind}"):
+    lenses, file = colmap.read_cameras(model / f"cameras.{kind}"), model / f"images.{kind}"
+    poses, notes[:] = colmap.without_unaligned(colmap.read_poses(file), lenses, file, strict=False)
+    for name, lens, viewmat in colmap.posed_lenses(poses, lenses, file):
         yield name, viewmat, lens

@@ -268,7 +268,8 @@ def prune_model(
 ) -> tuple[Gaussians, float]:
     """Lower degrees, then remove Gaussians; return the smaller set, by ascending degree, and its loss on all views.
 
-    The loss is at most ``allowed``. A search on few views is repeated for less if the loss on all views is too large.
+    The loss is at most ``allowed``. A search on few views is repeated for less if the loss on all views is too large; degrees
+    stay if lower ones alone lose too much there.
     ``cameras`` are those of all training views, tensors. The first to go have the least product of PUP-3DGS' sensitivity and of
     the change without them; by one of both alone, fewer could go at the same loss.
     """
@@ -276,6 +277,7 @@ def prune_model(
     order, lowered, aim = torch.argsort(space.sqrt() * removal.sqrt(), stable=True), gaussians, allowed
     if bool((stored_degrees(gaussians.sh) > 0).any()):
         lowered = lower_degrees(gaussians, harmonics, lambda g: loss(g, False), DEGREES_FRACTION * allowed)
+        lowered = lowered if loss(lowered, True) <= allowed else gaussians
     for _ in range(REPEATS):
         fraction = largest_fraction(lambda s: loss(select(lowered, keep_last(order, s)), False), aim)
         model = by_degree(select(lowered, keep_last(order, fraction)))

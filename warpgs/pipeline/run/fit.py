@@ -17,7 +17,7 @@ from warpgs.export.ply import write_ply
 from warpgs.files import write_json
 from warpgs.geometry import CENTRAL
 from warpgs.io.images import without_masked
-from warpgs.io.load import Split, check_spec
+from warpgs.io.load import Split, check_spec, split_names
 from warpgs.kernels.native import told_of_compiling
 from warpgs.pipeline.metrics.coverage import coverage_of_run
 from warpgs.pipeline.metrics.lpips import Lpips
@@ -65,6 +65,7 @@ from warpgs.pipeline.train.trainer import Trainer, background_warmup, complexity
 from warpgs.pipeline.train.view_modules import FittedViews
 from warpgs.plugins import is_ours
 from warpgs.poses.find import JSON, TEXT, find_poses, needs_poses, read_poses_record, source_digest
+from warpgs.poses.photographs import find_photographs, image_root, is_video
 from warpgs.priors.networks import in_threads
 from warpgs.priors.photo_checks import PhotoCheck, check_photos, photo_notes
 from warpgs.process import Detail, counted, noted_signals, say
@@ -308,6 +309,9 @@ def with_poses(
             "SCENE` first, and fit SCENE"
         )
     else:
+        if "=" not in (spec := request.split or "all") and not is_video(source):  # refuse what all photographs are too few for
+            root = image_root(source)
+            split_names([p.relative_to(root).as_posix() for p in find_photographs(source)[0]], spec)
         progress(f"{source} has no cameras: finding the poses of its photographs, to store them in {scene}")
         record = find_poses(
             source, scene, threads=torch.get_num_threads(), max_pixels=request.max_pixels, allow_outside=request.allow_outside,
