@@ -1,5 +1,6 @@
 """One step: render, loss, gradients, update; eager, or captured as a CUDA graph."""
 
+import contextlib
 import functools
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -200,6 +201,8 @@ class StepTaker:
 
     kept_sums = 0
     """Number of sums of gradients that a step of several views keeps."""
+    settles = False
+    """True if captured steps include spare rows (`Table.settle`), so that graphs outlast changes of the set of Gaussians."""
 
     def __init__(
         self, table: Table, views: LearnedViews, strategy: Strategy, cameras: Sequence[torch.Tensor],
@@ -330,6 +333,8 @@ class StepTaker:
         if not (captured and self.cuda):
             render = eager_renderer(self.options, max_instances)
             return [functools.partial(function, stacks[kind], buffers, plan, render) for kind in kinds]
+        if self.settles and self.table.settle():
+            self.clear()
         self._graphs = {k: g for k, g in self._graphs.items() if k[1] == plan}
         for kind in dict.fromkeys(kinds):
             if (kind, plan) not in self._graphs:
@@ -357,7 +362,8 @@ class StepTaker:
         """Return the graph of a function that changes nothing if the stop flag is set."""
         here, loaded = torch.cuda.current_stream(buffers.device), buffers.view_rows.clone()
         self.stream.wait_stream(here)
-        with torch.cuda.stream(self.stream):
+        spare = self.table.with_spare_rows() if self.settles else contextlib.nullcontext()
+        with torch.cuda.stream(self.stream), spare:
             # a first run loads kernels and fills caches, which is not allowed during a capture; it changes no parameter
             buffers.stop.fill_(NOT_FINITE)
             buffers.view_rows.zero_()
