@@ -39,8 +39,8 @@ def usable_cores() -> int:
         return os.cpu_count() or 1
 
 
-def wake_gpu() -> threading.Thread:
-    """Start the driver of the first CUDA device in a thread, if torch can use it: that takes most of a second; return it."""
+def wake_gpu() -> None:
+    """Start the driver of the first CUDA device in a thread, if torch can use it: that takes most of a second."""
 
     def wake() -> None:
         import ctypes
@@ -52,10 +52,7 @@ def wake_gpu() -> threading.Thread:
                 if driver.cuInit(0) == 0:  # 0 is the first device, too; torch and Warp share its primary context
                     driver.cuDevicePrimaryCtxRetain(ctypes.byref(ctypes.c_void_p()), 0)
 
-    thread = threading.Thread(target=wake)
-    with contextlib.suppress(RuntimeError):  # no more threads
-        thread.start()
-    return thread
+    threading.Thread(target=wake, name="driver").start()
 
 
 MAX_THREADS = 8

@@ -69,6 +69,14 @@ class Driver:
         return 0
 
 
+def woken():
+    """Start the driver, and wait for the end of that."""
+    wake_gpu()
+    for thread in threading.enumerate():
+        if thread.name == "driver":
+            thread.join()
+
+
 @pytest.mark.parametrize(
     ("library", "failing", "count"), [("libtorch_cuda.so", 0, 2), ("libtorch_cuda.so", 100, 1), ("", 0, 0)]
 )
@@ -79,15 +87,13 @@ def test_a_driver_is_started_for_a_torch_that_can_use_it(library, failing, count
     monkeypatch.setattr(threading, "excepthook", errors.append)
     monkeypatch.setattr("importlib.util.find_spec", lambda name: spec)
     monkeypatch.setattr("ctypes.CDLL", lambda name: driver)
-    wake_gpu().join()
+    woken()
     (tmp_path / "lib" / (library or "libtorch_cpu.so")).mkdir(parents=True)
-    wake_gpu().join()
+    woken()
     assert driver.calls == [("cuInit", 0), ("cuDevicePrimaryCtxRetain", 0)][:count]
     monkeypatch.undo()
     monkeypatch.setattr(threading, "excepthook", errors.append)
-    wake_gpu().join()
-    monkeypatch.setattr(threading.Thread, "start", lambda _: (_ for _ in ()).throw(RuntimeError("can't start new thread")))
-    wake_gpu()
+    woken()
     assert not errors
 
 

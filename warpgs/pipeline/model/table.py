@@ -30,11 +30,6 @@ ROOM, LEAST_FILLED, MOST_WITH_ROOM = 1.25, 0.5, 2**20
 the number in use above which it has no spare rows."""
 
 
-def room_for(count: int) -> int:
-    """Return the rows for which `Table.settle` takes memory."""
-    return count if count > MOST_WITH_ROOM else int(ROOM * count)
-
-
 def model_bytes(degrees: torch.Tensor) -> int:
     """Return the bytes of a model with these degrees [N]: float32, uncompressed, without coefficients above the degrees."""
     return FLOAT * int((11 + 3 * (degrees.long() + 1) ** 2).sum())
@@ -111,8 +106,10 @@ class Table:
     batch: int = 1
     """Number B of views over which gradients are averaged. Learning rates are multiplied by the square root of B, and decay
     rates of the moments are raised to the power B (Zhao et al. 2024, Grendel-GS, arXiv 2406.18533)."""
+    settles: bool = False
+    """True to keep addresses while the set of rows changes (`settle`), for CUDA graphs."""
     room: int = 0
-    """Number of rows for which there is memory after `settle`."""
+    """Number of rows for which `settle` took memory."""
 
     def __init__(self, params: Mapping[str, torch.Tensor], columns: Mapping[str, Column], device: torch.device, count: int):
         """Begin with zero moments and filled columns.
@@ -286,16 +283,22 @@ class Table:
         """Put the Gaussians in Morton order, so that neighbours in space are neighbours in memory."""
         self.reorder(torch.argsort(morton_codes(self.params["means"].detach()), stable=True))
 
+    def room_for(self, count: int) -> int:
+        """Return the number of rows for which there is memory once ``count`` are in use."""
+        return int(ROOM * count) if self.settles and count <= MOST_WITH_ROOM else count
+
     @torch.no_grad()
     def settle(self) -> bool:
         """Move the rows of Gaussians to fixed addresses, with spare rows behind them; return whether the addresses are new.
 
-        They stay while the rows fit. Spare rows have opacity 0, so no step changes them.
+        They stay while the rows fit. Spare rows have opacity 0, so no step changes them. Only a table that `settles` is moved.
         """
+        if not self.settles:
+            return False
         new = not self._memory or not self.room >= self.count >= LEAST_FILLED * self.room
         memory, self._memory = self._memory, {}
         if new:
-            self.room, memory = room_for(self.count), {}
+            self.room, memory = self.room_for(self.count), {}
         fills = {("columns", n): c.fill for n, c in self.kinds.items()} | {("params", "logit_opacities"): -math.inf}
         for group, tensors in self._groups().items():
             for name, rows in tensors.items():
@@ -310,19 +313,18 @@ class Table:
 
     @contextlib.contextmanager
     def with_spare_rows(self) -> Iterator[None]:
-        """Count the spare rows of `settle` as rows within the block."""
+        """Count the spare rows of `settle`, if any, as rows within the block."""
         count = self.count
         try:
-            self._show(self.room)
+            self._show(self.room or count)
             yield
         finally:
             self._show(count)
 
     def _show(self, count: int) -> None:
         """Have the first ``count`` rows of the settled memory."""
-        for group, tensors in self._groups().items():
-            for name in tensors:
-                tensors[name] = self._memory[group, name][:count].requires_grad_(group == "params")
+        for (group, name), whole in self._memory.items():
+            self._groups()[group][name] = whole[:count].requires_grad_(group == "params")
         self.count = count
 
     def reset_opacities(self, opacity: float) -> None:

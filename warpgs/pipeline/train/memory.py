@@ -17,7 +17,7 @@ from warpgs.device import FLOAT, SAMPLING, StepSizes, add_needs, format_bytes
 from warpgs.errors import UsageError
 from warpgs.kernels import blend, project, tiles
 from warpgs.kernels.tiles import MAX_INSTANCES
-from warpgs.pipeline.model.table import Table, room_for
+from warpgs.pipeline.model.table import Table
 from warpgs.pipeline.train import views as training_views
 from warpgs.pipeline.train.batch import SUMMED
 from warpgs.pipeline.train.loss import LossTerm, outputs_of
@@ -39,12 +39,11 @@ class Layout:
     def __init__(
         self, table: Table, views: Sequence[TrainingView], terms: Sequence[LossTerm] = (), strategy: Strategy | None = None,
         modules: Sequence[ViewModule] = (), *, kept: Sequence[TrainingView] = (), captured: bool = False, sums: int = 0,
-        averaged: bool = False, settled: bool = False,
+        averaged: bool = False,
     ):  # fmt: skip
-        """Find the sizes of steps, with ``kept`` views beside those that are trained on, and spare rows if ``settled``."""
+        """Find the sizes of steps, with ``kept`` views beside those that are trained on."""
         largest = max((v.camera for v in views), key=lambda c: c.width * c.height)
-        self.table, self.sums, self.averaged, self.settled = table, sums, averaged, settled
-        cuda = table.device.type == "cuda"
+        self.table, self.sums, self.averaged, cuda = table, sums, averaged, table.device.type == "cuda"
         self.sizes = StepSizes(
             largest.width, largest.height, table.row_bytes, len(views), masked=any(v.mask is not None for v in views),
             cutout=any(v.alpha is not None for v in views), depth="depth" in outputs_of(terms), cuda=cuda,
@@ -76,7 +75,7 @@ class Layout:
 
     def step(self, count: int, instances: int, chunked: bool = False, graphs: int | None = None) -> int:
         """Return the bytes at the heaviest moment of a step; each CUDA graph keeps memory of its own."""
-        copies, count = max(1, self.graphs if graphs is None else graphs), room_for(count) if self.settled else count
+        copies, count = max(1, self.graphs if graphs is None else graphs), self.table.room_for(count)
         return self.held(count) + copies * max(self.moments(count, instances, chunked).values())
 
     def smallest(self, count: int) -> int:

@@ -1,6 +1,5 @@
 """One step: render, loss, gradients, update; eager, or captured as a CUDA graph."""
 
-import contextlib
 import functools
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -201,8 +200,6 @@ class StepTaker:
 
     kept_sums = 0
     """Number of sums of gradients that a step of several views keeps."""
-    settles = False
-    """True if captured steps include spare rows (`Table.settle`), so that graphs outlast changes of the set of Gaussians."""
 
     def __init__(
         self, table: Table, views: LearnedViews, strategy: Strategy, cameras: Sequence[torch.Tensor],
@@ -333,7 +330,7 @@ class StepTaker:
         if not (captured and self.cuda):
             render = eager_renderer(self.options, max_instances)
             return [functools.partial(function, stacks[kind], buffers, plan, render) for kind in kinds]
-        if self.settles and self.table.settle():
+        if self.table.settle():
             self.clear()
         self._graphs = {k: g for k, g in self._graphs.items() if k[1] == plan}
         for kind in dict.fromkeys(kinds):
@@ -362,8 +359,7 @@ class StepTaker:
         """Return the graph of a function that changes nothing if the stop flag is set."""
         here, loaded = torch.cuda.current_stream(buffers.device), buffers.view_rows.clone()
         self.stream.wait_stream(here)
-        spare = self.table.with_spare_rows() if self.settles else contextlib.nullcontext()
-        with torch.cuda.stream(self.stream), spare:
+        with torch.cuda.stream(self.stream), self.table.with_spare_rows():
             # a first run loads kernels and fills caches, which is not allowed during a capture; it changes no parameter
             buffers.stop.fill_(NOT_FINITE)
             buffers.view_rows.zero_()

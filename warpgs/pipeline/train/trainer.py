@@ -387,7 +387,7 @@ class Trainer:
         """Change the set of Gaussians after the last step, if a change is due."""
         if not self.is_due(self.step):
             return
-        if not self.taker.settles:
+        if not self.table.settles:
             self.taker.clear()
         self.mean.restart()
         self.show_learned()
@@ -410,8 +410,8 @@ class Trainer:
     @property
     def by_rows(self) -> bool:
         """Whether Gaussians of opacity 0 change no bit of the others in a step: no part sums over all Gaussians."""
-        alone = type(self.strategy).regularisation is Strategy.regularisation
-        return alone and all(is_ours(type(part)) for part in (self.strategy, *self.terms))
+        ours = all(is_ours(type(part)) for part in (self.strategy, *self.terms))
+        return ours and self.batch == 1 and type(self.strategy).regularisation is Strategy.regularisation
 
     def show_learned(self) -> None:
         """Write the current values of view modules into the views."""
@@ -424,11 +424,10 @@ class Trainer:
         shown = [*views, *(half_size(v) for v in views if self.half_resolution > 0)]
         shown, self.stacks, self.places = stack_views(shown, len(views))
         self.context.views = shown[: len(views)]
-        captured = self.taker.cuda and self.captured and self.memory_limit is None
-        self.taker.settles = captured and self.batch == 1 and self.by_rows
+        self.table.settles = self.taker.cuda and self.captured and self.memory_limit is None and self.by_rows
         self.layout = Layout(
             self.table, shown, self.terms, self.strategy, c.view_modules, kept=self.stopping.whole, captured=self.captured,
-            sums=self.taker.kept_sums, averaged=self.mean.fraction > 0, settled=self.taker.settles,
+            sums=self.taker.kept_sums, averaged=self.mean.fraction > 0,
         )  # fmt: skip
         most = most_instances(self.gaussians, [v.camera for v in shown], self.context.render_options())
         self.memory = plan(
