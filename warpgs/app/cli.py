@@ -180,11 +180,14 @@ def main(arguments: list[str] | None = None) -> int:
         process.accept_all_letters()
         try:
             with process.interrupting_signals():
-                return exit_code(_run(words))
+                code = exit_code(_run(words))
         except SystemExit as e:  # after the help of a command
             if e.code or not (code := exit_code(0)):
                 raise
             raise SystemExit(code) from e
+    if arguments is None and words[:1] == ["fit"]:
+        process.leave(code)
+    return code
 
 
 def _run(arguments: list[str]) -> int:
