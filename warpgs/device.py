@@ -5,11 +5,13 @@ from __future__ import annotations
 import contextlib
 import errno
 import functools
+import importlib.util
 import os
 import platform
 import re
 import sys
 import tempfile
+import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -35,6 +37,22 @@ def usable_cores() -> int:
         return len(os.sched_getaffinity(0)) or 1  # missing on macOS and Windows
     except (AttributeError, OSError):
         return os.cpu_count() or 1
+
+
+def wake_gpu() -> None:
+    """Start the driver of the first CUDA device in a thread, if torch can use it: that takes most of a second."""
+
+    def wake() -> None:
+        import ctypes
+
+        folders = getattr(importlib.util.find_spec("torch"), "submodule_search_locations", ())
+        with contextlib.suppress(OSError, AttributeError):  # what fails here fails in torch again, which says it
+            if any(path.match("*torch_cuda*") for folder in folders for path in Path(folder, "lib").iterdir()):
+                driver = ctypes.CDLL("nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1")
+                if driver.cuInit(0) == 0:  # 0 is the first device, too; torch and Warp share its primary context
+                    driver.cuDevicePrimaryCtxRetain(ctypes.byref(ctypes.c_void_p()), 0)
+
+    threading.Thread(target=wake, name="driver").start()
 
 
 MAX_THREADS = 8

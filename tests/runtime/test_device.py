@@ -21,6 +21,7 @@ from warpgs.device import (
     installed_bytes,
     machine_memory,
     parse_bytes,
+    wake_gpu,
 )
 from warpgs.errors import UsageError
 
@@ -51,6 +52,67 @@ def test_results_keep_the_order_of_their_arguments_which_are_made_late():
 
 
 # Sizes in bytes: what is read, what is refused, what is written.
+
+
+class Driver:
+    """A CUDA driver that notes its calls."""
+
+    def __init__(self, failing: int):
+        self.calls, self.failing = [], failing
+
+    def cuInit(self, flags):
+        self.calls.append(("cuInit", flags))
+        return self.failing
+
+    def cuDevicePrimaryCtxRetain(self, context, handle):
+        self.calls.append(("cuDevicePrimaryCtxRetain", handle))
+        return 0
+
+
+def woken():
+    """Start the driver, and wait for the end of that."""
+    wake_gpu()
+    for thread in threading.enumerate():
+        if thread.name == "driver":
+            thread.join()
+
+
+@pytest.mark.parametrize(
+    ("library", "failing", "count"), [("libtorch_cuda.so", 0, 2), ("libtorch_cuda.so", 100, 1), ("", 0, 0)]
+)
+def test_a_driver_is_started_for_a_torch_that_can_use_it(library, failing, count, tmp_path, monkeypatch):
+    """With the context of the first device; nothing is raised without a device, a driver, or the whole of torch."""
+    driver, spec = Driver(failing), SimpleNamespace(submodule_search_locations=[str(tmp_path)])
+    errors: list = []
+    monkeypatch.setattr(threading, "excepthook", errors.append)
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: spec)
+    monkeypatch.setattr("ctypes.CDLL", lambda name: driver)
+    woken()
+    (tmp_path / "lib" / (library or "libtorch_cpu.so")).mkdir(parents=True)
+    woken()
+    assert driver.calls == [("cuInit", 0), ("cuDevicePrimaryCtxRetain", 0)][:count]
+    monkeypatch.undo()
+    monkeypatch.setattr(threading, "excepthook", errors.append)
+    woken()
+    assert not errors
+
+
+def test_a_fit_alone_starts_the_driver_before_its_imports():
+    """Not where it names a device, nor in any other command, nor in another rank."""
+    code = """
+import os
+from types import SimpleNamespace
+from warpgs.app import cli
+cli.wake_gpu = lambda: print("woken", end=" ")
+cli.importlib = SimpleNamespace(import_module=lambda name: SimpleNamespace(run=lambda *a: print(name, end=" ") or 0))
+for words in (["fit", "scene"], ["fit", "scene", "--device=cpu"], ["fit", "--help-all"], ["view", "run"]):
+    cli.main(words)
+os.environ["RANK"] = "1"
+cli.main(["fit", "scene"])
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    fit, others = "warpgs.app.fit", "warpgs.app.commands"
+    assert done.stdout.split() == ["woken", fit, fit, fit, others, fit]
 
 
 @pytest.mark.parametrize(

@@ -361,6 +361,41 @@ BYTES = os.fsdecode(b"b\xe4\xc3\xbc")
 CPU = ["--device", "cpu"]
 
 
+LEAVING = """
+import atexit, sys, threading, time
+from warpgs import process
+from warpgs.app import cli
+
+class Large:
+    def __del__(self):
+        print("freed")
+
+def late():
+    time.sleep(0.2)
+    print("thread")
+
+def run(words):
+    threading.Thread(target=late).start()
+    sys.stderr.write("no end of line")
+    return 3
+
+kept = Large()
+atexit.register(print, "at exit")
+cli._run = run
+sys.exit(cli.main())
+"""
+"""A program that ends as `warpgs` does."""
+
+
+@pytest.mark.parametrize(("command", "last"), [("fit", []), ("view", ["freed"])])
+def test_a_fit_ends_without_freeing_its_memory(command, last):
+    """After all threads and exit functions, with everything printed, and with its code; other commands end as usual."""
+    env, words = {n: v for n, v in os.environ.items() if n != "PYTHONUNBUFFERED"}, [command, "scene"]
+    done = subprocess.run([sys.executable, "-c", LEAVING, *words], capture_output=True, text=True, check=False, env=env)
+    assert done.returncode == 3 and done.stderr == "no end of line"
+    assert done.stdout.split("\n")[:-1] == ["thread", "at exit", *last]
+
+
 @on_linux
 def test_bytes_that_are_no_text_are_printed_as_codes(tmp_path):
     assert readable(f"{BYTES} \ud800") == "b\\xe4ü \\ud800"

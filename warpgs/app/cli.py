@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 import warpgs.clock  # noqa: F401, imported first: its time stands for the start of the process
 from warpgs import process
-from warpgs.device import exhausted_limit, is_out_of_memory, no_memory_message
+from warpgs.device import exhausted_limit, is_out_of_memory, no_memory_message, wake_gpu
 from warpgs.errors import ResourceError, UsageError, WarpgsError, did_you_mean
 from warpgs.folders import system_folder
 from warpgs.pipeline.train.presets import DEFAULT_PRESET, PRESETS
@@ -180,11 +180,14 @@ def main(arguments: list[str] | None = None) -> int:
         process.accept_all_letters()
         try:
             with process.interrupting_signals():
-                return exit_code(_run(words))
+                code = exit_code(_run(words))
         except SystemExit as e:  # after the help of a command
             if e.code or not (code := exit_code(0)):
                 raise
             raise SystemExit(code) from e
+    if arguments is None and words[:1] == ["fit"]:
+        process.leave(code)
+    return code
 
 
 def _run(arguments: list[str]) -> int:
@@ -212,6 +215,8 @@ def _run(arguments: list[str]) -> int:
         with waiting() as wait:
             if not ASKING & {*arguments} and os.environ.get("RANK", "0") == "0":  # until the command reports its own progress
                 wait(f"starting {name}")
+                if name == "fit" and "torch" not in sys.modules and not any(a.startswith("--device") for a in arguments):
+                    wake_gpu()
             own = name in OWN_FILES
             with process.fast_imports():
                 module = importlib.import_module(f"warpgs.app.{name if own else 'commands'}")

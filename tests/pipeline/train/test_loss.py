@@ -16,9 +16,9 @@ from tests.scenes import photos, priors, seeds, three_gaussians
 from warpgs.errors import UsageError
 from warpgs.geometry import depth_normals
 from warpgs.kernels import blend
+from warpgs.kernels.roughness import BOUND
 from warpgs.pipeline.model.start import InitConfig
 from warpgs.pipeline.train.loss import (
-    BOUND,
     CONFIRMED,
     EDGE,
     LOSS_TERMS,

@@ -15,6 +15,7 @@ from tests.scenes import photos, priors, seeds, three_gaussians
 from tests.tolerances import OPACITY_DECAY
 from warpgs.app.cli import main
 from warpgs.errors import DataError, UsageError
+from warpgs.pipeline.model import table
 from warpgs.pipeline.model.start import InitConfig
 from warpgs.pipeline.train import settings, stopping
 from warpgs.pipeline.train.memory import Layout
@@ -26,7 +27,7 @@ from warpgs.pipeline.train.settings import (
     steps_by_views,
     within_budget,
 )
-from warpgs.pipeline.train.step import LEAST_LOGIT, decay_opacities
+from warpgs.pipeline.train.step import LEAST_LOGIT, StepTaker, decay_opacities
 from warpgs.pipeline.train.stopping import (
     FLOOR,
     SIDES,
@@ -281,6 +282,12 @@ CONFIGS = {
 }
 
 
+def slow(config: FitConfig) -> FitConfig:
+    """The settings with slower growth, and with dropout."""
+    slower = dataclasses.replace(config.density, gradient=1e-3)
+    return dataclasses.replace(config, dropout=0.5, stopping=StoppingConfig(0.0), density=slower)
+
+
 @pytest.fixture
 def tiny(monkeypatch):
     """Images of few blocks, fits of few steps, and Gaussians that are hardly opaque."""
@@ -332,6 +339,46 @@ def test_a_fit_that_gains_takes_its_planned_steps(strategy, monkeypatch):
     fit = begun(dataclasses.replace(config, stopping=StoppingConfig(min_gain_db=1e-9)), None)
     assert fit.step == 60 and fit.stopping.ended == fit.stopping.marks[-1] and "its planned steps are done" in fit.stopping.why
     assert len(fit.stopping.measurements) >= 2 and all(v.mask is None for v in fit.views)
+
+
+@pytest.mark.usefixtures("tiny")
+@pytest.mark.parametrize("strategy", CONFIGS)
+def test_spare_rows_change_no_bit(strategy, monkeypatch):
+    """Nor do addresses that outlast changes of the set. With mcmc, whose loss has means over all rows, they would."""
+    config = slow(CONFIGS[strategy])
+    plain, honest, counts, new = begun(config, None), StepTaker.step, [], []
+
+    def step(taker, *arguments):
+        counts.append(len(taker.table))
+        taker.table.settles = True
+        new.append(taker.table.settle())
+        with taker.table.with_spare_rows():
+            assert len(taker.table) == taker.table.room >= counts[-1]
+            honest(taker, *arguments)
+
+    monkeypatch.setattr(StepTaker, "step", step)
+    monkeypatch.setattr(table, "ROOM", 1.9)
+    fit = begun(config, None)
+    changed = [a != b for a, b in itertools.pairwise(counts)]
+    assert new[0] and sum(new[1:]) < sum(changed) and not any(n and not c for n, c in zip(new[1:], changed))
+    assert fit.by_rows == same_bits(fit, plain) == (strategy != "mcmc")
+
+
+@pytest.mark.cuda
+@pytest.mark.usefixtures("tiny")
+@pytest.mark.parametrize("strategy", CONFIGS)
+def test_graphs_outlast_changes_of_the_set(strategy, monkeypatch):
+    """Fewer captures than with a new graph after each change, and the bits of steps without graphs."""
+    fits, captured, honest = [], [], StepTaker.capture
+    monkeypatch.setattr(StepTaker, "capture", lambda *arguments: captured.append(len(fits)) or honest(*arguments))
+    for graphs in (True, True, False):
+        config = dataclasses.replace(slow(CONFIGS[strategy]), cuda_graph=graphs)
+        fits.append(advanced(Trainer(photos(4), seeds(), config, torch.device("cuda", 0))))
+        monkeypatch.setattr(Trainer, "by_rows", False)
+    assert [f.table.settles for f in fits] == [strategy != "mcmc", False, False]
+    assert all(same_bits(fit, fits[2], but=("none",)) for fit in fits)
+    first, second = captured.count(0), captured.count(1)
+    assert 2 not in captured and (first < second if strategy == "sampling" else first <= second)
 
 
 @pytest.mark.usefixtures("tiny")

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -24,6 +25,9 @@ from warpgs.version import __version__
 
 FLOAT = 4
 """Size of a stored number [bytes]."""
+ROOM, LEAST_FILLED, MOST_WITH_ROOM = 1.25, 0.5, 2**20
+"""Rows for which `Table.settle` takes memory, as a multiple of those in use; the fraction in use below which it takes less; and
+the number in use above which it has no spare rows."""
 
 
 def model_bytes(degrees: torch.Tensor) -> int:
@@ -102,6 +106,10 @@ class Table:
     batch: int = 1
     """Number B of views over which gradients are averaged. Learning rates are multiplied by the square root of B, and decay
     rates of the moments are raised to the power B (Zhao et al. 2024, Grendel-GS, arXiv 2406.18533)."""
+    settles: bool = False
+    """True to keep addresses while the set of rows changes (`settle`), for CUDA graphs."""
+    room: int = 0
+    """Number of rows for which `settle` took memory."""
 
     def __init__(self, params: Mapping[str, torch.Tensor], columns: Mapping[str, Column], device: torch.device, count: int):
         """Begin with zero moments and filled columns.
@@ -118,6 +126,7 @@ class Table:
         self.kinds: dict[str, Column] = {}
         self.columns: dict[str, torch.Tensor] = {}
         self.count = count
+        self._memory: dict[tuple[str, str], torch.Tensor] = {}  # of `room` rows, by group and name
         self.add_columns(columns)
 
     def add_columns(self, columns: Mapping[str, Column]) -> None:
@@ -273,6 +282,50 @@ class Table:
     def sort_along_curve(self) -> None:
         """Put the Gaussians in Morton order, so that neighbours in space are neighbours in memory."""
         self.reorder(torch.argsort(morton_codes(self.params["means"].detach()), stable=True))
+
+    def room_for(self, count: int) -> int:
+        """Return the number of rows for which there is memory once ``count`` are in use."""
+        return int(ROOM * count) if self.settles and count <= MOST_WITH_ROOM else count
+
+    @torch.no_grad()
+    def settle(self) -> bool:
+        """Move the rows of Gaussians to fixed addresses, with spare rows behind them; return whether the addresses are new.
+
+        They stay while the rows fit. Spare rows have opacity 0, so no step changes them. Only a table that `settles` is moved.
+        """
+        if not self.settles:
+            return False
+        new = not self._memory or not self.room >= self.count >= LEAST_FILLED * self.room
+        memory, self._memory = self._memory, {}
+        if new:
+            self.room, memory = self.room_for(self.count), {}
+        fills = {("columns", n): c.fill for n, c in self.kinds.items()} | {("params", "logit_opacities"): -math.inf}
+        for group, tensors in self._groups().items():
+            for name, rows in tensors.items():
+                at = group, name
+                whole = memory[at] = rows.new_empty(self.room, *rows.shape[1:]) if new else memory[at]
+                if rows.data_ptr() != whole.data_ptr():  # the set changed
+                    whole[: self.count] = rows
+                    whole[self.count :] = fills.get(at, whole[:1] if group == "params" else 0)
+                    tensors[name] = whole[: self.count].requires_grad_(group == "params")
+        self._memory = memory
+        return new
+
+    @contextlib.contextmanager
+    def with_spare_rows(self) -> Iterator[None]:
+        """Count the spare rows of `settle`, if any, as rows within the block."""
+        count = self.count
+        try:
+            self._show(self.room or count)
+            yield
+        finally:
+            self._show(count)
+
+    def _show(self, count: int) -> None:
+        """Have the first ``count`` rows of the settled memory."""
+        for (group, name), whole in self._memory.items():
+            self._groups()[group][name] = whole[:count].requires_grad_(group == "params")
+        self.count = count
 
     def reset_opacities(self, opacity: float) -> None:
         """Limit every opacity to this value in (0, 1), and reset the moments of all opacities (the reset of 3DGS)."""

@@ -21,6 +21,7 @@ from warpgs.kernels import (
     neighbours,
     project_cpu,
     project_cuda,
+    roughness,
     sh,
     ssim,
     sweep,
@@ -48,7 +49,7 @@ def fit_kernels(cuda: bool) -> list[tuple[wp.Kernel, int]]:
         *((tiles.make_emit if cuda else tiles.make_emit_cpu)(real, slotted) for slotted in (True, False)),
         *(tiles.make_find_ranges(slotted, cuda) for slotted in (True, False)),
         neighbours.make_knn_kernels(real).search, neighbours.make_reach_kernel(), update.sample,
-        update.decay, update.end_kernel, mcmc.make_kernel(),
+        update.decay, update.end_kernel, mcmc.make_kernel(), *vars(roughness.make_kernels(real)).values(),
         blend.make_segments(real).gather_weights,
     ]  # fmt: skip
     if not cuda:

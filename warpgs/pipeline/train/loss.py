@@ -13,6 +13,7 @@ import torch
 from warpgs.device import FLOAT, LOSS, STEP, Needs, StepSizes
 from warpgs.errors import UsageError
 from warpgs.geometry import depth_normals
+from warpgs.kernels.roughness import roughness
 from warpgs.kernels.ssim import difference_bytes, differences
 from warpgs.pipeline.train.views import TrainingView
 from warpgs.plugins import Registry, is_ours, returned
@@ -374,44 +375,25 @@ class GivenNormalsDifference(LossTerm, group="given-normals."):
 
 # Smoothness of rendered depth, for few views: ambiguous depth becomes planar instead of fog.
 #
-# On a plane, inverse depth is a linear function of the pixel. So a pixel of depth z costs |z/z' + z/z'' - 2|, with the
-# depths z' and z'' of its two neighbours in the row, and again with those in the column. The term is the sum of these
-# costs, divided by the number of pixels. It has no unit. Weights are lower at edges of colour and at pixels with
-# consistent depth. A bound allows depth to jump where colour does not (docs/decisions/024-smooth-depth.md).
+# The term is the sum of the roughness of all pixels (`warpgs.kernels.roughness`), divided by their number. It has no unit.
+# Weights are lower at edges of colour and at pixels with consistent depth. A bound allows depth to jump where colour does
+# not (docs/decisions/024-smooth-depth.md).
 
-SMOOTH_MIN_ALPHA = 0.3
-"""Opacity above which the depth of a pixel is used."""
 EDGE = 0.1
 """Difference of colour between the two neighbours, as mean over the channels, at which the weight falls to 1/e."""
-BOUND = 0.1
-"""Largest value of the term at a pixel; above it the gradient is 0."""
 CONFIRMED = 0.2
 """Weight of pixels with consistent depth."""
-MAPS = 12
+MAPS = 8
 """Number of maps with one float per pixel that the term and its gradient hold at the loss."""
 
 
 def depth_roughness(
     depth: torch.Tensor, alpha: torch.Tensor, image: torch.Tensor, weight: torch.Tensor, mask: torch.Tensor | None
 ) -> torch.Tensor:
-    """Compute the roughness of depth: the weighted sum of min(|z/z' + z/z'' - 2|, `BOUND`) divided by pixel count, shape [].
-
-    z' and z'' are the depths of the two neighbours of a pixel of depth z, in its row and again in its column. The sum is over
-    pixels that, like both neighbours, are unmasked and more opaque than `SMOOTH_MIN_ALPHA`. Edges of the ``image`` weaken it.
-    """
-    shown = ~(alpha <= SMOOTH_MIN_ALPHA)  # True for a NaN, so that it reaches the loss
-    shown = shown if mask is None else shown & (mask > 0)
-    z = torch.where(shown, depth, 1)
-    value = z.new_zeros(())
-    for axis in (0, 1):
-        count = depth.shape[axis] - 2
-        if count < 1:
-            continue
-        (a, b, c), (one, two, three) = ([t.narrow(axis, i, count) for i in range(3)] for t in (z, shown))
-        step = (image.narrow(axis, 0, count) - image.narrow(axis, 2, count)).abs().mean(-1)
-        rough = torch.where(one & two & three, (b / a + b / c - 2).abs(), 0)
-        value = value + total(rough.clamp_max(BOUND) * torch.exp(-step / EDGE) * weight.narrow(axis, 1, count))
-    return value / depth.numel()
+    """Compute the mean roughness of depth, shape [], from depth, opacity, weights and a mask [H, W] and colours [H, W, 3]."""
+    gaps = image[:, :-2] - image[:, 2:], image[:-2] - image[2:]
+    rows, columns = (torch.exp(-gap.abs().mean(-1) / EDGE) for gap in gaps)
+    return total(roughness(depth, alpha, rows, columns, weight, mask)) / depth.numel()
 
 
 @register("smooth_depth")

@@ -75,7 +75,7 @@ class Layout:
 
     def step(self, count: int, instances: int, chunked: bool = False, graphs: int | None = None) -> int:
         """Return the bytes at the heaviest moment of a step; each CUDA graph keeps memory of its own."""
-        copies = max(1, self.graphs if graphs is None else graphs)
+        copies, count = max(1, self.graphs if graphs is None else graphs), self.table.room_for(count)
         return self.held(count) + copies * max(self.moments(count, instances, chunked).values())
 
     def smallest(self, count: int) -> int:

@@ -330,6 +330,8 @@ class StepTaker:
         if not (captured and self.cuda):
             render = eager_renderer(self.options, max_instances)
             return [functools.partial(function, stacks[kind], buffers, plan, render) for kind in kinds]
+        if self.table.settle():
+            self.clear()
         self._graphs = {k: g for k, g in self._graphs.items() if k[1] == plan}
         for kind in dict.fromkeys(kinds):
             if (kind, plan) not in self._graphs:
@@ -357,7 +359,7 @@ class StepTaker:
         """Return the graph of a function that changes nothing if the stop flag is set."""
         here, loaded = torch.cuda.current_stream(buffers.device), buffers.view_rows.clone()
         self.stream.wait_stream(here)
-        with torch.cuda.stream(self.stream):
+        with torch.cuda.stream(self.stream), self.table.with_spare_rows():
             # a first run loads kernels and fills caches, which is not allowed during a capture; it changes no parameter
             buffers.stop.fill_(NOT_FINITE)
             buffers.view_rows.zero_()

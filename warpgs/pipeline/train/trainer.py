@@ -29,9 +29,9 @@ from warpgs.pipeline.train.settings import FitConfig
 from warpgs.pipeline.train.setup import prepare, prepared_views, terms_of
 from warpgs.pipeline.train.step import CAPACITY_FACTOR, OverLimitError, StepPlan, StepTaker, steps_at_once
 from warpgs.pipeline.train.stopping import STATE, Stopping
-from warpgs.pipeline.train.strategies.base import StrategyContext, find_strategy
+from warpgs.pipeline.train.strategies.base import Strategy, StrategyContext, find_strategy
 from warpgs.pipeline.train.views import LearnedViews, TrainingView, half_size, show_learned, stack_views, with_learned
-from warpgs.plugins import returned
+from warpgs.plugins import is_ours, returned
 from warpgs.priors.networks import in_threads
 from warpgs.priors.sweep import sweep_depths
 from warpgs.process import Detail
@@ -387,7 +387,8 @@ class Trainer:
         """Change the set of Gaussians after the last step, if a change is due."""
         if not self.is_due(self.step):
             return
-        self.taker.clear()
+        if not self.table.settles:
+            self.taker.clear()
         self.mean.restart()
         self.show_learned()
         stopping, step = self.stopping, self.step
@@ -406,6 +407,12 @@ class Trainer:
             self.messages.append(Detail(f"{words}; from now on, training uses all pixels"))
         self._hold()
 
+    @property
+    def by_rows(self) -> bool:
+        """Whether Gaussians of opacity 0 change no bit of the others in a step: no part sums over all Gaussians."""
+        ours = all(is_ours(type(part)) for part in (self.strategy, *self.terms))
+        return ours and self.batch == 1 and type(self.strategy).regularisation is Strategy.regularisation
+
     def show_learned(self) -> None:
         """Write the current values of view modules into the views."""
         show_learned(self.views, self.stacks, self.places, self.learned)
@@ -417,6 +424,7 @@ class Trainer:
         shown = [*views, *(half_size(v) for v in views if self.half_resolution > 0)]
         shown, self.stacks, self.places = stack_views(shown, len(views))
         self.context.views = shown[: len(views)]
+        self.table.settles = self.taker.cuda and self.captured and self.memory_limit is None and self.by_rows
         self.layout = Layout(
             self.table, shown, self.terms, self.strategy, c.view_modules, kept=self.stopping.whole, captured=self.captured,
             sums=self.taker.kept_sums, averaged=self.mean.fraction > 0,
