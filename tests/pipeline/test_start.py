@@ -361,5 +361,5 @@ def test_the_second_call_finds_all_in_the_cache(tmp_path, monkeypatch, capsys):
         assert main(["doctor", "--warm"]) == 0
         said.append(capsys.readouterr().out)
         nothing.module.unload()
-    assert "cpu: test_start.nothing, " in said[0] and "1 modules: 1 compiled, 0 were in the cache" in said[0]
+    assert "cpu: test_start.nothing, after " in said[0] and "1 modules: 1 compiled, 0 were in the cache" in said[0]
     assert "test_start.nothing" not in said[1] and "1 modules: 0 compiled, 1 were in the cache" in said[1]
