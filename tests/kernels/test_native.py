@@ -215,7 +215,7 @@ def test_a_fit_compiles_no_module_and_no_header_twice():
     assert flags == {options["cpu_compiler_flags"] for options in (native.EXACT, native.ROLLED)}
     for jobs in kernels.values():
         blocks = {(kernel.module.name, block) for kernel, block in jobs}
-        assert len({name for name, _ in blocks}) == len(blocks) > 20
+        assert len({name for name, _ in blocks}) == len(blocks) == len(jobs) > 20
 
 
 @pytest.mark.slow

@@ -51,7 +51,7 @@ def fit_kernels(cuda: bool) -> list[tuple[wp.Kernel, int]]:
     if not cuda:
         variant, summed = (CAMERA_MODEL, "stored", False, sh.BASES), ssim.make_kernels(real, True)
         color, deep = (blend_cpu.make_kernels(real, TILE_SIZE, deep=deep) for deep in (False, True))
-        kernels = [
+        of_cpu = [
             sweep.match, sweep.best, sweep.follow_cpu, start, project_cpu.make_forward(real, *variant), update.sample, lists,
             *of_steps, color.forward, summed.forward, summed.backward, color.backward,
             blend.make_segments(real, VALUES, 9 + COLORS).sum_gradients, project_cpu.make_backward(real, *variant, False),
@@ -60,7 +60,7 @@ def fit_kernels(cuda: bool) -> list[tuple[wp.Kernel, int]]:
             of_renders[0], of_renders[1], walk.make_walk(real, TILE_SIZE, walk.make_contributions), update.squared_errors,
             scoring(), *of_renders[2:], ssim.make_kernels(real, False).backward, deep.backward,
         ]  # fmt: skip
-        return [(kernel, 1) for kernel in kernels]
+        return [(kernel, 1) for kernel in of_cpu]
     blending, warps = blend_cuda.make_kernels(TILE_SIZE), 32 * blend_cuda.WARPS
     forward = [(blend_cuda.make_forward(TILE_SIZE, save, per), warps) for save in (True, False) for per in (1, 2)]
     backward = [
@@ -69,7 +69,7 @@ def fit_kernels(cuda: bool) -> list[tuple[wp.Kernel, int]]:
         for passes in [blend_cuda.make_backward(TILE_SIZE, depth, chunk, False)]
         for kernel, block in ((passes.backward, warps), (passes.gather, THREADS))
     ]
-    return [
+    kernels = [
         (sweep.follow, sweep.BLOCK), (start, THREADS), (project_cuda.make_forward(real, CAMERA_MODEL), BLOCK),
         *((kernel, THREADS) for kernel in (update.sample, lists, *of_steps)), (blending.order_tiles, blend_cuda.ORDER_THREADS),
         *forward[:2], (ssim.make_cuda_kernels().forward, ssim.THREADS), *backward[: len(backward) // 2],
@@ -78,6 +78,7 @@ def fit_kernels(cuda: bool) -> list[tuple[wp.Kernel, int]]:
         (blending.contributions, TILE_SIZE * TILE_SIZE), *((kernel, THREADS) for kernel in of_renders),
         *forward[2:], *backward[len(backward) // 2 :],
     ]  # fmt: skip
+    return list(dict.fromkeys(kernels))  # chunks of any size are gathered by one kernel
 
 
 def scoring() -> wp.Kernel:
@@ -109,7 +110,7 @@ def compiled_ahead(device: torch.device) -> Iterator[list[tuple[wp.Kernel, int]]
     try:
         with contextlib.suppress(OSError):  # no more processes: the fit compiles alone
             for _ in range(min(PROCESSES, usable_cores() // 2, missing // 4)):
-                workers.append(PythonWorker("warpgs.pipeline.run.precompile", str(device), environment=cache))
+                workers.append(PythonWorker("warpgs.pipeline.run.precompile", target.alias, environment=cache))
         with loaded_ahead([(scoring().module, 1)], wp.get_device("cpu")):
             yield kernels
     finally:
@@ -118,7 +119,7 @@ def compiled_ahead(device: torch.device) -> Iterator[list[tuple[wp.Kernel, int]]
 
 
 def compile_free(kernels: list[tuple[wp.Kernel, int]], device: wp.Device, stopped: Callable[[], bool]) -> None:
-    """Compile modules into the cache without loading them, but none that another process or thread is compiling."""
+    """Compile modules into the cache, but none that another process is compiling; for a process that launches no kernel."""
     names = [module_name(kernel.module, block) for kernel, block in kernels]
     for name, (kernel, block) in zip(names, kernels, strict=True):
         if is_cached(name) or stopped():
@@ -161,10 +162,10 @@ def print_warming(devices: list[torch.device] | None = None) -> None:
 
 
 def main() -> None:
-    """Compile for the device of the command line, until stdin ends: a process of `compiled_ahead`."""
-    stop, device = threading.Event(), torch.device(sys.argv[1])
+    """Compile for Warp's device of the command line, until stdin ends: a process of `compiled_ahead`."""
+    stop, device = threading.Event(), wp.get_device(sys.argv[1])
     threading.Thread(target=lambda: (os.read(0, 1), stop.set()), daemon=True).start()
-    compile_free(fit_kernels(device.type == "cuda"), launch.warp_device(device), stop.is_set)
+    compile_free(fit_kernels(device.is_cuda), device, stop.is_set)
 
 
 if __name__ == "__main__":
