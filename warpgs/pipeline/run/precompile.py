@@ -1,7 +1,6 @@
 """Compile the kernels that a fit uses before it needs them, several modules at a time, into Warp's cache."""
 
 import contextlib
-import itertools
 import os
 import sys
 import threading
@@ -51,7 +50,7 @@ def fit_kernels(cuda: bool) -> list[tuple[wp.Kernel, int]]:
     if not cuda:
         variant, summed = (CAMERA_MODEL, "stored", False, sh.BASES), ssim.make_kernels(real, True)
         color, deep = (blend_cpu.make_kernels(real, TILE_SIZE, deep=deep) for deep in (False, True))
-        of_cpu = [
+        kernels = [
             sweep.match, sweep.best, sweep.follow_cpu, start, project_cpu.make_forward(real, *variant), update.sample, lists,
             *of_steps, color.forward, summed.forward, summed.backward, color.backward,
             blend.make_segments(real, VALUES, 9 + COLORS).sum_gradients, project_cpu.make_backward(real, *variant, False),
@@ -60,25 +59,23 @@ def fit_kernels(cuda: bool) -> list[tuple[wp.Kernel, int]]:
             of_renders[0], of_renders[1], walk.make_walk(real, TILE_SIZE, walk.make_contributions), update.squared_errors,
             scoring(), *of_renders[2:], ssim.make_kernels(real, False).backward, deep.backward,
         ]  # fmt: skip
-        return [(kernel, 1) for kernel in of_cpu]
-    blending, warps = blend_cuda.make_kernels(TILE_SIZE), 32 * blend_cuda.WARPS
-    forward = [(blend_cuda.make_forward(TILE_SIZE, save, per), warps) for save in (True, False) for per in (1, 2)]
-    backward = [
-        (kernel, block)
-        for depth, chunk in itertools.product((False, True), blend_cuda.CHUNKS)  # for a loss term that reads depth, too
-        for passes in [blend_cuda.make_backward(TILE_SIZE, depth, chunk, False)]
-        for kernel, block in ((passes.backward, warps), (passes.gather, THREADS))
-    ]
-    kernels = [
+        return [(kernel, 1) for kernel in kernels]
+    warps = 32 * blend_cuda.WARPS
+    save, show = ([(blend_cuda.make_forward(TILE_SIZE, saves, per), warps) for per in (1, 2)] for saves in (True, False))
+    color, deep = (  # without and with a loss term that reads depth; one kernel gathers chunks of any size
+        [blend_cuda.make_backward(TILE_SIZE, depth, chunk, False) for chunk in blend_cuda.CHUNKS] for depth in (False, True)
+    )
+    return [
         (sweep.follow, sweep.BLOCK), (start, THREADS), (project_cuda.make_forward(real, CAMERA_MODEL), BLOCK),
-        *((kernel, THREADS) for kernel in (update.sample, lists, *of_steps)), (blending.order_tiles, blend_cuda.ORDER_THREADS),
-        *forward[:2], (ssim.make_cuda_kernels().forward, ssim.THREADS), *backward[: len(backward) // 2],
-        (project_cuda.make_backward(real, CAMERA_MODEL), BLOCK),
+        *((kernel, THREADS) for kernel in (update.sample, lists, *of_steps)),
+        (blend_cuda.make_kernels(TILE_SIZE).order_tiles, blend_cuda.ORDER_THREADS), *save,
+        (ssim.make_cuda_kernels().forward, ssim.THREADS), *((each.backward, warps) for each in color),
+        (color[0].gather, THREADS), (project_cuda.make_backward(real, CAMERA_MODEL), BLOCK),
         *((kernel, THREADS) for kernel in (update.scheduled_update, graphs.make_fetch(), neighbours.make_reach_kernel())),
-        (blending.contributions, TILE_SIZE * TILE_SIZE), *((kernel, THREADS) for kernel in of_renders),
-        *forward[2:], *backward[len(backward) // 2 :],
+        # after the first step
+        *((kernel, THREADS) for kernel in of_renders), *show,
+        *((each.backward, warps) for each in deep), (deep[0].gather, THREADS),
     ]  # fmt: skip
-    return list(dict.fromkeys(kernels))  # chunks of any size are gathered by one kernel
 
 
 def scoring() -> wp.Kernel:
