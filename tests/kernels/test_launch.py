@@ -22,6 +22,7 @@ from warpgs.kernels import launch, native
 from warpgs.kernels.graphs import ALIGNMENT, TORCH, Arena, CapturedGraph, SizingAllocator, fetch, part
 from warpgs.kernels.neighbours import mean_square_distances
 from warpgs.kernels.update import Setting, opacity_dropout
+from warpgs.pipeline.run.precompile import compile_free
 from warpgs.render.rasterize import rasterize
 from warpgs.scene import Gaussians
 
@@ -546,9 +547,9 @@ import warp
 def refuse(*_, **__): raise AssertionError("compiled a second time")
 warp._src.build.build_cpu = refuse
 lock = load_module.lock_descriptor
-def note(descriptor):
+def note(descriptor, blocking):
     print("waits", flush=True)
-    lock(descriptor)
+    return lock(descriptor, blocking=blocking)
 load_module.lock_descriptor = note
 seen = torch.zeros(3, dtype=torch.int32)
 launch.launch(load_module_mark, 3, [seen], torch.device("cpu"))
@@ -611,6 +612,8 @@ def test_a_long_wait_for_modules_is_announced_once(cache, monkeypatch):
     monkeypatch.setattr(native, "say", lambda line, error: (said.append((line, error)), came.set()))
 
     class Slow:
+        name = "slow"
+
         def get_module_identifier(self, block_dim):
             return f"slow_{len(said)}"
 
@@ -633,8 +636,72 @@ def test_a_long_wait_for_modules_is_announced_once(cache, monkeypatch):
     assert len(said) == 2
 
 
+class Later:
+    """A module that is named and loaded as Warp's are; ``load`` does it."""
+
+    def __init__(self, name, flags, events, load):
+        self.name, self.options, self.events, self.own_load = name, {"cpu_compiler_flags": flags}, events, load
+
+    def get_module_identifier(self, block_dim):
+        self.events.append(f"name {self.name}")
+        return self.name
+
+    def load(self, device, block_dim):
+        self.events.append(f"load {self.name} in {threading.current_thread().name.partition('_')[0]}")
+        loaded = self.own_load()
+        Path(wp.config.kernel_cache_dir, self.name).mkdir(exist_ok=True)
+        return loaded
+
+
+def test_modules_that_the_cache_lacks_load_ahead(cache, monkeypatch):
+    """In order and in threads, once all are named; a launch waits for its module, and has its error; the end begins none."""
+    events, cpu = [], wp.get_device("cpu")
+    asked, loading, ended = (threading.Event() for _ in range(3))
+
+    def fail():
+        raise ResourceError("no memory")
+
+    def last():
+        loading.set()
+        assert ended.wait(20)
+
+    monkeypatch.setattr(native, "usable_cores", lambda: 2)
+    monkeypatch.setattr(native, "_LOADED", set())
+    steps = {"first": lambda: asked.wait(20), "there": fail, "second": fail, "third": last, "fourth": fail}
+    modules = {name: Later(name, "flags", events, step) for name, step in steps.items()}
+    (cache / "there").mkdir(parents=True)
+    with native.told_of_compiling(lambda name: asked.set()) as seconds:  # the launch waits, and says so
+        with native.loaded_ahead([(m, 1) for m in modules.values()], cpu):
+            assert native.load_module(modules["first"], cpu, 1) and len(seconds) == 1
+            assert loading.wait(20)
+            with pytest.raises(ResourceError, match="no memory"):
+                native.load_module(modules["second"], cpu, 1)
+            native._AHEAD[modules["fourth"], cpu.context, 1].add_done_callback(lambda cancelled: ended.set())
+    names, loads = ([e for e in events if e.startswith(kind)] for kind in ("name", "load"))
+    assert events[: len(steps)] == [f"name {name}" for name in steps] and len(names) > len(steps) and not native._AHEAD
+    assert loads[0] == "load first in compile" and "load second in MainThread" in loads
+    assert [e.split()[1] for e in loads if e.endswith("compile")] == ["first", "second", "third"]
+
+
+def test_a_module_that_another_compiles_is_left_to_it(cache, monkeypatch, device):
+    """Else it is compiled, under the name and for the blocks of the launch that loads it; not after the stop."""
+    target, module, block = launch.warp_device(device), load_module_mark.module, 1 if device == CPU else 64
+    monkeypatch.setitem(module.options, "block_dim", module.options["block_dim"])
+    name = native.module_name(module, block)
+    with native.exclusive(native.lock_of(name, target)):
+        compile_free([(load_module_mark, block)], target, lambda: False)
+    compile_free([(load_module_mark, block)], target, lambda: True)
+    assert not native.is_cached(name)
+    compile_free([(load_module_mark, block)], target, lambda: False)
+    assert native.is_cached(name)
+    monkeypatch.setattr(wp._src.build, f"build_{target.alias.partition(':')[0]}", None)
+    monkeypatch.setattr(native, "_LOADED", set())
+    module.unload()
+    assert native.load_module(module, target, block) is not None
+
+
 def test_a_lock_that_is_not_supported_is_no_obstacle_and_one_without_a_file_has_a_remedy(tmp_path, monkeypatch):
-    def refuse(_):
+    def refuse(_, blocking):
         raise OSError(95, "not supported")
 
     monkeypatch.setattr(native, "lock_descriptor", refuse)

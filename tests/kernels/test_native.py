@@ -205,6 +205,19 @@ def modules() -> dict[str, wp.Module]:
     return {k.module.name: k.module for k in kernels}
 
 
+def test_a_fit_compiles_no_module_and_no_header_twice():
+    """A module is compiled for each size of blocks, and Warp's headers for each set of compiler flags."""
+    kernels = {cuda: fit_kernels(cuda) for cuda in (True, False)}
+    flags = set()
+    for kernel, block in kernels[False]:
+        native.module_name(kernel.module, block)
+        flags.add(kernel.module.options["cpu_compiler_flags"])
+    assert flags == {options["cpu_compiler_flags"] for options in (native.EXACT, native.ROLLED)}
+    for jobs in kernels.values():
+        blocks = {(kernel.module.name, block) for kernel, block in jobs}
+        assert len({name for name, _ in blocks}) == len(blocks) == len(jobs) > 20
+
+
 @pytest.mark.slow
 def test_cuda_text_compiles(tmp_path):
     """Each module, to PTX."""

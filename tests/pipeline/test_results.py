@@ -92,7 +92,7 @@ def test_a_fit_ends_with_its_score_its_size_its_time_and_what_to_do_next(tmp_pat
     lines = result_lines(metrics, out)
     assert lines[0].startswith("held-out PSNR 24.50 dB, SSIM 0.800") and lines[0].endswith("(2 views)")
     assert "the nearest photograph 13.50 dB" in lines[1] and "all seen" in lines[2]
-    compiled = "in 1 min 15 s, of which 20 s to compile kernels, once on this machine"
+    compiled = "in 1 min 15 s, with kernels compiled once on this machine"
     assert lines[3] == f"1,234 Gaussians, 1.0 MiB, {compiled}: steps 40 s, kernels 20 s, scoring 12 s"
     assert lines[4] == f"report: {out / 'report.html'}"
     commands = [f"view '{out}'", f"render '{out}'", f"export '{out}' --to scene.html"]

@@ -102,14 +102,36 @@ def make_kernels(tile_size: int):
     return SimpleNamespace(order_tiles=order_tiles, contributions=contributions)
 
 
+def _flags(with_depth: bool, atomic: bool, absgrad: bool) -> dict[str, str]:
+    """Return the switches of the backward bodies as CUDA text, by name."""
+    flags = {"WITH_DEPTH": with_depth, "ATOMIC": atomic, "ABSGRAD": absgrad}
+    return {name: str(flag).lower() for name, flag in flags.items()}
+
+
+@functools.cache
+def make_gather(tile_size: int, with_depth: bool, atomic: bool, channels: int = COLORS, absgrad: bool = False):
+    """Make the kernel that sums the gradients of each Gaussian's instances, which `make_backward` computes."""
+    # Not in the module of `make_backward`: its blocks have another size, and Warp compiles a module anew for each size.
+    name = f"warpgs.kernels.blend_cuda.gather.{tile_size}.{int(with_depth)}.{int(atomic)}.{channels}" + ".absgrad" * absgrad
+
+    @cuda_kernel(_source("gather", tile_size, channels, **_flags(with_depth, atomic, absgrad)), "wp.tid()", name)
+    def gather(
+        i: int, projected: wp.array(dtype=float), starts: wp.array(dtype=int), counts: wp.array(dtype=int),
+        v_slots: wp.array2d(dtype=float),
+        # outputs
+        v_projected: wp.array(dtype=float),
+    ): ...  # fmt: skip
+
+    return gather
+
+
 @functools.cache
 def make_backward(
     tile_size: int, with_depth: bool, chunk: int, atomic: bool, channels: int = COLORS, absgrad: bool = False
 ):  # fmt: skip
     """Make the backward kernels: sums per instance, then per Gaussian (or ``atomic`` additions, in no fixed order)."""
     Blending = make_struct(wp.float32)
-    flags = {"WITH_DEPTH": with_depth, "ATOMIC": atomic, "ABSGRAD": absgrad}
-    numbers = {"CHUNK": chunk, **{name: str(flag).lower() for name, flag in flags.items()}}
+    numbers = {"CHUNK": chunk, **_flags(with_depth, atomic, absgrad)}
 
     name = f"warpgs.kernels.blend_cuda.backward.{tile_size}.{int(with_depth)}.{chunk}.{int(atomic)}.{channels}"
     name += ".absgrad" * absgrad
@@ -129,15 +151,7 @@ def make_backward(
         v_slots: wp.array2d(dtype=float),
     ): ...  # fmt: skip
 
-    @cuda_kernel(_source("gather", tile_size, channels, **numbers), "wp.tid()", name)
-    def gather(
-        i: int, projected: wp.array(dtype=float), starts: wp.array(dtype=int), counts: wp.array(dtype=int),
-        v_slots: wp.array2d(dtype=float),
-        # outputs
-        v_projected: wp.array(dtype=float),
-    ): ...  # fmt: skip
-
-    return SimpleNamespace(backward=backward, gather=gather)
+    return SimpleNamespace(backward=backward, gather=make_gather(tile_size, with_depth, atomic, channels, absgrad))
 
 
 def chunk_of(tiles: int, deterministic: bool) -> int:

@@ -8,7 +8,8 @@ import math
 import re
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -16,7 +17,7 @@ import warp as wp
 from filelock import lock_descriptor, unlock_descriptor
 
 from warpgs.clock import section
-from warpgs.device import REMEDY
+from warpgs.device import REMEDY, usable_cores
 from warpgs.errors import ResourceError
 from warpgs.files import make_folder
 from warpgs.process import say
@@ -138,6 +139,15 @@ def make_color(bases: int):
     return SimpleNamespace(color=color, color_backward=color_backward)
 
 
+def module_name(module: wp.Module, block_dim: int) -> str:
+    """Return the name of a module's folder in the cache; our modules without compiler flags get those of `EXACT`."""
+    # The object code stays the same, but for each set of flags Warp precompiles its headers anew, which takes 1.2 s.
+    if module.name.startswith("warpgs.") and module.options["cpu_compiler_flags"] is None:
+        module.options["cpu_compiler_flags"] = EXACT["cpu_compiler_flags"]
+        module.mark_modified()
+    return module.get_module_identifier(block_dim)
+
+
 _LOADED: set[tuple[wp.Module, object, int]] = set()
 """Modules that this process has loaded, each with the context of its device and its number of threads per block."""
 
@@ -191,30 +201,85 @@ def _announced() -> Iterator[None]:
 
 def load_module(module: wp.Module, device: wp.Device, block_dim: int):
     """Load a module for blocks of ``block_dim`` threads and return Warp's handle; compile it where the cache lacks it."""
-    # Fits that start at once on a fresh machine need the same modules: a file lock makes one compile, and the others find the
-    # result.
     key = (module, device.context, block_dim)
     if key in _LOADED:  # Warp's hash shows whether the module has new kernels
         return module.load(device, block_dim=block_dim)
-    cache, name = Path(wp.config.kernel_cache_dir), module.get_module_identifier(block_dim)
-    locks = cache / "locks"
-    make_folder(locks)
-    with section("kernels"), exclusive(locks / f"{name}.{device.is_cuda:d}"):
-        compiles, began = not (cache / name).is_dir(), time.perf_counter()
+    ahead = _AHEAD.get(key)
+    with section("kernels"):
+        if ahead is not None and not ahead.done():
+            for listener, _ in _LISTENERS:
+                listener(module_name(module, block_dim))
+            wait([ahead])
+        return _load(module, device, block_dim)  # raises an error of the thread, too
+
+
+def _load(module: wp.Module, device: wp.Device, block_dim: int, tells: bool = True):
+    """Load a module as `load_module` does, on this thread; tell no listener if ``tells`` is False."""
+    # Fits that start at once on a fresh machine need the same modules: a file lock makes one compile, and the others find the
+    # result.
+    with exclusive(lock_of(name := module_name(module, block_dim), device)):
+        compiles, began = not is_cached(name), time.perf_counter()
         told = tuple(_LISTENERS) if compiles else ()
-        for listener, _ in told:
+        for listener, _ in told if tells else ():
             listener(name)
         with _announced() if compiles and not told else contextlib.nullcontext():
             loaded = module.load(device, block_dim=block_dim)
         for _, seconds in told:
             seconds.append(time.perf_counter() - began)
-    _LOADED.add(key)
+    _LOADED.add((module, device.context, block_dim))
     return loaded
 
 
+def is_cached(name: str) -> bool:
+    """Return whether the cache has a folder for the name of a module."""
+    return Path(wp.config.kernel_cache_dir, name).is_dir()
+
+
+def lock_of(name: str, device: wp.Device) -> Path:
+    """Return the file that is locked while a module of that name is compiled."""
+    locks = Path(wp.config.kernel_cache_dir) / "locks"
+    make_folder(locks)
+    return locks / f"{name}.{device.is_cuda:d}"
+
+
+_AHEAD: dict[tuple[wp.Module, object, int], Future[object]] = {}
+"""Modules that threads of `loaded_ahead` are to load, by the key of `_LOADED`."""
+PER_FLAGS = 4
+"""Most threads that compile modules with the same compiler flags: each has to precompile Warp's headers first."""
+
+
 @contextlib.contextmanager
-def exclusive(path: Path) -> Iterator[None]:
-    """Lock a file, which is made if missing, so that one thread of one process at a time runs the body."""
+def loaded_ahead(modules: Iterable[tuple[wp.Module, int]], device: wp.Device) -> Iterator[None]:
+    """Compile and load modules that the cache lacks in threads during the block, in this order, each for a size of blocks.
+
+    `load_module` waits for such a module and raises its error. A module that is not begun when the block ends is left out.
+    """
+    # Names are computed before any module is compiled: Warp's hash of a module depends on which modules were compiled before
+    # it in the process, and another process would not find it in the cache.
+    missing = [(m, block) for m, block in modules if not is_cached(module_name(m, block))]
+    threads, pools, keys = max(1, min(PER_FLAGS, usable_cores() // 2)), dict[str, ThreadPoolExecutor](), []
+    try:
+        for module, block in missing:
+            flags = module.options["cpu_compiler_flags"]
+            pool = pools.get(flags) or pools.setdefault(flags, ThreadPoolExecutor(threads, thread_name_prefix="compile"))
+            keys.append((module, device.context, block))
+            _AHEAD[keys[-1]] = pool.submit(_load, module, device, block, False)
+        yield
+    finally:
+        for pool in pools.values():
+            pool.shutdown(wait=False, cancel_futures=True)
+        for pool in pools.values():
+            pool.shutdown()
+        for key in keys:
+            _AHEAD.pop(key, None)
+
+
+@contextlib.contextmanager
+def exclusive(path: Path, blocking: bool = True) -> Iterator[bool]:
+    """Lock a file, which is made if missing, so that one thread of one process at a time runs the body.
+
+    Yields True; without ``blocking`` False, and at once, where another has locked the file.
+    """
     # The system releases the lock when its process ends, even if killed. On a file system without locks the body runs unlocked:
     # Warp renames a compiled module into place, so two processes that compile it only lose time.
     try:
@@ -222,7 +287,9 @@ def exclusive(path: Path) -> Iterator[None]:
     except OSError as e:
         raise ResourceError(f"{path}: cannot be opened ({e.strerror or e}). {REMEDY}") from e
     with file, contextlib.ExitStack() as held:
+        free = True
         with contextlib.suppress(OSError):
-            lock_descriptor(file.fileno())
-            held.callback(unlock_descriptor, file.fileno())
-        yield
+            free = lock_descriptor(file.fileno(), blocking=blocking)
+            if free:
+                held.callback(unlock_descriptor, file.fileno())
+        yield free

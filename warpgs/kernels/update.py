@@ -49,7 +49,7 @@ SHIFT = slice(Setting.RED, Setting.BLUE + 1)
 """Columns of the difference of the backgrounds."""
 
 
-@wp.kernel(enable_backward=False, module="warpgs.kernels.step_buffers")
+@wp.kernel(enable_backward=False, module="warpgs.kernels.update")
 def begin_kernel(
     begin: int, counter: wp.array(dtype=wp.int64), view_rows: wp.array(dtype=wp.int64),
     lr_rows: wp.array2d(dtype=float), setting_rows: wp.array2d(dtype=float),
@@ -74,7 +74,7 @@ def begin_kernel(
         K[i] = Ks[view, i]
 
 
-@wp.kernel(enable_backward=False, module="warpgs.kernels.step_buffers")
+@wp.kernel(enable_backward=False, module="warpgs.kernels.update")
 def end_kernel(
     begin: int, loss: wp.array(dtype=float), mse: wp.array(dtype=float),
     # outputs; all but the last are read, too
@@ -291,7 +291,7 @@ def update_rows(param, grad, exp_avg, exp_avg_sq, lrs: list[float], head: int, b
 # After Binocular3DGS (Han et al. 2024, section 3.3), which multiplies by 0.995.
 
 
-@wp.kernel(enable_backward=False, module="warpgs.kernels.opacity_decay")
+@wp.kernel(enable_backward=False, module="warpgs.kernels.update")
 def decay(
     begin: int, logits: wp.array(dtype=float), factor: wp.float64,
     # outputs
@@ -321,7 +321,7 @@ def opacity_decay(logits: torch.Tensor, factor: float) -> torch.Tensor:
 # Opacity dropout: hide random Gaussians for a step and make the others more opaque (DropGaussian, Park et al. 2025).
 
 
-@wp.kernel(enable_backward=False, module="warpgs.kernels.dropout")
+@wp.kernel(enable_backward=False, module="warpgs.kernels.update")
 def sample(
     begin: int, settings: wp.array(dtype=float), seed: int,
     # outputs

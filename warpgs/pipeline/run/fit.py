@@ -41,6 +41,7 @@ from warpgs.pipeline.run.folder import (
     save_checkpoint,
     with_cameras,
 )
+from warpgs.pipeline.run.precompile import compiled_ahead
 from warpgs.pipeline.run.request import FitRequest, SceneRequest, check_overrides, choose_device, choose_split, read_scene
 from warpgs.pipeline.run.results import (
     evaluate_run,
@@ -417,12 +418,15 @@ def fit(
         folder as held,
         stages as progress,
         told_of_compiling(lambda name: progress(COMPILING)) as compiled,
+        contextlib.ExitStack() as compiling,
     ):
         resume = resume and out is not None and (out / CONFIG).is_file()  # else the folder holds only found poses
         if out is not None and resume:
             read_record(out)  # a run of another version is refused before anything takes time
         with clock("kernels"):
             chosen, where = choose_device(device)
+            if ranks.first:
+                compiling.enter_context(compiled_ahead(chosen))
         began = time.perf_counter()
         lpips = None if lpips_weights is None else Lpips(Path(lpips_weights), chosen)
         read, request, parts, found = _read(scene, split, chosen, out, progress, ranks)

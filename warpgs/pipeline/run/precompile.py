@@ -1,17 +1,18 @@
 """Compile the kernels that a fit uses before it needs them, several modules at a time, into Warp's cache."""
 
-import itertools
+import contextlib
 import os
+import sys
+import threading
 import time
-from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor, as_completed
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import torch
 import warp as wp
 
 from warpgs.constants import TILE_SIZE
-from warpgs.device import format_bytes
+from warpgs.device import format_bytes, usable_cores
 from warpgs.kernels import (
     blend,
     blend_cpu,
@@ -30,9 +31,9 @@ from warpgs.kernels import (
     walk,
 )
 from warpgs.kernels.falloff import COLORS, VALUES
-from warpgs.kernels.native import BLOCK, load_module
+from warpgs.kernels.native import BLOCK, exclusive, is_cached, load_module, loaded_ahead, lock_of, module_name
 from warpgs.pipeline.train.strategies import mcmc
-from warpgs.process import say
+from warpgs.process import PythonWorker, say
 
 THREADS = 256
 """Default number of threads of a block."""
@@ -41,65 +42,108 @@ CAMERA_MODEL = "pinhole"
 
 
 def fit_kernels(cuda: bool) -> list[tuple[wp.Kernel, int]]:
-    """Return a kernel of each module that a fit on CUDA or on the CPU launches, with the block size of the launches."""
+    """Return a kernel of each module that a fit on CUDA or on the CPU launches, with its block size, in the order of need."""
     # On CUDA a module is compiled once for each block size. Scores are computed on the CPU for fits on any device.
-    real = wp.float32
-    plain = [
-        tiles.make_kernels(real, cuda).pack_counts,
-        *((tiles.make_emit if cuda else tiles.make_emit_cpu)(real, slotted) for slotted in (True, False)),
-        *(tiles.make_find_ranges(slotted, cuda) for slotted in (True, False)),
-        neighbours.make_knn_kernels(real).search, neighbours.make_reach_kernel(), update.sample,
-        update.decay, update.end_kernel, mcmc.make_kernel(), *vars(roughness.make_kernels(real)).values(),
-        blend.make_segments(real).gather_weights,
-    ]  # fmt: skip
+    real, emit = wp.float32, tiles.make_emit if cuda else tiles.make_emit_cpu
+    of_steps, of_renders = ([emit(real, slotted), tiles.make_find_ranges(slotted, cuda)] for slotted in (True, False))
+    start, lists = neighbours.make_knn_kernels(real).search, tiles.make_kernels(real, cuda).pack_counts
+    of_renders += [blend.make_segments(real).gather_weights, mcmc.make_kernel()]
+    rough = [*vars(roughness.make_kernels(real)).values()]
     if not cuda:
-        blending, variant = blend_cpu.make_kernels(real, TILE_SIZE), (CAMERA_MODEL, "stored", False, sh.BASES)
-        scoring = [ssim.make_kernels(real, summed) for summed in (True, False)]
-        plain += [
-            project_cpu.make_forward(real, *variant), project_cpu.make_backward(real, *variant, False),
-            blending.forward, blending.backward, blend_cpu.make_kernels(real, TILE_SIZE, deep=False).backward,
-            walk.make_walk(real, TILE_SIZE, walk.make_contributions),
-            blend.make_segments(real, VALUES, 9 + COLORS).sum_gradients, update.squared_errors, sweep.match,
-            sweep.best, sweep.follow_cpu,
-            *(k for s in scoring for k in (s.forward, s.backward)),
-            *(update.make_adam_kernel(real, split, update.LANES) for split in (True, False)),
+        variant, summed = (CAMERA_MODEL, "stored", False, sh.BASES), ssim.make_kernels(real, True)
+        color, deep = (blend_cpu.make_kernels(real, TILE_SIZE, deep=deep) for deep in (False, True))
+        kernels = [
+            sweep.match, sweep.best, sweep.follow_cpu, start, project_cpu.make_forward(real, *variant), update.sample, lists,
+            *of_steps, color.forward, summed.forward, summed.backward, *rough, color.backward,
+            blend.make_segments(real, VALUES, 9 + COLORS).sum_gradients, project_cpu.make_backward(real, *variant, False),
+            *(update.make_adam_kernel(real, split, update.LANES) for split in (True, False)), neighbours.make_reach_kernel(),
+            # after the first step
+            of_renders[0], of_renders[1], walk.make_walk(real, TILE_SIZE, walk.make_contributions), update.squared_errors,
+            scoring(), *of_renders[2:], ssim.make_kernels(real, False).backward, deep.backward,
         ]  # fmt: skip
-        return [(kernel, 1) for kernel in plain]
-    blending, warps = blend_cuda.make_kernels(TILE_SIZE), 32 * blend_cuda.WARPS
-    others = [
-        (project_cuda.make_forward(real, CAMERA_MODEL), BLOCK), (project_cuda.make_backward(real, CAMERA_MODEL), BLOCK),
-        *((blend_cuda.make_forward(TILE_SIZE, save, per), warps) for save in (True, False) for per in (1, 2)),
-        (blending.order_tiles, blend_cuda.ORDER_THREADS), (blending.contributions, TILE_SIZE * TILE_SIZE),
-        (sweep.follow, sweep.BLOCK), (ssim.make_cuda_kernels().forward, ssim.THREADS),
+        return [(kernel, 1) for kernel in kernels]
+    warps = 32 * blend_cuda.WARPS
+    save, show = ([(blend_cuda.make_forward(TILE_SIZE, saves, per), warps) for per in (1, 2)] for saves in (True, False))
+    color, deep = (  # without and with a loss term that reads depth; one kernel gathers chunks of any size
+        [blend_cuda.make_backward(TILE_SIZE, depth, chunk, False) for chunk in blend_cuda.CHUNKS] for depth in (False, True)
+    )
+    return [
+        (sweep.follow, sweep.BLOCK), (start, THREADS), (project_cuda.make_forward(real, CAMERA_MODEL), BLOCK),
+        *((kernel, THREADS) for kernel in (update.sample, lists, *of_steps)),
+        (blend_cuda.make_kernels(TILE_SIZE).order_tiles, blend_cuda.ORDER_THREADS), *save,
+        (ssim.make_cuda_kernels().forward, ssim.THREADS), *((kernel, THREADS) for kernel in rough),
+        *((each.backward, warps) for each in color),
+        (color[0].gather, THREADS), (project_cuda.make_backward(real, CAMERA_MODEL), BLOCK),
+        *((kernel, THREADS) for kernel in (update.scheduled_update, graphs.make_fetch(), neighbours.make_reach_kernel())),
+        # after the first step
+        *((kernel, THREADS) for kernel in of_renders), *show,
+        *((each.backward, warps) for each in deep), (deep[0].gather, THREADS),
     ]  # fmt: skip
-    plain += [graphs.make_fetch(), update.scheduled_update]
-    for depth, chunk in itertools.product((False, True), blend_cuda.CHUNKS):  # with a loss term that reads depth, and without
-        passes = blend_cuda.make_backward(TILE_SIZE, depth, chunk, False)
-        plain.append(passes.gather)
-        others.append((passes.backward, warps))
-    return [*((kernel, THREADS) for kernel in plain), *others]
 
 
-def _load(device: torch.device, kernel: wp.Kernel, block: int) -> tuple[str, str, int, bool, float]:
-    """Compile and load a module; returns device, kernel, block size, whether it was compiled and not cached, and time [s]."""
-    began, name = time.time(), f"{kernel.func.__module__.rpartition('.')[2]}.{kernel.func.__name__}"
-    path = Path(load_module(kernel.module, launch.warp_device(device), block).binary_path)
-    return str(device), name, block, path.stat().st_mtime >= began, time.time() - began
+def scoring() -> wp.Kernel:
+    """Return the kernel that computes SSIM for scores, on the CPU."""
+    kernel: wp.Kernel = ssim.make_kernels(wp.float32, False).forward
+    return kernel
+
+
+PROCESSES = 4
+"""Most processes that compile for CUDA beside a fit."""
+LAST_MODULE = 60.0
+"""Time for such a process to finish its module [s]."""
+
+
+@contextlib.contextmanager
+def compiled_ahead(device: torch.device) -> Iterator[list[tuple[wp.Kernel, int]]]:
+    """Compile modules of a fit that the cache lacks during the block, in threads or for CUDA in processes; yield `fit_kernels`.
+
+    A launch that needs a module waits for it or compiles it, and raises its error.
+    """
+    kernels, target = fit_kernels(device.type == "cuda"), launch.warp_device(device)
+    if device.type != "cuda":
+        with loaded_ahead([(kernel.module, block) for kernel, block in kernels], target):
+            yield kernels
+        return
+    # NVRTC compiles for one thread of a process at a time. The processes take the modules that no other has locked.
+    missing = sum(not is_cached(module_name(kernel.module, block)) for kernel, block in kernels)
+    cache, workers = {"WARP_CACHE_PATH": str(Path(wp.config.kernel_cache_dir).parent)}, list[PythonWorker]()
+    try:
+        with contextlib.suppress(OSError):  # no more processes: the fit compiles alone
+            for _ in range(min(PROCESSES, usable_cores() // 2, missing // 4)):
+                workers.append(PythonWorker("warpgs.pipeline.run.precompile", target.alias, environment=cache))
+        with loaded_ahead([(scoring().module, 1)], wp.get_device("cpu")):
+            yield kernels
+    finally:
+        for worker in workers:
+            worker.end(LAST_MODULE)
+
+
+def compile_free(kernels: list[tuple[wp.Kernel, int]], device: wp.Device, stopped: Callable[[], bool]) -> None:
+    """Compile modules into the cache, but none that another process is compiling; for a process that launches no kernel."""
+    names = [module_name(kernel.module, block) for kernel, block in kernels]
+    for name, (kernel, block) in zip(names, kernels, strict=True):
+        if is_cached(name) or stopped():
+            continue
+        with exclusive(lock_of(name, device), blocking=False) as free:
+            if free and not is_cached(name):
+                kernel.module.options["block_dim"] = block
+                wp.compile_aot_module(kernel.module, device)
 
 
 def precompile_kernels(devices: list[torch.device] | None = None) -> Iterator[tuple[str, str, int, bool, float]]:
-    """Compile the modules that are not cached, by default for the CPU and all CUDA devices; yield `_load` of each when done."""
+    """Compile and load the modules of fits, by default on the CPU and all CUDA devices.
+
+    Yields device, kernel, block size, whether the module was not in the cache, and the time since the start [s], of each.
+    """
     if devices is None:
         devices = [torch.device("cpu"), *(torch.device("cuda", i) for i in range(torch.cuda.device_count()))]
-    jobs = {
-        (device, kernel.module, block): (device, kernel, block)
-        for device in devices
-        for kernel, block in fit_kernels(device.type == "cuda")
-    }
-    # Warp's own force_load also uses threads, but does not report the time of each module
-    with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
-        for done in as_completed([pool.submit(_load, *job) for job in jobs.values()]):
-            yield done.result()
+    began, wall = time.perf_counter(), time.time()
+    for device in devices:
+        with compiled_ahead(device) as kernels:
+            for kernel, block in kernels:
+                path = Path(load_module(kernel.module, launch.warp_device(device), block).binary_path)
+                name = f"{kernel.func.__module__.rpartition('.')[2]}.{kernel.func.__name__}"
+                yield str(device), name, block, path.stat().st_mtime >= wall, time.perf_counter() - began
 
 
 def print_warming(devices: list[torch.device] | None = None) -> None:
@@ -108,10 +152,21 @@ def print_warming(devices: list[torch.device] | None = None) -> None:
     for device, kernel, block, fresh, seconds in precompile_kernels(devices):
         count, compiled = count + 1, compiled + fresh
         if fresh:
-            say(f"{device}: {kernel}{'' if device == 'cpu' else f' in blocks of {block}'}, {seconds:.1f} s")
+            say(f"{device}: {kernel}{'' if device == 'cpu' else f' in blocks of {block}'}, after {seconds:.1f} s")
     folder = Path(wp.config.kernel_cache_dir)
     size = sum(p.stat().st_size for p in folder.rglob("*") if p.is_file())
     say(
         f"{count} modules: {compiled} compiled, {count - compiled} were in the cache, "
         f"{time.perf_counter() - began:.1f} s; {folder} holds {format_bytes(size)}"
     )
+
+
+def main() -> None:
+    """Compile for Warp's device of the command line, until stdin ends: a process of `compiled_ahead`."""
+    stop, device = threading.Event(), wp.get_device(sys.argv[1])
+    threading.Thread(target=lambda: (os.read(0, 1), stop.set()), daemon=True).start()
+    compile_free(fit_kernels(device.is_cuda), device, stop.is_set)
+
+
+if __name__ == "__main__":
+    main()

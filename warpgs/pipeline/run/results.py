@@ -372,7 +372,7 @@ def result_lines(metrics: dict[str, Any], out: Path | None) -> list[str]:
         lines += [f"  for comparison, without a fit: {best}"] if best else []
         lines += [f"  {metrics['coverage']['summary']}"] if "coverage" in metrics else []
     compiling = metrics["seconds"].get("compiling", 0.0)
-    once = f", of which {duration(compiling)} to compile kernels, once on this machine" if compiling >= 1 else ""
+    once = ", with kernels compiled once on this machine" if compiling >= 1 else ""
     size = format_bytes(metrics["complexity"]["bytes"])
     times = metrics["wall_seconds"]
     lines.append(f"{metrics['gaussians']:,} Gaussians, {size}, in {duration(times['total'])}{once}: {largest(times)}")
