@@ -205,13 +205,18 @@ def rig_of(cameras: list[Camera], depth: float) -> Rig:
     )  # fmt: skip
 
 
-def up_of(cameras: list[Camera], points: np.ndarray) -> np.ndarray:
-    """Return the upward unit vector [3] of a scene for films, from training cameras and points [N, 3] [u]."""
+def rig_among(cameras: list[Camera], points: np.ndarray) -> Rig:
+    """Return the arrangement of training cameras around their subject among points [N, 3] [u]."""
     depths = np.concatenate(
         [geometry.matmul(points - c.center, c.viewmat[2, :3]) for c in cameras[:: max(1, len(cameras) // 5)]]
     )
     ahead = depths[depths > 0]
-    return rig_of(cameras, float(np.median(ahead)) if len(ahead) else 1.0).up
+    return rig_of(cameras, float(np.median(ahead)) if len(ahead) else 1.0)
+
+
+def up_of(cameras: list[Camera], points: np.ndarray) -> np.ndarray:
+    """Return the upward unit vector [3] of a scene for films, from training cameras and points [N, 3] [u]."""
+    return rig_among(cameras, points).up
 
 
 def common_up(cameras: list[Camera]) -> np.ndarray | None:
@@ -472,6 +477,17 @@ def _neighbour_tour(distances: list[list[float]]) -> list[int]:
                     order[i : j + 1] = order[i : j + 1][::-1]
                     improved = True
     return order
+
+
+def midways(rig: Rig, cameras: list[Camera], most: int) -> list[tuple[int, int, Camera]]:
+    """Return upright cameras midway between up to ``most`` pairs of neighbouring cameras, with the indices of each pair."""
+    distances = np.array(_distances(cameras))
+    np.fill_diagonal(distances, np.inf)
+    pairs = sorted({(min(i, j), max(i, j)) for i, j in enumerate(distances.argmin(1).tolist())}) if len(cameras) > 1 else []
+    chosen = [pairs[i] for i in np.unique(np.linspace(0, len(pairs) - 1, min(most, len(pairs))).round().astype(int))]
+    frames = [framed(upright(rig, c)) for c in cameras]
+    ends = [[Keyframe(frames[k], t, rig.reach(cameras[k])) for t, k in enumerate(pair)] for pair in chosen]
+    return [(i, j, through(keyframes, 3)[1]) for (i, j), keyframes in zip(chosen, ends)]
 
 
 def tour_of(cameras: list[Camera], reaches: list[float], seconds: float, most: int) -> tuple[list[Keyframe], bool, bool]:
