@@ -306,7 +306,7 @@ def test_close_ups_do_not_cut_the_subject_off(model, monkeypatch, azimuths):
         return bool((depths > 0).all() and (pixels > 0).all() and (pixels < (c.width, c.height)).all())
 
     assert [whole(c) for c in cameras] == [i % 5 >= 3 for i in range(len(cameras))]
-    monkeypatch.setattr(film, "depth_and_coverage", lambda *_: (4.0, 1.0))
+    monkeypatch.setattr(film, "depth_and_coverage", lambda *_: (2.5, 1.0))
     plan = plan_film(model, "auto", FilmSettings(frames=12))
     assert all(whole(c) for _, c in plan.cameras), plan.notes
     assert ("close-ups are left out" in plan.notes[-1]) == ("interpolate" in plan.notes[-1])
