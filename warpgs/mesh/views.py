@@ -125,7 +125,7 @@ def surface_view(
     z, certain = r.depth, torch.ones_like(r.depth)
     if r.heaviest_ids is not None and r.heaviest_weights is not None:
         z, share = surface_depth(gaussians, camera, r.heaviest_ids, r.heaviest_weights)
-        certain = torch.where(share >= MIN_SHARE, 1.0, UNCERTAIN if fill else 0.0)
+        certain = torch.where(share >= MIN_SHARE, certain, UNCERTAIN if fill else 0.0)
         z = torch.where(certain > 0, z, 0)
     z = torch.where(r.alpha >= MIN_ALPHA, z, torch.where(r.alpha <= EMPTY, torch.inf, 0.0)).contiguous()
     weights = face_cosines(z, camera) * torch.where(torch.isfinite(z), r.alpha * certain, 1.0)
