@@ -162,6 +162,12 @@ class Detail(str):
     __slots__ = ()
 
 
+class Task(str):
+    """A note that asks the user to act: it also stands in the last lines of the terminal, and first in the report."""
+
+    __slots__ = ()
+
+
 def printable(text: object) -> str:
     """Return text with codes in place of control characters, such as ESC, and of bytes that are not text."""
     return "".join(

@@ -224,9 +224,13 @@ class Scene:
         return {v.name: v for v in reversed(self.views)}  # the first of equal names
 
 
+Box = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""A box: middle [3] and full sides [3] [u], and a rotation [3, 3] whose columns are the directions of the sides."""
+
+
 @dataclass(frozen=True)
 class Mesh:
-    """A surface of triangles, coloured at its vertices."""
+    """A surface of triangles, coloured at its vertices, and by a texture if it has one."""
 
     vertices: np.ndarray
     """World positions [u], float64, shape [V, 3]."""
@@ -234,6 +238,10 @@ class Mesh:
     """Vertices of each triangle, counter-clockwise seen from outside, int32, shape [F, 3]."""
     colors: np.ndarray
     """Colours in [0, 1] (sRGB), float32, shape [V, 3]."""
+    texture: np.ndarray | None = None
+    """Image of the colours, 8-bit sRGB, shape [T, T, 3]; None for a mesh that has only colours at its vertices."""
+    uv: np.ndarray | None = None
+    """Place of each triangle's corners in the texture, from its upper left corner, in [0, 1], float32, shape [F, 3, 2]."""
 
 
 @dataclass(frozen=True)

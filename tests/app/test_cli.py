@@ -137,7 +137,8 @@ def test_eval_measures_lpips(run, tmp_path, capsys):
 
 
 @pytest.mark.parametrize(("path", "pictures"), [("auto", 4), ("turntable", 4), ("spiral", 4), ("interpolate", 4), ("views", 9)])
-def test_render_paths(run, tmp_path, path, pictures, capsys):
+def test_render_paths(run, tmp_path, path, pictures, capsys, monkeypatch):
+    monkeypatch.setattr("warpgs.pipeline.run.commands.h264_encoder", lambda: None)
     flags = ["--path", path, *([] if path == "views" else ["--frames", "4"]), "--out", str(tmp_path), "--sheet"]
     assert main(["render", str(run), *flags, "--device", "cpu"]) == 0
     assert len(list(tmp_path.glob("*.png"))) == pictures + 1 and (tmp_path / "film.mp4").stat().st_size > 0

@@ -1,6 +1,7 @@
 """Formats of files: each reads back what it wrote, says how it is rendered, and a stranger's file ends in one sentence."""
 
 import base64
+import dataclasses
 import gzip
 import importlib.util
 import json
@@ -10,6 +11,7 @@ import sys
 import warnings
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -839,6 +841,29 @@ def test_glb_holds_the_mesh(tmp_path):
     assert np.array_equal(indices.reshape(-1, 3), TETRAHEDRON.faces) and (colors[:, 3] == 65535).all()
     assert np.allclose(colors[:, :3] / 65535, linear(TETRAHEDRON.colors), atol=1e-5)
     assert linear(np.array([0.0, 0.04, 0.5, 1.0])) == pytest.approx([0, 0.04 / 12.92, 0.21404, 1], abs=1e-5)
+
+
+def test_glb_holds_the_texture(tmp_path):
+    """Corners keep their places; vertices are shared where corners agree; a triangle without a place keeps its colours."""
+    uv = np.array([[[0, 0], [0, 1], [1, 0]], [[0, 0], [1, 0], [1, 1]], [[0.5, 1]] * 3, [[0.5, 1]] * 3], np.float32)
+    texture = np.random.default_rng(0).integers(0, 255, (8, 8, 3), np.uint8)
+    write_mesh(tmp_path / "a.glb", dataclasses.replace(TETRAHEDRON, texture=texture, uv=uv))
+    text, data = glb(tmp_path / "a.glb")
+    views = [data[v["byteOffset"] : v["byteOffset"] + v["byteLength"]] for v in text["bufferViews"]]
+    kinds = ((np.dtype("<f4"), 3), (np.dtype("<u2"), 4), (np.dtype("<u4"), 3), (np.dtype("<f4"), 2))
+    positions, colors, faces, places = (np.frombuffer(v, d).reshape(-1, n) for v, (d, n) in zip(views, kinds))
+    assert np.allclose(positions[faces] + text["nodes"][1]["translation"], TETRAHEDRON.vertices[TETRAHEDRON.faces])
+    assert (
+        np.array_equal(places[faces], uv) and len(positions) == 8 and [a["count"] for a in text["accessors"]] == [8, 8, 12, 8]
+    )
+    assert (colors[faces[:2]] == 65535).all()
+    assert np.allclose(colors[faces[2:], :3] / 65535, linear(TETRAHEDRON.colors)[TETRAHEDRON.faces[2:]], atol=1e-5)
+    image = cv2.imdecode(np.frombuffer(views[4], np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
+    assert np.abs(image.astype(int) - texture).mean() < 12 and all(v["byteOffset"] % 4 == 0 for v in text["bufferViews"])
+    (primitive,) = text["meshes"][0]["primitives"]
+    assert primitive["attributes"] == {"POSITION": 0, "COLOR_0": 1, "TEXCOORD_0": 3}
+    assert text["materials"][primitive["material"]]["pbrMetallicRoughness"]["baseColorTexture"] == {"index": 0}
+    assert (text["textures"], text["images"]) == ([{"source": 0}], [{"bufferView": 4, "mimeType": "image/jpeg"}])
 
 
 def test_upwards_becomes_y():

@@ -183,7 +183,7 @@ REASONS = {
         "onnx_bytes": OWN},
     "report/film.py": {"_decoded_sizes": OWN},
     "report/images.py": {"webp": OWN},
-    "report/overview.py": {"_rendered": OWN, "_with_legend": OWN},
+    "report/overview.py": {"_rendered": OWN, "_with_legend": OWN}, "report/page.py": {"_aspect": OWN},
     "kernels/native.py": {"source": "reads a file of the package",
         "exclusive": "opens a lock"},
     "clock.py": {"_age": SYSTEM},

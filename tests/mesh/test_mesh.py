@@ -12,7 +12,7 @@ from tests.mesh.balls import ALL_SIDES, CENTER, RADIUS, RED, ball, cameras
 from warpgs import rasterize
 from warpgs.app.cli import main
 from warpgs.errors import DataError, ResourceError, UsageError
-from warpgs.geometry import rotation_matrices
+from warpgs.geometry import project_points, rotation_matrices
 from warpgs.mesh import fuse as fusing
 from warpgs.mesh import views
 from warpgs.mesh.fuse import (
@@ -21,11 +21,13 @@ from warpgs.mesh.fuse import (
     check_memory,
     decimate,
     extract,
+    fill_holes,
     find_box,
     fuse,
     parts,
     plan_grid,
     remove_small_parts,
+    textured,
     vertex_colors,
 )
 from warpgs.mesh.views import (
@@ -73,6 +75,75 @@ def test_the_ball_is_found_in_its_colours(fused):
     colors, count = vertex_colors(more, SurfaceViews(ball(), cameras(ALL_SIDES), RENDER, "median"), fused.plan.truncation)
     assert count == fused.uncolored + 2 and np.array_equal(colors[:-2], fused.mesh.colors)
     assert colors[-2, 0] > 0.5 > colors[-2, 2] and colors[-1, 2] > 0.5 > colors[-1, 0]
+
+
+def test_each_triangle_shows_the_view_in_which_it_is_largest(fused):
+    """The texture has the colours of the vertices, without a seam; no texture where triangles are as fine as pixels."""
+    mesh = fused.mesh
+    height, width = mesh.texture.shape[:2]
+    columns, rows = np.clip((mesh.uv.mean(1) * [width, height]).astype(int), 0, [width - 1, height - 1]).T
+    flat = (mesh.uv == mesh.uv[:, :1]).all((1, 2))
+    assert flat.mean() < 0.2 and mesh.texture.dtype == np.uint8 and max(height, width) <= 4096
+    assert (mesh.texture[rows[flat], columns[flat]] == 255).all() and mesh.uv.min() >= 0 and mesh.uv.max() <= 1
+    texels, colors = mesh.texture[rows, columns] / 255, mesh.colors[mesh.faces].mean(1)
+    off = np.abs(texels - colors).max(1)[~flat]
+    assert np.median(off) < 0.03 and np.quantile(off, 0.95) < 0.3
+    views = SurfaceViews(ball(), cameras(ALL_SIDES), RENDER, "median")
+    plain = dataclasses.replace(mesh, texture=None, uv=None)
+    assert textured(plain, views, fused.plan.truncation, 1.0) is plain
+    again = textured(plain, views, fused.plan.truncation, 0.02)
+    assert np.array_equal(again.uv, mesh.uv) and np.array_equal(again.texture, mesh.texture)
+    largest = np.max([doubled_areas(project_points(c, mesh.vertices)[0][mesh.faces]) for c in cameras(ALL_SIDES)], axis=0)
+    assert np.median(doubled_areas(mesh.uv * [width, height])[~flat]) > 0.5 * np.median(largest)
+
+
+def doubled_areas(corners: np.ndarray) -> np.ndarray:
+    a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    return np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
+
+
+def test_a_mesh_of_the_subject_alone():
+    """What a third of the cameras look at, at a finer voxel; or what is in a box; an empty box is an error."""
+    far = dataclasses.replace(ball(), means=ball().means + torch.tensor([9.0, 0, 0]))
+    both = Gaussians(*(torch.cat(pair) for pair in zip(ball().tensors().values(), far.tensors().values())))
+    front = cameras(np.array([[0, 0, -1], [0.2, 0, -1], [0, 0.2, -1], [0.1, 0.1, -1], [0.2, 0.2, -1]]))
+    shift = np.eye(4) - 9 * np.eye(4)[:, :1] * np.eye(4)[3:]
+    aside = [dataclasses.replace(c, viewmat=c.viewmat @ shift) for c in front[:2]]
+    views, options = [*front, *aside], MeshOptions(resolution=24)
+    whole = fuse(both, views, RENDER, options).mesh
+    assert whole.vertices[:, 0].max() > 9
+    cropped = fuse(both, views, RENDER, dataclasses.replace(options, crop="auto"))
+    assert cropped.mesh.vertices[:, 0].max() < 1.7 and cropped.plan.voxel < 0.15
+    turn = np.array([[0.8, -0.6, 0], [0.6, 0.8, 0], [0, 0, 1]])
+    box = CENTER + np.array([9, 0, -1]), np.array([1.2, 1.0, 2.0]), turn
+    part = fuse(both, views, RENDER, MeshOptions(voxel=0.1, crop=box)).mesh
+    inside = (part.vertices - box[0]) @ turn
+    assert len(part.faces) > 50 and (np.abs(inside) <= box[1] / 2).all() and (np.abs(inside).max(0)[:2] > 0.4).all()
+    with pytest.raises(DataError, match="no surface is inside the box"):
+        fuse(both, views, RENDER, MeshOptions(crop=(box[0] + 99, *box[1:])))
+    with pytest.raises(UsageError, match="--crop must be auto or a box, not 'subject'"):
+        MeshOptions(crop="subject")
+
+
+def test_holes_are_filled_on_request():
+    """Uncertain and contradicted depths count a thousandth, so certain ones win; small holes are closed, large ones stay."""
+    c = cameras(np.array([[0, 0, -1.0]]))[0]
+    mist = dataclasses.replace(ball(), logit_opacities=torch.full((3000,), -1.0))
+    open_view, filled = surface_view(mist, c, RENDER), surface_view(mist, c, RENDER, fill=True)
+    unsure = (open_view.depth == 0) & (filled.depth > 0)
+    assert 100 < int(unsure.sum()) and torch.equal(open_view.depth[~unsure], filled.depth[~unsure])
+    assert 0 < float(filled.weights[unsure].max()) <= 1e-3 and not bool(open_view.weights[unsure].any())
+    assert len(sample_surface(filled, 10**6)[0]) == len(sample_surface(open_view, 10**6)[0])
+    contradicted = agreed(wall(0.0), [depth_map(wall(0.5, 6.0), 2)], fill=True)
+    assert bool((contradicted.depth == 4).all()) and float(contradicted.weights[:, 20:].max()) == pytest.approx(1e-3)
+    mesh = extract(*grid_of(sphere))
+    middles = mesh.vertices[mesh.faces].mean(1)
+    hole = (np.linalg.norm(middles - [1, 0, 0], axis=1) < 0.25) | (np.linalg.norm(middles - np.array([-1, 0, 0]), axis=1) < 0.7)
+    holed = dataclasses.replace(mesh, faces=mesh.faces[~hole])
+    closed = fill_holes(holed, 0.5)
+    area, normals, added = areas_and_normals(dataclasses.replace(closed, faces=closed.faces[len(holed.faces) :]))
+    assert area.sum() == pytest.approx(0.202, rel=0.1) and (added[:, 0] > 0.9).all()
+    assert ((normals * added).sum(1) > 0).all(), "they face outwards"
 
 
 def test_the_back_that_nobody_saw_stays_open():
@@ -136,6 +207,18 @@ def test_the_command_writes_in_units_of_the_files(stored, tmp_path, capsys):
     away = (vertices - [10, 20, 30]) * 0.5 - CENTER
     assert np.abs(np.linalg.norm(away, axis=1) - RADIUS).mean() < 0.05
     assert sorted(p.name for p in tmp_path.iterdir() if not p.name.startswith(".")) == ["a.ply"]
+
+
+def test_the_command_crops_in_units_of_the_files(stored, tmp_path, capsys):
+    """A box of six numbers, as of `warpgs export`; both flags in one call."""
+    low, high = (np.array([10, 20, 30]) + (CENTER + s) / 0.5 for s in ([-2, -2, -2], [0, 2, 2]))
+    words = ["--crop", ",".join(f"{v:g}" for v in (*low, *high)), "--fill-holes", "--voxel", "0.16", "--device", "cpu"]
+    assert main(["mesh", "run", "--out", str(tmp_path / "a.glb"), *words]) == 0
+    assert main(["mesh", "run", "--out", str(tmp_path / "a.ply"), *words]) == 0
+    head, body = (tmp_path / "a.ply").read_bytes().split(b"end_header\n", 1)
+    vertices = np.frombuffer(body, [("x", "<f4", 3), ("c", "u1", 3)], int(head.split(b"element vertex ")[1].split()[0]))["x"]
+    assert len(vertices) > 100 and (vertices >= low).all() and (vertices <= high).all()
+    assert b"TEXCOORD_0" in (tmp_path / "a.glb").read_bytes()
 
 
 def test_upright_where_the_cameras_agree(stored, tmp_path, capsys):

@@ -15,6 +15,7 @@ import warpgs
 from tests.scenes import ring, three_gaussians
 from warpgs.errors import DataError, UsageError
 from warpgs.geometry import look_at, project_points
+from warpgs.pipeline.films import film
 from warpgs.pipeline.films.film import FilmPlan, FilmSettings, fault_notes, fault_of, plan_film, render_film
 from warpgs.pipeline.films.paths import (
     BY_KIND,
@@ -275,7 +276,7 @@ def test_the_rig_is_found(cameras, kind, all_round):
 
 
 def test_a_film_of_one_side_stays_near_the_photographs():
-    """Over a wide arc it goes from one to the next; a spiral is as far from the scene as their mean place, and among them."""
+    """Over a wide arc it goes from one to the next; a spiral is as far from the scene as the photographs, and among them."""
     wide, narrow = around(np.arange(0, 70, 12)), around(np.arange(0, 31, 6))
     assert [path_of(rig_of(c, 2.0)) for c in (wide, narrow)] == ["interpolate", "spiral"]
     rig = rig_of(narrow, 2.0)
@@ -288,8 +289,38 @@ def test_a_film_of_one_side_stays_near_the_photographs():
         assert np.allclose(c.viewmat[:3, :3] @ c.viewmat[:3, :3].T, np.eye(3), atol=1e-12)
     eyes = np.array([c.center for c in path])
     assert np.linalg.norm(eyes - np.roll(eyes, 1, 0), axis=1).max() < 0.5  # the last is near the first
-    np.testing.assert_allclose((eyes - centers.mean(0)) @ ahead, 0, atol=1e-9)
+    np.testing.assert_allclose((rig.center - eyes) @ ahead, np.linalg.norm(rig.center - centers[0]), rtol=0.002)
     assert np.linalg.norm(eyes - centers.mean(0), axis=1).max() < np.linalg.norm(centers - centers.mean(0), axis=1).max()
+
+
+@pytest.mark.parametrize("azimuths", [np.arange(0, 360, 30), np.arange(0, 30, 3), np.arange(0, 96, 10)])
+def test_close_ups_do_not_cut_the_subject_off(model, monkeypatch, azimuths):
+    """Beside six of ten photographs from 1.5 units, a film shows a ball that those from 4 units show whole."""
+    cameras = [around([a], distance=1.5 if i % 5 < 3 else 4.0)[0] for i, a in enumerate(azimuths)]
+    named = {str(i): c for i, c in enumerate(cameras)}
+    model = dataclasses.replace(model, scene_cameras=named, train=tuple(named))
+    shape = TARGET + 0.9 * np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1.0]])
+
+    def whole(c: Camera) -> bool:
+        pixels, depths = project_points(c, shape)
+        return bool((depths > 0).all() and (pixels > 0).all() and (pixels < (c.width, c.height)).all())
+
+    assert [whole(c) for c in cameras] == [i % 5 >= 3 for i in range(len(cameras))]
+    monkeypatch.setattr(film, "depth_and_coverage", lambda *_: (2.5, 1.0))
+    plan = plan_film(model, "auto", FilmSettings(frames=12))
+    assert all(whole(c) for _, c in plan.cameras), plan.notes
+    assert ("close-ups are left out" in plan.notes[-1]) == ("interpolate" in plan.notes[-1])
+
+
+def test_a_film_has_the_shape_of_most_photographs():
+    """One wide photograph among upright ones, first by name, does not make the film wide."""
+    cameras = around(np.arange(0, 60, 12))
+    tall = [dataclasses.replace(c, width=30, height=40, K=c.K[[1, 0, 2]][:, [1, 0, 2]]) for c in cameras[1:]]
+    mixed = [cameras[0], *tall]
+    rig = rig_of(mixed, 4.0)
+    keys = tour_of(mixed, [rig.reach(c) for c in mixed], 2.0, 100)[0]
+    for path in (camera_path("spiral", rig, mixed, 3), camera_path("turntable", rig, mixed, 3), through(keys, 5)):
+        assert {(c.width, c.height) for c in path} == {(30, 40)}
 
 
 @pytest.mark.parametrize("roll", [(0, 0), (90, 90), (3, -4)])

@@ -10,12 +10,14 @@ import pytest
 import torch
 
 from tests.gaussians import cloud
+from tests.mesh.balls import ball, cameras
 from tests.pipeline.test_sampling import CONFIG as UNIFORM
 from tests.pipeline.test_sampling import METHOD
 from tests.scenes import photos, priors, seeds, three_gaussians
 from warpgs.constants import RULES, TILE_SIZE
 from warpgs.errors import ResourceError, UsageError
-from warpgs.pipeline.metrics.scores import render_view, score
+from warpgs.pipeline.films.paths import rig_among
+from warpgs.pipeline.metrics.scores import Renders, render_view, score
 from warpgs.pipeline.model.start import InitConfig, initial_gaussians
 from warpgs.pipeline.paper.strategy import PaperConfig
 from warpgs.pipeline.run import results
@@ -25,6 +27,7 @@ from warpgs.pipeline.run.results import (
     evaluate_run,
     event_figures,
     images_kept,
+    new_view,
     result_lines,
     rule_report_of,
     sampling_report_of,
@@ -80,6 +83,23 @@ def test_without_held_out_views_training_views_are_pictured(scene, tmp_path, mon
         evaluate_run(tmp_path, gaussians, views[:1], views[1:3], options)
 
 
+def test_the_first_image_is_a_new_view_where_two_photographs_agree():
+    """Midway between two neighbours that show the ball, not between two that look away; none of one view or another lens."""
+    near = np.array([[-0.3, 0, -1], [0.3, 0, -1]])
+    back = np.diag([-1.0, 1, -1, 1])
+    away = [dataclasses.replace(c, viewmat=back @ c.viewmat) for c in cameras(near + np.array([0, 3.0, 0]))]
+    views = [View(name, c, np.zeros((72, 72, 3), np.float32)) for name, c in zip("abcd", [*away, *cameras(near)])]
+    render = Renders(ball(), RasterizeOptions())
+    rig = rig_among([v.camera for v in views[2:]], ball().means.numpy())
+    ((image, words),) = new_view(rig, views, ball(), RasterizeOptions(), render)
+    assert words == "a new viewpoint, between c and d"
+    middle = rasterize(ball(), cameras(np.array([[0, 0, -1.0]]))[0]).rgb.numpy()
+    np.testing.assert_allclose(image, middle, atol=0.15)
+    flat = [dataclasses.replace(v, camera=dataclasses.replace(v.camera, model="orthographic")) for v in views]
+    for none in (views[2:3], flat):
+        assert new_view(rig, none, ball(), RasterizeOptions(), render) == []
+
+
 def test_a_fit_ends_with_its_score_its_size_its_time_and_what_to_do_next(tmp_path):
     """The commands name the run as a shell takes it; time for kernels is told where there was some."""
     metrics = {
@@ -97,6 +117,8 @@ def test_a_fit_ends_with_its_score_its_size_its_time_and_what_to_do_next(tmp_pat
     assert lines[4] == f"report: {out / 'report.html'}"
     commands = [f"view '{out}'", f"render '{out}'", f"export '{out}' --to scene.html"]
     assert [line.split("  ")[1] for line in lines[6:]] == [f"warpgs {words}" for words in commands]
+    asked = result_lines(metrics, out, ["remove blurred ones"])
+    assert asked == [*lines[:4], "to do:", "  remove blurred ones", *lines[4:]]
     quick = {"seconds": {"total": 4.0}, "wall_seconds": {"import": 5.0, "total": 5.0}}
     unscored = result_lines(metrics | {"test": {}} | quick, None)
     assert unscored[0] == "training PSNR 30.25 dB (no score of new views: no view is held out)"

@@ -1,5 +1,6 @@
 """The search for poses: its parts, whole scenes from photographs, interruptions, and fits that find poses once."""
 
+import dataclasses
 import os
 import re
 import shutil
@@ -20,7 +21,7 @@ from warpgs.errors import DataError, ResourceError, UsageError
 from warpgs.files import write_json
 from warpgs.io.load import load_scene
 from warpgs.pipeline.run import fit as module
-from warpgs.pipeline.run.fit import fit, lost_lines, with_poses
+from warpgs.pipeline.run.fit import fit, pose_tasks, title_of, with_poses
 from warpgs.pipeline.run.folder import StoredRun, run_folder
 from warpgs.pipeline.run.request import SceneRequest
 from warpgs.poses import find, mapping
@@ -38,6 +39,7 @@ from warpgs.poses.photographs import (
     without_png_metadata,
     write_frames,
 )
+from warpgs.process import Task
 
 # From photographs to a scene with poses; whatever does not work ends in a sentence and leaves nothing behind.
 
@@ -276,16 +278,21 @@ def test_poses_are_kept_in_the_run_folder(tmp_path, photographs, found, monkeypa
             pass
 
 
-def test_photographs_without_a_pose_are_told_of_at_the_end(tmp_path, found):
+def test_a_run_of_photographs_has_their_name_and_ends_with_what_to_do(tmp_path, found, photographs):
+    """The photographs without a pose, and the first three pieces of advice; nothing where all are well linked."""
     scene = tmp_path / "scene"
     scene.mkdir()
-    rows = found[1]["photographs"]
-    missing = f"2 of 6 photographs have no pose and were not used: {scene / 'poses.txt'} lists reasons and remedies"
-    for lost, said in ((0, []), (2, [missing])):
+    rows, missing = found[1]["photographs"], "2 of 6 photographs have no pose and were not used: scene/poses.txt in the run"
+    for lost, said in ((0, []), (2, [missing, *("to photograph next: " + a for a in "abc")])):
         unposed = [p | {"registered": False, "reason": "has none"} for p in rows[:lost]]
-        write_json(scene / JSON, found[1] | {"photographs": [*unposed, *rows[lost:]]})
-        assert [line.partition(", and")[0] for line in lost_lines(tmp_path)] == said
-    assert lost_lines(None) == lost_lines(scene) == []
+        write_json(scene / JSON, found[1] | {"photographs": [*unposed, *rows[lost:]], "advice": [*"abcd"][: 2 * lost]})
+        tasks = pose_tasks(tmp_path)
+        assert [line.partition(" folder")[0] for line in tasks] == said and all(isinstance(t, Task) for t in tasks)
+    assert pose_tasks(None) == pose_tasks(scene) == []
+    assert title_of(scene, tmp_path) == photographs.name != tmp_path.name
+    assert title_of(scene, tmp_path / "other") == "scene" and title_of(tmp_path / "garden", tmp_path) == "garden"
+    write_json(scene / JSON, {k: v for k, v in found[1].items() if k != "source"})  # as version 0.1 wrote it
+    assert title_of(scene, tmp_path) == tmp_path.name
 
 
 def test_other_requests_stay_as_they_are(tmp_path, photographs, found):
@@ -445,5 +452,15 @@ def test_reasons_and_advice():
     joined = found_mapping(matches={(0, 1): 200, (1, 2): 90, (2, 3): 9, (3, 4): 300}, keypoints=(900, 800, 700, 600, 500))
     assert "between d and c" in advice(joined, names)[0] and "photographs from e to the others" in advice(joined, names)[1]
     assert len(advice(joined, names)) == 2, "b and c match well, though their axes differ"
+    apart = found_mapping(
+        keypoints=(900,) * 7, groups=((0, 1, 2), (3, 4, 5)),
+        matches={(0, 1): 200, (1, 2): 90, (3, 4): 40, (4, 5): 50, (2, 4): 8, (1, 5): 5, (5, 6): 20},
+    )  # fmt: skip
+    bridge, other = advice(apart, [*names, "f", "g"])
+    assert "between e and c" in bridge and bridge.endswith("3 photographs form a separate group, d to f")
+    assert "photographs from g to the others" in other, "a photograph without a pose is no place to start from"
+    assert (
+        "from d to the photographs outside its group" in advice(dataclasses.replace(apart, matches={}), [*names, "f", "g"])[0]
+    )
     well = found_mapping(keypoints=(900, 800), matches={(0, 1): 200}, views=dict(list(found.views.items())[:2]))
     assert advice(well, ["a", "b"]) == []

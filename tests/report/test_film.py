@@ -1,5 +1,7 @@
 """Films: VP9 and animated images hold what they were given, and what is not whole never takes the place of what was there."""
 
+import os
+import sys
 from types import SimpleNamespace
 
 import cv2
@@ -8,7 +10,60 @@ import pytest
 from PIL import Image
 
 from warpgs.errors import DataError, ResourceError, UsageError
+from warpgs.report import film as film_files
 from warpgs.report.film import MAX_FPS, _with_one_palette, write_film
+
+encoder = film_files.h264_encoder.__wrapped__  # as it is without a cache
+
+
+@pytest.fixture(autouse=True)
+def without_ffmpeg(monkeypatch):
+    """As on a machine without ffmpeg, except in the test of ffmpeg."""
+    monkeypatch.setattr(film_files, "h264_encoder", lambda: None)
+
+
+FFMPEG = """#!{python}
+import sys, cv2, numpy as np
+words = sys.argv[1:]
+assert words[words.index("-c:v") + 1] == "h264", words
+if "lavfi" in words:
+    sys.exit({code})
+width, height = map(int, words[words.index("-s") + 1].split("x"))
+film = cv2.VideoWriter(words[-1], cv2.VideoWriter_fourcc(*"vp09"), float(words[words.index("-r") + 1]), (width, height))
+while data := sys.stdin.buffer.read(3 * width * height):
+    film.write(np.frombuffer(data, np.uint8).reshape(height, width, 3)[..., ::-1])
+    {more}
+film.release()
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="scripts have no #! line")
+@pytest.mark.parametrize(("code", "more", "used"), [(0, "pass", True), (1, "pass", False), (0, "sys.exit()", True)])
+def test_ffmpeg_encodes_if_it_can(tmp_path, monkeypatch, code, more, used):
+    """It gets all frames in order; one that has no encoder is not used; one that ends early leaves the old film."""
+    monkeypatch.setattr(film_files, "h264_encoder", encoder)
+    program, path = tmp_path / "bin" / "ffmpeg", tmp_path / "out" / "a.mp4"
+    for folder in (program.parent, path.parent):
+        folder.mkdir()
+    program.write_text(FFMPEG.format(python=sys.executable, code=code, more=more))
+    program.chmod(0o755)
+    path.write_bytes(b"old")
+    monkeypatch.setenv("PATH", str(program.parent))
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(sys.path))
+    assert encoder() == (str(program) if used else None)
+    frames = (np.broadcast_to(np.eye(3)[i // 4], (48, 65, 3)) for i in range(12))
+    if more != "pass":
+        with pytest.raises(ResourceError, match="only 1 of 12 frames"):
+            write_film(path, frames)
+        assert path.read_bytes() == b"old"
+    else:
+        assert write_film(path, frames, fps=24) == 12
+        film = cv2.VideoCapture(str(path))
+        colors = [film.read()[1][..., ::-1].mean((0, 1)).argmax() for _ in range(12)]
+        assert colors == [i // 4 for i in range(12)] and not film.read()[0]
+    assert list(path.parent.iterdir()) == [path]
+    monkeypatch.chdir(program.parent)
+    assert encoder() is None, "a program in the current folder is not run"
 
 
 @pytest.mark.parametrize(("name", "shape"), [("a.mp4", (48, 64)), ("a.webm", (49, 65))])

@@ -16,7 +16,7 @@ from rich.console import Console
 
 from warpgs.errors import ResourceError
 from warpgs.files import write_json
-from warpgs.process import Detail
+from warpgs.process import Detail, Task
 from warpgs.report.farm import FarmTable, JobRow, farm_page
 from warpgs.report.images import png, webp
 from warpgs.report.page import curve, write_page
@@ -72,7 +72,8 @@ def write(path, **changes):
         "scores": [["view", "PSNR [dB]"], ["images/0.png", "20.25"], ["images/1.png", "21.25"]],
         "views": views, "curves": [curve("Training loss", [1, 2, 3], [0.3, 0.2, 0.1])],
         "sampling": ("Two sentences.", [("first", image(0.31)), ("later", image(0.32))], [["added"], ["12"]], ""),
-        "overview": webp(np.full((6, 8, 3), 0.7)), "protocol": {"ground truth": "images_8 as stored", "LPIPS": "not measured"},
+        "pictures": [(webp(np.full((6, 8, 3), v)), w) for v, w in ((0.6, "a new viewpoint"), (0.7, "the Gaussians"))],
+        "protocol": {"ground truth": "images_8 as stored", "LPIPS": "not measured"},
         "held_out": True, "coverage": None, "record": {"config": {"steps": 2000}, "versions": {"torch": "2"}},
     }  # fmt: skip
     values |= changes
@@ -106,7 +107,7 @@ def test_all_images_are_embedded_byte_for_byte(tmp_path):
     values, _, page = write(tmp_path / "report.html")
     embedded = [base64.b64decode(a["src"].split(",", 1)[1], validate=True) for a in page.all("img")]
     given = [data for v in values["views"] for data in v[2:]]
-    given += [values["overview"], *(data for _, data in values["sampling"][1])]
+    given += [*(data for data, _ in values["pictures"]), *(data for _, data in values["sampling"][1])]
     assert sorted(embedded) == sorted(given)
     for data in embedded:
         assert cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR).shape == (6, 8, 3)
@@ -150,7 +151,7 @@ def test_names_from_files_cannot_become_markup(tmp_path):
 
 def test_parts_that_are_not_there_leave_no_empty_heading(tmp_path):
     _, _, page = write(
-        tmp_path / "report.html", notes=[], scores=[["view"]], views=[], curves=[], sampling=None, overview=None, protocol={}
+        tmp_path / "report.html", notes=[], scores=[["view"]], views=[], curves=[], sampling=None, pictures=[], protocol={}
     )
     assert page.text("h2") == ["Details"] and not page.all("img") and not page.all("ul")
     for held_out, words in ((True, "Held-out"), (False, "trained on")):
@@ -158,12 +159,15 @@ def test_parts_that_are_not_there_leave_no_empty_heading(tmp_path):
 
 
 def test_what_nobody_acts_on_stands_in_the_last_section(tmp_path):
-    """Notes for the user come first, details last, and nothing twice; the overview is the first image."""
-    notes = ["every 8th view held out", Detail("memory: 14 MiB planned")]
-    _, text, page = write(tmp_path / "report.html", notes=notes)
+    """A new viewpoint and the overview open the page; then what to do, then the views, choices, details; nothing twice."""
+    notes = [Task("remove blurred ones"), "every 8th view held out", Detail("memory: 14 MiB planned")]
+    _, text, page = write(tmp_path / "report.html", notes=[notes[1], notes[2], notes[0]])
     assert page.text("li") == notes
-    assert text.index("Choices made for you") < text.index(notes[0]) < text.index("<h2>Details") < text.index(notes[1])
-    assert "the Gaussians" in page.all("img")[0]["alt"] and page.all("img")[0]["src"].startswith("data:image/webp")
+    order = ("<h2>To do", notes[0], "<h2>Held-out views", "<h2>Choices made for you", notes[1], "<h2>Details", notes[2])
+    assert [text.index(words) for words in order] == sorted(map(text.index, order))
+    first, overview = page.all("img")[:2]
+    assert (first["alt"], overview["alt"]) == ("a new viewpoint", "the Gaussians") and "data:image/webp" in first["src"]
+    assert text.count("--aspect:1.33") == 2
 
 
 def test_sampling_shows_the_first_image_and_the_others_on_request(tmp_path):

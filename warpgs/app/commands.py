@@ -167,23 +167,26 @@ def plot(
 
 def mesh(
     run: Positional[Path], *, out: Path, voxel: float | None = None, resolution: int | None = None, max_faces: int = 200_000,
-    depth: str = "median", device: str = "auto",
+    depth: str = "median", crop: str | None = None, fill_holes: bool = False, device: str = "auto",
 ) -> list[str]:  # fmt: skip
     """Make a mesh of a run.
 
     Args:
         run: Run folder of `warpgs fit`.
-        out: File to write: .ply, or .glb (glTF).
+        out: File to write: .ply (colours at the vertices), or .glb (glTF; with a texture if pixels are finer than triangles).
         voxel: Side of a voxel, in units of the scene's files; smaller voxels show more detail and more noise.
         resolution: Voxels along the longest side of the mesh, instead of --voxel. Default: 256, or fewer for small images.
         max_faces: Largest number of triangles; larger meshes are simplified.
         depth: Rendered depth to fuse: median, or mean, which is less accurate at edges.
+        crop: auto (the surfaces that at least a third of the training cameras look at), or a box as for `warpgs export --crop`.
+        fill_holes: Fill holes: with depths that are uncertain or that only one view sees, and small ones with flat triangles.
         device: auto, cpu or cuda.
     """
     from warpgs.mesh.fuse import MeshOptions
     from warpgs.pipeline.run import export
 
-    return export.mesh(run, out, MeshOptions(voxel, resolution, max_faces, depth), device, stage=Stages(), say=say)
+    options = MeshOptions(voxel, resolution, max_faces, depth, fill_holes=fill_holes)
+    return export.mesh(run, out, options, device, crop=crop, stage=Stages(), say=say)
 
 
 def prune(

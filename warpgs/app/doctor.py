@@ -248,8 +248,9 @@ def _video() -> Iterable[Finding]:
         import numpy as np
 
         from warpgs.folders import temporary_folder
-        from warpgs.report.film import write_film
+        from warpgs.report.film import h264_encoder, write_film
 
+        detail = "H.264 through ffmpeg" if h264_encoder() else detail
         with temporary_folder() as folder:
             write_film(folder.path / "probe.mp4", (np.full((64, 64, 3), level) for level in (0, 0.5, 1)), 10)
     except Exception as e:

@@ -1,8 +1,10 @@
 """Files of meshes and of cameras for other programs."""
 
+import io
 import os
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -78,39 +80,63 @@ def rotation_to_y(up: np.ndarray) -> list[float]:
     return unit
 
 
+def _jpeg(pixels: np.ndarray) -> bytes:
+    """Return 8-bit colours [H, W, 3] as a JPEG file of full chroma, padded to a multiple of four bytes."""
+    from PIL import Image
+
+    data = io.BytesIO()
+    Image.fromarray(pixels).save(data, "JPEG", quality=92, subsampling=0)
+    return data.getvalue() + b"\0" * (-len(data.getvalue()) % 4)
+
+
 def _glb(path: Path, mesh: Mesh, up: np.ndarray | None, origin: np.ndarray) -> list[bytes]:
-    """Return the chunks of a glTF 2.0 file: one node, one unlit mesh, positions, colours and triangles.
+    """Return the chunks of a glTF 2.0 file: one node, one unlit mesh, positions, and colours or a texture.
 
     Positions are float32 relative to their middle, the node's translation, because float32 is coarse far from the origin.
     """
     middle = (mesh.vertices.min(0) + mesh.vertices.max(0)) / 2 if len(mesh.vertices) else np.zeros(3)
-    positions = (mesh.vertices - middle).astype("<f4")
-    colors = np.full((len(mesh.vertices), 4), 65535, "<u2")
-    colors[:, :3] = np.round(65535 * linear(mesh.colors))
-    arrays = [positions.tobytes(), colors.tobytes(), mesh.faces.astype("<u4").tobytes()]
-    starts = np.cumsum([0, *map(len, arrays)]).tolist()
-    rotation = [0.0, 0.0, 0.0, 1.0] if up is None else rotation_to_y(up)
+    positions, faces, colors = (mesh.vertices - middle).astype("<f4"), mesh.faces, mesh.colors
+    attributes: dict[str, int] = {"POSITION": 0, "COLOR_0": 1}
+    material: dict[str, Any] = {"doubleSided": True, "extensions": {"KHR_materials_unlit": {}}}
+    textures: dict[str, Any] = {}
+    coordinates: list[bytes] = []
+    if mesh.texture is not None and mesh.uv is not None:  # which multiplies the colours: they are white where it shows
+        shown = (mesh.uv != mesh.uv[:, :1]).any((1, 2))
+        corners = np.concatenate([mesh.faces.reshape(-1, 1), mesh.uv.astype("<f4").view("<i4").reshape(-1, 2)], 1)
+        corners, first, number = np.unique(corners, axis=0, return_index=True, return_inverse=True)
+        faces, positions = number.reshape(-1, 3), positions[corners[:, 0]]
+        colors = np.where(shown.repeat(3)[first, None], 1, mesh.colors[corners[:, 0]])
+        coordinates = [np.ascontiguousarray(corners[:, 1:], "<i4").tobytes(), _jpeg(mesh.texture)]
+        textures = {"textures": [{"source": 0}], "images": [{"bufferView": 4, "mimeType": "image/jpeg"}]}
+        attributes["TEXCOORD_0"] = 3
+        material["pbrMetallicRoughness"] = {"baseColorTexture": {"index": 0}}
+    levels = np.full((len(positions), 4), 65535, "<u2")
+    levels[:, :3] = np.round(65535 * linear(colors))
+    arrays = [positions.tobytes(), levels.tobytes(), faces.astype("<u4").tobytes(), *coordinates]
     extent = {"min": positions.min(0).tolist(), "max": positions.max(0).tolist()} if len(positions) else {}
     kinds = [
         (5126, "VEC3", len(positions), extent),
-        (5123, "VEC4", len(colors), {"normalized": True}),
-        (5125, "SCALAR", mesh.faces.size, {}),
+        (5123, "VEC4", len(positions), {"normalized": True}),
+        (5125, "SCALAR", faces.size, {}),
+        (5126, "VEC2", len(positions), {}),
     ]
+    starts = np.cumsum([0, *map(len, arrays)]).tolist()
+    rotation = [0.0, 0.0, 0.0, 1.0] if up is None else rotation_to_y(up)
     text = {
         "asset": {"version": "2.0", "generator": f"warpgs {__version__}"},
         "extensionsUsed": ["KHR_materials_unlit"],
         "scene": 0, "scenes": [{"nodes": [0]}],
         "nodes": [{"children": [1], "rotation": rotation}, {"mesh": 0, "translation": middle.tolist()}],
-        "materials": [{"doubleSided": True, "extensions": {"KHR_materials_unlit": {}}}],
-        "meshes": [{"primitives": [{"attributes": {"POSITION": 0, "COLOR_0": 1}, "indices": 2, "material": 0}]}],
+        "materials": [material], **textures,
+        "meshes": [{"primitives": [{"attributes": attributes, "indices": 2, "material": 0}]}],
         "buffers": [{"byteLength": starts[-1]}],
         "bufferViews": [
-            {"buffer": 0, "byteOffset": begin, "byteLength": len(a), "target": target}
-            for begin, a, target in zip(starts, arrays, (34962, 34962, 34963))
+            {"buffer": 0, "byteOffset": begin, "byteLength": len(a)} | ({"target": target} if target else {})
+            for begin, a, target in zip(starts, arrays, (34962, 34962, 34963, 34962, 0))
         ],
         "accessors": [
             {"bufferView": i, "componentType": kind, "type": form, "count": count, **more}
-            for i, (kind, form, count, more) in enumerate(kinds)
+            for i, (kind, form, count, more) in enumerate(kinds[: len(arrays) - bool(textures)])
         ],
     }  # fmt: skip
     if origin.any():

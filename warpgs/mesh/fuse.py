@@ -1,7 +1,7 @@
 """Fusion of depth into a grid of signed distances, and its zero surface as triangles."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated, Any
 
@@ -10,11 +10,13 @@ import torch
 
 from warpgs.device import available_bytes, format_bytes
 from warpgs.errors import DataError, ResourceError, UsageError
+from warpgs.geometry import matmul, pinhole_of, project_points
 from warpgs.kernels.launch import MAX_SIZE
 from warpgs.kernels.tsdf import gather_colors, integrate
-from warpgs.mesh.views import DEPTHS, SAMPLES, SurfaceViews, agreed, depth_map, neighbours, sample_surface
+from warpgs.mesh.views import DEPTHS, SAMPLES, SurfaceView, SurfaceViews, agreed, depth_map, neighbours, sample_surface
 from warpgs.render.options import RasterizeOptions
-from warpgs.scene import Camera, Gaussians, Mesh
+from warpgs.report.images import resized
+from warpgs.scene import Box, Camera, Gaussians, Mesh
 from warpgs.schema import Checked, Within
 
 RESOLUTION = 256
@@ -65,6 +67,25 @@ def find_box(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.maximum(low, first - FENCE * (third - first)), np.minimum(high, third + FENCE * (third - first))
 
 
+SUBJECT = 1 / 3
+"""Fraction of the cameras that look at the subject: its surroundings are in fewer photographs."""
+
+
+def subject(points: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
+    """Mask [N] of the points [N, 3] [u] that are in the images of at least `SUBJECT` of the cameras, if any are."""
+    counts = np.zeros(len(points), int)
+    for camera in map(pinhole_of, cameras):
+        pixels, depths = project_points(camera, points)
+        counts += (depths > 0) & (pixels >= 0).all(1) & (pixels < [camera.width, camera.height]).all(1)
+    return counts >= min(SUBJECT * len(cameras), counts.max(initial=0))
+
+
+def inside(points: np.ndarray, box: Box) -> np.ndarray:
+    """Mask [N] of the points [N, 3] in a box."""
+    center, size, rotation = box
+    return (np.abs(matmul(points - center, rotation)) <= np.asarray(size) / 2).all(1)
+
+
 def plan_grid(
     points: np.ndarray, footprints: np.ndarray, voxel: float | None = None, resolution: int | None = None
 ) -> GridPlan:
@@ -101,6 +122,8 @@ def check_memory(plan: GridPlan, device: torch.device) -> str:
     return format_bytes(sum(needs.values()))
 
 
+HOLE = 8.0
+"""Half the diagonal of the box around the largest hole that is closed with flat triangles, in voxels."""
 MAX_JUMP = 1.1
 """Largest difference, in units of the truncation, of the distances at two neighbouring grid points with a surface between them.
 A smaller limit leaves out surfaces at grazing angles; with a larger one, false triangles extend behind depth edges. The limit
@@ -165,19 +188,33 @@ def remove_small_parts(mesh: Mesh, fraction: float = MIN_PART) -> tuple[Mesh, in
     return _compact(replace(mesh, faces=mesh.faces[keep[part]])), int((~keep).sum())
 
 
+def _scaled(mesh: Mesh) -> tuple[Any, np.ndarray, float]:
+    """Return VTK's form of a mesh, centred and scaled to size 1, since VTK computes in float32; its centre [3] and size [u]."""
+    import pyvista
+
+    middle = mesh.vertices.mean(0)
+    size = float(np.abs(mesh.vertices - middle).max()) or 1.0
+    return pyvista.PolyData.from_regular_faces(((mesh.vertices - middle) / size).astype(np.float32), mesh.faces), middle, size
+
+
 def decimate(mesh: Mesh, max_faces: int) -> Mesh:
     """Return a mesh of at most about ``max_faces`` triangles, without colours, by quadric error (Garland and Heckbert 1997)."""
     # This part of VTK needs no graphics library.
     if len(mesh.faces) <= max_faces:
         return mesh
-    import pyvista
-
-    # centred and scaled to size 1, since VTK computes in float32
-    middle = mesh.vertices.mean(0)
-    size = float(np.abs(mesh.vertices - middle).max()) or 1.0
-    data = pyvista.PolyData.from_regular_faces(((mesh.vertices - middle) / size).astype(np.float32), mesh.faces)
+    data, middle, size = _scaled(mesh)
     fewer = data.decimate(1 - max_faces / len(mesh.faces))
     return _compact(_grey(np.asarray(fewer.points, np.float64) * size + middle, fewer.regular_faces))
+
+
+def fill_holes(mesh: Mesh, radius: float) -> Mesh:
+    """Return a mesh without colours; holes are closed if half the diagonal of the box around them is below ``radius`` [u]."""
+    data, middle, size = _scaled(mesh)
+    # the triangles that VTK adds may face inwards; those it was given come first, and set the side
+    closed = data.fill_holes(radius / size).compute_normals(
+        cell_normals=False, consistent_normals=True, split_vertices=False, non_manifold_traversal=False
+    )
+    return _grey(np.asarray(closed.points, np.float64) * size + middle, closed.regular_faces)
 
 
 COLOR_TOLERANCE = 1.0
@@ -199,10 +236,17 @@ class MeshOptions(Checked, group="--"):
     """Largest number of triangles; larger meshes are simplified."""
     depth: Annotated[str, DEPTHS] = "median"
     """Rendered depth that is fused: median, or mean (expected depth), which mixes surfaces at edges."""
+    crop: str | Box | None = None
+    """Part of the scene: auto for the surfaces that at least a third of the cameras look at; or a box in the units of the
+    cameras: centre [3], sides [3] and rotation [3, 3], whose columns are the directions of the sides; None for everything."""
+    fill_holes: bool = False
+    """Fill holes: with depths that are uncertain or that only one view sees, and small ones with flat triangles."""
 
     def __post_init__(self) -> None:
         """Check the options, before any view is rendered."""
         super().__post_init__()
+        if isinstance(self.crop, str) and self.crop != "auto":
+            raise UsageError(f"--crop must be auto or a box, not {self.crop[:60]!r}")
         if None not in (self.voxel, self.resolution):
             raise UsageError("--voxel and --resolution exclude each other; give one of them")
 
@@ -236,15 +280,22 @@ def fuse(
     if not cameras:
         raise UsageError("fuse needs at least one camera that sees the surfaces")
     samples, maps, like = [], [], gaussians.means
-    views = SurfaceViews(gaussians, cameras, render, options.depth, stage)
+    fill, box = options.fill_holes, None if isinstance(options.crop, str) else options.crop
+    views = SurfaceViews(gaussians, cameras, render, options.depth, stage, fill)
     for view in views("finding surfaces"):
         samples.append(sample_surface(view, max(1, SAMPLES // len(cameras))))
         maps.append(depth_map(view, len(cameras)))
-    plan = plan_grid(*map(np.concatenate, zip(*samples)), options.voxel, options.resolution)
+    points, footprints = map(np.concatenate, zip(*samples))
+    if options.crop is not None and len(points):
+        kept = subject(points, cameras) if box is None else inside(points, box)
+        if not kept.any():
+            raise DataError("--crop: no surface is inside the box; give a larger box, in the units of the scene's files")
+        points, footprints = points[kept], footprints[kept]
+    plan = plan_grid(points, footprints, options.voxel, options.resolution)
     planned(plan, check_memory(plan, like.device))
     distances, weights, confirmed = like.new_zeros(plan.shape), like.new_zeros(plan.shape), False
     for view, others in zip(views("fusing depth"), neighbours(maps)):
-        view = agreed(view, [maps[i] for i in others])
+        view = agreed(view, [maps[i] for i in others], fill)
         confirmed = confirmed or bool(((view.depth > 0) & torch.isfinite(view.depth)).any())
         integrate(distances, weights, plan.origin, plan.voxel, plan.truncation, view.camera, view.depth, view.weights)
     del maps
@@ -254,26 +305,86 @@ def fuse(
     stage("finding triangles: marching cubes")
     whole = extract(plan, distances, weights)
     del distances, weights
+    if box is not None:
+        whole = _compact(replace(whole, faces=whole.faces[inside(whole.vertices, box)[whole.faces].all(1)]))
     cleaned, removed = remove_small_parts(whole)
+    if fill:
+        cleaned = fill_holes(cleaned, HOLE * plan.voxel)
     if len(cleaned.faces) > options.max_faces:
         stage(f"simplifying: {len(cleaned.faces):,} triangles")
     mesh = decimate(cleaned, options.max_faces)
     colors, uncolored = vertex_colors(mesh, views, plan.truncation)
-    return FusedMesh(replace(mesh, colors=colors), plan, unseen, len(whole.faces), removed, uncolored)
+    mesh = textured(replace(mesh, colors=colors), views, plan.truncation, float(np.median(footprints)))
+    return FusedMesh(mesh, plan, unseen, len(whole.faces), removed, uncolored)
+
+
+def seen_colors(vertices: np.ndarray, views: Iterable[SurfaceView], truncation: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the weighted mean colour that views see at points [N, 3] [u], [N, 3], and whether any sees them, [N]."""
+    for i, view in enumerate(views):
+        if i == 0:
+            points = torch.as_tensor(vertices, dtype=view.depth.dtype, device=view.depth.device)
+            sums, weights = torch.zeros_like(points), torch.zeros_like(points[:, 0])
+        tolerance = COLOR_TOLERANCE * truncation
+        gather_colors(points, tolerance, view.camera, view.depth, view.weights, view.image, sums, weights)
+    known = (weights > 0).cpu().numpy()
+    return sums.cpu().numpy() / np.maximum(weights.cpu().numpy(), np.finfo(np.float32).tiny)[:, None], known
 
 
 def vertex_colors(mesh: Mesh, views: SurfaceViews, truncation: float) -> tuple[np.ndarray, int]:
     """Return the weighted mean colour [V, 3] that views see at each vertex, and the number of vertices that none sees."""
-    tolerance = COLOR_TOLERANCE * truncation
-    for i, view in enumerate(views("colouring")):
-        if i == 0:
-            points = torch.as_tensor(mesh.vertices, dtype=view.depth.dtype, device=view.depth.device)
-            sums, weights = torch.zeros_like(points), torch.zeros_like(points[:, 0])
-        gather_colors(points, tolerance, view.camera, view.depth, view.weights, view.image, sums, weights)
-    known = (weights > 0).cpu().numpy()
-    colors = sums.cpu().numpy() / np.maximum(weights.cpu().numpy(), np.finfo(np.float32).tiny)[:, None]
+    colors, known = seen_colors(mesh.vertices, views("colouring"), truncation)
     if known.any() and not known.all():
         from scipy.spatial import cKDTree
 
         colors[~known] = colors[known][cKDTree(mesh.vertices[known]).query(mesh.vertices[~known])[1]]
     return np.clip(colors, 0, 1).astype(np.float32), int((~known).sum())
+
+
+# Texture: the renders of some views side by side. Each triangle shows the view in which it and its surroundings are largest, so
+# neighbours mostly stay neighbours: few seams, and mipmaps and anti-aliasing mix no strangers. Triangles that no view shows
+# whole have the colours of their vertices.
+
+MAX_TEXTURE = 4096
+"""Largest side of a texture [px]: all devices with WebGL 2 show it."""
+TEXTURE_VIEWS = 16
+"""Largest number of views in a texture, evenly spaced: of 16, each still has about a thousand pixels a side."""
+COARSE = 1.5
+"""Median length of an edge [pixels of the photographs] below which the colours at vertices hold all detail."""
+SPREAD = 20
+"""Number of times that the areas of triangles are averaged with those of their neighbours, over about 5 edges."""
+STRIP = 4
+"""Height of the white strip below the views [px], for triangles with the colours of their vertices."""
+
+
+def textured(mesh: Mesh, views: SurfaceViews, truncation: float, footprint: float) -> Mesh:
+    """Return a mesh with a texture, if its edges are longer than `COARSE` pixels, each ``footprint`` [u] wide."""
+    ends = mesh.vertices[mesh.faces]
+    if np.median(np.linalg.norm(ends - np.roll(ends, 1, 1), axis=2)) < COARSE * footprint:
+        return mesh
+    chosen = np.unique(np.linspace(0, len(views.cameras) - 1, TEXTURE_VIEWS).round().astype(int)).tolist()
+    size = np.max([(views.cameras[i].width, views.cameras[i].height) for i in chosen], axis=0)
+    columns = max(1, round(math.sqrt(len(chosen) * size[1] / size[0])))
+    grid = np.array([columns, -(-len(chosen) // columns)])
+    cell = np.minimum(size, (MAX_TEXTURE - STRIP) // grid)
+    cell = np.maximum(1, size * (cell / size).min()).astype(int)
+    texture = np.full((grid[1] * cell[1] + STRIP, grid[0] * cell[0], 3), 255, np.uint8)
+    largest, uv = np.zeros(len(ends)), np.full((*ends.shape[:2], 2), [STRIP / 2, len(texture) - STRIP / 2])
+    degree = np.bincount(mesh.faces.ravel(), minlength=len(mesh.vertices)).clip(1)
+    for k, view in enumerate(views("making the texture", chosen)):
+        colors, seen = seen_colors(mesh.vertices, [view], truncation)
+        gain = mesh.colors[seen].sum(0) / colors[seen].sum(0).clip(1e-6)  # of exposure and white balance
+        places = project_points(view.camera, mesh.vertices)[0][mesh.faces]
+        a, b = places[:, 1] - places[:, 0], places[:, 2] - places[:, 0]
+        shown = seen[mesh.faces].all(1)
+        area = np.where(shown, np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]), 0)
+        for _ in range(SPREAD):
+            area = (np.bincount(mesh.faces.ravel(), area.repeat(3), len(seen)) / degree)[mesh.faces].mean(1)
+        area = np.where(shown, area, 0)
+        better, start = area > largest, cell * [k % columns, k // columns]
+        width, height = (cell * [view.camera.width, view.camera.height] / size).astype(int).clip(1)
+        largest[better] = area[better]
+        uv[better] = start + places[better] * [width / view.camera.width, height / view.camera.height]
+        texture[start[1] : start[1] + height, start[0] : start[0] + width] = resized(
+            gain * view.image.cpu().numpy(), width, height
+        )
+    return replace(mesh, texture=texture, uv=(uv / texture.shape[1::-1]).astype(np.float32))

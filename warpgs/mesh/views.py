@@ -95,6 +95,8 @@ EMPTY = 0.02
 """Opacity below which a pixel is empty: five of 255 levels."""
 SAMPLES = 200_000
 """Number of pixels of all views that are sampled to find the extent of the surfaces."""
+UNCERTAIN = 1e-3
+"""Weight of an uncertain depth, if holes are filled, as a fraction of a certain one's: it counts where no view is certain."""
 KEPT_PIXELS = 2**24
 """Largest number of pixels of all views together for which renders are kept, 320 MiB; otherwise every use renders again."""
 
@@ -106,7 +108,7 @@ class SurfaceView:
     camera: Camera
     """Pinhole camera, arrays of numpy."""
     depth: torch.Tensor
-    """z-depth [u], shape [H, W]; infinite for an empty pixel, 0 where the depth is uncertain."""
+    """z-depth [u], shape [H, W]; infinite for an empty pixel, 0 where it is uncertain and holes are not filled."""
     weights: torch.Tensor
     """Weight of each pixel, in [0, 1], shape [H, W]: the cosine between ray and normal, times alpha if there is a surface."""
     image: torch.Tensor
@@ -114,16 +116,19 @@ class SurfaceView:
 
 
 @torch.no_grad()
-def surface_view(gaussians: Gaussians, camera: Camera, options: RasterizeOptions, depth: str = "median") -> SurfaceView:
+def surface_view(
+    gaussians: Gaussians, camera: Camera, options: RasterizeOptions, depth: str = "median", fill: bool = False
+) -> SurfaceView:
     """Render what a camera sees of the surface, by one of `DEPTHS`; a lens is replaced by the pinhole of the same K."""
     camera = pinhole_of(camera)
     r = rasterize(gaussians, camera, replace(options, heaviest=CONTRIBUTORS if depth == "median" else 0))
-    z = r.depth
+    z, certain = r.depth, torch.ones_like(r.depth)
     if r.heaviest_ids is not None and r.heaviest_weights is not None:
         z, share = surface_depth(gaussians, camera, r.heaviest_ids, r.heaviest_weights)
-        z = torch.where(share >= MIN_SHARE, z, 0)
+        certain = torch.where(share >= MIN_SHARE, certain, UNCERTAIN if fill else 0.0)
+        z = torch.where(certain > 0, z, 0)
     z = torch.where(r.alpha >= MIN_ALPHA, z, torch.where(r.alpha <= EMPTY, torch.inf, 0.0)).contiguous()
-    weights = face_cosines(z, camera) * torch.where(torch.isfinite(z), r.alpha, 1.0)
+    weights = face_cosines(z, camera) * torch.where(torch.isfinite(z), r.alpha * certain, 1.0)
     return SurfaceView(camera, z, weights, r.rgb.contiguous())
 
 
@@ -136,27 +141,29 @@ class SurfaceViews:
 
     def __init__(
         self, gaussians: Gaussians, cameras: Sequence[Camera], options: RasterizeOptions, depth: str,
-        stage: Callable[[str], object] = lambda line: None,
+        stage: Callable[[str], object] = lambda line: None, fill: bool = False,
     ) -> None:  # fmt: skip
         """Prepare to render a model from all cameras by one of `DEPTHS`; ``stage`` shows a line before each view."""
-        self._render = lambda camera: surface_view(gaussians, camera, options, depth)
-        self._cameras, self._stage = cameras, stage
+        self._render = lambda camera: surface_view(gaussians, camera, options, depth, fill)
+        self.cameras, self._stage = cameras, stage
         self._keeps = sum(c.width * c.height for c in cameras) <= KEPT_PIXELS
         self._kept: dict[int, SurfaceView] = {}
 
-    def __call__(self, purpose: str) -> Iterator[SurfaceView]:
-        """Yield what each camera sees of the surface; ``purpose`` is the line of progress."""
-        for i, camera in enumerate(self._cameras):
-            self._stage(f"{purpose}: view {i + 1} of {len(self._cameras)}")
-            view = self._kept.get(i) or self._render(camera)
+    def __call__(self, purpose: str, chosen: Sequence[int] | None = None) -> Iterator[SurfaceView]:
+        """Yield what each camera, or those ``chosen``, sees of the surface; ``purpose`` is the line of progress."""
+        chosen = range(len(self.cameras)) if chosen is None else chosen
+        for done, i in enumerate(chosen):
+            self._stage(f"{purpose}: view {done + 1} of {len(chosen)}")
+            view = self._kept.get(i) or self._render(self.cameras[i])
             if self._keeps:
                 self._kept[i] = view
             yield view
 
 
 def sample_surface(view: SurfaceView, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return about ``count`` points of a view's surface, [N, 3] [u], and the width of a pixel there, [N] [u]."""
-    depth, camera = view.depth.cpu().numpy().astype(np.float64), view.camera
+    """Return about ``count`` points of a view's certain surface, [N, 3] [u], and the width of a pixel there, [N] [u]."""
+    certain = torch.where(view.weights > UNCERTAIN, view.depth, 0)
+    depth, camera = certain.cpu().numpy().astype(np.float64), view.camera
     step = max(1, round((depth.size / count) ** 0.5))
     row, column = np.mgrid[step // 2 : depth.shape[0] : step, step // 2 : depth.shape[1] : step].reshape(2, -1)
     z = depth[row, column]
@@ -206,8 +213,11 @@ def neighbours(maps: Sequence[DepthMap]) -> list[list[int]]:
     return [matching_views(sight, cameras, i, NEIGHBOURS, range(len(maps))) for i in range(len(maps))]
 
 
-def agreed(view: SurfaceView, others: Sequence[DepthMap]) -> SurfaceView:
-    """Return a view without the depths that no other view confirms within `TOLERANCE`, though one sees a surface there."""
+def agreed(view: SurfaceView, others: Sequence[DepthMap], fill: bool = False) -> SurfaceView:
+    """Return a view without the depths that no other view confirms within `TOLERANCE`, though one sees a surface there.
+
+    If holes are filled, these depths are uncertain instead.
+    """
     # A depth is kept if at least one other view has a surface within `TOLERANCE` of the depth's point. A depth is also kept if
     # its point projects onto no surface in any other view, such as outside of all other images. So a single view keeps all its
     # depths.
@@ -218,6 +228,8 @@ def agreed(view: SurfaceView, others: Sequence[DepthMap]) -> SurfaceView:
         confirmed |= difference <= TOLERANCE
         questioned |= torch.isfinite(difference)
     kept = confirmed | ~questioned | ~shown
+    if fill:
+        return replace(view, weights=torch.where(kept, view.weights, UNCERTAIN * view.weights))
     return replace(view, depth=torch.where(kept, view.depth, 0), weights=torch.where(kept, view.weights, 0))
 
 

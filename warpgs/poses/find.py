@@ -76,8 +76,19 @@ def neighbours(found: Mapping) -> list[tuple[int, int, float]]:
 def advice(found: Mapping, names: Sequence[str]) -> list[str]:
     """Return what to photograph next, a sentence each, the most urgent first; empty if nothing is missing."""
     said = []
-    for i in (i for i in range(len(names)) if i not in found.views):
-        weak = [names[j] for j, n in found.links[i] if n < WEAK_MATCHES]  # pairs that match well need no photograph between
+    lost = {i for i in range(len(names)) if i not in found.views}
+    groups = [group for members in found.groups[1:] if len(group := sorted(lost.intersection(members))) > 1]
+    for group in groups:  # one bridge joins a separate group as a whole
+        links = [(n, i, j) for i in group for j, n in found.links[i] if j in found.views]
+        _, i, j = max(links, default=(0, group[0], -1))
+        way = f"between {names[i]} and {names[j]}" if links else f"from {names[i]} to the photographs outside its group"
+        said.append(
+            f"take photographs {way}, each overlapping the previous one by two thirds: {len(group)} photographs form a "
+            f"separate group, {names[group[0]]} to {names[group[-1]]}"
+        )
+    for i in sorted(lost.difference(*groups)):
+        # pairs that match well need no photograph between
+        weak = [names[j] for j, n in found.links[i] if n < WEAK_MATCHES and j in found.views]
         if found.keypoints[i] < MIN_KEYPOINTS:
             said.append(f"take {names[i]} again: sharp, in good light, with a textured object in view")
         elif weak:
@@ -119,6 +130,7 @@ _RECORD = schema.fields(
             "focal": schema.number(above=0), "distortion": schema.number(), "width": schema.whole(1), "height": schema.whole(1),
         })), "pycolmap": schema.text,
     },
+    {"source": schema.text},
 )  # fmt: skip
 
 
@@ -253,7 +265,7 @@ def find_poses(
             found, more = _with_network(network, found, photographs, names, kind, work, progress, threads)
             notes += more
         _check_found(source, found, photographs)
-        record = record_of(found, photographs, digest, notes)
+        record = record_of(found, photographs, digest, notes) | {"source": source.resolve().name}
         for done, i in enumerate(found.views):
             progress(f"writing images: {done + 1} of {len(found.views)}")
             write_copy(photographs[i], scene / "images", max_pixels)

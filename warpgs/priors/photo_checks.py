@@ -15,6 +15,7 @@ import torch
 
 from warpgs.priors.flow import Features, agreeing_matches, sift_features
 from warpgs.priors.networks import single_threaded_opencv, without_ipp
+from warpgs.process import Task
 from warpgs.scene import View
 
 MIN_SHARPNESS = 0.87
@@ -180,7 +181,7 @@ def photo_notes(checks: Sequence[PhotoCheck]) -> list[str]:
         ("white balance differs from neighbouring photographs", REMEDY,
          [f"{name} (red {red:.2f}, green {green:.2f}, blue {blue:.2f} x)" for name, red, green, blue in tints]),
     )  # fmt: skip
-    notes = [f"{what}: {_listed(named)}; {remedy}" for what, remedy, named in faults if named]
+    notes: list[str] = [Task(f"{what}: {_listed(named)}; {remedy}") for what, remedy, named in faults if named]
     alone = [c.name for c in checks if not c.compared_with]
     return [*notes, *([f"blur and exposure not checked, too few matches: {_listed(alone)}"] if alone else [])]
 

@@ -1,8 +1,12 @@
 """Files of films: MP4 and animated images."""
 
 import contextlib
+import functools
 import io
-from collections.abc import Iterable, Iterator
+import os
+import shutil
+import subprocess
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -86,9 +90,9 @@ SUFFIXES = (*VIDEOS, *ANIMATIONS)
 
 def write_film(path: Path, frames: Iterable[np.ndarray], fps: int = 30) -> int:
     """Write frames [H, W, 3] in [0, 1], all of one size, as a film in the format that the path's suffix names."""
-    # A video (.mp4, .webm) is VP9, which OpenCV's wheels bring and current browsers play; an odd height loses a row, an odd
-    # width a column. An animated image (.webp, .gif) runs in a loop. The film is decoded before it replaces an older one,
-    # because the encoder does not report a full disk.
+    # A video is VP9, which OpenCV's wheels bring and current browsers play; .mp4 is H.264 if this machine has an encoder.
+    # An odd height loses a row, an odd width a column. An animated image (.webp, .gif) runs in a loop. The film is decoded
+    # before it replaces an older one, because the encoder does not report a full disk.
     suffix = path.suffix.lower()
     if suffix in ANIMATIONS:
         return write_animation(path, frames, fps)
@@ -110,25 +114,58 @@ def write_film(path: Path, frames: Iterable[np.ndarray], fps: int = 30) -> int:
     return len(sizes)
 
 
-def _encode(path: Path, temporary: str, frames: Iterable[np.ndarray], fps: int, sizes: list[tuple[int, int]]) -> None:
-    """Write frames to a temporary file, and the size of each, [width, height], to a list."""
+@functools.cache
+def h264_encoder() -> str | None:
+    """Return the ffmpeg on this machine's PATH if it encodes H.264, else None: OpenCV's wheels have no encoder for it."""
+    program = shutil.which("ffmpeg")
+    if program is None or Path(program).resolve().parent == Path.cwd().resolve():  # no file of the current folder is run
+        return None
+    probe = [program, "-v", "quiet", "-f", "lavfi", "-i", "color=s=64x64:d=0.1", "-c:v", "h264", "-f", "null", "-"]
+    try:
+        found = subprocess.run(probe, stdin=subprocess.DEVNULL, check=False, timeout=20).returncode == 0
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return program if found else None
+
+
+Writer = tuple[Callable[[np.ndarray], object], Callable[[], object]]
+"""Function that writes a frame, 8-bit [H, W, 3], and function that ends the file."""
+
+
+def _writer(path: Path, temporary: str, fps: int, size: tuple[int, int]) -> Writer:
+    """Return the writer of a video of frames of ``size``, [width, height]."""
     import cv2
 
-    writer = None
+    if path.suffix.lower() == ".mp4" and (program := h264_encoder()):
+        given = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", "{}x{}".format(*size), "-r", str(fps), "-i", "-"]
+        colors = "scale=out_color_matrix=bt709:out_range=tv,setparams=colorspace=bt709:color_primaries=bt709:color_trc=bt709"
+        codec = ["-vf", colors, "-c:v", "h264", "-pix_fmt", "yuv420p", "-movflags", "+faststart"]
+        folder, name = os.path.split(temporary)  # the folder may be a descriptor of this process
+        words = [program, "-v", "quiet", "-y", *given, *codec, name]
+        process = subprocess.Popen(words, stdin=subprocess.PIPE, cwd=folder)
+        assert process.stdin is not None
+        return process.stdin.write, process.communicate
+    # for .webm OpenCV warns on stderr of an unknown tag, but writes VP9
+    with hidden_stderr() if path.suffix.lower() == ".webm" else contextlib.nullcontext():
+        writer = cv2.VideoWriter(temporary, cv2.VideoWriter_fourcc(*"vp09"), fps, size)
+    if not writer.isOpened():
+        raise ResourceError(f"{path}: cannot be written; the folder is not writable, or OpenCV lacks a VP9 encoder")
+    return lambda pixels: writer.write(np.ascontiguousarray(pixels[..., ::-1])), writer.release
+
+
+def _encode(path: Path, temporary: str, frames: Iterable[np.ndarray], fps: int, sizes: list[tuple[int, int]]) -> None:
+    """Write frames to a temporary file, and the size of each, [width, height], to a list."""
+    writer: Writer | None = None
     try:
         for pixels in _checked(path, frames):
             height, width = (s // 2 * 2 for s in pixels.shape[:2])
-            if writer is None:
-                # for .webm OpenCV warns on stderr of an unknown tag, but writes VP9
-                with hidden_stderr() if path.suffix.lower() == ".webm" else contextlib.nullcontext():
-                    writer = cv2.VideoWriter(temporary, cv2.VideoWriter_fourcc(*"vp09"), fps, (width, height))
-                if not writer.isOpened():
-                    raise ResourceError(f"{path}: cannot be written; the folder is not writable, or OpenCV lacks a VP9 encoder")
+            writer = writer or _writer(path, temporary, fps, (width, height))
             sizes.append((width, height))
-            writer.write(np.ascontiguousarray(pixels[:height, :width, ::-1]))
+            with contextlib.suppress(BrokenPipeError):  # frames are missing then, which is noticed afterwards
+                writer[0](np.ascontiguousarray(pixels[:height, :width]))
     finally:
         if writer is not None:
-            writer.release()
+            writer[1]()
 
 
 def _decoded_sizes(path: Path) -> list[tuple[int, int]]:

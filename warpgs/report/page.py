@@ -2,6 +2,7 @@
 
 import base64
 import hashlib
+import io
 import json
 import math
 import re
@@ -12,7 +13,7 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 from urllib.parse import quote
 
 from warpgs.files import write_text
-from warpgs.process import Detail
+from warpgs.process import Detail, Task
 
 MOST_BYTES = 100
 """Longest name that is kept unchanged, without suffix: any file system allows it."""
@@ -129,7 +130,11 @@ def rendered(template: str, **contents: object) -> str:
         loader=jinja2.FileSystemLoader(Path(__file__).parent / "templates"), autoescape=True, trim_blocks=True,
         lstrip_blocks=True, undefined=jinja2.StrictUndefined,
     )  # fmt: skip
-    environment.filters |= {"data_uri": _data_uri, "address": lambda path: quote(path, errors="surrogateescape")}
+    environment.filters |= {
+        "data_uri": _data_uri,
+        "aspect": _aspect,
+        "address": lambda path: quote(path, errors="surrogateescape"),
+    }
     page = environment.get_template(template)
     own = "".join(page.blocks["script"](page.new_context())) if "script" in page.blocks else ""
     code = own.partition("<script>")[2].partition("</script>")[0]
@@ -139,6 +144,14 @@ def rendered(template: str, **contents: object) -> str:
 
 def _data_uri(data: bytes) -> str:
     return f"data:image/{'webp' if data[:4] == b'RIFF' else 'png'};base64,{base64.b64encode(data).decode()}"
+
+
+def _aspect(data: bytes) -> float:
+    """Return the width of an image file in units of its height."""
+    from PIL import Image
+
+    with Image.open(io.BytesIO(data)) as image:
+        return image.width / image.height
 
 
 def _without_folders(value: object) -> object:
@@ -153,7 +166,7 @@ def _without_folders(value: object) -> object:
 
 def write_page(path: Path, *, notes: list[str], record: dict[str, object], **contents: object) -> None:
     """Write the report page: one HTML file that refers to nothing outside it."""
-    choices = [n for n in notes if not isinstance(n, Detail)]
-    details = [n for n in notes if isinstance(n, Detail)]
+    tasks, details = ([n for n in notes if isinstance(n, kind)] for kind in (Task, Detail))
+    choices = [n for n in notes if not isinstance(n, Task | Detail)]
     words = json.dumps(_without_folders(record), indent=1)
-    write_text(path, rendered("report.html", choices=choices, details=details, record=words, **contents))
+    write_text(path, rendered("report.html", tasks=tasks, choices=choices, details=details, record=words, **contents))

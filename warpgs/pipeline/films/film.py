@@ -217,7 +217,10 @@ def plan_film(model: FittedModel, path: str, settings: FilmSettings) -> FilmPlan
         notes.append("the photographs are rotated; the film takes its upward direction from the common plane of the cameras")
     kind = paths.path_of(rig) if path == "auto" else path
     if kind == "interpolate":
-        cameras, words = _tour(rig, train, settings)
+        far = [c for c in train if not 0 < rig.reach(c) < paths.CLOSE * rig.distance]
+        left_out = len(train) - len(far) if path == "auto" and len(far) > 1 else 0
+        cameras, words = _tour(rig, far if left_out else train, settings)
+        words += f"; {left_out} close-ups are left out" * bool(left_out)
         if path == "auto" and rig.kind == "forward":
             words += "; --path turntable is calmer"
         remedy, nearer = EMPTY_VIEW, "--coverage marks these places"

@@ -2,6 +2,7 @@
 
 import itertools
 import math
+from collections import Counter
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -37,6 +38,10 @@ ROLLED = 0.05
 """The limit `FLAT`, but for the horizontal axes of level photographs, which lean by at most 13 degrees (root mean square)."""
 MIN_SAME = math.cos(math.radians(15))
 """Cosine of the largest angle between the normals of two planes that count as equal."""
+FAR = 0.8
+"""Quantile of the cameras' distances from the subject at which a film keeps it whole, as a fifth of the photographs do."""
+CLOSE = 0.6
+"""Distance below which a photograph is a close-up, as a fraction of the distance of a film."""
 MIN_SWING = math.radians(6)
 """Smallest range of azimuths of a film, for cameras above each other."""
 
@@ -56,7 +61,7 @@ class Rig:
     span: tuple[float, float] | None
     """First and last azimuth of the cameras (of their viewing directions, in a room) [rad]; None if they cover all sides."""
     distance: float
-    """Median distance of the cameras from ``center`` [u]."""
+    """Distance of the farther cameras from ``center`` [u], quantile `FAR`: nearer photographs may cut the subject off."""
     elevation: float
     """Mean elevation of the cameras above ``center``, or of their viewing directions, in a room [rad]."""
     rise: float
@@ -200,18 +205,23 @@ def rig_of(cameras: list[Camera], depth: float) -> Rig:
     azimuths, elevations, first = _azimuths(directions, up)
     distances = np.sqrt(((centers - focus) ** 2).sum(1))
     return Rig(
-        kind, focus, up, first, _span(azimuths), float(np.median(distances)), float(elevations.mean()),
+        kind, focus, up, first, _span(azimuths), float(np.quantile(distances, FAR)), float(elevations.mean()),
         float(elevations.std()), turned,
     )  # fmt: skip
 
 
-def up_of(cameras: list[Camera], points: np.ndarray) -> np.ndarray:
-    """Return the upward unit vector [3] of a scene for films, from training cameras and points [N, 3] [u]."""
+def rig_among(cameras: list[Camera], points: np.ndarray) -> Rig:
+    """Return the arrangement of training cameras around their subject among points [N, 3] [u]."""
     depths = np.concatenate(
         [geometry.matmul(points - c.center, c.viewmat[2, :3]) for c in cameras[:: max(1, len(cameras) // 5)]]
     )
     ahead = depths[depths > 0]
-    return rig_of(cameras, float(np.median(ahead)) if len(ahead) else 1.0).up
+    return rig_of(cameras, float(np.median(ahead)) if len(ahead) else 1.0)
+
+
+def up_of(cameras: list[Camera], points: np.ndarray) -> np.ndarray:
+    """Return the upward unit vector [3] of a scene for films, from training cameras and points [N, 3] [u]."""
+    return rig_among(cameras, points).up
 
 
 def common_up(cameras: list[Camera]) -> np.ndarray | None:
@@ -266,14 +276,16 @@ def upright(rig: Rig, camera: Camera) -> Camera:
 def _spiral_to_one_side(rig: Rig, cameras: list[Camera], frames: int) -> list[np.ndarray]:
     """Return poses along two turns that widen and narrow again among the cameras, all looking at the rig's centre."""
     center = np.mean([c.center for c in cameras], axis=0)
-    depth, forward = _length(rig.center - center), _unit(rig.center - center)
+    depth, forward = rig.distance, _unit(rig.center - center)
     side = _unit(np.cross(forward, rig.up))
     up = np.cross(side, forward)
     offsets = np.array([c.center for c in cameras]) - center
+    center = rig.center - depth * forward
     spans = [max(0.7 * float(np.abs(geometry.matmul(offsets, axis)).max()), 0.03 * depth) for axis in (side, up)]
     poses = []
     for t in np.arange(frames) / frames:
-        # not nearer, where Gaussians look like needles; not farther, where the image border shows unobserved areas
+        # not nearer, where Gaussians look like needles and the subject is cut off; not farther, where the image border shows
+        # unobserved areas
         angle, radius = 4 * np.pi * t, np.sin(np.pi * t)
         eye = center + radius * (spans[0] * np.cos(angle) * side + spans[1] * np.sin(angle) * up)
         poses.append(geometry.look_at(eye, rig.center, up))
@@ -297,15 +309,23 @@ def _turn(rig: Rig, frames: int, turns: int, rise: float) -> list[np.ndarray]:
     return poses
 
 
+def typical(cameras: list[Camera]) -> Camera:
+    """Return the first of the cameras that have the most common shape, upright or wide, and size."""
+    shapes = [(c.width < c.height, c.width, c.height) for c in cameras]
+    upright = 2 * sum(s[0] for s in shapes) > len(shapes)
+    counts = Counter(s for s in shapes if s[0] == upright)
+    return cameras[shapes.index(max(counts, key=counts.__getitem__))]
+
+
 def camera_path(kind: str, rig: Rig, cameras: list[Camera], frames: int) -> list[Camera]:
-    """Return cameras on a closed path, turntable or spiral, with size and intrinsics of the first of ``cameras``."""
+    """Return cameras on a closed path, turntable or spiral, with size and intrinsics of a typical one of ``cameras``."""
     if kind == "turntable":
         poses = _turn(rig, frames, 1, 0.0)
     elif rig.kind == "forward":
         poses = _spiral_to_one_side(rig, cameras, frames)
     else:
         poses = _turn(rig, frames, 2, rig.rise)
-    template = framed(cameras[0], turned=rig.turned)
+    template = framed(typical(cameras), turned=rig.turned)
     return [replace(template, viewmat=pose) for pose in poses]
 
 
@@ -383,7 +403,7 @@ def through(keyframes: list[Keyframe], frames: int, *, closed: bool = False) -> 
             row[3:7] *= -1
     times = np.array([k.seconds for k in keyframes])
     at = times[0] + (times[-1] - times[0]) * np.arange(frames) / max(frames if closed else frames - 1, 1)
-    template, cameras = keyframes[0].camera, []
+    template, cameras = typical([k.camera for k in keyframes]), []
     for row in _spline(rows, times, at, closed):
         rotation = geometry.rotation_matrices(row[3:7] / math.sqrt((row[3:7] ** 2).sum())).T
         camera = replace(template, viewmat=geometry.pose_at(rotation, row[:3] - row[8] * rotation[2]))
@@ -472,6 +492,17 @@ def _neighbour_tour(distances: list[list[float]]) -> list[int]:
                     order[i : j + 1] = order[i : j + 1][::-1]
                     improved = True
     return order
+
+
+def midways(rig: Rig, cameras: list[Camera], most: int) -> list[tuple[int, int, Camera]]:
+    """Return upright cameras midway between up to ``most`` pairs of neighbouring cameras, with the indices of each pair."""
+    distances = np.array(_distances(cameras))
+    np.fill_diagonal(distances, np.inf)
+    pairs = sorted({(min(i, j), max(i, j)) for i, j in enumerate(distances.argmin(1).tolist())}) if len(cameras) > 1 else []
+    chosen = [pairs[i] for i in np.unique(np.linspace(0, len(pairs) - 1, min(most, len(pairs))).round().astype(int))]
+    frames = [framed(upright(rig, c)) for c in cameras]
+    ends = [[Keyframe(frames[k], t, rig.reach(cameras[k])) for t, k in enumerate(pair)] for pair in chosen]
+    return [(i, j, through(keyframes, 3)[1]) for (i, j), keyframes in zip(chosen, ends)]
 
 
 def tour_of(cameras: list[Camera], reaches: list[float], seconds: float, most: int) -> tuple[list[Keyframe], bool, bool]:

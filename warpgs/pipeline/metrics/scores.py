@@ -16,6 +16,7 @@ from warpgs.kernels.ssim import RADIUS, ssim
 from warpgs.kernels.update import squared_error
 from warpgs.pipeline.metrics.lpips import Lpips
 from warpgs.priors.flow import nearest_views, pixel_grid
+from warpgs.process import Task
 from warpgs.render.options import RasterizeOptions
 from warpgs.render.rasterize import rasterize
 from warpgs.scene import Camera, Gaussians, View, checked_views
@@ -447,4 +448,4 @@ def moved_notes(fractions: dict[str, float]) -> list[str]:
     named = sorted(((f, name) for name, f in fractions.items() if f > 0), reverse=True)
     words = ", ".join(f"{name} ({f:.1%} of its pixels)" for f, name in named[:6])
     more = f" and {len(named) - 6} more" if len(named) > 6 else ""
-    return [f"moving or changing objects in {words}{more}; mask them out"] if named else []
+    return [Task(f"moving or changing objects in {words}{more}; mask them out")] if named else []

@@ -18,7 +18,7 @@ from warpgs.pipeline.model.limits import NEEDLE, ROUNDING, long_axes
 from warpgs.pipeline.model.table import truncated
 from warpgs.render.options import RasterizeOptions
 from warpgs.render.rasterize import rasterize
-from warpgs.scene import Camera, Gaussians
+from warpgs.scene import Box, Camera, Gaussians
 
 SEEN = 4 / 255
 """Least blending weight at which a view sees a Gaussian: with less, the Gaussian changes no pixel by more than 4 of 255
@@ -82,10 +82,6 @@ hairs and edges of a good model. With a tenth instead, removal costs up to 0.08 
 (docs/decisions/014-formats.md)."""
 MAX_BOX_BYTES = 65536
 """Largest size of a file that describes a box [bytes]."""
-
-
-Box = tuple[np.ndarray, np.ndarray, np.ndarray]
-"""A box: middle [3] and full sides [3] [file units], and a rotation [3, 3] whose columns are the directions of the sides."""
 
 
 def _numbers(value: Any, shape: tuple[int, ...], what: str) -> np.ndarray:

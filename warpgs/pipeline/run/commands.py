@@ -43,6 +43,7 @@ from warpgs.pipeline.train.trainer import train_views
 from warpgs.pipeline.train.views import TrainingView
 from warpgs.priors.views import PriorConfig, view_priors
 from warpgs.render.options import RasterizeOptions
+from warpgs.report.film import h264_encoder
 from warpgs.report.images import COVERAGE_LEGEND, Tile, contact_sheet, png
 from warpgs.report.overview import render_plot
 from warpgs.report.page import image_names, renaming_notes
@@ -107,10 +108,10 @@ def _cameras_of(path: Path) -> tuple[dict[str, Camera], list[str]]:
 
 
 VP9 = (
-    "the film is VP9, which browsers and VLC play; convert it for other players: "
-    "ffmpeg -i {} -c:v libx264 -pix_fmt yuv420p film-h264.mp4"
+    "the film is VP9, which browsers and VLC play; with ffmpeg installed, films are H.264, which all players play "
+    "(OpenCV's wheels have no encoder for it)"
 )
-"""Note on a film in .mp4; {} stands for its path."""
+"""Note on a film in .mp4 without an encoder of H.264."""
 
 
 def scene_of(
@@ -195,8 +196,8 @@ def render(
     with contextlib.nullcontext() if named else writing_into(home):
         files, faults = film.render_film(stored, plan, out, settings, coverage=training, sheet=sheet, tell=tell)
     *others, last = files
-    if last.suffix.lower() == ".mp4":
-        notes.append(VP9.format(shlex.quote(str(last))))
+    if last.suffix.lower() == ".mp4" and h264_encoder() is None:
+        notes.append(VP9)
     notes += faults + (
         [f"sheet of {min(film.SHEET_FRAMES, len(plan.cameras))} frames in {film.sheet_path(out)}"] if sheet else []
     )

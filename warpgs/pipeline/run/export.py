@@ -23,7 +23,7 @@ from warpgs.pipeline.films.paths import common_up
 from warpgs.pipeline.model import edit
 from warpgs.pipeline.run.folder import CONFIG, StoredRun, open_run
 from warpgs.pipeline.run.request import choose_device
-from warpgs.scene import Camera, Gaussians, Normalization, base_colors
+from warpgs.scene import Box, Camera, Gaussians, Normalization, base_colors
 
 
 @dataclass(frozen=True)
@@ -259,9 +259,16 @@ def _cameras_written(
     ]
 
 
+def _scene_box(box: Box, normalization: Normalization) -> Box:
+    """Return a box in file units in scene units."""
+    center, size, rotation = box
+    scale = normalization.scale
+    return (center - normalization.offset) * scale, size * scale, rotation
+
+
 def mesh(
-    folder: Path, target: Path, options: MeshOptions, device_name: str, *, stage: Callable[[str], object],
-    say: Callable[[str], object],
+    folder: Path, target: Path, options: MeshOptions, device_name: str, *, crop: str | None = None,
+    stage: Callable[[str], object], say: Callable[[str], object],
 ) -> list[str]:  # fmt: skip
     """Write the mesh of the surfaces that a run's training views see, in file units, as is ``voxel``; returns lines."""
     check_suffix(target)
@@ -272,6 +279,8 @@ def mesh(
     cameras, scale = training_cameras(run), run.normalization.scale
     if options.voxel is not None:
         options = replace(options, voxel=options.voxel * scale)
+    if crop is not None:
+        options = replace(options, crop=crop if crop == "auto" else _scene_box(edit.box_of(crop), run.normalization))
 
     def planned(plan: GridPlan, memory: str) -> None:
         lost = f"{100 * (1 - plan.inside):.1f} %"

@@ -69,7 +69,7 @@ from warpgs.poses.find import JSON, TEXT, find_poses, needs_poses, read_poses_re
 from warpgs.poses.photographs import find_photographs, image_root, is_video
 from warpgs.priors.networks import in_threads
 from warpgs.priors.photo_checks import PhotoCheck, check_photos, photo_notes
-from warpgs.process import Detail, counted, noted_signals, say
+from warpgs.process import Detail, Task, counted, noted_signals, say
 from warpgs.ranks import ALONE, Ranks
 from warpgs.report.page import image_names, renaming_notes
 from warpgs.report.progress import EventLog, Progress, Stages, duration
@@ -320,8 +320,6 @@ def with_poses(
         )  # fmt: skip
     lost = [f"no pose: {p['name']} {p['reason']}" for p in record["photographs"] if not p["registered"]]
     notes = [*record["notes"], *lost[:5], *([f"and {len(lost) - 5} more without a pose"] if len(lost) > 5 else [])]
-    notes += [f"to photograph next: {a}" for a in record["advice"][:SHOWN_ADVICE]]
-    notes += [f"{POSED_SCENE}/{TEXT} in the run folder lists the reasons for it"] if record["advice"] else []
     return replace(request, path=str(scene), matcher=None), notes
 
 
@@ -329,14 +327,22 @@ SHOWN_ADVICE = 3
 """Largest number of pieces of advice on further photographs that a fit prints."""
 
 
-def lost_lines(out: Path | None) -> list[str]:
-    """Return a line on the photographs without a pose, which a run leaves out; an empty list if all have one."""
+def title_of(scene: Path, out: Path) -> str:
+    """Return the name of a scene's folder; of the photographs, if their poses were found in the run folder ``out``."""
+    folder = scene.resolve()
+    if folder.parent != out.resolve() or not (folder / JSON).is_file():
+        return folder.name
+    return str(read_poses_record(folder).get("source") or out.resolve().name)
+
+
+def pose_tasks(out: Path | None) -> list[str]:
+    """Return what to photograph next, and how many photographs a run leaves out; empty if its poses need nothing more."""
     if out is None or not (out / POSED_SCENE / JSON).is_file():
         return []
-    rows, why = read_poses_record(out / POSED_SCENE)["photographs"], out / POSED_SCENE / TEXT
-    lost = sum(not p["registered"] for p in rows)
-    line = f"{lost} of {len(rows)} photographs have no pose and were not used: {why} lists reasons and remedies"
-    return [line] if lost else []
+    record, why = read_poses_record(out / POSED_SCENE), f"{POSED_SCENE}/{TEXT} in the run folder lists reasons and remedies"
+    lost, advice = sum(not p["registered"] for p in record["photographs"]), record["advice"][:SHOWN_ADVICE]
+    left_out = f"{lost} of {len(record['photographs'])} photographs have no pose and were not used: {why}"
+    return [*map(Task, [left_out] * bool(lost) + [f"to photograph next: {a}" for a in advice])]
 
 
 COMPILING = "compiling kernels, once on this machine, for a minute or two"
@@ -582,18 +588,20 @@ def _finish(job: FitJob, trainer: Trainer, record: dict[str, Any], checks: list[
         with section("checks"):
             metrics = _score(job, trainer, seconds, given, checks, renders)
         metrics["wall_seconds"] = job.clock.seconds()
+        job.notes += pose_tasks(job.out)
         if job.out is not None:
             write_json(job.out / METRICS_FILE, metrics)
             options, record["notes"] = trainer.context.render_options(), job.notes
             with section("report"):
                 write_report(
                     job.out, job.scene, job.split, trainer.gaussians, options, metrics, record,
+                    title=title_of(Path(job.scene.path), job.out),
                     sampling=partial(sampling_report_of, trainer, job.out), renders=renders, times=job.clock.seconds,
                     tell=job.progress,
                 )  # fmt: skip
             metrics["wall_seconds"] = job.clock.seconds()
             write_json(job.out / METRICS_FILE, metrics)  # again, with the time of the report
-        for line in [*lost_lines(job.out), *result_lines(metrics, job.out)]:
+        for line in result_lines(metrics, job.out, [n for n in job.notes if isinstance(n, Task)]):
             job.say(line)
     return FitResult(**job.model(trainer), config=job.config, metrics=metrics, notes=tuple(job.notes), folder=job.out)
 
@@ -636,13 +644,14 @@ def _score(
         ({"rule": rule}, [Detail(rule["summary"])]),
         ({"shape": shape}, [Detail(shape_summary(shape))]),
         (complexity, [Detail(complexity_summary(complexity))]),
-        ({"photographs": [vars(p) | {"moved": moved.get(p.name)} for p in checks]}, moved_notes(moved)),
+        ({"photographs": [vars(p) | {"moved": moved.get(p.name)} for p in checks]}, []),
         ({"view_modules": modules}, [e["summary"] for e in modules.values()]),
         ({"given": mapped}, [e["summary"] for e in mapped.values()]),
     ]
     for figures, sentences in table:
         metrics |= figures
         job.note(*sentences)
+    job.notes += moved_notes(moved)
     compiling = {"compiling": sum(job.compiled)} if job.compiled else {}
     return metrics | peak | event_figures(trainer) | {
         "protocol": protocol_of(scene, job.request.split, job.request.downscale or 1, train, test),

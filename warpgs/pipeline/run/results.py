@@ -18,11 +18,12 @@ from warpgs.constants import TILE_SIZE
 from warpgs.device import format_bytes, in_background
 from warpgs.errors import ResourceError
 from warpgs.files import make_folder, read_file, write_bytes
-from warpgs.geometry import MODELS, depth_normals
+from warpgs.geometry import CENTRAL, MODELS, depth_normals
 from warpgs.io.image_files import decode
 from warpgs.io.load import Split
-from warpgs.pipeline.films.paths import up_of
-from warpgs.pipeline.metrics.coverage import coverage_section
+from warpgs.mesh.views import MIN_ALPHA
+from warpgs.pipeline.films.paths import Rig, midways, rig_among
+from warpgs.pipeline.metrics.coverage import coverage_map, coverage_section, depth_views
 from warpgs.pipeline.metrics.lpips import Lpips
 from warpgs.pipeline.metrics.scores import (
     ALPHA_VARIANTS,
@@ -363,8 +364,8 @@ def summary_line(metrics: dict[str, Any]) -> str:
     return f"{score_line(metrics['test'])}; {size}, {duration(metrics['seconds']['total'])}"
 
 
-def result_lines(metrics: dict[str, Any], out: Path | None) -> list[str]:
-    """Return the final lines of a fit from metrics.json: scores, size, time, report, next steps."""
+def result_lines(metrics: dict[str, Any], out: Path | None, tasks: Sequence[str] = ()) -> list[str]:
+    """Return the final lines of a fit from metrics.json: scores, size, time, what to do, report, next steps."""
     lines = [f"training PSNR {metrics['train']['psnr']:.2f} dB (no score of new views: no view is held out)"]
     if metrics["test"]:
         lines = [f"held-out {score_line(metrics['test'])} ({len(metrics['views'])} views)"]
@@ -376,6 +377,7 @@ def result_lines(metrics: dict[str, Any], out: Path | None) -> list[str]:
     size = format_bytes(metrics["complexity"]["bytes"])
     times = metrics["wall_seconds"]
     lines.append(f"{metrics['gaussians']:,} Gaussians, {size}, in {duration(times['total'])}{once}: {largest(times)}")
+    lines += ["to do:", *(f"  {task}" for task in tasks)] if tasks else []
     if out is None:
         return [*lines, "nothing was written to disk, because no run folder (out) was given"]
     run, file = shlex.quote(str(out)), " --to scene.html"
@@ -461,23 +463,40 @@ def _images(shown: list[View], renders: Renders, rows: dict[str, Any], tell: Cal
     return [(v.name, caption, *images) for v, caption, images in zip(shown, captions, zip(*[files] * 4))]
 
 
+NEW_VIEWS = 8
+"""Largest number of viewpoints from which the first image of the page is chosen."""
+
+
+def new_view(
+    rig: Rig, train: list[View], gaussians: Gaussians, options: RasterizeOptions, renders: Renders
+) -> list[tuple[np.ndarray, str]]:
+    """Return the render midway between two training views that both show most of it, with its caption; empty without one."""
+    best, picture = -1.0, []
+    if not all(v.camera.model in CENTRAL for v in train):
+        return []
+    for i, j, camera in midways(rig, [v.camera for v in train], NEW_VIEWS):
+        image, depth, alpha = renders(camera)
+        pair = depth_views(gaussians, [train[k].camera for k in (i, j)], options, [train[k].mask for k in (i, j)], renders)
+        surface = torch.from_numpy(np.where(alpha >= MIN_ALPHA, depth, 0)).to(gaussians.means.device)
+        covered = float((coverage_map(surface, camera, pair)[0] == 2).double().mean())
+        if covered > best:
+            best, picture = covered, [(image, f"a new viewpoint, between {train[i].name} and {train[j].name}")]
+    return picture
+
+
 def _figures(metrics: dict[str, Any], seconds: float) -> list[tuple[str, str]]:
     """Return the main figures of the page as pairs of label and value."""
-    test, training = metrics["test"], f"{metrics['train']['psnr']:.2f} dB"
-    held_out = [("training PSNR: no score of new views", training)]
+    test = metrics["test"]
+    held_out = [("training PSNR: no score of new views", f"{metrics['train']['psnr']:.2f} dB")]
     if test:
         best = max(metrics["baselines"].values(), default=math.nan)
         held_out = [
             ("held-out PSNR", f"{test['psnr']:.2f} dB"), ("held-out SSIM", f"{test['ssim']:.3f}"),
             ("best baseline without a fit", f"{best:.2f} dB"),
             *((LABELS[k], f"{test[k]:.3f}") for k in ("alpha_empty", "alpha_object") if k in test),
-            ("training PSNR", training),
         ]  # fmt: skip
     size = format_bytes(metrics["complexity"]["bytes"])
-    return [
-        *held_out, ("Gaussians", f"{metrics['gaussians']:,}"), ("model", size), ("steps", f"{metrics['steps']:,}"),
-        ("time", duration(seconds)),
-    ]  # fmt: skip
+    return [*held_out, ("Gaussians", f"{metrics['gaussians']:,}"), ("model", size), ("time", duration(seconds))]
 
 
 def write_report(
@@ -489,6 +508,7 @@ def write_report(
     metrics: dict[str, Any],
     record: dict[str, Any],
     *,
+    title: str,
     sampling: Callable[[], Section | None],
     renders: Renders,
     times: Callable[[], dict[str, float]],
@@ -498,15 +518,18 @@ def write_report(
     train, test = [scene.view(n) for n in split.train], [scene.view(n) for n in split.test]
     tell("making the report")
     cameras = [v.camera for v in train], [v.camera for v in test]
-    up = up_of(cameras[0], gaussians.means.detach().cpu().numpy().astype(np.float64))
+    rig = rig_among(cameras[0], gaussians.means.detach().cpu().numpy().astype(np.float64))
     covered, shown = None, evenly_spaced(test or train, SHOWN_VIEWS)
     with ThreadPoolExecutor() as threads:  # images are encoded while others are rendered
         sampled = threads.submit(sampling)
         if "coverage" in metrics:
             names = image_names(v.name for v in scene.views)
             covered = threads.submit(coverage_section, out, metrics["coverage"], [v.name for v in shown], names)
-        overview = render_overview(gaussians, options, *cameras, up)
-        picture = None if overview is None else threads.submit(webp, overview)
+        opening = new_view(rig, train, gaussians, options, renders)
+        overview = render_overview(gaussians, options, *cameras, rig.up)
+        if overview is not None:
+            opening.append((overview, "the Gaussians, training cameras teal" + ", held-out cameras orange" * bool(test)))
+        pictures = [(threads.submit(webp, image), words) for image, words in opening]
         images = _images(shown, renders, {r["name"]: r for r in metrics["views"]}, tell)
     events = read_events(out / "metrics.jsonl")
     curves = [
@@ -525,12 +548,12 @@ def write_report(
     notes = [*record["notes"], Detail(times_line(spent))]
     write_page(
         out / "report.html",
-        title=(out if Path(scene.path).parent == out else Path(scene.path)).resolve().name,  # not "scene" for found poses
+        title=title,
         subtitle=f"preset {metrics['preset']}, {len(train)} training views, {len(test)} held out, "
         f"{camera.width} x {camera.height} px, {metrics['device']}",
         figures=_figures(metrics, spent["total"]), notes=notes, scores=table, views=images, curves=curves,
-        sampling=sampled.result(), overview=picture and picture.result(), coverage=covered and covered.result(),
-        held_out=bool(test),
+        sampling=sampled.result(), pictures=[(p.result(), words) for p, words in pictures],
+        coverage=covered and covered.result(), held_out=bool(test),
         record={k: v for k, v in record.items() if k != "cameras"},
         protocol=protocol | {LABELS.get(k, k): v for k, v in metrics["variants"].items()},
     )  # fmt: skip
