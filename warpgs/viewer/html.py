@@ -7,6 +7,7 @@ import math
 import os
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,9 +20,9 @@ from warpgs.files import write_text
 from warpgs.geometry import convert_camera, convert_gaussians, look_at, matmul, pose_at, quaternions, rotation_matrices
 from warpgs.locks import hold_file
 from warpgs.pipeline.films.paths import fov_y, up_of
-from warpgs.pipeline.run.export import NO_FILTERS, Filters, file_gaussians, filtered, rotate_camera
+from warpgs.pipeline.run.export import NO_FILTERS, Filters, file_gaussians, filtered
 from warpgs.pipeline.run.folder import open_run
-from warpgs.scene import Camera, Gaussians, base_colors
+from warpgs.scene import Camera, Gaussians, Normalization, base_colors
 from warpgs.viewer.server import LIMITS, NO_PARAMETERS, NO_TEXT_AS_CODE, TURNING, open_server, require_viser, stop_server
 
 if TYPE_CHECKING:
@@ -117,6 +118,7 @@ HELP = (
     "<style>#warpgs-help{position:fixed;top:.8em;right:.8em;z-index:2;font:13px sans-serif;color:#fff;text-shadow:0 0 3px #000}"
     "#warpgs-help button{font:inherit;margin-left:.5em;cursor:pointer}</style>"
     '<div id="warpgs-help">Drag to turn, scroll or pinch to zoom<button>Reset (R)</button>'
+    '<button id="warpgs-ruler" title="Distance of two points">Ruler</button>'
     '<button id="warpgs-limits" title="Stay where the photographs show the scene">Limits: on</button></div>'
     "<script>{const back=()=>{const m=window.__viserMutable;m?.resetCameraPose?m.resetCameraPose(true):location.reload()};"
     "document.querySelector('#warpgs-help button').addEventListener('click',back);"
@@ -166,11 +168,12 @@ ALL_ROUND = math.radians(100)
 
 
 def place_first_camera(
-    server: viser.ViserServer, camera: Camera, gaussians: Gaussians, cameras: Sequence[Camera]
+    server: viser.ViserServer, camera: Camera, gaussians: Gaussians, cameras: Sequence[Camera], level: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Set the camera at which pages start; return its target [3] [u] and the upward direction [3] of films."""
+    """Set the camera at which pages start; return its target [3] [u] and the upward direction [3] of films (`up_of`)."""
     target = camera.center + distance_ahead(camera, gaussians) * np.asarray(camera.viewmat[2, :3])
-    up, own = up_of(list(cameras), gaussians.means.detach().cpu().double().numpy()), -np.asarray(camera.viewmat[1, :3])
+    points, own = gaussians.means.detach().cpu().double().numpy(), -np.asarray(camera.viewmat[1, :3])
+    up = up_of(list(cameras), points, level)
     up = up if (up * own).sum() > 0.5 else own  # the camera looks along it, or lies on its side
     server.scene.set_up_direction(up)
     server.initial_camera.position = camera.center
@@ -249,17 +252,21 @@ def write_html(
     cameras: Sequence[Camera] = (),
     background: Sequence[float] = (0.0, 0.0, 0.0),
     title: str = "warpgs",
+    normalization: Normalization | None = None,
 ) -> list[str]:
-    """Write a model as one HTML file, which appears whole or not at all; return notes on differences from a render."""
+    """Write a model as one HTML file, which appears whole or not at all; return notes on differences from a render.
+
+    The upward direction and the unit of the page's ruler are those of the normalization.
+    """
     # The page holds the Gaussians in their own units (`packed`), with colours of degree 0 only. It contains no name of
     # a file, a view or a machine, except ``title``.
     if not len(gaussians):
         raise DataError("a page needs at least one Gaussian; fit the scene for longer")
-    arrays, scale, shortened = packed(gaussians)
+    (arrays, scale, shortened), normalization = packed(gaussians), normalization or Normalization()
     known, cameras = bool(cameras), cameras or [camera_before(gaussians)]
     first, server = cameras[0], open_server(port=0)
     try:
-        target, up = place_first_camera(server, first, gaussians, cameras)
+        target, up = place_first_camera(server, first, gaussians, cameras, normalization.up)
         server.scene.set_background_image(plain_background(background), format="png")
         add_limits(server, cameras, target, up)
         server.scene.add_gaussian_splats("/gaussians", *arrays, scale=scale)
@@ -275,7 +282,9 @@ def write_html(
     for name, value in (("OWN", fov_y(first)), ("SIDE", side), ("WIDE", wide), ("TALL", tall)):
         script = script.replace(name, f"{value:.8f}")
     script = script.replace("BACK", " ".join(map(str, plain_background(background)[0, 0])))
-    write_text(Path(path), f"{text}{HELP}{script}{end}{rest}")
+    ruler = Path(__file__).with_name("ruler.js").read_text("utf-8").replace("SIZE", repr(1 / normalization.scale))
+    ruler = ruler.replace("UNIT", normalization.unit)
+    write_text(Path(path), f"{text}{HELP}<script>{ruler}</script>{script}{end}{rest}")
     notes = ["the page shows no view-dependent colours; the run and its PLY keep them"] if gaussians.sh_degree else []
     return notes + [f"{shortened:,} Gaussians are longer than the page can store, and are shown shorter"] * bool(shortened)
 
@@ -290,12 +299,13 @@ def export_html(folder: Path, target: Path, filters: Filters = NO_FILTERS) -> li
     found = run.normalization.local
     cameras = [convert_camera(run.scene_cameras[n], found, "scene", "file") for n in run.train]
     if rotation is not None:
-        cameras = [rotate_camera(c, rotation) for c in cameras]
+        cameras = [convert_camera(c, Normalization(rotation=rotation.T), "scene", "file") for c in cameras]
+        found = replace(found, up=None if found.up is None else found.rotation @ rotation @ found.rotation.T @ found.up)
     gaussians = convert_gaussians(gaussians, found, "file", "scene")
     cameras = [convert_camera(c, found, "file", "scene") for c in cameras]
     with hold_file(target) as held:
         title = target.stem.encode("utf-8", "replace").decode()  # ? for bytes that are not UTF-8
-        notes = write_html(target, gaussians, middle_first(cameras), run.background, title)
+        notes = write_html(target, gaussians, middle_first(cameras), run.background, title, found)
     if run.antialiased:
         notes.append("the page shows the model without antialiasing: too bright from afar and in small windows")
     size = format_bytes(target.stat().st_size)

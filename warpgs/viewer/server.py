@@ -149,6 +149,12 @@ MESSAGES: Mapping[str, Schema] = {
             "near": _within(0, MAX_COORDINATE), "far": _within(0, MAX_COORDINATE), "image_height": _size, "image_width": _size,
         }
     ),
+    "ScenePointerMessage": _only(
+        {
+            "event_type": schema.one_of("click"), "ray_origin": _point, "ray_direction": _point,
+            "screen_pos": schema.items(schema.items(_coordinate, 2), 1), "modifier": schema.or_null(_short),
+        }
+    ),
     "GuiUpdateMessage": _only({"uuid": _short, "updates": _only({"value": _value})}),
     "SceneNodeClickMessage": _only(
         {

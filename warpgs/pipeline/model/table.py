@@ -5,8 +5,9 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -315,6 +316,25 @@ class Table:
 
 
 FORMAT = "warpgs-model-1"
+_THREE = schema.items(schema.number(), 3)
+SIMILARITY = schema.fields(
+    {"offset": _THREE, "scale": schema.number(above=0)},
+    {"rotation": schema.items(_THREE, 3), "up": schema.or_null(_THREE), "unit": schema.text, "place": schema.or_null(_THREE)},
+    others=False,
+)
+"""Schema of the values of a `Normalization` in files."""
+
+
+def similarity_values(n: Normalization) -> dict[str, Any]:
+    """Return the values of a normalization for JSON; only offset and scale if it was not levelled."""
+    values = {name: v.tolist() if isinstance(v, np.ndarray) else v for name, v in vars(n).items()}
+    return values if n.up is not None or n.unit != Normalization.unit else {name: values[name] for name in ("offset", "scale")}
+
+
+def similarity_of(values: Mapping[str, Any], where: str) -> Normalization:
+    """Return the normalization of `similarity_values`, which `SIMILARITY` has checked; DataError if it is no similarity."""
+    arrays = {name: np.array(v, np.float64) if isinstance(v, list) else v for name, v in values.items()}
+    return checked_normalization(Normalization(**arrays | {"scale": float(values["scale"])}), "file", where)
 
 
 @dataclass(frozen=True)
@@ -396,10 +416,8 @@ def save(path: str | Path, gaussians: Gaussians, normalization: Normalization | 
     where = f"{path}: not written"
     _check_values(gaussians, where)
     normalization = checked_normalization(normalization, units, where)
-    header = {
-        "format": FORMAT, "version": __version__, "units": units, "scale": repr(float(normalization.scale)),
-        "offset": json.dumps([float(v) for v in normalization.offset]),
-    }  # fmt: skip
+    similarity = similarity_values(replace(normalization, offset=np.asarray(normalization.offset, np.float64)))
+    header = {"format": FORMAT, "version": __version__, "units": units} | {n: json.dumps(v) for n, v in similarity.items()}
     tensors = {n: t.detach().cpu().contiguous() for n, t in gaussians.tensors().items()}
     write_bytes(Path(path), to_bytes(tensors, header))
 
@@ -419,10 +437,9 @@ def load(path: str | Path, device: str | torch.device = "cpu") -> Model:
     if header.get("format") != FORMAT or tensors.keys() != Gaussians.__dataclass_fields__.keys():
         raise DataError(f"{path}: not a model of format {FORMAT}; write it with warpgs.save, or read PLY with warpgs.read_ply")
     try:
-        offset = schema.parse(header["offset"])
-        schema.items(schema.number(), 3)(offset, "offset")
-        similarity = Normalization(np.array(offset, np.float64), float(header["scale"]))
-        normalization = checked_normalization(similarity, units := header["units"], str(path))
+        units, names = header["units"], header.keys() - {"format", "version", "units"}
+        SIMILARITY(similarity := {n: schema.parse(header[n]) for n in names}, "normalization")
+        normalization = checked_normalization(similarity_of(similarity, str(path)), units, str(path))
     except (KeyError, ValueError, UsageError) as e:
         raise DataError(f"{path}: its header is damaged ({e}); write it again with warpgs.save") from e
     gaussians = checked_gaussians(tensors, str(path)).to(device)
