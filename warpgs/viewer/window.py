@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -127,8 +127,7 @@ def inside(box: CropBox, means: torch.Tensor) -> torch.Tensor:
 def box_json(box: CropBox, normalization: Normalization) -> dict[str, Any]:
     """Return a box in file units: ``center`` [3], ``size`` [3], and ``rotation`` [3, 3] from its axes to the world's."""
     (center,), size = convert_points(box[0][None], normalization, "scene", "file"), box[1] / normalization.scale
-    rotation = matmul(normalization.rotation.T, box[2])
-    return {"center": center.tolist(), "size": size.tolist(), "rotation": rotation.tolist()}
+    return {"center": center.tolist(), "size": size.tolist(), "rotation": matmul(normalization.rotation.T, box[2]).tolist()}
 
 
 def keyframe(camera: Camera, seconds: float, normalization: Normalization) -> dict[str, Any]:
@@ -265,17 +264,6 @@ class Panel:
         """Show a note about the image; hide an empty one."""
         self._note.content, self._note.visible = _plain(note), bool(note)
 
-    def _telling(self, callback: Callable[[Any], object]) -> Callable[..., None]:
-        """Wrap a callback: its errors for the user become the note."""
-
-        def call(event: Any) -> None:
-            try:
-                callback(event)
-            except WarpgsError as e:
-                self.explain(str(e))
-
-        return guarded(call)
-
     def _add_stepping(self) -> None:
         names = {readable(name): name for name in self.content.model.scene_cameras}  # viser takes UTF-8 alone
         if names:
@@ -301,7 +289,9 @@ class Panel:
                 event.client.gui.add_image(image, format="jpeg")
                 event.client.gui.add_button("close").on_click(lambda _: modal.close())
 
-        self.server.gui.add_button("show sampling", hint="where the fit placed fine Gaussians").on_click(self._telling(show))
+        self.server.gui.add_button("show sampling", hint="where fine Gaussians were placed").on_click(
+            guarded(show, self.explain)
+        )
 
     def _add_crop(self) -> None:
         """Add a box that the user moves and rotates by its handles, and saves."""
@@ -329,7 +319,7 @@ class Panel:
                 return self.explain("no crop box yet: tick crop, and move the box")
             self._save(CROP, box_json(box, self.content.model.normalization))
 
-        save.on_click(self._telling(store))
+        save.on_click(guarded(store, self.explain))
 
     def _add_keyframes(self) -> None:
         """Add controls that append the current camera to a path, and save the path."""
@@ -356,17 +346,20 @@ class Panel:
                 del self.keyframes[-1:]
                 changed()
 
+        def store(_: Any) -> None:
+            if not self.keyframes:
+                raise UsageError("add a camera first")
+            self._save(PATH, self.keyframes)
+
         add.on_click(guarded(append))
         remove.on_click(guarded(pop))
-        save.on_click(
-            self._telling(lambda _: self._save(PATH, self.keyframes) if self.keyframes else self.explain("add a camera first"))
-        )
+        save.on_click(guarded(store, self.explain))
 
     def _add_ruler(self) -> None:
         """Add controls that measure the distance of two picked points, and set the scale of a run's files by it."""
         gui, scene, run = self.server.gui, self.server.scene, isinstance(self.content.model, StoredRun)
         with gui.add_folder("Ruler", expand_by_default=False):
-            measure, text = gui.add_checkbox("measure", False, hint="click two points"), gui.add_markdown("")
+            measure, self.measured = gui.add_checkbox("click two points", False), gui.add_markdown("")
             length = gui.add_number("length [m]", 1.0, min=0.0, max=1e6, step=0.001, visible=run)
             save = gui.add_button("set scale", visible=run)
         places: list[level.Place] = []
@@ -375,21 +368,20 @@ class Panel:
             place, n = self.window.place_at(event.client, *event.screen_pos), self.content.model.normalization
             places[:] = [*places, place] if len(places) == 1 else [place]
             scene.add_icosphere(f"/ruler/{len(places)}", 0.01 * self.window.extent, (255, 221, 51), position=place[0])
-            text.content = "click the other point"
             if len(places) == 2:
                 distance, error = level.distance(n, *places)
-                text.content = f"{distance:.4g} {n.unit}, uncertain by {100 * error:.2g} %"
+                self.measured.content = f"{distance:.4g} {n.unit}, uncertain by {100 * error:.2g} %"
 
         def store(_: Any) -> None:
             if len(places) != 2:
                 raise UsageError("pick two points first")
             said = level.store(self.content.stem, "cpu", lambda r: level.scaled(r.normalization, *places, length.value))
             self.window.show(content_of_run(self.content.stem, self.content.model.gaussians().means.device, self.content.views))
-            text.content = _plain(" ".join(said))
+            self.measured.content = _plain(" ".join(said))
 
-        picking = self._telling(pick)
+        picking = guarded(pick, self.explain)
         measure.on_update(guarded(lambda _: scene.on_click()(picking) if measure.value else scene.remove_click_callback()))
-        save.on_click(self._telling(store))
+        save.on_click(guarded(store, self.explain))
 
     def _save(self, name: str, values: Any) -> None:
         """Write a file beside the model, and show its path."""
@@ -433,9 +425,8 @@ class Window:
         self._frusta: dict[str, Any] = {}
         self._drawn: dict[int, tuple[Any, ...]] = {}
         self._lock, self._wake, self._open = threading.RLock(), threading.Event(), True
-        self._target, self._up = html.place_first_camera(
-            server, self.first, content.model.gaussians(), cameras or [self.first], content.model.normalization.up
-        )
+        rig, up = cameras or [self.first], content.model.normalization.up
+        self._target, self._up = html.place_first_camera(server, self.first, content.model.gaussians(), rig, up)
         server.scene.set_background_image(html.plain_background(content.model.background), format="png")
         self.panel = Panel(server, content, self, maps)
         self.limit()

@@ -209,10 +209,8 @@ def rig_of(cameras: list[Camera], depth: float, level: np.ndarray | None = None)
     )  # fmt: skip
 
 
-def up_of(cameras: list[Camera], points: np.ndarray, level: np.ndarray | None = None) -> np.ndarray:
-    """Return the upward unit vector [3] of films: ``level`` if it is known, else by training cameras and points [N, 3] [u]."""
-    if level is not None:
-        return level
+def up_of(cameras: list[Camera], points: np.ndarray) -> np.ndarray:
+    """Return the upward unit vector [3] of a scene for films, from training cameras and points [N, 3] [u]."""
     depths = np.concatenate(
         [geometry.matmul(points - c.center, c.viewmat[2, :3]) for c in cameras[:: max(1, len(cameras) // 5)]]
     )

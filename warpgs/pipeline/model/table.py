@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -327,7 +327,7 @@ SIMILARITY = schema.fields(
 
 def similarity_values(n: Normalization) -> dict[str, Any]:
     """Return the values of a normalization for JSON; only offset and scale if it was not levelled."""
-    values = {name: v.tolist() if isinstance(v, np.ndarray) else v for name, v in vars(n).items()}
+    values = {name: v.tolist() if isinstance(v, np.ndarray) else v for name, v in (vars(n) | {"scale": float(n.scale)}).items()}
     return values if n.up is not None or n.unit != Normalization.unit else {name: values[name] for name in ("offset", "scale")}
 
 
@@ -416,8 +416,8 @@ def save(path: str | Path, gaussians: Gaussians, normalization: Normalization | 
     where = f"{path}: not written"
     _check_values(gaussians, where)
     normalization = checked_normalization(normalization, units, where)
-    similarity = similarity_values(replace(normalization, offset=np.asarray(normalization.offset, np.float64)))
-    header = {"format": FORMAT, "version": __version__, "units": units} | {n: json.dumps(v) for n, v in similarity.items()}
+    similarity = {name: json.dumps(value) for name, value in similarity_values(normalization).items()}
+    header = {"format": FORMAT, "version": __version__, "units": units} | similarity
     tensors = {n: t.detach().cpu().contiguous() for n, t in gaussians.tensors().items()}
     write_bytes(Path(path), to_bytes(tensors, header))
 

@@ -5,6 +5,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -40,23 +41,23 @@ EARTH, SQUARED = 6378137.0, 0.00669437999014
 
 
 @torch.no_grad()
-def pixel_depth(model: FittedModel, camera: Camera, x: float, y: float) -> tuple[float, float]:
+def pixel_depth(model: FittedModel, camera: Camera, x: float, y: float, what: str = "the point") -> tuple[float, float]:
     """Return the rendered depth [u] at a pixel, and its standard deviation in 5 x 5 pixels [u]; UsageError on background."""
     if not (0 <= x < camera.width and 0 <= y < camera.height):
-        raise UsageError(f"outside of the image, which has {camera.width} x {camera.height} px in this run")
+        raise UsageError(f"{what}: outside of the image, which has {camera.width} x {camera.height} px in this run")
     r = rasterize(model.gaussians(), camera, replace(model.options(), heaviest=CONTRIBUTORS))
     depth, alpha, row, column = r.depth, r.alpha.cpu().numpy(), int(y), int(x)
     if camera.model == "pinhole":  # as in meshes: the mean depth makes steps on slanted surfaces
         depth, _ = surface_depth(model.gaussians(), camera, r.heaviest_ids, r.heaviest_weights)
     if not alpha[row, column] >= MIN_ALPHA:
-        raise UsageError(f"shows empty background (opacity {alpha[row, column]:.2f}); pick a point on a surface")
+        raise UsageError(f"{what}: shows empty background (opacity {alpha[row, column]:.2f}); pick a point on a surface")
     window, z = np.s_[max(0, row - 2) : row + 3, max(0, column - 2) : column + 3], depth.cpu().numpy()
     return float(z[row, column]), float(z[window][alpha[window] >= MIN_ALPHA].std())
 
 
-def place_at(model: FittedModel, camera: Camera, x: float, y: float) -> Place:
+def place_at(model: FittedModel, camera: Camera, x: float, y: float, what: str = "the point") -> Place:
     """Return the surface point at a pixel; its errors are half a pixel, the spread of depth, and what a second camera shows."""
-    z, spread = pixel_depth(model, camera, x, y)
+    z, spread = pixel_depth(model, camera, x, y, what)
     pixels = np.array([[0.5, 0.5], [0.5, 0.5], [1, 0.5], [0.5, 1]]) + np.floor([x, y])
     point, *others = back_project(camera, pixels, np.array([z, z + spread, z, z]))
     moves = others - point
@@ -84,10 +85,7 @@ def picked(run: StoredRun, text: str) -> Place:
     if name not in run.scene_cameras:
         near = did_you_mean(name, run.scene_cameras) or f"give a name such as {run.train[0]}"
         raise UsageError(f"{text[:80]}: the run has no view {name[:80]!r}; {near}")
-    try:
-        return place_at(run, run.scene_cameras[name], *numbers)
-    except UsageError as e:
-        raise UsageError(f"{text}: {e}") from e
+    return place_at(run, run.scene_cameras[name], *numbers, text)
 
 
 def distance(n: Normalization, first: Place, second: Place) -> tuple[float, float]:
@@ -147,9 +145,8 @@ def photographed(run: StoredRun) -> Levelled:
         leaning = np.arcsin(np.clip(matmul(rights, up), -1, 1))
         weights = 1 / (1 + (leaning[:, None] / LEANING) ** 2)
     n, line = upright(run.normalization, up)
-    line += f"; the {len(rights)} photographs lean by {np.degrees(np.median(abs(leaning))):.2g} degrees (median)"
-    one_way = np.linalg.eigvalsh(second)[1] < 0.03
-    return n, line + "; all look one way, so their tilt forwards remains: --ground is better" * bool(one_way)
+    more = "; all look one way, so their tilt forwards remains: --ground is better" * int(np.linalg.eigvalsh(second)[1] < 0.03)
+    return n, f"{line}; {len(rights)} photographs lean by {np.degrees(np.median(abs(leaning))):.2g} degrees (median){more}"
 
 
 def metres_about(coordinates: np.ndarray, place: np.ndarray) -> np.ndarray:
@@ -163,26 +160,19 @@ def metres_about(coordinates: np.ndarray, place: np.ndarray) -> np.ndarray:
     return np.stack([across * math.cos(latitude) * east, along * north, coordinates[:, 2] - place[2]], 1)
 
 
-def in_line(points: np.ndarray) -> bool:
-    """Return whether points [N, 3] lie on a line, within a twentieth of their extent; also for fewer than three."""
-    if len(points) < 3:
-        return True
-    sizes = np.linalg.svd(points - points.mean(0), compute_uv=False)
-    return not sizes[1] > 0.05 * sizes[0]
+def similarity(points: np.ndarray, targets: np.ndarray, weights: np.ndarray) -> tuple[Any, ...]:
+    """Return scale, rotation [3, 3] and translation [3] from points to targets [N, 3], distances [N], and if all is sure.
 
-
-def similarity(
-    points: np.ndarray, targets: np.ndarray, weights: np.ndarray
-) -> tuple[float, np.ndarray, np.ndarray, np.ndarray]:
-    """Return scale, rotation [3, 3] and translation [3] from points to targets [N, 3], and distances [N] (Umeyama 1991)."""
+    Weighted least squares (Umeyama 1991); points that leave a line by at most a twentieth of its length leave a rotation open.
+    """
     parts = weights[:, None] / weights.sum()
     middle, aim = (parts * points).sum(0), (parts * targets).sum(0)
     left, sizes, right = np.linalg.svd(matmul((parts * (targets - aim)).T, points - middle))
-    sizes[2] *= (sign := np.sign(np.linalg.det(left) * np.linalg.det(right)))
-    rotation = matmul(left * [1, 1, sign], right)
-    scale = float(sizes.sum() / (parts * (points - middle) ** 2).sum())
-    translation = aim - scale * matmul(rotation, middle)
-    return scale, rotation, translation, np.linalg.norm(scale * matmul(points, rotation.T) + translation - targets, axis=1)
+    signs = np.array([1, 1, np.sign(np.linalg.det(left) * np.linalg.det(right))])
+    rotation = matmul(left * signs, right)
+    scale = float((sizes * signs).sum() / max((parts * (points - middle) ** 2).sum(), 1e-300))
+    offs = np.linalg.norm(scale * matmul(points - middle, rotation.T) + aim - targets, axis=1)
+    return scale, rotation, aim - scale * matmul(rotation, middle), offs, bool(sizes[1] > sizes[0] / 400)
 
 
 def located(run: StoredRun, folder: Path | None) -> Levelled:
@@ -192,20 +182,21 @@ def located(run: StoredRun, folder: Path | None) -> Levelled:
     files = {name: next((p for p in some if p.is_file()), None) for name, some in paths.items()}
     rows = {name: gps for name, file in files.items() if file is not None and (gps := read_gps(read_image_file(file)))}
     centers, coordinates = np.array([run.scene_cameras[name].center for name in rows]), np.array([*rows.values()])
-    agree, weights = np.ones(len(rows), bool), np.ones(len(rows))
-    if len(rows) > 2:
+    count, sure, weights = len(rows), False, np.ones(len(rows))
+    if count > 2:
         place = np.median(coordinates, axis=0)
         targets = metres_about(coordinates, place)
         for _ in range(50):  # least absolute distances, which few outliers do not move
-            *_, offs = similarity(centers, targets, weights)
+            *_, offs, _ = similarity(centers, targets, weights)
             weights = 1 / np.maximum(offs, 0.01 * SURE)
-        agree = offs <= max(SURE, 3 * float(np.median(offs)))
-    if in_line(centers[agree]):
+        agree = (offs <= max(SURE, 3 * float(np.median(offs)))).astype(float)
+        scale, rotation, translation, offs, sure = similarity(centers, targets, agree)
+        count, offs = int(agree.sum()), offs[agree > 0]
+    if count < 3 or not sure:
         raise DataError(
-            f"--gps: {agree.sum()} of {len(files)} photographs have GPS in EXIF that fits the poses; 3 are needed, not on a line. "
+            f"--gps: {count} of {len(files)} photographs have GPS in EXIF that fits the poses; 3 are needed, not on a line. "
             "Copies often lose EXIF: --gps FOLDER reads originals with the names of the views"
         )
-    scale, rotation, translation, offs = similarity(centers[agree], targets[agree], np.ones(agree.sum()))
     line = f"GPS of {len(offs)} of {len(rows)} photographs is {np.median(offs):.2f} m (median), at most {offs.max():.2f} m off"
     line += "; x is east, y north, z up [m] from latitude {:.7f}, longitude {:.7f}, height {:.1f} m".format(*place)
     return Normalization(translation, 1 / scale, rotation.T, rotation[2], "m", place), line
@@ -216,12 +207,12 @@ def store(folder: Path, device_name: str, change: Callable[[StoredRun], Levelled
     read_record(folder)  # before a lock is made: it may be no run
     with hold_folder(folder) as held:
         run, ply = open_run(folder, device_name), folder / "point_cloud.ply"
-        n, lines = change(run)
+        n, line = change(run)
         write_json(folder / CONFIG, schema.read(folder / CONFIG, folder) | {"normalization": similarity_values(n)})
         if ply.is_file():
             write_ply(ply, drop_unused_sh(run.gaussians()), n, antialiased=run.antialiased)
-    old = [f"{folder / name} has the old coordinates; save it again" for name in ("crop.json", "path.json")]
-    return [*run.notes(), *held, *lines.splitlines(), *(line for line in old if Path(line.partition(" has ")[0]).is_file())]
+    old = [folder / name for name in ("crop.json", "path.json") if (folder / name).is_file()]
+    return [*run.notes(), *held, line, *(f"{path} has the old coordinates; save it again" for path in old)]
 
 
 def level(
@@ -229,19 +220,14 @@ def level(
     photographs: bool = False, gps: tuple[Path, ...] | None = None,
 ) -> list[str]:  # fmt: skip
     """Set scale, upward direction or place of a run's files, with the options of `warpgs level`; returns lines for the user."""
-    ways = [w for w in (scale, ground, photographs or None, gps) if w is not None]
-    if len(ways) not in (1, 1 + (scale is not None and gps is None)) or len(gps or ()) > 1:
-        raise UsageError(
-            "give --scale, one of --ground, --up and --gps with at most one folder, or --scale with --ground or --up"
-        )
+    if [scale is not None, ground is not None, photographs, gps is not None].count(True) != 1 or len(gps or ()) > 1:
+        raise UsageError("give one of --scale, --ground, --up and --gps, with at most one folder")
 
     def change(run: StoredRun) -> Levelled:
-        ends, corners = ([picked(run, text) for text in texts] for texts in ((scale or ())[:2], ground or ()))
-        n, lines = scaled(run.normalization, *ends, scale[2]) if scale else (run.normalization, "")
-        run = replace(run, normalization=n)
-        if ground or photographs or gps is not None:
-            n, line = grounded(run, corners) if ground else photographed(run) if photographs else located(run, *(gps or [None]))
-            lines = f"{lines}\n{line}".strip()
-        return n, lines
+        if scale:
+            return scaled(run.normalization, picked(run, scale[0]), picked(run, scale[1]), scale[2])
+        if ground:
+            return grounded(run, [picked(run, text) for text in ground])
+        return photographed(run) if photographs else located(run, *(gps or [None]))
 
     return store(folder, device_name, change)

@@ -498,7 +498,7 @@ def write_report(
     train, test = [scene.view(n) for n in split.train], [scene.view(n) for n in split.test]
     tell("making the report")
     cameras = [v.camera for v in train], [v.camera for v in test]
-    up = up_of(cameras[0], gaussians.means.detach().cpu().numpy().astype(np.float64), scene.normalization.up)
+    up = up_of(cameras[0], gaussians.means.detach().cpu().numpy().astype(np.float64))
     covered, shown = None, evenly_spaced(test or train, SHOWN_VIEWS)
     with ThreadPoolExecutor() as threads:  # images are encoded while others are rendered
         sampled = threads.submit(sampling)
