@@ -317,10 +317,9 @@ class Table:
 
 FORMAT = "warpgs-model-1"
 _THREE = schema.items(schema.number(), 3)
+_LEVEL = {"rotation": schema.items(_THREE, 3), "up": schema.or_null(_THREE), "place": schema.or_null(_THREE)}
 SIMILARITY = schema.fields(
-    {"offset": _THREE, "scale": schema.number(above=0)},
-    {"rotation": schema.items(_THREE, 3), "up": schema.or_null(_THREE), "unit": schema.text, "place": schema.or_null(_THREE)},
-    others=False,
+    {"offset": _THREE, "scale": schema.number(above=0)}, _LEVEL | {"unit": schema.one_of("units", "m")}, others=False
 )
 """Schema of the values of a `Normalization` in files."""
 

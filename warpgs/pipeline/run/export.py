@@ -265,7 +265,7 @@ def mesh(
     run = open_run(folder, device)
     if not run.train:
         raise DataError(f"{folder}: the run has no training views, so coverage is unknown; fit again")
-    cameras, scale = training_cameras(run), run.normalization.scale
+    cameras, scale, up = training_cameras(run), run.normalization.scale, upward(run)
     if options.voxel is not None:
         options = replace(options, voxel=options.voxel * scale)
 
@@ -278,8 +278,7 @@ def mesh(
 
     with hold_file(target) as notes:
         found = fuse(run.scene_gaussians, cameras, run.options(), options, stage=stage, planned=planned)
-        vertices, up = convert_points(found.mesh.vertices, run.normalization.local, "scene", "file"), upward(run)
-        made = replace(found.mesh, vertices=vertices)
+        made = replace(found.mesh, vertices=convert_points(found.mesh.vertices, run.normalization.local, "scene", "file"))
         write_mesh(target, made, up, run.normalization.origin)
     lines = [
         f"{found.extracted:,} triangles extracted, {found.removed:,} small parts removed; the mesh has "

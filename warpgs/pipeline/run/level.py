@@ -5,7 +5,6 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -18,7 +17,7 @@ from warpgs.geometry import back_project, convert_points, matmul, project_points
 from warpgs.io.image_files import read_gps, read_image_file
 from warpgs.locks import hold_folder
 from warpgs.mesh.views import CONTRIBUTORS, MIN_ALPHA, surface_depth
-from warpgs.pipeline.model.edit import drop_unused_sh, levelling
+from warpgs.pipeline.model.edit import drop_unused_sh, levelling, numbers_of
 from warpgs.pipeline.model.table import FittedModel, similarity_values
 from warpgs.pipeline.run.folder import CONFIG, StoredRun, open_run, read_record
 from warpgs.render.rasterize import rasterize
@@ -45,7 +44,7 @@ def pixel_depth(model: FittedModel, camera: Camera, x: float, y: float, what: st
     """Return the rendered depth [u] at a pixel, and its standard deviation in 5 x 5 pixels [u]; UsageError on background."""
     if not (0 <= x < camera.width and 0 <= y < camera.height):
         raise UsageError(f"{what}: outside of the image, which has {camera.width} x {camera.height} px in this run")
-    r = rasterize(model.gaussians(), camera, replace(model.options(), heaviest=CONTRIBUTORS))
+    r = rasterize(model.gaussians(), camera, replace(model.options(), heaviest=CONTRIBUTORS * (camera.model == "pinhole")))
     depth, alpha, row, column = r.depth, r.alpha.cpu().numpy(), int(y), int(x)
     if camera.model == "pinhole":  # as in meshes: the mean depth makes steps on slanted surfaces
         depth, _ = surface_depth(model.gaussians(), camera, r.heaviest_ids, r.heaviest_weights)
@@ -74,12 +73,7 @@ def place_at(model: FittedModel, camera: Camera, x: float, y: float, what: str =
 def picked(run: StoredRun, text: str) -> Place:
     """Return the place of VIEW:x,y, a pixel of a photograph, or of x,y,z in file units, which counts as exact."""
     name, colon, words = text.rpartition(":")
-    try:
-        numbers = np.array(words.split(","), np.float64)
-    except ValueError:
-        numbers = np.zeros(0)
-    if len(numbers) != (2 if colon else 3) or not np.isfinite(numbers).all():
-        raise UsageError(f"{text[:80]}: expected VIEW:x,y, a pixel of a photograph, or x,y,z in units of the run's files")
+    numbers = numbers_of(words.split(","), (2 if colon else 3,), f"{text[:80]}: a point, VIEW:x,y or x,y,z,")
     if not colon:
         return convert_points(numbers[None], run.normalization, "file", "scene")[0], np.zeros((3, 3))
     if name not in run.scene_cameras:
@@ -109,7 +103,7 @@ def scaled(n: Normalization, first: Place, second: Place, length: float) -> Leve
 def upright(n: Normalization, up: np.ndarray, ground: np.ndarray | None = None) -> Levelled:
     """Turn files so that ``up`` [3] of the scene is up: -y, or z after GPS. Off maps, ``ground`` [3] [u] gets height 0."""
     wanted, own = (np.array([0.0, -1, 0]) if v is None else matmul(n.rotation.T, v) for v in (n.up, up))
-    turn, degrees = matmul(levelling(wanted).T, levelling(own)), math.degrees(math.acos(min(1.0, float((wanted * own).sum()))))
+    turn, degrees = matmul(levelling(wanted).T, levelling(own)), np.degrees(np.arccos(np.clip((wanted * own).sum(), -1, 1)))
     offset = n.origin + matmul(turn, n.offset - n.origin)
     n = replace(n, rotation=matmul(n.rotation, turn.T), offset=offset, up=up)
     if ground is not None and n.place is None and not n.origin.any():
@@ -160,7 +154,7 @@ def metres_about(coordinates: np.ndarray, place: np.ndarray) -> np.ndarray:
     return np.stack([across * math.cos(latitude) * east, along * north, coordinates[:, 2] - place[2]], 1)
 
 
-def similarity(points: np.ndarray, targets: np.ndarray, weights: np.ndarray) -> tuple[Any, ...]:
+def similarity(points: np.ndarray, targets: np.ndarray, weights: np.ndarray) -> tuple[float | np.ndarray, ...]:
     """Return scale, rotation [3, 3] and translation [3] from points to targets [N, 3], distances [N], and if all is sure.
 
     Weighted least squares (Umeyama 1991); points that leave a line by at most a twentieth of its length leave a rotation open.
