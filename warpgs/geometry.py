@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from warpgs.constants import POSE_TOLERANCE
 from warpgs.errors import DataError, UsageError
-from warpgs.scene import ActivatedGaussians, Camera, Gaussians, Mesh, Normalization
+from warpgs.scene import ActivatedGaussians, Camera, Gaussians, Normalization
 
 if TYPE_CHECKING:
     import torch
@@ -490,7 +491,7 @@ def look_at(center: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarra
 #
 # ``scene`` units [u] are those of a `Scene` that `load_scene` returned: recentred and rescaled, as the fit sees it.
 # ``file`` units are those of the scene's own files and of a run's PLY files. `Normalization` holds the similarity from
-# file to scene units: ``x_scene = scale * (x_file - offset)``.
+# file to scene units: ``x_scene = scale * rotation @ (x_file - offset)``.
 
 UNITS = ("scene", "file")
 SH_COUNTS = (1, 4, 9, 16, 25)
@@ -503,8 +504,10 @@ def checked_normalization(normalization: Normalization | None, units: str, where
     if normalization is None and units == "scene":
         raise UsageError(f"{where}: units='scene' requires normalization=scene.normalization; give it, or units='file'")
     n = normalization or Normalization()
-    offset = np.asarray(n.offset)
-    if not (math.isfinite(n.scale) and n.scale > 0 and offset.shape == (3,) and np.isfinite(offset).all()):
+    offset, rotation = np.asarray(n.offset), np.asarray(n.rotation)
+    finite = math.isfinite(n.scale) and n.scale > 0 and offset.shape == (3,) and np.isfinite(offset).all()
+    turns = rotation.shape == (3, 3) and np.abs(matmul(rotation, rotation.T) - np.eye(3)).max() <= POSE_TOLERANCE
+    if not (finite and turns and np.linalg.det(rotation) > 0 and (n.up is None or 0.99 < np.linalg.norm(n.up) < 1.01)):
         raise DataError(f"{where}: the scene's normalization is not a similarity: {n}. Read the scene again")
     return n
 
@@ -535,26 +538,39 @@ def _same_units(source: str, target: str) -> bool:
 
 
 def _converted(points: Array, offset: Array, scale: float, target: str) -> Array:
-    """Return points [N, 3] in the other units, ``target``."""
+    """Return points [N, 3] in the other units, ``target``, in unchanged axes."""
     return points / scale + offset if target == "file" else scale * (points - offset)
+
+
+def convert_points(points: np.ndarray, normalization: Normalization, source: str, target: str) -> np.ndarray:
+    """Return points [N, 3] in other units, float64."""
+    if _same_units(source, target):
+        return points
+    offset, scale, rotation = np.asarray(normalization.offset, np.float64), normalization.scale, normalization.rotation
+    if target == "file":
+        return np.asarray(_converted(matmul(points, rotation), offset, scale, target))
+    return matmul(_converted(points, offset, scale, target), rotation.T)
 
 
 def convert_gaussians(gaussians: Gaussians, normalization: Normalization, source: str, target: str) -> Gaussians:
     """Return Gaussians in other units; tensors that do not change are shared.
 
-    Means and log scales change; quaternions, opacities and spherical harmonics do not, because the similarity has no rotation.
-    Sums are taken in float64. In file units, all tensors are float64 if the normalization has an `origin`: float32 would round
-    map coordinates to decimetres.
+    Means and log scales change; quaternions and spherical harmonics only if the similarity has a rotation. Sums are taken in
+    float64. In file units, all tensors are float64 if the normalization has an `origin`: float32 would round map coordinates to
+    decimetres.
     """
     check_stored(gaussians)
     if _same_units(source, target):
         return gaussians
+    if normalization.turned and target == "file":
+        gaussians = rotate(gaussians, normalization.rotation.T)
     means, kind = gaussians.means.double(), gaussians.means.dtype
     means = _converted(means, means.new_tensor(np.asarray(normalization.offset, np.float64)), normalization.scale, target)
     longer = math.log(normalization.scale) * (-1 if target == "file" else 1)
     if target == "file" and normalization.origin.any():
         gaussians, kind = Gaussians(**{name: t.double() for name, t in gaussians.tensors().items()}), means.dtype
-    return replace(gaussians, means=means.to(kind), log_scales=(gaussians.log_scales.double() + longer).to(kind))
+    gaussians = replace(gaussians, means=means.to(kind), log_scales=(gaussians.log_scales.double() + longer).to(kind))
+    return rotate(gaussians, normalization.rotation) if normalization.turned and target == "scene" else gaussians
 
 
 _NODES = ((0.0, 0.5688888888888889), (0.5384693101056831, 0.47862867049936647), (0.906179845938664, 0.23692688505618908))
@@ -617,26 +633,22 @@ def rotate(gaussians: Gaussians, rotation: np.ndarray) -> Gaussians:
     )
 
 
-def convert_mesh(mesh: Mesh, normalization: Normalization, source: str, target: str) -> Mesh:
-    """Return a mesh in other units: its vertices change, triangles and colours are shared."""
-    if _same_units(source, target):
-        return mesh
-    offset = np.asarray(normalization.offset, np.float64)
-    return replace(mesh, vertices=_converted(mesh.vertices, offset, normalization.scale, target))
-
-
 def convert_camera(camera: Camera, normalization: Normalization, source: str, target: str) -> Camera:
-    """Return a camera, or a batch of them, in other units: its translation changes, rotation and intrinsics do not."""
+    """Return a camera, or a batch of them, in other units: its pose changes, its intrinsics do not."""
     if _same_units(source, target):
         return camera
-    offset: Any = np.asarray(normalization.offset, np.float64)
+    offset, turn = np.asarray(normalization.offset, np.float64), normalization.rotation
     if isinstance(camera.viewmat, np.ndarray):
         viewmat: Any = camera.viewmat.copy()
     else:
-        viewmat, offset = camera.viewmat.clone(), camera.viewmat.new_tensor(offset)
+        viewmat = camera.viewmat.clone()
+        offset, turn = viewmat.new_tensor(offset), viewmat.new_tensor(turn)
     rotation, translation = viewmat[..., :3, :3], viewmat[..., :3, 3]
     if target == "file":
+        rotation = rotation @ turn if normalization.turned else rotation
         viewmat[..., :3, 3] = translation / normalization.scale - rotation @ offset
     else:
         viewmat[..., :3, 3] = normalization.scale * (rotation @ offset + translation)
+        rotation = rotation @ turn.T if normalization.turned else rotation
+    viewmat[..., :3, :3] = rotation
     return replace(camera, viewmat=viewmat)

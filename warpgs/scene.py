@@ -143,12 +143,25 @@ MAX_STEP = 1e-5
 
 @dataclass(frozen=True)
 class Normalization:
-    """Similarity from file coordinates to scene coordinates: ``x_scene = scale * (x_file - offset)``."""
+    """Similarity from file coordinates to scene coordinates: ``x_scene = scale * rotation @ (x_file - offset)``."""
 
     offset: np.ndarray = field(default_factory=lambda: np.zeros(3))
     """Offset [file units], float64, shape [3]."""
     scale: float = 1.0
     """Scene units per file unit."""
+    rotation: np.ndarray = field(default_factory=lambda: np.eye(3))
+    """Rotation from file axes to scene axes, float64, shape [3, 3]; the identity unless `warpgs level` turned the files."""
+    up: np.ndarray | None = None
+    """Upward direction in scene axes, length 1, float64, shape [3]; None unless `warpgs level` has set it."""
+    unit: str = "units"
+    """Name of the file unit: m if `warpgs level` has set the scale."""
+    place: np.ndarray | None = None
+    """Latitude, longitude [deg] and height [m] of 0 in files with x east, y north, z up, shape [3]; None if unknown."""
+
+    @property
+    def turned(self) -> bool:
+        """Return whether file axes differ from scene axes."""
+        return not np.array_equal(self.rotation, np.eye(3))
 
     @property
     def origin(self) -> np.ndarray:
@@ -167,7 +180,7 @@ class Normalization:
     @property
     def local(self) -> Normalization:
         """Return the similarity to scene units from file units about the `origin`."""
-        return Normalization(np.asarray(self.offset, np.float64) - self.origin, self.scale)
+        return replace(self, offset=np.asarray(self.offset, np.float64) - self.origin)
 
 
 def checked_origin(values: object, where: str) -> np.ndarray:

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from bench.lib.surfaces import distance_to, distance_to_mesh, sample, summary, true_depth
-from warpgs.geometry import convert_mesh
+from warpgs.geometry import convert_points
 from warpgs.mesh.fuse import MeshOptions, fuse
 from warpgs.mesh.views import surface_view
 from warpgs.pipeline.model.table import FittedModel
@@ -39,7 +39,8 @@ def mesh_row(model: FittedModel, options: MeshOptions, shapes: list[raycast.Shap
     cameras, scale, began = [model.cameras()[n] for n in model.train], model.normalization.scale, time.perf_counter()
     scaled = replace(options, voxel=None if options.voxel is None else options.voxel * scale)
     found = fuse(model.gaussians(), cameras, model.options(), scaled)
-    seconds, mesh = time.perf_counter() - began, convert_mesh(found.mesh, model.normalization, "scene", "file")
+    seconds, vertices = time.perf_counter() - began, convert_points(found.mesh.vertices, model.normalization, "scene", "file")
+    mesh = replace(found.mesh, vertices=vertices)
     on_mesh = sample(mesh, SAMPLES)
     off = np.min([distance_to(s, on_mesh) for s in shapes], axis=0)
     some = seen[:: max(1, len(seen) // SAMPLES)]

@@ -311,6 +311,6 @@ def box_files(root: Path) -> list[Path]:
     return [root / "a.json"]
 
 
-BOX = (edit.box_of, edit._box_of_file, edit._numbers)
+BOX = (edit.box_of, edit._box_of_file, edit.numbers_of)
 BOX_CHANGES = (json_value, json_value, text_number)
 register(Target("crop box", box_files, lambda root, path: edit.box_of(str(path)), BOX, BOX_CHANGES))

@@ -26,6 +26,7 @@ Pixels = tuple[np.ndarray, np.ndarray | None]
 def read(folder: Path, path: Path) -> Pixels:
     pixels = image_files.decode(path, MAX_PIXELS)
     assert image_files.read_exif(path.read_bytes())[0] in range(1, 9)
+    assert abs((image_files.read_gps(path.read_bytes()) or (0,))[0]) <= 90
     return pixels
 
 

@@ -172,6 +172,7 @@ REASONS = {
     "pipeline/farm/farm.py": {"LocalEngine._serve": PIPE},
     "pipeline/farm/worker.py": {"main": PIPE},
     "pipeline/metrics/coverage.py": {"coverage_section": OWN},
+    "pipeline/run/level.py": {"store": "reads config.json again, which `read_record` has checked"},
     "pipeline/run/results.py": {"sampling_report_of": "reads images for `webp`, which is named here"},
     "plugins.py": {"module_digest": DIGEST},
     "poses/find.py": {"find_poses": OWN, "source_digest": DIGEST},
@@ -193,6 +194,7 @@ REASONS = {
         "hidden_stderr": "opens /dev/null for writing", "run_python": PIPE,
         "_send_to_null": "opens /dev/null for writing"},
     "ranks.py": {"machine": SYSTEM},
+    "viewer/html.py": {"write_html": "reads a file of the package"},
     "viewer/window.py": {"Panel._add_sampling": "reads an image for `decode`, whose reader is named here"},
 }  # fmt: skip
 """Why a function that opens something is not read by the fuzzer, by file and function."""

@@ -24,6 +24,10 @@ MESSAGES = {
         "type": "SceneNodeClickMessage", **PLACE, "instance_index": None, "ray_origin": [0.0, 0.0, 0.0],
         "ray_direction": [0.0, 0.0, 1.0], "screen_pos": [0.5, 0.5], "modifier": None,
     },
+    "pointer": {
+        "type": "ScenePointerMessage", "event_type": "click", "ray_origin": [0.0, 0.0, 0.0], "ray_direction": [0.0, 0.0, 1.0],
+        "screen_pos": [[0.5, 0.5]], "modifier": None,
+    },
     "moved": {"type": "TransformControlsUpdateMessage", **PLACE, "wxyz": [0.0, 1.0, 0.0, 0.0], "position": [1.0, 2.0, 3.0]},
     "tick": {"type": "GuiUpdateMessage", "uuid": "tick", "updates": {"value": True}},
     "choice": {"type": "GuiUpdateMessage", "uuid": "choice", "updates": {"value": "depth"}},

@@ -12,8 +12,9 @@ import pytest
 
 from tests.scenes import ring, three_gaussians
 from tests.viewer import wait_shown
-from warpgs.geometry import look_at
+from warpgs.geometry import look_at, project_points
 from warpgs.render.rasterize import rasterize
+from warpgs.scene import Normalization
 from warpgs.synthetic.demo import split_spec, write_demo
 from warpgs.viewer import server as connections
 from warpgs.viewer.html import (
@@ -184,6 +185,30 @@ def test_a_page_tells_how_to_move_and_returns(browser, tmp_path):
         browser.value(f"void {back}")
         browser.wait(f"{place} === {before!r}")
     assert not [line for line in browser.console() if "Content Security Policy" in line]
+
+
+@pytest.mark.browser
+def test_a_page_has_a_ruler(browser, tmp_path):
+    """Two clicks on Gaussians give the distance of their means in the unit of the files; a click beside them says so."""
+    g, camera, path = three_gaussians(), ring(3)[1], tmp_path / "scene.html"
+    means = g.means.new_tensor([[-0.8, 0.1, 0.5], [0.1, 0.2, 0.1], [0.5, -0.3, -0.2]])
+    g = dataclasses.replace(g, means=means, log_scales=0 * g.log_scales - 2.5, logit_opacities=0 * g.logit_opacities + 4)
+    K = np.diag([20, 20, 1.0]) @ camera.K
+    K[:2, 2] = 400, 320
+    write_html(path, g, [camera], normalization=Normalization(scale=0.25, unit="m"))
+    browser.resize(800, 640)
+    browser.open(path.as_uri())
+    ruler = "document.querySelector('#warpgs-ruler')"
+    browser.wait(f"{ruler} && document.querySelector('#warpgs-loading') === null")
+    browser.value(f"{ruler}.click()")
+    ends = means.double().numpy()[[0, 2]]
+    length = np.linalg.norm(ends[0] - ends[1]) / 0.25
+    pixels = project_points(dataclasses.replace(camera, K=K), ends)[0].tolist()
+    for (x, y), said in zip([*pixels, (5, 600)], ("click the other point", f": {length:.2g}", "no surface there")):
+        for kind in ("mousePressed", "mouseReleased"):
+            browser.ask("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)
+        browser.wait(f"{ruler}.textContent.includes({said!r})")
+    assert not refused(browser), browser.console()
 
 
 @pytest.mark.browser

@@ -5,6 +5,7 @@ import contextlib
 import dataclasses
 import json
 import os
+import shutil
 import threading
 from types import SimpleNamespace
 
@@ -18,10 +19,13 @@ from tests.viewer import wait_shown
 from warpgs.app.cli import main
 from warpgs.errors import DataError
 from warpgs.geometry import convert_gaussians
+from warpgs.pipeline.films.paths import fov_y
 from warpgs.pipeline.model.start import InitConfig
+from warpgs.pipeline.run import level
+from warpgs.pipeline.run.folder import load_checkpoint, save_checkpoint
 from warpgs.synthetic.demo import split_spec, write_demo
 from warpgs.viewer import watch
-from warpgs.viewer.html import middle_first
+from warpgs.viewer.html import middle_first, wxyz_of
 from warpgs.viewer.server import open_server, stop_server
 from warpgs.viewer.window import (
     COARSE_LAYER,
@@ -300,6 +304,47 @@ def test_a_run_is_followed_until_it_is_interrupted(folder, monkeypatch, capsys):
     told = capsys.readouterr().out
     assert len(shown) == 1
     assert all(words in told for words in ("waiting for the first checkpoint", "step 12", "http://127.0.0.1:1/word/"))
+
+
+def test_the_ruler_picks_and_scales_as_the_command_does(folder, tmp_path):
+    """Two clicks at a training camera are its pixels on the command line; a typed length becomes the scale of the files."""
+    run = shutil.copytree(folder / "run", tmp_path / "run")
+    record, (tensors, state) = json.loads((run / "config.json").read_text()), load_checkpoint(run)
+    for values in record["cameras"].values():  # a browser's camera has its principal point in the middle
+        values["K"][0][2], values["K"][1][2] = SIZE[0] / 2, SIZE[1] / 2
+    (run / "config.json").write_text(json.dumps(record))
+    tensors["params.logit_opacities"][:] = 4
+    save_checkpoint(run, tensors, state)
+    server = open_server(0)
+    window = Window(server, content_of_run(run))
+    model, panel = window.content.model, window.panel
+    camera = model.scene_cameras[model.train[0]]
+    rows, columns = np.nonzero(warpgs.rasterize(model.gaussians(), camera, model.options()).alpha.detach().numpy() > 0.6)
+    eye = SimpleNamespace(wxyz=wxyz_of(camera), position=camera.center, fov=fov_y(camera))
+    eye.image_width, eye.image_height = SIZE
+    try:
+        button(window, "click two points").value = True
+        (click,), (store,) = server.scene._scene_pointer_cb, button(window, "set scale")._impl.update_cb
+
+        def measured(*ends):
+            for i in ends:
+                at = (columns[i] + 0.5) / SIZE[0], (rows[i] + 0.5) / SIZE[1]
+                click.callback(SimpleNamespace(client=SimpleNamespace(camera=eye), screen_pos=at))
+            return panel.measured.content
+
+        measured(0)
+        store(None)
+        assert "pick two points first" in panel._note.content
+        places = [level.picked(model, f"{model.train[0]}:{columns[i]},{rows[i]}") for i in (0, -1)]
+        units, error = level.distance(model.normalization, *places)
+        assert measured(-1) == f"{units:.4g} units, uncertain by {100 * error:.2g} %"
+        button(window, "length [m]").value = 3.0
+        store(None)
+        assert "in metres" in panel.measured.content and measured(0, -1).startswith("3 m,")
+    finally:
+        window.close()
+        stop_server(server)
+    assert warpgs.open_run(run).normalization.scale == pytest.approx(model.normalization.scale * units / 3)
 
 
 def test_a_page_names_nobody(folder, tmp_path, capsys):

@@ -128,6 +128,7 @@ COMMANDS = {
     "export": "write a run's Gaussians to a file or a web page",
     "convert": "write a file of Gaussians or cameras in another format",
     "mesh": "make a mesh of a run's surfaces: .ply, .glb",
+    "level": "set the scale, ground and place of a run by points or GPS",
     "prune": "shrink a finished model within a PSNR budget",
     "eval": "score a run again on its held-out views",
     "compare": "fit presets to scenes with several seeds; tables and plots",
@@ -141,7 +142,7 @@ COMMANDS = {
 GROUPS = {
     "start": ("demo", "poses", "fit"),
     "look": ("view", "render", "plot", "priors"),
-    "share": ("export", "convert", "mesh", "prune"),
+    "share": ("level", "export", "convert", "mesh", "prune"),
     "measure": ("eval", "compare", "ablate", "convert-lpips"),
     "many scenes": ("farm",),
     "this machine": ("doctor",),

@@ -189,6 +189,26 @@ def mesh(
     return export.mesh(run, out, options, device, crop=crop, stage=Stages(), say=say)
 
 
+def level(
+    run: Positional[Path], *, scale: tuple[str, str, float] | None = None, ground: tuple[str, str, str] | None = None,
+    up: Literal["photographs"] | None = None, gps: tuple[Path, ...] | None = None, device: str = "auto",
+) -> list[str]:  # fmt: skip
+    """Give a run's files real sizes.
+
+    Args:
+        run: Run folder of `warpgs fit`; its PLY is written again, and every later export has the new coordinates.
+        scale: Two points and the length between them [m]. A point is VIEW:x,y, a pixel of a photograph at the size of the
+            fit, or x,y,z in units of the run's files.
+        ground: Three points of the ground, which becomes level.
+        up: photographs, to level by how the photographs were held.
+        gps: Metres to east, north and up by the GPS in EXIF, of the scene's photographs or of those in a folder.
+        device: auto, cpu or cuda.
+    """
+    from warpgs.pipeline.run import level as levels
+
+    return levels.level(run, device, scale, ground, up is not None, gps)
+
+
 def prune(
     run: Positional[Path], *, keep_psnr: float = 0.1, out: Path | None = None, device: str = "auto", reader: str | None = None
 ) -> list[str]:
@@ -238,8 +258,8 @@ def convert_lpips(*, backbone: Path, heads: Path, out: Path) -> list[str]:
 
 
 COMMANDS: dict[str, Callable[..., Any]] = {
-    "demo": demo, "poses": poses, "view": view, "render": render, "plot": plot, "mesh": mesh, "prune": prune,
-    "eval": evaluate, "convert-lpips": convert_lpips,
+    "demo": demo, "poses": poses, "view": view, "render": render, "plot": plot, "mesh": mesh, "level": level,
+    "prune": prune, "eval": evaluate, "convert-lpips": convert_lpips,
 }  # fmt: skip
 """Commands with the same flags at every call."""
 

@@ -89,7 +89,7 @@ def from_origin(gaussians: Gaussians, origin: np.ndarray, normalization: Normali
         tensors = {name: t.double() for name, t in gaussians.tensors().items()}
         return Gaussians(**tensors | {"means": tensors["means"] + tensors["means"].new_tensor(origin)})
     offset = np.asarray(normalization.offset, np.float64) - origin
-    return convert_gaussians(gaussians, Normalization(offset, normalization.scale), "file", units)
+    return convert_gaussians(gaussians, replace(normalization, offset=offset), "file", units)
 
 
 def arrays_to_write(

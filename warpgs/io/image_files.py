@@ -382,6 +382,12 @@ class _Directory:
         kind, length, _ = self.entries.get(tag, (0, 0, 0))
         return self.numbers(tag)[0] if kind in (3, 4) and length == 1 else None
 
+    def ratios(self, tag: int) -> list[float]:
+        """Return the fractions of a tag; none for a tag that is missing or of another type, NaN for a division by 0."""
+        kind, length, place = self.entries.get(tag, (0, 0, 0))
+        values = self._unpack(f"{2 * length}I", self._place(8 * length, place)) if kind == 5 and length <= 3 else ()
+        return [a / b if b else math.nan for a, b in zip(values[::2], values[1::2])]
+
     def text(self, tag: int) -> str:
         """Return the text of a tag, maybe empty, without the zero bytes and spaces around it."""
         kind, length, place = self.entries.get(tag, (0, 0, 0))
@@ -528,14 +534,16 @@ def decode(path: Path, max_pixels: int = MAX_PIXELS, data: bytes | None = None) 
     return np.ascontiguousarray(color), alpha
 
 
-# EXIF of a photograph and its lens: five tags, read from the first directory and the block of exposure data.
+# EXIF of a photograph and its lens: a few tags, read from the first directory and the blocks of exposure and GPS data.
 #
 # Only the values of these tags are read, because libraries that read all of EXIF copy overlapping values again and again.
 
-MAKE, MODEL, ORIENTATION, EXPOSURE, FOCAL_35MM = 0x010F, 0x0110, 0x0112, 0x8769, 0xA405
-"""Tags: maker and model of the device, orientation, place of the exposure data, and focal length on 35 mm film [mm]."""
+MAKE, MODEL, ORIENTATION, EXPOSURE, GPS, FOCAL_35MM = 0x010F, 0x0110, 0x0112, 0x8769, 0x8825, 0xA405
+"""Tags: maker and model of the device, orientation, places of exposure and GPS data, and focal length on 35 mm film [mm]."""
 MAX_FOCAL = 10_000
 """Longest equivalent focal length that is accepted [mm]."""
+MAX_HEIGHT = 20_000
+"""Largest height that is accepted [m]."""
 PREFIX = b"Exif\0\0"
 """First bytes of EXIF in JPEG, and in some WebP files."""
 
@@ -566,6 +574,20 @@ def parse_exif(block: bytes) -> Exif:
     except ValueError:
         return NO_EXIF
     return orientation if orientation <= 8 else 1, maker, model, float(focal) if focal and focal <= MAX_FOCAL else None
+
+
+def read_gps(data: bytes) -> tuple[float, float, float] | None:
+    """Return latitude, longitude [deg] and height [m] (0 if unknown) of an image file by its EXIF; None without them."""
+    try:
+        block = _block(data).removeprefix(PREFIX)
+        tags = _Directory(block, _Directory(block).number(GPS))
+        degrees = [np.dot(tags.ratios(tag), (1, 1 / 60, 1 / 3600)) for tag in (2, 4)]
+        latitude, longitude = (-v if tags.text(tag) in ("S", "W") else v for tag, v in zip((1, 3), degrees))
+        height = sum(tags.ratios(6)) * (-1 if tags.numbers(5) == (1,) else 1)
+    except ValueError:
+        return None
+    sound = abs(latitude) <= 90 and abs(longitude) <= 180 and abs(height) <= MAX_HEIGHT
+    return (float(latitude), float(longitude), float(height)) if sound and (latitude or longitude) else None
 
 
 def _block(data: bytes) -> bytes:

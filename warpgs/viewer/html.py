@@ -7,6 +7,7 @@ import math
 import os
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,9 +20,9 @@ from warpgs.files import write_text
 from warpgs.geometry import convert_camera, convert_gaussians, look_at, matmul, pose_at, quaternions, rotation_matrices
 from warpgs.locks import hold_file
 from warpgs.pipeline.films.paths import fov_y, up_of
-from warpgs.pipeline.run.export import NO_FILTERS, Filters, file_gaussians, filtered, rotate_camera
+from warpgs.pipeline.run.export import NO_FILTERS, Filters, file_gaussians, filtered
 from warpgs.pipeline.run.folder import open_run
-from warpgs.scene import Camera, Gaussians, base_colors
+from warpgs.scene import Camera, Gaussians, Normalization, base_colors
 from warpgs.viewer.server import LIMITS, NO_PARAMETERS, NO_TEXT_AS_CODE, TURNING, open_server, require_viser, stop_server
 
 if TYPE_CHECKING:
@@ -113,20 +114,6 @@ NO_REMARKS = "<style>.mantine-Notifications-root{display:none}</style>"
 """Style that hides viser's remark on browsers without a GPU, which would cover the model."""
 NO_SCENE_TREE = '<style>:has(>[aria-label$="scene tree"]){display:none!important}</style>'
 """Style that hides viser's button for the scene tree, which has only one entry."""
-HELP = (
-    "<style>#warpgs-help{position:fixed;top:.8em;right:.8em;z-index:2;font:13px sans-serif;color:#fff;text-shadow:0 0 3px #000}"
-    "#warpgs-help button{font:inherit;margin-left:.5em;cursor:pointer}</style>"
-    '<div id="warpgs-help">Drag to turn, scroll or pinch to zoom<button>Reset (R)</button>'
-    '<button id="warpgs-limits" title="Stay where the photographs show the scene">Limits: on</button></div>'
-    "<script>{const back=()=>{const m=window.__viserMutable;m?.resetCameraPose?m.resetCameraPose(true):location.reload()};"
-    "document.querySelector('#warpgs-help button').addEventListener('click',back);"
-    "document.querySelector('#warpgs-limits').addEventListener('click',e=>{"
-    "const free=document.body.classList.toggle('warpgs-free');e.target.textContent='Limits: '+(free?'off':'on');"
-    "window.__viserMutable?.cameraControl?.rotate(0,0,true)});"
-    "addEventListener('keydown',e=>{if(e.key.toLowerCase()==='r'&&!e.ctrlKey&&!e.metaKey&&!e.altKey)back()})}</script>"
-)
-"""Line of help, with a button that returns to the first view; without viser's reset function, the page is reloaded. Another
-button switches the limits of `TURNING` off, and the frame of `WHOLE_IMAGE` with them."""
 LOADING = (
     '<div id="warpgs-loading" style="position:fixed;inset:0;z-index:2;display:grid;place-items:center;pointer-events:none;'
     'font:16px sans-serif;color:#888">Loading the scene ...</div>'
@@ -142,23 +129,6 @@ SORT_FROM_DISK = (
 """Script for a page opened from disk. Browsers reject its blobs as module workers; without the sorting worker, Gaussians
 are blended in the order of the file. The script hides the blob, so viser's page starts the worker from a data:
 address, which works."""
-WHOLE_IMAGE = (
-    "<style>#warpgs-frame{position:fixed;inset:0;margin:auto;z-index:1;pointer-events:none;"
-    "box-shadow:0 0 0 9999px rgb(BACK/.9)}"
-    '.warpgs-free #warpgs-frame{display:none}</style><div id="warpgs-frame"></div>'
-    "<script>{let fov=OWN,reach=0;const degrees=180/Math.PI,box=document.querySelector('#warpgs-frame').style,frame=()=>{"
-    "const m=window.__viserMutable,k=1.1*innerHeight*reach/m.cameraControl.distance/Math.tan(m.camera.fov/degrees/2);"
-    "box.width=Math.min(WIDE*k,1e5)+'px';box.height=Math.min(TALL*k,1e5)+'px'},show=()=>{"
-    "const m=window.__viserMutable,c=m?.camera,t=m?.cameraControl;"
-    "if(!t||!c||Math.abs(c.fov-fov*degrees)>1e-3)return requestAnimationFrame(show);"
-    "if(!reach){reach=t.distance;t.addEventListener('update',frame)}"
-    "fov=2*Math.atan(Math.max(Math.tan(OWN/2),SIDE*innerHeight/innerWidth));c.fov=fov*degrees;c.updateProjectionMatrix();"
-    "frame()};show();addEventListener('resize',show)}</script>"
-)
-"""Script that widens the vertical field of view OWN [rad] in a browser window narrower than the first camera's image,
-such as a phone's; otherwise the sides would be cut off. SIDE is half the width of the image at distance 1. Whatever is
-outside 1.1 times WIDE and TALL, the results of `seen_at`, fades into the background's colour BACK; zooming in widens this
-frame."""
 LEAST_MARGIN, LARGEST_MARGIN = math.radians(2), math.radians(15)
 """Limits of the angle that a page may turn beyond the photographs [rad]; between them it is a quarter of the captured arc."""
 ALL_ROUND = math.radians(100)
@@ -166,11 +136,12 @@ ALL_ROUND = math.radians(100)
 
 
 def place_first_camera(
-    server: viser.ViserServer, camera: Camera, gaussians: Gaussians, cameras: Sequence[Camera]
+    server: viser.ViserServer, camera: Camera, gaussians: Gaussians, cameras: Sequence[Camera], level: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Set the camera at which pages start; return its target [3] [u] and the upward direction [3] of films."""
+    """Set the camera at which pages start; return its target [3] [u] and the upward direction [3], ``level`` or of films."""
     target = camera.center + distance_ahead(camera, gaussians) * np.asarray(camera.viewmat[2, :3])
-    up, own = up_of(list(cameras), gaussians.means.detach().cpu().double().numpy()), -np.asarray(camera.viewmat[1, :3])
+    points, own = gaussians.means.detach().cpu().double().numpy(), -np.asarray(camera.viewmat[1, :3])
+    up = up_of(list(cameras), points) if level is None else level
     up = up if (up * own).sum() > 0.5 else own  # the camera looks along it, or lies on its side
     server.scene.set_up_direction(up)
     server.initial_camera.position = camera.center
@@ -249,17 +220,21 @@ def write_html(
     cameras: Sequence[Camera] = (),
     background: Sequence[float] = (0.0, 0.0, 0.0),
     title: str = "warpgs",
+    normalization: Normalization | None = None,
 ) -> list[str]:
-    """Write a model as one HTML file, which appears whole or not at all; return notes on differences from a render."""
+    """Write a model as one HTML file, which appears whole or not at all; return notes on differences from a render.
+
+    The upward direction and the unit of the page's ruler are those of the normalization.
+    """
     # The page holds the Gaussians in their own units (`packed`), with colours of degree 0 only. It contains no name of
     # a file, a view or a machine, except ``title``.
     if not len(gaussians):
         raise DataError("a page needs at least one Gaussian; fit the scene for longer")
-    arrays, scale, shortened = packed(gaussians)
+    (arrays, scale, shortened), normalization = packed(gaussians), normalization or Normalization()
     known, cameras = bool(cameras), cameras or [camera_before(gaussians)]
     first, server = cameras[0], open_server(port=0)
     try:
-        target, up = place_first_camera(server, first, gaussians, cameras)
+        target, up = place_first_camera(server, first, gaussians, cameras, normalization.up)
         server.scene.set_background_image(plain_background(background), format="png")
         add_limits(server, cameras, target, up)
         server.scene.add_gaussian_splats("/gaussians", *arrays, scale=scale)
@@ -271,11 +246,12 @@ def write_html(
     text = re.sub(r"<title>[^<]*</title>", lambda _: f"<title>{html.escape(title)}</title>", text, count=1)
     text, end, rest = text.replace("<head>", head, 1).replace("<body>", f"<body>{LOADING}", 1).rpartition("</body>")
     wide, tall = seen_at(cameras, target) if known else (1e3, 1e3)
-    script, side = WHOLE_IMAGE, 0.5 * first.width / float(first.K[0, 0])
-    for name, value in (("OWN", fov_y(first)), ("SIDE", side), ("WIDE", wide), ("TALL", tall)):
-        script = script.replace(name, f"{value:.8f}")
-    script = script.replace("BACK", " ".join(map(str, plain_background(background)[0, 0])))
-    write_text(Path(path), f"{text}{HELP}{script}{end}{rest}")
+    values = {"OWN": fov_y(first), "SIDE": 0.5 * first.width / float(first.K[0, 0]), "WIDE": wide, "TALL": tall}
+    tools = Path(__file__).with_name("tools.html").read_text("utf-8").replace("UNIT", normalization.unit)
+    tools = tools.replace("BACK", " ".join(map(str, plain_background(background)[0, 0])))
+    for name, value in (values | {"LENGTH": 1 / normalization.scale}).items():
+        tools = tools.replace(name, f"{value:.8g}")
+    write_text(Path(path), f"{text}{tools}{end}{rest}")
     notes = ["the page shows no view-dependent colours; the run and its PLY keep them"] if gaussians.sh_degree else []
     return notes + [f"{shortened:,} Gaussians are longer than the page can store, and are shown shorter"] * bool(shortened)
 
@@ -290,12 +266,13 @@ def export_html(folder: Path, target: Path, filters: Filters = NO_FILTERS) -> li
     found = run.normalization.local
     cameras = [convert_camera(run.scene_cameras[n], found, "scene", "file") for n in run.train]
     if rotation is not None:
-        cameras = [rotate_camera(c, rotation) for c in cameras]
+        cameras = [convert_camera(c, Normalization(rotation=rotation.T), "scene", "file") for c in cameras]
+        found = replace(found, up=None if found.up is None else found.rotation @ rotation @ found.rotation.T @ found.up)
     gaussians = convert_gaussians(gaussians, found, "file", "scene")
     cameras = [convert_camera(c, found, "file", "scene") for c in cameras]
     with hold_file(target) as held:
         title = target.stem.encode("utf-8", "replace").decode()  # ? for bytes that are not UTF-8
-        notes = write_html(target, gaussians, middle_first(cameras), run.background, title)
+        notes = write_html(target, gaussians, middle_first(cameras), run.background, title, found)
     if run.antialiased:
         notes.append("the page shows the model without antialiasing: too bright from afar and in small windows")
     size = format_bytes(target.stat().st_size)

@@ -33,15 +33,18 @@ def said(error: BaseException) -> str:
     return line if isinstance(error, WarpgsError) else f"{type(error).__name__}: {line}"
 
 
-def guarded(callback: Callable[..., Any]) -> Callable[..., None]:
-    """Wrap a callback: if it raises an error, print one line on stderr."""
+def guarded(callback: Callable[..., Any], tell: Callable[[str], object] | None = None) -> Callable[..., None]:
+    """Wrap a callback: if it raises an error for the user, ``tell`` it; else, or without ``tell``, print one line on stderr."""
 
     @functools.wraps(callback)
     def call(*args: Any) -> None:
         try:
             callback(*args)
         except Exception as e:  # any error of a browser's request; the viewer continues
-            say(f"the viewer could not serve a request of a browser ({said(e)})", error=True)
+            if tell is not None and isinstance(e, WarpgsError):
+                tell(str(e))
+            else:
+                say(f"the viewer could not serve a request of a browser ({said(e)})", error=True)
 
     return call
 
@@ -141,6 +144,7 @@ _coordinate = _within(-MAX_COORDINATE, MAX_COORDINATE)
 _point = schema.items(_coordinate, 3)
 _size = schema.whole(0, 2**15)
 _node = {"name": _short, "owner": _short}
+_click = {"ray_origin": _point, "ray_direction": _point, "modifier": schema.or_null(_short)}
 _only = functools.partial(schema.fields, others=False)
 MESSAGES: Mapping[str, Schema] = {
     "ViewerCameraMessage": _only(
@@ -151,10 +155,10 @@ MESSAGES: Mapping[str, Schema] = {
     ),
     "GuiUpdateMessage": _only({"uuid": _short, "updates": _only({"value": _value})}),
     "SceneNodeClickMessage": _only(
-        {
-            **_node, "instance_index": schema.or_null(schema.whole(0)), "ray_origin": _point, "ray_direction": _point,
-            "screen_pos": schema.items(_coordinate, 2), "modifier": schema.or_null(_short),
-        }
+        {**_node, **_click, "instance_index": schema.or_null(schema.whole(0)), "screen_pos": schema.items(_coordinate, 2)}
+    ),
+    "ScenePointerMessage": _only(
+        {**_click, "event_type": schema.one_of("click"), "screen_pos": schema.items(schema.items(_coordinate, 2), 1)}
     ),
     "TransformControlsUpdateMessage": _only({**_node, "wxyz": _rotation, "position": _point}),
     "TransformControlsDragStartMessage": _only(_node),

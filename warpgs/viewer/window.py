@@ -13,15 +13,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from warpgs.errors import DataError, WarpgsError
+from warpgs.errors import DataError, UsageError, WarpgsError
 from warpgs.export.base import format_of, read_with_antialiasing
 from warpgs.files import read_file, readable, remove_leftovers, write_json
-from warpgs.geometry import camera_extent, convert_camera, convert_gaussians, matmul, pose_of, rotation_matrices
+from warpgs.geometry import camera_extent, convert_camera, convert_gaussians, convert_points, matmul, pose_of, rotation_matrices
 from warpgs.io.image_files import decode
 from warpgs.mesh.views import MIN_ALPHA
 from warpgs.pipeline.films.paths import fov_y
 from warpgs.pipeline.metrics.coverage import DepthView, classes_of, coverage_map, depth_views
 from warpgs.pipeline.model.table import FittedModel
+from warpgs.pipeline.run import level
 from warpgs.pipeline.run.commands import RULE, scene_of
 from warpgs.pipeline.run.folder import TENSORS, StoredRun, load_checkpoint, open_run
 from warpgs.pipeline.train.settings import FitConfig
@@ -60,7 +61,7 @@ class Content:
         return self.stem / name if self.stem.is_dir() else self.stem.with_name(f"{self.stem.name}-{name}")
 
 
-def content_of_run(folder: Path, device: str = "cpu", views: Mapping[str, View] | None = None) -> Content:
+def content_of_run(folder: Path, device: str | torch.device = "cpu", views: Mapping[str, View] | None = None) -> Content:
     """Read a run, finished or still going."""
     run = open_run(folder, device)
     means, level = run.gaussians().means, load_checkpoint(folder)[0].get("columns.level")
@@ -125,8 +126,8 @@ def inside(box: CropBox, means: torch.Tensor) -> torch.Tensor:
 
 def box_json(box: CropBox, normalization: Normalization) -> dict[str, Any]:
     """Return a box in file units: ``center`` [3], ``size`` [3], and ``rotation`` [3, 3] from its axes to the world's."""
-    center, size = box[0] / normalization.scale + normalization.offset, box[1] / normalization.scale
-    return {"center": center.tolist(), "size": size.tolist(), "rotation": box[2].tolist()}
+    (center,), size = convert_points(box[0][None], normalization, "scene", "file"), box[1] / normalization.scale
+    return {"center": center.tolist(), "size": size.tolist(), "rotation": matmul(normalization.rotation.T, box[2]).tolist()}
 
 
 def keyframe(camera: Camera, seconds: float, normalization: Normalization) -> dict[str, Any]:
@@ -240,6 +241,7 @@ class Panel:
         self._add_sampling()
         self._add_crop()
         self._add_keyframes()
+        self._add_ruler()
         self.tell(content)
 
     def crop_box(self) -> CropBox | None:
@@ -282,15 +284,14 @@ class Panel:
             return
 
         def show(event: Any) -> None:
-            try:
-                image = np.round(255 * decode(sheet, data=read_file(sheet, run))[0]).astype(np.uint8)
-            except WarpgsError as e:
-                return self.explain(str(e))
+            image = np.round(255 * decode(sheet, data=read_file(sheet, run))[0]).astype(np.uint8)
             with event.client.gui.add_modal("Where fine Gaussians were placed") as modal:
                 event.client.gui.add_image(image, format="jpeg")
                 event.client.gui.add_button("close").on_click(lambda _: modal.close())
 
-        self.server.gui.add_button("show sampling", hint="where the fit placed fine Gaussians").on_click(guarded(show))
+        self.server.gui.add_button("show sampling", hint="where fine Gaussians were placed").on_click(
+            guarded(show, self.explain)
+        )
 
     def _add_crop(self) -> None:
         """Add a box that the user moves and rotates by its handles, and saves."""
@@ -318,7 +319,7 @@ class Panel:
                 return self.explain("no crop box yet: tick crop, and move the box")
             self._save(CROP, box_json(box, self.content.model.normalization))
 
-        save.on_click(guarded(store))
+        save.on_click(guarded(store, self.explain))
 
     def _add_keyframes(self) -> None:
         """Add controls that append the current camera to a path, and save the path."""
@@ -345,20 +346,48 @@ class Panel:
                 del self.keyframes[-1:]
                 changed()
 
+        def store(_: Any) -> None:
+            if not self.keyframes:
+                raise UsageError("add a camera first")
+            self._save(PATH, self.keyframes)
+
         add.on_click(guarded(append))
         remove.on_click(guarded(pop))
-        save.on_click(
-            guarded(lambda _: self._save(PATH, self.keyframes) if self.keyframes else self.explain("add a camera first"))
-        )
+        save.on_click(guarded(store, self.explain))
+
+    def _add_ruler(self) -> None:
+        """Add controls that measure the distance of two picked points, and set the scale of a run's files by it."""
+        gui, scene, run = self.server.gui, self.server.scene, isinstance(self.content.model, StoredRun)
+        with gui.add_folder("Ruler", expand_by_default=False):
+            measure, self.measured = gui.add_checkbox("click two points", False), gui.add_markdown("")
+            length = gui.add_number("length [m]", 1.0, min=0.0, max=1e6, step=0.001, visible=run)
+            save = gui.add_button("set scale", visible=run)
+        places: list[level.Place] = []
+
+        def pick(event: Any) -> None:
+            place, n = self.window.place_at(event.client, *event.screen_pos), self.content.model.normalization
+            places[:] = [*places, place] if len(places) == 1 else [place]
+            scene.add_icosphere(f"/ruler/{len(places)}", 0.01 * self.window.extent, (255, 221, 51), position=place[0])
+            if len(places) == 2:
+                distance, error = level.distance(n, *places)
+                self.measured.content = f"{distance:.4g} {n.unit}, uncertain by {100 * error:.2g} %"
+
+        def store(_: Any) -> None:
+            if len(places) != 2:
+                raise UsageError("pick two points first")
+            said = level.store(self.content.stem, "cpu", lambda r: level.scaled(r.normalization, *places, length.value))
+            self.window.show(content_of_run(self.content.stem, self.content.model.gaussians().means.device, self.content.views))
+            self.measured.content = _plain(" ".join(said))
+
+        picking = guarded(pick, self.explain)
+        measure.on_update(guarded(lambda _: scene.on_click()(picking) if measure.value else scene.remove_click_callback()))
+        save.on_click(guarded(store, self.explain))
 
     def _save(self, name: str, values: Any) -> None:
         """Write a file beside the model, and show its path."""
         path = self.content.saved(name)
         remove_leftovers(path.parent)
-        try:
-            write_json(path, values)
-        except WarpgsError as e:
-            return self.explain(str(e))
+        write_json(path, values)
         say(f"saved {path}")
         self.explain(f"saved {path}")
 
@@ -396,7 +425,8 @@ class Window:
         self._frusta: dict[str, Any] = {}
         self._drawn: dict[int, tuple[Any, ...]] = {}
         self._lock, self._wake, self._open = threading.RLock(), threading.Event(), True
-        self._target, self._up = html.place_first_camera(server, self.first, content.model.gaussians(), cameras or [self.first])
+        rig, up = cameras or [self.first], content.model.normalization.up
+        self._target, self._up = html.place_first_camera(server, self.first, content.model.gaussians(), rig, up)
         server.scene.set_background_image(html.plain_background(content.model.background), format="png")
         self.panel = Panel(server, content, self, maps)
         self.limit()
@@ -484,6 +514,13 @@ class Window:
         size = max(int(state.image_width), 16), max(int(state.image_height), 16)
         factor = 1.0 if side is None else min(1.0, side / max(size))
         return html.camera_at(state.wxyz, state.position, state.fov, *(max(16, round(factor * length)) for length in size))
+
+    def place_at(self, client: viser.ClientHandle, x: float, y: float) -> level.Place:
+        """Return the surface point at a place of a browser's image, from (0, 0) at the upper left to (1, 1)."""
+        model = self.content.model
+        camera = self.camera_of(client, MAP_SIDE[model.gaussians().means.device.type])
+        with self._lock:
+            return level.place_at(model, camera, x * camera.width, y * camera.height)
 
     def _connected(self, client: viser.ClientHandle) -> None:
         client.camera.fov = fov_y(self.first, client.camera.aspect)

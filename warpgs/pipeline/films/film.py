@@ -206,7 +206,7 @@ def plan_film(model: FittedModel, path: str, settings: FilmSettings) -> FilmPlan
         names = image_names(scene)
         shown = [(names[n], paths.framed(c, settings.size, settings.fov_y)) for n, c in scene.items()]
         return FilmPlan(shown, coverage, EMPTY_VIEW, [], _nearer([c for _, c in shown], train, "--coverage marks these places"))
-    rig = paths.rig_of(train, depth)
+    rig = paths.rig_of(train, depth, model.normalization.up)
     if path.lower().endswith(".json"):
         cameras, words = _keyframes(model, Path(path), rig, train[0], settings)
         remedy = "c2w of keyframes is camera-to-world in OpenCV axes, in the units of the scene's files"

@@ -186,21 +186,25 @@ def _kind(cameras: list[Camera], focus: np.ndarray, depth: float) -> str:
     return "room" if outwards or spread < 0.5 * depth else "free"
 
 
-def rig_of(cameras: list[Camera], depth: float) -> Rig:
-    """Return the arrangement of cameras around their subject, ``depth`` [u] in front of them if their axes do not meet."""
+def rig_of(cameras: list[Camera], depth: float, level: np.ndarray | None = None) -> Rig:
+    """Return the arrangement of cameras around their subject, ``depth`` [u] in front of them if their axes do not meet.
+
+    ``level`` is the upward direction [3], if it is known.
+    """
     # If the optical axes meet, the subject is the point nearest to all axes. If the cameras see it from one side, or the axes
     # are nearly parallel, the subject is ``depth`` in front of their mean centre.
     centers, forwards = np.array([c.center for c in cameras]), np.array([c.viewmat[2, :3] for c in cameras])
     focus = geometry.focus_point(cameras)
     kind = _kind(cameras, focus, depth)
     if kind == "ring":
-        span = _span(_azimuths(centers - focus, _upward(cameras, focus)[0])[0])
+        span = _span(_azimuths(centers - focus, _upward(cameras, focus)[0] if level is None else level)[0])
         kind = "forward" if span is not None and span[1] - span[0] < MIN_RING else kind
     if kind == "forward":
         focus = centers.mean(0) + depth * _unit(forwards.mean(0))
     elif kind != "ring":
         focus = centers.mean(0) if kind == "room" else (centers + depth * forwards).mean(0)
     up, turned = _upward(cameras, focus)
+    up = up if level is None else level
     directions = forwards if kind == "room" else centers - focus
     azimuths, elevations, first = _azimuths(directions, up)
     distances = np.sqrt(((centers - focus) ** 2).sum(1))

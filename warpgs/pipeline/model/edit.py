@@ -84,14 +84,14 @@ MAX_BOX_BYTES = 65536
 """Largest size of a file that describes a box [bytes]."""
 
 
-def _numbers(value: Any, shape: tuple[int, ...], what: str) -> np.ndarray:
+def numbers_of(value: Any, shape: tuple[int, ...], what: str) -> np.ndarray:
     """Return finite numbers of a shape; UsageError if ``value`` is anything else."""
     try:
         array = np.array(value, np.float64)
     except (ValueError, TypeError, OverflowError):
         array = np.empty(0)
     if array.shape != shape or not np.isfinite(array).all():
-        raise UsageError(f"--crop: {what} takes {' x '.join(map(str, shape))} finite numbers, not {str(value)[:60]}")
+        raise UsageError(f"{what} takes {' x '.join(map(str, shape))} finite numbers, not {str(value)[:60]}")
     return array
 
 
@@ -105,11 +105,11 @@ def box_of(text: str) -> Box:
         forms = "six numbers separated by commas, JSON with center and size, or a .json file"
         raise UsageError(f"--crop {text[:60]}: give {forms}") from e
     if isinstance(value, list):
-        low, high = _numbers(value, (6,), "a box").reshape(2, 3)
+        low, high = numbers_of(value, (6,), "--crop: a box").reshape(2, 3)
         center, size, rotation = (low + high) / 2, high - low, np.eye(3)
     else:
-        center, size = (_numbers(value.get(key), (3,), key) for key in ("center", "size"))
-        rotation = _numbers(value.get("rotation", np.eye(3).tolist()), (3, 3), "rotation")
+        center, size = (numbers_of(value.get(key), (3,), f"--crop: {key}") for key in ("center", "size"))
+        rotation = numbers_of(value.get("rotation", np.eye(3).tolist()), (3, 3), "--crop: rotation")
     if np.abs(matmul(rotation, rotation.T) - np.eye(3)).max() > 1e-3:
         raise UsageError("--crop: rotation must be a rotation matrix: its columns are not perpendicular, or not of length 1")
     if not (size > 0).all():

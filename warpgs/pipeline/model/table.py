@@ -8,6 +8,7 @@ import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -368,6 +369,24 @@ class Table:
 
 
 FORMAT = "warpgs-model-1"
+_THREE = schema.items(schema.number(), 3)
+_LEVEL = {"rotation": schema.items(_THREE, 3), "up": schema.or_null(_THREE), "place": schema.or_null(_THREE)}
+SIMILARITY = schema.fields(
+    {"offset": _THREE, "scale": schema.number(above=0)}, _LEVEL | {"unit": schema.one_of("units", "m")}, others=False
+)
+"""Schema of the values of a `Normalization` in files."""
+
+
+def similarity_values(n: Normalization) -> dict[str, Any]:
+    """Return the values of a normalization for JSON; only offset and scale if it was not levelled."""
+    values = {name: v.tolist() if isinstance(v, np.ndarray) else v for name, v in (vars(n) | {"scale": float(n.scale)}).items()}
+    return values if n.up is not None or n.unit != Normalization.unit else {name: values[name] for name in ("offset", "scale")}
+
+
+def similarity_of(values: Mapping[str, Any], where: str) -> Normalization:
+    """Return the normalization of `similarity_values`, which `SIMILARITY` has checked; DataError if it is no similarity."""
+    arrays = {name: np.array(v, np.float64) if isinstance(v, list) else v for name, v in values.items()}
+    return checked_normalization(Normalization(**arrays | {"scale": float(values["scale"])}), "file", where)
 
 
 @dataclass(frozen=True)
@@ -449,10 +468,8 @@ def save(path: str | Path, gaussians: Gaussians, normalization: Normalization | 
     where = f"{path}: not written"
     _check_values(gaussians, where)
     normalization = checked_normalization(normalization, units, where)
-    header = {
-        "format": FORMAT, "version": __version__, "units": units, "scale": repr(float(normalization.scale)),
-        "offset": json.dumps([float(v) for v in normalization.offset]),
-    }  # fmt: skip
+    similarity = {name: json.dumps(value) for name, value in similarity_values(normalization).items()}
+    header = {"format": FORMAT, "version": __version__, "units": units} | similarity
     tensors = {n: t.detach().cpu().contiguous() for n, t in gaussians.tensors().items()}
     write_bytes(Path(path), to_bytes(tensors, header))
 
@@ -472,10 +489,9 @@ def load(path: str | Path, device: str | torch.device = "cpu") -> Model:
     if header.get("format") != FORMAT or tensors.keys() != Gaussians.__dataclass_fields__.keys():
         raise DataError(f"{path}: not a model of format {FORMAT}; write it with warpgs.save, or read PLY with warpgs.read_ply")
     try:
-        offset = schema.parse(header["offset"])
-        schema.items(schema.number(), 3)(offset, "offset")
-        similarity = Normalization(np.array(offset, np.float64), float(header["scale"]))
-        normalization = checked_normalization(similarity, units := header["units"], str(path))
+        units, names = header["units"], header.keys() - {"format", "version", "units"}
+        SIMILARITY(similarity := {n: schema.parse(header[n]) for n in names}, "normalization")
+        normalization = checked_normalization(similarity_of(similarity, str(path)), units, str(path))
     except (KeyError, ValueError, UsageError) as e:
         raise DataError(f"{path}: its header is damaged ({e}); write it again with warpgs.save") from e
     gaussians = checked_gaussians(tensors, str(path)).to(device)

@@ -347,7 +347,8 @@ def plot(
     tell("rendering depth")
     found = stored.cameras()
     train, test = ([found[n] for n in names] for names in (stored.train, stored.test))
-    rig = rig_of(train, film.depth_and_coverage(stored.gaussians(), train, stored.options())[0])
+    depth = film.depth_and_coverage(stored.gaussians(), train, stored.options())[0]
+    rig = rig_of(train, depth, stored.normalization.up)
     azimuth = 0.0 if rig.span is None else 0.5 * (rig.span[0] + rig.span[1])
     eye = rig.direction(azimuth + 0.7, max(rig.elevation + 0.35, 0.5))  # from above at an angle, behind cameras of one side
     if start:

@@ -14,7 +14,7 @@ from warpgs.device import format_bytes
 from warpgs.errors import DataError, UsageError
 from warpgs.export.base import Format, find_format, format_of, origin_of, write_gaussians
 from warpgs.export.meshes_and_cameras import check_suffix, holds_cameras, write_cameras, write_mesh
-from warpgs.geometry import convert_camera, convert_gaussians, convert_mesh, matmul, rotate
+from warpgs.geometry import convert_camera, convert_gaussians, convert_points, matmul, rotate
 from warpgs.io.transforms import read_cameras, stated_origin
 from warpgs.kernels.neighbours import morton_codes
 from warpgs.locks import hold_file
@@ -49,7 +49,7 @@ def filtered(
     gaussians: Gaussians, stored: StoredRun | None, filters: Filters, cleaned: bool, origin: np.ndarray
 ) -> tuple[Gaussians, np.ndarray | None, list[str]]:
     """Filter Gaussians in file units about an origin [3]; returns them with the rotation, if any, and lines for the user."""
-    rotation = rotation_of(filters.rotate, None if stored is None else training_cameras(stored))
+    rotation = rotation_of(filters.rotate, None if stored is None else upward(stored))
     keep, lines = torch.ones(len(gaussians), dtype=torch.bool, device="cpu"), []
     if filters.crop is not None:
         center, *rest = edit.box_of(filters.crop)
@@ -98,15 +98,19 @@ def training_cameras(stored: StoredRun) -> list[Camera]:
     return [stored.scene_cameras[name] for name in stored.train]
 
 
-def rotation_of(wish: str | None, cameras: list[Camera] | None) -> np.ndarray | None:
-    """Return the rotation [3, 3] that a user's text specifies; None for no rotation."""
+def upward(stored: StoredRun) -> np.ndarray | None:
+    """Return the upward direction [3] in a run's files: as levelled, else as its cameras agree; None if they do not."""
+    n = stored.normalization
+    return common_up(training_cameras(stored)) if n.up is None else matmul(n.rotation.T, n.up)
+
+
+def rotation_of(wish: str | None, up: np.ndarray | None) -> np.ndarray | None:
+    """Return the rotation [3, 3] that a user's text specifies, for files with an upward direction [3]; None for no rotation."""
     if wish is None:
         return None
     if wish == "level":
-        if cameras is None:
-            raise UsageError("--rotate level needs the cameras of a run: use warpgs export RUN, or give x,y,z,degrees")
-        if (up := common_up(cameras)) is None:
-            raise UsageError("--rotate level: the cameras do not agree on an upward direction; give x,y,z,degrees")
+        if up is None:
+            raise UsageError("--rotate level needs the cameras of a run that agree on an upward direction; give x,y,z,degrees")
         return edit.levelling(up)
     try:
         x, y, z, degrees = map(float, wish.split(","))
@@ -119,13 +123,6 @@ def turned_line(rotation: np.ndarray) -> str:
     """Return a line for the user on a rotation [3, 3]."""
     degrees = math.degrees(math.acos(min(1.0, max(-1.0, (float(np.trace(rotation)) - 1) / 2))))
     return f"rotated by {degrees:.1f} degrees about the origin; use the same --rotate for Gaussians and cameras"
-
-
-def rotate_camera(camera: Camera, rotation: np.ndarray) -> Camera:
-    """Return a camera after a rotation [3, 3] of the scene about the origin; numpy arrays."""
-    viewmat = np.array(camera.viewmat, np.float64)
-    viewmat[:3, :3] = matmul(viewmat[:3, :3], rotation.T)
-    return replace(camera, viewmat=viewmat)
 
 
 MAX_POINTS = 100_000
@@ -144,7 +141,7 @@ def convert(
         origin = stated_origin(source)
         if not origin.any():
             origin = origin_of(np.array([c.center for c in found.values()]))
-        return [*notes, *_cameras_written(found, list(found.values()), target, filters, origin)]
+        return [*notes, *_cameras_written(found, common_up(list(found.values())), target, filters, origin)]
     given = [find_format(f) for f in formats]
     for unused in (f for f in given if not (f.fits(source) or f.fits(target))):
         format_of(target, unused)  # says that its name is another
@@ -168,9 +165,8 @@ def export(
     if holds_cameras(target):
         _check_for_cameras(filters, () if format is None else (format,))
         stored = open_run(folder, torch.device("cpu"))
-        level = training_cameras(stored)
         origin, models = stored.normalization.origin, file_gaussians(stored)
-        return _cameras_written(stored.cameras("file"), level, target, filters, origin, keep_names, models)
+        return _cameras_written(stored.cameras("file"), upward(stored), target, filters, origin, keep_names, models)
     if keep_names:
         raise UsageError(f"{target}: --keep-names requires cameras; name the file cameras.json, transforms.json or sparse")
     kind = format_of(target, format)
@@ -227,18 +223,18 @@ def _check_for_cameras(filters: Filters, formats: Sequence[object]) -> None:
 
 
 def _cameras_written(
-    named: Mapping[str, Camera], level: list[Camera], target: Path, filters: Filters, origin: np.ndarray,
+    named: Mapping[str, Camera], up: np.ndarray | None, target: Path, filters: Filters, origin: np.ndarray,
     keep_names: bool = False, gaussians: Gaussians | None = None,
 ) -> list[str]:  # fmt: skip
-    """Rotate cameras about an origin in file units, and write them; ``level`` are those that define up. Returns lines.
+    """Rotate cameras about an origin in file units, with an upward direction, and write them; returns lines for the user.
 
     The most opaque of the Gaussians become COLMAP's points.
     """
-    rotation, lines, points, cameras = rotation_of(filters.rotate, level), [], None, list(named.values())
+    rotation, lines, points, cameras = rotation_of(filters.rotate, up), [], None, list(named.values())
     if origin.any():
         cameras = [convert_camera(c, Normalization(origin), "file", "scene") for c in cameras]
     if rotation is not None:
-        cameras = [rotate_camera(c, rotation) for c in cameras]
+        cameras = [convert_camera(c, Normalization(rotation=rotation.T), "scene", "file") for c in cameras]
         lines.append(turned_line(rotation))
     if gaussians is not None and target.name == "sparse":
         shown = gaussians.logit_opacities.argsort(descending=True, stable=True)[:MAX_POINTS]
@@ -276,7 +272,7 @@ def mesh(
     run = open_run(folder, device)
     if not run.train:
         raise DataError(f"{folder}: the run has no training views, so coverage is unknown; fit again")
-    cameras, scale = training_cameras(run), run.normalization.scale
+    cameras, scale, up = training_cameras(run), run.normalization.scale, upward(run)
     if options.voxel is not None:
         options = replace(options, voxel=options.voxel * scale)
     if crop is not None:
@@ -291,7 +287,7 @@ def mesh(
 
     with hold_file(target) as notes:
         found = fuse(run.scene_gaussians, cameras, run.options(), options, stage=stage, planned=planned)
-        made, up = convert_mesh(found.mesh, run.normalization.local, "scene", "file"), common_up(cameras)
+        made = replace(found.mesh, vertices=convert_points(found.mesh.vertices, run.normalization.local, "scene", "file"))
         write_mesh(target, made, up, run.normalization.origin)
     lines = [
         f"{found.extracted:,} triangles extracted, {found.removed:,} small parts removed; the mesh has "

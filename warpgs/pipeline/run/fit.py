@@ -24,7 +24,7 @@ from warpgs.pipeline.metrics.lpips import Lpips
 from warpgs.pipeline.metrics.scores import Renders, moved_fractions, moved_notes
 from warpgs.pipeline.model.edit import drop_unused_sh
 from warpgs.pipeline.model.limits import shape_figures, shape_summary
-from warpgs.pipeline.model.table import FittedModel
+from warpgs.pipeline.model.table import FittedModel, similarity_of
 from warpgs.pipeline.run.folder import (
     CONFIG,
     METRICS_FILE,
@@ -535,6 +535,7 @@ def _prepare(job: FitJob, resumed: Path | None) -> tuple[Trainer, dict[str, Any]
     if resumed is not None:
         stored = read_record(resumed)
         check_same(record, stored, resumed)
+        job.scene = replace(job.scene, normalization=similarity_of(stored["normalization"], str(resumed / CONFIG)))
         if (resumed / TENSORS).is_file():
             state = load_checkpoint(resumed)
             check_checkpoint(state[1], stored, resumed)

@@ -24,11 +24,11 @@ from warpgs.io.images import CHOICES
 from warpgs.io.load import Split
 from warpgs.kernels.cameras import check_camera
 from warpgs.locks import check_free, hold_folder
-from warpgs.pipeline.model.table import FittedModel, checked_gaussians, unpack
+from warpgs.pipeline.model.table import SIMILARITY, FittedModel, checked_gaussians, similarity_of, similarity_values, unpack
 from warpgs.pipeline.run.request import FitRequest, SceneRequest, choose_device
 from warpgs.pipeline.train.settings import FitConfig, fingerprint, upgraded
 from warpgs.poses.find import JSON as POSES
-from warpgs.scene import Camera, Normalization, Scene
+from warpgs.scene import Camera, Scene
 from warpgs.schema import SchemaError, fields, flag, items, mapping, number, one_of, or_null, real, text, whole
 from warpgs.version import __version__
 
@@ -67,7 +67,7 @@ _PARTS = items(fields({"name": text}))
 _RECORD = fields(
     {
         "scene": _SCENE, "fingerprint": text, "train": items(_view_name), "test": items(_view_name), "notes": items(text),
-        "normalization": fields({"offset": items(number(), 3), "scale": number(above=0)}),
+        "normalization": SIMILARITY,
         "background": items(number(), 3), "config_hash": text, "device": text, "versions": mapping(text),
         "config": fields(
             {"rule": one_of(*RULES), "seed": whole(0), "strategy": text, "loss_terms": _PARTS, "view_modules": _PARTS},
@@ -263,7 +263,7 @@ def record_of(
         "scene": {**asdict(request), "path": str(Path(request.path).resolve()) if request.path else None},
         "scene_format": scene.format, "fingerprint": scene.fingerprint,
         "train": split.train, "test": split.test, "notes": notes,
-        "normalization": {"offset": scene.normalization.offset.tolist(), "scale": scene.normalization.scale},
+        "normalization": similarity_values(scene.normalization),
         "background": scene.background, "transparent": scene.transparent,
         "config": config.to_json(), "config_hash": config.fingerprint(), "own_code": config.own_code(),
         "device": device.type, "versions": versions(),
@@ -474,10 +474,10 @@ def open_run(folder: str | Path, device: str | torch.device = "auto") -> StoredR
     except ValueError as e:
         raise DataError(f"{path}: incomplete or damaged: {e}; {RESTORE}") from e
     gaussians = checked_gaussians(found, str(path)).to(where)
-    normalization, (red, green, blue) = record["normalization"], map(float, record["background"])
+    red, green, blue = map(float, record["background"])
     return StoredRun(
         gaussians,
-        Normalization(np.array(normalization["offset"], np.float64), float(normalization["scale"])),
+        similarity_of(record["normalization"], str(folder / CONFIG)),
         _cameras(record["cameras"], folder / CONFIG) | _cameras(state.get("cameras", {}), path),
         tuple(record["train"]), tuple(record["test"]), record["config"]["rule"], (red, green, blue), state["step"], folder,
         record, transparent=record.get("transparent", False), antialiased=record["config"].get("antialiased", False),

@@ -1,0 +1,296 @@
+"""Real sizes: a scene with known geometry, tilted and out of scale, gets its lengths, its ground and its place back."""
+
+import dataclasses
+import json
+import math
+import re
+import shutil
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+import warpgs
+from warpgs.app.cli import main
+from warpgs.errors import DataError
+from warpgs.export.base import write_gaussians
+from warpgs.export.meshes_and_cameras import write_cameras
+from warpgs.geometry import back_project, convert_camera, convert_points, logit, look_at, pose_at, project_points, quaternions
+from warpgs.io.image_files import read_gps
+from warpgs.io.transforms import read_cameras
+from warpgs.pipeline.films.film import FilmSettings, plan_film
+from warpgs.pipeline.films.paths import read_keyframes
+from warpgs.pipeline.model.edit import rotation_about
+from warpgs.pipeline.model.start import InitConfig
+from warpgs.pipeline.model.table import save, similarity_values
+from warpgs.pipeline.run import level
+from warpgs.pipeline.run.folder import load_checkpoint, open_run, save_checkpoint
+from warpgs.pipeline.run.level import metres_about, photographed
+from warpgs.scene import Camera, Normalization
+from warpgs.synthetic import raycast
+from warpgs.synthetic.demo import camera_path, still_life
+
+UNIT = 2.5
+"""True metres per unit of the scene's files."""
+TILT = rotation_about(np.array([0.6, 0.2, 0.7]), math.radians(35))
+"""Rotation from true axes, in which -y is up, to those of the scene's files."""
+SHAPES, CAMERAS = still_life(), camera_path(8, 96, 72)
+NAMES, TRUE, UP = [f"images/{i:03d}.png" for i in range(8)], np.array([c.center for c in CAMERAS]), np.array([0.0, -1, 0])
+PIXELS = np.mgrid[:96, :72].reshape(2, -1).T + 0.5
+PLACE, EAST, NORTH = (-33.8568, 151.2153, 31.0), 92_539.5, 110_919.8
+"""Latitude, longitude [deg] and height [m], and metres a degree there (NGA, length of a degree)."""
+TO_EAST_NORTH_UP = 100 * np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]])
+"""From true positions, as if of a hundred times as large a place."""
+
+
+def surface(view, pixels=PIXELS):
+    """True points [N, 3] [m] and shapes [N] at pixels [N, 2] of a view."""
+    rays, eye = raycast.pixel_rays(CAMERAS[view].K, CAMERAS[view].viewmat, pixels), CAMERAS[view].center
+    distances, shapes = raycast.cast(SHAPES, eye, rays)
+    return eye + distances[:, None] * rays, shapes
+
+
+POINTS, HIT = map(np.concatenate, zip(*map(surface, range(8))))
+
+
+def exif(*place):
+    """EXIF of a photograph that was taken at latitude, longitude and height."""
+    a, b, height = map(float, place)
+    a_parts, b_parts = ((float(int(v)), float(int(v % 1 * 60)), v * 60 % 1 * 60) for v in (abs(a), abs(b)))
+    made = Image.Exif()
+    made[0x8825] = {1: "NS"[a < 0], 2: a_parts, 3: "EW"[b < 0], 4: b_parts, 5: bytes([height < 0]), 6: abs(height)}
+    return made
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """A fit of the tilted scene; and a copy whose model is the true surfaces: a small disk at each pixel of each view."""
+    folder = tmp_path_factory.mktemp("level")
+    (folder / "scene" / "images").mkdir(parents=True)
+    tilted = [dataclasses.replace(c, viewmat=pose_at(c.viewmat[:3, :3] @ TILT.T, TILT @ c.center / UNIT)) for c in CAMERAS]
+    write_cameras(folder / "scene" / "transforms.json", tilted, NAMES)
+    for i, (name, c) in enumerate(zip(NAMES, CAMERAS)):
+        image = np.round(255 * raycast.render(SHAPES, raycast.Light(), c.K, c.viewmat, 96, 72)).astype(np.uint8)
+        x, y, z = c.center @ TO_EAST_NORTH_UP + [400 * (i == 1), 300 * (i == 5), 0]  # two photographs are wrong
+        place = exif(PLACE[0] + y / NORTH, PLACE[1] + x / EAST, PLACE[2] + z)
+        Image.fromarray(image).save(folder / "scene" / name, exif=place)
+    config = warpgs.FitConfig(steps=4, init=InitConfig(source="random", random_count=50))
+    warpgs.fit(folder / "scene", config, split="every:4", out=folder / "fit", device="cpu", verbose=False)
+    shutil.copytree(folder / "fit", folder / "run")
+    n, (_, state) = open_run(folder / "run", "cpu").normalization, load_checkpoint(folder / "run")
+    normals = np.empty_like(POINTS)
+    for k, shape in enumerate(SHAPES):
+        normals[HIT == k] = shape.normal(shape.local(POINTS[HIT == k])) @ (TILT @ shape.rotation).T
+    sides = np.cross(normals, normals[:, [1, 2, 0]] * [1, 1, -1])
+    sides /= np.linalg.norm(sides, axis=1, keepdims=True)
+    pixel = np.linalg.norm(POINTS - np.repeat(TRUE, len(PIXELS), 0), axis=1) / CAMERAS[0].K[0, 0] / UNIT * n.scale
+    params = {
+        "means": convert_points(POINTS @ TILT.T / UNIT, n, "file", "scene"), "sh": np.zeros((len(POINTS), 1, 3)),
+        "quats": quaternions(torch.from_numpy(np.stack([sides, np.cross(normals, sides), normals], 2))),
+        "log_scales": np.log(pixel[:, None] * [0.7, 0.7, 0.05]), "logit_opacities": np.full(len(POINTS), logit(0.9)),
+    }  # fmt: skip
+    save_checkpoint(folder / "run", {f"params.{k}": torch.as_tensor(v, dtype=torch.float32) for k, v in params.items()}, state)
+    return folder
+
+
+@pytest.fixture
+def run(made, tmp_path):
+    shutil.copytree(made / "run", tmp_path / "run")
+    return tmp_path / "run"
+
+
+def sh(*words):
+    """Run a command that has --device."""
+    return main([*map(str, words), "--device", "cpu"])
+
+
+def picks(views_and_pixels):
+    return [f"{NAMES[view]}:{int(x)},{int(y)}" for view, (x, y) in views_and_pixels]
+
+
+def ground():
+    """Pixels of the floor, far apart, in different photographs."""
+    for view, way in ((1, (-1, 2)), (2, (1, 2)), (6, (0.3, -2))):
+        points, shapes = surface(view)
+        floor = np.flatnonzero(shapes == 3)
+        yield view, PIXELS[floor[np.argsort(points[floor][:, [0, 2]] @ way)[len(floor) // 20]]]
+
+
+def poses(run, target):
+    """Exported cameras: rotations from true axes to file axes, and centres, by view."""
+    target.mkdir()
+    assert main(["export", str(run), "--to", str(target / "transforms.json"), "--keep-names"]) == 0
+    found = read_cameras(target / "transforms.json")[0]
+    turns = [found[n].viewmat[:3, :3].T @ true.viewmat[:3, :3] for n, true in zip(NAMES, CAMERAS)]
+    return turns, np.array([found[n].center for n in NAMES])
+
+
+def steps(points):
+    return np.linalg.norm(np.diff(points, axis=0), axis=1)
+
+
+def degrees_apart(a, b):
+    return math.degrees(math.acos(min(1.0, float(np.dot(a, b)))))
+
+
+def test_files_get_a_length_and_a_level_ground(run, tmp_path, capsys):
+    """Gaussians, cameras and mesh are in metres within 1 %, level within 1 degree, over a ground at 0; also if done twice."""
+    ends = [(0, (20.5, 50.5)), (6, (70.5, 20.5))]
+    length = steps(np.concatenate([surface(view, np.array([pixel]))[0] for view, pixel in ends]))[0]
+    commands = ["--scale", *picks(ends), length], ["--ground", *picks(ground())]
+    assert [sh("level", run, *words) for words in commands] == [0, 0]
+    said = capsys.readouterr().out
+    percent, tilt = (float(re.search(rf"uncertain by ([0-9.]+) {unit}", said)[1]) for unit in ("%", "degrees"))
+    n = open_run(run, "cpu").normalization
+    turns, centers = poses(run, tmp_path / "cameras")
+    assert 100 * abs(steps(centers) / steps(TRUE) - 1).max() < min(1, 2 * percent) and percent < 3
+    assert all(degrees_apart(turn @ UP, UP) < min(1, 2 * tilt) for turn in turns) and tilt < 5
+    assert main(["export", str(run), "--to", str(tmp_path / "a.ply")]) == 0
+    means = warpgs.read_ply(tmp_path / "a.ply").means.numpy()
+    np.testing.assert_array_equal(means, warpgs.read_ply(run / "point_cloud.ply").means.numpy())
+    np.testing.assert_allclose(steps(means[::977]), steps(POINTS[::977]), rtol=0.01)
+    assert abs(means[HIT == 3, 1]).max() < 0.03 and means[HIT != 3, 1].mean() < -0.5
+    assert sh("mesh", run, "--out", tmp_path / "a_mesh.ply", "--resolution", 48) == 0
+    head, _, body = (tmp_path / "a_mesh.ply").read_bytes().partition(b"end_header\n")
+    rows = np.frombuffer(body, [("at", "<f4", 3), ("color", "u1", 3)], int(re.search(rb"vertex (\d+)", head)[1]))
+    found, wanted = (np.percentile(v, [5, 95], axis=0) for v in (rows["at"], means))
+    np.testing.assert_allclose(found, wanted, atol=0.4)
+    assert [sh("level", run, *words) for words in commands] == [0, 0]
+    for name, value in vars(open_run(run, "cpu").normalization).items():
+        if name not in ("unit", "place"):
+            np.testing.assert_allclose(value, getattr(n, name), rtol=1e-9, atol=1e-9)
+
+
+def test_renders_films_and_exports_agree_in_new_coordinates(made, tmp_path, capsys):
+    """Anisotropic, view-dependent Gaussians: files, saved models, formats, films, keyframes and a continued fit."""
+    shutil.copytree(made / "fit", tmp_path / "run")
+    g = open_run(tmp_path / "run", "cpu").gaussians()
+    g = dataclasses.replace(g, sh=0.3 * torch.randn(len(g), 16, 3, generator=torch.Generator().manual_seed(0)))
+    assert sh("level", tmp_path / "run", "--up", "photographs") == 0
+    before = open_run(tmp_path / "run", "cpu").normalization
+    assert sh("level", tmp_path / "run", "--scale", "1,2,3", "-1,2.5,3", 4) == 0
+    run = open_run(tmp_path / "run", "cpu")
+    n, camera = run.normalization, run.scene_cameras[NAMES[2]]
+    np.testing.assert_allclose(n.offset, before.offset * 4 / math.hypot(2, 0.5))  # about 0 of the files
+    moved = convert_camera(camera, n, "scene", "file")
+    np.testing.assert_allclose(convert_camera(moved, n, "file", "scene").viewmat, camera.viewmat, atol=1e-12)
+    image = warpgs.rasterize(g, camera, run.options()).rgb
+    write_gaussians(tmp_path / "a.ply", g, n)
+    save(tmp_path / "a.safetensors", g, n)
+    for other, seen in (
+        (warpgs.read_ply(tmp_path / "a.ply"), moved), (warpgs.read_ply(tmp_path / "a.ply", n, units="scene"), camera),
+        (warpgs.load(tmp_path / "a.safetensors").gaussians("file"), moved),
+    ):  # fmt: skip
+        assert image.std() > 0.01 and (warpgs.rasterize(other, seen, run.options()).rgb - image).abs().max() < 2e-3
+    for suffix in (".spz", ".sog", ".glb"):
+        target = tmp_path / f"b{suffix}"
+        assert main(["export", str(run.folder), "--to", str(target), "--no-clean"]) == 0
+        assert torch.cdist(run.gaussians("file").means, warpgs.export.read_gaussians(target).means).amin(1).max() < 0.01
+    assert main(["export", str(run.folder), "--to", str(tmp_path / "cameras.json"), "--rotate", "level"]) == 0
+    assert "rotated by 0.0 degrees" in capsys.readouterr().out  # they are level already
+    key = {"c2w": np.linalg.inv(moved.viewmat).tolist(), "fov_y": 0.8, "seconds": 0}
+    (tmp_path / "path.json").write_text(json.dumps([key]))
+    np.testing.assert_allclose(read_keyframes(tmp_path / "path.json", camera, n)[0].camera.viewmat, camera.viewmat, atol=1e-9)
+    for _, c in plan_film(run, "turntable", FilmSettings(frames=4)).cameras:
+        assert abs(c.viewmat[0, :3] @ n.up) < 1e-6  # its horizontal axis is level
+    ply = (tmp_path / "run" / "point_cloud.ply").read_bytes()
+    assert main(["fit", "--out", str(tmp_path / "run"), "--resume"]) == 0
+    assert (tmp_path / "run" / "point_cloud.ply").read_bytes() == ply
+    assert similarity_values(open_run(tmp_path / "run", "cpu").normalization) == similarity_values(n)
+
+
+def test_a_second_camera_that_disagrees_adds_to_the_error(run, monkeypatch):
+    """By the distance of the point that it shows; one from which the point is hidden does not."""
+    stored = open_run(run, "cpu")
+    first, second = (stored.scene_cameras[name] for name in stored.train[:2])
+    model = SimpleNamespace(scene_cameras=stored.scene_cameras, train=stored.train[:2])
+    depths: dict[int, tuple[float, float]] = {}
+    monkeypatch.setattr(level, "pixel_depth", lambda _, camera, *more: depths[id(camera)])
+    for factor, seen in ((1.05, True), (0.8, False)):
+        ahead = project_points(second, back_project(first, np.array([[48.5, 36.5]]), np.array([2.0])))[1][0]
+        depths |= {id(first): (2.0, 0.0), id(second): (factor * ahead, 0.0)}
+        _, error = level.place_at(model, first, 48, 36)
+        axis = second.viewmat[2, :3]
+        assert (math.sqrt(axis @ error @ axis) > 0.049 * ahead) == seen
+
+
+def test_photographs_show_what_is_up():
+    """All round and looking down, two of them on their side and one askew: within 1 degree; without agreement an error."""
+    cameras = {}
+    for i, roll in enumerate([0.5, -0.5, 0.5, 90, -0.5, 25, 0.5, -0.5, 90, 0.5, -0.5]):
+        eye = np.array([3 * math.cos(0.5 * i), -1.5, 3 * math.sin(0.5 * i)])
+        viewmat = np.eye(4)
+        viewmat[:3, :3] = rotation_about(np.array([0, 0, 1.0]), math.radians(roll))
+        cameras[str(i)] = Camera(viewmat @ look_at(eye, np.zeros(3), UP), CAMERAS[0].K, 96, 72)
+
+    def levelled(train):
+        n = Normalization(rotation=TILT)
+        return photographed(SimpleNamespace(scene_cameras=cameras, train=train, normalization=n, folder="run"))
+
+    n, line = levelled((*cameras,))
+    assert degrees_apart(n.up, UP) < 1 and re.search("lean by 0.[45]", line) and "one way" not in line
+    np.testing.assert_allclose(n.rotation.T @ n.up, UP, atol=1e-12)
+    assert "all look one way" in levelled(("0",))[1]
+    cameras["1"] = dataclasses.replace(cameras["0"], viewmat=np.diag([-1.0, -1, 1, 1]) @ cameras["0"].viewmat)
+    with pytest.raises(DataError, match="no common upward direction; use --ground"):
+        levelled(("0", "1"))
+
+
+def test_gps_gives_place_and_north(run, made, tmp_path, capsys):
+    """East, north and up in metres, though two photographs are off by 300 m; the ground's level keeps z up, and the heights."""
+    assert sh("level", run, "--gps") == 0
+    said = capsys.readouterr().out
+    assert "GPS of 6 of 8 photographs" in said and float(re.search(r"at most ([0-9.]+) m off", said)[1]) < 0.1
+    turns, centers = poses(run, tmp_path / "cameras")
+    n = open_run(run, "cpu").normalization
+    zero = metres_about(np.array([PLACE]), n.place)[0]
+    np.testing.assert_allclose(centers - zero, TRUE @ TO_EAST_NORTH_UP, atol=0.2)
+    assert all(degrees_apart(t @ UP, [0, 0, 1]) < 0.1 and degrees_apart(t @ [0, 0, 1], [0, 1, 0]) < 0.1 for t in turns)
+    assert sh("level", run, "--ground", *picks(ground())) == 0 and "z is up" in capsys.readouterr().out
+    assert np.linalg.norm(open_run(run, "cpu").normalization.offset - n.offset) < 5
+    turns, _ = poses(run, tmp_path / "level")
+    assert all(degrees_apart(t @ UP, [0, 0, 1]) < 1 and degrees_apart(t @ [0, 0, 1], [0, 1, 0]) < 1 for t in turns)
+    (tmp_path / "few" / "images").mkdir(parents=True)
+    for name in NAMES[:2]:
+        shutil.copy(made / "scene" / name, tmp_path / "few" / name)
+    assert sh("level", run, "--gps", tmp_path / "few") == 3
+    assert re.search("2 of 8 photographs have GPS in EXIF that fits .* --gps FOLDER", capsys.readouterr().err)
+
+
+def test_gps_of_files_is_read_with_bounds(tmp_path):
+    for place in ((91, 0, 0), (10, 10, 9e9), (0, 0, 0), (10.5, -20.25, -30)):
+        Image.new("RGB", (8, 8)).save(tmp_path / "a.jpg", exif=exif(*place))
+        data = (tmp_path / "a.jpg").read_bytes()
+        assert read_gps(data) == (None if place[2] >= 0 else pytest.approx(place))
+    assert {read_gps(data[:end]) for end in range(len(data))} <= {None, read_gps(data)}
+
+
+BAD = {
+    "outside": (["--scale", f"{NAMES[0]}:96,3", f"{NAMES[1]}:3,3", "1"], "96,3: outside of the image, which has 96 x 72 px"),
+    "background": (["--scale", f"{NAMES[0]}:9,3", f"{NAMES[1]}:3,3", "1"], "shows empty background .opacity 0.0"),
+    "equal": (["--scale", f"{NAMES[0]}:9,3", f"{NAMES[0]}:9,3", "1"], "the two points are equal"),
+    "no length": (["--scale", "0,0,0", "1,2,3", "0"], "the length must be above 0 m, not 0"),
+    "negative": (["--scale", "0,0,0", "1,2,3", "-2"], "the length must be above 0 m, not -2"),
+    "unknown": (["--scale", "images/00.png:9,3", f"{NAMES[0]}:9,3", "1"], "no view 'images/00.png'; did you mean images/00"),
+    "nan": (["--scale", "1,2,nan", "1,2,3", "1"], "a point, VIEW:x,y or x,y,z, takes 3 finite numbers"),
+    "in line": (["--ground", "0,0,0", "1,0,0", "2,0,0"], "equal or nearly on a line"),
+    "nothing": ([], "give one of --scale"),
+    "both": (["--up", "photographs", "--ground", "0,0,0", "1,0,0", "0,1,0"], "give one of --scale"),
+}
+
+
+@pytest.mark.parametrize("kind", BAD)
+def test_picks_that_cannot_be_honoured(run, capsys, kind):
+    """One line that says why, before anything is written."""
+    words, message = BAD[kind]
+    if kind == "background":
+        tensors, state = load_checkpoint(run)
+        tensors["params.logit_opacities"][:] = -9
+        save_checkpoint(run, tensors, state)
+    before = {p: p.read_bytes() for p in run.rglob("*") if p.is_file()}
+    assert sh("level", run, *words) == 2
+    error = capsys.readouterr().err
+    assert len(error.splitlines()) == 1 and re.search(message, error), error
+    assert {p: p.read_bytes() for p in run.rglob("*") if p.is_file()} == before

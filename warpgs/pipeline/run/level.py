@@ -1,0 +1,227 @@
+"""Real sizes: scale, upward direction and geographic place of a run's files, by picked points, poses or GPS."""
+
+import contextlib
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from warpgs import schema
+from warpgs.errors import DataError, UsageError, did_you_mean
+from warpgs.export.ply import write_ply
+from warpgs.files import write_json
+from warpgs.geometry import back_project, convert_points, matmul, project_points
+from warpgs.io.image_files import read_gps, read_image_file
+from warpgs.locks import hold_folder
+from warpgs.mesh.views import CONTRIBUTORS, MIN_ALPHA, surface_depth
+from warpgs.pipeline.model.edit import drop_unused_sh, levelling, numbers_of
+from warpgs.pipeline.model.table import FittedModel, similarity_values
+from warpgs.pipeline.run.folder import CONFIG, StoredRun, open_run, read_record
+from warpgs.render.rasterize import rasterize
+from warpgs.scene import Camera, Normalization
+
+Place = tuple[np.ndarray, np.ndarray]
+"""Point of the scene [3] [u], and the covariance of its error [3, 3] [u²]."""
+Levelled = tuple[Normalization, str]
+"""New similarity, and a line for the user."""
+HIDDEN = 0.1
+"""Another camera does not see a point that is behind its rendered depth by more than this fraction."""
+LEAST = 1e-6
+"""Least distance of picked points [u]."""
+LEANING = math.radians(3)
+"""Angle from level at which the weight of a photograph is halved."""
+SURE = 1.0
+"""Distance between GPS and pose at which a photograph is no outlier [m]: phones are off by metres."""
+EARTH, SQUARED = 6378137.0, 0.00669437999014
+"""Equatorial radius [m] and squared eccentricity of WGS 84."""
+
+
+@torch.no_grad()
+def pixel_depth(model: FittedModel, camera: Camera, x: float, y: float, what: str = "the point") -> tuple[float, float]:
+    """Return the rendered depth [u] at a pixel, and its standard deviation in 5 x 5 pixels [u]; UsageError on background."""
+    if not (0 <= x < camera.width and 0 <= y < camera.height):
+        raise UsageError(f"{what}: outside of the image, which has {camera.width} x {camera.height} px in this run")
+    r = rasterize(model.gaussians(), camera, replace(model.options(), heaviest=CONTRIBUTORS * (camera.model == "pinhole")))
+    depth, alpha, row, column = r.depth, r.alpha.cpu().numpy(), int(y), int(x)
+    if camera.model == "pinhole":  # as in meshes: the mean depth makes steps on slanted surfaces
+        depth, _ = surface_depth(model.gaussians(), camera, r.heaviest_ids, r.heaviest_weights)
+    if not alpha[row, column] >= MIN_ALPHA:
+        raise UsageError(f"{what}: shows empty background (opacity {alpha[row, column]:.2f}); pick a point on a surface")
+    window, z = np.s_[max(0, row - 2) : row + 3, max(0, column - 2) : column + 3], depth.cpu().numpy()
+    return float(z[row, column]), float(z[window][alpha[window] >= MIN_ALPHA].std())
+
+
+def place_at(model: FittedModel, camera: Camera, x: float, y: float, what: str = "the point") -> Place:
+    """Return the surface point at a pixel; its errors are half a pixel, the spread of depth, and what a second camera shows."""
+    z, spread = pixel_depth(model, camera, x, y, what)
+    pixels = np.array([[0.5, 0.5], [0.5, 0.5], [1, 0.5], [0.5, 1]]) + np.floor([x, y])
+    point, *others = back_project(camera, pixels, np.array([z, z + spread, z, z]))
+    moves = others - point
+    aside = [(float(np.linalg.norm(c.center - camera.center)), c) for c in map(model.scene_cameras.get, model.train)]
+    for _, c in sorted((pair for pair in aside if pair[0] > 1e-3 * z), key=lambda pair: pair[0])[:4]:
+        pixel, (ahead,) = project_points(c, point[None])
+        with contextlib.suppress(UsageError):  # it does not see the point
+            if ahead > 0 and (seen := pixel_depth(model, c, *pixel[0])[0]) >= (1 - HIDDEN) * ahead:
+                moves = np.concatenate([moves, back_project(c, pixel, np.array([seen])) - point])
+                break
+    return point, matmul(moves.T, moves)
+
+
+def picked(run: StoredRun, text: str) -> Place:
+    """Return the place of VIEW:x,y, a pixel of a photograph, or of x,y,z in file units, which counts as exact."""
+    name, colon, words = text.rpartition(":")
+    numbers = numbers_of(words.split(","), (2 if colon else 3,), f"{text[:80]}: a point, VIEW:x,y or x,y,z,")
+    if not colon:
+        return convert_points(numbers[None], run.normalization, "file", "scene")[0], np.zeros((3, 3))
+    if name not in run.scene_cameras:
+        near = did_you_mean(name, run.scene_cameras) or f"give a name such as {run.train[0]}"
+        raise UsageError(f"{text[:80]}: the run has no view {name[:80]!r}; {near}")
+    return place_at(run, run.scene_cameras[name], *numbers, text)
+
+
+def distance(n: Normalization, first: Place, second: Place) -> tuple[float, float]:
+    """Return the distance of two places [file units] and its relative standard deviation; UsageError for equal places."""
+    apart = second[0] - first[0]
+    length = float(np.linalg.norm(apart))
+    if not length > LEAST:
+        raise UsageError("the two points are equal; pick two that are apart")
+    return length / n.scale, math.sqrt((matmul(first[1] + second[1], apart) * apart).sum()) / length**2
+
+
+def scaled(n: Normalization, first: Place, second: Place, length: float) -> Levelled:
+    """Give files the scale at which two places are ``length`` [m] apart."""
+    if not 0 < length < math.inf:
+        raise UsageError(f"the length must be above 0 m, not {length:g}")
+    units, error = distance(n, first, second)
+    n = replace(n, offset=n.origin + (n.offset - n.origin) * (length / units), scale=n.scale * units / length, unit="m")
+    return n, f"scale: files are {length / units:.6g} times as large, in metres; uncertain by {100 * error:.2g} %"
+
+
+def upright(n: Normalization, up: np.ndarray, ground: np.ndarray | None = None) -> Levelled:
+    """Turn files so that ``up`` [3] of the scene is up: -y, or z after GPS. Off maps, ``ground`` [3] [u] gets height 0."""
+    wanted, own = (np.array([0.0, -1, 0]) if v is None else matmul(n.rotation.T, v) for v in (n.up, up))
+    turn, degrees = matmul(levelling(wanted).T, levelling(own)), np.degrees(np.arccos(np.clip((wanted * own).sum(), -1, 1)))
+    offset = n.origin + matmul(turn, n.offset - n.origin)
+    n = replace(n, rotation=matmul(n.rotation, turn.T), offset=offset, up=up)
+    if ground is not None and n.place is None and not n.origin.any():
+        n = replace(n, offset=offset - wanted * (convert_points(ground[None], n, "scene", "file") * wanted).sum())
+    return n, f"{'z' if wanted[2] > 0.5 else '-y'} is up in files, which were turned by {degrees:.1f} degrees"
+
+
+def grounded(run: StoredRun, places: Sequence[Place]) -> Levelled:
+    """Turn files so that three places lie on the ground, below the cameras."""
+    corners = np.array([point for point, _ in places])
+    sides = np.linalg.norm(np.roll(corners, 1, 0) - np.roll(corners, -1, 0), axis=1)  # opposite to each corner
+    normal = np.cross(corners[1] - corners[0], corners[2] - corners[0])
+    if not (area := float(np.linalg.norm(normal))) > max(LEAST**2, 0.01 * sides.max() ** 2):
+        raise UsageError("--ground: the three points are equal or nearly on a line; pick three that span the ground")
+    center = np.mean([run.scene_cameras[name].center for name in run.train], axis=0)
+    normal *= np.sign(((center - corners[0]) * normal).sum()) / area
+    # a point's error along the normal tilts the plane about the opposite side
+    tilts = [math.sqrt((matmul(error, normal) * normal).sum()) * side / area for (_, error), side in zip(places, sides)]
+    n, line = upright(run.normalization, normal, corners[0])
+    return n, f"{line}; the ground's tilt is uncertain by {math.degrees(math.hypot(*tilts)):.2g} degrees"
+
+
+def photographed(run: StoredRun) -> Levelled:
+    """Turn files by the photographs: upward is the mean of their upward axes, moved until their horizontal axes are level."""
+    rights, downs = (np.array([run.scene_cameras[name].viewmat[i, :3] for name in run.train]) for i in (0, 1))
+    weights = np.ones((len(rights), 1))
+    for _ in range(20):  # photographs that lean, such as portraits, get small weights
+        mean, second = -(weights * downs).sum(0) / weights.sum(), matmul((weights * rights).T, rights) / weights.sum()
+        if not np.linalg.norm(mean) > 0.5:
+            raise DataError(f"{run.folder}: the photographs have no common upward direction; use --ground")
+        up = np.linalg.solve(second + 0.01 * np.eye(3), mean)  # least squares; the mean decides where no axis points
+        up /= np.linalg.norm(up)
+        leaning = np.arcsin(np.clip(matmul(rights, up), -1, 1))
+        weights = 1 / (1 + (leaning[:, None] / LEANING) ** 2)
+    n, line = upright(run.normalization, up)
+    more = "; all look one way, so their tilt forwards remains: --ground is better" * int(np.linalg.eigvalsh(second)[1] < 0.03)
+    return n, f"{line}; {len(rights)} photographs lean by {np.degrees(np.median(abs(leaning))):.2g} degrees (median){more}"
+
+
+def metres_about(coordinates: np.ndarray, place: np.ndarray) -> np.ndarray:
+    """Return metres to east, north and up [N, 3] of coordinates [N, 3]: latitude, longitude [deg] and height [m].
+
+    The meridian and the parallel of ``place`` [3] count as straight, which is exact to 1e-4 within a kilometre.
+    """
+    (north, east), latitude = np.radians((coordinates - place)[:, :2].T), math.radians(place[0])
+    narrowed = 1 - SQUARED * math.sin(latitude) ** 2
+    along, across = EARTH * (1 - SQUARED) / narrowed**1.5 + place[2], EARTH / math.sqrt(narrowed) + place[2]
+    return np.stack([across * math.cos(latitude) * east, along * north, coordinates[:, 2] - place[2]], 1)
+
+
+def similarity(points: np.ndarray, targets: np.ndarray, weights: np.ndarray) -> tuple[float | np.ndarray, ...]:
+    """Return scale, rotation [3, 3] and translation [3] from points to targets [N, 3], distances [N], and if all is sure.
+
+    Weighted least squares (Umeyama 1991); points that leave a line by at most a twentieth of its length leave a rotation open.
+    """
+    parts = weights[:, None] / weights.sum()
+    middle, aim = (parts * points).sum(0), (parts * targets).sum(0)
+    left, sizes, right = np.linalg.svd(matmul((parts * (targets - aim)).T, points - middle))
+    signs = np.array([1, 1, np.sign(np.linalg.det(left) * np.linalg.det(right))])
+    rotation = matmul(left * signs, right)
+    scale = float((sizes * signs).sum() / max((parts * (points - middle) ** 2).sum(), 1e-300))
+    offs = np.linalg.norm(scale * matmul(points - middle, rotation.T) + aim - targets, axis=1)
+    return scale, rotation, aim - scale * matmul(rotation, middle), offs, bool(sizes[1] > sizes[0] / 400)
+
+
+def located(run: StoredRun, folder: Path | None) -> Levelled:
+    """Give files metres to east, north and up of the middle of the photographs, by their EXIF; those far off do not count."""
+    home = Path(run.record["scene"]["path"] or run.folder)
+    paths = {name: [f / name for f in ([home / "images", home] if folder is None else [folder])] for name in run.scene_cameras}
+    files = {name: next((p for p in some if p.is_file()), None) for name, some in paths.items()}
+    rows = {name: gps for name, file in files.items() if file is not None and (gps := read_gps(read_image_file(file)))}
+    centers, coordinates = np.array([run.scene_cameras[name].center for name in rows]), np.array([*rows.values()])
+    count, sure, weights = len(rows), False, np.ones(len(rows))
+    if count > 2:
+        place = np.median(coordinates, axis=0)
+        targets = metres_about(coordinates, place)
+        for _ in range(50):  # least absolute distances, which few outliers do not move
+            *_, offs, _ = similarity(centers, targets, weights)
+            weights = 1 / np.maximum(offs, 0.01 * SURE)
+        agree = (offs <= max(SURE, 3 * float(np.median(offs)))).astype(float)
+        scale, rotation, translation, offs, sure = similarity(centers, targets, agree)
+        count, offs = int(agree.sum()), offs[agree > 0]
+    if count < 3 or not sure:
+        raise DataError(
+            f"--gps: {count} of {len(files)} photographs have GPS in EXIF that fits the poses; 3 are needed, not on a line. "
+            "Copies often lose EXIF: --gps FOLDER reads originals with the names of the views"
+        )
+    line = f"GPS of {len(offs)} of {len(rows)} photographs is {np.median(offs):.2f} m (median), at most {offs.max():.2f} m off"
+    line += "; x is east, y north, z up [m] from latitude {:.7f}, longitude {:.7f}, height {:.1f} m".format(*place)
+    return Normalization(translation, 1 / scale, rotation.T, rotation[2], "m", place), line
+
+
+def store(folder: Path, device_name: str, change: Callable[[StoredRun], Levelled]) -> list[str]:
+    """Replace the similarity of a run, and its PLY, by what ``change`` returns for it; returns lines for the user."""
+    read_record(folder)  # before a lock is made: it may be no run
+    with hold_folder(folder) as held:
+        run, ply = open_run(folder, device_name), folder / "point_cloud.ply"
+        n, line = change(run)
+        write_json(folder / CONFIG, schema.read(folder / CONFIG, folder) | {"normalization": similarity_values(n)})
+        if ply.is_file():
+            write_ply(ply, drop_unused_sh(run.gaussians()), n, antialiased=run.antialiased)
+    old = [folder / name for name in ("crop.json", "path.json") if (folder / name).is_file()]
+    return [*run.notes(), *held, line, *(f"{path} has the old coordinates; save it again" for path in old)]
+
+
+def level(
+    folder: Path, device_name: str, scale: tuple[str, str, float] | None = None, ground: tuple[str, str, str] | None = None,
+    photographs: bool = False, gps: tuple[Path, ...] | None = None,
+) -> list[str]:  # fmt: skip
+    """Set scale, upward direction or place of a run's files, with the options of `warpgs level`; returns lines for the user."""
+    if [scale is not None, ground is not None, photographs, gps is not None].count(True) != 1 or len(gps or ()) > 1:
+        raise UsageError("give one of --scale, --ground, --up and --gps, with at most one folder")
+
+    def change(run: StoredRun) -> Levelled:
+        if scale:
+            return scaled(run.normalization, picked(run, scale[0]), picked(run, scale[1]), scale[2])
+        if ground:
+            return grounded(run, [picked(run, text) for text in ground])
+        return photographed(run) if photographs else located(run, *(gps or [None]))
+
+    return store(folder, device_name, change)
