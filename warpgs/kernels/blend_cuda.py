@@ -11,12 +11,12 @@ from types import SimpleNamespace
 import torch
 import warp as wp
 
-from warpgs.constants import SMALLEST_WEIGHT, TILE_SIZE
+from warpgs.constants import LARGEST_HALF, SMALLEST_WEIGHT, TILE_SIZE
 from warpgs.device import FLOAT, StepSizes
 from warpgs.kernels import launch
-from warpgs.kernels.falloff import COLORS, Pass, make_struct
+from warpgs.kernels.falloff import COLORS, LARGEST_STOP, Pass, make_struct
 from warpgs.kernels.graphs import TORCH, Allocator
-from warpgs.kernels.native import cuda_kernel, source
+from warpgs.kernels.native import SCALE, cuda_kernel, source
 from warpgs.kernels.tiles import Tiles, grid
 
 CHUNKS = (64, 128, 256)
@@ -32,6 +32,10 @@ WARPS = 2
 LARGE_GAUSSIAN = 8
 """Mean number of tiles per visible Gaussian at which a warp of the forward pass takes two blocks of pixels instead of one. This
 halves the instances that are loaded and tested; few instances touch only one block (docs/decisions/005-cuda-blending.md)."""
+IMAGE_BLOCKS = 2
+"""Blocks of pixels that a warp takes in images with `Pass.max_error`."""
+LARGE_TILE = 32
+"""Side of a tile in large images with `Pass.max_error` [px]."""
 RANKS = 33
 """Number of ranks of tiles; the rank of a tile is the number of bits of its list's length, 0 to 32."""
 ORDER_THREADS = 256
@@ -40,9 +44,6 @@ STRIDE = 12
 """Stride of the sums of an instance, in floats, with three channels: the size of a projected Gaussian, so that rows are
 16-byte aligned. There are at most twelve sums: two along the rows of the factor, three for the factor, opacity, colour, depth,
 and two of magnitudes. Each further channel adds one."""
-
-# 2^-(e1^2 + e2^2) = exp(-|U d|^2 / 2) where e = SCALE U d
-SCALE = "0.84932180028801904272f"  # sqrt(log2(e) / 2)
 
 
 def _source(name: str, tile_size: int, channels: int, **numbers) -> str:
@@ -75,6 +76,27 @@ def make_forward(tile_size: int, save: bool, per: int, channels: int = COLORS):
     ): ...  # fmt: skip
 
     return forward
+
+
+@functools.cache
+def make_image(tile_size: int, per: int):
+    """Make the compositing kernel of images without gradients and with `Pass.max_error`; arguments as of `make_forward`."""
+    Blending = make_struct(wp.float32)
+    numbers = {"PER": per, "LARGEST_HALF": f"{LARGEST_HALF}f", "LARGEST_STOP": f"{LARGEST_STOP}f"}
+
+    module = f"warpgs.kernels.blend_cuda.image.{tile_size}.{per}"
+
+    @cuda_kernel(_source("image", tile_size, COLORS, **numbers), "wp.tid() // 32", module)
+    def image(
+        item: int, settings: Blending, records: wp.array(dtype=float), largest: wp.array(dtype=int),
+        counts: wp.array(dtype=int), order: wp.array(dtype=int), ranges: wp.array(dtype=int), ids: wp.array(dtype=int),
+        backgrounds: wp.array(dtype=float), max_error: float, rounding: float,
+        # outputs
+        rgb: wp.array(dtype=float), alpha_out: wp.array(dtype=float), depth: wp.array(dtype=float),
+        bounds: wp.array(dtype=float),
+    ): ...  # fmt: skip
+
+    return image
 
 
 @functools.cache
@@ -159,6 +181,41 @@ def order_bytes(sizes: StepSizes) -> int:
     return FLOAT * RANKS * columns * rows
 
 
+def _in_order(tiles: Tiles, allocator: Allocator) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return the number of tiles of each rank [RANKS], and the tiles in order of their ranks, a row for each [RANKS, T]."""
+    device, count = tiles.ranges.device, tiles.ranges.shape[0]
+    counts = allocator.workspace((RANKS,), torch.int32, device).zero_()
+    order = allocator.workspace((RANKS, count), torch.int32, device)
+    threads = -(-count // ORDER_THREADS) * ORDER_THREADS
+    inputs = [tiles.ranges, count, counts, order]
+    launch.launch(make_kernels(tiles.size).order_tiles, threads, inputs, device, block_dim=ORDER_THREADS)
+    return counts, order
+
+
+def image(
+    tiles: Tiles, backgrounds: torch.Tensor, settings: Pass, allocator: Allocator = TORCH
+) -> tuple[torch.Tensor, ...]:  # fmt: skip
+    """Return rgb [C, H, W, 3], alpha and depth [C, H, W] of packed Gaussians, and bounds of the error of rgb [C]."""
+    device, shape = backgrounds.device, (backgrounds.shape[0], *settings.window[:1:-1])
+    found = tuple(allocator.output(s, torch.float32, device) for s in ((*shape, COLORS), shape, shape, shape[:1]))
+    assert tiles.packed is not None
+    inputs = [
+        settings.struct(tiles.size, wp.float32), *tiles.packed, *_in_order(tiles, allocator), tiles.ranges, tiles.gaussian_ids,
+        backgrounds, settings.max_error, settings.rounding(), *found,
+    ]  # fmt: skip
+    threads = len(tiles.ranges) * tiles.size * tiles.size // IMAGE_BLOCKS
+    launch.launch(make_image(tiles.size, IMAGE_BLOCKS), threads, inputs, device, block_dim=32 * WARPS)
+    return found
+
+
+def image_tile(settings: Pass) -> int:
+    """Return the side of the tiles [px] for an image with `Pass.max_error`: larger for large images, with fewer instances."""
+    x, y, width, height = settings.window
+    columns, rows = grid(width, height, TILE_SIZE)
+    large = columns * rows > MAX_TILES[1] and x % LARGE_TILE == y % LARGE_TILE == 0
+    return LARGE_TILE if large else settings.tile_size
+
+
 def forward(
     projected: torch.Tensor,
     tiles: Tiles,
@@ -180,17 +237,14 @@ def forward(
     chunk = chunk_of(tiles.ranges.shape[0], settings.deterministic)
     rows, state = tiles.slots.shape[0] // chunk + 1 if save else 0, STATE + channels - COLORS
     states = allocator.saved((rows, state * pixels), torch.float32, device)
-    k, count = make_kernels(tiles.size), tiles.ranges.shape[0]
-    counts = allocator.workspace((RANKS,), torch.int32, device).zero_()
-    order = allocator.workspace((RANKS, count), torch.int32, device)
-    threads = -(-count // ORDER_THREADS) * ORDER_THREADS
-    launch.launch(k.order_tiles, threads, [tiles.ranges, count, counts, order], device, block_dim=ORDER_THREADS)
     inputs = [
-        settings.struct(tiles.size, wp.float32), chunk, projected, counts, order, tiles.ranges, tiles.gaussian_ids, backgrounds,
-        rgb, alpha, depth, transmittances, weights, ends, states,
+        settings.struct(tiles.size, wp.float32), chunk, projected, *_in_order(tiles, allocator), tiles.ranges,
+        tiles.gaussian_ids, backgrounds, rgb, alpha, depth, transmittances, weights, ends, states,
     ]  # fmt: skip
     per = 2 if tiles.gaussian_ids.shape[0] >= LARGE_GAUSSIAN * tiles.visible else 1
-    launch.launch(make_forward(tiles.size, save, per, channels), count * pixels // per, inputs, device, block_dim=32 * WARPS)
+    launch.launch(
+        make_forward(tiles.size, save, per, channels), len(tiles.ranges) * pixels // per, inputs, device, block_dim=32 * WARPS
+    )
     return rgb, alpha, depth, transmittances, weights, ends, states
 
 

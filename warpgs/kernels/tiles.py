@@ -8,7 +8,7 @@ from typing import Any
 import torch
 import warp as wp
 
-from warpgs.constants import TILE_SIZE
+from warpgs.constants import LARGEST_HALF, TILE_SIZE
 from warpgs.device import (
     BINNING,
     BLENDING,
@@ -26,7 +26,7 @@ from warpgs.kernels import launch
 from warpgs.kernels.ellipse import make_spans
 from warpgs.kernels.graphs import TORCH, Allocator
 from warpgs.kernels.launch import sort_pairs
-from warpgs.kernels.native import EXACT
+from warpgs.kernels.native import EXACT, SCALE, cuda_kernel, source
 from warpgs.kernels.native import make_functions as make_native
 from warpgs.kernels.project_cpu import LANES
 
@@ -102,10 +102,11 @@ def make_write(slotted: bool):
 
 
 @functools.cache
-def make_emit(real, slotted: bool):
+def make_emit(real, slotted: bool, ranked: bool = False):
     """Make the kernel for CUDA that writes the instances of each Gaussian, row by row of tiles (for a CPU: `make_emit_cpu`)."""
     # A warp shares the rows and then the tiles of its 32 Gaussians evenly among its lanes. Unused slots get the tile
-    # ``no_tile``. Without ``slotted``, the number of the Gaussian takes the place of the slot.
+    # ``no_tile``. Without ``slotted``, the number of the Gaussian takes the place of the slot; with ``ranked``, its place in
+    # the order of depth does.
     s = make_spans(real)
     vec3 = wp.types.vector(3, real)
     vec2i = s.vec2i
@@ -123,7 +124,7 @@ def make_emit(real, slotted: bool):
             projected[i, 0], projected[i, 1], factor, reach, projected[i, 10], projected[i, 11], row, origin_x, width, tile_size
         )
 
-    module = f"warpgs.kernels.tiles.emit.{real.__name__}.{int(slotted)}"
+    module = f"warpgs.kernels.tiles.emit.{real.__name__}.{int(slotted)}{'.ranked' * ranked}"
 
     # five blocks to a multiprocessor
     @wp.kernel(enable_backward=False, grid_stride=False, cuda_max_registers=48, module=module)
@@ -185,6 +186,8 @@ def make_emit(real, slotted: bool):
                 to = done + lane + lanes.broadcast(to_slot, at)
                 key = done + lane + lanes.broadcast(to_key, at)
                 owner_of = lanes.broadcast(g, at)
+                if wp.static(ranked):
+                    owner_of = j - lane + lanes.broadcast(owner, at)
                 if to < lanes.broadcast(limit, at) and done + lane < tile_count:
                     write(to, key, owner_of, keys, slots, owners)
                 done += 32
@@ -309,6 +312,21 @@ def make_emit_cpu(real, slotted: bool):
                 to += 1
 
     return emit
+
+
+@functools.cache
+def make_pack():
+    """Make the kernel that packs visible Gaussians in order of depth, for images without gradients (blend_image.cu)."""
+    numbers = {"SCALE": SCALE, "LARGEST_HALF": f"{LARGEST_HALF}f"}
+
+    @cuda_kernel(source("blend_pack.cu", **numbers), "begin + wp.tid()", "warpgs.kernels.tiles.pack")
+    def pack(
+        j: int, projected: wp.array(dtype=float), order: wp.array(dtype=int), tile_counts: wp.array(dtype=int), count: int,
+        # outputs; largest is zero on entry
+        counts: wp.array(dtype=wp.int64), records: wp.array(dtype=float), largest: wp.array(dtype=int),
+    ): ...  # fmt: skip
+
+    return pack
 
 
 def _of_sum(native: bool) -> tuple[int, int]:
@@ -449,6 +467,8 @@ def split_sum(total: int, count: int) -> tuple[int, int]:
     return divmod(total, 2 ** sum_bits(count))
 
 
+RECORD_SIZE = 8
+"""Number of floats of a packed Gaussian, see `Tiles.packed`."""
 LIST_BYTES = 20
 """Bytes of an instance while the lists are made: two sort buffers of (key, slot), and the Gaussian number."""
 BYTES_PER_INSTANCE = LIST_BYTES + 48 + 80
@@ -484,6 +504,9 @@ class Tiles:
     """Actual number of instances, int64, shape [1], for kernels; with a capacity, M is the capacity."""
     visible: int = 0
     """Number of Gaussians that have instances; with a capacity, an upper bound."""
+    packed: tuple[torch.Tensor, torch.Tensor] | None = None
+    """With `Pass.max_error` on CUDA in float32: records of the visible Gaussians in order of depth (blend_pack.cu), float32
+    [V, 8], and the bits of the largest colour, int32 [1]. ``gaussian_ids`` are then places in this order."""
 
     def tensors(self) -> tuple[torch.Tensor, ...]:
         """Return all tensors [...], in the order of the constructor."""
@@ -603,7 +626,13 @@ def bin_tiles(
     with launch.stream_of(device):
         order, visible, total = _depth_order(projected, counts, columns * rows, memory)
         ends = allocator.saved((max(visible, 1),), torch.int64, device)
-        launch.launch(make_kernels(real, native).ordered_counts, visible, [order, counts, ends], device)
+        packed = None
+        if settings.max_error and native and real is wp.float32:
+            largest = allocator.workspace((1,), torch.int32, device).zero_()
+            packed = allocator.workspace((visible, RECORD_SIZE), torch.float32, device), largest
+            launch.launch(make_pack(), -(-visible // 256) * 256, [projected, order, counts, visible, ends, *packed], device)
+        else:
+            launch.launch(make_kernels(real, native).ordered_counts, visible, [order, counts, ends], device)
         ends = torch.cumsum(ends, 0, out=ends) if visible > 0 else ends.zero_()
         starts, keys, slots = (allocator.saved((n,), torch.int32, device) for n in (len(counts), 2 * total, 2 * total))
         owners = allocator.workspace((total if slotted else 0,), torch.int32, device)
@@ -617,7 +646,8 @@ def bin_tiles(
         emit, threads, cost = make_emit_cpu, -(-visible // LANES), 10 * LANES
         if native:
             emit, threads, cost = make_emit, -(-visible // 256) * 256, 10
-        launch.launch(emit(real, slotted), threads, inputs, device, cost=cost)
+        kernel = emit(real, slotted) if packed is None else emit(real, False, ranked=True)
+        launch.launch(kernel, threads, inputs, device, cost=cost)
         if listed is not None:
             own, kept = keys[:total], torch.cat([listed, listed.new_zeros(1)])
             own.masked_fill_(~kept[own.long()], no_tile)
@@ -626,4 +656,4 @@ def bin_tiles(
         inputs = [keys, slots, owners, total, no_tile, ids, ranges]
         launch.launch(make_find_ranges(slotted, native), -(-total // EACH) if native else total, inputs, device)
     own_slots = slots[: total if slotted else 0]
-    return Tiles(tile_size, ranges, ids, own_slots, starts, counts, keys[:total], ends[-1:], visible)
+    return Tiles(tile_size, ranges, ids, own_slots, starts, counts, keys[:total], ends[-1:], visible, packed)

@@ -34,15 +34,13 @@ struct Splat {
     // cut, that is |U d|^2 <= limit. The least |U d|^2 over the block lies on one of the two edges that face the mean. Distances
     // are widened by their largest rounding errors. A NaN is kept; it changes nothing.
     __device__ bool touches(float left, float top, float limit, float bottom = 3.5f) const {
-        const float4 c = rest[REST - 1];
-        const float slack_x = 0.01f + 2e-6f * (fabsf(a.x) + c.z), slack_y = 0.01f + 2e-6f * (fabsf(a.y) + c.w);
+        const float slack_x = 0.01f + 2e-6f * fabsf(a.x), slack_y = 0.01f + 2e-6f * fabsf(a.y);
         const float x0 = left + 0.5f - a.x - slack_x, x1 = left + 7.5f - a.x + slack_x;
         const float y0 = top + 0.5f - a.y - slack_y, y1 = top + bottom - a.y + slack_y;
         const float near_x = fminf(fmaxf(0.0f, x0), x1), near_y = fminf(fmaxf(0.0f, y0), y1);
         const float y = fminf(fmaxf(-__fdividef(a.w * a.z * near_x, a.w * a.w + b.x * b.x), y0), y1);
         const float x = fminf(fmaxf(-__fdividef(a.w * near_y, a.z), x0), x1);
-        return !(near_x > c.z || -near_x > c.z || near_y > c.w || -near_y > c.w
-                 || (below(near_x, y) > limit && below(x, near_y) > limit));
+        return !(below(near_x, y) > limit && below(x, near_y) > limit);
     }
     __device__ float below(float dx, float dy) const {
         const float p = a.z * dx, r = a.w * dy, e2 = b.x * dy;
