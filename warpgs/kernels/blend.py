@@ -108,10 +108,8 @@ def composite(
     # ``image`` may be a slice of the channels of an image; on CUDA in float32 it may have fewer than D channels: then only the
     # first ones are written. Without ``save``, transmittances and weights may be empty. With `Pass.max_error`: rgb, alpha,
     # depth, and bounds of the error of rgb [C].
-    if settings.max_error:
-        if tiles.packed is not None:
-            return blend_cuda.image(tiles, backgrounds, settings, allocator)
-        return _rounded_image(projected, tiles, backgrounds, settings)
+    if settings.max_error and tiles.packed is None:
+        return _rounded(projected, tiles, backgrounds, settings)
     if is_native(projected):
         return blend_cuda.forward(projected, tiles, backgrounds, settings, save=save, allocator=allocator, image=image)
     real, device = launch.real_of(projected), projected.device
@@ -130,20 +128,19 @@ def composite(
     return rgb, alpha, depth, transmittances, weights, ends, allocator.saved((0,), projected.dtype, device)
 
 
-def _rounded_image(
-    projected: torch.Tensor, tiles: Tiles, backgrounds: torch.Tensor, settings: Pass
-) -> tuple[torch.Tensor, ...]:  # fmt: skip
-    """Return what `blend_cuda.image` does, with its roundings and, over all cameras, the lowest of its stops."""
+def _rounded(projected: torch.Tensor, tiles: Tiles, backgrounds: torch.Tensor, settings: Pass) -> tuple[torch.Tensor, ...]:
+    """Return what blend_forward.cu does of packed Gaussians, with its roundings and, over all cameras, its lowest stop."""
     rounded, rule = projected.clone(), settings.rule
     colors, depths = rounded[..., GEOMETRY : GEOMETRY + COLORS], rounded[..., GEOMETRY + COLORS]
     most = float(colors.amax()) if colors.numel() else 0.0
     colors.copy_(colors.clamp_max(LARGEST_HALF).half())
     depths.copy_(depths.bfloat16())
     low, high = backgrounds.clamp_max(0), backgrounds.clamp_min(most)
-    spread, behind = (high - low).amax(1) / 2, (low + high) / 2  # of all colours that a pixel may have behind
-    errors = (settings.rounding() if most <= LARGEST_HALF else 1.0) * most + 1e-6 * spread + 3e-8
-    stop = ((settings.max_error * 0.999 - errors) / spread).amin().clamp(rule.transmittance_stop, LARGEST_STOP)
-    coarse = replace(settings, max_error=0.0, rule=replace(rule, transmittance_stop=float(stop.nan_to_num())))
+    spread, behind, reach = (high - low).amax(1) / 2, (low + high) / 2, torch.maximum(high, -low).amax(1)
+    errors = (settings.rounding() if most <= LARGEST_HALF else 1.0) * reach + 3e-8
+    stop = ((settings.max_error * 0.999 - errors) / spread).nan_to_num().amin().clamp_max(LARGEST_STOP)
+    stop = stop.clamp_min(4 * rule.transmittance_stop)
+    coarse = replace(settings, max_error=0.0, rule=replace(rule, transmittance_stop=float(stop)))
     rgb, alpha, depth, left, *_ = composite(rounded, tiles, backgrounds, coarse, save=True)
     rgb += ((behind - backgrounds)[:, None, None] * left[..., None]).where(left[..., None] < stop, 0.0)
     return rgb, alpha, depth, (errors + stop * spread) * 1.001

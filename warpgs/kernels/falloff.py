@@ -81,14 +81,12 @@ class Pass:
         return found
 
     def rounding(self) -> float:
-        """Return the largest error of a colour by rounding with ``max_error``, as a fraction of the largest colour."""
-        # that of a half; of two sums over all layers that a pixel may blend; and of their weights (docs/numerics.md)
-        layers = SPARE_LAYERS - math.log(self.rule.transmittance_stop) / self.rule.alpha_cut
+        """Return the largest error of a colour by rounding with ``max_error``, as a fraction of the largest colour behind."""
+        # of a half; of two sums over all layers in front of the stop, and at their ends; of weights (docs/numerics.md)
+        layers = 16 - math.log(self.rule.transmittance_stop) / self.rule.alpha_cut
         return 2.0**-11 + (2 * layers + 4 / self.rule.alpha_cut) * 2.0**-24
 
 
-SPARE_LAYERS = 48
-"""Layers that a pixel may blend after its transmittance has passed the stop, 32, and roundings at the end of a sum."""
 LARGEST_STOP = 0.5
 """Largest transmittance at which a pixel is finished because of `Pass.max_error`."""
 

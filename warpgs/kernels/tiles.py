@@ -26,7 +26,7 @@ from warpgs.kernels import launch
 from warpgs.kernels.ellipse import make_spans
 from warpgs.kernels.graphs import TORCH, Allocator
 from warpgs.kernels.launch import sort_pairs
-from warpgs.kernels.native import EXACT, SCALE, cuda_kernel, source
+from warpgs.kernels.native import EXACT, SCALE, source
 from warpgs.kernels.native import make_functions as make_native
 from warpgs.kernels.project_cpu import LANES
 
@@ -105,8 +105,8 @@ def make_write(slotted: bool):
 def make_emit(real, slotted: bool, ranked: bool = False):
     """Make the kernel for CUDA that writes the instances of each Gaussian, row by row of tiles (for a CPU: `make_emit_cpu`)."""
     # A warp shares the rows and then the tiles of its 32 Gaussians evenly among its lanes. Unused slots get the tile
-    # ``no_tile``. Without ``slotted``, the number of the Gaussian takes the place of the slot; with ``ranked``, its place in
-    # the order of depth does.
+    # ``no_tile``. Without ``slotted``, the number of the Gaussian takes the place of the slot. With ``ranked``, its place in
+    # the order of depth does, and ``owners`` are `Tiles.packed`.
     s = make_spans(real)
     vec3 = wp.types.vector(3, real)
     vec2i = s.vec2i
@@ -123,6 +123,9 @@ def make_emit(real, slotted: bool, ranked: bool = False):
         return s.tile_columns(
             projected[i, 0], projected[i, 1], factor, reach, projected[i, 10], projected[i, 11], row, origin_x, width, tile_size
         )
+
+    @wp.func_native(source("blend_pack.cu", SCALE=SCALE, LARGEST_HALF=f"{LARGEST_HALF}f"))
+    def pack(j: int, i: int, count: int, projected: wp.array2d(dtype=real), records: wp.array(dtype=int)): ...
 
     module = f"warpgs.kernels.tiles.emit.{real.__name__}.{int(slotted)}{'.ranked' * ranked}"
 
@@ -154,7 +157,10 @@ def make_emit(real, slotted: bool, ranked: bool = False):
                 tile_counts[i] = touched
             end = int(last_slot)
             slot = end - touched
-            starts[i] = slot
+            if wp.static(not ranked):
+                starts[i] = slot
+        if wp.static(ranked):
+            pack(j, i, count, projected, owners)
         rows = vec2i(0, 0)
         if touched > 0:
             rows = s.tile_rows(projected[i, 1], projected[i, 11], origin_y, height, tile_size)
@@ -312,21 +318,6 @@ def make_emit_cpu(real, slotted: bool):
                 to += 1
 
     return emit
-
-
-@functools.cache
-def make_pack():
-    """Make the kernel that packs visible Gaussians in order of depth, for images without gradients (blend_image.cu)."""
-    numbers = {"SCALE": SCALE, "LARGEST_HALF": f"{LARGEST_HALF}f"}
-
-    @cuda_kernel(source("blend_pack.cu", **numbers), "begin + wp.tid()", "warpgs.kernels.tiles.pack")
-    def pack(
-        j: int, projected: wp.array(dtype=float), order: wp.array(dtype=int), tile_counts: wp.array(dtype=int), count: int,
-        # outputs; largest is zero on entry
-        counts: wp.array(dtype=wp.int64), records: wp.array(dtype=float), largest: wp.array(dtype=int),
-    ): ...  # fmt: skip
-
-    return pack
 
 
 def _of_sum(native: bool) -> tuple[int, int]:
@@ -504,9 +495,9 @@ class Tiles:
     """Actual number of instances, int64, shape [1], for kernels; with a capacity, M is the capacity."""
     visible: int = 0
     """Number of Gaussians that have instances; with a capacity, an upper bound."""
-    packed: tuple[torch.Tensor, torch.Tensor] | None = None
-    """With `Pass.max_error` on CUDA in float32: records of the visible Gaussians in order of depth (blend_pack.cu), float32
-    [V, 8], and the bits of the largest colour, int32 [1]. ``gaussian_ids`` are then places in this order."""
+    packed: torch.Tensor | None = None
+    """With `Pass.max_error` on CUDA in float32: records of the visible Gaussians in order of depth (blend_pack.cu), float32,
+    shape [8 V + 8]; the last one starts with the largest colour. ``gaussian_ids`` are then places in this order."""
 
     def tensors(self) -> tuple[torch.Tensor, ...]:
         """Return all tensors [...], in the order of the constructor."""
@@ -626,16 +617,12 @@ def bin_tiles(
     with launch.stream_of(device):
         order, visible, total = _depth_order(projected, counts, columns * rows, memory)
         ends = allocator.saved((max(visible, 1),), torch.int64, device)
-        packed = None
-        if settings.max_error and native and real is wp.float32:
-            largest = allocator.workspace((1,), torch.int32, device).zero_()
-            packed = allocator.workspace((visible, RECORD_SIZE), torch.float32, device), largest
-            launch.launch(make_pack(), -(-visible // 256) * 256, [projected, order, counts, visible, ends, *packed], device)
-        else:
-            launch.launch(make_kernels(real, native).ordered_counts, visible, [order, counts, ends], device)
+        launch.launch(make_kernels(real, native).ordered_counts, visible, [order, counts, ends], device)
         ends = torch.cumsum(ends, 0, out=ends) if visible > 0 else ends.zero_()
         starts, keys, slots = (allocator.saved((n,), torch.int32, device) for n in (len(counts), 2 * total, 2 * total))
-        owners = allocator.workspace((total if slotted else 0,), torch.int32, device)
+        packs = settings.max_error > 0 and native and real is wp.float32 and not slotted
+        owned = (visible + 1) * RECORD_SIZE if packs else total if slotted else 0
+        owners = allocator.workspace((owned,), torch.int32, device)
         if memory.capacity is not None and not native:  # the CUDA kernel fills the unused capacity
             keys[:total].fill_(no_tile)
         overflow = starts if memory.capacity is None else memory.overflow
@@ -643,11 +630,12 @@ def bin_tiles(
             projected, order, counts, ends, visible, per_camera, *origin, width, height, tile_size, rule.alpha_cut,
             rule.square_sigma, columns, columns * rows, no_tile, total, starts, keys, slots, owners, overflow,
         ]  # fmt: skip
-        emit, threads, cost = make_emit_cpu, -(-visible // LANES), 10 * LANES
+        if packs:
+            owners[-RECORD_SIZE:].zero_()
         if native:
-            emit, threads, cost = make_emit, -(-visible // 256) * 256, 10
-        kernel = emit(real, slotted) if packed is None else emit(real, False, ranked=True)
-        launch.launch(kernel, threads, inputs, device, cost=cost)
+            launch.launch(make_emit(real, slotted, packs), -(-visible // 256) * 256, inputs, device)
+        else:
+            launch.launch(make_emit_cpu(real, slotted), -(-visible // LANES), inputs, device, cost=10 * LANES)
         if listed is not None:
             own, kept = keys[:total], torch.cat([listed, listed.new_zeros(1)])
             own.masked_fill_(~kept[own.long()], no_tile)
@@ -655,5 +643,5 @@ def bin_tiles(
         ids = slots[total:] if slotted else slots[:total]  # the second half of the buffers is free again
         inputs = [keys, slots, owners, total, no_tile, ids, ranges]
         launch.launch(make_find_ranges(slotted, native), -(-total // EACH) if native else total, inputs, device)
-    own_slots = slots[: total if slotted else 0]
+    own_slots, packed = slots[: total if slotted else 0], owners.view(torch.float32) if packs else None
     return Tiles(tile_size, ranges, ids, own_slots, starts, counts, keys[:total], ends[-1:], visible, packed)

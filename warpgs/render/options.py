@@ -32,8 +32,8 @@ def _is_whole(value: object) -> bool:
 
 
 def _has_bound(rule: Rule) -> bool:
-    """Return whether the error of ``max_error`` has a bound under a rule."""
-    return rule.inclusive_stop and rule.alpha_cut > 0 and rule.transmittance_stop > 0 and rule.square_sigma == 0
+    """Return whether ``max_error`` supports a rule. The stop of rule fast, 1e-3, keeps four times the stop below 1/255."""
+    return rule.inclusive_stop and rule.alpha_cut > 0 and 0 < rule.transmittance_stop <= 1e-3 and rule.square_sigma == 0
 
 
 @document_fields

@@ -353,7 +353,7 @@ def _render(gaussians: RasterizedGaussians, camera: Camera, options: RasterizeOp
             f"absgrad supports at most {WIDTHS[-1]} channels of colors, and no features: render more in a second call"
         )
     if options.max_error is not None:
-        if compose.needs_slots(inputs):
+        if compose.needs_slots(t for t in (*inputs, options.background) if isinstance(t, torch.Tensor)):
             raise UsageError("max_error renders without gradients: call rasterize under torch.no_grad(), or leave it out")
         settings = replace(settings, max_error=float(options.max_error))
         if inputs.means.is_cuda and inputs.means.dtype == torch.float32:
