@@ -78,8 +78,9 @@ class RasterizeOptions:
     max_error: float | None = None
     """Largest error of ``rgb`` against the same call without this option, such as 1/255, to save time on CUDA: colours are
     rounded to 16 bits, and pixels finish at a higher transmittance. ``Render.error_bound`` is then a proven bound, one number
-    for all pixels (docs/numerics.md); it is larger than ``max_error`` only if colours exceed about 4. Depths are rounded to
-    0.4 %. Without gradients, for spherical harmonics, and for rules exact, balanced and fast. None for no error."""
+    for all pixels of a camera (docs/numerics.md); it exceeds ``max_error`` only below 0.001 (balanced, fast: 0.003) times the
+    largest colour. Alpha and depth have no bound. Without gradients, for spherical harmonics, and for rules exact, balanced
+    and fast. None for no error."""
     memory_budget: int | None = None
     """Bytes that the (Gaussian, tile) instances may take at a time; None for four fifths of the free memory. With
     ``max_instances``, the chunks keep to both limits."""

@@ -287,7 +287,7 @@ def _frames(
     photographs, views = [model.cameras()[n] for n in model.train], coverage if isinstance(coverage, Sequence) else []
     cut_out, masks = any(v.alpha is not None for v in views), [v.mask for v in views] or None
     training = depth_views(gaussians, [v.camera for v in views] or photographs, options, masks) if coverage else None
-    shown = options.for_display(gaussians)
+    shown = options if coverage else options.for_display(gaussians)  # coverage needs exact depths
     for camera in cameras:
         with torch.no_grad():
             r = rasterize(gaussians, camera, shown)
