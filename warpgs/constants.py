@@ -62,6 +62,9 @@ of float32. The eigenvalue is that of the remainder S in docs/project.md, sectio
 LARGEST_COEFFICIENT = 1e6
 """Largest magnitude of a spherical-harmonics coefficient that is read."""
 
+LARGEST_HALF = 65504.0
+"""Largest number in half precision."""
+
 SMALLEST_WEIGHT = 1e-20
 """Smallest sum of blending weights at which a pixel has a depth. The gradient of depth is multiplied by depths up to `FAR` and
 divided by this sum: the factor is at most 1e30, within float32. Smaller sums occur only with an alpha cut of 0."""

@@ -422,7 +422,8 @@ class Render:
     W]; 0 where alpha is below 1/2. Only if requested. It has no gradient: a backward pass through it is an error."""
     error_bound: torch.Tensor | None = None
     """Upper bound of the error of ``rgb`` against rule `exact`, over all channels, shape [..., H, W]; see
-    ``RasterizeOptions.error_bound``. Only if requested. It has no gradient: a backward pass through it is an error."""
+    ``RasterizeOptions.error_bound``, and ``max_error``. Only if requested. It has no gradient: a backward pass through it is
+    an error."""
     features: torch.Tensor | None = None
     """Channels of ``RasterizeOptions.features`` over their background, shape [..., H, W, D]; only with features."""
     heaviest_ids: torch.Tensor | None = None

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 import warpgs
-from tests.gaussians import camera, cloud
+from tests.gaussians import LENSES, camera, cloud, lens_camera
 from tests.reference.project import project_reference
 from tools.run_docs import ROOT, collect
 from warpgs import RasterizeOptions, Rule, rasterize
@@ -19,7 +19,7 @@ from warpgs.errors import UsageError
 from warpgs.render.options import SWITCHES, WHOLE_NUMBERS
 from warpgs.render.rasterize import FASTEST_FIRST, select_rule
 from warpgs.render.reference import reference_image
-from warpgs.scene import Camera, Gaussians
+from warpgs.scene import C0, Camera, Gaussians
 
 
 @pytest.mark.parametrize(
@@ -300,6 +300,143 @@ def test_channels_have_a_bound_too(device):
     none = Gaussians(**{n: t[:0] for n, t in g.tensors().items()})
     assert float(rasterize(none, cam, RasterizeOptions(error_bound=True)).error_bound.detach().max()) < 1e-30
     assert not options.repeatable() and exact.error_bound is None
+
+
+IMAGE_RULES = ("exact", "balanced", "fast")
+"""Rules under which images may have a largest error."""
+
+
+def stacked(opacities, colors, device, dtype=torch.float32) -> tuple[Gaussians, Camera]:
+    """Flat layers [L] over a whole image of 50 x 34 px, front to back, with grey colours."""
+    count, how = len(opacities), {"dtype": dtype, "device": device}
+    means = torch.tensor([[0.0, 0.0, 2.0 + i] for i in range(count)], **how)
+    sh = ((torch.tensor(colors, **how) - 0.5) / C0)[:, None, None].expand(count, 1, 3).contiguous()
+    quats = torch.tensor([[1.0, 0, 0, 0]], **how).expand(count, 4).contiguous()
+    flat = torch.full((count, 3), 6.0, **how)
+    gaussians = Gaussians(means, quats, flat, torch.logit(torch.tensor(opacities, **how)), sh)
+    return gaussians, camera(50, 34, dtype=dtype, device=device)
+
+
+def off_and_bound(g, cam, options, error):
+    """Return the error of an image with ``max_error`` and its bound, shape [..., H, W] each, after checks of its form."""
+    fine, coarse = rasterize(g, cam, options), rasterize(g, cam, dataclasses.replace(options, max_error=error))
+    off, bound = (coarse.rgb - fine.rgb).abs().amax(-1), coarse.error_bound
+    assert fine.error_bound is None and bound.shape == coarse.alpha.shape and bool((off <= bound).all())
+    return off, bound
+
+
+def composited(projected, background, rule, width, height) -> torch.Tensor:
+    """Return the image [H, W, 3] of projected Gaussians [N, 12] with the cut-offs of a rule, pixel by pixel, layer by layer."""
+    y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
+    image, left, open_ = (
+        torch.zeros(height, width, 3).double(),
+        torch.ones(height, width).double(),
+        torch.ones(height, width) > 0,
+    )
+    for row in projected[projected[:, 9].argsort(stable=True)]:
+        dx, dy = x - row[0], y - row[1]
+        square = (row[2] * dx + row[3] * dy) ** 2 + (row[4] * dy) ** 2
+        alpha = (row[5] * torch.exp(-square / 2)).clamp_max(rule.alpha_max)
+        alpha = torch.where(open_ & (alpha >= rule.alpha_cut), alpha, 0.0)
+        image += (alpha * left)[..., None] * row[6:9]
+        left = left * (1 - alpha)
+        open_ &= left >= rule.transmittance_stop
+    return image + left[..., None] * background
+
+
+@pytest.mark.parametrize("rule", IMAGE_RULES)
+def test_images_within_an_error_keep_their_bound(device, rule):
+    """Every pixel of hard scenes: layers without number, needles, opaque fronts, alphas at the cuts, colours up to 30."""
+    for number in range(2 * len(KINDS)):
+        kind, g, cam, background = bound_scene(number)
+        g = Gaussians(**{n: t.to(device) for n, t in g.tensors().items()})
+        for error in (1e-5, 1 / 255, 0.05):
+            _, bound = off_and_bound(g, cam, RasterizeOptions(rule=rule, background=background), error)
+            least = 5e-3 if rule == "fast" else 2e-3 if rule == "balanced" else 1e-3  # rounding, and four stops
+            assert kind == "bright" or float(bound.max()) <= max(error, 3 * least), (number, error)
+
+
+def test_images_within_an_error_beside_a_reference():
+    """In float64, pixel by pixel, with two cameras, each lens, antialiasing and empty pixels before wild backgrounds."""
+    behind = torch.tensor([[-0.5, 2.0, 0.0], [1.0, 0.0, 0.3]], dtype=torch.float64)
+    g, worst = cloud(150, torch.float64), 0.0
+    places = g.means * torch.tensor([0.3, 0.3, 1.0])
+    g = dataclasses.replace(g, means=places, log_scales=g.log_scales + 0.5, logit_opacities=g.logit_opacities + 3)
+    for model in ("pinhole", *LENSES):
+        size = {"width": 37, "height": 35, "cameras": 2}  # three tiles a row, whose borders cut Gaussians
+        cam = camera(**size) if model == "pinhole" else lens_camera(model, **size)
+        for rule in IMAGE_RULES:
+            given = RasterizeOptions(rule=rule, background=behind, antialiased=True, max_error=0.02)
+            r = rasterize(g, cam, given)
+            for i in range(2):
+                truth = composited(r.projected[i], behind[i], RULES[rule], 37, 35)
+                off = (r.rgb[i] - truth).abs().amax(-1)
+                assert bool((off <= r.error_bound[i]).all()) and bool((r.alpha[i] == 0).any())
+                worst = max(worst, float((off / r.error_bound[i]).max()))
+    assert worst > 0.3
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_the_error_is_used_up(device, dtype):
+    """A black front just opaque enough, and white behind; a finished pixel may not count what lies far behind it."""
+    opacities, colors = (0.5, 0.5, 0.5, 0.224, *[0.99] * 4), (*[0.0] * 4, *[1.0] * 4)  # CUDA tests every fourth layer
+    g, cam = stacked(opacities, colors, device, dtype)
+    off, bound = off_and_bound(g, cam, RasterizeOptions(), 0.05)
+    assert 0.95 * float(bound.min()) <= float(off.min()) and float(bound.max()) <= 0.05
+    dark = rasterize(*stacked([0.3] * 8, [0.0] * 8, device, dtype), RasterizeOptions(max_error=1.0))
+    assert float(dark.alpha.min()) >= 0.5
+    # in front of the stop of `exact` by a hair, then white, in the colours that halves round most, and colours that none holds
+    for opacities, rule in (((0.99, 0.95, 0.82, 0.99, 0.99), "exact"), ((0.9, 0.9, 0.91, 0.99, 0.99), "fast")):
+        for scale in (1.0, 3000.0, 1e5):
+            colors = tuple(scale * c for c in (0.99976, 0.99976, 0.99976, 1.0, 1.0))
+            off_and_bound(*stacked(opacities, colors, device, dtype), RasterizeOptions(rule=rule), 1e-5)
+
+
+def test_an_error_is_for_images_alone(device):
+    """Wrong numbers, options and rules; gradients by anything that has one."""
+    for value in (0, -1.0, math.nan, math.inf, True, "0.1"):
+        with pytest.raises(UsageError, match="max_error must be a positive number"):
+            RasterizeOptions(max_error=value)
+    given = dict.fromkeys(("contributions", "median_depth", "error_bound", "absgrad"), True)
+    given |= {"heaviest": 2, "max_instances": 9, "colors": torch.zeros(3, 2), "features": torch.zeros(3, 2)}
+    for name, value in given.items():
+        with pytest.raises(UsageError, match=f"max_error and {name} exclude each other"):
+            RasterizeOptions(max_error=0.01, **{name: value})
+    for rule in ("gsplat-1.6", "inria", Rule("own", alpha_cut=0.0), Rule("own", transmittance_stop=0.01)):
+        with pytest.raises(UsageError, match=r"max_error does not support rule .*: choose exact, balanced or fast"):
+            RasterizeOptions(max_error=0.01, rule=rule)
+    g, cam = cloud(30, device=device), camera(dtype=torch.float32, device=device)
+    options = RasterizeOptions(max_error=1 / 255, background=torch.zeros(3, device=device))
+    for holder, name in ((g, "means"), (cam, "viewmat"), (options, "background")):
+        learned = dataclasses.replace(holder, **{name: getattr(holder, name).clone().requires_grad_()})
+        given = [learned if own is holder else own for own in (g, cam, options)]
+        with pytest.raises(UsageError, match=r"max_error renders without gradients: call rasterize under torch\.no_grad"):
+            rasterize(*given)
+        with torch.no_grad():
+            r = rasterize(*given)
+        assert not r.rgb.requires_grad and r.error_bound is not None
+    shown = RasterizeOptions().for_display(g)
+    assert shown.max_error == (1 / 255 if device.type == "cuda" else None)
+    none = Gaussians(**{n: t[:0] for n, t in g.tensors().items()})
+    r = rasterize(none, cam, dataclasses.replace(options, background=torch.ones(3, device=device)))
+    assert bool((r.rgb == 1).all()) and float(r.error_bound.max()) <= 1 / 255
+
+
+@pytest.mark.cuda
+def test_large_images_within_an_error():
+    """Tiles of 32 px, windows that cut them, a batch, and calls by graphs; alphas keep the bits of a stop that is as late."""
+    g = cloud(3000, device="cuda", seed=2)
+    cam = camera(2432, 1900, cameras=2, dtype=torch.float32, device="cuda")
+    behind = torch.tensor([[0.2, 1.5, 0.0], [1.0, 0.0, 0.7]], device="cuda")
+    for window in (None, (32, 64, 2368, 1824), (16, 48, 2400, 1824)):
+        options = RasterizeOptions(background=behind, window=window, record=False)
+        off, bound = off_and_bound(g, cam, options, 1 / 255)
+        assert float(off.max()) > 1e-3 and float(bound.max()) <= 1 / 255
+        eager = rasterize(g, cam, dataclasses.replace(options, max_error=1 / 255)).rgb
+        for _ in range(6):
+            graphed = rasterize(g, cam, dataclasses.replace(options, max_error=1 / 255, record=True))
+            assert torch.equal(graphed.rgb, eager) and torch.equal(graphed.error_bound, bound)
+            del graphed
 
 
 PAGE = ROOT / "docs" / "coming-from-gsplat.md"

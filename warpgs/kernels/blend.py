@@ -2,14 +2,16 @@
 
 import functools
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from types import SimpleNamespace
 
 import torch
 import warp as wp
 
+from warpgs.constants import LARGEST_HALF
 from warpgs.device import BINNING, BLENDING, FLOAT, LOSS, PROJECTION, SAMPLING, Needs, StepSizes
 from warpgs.kernels import blend_cpu, blend_cuda, launch
-from warpgs.kernels.falloff import COLORS, VALUES, WIDTHS, Pass
+from warpgs.kernels.falloff import COLORS, LARGEST_STOP, VALUES, WIDTHS, Pass
 from warpgs.kernels.graphs import TORCH, Allocator
 from warpgs.kernels.launch import first_order, keep, kept
 from warpgs.kernels.native import ROLLED
@@ -104,7 +106,10 @@ def composite(
 ) -> tuple[torch.Tensor, ...]:
     """Return rgb [C, H, W, D]; alpha, depth, transmittances, weights and ends [C, H, W]; and states. Nothing is checked."""
     # ``image`` may be a slice of the channels of an image; on CUDA in float32 it may have fewer than D channels: then only the
-    # first ones are written. Without ``save``, transmittances and weights may be empty.
+    # first ones are written. Without ``save``, transmittances and weights may be empty. With `Pass.max_error`: rgb, alpha,
+    # depth, and bounds of the error of rgb [C].
+    if settings.max_error and tiles.packed is None:
+        return _rounded(projected, tiles, backgrounds, settings)
     if is_native(projected):
         return blend_cuda.forward(projected, tiles, backgrounds, settings, save=save, allocator=allocator, image=image)
     real, device = launch.real_of(projected), projected.device
@@ -121,6 +126,24 @@ def composite(
     kernel = blend_cpu.make_kernels(real, tiles.size, channels).forward
     launch.launch(kernel, len(tiles.ranges), inputs, device, cost=10_000, block_dim=32)
     return rgb, alpha, depth, transmittances, weights, ends, allocator.saved((0,), projected.dtype, device)
+
+
+def _rounded(projected: torch.Tensor, tiles: Tiles, backgrounds: torch.Tensor, settings: Pass) -> tuple[torch.Tensor, ...]:
+    """Return what blend_forward.cu does of packed Gaussians, with its roundings and, over all cameras, its lowest stop."""
+    rounded, rule = projected.clone(), settings.rule
+    colors, depths = rounded[..., GEOMETRY : GEOMETRY + COLORS], rounded[..., GEOMETRY + COLORS]
+    most = float(colors.amax()) if colors.numel() else 0.0
+    colors.copy_(colors.clamp_max(LARGEST_HALF).half())
+    depths.copy_(depths.bfloat16())
+    low, high = backgrounds.clamp_max(0), backgrounds.clamp_min(most)
+    spread, behind, reach = (high - low).amax(1) / 2, (low + high) / 2, torch.maximum(high, -low).amax(1)
+    errors = (settings.rounding() if most <= LARGEST_HALF else 1.0) * reach + 3e-8
+    stop = ((settings.max_error * 0.999 - errors) / spread).nan_to_num().amin().clamp_max(LARGEST_STOP)
+    stop = stop.clamp_min(4 * rule.transmittance_stop)
+    coarse = replace(settings, max_error=0.0, rule=replace(rule, transmittance_stop=float(stop)))
+    rgb, alpha, depth, left, *_ = composite(rounded, tiles, backgrounds, coarse, save=True)
+    rgb += ((behind - backgrounds)[:, None, None] * left[..., None]).where(left[..., None] < stop, 0.0)
+    return rgb, alpha, depth, (errors + stop * spread) * 1.001
 
 
 def composite_gradients(
@@ -175,6 +198,8 @@ class _Blend(torch.autograd.Function):
         if save:
             check_slots(tiles)
         rgb, alpha, depth, *rest = composite(projected, tiles, backgrounds, settings, save=save)
+        if settings.max_error:
+            return rgb, alpha, depth, *rest
         if save:
             # all as saved tensors, which are freed after the backward pass
             keep(ctx, projected, backgrounds, rgb, depth, *rest, *tiles.tensors())

@@ -11,13 +11,13 @@ from types import SimpleNamespace
 import torch
 import warp as wp
 
-from warpgs.constants import SMALLEST_WEIGHT, TILE_SIZE
+from warpgs.constants import LARGEST_HALF, SMALLEST_WEIGHT, TILE_SIZE
 from warpgs.device import FLOAT, StepSizes
 from warpgs.kernels import launch
-from warpgs.kernels.falloff import COLORS, Pass, make_struct
+from warpgs.kernels.falloff import COLORS, LARGEST_STOP, Pass, make_struct
 from warpgs.kernels.graphs import TORCH, Allocator
-from warpgs.kernels.native import cuda_kernel, source
-from warpgs.kernels.tiles import Tiles, grid
+from warpgs.kernels.native import SCALE, cuda_kernel, source
+from warpgs.kernels.tiles import RECORD_SIZE, Tiles, grid
 
 CHUNKS = (64, 128, 256)
 """Instances for one warp of the backward pass, multiples of 32. Small images use the first number, to have enough warps. Larger
@@ -32,6 +32,8 @@ WARPS = 2
 LARGE_GAUSSIAN = 8
 """Mean number of tiles per visible Gaussian at which a warp of the forward pass takes two blocks of pixels instead of one. This
 halves the instances that are loaded and tested; few instances touch only one block (docs/decisions/005-cuda-blending.md)."""
+LARGE_IMAGE, LARGE_TILE = 2**22, 32
+"""Pixels above which images with `Pass.max_error` have large tiles, and the side of these [px]."""
 RANKS = 33
 """Number of ranks of tiles; the rank of a tile is the number of bits of its list's length, 0 to 32."""
 ORDER_THREADS = 256
@@ -41,37 +43,37 @@ STRIDE = 12
 16-byte aligned. There are at most twelve sums: two along the rows of the factor, three for the factor, opacity, colour, depth,
 and two of magnitudes. Each further channel adds one."""
 
-# 2^-(e1^2 + e2^2) = exp(-|U d|^2 / 2) where e = SCALE U d
-SCALE = "0.84932180028801904272f"  # sqrt(log2(e) / 2)
-
 
 def _source(name: str, tile_size: int, channels: int, **numbers) -> str:
     """Return the CUDA text of one body."""
     more = channels - COLORS
-    numbers |= {"SIDE": tile_size, "SCALE": SCALE, "WARPS": WARPS}
-    numbers |= {"CHANNELS": channels, "STATE": STATE + more, "STRIDE": STRIDE + more}
-    numbers["SMALLEST_WEIGHT"] = f"{SMALLEST_WEIGHT}f"
-    return source(f"blend_{name}.cu", **numbers)
+    shared = {"SIDE": tile_size, "SCALE": SCALE, "WARPS": WARPS}
+    shared |= {"CHANNELS": channels, "STATE": STATE + more, "STRIDE": STRIDE + more}
+    shared["SMALLEST_WEIGHT"] = f"{SMALLEST_WEIGHT}f"
+    return source(f"blend_{name}.cu", **shared | numbers)
 
 
 @functools.cache
-def make_forward(tile_size: int, save: bool, per: int, channels: int = COLORS):
+def make_forward(tile_size: int, save: bool, per: int, channels: int = COLORS, packed: bool = False):
     """Make the compositing kernel; a warp composites ``per`` blocks of 8 x 4 px, 1 or 2, which does not change the image."""
     # Images and projected Gaussians are flat arrays. Arrays with a row per instance have two axes, since a flat one could be
     # too long for 32-bit sizes.
     Blending = make_struct(wp.float32)
 
-    module = f"warpgs.kernels.blend_cuda.forward.{tile_size}.{int(save)}.{per}.{channels}"
+    numbers = {"SAVE": str(save).lower(), "PER": per, "PACKED": str(packed).lower()}
+    numbers |= {"LARGEST_HALF": f"{LARGEST_HALF}f", "LARGEST_STOP": f"{LARGEST_STOP}f"}
+    numbers |= {"STRIDE": RECORD_SIZE} if packed else {}
+    module = f"warpgs.kernels.blend_cuda.forward.{tile_size}.{int(save)}.{per}.{channels}{'.packed' * packed}"
 
-    @cuda_kernel(_source("forward", tile_size, channels, SAVE=str(save).lower(), PER=per), "wp.tid() // 32", module)
+    @cuda_kernel(_source("forward", tile_size, channels, **numbers), "wp.tid() // 32", module)
     def forward(
         item: int, settings: Blending, chunk: int, projected: wp.array(dtype=float), counts: wp.array(dtype=int),
         order: wp.array(dtype=int), ranges: wp.array(dtype=int), gaussian_ids: wp.array(dtype=int),
-        backgrounds: wp.array(dtype=float),
+        backgrounds: wp.array(dtype=float), max_error: float, rounding: float,
         # outputs
         rgb: wp.array2d(dtype=float), alpha_out: wp.array(dtype=float), depth: wp.array(dtype=float),
         transmittances: wp.array(dtype=float), weights: wp.array(dtype=float), ends: wp.array(dtype=int),
-        states: wp.array2d(dtype=float),
+        states: wp.array2d(dtype=float), bounds: wp.array(dtype=float),
     ): ...  # fmt: skip
 
     return forward
@@ -173,6 +175,13 @@ def order_bytes(sizes: StepSizes) -> int:
     return FLOAT * RANKS * columns * rows
 
 
+def image_tile(settings: Pass) -> int:
+    """Return the side of the tiles [px] for an image with `Pass.max_error`: larger for large images, with fewer instances."""
+    x, y, width, height = settings.window
+    large = width * height > LARGE_IMAGE and x % LARGE_TILE == y % LARGE_TILE == 0
+    return LARGE_TILE if large else settings.tile_size
+
+
 def forward(
     projected: torch.Tensor,
     tiles: Tiles,
@@ -184,12 +193,13 @@ def forward(
     image: torch.Tensor | None = None,
 ) -> tuple[torch.Tensor, ...]:
     """Return what `blend.composite` returns; states [S, P] have a row for each chunk of instances."""
-    device, channels = projected.device, backgrounds.shape[1]
+    device, channels, packed = projected.device, backgrounds.shape[1], tiles.packed is not None
     shape = (backgrounds.shape[0], *settings.window[:1:-1])
     rgb = allocator.output((*shape, channels), torch.float32, device) if image is None else image
     alpha, depth = (allocator.output(shape, torch.float32, device) for _ in range(2))
     transmittances, weights = allocator.saved((2, *(shape if save else (0,))), torch.float32, device).unbind()
-    ends = allocator.saved(shape, torch.int32, device)
+    ends = allocator.saved((0,) if packed else shape, torch.int32, device)
+    bounds = allocator.output(shape[:1], torch.float32, device) if packed else weights
     pixels = tiles.size * tiles.size
     chunk = chunk_of(tiles.ranges.shape[0], settings.deterministic)
     rows, state = tiles.slots.shape[0] // chunk + 1 if save else 0, STATE + channels - COLORS
@@ -200,12 +210,14 @@ def forward(
     threads = -(-count // ORDER_THREADS) * ORDER_THREADS
     launch.launch(k.order_tiles, threads, [tiles.ranges, count, counts, order], device, block_dim=ORDER_THREADS)
     inputs = [
-        settings.struct(tiles.size, wp.float32), chunk, projected, counts, order, tiles.ranges, tiles.gaussian_ids, backgrounds,
-        rgb, alpha, depth, transmittances, weights, ends, states,
+        settings.struct(tiles.size, wp.float32), chunk, projected if tiles.packed is None else tiles.packed, counts, order,
+        tiles.ranges, tiles.gaussian_ids, backgrounds, settings.max_error, settings.rounding() if packed else 0.0,
+        rgb, alpha, depth, transmittances, weights, ends, states, bounds,
     ]  # fmt: skip
-    per = 2 if tiles.gaussian_ids.shape[0] >= LARGE_GAUSSIAN * tiles.visible else 1
-    launch.launch(make_forward(tiles.size, save, per, channels), count * pixels // per, inputs, device, block_dim=32 * WARPS)
-    return rgb, alpha, depth, transmittances, weights, ends, states
+    per = 2 if packed or tiles.gaussian_ids.shape[0] >= LARGE_GAUSSIAN * tiles.visible else 1
+    kernel = make_forward(tiles.size, save, per, channels, packed)
+    launch.launch(kernel, count * pixels // per, inputs, device, block_dim=32 * WARPS)
+    return (rgb, alpha, depth, bounds) if packed else (rgb, alpha, depth, transmittances, weights, ends, states)
 
 
 def backward(

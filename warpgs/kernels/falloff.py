@@ -1,6 +1,7 @@
 """What the blending kernels share: settings, the falloff of a Gaussian, batches and records."""
 
 import functools
+import math
 from dataclasses import dataclass
 from types import SimpleNamespace
 
@@ -60,6 +61,8 @@ class Pass:
     """True to sum gradients in a fixed order on every device."""
     absgrad: bool = False
     """True to sum magnitudes of the mean's gradient over pixels, too; the gradient of the box holds these sums."""
+    max_error: float = 0.0
+    """Largest error of a colour against the same pass with 0, in images without gradients; 0 for none."""
 
     def variant(self) -> tuple[str, str, bool, int]:
         """Return the settings that are compiled into the kernels of the projection."""
@@ -77,6 +80,15 @@ class Pass:
         found.inclusive, found.whole_tiles = int(rule.inclusive_stop), int(rule.square_sigma > 0)
         return found
 
+    def rounding(self) -> float:
+        """Return the largest error of a colour by rounding with ``max_error``, as a fraction of the largest colour behind."""
+        # of a half; of two sums over all layers in front of the stop, and at their ends; of weights (docs/numerics.md)
+        layers = 16 - math.log(self.rule.transmittance_stop) / self.rule.alpha_cut
+        return 2.0**-11 + (2 * layers + 4 / self.rule.alpha_cut) * 2.0**-24
+
+
+LARGEST_STOP = 0.5
+"""Largest transmittance at which a pixel is finished because of `Pass.max_error`."""
 
 STRIP = 8
 """Pixels of a row that are processed together. With more, the sums of a strip would not fit the 16 registers of AVX2."""

@@ -58,6 +58,9 @@ def cuda_kernel(text: str, item: str, module: str, **options: object) -> Callabl
     return make
 
 
+SCALE = "0.84932180028801904272f"
+"""Factor of CUDA text that takes U to units where the falloff is 2^-|U d|^2: sqrt(log2(e) / 2)."""
+
 _MACHINE = wp.config.cpu_compiler_flags or "-march=native"
 # Align the stack to cache lines: else every access of 64 bytes to a local vector touches two lines.
 _STACK = "-mstackrealign -mstack-alignment=64"

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 import warp as wp
 
-from warpgs.constants import TILE_SIZE
+from warpgs.constants import LARGEST_HALF, TILE_SIZE
 from warpgs.device import (
     BINNING,
     BLENDING,
@@ -26,7 +26,7 @@ from warpgs.kernels import launch
 from warpgs.kernels.ellipse import make_spans
 from warpgs.kernels.graphs import TORCH, Allocator
 from warpgs.kernels.launch import sort_pairs
-from warpgs.kernels.native import EXACT
+from warpgs.kernels.native import EXACT, SCALE, source
 from warpgs.kernels.native import make_functions as make_native
 from warpgs.kernels.project_cpu import LANES
 
@@ -102,10 +102,11 @@ def make_write(slotted: bool):
 
 
 @functools.cache
-def make_emit(real, slotted: bool):
+def make_emit(real, slotted: bool, ranked: bool = False):
     """Make the kernel for CUDA that writes the instances of each Gaussian, row by row of tiles (for a CPU: `make_emit_cpu`)."""
     # A warp shares the rows and then the tiles of its 32 Gaussians evenly among its lanes. Unused slots get the tile
-    # ``no_tile``. Without ``slotted``, the number of the Gaussian takes the place of the slot.
+    # ``no_tile``. Without ``slotted``, the number of the Gaussian takes the place of the slot. With ``ranked``, its place in
+    # the order of depth does, and ``owners`` are `Tiles.packed`.
     s = make_spans(real)
     vec3 = wp.types.vector(3, real)
     vec2i = s.vec2i
@@ -123,7 +124,10 @@ def make_emit(real, slotted: bool):
             projected[i, 0], projected[i, 1], factor, reach, projected[i, 10], projected[i, 11], row, origin_x, width, tile_size
         )
 
-    module = f"warpgs.kernels.tiles.emit.{real.__name__}.{int(slotted)}"
+    @wp.func_native(source("blend_pack.cu", SCALE=SCALE, LARGEST_HALF=f"{LARGEST_HALF}f"))
+    def pack(j: int, i: int, count: int, projected: wp.array2d(dtype=real), records: wp.array(dtype=int)): ...
+
+    module = f"warpgs.kernels.tiles.emit.{real.__name__}.{int(slotted)}{'.ranked' * ranked}"
 
     # five blocks to a multiprocessor
     @wp.kernel(enable_backward=False, grid_stride=False, cuda_max_registers=48, module=module)
@@ -153,7 +157,10 @@ def make_emit(real, slotted: bool):
                 tile_counts[i] = touched
             end = int(last_slot)
             slot = end - touched
-            starts[i] = slot
+            if wp.static(not ranked):
+                starts[i] = slot
+        if wp.static(ranked):
+            pack(j, i, count, projected, owners)
         rows = vec2i(0, 0)
         if touched > 0:
             rows = s.tile_rows(projected[i, 1], projected[i, 11], origin_y, height, tile_size)
@@ -185,6 +192,8 @@ def make_emit(real, slotted: bool):
                 to = done + lane + lanes.broadcast(to_slot, at)
                 key = done + lane + lanes.broadcast(to_key, at)
                 owner_of = lanes.broadcast(g, at)
+                if wp.static(ranked):
+                    owner_of = j - lane + lanes.broadcast(owner, at)
                 if to < lanes.broadcast(limit, at) and done + lane < tile_count:
                     write(to, key, owner_of, keys, slots, owners)
                 done += 32
@@ -449,6 +458,8 @@ def split_sum(total: int, count: int) -> tuple[int, int]:
     return divmod(total, 2 ** sum_bits(count))
 
 
+RECORD_SIZE = 8
+"""Number of floats of a packed Gaussian, see `Tiles.packed`."""
 LIST_BYTES = 20
 """Bytes of an instance while the lists are made: two sort buffers of (key, slot), and the Gaussian number."""
 BYTES_PER_INSTANCE = LIST_BYTES + 48 + 80
@@ -484,6 +495,9 @@ class Tiles:
     """Actual number of instances, int64, shape [1], for kernels; with a capacity, M is the capacity."""
     visible: int = 0
     """Number of Gaussians that have instances; with a capacity, an upper bound."""
+    packed: torch.Tensor | None = None
+    """With `Pass.max_error` on CUDA in float32: records of the visible Gaussians in order of depth (blend_pack.cu), float32,
+    shape [8 V + 8]; the last one starts with the largest colour. ``gaussian_ids`` are then places in this order."""
 
     def tensors(self) -> tuple[torch.Tensor, ...]:
         """Return all tensors [...], in the order of the constructor."""
@@ -606,7 +620,9 @@ def bin_tiles(
         launch.launch(make_kernels(real, native).ordered_counts, visible, [order, counts, ends], device)
         ends = torch.cumsum(ends, 0, out=ends) if visible > 0 else ends.zero_()
         starts, keys, slots = (allocator.saved((n,), torch.int32, device) for n in (len(counts), 2 * total, 2 * total))
-        owners = allocator.workspace((total if slotted else 0,), torch.int32, device)
+        packs = settings.max_error > 0 and native and real is wp.float32 and not slotted
+        owned = (visible + 1) * RECORD_SIZE if packs else total if slotted else 0
+        owners = allocator.workspace((owned,), torch.int32, device)
         if memory.capacity is not None and not native:  # the CUDA kernel fills the unused capacity
             keys[:total].fill_(no_tile)
         overflow = starts if memory.capacity is None else memory.overflow
@@ -614,10 +630,12 @@ def bin_tiles(
             projected, order, counts, ends, visible, per_camera, *origin, width, height, tile_size, rule.alpha_cut,
             rule.square_sigma, columns, columns * rows, no_tile, total, starts, keys, slots, owners, overflow,
         ]  # fmt: skip
-        emit, threads, cost = make_emit_cpu, -(-visible // LANES), 10 * LANES
+        if packs:
+            owners[-RECORD_SIZE:].zero_()
         if native:
-            emit, threads, cost = make_emit, -(-visible // 256) * 256, 10
-        launch.launch(emit(real, slotted), threads, inputs, device, cost=cost)
+            launch.launch(make_emit(real, slotted, packs), -(-visible // 256) * 256, inputs, device)
+        else:
+            launch.launch(make_emit_cpu(real, slotted), -(-visible // LANES), inputs, device, cost=10 * LANES)
         if listed is not None:
             own, kept = keys[:total], torch.cat([listed, listed.new_zeros(1)])
             own.masked_fill_(~kept[own.long()], no_tile)
@@ -625,5 +643,5 @@ def bin_tiles(
         ids = slots[total:] if slotted else slots[:total]  # the second half of the buffers is free again
         inputs = [keys, slots, owners, total, no_tile, ids, ranges]
         launch.launch(make_find_ranges(slotted, native), -(-total // EACH) if native else total, inputs, device)
-    own_slots = slots[: total if slotted else 0]
-    return Tiles(tile_size, ranges, ids, own_slots, starts, counts, keys[:total], ends[-1:], visible)
+    own_slots, packed = slots[: total if slotted else 0], owners.view(torch.float32) if packs else None
+    return Tiles(tile_size, ranges, ids, own_slots, starts, counts, keys[:total], ends[-1:], visible, packed)

@@ -8,10 +8,9 @@ import warp as wp
 
 from warpgs.kernels import blend_cuda, launch
 from warpgs.kernels.blend import check_slots, composite, is_native, make_segments
-from warpgs.kernels.blend_cuda import SCALE
 from warpgs.kernels.ellipse import PROJECTED_SIZE
 from warpgs.kernels.falloff import STRIP, Pass, make_functions, make_struct
-from warpgs.kernels.native import ROLLED, cuda_kernel, source
+from warpgs.kernels.native import ROLLED, SCALE, cuda_kernel, source
 from warpgs.kernels.tiles import Tiles
 
 # These are separate passes, so that `blend` does not become slower. Alpha comes from the same operations as in `blend`, so that

@@ -1,7 +1,9 @@
 """Options of the rasterizer."""
 
+import math
 from dataclasses import dataclass, replace
 from numbers import Real
+from typing import Self
 
 import numpy as np
 import torch
@@ -11,18 +13,27 @@ from warpgs.errors import UsageError, document_fields
 from warpgs.kernels.falloff import Pass
 from warpgs.kernels.tiles import MAX_INSTANCES
 from warpgs.render.compose import pass_of
-from warpgs.scene import Camera
+from warpgs.scene import Camera, RasterizedGaussians
 
 SWITCHES = ("contributions", "median_depth", "error_bound", "deterministic", "absgrad", "antialiased", "record")
 """Options that are True or False."""
 WHOLE_NUMBERS = ("sh_degree", "tile_size", "heaviest", "memory_budget", "capacity", "max_instances")
 """Options that are integers; all but ``tile_size`` and ``heaviest`` may be None."""
+BEYOND_IMAGES = (
+    "colors", "features", "contributions", "median_depth", "heaviest", "error_bound", "absgrad", "pixels", "max_instances",
+)  # fmt: skip
+"""Options that exclude ``max_error``."""
 TILE_SIZES = (8, 16)
 """Supported sides of a tile [px]."""
 
 
 def _is_whole(value: object) -> bool:
     return isinstance(value, (int, np.integer)) and not isinstance(value, bool)
+
+
+def _has_bound(rule: Rule) -> bool:
+    """Return whether ``max_error`` supports a rule. The stop of rule fast, 1e-3, keeps four times the stop below 1/255."""
+    return rule.inclusive_stop and rule.alpha_cut > 0 and 0 < rule.transmittance_stop <= 1e-3 and rule.square_sigma == 0
 
 
 @document_fields
@@ -64,6 +75,12 @@ class RasterizeOptions:
     """True to also bound the error of ``rgb`` against rule `exact`. The bound of a pixel is its difference from a float64
     render under `exact`, plus the rounding of float64. So the bound covers both cut-offs and float32 rounding. The float64
     render takes several times as long as one in float32 (docs/numerics.md). Not with ``capacity``."""
+    max_error: float | None = None
+    """Largest error of ``rgb`` against the same call without this option, such as 1/255, to save time on CUDA: colours are
+    rounded to 16 bits, and pixels finish at a higher transmittance. ``Render.error_bound`` is then a proven bound, one number
+    for all pixels of a camera (docs/numerics.md); it exceeds ``max_error`` only below 0.001 (balanced, fast: 0.003) times the
+    largest colour. Alpha and depth have no bound. Without gradients, for spherical harmonics, and for rules exact, balanced
+    and fast. None for no error."""
     memory_budget: int | None = None
     """Bytes that the (Gaussian, tile) instances may take at a time; None for four fifths of the free memory. With
     ``max_instances``, the chunks keep to both limits."""
@@ -139,9 +156,22 @@ class RasterizeOptions:
             raise UsageError(f"capacity must be at most {MAX_INSTANCES:,}, not {self.capacity:,}")
         if self.error_bound and self.capacity is not None:
             raise UsageError("error_bound and capacity exclude each other: leave one out")
+        if self.max_error is not None:
+            self._check_max_error()
         if self.feature_background is not None and self.features is None:
             raise UsageError("feature_background requires features: give features=..., or leave feature_background out")
         self.cut_offs()
+
+    def _check_max_error(self) -> None:
+        """Raise UsageError where ``max_error`` is no positive number, or goes with an option or a rule that has no bound."""
+        if isinstance(self.max_error, bool) or not isinstance(self.max_error, Real) or not 0 < self.max_error < math.inf:
+            raise UsageError(f"max_error must be a positive number, such as 1/255, not {self.max_error!r}")
+        for name in BEYOND_IMAGES:
+            value = getattr(self, name)
+            if value is not None and (isinstance(value, torch.Tensor) or value):
+                raise UsageError(f"max_error and {name} exclude each other: leave one out")
+        if not _has_bound(rule := self.cut_offs()):
+            raise UsageError(f"max_error does not support rule {rule.name}: choose exact, balanced or fast")
 
     def cut_offs(self) -> Rule:
         """Return the rule, with the near and the far plane of the options.
@@ -155,6 +185,11 @@ class RasterizeOptions:
         if not 0 <= near < far <= FAR:
             raise ValueError(f"near {near} and far {far} are not a range of depths: give 0 <= near < far <= {FAR:g}")
         return rule if (near, far) == (rule.near, rule.far) else replace(rule, near=near, far=far)
+
+    def for_display(self, gaussians: RasterizedGaussians) -> Self:
+        """Return the options for images of 8 bits that are only looked at: on CUDA with ``max_error`` of one level."""
+        fast = gaussians.means.is_cuda and gaussians.means.dtype == torch.float32 and _has_bound(self.cut_offs())
+        return replace(self, max_error=1 / 255) if fast else self
 
     def repeatable(self) -> bool:
         """Return whether calls with these options may be captured as CUDA graphs."""

@@ -15,6 +15,7 @@ from warpgs.constants import K_TOLERANCE, POSE_TOLERANCE
 from warpgs.device import available_bytes, installed_bytes
 from warpgs.errors import ResourceError, UsageError
 from warpgs.kernels import launch
+from warpgs.kernels.blend_cuda import image_tile
 from warpgs.kernels.cameras import check_camera
 from warpgs.kernels.ellipse import ProjectInputs
 from warpgs.kernels.falloff import WIDTHS, Pass
@@ -351,6 +352,12 @@ def _render(gaussians: RasterizedGaussians, camera: Camera, options: RasterizeOp
         raise UsageError(
             f"absgrad supports at most {WIDTHS[-1]} channels of colors, and no features: render more in a second call"
         )
+    if options.max_error is not None:
+        if compose.needs_slots(t for t in (*inputs, options.background) if isinstance(t, torch.Tensor)):
+            raise UsageError("max_error renders without gradients: call rasterize under torch.no_grad(), or leave it out")
+        settings = replace(settings, max_error=float(options.max_error))
+        if inputs.means.is_cuda and inputs.means.dtype == torch.float32:
+            settings = replace(settings, tile_size=image_tile(settings))
     if inputs.means.is_cuda and options.repeatable():
         backgrounds = None if options.background is None else _layer("background", options.background, None, inputs)[1]
         gradients = compose.needs_slots((*inputs, backgrounds))
@@ -433,7 +440,9 @@ def _as_render(
     if len(camera.viewmat.shape) == 2:  # not image[0], whose gradient would be a copy among zeros
         images = [image.squeeze(0) for image in images]
         maps = {name: values if name in WHOLE else values.squeeze(0) for name, values in maps.items()}
-    rgb, alpha, depth = images
+    rgb, alpha, depth, *bounds = images
+    if bounds:
+        maps["error_bound"] = bounds[0][..., None, None].expand_as(alpha)
     return Render(rgb, alpha, depth, projected, tile_counts, **maps)
 
 

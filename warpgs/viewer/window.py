@@ -174,6 +174,9 @@ class Maps:
         elif kind == ERROR and view is None:
             why = "the photographs cannot be read" if name else "step into a camera, by a click or by its name"
             kind, note = RENDER, f"the error map cannot be shown: {why}"
+        if kind == RENDER:
+            rgb = rasterize(gaussians, camera, options.for_display(gaussians)).rgb
+            return (255 * rgb.clamp(0, 1)).round().to(torch.uint8).cpu().numpy(), note
         r = rasterize(gaussians, camera if kind != ERROR or view is None else view.camera, options)
         colors = r.rgb.cpu().numpy()
         if kind == DEPTH:

@@ -120,7 +120,7 @@ while (top_instance > floor) {
                 Splat s;
                 s.load(projected.data, id);
                 s.rescale();
-                const float limit = limit_of(s.b.y, alpha_cut);
+                const float limit = limit_of(s.b.y, log_cut);
                 #pragma unroll
                 for (int k = 0; k < BLOCKS; ++k)
                     if (whole_tiles || s.touches(

@@ -290,9 +290,10 @@ def _frames(
     photographs, views = [model.cameras()[n] for n in model.train], coverage if isinstance(coverage, Sequence) else []
     cut_out, masks = any(v.alpha is not None for v in views), [v.mask for v in views] or None
     training = depth_views(gaussians, [v.camera for v in views] or photographs, options, masks) if coverage else None
+    shown = options if coverage else options.for_display(gaussians)  # coverage needs exact depths
     for camera in cameras:
         with torch.no_grad():
-            r = rasterize(gaussians, camera, options)
+            r = rasterize(gaussians, camera, shown)
         image, surface, covered = r.rgb.cpu().numpy(), torch.where(r.alpha >= MIN_ALPHA, r.depth, 0), None
         if training is not None:
             classes = classes_of(coverage_map(surface, camera, training)[0], (surface <= 0) & cut_out)
