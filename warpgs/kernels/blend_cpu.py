@@ -7,7 +7,7 @@ import warp as wp
 
 from warpgs.constants import SMALLEST_WEIGHT
 from warpgs.kernels.falloff import ABREAST, BATCH, COLORS, STRIP, TOGETHER, VALUES, make_batches, make_functions, make_records
-from warpgs.kernels.native import ROLLED
+from warpgs.kernels.native import ROLLED, make_prefetch
 
 # The backward blending kernel in plain Warp, one task per tile; used on the CPU, and for float64 on every device.
 #
@@ -25,6 +25,7 @@ def make_backward(real, tile_size: int, channels: int, absgrad: bool = False, de
     at, at_int = b.at, b.at_int
     count = VALUES + channels - COLORS + 2 * absgrad
     values, together_values = count, TOGETHER * count
+    prefetch, prefetch_slot = make_prefetch(b.record), make_prefetch(real, 2)
     stride, side, pixels_of_tile = tile_size * (tile_size + 1), tile_size, tile_size * tile_size
     strip, half, abreast = STRIP, STRIP // 2, ABREAST
     parts, strips = tile_size // STRIP, tile_size * (tile_size // STRIP)
@@ -283,7 +284,7 @@ def make_backward(real, tile_size: int, channels: int, absgrad: bool = False, de
         # outputs, zero on entry
         v_slots: wp.array2d(dtype=real),
     ):  # fmt: skip
-        tile = begin + wp.tid()
+        tile = ranges.shape[0] - 1 - begin - wp.tid()  # from the last on, as the instances
         place = f.place_of(tile, side, settings)
         left = settings.origin_x + place[1]
         top = settings.origin_y + place[2]
@@ -310,6 +311,10 @@ def make_backward(real, tile_size: int, channels: int, absgrad: bool = False, de
         )
         while last > first:
             count = wp.min(batch, last - first)
+            for earlier in range(wp.max(last - 2 * batch, 0), wp.max(last - batch, 0)):  # also of the next tile
+                prefetch(projected, gaussian_ids[earlier])
+            for k in range(count):
+                prefetch_slot(v_slots, slots[last - 1 - k])
             b.load(projected, gaussian_ids, last - 1, count, settings.whole_tiles, gaussians)
             b.find_rows(left, top, last - 1, count, until, gaussians)
             j = int(0)
@@ -356,6 +361,7 @@ def make_forward(real, tile_size: int, channels: int):
     batch_ints = wp.types.vector(FORWARD_BATCH, wp.int32)
     batch_strips = wp.types.vector(FORWARD_BATCH * STRIP, real)
     record = wp.types.vector(9 + channels, real)
+    prefetch = make_prefetch(record)
     # of several channels, one after the other
     tile_channels = wp.types.vector(channels * tile_size * (tile_size + 1), real)
     strip_channels = wp.types.vector(2 * channels * STRIP, real)
@@ -475,13 +481,8 @@ def make_forward(real, tile_size: int, channels: int):
         first = ranges[tile, 0]
         while first < last:
             count = wp.min(batch, last - first)
-            j = int(0)
-            while j < count:  # a loop of its own, so that many loads are under way at once
-                i = gaussian_ids[wp.max(first + j, 0)]
-                if f.never(i):
-                    break
-                mx[j & bits] = projected[i][0]
-                j += 1
+            for later in range(first + batch, wp.min(first + 2 * batch, gaussian_ids.shape[0])):  # also of the next tile
+                prefetch(projected, gaussian_ids[later])
             for j in range(batch):
                 limit[j] = real(-1.0)  # reaches nothing
             j = int(0)
@@ -489,6 +490,7 @@ def make_forward(real, tile_size: int, channels: int):
                 i = gaussian_ids[wp.max(first + j, 0)]
                 if f.never(i):
                     break
+                mx[j] = projected[i][0]
                 my[j] = projected[i][1]
                 u11[j] = projected[i][2]
                 u12[j] = projected[i][3]
