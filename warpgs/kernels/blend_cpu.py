@@ -26,6 +26,7 @@ def make_backward(real, tile_size: int, channels: int, absgrad: bool = False, de
     count = VALUES + channels - COLORS + 2 * absgrad
     values, together_values = count, TOGETHER * count
     prefetch, prefetch_slot = make_prefetch(b.record), make_prefetch(real, 2)
+    prefetch_end, prefetch_value = make_prefetch(wp.int32), make_prefetch(real)
     stride, side, pixels_of_tile = tile_size * (tile_size + 1), tile_size, tile_size * tile_size
     strip, half, abreast = STRIP, STRIP // 2, ABREAST
     parts, strips = tile_size // STRIP, tile_size * (tile_size // STRIP)
@@ -295,20 +296,17 @@ def make_backward(real, tile_size: int, channels: int, absgrad: bool = False, de
         shades = r.Shades()
         held = r.Held()
         first = ranges[tile, 0]
-        # One value of each cache line in a loop of its own, so that many loads are under way at once; this is overwritten.
-        corner = (place[0] * settings.height + place[2]) * settings.width + place[1]
-        across = wp.min(side, settings.width - place[1])
-        for row in range(side):
-            o = corner + wp.min(row, settings.height - place[2] - 1) * settings.width
-            if f.never(o):
-                break
-            until[row] = ends[o]
-            shades.w[row * (touches + 1) + touches] = transmittances[o]
-            for part in range(touches):
-                shades.w[row * (touches + 1) + part] = v_rgb[(o + wp.min(part * apart, across - 1)) * pitch]
         last = load_pixels(
             place, settings, backgrounds, transmittances, weights, depth, ends, v_rgb, pitch, v_alpha, v_depth, pixels, until
         )
+        # the pixels of the next tile
+        behind = f.place_of(wp.max(tile - 1, 0), side, settings)
+        for row in range(side):
+            o = (behind[0] * settings.height + behind[2] + row) * settings.width + behind[1]
+            prefetch_end(ends, o)
+            prefetch_value(transmittances, o)
+            for part in range(touches):
+                prefetch_value(v_rgb, (o + part * apart) * pitch)
         while last > first:
             count = wp.min(batch, last - first)
             for earlier in range(wp.max(last - 2 * batch, 0), wp.max(last - batch, 0)):  # also of the next tile
