@@ -536,7 +536,7 @@ EVENT_TIMES = 1.0, 0.8
 SWEPT_VIEWS = 30
 """Views whose pixels, over the area of a merged cell, give about the number of first points; more add no points."""
 FIRST_LOOK = 0.1
-"""Upper bound of the time limit on a CPU for each of ``max_steps`` [s]: one minute for the 600 of preset `quick`."""
+"""Upper bound of the time limit on a CPU for each of ``max_steps`` [s]: half a minute for the 300 of preset `quick`."""
 ONE_LAYER = 1.1
 """Time of a step on a CPU with one layer of Gaussians, relative to a step with two layers, where there are fewer Gaussians."""
 MEANS_LR, SH_LR, CPU_RATES, CPU_RATES_VIEWS = 1.6e-4, 2.5e-3, 2.5, 9
