@@ -309,15 +309,13 @@ def make_backward(real, tile_size: int, channels: int, absgrad: bool = False, de
                 prefetch_value(v_rgb, (o + part * apart) * pitch)
         while last > first:
             count = wp.min(batch, last - first)
-            for earlier in range(wp.max(last - 2 * batch, 0), wp.max(last - batch, 0)):  # also of the next tile
-                prefetch(projected, gaussian_ids[earlier])
-            for k in range(count):
-                prefetch_slot(v_slots, slots[last - 1 - k])
             b.load(projected, gaussian_ids, last - 1, count, settings.whole_tiles, gaussians)
             b.find_rows(left, top, last - 1, count, until, gaussians)
             j = int(0)
             while j < count:
                 last -= 1
+                prefetch(projected, gaussian_ids[wp.max(last - batch, 0)])  # also those of the next tile
+                prefetch_slot(v_slots, slots[wp.max(last - together, 0)])
                 b.find_row_values(j & bits, top, gaussians, rows)
                 walk(j & bits, last, left, settings, gaussians, rows, pixels, shades)
                 # Apart from the walk, since both together would need more than 16 registers.
@@ -479,8 +477,6 @@ def make_forward(real, tile_size: int, channels: int):
         first = ranges[tile, 0]
         while first < last:
             count = wp.min(batch, last - first)
-            for later in range(first + batch, wp.min(first + 2 * batch, gaussian_ids.shape[0])):  # also of the next tile
-                prefetch(projected, gaussian_ids[later])
             for j in range(batch):
                 limit[j] = real(-1.0)  # reaches nothing
             j = int(0)
@@ -511,6 +507,9 @@ def make_forward(real, tile_size: int, channels: int):
             left_open = int(0)
             for row in range(side):
                 y = real(settings.origin_y + top + row) + real(0.5)
+                for k in range(batch // side):  # of the next batch, or of the next tile
+                    later = first + batch + row * (batch // side) + k
+                    prefetch(projected, gaussian_ids[wp.min(later, gaussian_ids.shape[0] - 1)])
                 group = int(0)
                 while group < count:
                     o = group & bits
