@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import errno
 import functools
 import os
@@ -35,6 +36,19 @@ def usable_cores() -> int:
         return len(os.sched_getaffinity(0)) or 1  # missing on macOS and Windows
     except (AttributeError, OSError):
         return os.cpu_count() or 1
+
+
+MMAP_THRESHOLD, TRIM_THRESHOLD = 2**26, 2**28
+"""Size from which glibc maps an allocation by itself, and free memory at the end of its heap that it keeps [bytes]."""
+
+
+@functools.cache
+def keep_freed_memory() -> None:
+    """Let glibc keep the memory that a step frees: the next step would map, and clear, the same pages again."""
+    with contextlib.suppress(AttributeError, OSError, TypeError):  # no glibc
+        mallopt = ctypes.CDLL(None).mallopt
+        if mallopt(-3, MMAP_THRESHOLD):  # older ones refuse this size; the trim threshold alone would map every tensor
+            mallopt(-1, TRIM_THRESHOLD)
 
 
 MAX_THREADS = 8
