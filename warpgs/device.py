@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import errno
 import functools
 import importlib.util
@@ -43,8 +44,6 @@ def wake_gpu() -> None:
     """Start the driver of the first CUDA device in a thread, if torch can use it: that takes most of a second."""
 
     def wake() -> None:
-        import ctypes
-
         folders = getattr(importlib.util.find_spec("torch"), "submodule_search_locations", ())
         with contextlib.suppress(OSError, AttributeError):  # what fails here fails in torch again, which says it
             if any(path.match("*torch_cuda*") for folder in folders for path in Path(folder, "lib").iterdir()):
@@ -53,6 +52,19 @@ def wake_gpu() -> None:
                     driver.cuDevicePrimaryCtxRetain(ctypes.byref(ctypes.c_void_p()), 0)
 
     threading.Thread(target=wake, name="driver").start()
+
+
+MMAP_THRESHOLD, TRIM_THRESHOLD = 2**26, 2**28
+"""Size from which glibc maps an allocation by itself, and free memory at the end of its heap that it keeps [bytes]."""
+
+
+@functools.cache
+def keep_freed_memory() -> None:
+    """Let glibc keep the memory that a step frees: the next step would map, and clear, the same pages again."""
+    with contextlib.suppress(AttributeError, OSError, TypeError):  # no glibc
+        mallopt = ctypes.CDLL(None).mallopt
+        if mallopt(-3, MMAP_THRESHOLD):  # older ones refuse this size; the trim threshold alone would map every tensor
+            mallopt(-1, TRIM_THRESHOLD)
 
 
 MAX_THREADS = 8

@@ -4,7 +4,8 @@ OLD and NEW are folders of the two checkouts; each has its own kernel cache, fil
 given twice, with the same flags, is measured alone. SCENES are folders, FOLDER@SPLIT for different splits, or with --data named
 rows: those of bench/lib/scenes.py, and ``fern:3:film`` and ``fox:30``, which begin with photographs without cameras. With
 several sets of --cores, one scene runs on each set at the same time. The order of the checkouts changes from round to round.
-Wall time is measured from the start to the end of the process; no run has poses, priors or a run folder of an earlier one.
+Wall time is measured from the start to the end of the process, processor time with one set of --cores; no run has poses, priors
+or a run folder of an earlier one.
 """
 
 from __future__ import annotations
@@ -66,19 +67,20 @@ def compile_kernels(checkout: Path, env: dict[str, str]) -> None:
 
 
 def timed(words: list[str], checkout: Path, env: dict[str, str], out: Path, film: bool = False) -> dict:
-    """Run a fit, and make a film of it; return the wall time [s] and the figures of metrics.json."""
-    began, device = time.perf_counter(), words[words.index("--device") :][:2]
+    """Run a fit, and make a film of it; return its times [s] and the figures of metrics.json."""
+    began, used, device = time.perf_counter(), os.times(), words[words.index("--device") :][:2]
     for command in (words, *([[*words[: words.index("fit")], "render", str(out), *device]] if film else [])):
         done = subprocess.run(command, cwd=checkout, env=env, capture_output=True, text=True, check=False)
         if done.returncode:
             raise RuntimeError(f"{shlex.join(command)} in {checkout} ended with {done.returncode}:\n{done.stderr[-2000:]}")
-    wall = time.perf_counter() - began
+    wall, now = time.perf_counter() - began, os.times()
+    processor = now.children_user + now.children_system - used.children_user - used.children_system
     m = json.loads((out / "metrics.json").read_text("utf-8"))
     seconds = {k: m["seconds"][k] for k in ("setup", "training", "total")}
     seconds["compiling"] = m["seconds"].get("compiling", 0.0)
     psnr = (m["test"] or m["train"])["psnr"]
     figures = {"steps": m["steps"], "psnr": psnr, "gaussians": m["gaussians"]}
-    return {"wall": wall, **seconds, **figures, "sections": m.get("wall_seconds", {})}
+    return {"wall": wall, "processor": processor, **seconds, **figures, "sections": m.get("wall_seconds", {})}
 
 
 def sections(rows: list[dict]) -> str:
@@ -88,7 +90,8 @@ def sections(rows: list[dict]) -> str:
     order = list(dict.fromkeys(n for r in rows for n in r["sections"] if n not in ("other", "total")))
     names = [*order, "other", "total"]
     lines = [[n, *(f"{statistics.median(r['sections'].get(n, 0.0) for r in own[c]):.2f}" for c in columns)] for n in names]
-    lines.append(["shell to prompt", *(f"{statistics.median(r['wall'] for r in own[c]):.2f}" for c in columns)])
+    for name, kind in (("shell to prompt", "wall"), ("processor time", "processor")):
+        lines.append([name, *(f"{statistics.median(r[kind] for r in own[c]):.2f}" for c in columns)])
     return markdown(["section [s], median", *map(" ".join, columns)], lines)
 
 

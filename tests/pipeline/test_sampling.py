@@ -231,6 +231,8 @@ def test_gaussians_that_no_view_shows_are_removed(monkeypatch):
     assert [s for s in range(41) if fit.strategy.prunes(s)] == [28]
     resets = dataclasses.replace(CONFIG, density=dataclasses.replace(CONFIG.density, reset_every=3))
     assert not any(fitted(resets, 0).strategy.prunes(s) for s in range(41))  # after a reset nothing is seen
+    monkeypatch.setattr(sampling, "PRUNE_LEAST", 14)
+    assert not any(fit.strategy.prunes(s) for s in range(41))
 
 
 def test_full_fine_layer_frees_its_least_contributors():

@@ -14,7 +14,7 @@ from warpgs.kernels import blend_cpu, blend_cuda, launch
 from warpgs.kernels.falloff import COLORS, LARGEST_STOP, VALUES, WIDTHS, Pass
 from warpgs.kernels.graphs import TORCH, Allocator
 from warpgs.kernels.launch import first_order, keep, kept
-from warpgs.kernels.native import ROLLED
+from warpgs.kernels.native import ROLLED, make_prefetch
 from warpgs.kernels.tiles import Tiles
 
 
@@ -42,8 +42,7 @@ def make_segments(real, values: int = VALUES, width: int = 9 + COLORS):
     """Make the kernels that sum gradient slots of ``values`` numbers, always in slot order, into rows of ``width`` numbers."""
     reals = wp.types.vector(values, real)
     record = wp.types.vector(width, real)
-    lane_reals = wp.types.vector(SUMMED * values, real)
-    count = values
+    prefetch = make_prefetch(reals)
     lanes = SUMMED
 
     @wp.kernel(enable_backward=False, module="unique", module_options=ROLLED)
@@ -54,19 +53,15 @@ def make_segments(real, values: int = VALUES, width: int = 9 + COLORS):
     ):  # fmt: skip
         first = (begin + wp.tid()) * lanes
         used = wp.min(lanes, starts.shape[0] - first)
-        totals = lane_reals()
-        for lane in range(lanes):  # the first slots in a loop of their own, so that many loads are under way at once
-            if lane < used and counts[first + lane] > 0:
-                v = v_slots[starts[first + lane]]
-                for k in range(wp.static(values)):
-                    totals[lane * count + k] = v[k]
+        for later in range(first + 2 * lanes, wp.min(first + 3 * lanes, starts.shape[0])):
+            if counts[later] > 0:  # without slots, starts are undefined
+                prefetch(v_slots, starts[later])
+                prefetch(v_slots, starts[later] + counts[later] - 1)
         for lane in range(used):
             i = first + lane
             total = record()
-            for k in range(wp.static(values)):
-                total[k] = totals[lane * count + k]
-            for later in range(1, counts[i]):  # without slots, starts are undefined
-                v = v_slots[starts[i] + later]
+            for slot in range(starts[i], starts[i] + counts[i]):
+                v = v_slots[slot]
                 for k in range(wp.static(values)):
                     total[k] += v[k]
             v_projected[i] = total

@@ -7,7 +7,7 @@ import warp as wp
 
 from warpgs.constants import SMALLEST_WEIGHT
 from warpgs.kernels.falloff import ABREAST, BATCH, COLORS, STRIP, TOGETHER, VALUES, make_batches, make_functions, make_records
-from warpgs.kernels.native import ROLLED
+from warpgs.kernels.native import ROLLED, make_prefetch
 
 # The backward blending kernel in plain Warp, one task per tile; used on the CPU, and for float64 on every device.
 #
@@ -25,6 +25,8 @@ def make_backward(real, tile_size: int, channels: int, absgrad: bool = False, de
     at, at_int = b.at, b.at_int
     count = VALUES + channels - COLORS + 2 * absgrad
     values, together_values = count, TOGETHER * count
+    prefetch, prefetch_slot = make_prefetch(b.record), make_prefetch(real, 2)
+    prefetch_end, prefetch_value = make_prefetch(wp.int32), make_prefetch(real)
     stride, side, pixels_of_tile = tile_size * (tile_size + 1), tile_size, tile_size * tile_size
     strip, half, abreast = STRIP, STRIP // 2, ABREAST
     parts, strips = tile_size // STRIP, tile_size * (tile_size // STRIP)
@@ -283,7 +285,7 @@ def make_backward(real, tile_size: int, channels: int, absgrad: bool = False, de
         # outputs, zero on entry
         v_slots: wp.array2d(dtype=real),
     ):  # fmt: skip
-        tile = begin + wp.tid()
+        tile = ranges.shape[0] - 1 - begin - wp.tid()  # from the last on, as the instances
         place = f.place_of(tile, side, settings)
         left = settings.origin_x + place[1]
         top = settings.origin_y + place[2]
@@ -294,20 +296,17 @@ def make_backward(real, tile_size: int, channels: int, absgrad: bool = False, de
         shades = r.Shades()
         held = r.Held()
         first = ranges[tile, 0]
-        # One value of each cache line in a loop of its own, so that many loads are under way at once; this is overwritten.
-        corner = (place[0] * settings.height + place[2]) * settings.width + place[1]
-        across = wp.min(side, settings.width - place[1])
-        for row in range(side):
-            o = corner + wp.min(row, settings.height - place[2] - 1) * settings.width
-            if f.never(o):
-                break
-            until[row] = ends[o]
-            shades.w[row * (touches + 1) + touches] = transmittances[o]
-            for part in range(touches):
-                shades.w[row * (touches + 1) + part] = v_rgb[(o + wp.min(part * apart, across - 1)) * pitch]
         last = load_pixels(
             place, settings, backgrounds, transmittances, weights, depth, ends, v_rgb, pitch, v_alpha, v_depth, pixels, until
         )
+        # the pixels of the next tile
+        behind = f.place_of(wp.max(tile - 1, 0), side, settings)
+        for row in range(side):
+            o = (behind[0] * settings.height + behind[2] + row) * settings.width + behind[1]
+            prefetch_end(ends, o)
+            prefetch_value(transmittances, o)
+            for part in range(touches):
+                prefetch_value(v_rgb, (o + part * apart) * pitch)
         while last > first:
             count = wp.min(batch, last - first)
             b.load(projected, gaussian_ids, last - 1, count, settings.whole_tiles, gaussians)
@@ -315,6 +314,8 @@ def make_backward(real, tile_size: int, channels: int, absgrad: bool = False, de
             j = int(0)
             while j < count:
                 last -= 1
+                prefetch(projected, gaussian_ids[wp.max(last - batch, 0)])  # also those of the next tile
+                prefetch_slot(v_slots, slots[wp.max(last - together, 0)])
                 b.find_row_values(j & bits, top, gaussians, rows)
                 walk(j & bits, last, left, settings, gaussians, rows, pixels, shades)
                 # Apart from the walk, since both together would need more than 16 registers.
@@ -356,6 +357,7 @@ def make_forward(real, tile_size: int, channels: int):
     batch_ints = wp.types.vector(FORWARD_BATCH, wp.int32)
     batch_strips = wp.types.vector(FORWARD_BATCH * STRIP, real)
     record = wp.types.vector(9 + channels, real)
+    prefetch = make_prefetch(record)
     # of several channels, one after the other
     tile_channels = wp.types.vector(channels * tile_size * (tile_size + 1), real)
     strip_channels = wp.types.vector(2 * channels * STRIP, real)
@@ -475,13 +477,6 @@ def make_forward(real, tile_size: int, channels: int):
         first = ranges[tile, 0]
         while first < last:
             count = wp.min(batch, last - first)
-            j = int(0)
-            while j < count:  # a loop of its own, so that many loads are under way at once
-                i = gaussian_ids[wp.max(first + j, 0)]
-                if f.never(i):
-                    break
-                mx[j & bits] = projected[i][0]
-                j += 1
             for j in range(batch):
                 limit[j] = real(-1.0)  # reaches nothing
             j = int(0)
@@ -489,6 +484,7 @@ def make_forward(real, tile_size: int, channels: int):
                 i = gaussian_ids[wp.max(first + j, 0)]
                 if f.never(i):
                     break
+                mx[j] = projected[i][0]
                 my[j] = projected[i][1]
                 u11[j] = projected[i][2]
                 u12[j] = projected[i][3]
@@ -511,6 +507,9 @@ def make_forward(real, tile_size: int, channels: int):
             left_open = int(0)
             for row in range(side):
                 y = real(settings.origin_y + top + row) + real(0.5)
+                for k in range(batch // side):  # of the next batch, or of the next tile
+                    later = first + batch + row * (batch // side) + k
+                    prefetch(projected, gaussian_ids[wp.min(later, gaussian_ids.shape[0] - 1)])
                 group = int(0)
                 while group < count:
                     o = group & bits

@@ -269,17 +269,11 @@ def make_batches(real, tile_size: int, channels: int):
     ):  # fmt: skip
         """Load the Gaussians of ``count`` instances, from the last on backwards."""
         j = int(0)
-        while j < count:  # a loop of its own, so that many loads are under way at once
-            i = gaussian_ids[wp.max(last - j, 0)]
-            if f.never(i):
-                break
-            b.x[j & bits] = projected[i][0]
-            j += 1
-        j = int(0)
         while j < count:
             i = gaussian_ids[wp.max(last - j, 0)]
             if f.never(i):
                 break
+            b.x[j & bits] = projected[i][0]
             b.y[j & bits] = projected[i][1]
             b.u11[j & bits] = projected[i][2]
             b.u12[j & bits] = projected[i][3]

@@ -124,6 +124,17 @@ def make_functions():
 
 
 @functools.cache
+def make_prefetch(kind: type, axes: int = 1):
+    """Make the function that asks for a row of an array before it is read, so that a CPU does not wait for it."""
+
+    @wp.func_native(source("native_prefetch.cu"))
+    def prefetch(rows: wp.array(dtype=kind, ndim=axes), i: int):
+        """Load row i into the cache; i may be outside the array. Does nothing on CUDA."""
+
+    return prefetch
+
+
+@functools.cache
 def make_color(bases: int):
     """Make the functions on colours, for CUDA and float32, and for a number of basis values (`sh.bases_for`)."""
     values = wp.types.vector(bases, wp.float32)

@@ -203,14 +203,16 @@ def make_forward(real, camera_model: str, parameters: str, antialiased: bool, ba
             i = camera * count + n
             color = vec3(real(0.5), real(0.5), real(0.5))
             if tiles[lane] > 0:
-                large = int(0)
+                largest = vec3()
                 k = int(0)
                 while k < sh_count:
                     coefficient = coefficients[wp.max(n, 0), wp.max(k, 0)]
                     color += values[wp.max(k, 0) * LANES + lane] * coefficient
-                    large += wp.where(wp.max(wp.abs(coefficient)) <= real(LARGEST_COEFFICIENT), 0, 1)
+                    for channel in range(3):  # a NaN makes the colour one
+                        size = wp.abs(coefficient[channel])
+                        largest[channel] = wp.where(largest[channel] < size, size, largest[channel])
                     k += 1
-                if not (m.finite3(color) and large == 0):
+                if not (m.finite3(color) and wp.max(largest) <= real(LARGEST_COEFFICIENT)):
                     tiles[lane] = 0
             tile_counts[i] = tiles[lane]
             if tiles[lane] > 0:

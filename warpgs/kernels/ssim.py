@@ -10,7 +10,7 @@ import warp as wp
 from warpgs.device import FLOAT, StepSizes
 from warpgs.kernels import launch
 from warpgs.kernels.launch import first_order, keep, kept
-from warpgs.kernels.native import ROLLED, cuda_kernel, source
+from warpgs.kernels.native import ROLLED, cuda_kernel, make_prefetch, source
 
 RADIUS = 5
 """Half size of the window [px]."""
@@ -118,6 +118,7 @@ def make_kernels(real, summed: bool):
     vec11i = wp.types.vector(TAPS, wp.int32)
     values = wp.types.vector(LANES, real)
     several = wp.types.vector(5 * LANES, real)
+    prefetch = make_prefetch(real)
     kernel = functools.partial(wp.kernel, enable_backward=False, module="unique", module_options=ROLLED)
 
     @wp.func
@@ -189,6 +190,8 @@ def make_kernels(real, summed: bool):
             w = taps_of(y, height)
             for step in range((columns + LANES - 1) // LANES):
                 x = wp.min(step * LANES, columns - LANES)
+                prefetch(a, o[10] + columns + x)  # of the row that the next window adds: too many streams for the processor
+                prefetch(b, o[10] + columns + x)
                 for lane in range(LANES):
                     put(down_pairs(a, b, o, w, x, lane), lane, sums)
                 for k in range(5):
@@ -244,6 +247,9 @@ def make_kernels(real, summed: bool):
             w = taps_of(y, height)
             for step in range((columns + LANES - 1) // LANES):
                 x = wp.min(step * LANES, columns - LANES)
+                prefetch(by_mean, o[10] + columns + x)
+                prefetch(by_variance, o[10] + columns + x)
+                prefetch(by_gap, o[10] + columns + x)
                 for lane in range(LANES):
                     sums[lane] = down(by_mean, o, w, x, lane)
                     sums[LANES + lane] = down(by_variance, o, w, x, lane)

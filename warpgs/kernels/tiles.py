@@ -26,7 +26,7 @@ from warpgs.kernels import launch
 from warpgs.kernels.ellipse import make_spans
 from warpgs.kernels.graphs import TORCH, Allocator
 from warpgs.kernels.launch import sort_pairs
-from warpgs.kernels.native import EXACT, SCALE, source
+from warpgs.kernels.native import EXACT, SCALE, make_prefetch, source
 from warpgs.kernels.native import make_functions as make_native
 from warpgs.kernels.project_cpu import LANES
 
@@ -40,6 +40,7 @@ def make_find_ranges(slotted: bool, native: bool):
     # A thread's instances lie far apart, so that neighbouring threads read neighbouring instances.
     each = EACH if native else 1
     ints = wp.types.vector(each, wp.int32)
+    prefetch = make_prefetch(wp.int32)
     module = f"warpgs.kernels.tiles.ranges.{int(slotted)}.{int(native)}"
 
     @wp.kernel(enable_backward=False, grid_stride=False, module=module)
@@ -51,6 +52,8 @@ def make_find_ranges(slotted: bool, native: bool):
     ):  # fmt: skip
         first = begin + wp.tid()
         apart = (count + each - 1) // each
+        if wp.static(slotted and not native):
+            prefetch(owners, slots[wp.min(first + 64, count - 1)])
         tile = ints()
         before = ints()
         after = ints()
@@ -229,7 +232,7 @@ def make_emit_cpu(real, slotted: bool):
     lane_reals = wp.types.vector(LANES, real)
     lane_ints = wp.types.vector(LANES, wp.int32)
     lanes = LANES
-    write = make_write(slotted)
+    write, prefetch, prefetch_count = make_write(slotted), make_prefetch(real, 2), make_prefetch(wp.int32)
 
     @wp.kernel(enable_backward=False, module="unique", module_options=EXACT)
     def emit(
@@ -243,6 +246,9 @@ def make_emit_cpu(real, slotted: bool):
     ):  # fmt: skip
         first = (begin + wp.tid()) * lanes
         used = wp.min(lanes, count - first)
+        for later in range(first + 2 * lanes, wp.min(first + 3 * lanes, count)):
+            prefetch(projected, order[later])
+            prefetch_count(tile_counts, order[later])
         corner = (origin_y // tile_size) * columns + origin_x // tile_size  # rows and columns count from the image's corner
         owner = lane_ints()
         first_tile = lane_ints()

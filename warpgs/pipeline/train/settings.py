@@ -31,7 +31,7 @@ from warpgs.pipeline.train.schedule import OptimizerConfig, PhaseConfig, color_o
 from warpgs.pipeline.train.stopping import StoppingConfig
 from warpgs.pipeline.train.strategies.base import STRATEGIES, Settings, find_strategy
 from warpgs.pipeline.train.strategies.clone_split import DensityConfig
-from warpgs.pipeline.train.strategies.sampling import MAX_VIEWS, MAX_WEIGHED, MethodConfig
+from warpgs.pipeline.train.strategies.sampling import MAX_VIEWS, MAX_WEIGHED, MethodConfig, removals
 from warpgs.pipeline.train.view_modules import VIEW_MODULES, ViewModule
 from warpgs.plugins import Registry, flag_group, own_code
 from warpgs.priors.views import PriorConfig
@@ -528,15 +528,16 @@ CPU_PIXELS = 1.55e6
 times as many pixels."""
 CPU_SECONDS = 45.0, 4.0, 1200.0
 """Default time limit of a fit on a CPU [s]: constant part, part for each view, and upper bound of the sum."""
-CPU_TIMES = 8e-8, 3.6e-7, 1.4e-8
+CPU_TIMES = 6.8e-8, 3.1e-7, 1.2e-8
 """Time of a step on two idle cores of 2.5 GHz: for a pixel, for a Gaussian, and for each coefficient of the harmonics of a
 Gaussian [s]. Measured as processor time over two threads (docs/decisions/025-time-on-a-cpu.md)."""
-EVENT_TIMES = 1.0, 0.8
-"""Time of a sampling event, in steps: for each view that is sampled, and for each view that ranks Gaussians for eviction."""
+EVENT_TIMES = 1.0, 0.8, 2.6
+"""Time of an event, in steps: for each view that is sampled, for each view that ranks Gaussians for eviction, and for each view
+that shows which Gaussians to remove."""
 SWEPT_VIEWS = 30
 """Views whose pixels, over the area of a merged cell, give about the number of first points; more add no points."""
 FIRST_LOOK = 0.1
-"""Upper bound of the time limit on a CPU for each of ``max_steps`` [s]: one minute for the 600 of preset `quick`."""
+"""Upper bound of the time limit on a CPU for each of ``max_steps`` [s]: half a minute for the 300 of preset `quick`."""
 ONE_LAYER = 1.1
 """Time of a step on a CPU with one layer of Gaussians, relative to a step with two layers, where there are fewer Gaussians."""
 MEANS_LR, SH_LR, CPU_RATES, CPU_RATES_VIEWS = 1.6e-4, 2.5e-3, 2.5, 9
@@ -562,8 +563,9 @@ def step_times(config: FitConfig, views: int, pixels: float, start: int, done: i
     assert config.steps is not None and config.half_resolution is not None  # `settings_by_views` has chosen
     assert config.sh_degree is not None
     (of_pixel, of_gaussian, of_coefficient), sampler, steps = CPU_TIMES, config.method.sampler, np.arange(1, config.steps + 1)
-    events = np.array(plan_phases(config.phases, config.steps).events if find_strategy(config.strategy).samples else [])
-    due = (events[:, None] == steps).any(0)
+    phases, samples = plan_phases(config.phases, config.steps), find_strategy(config.strategy).samples
+    due = np.isin(steps, phases.events) & samples
+    removed = np.isin(steps, list(removals(phases, views))) & samples
     added = sampler.fraction * pixels * min(views, MAX_VIEWS)
     wanted = start + added * np.cumsum(due & (steps > done))
     most = max(start, min(config.max_gaussians, (1 + sampler.max_fraction) * start))
@@ -571,6 +573,7 @@ def step_times(config: FitConfig, views: int, pixels: float, start: int, done: i
     full = of_pixel * pixels + (of_gaussian + of_coefficient * (config.sh_degree + 1) ** 2) * counts
     half = 0.75 * of_pixel * pixels * (steps <= config.half_resolution * config.steps)
     events_in_steps = due * (EVENT_TIMES[0] * min(views, MAX_VIEWS) + EVENT_TIMES[1] * weighed)
+    events_in_steps += removed * (EVENT_TIMES[2] * views)
     return config.batch * (full - half) + events_in_steps * full, counts
 
 

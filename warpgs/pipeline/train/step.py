@@ -7,7 +7,7 @@ from typing import Any
 
 import torch
 
-from warpgs.device import available_bytes
+from warpgs.device import available_bytes, keep_freed_memory
 from warpgs.errors import ResourceError
 from warpgs.kernels.graphs import CapturedGraph, GraphMemory
 from warpgs.kernels.tiles import BYTES_PER_INSTANCE, MAX_INSTANCES, InstanceMemory
@@ -210,6 +210,7 @@ class StepTaker:
         self.options, self.dropout_seed, device = options, dropout_seed, table.device
         self.buffers = StepBuffers(device, 3 * (len(table.params) + len(views.table.params)))
         self.cuda = device.type == "cuda"
+        keep_freed_memory()
         if self.cuda:
             self.stream = torch.cuda.Stream(device)
             """Stream of captures, always the same one: torch reuses freed memory only on the stream that used it before."""

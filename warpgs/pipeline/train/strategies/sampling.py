@@ -14,6 +14,7 @@ from warpgs.geometry import back_project_tensors, logit
 from warpgs.kernels.update import Setting
 from warpgs.pipeline.model.edit import SEEN, coverage
 from warpgs.pipeline.model.table import Column, DensityUpdate
+from warpgs.pipeline.train.schedule import Phases
 from warpgs.pipeline.train.strategies.base import Growth, Strategy, StrategyContext, register
 from warpgs.pipeline.train.strategies.clone_split import GradientGrowth
 from warpgs.pipeline.train.views import TrainingView, half_size_camera
@@ -37,10 +38,21 @@ OPACITY = 0.1
 PROTECTED_STEPS, PROTECTED_OPACITY = 500, 0.05
 """Age up to which a sampled Gaussian is protected [steps] (T_protect, five densification intervals), and its smallest opacity
 (alpha_minimum, ten times the pruning threshold). The paper gives neither value."""
-PRUNE_EVERY, PRUNE_VIEWS, PRUNE_LATE = 500, 40, (0, 1 / 4, 5 / 8)
+PRUNE_EVERY, PRUNE_VIEWS, PRUNE_LEAST, PRUNE_LATE = 500, 40, 10, (0, 1 / 4, 5 / 8)
 """Steps between removals of unseen Gaussians while the set grows: at most a tenth of the fit, but at least the second number
-for each view, since a removal renders all of them. And times of the last removals as fractions of phase 3, all before the steps
+for each view, since a removal renders all of them. Fewest steps for each view of a fit with any removal, which takes as long as
+2.6 steps for each view. And times of the last removals as fractions of phase 3, all before the steps
 over which parameters are averaged."""
+
+
+def removals(p: Phases, views: int) -> set[int]:
+    """Return the numbers of steps done when Gaussians that none of some views shows are removed."""
+    most = p.planned // (PRUNE_VIEWS * max(1, views)) or int(p.planned >= PRUNE_LEAST * views)
+    late = {p.stable_start + int(part * (p.steps - p.stable_start)) for part in PRUNE_LATE[:most]}
+    every = max(1, min(PRUNE_EVERY, p.planned // 10), PRUNE_VIEWS * views)
+    return {s for s in range(every, p.stable_start, every) if s > p.refine} | {s for s in late if s < p.steps}
+
+
 COARSE_LR_FACTOR = 0.1
 """Factor on the learning rate of the coarse layer's means from phase 2 on, with two layers."""
 
@@ -354,14 +366,9 @@ class Sampling(Strategy):
 
     def prunes(self, step: int) -> bool:
         """Return whether unseen Gaussians are removed after a step."""
-        p = self.context.phases
-        most = p.planned // (PRUNE_VIEWS * max(1, len(self.context.views)))
-        late = [p.stable_start + int(part * (p.steps - p.stable_start)) for part in PRUNE_LATE[: most or 1]]
-        every = max(1, min(PRUNE_EVERY, p.planned // 10), PRUNE_VIEWS * len(self.context.views))
-        grows = p.refine < step < p.stable_start
-        due = (grows and step % every == 0) or (step in late and step < p.steps)
         # after opacities were reset, no view shows any Gaussian
-        return self.prunes_unseen and not self.gradients.config.reset_every and due
+        possible = self.prunes_unseen and not self.gradients.config.reset_every
+        return possible and step in removals(self.context.phases, len(self.context.views))
 
     def prune(self, step: int) -> Iterator[DensityUpdate]:
         """Remove the Gaussians whose blending weight is below `SEEN` in all training views, but no protected ones."""
