@@ -62,7 +62,7 @@ def small_kernels() -> SimpleNamespace:
         Splat s;
         s.load(projected.data, i);
         s.rescale();
-        return s.touches(corners.data[2 * i], corners.data[2 * i + 1], limit_of(s.b.y, cut));
+        return s.touches(corners.data[2 * i], corners.data[2 * i + 1], limit_of(s.b.y, __log2f(cut)));
         """
     )
     def touches(projected: wp.array(dtype=float), corners: wp.array(dtype=float), cut: float, i: int) -> int: ...
