@@ -216,6 +216,7 @@ ELSEWHERE = {
     ("report/images.py", "save"): "Pillow, into memory",
     ("report/film.py", "save"): "the same",
     ("export/sog.py", "save"): "the same",
+    ("export/meshes_and_cameras.py", "save"): "the same",
     ("poses/photographs.py", "save"): "the same",
     ("folders.py", "open wb"): "the temporary file of `writing`",
     ("files.py", "open ab"): "a file that grows by lines: metrics.jsonl, the log of a job",

@@ -51,7 +51,7 @@ def wake_gpu() -> None:
                 if driver.cuInit(0) == 0:  # 0 is the first device, too; torch and Warp share its primary context
                     driver.cuDevicePrimaryCtxRetain(ctypes.byref(ctypes.c_void_p()), 0)
 
-    threading.Thread(target=wake, name="driver").start()
+    threading.Thread(target=wake, name="driver", daemon=True).start()
 
 
 MMAP_THRESHOLD, TRIM_THRESHOLD = 2**26, 2**28

@@ -471,8 +471,10 @@ def python_lines(module: str, *arguments: str, folder: Path, environment: dict[s
         worker.end(0)
 
 
-def run_program(program: str, *options: str, stdin: str, timeout: float, hidden: str) -> tuple[int, str, str]:
-    """Run a program that starts this package elsewhere, and return its outcome."""
+def run_program(
+    program: str, *options: str, stdin: str = "", timeout: float, hidden: tuple[str, ...] = ()
+) -> tuple[int, str, str]:
+    """Run another program without the variables of ``hidden`` beginnings, and return its exit code, stdout and stderr."""
     environment = {k: v for k, v in _environment(None).items() if not k.startswith(hidden)}
     try:
         done = subprocess.run(
@@ -482,6 +484,13 @@ def run_program(program: str, *options: str, stdin: str, timeout: float, hidden:
     except (OSError, subprocess.TimeoutExpired) as e:
         return 1, "", str(e)
     return done.returncode, done.stdout, done.stderr
+
+
+def fed_program(*words: str, folder: str) -> tuple[Callable[[Any], object], Callable[[], object]]:
+    """Start a program in a folder; return the function that writes to its stdin, and the one that ends it there."""
+    process = subprocess.Popen(words, stdin=subprocess.PIPE, cwd=folder)
+    assert process.stdin is not None
+    return process.stdin.write, process.communicate
 
 
 LAST_BYTES = 10_000

@@ -22,7 +22,6 @@ from warpgs.kernels import launch, native
 from warpgs.kernels.graphs import ALIGNMENT, TORCH, Arena, CapturedGraph, SizingAllocator, fetch, part
 from warpgs.kernels.neighbours import mean_square_distances
 from warpgs.kernels.update import Setting, opacity_dropout
-from warpgs.pipeline.run.precompile import compile_free
 from warpgs.render.rasterize import rasterize
 from warpgs.scene import Gaussians
 
@@ -547,9 +546,9 @@ import warp
 def refuse(*_, **__): raise AssertionError("compiled a second time")
 warp._src.build.build_cpu = refuse
 lock = load_module.lock_descriptor
-def note(descriptor, blocking):
+def note(descriptor):
     print("waits", flush=True)
-    return lock(descriptor, blocking=blocking)
+    lock(descriptor)
 load_module.lock_descriptor = note
 seen = torch.zeros(3, dtype=torch.int32)
 launch.launch(load_module_mark, 3, [seen], torch.device("cpu"))
@@ -683,25 +682,27 @@ def test_modules_that_the_cache_lacks_load_ahead(cache, monkeypatch):
     assert [e.split()[1] for e in loads if e.endswith("compile")] == ["first", "second", "third"]
 
 
-def test_a_module_that_another_compiles_is_left_to_it(cache, monkeypatch, device):
-    """Else it is compiled, under the name and for the blocks of the launch that loads it; not after the stop."""
-    target, module, block = launch.warp_device(device), load_module_mark.module, 1 if device == CPU else 64
-    monkeypatch.setitem(module.options, "block_dim", module.options["block_dim"])
-    name = native.module_name(module, block)
-    with native.exclusive(native.lock_of(name, target)):
-        compile_free([(load_module_mark, block)], target, lambda: False)
-    compile_free([(load_module_mark, block)], target, lambda: True)
-    assert not native.is_cached(name)
-    compile_free([(load_module_mark, block)], target, lambda: False)
-    assert native.is_cached(name)
-    monkeypatch.setattr(wp._src.build, f"build_{target.alias.partition(':')[0]}", None)
+def test_after_an_error_none_waits_for_a_module(cache, monkeypatch):
+    """Not the block for the module at hand, and no thread for one that was not begun: it loads that itself."""
+    events, cpu = [], wp.get_device("cpu")
+    begun, asked, ended = (threading.Event() for _ in range(3))
+    monkeypatch.setattr(native, "usable_cores", lambda: 2)
     monkeypatch.setattr(native, "_LOADED", set())
-    module.unload()
-    assert native.load_module(module, target, block) is not None
+    steps = {"first": lambda: begun.set() or ended.wait(20), "second": lambda: "loaded"}
+    modules = {name: Later(name, "flags", events, step) for name, step in steps.items()}
+    (cache / "locks").mkdir(parents=True)
+    with ThreadPoolExecutor(1) as other, native.told_of_compiling(lambda name: asked.set()):
+        with pytest.raises(KeyboardInterrupt), native.loaded_ahead([(m, 1) for m in modules.values()], cpu):
+            launched = other.submit(native.load_module, modules["second"], cpu, 1)
+            assert begun.wait(20) and asked.wait(20)
+            raise KeyboardInterrupt
+        assert launched.result(20) == "loaded" and not native._AHEAD
+        ended.set()
+    assert next(e for e in events if e.startswith("load second")).startswith("load second in ThreadPoolExecutor")
 
 
 def test_a_lock_that_is_not_supported_is_no_obstacle_and_one_without_a_file_has_a_remedy(tmp_path, monkeypatch):
-    def refuse(_, blocking):
+    def refuse(_):
         raise OSError(95, "not supported")
 
     monkeypatch.setattr(native, "lock_descriptor", refuse)

@@ -1,6 +1,5 @@
 """Where fits start: points from confirmed depth and where no view looks, and kernels compiled beforehand."""
 
-import contextlib
 import dataclasses
 
 import numpy as np
@@ -349,32 +348,6 @@ def test_a_fit_launches_nothing_else(device, strategy, recorded, monkeypatch):
     score(views[1], render_view(fit.gaussians, views[1], RasterizeOptions())[0])
     warmed = {(kind, k.module, block) for kind in ("cpu", "cuda") for k, block in fit_kernels(kind == "cuda")}
     assert len(launched) > 8 and launched <= warmed and {1, 32, 64, 128, 256} <= {block for _, _, block in warmed}
-
-
-@pytest.mark.parametrize("refused", [False, True])
-def test_processes_compile_for_cuda_during_a_fit(tmp_path, monkeypatch, refused):
-    """Half as many as cores, for the fit's device and cache; they end with it. Without them the fit goes on."""
-    calls = []
-
-    class Worker:
-        def __init__(self, module, *arguments, environment):
-            calls.append((module, *arguments, environment))
-            if refused:
-                raise OSError("too many processes")
-
-        def end(self, seconds):
-            calls.append("end")
-
-    monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path / "version"))
-    monkeypatch.setattr(precompile, "fit_kernels", lambda cuda: [(nothing, 1)] * 9)
-    monkeypatch.setattr(precompile, "PythonWorker", Worker)
-    monkeypatch.setattr(precompile, "usable_cores", lambda: 5)
-    monkeypatch.setattr(precompile, "loaded_ahead", lambda modules, device: contextlib.nullcontext(calls.append(device.alias)))
-    monkeypatch.setattr(interop, "warp_device", lambda device: wp.get_device("cpu"))
-    with pytest.raises(KeyboardInterrupt), precompile.compiled_ahead(torch.device("cuda", 0)):
-        raise KeyboardInterrupt
-    started = (precompile.__name__, "cpu", {"WARP_CACHE_PATH": str(tmp_path)})
-    assert calls == ([started, "cpu"] if refused else [started, started, "cpu", "end", "end"])
 
 
 @pytest.mark.slow

@@ -186,7 +186,7 @@ def main(arguments: list[str] | None = None) -> int:
             if e.code or not (code := exit_code(0)):
                 raise
             raise SystemExit(code) from e
-    if arguments is None and words[:1] == ["fit"]:
+    if arguments is None and words[:1] == ["fit"] and sys.getprofile() is sys.gettrace() is None:  # which report at the end
         process.leave(code)
     return code
 
@@ -216,7 +216,11 @@ def _run(arguments: list[str]) -> int:
         with waiting() as wait:
             if not ASKING & {*arguments} and os.environ.get("RANK", "0") == "0":  # until the command reports its own progress
                 wait(f"starting {name}")
-                if name == "fit" and "torch" not in sys.modules and not any(a.startswith("--device") for a in arguments):
+                if (
+                    name == "fit"
+                    and "torch" not in sys.modules
+                    and not any(a.startswith(("--device", "--resume")) for a in arguments)
+                ):
                     wake_gpu()
             own = name in OWN_FILES
             with process.fast_imports():

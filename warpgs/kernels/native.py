@@ -8,8 +8,9 @@ import math
 import re
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor, wait
+from concurrent.futures import CancelledError, Future, wait
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -223,7 +224,8 @@ def load_module(module: wp.Module, device: wp.Device, block_dim: int):
         if ahead is not None and not ahead.done():
             for listener, _ in _LISTENERS:
                 listener(module_name(module, block_dim))
-            wait([ahead])
+            with contextlib.suppress(CancelledError):
+                ahead.exception()
         return _load(module, device, block_dim)  # raises an error of the thread, too
 
 
@@ -266,34 +268,46 @@ PER_FLAGS = 4
 def loaded_ahead(modules: Iterable[tuple[wp.Module, int]], device: wp.Device) -> Iterator[None]:
     """Compile and load modules that the cache lacks in threads during the block, in this order, each for a size of blocks.
 
-    `load_module` waits for such a module and raises its error. A module that is not begun when the block ends is left out.
+    `load_module` waits for such a module and raises its error. A module that is not begun when the block ends is left out, and
+    after an error none is waited for.
     """
     # Names are computed before any module is compiled: Warp's hash of a module depends on which modules were compiled before
     # it in the process, and another process would not find it in the cache.
     missing = [(m, block) for m, block in modules if not is_cached(module_name(m, block))]
-    threads, pools, keys = max(1, min(PER_FLAGS, usable_cores() // 2)), dict[str, ThreadPoolExecutor](), []
+    made: dict[tuple[wp.Module, object, int], Future[object]] = {(m, device.context, block): Future() for m, block in missing}
+    waiting: dict[str, deque[tuple[wp.Module, int]]] = {}
+    for module, block in missing:
+        waiting.setdefault(module.options["cpu_compiler_flags"], deque()).append((module, block))
+
+    def work(jobs: deque[tuple[wp.Module, int]]) -> None:
+        while True:
+            try:
+                module, block = jobs.popleft()
+            except IndexError:
+                return
+            future = made[module, device.context, block]
+            if future.set_running_or_notify_cancel():
+                try:
+                    future.set_result(_load(module, device, block, False))
+                except BaseException as e:  # the launch that needs the module tries again, and raises it
+                    future.set_exception(e)
+
+    _AHEAD.update(made)
     try:
-        for module, block in missing:
-            flags = module.options["cpu_compiler_flags"]
-            pool = pools.get(flags) or pools.setdefault(flags, ThreadPoolExecutor(threads, thread_name_prefix="compile"))
-            keys.append((module, device.context, block))
-            _AHEAD[keys[-1]] = pool.submit(_load, module, device, block, False)
+        for jobs in waiting.values():
+            for _ in range(min(PER_FLAGS, max(1, usable_cores() // 2), len(jobs))):
+                threading.Thread(target=work, args=(jobs,), name="compile", daemon=True).start()
         yield
+        wait([future for future in made.values() if not future.cancel()])
     finally:
-        for pool in pools.values():
-            pool.shutdown(wait=False, cancel_futures=True)
-        for pool in pools.values():
-            pool.shutdown()
-        for key in keys:
-            _AHEAD.pop(key, None)
+        for key, future in made.items():
+            future.cancel()
+            del _AHEAD[key]
 
 
 @contextlib.contextmanager
-def exclusive(path: Path, blocking: bool = True) -> Iterator[bool]:
-    """Lock a file, which is made if missing, so that one thread of one process at a time runs the body.
-
-    Yields True; without ``blocking`` False, and at once, where another has locked the file.
-    """
+def exclusive(path: Path) -> Iterator[None]:
+    """Lock a file, which is made if missing, so that one thread of one process at a time runs the body."""
     # The system releases the lock when its process ends, even if killed. On a file system without locks the body runs unlocked:
     # Warp renames a compiled module into place, so two processes that compile it only lose time.
     try:
@@ -301,9 +315,7 @@ def exclusive(path: Path, blocking: bool = True) -> Iterator[bool]:
     except OSError as e:
         raise ResourceError(f"{path}: cannot be opened ({e.strerror or e}). {REMEDY}") from e
     with file, contextlib.ExitStack() as held:
-        free = True
         with contextlib.suppress(OSError):
-            free = lock_descriptor(file.fileno(), blocking=blocking)
-            if free:
-                held.callback(unlock_descriptor, file.fileno())
-        yield free
+            lock_descriptor(file.fileno())
+            held.callback(unlock_descriptor, file.fileno())
+        yield

@@ -14,6 +14,7 @@ import warp as wp
 
 from warpgs.kernels import launch
 from warpgs.kernels.launch import first_order, keep, kept
+from warpgs.kernels.native import EXACT
 
 MIN_ALPHA = 0.3
 """Opacity above which the depth of a pixel is used."""
@@ -27,7 +28,8 @@ def make_kernels(real):
     vec2 = wp.types.vector(2, real)
     Reals, Pairs = (wp.array(dtype=kind) for kind in (real, vec2))
     least_alpha, bound = real(MIN_ALPHA), real(BOUND)
-    options = {"enable_backward": False, "module": "unique", "module_options": {"fuse_fp": False}}
+    flags = {"fuse_fp": False, "cpu_compiler_flags": EXACT["cpu_compiler_flags"]}
+    options = {"enable_backward": False, "module": "unique", "module_options": flags}
 
     @wp.func
     def place(i: int, width: int, count: int, axis: int) -> wp.vec3i:

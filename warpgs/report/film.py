@@ -5,7 +5,6 @@ import functools
 import io
 import os
 import shutil
-import subprocess
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
@@ -13,7 +12,7 @@ import numpy as np
 
 from warpgs.errors import DataError, ResourceError, UsageError
 from warpgs.files import replacing, write_bytes
-from warpgs.process import hidden_stderr, utf8_name
+from warpgs.process import fed_program, hidden_stderr, run_program, utf8_name
 
 ANIMATIONS = (".webp", ".gif")
 MAX_BYTES = 2**30
@@ -120,12 +119,8 @@ def h264_encoder() -> str | None:
     program = shutil.which("ffmpeg")
     if program is None or Path(program).resolve().parent == Path.cwd().resolve():  # no file of the current folder is run
         return None
-    probe = [program, "-v", "quiet", "-f", "lavfi", "-i", "color=s=64x64:d=0.1", "-c:v", "h264", "-f", "null", "-"]
-    try:
-        found = subprocess.run(probe, stdin=subprocess.DEVNULL, check=False, timeout=20).returncode == 0
-    except (OSError, subprocess.SubprocessError):
-        return None
-    return program if found else None
+    probe = "-v quiet -f lavfi -i color=s=64x64:d=0.1 -c:v h264 -f null -"
+    return program if run_program(program, *probe.split(), timeout=20)[0] == 0 else None
 
 
 Writer = tuple[Callable[[np.ndarray], object], Callable[[], object]]
@@ -141,10 +136,7 @@ def _writer(path: Path, temporary: str, fps: int, size: tuple[int, int]) -> Writ
         colors = "scale=out_color_matrix=bt709:out_range=tv,setparams=colorspace=bt709:color_primaries=bt709:color_trc=bt709"
         codec = ["-vf", colors, "-c:v", "h264", "-pix_fmt", "yuv420p", "-movflags", "+faststart"]
         folder, name = os.path.split(temporary)  # the folder may be a descriptor of this process
-        words = [program, "-v", "quiet", "-y", *given, *codec, name]
-        process = subprocess.Popen(words, stdin=subprocess.PIPE, cwd=folder)
-        assert process.stdin is not None
-        return process.stdin.write, process.communicate
+        return fed_program(program, "-v", "quiet", "-y", *given, *codec, name, folder=folder)
     # for .webm OpenCV warns on stderr of an unknown tag, but writes VP9
     with hidden_stderr() if path.suffix.lower() == ".webm" else contextlib.nullcontext():
         writer = cv2.VideoWriter(temporary, cv2.VideoWriter_fourcc(*"vp09"), fps, size)

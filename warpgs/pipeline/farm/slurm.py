@@ -134,7 +134,7 @@ class SlurmEngine:
 
 def _call(program: str, *options: str, script: str = "") -> tuple[int, str, str]:
     """Call a command of Slurm. Variables such as SBATCH_ACCOUNT apply, but those of squeue do not: they could hide jobs."""
-    return run_program(program, *options, stdin=script, timeout=PATIENCE, hidden="SQUEUE_")
+    return run_program(program, *options, stdin=script, timeout=PATIENCE, hidden=("SQUEUE_",))
 
 
 def _last_line(text: str) -> str:

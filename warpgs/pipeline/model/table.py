@@ -220,6 +220,8 @@ class Table:
                 the set grows beyond ``capacity``.
         """
         self._check(update, capacity)
+        if self.count > MOST_WITH_ROOM:  # else both sets would be held until `settle`
+            self._memory = {}
         added, keep, parents = update.added, update.keep, update.parents.to(self.device)
         if not added and not len(parents):
             added = {n: t.detach()[:0] for n, t in self.params.items()}
@@ -295,6 +297,7 @@ class Table:
         They stay while the rows fit. Spare rows have opacity 0, so no step changes them. Only a table that `settles` is moved.
         """
         if not self.settles:
+            self._memory, self.room = {}, 0
             return False
         new = not self._memory or not self.room >= self.count >= LEAST_FILLED * self.room
         memory, self._memory = self._memory, {}

@@ -1,18 +1,15 @@
 """Compile the kernels that a fit uses before it needs them, several modules at a time, into Warp's cache."""
 
 import contextlib
-import os
-import sys
-import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import torch
 import warp as wp
 
 from warpgs.constants import TILE_SIZE
-from warpgs.device import format_bytes, usable_cores
+from warpgs.device import format_bytes
 from warpgs.kernels import (
     blend,
     blend_cpu,
@@ -31,9 +28,9 @@ from warpgs.kernels import (
     walk,
 )
 from warpgs.kernels.falloff import COLORS, VALUES
-from warpgs.kernels.native import BLOCK, exclusive, is_cached, load_module, loaded_ahead, lock_of, module_name
+from warpgs.kernels.native import BLOCK, load_module, loaded_ahead
 from warpgs.pipeline.train.strategies import mcmc
-from warpgs.process import PythonWorker, say
+from warpgs.process import say
 
 THREADS = 256
 """Default number of threads of a block."""
@@ -87,47 +84,17 @@ def scoring() -> wp.Kernel:
     return kernel
 
 
-PROCESSES = 4
-"""Most processes that compile for CUDA beside a fit."""
-LAST_MODULE = 60.0
-"""Time for such a process to finish its module [s]."""
-
-
 @contextlib.contextmanager
 def compiled_ahead(device: torch.device) -> Iterator[list[tuple[wp.Kernel, int]]]:
-    """Compile modules of a fit that the cache lacks during the block, in threads or for CUDA in processes; yield `fit_kernels`.
+    """Compile modules for the CPU that a fit needs and the cache lacks in threads during the block; yield `fit_kernels`.
 
     A launch that needs a module waits for it or compiles it, and raises its error.
     """
-    kernels, target = fit_kernels(device.type == "cuda"), launch.warp_device(device)
-    if device.type != "cuda":
-        with loaded_ahead([(kernel.module, block) for kernel, block in kernels], target):
-            yield kernels
-        return
-    # NVRTC compiles for one thread of a process at a time. The processes take the modules that no other has locked.
-    missing = sum(not is_cached(module_name(kernel.module, block)) for kernel, block in kernels)
-    cache, workers = {"WARP_CACHE_PATH": str(Path(wp.config.kernel_cache_dir).parent)}, list[PythonWorker]()
-    try:
-        with contextlib.suppress(OSError):  # no more processes: the fit compiles alone
-            for _ in range(min(PROCESSES, usable_cores() // 2, missing // 4)):
-                workers.append(PythonWorker("warpgs.pipeline.run.precompile", target.alias, environment=cache))
-        with loaded_ahead([(scoring().module, 1)], wp.get_device("cpu")):
-            yield kernels
-    finally:
-        for worker in workers:
-            worker.end(LAST_MODULE)
-
-
-def compile_free(kernels: list[tuple[wp.Kernel, int]], device: wp.Device, stopped: Callable[[], bool]) -> None:
-    """Compile modules into the cache, but none that another process is compiling; for a process that launches no kernel."""
-    names = [module_name(kernel.module, block) for kernel, block in kernels]
-    for name, (kernel, block) in zip(names, kernels, strict=True):
-        if is_cached(name) or stopped():
-            continue
-        with exclusive(lock_of(name, device), blocking=False) as free:
-            if free and not is_cached(name):
-                kernel.module.options["block_dim"] = block
-                wp.compile_aot_module(kernel.module, device)
+    kernels = fit_kernels(device.type == "cuda")
+    # NVRTC compiles for one thread of a process at a time, and more processes gained .5 s (docs/decisions/032)
+    ahead = kernels if device.type == "cpu" else [(scoring(), 1)]
+    with loaded_ahead([(kernel.module, block) for kernel, block in ahead], wp.get_device("cpu")):
+        yield kernels
 
 
 def precompile_kernels(devices: list[torch.device] | None = None) -> Iterator[tuple[str, str, int, bool, float]]:
@@ -159,14 +126,3 @@ def print_warming(devices: list[torch.device] | None = None) -> None:
         f"{count} modules: {compiled} compiled, {count - compiled} were in the cache, "
         f"{time.perf_counter() - began:.1f} s; {folder} holds {format_bytes(size)}"
     )
-
-
-def main() -> None:
-    """Compile for Warp's device of the command line, until stdin ends: a process of `compiled_ahead`."""
-    stop, device = threading.Event(), wp.get_device(sys.argv[1])
-    threading.Thread(target=lambda: (os.read(0, 1), stop.set()), daemon=True).start()
-    compile_free(fit_kernels(device.is_cuda), device, stop.is_set)
-
-
-if __name__ == "__main__":
-    main()
