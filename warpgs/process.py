@@ -487,10 +487,19 @@ def run_program(
 
 
 def fed_program(*words: str, folder: str) -> tuple[Callable[[Any], object], Callable[[], object]]:
-    """Start a program in a folder; return the function that writes to its stdin, and the one that ends it there."""
+    """Start a program in a folder; return the function that writes to its stdin, and the one that ends it there.
+
+    The latter raises ResourceError if the program failed.
+    """
     process = subprocess.Popen(words, stdin=subprocess.PIPE, cwd=folder)
     assert process.stdin is not None
-    return process.stdin.write, process.communicate
+
+    def end() -> None:
+        process.communicate()
+        if process.returncode:
+            raise ResourceError(f"{words[0]} ended with code {process.returncode}; repair it, or write another kind of file")
+
+    return process.stdin.write, end
 
 
 LAST_BYTES = 10_000

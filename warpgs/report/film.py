@@ -120,7 +120,7 @@ def h264_encoder() -> str | None:
     if program is None or Path(program).resolve().parent == Path.cwd().resolve():  # no file of the current folder is run
         return None
     probe = "-v quiet -f lavfi -i color=s=64x64:d=0.1 -c:v h264 -f null -"
-    return program if run_program(program, *probe.split(), timeout=20)[0] == 0 else None
+    return program if run_program(program, *probe.split(), timeout=5)[0] == 0 else None
 
 
 Writer = tuple[Callable[[np.ndarray], object], Callable[[], object]]

@@ -448,4 +448,4 @@ def moved_notes(fractions: dict[str, float]) -> list[str]:
     named = sorted(((f, name) for name, f in fractions.items() if f > 0), reverse=True)
     words = ", ".join(f"{name} ({f:.1%} of its pixels)" for f, name in named[:6])
     more = f" and {len(named) - 6} more" if len(named) > 6 else ""
-    return [Task(f"moving or changing objects in {words}{more}; mask them out")] if named else []
+    return [Task(f"something may have moved in {words}{more}: look, and mask it out")] if named else []

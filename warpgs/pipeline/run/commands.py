@@ -108,8 +108,8 @@ def _cameras_of(path: Path) -> tuple[dict[str, Camera], list[str]]:
 
 
 VP9 = (
-    "the film is VP9, which browsers and VLC play; with ffmpeg installed, films are H.264, which all players play "
-    "(OpenCV's wheels have no encoder for it)"
+    "the film is VP9, which browsers and VLC play; with an ffmpeg on the PATH that encodes H.264, films are H.264, "
+    "which all players play (OpenCV's wheels have no encoder for it)"
 )
 """Note on a film in .mp4 without an encoder of H.264."""
 

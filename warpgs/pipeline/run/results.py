@@ -492,7 +492,7 @@ def _figures(metrics: dict[str, Any], seconds: float) -> list[tuple[str, str]]:
         best = max(metrics["baselines"].values(), default=math.nan)
         held_out = [
             ("held-out PSNR", f"{test['psnr']:.2f} dB"), ("held-out SSIM", f"{test['ssim']:.3f}"),
-            ("best baseline without a fit", f"{best:.2f} dB"),
+            ("best without a fit", f"{best:.2f} dB"),
             *((LABELS[k], f"{test[k]:.3f}") for k in ("alpha_empty", "alpha_object") if k in test),
         ]  # fmt: skip
     size = format_bytes(metrics["complexity"]["bytes"])
