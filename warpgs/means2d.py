@@ -71,11 +71,9 @@ def projected_means(
     columns = {"grad": slice(0, 2)} | ({"absgrad": slice(10, 12)} if absgrad else {})
 
     def keep(i: int, gradient: torch.Tensor) -> None:
-        whole = gradient.detach()
-        if len(parts) > 1:  # the passes through other scenes add theirs
-            whole = torch.cat([whole if j == i else torch.zeros_like(part) for j, part in enumerate(parts)])
-        for name, part in columns.items():
-            before, found = getattr(means2d, name, None), select(whole[..., part])
+        each = [gradient.detach() if j == i else torch.zeros_like(part) for j, part in enumerate(parts)]
+        for name, place in columns.items():  # the passes through the other parts add theirs
+            before, found = getattr(means2d, name, None), select(torch.cat([values[..., place] for values in each]))
             setattr(means2d, name, found if before is None else before + found)
 
     def refuse(gradient: torch.Tensor) -> None:

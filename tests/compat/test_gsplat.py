@@ -242,7 +242,7 @@ def test_arguments_of_gsplat_become_ours(arguments, camera_options, options):
         ({"camera_model": "ortho", "radial_coeffs": torch.zeros(2, 4)}, "radial_coeffs with camera_model='ortho'"),
         ({"camera_model": "fisheye", "tangential_coeffs": torch.zeros(2, 2)}, "tangential_coeffs with camera_model='fisheye'"),
         ({"colors": None}, "colors must be given in render_mode 'RGB'"),
-        ({"means": torch.zeros(2, COUNT, 3)}, r"opacities must have the batch axes \[2\] of means, not shape \[40\]"),
+        ({"means": torch.zeros(2, COUNT, 3)}, r"quats must have the batch axes \[2\] of means, not shape \[40, 4\]"),
         ({"backgrounds": torch.zeros(2, 4)}, "background must have shape"),
     ],
 )

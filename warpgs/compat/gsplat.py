@@ -150,9 +150,8 @@ class _Meta(UserDict[str, Any]):
 
     def __getitem__(self, name: str) -> Any:
         """Return a value."""
-        if callable(value := self.data[name]):
-            value = self.data[name] = value()
-        return value
+        self.data[name] = value() if callable(value := self.data[name]) else value
+        return self.data[name]
 
 
 def rasterization(
@@ -229,8 +228,7 @@ def rasterization(
         ValueError: A shape is wrong, or a value of a camera, as in `warpgs.rasterize`.
     """
     _check_supported(locals())
-    batch, cameras, features = means.shape[:-2], viewmats.shape[-3], extra_signals
-    harmonics = behind = None
+    batch, cameras, features, harmonics, behind = means.shape[:-2], viewmats.shape[-3], extra_signals, None, None
     if "RGB" not in render_mode:
         colors, backgrounds, sh_degree = means.new_zeros(*means.shape[:-1], 1), None, None
     if colors is None:
@@ -252,8 +250,8 @@ def rasterization(
     renders = []
     for scene, view in [(scene, view) for scene in range(batch.numel()) for view in views]:
         of = functools.partial(_part, batch, scene, view)
-        values = {name: of(name, given) for name, given in {"means": means, "opacities": opacities, **form}.items()}
-        gaussians = kind(**values, sh=harmonics)
+        shape = {name: of(name, values) for name, values in form.items()}
+        gaussians = kind(means=of("means", means), opacities=of("opacities", opacities), sh=harmonics, **shape)
         camera = Camera(of("viewmats", viewmats), of("Ks", Ks), width, height, lens, of("distortion", distortion))
         options = RasterizeOptions(
             rule=rule, near=near_plane, far=far_plane, sh_degree=sh_degree, tile_size=size, absgrad=absgrad,
