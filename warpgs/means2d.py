@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import copy
+import functools
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -53,26 +55,33 @@ def count_passes(projected: torch.Tensor, passes: list[bool] | None = None) -> N
     setattr(projected, PASSED, passes)
 
 
-def projected_means(projected: torch.Tensor, absgrad: bool) -> torch.Tensor:
-    """Return the means [C, N, 2] of projected Gaussians [C, N, 12], which hold their gradients after the next backward pass.
+def projected_means(
+    parts: Sequence[torch.Tensor], absgrad: bool, select: Callable[[torch.Tensor], torch.Tensor] = lambda values: values
+) -> torch.Tensor:
+    """Return the means of projected Gaussians, which hold their gradients after the next backward pass.
+
+    ``parts`` [C, N, 12] are those of each scene; ``select`` picks or reshapes what is returned, from means [sum of C, N, 2].
 
     Raises:
         UsageError: A backward pass went through them already.
     """
-    if getattr(projected, PASSED, None):
+    if any(getattr(part, PASSED, None) for part in parts):
         raise UsageError("read render.means2d before the backward pass: gradients of earlier passes are not kept")
-    means2d = projected.detach()[..., :2].as_subclass(ProjectedMeans)
+    means2d = select(torch.cat([part.detach()[..., :2] for part in parts])).as_subclass(ProjectedMeans)
     columns = {"grad": slice(0, 2)} | ({"absgrad": slice(10, 12)} if absgrad else {})
 
-    def keep(gradient: torch.Tensor) -> None:
-        for name, part in columns.items():
-            before, found = getattr(means2d, name, None), gradient.detach()[..., part]
+    def keep(i: int, gradient: torch.Tensor) -> None:
+        each = [gradient.detach() if j == i else torch.zeros_like(part) for j, part in enumerate(parts)]
+        for name, place in columns.items():  # the passes through the other parts add theirs
+            before, found = getattr(means2d, name, None), select(torch.cat([values[..., place] for values in each]))
             setattr(means2d, name, found if before is None else before + found)
 
     def refuse(gradient: torch.Tensor) -> None:
         raise RuntimeError("means2d passes no gradient to the Gaussians: use Render.projected[..., :2] instead")
 
-    if projected.requires_grad:
+    if any(part.requires_grad for part in parts):
         means2d.requires_grad_().register_hook(refuse)
-        projected.register_hook(keep)
+    for i, part in enumerate(parts):
+        if part.requires_grad:
+            part.register_hook(functools.partial(keep, i))
     return means2d

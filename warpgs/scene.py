@@ -450,7 +450,7 @@ class Render:
         """
         from warpgs.means2d import projected_means
 
-        return projected_means(self.projected, self.absgrad)
+        return projected_means([self.projected], self.absgrad)
 
     @property
     def visible(self) -> torch.Tensor:

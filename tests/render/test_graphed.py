@@ -252,12 +252,12 @@ def test_backward_passes_are_counted(small, loss):
     settings = pass_of(cam, g.sh_degree, RULES["exact"])
     for early in (True, False):
         images, projected, _ = own.render(inputs_of(g, cam), None, settings)
-        means2d = projected_means(projected, False) if early else None
+        means2d = projected_means([projected], False) if early else None
         y = projected[..., :2].sum() if loss == "projected" else images[0].sum()
         torch.autograd.grad(y, projected if loss == "up to projected" else g.means)
         assert means2d is None or bool(means2d.grad.any())
         with pytest.raises(UsageError, match=r"read render\.means2d before the backward pass"):
-            projected_means(projected, False)
+            projected_means([projected], False)
 
 
 def test_after_a_failed_capture_calls_run_without_graphs(recorder):

@@ -1,6 +1,7 @@
 """Options and rules: checked where they are made, named after other programs, chosen by error, with a true bound."""
 
 import dataclasses
+import inspect
 import math
 import re
 from typing import NamedTuple
@@ -14,6 +15,7 @@ from tests.gaussians import LENSES, camera, cloud, lens_camera
 from tests.reference.project import project_reference
 from tools.run_docs import ROOT, collect
 from warpgs import RasterizeOptions, Rule, rasterize
+from warpgs.compat.gsplat import rasterization
 from warpgs.constants import RULES
 from warpgs.errors import UsageError
 from warpgs.render.options import SWITCHES, WHOLE_NUMBERS
@@ -462,5 +464,5 @@ def test_every_argument_has_a_row():
     text = PAGE.read_text("utf-8")
     table = text.split("## Arguments")[1].split("## Results")[0]
     named = [name for row in table.splitlines()[4:] for name in re.findall(r"`(\w+)`", row.split("|")[1] if "|" in row else "")]
-    assert set(named) == set(ARGUMENTS)
+    assert set(named) == set(ARGUMENTS) and list(inspect.signature(rasterization).parameters) == ARGUMENTS
     assert len(text.split()) <= 800

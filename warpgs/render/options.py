@@ -199,5 +199,5 @@ class RasterizeOptions:
 
 
 def image_settings(camera: Camera, degree: int, options: RasterizeOptions) -> Pass:
-    """Return the settings by which a fit renders whole images; cut-offs and antialiasing are those of the options."""
-    return pass_of(camera, degree, options.cut_offs(), antialiased=options.antialiased)
+    """Return the settings of whole images; cut-offs, antialiasing and tile size are those of the options."""
+    return pass_of(camera, degree, options.cut_offs(), antialiased=options.antialiased, tile_size=options.tile_size)
