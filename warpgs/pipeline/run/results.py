@@ -25,17 +25,7 @@ from warpgs.mesh.views import MIN_ALPHA
 from warpgs.pipeline.films.paths import Rig, midways, rig_among
 from warpgs.pipeline.metrics.coverage import coverage_map, coverage_section, depth_views
 from warpgs.pipeline.metrics.lpips import Lpips
-from warpgs.pipeline.metrics.scores import (
-    ALPHA_VARIANTS,
-    Renders,
-    ViewMetrics,
-    baselines,
-    psnr_of,
-    render_view,
-    score,
-    summarize,
-    variants,
-)
+from warpgs.pipeline.metrics.scores import Renders, ViewMetrics, baselines, psnr_of, render_view, score, summarize, variants
 from warpgs.pipeline.paper.scores import SUPPORT
 from warpgs.pipeline.train.loss import GIVEN_MIN_ALPHA
 from warpgs.pipeline.train.schedule import Phases
@@ -433,7 +423,7 @@ def evaluate_run(
     return {
         "test": summarize(rows), "train": summarize(train_rows),
         "views": [r.row() for r in rows],
-        "variants": variants(lpips) | (ALPHA_VARIANTS if any(r.opacity for r in found) else {}),
+        "variants": variants(lpips, any(r.opacity for r in found)),
         "baselines": plain.result(),
     }  # fmt: skip
 
