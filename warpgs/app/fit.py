@@ -8,6 +8,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
+import tyro  # noqa: TID253 - only a command imports this file
+
 from warpgs.app import flags
 from warpgs.clock import Clock, section, since_start, timed
 from warpgs.device import parse_bytes
@@ -29,8 +31,6 @@ from warpgs.ranks import join, place
 
 def scene_flags(*, positional: bool) -> tuple[type, Any]:
     """Return the dataclass of the flags, and their defaults."""
-    import tyro
-
     shown = (tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")) if positional else (tyro.conf.Fixed, tyro.conf.Suppress)
     return flags.flags_of(SceneRequest, SceneRequest(tyro.MISSING if positional else ""), {"path": shown})
 
@@ -129,8 +129,6 @@ def _choices() -> str:
 
 def _read_by(metavar: str, read: Callable[[str], Any], kind: type, text: Callable[[Any], str]) -> Any:
     """Return tyro's rule for a flag of one word, whose value is of ``kind`` or None, and is shown as ``text``."""
-    import tyro
-
     return tyro.constructors.PrimitiveConstructorSpec(
         nargs=1, metavar=metavar, instance_from_str=lambda words: read(words[0]),
         is_instance=lambda value: value is None or isinstance(value, kind), str_from_instance=lambda value: [text(value)],
@@ -144,8 +142,6 @@ def _names(parts: Parts) -> Any:
 
 def _flags(base: FitConfig, terms: Parts, modules: Parts) -> type:
     """Return the dataclass of all flags: the request, ``base``, the settings of strategy, loss terms and view modules."""
-    import tyro
-
     size = _read_by("SIZE", parse_bytes, int, lambda v: "none" if v is None else f"{v}B")
     special = {
         "memory_limit": (size,), "loss_terms": (_names(terms),), "view_modules": (_names(modules),),
