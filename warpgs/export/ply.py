@@ -14,7 +14,7 @@ import numpy as np
 
 from warpgs.errors import DataError
 from warpgs.export import base
-from warpgs.files import writing
+from warpgs.files import replacing
 from warpgs.geometry import checked_normalization
 from warpgs.scene import ORIGIN, Gaussians, Normalization, base_coefficients, base_colors, checked_origin
 
@@ -386,7 +386,7 @@ def _write(
     arrays, origin = base.arrays_to_write(path, gaussians, normalization, units, origin)
     n, k = arrays["sh"].shape[:2]
     header = _header(n, 3 * (k - 1), antialiased, origin)
-    with writing(path, len(header) + 4 * n * (14 + 3 * k)) as file:
+    with replacing(path, size=len(header) + 4 * n * (14 + 3 * k)) as (file, _):
         file.write(header)
         for start in range(0, n, CHUNK_ROWS):
             file.write(_rows({name: a[start : start + CHUNK_ROWS] for name, a in arrays.items()}).tobytes())

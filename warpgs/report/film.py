@@ -106,7 +106,7 @@ def write_film(path: Path, frames: Iterable[np.ndarray], fps: int = 30) -> int:
                 "write elsewhere"
             )
 
-    with replacing(path, check, suffix=suffix) as temporary, utf8_name(temporary) as name:
+    with replacing(path, check, suffix=suffix) as (_, temporary), utf8_name(temporary) as name:
         _encode(path, name, frames, fps, sizes)
     return len(sizes)
 

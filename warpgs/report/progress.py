@@ -114,7 +114,7 @@ _PANELS: list[Progress] = []
 """Panel of a fit's steps that occupies the terminal now, if any."""
 
 
-class Stages:
+class Stages(contextlib.AbstractContextManager["Stages"]):
     """Lines about the current work, such as ``finding depth: view 7 of 24``.
 
     The text before the last colon names a stage; numbers after it, such as ``7 of 24``, make a bar. In a terminal one line
@@ -126,10 +126,6 @@ class Stages:
         """Print plain lines with ``show``; with ``live`` None, write in place if ``show`` is the default, in a terminal."""
         self.show, self.printed, self.shown = show, {}, set()
         self.live = (show is say and is_live()) if live is None else live
-
-    def __enter__(self) -> Stages:
-        """Return these stages."""
-        return self
 
     def __exit__(self, *error) -> None:
         """Remove the line."""

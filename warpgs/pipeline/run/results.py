@@ -428,11 +428,6 @@ def evaluate_run(
     }  # fmt: skip
 
 
-def _encoded(draw: Callable[..., np.ndarray], *parts: np.ndarray) -> bytes:
-    """Draw an image of a view and encode it for the page."""
-    return webp(draw(*parts))
-
-
 def _images(shown: list[View], renders: Renders, rows: dict[str, Any], tell: Callable[[str], object]) -> list[tuple[Any, ...]]:
     """Render the views that the page shows, and encode their images."""
     captions = []
@@ -449,7 +444,7 @@ def _images(shown: list[View], renders: Renders, rows: dict[str, Any], tell: Cal
             yield from ((np.asarray, a) for a in (image, view.image))
             yield from ((error_map, image, view.image), (depth_map, depth, alpha))
 
-    files = iter(in_background(_encoded, parts()))
+    files = iter(in_background(lambda draw, *maps: webp(draw(*maps)), parts()))
     return [(v.name, caption, *images) for v, caption, images in zip(shown, captions, zip(*[files] * 4))]
 
 
