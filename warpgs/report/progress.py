@@ -13,16 +13,13 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO
+from typing import Any, BinaryIO
 
 from warpgs import schema
 from warpgs.errors import ResourceError
 from warpgs.files import appending, plain, read_file, write_bytes
 from warpgs.folders import RefusedError
 from warpgs.process import careful, printable, say
-
-if TYPE_CHECKING:
-    from rich.console import Console
 
 PLAIN_INTERVAL = 10.0
 """Seconds between two plain lines on the steps of a fit."""
@@ -53,7 +50,7 @@ def is_live() -> bool:
     return stdout is not None and stdout.isatty() and os.environ.get("TERM") != "dumb"
 
 
-def _console() -> tuple[Console, bool]:
+def _console() -> tuple[Any, bool]:
     """Return rich's console, and whether stderr is a terminal, too: redirected errors do not disturb a line."""
     from rich.console import Console
 
