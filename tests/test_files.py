@@ -72,7 +72,7 @@ def test_order_of_a_replacement(tmp_path, monkeypatch):
 
     monkeypatch.setattr(files.os, "fsync", synced)
     monkeypatch.setattr(files.os, "replace", lambda *a, **at: order.append("replace") or replace(*a, **at))
-    with replacing(path, lambda p: order.append(p.read_bytes())) as temporary:
+    with replacing(path, lambda p: order.append(p.read_bytes())) as (_, temporary):
         assert OWN_NAMES.fullmatch(temporary.name) and temporary.parent.samefile(tmp_path)
         temporary.write_bytes(b"new")
     assert path.read_bytes() == b"new" and order[1:3] == [b"new", "replace"]
@@ -90,7 +90,7 @@ def test_whatever_fails_the_old_file_stays_and_the_error_is_its_own(tmp_path, mo
     if stuck:
         monkeypatch.setattr(os, "unlink", full)
     with pytest.raises(ResourceError, match=r"a\.json: cannot be written \(No space left.* is untouched"):
-        with replacing(path, full if failing == "check" else None) as temporary:
+        with replacing(path, full if failing == "check" else None) as (_, temporary):
             temporary.write_bytes(b"new")
             if failing == "write":
                 full()
@@ -106,7 +106,7 @@ def test_a_short_file_or_a_failed_check_leaves_the_old_one(tmp_path, monkeypatch
     def refuse(_):
         raise DataError("no film")
 
-    with pytest.raises(DataError, match="no film"), replacing(tmp_path / "a", refuse) as temporary:
+    with pytest.raises(DataError, match="no film"), replacing(tmp_path / "a", refuse) as (_, temporary):
         temporary.write_bytes(b"new")
     assert not list(tmp_path.iterdir())
     path = tmp_path / "a.bin"
@@ -212,13 +212,13 @@ ELSEWHERE = {
     ("process.py", "open wb"): "the null device",
     ("report/film.py", "VideoWriter"): "into the temporary file of `replacing`, which decodes it",
     ("report/overview.py", "savez"): "into a temporary folder",
-    ("poses/matching.py", "savez"): "into the file of `writing`",
+    ("poses/matching.py", "savez"): "into the file of `replacing`",
     ("report/images.py", "save"): "Pillow, into memory",
     ("report/film.py", "save"): "the same",
     ("export/sog.py", "save"): "the same",
     ("export/meshes_and_cameras.py", "save"): "the same",
     ("poses/photographs.py", "save"): "the same",
-    ("folders.py", "open wb"): "the temporary file of `writing`",
+    ("folders.py", "open wb"): "the temporary file of `replacing`",
     ("files.py", "open ab"): "a file that grows by lines: metrics.jsonl, the log of a job",
     ("folders.py", "os.open"): "folders and files by descriptor, for the functions of `warpgs.files`",
     ("files.py", "os.open"): "files by descriptor, to read",
@@ -360,7 +360,7 @@ WAYS = {
 
 
 def _replace(path):
-    with replacing(path) as temporary:
+    with replacing(path) as (_, temporary):
         temporary.write_bytes(b"new")
 
 
@@ -497,7 +497,7 @@ import sys
 from pathlib import Path
 from warpgs.files import filling, replacing
 from warpgs.folders import temporary_folder
-with temporary_folder(), filling(Path(sys.argv[1]) / "scene") as folder, replacing(Path(sys.argv[1]) / "a.ply") as file:
+with temporary_folder(), filling(Path(sys.argv[1]) / "scene") as folder, replacing(Path(sys.argv[1]) / "a.ply") as (_, file):
     (folder / "photo.jpg").touch()
     file.touch()
     print("holds", flush=True)

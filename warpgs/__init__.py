@@ -5,8 +5,6 @@ recentred and rescaled. The scene's own files and PLY files are in file units. F
 argument ``units``. All other functions, such as `rasterize`, need Gaussians and cameras in the same units.
 """
 
-from __future__ import annotations
-
 import sys
 from typing import TYPE_CHECKING
 

@@ -150,27 +150,11 @@ def writable(path: Path, remedy: str = "", done: str = "written", amount: str = 
 @contextlib.contextmanager
 def replacing(
     path: Path, check: Callable[[Path], object] | None = None, *, size: int | None = None, suffix: str = ""
-) -> Iterator[Path]:
-    """Give the path of a temporary file beside ``path``; the block writes the file, which then replaces ``path``."""
+) -> Iterator[tuple[BinaryIO, Path]]:
+    """Give a temporary file beside ``path``, open and by its path; the block writes it, and then it replaces ``path``."""
     # The temporary file is synced to the disk and checked first; the folder is synced afterwards. On any error,
     # including one in the block, the temporary file is removed and an old file stays unchanged. If ``path`` is a link,
     # the link is replaced.
-    with _replaced(path, size, check, suffix) as (_, temporary):
-        yield temporary
-
-
-@contextlib.contextmanager
-def writing(path: Path, size: int | None = None) -> Iterator[BinaryIO]:
-    """Give a temporary file to write to; at the end of the block it replaces ``path``, as in `replacing`."""
-    with _replaced(path, size) as (file, _):
-        yield file
-
-
-@contextlib.contextmanager
-def _replaced(
-    path: Path, size: int | None, check: Callable[[Path], object] | None = None, suffix: str = ""
-) -> Iterator[tuple[BinaryIO, Path]]:
-    """Give a temporary file, open and by its path; after the block the file is synced and checked, and replaces ``path``."""
     amount = "" if size is None else f"{size / 2**20:.1f} MiB " if size >= 2**20 else f"{size:,} bytes "
     with (
         writable(path, amount=amount, note="; the old file is untouched"),
@@ -237,9 +221,8 @@ def _sync(folder: Folder) -> None:
 
 def write_bytes(path: Path, *chunks: bytes | memoryview) -> None:
     """Replace a file by chunks of bytes, once all of them are on disk."""
-    with writing(path, sum(map(len, chunks))) as f:
-        for chunk in chunks:
-            f.write(chunk)
+    with replacing(path, size=sum(map(len, chunks))) as (file, _):
+        file.writelines(chunks)
 
 
 def write_text(path: Path, text: str) -> None:

@@ -48,7 +48,7 @@ class RefusedError(OSError):
         return self.strerror
 
 
-class Folder:
+class Folder(contextlib.AbstractContextManager["Folder"]):
     """An open folder, whose entries are used by name without following links; a context manager that closes it."""
 
     def __init__(self, path: Path, above: Folder | None = None):
@@ -65,9 +65,6 @@ class Folder:
             self.descriptor = os.open(name, os.O_RDONLY | os.O_DIRECTORY | links, dir_fd=at)
             status = os.fstat(self.descriptor)
         self.identity = status.st_dev, status.st_ino
-
-    def __enter__(self) -> Folder:
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.close()
@@ -294,7 +291,7 @@ def temporary_file(above: Folder, suffix: str = "") -> Iterator[tuple[str, Binar
             above.unlink(name)
 
 
-class Temporary:
+class Temporary(contextlib.AbstractContextManager["Temporary"]):
     """A name for a new folder, with a lock beside it; at the end, the folder that has the name is removed."""
 
     def __init__(self, above: Folder, prefix: str = ".warpgs-"):
@@ -305,9 +302,6 @@ class Temporary:
         self.path = above.path / self.name
         with _LOCK:
             _HELD.add(self._lock)
-
-    def __enter__(self) -> Temporary:
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.remove()

@@ -11,7 +11,7 @@ import numpy as np
 
 from warpgs.constants import POSE_TOLERANCE
 from warpgs.errors import DataError, UsageError
-from warpgs.scene import ActivatedGaussians, Camera, Gaussians, Normalization
+from warpgs.scene import ActivatedGaussians, Box, Camera, Gaussians, Normalization
 
 if TYPE_CHECKING:
     import torch
@@ -550,6 +550,14 @@ def convert_points(points: np.ndarray, normalization: Normalization, source: str
     if target == "file":
         return np.asarray(_converted(matmul(points, rotation), offset, scale, target))
     return matmul(_converted(points, offset, scale, target), rotation.T)
+
+
+def convert_box(box: Box, normalization: Normalization, source: str, target: str) -> Box:
+    """Return a box in other units, float64."""
+    ((center,), size, axes), n = (convert_points(box[0][None], normalization, source, target), *box[1:]), normalization
+    if target == "file":
+        return center, size / n.scale, matmul(n.rotation.T, axes)
+    return center, size * n.scale, matmul(n.rotation, axes)
 
 
 def convert_gaussians(gaussians: Gaussians, normalization: Normalization, source: str, target: str) -> Gaussians:

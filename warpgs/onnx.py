@@ -1,24 +1,18 @@
 """Networks as ONNX files: checked before they are loaded, run by ONNX Runtime."""
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import queue
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
 from warpgs.device import usable_cores
 from warpgs.errors import DataError, ResourceError
 from warpgs.files import read_file
-
-if TYPE_CHECKING:
-    from onnxruntime import InferenceSession
-
 
 # Check of an ONNX file by its bytes, before onnxruntime loads it: nothing outside the file may be loaded.
 #
@@ -193,8 +187,8 @@ def _interruptible(call: Callable[[], T], cancel: Callable[[], object]) -> T:
     return answer[0]
 
 
-def start_session(data: bytes, path: Path, provider: str, threads: int) -> InferenceSession:
-    """Return a session for the bytes of a checked ONNX file."""
+def start_session(data: bytes, path: Path, provider: str, threads: int) -> Any:
+    """Return an `InferenceSession` for the bytes of a checked ONNX file."""
     try:
         import onnxruntime as ort
     except ImportError as e:

@@ -24,7 +24,6 @@ from warpgs.process import ignored_signals, say
 if TYPE_CHECKING:
     import torch
     import torch.distributed as dist
-    from torch.distributed import Store
 
 
 # Guards of all servers: sockets that only this machine reaches, and checks of requests for a served page.
@@ -214,7 +213,7 @@ class RankWatch:
     Calls through one connection wait for each other, so the thread has its own connection.
     """
 
-    def __init__(self, rank: int, count: int, store: Store, own: Store):
+    def __init__(self, rank: int, count: int, store: dist.Store, own: dist.Store):
         """Give the first sign of life, and begin to watch."""
         self.rank, self.count, self.store = rank, count, store
         self.here = machine()

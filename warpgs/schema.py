@@ -119,13 +119,14 @@ def real(value: Any, place: str) -> None:
         _refuse(value, place, "a number")
 
 
-def number(low: float = -math.inf, above: float = -math.inf) -> Schema:
-    """Return the schema of finite numbers that are at least ``low`` and larger than ``above``."""
+def number(low: float = -math.inf, above: float = -math.inf, high: float = math.inf) -> Schema:
+    """Return the schema of finite numbers that are at least ``low``, larger than ``above``, and at most ``high``."""
 
     def check(value: Any, place: str) -> None:
         sound = not isinstance(value, bool) and isinstance(value, (int, float)) and abs(value) <= MAX_NUMBER
-        if not (sound and value >= low and value > above):
+        if not (sound and low <= value <= high and value > above):
             bounds = f" of at least {low:g}" * (low > -math.inf) + f" above {above:g}" * (above > -math.inf)
+            bounds += f" of at most {high:g}" * (high < math.inf)
             _refuse(value, place, f"a finite number{bounds}")
 
     return check

@@ -1,7 +1,5 @@
 """Public names for strategies, loss terms and view modules of your own."""
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING
 
 from warpgs.faces import lazy

@@ -26,7 +26,7 @@ import warp
 
 from tests.faults.calls import Call, numbered
 from warpgs.app.cli import OWN_FILES, main
-from warpgs.pipeline.farm.job import Event, job_text
+from warpgs.pipeline.farm.job import Event
 from warpgs.pipeline.farm.work import run_job
 from warpgs.pipeline.run import commands as plot
 from warpgs.pipeline.run import results
@@ -51,7 +51,7 @@ class OneProcess:
 
     def wait(self, seconds: float) -> list[Event]:
         job = self.jobs.pop(0)
-        return [(job.name, run_job(job_text(job)), "")]
+        return [(job.name, run_job(job.text()), "")]
 
     def close(self) -> None:
         """Do nothing."""

@@ -4,7 +4,7 @@ import dataclasses
 import sys
 from pathlib import Path
 
-from warpgs.pipeline.farm.job import Event, FarmJob, job_text
+from warpgs.pipeline.farm.job import Event, FarmJob
 from warpgs.pipeline.farm.work import run_job
 from warpgs.pipeline.model.start import InitConfig
 from warpgs.pipeline.run.request import FitRequest, SceneRequest
@@ -47,7 +47,7 @@ class HereEngine:
     def wait(self, seconds: float) -> list[Event]:
         """Run the oldest job; the function's result is its state, or its whole event."""
         job = self.started.pop(0)
-        done = self.work(job_text(job))
+        done = self.work(job.text())
         return [(job.name, done, "") if isinstance(done, str) else done]
 
     def close(self) -> None:

@@ -34,7 +34,6 @@ from warpgs.pipeline.farm.job import (
     file_digest,
     finished,
     job_of,
-    job_text,
     list_jobs,
     read_job_record,
     write_record,
@@ -275,18 +274,18 @@ def test_a_class_of_a_preset_file_is_found_by_another_process(scenes, tmp_path, 
     head = "from warpgs import Strategy\nfrom warpgs.pipeline.train.strategies.base import register\n"
     path.write_text(f"{head}{decorator}class Mine(Strategy):\n    pass\nmine = {{'strategy': Mine}}\n")
     (job, _) = jobs_of(scenes, tmp_path)
-    text = job_text(replace(job, request=replace(job.request, config=preset_settings(f"{path}:mine")[0])))
+    text = replace(job, request=replace(job.request, config=preset_settings(f"{path}:mine")[0])).text()
     for name in [n for n, m in sys.modules.items() if getattr(m, "__file__", None) == str(path)]:
         del sys.modules[name]
     kept = {n: c for n, c in STRATEGIES._classes.items() if c.__module__.startswith("warpgs.")}
     monkeypatch.setattr(STRATEGIES, "_classes", kept)
     found = job_of(text)
-    assert STRATEGIES.find(found.request.config.strategy).__name__ == "Mine" and job_text(found) == text
+    assert STRATEGIES.find(found.request.config.strategy).__name__ == "Mine" and found.text() == text
 
 
 def test_a_job_as_text_is_the_same_job(scenes, tmp_path):
     (job, _) = jobs_of(scenes, tmp_path)
-    assert job_of(job_text(job)) == job and job_of(job_text(job)).identity() == job.identity()
+    assert job_of(job.text()) == job and job_of(job.text()).identity() == job.identity()
     elsewhere = replace(job, request=replace(job.request, device="cuda"))
     assert elsewhere.identity() != job.identity(), "photographs have another size on a GPU"
 

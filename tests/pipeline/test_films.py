@@ -25,10 +25,10 @@ from warpgs.pipeline.films.paths import (
     framed,
     path_of,
     read_keyframes,
+    rig_among,
     rig_of,
     through,
     tour_of,
-    up_of,
 )
 from warpgs.pipeline.model.table import FittedModel
 from warpgs.scene import Camera, Normalization
@@ -330,7 +330,7 @@ def test_a_ring_is_circled_level_whatever_way_the_photographs_lie(kind, roll):
     cameras = [rolled(c, roll[i % 2]) for i, c in enumerate(around(np.arange(0, 360, 24)))]
     rig = rig_of(cameras, 1.0)
     assert rig.turned == (abs(roll[0]) == 90) and np.abs(rig.up - UP).max() < 1e-6
-    for up in (up_of(cameras, TARGET + 0.1 * np.eye(3)), common_up(cameras)):
+    for up in (rig_among(cameras, TARGET + 0.1 * np.eye(3)).up, common_up(cameras)):
         assert np.abs(up - UP).max() < 1e-6
     path = camera_path(kind, rig, cameras, 9)
     for c in path:

@@ -185,7 +185,9 @@ def test_what_is_there_is_not_overwritten(sfm, tmp_path, photographs):
 
 def test_a_worker_that_fails_or_is_not_there(sfm, tmp_path, photographs, monkeypatch):
     """Its last words are in the message, or what to install; nothing is left."""
-    monkeypatch.setattr(find, "prepare", lambda path, root, small, most: prepare(path, root, small.with_name("lost"), most))
+    monkeypatch.setattr(
+        find.photos, "prepare", lambda path, root, small, most: prepare(path, root, small.with_name("lost"), most)
+    )
     with pytest.raises(ResourceError, match=r"pycolmap ended with code \d+.*last message: "):
         find_poses(photographs, tmp_path / "out")
     monkeypatch.setattr(mapping.importlib.util, "find_spec", lambda name: None)

@@ -146,7 +146,7 @@ def test_classical_sources_say_so():
 
 def test_both_networks_are_opened_before_one_runs(tmp_path, monkeypatch):
     config = PriorConfig(depth_model=nw.depth_network(tmp_path / "d.onnx"), segmentation_model=str(tmp_path / "none.onnx"))
-    monkeypatch.setattr("warpgs.priors.views.network_disparity", lambda *a: pytest.fail("ran"))
+    monkeypatch.setattr("warpgs.priors.networks.network_disparity", lambda *a: pytest.fail("ran"))
     with pytest.raises(DataError, match=r"none\.onnx: the model cannot be read"):
         view_priors([view(shapes()[0])], config)
 

@@ -295,7 +295,14 @@ def test_the_first_is_noted_and_the_second_raised(number):
     assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
 
 
-STAGES = ["fit.read_scene", "fit.Trainer", "fit.background_warmup", "fit.write_ply", "fit.evaluate_run", "results.write_page"]
+STAGES = [
+    "fit.read_scene",
+    "fit.Trainer",
+    "fit.background_warmup",
+    "fit.write_ply",
+    "results.evaluate_run",
+    "results.write_page",
+]
 
 
 @pytest.mark.usefixtures("handlers")

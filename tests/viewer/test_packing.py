@@ -8,11 +8,12 @@ import torch
 
 from tests.gaussians import cloud
 from tests.scenes import ring, three_gaussians
-from warpgs.geometry import convert_camera, convert_gaussians, rotation_matrices
-from warpgs.pipeline.films.paths import fov_y, up_of
+from warpgs.geometry import convert_box, convert_camera, convert_gaussians, rotation_matrices
+from warpgs.pipeline.films.paths import fov_y, rig_among
+from warpgs.pipeline.model.edit import inside
 from warpgs.scene import Normalization
 from warpgs.viewer.html import LARGEST_HALF, camera_at, camera_before, distance_ahead, packed, stands_at, wxyz_of
-from warpgs.viewer.window import box_json, inside, keyframe
+from warpgs.viewer.window import box_json, keyframe
 
 
 def test_half_precision_keeps_gaussians_of_any_scene():
@@ -44,8 +45,8 @@ def test_poses_there_and_back():
         np.testing.assert_allclose(back.viewmat, c.viewmat, atol=1e-12)
         assert abs(back.K[1, 1] - c.K[1, 1]) < 1e-9 and stands_at(back, c, 1e-9)
     first, second = ring(2)
-    assert not stands_at(first, second, 1.0) and up_of(ring(5), np.zeros((1, 3))) @ [0, -1, 0] > 0.99
-    assert up_of([camera_before(three_gaussians())], three_gaussians().means.numpy()) @ [0, -1, 0] > 0.99
+    assert not stands_at(first, second, 1.0) and rig_among(ring(5), np.zeros((1, 3))).up @ [0, -1, 0] > 0.99
+    assert rig_among([camera_before(three_gaussians())], three_gaussians().means.numpy()).up @ [0, -1, 0] > 0.99
     assert abs(distance_ahead(first, three_gaussians()) - 2.2) < 0.4
     assert distance_ahead(camera_before(three_gaussians()), three_gaussians()) > 0.3
 
@@ -53,15 +54,17 @@ def test_poses_there_and_back():
 def test_a_box_in_file_units_holds_the_same_points():
     turn = rotation_matrices(np.array([0.8, 0.0, 0.6, 0.0]))
     g, box = cloud(300), (np.array([0.2, 0.1, 4.0]), np.array([2.0, 1.0, 1.5]), turn)
-    within = inside(box, g.means)
+    within = inside(g, box)
     assert 0 < int(within.sum()) < len(within)
-    n = Normalization(np.array([400.0, -20.0, 7.0]), 0.25)
+    n = Normalization(np.array([400.0, -20.0, 7.0]), 0.25, turn)
     stored = box_json(box, n)
+    for back, part in zip(convert_box(tuple(map(np.array, stored.values())), n, "file", "scene"), box, strict=True):
+        np.testing.assert_allclose(back, part, atol=1e-12)
     means = convert_gaussians(g, n, "scene", "file").means.double().numpy()
     local = (means - stored["center"]) @ np.array(stored["rotation"])
     again = (np.abs(local) <= np.array(stored["size"]) / 2 + 1e-4).all(1)
     assert (again == within.numpy()).mean() > 0.99
-    assert not inside((np.zeros(3), np.full(3, 2.0), np.eye(3)), torch.eye(3) * 1.1).any()
+    assert not inside(dataclasses.replace(g, means=torch.eye(3) * 1.1), (np.zeros(3), np.full(3, 2.0), np.eye(3))).any()
 
 
 def test_a_keyframe_is_camera_to_world_in_file_units():

@@ -8,16 +8,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
-from warpgs.app.flags import (
-    MAX_THREADS,
-    MAX_WHOLE,
-    check_range,
-    flags_of,
-    listed,
-    parse_flags,
-    settings_of,
-    word_after,
-)
+import tyro  # noqa: TID253 - only a command imports this file
+
+from warpgs.app import flags
 from warpgs.clock import Clock, section, since_start, timed
 from warpgs.device import parse_bytes
 from warpgs.errors import UsageError
@@ -38,17 +31,15 @@ from warpgs.ranks import join, place
 
 def scene_flags(*, positional: bool) -> tuple[type, Any]:
     """Return the dataclass of the flags, and their defaults."""
-    import tyro
-
     shown = (tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")) if positional else (tyro.conf.Fixed, tyro.conf.Suppress)
-    return flags_of(SceneRequest, SceneRequest(tyro.MISSING if positional else ""), {"path": shown})
+    return flags.flags_of(SceneRequest, SceneRequest(tyro.MISSING if positional else ""), {"path": shown})
 
 
-def scene_of(flags: Any, path: str) -> SceneRequest:
+def scene_of(a: Any, path: str) -> SceneRequest:
     """Return the request for a scene folder from parsed flags; a user-defined reader is loaded."""
-    asked = settings_of(SceneRequest, flags)
+    asked = flags.settings_of(SceneRequest, a)
     if asked.downscale is not None:
-        check_range("--downscale", asked.downscale, 1, MAX_WHOLE)
+        flags.check_range("--downscale", asked.downscale, 1, flags.MAX_WHOLE)
     if asked.reader is not None:
         READERS.load(asked.reader)
     named = {n: getattr(asked, n) for n in ("score_masks", "matcher", "depths", "normals")}
@@ -94,7 +85,7 @@ Parts = dict[str, Any]
 
 def _parts(registry: Registry[Any], flag: str, arguments: list[str], base: tuple[Any, ...]) -> Parts:
     """Return the parts of a registry that a flag names, with default settings; ``base`` if the flag is not given."""
-    given, parts = word_after(arguments, flag), Parts()
+    given, parts = flags.word_after(arguments, flag), Parts()
     for part in base if given is None else parts_named(registry, flag, given, True):
         if (group := flag_group(part.name)) in parts:
             raise UsageError(f"{flag} {given}: two of these names define the flags --{group}; leave one out")
@@ -117,9 +108,9 @@ def _view_modules(arguments: list[str], base: FitConfig) -> Parts:
 
 def _preset(arguments: list[str]) -> tuple[FitConfig, str]:
     """Return the settings that the flags start from, and a description of their source."""
-    name = word_after(arguments, "--preset")
+    name = flags.word_after(arguments, "--preset")
     base, origin = preset_settings(name)
-    strategy = word_after(arguments, "--strategy")
+    strategy = flags.word_after(arguments, "--strategy")
     if strategy is None or strategy == base.strategy:
         return base, origin
     own = STRATEGIES.load(strategy).Config
@@ -133,13 +124,11 @@ def _choices() -> str:
         "view modules": VIEW_MODULES,
     }  # fmt: skip
     lines = {"presets": PRESETS.described(), **{title: registry.described() for title, registry in plug_ins.items()}}
-    return "\n\n".join(listed(title, about) for title, about in lines.items())
+    return "\n\n".join(flags.listed(title, about) for title, about in lines.items())
 
 
 def _read_by(metavar: str, read: Callable[[str], Any], kind: type, text: Callable[[Any], str]) -> Any:
     """Return tyro's rule for a flag of one word, whose value is of ``kind`` or None, and is shown as ``text``."""
-    import tyro
-
     return tyro.constructors.PrimitiveConstructorSpec(
         nargs=1, metavar=metavar, instance_from_str=lambda words: read(words[0]),
         is_instance=lambda value: value is None or isinstance(value, kind), str_from_instance=lambda value: [text(value)],
@@ -153,15 +142,13 @@ def _names(parts: Parts) -> Any:
 
 def _flags(base: FitConfig, terms: Parts, modules: Parts) -> type:
     """Return the dataclass of all flags: the request, ``base``, the settings of strategy, loss terms and view modules."""
-    import tyro
-
     size = _read_by("SIZE", parse_bytes, int, lambda v: "none" if v is None else f"{v}B")
     special = {
         "memory_limit": (size,), "loss_terms": (_names(terms),), "view_modules": (_names(modules),),
         "priors": (tyro.conf.OmitArgPrefixes,), "strategy_config": (tyro.conf.Fixed, tyro.conf.Suppress),
     }  # fmt: skip
     chosen = dataclasses.replace(base, loss_terms=tuple(terms.values()), view_modules=tuple(modules.values()))
-    kind, default = flags_of(FitConfig, chosen, special)
+    kind, default = flags.flags_of(FitConfig, chosen, special)
     fields: list[tuple[str, Any, Any]] = [("config", Annotated[kind, tyro.conf.arg(name="")], field(default=default))]
     own = {} if base.strategy_config is None else {flag_group(base.strategy): base.strategy_config}
     reading, unread = scene_flags(positional=True)
@@ -172,7 +159,7 @@ def _flags(base: FitConfig, terms: Parts, modules: Parts) -> type:
         if name in taken:
             raise UsageError(f"the plug-in name {name} is taken by a flag of warpgs; rename the plug-in")
         taken.add(name)
-        group, default = flags_of(type(settings), settings)
+        group, default = flags.flags_of(type(settings), settings)
         fields.append((f"{name}_settings", Annotated[group, tyro.conf.arg(name=name)], field(default=default)))
     for name in VIEW_MODULES.names():
         about = (inspect.getdoc(VIEW_MODULES.find(name)) or "").partition("\n\n")[0]
@@ -184,9 +171,9 @@ def _config(a: Any, base: FitConfig, terms: Parts, modules: Parts) -> FitConfig:
     """Return the settings of parsed flags."""
 
     def settings(name: str, part: Any) -> Any:
-        return settings_of(type(part), getattr(a, f"{name}_settings"))
+        return flags.settings_of(type(part), getattr(a, f"{name}_settings"))
 
-    config, own = settings_of(FitConfig, a.config), base.strategy_config
+    config, own = flags.settings_of(FitConfig, a.config), base.strategy_config
     if own is not None:
         config = dataclasses.replace(config, strategy_config=settings(flag_group(base.strategy), own))
     found, learned = (tuple(settings(n, p) for n, p in parts.items()) for parts in (terms, modules))
@@ -207,18 +194,18 @@ def _continued(arguments: list[str], about: str) -> FitRequest:
     """Return the request that continues a run with its original settings."""
     from warpgs.pipeline.run.folder import stored_request
 
-    a = parse_flags(Request, arguments, "warpgs fit", about)
+    a = flags.parse_flags(Request, arguments, "warpgs fit", about)
     view_port = _machine(a)
     request = stored_request(a.out)
     say(f"continuing the run: preset {request.config.preset}, {request.config.steps:,} steps, {request.scene.path}")
-    device = request.device if word_after(arguments, "--device") is None else a.device
+    device = request.device if flags.word_after(arguments, "--device") is None else a.device
     return dataclasses.replace(request, device=device, view_port=view_port, lpips_weights=a.lpips_weights)
 
 
 def _machine(a: Any) -> int | None:
     """Set the number of threads; return the port of the viewer, None for no viewer."""
-    check_range("--threads", a.threads, 0, MAX_THREADS)
-    check_range("--view-port", a.view_port, 0, 65535)
+    flags.check_range("--threads", a.threads, 0, flags.MAX_THREADS)
+    flags.check_range("--view-port", a.view_port, 0, 65535)
     if a.threads:
         set_threads(a.threads)
     return a.view_port if a.view else None
@@ -230,19 +217,19 @@ def request_of(arguments: list[str], about: str) -> FitRequest:
         return _continued(arguments, about)
     base, origin = _preset(arguments)
     parts = _parts(LOSS_TERMS, "--loss-terms", arguments, base.loss_terms), _view_modules(arguments, base)
-    a: Any = parse_flags(_flags(base, *parts), arguments, "warpgs fit", f"{about}\n\n{_choices()}")
+    a: Any = flags.parse_flags(_flags(base, *parts), arguments, "warpgs fit", f"{about}\n\n{_choices()}")
     scene = scene_of(a.reading, a.reading.path)
     view_port = _machine(a)
     config = dataclasses.replace(_config(a, base, *parts), preset=base.preset)
-    check_range("--steps", config.steps or 1, 1, MAX_WHOLE)
+    flags.check_range("--steps", config.steps or 1, 1, flags.MAX_WHOLE)
     if a.time_budget is not None:
-        if a.resume or word_after(arguments, "--steps"):
+        if a.resume or flags.word_after(arguments, "--steps"):
             raise UsageError(
                 "--time-budget chooses the number of steps; leave out --steps. To continue a run, give only --out RUN --resume"
             )
         check_budget(a.time_budget)
     notes = (origin_note(origin, base, config),)
-    if word_after(arguments, "--preset") is None:
+    if flags.word_after(arguments, "--preset") is None:
         say(f"preset {base.preset}: {PRESETS.described()[base.preset]}")
     return FitRequest(scene, a.out, config, a.device, a.resume, a.lpips_weights, a.time_budget, notes, view_port)
 

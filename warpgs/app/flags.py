@@ -11,6 +11,8 @@ import typing
 from collections.abc import Callable, Iterator, Mapping
 from typing import Annotated, Any, TypeVar
 
+import tyro  # noqa: TID253 - only a command imports this file
+
 from warpgs.errors import UsageError, field_docs
 from warpgs.process import say
 
@@ -38,8 +40,6 @@ def call(command: Callable[..., Any], arguments: list[str], program: str, descri
 
 def _open_value(info: Any) -> Any:
     """Return tyro's rule for a number or switch that may be None, which takes none, true and false in any case."""
-    import tyro
-
     kinds = typing.get_args(info.type)
     kind = next((k for k in (int, float, bool) if set(kinds) == {k, types.NoneType}), None)
     if kind is None:
@@ -73,8 +73,6 @@ def _columns() -> Iterator[None]:
 
 def parse_flags(kind: Callable[..., Any], arguments: list[str], program: str, description: str) -> Any:
     """Return the instance of a dataclass of flags for the arguments of a command line."""
-    import tyro
-
     words = ["--help" if word == "--help-all" else word for word in arguments]
     complaint, registry = io.StringIO(), tyro.constructors.ConstructorRegistry()
     registry.primitive_rule(_open_value)
@@ -98,8 +96,6 @@ def parse_flags(kind: Callable[..., Any], arguments: list[str], program: str, de
 
 def flags_of(kind: type, default: Any, special: Mapping[str, tuple[Any, ...]] | None = None) -> tuple[type, Any]:
     """Return a subclass of a settings dataclass whose fields are flags with their docstrings as help, and its defaults."""
-    import tyro
-
     hints, docs, fields, values = typing.get_type_hints(kind), field_docs(kind), [], {}
     for f in dataclasses.fields(kind):
         hint, value = hints[f.name], getattr(default, f.name)

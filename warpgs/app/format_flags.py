@@ -5,6 +5,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
+import tyro  # noqa: TID253 - only a command imports this file
+
 from warpgs.app.flags import flags_of, listed, settings_of, word_after
 from warpgs.errors import UsageError
 from warpgs.export.base import Format, all_formats, find_format
@@ -19,7 +21,6 @@ def format_lines() -> str:
 
 def format_flags(arguments: list[str]) -> type:
     """Return the dataclass of the flags that `export` and `convert` share, including options of the format of --format."""
-    import tyro
 
     @dataclass(frozen=True, kw_only=True)
     class Shared:

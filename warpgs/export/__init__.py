@@ -1,7 +1,5 @@
 """Export of Gaussians to files of other programs, in the coordinates of the input files."""
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING
 
 from warpgs.faces import lazy

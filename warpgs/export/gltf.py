@@ -13,23 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from warpgs.export.base import (
-    SH_SIZES,
-    Arrays,
-    Format,
-    by_rows,
-    half_turn,
-    half_turn_in_place,
-    logits,
-    malformed,
-    parts,
-    reading,
-    register,
-    rounded,
-    sigmoid,
-    transform_in_place,
-    unit_quats,
-)
+from warpgs.export import base
 from warpgs.geometry import pose_of, rotation_matrices
 from warpgs.scene import ORIGIN, base_colors
 
@@ -66,22 +50,22 @@ def glb(document: dict[str, Any], *body: bytes) -> list[bytes]:
     return [head, text, struct.pack("<II", size, BINARY_CHUNK), *body]
 
 
-def _document(arrays: Arrays, origin: np.ndarray | None) -> tuple[dict[str, Any], bytes]:
+def _document(arrays: base.Arrays, origin: np.ndarray | None) -> tuple[dict[str, Any], bytes]:
     """Return the glTF document and its binary buffer."""
-    a = half_turn({k: np.asarray(v) for k, v in arrays.items()}, "z")
+    a = base.half_turn({k: np.asarray(v) for k, v in arrays.items()}, "z")
     scales = np.clip(np.exp(a["log_scales"].astype(np.float64)), _TINY, 3e38)
     attributes = {
         "POSITION": ("VEC3", a["means"]),
-        f"{EXTENSION}:ROTATION": ("VEC4", unit_quats(a["quats"])[:, [1, 2, 3, 0]]),
+        f"{EXTENSION}:ROTATION": ("VEC4", base.unit_quats(a["quats"])[:, [1, 2, 3, 0]]),
         f"{EXTENSION}:SCALE": ("VEC3", scales),
-        f"{EXTENSION}:OPACITY": ("SCALAR", sigmoid(a["logit_opacities"])),
+        f"{EXTENSION}:OPACITY": ("SCALAR", base.sigmoid(a["logit_opacities"])),
     }
     for k in range(a["sh"].shape[1]):
         degree = math.isqrt(k)
         attributes[f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{k - degree * degree}"] = ("VEC3", a["sh"][:, k])
     # for programs that show Gaussians as points
     opacities, colors = attributes[f"{EXTENSION}:OPACITY"][1][:, None], linear(base_colors(a["sh"][:, :1]))
-    attributes["COLOR_0"] = ("VEC4", rounded(65535 * np.concatenate([colors, opacities], 1), 65535).astype("<u2"))
+    attributes["COLOR_0"] = ("VEC4", base.rounded(65535 * np.concatenate([colors, opacities], 1), 65535).astype("<u2"))
     views: list[dict] = []
     accessors: list[dict] = []
     parts_of_body: list[bytes] = []
@@ -115,12 +99,12 @@ def _document(arrays: Arrays, origin: np.ndarray | None) -> tuple[dict[str, Any]
     return document, b"".join(parts_of_body)
 
 
-def decode(path: Path, data: bytes) -> Arrays:
+def decode(path: Path, data: bytes) -> base.Arrays:
     """Return the Gaussians of a .glb or .gltf file's bytes, in the axes of PLY."""
     document, body = _split(path, data)
     buffers = document.get("buffers")
     if not isinstance(buffers, list) or len(buffers) != 1 or not isinstance(buffers[0], dict):
-        raise malformed(path, "it does not have exactly one buffer")
+        raise base.malformed(path, "it does not have exactly one buffer")
     if (uri := buffers[0].get("uri")) is not None:
         body = _inside(path, uri)
     primitive, mesh = _primitive(path, document)
@@ -128,48 +112,48 @@ def decode(path: Path, data: bytes) -> Arrays:
 
     def values(name: str) -> np.ndarray:
         if name not in names:
-            raise malformed(path, f"the attribute {name} is missing")
+            raise base.malformed(path, f"the attribute {name} is missing")
         return _accessor(path, document, body, names[name], whole=name in ("POSITION", f"{EXTENSION}:SCALE"))
 
     degrees = [d for d in range(4) if f"{EXTENSION}:SH_DEGREE_{d}_COEF_0" in names]
     if degrees != list(range(len(degrees))) or not degrees:
-        raise malformed(path, f"it has harmonics of degrees {degrees}, but degrees must start at 0 and have no gap")
-    orders = [(math.isqrt(k), k - math.isqrt(k) ** 2) for k in range(SH_SIZES[degrees[-1]])]
+        raise base.malformed(path, f"it has harmonics of degrees {degrees}, but degrees must start at 0 and have no gap")
+    orders = [(math.isqrt(k), k - math.isqrt(k) ** 2) for k in range(base.SH_SIZES[degrees[-1]])]
     means, turns, scales, opacities = (
         values(name) for name in ("POSITION", *(f"{EXTENSION}:{n}" for n in ("ROTATION", "SCALE", "OPACITY")))
     )
     harmonics = [values(f"{EXTENSION}:SH_DEGREE_{d}_COEF_{c}") for d, c in orders]
     n = len(means)
     if any(len(v) != n for v in (turns, scales, opacities, *harmonics)):
-        raise malformed(path, "its attributes differ in length")
+        raise base.malformed(path, "its attributes differ in length")
     if {v.shape[1] for v in (means, scales, *harmonics)} != {3}:
-        raise malformed(path, "a position, scale or harmonic does not have three components")
+        raise base.malformed(path, "a position, scale or harmonic does not have three components")
 
     def logs(part: slice) -> np.ndarray:
         lengths = _rows(scales, part)
         if (lengths < 0).any():
-            raise malformed(path, "an axis has a negative length")
+            raise base.malformed(path, "an axis has a negative length")
         return np.log(np.maximum(lengths, _TINY))
 
     sh = np.empty((n, len(harmonics), 3), np.float32)
     for k, table in enumerate(harmonics):
-        for part in parts(n):
+        for part in base.parts(n):
             sh[part, k] = _rows(table, part)
     arrays = {
         "sh": sh,
-        "means": by_rows(n, (3,), lambda p: _rows(means, p)),
-        "quats": by_rows(n, (4,), lambda p: _rows(turns, p)[:, [3, 0, 1, 2]]),
-        "log_scales": by_rows(n, (3,), logs),
-        "logit_opacities": by_rows(n, (), lambda p: logits(_rows(opacities, p)[:, 0], 2.0**-22)),
+        "means": base.by_rows(n, (3,), lambda p: _rows(means, p)),
+        "quats": base.by_rows(n, (4,), lambda p: _rows(turns, p)[:, [3, 0, 1, 2]]),
+        "log_scales": base.by_rows(n, (3,), logs),
+        "logit_opacities": base.by_rows(n, (), lambda p: base.logits(_rows(opacities, p)[:, 0], 2.0**-22)),
     }
     copies = [arrays, *({name: array.copy() for name, array in arrays.items()} for _ in places[1:])]
     for copy, place in zip(copies, places):
         if not np.array_equal(place, np.eye(4)):
             copy["means"] = copy["means"].astype(np.float64)  # a translation may be in map coordinates
-            transform_in_place(copy, place[:3, :3], place[:3, 3])
+            base.transform_in_place(copy, place[:3, :3], place[:3, 3])
     if places[1:]:
         arrays = {name: np.concatenate([copy[name] for copy in copies]) for name in arrays}
-    half_turn_in_place(arrays, "z")
+    base.half_turn_in_place(arrays, "z")
     return arrays
 
 
@@ -185,21 +169,23 @@ def _places(path: Path, document: dict[str, Any], mesh: int) -> list[np.ndarray]
         i, above = left.pop()
         node, place = _item(path, document, "nodes", i), above @ _matrix_of(_item(path, document, "nodes", i))
         if i in seen:
-            raise malformed(path, f"node {i} has two parents")
+            raise base.malformed(path, f"node {i} has two parents")
         seen.add(i)
         left += [(child, place) for child in reversed(node.get("children", []))]
         if node.get("mesh") == mesh:
             if "EXT_mesh_gpu_instancing" in (node.get("extensions") or ()):
-                raise malformed(path, f"node {i} repeats the Gaussians with EXT_mesh_gpu_instancing, which is not supported")
+                raise base.malformed(
+                    path, f"node {i} repeats the Gaussians with EXT_mesh_gpu_instancing, which is not supported"
+                )
             product = place[:3, :3].T @ place[:3, :3]
             square = np.trace(product) / 3
             if not (square > 0 and np.isfinite(place).all() and np.abs(product / square - np.eye(3)).max() <= MAX_SHEAR):
-                raise malformed(
+                raise base.malformed(
                     path, f"node {i} scales the Gaussians by different factors, by 0 or with shear; apply it in another program"
                 )
             found.append(place)
     if len(found) > MAX_COPIES or (not found and any(n.get("mesh") == mesh for n in nodes)):
-        raise malformed(path, f"its scene shows the Gaussians {len(found)} times (supported: 1 to {MAX_COPIES})")
+        raise base.malformed(path, f"its scene shows the Gaussians {len(found)} times (supported: 1 to {MAX_COPIES})")
     return found or [np.eye(4)]
 
 
@@ -224,27 +210,29 @@ def _split(path: Path, data: bytes) -> tuple[dict[str, Any], bytes | memoryview]
     body: bytes | memoryview = b""
     if data[:4] == b"glTF":
         if len(data) < 20:
-            raise malformed(path, "its header is truncated")
+            raise base.malformed(path, "its header is truncated")
         _, version, total, size, kind = struct.unpack_from("<IIIII", data)
         if version != 2 or kind != JSON_CHUNK or not 20 + size <= total <= len(data):
-            raise malformed(path, f"its header is invalid: version {version}, {total} bytes, in a file of {len(data)} bytes")
+            raise base.malformed(
+                path, f"its header is invalid: version {version}, {total} bytes, in a file of {len(data)} bytes"
+            )
         text, rest = data[20 : 20 + size], memoryview(data)[20 + size : total]
         if len(rest) >= 8:
             size, kind = struct.unpack_from("<II", rest)
             if kind != BINARY_CHUNK:
-                raise malformed(path, f"its second chunk is not binary: type {kind:#010x}")
+                raise base.malformed(path, f"its second chunk is not binary: type {kind:#010x}")
             if size > len(rest) - 8:
-                raise malformed(path, f"its binary chunk of {size} bytes is truncated")
+                raise base.malformed(path, f"its binary chunk of {size} bytes is truncated")
             body = rest[8 : 8 + size]
     else:
         text = data
     if text.count(b"[") + text.count(b"{") > MAX_PARTS:
-        raise malformed(path, f"its JSON has more than {MAX_PARTS:,} lists and objects")
+        raise base.malformed(path, f"its JSON has more than {MAX_PARTS:,} lists and objects")
     if text.count(b",") > MAX_VALUES:
-        raise malformed(path, f"its JSON has more than {MAX_VALUES:,} values")
+        raise base.malformed(path, f"its JSON has more than {MAX_VALUES:,} values")
     document = json.loads(text)
     if not isinstance(document, dict):
-        raise malformed(path, "its JSON is not an object")
+        raise base.malformed(path, "its JSON is not an object")
     return document, body
 
 
@@ -252,25 +240,25 @@ def _inside(path: Path, uri: object) -> bytes:
     """Return the bytes of a data URI; other URIs are rejected, so that a file cannot choose other files to open."""
     head, comma, text = uri.partition(",") if isinstance(uri, str) else ("", "", "")
     if not (head.startswith("data:") and head.endswith(";base64") and comma):
-        raise malformed(path, "its numbers are in another file, which is not opened; combine both into one .glb")
+        raise base.malformed(path, "its numbers are in another file, which is not opened; combine both into one .glb")
     return base64.b64decode(text, validate=True)
 
 
 def _primitive(path: Path, document: dict[str, Any]) -> tuple[dict[str, Any], int]:
     """Return the one primitive of Gaussians and the number of its mesh; DataError for features that are not supported."""
     if unknown := [str(e)[:40] for e in document.get("extensionsRequired", []) if e not in SUPPORTED]:
-        raise malformed(path, f"it requires the extension {unknown[0]}, which is not supported")
+        raise base.malformed(path, f"it requires the extension {unknown[0]}, which is not supported")
     primitives = [(p, i) for i, mesh in enumerate(document.get("meshes", [])) for p in mesh["primitives"]]
     found = [(p, i) for p, i in primitives if EXTENSION in p.get("extensions", {})]
     if len(found) != 1:
-        raise malformed(path, f"it has {len(found)} primitives with {EXTENSION}; exactly one is supported")
+        raise base.malformed(path, f"it has {len(found)} primitives with {EXTENSION}; exactly one is supported")
     extension = found[0][0]["extensions"][EXTENSION]
     kernel, space = extension.get("kernel"), extension.get("colorSpace")
     if (kernel, space) != ("ellipse", COLOR_SPACE):
         given = f"kernel {str(kernel)[:40]!r} or colour space {str(space)[:40]!r} is not supported"
-        raise malformed(path, f"{given} (supported: 'ellipse', {COLOR_SPACE!r})")
+        raise base.malformed(path, f"{given} (supported: 'ellipse', {COLOR_SPACE!r})")
     if extension.get("extensions"):
-        raise malformed(path, "its Gaussians are compressed by a further extension; export them uncompressed")
+        raise base.malformed(path, "its Gaussians are compressed by a further extension; export them uncompressed")
     return found[0]
 
 
@@ -278,7 +266,7 @@ def _item(path: Path, document: dict[str, Any], table: str, at: object) -> dict[
     """Return an object of a list of the document."""
     rows = document.get(table)
     if not isinstance(rows, list) or type(at) is not int or not 0 <= at < len(rows) or not isinstance(rows[at], dict):
-        raise malformed(path, f"{table} {str(at)[:20]} does not exist")
+        raise base.malformed(path, f"{table} {str(at)[:20]} does not exist")
     row: dict[str, Any] = rows[at]
     return row
 
@@ -289,61 +277,61 @@ def _accessor(path: Path, document: dict[str, Any], body: bytes | memoryview, in
     def count(row: dict[str, Any], key: str, default: int | None = None) -> int:
         value = row.get(key, default)
         if type(value) is not int or not 0 <= value <= len(body):
-            raise malformed(path, f"{key} {str(value)[:20]!r} does not fit into the {len(body)} bytes of its buffer")
+            raise base.malformed(path, f"{key} {str(value)[:20]!r} does not fit into the {len(body)} bytes of its buffer")
         return value
 
     accessor = _item(path, document, "accessors", index)
     view = _item(path, document, "bufferViews", accessor.get("bufferView"))
     kind, width = _KINDS.get(accessor.get("componentType")), _WIDTHS.get(accessor.get("type"))
     if kind is None or width is None or "sparse" in accessor or view.get("buffer") != 0:
-        raise malformed(path, f"accessor {index} has an unsupported type")
+        raise base.malformed(path, f"accessor {index} has an unsupported type")
     normalized = accessor.get("normalized") is True
     if kind != "<f4" and not (normalized or whole):
-        raise malformed(path, f"accessor {index} contains integers that are not normalised")
+        raise base.malformed(path, f"accessor {index} contains integers that are not normalised")
     dtype = np.dtype(kind)
     size, rows = dtype.itemsize * width, count(accessor, "count")
     stride = count(view, "byteStride", size) or size
     start, offset, length = count(view, "byteOffset", 0), count(accessor, "byteOffset", 0), count(view, "byteLength")
     if stride < size or start + length > len(body) or (rows and offset + (rows - 1) * stride + size > length):
-        raise malformed(path, f"accessor {index} reaches beyond its {length} bytes")
+        raise base.malformed(path, f"accessor {index} reaches beyond its {length} bytes")
     if not rows:
         return np.empty((0, width), np.float32)
     numbers = np.ndarray((rows, width), dtype, body, start + offset, (stride, dtype.itemsize))
     return numbers if kind == "<f4" or normalized else numbers.astype(np.float32)
 
 
-@register("glb")
-class BinaryGltf(Format):
+@base.register("glb")
+class BinaryGltf(base.Format):
     """Binary glTF."""
 
     suffix = ".glb"
     description = "glTF 2.0 with KHR_gaussian_splatting, binary, float32; Cesium, 3D engines"
     decode = staticmethod(decode)
 
-    def encode(self, arrays: Arrays) -> list[bytes]:
+    def encode(self, arrays: base.Arrays) -> list[bytes]:
         """Return the bytes of a file."""
         return glb(*_document(arrays, self.origin))
 
     def origin_in(self, path: Path) -> object:
         """Return the origin in the document's extras."""
-        with reading(path, whole=True) as file:
+        with base.reading(path, whole=True) as file:
             extras = _split(path, file.read())[0].get("extras")
         return extras.get(ORIGIN) if isinstance(extras, dict) else None
 
     def is_own(self, path: Path) -> bool:
         """Return whether the document names warpgs as its generator."""
-        with reading(path, whole=True) as file:
+        with base.reading(path, whole=True) as file:
             return bool(_split(path, file.read())[0].get("asset") == {"version": "2.0", "generator": "warpgs"})
 
 
-@register("gltf")
+@base.register("gltf")
 class TextGltf(BinaryGltf):
     """Text glTF."""
 
     suffix = ".gltf"
     description = "glTF 2.0 with KHR_gaussian_splatting, text with embedded numbers"
 
-    def encode(self, arrays: Arrays) -> list[bytes]:
+    def encode(self, arrays: base.Arrays) -> list[bytes]:
         """Return the bytes of a file, with its numbers embedded as base64."""
         document, body = _document(arrays, self.origin)
         document["buffers"][0]["uri"] = "data:application/octet-stream;base64," + base64.b64encode(body).decode()

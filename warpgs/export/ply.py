@@ -13,29 +13,8 @@ from pathlib import Path
 import numpy as np
 
 from warpgs.errors import DataError
-from warpgs.export.base import (
-    SH_SIZES,
-    SQRT2,
-    Arrays,
-    Format,
-    arrays_to_write,
-    by_rows,
-    from_origin,
-    from_smallest_three,
-    logits,
-    malformed,
-    origin_of,
-    parts,
-    reading,
-    register,
-    rounded,
-    sigmoid,
-    smallest_three,
-    usable,
-    warn_of_antialiasing,
-    with_least_scale,
-)
-from warpgs.files import writing
+from warpgs.export import base
+from warpgs.files import replacing
 from warpgs.geometry import checked_normalization
 from warpgs.scene import ORIGIN, Gaussians, Normalization, base_coefficients, base_colors, checked_origin
 
@@ -154,23 +133,23 @@ _VERTEX_NAMES = ["packed_position", "packed_rotation", "packed_scale", "packed_c
 _BITS = (11, 10, 11)
 
 
-def encode(arrays: Arrays, antialiased: bool, origin: np.ndarray | None = None) -> list[bytes]:
+def encode(arrays: base.Arrays, antialiased: bool, origin: np.ndarray | None = None) -> list[bytes]:
     """Return the bytes of a file, with antialiasing declared in its header; harmonics above degree 0 are clamped to +-4."""
     n, k = arrays["sh"].shape[:2]
     chunks = np.arange(n) // CHUNK
     colors = base_colors(arrays["sh"][:, :1].astype(np.float64))
     bounds, fractions = [], []
-    for values in (arrays["means"], with_least_scale(arrays["log_scales"]), colors):
+    for values in (arrays["means"], base.with_least_scale(arrays["log_scales"]), colors):
         starts = np.arange(0, n, CHUNK)
         low = np.minimum.reduceat(values, starts).astype("<f4")
         high = np.maximum.reduceat(values, starts).astype("<f4")
         bounds += [low, high]
         span = high.astype(np.float64) - low
         fractions.append((values - low[chunks].astype(np.float64)) / np.where(span > 0, span, 1)[chunks])
-    largest, others = smallest_three(arrays["quats"])
+    largest, others = base.smallest_three(arrays["quats"])
     position, scale = (_pack(fractions[i], _BITS) for i in (0, 1))
-    rgba = np.concatenate([fractions[2], sigmoid(arrays["logit_opacities"])[:, None]], 1)
-    rotation = (largest << 30) | _pack(others / SQRT2 + 0.5, (10, 10, 10))
+    rgba = np.concatenate([fractions[2], base.sigmoid(arrays["logit_opacities"])[:, None]], 1)
+    rotation = (largest << 30) | _pack(others / base.SQRT2 + 0.5, (10, 10, 10))
     rows = np.stack([position, rotation, scale, _pack(rgba, (8, 8, 8, 8))], 1).astype("<u4")
     rest = arrays["sh"][:, 1:].astype(np.float64).transpose(0, 2, 1).reshape(n, -1)
     harmonics = np.clip(np.floor((rest / SH_RANGE + 0.5) * 256), 0, 255).astype("u1")
@@ -186,7 +165,7 @@ def encode(arrays: Arrays, antialiased: bool, origin: np.ndarray | None = None) 
 
 def start_of(path: Path) -> bytes:
     """Return the first `MAX_HEADER_BYTES` bytes of a PLY file, or the whole file if it is shorter, and check its header."""
-    with reading(path) as file:
+    with base.reading(path) as file:
         head = file.read(MAX_HEADER_BYTES)
     parse_header(path, head)
     return head
@@ -198,23 +177,23 @@ def is_compressed(path: Path, data: bytes) -> bool:
     return any(name == "vertex" and "packed_position" in dict(properties) for name, _, properties in elements)
 
 
-def decode(path: Path, data: bytes) -> Arrays:
+def decode(path: Path, data: bytes) -> base.Arrays:
     """Return the Gaussians of a file's bytes."""
     elements, start = parse_header(path, data[:MAX_HEADER_BYTES])
     if ASCII.search(data[:start]):
-        raise malformed(path, "it is compressed, but in ASCII")
+        raise base.malformed(path, "it is compressed, but in ASCII")
     tables = {}
     for element in elements:
         name, _, properties = element
         if name in tables or not properties or LIST in dict(properties).values():
-            raise malformed(path, f"its element {name[:40]!r} is invalid")
+            raise base.malformed(path, f"its element {name[:40]!r} is invalid")
         tables[name], start = _table(path, data, element, start)
     chunk, vertex, sh = tables.get("chunk"), tables.get("vertex"), tables.get("sh")
     if chunk is None or vertex is None:
-        raise malformed(path, "the element chunk or vertex is missing")
+        raise base.malformed(path, "the element chunk or vertex is missing")
     n = len(vertex)
     if len(chunk) != -(-n // CHUNK):
-        raise malformed(path, f"it has {len(chunk)} chunks, but {n} Gaussians need {-(-n // CHUNK)}")
+        raise base.malformed(path, f"it has {len(chunk)} chunks, but {n} Gaussians need {-(-n // CHUNK)}")
     position, rotation, scale, color = (_column(path, vertex, name, "<u4") for name in _VERTEX_NAMES)
     bounds = [_bounds(path, chunk, group) for group in _GROUPS]
 
@@ -228,7 +207,7 @@ def decode(path: Path, data: bytes) -> Arrays:
 
     def quats(part: slice) -> np.ndarray:
         packed = rotation[part].astype(np.int64)
-        return from_smallest_three(packed >> 30, (_unpack(packed & (2**30 - 1), (10, 10, 10)) - 0.5) * SQRT2)
+        return base.from_smallest_three(packed >> 30, (_unpack(packed & (2**30 - 1), (10, 10, 10)) - 0.5) * base.SQRT2)
 
     def harmonics(part: slice) -> np.ndarray:
         first = base_coefficients(values(2, color, (8, 8, 8, 8), part))[:, None]
@@ -236,11 +215,13 @@ def decode(path: Path, data: bytes) -> Arrays:
 
     rest, k = (None, 1) if sh is None else _harmonics(path, sh, n)
     return {
-        "sh": by_rows(n, (k, 3), harmonics),
-        "means": by_rows(n, (3,), lambda p: values(0, position, _BITS, p)),
-        "quats": by_rows(n, (4,), quats),
-        "log_scales": by_rows(n, (3,), lambda p: values(1, scale, _BITS, p)),
-        "logit_opacities": by_rows(n, (), lambda p: logits(_unpack(color[p].astype(np.int64), (8, 8, 8, 8))[:, 3], 1 / 255)),
+        "sh": base.by_rows(n, (k, 3), harmonics),
+        "means": base.by_rows(n, (3,), lambda p: values(0, position, _BITS, p)),
+        "quats": base.by_rows(n, (4,), quats),
+        "log_scales": base.by_rows(n, (3,), lambda p: values(1, scale, _BITS, p)),
+        "logit_opacities": base.by_rows(
+            n, (), lambda p: base.logits(_unpack(color[p].astype(np.int64), (8, 8, 8, 8))[:, 3], 1 / 255)
+        ),
     }
 
 
@@ -257,8 +238,8 @@ def _bounds(path: Path, chunk: np.ndarray, group: tuple[str, ...]) -> list[np.nd
 def _harmonics(path: Path, sh: np.ndarray, n: int) -> tuple[Callable[[slice], np.ndarray], int]:
     """Return a function for the coefficients above degree 0 [P, K - 1, 3] of some rows, and K."""
     count = len(sh.dtype.names or ())
-    if len(sh) != n or count // 3 + 1 not in SH_SIZES or count % 3:
-        raise malformed(path, f"{len(sh)} rows of {count} harmonics do not fit {n} Gaussians")
+    if len(sh) != n or count // 3 + 1 not in base.SH_SIZES or count % 3:
+        raise base.malformed(path, f"{len(sh)} rows of {count} harmonics do not fit {n} Gaussians")
     columns = [_column(path, sh, f"f_rest_{i}", "u1") for i in range(count)]
 
     def rows(part: slice) -> np.ndarray:
@@ -275,19 +256,19 @@ def _table(path: Path, data: bytes, element: Element, start: int) -> tuple[np.nd
     """Return the rows of an element that begins at byte ``start`` of the file, and the byte at which the next one begins."""
     name, count, properties = element
     if len(dict(properties)) < len(properties):
-        raise malformed(path, f"a property of {name[:40]!r} appears twice")
+        raise base.malformed(path, f"a property of {name[:40]!r} appears twice")
     dtype = np.dtype(properties)
     end = start + count * dtype.itemsize
     if end > len(data):
         rows = f"{count} rows of {name[:40]!r}"
-        raise malformed(path, f"truncated: {rows} end at byte {end}, but the file has {len(data)} bytes")
+        raise base.malformed(path, f"truncated: {rows} end at byte {end}, but the file has {len(data)} bytes")
     return np.frombuffer(data, dtype, count, start), end
 
 
 def _column(path: Path, table: np.ndarray, name: str, kind: str) -> np.ndarray:
     """Return a column of a table; DataError where it is missing or of another type."""
     if name not in (table.dtype.names or ()) or table.dtype[name] != np.dtype(kind):
-        raise malformed(path, f"the property {name} is missing, or has the wrong type")
+        raise base.malformed(path, f"the property {name} is missing, or has the wrong type")
     return table[name]
 
 
@@ -296,7 +277,7 @@ def _pack(fractions: np.ndarray, bits: tuple[int, ...]) -> np.ndarray:
     packed = np.zeros(len(fractions), np.int64)
     for column, width in zip(fractions.T, bits):
         most = 2**width - 1
-        packed = (packed << width) | rounded(column * most, most)
+        packed = (packed << width) | base.rounded(column * most, most)
     return packed
 
 
@@ -310,7 +291,7 @@ def _unpack(packed: np.ndarray, bits: tuple[int, ...]) -> np.ndarray:
     return np.stack(columns[::-1], 1)
 
 
-class _HeadedFormat(Format):
+class _HeadedFormat(base.Format):
     """A format with declarations of a file as comments in its header."""
 
     declares = True
@@ -328,7 +309,7 @@ class _HeadedFormat(Format):
         return is_own(start_of(path))
 
 
-@register("compressed_ply")
+@base.register("compressed_ply")
 class CompressedPLY(_HeadedFormat):
     """The compressed PLY format."""
 
@@ -337,7 +318,7 @@ class CompressedPLY(_HeadedFormat):
     sorted = True
     decode = staticmethod(decode)
 
-    def encode(self, arrays: Arrays) -> list[bytes]:
+    def encode(self, arrays: base.Arrays) -> list[bytes]:
         """Return the bytes of a file."""
         return encode(arrays, self.antialiased, self.origin)
 
@@ -402,10 +383,10 @@ def _write(
     origin: np.ndarray | None,
 ) -> None:  # fmt: skip
     """Write Gaussians as `write_ply` does, about an ``origin`` [3] if one is given."""
-    arrays, origin = arrays_to_write(path, gaussians, normalization, units, origin)
+    arrays, origin = base.arrays_to_write(path, gaussians, normalization, units, origin)
     n, k = arrays["sh"].shape[:2]
     header = _header(n, 3 * (k - 1), antialiased, origin)
-    with writing(path, len(header) + 4 * n * (14 + 3 * k)) as file:
+    with replacing(path, size=len(header) + 4 * n * (14 + 3 * k)) as (file, _):
         file.write(header)
         for start in range(0, n, CHUNK_ROWS):
             file.write(_rows({name: a[start : start + CHUNK_ROWS] for name, a in arrays.items()}).tobytes())
@@ -437,9 +418,9 @@ def read_ply(path: str | os.PathLike[str], normalization: Normalization | None =
     path = Path(path)
     notes: list[str] = []
     normalization = checked_normalization(normalization, units, str(path))
-    gaussians = from_origin(*_read(path, False, notes), normalization, units)
+    gaussians = base.from_origin(*_read(path, False, notes), normalization, units)
     if is_antialiased(start_of(path)):
-        warn_of_antialiasing(path)
+        base.warn_of_antialiasing(path)
     for note in notes:
         warnings.warn(note, stacklevel=2)
     return gaussians
@@ -447,7 +428,7 @@ def read_ply(path: str | os.PathLike[str], normalization: Normalization | None =
 
 def _read(path: Path, strict: bool, notes: list[str]) -> tuple[Gaussians, np.ndarray]:
     """Return the Gaussians in file units about an origin, and the origin [3]; fills ``notes``."""
-    with reading(path) as file:
+    with base.reading(path) as file:
         size = os.fstat(file.fileno()).st_size
         head = file.read(MAX_HEADER_BYTES)
         elements, start = parse_header(path, head)
@@ -559,10 +540,10 @@ def _assemble(
     arrays = {name: np.empty((n, *shape), np.float32) for name, shape in shapes.items()}
     bad = np.zeros(n, bool)
     reasons: list[str] = []
-    for part in parts(n):
+    for part in base.parts(n):
         rows = read(part)
         if part.start == 0 and all(rows.dtype[name].itemsize == 8 for name in _POSITION):
-            middle = origin_of(np.stack([rows[name] for name in _POSITION], 1).astype(np.float64))
+            middle = base.origin_of(np.stack([rows[name] for name in _POSITION], 1).astype(np.float64))
         columns = functools.partial(_columns, rows, part.start, bad[part], reasons)
         if _DC[0] in (rows.dtype.names or ()):
             arrays["sh"][part, 0] = columns(_DC)
@@ -579,14 +560,14 @@ def _assemble(
         arrays["means"][part] = columns(_POSITION, shift=middle)
         arrays["log_scales"][part] = columns(_SCALE, least=FLAT)
         arrays["logit_opacities"][part] = columns(["opacity"], -OPAQUE, OPAQUE)[:, 0]
-    logits, scales = arrays["logit_opacities"], arrays["log_scales"]
-    if n >= LEAST_JUDGED and logits.min() >= 0 and logits.max() <= 1 and scales.min() > 0:
+    stored, scales = arrays["logit_opacities"], arrays["log_scales"]
+    if n >= LEAST_JUDGED and stored.min() >= 0 and stored.max() <= 1 and scales.min() > 0:
         notes.append(
-            f"{path}: all opacities are from {logits.min():.2g} to {logits.max():.2g} and all log scales above 0, as if stored "
+            f"{path}: all opacities are from {stored.min():.2g} to {stored.max():.2g} and all log scales above 0, as if stored "
             "after the sigmoid and the exponential; they are read as logits and logarithms. If images are foggy, export the "
             "model again without activations"
         )
-    return usable(path, arrays, bad, next(iter(reasons), ""), lambda: strict, notes, ply_error), origin + middle
+    return base.usable(path, arrays, bad, next(iter(reasons), ""), lambda: strict, notes, ply_error), origin + middle
 
 
 def _columns(
@@ -611,7 +592,7 @@ def _columns(
     return out
 
 
-@register("ply")
+@base.register("ply")
 class PLY(_HeadedFormat):
     """The PLY format; such a file may be compressed."""
 

@@ -17,23 +17,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from warpgs.export.base import (
-    SH_SIZES,
-    SQRT2,
-    Arrays,
-    Format,
-    by_rows,
-    from_smallest_three,
-    logits,
-    malformed,
-    parts,
-    reading,
-    register,
-    rounded,
-    sigmoid,
-    smallest_three,
-    with_least_scale,
-)
+from warpgs.export import base
 from warpgs.scene import ORIGIN
 
 LEVELS = 256
@@ -57,7 +41,7 @@ MAX_PALETTE_PIXELS = 2**20
 _DATE = (1980, 1, 1, 0, 0, 0)
 
 
-def encode(arrays: Arrays, antialiased: bool = False, origin: np.ndarray | None = None) -> list[bytes]:
+def encode(arrays: base.Arrays, antialiased: bool = False, origin: np.ndarray | None = None) -> list[bytes]:
     """Return the bytes of a file, with antialiasing declared in meta.json."""
     n, k = arrays["sh"].shape[:2]
     width = 4 * math.ceil(math.sqrt(n) / 4)
@@ -76,19 +60,19 @@ def encode(arrays: Arrays, antialiased: bool = False, origin: np.ndarray | None 
     means = arrays["means"].astype(np.float64)
     logs = np.sign(means) * np.log1p(np.abs(means))
     low, high = logs.min(0), logs.max(0)
-    levels = rounded(65535 * (logs - low) / np.where(high > low, high - low, 1), 65535)
+    levels = base.rounded(65535 * (logs - low) / np.where(high > low, high - low, 1), 65535)
     meta["means"] = {"mins": low.tolist(), "maxs": high.tolist(), "files": ["means_l.webp", "means_u.webp"]}
     image("means_l.webp", *(levels & 255).T)
     image("means_u.webp", *(levels >> 8).T)
-    largest, others = smallest_three(arrays["quats"])
+    largest, others = base.smallest_three(arrays["quats"])
     meta["quats"] = {"files": ["quats.webp"]}
-    image("quats.webp", *rounded(255 * (others / SQRT2 + 0.5), 255).T, largest + 252)
-    book, labels = codebook(with_least_scale(arrays["log_scales"]))
+    image("quats.webp", *base.rounded(255 * (others / base.SQRT2 + 0.5), 255).T, largest + 252)
+    book, labels = codebook(base.with_least_scale(arrays["log_scales"]))
     meta["scales"] = {"codebook": book.tolist(), "files": ["scales.webp"]}
     image("scales.webp", *labels.T)
     book, labels = codebook(arrays["sh"][:, 0])
     meta["sh0"] = {"codebook": book.tolist(), "files": ["sh0.webp"]}
-    image("sh0.webp", *labels.T, rounded(255 * sigmoid(arrays["logit_opacities"]), 255))
+    image("sh0.webp", *labels.T, base.rounded(255 * base.sigmoid(arrays["logit_opacities"]), 255))
     if k > 1:
         rows, labels = _palette(arrays["sh"][:, 1:].reshape(n, -1).astype(np.float64))
         book, pixels = codebook(rows)
@@ -157,7 +141,7 @@ def _webp(pixels: np.ndarray) -> bytes:
     return out.getvalue()
 
 
-def decode(path: Path, file: BinaryIO) -> Arrays:
+def decode(path: Path, file: BinaryIO) -> base.Arrays:
     """Return the Gaussians of an open file; images much larger than the Gaussians need are rejected before decoding."""
     size = file.seek(0, os.SEEK_END)
     _check_contents(path, file, size)
@@ -165,9 +149,9 @@ def decode(path: Path, file: BinaryIO) -> Arrays:
         meta = _meta(path, archive)
         n = meta.get("count")
         if meta.get("model", "default") not in ("default", "antialiased"):
-            raise malformed(path, f"its model {str(meta['model'])[:40]!r} is not supported")
+            raise base.malformed(path, f"its model {str(meta['model'])[:40]!r} is not supported")
         if type(n) is not int or not 0 < n <= MAX_PER_BYTE * size + SMALL:
-            raise malformed(path, f"it announces {str(n)[:20]} Gaussians in only {size} bytes")
+            raise base.malformed(path, f"it announces {str(n)[:20]} Gaussians in only {size} bytes")
         most = MAX_PIXEL_BYTES * (MAX_PIXELS * n + SMALL)
 
         def pixels(part: str, i: int) -> np.ndarray:
@@ -180,7 +164,7 @@ def decode(path: Path, file: BinaryIO) -> Arrays:
         quats = _quats(path, pixels("quats", 0), n)
         means = _means(meta["means"], pixels("means", 0), pixels("means", 1), n)
         scales, book = pixels("scales", 0), _book(path, meta["scales"])
-        log_scales = by_rows(n, (3,), lambda p: book[scales[p, :3]])
+        log_scales = base.by_rows(n, (3,), lambda p: book[scales[p, :3]])
     return {"means": means, "quats": quats, "log_scales": log_scales, "logit_opacities": opacities, "sh": sh}
 
 
@@ -188,7 +172,7 @@ def _meta(path: Path, archive: zipfile.ZipFile) -> dict[str, Any]:
     """Return meta.json; DataError where it is of another version."""
     meta = json.loads(_member(path, archive, "meta.json", MAX_META_BYTES))
     if not isinstance(meta, dict) or meta.get("version") != 2:
-        raise malformed(path, "its meta.json is not of version 2")
+        raise base.malformed(path, "its meta.json is not of version 2")
     return meta
 
 
@@ -201,7 +185,7 @@ def _harmonics(
     rows = _palette_rows(path, meta["shN"], member(meta["shN"]["files"][0]))
     labels = pixels("shN", 1)
     sh = np.empty((n, 1 + rows.shape[1], 3), np.float32)
-    for part in parts(n):
+    for part in base.parts(n):
         label = labels[part, 0].astype(np.int64) | labels[part, 1].astype(np.int64) << 8
         sh[part, 1:] = rows[_within(path, label, len(rows), part.start)]
     return sh
@@ -209,9 +193,9 @@ def _harmonics(
 
 def _colors(book: np.ndarray, pixels: np.ndarray, sh: np.ndarray) -> np.ndarray:
     """Set the first coefficient in ``sh`` [N, K, 3] from colour pixels [P, 4]; returns the logits of the opacities [N]."""
-    for part in parts(len(sh)):
+    for part in base.parts(len(sh)):
         sh[part, 0] = book[pixels[part, :3]]
-    return by_rows(len(sh), (), lambda p: logits(pixels[p, 3] / 255, 1 / 255))
+    return base.by_rows(len(sh), (), lambda p: base.logits(pixels[p, 3] / 255, 1 / 255))
 
 
 def _means(part: dict[str, Any], lower: np.ndarray, upper: np.ndarray, n: int) -> np.ndarray:
@@ -224,16 +208,18 @@ def _means(part: dict[str, Any], lower: np.ndarray, upper: np.ndarray, n: int) -
         with np.errstate(over="ignore"):  # an infinity is named with its Gaussian afterwards
             return np.sign(logs) * np.expm1(np.abs(logs))
 
-    return by_rows(n, (3,), rows)
+    return base.by_rows(n, (3,), rows)
 
 
 def _quats(path: Path, pixels: np.ndarray, n: int) -> np.ndarray:
     """Return the rotations [N, 4] that ``pixels`` [P, 4] store."""
     largest = pixels[:n, 3]
     if (largest < 252).any():
-        raise malformed(path, f"the rotation of Gaussian {int(np.argmax(largest < 252))} does not name its largest component")
-    return by_rows(
-        n, (4,), lambda p: from_smallest_three(largest[p].astype(np.int64) - 252, (pixels[p, :3] / 255 - 0.5) * SQRT2)
+        raise base.malformed(
+            path, f"the rotation of Gaussian {int(np.argmax(largest < 252))} does not name its largest component"
+        )
+    return base.by_rows(
+        n, (4,), lambda p: base.from_smallest_three(largest[p].astype(np.int64) - 252, (pixels[p, :3] / 255 - 0.5) * base.SQRT2)
     )
 
 
@@ -246,7 +232,7 @@ def _check_contents(path: Path, file: BinaryIO, size: int) -> None:
     locator, end = (last := file.read())[:-22], last[-22:]
     plain = end[:4] == b"PK\5\6" and end[-2:] == b"\0\0" and locator[:4] != b"PK\6\7"
     if not plain or int.from_bytes(end[12:16], "little") > MAX_CONTENTS_BYTES:
-        raise malformed(
+        raise base.malformed(
             path, f"its table of contents is not at the end of the file, or has more than {MAX_CONTENTS_BYTES:,} bytes"
         )
 
@@ -254,13 +240,13 @@ def _check_contents(path: Path, file: BinaryIO, size: int) -> None:
 def _member(path: Path, archive: zipfile.ZipFile, name: object, most: int) -> bytes:
     """Return a file of the archive of at most ``most`` bytes, read into memory only: its name is never used as a path."""
     if not isinstance(name, str) or name not in archive.namelist():
-        raise malformed(path, f"{str(name)[:40]!r} is not in the archive")
+        raise base.malformed(path, f"{str(name)[:40]!r} is not in the archive")
     if archive.getinfo(name).file_size > most:
-        raise malformed(path, f"{name[:40]!r} would take {archive.getinfo(name).file_size} bytes")
+        raise base.malformed(path, f"{name[:40]!r} would take {archive.getinfo(name).file_size} bytes")
     with archive.open(name) as file:
         content = file.read(most + 1)
     if len(content) > most:
-        raise malformed(path, f"{name[:40]!r} takes more than {most} bytes")
+        raise base.malformed(path, f"{name[:40]!r} takes more than {most} bytes")
     return content
 
 
@@ -270,15 +256,15 @@ def _pixels(path: Path, name: str, content: bytes, n: int) -> np.ndarray:
 
     width, height = _webp_size(content)
     if not width * height:
-        raise malformed(path, f"{name[:40]!r} is not a lossless WebP image")
+        raise base.malformed(path, f"{name[:40]!r} is not a lossless WebP image")
     if not n <= width * height <= MAX_PIXELS * n + SMALL:
-        raise malformed(path, f"{name[:40]!r} has {width} x {height} pixels for {n} values")
+        raise base.malformed(path, f"{name[:40]!r} has {width} x {height} pixels for {n} values")
     try:
         image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error as e:
-        raise malformed(path, f"{name[:40]!r} is not a readable WebP image") from e
+        raise base.malformed(path, f"{name[:40]!r} is not a readable WebP image") from e
     if image is None or image.shape[:2] != (height, width) or image.dtype != np.uint8 or image.ndim != 3:
-        raise malformed(path, f"{name[:40]!r} is not a readable WebP image")
+        raise base.malformed(path, f"{name[:40]!r} is not a readable WebP image")
     if image.shape[2] == 4:
         return cv2.cvtColor(image, cv2.COLOR_BGRA2RGBA, image).reshape(-1, 4)
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGBA).reshape(-1, 4)
@@ -302,7 +288,7 @@ def _book(path: Path, part: dict[str, Any]) -> np.ndarray:
     """Return the 256 numbers of a codebook."""
     book = np.array(part["codebook"], np.float64)
     if book.shape != (LEVELS,):
-        raise malformed(path, f"a codebook has the shape {book.shape}, not {LEVELS} numbers")
+        raise base.malformed(path, f"a codebook has the shape {book.shape}, not {LEVELS} numbers")
     return book
 
 
@@ -310,11 +296,11 @@ def _palette_rows(path: Path, part: dict[str, Any], content: bytes) -> np.ndarra
     """Return the rows of the palette of harmonics [P, K - 1, 3]."""
     bands, count = part["bands"], part["count"]
     if bands not in (1, 2, 3) or type(count) is not int or not 0 < count <= PALETTE:
-        raise malformed(path, f"its table of harmonics is invalid: {str(count)[:20]} rows, {str(bands)[:20]} degrees")
-    k = SH_SIZES[bands] - 1
+        raise base.malformed(path, f"its table of harmonics is invalid: {str(count)[:20]} rows, {str(bands)[:20]} degrees")
+    k = base.SH_SIZES[bands] - 1
     pixels = _pixels(path, "harmonics", content, count * k)
     if len(pixels) % (COLUMNS * k):
-        raise malformed(path, "its image of harmonics has an invalid width")
+        raise base.malformed(path, "its image of harmonics has an invalid width")
     return _book(path, part).astype(np.float32)[pixels[: count * k, :3].reshape(count, k, 3)]
 
 
@@ -322,12 +308,12 @@ def _within(path: Path, labels: np.ndarray, count: int, first: int) -> np.ndarra
     """Return the labels of the Gaussians from number ``first`` on; DataError if a label is not below ``count``."""
     if (labels >= count).any():
         row = first + int(np.argmax(labels >= count))
-        raise malformed(path, f"Gaussian {row} refers to harmonics beyond the {count} rows")
+        raise base.malformed(path, f"Gaussian {row} refers to harmonics beyond the {count} rows")
     return labels
 
 
-@register("sog")
-class SOG(Format):
+@base.register("sog")
+class SOG(base.Format):
     """The SOG format."""
 
     suffix = ".sog"
@@ -337,7 +323,7 @@ class SOG(Format):
     declares = True
     decode = staticmethod(decode)
 
-    def encode(self, arrays: Arrays) -> list[bytes]:
+    def encode(self, arrays: base.Arrays) -> list[bytes]:
         """Return the bytes of a file."""
         return encode(arrays, self.antialiased, self.origin)
 
@@ -355,5 +341,5 @@ class SOG(Format):
 
     def _meta_of(self, path: Path) -> dict[str, Any]:
         """Return meta.json of a file."""
-        with reading(path) as file, zipfile.ZipFile(file) as archive:
+        with base.reading(path) as file, zipfile.ZipFile(file) as archive:
             return _meta(path, archive)

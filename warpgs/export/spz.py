@@ -17,25 +17,7 @@ from typing import BinaryIO
 import numpy as np
 
 from warpgs.errors import DataError, UsageError, install_extras
-from warpgs.export.base import (
-    SQRT2,
-    Arrays,
-    Format,
-    by_rows,
-    from_smallest_three,
-    half_turn,
-    half_turn_in_place,
-    logits,
-    malformed,
-    parts,
-    reading,
-    register,
-    rounded,
-    sigmoid,
-    smallest_three,
-    transform_in_place,
-    unit_quats,
-)
+from warpgs.export import base
 
 Section = Callable[[int], bytes]
 """Function that returns the next bytes of a section, exactly as many as are requested."""
@@ -74,37 +56,37 @@ def fractional_bits(means: np.ndarray) -> int:
     return bits
 
 
-def _sections(a: Arrays, bits: int, version: int) -> list[bytes]:
+def _sections(a: base.Arrays, bits: int, version: int) -> list[bytes]:
     """Return the attributes of RUB Gaussians in file order."""
     fixed = np.floor(a["means"].astype(np.float64) * 2.0**bits + 0.5).astype("<i4")
-    colors = rounded(COLOR * a["sh"][:, 0].astype(np.float64) + 127.5, 255)
-    scales = rounded(16 * (a["log_scales"].astype(np.float64) + 10), 255)
-    xyzw = unit_quats(a["quats"])[:, [1, 2, 3, 0]]
+    colors = base.rounded(COLOR * a["sh"][:, 0].astype(np.float64) + 127.5, 255)
+    scales = base.rounded(16 * (a["log_scales"].astype(np.float64) + 10), 255)
+    xyzw = base.unit_quats(a["quats"])[:, [1, 2, 3, 0]]
     if version == 2:
         positive = xyzw * np.where(xyzw[:, 3:] < 0, -1, 1)
-        rotations = rounded(127.5 * positive[:, :3] + 127.5, 255).astype("u1").tobytes()
+        rotations = base.rounded(127.5 * positive[:, :3] + 127.5, 255).astype("u1").tobytes()
     else:
-        largest, others = smallest_three(xyzw)
+        largest, others = base.smallest_three(xyzw)
         packed = largest << 30
         for i in range(3):
-            size = rounded(511 * SQRT2 * np.abs(others[:, i]), 511)
+            size = base.rounded(511 * base.SQRT2 * np.abs(others[:, i]), 511)
             packed |= (size | ((others[:, i] < 0).astype(np.int64) << 9)) << (10 * (2 - i))
         rotations = packed.astype("<u4").tobytes()
     return [
         fixed.view("u1").reshape(-1, 4)[:, :3].tobytes(),
-        rounded(255 * sigmoid(a["logit_opacities"]), 255).astype("u1").tobytes(),
+        base.rounded(255 * base.sigmoid(a["logit_opacities"]), 255).astype("u1").tobytes(),
         colors.astype("u1").tobytes(),
         scales.astype("u1").tobytes(),
         rotations,
-        rounded(128 * a["sh"][:, 1:].astype(np.float64) + 128, 255).astype("u1").tobytes(),
+        base.rounded(128 * a["sh"][:, 1:].astype(np.float64) + 128, 255).astype("u1").tobytes(),
     ]
 
 
-def encode(arrays: Arrays, version: int = VERSION, antialiased: bool = False) -> list[bytes]:
+def encode(arrays: base.Arrays, version: int = VERSION, antialiased: bool = False) -> list[bytes]:
     """Return the bytes of a file."""
     if version not in VERSIONS:
         raise UsageError(f"SPZ version {version}: choose one of {', '.join(map(str, VERSIONS))}")
-    a = half_turn({k: np.asarray(v) for k, v in arrays.items()}, "x")
+    a = base.half_turn({k: np.asarray(v) for k, v in arrays.items()}, "x")
     bits, n = fractional_bits(a["means"]), len(a["means"])
     sections, degree = _sections(a, bits, version), math.isqrt(a["sh"].shape[1]) - 1
     if version < 4:
@@ -117,20 +99,20 @@ def encode(arrays: Arrays, version: int = VERSION, antialiased: bool = False) ->
     return [HEADER_4.pack(MAGIC, 4, n, degree, bits, int(antialiased), len(streams), HEADER_4.size), toc, *streams]
 
 
-def decode(path: Path, data: bytes) -> Arrays:
+def decode(path: Path, data: bytes) -> base.Arrays:
     """Return the Gaussians of a file's bytes, in the axes of PLY."""
     if data[:2] == b"\x1f\x8b":
         stream = gzip.GzipFile(fileobj=io.BytesIO(data))
         head = stream.read(HEADER.size)
         if len(head) < HEADER.size:
-            raise malformed(path, "its header is truncated")
+            raise base.malformed(path, "its header is truncated")
         magic, version, n, degree, bits, flags, _ = HEADER.unpack(head)
         sizes = _checked(path, len(data), (magic, version, n, degree, bits), (2, 3))
         extensions = bytearray()
         sections = _parts_of_gzip(path, stream, n, sizes, extensions if flags & EXTENDED else None)
     else:
         if len(data) < HEADER_4.size:
-            raise malformed(path, "its header is truncated")
+            raise base.malformed(path, "its header is truncated")
         magic, version, n, degree, bits, flags, count, place = HEADER_4.unpack_from(data)
         sizes = _checked(path, len(data), (magic, version, n, degree, bits), (4,))
         extensions = bytearray(data[HEADER_4.size : place] if flags & EXTENDED else b"")
@@ -138,9 +120,9 @@ def decode(path: Path, data: bytes) -> Arrays:
     arrays = _unpack(sections, n, degree, bits, version)
     next(sections, None)  # checks the end of the last section
     if (system := _coordinate_system(path, extensions)) == RUB:
-        half_turn_in_place(arrays, "x")
+        base.half_turn_in_place(arrays, "x")
     else:
-        transform_in_place(arrays, to_ply(system), np.zeros(3))
+        base.transform_in_place(arrays, to_ply(system), np.zeros(3))
     return arrays
 
 
@@ -164,7 +146,7 @@ def _coordinate_system(path: Path, extensions: bytes | bytearray) -> int:
         if kind == COORDINATE_SYSTEM and size >= 4 and at <= len(extensions):
             system = int.from_bytes(extensions[at - size : at - size + 4], "little")
             if system > 16:
-                raise malformed(path, f"its coordinate system {system} is unknown (known: 1 to 16)")
+                raise base.malformed(path, f"its coordinate system {system} is unknown (known: 1 to 16)")
             return system or RUB
     return RUB
 
@@ -177,7 +159,7 @@ def _parts_of_gzip(
     def read(size: int) -> bytes:
         data = stream.read(size)
         if len(data) != size:
-            raise malformed(path, f"{n} Gaussians need {sum(sizes)} bytes, but the file has fewer")
+            raise base.malformed(path, f"{n} Gaussians need {sum(sizes)} bytes, but the file has fewer")
         return data
 
     for _ in sizes:
@@ -185,23 +167,23 @@ def _parts_of_gzip(
     if extensions is not None:
         extensions += stream.read(MAX_EXTENSIONS)
     if stream.read(1):  # at its end the checksum has been compared
-        raise malformed(path, f"{n} Gaussians need {sum(sizes)} bytes, but the file has more")
+        raise base.malformed(path, f"{n} Gaussians need {sum(sizes)} bytes, but the file has more")
 
 
 def _checked(path: Path, size: int, header: tuple[int, ...], versions: tuple[int, ...]) -> list[int]:
     """Return the sizes of the sections [bytes]; DataError where the header does not fit a file of ``size`` bytes."""
     magic, version, n, degree, bits = header
     if magic != MAGIC:
-        raise malformed(path, "it does not start with the SPZ signature")
+        raise base.malformed(path, "it does not start with the SPZ signature")
     if version not in versions:
-        raise malformed(path, f"version {version} is not supported here (supported: {', '.join(map(str, versions))})")
+        raise base.malformed(path, f"version {version} is not supported here (supported: {', '.join(map(str, versions))})")
     if degree > 4:
-        raise malformed(path, f"harmonics of degree {degree} are not supported (supported: 0 to 4)")
+        raise base.malformed(path, f"harmonics of degree {degree} are not supported (supported: 0 to 4)")
     if bits > MAX_FRACTIONAL_BITS:
-        raise malformed(path, f"its coordinates have {bits} fractional bits, more than {MAX_FRACTIONAL_BITS}")
+        raise base.malformed(path, f"its coordinates have {bits} fractional bits, more than {MAX_FRACTIONAL_BITS}")
     sizes = [9 * n, n, 3 * n, 3 * n, (3 if version == 2 else 4) * n, 3 * degree * (degree + 2) * n]
     if sum(sizes) > MAX_RATIO * size + SMALL:
-        raise malformed(path, f"it announces {n} Gaussians in only {size} bytes")
+        raise base.malformed(path, f"it announces {n} Gaussians in only {size} bytes")
     return sizes
 
 
@@ -209,7 +191,7 @@ def _streams(path: Path, data: bytes, sizes: list[int], count: int, place: int) 
     """Yield the sections of a version-4 file, each to be read to its end before the next; an empty section has no stream."""
     wanted = [s for s in sizes if s]
     if count != len(wanted) or place < HEADER_4.size or place + 16 * count > len(data):
-        raise malformed(path, f"its table of {count} streams at byte {place} is invalid")
+        raise base.malformed(path, f"its table of {count} streams at byte {place} is invalid")
     decompressor = _zstandard().ZstdDecompressor(max_window_size=MAX_WINDOW)
     view, i, start = memoryview(data), 0, place + 16 * count
     for size in sizes:
@@ -218,13 +200,13 @@ def _streams(path: Path, data: bytes, sizes: list[int], count: int, place: int) 
             continue
         packed, plain = struct.unpack_from("<QQ", data, place + 16 * i)
         if plain != size or start + packed > len(data):
-            raise malformed(
+            raise base.malformed(
                 path, f"stream {i} announces {packed} packed and {plain} unpacked bytes, but should unpack to {size}"
             )
         with decompressor.stream_reader(view[start : start + packed]) as reader:
             yield functools.partial(_decompressed, path, reader, i, size)
             if _decompressed(path, reader, i, size, 1, end=True):
-                raise malformed(path, f"stream {i} does not hold its {size} bytes")
+                raise base.malformed(path, f"stream {i} does not hold its {size} bytes")
         i, start = i + 1, start + packed
 
 
@@ -233,29 +215,29 @@ def _decompressed(path: Path, reader: BinaryIO, i: int, whole: int, size: int, *
     try:
         data = reader.read(size)
     except _zstandard().ZstdError as e:
-        raise malformed(path, f"stream {i} is not a zstd stream, or asks for more than {MAX_WINDOW >> 20} MiB") from e
+        raise base.malformed(path, f"stream {i} is not a zstd stream, or asks for more than {MAX_WINDOW >> 20} MiB") from e
     if len(data) != size and not end:
-        raise malformed(path, f"stream {i} does not hold its {whole} bytes")
+        raise base.malformed(path, f"stream {i} does not hold its {whole} bytes")
     return data
 
 
-def _unpack(sections: Iterator[Section], n: int, degree: int, bits: int, version: int) -> Arrays:
+def _unpack(sections: Iterator[Section], n: int, degree: int, bits: int, version: int) -> base.Arrays:
     """Return the Gaussians of the sections, in RUB axes."""
 
     def take(width: int, shape: tuple[int, ...], make: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
         read = next(sections)
-        return by_rows(n, shape, lambda p: make(np.frombuffer(read((p.stop - p.start) * width), "u1").reshape(-1, width)))
+        return base.by_rows(n, shape, lambda p: make(np.frombuffer(read((p.stop - p.start) * width), "u1").reshape(-1, width)))
 
     means = take(9, (3,), lambda data: _fixed(data) / 2.0**bits)
-    opacities = take(1, (), lambda data: logits(data[:, 0] / 255, 1 / 255))
+    opacities = take(1, (), lambda data: base.logits(data[:, 0] / 255, 1 / 255))
     k = degree * (degree + 2)
     read, sh = next(sections), np.empty((n, k + 1, 3), np.float32)
-    for p in parts(n):
+    for p in base.parts(n):
         sh[p, 0] = (np.frombuffer(read((p.stop - p.start) * 3), "u1").reshape(-1, 3) - 127.5) / COLOR
     scales = take(3, (3,), lambda data: data / 16 - 10)
     quats = take(3, (4,), _quats_2) if version == 2 else take(4, (4,), _quats)
     read = next(sections)
-    for p in parts(n):
+    for p in base.parts(n):
         rest = np.frombuffer(read((p.stop - p.start) * 3 * k), "u1").reshape(p.stop - p.start, k, 3)
         sh[p, 1:] = (rest.astype(np.float64) - 128) / 128
     return {"means": means, "quats": quats, "log_scales": scales, "logit_opacities": opacities, "sh": sh}
@@ -278,8 +260,8 @@ def _quats(data: np.ndarray) -> np.ndarray:
     """Return rotations wxyz [P, 4] from the bytes [P, 4] of versions 3 and 4."""
     packed = np.ascontiguousarray(data).view("<u4")[:, 0].astype(np.int64)
     components = np.stack([(packed >> s) & 1023 for s in (20, 10, 0)], 1)
-    fractions = np.where(components & 512, -1, 1) * (components & 511) / (511 * SQRT2)
-    return from_smallest_three(packed >> 30, fractions)[:, [3, 0, 1, 2]]
+    fractions = np.where(components & 512, -1, 1) * (components & 511) / (511 * base.SQRT2)
+    return base.from_smallest_three(packed >> 30, fractions)[:, [3, 0, 1, 2]]
 
 
 def _zstandard():
@@ -299,8 +281,8 @@ class SPZConfig:
     """Version of the format to write: 2, 3, or 4, which needs zstandard (the extra ``formats``)."""
 
 
-@register("spz")
-class SPZ(Format):
+@base.register("spz")
+class SPZ(base.Format):
     """The SPZ format."""
 
     suffix = ".spz"
@@ -315,13 +297,13 @@ class SPZ(Format):
     )
     decode = staticmethod(decode)
 
-    def encode(self, arrays: Arrays) -> list[bytes]:
+    def encode(self, arrays: base.Arrays) -> list[bytes]:
         """Return the bytes of a file of the version that the options name."""
         return encode(arrays, self.config.version, self.antialiased)
 
     def is_antialiased(self, path: Path) -> bool:
         """Return whether the header declares antialiasing."""
-        with reading(path) as file:
+        with base.reading(path) as file:
             packed = file.read(2) == b"\x1f\x8b"
             file.seek(0)
             head = (gzip.GzipFile(fileobj=file) if packed else file).read(HEADER.size)

@@ -1,7 +1,5 @@
 """Readers of scene folders: one file per format; `load_scene` turns each into a `warpgs.scene.Scene`."""
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING
 
 from warpgs.faces import lazy

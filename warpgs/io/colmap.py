@@ -16,25 +16,8 @@ import numpy as np
 from warpgs.errors import DataError
 from warpgs.files import open_input, read_file
 from warpgs.geometry import pose_of
-from warpgs.io.folder import (
-    Probe,
-    Reader,
-    SceneFolder,
-    ViewList,
-    about,
-    by_key,
-    has_folder,
-    is_absolute,
-    listed,
-    matched_note,
-    missing_name,
-    missing_note,
-    name_key,
-    quat_rotation,
-    register,
-    rigid,
-    view_name,
-)
+from warpgs.io import folder as scenes
+from warpgs.io.folder import Probe, Reader, SceneFolder, ViewList, register
 from warpgs.io.images import SUFFIXES, Lens, ReadOptions, list_images
 from warpgs.scene import ORIGIN, PointCloud, Scene, base_colors, checked_origin
 
@@ -274,7 +257,7 @@ def without_unaligned(
     kept = {number: pose for number, pose in poses.items() if finite(pose)}
     if strict or not kept or len(kept) == len(poses):
         return poses, []
-    names = listed(sorted(pose[0] for number, pose in poses.items() if number not in kept))
+    names = scenes.listed(sorted(pose[0] for number, pose in poses.items() if number not in kept))
     count = f"{len(poses) - len(kept)} of {len(poses)} images of {file.name}"
     return kept, [f"left out: {count} have a pose or camera that is not finite: {names}"]
 
@@ -286,8 +269,8 @@ def posed_lenses(poses: dict[int, Pose], lenses: dict[int, Lens], file: Path) ->
         where = f"{file}, image {name!r}"
         if camera not in lenses:
             raise DataError(f"{where}: camera {camera} is missing from cameras{file.suffix}; export the cameras again")
-        viewmat = rigid(pose_of(quat_rotation(quat, where), translation), where)
-        yield name, lenses[camera].checked(f"{file.with_stem('cameras')}, camera {camera}"), about(viewmat, origin)
+        viewmat = scenes.rigid(pose_of(scenes.quat_rotation(quat, where), translation), where)
+        yield name, lenses[camera].checked(f"{file.with_stem('cameras')}, camera {camera}"), scenes.about(viewmat, origin)
 
 
 def read_points(path: Path, names: dict[int, str], notes: list[str] | None = None) -> PointCloud:
@@ -451,7 +434,7 @@ def image_base(root: Path, model: Path) -> str | None:
         space = space.parent if space.name == "sparse" else space
     for place in dict.fromkeys((space, root)):
         for name, others in (("images", "images_*"), ("input", "input")):
-            if place.is_relative_to(root) and has_folder(place, name, others):
+            if place.is_relative_to(root) and scenes.has_folder(place, name, others):
                 return (place / name).relative_to(root).as_posix()
     for place in dict.fromkeys((model, space, root)):  # as RealityScan exports them
         if place.is_relative_to(root) and any(p.suffix.lower() in SUFFIXES and p.is_file() for p in place.glob("[!.]*")):
@@ -468,26 +451,26 @@ def _image_paths(
     name, if only one file fits. Files of reduced images (images_8) may also have other names (LLFF's image000.png): they are
     matched in sorted order if the counts agree.
     """
-    outside = {n for n in names if is_absolute(n) and not (scene.options.allow_outside and (images / n).is_file())}
+    outside = {n for n in names if scenes.is_absolute(n) and not (scene.options.allow_outside and (images / n).is_file())}
     paths = {n: scene.child(images, n, where) for n in names if n not in outside}
     used = {n: p for n, p in paths.items() if p.is_file()}
     lost, taken = [n for n in names if n not in used], set(used.values())
     if not lost:
         return paths, []
     free = {p: p.relative_to(images).as_posix() for p in files if p not in taken}
-    by_path, by_name = by_key(free), by_key({p: p.name for p in free})
+    by_path, by_name = scenes.by_key(free), scenes.by_key({p: p.name for p in free})
     found: dict[str, Path] = {}
     for n in lost:
         plain = n.replace("\\", "/").removeprefix("./")
         inner = plain.removeprefix(f"{base}/")
         if n in outside:
-            match = by_name.get(name_key(plain.rpartition("/")[2]))
+            match = by_name.get(scenes.name_key(plain.rpartition("/")[2]))
         elif inner != plain and (images / inner).is_file():
             match = scene.child(images, inner, where)
         elif images == scene.root / base and (scene.root / plain).is_file():
             match = scene.child(scene.root, plain, where)
         else:
-            match = by_path.get(name_key(plain)) or by_path.get(name_key(inner))
+            match = by_path.get(scenes.name_key(plain)) or by_path.get(scenes.name_key(inner))
         if match is not None:
             found[n] = match
     claims = Counter(found.values())
@@ -498,9 +481,9 @@ def _image_paths(
         order = f"images of {images.name} matched in sorted order, because their names differ"
         return pairs, [f"{order} ({min(names)} is {pairs[min(names)].name})"]
     for n in (n for n in outside if n not in found):
-        elsewhere = is_absolute(n) and not Path(n).exists()
-        paths[n] = images / missing_name(n) if elsewhere else scene.child(images, n, where)  # which refuses
-    return paths | found, matched_note(found, images.name, scene.root)
+        elsewhere = scenes.is_absolute(n) and not Path(n).exists()
+        paths[n] = images / scenes.missing_name(n) if elsewhere else scene.child(images, n, where)  # which refuses
+    return paths | found, scenes.matched_note(found, images.name, scene.root)
 
 
 @register("colmap")
@@ -549,7 +532,9 @@ class ColmapReader(Reader):
         named: dict[str, str] = {}  # names of the views by name of the reconstruction
         for name, lens, viewmat in posed_lenses(poses, lenses, file):
             path = paths[name]
-            view = view_name(path.relative_to(images).as_posix() if is_absolute(name) and images in path.parents else name)
+            view = scenes.view_name(
+                path.relative_to(images).as_posix() if scenes.is_absolute(name) and images in path.parents else name
+            )
             if options.excludes(view):
                 continue
             if not path.is_file():
@@ -561,7 +546,9 @@ class ColmapReader(Reader):
         unposed = len(set(files) - set(paths.values()))
         if unposed:
             notes.append(f"{unposed} files in {images.name} have no pose in the reconstruction and are left out")
-        notes += missing_note(missing, len(poses), "images", file, options.strict) + views.notes(options) + scene.mask_notes()
+        notes += (
+            scenes.missing_note(missing, len(poses), "images", file, options.strict) + views.notes(options) + scene.mask_notes()
+        )
         there = {v.name for v in views.views}  # without those that are left out
         names = {n: named[p[0]] for n, p in poses.items() if named.get(p[0]) in there}
         points, more = self._points(scene, model, kind, names)

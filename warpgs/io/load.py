@@ -14,17 +14,8 @@ import numpy as np
 
 from warpgs.errors import DataError, UsageError, similar_folder
 from warpgs.geometry import FAR_OFF, camera_extent, matmul, near_cameras
-from warpgs.io.folder import (
-    Probe,
-    Reader,
-    SceneFolder,
-    all_readers,
-    find_reader,
-    image_ids,
-    listed,
-    named_by_dtu,
-    protocol_ids,
-)
+from warpgs.io import folder as scenes
+from warpgs.io.folder import Probe, Reader, SceneFolder
 from warpgs.io.image_files import MAX_PIXELS, READ, unread_note
 from warpgs.io.images import ReadOptions, SceneOptions, cut_from_black, image_scale, list_images, matches
 from warpgs.io.maps import check_found
@@ -161,7 +152,7 @@ def _every_8th(names: list[str], count: int, spec: str) -> Split:
 def _dtu(names: list[str], count: int, spec: str) -> Split:
     if count not in (3, 6, 9):
         raise UsageError(f"split {spec!r}: the DTU protocol has 3, 6 or 9 training views; use dtu:3, dtu:6 or dtu:9")
-    found = protocol_ids(names, DTU_TRAIN[:count] + DTU_TEST, DTU_VIEWS, f"split {spec}")
+    found = scenes.protocol_ids(names, DTU_TRAIN[:count] + DTU_TEST, DTU_VIEWS, f"split {spec}")
     return Split(tuple(found[i] for i in DTU_TRAIN[:count]), tuple(found[i] for i in DTU_TEST))
 
 
@@ -343,7 +334,7 @@ def add_score_masks(views: list[View], folder: Path, scene: SceneFolder) -> tupl
     files = list_images(folder) if folder.is_dir() else []
     if not files:
         raise DataError(f"{folder}: contains no masks; name the folder that contains 000.png, 001.png, ... with --score-masks")
-    numbers, ids = image_ids([f.name for f in files]), image_ids([v.name for v in views])
+    numbers, ids = scenes.image_ids([f.name for f in files]), scenes.image_ids([v.name for v in views])
     if numbers is None:
         raise DataError(f"{folder}: the masks have no distinct numbers; name them 000.png, 001.png, ... by id")
     masks = dict(zip(numbers, files))
@@ -359,7 +350,7 @@ def add_score_masks(views: list[View], folder: Path, scene: SceneFolder) -> tupl
             f"{folder}: no mask for image id {shown} (ids are counted from 0; an image rect_001_... is id 0); the "
             f"masks run from {files[0].name} to {files[-1].name}. Restore the missing ones"
         )
-    if min(ids) == 1 and 0 in masks and not named_by_dtu([v.name for v in views]):
+    if min(ids) == 1 and 0 in masks and not scenes.named_by_dtu([v.name for v in views]):
         raise DataError(
             f"{folder}: the images start with 1 ({views[ids.index(1)].name}), the masks with 0, so the masks may be off by "
             f"one; rename the images so that they count from 0, or remove mask 0"
@@ -465,9 +456,9 @@ def read_folder(
             found = f"is a file; {fix}" if root.is_file() else f"no such folder; {similar_folder(root) or fix}"
             raise DataError(f"{root}: {found}")
         if checked.reconstruction is None:
-            chosen, notes = detect(root) if reader is None else (_accepted(root, find_reader(reader)), [])
+            chosen, notes = detect(root) if reader is None else (_accepted(root, scenes.find_reader(reader)), [])
         elif reader in (None, "colmap"):
-            chosen, notes = find_reader("colmap"), []
+            chosen, notes = scenes.find_reader("colmap"), []
         else:
             raise UsageError("--reconstruction requires a COLMAP scene; leave it out, or give --reader colmap")
         return _finished(root, chosen, chosen.read(root, checked), notes, checked)
@@ -478,7 +469,7 @@ def read_folder(
 
 def detect(root: Path) -> tuple[Reader, list[str]]:
     """Return the reader of the first complete format of a scene folder, and notes on the formats passed over."""
-    readers = all_readers()
+    readers = scenes.all_readers()
     found = [(r, p) for r in readers if (p := _probe(r, root)) is not None]
     complete = [r for r, p in sorted(found, key=lambda row: row[1].fallback) if not p.missing]
     broken = [f"{p.found} lacks {p.missing}" for _, p in found if p.missing]
@@ -509,7 +500,7 @@ def _accepted(root: Path, reader: Reader) -> Reader:
     """Return a reader that the user chose; DataError where its format is not in the folder or not complete."""
     probe = _probe(reader, root)
     if probe is None:
-        others = [p.found for r in all_readers() if (p := _probe(r, root)) is not None]
+        others = [p.found for r in scenes.all_readers() if (p := _probe(r, root)) is not None]
         there = f"; the folder holds {' and '.join(others)}" if others else ""
         wanted = f" ({reader.description})" if reader.description else ""
         raise DataError(f"{root}: the reader {reader.name} finds no scene of its format{wanted}{there}. Choose another reader")
@@ -526,7 +517,7 @@ def _exclusions(options: ReadOptions, names: list[str]) -> list[str]:
             raise DataError(
                 f"--exclude {pattern[:80]}: no view has this name; the nearest names are {_nearest(names, pattern)}"
             )
-    return [f"left out by --exclude: {len(out)} image{'s' if len(out) != 1 else ''}: {listed(out)}"] if out else []
+    return [f"left out by --exclude: {len(out)} image{'s' if len(out) != 1 else ''}: {scenes.listed(out)}"] if out else []
 
 
 MAX_FOCAL = 100

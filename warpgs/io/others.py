@@ -11,18 +11,8 @@ import numpy as np
 from warpgs.errors import DataError
 from warpgs.files import read_input, unread_reason
 from warpgs.geometry import matmul, pose_of
-from warpgs.io.folder import (
-    Probe,
-    Reader,
-    SceneFolder,
-    ViewList,
-    from_camera_to_world,
-    has_folder,
-    register,
-    resampling_note,
-    rigid,
-    view_name,
-)
+from warpgs.io import folder as scenes
+from warpgs.io.folder import Probe, Reader, SceneFolder, ViewList, register
 from warpgs.io.images import Lens, ReadOptions, list_images
 from warpgs.io.maps import array_numbers, mapped_array
 from warpgs.scene import Scene
@@ -55,7 +45,7 @@ class LLFFReader(Reader):
         """See `Reader.probe`."""
         if not (folder / FILE).is_file():
             return None
-        return Probe(FILE, "" if has_folder(folder, "images", "images_*") else "its image folder, images or images_N")
+        return Probe(FILE, "" if scenes.has_folder(folder, "images", "images_*") else "its image folder, images or images_N")
 
     def read(self, folder: Path, options: ReadOptions) -> Scene:
         """See `Reader.read`."""
@@ -82,7 +72,7 @@ class LLFFReader(Reader):
             lens = Lens(np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]]), int(width), int(height))
             # columns: down, right, back, centre
             pose = np.stack([matrix[:, 1], matrix[:, 0], -matrix[:, 2], matrix[:, 3]], axis=1)
-            viewmat, mask = from_camera_to_world(pose, where, opengl=False), scene.mask_of(file, images)
+            viewmat, mask = scenes.from_camera_to_world(pose, where, opengl=False), scene.mask_of(file, images)
             views.add(name, viewmat, partial(scene.image, file, lens.checked(where), downscale=factor, mask=mask))
         notes = ([note] if note else []) + views.notes(options) + scene.mask_notes()
         return self.scene(folder, views.views, notes, pixels=scene.pixel_source(by_folder=True))
@@ -114,7 +104,7 @@ def decompose(P: np.ndarray, where: str) -> tuple[np.ndarray, np.ndarray]:
     if np.linalg.det(R) < 0:  # P is given up to sign
         R, t = -R, -t
     K = K / K[2, 2]
-    return _centred(K, where), rigid(pose_of(R, t), where)
+    return _centred(K, where), scenes.rigid(pose_of(R, t), where)
 
 
 def _centred(K: np.ndarray, where: str) -> np.ndarray:
@@ -182,7 +172,7 @@ class DTUReader(Reader):
         found = next((f for f in FILES if (folder / f).is_file()), None)
         if found is None:
             return None
-        return Probe(found, "" if has_folder(folder, *FOLDERS) else f"its image folder, {' or '.join(FOLDERS)}")
+        return Probe(found, "" if scenes.has_folder(folder, *FOLDERS) else f"its image folder, {' or '.join(FOLDERS)}")
 
     def read(self, folder: Path, options: ReadOptions) -> Scene:
         """See `Reader.read`."""
@@ -209,7 +199,7 @@ class DTUReader(Reader):
             K, viewmat = decompose(matmul(world, scale)[:3], where)
             mask = partial(scene.mask, masks[file]) if file in masks else None
             views.add(name, viewmat, partial(scene.image, file, _lens(K, where), mask=mask))
-        notes = resampling_note(options.downscale) + views.notes(options)
+        notes = scenes.resampling_note(options.downscale) + views.notes(options)
         return self.scene(folder, views.views, notes, pixels=scene.pixel_source(by_folder=False))
 
 
@@ -271,16 +261,16 @@ class MiddleburyReader(Reader):
         notes = [f"cameras taken from {path.name}; {', '.join(p.name for p in others)} ignored"] if others else []
         scene, views = SceneFolder(folder, options), ViewList(options)
         for number, name, values in read_camera_rows(scene.inside(path)):
-            if options.excludes(view_name(name)):
+            if options.excludes(scenes.view_name(name)):
                 continue
             where = f"{path}, line {number}, image {name!r}"
             K = _centred(values[:9].reshape(3, 3).copy(), where)
             if not np.allclose(K[[1, 2, 2, 2], [0, 0, 1, 2]], (0, 0, 0, 1)):
                 lower = "its lower rows are not 0 fy cy, 0 0 1"
                 raise DataError(f"{where}: K is not a matrix of intrinsics ({lower}); calibrate again")
-            viewmat = rigid(pose_of(values[9:18].reshape(3, 3), values[18:21]), where)
-            file, view = scene.child(folder, name, where), views.claim(view_name(name), where)
+            viewmat = scenes.rigid(pose_of(values[9:18].reshape(3, 3), values[18:21]), where)
+            file, view = scene.child(folder, name, where), views.claim(scenes.view_name(name), where)
             mask = scene.mask_of(file, folder, folder / "masks")
             views.add(view, viewmat, partial(scene.image, file, _lens(K, where), mask=mask))
-        notes += resampling_note(options.downscale) + views.notes(options) + scene.mask_notes()
+        notes += scenes.resampling_note(options.downscale) + views.notes(options) + scene.mask_notes()
         return self.scene(folder, views.views, notes, pixels=scene.pixel_source(by_folder=False))

@@ -15,23 +15,8 @@ from warpgs.errors import DataError
 from warpgs.files import is_within, read_file
 from warpgs.geometry import matmul, seen_pixels
 from warpgs.io import colmap
-from warpgs.io.folder import (
-    Probe,
-    Reader,
-    SceneFolder,
-    ViewList,
-    about,
-    by_key,
-    from_camera_to_world,
-    is_absolute,
-    matched_note,
-    missing_name,
-    missing_note,
-    name_key,
-    register,
-    resampling_note,
-    view_name_of,
-)
+from warpgs.io import folder as scenes
+from warpgs.io.folder import Probe, Reader, SceneFolder, ViewList, register
 from warpgs.io.images import BLACK, SUFFIXES, Lens, ReadOptions, list_images
 from warpgs.io.maps import SUFFIXES as MAPS
 from warpgs.io.maps import NamedMaps
@@ -196,20 +181,20 @@ def _image_paths(scene: SceneFolder, file: Path, frames: list[Any]) -> tuple[dic
     taken = {p for p in paths.values() if p.is_file()}
     lost = [*(n for n, p in paths.items() if p not in taken), *refused]
     files = {p: p.relative_to(folder).as_posix() for p in list_images(folder)} if lost else {}
-    found, fits = dict[str, Path](), by_key({p: n for p, n in files.items() if p not in taken})
-    ends = Counter(end for n in (*paths, *refused) for end in {*map(name_key, _inner_names(n))}) if lost else Counter()
+    found, fits = dict[str, Path](), scenes.by_key({p: n for p, n in files.items() if p not in taken})
+    ends = Counter(end for n in (*paths, *refused) for end in {*map(scenes.name_key, _inner_names(n))}) if lost else Counter()
     for n in lost:
-        names = _inner_names(n) if n in refused or is_absolute(n) else [view_name_of(paths[n], folder)]
-        unique = (e for e in names if ends[name_key(e)] < 2)  # an end of two names is neither's
-        matches = [folder / e if folder / e in files else fits.get(name_key(e)) for e in unique]
+        names = _inner_names(n) if n in refused or scenes.is_absolute(n) else [scenes.view_name_of(paths[n], folder)]
+        unique = (e for e in names if ends[scenes.name_key(e)] < 2)  # an end of two names is neither's
+        matches = [folder / e if folder / e in files else fits.get(scenes.name_key(e)) for e in unique]
         found |= dict([(n, p) for p in matches if p is not None][:1])
     claims = Counter(found.values())
     found = {n: p for n, p in found.items() if claims[p] == 1 and p not in taken}
     for n, error in refused.items():
-        if n not in found and (not is_absolute(n) or Path(n).exists()):
+        if n not in found and (not scenes.is_absolute(n) or Path(n).exists()):
             raise error
-        paths[n] = folder / missing_name(n)
-    return paths | found, matched_note(found, file.name, scene.root)
+        paths[n] = folder / scenes.missing_name(n)
+    return paths | found, scenes.matched_note(found, file.name, scene.root)
 
 
 Named = Callable[[object, str], Path]
@@ -220,7 +205,7 @@ def _named_file(scene: SceneFolder, folder: Path, taken: set[Path], moved: dict[
     """Return the path of a `Named` file; one outside of the scene is found by the end of its path, and stored in ``moved``."""
     ends = [p for e in _inner_names(str(name))[:-1] if (p := folder / e).is_file() and p not in taken]
     path = folder / str(name).replace("\\", "/")
-    if ends and not path.is_file() and (is_absolute(str(name)) or not is_within(path, scene.root)):
+    if ends and not path.is_file() and (scenes.is_absolute(str(name)) or not is_within(path, scene.root)):
         moved[str(name)] = ends[0]
         return ends[0]
     return scene.child(folder, name, where, root=scene.root)
@@ -325,14 +310,14 @@ class TransformsReader(Reader):
             named = partial(_named_file, scene, file.parent, {*paths.values()}, moved)
             for number, frame in enumerate(shared["frames"]):
                 where, path = f"{file}, frame {number}", paths[frame["file_path"]]
-                if options.excludes(view_name_of(path, folder)):
+                if options.excludes(scenes.view_name_of(path, folder)):
                     continue
                 if not path.is_file():
                     missing.append(str(frame["file_path"]))
                     continue
-                name = views.claim(view_name_of(path, folder), where)
+                name = views.claim(scenes.view_name_of(path, folder), where)
                 where = f"{where} ({name})"
-                viewmat = about(from_camera_to_world(matrix_of(frame, where), where, opengl=True), origin)
+                viewmat = scenes.about(scenes.from_camera_to_world(matrix_of(frame, where), where, opengl=True), origin)
                 if frame.get("mask_path"):
                     mask_file = named(frame["mask_path"], f"{where}, mask")
                     if not mask_file.is_file():
@@ -347,13 +332,13 @@ class TransformsReader(Reader):
             if shared.get("ply_file_path"):
                 points, note = _points(scene, file, named, shared, views.views)
                 notes.append(note)
-            notes += matched + matched_note(moved, file.name, folder, "file")
+            notes += matched + scenes.matched_note(moved, file.name, folder, "file")
             if unused := [key for s in ("train", "val", "test") if shared.get(key := f"{s}_filenames")]:  # of nerfstudio
                 notes.append(f"{' and '.join(unused)} of {file.name} choose no views; --split 'train=NAMES;test=NAMES' does")
-        notes += missing_note(missing, total, "frames", files_of(folder)[0], options.strict)
+        notes += scenes.missing_note(missing, total, "frames", files_of(folder)[0], options.strict)
         if outside := sum(v.name.startswith("outside/") for v in views.views):
             notes.append(f"{outside} images are outside the scene folder; their views are named outside/...")
-        notes += resampling_note(options.downscale) + views.notes(options) + scene.mask_notes()
+        notes += scenes.resampling_note(options.downscale) + views.notes(options) + scene.mask_notes()
         pixels = scene.pixel_source(by_folder=False)
         return self.scene(folder, views.views, notes, background=background, pixels=pixels, points=points)
 
@@ -414,7 +399,7 @@ def _inria(path: Path, rows: list[Any]) -> Iterator[Row]:
             name, origin = str(row.get("img_name", i)), _origin(row, where)
         except (KeyError, TypeError, ValueError, OverflowError, AttributeError) as e:
             raise DataError(f"{where}: needs rotation, position, width, height, fx and fy as numbers; correct the entry") from e
-        yield name, about(from_camera_to_world(pose, where, opengl=False), origin), lens.checked(where)
+        yield name, scenes.about(scenes.from_camera_to_world(pose, where, opengl=False), origin), lens.checked(where)
 
 
 def _drawn(path: Path, values: dict[str, Any]) -> Iterator[Row]:
@@ -433,7 +418,7 @@ def _drawn(path: Path, values: dict[str, Any]) -> Iterator[Row]:
             raise DataError(f"{where}: needs {needs}; export the path again") from e
         focal = 0.5 * height / math.tan(0.5 * math.radians(fov))
         lens = Lens(np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]]), width, height)
-        yield f"{i:05d}", from_camera_to_world(pose, where, opengl=True), lens.checked(where)
+        yield f"{i:05d}", scenes.from_camera_to_world(pose, where, opengl=True), lens.checked(where)
 
 
 def _transforms(path: Path) -> Iterator[Row]:
@@ -447,8 +432,8 @@ def _transforms(path: Path) -> Iterator[Row]:
         if any(frame.get(key, shared.get(key)) is None for key in ("w", "h")):
             raise DataError(f"{where}: gives no w and h, so the image size is unknown. Add them, or give the scene's folder")
         lens = lens_of(frame, shared, 0, 0, where)
-        viewmat = from_camera_to_world(matrix_of(frame, where), where, opengl=True)
-        yield str(frame.get("file_path", i)), about(viewmat, origin), lens
+        viewmat = scenes.from_camera_to_world(matrix_of(frame, where), where, opengl=True)
+        yield str(frame.get("file_path", i)), scenes.about(viewmat, origin), lens
 
 
 def colmap_folder(folder: Path) -> tuple[Path, str, list[str]] | None:

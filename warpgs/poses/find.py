@@ -13,22 +13,9 @@ from warpgs import files, schema
 from warpgs.errors import DataError, UsageError
 from warpgs.io.folder import all_readers
 from warpgs.io.image_files import MAX_PIXELS, unread_note
+from warpgs.poses import photographs as photos
 from warpgs.poses.mapping import EXHAUSTIVE, LEARNED, Mapping, camera_groups, cameras_of, check_installed, find_model
 from warpgs.poses.matching import Matcher, write_matches
-from warpgs.poses.photographs import (
-    Photograph,
-    Progress,
-    find_photographs,
-    image_root,
-    is_heic,
-    is_video,
-    models_below,
-    photographs_inside,
-    prepare,
-    to_jpeg,
-    write_copy,
-    write_frames,
-)
 
 MIN_KEYPOINTS = 100
 """Keypoints below which a photograph shows too little to match: a blank wall, darkness, blur."""
@@ -134,7 +121,7 @@ _RECORD = schema.fields(
 )  # fmt: skip
 
 
-def record_of(found: Mapping, photographs: Sequence[Photograph], digest: str, notes: Sequence[str]) -> dict[str, Any]:
+def record_of(found: Mapping, photographs: Sequence[photos.Photograph], digest: str, notes: Sequence[str]) -> dict[str, Any]:
     """Return the contents of poses.json; ``digest`` is the hash of the source, ``notes`` are choices made for the user."""
     names = [p.name for p in photographs]
     rows = []
@@ -214,9 +201,9 @@ MODEL_FILES = ("cameras.bin", "images.bin", "points3D.bin", "rigs.bin", "frames.
 def needs_poses(path: Path) -> bool:
     """Return whether a path is a video, or a folder of images that holds no scene format."""
     try:
-        if is_video(path):
+        if photos.is_video(path):
             return True
-        return path.is_dir() and all(r.probe(path) is None for r in all_readers()) and bool(find_photographs(path)[0])
+        return path.is_dir() and all(r.probe(path) is None for r in all_readers()) and bool(photos.find_photographs(path)[0])
     except OSError:  # the scene reader reports the error
         return False
 
@@ -230,10 +217,10 @@ def source_digest(source: Path, allow_outside: bool = False) -> str:
         except OSError as e:
             raise DataError(f"{path}: cannot be read ({files.unread_reason(e)}); fix its permissions or copy it again") from e
 
-    if is_video(source):
+    if photos.is_video(source):
         return digest(source)
-    root, total = image_root(source), hashlib.sha256()
-    for path in photographs_inside(source, allow_outside):
+    root, total = photos.image_root(source), hashlib.sha256()
+    for path in photos.photographs_inside(source, allow_outside):
         name = path.relative_to(root).as_posix().encode("utf-8", "surrogateescape")
         total.update(name + b"\0" + bytes.fromhex(digest(path)))
     return total.hexdigest()
@@ -248,7 +235,7 @@ def find_poses(
     max_pixels: int = MAX_PIXELS,
     allow_outside: bool = False,
     matcher: str | Path | None = None,
-    progress: Progress = lambda line: None,
+    progress: photos.Progress = lambda line: None,
 ) -> dict[str, Any]:
     """Find the poses of photographs or of a video's sharpest frames; write a scene folder, whole or not at all."""
     source, out = Path(source), Path(out)
@@ -256,7 +243,7 @@ def find_poses(
     check_installed()
     network = None if matcher is None else Matcher(matcher, threads)
     with files.filling(out) as scene:
-        work, kind = scene / "work", "video" if is_video(source) else "photographs"
+        work, kind = scene / "work", "video" if photos.is_video(source) else "photographs"
         digest = source_digest(source, allow_outside)  # before anything is written, which may be below the source
         files.make_folder(work / "small")
         photographs, names, notes = _prepared(source, work, frames, max_pixels, progress)
@@ -268,7 +255,7 @@ def find_poses(
         record = record_of(found, photographs, digest, notes) | {"source": source.resolve().name}
         for done, i in enumerate(found.views):
             progress(f"writing images: {done + 1} of {len(found.views)}")
-            write_copy(photographs[i], scene / "images", max_pixels)
+            photos.write_copy(photographs[i], scene / "images", max_pixels)
         files.make_folder(scene / "sparse" / "0")
         for name in MODEL_FILES:
             if (work / "model" / name).is_file():
@@ -280,8 +267,8 @@ def find_poses(
 
 
 def _with_network(
-    network: Matcher, found: Mapping, photographs: list[Photograph], names: list[str], kind: str, work: Path,
-    progress: Progress, threads: int,
+    network: Matcher, found: Mapping, photographs: list[photos.Photograph], names: list[str], kind: str, work: Path,
+    progress: photos.Progress, threads: int,
 ) -> tuple[Mapping, list[str]]:  # fmt: skip
     """Return the model from the network's matches if it has more photographs than SIFT's, and notes."""
     # the network, which is less accurate, runs only if SIFT leaves photographs without a pose
@@ -309,7 +296,7 @@ def _something_else(folder: Path) -> str:
         return "is the folder of a run; give the scene that it was fitted to"
     probes = {d.name: [p for r in all_readers() if (p := r.probe(d))] for d in sorted(folder.iterdir()) if d.is_dir()}
     scenes = [name for name, found in probes.items() if found]
-    if model := next((m for m in models_below(folder) if all(p.missing for p in probes[m.parts[0]])), None):
+    if model := next((m for m in photos.models_below(folder) if all(p.missing for p in probes[m.parts[0]])), None):
         use = f"`warpgs fit {folder} --reconstruction {model.as_posix()}` uses its poses; move it away to find new ones"
         return f"holds a COLMAP reconstruction in {model.as_posix()}: {use}"
     if scenes:
@@ -320,14 +307,14 @@ def _something_else(folder: Path) -> str:
 def _check(source: Path, out: Path, allow_outside: bool) -> None:
     """Raise an error for an unusable source or target, before any work."""
     try:
-        if not is_video(source):
+        if not photos.is_video(source):
             if not source.is_dir():
                 there = files.NOT_REGULAR if source.exists() else "does not exist"
                 what = "is not a supported video (mp4, mov, m4v, avi, mkv, webm)" if source.is_file() else there
                 raise DataError(f"{source}: {what}; give a folder of photographs, or a video")
             if other := _something_else(source):
                 raise UsageError(f"{source}: {other}")
-            if not photographs_inside(source, allow_outside):
+            if not photos.photographs_inside(source, allow_outside):
                 none = "holds no supported image (JPEG, PNG, BMP, TIFF, WebP, AVIF or HEIC); give the folder of photographs"
                 raise DataError(f"{source}: {unread_note(source) or none}")
         if out.exists() and not (out.is_dir() and files.is_empty(out)):
@@ -337,36 +324,36 @@ def _check(source: Path, out: Path, allow_outside: bool) -> None:
 
 
 def _prepared(
-    source: Path, work: Path, frames: int, max_pixels: int, progress: Progress
-) -> tuple[list[Photograph], list[str], list[str]]:
+    source: Path, work: Path, frames: int, max_pixels: int, progress: photos.Progress
+) -> tuple[list[photos.Photograph], list[str], list[str]]:
     """Return the photographs of a source, the names of their copies in ``work``/small, and notes for the user."""
     notes, root = [], source
-    if is_video(source):
+    if photos.is_video(source):
         root = work / "frames"
         files.make_folder(root)
-        total = write_frames(source, root, frames, progress)
+        total = photos.write_frames(source, root, frames, progress)
         taken = min(frames, total)
         notes.append(f"{taken} of {total} frames are used: the sharpest frame of each of {taken} equal parts of the video")
-    root = image_root(root)
-    (paths, about), unread = find_photographs(root), unread_note(root)
+    root = photos.image_root(root)
+    (paths, about), unread = photos.find_photographs(root), unread_note(root)
     notes += about
     if unread:
         notes.append(f"left out: {unread}")
     if len(paths) < MIN_PHOTOGRAPHS:
-        what = "frame" if is_video(source) else "photograph"
+        what = "frame" if photos.is_video(source) else "photograph"
         raise DataError(
             f"{source}: has {len(paths)} {what}{'s' if len(paths) != 1 else ''}; poses need at least {MIN_PHOTOGRAPHS}, "
             f"better 8 to 20 that overlap by two thirds{'; left out: ' + unread if unread else ''}"
         )
     photographs, names = [], []
-    copies = to_jpeg([p for p in paths if is_heic(p)], root, work / "heic", max_pixels, progress)
+    copies = photos.to_jpeg([p for p in paths if photos.is_heic(p)], root, work / "heic", max_pixels, progress)
     if copies:
         notes.append(f"{len(copies)} HEIC photograph{'s' if len(copies) != 1 else ''} converted to JPEG")
     for i, path in enumerate(paths):
         progress(f"reading photographs: {i + 1} of {len(paths)}")
         names.append(f"{i:06d}.png")
         file, below = (copies[path], work / "heic") if path in copies else (path, root)
-        photographs.append(prepare(file, below, work / "small" / names[-1], max_pixels))
+        photographs.append(photos.prepare(file, below, work / "small" / names[-1], max_pixels))
     taken: dict[str, Path] = {}
     for p, path in zip(photographs, paths):
         if (same := taken.setdefault(p.name, path)) is not path:
@@ -374,7 +361,7 @@ def _prepared(
     return photographs, names, [*notes, *_notes(photographs)]
 
 
-def _notes(photographs: list[Photograph]) -> list[str]:
+def _notes(photographs: list[photos.Photograph]) -> list[str]:
     """Return notes on assumptions about the photographs."""
     cameras = cameras_of(photographs, camera_groups(photographs))
     known = sum(c.focal is not None for c in cameras)
@@ -387,7 +374,7 @@ def _notes(photographs: list[Photograph]) -> list[str]:
     return notes
 
 
-def _links(found: Mapping, photographs: list[Photograph]) -> str:
+def _links(found: Mapping, photographs: list[photos.Photograph]) -> str:
     """Return which pairs match best, and which photographs match none; fewest matches first."""
     pairs: dict[tuple[int, ...], int] = {}
     for i in range(len(photographs)):
@@ -402,7 +389,7 @@ def _links(found: Mapping, photographs: list[Photograph]) -> str:
     return "; ".join([*words, *([f"{more} more pairs"] if more > 0 else [])])
 
 
-def _check_found(source: Path, found: Mapping, photographs: list[Photograph]) -> None:
+def _check_found(source: Path, found: Mapping, photographs: list[photos.Photograph]) -> None:
     """Raise a DataError where too few photographs fit together, with the reason that most of them have."""
     if len(found.views) >= MIN_PHOTOGRAPHS:
         return

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from warpgs.errors import DataError
-from warpgs.files import writing
+from warpgs.files import replacing
 from warpgs.io.image_files import decode_png
 from warpgs.onnx import Model, fixed_size
 
@@ -212,7 +212,7 @@ def write_matches(
     for k, (i, j) in enumerate(pairs):
         progress(f"matching: pair {k + 1} of {len(pairs)}")
         matches.append(mutual_matches(found[i][1], found[j][1]))
-    with writing(out) as file:
+    with replacing(out) as (file, _):
         np.savez(
             file, keypoints=np.concatenate([p for p, _ in found]), per_photograph=np.array([len(p) for p, _ in found]),
             pairs=np.array(pairs).reshape(-1, 2), matches=np.concatenate(matches), counts=np.array([len(m) for m in matches]),

@@ -1,7 +1,5 @@
 """Networks from their authors' files to ONNX; needs the extra `export`."""
 
-from __future__ import annotations
-
 import hashlib
 import importlib.util
 import io
@@ -12,9 +10,10 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import torch
 
 from warpgs.errors import DataError, ResourceError, UsageError, install_extras
 from warpgs.files import read_file, read_input, remove_leftovers, write_bytes, write_text
@@ -23,10 +22,6 @@ from warpgs.onnx import check_onnx, start_session
 from warpgs.priors.networks import HALF, IMAGENET, side_file
 from warpgs.priors.views import CLASSES
 
-if TYPE_CHECKING:
-    import torch
-
-
 REMEDY = install_extras("export")
 
 
@@ -34,8 +29,6 @@ def onnx_bytes(
     network: torch.nn.Module, image: torch.Tensor, outputs: Sequence[str], sizes: dict[int, Any] | None = None
 ) -> bytes:
     """Return the ONNX file of a network for an ``image`` [1, 3, h, w]; ``sizes`` are the sizes that its axes may have."""
-    import torch
-
     try:
         import onnxscript  # noqa: F401
     except ImportError as e:
@@ -115,8 +108,6 @@ def package_files() -> dict[str, bytes]:
 
 def _backbone() -> torch.nn.Module:
     """Return XFeat's network, which maps an image [1, 3, h, w] to descriptors, keypoint logits and reliability of each cell."""
-    import torch
-
     files = package_files()
 
     class Checked(importlib.abc.InspectLoader):
@@ -141,7 +132,6 @@ def _backbone() -> torch.nn.Module:
 
 def build_matcher() -> torch.nn.Module:
     """Return XFeat in torch: an image [1, 3, h, w] to keypoints [K, 2] [px], scores [K], descriptors [K, 64]."""
-    import torch
     from torch.nn.functional import grid_sample, interpolate, max_pool2d, normalize, pixel_shuffle
 
     class Keypoints(torch.nn.Module):
@@ -177,7 +167,6 @@ def agreement(found: list[np.ndarray], wanted: list[np.ndarray]) -> float:
 
 def export_matcher(out: Path) -> list[str]:
     """Write XFeat as an ONNX file for `--matcher`; return lines for the user."""
-    import torch
     from torch.export import Dim
 
     network = build_matcher()
@@ -260,7 +249,6 @@ def _dpt(request: ExportRequest) -> torch.nn.Module:
 def _fcn_resnet18(request: ExportRequest) -> torch.nn.Module:
     """Return FCN-8s (Long et al. 2015) on ResNet-18 (He et al. 2016): class scores at strides 8, 16, 32, summed at stride 8."""
     given = None if request.random_weights else _own_weights(request.weights)
-    import torch
     from transformers import ResNetBackbone, ResNetConfig
 
     stages = ["stage2", "stage3", "stage4"]
@@ -323,7 +311,6 @@ def _fcn_resnet50(request: ExportRequest) -> torch.nn.Module:
 
 def _one_output(network: torch.nn.Module, name: str) -> torch.nn.Module:
     """Return a network with one of the named outputs of another."""
-    import torch
 
     class OneOutput(torch.nn.Module):
         def __init__(self):
@@ -338,8 +325,6 @@ def _one_output(network: torch.nn.Module, name: str) -> torch.nn.Module:
 
 def build(request: ExportRequest) -> torch.nn.Module:
     """Return the network in torch, ready for inference: [1, 3, h, w] to disparity [1, h, w] or to scores [1, 21, h, w]."""
-    import torch
-
     makers = {"dpt": _dpt, "fcn-resnet18": _fcn_resnet18, "fcn-resnet50": _fcn_resnet50}
     try:
         with torch.random.fork_rng(devices=[]):
@@ -351,8 +336,6 @@ def build(request: ExportRequest) -> torch.nn.Module:
 
 def export_network(request: ExportRequest, out: Path) -> list[str]:
     """Write a network as ONNX, and a JSON file that describes its input and output; return lines for the user."""
-    import torch
-
     if request.model == "xfeat":
         return export_matcher(out)
     network = build(request)

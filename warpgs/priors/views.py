@@ -13,19 +13,6 @@ import numpy as np
 from warpgs.errors import DataError, UsageError
 from warpgs.onnx import PROVIDERS
 from warpgs.priors import networks
-from warpgs.priors.networks import (
-    IMAGENET,
-    MapCache,
-    Network,
-    Preprocessing,
-    cache_folder,
-    complete_disparity,
-    describe,
-    network_disparity,
-    resize,
-    single_threaded_opencv,
-    without_ipp,
-)
 from warpgs.process import Detail, counted
 from warpgs.scene import Prior, View
 from warpgs.schema import Checked
@@ -41,7 +28,7 @@ if TYPE_CHECKING:
 
 CLASSES = 21
 """Number of PASCAL VOC classes: background first, then 20 kinds of things."""
-DEFAULTS = Preprocessing(512, 32, *IMAGENET, output="classes")
+DEFAULTS = networks.Preprocessing(512, 32, *networks.IMAGENET, output="classes")
 BOUNDARY_WIDTH = 2 / 500
 """Standard deviation of omega_boundary, in image widths: 2 px at 500 px."""
 MIN_FOREGROUND = 0.01
@@ -62,7 +49,7 @@ Maps = tuple[np.ndarray, np.ndarray, np.ndarray]
 """Confidence, boundary and foreground of `warpgs.scene.Prior`: float32, shape [H, W], in [0, 1]."""
 
 
-def class_probabilities(network: Network, preprocessing: Preprocessing, image: np.ndarray) -> np.ndarray:
+def class_probabilities(network: networks.Network, preprocessing: networks.Preprocessing, image: np.ndarray) -> np.ndarray:
     """Return the probability of each of the 21 classes at each pixel of an image [H, W, 3], float32 [H, W, 21]."""
     output = network.run(preprocessing.prepare(network, image))
     if output.ndim != 4 or output.shape[0] != 1 or CLASSES not in (output.shape[1], output.shape[3]):
@@ -72,7 +59,7 @@ def class_probabilities(network: Network, preprocessing: Preprocessing, image: n
         )
     scores = output[0].transpose(1, 2, 0) if output.shape[1] == CLASSES else output[0]
     are_probabilities = bool((scores >= 0).all()) and np.allclose(scores.sum(-1), 1, atol=1e-3)
-    scores = resize(scores, *image.shape[:2])
+    scores = networks.resize(scores, *image.shape[:2])
     if are_probabilities:
         return scores
     e = np.exp(scores - scores.max(-1, keepdims=True))
@@ -100,7 +87,7 @@ def _falloff(edge: np.ndarray) -> np.ndarray:
     return np.exp(-0.5 / (BOUNDARY_WIDTH * edge.shape[1]) ** 2 * squares).astype(np.float32)
 
 
-def network_semantics(network: Network, preprocessing: Preprocessing, image: np.ndarray) -> Maps:
+def network_semantics(network: networks.Network, preprocessing: networks.Preprocessing, image: np.ndarray) -> Maps:
     """Return the maps of an image [H, W, 3] in [0, 1] by a segmentation network."""
     p = class_probabilities(network, preprocessing, image)
     return np.clip(p.max(-1), 0, 1), boundary_weight(p.argmax(-1)), np.clip(1 - p[..., 0], 0, 1)
@@ -120,8 +107,8 @@ def classical_semantics(image: np.ndarray) -> Maps:
     height, width = image.shape[:2]
     shrink = (MAX_PIXELS / (height * width)) ** 0.5
     if shrink < 1:
-        small = classical_semantics(resize(image, *(_fast_length(max(1, int(shrink * n))) for n in (height, width))))
-        confidence, boundary, foreground = (np.clip(resize(part, height, width), 0, 1) for part in small)
+        small = classical_semantics(networks.resize(image, *(_fast_length(max(1, int(shrink * n))) for n in (height, width))))
+        confidence, boundary, foreground = (np.clip(networks.resize(part, height, width), 0, 1) for part in small)
         return confidence, boundary, foreground
     pixels = np.round(np.clip(image, 0, 1) * 255).astype(np.uint8)
     flat = np.clip(cv2.ximgproc.l0Smooth(pixels, None, L0_WEIGHT, L0_GROWTH), 0, 255).astype(np.uint8)
@@ -137,7 +124,7 @@ def classical_semantics(image: np.ndarray) -> Maps:
 
 def classical_maps(images: Sequence[np.ndarray], tell: Callable[[str], object] = lambda line: None) -> list[Maps]:
     """Return `classical_semantics` of each image, each by one thread, so that results do not depend on their number."""
-    with single_threaded_opencv(), ThreadPoolExecutor(os.cpu_count() or 1, initializer=without_ipp) as pool:
+    with networks.single_threaded_opencv(), ThreadPoolExecutor(os.cpu_count() or 1, initializer=networks.without_ipp) as pool:
         made = [pool.submit(classical_semantics, image) for image in images]
         return [m.result() for m in counted(made, tell, "finding salient regions", "views")]
 
@@ -179,12 +166,12 @@ Source = Callable[[int], tuple[tuple[np.ndarray, ...], str]]
 
 
 def _by_network(
-    kind: str, views: Sequence[View], config: PriorConfig, threads: int, cache: MapCache, notes: list[str]
+    kind: str, views: Sequence[View], config: PriorConfig, threads: int, cache: networks.MapCache, notes: list[str]
 ) -> Source:
     """Return the source of the disparity, or of the semantic maps, of a network."""
     is_depth = kind == "depth"
-    network = Network(getattr(config, f"{kind}_model"), config.onnx_provider, threads)
-    how, messages = describe(network, networks.DEFAULTS if is_depth else DEFAULTS, kind)
+    network = networks.Network(getattr(config, f"{kind}_model"), config.onnx_provider, threads)
+    how, messages = networks.describe(network, networks.DEFAULTS if is_depth else DEFAULTS, kind)
     if (how.output == "classes") is is_depth:
         raise DataError(f"{network.path}: its output is {how.output}, which is not for --{kind}-model; check the flags")
     notes += [f"{'depth' if is_depth else 'semantics'}: {network.title} gives {how.output}", *messages]
@@ -195,7 +182,7 @@ def _by_network(
         image = views[i].image
 
         def make() -> tuple[np.ndarray, ...]:
-            return (network_disparity(network, how, image),) if is_depth else network_semantics(network, how, image)
+            return (networks.network_disparity(network, how, image),) if is_depth else network_semantics(network, how, image)
 
         return cache.maps(image, names, decided_by, make), f"{how.output} by {network.title}"
 
@@ -218,7 +205,7 @@ def _by_views(views: Sequence[View], depths: Sequence[ViewDepth] | None, notes: 
         view, d = views[i], depths[i]
         if d.valid.sum() < MIN_CONSISTENT:
             return (np.zeros(d.depth.shape, np.float32),), "none"
-        completed = complete_disparity(view.image, d.depth, d.valid, d.sensitivity)
+        completed = networks.complete_disparity(view.image, d.depth, d.valid, d.sensitivity)
         return (completed,), f"depth consistent with other views at {fractions[i]:.1%} of the pixels, completed"
 
     return disparity
@@ -267,7 +254,7 @@ def view_priors(
     """Return a prior for the pixels of each view before anything is fitted, and notes on choices and assumptions."""
     notes: list[str] = []
     classical = config.segmentation_model is None
-    cache = MapCache(cache_folder())
+    cache = networks.MapCache(networks.cache_folder())
     # both are opened before either runs: a wrong file is found at once
     opened = None if config.depth_model is None else _by_network("depth", views, config, threads, cache, notes)
     if classical:

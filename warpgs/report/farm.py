@@ -8,16 +8,12 @@ import textwrap
 import time
 from collections import Counter, defaultdict
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from warpgs.device import format_bytes
 from warpgs.process import careful, printable, say
 from warpgs.report.page import rendered
 from warpgs.report.progress import PLAIN_INTERVAL, duration, is_live, waiting
-
-if TYPE_CHECKING:
-    from rich.console import RenderableType
-
 
 STATES = ("waiting", "running", "elsewhere", "done", "failed")
 STYLES = {"running": "bold", "elsewhere": "dim", "done": "green", "failed": "bold red"}
@@ -113,7 +109,7 @@ class FarmTable:
         left = "" if self.left is None or not self.left else f"  left {duration(self.left)}"
         return f"{states}  after {duration(time.monotonic() - self.began)}{left}"
 
-    def panel(self) -> RenderableType:
+    def panel(self) -> Any:
         """Return the table."""
         from rich.console import Group
         from rich.progress_bar import ProgressBar

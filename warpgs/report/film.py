@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
+from PIL import Image
 
 from warpgs.errors import DataError, ResourceError, UsageError
 from warpgs.files import replacing, write_bytes
@@ -53,8 +54,6 @@ def _pixels(path: Path, frames: Iterable[np.ndarray]) -> list[np.ndarray]:
 
 def _with_one_palette(pixels: list[np.ndarray]) -> list:
     """Return frames as Pillow images with one palette, so that colours do not flicker, and with dithering against banding."""
-    from PIL import Image
-
     step = max(1, round((sum(p.shape[0] * p.shape[1] for p in pixels) / PALETTE_PIXELS) ** 0.5))
     sample = np.concatenate([p[::step, ::step].reshape(-1, 3) for p in pixels])
     palette = Image.fromarray(sample[None]).quantize(256, Image.Quantize.MEDIANCUT)
@@ -64,8 +63,6 @@ def _with_one_palette(pixels: list[np.ndarray]) -> list:
 def write_animation(path: Path, frames: Iterable[np.ndarray], fps: int) -> int:
     """Write frames [H, W, 3] in [0, 1], all of one size, as an animated WebP or GIF; returns their number."""
     # Equal frames in a row become one frame that is shown longer.
-    from PIL import Image
-
     if fps > MAX_FPS:
         raise UsageError(f"{path}: browsers show at most {MAX_FPS} frames per second of an animated image, not {fps}")
     pixels, gif = _pixels(path, frames), path.suffix.lower() == ".gif"
@@ -108,7 +105,7 @@ def write_film(path: Path, frames: Iterable[np.ndarray], fps: int = 30) -> int:
                 "write elsewhere"
             )
 
-    with replacing(path, check, suffix=suffix) as temporary, utf8_name(temporary) as name:
+    with replacing(path, check, suffix=suffix) as (_, temporary), utf8_name(temporary) as name:
         _encode(path, name, frames, fps, sizes)
     return len(sizes)
 

@@ -5,7 +5,9 @@ import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import cv2  # noqa: TID253 - most functions here call it
 import numpy as np
+from PIL import Image, ImageDraw, ImageFont
 
 from warpgs.errors import ResourceError
 
@@ -24,8 +26,6 @@ def png(image: np.ndarray) -> bytes:
 
 
 def _encoded(suffix: str, pixels: np.ndarray, options: Sequence[int] = ()) -> bytes:
-    import cv2
-
     done, data = cv2.imencode(suffix, pixels, options)
     if not done:
         raise ResourceError(f"an image of {pixels.shape[1]} x {pixels.shape[0]} px could not be encoded as {suffix}")
@@ -34,8 +34,6 @@ def _encoded(suffix: str, pixels: np.ndarray, options: Sequence[int] = ()) -> by
 
 def webp(image: np.ndarray | bytes, width: int = PAGE_WIDTH, quality: int = 82) -> bytes:
     """Encode colours [H, W, 3] in [0, 1], or an image file, as WebP of at most ``width`` px, a tenth of the size of a PNG."""
-    import cv2
-
     if isinstance(image, bytes):
         pixels = cv2.imdecode(np.frombuffer(image, np.uint8), cv2.IMREAD_COLOR)
     else:
@@ -56,8 +54,6 @@ def straight_alpha(image: np.ndarray, alpha: np.ndarray, background: tuple[float
 
 def resized(image: np.ndarray, width: int, height: int):
     """Return colours in [0, 1], [H, W, 3], at another size, as a Pillow image; areas are averaged if the width shrinks."""
-    from PIL import Image
-
     pixels = Image.fromarray(np.round(np.clip(image, 0, 1) * 255).astype(np.uint8))
     way = Image.Resampling.BOX if width < image.shape[1] else Image.Resampling.BICUBIC
     return pixels.resize((width, height), way)
@@ -65,8 +61,6 @@ def resized(image: np.ndarray, width: int, height: int):
 
 def colored(values: np.ndarray, name: str) -> np.ndarray:
     """Return the colours [H, W, 3] that a colour map of OpenCV, such as INFERNO, gives to values [H, W] between 0 and 1."""
-    import cv2
-
     table = cv2.applyColorMap(np.arange(256, dtype=np.uint8)[:, None], getattr(cv2, f"COLORMAP_{name}"))[:, 0, ::-1]
     return np.take(table.astype(np.float32) / 255, np.round(np.clip(values, 0, 1) * 255).astype(np.uint8), axis=0)
 
@@ -179,8 +173,6 @@ enlarge: x, y, width, height [px]."""
 
 def sheet(headings: list[str], strips: list[Strip]) -> bytes:
     """Return a figure with a cell for each heading and strip as bytes of an RGB PNG; images have the width of a column."""
-    from PIL import Image, ImageDraw, ImageFont
-
     available = (MAX_WIDTH - 2 * MARGIN + GAP) // len(headings) - GAP
     column = max(CELL[0], min(CELL[1], available, max(320, *(cells[0][0].shape[1] for _, cells, _ in strips))))
     bold, small = (ImageFont.load_default(max(least, column / part)) for least, part in ((17, 22), (14, 30)))
@@ -262,8 +254,6 @@ def _tile_image(tile: Tile, size: tuple[int, int]):
 
 def _dotted(image, centers: np.ndarray):
     """Return an image with small discs at rows and columns [px], shape [S, 2], anti-aliased by supersampling."""
-    from PIL import Image, ImageDraw
-
     least, most = 0.9, max(1.4, image.width / 220)
     radius = min(most, max(least, (MAX_DOT_FRACTION * image.width * image.height / (np.pi * max(1, len(centers)))) ** 0.5))
     fine = 4
@@ -279,8 +269,6 @@ def contact_sheet(
     title: str, lines: list[str], tiles: list[Tile], *, columns: int = 4, tile_width: int = 440, text: float = 1.0
 ) -> np.ndarray:
     """Arrange labelled tiles of one size in rows, with colour bars of maps and lines of text; colours [rows, columns, 3]."""
-    from PIL import Image, ImageDraw, ImageFont
-
     height, width = tiles[0].values.shape[:2]
     tile_height = max(1, round(tile_width * height / width))
     rows = -(-(len(tiles) + 1) // columns)

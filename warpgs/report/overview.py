@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from PIL import ImageColor
+from PIL import Image, ImageColor, ImageDraw, ImageFont
 
 from warpgs.errors import ResourceError
 from warpgs.files import disk_is_full
@@ -215,8 +215,6 @@ def _frustum_size(cameras: list[Camera], reach: float) -> float:
 
 def _with_legend(data: bytes, entries: list[tuple[str, str]], size: tuple[int, int], background: str) -> bytes:
     """Return a PNG of the size wanted: a render, and below it a strip with a square and text for each entry."""
-    from PIL import Image, ImageDraw, ImageFont
-
     canvas = Image.new("RGB", size, background)
     with Image.open(io.BytesIO(data)) as render:
         canvas.paste(render.convert("RGB"), (0, 0))

@@ -13,16 +13,13 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO
+from typing import Any, BinaryIO
 
 from warpgs import schema
 from warpgs.errors import ResourceError
 from warpgs.files import appending, plain, read_file, write_bytes
 from warpgs.folders import RefusedError
 from warpgs.process import careful, printable, say
-
-if TYPE_CHECKING:
-    from rich.console import Console
 
 PLAIN_INTERVAL = 10.0
 """Seconds between two plain lines on the steps of a fit."""
@@ -53,7 +50,7 @@ def is_live() -> bool:
     return stdout is not None and stdout.isatty() and os.environ.get("TERM") != "dumb"
 
 
-def _console() -> tuple[Console, bool]:
+def _console() -> tuple[Any, bool]:
     """Return rich's console, and whether stderr is a terminal, too: redirected errors do not disturb a line."""
     from rich.console import Console
 
@@ -114,7 +111,7 @@ _PANELS: list[Progress] = []
 """Panel of a fit's steps that occupies the terminal now, if any."""
 
 
-class Stages:
+class Stages(contextlib.AbstractContextManager["Stages"]):
     """Lines about the current work, such as ``finding depth: view 7 of 24``.
 
     The text before the last colon names a stage; numbers after it, such as ``7 of 24``, make a bar. In a terminal one line
@@ -126,10 +123,6 @@ class Stages:
         """Print plain lines with ``show``; with ``live`` None, write in place if ``show`` is the default, in a terminal."""
         self.show, self.printed, self.shown = show, {}, set()
         self.live = (show is say and is_live()) if live is None else live
-
-    def __enter__(self) -> Stages:
-        """Return these stages."""
-        return self
 
     def __exit__(self, *error) -> None:
         """Remove the line."""

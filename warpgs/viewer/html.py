@@ -19,7 +19,7 @@ from warpgs.errors import DataError
 from warpgs.files import write_text
 from warpgs.geometry import convert_camera, convert_gaussians, look_at, matmul, pose_at, quaternions, rotation_matrices
 from warpgs.locks import hold_file
-from warpgs.pipeline.films.paths import fov_y, up_of
+from warpgs.pipeline.films.paths import fov_y, rig_among
 from warpgs.pipeline.run.export import NO_FILTERS, Filters, file_gaussians, filtered
 from warpgs.pipeline.run.folder import open_run
 from warpgs.scene import Camera, Gaussians, Normalization, base_colors
@@ -141,7 +141,7 @@ def place_first_camera(
     """Set the camera at which pages start; return its target [3] [u] and the upward direction [3], ``level`` or of films."""
     target = camera.center + distance_ahead(camera, gaussians) * np.asarray(camera.viewmat[2, :3])
     points, own = gaussians.means.detach().cpu().double().numpy(), -np.asarray(camera.viewmat[1, :3])
-    up = up_of(list(cameras), points) if level is None else level
+    up = rig_among(list(cameras), points).up if level is None else level
     up = up if (up * own).sum() > 0.5 else own  # the camera looks along it, or lies on its side
     server.scene.set_up_direction(up)
     server.initial_camera.position = camera.center

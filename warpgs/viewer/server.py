@@ -106,17 +106,6 @@ MAX_TEXT = 4096
 """Longest text: names of images are among the values of controls."""
 
 
-def _within(low: float, high: float) -> Schema:
-    """Return the schema of finite numbers from ``low`` to ``high``."""
-
-    def check(value: Any, place: str) -> None:
-        schema.number(low)(value, place)
-        if value > high:
-            raise SchemaError(f"{place} must be at most {high:g}, not {value:g}")
-
-    return check
-
-
 def _short(value: Any, place: str) -> None:
     schema.text(value, place)
     if len(value) > MAX_TEXT:
@@ -125,7 +114,7 @@ def _short(value: Any, place: str) -> None:
 
 def _rotation(value: Any, place: str) -> None:
     """Allow unit quaternions."""
-    schema.items(_within(-1.01, 1.01), 4)(value, place)
+    schema.items(schema.number(-1.01, high=1.01), 4)(value, place)
     if abs(math.hypot(*value) - 1) > 0.01:
         raise SchemaError(f"{place} must be a unit quaternion")
 
@@ -140,7 +129,8 @@ def _value(value: Any, place: str) -> None:
         _coordinate(value, place)
 
 
-_coordinate = _within(-MAX_COORDINATE, MAX_COORDINATE)
+_coordinate = schema.number(-MAX_COORDINATE, high=MAX_COORDINATE)
+_distance = schema.number(0, high=MAX_COORDINATE)
 _point = schema.items(_coordinate, 3)
 _size = schema.whole(0, 2**15)
 _node = {"name": _short, "owner": _short}
@@ -149,8 +139,9 @@ _only = functools.partial(schema.fields, others=False)
 MESSAGES: Mapping[str, Schema] = {
     "ViewerCameraMessage": _only(
         {
-            "wxyz": _rotation, "position": _point, "look_at": _point, "up_direction": _point, "fov": _within(1e-3, 3.1),
-            "near": _within(0, MAX_COORDINATE), "far": _within(0, MAX_COORDINATE), "image_height": _size, "image_width": _size,
+            "wxyz": _rotation, "position": _point, "look_at": _point, "up_direction": _point,
+            "fov": schema.number(1e-3, high=3.1), "near": _distance, "far": _distance, "image_height": _size,
+            "image_width": _size,
         }
     ),
     "GuiUpdateMessage": _only({"uuid": _short, "updates": _only({"value": _value})}),

@@ -139,10 +139,7 @@ def live_view(folder: Path, port: int = PORT) -> Iterator[LiveView]:
     server = open_server(port)
     try:
         say(f"watch the fit at {address(server)} (afterwards with `warpgs view {shlex.quote(str(folder))}`)")
-        live = LiveView(server, folder.resolve().name, folder)
-        try:
+        with contextlib.closing(LiveView(server, folder.resolve().name, folder)) as live:
             yield live
-        finally:
-            live.close()
     finally:
         stop_server(server)

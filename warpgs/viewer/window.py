@@ -16,11 +16,12 @@ import torch
 from warpgs.errors import DataError, UsageError, WarpgsError
 from warpgs.export.base import format_of, read_with_antialiasing
 from warpgs.files import read_file, readable, remove_leftovers, write_json
-from warpgs.geometry import camera_extent, convert_camera, convert_gaussians, convert_points, matmul, pose_of, rotation_matrices
+from warpgs.geometry import camera_extent, convert_box, convert_camera, convert_gaussians, matmul, pose_of, rotation_matrices
 from warpgs.io.image_files import decode
 from warpgs.mesh.views import MIN_ALPHA
 from warpgs.pipeline.films.paths import fov_y
 from warpgs.pipeline.metrics.coverage import DepthView, classes_of, coverage_map, depth_views
+from warpgs.pipeline.model.edit import inside
 from warpgs.pipeline.model.table import FittedModel
 from warpgs.pipeline.run import level
 from warpgs.pipeline.run.commands import RULE, scene_of
@@ -31,7 +32,7 @@ from warpgs.process import say
 from warpgs.render.options import RasterizeOptions
 from warpgs.render.rasterize import rasterize
 from warpgs.report.images import coverage_image, depth_map, error_map, resized
-from warpgs.scene import Camera, Gaussians, Normalization, View
+from warpgs.scene import Box, Camera, Gaussians, Normalization, View
 from warpgs.viewer import html
 from warpgs.viewer.server import guarded, said
 
@@ -113,21 +114,10 @@ MAX_KEYFRAMES = 1000
 """Largest number of keyframes of a path: half an hour at the default of 2 s between them."""
 
 
-CropBox = tuple[np.ndarray, np.ndarray, np.ndarray]
-"""Centre [3] and lengths of the sides [3] of a box [u], and the rotation [3, 3] from its axes to the world's."""
-
-
-def inside(box: CropBox, means: torch.Tensor) -> torch.Tensor:
-    """Return which points [N, 3] [u] are in a box, bool, shape [N]."""
-    center, size, rotation = map(torch.from_numpy, box)
-    offsets = means.detach().cpu().double() - center
-    return ((offsets[:, :, None] * rotation).sum(1).abs() <= size / 2).all(1).to(means.device)
-
-
-def box_json(box: CropBox, normalization: Normalization) -> dict[str, Any]:
+def box_json(box: Box, normalization: Normalization) -> dict[str, Any]:
     """Return a box in file units: ``center`` [3], ``size`` [3], and ``rotation`` [3, 3] from its axes to the world's."""
-    (center,), size = convert_points(box[0][None], normalization, "scene", "file"), box[1] / normalization.scale
-    return {"center": center.tolist(), "size": size.tolist(), "rotation": matmul(normalization.rotation.T, box[2]).tolist()}
+    center, size, rotation = convert_box(box, normalization, "scene", "file")
+    return {"center": center.tolist(), "size": size.tolist(), "rotation": rotation.tolist()}
 
 
 def keyframe(camera: Camera, seconds: float, normalization: Normalization) -> dict[str, Any]:
@@ -247,7 +237,7 @@ class Panel:
         self._add_ruler()
         self.tell(content)
 
-    def crop_box(self) -> CropBox | None:
+    def crop_box(self) -> Box | None:
         """Return the box outside of which nothing is to be shown; None for everything."""
         if not self._crop.value:
             return None
@@ -460,7 +450,7 @@ class Window:
             keep &= fine if layer == FINE_LAYER else ~fine
         box = self.panel.crop_box()
         if box is not None:
-            keep &= inside(box, gaussians.means)
+            keep &= inside(gaussians, box)
         return Gaussians(**{n: t.detach()[keep] for n, t in gaussians.tensors().items()})
 
     def redraw(self) -> None:

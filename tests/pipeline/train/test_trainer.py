@@ -255,9 +255,9 @@ def test_resume_after_kill_gives_the_same_ply(tmp_path):
     ]  # fmt: skip
     # stands still after the first checkpoint, says so, and waits for the end
     stand_still = (
-        "import sys\nfrom warpgs.app.cli import main\nfrom warpgs.pipeline.run import fit, folder\n"
+        "import sys\nfrom warpgs.app.cli import main\nfrom warpgs.pipeline.run import folder\n"
         "def save(*a, **k):\n    made(*a, **k)\n    print('saved', flush=True)\n    sys.stdin.read()\n"
-        "made = folder.save_checkpoint\nfit.save_checkpoint = save\nsys.exit(main(sys.argv[1:]))"
+        "made = folder.save_checkpoint\nfolder.save_checkpoint = save\nsys.exit(main(sys.argv[1:]))"
     )
 
     def command(out: str, *more: str) -> list[str]:

@@ -15,18 +15,7 @@ from pathlib import Path
 from warpgs.errors import FolderHeldError, ResourceError, UsageError
 from warpgs.files import remove_leftovers, write_csv, write_text, writing_into
 from warpgs.locks import hold_folder
-from warpgs.pipeline.farm.job import (
-    PLY,
-    THUMBNAIL,
-    Engine,
-    Event,
-    FarmJob,
-    JobRecord,
-    finished,
-    job_text,
-    read_job_record,
-    write_record,
-)
+from warpgs.pipeline.farm.job import PLY, THUMBNAIL, Engine, Event, FarmJob, JobRecord, finished, read_job_record, write_record
 from warpgs.pipeline.run.request import choose_device
 from warpgs.process import PythonWorker, say
 from warpgs.report.farm import FarmTable, JobRow, farm_page
@@ -83,7 +72,7 @@ class LocalEngine:
 
     def start(self, job: FarmJob) -> None:
         """Start a job in an idle process, or in a new one."""
-        self._jobs.put((job.name, job_text(job)))
+        self._jobs.put((job.name, job.text()))
 
     def wait(self, seconds: float) -> list[Event]:
         """Return the next event of all processes, if any."""

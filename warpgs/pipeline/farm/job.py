@@ -45,20 +45,19 @@ class FarmJob:
             values.append(own)
         return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()[:16]
 
-
-def job_text(job: FarmJob) -> str:
-    """Return a job as one line of JSON."""
-    r = job.request
-    return json.dumps({
-        "name": job.name, "folder": str(job.folder.absolute()), "results": str(job.results.absolute()),
-        "scene": asdict(r.scene), "out": str(r.out.absolute()), "config": r.config.to_json(), "device": r.device,
-        "lpips_weights": None if r.lpips_weights is None else str(r.lpips_weights.resolve()), "notes": r.notes,
-        "own_code": own_places(r.config.plugged_in()),
-    })  # fmt: skip
+    def text(self) -> str:
+        """Return the job as one line of JSON."""
+        r = self.request
+        return json.dumps({
+            "name": self.name, "folder": str(self.folder.absolute()), "results": str(self.results.absolute()),
+            "scene": asdict(r.scene), "out": str(r.out.absolute()), "config": r.config.to_json(), "device": r.device,
+            "lpips_weights": None if r.lpips_weights is None else str(r.lpips_weights.resolve()), "notes": r.notes,
+            "own_code": own_places(r.config.plugged_in()),
+        })  # fmt: skip
 
 
 def job_of(text: str) -> FarmJob:
-    """Return the job of `job_text`; user code that the job names is imported, as in the process that wrote the text."""
+    """Return the job of `FarmJob.text`; user code that the job names is imported, as in the process that wrote the text."""
     v = schema.parse(text)
     scene, config = SceneRequest(**v["scene"]), v["config"]
     if scene.reader is not None:

@@ -11,7 +11,7 @@ from typing import Any
 
 from warpgs.errors import ResourceError, UsageError, install_extras
 from warpgs.folders import private_folder
-from warpgs.pipeline.farm.job import Event, FarmJob, job_text
+from warpgs.pipeline.farm.job import Event, FarmJob
 from warpgs.pipeline.farm.work import run_job
 from warpgs.ranks import listeners, say_what_is_open
 
@@ -49,7 +49,7 @@ class RayEngine:
 
     def start(self, job: FarmJob) -> None:
         """Send a job."""
-        self._running[self._task.remote(job_text(job), self._threads)] = job.name
+        self._running[self._task.remote(job.text(), self._threads)] = job.name
 
     def wait(self, seconds: float) -> list[Event]:
         """Return the jobs that have ended."""

@@ -12,7 +12,7 @@ from pathlib import Path
 from warpgs.errors import ResourceError, UsageError, WarpgsError
 from warpgs.files import write_text
 from warpgs.locks import private_shared_folder
-from warpgs.pipeline.farm.job import Event, FarmJob, job_text
+from warpgs.pipeline.farm.job import Event, FarmJob
 from warpgs.pipeline.farm.work import run_job
 from warpgs.process import interrupting_signals, run_program, say
 
@@ -76,7 +76,7 @@ class SlurmEngine:
         """Hand a job to Slurm."""
         base = self._folder / str(next(self._numbers))
         text, answer, log = (base.with_suffix(s) for s in SUFFIXES)
-        write_text(text, job_text(job))
+        write_text(text, job.text())
         command = [sys.executable, "-P", "-m", "warpgs.pipeline.farm.slurm", str(text), str(answer), str(self._threads)]
         script = f"#!/bin/sh\nexec {shlex.join(command)}\n"
         code, output, errors = _call("sbatch", "--parsable", *self._options, f"--output={log}", script=script)

@@ -19,20 +19,7 @@ from warpgs.io.image_files import decode
 from warpgs.io.load import Split
 from warpgs.kernels.launch import set_threads
 from warpgs.locks import hold_folder
-from warpgs.pipeline.farm.job import (
-    CHECKED,
-    LOG,
-    PLY,
-    THUMBNAIL,
-    FarmJob,
-    JobRecord,
-    file_digest,
-    is_whole,
-    job_of,
-    read_job_record,
-    source_stamp,
-    write_record,
-)
+from warpgs.pipeline.farm import job as jobs
 from warpgs.pipeline.metrics.lpips import Lpips
 from warpgs.pipeline.run.commands import evaluate
 from warpgs.pipeline.run.fit import fit_request, with_poses
@@ -148,18 +135,18 @@ def run_job(text: str, threads: int = 0, on_step: Callable[[StepReport], object]
     """Run a job from its text; the job's output goes to its log."""
     if threads:
         set_threads(threads)
-    job = job_of(text)
+    job = jobs.job_of(text)
     with files.writing_into(job.results):
         files.make_folder(job.folder)
-        with files.writable(job.folder / LOG):
-            file = files.appending(job.folder / LOG)
+        with files.writable(job.folder / jobs.LOG):
+            file = files.appending(job.folder / jobs.LOG)
         with file, output_to(file.fileno()):  # of native libraries, too
             return fit_job(job, on_step)
 
 
-def fit_job(job: FarmJob, on_step: Callable[[StepReport], object] | None = None) -> str:
+def fit_job(job: jobs.FarmJob, on_step: Callable[[StepReport], object] | None = None) -> str:
     """Fit or continue a job, or keep a finished one, and write its record; returns the state as `run_job` does."""
-    began, source, out = time.perf_counter(), source_stamp(Path(job.request.scene.path)), job.request.out
+    began, source, out = time.perf_counter(), jobs.source_stamp(Path(job.request.scene.path)), job.request.out
     error: Exception | None = None
     again = False
     try:
@@ -176,29 +163,29 @@ def fit_job(job: FarmJob, on_step: Callable[[StepReport], object] | None = None)
             message = no_memory_message(error) if full else f"internal error, {type(error).__name__}: {error}"
         for line in "".join(traceback.format_exception(error)).splitlines():
             say(line)
-    record = JobRecord(
+    record = jobs.JobRecord(
         job.name, job.identity(), "failed" if error else "done", how, message, again, source, time.perf_counter() - began
     )
     if metrics is not None:
-        write_thumbnail(out / "renders", job.folder / THUMBNAIL)
+        write_thumbnail(out / "renders", job.folder / jobs.THUMBNAIL)
         record = replace(
             record, psnr=metrics["test"].get("psnr"), ssim=metrics["test"].get("ssim"), steps=metrics["steps"],
-            gaussians=metrics.get("gaussians", 0), ply_bytes=(out / PLY).stat().st_size,
-            files={n: file_digest(out / n) for n in CHECKED},
+            gaussians=metrics.get("gaussians", 0), ply_bytes=(out / jobs.PLY).stat().st_size,
+            files={n: jobs.file_digest(out / n) for n in jobs.CHECKED},
         )  # fmt: skip
-    write_record(job.folder, record)
+    jobs.write_record(job.folder, record)
     gc.collect()  # a fit and its recorded steps refer to each other: without this their device memory is not freed
     return record.state
 
 
-def _ensure(job: FarmJob, on_step: Callable[[StepReport], object] | None) -> Outcome:
+def _ensure(job: jobs.FarmJob, on_step: Callable[[StepReport], object] | None) -> Outcome:
     """Return the outcome of the fit; the scene is read here only if an existing run may match."""
     request = job.request
     device, _ = choose_device(request.device)
     lpips = {} if request.lpips_weights is None else Lpips(request.lpips_weights, device).variants()
     files.remove_leftovers(job.folder)
-    before = read_job_record(job.folder)
-    if before is not None and before.state == "done" and not is_whole(request.out, before):
+    before = jobs.read_job_record(job.folder)
+    if before is not None and before.state == "done" and not jobs.is_whole(request.out, before):
         files.remove_file(request.out / "metrics.json")  # continued from its checkpoint, it writes all files again
     fingerprint, split, resolved = "", None, request.config
     if (request.out / CONFIG).is_file():

@@ -223,11 +223,6 @@ def rig_among(cameras: list[Camera], points: np.ndarray) -> Rig:
     return rig_of(cameras, float(np.median(ahead)) if len(ahead) else 1.0)
 
 
-def up_of(cameras: list[Camera], points: np.ndarray) -> np.ndarray:
-    """Return the upward unit vector [3] of a scene for films, from training cameras and points [N, 3] [u]."""
-    return rig_among(cameras, points).up
-
-
 def common_up(cameras: list[Camera]) -> np.ndarray | None:
     """Return the upward unit vector [3] that cameras agree on, as films use it; None if they do not agree."""
     up, turned = _upward(cameras, geometry.focus_point(cameras))

@@ -310,9 +310,10 @@ def summarize(metrics: list[ViewMetrics]) -> dict[str, float]:
     return means
 
 
-def variants(lpips: Lpips | None) -> dict[str, str]:
-    """Return the definition of each score but those of `ALPHA_VARIANTS`, and how masks are used."""
-    return VARIANTS | {"masks": MASKED} | ({"lpips": NO_LPIPS} if lpips is None else lpips.variants())
+def variants(lpips: Lpips | None, alpha: bool = False) -> dict[str, str]:
+    """Return the definition of each score, with those of `ALPHA_VARIANTS` if ``alpha``, and how masks are used."""
+    networks = {"lpips": NO_LPIPS} if lpips is None else lpips.variants()
+    return VARIANTS | {"masks": MASKED} | networks | (ALPHA_VARIANTS if alpha else {})
 
 
 MATCHED_RULE = "over the right half of each view, after an affine colour map fitted to its left half"

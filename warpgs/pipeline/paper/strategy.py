@@ -7,18 +7,7 @@ from typing import Annotated
 import torch
 
 from warpgs.device import STEP, Needs, StepSizes
-from warpgs.pipeline.paper.scores import (
-    Residual,
-    gain_map,
-    geometry_gate,
-    geometry_score,
-    importance,
-    normalized,
-    render_score,
-    residual_of,
-    semantic_score,
-    weights,
-)
+from warpgs.pipeline.paper import scores
 from warpgs.pipeline.train.strategies.base import StrategyContext, register
 from warpgs.pipeline.train.strategies.sampling import Rendered, Sampling
 from warpgs.pipeline.train.views import TrainingView
@@ -54,7 +43,7 @@ class PaperConfig(Checked, group="paper."):
 
     def weights(self, semantics: bool = True) -> tuple[float, float, float]:
         """Return the weights of the three scores, scaled to sum to 1; ``semantics`` is False for a view without the second."""
-        return weights(self.s_render, self.s_semantic and semantics, self.s_geometry)
+        return scores.weights(self.s_render, self.s_semantic and semantics, self.s_geometry)
 
     @property
     def asked_quantile(self) -> float:
@@ -83,7 +72,7 @@ class Paper(Sampling):
         """S_semantic of each training view, [H, W] in [0, 1]; None where its prior has no semantics."""
         self.geometry: list[torch.Tensor] = []
         """S_geometry of each training view, [H, W] in [0, 1]."""
-        self.residuals: list[Residual] = []
+        self.residuals: list[scores.Residual] = []
         """Residuals of the views of an event, to compute gains; empty if the residual is a length."""
 
     @classmethod
@@ -105,8 +94,8 @@ class Paper(Sampling):
                 for n in ("disparity", "confidence", "boundary", "foreground")
             }
             valid = None if view.countable is None else view.countable > 0
-            self.geometry.append(geometry_score(maps.pop("disparity"), valid))
-            semantic = semantic_score(**maps)
+            self.geometry.append(scores.geometry_score(maps.pop("disparity"), valid))
+            semantic = scores.semantic_score(**maps)
             self.semantic.append(semantic if bool(semantic.any()) else None)
 
     def before_event(self, views: Mapping[int, TrainingView], rendered: Mapping[int, Rendered]) -> None:
@@ -114,7 +103,7 @@ class Paper(Sampling):
         self.residuals = []
         if self.config.residual == "gain" and self.config.weights()[0] > 0:
             footprint = self.method.sampler.footprint
-            self.residuals = [residual_of(v, rendered[i].rgb, rendered[i].surface, footprint) for i, v in views.items()]
+            self.residuals = [scores.residual_of(v, rendered[i].rgb, rendered[i].surface, footprint) for i, v in views.items()]
 
     def importance(self, number: int, view: TrainingView, rendered: Rendered) -> dict[str, torch.Tensor]:
         """Return S_render, S_semantic, S_geometry and S_importance of a view, [H, W] each; nothing if all weights are 0."""
@@ -124,16 +113,16 @@ class Paper(Sampling):
         if sum(by) == 0:
             return {}
         residual = (
-            normalized(gain_map(view, depth, valid, self.residuals), valid)
+            scores.normalized(scores.gain_map(view, depth, valid, self.residuals), valid)
             if self.residuals
-            else render_score(rgb, view.image, valid)
+            else scores.render_score(rgb, view.image, valid)
         )
         zeros = torch.zeros_like(depth)
-        scores = (residual, zeros if semantic is None else semantic, self.geometry[number] if self.geometry else zeros)
+        parts = (residual, zeros if semantic is None else semantic, self.geometry[number] if self.geometry else zeros)
         names = (f"{w:.2f} {n}" for w, n in zip(by, ("S_render", "S_semantic", "S_geometry")))
-        return dict(zip(names, scores)) | {"S_importance": importance(scores, by)}
+        return dict(zip(names, parts)) | {"S_importance": scores.importance(parts, by)}
 
     def gate(self, number: int, valid: torch.Tensor, wanted: int) -> tuple[torch.Tensor, float]:
         """Return M_reliable of a view, bool [H, W], and the quantile of S_geometry that was used."""
         geometry = self.geometry[number] if self.geometry else torch.zeros_like(valid, dtype=torch.float32)
-        return geometry_gate(geometry, valid, self.asked_quantile, wanted)
+        return scores.geometry_gate(geometry, valid, self.asked_quantile, wanted)

@@ -14,7 +14,7 @@ from warpgs.device import format_bytes
 from warpgs.errors import DataError, UsageError
 from warpgs.export.base import Format, find_format, format_of, origin_of, write_gaussians
 from warpgs.export.meshes_and_cameras import check_suffix, holds_cameras, write_cameras, write_mesh
-from warpgs.geometry import convert_camera, convert_gaussians, convert_points, matmul, rotate
+from warpgs.geometry import convert_box, convert_camera, convert_gaussians, convert_points, matmul, rotate
 from warpgs.io.transforms import read_cameras, stated_origin
 from warpgs.kernels.neighbours import morton_codes
 from warpgs.locks import hold_file
@@ -23,7 +23,7 @@ from warpgs.pipeline.films.paths import common_up
 from warpgs.pipeline.model import edit
 from warpgs.pipeline.run.folder import CONFIG, StoredRun, open_run
 from warpgs.pipeline.run.request import choose_device
-from warpgs.scene import Box, Camera, Gaussians, Normalization, base_colors
+from warpgs.scene import Camera, Gaussians, Normalization, base_colors
 
 
 @dataclass(frozen=True)
@@ -248,18 +248,8 @@ def _cameras_written(
     lines += origin_line(origin)
     sizes = sorted({(c.width, c.height) for c in cameras})
     some = ", ".join(f"{w} x {h}" for w, h in sizes[:3]) + (" ..." if len(sizes) > 3 else "")
-    return [
-        *notes,
-        *lines,
-        f"{len(cameras):,} cameras for images of {some} px in {target}; their names are {'kept' if keep_names else 'numbers'}",
-    ]
-
-
-def _scene_box(box: Box, normalization: Normalization) -> Box:
-    """Return a box in file units in scene units."""
-    center, size, rotation = box
-    scale = normalization.scale
-    return (center - normalization.offset) * scale, size * scale, rotation
+    names = "kept" if keep_names else "numbers"
+    return [*notes, *lines, f"{len(cameras):,} cameras for images of {some} px in {target}; their names are {names}"]
 
 
 def mesh(
@@ -276,7 +266,8 @@ def mesh(
     if options.voxel is not None:
         options = replace(options, voxel=options.voxel * scale)
     if crop is not None:
-        options = replace(options, crop=crop if crop == "auto" else _scene_box(edit.box_of(crop), run.normalization))
+        box = crop if crop == "auto" else convert_box(edit.box_of(crop), run.normalization, "file", "scene")
+        options = replace(options, crop=box)
 
     def planned(plan: GridPlan, memory: str) -> None:
         lost = f"{100 * (1 - plan.inside):.1f} %"

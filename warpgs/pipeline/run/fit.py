@@ -25,35 +25,11 @@ from warpgs.pipeline.metrics.scores import Renders, moved_fractions, moved_notes
 from warpgs.pipeline.model.edit import drop_unused_sh
 from warpgs.pipeline.model.limits import shape_figures, shape_summary
 from warpgs.pipeline.model.table import FittedModel, similarity_of
-from warpgs.pipeline.run.folder import (
-    CONFIG,
-    METRICS_FILE,
-    POSED_SCENE,
-    TENSORS,
-    camera_values,
-    cameras_of,
-    check_checkpoint,
-    check_same,
-    load_checkpoint,
-    read_record,
-    record_of,
-    run_folder,
-    save_checkpoint,
-    with_cameras,
-)
+from warpgs.pipeline.run import folder as folders
+from warpgs.pipeline.run import results
+from warpgs.pipeline.run.folder import CONFIG, METRICS_FILE, POSED_SCENE, TENSORS
 from warpgs.pipeline.run.precompile import compiled_ahead
 from warpgs.pipeline.run.request import FitRequest, SceneRequest, check_overrides, choose_device, choose_split, read_scene
-from warpgs.pipeline.run.results import (
-    evaluate_run,
-    event_figures,
-    given_figures,
-    images_kept,
-    protocol_of,
-    result_lines,
-    rule_report_of,
-    sampling_report_of,
-    write_report,
-)
 from warpgs.pipeline.train.batch import check_ranks, check_renders, own_slots
 from warpgs.pipeline.train.loss import term_values
 from warpgs.pipeline.train.memory import plan_summary
@@ -135,13 +111,13 @@ class FitJob:
 
     def cameras(self, trainer: Trainer) -> Mapping[str, Camera]:
         """Return the cameras of all views after the view modules, by name."""
-        return trainer.learned.cameras(cameras_of(self.scene), self.split.train, self.split.test)
+        return trainer.learned.cameras(folders.cameras_of(self.scene), self.split.train, self.split.test)
 
     def model(self, trainer: Trainer) -> dict[str, Any]:
         """Return the fields of the current `FittedModel`, by name."""
         return {
             "scene_gaussians": trainer.gaussians, "normalization": self.scene.normalization,
-            "scene_cameras": cameras_of(self.scene), "train": self.split.train, "test": self.split.test,
+            "scene_cameras": folders.cameras_of(self.scene), "train": self.split.train, "test": self.split.test,
             "rule": self.config.rule, "background": self.scene.background, "step": trainer.step,
             "transparent": self.scene.transparent, "antialiased": self.config.antialiased,
         }  # fmt: skip
@@ -161,13 +137,13 @@ def take_steps(job: FitJob, trainer: Trainer) -> None:
             images_written()  # a fit that continues from the checkpoint does not write them
             tensors, state = trainer.state()
             if trainer.config.view_modules:  # by which a run is opened without their code
-                state["cameras"] = {n: camera_values(c) for n, c in job.cameras(trainer).items()}
-            save_checkpoint(out, tensors, state | {"fingerprint": job.scene.fingerprint, "train": job.split.train})
+                state["cameras"] = {n: folders.camera_values(c) for n, c in job.cameras(trainer).items()}
+            folders.save_checkpoint(out, tensors, state | {"fingerprint": job.scene.fingerprint, "train": job.split.train})
 
     def restore(trainer: Trainer) -> bool:
         if out is None or log is None or not (out / TENSORS).is_file():
             return False
-        trainer.load(*load_checkpoint(out))
+        trainer.load(*folders.load_checkpoint(out))
         log.rewind(trainer.step)
         return True
 
@@ -189,7 +165,7 @@ def take_steps(job: FitJob, trainer: Trainer) -> None:
 
     with contextlib.ExitStack() as stack:
         if out is not None and log is not None:
-            images_written = stack.enter_context(images_kept(trainer, list(job.split.train), out))
+            images_written = stack.enter_context(results.images_kept(trainer, list(job.split.train), out))
             stack.callback(log.close)
         planned = planned_times(job, trainer)[0]
         progress = stack.enter_context(Progress(trainer.steps, trainer.step, planned=planned)) if job.verbose else None
@@ -415,7 +391,7 @@ def fit(
     config, origin = _checked_settings(preset, overrides, out, resume, time_budget, ranks)
     scene = _checked_source(scene, split)
     verbose, own = ranks.first and verbose, out if ranks.first else None
-    folder = contextlib.nullcontext(list[str]()) if own is None else run_folder(own, resume)
+    folder = contextlib.nullcontext(list[str]()) if own is None else folders.run_folder(own, resume)
     stages = Stages() if verbose else Stages(lambda line: None)
     with (
         torch.inference_mode(False),  # a caller's own mode would end the first step
@@ -428,7 +404,7 @@ def fit(
     ):
         resume = resume and out is not None and (out / CONFIG).is_file()  # else the folder holds only found poses
         if out is not None and resume:
-            read_record(out)  # a run of another version is refused before anything takes time
+            folders.read_record(out)  # a run of another version is refused before anything takes time
         with clock("kernels"):
             chosen, where = choose_device(device)
             if ranks.first:
@@ -531,14 +507,14 @@ def fit_request(request: FitRequest, **others: Any) -> FitResult:
 
 def _prepare(job: FitJob, resumed: Path | None) -> tuple[Trainer, dict[str, Any], list[PhotoCheck]]:
     """Return the trainer, which continues the run ``resumed``, the record of the run, and checks of photographs."""
-    record, state = record_of(job.request, job.config, job.scene, job.split, job.notes, job.device), None
+    record, state = folders.record_of(job.request, job.config, job.scene, job.split, job.notes, job.device), None
     if resumed is not None:
-        stored = read_record(resumed)
-        check_same(record, stored, resumed)
+        stored = folders.read_record(resumed)
+        folders.check_same(record, stored, resumed)
         job.scene = replace(job.scene, normalization=similarity_of(stored["normalization"], str(resumed / CONFIG)))
         if (resumed / TENSORS).is_file():
-            state = load_checkpoint(resumed)
-            check_checkpoint(state[1], stored, resumed)
+            state = folders.load_checkpoint(resumed)
+            folders.check_checkpoint(state[1], stored, resumed)
             if state[1]["step"] == state[1].get("steps"):
                 job.say(f"  all {state[1]['step']:,} steps are taken; only the images, scores and report are made again")
     check_equal(record, None if state is None else state[1].get("step"), job.ranks)
@@ -578,8 +554,8 @@ def _finish(job: FitJob, trainer: Trainer, record: dict[str, Any], checks: list[
     job.ranks.part()
     metrics: dict[str, Any] = {}
     if job.ranks.first:
-        given = cameras_of(job.scene)
-        job.scene = with_cameras(job.scene, job.cameras(trainer))
+        given = folders.cameras_of(job.scene)
+        job.scene = folders.with_cameras(job.scene, job.cameras(trainer))
         if job.out is not None:
             model, path = drop_unused_sh(trainer.gaussians), job.out / "point_cloud.ply"
             with section("writing"):
@@ -594,15 +570,15 @@ def _finish(job: FitJob, trainer: Trainer, record: dict[str, Any], checks: list[
             write_json(job.out / METRICS_FILE, metrics)
             options, record["notes"] = trainer.context.render_options(), job.notes
             with section("report"):
-                write_report(
+                results.write_report(
                     job.out, job.scene, job.split, trainer.gaussians, options, metrics, record,
                     title=title_of(Path(job.scene.path), job.out),
-                    sampling=partial(sampling_report_of, trainer, job.out), renders=renders, times=job.clock.seconds,
+                    sampling=partial(results.sampling_report_of, trainer, job.out), renders=renders, times=job.clock.seconds,
                     tell=job.progress,
                 )  # fmt: skip
             metrics["wall_seconds"] = job.clock.seconds()
             write_json(job.out / METRICS_FILE, metrics)  # again, with the time of the report
-        for line in result_lines(metrics, job.out, [n for n in job.notes if isinstance(n, Task)]):
+        for line in results.result_lines(metrics, job.out, [n for n in job.notes if isinstance(n, Task)]):
             job.say(line)
     return FitResult(**job.model(trainer), config=job.config, metrics=metrics, notes=tuple(job.notes), folder=job.out)
 
@@ -622,25 +598,25 @@ def _score(
     options, tell, compare = trainer.context.render_options(), job.progress, not job.other_models
     scored = (job.out, gaussians, train, test, options)
     with section("scoring"):
-        metrics = evaluate_run(*scored, job.lpips, names=names, renders=renders, tell=tell)
+        metrics = results.evaluate_run(*scored, job.lpips, names=names, renders=renders, tell=tell)
     if test and compare:
         with section("coverage"):
             metrics["coverage"] = coverage_of_run(*scored, names=names, renders=renders, tell=tell)
     tell("checking float32 accuracy")
-    rule = rule_report_of(gaussians, train, options, seed=c.seed, half_resolution=trainer.half_resolution)
+    rule = results.rule_report_of(gaussians, train, options, seed=c.seed, half_resolution=trainer.half_resolution)
     shape = shape_figures(gaussians, c.limits, trainer.radius, trainer.context.extent, [v.camera for v in train])
     moved: dict[str, float] = {}
     if compare:
         shown = counted(train, tell, "checking for moving objects", "views")
         fractions = moved_fractions(train, (renders(v.camera) for v in shown))
         moved = {v.name: f for v, f in zip(train, fractions, strict=True)}
-    complexity, cameras, scale = complexity_figures(trainer), cameras_of(scene), scene.normalization.scale
+    complexity, cameras, scale = complexity_figures(trainer), folders.cameras_of(scene), scene.normalization.scale
     modules = {
         m.name: m.figures(
             FittedViews(learned.params_of(m), job.split.train, test, given, cameras, scale, gaussians, options)
         ) for m in learned.modules
     }  # fmt: skip
-    mapped = given_figures(train, trainer.views, renders)
+    mapped = results.given_figures(train, trainer.views, renders)
     table: list[tuple[dict[str, Any], list[str]]] = [  # figures of metrics.json, and their sentences in the report
         ({"rule": rule}, [Detail(rule["summary"])]),
         ({"shape": shape}, [Detail(shape_summary(shape))]),
@@ -654,8 +630,8 @@ def _score(
         job.note(*sentences)
     job.notes += moved_notes(moved)
     compiling = {"compiling": sum(job.compiled)} if job.compiled else {}
-    return metrics | peak | event_figures(trainer) | {
-        "protocol": protocol_of(scene, job.request.split, job.request.downscale or 1, train, test),
+    return metrics | peak | results.event_figures(trainer) | {
+        "protocol": results.protocol_of(scene, job.request.split, job.request.downscale or 1, train, test),
         "steps": trainer.step, "batch": c.batch, "ranks": job.ranks.count,
         "gaussians": len(gaussians), "preset": c.preset, "seed": c.seed,
         "config_hash": c.fingerprint(), "fingerprint": scene.fingerprint, "device": job.where.removeprefix("on "),

@@ -25,17 +25,7 @@ from warpgs.mesh.views import MIN_ALPHA
 from warpgs.pipeline.films.paths import Rig, midways, rig_among
 from warpgs.pipeline.metrics.coverage import coverage_map, coverage_section, depth_views
 from warpgs.pipeline.metrics.lpips import Lpips
-from warpgs.pipeline.metrics.scores import (
-    ALPHA_VARIANTS,
-    Renders,
-    ViewMetrics,
-    baselines,
-    psnr_of,
-    render_view,
-    score,
-    summarize,
-    variants,
-)
+from warpgs.pipeline.metrics.scores import Renders, ViewMetrics, baselines, psnr_of, render_view, score, summarize, variants
 from warpgs.pipeline.paper.scores import SUPPORT
 from warpgs.pipeline.train.loss import GIVEN_MIN_ALPHA
 from warpgs.pipeline.train.schedule import Phases
@@ -433,14 +423,9 @@ def evaluate_run(
     return {
         "test": summarize(rows), "train": summarize(train_rows),
         "views": [r.row() for r in rows],
-        "variants": variants(lpips) | (ALPHA_VARIANTS if any(r.opacity for r in found) else {}),
+        "variants": variants(lpips, any(r.opacity for r in found)),
         "baselines": plain.result(),
     }  # fmt: skip
-
-
-def _encoded(draw: Callable[..., np.ndarray], *parts: np.ndarray) -> bytes:
-    """Draw an image of a view and encode it for the page."""
-    return webp(draw(*parts))
 
 
 def _images(shown: list[View], renders: Renders, rows: dict[str, Any], tell: Callable[[str], object]) -> list[tuple[Any, ...]]:
@@ -459,7 +444,7 @@ def _images(shown: list[View], renders: Renders, rows: dict[str, Any], tell: Cal
             yield from ((np.asarray, a) for a in (image, view.image))
             yield from ((error_map, image, view.image), (depth_map, depth, alpha))
 
-    files = iter(in_background(_encoded, parts()))
+    files = iter(in_background(lambda draw, *maps: webp(draw(*maps)), parts()))
     return [(v.name, caption, *images) for v, caption, images in zip(shown, captions, zip(*[files] * 4))]
 
 
