@@ -9,7 +9,6 @@ from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
 from pathlib import Path
 
-import cv2  # noqa: TID253 - most functions here call it
 import numpy as np
 
 from warpgs import geometry
@@ -234,6 +233,8 @@ def _fits(shape: tuple[int, ...], lens: Lens) -> bool:
 
 
 def _resize(image: np.ndarray, width: int, height: int) -> np.ndarray:
+    import cv2
+
     return cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
 
 
@@ -249,6 +250,8 @@ def _fold_radius2(distortion: tuple[float, ...]) -> float:
 
 def undistortion_maps(K: np.ndarray, lens: Lens, width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the columns and rows [H, W] in the distorted image of a pinhole image's pixels, in OpenCV's convention."""
+    import cv2
+
     K = K.copy()
     K[:2, 2] -= 0.5  # OpenCV's pixel centres are at whole numbers
     return cv2.initUndistortRectifyMap(K, np.array(lens.distortion), None, K, (width, height), cv2.CV_32FC1)
@@ -256,6 +259,8 @@ def undistortion_maps(K: np.ndarray, lens: Lens, width: int, height: int) -> tup
 
 def nearest_unmasked(raster: np.ndarray, mask: np.ndarray | None) -> np.ndarray:
     """Return a raster [H, W, ...] whose masked pixels have the value of the nearest unmasked one, or 0 if all are masked."""
+    import cv2
+
     if mask is None or mask.all():
         return raster
     if not mask.any():
@@ -282,6 +287,8 @@ def without_masked(view: View) -> View:
 
 def _undistort(loaded: LoadedImage, lens: Lens) -> LoadedImage:
     """Resample to a pinhole of the same K; pixels that the lens never saw are masked out."""
+    import cv2
+
     height, width = loaded.image.shape[:2]
     map_x, map_y = undistortion_maps(loaded.K, lens, width, height)
     K = loaded.K.copy()
@@ -481,6 +488,8 @@ def empty_pixels(dark: np.ndarray) -> np.ndarray:
     The region of adjacent dark pixels (4 neighbours) around such a pixel touches the border, or covers at least `HOLE` of the
     image.
     """
+    import cv2
+
     _, labels, found, _ = cv2.connectedComponentsWithStats(dark.astype(np.uint8), connectivity=4)
     empty = found[:, cv2.CC_STAT_AREA] >= HOLE * dark.size
     empty[np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]])] = True

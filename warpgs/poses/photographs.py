@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-import cv2  # noqa: TID253 - most functions here call it
 import numpy as np
 
 from warpgs.errors import DataError, UsageError, install_extras
@@ -73,6 +72,8 @@ def is_video(path: Path) -> bool:
 
 def _frames(path: Path) -> Iterator[np.ndarray]:
     """Yield the frames of a video, uint8 BGR [H, W, 3], upright."""
+    import cv2
+
     _check_container(path)
     with utf8_name(path) as name, hidden_stderr():  # for a broken file, both would print the error, too
         capture = cv2.VideoCapture(name, cv2.CAP_FFMPEG)
@@ -111,6 +112,8 @@ def _check_container(path: Path) -> None:
 
 def sharpness(frame: np.ndarray) -> float:
     """Return the variance of the Laplacian of a frame, uint8 BGR [H, W, 3], at a size at which noise averages out."""
+    import cv2
+
     gray = cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)
     scale = SHARPNESS_SIDE / max(gray.shape)
     if scale < 1:
@@ -126,6 +129,8 @@ def sharpest(values: list[float], count: int) -> list[int]:
 
 def write_frames(path: Path, folder: Path, count: int, progress: Progress) -> int:
     """Write the sharpest frame of each of ``count`` equal parts of a video as PNG; return the video's number of frames."""
+    import cv2
+
     values = []
     for i, frame in enumerate(_frames(path)):
         progress(f"looking for sharp frames: {i + 1} read")
@@ -318,6 +323,8 @@ def _format(data: bytes) -> str:
 
 def prepare(path: Path, root: Path, small: Path, max_pixels: int = image_files.MAX_PIXELS) -> Photograph:
     """Read a photograph and write the upright copy that is matched, at most `MATCHING_SIDE` pixels wide and high."""
+    import cv2
+
     data = image_files.read_image_file(path, max_pixels)
     name, colors = path.relative_to(root).as_posix(), image_files.decode(path, max_pixels, data)[0]
     orientation, *names, film = image_files.read_exif(data)  # decode has checked that the file is an image within the limits
@@ -338,6 +345,8 @@ def prepare(path: Path, root: Path, small: Path, max_pixels: int = image_files.M
 
 def write_copy(photograph: Photograph, folder: Path, max_pixels: int = image_files.MAX_PIXELS) -> None:
     """Write a photograph into the image folder of a scene: upright, at full size, and without its metadata."""
+    import cv2
+
     data = image_files.read_image_file(photograph.path, max_pixels)
     if hashlib.sha256(data).hexdigest() != photograph.digest:
         raise DataError(f"{photograph.path}: the file has changed since it was read; start again")

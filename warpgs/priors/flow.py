@@ -5,7 +5,6 @@ import itertools
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-import cv2  # noqa: TID253 - most functions here call it
 import numpy as np
 
 from warpgs import geometry
@@ -106,6 +105,8 @@ def _ray_lengths(rays: np.ndarray, others: np.ndarray, tau: np.ndarray) -> tuple
 
 def round_trip(matches: np.ndarray, pixels: np.ndarray, back: np.ndarray) -> np.ndarray:
     """Return the distance [px] from each pixel to its match moved by the flow ``back`` [H, W, 2], shape [N]; inf outside."""
+    import cv2
+
     height, width = back.shape[:2]
     # OpenCV samples at whole numbers for pixel centres
     at = np.nan_to_num(matches - 0.5, nan=-1e6, posinf=-1e6, neginf=-1e6).astype(np.float32)[:, None]
@@ -180,6 +181,8 @@ features."""
 
 def sift_features(view: View, max_pixels: int | None = None, most: int = 0) -> Features:
     """Find the SIFT features of a view (Lowe 2004) within its mask, at most ``most`` of them unless that is 0."""
+    import cv2
+
     gray = cv2.cvtColor((view.image * 255).round().astype(np.uint8), cv2.COLOR_RGB2GRAY)
     mask = None if view.mask is None else view.mask.astype(np.uint8) * 255
     scale = np.ones(2)
@@ -198,6 +201,8 @@ def sift_features(view: View, max_pixels: int | None = None, most: int = 0) -> F
 
 def _ratio_matches(first: np.ndarray | None, second: np.ndarray | None) -> np.ndarray:
     """Return the rows [N, 2] of descriptors [K, 128] that match by Lowe's test."""
+    import cv2
+
     if first is None or second is None or min(len(first), len(second)) < 2:
         return np.zeros((0, 2), int)
     matches = cv2.BFMatcher(cv2.NORM_L2).knnMatch(first.astype(np.float32), second.astype(np.float32), k=2)
@@ -295,6 +300,8 @@ def read_flo(path: Path) -> np.ndarray:
 
 def resize_flow(flow: np.ndarray, width: int, height: int, second: tuple[int, int] | None = None) -> np.ndarray:
     """Return flow [h, w, 2] [px] at another image size, [height, width, 2]; ``second`` is the second image's new size."""
+    import cv2
+
     h, w = flow.shape[:2]
     if (w, h) == (width, height) == (second or (width, height)):
         return flow
@@ -331,11 +338,15 @@ def _from_folder(folder: Path, views: Sequence[View]) -> FlowBetween:
 
 
 def _gray(view: View) -> np.ndarray:
+    import cv2
+
     return cv2.cvtColor((view.image * 255).round().clip(0, 255).astype(np.uint8), cv2.COLOR_RGB2GRAY)
 
 
 def _same_size(views: Sequence[View], i: int, j: int, compute: Callable[[View, View], np.ndarray | None]) -> np.ndarray | None:
     """Return flow by a method that needs both images at one size: the second is resized to the first's size."""
+    import cv2
+
     first, second = views[i], views[j]
     a, b = first.camera, second.camera
     if (a.width, a.height) != (b.width, b.height):
@@ -346,6 +357,8 @@ def _same_size(views: Sequence[View], i: int, j: int, compute: Callable[[View, V
 
 
 def _classic(kind: str) -> Callable[[View, View], np.ndarray]:
+    import cv2
+
     if kind == "deepflow":
         method = cv2.optflow.createOptFlow_DeepFlow()
     else:
@@ -361,6 +374,8 @@ def _classic(kind: str) -> Callable[[View, View], np.ndarray]:
 
 def _sparse(views: Sequence[View]) -> FlowBetween:
     """Return a function for the flow from SIFT matches near epipolar lines, interpolated along edges (Revaud et al. 2015)."""
+    import cv2
+
     sift = cv2.SIFT_create(contrastThreshold=0.01)
     features = []
     for view in views:
@@ -392,6 +407,8 @@ def _sparse(views: Sequence[View]) -> FlowBetween:
 
 def _network(path: Path) -> Callable[[View, View], np.ndarray]:
     """Return a function for the flow by a network of two images [1, 3, h, w]; its last output [1, 2, h, w] is used."""
+    import cv2
+
     network = Model(path)
     shapes = [shape for _, _, shape in network.inputs]
     if len(shapes) != 2 or any(len(shape) != 4 for shape in shapes):

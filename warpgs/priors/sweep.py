@@ -3,7 +3,6 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
-import cv2  # noqa: TID253 - most functions here call it
 import numpy as np
 import torch
 
@@ -27,6 +26,8 @@ def complete(depth: np.ndarray, valid: np.ndarray, image: np.ndarray) -> np.ndar
     """Fill a depth map [u], [H, W], by edge-aware averages of inverse depth; the median where no valid depth reaches."""
     # Smoothed inverse depths by the smoothed mask (Min et al. 2014): planes stay planes, and far surfaces are not pulled near.
     # Measured in docs/decisions/007-coarse-start.md.
+    import cv2
+
     if not valid.any():
         return np.zeros(depth.shape, np.float32)
     inverse = np.where(valid, 1 / np.where(valid, depth, 1), 0).astype(np.float32)
@@ -323,6 +324,8 @@ GPU_FRACTION = 0.25
 
 def _reduced(view: View) -> View:
     """Return the view, resized to at most `MAX_PIXELS` where it is larger."""
+    import cv2
+
     c = view.camera
     shrink = min(1.0, (MAX_PIXELS / (c.width * c.height)) ** 0.5)
     if shrink == 1.0:
@@ -364,6 +367,8 @@ def _on_gpu(views: Mapping[int, View], planes: Mapping[int, np.ndarray], device:
 
 def _at_size(found: ViewDepth, small: View, view: View, notes: Sequence[str]) -> ViewDepth:
     """Return depth found in a smaller image, resized to the view's own size and without masked pixels."""
+    import cv2
+
     depth, valid, sensitivity = found.depth, found.valid, found.sensitivity
     if small is not view:
         size, scale = (view.camera.width, view.camera.height), small.camera.width / view.camera.width

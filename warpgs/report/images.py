@@ -5,7 +5,6 @@ import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import cv2  # noqa: TID253 - most functions here call it
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
@@ -26,6 +25,8 @@ def png(image: np.ndarray) -> bytes:
 
 
 def _encoded(suffix: str, pixels: np.ndarray, options: Sequence[int] = ()) -> bytes:
+    import cv2
+
     done, data = cv2.imencode(suffix, pixels, options)
     if not done:
         raise ResourceError(f"an image of {pixels.shape[1]} x {pixels.shape[0]} px could not be encoded as {suffix}")
@@ -34,6 +35,8 @@ def _encoded(suffix: str, pixels: np.ndarray, options: Sequence[int] = ()) -> by
 
 def webp(image: np.ndarray | bytes, width: int = PAGE_WIDTH, quality: int = 82) -> bytes:
     """Encode colours [H, W, 3] in [0, 1], or an image file, as WebP of at most ``width`` px, a tenth of the size of a PNG."""
+    import cv2
+
     if isinstance(image, bytes):
         pixels = cv2.imdecode(np.frombuffer(image, np.uint8), cv2.IMREAD_COLOR)
     else:
@@ -61,6 +64,8 @@ def resized(image: np.ndarray, width: int, height: int):
 
 def colored(values: np.ndarray, name: str) -> np.ndarray:
     """Return the colours [H, W, 3] that a colour map of OpenCV, such as INFERNO, gives to values [H, W] between 0 and 1."""
+    import cv2
+
     table = cv2.applyColorMap(np.arange(256, dtype=np.uint8)[:, None], getattr(cv2, f"COLORMAP_{name}"))[:, 0, ::-1]
     return np.take(table.astype(np.float32) / 255, np.round(np.clip(values, 0, 1) * 255).astype(np.uint8), axis=0)
 
