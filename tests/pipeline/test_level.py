@@ -201,6 +201,47 @@ def test_renders_films_and_exports_agree_in_new_coordinates(made, tmp_path, caps
     assert similarity_values(open_run(tmp_path / "run", "cpu").normalization) == similarity_values(n)
 
 
+def vertices(path):
+    """Vertices of a mesh in PLY [N, 3]."""
+    head, _, body = path.read_bytes().partition(b"end_header\n")
+    return np.frombuffer(body, [("at", "<f4", 3), ("color", "u1", 3)], int(re.search(rb"vertex (\d+)", head)[1]))["at"]
+
+
+def test_a_box_of_the_same_place_cuts_the_same_surface(run, tmp_path, capsys):
+    """Before and after the files are turned and scaled; the box is turned, too."""
+    assert sh("level", run, "--scale", "0,0,0", "1,0,0", UNIT) == 0
+    surfaces, middle, axes = [], np.mean(POINTS[HIT == 0], axis=0) @ TILT.T, rotation_about(np.array([1.0, 0, 0]), 0.4)
+    place = open_run(run, "cpu").normalization
+    middle, axes = convert_points(middle[None], place, "file", "scene")[0], place.rotation @ axes
+    for name in ("before", "after"):
+        n = open_run(run, "cpu").normalization
+        center = convert_points(middle[None], n, "scene", "file")[0].tolist()
+        size = (np.array([1.5, 1.2, 1.0]) * place.scale / n.scale).tolist()
+        box = json.dumps({"center": center, "size": size, "rotation": (n.rotation.T @ axes).tolist()})
+        voxel = 0.06 * place.scale / n.scale
+        assert sh("mesh", run, "--out", tmp_path / f"{name}.ply", "--voxel", voxel, "--crop", box) == 0
+        assert f"voxel {voxel:.4g} m" in capsys.readouterr().out
+        surfaces.append(convert_points(vertices(tmp_path / f"{name}.ply"), n, "file", "scene"))
+        assert sh("level", run, "--ground", *picks(ground())) == 0
+    assert len(surfaces[0]) == len(surfaces[1]) > 50
+    np.testing.assert_allclose(*surfaces, atol=1e-4 * place.scale)
+
+
+def test_coordinates_of_given_points_are_new_after_a_command(run, capsys):
+    """They are printed, and with them a repeated command changes nothing; pixels need no such line."""
+    ground_points, ends = ["0,0,0", "1,0,0.2", "0.1,1,0"], ["0.1,0.2,0.3", "-0.2,0.4,0.1"]
+    for words, length in ((["--scale", *ends], ["2"]), (["--ground", *ground_points], [])):
+        assert sh("level", run, *words, *length) == 0
+        said = re.search(r"the points are now at (.+) \(", capsys.readouterr().out)
+        n = open_run(run, "cpu").normalization
+        assert sh("level", run, words[0], *said[1].split(), *length) == 0
+        again = open_run(run, "cpu").normalization
+        for key in ("offset", "scale", "rotation"):
+            np.testing.assert_allclose(getattr(again, key), getattr(n, key), rtol=1e-6, atol=1e-6)
+        capsys.readouterr()
+    assert sh("level", run, "--ground", *picks(ground())) == 0 and "now at" not in capsys.readouterr().out
+
+
 def test_a_second_camera_that_disagrees_adds_to_the_error(run, monkeypatch):
     """By the distance of the point that it shows; one from which the point is hidden does not."""
     stored = open_run(run, "cpu")

@@ -218,10 +218,15 @@ def level(
         raise UsageError("give one of --scale, --ground, --up and --gps, with at most one folder")
 
     def change(run: StoredRun) -> Levelled:
-        if scale:
-            return scaled(run.normalization, picked(run, scale[0]), picked(run, scale[1]), scale[2])
-        if ground:
-            return grounded(run, [picked(run, text) for text in ground])
-        return photographed(run) if photographs else located(run, *(gps or [None]))
+        texts = scale[:2] if scale else ground or ()
+        places = [picked(run, text) for text in texts]
+        if not places:
+            return photographed(run) if photographs else located(run, *(gps or [None]))
+        n, line = scaled(run.normalization, *places, scale[2]) if scale else grounded(run, places)
+        if all(":" in text for text in texts):  # pixels stay where they are; coordinates move with the files
+            return n, line
+        points = np.round(convert_points(np.array([point for point, _ in places]), n, "scene", "file"), 9) + 0.0
+        now = " ".join(",".join(f"{v:.12g}" for v in point) for point in points)
+        return n, f"{line}; the points are now at {now} (give these to repeat the command)"
 
     return store(folder, device_name, change)
