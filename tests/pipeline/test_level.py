@@ -14,7 +14,7 @@ from PIL import Image
 
 import warpgs
 from warpgs.app.cli import main
-from warpgs.errors import DataError
+from warpgs.errors import DataError, ResourceError
 from warpgs.export.base import write_gaussians
 from warpgs.export.meshes_and_cameras import write_cameras
 from warpgs.geometry import back_project, convert_camera, convert_points, logit, look_at, pose_at, project_points, quaternions
@@ -189,7 +189,9 @@ def test_renders_films_and_exports_agree_in_new_coordinates(made, tmp_path, caps
         assert main(["export", str(run.folder), "--to", str(target), "--no-clean"]) == 0
         assert torch.cdist(run.gaussians("file").means, warpgs.export.read_gaussians(target).means).amin(1).max() < 0.01
     assert main(["export", str(run.folder), "--to", str(tmp_path / "cameras.json"), "--rotate", "level"]) == 0
-    assert "rotated by 0.0 degrees" in capsys.readouterr().out  # they are level already
+    said = capsys.readouterr().out
+    assert "rotated by 0.0 degrees" in said  # they are level already
+    assert re.search("rounds positions, by at most [0-9.e-]+ m$", said, re.M) and "replaces" not in said
     key = {"c2w": np.linalg.inv(moved.viewmat).tolist(), "fov_y": 0.8, "seconds": 0}
     (tmp_path / "path.json").write_text(json.dumps([key]))
     np.testing.assert_allclose(read_keyframes(tmp_path / "path.json", camera, n)[0].camera.viewmat, camera.viewmat, atol=1e-9)
@@ -293,11 +295,59 @@ def test_gps_gives_place_and_north(run, made, tmp_path, capsys):
     assert np.linalg.norm(open_run(run, "cpu").normalization.offset - n.offset) < 5
     turns, _ = poses(run, tmp_path / "level")
     assert all(degrees_apart(t @ UP, [0, 0, 1]) < 1 and degrees_apart(t @ [0, 0, 1], [0, 1, 0]) < 1 for t in turns)
+    for again in (False, True):
+        assert sh("level", run, "--up", "photographs") == 0
+        assert ("this replaces the earlier level" in capsys.readouterr().out) != again
     (tmp_path / "few" / "images").mkdir(parents=True)
     for name in NAMES[:2]:
         shutil.copy(made / "scene" / name, tmp_path / "few" / name)
     assert sh("level", run, "--gps", tmp_path / "few") == 3
     assert re.search("2 of 8 photographs have GPS in EXIF that fits .* --gps FOLDER", capsys.readouterr().err)
+
+
+def test_gps_that_is_not_found(run, made, tmp_path, capsys):
+    """No folder, no file with the name of a view, no EXIF: each has its message; HEIC originals of copies are found by name."""
+    folder = tmp_path / "originals"
+
+    def error():
+        assert sh("level", run, "--gps", folder) == 3
+        return capsys.readouterr().err
+
+    assert "no such folder; give the folder of the originals" in error()
+    (folder / "images").mkdir(parents=True)
+    assert f"no file has the name of a photograph, such as {NAMES[0]} and {NAMES[1]}" in error()
+    for name in NAMES[:3]:
+        Image.new("RGB", (8, 8)).save(folder / name)
+    assert re.search("none of the 3 photographs found in .* has GPS in EXIF. Copies often lose EXIF", error())
+    record = json.loads((run / "config.json").read_text())
+    renamed = {name: name.replace(".png", ".HEIC.jpg") for name in NAMES}
+    record |= {key: [renamed[name] for name in record[key]] for key in ("train", "test")}
+    record["cameras"] = {renamed[name]: camera for name, camera in record["cameras"].items()}
+    (run / "config.json").write_text(json.dumps(record))
+    for name in NAMES:
+        (folder / name).with_suffix(".HEIC").write_bytes(b"\0\0\0\x18ftypheic" + bytes(40))
+    assert re.search("none of the 8 .* EXIF of HEIC is not read: convert .* to JPEG .* such as images/000.HEIC.jpg", error())
+    for name in NAMES:
+        shutil.copy(made / "scene" / name, (folder / name).with_suffix(".HEIC"))
+    assert sh("level", run, "--gps", folder) == 0
+
+
+@pytest.mark.parametrize("failing", ["write_ply", "write_json"])
+def test_an_error_while_files_are_replaced_says_to_repeat(run, monkeypatch, capsys, failing):
+    """config.json is last, so that it has the old state until the PLY is new; repeated, both are new."""
+    before = (run / "config.json").read_bytes()
+
+    def full(*values, **more):
+        raise ResourceError("the disk is full; free some space")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(level, failing, full)
+        assert sh("level", run, "--scale", *picks(ground())[:2], 3) == 4
+    assert "the disk is full; free some space; then repeat the command" in capsys.readouterr().err
+    assert (run / "config.json").read_bytes() == before
+    assert sh("level", run, "--scale", *picks(ground())[:2], 3) == 0
+    means = open_run(run, "cpu").gaussians("file").means
+    np.testing.assert_allclose(warpgs.read_ply(run / "point_cloud.ply").means, means, rtol=1e-5, atol=1e-6)
 
 
 def test_gps_of_files_is_read_with_bounds(tmp_path):
