@@ -199,7 +199,7 @@ def stored(monkeypatch, tmp_path_factory):
 def test_the_command_writes_in_units_of_the_files(stored, tmp_path, capsys):
     assert main(["mesh", "run", "--out", str(tmp_path / "a.ply"), "--voxel", "0.16", "--device", "cpu"]) == 0
     text = capsys.readouterr().out
-    assert text.index("voxel 0.16 in units of the scene's files") < text.index("fusing depth: view 1 of 9")
+    assert text.index("voxel 0.16 units of the scene's files") < text.index("fusing depth: view 1 of 9")
     assert "was not observed by the 9 training views" in text and "triangles extracted" in text
     head, body = (tmp_path / "a.ply").read_bytes().split(b"end_header\n", 1)
     count = int(head.split(b"element vertex ")[1].split()[0])

@@ -14,7 +14,7 @@ from PIL import Image
 
 import warpgs
 from warpgs.app.cli import main
-from warpgs.errors import DataError
+from warpgs.errors import DataError, ResourceError
 from warpgs.export.base import write_gaussians
 from warpgs.export.meshes_and_cameras import write_cameras
 from warpgs.geometry import back_project, convert_camera, convert_points, logit, look_at, pose_at, project_points, quaternions
@@ -189,7 +189,9 @@ def test_renders_films_and_exports_agree_in_new_coordinates(made, tmp_path, caps
         assert main(["export", str(run.folder), "--to", str(target), "--no-clean"]) == 0
         assert torch.cdist(run.gaussians("file").means, warpgs.export.read_gaussians(target).means).amin(1).max() < 0.01
     assert main(["export", str(run.folder), "--to", str(tmp_path / "cameras.json"), "--rotate", "level"]) == 0
-    assert "rotated by 0.0 degrees" in capsys.readouterr().out  # they are level already
+    said = capsys.readouterr().out
+    assert "rotated by 0.0 degrees" in said  # they are level already
+    assert re.search("rounds positions, by at most [0-9.e-]+ m$", said, re.M) and "replaces" not in said
     key = {"c2w": np.linalg.inv(moved.viewmat).tolist(), "fov_y": 0.8, "seconds": 0}
     (tmp_path / "path.json").write_text(json.dumps([key]))
     np.testing.assert_allclose(read_keyframes(tmp_path / "path.json", camera, n)[0].camera.viewmat, camera.viewmat, atol=1e-9)
@@ -199,6 +201,47 @@ def test_renders_films_and_exports_agree_in_new_coordinates(made, tmp_path, caps
     assert main(["fit", "--out", str(tmp_path / "run"), "--resume"]) == 0
     assert (tmp_path / "run" / "point_cloud.ply").read_bytes() == ply
     assert similarity_values(open_run(tmp_path / "run", "cpu").normalization) == similarity_values(n)
+
+
+def vertices(path):
+    """Vertices of a mesh in PLY [N, 3]."""
+    head, _, body = path.read_bytes().partition(b"end_header\n")
+    return np.frombuffer(body, [("at", "<f4", 3), ("color", "u1", 3)], int(re.search(rb"vertex (\d+)", head)[1]))["at"]
+
+
+def test_a_box_of_the_same_place_cuts_the_same_surface(run, tmp_path, capsys):
+    """Before and after the files are turned and scaled; the box is turned, too."""
+    assert sh("level", run, "--scale", "0,0,0", "1,0,0", UNIT) == 0
+    surfaces, middle, axes = [], np.mean(POINTS[HIT == 0], axis=0) @ TILT.T, rotation_about(np.array([1.0, 0, 0]), 0.4)
+    place = open_run(run, "cpu").normalization
+    middle, axes = convert_points(middle[None], place, "file", "scene")[0], place.rotation @ axes
+    for name in ("before", "after"):
+        n = open_run(run, "cpu").normalization
+        center = convert_points(middle[None], n, "scene", "file")[0].tolist()
+        size = (np.array([1.5, 1.2, 1.0]) * place.scale / n.scale).tolist()
+        box = json.dumps({"center": center, "size": size, "rotation": (n.rotation.T @ axes).tolist()})
+        voxel = 0.06 * place.scale / n.scale
+        assert sh("mesh", run, "--out", tmp_path / f"{name}.ply", "--voxel", voxel, "--crop", box) == 0
+        assert f"voxel {voxel:.4g} m" in capsys.readouterr().out
+        surfaces.append(convert_points(vertices(tmp_path / f"{name}.ply"), n, "file", "scene"))
+        assert sh("level", run, "--ground", *picks(ground())) == 0
+    assert len(surfaces[0]) == len(surfaces[1]) > 50
+    np.testing.assert_allclose(*surfaces, atol=1e-4 * place.scale)
+
+
+def test_coordinates_of_given_points_are_new_after_a_command(run, capsys):
+    """They are printed, and with them a repeated command changes nothing; pixels need no such line."""
+    ground_points, ends = ["0,0,0", "1,0,0.2", "0.1,1,0"], ["0.1,0.2,0.3", "-0.2,0.4,0.1"]
+    for words, length in ((["--scale", *ends], ["2"]), (["--ground", *ground_points], [])):
+        assert sh("level", run, *words, *length) == 0
+        said = re.search(r"the points are now at (.+) \(", capsys.readouterr().out)
+        n = open_run(run, "cpu").normalization
+        assert sh("level", run, words[0], *said[1].split(), *length) == 0
+        again = open_run(run, "cpu").normalization
+        for key in ("offset", "scale", "rotation"):
+            np.testing.assert_allclose(getattr(again, key), getattr(n, key), rtol=1e-6, atol=1e-6)
+        capsys.readouterr()
+    assert sh("level", run, "--ground", *picks(ground())) == 0 and "now at" not in capsys.readouterr().out
 
 
 def test_a_second_camera_that_disagrees_adds_to_the_error(run, monkeypatch):
@@ -252,11 +295,59 @@ def test_gps_gives_place_and_north(run, made, tmp_path, capsys):
     assert np.linalg.norm(open_run(run, "cpu").normalization.offset - n.offset) < 5
     turns, _ = poses(run, tmp_path / "level")
     assert all(degrees_apart(t @ UP, [0, 0, 1]) < 1 and degrees_apart(t @ [0, 0, 1], [0, 1, 0]) < 1 for t in turns)
+    for again in (False, True):
+        assert sh("level", run, "--up", "photographs") == 0
+        assert ("this replaces the earlier level" in capsys.readouterr().out) != again
     (tmp_path / "few" / "images").mkdir(parents=True)
     for name in NAMES[:2]:
         shutil.copy(made / "scene" / name, tmp_path / "few" / name)
     assert sh("level", run, "--gps", tmp_path / "few") == 3
     assert re.search("2 of 8 photographs have GPS in EXIF that fits .* --gps FOLDER", capsys.readouterr().err)
+
+
+def test_gps_that_is_not_found(run, made, tmp_path, capsys):
+    """No folder, no file with the name of a view, no EXIF: each has its message; HEIC originals of copies are found by name."""
+    folder = tmp_path / "originals"
+
+    def error():
+        assert sh("level", run, "--gps", folder) == 3
+        return capsys.readouterr().err
+
+    assert "no such folder; give the folder of the originals" in error()
+    (folder / "images").mkdir(parents=True)
+    assert f"no file has the name of a photograph, such as {NAMES[0]} and {NAMES[1]}" in error()
+    for name in NAMES[:3]:
+        Image.new("RGB", (8, 8)).save(folder / name)
+    assert re.search("none of the 3 photographs found in .* has GPS in EXIF. Copies often lose EXIF", error())
+    record = json.loads((run / "config.json").read_text())
+    renamed = {name: name.replace(".png", ".HEIC.jpg") for name in NAMES}
+    record |= {key: [renamed[name] for name in record[key]] for key in ("train", "test")}
+    record["cameras"] = {renamed[name]: camera for name, camera in record["cameras"].items()}
+    (run / "config.json").write_text(json.dumps(record))
+    for name in NAMES:
+        (folder / name).with_suffix(".HEIC").write_bytes(b"\0\0\0\x18ftypheic" + bytes(40))
+    assert re.search("none of the 8 .* EXIF of HEIC is not read: convert .* to JPEG .* such as images/000.HEIC.jpg", error())
+    for name in NAMES:
+        shutil.copy(made / "scene" / name, (folder / name).with_suffix(".HEIC"))
+    assert sh("level", run, "--gps", folder) == 0
+
+
+@pytest.mark.parametrize("failing", ["write_ply", "write_json"])
+def test_an_error_while_files_are_replaced_says_to_repeat(run, monkeypatch, capsys, failing):
+    """config.json is last, so that it has the old state until the PLY is new; repeated, both are new."""
+    before = (run / "config.json").read_bytes()
+
+    def full(*values, **more):
+        raise ResourceError("the disk is full; free some space")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(level, failing, full)
+        assert sh("level", run, "--scale", *picks(ground())[:2], 3) == 4
+    assert "the disk is full; free some space; then repeat the command" in capsys.readouterr().err
+    assert (run / "config.json").read_bytes() == before
+    assert sh("level", run, "--scale", *picks(ground())[:2], 3) == 0
+    means = open_run(run, "cpu").gaussians("file").means
+    np.testing.assert_allclose(warpgs.read_ply(run / "point_cloud.ply").means, means, rtol=1e-5, atol=1e-6)
 
 
 def test_gps_of_files_is_read_with_bounds(tmp_path):

@@ -174,7 +174,7 @@ def mesh(
     Args:
         run: Run folder of `warpgs fit`.
         out: File to write: .ply (colours at the vertices), or .glb (glTF; with a texture if pixels are finer than triangles).
-        voxel: Side of a voxel, in units of the scene's files; smaller voxels show more detail and more noise.
+        voxel: Side of a voxel, in units of the run's files; smaller voxels show more detail and more noise.
         resolution: Voxels along the longest side of the mesh, instead of --voxel. Default: 256, or fewer for small images.
         max_faces: Largest number of triangles; larger meshes are simplified.
         depth: Rendered depth to fuse: median, or mean, which is less accurate at edges.
@@ -197,8 +197,8 @@ def level(
 
     Args:
         run: Run folder of `warpgs fit`; its PLY is written again, and every later export has the new coordinates.
-        scale: Two points and the length between them [m]. A point is VIEW:x,y, a pixel of a photograph at the size of the
-            fit, or x,y,z in units of the run's files.
+        scale: Such as a.jpg:410,220 b.jpg:95,310 1.2: two points, and the length between them [m].
+            A point is VIEW:X,Y (a pixel of a photograph at the size of the fit) or X,Y,Z (coordinates in the run's files).
         ground: Three points of the ground, which becomes level.
         up: photographs, to level by how the photographs were held.
         gps: Metres to east, north and up by the GPS in EXIF, of the scene's photographs or of those in a folder.

@@ -289,7 +289,7 @@ def fuse(
     if options.crop is not None and len(points):
         kept = subject(points, cameras) if box is None else inside(points, box)
         if not kept.any():
-            raise DataError("--crop: no surface is inside the box; give a larger box, in the units of the scene's files")
+            raise DataError("--crop: no surface is inside the box; give a larger box, in the units of the run's files")
         points, footprints = points[kept], footprints[kept]
     plan = plan_grid(points, footprints, options.voxel, options.resolution)
     planned(plan, check_memory(plan, like.device))

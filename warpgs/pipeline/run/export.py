@@ -84,6 +84,11 @@ def file_gaussians(stored: StoredRun) -> Gaussians:
     return convert_gaussians(edit.drop_unused_sh(stored.gaussians()), stored.normalization.local, "scene", "file")
 
 
+def _unit(stored: StoredRun | None) -> str:
+    """Return the name of the unit of a run's files, or of a file of no run."""
+    return "m" if stored is not None and stored.normalization.unit == "m" else "units of the scene's files"
+
+
 def origin_line(origin: np.ndarray) -> list[str]:
     """Return a line for the user on the origin [3] of a file, if it is not 0."""
     at = ", ".join(f"{v:.12g}" for v in origin)
@@ -209,7 +214,7 @@ def _written(
         other = int((scales > 0.1).sum())
         if moved or not float(scales.max()) < ROUNDING:
             more = f"; axis lengths of {other:,} Gaussians change by more than 10 %" if other else ""
-            lines.append(f"the format rounds positions, by at most {moved:.2g} units of the scene's files{more}")
+            lines.append(f"the format rounds positions, by at most {moved:.2g} {_unit(stored)}{more}")
     lines += ([kind.note] if kind.note else []) + origin_line(origin)
     return [*notes, *lines, f"{len(gaussians):,} Gaussians in {target}, {format_bytes(target.stat().st_size)}"]
 
@@ -272,8 +277,8 @@ def mesh(
     def planned(plan: GridPlan, memory: str) -> None:
         lost = f"{100 * (1 - plan.inside):.1f} %"
         say(
-            f"grid: {' x '.join(map(str, plan.shape))} points, {memory}, voxel {plan.voxel / scale:.4g} in units of the "
-            "scene's files" + (f"; {lost} of the observed surface is outside the grid and left out" if lost != "0.0 %" else "")
+            f"grid: {' x '.join(map(str, plan.shape))} points, {memory}, voxel {plan.voxel / scale:.4g} {_unit(run)}"
+            + (f"; {lost} of the observed surface is outside the grid and left out" if lost != "0.0 %" else "")
         )
 
     with hold_file(target) as notes:

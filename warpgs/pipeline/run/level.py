@@ -10,11 +10,11 @@ import numpy as np
 import torch
 
 from warpgs import schema
-from warpgs.errors import DataError, UsageError, did_you_mean
+from warpgs.errors import DataError, ResourceError, UsageError, did_you_mean, similar_folder
 from warpgs.export.ply import write_ply
 from warpgs.files import write_json
 from warpgs.geometry import back_project, convert_points, matmul, project_points
-from warpgs.io.image_files import read_gps, read_image_file
+from warpgs.io.image_files import BRANDS_END, brand, read_gps, read_image_file
 from warpgs.locks import hold_folder
 from warpgs.mesh.views import CONTRIBUTORS, MIN_ALPHA, surface_depth
 from warpgs.pipeline.model.edit import drop_unused_sh, levelling, numbers_of
@@ -140,6 +140,8 @@ def photographed(run: StoredRun) -> Levelled:
         weights = 1 / (1 + (leaning[:, None] / LEANING) ** 2)
     n, line = upright(run.normalization, up)
     more = "; all look one way, so their tilt forwards remains: --ground is better" * int(np.linalg.eigvalsh(second)[1] < 0.03)
+    if run.normalization.up is not None and not np.allclose(run.normalization.up, up, atol=1e-6):
+        more += "; this replaces the earlier level"
     return n, f"{line}; {len(rights)} photographs lean by {np.degrees(np.median(abs(leaning))):.2g} degrees (median){more}"
 
 
@@ -172,9 +174,23 @@ def similarity(points: np.ndarray, targets: np.ndarray, weights: np.ndarray) -> 
 def located(run: StoredRun, folder: Path | None) -> Levelled:
     """Give files metres to east, north and up of the middle of the photographs, by their EXIF; those far off do not count."""
     home = Path(run.record["scene"]["path"] or run.folder)
-    paths = {name: [f / name for f in ([home / "images", home] if folder is None else [folder])] for name in run.scene_cameras}
-    files = {name: next((p for p in some if p.is_file()), None) for name, some in paths.items()}
-    rows = {name: gps for name, file in files.items() if file is not None and (gps := read_gps(read_image_file(file)))}
+    source, below = (home, [home / "images", home]) if folder is None else (folder, [folder])
+    if not source.is_dir():
+        raise DataError(f"--gps: {source}: no such folder; {similar_folder(source) or 'give the folder of the originals'}")
+    # a.HEIC.jpg is the copy of a.HEIC
+    paths = {name: [f / n for n in (name, name.removesuffix(".jpg")) for f in below] for name in run.scene_cameras}
+    files = {name: p for name, some in paths.items() if (p := next((p for p in some if p.is_file()), None))}
+    if not files:
+        names = " and ".join([*paths][:2])
+        raise DataError(f"--gps: {source}: no file has the name of a photograph, such as {names}; give the originals' folder")
+    rows = {name: gps for name, file in files.items() if (gps := read_gps(read_image_file(file)))}
+    remedy = "Copies often lose EXIF: --gps FOLDER reads originals with the names of the views"
+    if heic := next(
+        (n for n, p in files.items() if n not in rows and brand(read_image_file(p, start=BRANDS_END)) == "HEIC"), ""
+    ):
+        remedy = f"EXIF of HEIC is not read: convert the originals to JPEG with their metadata, with names such as {heic}"
+    if not rows:
+        raise DataError(f"--gps: none of the {len(files)} photographs found in {source} has GPS in EXIF. {remedy}")
     centers, coordinates = np.array([run.scene_cameras[name].center for name in rows]), np.array([*rows.values()])
     count, sure, weights = len(rows), False, np.ones(len(rows))
     if count > 2:
@@ -188,8 +204,8 @@ def located(run: StoredRun, folder: Path | None) -> Levelled:
         count, offs = int(agree.sum()), offs[agree > 0]
     if count < 3 or not sure:
         raise DataError(
-            f"--gps: {count} of {len(files)} photographs have GPS in EXIF that fits the poses; 3 are needed, not on a line. "
-            "Copies often lose EXIF: --gps FOLDER reads originals with the names of the views"
+            f"--gps: {count} of {len(paths)} photographs have GPS in EXIF that fits the poses; 3 are needed, not on a line. "
+            + remedy
         )
     line = f"GPS of {len(offs)} of {len(rows)} photographs is {np.median(offs):.2f} m (median), at most {offs.max():.2f} m off"
     line += "; x is east, y north, z up [m] from latitude {:.7f}, longitude {:.7f}, height {:.1f} m".format(*place)
@@ -202,9 +218,13 @@ def store(folder: Path, device_name: str, change: Callable[[StoredRun], Levelled
     with hold_folder(folder) as held:
         run, ply = open_run(folder, device_name), folder / "point_cloud.ply"
         n, line = change(run)
-        write_json(folder / CONFIG, schema.read(folder / CONFIG, folder) | {"normalization": similarity_values(n)})
-        if ply.is_file():
-            write_ply(ply, drop_unused_sh(run.gaussians()), n, antialiased=run.antialiased)
+        record = schema.read(folder / CONFIG, folder) | {"normalization": similarity_values(n)}
+        try:
+            if ply.is_file():  # before config.json: as long as that has the old state, the command can be repeated
+                write_ply(ply, drop_unused_sh(run.gaussians()), n, antialiased=run.antialiased)
+            write_json(folder / CONFIG, record)
+        except ResourceError as e:
+            raise ResourceError(f"{e}; then repeat the command, because {ply.name} and {CONFIG} may disagree") from e
     old = [folder / name for name in ("crop.json", "path.json") if (folder / name).is_file()]
     return [*run.notes(), *held, line, *(f"{path} has the old coordinates; save it again" for path in old)]
 
@@ -218,10 +238,15 @@ def level(
         raise UsageError("give one of --scale, --ground, --up and --gps, with at most one folder")
 
     def change(run: StoredRun) -> Levelled:
-        if scale:
-            return scaled(run.normalization, picked(run, scale[0]), picked(run, scale[1]), scale[2])
-        if ground:
-            return grounded(run, [picked(run, text) for text in ground])
-        return photographed(run) if photographs else located(run, *(gps or [None]))
+        texts = scale[:2] if scale else ground or ()
+        places = [picked(run, text) for text in texts]
+        if not places:
+            return photographed(run) if photographs else located(run, *(gps or [None]))
+        n, line = scaled(run.normalization, *places, scale[2]) if scale else grounded(run, places)
+        if all(":" in text for text in texts):  # pixels stay where they are; coordinates move with the files
+            return n, line
+        points = np.round(convert_points(np.array([point for point, _ in places]), n, "scene", "file"), 9) + 0.0
+        now = " ".join(",".join(f"{v:.12g}" for v in point) for point in points)
+        return n, f"{line}; the points are now at {now} (give these to repeat the command)"
 
     return store(folder, device_name, change)
