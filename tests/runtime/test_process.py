@@ -132,6 +132,7 @@ def test_no_command_runs_what_lies_beside_a_scene(trap, tmp_path, program):
         "poses": (0 if find_spec("pycolmap") else 4, ["poses", "images", "--out", str(tmp_path / "found")]),
         "farm": (0, ["farm", str(jobs), *FIT, "--out", str(tmp_path / "farm")]),
         "mesh": (3, ["mesh", out, "--out", str(tmp_path / "a.glb"), "--device", "cpu"]),
+        "level": (0, ["level", out, "--up", "photographs"]),
     }  # fmt: skip
     assert {c.split()[0] for c in commands} == {"help", *COMMANDS}
     for name, (code, words) in commands.items():
