@@ -225,10 +225,10 @@ def _kernel_cache() -> Iterable[Finding]:
         return
     if refused:
         remedy = "set WARP_CACHE_PATH to a folder that only you may write to"
-        yield Finding(topic, NOTE, f"{refused}; every run compiles its kernels for a minute or two", remedy, True)
+        yield Finding(topic, NOTE, f"{refused}; every run compiles its kernels for up to a minute", remedy, True)
         return
     size = _size(folder)
-    first = "" if size else "; empty: the first fit compiles for a minute or two"
+    first = "" if size else "; empty: the first fit compiles for up to a minute"
     yield Finding(topic, OK, f"{folder}, {format_bytes(size)}, writable{first}", required=True)
 
 

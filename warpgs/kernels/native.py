@@ -192,7 +192,7 @@ def _say_compiling() -> None:
     if not _said:
         _said = True
         say(
-            "warpgs: compiling kernels, once on this machine, for up to a minute or two; `warpgs doctor --warm` does it",
+            "warpgs: compiling kernels, once on this machine, for up to a minute; `warpgs doctor --warm` does it",
             error=True,
         )
 

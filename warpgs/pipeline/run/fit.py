@@ -321,7 +321,7 @@ def pose_tasks(out: Path | None) -> list[str]:
     return [*map(Task, [left_out] * bool(lost) + [f"to photograph next: {a}" for a in advice])]
 
 
-COMPILING = "compiling kernels, once on this machine, for a minute or two"
+COMPILING = "compiling kernels, once on this machine, for up to a minute"
 """Message while kernels are compiled."""
 
 
