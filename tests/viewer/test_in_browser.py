@@ -37,7 +37,7 @@ pytest.importorskip("viser")
 WIDTH, HEIGHT = 700, 600
 SHOWN = np.s_[200:, :]
 """Rows without the page's own button."""
-CORNER = np.s_[:160, :320]
+CORNER = np.s_[40:160, :320]
 """Place of viser's remark on software rendering, in white letters, which the page hides."""
 
 
