@@ -146,7 +146,7 @@ def _part(batch: torch.Size, scene: int, views: slice, name: str, values: Tensor
 
 
 class _Meta(UserDict[str, Any]):
-    """A dictionary whose values are computed when they are first read, if they are functions."""
+    """A dictionary. A value that is a function is computed when it is first read."""
 
     def __getitem__(self, name: str) -> Any:
         """Return a value."""

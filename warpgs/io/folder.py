@@ -512,7 +512,7 @@ class ViewList:
     """Views of a scene in the order of reading, and counts of changes to their pixels.
 
     Args:
-        options: Options for reading the scene, whose ``on_image`` is called; None for no call.
+        options: Options for reading the scene; their ``on_image`` is called for each view. None for no call.
     """
 
     def __init__(self, options: ReadOptions | None = None) -> None:

@@ -258,7 +258,7 @@ def undistortion_maps(K: np.ndarray, lens: Lens, width: int, height: int) -> tup
 
 
 def nearest_unmasked(raster: np.ndarray, mask: np.ndarray | None) -> np.ndarray:
-    """Return a raster [H, W, ...] whose masked pixels have the value of the nearest unmasked one, or 0 if all are masked."""
+    """Return a raster [H, W, ...] with masked pixels filled from the nearest unmasked one, or with 0 if all are masked."""
     import cv2
 
     if mask is None or mask.all():

@@ -238,7 +238,7 @@ class MeshOptions(Checked, group="--"):
     """Rendered depth that is fused: median, or mean (expected depth), which mixes surfaces at edges."""
     crop: str | Box | None = None
     """Part of the scene: auto for the surfaces that at least a third of the cameras look at; or a box in the units of the
-    cameras: centre [3], sides [3] and rotation [3, 3], whose columns are the directions of the sides; None for everything."""
+    cameras: centre [3], sides [3], and rotation [3, 3] with the directions of the sides as columns; None for everything."""
     fill_holes: bool = False
     """Fill holes: with depths that are uncertain or that only one view sees, and small ones with flat triangles."""
 

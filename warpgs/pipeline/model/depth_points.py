@@ -28,7 +28,7 @@ NEAR_FRACTION, FAR_FRACTION = 1 / 1.3, 3.0
 """Factors of the 2nd and the 98th percentile of known depths: the planes of a sweep lie between the two products. Few of the
 planes are at distant surfaces, many at near ones."""
 CHUNK = 2**15
-"""Number of points whose cells are computed at a time: their arrays stay in a core's cache."""
+"""Number of points in one pass over cells: the arrays of a pass stay in a core's cache."""
 MIN_KNOWN = 10
 """Fewest known points of a view from which its range of depths is taken."""
 
