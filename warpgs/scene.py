@@ -103,7 +103,7 @@ class View:
     """Opacity of the subject, which ``image`` shows over the background; [0, 1], float32, shape [H, W]. None if opaque."""
     alpha_estimated: bool = False
     """True if ``alpha`` was estimated from a black background: it then selects the pixels that start Gaussians and are scored.
-    The loss does not use it, because dark parts of the object may count as background."""
+    The loss uses it only away from the object, because dark parts of the object may count as background."""
     depth: GivenDepth | None = None
     """Given depth, for the start and the loss of a fit; None if there is none."""
     normals: np.ndarray | None = None

@@ -32,7 +32,7 @@ from warpgs.pipeline.model.limits import LimitConfig, camera_rows
 from warpgs.pipeline.model.start import InitConfig, initial_points, random_points
 from warpgs.pipeline.run.commands import open_file
 from warpgs.pipeline.train import step, trainer
-from warpgs.pipeline.train.loss import AlphaDifference, LossConfig, LossInputs, Target
+from warpgs.pipeline.train.loss import AlphaDifference, EmptyOpacity, LossConfig, LossInputs, Target
 from warpgs.pipeline.train.memory import most_instances
 from warpgs.pipeline.train.schedule import over, random_shift
 from warpgs.pipeline.train.settings import FitConfig, settings_by_views
@@ -480,8 +480,26 @@ def test_alpha_term_is_a_mean_absolute_difference(masked):
     assert term(true) == pytest.approx(0.5 * float(expected), rel=1e-5) and term(None) == 0
 
 
-@pytest.mark.parametrize("loss", [LossConfig(alpha_weight=0), LossConfig()], ids=["background", "alpha"])
-def test_either_way_empties_what_is_empty(loss, monkeypatch):
+def test_opacity_counts_only_away_from_an_object_on_black():
+    """At 4 px of an image whose diagonal is 800 px; the term is the mean over all pixels, by hand."""
+    alpha = torch.zeros(480, 640)
+    alpha[100:200, 300:400] = 1
+    view = TrainingView(None, torch.zeros(480, 640, 3), alpha=alpha)
+    empty = EmptyOpacity(0.5).needs(view, None)["empty"]
+    expected = torch.ones(480, 640)
+    expected[96:204, 296:404] = 0
+    assert torch.equal(empty, expected)
+    inputs = LossInputs({"alpha": torch.full((480, 640), 0.2)}, Target(view.image, None, {"empty": empty}), None, None, None)
+    assert float(EmptyOpacity(0.5)(inputs)) == pytest.approx(0.5 * 0.2 * (1 - 108 * 108 / (480 * 640)), rel=1e-5)
+    assert not EmptyOpacity().needs(dataclasses.replace(view, alpha=None), None)["empty"].any()
+
+
+@pytest.mark.parametrize(
+    ("loss", "estimated"),
+    [(LossConfig(alpha_weight=0), False), (LossConfig(), False), (LossConfig(), True)],
+    ids=["background", "alpha", "estimated"],
+)
+def test_each_way_empties_what_is_empty(loss, estimated, monkeypatch):
     """Without opacities Gaussians in the colour of the background are left where nothing is."""
     if loss.alpha_weight:
         monkeypatch.setattr(trainer, "random_shift", lambda *_: (0.0, 0.0, 0.0))
@@ -490,16 +508,18 @@ def test_either_way_empties_what_is_empty(loss, monkeypatch):
     white = PointCloud(np.concatenate([seeds().points, points]), np.ones((len(seeds()) + 200, 3), np.float32))
     views = cutouts()
     plain = alpha_errors(fitted([dataclasses.replace(v, alpha=None) for v in views], LossConfig(), points=white), views)[0]
-    empty, missing = alpha_errors(fitted(views, loss, points=white), views)
+    given = [dataclasses.replace(v, alpha=np.float32(v.alpha > 0.02), alpha_estimated=True) for v in views]
+    empty, missing = alpha_errors(fitted(given if estimated else views, loss, points=white), views)
     assert empty < 0.3 * plain and missing < (0.1 if loss.alpha_weight else 1)  # by colour alone it takes more steps
 
 
-def test_opaque_views_have_no_shift_and_an_estimated_opacity_is_no_target():
-    """An estimated one says where Gaussians start and are sampled; the loss is that of opaque views."""
+def test_opaque_views_have_no_shift_and_an_estimated_opacity_is_a_target_only_where_it_is_empty():
+    """An estimated one says where Gaussians start and are sampled; alpha_weight 0 leaves the loss of opaque views."""
     assert fitted(cutouts(), LossConfig(), 0).settings(5)[SHIFT] != (0, 0, 0)
-    for change in ({"alpha": None}, {"alpha_estimated": True}):
-        fit = fitted([dataclasses.replace(v, **change) for v in cutouts()], LossConfig(), 1)
-        assert [t.name for t in fit.terms] == ["photometric"] and fit.settings(5)[SHIFT] == (0, 0, 0)
+    estimated = {"alpha_estimated": True}
+    for change, weight, more in (({"alpha": None}, 1, []), (estimated, 0, []), (estimated, 1, ["empty"])):
+        fit = fitted([dataclasses.replace(v, **change) for v in cutouts()], LossConfig(alpha_weight=weight), 1)
+        assert [t.name for t in fit.terms] == ["photometric", *more] and fit.settings(5)[SHIFT] == (0, 0, 0)
     assert fit.views[0].countable is not None and fit.layout.sizes.cutout
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated, ClassVar
@@ -271,6 +272,40 @@ class AlphaDifference(LossTerm, group="alpha."):
         return total(difference * target.mask) / target.mask.sum().clamp_min(1) * self.weight
 
 
+EMPTY_WEIGHT = 0.3
+"""Weight of `EmptyOpacity`, as a fraction of that of `AlphaDifference` (docs/decisions/034-objects-on-black.md)."""
+AWAY = 0.005
+"""Least distance from the object at which a pixel is empty for certain, as a fraction of the image's diagonal."""
+
+
+@register("empty")
+@dataclass(frozen=True)
+class EmptyOpacity(LossTerm, group="empty."):
+    """The weighted mean opacity where photographs of an object on black are empty, which black haze would hide."""
+
+    needs_outputs: ClassVar[tuple[str, ...]] = ("alpha",)
+    weight: Weight = EMPTY_WEIGHT
+    """Weight of the term, in [0, 1000]."""
+
+    def needs(self, view: TrainingView, prior: Prior | None) -> dict[str, torch.Tensor]:
+        """Return 1 for pixels at least `AWAY` from the object, 0 for others and without an opacity, shape [H, W]."""
+        if view.alpha is None:
+            return {"empty": torch.zeros_like(view.image[..., 0])}
+        reach = max(1, round(AWAY * math.hypot(*view.alpha.shape)))
+        near = torch.nn.functional.max_pool2d((view.alpha > 0)[None, None].to(view.alpha.dtype), 2 * reach + 1, 1, reach)
+        return {"empty": 1 - near[0, 0]}
+
+    def bytes(self, sizes: StepSizes) -> Needs:
+        """Return the bytes of the product and its gradient, and of the copy of the map on CUDA."""
+        copy = FLOAT * sizes.pixels * sizes.cuda
+        return {**dict.fromkeys(STEP, copy), LOSS: copy + 2 * FLOAT * sizes.pixels}
+
+    def __call__(self, inputs: LossInputs) -> torch.Tensor:
+        """Compute ``weight`` times the sum of the opacities of empty pixels, divided by the number of pixels, shape []."""
+        alpha = inputs.outputs["alpha"]
+        return total(alpha * inputs.target.maps["empty"]) * (self.weight / alpha.numel())
+
+
 # Loss terms for given depth and normals, for views that have them.
 #
 # The depth term is the mean of |q / z - q / d|, with rendered depth z, given depth d, and the view's median given depth
@@ -427,7 +462,7 @@ class LossConfig(Checked, group="loss."):
 
     alpha_weight: Weight = 1.0
     """Weight of the mean absolute difference of rendered and given opacity, for views with an alpha channel, in [0, 1000]; 0 to
-    disable."""
+    disable. Where objects on black are empty, rendered opacity has 0.3 times this weight."""
     smooth_weight: Weight | None = 0.0
     """Weight of the roughness of rendered depth (docs/decisions/024-smooth-depth.md), in [0, 1000]; 0 to disable. None: chosen
     by the number of views."""
@@ -439,12 +474,17 @@ class LossConfig(Checked, group="loss."):
 
 
 def built_in_terms(
-    config: LossConfig, cutout: bool = False, depth: bool = False, normals: bool = False
+    config: LossConfig, cutout: bool = False, depth: bool = False, normals: bool = False, black: bool = False
 ) -> tuple[LossTerm, ...]:
-    """Return the built-in terms of a fit, by its weights and by whether a view has an alpha channel, depth or normals."""
+    """Return the built-in terms of a fit, by its weights and by whether a view has an alpha channel, depth or normals.
+
+    ``black`` says that an opacity was estimated from black backgrounds.
+    """
     terms: list[LossTerm] = [Photometric()]
     if cutout and config.alpha_weight > 0:
         terms.append(AlphaDifference(config.alpha_weight))
+    elif black and config.alpha_weight > 0:
+        terms.append(EmptyOpacity(EMPTY_WEIGHT * config.alpha_weight))
     if config.smooth_weight:
         terms.append(SmoothDepth(config.smooth_weight))
     if depth and config.depth_weight > 0:

@@ -109,9 +109,9 @@ def needs_priors(config: FitConfig) -> bool:
     return by_strategy or config.priors.depth_guides or any(t.needs_priors for t in terms_of(config))
 
 
-def terms_of(config: FitConfig, cutout: bool = False, depth: bool = False, normals: bool = False) -> tuple[LossTerm, ...]:
-    """Return all loss terms of a fit by its settings, and by whether a view has an alpha channel, given depth or normals."""
-    return (*built_in_terms(config.loss, cutout, depth, normals), *config.loss_terms)
+def terms_of(config: FitConfig, **views: bool) -> tuple[LossTerm, ...]:
+    """Return all loss terms of a fit by its settings, and by what the views have, as `built_in_terms` takes it."""
+    return (*built_in_terms(config.loss, **views), *config.loss_terms)
 
 
 def prepared_views(

@@ -187,7 +187,7 @@ class Trainer:
         """Dropout probability at the last step."""
         self.cutout = any(v.alpha is not None and not v.alpha_estimated for v in train)  # then every view gets one
         given = {n: any(getattr(v, n) is not None for v in train) for n in ("depth", "normals")}
-        self.terms = terms_of(c, self.cutout, **given)
+        self.terms = terms_of(c, cutout=self.cutout, black=any(v.alpha_estimated for v in train), **given)
         self.step = 0  # taken
         self.memory_limit, self.captured = c.memory_limit, c.cuda_graph
         """Memory limit of steps [bytes], None for no limit; and whether steps may be captured. `spare_memory` changes both."""
