@@ -176,6 +176,8 @@ def main(arguments: list[str] | None = None) -> int:
     with contextlib.suppress(OSError):  # no folder for temporary files: a command that needs one raises the error
         system_folder()
     words = sys.argv[1:] if arguments is None else arguments
+    if arguments is None and words[:1] == ["fit"]:
+        process.keep_memory()
     prints = words[:1] in ([], *([name] for name in PRINTING)) and "--warm" not in words
     with process.careful_output(prints or bool(ASKING & {*words})) as exit_code:
         process.accept_all_letters()
