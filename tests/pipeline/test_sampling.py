@@ -63,10 +63,14 @@ def event_of(fit: Trainer, views, step: int, fraction: float = 0.01, max_fractio
     return fit.strategy.sample(step, dict(enumerate(views)), fraction, max_fraction)
 
 
+def drawn_numbers(score: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
+    return torch.rand(score.shape, dtype=torch.float64, generator=generator)
+
+
 def drawn_counts(score: torch.Tensor, gate: torch.Tensor, count: int, repeats: int) -> np.ndarray:
     generator, counts = torch.Generator().manual_seed(0), np.zeros(score.shape, int)
     for _ in range(repeats):
-        at = sample_pixels(score, gate, count, generator, random=True).numpy()
+        at = sample_pixels(score, gate, count, drawn_numbers(score, generator)).numpy()
         assert len(np.unique(at, axis=0)) == len(at) == count
         counts[at[:, 0], at[:, 1]] += 1
     return counts
@@ -95,7 +99,7 @@ def test_pixels_without_score_are_never_drawn_and_fewer_come_back():
     """Asked for five, two have a score: two come back."""
     score = torch.zeros(3, 4)
     score[1, 2], score[0, 3] = 0.5, 1e-6
-    at = sample_pixels(score, torch.ones(3, 4, dtype=torch.bool), 5, torch.Generator(), random=True)
+    at = sample_pixels(score, torch.ones(3, 4, dtype=torch.bool), 5, drawn_numbers(score, torch.Generator()))
     assert at.tolist() == [[0, 3], [1, 2]]
 
 
@@ -103,7 +107,7 @@ def test_without_adaptive_placement_the_highest_are_taken():
     """Deterministic top n within the gate."""
     score = torch.rand(8, 9, generator=torch.Generator().manual_seed(3))
     gate = score < 0.9
-    at = sample_pixels(score, gate, 5, torch.Generator(), random=False)
+    at = sample_pixels(score, gate, 5, None)
     lowest = score[at[:, 0], at[:, 1]].min()
     assert int((score[gate] >= lowest).sum()) == 5
 

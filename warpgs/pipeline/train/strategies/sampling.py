@@ -3,6 +3,7 @@
 import dataclasses
 import math
 from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import Annotated, Any, NamedTuple
 
@@ -120,23 +121,19 @@ def valid_pixels(alpha: torch.Tensor, depth: torch.Tensor, mask: torch.Tensor | 
     return valid & inner
 
 
-def sample_pixels(
-    score: torch.Tensor, gate: torch.Tensor, count: int, generator: torch.Generator, *, random: bool
-) -> torch.Tensor:
+def sample_pixels(score: torch.Tensor, gate: torch.Tensor, count: int, uniform: torch.Tensor | None) -> torch.Tensor:
     """Sample pixels within a gate without replacement, with probability proportional to a score (P_sample).
 
     Successive sampling: the ``count`` smallest of E_i / score_i with exponential E_i (Efraimidis and Spirakis 2006).
 
     Returns rows and columns, int64, shape [S, 2], with S = ``count`` or the number of gated pixels with a positive score.
-    ``generator`` is on the CPU. If ``random`` is False, the highest scores are taken instead.
+    ``uniform`` are random numbers in [0, 1), float64, [H, W], on the CPU. If it is None, the highest scores are taken instead.
     """
     allowed = gate & (score > 0)
     count = min(count, int(allowed.sum()))
-    if random:
-        uniform = torch.rand(score.shape, dtype=torch.float64, generator=generator, device="cpu").to(score.device)
-        key = score.double() / -torch.log1p(-uniform)
-    else:
-        key = score.double()
+    key = score.double()
+    if uniform is not None:
+        key = key / -torch.log1p(-uniform.to(score.device))
     key = torch.where(allowed, key, -1.0)
     chosen = torch.topk(key.flatten(), count).indices.sort().values
     return torch.stack([chosen // score.shape[1], chosen % score.shape[1]], 1)
@@ -250,18 +247,25 @@ class Sampling(Strategy):
         if len(numbers) > MAX_VIEWS:
             order = torch.randperm(len(views), generator=generator, device="cpu")
             numbers = [numbers[i] for i in sorted(order[:MAX_VIEWS].tolist())]
-        rendered = {i: self.render_before(views[i]) for i in numbers}
-        self.before_event({i: views[i] for i in numbers}, rendered)
+
+        def draw(number: int) -> torch.Tensor | None:
+            shape = views[number].image.shape[:2]
+            return torch.rand(shape, dtype=torch.float64, generator=generator, device="cpu") if self.at_random else None
+
         sampled, rows = [], []
-        for i, r in rendered.items():
-            view, wanted = views[i], max(1, round(fraction * r.valid.numel()))
-            scores = self.importance(i, view, r)
-            gate, quantile = self.gate(i, r.valid, wanted)
-            score = [*scores.values()][-1] if scores else torch.ones_like(r.depth)
-            at = sample_pixels(score, gate, wanted, generator, random=self.at_random)
-            footprint, coefficients = self.method.sampler.footprint, t.gaussians.sh.shape[1]
-            rows.append(fine_gaussians(view.camera, view.image, r.depth, at, footprint, coefficients))
-            sampled.append(SampledView(i, r.rgb, scores, gate, quantile, at))
+        with ThreadPoolExecutor(1) as thread:
+            drawn = thread.map(draw, numbers)  # in their order, while the device renders; nothing else draws until all are done
+            rendered = {i: self.render_before(views[i]) for i in numbers}
+            self.before_event({i: views[i] for i in numbers}, rendered)
+            for (i, r), uniform in zip(rendered.items(), drawn, strict=True):
+                view, wanted = views[i], max(1, round(fraction * r.valid.numel()))
+                scores = self.importance(i, view, r)
+                gate, quantile = self.gate(i, r.valid, wanted)
+                score = [*scores.values()][-1] if scores else torch.ones_like(r.depth)
+                at = sample_pixels(score, gate, wanted, uniform)
+                footprint, coefficients = self.method.sampler.footprint, t.gaussians.sh.shape[1]
+                rows.append(fine_gaussians(view.camera, view.image, r.depth, at, footprint, coefficients))
+                sampled.append(SampledView(i, r.rgb, scores, gate, quantile, at))
         added = {n: torch.cat([r[n] for r in rows]) for n in rows[0]}
         return *self._within_limits(step, added, views.values(), max_fraction), sampled
 
