@@ -67,7 +67,7 @@ def keep_freed_memory() -> None:
             mallopt(-1, TRIM_THRESHOLD)
 
 
-MAX_THREADS = 8
+MAX_THREADS = 16
 """Most threads of `in_background`: each holds the images of one view."""
 
 

@@ -504,7 +504,7 @@ MIN_SEEN = 0.5
 """Smallest fraction of the pixels of an image that a usual lens leaves."""
 
 
-LOADERS = 4
+LOADERS = 8
 """Largest number of threads that load images; each needs 15 bytes a pixel of one at full size, 30 with lens distortion."""
 
 

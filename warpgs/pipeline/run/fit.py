@@ -4,8 +4,8 @@ import contextlib
 import json
 import time
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -562,7 +562,9 @@ def _finish(job: FitJob, trainer: Trainer, record: dict[str, Any], checks: list[
                 write_ply(path, model, job.scene.normalization, antialiased=job.config.antialiased)
             job.say(f"model: {path}; scores and report follow")
         renders = Renders(trainer.gaussians, trainer.context.render_options())
-        with section("checks"):
+        with section("checks"), ThreadPoolExecutor(1) as thread:
+            # for the report, of which it takes the longest
+            sampled = thread.submit(lambda: None if job.out is None else results.sampling_report_of(trainer, job.out))
             metrics = _score(job, trainer, seconds, given, checks, renders)
         metrics["wall_seconds"] = job.clock.seconds()
         job.notes += pose_tasks(job.out)
@@ -572,9 +574,8 @@ def _finish(job: FitJob, trainer: Trainer, record: dict[str, Any], checks: list[
             with section("report"):
                 results.write_report(
                     job.out, job.scene, job.split, trainer.gaussians, options, metrics, record,
-                    title=title_of(Path(job.scene.path), job.out),
-                    sampling=partial(results.sampling_report_of, trainer, job.out), renders=renders, times=job.clock.seconds,
-                    tell=job.progress,
+                    title=title_of(Path(job.scene.path), job.out), sampling=sampled.result, renders=renders,
+                    times=job.clock.seconds, tell=job.progress,
                 )  # fmt: skip
             metrics["wall_seconds"] = job.clock.seconds()
             write_json(job.out / METRICS_FILE, metrics)  # again, with the time of the report
@@ -597,11 +598,13 @@ def _score(
     names, learned = image_names(v.name for v in scene.views), trainer.learned
     options, tell, compare = trainer.context.render_options(), job.progress, not job.other_models
     scored = (job.out, gaussians, train, test, options)
-    with section("scoring"):
-        metrics = results.evaluate_run(*scored, job.lpips, names=names, renders=renders, tell=tell)
-    if test and compare:
-        with section("coverage"):
-            metrics["coverage"] = coverage_of_run(*scored, names=names, renders=renders, tell=tell)
+    with ThreadPoolExecutor(1) as thread:
+        covered = test and compare and thread.submit(coverage_of_run, *scored, names=names, renders=renders)
+        with section("scoring"):
+            metrics = results.evaluate_run(*scored, job.lpips, names=names, renders=renders, tell=tell)
+        if covered:
+            with section("coverage"):
+                metrics["coverage"] = covered.result()
     tell("checking float32 accuracy")
     rule = results.rule_report_of(gaussians, train, options, seed=c.seed, half_resolution=trainer.half_resolution)
     shape = shape_figures(gaussians, c.limits, trainer.radius, trainer.context.extent, [v.camera for v in train])

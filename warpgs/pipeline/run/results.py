@@ -25,7 +25,7 @@ from warpgs.mesh.views import MIN_ALPHA
 from warpgs.pipeline.films.paths import Rig, midways, rig_among
 from warpgs.pipeline.metrics.coverage import coverage_map, coverage_section, depth_views
 from warpgs.pipeline.metrics.lpips import Lpips
-from warpgs.pipeline.metrics.scores import Renders, ViewMetrics, baselines, psnr_of, render_view, score, summarize, variants
+from warpgs.pipeline.metrics.scores import Renders, baselines, psnr_of, render_view, score, summarize, variants
 from warpgs.pipeline.paper.scores import SUPPORT
 from warpgs.pipeline.train.loss import GIVEN_MIN_ALPHA
 from warpgs.pipeline.train.schedule import Phases
@@ -407,18 +407,24 @@ def evaluate_run(
         make_folder(out / folder)
     files, held_out = names or image_names(v.name for v in [*train, *test]), {v.name for v in test}
 
-    def finish(view: View, image: np.ndarray, depth: np.ndarray, alpha: np.ndarray) -> ViewMetrics:
+    def beside(image: np.ndarray, photo: np.ndarray) -> np.ndarray:
+        return side_by_side([np.clip(image, 0, 1), photo, error_map(image, photo)])
+
+    def save(folder: str, view: View, draw: Callable[..., np.ndarray], *parts: np.ndarray) -> None:
         if out is not None and (view.name in held_out or not test):
-            row = side_by_side([np.clip(image, 0, 1), view.image, error_map(image, view.image)])
-            write_bytes(out / "renders" / f"{files[view.name]}.png", png(row))
-            write_bytes(out / "depth" / f"{files[view.name]}.png", png(depth_map(depth, alpha)))
-        return score(view, image, lpips if view.name in held_out else None, alpha)
+            write_bytes(out / folder / f"{files[view.name]}.png", png(draw(*parts)))
+
+    def jobs() -> Iterator[tuple[Any, ...]]:
+        for view in counted([*test, *train], tell, "scoring", "views"):
+            image, depth, alpha = renders(view.camera) if renders else render_view(gaussians, view, options)
+            yield save, "renders", view, beside, image, view.image
+            yield save, "depth", view, depth_map, depth, alpha
+            yield score, view, image, lpips if view.name in held_out else None, alpha
 
     with ThreadPoolExecutor(1) as thread:
         plain = thread.submit(lambda: baselines(train, test) if test else {})
-        shown = counted([*test, *train], tell, "scoring", "views")
-        rendered = ((v, *(renders(v.camera) if renders else render_view(gaussians, v, options))) for v in shown)
-        found = in_background(finish, rendered, 0 if lpips is None else 1)  # LPIPS needs much memory for each view
+        # LPIPS needs much memory for each view
+        found = in_background(lambda do, *parts: do(*parts), jobs(), 0 if lpips is None else 1)[2::3]
     rows, train_rows = found[: len(test)], found[len(test) :]
     return {
         "test": summarize(rows), "train": summarize(train_rows),
