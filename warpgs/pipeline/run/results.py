@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -512,6 +513,7 @@ def write_report(
     rig = rig_among(cameras[0], gaussians.means.detach().cpu().numpy().astype(np.float64))
     covered, shown = None, evenly_spaced(test or train, SHOWN_VIEWS)
     with ThreadPoolExecutor() as threads:  # images are encoded while others are rendered
+        threads.submit(import_module, "jinja2")  # takes a tenth of a second, at the end
         sampled = threads.submit(sampling)
         if "coverage" in metrics:
             names = image_names(v.name for v in scene.views)
