@@ -311,9 +311,9 @@ def fast_imports() -> Iterator[None]:
         gc.enable()
 
 
-KEEPS = {"arenas": (-8, 1), "maps": (-4, 0), "trim": (-1, 2**31 - 1), "pad": (-2, 2**26)}
-"""Options of glibc's mallopt and their values: one heap for all threads, which large arrays come from, too, and which does not
-shrink; it grows by 64 MiB."""
+KEEPS = {-8: 1, -4: 0, -1: 2**31 - 1, -2: 2**26}
+"""Options of glibc's mallopt, M_ARENA_MAX, M_MMAP_MAX, M_TRIM_THRESHOLD and M_TOP_PAD, and their values: one heap for all
+threads, which large arrays come from, too, and which does not shrink; it grows by 64 MiB."""
 
 
 def keep_memory() -> None:
@@ -321,9 +321,8 @@ def keep_memory() -> None:
     # The system zeroes each page that is touched for the first time, one page at a time: threads that fill new arrays wait
     # for each other, a third of their time on two cores.
     with contextlib.suppress(AttributeError, OSError, TypeError):  # another library, or another system
-        options = ctypes.CDLL(None).mallopt
-        for option, value in KEEPS.values():
-            options(option, value)
+        for option, value in KEEPS.items():
+            ctypes.CDLL(None).mallopt(option, value)
 
 
 def leave(code: int) -> NoReturn:

@@ -97,8 +97,7 @@ def _ranks(cells: Parts) -> tuple[int, list[np.ndarray]]:
 
     parts, own_ranks = zip(*in_threads(sort, cells))  # first each part, in threads, then what is left of them
     numbers, ranks = np.unique(np.concatenate(parts), return_inverse=True)
-    ends = np.cumsum([len(p) for p in parts])[:-1]
-    return len(numbers), in_threads(lambda among, own: among[own], np.split(ranks, ends), own_ranks)
+    return len(numbers), in_threads(np.take, np.split(ranks, np.cumsum([*map(len, parts)])[:-1]), own_ranks)
 
 
 def merge(points: Parts, colors: Parts, cells: Parts) -> PointCloud:

@@ -514,7 +514,6 @@ def write_report(
     covered, shown = None, evenly_spaced(test or train, SHOWN_VIEWS)
     with ThreadPoolExecutor() as threads:  # images are encoded while others are rendered
         threads.submit(import_module, "jinja2")  # takes a tenth of a second, at the end
-        sampled = threads.submit(sampling)
         if "coverage" in metrics:
             names = image_names(v.name for v in scene.views)
             covered = threads.submit(coverage_section, out, metrics["coverage"], [v.name for v in shown], names)
@@ -545,7 +544,7 @@ def write_report(
         subtitle=f"preset {metrics['preset']}, {len(train)} training views, {len(test)} held out, "
         f"{camera.width} x {camera.height} px, {metrics['device']}",
         figures=_figures(metrics, spent["total"]), notes=notes, scores=table, views=images, curves=curves,
-        sampling=sampled.result(), pictures=[(p.result(), words) for p, words in pictures],
+        sampling=sampling(), pictures=[(p.result(), words) for p, words in pictures],
         coverage=covered and covered.result(), held_out=bool(test),
         record={k: v for k, v in record.items() if k != "cameras"},
         protocol=protocol | {LABELS.get(k, k): v for k, v in metrics["variants"].items()},
