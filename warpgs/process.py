@@ -2,7 +2,6 @@
 
 import atexit
 import contextlib
-import ctypes
 import errno
 import gc
 import io
@@ -309,20 +308,6 @@ def fast_imports() -> Iterator[None]:
     finally:
         gc.freeze()
         gc.enable()
-
-
-KEEPS = {-8: 1, -4: 0, -1: 2**31 - 1, -2: 2**26}
-"""Options of glibc's mallopt, M_ARENA_MAX, M_MMAP_MAX, M_TRIM_THRESHOLD and M_TOP_PAD, and their values: one heap for all
-threads, which large arrays come from, too, and which does not shrink; it grows by 64 MiB."""
-
-
-def keep_memory() -> None:
-    """Keep memory that is freed, for the next array, where the C library can do that; call it before there are threads."""
-    # The system zeroes each page that is touched for the first time, one page at a time: threads that fill new arrays wait
-    # for each other, a third of their time on two cores.
-    with contextlib.suppress(AttributeError, OSError, TypeError):  # another library, or another system
-        for option, value in KEEPS.items():
-            ctypes.CDLL(None).mallopt(option, value)
 
 
 def leave(code: int) -> NoReturn:

@@ -103,6 +103,23 @@ def test_pixels_without_score_are_never_drawn_and_fewer_come_back():
     assert at.tolist() == [[0, 3], [1, 2]]
 
 
+def test_a_class_of_others_may_draw_numbers_itself():
+    """Its numbers and those of the sampled pixels come in one order, view by view, however long each takes."""
+
+    class Drawing(sampling.Sampling):
+        def importance(self, number, view, rendered):
+            return {"own": drawn_numbers(rendered.depth, self.context.generator).float()}
+
+    fit = fitted(steps=1)
+    views, generator = fit.views[:2], fit.generator.clone_state()
+    strategy = Drawing(fit.context)
+    sampled = strategy.sample(1, dict(enumerate(views)), 0.01, 0.5)[-1]
+    for view, own in zip(views, sampled, strict=True):
+        score = drawn_numbers(view.image[..., 0], generator).float()
+        at = sample_pixels(score, own.gate, len(own.at), drawn_numbers(score, generator))
+        assert torch.equal(own.scores["own"], score) and torch.equal(own.at, at)
+
+
 def test_without_adaptive_placement_the_highest_are_taken():
     """Deterministic top n within the gate."""
     score = torch.rand(8, 9, generator=torch.Generator().manual_seed(3))

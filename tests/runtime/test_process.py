@@ -407,12 +407,13 @@ def test_a_fit_ends_without_freeing_its_memory(command, last):
 TOUCHES = """
 import resource, sys, threading
 import numpy as np
-from warpgs.process import keep_memory
+from warpgs.device import keep_all_freed_memory, keep_freed_memory
 if sys.argv[1:]:
-    keep_memory()
+    keep_all_freed_memory()
+    keep_freed_memory()  # as the first step does
 def touch():
     for _ in range(4):
-        for size in (10**6, 4 * 10**7):
+        for size in (10**6, 3 * 10**8):
             np.ones(size, np.uint8)
 threads = [threading.Thread(target=touch) for _ in range(2)]
 for function in (touch, *(t.start for t in threads), *(t.join for t in threads)):
@@ -425,7 +426,7 @@ print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - faults)
 
 @on_linux
 def test_kept_memory_is_not_touched_for_the_first_time_again():
-    """Arrays of one and of 40 megabytes, after others of their size, by several threads, were freed."""
+    """Arrays of one and of 300 megabytes, after others of their size, by several threads, were freed."""
     faults, kept = (
         int(subprocess.run([sys.executable, "-c", TOUCHES, *words], capture_output=True, check=True).stdout)
         for words in ([], ["kept"])

@@ -19,6 +19,7 @@ from warpgs.pipeline.train.schedule import Phases
 from warpgs.pipeline.train.strategies.base import Growth, Strategy, StrategyContext, register
 from warpgs.pipeline.train.strategies.clone_split import GradientGrowth
 from warpgs.pipeline.train.views import TrainingView, half_size_camera
+from warpgs.plugins import is_ours
 from warpgs.render.options import RasterizeOptions
 from warpgs.render.rasterize import rasterize
 from warpgs.scene import Camera, Gaussians, base_coefficients
@@ -254,15 +255,16 @@ class Sampling(Strategy):
 
         sampled, rows = [], []
         with ThreadPoolExecutor(1) as thread:
-            drawn = thread.map(draw, numbers)  # in their order, while the device renders; nothing else draws until all are done
+            # in their order, while the device renders; a class of others may draw numbers itself
+            drawn = (thread.map if is_ours(type(self)) else map)(draw, numbers)
             rendered = {i: self.render_before(views[i]) for i in numbers}
             self.before_event({i: views[i] for i in numbers}, rendered)
-            for (i, r), uniform in zip(rendered.items(), drawn, strict=True):
+            for i, r in rendered.items():
                 view, wanted = views[i], max(1, round(fraction * r.valid.numel()))
                 scores = self.importance(i, view, r)
                 gate, quantile = self.gate(i, r.valid, wanted)
                 score = [*scores.values()][-1] if scores else torch.ones_like(r.depth)
-                at = sample_pixels(score, gate, wanted, uniform)
+                at = sample_pixels(score, gate, wanted, next(drawn))
                 footprint, coefficients = self.method.sampler.footprint, t.gaussians.sh.shape[1]
                 rows.append(fine_gaussians(view.camera, view.image, r.depth, at, footprint, coefficients))
                 sampled.append(SampledView(i, r.rgb, scores, gate, quantile, at))
