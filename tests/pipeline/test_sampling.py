@@ -120,6 +120,35 @@ def test_a_class_of_others_may_draw_numbers_itself():
         assert torch.equal(own.scores["own"], score) and torch.equal(own.at, at)
 
 
+@pytest.mark.parametrize("most", [2, 3])
+def test_numbers_drawn_ahead_are_those_that_an_event_would_draw(most, monkeypatch):
+    """Also with fewer views than there are; not if anything was drawn since."""
+    monkeypatch.setattr(sampling, "MAX_VIEWS", most)
+    fit = fitted(steps=1)
+    state, event = fit.generator.get_state(), fit.phases.events[0]
+
+    def sampled(**patch):
+        with monkeypatch.context() as m:
+            for name, value in patch.items():
+                m.setattr(sampling, name, value)
+            return [s.at for s in event_of(fit, fit.views, event)[-1]], fit.generator.get_state()
+
+    plain = sampled()
+    fit.generator.set_state(state)
+    fit.strategy.before_steps(event)
+    fit.strategy._ahead.result()
+    ahead = sampled(drawn=None)
+    assert torch.equal(torch.cat(ahead[0]), torch.cat(plain[0])) and torch.equal(ahead[1], plain[1])
+    fit.generator.set_state(state)
+    fit.strategy.before_steps(event - 1)
+    fit.strategy.before_steps(event)
+    torch.rand(1, generator=fit.generator)
+    after = sampled()
+    fit.generator.set_state(state)
+    torch.rand(1, generator=fit.generator)
+    assert torch.equal(after[0][0], sampled()[0][0]) and not torch.equal(after[0][0], plain[0][0])
+
+
 def test_without_adaptive_placement_the_highest_are_taken():
     """Deterministic top n within the gate."""
     score = torch.rand(8, 9, generator=torch.Generator().manual_seed(3))
