@@ -1,6 +1,7 @@
 """Two checkouts in turn on one machine: wall time, start, and held-out PSNR of the whole command `warpgs fit`.
 
-OLD and NEW are folders of the two checkouts; each has its own kernel cache, filled before the first round. A checkout that is
+OLD and NEW are folders of the two checkouts; each has its own kernel cache, filled before the first round, in the folder
+--cache if it is to be used again. A checkout that is
 given twice, with the same flags, is measured alone. SCENES are folders, FOLDER@SPLIT for different splits, or with --data named
 rows: those of bench/lib/scenes.py, and ``fern:3:film`` and ``fox:30``, which begin with photographs without cameras. With
 several sets of --cores, one scene runs on each set at the same time. The order of the checkouts changes from round to round.
@@ -122,7 +123,7 @@ def main(arguments: list[str] | None = None) -> int:
     """Run the rounds, print and keep the times; return 0."""
     a = parse(
         __doc__, arguments, {"old": Path, "new": Path, "scenes": [str]}, need=("out",), split="llff:3", downscale=0, rounds=5,
-        cores=["0,1"], device="cpu", old_flags="", new_flags="", data=Path("."), out=Path,
+        cores=["0,1"], device="cpu", old_flags="", new_flags="", data=Path("."), out=Path, cache=Path(),
     )  # fmt: skip
     rows: list[dict] = []
     sides = SIDES if (a.old.resolve(), a.old_flags) != (a.new.resolve(), a.new_flags) else SIDES[1:]
@@ -131,7 +132,7 @@ def main(arguments: list[str] | None = None) -> int:
     for cores in a.cores:
         free.put(cores)
     with tempfile.TemporaryDirectory() as work, ThreadPoolExecutor(len(a.cores)) as pool:
-        caches = {side: Path(work, f"cache_{side}") for side in sides}
+        caches = {side: Path(work, a.cache, f"cache_{side}") for side in sides}
 
         def pair(turn: int, place: str) -> list[dict]:
             """Fit a scene with both checkouts, one after the other on the same cores."""

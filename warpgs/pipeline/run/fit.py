@@ -1,7 +1,9 @@
 """`fit`: a scene becomes a run."""
 
 import contextlib
+import itertools
 import json
+import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -17,7 +19,7 @@ from warpgs.export.ply import write_ply
 from warpgs.files import write_json
 from warpgs.geometry import CENTRAL
 from warpgs.io.images import without_masked
-from warpgs.io.load import Split, check_spec, split_names
+from warpgs.io.load import Split, check_spec, fingerprint, split_names
 from warpgs.kernels.native import told_of_compiling
 from warpgs.pipeline.metrics.coverage import coverage_of_run
 from warpgs.pipeline.metrics.lpips import Lpips
@@ -400,7 +402,7 @@ def fit(
         folder as held,
         stages as progress,
         told_of_compiling(lambda name: progress(COMPILING)) as compiled,
-        contextlib.ExitStack() as compiling,
+        contextlib.ExitStack() as beside,
     ):
         resume = resume and out is not None and (out / CONFIG).is_file()  # else the folder holds only found poses
         if out is not None and resume:
@@ -408,17 +410,21 @@ def fit(
         with clock("kernels"):
             chosen, where = choose_device(device)
             if ranks.first:
-                compiling.enter_context(compiled_ahead(chosen))
+                beside.enter_context(compiled_ahead(chosen))
         began = time.perf_counter()
         lpips = None if lpips_weights is None else Lpips(Path(lpips_weights), chosen)
         read, request, parts, found = _read(scene, split, chosen, out, progress, ranks)
+        thread, stopped = beside.enter_context(ThreadPoolExecutor(1)), threading.Event()
+        beside.callback(stopped.set)
+        views = itertools.takewhile(lambda _: not stopped.is_set(), read.views)
+        hashed = thread.submit(lambda: read.fingerprint if isinstance(scene, Scene) else fingerprint(views))
         job = FitJob(
             scene=read, request=request, split=parts, config=config, device=chosen, where=where, out=own, lpips=lpips,
             notes=[*notes, *origin, *held, *found], verbose=verbose, on_step=on_step, on_model=on_model, ranks=ranks,
             began=began, clock=clock, progress=progress, compiled=compiled,
         )  # fmt: skip
         _settle(job, time_budget)
-        trainer, record, checks = _prepare(job, out if resume else None)
+        trainer, record, checks = _prepare(job, out if resume else None, hashed.result)
         if own is not None and not resume:
             write_json(own / CONFIG, record)
         result = _finish(job, trainer, record, checks)
@@ -463,7 +469,7 @@ def _read(
     scene: Scene | SceneRequest, split: str | None, device: torch.device, out: Path | None,
     progress: Callable[[str], object], ranks: Ranks,
 ) -> tuple[Scene, SceneRequest, Split, list[str]]:  # fmt: skip
-    """Read a scene, and find its poses where it has none; return it with its request, its split and notes."""
+    """Read a scene, without its fingerprint, and find its poses where it has none; return it with request, split and notes."""
     if isinstance(scene, Scene):
         parts, notes = choose_split(scene, split)
         read, request, notes = scene, SceneRequest("", split, downscale=1).with_scale(device.type), [*scene.notes, *notes]
@@ -472,7 +478,7 @@ def _read(
             request, poses = with_poses(scene.with_scale(device.type), out, progress, ranks.count)
         progress(f"reading {request.path}")
         with section("reading"):
-            read, parts, notes = read_scene(request, progress)
+            read, parts, notes = read_scene(request, progress, hashed=False)
         notes = [*poses, *notes]
     return read, request, parts, notes + ([] if out is None else renaming_notes(image_names(v.name for v in read.views)))
 
@@ -505,10 +511,15 @@ def fit_request(request: FitRequest, **others: Any) -> FitResult:
         raise KeyboardInterrupt(again) from e
 
 
-def _prepare(job: FitJob, resumed: Path | None) -> tuple[Trainer, dict[str, Any], list[PhotoCheck]]:
+def _prepare(job: FitJob, resumed: Path | None, hashed: Callable[[], str]) -> tuple[Trainer, dict[str, Any], list[PhotoCheck]]:
     """Return the trainer, which continues the run ``resumed``, the record of the run, and checks of photographs."""
-    record, state = folders.record_of(job.request, job.config, job.scene, job.split, job.notes, job.device), None
-    if resumed is not None:
+
+    def recorded() -> dict[str, Any]:
+        job.scene = replace(job.scene, fingerprint=hashed())  # of the scene as it was read
+        return folders.record_of(job.request, job.config, job.scene, job.split, job.notes, job.device)
+
+    record, state = recorded() if resumed is not None or job.ranks.count > 1 else None, None
+    if record is not None and resumed is not None:
         stored = folders.read_record(resumed)
         folders.check_same(record, stored, resumed)
         job.scene = replace(job.scene, normalization=similarity_of(stored["normalization"], str(resumed / CONFIG)))
@@ -517,7 +528,8 @@ def _prepare(job: FitJob, resumed: Path | None) -> tuple[Trainer, dict[str, Any]
             folders.check_checkpoint(state[1], stored, resumed)
             if state[1]["step"] == state[1].get("steps"):
                 job.say(f"  all {state[1]['step']:,} steps are taken; only the images, scores and report are made again")
-    check_equal(record, None if state is None else state[1].get("step"), job.ranks)
+    if record is not None:
+        check_equal(record, None if state is None else state[1].get("step"), job.ranks)
     checks: list[PhotoCheck] = []
     with background_warmup(job.config, job.device) as ready:
         if job.other_models:
@@ -537,7 +549,7 @@ def _prepare(job: FitJob, resumed: Path | None) -> tuple[Trainer, dict[str, Any]
         except DataError as e:
             raise DataError(f"{resumed}/{TENSORS}: {e}") from e
         job.notes.append(f"continued from step {trainer.step}; this run's times count from there")
-    return trainer, record, checks
+    return trainer, record or recorded(), checks
 
 
 def _finish(job: FitJob, trainer: Trainer, record: dict[str, Any], checks: list[PhotoCheck]) -> FitResult:
