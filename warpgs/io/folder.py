@@ -505,7 +505,7 @@ MIN_SEEN = 0.5
 
 
 LOADERS, MOST_LOADERS, LOADER_BYTES = 4, 16, 2**32
-"""Largest number of threads that load images; each needs 15 bytes a pixel of one at full size, 30 with lens distortion. Then the
+"""Largest number of threads that load images, each with 15 bytes a pixel of one at full size, 30 with lens distortion; then the
 number where each has this much free memory [bytes], which is enough for 100 megapixels."""
 
 
