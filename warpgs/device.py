@@ -54,20 +54,33 @@ def wake_gpu() -> None:
     threading.Thread(target=wake, name="driver", daemon=True).start()
 
 
-MMAP_THRESHOLD, TRIM_THRESHOLD = 2**26, 2**28
-"""Size from which glibc maps an allocation by itself, and free memory at the end of its heap that it keeps [bytes]."""
+M_TRIM_THRESHOLD, M_TOP_PAD, M_MMAP_THRESHOLD, M_MMAP_MAX, M_ARENA_MAX = -1, -2, -3, -4, -8
+"""Options of glibc's mallopt: free memory at the end of a heap that it keeps, by which a heap grows, from which it maps an
+allocation by itself [bytes]; number of such allocations; number of heaps, one for all threads or one for each."""
+
+
+def _set_malloc(*options: tuple[int, int]) -> None:
+    """Set options of glibc's memory, up to the first that it refuses; nothing elsewhere."""
+    with contextlib.suppress(AttributeError, OSError, TypeError):  # no glibc
+        all(ctypes.CDLL(None).mallopt(*option) for option in options)
 
 
 @functools.cache
 def keep_freed_memory() -> None:
     """Let glibc keep the memory that a step frees: the next step would map, and clear, the same pages again."""
-    with contextlib.suppress(AttributeError, OSError, TypeError):  # no glibc
-        mallopt = ctypes.CDLL(None).mallopt
-        if mallopt(-3, MMAP_THRESHOLD):  # older ones refuse this size; the trim threshold alone would map every tensor
-            mallopt(-1, TRIM_THRESHOLD)
+    # older ones refuse this size; the trim threshold alone would map every tensor
+    _set_malloc((M_MMAP_THRESHOLD, 2**26), (M_TRIM_THRESHOLD, 2**28))
 
 
-MAX_THREADS = 8
+def keep_all_freed_memory() -> None:
+    """Let glibc keep all memory that this process frees, for all threads; call it before there are others."""
+    # The system clears each page that is touched for the first time, one page at a time: threads that fill new arrays wait
+    # for each other, a third of their time on two cores.
+    keep_freed_memory()  # so that a step does not change the options again
+    _set_malloc((M_ARENA_MAX, 1), (M_MMAP_MAX, 0), (M_TRIM_THRESHOLD, 2**31 - 1), (M_TOP_PAD, 2**26))
+
+
+MAX_THREADS = 16
 """Most threads of `in_background`: each holds the images of one view."""
 
 

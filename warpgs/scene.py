@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterable, Sized
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
@@ -511,7 +512,8 @@ def checked_views(views: Iterable[View], where: str = "") -> list[View]:
     if isinstance(views, (View, Scene, np.ndarray)) or not isinstance(views, Iterable):
         fix = "give scene.views" if isinstance(views, Scene) else "give [view]"
         raise _wrong(f"{where}views", "a list of View", type(views).__name__, fix)
-    return [_checked_view(f"{where}views[{i}]", v, where) for i, v in enumerate(views)]
+    with ThreadPoolExecutor() as pool:  # an error is that of the first view that has one
+        return list(pool.map(lambda row: _checked_view(f"{where}views[{row[0]}]", row[1], where), enumerate(views)))
 
 
 def _checked_view(what: str, view: View, where: str) -> View:

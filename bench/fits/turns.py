@@ -1,11 +1,11 @@
 """Two checkouts in turn on one machine: wall time, start, and held-out PSNR of the whole command `warpgs fit`.
 
-OLD and NEW are folders of the two checkouts; each has its own kernel cache, filled before the first round. A checkout that is
-given twice, with the same flags, is measured alone. SCENES are folders, FOLDER@SPLIT for different splits, or with --data named
-rows: those of bench/lib/scenes.py, and ``fern:3:film`` and ``fox:30``, which begin with photographs without cameras. With
-several sets of --cores, one scene runs on each set at the same time. The order of the checkouts changes from round to round.
-Wall time is measured from the start to the end of the process, processor time with one set of --cores; no run has poses, priors
-or a run folder of an earlier one.
+OLD and NEW are folders of the two checkouts; each has its own kernel cache, in the folder --cache or else for this run alone,
+filled before the first round. A checkout that is given twice, with the same flags, is measured alone. SCENES are folders,
+FOLDER@SPLIT for different splits, or with --data named rows: those of bench/lib/scenes.py, and ``fern:3:film`` and ``fox:30``,
+which begin with photographs without cameras. With several sets of --cores, one scene runs on each set at the same time; an
+empty set is all cores. The order of the checkouts changes from round to round. Wall time is measured from the start to the end
+of the process, processor time with one set of --cores; no run has poses, priors or a run folder of an earlier one.
 """
 
 from __future__ import annotations
@@ -122,7 +122,7 @@ def main(arguments: list[str] | None = None) -> int:
     """Run the rounds, print and keep the times; return 0."""
     a = parse(
         __doc__, arguments, {"old": Path, "new": Path, "scenes": [str]}, need=("out",), split="llff:3", downscale=0, rounds=5,
-        cores=["0,1"], device="cpu", old_flags="", new_flags="", data=Path("."), out=Path,
+        cores=["0,1"], device="cpu", old_flags="", new_flags="", data=Path("."), out=Path, cache=Path(),
     )  # fmt: skip
     rows: list[dict] = []
     sides = SIDES if (a.old.resolve(), a.old_flags) != (a.new.resolve(), a.new_flags) else SIDES[1:]
@@ -131,7 +131,8 @@ def main(arguments: list[str] | None = None) -> int:
     for cores in a.cores:
         free.put(cores)
     with tempfile.TemporaryDirectory() as work, ThreadPoolExecutor(len(a.cores)) as pool:
-        caches = {side: Path(work, f"cache_{side}") for side in sides}
+        Path(work, a.cache).mkdir(parents=True, exist_ok=True)
+        caches = {side: Path(work, a.cache, f"cache_{side}") for side in sides}
 
         def pair(turn: int, place: str) -> list[dict]:
             """Fit a scene with both checkouts, one after the other on the same cores."""

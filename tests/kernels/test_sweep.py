@@ -52,7 +52,7 @@ def computed(device, costs, down, across, small) -> np.ndarray:
     return scanline_costs(*on_device, small).cpu().numpy()
 
 
-@pytest.mark.parametrize("shape", [(1, 7, 3), (7, 1, 3), (3, 4, 1), (40, 33, 17), (1, 1, 4)])
+@pytest.mark.parametrize("shape", [(1, 7, 3), (7, 1, 3), (3, 4, 1), (40, 33, 17), (1, 1, 4), (5, 4, 70)])
 def test_equal_to_the_definition(device, shape):
     """The sums agree to the last unit, also for one row, one column and one plane, and for costs in another order of memory."""
     costs, down, across = problem(shape)

@@ -216,7 +216,8 @@ def test_sampling_weights_of_any_kind(device, weights, count, random):
     """Zero, negative and NaN are never drawn, infinite ones first; as many come back as could be drawn, none twice."""
     score = torch.tensor([weights], device=device)
     gate = torch.ones_like(score, dtype=torch.bool)
-    at = sample_pixels(score, gate, count, torch.Generator().manual_seed(0), random=random)
+    uniform = torch.rand(score.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    at = sample_pixels(score, gate, count, uniform if random else None)
     allowed = [i for i, w in enumerate(weights) if w > 0]
     columns = at[:, 1].tolist()
     assert len(columns) == len(set(columns)) == min(count, len(allowed)) and set(columns) <= set(allowed)
@@ -230,7 +231,7 @@ def test_more_pixels_than_2_to_the_24(device):
     score = torch.linspace(0, 1, count, device=device).view(16, -1)
     gate, used = geometry_gate(score, torch.ones_like(score, dtype=torch.bool), 0.6, 100)
     assert used == 0.6 and abs(float(gate.float().mean()) - 0.4) < 1e-3
-    at = sample_pixels(score, gate, 100, torch.Generator().manual_seed(0), random=True)
+    at = sample_pixels(score, gate, 100, torch.rand(score.shape, dtype=torch.float64))
     assert len(at) == 100 and bool(gate[at[:, 0], at[:, 1]].all())
     assert float(normalized(score).max()) == 1.0
 

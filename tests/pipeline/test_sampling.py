@@ -63,10 +63,14 @@ def event_of(fit: Trainer, views, step: int, fraction: float = 0.01, max_fractio
     return fit.strategy.sample(step, dict(enumerate(views)), fraction, max_fraction)
 
 
+def drawn_numbers(score: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
+    return torch.rand(score.shape, dtype=torch.float64, generator=generator)
+
+
 def drawn_counts(score: torch.Tensor, gate: torch.Tensor, count: int, repeats: int) -> np.ndarray:
     generator, counts = torch.Generator().manual_seed(0), np.zeros(score.shape, int)
     for _ in range(repeats):
-        at = sample_pixels(score, gate, count, generator, random=True).numpy()
+        at = sample_pixels(score, gate, count, drawn_numbers(score, generator)).numpy()
         assert len(np.unique(at, axis=0)) == len(at) == count
         counts[at[:, 0], at[:, 1]] += 1
     return counts
@@ -95,15 +99,61 @@ def test_pixels_without_score_are_never_drawn_and_fewer_come_back():
     """Asked for five, two have a score: two come back."""
     score = torch.zeros(3, 4)
     score[1, 2], score[0, 3] = 0.5, 1e-6
-    at = sample_pixels(score, torch.ones(3, 4, dtype=torch.bool), 5, torch.Generator(), random=True)
+    at = sample_pixels(score, torch.ones(3, 4, dtype=torch.bool), 5, drawn_numbers(score, torch.Generator()))
     assert at.tolist() == [[0, 3], [1, 2]]
+
+
+def test_a_class_of_others_may_draw_numbers_itself():
+    """Its numbers and those of the sampled pixels come in one order, view by view, however long each takes."""
+
+    class Drawing(sampling.Sampling):
+        def importance(self, number, view, rendered):
+            return {"own": drawn_numbers(rendered.depth, self.context.generator).float()}
+
+    fit = fitted(steps=1)
+    views, generator = fit.views[:2], fit.generator.clone_state()
+    strategy = Drawing(fit.context)
+    sampled = strategy.sample(1, dict(enumerate(views)), 0.01, 0.5)[-1]
+    for view, own in zip(views, sampled, strict=True):
+        score = drawn_numbers(view.image[..., 0], generator).float()
+        at = sample_pixels(score, own.gate, len(own.at), drawn_numbers(score, generator))
+        assert torch.equal(own.scores["own"], score) and torch.equal(own.at, at)
+
+
+@pytest.mark.parametrize("most", [2, 3])
+def test_numbers_drawn_ahead_are_those_that_an_event_would_draw(most, monkeypatch):
+    """Also with fewer views than there are; not if anything was drawn since."""
+    monkeypatch.setattr(sampling, "MAX_VIEWS", most)
+    fit = fitted(steps=1)
+    state, event = fit.generator.get_state(), fit.phases.events[0]
+
+    def sampled(**patch):
+        with monkeypatch.context() as m:
+            for name, value in patch.items():
+                m.setattr(sampling, name, value)
+            return [s.at for s in event_of(fit, fit.views, event)[-1]], fit.generator.get_state()
+
+    plain = sampled()
+    fit.generator.set_state(state)
+    fit.strategy.before_steps(event)
+    fit.strategy._ahead.result()
+    ahead = sampled(drawn=None)
+    assert torch.equal(torch.cat(ahead[0]), torch.cat(plain[0])) and torch.equal(ahead[1], plain[1])
+    fit.generator.set_state(state)
+    fit.strategy.before_steps(event - 1)
+    fit.strategy.before_steps(event)
+    torch.rand(1, generator=fit.generator)
+    after = sampled()
+    fit.generator.set_state(state)
+    torch.rand(1, generator=fit.generator)
+    assert torch.equal(after[0][0], sampled()[0][0]) and not torch.equal(after[0][0], plain[0][0])
 
 
 def test_without_adaptive_placement_the_highest_are_taken():
     """Deterministic top n within the gate."""
     score = torch.rand(8, 9, generator=torch.Generator().manual_seed(3))
     gate = score < 0.9
-    at = sample_pixels(score, gate, 5, torch.Generator(), random=False)
+    at = sample_pixels(score, gate, 5, None)
     lowest = score[at[:, 0], at[:, 1]].min()
     assert int((score[gate] >= lowest).sum()) == 5
 

@@ -404,6 +404,36 @@ def test_a_fit_ends_without_freeing_its_memory(command, last):
     assert done.stdout.split("\n")[:-1] == ["thread", "at exit", *last]
 
 
+TOUCHES = """
+import resource, sys, threading
+import numpy as np
+from warpgs.device import keep_all_freed_memory, keep_freed_memory
+if sys.argv[1:]:
+    keep_all_freed_memory()
+    keep_freed_memory()  # as the first step does
+def touch():
+    for _ in range(4):
+        for size in (10**6, 3 * 10**8):
+            np.ones(size, np.uint8)
+threads = [threading.Thread(target=touch) for _ in range(2)]
+for function in (touch, *(t.start for t in threads), *(t.join for t in threads)):
+    function()
+faults = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+touch()
+print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - faults)
+"""
+
+
+@on_linux
+def test_kept_memory_is_not_touched_for_the_first_time_again():
+    """Arrays of one and of 300 megabytes, after others of their size, by several threads, were freed."""
+    faults, kept = (
+        int(subprocess.run([sys.executable, "-c", TOUCHES, *words], capture_output=True, check=True).stdout)
+        for words in ([], ["kept"])
+    )
+    assert kept < 20 < faults
+
+
 @on_linux
 def test_bytes_that_are_no_text_are_printed_as_codes(tmp_path):
     assert readable(f"{BYTES} \ud800") == "b\\xe4ü \\ud800"

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 import warpgs.clock  # noqa: F401, imported first: its time stands for the start of the process
 from warpgs import process
-from warpgs.device import exhausted_limit, is_out_of_memory, no_memory_message, wake_gpu
+from warpgs.device import exhausted_limit, is_out_of_memory, keep_all_freed_memory, no_memory_message, wake_gpu
 from warpgs.errors import ResourceError, UsageError, WarpgsError, did_you_mean
 from warpgs.folders import system_folder
 from warpgs.pipeline.train.presets import DEFAULT_PRESET, PRESETS
@@ -176,6 +176,8 @@ def main(arguments: list[str] | None = None) -> int:
     with contextlib.suppress(OSError):  # no folder for temporary files: a command that needs one raises the error
         system_folder()
     words = sys.argv[1:] if arguments is None else arguments
+    if arguments is None and words[:1] == ["fit"]:
+        keep_all_freed_memory()
     prints = words[:1] in ([], *([name] for name in PRINTING)) and "--warm" not in words
     with process.careful_output(prints or bool(ASKING & {*words})) as exit_code:
         process.accept_all_letters()

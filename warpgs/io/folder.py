@@ -18,7 +18,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from warpgs.constants import POSE_TOLERANCE
-from warpgs.device import usable_cores
+from warpgs.device import machine_memory, usable_cores
 from warpgs.errors import DataError, UsageError, shortened
 from warpgs.files import inside, is_within
 from warpgs.geometry import matmul, nearest_rotation, rotation_matrices
@@ -504,8 +504,15 @@ MIN_SEEN = 0.5
 """Smallest fraction of the pixels of an image that a usual lens leaves."""
 
 
-LOADERS = 4
-"""Largest number of threads that load images; each needs 15 bytes a pixel of one at full size, 30 with lens distortion."""
+LOADERS, MOST_LOADERS, LOADER_BYTES = 4, 16, 2**32
+"""Largest number of threads that load images, each with 15 bytes a pixel of one at full size, 30 with lens distortion; then the
+number where each has this much free memory [bytes], which is enough for 100 megapixels."""
+
+
+def loaders() -> int:
+    """Return the number of threads that load images on this machine."""
+    _, free = machine_memory() or (0, 0)
+    return min(usable_cores(), max(LOADERS, min(MOST_LOADERS, free // LOADER_BYTES)))
 
 
 class ViewList:
@@ -551,7 +558,7 @@ class ViewList:
     def _load(self) -> None:
         """Load the images that wait; an error is that of the first image that has one."""
         waiting, self._waiting = self._waiting, []
-        with warnings.catch_warnings(action="ignore"), ThreadPoolExecutor(min(LOADERS, usable_cores())) as pool:
+        with warnings.catch_warnings(action="ignore"), ThreadPoolExecutor(loaders()) as pool:
             for (name, viewmat, _), loaded in zip(waiting, pool.map(lambda row: row[2](), waiting)):
                 if self._on_image is not None:
                     self._on_image(name)

@@ -6,7 +6,7 @@ import hashlib
 import itertools
 import re
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, fields, replace
 from pathlib import Path, PurePosixPath
 
@@ -89,7 +89,7 @@ def normalize_points(points: PointCloud, n: Normalization, where: str) -> PointC
     return replace(points, points=moved)
 
 
-def fingerprint(views: list[View]) -> str:
+def fingerprint(views: Iterable[View]) -> str:
     """Return the SHA-256, hexadecimal, over names, cameras, pixels, masks and given maps of the views in their order."""
     digest = hashlib.sha256()
     for v in views:
@@ -444,8 +444,10 @@ def read_folder(
     options: SceneOptions,
     reader: str | type[Reader] | Reader | None = None,
     progress: Callable[[str], object] | None = None,
+    *,
+    hashed: bool = True,
 ) -> Scene:
-    """Read a scene folder, as `load_scene` does."""
+    """Read a scene folder, as `load_scene` does; without its fingerprint if ``hashed`` is False."""
     root, (factor, side), numbers = Path(path), image_scale(options.downscale, options.max_side), itertools.count(1)
     on_image = None if progress is None else lambda name: progress(f"reading {root}: image {next(numbers)}")
     given = {f.name: getattr(options, f.name) for f in fields(SceneOptions)}
@@ -461,7 +463,8 @@ def read_folder(
             chosen, notes = scenes.find_reader("colmap"), []
         else:
             raise UsageError("--reconstruction requires a COLMAP scene; leave it out, or give --reader colmap")
-        return _finished(root, chosen, chosen.read(root, checked), notes, checked)
+        scene = _finished(root, chosen, chosen.read(root, checked), notes, checked)
+        return replace(scene, fingerprint=fingerprint(scene.views)) if hashed else scene
     except OSError as e:
         # folders without permission, names too long for the file system, disks that fail
         raise DataError(f"{e.filename or root}: cannot be read ({e.strerror or e}); fix its permissions or copy it") from e
@@ -586,7 +589,7 @@ def doubtful_notes(views: list[View], points: PointCloud | None) -> list[str]:
 
 
 def _finished(root: Path, reader: Reader, scene: Scene, notes: list[str], options: ReadOptions) -> Scene:
-    """Check a scene that a reader returned; return it sorted, in scene coordinates, with score masks and fingerprint."""
+    """Check a scene that a reader returned; return it sorted, in scene coordinates, with score masks."""
     own = f"the reader {reader.name} must return a Scene in file coordinates, without a Normalization; fix it"
     scene = checked_scene(returned(reader, "read", scene, Scene, "a Scene"), f"{root}, ")
     if scene.normalization.scale != 1 or scene.normalization.offset.any():
@@ -625,5 +628,4 @@ def _finished(root: Path, reader: Reader, scene: Scene, notes: list[str], option
         points=points,
         normalization=n,
         notes=(*notes, *more),
-        fingerprint=fingerprint(views),
     )

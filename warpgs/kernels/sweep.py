@@ -1,5 +1,6 @@
 """Plane sweeps: depths of the planes, their costs, and the scanlines that smooth them."""
 
+import functools
 import math
 from collections.abc import Sequence
 
@@ -9,7 +10,7 @@ import warp as wp
 
 from warpgs import geometry
 from warpgs.kernels import launch
-from warpgs.kernels.native import EXACT
+from warpgs.kernels.native import EXACT, cuda_kernel, source
 from warpgs.scene import Camera
 
 # Depths of a plane sweep on a CPU: the best plane of each pixel, and round trips through another view's depth.
@@ -538,50 +539,27 @@ def follow_cpu(
 
 
 BLOCK = 32
-"""Threads of a block: few, so that some hundred lines spread over many multiprocessors."""
+"""Threads of a block, all for one line: some hundred lines spread over many multiprocessors."""
 FAR_AWAY = 2**20
 """Number above every path cost."""
 LARGEST = 2**13 - 1
 """Largest cost plus penalties: the sum of four paths then fits into signed 16 bits."""
 
 
-@wp.kernel(enable_backward=False, module="warpgs.kernels.scanlines")
-def follow(
-    begin: int, costs: wp.array2d(dtype=wp.int16), bounds: wp.array(dtype=int), small: int, planes: int,
-    # pixels of a line: where it starts, from one to the next, how many; the same for the steps between them
-    line_step: int, pixel_step: int, length: int, line_edge: int, pixel_edge: int,
-    # outputs
-    path: wp.array2d(dtype=int), total: wp.array2d(dtype=wp.int16),
-):  # fmt: skip
-    """Add the costs of the paths along a line, both ways."""
-    line = begin + wp.tid()
-    path[line, planes] = FAR_AWAY
-    for way in range(2):
-        lowest = int(0)
-        for k in range(length):
-            j = k
-            edge = k - 1
-            if way == 1:
-                j = length - 1 - k
-                edge = j
-            pixel = line * line_step + j * pixel_step
-            most = int(0)  # the most that any change of depth may add to the best of the pixel before
-            if k > 0:
-                most = lowest + bounds[line * line_edge + edge * pixel_edge]
-            left = int(FAR_AWAY)
-            here = path[line, 0]
-            least = int(FAR_AWAY)
-            for d in range(planes):
-                right = path[line, d + 1]
-                cost = int(costs[pixel, d])
-                if k > 0:
-                    cost += wp.min(wp.min(here, most), wp.min(left, right) + small) - lowest
-                path[line, d] = cost
-                total[pixel, d] = wp.int16(int(total[pixel, d]) + cost)
-                least = wp.min(least, cost)
-                left = here
-                here = right
-            lowest = least
+@functools.cache
+def make_follow():
+    """Make the kernel for CUDA, of `BLOCK` threads per line: costs of the paths along it, both ways, add to ``total``."""
+
+    @cuda_kernel(source("scanlines.cu", FAR_AWAY=FAR_AWAY), f"(begin + wp.tid()) // {BLOCK}", "warpgs.kernels.scanlines")
+    def follow(
+        line: int, costs: wp.array2d(dtype=wp.int16), bounds: wp.array(dtype=int), small: int, planes: int,
+        # pixels of a line: where it starts, from one to the next, how many; the same for the steps between them
+        line_step: int, pixel_step: int, length: int, line_edge: int, pixel_edge: int,
+        # outputs
+        path: wp.array2d(dtype=int), total: wp.array2d(dtype=wp.int16),
+    ): ...  # fmt: skip
+
+    return follow
 
 
 def scanline_costs(costs: torch.Tensor, down: torch.Tensor, across: torch.Tensor, small: int) -> torch.Tensor:
@@ -605,7 +583,6 @@ def scanline_costs(costs: torch.Tensor, down: torch.Tensor, across: torch.Tensor
             cost = max(1, length * padded // 20)
             launch.launch(follow_cpu, lines, [*inputs, path, total], costs.device, cost=cost)
         else:
-            path = torch.empty(lines, planes + 1, dtype=torch.int32, device=costs.device)
-            cost = max(1, length * planes // 2)
-            launch.launch(follow, lines, [*inputs, path, total], costs.device, cost=cost, block_dim=BLOCK)
+            path = torch.empty(lines, 2 * (planes + 2), dtype=torch.int32, device=costs.device)
+            launch.launch(make_follow(), BLOCK * lines, [*inputs, path, total], costs.device, block_dim=BLOCK)
     return total[..., :planes]

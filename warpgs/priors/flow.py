@@ -170,7 +170,7 @@ MIN_ANGLE = 1.0
 """Smallest angle between the two rays [deg]; below it depth is noise."""
 MAX_PAIRS = 30
 """Largest number of pairs of views that are matched, nearest first."""
-PIXELS_AT_ONCE = 8_000_000
+PIXELS_AT_ONCE = 16_000_000
 """Number of pixels of the images whose features are found at a time; SIFT takes about 250 bytes of memory a pixel."""
 
 

@@ -1,6 +1,7 @@
 """Scores of rendered views: PSNR, SSIM and LPIPS within the scored region, after matching of colours, and moved cameras."""
 
 import math
+import threading
 import warnings
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field, replace
@@ -194,19 +195,21 @@ class Renders:
         """Begin without a render."""
         self._parts, self._left = (gaussians, options), KEPT_BYTES
         self._kept: dict[int, tuple[Camera, tuple[np.ndarray, np.ndarray, np.ndarray]]] = {}
+        self._lock = threading.Lock()
 
     @torch.no_grad()
     def __call__(self, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return colours [H, W, 3], depth [u] [H, W] and alpha [H, W] as numpy arrays, which nobody may change."""
-        if id(camera) in self._kept:  # a kept camera lives, so no other has its id
-            return self._kept[id(camera)][1]
-        gaussians, options = self._parts
-        r = rasterize(gaussians, camera, options)
-        images = r.rgb.cpu().numpy(), r.depth.cpu().numpy(), r.alpha.cpu().numpy()
-        if (size := sum(a.nbytes for a in images)) <= self._left:
-            self._left -= size
-            self._kept[id(camera)] = camera, images
-        return images
+        with self._lock:
+            if id(camera) in self._kept:  # a kept camera lives, so no other has its id
+                return self._kept[id(camera)][1]
+            gaussians, options = self._parts
+            r = rasterize(gaussians, camera, options)
+            images = r.rgb.cpu().numpy(), r.depth.cpu().numpy(), r.alpha.cpu().numpy()
+            if (size := sum(a.nbytes for a in images)) <= self._left:
+                self._left -= size
+                self._kept[id(camera)] = camera, images
+            return images
 
 
 def render_view(gaussians: Gaussians, view: View, options: RasterizeOptions) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

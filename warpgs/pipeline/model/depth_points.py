@@ -88,11 +88,16 @@ def merge_cells(points: Parts, widths: Parts, cell: float = 1.0) -> list[np.ndar
 
 def _ranks(cells: Parts) -> tuple[int, list[np.ndarray]]:
     """Return how many numbers of cells there are, and the rank of each one's number, int64 [N]."""
-    # neighbouring pixels often share a cell: only the first of a run is sorted
-    firsts = [np.flatnonzero(np.diff(c, prepend=c[:1] - 1)) for c in cells]
-    numbers, ranks = np.unique(np.concatenate([c[f] for c, f in zip(cells, firsts)]), return_inverse=True)
-    parts = np.split(ranks, np.cumsum([len(f) for f in firsts])[:-1])
-    return len(numbers), [np.repeat(r, np.diff(f, append=len(c))) for r, f, c in zip(parts, firsts, cells)]
+
+    def sort(own: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        # neighbouring pixels often share a cell: only the first of a run is sorted
+        firsts = np.flatnonzero(np.diff(own, prepend=own[:1] - 1))
+        numbers, ranks = np.unique(own[firsts], return_inverse=True)
+        return numbers, np.repeat(ranks, np.diff(firsts, append=len(own)))
+
+    parts, own_ranks = zip(*in_threads(sort, cells))  # first each part, in threads, then what is left of them
+    numbers, ranks = np.unique(np.concatenate(parts), return_inverse=True)
+    return len(numbers), in_threads(np.take, np.split(ranks, np.cumsum([*map(len, parts)])[:-1]), own_ranks)
 
 
 def merge(points: Parts, colors: Parts, cells: Parts) -> PointCloud:

@@ -1,11 +1,13 @@
 """`fit`: a scene becomes a run."""
 
 import contextlib
+import itertools
 import json
+import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -17,7 +19,7 @@ from warpgs.export.ply import write_ply
 from warpgs.files import write_json
 from warpgs.geometry import CENTRAL
 from warpgs.io.images import without_masked
-from warpgs.io.load import Split, check_spec, split_names
+from warpgs.io.load import Split, check_spec, fingerprint, split_names
 from warpgs.kernels.native import told_of_compiling
 from warpgs.pipeline.metrics.coverage import coverage_of_run
 from warpgs.pipeline.metrics.lpips import Lpips
@@ -400,7 +402,7 @@ def fit(
         folder as held,
         stages as progress,
         told_of_compiling(lambda name: progress(COMPILING)) as compiled,
-        contextlib.ExitStack() as compiling,
+        contextlib.ExitStack() as beside,
     ):
         resume = resume and out is not None and (out / CONFIG).is_file()  # else the folder holds only found poses
         if out is not None and resume:
@@ -408,17 +410,21 @@ def fit(
         with clock("kernels"):
             chosen, where = choose_device(device)
             if ranks.first:
-                compiling.enter_context(compiled_ahead(chosen))
+                beside.enter_context(compiled_ahead(chosen))
         began = time.perf_counter()
         lpips = None if lpips_weights is None else Lpips(Path(lpips_weights), chosen)
         read, request, parts, found = _read(scene, split, chosen, out, progress, ranks)
+        thread, stopped = beside.enter_context(ThreadPoolExecutor(1)), threading.Event()
+        beside.callback(stopped.set)
+        views = itertools.takewhile(lambda _: not stopped.is_set(), read.views)
+        hashed = thread.submit(lambda: read.fingerprint if isinstance(scene, Scene) else fingerprint(views))
         job = FitJob(
             scene=read, request=request, split=parts, config=config, device=chosen, where=where, out=own, lpips=lpips,
             notes=[*notes, *origin, *held, *found], verbose=verbose, on_step=on_step, on_model=on_model, ranks=ranks,
             began=began, clock=clock, progress=progress, compiled=compiled,
         )  # fmt: skip
         _settle(job, time_budget)
-        trainer, record, checks = _prepare(job, out if resume else None)
+        trainer, record, checks = _prepare(job, out if resume else None, hashed.result)
         if own is not None and not resume:
             write_json(own / CONFIG, record)
         result = _finish(job, trainer, record, checks)
@@ -463,7 +469,7 @@ def _read(
     scene: Scene | SceneRequest, split: str | None, device: torch.device, out: Path | None,
     progress: Callable[[str], object], ranks: Ranks,
 ) -> tuple[Scene, SceneRequest, Split, list[str]]:  # fmt: skip
-    """Read a scene, and find its poses where it has none; return it with its request, its split and notes."""
+    """Read a scene, without its fingerprint, and find its poses where it has none; return it with request, split and notes."""
     if isinstance(scene, Scene):
         parts, notes = choose_split(scene, split)
         read, request, notes = scene, SceneRequest("", split, downscale=1).with_scale(device.type), [*scene.notes, *notes]
@@ -472,7 +478,7 @@ def _read(
             request, poses = with_poses(scene.with_scale(device.type), out, progress, ranks.count)
         progress(f"reading {request.path}")
         with section("reading"):
-            read, parts, notes = read_scene(request, progress)
+            read, parts, notes = read_scene(request, progress, hashed=False)
         notes = [*poses, *notes]
     return read, request, parts, notes + ([] if out is None else renaming_notes(image_names(v.name for v in read.views)))
 
@@ -505,10 +511,15 @@ def fit_request(request: FitRequest, **others: Any) -> FitResult:
         raise KeyboardInterrupt(again) from e
 
 
-def _prepare(job: FitJob, resumed: Path | None) -> tuple[Trainer, dict[str, Any], list[PhotoCheck]]:
+def _prepare(job: FitJob, resumed: Path | None, hashed: Callable[[], str]) -> tuple[Trainer, dict[str, Any], list[PhotoCheck]]:
     """Return the trainer, which continues the run ``resumed``, the record of the run, and checks of photographs."""
-    record, state = folders.record_of(job.request, job.config, job.scene, job.split, job.notes, job.device), None
-    if resumed is not None:
+
+    def recorded() -> dict[str, Any]:
+        job.scene = replace(job.scene, fingerprint=hashed())  # of the scene as it was read
+        return folders.record_of(job.request, job.config, job.scene, job.split, job.notes, job.device)
+
+    record, state = recorded() if resumed is not None or job.ranks.count > 1 else None, None
+    if record is not None and resumed is not None:
         stored = folders.read_record(resumed)
         folders.check_same(record, stored, resumed)
         job.scene = replace(job.scene, normalization=similarity_of(stored["normalization"], str(resumed / CONFIG)))
@@ -517,7 +528,8 @@ def _prepare(job: FitJob, resumed: Path | None) -> tuple[Trainer, dict[str, Any]
             folders.check_checkpoint(state[1], stored, resumed)
             if state[1]["step"] == state[1].get("steps"):
                 job.say(f"  all {state[1]['step']:,} steps are taken; only the images, scores and report are made again")
-    check_equal(record, None if state is None else state[1].get("step"), job.ranks)
+    if record is not None:
+        check_equal(record, None if state is None else state[1].get("step"), job.ranks)
     checks: list[PhotoCheck] = []
     with background_warmup(job.config, job.device) as ready:
         if job.other_models:
@@ -537,7 +549,7 @@ def _prepare(job: FitJob, resumed: Path | None) -> tuple[Trainer, dict[str, Any]
         except DataError as e:
             raise DataError(f"{resumed}/{TENSORS}: {e}") from e
         job.notes.append(f"continued from step {trainer.step}; this run's times count from there")
-    return trainer, record, checks
+    return trainer, record or recorded(), checks
 
 
 def _finish(job: FitJob, trainer: Trainer, record: dict[str, Any], checks: list[PhotoCheck]) -> FitResult:
@@ -562,7 +574,9 @@ def _finish(job: FitJob, trainer: Trainer, record: dict[str, Any], checks: list[
                 write_ply(path, model, job.scene.normalization, antialiased=job.config.antialiased)
             job.say(f"model: {path}; scores and report follow")
         renders = Renders(trainer.gaussians, trainer.context.render_options())
-        with section("checks"):
+        with section("checks"), ThreadPoolExecutor(1) as thread:
+            # for the report, of which it takes the longest
+            sampled = thread.submit(lambda: None if job.out is None else results.sampling_report_of(trainer, job.out))
             metrics = _score(job, trainer, seconds, given, checks, renders)
         metrics["wall_seconds"] = job.clock.seconds()
         job.notes += pose_tasks(job.out)
@@ -572,9 +586,8 @@ def _finish(job: FitJob, trainer: Trainer, record: dict[str, Any], checks: list[
             with section("report"):
                 results.write_report(
                     job.out, job.scene, job.split, trainer.gaussians, options, metrics, record,
-                    title=title_of(Path(job.scene.path), job.out),
-                    sampling=partial(results.sampling_report_of, trainer, job.out), renders=renders, times=job.clock.seconds,
-                    tell=job.progress,
+                    title=title_of(Path(job.scene.path), job.out), sampling=sampled.result, renders=renders,
+                    times=job.clock.seconds, tell=job.progress,
                 )  # fmt: skip
             metrics["wall_seconds"] = job.clock.seconds()
             write_json(job.out / METRICS_FILE, metrics)  # again, with the time of the report
@@ -597,11 +610,13 @@ def _score(
     names, learned = image_names(v.name for v in scene.views), trainer.learned
     options, tell, compare = trainer.context.render_options(), job.progress, not job.other_models
     scored = (job.out, gaussians, train, test, options)
-    with section("scoring"):
-        metrics = results.evaluate_run(*scored, job.lpips, names=names, renders=renders, tell=tell)
-    if test and compare:
-        with section("coverage"):
-            metrics["coverage"] = coverage_of_run(*scored, names=names, renders=renders, tell=tell)
+    with ThreadPoolExecutor(1) as thread:
+        covered = test and compare and thread.submit(coverage_of_run, *scored, names=names, renders=renders)
+        with section("scoring"):
+            metrics = results.evaluate_run(*scored, job.lpips, names=names, renders=renders, tell=tell)
+        if covered:
+            with section("coverage"):
+                metrics["coverage"] = covered.result()
     tell("checking float32 accuracy")
     rule = results.rule_report_of(gaussians, train, options, seed=c.seed, half_resolution=trainer.half_resolution)
     shape = shape_figures(gaussians, c.limits, trainer.radius, trainer.context.extent, [v.camera for v in train])

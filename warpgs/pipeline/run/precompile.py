@@ -65,7 +65,7 @@ def fit_kernels(cuda: bool) -> list[tuple[wp.Kernel, int]]:
         [blend_cuda.make_backward(TILE_SIZE, depth, chunk, False) for chunk in blend_cuda.CHUNKS] for depth in (False, True)
     )
     return [
-        (sweep.follow, sweep.BLOCK), (start, THREADS), (project_cuda.make_forward(real, CAMERA_MODEL), BLOCK),
+        (sweep.make_follow(), sweep.BLOCK), (start, THREADS), (project_cuda.make_forward(real, CAMERA_MODEL), BLOCK),
         *((kernel, THREADS) for kernel in (update.sample, lists, *of_steps)),
         (blend_cuda.make_kernels(TILE_SIZE).order_tiles, blend_cuda.ORDER_THREADS), *save,
         (ssim.make_cuda_kernels().forward, ssim.THREADS), *((kernel, THREADS) for kernel in rough),

@@ -109,8 +109,10 @@ def choose_split(scene: Scene, spec: str | None) -> tuple[Split, list[str]]:
     return split, notes
 
 
-def read_scene(request: SceneRequest, progress: Callable[[str], object] | None = None) -> tuple[Scene, Split, list[str]]:
-    """Load a scene and split its views; returns both with the notes for the user. ``progress`` is as in `load_scene`."""
-    scene = read_folder(request.path, request, request.reader, progress)
+def read_scene(
+    request: SceneRequest, progress: Callable[[str], object] | None = None, *, hashed: bool = True
+) -> tuple[Scene, Split, list[str]]:
+    """Load a scene and split its views; returns both with the notes for the user. Arguments are those of `read_folder`."""
+    scene = read_folder(request.path, request, request.reader, progress, hashed=hashed)
     split, notes = choose_split(scene, request.split)
     return scene, split, [*scene.notes, *notes]

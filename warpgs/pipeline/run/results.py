@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -25,7 +26,7 @@ from warpgs.mesh.views import MIN_ALPHA
 from warpgs.pipeline.films.paths import Rig, midways, rig_among
 from warpgs.pipeline.metrics.coverage import coverage_map, coverage_section, depth_views
 from warpgs.pipeline.metrics.lpips import Lpips
-from warpgs.pipeline.metrics.scores import Renders, ViewMetrics, baselines, psnr_of, render_view, score, summarize, variants
+from warpgs.pipeline.metrics.scores import Renders, baselines, psnr_of, render_view, score, summarize, variants
 from warpgs.pipeline.paper.scores import SUPPORT
 from warpgs.pipeline.train.loss import GIVEN_MIN_ALPHA
 from warpgs.pipeline.train.schedule import Phases
@@ -407,18 +408,24 @@ def evaluate_run(
         make_folder(out / folder)
     files, held_out = names or image_names(v.name for v in [*train, *test]), {v.name for v in test}
 
-    def finish(view: View, image: np.ndarray, depth: np.ndarray, alpha: np.ndarray) -> ViewMetrics:
+    def beside(image: np.ndarray, photo: np.ndarray) -> np.ndarray:
+        return side_by_side([np.clip(image, 0, 1), photo, error_map(image, photo)])
+
+    def save(folder: str, view: View, draw: Callable[..., np.ndarray], *parts: np.ndarray) -> None:
         if out is not None and (view.name in held_out or not test):
-            row = side_by_side([np.clip(image, 0, 1), view.image, error_map(image, view.image)])
-            write_bytes(out / "renders" / f"{files[view.name]}.png", png(row))
-            write_bytes(out / "depth" / f"{files[view.name]}.png", png(depth_map(depth, alpha)))
-        return score(view, image, lpips if view.name in held_out else None, alpha)
+            write_bytes(out / folder / f"{files[view.name]}.png", png(draw(*parts)))
+
+    def jobs() -> Iterator[tuple[Any, ...]]:
+        for view in counted([*test, *train], tell, "scoring", "views"):
+            image, depth, alpha = renders(view.camera) if renders else render_view(gaussians, view, options)
+            yield save, "renders", view, beside, image, view.image
+            yield save, "depth", view, depth_map, depth, alpha
+            yield score, view, image, lpips if view.name in held_out else None, alpha
 
     with ThreadPoolExecutor(1) as thread:
         plain = thread.submit(lambda: baselines(train, test) if test else {})
-        shown = counted([*test, *train], tell, "scoring", "views")
-        rendered = ((v, *(renders(v.camera) if renders else render_view(gaussians, v, options))) for v in shown)
-        found = in_background(finish, rendered, 0 if lpips is None else 1)  # LPIPS needs much memory for each view
+        # LPIPS needs much memory for each view
+        found = in_background(lambda do, *parts: do(*parts), jobs(), 0 if lpips is None else 1)[2::3]
     rows, train_rows = found[: len(test)], found[len(test) :]
     return {
         "test": summarize(rows), "train": summarize(train_rows),
@@ -506,7 +513,7 @@ def write_report(
     rig = rig_among(cameras[0], gaussians.means.detach().cpu().numpy().astype(np.float64))
     covered, shown = None, evenly_spaced(test or train, SHOWN_VIEWS)
     with ThreadPoolExecutor() as threads:  # images are encoded while others are rendered
-        sampled = threads.submit(sampling)
+        threads.submit(import_module, "jinja2")  # takes a tenth of a second, at the end
         if "coverage" in metrics:
             names = image_names(v.name for v in scene.views)
             covered = threads.submit(coverage_section, out, metrics["coverage"], [v.name for v in shown], names)
@@ -537,7 +544,7 @@ def write_report(
         subtitle=f"preset {metrics['preset']}, {len(train)} training views, {len(test)} held out, "
         f"{camera.width} x {camera.height} px, {metrics['device']}",
         figures=_figures(metrics, spent["total"]), notes=notes, scores=table, views=images, curves=curves,
-        sampling=sampled.result(), pictures=[(p.result(), words) for p, words in pictures],
+        sampling=sampling(), pictures=[(p.result(), words) for p, words in pictures],
         coverage=covered and covered.result(), held_out=bool(test),
         record={k: v for k, v in record.items() if k != "cameras"},
         protocol=protocol | {LABELS.get(k, k): v for k, v in metrics["variants"].items()},

@@ -320,6 +320,8 @@ class Trainer:
         steps = range(first, first + count)
         buffers.load([row for _, row in places[:count]], [self._lr_row(s) for s in steps], [self.settings(s) for s in steps])
         self.chosen = chosen
+        if self.layout.graphs:
+            self.strategy.before_steps(steps[-1])
         try:
             self.taker.take(
                 places, lambda: [self.settings(step, slot) for step in steps for slot in range(self.batch)],

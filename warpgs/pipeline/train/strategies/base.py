@@ -205,6 +205,9 @@ class Strategy:
         """
         return {}
 
+    def before_steps(self, last: int) -> None:
+        """Begin, on the host, what an update after the step ``last`` needs, while the device takes the steps up to it."""
+
     def due(self, step: int) -> bool:
         """Return whether `update` changes anything after a step; not called after early stopping has ended growth."""
         return False

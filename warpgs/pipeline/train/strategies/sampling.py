@@ -3,6 +3,7 @@
 import dataclasses
 import math
 from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import Annotated, Any, NamedTuple
 
@@ -18,6 +19,7 @@ from warpgs.pipeline.train.schedule import Phases
 from warpgs.pipeline.train.strategies.base import Growth, Strategy, StrategyContext, register
 from warpgs.pipeline.train.strategies.clone_split import GradientGrowth
 from warpgs.pipeline.train.views import TrainingView, half_size_camera
+from warpgs.plugins import is_ours
 from warpgs.render.options import RasterizeOptions
 from warpgs.render.rasterize import rasterize
 from warpgs.scene import Camera, Gaussians, base_coefficients
@@ -120,23 +122,19 @@ def valid_pixels(alpha: torch.Tensor, depth: torch.Tensor, mask: torch.Tensor | 
     return valid & inner
 
 
-def sample_pixels(
-    score: torch.Tensor, gate: torch.Tensor, count: int, generator: torch.Generator, *, random: bool
-) -> torch.Tensor:
+def sample_pixels(score: torch.Tensor, gate: torch.Tensor, count: int, uniform: torch.Tensor | None) -> torch.Tensor:
     """Sample pixels within a gate without replacement, with probability proportional to a score (P_sample).
 
     Successive sampling: the ``count`` smallest of E_i / score_i with exponential E_i (Efraimidis and Spirakis 2006).
 
     Returns rows and columns, int64, shape [S, 2], with S = ``count`` or the number of gated pixels with a positive score.
-    ``generator`` is on the CPU. If ``random`` is False, the highest scores are taken instead.
+    ``uniform`` are random numbers in [0, 1), float64, [H, W], on the CPU. If it is None, the highest scores are taken instead.
     """
     allowed = gate & (score > 0)
     count = min(count, int(allowed.sum()))
-    if random:
-        uniform = torch.rand(score.shape, dtype=torch.float64, generator=generator, device="cpu").to(score.device)
-        key = score.double() / -torch.log1p(-uniform)
-    else:
-        key = score.double()
+    key = score.double()
+    if uniform is not None:
+        key = key / -torch.log1p(-uniform.to(score.device))
     key = torch.where(allowed, key, -1.0)
     chosen = torch.topk(key.flatten(), count).indices.sort().values
     return torch.stack([chosen // score.shape[1], chosen % score.shape[1]], 1)
@@ -181,6 +179,22 @@ EVENT = schema.fields({"step": _COUNT, "added": _COUNT, "evicted": _COUNT, "quan
 """Schema of a stored event."""
 
 
+def drawn(generator: torch.Generator, shapes: Mapping[int, torch.Size]) -> Iterator[Any]:
+    """Yield the views of an event, by their numbers, then a random number in [0, 1) for each pixel of each, float64 [H, W]."""
+    numbers = list(shapes)
+    if len(numbers) > MAX_VIEWS:
+        order = torch.randperm(len(numbers), generator=generator, device="cpu")
+        numbers = [numbers[i] for i in sorted(order[:MAX_VIEWS].tolist())]
+    yield numbers
+    for i in numbers:
+        yield torch.rand(shapes[i], dtype=torch.float64, generator=generator, device="cpu")
+
+
+def drawn_ahead(own: torch.Generator, shapes: Mapping[int, torch.Size]) -> tuple[Any, list[Any], torch.Tensor]:
+    """Return the state and views for which `drawn` yields the values, the values, and the state after them."""
+    return (own.get_state(), shapes), list(drawn(own, shapes)), own.get_state()
+
+
 @register("sampling")
 class Sampling(Strategy):
     """Growth by gradients; and at events in phase 2, fine Gaussians behind pixels that are sampled uniformly.
@@ -214,6 +228,7 @@ class Sampling(Strategy):
         """Settings."""
         self.events: list[dict[str, Any]] = []
         """Step of each sampling event, Gaussians added and evicted, and the quantile of the gate in each view."""
+        self._ahead: Future[Any] | None = None
         self.on_event: Callable[[int, list[SampledView]], None] | None = None
         """Function that is called with the step and the samples of each view after each event."""
 
@@ -245,25 +260,41 @@ class Sampling(Strategy):
     ) -> tuple[DensityUpdate, int, list[SampledView]]:
         """Return the change by an event on views by index, the number of evicted Gaussians, and the samples of each view."""
         # docs/decisions/008-method.md
-        t, generator = self.context, self.context.generator
-        numbers = list(views)
-        if len(numbers) > MAX_VIEWS:
-            order = torch.randperm(len(views), generator=generator, device="cpu")
-            numbers = [numbers[i] for i in sorted(order[:MAX_VIEWS].tolist())]
+        t = self.context
+        draws = self._draws({i: v.image.shape[:2] for i, v in views.items()})
+        numbers, sampled, rows = next(draws), [], []
         rendered = {i: self.render_before(views[i]) for i in numbers}
         self.before_event({i: views[i] for i in numbers}, rendered)
-        sampled, rows = [], []
         for i, r in rendered.items():
             view, wanted = views[i], max(1, round(fraction * r.valid.numel()))
             scores = self.importance(i, view, r)
             gate, quantile = self.gate(i, r.valid, wanted)
             score = [*scores.values()][-1] if scores else torch.ones_like(r.depth)
-            at = sample_pixels(score, gate, wanted, generator, random=self.at_random)
+            at = sample_pixels(score, gate, wanted, next(draws) if self.at_random else None)
             footprint, coefficients = self.method.sampler.footprint, t.gaussians.sh.shape[1]
             rows.append(fine_gaussians(view.camera, view.image, r.depth, at, footprint, coefficients))
             sampled.append(SampledView(i, r.rgb, scores, gate, quantile, at))
         added = {n: torch.cat([r[n] for r in rows]) for n in rows[0]}
         return *self._within_limits(step, added, views.values(), max_fraction), sampled
+
+    def before_steps(self, last: int) -> None:
+        """Draw the random numbers of an event after the step ``last`` in a thread, 8 bytes for each pixel of its views."""
+        # a class of others may draw numbers of its own
+        if last in self.context.phases.events and self.at_random and is_ours(type(self)):
+            shapes = {i: v.image.shape[:2] for i, v in enumerate(self.context.views)}
+            thread = ThreadPoolExecutor(1)
+            self._ahead = thread.submit(drawn_ahead, self.context.generator.clone_state(), shapes)
+            thread.shutdown(wait=False)
+
+    def _draws(self, shapes: Mapping[int, torch.Size]) -> Iterator[Any]:
+        """Return what `drawn` yields for views of these shapes; numbers that were drawn ahead, if nothing was drawn since."""
+        ahead, self._ahead, generator = self._ahead, None, self.context.generator
+        if ahead is not None:
+            (state, known), values, after = ahead.result()
+            if known == shapes and torch.equal(state, generator.get_state()):
+                generator.set_state(after)
+                return iter(values)
+        return drawn(generator, shapes)
 
     def _within_limits(
         self, step: int, added: dict[str, torch.Tensor], views: Iterable[TrainingView], max_fraction: float
