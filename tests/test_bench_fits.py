@@ -210,7 +210,7 @@ def test_the_default_strategy_has_its_own_settings(fake_gsplat, monkeypatch):
     monkeypatch.setitem(sys.modules, "gsplat", made)
     s = default_settings(7000)
     strategy, state = strategy_of(s, 2.5)
-    assert strategy.told == {"refine_start_iter": 500, "refine_stop_iter": 3500, "refine_every": 100} and state == 2.5
+    assert strategy.told == {"refine_start_iter": 500, "refine_stop_iter": 3500, "refine_every": 100, "reset_every": 3000} and state == 2.5
     assert (s.init_opacity, s.init_scale, s.opacity_reg, s.scale_reg) == (0.1, 1.0, 0.0, 0.0)
 
 
