@@ -21,8 +21,8 @@ from warpgs.render.rasterize import rasterize
 from warpgs.scene import Box, Camera, Gaussians
 
 SEEN = 4 / 255
-"""Least blending weight at which a view sees a Gaussian: with less, the Gaussian changes no pixel by more than 4 of 255
-levels."""
+"""Least blending weight at which a view sees a Gaussian. Removing one with less changes no pixel of a view by more than 4 levels
+of 255 between black and white, and by 1 level where its colour is within a quarter of the range of what is behind it."""
 PROBES = 16
 """Least number of random images over all views for the sensitivities."""
 
@@ -31,12 +31,17 @@ PROBES = 16
 def coverage(gaussians: Gaussians, cameras: list[Camera], options: RasterizeOptions) -> tuple[torch.Tensor, torch.Tensor]:
     """Render all views (tensors); return each Gaussian's largest blending weight [N], and how many views see it, int64 [N].
 
-    The largest weight is the score of RadSplat (arXiv 2403.13806); a sum of weights would be small for thin Gaussians.
+    The largest weight is the score of RadSplat (arXiv 2403.13806); a sum of weights would be small for thin Gaussians. Weights
+    below `SEEN` may be those of fewer pixels than were rendered: behind less light than that, no weight is larger.
     """
+    rule = options.cut_offs()
+    if rule.inclusive_stop:  # else the Gaussian at the stop has no weight
+        rule = replace(rule, transmittance_stop=max(SEEN, rule.transmittance_stop))
+    options = replace(options, contributions=True, sh_degree=0, rule=rule)
     maxima = gaussians.means.new_zeros(len(gaussians))
     views = torch.zeros_like(maxima, dtype=torch.int64)
     for c in cameras:
-        weights = rasterize(gaussians, c, replace(options, contributions=True)).weight_maxima[0]
+        weights = rasterize(gaussians, c, options).weight_maxima[0]
         maxima = torch.maximum(maxima, weights)
         views += weights >= SEEN
     return maxima, views

@@ -38,16 +38,16 @@ OPACITY = 0.1
 PROTECTED_STEPS, PROTECTED_OPACITY = 500, 0.05
 """Age up to which a sampled Gaussian is protected [steps] (T_protect, five densification intervals), and its smallest opacity
 (alpha_minimum, ten times the pruning threshold). The paper gives neither value."""
-PRUNE_EVERY, PRUNE_VIEWS, PRUNE_LEAST, PRUNE_LATE = 500, 40, 10, (0, 1 / 4, 5 / 8)
+PRUNE_EVERY, PRUNE_VIEWS, PRUNE_LEAST, PRUNE_LATE = 500, 14, 8, (0, 13 / 16, 3 / 8)
 """Steps between removals of unseen Gaussians while the set grows: at most a tenth of the fit, but at least the second number
 for each view, since a removal renders all of them. Fewest steps for each view of a fit with any removal, which takes as long as
-2.6 steps for each view. And times of the last removals as fractions of phase 3, all before the steps
-over which parameters are averaged."""
+0.8 steps for each view. And times of the last removals as fractions of phase 3, the most useful first, all before the steps
+over which parameters are averaged; the third only in fits long enough for it."""
 
 
 def removals(p: Phases, views: int) -> set[int]:
     """Return the numbers of steps done when Gaussians that none of some views shows are removed."""
-    most = p.planned // (PRUNE_VIEWS * max(1, views)) or int(p.planned >= PRUNE_LEAST * views)
+    most = max(p.planned // (PRUNE_VIEWS * max(1, views)), 2) if p.planned >= PRUNE_LEAST * views else 0
     late = {p.stable_start + int(part * (p.steps - p.stable_start)) for part in PRUNE_LATE[:most]}
     every = max(1, min(PRUNE_EVERY, p.planned // 10), PRUNE_VIEWS * views)
     return {s for s in range(every, p.stable_start, every) if s > p.refine} | {s for s in late if s < p.steps}
@@ -308,7 +308,11 @@ class Sampling(Strategy):
 
     def is_protected(self, step: int | torch.Tensor) -> torch.Tensor:
         """Return the Gaussians that are young enough for protection at a step, bool, shape [N]."""
-        return step - self.context.table.columns["created_step"] <= PROTECTED_STEPS
+        return self.age(step) <= PROTECTED_STEPS
+
+    def age(self, step: int | torch.Tensor) -> torch.Tensor:
+        """Return the steps since each Gaussian was sampled, int32, shape [N]; more than any fit has for others."""
+        return step - self.context.table.columns["created_step"]
 
     def is_layered(self, step: int) -> bool:
         """Return whether only the fine layer grows and the coarse layer moves slowly: with two layers, from phase 2 on."""
@@ -371,11 +375,11 @@ class Sampling(Strategy):
         return possible and step in removals(self.context.phases, len(self.context.views))
 
     def prune(self, step: int) -> Iterator[DensityUpdate]:
-        """Remove the Gaussians whose blending weight is below `SEEN` in all training views, but no protected ones."""
+        """Remove the Gaussians whose blending weight is below `SEEN` in all training views, but no young ones in phase 2."""
         t = self.context
         seen = coverage(t.gaussians, [v.camera for v in t.views], t.render_options())[0] >= SEEN
-        if self.protects:
-            seen |= self.is_protected(step)
+        if self.protects and step < t.phases.stable_start:  # new ones may be hidden by others that are about to go
+            seen |= self.age(step) <= min(PROTECTED_STEPS, t.phases.planned // 10)
         if not bool(seen.all()) and bool(seen.any()):
             yield DensityUpdate(torch.nonzero(seen).squeeze(1))
 
