@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from warpgs.constants import ALPHA_CUT
 from warpgs.errors import DataError, UsageError
 from warpgs.files import read_input, unread_reason
 from warpgs.geometry import matmul
@@ -21,8 +22,8 @@ from warpgs.render.rasterize import rasterize
 from warpgs.scene import Box, Camera, Gaussians
 
 SEEN = 4 / 255
-"""Least blending weight at which a view sees a Gaussian. Without one of less weight, no pixel of a view changes by more than 4 of
-255 levels between black and white, or by 1 level where its colour is within a quarter of that range of what is behind it."""
+"""Least blending weight at which a view sees a Gaussian. Without it, a pixel changes by its weight times the difference between
+its colour and what is behind: with less weight by less than 4 of 255 levels, even for white before black."""
 PROBES = 16
 """Least number of random images over all views for the sensitivities."""
 
@@ -31,12 +32,12 @@ PROBES = 16
 def coverage(gaussians: Gaussians, cameras: list[Camera], options: RasterizeOptions) -> tuple[torch.Tensor, torch.Tensor]:
     """Render all views (tensors); return each Gaussian's largest blending weight [N], and how many views see it, int64 [N].
 
-    The largest weight is the score of RadSplat (arXiv 2403.13806); a sum of weights would be small for thin Gaussians. Weights
-    below `SEEN` may be those of fewer pixels than were rendered: behind less light than that, no weight is larger.
+    The largest weight is the score of RadSplat (arXiv 2403.13806); a sum of weights would be small for thin Gaussians. Rays end
+    where less than `ALPHA_CUT` of the light is left, which no weight exceeds; so smaller weights may be too small.
     """
     rule = options.cut_offs()
     if rule.inclusive_stop:  # else the Gaussian at the stop has no weight
-        rule = replace(rule, transmittance_stop=max(SEEN, rule.transmittance_stop))
+        rule = replace(rule, transmittance_stop=max(ALPHA_CUT, rule.transmittance_stop))
     options = replace(options, contributions=True, sh_degree=0, rule=rule)
     maxima = gaussians.means.new_zeros(len(gaussians))
     views = torch.zeros_like(maxima, dtype=torch.int64)

@@ -9,6 +9,7 @@ from typing import Annotated, Any, NamedTuple
 import torch
 
 from warpgs import schema
+from warpgs.constants import ALPHA_CUT
 from warpgs.device import FLOAT, SAMPLING, Needs, StepSizes
 from warpgs.geometry import back_project_tensors, logit
 from warpgs.kernels.update import Setting
@@ -38,11 +39,11 @@ OPACITY = 0.1
 PROTECTED_STEPS, PROTECTED_OPACITY = 500, 0.05
 """Age up to which a sampled Gaussian is protected [steps] (T_protect, five densification intervals), and its smallest opacity
 (alpha_minimum, ten times the pruning threshold). The paper gives neither value."""
-PRUNE_EVERY, PRUNE_VIEWS, PRUNE_LEAST, PRUNE_LATE = 500, 14, 8, (0, 13 / 16, 3 / 8)
+PRUNE_EVERY, PRUNE_VIEWS, PRUNE_LEAST, PRUNE_LATE = 500, 40, 8, (0, 13 / 16, 3 / 8)
 """Steps between removals of unseen Gaussians while the set grows: at most a tenth of the fit, but at least the second number
 for each view, since a removal renders all of them. Fewest steps for each view of a fit with any removal, which takes as long as
-0.8 steps for each view. And times of the last removals as fractions of phase 3, the most useful first, all before the steps
-over which parameters are averaged; the third only in fits long enough for it."""
+0.8 steps for each view. And times of the last removals as fractions of phase 3, all before the steps over which parameters are
+averaged; the third only in a fit that is long enough for three by the second number."""
 
 
 def removals(p: Phases, views: int) -> set[int]:
@@ -308,11 +309,7 @@ class Sampling(Strategy):
 
     def is_protected(self, step: int | torch.Tensor) -> torch.Tensor:
         """Return the Gaussians that are young enough for protection at a step, bool, shape [N]."""
-        return self.age(step) <= PROTECTED_STEPS
-
-    def age(self, step: int | torch.Tensor) -> torch.Tensor:
-        """Return the steps since each Gaussian was sampled, int32, shape [N]; more than any fit has for others."""
-        return step - self.context.table.columns["created_step"]
+        return step - self.context.table.columns["created_step"] <= PROTECTED_STEPS
 
     def is_layered(self, step: int) -> bool:
         """Return whether only the fine layer grows and the coarse layer moves slowly: with two layers, from phase 2 on."""
@@ -375,11 +372,16 @@ class Sampling(Strategy):
         return possible and step in removals(self.context.phases, len(self.context.views))
 
     def prune(self, step: int) -> Iterator[DensityUpdate]:
-        """Remove the Gaussians whose blending weight is below `SEEN` in all training views, but no young ones in phase 2."""
+        """Remove Gaussians whose blending weight is below `SEEN` in all training views.
+
+        Before the last removal, protected ones go only below the smallest alpha: others may still come to the front.
+        """
         t = self.context
-        seen = coverage(t.gaussians, [v.camera for v in t.views], t.render_options())[0] >= SEEN
-        if self.protects and step < t.phases.stable_start:  # new ones may be hidden by others that are about to go
-            seen |= self.age(step) <= min(PROTECTED_STEPS, t.phases.planned // 10)
+        maxima = coverage(t.gaussians, [v.camera for v in t.views], t.render_options())[0]
+        least = torch.full_like(maxima, SEEN)
+        if self.protects and step < max(removals(t.phases, len(t.views)), default=0):
+            least[self.is_protected(step)] = ALPHA_CUT
+        seen = maxima >= least
         if not bool(seen.all()) and bool(seen.any()):
             yield DensityUpdate(torch.nonzero(seen).squeeze(1))
 
