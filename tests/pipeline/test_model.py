@@ -425,31 +425,35 @@ def test_files_for_strangers_are_cleaned_unless_asked_otherwise(suffix, flags, c
     assert main([*words, "--clean", "--no-clean"]) == UsageError.exit_code
 
 
-@pytest.mark.parametrize("steepness", [1, 8, 20])
-@pytest.mark.parametrize("limit", [0.1, 0.3, 0.77])
-def test_largest_share(limit, steepness):
-    """At nearly the whole limit, never above it, after few tries; within the last of the intervals at a step."""
-    asked = []
-    fraction = edit.largest_fraction(lambda s: asked.append(s) or math.exp(steepness * (s - limit)), 1.0)
-    assert edit.AIM <= math.exp(steepness * (fraction - limit)) <= 1 and len(asked) <= edit.TRIES
-    fraction = edit.largest_fraction(lambda s: asked.append(s) or 1e3 * (s > limit), 1.0)
-    assert limit - 2 ** (1 - edit.TRIES) <= fraction <= limit and len(asked) <= 2 * edit.TRIES
+@pytest.mark.parametrize("power", [0.4, 1, 2])
+@pytest.mark.parametrize("limit", [1e-3, 0.1, 30])
+def test_largest_budget(limit, power):
+    """At nearly the whole limit, never above it, after few tries from far off; at a step between both sides of it."""
+    tried = {}
+    budget = edit.largest_budget(tried, lambda b: (b / limit) ** power, 1.0, 1e9, 1.0)
+    assert edit.AIM <= (budget / limit) ** power <= 1 and len(tried) <= 5
+    tried = {}
+    budget = edit.largest_budget(tried, lambda b: 1e-9 + 1e3 * (b > limit), 1.0, 1e9, 1.0)
+    assert 0 < budget <= limit and len(tried) == edit.TRIES
+    assert edit.largest_budget(tried, lambda b: 1e-9 + 1e3 * (b > limit), 1.0, 1e9, 1.0) >= budget, "it forgot what it tried"
 
 
-def test_a_share_is_0_or_was_tried():
-    """Also where losses are negative, equal, undefined or do not grow with the fraction."""
-    assert edit.largest_fraction(lambda s: -1.0, 0.1) == 1
+def test_a_budget_is_0_or_was_tried():
+    """Also where losses are negative, equal, undefined or do not grow with the budget; a search ends at the largest budget."""
+    assert edit.largest_budget({}, lambda b: -1.0, 1.0, 50.0, 0.1) == 50
     for loss in (1.0, math.nan, math.inf):
-        assert edit.largest_fraction(lambda s, loss=loss: loss, 0.1) == 0
+        assert edit.largest_budget({}, lambda b, loss=loss: loss, 1.0, 50.0, 0.1) == 0
     for seed in range(20):
-        draw, asked = np.random.default_rng(seed), {0.0: -1.0}
-        fraction = edit.largest_fraction(lambda s, a=asked, d=draw: a.setdefault(s, d.uniform(-0.1, 0.4)), 0.1)
-        assert asked[fraction] <= 0.1 and all(0 <= s <= 1 for s in asked)
+        draw, tried = np.random.default_rng(seed), {}
+        budget = edit.largest_budget(tried, lambda b, d=draw: d.uniform(-0.1, 0.4), 1.0, 50.0, 0.1)
+        assert tried.get(budget, 0.0) <= 0.1 and all(0 < b <= 50 for b in tried)
 
 
-def test_the_last_of_an_order_stay():
-    assert edit.keep_last(torch.tensor([3, 1, 0, 2]), 0.5).tolist() == [0, 2]
-    assert edit.keep_last(torch.tensor([3, 1, 0, 2]), 1.0).tolist() == [2]
+def test_the_cheapest_rows():
+    """The least scores, while their changes are within the budget; one row remains."""
+    scores, changes = torch.tensor([3.0, 1.0, 0.0, 2.0]), torch.tensor([0.1, 5.0, 1.0, 0.0])
+    for budget, rows in ((0.5, []), (1.0, [2]), (5.9, [2]), (6.0, [1, 2, 3]), (1e9, [1, 2, 3])):
+        assert edit.cheapest(scores, changes, budget).nonzero()[:, 0].tolist() == rows
 
 
 @pytest.mark.parametrize("hidden", [0.5, 1, 2, 6, 1e9])
@@ -463,21 +467,10 @@ def test_few_views_do_not_decide_alone(hidden):
         removed = 1 - len(made) / len(whole)
         return 0.01 * math.exp(5 * removed) * (hidden if on_all else 1)
 
-    made, lost = edit.prune_model(whole, cameras, RasterizeOptions(), 0, loss, 0.1)
+    made, lost = edit.prune_model(whole, cameras, RasterizeOptions(), 0, loss, 0.1, 1.0)
     assert lost <= 0.1 and (lost == 0 if hidden == 1e9 else made is tries[True][-1] and lost == loss(made, True))
     assert (len(made) == len(whole)) == (hidden == 1e9)
-    assert len(tries[True]) <= edit.REPEATS + 1 and len(tries[False]) <= edit.TRIES * (edit.REPEATS + 1)
-
-
-def test_degrees_stay_if_lower_ones_alone_lose_too_much_on_all_views():
-    """Gaussians are removed all the same."""
-    whole, cameras = cloud(400, degree=1), [torch_camera(c) for c in ring(3, 40, 30)]
-
-    def loss(made, on_all):
-        return 0.1 * (1 - len(made) / len(whole)) + (on_all and not bool((edit.stored_degrees(made.sh) == 1).all()))
-
-    made, lost = edit.prune_model(whole, cameras, RasterizeOptions(), 0, loss, 0.05)
-    assert 0.2 < len(made) / len(whole) < 0.6 and lost <= 0.05
+    assert len(tries[True]) <= edit.REPEATS + 1 and len(tries[False]) <= edit.TRIES * edit.REPEATS
 
 
 FLAGS = f"--split {split_spec(8)} --steps 80 --device cpu --preset 3dgs --sh-every 20 --init.random-count 600".split()
@@ -578,7 +571,7 @@ def test_prune_keeps_its_promise(run, tmp_path, capsys):
     assert "Gaussians, mean SH degree" in words and "times smaller" in words and "held-out PSNR" in words
     assert f"`warpgs eval '{tmp_path}/a small one'` scores it" in words and f"`warpgs render '{tmp_path}/a small one'`" in words
     assert "trying smaller models: number 1" in words and "scoring the smaller model" in words
-    assert len(re.findall("trying smaller models: number", words)) <= 2 * edit.TRIES + 1, "one search for each step"
+    assert len(re.findall("trying smaller models: number", words)) <= edit.TRIES + edit.REPEATS, "one search"
     assert before == {p: p.read_bytes() for p in run.rglob("*") if p.is_file()}
     record = json.loads((tmp_path / "a small one" / "config.json").read_text())["pruned"]
     whole, small = (open_run(f, CPU).gaussians() for f in (run, tmp_path / "a small one"))
@@ -642,12 +635,13 @@ def test_only_the_mirror_keeps_its_harmonics():
     cameras = [torch_camera(c) for c in ring(6, 80, 60)]
     photos = [rasterize(g, c).rgb for c in cameras]
 
-    def loss(model) -> float:
+    def loss(model, on_all) -> float:
         return max(float((rasterize(model, c).rgb - p).square().mean()) for c, p in zip(cameras, photos))
 
-    need = edit.sensitivities(g, cameras, RasterizeOptions(), 0)[2]
-    degrees = edit.stored_degrees(edit.lower_degrees(g, need, loss, 1e-6).sh)
-    assert bool((degrees[~right] == 0).all()) and float(degrees[right].float().mean()) > 0.8
+    made, lost = edit.prune_model(g, cameras, RasterizeOptions(), 0, loss, 1e-6, 1e-3)
+    kept = {tuple(m): d for m, d in zip(made.means.tolist(), edit.stored_degrees(made.sh).tolist())}
+    degrees = torch.tensor([kept.get(tuple(m), 0) for m in g.means.tolist()])
+    assert lost <= 1e-6 and bool((degrees[~right] == 0).all()) and float(degrees[right].float().mean()) > 0.8
 
 
 def make_cameras(count=3):

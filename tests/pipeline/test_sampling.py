@@ -262,23 +262,28 @@ def test_nothing_is_added_in_phase_three(monkeypatch):
 
 
 def test_gaussians_that_no_view_shows_are_removed(monkeypatch):
-    """Faint and hidden ones go, young fine ones stay; at steps in phase 2 and 3; but the paper's strategy removes none."""
+    """Faint and hidden ones go, young fine ones only at the end, or if they change no level; but the paper removes none."""
     monkeypatch.setattr(sampling, "PRUNE_VIEWS", 1)
     fit = fitted(steps=0)
     fit.table.apply(grown(fit, 3, [-1, -1], columns={"level": FINE, "created_step": 7}))
     fit.table.apply(grown(fit, 5, [0]))
-    fit.table.params["logit_opacities"].detach()[[0, 3, 5]] = torch.tensor([-10.0, -10.0, 3.0])
+    opacities = fit.table.params["logit_opacities"].detach()
+    opacities[[0, 3, 4, 5]] = torch.tensor([-10.0, geometry.logit(3 / 255), -10.0, 3.0])
     fit.table.params["means"].detach()[5] = 100.0  # behind all cameras
-    (change,) = fit.strategy.prune(12)
-    assert change.keep.tolist() == [1, 2, 3, 4] and len(change.parents) == 0
-    (change,) = fit.strategy.prune(30)
-    assert change.keep.tolist() == [1, 2, 4]
+    for step in (12, 32, 36):
+        fit.table.columns["created_step"][3:5] = step - 1
+        (change,) = fit.strategy.prune(step)
+        assert change.keep.tolist() == [1, 2, 3] and len(change.parents) == 0  # 3 is young
+    for step, created in ((37, 36), (36, 36 - sampling.PROTECTED_STEPS - 1)):  # at the last removal, or too old
+        fit.table.columns["created_step"][3:5] = created
+        (change,) = fit.strategy.prune(step)
+        assert change.keep.tolist() == [1, 2]
     fit.table.params["logit_opacities"].detach()[:] = -10.0
     assert not [*fit.strategy.prune(30)]  # a model of nothing is no help
-    assert [s for s in range(41) if fit.strategy.prunes(s)] == [12, 16, 20, 24, 28, 31, 35]
+    assert [s for s in range(41) if fit.strategy.prunes(s)] == [12, 16, 20, 24, 28, 32, 37]
     assert not any(Paper(fit.context).prunes(s) for s in range(41))
-    monkeypatch.setattr(sampling, "PRUNE_VIEWS", 14)  # one removal has time among 40 steps of three views
-    assert [s for s in range(41) if fit.strategy.prunes(s)] == [28]
+    monkeypatch.setattr(sampling, "PRUNE_VIEWS", 14)  # two removals have time among 40 steps of three views
+    assert [s for s in range(41) if fit.strategy.prunes(s)] == [28, 37]
     resets = dataclasses.replace(CONFIG, density=dataclasses.replace(CONFIG.density, reset_every=3))
     assert not any(fitted(resets, 0).strategy.prunes(s) for s in range(41))  # after a reset nothing is seen
     monkeypatch.setattr(sampling, "PRUNE_LEAST", 14)

@@ -9,8 +9,8 @@ import warp as wp
 from warpgs.kernels import blend_cuda, launch
 from warpgs.kernels.blend import check_slots, composite, is_native, make_segments
 from warpgs.kernels.ellipse import PROJECTED_SIZE
-from warpgs.kernels.falloff import STRIP, Pass, make_functions, make_struct
-from warpgs.kernels.native import ROLLED, SCALE, cuda_kernel, source
+from warpgs.kernels.falloff import ABREAST, STRIP, TOGETHER, Pass, make_functions, make_struct
+from warpgs.kernels.native import ROLLED, SCALE, cuda_kernel, make_prefetch, source
 from warpgs.kernels.tiles import Tiles
 
 # These are separate passes, so that `blend` does not become slower. Alpha comes from the same operations as in `blend`, so that
@@ -132,20 +132,111 @@ def make_heaviest(real):
 
 
 @functools.cache
-def make_contributions(real):
-    """Make the visitor that adds to the sum and maximum of an instance's weight, in slot order."""
+def make_weights(real, tile_size: int):
+    """Make the kernel of `contributions`, one task per tile; its loops over a strip have no branch, so that they vectorise."""
+    f = make_functions(real)
+    tile_reals = wp.types.vector(tile_size * (tile_size + 1), real)
+    strip_reals = wp.types.vector(STRIP, real)
+    prefetch, ahead = make_prefetch(real, 2), TOGETHER
+    row_reals, column_reals = wp.types.vector(tile_size, real), wp.types.vector((tile_size + ABREAST) * STRIP, real)
+    side, strip, parts, abreast, bits, outside = tile_size, STRIP, tile_size // STRIP, ABREAST, tile_size - 1, real(-1.0)
 
-    @wp.func(inline=True)
-    def visit(
-        pixel: int, instance: int, i: int, weight: real, after: real, depth: real, slots: wp.array(dtype=int), k: int,
-        weights: wp.array(dtype=real), ids: wp.array(dtype=int), counts: wp.array(dtype=int),
-    ) -> bool:  # fmt: skip
-        slot = 2 * slots[instance]
-        weights[slot] += weight
-        weights[slot + 1] = wp.max(weights[slot + 1], weight)
-        return False
+    @wp.kernel(enable_backward=False, module="unique", module_options=ROLLED)
+    def weigh(
+        begin: int, settings: f.Blending, projected: wp.array2d(dtype=real), ranges: wp.array2d(dtype=int),
+        gaussian_ids: wp.array(dtype=int), slots: wp.array(dtype=int),
+        # outputs: sum and maximum of each instance
+        weights: wp.array2d(dtype=real),
+    ):  # fmt: skip
+        tile = begin + wp.tid()
+        place = f.place_of(tile, side, settings)
+        left = settings.origin_x + place[1]
+        top = settings.origin_y + place[2]
+        t = tile_reals()  # falls below the stop once a pixel is finished
+        for row in range(side):
+            for column in range(side):
+                inside = place[1] + column < settings.width and place[2] + row < settings.height
+                t[row * side + column] = wp.where(inside, real(1.0), outside)
+        ramp = strip_reals()
+        sums = strip_reals()
+        maxima = strip_reals()
+        e12 = row_reals()
+        e22 = row_reals()
+        e1 = f.abreast()
+        squares = f.abreast()
+        falloffs = column_reals()  # of a column of strips
+        left_open = int(1)
+        instance = ranges[tile, 0]
+        while instance < ranges[tile, 1] and left_open > 0:
+            later = wp.min(instance + ahead, gaussian_ids.shape[0] - 1)
+            prefetch(projected, gaussian_ids[later])
+            prefetch(weights, slots[later])
+            i = gaussian_ids[instance]
+            mx = projected[i, 0]
+            my = projected[i, 1]
+            u11 = projected[i, 2]
+            u12 = projected[i, 3]
+            u22 = projected[i, 4]
+            opacity = projected[i, 5]
+            bounds = f.bounds_of(mx, my, u11, u22, projected[i, 10], projected[i, 11], settings.whole_tiles)
+            for lane in range(strip):
+                ramp[lane] = f.apart(u11 * real(lane))
+                sums[lane] = real(0.0)
+                maxima[lane] = real(0.0)
+            for row in range(side):
+                dy = real(top + row) + real(0.5) - my
+                e2 = u22 * dy
+                e12[row] = f.apart(u12 * dy)
+                e22[row] = f.apart(e2 * e2)
+            for part in range(parts):
+                at_left = f.apart(u11 * (real(left + part * strip) + real(0.5) - mx))
+                first = int(side)
+                end = int(0)
+                for row in range(side):
+                    hit = f.reaches(at_left + e12[row], u11, e22[row], bounds[0], bounds[1])
+                    first = wp.min(first, wp.where(hit, row, side))
+                    end = wp.max(end, wp.where(hit, row + 1, 0))
+                k = int(0)
+                while k < end - first:
+                    for lane in range(strip):
+                        for n in range(abreast):
+                            e1[n] = at_left + e12[(first + k + n) & bits] + ramp[lane]
+                            squares[n] = e22[(first + k + n) & bits]
+                        found = f.falloffs(wp.cw_mul(e1, e1) + squares)
+                        for n in range(abreast):
+                            falloffs[(k + n) * strip + lane] = found[n]
+                    k += abreast  # the last few may lie beyond the end; their values are not read
+                k = int(0)
+                while k < end - first:
+                    base = wp.max((first + k) * side + part * strip, 0)
+                    o = wp.max(k * strip, 0)
+                    k += 1
+                    for lane in range(strip):
+                        raw = opacity * falloffs[o + lane]
+                        alpha = wp.where(settings.alpha_max < raw, settings.alpha_max, raw)
+                        alpha = wp.where(alpha >= settings.alpha_cut, alpha, real(0.0))
+                        before = t[base + lane]
+                        after = before * (real(1.0) - alpha)
+                        blended = wp.where(settings.inclusive != 0, before, after) >= settings.stop
+                        weight = wp.where(blended, alpha * before, real(0.0))
+                        t[base + lane] = after
+                        sums[lane] = sums[lane] + weight
+                        maxima[lane] = wp.max(maxima[lane], weight)
+            total = real(0.0)
+            largest = real(0.0)
+            for lane in range(strip):
+                total += sums[lane]
+                largest = wp.max(largest, maxima[lane])
+            slot = slots[instance]
+            weights[slot, 0] = total
+            weights[slot, 1] = largest
+            instance += 1
+            if instance % strip == 0:
+                left_open = int(0)
+                for p in range(side * side):
+                    left_open += wp.where(t[p] >= settings.stop, 1, 0)
 
-    return visit
+    return weigh
 
 
 @functools.cache
@@ -220,7 +311,9 @@ def contributions(projected: torch.Tensor, tiles: Tiles, settings: Pass) -> tupl
         ends = composite(projected, tiles, projected.new_zeros(len(projected), 3), settings, save=False)[5]
         blend_cuda.instance_weights(projected, tiles, settings, ends, weights)
     else:
-        _walk(make_contributions, projected, tiles, settings, 0, weights)
+        real = launch.real_of(projected)
+        inputs = [settings.struct(tiles.size, real), projected, tiles.ranges, tiles.gaussian_ids, tiles.slots, weights]
+        launch.launch(make_weights(real, tiles.size), len(tiles.ranges), inputs, projected.device, cost=10_000, block_dim=32)
     sums, maxima = projected.new_empty(projected.shape[:2]), projected.new_empty(projected.shape[:2])
     kernel = make_segments(launch.real_of(projected)).gather_weights
     launch.launch(kernel, len(tiles.counts), [weights, tiles.starts, tiles.counts, sums, maxima], projected.device)

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from warpgs.constants import ALPHA_CUT
 from warpgs.errors import DataError, UsageError
 from warpgs.files import read_input, unread_reason
 from warpgs.geometry import matmul
@@ -21,8 +22,8 @@ from warpgs.render.rasterize import rasterize
 from warpgs.scene import Box, Camera, Gaussians
 
 SEEN = 4 / 255
-"""Least blending weight at which a view sees a Gaussian: with less, the Gaussian changes no pixel by more than 4 of 255
-levels."""
+"""Least blending weight at which a view sees a Gaussian. Without it, a pixel changes by its weight times the difference between
+its colour and what is behind: with less weight by less than 4 of 255 levels, even for white before black."""
 PROBES = 16
 """Least number of random images over all views for the sensitivities."""
 
@@ -31,12 +32,17 @@ PROBES = 16
 def coverage(gaussians: Gaussians, cameras: list[Camera], options: RasterizeOptions) -> tuple[torch.Tensor, torch.Tensor]:
     """Render all views (tensors); return each Gaussian's largest blending weight [N], and how many views see it, int64 [N].
 
-    The largest weight is the score of RadSplat (arXiv 2403.13806); a sum of weights would be small for thin Gaussians.
+    The largest weight is the score of RadSplat (arXiv 2403.13806); a sum of weights would be small for thin Gaussians. Rays end
+    where less than `ALPHA_CUT` of the light is left, which no weight exceeds; so smaller weights may be too small.
     """
+    rule = options.cut_offs()
+    if rule.inclusive_stop:  # else the Gaussian at the stop has no weight
+        rule = replace(rule, transmittance_stop=max(ALPHA_CUT, rule.transmittance_stop))
+    options = replace(options, contributions=True, sh_degree=0, rule=rule)
     maxima = gaussians.means.new_zeros(len(gaussians))
     views = torch.zeros_like(maxima, dtype=torch.int64)
     for c in cameras:
-        weights = rasterize(gaussians, c, replace(options, contributions=True)).weight_maxima[0]
+        weights = rasterize(gaussians, c, options).weight_maxima[0]
         maxima = torch.maximum(maxima, weights)
         views += weights >= SEEN
     return maxima, views
@@ -188,14 +194,12 @@ def levelling(up: np.ndarray) -> np.ndarray:
     return rotation_about(axis if angle % math.pi > 1e-12 else np.array([1.0, 0.0, 0.0]), angle)
 
 
-TRIES = 8
-"""Largest number of steps in the search for the largest fraction."""
+TRIES = 6
+"""Largest number of models that a search tries on few views."""
 AIM = 0.9
 """A search ends at this part of the allowed loss; it costs about 1 % of the Gaussians that could be removed."""
-FAR_APART = 50
-"""Ratio of the losses at both ends of a search above which it goes on in the middle."""
 DEGREES_FRACTION = 1 / 3
-"""Part of the allowed loss that lower degrees may use up. Removal may use up the rest."""
+"""Part of the changes that lower degrees may cause. Removal may cause the rest."""
 REPEATS = 3
 """Largest number of searches for a model that keeps the limit on all views."""
 
@@ -204,31 +208,49 @@ Loss = Callable[[Gaussians, bool], float]
 """The loss of a model, on all views or on a few."""
 
 
-def largest_fraction(loss: Callable[[float], float], allowed: float) -> float:
-    """Return the largest fraction in [0, 1] that was tried and has at most the allowed loss; 1 is tried first, 0 needs no test.
+def largest_budget(
+    tried: dict[float, float], loss: Callable[[float], float], first: float, most: float, allowed: float
+) -> float:
+    """Return the largest budget that was tried and has at most the allowed loss, or 0; adds to ``tried``, the losses by budget.
 
-    The logarithm of the loss is nearly linear in the fraction, so the next one is on the line through the losses at both ends;
-    if these are far apart, as at a step, it is the middle.
+    The loss is about a power of the budget: the next one is on the line through the nearest two losses, in logarithms, and
+    inside of the budgets that are known to be too small and too large. ``first`` is tried first; none is above ``most``.
     """
-    low, high, at = 0.0, 1.0, 1.0
-    below = above = least = 0.01 * allowed
+    target = math.sqrt(AIM) * allowed
     for _ in range(TRIES):
-        lost = loss(at)
-        if lost <= allowed:
-            low, below = at, max(lost, least)
-        else:
-            high, above = at, lost
-        if low == 1 or AIM * allowed <= lost <= allowed:
+        low = max((budget for budget, lost in tried.items() if lost <= allowed), default=0.0)
+        high = min((budget for budget in tried if budget > low), default=math.inf)
+        if low >= most or (low > 0 and tried[low] >= AIM * allowed):
             break
-        steep = not above < FAR_APART * below  # or not finite
-        part = 0.5 if steep else math.log(math.sqrt(AIM) * allowed / below) / math.log(above / below)
-        at = low + (high - low) * min(0.9, max(0.1, part))
-    return low
+        at, near = first, sorted(tried, reverse=high == math.inf)[:2] if low == 0 or high == math.inf else [low, high]
+        if near:
+            # from a thousandth of the allowed loss to a thousand times as much, which also stands for NaN
+            losses = [1e-3 * max(1.0, min(1e6, 1e3 * tried[budget] / allowed)) for budget in near]
+            ends = [math.log(budget) for budget in near]
+            power = math.log(losses[1] / losses[0]) / (ends[1] - ends[0]) if len(near) > 1 else 1.0
+            step = math.log(target / allowed / losses[0]) / min(5.0, max(0.2, power))
+            if low > 0 and high < math.inf:
+                step = (ends[1] - ends[0]) * min(0.9, max(0.1, step / (ends[1] - ends[0])))
+            at = min(most, near[0] * math.exp(step))
+        tried[min(at, most)] = loss(min(at, most))
+    return max((budget for budget, lost in tried.items() if lost <= allowed), default=0.0)
 
 
-def keep_last(order: torch.Tensor, fraction: float) -> torch.Tensor:
-    """Return the rows, ascending, that remain after the first ``fraction`` of an order [N] is removed; at least one remains."""
-    return order[min(len(order) - 1, int(fraction * len(order))) :].sort().values
+def importance(space: torch.Tensor, removal: torch.Tensor) -> torch.Tensor:
+    """Return the scores [N] by which Gaussians are removed, the least first, from their `sensitivities`.
+
+    A score is the product of PUP-3DGS' sensitivity and of the change without the Gaussian; by one of both alone, fewer could go
+    at the same loss.
+    """
+    return space.sqrt() * removal.sqrt()
+
+
+def cheapest(scores: torch.Tensor, changes: torch.Tensor, budget: float) -> torch.Tensor:
+    """Return the rows of least score [N] whose changes [N] add up to at most ``budget``, bool [N]; at least one row is not."""
+    order, chosen = torch.argsort(scores, stable=True), torch.zeros_like(scores, dtype=torch.bool)
+    sums = changes[order].double().cpu().cumsum(0)  # on a CPU one after another: the same bits each time
+    chosen[order[: min(int((sums <= budget).sum()), len(order) - 1)]] = True
+    return chosen
 
 
 def stored_degrees(sh: torch.Tensor) -> torch.Tensor:
@@ -247,36 +269,27 @@ def drop_unused_sh(gaussians: Gaussians) -> Gaussians:
     return limit_degree(gaussians, int(stored_degrees(gaussians.sh).max()) if len(gaussians) else 0)
 
 
-def lower_degrees(gaussians: Gaussians, need: torch.Tensor, loss: Callable[[Gaussians], float], allowed: float) -> Gaussians:
-    """Return the set without harmonics above degree 0 in as many Gaussians as the allowed loss permits, least need first."""
-    order, degrees = torch.argsort(need, stable=True), stored_degrees(gaussians.sh)
-
-    def lowered(fraction: float) -> Gaussians:
-        some = degrees.clone()
-        some[order[: int(fraction * len(order))]] = 0
-        return replace(gaussians, sh=truncated(gaussians.sh, some))
-
-    return lowered(largest_fraction(lambda s: loss(lowered(s)), allowed))
-
-
 def prune_model(
-    gaussians: Gaussians, cameras: list[Camera], options: RasterizeOptions, seed: int, loss: Loss, allowed: float
+    gaussians: Gaussians, cameras: list[Camera], options: RasterizeOptions, seed: int, loss: Loss, allowed: float, first: float
 ) -> tuple[Gaussians, float]:
-    """Lower degrees, then remove Gaussians; return the smaller set, by ascending degree, and its loss on all views.
+    """Lower degrees and remove Gaussians; return the smaller set, by ascending degree, and its loss on all views.
 
-    The loss is at most ``allowed``. A search on few views is repeated for less if the loss on all views is too large; degrees
-    stay if lower ones alone lose too much there.
-    ``cameras`` are those of all training views, tensors. The first to go have the least product of PUP-3DGS' sensitivity and of
-    the change without them; by one of both alone, fewer could go at the same loss.
+    The loss is at most ``allowed``. `sensitivities` ranks everything once; they also add up to a budget, of which degrees take
+    `DEGREES_FRACTION`. The search is for the budget: it begins with ``first``, on few views, and is repeated for less if the
+    loss on all views is too large. ``cameras`` are those of all training views, tensors.
     """
     space, removal, harmonics = sensitivities(gaussians, cameras, options, seed)
-    order, lowered, aim = torch.argsort(space.sqrt() * removal.sqrt(), stable=True), gaussians, allowed
-    if bool((stored_degrees(gaussians.sh) > 0).any()):
-        lowered = lower_degrees(gaussians, harmonics, lambda g: loss(g, False), DEGREES_FRACTION * allowed)
-        lowered = lowered if loss(lowered, True) <= allowed else gaussians
+    scores, degrees, aim = importance(space, removal), stored_degrees(gaussians.sh), allowed
+    most, tried = float((removal + harmonics).double().sum()) / DEGREES_FRACTION, dict[float, float]()
+
+    def smaller(budget: float) -> Gaussians:
+        lowered = torch.where(cheapest(harmonics, harmonics, DEGREES_FRACTION * budget), 0, degrees)
+        keep = ~cheapest(scores, removal, (1 - DEGREES_FRACTION) * budget)
+        return select(replace(gaussians, sh=truncated(gaussians.sh, lowered)), keep)
+
     for _ in range(REPEATS):
-        fraction = largest_fraction(lambda s: loss(select(lowered, keep_last(order, s)), False), aim)
-        model = by_degree(select(lowered, keep_last(order, fraction)))
+        budget = largest_budget(tried, lambda budget: loss(smaller(budget), False), first, most, aim)
+        model = by_degree(smaller(budget))
         if (lost := loss(model, True)) <= allowed:
             return model, lost
         aim *= AIM * allowed / lost

@@ -266,7 +266,10 @@ def prune(
         return float(np.mean(psnrs[rows] - view_psnrs(gaussians, [train[i] for i in rows], options)))
 
     cameras = [TrainingView.of(v, device).camera for v in train]
-    made, lost = edit.prune_model(before, cameras, options, stored.record["config"]["seed"], loss, keep_psnr)
+    # the changes of all images that would lower PSNR by this much if they had nothing to do with the errors
+    values = np.array([v.image.size for v in train])
+    first = float((values * 10 ** (-psnrs / 10)).sum()) * (10 ** (keep_psnr / 10) - 1)
+    made, lost = edit.prune_model(before, cameras, options, stored.record["config"]["seed"], loss, keep_psnr, first)
     tell("scoring the smaller model")
     degrees = [edit.stored_degrees(g.sh) for g in (before, made)]
     counts, sizes = [len(d) for d in degrees], [model_bytes(d) for d in degrees]

@@ -55,7 +55,7 @@ def fit_kernels(cuda: bool) -> list[tuple[wp.Kernel, int]]:
             blend.make_segments(real, VALUES, 9 + COLORS).sum_gradients, project_cpu.make_backward(real, *variant, False),
             *(update.make_adam_kernel(real, split, update.LANES) for split in (True, False)), neighbours.make_reach_kernel(),
             # after the first step
-            of_renders[0], of_renders[1], walk.make_walk(real, TILE_SIZE, walk.make_contributions), update.squared_errors,
+            of_renders[0], of_renders[1], walk.make_weights(real, TILE_SIZE), update.squared_errors,
             scoring(), *of_renders[2:], ssim.make_kernels(real, False).backward, deep.backward,
         ]  # fmt: skip
         return [(kernel, 1) for kernel in kernels]

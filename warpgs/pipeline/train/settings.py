@@ -531,7 +531,7 @@ CPU_SECONDS = 45.0, 4.0, 1200.0
 CPU_TIMES = 6.8e-8, 3.1e-7, 1.2e-8
 """Time of a step on two idle cores of 2.5 GHz: for a pixel, for a Gaussian, and for each coefficient of the harmonics of a
 Gaussian [s]. Measured as processor time over two threads (docs/decisions/025-time-on-a-cpu.md)."""
-EVENT_TIMES = 1.0, 0.8, 2.6
+EVENT_TIMES = 1.0, 0.6, 0.8
 """Time of an event, in steps: for each view that is sampled, for each view that ranks Gaussians for eviction, and for each view
 that shows which Gaussians to remove."""
 SWEPT_VIEWS = 30

@@ -10,6 +10,7 @@ from typing import Annotated, Any, NamedTuple
 import torch
 
 from warpgs import schema
+from warpgs.constants import ALPHA_CUT
 from warpgs.device import FLOAT, SAMPLING, Needs, StepSizes
 from warpgs.geometry import back_project_tensors, logit
 from warpgs.kernels.update import Setting
@@ -40,16 +41,16 @@ OPACITY = 0.1
 PROTECTED_STEPS, PROTECTED_OPACITY = 500, 0.05
 """Age up to which a sampled Gaussian is protected [steps] (T_protect, five densification intervals), and its smallest opacity
 (alpha_minimum, ten times the pruning threshold). The paper gives neither value."""
-PRUNE_EVERY, PRUNE_VIEWS, PRUNE_LEAST, PRUNE_LATE = 500, 40, 10, (0, 1 / 4, 5 / 8)
+PRUNE_EVERY, PRUNE_VIEWS, PRUNE_LEAST, PRUNE_LATE = 500, 40, 8, (0, 13 / 16, 3 / 8)
 """Steps between removals of unseen Gaussians while the set grows: at most a tenth of the fit, but at least the second number
 for each view, since a removal renders all of them. Fewest steps for each view of a fit with any removal, which takes as long as
-2.6 steps for each view. And times of the last removals as fractions of phase 3, all before the steps
-over which parameters are averaged."""
+0.8 steps for each view. And times of the last removals as fractions of phase 3, all before the steps over which parameters are
+averaged; the third only in a fit that is long enough for three by the second number."""
 
 
 def removals(p: Phases, views: int) -> set[int]:
     """Return the numbers of steps done when Gaussians that none of some views shows are removed."""
-    most = p.planned // (PRUNE_VIEWS * max(1, views)) or int(p.planned >= PRUNE_LEAST * views)
+    most = max(p.planned // (PRUNE_VIEWS * max(1, views)), 2) if p.planned >= PRUNE_LEAST * views else 0
     late = {p.stable_start + int(part * (p.steps - p.stable_start)) for part in PRUNE_LATE[:most]}
     every = max(1, min(PRUNE_EVERY, p.planned // 10), PRUNE_VIEWS * views)
     return {s for s in range(every, p.stable_start, every) if s > p.refine} | {s for s in late if s < p.steps}
@@ -402,11 +403,16 @@ class Sampling(Strategy):
         return possible and step in removals(self.context.phases, len(self.context.views))
 
     def prune(self, step: int) -> Iterator[DensityUpdate]:
-        """Remove the Gaussians whose blending weight is below `SEEN` in all training views, but no protected ones."""
+        """Remove Gaussians whose blending weight is below `SEEN` in all training views.
+
+        Before the last removal, protected ones go only below the smallest alpha: others may still come to the front.
+        """
         t = self.context
-        seen = coverage(t.gaussians, [v.camera for v in t.views], t.render_options())[0] >= SEEN
-        if self.protects:
-            seen |= self.is_protected(step)
+        maxima = coverage(t.gaussians, [v.camera for v in t.views], t.render_options())[0]
+        least = torch.full_like(maxima, SEEN)
+        if self.protects and step < max(removals(t.phases, len(t.views)), default=0):
+            least[self.is_protected(step)] = ALPHA_CUT
+        seen = maxima >= least
         if not bool(seen.all()) and bool(seen.any()):
             yield DensityUpdate(torch.nonzero(seen).squeeze(1))
 
