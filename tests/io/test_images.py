@@ -24,6 +24,10 @@ from warpgs.poses.photographs import prepare, write_copy
 # Decoding, orientation, masks, undistortion and resizing, each with the camera in step.
 
 
+MASK = np.tile(np.array([0, *[255] * 3], np.uint8).repeat(4), (12, 1))
+"""A mask of the test image whose left quarter is black."""
+
+
 def lens(width, height, focal=20.0, distortion=(), model="PINHOLE"):
     K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
     return Lens(K, width, height, distortion, model)
@@ -56,19 +60,16 @@ def test_every_kind_of_png_is_decoded(mode, tmp_path):
 
 @pytest.mark.parametrize("kind", ["JPEG", "PNG", "BMP", "TIFF", "WEBP", "AVIF"])
 def test_truncated_images_are_named(kind, tmp_path):
+    """As are missing ones and those that are not finite."""
     path, data = tmp_path / f"a.{kind.lower()}", encoded(kind)
     for kept in (0.0, 0.02, 0.5, 0.9, 0.999):
         path.write_bytes(data[: int(kept * len(data))])
         with pytest.raises(DataError, match=rf"{path.name}: the image cannot be decoded: \w.*Restore"):
             decode(path)
-
-
-def test_missing_and_non_finite_images(tmp_path):
-    with pytest.raises(DataError, match=r"gone.png: the image file is missing; restore"):
-        decode(tmp_path / "gone.png")
     Image.fromarray(np.full((8, 8), np.nan, np.float32)).save(tmp_path / "nan.tiff")
-    with pytest.raises(DataError, match=r"nan.tiff: some pixels are not finite"):
-        decode(tmp_path / "nan.tiff")
+    for name, words in (("gone.png", "the image file is missing; restore"), ("nan.tiff", "some pixels are not finite")):
+        with pytest.raises(DataError, match=f"{name}: {words}"):
+            decode(tmp_path / name)
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))
@@ -181,43 +182,30 @@ def test_a_lens_that_folds_back_is_masked_there(tmp_path):
 @pytest.mark.parametrize("keeps", ["white", "black"])
 def test_masks_folder(name, keeps, tmp_path):
     scenes.write_colmap(tmp_path)
-    mask = np.zeros((12, 16), np.uint8)
-    mask[:, 4:] = 255
-    scenes.save(tmp_path / "masks" / name, mask)
+    scenes.save(tmp_path / "masks" / name, MASK)
     scene = load_scene(tmp_path, mask_keeps=keeps)
-    assert (scene.views[0].mask == ((mask > 0) == (keeps == "white"))).all() and scene.views[1].mask is None
+    assert (scene.views[0].mask == ((MASK > 0) == (keeps == "white"))).all() and scene.views[1].mask is None
     assert "1 image masked by a mask file" in scene.notes
     kept = f"masks keep {'75.0%' if keeps == 'white' else '25.0%'} of the pixels, the {keeps} ones (--mask-keeps {keeps})"
     assert f"{kept}; the others are ignored (--masks ignore)" in scene.notes
     half = load_scene(tmp_path, downscale=2, mask_keeps=keeps).views[0].mask
-    assert (half == ((mask[::2, ::2] > 0) == (keeps == "white"))).all()
+    assert (half == ((MASK[::2, ::2] > 0) == (keeps == "white"))).all()
 
 
-NAMES_OF_MASKS = [
-    "photo0.jpg",
-    "PHOTO0.PNG",
-    "photo0_mask.png",
-    "photo0.mask.png",
-    "photo0.png.mask.png",
-    "photo0-mask.tif",
-    "photo0.JPG_mask.png",
-]
+ENDS = [".jpg", "_mask.png", ".mask.png", ".png.mask.png", "-mask.tif", ".JPG_mask.png"]
 
 
-@pytest.mark.parametrize("name", NAMES_OF_MASKS)
+@pytest.mark.parametrize("name", ["PHOTO0.PNG", *(f"photo0{end}" for end in ENDS)])
 def test_masks_by_the_names_of_other_programs(name, tmp_path):
     """An exact name comes first, two files for one image are none, and an image may itself be called a mask."""
     scenes.write_colmap(tmp_path, names=("photo0.png", "face_mask.png", "c.png", "d.png", "e.png"))
-    mask = np.zeros((12, 16), np.uint8)
-    mask[:, 4:] = 255
-    scenes.save(tmp_path / "masks" / name, mask)
+    scenes.save(tmp_path / "masks" / name, MASK)
     views = {v.name: v for v in load_scene(tmp_path).views}
     kept = views["photo0.png"].mask
-    assert kept is not None and np.abs(kept.astype(int) - (mask > 0)).sum() <= 12 and views["face_mask.png"].mask is None
-    scenes.save(tmp_path / "masks" / "face_mask.PNG", mask)
-    scenes.save(tmp_path / "masks" / "c.tif", mask)
-    scenes.save(tmp_path / "masks" / "c_mask.png", mask)
-    scenes.save(tmp_path / "masks" / "photo0.png", np.full_like(mask, 255))
+    assert kept is not None and np.abs(kept.astype(int) - (MASK > 0)).sum() <= 12 and views["face_mask.png"].mask is None
+    for other in ("face_mask.PNG", "c.tif", "c_mask.png"):
+        scenes.save(tmp_path / "masks" / other, MASK)
+    scenes.save(tmp_path / "masks" / "photo0.png", np.full_like(MASK, 255))
     scene = load_scene(tmp_path)
     assert [v.name for v in scene.views if v.mask is not None and not v.mask.all()] == ["face_mask.png"]
     assert [n for n in scene.notes if "masks" in n and "match" in n] == [
@@ -248,6 +236,11 @@ def test_a_mask_with_the_suffix_of_its_photograph_is_of_no_other(tmp_path):
     kept = {v.name: v.mask is not None and not v.mask.all() for v in scene.views}
     assert kept == {"a.jpg": True, "a.png": False, "b.JPG": True, "b.png": False, "c.png": True}
     assert not any("match no image" in n for n in scene.notes)
+    scenes.write_middlebury(tmp_path / "scene")  # whose masks lie in its own folder
+    scenes.save(tmp_path / "scene" / "masks" / "photo1.png", MASK)
+    scenes.save(tmp_path / "masks" / "photo0.png", MASK)  # of the scene beside it
+    views = load_scene(tmp_path / "scene").views
+    assert views[0].mask is None and not views[1].mask[:, 0].any()
 
 
 @pytest.mark.parametrize(
@@ -269,16 +262,6 @@ def test_masked_pixels_do_not_run_into_others(focal, distortion, downscale, alph
     assert (black.alpha is not None) is alpha and (
         not alpha or np.array_equal(black.alpha[black.mask], noise.alpha[black.mask])
     )
-
-
-def test_masks_of_middlebury_lie_in_the_scene_folder(tmp_path):
-    scenes.write_middlebury(tmp_path / "scene")
-    mask = np.full((12, 16), 255, np.uint8)
-    mask[0] = 0
-    scenes.save(tmp_path / "scene" / "masks" / "photo1.png", mask)
-    scenes.save(tmp_path / "masks" / "photo0.png", mask)  # of another scene beside it
-    views = load_scene(tmp_path / "scene").views
-    assert views[0].mask is None and not views[1].mask[0].any()
 
 
 def rgba(i, alpha):
@@ -354,38 +337,29 @@ def test_masks_cut_out(tmp_path):
     np.testing.assert_allclose(half, alpha.reshape(6, 2, 8, 2).mean((1, 3)), atol=1e-6)
 
 
-def test_cutting_out_without_masks_is_said_and_words_are_checked(tmp_path):
-    scenes.write_colmap(tmp_path)
-    assert "--masks cutout changes nothing: no image has a mask file" in load_scene(tmp_path, masks="cutout").notes
-    with pytest.raises(UsageError, match="--masks must be ignore or cutout, not 'cut'"):
-        load_scene(tmp_path, masks="cut")
-    with pytest.raises(UsageError, match="--mask-keeps must be white or black, not 'gray'"):
-        load_scene(tmp_path, mask_keeps="gray")
-
-
 def test_masks_that_cannot_be_used(tmp_path):
+    """Nor can words that are none; cutting out without masks gives a note."""
     scenes.write_colmap(tmp_path)
     path = tmp_path / "masks" / "photo0.png"
     for i in range(scenes.VIEWS):
         scenes.save(path.with_name(f"photo{i}.png"), np.zeros((12, 16), np.uint8))
-    with pytest.raises(DataError, match=r"has 0 usable views \(.*masks that keep no pixel.*--mask-keeps.*photo0.png"):
-        load_scene(tmp_path)
+    scenes.refused(tmp_path, r"has 0 usable views \(.*masks that keep no pixel.*--mask-keeps.*photo0.png")
     for i in range(1, scenes.VIEWS):
         path.with_name(f"photo{i}.png").unlink()
     scenes.save(path, np.full((12, 30), 255, np.uint8))
-    with pytest.raises(DataError, match=r"photo0.png: its mask is 30 x 12 px, the image 16 x 12"):
-        load_scene(tmp_path)
+    scenes.refused(tmp_path, r"photo0.png: its mask is 30 x 12 px, the image 16 x 12")
     path.write_bytes(b"no image")
-    with pytest.raises(DataError, match=r"masks/photo0.png: the image cannot be decoded"):
-        load_scene(tmp_path)
+    scenes.refused(tmp_path, r"masks/photo0.png: the image cannot be decoded")
     scenes.save(path, np.full((24, 32), 255, np.uint8))  # twice the size is the same mask
     assert load_scene(tmp_path).views[0].mask.all()
-
-
-def test_downscale_must_be_a_positive_whole_number(tmp_path):
-    for downscale in (0, -1, 2.0, True, "2"):
-        with pytest.raises(UsageError, match="--downscale must be a whole number of at least 1"):
-            load_scene(tmp_path, downscale=downscale)
+    path.unlink()
+    assert "--masks cutout changes nothing: no image has a mask file" in load_scene(tmp_path, masks="cutout").notes
+    wrong = [({"masks": "cut"}, "--masks must be ignore or cutout, not 'cut'")]
+    wrong += [({"mask_keeps": "gray"}, "--mask-keeps must be white or black, not 'gray'")]
+    wrong += [({"downscale": d}, "--downscale must be a whole number of at least 1") for d in (0, -1, 2.0, True, "2")]
+    for options, words in wrong:
+        with pytest.raises(UsageError, match=words):
+            load_scene(tmp_path, **options)
 
 
 # Images are taken whole or not at all: damage that a checksum, a decoder or the sizes in the file show is refused.
@@ -432,9 +406,6 @@ def tiff(width: int, height: int, strips: list[tuple[int, int]], pixels: bytes, 
     return b"II*\0" + struct.pack("<I", 8) + directory + struct.pack(f"<{2 * count}I", *offsets, *lengths) + pixels
 
 
-# ---- undamaged files keep their pixels -------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     "mode,options",
     [
@@ -466,9 +437,6 @@ def test_big_tiff_and_tiles_are_read(order, tmp_path):
     refused(tmp_path, path.read_bytes()[:-1], "lie outside of the file")
 
 
-# ---- JPEG ------------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("options", [{}, {"progressive": True}, {"restart_marker_blocks": 8}])
 def test_a_jpeg_whose_coded_data_is_zeroed_or_ends_early_or_is_of_another_size(options, tmp_path):
     data = encoded("JPEG", **options)
@@ -483,18 +451,7 @@ def test_a_jpeg_whose_coded_data_is_zeroed_or_ends_early_or_is_of_another_size(o
         refused(tmp_path, data[:at] + struct.pack(">HH", height, width) + data[at + 4 :], "decoded")
 
 
-def test_a_progressive_jpeg_that_lacks_scans(tmp_path):
-    data = encoded("JPEG", progressive=True)
-    scans = [i for i in range(len(data)) if data[i : i + 2] == b"\xff\xda"]
-    assert len(scans) > 3
-    for at in scans[1:]:
-        refused(tmp_path, data[:at] + b"\xff\xd9", "some of its scans are missing")
-
-
-# ---- PNG, BMP, WebP --------------------------------------------------------------------------------------------------
-
-
-def test_a_png_that_lacks_a_part_or_has_a_wrong_bit_or_checksum(tmp_path):
+def test_files_that_lack_a_part_or_have_a_wrong_bit_or_checksum(tmp_path):
     rows = bytes(13) * 8
     good = gray_png(12, 8, rows)
     (tmp_path / "a.png").write_bytes(good)
@@ -511,9 +468,7 @@ def test_a_png_that_lacks_a_part_or_has_a_wrong_bit_or_checksum(tmp_path):
         data = bytearray(encoded("PNG"))
         data[int(at * len(data))] ^= 4
         refused(tmp_path, bytes(data), "decoded")
-
-
-def test_a_bmp_or_webp_that_is_shorter_than_its_header_says(tmp_path):
+    # a BMP or WebP that is shorter than its header says
     refused(tmp_path, encoded("BMP")[:-9], "truncated")
     refused(tmp_path, encoded("WEBP")[:-9], "it ends early")
     refused(tmp_path, b"RIFF" + struct.pack("<I", 4) + b"WEBP" + bytes(8), "its header is broken")
@@ -522,12 +477,13 @@ def test_a_bmp_or_webp_that_is_shorter_than_its_header_says(tmp_path):
     refused(tmp_path, bytes(data), "truncated")
     data[22:26], data[30:34] = struct.pack("<i", 64), struct.pack("<I", 1)
     refused(tmp_path, bytes(data), "compressed, so damage would not be detected")
-
-
-# ---- TIFF ------------------------------------------------------------------------------------------------------------
-
-
-def test_a_compressed_tiff_with_a_zeroed_middle(tmp_path):
+    # a progressive JPEG that lacks scans
+    data = encoded("JPEG", progressive=True)
+    scans = [i for i in range(len(data)) if data[i : i + 2] == b"\xff\xda"]
+    assert len(scans) > 3
+    for at in scans[1:]:
+        refused(tmp_path, data[:at] + b"\xff\xd9", "some of its scans are missing")
+    # a compressed TIFF with a zeroed middle
     for compression in ("tiff_lzw", "tiff_adobe_deflate", "tiff_deflate"):
         refused(tmp_path, zeroed(encoded("TIFF", compression=compression), 0.4, 0.6), "damaged")
     ok, data = cv2.imencode(".tif", np.asarray(photo()).astype(np.uint16) * 257, [cv2.IMWRITE_TIFF_COMPRESSION, 5])
@@ -547,9 +503,6 @@ def test_strips_that_hold_too_little(tmp_path):
     assert decode(tmp_path / "a.tif")[0].shape == (8, 16, 3)
     refused(tmp_path, tiff(16, 9, [(0, len(packed))], packed, 8), "decoded")
     refused(tmp_path, tiff(16, 8, [(0, len(packed))], packed[:-1] + b"\x77", 8), "incorrect data check")
-
-
-# ---- files that announce much ----------------------------------------------------------------------------------------
 
 
 def announcing(kind: str, width: int, height: int) -> bytes:
@@ -624,7 +577,6 @@ def test_any_error_of_a_decoder_is_damage_of_the_file(tmp_path, monkeypatch):
     header = chunk(b"IHDR", struct.pack(">IIBBBBB", 2**31, 1, 8, 0, 0, 0, 0))
     with pytest.raises(ValueError, match="its pixels are damaged"):
         image_files._loaded(image_files._opened("PNG", gray_png(1, 1, bytes(2))[:33] + header + chunk(b"IDAT", b"")))
-    (tmp_path / "photo.img").write_bytes(encoded("PNG"))
     for error in (OverflowError, ZeroDivisionError, Image.DecompressionBombError, cv2.error):
 
         def fails(*_, error=error):
@@ -632,28 +584,22 @@ def test_any_error_of_a_decoder_is_damage_of_the_file(tmp_path, monkeypatch):
 
         monkeypatch.setattr(ImageFile.ImageFile, "load", fails)
         refused(tmp_path, encoded("PNG"), "its pixels are damaged .signed integer is greater than maximum")
-    monkeypatch.setattr(ImageFile.ImageFile, "load", lambda *_: np.empty(2**50))
-    with pytest.raises(ResourceError, match=r"photo.img: decoding the image needs 0.0 GiB"):
-        decode(tmp_path / "photo.img")
 
 
 def test_no_memory_for_an_image_is_no_damage(tmp_path, monkeypatch):
-    path = tmp_path / "a.png"
-    path.write_bytes(encoded("PNG"))
+    (tmp_path / "photo.img").write_bytes(encoded("PNG"))
 
     def full(*_):
         error = cv2.error("Failed to allocate 4 bytes")
         error.code = cv2.Error.StsNoMem
         raise error
 
-    monkeypatch.setattr(cv2, "imdecode", full)
-    with pytest.raises(ResourceError, match=r"a.png: decoding the image needs 0.0 GiB of free memory; shrink the image"):
-        decode(path)
-
-
-def test_other_files_are_no_images(tmp_path):
-    for data in (b"", b"P5 2 2 255 abcd", b"GIF89a" + bytes(20)):
-        refused(tmp_path, data, "it is (empty|not a JPEG, PNG, BMP, TIFF, WebP or AVIF file)")
+    for owner, name, wrong in ((cv2, "imdecode", full), (ImageFile.ImageFile, "load", lambda *_: np.empty(2**50))):
+        monkeypatch.setattr(owner, name, wrong)
+        with pytest.raises(
+            ResourceError, match=r"photo.img: decoding the image needs 0.0 GiB of free memory; shrink the image"
+        ):
+            decode(tmp_path / "photo.img")
 
 
 # AVIF: decoded whole or not at all, with what EXIF says of the lens and nothing of it in the copy.
@@ -714,6 +660,7 @@ FTYP = b"\0\0\0\x1cftyp"
 
 
 def test_the_format_and_its_remedy_are_named(tmp_path):
+    """A folder of RAW files is told from an empty one; other files are no images."""
     for name, data, words in (
         ("a.heic", FTYP + b"heic\0\0\0\0mif1heic" + bytes(40), "a HEIC photograph, .* only for finding poses.*JPEG"),
         ("a.jpg", FTYP + b"mif1", "a HEIC photograph"),  # truncated, under another name
@@ -723,11 +670,9 @@ def test_the_format_and_its_remedy_are_named(tmp_path):
         (tmp_path / name).write_bytes(data)
         with pytest.raises(DataError, match=rf"{name}: is {words}"):
             decode(tmp_path / name)
-
-
-def test_a_folder_of_raw_files_is_told_from_an_empty_one(tmp_path):
-    scenes.WRITERS["llff"](tmp_path)
-    for file in (tmp_path / "images").iterdir():
+    scenes.write_llff(tmp_path / "raw")
+    for file in (tmp_path / "raw" / "images").iterdir():
         file.rename(file.with_suffix(".NEF"))
-    with pytest.raises(DataError, match=r"images: .*\.NEF is a RAW file, which is not supported; convert"):
-        load_scene(tmp_path)
+    scenes.refused(tmp_path / "raw", r"images: .*\.NEF is a RAW file, which is not supported; convert")
+    for data in (b"", b"P5 2 2 255 abcd", b"GIF89a" + bytes(20)):
+        refused(tmp_path, data, "it is (empty|not a JPEG, PNG, BMP, TIFF, WebP or AVIF file)")
