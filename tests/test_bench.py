@@ -23,16 +23,11 @@ from warpgs import rasterize
 from warpgs.kernels.ssim import ssim
 from warpgs.scene import Gaussians
 
-# The benches run and their arithmetic holds; how long things take is nobody's test.
-
 CPU = torch.device("cpu")
 
 
 def tiny(names: tuple[str, ...]) -> dict:
-    """A run over tiny sizes, as JSON, on a machine that is never too slow or busy: neither is what these tests are about.
-
-    One thread: torch's spin where cores are shared, and that takes longer than the work.
-    """
+    """A run over tiny sizes, as JSON, as if the machine were never slow or busy; on one thread, as torch's spin otherwise."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     with pytest.MonkeyPatch.context() as patch:
@@ -66,9 +61,7 @@ def test_every_op_gives_rows():
 
 def test_the_ops_of_the_page_are_those_of_its_results():
     """Names, sizes, programs and directions are those of the kept rows, so that old and new results compare."""
-    rows = [
-        r for r in result_file.stored("ops")["cpu2"]["rows"] if r["op"] in OPS
-    ]  # an op of its own, sh, became a part of others
+    rows = [r for r in result_file.stored("ops")["cpu2"]["rows"] if r["op"] in OPS]  # sh became a part of others
     assert set(DEFAULT) == {r["op"] for r in rows}
     for r in rows:
         op, image = OPS[r["op"]], {"width", "height"} <= r.keys()
@@ -76,15 +69,8 @@ def test_the_ops_of_the_page_are_those_of_its_results():
         assert ("N" in r, "degree" in r, "cameras" in r) == tuple(a in op.axes for a in ("count", "degree", "cameras"))
 
 
-def test_a_budget_of_nothing_skips_everything():
-    """All tasks are listed with the reason, none is measured."""
-    result = run(CPU, tiny=True, ops=("adam", "knn"), budget=0, echo=lambda line: None)
-    assert not result["rows"] and {s["op"] for s in result["skipped"]} == {"adam", "knn"}
-    assert all("no time is left" in s["reason"] for s in result["skipped"])
-
-
 def test_a_second_run_measures_only_what_the_first_lacks_or_what_was_disturbed(result):
-    """All rows stay as they are but the one that was taken out, and the one during which other programs kept cores busy."""
+    """All other rows stay as they are; a budget of nothing skips everything, with a reason."""
     busy = [r | {"others_cores": 2.0} if r["op"] == "knn" else r for r in result["rows"]]
     knn = sum(r["op"] == "knn" for r in busy)
     lacking = result | {"rows": [r for r in busy if (r["op"], r.get("N")) != ("adam", 100)]}
@@ -93,6 +79,9 @@ def test_a_second_run_measures_only_what_the_first_lacks_or_what_was_disturbed(r
     kept = [r for r in again["rows"] if r in result["rows"]]
     assert len(again["rows"]) == len(result["rows"]) and len(kept) == len(busy) - knn - 1
     assert again["roofline"] == result["roofline"] and len(lines) == 1 + 1 + knn
+    nothing = run(CPU, tiny=True, ops=("adam", "knn"), budget=0, echo=lambda line: None)
+    assert not nothing["rows"] and {s["op"] for s in nothing["skipped"]} == {"adam", "knn"}
+    assert all("no time is left" in s["reason"] for s in nothing["skipped"])
 
 
 def row(count: int, milliseconds: float, **more) -> dict:
@@ -100,8 +89,8 @@ def row(count: int, milliseconds: float, **more) -> dict:
     return {"op": "adam", "program": "warpgs", "direction": "forward", "N": count, "median_ms": milliseconds, **more}
 
 
-def test_points_vary_one_axis_at_a_time_and_along_the_diagonal():
-    """No full cross product; the base point once; sizes as agreed for each device."""
+def test_points_vary_one_axis_at_a_time_and_along_the_diagonal(monkeypatch):
+    """No full cross product; growth is that of the axis that grows most; what took too long is not tried at larger sizes."""
     axes = ("count", "image", "degree", "cameras")
     for device, largest, widest in (("cpu", 10**6, 1920), ("cuda", 10**7, 7680)):
         found = points(axes, torch.device(device), tiny=False)
@@ -109,6 +98,20 @@ def test_points_vary_one_axis_at_a_time_and_along_the_diagonal():
         assert max(p.count for p in found) == largest and max(p.width for p in found) == widest
         assert {p.degree for p in found} == {0, 1, 2, 3} and {p.cameras for p in found} == {1, 4}
         assert sum(p.count != 100_000 and p.width != 504 for p in found) in (4, 5)
+    # linear in Gaussians and pixels; more threads make less work; nothing is said about smaller sizes
+    small, large = Point(1000, 10, 10).sizes(("count", "image")), Point(4000, 30, 30).sizes(("count", "image"))
+    assert growth(small, large) == 9
+    assert growth(large, small) is None
+    assert growth({"N": 5, "threads": 2}, {"N": 5, "threads": 1}) == 2
+    bench = Bench(CPU, 3, None, lambda line: None)
+    bench._stop("adam", "warpgs", "forward", {"N": 1000}, "took 3 s a repeat")
+    found = [bench._chosen("adam", Point(n), {"N": n}) for n in (100, 1000, 10_000)]
+    assert found == [{("warpgs", "forward")}, set(), set()] and len(bench.skipped) == 3
+    # work beyond the limit is left after the warm-up: two calls and no more
+    calls = []
+    monkeypatch.setattr(timing, "_timed", lambda work, device: (calls.append(1) or 3000.0, None))
+    (row,) = timing.measure_in_turn([lambda: None], CPU, limit_ms=2000.0)
+    assert row["warm_up_ms"] == 3000.0 and "median_ms" not in row and len(calls) == 2
 
 
 def test_disturbed_rows_are_known_and_give_way_to_faster_ones():
@@ -123,30 +126,6 @@ def test_disturbed_rows_are_known_and_give_way_to_faster_ones():
     bench._keep([row(100, 2.1, others_cores=0.0), row(100, 4.0, **peer, others_cores=0.0)])
     bench._keep([row(1000, 9.0, others_cores=0.0)])
     assert [r["median_ms"] for r in bench.rows] == [2.1, 4.0, 3.0, 4.0] and not bench.open("adam", {"N": 100})
-
-
-def test_what_took_too_long_is_not_tried_at_larger_sizes():
-    """Nor is anything where two sizes cannot be compared left out."""
-    bench = Bench(CPU, 3, None, lambda line: None)
-    bench._stop("adam", "warpgs", "forward", {"N": 1000}, "took 3 s a repeat")
-    found = [bench._chosen("adam", Point(n), {"N": n}) for n in (100, 1000, 10_000)]
-    assert found == [{("warpgs", "forward")}, set(), set()] and len(bench.skipped) == 3
-
-
-def test_work_beyond_the_limit_is_left_after_the_warm_up(monkeypatch):
-    """Two calls and no more."""
-    calls = []
-    monkeypatch.setattr(timing, "_timed", lambda work, device: (calls.append(1) or 3000.0, None))
-    (row,) = timing.measure_in_turn([lambda: None], CPU, limit_ms=2000.0)
-    assert row["warm_up_ms"] == 3000.0 and "median_ms" not in row and len(calls) == 2
-
-
-def test_growth_is_that_of_the_axis_that_grows_most():
-    """Linear in Gaussians and pixels; more threads make less work; nothing is said about smaller sizes."""
-    small, large = Point(1000, 10, 10).sizes(("count", "image")), Point(4000, 30, 30).sizes(("count", "image"))
-    assert growth(small, large) == 9
-    assert growth(large, small) is None
-    assert growth({"N": 5, "threads": 2}, {"N": 5, "threads": 1}) == 2
 
 
 def test_peers_draw_and_score_the_same():
@@ -193,16 +172,10 @@ def test_performance_tables_hold_the_results():
     assert svgs == performance_page.plots(json.loads(json.dumps(dict(reversed(results.items())))))
     assert set(svgs) == {"plots/a_pixels.svg", "plots/a_whole.svg", "plots/b_pixels.svg", "plots/b_whole.svg"}
     assert all(ElementTree.fromstring(svg).tag.endswith("svg") for svg in svgs.values())
-
-
-def test_a_mean_of_missing_values_is_nan():
-    """A table with a figure that one fit lacks is still written."""
+    # a table with a figure that one fit lacks is still written
     assert mean_sd([1.0, 2.0]) == "1.50 ± 0.71" and mean_sd([1.0]) == "1.00"
     assert mean_sd([1.0, math.nan]) == mean_sd([math.nan, math.nan]) == mean_sd([math.nan]) == "nan"
-
-
-def test_generated_parts_of_a_page_are_replaced_by_name():
-    """Text outside the marks stays; a missing part, and marks without one, are errors."""
+    # text outside the marks stays; a missing part, and marks without one, are errors
     page = "a\n<!-- x y: written by bench.document -->\nold\n<!-- end of x y -->\nb\n"
     assert pages.filled(page, {"x y": "new\n"}) == page.replace("old\n", "\nnew\n\n")
     for parts in ({}, {"x y": "", "z": ""}):
@@ -216,9 +189,6 @@ def test_pages_and_charts_are_those_of_the_kept_results():
     stale = [path for path, text in files.items() if (pages.DOCS / path).read_text("utf-8") != text]
     assert not stale, f"{', '.join(stale)} differ from bench/results: run python -m bench.document"
     assert {f"plots/{p.name}" for p in (pages.DOCS / "plots").glob("*.svg")} == {p for p in files if p.startswith("plots/")}
-
-
-# Programs of the suite run on tiny sizes, their peers agree, and the kept results are of one format.
 
 
 def test_everything_that_can_be_run_is_listed(capsys, monkeypatch):

@@ -51,8 +51,6 @@ from warpgs.poses import mapping
 from warpgs.process import ProcessFailed
 from warpgs.report.overview import remedy_for, run_pyvista
 
-# A file appears whole or not at all, however its writing ends, and nothing in the package writes any other way.
-
 ROOT = Path(__file__).parent.parent
 LEFT = ".warpgs-0123456789abcdef.tmp"
 
@@ -159,7 +157,8 @@ def test_a_folder_that_cannot_be_synced(tmp_path, monkeypatch):
     assert (tmp_path / "a").read_bytes() == b"2"
 
 
-def test_a_folder_with_nothing_but_our_own_leftovers_is_empty(tmp_path):
+def test_only_own_names_are_leftovers_and_are_swept(tmp_path):
+    """Not what looks like it, nor through a link; a name of ours that is a link goes itself."""
     assert is_empty(tmp_path)
     for name in (LOCK, LEFT, LEFT + ".mp4"):
         (tmp_path / name).touch()
@@ -170,6 +169,20 @@ def test_a_folder_with_nothing_but_our_own_leftovers_is_empty(tmp_path):
         (tmp_path / name).unlink()
     with pytest.raises(ResourceError, match="cannot be read"):
         is_empty(tmp_path / "none")
+    for name in (LOCK, LEFT, LEFT + ".mp4"):
+        (tmp_path / name).unlink()
+    hexes = "0123456789abcdef"
+    (tmp_path / "kept").mkdir()
+    (tmp_path / "kept" / "file").touch()
+    for name in (f"warpgs-{hexes}", f"warpgs-{hexes}.txt", f".warpgs-{hexes[1:]}.tmp", "warpgs-error-x.txt"):
+        (tmp_path / name).mkdir()
+    kept = {p.name for p in tmp_path.iterdir()}
+    (tmp_path / f".warpgs-{hexes}.tmp" / "below").mkdir(parents=True)
+    (tmp_path / f"warpgs-{hexes}.tmp.mp4").touch()
+    (tmp_path / f"warpgs-{hexes}.tmp.lock").touch()
+    (tmp_path / f"warpgs-{hexes}.tmp").symlink_to("kept", target_is_directory=True)
+    remove_leftovers(tmp_path)
+    assert {p.name for p in tmp_path.iterdir()} == kept and (tmp_path / "kept" / "file").exists()
 
 
 def test_a_folder_appears_whole_or_not_at_all(tmp_path, monkeypatch):
@@ -248,16 +261,13 @@ def writers(tree: ast.AST) -> set[str]:
 
 
 def test_nothing_writes_past_the_one_way():
-    """Whatever writes a file is `warpgs.files`, or stands in the list above with its reason; and the list is true."""
+    """Whatever writes a file is `warpgs.files`, or is listed above with its reason; the list is true, and writers are seen."""
     found = set()
     for path in sorted((ROOT / "warpgs").rglob("*.py")):
         name = path.relative_to(ROOT / "warpgs").as_posix()
         found |= {(name, call) for call in writers(ast.parse(path.read_text("utf-8")))}
     assert found - ELSEWHERE.keys() == set(), "write it with warpgs.files"
     assert ELSEWHERE.keys() - found == set(), "no longer there"
-
-
-def test_writers_are_seen():
     for code in ("open(p, 'w')", "p.write_text('')", "cv2.imwrite(p, i)", "os.open(p, 1)", "open(p, mode='r+b')"):
         assert writers(ast.parse(code)), code
     assert not writers(ast.parse("open(p); p.open('rb'); write_bytes(p, b''); os.replace(a, b); Image.open(p); model.load(p)"))
@@ -265,10 +275,7 @@ def test_writers_are_seen():
 
 @pytest.mark.fault
 def test_commands_put_every_file_in_place_as_a_whole(tmp_path):
-    """Python's own record of what is opened and renamed: each file that is there at the end was put there under a name of ours.
-
-    That holds for files that libraries in C write past Python, too, as they cannot be there without having been renamed.
-    """
+    """By Python's record of what is opened and renamed: each file that is there was put there under a name of ours."""
     code = (ROOT / "tests" / "audited_commands.py").read_text("utf-8")
     environment = os.environ | {"PYTHONPATH": str(ROOT), "WARPGS_CACHE": str(tmp_path / "cache"), "CUDA_VISIBLE_DEVICES": ""}
     done = subprocess.run(
@@ -278,8 +285,7 @@ def test_commands_put_every_file_in_place_as_a_whole(tmp_path):
     assert done.stdout.splitlines()[-1] == "every file was put in place as a whole"
 
 
-# One function opens every input file: pipes, devices and folders are refused before a byte is read, and sizes are
-# bounded.
+# One function opens every input file: pipes, devices and folders are refused before a byte is read; sizes are bounded.
 
 
 def special(kind, path):
@@ -347,16 +353,6 @@ def test_sizes_are_bounded_before_and_while_reading(tmp_path, monkeypatch):
 # Below a folder of results no link is followed, neither to write nor to read; the folder itself may be a link.
 
 with_links = pytest.mark.skipif(os.name == "nt", reason="links need a right that users of Windows often lack")
-WAYS = {
-    "write": lambda p: write_bytes(p / "canary", b"new"),
-    "replace": lambda p: _replace(p / "canary"),
-    "append": lambda p: appending(p / "canary").close(),
-    "make": lambda p: make_folder(p / "below"),
-    "fill": lambda p: _fill(p / "below"),
-    "remove": lambda p: remove_file(p / "canary"),
-    "move": lambda p: move_folder(p / "folder", "moved"),
-    "read": lambda p: open_input(p / "canary", p).close(),
-}
 
 
 def _replace(path):
@@ -367,6 +363,18 @@ def _replace(path):
 def _fill(path):
     with filling(path) as temporary:
         (temporary / "x").touch()
+
+
+WAYS = {
+    "write": lambda p: write_bytes(p / "canary", b"new"),
+    "replace": lambda p: _replace(p / "canary"),
+    "append": lambda p: appending(p / "canary").close(),
+    "make": lambda p: make_folder(p / "below"),
+    "fill": lambda p: _fill(p / "below"),
+    "remove": lambda p: remove_file(p / "canary"),
+    "move": lambda p: move_folder(p / "folder", "moved"),
+    "read": lambda p: open_input(p / "canary", p).close(),
+}
 
 
 @pytest.fixture
@@ -525,11 +533,11 @@ def places(tmp_path, monkeypatch):
     folders.sweep_temporary_files.cache_clear()
 
 
-def started(code, *words):
+def started(code, *words, stdin=subprocess.PIPE):
     """Start Python, and wait for its first line."""
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
     words = [sys.executable, "-c", code, *map(str, words)]
-    process = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment)
+    process = subprocess.Popen(words, stdin=stdin, stdout=subprocess.PIPE, text=True, env=environment)
     assert process.stdout.readline()
     return process
 
@@ -555,9 +563,7 @@ def test_a_folder_is_held_until_the_last_process_in_it_has_ended(places):
     """A child that works in it may outlive its parent for a moment."""
     _, system = places
     read, write = os.pipe()
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
-    with subprocess.Popen([sys.executable, "-c", ORPHAN], stdin=read, stdout=subprocess.PIPE, env=environment) as process:
-        process.stdout.readline()
+    with started(ORPHAN, stdin=read) as process:
         process.kill()
     (lock,) = system.glob("*.lock")
     with open_folder(system) as folder:
@@ -569,22 +575,6 @@ def test_a_folder_is_held_until_the_last_process_in_it_has_ended(places):
             folders.lock_descriptor(file.fileno())  # waits for it
         sweep(folder)
     assert not list(system.iterdir())
-
-
-def test_only_own_names_are_swept(tmp_path):
-    """Not what looks like it, nor through a link; a name of ours that is a link goes itself."""
-    hexes = "0123456789abcdef"
-    (tmp_path / "kept").mkdir()
-    (tmp_path / "kept" / "file").touch()
-    for name in (f"warpgs-{hexes}", f"warpgs-{hexes}.txt", f".warpgs-{hexes[1:]}.tmp", "warpgs-error-x.txt"):
-        (tmp_path / name).mkdir()
-    kept = {p.name for p in tmp_path.iterdir()}
-    (tmp_path / f".warpgs-{hexes}.tmp" / "below").mkdir(parents=True)
-    (tmp_path / f"warpgs-{hexes}.tmp.mp4").touch()
-    (tmp_path / f"warpgs-{hexes}.tmp.lock").touch()
-    (tmp_path / f"warpgs-{hexes}.tmp").symlink_to("kept", target_is_directory=True)
-    remove_leftovers(tmp_path)
-    assert {p.name for p in tmp_path.iterdir()} == kept and (tmp_path / "kept" / "file").exists()
 
 
 @pytest.mark.skipif(not hasattr(os, "getuid") or os.getuid() != 0, reason="only root can give files to another user")
@@ -657,7 +647,7 @@ def test_the_system_s_folder_is_found_without_writing(tmp_path, monkeypatch):
 FULL = f"[Errno {errno.ENOSPC}] {os.strerror(errno.ENOSPC)}"
 
 
-def test_words_and_room(tmp_path, monkeypatch):
+def test_a_full_disk_is_known_by_words_room_and_renderer(tmp_path, monkeypatch):
     assert disk_is_full(tmp_path, f"OSError: {FULL}: 'a.png'") and not disk_is_full(tmp_path, "Segmentation fault")
     with pytest.raises(sqlite3.OperationalError) as e:
         database = sqlite3.connect(tmp_path / "a.db")
@@ -667,6 +657,10 @@ def test_words_and_room(tmp_path, monkeypatch):
     assert disk_is_full(tmp_path, str(e.value))
     monkeypatch.setattr(files, "MIN_FREE", 2**80)
     assert disk_is_full(tmp_path, "") and not disk_is_full(tmp_path / "none", "")
+    monkeypatch.undo()
+    works, why = run_pyvista(f"import os; raise OSError({errno.ENOSPC}, os.strerror({errno.ENOSPC}))")
+    assert not works and remedy_for(why).startswith("free some disk space for temporary files in ")
+    assert "renderer" in remedy_for(run_pyvista("raise SystemExit(3)")[1])
 
 
 @pytest.mark.parametrize(("said", "words"), [(FULL, "its disk is full"), ("killed", "too little memory")])
@@ -683,12 +677,6 @@ def test_poses(tmp_path, monkeypatch, said, words):
     assert (str(e.value).startswith(f"{tmp_path}: ")) == (said == FULL)
 
 
-def test_a_renderer():
-    works, why = run_pyvista(f"import os; raise OSError({errno.ENOSPC}, os.strerror({errno.ENOSPC}))")
-    assert not works and remedy_for(why).startswith("free some disk space for temporary files in ")
-    assert "renderer" in remedy_for(run_pyvista("raise SystemExit(3)")[1])
-
-
 @pytest.mark.fault
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="no Linux mount")
 @pytest.mark.parametrize("command", ["poses", "plot"])
@@ -702,9 +690,8 @@ def test_real_disks(tmp_path, command):
         pytest.skip("this user cannot mount")
     try:
         program = [sys.executable, "-P", "-m", "warpgs"]
-        subprocess.run(
-            [*program, "demo", str(files / "scene"), "--views", "8", "--width", "320", "--height", "240"], check=True
-        )
+        size = ["--views", "8", "--width", "320", "--height", "240"]
+        subprocess.run([*program, "demo", str(files / "scene"), *size], check=True)
         words = ["poses", str(files / "scene" / "images"), "--out", str(disk / "scene")]
         environment = dict(os.environ)
         if command == "plot":

@@ -83,21 +83,18 @@ def test_any_number_of_processes_fits_the_same_model(tmp_path, capsys, first, th
         assert f'"ranks": {count}' in (tmp_path / run / "metrics.json").read_text()
 
 
-@pytest.mark.parametrize(("name", "value"), [("RANK", "2"), ("RANK", "-1"), ("WORLD_SIZE", "two"), ("MASTER_PORT", "")])
-def test_variables_that_are_no_numbers_are_named(monkeypatch, name, value):
-    for key, usual in (("RANK", "0"), ("WORLD_SIZE", "2"), ("LOCAL_RANK", "0"), ("MASTER_PORT", "29500")):
-        monkeypatch.setenv(key, usual)
-    monkeypatch.setenv(name, value)
-    with pytest.raises(UsageError, match=f"the environment variable {name} must be"):
-        ranks.join("cpu")
-
-
-def test_a_process_alone_joins_nobody(monkeypatch):
+def test_variables_that_are_no_numbers_are_named_and_a_process_alone_joins_nobody(monkeypatch):
     monkeypatch.delenv("RANK", raising=False)
     assert ranks.join("cpu") is ranks.ALONE and ranks.ALONE.first
     for key, value in (("RANK", "0"), ("WORLD_SIZE", "1")):
         monkeypatch.setenv(key, value)
     assert ranks.join("cpu") is ranks.ALONE
+    for name, value in (("RANK", "2"), ("RANK", "-1"), ("WORLD_SIZE", "two"), ("MASTER_PORT", "")):
+        usual = {"RANK": "0", "WORLD_SIZE": "2", "LOCAL_RANK": "0", "MASTER_PORT": "29500"}
+        for key, set_to in (usual | {name: value}).items():
+            monkeypatch.setenv(key, set_to)
+        with pytest.raises(UsageError, match=f"the environment variable {name} must be"):
+            ranks.join("cpu")
 
 
 class Store(dict):
@@ -112,12 +109,10 @@ class Store(dict):
         return self[key]
 
 
-def test_silence_of_another_machine_is_a_loss_after_a_while(monkeypatch, capsys):
+def test_silence_of_another_machine_is_a_loss_after_a_while(unwatched, monkeypatch, capsys):
     """Not at once, nor where the process has said goodbye; and of two that find it one alone says so."""
     now = [100.0]
     monkeypatch.setattr(ranks.time, "monotonic", lambda: now[0])
-    monkeypatch.setattr(ranks.time, "sleep", lambda seconds: None)
-    monkeypatch.setattr(ranks.threading.Thread, "start", lambda self: None)
     store = Store()
     first, second = (ranks.RankWatch(rank, 3, store, store) for rank in (0, 1))
     assert not first.is_lost(2)  # it is still to come
@@ -151,6 +146,11 @@ def test_the_first_rank_keeps_the_store_until_all_have_read_the_error(unwatched,
         with pytest.raises(SystemExit):
             ranks.RankWatch(rank, 3, store, store)._watch()
         assert unwatched == waits
+    store = Store()  # all ranks read the texts of all
+    watches = [ranks.RankWatch(rank, 3, store, store) for rank in range(3)]
+    for rank in (1, 2):
+        store.set(f"text/{rank}", f"of {rank}")
+    assert watches[0].texts("of 0") == ["of 0", "of 1", "of 2"] and ranks.ALONE.texts("own") == ["own"]
 
 
 def test_the_lowest_rank_of_a_machine_reports_the_loss_of_the_store(unwatched, monkeypatch, capsys):
@@ -174,14 +174,6 @@ def test_the_lowest_rank_of_a_machine_reports_the_loss_of_the_store(unwatched, m
         watch.fail("warpgs: rank 0 is gone")
         assert len(capsys.readouterr().err.splitlines()) == printed
         assert len(unwatched) == printed  # it stays while the others look for it
-
-
-def test_all_ranks_read_the_texts_of_all(unwatched):
-    store = Store()
-    watches = [ranks.RankWatch(rank, 3, store, store) for rank in range(3)]
-    for rank in (1, 2):
-        store.set(f"text/{rank}", f"of {rank}")
-    assert watches[0].texts("of 0") == ["of 0", "of 1", "of 2"] and ranks.ALONE.texts("own") == ["own"]
 
 
 class Two(ranks.Ranks):
@@ -217,15 +209,7 @@ def test_the_error_of_a_rank_is_printed_whole(monkeypatch):
     assert handlers == [signal.SIG_IGN]
 
 
-def test_a_machine_has_a_name_on_every_system(monkeypatch):
-    def none(*_):
-        raise FileNotFoundError
-
-    monkeypatch.setattr(ranks.Path, "read_text", none)
-    assert ranks.machine() == ranks.platform.node()
-
-
-def test_the_end_of_a_process_is_seen():
+def test_the_end_of_a_process_is_seen(monkeypatch):
     """This one is there, and one that has ended is gone, also while its parent has not asked."""
     ended = subprocess.Popen([sys.executable, "-c", ""])
     if hasattr(os, "waitid"):
@@ -234,6 +218,12 @@ def test_the_end_of_a_process_is_seen():
         ended.wait()
     assert ranks.is_gone(ended.pid) and not ranks.is_gone(os.getpid())
     ended.wait()
+
+    def none(*_):
+        raise FileNotFoundError
+
+    monkeypatch.setattr(ranks.Path, "read_text", none)  # every system has a name
+    assert ranks.machine() == ranks.platform.node()
 
 
 LISTENING = """

@@ -16,7 +16,7 @@ from tests.faults.format_targets import zip_member
 from tests.faults.image_targets import png_checksums, png_rows
 from tests.faults.model_targets import SMALL, onnx_field, run_files, tensors_body, tensors_header
 from tests.faults.mutations import Change, json_value, many_rows, rarely, text_line, text_number, zip_bomb
-from tests.faults.targets import Target, not_finite, register
+from tests.faults.targets import Target, not_finite, register, writing
 from tests.priors import networks as nw
 from warpgs import locks, onnx, schema
 from warpgs.app import farm as farm_command
@@ -101,9 +101,7 @@ LINES = (
 )  # fmt: skip
 
 
-def job_files(root: Path) -> list[Path]:
-    (root / "jobs.jsonl").write_text("".join(json.dumps(line) + "\n" for line in LINES), "utf-8")
-    return [root / "jobs.jsonl"]
+job_files = writing({"jobs.jsonl": "".join(json.dumps(line) + "\n" for line in LINES).encode()})
 
 
 def one_line(change: Change) -> Change:
@@ -186,10 +184,8 @@ EVENTS = (progress.read_events, progress.EventLog.rewind)
 register(Target("events", event_files, events_of, EVENTS, LINE_CHANGES, nonsense=events_nonsense, lines=0.75))
 
 
-def lock_files(root: Path) -> list[Path]:
-    values = {"process": 7, "host": "machine", "since": "2024-01-01 10:00", "command": "warpgs fit scene"}
-    (root / "lock").write_bytes(b"\n" + json.dumps(values).encode())
-    return [root / "lock"]
+SIGNATURE = {"process": 7, "host": "machine", "since": "2024-01-01 10:00", "command": "warpgs fit scene"}
+LOCK = {"lock": b"\n" + json.dumps(SIGNATURE).encode()}
 
 
 def holder(root: Path, path: Path) -> str | None:
@@ -197,7 +193,7 @@ def holder(root: Path, path: Path) -> str | None:
     return locks._signed(data[1:])
 
 
-register(Target("signature of a lock", lock_files, holder, (locks._signed,), (one_line(json_value), text_number)))
+register(Target("signature of a lock", writing(LOCK), holder, (locks._signed,), (one_line(json_value), text_number)))
 
 # ---- runs --------------------------------------------------------------------------------------------------------------
 
@@ -230,11 +226,6 @@ noise-lr = 1e4
 """
 
 
-def preset_file(root: Path) -> list[Path]:
-    (root / "my.toml").write_text(PRESET, "utf-8")
-    return [root / "my.toml"]
-
-
 def settings_of_preset(root: Path, path: Path) -> FitConfig:
     config, origin = presets.preset_settings(path)
     assert config.preset == path.name and str(path) in origin
@@ -242,7 +233,7 @@ def settings_of_preset(root: Path, path: Path) -> FitConfig:
 
 
 PRESET_PARSER = (presets._read, presets._config_of_file, presets._config_of, settings.with_settings, settings._typed)
-register(Target("preset", preset_file, settings_of_preset, PRESET_PARSER, LINE_CHANGES, lines=0.7))
+register(Target("preset", writing({"my.toml": PRESET.encode()}), settings_of_preset, PRESET_PARSER, LINE_CHANGES, lines=0.7))
 
 # ---- images of a run ---------------------------------------------------------------------------------------------------
 
@@ -317,24 +308,17 @@ register(
 # ---- networks in onnxruntime -------------------------------------------------------------------------------------------
 
 
-def network_files(root: Path) -> list[Path]:
-    for layout in ("nchw", "nhwc"):
-        (root / f"{layout}.onnx").write_bytes(nw.linear(np.eye(3), np.zeros(3), layout=layout))
-    return sorted(root.glob("*.onnx"))
-
-
+LINEAR = {f"{layout}.onnx": nw.linear(np.eye(3), np.zeros(3), layout=layout) for layout in ("nchw", "nhwc")}
 NETWORK = (networks.Network.__init__, onnx.Model.__init__, onnx.start_session, onnx.read_model)
 register(
     Target(
-        "network", network_files, lambda root, path: networks.Network(path, threads=1), NETWORK,
+        "network", writing(LINEAR), lambda root, path: networks.Network(path, threads=1), NETWORK,
         (onnx_field, onnx_field, onnx_field), lines=0.7, share=0.3,
     )
 )  # fmt: skip
 
 
-def matcher_files(root: Path) -> list[Path]:
-    (root / "matcher.onnx").write_bytes(nw.matcher(np.array([[3.0, 4.0]]), np.ones(1), np.array([[0.6, 0.8]])))
-    return [root / "matcher.onnx"]
+MATCHER = {"matcher.onnx": nw.matcher(np.array([[3.0, 4.0]]), np.ones(1), np.array([[0.6, 0.8]]))}
 
 
 def matched(root: Path, path: Path) -> matching.Features:
@@ -349,7 +333,7 @@ def matcher_nonsense(found: matching.Features) -> str:
 
 register(
     Target(
-        "matcher", matcher_files, matched, (matching.Matcher.__init__, matching.Matcher.features, matching.Matcher._check),
+        "matcher", writing(MATCHER), matched, (matching.Matcher.__init__, matching.Matcher.features, matching.Matcher._check),
         (onnx_field, onnx_field, onnx_field), nonsense=matcher_nonsense, lines=0.6, share=0.2,
     )
 )  # fmt: skip

@@ -31,13 +31,11 @@ from tests.faults.tiny_runs import (
 from warpgs.files import LOCK, OWN_NAMES
 from warpgs.pipeline.run.export import export
 
-# Commands that die before one of their calls: nothing is lost, nothing is half, and the next command goes on from
-# there.
+# Commands that die before one of their calls: nothing is lost, nothing is half, and the next command goes on from there.
 #
-# A process kills itself before a call of a known number, so that no clock decides where it dies. `make test-fault`
-# kills one fit; WARPGS_KILLS=200 spreads that many kills over all of them, those between the opening of a file and its
-# removal first. What each kill came before is a property of its test in pytest's `--junit-xml` (`-o
-# junit_family=xunit1`).
+# A process kills itself before a call of a known number, so that no clock decides where it dies. `make test-fault` kills one;
+# WARPGS_KILLS=200 spreads that many kills over all, those between the opening of a file and its removal first. What each kill
+# came before is a property of its test in pytest's `--junit-xml` (`-o junit_family=xunit1`).
 
 pytestmark = pytest.mark.fault
 KILLS = int(os.environ.get("WARPGS_KILLS", "0"))
@@ -138,20 +136,16 @@ def test_calls_are_seen(reference):
     for command, calls in reference.calls.items():
         replaced = {path for kind, path, _ in calls if kind == "replace"}
         assert sum(kind == "fsync" for kind, _, _ in calls) >= len(replaced) > 0, command
-
-
-def test_a_checkpoint_comes_after_the_images_of_events_before_it(reference):
-    """A fit that goes on from it does not write them."""
+    # a checkpoint comes after the images of events before it: a fit that goes on from it does not write them
     placed = [Path(path).name for kind, path, _ in reference.calls["fit"] if kind == "replace"]
     checkpoints = [i for i, name in enumerate(placed) if name == "checkpoint.safetensors"]
     for event in (n for n in placed if n.startswith("0000")):
         assert placed.index(event) < checkpoints[int(event[:6]) // 10], placed
 
 
-# Two commands that want one folder at the same time: one gets it, the other says whose it is, and nothing is mixed.
-#
-# Both processes are ready before either may go, and who has got the folder waits at its first step until the other has
-# ended: no clock decides anything. `make test-fault` runs one such pair, WARPGS_KILLS=200 twenty.
+# Two commands that want one folder at the same time: one gets it, the other says whose it is, nothing is mixed. Both are ready
+# before either may go, and who has got the folder waits at its first step until the other has ended: no clock decides anything.
+# `make test-fault` runs one such pair, WARPGS_KILLS=200 twenty.
 
 RACES = max(1, int(os.environ.get("WARPGS_KILLS", "0")) // 10)
 PAIRS = (("fit", "fit"), ("resume", "resume"), ("fit", "resume"))

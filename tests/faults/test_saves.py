@@ -43,11 +43,8 @@ from warpgs.report.film import write_film
 from warpgs.report.progress import EventLog
 from warpgs.synthetic.demo import split_spec
 
-# A fault at every call of every way of saving: an error of ours, nothing lost, nothing left over, and the next time it
-# works.
-#
-# Every call is numbered once; then each fails in turn, in each of the ways below, and the same is saved again without a
-# fault.
+# A fault at every call of every way of saving: an error of ours, nothing lost, nothing left over, and the next time it works.
+# Every call is numbered once; then each fails in turn, in each of the ways below, and the same is saved again without a fault.
 
 pytestmark = pytest.mark.fault
 MANY = int(os.environ.get("WARPGS_KILLS", "0")) >= 100
@@ -259,10 +256,8 @@ def assert_saved(work: Path, new: Path, what: str = "", left: bool = False) -> N
             assert torch.equal(*found), what
 
 
-# Real disks that are full, have no room for names, cannot be written, or whose folders go away.
-#
-# They are small file systems in memory, which only root of a Linux machine may mount; elsewhere their tests are
-# skipped. `make test-fault` tries one size of each kind, WARPGS_KILLS=200 all.
+# Real disks that are full, have no room for names, cannot be written, or whose folders go away: small file systems in memory,
+# which only root of a Linux machine may mount. `make test-fault` tries one size of each kind, WARPGS_KILLS=200 all.
 
 KIB = 1024
 
@@ -270,11 +265,6 @@ KIB = 1024
 def sizes(*values: int) -> tuple[int, ...]:
     """Return all values, or the middle one."""
     return values if MANY else values[len(values) // 2 :][:1]
-
-
-def mount(*words: str) -> str:
-    """Call mount; returns what it says if it fails."""
-    return subprocess.run(["mount", *words], capture_output=True, text=True, check=False).stderr
 
 
 @pytest.fixture
@@ -287,19 +277,14 @@ def disk(tmp_path) -> Iterator[Callable[[str], Path]]:
 
     def mounted(options: str) -> Path:
         again = "remount," if os.path.ismount(folder) else ""
-        refused = mount("-t", "tmpfs", "-o", again + options, "tmpfs", str(folder))
-        if refused:
+        words = ["mount", "-t", "tmpfs", "-o", again + options, "tmpfs", str(folder)]
+        if refused := subprocess.run(words, capture_output=True, text=True, check=False).stderr:
             pytest.skip(f"mount: {refused.strip()}")
         return folder
 
     yield mounted
     if os.path.ismount(folder):
         subprocess.run(["umount", "-l", str(folder)], check=True)
-
-
-def used(folder: Path) -> int:
-    """Bytes taken on the disk of a folder."""
-    return shutil.disk_usage(folder).used
 
 
 def check_refused(work: Path, before: dict[str, str], said: str) -> None:
@@ -319,13 +304,8 @@ def check_right(reference, command: str, work: Path, before: dict[str, str]) -> 
         elif path.endswith(SAME_BYTES) and path != "run/checkpoint.safetensors":  # it holds notes on images that did not fit
             assert digest == reference.after[command][path], path
     if command == "fit":
-        check_tensors(reference.folder / "finished" / "run", work / "run")
-
-
-def check_tensors(wanted: Path, found: Path) -> None:
-    """Two checkpoints hold the same numbers."""
-    (a, _), (b, _) = load_checkpoint(wanted), load_checkpoint(found)
-    assert a.keys() == b.keys() and all(torch.equal(a[n], b[n]) for n in a)
+        a, b = (load_checkpoint(folder / "run")[0] for folder in (reference.folder / "finished", work))
+        assert a.keys() == b.keys() and all(torch.equal(a[n], b[n]) for n in a)
 
 
 def check_command(reference, command, work, before, capfd, make_room):
@@ -348,7 +328,7 @@ def test_a_disk_that_fills(reference, disk, capfd, command, room):
     work = disk("size=64m") / "work"
     reference.before(command, work)
     before = digests(work)
-    disk(f"size={max(used(work) + room, 4 * KIB)}")
+    disk(f"size={max(shutil.disk_usage(work).used + room, 4 * KIB)}")
     check_command(reference, command, work, before, capfd, lambda: disk("size=64m"))
 
 

@@ -49,8 +49,6 @@ from warpgs.pipeline.run.folder import METRICS_FILE, StoredRun
 from warpgs.render.options import RasterizeOptions
 from warpgs.scene import Camera, Gaussians, Mesh, Normalization
 
-# A ball of Gaussians becomes a mesh of a ball: place, colours, open backs, files in the units of the scene's files.
-
 RENDER = RasterizeOptions()
 
 
@@ -197,27 +195,24 @@ def stored(monkeypatch, tmp_path_factory):
 
 
 def test_the_command_writes_in_units_of_the_files(stored, tmp_path, capsys):
+    """A box is six numbers, as of `warpgs export`; with holes filled."""
     assert main(["mesh", "run", "--out", str(tmp_path / "a.ply"), "--voxel", "0.16", "--device", "cpu"]) == 0
     text = capsys.readouterr().out
     assert text.index("voxel 0.16 units of the scene's files") < text.index("fusing depth: view 1 of 9")
     assert "was not observed by the 9 training views" in text and "triangles extracted" in text
-    head, body = (tmp_path / "a.ply").read_bytes().split(b"end_header\n", 1)
-    count = int(head.split(b"element vertex ")[1].split()[0])
-    vertices = np.frombuffer(body, [("x", "<f4", 3), ("c", "u1", 3)], count)["x"]
-    away = (vertices - [10, 20, 30]) * 0.5 - CENTER
+
+    def vertices():
+        head, body = (tmp_path / "a.ply").read_bytes().split(b"end_header\n", 1)
+        return np.frombuffer(body, [("x", "<f4", 3), ("c", "u1", 3)], int(head.split(b"element vertex ")[1].split()[0]))["x"]
+
+    away = (vertices() - [10, 20, 30]) * 0.5 - CENTER
     assert np.abs(np.linalg.norm(away, axis=1) - RADIUS).mean() < 0.05
     assert sorted(p.name for p in tmp_path.iterdir() if not p.name.startswith(".")) == ["a.ply"]
-
-
-def test_the_command_crops_in_units_of_the_files(stored, tmp_path, capsys):
-    """A box of six numbers, as of `warpgs export`; both flags in one call."""
     low, high = (np.array([10, 20, 30]) + (CENTER + s) / 0.5 for s in ([-2, -2, -2], [0, 2, 2]))
     words = ["--crop", ",".join(f"{v:g}" for v in (*low, *high)), "--fill-holes", "--voxel", "0.16", "--device", "cpu"]
     assert main(["mesh", "run", "--out", str(tmp_path / "a.glb"), *words]) == 0
     assert main(["mesh", "run", "--out", str(tmp_path / "a.ply"), *words]) == 0
-    head, body = (tmp_path / "a.ply").read_bytes().split(b"end_header\n", 1)
-    vertices = np.frombuffer(body, [("x", "<f4", 3), ("c", "u1", 3)], int(head.split(b"element vertex ")[1].split()[0]))["x"]
-    assert len(vertices) > 100 and (vertices >= low).all() and (vertices <= high).all()
+    assert len(vertices()) > 100 and (vertices() >= low).all() and (vertices() <= high).all()
     assert b"TEXCOORD_0" in (tmp_path / "a.glb").read_bytes()
 
 
@@ -276,19 +271,14 @@ def test_a_voxel_is_what_is_asked_for():
     assert (high < [3.6, 1.2, 11.2]).all() and (high >= [0.98, 0.49, 5.9]).all()
 
 
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        ({"voxel": 0.0}, "above 0"), ({"voxel": float("nan")}, "above 0"), ({"voxel": 1e-9}, "at least a millionth"),
+def test_grids_that_make_no_sense_or_do_not_fit_are_refused(monkeypatch):
+    nan = float("nan")
+    for options, words in (
+        ({"voxel": 0.0}, "above 0"), ({"voxel": nan}, "above 0"), ({"voxel": 1e-9}, "at least a millionth"),
         ({"voxel": 1.0, "resolution": 9}, "one of them"), ({"resolution": 7}, "8, 4096"), ({"resolution": 4097}, "8, 4096"),
-    ],
-)  # fmt: skip
-def test_what_makes_no_grid_is_refused(options, words):
-    with pytest.raises(UsageError, match=words):
-        plan_grid(points(), np.full(20_000, 1e-4), MeshOptions(**options).voxel)
-
-
-def test_a_grid_that_does_not_fit_is_refused(monkeypatch):
+    ):  # fmt: skip
+        with pytest.raises(UsageError, match=words):
+            plan_grid(points(), np.full(20_000, 1e-4), MeshOptions(**options).voxel)
     plan = GridPlan((0, 0, 0), 1.0, (1000, 1000, 100), 1.0)
     monkeypatch.setattr(fusing, "available_bytes", lambda _: 3 * 10**9)
     assert check_memory(plan, CPU) == "2.0 GiB"
@@ -333,7 +323,7 @@ def test_a_sphere_is_closed_and_faces_outwards():
     assert mesh.faces.dtype == np.int32 and mesh.colors.shape == mesh.vertices.shape
 
 
-def test_what_was_not_seen_stays_open():
+def test_what_was_not_seen_stays_open_without_skirts_and_small_parts_go():
     mesh = extract(*grid_of(sphere, lambda x: x[..., 0] < 0.33))
     assert 0.2 < mesh.vertices[:, 0].max() < 0.33
     _, normals, middles = areas_and_normals(mesh)
@@ -342,14 +332,10 @@ def test_what_was_not_seen_stays_open():
     for limit in (9, 1.2):  # nothing seen at all, and nothing but emptiness
         with pytest.raises(DataError, match="no surface inside the grid"):
             extract(*grid_of(sphere, lambda x, limit=limit: x[..., 0] > limit))
-
-
-def test_no_skirt_between_two_surfaces():
+    # no skirt between two surfaces
     mesh = extract(*grid_of(lambda x: np.where(x[..., 0] < 0.05, x[..., 2] + 0.53, x[..., 2] - 0.53)))
     assert (np.abs(np.abs(mesh.vertices[:, 2]) - 0.53) < 1.2 * VOXEL).all() and parts(mesh)[0] == 2
-
-
-def test_small_parts_go():
+    # small parts go
     alone = extract(*grid_of(sphere))
     both = extract(*grid_of(lambda x: np.minimum(sphere(x), np.linalg.norm(x - [1.2, 1.1, 1.3], axis=-1) - 0.12)))
     assert parts(both)[0] == 2
@@ -415,9 +401,7 @@ def test_thinned_maps_say_the_same(monkeypatch):
     assert thin[2] == 3 and thin[1].shape == (11, 16) and torch.equal(thin[1], other.depth[1::3, 1::3])
     assert torch.equal(agreed(view, [thin]).depth, view.depth)
     assert not bool(agreed(dataclasses.replace(view, depth=view.depth * 1.1), [thin]).depth[:, 8:].any())
-
-
-def test_neighbours_share_sight(monkeypatch):
+    # neighbours share sight
     maps = [depth_map(wall(x), 5) for x in (0.0, 0.5, 1.0, 1.5, 90.0)]
     monkeypatch.setattr(views, "NEIGHBOURS", 2)
     assert neighbours(maps)[0] == [1, 2] and sorted(neighbours(maps)[2]) == [1, 3]
@@ -464,9 +448,7 @@ def test_the_densest_point_of_a_ray():
             best = int(distance.argmin())
             if 0 < best < len(t) - 1:
                 assert float(found[p, i]) == pytest.approx(float(t[best]), abs=1e-3)
-
-
-def test_the_median_by_weight():
+    # the median by weight
     depths = torch.tensor([[3.0, 1.0, 2.0, 0.1], [5.0, 4.0, 9.0, 9.0], [7.0, 7.0, 7.0, 7.0]])
     weights = torch.tensor([[0.2, 0.2, 0.3, 0.0], [0.3, 0.2, 0.0, 0.0], [0.0, 0.0, 0.0, 0.0]])
     assert weighted_median(depths, weights).tolist() == [2.0, 5.0, 7.0]

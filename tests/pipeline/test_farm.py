@@ -48,8 +48,6 @@ from warpgs.pipeline.train.strategies.base import STRATEGIES
 from warpgs.process import run_python
 from warpgs.ranks import is_loopback, listeners
 
-# Farms: each job once, whatever dies, and the same bytes as single fits.
-
 
 @pytest.fixture(scope="module")
 def scenes(tmp_path_factory):
@@ -167,19 +165,6 @@ def test_a_rerun_skips_what_is_finished_and_valid(scenes, single, results, tmp_p
     assert (status.record.how, status.record.steps) == ("redone", 4) and (results / "s0" / "run.old1").is_dir()
 
 
-def test_links_that_double_a_scene_at_each_level_are_not_listed(tmp_path, monkeypatch):
-    """40 folders with two links each to the next would be a million million folders."""
-    monkeypatch.setattr(record, "MOST_FILES", 100)
-    for level in range(7):
-        (tmp_path / f"{level}").mkdir()
-        for name in "ab":
-            (tmp_path / f"{level}" / name).symlink_to(tmp_path / f"{level + 1}")
-    (tmp_path / "7").mkdir()
-    for level in ("0", "3"):
-        (tmp_path / level / "image.png").touch()
-    assert record.source_stamp(tmp_path / "3") and not record.source_stamp(tmp_path / "0")  # 31 folders, and 255
-
-
 def test_settings_that_follow_from_the_views_are_the_same_settings(scenes, tmp_path):
     """The record of a run has settings that were left open as chosen: the finished run is kept all the same."""
     (job, _) = jobs_of(scenes, tmp_path, half_resolution=None)
@@ -283,20 +268,15 @@ def test_a_class_of_a_preset_file_is_found_by_another_process(scenes, tmp_path, 
     assert STRATEGIES.find(found.request.config.strategy).__name__ == "Mine" and found.text() == text
 
 
-def test_a_job_as_text_is_the_same_job(scenes, tmp_path):
+def test_a_job_as_text_is_the_same_job(scenes, tmp_path, monkeypatch):
     (job, _) = jobs_of(scenes, tmp_path)
     assert job_of(job.text()) == job and job_of(job.text()).identity() == job.identity()
     elsewhere = replace(job, request=replace(job.request, device="cuda"))
     assert elsewhere.identity() != job.identity(), "photographs have another size on a GPU"
-
-
-def test_slots(monkeypatch):
-    """GPUs take turns, under the names that the user's own variable gives them."""
-    monkeypatch.setattr("torch.cuda.is_available", lambda: True)
-    monkeypatch.setattr("torch.cuda.device_count", lambda: 2)
-    monkeypatch.setattr("torch.cuda.current_device", lambda: 0)
-    monkeypatch.setattr("torch.cuda.get_device_name", lambda _: "a GPU")
-    monkeypatch.setattr("torch.get_num_threads", lambda: 8)
+    # GPUs take turns, under the names that the user's own variable gives them
+    torch = {"cuda.is_available": True, "cuda.device_count": 2, "cuda.current_device": 0, "cuda.get_device_name": "a GPU"}
+    for name, value in (torch | {"get_num_threads": 8}).items():
+        monkeypatch.setattr(f"torch.{name}", lambda *_, value=value: value)
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "3,5")
     with pytest.raises(UsageError, match="--slots and --per-gpu must be numbers from 1"):
         local_slots("cuda", 0, 2)
@@ -332,8 +312,6 @@ def test_engines_of_clusters_give_the_same_bytes(scenes, single, tmp_path, monke
     jobs = jobs_of(scenes, tmp_path / "out")
     killed = tmp_path / "killed"
     if kind == "ray":
-        from warpgs.pipeline.farm.ray import RayEngine
-
         if importlib.util.find_spec("ray") is None:  # what is imported before the engine listens at every interface
             pytest.skip("ray is not installed")
         engine = RayEngine("cpu", 2, 1)
@@ -386,8 +364,8 @@ def _die_once(mark):
 # What a farm is given: folders, globs, and files of jobs that anybody may have written.
 
 
-def test_folders_and_globs(tmp_path):
-    """Each folder is a scene, hidden ones are not; equal names are told apart by the folders above."""
+def test_folders_globs_and_lines_of_flags(tmp_path, monkeypatch):
+    """Folders are scenes, hidden ones are not; lines are flags, with paths from the file; links without end are not listed."""
     for name in ("b/scene", "a/scene", ".hidden"):
         (tmp_path / name).mkdir(parents=True)
     assert [j[:2] for j in list_jobs(str(tmp_path))] == [("a", tmp_path / "a"), ("b", tmp_path / "b")]
@@ -397,10 +375,7 @@ def test_folders_and_globs(tmp_path):
     write_scenes(tmp_path / "more", 1)
     with pytest.raises(UsageError, match="is a single scene: fit it with `warpgs fit`"):
         list_jobs(str(tmp_path / "more" / "s0"))
-
-
-def test_lines_are_flags_of_fit(tmp_path):
-    """Relative paths are from the file; booleans are switches, in groups too; the longest name is one of a folder."""
+    # relative paths are from the file; booleans are switches, in groups too; the longest name is one of a folder
     path, long = tmp_path / "jobs.jsonl", 66 * "写"
     line = '{"scene": "x", "steps": 5, "refine_poses": true, "method.pm": false}'
     path.write_text(f"{line}\n\n{json.dumps({'scene': '/y', 'name': long})}", "utf-8")
@@ -411,6 +386,16 @@ def test_lines_are_flags_of_fit(tmp_path):
     path.write_text('{"scene": "a/x"}\n{"scene": "b/X"}')
     with pytest.raises(UsageError, match=r"jobs\.jsonl: two jobs have the name 'X'"):
         list_jobs(str(path))
+    # 40 folders with two links each to the next would be a million million folders
+    monkeypatch.setattr(record, "MOST_FILES", 100)
+    levels = [tmp_path / f"{level}" for level in range(8)]
+    for level, below in zip(levels, [*levels[1:], None]):
+        level.mkdir()
+        for name in "ab" if below else "":
+            (level / name).symlink_to(below)
+    for level in (levels[0], levels[3]):
+        (level / "image.png").touch()
+    assert record.source_stamp(levels[3]) and not record.source_stamp(levels[0])  # 31 folders, and 255
 
 
 def test_lines_that_are_no_jobs(tmp_path):
@@ -626,8 +611,7 @@ def test_commands_are_called_without_a_shell(tmp_path, monkeypatch):
     assert slurm._call("squeue", "$(id)", script="text\n")[1] == "$(id) text 1 .\n"
 
 
-# Ray's engine joins the cluster that is named, or starts a private one; it takes none that another user could have
-# planted.
+# Ray's engine joins the cluster that is named, or starts a private one; it takes none that another user could have planted.
 
 
 @pytest.fixture

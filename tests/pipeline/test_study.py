@@ -62,8 +62,6 @@ from warpgs.pipeline.train.strategies.sampling import MethodConfig
 from warpgs.report.images import BOXES, crops, disagreement, sheet
 from warpgs.synthetic.demo import split_spec, write_demo
 
-# Tables of a study: the figures that were measured, in three notations that agree.
-
 BASE, OTHER = [20.0, 20.2, 20.1], [20.6, 20.7, 20.8]
 GAP = paired_difference(OTHER, BASE)
 
@@ -116,8 +114,8 @@ def test_ablation_has_check_marks_in_every_notation():
     assert head[1:3] == ["Hier", "S_rend"] and [r[1:3] for r in rows if r[3] == "psnr"] == [[1, 1], [0, 1]]
 
 
-def test_csv_keeps_every_digit():
-    """What was not measured is empty, not zero."""
+def test_csv_keeps_every_digit_and_latex_is_balanced_and_escaped():
+    """What was not measured is empty, not zero; names cannot break a table: TeX reads ^^5c as a backslash."""
     head, *rows = csv_rows(table_of())
     rows = {(r[0], r[1]): dict(zip(head, r, strict=True)) for r in rows}
     r = rows["no a_b|c", "psnr"]
@@ -125,10 +123,6 @@ def test_csv_keeps_every_digit():
     assert found == [sample(OTHER).mean, sample(OTHER).sd, GAP.mean, GAP.low, GAP.high] and r["pairs"] == 3
     assert rows["full", "psnr"]["difference"] == rows["full", "psnr"]["pairs"] == rows["full", "lpips"]["mean"] == ""
     assert len(rows) == 6
-
-
-def test_latex_is_balanced_and_escaped():
-    """Names cannot break the table: TeX reads ^^5c as a backslash, and an empty line as the end of a paragraph."""
     tex = latex(table_of())
     assert tex.count("{") == tex.count("}") and tex.count("$") % 2 == 0 and "\\begin{tabular}{lcccr}" in tex
     assert "no a\\_b|c" in tex and "100 \\%" in tex and "paired by seed, with a 95 \\% t int" in tex
@@ -138,16 +132,19 @@ def test_latex_is_balanced_and_escaped():
     assert words in latex(table_of(caption="\\a^^5cinput{b}~c\n\nd"))
 
 
-def test_small_differences_keep_their_digits():
+def test_small_differences_keep_their_digits_and_few_measurements_have_no_spread():
     """No minus zero, and an interval without 0 does not end at 0."""
     assert interval(paired_difference([20.0, 20.0, 20.001], [20.0, 20.001, 20.0]), 2) == "+0.00 [+0.00, +0.00]"
     assert interval(paired_difference([19.9986, 19.9988], [20.0, 20.0]), 2) == "-0.00130 [-0.00257, -0.00003]"
-
-
-def test_best_follows_the_direction_and_what_is_printed():
-    """Equal when printed is equally best; nothing measured has no best."""
+    # equal when printed is equally best; nothing measured has no best
     table = table_of(samples={str(v): {m: sample([v]) for m in ("psnr", "lpips")} for v in (20.0001, 20.0004, 21.0)})
     assert [table.best("psnr"), table.best("lpips")] == [21.0, 20.0] and math.isnan(table.best("ssim"))
+    d = paired_difference([2.0], [1.0])
+    assert d.mean == 1 and math.isnan(d.sd) and math.isnan(d.low) and not d.excludes_zero
+    assert family_confidence(1) == 0.95 and family_confidence(10) == pytest.approx(0.995)
+    assert math.isnan(sample([]).mean) and paired_difference([1.0, 2.0], [0.0, 1.0]).low == 1.0
+    with pytest.raises(ValueError):
+        paired_difference([1.0, 2.0], [1.0])
 
 
 # Studies: paired, resumable, honest about what is missing.
@@ -197,9 +194,8 @@ def test_every_run_is_an_ordinary_run_folder_and_every_file_of_the_study_is_ther
     image = Image.open(request.out / "figure.png")
     assert image.width > 3 * 180 and image.height > 200
     record = json.loads((request.out / "study.json").read_text())
-    assert (
-        record["seeds"] == 2 and set(record["variants"]) == {"a", "b b"} and len(record["scenes"]["still"]["fingerprint"]) == 64
-    )
+    assert record["seeds"] == 2 and set(record["variants"]) == {"a", "b b"}
+    assert len(record["scenes"]["still"]["fingerprint"]) == 64
 
 
 def test_table_is_of_these_runs(finished):
@@ -307,9 +303,8 @@ def test_a_strategy_whose_code_was_edited_is_fitted_again(finished, tmp_path, mo
 )  # fmt: skip
 def test_what_makes_a_run_another_run(finished, tmp_path, monkeypatch, key, value, word):
     """Each of these alone forbids to keep it."""
-    monkeypatch.setattr(
-        "warpgs.pipeline.farm.work.fit_request", lambda request: SimpleNamespace(metrics={"fitted": request.resume})
-    )
+    fitted = lambda request: SimpleNamespace(metrics={"fitted": request.resume})  # noqa: E731
+    monkeypatch.setattr("warpgs.pipeline.farm.work.fit_request", fitted)
     request = copy_of(finished, tmp_path)
     folder = run_folder(request, "still", "a", 0)
     record = json.loads((folder / "config.json").read_text()) | {key: value}
@@ -465,10 +460,7 @@ def test_ablation_rows_switch_off_one_part_each():
     assert all(marks["full"]) and list(SWITCHES)[:7] == ["hier", "s_render", "s_semantic", "s_geometry", "ra", "agp", "pm"]
     with pytest.raises(UsageError, match="preset '3dgs' has no sampling events"):
         ablation_variants(FitConfig())
-
-
-def test_ablation_switches_on_what_a_preset_leaves_out():
-    """A preset without scores gets a row with each and one with all, and no row twice: uniform is the preset itself."""
+    # a preset without scores gets a row with each and one with all, and no row twice: uniform is the preset itself
     base = dataclasses.replace(FULL, strategy="sampling", strategy_config=None)
     variants, _ = ablation_variants(base)
     rows = "full", "residual only", "residual + semantics + geometry", "with s_semantic", "with s_geometry"
@@ -523,15 +515,6 @@ def test_interval_equals_scipys_paired_t(n, confidence):
     assert d.excludes_zero == (stats.ttest_rel(ours, base).pvalue < 1 - confidence)
 
 
-def test_few_measurements_have_no_spread_and_unpaired_ones_are_refused():
-    d = paired_difference([2.0], [1.0])
-    assert d.mean == 1 and math.isnan(d.sd) and math.isnan(d.low) and not d.excludes_zero
-    assert family_confidence(1) == 0.95 and family_confidence(10) == pytest.approx(0.995)
-    assert math.isnan(sample([]).mean) and paired_difference([1.0, 2.0], [0.0, 1.0]).low == 1.0
-    with pytest.raises(ValueError):
-        paired_difference([1.0, 2.0], [1.0])
-
-
 # The plot of a study and its figure: every number is shown, nothing leaves its frame, crops lie where pictures differ.
 
 SVG = "{http://www.w3.org/2000/svg}"
@@ -559,11 +542,8 @@ def test_forest_draws_every_seed_and_prints_every_interval():
     assert xs[1] < xs[2] < xs[0] and xs[0] - xs[2] == pytest.approx(xs[2] - xs[1], abs=0.2)
     # more PSNR is better, more LPIPS is worse, and what the interval does not decide is neither
     assert [c.get("fill") for c in large] == [BETTER, WORSE, UNDECIDED]
-    assert [c.get("fill") for c in forest_of("lpips").findall(f"{SVG}circle") if c.get("r") == "5.5"] == [
-        WORSE,
-        BETTER,
-        UNDECIDED,
-    ]
+    means = [c for c in forest_of("lpips").findall(f"{SVG}circle") if c.get("r") == "5.5"]
+    assert [c.get("fill") for c in means] == [WORSE, BETTER, UNDECIDED]
     one = {"b": {"psnr": paired_difference([0.5], [0.0]), "lpips": paired_difference([], [])}}
     root = ElementTree.fromstring(forest(Table("t", ("psnr", "lpips"), {"a": {}, "b": {}}, one)))
     words = [t.text for t in root.findall(f"{SVG}text")]

@@ -38,7 +38,8 @@ def clock(monkeypatch):
     return now
 
 
-def test_plain_lines_come_about_every_ten_seconds(capsys, clock):
+def test_plain_lines_come_about_every_ten_seconds_and_a_live_view_has_all_values(capsys, clock):
+    """The live view shows the same values; nothing done prints nothing, and an error passes through."""
     with Progress(100, live=False) as progress:
         for step in range(1, 101):
             clock[0] += 0.5
@@ -49,6 +50,18 @@ def test_plain_lines_come_about_every_ten_seconds(capsys, clock):
     last = lines[-1]
     for word in ("step 100 of 100", "loss 0.2500", "train PSNR 20.50 dB", "Gaussians 12,345", "per step 500 ms", "left 0 s"):
         assert word in last
+    with Progress(10, live=True) as progress:
+        for step in range(1, 11):
+            progress.update(step=step, loss=0.125, psnr=33.0, count=4321, seconds=0.1)
+    out = capsys.readouterr().out
+    for word in ("10 of 10", "0.1250", "33.00 dB", "4,321", "left"):
+        assert word in out
+    with pytest.raises(KeyboardInterrupt), Progress(10) as progress:
+        assert progress.live is False
+        raise KeyboardInterrupt
+    with Progress(10, live=False):
+        pass
+    assert capsys.readouterr().out == ""
 
 
 def test_time_left_is_that_of_the_steps_to_come(capsys, clock):
@@ -101,35 +114,16 @@ def test_time_left_rises_where_the_machine_becomes_much_slower(capsys, clock):
     assert max(left[s] for s in left if 200 < s <= 300) > 1800
 
 
-def test_nothing_done_prints_nothing(capsys):
-    """And an error passes through; pytest has no terminal, so lines are plain."""
-    with pytest.raises(KeyboardInterrupt), Progress(10) as progress:
-        assert progress.live is False
-        raise KeyboardInterrupt
-    with Progress(10, live=False):
-        pass
-    assert capsys.readouterr().out == ""
-
-
-def test_live_view_shows_all_values_and_ends_cleanly(capsys):
-    with Progress(10, live=True) as progress:
-        for step in range(1, 11):
-            progress.update(step=step, loss=0.125, psnr=33.0, count=4321, seconds=0.1)
-    out = capsys.readouterr().out
-    for word in ("10 of 10", "0.1250", "33.00 dB", "4,321", "left"):
-        assert word in out
-
-
-@pytest.mark.parametrize(
-    "seconds, text",
-    [(59.4, "59 s"), (59.6, "1 min 00 s"), (125, "2 min 05 s"), (3599.7, "1 h 00 min"), (4260, "1 h 11 min")],
-)
-def test_durations(seconds, text):
-    assert duration(seconds) == text
-
-
-def test_stages_of_the_set_up_are_shown_at_once_and_then_every_few_seconds(clock):
-    """A stage's first line, and one every five seconds; another stage does not wait."""
+def test_durations_and_stages_of_the_set_up(clock):
+    for seconds, text in {
+        59.4: "59 s",
+        59.6: "1 min 00 s",
+        125: "2 min 05 s",
+        3599.7: "1 h 00 min",
+        4260: "1 h 11 min",
+    }.items():
+        assert duration(seconds) == text
+    # a stage's first line, and one every five seconds; another stage does not wait
     lines = []
     stages = Stages(lines.append)
     for view in range(20):

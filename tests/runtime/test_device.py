@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from warpgs import device, folders
+from warpgs import device, folders, locks
 from warpgs.device import (
     available_bytes,
     choose_kernel_cache,
@@ -24,8 +24,7 @@ from warpgs.device import (
     wake_gpu,
 )
 from warpgs.errors import UsageError
-
-# Work in threads.
+from warpgs.priors.networks import cache_folder
 
 
 def test_results_keep_the_order_of_their_arguments_which_are_made_late():
@@ -115,20 +114,12 @@ cli.main(["fit", "scene"])
     assert done.stdout.split() == ["woken", fit, fit, fit, others, fit]
 
 
-@pytest.mark.parametrize(
-    ("text", "size"), [("2GiB", 2**31), ("512 MB", 512 * 10**6), ("1.5kib", 1536), (".5 TB", 5 * 10**11), ("7B", 7)]
-)
-def test_sizes_are_read(text, size):
-    assert parse_bytes(text) == size
-
-
-@pytest.mark.parametrize("text", ["", "2", "-1GiB", "1e3MB", "0.1B", "2GiB!", "9" * 400 + "B", "٣GiB"])
-def test_nonsense_is_no_size(text):
-    with pytest.raises(UsageError, match="memory limit"):
-        parse_bytes(text)
-
-
-def test_sizes_are_written():
+def test_sizes_are_read_and_written():
+    for text, size in {"2GiB": 2**31, "512 MB": 512 * 10**6, "1.5kib": 1536, ".5 TB": 5 * 10**11, "7B": 7}.items():
+        assert parse_bytes(text) == size
+    for text in ("", "2", "-1GiB", "1e3MB", "0.1B", "2GiB!", "9" * 400 + "B", "٣GiB"):
+        with pytest.raises(UsageError, match="memory limit"):
+            parse_bytes(text)
     sizes = {5: "5 B", 2048: "2 KiB", 3 * 2**20: "3.0 MiB", 2.5 * 2**30: "2.5 GiB", 2**41: "2.0 TiB"}
     assert {n: format_bytes(n) for n in sizes} == sizes
 
@@ -152,9 +143,8 @@ def psutil_like(error=None, **found):
 @pytest.fixture
 def elsewhere(monkeypatch, tmp_path):
     """A machine without /proc and /sys, of 16 GiB, 10 of them free; nothing is remembered of this one."""
-    monkeypatch.setattr(device, "OWN_CGROUPS", tmp_path / "proc")
-    monkeypatch.setattr(device, "CGROUPS", tmp_path / "sys")
-    monkeypatch.setattr(device, "CPU_INFO", tmp_path / "cpuinfo")
+    for name, file in (("OWN_CGROUPS", "proc"), ("CGROUPS", "sys"), ("CPU_INFO", "cpuinfo")):
+        monkeypatch.setattr(device, name, tmp_path / file)
     monkeypatch.setitem(sys.modules, "psutil", psutil_like(total=16 * GIB, available=10 * GIB))
     forgotten = (device.installed_bytes, device._say_assumed)
     for f in forgotten:
@@ -172,9 +162,13 @@ def group(root, parts: str, **files):
         (folder / name.replace("__", ".")).write_text(f"{text}\n", "utf-8")
 
 
-def test_this_machine():
+def test_this_machine_and_memory_that_torch_holds_unused(monkeypatch):
     assert 2**28 < installed_bytes(CPU) < 2**46 and 2**20 < available_bytes(CPU) <= installed_bytes(CPU)
     assert 1 <= device.usable_cores() <= (os.cpu_count() or 1) and device.processor_name()
+    # free on a CUDA device is what the driver says, and what torch has reserved and not given out
+    for name, value in (("mem_get_info", (1000, 5000)), ("memory_reserved", 300), ("memory_allocated", 20)):
+        monkeypatch.setattr(torch.cuda, name, lambda _, value=value: value)
+    assert available_bytes(torch.device("cuda", 0)) == 1280
 
 
 def test_without_control_groups(elsewhere):
@@ -236,14 +230,6 @@ def test_a_system_that_says_nothing(elsewhere, monkeypatch, capsys, error):
     assert available_bytes(CPU) == GIB - 2**20 and not capsys.readouterr().err
 
 
-def test_memory_that_torch_holds_unused_is_available(monkeypatch):
-    """Free on a CUDA device is what the driver says, and what torch has reserved and not given out."""
-    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda _: (1000, 5000))
-    monkeypatch.setattr(torch.cuda, "memory_reserved", lambda _: 300)
-    monkeypatch.setattr(torch.cuda, "memory_allocated", lambda _: 20)
-    assert available_bytes(torch.device("cuda", 0)) == 1280
-
-
 def test_processors(elsewhere, monkeypatch):
     """Linux names the model and the cores of the process; elsewhere all are usable, and Python may know a name."""
     (elsewhere / "cpuinfo").write_text("processor : 0\nmodel name\t: Some Processor: 3\n", "utf-8")
@@ -259,8 +245,7 @@ def test_processors(elsewhere, monkeypatch):
         assert device.processor_name() == (processor or machine or "unknown")
 
 
-# Where kernels are compiled to: the usual folder, or a private one with a line that says so, or an error with its
-# remedy.
+# Where kernels are compiled to: the usual folder, a private one with a line that says so, or an error with its remedy.
 
 POSIX = pytest.mark.skipif(not hasattr(os, "getuid"), reason="mode bits say nothing on Windows")
 HOMES = ("HOME", "USERPROFILE", "HOMEDRIVE", "HOMEPATH", "LOCALAPPDATA", "XDG_CACHE_HOME", "WARP_CACHE_PATH", "WARPGS_CACHE")
@@ -328,10 +313,7 @@ def private(done: subprocess.CompletedProcess, reason: str) -> None:
 
 
 def test_a_home_that_cannot_be_written(python, tmp_path):
-    """A path below a file stands for /proc/1, a read-only disk and the like; kernels compile and run all the same.
-
-    If nothing else can be written either, every command ends with the code of resources, and the remedy.
-    """
+    """A path below a file stands for a read-only disk: kernels still run; if nothing else can be written, that is said."""
     (tmp_path / "file").write_text("")
     homes = dict.fromkeys(("HOME", "USERPROFILE", "LOCALAPPDATA"), str(tmp_path / "file" / "home"))
     private(python(COMPILE, **homes), "cannot be written")
@@ -365,6 +347,9 @@ def test_a_sound_folder_is_used(monkeypatch, tmp_path):
     assert chosen(monkeypatch, tmp_path / "new" / "cache") == ((tmp_path / "new" / "cache").resolve(), "")
     assert os.name == "nt" or (tmp_path / "new" / "cache").stat().st_mode & 0o777 == 0o700
     assert choose_kernel_cache(str(tmp_path / "mine")) == ((tmp_path / "mine").resolve(), "")
+    monkeypatch.delattr(os, "getuid", raising=False)  # where files have no owners nothing is refused
+    tmp_path.chmod(0o777)
+    assert chosen(monkeypatch, tmp_path / "cache") == ((tmp_path / "cache").resolve(), "")
 
 
 @POSIX
@@ -384,8 +369,6 @@ def test_a_folder_that_others_can_write_to_is_refused(monkeypatch, tmp_path, whe
 @POSIX
 def test_groups_links_and_owners(monkeypatch, tmp_path):
     """A group of other users may not write, the user's own may; links in a cache and folders of others are not followed."""
-    from warpgs import locks
-
     cache = tmp_path / "cache"
     cache.mkdir()
     cache.chmod(0o775)
@@ -421,30 +404,24 @@ def test_what_another_user_owns_is_refused(monkeypatch, tmp_path, planted, refus
     assert (folder != cache.resolve()) == refused == ("other users can write to" in why)
 
 
-def test_where_files_have_no_owners_nothing_is_refused(monkeypatch, tmp_path):
-    monkeypatch.delattr(os, "getuid", raising=False)
-    tmp_path.chmod(0o777)
-    assert chosen(monkeypatch, tmp_path / "cache") == ((tmp_path / "cache").resolve(), "")
-
-
 def test_no_folder_is_ever_called_tilde(monkeypatch, tmp_path):
     """A ~ that nobody has replaced means the home folder; where that is not known, nothing is made."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
-    for name in ("HOME", "USERPROFILE"):
-        monkeypatch.setenv(name, str(tmp_path / "home"))
+
+    def homes(home):
+        for name in ("HOME", "USERPROFILE"):
+            monkeypatch.setenv(name, str(home))
+
+    homes(tmp_path / "home")
     assert chosen(monkeypatch, "~/k") == ((tmp_path / "home" / "k").resolve(), "")
     for home in ("~", "relative"):
-        for name in ("HOME", "USERPROFILE"):
-            monkeypatch.setenv(name, home)
+        homes(home)
         assert "an unknown home folder" in chosen(monkeypatch, "~/k")[1]
         monkeypatch.delenv("WARP_CACHE_PATH")
         monkeypatch.delenv("LOCALAPPDATA", raising=False)
         assert folders.cache_home() is None and "no home" in choose_kernel_cache()[1]
-    from warpgs.priors.networks import cache_folder
-
-    for name in ("HOME", "USERPROFILE"):
-        monkeypatch.setenv(name, str(tmp_path / "home"))
+    homes(tmp_path / "home")
     monkeypatch.setenv("WARPGS_CACHE", "~/maps")  # of another cache, that of the networks' maps
     assert cache_folder() == tmp_path / "home" / "maps"
     assert {p.name for p in tmp_path.iterdir()} == {"home"}

@@ -31,8 +31,8 @@ def refusal(folder) -> str:
     return str(e.value)
 
 
-def test_a_second_holder_is_told_whose_the_folder_is(tmp_path, monkeypatch):
-    """Number, machine, time and command of the holder; both may hold it one after the other."""
+def test_a_second_holder_is_told_whose_the_folder_is_and_impossible_paths_are_named(tmp_path, monkeypatch):
+    """Number, machine, time and command of the holder; a signature without sense is of another process; impossible paths."""
     monkeypatch.setattr(sys, "argv", ["/usr/bin/warpgs", "fit", "my scene", *["x"] * 200])
     with hold_folder(tmp_path) as notes:
         said = refusal(tmp_path)
@@ -43,13 +43,20 @@ def test_a_second_holder_is_told_whose_the_folder_is(tmp_path, monkeypatch):
     monkeypatch.setattr(sys, "argv", ["/lib/warpgs/__main__.py", "eval"])
     with hold_folder(tmp_path):
         assert "`warpgs eval`" in refusal(tmp_path)
-
-
-def test_a_signature_that_makes_no_sense_is_of_another_process(tmp_path):
     with hold_folder(tmp_path):
         for signature in (b"[" * 100_000, b"[]", b'{"command": ""}', bytes(1)):
             (tmp_path / LOCK).write_bytes(b"\n" + signature)
             assert refusal(tmp_path).startswith(f"{tmp_path}: another process is writing there")
+    (tmp_path / "made.ply").mkdir()
+    (tmp_path / "file").touch()
+    for name, message in (("made.ply", "made.ply: is a folder"), (300 * "a", "too long; choose a shorter")):
+        with pytest.raises(UsageError, match=message), hold_file(tmp_path / name):
+            pytest.fail("held")
+    for name in ("x" * 300, "file/below"):
+        with pytest.raises(ResourceError, match="choose another folder"), hold_folder(tmp_path / name):
+            pytest.fail("held")
+    with hold_file(tmp_path / "new" / "a.ply"):
+        assert "is writing there" in refusal(tmp_path / "new")
 
 
 def test_a_lock_file_alone_holds_nothing(tmp_path):
@@ -120,17 +127,3 @@ def test_a_killed_holder_gives_the_folder_free(tmp_path):
         assert (tmp_path / LOCK).is_file()
         with hold_folder(tmp_path):
             assert str(os.getpid()) in refusal(tmp_path)
-
-
-def test_a_path_that_no_file_can_have_is_named_before_the_work(tmp_path):
-    """A folder, and a name beyond what the system takes; other names hold the folder of the file."""
-    (tmp_path / "made.ply").mkdir()
-    (tmp_path / "file").touch()
-    for name, message in (("made.ply", "made.ply: is a folder"), (300 * "a", "too long; choose a shorter")):
-        with pytest.raises(UsageError, match=message), hold_file(tmp_path / name):
-            pytest.fail("held")
-    for name in ("x" * 300, "file/below"):
-        with pytest.raises(ResourceError, match="choose another folder"), hold_folder(tmp_path / name):
-            pytest.fail("held")
-    with hold_file(tmp_path / "new" / "a.ply"):
-        assert "is writing there" in refusal(tmp_path / "new")

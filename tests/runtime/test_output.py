@@ -4,6 +4,7 @@ import ast
 import errno
 import io
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -11,7 +12,10 @@ from pathlib import Path
 
 import pytest
 
+import warpgs
+from tests.faults.tiny_runs import words_of
 from warpgs import process
+from warpgs.app import doctor
 from warpgs.app.cli import main
 from warpgs.export.ply import read_ply
 from warpgs.pipeline.run.folder import load_checkpoint
@@ -25,6 +29,7 @@ from warpgs.process import (
     printable,
     say,
 )
+from warpgs.report.progress import EventLog
 from warpgs.synthetic.demo import split_spec, write_demo
 
 # Output that cannot be written: said once, and no result is another for it.
@@ -119,8 +124,6 @@ def test_neither_stdout_nor_stderr(scene, tmp_path, monkeypatch):
 
 def test_the_same_without_the_command_line(scene, tmp_path, monkeypatch, capfd):
     """`warpgs.fit` in a program whose reader has gone; the program's own streams stay as they are."""
-    import warpgs
-
     stream = Broken(1, errno.EPIPE)
     monkeypatch.setattr(sys, "stdout", stream)
     monkeypatch.setattr(process, "_is_lost", False)
@@ -129,19 +132,13 @@ def test_the_same_without_the_command_line(scene, tmp_path, monkeypatch, capfd):
     assert capfd.readouterr().err.count(GOES_ON) == 1
 
 
-def test_a_table_that_cannot_be_written(monkeypatch, capsys):
-    """The doctor's lines and tables, by rich and by `say`: code 4 for a full disk, none for a closed pipe."""
-    from warpgs.app import doctor
-
+def test_tables_answers_and_errors_of_the_program_itself(monkeypatch, capsys):
+    """Code 4 for a full disk, none for a closed pipe; an answer to another process fails; other errors are raised."""
     monkeypatch.setattr(doctor, "diagnose", lambda *_: [])
     for number, code in ((errno.ENOSPC, 4), (errno.EPIPE, 0)):
         monkeypatch.setattr(sys, "stdout", Broken(1, number))
         assert main(["doctor"]) == code
         assert capsys.readouterr().err.count("stdout cannot be written") == (code == 4)
-
-
-def test_an_answer_that_nobody_reads_is_an_error(monkeypatch, capsys):
-    """A process that works for another one ends with it."""
     monkeypatch.setattr(sys, "stdout", Broken(0, errno.EPIPE))
     monkeypatch.setattr(process, "_is_lost", False)
     say("a line")
@@ -149,10 +146,6 @@ def test_an_answer_that_nobody_reads_is_an_error(monkeypatch, capsys):
     assert capsys.readouterr().err.count("\n") == 1
     with pytest.raises(BrokenPipeError):
         answer("a line")
-
-
-def test_what_is_no_failure_of_the_stream_is_raised(capsys):
-    """An error of the program itself, such as text that is none, is not taken for one."""
     with careful_output(False), pytest.raises(TypeError):
         sys.stdout.write(b"bytes")
     stream = io.TextIOWrapper(io.BytesIO(), "ascii")
@@ -199,8 +192,6 @@ def test_native_output_without_streams(monkeypatch, tmp_path):
 @pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="this system has no SIGHUP")
 def test_a_terminal_that_hangs_up(scene, tmp_path, monkeypatch):
     """SIGHUP comes and both streams fail: the step in progress is saved, and --resume continues from it."""
-    from warpgs.report.progress import EventLog
-
     write, streams = EventLog.write, [Broken(1000, errno.EIO), Broken(1000, errno.EIO)]
 
     def hang_up(log, **values):
@@ -236,24 +227,9 @@ def test_a_fit_from_a_shell(scene, tmp_path, output):
 @pytest.mark.slow
 def test_every_command_goes_on(scene, tmp_path, monkeypatch):
     """What is written to files is there, and stderr holds one line on the output; a table is a product, and is not."""
-    run, cpu, split = str(tmp_path / "run"), ["--device", "cpu"], ["--split", split_spec(8)]
-    few = [*split, *cpu, "--steps", "2"]
-    commands = [
-        ["demo", str(tmp_path / "scene"), "--views", "8", "--width", "32", "--height", "32"],
-        ["fit", str(scene), "--out", run, *split, *cpu, "--steps", "30", "--preset", "quick"],
-        ["fit", "--out", run, "--resume"],
-        ["eval", run, *cpu],
-        ["render", run, "--frames", "2", "--path", "turntable", *cpu],
-        ["plot", run, *cpu],
-        ["export", run, "--to", str(tmp_path / "a.ply")],
-        ["convert", str(tmp_path / "a.ply"), str(tmp_path / "a.spz")],
-        ["prune", run, "--keep-psnr", "3", *cpu],
-        ["mesh", run, "--out", str(tmp_path / "m.glb"), "--resolution", "16", *cpu],
-        ["priors", "show", str(scene), *split, "--out", str(tmp_path / "priors")],
-        ["farm", str(scene.parent), "--out", str(tmp_path / "farm"), "--preset", "3dgs", *few],
-        ["doctor", "--warm"],
-        ["compare", str(scene), "--out", str(tmp_path / "study"), "--presets", "3dgs,mcmc", "--seeds", "1", *few],
-    ]
+    shutil.copytree(scene, scene.parent / "scenes" / "s0")
+    names = "demo fit resume eval render plot export convert prune mesh priors farm compare".split()
+    commands = [*(words_of(name, scene, tmp_path) for name in names), ["doctor", "--warm"]]
     for words in commands:
         errors = io.StringIO()
         monkeypatch.setattr(sys, "stdout", Broken(0, errno.ENOSPC))
@@ -261,8 +237,8 @@ def test_every_command_goes_on(scene, tmp_path, monkeypatch):
         assert main(words) == (4 if words[0] == "compare" else 0), errors.getvalue()
         said = errors.getvalue()
         assert said.count("\n") == 1 and "stdout cannot be written" in said, (words, said)
-    there = ["a.spz", "m.glb", "farm/index.html", "study/table.md", "run/plot.png", "run/eval.json", "run-pruned/config.json"]
-    assert all((tmp_path / name).is_file() for name in there)
+    there = "b.spz m.glb results/index.html study/table.md run/plot.png run/eval.json run-pruned/config.json"
+    assert all((tmp_path / name).is_file() for name in there.split())
 
 
 # What the program prints: text that no terminal obeys, in letters that the terminal has.
@@ -276,6 +252,12 @@ def test_what_a_terminal_would_obey_is_printed_as_codes():
     assert printable(NASTY) == r"\x1b]0;owned\x07\x1b[2Ja\rb\nc\x9b31m\u202ed\u2066e\x7f\u2028f\ud800"
     for text in ("Straße, 写真 № 1", "می‌خواهم", "👩‍👩‍👧", "e\u0301 \u2013 \u201cx\u201d"):
         assert printable(text) == text
+    # one file alone calls `print` or writes to stdout or stderr; a table of the doctor goes through rich, cell by cell
+    for path in (ROOT / "warpgs").rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+            if isinstance(node, ast.Call) and path.name != "process.py":
+                name = ast.unparse(node.func) if isinstance(node.func, (ast.Name, ast.Attribute)) else ""
+                assert name != "print" and not name.startswith(("sys.stdout.w", "sys.stderr.w")), path
 
 
 @pytest.mark.parametrize("encoding", ["ascii", "cp1252", "utf-8"])
@@ -286,15 +268,6 @@ def test_letters_that_a_terminal_does_not_have(monkeypatch, encoding):
     say(f"写真{NASTY}")
     wanted = "写真" if encoding == "utf-8" else r"\u5199\u771f"
     assert raw.getvalue().decode(encoding).startswith(wanted) and b"\x1b" not in raw.getvalue()
-
-
-def test_one_place_prints():
-    """Only one file calls `print` or writes to stdout or stderr; a table of the doctor goes through rich, cell by cell."""
-    for path in (ROOT / "warpgs").rglob("*.py"):
-        for node in ast.walk(ast.parse(path.read_text("utf-8"))):
-            if isinstance(node, ast.Call) and path.name != "process.py":
-                name = ast.unparse(node.func) if isinstance(node.func, (ast.Name, ast.Attribute)) else ""
-                assert name != "print" and not name.startswith(("sys.stdout.w", "sys.stderr.w")), path
 
 
 def streams(monkeypatch, encoding):

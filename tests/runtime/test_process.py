@@ -28,9 +28,8 @@ from warpgs.pipeline.run.folder import load_checkpoint
 from warpgs.poses.photographs import _frames, scene_name
 from warpgs.process import ignored_signals, interrupting_signals, noted_signals, run_python, utf8_name
 from warpgs.report.film import write_film
+from warpgs.report.progress import EventLog
 from warpgs.synthetic.demo import split_spec, write_demo, write_object
-
-# What lies in the current folder never runs: a scene may come from anybody, and may hold a numpy.py.
 
 ROOT = Path(__file__).parent.parent.parent
 PLANTED = (
@@ -185,27 +184,21 @@ def starters(path: Path) -> list[str]:
     return found
 
 
-def test_one_file_alone_starts_processes():
+def test_one_file_alone_starts_processes(tmp_path):
     """And none starts a shell; the program itself may start again. The overview names an exception of `subprocess` alone."""
     for path in (ROOT / "warpgs").rglob("*.py"):
         names = ("run", "DEVNULL", "CompletedProcess", "Popen", "PIPE")
         allowed = {"process.py": {f"subprocess.{n}" for n in names} | {"os.execv"}}
         more = {"subprocess.TimeoutExpired"}
         assert set(starters(path)) <= allowed.get(path.name, set()) | more, path
-
-
-@pytest.mark.parametrize(
-    "text",
-    [
+    # the search finds what starts processes
+    for text in (
         "import os\nos.system('a')", "from os import popen", "import os as o\no.execvp('a', [])", "from subprocess import run",
-        "import subprocess as s\ns.Popen('a')", "f(shell=True)",
+        "import subprocess as s\ns.Popen('a')", "f(shell=True)", "import multiprocessing as m\nm.Process()",
         "import concurrent.futures\nconcurrent.futures.ProcessPoolExecutor()",
-        "import multiprocessing as m\nm.Process()",
-    ],
-)  # fmt: skip
-def test_the_search_finds_what_starts_processes(tmp_path, text):
-    (tmp_path / "a.py").write_text(text)
-    assert starters(tmp_path / "a.py")
+    ):  # fmt: skip
+        (tmp_path / "a.py").write_text(text)
+        assert starters(tmp_path / "a.py"), text
 
 
 # Ctrl-C, SIGTERM and SIGHUP: one sentence and one exit code wherever they come, and none where they are ignored.
@@ -255,24 +248,6 @@ def test_an_ignored_signal_stays_ignored(context, number):
 
 
 @pytest.mark.usefixtures("handlers")
-@pytest.mark.parametrize("number", SIGNALS)
-def test_a_signal_during_a_destructor_is_not_lost(number):
-    """Python throws away what a destructor raises: the first Ctrl-C would do nothing."""
-
-    class Thing:
-        def __del__(self):
-            signal.raise_signal(number)
-            raised.append("not in the destructor")
-
-    raised = []
-    with pytest.raises(KeyboardInterrupt), interrupting_signals():
-        Thing()
-        threading.Event().wait(60)  # ended by the signal that comes again
-        raised.append("not at all")
-    assert raised == []
-
-
-@pytest.mark.usefixtures("handlers")
 @pytest.mark.parametrize("context", CONTEXTS)
 def test_other_threads_leave_signals_alone(context):
     """Python lets the main thread alone set handlers."""
@@ -287,7 +262,8 @@ def test_other_threads_leave_signals_alone(context):
 
 @pytest.mark.usefixtures("handlers")
 @pytest.mark.parametrize("number", SIGNALS)
-def test_the_first_is_noted_and_the_second_raised(number):
+def test_the_second_signal_is_raised_and_none_is_lost_in_a_destructor(number):
+    """Python throws away what a destructor raises: there the first Ctrl-C would do nothing."""
     with noted_signals() as came:
         signal.raise_signal(number)
         assert came()
@@ -295,15 +271,27 @@ def test_the_first_is_noted_and_the_second_raised(number):
             signal.raise_signal(number)
     assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
 
+    class Thing:
+        def __del__(self):
+            signal.raise_signal(number)
+            raised.append("not in the destructor")
 
-STAGES = [
+    raised = []
+    with pytest.raises(KeyboardInterrupt), interrupting_signals():
+        Thing()
+        threading.Event().wait(60)  # ended by the signal that comes again
+        raised.append("not at all")
+    assert raised == []
+
+
+STAGES = (
     "fit.read_scene",
     "fit.Trainer",
     "fit.background_warmup",
     "fit.write_ply",
     "results.evaluate_run",
     "results.write_page",
-]
+)
 
 
 @pytest.mark.usefixtures("handlers")
@@ -322,8 +310,6 @@ def test_outside_the_steps_the_end_is_the_same(stop_signals_scene, tmp_path, cap
 @pytest.mark.parametrize("number", SIGNALS)
 def test_within_the_steps_the_one_in_progress_is_saved(stop_signals_scene, tmp_path, capsys, monkeypatch, number):
     """And a second signal in the same step ends the fit without it."""
-    from warpgs.report.progress import EventLog
-
     write, times = EventLog.write, [1]
 
     def signalled(log, **values):
@@ -405,15 +391,12 @@ def test_a_fit_ends_without_freeing_its_memory(command, last):
 
 
 @on_linux
-def test_bytes_that_are_no_text_are_printed_as_codes(tmp_path):
+def test_names_that_are_no_text_for_output_libraries_and_films(tmp_path, monkeypatch):
     assert readable(f"{BYTES} \ud800") == "b\\xe4ü \\ud800"
-    write_text(tmp_path / BYTES, BYTES)
-    assert (tmp_path / BYTES).read_text("utf-8") == "b\\xe4ü"
+    write_text(tmp_path / f"{BYTES}.text", BYTES)
+    assert (tmp_path / f"{BYTES}.text").read_text("utf-8") == "b\\xe4ü"
     assert scene_name(f"a/{BYTES}.png", b"\x89PNG\r\n\x1a\n") == "a/b%E4ü.png"
-
-
-@on_linux
-def test_a_name_that_a_library_can_take(tmp_path, monkeypatch):
+    # a name that a library can take
     folder = tmp_path / BYTES
     folder.mkdir()
     for path in (folder / "file", folder / f"{BYTES}.txt", tmp_path / "plain"):
@@ -426,13 +409,10 @@ def test_a_name_that_a_library_can_take(tmp_path, monkeypatch):
     monkeypatch.setattr(process, "DESCRIPTORS", tmp_path / "none")
     with pytest.raises(UsageError, match=r"b\\xe4ü/file: the name is not UTF-8"), utf8_name(folder / "file"):
         pass
-
-
-@on_linux
-def test_films(tmp_path):
-    """OpenCV ended the process at such a name; a film is written, checked and read."""
-    path = tmp_path / BYTES / f"{BYTES}.mp4"
-    path.parent.mkdir()
+    # OpenCV ended the process at such a name; a film is written, checked and read
+    monkeypatch.undo()
+    path = tmp_path / "films" / BYTES / f"{BYTES}.mp4"
+    path.parent.mkdir(parents=True)
     frames = [np.full((16, 16, 3), 0.2 * i, np.float32) for i in range(3)]
     assert write_film(path, frames) == 3 and [p.name for p in path.parent.iterdir()] == [path.name]
     assert len(list(_frames(path))) == 3
@@ -559,20 +539,15 @@ def test_poses(tmp_path, capfd):
 
 
 @on_linux
-def test_python_that_takes_names_for_ascii(tmp_path):
-    """It is started again in its UTF-8 mode, once, which is said; letters are printed as the terminal has them."""
+def test_python_that_takes_names_for_ascii(tmp_path, monkeypatch):
+    """It is started again in its UTF-8 mode, once, which is said, with its own options and words."""
     program, ascii_names = ("-P", "-m", "warpgs"), {"LC_ALL": "C", "PYTHONUTF8": "0"}
     done = run(*program, "demo", str(tmp_path / "写"), "--views", "8", "--width", "32", "--height", "32", **ascii_names)
     said = done.stderr
     assert done.returncode == 0 and (tmp_path / "写" / "sparse").is_dir() and said.isascii(), said
     assert said.count("UTF-8 mode") == 1 and said.count("\n") == 1 and "\\u5199" in done.stdout
     assert run(*program, "--version", LC_ALL="C.UTF-8", PYTHONUTF8="0").stderr == ""
-
-
-@on_linux
-def test_starting_again_keeps_the_command(monkeypatch):
-    """The words, the interpreter's own options, and nothing twice."""
-    called: list[list[str]] = []
+    called: list[list[str]] = []  # the words, the interpreter's own options, and nothing twice
     monkeypatch.setattr(os, "execv", lambda program, words: called.append([program, *words]))
     monkeypatch.setattr(os, "environ", dict(os.environ))
     monkeypatch.setattr(sys, "getfilesystemencoding", lambda: "iso8859-1")

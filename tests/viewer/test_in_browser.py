@@ -30,9 +30,6 @@ from warpgs.viewer.server import address, open_server, stop_server
 from warpgs.viewer.watch import live_view
 from warpgs.viewer.window import CROP, PATH, Window, content_of_run
 
-# The page of a model in a real browser, opened as a file: it shows what our rasterizer does, and asks nobody for
-# anything.
-
 pytest.importorskip("viser")
 WIDTH, HEIGHT = 700, 600
 SHOWN = np.s_[200:, :]
@@ -54,11 +51,6 @@ def crowd():
     return type(g)(**{n: t[order] for n, t in g.tensors().items()})
 
 
-def test_the_middle_of_the_cameras_comes_first():
-    cameras = [moved(x) for x in (4.0, 0.0, 1.5, 1.0)]
-    assert [c.center[0] for c in middle_first(cameras)] == [1.5, 4.0, 0.0, 1.0] and middle_first([]) == []
-
-
 UP, TARGET = np.array([0.0, -1, 0]), np.zeros(3)
 
 
@@ -74,8 +66,8 @@ def degrees(cameras, target=TARGET):
     return *np.degrees(arc), np.degrees(margin)
 
 
-def test_a_page_turns_as_far_as_the_photographs():
-    """To each side, with a margin of a quarter of the arc; all round there is no limit in yaw, and none with one camera."""
+def test_a_page_turns_as_far_as_the_photographs_and_shows_what_they_saw():
+    """To each side with a margin, about the scene's upward direction; a portrait photograph sees its own width."""
     narrow = [looking(np.radians(a)) for a in (0, -6, -3, 10)]
     np.testing.assert_allclose(degrees(narrow), [6, 10, 0, 0, 4], atol=1e-9)
     arc = [looking(np.radians(a), h) for a, h in ((0, 0), (-30, 0), (40, 0), (0, np.tan(np.radians(20))))]
@@ -89,10 +81,7 @@ def test_a_page_turns_as_far_as_the_photographs():
     around = degrees([looking(np.radians(a), 0.5) for a in range(0, 360, 45)])
     np.testing.assert_allclose(around, [np.inf, np.inf, 0, 0, 15], atol=1e-9)
     np.testing.assert_array_equal(degrees(arc[:1])[:4], np.inf)
-
-
-def test_a_page_turns_about_the_upward_direction_of_the_scene():
-    """Not about that of a camera that looks down: half a turn about it would end below the ground."""
+    # not about that of a camera that looks down: half a turn about it would end below the ground
     server = SimpleNamespace(scene=SimpleNamespace(set_up_direction=lambda up: None), initial_camera=SimpleNamespace())
     cameras = [looking(np.radians(a), 0.7) for a in range(0, 360, 45)]
     up = place_first_camera(server, cameras[0], three_gaussians(), cameras)[1]
@@ -101,10 +90,7 @@ def test_a_page_turns_about_the_upward_direction_of_the_scene():
     down = dataclasses.replace(cameras[0], viewmat=look_at(np.array([0.0, -4, 0]), TARGET, np.array([0.0, 0, 1])))
     up = place_first_camera(server, down, three_gaussians(), cameras)[1]  # the scene's is in the middle of its image
     np.testing.assert_allclose(up, [0, 0, 1], atol=1e-6)
-
-
-def test_a_page_shows_what_the_photographs_saw():
-    """A portrait photograph sees its own width; cameras beside it add what they see of the plane through the target."""
+    # cameras beside the first add what they see of the plane through the target
     first = moved(0.0)
     K = np.array([[100.0, 0, 30], [0, 100, 60], [0, 0, 1]])
     portrait = dataclasses.replace(first, K=K, width=60, height=120)
@@ -112,6 +98,8 @@ def test_a_page_shows_what_the_photographs_saw():
     np.testing.assert_allclose(seen_at([portrait], target), [0.3, 0.6])
     row = [dataclasses.replace(portrait, viewmat=moved(x).viewmat) for x in (0.0, -1.0, 2.0)]
     np.testing.assert_allclose(seen_at(row, target), [0.3 + 1 / 4, 0.6])
+    cameras = [moved(x) for x in (4.0, 0.0, 1.5, 1.0)]
+    assert [c.center[0] for c in middle_first(cameras)] == [1.5, 4.0, 0.0, 1.0] and middle_first([]) == []
 
 
 TURNED = "(()=>{const t=__viserMutable.cameraControl;t.update(9);return t.azimuthAngle})()"
@@ -159,10 +147,7 @@ def moved(x):
 
 @pytest.mark.browser
 def test_a_page_tells_how_to_move_and_returns(browser, tmp_path):
-    """The line of help stands there, no scene tree does, and the key R and the button lead back to the first view.
-
-    The page says that it loads, until the scene is there.
-    """
+    """A line of help, no scene tree; the key R and a button lead back to the first view; loading is said."""
     path = tmp_path / "scene.html"
     write_html(path, crowd(), [ring(3)[1]], title="my <scene>")
     body = path.read_text("utf-8").partition("<body>")[2]

@@ -33,13 +33,10 @@ def test_half_precision_keeps_gaussians_of_any_scene():
     assert shortened == 1 and np.abs(covariances).max() <= LARGEST_HALF and np.isfinite(covariances.astype(np.float16)).all()
 
 
-def test_colors_and_opacities_are_those_of_degree_0():
+def test_colors_of_degree_0_poses_there_and_back_and_keyframes_in_file_units():
     (*_, colors, opacities), _, _ = packed(three_gaussians())
     np.testing.assert_allclose(colors, 255 * np.array([[0.9, 0.2, 0.1], [0.15, 0.8, 0.2], [0.2, 0.3, 0.95]]), atol=0.51)
     np.testing.assert_allclose(opacities[:, 0], 255 * np.array([0.9, 0.85, 0.95]), atol=0.51)
-
-
-def test_poses_there_and_back():
     for c in ring(5):
         back = camera_at(wxyz_of(c), c.center, fov_y(c), c.width, c.height)
         np.testing.assert_allclose(back.viewmat, c.viewmat, atol=1e-12)
@@ -49,6 +46,12 @@ def test_poses_there_and_back():
     assert rig_among([camera_before(three_gaussians())], three_gaussians().means.numpy()).up @ [0, -1, 0] > 0.99
     assert abs(distance_ahead(first, three_gaussians()) - 2.2) < 0.4
     assert distance_ahead(camera_before(three_gaussians()), three_gaussians()) > 0.3
+    n, c = Normalization(np.array([4.0, -2.0, 7.0]), 0.25), ring(3)[0]
+    k = keyframe(c, 1.5, n)
+    c2w = np.array(k["c2w"])
+    np.testing.assert_allclose(c2w @ convert_camera(c, n, "scene", "file").viewmat, np.eye(4), atol=1e-9)
+    np.testing.assert_allclose(c2w[:3, 3], c.center / 0.25 + n.offset, atol=1e-9)
+    assert k["seconds"] == 1.5 and abs(k["fov_y"] - fov_y(c)) < 1e-12
 
 
 def test_a_box_in_file_units_holds_the_same_points():
@@ -65,12 +68,3 @@ def test_a_box_in_file_units_holds_the_same_points():
     again = (np.abs(local) <= np.array(stored["size"]) / 2 + 1e-4).all(1)
     assert (again == within.numpy()).mean() > 0.99
     assert not inside(dataclasses.replace(g, means=torch.eye(3) * 1.1), (np.zeros(3), np.full(3, 2.0), np.eye(3))).any()
-
-
-def test_a_keyframe_is_camera_to_world_in_file_units():
-    n, c = Normalization(np.array([4.0, -2.0, 7.0]), 0.25), ring(3)[0]
-    k = keyframe(c, 1.5, n)
-    c2w = np.array(k["c2w"])
-    np.testing.assert_allclose(c2w @ convert_camera(c, n, "scene", "file").viewmat, np.eye(4), atol=1e-9)
-    np.testing.assert_allclose(c2w[:3, 3], c.center / 0.25 + n.offset, atol=1e-9)
-    assert k["seconds"] == 1.5 and abs(k["fov_y"] - fov_y(c)) < 1e-12
