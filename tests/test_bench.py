@@ -191,8 +191,8 @@ def test_pages_and_charts_are_those_of_the_kept_results():
     assert {f"plots/{p.name}" for p in (pages.DOCS / "plots").glob("*.svg")} == {p for p in files if p.startswith("plots/")}
 
 
-def test_everything_that_can_be_run_is_listed(capsys, monkeypatch):
-    """A line for each program with the first sentence of its docstring; another name is an error."""
+def test_everything_that_can_be_run_is_listed(capsys, monkeypatch, tmp_path):
+    """A line for each program; a result has the keys of the format, facts and rows, and no folder of the machine."""
     monkeypatch.setattr(sys, "argv", ["bench", "--help"])
     assert bench_main.main() == 0
     text = capsys.readouterr().out
@@ -201,6 +201,14 @@ def test_everything_that_can_be_run_is_listed(capsys, monkeypatch):
     assert all(line.endswith((".", ":")) or line[:2] != "  " for line in text.splitlines()), text
     monkeypatch.setattr(sys, "argv", ["bench", "nothing"])
     assert bench_main.main() == 2 and "--help" in capsys.readouterr().err
+    monkeypatch.setattr(sys, "argv", ["x", "/data/fern", "--out", "a.json"])
+    made = result_file.result("w", CPU, [{"a": 1}], size=3)
+    assert made["command"].endswith("fern --out a.json") and "/data" not in made["command"]
+    assert list(made) == ["what", "command", "commit", "date", "machine", "versions", "size", "rows"]
+    result_file.write(tmp_path / "a.json", made)
+    assert result_file.read(tmp_path / "a.json") == made
+    with pytest.raises(ValueError, match="versions"):
+        result_file.write(tmp_path / "b.json", {k: v for k, v in made.items() if k != "versions"})
 
 
 @pytest.mark.parametrize("path", sorted(result_file.FOLDER.glob("*")), ids=lambda p: p.name)
@@ -214,33 +222,8 @@ def test_kept_results_are_of_one_format(path):
     assert {"device", "name"} <= set(values["machine"]) and {"torch", "warp"} <= set(values["versions"])
 
 
-def test_a_result_says_what_it_was_made_by(tmp_path, monkeypatch):
-    """The keys of the format, then facts, then rows; folders of the machine are left out of the command."""
-    monkeypatch.setattr(sys, "argv", ["x", "/data/fern", "--out", "a.json"])
-    made = result_file.result("w", CPU, [{"a": 1}], size=3)
-    assert made["command"].endswith("fern --out a.json") and "/data" not in made["command"]
-    assert list(made) == ["what", "command", "commit", "date", "machine", "versions", "size", "rows"]
-    result_file.write(tmp_path / "a.json", made)
-    assert result_file.read(tmp_path / "a.json") == made
-    with pytest.raises(ValueError, match="versions"):
-        result_file.write(tmp_path / "b.json", {k: v for k, v in made.items() if k != "versions"})
-
-
-def test_steps_of_given_gaussians_train(device):
-    """The same step over and over lowers the loss; with a learning rate of next to nothing all stays as it was."""
-    g, view, target = gaussians(200, device, 1), bench_camera(48, 32, device), image(48, 32, device)
-    losses = []
-    for lr in (1e-2, 1e-12):
-        steps = training.Steps(g, view, target, "exact", lr)
-        for _ in range(20):
-            steps.eager()
-        losses.append(float(steps.buffers.history[0, 0]))
-    assert losses[0] < 0.95 * losses[1]
-    assert all(torch.equal(t, g.tensors()[n]) for n, t in steps.table.params.items() if n == "quats")
-
-
 def test_naive_kernels_equal_the_real_ones(device):
-    """Image and gradients of the peer with a thread a pixel: two cameras, an image that is no multiple of a tile."""
+    """Image and gradients of the peer with a thread a pixel; the same step over and over lowers the loss."""
     cam = camera(45, 37, cameras=2, dtype=torch.float32, device=device)
     tensors = cloud(300, torch.float32, device).tensors()
     tensors["logit_opacities"] += 3  # some alphas are clamped, some pixels stop
@@ -251,3 +234,12 @@ def test_naive_kernels_equal_the_real_ones(device):
     # an alpha within a rounding of the cut may be drawn by one and not by the other
     for found, wanted in [(theirs.detach(), ours.detach()), *pairs]:
         assert float((found - wanted).norm()) <= 1e-4 * float(wanted.norm())
+    g, view, target = gaussians(200, device, 1), bench_camera(48, 32, device), image(48, 32, device)
+    losses = []
+    for lr in (1e-2, 1e-12):
+        steps = training.Steps(g, view, target, "exact", lr)
+        for _ in range(20):
+            steps.eager()
+        losses.append(float(steps.buffers.history[0, 0]))
+    assert losses[0] < 0.95 * losses[1]
+    assert all(torch.equal(t, g.tensors()[n]) for n, t in steps.table.params.items() if n == "quats")

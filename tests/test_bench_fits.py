@@ -91,8 +91,8 @@ def test_gsplat_is_trained_as_its_example_trainer_does(fake_gsplat):
     assert after < before
 
 
-def test_the_unit_changes_nothing_that_is_seen(fake_gsplat):
-    """Twice the unit with twice the world gives the same image."""
+def test_units_and_the_default_strategy_of_gsplat(fake_gsplat, monkeypatch):
+    """Twice the unit with twice the world gives the same image; refinement ends half-way, without regularizers."""
     view, s = photos(1)[0], gsplat_trainer.Settings(steps=1, cap=1)
     torch.manual_seed(0)
     params = gsplat_trainer.start(first(100).means, torch.rand(100, 3), s)
@@ -100,10 +100,7 @@ def test_the_unit_changes_nothing_that_is_seen(fake_gsplat):
     params["means"].data *= 2
     params["scales"].data += np.log(2)
     assert image.max() > 0.05 and np.abs(gsplat_trainer.image_of(params, view, 2.0) - image).max() < 1e-3
-
-
-def test_its_own_unit_is_that_of_its_parser():
-    """Cameras on a circle of radius 4 in the files that look at the origin: there 4 is 1, whatever our unit."""
+    # cameras on a circle of radius 4 in the files that look at the origin: there 4 is 1, whatever our unit
     cameras, n = [], Normalization(np.array([1.0, 2.0, 3.0]), 0.5)
     for angle in np.linspace(0, 2 * np.pi, 8, endpoint=False):
         axis = -np.array([np.cos(angle), np.sin(angle), 0])
@@ -115,6 +112,12 @@ def test_its_own_unit_is_that_of_its_parser():
         cameras.append(Camera(viewmat, np.eye(3), 4, 4))
     assert gsplat_trainer.own_scale(cameras, n) == pytest.approx(1 / (4 * 0.5))
     assert gsplat_trainer.scene_scale(cameras, 0.5) == pytest.approx(1.1 * 0.5 * 2)
+    default = lambda **k: SimpleNamespace(told=k, initialize_state=lambda scene_scale: scene_scale)  # noqa: E731
+    monkeypatch.setitem(sys.modules, "gsplat", SimpleNamespace(DefaultStrategy=default))
+    s = default_settings(7000)
+    strategy, state = strategy_of(s, 2.5)
+    assert strategy.told == {"refine_start_iter": 500, "refine_stop_iter": 3500, "refine_every": 100} and state == 2.5
+    assert (s.init_opacity, s.init_scale, s.opacity_reg, s.scale_reg) == (0.1, 1.0, 0.0, 0.0)
 
 
 # Presets side by side: rows and their left-out views, the worker processes, one fit, and the tables.
@@ -191,16 +194,6 @@ def test_a_fit_gives_a_row_and_the_peer_starts_from_the_same_points(demo, fake_g
         counts[preset] = row.get("points")
     seen = scene_at(demo, 1).points.seen_by(set(split_views(scene_at(demo, 1), split_spec(8)).train), least=2)
     assert counts[one_fit.PEER_POINTS] == len(seen) != counts[one_fit.PEER] > 0
-
-
-def test_the_default_strategy_has_its_own_settings(fake_gsplat, monkeypatch):
-    """Refinement up to half of the steps, no regularizers, opacity 0.1; its state knows the size of the scene."""
-    default = lambda **k: SimpleNamespace(told=k, initialize_state=lambda scene_scale: scene_scale)  # noqa: E731
-    monkeypatch.setitem(sys.modules, "gsplat", SimpleNamespace(DefaultStrategy=default))
-    s = default_settings(7000)
-    strategy, state = strategy_of(s, 2.5)
-    assert strategy.told == {"refine_start_iter": 500, "refine_stop_iter": 3500, "refine_every": 100} and state == 2.5
-    assert (s.init_opacity, s.init_scale, s.opacity_reg, s.scale_reg) == (0.1, 1.0, 0.0, 0.0)
 
 
 def results(row: str, preset: str, scores: list[float], **more) -> list[dict]:

@@ -35,17 +35,6 @@ from warpgs.files import (
     unread_reason,
     write_bytes,
 )
-from warpgs.folders import (
-    NAMES,
-    RefusedError,
-    Temporary,
-    open_folder,
-    output_folder,
-    shared_locks,
-    sweep,
-    system_folder,
-    temporary_folder,
-)
 from warpgs.locks import hold_folder
 from warpgs.poses import mapping
 from warpgs.process import ProcessFailed
@@ -197,7 +186,7 @@ def test_a_folder_appears_whole_or_not_at_all(tmp_path, monkeypatch):
             assert OWN_NAMES.fullmatch(temporary.name) and temporary.parent == (tmp_path / name).parent
             (temporary / "x").touch()
         assert [p.name for p in (tmp_path / name).iterdir()] == ["x"] and not temporary.exists()
-    with open_folder(tmp_path / "a") as above, Temporary(above) as held:  # another process works in it
+    with folders.open_folder(tmp_path / "a") as above, folders.Temporary(above) as held:  # another process works in it
         above.mkdir(held.name)
         with pytest.raises(ResourceError, match="cannot be created"), filling(tmp_path / "a"):
             pass
@@ -397,7 +386,7 @@ def test_a_folder_that_is_a_link_is_refused(tmp_path, outside, way, depth):
     at = root.joinpath(*"abc"[:depth])
     at.parent.mkdir(parents=True)
     at.symlink_to(outside)
-    with output_folder(root), pytest.raises((ResourceError, RefusedError), match=f"{at}: is a link"):
+    with folders.output_folder(root), pytest.raises((ResourceError, folders.RefusedError), match=f"{at}: is a link"):
         WAYS[way](at)
 
 
@@ -409,7 +398,7 @@ def test_the_folder_itself_may_be_a_link(tmp_path):
     (real / "canary").write_bytes(b"old")
     (tmp_path / "home").symlink_to(tmp_path / "disk")
     (tmp_path / "disk" / "link").symlink_to(real)
-    with output_folder(tmp_path / "home" / "link"):
+    with folders.output_folder(tmp_path / "home" / "link"):
         for way in WAYS.values():
             (real / "canary").write_bytes(b"old")
             way(tmp_path / "home" / "link")
@@ -421,7 +410,7 @@ def test_a_file_that_is_a_link_is_replaced_and_never_followed(tmp_path, outside)
     root = tmp_path / "results"
     root.mkdir()
     link = root / "link"
-    with output_folder(root):
+    with folders.output_folder(root):
         for write in (lambda: write_bytes(link, b"new"), lambda: _replace(link)):
             link.symlink_to(outside / "canary")
             write()
@@ -430,14 +419,14 @@ def test_a_file_that_is_a_link_is_replaced_and_never_followed(tmp_path, outside)
         for target in (outside / "canary", outside / "new", outside):
             link.symlink_to(target)
             for refused in (appending, lambda p: open_input(p, root)):
-                with pytest.raises(RefusedError, match="is a link, and links inside"):
+                with pytest.raises(folders.RefusedError, match="is a link, and links inside"):
                     refused(link)
             with pytest.raises(ResourceError, match="link: is a link, and links inside"), filling(link):
                 pass
             remove_file(link)
             assert not link.is_symlink()
         os.mkfifo(link)
-        with pytest.raises(RefusedError, match="not a regular file"):
+        with pytest.raises(folders.RefusedError, match="not a regular file"):
             open_input(link, root)
         with pytest.raises(OSError):
             appending(link)
@@ -448,7 +437,7 @@ def test_a_file_that_is_a_link_is_replaced_and_never_followed(tmp_path, outside)
     (root / "file").symlink_to(outside / "canary")
     assert open_input(root / "file").read() == b"old"
     for path in (root / "file", root / "folder" / "canary"):
-        with pytest.raises(RefusedError, match="is a link"):
+        with pytest.raises(folders.RefusedError, match="is a link"):
             open_input(path, root)
     with pytest.raises(FileNotFoundError):
         open_input(root / "none" / "x", root)
@@ -459,7 +448,7 @@ def test_a_folder_that_was_replaced_is_not_written(tmp_path):
     """Neither the one that took its place nor, once that is gone, another; at its own place again it is."""
     root, inner = tmp_path / "results", tmp_path / "results" / "a"
     inner.mkdir(parents=True)
-    with output_folder(root), output_folder(inner):
+    with folders.output_folder(root), folders.output_folder(inner):
         for folder in (root, inner):
             moved = tmp_path / "moved"
             folder.rename(moved)
@@ -483,13 +472,13 @@ def test_folders_are_closed(tmp_path):
     descriptors = "/proc/self/fd" if os.path.isdir("/proc/self/fd") else "/dev/fd"
     (tmp_path / "link").symlink_to(tmp_path)
     before = len(os.listdir(descriptors))
-    with output_folder(tmp_path):
-        with output_folder(tmp_path):
+    with folders.output_folder(tmp_path):
+        with folders.output_folder(tmp_path):
             write_bytes(tmp_path / "a", b"1")
             with pytest.raises(ResourceError):
                 make_folder(tmp_path / "link" / "b")
-            with pytest.raises(RefusedError):
-                open_folder(tmp_path / "link")
+            with pytest.raises(folders.RefusedError):
+                folders.open_folder(tmp_path / "link")
             with pytest.raises(ResourceError, match="use a path without"):
                 write_bytes(tmp_path / ".." / "x", b"")
         thread = threading.Thread(target=write_bytes, args=(tmp_path / "b", b"2"))
@@ -547,8 +536,8 @@ def test_another_command_leaves_what_is_held_and_removes_what_a_killed_one_left(
     results, system = places
     process = started(HOLDS, results)
     there = {p.name for p in results.iterdir()}, {p.name for p in system.iterdir()}
-    assert [len(t) for t in there] == [3, 2] and all(map(NAMES.fullmatch, there[0] | there[1]))
-    with hold_folder(results), temporary_folder():
+    assert [len(t) for t in there] == [3, 2] and all(map(folders.NAMES.fullmatch, there[0] | there[1]))
+    with hold_folder(results), folders.temporary_folder():
         now = {p.name for p in results.iterdir()}, {p.name for p in system.iterdir()}
     assert now[0] >= there[0] and now[1] >= there[1]
     process.kill()
@@ -566,14 +555,14 @@ def test_a_folder_is_held_until_the_last_process_in_it_has_ended(places):
     with started(ORPHAN, stdin=read) as process:
         process.kill()
     (lock,) = system.glob("*.lock")
-    with open_folder(system) as folder:
-        sweep(folder)
+    with folders.open_folder(system) as folder:
+        folders.sweep(folder)
         assert lock.exists() and len(list(system.iterdir())) == 2
         os.close(read)
         os.close(write)
         with lock.open("r+b") as file:
             folders.lock_descriptor(file.fileno())  # waits for it
-        sweep(folder)
+        folders.sweep(folder)
     assert not list(system.iterdir())
 
 
@@ -583,8 +572,8 @@ def test_what_another_user_has_in_the_system_s_folder_stays(tmp_path):
     for name, user in zip(names, (0, 12345)):
         (tmp_path / name).mkdir()
         os.chown(tmp_path / name, user, -1)
-    with open_folder(tmp_path) as folder:
-        sweep(folder, own=True)
+    with folders.open_folder(tmp_path) as folder:
+        folders.sweep(folder, own=True)
     assert [p.name for p in tmp_path.iterdir()] == [names[1]]
 
 
@@ -603,25 +592,25 @@ def test_a_sweep_between_making_and_locking_costs_a_name(tmp_path, monkeypatch, 
         return lock(descriptor, blocking=blocking)
 
     monkeypatch.setattr(folders, "lock_descriptor", raced)
-    with open_folder(tmp_path) as folder, Temporary(folder) as held:
+    with folders.open_folder(tmp_path) as folder, folders.Temporary(folder) as held:
         assert len(calls) == 2 and (tmp_path / (held.name + ".lock")).exists()
 
 
 def test_a_temporary_folder_is_private_and_goes_with_its_lock(places):
     _, system = places
-    with shared_locks() as locks:
+    with folders.shared_locks() as locks:
         before = len(locks)
-    with temporary_folder() as folder:
+    with folders.temporary_folder() as folder:
         assert folder.path.parent == system.resolve() and (os.name == "nt" or folder.path.stat().st_mode & 0o777 == 0o700)
         (folder.path / "file").touch()
-        with shared_locks() as locks:
+        with folders.shared_locks() as locks:
             assert len(locks) == before + (os.name != "nt")
         folder.remove()
         assert not list(system.iterdir())
-    with shared_locks() as locks:
+    with folders.shared_locks() as locks:
         assert len(locks) == before
     if hasattr(os, "fork"):  # a child leaves the folder to its parent
-        with temporary_folder() as folder:
+        with folders.temporary_folder() as folder:
             child = os.fork()
             if not child:
                 folder.remove()
@@ -639,7 +628,7 @@ def test_the_system_s_folder_is_found_without_writing(tmp_path, monkeypatch):
     monkeypatch.setattr(tempfile, "_get_default_tempdir", lambda *_: pytest.fail("it searched"))
     monkeypatch.setenv("TMPDIR", str(tmp_path / "missing"))
     monkeypatch.setenv("TEMP", str(named))
-    assert system_folder() == named.resolve() and tempfile.gettempdir() == str(named)
+    assert folders.system_folder() == named.resolve() and tempfile.gettempdir() == str(named)
 
 
 # A full disk of another process is called that, and neither a lack of memory nor a fault of a renderer.

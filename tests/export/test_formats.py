@@ -220,16 +220,7 @@ def test_axes_and_nodes_on_disk(tmp_path):
     assert back.dtype == torch.float64 and torch.allclose(back, wanted, rtol=0, atol=1e-6)
 
 
-def test_more_rows_of_harmonics_than_a_palette(monkeypatch, tmp_path):
-    monkeypatch.setattr(sog, "PALETTE", 64)
-    made = model(n=200, degree=1)
-    write_gaussians(tmp_path / "a.sog", made, units="file")
-    back = read_gaussians(tmp_path / "a.sog")
-    assert 0.02 < differences(made, back)["rest"] < float(made.sh[:, 1:].max() - made.sh[:, 1:].min())
-    assert len(torch.unique(back.sh[:, 1:], dim=0)) <= 64
-
-
-def test_names_say_the_format(tmp_path):
+def test_names_say_the_format_and_bad_numbers_and_long_palettes(tmp_path, monkeypatch):
     assert format_of("A.Compressed.PLY").name == "compressed_ply" and format_of("a.b.ply").name == "ply"
     with pytest.raises(UsageError, match=r"format \.obj is not supported; use one of"):
         format_of("a.obj")
@@ -245,18 +236,23 @@ def test_names_say_the_format(tmp_path):
     write_gaussians(tmp_path / "a.compressed.ply", made, units="file")
     (tmp_path / "a.compressed.ply").rename(tmp_path / "a.ply")  # a compressed PLY may have a plain name
     assert differences(made, read_gaussians(tmp_path / "a.ply"))["means"] < 0.01
-
-
-def test_numbers_that_are_none_are_not_written(tmp_path):
+    # numbers that are none are not written
     made = model()
     made.means[3, 1] = torch.nan
     for suffix in SUFFIXES:
         with pytest.raises(DataError, match=r"1 of \d+ values of means are not finite"):
-            write_gaussians(tmp_path / f"a{suffix}", made, units="file")
-    assert not list(tmp_path.iterdir())
+            write_gaussians(tmp_path / f"bad{suffix}", made, units="file")
+    assert not list(tmp_path.glob("bad*"))
     made.means[3, 1] = 1e8
     with pytest.raises(DataError, match="SPZ coordinates must be at most"):
         write_gaussians(tmp_path / "a.spz", made, units="file")
+    # more rows of harmonics than a palette
+    monkeypatch.setattr(sog, "PALETTE", 64)
+    made = model(n=200, degree=1)
+    write_gaussians(tmp_path / "a.sog", made, units="file")
+    back = read_gaussians(tmp_path / "a.sog")
+    assert 0.02 < differences(made, back)["rest"] < float(made.sh[:, 1:].max() - made.sh[:, 1:].min())
+    assert len(torch.unique(back.sh[:, 1:], dim=0)) <= 64
 
 
 @pytest.mark.parametrize("suffix", [s for s in SUFFIXES if s != ".ply"])
@@ -291,14 +287,6 @@ def test_side_files(suffix, tmp_path):
             read_gaussians(path)
     write_gaussians(path, made, Normalization())
     assert not side.exists() and read_gaussians(path).means.dtype == torch.float32
-
-
-@pytest.mark.parametrize("suffix", [".ply", ".glb"])
-def test_meshes_state_their_origin(tmp_path, suffix):
-    made = Mesh(np.eye(3), np.array([[0, 1, 2]], np.int32), np.zeros((3, 3), np.float32))
-    write_mesh(tmp_path / f"a{suffix}", made, None, np.array([441_000.0, 5_500_000.0, 130.0]))
-    start = (tmp_path / f"a{suffix}").read_bytes()[:1500]
-    assert (b"comment warpgs_origin 441000.0 5500000.0 130.0\n" if suffix == ".ply" else b'"warpgs_origin":[441000.0,') in start
 
 
 @pytest.mark.parametrize("name", FOREIGN)
@@ -852,7 +840,7 @@ def test_glb_holds_the_texture(tmp_path):
 
 @pytest.mark.parametrize("suffix", [".ply", ".glb"])
 def test_what_is_no_mesh_is_not_written(tmp_path, suffix):
-    """Numbers that are not finite, triangles of missing vertices, other suffixes."""
+    """Numbers that are not finite, triangles of missing vertices, other suffixes; what is written states its origin."""
     path = tmp_path / f"a{suffix}"
     bad = TETRAHEDRON.vertices.copy()
     bad[1, 1] = np.nan
@@ -863,3 +851,6 @@ def test_what_is_no_mesh_is_not_written(tmp_path, suffix):
     with pytest.raises(UsageError, match=r"use \.ply or \.glb"):
         write_mesh(tmp_path / f"a.obj{suffix[1:]}", TETRAHEDRON)
     assert not list(tmp_path.iterdir())
+    write_mesh(path, TETRAHEDRON, None, np.array([441_000.0, 5_500_000.0, 130.0]))
+    stated = b"comment warpgs_origin 441000.0 5500000.0 130.0\n" if suffix == ".ply" else b'"warpgs_origin":[441000.0,'
+    assert stated in path.read_bytes()[:1500]

@@ -239,10 +239,11 @@ def ran(folder, data: bytes, plain: bool = False, measured: bool = True) -> Tall
         (root / "a").write_bytes(b"ok")
         return [root / "a"]
 
-    target = Target(
-        "planted", prepare, read, (read,), nonsense=lambda found: "nonsense" if found == b"ok nonsense" else "",
-        unexplained=lambda before, after, good, found: "unexplained" if found == b"ok unexplained" else "",
-    )  # fmt: skip
+    def ends_with(word):
+        return lambda *found: word if isinstance(found[-1], bytes) and found[-1].endswith(word.encode()) else ""
+
+    judges = {word: ends_with(word) for word in ("nonsense", "unexplained")}
+    target = Target("planted", prepare, read, (read,), **judges)
     made = Worker(target, 0, folder, measured=measured)
     made.put = lambda index: ((folder / "a").write_bytes(data), (folder / "a", data, plain))[1]
     made.run(0)

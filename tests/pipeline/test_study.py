@@ -168,14 +168,6 @@ def finished(scene, tmp_path_factory):
     return request, run_study(request)
 
 
-def test_a_study_without_a_split_holds_a_view_out_and_its_fits_do_the_same(scene, capsys):
-    """A fit of its own would train on every view."""
-    wanted = dataclasses.replace(scene, split=None)
-    asked, _, split = study._place(wanted, "cpu")
-    assert split.test == ("004.png",) and "no --split given: 004.png is held out" in capsys.readouterr().out
-    assert read_scene(asked)[1] == split and asked.max_side == CPU_MAX_SIDE
-
-
 def metrics_of(request, variant, seed):
     return json.loads((run_folder(request, "still", variant, seed) / "metrics.json").read_text())
 
@@ -400,7 +392,7 @@ def fail(text):
     return job_of(text).name, "crashed", "its process ended"
 
 
-def test_requests_that_make_no_sense(scene, tmp_path):
+def test_requests_that_make_no_sense(scene, tmp_path, capsys):
     """Found out before anything is fitted."""
     both = {"a": A, "b": B}
     for words, scenes, variants, seeds in (
@@ -415,6 +407,11 @@ def test_requests_that_make_no_sense(scene, tmp_path):
     with pytest.raises(DataError, match="no view is held out"):
         run_study(StudyRequest((dataclasses.replace(scene, split="all"),), {"a": A, "b": B}, 1, tmp_path / "x", "cpu"))
     assert not (tmp_path / "x").exists()
+    # without a split a view is held out, in its fits too: a fit of its own would train on every view
+    wanted = dataclasses.replace(scene, split=None)
+    asked, _, split = study._place(wanted, "cpu")
+    assert split.test == ("004.png",) and "no --split given: 004.png is held out" in capsys.readouterr().out
+    assert read_scene(asked)[1] == split and asked.max_side == CPU_MAX_SIDE
 
 
 def test_command_compares_presets(scene, tmp_path, capsys, monkeypatch):
@@ -551,8 +548,8 @@ def test_forest_draws_every_seed_and_prints_every_interval():
     assert "no pair of runs to compare" in forest(Table("t", ("lpips",), {"a": {}, "b": {}}, one))
 
 
-def test_crops_find_where_pictures_differ():
-    """The largest disagreement first, the next one beside it, none overlapping."""
+def test_crops_find_where_pictures_differ_and_a_sheet_shows_them():
+    """The largest disagreement first, none overlapping; a sheet has columns of one width, colours kept, and boxes."""
     truth = np.zeros((40, 60, 3), np.float32)
     a, b = truth.copy(), truth.copy()
     a[30:36, 44:54] = 0.9
@@ -568,10 +565,6 @@ def test_crops_find_where_pictures_differ():
     many = crops(np.random.default_rng(0).random((20, 20)), 10, 10, 9)
     assert 1 <= len(many) <= 4
     assert all(abs(a - c) >= 10 or abs(b - d) >= 10 for i, (a, b) in enumerate(many) for c, d in many[:i])
-
-
-def test_sheet_shows_every_picture_and_its_crops():
-    """Columns of one width; a flat picture keeps its colour; boxes and frames have the colours of their crop."""
     colors = [(0.2, 0.4, 0.6), (0.8, 0.1, 0.3), (0.5, 0.5, 0.1)]
     cells = [(np.full((30, 40, 3), c, np.float32), f"{i}.00 dB") for i, c in enumerate(colors)]
     data = sheet(["a", "b" * 90, "photograph"], [("scene, view", cells, [(2, 3, 8, 6), (20, 10, 8, 6)])] * 2)

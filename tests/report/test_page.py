@@ -143,14 +143,6 @@ def test_names_from_files_cannot_become_markup(tmp_path):
     assert json.loads("".join(page.text("pre"))) == shown and "/me" not in text
 
 
-def test_parts_that_are_not_there_leave_no_empty_heading(tmp_path):
-    nothing = {key: [] for key in ("notes", "views", "curves", "pictures")} | {"sampling": None, "protocol": {}}
-    _, _, page = write(tmp_path / "report.html", scores=[["view"]], **nothing)
-    assert page.text("h2") == ["Details"] and not page.all("img") and not page.all("ul")
-    for held_out, words in ((True, "Held-out"), (False, "trained on")):
-        assert any(words in t for t in write(tmp_path / "report.html", held_out=held_out)[2].text("h2"))
-
-
 def test_what_nobody_acts_on_stands_in_the_last_section(tmp_path):
     """A new viewpoint and the overview open the page; then what to do, then the views, choices, details; nothing twice."""
     notes = [Task("remove blurred ones"), "every 8th view held out", Detail("memory: 14 MiB planned")]
@@ -161,6 +153,11 @@ def test_what_nobody_acts_on_stands_in_the_last_section(tmp_path):
     first, overview = page.all("img")[:2]
     assert (first["alt"], overview["alt"]) == ("a new viewpoint", "the Gaussians") and "data:image/webp" in first["src"]
     assert text.count("--aspect:1.33") == 2
+    nothing = {key: [] for key in ("notes", "views", "curves", "pictures")} | {"sampling": None, "protocol": {}}
+    _, _, page = write(tmp_path / "report.html", scores=[["view"]], **nothing)
+    assert page.text("h2") == ["Details"] and not page.all("img") and not page.all("ul")
+    for held_out, words in ((True, "Held-out"), (False, "trained on")):
+        assert any(words in t for t in write(tmp_path / "report.html", held_out=held_out)[2].text("h2"))
 
 
 @pytest.mark.parametrize("ys", [[0.0, 0.0, 0.0], [float("nan")] * 3, [1e-9, 2e-9, float("inf")], [-5e7, 0.0, 5e7]])

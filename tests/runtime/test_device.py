@@ -12,17 +12,6 @@ import pytest
 import torch
 
 from warpgs import device, folders, locks
-from warpgs.device import (
-    available_bytes,
-    choose_kernel_cache,
-    container_memory,
-    format_bytes,
-    in_background,
-    installed_bytes,
-    machine_memory,
-    parse_bytes,
-    wake_gpu,
-)
 from warpgs.errors import UsageError
 from warpgs.priors.networks import cache_folder
 
@@ -43,11 +32,11 @@ def test_results_keep_the_order_of_their_arguments_which_are_made_late():
         ahead.append(len(made) - len(ahead))
         return i + one
 
-    assert in_background(work, arguments(), 2) == [*range(1, 10)]
+    assert device.in_background(work, arguments(), 2) == [*range(1, 10)]
     assert max(ahead) <= 4
     with pytest.raises(ZeroDivisionError):
-        in_background(lambda i: 1 // i, ((1,), (0,)))
-    assert in_background(work, ()) == []
+        device.in_background(lambda i: 1 // i, ((1,), (0,)))
+    assert device.in_background(work, ()) == []
 
 
 # Sizes in bytes: what is read, what is refused, what is written.
@@ -70,7 +59,7 @@ class Driver:
 
 def woken():
     """Start the driver, and wait for the end of that."""
-    wake_gpu()
+    device.wake_gpu()
     for thread in threading.enumerate():
         if thread.name == "driver":
             thread.join()
@@ -116,12 +105,12 @@ cli.main(["fit", "scene"])
 
 def test_sizes_are_read_and_written():
     for text, size in {"2GiB": 2**31, "512 MB": 512 * 10**6, "1.5kib": 1536, ".5 TB": 5 * 10**11, "7B": 7}.items():
-        assert parse_bytes(text) == size
+        assert device.parse_bytes(text) == size
     for text in ("", "2", "-1GiB", "1e3MB", "0.1B", "2GiB!", "9" * 400 + "B", "٣GiB"):
         with pytest.raises(UsageError, match="memory limit"):
-            parse_bytes(text)
+            device.parse_bytes(text)
     sizes = {5: "5 B", 2048: "2 KiB", 3 * 2**20: "3.0 MiB", 2.5 * 2**30: "2.5 GiB", 2**41: "2.0 TiB"}
-    assert {n: format_bytes(n) for n in sizes} == sizes
+    assert {n: device.format_bytes(n) for n in sizes} == sizes
 
 
 # Memory and processor on systems that lack what this one has, by stand-ins for what they read.
@@ -163,22 +152,31 @@ def group(root, parts: str, **files):
 
 
 def test_this_machine_and_memory_that_torch_holds_unused(monkeypatch):
-    assert 2**28 < installed_bytes(CPU) < 2**46 and 2**20 < available_bytes(CPU) <= installed_bytes(CPU)
+    assert 2**28 < device.installed_bytes(CPU) < 2**46 and 2**20 < device.available_bytes(CPU) <= device.installed_bytes(CPU)
     assert 1 <= device.usable_cores() <= (os.cpu_count() or 1) and device.processor_name()
     # free on a CUDA device is what the driver says, and what torch has reserved and not given out
     for name, value in (("mem_get_info", (1000, 5000)), ("memory_reserved", 300), ("memory_allocated", 20)):
         monkeypatch.setattr(torch.cuda, name, lambda _, value=value: value)
-    assert available_bytes(torch.device("cuda", 0)) == 1280
+    assert device.available_bytes(torch.device("cuda", 0)) == 1280
 
 
 def test_without_control_groups(elsewhere):
     """What psutil says; a limit above the machine, or a file of nonsense, changes nothing."""
-    assert container_memory() is None and machine_memory() == (16 * GIB, 10 * GIB)
-    assert (installed_bytes(CPU), available_bytes(CPU)) == (16 * GIB, 10 * GIB)
+    assert device.container_memory() is None and device.machine_memory() == (16 * GIB, 10 * GIB)
+    assert (device.installed_bytes(CPU), device.available_bytes(CPU)) == (16 * GIB, 10 * GIB)
     group(elsewhere, "", memory__max=64 * GIB, memory__current=0)
-    assert machine_memory() == (16 * GIB, 10 * GIB)
+    assert device.machine_memory() == (16 * GIB, 10 * GIB)
     group(elsewhere, "", memory__max="-7 or so")
-    assert container_memory() is None
+    assert device.container_memory() is None
+    # limits of version 1: none is a large number; the group's path may lie outside of what the container sees
+    (elsewhere / "proc").write_text("4:cpu,memory:/docker/x\n1:name=systemd:/\n0::/\n", "utf-8")
+    none = {"memory__limit_in_bytes": 2**63 - 4096, "memory__usage_in_bytes": GIB}
+    group(elsewhere, "memory", **none)
+    assert device.container_memory() is None
+    group(elsewhere, "memory", memory__limit_in_bytes=2 * GIB, memory__stat=f"total_inactive_file {GIB // 2}")
+    assert device.machine_memory() == (2 * GIB, 3 * GIB // 2)
+    group(elsewhere, "memory/docker/x", memory__limit_in_bytes=GIB)  # what is used is not said
+    assert device.machine_memory() == (GIB, GIB)
 
 
 def test_limits_of_version_2(elsewhere):
@@ -187,11 +185,11 @@ def test_limits_of_version_2(elsewhere):
     group(elsewhere, "", memory__stat="anon 5")  # the root has no limit file
     group(elsewhere, "a", memory__max=4 * GIB, memory__current=3 * GIB, memory__stat=f"anon 1\ninactive_file {GIB}")
     group(elsewhere, "a/b", memory__max="max", memory__current=1)
-    assert container_memory() == machine_memory() == (4 * GIB, 2 * GIB)
+    assert device.container_memory() == device.machine_memory() == (4 * GIB, 2 * GIB)
     group(elsewhere, "a/b", memory__max=3 * GIB, memory__current=GIB, memory__stat="")
-    assert machine_memory() == (3 * GIB, 2 * GIB)
+    assert device.machine_memory() == (3 * GIB, 2 * GIB)
     group(elsewhere, "a", memory__current=6 * GIB)
-    assert machine_memory() == (3 * GIB, 0)
+    assert device.machine_memory() == (3 * GIB, 0)
 
 
 @pytest.mark.parametrize("own", ["0::/\n", "0::/../elsewhere\n", "", "odd\n0::\n", None])
@@ -200,19 +198,7 @@ def test_the_root_of_a_container_is_its_own_group(elsewhere, own):
     if own is not None:
         (elsewhere / "proc").write_text(own, "utf-8")
     group(elsewhere, "", memory__max=GIB, memory__current=2**20)
-    assert machine_memory() == (GIB, GIB - 2**20)
-
-
-def test_limits_of_version_1(elsewhere):
-    """No limit is a large number; the group's path may lie outside of what the container sees."""
-    (elsewhere / "proc").write_text("4:cpu,memory:/docker/x\n1:name=systemd:/\n0::/\n", "utf-8")
-    none = {"memory__limit_in_bytes": 2**63 - 4096, "memory__usage_in_bytes": GIB}
-    group(elsewhere, "memory", **none)
-    assert container_memory() is None
-    group(elsewhere, "memory", memory__limit_in_bytes=2 * GIB, memory__stat=f"total_inactive_file {GIB // 2}")
-    assert machine_memory() == (2 * GIB, 3 * GIB // 2)
-    group(elsewhere, "memory/docker/x", memory__limit_in_bytes=GIB)  # what is used is not said
-    assert machine_memory() == (GIB, GIB)
+    assert device.machine_memory() == (GIB, GIB - 2**20)
 
 
 REFUSALS = [PermissionError("/proc"), RuntimeError("host_statistics64"), None]
@@ -222,12 +208,12 @@ REFUSALS = [PermissionError("/proc"), RuntimeError("host_statistics64"), None]
 def test_a_system_that_says_nothing(elsewhere, monkeypatch, capsys, error):
     """A stated amount is assumed, with one line; a container's limit still counts."""
     monkeypatch.setitem(sys.modules, "psutil", None if error is None else psutil_like(error, total=GIB))
-    assert machine_memory() is None
-    assert [available_bytes(CPU), available_bytes(CPU), installed_bytes(CPU)] == [device.ASSUMED_BYTES] * 3
+    assert device.machine_memory() is None
+    assert [device.available_bytes(CPU), device.available_bytes(CPU), device.installed_bytes(CPU)] == [device.ASSUMED_BYTES] * 3
     said = capsys.readouterr().err
     assert said.count("\n") == 1 and "2 GiB are assumed" in said
     group(elsewhere, "", memory__max=GIB, memory__current=2**20)
-    assert available_bytes(CPU) == GIB - 2**20 and not capsys.readouterr().err
+    assert device.available_bytes(CPU) == GIB - 2**20 and not capsys.readouterr().err
 
 
 def test_processors(elsewhere, monkeypatch):
@@ -331,7 +317,7 @@ def test_a_user_that_the_system_does_not_know(python, home, reason):
 
 def chosen(monkeypatch, folder) -> tuple[Path, str]:
     monkeypatch.setenv("WARP_CACHE_PATH", str(folder))
-    return choose_kernel_cache()
+    return device.choose_kernel_cache()
 
 
 def filled_cache(folder: Path) -> Path:
@@ -346,7 +332,7 @@ def test_a_sound_folder_is_used(monkeypatch, tmp_path):
     """It is made for this user alone; one that the user's program or Warp has set comes first."""
     assert chosen(monkeypatch, tmp_path / "new" / "cache") == ((tmp_path / "new" / "cache").resolve(), "")
     assert os.name == "nt" or (tmp_path / "new" / "cache").stat().st_mode & 0o777 == 0o700
-    assert choose_kernel_cache(str(tmp_path / "mine")) == ((tmp_path / "mine").resolve(), "")
+    assert device.choose_kernel_cache(str(tmp_path / "mine")) == ((tmp_path / "mine").resolve(), "")
     monkeypatch.delattr(os, "getuid", raising=False)  # where files have no owners nothing is refused
     tmp_path.chmod(0o777)
     assert chosen(monkeypatch, tmp_path / "cache") == ((tmp_path / "cache").resolve(), "")
@@ -420,7 +406,7 @@ def test_no_folder_is_ever_called_tilde(monkeypatch, tmp_path):
         assert "an unknown home folder" in chosen(monkeypatch, "~/k")[1]
         monkeypatch.delenv("WARP_CACHE_PATH")
         monkeypatch.delenv("LOCALAPPDATA", raising=False)
-        assert folders.cache_home() is None and "no home" in choose_kernel_cache()[1]
+        assert folders.cache_home() is None and "no home" in device.choose_kernel_cache()[1]
     homes(tmp_path / "home")
     monkeypatch.setenv("WARPGS_CACHE", "~/maps")  # of another cache, that of the networks' maps
     assert cache_folder() == tmp_path / "home" / "maps"
@@ -436,7 +422,7 @@ def test_the_place_on_each_system(monkeypatch, tmp_path, system):
     for name in ("XDG_CACHE_HOME", "LOCALAPPDATA", "WARP_CACHE_PATH"):
         monkeypatch.delenv(name, raising=False)
     wanted = {"linux": ".cache/warp", "darwin": "Library/Caches/warp", "win32": "AppData/Local/NVIDIA/warp/Cache"}[system]
-    assert choose_kernel_cache() == ((tmp_path / wanted).resolve(), "")
+    assert device.choose_kernel_cache() == ((tmp_path / wanted).resolve(), "")
 
 
 # Idle threads of OpenMP: they sleep where warpgs is imported first, and a warning says so where they do not.

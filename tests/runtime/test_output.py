@@ -19,16 +19,6 @@ from warpgs.app import doctor
 from warpgs.app.cli import main
 from warpgs.export.ply import read_ply
 from warpgs.pipeline.run.folder import load_checkpoint
-from warpgs.process import (
-    CarefulStream,
-    answer,
-    careful_output,
-    hidden_stderr,
-    open_missing_descriptors,
-    output_to,
-    printable,
-    say,
-)
 from warpgs.report.progress import EventLog
 from warpgs.synthetic.demo import split_spec, write_demo
 
@@ -141,18 +131,18 @@ def test_tables_answers_and_errors_of_the_program_itself(monkeypatch, capsys):
         assert capsys.readouterr().err.count("stdout cannot be written") == (code == 4)
     monkeypatch.setattr(sys, "stdout", Broken(0, errno.EPIPE))
     monkeypatch.setattr(process, "_is_lost", False)
-    say("a line")
-    say("a line")
+    process.say("a line")
+    process.say("a line")
     assert capsys.readouterr().err.count("\n") == 1
     with pytest.raises(BrokenPipeError):
-        answer("a line")
-    with careful_output(False), pytest.raises(TypeError):
+        process.answer("a line")
+    with process.careful_output(False), pytest.raises(TypeError):
         sys.stdout.write(b"bytes")
     stream = io.TextIOWrapper(io.BytesIO(), "ascii")
     with pytest.raises(UnicodeEncodeError):
-        CarefulStream(stream).write("é")
+        process.CarefulStream(stream).write("é")
     stream.close()
-    careful = CarefulStream(stream)
+    careful = process.CarefulStream(stream)
     careful.write("a")
     careful.flush()
     assert isinstance(careful.failure, ValueError) and "closed file" in capsys.readouterr().err
@@ -175,7 +165,7 @@ sys.exit(0 if file > 2 and os.get_inheritable(1) and not os.fstat(file).st_size 
 def test_no_file_becomes_stdout_or_stderr(tmp_path, closed):
     code = CLOSED.format(closed=closed, path=str(tmp_path / "file"))
     assert subprocess.run([sys.executable, "-c", code], check=False, capture_output=True).returncode == 0
-    open_missing_descriptors()  # nothing to do
+    process.open_missing_descriptors()  # nothing to do
 
 
 def test_native_output_without_streams(monkeypatch, tmp_path):
@@ -183,7 +173,7 @@ def test_native_output_without_streams(monkeypatch, tmp_path):
     for stream in (None, Broken(0, errno.ENOSPC)):
         monkeypatch.setattr(sys, "stdout", stream)
         monkeypatch.setattr(sys, "stderr", stream)
-        with (tmp_path / "log").open("ab") as file, hidden_stderr(), output_to(file.fileno()):
+        with (tmp_path / "log").open("ab") as file, process.hidden_stderr(), process.output_to(file.fileno()):
             os.write(1, b"native\n")
     assert (tmp_path / "log").read_text() == 2 * "native\n"
 
@@ -249,9 +239,9 @@ NASTY = "\x1b]0;owned\x07\x1b[2Ja\rb\nc\x9b31m\u202ed\u2066e\x7f\u2028f\ud800"
 
 def test_what_a_terminal_would_obey_is_printed_as_codes():
     """ESC, BEL, CR, line ends, C1, DEL, changes of direction, halves of characters; letters of all scripts stay."""
-    assert printable(NASTY) == r"\x1b]0;owned\x07\x1b[2Ja\rb\nc\x9b31m\u202ed\u2066e\x7f\u2028f\ud800"
+    assert process.printable(NASTY) == r"\x1b]0;owned\x07\x1b[2Ja\rb\nc\x9b31m\u202ed\u2066e\x7f\u2028f\ud800"
     for text in ("Straße, 写真 № 1", "می‌خواهم", "👩‍👩‍👧", "e\u0301 \u2013 \u201cx\u201d"):
-        assert printable(text) == text
+        assert process.printable(text) == text
     # one file alone calls `print` or writes to stdout or stderr; a table of the doctor goes through rich, cell by cell
     for path in (ROOT / "warpgs").rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_text("utf-8"))):
@@ -265,7 +255,7 @@ def test_letters_that_a_terminal_does_not_have(monkeypatch, encoding):
     raw = io.BytesIO()
     stream = io.TextIOWrapper(raw, encoding)
     monkeypatch.setattr(sys, "stdout", stream)
-    say(f"写真{NASTY}")
+    process.say(f"写真{NASTY}")
     wanted = "写真" if encoding == "utf-8" else r"\u5199\u771f"
     assert raw.getvalue().decode(encoding).startswith(wanted) and b"\x1b" not in raw.getvalue()
 

@@ -175,7 +175,7 @@ def test_the_first_view_is_that_of_the_page_and_a_narrow_window_shows_the_whole_
         assert state.fov == pytest.approx(2 * np.arctan(side / 2))
 
 
-def test_a_browser_gets_the_image_that_it_asks_for(window):
+def test_a_browser_gets_the_image_that_it_asks_for(window, monkeypatch):
     camera = window.content.model.scene_cameras[window.content.model.train[0]]
     sent = []
     size = {"image_width": 64, "image_height": 48, "update_timestamp": 1.0}
@@ -189,6 +189,15 @@ def test_a_browser_gets_the_image_that_it_asks_for(window):
     window.panel.kind.value = windows.GAUSSIANS
     window._render_for(client)
     assert sent[-1].shape == (2, 2, 3) and not window.panel._note.visible
+    panel, told = window.panel, []
+    camera = window.content.model.scene_cameras[window.content.model.train[0]]
+    monkeypatch.setattr(panel, "keyframes", [])
+    monkeypatch.setattr(panel, "explain", told.append)
+    monkeypatch.setattr(window, "camera_of", lambda client: camera)
+    (append,) = button(window, "add this camera")._impl.update_cb
+    for _ in range(windows.MAX_KEYFRAMES + 3):
+        append(SimpleNamespace(client=None))
+    assert len(panel.keyframes) == windows.MAX_KEYFRAMES and told == ["a path has at most 1,000 keyframes"] * 3
 
 
 def test_an_unknown_wish_ends_no_thread(window, monkeypatch):
@@ -210,18 +219,6 @@ def test_an_unknown_wish_ends_no_thread(window, monkeypatch):
         window._wake.set()
         assert said_all.wait(60) and window._thread.is_alive()
     assert set(told) == {"no image: KeyError: 'unknown'"}
-
-
-def test_keyframes_are_bounded(window, monkeypatch):
-    panel, told = window.panel, []
-    camera = window.content.model.scene_cameras[window.content.model.train[0]]
-    monkeypatch.setattr(panel, "keyframes", [])
-    monkeypatch.setattr(panel, "explain", told.append)
-    monkeypatch.setattr(window, "camera_of", lambda client: camera)
-    (append,) = button(window, "add this camera")._impl.update_cb
-    for _ in range(windows.MAX_KEYFRAMES + 3):
-        append(SimpleNamespace(client=None))
-    assert len(panel.keyframes) == windows.MAX_KEYFRAMES and told == ["a path has at most 1,000 keyframes"] * 3
 
 
 @pytest.mark.skipif(os.name == "nt", reason="links need a right that users often lack")
