@@ -112,10 +112,7 @@ def test_points_vary_one_axis_at_a_time_and_along_the_diagonal(monkeypatch):
     monkeypatch.setattr(timing, "_timed", lambda work, device: (calls.append(1) or 3000.0, None))
     (row,) = timing.measure_in_turn([lambda: None], CPU, limit_ms=2000.0)
     assert row["warm_up_ms"] == 3000.0 and "median_ms" not in row and len(calls) == 2
-
-
-def test_disturbed_rows_are_known_and_give_way_to_faster_ones():
-    """Per op and sizes; all rows of a second try take the place of slower ones, and of nothing else."""
+    # disturbed rows are known per op and sizes, and give way to faster ones of a second try, with nothing else
     bench = Bench(CPU, 3, None, print)
     peer = {"program": "peer"}
     bench._keep([row(100, 2.0, others_cores=0.9), row(100, 6.0, **peer, others_cores=0.9)])

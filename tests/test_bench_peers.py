@@ -35,10 +35,7 @@ def test_ours_and_plain_torch_give_the_same_gradients():
         a, b = (drawing.named_gradients(weights) for drawing in (ours, plain))
         assert list(a) == list(g.tensors()) and ours.image().shape == (16, 20, 3)
         assert all(a[n].shape == t.shape and (a[n] - b[n]).norm() < 1e-7 * b[n].norm() for n, t in g.tensors().items())
-
-
-def test_a_layout_of_its_own_is_turned_into_ours():
-    """Channels first, coefficients in two tensors, opacities in a column: images and gradients are ours."""
+    # channels first, coefficients in two tensors, opacities in a column: images and gradients are ours
     g, camera = inputs.gaussians(30, CPU), inputs.camera(20, 16, CPU)
     t = {name: v.detach() for name, v in g.tensors().items()}
     leaves = t | {"logit_opacities": t["logit_opacities"][:, None], "sh0": t["sh"][:, :1], "sh_rest": t["sh"][:, 1:]}

@@ -126,10 +126,7 @@ def test_random_cameras_stay_near_the_training_cameras(module):
         assert float(torch.det(R)) > 0 and float((centers + R.T @ t).norm(dim=1).min()) < 1e-5
     near, far = (module.random_cameras(views, n, 50, torch.Generator().manual_seed(1))[:, :3, 3] for n in (0.1, 1.0))
     assert far.std() > near.std()
-
-
-def test_scenes_that_it_cannot_fit_are_refused(module):
-    """One view has no neighbour; transparent views have a random background, which two renders would not share."""
+    # one view has no neighbour; transparent views have a random background, which two renders would not share
     with pytest.raises(UsageError, match="at least two opaque"):
         fit(module, views=1)
     config = fit(module).config

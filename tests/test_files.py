@@ -546,10 +546,7 @@ def test_another_command_leaves_what_is_held_and_removes_what_a_killed_one_left(
     with hold_folder(results):
         pass
     assert not list(results.iterdir()) and not list(system.iterdir())
-
-
-def test_a_folder_is_held_until_the_last_process_in_it_has_ended(places):
-    """A child that works in it may outlive its parent for a moment."""
+    # a child that works in a folder may outlive its parent for a moment: it is held until the last process has ended
     _, system = places
     read, write = os.pipe()
     with started(ORPHAN, stdin=read) as process:

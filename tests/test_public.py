@@ -220,10 +220,6 @@ def test_what_is_gone_names_its_new_place(monkeypatch):
     assert version.__version__ and not hasattr(version, "Other")
     with pytest.raises(ModuleNotFoundError, match=r"No module named 'warpgs\.never_was'"):
         importlib.import_module("warpgs.never_was")
-
-
-def test_the_changelog_lists_old_imports():
-    """A row for each."""
     table = (ROOT.parent / "CHANGELOG.md").read_text("utf-8").split("## New names of old imports")[1]
     rows = re.findall(r"^\| `(warpgs\.\S+)` \| `(\S+)` \|$", table, re.MULTILINE)
     assert rows == [(f"{module}.{name}", new) for module, name, new in OLD]

@@ -76,6 +76,20 @@ def test_every_package_stands_in_the_table_with_its_use():
     for name, (licence, _) in table().items():
         assert set(re.split(r" AND | OR | WITH ", licence)) <= ALLOWED | COPYLEFT.get(name, set()), name
     assert {name for name, (_, use) in table().items() if use == "poses"} == COPYLEFT.keys()
+    # installed packages say the same by the field that the index shows; long texts hold licences of compiled parts
+    checked = 0
+    for name, (licence, _) in table().items():
+        try:
+            said = importlib.metadata.metadata(name)
+        except importlib.metadata.PackageNotFoundError:  # of another system, or of the extra
+            continue
+        short = [t for t in said.get_all("License") or [] if len(t) < 80]
+        classes = [c for c in said.get_all("Classifier") or [] if c.startswith("License")]
+        assert name in EXPLAINED or not [t for t in [*short, *classes] if FORBIDDEN.search(t)], name
+        expression = said.get("License-Expression")
+        assert expression in (None, licence), name
+        checked += 1
+    assert checked > 40
 
 
 def test_actions_and_images_are_named_by_what_they_contain():
@@ -99,20 +113,3 @@ def test_a_skipped_test_fails_where_all_extras_are_said_to_be_installed(monkeypa
         monkeypatch.setenv("WARPGS_EXTRAS_INSTALLED", value)
         report = SimpleNamespace(skipped=True, outcome="skipped", longrepr=("a_test.py", 3, f"Skipped: {reason}"))
         assert without_missing_extras(report).outcome == outcome
-
-
-def test_installed_packages_say_the_same():
-    """By the field that the index shows; long texts hold the licences of compiled parts, which the document speaks of."""
-    checked = 0
-    for name, (licence, _) in table().items():
-        try:
-            said = importlib.metadata.metadata(name)
-        except importlib.metadata.PackageNotFoundError:  # of another system, or of the extra
-            continue
-        short = [t for t in said.get_all("License") or [] if len(t) < 80]
-        classes = [c for c in said.get_all("Classifier") or [] if c.startswith("License")]
-        assert name in EXPLAINED or not [t for t in [*short, *classes] if FORBIDDEN.search(t)], name
-        expression = said.get("License-Expression")
-        assert expression in (None, licence), name
-        checked += 1
-    assert checked > 40

@@ -95,6 +95,15 @@ def test_variables_that_are_no_numbers_are_named_and_a_process_alone_joins_nobod
             monkeypatch.setenv(key, set_to)
         with pytest.raises(UsageError, match=f"the environment variable {name} must be"):
             ranks.join("cpu")
+    # interfaces are named for ranks of this machine alone, and not over those that the user named
+    for name in ("GLOO_SOCKET_IFNAME", "NCCL_SOCKET_IFNAME"):
+        monkeypatch.setenv(name, "")
+        monkeypatch.delenv(name)
+    assert ranks._stay_home("192.0.2.1") is None and "GLOO_SOCKET_IFNAME" not in os.environ
+    monkeypatch.setenv("NCCL_SOCKET_IFNAME", "mine")
+    assert ranks._stay_home("127.0.0.1") == "127.0.0.1"
+    if sys.platform != "win32":
+        assert os.environ["GLOO_SOCKET_IFNAME"] == loopback_interface() and os.environ["NCCL_SOCKET_IFNAME"] == "mine"
 
 
 class Store(dict):
@@ -247,18 +256,6 @@ def test_ranks_of_one_machine_listen_there_alone():
         assert code == 0, errors
         (line,) = out.splitlines()
         assert json.loads(line) and all(is_loopback(ip) for ip, _ in json.loads(line)), line
-
-
-def test_another_host_keeps_its_interfaces(monkeypatch):
-    """Interfaces are named for ranks of this machine alone, and not over those that the user named."""
-    for name in ("GLOO_SOCKET_IFNAME", "NCCL_SOCKET_IFNAME"):
-        monkeypatch.setenv(name, "")
-        monkeypatch.delenv(name)
-    assert ranks._stay_home("192.0.2.1") is None and "GLOO_SOCKET_IFNAME" not in os.environ
-    monkeypatch.setenv("NCCL_SOCKET_IFNAME", "mine")
-    assert ranks._stay_home("127.0.0.1") == "127.0.0.1"
-    if sys.platform != "win32":
-        assert os.environ["GLOO_SOCKET_IFNAME"] == loopback_interface() and os.environ["NCCL_SOCKET_IFNAME"] == "mine"
 
 
 @pytest.mark.parametrize("rank, shown", [("0", ["starting eval"]), ("1", [])])

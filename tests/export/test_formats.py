@@ -218,6 +218,27 @@ def test_axes_and_nodes_on_disk(tmp_path):
     back = read_gaussians(tmp_path / "a.glb").means
     wanted = made.means.double() + torch.tensor([-441_000.25, -5_500_000.5, 130.0], dtype=torch.float64)
     assert back.dtype == torch.float64 and torch.allclose(back, wanted, rtol=0, atol=1e-6)
+    # scales and positions may be plain integers; programs without Gaussians show points in linear colours, with opacities
+    path, made = tmp_path / "a.glb", arrays_of(model(5, 1))
+    document, body = gltf._split(path, encoded(".glb"))
+    color = document["accessors"][document["meshes"][0]["primitives"][0]["attributes"]["COLOR_0"]]
+    assert (color["componentType"], color["type"], color["normalized"]) == (5123, "VEC4", True)
+    view = document["bufferViews"][color["bufferView"]]
+    colors = np.frombuffer(body, "<u2", 20, view["byteOffset"]).reshape(5, 4) / 65535
+    wanted = linear(0.28209479 * made["sh"][:, 0] + 0.5)
+    assert np.allclose(colors, np.column_stack([wanted, base.sigmoid(made["logit_opacities"])]), atol=1e-5)
+
+    def change(document):
+        document["accessors"][2] |= {"componentType": 5121}
+        document["accessors"][0] |= {"componentType": 5122}
+        document["extensionsRequired"] = ["KHR_mesh_quantization"]
+
+    path.write_bytes(with_document(change))
+    scales, means = body[document["bufferViews"][2]["byteOffset"] :][:15], body[document["bufferViews"][0]["byteOffset"] :][:30]
+    back = read_gaussians(path)
+    lengths = np.frombuffer(scales, "u1").reshape(5, 3).astype("f4")
+    assert np.allclose(back.log_scales.exp(), np.maximum(lengths, gltf._TINY), rtol=1e-5)
+    assert np.array_equal(back.means, np.frombuffer(means, "<i2").reshape(5, 3) * [-1, -1, 1])
 
 
 def test_names_say_the_format_and_bad_numbers_and_long_palettes(tmp_path, monkeypatch):
@@ -369,7 +390,7 @@ def test_gaussians_with_bad_numbers_are_left_out_of_any_format(suffix, tmp_path)
         refused(path, with_a_bad_one(suffix, own=True)[0], "is not finite")
 
 
-def test_counts_beyond_the_size_are_refused(tmp_path):
+def test_counts_chunks_and_numbers_that_lie(tmp_path):
     head = spz.HEADER.pack(spz.MAGIC, 3, 2**31, 3, 12, 0, 0)
     refused(tmp_path / "a.spz", gzip.compress(head + bytes(1000)), "2147483648 Gaussians in")
     more = gzip.compress(spz.HEADER.pack(spz.MAGIC, 3, 5, 0, 12, 0, 0) + bytes(10**6))
@@ -386,6 +407,26 @@ def test_counts_beyond_the_size_are_refused(tmp_path):
     lines = ["ply", "format binary_little_endian 1.0", "element chunk 99999999999", "property float min_x"]
     lines += ["element vertex 1", "property uint packed_position", "end_header\n"]
     refused(tmp_path / "a.compressed.ply", "\n".join(lines).encode(), "truncated")
+    # a chunk's size beyond the end, a second chunk of another kind, NaN, an axis of negative length, a rotation of zero length
+    data = bytearray(encoded(".glb"))
+    start = 20 + struct.unpack_from("<I", data, 12)[0]
+    size = struct.unpack_from("<I", data, start)[0]
+    for chunk, match in (((size + 1, gltf.BINARY_CHUNK), "is truncated"), ((size, 7), "is not binary")):
+        struct.pack_into("<II", data, start, *chunk)
+        refused(tmp_path / "a.glb", bytes(data), match)
+    document = json.loads(encoded(".gltf"))
+    head, _, text = document["buffers"][0]["uri"].partition(",")
+    body = struct.pack("<f", float("nan")) + base64.b64decode(text)[4:]
+    document["buffers"][0]["uri"] = head + "," + base64.b64encode(body).decode()
+    refused(tmp_path / "a.gltf", json.dumps(document).encode(), "means of Gaussian 0 is not finite")
+    row = np.frombuffer(encoded(".splat", degree=0), base._ROW).copy()
+    row["scale"][2, 1] = -1
+    refused(tmp_path / "a.splat", row.tobytes(), "axis of Gaussian 2 has a negative length")
+    made = arrays_of(model(5, 1))
+    made["quats"][2] = 0
+    base.transform_in_place(made, placed(TURN)[:3, :3], np.zeros(3))
+    with pytest.raises(DataError, match="the rotation of Gaussian 2 has zero length"):
+        gaussians_of(tmp_path, made)
 
 
 def repacked(change):
@@ -525,53 +566,6 @@ def test_nodes_place_gaussians(nodes, roots, wanted, tmp_path):
     assert len(back) == 5 * len(wanted)
 
 
-def test_integers_and_points_of_gltf(tmp_path):
-    """Scales and positions may be plain integers; programs without Gaussians show points in linear colours, with opacities."""
-    path, made = tmp_path / "a.glb", arrays_of(model(5, 1))
-    document, body = gltf._split(path, encoded(".glb"))
-    color = document["accessors"][document["meshes"][0]["primitives"][0]["attributes"]["COLOR_0"]]
-    assert (color["componentType"], color["type"], color["normalized"]) == (5123, "VEC4", True)
-    view = document["bufferViews"][color["bufferView"]]
-    colors = np.frombuffer(body, "<u2", 20, view["byteOffset"]).reshape(5, 4) / 65535
-    wanted = linear(0.28209479 * made["sh"][:, 0] + 0.5)
-    assert np.allclose(colors, np.column_stack([wanted, base.sigmoid(made["logit_opacities"])]), atol=1e-5)
-
-    def change(document):
-        document["accessors"][2] |= {"componentType": 5121}
-        document["accessors"][0] |= {"componentType": 5122}
-        document["extensionsRequired"] = ["KHR_mesh_quantization"]
-
-    path.write_bytes(with_document(change))
-    scales, means = body[document["bufferViews"][2]["byteOffset"] :][:15], body[document["bufferViews"][0]["byteOffset"] :][:30]
-    back = read_gaussians(path)
-    lengths = np.frombuffer(scales, "u1").reshape(5, 3).astype("f4")
-    assert np.allclose(back.log_scales.exp(), np.maximum(lengths, gltf._TINY), rtol=1e-5)
-    assert np.array_equal(back.means, np.frombuffer(means, "<i2").reshape(5, 3) * [-1, -1, 1])
-
-
-def test_chunks_and_numbers_that_lie(tmp_path):
-    """A size beyond the end, a second chunk of another kind, NaN, an axis of negative length, a rotation of zero length."""
-    data = bytearray(encoded(".glb"))
-    start = 20 + struct.unpack_from("<I", data, 12)[0]
-    size = struct.unpack_from("<I", data, start)[0]
-    for chunk, match in (((size + 1, gltf.BINARY_CHUNK), "is truncated"), ((size, 7), "is not binary")):
-        struct.pack_into("<II", data, start, *chunk)
-        refused(tmp_path / "a.glb", bytes(data), match)
-    document = json.loads(encoded(".gltf"))
-    head, _, text = document["buffers"][0]["uri"].partition(",")
-    body = struct.pack("<f", float("nan")) + base64.b64decode(text)[4:]
-    document["buffers"][0]["uri"] = head + "," + base64.b64encode(body).decode()
-    refused(tmp_path / "a.gltf", json.dumps(document).encode(), "means of Gaussian 0 is not finite")
-    row = np.frombuffer(encoded(".splat", degree=0), base._ROW).copy()
-    row["scale"][2, 1] = -1
-    refused(tmp_path / "a.splat", row.tobytes(), "axis of Gaussian 2 has a negative length")
-    made = arrays_of(model(5, 1))
-    made["quats"][2] = 0
-    base.transform_in_place(made, placed(TURN)[:3, :3], np.zeros(3))
-    with pytest.raises(DataError, match="the rotation of Gaussian 2 has zero length"):
-        gaussians_of(tmp_path, made)
-
-
 # Files that say how they are rendered: antialiased or not, in our words and in those of other programs.
 
 
@@ -674,7 +668,7 @@ def own(tmp_path, monkeypatch):
 
 
 def test_one_file_adds_a_format(own, tmp_path, capsys):
-    """To convert to it and back, with options of its own; the bits are those that were stored."""
+    """To convert to it and back, with options of its own, bit for bit; Python takes a class, an object or its place."""
     spec, flags = f"{own}:Archive", ["--no-clean"]
     assert main(["convert", str(tmp_path / "a.ply"), str(tmp_path / "b.mine"), "--format", spec, *flags]) == 0
     assert main(["convert", str(tmp_path / "a.ply"), str(tmp_path / "b.spz"), "--spz.version", "2", *flags]) == 0
@@ -688,9 +682,6 @@ def test_one_file_adds_a_format(own, tmp_path, capsys):
         main(["convert", "--format", spec, "--help"])
     said = " ".join(capsys.readouterr().out.replace("│", "").split())
     assert "--archive.packed" in said and "Make the archive smaller, in more time" in said
-
-
-def test_python_takes_a_class_an_object_or_its_place(own, tmp_path):
     cls = FORMATS.load(f"{own}:Archive")
     for i, choice in enumerate((cls, cls(), cls(cls.Config(packed=True)), f"{own}:Archive")):
         write_gaussians(tmp_path / f"{i}.mine", cloud(40), units="file", format=choice)

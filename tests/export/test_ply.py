@@ -65,6 +65,18 @@ def test_layout_on_disk(tmp_path):
     rest = [3, 6, 9, 4, 7, 10, 5, 8, 11]
     want = [1, 2, 3, 0, 0, 0, 0, 1, 2, *rest, 2.5, -1, -2, -3, 0.5, 0.1, 0.2, 0.3]
     assert body == struct.pack(f"<{len(want)}f", *want)
+    # unknown properties and elements are ignored
+    path = tmp_path / "a.ply"
+    lines = ["comment end_header is not here", "obj_info x", "element camera 2", "property double f", "property uchar g",
+             "element vertex 1", "property uchar red", *PROPERTIES, "property double error",
+             "element face 1", "property list uchar int vertex_indices"]  # fmt: skip
+    path.write_bytes(ply(lines, b"\0" * 18 + b"\7" + ROW + b"\0" * 8 + b"\3" + b"\0" * 12))
+    model = read_ply(path)
+    assert model.means.tolist() == [[1, 2, 3]] and model.sh.tolist() == [[[4, 5, 6]]]
+    assert model.quats.tolist() == [[11, 12, 13, 14]] and model.logit_opacities.tolist() == [7]
+    lines = ["element vertex 1", *(f"property double {n}" for n in reversed(NAMES))]  # any order, doubles, CRLF
+    path.write_bytes(ply(lines).replace(b"\n", b"\r\n") + np.arange(14, 0, -1, dtype="<f8").tobytes())
+    assert read_ply(path).means.tolist() == [[1, 2, 3]] and read_ply(path).log_scales.tolist() == [[8, 9, 10]]
 
 
 def test_file_coordinates_are_restored_in_float64(tmp_path):
@@ -150,20 +162,6 @@ def test_a_failing_disk_leaves_the_old_file(tmp_path, monkeypatch, fsync, words)
     with pytest.raises(ResourceError, match=words):
         write_ply(path, make(), Normalization())
     assert path.read_bytes() == b"old" and list(tmp_path.iterdir()) == [path]
-
-
-def test_unknown_properties_and_elements_are_ignored(tmp_path):
-    path = tmp_path / "a.ply"
-    lines = ["comment end_header is not here", "obj_info x", "element camera 2", "property double f", "property uchar g",
-             "element vertex 1", "property uchar red", *PROPERTIES, "property double error",
-             "element face 1", "property list uchar int vertex_indices"]  # fmt: skip
-    path.write_bytes(ply(lines, b"\0" * 18 + b"\7" + ROW + b"\0" * 8 + b"\3" + b"\0" * 12))
-    model = read_ply(path)
-    assert model.means.tolist() == [[1, 2, 3]] and model.sh.tolist() == [[[4, 5, 6]]]
-    assert model.quats.tolist() == [[11, 12, 13, 14]] and model.logit_opacities.tolist() == [7]
-    lines = ["element vertex 1", *(f"property double {n}" for n in reversed(NAMES))]  # any order, doubles, CRLF
-    path.write_bytes(ply(lines).replace(b"\n", b"\r\n") + np.arange(14, 0, -1, dtype="<f8").tobytes())
-    assert read_ply(path).means.tolist() == [[1, 2, 3]] and read_ply(path).log_scales.tolist() == [[8, 9, 10]]
 
 
 @pytest.mark.parametrize("form", ["ascii", "binary_big_endian", "binary_little_endian"])

@@ -113,7 +113,7 @@ def with_digest(data: bytes) -> bytes:
 
 
 def within_digest(change: Change) -> Change:
-    return lambda data, rng: (lambda body: body + hashlib.sha256(body).digest())(change(data[:-32], rng))
+    return lambda data, rng: with_digest(change(data[:-32], rng) + bytes(32))
 
 
 def model_files(root: Path) -> list[Path]:
@@ -137,8 +137,7 @@ def checkpoints(root: Path) -> list[Path]:
 
 
 def checkpoint_nonsense(loaded: tuple) -> str:
-    tensors, state = loaded
-    sound = isinstance(state, dict) and all(isinstance(t, torch.Tensor) for t in tensors.values())
+    sound = isinstance(loaded[1], dict) and all(isinstance(t, torch.Tensor) for t in loaded[0].values())
     return "" if sound else "the state is no table"
 
 
@@ -237,28 +236,21 @@ FLOW = np.random.default_rng(0).normal(size=(5, 4, 2)).astype("<f4").tobytes()
 FLO = {"a.flo": flow.FLO_MAGIC.tobytes() + struct.pack("<ii", 4, 5) + FLOW}
 
 
-def flo_nonsense(found: np.ndarray) -> str:
-    return "" if found.ndim == 3 and found.dtype == np.float32 and not np.isinf(found).any() else "no flow"
-
-
-def flo_number(data: bytes, rng: np.random.Generator) -> bytes:
-    return data[:12] + number(data[12:], rng)
-
-
-READ_FLO = (flow.read_flo,)
-register(Target("flow", writing(FLO), lambda root, path: flow.read_flo(path), READ_FLO, (flo_number,), nonsense=flo_nonsense))
+register(
+    Target(
+        "flow", writing(FLO), lambda root, path: flow.read_flo(path), (flow.read_flo,),
+        (lambda data, rng: data[:12] + number(data[12:], rng),),
+        nonsense=lambda f: "" if f.ndim == 3 and f.dtype == np.float32 and not np.isinf(f).any() else "no flow",
+    )
+)  # fmt: skip
 SIDE = {"size": 518, "multiple": 14, "mean": [0.5, 0.4, 0.3], "std": [0.2, 0.2, 0.2], "output": "depth"}
-
-
-def side_nonsense(values: dict) -> str:
-    return "" if isinstance(values, dict) and set(values) <= set(networks.KEYS) else "no description"
-
 
 register(
     Target(
         "description of a network", writing({"m.onnx.json": json.dumps(SIDE).encode()}),
         lambda root, path: networks.read_side_file(root / "m.onnx"), (networks.read_side_file,),
-        (json_value, json_value, text_number), nonsense=side_nonsense,
+        (json_value, json_value, text_number),
+        nonsense=lambda values: "" if isinstance(values, dict) and set(values) <= set(networks.KEYS) else "no description",
     )
 )  # fmt: skip
 

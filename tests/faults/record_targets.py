@@ -57,18 +57,13 @@ def turned(angle: float) -> list[list[float]]:
     return [[c, 0.0, s, angle], [0.0, 1.0, 0.0, 0.5], [-s, 0.0, c, -2.0], [0.0, 0.0, 0.0, 1.0]]
 
 
-def cameras_of_path(root: Path, path: Path) -> list[Camera]:
-    found = paths.read_keyframes(path, TEMPLATE, Normalization(np.array([1.0, 2, 3]), 0.5))
-    return paths.through(found, 5)
-
-
-def path_nonsense(cameras: list[Camera]) -> str:
-    return "".join(not_finite(viewmat=c.viewmat, K=c.K) for c in cameras)
-
-
 PATH = [{"c2w": turned(0.3 * i), "fov_y": 0.8 + 0.1 * i, "seconds": 2.0 * i} for i in range(4)]
-KEYFRAMES = (paths.read_keyframes, paths.through)
-add("keyframes", "path.json", PATH, cameras_of_path, KEYFRAMES, nonsense=path_nonsense, lines=0.85)
+UNITS = Normalization(np.array([1.0, 2, 3]), 0.5)
+add(
+    "keyframes", "path.json", PATH, lambda root, path: paths.through(paths.read_keyframes(path, TEMPLATE, UNITS), 5),
+    (paths.read_keyframes, paths.through), lines=0.85,
+    nonsense=lambda cameras: "".join(not_finite(viewmat=c.viewmat, K=c.K) for c in cameras),
+)  # fmt: skip
 
 # ---- scores of a run ---------------------------------------------------------------------------------------------------
 
@@ -148,12 +143,11 @@ FOUND = {
 }  # fmt: skip
 
 
-def pose_lines(root: Path, path: Path) -> list[str]:
-    return poses_record.report_lines(poses_record.read_poses_record(root))
-
-
-PARSER = (poses_record.read_poses_record, poses_record.report_lines, schema.items)
-add("record of poses", poses_record.JSON, FOUND, pose_lines, PARSER)
+add(
+    "record of poses", poses_record.JSON, FOUND,
+    lambda root, path: poses_record.report_lines(poses_record.read_poses_record(root)),
+    (poses_record.read_poses_record, poses_record.report_lines, schema.items),
+)  # fmt: skip
 
 
 def event_files(root: Path) -> list[Path]:
@@ -188,12 +182,13 @@ SIGNATURE = {"process": 7, "host": "machine", "since": "2024-01-01 10:00", "comm
 LOCK = {"lock": b"\n" + json.dumps(SIGNATURE).encode()}
 
 
-def holder(root: Path, path: Path) -> str | None:
-    data = path.read_bytes() if path.is_file() else b""
-    return locks._signed(data[1:])
-
-
-register(Target("signature of a lock", writing(LOCK), holder, (locks._signed,), (one_line(json_value), text_number)))
+register(
+    Target(
+        "signature of a lock", writing(LOCK),
+        lambda root, path: locks._signed(path.read_bytes()[1:] if path.is_file() else b""),
+        (locks._signed,), (one_line(json_value), text_number),
+    )
+)  # fmt: skip
 
 # ---- runs --------------------------------------------------------------------------------------------------------------
 
@@ -295,13 +290,10 @@ def maps_of(root: Path, path: Path) -> tuple[np.ndarray, ...] | None:
     return found
 
 
-def map_nonsense(found: tuple[np.ndarray, ...]) -> str:
-    return "" if all(m.shape == (6, 9) and m.min() >= 0 and m.max() <= 1 for m in found) else "a map is none"
-
-
 register(
     Target(
-        "stored maps", map_files, maps_of, (networks.MapCache._read,), (tensors_header, tensors_body), nonsense=map_nonsense
+        "stored maps", map_files, maps_of, (networks.MapCache._read,), (tensors_header, tensors_body),
+        nonsense=lambda maps: "" if all(m.shape == (6, 9) and 0 <= m.min() <= m.max() <= 1 for m in maps) else "a map is none",
     )
 )  # fmt: skip
 
@@ -321,10 +313,6 @@ register(
 MATCHER = {"matcher.onnx": nw.matcher(np.array([[3.0, 4.0]]), np.ones(1), np.array([[0.6, 0.8]]))}
 
 
-def matched(root: Path, path: Path) -> matching.Features:
-    return matching.Matcher(path, threads=1).features(np.zeros((8, 8, 3), np.uint8))
-
-
 def matcher_nonsense(found: matching.Features) -> str:
     pixels, descriptors = found
     inside = (pixels >= 0) & (pixels <= 8)
@@ -333,7 +321,9 @@ def matcher_nonsense(found: matching.Features) -> str:
 
 register(
     Target(
-        "matcher", writing(MATCHER), matched, (matching.Matcher.__init__, matching.Matcher.features, matching.Matcher._check),
+        "matcher", writing(MATCHER),
+        lambda root, path: matching.Matcher(path, threads=1).features(np.zeros((8, 8, 3), np.uint8)),
+        (matching.Matcher.__init__, matching.Matcher.features, matching.Matcher._check),
         (onnx_field, onnx_field, onnx_field), nonsense=matcher_nonsense, lines=0.6, share=0.2,
     )
 )  # fmt: skip
@@ -354,13 +344,9 @@ def flow_by_network(root: Path, path: Path) -> np.ndarray:
     return flow._network(path)(View("a", camera, IMAGE), View("b", camera, 1 - IMAGE))
 
 
-def flow_nonsense(found: np.ndarray) -> str:
-    return "" if found.shape == (6, 9, 2) and found.dtype == np.float32 else "no flow"
-
-
 register(
     Target(
         "flow network", flow_networks, flow_by_network, (flow._network,), (onnx_field, onnx_field, onnx_field),
-        nonsense=flow_nonsense, share=0.3,
+        nonsense=lambda found: "" if found.shape == (6, 9, 2) and found.dtype == np.float32 else "no flow", share=0.3,
     )
 )  # fmt: skip

@@ -477,9 +477,7 @@ def test_files_that_lack_a_part_or_have_a_wrong_bit_or_checksum(tmp_path):
     ok, data = cv2.imencode(".tif", np.asarray(photo()).astype(np.uint16) * 257, [cv2.IMWRITE_TIFF_COMPRESSION, 5])
     assert ok
     refused(tmp_path, zeroed(data.tobytes(), 0.4, 0.6), "decoded")
-
-
-def test_strips_that_hold_too_little(tmp_path):
+    # strips that hold too little
     pixels = bytes(range(64)) * 2
     (tmp_path / "a.tif").write_bytes(tiff(16, 8, [(0, 64), (64, 64)], pixels, rows=4))
     assert decode(tmp_path / "a.tif")[0].shape == (8, 16, 3)
@@ -616,10 +614,7 @@ def test_an_avif_has_its_colours_and_straight_alpha_and_is_bounded(tmp_path):
             np.testing.assert_allclose(part.mean((0, 1)), wanted, atol=0.04)
     with pytest.raises(DataError, match=r"96 x 64 px, more than the limit of 100 pixels"):
         decode(path, 100)
-
-
-def test_a_photograph_is_copied_upright_without_what_it_says_of_its_owner(tmp_path):
-    """Its lens is known by EXIF: 26 mm of film whose diagonal is 43.3 mm."""
+    # a photograph is copied upright without what it says of its owner; its lens is known by EXIF: 26 mm of 43.3 mm film
     source = tmp_path / "in" / "a.avif"
     source.parent.mkdir()
     source.write_bytes(avif(orientation=6))

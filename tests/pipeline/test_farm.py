@@ -379,10 +379,7 @@ def test_folders_globs_and_lines_of_flags(tmp_path, monkeypatch):
     for level in (levels[0], levels[3]):
         (level / "image.png").touch()
     assert record.source_stamp(levels[3]) and not record.source_stamp(levels[0])  # 31 folders, and 255
-
-
-def test_lines_that_are_no_jobs(tmp_path):
-    """One sentence, with the number of the line where it is the line's fault."""
+    # lines that are no jobs end in one sentence, with the number of the line where it is the line's fault
     path = tmp_path / "jobs.jsonl"
     for word, values in {
         "is not a valid name": [{"name": n} for n in ("../b", "index.html", ".b", 101 * "x")], "must be text": [{"steps": [1]}],

@@ -386,6 +386,15 @@ def test_rooms_close_photographs_rings_and_closed_splines():
     for values in (eyes, axes.reshape(frames, 9)):
         speed = np.diff(np.concatenate([values, values[:2]]), axis=0)
         assert np.abs(np.diff(speed, axis=0)).max() < 0.1 * np.abs(speed).max()
+    # a tour of views whose names say nothing goes from neighbour to neighbour, and of too many views through some
+    azimuths = np.arange(0, 300, 20)
+    shuffled = around(azimuths[np.random.default_rng(0).permutation(15)])
+    keys, _, by_name = paths.tour_of(shuffled, [0.0] * 15, 4.0, 100)
+    legs = [np.linalg.norm(a.camera.center - b.camera.center) for a, b in itertools.pairwise(keys)]
+    assert not by_name and len(legs) == 14 and max(legs) < 1.5
+    assert paths.tour_of(around(azimuths), [0.0] * 15, 4.0, 100)[2]
+    keys, closed, _ = paths.tour_of(around(azimuths), [0.0] * 15, 4.0, 6)
+    assert len(keys) - closed == 6
 
 
 @pytest.mark.parametrize(
@@ -409,15 +418,3 @@ def test_a_tour_passes_through_the_cameras(cameras, closed):
     assert steps.max() < 20 * np.median(steps)
     assert np.linalg.norm(np.diff(eyes, 2, axis=0), axis=1).max() < 0.15 * np.median(steps)
     assert np.allclose(path[0].viewmat, cameras[0].viewmat, atol=1e-9) or not by_name
-
-
-def test_a_tour_of_views_whose_names_say_nothing_goes_from_neighbour_to_neighbour():
-    """And of too many views it passes through some."""
-    azimuths = np.arange(0, 300, 20)
-    shuffled = around(azimuths[np.random.default_rng(0).permutation(15)])
-    keys, _, by_name = paths.tour_of(shuffled, [0.0] * 15, 4.0, 100)
-    legs = [np.linalg.norm(a.camera.center - b.camera.center) for a, b in itertools.pairwise(keys)]
-    assert not by_name and len(legs) == 14 and max(legs) < 1.5
-    assert paths.tour_of(around(azimuths), [0.0] * 15, 4.0, 100)[2]
-    keys, closed, _ = paths.tour_of(around(azimuths), [0.0] * 15, 4.0, 6)
-    assert len(keys) - closed == 6

@@ -102,9 +102,7 @@ def test_markdown_holds_means_deviations_and_differences():
     gaps = {"b": {"psnr": paired_difference([21.0], [20.0])}}
     figures, gaps = cells(markdown(table_of(samples=one, differences=gaps, metrics=("psnr",))))
     assert figures[2][1] == "20.00" and gaps[2][1] == "+1.00"
-
-
-def test_ablation_has_check_marks_in_every_notation():
+    # an ablation has check marks in every notation
     t = table_of(switches=("Hier", "S_{rend}"), marks={"full": (True, True), "no a_b|c": (False, True)})
     figures, _ = cells(markdown(t))
     assert figures[0][:3] == ["row", "Hier", "S_rend"] and [r[1:3] for r in figures[2:]] == [["✓", "✓"], ["✗", "✓"]]
@@ -172,9 +170,9 @@ def metrics_of(request, variant, seed):
     return json.loads((run_folder(request, "still", variant, seed) / "metrics.json").read_text())
 
 
-def test_every_run_is_an_ordinary_run_folder_and_every_file_of_the_study_is_there(finished):
-    """SCENE/VARIANT/SEED; the figure shows both settings and the held-out photographs."""
-    request, _ = finished
+def test_every_run_is_an_ordinary_run_folder_and_tables_are_of_these_runs(finished):
+    """SCENE/VARIANT/SEED; means, deviations and paired intervals are computed once more from the run folders."""
+    request, lines = finished
     for variant, steps in (("a", 8), ("b b", 16)):
         for seed in (0, 1):
             folder = request.out / "still" / variant.replace(" ", "-") / str(seed)
@@ -188,11 +186,6 @@ def test_every_run_is_an_ordinary_run_folder_and_every_file_of_the_study_is_ther
     record = json.loads((request.out / "study.json").read_text())
     assert record["seeds"] == 2 and set(record["variants"]) == {"a", "b b"}
     assert len(record["scenes"]["still"]["fingerprint"]) == 64
-
-
-def test_table_is_of_these_runs(finished):
-    """Means, deviations and paired intervals, computed here once more from the run folders."""
-    request, lines = finished
     text = (request.out / "table.md").read_text()
     figures, gaps = cells(text)
     psnr = {v: [metrics_of(request, v, s)["test"]["psnr"] for s in (0, 1)] for v in ("a", "b b")}

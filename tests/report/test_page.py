@@ -206,14 +206,7 @@ def test_every_event_is_a_line_of_strict_json(tmp_path):
     assert json.loads((tmp_path / "a.json").read_text()) == {"a": [None, 1.5], "b": [None], "c": {"d": 2}}
     with pytest.raises(ResourceError, match="no"):
         EventLog(tmp_path / "no" / "metrics.jsonl")
-
-
-def steps_of(path):
-    return [e["step"] for e in read_events(path)]
-
-
-def test_a_resumed_log_ends_with_the_checkpoint(tmp_path):
-    """Later events and a line cut by a kill are dropped; a new fit starts empty, and a log may be missing."""
+    # a resumed log ends with the checkpoint: later events and a line cut by a kill are dropped; a log may be missing
     path = tmp_path / "metrics.jsonl"
     fill(path, range(1, 11))
     fill(path, range(7, 9), start=6)
@@ -232,19 +225,16 @@ def test_a_resumed_log_ends_with_the_checkpoint(tmp_path):
     assert read_events(path) == [{"step": 3}]
 
 
+def steps_of(path):
+    return [e["step"] for e in read_events(path)]
+
+
 # The index of a farm and its live table: every job, whatever it is called.
 
 ROWS = [
     JobRow("a", "done", 500, 61.0, 25.5, 1200), JobRow("b\x1b[31m", "running", 40, 3.0), JobRow("c", "waiting"),
     JobRow("d", "failed", message="d: no images <b>"), JobRow("e", "failed", message="e: no images <b>"),
 ]  # fmt: skip
-
-
-def test_failures_are_counted_by_message():
-    """The name of the scene in it makes no other message; nothing of a name is markup."""
-    page = farm_page("a & b", [replace(r, thumbnail="x y/t.jpg" if r.name == "a" else "") for r in ROWS], 90)
-    assert "<td>SCENE: no images &lt;b&gt;</td><td>2</td><td>d, e</td>" in page and "<h1>a &amp; b</h1>" in page
-    assert 'src="x%20y/t.jpg"' in page and "2 jobs are not done yet" in page and "25.50 dB" in page
 
 
 def test_the_table_shows_running_jobs_and_without_a_terminal_each_job_once(capsys):
@@ -261,3 +251,7 @@ def test_the_table_shows_running_jobs_and_without_a_terminal_each_job_once(capsy
             table.update(ROWS, None)
     lines = capsys.readouterr().out.splitlines()
     assert [line.split("  ")[0] for line in lines[:3]] == ["a", "d", "e"] and len(lines) == 4
+    # the index counts failures by message; the name of the scene in it makes no other message; nothing of a name is markup
+    page = farm_page("a & b", [replace(r, thumbnail="x y/t.jpg" if r.name == "a" else "") for r in ROWS], 90)
+    assert "<td>SCENE: no images &lt;b&gt;</td><td>2</td><td>d, e</td>" in page and "<h1>a &amp; b</h1>" in page
+    assert 'src="x%20y/t.jpg"' in page and "2 jobs are not done yet" in page and "25.50 dB" in page

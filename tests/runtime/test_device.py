@@ -39,24 +39,6 @@ def test_results_keep_the_order_of_their_arguments_which_are_made_late():
     assert device.in_background(work, ()) == []
 
 
-# Sizes in bytes: what is read, what is refused, what is written.
-
-
-class Driver:
-    """A CUDA driver that notes its calls."""
-
-    def __init__(self, failing: int):
-        self.calls, self.failing = [], failing
-
-    def cuInit(self, flags):
-        self.calls.append(("cuInit", flags))
-        return self.failing
-
-    def cuDevicePrimaryCtxRetain(self, context, handle):
-        self.calls.append(("cuDevicePrimaryCtxRetain", handle))
-        return 0
-
-
 def woken():
     """Start the driver, and wait for the end of that."""
     device.wake_gpu()
@@ -70,7 +52,11 @@ def woken():
 )
 def test_a_driver_is_started_for_a_torch_that_can_use_it(library, failing, count, tmp_path, monkeypatch):
     """With the context of the first device; nothing is raised without a device, a driver, or the whole of torch."""
-    driver, spec = Driver(failing), SimpleNamespace(submodule_search_locations=[str(tmp_path)])
+    calls, spec = [], SimpleNamespace(submodule_search_locations=[str(tmp_path)])
+    driver = SimpleNamespace(
+        cuInit=lambda flags: calls.append(("cuInit", flags)) or failing,
+        cuDevicePrimaryCtxRetain=lambda context, handle: calls.append(("cuDevicePrimaryCtxRetain", handle)) or 0,
+    )
     errors: list = []
     monkeypatch.setattr(threading, "excepthook", errors.append)
     monkeypatch.setattr("importlib.util.find_spec", lambda name: spec)
@@ -78,7 +64,7 @@ def test_a_driver_is_started_for_a_torch_that_can_use_it(library, failing, count
     woken()
     (tmp_path / "lib" / (library or "libtorch_cpu.so")).mkdir(parents=True)
     woken()
-    assert driver.calls == [("cuInit", 0), ("cuDevicePrimaryCtxRetain", 0)][:count]
+    assert calls == [("cuInit", 0), ("cuDevicePrimaryCtxRetain", 0)][:count]
     monkeypatch.undo()
     monkeypatch.setattr(threading, "excepthook", errors.append)
     woken()
@@ -177,10 +163,7 @@ def test_without_control_groups(elsewhere):
     assert device.machine_memory() == (2 * GIB, 3 * GIB // 2)
     group(elsewhere, "memory/docker/x", memory__limit_in_bytes=GIB)  # what is used is not said
     assert device.machine_memory() == (GIB, GIB)
-
-
-def test_limits_of_version_2(elsewhere):
-    """The tightest group between the process and the root counts; file pages not used lately are free."""
+    # limits of version 2: the tightest group between the process and the root counts; file pages not used lately are free
     (elsewhere / "proc").write_text("0::/a/b\n", "utf-8")
     group(elsewhere, "", memory__stat="anon 5")  # the root has no limit file
     group(elsewhere, "a", memory__max=4 * GIB, memory__current=3 * GIB, memory__stat=f"anon 1\ninactive_file {GIB}")

@@ -70,6 +70,16 @@ def test_a_lock_file_alone_holds_nothing(tmp_path):
     with hold_folder(tmp_path, "renders", "depth"):
         assert sorted(p.name for p in tmp_path.rglob("*")) == sorted([LOCK, "renders", "other", LEFT])
     assert not (tmp_path / LOCK).exists()
+    # after an error only a folder that was made here, with nothing in it, is removed again
+    own = tmp_path / "own"
+    own.mkdir()
+    for folder in (own, tmp_path / "made"):
+        with pytest.raises(ValueError, match="of the body"), hold_folder(folder):
+            raise ValueError("of the body")
+    with pytest.raises(ValueError, match="of the body"), hold_folder(tmp_path / "filled"):
+        (tmp_path / "filled" / "result").write_text("kept")
+        raise ValueError("of the body")
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["filled", "own"]
 
 
 def test_a_lock_that_was_removed_meanwhile_is_taken_anew(tmp_path, monkeypatch):
@@ -87,10 +97,7 @@ def test_a_lock_that_was_removed_meanwhile_is_taken_anew(tmp_path, monkeypatch):
         assert len(calls) == 2 and (tmp_path / LOCK).is_file()
         assert str(os.getpid()) in refusal(tmp_path)
 
-
-def test_a_file_system_without_locks_is_noted(tmp_path, monkeypatch):
-    """The work goes on, and nothing is removed that may be another's."""
-
+    # where a file system has no locks the work goes on, and nothing is removed that may be another's
     def refuse(descriptor, blocking):
         raise OSError(errno.ENOSYS, "Function not implemented")
 
@@ -99,19 +106,6 @@ def test_a_file_system_without_locks_is_noted(tmp_path, monkeypatch):
     with hold_folder(tmp_path) as notes:
         assert len(notes) == 1 and "has no locks" in notes[0] and str(tmp_path) in notes[0]
     assert (tmp_path / LEFT).is_file()
-
-
-def test_only_a_folder_made_here_is_removed_again(tmp_path):
-    """After an error, and while nothing is in it; a folder of the user's own stays, and the error is the one that came."""
-    own = tmp_path / "own"
-    own.mkdir()
-    for folder in (own, tmp_path / "made"):
-        with pytest.raises(ValueError, match="of the body"), hold_folder(folder):
-            raise ValueError("of the body")
-    with pytest.raises(ValueError, match="of the body"), hold_folder(tmp_path / "filled"):
-        (tmp_path / "filled" / "result").write_text("kept")
-        raise ValueError("of the body")
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["filled", "own"]
 
 
 @pytest.mark.fault

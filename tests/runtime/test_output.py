@@ -136,6 +136,7 @@ def test_tables_answers_and_errors_of_the_program_itself(monkeypatch, capsys):
     assert capsys.readouterr().err.count("\n") == 1
     with pytest.raises(BrokenPipeError):
         process.answer("a line")
+    monkeypatch.undo()
     with process.careful_output(False), pytest.raises(TypeError):
         sys.stdout.write(b"bytes")
     stream = io.TextIOWrapper(io.BytesIO(), "ascii")

@@ -456,6 +456,9 @@ def test_a_fit_and_what_follows(scene, tmp_path, capsys):
     assert main(["export", str(run), "--to", str(tmp_path / f"{BYTES}.spz")]) == 0
     printed = capsys.readouterr().out
     assert "b\\xe4ü" in printed and BYTES not in printed
+    file = tmp_path / f"{BYTES}.py"
+    file.write_text("from warpgs.io.colmap import ColmapReader\nclass Own(ColmapReader):\n    pass\n")
+    assert main(["fit", str(scene), "--out", str(tmp_path / "run"), "--reader", f"{file}:Own", *flags(1)]) == 0
 
 
 @on_linux
@@ -481,13 +484,6 @@ def test_the_farm(scene, tmp_path):
     assert row["name"] == "sceneb\\xe4ü" and row["state"] == "done"
     assert "sceneb%E4%C3%BC/run/report.html" in page and "sceneb%E4%C3%BC/thumbnail.jpg" in page
     assert cv2.imdecode(np.fromfile(out / scene.name / "thumbnail.jpg", np.uint8), cv2.IMREAD_COLOR) is not None
-
-
-@on_linux
-def test_plug_ins(scene, tmp_path):
-    file = tmp_path / f"{BYTES}.py"
-    file.write_text("from warpgs.io.colmap import ColmapReader\nclass Own(ColmapReader):\n    pass\n")
-    assert main(["fit", str(scene), "--out", str(tmp_path / "run"), "--reader", f"{file}:Own", *flags(1)]) == 0
 
 
 @on_linux

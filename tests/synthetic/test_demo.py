@@ -85,10 +85,7 @@ def test_images_fill_the_frame_and_tracks_respect_occlusion(made):
                 (u, v), depth = project(camera, view, x)
                 hidden += inside and depth > 0 and 2 < u < 126 and 2 < v < 94
     assert hidden > 20  # the scene does hide points from some views
-
-
-def test_points_are_where_their_images_show_them(made):
-    """They reproject onto their observations, in the colours there."""
+    # points reproject onto their observations, in the colours there
     _, _, camera, views, points = made
     errors = []
     for number, (x, rgb, track) in points.items():

@@ -31,6 +31,20 @@ def test_half_precision_keeps_gaussians_of_any_scene():
     g.log_scales[7, 1] += math.log(1e6)  # one axis of a million medians is counted, and finite
     (_, covariances, *_), _, shortened = packed(g)
     assert shortened == 1 and np.abs(covariances).max() <= LARGEST_HALF and np.isfinite(covariances.astype(np.float16)).all()
+    # a box in file units holds the same points
+    turn = rotation_matrices(np.array([0.8, 0.0, 0.6, 0.0]))
+    g, box = cloud(300), (np.array([0.2, 0.1, 4.0]), np.array([2.0, 1.0, 1.5]), turn)
+    within = inside(g, box)
+    assert 0 < int(within.sum()) < len(within)
+    n = Normalization(np.array([400.0, -20.0, 7.0]), 0.25, turn)
+    stored = box_json(box, n)
+    for back, part in zip(convert_box(tuple(map(np.array, stored.values())), n, "file", "scene"), box, strict=True):
+        np.testing.assert_allclose(back, part, atol=1e-12)
+    means = convert_gaussians(g, n, "scene", "file").means.double().numpy()
+    local = (means - stored["center"]) @ np.array(stored["rotation"])
+    again = (np.abs(local) <= np.array(stored["size"]) / 2 + 1e-4).all(1)
+    assert (again == within.numpy()).mean() > 0.99
+    assert not inside(dataclasses.replace(g, means=torch.eye(3) * 1.1), (np.zeros(3), np.full(3, 2.0), np.eye(3))).any()
 
 
 def test_colors_of_degree_0_poses_there_and_back_and_keyframes_in_file_units():
@@ -52,19 +66,3 @@ def test_colors_of_degree_0_poses_there_and_back_and_keyframes_in_file_units():
     np.testing.assert_allclose(c2w @ convert_camera(c, n, "scene", "file").viewmat, np.eye(4), atol=1e-9)
     np.testing.assert_allclose(c2w[:3, 3], c.center / 0.25 + n.offset, atol=1e-9)
     assert k["seconds"] == 1.5 and abs(k["fov_y"] - fov_y(c)) < 1e-12
-
-
-def test_a_box_in_file_units_holds_the_same_points():
-    turn = rotation_matrices(np.array([0.8, 0.0, 0.6, 0.0]))
-    g, box = cloud(300), (np.array([0.2, 0.1, 4.0]), np.array([2.0, 1.0, 1.5]), turn)
-    within = inside(g, box)
-    assert 0 < int(within.sum()) < len(within)
-    n = Normalization(np.array([400.0, -20.0, 7.0]), 0.25, turn)
-    stored = box_json(box, n)
-    for back, part in zip(convert_box(tuple(map(np.array, stored.values())), n, "file", "scene"), box, strict=True):
-        np.testing.assert_allclose(back, part, atol=1e-12)
-    means = convert_gaussians(g, n, "scene", "file").means.double().numpy()
-    local = (means - stored["center"]) @ np.array(stored["rotation"])
-    again = (np.abs(local) <= np.array(stored["size"]) / 2 + 1e-4).all(1)
-    assert (again == within.numpy()).mean() > 0.99
-    assert not inside(dataclasses.replace(g, means=torch.eye(3) * 1.1), (np.zeros(3), np.full(3, 2.0), np.eye(3))).any()

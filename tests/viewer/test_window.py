@@ -104,8 +104,8 @@ def test_images_at_a_camera_are_those_of_the_rasterizer(window):
     np.testing.assert_allclose(out[20, 16:70, 0], (np.arange(16, 70) + 0.5 - 6) / 2 - 0.5, atol=0.02)
 
 
-def test_layers_and_the_crop_box_choose_what_is_shown(window):
-    """Fine and coarse make the whole; the box that is saved is the one that is seen, in file units."""
+def test_layers_and_the_crop_box_choose_what_is_shown_and_saved(window, tmp_path):
+    """Fine and coarse make the whole; keyframes are cameras of `warpgs render`, the box is that of `warpgs export`."""
     panel, count = window.panel, len(window.content.model.gaussians())
     shown = {}
     for layer in (windows.FINE_LAYER, windows.COARSE_LAYER):
@@ -121,10 +121,6 @@ def test_layers_and_the_crop_box_choose_what_is_shown(window):
     means = (window.shown().means.double().numpy() / n.scale + n.offset) - stored["center"]
     assert (np.abs(means @ np.array(stored["rotation"])) <= np.array(stored["size"]) / 2 + 1e-4).all()
     panel._crop.value = False
-
-
-def test_what_is_saved_is_rendered_and_exported(window, tmp_path):
-    """Keyframes are cameras of `warpgs render`, and the box is that of `warpgs export`: the same images and Gaussians."""
     panel, content, run = window.panel, window.content, str(window.content.stem)
     n, names = content.model.normalization, content.model.train[:2]
     panel._save(PATH, [keyframe(content.model.scene_cameras[name], 0.5 * i, n) for i, name in enumerate(names)])
