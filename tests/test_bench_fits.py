@@ -29,7 +29,7 @@ from warpgs.pipeline.train.schedule import mean_color
 from warpgs.pipeline.train.settings import settings_by_views
 from warpgs.scene import Camera, Gaussians, Mesh, Normalization, View
 from warpgs.synthetic import raycast
-from warpgs.synthetic.demo import camera_path, split_spec, still_life, write_demo
+from warpgs.synthetic.demo import camera_path, split_spec, still_life
 
 
 @pytest.fixture
@@ -123,14 +123,6 @@ def test_units_and_the_default_strategy_of_gsplat(fake_gsplat, monkeypatch):
 # Presets side by side: rows and their left-out views, the worker processes, one fit, and the tables.
 
 
-@pytest.fixture(scope="module")
-def demo(tmp_path_factory) -> str:
-    """Folder of a tiny scene."""
-    folder = tmp_path_factory.mktemp("data") / "scene"
-    write_demo(folder, views=8, width=40, height=32)
-    return str(folder)
-
-
 def test_rows_are_named_or_given(tmp_path):
     """A name, or a folder with its split and downscale; anything else is an error that lists them."""
     assert row_of("fern:3") is ROWS["fern:3"] and row_of("a/b@llff:3") == Row("a/b", "llff:3")
@@ -155,7 +147,7 @@ def test_training_views_are_left_out_and_held_out_ones_are_not_read(demo):
     assert left_out(tuple("abcdefghi"), 1) == [("e",)] and left_out(tuple("abcdefghi"), 3) == [("c", "e", "g")]
     with pytest.raises(UsageError, match="at least two"):
         left_out(("a", "b"), 1)
-    scene, spec = scene_at(demo, 1), split_spec(8)
+    scene, spec = scene_at(str(demo), 1), split_spec(8)
     whole = split_views(scene, spec)
     assert folds(scene, spec, 0) == [(spec, "")]
     ((part, names),) = folds(scene, spec, 2)
@@ -189,10 +181,10 @@ def test_a_fit_gives_a_row_and_the_peer_starts_from_the_same_points(demo, fake_g
     monkeypatch.setattr(sys.modules["gsplat"], "DefaultStrategy", DefaultStrategy, raising=False)
     counts = {}
     for preset in ("quick", *one_fit.PEERS):
-        row = one_fit.measure(Fit("r", f"{preset}:steps=3", 1, demo, split_spec(8), "", 1, "cpu"))
+        row = one_fit.measure(Fit("r", f"{preset}:steps=3", 1, str(demo), split_spec(8), "", 1, "cpu"))
         assert 3 < row["psnr"] < 40 and row["steps"] == 3 and row["bytes"] > 0 and row["setup"] > 0
         counts[preset] = row.get("points")
-    seen = scene_at(demo, 1).points.seen_by(set(split_views(scene_at(demo, 1), split_spec(8)).train), least=2)
+    seen = scene_at(str(demo), 1).points.seen_by(set(split_views(scene_at(str(demo), 1), split_spec(8)).train), least=2)
     assert counts[one_fit.PEER_POINTS] == len(seen) != counts[one_fit.PEER] > 0
 
 

@@ -23,7 +23,7 @@ from warpgs.pipeline.train.trainer import Trainer
 from warpgs.pipeline.train.view_modules import VIEW_MODULES, ViewModule
 from warpgs.pipeline.train.views import LearnedViews
 from warpgs.plugins import Registry, load_object
-from warpgs.synthetic.demo import split_spec, write_demo
+from warpgs.synthetic.demo import split_spec
 
 OWN = """
 from pathlib import Path
@@ -208,14 +208,13 @@ def test_settings_of_ones_own_travel_through_json(registry):
     assert FitConfig(loss_terms=(Faint(),)).fingerprint() != FitConfig(loss_terms=(Faint(0.1),)).fingerprint()
 
 
-def test_an_error_in_own_code_names_its_file(tmp_path, capsys):
+def test_an_error_in_own_code_names_its_file(demo, tmp_path, capsys):
     """What a user's own class raises is not called a defect of warpgs: the line says which file and line."""
     own = tmp_path / "mine.py"
     code = "class Mine(warpgs.Strategy):\n    def columns(self):\n        raise ValueError('my own bug')\n"
     own.write_text(f"import warpgs\n\n\n{code}")
-    write_demo(tmp_path / "scene", views=8, width=48, height=36)
     flags = ["--split", split_spec(8), "--preset", "3dgs", "--steps", "2", "--device", "cpu", "--strategy", f"{own}:Mine"]
-    assert main(["fit", str(tmp_path / "scene"), "--out", str(tmp_path / "run"), *flags]) == 2
+    assert main(["fit", str(demo), "--out", str(tmp_path / "run"), *flags]) == 2
     said = capsys.readouterr().err
     assert "my own bug" in said and f"{own}, line 6" in said and "defect of warpgs" not in said
 

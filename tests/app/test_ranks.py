@@ -16,7 +16,6 @@ from warpgs.errors import UsageError
 from warpgs.pipeline.run.fit import fit
 from warpgs.ranks import is_loopback, loopback_interface
 from warpgs.report import progress
-from warpgs.synthetic.demo import write_demo
 
 
 def started(count: int, *command: str) -> list[subprocess.Popen]:
@@ -49,11 +48,10 @@ def ended(processes: list[subprocess.Popen]) -> list[tuple[int, str, str]]:
 @pytest.mark.parametrize(
     ("first", "then"), [pytest.param(2, 1, marks=pytest.mark.slow), pytest.param(3, 2, marks=pytest.mark.fault)]
 )
-def test_any_number_of_processes_fits_the_same_model(tmp_path, capsys, first, then):
+def test_any_number_of_processes_fits_the_same_model(demo, tmp_path, capsys, first, then):
     """Some, of which one is killed; fewer that go on; and one alone, uninterrupted: the same PLY and the same state."""
-    write_demo(tmp_path / "scene", views=8, width=48, height=36)
     flags = [
-        str(tmp_path / "scene"), "--device", "cpu", "--preset", "3dgs", "--steps", "8", "--batch", "5", "--dropout", "0.3",
+        str(demo), "--device", "cpu", "--preset", "3dgs", "--steps", "8", "--batch", "5", "--dropout", "0.3",
         "--init.source", "random", "--init.random-count", "60", "--density.start", "1", "--density.every", "3",
         "--density.gradient", "1e-6", "--checkpoint-every", "2",
         "--optimizer.average-last", "0.75",
@@ -199,11 +197,10 @@ class Two(ranks.Ranks):
     "changed",
     ["a different version of warpgs", "a different scene", "a different split", "different settings", "a different checkpoint"],
 )
-def test_ranks_that_do_not_fit_the_same_are_refused(tmp_path, changed):
+def test_ranks_that_do_not_fit_the_same_are_refused(demo, tmp_path, changed):
     """Each would take its part of other steps, and the model would be that of no fit; nothing is written."""
-    write_demo(tmp_path / "scene", views=8, width=48, height=36)
     with pytest.raises(UsageError, match=f"rank 1 has {changed} than rank 0: "):
-        fit(tmp_path / "scene", out=tmp_path / "run", device="cpu", steps=1, batch=2, ranks=Two(changed), verbose=False)
+        fit(demo, out=tmp_path / "run", device="cpu", steps=1, batch=2, ranks=Two(changed), verbose=False)
     assert not (tmp_path / "run" / "config.json").exists()
 
 

@@ -80,22 +80,17 @@ MORE = {
 }  # fmt: skip
 
 
-def child(files):
-    done = subprocess.run(
-        [sys.executable, "-m", memory_of_readers.__name__, json.dumps(files)], capture_output=True, text=True, check=False
-    )
-    assert done.returncode == 0, done.stderr[-3000:]
-    return [json.loads(line) for line in done.stdout.splitlines()]
-
-
 def check(folder, cases):
     files = []
     for name, make in cases.items():
         write_gaussians(folder / f"tiny{name[1:]}", cloud(3), units="file")
         files.append((str(folder / name), make(folder / name)))
-    found = {path.rsplit("/", 1)[1]: (beyond / 2**20, words) for path, beyond, words in child(files)}
+    words = [sys.executable, "-m", memory_of_readers.__name__, json.dumps(files)]
+    done = subprocess.run(words, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr[-3000:]
+    found = {path.rsplit("/", 1)[1]: (beyond, refusal) for path, beyond, refusal in map(json.loads, done.stdout.splitlines())}
     assert found.keys() == cases.keys()
-    assert not {name: it for name, it in found.items() if it[1] or it[0] > memory_of_readers.ROOM / 2**20}
+    assert not {name: it for name, it in found.items() if it[1] or it[0] > memory_of_readers.MEMORY}
 
 
 def test_memory_beyond_the_result(tmp_path):

@@ -114,6 +114,10 @@ def test_nothing_is_lost_or_half_after_a_kill(reference, tmp_path, record_proper
             assert digest == wanted[path], path
 
 
+GROWING = ("metrics.jsonl", "log.txt")
+"""Files that grow by lines."""
+
+
 def test_calls_are_seen(reference):
     """A kind of call that a command is known to make and that is not numbered would never be killed at."""
     kinds = {c: {kind for kind, _, _ in calls} for c, calls in reference.calls.items()}
@@ -122,6 +126,15 @@ def test_calls_are_seen(reference):
     for command, calls in reference.calls.items():
         replaced = {path for kind, path, _ in calls if kind == "replace"}
         assert sum(kind == "fsync" for kind, _, _ in calls) >= len(replaced) > 0, command
+    # each file that is there at the end was put there as a whole, under a name of ours, those of libraries in C too
+    placed = {path for calls in reference.calls.values() for kind, path, _ in calls if kind == "replace"}
+    assert placed >= {"made", "run-pruned"}  # folders, which take their files along
+    for command, beginnings in tiny_runs.OWN.items():
+        opened = {path for kind, path, _ in reference.calls.get(command, ()) if kind == "open"}
+        assert all(tiny_runs.is_temporary(p) or Path(p).name in GROWING for p in opened), command
+        for path in (p for p in reference.after.get(command, ()) if p.startswith(beginnings)):
+            there = {path, *(p.as_posix() for p in Path(path).parents)}
+            assert there & placed or Path(path).name in GROWING, path
     # a checkpoint comes after the images of events before it: a fit that goes on from it does not write them
     placed = [Path(path).name for kind, path, _ in reference.calls["fit"] if kind == "replace"]
     checkpoints = [i for i, name in enumerate(placed) if name == "checkpoint.safetensors"]

@@ -60,7 +60,7 @@ from warpgs.pipeline.train.settings import FitConfig
 from warpgs.pipeline.train.strategies.base import STRATEGIES
 from warpgs.pipeline.train.strategies.sampling import MethodConfig
 from warpgs.report.images import BOXES, crops, disagreement, sheet
-from warpgs.synthetic.demo import split_spec, write_demo
+from warpgs.synthetic.demo import split_spec
 
 BASE, OTHER = [20.0, 20.2, 20.1], [20.6, 20.7, 20.8]
 GAP = paired_difference(OTHER, BASE)
@@ -152,11 +152,8 @@ B = dataclasses.replace(A, preset="b", steps=16)
 
 
 @pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    """A demo scene with photographs of 48 x 36 px."""
-    folder = tmp_path_factory.mktemp("data") / "still"
-    write_demo(folder, views=8, width=48, height=36)
-    return SceneRequest(str(folder), split_spec(8))
+def scene(demo):
+    return SceneRequest(str(demo), split_spec(8))
 
 
 @pytest.fixture(scope="module")
@@ -462,10 +459,8 @@ def test_ablation_rows_switch_off_one_part_each():
     assert "paper-literal" not in ablation_variants(PRESETS["paper-literal"])[0]
 
 
-def test_command_ablates(tmp_path, capsys, monkeypatch):
+def test_command_ablates(scene, tmp_path, capsys, monkeypatch):
     """`warpgs ablate` from flags to a table with check marks; two of its rows, for time."""
-    scene = tmp_path / "still"
-    write_demo(scene, views=8, width=48, height=36)
     monkeypatch.setitem(PRESETS._made, "whole", FULL)
     monkeypatch.setattr("warpgs.pipeline.study.study.ABLATION_ROWS", {n: ABLATION_ROWS[n] for n in ("full", "no pm")})
     monkeypatch.setenv("WARPGS_CACHE", str(tmp_path / "cache"))
@@ -477,14 +472,14 @@ def test_command_ablates(tmp_path, capsys, monkeypatch):
 
     monkeypatch.setattr("warpgs.pipeline.farm.work.fit_request", noted)
     flags = ["--preset", "whole", "--seeds", "1", "--steps", "2", "--device", "cpu", "--out", str(tmp_path / "out")]
-    assert main(["ablate", str(scene), "--split", split_spec(8), *flags]) == 0
+    assert main(["ablate", scene.path, "--split", scene.split, *flags]) == 0
     assert "[2/2] still, no pm, seed 0" in capsys.readouterr().out
     figures, gaps = cells((tmp_path / "out" / "table.md").read_text())
     assert figures[0][1:9] == ["Hier", "S_rend", "S_sem", "S_geo", "RA", "AGP", "PM", "Events"]
     assert [r[1:9] for r in figures[2:]] == [["✓"] * 8, ["✓"] * 6 + ["✗", "✓"]]
     assert gaps[2] == ["no pm", "not exercised", "not exercised", "not exercised", "-"]  # two steps end before any event
     assert asked == [(0, PaperConfig()), (0, PaperConfig(pm=False))]
-    assert main(["ablate", str(scene), "--out", str(tmp_path / "y"), "--preset", "3dgs"]) == 2
+    assert main(["ablate", scene.path, "--out", str(tmp_path / "y"), "--preset", "3dgs"]) == 2
     assert "ablate a preset with them" in capsys.readouterr().err
 
 

@@ -62,16 +62,9 @@ def test_words_that_cannot_be_written(tmp_path, output):
             assert not said
 
 
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("streams") / "scene"
-    write_demo(folder, views=8, width=32, height=32)
-    return folder
-
-
-def fit_words(scene, out, steps=3):
+def fit_words(demo, out, steps=3):
     flags = ["--device", "cpu", "--preset", "3dgs", "--init.source", "random", "--init.random-count", "50"]
-    return ["fit", str(scene), "--split", split_spec(8), "--out", str(out), "--steps", str(steps), *flags]
+    return ["fit", str(demo), "--split", split_spec(8), "--out", str(out), "--steps", str(steps), *flags]
 
 
 class Broken(io.StringIO):
@@ -89,20 +82,20 @@ class Broken(io.StringIO):
 
 
 @pytest.mark.parametrize(("lines", "number"), [(0, errno.ENOSPC), (4, errno.EIO)])
-def test_a_fit_goes_on_without_its_output(scene, tmp_path, monkeypatch, lines, number):
+def test_a_fit_goes_on_without_its_output(demo, tmp_path, monkeypatch, lines, number):
     errors = io.StringIO()
     monkeypatch.setattr(sys, "stdout", Broken(lines, number))
     monkeypatch.setattr(sys, "stderr", errors)
-    assert main(fit_words(scene, tmp_path / "run")) == 0
+    assert main(fit_words(demo, tmp_path / "run")) == 0
     assert errors.getvalue() == f"warpgs: stdout cannot be written ({os.strerror(number)}){GOES_ON}"
     assert len(read_ply(tmp_path / "run" / "point_cloud.ply")) and (tmp_path / "run" / "report.html").is_file()
 
 
-def test_neither_stdout_nor_stderr(scene, tmp_path, monkeypatch):
+def test_neither_stdout_nor_stderr(demo, tmp_path, monkeypatch):
     """As under pythonw, or after `>&- 2>&-`: Python has no streams at all."""
     monkeypatch.setattr(sys, "stdout", None)
     monkeypatch.setattr(sys, "stderr", None)
-    assert main(fit_words(scene, tmp_path / "run")) == 0 and (tmp_path / "run" / "report.html").is_file()
+    assert main(fit_words(demo, tmp_path / "run")) == 0 and (tmp_path / "run" / "report.html").is_file()
     assert main(["export", str(tmp_path / "nothing"), "--to", "a.ply"]) == 3
     assert main(["doctor", "--device", "cpu"]) == 2
     assert main(["--help"]) == 4
@@ -112,12 +105,12 @@ def test_neither_stdout_nor_stderr(scene, tmp_path, monkeypatch):
     assert main(["export", "--nonsense"]) == 2
 
 
-def test_the_same_without_the_command_line(scene, tmp_path, monkeypatch, capfd):
+def test_the_same_without_the_command_line(demo, tmp_path, monkeypatch, capfd):
     """`warpgs.fit` in a program whose reader has gone; the program's own streams stay as they are."""
     stream = Broken(1, errno.EPIPE)
     monkeypatch.setattr(sys, "stdout", stream)
     monkeypatch.setattr(process, "_is_lost", False)
-    assert warpgs.fit(scene, warpgs.FitConfig(steps=2), out=tmp_path / "run", device="cpu").metrics["steps"] == 2
+    assert warpgs.fit(demo, warpgs.FitConfig(steps=2), out=tmp_path / "run", device="cpu").metrics["steps"] == 2
     assert sys.stdout is stream
     assert capfd.readouterr().err.count(GOES_ON) == 1
 
@@ -181,7 +174,7 @@ def test_native_output_without_streams(monkeypatch, tmp_path):
 
 @with_sh
 @pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="this system has no SIGHUP")
-def test_a_terminal_that_hangs_up(scene, tmp_path, monkeypatch):
+def test_a_terminal_that_hangs_up(demo, tmp_path, monkeypatch):
     """SIGHUP comes and both streams fail: the step in progress is saved, and --resume continues from it."""
     write, streams = EventLog.write, [Broken(1000, errno.EIO), Broken(1000, errno.EIO)]
 
@@ -196,7 +189,7 @@ def test_a_terminal_that_hangs_up(scene, tmp_path, monkeypatch):
         monkeypatch.setattr(EventLog, "write", hang_up)
         for name, stream in zip(("stdout", "stderr"), streams, strict=True):
             monkeypatch.setattr(sys, name, stream)
-        assert main(fit_words(scene, tmp_path / "run")) == 130
+        assert main(fit_words(demo, tmp_path / "run")) == 130
     finally:
         signal.signal(signal.SIGHUP, before)
     monkeypatch.undo()
@@ -207,20 +200,20 @@ def test_a_terminal_that_hangs_up(scene, tmp_path, monkeypatch):
 @with_sh
 @pytest.mark.slow
 @pytest.mark.parametrize("output", LOST)
-def test_a_fit_from_a_shell(scene, tmp_path, output):
+def test_a_fit_from_a_shell(demo, tmp_path, output):
     """In a process as a shell starts it: code 0, and all files, whatever became of its words."""
-    code, said = shell(fit_words(scene, tmp_path / "run"), output, tmp_path)
+    code, said = shell(fit_words(demo, tmp_path / "run"), output, tmp_path)
     assert code == 0 and (tmp_path / "run" / "report.html").is_file(), said
     assert said == (f"warpgs: stdout cannot be written ({LOST[output]}){GOES_ON}" if LOST[output] else "")
 
 
 @with_sh
 @pytest.mark.slow
-def test_every_command_goes_on(scene, tmp_path, monkeypatch):
+def test_every_command_goes_on(demo, tmp_path, monkeypatch):
     """What is written to files is there, and stderr holds one line on the output; a table is a product, and is not."""
-    shutil.copytree(scene, scene.parent / "scenes" / "s0")
+    shutil.copytree(demo, demo.parent / "scenes" / "s0")
     names = "demo fit resume eval render plot export convert prune mesh priors farm compare".split()
-    commands = [*(words_of(name, scene, tmp_path) for name in names), ["doctor", "--warm"]]
+    commands = [*(words_of(name, demo, tmp_path) for name in names), ["doctor", "--warm"]]
     for words in commands:
         errors = io.StringIO()
         monkeypatch.setattr(sys, "stdout", Broken(0, errno.ENOSPC))

@@ -220,13 +220,6 @@ def handlers():
         signal.signal(number, handler)
 
 
-@pytest.fixture(scope="module")
-def stop_signals_scene(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("signals") / "scene"
-    write_demo(folder, views=8, width=32, height=32)
-    return folder
-
-
 def fit(scene, out, *more):
     flags = ["--steps", "3", "--device", "cpu", "--preset", "3dgs", "--init.source", "random", "--init.random-count", "50"]
     return main(["fit", str(scene), "--split", split_spec(8), "--out", str(out), *flags, *more])
@@ -296,10 +289,10 @@ STAGES = (
 
 @pytest.mark.usefixtures("handlers")
 @pytest.mark.parametrize(("stage", "number"), [(s, SIGNALS[i % len(SIGNALS)].values[0]) for i, s in enumerate(STAGES)])
-def test_outside_the_steps_the_end_is_the_same(stop_signals_scene, tmp_path, capsys, monkeypatch, stage, number):
+def test_outside_the_steps_the_end_is_the_same(demo, tmp_path, capsys, monkeypatch, stage, number):
     """While the scene is read, priors are made, results are scored and written: code 130, and nothing but the sentence."""
     monkeypatch.setattr(f"warpgs.pipeline.run.{stage}", lambda *_, **__: signal.raise_signal(number))
-    assert fit(stop_signals_scene, tmp_path / "run") == 130
+    assert fit(demo, tmp_path / "run") == 130
     early = STAGES.index(stage) < 3
     assert capsys.readouterr().err == (UNSAVED if early else SENTENCE)
     assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
@@ -308,7 +301,7 @@ def test_outside_the_steps_the_end_is_the_same(stop_signals_scene, tmp_path, cap
 
 @pytest.mark.usefixtures("handlers")
 @pytest.mark.parametrize("number", SIGNALS)
-def test_within_the_steps_the_one_in_progress_is_saved(stop_signals_scene, tmp_path, capsys, monkeypatch, number):
+def test_within_the_steps_the_one_in_progress_is_saved(demo, tmp_path, capsys, monkeypatch, number):
     """And a second signal in the same step ends the fit without it."""
     write, times = EventLog.write, [1]
 
@@ -318,9 +311,9 @@ def test_within_the_steps_the_one_in_progress_is_saved(stop_signals_scene, tmp_p
             signal.raise_signal(number)
 
     monkeypatch.setattr(EventLog, "write", signalled)
-    assert fit(stop_signals_scene, tmp_path / "run") == 130 and load_checkpoint(tmp_path / "run")[1]["step"] == 1
+    assert fit(demo, tmp_path / "run") == 130 and load_checkpoint(tmp_path / "run")[1]["step"] == 1
     times[0] = 2
-    assert fit(stop_signals_scene, tmp_path / "run", "--resume") == 130 and load_checkpoint(tmp_path / "run")[1]["step"] == 1
+    assert fit(demo, tmp_path / "run", "--resume") == 130 and load_checkpoint(tmp_path / "run")[1]["step"] == 1
     assert capsys.readouterr().err == 2 * SENTENCE
     monkeypatch.undo()
     assert main(["fit", "--out", str(tmp_path / "run"), "--resume"]) == 0  # all else is as the run was started
