@@ -110,8 +110,8 @@ def test_points_vary_one_axis_at_a_time_and_along_the_diagonal(monkeypatch):
     # work beyond the limit is left after the warm-up: two calls and no more
     calls = []
     monkeypatch.setattr(timing, "_timed", lambda work, device: (calls.append(1) or 3000.0, None))
-    (row,) = timing.measure_in_turn([lambda: None], CPU, limit_ms=2000.0)
-    assert row["warm_up_ms"] == 3000.0 and "median_ms" not in row and len(calls) == 2
+    (late,) = timing.measure_in_turn([lambda: None], CPU, limit_ms=2000.0)
+    assert late["warm_up_ms"] == 3000.0 and "median_ms" not in late and len(calls) == 2
     # disturbed rows are known per op and sizes, and give way to faster ones of a second try, with nothing else
     bench = Bench(CPU, 3, None, print)
     peer = {"program": "peer"}
