@@ -163,7 +163,10 @@ def test_without_control_groups(elsewhere):
     assert device.machine_memory() == (2 * GIB, 3 * GIB // 2)
     group(elsewhere, "memory/docker/x", memory__limit_in_bytes=GIB)  # what is used is not said
     assert device.machine_memory() == (GIB, GIB)
-    # limits of version 2: the tightest group between the process and the root counts; file pages not used lately are free
+
+
+def test_limits_of_version_2(elsewhere):
+    """The tightest group between the process and the root counts; file pages not used lately are free."""
     (elsewhere / "proc").write_text("0::/a/b\n", "utf-8")
     group(elsewhere, "", memory__stat="anon 5")  # the root has no limit file
     group(elsewhere, "a", memory__max=4 * GIB, memory__current=3 * GIB, memory__stat=f"anon 1\ninactive_file {GIB}")
