@@ -71,15 +71,15 @@ def test_a_lock_file_alone_holds_nothing(tmp_path):
         assert sorted(p.name for p in tmp_path.rglob("*")) == sorted([LOCK, "renders", "other", LEFT])
     assert not (tmp_path / LOCK).exists()
     # after an error only a folder that was made here, with nothing in it, is removed again
-    own = tmp_path / "own"
-    own.mkdir()
-    for folder in (own, tmp_path / "made"):
+    base, own = tmp_path / "base", tmp_path / "base" / "own"
+    own.mkdir(parents=True)
+    for folder in (own, base / "made"):
         with pytest.raises(ValueError, match="of the body"), hold_folder(folder):
             raise ValueError("of the body")
-    with pytest.raises(ValueError, match="of the body"), hold_folder(tmp_path / "filled"):
-        (tmp_path / "filled" / "result").write_text("kept")
+    with pytest.raises(ValueError, match="of the body"), hold_folder(base / "filled"):
+        (base / "filled" / "result").write_text("kept")
         raise ValueError("of the body")
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["filled", "own"]
+    assert sorted(p.name for p in base.iterdir()) == ["filled", "own"]
 
 
 def test_a_lock_that_was_removed_meanwhile_is_taken_anew(tmp_path, monkeypatch):
