@@ -10,7 +10,7 @@ import torch
 
 import warpgs
 from bench import __main__ as bench_main
-from bench.lib import inputs, ops, pages, peers, performance_page, result_file, timing, training
+from bench.lib import ops, pages, peers, performance_page, result_file, timing, training
 from bench.lib.inputs import camera as bench_camera
 from bench.lib.inputs import gaussians, image
 from bench.lib.naive import rasterize as bench_programs_rasterize
@@ -19,8 +19,6 @@ from bench.lib.ops import Bench, run
 from bench.lib.points import Point, growth, points
 from bench.lib.tables import mean_sd
 from tests.gaussians import camera, cloud
-from warpgs import rasterize
-from warpgs.kernels.ssim import ssim
 from warpgs.scene import Gaussians
 
 CPU = torch.device("cpu")
@@ -123,15 +121,6 @@ def test_points_vary_one_axis_at_a_time_and_along_the_diagonal(monkeypatch):
     bench._keep([row(100, 2.1, others_cores=0.0), row(100, 4.0, **peer, others_cores=0.0)])
     bench._keep([row(1000, 9.0, others_cores=0.0)])
     assert [r["median_ms"] for r in bench.rows] == [2.1, 4.0, 3.0, 4.0] and not bench.open("adam", {"N": 100})
-
-
-def test_peers_draw_and_score_the_same():
-    """What is compared for speed must agree in its result."""
-    gaussians, camera = inputs.gaussians(60, CPU), inputs.camera(40, 30, CPU, 2)
-    ours, dense = rasterize(gaussians, camera).rgb, peers.dense_rasterize(gaussians, camera)
-    assert (ours - dense).abs().max() < 1e-3
-    a, b = inputs.image(40, 30, CPU), inputs.image(40, 30, CPU, seed=1)
-    assert (ssim(a, b) - peers.torch_ssim(a, b)).abs().max() < 1e-4
 
 
 def hand_made(device: str) -> dict:
