@@ -80,6 +80,16 @@ def browser(tmp_path, request):
     opened.close()
 
 
+@pytest.fixture(scope="session")
+def demo(tmp_path_factory):
+    """Folder of a scene of eight photographs of 48 x 36 px, which no test changes."""
+    from warpgs.synthetic.demo import write_demo
+
+    folder = tmp_path_factory.mktemp("demo") / "still"
+    write_demo(folder, views=8, width=48, height=36)
+    return folder
+
+
 @pytest.fixture(autouse=True, scope="session")
 def no_overview_in_reports():
     """Leave the 3D overview out of reports, for speed; tests/report/test_overview.py looks at it."""

@@ -10,7 +10,7 @@ import torch
 
 import warpgs
 from bench import __main__ as bench_main
-from bench.lib import inputs, ops, pages, peers, performance_page, result_file, timing, training
+from bench.lib import ops, pages, peers, performance_page, result_file, timing, training
 from bench.lib.inputs import camera as bench_camera
 from bench.lib.inputs import gaussians, image
 from bench.lib.naive import rasterize as bench_programs_rasterize
@@ -19,20 +19,13 @@ from bench.lib.ops import Bench, run
 from bench.lib.points import Point, growth, points
 from bench.lib.tables import mean_sd
 from tests.gaussians import camera, cloud
-from warpgs import rasterize
-from warpgs.kernels.ssim import ssim
 from warpgs.scene import Gaussians
-
-# The benches run and their arithmetic holds; how long things take is nobody's test.
 
 CPU = torch.device("cpu")
 
 
 def tiny(names: tuple[str, ...]) -> dict:
-    """A run over tiny sizes, as JSON, on a machine that is never too slow or busy: neither is what these tests are about.
-
-    One thread: torch's spin where cores are shared, and that takes longer than the work.
-    """
+    """A run over tiny sizes, as JSON, as if the machine were never slow or busy; on one thread, as torch's spin otherwise."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     with pytest.MonkeyPatch.context() as patch:
@@ -66,9 +59,7 @@ def test_every_op_gives_rows():
 
 def test_the_ops_of_the_page_are_those_of_its_results():
     """Names, sizes, programs and directions are those of the kept rows, so that old and new results compare."""
-    rows = [
-        r for r in result_file.stored("ops")["cpu2"]["rows"] if r["op"] in OPS
-    ]  # an op of its own, sh, became a part of others
+    rows = [r for r in result_file.stored("ops")["cpu2"]["rows"] if r["op"] in OPS]  # sh became a part of others
     assert set(DEFAULT) == {r["op"] for r in rows}
     for r in rows:
         op, image = OPS[r["op"]], {"width", "height"} <= r.keys()
@@ -76,15 +67,8 @@ def test_the_ops_of_the_page_are_those_of_its_results():
         assert ("N" in r, "degree" in r, "cameras" in r) == tuple(a in op.axes for a in ("count", "degree", "cameras"))
 
 
-def test_a_budget_of_nothing_skips_everything():
-    """All tasks are listed with the reason, none is measured."""
-    result = run(CPU, tiny=True, ops=("adam", "knn"), budget=0, echo=lambda line: None)
-    assert not result["rows"] and {s["op"] for s in result["skipped"]} == {"adam", "knn"}
-    assert all("no time is left" in s["reason"] for s in result["skipped"])
-
-
 def test_a_second_run_measures_only_what_the_first_lacks_or_what_was_disturbed(result):
-    """All rows stay as they are but the one that was taken out, and the one during which other programs kept cores busy."""
+    """All other rows stay as they are; a budget of nothing skips everything, with a reason."""
     busy = [r | {"others_cores": 2.0} if r["op"] == "knn" else r for r in result["rows"]]
     knn = sum(r["op"] == "knn" for r in busy)
     lacking = result | {"rows": [r for r in busy if (r["op"], r.get("N")) != ("adam", 100)]}
@@ -93,6 +77,9 @@ def test_a_second_run_measures_only_what_the_first_lacks_or_what_was_disturbed(r
     kept = [r for r in again["rows"] if r in result["rows"]]
     assert len(again["rows"]) == len(result["rows"]) and len(kept) == len(busy) - knn - 1
     assert again["roofline"] == result["roofline"] and len(lines) == 1 + 1 + knn
+    nothing = run(CPU, tiny=True, ops=("adam", "knn"), budget=0, echo=lambda line: None)
+    assert not nothing["rows"] and {s["op"] for s in nothing["skipped"]} == {"adam", "knn"}
+    assert all("no time is left" in s["reason"] for s in nothing["skipped"])
 
 
 def row(count: int, milliseconds: float, **more) -> dict:
@@ -100,8 +87,8 @@ def row(count: int, milliseconds: float, **more) -> dict:
     return {"op": "adam", "program": "warpgs", "direction": "forward", "N": count, "median_ms": milliseconds, **more}
 
 
-def test_points_vary_one_axis_at_a_time_and_along_the_diagonal():
-    """No full cross product; the base point once; sizes as agreed for each device."""
+def test_points_vary_one_axis_at_a_time_and_along_the_diagonal(monkeypatch):
+    """No full cross product; growth is that of the axis that grows most; what took too long is not tried at larger sizes."""
     axes = ("count", "image", "degree", "cameras")
     for device, largest, widest in (("cpu", 10**6, 1920), ("cuda", 10**7, 7680)):
         found = points(axes, torch.device(device), tiny=False)
@@ -109,10 +96,21 @@ def test_points_vary_one_axis_at_a_time_and_along_the_diagonal():
         assert max(p.count for p in found) == largest and max(p.width for p in found) == widest
         assert {p.degree for p in found} == {0, 1, 2, 3} and {p.cameras for p in found} == {1, 4}
         assert sum(p.count != 100_000 and p.width != 504 for p in found) in (4, 5)
-
-
-def test_disturbed_rows_are_known_and_give_way_to_faster_ones():
-    """Per op and sizes; all rows of a second try take the place of slower ones, and of nothing else."""
+    # linear in Gaussians and pixels; more threads make less work; nothing is said about smaller sizes
+    small, large = Point(1000, 10, 10).sizes(("count", "image")), Point(4000, 30, 30).sizes(("count", "image"))
+    assert growth(small, large) == 9
+    assert growth(large, small) is None
+    assert growth({"N": 5, "threads": 2}, {"N": 5, "threads": 1}) == 2
+    bench = Bench(CPU, 3, None, lambda line: None)
+    bench._stop("adam", "warpgs", "forward", {"N": 1000}, "took 3 s a repeat")
+    found = [bench._chosen("adam", Point(n), {"N": n}) for n in (100, 1000, 10_000)]
+    assert found == [{("warpgs", "forward")}, set(), set()] and len(bench.skipped) == 3
+    # work beyond the limit is left after the warm-up: two calls and no more
+    calls = []
+    monkeypatch.setattr(timing, "_timed", lambda work, device: (calls.append(1) or 3000.0, None))
+    (late,) = timing.measure_in_turn([lambda: None], CPU, limit_ms=2000.0)
+    assert late["warm_up_ms"] == 3000.0 and "median_ms" not in late and len(calls) == 2
+    # disturbed rows are known per op and sizes, and give way to faster ones of a second try, with nothing else
     bench = Bench(CPU, 3, None, print)
     peer = {"program": "peer"}
     bench._keep([row(100, 2.0, others_cores=0.9), row(100, 6.0, **peer, others_cores=0.9)])
@@ -123,39 +121,6 @@ def test_disturbed_rows_are_known_and_give_way_to_faster_ones():
     bench._keep([row(100, 2.1, others_cores=0.0), row(100, 4.0, **peer, others_cores=0.0)])
     bench._keep([row(1000, 9.0, others_cores=0.0)])
     assert [r["median_ms"] for r in bench.rows] == [2.1, 4.0, 3.0, 4.0] and not bench.open("adam", {"N": 100})
-
-
-def test_what_took_too_long_is_not_tried_at_larger_sizes():
-    """Nor is anything where two sizes cannot be compared left out."""
-    bench = Bench(CPU, 3, None, lambda line: None)
-    bench._stop("adam", "warpgs", "forward", {"N": 1000}, "took 3 s a repeat")
-    found = [bench._chosen("adam", Point(n), {"N": n}) for n in (100, 1000, 10_000)]
-    assert found == [{("warpgs", "forward")}, set(), set()] and len(bench.skipped) == 3
-
-
-def test_work_beyond_the_limit_is_left_after_the_warm_up(monkeypatch):
-    """Two calls and no more."""
-    calls = []
-    monkeypatch.setattr(timing, "_timed", lambda work, device: (calls.append(1) or 3000.0, None))
-    (row,) = timing.measure_in_turn([lambda: None], CPU, limit_ms=2000.0)
-    assert row["warm_up_ms"] == 3000.0 and "median_ms" not in row and len(calls) == 2
-
-
-def test_growth_is_that_of_the_axis_that_grows_most():
-    """Linear in Gaussians and pixels; more threads make less work; nothing is said about smaller sizes."""
-    small, large = Point(1000, 10, 10).sizes(("count", "image")), Point(4000, 30, 30).sizes(("count", "image"))
-    assert growth(small, large) == 9
-    assert growth(large, small) is None
-    assert growth({"N": 5, "threads": 2}, {"N": 5, "threads": 1}) == 2
-
-
-def test_peers_draw_and_score_the_same():
-    """What is compared for speed must agree in its result."""
-    gaussians, camera = inputs.gaussians(60, CPU), inputs.camera(40, 30, CPU, 2)
-    ours, dense = rasterize(gaussians, camera).rgb, peers.dense_rasterize(gaussians, camera)
-    assert (ours - dense).abs().max() < 1e-3
-    a, b = inputs.image(40, 30, CPU), inputs.image(40, 30, CPU, seed=1)
-    assert (ssim(a, b) - peers.torch_ssim(a, b)).abs().max() < 1e-4
 
 
 def hand_made(device: str) -> dict:
@@ -193,16 +158,10 @@ def test_performance_tables_hold_the_results():
     assert svgs == performance_page.plots(json.loads(json.dumps(dict(reversed(results.items())))))
     assert set(svgs) == {"plots/a_pixels.svg", "plots/a_whole.svg", "plots/b_pixels.svg", "plots/b_whole.svg"}
     assert all(ElementTree.fromstring(svg).tag.endswith("svg") for svg in svgs.values())
-
-
-def test_a_mean_of_missing_values_is_nan():
-    """A table with a figure that one fit lacks is still written."""
+    # a table with a figure that one fit lacks is still written
     assert mean_sd([1.0, 2.0]) == "1.50 ± 0.71" and mean_sd([1.0]) == "1.00"
     assert mean_sd([1.0, math.nan]) == mean_sd([math.nan, math.nan]) == mean_sd([math.nan]) == "nan"
-
-
-def test_generated_parts_of_a_page_are_replaced_by_name():
-    """Text outside the marks stays; a missing part, and marks without one, are errors."""
+    # text outside the marks stays; a missing part, and marks without one, are errors
     page = "a\n<!-- x y: written by bench.document -->\nold\n<!-- end of x y -->\nb\n"
     assert pages.filled(page, {"x y": "new\n"}) == page.replace("old\n", "\nnew\n\n")
     for parts in ({}, {"x y": "", "z": ""}):
@@ -218,11 +177,8 @@ def test_pages_and_charts_are_those_of_the_kept_results():
     assert {f"plots/{p.name}" for p in (pages.DOCS / "plots").glob("*.svg")} == {p for p in files if p.startswith("plots/")}
 
 
-# Programs of the suite run on tiny sizes, their peers agree, and the kept results are of one format.
-
-
-def test_everything_that_can_be_run_is_listed(capsys, monkeypatch):
-    """A line for each program with the first sentence of its docstring; another name is an error."""
+def test_everything_that_can_be_run_is_listed(capsys, monkeypatch, tmp_path):
+    """A line for each program; a result has the keys of the format, facts and rows, and no folder of the machine."""
     monkeypatch.setattr(sys, "argv", ["bench", "--help"])
     assert bench_main.main() == 0
     text = capsys.readouterr().out
@@ -231,6 +187,14 @@ def test_everything_that_can_be_run_is_listed(capsys, monkeypatch):
     assert all(line.endswith((".", ":")) or line[:2] != "  " for line in text.splitlines()), text
     monkeypatch.setattr(sys, "argv", ["bench", "nothing"])
     assert bench_main.main() == 2 and "--help" in capsys.readouterr().err
+    monkeypatch.setattr(sys, "argv", ["x", "/data/fern", "--out", "a.json"])
+    made = result_file.result("w", CPU, [{"a": 1}], size=3)
+    assert made["command"].endswith("fern --out a.json") and "/data" not in made["command"]
+    assert list(made) == ["what", "command", "commit", "date", "machine", "versions", "size", "rows"]
+    result_file.write(tmp_path / "a.json", made)
+    assert result_file.read(tmp_path / "a.json") == made
+    with pytest.raises(ValueError, match="versions"):
+        result_file.write(tmp_path / "b.json", {k: v for k, v in made.items() if k != "versions"})
 
 
 @pytest.mark.parametrize("path", sorted(result_file.FOLDER.glob("*")), ids=lambda p: p.name)
@@ -244,33 +208,8 @@ def test_kept_results_are_of_one_format(path):
     assert {"device", "name"} <= set(values["machine"]) and {"torch", "warp"} <= set(values["versions"])
 
 
-def test_a_result_says_what_it_was_made_by(tmp_path, monkeypatch):
-    """The keys of the format, then facts, then rows; folders of the machine are left out of the command."""
-    monkeypatch.setattr(sys, "argv", ["x", "/data/fern", "--out", "a.json"])
-    made = result_file.result("w", CPU, [{"a": 1}], size=3)
-    assert made["command"].endswith("fern --out a.json") and "/data" not in made["command"]
-    assert list(made) == ["what", "command", "commit", "date", "machine", "versions", "size", "rows"]
-    result_file.write(tmp_path / "a.json", made)
-    assert result_file.read(tmp_path / "a.json") == made
-    with pytest.raises(ValueError, match="versions"):
-        result_file.write(tmp_path / "b.json", {k: v for k, v in made.items() if k != "versions"})
-
-
-def test_steps_of_given_gaussians_train(device):
-    """The same step over and over lowers the loss; with a learning rate of next to nothing all stays as it was."""
-    g, view, target = gaussians(200, device, 1), bench_camera(48, 32, device), image(48, 32, device)
-    losses = []
-    for lr in (1e-2, 1e-12):
-        steps = training.Steps(g, view, target, "exact", lr)
-        for _ in range(20):
-            steps.eager()
-        losses.append(float(steps.buffers.history[0, 0]))
-    assert losses[0] < 0.95 * losses[1]
-    assert all(torch.equal(t, g.tensors()[n]) for n, t in steps.table.params.items() if n == "quats")
-
-
 def test_naive_kernels_equal_the_real_ones(device):
-    """Image and gradients of the peer with a thread a pixel: two cameras, an image that is no multiple of a tile."""
+    """Image and gradients of the peer with a thread a pixel; the same step over and over lowers the loss."""
     cam = camera(45, 37, cameras=2, dtype=torch.float32, device=device)
     tensors = cloud(300, torch.float32, device).tensors()
     tensors["logit_opacities"] += 3  # some alphas are clamped, some pixels stop
@@ -281,3 +220,12 @@ def test_naive_kernels_equal_the_real_ones(device):
     # an alpha within a rounding of the cut may be drawn by one and not by the other
     for found, wanted in [(theirs.detach(), ours.detach()), *pairs]:
         assert float((found - wanted).norm()) <= 1e-4 * float(wanted.norm())
+    g, view, target = gaussians(200, device, 1), bench_camera(48, 32, device), image(48, 32, device)
+    losses = []
+    for lr in (1e-2, 1e-12):
+        steps = training.Steps(g, view, target, "exact", lr)
+        for _ in range(20):
+            steps.eager()
+        losses.append(float(steps.buffers.history[0, 0]))
+    assert losses[0] < 0.95 * losses[1]
+    assert all(torch.equal(t, g.tensors()[n]) for n, t in steps.table.params.items() if n == "quats")

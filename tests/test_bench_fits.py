@@ -27,12 +27,9 @@ from warpgs.io.load import split_views
 from warpgs.pipeline.train.presets import PRESETS
 from warpgs.pipeline.train.schedule import mean_color
 from warpgs.pipeline.train.settings import settings_by_views
-from warpgs.pipeline.train.strategies.base import STRATEGIES
 from warpgs.scene import Camera, Gaussians, Mesh, Normalization, View
 from warpgs.synthetic import raycast
-from warpgs.synthetic.demo import camera_path, split_spec, still_life, write_demo
-
-# The training loop around gsplat, with a stand-in for gsplat that renders with our rasterizer and notes its calls.
+from warpgs.synthetic.demo import camera_path, split_spec, still_life
 
 
 @pytest.fixture
@@ -94,8 +91,8 @@ def test_gsplat_is_trained_as_its_example_trainer_does(fake_gsplat):
     assert after < before
 
 
-def test_the_unit_changes_nothing_that_is_seen(fake_gsplat):
-    """Twice the unit with twice the world gives the same image."""
+def test_units_and_the_default_strategy_of_gsplat(fake_gsplat, monkeypatch):
+    """Twice the unit with twice the world gives the same image; refinement ends half-way, without regularizers."""
     view, s = photos(1)[0], gsplat_trainer.Settings(steps=1, cap=1)
     torch.manual_seed(0)
     params = gsplat_trainer.start(first(100).means, torch.rand(100, 3), s)
@@ -103,10 +100,7 @@ def test_the_unit_changes_nothing_that_is_seen(fake_gsplat):
     params["means"].data *= 2
     params["scales"].data += np.log(2)
     assert image.max() > 0.05 and np.abs(gsplat_trainer.image_of(params, view, 2.0) - image).max() < 1e-3
-
-
-def test_its_own_unit_is_that_of_its_parser():
-    """Cameras on a circle of radius 4 in the files that look at the origin: there 4 is 1, whatever our unit."""
+    # cameras on a circle of radius 4 in the files that look at the origin: there 4 is 1, whatever our unit
     cameras, n = [], Normalization(np.array([1.0, 2.0, 3.0]), 0.5)
     for angle in np.linspace(0, 2 * np.pi, 8, endpoint=False):
         axis = -np.array([np.cos(angle), np.sin(angle), 0])
@@ -118,30 +112,25 @@ def test_its_own_unit_is_that_of_its_parser():
         cameras.append(Camera(viewmat, np.eye(3), 4, 4))
     assert gsplat_trainer.own_scale(cameras, n) == pytest.approx(1 / (4 * 0.5))
     assert gsplat_trainer.scene_scale(cameras, 0.5) == pytest.approx(1.1 * 0.5 * 2)
+    default = lambda **k: SimpleNamespace(told=k, initialize_state=lambda scene_scale: scene_scale)  # noqa: E731
+    monkeypatch.setitem(sys.modules, "gsplat", SimpleNamespace(DefaultStrategy=default))
+    s = default_settings(7000)
+    strategy, state = strategy_of(s, 2.5)
+    assert strategy.told == {"refine_start_iter": 500, "refine_stop_iter": 3500, "refine_every": 100} and state == 2.5
+    assert (s.init_opacity, s.init_scale, s.opacity_reg, s.scale_reg) == (0.1, 1.0, 0.0, 0.0)
 
 
 # Presets side by side: rows and their left-out views, the worker processes, one fit, and the tables.
 
 
-@pytest.fixture(scope="module")
-def demo(tmp_path_factory) -> str:
-    """Folder of a tiny scene."""
-    folder = tmp_path_factory.mktemp("data") / "scene"
-    write_demo(folder, views=8, width=40, height=32)
-    return str(folder)
-
-
-def test_rows_are_named_or_given():
+def test_rows_are_named_or_given(tmp_path):
     """A name, or a folder with its split and downscale; anything else is an error that lists them."""
     assert row_of("fern:3") is ROWS["fern:3"] and row_of("a/b@llff:3") == Row("a/b", "llff:3")
     assert row_of("a/b@every:8@2") == Row("a/b", "every:8", 2)
     for name in ("fern:4", "a@", "@llff:3", "a@all@0"):
         with pytest.raises(UsageError, match="fern:17"):
             row_of(name)
-
-
-def test_a_row_without_cameras_has_some_photographs_and_nothing_else(tmp_path):
-    """They are evenly spaced, the first and the last among them; each call makes a new folder."""
+    # without cameras: photographs evenly spaced, the first and the last among them, in a new folder at each call
     folder, count, flags = PHOTOGRAPHS["fern:3:film"]
     source = tmp_path / folder
     source.mkdir(parents=True)
@@ -158,7 +147,7 @@ def test_training_views_are_left_out_and_held_out_ones_are_not_read(demo):
     assert left_out(tuple("abcdefghi"), 1) == [("e",)] and left_out(tuple("abcdefghi"), 3) == [("c", "e", "g")]
     with pytest.raises(UsageError, match="at least two"):
         left_out(("a", "b"), 1)
-    scene, spec = scene_at(demo, 1), split_spec(8)
+    scene, spec = scene_at(str(demo), 1), split_spec(8)
     whole = split_views(scene, spec)
     assert folds(scene, spec, 0) == [(spec, "")]
     ((part, names),) = folds(scene, spec, 2)
@@ -173,10 +162,7 @@ def test_failures_are_results_and_no_task_begins_after_the_limit():
     found = dict(finished(eval, ["1 / 0", died, good], 1, math.inf))  # built in: workers import nothing
     assert found["1 / 0"]["error"].startswith("ZeroDivisionError") and found[good] == {"square": 4}
     assert "Broken" in found[died]["error"]
-
-
-def test_an_error_before_the_first_task_is_not_lost():
-    """Without compiled kernels, every worker would compile them again."""
+    # without compiled kernels, every worker would compile them again
     with pytest.raises(ZeroDivisionError):
         list(finished(eval, ["{}"], 1, math.inf, functools.partial(divmod, 1, 0)))
 
@@ -195,10 +181,10 @@ def test_a_fit_gives_a_row_and_the_peer_starts_from_the_same_points(demo, fake_g
     monkeypatch.setattr(sys.modules["gsplat"], "DefaultStrategy", DefaultStrategy, raising=False)
     counts = {}
     for preset in ("quick", *one_fit.PEERS):
-        row = one_fit.measure(Fit("r", f"{preset}:steps=3", 1, demo, split_spec(8), "", 1, "cpu"))
+        row = one_fit.measure(Fit("r", f"{preset}:steps=3", 1, str(demo), split_spec(8), "", 1, "cpu"))
         assert 3 < row["psnr"] < 40 and row["steps"] == 3 and row["bytes"] > 0 and row["setup"] > 0
         counts[preset] = row.get("points")
-    seen = scene_at(demo, 1).points.seen_by(set(split_views(scene_at(demo, 1), split_spec(8)).train), least=2)
+    seen = scene_at(str(demo), 1).points.seen_by(set(split_views(scene_at(str(demo), 1), split_spec(8)).train), least=2)
     assert counts[one_fit.PEER_POINTS] == len(seen) != counts[one_fit.PEER] > 0
 
 
@@ -210,7 +196,10 @@ def test_the_default_strategy_has_its_own_settings(fake_gsplat, monkeypatch):
     monkeypatch.setitem(sys.modules, "gsplat", made)
     s = default_settings(7000)
     strategy, state = strategy_of(s, 2.5)
-    assert strategy.told == {"refine_start_iter": 500, "refine_stop_iter": 3500, "refine_every": 100, "reset_every": 3000} and state == 2.5
+    assert (
+        strategy.told == {"refine_start_iter": 500, "refine_stop_iter": 3500, "refine_every": 100, "reset_every": 3000}
+        and state == 2.5
+    )
     assert (s.init_opacity, s.init_scale, s.opacity_reg, s.scale_reg) == (0.1, 1.0, 0.0, 0.0)
 
 
@@ -220,20 +209,15 @@ def results(row: str, preset: str, scores: list[float], **more) -> list[dict]:
     return [{"row": row, "preset": preset, "seed": s, "psnr": p} | rest for s, p in enumerate(scores)]
 
 
-def test_the_rival_is_picked_on_the_other_seeds():
-    """One lucky seed makes a rival everywhere but on that seed."""
+def test_rivals_and_tables_of_presets():
+    """Tables have the worst seed below the median, times beside other fits in brackets, failures by name, sizes in pairs."""
     scores = {"default": [20.0, 20.0, 20.0], "even": [20.1, 20.1, 20.1], "lucky": [19.0, 25.0, 19.0]}
     d, names = rival({k: dict(enumerate(v)) for k, v in scores.items()}, "default")
     assert sorted(names) == ["even", "lucky"]
     assert d.mean == pytest.approx(((20 - 19) + (20 - 20.1) + (20 - 19)) / 3) and d.count == 3
-    shorter, _ = rival(
-        {"default": {0: 20.0, 1: 20.0, 2: 20.0}, "weak": {0: 1.0, 1: 1.0, 2: 1.0}, "best": {0: 21.0, 1: 21.0}}, "default"
-    )
+    weak = {"default": dict.fromkeys(range(3), 20.0), "weak": dict.fromkeys(range(3), 1.0), "best": {0: 21.0, 1: 21.0}}
+    shorter, _ = rival(weak, "default")
     assert shorter.count == 2 and shorter.mean == pytest.approx(-1), "seeds that the best lacks are not compared"
-
-
-def test_tables_say_worst_seed_times_and_failures():
-    """The worst seed below the median, times beside other fits in brackets, views left out averaged, errors named."""
     rows = results("a", "default", [20.0, 20.2, 19.5], jobs=1) + results("a", "x", [20.1, 20.1, 20.1], jobs=6)
     rows += results("b", "x", [1.0], left_out="u") + results("b", "x", [3.0], left_out="v")
     rows += [{"row": "b", "preset": "default", "seed": 0, "error": "E: no"}]
@@ -241,6 +225,13 @@ def test_tables_say_worst_seed_times_and_failures():
     assert "| a | `default` | 3 | 19.90 ± 0.36 | 0.5000 ± 0.0000 | 0.50 | 10 | 2 | 1.0 + 2.0 | 7 |" in text
     assert "| (1.0 + 2.0) | 7 |" in text and "| b | `x` | 1 | 2.00 |" in text
     assert "Worst row: a, -0.20 dB, beyond" in text and "- failed: b, `default`, seed 0: E: no" in text
+    rows = []
+    for row in ("a", "b"):
+        rows += results(row, "paper", [20.0, 21.0]) + results(row, "small", [19.96, 20.96], bytes=1000)
+        rows += results(row, "pruned/paper", [19.9, 20.9], ssim=None)
+    text = sizes_table(rows, "paper")
+    assert "- small: 0.50 of the bytes, -0.0400 dB [-0.0400, -0.0400], +0.0000 SSIM" in text
+    assert "- pruned/paper: 1.00 of the bytes, -0.1000 dB [-0.1000, -0.1000] over 2 scenes; beyond limits" in text
 
 
 @dataclass(frozen=True)
@@ -286,28 +277,10 @@ def test_a_preset_changes_what_it_names_and_nothing_else():
             one_fit.config_of(bad)
 
 
-def test_sizes_are_paired_with_the_fixed_fit():
-    """Half the bytes at 0.04 dB less is within the limits; SSIM that is not measured is left out."""
-    rows = []
-    for row in ("a", "b"):
-        rows += results(row, "paper", [20.0, 21.0]) + results(row, "small", [19.96, 20.96], bytes=1000)
-        rows += results(row, "pruned/paper", [19.9, 20.9], ssim=None)
-    text = sizes_table(rows, "paper")
-    assert "- small: 0.50 of the bytes, -0.0400 dB [-0.0400, -0.0400], +0.0000 SSIM" in text
-    assert "- pruned/paper: 1.00 of the bytes, -0.1000 dB [-0.1000, -0.1000] over 2 scenes; beyond limits" in text
-
-
 # Rivals under one rule: their steps are chosen on training views left out, and all share start, background and degree.
 
 
-@pytest.fixture
-def registry_as_it_was(monkeypatch):
-    """What a test registers is gone after it."""
-    STRATEGIES.names()
-    monkeypatch.setattr(STRATEGIES, "_classes", dict(STRATEGIES._classes))
-
-
-@pytest.mark.usefixtures("registry_as_it_was")
+@pytest.mark.usefixtures("registries_as_they_were")
 @pytest.mark.parametrize("views", [3, 6])
 def test_all_arms_share_start_background_and_degree(views):
     """Those of `default`, for any number of views; only the ladder's first arm starts at random."""
@@ -325,9 +298,9 @@ def test_all_arms_share_start_background_and_degree(views):
         assert same != (arm is LADDER[0]), arm.words
 
 
-@pytest.mark.usefixtures("registry_as_it_was")
+@pytest.mark.usefixtures("registries_as_they_were")
 def test_the_page_pairs_each_method_with_its_base():
-    """Differences are paired by seed, to the first arm or to the one above; few seeds have no interval; cells may lack."""
+    """Pairs by seed with the first arm or the one above; few seeds have no interval; other steps stand beside the first arm."""
     arms = (Arm("a", "default"), Arm("b", "3dgs", (10, 20)), Arm("c", "mcmc:steps=7"))
     rows = results("fern:3", "default", [20.0, 20.2, 20.1]) + results("fern:3", "3dgs:steps=20", [21.0, 21.4, 21.2])
     rows += results("fern:3", "mcmc:steps=7", [19.0, 19.2])
@@ -340,11 +313,6 @@ def test_the_page_pairs_each_method_with_its_base():
     assert "| c | 7 | 19.10 / 0.500 (2 seeds) | -1.00 |" in table
     again = arms_table((*arms, Arm("d", "quick")), rows, ["fern:3"], above=True).splitlines()
     assert again[-2:] == ["| c | 7 | 19.10 / 0.500 (2 seeds) | -2.10 |", "| d |  |  |  |"]
-
-
-@pytest.mark.usefixtures("registry_as_it_was")
-def test_the_page_lists_scores_with_steps_that_were_not_chosen():
-    """Those on held-out views alone, beside the first arm: the chosen number stands in the other table."""
     arms = (Arm("a", "default"), Arm("b", "3dgs", (10, 20)))
     rows = results("fern:3", "3dgs:steps=10", [21.0, 21.4]) + results("fern:3", "3dgs:steps=20", [20.0])
     rows += results("fern:3", "default", [22.0, 22.0, 25.0])
@@ -352,31 +320,21 @@ def test_the_page_lists_scores_with_steps_that_were_not_chosen():
     assert other_steps_table(arms, rows, ["fern:3"]).splitlines()[2:] == ["| fern | b | 10 | 21.20 ± 0.28 (2 seeds) | -0.80 |"]
 
 
-@pytest.mark.usefixtures("registry_as_it_was")
-def test_every_arm_names_its_steps_once():
-    """Numbers of steps are read from the preset itself."""
+@pytest.mark.usefixtures("registries_as_they_were")
+def test_arms_name_their_steps_and_settings_and_steps_are_chosen_on_views_left_out():
+    """Numbers of steps are read from the preset; settings of a strategy of one's own come after it; views left out choose."""
     for arm in (a for arms in ARMS.values() for a in arms if a.steps):
         assert len(arm.steps) > 1 and arm.steps == tuple(sorted(arm.steps))
         for steps in arm.steps:
             preset = arm.with_steps(steps)
             found = peer_settings(preset, photos(3)) if is_peer(preset) else config_of(preset)
             assert found.steps == steps
-
-
-@pytest.mark.usefixtures("registry_as_it_was")
-def test_an_arm_sets_what_a_strategy_of_ones_own_has():
-    """By the names of its flags, after the strategy; a name that it lacks is refused."""
     own = "3dgs:strategy=examples/05_own_strategy.py:Sprout,sprout.growth="
     assert config_of(f"{own}0.5").strategy_config.growth == 0.5
     assert config_of(f"{own}0.5,steps=7,sprout.every=3").strategy_config.every == 3
     for bad in (f"{own}0.5,sprout.speed=1", "3dgs:sprout.growth=0.5"):
         with pytest.raises(UsageError, match="sets nothing"):
             config_of(bad)
-
-
-@pytest.mark.usefixtures("registry_as_it_was")
-def test_steps_are_chosen_on_views_left_out():
-    """The best mean; a number that lacks a view, a test score and a failure count for nothing."""
     arm = Arm("a", "3dgs:sh_degree=0", (10, 20, 30))
 
     def row(steps: int, out: str, psnr: float) -> dict:
@@ -429,19 +387,14 @@ def test_distances_to_the_shapes_that_rays_hit():
             assert (found <= 0.02 + 1e-6).all() and (not len(x) or np.median(found) == pytest.approx(0.02, abs=1e-6))
 
 
-def test_depth_is_along_the_axis():
-    """A wall across the axis has one depth."""
-    wall = raycast.Plane((0, 0, 3.0), still_life()[0].texture)
-    camera = Camera(np.eye(4), np.array([[30.0, 0, 16], [0, 30, 12], [0, 0, 1]]), 32, 24)
-    assert np.allclose(surfaces.true_depth([wall], camera), 3) and surfaces.true_depth([wall], camera).shape == (24, 32)
-
-
 def test_samples_and_distances_of_triangles():
     """Samples lie on the triangles, evenly; distances are to the nearest point of them, not to a vertex."""
     found = surfaces.sample(SQUARE, 4000)
     assert (found[:, 2] == 0).all() and np.allclose(found.mean(0), [1, 0.5, 0], atol=0.05)
     assert np.allclose(surfaces.distance_to_mesh(SQUARE, np.array([[1.0, 0.5, 3], [4, 0.5, 0], [1, 0.2, 0]])), [3, 2, 0])
     row = surfaces.summary("x", np.array([0.0, 0.01, 0.02, 0.97]), 1.0)
-    assert (
-        row["x_mean"] == row["x_mean_of_radius"] == 0.25 and row["x_median"] == 0.015 and row["x_within_0.01_of_radius"] == 0.5
-    )
+    assert row["x_mean"] == row["x_mean_of_radius"] == 0.25
+    assert (row["x_median"], row["x_within_0.01_of_radius"]) == (0.015, 0.5)
+    wall = raycast.Plane((0, 0, 3.0), still_life()[0].texture)
+    camera = Camera(np.eye(4), np.array([[30.0, 0, 16], [0, 30, 12], [0, 0, 1]]), 32, 24)
+    assert np.allclose(surfaces.true_depth([wall], camera), 3) and surfaces.true_depth([wall], camera).shape == (24, 32)

@@ -12,6 +12,7 @@ from bench.lib.rasterizers import Drawing
 from warpgs import RasterizeOptions, rasterize
 from warpgs.constants import RULES, Rule
 from warpgs.export.base import half_turn
+from warpgs.kernels.ssim import ssim
 from warpgs.scene import Camera, Gaussians
 
 CPU = torch.device("cpu")
@@ -24,7 +25,9 @@ def dense(g: Gaussians, camera: Camera, rule: Rule = RULES["exact"]) -> Drawing:
 
 
 def test_ours_and_plain_torch_give_the_same_gradients():
-    """In float64, by our names and shapes, under every rule that plain torch knows."""
+    """In float64, by our names and shapes, under every rule that plain torch knows; the same SSIM."""
+    a, b = (inputs.image(40, 30, CPU, seed=seed) for seed in (0, 1))
+    assert (ssim(a, b) - peers.torch_ssim(a, b)).abs().max() < 1e-4
     g = Gaussians(**{n: t.detach().double() for n, t in inputs.gaussians(40, CPU).tensors().items()})
     g = dataclasses.replace(g, logit_opacities=g.logit_opacities + 4, log_scales=g.log_scales + 1)  # many pixels stop
     camera = inputs.camera(20, 16, CPU)
@@ -34,11 +37,9 @@ def test_ours_and_plain_torch_give_the_same_gradients():
         ours, plain = rasterizers.ours(g, camera, rule=rule), dense(g, camera, rule)
         a, b = (drawing.named_gradients(weights) for drawing in (ours, plain))
         assert list(a) == list(g.tensors()) and ours.image().shape == (16, 20, 3)
+        assert (ours.image() - plain.image()).abs().max() < 1e-7
         assert all(a[n].shape == t.shape and (a[n] - b[n]).norm() < 1e-7 * b[n].norm() for n, t in g.tensors().items())
-
-
-def test_a_layout_of_its_own_is_turned_into_ours():
-    """Channels first, coefficients in two tensors, opacities in a column: images and gradients are ours."""
+    # channels first, coefficients in two tensors, opacities in a column: images and gradients are ours
     g, camera = inputs.gaussians(30, CPU), inputs.camera(20, 16, CPU)
     t = {name: v.detach() for name, v in g.tensors().items()}
     leaves = t | {"logit_opacities": t["logit_opacities"][:, None], "sh0": t["sh"][:, :1], "sh_rest": t["sh"][:, 1:]}

@@ -20,7 +20,6 @@ class Time:
 
 @pytest.fixture
 def time() -> Time:
-    """A time that stands still."""
     return Time()
 
 
@@ -40,10 +39,7 @@ def test_sections_sum_to_the_total(time):
     assert [*found] == ["import", "reading", "kernels", "other", "total"]
     time.now += 1
     assert watch.seconds() == found | {"other": 1.25, "total": 18.75}  # it runs on
-
-
-def test_a_section_ends_with_an_error(time):
-    """A failed section has its time; an open one counts up to now."""
+    # a failed section has its time; an open one counts up to now
     watch = Clock(now=time)
     with pytest.raises(ValueError, match="wrong"), watch("scoring"):
         time.now += 3
@@ -81,9 +77,10 @@ def test_the_largest_parts_are_named_once():
     """Phases are one part in the short line; the long line has all."""
     found = {"import": 4.0, "steps (phase 1)": 3.0, "steps (phase 2)": 3.4, "report": 2.0, "other": 0.1, "total": 12.5}
     assert largest(found) == "steps 6 s, import 4 s, report 2 s"
-    assert times_line(found).endswith(
-        "12.50 s: import 4.00 s, steps (phase 1) 3.00 s, steps (phase 2) 3.40 s, report 2.00 s, other 0.10 s"
-    )
+    parts = "import 4.00 s, steps (phase 1) 3.00 s, steps (phase 2) 3.40 s, report 2.00 s, other 0.10 s"
+    assert times_line(found).endswith(f"12.50 s: {parts}")
+    # the age of this process is at least that of the first line, and unknown without /proc
+    assert not clock._age() <= 0
 
 
 @pytest.mark.parametrize(("age", "counted"), [(0.75, 0.75), (5.25, 0.5), (math.nan, 0.5)])
@@ -92,9 +89,3 @@ def test_the_time_before_the_first_line_counts(monkeypatch, age, counted):
     monkeypatch.setattr(clock, "FIRST_LINE", 9.5)
     monkeypatch.setattr(clock, "_age", lambda: age)
     assert clock.since_start(now=lambda: 10.0) == counted
-
-
-def test_the_age_of_this_process_is_known():
-    """It is at least that of the first line, and unknown without /proc."""
-    age = clock._age()
-    assert not age <= 0

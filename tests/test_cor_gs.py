@@ -12,7 +12,6 @@ from tests.scenes import photos, seeds
 from warpgs import rasterize
 from warpgs.errors import UsageError
 from warpgs.pipeline.model.start import InitConfig
-from warpgs.pipeline.train.loss import LOSS_TERMS
 from warpgs.pipeline.train.presets import preset_settings
 from warpgs.pipeline.train.settings import FitConfig
 from warpgs.pipeline.train.strategies.base import STRATEGIES
@@ -24,16 +23,11 @@ FILE = Path(__file__).parent.parent / "examples" / "11_cor_gs.py"
 NAME = f"{FILE}:CorGS"
 
 
-@pytest.fixture(autouse=True)
-def registry_as_it_was(monkeypatch):
-    """What a test registers is gone after it."""
-    STRATEGIES.names()
-    monkeypatch.setattr(STRATEGIES, "_classes", dict(STRATEGIES._classes))
+pytestmark = pytest.mark.usefixtures("registries_as_they_were")
 
 
 def test_the_files_of_the_page_are_a_preset(tmp_path, monkeypatch):
     """A loss term and a strategy in one preset, each with a setting; the fit takes a step in which the strategy acts."""
-    monkeypatch.setattr(LOSS_TERMS, "_classes", dict(LOSS_TERMS._classes))
     monkeypatch.chdir(tmp_path)
     page = (FILE.parent.parent / "docs" / "add-a-baseline.md").read_text("utf-8")
     for kind, name in (("toml", "rule.toml"), ("python", "my.py")):
@@ -91,7 +85,7 @@ def error(trainer: Trainer, table) -> float:
 
 
 def test_models_differ_and_learn(module):
-    """Both are trained on the same views, in an order of their own."""
+    """Both are trained on the same views, in an order of their own; the term is zero where models agree, as at first."""
     trainer = fit(module, steps=40, gradient=1.0)
     ours, twin = trainer.table, trainer.strategy.twin.table
     before = error(trainer, ours)
@@ -99,6 +93,11 @@ def test_models_differ_and_learn(module):
     advanced(trainer, 40)
     assert len(twin) == len(ours) and not torch.equal(twin.params["means"], ours.params["means"])
     assert max(error(trainer, ours), error(trainer, twin)) < 0.8 * before
+    trainer = fit(module)
+    assert float(trainer.strategy.regularisation(False, trainer.gaussians).detach()) == pytest.approx(0, abs=1e-6)
+    with torch.no_grad():
+        trainer.strategy.twin.table.params["sh"] += 0.5
+    assert float(trainer.strategy.regularisation(False, trainer.gaussians).detach()) > 0.01
 
 
 def test_gaussians_without_a_neighbour_are_pruned_in_both_models(module):
@@ -113,18 +112,8 @@ def test_gaussians_without_a_neighbour_are_pruned_in_both_models(module):
         table.apply(change)
     assert strategy.prunes(6) and not strategy.prunes(4)
     assert (len(table), len(strategy.twin.table)) == (counts[0] - 1, counts[1] - 1)
-    assert all(
-        float(t.params["means"].detach().abs().max()) < 50 * trainer.context.extent for t in (table, strategy.twin.table)
-    )
-
-
-def test_the_term_is_zero_where_models_agree(module):
-    """At the first step both models are one; the weight scales what follows."""
-    trainer = fit(module)
-    assert float(trainer.strategy.regularisation(False, trainer.gaussians).detach()) == pytest.approx(0, abs=1e-6)
-    with torch.no_grad():
-        trainer.strategy.twin.table.params["sh"] += 0.5
-    assert float(trainer.strategy.regularisation(False, trainer.gaussians).detach()) > 0.01
+    for means in (t.params["means"].detach() for t in (table, strategy.twin.table)):
+        assert float(means.abs().max()) < 50 * trainer.context.extent
 
 
 def test_random_cameras_stay_near_the_training_cameras(module):
@@ -137,10 +126,7 @@ def test_random_cameras_stay_near_the_training_cameras(module):
         assert float(torch.det(R)) > 0 and float((centers + R.T @ t).norm(dim=1).min()) < 1e-5
     near, far = (module.random_cameras(views, n, 50, torch.Generator().manual_seed(1))[:, :3, 3] for n in (0.1, 1.0))
     assert far.std() > near.std()
-
-
-def test_scenes_that_it_cannot_fit_are_refused(module):
-    """One view has no neighbour; transparent views have a random background, which two renders would not share."""
+    # one view has no neighbour; transparent views have a random background, which two renders would not share
     with pytest.raises(UsageError, match="at least two opaque"):
         fit(module, views=1)
     config = fit(module).config

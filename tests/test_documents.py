@@ -16,9 +16,7 @@ from PIL import Image
 
 from bench.lib import result_file
 from tests.scenes import view_stub
-from tools.run_dockerfile import ROOT as run_dockerfile_ROOT
 from tools.run_dockerfile import instructions, of_target, run
-from tools.run_docs import ROOT as run_docs_ROOT
 from tools.run_docs import collect, main, pages, prepare, run_blocks, shortened
 from warpgs import PRESETS, read_ply
 from warpgs.app.cli import ASKING
@@ -26,9 +24,13 @@ from warpgs.pipeline.train import settings as by_views
 from warpgs.pipeline.train.settings import FitConfig, settings_by_views
 from warpgs.synthetic.demo import write_demo
 
-# Whatever the documents name is there: files, tests and flags. Links and formulas are checked by `make docs`.
-
 ROOT = Path(__file__).parent.parent
+
+
+def text_of(name: str) -> str:
+    return (ROOT / name).read_text("utf-8")
+
+
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
 """Decisions and the changelog are left out: they tell what was, too."""
 GONE_FLAGS = {"fused-adam"}
@@ -43,7 +45,7 @@ def named_files(text: str) -> set[tuple[str, str]]:
 
 
 def test_named_files_and_tests_are_there():
-    """Every path of code leads to a file, and every test named behind it is in that file."""
+    """Every path of code leads to a file, every test named behind it is in that file, and links lead to files."""
     missing = []
     for page, (name, test) in ((p, named) for p in PAGES for named in sorted(named_files(p.read_text("utf-8")))):
         found = [home / name for home in HOMES if (home / name).is_file()]
@@ -52,6 +54,9 @@ def test_named_files_and_tests_are_there():
         elif test and f"def {test}(" not in found[0].read_text("utf-8"):
             missing.append(f"{page.name}: {name}::{test}")
     assert not missing, f"pages name what is not there: {', '.join(missing)}"
+    for document in ("README.md", "docs/architecture.md", "CONTRIBUTING.md"):
+        for target in re.findall(r"\]\((?!http)([^)#]+)\)", text_of(document)):
+            assert ((ROOT / document).parent / target).exists(), f"{document}: {target}"
 
 
 def test_named_flags_are_there():
@@ -65,15 +70,14 @@ def test_named_flags_are_there():
         parts = {flag: [part.replace("-", "_") for part in flag.split(".")] for flag in flags}
         off = [(f, *names) for f, names in parts.items() if len(names) == 2 and names[1].startswith("no_")]
         missing += [f"{page.name}: --{f}" for f, group, name in off if get_type_hints(settings[group])[name[3:]] is not bool]
-        missing += [
-            f"{page.name}: --{f}" for f, names in sorted(parts.items()) if not {n.removeprefix("no_") for n in names} <= known
-        ]
+        unknown = [f for f, names in sorted(parts.items()) if not {n.removeprefix("no_") for n in names} <= known]
+        missing += [f"{page.name}: --{f}" for f in unknown]
     assert not missing, f"pages name flags that no command has: {', '.join(missing)}"
 
 
 def test_the_page_on_presets_says_what_the_rule_chooses():
     """The columns of its table are the settings for so many views."""
-    text = (ROOT / "docs/presets.md").read_text("utf-8")
+    text = text_of("docs/presets.md")
     rows = [[c.strip() for c in line.split("|")[3:-1]] for line in text[text.index("| setting | rule |") :].splitlines()[:12]]
     counts = [int(cell.split()[0]) for cell in rows[0]]
     assert len(counts) >= 5
@@ -86,14 +90,6 @@ def test_the_page_on_presets_says_what_the_rule_chooses():
             config.half_resolution, config.optimizer.average_last,
         )  # fmt: skip
         assert tuple(float(row[column].replace(",", "")) for row in rows[2:]) == chosen, views
-
-
-def test_the_score_of_the_quickstart_is_that_of_its_file():
-    """Its commands, as `bench.fits.presets` runs them."""
-    rows = json.loads((ROOT / "bench/results/quickstart_cpu2.json").read_text("utf-8"))["rows"]
-    (row,) = (r for r in rows if r["preset"] == "default" and r["row"].endswith("@every:8"))
-    said = re.findall(r"held-out PSNR ([\d.]+) dB, SSIM ([\d.]+),", (ROOT / "docs/quickstart.md").read_text("utf-8"))
-    assert said == [(f"{row['psnr']:.2f}", f"{row['ssim']:.3f}")]
 
 
 BY_HAND = {
@@ -189,12 +185,8 @@ SLOW_TO_READ = re.compile(
 
 def test_pages_are_plain():
     """Fewer than one such phrase in 1,000 words of any page, code left out."""
-    pages = [
-        *PAGES,
-        *(ROOT / n for n in ("SECURITY.md", "CHANGELOG.md", "bench/README.md")),
-        *(ROOT / "docs/decisions").glob("*.md"),
-    ]
-    broken = []
+    others = [ROOT / name for name in ("SECURITY.md", "CHANGELOG.md", "bench/README.md")]
+    pages, broken = [*PAGES, *others, *(ROOT / "docs/decisions").glob("*.md")], []
     for page in pages:
         text = re.sub(r"```.*?```", "", page.read_text("utf-8"), flags=re.DOTALL)
         found = [m[0] for m in SLOW_TO_READ.finditer(text)]
@@ -205,7 +197,7 @@ def test_pages_are_plain():
 
 def test_the_way_of_one_photograph_names_functions_that_exist():
     """Each row of its table names a file of the package and a function in it; no function comes twice."""
-    text = (ROOT / "docs/architecture.md").read_text("utf-8")
+    text = text_of("docs/architecture.md")
     hops = re.findall(r"^\| `([\w/]+\.py)` \| `([\w.]+)` \|", text[text.index("## The way of one photograph") :], re.M)
     assert len(hops) == len(set(hops)) > 20
     for file, function in hops:
@@ -214,11 +206,8 @@ def test_the_way_of_one_photograph_names_functions_that_exist():
             found = [n for n in found if getattr(n, "name", None) == name]
             assert found, f"{file}: there is no {function}"
             found = found[0].body
-
-
-def test_every_line_of_the_security_page_names_a_test_that_is_there():
-    """Each row of its tables names at least one test."""
-    text = (ROOT / "SECURITY.md").read_text("utf-8")
+    # each row of the security page names at least one test, which is there
+    text = text_of("SECURITY.md")
     rows = [line for line in text.splitlines() if line.startswith("|") and not re.match(r"\|(---|.* \| test \|$)", line)]
     assert len(rows) > 20
     for row in rows:
@@ -245,23 +234,6 @@ def gone_presets(command: str) -> set[str]:
     return names - set(PRESETS) - {"gsplat", ""}
 
 
-def test_scores_of_the_readme_are_means_of_results():
-    """Each PSNR is the mean over the seeds of a preset with three photographs of fern."""
-    groups: dict[tuple, list[float]] = defaultdict(list)
-    for path in (ROOT / "bench/results").glob("*.json"):
-        for r in json.loads(path.read_text("utf-8"))["rows"]:
-            here = (
-                r.get("row") == "fern:3"
-                or r.get("scene") == "fern llff:3"
-                or (r.get("scene") == "fern" and "_llff3_" in path.name)
-            )
-            if here and not r.get("left_out") and "psnr" in r:
-                groups[path.name, r.get("preset", r.get("side"))].append(r["psnr"])
-    means = {f"{sum(v) / len(v):.1f}" for v in groups.values()}
-    stated = re.findall(r"(\d+\.\d+) dB", (ROOT / "README.md").read_text("utf-8"))
-    assert len(stated) >= 2 and {*stated} <= means
-
-
 def test_pages_and_kept_results_agree():
     """Named files are there; no result is of uncommitted code; no file is unnamed; gone presets are noted."""
     pages = [*PAGES, ROOT / "bench/README.md", *sorted((ROOT / "docs/decisions").glob("*.md"))]
@@ -282,50 +254,52 @@ def test_pages_and_kept_results_agree():
 
 
 def snippets(page: str) -> list[str]:
-    return re.findall(r"```python\n(.*?)```", (ROOT / page).read_text("utf-8"), re.DOTALL)
+    return re.findall(r"```python\n(.*?)```", text_of(page), re.DOTALL)
 
 
-def test_the_example_of_the_rasterizer_fits_an_image(capsys):
-    """Run as printed, it ends near the target."""
-    text = next(t for t in snippets("docs/rasterizer.md") if "rasterize(" in t and "backward()" in t)
-    assert len(text.splitlines()) <= 28
-    exec(compile(text, "docs/rasterizer.md", "exec"), {})
-    assert float(capsys.readouterr().out.split()[-1]) < 0.06
-
-
-def test_the_example_fits_a_scene(tmp_path, monkeypatch):
-    """Run as printed beside a tiny scene, with fewer steps: the PLY is there, in file units."""
+def test_the_examples_fit_a_scene_and_an_image(tmp_path, monkeypatch, capsys):
+    """Run as printed, the rasterizer's ends near its target; that of a scene, with fewer steps, writes a PLY in file units."""
     write_demo(tmp_path / "scene", views=8, width=48, height=36)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setitem(PRESETS._made, "quick", dataclasses.replace(PRESETS["quick"], steps=5))
     exec(compile(snippets("README.md")[0], "README.md", "exec"), {})
     ours, runs = (read_ply(tmp_path / name) for name in ("model.ply", "fitted/point_cloud.ply"))
     assert torch.equal(ours.means, runs.means)
+    text = next(t for t in snippets("docs/rasterizer.md") if "rasterize(" in t and "backward()" in t)
+    assert len(text.splitlines()) <= 28
+    exec(compile(text, "docs/rasterizer.md", "exec"), {})
+    assert float(capsys.readouterr().out.split()[-1]) < 0.06
 
 
-def test_links_lead_somewhere():
-    """Every file that the README and the architecture name exists."""
-    for document in ("README.md", "docs/architecture.md", "CONTRIBUTING.md"):
-        text = (ROOT / document).read_text("utf-8")
-        for target in re.findall(r"\]\((?!http)([^)#]+)\)", text):
-            assert ((ROOT / document).parent / target).exists(), f"{document}: {target}"
-
-
-def test_the_first_picture_of_the_readme_is_large_and_loads_fast():
-    """It comes before all text, at 640 px or more, in at most 300 kB."""
-    name = re.match(r"# warpgs\n\n!\[[^]]+\]\(([^)]+)\)", (ROOT / "README.md").read_text("utf-8"))[1]
+def test_picture_and_scores_of_the_readme_and_the_quickstart():
+    """It comes before all text, at 640 px or more, in at most 300 kB; scores are those of results, as means over seeds."""
+    name = re.match(r"# warpgs\n\n!\[[^]]+\]\(([^)]+)\)", text_of("README.md"))[1]
     with Image.open(ROOT / name) as picture:
         assert min(picture.size) >= 640
     assert (ROOT / name).stat().st_size <= 300_000
+    # the quickstart's commands, as `bench.fits.presets` runs them
+    rows = json.loads(text_of("bench/results/quickstart_cpu2.json"))["rows"]
+    (row,) = (r for r in rows if r["preset"] == "default" and r["row"].endswith("@every:8"))
+    said = re.findall(r"held-out PSNR ([\d.]+) dB, SSIM ([\d.]+),", text_of("docs/quickstart.md"))
+    assert said == [(f"{row['psnr']:.2f}", f"{row['ssim']:.3f}")]
+    groups: dict[tuple, list[float]] = defaultdict(list)
+    for path in (ROOT / "bench/results").glob("*.json"):
+        for r in json.loads(path.read_text("utf-8"))["rows"]:
+            scene = "fern llff:3" if r.get("scene") == "fern" and "_llff3_" in path.name else r.get("scene")
+            if (r.get("row") == "fern:3" or scene == "fern llff:3") and not r.get("left_out") and "psnr" in r:
+                groups[path.name, r.get("preset", r.get("side"))].append(r["psnr"])
+    means = {f"{sum(v) / len(v):.1f}" for v in groups.values()}
+    stated = re.findall(r"(\d+\.\d+) dB", text_of("README.md"))
+    assert len(stated) >= 2 and {*stated} <= means
 
 
 def test_the_hosted_checks_are_those_of_the_readme():
     """Both commands, each system, and every Python that the package allows."""
-    text = (ROOT / ".github/workflows/test.yml").read_text("utf-8")
-    commands = re.findall(r"^(make \w+) ", (ROOT / "README.md").read_text("utf-8"), re.MULTILINE)
+    text = text_of(".github/workflows/test.yml")
+    commands = re.findall(r"^(make \w+) ", text_of("README.md"), re.MULTILINE)
     assert re.findall(r"- run: (make \w+)", text) == commands == ["make demo", "make test"]
     assert all(f"{system}-latest" in text for system in ("ubuntu", "macos", "windows"))
-    low, high = re.search(r'requires-python = ">=3\.(\d+),<3\.(\d+)"', (ROOT / "pyproject.toml").read_text("utf-8")).groups()
+    low, high = re.search(r'requires-python = ">=3\.(\d+),<3\.(\d+)"', text_of("pyproject.toml")).groups()
     assert re.search(r"python: \[(.*)\]", text)[1] == ", ".join(f'"3.{n}"' for n in range(int(low), int(high)))
 
 
@@ -355,7 +329,7 @@ def messages() -> list[str]:
 
 
 def test_quoted_messages_are_there():
-    quoted = re.findall(r"^\*\*`(.+)`\*\*", (ROOT / "docs/troubleshooting.md").read_text("utf-8"), re.MULTILINE)
+    quoted = re.findall(r"^\*\*`(.+)`\*\*", text_of("docs/troubleshooting.md"), re.MULTILINE)
     assert len(quoted) > 30
     known, missing = messages(), []
     for message in quoted:
@@ -398,36 +372,33 @@ a table without a language
 """
 
 
-def test_blocks_and_reasons():
+def test_blocks_of_pages_are_found_shortened_and_prepared(capsys, tmp_path):
     first, marked, bare, python = collect("x.md", PAGE)
     assert (first.line, first.code) == (4, "echo first > a")
     assert first.left_out == (("ssh -L 8080:127.0.0.1:8080 you@there", "another machine"),)
     assert (marked.code, marked.left_out) == ("", (("echo never > b", "needs a GPU"),))
     assert (bare.code, bare.left_out[0][1]) == ("warpgs export run --to a.ply", "GPU")
     assert python.python and python.code.startswith("open(") and not first.python
-
-
-def test_a_marker_says_why():
+    # a marker says why
     with pytest.raises(ValueError, match="line 3"):
         collect("x.md", "<!-- docs-run:  -->\n```bash\necho a\n```\n")
-
-
-@pytest.mark.skipif(shutil.which("bash") is None, reason="there is no bash")
-def test_blocks_run_in_order_and_failures_are_named(tmp_path):
-    text = "```python\nopen('a', 'w')\n```\n```bash\ncat a\nfalse\ntouch late\n```\n```bash\ncp a b\n```\n"
-    (line,) = run_blocks(collect("x.md", text), tmp_path, tmp_path)
-    assert line.startswith("x.md, line 5: exit code 1") and (tmp_path / "b").exists() and not (tmp_path / "late").exists()
-
-
-@pytest.mark.skipif(shutil.which("bash") is None, reason="there is no bash")
-def test_the_next_block_runs_where_the_last_one_ended(tmp_path):
-    """As in the reader's shell, after `cd`."""
-    text = "```bash\nmkdir tour && cd tour\n```\n```bash\ntouch a\n```\n```python\nopen('b', 'w')\n```\n"
-    assert run_blocks(collect("x.md", text), tmp_path, tmp_path) == []
-    assert (tmp_path / "tour" / "a").exists() and (tmp_path / "tour" / "b").exists()
-
-
-def test_a_page_gets_what_it_uses_and_does_not_make(tmp_path):
+    # only what is long is made short
+    assert shortened(["fit", "s", "--out", "r"])[-2:] == ["--steps", "40"]
+    assert shortened(["compare", "s", "--seeds", "5", "--steps=9"]) == ["compare", "s", "--seeds", "1", "--steps=9"]
+    assert shortened(["fit", "s", "--steps=3", "--view"])[2:] == ["--steps=3", "--view", "--view-port", "0"]
+    for words in (["fit", "s", "--steps=3"], ["fit", "--help"], ["export", "run"], []):
+        assert shortened(words) == words
+    # no marker lacks its reason, and hardly anything is left out
+    blocks = [b for p in pages() for b in collect(p, text_of(p))]
+    assert sum(bool(b.code) for b in blocks) > 20
+    assert sum(len(b.left_out) for b in blocks) <= 26
+    with pytest.raises(SystemExit, match="0"):
+        main(["--help"])
+    assert "--install" in capsys.readouterr().out
+    with pytest.raises(SystemExit, match="2"):
+        main(["docs/no.md"])
+    assert "no such page: docs/no.md" in capsys.readouterr().err
+    # a page gets what it uses and does not make
     made, folder = tmp_path / "made", tmp_path / "page"
     for name in ("scene", "run", "photographs"):
         (made / name).mkdir(parents=True)
@@ -436,28 +407,15 @@ def test_a_page_gets_what_it_uses_and_does_not_make(tmp_path):
     assert [p.name for p in folder.iterdir()] == ["scene"]
 
 
-def test_only_what_is_long_is_made_short():
-    assert shortened(["fit", "s", "--out", "r"])[-2:] == ["--steps", "40"]
-    assert shortened(["compare", "s", "--seeds", "5", "--steps=9"]) == ["compare", "s", "--seeds", "1", "--steps=9"]
-    assert shortened(["fit", "s", "--steps=3", "--view"])[2:] == ["--steps=3", "--view", "--view-port", "0"]
-    for words in (["fit", "s", "--steps=3"], ["fit", "--help"], ["export", "run"], []):
-        assert shortened(words) == words
-
-
-def test_every_page_can_be_read():
-    """No marker lacks its reason, and hardly anything is left out."""
-    blocks = [b for p in pages() for b in collect(p, Path(run_docs_ROOT / p).read_text("utf-8"))]
-    assert sum(bool(b.code) for b in blocks) > 20
-    assert sum(len(b.left_out) for b in blocks) <= 26
-
-
-def test_the_program_shows_its_flags_and_names_an_unknown_page(capsys):
-    with pytest.raises(SystemExit, match="0"):
-        main(["--help"])
-    assert "--install" in capsys.readouterr().out
-    with pytest.raises(SystemExit, match="2"):
-        main(["docs/no.md"])
-    assert "no such page: docs/no.md" in capsys.readouterr().err
+@pytest.mark.skipif(shutil.which("bash") is None, reason="there is no bash")
+def test_blocks_run_in_order_and_failures_are_named(tmp_path):
+    """The next block runs where the last one ended, as in the reader's shell after `cd`."""
+    text = "```python\nopen('a', 'w')\n```\n```bash\ncat a\nfalse\ntouch late\n```\n```bash\ncp a b\n```\n"
+    (line,) = run_blocks(collect("x.md", text), tmp_path, tmp_path)
+    assert line.startswith("x.md, line 5: exit code 1") and (tmp_path / "b").exists() and not (tmp_path / "late").exists()
+    text = "```bash\nmkdir tour && cd tour\n```\n```bash\ntouch a\n```\n```python\nopen('b', 'w')\n```\n"
+    assert run_blocks(collect("x.md", text), tmp_path, tmp_path) == []
+    assert (tmp_path / "tour" / "a").exists() and (tmp_path / "tour" / "b").exists()
 
 
 # The lines of a Dockerfile that run without Docker: those of a target, in their order, in a clean folder.
@@ -484,14 +442,11 @@ def test_lines_of_a_target_run_in_the_folder_and_those_of_root_do_not(tmp_path, 
     assert [word for word, _ in steps] == ["RUN", "USER", "ENV", "RUN", "ARG", "RUN"]
     (left_out,) = run(steps, tmp_path, {"NAME": "c"})
     assert "apt-get install everything" in left_out and [p.name for p in (tmp_path / "a").iterdir()] == ["c"]
-
-
-def test_the_dockerfile_has_both_targets_and_runs_as_no_root():
-    """Only the system's libraries are installed before USER; every file that COPY names is there."""
-    found = instructions((run_dockerfile_ROOT / "Dockerfile").read_text("utf-8"))
+    # only the system's libraries are installed before USER; every file that COPY names is there
+    found = instructions(text_of("Dockerfile"))
     for target in ("cpu", "cuda"):
         steps = of_target(found, target)
         words = [word for word, _ in steps]
         assert words.count("USER") == 1 and words[: words.index("USER")] == ["RUN"] and words[-1] == "CMD"
         for rest in (rest for word, rest in steps if word == "COPY"):
-            assert all((run_dockerfile_ROOT / name).exists() for name in rest.split()[:-1] if not name.startswith("--"))
+            assert all((ROOT / name).exists() for name in rest.split()[:-1] if not name.startswith("--"))

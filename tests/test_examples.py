@@ -13,7 +13,6 @@ import torch
 from PIL import Image
 
 from warpgs.app.fit import request_of
-from warpgs.synthetic.demo import write_demo
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 SMALL = {
@@ -97,12 +96,11 @@ def test_the_splatfacto_example_densifies_and_mends_its_cameras(tmp_path, capsys
 
 
 @pytest.mark.parametrize("name", ["02_fit_scene", "04_own_loss"])
-def test_examples_take_a_scene(name, tmp_path, monkeypatch, capsys):
+def test_examples_take_a_scene(name, demo, tmp_path, monkeypatch, capsys):
     """A folder that is given is fitted, with views held out to score."""
     monkeypatch.setenv("WARPGS_CACHE", str(tmp_path / "cache"))
-    write_demo(tmp_path / "scene", views=8, width=48, height=36)
     flags = ["--steps", "5"] + (["--frames", "2"] if name == "02_fit_scene" else [])
-    run(name, [str(tmp_path / "scene"), *flags, "--out", str(tmp_path / ("out" if "scene" in name else "out.png"))])
+    run(name, [str(demo), *flags, "--out", str(tmp_path / ("out" if "scene" in name else "out.png"))])
     assert "held-out PSNR" in capsys.readouterr().out
 
 

@@ -35,23 +35,10 @@ from warpgs.files import (
     unread_reason,
     write_bytes,
 )
-from warpgs.folders import (
-    NAMES,
-    RefusedError,
-    Temporary,
-    open_folder,
-    output_folder,
-    shared_locks,
-    sweep,
-    system_folder,
-    temporary_folder,
-)
 from warpgs.locks import hold_folder
 from warpgs.poses import mapping
 from warpgs.process import ProcessFailed
 from warpgs.report.overview import remedy_for, run_pyvista
-
-# A file appears whole or not at all, however its writing ends, and nothing in the package writes any other way.
 
 ROOT = Path(__file__).parent.parent
 LEFT = ".warpgs-0123456789abcdef.tmp"
@@ -159,7 +146,8 @@ def test_a_folder_that_cannot_be_synced(tmp_path, monkeypatch):
     assert (tmp_path / "a").read_bytes() == b"2"
 
 
-def test_a_folder_with_nothing_but_our_own_leftovers_is_empty(tmp_path):
+def test_only_own_names_are_leftovers_and_are_swept(tmp_path):
+    """Not what looks like it, nor through a link; a name of ours that is a link goes itself."""
     assert is_empty(tmp_path)
     for name in (LOCK, LEFT, LEFT + ".mp4"):
         (tmp_path / name).touch()
@@ -170,6 +158,20 @@ def test_a_folder_with_nothing_but_our_own_leftovers_is_empty(tmp_path):
         (tmp_path / name).unlink()
     with pytest.raises(ResourceError, match="cannot be read"):
         is_empty(tmp_path / "none")
+    for name in (LOCK, LEFT, LEFT + ".mp4"):
+        (tmp_path / name).unlink()
+    hexes = "0123456789abcdef"
+    (tmp_path / "kept").mkdir()
+    (tmp_path / "kept" / "file").touch()
+    for name in (f"warpgs-{hexes}", f"warpgs-{hexes}.txt", f".warpgs-{hexes[1:]}.tmp", "warpgs-error-x.txt"):
+        (tmp_path / name).mkdir()
+    kept = {p.name for p in tmp_path.iterdir()}
+    (tmp_path / f".warpgs-{hexes}.tmp" / "below").mkdir(parents=True)
+    (tmp_path / f"warpgs-{hexes}.tmp.mp4").touch()
+    (tmp_path / f"warpgs-{hexes}.tmp.lock").touch()
+    (tmp_path / f"warpgs-{hexes}.tmp").symlink_to("kept", target_is_directory=True)
+    remove_leftovers(tmp_path)
+    assert {p.name for p in tmp_path.iterdir()} == kept and (tmp_path / "kept" / "file").exists()
 
 
 def test_a_folder_appears_whole_or_not_at_all(tmp_path, monkeypatch):
@@ -184,7 +186,7 @@ def test_a_folder_appears_whole_or_not_at_all(tmp_path, monkeypatch):
             assert OWN_NAMES.fullmatch(temporary.name) and temporary.parent == (tmp_path / name).parent
             (temporary / "x").touch()
         assert [p.name for p in (tmp_path / name).iterdir()] == ["x"] and not temporary.exists()
-    with open_folder(tmp_path / "a") as above, Temporary(above) as held:  # another process works in it
+    with folders.open_folder(tmp_path / "a") as above, folders.Temporary(above) as held:  # another process works in it
         above.mkdir(held.name)
         with pytest.raises(ResourceError, match="cannot be created"), filling(tmp_path / "a"):
             pass
@@ -248,38 +250,19 @@ def writers(tree: ast.AST) -> set[str]:
 
 
 def test_nothing_writes_past_the_one_way():
-    """Whatever writes a file is `warpgs.files`, or stands in the list above with its reason; and the list is true."""
+    """Whatever writes a file is `warpgs.files`, or is listed above with its reason; the list is true, and writers are seen."""
     found = set()
     for path in sorted((ROOT / "warpgs").rglob("*.py")):
         name = path.relative_to(ROOT / "warpgs").as_posix()
         found |= {(name, call) for call in writers(ast.parse(path.read_text("utf-8")))}
     assert found - ELSEWHERE.keys() == set(), "write it with warpgs.files"
     assert ELSEWHERE.keys() - found == set(), "no longer there"
-
-
-def test_writers_are_seen():
     for code in ("open(p, 'w')", "p.write_text('')", "cv2.imwrite(p, i)", "os.open(p, 1)", "open(p, mode='r+b')"):
         assert writers(ast.parse(code)), code
     assert not writers(ast.parse("open(p); p.open('rb'); write_bytes(p, b''); os.replace(a, b); Image.open(p); model.load(p)"))
 
 
-@pytest.mark.fault
-def test_commands_put_every_file_in_place_as_a_whole(tmp_path):
-    """Python's own record of what is opened and renamed: each file that is there at the end was put there under a name of ours.
-
-    That holds for files that libraries in C write past Python, too, as they cannot be there without having been renamed.
-    """
-    code = (ROOT / "tests" / "audited_commands.py").read_text("utf-8")
-    environment = os.environ | {"PYTHONPATH": str(ROOT), "WARPGS_CACHE": str(tmp_path / "cache"), "CUDA_VISIBLE_DEVICES": ""}
-    done = subprocess.run(
-        [sys.executable, "-c", code, str(tmp_path / "out")], env=environment, capture_output=True, text=True, check=False
-    )
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert done.stdout.splitlines()[-1] == "every file was put in place as a whole"
-
-
-# One function opens every input file: pipes, devices and folders are refused before a byte is read, and sizes are
-# bounded.
+# One function opens every input file: pipes, devices and folders are refused before a byte is read; sizes are bounded.
 
 
 def special(kind, path):
@@ -347,16 +330,6 @@ def test_sizes_are_bounded_before_and_while_reading(tmp_path, monkeypatch):
 # Below a folder of results no link is followed, neither to write nor to read; the folder itself may be a link.
 
 with_links = pytest.mark.skipif(os.name == "nt", reason="links need a right that users of Windows often lack")
-WAYS = {
-    "write": lambda p: write_bytes(p / "canary", b"new"),
-    "replace": lambda p: _replace(p / "canary"),
-    "append": lambda p: appending(p / "canary").close(),
-    "make": lambda p: make_folder(p / "below"),
-    "fill": lambda p: _fill(p / "below"),
-    "remove": lambda p: remove_file(p / "canary"),
-    "move": lambda p: move_folder(p / "folder", "moved"),
-    "read": lambda p: open_input(p / "canary", p).close(),
-}
 
 
 def _replace(path):
@@ -367,6 +340,18 @@ def _replace(path):
 def _fill(path):
     with filling(path) as temporary:
         (temporary / "x").touch()
+
+
+WAYS = {
+    "write": lambda p: write_bytes(p / "canary", b"new"),
+    "replace": lambda p: _replace(p / "canary"),
+    "append": lambda p: appending(p / "canary").close(),
+    "make": lambda p: make_folder(p / "below"),
+    "fill": lambda p: _fill(p / "below"),
+    "remove": lambda p: remove_file(p / "canary"),
+    "move": lambda p: move_folder(p / "folder", "moved"),
+    "read": lambda p: open_input(p / "canary", p).close(),
+}
 
 
 @pytest.fixture
@@ -389,7 +374,7 @@ def test_a_folder_that_is_a_link_is_refused(tmp_path, outside, way, depth):
     at = root.joinpath(*"abc"[:depth])
     at.parent.mkdir(parents=True)
     at.symlink_to(outside)
-    with output_folder(root), pytest.raises((ResourceError, RefusedError), match=f"{at}: is a link"):
+    with folders.output_folder(root), pytest.raises((ResourceError, folders.RefusedError), match=f"{at}: is a link"):
         WAYS[way](at)
 
 
@@ -401,7 +386,7 @@ def test_the_folder_itself_may_be_a_link(tmp_path):
     (real / "canary").write_bytes(b"old")
     (tmp_path / "home").symlink_to(tmp_path / "disk")
     (tmp_path / "disk" / "link").symlink_to(real)
-    with output_folder(tmp_path / "home" / "link"):
+    with folders.output_folder(tmp_path / "home" / "link"):
         for way in WAYS.values():
             (real / "canary").write_bytes(b"old")
             way(tmp_path / "home" / "link")
@@ -413,7 +398,7 @@ def test_a_file_that_is_a_link_is_replaced_and_never_followed(tmp_path, outside)
     root = tmp_path / "results"
     root.mkdir()
     link = root / "link"
-    with output_folder(root):
+    with folders.output_folder(root):
         for write in (lambda: write_bytes(link, b"new"), lambda: _replace(link)):
             link.symlink_to(outside / "canary")
             write()
@@ -422,14 +407,14 @@ def test_a_file_that_is_a_link_is_replaced_and_never_followed(tmp_path, outside)
         for target in (outside / "canary", outside / "new", outside):
             link.symlink_to(target)
             for refused in (appending, lambda p: open_input(p, root)):
-                with pytest.raises(RefusedError, match="is a link, and links inside"):
+                with pytest.raises(folders.RefusedError, match="is a link, and links inside"):
                     refused(link)
             with pytest.raises(ResourceError, match="link: is a link, and links inside"), filling(link):
                 pass
             remove_file(link)
             assert not link.is_symlink()
         os.mkfifo(link)
-        with pytest.raises(RefusedError, match="not a regular file"):
+        with pytest.raises(folders.RefusedError, match="not a regular file"):
             open_input(link, root)
         with pytest.raises(OSError):
             appending(link)
@@ -440,7 +425,7 @@ def test_a_file_that_is_a_link_is_replaced_and_never_followed(tmp_path, outside)
     (root / "file").symlink_to(outside / "canary")
     assert open_input(root / "file").read() == b"old"
     for path in (root / "file", root / "folder" / "canary"):
-        with pytest.raises(RefusedError, match="is a link"):
+        with pytest.raises(folders.RefusedError, match="is a link"):
             open_input(path, root)
     with pytest.raises(FileNotFoundError):
         open_input(root / "none" / "x", root)
@@ -451,7 +436,7 @@ def test_a_folder_that_was_replaced_is_not_written(tmp_path):
     """Neither the one that took its place nor, once that is gone, another; at its own place again it is."""
     root, inner = tmp_path / "results", tmp_path / "results" / "a"
     inner.mkdir(parents=True)
-    with output_folder(root), output_folder(inner):
+    with folders.output_folder(root), folders.output_folder(inner):
         for folder in (root, inner):
             moved = tmp_path / "moved"
             folder.rename(moved)
@@ -475,13 +460,13 @@ def test_folders_are_closed(tmp_path):
     descriptors = "/proc/self/fd" if os.path.isdir("/proc/self/fd") else "/dev/fd"
     (tmp_path / "link").symlink_to(tmp_path)
     before = len(os.listdir(descriptors))
-    with output_folder(tmp_path):
-        with output_folder(tmp_path):
+    with folders.output_folder(tmp_path):
+        with folders.output_folder(tmp_path):
             write_bytes(tmp_path / "a", b"1")
             with pytest.raises(ResourceError):
                 make_folder(tmp_path / "link" / "b")
-            with pytest.raises(RefusedError):
-                open_folder(tmp_path / "link")
+            with pytest.raises(folders.RefusedError):
+                folders.open_folder(tmp_path / "link")
             with pytest.raises(ResourceError, match="use a path without"):
                 write_bytes(tmp_path / ".." / "x", b"")
         thread = threading.Thread(target=write_bytes, args=(tmp_path / "b", b"2"))
@@ -525,11 +510,11 @@ def places(tmp_path, monkeypatch):
     folders.sweep_temporary_files.cache_clear()
 
 
-def started(code, *words):
+def started(code, *words, stdin=subprocess.PIPE):
     """Start Python, and wait for its first line."""
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
     words = [sys.executable, "-c", code, *map(str, words)]
-    process = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment)
+    process = subprocess.Popen(words, stdin=stdin, stdout=subprocess.PIPE, text=True, env=environment)
     assert process.stdout.readline()
     return process
 
@@ -539,8 +524,8 @@ def test_another_command_leaves_what_is_held_and_removes_what_a_killed_one_left(
     results, system = places
     process = started(HOLDS, results)
     there = {p.name for p in results.iterdir()}, {p.name for p in system.iterdir()}
-    assert [len(t) for t in there] == [3, 2] and all(map(NAMES.fullmatch, there[0] | there[1]))
-    with hold_folder(results), temporary_folder():
+    assert [len(t) for t in there] == [3, 2] and all(map(folders.NAMES.fullmatch, there[0] | there[1]))
+    with hold_folder(results), folders.temporary_folder():
         now = {p.name for p in results.iterdir()}, {p.name for p in system.iterdir()}
     assert now[0] >= there[0] and now[1] >= there[1]
     process.kill()
@@ -549,42 +534,21 @@ def test_another_command_leaves_what_is_held_and_removes_what_a_killed_one_left(
     with hold_folder(results):
         pass
     assert not list(results.iterdir()) and not list(system.iterdir())
-
-
-def test_a_folder_is_held_until_the_last_process_in_it_has_ended(places):
-    """A child that works in it may outlive its parent for a moment."""
+    # a child that works in a folder may outlive its parent for a moment: it is held until the last process has ended
     _, system = places
     read, write = os.pipe()
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
-    with subprocess.Popen([sys.executable, "-c", ORPHAN], stdin=read, stdout=subprocess.PIPE, env=environment) as process:
-        process.stdout.readline()
+    with started(ORPHAN, stdin=read) as process:
         process.kill()
     (lock,) = system.glob("*.lock")
-    with open_folder(system) as folder:
-        sweep(folder)
+    with folders.open_folder(system) as folder:
+        folders.sweep(folder)
         assert lock.exists() and len(list(system.iterdir())) == 2
         os.close(read)
         os.close(write)
         with lock.open("r+b") as file:
             folders.lock_descriptor(file.fileno())  # waits for it
-        sweep(folder)
+        folders.sweep(folder)
     assert not list(system.iterdir())
-
-
-def test_only_own_names_are_swept(tmp_path):
-    """Not what looks like it, nor through a link; a name of ours that is a link goes itself."""
-    hexes = "0123456789abcdef"
-    (tmp_path / "kept").mkdir()
-    (tmp_path / "kept" / "file").touch()
-    for name in (f"warpgs-{hexes}", f"warpgs-{hexes}.txt", f".warpgs-{hexes[1:]}.tmp", "warpgs-error-x.txt"):
-        (tmp_path / name).mkdir()
-    kept = {p.name for p in tmp_path.iterdir()}
-    (tmp_path / f".warpgs-{hexes}.tmp" / "below").mkdir(parents=True)
-    (tmp_path / f"warpgs-{hexes}.tmp.mp4").touch()
-    (tmp_path / f"warpgs-{hexes}.tmp.lock").touch()
-    (tmp_path / f"warpgs-{hexes}.tmp").symlink_to("kept", target_is_directory=True)
-    remove_leftovers(tmp_path)
-    assert {p.name for p in tmp_path.iterdir()} == kept and (tmp_path / "kept" / "file").exists()
 
 
 @pytest.mark.skipif(not hasattr(os, "getuid") or os.getuid() != 0, reason="only root can give files to another user")
@@ -593,8 +557,8 @@ def test_what_another_user_has_in_the_system_s_folder_stays(tmp_path):
     for name, user in zip(names, (0, 12345)):
         (tmp_path / name).mkdir()
         os.chown(tmp_path / name, user, -1)
-    with open_folder(tmp_path) as folder:
-        sweep(folder, own=True)
+    with folders.open_folder(tmp_path) as folder:
+        folders.sweep(folder, own=True)
     assert [p.name for p in tmp_path.iterdir()] == [names[1]]
 
 
@@ -613,25 +577,25 @@ def test_a_sweep_between_making_and_locking_costs_a_name(tmp_path, monkeypatch, 
         return lock(descriptor, blocking=blocking)
 
     monkeypatch.setattr(folders, "lock_descriptor", raced)
-    with open_folder(tmp_path) as folder, Temporary(folder) as held:
+    with folders.open_folder(tmp_path) as folder, folders.Temporary(folder) as held:
         assert len(calls) == 2 and (tmp_path / (held.name + ".lock")).exists()
 
 
 def test_a_temporary_folder_is_private_and_goes_with_its_lock(places):
     _, system = places
-    with shared_locks() as locks:
+    with folders.shared_locks() as locks:
         before = len(locks)
-    with temporary_folder() as folder:
+    with folders.temporary_folder() as folder:
         assert folder.path.parent == system.resolve() and (os.name == "nt" or folder.path.stat().st_mode & 0o777 == 0o700)
         (folder.path / "file").touch()
-        with shared_locks() as locks:
+        with folders.shared_locks() as locks:
             assert len(locks) == before + (os.name != "nt")
         folder.remove()
         assert not list(system.iterdir())
-    with shared_locks() as locks:
+    with folders.shared_locks() as locks:
         assert len(locks) == before
     if hasattr(os, "fork"):  # a child leaves the folder to its parent
-        with temporary_folder() as folder:
+        with folders.temporary_folder() as folder:
             child = os.fork()
             if not child:
                 folder.remove()
@@ -649,7 +613,7 @@ def test_the_system_s_folder_is_found_without_writing(tmp_path, monkeypatch):
     monkeypatch.setattr(tempfile, "_get_default_tempdir", lambda *_: pytest.fail("it searched"))
     monkeypatch.setenv("TMPDIR", str(tmp_path / "missing"))
     monkeypatch.setenv("TEMP", str(named))
-    assert system_folder() == named.resolve() and tempfile.gettempdir() == str(named)
+    assert folders.system_folder() == named.resolve() and tempfile.gettempdir() == str(named)
 
 
 # A full disk of another process is called that, and neither a lack of memory nor a fault of a renderer.
@@ -657,7 +621,7 @@ def test_the_system_s_folder_is_found_without_writing(tmp_path, monkeypatch):
 FULL = f"[Errno {errno.ENOSPC}] {os.strerror(errno.ENOSPC)}"
 
 
-def test_words_and_room(tmp_path, monkeypatch):
+def test_a_full_disk_is_known_by_words_room_and_renderer(tmp_path, monkeypatch):
     assert disk_is_full(tmp_path, f"OSError: {FULL}: 'a.png'") and not disk_is_full(tmp_path, "Segmentation fault")
     with pytest.raises(sqlite3.OperationalError) as e:
         database = sqlite3.connect(tmp_path / "a.db")
@@ -667,6 +631,10 @@ def test_words_and_room(tmp_path, monkeypatch):
     assert disk_is_full(tmp_path, str(e.value))
     monkeypatch.setattr(files, "MIN_FREE", 2**80)
     assert disk_is_full(tmp_path, "") and not disk_is_full(tmp_path / "none", "")
+    monkeypatch.undo()
+    works, why = run_pyvista(f"import os; raise OSError({errno.ENOSPC}, os.strerror({errno.ENOSPC}))")
+    assert not works and remedy_for(why).startswith("free some disk space for temporary files in ")
+    assert "renderer" in remedy_for(run_pyvista("raise SystemExit(3)")[1])
 
 
 @pytest.mark.parametrize(("said", "words"), [(FULL, "its disk is full"), ("killed", "too little memory")])
@@ -683,12 +651,6 @@ def test_poses(tmp_path, monkeypatch, said, words):
     assert (str(e.value).startswith(f"{tmp_path}: ")) == (said == FULL)
 
 
-def test_a_renderer():
-    works, why = run_pyvista(f"import os; raise OSError({errno.ENOSPC}, os.strerror({errno.ENOSPC}))")
-    assert not works and remedy_for(why).startswith("free some disk space for temporary files in ")
-    assert "renderer" in remedy_for(run_pyvista("raise SystemExit(3)")[1])
-
-
 @pytest.mark.fault
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="no Linux mount")
 @pytest.mark.parametrize("command", ["poses", "plot"])
@@ -702,9 +664,8 @@ def test_real_disks(tmp_path, command):
         pytest.skip("this user cannot mount")
     try:
         program = [sys.executable, "-P", "-m", "warpgs"]
-        subprocess.run(
-            [*program, "demo", str(files / "scene"), "--views", "8", "--width", "320", "--height", "240"], check=True
-        )
+        size = ["--views", "8", "--width", "320", "--height", "240"]
+        subprocess.run([*program, "demo", str(files / "scene"), *size], check=True)
         words = ["poses", str(files / "scene" / "images"), "--out", str(disk / "scene")]
         environment = dict(os.environ)
         if command == "plot":

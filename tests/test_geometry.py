@@ -6,6 +6,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from safetensors.torch import save_file
 
 import warpgs
 from tests.gaussians import LENSES, SMOOTH, camera, cloud, hand_placed, lens_camera
@@ -16,8 +17,6 @@ from warpgs.geometry import convert_camera, convert_gaussians, near_cameras
 from warpgs.io.load import normalize_view
 from warpgs.render.options import RasterizeOptions
 from warpgs.scene import Camera, View
-
-# Units: the similarity between scene and file coordinates, forth and back.
 
 N = Normalization(np.array([3.0, -2.0, 0.5]), 0.25)
 
@@ -37,10 +36,8 @@ def test_gaussians_and_cameras_together_look_the_same_in_both_units():
     assert g_file.sh is g.sh and g_file.quats is g.quats and g_file.logit_opacities is g.logit_opacities
     np.testing.assert_allclose(g_file.means, g.means.numpy() / 0.25 + N.offset, rtol=1e-12)
     np.testing.assert_allclose(g_file.log_scales.exp(), g.log_scales.exp() / 0.25, rtol=1e-12)
-
-
-def test_conversions_are_inverse_and_those_of_the_reader():
-    g, c = as_double(cloud(5)), camera()
+    # conversions are inverse, and those of the reader
+    g = as_double(cloud(5))
     back = convert_gaussians(convert_gaussians(g, N, "scene", "file"), N, "file", "scene")
     torch.testing.assert_close(back.means, g.means, rtol=1e-12, atol=1e-12)
     torch.testing.assert_close(back.log_scales, g.log_scales, rtol=1e-12, atol=1e-12)
@@ -93,8 +90,6 @@ def test_mistakes_are_named(tmp_path):
     write_ply(tmp_path / "a", g, units="file")
     with pytest.raises(DataError, match="damaged or not a safetensors file"):
         load(tmp_path / "a")
-    from safetensors.torch import save_file
-
     save_file({"means": g.means}, tmp_path / "b")
     with pytest.raises(DataError, match="not a model of format"):
         load(tmp_path / "b")
@@ -163,9 +158,7 @@ def test_rotations_turn_vectors_as_quaternions_do():
     assert np.array_equal(geometry.rotation_matrices(q[7]), R[7])
     back = geometry.quaternions(torch.from_numpy(R)).numpy()  # up to the sign, for half turns too
     assert np.allclose(np.abs((back * q).sum(1)), 1, atol=1e-14)
-
-
-def test_logit_is_the_inverse_of_the_sigmoid():
+    # logit is the inverse of the sigmoid
     for probability in (1e-12, 0.1, 0.5, 0.99):
         assert 1 / (1 + math.exp(-geometry.logit(probability))) == pytest.approx(probability, rel=1e-12)
     assert (geometry.logit(0), geometry.logit(1.0)) == (-math.inf, math.inf)
@@ -188,9 +181,7 @@ def test_normals_of_gaussians_are_their_shortest_axes():
         assert torch.allclose(geometry.gaussian_normals(g, one), normals, atol=1e-15)
         parallel = geometry.gaussian_normals(g, dataclasses.replace(one, model="orthographic"))
         assert bool((parallel @ viewmat[2, :3] < 0).all()) and torch.equal(parallel.abs(), normals.abs())
-
-
-def test_gradient_of_the_normals_of_gaussians():
+    # their gradient
     g, cam = hand_placed(degree=0), camera()
     quats = g.quats.clone().requires_grad_()
 
@@ -213,6 +204,14 @@ def test_points_come_back_from_pixels_and_depths():
         assert np.allclose(found.numpy(), points, atol=1e-12)
         again = geometry.project_tensors(tensors, found)
         assert np.allclose(again[0].numpy(), pixels, atol=1e-9) and np.allclose(again[1].numpy(), depths, atol=1e-12)
+    cam = camera()  # of another model
+    arrays = Camera(cam.viewmat.numpy(), cam.K.numpy(), 18, 17, "own")
+    with pytest.raises(UsageError, match="'own'; undistort"):
+        geometry.project_points(arrays, np.zeros((1, 3)))
+    with pytest.raises(UsageError, match="undistort"):
+        geometry.back_project(arrays, np.zeros((1, 2)), np.ones(1))
+    with pytest.raises(UsageError, match="undistort"):
+        geometry.back_project_tensors(dataclasses.replace(cam, model="own"), torch.zeros(1, 2), torch.ones(1))
 
 
 def plane_depth(cam: Camera, normal: torch.Tensor, distance: float) -> torch.Tensor:
@@ -281,17 +280,6 @@ def test_points_come_back_from_lenses(model):
     if model == "opencv":
         assert bool((geometry.project_tensors(cam, -found)[1] <= 0).all())
         assert geometry.project_points(arrays, -points)[1].tolist() == [0] * 50
-
-
-def test_other_camera_models_are_refused():
-    cam = camera()
-    arrays = Camera(cam.viewmat.numpy(), cam.K.numpy(), 18, 17, "own")
-    with pytest.raises(UsageError, match="'own'; undistort"):
-        geometry.project_points(arrays, np.zeros((1, 3)))
-    with pytest.raises(UsageError, match="undistort"):
-        geometry.back_project(arrays, np.zeros((1, 2)), np.ones(1))
-    with pytest.raises(UsageError, match="undistort"):
-        geometry.back_project_tensors(dataclasses.replace(cam, model="own"), torch.zeros(1, 2), torch.ones(1))
 
 
 @pytest.mark.parametrize(

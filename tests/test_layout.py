@@ -66,10 +66,7 @@ SAFE = {"np.load": ("allow_pickle", False), "torch.load": ("weights_only", True)
 
 
 def test_nothing_can_run_foreign_code():
-    """No pickle, no eval, no exec; numpy files are read without objects, foreign torch files as tensors only.
-
-    Ray sends pickles: farm/ray.py alone imports it, when it is asked for.
-    """
+    """No pickle, no eval, no exec; files are read without objects; farm/ray.py alone imports Ray, which sends pickles."""
     for path in PRODUCT:
         nodes = nodes_of(path)
         imported = imports(nodes)
@@ -100,22 +97,14 @@ def bench_imports(path: Path) -> set[str]:
     return {name for name in found if name.split(".")[0] == "bench"}
 
 
-def test_benches_share_only_what_stands_in_lib():
-    """A program imports no other program; what two of them share stands in `bench/lib`. Files are rooms as elsewhere."""
+def test_benches_share_only_what_stands_in_lib_and_are_listed():
+    """Programs are free to change: none imports another, tests import their list alone; a README has a row for each."""
     for path in [*BENCHES, *(BENCH / "lib").glob("*.py")]:
         assert all(name.startswith("bench.lib") for name in bench_imports(path)), path
         assert len(path.read_text("utf-8").splitlines()) <= 800, path
-
-
-def test_tests_import_only_the_lib_of_the_benches():
-    """Programs are free to change; `bench.__main__`, the list of them, is an exception."""
     naming = [p for p in (ROOT / "tests").rglob("*.py") if "bench" in p.read_text("utf-8")]
     found = {name for p in naming for name in bench_imports(p)}
     assert {n for n in found if not n.startswith("bench.lib")} <= {"bench.__main__"}
-
-
-def test_the_readme_of_the_benches_lists_every_program():
-    """A row for each file with a `main`, with its command."""
     text = (BENCH / "README.md").read_text("utf-8")
     for path in BENCHES:
         if any(isinstance(n, ast.FunctionDef) and n.name == "main" for n in ast.parse(path.read_text("utf-8")).body):

@@ -23,7 +23,7 @@ from warpgs.pipeline.train.trainer import Trainer
 from warpgs.pipeline.train.view_modules import VIEW_MODULES, ViewModule
 from warpgs.pipeline.train.views import LearnedViews
 from warpgs.plugins import Registry, load_object
-from warpgs.synthetic.demo import split_spec, write_demo
+from warpgs.synthetic.demo import split_spec
 
 OWN = """
 from pathlib import Path
@@ -38,9 +38,7 @@ number = 3
 
 
 @pytest.fixture
-def registry(monkeypatch) -> Registry:
-    STRATEGIES.names()
-    monkeypatch.setattr(STRATEGIES, "_classes", dict(STRATEGIES._classes))
+def registry(registries_as_they_were) -> Registry:
     return STRATEGIES
 
 
@@ -100,16 +98,12 @@ def test_what_is_not_there_or_of_another_kind_is_said(registry, own, spec, said)
 
 
 def test_a_file_that_fails_is_not_half_loaded(registry, own):
-    """Its error is named; once it is fixed, it loads."""
+    """Its error is named; once it is fixed, it loads; one that cannot import its neighbour is told how, and no other."""
     own.write_text("raise RuntimeError('mine')")
     with pytest.raises(UsageError, match="RuntimeError: mine"):
         registry.load(f"{own}:Own")
     own.write_text(OWN)
     assert registry.load(f"{own}:Own").__name__ == "Own"
-
-
-def test_a_file_that_cannot_import_its_neighbour_is_told_how(registry, own):
-    """Another module that is missing keeps the usual advice."""
     (own.parent / "neighbour_probe.py").write_text("import own_neighbour\n")
     with pytest.raises(UsageError, match=r"give path/to/file\.py:Own"):
         registry.load(f"{own.parent}/neighbour_probe.py:Own")
@@ -133,11 +127,10 @@ class Twice(LossTerm):
 """
 
 
+@pytest.mark.usefixtures("registries_as_they_were")
 @pytest.mark.parametrize("by_path_first", [True, False])
 def test_a_file_that_is_loaded_twice_is_named(tmp_path, monkeypatch, by_path_first):
     """By its path and by an import: two classes have one name, and the message says so."""
-    LOSS_TERMS.names()
-    monkeypatch.setattr(LOSS_TERMS, "_classes", dict(LOSS_TERMS._classes))
     monkeypatch.syspath_prepend(tmp_path)
     (tmp_path / "own_twice.py").write_text(TERM)
     (tmp_path / "own_probe.py").write_text("from own_twice import Twice\n")
@@ -152,14 +145,11 @@ def test_a_file_that_is_loaded_twice_is_named(tmp_path, monkeypatch, by_path_fir
         del sys.modules[name]
 
 
-def test_an_unknown_name_lists_those_there_are(registry):
+def test_unknown_names_list_those_there_are_and_none_is_imported_by_find(registry, own):
     with pytest.raises(UsageError, match=r"unknown strategy 'best'; choose one of .*clone_split.* or give module:Class"):
         registry.find("best")
     with pytest.raises(UsageError, match="int is not a strategy"):
         registry.find(int)
-
-
-def test_a_name_with_a_colon_is_never_imported_by_find(registry, own):
     for spec in (f"{own}:Own", "own_strategy:Own"):
         with pytest.raises(UsageError, match="does not load your code"):
             registry.find(spec)
@@ -189,9 +179,8 @@ def test_a_run_continues_with_the_code_that_it_began_with(tmp_path):
             check_same(same | {"own_code": now}, same | {"own_code": then}, tmp_path)
 
 
-def test_settings_of_ones_own_travel_through_json(registry, monkeypatch):
+def test_settings_of_ones_own_travel_through_json(registry):
     """A strategy's own settings, an empty one too, and those of a loss term come back as they were; defaults need no saying."""
-    monkeypatch.setattr(LOSS_TERMS, "_classes", dict(LOSS_TERMS._classes))
 
     @dataclasses.dataclass(frozen=True)
     class Settings:
@@ -219,14 +208,13 @@ def test_settings_of_ones_own_travel_through_json(registry, monkeypatch):
     assert FitConfig(loss_terms=(Faint(),)).fingerprint() != FitConfig(loss_terms=(Faint(0.1),)).fingerprint()
 
 
-def test_an_error_in_own_code_names_its_file(tmp_path, capsys):
+def test_an_error_in_own_code_names_its_file(demo, tmp_path, capsys):
     """What a user's own class raises is not called a defect of warpgs: the line says which file and line."""
     own = tmp_path / "mine.py"
     code = "class Mine(warpgs.Strategy):\n    def columns(self):\n        raise ValueError('my own bug')\n"
     own.write_text(f"import warpgs\n\n\n{code}")
-    write_demo(tmp_path / "scene", views=8, width=48, height=36)
     flags = ["--split", split_spec(8), "--preset", "3dgs", "--steps", "2", "--device", "cpu", "--strategy", f"{own}:Mine"]
-    assert main(["fit", str(tmp_path / "scene"), "--out", str(tmp_path / "run"), *flags]) == 2
+    assert main(["fit", str(demo), "--out", str(tmp_path / "run"), *flags]) == 2
     said = capsys.readouterr().err
     assert "my own bug" in said and f"{own}, line 6" in said and "defect of warpgs" not in said
 
@@ -235,24 +223,20 @@ def of_strategy(**methods):
     return {"strategy": type("Own", (Strategy,), methods)}
 
 
-def of_term(**methods):
-    return {
-        "loss_terms": (dataclasses.dataclass(frozen=True)(LOSS_TERMS.register("own")(type("Own", (LossTerm,), methods)))(),)
-    }
-
-
-def of_module(**methods):
-    learned = {
-        "parameters": lambda self, views: {"p": torch.zeros(len(views))},
-        "lrs": lambda self, progress, extent: {"p": 0.1},
-    }
-    cls = VIEW_MODULES.register("own")(type("Own", (ViewModule,), learned | methods))
-    return {"view_modules": (dataclasses.dataclass(frozen=True)(cls)(),)}
-
-
 def always(value):
     """A method that returns a value, whatever its arguments."""
     return lambda self, *_: value
+
+
+def of_term(**methods):
+    cls = LOSS_TERMS.register("own")(type("Own", (LossTerm,), methods))
+    return {"loss_terms": (dataclasses.dataclass(frozen=True)(cls)(),)}
+
+
+def of_module(**methods):
+    learned = {"parameters": lambda self, views: {"p": torch.zeros(len(views))}, "lrs": always({"p": 0.1})}
+    cls = VIEW_MODULES.register("own")(type("Own", (ViewModule,), learned | methods))
+    return {"view_modules": (dataclasses.dataclass(frozen=True)(cls)(),)}
 
 
 DUE = {"due": always(True)}
@@ -262,10 +246,7 @@ DUE = {"due": always(True)}
     "part, method, found, others",
     [
         *((of_strategy, "update", v, DUE) for v in (None, 3, [None], ["row"])),
-        *(
-            (of_strategy, "statistics", v, {})
-            for v in (None, 3, {"seen": 1}, {"unknown": torch.zeros(60)}, {1: torch.zeros(60)})
-        ),
+        *((of_strategy, "statistics", v, {}) for v in (None, 3, {"seen": 1}, {"none": torch.zeros(60)}, {1: torch.zeros(60)})),
         (of_strategy, "statistics", {"seen": torch.zeros(59)}, {"columns": always({"seen": Column(0)})}),
         *((of_strategy, "columns", v, {}) for v in (None, {"seen": 0.0})),
         *((of_strategy, "regularisation", v, {}) for v in (1.0, torch.ones(2))),
@@ -281,11 +262,8 @@ DUE = {"due": always(True)}
         *((of_module, "regularisation", v, {}) for v in (1.0, torch.ones(2))),
     ],
 )
-def test_a_wrong_result_of_a_part_names_its_class_and_method(part, method, found, others, registry, monkeypatch, device):
+def test_a_wrong_result_of_a_part_names_its_class_and_method(part, method, found, others, registry, device):
     """Not with an error of torch or Python from inside a step."""
-    for known in (LOSS_TERMS, VIEW_MODULES):
-        known.names()
-        monkeypatch.setattr(known, "_classes", dict(known._classes))
     moved = found.to(device) if isinstance(found, torch.Tensor) else found
     settings = part(**{method: always(moved)} | others)
     if "strategy" in settings:

@@ -21,9 +21,10 @@ from PIL import Image
 import warpgs
 from warpgs import faces, schema
 from warpgs.errors import document_fields, field_docs
+from warpgs.report.images import png
 from warpgs.schema import SchemaError, fields, flag, items, mapping, number, one_of, or_null, parse, real, text, whole
-
-# The package as `import warpgs` shows it.
+from warpgs.synthetic.demo import camera_path, still_life
+from warpgs.synthetic.raycast import Light, render
 
 ROOT = Path(warpgs.__file__).parent
 BELOW = ("train", "kernels", "io", "export", "compat.gsplat")
@@ -44,7 +45,7 @@ def seen_by_type_checkers(face: str) -> dict[str, tuple[str, str]]:
 
 @pytest.mark.parametrize("face", FACES)
 def test_dir_lists_the_public_names_and_nothing_else(face):
-    """Beside the faces and names with two underscores; none twice, and none that a module of the same folder would hide."""
+    """None twice, none that a module would hide; type checkers see the same; the marker of PEP 561 is there."""
     module = FACES[face]
     others = {name for name in BELOW if "." not in name} if module is warpgs else set()
     assert {n for n in dir(module) if not n.startswith("__")} == set(module.__all__) | others
@@ -52,32 +53,25 @@ def test_dir_lists_the_public_names_and_nothing_else(face):
     assert not set(module.__all__) & {p.stem for path in getattr(module, "__path__", []) for p in Path(path).iterdir()}
     with pytest.raises(AttributeError, match=f"module '{face}' has no attribute 'os_path'"):
         module.os_path  # noqa: B018
+    assert set(seen_by_type_checkers(face)) == set(FACES[face].__all__)
+    assert (ROOT / "py.typed").is_file()
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_every_public_name_is_there_and_documented(name):
-    """It loads from where type checkers find it, and its own docstring says what it is."""
+    """It loads from where type checkers find it, with a docstring; every argument and result of it and its methods is typed."""
     face, _, public = name.rpartition(".")
     home, attribute = seen_by_type_checkers(face)[public]
     value = getattr(FACES[face], public)
     assert value is getattr(importlib.import_module(home), attribute) or attribute == "register"  # a method: new at each look
     assert public.isupper() or value.__doc__
-
-
-@pytest.mark.parametrize("kind", [warpgs.RasterizeOptions, warpgs.Rule])
-def test_help_describes_every_option(kind):
-    """The class documentation has the field's name and at least 20 letters about it, in lines that fit a terminal."""
-    text = inspect.getdoc(kind)
-    assert max(map(len, text.splitlines())) <= 76  # help adds a margin of 4
-    assert len(dataclasses.fields(kind)) >= 8
-    assert all(re.search(rf"^    {f.name}: \w.{{20}}", text, re.MULTILINE) for f in dataclasses.fields(kind))
-
-
-@pytest.mark.parametrize("face", FACES)
-def test_type_checkers_see_the_same_names(face):
-    """Names under TYPE_CHECKING are those of ``__all__``; the marker of PEP 561 is there."""
-    assert set(seen_by_type_checkers(face)) == set(FACES[face].__all__)
-    assert (ROOT / "py.typed").is_file()
+    functions = [value] if inspect.isfunction(value) else []
+    if inspect.isclass(value):
+        functions = [f for f in vars(value).values() if inspect.isfunction(f) and f.__module__ == value.__module__]
+    for function in functions:
+        if function.__name__[0] != "_" or function.__name__ == "__call__":
+            bare = [p.name for p in inspect.signature(function).parameters.values() if p.annotation is p.empty]
+            assert set(bare) <= {"self", "cls"} and "return" in function.__annotations__, function
 
 
 def test_import_loads_neither_torch_nor_warp():
@@ -115,19 +109,15 @@ LISTED = re.findall(r"^\.\. (?:auto\w+|py:data):: (warpgs[\w.]+)", REFERENCE, re
 
 
 def test_the_reference_lists_every_public_name():
-    """Under the face; a name of several faces at one of them; decorators and `STEP` stand in the text."""
-    named = {n.rpartition(".")[2] for n in [*LISTED, *re.findall(r"`(warpgs[\w.]+)", REFERENCE)]}
-    assert {n.rpartition(".")[2] for n in NAMES} - named == set()
+    """A name of several faces at one of them, and every type in the signatures of the base classes."""
+    stated = {n.rpartition(".")[2] for n in [*LISTED, *re.findall(r"`(warpgs[\w.]+)", REFERENCE)]}
+    assert {n.rpartition(".")[2] for n in NAMES} - stated == set()
     assert set(LISTED) <= set(NAMES)
-
-
-def test_the_reference_lists_what_a_class_of_ones_own_meets():
-    """Every type in the signatures of the base classes, and in those of the types that they lead to."""
     own = re.findall(r"^\.\. autoclass:: (warpgs[\w.]+)", REFERENCE.split("## Classes to derive from")[1], re.MULTILINE)
     assert len(own) > 15
     classes = [getattr(importlib.import_module(path.rpartition(".")[0]), path.rpartition(".")[2]) for path in own]
-    named = set().union(*map(names_in_annotations, classes))
-    assert named - {path.rpartition(".")[2] for path in LISTED} == set()
+    met = set().union(*map(names_in_annotations, classes))
+    assert met - {path.rpartition(".")[2] for path in LISTED} == set()
 
 
 def named(code: str) -> set[str]:
@@ -154,16 +144,12 @@ def code_of_pages() -> dict[str, str]:
     return code
 
 
-def test_examples_and_pages_import_faces_alone():
-    """Users copy them, and what is not on a face may move on any day."""
+def test_examples_and_pages_import_faces_alone_and_the_package_none():
+    """Users copy examples, and what is not on a face may move; in the package names come from where they are defined."""
     code = code_of_pages()
     assert len(code) > 20
     strangers = {place: left for place, text in code.items() if (left := named(text) - set(NAMES) - set(FACES))}
     assert not strangers
-
-
-def test_the_package_imports_nothing_from_a_face():
-    """Names come from where they are defined; modules of a face's folder are no names of the face."""
     for path in ROOT.rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_text("utf-8"))):
             if isinstance(node, ast.ImportFrom) and node.module in FACES and path != ROOT / "__init__.py":
@@ -203,10 +189,6 @@ STILL_THERE = {
 )
 def test_names_that_stayed_give_what_they_gave(light, pixel, mean):
     """A camera, a pixel and the mean colour of a view, recorded before the modules were merged; and the pixels of a PNG."""
-    from warpgs.report.images import png
-    from warpgs.synthetic.demo import camera_path, still_life
-    from warpgs.synthetic.raycast import Light, render
-
     camera = camera_path(9, 64, 48)[2]
     assert camera.viewmat[:3, 3] == pytest.approx([0.8011, 0.2279, 0.0505], abs=1e-4)
     image = render(still_life(), Light(*light), camera.K, camera.viewmat, 64, 48, 1)
@@ -229,10 +211,6 @@ def test_what_is_gone_names_its_new_place(monkeypatch):
     assert version.__version__ and not hasattr(version, "Other")
     with pytest.raises(ModuleNotFoundError, match=r"No module named 'warpgs\.never_was'"):
         importlib.import_module("warpgs.never_was")
-
-
-def test_the_changelog_lists_old_imports():
-    """A row for each."""
     table = (ROOT.parent / "CHANGELOG.md").read_text("utf-8").split("## New names of old imports")[1]
     rows = re.findall(r"^\| `(warpgs\.\S+)` \| `(\S+)` \|$", table, re.MULTILINE)
     assert rows == [(f"{module}.{name}", new) for module, name, new in OLD]
@@ -240,7 +218,6 @@ def test_the_changelog_lists_old_imports():
 
 # Whoever imports warpgs gets types, and the checker looks at the modules that define public names.
 
-PUBLIC_TYPES_ROOT = Path(__file__).parent.parent
 UNCHECKED = {
     "warpgs.geometry", "warpgs.io.folder", "warpgs.kernels.ssim", "warpgs.kernels.update", "warpgs.mesh.fuse",
     "warpgs.pipeline.model.start", "warpgs.pipeline.model.table", "warpgs.pipeline.train.step", "warpgs.pipeline.train.views",
@@ -251,27 +228,11 @@ UNCHECKED = {
 
 def test_every_module_of_a_public_name_is_type_checked():
     """Faces and homes of their names are among mypy's files, and the package says that it carries types."""
-    settings = tomllib.loads((PUBLIC_TYPES_ROOT / "pyproject.toml").read_text("utf-8"))["tool"]["mypy"]
+    settings = tomllib.loads((ROOT.parent / "pyproject.toml").read_text("utf-8"))["tool"]["mypy"]
     homes = {home for face in FACES for home, _ in seen_by_type_checkers(face).values()}
-    files = {
-        str(Path(importlib.import_module(m).__file__).relative_to(PUBLIC_TYPES_ROOT)) for m in homes - UNCHECKED | set(FACES)
-    }
+    modules = (importlib.import_module(m) for m in homes - UNCHECKED | set(FACES))
+    files = {str(Path(m.__file__).relative_to(ROOT.parent)) for m in modules}
     assert settings["strict"] and files <= set(settings["files"])
-    assert (PUBLIC_TYPES_ROOT / "warpgs/py.typed").exists()
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_signatures_of_public_names_are_typed(name):
-    """Every argument and result of a function, and of the methods that a class defines; checked homes are not enough."""
-    face, _, public = name.rpartition(".")
-    value = getattr(FACES[face], public)
-    functions = [value] if inspect.isfunction(value) else []
-    if inspect.isclass(value):
-        functions = [f for f in vars(value).values() if inspect.isfunction(f) and f.__module__ == value.__module__]
-    for function in functions:
-        if function.__name__[0] != "_" or function.__name__ == "__call__":
-            bare = [p.name for p in inspect.signature(function).parameters.values() if p.annotation is p.empty]
-            assert set(bare) <= {"self", "cls"} and "return" in function.__annotations__, function
 
 
 # Schemas: what is allowed passes, anything else is named with its place; size and depth are bounded.
@@ -303,11 +264,6 @@ def test_what_is_allowed_and_what_is_not(kind, good, bad):
             kind(value, "x")
 
 
-def test_the_place_is_named():
-    with pytest.raises(SchemaError, match=r"^a\[1\]\.b must be a finite number, not 'c'$"):
-        fields({"a": items(fields({"b": number()}))})({"a": [{"b": 1}, {"b": "c"}]}, "")
-
-
 @pytest.mark.parametrize("inner", ["[]", "{}", '{"a": []}'])
 def test_depth_and_size_are_bounded(inner, monkeypatch):
     """Neither Python's stack nor anybody's who walks through the value is in danger."""
@@ -326,11 +282,17 @@ def test_depth_and_size_are_bounded(inner, monkeypatch):
         parse("[1, 2, 3, 4]")
 
 
-@pytest.mark.parametrize("bad", [b"", b"[", b"\xff\xfe\xfd", b"9" * 5000, b'{"a":}'])
-def test_what_is_no_json(bad, tmp_path):
-    (tmp_path / "a").write_bytes(bad)
-    with pytest.raises(SchemaError, match="not valid JSON"):
-        schema.read(tmp_path / "a")
+def test_the_place_of_a_wrong_value_is_named_and_only_files_of_json_are_read(tmp_path):
+    with pytest.raises(SchemaError, match=r"^a\[1\]\.b must be a finite number, not 'c'$"):
+        fields({"a": items(fields({"b": number()}))})({"a": [{"b": 1}, {"b": "c"}]}, "")
+    for bad in (b"", b"[", b"\xff\xfe\xfd", b"9" * 5000, b'{"a":}'):
+        (tmp_path / "a").write_bytes(bad)
+        with pytest.raises(SchemaError, match="not valid JSON"):
+            schema.read(tmp_path / "a")
+    with pytest.raises(OSError, match="is a folder"):
+        schema.read(tmp_path)
+    with pytest.raises(FileNotFoundError):
+        schema.read(tmp_path / "none")
 
 
 @pytest.mark.parametrize("text", ["[" + "[]," * 20 + "[]]", b"[" + b"{}," * 20 + b"{}]"])
@@ -343,25 +305,20 @@ def test_many_lists_are_refused_before_they_are_made(text, monkeypatch):
         schema.parse(text)
 
 
-def test_only_ordinary_files_are_read(tmp_path):
-    with pytest.raises(OSError, match="is a folder"):
-        schema.read(tmp_path)
-    with pytest.raises(FileNotFoundError):
-        schema.read(tmp_path / "none")
-
-
 # Docstrings of fields are read from source, and `help` shows them.
 
-DOCUMENTED = ("ActivatedGaussians", "Camera", "CovarianceGaussians", "Gaussians", "RasterizeOptions", "Render", "Scene", "View")
+DOCUMENTED = "ActivatedGaussians Camera CovarianceGaussians Gaussians RasterizeOptions Render Rule Scene View".split()
 
 
 @pytest.mark.parametrize("name", DOCUMENTED)
 def test_help_shows_every_field(name):
-    """With the start of its docstring."""
+    """With the start of its docstring; of options at least 20 letters about each, in lines that fit a terminal."""
     kind = getattr(warpgs, name)
-    shown = pydoc.plain(pydoc.render_doc(kind))
+    shown, text = pydoc.plain(pydoc.render_doc(kind)), inspect.getdoc(kind)
     for field in dataclasses.fields(kind):
         assert f"{field.name}: {field_docs(kind)[field.name].split()[0]} " in shown
+        assert name not in ("RasterizeOptions", "Rule") or re.search(rf"^    {field.name}: \w.{{20}}", text, re.MULTILINE)
+    assert name not in ("RasterizeOptions", "Rule") or max(map(len, text.splitlines())) <= 76  # help adds a margin of 4
 
 
 @dataclasses.dataclass

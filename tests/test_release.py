@@ -72,7 +72,4 @@ def test_the_metadata_name_version_licence_pythons_and_command(release):
     with zipfile.ZipFile(release[0]) as archive:
         commands = archive.read(f"warpgs-{__version__}.dist-info/entry_points.txt").decode()
     assert commands.split() == ["[console_scripts]", "warpgs", "=", "warpgs.app.cli:main"]
-
-
-def test_the_citation_has_this_version():
     assert f"\nversion: {__version__}\n" in (ROOT / "CITATION.cff").read_text("utf-8")

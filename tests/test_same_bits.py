@@ -96,10 +96,7 @@ def test_the_table_names_the_first_stage_that_differs():
     lines = same_bits.table(rows).splitlines()[2:]
     assert [line.split(" | ")[-2:] for line in lines[:2]] == [["none", "none |"]] * 2
     assert lines[2].endswith("| torch.exp | 3dgs: last PLY |")
-
-
-def test_a_row_takes_the_place_of_the_same_run_before():
-    """One of another label, kind of device or size of the scene is added."""
+    # one of another label, kind of device or size of the scene is added
     rows = [row("x", {"a": "0"}), row("y", {"a": "0"})]
     assert same_bits.placed(rows, row("x", {"a": "1"})) == [row("x", {"a": "1"}), rows[1]]
     for other in (row("z", {}), row("x", {}, "cuda"), row("x", {}, arguments={"views": 2})):

@@ -52,15 +52,19 @@ def table() -> dict[str, tuple[str, str]]:
 
 
 def test_the_lock_is_of_this_project():
-    """It holds all that pyproject.toml asks for, at the versions of constraints.txt."""
+    """All that pyproject.toml asks for, at the versions of constraints.txt, with all extras that tests need, and no place."""
     pins = dict(line.split("==") for line in (ROOT / "constraints.txt").read_text().splitlines() if "==" in line)
     lock, extras = locked(), PROJECT["optional-dependencies"]
-    named = {plain(r) for e in extras.keys() - set(UNLOCKED) - {"dev"} for r in extras[e]} | {
-        plain(r) for r in PROJECT["dependencies"]
-    }
+    named = {plain(r) for e in extras.keys() - set(UNLOCKED) - {"dev"} for r in extras[e]}
+    named |= {plain(r) for r in PROJECT["dependencies"]}
     assert named | {plain(r) for r in extras["dev"]} <= lock.keys()
     assert named <= pins.keys()
     assert {n: [v] for n, v in pins.items()} == {n: lock[n] for n in pins}
+    text, makefile = ((ROOT / name).read_text("utf-8") for name in ("requirements.lock", "Makefile"))
+    assert [n for n in text.splitlines() if re.search(r"file:|://|--(extra-)?index|--find-links|/opt/| @ ", n)] == []
+    needed = sorted(extras.keys() - set(UNLOCKED))
+    assert re.findall(r"--extra (\w+)", text.partition("==")[0]) == needed
+    assert f"EXTRAS ?= {','.join(needed)}\nexport WARPGS_EXTRAS_INSTALLED := 1" in makefile
 
 
 def test_every_package_stands_in_the_table_with_its_use():
@@ -69,26 +73,23 @@ def test_every_package_stands_in_the_table_with_its_use():
         wanted |= {plain(r): extra for r in PROJECT["optional-dependencies"][extra]}
     wanted |= {plain(r): "fit" for r in PROJECT["dependencies"]}
     assert {n: use for n, (_, use) in table().items()} == wanted
-
-
-def test_no_licence_forbids_or_demands():
     for name, (licence, _) in table().items():
         assert set(re.split(r" AND | OR | WITH ", licence)) <= ALLOWED | COPYLEFT.get(name, set()), name
     assert {name for name, (_, use) in table().items() if use == "poses"} == COPYLEFT.keys()
-
-
-def test_the_lock_knows_nothing_of_the_machine_that_wrote_it():
-    """No index, no path, no URL: hashes of PyPI's files alone."""
-    lines = (ROOT / "requirements.lock").read_text("utf-8").splitlines()
-    assert [n for n in lines if re.search(r"file:|://|--(extra-)?index|--find-links|/opt/| @ ", n)] == []
-
-
-def test_the_lock_was_written_with_all_extras_that_tests_need():
-    """And both ways to install bring them."""
-    extras = sorted(PROJECT["optional-dependencies"].keys() - set(UNLOCKED))
-    text, makefile = (ROOT / "requirements.lock").read_text("utf-8"), (ROOT / "Makefile").read_text("utf-8")
-    assert re.findall(r"--extra (\w+)", text.partition("==")[0]) == extras
-    assert f"EXTRAS ?= {','.join(extras)}\nexport WARPGS_EXTRAS_INSTALLED := 1" in makefile
+    # installed packages say the same by the field that the index shows; long texts hold licences of compiled parts
+    checked = 0
+    for name, (licence, _) in table().items():
+        try:
+            said = importlib.metadata.metadata(name)
+        except importlib.metadata.PackageNotFoundError:  # of another system, or of the extra
+            continue
+        short = [t for t in said.get_all("License") or [] if len(t) < 80]
+        classes = [c for c in said.get_all("Classifier") or [] if c.startswith("License")]
+        assert name in EXPLAINED or not [t for t in [*short, *classes] if FORBIDDEN.search(t)], name
+        expression = said.get("License-Expression")
+        assert expression in (None, licence), name
+        checked += 1
+    assert checked > 40
 
 
 def test_actions_and_images_are_named_by_what_they_contain():
@@ -112,20 +113,3 @@ def test_a_skipped_test_fails_where_all_extras_are_said_to_be_installed(monkeypa
         monkeypatch.setenv("WARPGS_EXTRAS_INSTALLED", value)
         report = SimpleNamespace(skipped=True, outcome="skipped", longrepr=("a_test.py", 3, f"Skipped: {reason}"))
         assert without_missing_extras(report).outcome == outcome
-
-
-def test_installed_packages_say_the_same():
-    """By the field that the index shows; long texts hold the licences of compiled parts, which the document speaks of."""
-    checked = 0
-    for name, (licence, _) in table().items():
-        try:
-            said = importlib.metadata.metadata(name)
-        except importlib.metadata.PackageNotFoundError:  # of another system, or of the extra
-            continue
-        short = [t for t in said.get_all("License") or [] if len(t) < 80]
-        classes = [c for c in said.get_all("Classifier") or [] if c.startswith("License")]
-        assert name in EXPLAINED or not [t for t in [*short, *classes] if FORBIDDEN.search(t)], name
-        expression = said.get("License-Expression")
-        assert expression in (None, licence), name
-        checked += 1
-    assert checked > 40

@@ -37,8 +37,6 @@ from warpgs.pipeline.train.view_modules import VIEW_MODULES
 from warpgs.report import progress
 from warpgs.synthetic.demo import split_spec, write_demo
 
-# The commands as a user types them: results, exit codes, and one line for every mistake.
-
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
@@ -112,15 +110,12 @@ def test_run_folder_holds_what_it_promises(run, scene):
     assert 0 < memory["planned"] < memory["planned_at_cap"] and memory["limit"] is None and "memory: a step takes " in page
 
 
-def test_eval_repeats_the_scores(run, capsys):
+def test_eval_repeats_the_scores_and_measures_lpips(run, capsys, tmp_path):
+    """With weights, LPIPS by net and mode stand in eval.json; a file that holds none is refused first."""
     assert main(["eval", str(run), "--device", "cpu"]) == 0
     metrics = json.loads((run / "metrics.json").read_text())
     assert f"PSNR {metrics['test']['psnr']:.2f} dB" in capsys.readouterr().out.splitlines()[-1]
     assert json.loads((run / "eval.json").read_text())["test"] == metrics["test"]
-
-
-def test_eval_measures_lpips(run, tmp_path, capsys):
-    """With weights the figures stand in eval.json, named by net and mode; a file that holds none is refused first."""
     torch.manual_seed(0)
     net = NETS["alex"]
     state = {name: torch.randn(shape).abs() / 10 for name, shape in net.shapes().items()}
@@ -155,18 +150,12 @@ def test_plot(run, tmp_path, capsys):
         assert code == 4 and "libegl1" in capsys.readouterr().err and not target.exists()
     else:
         assert cv2.imread(str(target)).shape == (240, 320, 3) and "Gaussians of opacity 0.1 or" in capsys.readouterr().out
-
-
-@pytest.mark.parametrize(
-    ("words", "why"),
-    [
-        (["--points", "stars"], "gaussians, start"), (["--color", "red"], "own, coverage"),
-        (["--size", "9", "9"], "64 to 8192"), (["--background", "red"], "white, black"), (["--out", "a.jpg"], "is a .png"),
-        (["--points", "start", "--color", "coverage"], "coverage needs Gaussians"),
-    ],
-)  # fmt: skip
-def test_plots_that_cannot_be_are_refused(run, capsys, words, why):
-    assert why in failure(capsys, 2, "plot", str(run), *words)
+    for words, why in (
+        ("--points stars", "gaussians, start"), ("--color red", "own, coverage"), ("--size 9 9", "64 to 8192"),
+        ("--background red", "white, black"), ("--out a.jpg", "is a .png"),
+        ("--points start --color coverage", "coverage needs Gaussians"),
+    ):  # fmt: skip
+        assert why in failure(capsys, 2, "plot", str(run), *words.split())
 
 
 @pytest.mark.parametrize("command", ["export", "convert"])
@@ -196,26 +185,31 @@ def test_cameras_for_other_trainers(run, scene, tmp_path, capsys, name, flags):
     assert ("their names are kept" if flags else "their names are numbers") in said
     if name == "sparse":
         made = read_ply(run / "point_cloud.ply")
-        wanted = made.means.double().numpy()[made.logit_opacities.argsort(descending=True, stable=True)]
+        order = made.logit_opacities.argsort(descending=True, stable=True)
+        wanted = made.means.double().numpy()[order]
         wanted = wanted @ np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1]]) if "--rotate" in flags else wanted
         rows = np.loadtxt(target / "0" / "points3D.txt")
         assert np.allclose(rows[:, 1:4], wanted, atol=1e-5) and f"of {len(made):,} Gaussians, for trainers" in said
-        colors = np.clip(0.28209479 * made.sh[:, 0].numpy() + 0.5, 0, 1)[
-            made.logit_opacities.argsort(descending=True, stable=True)
-        ]
+        colors = np.clip(0.28209479 * made.sh[:, 0].numpy() + 0.5, 0, 1)[order]
         assert np.abs(rows[:, 4:7] - 255 * colors).max() <= 0.51
         pycolmap = pytest.importorskip("pycolmap")
         model = pycolmap.Reconstruction(str(target / "0"))
         assert len(model.points3D) == len(made) and sorted(i.name for i in model.images.values()) == found
 
 
-def test_names_that_files_cannot_hold(run, tmp_path, capsys):
+def test_names_that_files_cannot_hold_and_data_that_have_changed(scene, run, tmp_path, capsys):
     camera = next(iter(open_run(run, "cpu").cameras("file").values()))
     with pytest.raises(UsageError, match=r"cannot hold the name 'a b\.png'; leave out --keep-names"):
         write_cameras(tmp_path / "sparse", [camera], ["images/a b.png"])
     write_cameras(tmp_path / "transforms.json", [camera], ["images/a b.png"])
     assert list(read_cameras(tmp_path / "transforms.json")[0]) == ["images/a b.png"] and not (tmp_path / "sparse").exists()
     assert "--keep-names requires cameras" in failure(capsys, 2, "export", str(run), "--to", "a.spz", "--keep-names")
+    moved, copy = (Path(shutil.copytree(folder, tmp_path / folder.name)) for folder in (scene, run))
+    record = json.loads((copy / "config.json").read_text())
+    record["scene"]["path"] = str(moved)
+    (copy / "config.json").write_text(json.dumps(record))
+    (moved / "images" / "000.png").write_bytes((moved / "images" / "001.png").read_bytes())
+    assert "have changed since the fit" in failure(capsys, 3, "eval", str(copy), "--device", "cpu")
 
 
 def failure(capsys, code: int, *arguments: str) -> str:
@@ -288,12 +282,6 @@ def test_words_in_the_wrong_place_get_the_right_command(run, tmp_path, monkeypat
     assert hint in text and [p.name for p in tmp_path.iterdir()] == ["scene.html"]
 
 
-def test_cuda_where_there_is_none(scene, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
-    text = failure(capsys, 4, "fit", str(scene), "--out", str(tmp_path / "x"), "--device", "cuda")
-    assert "warpgs doctor" in text and "--device cpu" in text
-
-
 @pytest.mark.skipif(getattr(os, "geteuid", int)() == 0, reason="root, and Windows, may write anywhere")
 def test_unwritable_output(scene, tmp_path, capsys):
     """A folder that cannot be written is found out before the scene is read."""
@@ -301,9 +289,12 @@ def test_unwritable_output(scene, tmp_path, capsys):
     assert "cannot be written" in failure(capsys, 4, "fit", str(scene), "--out", str(tmp_path / "x"))
 
 
-def test_output_below_a_file(scene, capsys):
+def test_output_below_a_file_and_cuda_where_there_is_none(scene, capsys, tmp_path, monkeypatch):
     below = scene / "images" / "000.png" / "run"
     assert "cannot be written" in failure(capsys, 4, "fit", str(scene), "--out", str(below))
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    text = failure(capsys, 4, "fit", str(scene), "--out", str(tmp_path / "x"), "--device", "cuda")
+    assert "warpgs doctor" in text and "--device cpu" in text
 
 
 CUDA_FULL = "CUDA out of memory. Tried to allocate 48.00 MiB. GPU 0 has a total capacity of 139.80 GiB."
@@ -313,17 +304,8 @@ NO_MEMORY = [
     RuntimeError("OpenCV(5.0.0) alloc.cpp:73: error: (-4:Insufficient memory) Failed to allocate 9 bytes"),
     RuntimeError("Failed to allocate 9 bytes on device 'cpu'"),
 ]  # fmt: skip
-
-
-@pytest.mark.parametrize("error", NO_MEMORY, ids=[str(e)[-20:] for e in NO_MEMORY])
-def test_no_memory_left_is_no_defect(error, capsys, monkeypatch):
-    def full(*_):
-        raise error
-
-    monkeypatch.setattr("warpgs.pipeline.run.export.export", full)
-    line = failure(capsys, 4, "export", "run", "--to", "x.ply")
-    assert "out of memory (" in line and "End other programs" in line and "total capacity" not in line
-    assert "--" not in line, "export has no flags of a fit"
+LIBRARY = ImportError("libx.so: failed to map segment from shared object")
+THREADS = RuntimeError("can't start new thread")
 
 
 @pytest.mark.parametrize("ask", [lambda: torch.empty(2**60), lambda: np.zeros((2**30, 2**24))])
@@ -357,41 +339,37 @@ def test_numbers_at_their_extremes(tmp_path, capsys, monkeypatch, command, flag)
     assert [p.name for p in tmp_path.iterdir()] == ["scene"]
 
 
-@pytest.mark.parametrize(
-    ("error", "words"),
-    [
-        (ImportError("libx.so: failed to map segment from shared object"), "a library cannot be loaded"),
-        (RuntimeError("can't start new thread"), "too many threads"),
-    ],
-)
-def test_limits_of_the_system_are_no_defects(error, words, capsys, monkeypatch):
+@pytest.mark.parametrize("error", [*NO_MEMORY, LIBRARY, THREADS], ids=lambda e: str(e)[-20:])
+def test_limits_of_the_system_are_no_defects(error, capsys, monkeypatch):
     def full(*_):
         raise error
 
     monkeypatch.setattr("warpgs.pipeline.run.export.export", full)
     line = failure(capsys, 4, "export", "run", "--to", "x.ply")
-    assert words in line and "ulimit" in line and str(error) in line
+    if error in NO_MEMORY:
+        assert "out of memory (" in line and "End other programs" in line and "total capacity" not in line
+        assert "--" not in line, "export has no flags of a fit"
+    else:
+        assert {LIBRARY: "a library cannot be loaded", THREADS: "too many threads"}[error] in line
+        assert "ulimit" in line and str(error) in line
 
 
 @pytest.mark.parametrize("program", [["-m", "warpgs"], ["-c", "import sys; from warpgs.app.cli import main; sys.exit(main())"]])
 def test_a_deleted_working_folder_is_named(program, tmp_path):
     gone = tmp_path / "gone"
     gone.mkdir()
-    line = 'rmdir "$PWD"; exec "$@"'
-    words = [sys.executable, "-P", *program, "fit", "scene", "--out", "run"]
+    words = ["sh", "-c", 'rmdir "$PWD"; exec "$@"', "sh", sys.executable, "-P", *program, "fit", "scene", "--out", "run"]
     environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])}
-    done = subprocess.run(
-        ["sh", "-c", line, "sh", *words], cwd=gone, env=environment, capture_output=True, text=True, timeout=300, check=False
-    )
+    done = subprocess.run(words, cwd=gone, env=environment, capture_output=True, text=True, timeout=300, check=False)
     assert (done.returncode, done.stderr) == (2, "warpgs: the current folder was deleted; change to another one\n")
 
 
-@pytest.mark.parametrize("columns", ["3", "0", "200"])
-def test_help_of_a_narrow_terminal_ends(columns, monkeypatch, capsys):
-    monkeypatch.setenv("COLUMNS", columns)
-    with pytest.raises(SystemExit) as end:
-        main(["render", "--help"])
-    assert not end.value.code and "--fps" in capsys.readouterr().out and os.environ["COLUMNS"] == columns
+def test_help_of_a_narrow_terminal_ends(monkeypatch, capsys):
+    for columns in ("3", "0", "200"):
+        monkeypatch.setenv("COLUMNS", columns)
+        with pytest.raises(SystemExit) as end:
+            main(["render", "--help"])
+        assert not end.value.code and "--fps" in capsys.readouterr().out and os.environ["COLUMNS"] == columns
 
 
 def test_defects_are_called_defects(tmp_path, capsys, monkeypatch):
@@ -401,24 +379,12 @@ def test_defects_are_called_defects(tmp_path, capsys, monkeypatch):
     text = capsys.readouterr().err
     assert "internal error, ZeroDivisionError" in text and "Traceback" not in text
     assert "Traceback" in next(tmp_path.glob("warpgs-error-*.txt")).read_text()
-
-
-def test_a_package_that_is_gone_is_named(capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "pyvista", None)
     monkeypatch.setattr("warpgs.pipeline.run.export.export", lambda *a: __import__("pyvista"))
     assert "the Python package pyvista, which is missing" in failure(capsys, 2, "export", "run", "--to", "x.ply")
 
 
-def test_changed_data_are_noticed(scene, run, tmp_path, capsys):
-    moved, copy = (Path(shutil.copytree(folder, tmp_path / folder.name)) for folder in (scene, run))
-    record = json.loads((copy / "config.json").read_text())
-    record["scene"]["path"] = str(moved)
-    (copy / "config.json").write_text(json.dumps(record))
-    (moved / "images" / "000.png").write_bytes((moved / "images" / "001.png").read_bytes())
-    assert "have changed since the fit" in failure(capsys, 3, "eval", str(copy), "--device", "cpu")
-
-
-def test_demo_command_tells_the_next_step(tmp_path, capsys):
+def test_demo_command_tells_the_next_step(tmp_path, capsys, monkeypatch):
     """The printed command is short, and is one that reads; a shell takes it as it is."""
     assert main(["demo", str(tmp_path / "a d"), "--views", "8", "--width", "48", "--height", "36"]) == 0
     assert f"next: warpgs fit '{tmp_path / 'a d'}' --split every:8 --out run" in capsys.readouterr().out
@@ -426,6 +392,9 @@ def test_demo_command_tells_the_next_step(tmp_path, capsys):
     assert main(["demo", str(tmp_path / "o"), "--object", "--format", "colmap", *size]) == 0
     assert "--split llff:8 --masks cutout --out" in capsys.readouterr().out
     assert main(["--version"]) == 0
+    monkeypatch.setitem(REMOVED, "--old-name", "use --new-name")
+    assert main(["demo", "d", "--old_name=3"]) == 2
+    assert capsys.readouterr().err == "warpgs: --old-name was removed: use --new-name\n"
 
 
 # Help on one screen: what it says is what the code does, and it imports nothing that takes time.
@@ -477,31 +446,12 @@ class Open:
     number: float | None = 1.0
 
 
-@pytest.mark.parametrize(
-    ("words", "found"),
-    [
-        ("--switch none --whole none --number None", Open(None, None, None)),
-        ("--switch true --whole 3", Open(True, 3)),
-        ("--switch False --number 2", Open(False, 1, 2.0)),
-    ],
-)
-def test_open_settings_take_none_and_switches_in_any_case(words, found):
-    assert parse_flags(Open, words.split(), "warpgs fit", "") == found
-
-
-def test_a_removed_flag_names_what_replaces_it(capsys, monkeypatch):
-    monkeypatch.setitem(REMOVED, "--old-name", "use --new-name")
-    assert main(["demo", "d", "--old_name=3"]) == 2
-    assert capsys.readouterr().err == "warpgs: --old-name was removed: use --new-name\n"
-
-
-def test_all_flags_are_one_word_further(capsys):
-    """--help-all is the help of the parser, with every flag of the short one and those of the groups."""
-    with pytest.raises(SystemExit) as end:
-        main(["fit", "--help-all"])
-    text = capsys.readouterr().out
-    assert end.value.code == 0 and all(name in text for name, *_ in cli.FLAGS)
-    assert "--stopping.min-gain-db" in text and len(text.splitlines()) > 200
+def test_open_settings_take_none_and_switches_in_any_case():
+    for words, found in {
+        "--switch none --whole none --number None": Open(None, None, None), "--switch true --whole 3": Open(True, 3),
+        "--switch False --number 2": Open(False, 1, 2.0),
+    }.items():  # fmt: skip
+        assert parse_flags(Open, words.split(), "warpgs fit", "") == found
 
 
 @pytest.mark.parametrize(("flag", "word", "default"), [f[:3] for f in cli.FLAGS if f[0] != "--out"])
@@ -519,12 +469,6 @@ def test_flags_and_their_defaults_are_those_of_the_parser(flag, word, default):
     assert default == ("" if value is None else str(value)) and (word == "") == isinstance(value, bool)
     if not word:
         assert request_of([*BASE, flag], "") != request
-
-
-def test_steps_that_a_preset_s_line_names_are_its_own():
-    for name, line in PRESETS.described().items():
-        stated, config = re.search(r"([0-9]+) steps", line), PRESETS[name]
-        assert (int(stated[1]) if stated else FitConfig().max_steps) == (config.steps or config.max_steps)
 
 
 def test_what_is_registered_is_in_the_help(capsys, monkeypatch):
@@ -548,16 +492,22 @@ def test_what_is_registered_is_in_the_help(capsys, monkeypatch):
     assert all(f"{name}: {about}" in " ".join(text.split()) for name, about in PRESETS.described().items())
 
 
-def test_choices_are_those_of_the_code():
+def test_choices_steps_and_flags_are_those_of_the_code(capsys):
+    """--help-all is the help of the parser, with every flag of the short one and those of the groups."""
     assert sorted(", ".join(cli.SPLITS).split(", ")) == sorted(re.split(r", (?:or )?", SPECS))
     text, fields = {f[0]: f[3] for f in cli.FLAGS}, request_of(BASE, "").config
     for color in re.findall(r"auto|mean|scene|black|white", text["--background"]):
         dataclasses.replace(fields, background=color)
     for how in ("ignore", "cutout"):
         assert how in text["--masks"] and request_of([*BASE, "--masks", how], "").scene.masks == how
-
-
-@pytest.mark.parametrize("line", cli.EXAMPLES)
-def test_examples_parse(line):
-    program, command, *words = line.split()
-    assert (program, command) == ("warpgs", "fit") and request_of(words, "").out.name == "run"
+    for name, line in PRESETS.described().items():
+        stated, config = re.search(r"([0-9]+) steps", line), PRESETS[name]
+        assert (int(stated[1]) if stated else FitConfig().max_steps) == (config.steps or config.max_steps)
+    with pytest.raises(SystemExit) as end:
+        main(["fit", "--help-all"])
+    text = capsys.readouterr().out
+    assert end.value.code == 0 and all(name in text for name, *_ in cli.FLAGS)
+    assert "--stopping.min-gain-db" in text and len(text.splitlines()) > 200
+    for line in cli.EXAMPLES:
+        program, command, *words = line.split()
+        assert (program, command) == ("warpgs", "fit") and request_of(words, "").out.name == "run"

@@ -82,13 +82,9 @@ def test_a_package_that_cannot_be_imported(monkeypatch, name, error, topic, stat
 
 def torch_like(cuda, available):
     properties = types.SimpleNamespace(name="GPU X", total_memory=24 * 2**30, major=8, minor=9)
-    return types.SimpleNamespace(
-        __version__="9.9",
-        version=types.SimpleNamespace(cuda=cuda),
-        cuda=types.SimpleNamespace(
-            is_available=lambda: available, device_count=lambda: 2, get_device_properties=lambda i: properties
-        ),
-    )
+    of_cuda = {"is_available": lambda: available, "device_count": lambda: 2, "get_device_properties": lambda i: properties}
+    version, cuda = types.SimpleNamespace(cuda=cuda), types.SimpleNamespace(**of_cuda)
+    return types.SimpleNamespace(__version__="9.9", version=version, cuda=cuda)
 
 
 @pytest.mark.parametrize(
@@ -110,9 +106,8 @@ def test_no_usable_device(monkeypatch, cuda, hidden, words):
 
 @pytest.mark.parametrize(("both", "status", "words"), [(True, OK, "13.1"), (False, MISSING, "Warp sees no CUDA device")])
 def test_devices_that_torch_sees(monkeypatch, both, status, words):
-    warp = types.SimpleNamespace(
-        is_cuda_available=lambda: both, get_cuda_device_count=lambda: 2, get_cuda_driver_version=lambda: (13, 1)
-    )
+    found = {"is_cuda_available": both, "get_cuda_device_count": 2, "get_cuda_driver_version": (13, 1)}
+    warp = types.SimpleNamespace(**{name: lambda value=value: value for name, value in found.items()})
     monkeypatch.setitem(sys.modules, "torch", torch_like("13.0", True))
     monkeypatch.setattr(doctor, "_quiet_warp", lambda: warp)
     first, second, last = doctor._cuda()
@@ -120,7 +115,8 @@ def test_devices_that_torch_sees(monkeypatch, both, status, words):
     assert last.status == status and words in last.detail and ("--device cpu" in last.remedy) != both
 
 
-def test_the_prior_cache(monkeypatch, tmp_path):
+def test_caches_that_cannot_be_used(monkeypatch, tmp_path):
+    """Maps: a note. Kernels: a private folder is a note, as a fit compiles each time; none at all stops it."""
     monkeypatch.setenv("WARPGS_CACHE", str(tmp_path / "maps"))
     (f,) = doctor._prior_cache()
     assert f.status == OK and str(tmp_path / "maps") in f.detail and "0 B" in f.detail
@@ -128,25 +124,6 @@ def test_the_prior_cache(monkeypatch, tmp_path):
     monkeypatch.setenv("WARPGS_CACHE", str(tmp_path / "file" / "maps"))
     (f,) = doctor._prior_cache()
     assert f.status == NOTE and "WARPGS_CACHE" in f.remedy and not f.required
-
-
-def test_a_cache_that_another_process_changes_has_a_size(monkeypatch, tmp_path):
-    for name in ("gone", "kept"):
-        (tmp_path / name).mkdir()
-        (tmp_path / name / "a").write_bytes(bytes(7))
-    real = os.scandir
-
-    def scandir(path):
-        if Path(path).name == "gone":
-            raise FileNotFoundError(path)
-        return real(path)
-
-    monkeypatch.setattr(os, "scandir", scandir)
-    assert doctor._size(tmp_path) == 7
-
-
-def test_a_kernel_cache_that_cannot_be_used(monkeypatch, tmp_path):
-    """A private one is a note: a fit works, and compiles each time; none at all stops it."""
     monkeypatch.setattr(doctor, "prepare_kernel_cache", lambda: (tmp_path, "it cannot be written"))
     (f,) = doctor._kernel_cache()
     assert f.status == NOTE and "cannot be written" in f.detail and "WARP_CACHE_PATH" in f.remedy
@@ -157,39 +134,38 @@ def test_a_kernel_cache_that_cannot_be_used(monkeypatch, tmp_path):
     monkeypatch.setattr(doctor, "prepare_kernel_cache", refuse)
     (f,) = doctor._kernel_cache()
     assert f.status == MISSING and f.required and "WARP_CACHE_PATH" in f.remedy
+    for name in ("gone", "kept"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "a").write_bytes(bytes(7))
+    real = os.scandir
+
+    def scandir(path):  # another process removes a folder
+        if Path(path).name == "gone":
+            raise FileNotFoundError(path)
+        return real(path)
+
+    monkeypatch.setattr(os, "scandir", scandir)
+    (tmp_path / "file").unlink()
+    assert doctor._size(tmp_path) == 7
 
 
-@pytest.mark.parametrize(("answer", "status"), [((True, "through EGL"), OK), ((False, "no display"), NOTE)])
-def test_rendering_is_what_the_probe_says(monkeypatch, answer, status):
-    overview = types.SimpleNamespace(probe_rendering=lambda: answer)
-    monkeypatch.setitem(sys.modules, "warpgs.report.overview", overview)
-    (f,) = doctor._rendering()
-    assert f.status == status and answer[1] in f.detail and bool(f.remedy) == (status != OK)
-
-
-def test_an_encoder_that_writes_nothing(monkeypatch):
+def test_renderer_encoder_disk_and_memory(monkeypatch, tmp_path):
+    """Rendering is what the probe says; an encoder that writes nothing, little disk and little memory are notes."""
+    for answer, status in (((True, "through EGL"), OK), ((False, "no display"), NOTE)):
+        overview = types.SimpleNamespace(probe_rendering=lambda answer=answer: answer)
+        monkeypatch.setitem(sys.modules, "warpgs.report.overview", overview)
+        (f,) = doctor._rendering()
+        assert f.status == status and answer[1] in f.detail and bool(f.remedy) == (status != OK)
     writer = types.SimpleNamespace(isOpened=lambda: False, release=lambda: None)
     monkeypatch.setattr("cv2.VideoWriter", lambda *a: writer)
     (f,) = doctor._video()
     assert f.status == NOTE and f.remedy
-
-
-def test_little_disk_and_memory_are_notes(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(doctor.shutil, "disk_usage", lambda p: types.SimpleNamespace(free=2**20))
     monkeypatch.setattr(doctor, "machine_memory", lambda: (2**32, 2**30))
     found = by_topic([*doctor._disk(), *doctor._processor()])
     assert found["Disk"].status == found["Memory"].status == NOTE
     assert found["Disk"].remedy and "4.0 GiB" in found["Memory"].detail
-
-
-def test_a_check_that_fails_is_a_finding(monkeypatch):
-    def _odd_check():
-        raise RuntimeError("no such thing")
-
-    monkeypatch.setattr(doctor, "CHECKS", (_odd_check,))
-    (f,) = doctor.diagnose()
-    assert f.topic == "Odd check" and f.status == NOTE and "no such thing" in f.detail
 
 
 def test_eighty_columns_keep_the_keys_whole():
@@ -217,7 +193,7 @@ def test_a_package_that_is_only_found(monkeypatch):
 
 
 def test_checks_run_side_by_side(monkeypatch):
-    """The one that waits for a process waits beside the others, and keeps its place in the report."""
+    """One that waits for a process waits beside the others, and keeps its place; one that fails is a finding."""
     met = threading.Barrier(2, timeout=60)
 
     def one():
@@ -232,17 +208,21 @@ def test_checks_run_side_by_side(monkeypatch):
     monkeypatch.setattr(doctor, "APART", frozenset({one}))
     assert [(f.topic, f.status) for f in doctor.diagnose()] == [("one", OK), ("two", OK)]
 
+    def _odd_check():
+        raise RuntimeError("no such thing")
 
-def test_what_native_code_says_of_a_driver_is_hidden(monkeypatch, capfd):
-    fake = types.SimpleNamespace(
-        config=types.SimpleNamespace(log_level=1), LOG_ERROR=4, init=lambda: os.write(2, b"no driver\n")
-    )
+    monkeypatch.setattr(doctor, "CHECKS", (_odd_check,))
+    (f,) = doctor.diagnose()
+    assert f.topic == "Odd check" and f.status == NOTE and "no such thing" in f.detail
+
+
+def test_a_driver_s_words_are_hidden_and_compiling_is_shown(monkeypatch, capfd):
+    config = types.SimpleNamespace(log_level=1)
+    fake = types.SimpleNamespace(config=config, LOG_ERROR=4, init=lambda: os.write(2, b"no driver\n"))
     monkeypatch.setitem(sys.modules, "warp", fake)
     monkeypatch.setattr(doctor, "prepare_kernel_cache", lambda: None)
     assert doctor._quiet_warp() is fake and fake.config.log_level == 1 and capfd.readouterr().err == ""
-
-
-def test_a_terminal_shows_that_kernels_are_compiled(monkeypatch):
+    monkeypatch.undo()
     lines = []
     monkeypatch.setattr(progress, "is_live", lambda: True)
     monkeypatch.setattr(progress._STATUS, "show", lines.append)

@@ -16,7 +16,6 @@ from warpgs.errors import UsageError
 from warpgs.pipeline.run.fit import fit
 from warpgs.ranks import is_loopback, loopback_interface
 from warpgs.report import progress
-from warpgs.synthetic.demo import write_demo
 
 
 def started(count: int, *command: str) -> list[subprocess.Popen]:
@@ -49,11 +48,10 @@ def ended(processes: list[subprocess.Popen]) -> list[tuple[int, str, str]]:
 @pytest.mark.parametrize(
     ("first", "then"), [pytest.param(2, 1, marks=pytest.mark.slow), pytest.param(3, 2, marks=pytest.mark.fault)]
 )
-def test_any_number_of_processes_fits_the_same_model(tmp_path, capsys, first, then):
+def test_any_number_of_processes_fits_the_same_model(demo, tmp_path, capsys, first, then):
     """Some, of which one is killed; fewer that go on; and one alone, uninterrupted: the same PLY and the same state."""
-    write_demo(tmp_path / "scene", views=8, width=48, height=36)
     flags = [
-        str(tmp_path / "scene"), "--device", "cpu", "--preset", "3dgs", "--steps", "8", "--batch", "5", "--dropout", "0.3",
+        str(demo), "--device", "cpu", "--preset", "3dgs", "--steps", "8", "--batch", "5", "--dropout", "0.3",
         "--init.source", "random", "--init.random-count", "60", "--density.start", "1", "--density.every", "3",
         "--density.gradient", "1e-6", "--checkpoint-every", "2",
         "--optimizer.average-last", "0.75",
@@ -83,21 +81,27 @@ def test_any_number_of_processes_fits_the_same_model(tmp_path, capsys, first, th
         assert f'"ranks": {count}' in (tmp_path / run / "metrics.json").read_text()
 
 
-@pytest.mark.parametrize(("name", "value"), [("RANK", "2"), ("RANK", "-1"), ("WORLD_SIZE", "two"), ("MASTER_PORT", "")])
-def test_variables_that_are_no_numbers_are_named(monkeypatch, name, value):
-    for key, usual in (("RANK", "0"), ("WORLD_SIZE", "2"), ("LOCAL_RANK", "0"), ("MASTER_PORT", "29500")):
-        monkeypatch.setenv(key, usual)
-    monkeypatch.setenv(name, value)
-    with pytest.raises(UsageError, match=f"the environment variable {name} must be"):
-        ranks.join("cpu")
-
-
-def test_a_process_alone_joins_nobody(monkeypatch):
+def test_variables_that_are_no_numbers_are_named_and_a_process_alone_joins_nobody(monkeypatch):
     monkeypatch.delenv("RANK", raising=False)
     assert ranks.join("cpu") is ranks.ALONE and ranks.ALONE.first
     for key, value in (("RANK", "0"), ("WORLD_SIZE", "1")):
         monkeypatch.setenv(key, value)
     assert ranks.join("cpu") is ranks.ALONE
+    for name, value in (("RANK", "2"), ("RANK", "-1"), ("WORLD_SIZE", "two"), ("MASTER_PORT", "")):
+        usual = {"RANK": "0", "WORLD_SIZE": "2", "LOCAL_RANK": "0", "MASTER_PORT": "29500"}
+        for key, set_to in (usual | {name: value}).items():
+            monkeypatch.setenv(key, set_to)
+        with pytest.raises(UsageError, match=f"the environment variable {name} must be"):
+            ranks.join("cpu")
+    # interfaces are named for ranks of this machine alone, and not over those that the user named
+    for name in ("GLOO_SOCKET_IFNAME", "NCCL_SOCKET_IFNAME"):
+        monkeypatch.setenv(name, "")
+        monkeypatch.delenv(name)
+    assert ranks._stay_home("192.0.2.1") is None and "GLOO_SOCKET_IFNAME" not in os.environ
+    monkeypatch.setenv("NCCL_SOCKET_IFNAME", "mine")
+    assert ranks._stay_home("127.0.0.1") == "127.0.0.1"
+    if sys.platform != "win32":
+        assert os.environ["GLOO_SOCKET_IFNAME"] == loopback_interface() and os.environ["NCCL_SOCKET_IFNAME"] == "mine"
 
 
 class Store(dict):
@@ -112,12 +116,10 @@ class Store(dict):
         return self[key]
 
 
-def test_silence_of_another_machine_is_a_loss_after_a_while(monkeypatch, capsys):
+def test_silence_of_another_machine_is_a_loss_after_a_while(unwatched, monkeypatch, capsys):
     """Not at once, nor where the process has said goodbye; and of two that find it one alone says so."""
     now = [100.0]
     monkeypatch.setattr(ranks.time, "monotonic", lambda: now[0])
-    monkeypatch.setattr(ranks.time, "sleep", lambda seconds: None)
-    monkeypatch.setattr(ranks.threading.Thread, "start", lambda self: None)
     store = Store()
     first, second = (ranks.RankWatch(rank, 3, store, store) for rank in (0, 1))
     assert not first.is_lost(2)  # it is still to come
@@ -151,6 +153,11 @@ def test_the_first_rank_keeps_the_store_until_all_have_read_the_error(unwatched,
         with pytest.raises(SystemExit):
             ranks.RankWatch(rank, 3, store, store)._watch()
         assert unwatched == waits
+    store = Store()  # all ranks read the texts of all
+    watches = [ranks.RankWatch(rank, 3, store, store) for rank in range(3)]
+    for rank in (1, 2):
+        store.set(f"text/{rank}", f"of {rank}")
+    assert watches[0].texts("of 0") == ["of 0", "of 1", "of 2"] and ranks.ALONE.texts("own") == ["own"]
 
 
 def test_the_lowest_rank_of_a_machine_reports_the_loss_of_the_store(unwatched, monkeypatch, capsys):
@@ -176,14 +183,6 @@ def test_the_lowest_rank_of_a_machine_reports_the_loss_of_the_store(unwatched, m
         assert len(unwatched) == printed  # it stays while the others look for it
 
 
-def test_all_ranks_read_the_texts_of_all(unwatched):
-    store = Store()
-    watches = [ranks.RankWatch(rank, 3, store, store) for rank in range(3)]
-    for rank in (1, 2):
-        store.set(f"text/{rank}", f"of {rank}")
-    assert watches[0].texts("of 0") == ["of 0", "of 1", "of 2"] and ranks.ALONE.texts("own") == ["own"]
-
-
 class Two(ranks.Ranks):
     count = 2
 
@@ -198,11 +197,10 @@ class Two(ranks.Ranks):
     "changed",
     ["a different version of warpgs", "a different scene", "a different split", "different settings", "a different checkpoint"],
 )
-def test_ranks_that_do_not_fit_the_same_are_refused(tmp_path, changed):
+def test_ranks_that_do_not_fit_the_same_are_refused(demo, tmp_path, changed):
     """Each would take its part of other steps, and the model would be that of no fit; nothing is written."""
-    write_demo(tmp_path / "scene", views=8, width=48, height=36)
     with pytest.raises(UsageError, match=f"rank 1 has {changed} than rank 0: "):
-        fit(tmp_path / "scene", out=tmp_path / "run", device="cpu", steps=1, batch=2, ranks=Two(changed), verbose=False)
+        fit(demo, out=tmp_path / "run", device="cpu", steps=1, batch=2, ranks=Two(changed), verbose=False)
     assert not (tmp_path / "run" / "config.json").exists()
 
 
@@ -217,15 +215,7 @@ def test_the_error_of_a_rank_is_printed_whole(monkeypatch):
     assert handlers == [signal.SIG_IGN]
 
 
-def test_a_machine_has_a_name_on_every_system(monkeypatch):
-    def none(*_):
-        raise FileNotFoundError
-
-    monkeypatch.setattr(ranks.Path, "read_text", none)
-    assert ranks.machine() == ranks.platform.node()
-
-
-def test_the_end_of_a_process_is_seen():
+def test_the_end_of_a_process_is_seen(monkeypatch):
     """This one is there, and one that has ended is gone, also while its parent has not asked."""
     ended = subprocess.Popen([sys.executable, "-c", ""])
     if hasattr(os, "waitid"):
@@ -234,6 +224,12 @@ def test_the_end_of_a_process_is_seen():
         ended.wait()
     assert ranks.is_gone(ended.pid) and not ranks.is_gone(os.getpid())
     ended.wait()
+
+    def none(*_):
+        raise FileNotFoundError
+
+    monkeypatch.setattr(ranks.Path, "read_text", none)  # every system has a name
+    assert ranks.machine() == ranks.platform.node()
 
 
 LISTENING = """
@@ -257,18 +253,6 @@ def test_ranks_of_one_machine_listen_there_alone():
         assert code == 0, errors
         (line,) = out.splitlines()
         assert json.loads(line) and all(is_loopback(ip) for ip, _ in json.loads(line)), line
-
-
-def test_another_host_keeps_its_interfaces(monkeypatch):
-    """Interfaces are named for ranks of this machine alone, and not over those that the user named."""
-    for name in ("GLOO_SOCKET_IFNAME", "NCCL_SOCKET_IFNAME"):
-        monkeypatch.setenv(name, "")
-        monkeypatch.delenv(name)
-    assert ranks._stay_home("192.0.2.1") is None and "GLOO_SOCKET_IFNAME" not in os.environ
-    monkeypatch.setenv("NCCL_SOCKET_IFNAME", "mine")
-    assert ranks._stay_home("127.0.0.1") == "127.0.0.1"
-    if sys.platform != "win32":
-        assert os.environ["GLOO_SOCKET_IFNAME"] == loopback_interface() and os.environ["NCCL_SOCKET_IFNAME"] == "mine"
 
 
 @pytest.mark.parametrize("rank, shown", [("0", ["starting eval"]), ("1", [])])

@@ -262,12 +262,6 @@ def test_other_arguments_are_refused_by_name(arguments, message):
         gsplat.rasterization(**scene(), renderer_config=1)
 
 
-def test_a_fisheye_sorted_by_z_has_no_depths():
-    """The rasterizer knows distances alone: a key that would be wrong is absent."""
-    meta = gsplat.rasterization(**scene(), camera_model="fisheye")[2]
-    assert "depths" not in meta and "conics" in meta
-
-
 @pytest.mark.parametrize("mode", ["RGB", "ED", "RGB+D"])
 def test_results_may_be_edited_in_place(mode):
     """The backward pass then has the gradients of a product with the mask, and sets absgrad."""
@@ -314,3 +308,6 @@ def test_harmonics_and_rotations():
     assert torch.equal(two, gsplat.rasterization(**given)[0]) and bool((values < -0.5).any())
     quats = given["quats"].double()
     torch.testing.assert_close(gsplat.quat_to_rotmat(3 * quats)[1], rotations(quats[1]))
+    # a fisheye that is sorted by z has distances alone: a key that would be wrong is absent
+    meta = gsplat.rasterization(**scene(), camera_model="fisheye")[2]
+    assert "depths" not in meta and "conics" in meta

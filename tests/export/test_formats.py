@@ -41,8 +41,6 @@ from warpgs.kernels.sh import basis
 from warpgs.pipeline.run.export import convert
 from warpgs.scene import Mesh, Normalization
 
-# Every format reads back what it wrote within its quantum, and a stranger's file ends in one sentence.
-
 GOLDEN = Path(__file__).parent / "golden"
 SUFFIXES = suffixes()
 
@@ -201,7 +199,7 @@ def test_the_page_names_the_bytes_of_a_gaussian(suffix, tmp_path):
     assert abs(path.stat().st_size / n - int(named[1])) < 1
 
 
-def test_axes_on_disk(tmp_path):
+def test_axes_and_nodes_on_disk(tmp_path):
     made = model(n=1, degree=0)
     x, y, z = made.means[0].tolist()
     document, body = gltf._split(Path("a.glb"), b"".join(gltf.BinaryGltf().encode(arrays_of(made))))
@@ -212,18 +210,38 @@ def test_axes_on_disk(tmp_path):
     primitive = document["meshes"][0]["primitives"][0]
     assert primitive["extensions"]["KHR_gaussian_splatting"]["colorSpace"] == "srgb_rec709_display"
     assert {"POSITION", "KHR_gaussian_splatting:SH_DEGREE_0_COEF_0"} <= primitive["attributes"].keys()
+    # the translation of a node is added in float64
+    made = model(50)
+    document, body = gltf._document(arrays_of(made), None)
+    document["nodes"][0]["translation"] = [441_000.25, 5_500_000.5, 130.0]
+    (tmp_path / "a.glb").write_bytes(b"".join(gltf.glb(document, body)))
+    back = read_gaussians(tmp_path / "a.glb").means
+    wanted = made.means.double() + torch.tensor([-441_000.25, -5_500_000.5, 130.0], dtype=torch.float64)
+    assert back.dtype == torch.float64 and torch.allclose(back, wanted, rtol=0, atol=1e-6)
+    # scales and positions may be plain integers; programs without Gaussians show points in linear colours, with opacities
+    path, made = tmp_path / "a.glb", arrays_of(model(5, 1))
+    document, body = gltf._split(path, encoded(".glb"))
+    color = document["accessors"][document["meshes"][0]["primitives"][0]["attributes"]["COLOR_0"]]
+    assert (color["componentType"], color["type"], color["normalized"]) == (5123, "VEC4", True)
+    view = document["bufferViews"][color["bufferView"]]
+    colors = np.frombuffer(body, "<u2", 20, view["byteOffset"]).reshape(5, 4) / 65535
+    wanted = linear(0.28209479 * made["sh"][:, 0] + 0.5)
+    assert np.allclose(colors, np.column_stack([wanted, base.sigmoid(made["logit_opacities"])]), atol=1e-5)
+
+    def change(document):
+        document["accessors"][2] |= {"componentType": 5121}
+        document["accessors"][0] |= {"componentType": 5122}
+        document["extensionsRequired"] = ["KHR_mesh_quantization"]
+
+    path.write_bytes(with_document(change))
+    scales, means = body[document["bufferViews"][2]["byteOffset"] :][:15], body[document["bufferViews"][0]["byteOffset"] :][:30]
+    back = read_gaussians(path)
+    lengths = np.frombuffer(scales, "u1").reshape(5, 3).astype("f4")
+    assert np.allclose(back.log_scales.exp(), np.maximum(lengths, gltf._TINY), rtol=1e-5)
+    assert np.array_equal(back.means, np.frombuffer(means, "<i2").reshape(5, 3) * [-1, -1, 1])
 
 
-def test_more_rows_of_harmonics_than_a_palette(monkeypatch, tmp_path):
-    monkeypatch.setattr(sog, "PALETTE", 64)
-    made = model(n=200, degree=1)
-    write_gaussians(tmp_path / "a.sog", made, units="file")
-    back = read_gaussians(tmp_path / "a.sog")
-    assert 0.02 < differences(made, back)["rest"] < float(made.sh[:, 1:].max() - made.sh[:, 1:].min())
-    assert len(torch.unique(back.sh[:, 1:], dim=0)) <= 64
-
-
-def test_names_say_the_format(tmp_path):
+def test_names_say_the_format_and_bad_numbers_and_long_palettes(tmp_path, monkeypatch):
     assert format_of("A.Compressed.PLY").name == "compressed_ply" and format_of("a.b.ply").name == "ply"
     with pytest.raises(UsageError, match=r"format \.obj is not supported; use one of"):
         format_of("a.obj")
@@ -239,18 +257,23 @@ def test_names_say_the_format(tmp_path):
     write_gaussians(tmp_path / "a.compressed.ply", made, units="file")
     (tmp_path / "a.compressed.ply").rename(tmp_path / "a.ply")  # a compressed PLY may have a plain name
     assert differences(made, read_gaussians(tmp_path / "a.ply"))["means"] < 0.01
-
-
-def test_numbers_that_are_none_are_not_written(tmp_path):
+    # numbers that are none are not written
     made = model()
     made.means[3, 1] = torch.nan
     for suffix in SUFFIXES:
         with pytest.raises(DataError, match=r"1 of \d+ values of means are not finite"):
-            write_gaussians(tmp_path / f"a{suffix}", made, units="file")
-    assert not list(tmp_path.iterdir())
+            write_gaussians(tmp_path / f"bad{suffix}", made, units="file")
+    assert not list(tmp_path.glob("bad*"))
     made.means[3, 1] = 1e8
     with pytest.raises(DataError, match="SPZ coordinates must be at most"):
         write_gaussians(tmp_path / "a.spz", made, units="file")
+    # more rows of harmonics than a palette
+    monkeypatch.setattr(sog, "PALETTE", 64)
+    made = model(n=200, degree=1)
+    write_gaussians(tmp_path / "a.sog", made, units="file")
+    back = read_gaussians(tmp_path / "a.sog")
+    assert 0.02 < differences(made, back)["rest"] < float(made.sh[:, 1:].max() - made.sh[:, 1:].min())
+    assert len(torch.unique(back.sh[:, 1:], dim=0)) <= 64
 
 
 @pytest.mark.parametrize("suffix", [s for s in SUFFIXES if s != ".ply"])
@@ -285,25 +308,6 @@ def test_side_files(suffix, tmp_path):
             read_gaussians(path)
     write_gaussians(path, made, Normalization())
     assert not side.exists() and read_gaussians(path).means.dtype == torch.float32
-
-
-def test_nodes_in_map_coordinates(tmp_path):
-    """The translation of a glTF node is added in float64."""
-    made = model(50)
-    document, body = gltf._document(arrays_of(made), None)
-    document["nodes"][0]["translation"] = [441_000.25, 5_500_000.5, 130.0]
-    (tmp_path / "a.glb").write_bytes(b"".join(gltf.glb(document, body)))
-    back = read_gaussians(tmp_path / "a.glb").means
-    wanted = made.means.double() + torch.tensor([-441_000.25, -5_500_000.5, 130.0], dtype=torch.float64)
-    assert back.dtype == torch.float64 and torch.allclose(back, wanted, rtol=0, atol=1e-6)
-
-
-@pytest.mark.parametrize("suffix", [".ply", ".glb"])
-def test_meshes_state_their_origin(tmp_path, suffix):
-    made = Mesh(np.eye(3), np.array([[0, 1, 2]], np.int32), np.zeros((3, 3), np.float32))
-    write_mesh(tmp_path / f"a{suffix}", made, None, np.array([441_000.0, 5_500_000.0, 130.0]))
-    start = (tmp_path / f"a{suffix}").read_bytes()[:1500]
-    assert (b"comment warpgs_origin 441000.0 5500000.0 130.0\n" if suffix == ".ply" else b'"warpgs_origin":[441000.0,') in start
 
 
 @pytest.mark.parametrize("name", FOREIGN)
@@ -386,12 +390,11 @@ def test_gaussians_with_bad_numbers_are_left_out_of_any_format(suffix, tmp_path)
         refused(path, with_a_bad_one(suffix, own=True)[0], "is not finite")
 
 
-def test_counts_beyond_the_size_are_refused(tmp_path):
+def test_counts_chunks_and_numbers_that_lie(tmp_path):
     head = spz.HEADER.pack(spz.MAGIC, 3, 2**31, 3, 12, 0, 0)
     refused(tmp_path / "a.spz", gzip.compress(head + bytes(1000)), "2147483648 Gaussians in")
-    refused(
-        tmp_path / "a.spz", gzip.compress(spz.HEADER.pack(spz.MAGIC, 3, 5, 0, 12, 0, 0) + bytes(10**6)), "the file has more"
-    )
+    more = gzip.compress(spz.HEADER.pack(spz.MAGIC, 3, 5, 0, 12, 0, 0) + bytes(10**6))
+    refused(tmp_path / "a.spz", more, "the file has more")
     bomb = gzip.compress(spz.HEADER.pack(spz.MAGIC, 3, 100_000, 0, 12, 0, 0) + bytes(20 * 100_000))
     refused(tmp_path / "a.spz", bomb, f"announces 100000 Gaussians in only {len(bomb)} bytes")
     if importlib.util.find_spec("zstandard"):
@@ -404,6 +407,26 @@ def test_counts_beyond_the_size_are_refused(tmp_path):
     lines = ["ply", "format binary_little_endian 1.0", "element chunk 99999999999", "property float min_x"]
     lines += ["element vertex 1", "property uint packed_position", "end_header\n"]
     refused(tmp_path / "a.compressed.ply", "\n".join(lines).encode(), "truncated")
+    # a chunk's size beyond the end, a second chunk of another kind, NaN, an axis of negative length, a rotation of zero length
+    data = bytearray(encoded(".glb"))
+    start = 20 + struct.unpack_from("<I", data, 12)[0]
+    size = struct.unpack_from("<I", data, start)[0]
+    for chunk, match in (((size + 1, gltf.BINARY_CHUNK), "is truncated"), ((size, 7), "is not binary")):
+        struct.pack_into("<II", data, start, *chunk)
+        refused(tmp_path / "a.glb", bytes(data), match)
+    document = json.loads(encoded(".gltf"))
+    head, _, text = document["buffers"][0]["uri"].partition(",")
+    body = struct.pack("<f", float("nan")) + base64.b64decode(text)[4:]
+    document["buffers"][0]["uri"] = head + "," + base64.b64encode(body).decode()
+    refused(tmp_path / "a.gltf", json.dumps(document).encode(), "means of Gaussian 0 is not finite")
+    row = np.frombuffer(encoded(".splat", degree=0), base._ROW).copy()
+    row["scale"][2, 1] = -1
+    refused(tmp_path / "a.splat", row.tobytes(), "axis of Gaussian 2 has a negative length")
+    made = arrays_of(model(5, 1))
+    made["quats"][2] = 0
+    base.transform_in_place(made, placed(TURN)[:3, :3], np.zeros(3))
+    with pytest.raises(DataError, match="the rotation of Gaussian 2 has zero length"):
+        gaussians_of(tmp_path, made)
 
 
 def repacked(change):
@@ -456,10 +479,7 @@ def with_document(change):
 
 
 def at(*keys, value):
-    def change(document):
-        set_to(*keys, value=value)(document, {})
-
-    return change
+    return lambda document: set_to(*keys, value=value)(document, {})
 
 
 EXTENSION = ("meshes", 0, "primitives", 0, "extensions", "KHR_gaussian_splatting")
@@ -508,9 +528,7 @@ def placed(node):
         return np.array(node["matrix"], float).reshape(4, 4).T
     turn = rotation_matrices(np.array(node["rotation"], float)[[3, 0, 1, 2]] / np.linalg.norm(node["rotation"]))
     matrix = np.eye(4)
-    matrix[:3] = np.concatenate(
-        [turn * np.array(node.get("scale", 1)), np.reshape(node.get("translation", [0] * 3), (3, 1))], 1
-    )
+    matrix[:3, :3], matrix[:3, 3] = turn * np.array(node.get("scale", 1)), node.get("translation", 0)
     return matrix
 
 
@@ -529,11 +547,8 @@ def placed(node):
 )
 def test_nodes_place_gaussians(nodes, roots, wanted, tmp_path):
     """Means, shapes and colours follow all nodes above the mesh; each node that shows it has a copy of it."""
-
-    def change(document):
-        document.update(nodes=nodes, scenes=[{"nodes": roots}] if roots else [])
-
-    (tmp_path / "a.glb").write_bytes(with_document(change))
+    shown = {"nodes": nodes, "scenes": [{"nodes": roots}] if roots else []}
+    (tmp_path / "a.glb").write_bytes(with_document(lambda document: document.update(shown)))
     plain, back = gltf.decode(Path("a.glb"), encoded(".glb")), read_gaussians(tmp_path / "a.glb")
     made = gaussians_of(Path("a.glb"), plain)
     if len(wanted) == 1 and np.array_equal(wanted[0], np.eye(4)):
@@ -549,59 +564,6 @@ def test_nodes_place_gaussians(nodes, roots, wanted, tmp_path):
         before, after = (torch.einsum("dk,nkc->dnc", basis(v)[:, :4], g.sh.double()) for v, g in ((d, made), (turned, part)))
         assert torch.allclose(before, after, atol=1e-5)
     assert len(back) == 5 * len(wanted)
-
-
-def test_rotations_of_zero_length_stay(tmp_path):
-    """A turned model still tells which Gaussians have no rotation."""
-    made = arrays_of(model(5, 1))
-    made["quats"][2] = 0
-    base.transform_in_place(made, placed(TURN)[:3, :3], np.zeros(3))
-    with pytest.raises(DataError, match="the rotation of Gaussian 2 has zero length"):
-        gaussians_of(tmp_path, made)
-
-
-def test_integers_and_points_of_gltf(tmp_path):
-    """Scales and positions may be plain integers; programs without Gaussians show points in linear colours, with opacities."""
-    path, made = tmp_path / "a.glb", arrays_of(model(5, 1))
-    document, body = gltf._split(path, encoded(".glb"))
-    color = document["accessors"][document["meshes"][0]["primitives"][0]["attributes"]["COLOR_0"]]
-    assert (color["componentType"], color["type"], color["normalized"]) == (5123, "VEC4", True)
-    view = document["bufferViews"][color["bufferView"]]
-    colors = np.frombuffer(body, "<u2", 20, view["byteOffset"]).reshape(5, 4) / 65535
-    wanted = linear(0.28209479 * made["sh"][:, 0] + 0.5)
-    assert np.allclose(colors[:, :3], wanted, atol=1e-5) and np.allclose(
-        colors[:, 3], base.sigmoid(made["logit_opacities"]), atol=1e-5
-    )
-
-    def change(document):
-        document["accessors"][2] |= {"componentType": 5121}
-        document["accessors"][0] |= {"componentType": 5122}
-        document["extensionsRequired"] = ["KHR_mesh_quantization"]
-
-    path.write_bytes(with_document(change))
-    scales, means = body[document["bufferViews"][2]["byteOffset"] :][:15], body[document["bufferViews"][0]["byteOffset"] :][:30]
-    back = read_gaussians(path)
-    lengths = np.frombuffer(scales, "u1").reshape(5, 3).astype("f4")
-    assert np.allclose(back.log_scales.exp(), np.maximum(lengths, gltf._TINY), rtol=1e-5)
-    assert np.array_equal(back.means, np.frombuffer(means, "<i2").reshape(5, 3) * [-1, -1, 1])
-
-
-def test_chunks_and_numbers_that_lie(tmp_path):
-    """A size beyond the end of the file, a second chunk of another kind, NaN, and an axis of negative length."""
-    data = bytearray(encoded(".glb"))
-    start = 20 + struct.unpack_from("<I", data, 12)[0]
-    size = struct.unpack_from("<I", data, start)[0]
-    for chunk, match in (((size + 1, gltf.BINARY_CHUNK), "is truncated"), ((size, 7), "is not binary")):
-        struct.pack_into("<II", data, start, *chunk)
-        refused(tmp_path / "a.glb", bytes(data), match)
-    document = json.loads(encoded(".gltf"))
-    head, _, text = document["buffers"][0]["uri"].partition(",")
-    body = struct.pack("<f", float("nan")) + base64.b64decode(text)[4:]
-    document["buffers"][0]["uri"] = head + "," + base64.b64encode(body).decode()
-    refused(tmp_path / "a.gltf", json.dumps(document).encode(), "means of Gaussian 0 is not finite")
-    row = np.frombuffer(encoded(".splat", degree=0), base._ROW).copy()
-    row["scale"][2, 1] = -1
-    refused(tmp_path / "a.splat", row.tobytes(), "axis of Gaussian 2 has a negative length")
 
 
 # Files that say how they are rendered: antialiased or not, in our words and in those of other programs.
@@ -706,7 +668,7 @@ def own(tmp_path, monkeypatch):
 
 
 def test_one_file_adds_a_format(own, tmp_path, capsys):
-    """To convert to it and back, with options of its own; the bits are those that were stored."""
+    """To convert to it and back, with options of its own, bit for bit; Python takes a class, an object or its place."""
     spec, flags = f"{own}:Archive", ["--no-clean"]
     assert main(["convert", str(tmp_path / "a.ply"), str(tmp_path / "b.mine"), "--format", spec, *flags]) == 0
     assert main(["convert", str(tmp_path / "a.ply"), str(tmp_path / "b.spz"), "--spz.version", "2", *flags]) == 0
@@ -720,9 +682,6 @@ def test_one_file_adds_a_format(own, tmp_path, capsys):
         main(["convert", "--format", spec, "--help"])
     said = " ".join(capsys.readouterr().out.replace("│", "").split())
     assert "--archive.packed" in said and "Make the archive smaller, in more time" in said
-
-
-def test_python_takes_a_class_an_object_or_its_place(own, tmp_path):
     cls = FORMATS.load(f"{own}:Archive")
     for i, choice in enumerate((cls, cls(), cls(cls.Config(packed=True)), f"{own}:Archive")):
         write_gaussians(tmp_path / f"{i}.mine", cloud(40), units="file", format=choice)
@@ -739,7 +698,7 @@ def test_python_takes_a_class_an_object_or_its_place(own, tmp_path):
 
 
 def test_a_registered_format_is_found_by_its_suffix(own, tmp_path, capsys):
-    """Without a word about it, in the help too; those of ours keep their files."""
+    """In the help too; those of ours keep their files; a name with a colon is never imported."""
 
     @FORMATS.register("rows")
     class Rows(Format):
@@ -757,6 +716,11 @@ def test_a_registered_format_is_found_by_its_suffix(own, tmp_path, capsys):
         with pytest.raises(SystemExit):
             main([command, "--help"])
         assert ".rows" in capsys.readouterr().out
+    before = set(sys.modules)
+    for find, name, words in ((FORMATS.find, own, "does not load your code"), (format_of, own.name, "is not supported")):
+        with pytest.raises(UsageError, match=words):
+            find(f"{name}:Archive")
+    assert not any("mine" in n for n in set(sys.modules) - before)
 
 
 @pytest.mark.parametrize(
@@ -777,16 +741,6 @@ def test_mistakes_are_one_sentence(own, tmp_path, capsys, flags, said):
     assert main(["convert", str(tmp_path / "a.ply"), str(tmp_path / name), *more]) == 2
     text = capsys.readouterr().err
     assert said in text and len(text.splitlines()) == 1 and not (tmp_path / name).exists()
-
-
-def test_no_file_names_code(own, tmp_path):
-    """A name with a colon is looked up where something stored names it, and never imported."""
-    before = set(sys.modules)
-    with pytest.raises(UsageError, match="does not load your code"):
-        FORMATS.find(f"{own}:Archive")
-    with pytest.raises(UsageError, match="is not supported"):
-        format_of(tmp_path / f"{own.name}:Archive")
-    assert not any("mine" in n for n in set(sys.modules) - before)
 
 
 # Meshes as files, read back by numpy, by VTK and by pygltflib.
@@ -841,6 +795,12 @@ def test_glb_holds_the_mesh(tmp_path):
     assert np.array_equal(indices.reshape(-1, 3), TETRAHEDRON.faces) and (colors[:, 3] == 65535).all()
     assert np.allclose(colors[:, :3] / 65535, linear(TETRAHEDRON.colors), atol=1e-5)
     assert linear(np.array([0.0, 0.04, 0.5, 1.0])) == pytest.approx([0, 0.04 / 12.92, 0.21404, 1], abs=1e-5)
+    # the quaternion xyzw turns a direction to +y
+    for up in ((0, 1, 0), (0, -1, 0), (0, 0, 2), (-3, 0, 0), (0.3, -0.9, 0.2), (1e-9, -1, 0)):
+        x, y, z, w = rotation_to_y(np.array(up, float))
+        v, q = np.array(up, float) / np.linalg.norm(up), np.array([x, y, z])
+        turned = v + 2 * np.cross(q, np.cross(q, v) + w * v)
+        assert np.allclose(turned, [0, 1, 0], atol=1e-6) and np.isclose(x * x + y * y + z * z + w * w, 1)
 
 
 def test_glb_holds_the_texture(tmp_path):
@@ -853,9 +813,12 @@ def test_glb_holds_the_texture(tmp_path):
     kinds = ((np.dtype("<f4"), 3), (np.dtype("<u2"), 4), (np.dtype("<u4"), 3), (np.dtype("<f4"), 2))
     positions, colors, faces, places = (np.frombuffer(v, d).reshape(-1, n) for v, (d, n) in zip(views, kinds))
     assert np.allclose(positions[faces] + text["nodes"][1]["translation"], TETRAHEDRON.vertices[TETRAHEDRON.faces])
-    assert (
-        np.array_equal(places[faces], uv) and len(positions) == 8 and [a["count"] for a in text["accessors"]] == [8, 8, 12, 8]
-    )
+    assert np.array_equal(places[faces], uv) and [a["count"] for a in text["accessors"]] == [len(positions), 8, 12, 8] == [
+        8,
+        8,
+        12,
+        8,
+    ]
     assert (colors[faces[:2]] == 65535).all()
     assert np.allclose(colors[faces[2:], :3] / 65535, linear(TETRAHEDRON.colors)[TETRAHEDRON.faces[2:]], atol=1e-5)
     image = cv2.imdecode(np.frombuffer(views[4], np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
@@ -866,18 +829,9 @@ def test_glb_holds_the_texture(tmp_path):
     assert (text["textures"], text["images"]) == ([{"source": 0}], [{"bufferView": 4, "mimeType": "image/jpeg"}])
 
 
-def test_upwards_becomes_y():
-    """The quaternion xyzw turns the direction to +y."""
-    for up in ((0, 1, 0), (0, -1, 0), (0, 0, 2), (-3, 0, 0), (0.3, -0.9, 0.2), (1e-9, -1, 0)):
-        x, y, z, w = rotation_to_y(np.array(up, float))
-        v, q = np.array(up, float) / np.linalg.norm(up), np.array([x, y, z])
-        turned = v + 2 * np.cross(q, np.cross(q, v) + w * v)
-        assert np.allclose(turned, [0, 1, 0], atol=1e-6) and np.isclose(x * x + y * y + z * z + w * w, 1)
-
-
 @pytest.mark.parametrize("suffix", [".ply", ".glb"])
 def test_what_is_no_mesh_is_not_written(tmp_path, suffix):
-    """Numbers that are not finite, triangles of missing vertices, other suffixes."""
+    """Numbers that are not finite, triangles of missing vertices, other suffixes; what is written states its origin."""
     path = tmp_path / f"a{suffix}"
     bad = TETRAHEDRON.vertices.copy()
     bad[1, 1] = np.nan
@@ -888,3 +842,6 @@ def test_what_is_no_mesh_is_not_written(tmp_path, suffix):
     with pytest.raises(UsageError, match=r"use \.ply or \.glb"):
         write_mesh(tmp_path / f"a.obj{suffix[1:]}", TETRAHEDRON)
     assert not list(tmp_path.iterdir())
+    write_mesh(path, TETRAHEDRON, None, np.array([441_000.0, 5_500_000.0, 130.0]))
+    stated = b"comment warpgs_origin 441000.0 5500000.0 130.0\n" if suffix == ".ply" else b'"warpgs_origin":[441000.0,'
+    assert stated in path.read_bytes()[:1500]

@@ -25,8 +25,8 @@ def split(path):
     return head.decode().splitlines(), body
 
 
-def ply(lines, body=b""):
-    return ("\n".join(["ply", "format binary_little_endian 1.0", *lines, "end_header"]) + "\n").encode() + body
+def ply(lines, body=b"", form="binary_little_endian"):
+    return ("\n".join(["ply", f"format {form} 1.0", *lines, "end_header"]) + "\n").encode() + body
 
 
 NAMES = "x y z f_dc_0 f_dc_1 f_dc_2 opacity scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3".split()
@@ -65,6 +65,18 @@ def test_layout_on_disk(tmp_path):
     rest = [3, 6, 9, 4, 7, 10, 5, 8, 11]
     want = [1, 2, 3, 0, 0, 0, 0, 1, 2, *rest, 2.5, -1, -2, -3, 0.5, 0.1, 0.2, 0.3]
     assert body == struct.pack(f"<{len(want)}f", *want)
+    # unknown properties and elements are ignored
+    path = tmp_path / "a.ply"
+    lines = ["comment end_header is not here", "obj_info x", "element camera 2", "property double f", "property uchar g",
+             "element vertex 1", "property uchar red", *PROPERTIES, "property double error",
+             "element face 1", "property list uchar int vertex_indices"]  # fmt: skip
+    path.write_bytes(ply(lines, b"\0" * 18 + b"\7" + ROW + b"\0" * 8 + b"\3" + b"\0" * 12))
+    model = read_ply(path)
+    assert model.means.tolist() == [[1, 2, 3]] and model.sh.tolist() == [[[4, 5, 6]]]
+    assert model.quats.tolist() == [[11, 12, 13, 14]] and model.logit_opacities.tolist() == [7]
+    lines = ["element vertex 1", *(f"property double {n}" for n in reversed(NAMES))]  # any order, doubles, CRLF
+    path.write_bytes(ply(lines).replace(b"\n", b"\r\n") + np.arange(14, 0, -1, dtype="<f8").tobytes())
+    assert read_ply(path).means.tolist() == [[1, 2, 3]] and read_ply(path).log_scales.tolist() == [[8, 9, 10]]
 
 
 def test_file_coordinates_are_restored_in_float64(tmp_path):
@@ -90,8 +102,7 @@ def test_doubles_in_map_coordinates(tmp_path, text):
     rows[:, :3] += [441_000, 5_500_000, 130]
     header = ["element vertex 50", *(f"property double {n}" for n in NAMES)]
     body = "".join(" ".join(map(repr, row)) + "\n" for row in rows.tolist()).encode() if text else rows.astype("<f8").tobytes()
-    data = ply(header, body)
-    (tmp_path / "a.ply").write_bytes(data.replace(b"binary_little_endian", b"ascii") if text else data)
+    (tmp_path / "a.ply").write_bytes(ply(header, body, "ascii" if text else "binary_little_endian"))
     normalization = Normalization(np.array([441_000.5, 5_500_000.25, 130]), 0.2)
     convert(tmp_path / "a.ply", tmp_path / "b.ply")
     for name in ("a.ply", "b.ply"):
@@ -120,13 +131,20 @@ def test_non_finite_is_refused_by_name_and_the_old_file_stays(tmp_path, name, va
     assert path.read_bytes() == b"old" and list(tmp_path.iterdir()) == [path]
 
 
-def test_overflow_on_the_way_to_file_coordinates_is_refused(tmp_path):
+def test_units_folders_and_files_that_cannot_be_used(tmp_path):
     with pytest.raises(DataError, match="means"):
         write_ply(tmp_path / "a.ply", make(), Normalization(np.zeros(3), 1e-39))
     for scale in (0.0, -1.0, float("nan")):
         with pytest.raises(DataError, match="normalization"):
             write_ply(tmp_path / "a.ply", make(), Normalization(np.zeros(3), scale))
     assert not list(tmp_path.iterdir())
+    with pytest.raises(ResourceError, match="cannot be written"):
+        write_ply(tmp_path / "no" / "a.ply", make(), Normalization())
+    with pytest.raises(DataError, match="cannot be read"):
+        read_ply(tmp_path / "a.ply")
+    write_gaussians(tmp_path / "a.compressed.ply", make(5, 1), units="file")
+    with pytest.raises(DataError, match=r"is a compressed PLY file.*use warpgs\.export\.read_gaussians"):
+        read_ply(tmp_path / "a.compressed.ply")
 
 
 @pytest.mark.parametrize("fsync,words", [(28, "No space left"), (None, "only 400 of .* bytes were written")])
@@ -144,31 +162,6 @@ def test_a_failing_disk_leaves_the_old_file(tmp_path, monkeypatch, fsync, words)
     with pytest.raises(ResourceError, match=words):
         write_ply(path, make(), Normalization())
     assert path.read_bytes() == b"old" and list(tmp_path.iterdir()) == [path]
-
-
-def test_missing_folder_and_missing_file(tmp_path):
-    with pytest.raises(ResourceError, match="cannot be written"):
-        write_ply(tmp_path / "no" / "a.ply", make(), Normalization())
-    with pytest.raises(DataError, match="cannot be read"):
-        read_ply(tmp_path / "a.ply")
-
-
-def test_unknown_properties_and_elements_are_ignored(tmp_path):
-    path = tmp_path / "a.ply"
-    lines = ["comment end_header is not here", "obj_info x", "element camera 2", "property double f", "property uchar g",
-             "element vertex 1", "property uchar red", *PROPERTIES, "property double error",
-             "element face 1", "property list uchar int vertex_indices"]  # fmt: skip
-    path.write_bytes(ply(lines, b"\0" * 18 + b"\7" + ROW + b"\0" * 8 + b"\3" + b"\0" * 12))
-    model = read_ply(path)
-    assert model.means.tolist() == [[1, 2, 3]] and model.sh.tolist() == [[[4, 5, 6]]]
-    assert model.quats.tolist() == [[11, 12, 13, 14]] and model.logit_opacities.tolist() == [7]
-    lines = ["element vertex 1", *(f"property double {n}" for n in reversed(NAMES))]  # any order, doubles, CRLF
-    path.write_bytes(ply(lines).replace(b"\n", b"\r\n") + np.arange(14, 0, -1, dtype="<f8").tobytes())
-    assert read_ply(path).means.tolist() == [[1, 2, 3]] and read_ply(path).log_scales.tolist() == [[8, 9, 10]]
-
-
-def TEXT(lines):
-    return ply(lines).replace(b"binary_little_endian", b"ascii")
 
 
 @pytest.mark.parametrize("form", ["ascii", "binary_big_endian", "binary_little_endian"])
@@ -199,10 +192,10 @@ def test_colours_in_bytes(tmp_path, form, rest):
     rows = np.ones(2, [(n, {"binary_big_endian": ">"}.get(form, "<") + k) for n, k in kinds.items()])
     rows["red"], rows["green"], rows["blue"] = (0, 255), (51, 102), (255, 0)
     words = {"u1": "uchar", "f4": "float"}
-    lines = ["ply", f"format {form} 1.0", "element vertex 2", *(f"property {words[k]} {n}" for n, k in kinds.items())]
+    lines = ["element vertex 2", *(f"property {words[k]} {n}" for n, k in kinds.items())]
     text = "".join(" ".join(f"{v:g}" for v in row) + "\n" for row in rows.tolist()).encode()
     path = tmp_path / "a.ply"
-    path.write_bytes("\n".join([*lines, "end_header\n"]).encode() + (text if form == "ascii" else rows.tobytes()))
+    path.write_bytes(ply(lines, text if form == "ascii" else rows.tobytes(), form))
     gaussians = read_ply(path)
     wanted = torch.tensor([[0, 0.2, 1], [1, 0.4, 0]])
     assert torch.allclose(base_colors(gaussians.sh), wanted, atol=1e-6) and gaussians.sh.shape[1] == 1 + rest // 3
@@ -219,9 +212,8 @@ def test_gaussians_with_bad_numbers_are_left_out(tmp_path, own):
     lines, body = split(path)
     values = np.frombuffer(body, "<f4").reshape(7, -1).copy()
     values[1, 20], values[2, -6], values[4, -4:], values[5, 0] = np.nan, np.inf, 0, -np.inf
-    path.write_bytes(
-        "\n".join([line for line in lines if own or "comment" not in line] + ["end_header\n"]).encode() + values.tobytes()
-    )
+    head = "\n".join([*(line for line in lines if own or "comment" not in line), "end_header\n"])
+    path.write_bytes(head.encode() + values.tobytes())
     with pytest.raises(DataError, match="f_rest_11 of Gaussian 1 is not finite"):
         read_gaussians(path, strict=True)
     if own:
@@ -249,16 +241,19 @@ def test_final_opacities_and_lengths_get_a_note(tmp_path, n, final):
     assert [bool(re.search(words, str(w.message))) for w in caught] == [True] * (final and n == 200)
 
 
-RESET_FREE_STEPS = [f"property float f_rest_{i}" for i in range(9)]
+REST = [f"property float f_rest_{i}" for i in range(9)]
 MALFORMED = {
     "empty": (b"", "start with 'ply'"),
     "not ply": (b"solid cube\n", "start with 'ply'"),
     "no end": (b"ply\nformat binary_little_endian 1.0\n", "no 'end_header'"),
     "long header": (b"ply\n" + b"comment a\n" * (MAX_HEADER_BYTES // 10) + b"end_header\n", "no 'end_header'"),
     "other format": (ply([]).replace(b"little", b"middle"), "its format is binary_middle_endian 1.0, not one of"),
-    "short text": (TEXT(["element vertex 2", *PROPERTIES]) + b"1 2 3\n" * 20, "Gaussians 0 to 1 are not rows of 14 numbers"),
-    "words": (TEXT(["element vertex 1", *PROPERTIES]) + b"one " * 14, "convert string 'one'"),
-    "huge text": (TEXT(["element vertex 999999999", *PROPERTIES]) + b"1 " * 14, "truncated"),
+    "short text": (
+        ply(["element vertex 2", *PROPERTIES], b"1 2 3\n" * 20, "ascii"),
+        "Gaussians 0 to 1 are not rows of 14 numbers",
+    ),
+    "words": (ply(["element vertex 1", *PROPERTIES], b"one " * 14, "ascii"), "convert string 'one'"),
+    "huge text": (ply(["element vertex 999999999", *PROPERTIES], b"1 " * 14, "ascii"), "truncated"),
     "no format": (b"ply\nelement vertex 0\nend_header\n", "not given"),
     "no vertex": (ply(["element face 0"]), "one 'element vertex'"),
     "two vertices": (ply(["element vertex 0", "element vertex 0"]), "one 'element vertex'"),
@@ -271,8 +266,8 @@ MALFORMED = {
     "twice": (ply(["element vertex 1", *PROPERTIES, "property float x"], ROW * 2), "appears twice"),
     "missing": (ply(["element vertex 1", *PROPERTIES[1:]], ROW), "missing: x"),
     "flat": (ply(["element vertex 1", *(p for p in PROPERTIES if "scale_2" not in p)], ROW), "2DGS"),
-    "half a degree": (ply(["element vertex 0", *PROPERTIES, *RESET_FREE_STEPS[:5]]), "5 f_rest"),
-    "gap": (ply(["element vertex 0", *PROPERTIES, *RESET_FREE_STEPS[:8], "property float f_rest_9"]), "missing: f_rest_8"),
+    "half a degree": (ply(["element vertex 0", *PROPERTIES, *REST[:5]]), "5 f_rest"),
+    "gap": (ply(["element vertex 0", *PROPERTIES, *REST[:8], "property float f_rest_9"]), "missing: f_rest_8"),
     "vertex list": (ply(["element vertex 0", *PROPERTIES, "property list uchar int i"]), "'vertex' has list"),
     "list before": (ply(["element face 1", "property list uchar int i", "element vertex 0"]), "'face' has list"),
     "nan": (ply(["element vertex 1", *PROPERTIES], ROW[:24] + b"\0\0\xc0\x7f" + ROW[28:]), "opacity of Gaussian 0"),
@@ -288,12 +283,6 @@ def test_malformed_files_are_told_with_path_and_remedy(tmp_path, name):
     with pytest.raises(DataError, match=message) as error:
         read_ply(path)
     assert str(path) in str(error.value) and "Export" in str(error.value)
-
-
-def test_compressed_files_name_their_reader(tmp_path):
-    write_gaussians(tmp_path / "a.compressed.ply", make(5, 1), units="file")
-    with pytest.raises(DataError, match=r"is a compressed PLY file.*use warpgs\.export\.read_gaussians"):
-        read_ply(tmp_path / "a.compressed.ply")
 
 
 def test_infinite_logits_and_axes_without_length(tmp_path):

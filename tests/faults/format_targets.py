@@ -14,21 +14,10 @@ from pathlib import Path
 
 import numpy as np
 
+from tests.faults import mutations
 from tests.faults.model_targets import nonsense, ply_body, ply_header
-from tests.faults.mutations import (
-    Change,
-    damage,
-    json_value,
-    large_webp,
-    many_rows,
-    number,
-    rarely,
-    spz_bomb,
-    text_line,
-    text_number,
-    zip_bomb,
-)
-from tests.faults.targets import Target, not_finite, register
+from tests.faults.mutations import Change, damage, json_value, number, rarely, text_line, text_number
+from tests.faults.targets import Target, not_finite, register, writing
 from tests.gaussians import cloud
 from tests.io import scenes
 from warpgs.errors import DataError
@@ -66,10 +55,7 @@ def add(name: str, suffix: str, parser: tuple, changes: tuple[Change, ...], prep
 
 # ---- compressed PLY and .splat -----------------------------------------------------------------------------------------
 
-COMPRESSED = (
-    ply.decode, ply.is_compressed, ply._harmonics, ply._table,
-    ply._column, ply._unpack,
-)  # fmt: skip
+COMPRESSED = (ply.decode, ply.is_compressed, ply._harmonics, ply._table, ply._column, ply._unpack)
 add("compressed PLY", ".compressed.ply", COMPRESSED, (ply_header(text_number), ply_header(text_line), ply_body, ply_body))
 add("splat", ".splat", (base.decode,), (number, number))
 
@@ -87,10 +73,6 @@ def inside_gzip(change: Change) -> Change:
         return gzip.compress(change(plain, rng), mtime=0)
 
     return changed
-
-
-def header_number(data: bytes, rng: np.random.Generator) -> bytes:
-    return number(data[:32], rng) + data[32:]
 
 
 def spz_files(root: Path) -> list[Path]:
@@ -133,7 +115,12 @@ def spz_streams(data: bytes, rng: np.random.Generator) -> bytes:
 
 
 SPZ = (spz.decode, spz._checked, spz._streams, spz._unpack, spz._coordinate_system)
-SPZ_CHANGES = (rarely(spz_bomb, inside_gzip(header_number)), inside_gzip(number), inside_gzip(damage), spz_streams)
+SPZ_CHANGES = (
+    rarely(mutations.spz_bomb, inside_gzip(lambda data, rng: number(data[:32], rng) + data[32:])),
+    inside_gzip(number),
+    inside_gzip(damage),
+    spz_streams,
+)
 add("SPZ", ".spz", SPZ, SPZ_CHANGES, spz_files)
 
 
@@ -172,8 +159,7 @@ def archive_of(members: dict[str, bytes], packed: bool = False) -> bytes:
 
 def zip_member(data: bytes, rng: np.random.Generator) -> bytes:
     """Change, remove or rename a file of an archive."""
-    members = members_of(data)
-    if not members:
+    if not (members := members_of(data)):
         return damage(data, rng)
     name, kind = sorted(members)[int(rng.integers(len(members)))], int(rng.integers(8))
     if kind == 0:
@@ -209,11 +195,11 @@ def sog_image(data: bytes, rng: np.random.Generator) -> bytes:
     """Put a large image of one colour in place of another."""
     members = members_of(data)
     names = sorted(n for n in members if n.endswith(".webp"))
-    return archive_of(members | {names[int(rng.integers(len(names)))]: large_webp()}) if names else data
+    return archive_of(members | {names[int(rng.integers(len(names)))]: mutations.large_webp()}) if names else data
 
 
 SOG = (sog.decode, sog._member, sog._pixels, sog._book, sog._palette_rows, sog._within)
-add("SOG", ".sog", SOG, (sog_member, sog_member, rarely(sog_image, rarely(zip_bomb, sog_member))))
+add("SOG", ".sog", SOG, (sog_member, sog_member, rarely(sog_image, rarely(mutations.zip_bomb, sog_member))))
 
 # ---- glTF --------------------------------------------------------------------------------------------------------------
 
@@ -300,17 +286,14 @@ CAMERAS = (
     transforms._json, transforms.read_json, transforms._number, transforms.lens_of, transforms.matrix_of, transforms._origin,
     read_cameras, read_poses,
 )  # fmt: skip
-CAMERA_CHANGES = (rarely(many_rows, json_value), json_value, text_number, text_line)
+CAMERA_CHANGES = (rarely(mutations.many_rows, json_value), json_value, text_number, text_line)
 register(Target("cameras", camera_paths, read_any, CAMERAS, CAMERA_CHANGES, nonsense=camera_nonsense))
 
 
-def box_files(root: Path) -> list[Path]:
-    (root / "a.json").write_text(
-        json.dumps({"center": [0.0, 1.0, 2.0], "size": [1.0, 2.0, 3.0], "rotation": np.eye(3).tolist()})
+BOX = json.dumps({"center": [0.0, 1.0, 2.0], "size": [1.0, 2.0, 3.0], "rotation": np.eye(3).tolist()})
+register(
+    Target(
+        "crop box", writing({"a.json": BOX.encode()}), lambda root, path: edit.box_of(str(path)),
+        (edit.box_of, edit._box_of_file, edit.numbers_of), (json_value, json_value, text_number),
     )
-    return [root / "a.json"]
-
-
-BOX = (edit.box_of, edit._box_of_file, edit.numbers_of)
-BOX_CHANGES = (json_value, json_value, text_number)
-register(Target("crop box", box_files, lambda root, path: edit.box_of(str(path)), BOX, BOX_CHANGES))
+)  # fmt: skip

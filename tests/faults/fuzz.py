@@ -22,21 +22,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tests.faults.bounds import (
-    ALLOCATOR,
-    LIMIT,
-    MEMORY,
-    WALL,
-    Hang,
-    Line,
-    PeakMemory,
-    Reached,
-    bound_process,
-    garbage,
-    size_of,
-    spent,
-    time_limit,
-)
+from tests.faults import bounds
 from tests.faults.mutations import damage
 from tests.faults.targets import MODULES, Target, all_targets, parser_lines
 
@@ -63,7 +49,7 @@ class Tally:
     """Processor time [s]."""
     memory: int = 0
     """Peak beyond the result [bytes]."""
-    lines: set[Line] = field(default_factory=set)
+    lines: set[bounds.Line] = field(default_factory=set)
     failures: list[str] = field(default_factory=list)
     kinds: Counter[str] = field(default_factory=Counter)
 
@@ -101,7 +87,7 @@ class Worker:
         """Write the valid files; ``measured`` bounds the time of an input, after `bound_process`, and traces its lines."""
         self.target, self.seed, self.folder, self.measured = target, seed, folder, measured
         self.tally = Tally(target.name)
-        self.reached = Reached(parser_lines(target) if measured else {})
+        self.reached = bounds.Reached(parser_lines(target) if measured else {})
         self.paths = target.prepare(folder)
         self.bytes = {p: p.read_bytes() for p in self.paths}
         self.good = {p: self._try(p) for p in self.paths}
@@ -126,10 +112,10 @@ class Worker:
         finally:
             self.tally.lines |= self.reached.lines()
 
-    def _first_checks(self, path: Path) -> set[Line]:
+    def _first_checks(self, path: Path) -> set[bounds.Line]:
         """Return the lines that run where files without a meaning, in place of a valid one, are refused."""
         lines = set()
-        for data in [*garbage(), None]:
+        for data in [*bounds.garbage(), None]:
             path.unlink()
             if data is not None:
                 path.write_bytes(data)
@@ -168,18 +154,18 @@ class Worker:
         except Exception as e:  # of the fuzzer itself: nothing was read
             tally.fail("no input", index, repr(e))
             return
-        peak, began = PeakMemory(), spent()
+        peak, began = bounds.PeakMemory(), bounds.spent()
         tally.inputs += 1
         try:
             found = self._outcome(index, path, data, plain)
-            grown, seconds = peak.grown(), spent() - began
-            grown -= size_of(found) if grown > MEMORY else 0
+            grown, seconds = peak.grown(), bounds.spent() - began
+            grown -= bounds.size_of(found) if grown > bounds.MEMORY else 0
         finally:
             self.restore(path)
         tally.slowest, tally.memory = max(tally.slowest, seconds), max(tally.memory, grown)
-        if seconds > LIMIT:  # where a library swallows the exception, or the system has no timer
+        if seconds > bounds.LIMIT:  # where a library swallows the exception, or the system has no timer
             tally.fail("hang", index, f"takes {seconds:.1f} s of processor time")
-        if grown > MEMORY:
+        if grown > bounds.MEMORY:
             tally.fail("memory", index, f"takes {grown / 2**20:.0f} MiB beyond its result, for a file of {len(data):,} bytes")
 
     def _outcome(self, index: int, path: Path, data: bytes, plain: bool) -> object:
@@ -188,7 +174,7 @@ class Worker:
 
         tally, found = self.tally, None
         try:
-            with time_limit(self.measured):
+            with bounds.time_limit(self.measured):
                 found = self._read(path)
             if found is None:  # the file is passed over, as one that is not there
                 tally.refused += 1
@@ -201,8 +187,10 @@ class Worker:
             tally.refused += 1
             if str(self.folder) not in str(e) or len(str(e)) < len(str(self.folder)) + 20:
                 tally.fail("message", index, str(e))
-        except Hang:
-            tally.fail("hang", index, f"takes more than {LIMIT:.0f} s of processor time, or {WALL:.0f} s of wall time")
+        except bounds.Hang:
+            tally.fail(
+                "hang", index, f"takes more than {bounds.LIMIT:.0f} s of processor time, or {bounds.WALL:.0f} s of wall time"
+            )
         except Exception as e:
             last = traceback.extract_tb(e.__traceback__)[-1]
             tally.fail("raw", index, f"{type(e).__name__}: {str(e)[:200]} ({last.filename}, line {last.lineno})")
@@ -222,7 +210,7 @@ class Worker:
 def work(name: str, seed: int, first: int, last: int, current, results) -> None:
     """Read the inputs ``first`` to ``last`` of a reader and send a `Tally` at the end; ``current`` tells which one runs."""
     target, broken = all_targets()[name], Tally(name)
-    bound_process()
+    bounds.bound_process()
     with tempfile.TemporaryDirectory() as folder:
         try:
             worker = Worker(target, seed, Path(os.path.realpath(folder)), measured=True)
@@ -239,7 +227,7 @@ def work(name: str, seed: int, first: int, last: int, current, results) -> None:
 @functools.cache
 def _context() -> multiprocessing.context.BaseContext:
     """Return how processes start: on Linux from one that has imported all readers, in the environment of `ALLOCATOR`."""
-    os.environ.update(ALLOCATOR)
+    os.environ.update(bounds.ALLOCATOR)
     if sys.platform != "linux":
         return multiprocessing.get_context("spawn")
     context = multiprocessing.get_context("forkserver")
@@ -250,7 +238,7 @@ def _context() -> multiprocessing.context.BaseContext:
 def _outcome_of(process, current, results) -> Tally | None:
     """Wait for the tally of a process; None where it ends without one, or stands still."""
     seen, since = current.value, time.monotonic()
-    while process.is_alive() and time.monotonic() - since < 3 * WALL:
+    while process.is_alive() and time.monotonic() - since < 3 * bounds.WALL:
         try:
             return results.get(timeout=0.5)
         except queue.Empty:

@@ -14,7 +14,7 @@ from PIL import Image
 from tests.faults.mutations import Change, damage, number, png_bomb, rarely
 from tests.faults.scene_targets import nonsense as scene_nonsense
 from tests.faults.scene_targets import read_scene, write_masked
-from tests.faults.targets import Target, not_finite, register
+from tests.faults.targets import Target, not_finite, register, writing
 from tests.io import scenes
 from warpgs.io import folder as folders
 from warpgs.io import image_files, images, load
@@ -82,12 +82,8 @@ def by_opencv(suffix: str, array: np.ndarray, *options: int) -> bytes:
 
 
 def add(name: str, samples: dict[str, bytes], parser: tuple, changes: tuple[Change, ...] = (), **more) -> None:
-    def prepare(folder: Path) -> list[Path]:
-        for key, data in samples.items():
-            (folder / f"{key}.img").write_bytes(data)
-        return sorted(folder.iterdir())
-
-    register(Target(name, prepare, read, parser, changes, nonsense=nonsense, **more))
+    files = writing({f"{key}.img": data for key, data in sorted(samples.items())})
+    register(Target(name, files, read, parser, changes, nonsense=nonsense, **more))
 
 
 # ---- PNG -------------------------------------------------------------------------------------------------------------
@@ -234,13 +230,8 @@ def webp_chunk(data: bytes, rng: np.random.Generator) -> bytes:
 
 BMP_MODES = ("RGB", "RGBA", "L", "P", "1")
 OLD = b"BM" + struct.pack("<IHHI", 26 + 4 * 32, 0, 0, 26) + struct.pack("<IHHHH", 12, 10, 4, 1, 24) + bytes(range(128))
-add(
-    "bmp",
-    {m: encoded("BMP", m) for m in BMP_MODES} | {"old": OLD},
-    (image_files._opened, image_files._loaded),
-    (header,),
-    unexplained=near,
-)
+BMPS = {m: encoded("BMP", m) for m in BMP_MODES} | {"old": OLD}
+add("bmp", BMPS, (image_files._opened, image_files._loaded), (header,), unexplained=near)
 
 COLORS = np.asarray(photo("RGB"))
 DEEP = COLORS.astype(np.uint16) * 257
@@ -262,12 +253,8 @@ def big_tiled(gray: np.ndarray, order: str = "<") -> bytes:
 
 
 TIFF_PARSER = (
-    image_files._Directory,
-    image_files._tiff_tags,
-    image_files._tiff_size,
-    image_files._check_tiff,
-    image_files.unpacked_size,
-)
+    image_files._Directory, image_files._tiff_tags, image_files._tiff_size, image_files._check_tiff, image_files.unpacked_size,
+)  # fmt: skip
 add("tiff", TIFFS | {"big": big_tiled(np.arange(512).reshape(16, 32))}, TIFF_PARSER, (tiff_tag, tiff_tag))
 
 WEBPS = {
@@ -281,12 +268,8 @@ ANY |= {"jpeg": JPEGS["4440"], "gif": encoded("GIF", "P"), "avif": encoded("AVIF
 ANY |= {"bmp": encoded("BMP", "L"), "heic": struct.pack(">I8s", 12, b"ftypheic")}
 RLE, NO_PIXELS = struct.pack("<I", 1), b"WEBPVP8X" + struct.pack("<IIHI", 10, 0, 4, 0)
 ANY |= {"packed": ANY["bmp"][:30] + RLE + ANY["bmp"][34:], "no pixels": b"RIFF" + struct.pack("<I", 22) + NO_PIXELS}
-add(
-    "any image",
-    ANY,
-    (image_files.format_of, image_files._raster, image_files.decode, image_files._size, image_files._decoded),
-    (header,),
-)
+ANY_PARSER = (image_files.format_of, image_files._raster, image_files.decode, image_files._size, image_files._decoded)
+add("any image", ANY, ANY_PARSER, (header,))
 
 
 def other_size(data: bytes, rng: np.random.Generator) -> bytes:

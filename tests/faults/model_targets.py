@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from tests.faults.mutations import Change, damage, json_value, number, text_line, text_number
-from tests.faults.targets import Target, not_finite, register
+from tests.faults.targets import Target, not_finite, register, writing
 from tests.gaussians import cloud
 from tests.io import scenes
 from tests.priors import networks as nw
@@ -113,7 +113,7 @@ def with_digest(data: bytes) -> bytes:
 
 
 def within_digest(change: Change) -> Change:
-    return lambda data, rng: (lambda body: body + hashlib.sha256(body).digest())(change(data[:-32], rng))
+    return lambda data, rng: with_digest(change(data[:-32], rng) + bytes(32))
 
 
 def model_files(root: Path) -> list[Path]:
@@ -137,8 +137,7 @@ def checkpoints(root: Path) -> list[Path]:
 
 
 def checkpoint_nonsense(loaded: tuple) -> str:
-    tensors, state = loaded
-    sound = isinstance(state, dict) and all(isinstance(t, torch.Tensor) for t in tensors.values())
+    sound = isinstance(loaded[1], dict) and all(isinstance(t, torch.Tensor) for t in loaded[0].values())
     return "" if sound else "the state is no table"
 
 
@@ -192,9 +191,7 @@ def onnx_files(root: Path) -> list[Path]:
     whole = nw.model(graph, nw.field(25, own) + nw.field(20, nw.field(1, inner)))
     files = {"a": whole, "b": nw.linear(np.eye(3), np.zeros(3)), "c": nw.linear(np.eye(3), np.zeros(3), layout="nhwc")}
     foreign = nw.graph([nw.node("Run", ["x"], ["y"], "evil")], [nw.external_tensor("k", (1,), "w")], [x], [y])
-    for name, data in (files | {"d": nw.model(foreign)}).items():
-        (root / f"{name}.onnx").write_bytes(data)
-    return [root / f"{name}.onnx" for name in (*files, "d")]
+    return writing({f"{name}.onnx": data for name, data in (files | {"d": nw.model(foreign)}).items()})(root)
 
 
 def onnx_field(data: bytes, rng: np.random.Generator) -> bytes:
@@ -235,39 +232,25 @@ PARTS = (onnx.check_onnx, onnx._walk, onnx._message, onnx._varint, onnx._text)
 register(Target("onnx", onnx_files, check_onnx, PARTS, (onnx_field, onnx_field, onnx_field)))
 
 
-def flo_files(root: Path) -> list[Path]:
-    values = np.random.default_rng(0).normal(size=(5, 4, 2)).astype("<f4")
-    (root / "a.flo").write_bytes(flow.FLO_MAGIC.tobytes() + struct.pack("<ii", 4, 5) + values.tobytes())
-    return [root / "a.flo"]
-
-
-def flo_nonsense(found: np.ndarray) -> str:
-    return "" if found.ndim == 3 and found.dtype == np.float32 and not np.isinf(found).any() else "no flow"
-
-
-def flo_number(data: bytes, rng: np.random.Generator) -> bytes:
-    return data[:12] + number(data[12:], rng)
-
-
-register(
-    Target("flow", flo_files, lambda root, path: flow.read_flo(path), (flow.read_flo,), (flo_number,), nonsense=flo_nonsense)
-)
-
-
-def side_files(root: Path) -> list[Path]:
-    values = {"size": 518, "multiple": 14, "mean": [0.5, 0.4, 0.3], "std": [0.2, 0.2, 0.2], "output": "depth"}
-    (root / "m.onnx.json").write_text(json.dumps(values), "utf-8")
-    return [root / "m.onnx.json"]
-
-
-def side_nonsense(values: dict) -> str:
-    return "" if isinstance(values, dict) and set(values) <= set(networks.KEYS) else "no description"
+FLOW = np.random.default_rng(0).normal(size=(5, 4, 2)).astype("<f4").tobytes()
+FLO = {"a.flo": flow.FLO_MAGIC.tobytes() + struct.pack("<ii", 4, 5) + FLOW}
 
 
 register(
     Target(
-        "description of a network", side_files, lambda root, path: networks.read_side_file(root / "m.onnx"),
-        (networks.read_side_file,), (json_value, json_value, text_number), nonsense=side_nonsense,
+        "flow", writing(FLO), lambda root, path: flow.read_flo(path), (flow.read_flo,),
+        (lambda data, rng: data[:12] + number(data[12:], rng),),
+        nonsense=lambda f: "" if f.ndim == 3 and f.dtype == np.float32 and not np.isinf(f).any() else "no flow",
+    )
+)  # fmt: skip
+SIDE = {"size": 518, "multiple": 14, "mean": [0.5, 0.4, 0.3], "std": [0.2, 0.2, 0.2], "output": "depth"}
+
+register(
+    Target(
+        "description of a network", writing({"m.onnx.json": json.dumps(SIDE).encode()}),
+        lambda root, path: networks.read_side_file(root / "m.onnx"), (networks.read_side_file,),
+        (json_value, json_value, text_number),
+        nonsense=lambda values: "" if isinstance(values, dict) and set(values) <= set(networks.KEYS) else "no description",
     )
 )  # fmt: skip
 

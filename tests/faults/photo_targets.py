@@ -13,7 +13,7 @@ from PIL import Image
 
 from tests.faults import image_targets
 from tests.faults.image_targets import encoded, jpeg_segments, photo, png_checksums, tiff_tag
-from tests.faults.mutations import Change, damage, number, png_bomb, rarely
+from tests.faults.mutations import damage, number, png_bomb, rarely
 from tests.faults.targets import Target, register
 from warpgs.errors import DataError
 from warpgs.io import image_files
@@ -173,13 +173,11 @@ def video_files(root: Path) -> list[Path]:
 
 
 def video_header(data: bytes, rng: np.random.Generator) -> bytes:
-    """Change a number in the first bytes."""
     return number(data[:600], rng) + data[600:]
 
 
-def frame_bytes(change: Change) -> Change:
-    """Return the change of what follows the first bytes."""
-    return lambda data, rng: data[:600] + change(data[600:], rng)
+def video_body(data: bytes, rng: np.random.Generator) -> bytes:
+    return data[:600] + damage(data[600:], rng)
 
 
 def frames_of(root: Path, path: Path) -> list[np.ndarray]:
@@ -191,4 +189,4 @@ def frames_of(root: Path, path: Path) -> list[np.ndarray]:
 
 
 VIDEO = (photographs._frames, photographs.write_frames, photographs.sharpest)
-register(Target("video", video_files, frames_of, VIDEO, (video_header, box, frame_bytes(damage)), share=0.3))
+register(Target("video", video_files, frames_of, VIDEO, (video_header, box, video_body), share=0.3))

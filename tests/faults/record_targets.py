@@ -16,7 +16,7 @@ from tests.faults.format_targets import zip_member
 from tests.faults.image_targets import png_checksums, png_rows
 from tests.faults.model_targets import SMALL, onnx_field, run_files, tensors_body, tensors_header
 from tests.faults.mutations import Change, json_value, many_rows, rarely, text_line, text_number, zip_bomb
-from tests.faults.targets import Target, not_finite, register
+from tests.faults.targets import Target, not_finite, register, writing
 from tests.priors import networks as nw
 from warpgs import locks, onnx, schema
 from warpgs.app import farm as farm_command
@@ -57,18 +57,13 @@ def turned(angle: float) -> list[list[float]]:
     return [[c, 0.0, s, angle], [0.0, 1.0, 0.0, 0.5], [-s, 0.0, c, -2.0], [0.0, 0.0, 0.0, 1.0]]
 
 
-def cameras_of_path(root: Path, path: Path) -> list[Camera]:
-    found = paths.read_keyframes(path, TEMPLATE, Normalization(np.array([1.0, 2, 3]), 0.5))
-    return paths.through(found, 5)
-
-
-def path_nonsense(cameras: list[Camera]) -> str:
-    return "".join(not_finite(viewmat=c.viewmat, K=c.K) for c in cameras)
-
-
 PATH = [{"c2w": turned(0.3 * i), "fov_y": 0.8 + 0.1 * i, "seconds": 2.0 * i} for i in range(4)]
-KEYFRAMES = (paths.read_keyframes, paths.through)
-add("keyframes", "path.json", PATH, cameras_of_path, KEYFRAMES, nonsense=path_nonsense, lines=0.85)
+UNITS = Normalization(np.array([1.0, 2, 3]), 0.5)
+add(
+    "keyframes", "path.json", PATH, lambda root, path: paths.through(paths.read_keyframes(path, TEMPLATE, UNITS), 5),
+    (paths.read_keyframes, paths.through), lines=0.85,
+    nonsense=lambda cameras: "".join(not_finite(viewmat=c.viewmat, K=c.K) for c in cameras),
+)  # fmt: skip
 
 # ---- scores of a run ---------------------------------------------------------------------------------------------------
 
@@ -101,9 +96,7 @@ LINES = (
 )  # fmt: skip
 
 
-def job_files(root: Path) -> list[Path]:
-    (root / "jobs.jsonl").write_text("".join(json.dumps(line) + "\n" for line in LINES), "utf-8")
-    return [root / "jobs.jsonl"]
+job_files = writing({"jobs.jsonl": "".join(json.dumps(line) + "\n" for line in LINES).encode()})
 
 
 def one_line(change: Change) -> Change:
@@ -150,12 +143,11 @@ FOUND = {
 }  # fmt: skip
 
 
-def pose_lines(root: Path, path: Path) -> list[str]:
-    return poses_record.report_lines(poses_record.read_poses_record(root))
-
-
-PARSER = (poses_record.read_poses_record, poses_record.report_lines, schema.items)
-add("record of poses", poses_record.JSON, FOUND, pose_lines, PARSER)
+add(
+    "record of poses", poses_record.JSON, FOUND,
+    lambda root, path: poses_record.report_lines(poses_record.read_poses_record(root)),
+    (poses_record.read_poses_record, poses_record.report_lines, schema.items),
+)  # fmt: skip
 
 
 def event_files(root: Path) -> list[Path]:
@@ -186,18 +178,17 @@ EVENTS = (progress.read_events, progress.EventLog.rewind)
 register(Target("events", event_files, events_of, EVENTS, LINE_CHANGES, nonsense=events_nonsense, lines=0.75))
 
 
-def lock_files(root: Path) -> list[Path]:
-    values = {"process": 7, "host": "machine", "since": "2024-01-01 10:00", "command": "warpgs fit scene"}
-    (root / "lock").write_bytes(b"\n" + json.dumps(values).encode())
-    return [root / "lock"]
+SIGNATURE = {"process": 7, "host": "machine", "since": "2024-01-01 10:00", "command": "warpgs fit scene"}
+LOCK = {"lock": b"\n" + json.dumps(SIGNATURE).encode()}
 
 
-def holder(root: Path, path: Path) -> str | None:
-    data = path.read_bytes() if path.is_file() else b""
-    return locks._signed(data[1:])
-
-
-register(Target("signature of a lock", lock_files, holder, (locks._signed,), (one_line(json_value), text_number)))
+register(
+    Target(
+        "signature of a lock", writing(LOCK),
+        lambda root, path: locks._signed(path.read_bytes()[1:] if path.is_file() else b""),
+        (locks._signed,), (one_line(json_value), text_number),
+    )
+)  # fmt: skip
 
 # ---- runs --------------------------------------------------------------------------------------------------------------
 
@@ -230,11 +221,6 @@ noise-lr = 1e4
 """
 
 
-def preset_file(root: Path) -> list[Path]:
-    (root / "my.toml").write_text(PRESET, "utf-8")
-    return [root / "my.toml"]
-
-
 def settings_of_preset(root: Path, path: Path) -> FitConfig:
     config, origin = presets.preset_settings(path)
     assert config.preset == path.name and str(path) in origin
@@ -242,7 +228,7 @@ def settings_of_preset(root: Path, path: Path) -> FitConfig:
 
 
 PRESET_PARSER = (presets._read, presets._config_of_file, presets._config_of, settings.with_settings, settings._typed)
-register(Target("preset", preset_file, settings_of_preset, PRESET_PARSER, LINE_CHANGES, lines=0.7))
+register(Target("preset", writing({"my.toml": PRESET.encode()}), settings_of_preset, PRESET_PARSER, LINE_CHANGES, lines=0.7))
 
 # ---- images of a run ---------------------------------------------------------------------------------------------------
 
@@ -304,41 +290,27 @@ def maps_of(root: Path, path: Path) -> tuple[np.ndarray, ...] | None:
     return found
 
 
-def map_nonsense(found: tuple[np.ndarray, ...]) -> str:
-    return "" if all(m.shape == (6, 9) and m.min() >= 0 and m.max() <= 1 for m in found) else "a map is none"
-
-
 register(
     Target(
-        "stored maps", map_files, maps_of, (networks.MapCache._read,), (tensors_header, tensors_body), nonsense=map_nonsense
+        "stored maps", map_files, maps_of, (networks.MapCache._read,), (tensors_header, tensors_body),
+        nonsense=lambda maps: "" if all(m.shape == (6, 9) and 0 <= m.min() <= m.max() <= 1 for m in maps) else "a map is none",
     )
 )  # fmt: skip
 
 # ---- networks in onnxruntime -------------------------------------------------------------------------------------------
 
 
-def network_files(root: Path) -> list[Path]:
-    for layout in ("nchw", "nhwc"):
-        (root / f"{layout}.onnx").write_bytes(nw.linear(np.eye(3), np.zeros(3), layout=layout))
-    return sorted(root.glob("*.onnx"))
-
-
+LINEAR = {f"{layout}.onnx": nw.linear(np.eye(3), np.zeros(3), layout=layout) for layout in ("nchw", "nhwc")}
 NETWORK = (networks.Network.__init__, onnx.Model.__init__, onnx.start_session, onnx.read_model)
 register(
     Target(
-        "network", network_files, lambda root, path: networks.Network(path, threads=1), NETWORK,
+        "network", writing(LINEAR), lambda root, path: networks.Network(path, threads=1), NETWORK,
         (onnx_field, onnx_field, onnx_field), lines=0.7, share=0.3,
     )
 )  # fmt: skip
 
 
-def matcher_files(root: Path) -> list[Path]:
-    (root / "matcher.onnx").write_bytes(nw.matcher(np.array([[3.0, 4.0]]), np.ones(1), np.array([[0.6, 0.8]])))
-    return [root / "matcher.onnx"]
-
-
-def matched(root: Path, path: Path) -> matching.Features:
-    return matching.Matcher(path, threads=1).features(np.zeros((8, 8, 3), np.uint8))
+MATCHER = {"matcher.onnx": nw.matcher(np.array([[3.0, 4.0]]), np.ones(1), np.array([[0.6, 0.8]]))}
 
 
 def matcher_nonsense(found: matching.Features) -> str:
@@ -349,7 +321,9 @@ def matcher_nonsense(found: matching.Features) -> str:
 
 register(
     Target(
-        "matcher", matcher_files, matched, (matching.Matcher.__init__, matching.Matcher.features, matching.Matcher._check),
+        "matcher", writing(MATCHER),
+        lambda root, path: matching.Matcher(path, threads=1).features(np.zeros((8, 8, 3), np.uint8)),
+        (matching.Matcher.__init__, matching.Matcher.features, matching.Matcher._check),
         (onnx_field, onnx_field, onnx_field), nonsense=matcher_nonsense, lines=0.6, share=0.2,
     )
 )  # fmt: skip
@@ -370,13 +344,9 @@ def flow_by_network(root: Path, path: Path) -> np.ndarray:
     return flow._network(path)(View("a", camera, IMAGE), View("b", camera, 1 - IMAGE))
 
 
-def flow_nonsense(found: np.ndarray) -> str:
-    return "" if found.shape == (6, 9, 2) and found.dtype == np.float32 else "no flow"
-
-
 register(
     Target(
         "flow network", flow_networks, flow_by_network, (flow._network,), (onnx_field, onnx_field, onnx_field),
-        nonsense=flow_nonsense, share=0.3,
+        nonsense=lambda found: "" if found.shape == (6, 9, 2) and found.dtype == np.float32 else "no flow", share=0.3,
     )
 )  # fmt: skip

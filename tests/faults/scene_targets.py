@@ -43,9 +43,9 @@ def nonsense(scene: Scene) -> str:
     if points is not None:
         if bad := not_finite(points=points.points.astype(np.float32), colors=points.colors):
             return bad
-        if (points.tracks is not None and len(points.tracks) != len(points.points)) or np.abs(points.points).max(
-            initial=0
-        ) > 1e13:
+        if points.tracks is not None and len(points.tracks) != len(points.points):
+            return "tracks are none"
+        if np.abs(points.points).max(initial=0) > 1e13:
             return "points are none"
     n = scene.normalization
     return not_finite(offset=n.offset, scale=np.array(n.scale))

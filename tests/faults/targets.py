@@ -91,6 +91,17 @@ def parser_lines(target: Target) -> dict[str, set[int]]:
     return lines
 
 
+def writing(files: dict[str, bytes]) -> Callable[[Path], list[Path]]:
+    """Return a function that writes files of these names to a folder, and returns their paths."""
+
+    def prepare(root: Path) -> list[Path]:
+        for name, data in files.items():
+            (root / name).write_bytes(data)
+        return [root / name for name in files]
+
+    return prepare
+
+
 def not_finite(**arrays: np.ndarray | None) -> str:
     """Return the names of arrays that hold a NaN or an infinity."""
     return ", ".join(f"{n} not finite" for n, a in arrays.items() if a is not None and not np.isfinite(a).all())

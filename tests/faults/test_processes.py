@@ -11,33 +11,15 @@ from pathlib import Path
 import pytest
 from filelock import lock_descriptor
 
-from tests.faults.tiny_runs import (
-    COMMANDS,
-    NEEDS,
-    OWN,
-    SAME_BYTES,
-    Done,
-    Reference,
-    can_run,
-    check_whole,
-    child,
-    digests,
-    environment,
-    is_temporary,
-    leftovers,
-    succeeded,
-    words_of,
-)
+from tests.faults import tiny_runs
 from warpgs.files import LOCK, OWN_NAMES
 from warpgs.pipeline.run.export import export
 
-# Commands that die before one of their calls: nothing is lost, nothing is half, and the next command goes on from
-# there.
+# Commands that die before one of their calls: nothing is lost, nothing is half, and the next command goes on from there.
 #
-# A process kills itself before a call of a known number, so that no clock decides where it dies. `make test-fault`
-# kills one fit; WARPGS_KILLS=200 spreads that many kills over all of them, those between the opening of a file and its
-# removal first. What each kill came before is a property of its test in pytest's `--junit-xml` (`-o
-# junit_family=xunit1`).
+# A process kills itself before a call of a known number, so that no clock decides where it dies. `make test-fault` kills one;
+# WARPGS_KILLS=200 spreads that many kills over all, those between the opening of a file and its removal first. What each kill
+# came before is a property of its test in pytest's `--junit-xml` (`-o junit_family=xunit1`).
 
 pytestmark = pytest.mark.fault
 KILLS = int(os.environ.get("WARPGS_KILLS", "0"))
@@ -46,7 +28,7 @@ SHARES = {
     "view": 0.026, "compare": 0.1, "worker": 0.1, "farm": 0.02, "poses": 0.092,
 }  # fmt: skip
 """Parts of all kills by command: more for those with many calls, fewer for those that take long."""
-CASES = [(c, i) for c in COMMANDS for i in range(round(SHARES[c] * KILLS))] or [("fit", 0)]
+CASES = [(c, i) for c in tiny_runs.COMMANDS for i in range(round(SHARES[c] * KILLS))] or [("fit", 0)]
 
 
 def chosen(calls: list[tuple[str, str, str]], count: int) -> list[int]:
@@ -65,50 +47,50 @@ def chosen(calls: list[tuple[str, str, str]], count: int) -> list[int]:
     return taken + others[: count - len(taken)]
 
 
-def check_after_kill(reference: Reference, command: str, work: Path, before: dict[str, str]) -> None:
+def check_after_kill(reference: tiny_runs.Reference, command: str, work: Path, before: dict[str, str]) -> None:
     """Look at what a killed command left: all that was there before, as it was or as the command makes it, and all whole."""
-    check_whole(work, ended=False)
-    now = digests(work)
+    tiny_runs.check_whole(work, ended=False)
+    now = tiny_runs.digests(work)
     assert before.keys() <= now.keys(), "lost"
     made = {digest for _, _, digest in reference.calls[command]} | set(reference.after[command].values())
     for path, digest in now.items():
-        if is_temporary(path):
+        if tiny_runs.is_temporary(path):
             continue
-        if not path.startswith(OWN[command]):
+        if not path.startswith(tiny_runs.OWN[command]):
             assert digest == before[path], f"{path} is not of this command"
-        elif path.endswith(SAME_BYTES):
+        elif path.endswith(tiny_runs.SAME_BYTES):
             assert digest == before.get(path) or digest in made, f"{path} is neither the old file nor the new one"
 
 
-def go_on(reference: Reference, command: str, work: Path) -> Done:
+def go_on(reference: tiny_runs.Reference, command: str, work: Path) -> tiny_runs.Done:
     """Run the command that a user would run next."""
     if command == "fit" and (work / "run" / "config.json").is_file():
         command = "resume"
     made = {"prune": work / "run-pruned", "poses": work / "posed"}.get(command)
     if made is not None and made.is_dir():  # it would be refused a second time
         source = made if command == "prune" else work / "run"
-        done = child(work, ["export", str(source), "--to", str(work / "b.ply")])
+        done = tiny_runs.child(work, ["export", str(source), "--to", str(work / "b.ply")])
         (work / "b.ply").unlink()
         return done
-    return child(work, words_of(command, reference.scene, work))
+    return tiny_runs.child(work, tiny_runs.words_of(command, reference.scene, work))
 
 
 @pytest.mark.parametrize("command, index", CASES)
 def test_nothing_is_lost_or_half_after_a_kill(reference, tmp_path, record_property, command, index):
-    if not can_run(command):
-        pytest.skip(f"{NEEDS[command]} is not installed")
+    if not tiny_runs.can_run(command):
+        pytest.skip(f"{tiny_runs.NEEDS[command]} is not installed")
     work = tmp_path / "work"
     reference.before(command, work)
-    before, calls = digests(work), reference.calls[command]
+    before, calls = tiny_runs.digests(work), reference.calls[command]
     numbers = chosen(calls, sum(c == command for c, _ in CASES))
     if index >= len(numbers):
         pytest.skip(f"{command} has {len(calls)} calls, and each has its kill")
     number = numbers[index]
-    done = child(work, words_of(command, reference.scene, work), kill_at=number)
+    done = tiny_runs.child(work, tiny_runs.words_of(command, reference.scene, work), kill_at=number)
     while done.code == 0 and (number := min(number - 1, len(done.calls[command]))):  # a farm notes the state now and then
         shutil.rmtree(work)
         reference.before(command, work)
-        done = child(work, words_of(command, reference.scene, work), kill_at=number)
+        done = tiny_runs.child(work, tiny_runs.words_of(command, reference.scene, work), kill_at=number)
     assert done.code not in range(6), done.said
     (made,) = done.calls.values()
     assert len(made) == number
@@ -118,16 +100,22 @@ def test_nothing_is_lost_or_half_after_a_kill(reference, tmp_path, record_proper
         with path.open("r+b") as file:
             assert lock_descriptor(file.fileno(), blocking=False), f"{path} is still held"
 
-    succeeded(go_on(reference, command, work))
-    assert leftovers(work) == []
-    check_whole(work, ended=True)
-    now, wanted = digests(work), reference.after[command]
-    assert {p for p in now if p.startswith(OWN[command])} == {p for p in wanted if p.startswith(OWN[command])}
+    tiny_runs.succeeded(go_on(reference, command, work))
+    assert tiny_runs.leftovers(work) == []
+    tiny_runs.check_whole(work, ended=True)
+    now, wanted = tiny_runs.digests(work), reference.after[command]
+    assert {p for p in now if p.startswith(tiny_runs.OWN[command])} == {
+        p for p in wanted if p.startswith(tiny_runs.OWN[command])
+    }
     for path, digest in now.items():
-        if not path.startswith(OWN[command]):
+        if not path.startswith(tiny_runs.OWN[command]):
             assert digest == before[path], path
-        elif path.endswith(SAME_BYTES):
+        elif path.endswith(tiny_runs.SAME_BYTES):
             assert digest == wanted[path], path
+
+
+GROWING = ("metrics.jsonl", "log.txt")
+"""Files that grow by lines."""
 
 
 def test_calls_are_seen(reference):
@@ -138,20 +126,25 @@ def test_calls_are_seen(reference):
     for command, calls in reference.calls.items():
         replaced = {path for kind, path, _ in calls if kind == "replace"}
         assert sum(kind == "fsync" for kind, _, _ in calls) >= len(replaced) > 0, command
-
-
-def test_a_checkpoint_comes_after_the_images_of_events_before_it(reference):
-    """A fit that goes on from it does not write them."""
+    # each file that is there at the end was put there as a whole, under a name of ours, those of libraries in C too
+    placed = {path for calls in reference.calls.values() for kind, path, _ in calls if kind == "replace"}
+    assert placed >= {"made", "run-pruned"}  # folders, which take their files along
+    for command, beginnings in tiny_runs.OWN.items():
+        opened = {path for kind, path, _ in reference.calls.get(command, ()) if kind == "open"} - {"tmp"}  # nameless
+        assert not [p for p in opened if not tiny_runs.is_temporary(p) and Path(p).name not in GROWING], command
+        for path in (p for p in reference.after.get(command, ()) if p.startswith(beginnings)):
+            there = {path, *(p.as_posix() for p in Path(path).parents)}
+            assert there & placed or Path(path).name in GROWING, path
+    # a checkpoint comes after the images of events before it: a fit that goes on from it does not write them
     placed = [Path(path).name for kind, path, _ in reference.calls["fit"] if kind == "replace"]
     checkpoints = [i for i, name in enumerate(placed) if name == "checkpoint.safetensors"]
     for event in (n for n in placed if n.startswith("0000")):
         assert placed.index(event) < checkpoints[int(event[:6]) // 10], placed
 
 
-# Two commands that want one folder at the same time: one gets it, the other says whose it is, and nothing is mixed.
-#
-# Both processes are ready before either may go, and who has got the folder waits at its first step until the other has
-# ended: no clock decides anything. `make test-fault` runs one such pair, WARPGS_KILLS=200 twenty.
+# Two commands that want one folder at the same time: one gets it, the other says whose it is, nothing is mixed. Both are ready
+# before either may go, and who has got the folder waits at its first step until the other has ended: no clock decides anything.
+# `make test-fault` runs one such pair, WARPGS_KILLS=200 twenty.
 
 RACES = max(1, int(os.environ.get("WARPGS_KILLS", "0")) // 10)
 PAIRS = (("fit", "fit"), ("resume", "resume"), ("fit", "resume"))
@@ -180,7 +173,7 @@ sys.exit(main(sys.argv[1:]))
 def started(words: list[str]) -> subprocess.Popen:
     return subprocess.Popen(
         [sys.executable, "-P", "-c", GO, *words], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-        env=environment(), text=True, encoding="utf-8",
+        env=tiny_runs.environment(), text=True, encoding="utf-8",
     )  # fmt: skip
 
 
@@ -190,12 +183,12 @@ def go(process: subprocess.Popen) -> None:
 
 
 @pytest.mark.parametrize("one, other, index", RACES_CASES)
-def test_one_of_two_gets_the_folder(reference: Reference, tmp_path, one, other, index):
+def test_one_of_two_gets_the_folder(reference: tiny_runs.Reference, tmp_path, one, other, index):
     work = tmp_path / "work"
     reference.before("fit" if one == other == "fit" else "resume", work)
     # with two seeds, mixed results are visible; a continued run has the seed it was started with
     seeds = ["1", "2"] if one == other == "fit" else ["0", "0"]
-    processes = [started([*words_of(c, reference.scene, work), "--seed", s]) for c, s in zip((one, other), seeds)]
+    processes = [started([*tiny_runs.words_of(c, reference.scene, work), "--seed", s]) for c, s in zip((one, other), seeds)]
     try:
         for p in processes:
             assert "ready\n" in iter(p.stdout.readline, "")
@@ -220,14 +213,14 @@ def test_one_of_two_gets_the_folder(reference: Reference, tmp_path, one, other, 
             p.communicate()
     check_one_run(work, int(seeds[fitting.index(True)]))
     if one != other or one == "resume":
-        assert digests(work)["run/point_cloud.ply"] == reference.after["fit"]["run/point_cloud.ply"]
+        assert tiny_runs.digests(work)["run/point_cloud.ply"] == reference.after["fit"]["run/point_cloud.ply"]
 
 
 def check_one_run(work, seed: int) -> None:
     """Settings, scores, checkpoint, log and PLY are of one run."""
     run = work / "run"
-    assert leftovers(work) == []
-    check_whole(work, ended=True)
+    assert tiny_runs.leftovers(work) == []
+    tiny_runs.check_whole(work, ended=True)
     record, metrics = (json.loads((run / n).read_text("utf-8")) for n in ("config.json", "metrics.json"))
     assert record["config"]["seed"] == metrics["seed"] == seed and record["config_hash"] == metrics["config_hash"]
     export(run, work / "of_checkpoint.ply")

@@ -12,14 +12,11 @@ import pytest
 
 import warpgs
 from tests.faults import bounds
-from tests.faults import fuzz as fuzzer
 from tests.faults.bounds import size_of
 from tests.faults.fuzz import JUDGED, Tally, Worker, fuzz, missed, shallow, shares, table
 from tests.faults.targets import Target, all_targets, parser_lines
 from warpgs.errors import DataError
 from warpgs.pipeline.metrics import lpips
-
-# Readers of foreign files understand them or refuse them with a sentence, whatever was done to the files.
 
 INPUTS = int(os.environ.get("FUZZ", "2000"))
 FEW, ENOUGH = 10_000, 50_000
@@ -48,9 +45,8 @@ def test_many_damaged_files(name, capfd):
     assert not tally.failures
     assert INPUTS < FEW or not shallow(tally)
     if INPUTS >= ENOUGH:
-        assert len(tally.lines) >= all_targets()[name].lines * sum(map(len, parser_lines(all_targets()[name]).values())), (
-            missed(tally)
-        )
+        wanted = all_targets()[name].lines * sum(map(len, parser_lines(all_targets()[name]).values()))
+        assert len(tally.lines) >= wanted, missed(tally)
 
 
 @pytest.mark.parametrize("name", ["png", "model file", "run record"])
@@ -61,38 +57,6 @@ def test_the_same_seed_gives_the_same_inputs(name, tmp_path):
         worker = Worker(all_targets()[name], seed=3, folder=folder)
         written.append([worker.put(i)[1] for i in range(9)])
     assert written[0] == written[1] and len(set(written[0])) > 5
-
-
-class Planted:
-    """A reader with a defect of each kind, by the first byte of its file."""
-
-    @staticmethod
-    def read(folder, path):
-        kind = path.read_bytes()[:1] if path.is_file() else b"-"
-        if kind == b"r":
-            raise KeyError("raw")
-        return kind
-
-
-@pytest.mark.parametrize(
-    "data,kind", [(b"raw", "raw"), (b"nonsense", "nonsense"), (b"unexplained", "nonsense"), (b"fine", None)]
-)
-def test_defects_are_noticed(data, kind, tmp_path):
-    """What the fuzzer calls a defect is one: each kind is planted once."""
-    from tests.faults.targets import Target
-
-    def prepare(folder):
-        (folder / "a").write_bytes(b"fine")
-        return [folder / "a"]
-
-    target = Target(
-        "planted", prepare, Planted.read, (Planted,), nonsense=lambda found: "nonsense" if found == b"n" else "",
-        unexplained=lambda before, after, good, found: "unexplained" if found == b"u" else "",
-    )  # fmt: skip
-    worker = Worker(target, 0, tmp_path)
-    worker.put = lambda index: ((tmp_path / "a").write_bytes(data), (tmp_path / "a", data, True))[1]
-    worker.run(0)
-    assert list(worker.tally.kinds) == ([kind] if kind else [])
 
 
 # Every function of warpgs that opens input is read by the fuzzer, or a reason stands here why it is not.
@@ -246,17 +210,18 @@ def test_the_fuzzer_calls_the_reader(target, tmp_path, monkeypatch):
     assert {(str(PACKAGE / f), n) for f, n in BY_TARGET[target]} <= called
 
 
-# What the fuzzer bounds is bounded: time of the processor, memory beyond the result; and it knows what gets past a
-# check.
+# What the fuzzer calls a defect is one, what it bounds is bounded, and it knows what gets past a check.
 
 LARGE = 100 * 2**20
 
 
 def read(folder, path):
-    """Read a file whose first letter says what to do."""
+    """Read a file whose words say what to do."""
     data = path.read_bytes() if path.is_file() else b""
     if not data.startswith(b"ok"):
         raise DataError(f"{path}: does not begin as these files do; write it again")
+    if data == b"ok raw":
+        raise KeyError("raw")
     if data == b"ok allocate":
         np.ones(LARGE, np.uint8)
     if data == b"ok return":
@@ -266,24 +231,36 @@ def read(folder, path):
     return data
 
 
-def worker(folder, data: bytes) -> Worker:
-    """Return a worker that reads one input, without the limits that only a process of its own can have."""
+def ran(folder, data: bytes, plain: bool = False, measured: bool = True) -> Tally:
+    """Return the outcome of one input, without the limits that only a process of its own can have."""
 
     def prepare(root):
         (root / "a").write_bytes(b"ok")
         return [root / "a"]
 
-    made = Worker(Target("planted", prepare, read, (read,)), 0, folder, measured=True)
-    made.put = lambda index: ((folder / "a").write_bytes(data), (folder / "a", data, False))[1]
-    return made
+    def ends_with(word):
+        return lambda *found: word if isinstance(found[-1], bytes) and found[-1].endswith(word.encode()) else ""
+
+    judges = {word: ends_with(word) for word in ("nonsense", "unexplained")}
+    target = Target("planted", prepare, read, (read,), **judges)
+    made = Worker(target, 0, folder, measured=measured)
+    made.put = lambda index: ((folder / "a").write_bytes(data), (folder / "a", data, plain))[1]
+    made.run(0)
+    return made.tally
 
 
-@pytest.mark.skipif(bounds.sys.platform != "linux", reason="memory is measured on Linux alone")
+@pytest.mark.parametrize("kind", ["raw", "nonsense", "unexplained", None])
+def test_defects_are_noticed(kind, tmp_path):
+    wanted = [{"unexplained": "nonsense"}.get(kind, kind)] if kind else []
+    assert list(ran(tmp_path, f"ok {kind}".encode(), plain=True, measured=False).kinds) == wanted
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="memory is measured on Linux alone")
 @pytest.mark.parametrize("data, kinds", [(b"ok allocate", ["memory"]), (b"ok return", []), (b"ok", [])])
 def test_memory_beyond_the_result_is_noticed(data, kinds, tmp_path):
-    made = worker(tmp_path, data)
-    made.run(0)
-    assert list(made.tally.kinds) == kinds
+    assert list(ran(tmp_path, data).kinds) == kinds
+    array = np.zeros(1000, np.float32)
+    assert 4000 <= size_of({"a": array, "b": (array, b"x" * 100)}) < 5000  # the same array counts once
 
 
 @pytest.mark.skipif(not hasattr(bounds.signal, "setitimer"), reason="Windows has no timers")
@@ -293,33 +270,21 @@ def test_an_endless_loop_is_a_hang(tmp_path, monkeypatch):
     before = [bounds.signal.getsignal(s) for s in (bounds.signal.SIGPROF, bounds.signal.SIGALRM)]
     bounds.catch_timers()
     try:
-        made = worker(tmp_path, b"ok loop")
-        made.run(0)
+        assert list(ran(tmp_path, b"ok loop").kinds) == ["hang"]
     finally:
         for s, handler in zip((bounds.signal.SIGPROF, bounds.signal.SIGALRM), before):
             bounds.signal.signal(s, handler)
-    assert list(made.tally.kinds) == ["hang"]
-    monkeypatch.setattr(fuzzer, "LIMIT", -1)  # slow code that swallows the exception
-    made = worker(tmp_path, b"ok")
-    made.run(0)
-    assert list(made.tally.kinds) == ["hang"]
+    times = iter((0.0, 1.0))  # of slow code that swallows the exception
+    monkeypatch.setattr(bounds, "spent", lambda: next(times))
+    assert list(ran(tmp_path, b"ok").kinds) == ["hang"]
 
 
-def test_the_first_check_is_told_from_later_ones(tmp_path):
+def test_the_first_check_is_told_from_later_ones_and_every_reader_gets_inputs(tmp_path):
     """Too few inputs past it fail."""
     for data, past in ((b"", 0), (b"xx", 0), (b"ok", 1), (b"ok more", 1)):
-        made = worker(tmp_path, data)
-        made.run(0)
-        assert made.tally.past == past and not made.tally.failures
+        tally = ran(tmp_path, data)
+        assert tally.past == past and not tally.failures
     assert shallow(Tally("a", inputs=100, past=9)) and not shallow(Tally("a", inputs=100, past=10))
     assert not shallow(Tally("a", inputs=JUDGED - 1)) and shallow(Tally("a", inputs=JUDGED))
-
-
-def test_sizes_of_results():
-    array = np.zeros(1000, np.float32)
-    assert 4000 <= size_of({"a": array, "b": (array, b"x" * 100)}) < 5000  # the same array counts once
-
-
-def test_every_reader_gets_inputs():
     counts = shares(list(all_targets()), 200_000)
     assert sum(counts.values()) >= 200_000 and min(counts.values()) >= JUDGED

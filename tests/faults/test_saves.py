@@ -15,18 +15,8 @@ import pytest
 import torch
 
 import warpgs
+from tests.faults import tiny_runs
 from tests.faults.calls import Call, numbered
-from tests.faults.tiny_runs import (
-    OWN,
-    SAME_BYTES,
-    STEPS,
-    VIEWS,
-    check_whole,
-    digests,
-    is_temporary,
-    leftovers,
-    words_of,
-)
 from warpgs.app.cli import main
 from warpgs.errors import ResourceError
 from warpgs.export.ply import write_ply
@@ -43,11 +33,8 @@ from warpgs.report.film import write_film
 from warpgs.report.progress import EventLog
 from warpgs.synthetic.demo import split_spec
 
-# A fault at every call of every way of saving: an error of ours, nothing lost, nothing left over, and the next time it
-# works.
-#
-# Every call is numbered once; then each fails in turn, in each of the ways below, and the same is saved again without a
-# fault.
+# A fault at every call of every way of saving: an error of ours, nothing lost, nothing left over, and the next time it works.
+# Every call is numbered once; then each fails in turn, in each of the ways below, and the same is saved again without a fault.
 
 pytestmark = pytest.mark.fault
 MANY = int(os.environ.get("WARPGS_KILLS", "0")) >= 100
@@ -230,8 +217,8 @@ def save_check_after_fault(way: str, call: Call | None, ended: str, work: Path, 
     if ended == "saved":
         assert_saved(work, new, what, left=call is not None and call.kind == "unlink")
         return
-    now, was, wanted = digests(work), digests(old), digests(new)
-    left = [p for p in now if is_temporary(p)]
+    now, was, wanted = tiny_runs.digests(work), tiny_runs.digests(old), tiny_runs.digests(new)
+    left = [p for p in now if tiny_runs.is_temporary(p)]
     # a lock file that is not ours may be another's
     assert not left or (call.kind in ("unlink", "lock") and len(left) == 1), f"{what}: {left}"
     kept = [p for p in now if p not in left]
@@ -241,28 +228,26 @@ def save_check_after_fault(way: str, call: Call | None, ended: str, work: Path, 
         return
     assert was.keys() <= set(kept), f"{what}: lost"
     for path in kept:
-        if path.endswith(SAME_BYTES):
+        if path.endswith(tiny_runs.SAME_BYTES):
             assert now[path] in (was.get(path), wanted.get(path)), f"{what}: {path}"
 
 
 def assert_saved(work: Path, new: Path, what: str = "", left: bool = False) -> None:
     """All is there, and nothing else, but for a temporary file whose removal failed."""
-    now, wanted = digests(work), digests(new)
+    now, wanted = tiny_runs.digests(work), tiny_runs.digests(new)
     if left:
-        now = {p: d for p, d in now.items() if not is_temporary(p)}
+        now = {p: d for p, d in now.items() if not tiny_runs.is_temporary(p)}
     assert now.keys() == wanted.keys(), what
     for path in now:
-        if path.endswith(SAME_BYTES) or path == "metrics.jsonl":
+        if path.endswith(tiny_runs.SAME_BYTES) or path == "metrics.jsonl":
             assert now[path] == wanted[path], f"{what}: {path}"
         elif path == "a.model":  # its header has no order
             found = [table.load(f / path).gaussians().means for f in (work, new)]
             assert torch.equal(*found), what
 
 
-# Real disks that are full, have no room for names, cannot be written, or whose folders go away.
-#
-# They are small file systems in memory, which only root of a Linux machine may mount; elsewhere their tests are
-# skipped. `make test-fault` tries one size of each kind, WARPGS_KILLS=200 all.
+# Real disks that are full, have no room for names, cannot be written, or whose folders go away: small file systems in memory,
+# which only root of a Linux machine may mount. `make test-fault` tries one size of each kind, WARPGS_KILLS=200 all.
 
 KIB = 1024
 
@@ -270,11 +255,6 @@ KIB = 1024
 def sizes(*values: int) -> tuple[int, ...]:
     """Return all values, or the middle one."""
     return values if MANY else values[len(values) // 2 :][:1]
-
-
-def mount(*words: str) -> str:
-    """Call mount; returns what it says if it fails."""
-    return subprocess.run(["mount", *words], capture_output=True, text=True, check=False).stderr
 
 
 @pytest.fixture
@@ -287,8 +267,8 @@ def disk(tmp_path) -> Iterator[Callable[[str], Path]]:
 
     def mounted(options: str) -> Path:
         again = "remount," if os.path.ismount(folder) else ""
-        refused = mount("-t", "tmpfs", "-o", again + options, "tmpfs", str(folder))
-        if refused:
+        words = ["mount", "-t", "tmpfs", "-o", again + options, "tmpfs", str(folder)]
+        if refused := subprocess.run(words, capture_output=True, text=True, check=False).stderr:
             pytest.skip(f"mount: {refused.strip()}")
         return folder
 
@@ -297,47 +277,39 @@ def disk(tmp_path) -> Iterator[Callable[[str], Path]]:
         subprocess.run(["umount", "-l", str(folder)], check=True)
 
 
-def used(folder: Path) -> int:
-    """Bytes taken on the disk of a folder."""
-    return shutil.disk_usage(folder).used
-
-
 def check_refused(work: Path, before: dict[str, str], said: str) -> None:
     """The last words are ours, nothing is lost or half, and nothing is left over."""
     assert "defect" not in said and "Traceback" not in said and REMEDY.search(said), said
-    check_whole(work, ended=False)
-    assert leftovers(work) == [] and before.keys() <= digests(work).keys(), said
+    tiny_runs.check_whole(work, ended=False)
+    assert tiny_runs.leftovers(work) == [] and before.keys() <= tiny_runs.digests(work).keys(), said
 
 
 def check_right(reference, command: str, work: Path, before: dict[str, str]) -> None:
     """The command's results are there."""
-    assert leftovers(work) == []
-    check_whole(work, ended=True)
-    for path, digest in digests(work).items():
-        if not path.startswith(OWN[command]):
+    assert tiny_runs.leftovers(work) == []
+    tiny_runs.check_whole(work, ended=True)
+    for path, digest in tiny_runs.digests(work).items():
+        if not path.startswith(tiny_runs.OWN[command]):
             assert digest == before[path], path
-        elif path.endswith(SAME_BYTES) and path != "run/checkpoint.safetensors":  # it holds notes on images that did not fit
+        elif (
+            path.endswith(tiny_runs.SAME_BYTES) and path != "run/checkpoint.safetensors"
+        ):  # it holds notes on images that did not fit
             assert digest == reference.after[command][path], path
     if command == "fit":
-        check_tensors(reference.folder / "finished" / "run", work / "run")
-
-
-def check_tensors(wanted: Path, found: Path) -> None:
-    """Two checkpoints hold the same numbers."""
-    (a, _), (b, _) = load_checkpoint(wanted), load_checkpoint(found)
-    assert a.keys() == b.keys() and all(torch.equal(a[n], b[n]) for n in a)
+        a, b = (load_checkpoint(folder / "run")[0] for folder in (reference.folder / "finished", work))
+        assert a.keys() == b.keys() and all(torch.equal(a[n], b[n]) for n in a)
 
 
 def check_command(reference, command, work, before, capfd, make_room):
     """A command comes to its end, or is refused with nothing lost and comes to its end once there is room."""
-    code = main(words_of(command, reference.scene, work))
+    code = main(tiny_runs.words_of(command, reference.scene, work))
     said = capfd.readouterr().err
     if code:
         assert code == 4, said
         check_refused(work, before, said)
         make_room()
         again = "resume" if command == "fit" and (work / "run" / "config.json").is_file() else command
-        assert main(words_of(again, reference.scene, work)) == 0
+        assert main(tiny_runs.words_of(again, reference.scene, work)) == 0
     check_right(reference, command, work, before)
 
 
@@ -347,8 +319,8 @@ def test_a_disk_that_fills(reference, disk, capfd, command, room):
     """What was there before stays, and with more room the command comes to its end."""
     work = disk("size=64m") / "work"
     reference.before(command, work)
-    before = digests(work)
-    disk(f"size={max(used(work) + room, 4 * KIB)}")
+    before = tiny_runs.digests(work)
+    disk(f"size={max(shutil.disk_usage(work).used + room, 4 * KIB)}")
     check_command(reference, command, work, before, capfd, lambda: disk("size=64m"))
 
 
@@ -357,7 +329,7 @@ def test_a_disk_that_fills(reference, disk, capfd, command, room):
 def test_a_disk_without_room_for_names(reference, disk, capfd, command, names):
     work = disk("size=64m,nr_inodes=1000") / "work"
     reference.before(command, work)
-    before = digests(work)
+    before = tiny_runs.digests(work)
     there = os.statvfs(work)
     disk(f"nr_inodes={there.f_files - there.f_ffree + names}")
     check_command(reference, command, work, before, capfd, lambda: disk("nr_inodes=1000"))
@@ -367,26 +339,26 @@ def test_a_disk_without_room_for_names(reference, disk, capfd, command, names):
 def test_a_disk_that_cannot_be_written(reference, disk, capfd, command):
     work = disk("size=64m") / "work"
     reference.before(command, work)
-    before = digests(work)
+    before = tiny_runs.digests(work)
     disk("ro")
-    assert main(words_of(command, reference.scene, work)) == 4
+    assert main(tiny_runs.words_of(command, reference.scene, work)) == 4
     check_refused(work, before, capfd.readouterr().err)
-    assert digests(work) == before
+    assert tiny_runs.digests(work) == before
 
 
 @pytest.mark.parametrize("folder", ["in a file", "file", *["mount point"] * MANY])
 def test_places_for_a_run(reference, disk, capfd, folder):
     """A mount point is a folder like any other, and stays one; a file is none."""
     work = disk("size=4k")
-    words = words_of("fit", reference.scene, work)
+    words = tiny_runs.words_of("fit", reference.scene, work)
     if folder == "mount point":
         words = [str(work) if w == str(work / "run") else w for w in words]
         assert main(words) == 4
-        assert leftovers(work) == [] and os.path.ismount(work)
+        assert tiny_runs.leftovers(work) == [] and os.path.ismount(work)
         disk("size=64m")
         again = [*words, "--resume"] if (work / "config.json").is_file() else words
         assert main(again) == 0
-        assert digests(work)["point_cloud.ply"] == reference.after["fit"]["run/point_cloud.ply"]
+        assert tiny_runs.digests(work)["point_cloud.ply"] == reference.after["fit"]["run/point_cloud.ply"]
     else:
         (work / "run").write_text("the user's own")
         if folder == "in a file":
@@ -401,7 +373,7 @@ def test_places_for_a_run(reference, disk, capfd, folder):
 def test_a_run_folder_that_goes_away(reference, tmp_path, what):
     """The fit ends with an error of ours at its next checkpoint, and what stands there now is left alone."""
     out = tmp_path / "run"
-    config = replace(PRESETS["quick"], steps=STEPS, checkpoint_every=10)
+    config = replace(PRESETS["quick"], steps=tiny_runs.STEPS, checkpoint_every=10)
 
     def go_away(report) -> None:
         if report.step == 15:
@@ -411,7 +383,7 @@ def test_a_run_folder_that_goes_away(reference, tmp_path, what):
 
     with pytest.raises(ResourceError, match="cannot be written") as e:
         warpgs.fit(
-            reference.scene, config, split=split_spec(VIEWS), out=out, device="cpu", on_step=go_away, verbose=False
+            reference.scene, config, split=split_spec(tiny_runs.VIEWS), out=out, device="cpu", on_step=go_away, verbose=False
         )  # fmt: skip
     assert REMEDY.search(str(e.value))
     assert out.read_text() == "the user's own" if what == "a file" else not out.exists()

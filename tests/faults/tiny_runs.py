@@ -128,10 +128,7 @@ def server() -> subprocess.Popen:
 
 
 def child(work: Path, *commands: list[str], kill_at: int = 0) -> Done:
-    """Run commands in one process, which kills itself before a call of the last one, where that is not 0.
-
-    Its temporary files lie in a folder of ``work``. What it started has ended, too, when this returns.
-    """
+    """Run commands in one process that kills itself before a call of the last one; its temporary files lie in ``work``."""
     trace, said = (work.with_name(f"{work.name}.{end}") for end in ("calls", "said"))
     tmp = work / "tmp"
     tmp.mkdir(exist_ok=True)

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 
 from tests.faults.mutations import changed_value, flip, number, text_line
-from tests.faults.targets import Target, register
+from tests.faults.targets import Target, register, writing
 from warpgs import ranks
 from warpgs.errors import DataError
 from warpgs.viewer import server
@@ -45,9 +45,7 @@ TOKEN = "a" * 43
 
 
 def frame_files(root: Path) -> list[Path]:
-    for name, message in MESSAGES.items():
-        (root / f"{name}.frame").write_bytes(server.write_frame(message))
-    return sorted(root.glob("*.frame"))
+    return sorted(writing({f"{name}.frame": server.write_frame(message) for name, message in MESSAGES.items()})(root))
 
 
 def frame_value(data: bytes, rng: np.random.Generator) -> bytes:
@@ -89,11 +87,9 @@ TARGETS = (b"/", b"//", b"*", b"http://x/", SECRET, SECRET + b"/../x", b"/?a=b",
 
 
 def request_files(root: Path) -> list[Path]:
-    page, socket, script = (b"/", HEADERS[:1]), (b"/", HEADERS), (b"/assets/a.js", HEADERS[:2])
-    for name, (path, headers) in {"page": page, "socket": socket, "script": script}.items():
-        lines = [b"GET " + SECRET + path + b" HTTP/1.1", *headers, b"", b""]
-        (root / f"{name}.http").write_bytes(b"\r\n".join(lines))
-    return sorted(root.glob("*.http"))
+    asked = {"page": (b"/", HEADERS[:1]), "script": (b"/assets/a.js", HEADERS[:2]), "socket": (b"/", HEADERS)}
+    first = {name: b"GET " + SECRET + path + b" HTTP/1.1" for name, (path, _) in asked.items()}
+    return writing({f"{name}.http": b"\r\n".join([first[name], *asked[name][1], b"", b""]) for name in asked})(root)
 
 
 def request_line(data: bytes, rng: np.random.Generator) -> bytes:

@@ -75,26 +75,17 @@ def pose_numbers(i: int) -> list[float]:
     return [*quaternion(VIEWMATS[i, :3, :3]), *VIEWMATS[i, :3, 3]]
 
 
-MODEL_IDS = {
-    "SIMPLE_PINHOLE": 0,
-    "PINHOLE": 1,
-    "SIMPLE_RADIAL": 2,
-    "RADIAL": 3,
-    "OPENCV": 4,
-    "OPENCV_FISHEYE": 5,
-    "FULL_OPENCV": 6,
-    "FOV": 7,
-    "SIMPLE_RADIAL_FISHEYE": 8,
-    "RADIAL_FISHEYE": 9,
-    "THIN_PRISM_FISHEYE": 10,
-    "RAD_TAN_THIN_PRISM_FISHEYE": 11,
-}
+MODELS = (
+    "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "FOV",
+    "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE", "RAD_TAN_THIN_PRISM_FISHEYE",
+)  # fmt: skip
+"""COLMAP's camera models in the order of their ids."""
 PINHOLE = (FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2)
 
 
 def colmap_bin(model="PINHOLE", parameters=PINHOLE, names=NAMES, size=(WIDTH, HEIGHT)) -> dict[str, bytes]:
     """Return the three binary files; the first image has two observations, so that records differ in length."""
-    cameras = struct.pack("<QiiQQ", 1, 1, MODEL_IDS[model], *size) + struct.pack(f"<{len(parameters)}d", *parameters)
+    cameras = struct.pack("<QiiQQ", 1, 1, MODELS.index(model), *size) + struct.pack(f"<{len(parameters)}d", *parameters)
     images = struct.pack("<Q", len(names))
     for i, name in enumerate(names):
         seen = 2 if i == 0 else 0

@@ -22,21 +22,15 @@ from warpgs.scene import base_coefficients
 # The same cameras and images give the same scene, whatever the format.
 
 
-def landing(scene, i, point):
+def landing(scene, i, point=scenes.POINT):
     """Return the position in the i-th view [px] of a point in file coordinates, by all that the scene holds."""
-    camera, n = scene.views[i].camera, scene.normalization
-    x = camera.viewmat[:3, :3] @ (n.scale * (point - n.offset)) + camera.viewmat[:3, 3]
-    return (camera.K @ (x / x[2]))[:2]
-
-
-def by_index(scene):
-    """Return the positions of the views in the order of their cameras; only Blender's folders change it."""
-    return sorted(range(len(scene.views)), key=lambda j: scene.views[j].name.rpartition("/")[2])
+    n = scene.normalization
+    return project_points(scene.views[i].camera, n.scale * (point - n.offset)[None])[0][0]
 
 
 @pytest.mark.parametrize("kind", scenes.WRITERS)
-def test_every_format_gives_the_same_scene(kind, tmp_path):
-    """A point lands on the same pixel, at every scale; pixels are RGB; the scene is centred and of unit size."""
+def test_every_format_gives_the_same_scene(kind, tmp_path, monkeypatch):
+    """A point lands on the same pixel at every scale; pixels are RGB; the scene is of unit size; a longest side holds."""
     scenes.WRITERS[kind](tmp_path)
     point = scenes.POINT if kind != "dtu" else (np.linalg.inv(scenes.SCALE_MAT) @ [*scenes.POINT, 1])[:3]
     for downscale in (1, 2, 3):
@@ -46,7 +40,10 @@ def test_every_format_gives_the_same_scene(kind, tmp_path):
         np.testing.assert_allclose(centers.mean(0), 0, atol=1e-12)
         assert np.linalg.norm(centers, axis=1).max() == pytest.approx(1 / 1.1)
         assert downscale == 1 or any(f"by {downscale}" in n for n in scene.notes)
-        for i, j in enumerate(by_index(scene)):
+        order = sorted(
+            range(len(scene.views)), key=lambda j: scene.views[j].name.rpartition("/")[2]
+        )  # Blender's folders change it
+        for i, j in enumerate(order):
             view, camera = scene.views[j], scene.views[j].camera
             assert (camera.width, camera.height) == (round(16 / downscale), round(12 / downscale))
             expected = scenes.pixel(i) * [camera.width / 16, camera.height / 12]
@@ -55,13 +52,7 @@ def test_every_format_gives_the_same_scene(kind, tmp_path):
             if downscale == 1:
                 right = (slice(None), slice(scenes.WIDTH // 2, None))  # Blender's left halves are transparent
                 np.testing.assert_allclose(view.image[right], scenes.image(i)[right] / 255, atol=1e-6)
-
-
-@pytest.mark.parametrize("kind", scenes.WRITERS)
-def test_images_over_the_longest_side_are_reduced_and_that_is_said(kind, tmp_path, monkeypatch):
-    """Without a factor the default bound holds, with one or with 0 none does."""
-    monkeypatch.setattr("warpgs.io.images.DEFAULT_MAX_SIDE", 8)
-    scenes.WRITERS[kind](tmp_path)
+    monkeypatch.setattr("warpgs.io.images.DEFAULT_MAX_SIDE", 8)  # without a factor; with one, or with 0, none holds
     reduced, whole = load_scene(tmp_path), load_scene(tmp_path, max_side=0)
     assert {(v.camera.width, v.camera.height) for v in reduced.views} == {(8, 6)} and "at most 8 px a side" in reduced.pixels
     assert any("reduced to 8 px on the longer side" in n for n in reduced.notes)
@@ -81,23 +72,20 @@ def test_colmap_points_colors_and_tracks(kind, tmp_path):
     assert len(scene.points.seen_by({"photo3.png"})) == 1
 
 
-def test_blender_is_put_over_white_and_split_by_folder(tmp_path):
+def test_blender_is_put_over_white_and_dtu_masks_match_by_number(tmp_path):
     scene = load_scene(scenes.write_blender(tmp_path))
     assert scene.background == (1.0, 1.0, 1.0)
     assert [v.name for v in scene.views] == ["test/r_4.png", *(f"train/r_{i}.png" for i in range(3)), "val/r_3.png"]
     assert all(v.mask is None and (v.image[:, :8] == 1).all() for v in scene.views)
     assert all((v.alpha[:, :8] == 0).all() and (v.alpha[:, 8:] == 1).all() for v in scene.views)
     assert "5 images transparent in part, by the alpha channel" in scene.notes
-
-
-def test_dtu_masks_match_by_number_and_can_be_inverted(tmp_path):
-    scenes.write_dtu(tmp_path)
+    dtu = scenes.write_dtu(tmp_path / "dtu")
     mask = np.zeros((12, 16), np.uint8)
     mask[:, 4:] = 255
     for i in range(5):
-        scenes.save(tmp_path / "mask" / f"{i:03d}.png", mask)
-    assert all((v.mask == (mask > 0)).all() for v in load_scene(tmp_path).views)
-    assert all((v.mask == (mask == 0)).all() for v in load_scene(tmp_path, mask_keeps="black").views)
+        scenes.save(dtu / "mask" / f"{i:03d}.png", mask)
+    assert all((v.mask == (mask > 0)).all() for v in load_scene(dtu).views)
+    assert all((v.mask == (mask == 0)).all() for v in load_scene(dtu, mask_keeps="black").views)
 
 
 def test_transforms_per_frame_intrinsics_and_mask_path(tmp_path):
@@ -114,34 +102,23 @@ def test_transforms_per_frame_intrinsics_and_mask_path(tmp_path):
     assert not scene.views[2].mask[:, :8].any() and scene.views[2].mask[:, 8:].all()
 
 
-def test_fingerprint_follows_the_data(tmp_path):
-    first = load_scene(scenes.write_colmap(tmp_path / "a")).fingerprint
-    assert len(first) == 64 and first == load_scene(scenes.write_colmap(tmp_path / "b")).fingerprint
-    image = scenes.image(1)
-    image[0, 0, 0] ^= 1
-    scenes.save(tmp_path / "b" / "images" / "photo1.png", image)
-    assert load_scene(tmp_path / "b").fingerprint != first
-    assert load_scene(tmp_path / "a", downscale=2).fingerprint != first
-
-
-def test_ready_made_small_images_are_taken(tmp_path):
-    scenes.write_colmap(tmp_path)
-    scenes.save_images(tmp_path / "images_2", width=8, height=6)
-    scenes.save(tmp_path / "images_2" / "photo0.png", np.full((6, 8, 3), 7, np.uint8))
-    scene = load_scene(tmp_path, downscale=2)
-    assert (scene.views[0].image == np.float32(7 / 255)).all() and "images taken from images_2" in scene.notes
-    assert scene.views[0].camera.K[0, 0] == 10
-
-
-@pytest.mark.parametrize("other", ["{stem}.jpg", "image{i:03d}.png"])
-def test_small_images_of_other_names_are_matched(other, tmp_path):
+@pytest.mark.parametrize("other", ["{stem}.png", "{stem}.jpg", "image{i:03d}.png"])
+def test_ready_made_small_images_are_taken(other, tmp_path):
+    """Of the same names, or matched by stem or by order."""
     scenes.write_colmap(tmp_path)
     names = [other.format(stem=n[:-4], i=i) for i, n in enumerate(scenes.NAMES)]
     scenes.save_images(tmp_path / "images_2", names, 8, 6)
     scene = load_scene(tmp_path, downscale=2)
-    assert [v.name for v in scene.views] == list(scenes.NAMES) and any("matched" in n for n in scene.notes)
+    assert [v.name for v in scene.views] == list(scenes.NAMES)
+    assert any("matched" in n for n in scene.notes) == (other != "{stem}.png")
+    assert "images taken from images_2" in scene.notes
+    assert scene.views[0].camera.K[0, 0] == 10
+    assert scene.pixels == "images_2 as stored" and load_scene(tmp_path).pixels == "images as stored"
+    assert load_scene(tmp_path, downscale=3).pixels == "images area-resampled by 3"
     blues = [float(v.image[..., 2].mean()) for v in scene.views]
     np.testing.assert_allclose(np.diff(blues), 0.2, atol=0.08)  # JPEG is not exact
+    scenes.save(tmp_path / "images_2" / names[0], np.full((6, 8, 3), 7, np.uint8))
+    assert (load_scene(tmp_path, downscale=2).views[0].image == np.float32(7 / 255)).all()
 
 
 def test_llff_with_only_small_images(tmp_path):
@@ -191,15 +168,20 @@ def test_other_files_of_a_reconstruction(tmp_path):
         scenes.save(tmp_path / "images" / name, scenes.image(0))
     scene = load_scene(tmp_path)
     assert len(scene.views) == 5 and any(n.startswith("1 files in images have no pose") for n in scene.notes)
-
-
-def test_outside_images_need_permission_and_get_harmless_names(tmp_path):
+    # the fingerprint follows the data
+    first = load_scene(scenes.write_colmap(tmp_path / "a")).fingerprint
+    assert len(first) == 64 and first == load_scene(scenes.write_colmap(tmp_path / "b")).fingerprint
+    image = scenes.image(1)
+    image[0, 0, 0] ^= 1
+    scenes.save(tmp_path / "b" / "images" / "photo1.png", image)
+    assert load_scene(tmp_path / "b").fingerprint != first
+    assert load_scene(tmp_path / "a", downscale=2).fingerprint != first
+    # images outside need permission, and get harmless names
     content = scenes.transforms_json()
     content["frames"][0]["file_path"] = "../elsewhere.png"
     root = scenes.write_transforms(tmp_path / "scene", content)
     scenes.save(tmp_path / "elsewhere.png", scenes.image(0))
-    with pytest.raises(DataError, match=r"frame 0: '../elsewhere.png' points outside the scene folder.*--allow-outside"):
-        load_scene(root)
+    refused(root, r"frame 0: '../elsewhere.png' points outside the scene folder.*--allow-outside")
     scene = load_scene(root, allow_outside=True)
     assert any(v.name.startswith("outside/") and v.name.endswith("elsewhere.png") for v in scene.views)
     assert any("1 images are outside" in n for n in scene.notes)
@@ -338,8 +320,9 @@ def test_names_of_frames_are_matched_to_the_only_file_that_fits(kind, tmp_path):
 
 @pytest.mark.parametrize("kind", scenes.WRITERS)
 def test_photographs_are_left_out_by_name_before_they_are_decoded(kind, tmp_path):
-    root = scenes.WRITERS[kind](tmp_path)
-    scene = load_scene(root)
+    root, lines = scenes.WRITERS[kind](tmp_path), []
+    scene = load_scene(root, progress=lambda line: lines.append((threading.get_ident(), line)))
+    assert lines == [(threading.get_ident(), f"reading {root}: image {i + 1}") for i in range(5)]
     name = scene.views[1].name
     bad = next(p for p in root.rglob("*.png") if p.as_posix().endswith(name))
     bad.write_bytes(bad.read_bytes()[:60])
@@ -349,18 +332,8 @@ def test_photographs_are_left_out_by_name_before_they_are_decoded(kind, tmp_path
         gone = {name, scene.views[2].name} if "," in pattern else {name}
         assert [v.name for v in left.views] == [v.name for v in scene.views if v.name not in gone]
         assert any(n.startswith(f"left out by --exclude: {len(gone)} image") and name in n for n in left.notes)
-    refused(
-        root,
-        f"--exclude x{scene.views[0].name}: no view has this name; the nearest names are {scene.views[0].name}",
-        exclude=f"x{scene.views[0].name},{name}",
-    )
-
-
-@pytest.mark.parametrize("kind", scenes.WRITERS)
-def test_progress_comes_in_order_from_the_thread_that_reads(kind, tmp_path):
-    lines = []
-    load_scene(scenes.WRITERS[kind](tmp_path), progress=lambda line: lines.append((threading.get_ident(), line)))
-    assert lines == [(threading.get_ident(), f"reading {tmp_path}: image {i + 1}") for i in range(5)]
+    first = scene.views[0].name
+    refused(root, f"--exclude x{first}: no view has this name; the nearest names are {first}", exclude=f"x{first},{name}")
 
 
 @pytest.mark.parametrize("kind", ["colmap", "colmap text", "transforms"])
@@ -514,7 +487,7 @@ def test_rational_lenses_without_rational_terms_are_undistorted(write, tmp_path)
     assert third.fingerprint != opencv.fingerprint and "5 images undistorted (FULL_OPENCV)" in third.notes
     refused(
         write(tmp_path / "f", model="FULL_OPENCV", parameters=(*scenes.PINHOLE, *[0] * 7, 0.1)),
-        "FULL_OPENCV is not supp.*native",
+        "FULL_OPENCV is not supported.*or fit with --lenses native",
     )
     for model, count in (("OPENCV_FISHEYE", 8), ("FOV", 5), ("THIN_PRISM_FISHEYE", 12), ("RAD_TAN_THIN_PRISM_FISHEYE", 16)):
         refused(
@@ -566,17 +539,14 @@ def lands(scene, model: str, terms: tuple[float, ...]) -> None:
     for i, view in enumerate(scene.views):
         camera = view.camera
         assert camera.model == model and np.array_equal(view.image, (scenes.image(i) / 255).astype(np.float32))
-        point = scenes.POINT
         wanted = scenes.pixel(i)
         if model != "pinhole":
             padded = np.zeros(4 if model == "fisheye" else 8)
             padded[: len(terms)] = terms
             assert np.array_equal(camera.distortion, padded)
-            in_camera = scenes.VIEWMATS[i, :3, :3] @ point + scenes.VIEWMATS[i, :3, 3]
+            in_camera = scenes.VIEWMATS[i, :3, :3] @ scenes.POINT + scenes.VIEWMATS[i, :3, 3]
             wanted = opencv_pixels(model, padded, scenes.K, in_camera[None])[0]
-        n = scene.normalization
-        found, _ = project_points(camera, n.scale * (point - n.offset)[None])
-        np.testing.assert_allclose(found[0], wanted, atol=1e-8)
+        np.testing.assert_allclose(landing(scene, i), wanted, atol=1e-8)
 
 
 @pytest.mark.parametrize("name", COLMAP)
@@ -618,28 +588,22 @@ def lenses_reach(camera) -> np.ndarray:
     return np.isfinite(geometry.from_plane(camera.model, camera.distortion, plane)).all(-1)
 
 
-def test_errors_name_the_way_to_keep_a_lens(tmp_path):
+@pytest.mark.parametrize(
+    "lenses, values, message",
+    [
+        ("undistort", {"camera_model": "OPENCV_FISHEYE"}, "OPENCV_FISHEYE is not supported.*or fit them with --lenses native"),
+        ("undistort", {"is_fisheye": True}, "is_fisheye belongs to a fisheye.*or fit them with --lenses native"),
+        ("native", {"k4": 0.1}, "k4 belongs to a fisheye or rational lens"),
+        ("native", {"is_fisheye": True, "p1": 0.1}, "p1 is not supported for a fisheye"),
+        ("native", {"is_fisheye": True, "fisheye_crop_radius": 9}, "fisheye_crop_radius is not supported for a fisheye"),
+    ],
+)
+def test_errors_name_the_way_to_keep_a_lens(lenses, values, message, tmp_path):
     """Undistorting stays the default; terms that no model here has are refused either way."""
-    scenes.write_colmap(tmp_path / "a", model="OPENCV_FISHEYE", parameters=COLMAP["OPENCV_FISHEYE"][0])
-    with pytest.raises(DataError, match=r"OPENCV_FISHEYE is not supported.*or fit with --lenses native"):
-        load_scene(tmp_path / "a")
-    for values, message in (
-        ({"camera_model": "OPENCV_FISHEYE"}, "OPENCV_FISHEYE is not supported.*or fit them with --lenses native"),
-        ({"is_fisheye": True}, "is_fisheye belongs to a fisheye.*or fit them with --lenses native"),
-    ):
-        scenes.write_transforms(tmp_path / "b", scenes.transforms_json(fl_x=F, **values))
-        with pytest.raises(DataError, match=message):
-            load_scene(tmp_path / "b")
-    for values, message in (
-        ({"k4": 0.1}, "k4 belongs to a fisheye or rational lens"),
-        ({"is_fisheye": True, "p1": 0.1}, "p1 is not supported for a fisheye"),
-        ({"is_fisheye": True, "fisheye_crop_radius": 9}, "fisheye_crop_radius is not supported for a fisheye"),
-    ):
-        scenes.write_transforms(tmp_path / "b", scenes.transforms_json(fl_x=F, **values))
-        with pytest.raises(DataError, match=message):
-            load_scene(tmp_path / "b", lenses="native")
+    scenes.write_transforms(tmp_path, scenes.transforms_json(fl_x=F, **values))
+    refused(tmp_path, message, **({} if lenses == "undistort" else {"lenses": lenses}))
     with pytest.raises(UsageError, match="--lenses must be undistort or native, not 'both'"):
-        load_scene(tmp_path / "b", lenses="both")
+        load_scene(tmp_path, lenses="both")
 
 
 # Objects on black: what around them is empty, and scenes that are left alone.
@@ -662,7 +626,7 @@ def write(root, images):
 
 
 def test_dark_pixels_around_objects_and_in_holes_are_transparent(tmp_path):
-    """A speck stays opaque; the region of the score is that of the same images without opacity."""
+    """A speck stays opaque; scores count the same region; one bright image, alpha channel or mask leaves all as they are."""
     write(tmp_path, [ring(i) for i in range(5)])
     scene, plain = load_scene(tmp_path), load_scene(tmp_path, black_is_empty=False)
     alpha = np.zeros((36, 48), np.float32)
@@ -677,15 +641,11 @@ def test_dark_pixels_around_objects_and_in_holes_are_transparent(tmp_path):
     note = "every image shows an object on black: the dark pixels around the object and in its holes (74.8% of all pixels)"
     assert any(n.startswith(note) and "--no-black-is-empty" in n for n in scene.notes)
     assert not any("object on black" in n for n in plain.notes) and scene.fingerprint != plain.fingerprint
-
-
-def test_one_view_that_differs_leaves_all_as_they_are(tmp_path):
-    """By a bright image, an alpha channel, or a mask."""
-    alpha = np.full((36, 48, 1), 255, np.uint8)
-    alpha[0] = 9
+    channel = np.full((36, 48, 1), 255, np.uint8)
+    channel[0] = 9
     for name, image in (
         (scenes.NAMES[4], np.full((36, 48, 3), 90, np.uint8)),
-        (scenes.NAMES[4], np.concatenate([ring(4), alpha], axis=2)),
+        (scenes.NAMES[4], np.concatenate([ring(4), channel], axis=2)),
         ("masks/photo4.png", np.full((36, 48), 255, np.uint8)),
     ):
         write(tmp_path, [ring(i) for i in range(5)])
@@ -703,12 +663,8 @@ def viewer_path(**changes) -> dict:
     frames = [
         {"camera_to_world": np.ravel(scenes.opengl(i)).tolist(), "fov": fov, "aspect": 4 / 3} for i in range(scenes.VIEWS)
     ]
-    return {
-        "render_width": scenes.WIDTH,
-        "render_height": float(scenes.HEIGHT),
-        "keyframes": [],
-        "camera_path": frames,
-    } | changes
+    sizes = {"render_width": scenes.WIDTH, "render_height": float(scenes.HEIGHT)}
+    return sizes | {"keyframes": [], "camera_path": frames} | changes
 
 
 def test_cameras_of_a_path_of_nerfstudio(tmp_path):

@@ -96,13 +96,7 @@ def test_cameras(file, names, tmp_path):
     grows(make)
 
 
-def test_cameras_keep_all_names_unique(tmp_path):
-    inria(tmp_path / "cameras.json", ["a", "a-2", "a", "a", "a-2", "b"])
-    found, _ = camera_files.read_cameras(tmp_path / "cameras.json")
-    assert list(found) == ["a", "a-2", "a-3", "a-4", "a-2-2", "b"]
-
-
-def test_points_of_colmap_and_parameters_of_middlebury(tmp_path):
+def test_points_parameters_jobs_events_photographs_and_views(tmp_path):
     def points(n):
         path = tmp_path / f"{n}.txt"
         path.write_text("".join(f"{i} 0 0 1 9 9 9 0.1 1 0 2 0\n" for i in range(n)))
@@ -113,8 +107,32 @@ def test_points_of_colmap_and_parameters_of_middlebury(tmp_path):
         path.write_text(f"{n}\n" + "".join(f"{i}.png {'1 ' * 21}\n" for i in range(n)))
         return lambda: others.read_camera_rows(path)
 
-    grows(points)
-    grows(parameters)
+    def jobs(n):
+        path = tmp_path / f"{n}.jsonl"
+        path.write_text("".join(json.dumps({"scene": f"s{i}", "steps": 5}) + "\n" for i in range(n)))
+        return lambda: list_jobs(str(path))
+
+    def events(n):
+        path = tmp_path / f"{n}.events"
+        path.write_text("".join(json.dumps({"step": i, "loss": 0.5}) + "\n" for i in range(n)))
+        return lambda: read_events(path)
+
+    photographs = [Photograph(f"{i}.png", None, 40, 30, 1, f"phone {i}", None, "0") for i in range(LARGE)]
+    assert cameras_of(photographs, camera_groups(photographs)) == photographs
+    grows(lambda n: lambda: _notes(photographs[:n]))
+
+    def lookups(n):
+        views = scene(n)
+        split = split_views(views, "every:2")
+        return lambda: (coincident_views(views, split), [views.view(v.name) for v in views.views], image_names(split.train))
+
+    for make in (points, parameters, jobs, events, lookups):
+        grows(make)
+    with pytest.raises(KeyError):
+        scene(3).view("none")
+    inria(tmp_path / "cameras.json", ["a", "a-2", "a", "a", "a-2", "b"])
+    found, _ = camera_files.read_cameras(tmp_path / "cameras.json")
+    assert list(found) == ["a", "a-2", "a-3", "a-4", "a-2-2", "b"]
 
 
 def scene(n):
@@ -149,38 +167,6 @@ def test_names_are_found_by_their_ends(wanted, found):
             find(wanted)
     else:
         assert find(wanted) == found
-
-
-def test_views_of_a_scene():
-    def make(n):
-        views = scene(n)
-        split = split_views(views, "every:2")
-        return lambda: (coincident_views(views, split), [views.view(v.name) for v in views.views], image_names(split.train))
-
-    grows(make)
-    with pytest.raises(KeyError):
-        scene(3).view("none")
-
-
-def test_lists_of_jobs_and_events(tmp_path):
-    def jobs(n):
-        path = tmp_path / f"{n}.jsonl"
-        path.write_text("".join(json.dumps({"scene": f"s{i}", "steps": 5}) + "\n" for i in range(n)))
-        return lambda: list_jobs(str(path))
-
-    def events(n):
-        path = tmp_path / f"{n}.events"
-        path.write_text("".join(json.dumps({"step": i, "loss": 0.5}) + "\n" for i in range(n)))
-        return lambda: read_events(path)
-
-    grows(jobs)
-    grows(events)
-
-
-def test_photographs_of_as_many_cameras():
-    photographs = [Photograph(f"{i}.png", None, 40, 30, 1, f"phone {i}", None, "0") for i in range(LARGE)]
-    assert cameras_of(photographs, camera_groups(photographs)) == photographs
-    grows(lambda n: lambda: _notes(photographs[:n]))
 
 
 def test_what_to_photograph_next():

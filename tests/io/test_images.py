@@ -24,6 +24,10 @@ from warpgs.poses.photographs import prepare, write_copy
 # Decoding, orientation, masks, undistortion and resizing, each with the camera in step.
 
 
+MASK = np.tile(np.array([0, *[255] * 3], np.uint8).repeat(4), (12, 1))
+"""A mask of the test image whose left quarter is black."""
+
+
 def lens(width, height, focal=20.0, distortion=(), model="PINHOLE"):
     K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
     return Lens(K, width, height, distortion, model)
@@ -56,19 +60,16 @@ def test_every_kind_of_png_is_decoded(mode, tmp_path):
 
 @pytest.mark.parametrize("kind", ["JPEG", "PNG", "BMP", "TIFF", "WEBP", "AVIF"])
 def test_truncated_images_are_named(kind, tmp_path):
+    """As are missing ones and those that are not finite."""
     path, data = tmp_path / f"a.{kind.lower()}", encoded(kind)
     for kept in (0.0, 0.02, 0.5, 0.9, 0.999):
         path.write_bytes(data[: int(kept * len(data))])
         with pytest.raises(DataError, match=rf"{path.name}: the image cannot be decoded: \w.*Restore"):
             decode(path)
-
-
-def test_missing_and_non_finite_images(tmp_path):
-    with pytest.raises(DataError, match=r"gone.png: the image file is missing; restore"):
-        decode(tmp_path / "gone.png")
     Image.fromarray(np.full((8, 8), np.nan, np.float32)).save(tmp_path / "nan.tiff")
-    with pytest.raises(DataError, match=r"nan.tiff: some pixels are not finite"):
-        decode(tmp_path / "nan.tiff")
+    for name, words in (("gone.png", "the image file is missing; restore"), ("nan.tiff", "some pixels are not finite")):
+        with pytest.raises(DataError, match=f"{name}: {words}"):
+            decode(tmp_path / name)
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))
@@ -94,13 +95,27 @@ def test_exif_turns_only_what_fits_turned(orientation, tmp_path):
     assert "rotated by the EXIF orientation" in loaded.done
 
 
-def test_size_within_a_pixel_is_rescaled_and_others_are_refused(tmp_path):
+def test_sizes_within_a_pixel_lenses_that_fold_back_and_alpha_of_a_lens(tmp_path):
     path = tmp_path / "a.png"
     scenes.save(path, scenes.image(0, 33, 25))  # a half of 65 x 49, rounded up
     K = load_image(path, lens(65, 49, 40.0), ReadOptions()).K
     np.testing.assert_allclose(K[[0, 1, 0, 1], [0, 1, 2, 2]], [40 * 33 / 65, 40 * 25 / 49, 16.5, 12.5])
     with pytest.raises(DataError, match=r"a.png: the image is 33 x 25 px, its camera 60 x 60: the aspects differ"):
         load_image(path, lens(60, 60), ReadOptions())
+    # a lens that folds back is masked there
+    scenes.save(tmp_path / "a.png", scenes.image(0, 64, 48))
+    loaded = load_image(tmp_path / "a.png", lens(64, 48, 30.0, (-0.5, 0.0, 0.0, 0.0), "RADIAL"), ReadOptions())
+    x, y = grid(64, 48)
+    radius2 = ((x - 32) / 30) ** 2 + ((y - 24) / 30) ** 2
+    assert not loaded.mask[radius2 > 1 / 1.5].any() and loaded.mask[radius2 < 0.6].all()
+    # alpha is freed of distortion with its image: white where opaque, so that over black every channel is the alpha
+    image = np.full((48, 64, 4), 255, np.uint8)
+    image[..., 3] = np.tile((np.arange(64) % 8 < 4) * 255, (48, 1))
+    scenes.save(tmp_path / "a.png", image)
+    loaded = load_image(tmp_path / "a.png", lens(64, 48, 60.0, (0.3, 0.0, 0.0, 0.0)), ReadOptions(downscale=2))
+    np.testing.assert_allclose(loaded.image, loaded.alpha[..., None].repeat(3, 2), atol=1e-6)
+    straight = load_image(tmp_path / "a.png", lens(64, 48, 60.0), ReadOptions(downscale=2))
+    assert np.abs(straight.alpha - loaded.alpha)[0].max() > 0.5 and loaded.mask is not None
 
 
 @pytest.mark.parametrize("factor", [2, 3, 4])
@@ -169,55 +184,34 @@ def test_undistortion_agrees_with_the_analytic_image(terms, tmp_path):
         assert not mask[0, 0] and mask[24, 32]
 
 
-def test_a_lens_that_folds_back_is_masked_there(tmp_path):
-    scenes.save(tmp_path / "a.png", scenes.image(0, 64, 48))
-    loaded = load_image(tmp_path / "a.png", lens(64, 48, 30.0, (-0.5, 0.0, 0.0, 0.0), "RADIAL"), ReadOptions())
-    x, y = grid(64, 48)
-    radius2 = ((x - 32) / 30) ** 2 + ((y - 24) / 30) ** 2
-    assert not loaded.mask[radius2 > 1 / 1.5].any() and loaded.mask[radius2 < 0.6].all()
-
-
 @pytest.mark.parametrize("name", ["photo0.png", "photo0.png.png"])
 @pytest.mark.parametrize("keeps", ["white", "black"])
 def test_masks_folder(name, keeps, tmp_path):
     scenes.write_colmap(tmp_path)
-    mask = np.zeros((12, 16), np.uint8)
-    mask[:, 4:] = 255
-    scenes.save(tmp_path / "masks" / name, mask)
+    scenes.save(tmp_path / "masks" / name, MASK)
     scene = load_scene(tmp_path, mask_keeps=keeps)
-    assert (scene.views[0].mask == ((mask > 0) == (keeps == "white"))).all() and scene.views[1].mask is None
+    assert (scene.views[0].mask == ((MASK > 0) == (keeps == "white"))).all() and scene.views[1].mask is None
     assert "1 image masked by a mask file" in scene.notes
     kept = f"masks keep {'75.0%' if keeps == 'white' else '25.0%'} of the pixels, the {keeps} ones (--mask-keeps {keeps})"
     assert f"{kept}; the others are ignored (--masks ignore)" in scene.notes
     half = load_scene(tmp_path, downscale=2, mask_keeps=keeps).views[0].mask
-    assert (half == ((mask[::2, ::2] > 0) == (keeps == "white"))).all()
+    assert (half == ((MASK[::2, ::2] > 0) == (keeps == "white"))).all()
 
 
-NAMES_OF_MASKS = [
-    "photo0.jpg",
-    "PHOTO0.PNG",
-    "photo0_mask.png",
-    "photo0.mask.png",
-    "photo0.png.mask.png",
-    "photo0-mask.tif",
-    "photo0.JPG_mask.png",
-]
+ENDS = [".jpg", "_mask.png", ".mask.png", ".png.mask.png", "-mask.tif", ".JPG_mask.png"]
 
 
-@pytest.mark.parametrize("name", NAMES_OF_MASKS)
+@pytest.mark.parametrize("name", ["PHOTO0.PNG", *(f"photo0{end}" for end in ENDS)])
 def test_masks_by_the_names_of_other_programs(name, tmp_path):
     """An exact name comes first, two files for one image are none, and an image may itself be called a mask."""
     scenes.write_colmap(tmp_path, names=("photo0.png", "face_mask.png", "c.png", "d.png", "e.png"))
-    mask = np.zeros((12, 16), np.uint8)
-    mask[:, 4:] = 255
-    scenes.save(tmp_path / "masks" / name, mask)
+    scenes.save(tmp_path / "masks" / name, MASK)
     views = {v.name: v for v in load_scene(tmp_path).views}
     kept = views["photo0.png"].mask
-    assert kept is not None and np.abs(kept.astype(int) - (mask > 0)).sum() <= 12 and views["face_mask.png"].mask is None
-    scenes.save(tmp_path / "masks" / "face_mask.PNG", mask)
-    scenes.save(tmp_path / "masks" / "c.tif", mask)
-    scenes.save(tmp_path / "masks" / "c_mask.png", mask)
-    scenes.save(tmp_path / "masks" / "photo0.png", np.full_like(mask, 255))
+    assert kept is not None and np.abs(kept.astype(int) - (MASK > 0)).sum() <= 12 and views["face_mask.png"].mask is None
+    for other in ("face_mask.PNG", "c.tif", "c_mask.png"):
+        scenes.save(tmp_path / "masks" / other, MASK)
+    scenes.save(tmp_path / "masks" / "photo0.png", np.full_like(MASK, 255))
     scene = load_scene(tmp_path)
     assert [v.name for v in scene.views if v.mask is not None and not v.mask.all()] == ["face_mask.png"]
     assert [n for n in scene.notes if "masks" in n and "match" in n] == [
@@ -248,6 +242,11 @@ def test_a_mask_with_the_suffix_of_its_photograph_is_of_no_other(tmp_path):
     kept = {v.name: v.mask is not None and not v.mask.all() for v in scene.views}
     assert kept == {"a.jpg": True, "a.png": False, "b.JPG": True, "b.png": False, "c.png": True}
     assert not any("match no image" in n for n in scene.notes)
+    scenes.write_middlebury(tmp_path / "scene")  # whose masks lie in its own folder
+    scenes.save(tmp_path / "scene" / "masks" / "photo1.png", MASK)
+    scenes.save(tmp_path / "masks" / "photo0.png", MASK)  # of the scene beside it
+    views = load_scene(tmp_path / "scene").views
+    assert views[0].mask is None and not views[1].mask[:, 0].any()
 
 
 @pytest.mark.parametrize(
@@ -269,16 +268,6 @@ def test_masked_pixels_do_not_run_into_others(focal, distortion, downscale, alph
     assert (black.alpha is not None) is alpha and (
         not alpha or np.array_equal(black.alpha[black.mask], noise.alpha[black.mask])
     )
-
-
-def test_masks_of_middlebury_lie_in_the_scene_folder(tmp_path):
-    scenes.write_middlebury(tmp_path / "scene")
-    mask = np.full((12, 16), 255, np.uint8)
-    mask[0] = 0
-    scenes.save(tmp_path / "scene" / "masks" / "photo1.png", mask)
-    scenes.save(tmp_path / "masks" / "photo0.png", mask)  # of another scene beside it
-    views = load_scene(tmp_path / "scene").views
-    assert views[0].mask is None and not views[1].mask[0].any()
 
 
 def rgba(i, alpha):
@@ -319,17 +308,6 @@ def test_transparent_colours_do_not_run_into_others(background, tmp_path):
     np.testing.assert_allclose(loaded.image, expected, atol=1e-6)
 
 
-def test_alpha_is_freed_of_distortion_with_its_image(tmp_path):
-    """White where opaque, so that over black every channel is the alpha."""
-    image = np.full((48, 64, 4), 255, np.uint8)
-    image[..., 3] = np.tile((np.arange(64) % 8 < 4) * 255, (48, 1))
-    scenes.save(tmp_path / "a.png", image)
-    loaded = load_image(tmp_path / "a.png", lens(64, 48, 60.0, (0.3, 0.0, 0.0, 0.0)), ReadOptions(downscale=2))
-    np.testing.assert_allclose(loaded.image, loaded.alpha[..., None].repeat(3, 2), atol=1e-6)
-    straight = load_image(tmp_path / "a.png", lens(64, 48, 60.0), ReadOptions(downscale=2))
-    assert np.abs(straight.alpha - loaded.alpha)[0].max() > 0.5 and loaded.mask is not None
-
-
 def test_masks_cut_out(tmp_path):
     """Gray is transparent in part; an alpha channel counts too; masks that keep nothing or everything are named."""
     scenes.write_colmap(tmp_path)
@@ -354,38 +332,29 @@ def test_masks_cut_out(tmp_path):
     np.testing.assert_allclose(half, alpha.reshape(6, 2, 8, 2).mean((1, 3)), atol=1e-6)
 
 
-def test_cutting_out_without_masks_is_said_and_words_are_checked(tmp_path):
-    scenes.write_colmap(tmp_path)
-    assert "--masks cutout changes nothing: no image has a mask file" in load_scene(tmp_path, masks="cutout").notes
-    with pytest.raises(UsageError, match="--masks must be ignore or cutout, not 'cut'"):
-        load_scene(tmp_path, masks="cut")
-    with pytest.raises(UsageError, match="--mask-keeps must be white or black, not 'gray'"):
-        load_scene(tmp_path, mask_keeps="gray")
-
-
 def test_masks_that_cannot_be_used(tmp_path):
+    """Nor can words that are none; cutting out without masks gives a note."""
     scenes.write_colmap(tmp_path)
     path = tmp_path / "masks" / "photo0.png"
     for i in range(scenes.VIEWS):
         scenes.save(path.with_name(f"photo{i}.png"), np.zeros((12, 16), np.uint8))
-    with pytest.raises(DataError, match=r"has 0 usable views \(.*masks that keep no pixel.*--mask-keeps.*photo0.png"):
-        load_scene(tmp_path)
+    scenes.refused(tmp_path, r"has 0 usable views \(.*masks that keep no pixel.*--mask-keeps.*photo0.png")
     for i in range(1, scenes.VIEWS):
         path.with_name(f"photo{i}.png").unlink()
     scenes.save(path, np.full((12, 30), 255, np.uint8))
-    with pytest.raises(DataError, match=r"photo0.png: its mask is 30 x 12 px, the image 16 x 12"):
-        load_scene(tmp_path)
+    scenes.refused(tmp_path, r"photo0.png: its mask is 30 x 12 px, the image 16 x 12")
     path.write_bytes(b"no image")
-    with pytest.raises(DataError, match=r"masks/photo0.png: the image cannot be decoded"):
-        load_scene(tmp_path)
+    scenes.refused(tmp_path, r"masks/photo0.png: the image cannot be decoded")
     scenes.save(path, np.full((24, 32), 255, np.uint8))  # twice the size is the same mask
     assert load_scene(tmp_path).views[0].mask.all()
-
-
-def test_downscale_must_be_a_positive_whole_number(tmp_path):
-    for downscale in (0, -1, 2.0, True, "2"):
-        with pytest.raises(UsageError, match="--downscale must be a whole number of at least 1"):
-            load_scene(tmp_path, downscale=downscale)
+    path.unlink()
+    assert "--masks cutout changes nothing: no image has a mask file" in load_scene(tmp_path, masks="cutout").notes
+    wrong = [({"masks": "cut"}, "--masks must be ignore or cutout, not 'cut'")]
+    wrong += [({"mask_keeps": "gray"}, "--mask-keeps must be white or black, not 'gray'")]
+    wrong += [({"downscale": d}, "--downscale must be a whole number of at least 1") for d in (0, -1, 2.0, True, "2")]
+    for options, words in wrong:
+        with pytest.raises(UsageError, match=words):
+            load_scene(tmp_path, **options)
 
 
 # Images are taken whole or not at all: damage that a checksum, a decoder or the sizes in the file show is refused.
@@ -432,9 +401,6 @@ def tiff(width: int, height: int, strips: list[tuple[int, int]], pixels: bytes, 
     return b"II*\0" + struct.pack("<I", 8) + directory + struct.pack(f"<{2 * count}I", *offsets, *lengths) + pixels
 
 
-# ---- undamaged files keep their pixels -------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     "mode,options",
     [
@@ -451,22 +417,12 @@ def test_pixels_of_a_jpeg_are_those_of_opencv(mode, options, tmp_path):
     assert (decode(path)[0] == expected).all()
 
 
-def test_an_interlaced_png_is_read(tmp_path):
-    gray, path = np.arange(11 * 9, dtype=np.uint8).reshape(9, 11), tmp_path / "a.png"
-    path.write_bytes(interlaced(gray))
-    assert (decode(path)[0][..., 0] == gray / np.float32(255)).all()
-    refused(tmp_path, interlaced(gray, -1), "decoded")
-
-
 @pytest.mark.parametrize("order", ["<", ">"])
 def test_big_tiff_and_tiles_are_read(order, tmp_path):
     gray, path = 99 * np.arange(32 * 16).reshape(16, 32), tmp_path / "a.tif"
     path.write_bytes(big_tiled(gray, order))
     assert (decode(path)[0][..., 0] == gray.astype(np.float32) / 65535).all()
     refused(tmp_path, path.read_bytes()[:-1], "lie outside of the file")
-
-
-# ---- JPEG ------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("options", [{}, {"progressive": True}, {"restart_marker_blocks": 8}])
@@ -483,18 +439,7 @@ def test_a_jpeg_whose_coded_data_is_zeroed_or_ends_early_or_is_of_another_size(o
         refused(tmp_path, data[:at] + struct.pack(">HH", height, width) + data[at + 4 :], "decoded")
 
 
-def test_a_progressive_jpeg_that_lacks_scans(tmp_path):
-    data = encoded("JPEG", progressive=True)
-    scans = [i for i in range(len(data)) if data[i : i + 2] == b"\xff\xda"]
-    assert len(scans) > 3
-    for at in scans[1:]:
-        refused(tmp_path, data[:at] + b"\xff\xd9", "some of its scans are missing")
-
-
-# ---- PNG, BMP, WebP --------------------------------------------------------------------------------------------------
-
-
-def test_a_png_that_lacks_a_part_or_has_a_wrong_bit_or_checksum(tmp_path):
+def test_files_that_lack_a_part_or_have_a_wrong_bit_or_checksum(tmp_path):
     rows = bytes(13) * 8
     good = gray_png(12, 8, rows)
     (tmp_path / "a.png").write_bytes(good)
@@ -511,9 +456,7 @@ def test_a_png_that_lacks_a_part_or_has_a_wrong_bit_or_checksum(tmp_path):
         data = bytearray(encoded("PNG"))
         data[int(at * len(data))] ^= 4
         refused(tmp_path, bytes(data), "decoded")
-
-
-def test_a_bmp_or_webp_that_is_shorter_than_its_header_says(tmp_path):
+    # a BMP or WebP that is shorter than its header says
     refused(tmp_path, encoded("BMP")[:-9], "truncated")
     refused(tmp_path, encoded("WEBP")[:-9], "it ends early")
     refused(tmp_path, b"RIFF" + struct.pack("<I", 4) + b"WEBP" + bytes(8), "its header is broken")
@@ -522,20 +465,19 @@ def test_a_bmp_or_webp_that_is_shorter_than_its_header_says(tmp_path):
     refused(tmp_path, bytes(data), "truncated")
     data[22:26], data[30:34] = struct.pack("<i", 64), struct.pack("<I", 1)
     refused(tmp_path, bytes(data), "compressed, so damage would not be detected")
-
-
-# ---- TIFF ------------------------------------------------------------------------------------------------------------
-
-
-def test_a_compressed_tiff_with_a_zeroed_middle(tmp_path):
+    # a progressive JPEG that lacks scans
+    data = encoded("JPEG", progressive=True)
+    scans = [i for i in range(len(data)) if data[i : i + 2] == b"\xff\xda"]
+    assert len(scans) > 3
+    for at in scans[1:]:
+        refused(tmp_path, data[:at] + b"\xff\xd9", "some of its scans are missing")
+    # a compressed TIFF with a zeroed middle
     for compression in ("tiff_lzw", "tiff_adobe_deflate", "tiff_deflate"):
         refused(tmp_path, zeroed(encoded("TIFF", compression=compression), 0.4, 0.6), "damaged")
     ok, data = cv2.imencode(".tif", np.asarray(photo()).astype(np.uint16) * 257, [cv2.IMWRITE_TIFF_COMPRESSION, 5])
     assert ok
     refused(tmp_path, zeroed(data.tobytes(), 0.4, 0.6), "decoded")
-
-
-def test_strips_that_hold_too_little(tmp_path):
+    # strips that hold too little
     pixels = bytes(range(64)) * 2
     (tmp_path / "a.tif").write_bytes(tiff(16, 8, [(0, 64), (64, 64)], pixels, rows=4))
     assert decode(tmp_path / "a.tif")[0].shape == (8, 16, 3)
@@ -547,9 +489,6 @@ def test_strips_that_hold_too_little(tmp_path):
     assert decode(tmp_path / "a.tif")[0].shape == (8, 16, 3)
     refused(tmp_path, tiff(16, 9, [(0, len(packed))], packed, 8), "decoded")
     refused(tmp_path, tiff(16, 8, [(0, len(packed))], packed[:-1] + b"\x77", 8), "incorrect data check")
-
-
-# ---- files that announce much ----------------------------------------------------------------------------------------
 
 
 def announcing(kind: str, width: int, height: int) -> bytes:
@@ -572,35 +511,31 @@ def announcing(kind: str, width: int, height: int) -> bytes:
 @pytest.mark.parametrize("kind", ["JPEG", "PNG", "TIFF", "BMP", "WEBP"])
 def test_the_header_alone_decides_what_is_too_large(kind, tmp_path):
     width, height = (30000, 30000) if kind != "WEBP" else (16000, 16000)
-    refused(
-        tmp_path,
-        announcing(kind, width, height),
-        rf"is {width} x {height} px, more than the limit of 100,000,000 .*--max-pixels {width * height} .decoding",
-    )
+    limit = rf"more than the limit of 100,000,000 .*--max-pixels {width * height} .decoding"
+    refused(tmp_path, announcing(kind, width, height), f"is {width} x {height} px, {limit}")
     refused(tmp_path, announcing(kind, 0, 64), "decoded")
 
 
-def test_the_limit_holds_for_images_masks_and_score_masks(tmp_path):
+def test_the_limit_holds_for_images_masks_and_score_masks_and_threads_leave_warnings(tmp_path):
     scenes.write_colmap(tmp_path)
     size = scenes.WIDTH * scenes.HEIGHT
     assert len(load_scene(tmp_path, max_pixels=size).views) == scenes.VIEWS
-    with pytest.raises(DataError, match=r"photo0.png: the image is 16 x 12 px, more than the limit of 191 pixels"):
-        load_scene(tmp_path, max_pixels=size - 1)
+    scenes.refused(tmp_path, "photo0.png: the image is 16 x 12 px, more than the limit of 191 pixels", max_pixels=size - 1)
     for folder, names in (("idrmasks", [f"{i}.png" for i in range(scenes.VIEWS)]), ("masks", ["photo0.png"])):
         for name in names:
             scenes.save(tmp_path / folder / name, np.full((24, 32), 255, np.uint8))
         assert len(load_scene(tmp_path, max_pixels=4 * size).views) == scenes.VIEWS
-        with pytest.raises(DataError, match=rf"{folder}.*: the image is 32 x 24 px, more than the limit of 192 pixels"):
-            load_scene(tmp_path, max_pixels=size)
-
-
-def test_threads_that_decode_leave_the_filters_of_warnings(tmp_path):
-    """Of two that put the filters back, the later could put back the other's, and no warning would show any more."""
+        scenes.refused(tmp_path, rf"{folder}.*: the image is 32 x 24 px, more than the limit of 192 pixels", max_pixels=size)
+    # of two threads that put the filters of warnings back, the later could put back the other's
     (tmp_path / "a.jpg").write_bytes(encoded("JPEG"))
     before = [*warnings.filters]
     with ThreadPoolExecutor(4) as pool:
         assert len([*pool.map(decode, [tmp_path / "a.jpg"] * 200)]) == 200
     assert warnings.filters == before
+    gray, path = np.arange(11 * 9, dtype=np.uint8).reshape(9, 11), tmp_path / "a.png"
+    path.write_bytes(interlaced(gray))
+    assert (decode(path)[0][..., 0] == gray / np.float32(255)).all()
+    refused(tmp_path, interlaced(gray, -1), "decoded")
 
 
 def test_a_second_size_or_a_chunk_beyond_the_file_is_refused_before_any_pixel_is_decoded(tmp_path, monkeypatch):
@@ -624,7 +559,6 @@ def test_any_error_of_a_decoder_is_damage_of_the_file(tmp_path, monkeypatch):
     header = chunk(b"IHDR", struct.pack(">IIBBBBB", 2**31, 1, 8, 0, 0, 0, 0))
     with pytest.raises(ValueError, match="its pixels are damaged"):
         image_files._loaded(image_files._opened("PNG", gray_png(1, 1, bytes(2))[:33] + header + chunk(b"IDAT", b"")))
-    (tmp_path / "photo.img").write_bytes(encoded("PNG"))
     for error in (OverflowError, ZeroDivisionError, Image.DecompressionBombError, cv2.error):
 
         def fails(*_, error=error):
@@ -632,28 +566,22 @@ def test_any_error_of_a_decoder_is_damage_of_the_file(tmp_path, monkeypatch):
 
         monkeypatch.setattr(ImageFile.ImageFile, "load", fails)
         refused(tmp_path, encoded("PNG"), "its pixels are damaged .signed integer is greater than maximum")
-    monkeypatch.setattr(ImageFile.ImageFile, "load", lambda *_: np.empty(2**50))
-    with pytest.raises(ResourceError, match=r"photo.img: decoding the image needs 0.0 GiB"):
-        decode(tmp_path / "photo.img")
 
 
 def test_no_memory_for_an_image_is_no_damage(tmp_path, monkeypatch):
-    path = tmp_path / "a.png"
-    path.write_bytes(encoded("PNG"))
+    (tmp_path / "photo.img").write_bytes(encoded("PNG"))
 
     def full(*_):
         error = cv2.error("Failed to allocate 4 bytes")
         error.code = cv2.Error.StsNoMem
         raise error
 
-    monkeypatch.setattr(cv2, "imdecode", full)
-    with pytest.raises(ResourceError, match=r"a.png: decoding the image needs 0.0 GiB of free memory; shrink the image"):
-        decode(path)
-
-
-def test_other_files_are_no_images(tmp_path):
-    for data in (b"", b"P5 2 2 255 abcd", b"GIF89a" + bytes(20)):
-        refused(tmp_path, data, "it is (empty|not a JPEG, PNG, BMP, TIFF, WebP or AVIF file)")
+    for owner, name, wrong in ((cv2, "imdecode", full), (ImageFile.ImageFile, "load", lambda *_: np.empty(2**50))):
+        monkeypatch.setattr(owner, name, wrong)
+        with pytest.raises(
+            ResourceError, match=r"photo.img: decoding the image needs 0.0 GiB of free memory; shrink the image"
+        ):
+            decode(tmp_path / "photo.img")
 
 
 # AVIF: decoded whole or not at all, with what EXIF says of the lens and nothing of it in the copy.
@@ -686,10 +614,7 @@ def test_an_avif_has_its_colours_and_straight_alpha_and_is_bounded(tmp_path):
             np.testing.assert_allclose(part.mean((0, 1)), wanted, atol=0.04)
     with pytest.raises(DataError, match=r"96 x 64 px, more than the limit of 100 pixels"):
         decode(path, 100)
-
-
-def test_a_photograph_is_copied_upright_without_what_it_says_of_its_owner(tmp_path):
-    """Its lens is known by EXIF: 26 mm of film whose diagonal is 43.3 mm."""
+    # a photograph is copied upright without what it says of its owner; its lens is known by EXIF: 26 mm of 43.3 mm film
     source = tmp_path / "in" / "a.avif"
     source.parent.mkdir()
     source.write_bytes(avif(orientation=6))
@@ -714,6 +639,7 @@ FTYP = b"\0\0\0\x1cftyp"
 
 
 def test_the_format_and_its_remedy_are_named(tmp_path):
+    """A folder of RAW files is told from an empty one; other files are no images."""
     for name, data, words in (
         ("a.heic", FTYP + b"heic\0\0\0\0mif1heic" + bytes(40), "a HEIC photograph, .* only for finding poses.*JPEG"),
         ("a.jpg", FTYP + b"mif1", "a HEIC photograph"),  # truncated, under another name
@@ -723,11 +649,9 @@ def test_the_format_and_its_remedy_are_named(tmp_path):
         (tmp_path / name).write_bytes(data)
         with pytest.raises(DataError, match=rf"{name}: is {words}"):
             decode(tmp_path / name)
-
-
-def test_a_folder_of_raw_files_is_told_from_an_empty_one(tmp_path):
-    scenes.WRITERS["llff"](tmp_path)
-    for file in (tmp_path / "images").iterdir():
+    scenes.write_llff(tmp_path / "raw")
+    for file in (tmp_path / "raw" / "images").iterdir():
         file.rename(file.with_suffix(".NEF"))
-    with pytest.raises(DataError, match=r"images: .*\.NEF is a RAW file, which is not supported; convert"):
-        load_scene(tmp_path)
+    scenes.refused(tmp_path / "raw", r"images: .*\.NEF is a RAW file, which is not supported; convert")
+    for data in (b"", b"P5 2 2 255 abcd", b"GIF89a" + bytes(20)):
+        refused(tmp_path, data, "it is (empty|not a JPEG, PNG, BMP, TIFF, WebP or AVIF file)")

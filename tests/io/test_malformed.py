@@ -17,22 +17,17 @@ from warpgs.io.load import detect, load_scene
 from warpgs.io.transforms import TransformsReader, read_cameras
 from warpgs.process import Detail
 
-# Broken scenes end in a message that names the file, the reason and the remedy, never in a traceback.
-
 # ---- detection -------------------------------------------------------------------------------------------------------
 
 
 def test_folders_that_hold_no_scene(tmp_path):
+    """Of several complete formats the first is taken, with a note; alone, what a broken one lacks is named."""
     refused(tmp_path / "gone", "gone: no such folder; give a folder of photographs")
     (tmp_path / "photographs").mkdir()
     refused(tmp_path / "photogaphs", r"photogaphs: no such folder; did you mean photographs\?")
     refused(tmp_path, r"no scene format found. Looked for: sparse/0.*transforms.json.*poses_bounds.npy.*cameras.npz.*_par.txt")
     (tmp_path / "a.txt").write_text("")
     refused(tmp_path / "a.txt", "a.txt: is a file; give a folder")
-
-
-def test_the_complete_format_is_taken_with_a_note(tmp_path):
-    """Of several complete ones, the first; alone, what a broken one lacks is named."""
     scenes.write_colmap(tmp_path)
     (tmp_path / "sparse" / "0" / "images.bin").unlink()
     refused(tmp_path, "the COLMAP reconstruction in sparse/0 lacks images.bin, and no other format was found. Copy")
@@ -66,19 +61,14 @@ def read_all(folder, kind):
 
 
 @pytest.mark.parametrize("name", ["cameras.bin", "images.bin", "points3D.bin"])
-def test_every_truncation_is_noticed(name, tmp_path):
+def test_truncations_and_wrong_counts_are_noticed(name, tmp_path):
+    """Counts that are too large are refused before a record is read; too small ones leave bytes over."""
     files = scenes.colmap_bin()
     scenes.write_files(tmp_path, files)
     for length in reversed(range(len(files[name]))):
         os.truncate(tmp_path / name, length)
         with pytest.raises(DataError, match=rf"{name}: .*(truncated|ends in the middle)"):
             read_all(tmp_path, "bin")
-
-
-@pytest.mark.parametrize("name", ["cameras.bin", "images.bin", "points3D.bin"])
-def test_counts_that_the_file_does_not_hold(name, tmp_path):
-    """Too many are refused before a record is read; too few leave bytes over."""
-    files = scenes.colmap_bin()
     (right,) = struct.unpack_from("<Q", files[name])
     for count, words in (
         *((c, rf"announces {c:,} records but holds bytes for at most \d+") for c in (100, 2**40, 2**64 - 1)),
@@ -94,12 +84,27 @@ def test_counts_that_the_file_does_not_hold(name, tmp_path):
         read_all(tmp_path, "bin")
 
 
-def test_unknown_lens_models(tmp_path):
+def test_lens_models_distortion_and_points_of_binary_files(tmp_path):
     scenes.write_colmap(tmp_path)
-    path = tmp_path / "sparse" / "0" / "cameras.bin"
+    cameras, path = (tmp_path / "sparse" / "0" / f"{name}.bin" for name in ("cameras", "points3D"))
     for model, name in ((5, "OPENCV_FISHEYE"), (77, "77"), (-1, "-1")):
-        path.write_bytes(path.read_bytes()[:12] + struct.pack("<i", model) + path.read_bytes()[16:])
+        cameras.write_bytes(cameras.read_bytes()[:12] + struct.pack("<i", model) + cameras.read_bytes()[16:])
         refused(tmp_path, rf"cameras.bin: camera model {name} is not supported \(supported: SIMPLE_PINHOLE.*image_undistorter")
+    scenes.write_colmap(tmp_path, model="SIMPLE_RADIAL", parameters=(20, 8, 6, 1e300))
+    refused(tmp_path, r"camera 1: distortion .*1e\+300")
+    for k1 in (1e-320, 5e-324, -1e-320, 1e-100):
+        scene = load_scene(scenes.write_colmap(tmp_path, model="SIMPLE_RADIAL", parameters=(20, 8, 6, k1)))
+        assert scene.views[0].mask is None
+        np.testing.assert_allclose(scene.views[0].image, scenes.image(0) / 255, atol=1e-6)
+    for far in (1.7e308, -1.7e308, 1e30):
+        path.write_bytes(path.read_bytes()[:16] + struct.pack("<d", far) + path.read_bytes()[24:])
+        refused(tmp_path, r"1 of 3 points are not finite, or farther than 1e\+12 times the extent of the cameras; remove them")
+    path.write_bytes(struct.pack("<Q", 0))
+    scene = load_scene(tmp_path)
+    assert len(scene.points) == 0 and "points3D.bin holds no points" in scene.notes
+    path.unlink()
+    scene = load_scene(tmp_path)
+    assert scene.points is None and any("points3D.bin is missing" in n for n in scene.notes)
 
 
 @pytest.mark.parametrize(
@@ -120,36 +125,6 @@ def test_unknown_lens_models(tmp_path):
 @pytest.mark.parametrize("write", [scenes.write_colmap, scenes.write_colmap_txt])
 def test_impossible_cameras(write, parameters, size, message, tmp_path):
     refused(write(tmp_path, parameters=parameters, size=size), rf"(cameras\.(bin|txt).*camera 1: .*|photo0.png: .*){message}")
-
-
-def test_distortion_of_nothing_and_of_too_much(tmp_path):
-    scenes.write_colmap(tmp_path, model="SIMPLE_RADIAL", parameters=(20, 8, 6, 1e300))
-    refused(tmp_path, r"camera 1: distortion .*1e\+300")
-    for k1 in (1e-320, 5e-324, -1e-320, 1e-100):
-        scene = load_scene(scenes.write_colmap(tmp_path, model="SIMPLE_RADIAL", parameters=(20, 8, 6, k1)))
-        assert scene.views[0].mask is None
-        np.testing.assert_allclose(scene.views[0].image, scenes.image(0) / 255, atol=1e-6)
-
-
-def test_points_beyond_all_measure(tmp_path):
-    scenes.write_colmap(tmp_path)
-    path = tmp_path / "sparse" / "0" / "points3D.bin"
-    for far in (1.7e308, -1.7e308, 1e30):
-        data = bytearray(path.read_bytes())
-        data[16:24] = struct.pack("<d", far)
-        path.write_bytes(data)
-        refused(tmp_path, r"1 of 3 points are not finite, or farther than 1e\+12 times the extent of the cameras; remove them")
-
-
-def test_no_points_are_a_note(tmp_path):
-    scenes.write_colmap(tmp_path)
-    path = tmp_path / "sparse" / "0" / "points3D.bin"
-    path.write_bytes(struct.pack("<Q", 0))
-    scene = load_scene(tmp_path)
-    assert len(scene.points) == 0 and "points3D.bin holds no points" in scene.notes
-    path.unlink()
-    scene = load_scene(tmp_path)
-    assert scene.points is None and any("points3D.bin is missing" in n for n in scene.notes)
 
 
 def patched_pose(tmp_path, **changes):
@@ -186,12 +161,9 @@ def test_broken_poses_in_text(changes, message, tmp_path):
     refused(patched_pose(tmp_path, **changes), message, strict=True)
 
 
-NOT_FINITE = ["nan", "-nan(ind)", "inf", "1.#QNAN", "-1.#IND00"]
-
-
 @pytest.mark.parametrize("kind", ["txt", "bin"])
 @pytest.mark.parametrize("what", ["pose", "camera"])
-@pytest.mark.parametrize("number", NOT_FINITE)
+@pytest.mark.parametrize("number", ["nan", "-nan(ind)", "inf", "1.#QNAN", "-1.#IND00"])
 def test_images_without_a_finite_pose_or_camera_are_left_out(number, what, kind, tmp_path):
     """Some programs write unaligned photographs so, on Windows in the spelling of its library."""
     write, value = (scenes.write_colmap, scenes.write_colmap_txt)[kind == "txt"], np.inf if number == "inf" else np.nan
@@ -267,7 +239,7 @@ def test_broken_text_files(name, content, message, tmp_path):
 
 @pytest.mark.parametrize("kind", ["colmap", "transforms"])
 def test_a_long_text_of_a_file_is_shortened(kind, tmp_path):
-    """In errors, which go into the files of a run or a farm; the file is still named."""
+    """In errors and notes, which go into the files of a run or a farm; the file is still named."""
     long = "x" * 1_000_000
     if kind == "colmap":
         patched_pose(tmp_path, _2=long)
@@ -277,9 +249,6 @@ def test_a_long_text_of_a_file_is_shortened(kind, tmp_path):
         load_scene(tmp_path)
     text = str(raised.value)
     assert text.startswith(str(tmp_path)) and "x [" in text and "letters left out] x" in text and len(text) < 4100
-
-
-def test_a_long_note_is_shortened():
     notes = TransformsReader().scene(Path("a"), [], ["x" * 9000 + " end", Detail("y" * 9000)]).notes
     assert len(notes[0]) < 4200 and notes[0].endswith("x end") and isinstance(notes[1], Detail) and len(notes[1]) < 4200
 
@@ -358,30 +327,24 @@ def test_json_that_is_no_scene(text, tmp_path):
     refused(tmp_path, r"transforms.json|0 usable views")
 
 
-NESTED = '{"a":' * 900 + "1" + "}" * 900
-
-
 def test_json_that_is_nested_deep_or_huge(tmp_path, monkeypatch):
     scenes.write_transforms(tmp_path)
     path = tmp_path / "transforms.json"
-    text = path.read_text()
+    text, nested = path.read_text(), '{"a":' * 900 + "1" + "}" * 900
     for key in ("file_path", "mask_path", "transform_matrix", "fl_x", "camera_model", "ply_file_path", "x"):
-        path.write_text(text.replace('"frames": [{', f'"{key}": {NESTED}, "frames": [{{"{key}": {NESTED}, ', 1))
+        path.write_text(text.replace('"frames": [{', f'"{key}": {nested}, "frames": [{{"{key}": {nested}, ', 1))
         refused(tmp_path, r"transforms.json: is nested deeper than 16 levels|transforms.json: cannot be read as JSON")
     path.write_text(text)
     monkeypatch.setattr("warpgs.io.transforms.MAX_BYTES", 100)
     refused(tmp_path, r"transforms.json: cannot be read .is larger than 100 bytes")
 
 
-def test_no_focal_length(tmp_path):
+def test_no_focal_length_and_names_that_no_file_has(tmp_path):
     scenes.write_transforms(tmp_path, scenes.transforms_json(fl_x=None, fl_y=None))
     refused(tmp_path, r"frame 0 .*has neither fl_x nor camera_angle_x")
     scenes.write_transforms(tmp_path, scenes.transforms_json(fl_x=None, fl_y=None, camera_angle_x=4.0))
     refused(tmp_path, r"frame 0 .*camera_angle_x is 4.0 rad, not between 0 and pi")
-
-
-def test_names_that_no_file_has(tmp_path):
-    """Too long for the file system, and of half a character; the message is text all the same."""
+    # too long for the file system, and of half a character; the message is text all the same
     refused(broken_frame(tmp_path, file_path="x" * 300 + ".png"), r"cannot be read|usable views|no image file")
     with pytest.raises(DataError) as caught:
         load_scene(broken_frame(tmp_path, file_path="\ud800.png"))
@@ -431,23 +394,17 @@ def test_numpy_files_that_are_none(name, write, tmp_path):
     with (tmp_path / name).open("wb") as f:
         np.save(f, pickled)  # would run code if it were unpickled
     refused(tmp_path, rf"{name}: cannot be read as")
+    with (tmp_path / name).open("wb") as f:
+        if name.endswith("npy"):
+            np.lib.format.write_array_header_1_0(f, {"descr": "<f8", "fortran_order": False, "shape": (10**13, 17)})
+            f.write(b"\0" * 64)
+        else:
+            f.truncate(2**24 + 1)  # of which zipfile would make ten times its size of a table of contents
+    refused(tmp_path, rf"{name}: cannot be read as (a numpy array|an archive of arrays \(OSError: .*is larger than 16 MiB)")
     if name.endswith("npy"):
         with (tmp_path / name).open("wb") as f:
             np.savez(f, a=np.zeros(3))
         refused(tmp_path, "is an archive of arrays, not one array")
-
-
-def test_numpy_files_that_announce_more_than_there_is(tmp_path):
-    """Of an archive, zipfile makes ten times its size of a table of contents."""
-    scenes.write_llff(tmp_path)
-    with (tmp_path / "poses_bounds.npy").open("wb") as f:
-        np.lib.format.write_array_header_1_0(f, {"descr": "<f8", "fortran_order": False, "shape": (10**13, 17)})
-        f.write(b"\0" * 64)
-    refused(tmp_path, r"poses_bounds.npy: cannot be read as a numpy array")
-    scenes.write_dtu(tmp_path / "dtu")
-    with (tmp_path / "dtu" / "cameras.npz").open("wb") as f:
-        f.truncate(2**24 + 1)
-    refused(tmp_path / "dtu", r"cameras.npz: cannot be read as an archive of arrays \(OSError: .*is larger than 16 MiB")
 
 
 SKEW = np.block([[np.array([[20, 5, 8], [0, 20, 6], [0, 0, 1.0]]), np.zeros((3, 1))], [np.zeros((1, 3)), np.ones((1, 1))]])

@@ -162,16 +162,6 @@ def test_a_wrong_field_is_named_with_its_fix(case, way, tmp_path):
     assert str(e.value).startswith(f"{tmp_path}, " if way == "reader" else field) and not (tmp_path / "run").exists()
 
 
-def test_arguments_that_are_no_views_and_no_scene():
-    scene = right()
-    for views, fix in ((scene, "give scene.views"), (scene.views[0], r"give \[view\]"), (PIXELS, r"give \[view\]")):
-        with pytest.raises(DataError, match=f"views must be a list of View; got .*{fix}"):
-            warpgs.evaluate(three_gaussians(), views)
-    assert warpgs.evaluate(three_gaussians(), []) == []
-    with pytest.raises(UsageError, match=r"scene must be a warpgs.Scene or a folder, not tuple; give Scene\("):
-        warpgs.fit(scene.views)
-
-
 @pytest.mark.parametrize("write", scenes.WRITERS.values(), ids=scenes.WRITERS)
 def test_scenes_of_files_pass_as_the_same_object(write, tmp_path):
     scene = load_scene(write(tmp_path))
@@ -183,7 +173,7 @@ def frozen(array: np.ndarray) -> np.ndarray:
     return array
 
 
-def test_a_right_scene_passes_as_the_same_object():
+def test_a_right_scene_passes_and_arguments_that_are_none_are_named():
     scene = right()
     camera = dataclasses.replace(scene.views[0].camera, K=np.float32(scene.views[0].camera.K), width=np.int64(W))
     lens = dataclasses.replace(camera, model="fisheye", distortion=np.zeros(4))
@@ -191,6 +181,18 @@ def test_a_right_scene_passes_as_the_same_object():
     views = (*scene.views, *(dataclasses.replace(scene.views[0], name=f"{i}.png", **f) for i, f in enumerate(fields)))
     scene = dataclasses.replace(scene, views=views, background=(1, 1, 1))
     assert checked_scene(scene) is scene and all(map(lambda a, b: a is b, checked_views(views), views))
+    scene = right()
+    for views, fix in ((scene, "give scene.views"), (scene.views[0], r"give \[view\]"), (PIXELS, r"give \[view\]")):
+        with pytest.raises(DataError, match=f"views must be a list of View; got .*{fix}"):
+            warpgs.evaluate(three_gaussians(), views)
+    assert warpgs.evaluate(three_gaussians(), []) == []
+    with pytest.raises(UsageError, match=r"scene must be a warpgs.Scene or a folder, not tuple; give Scene\("):
+        warpgs.fit(scene.views)
+    c = scene.views[1].camera  # of tensors, and views in another order
+    camera = Camera(torch.from_numpy(c.viewmat).requires_grad_(), torch.from_numpy(c.K), W, H)
+    views = (scene.views[3], dataclasses.replace(scene.views[1], camera=camera), scene.views[0], scene.views[2])
+    other = dataclasses.replace(scene, views=views)
+    assert fitted(other, split="every:4").metrics["test"]["psnr"] == fitted(scene, split="every:4").metrics["test"]["psnr"]
 
 
 CONVERTED = {
@@ -222,15 +224,6 @@ def test_other_arrays_of_the_same_values_score_and_fit_the_same(convert):
     assert all(torch.equal(t, results[1][name]) for name, t in results[0].items())
 
 
-def test_tensors_as_cameras_and_views_in_any_order_score_the_same():
-    scene = right()
-    c = scene.views[1].camera
-    camera = Camera(torch.from_numpy(c.viewmat).requires_grad_(), torch.from_numpy(c.K), W, H)
-    views = (scene.views[3], dataclasses.replace(scene.views[1], camera=camera), scene.views[0], scene.views[2])
-    other = dataclasses.replace(scene, views=views)
-    assert fitted(other, split="every:4").metrics["test"]["psnr"] == fitted(scene, split="every:4").metrics["test"]["psnr"]
-
-
 DOUBTS = {
     "lens": (r"leaves few", r"leaves few pixels of 5 images, \d+% of images/photo"),
     "principal point": ("principal point", r"principal point of 5 of 5 views is outside the image, .*: 40, 6 of 16 x 12 px"),
@@ -240,10 +233,7 @@ DOUBTS = {
     "empty mask": ("keep no", r"masks that keep no pixel, so that their views are left out .*--mask-keeps.*photo1.png \(1\)"),
     "equal": ("equal pixels", r"2 of 5 photographs have equal pixels, such as .*photo0.png and .*photo1.png"),
     "blank": ("single colour", r"1 of 5 photographs have a single colour, such as .*photo1.png; leave them out \(--exclude\)"),
-    "focal length": (
-        "focal length",
-        r"the focal length of 5 of 5 views is over 100 times .*photo0.png: 2000 px at 16 x 12",
-    ),
+    "focal length": ("focal length", r"focal length of 5 of 5 views is over 100 times .*photo0.png: 2000 px at 16 x 12"),
     "one other pixel": ("no such words", ""),
     "none": ("no such words", ""),
 }

@@ -66,11 +66,8 @@ def test_dtu_protocol(views):
         assert ids(split.train) == train[:k] and ids(split.test) == test
 
 
-def test_dtu_ids_are_those_of_the_names():
-    """DTU's own names, and files renamed to count from one, give the same views as files that count from zero.
-
-    Names without numbers are counted in sorted order; a gap is refused: every id after it would be shifted by one.
-    """
+def test_ids_of_names_and_splits_by_number():
+    """Files that count from one or from zero give the same views; a gap would shift every id after it."""
     for form in ("rect_{:03d}_3_r5000.png", "images/{:03d}.png"):
         split = split_views(scene_of([form.format(i + 1) for i in range(49)]), "dtu:3")
         assert split.train == tuple(form.format(i + 1) for i in (25, 22, 28)) and split.test[0] == form.format(2)
@@ -81,16 +78,11 @@ def test_dtu_ids_are_those_of_the_names():
         split_views(scene_of(names[:10] + names[11:]), "dtu:3")
     with pytest.raises(DataError, match=r"with the ids 0 are missing"):
         split_views(scene_of(names[1:]), "dtu:3")
-
-
-def test_blender_protocol_counts_frames_not_names():
+    # Blender's frames are counted, not their names
     names = [f"{part}/r_{i}.png" for part, n in (("train", 100), ("val", 100), ("test", 200)) for i in range(n)]
     split = split_views(scene_of(names), "blender:8")
     assert split.train == tuple(f"train/r_{i}.png" for i in (2, 16, 26, 55, 73, 76, 86, 93))
     assert split.test == tuple(f"test/r_{i}.png" for i in range(0, 200, 8))
-
-
-def test_every_and_all():
     split = split_views(numbered(7), "every:3")
     assert ids(split.test) == [0, 3, 6] and ids(split.train) == [1, 2, 4, 5]
     assert split_views(numbered(3), "all") == Split(("000.png", "001.png", "002.png"), ())

@@ -25,19 +25,6 @@ from warpgs.locks import hold_folder, private_shared_folder
 from warpgs.pipeline.farm import job as record
 from warpgs.pipeline.farm import slurm, work
 from warpgs.pipeline.farm.farm import LocalEngine, local_slots, make_engine, run_farm
-from warpgs.pipeline.farm.job import (
-    CHECKED,
-    LOG,
-    PLY,
-    THUMBNAIL,
-    JobRecord,
-    file_digest,
-    finished,
-    job_of,
-    list_jobs,
-    read_job_record,
-    write_record,
-)
 from warpgs.pipeline.farm.ray import RayEngine
 from warpgs.pipeline.farm.slurm import SlurmEngine
 from warpgs.pipeline.farm.work import run_job
@@ -47,8 +34,6 @@ from warpgs.pipeline.train.presets import preset_settings
 from warpgs.pipeline.train.strategies.base import STRATEGIES
 from warpgs.process import run_python
 from warpgs.ranks import is_loopback, listeners
-
-# Farms: each job once, whatever dies, and the same bytes as single fits.
 
 
 @pytest.fixture(scope="module")
@@ -63,7 +48,7 @@ def single(scenes, tmp_path_factory):
     found = {}
     for job in jobs_of(scenes, tmp_path_factory.mktemp("single")):
         fit_request(job.request)
-        found[job.name] = file_digest(job.request.out / PLY)
+        found[job.name] = record.file_digest(job.request.out / record.PLY)
     return found
 
 
@@ -81,7 +66,7 @@ def unfitted(monkeypatch):
 
     def pretend(request, *_, **__):
         make_folder(request.out)
-        for name in CHECKED:
+        for name in record.CHECKED:
             (request.out / name).write_text(request.scene.path)
         return "fitted", {"test": {}, "steps": 1}, ""
 
@@ -97,7 +82,7 @@ def results(done, tmp_path):
 
 
 def digests(statuses):
-    return {s.job.name: s.record.files.get(PLY) for s in statuses}
+    return {s.job.name: s.record.files.get(record.PLY) for s in statuses}
 
 
 TERM = """
@@ -141,15 +126,15 @@ def test_processes_give_the_bytes_of_single_fits_and_one_that_is_killed_is_repla
     assert killed and [s.attempts for s in statuses] == [2, 1]
     assert [s.state for s in statuses] == ["done", "done"] and "killed by signal 9" in statuses[0].notes[0]
     assert digests(statuses) == single and statuses[0].record.how == "continued"
-    assert "held-out PSNR" in (tmp_path / "out" / "s1" / LOG).read_text("utf-8")
-    assert (tmp_path / "out" / "s1" / THUMBNAIL).is_file()
+    assert "held-out PSNR" in (tmp_path / "out" / "s1" / record.LOG).read_text("utf-8")
+    assert (tmp_path / "out" / "s1" / record.THUMBNAIL).is_file()
 
 
 def test_a_rerun_skips_what_is_finished_and_valid(scenes, single, results, tmp_path):
     """A changed byte starts that job alone; other times of files are no other data; another setting is another run."""
     engine = HereEngine()
     assert [s.state for s in run_farm(jobs_of(scenes, results), engine)] == ["done", "done"] and engine.begun == []
-    ply = results / "s1" / "run" / PLY
+    ply = results / "s1" / "run" / record.PLY
     data = bytearray(ply.read_bytes())
     data[-1] ^= 1
     ply.write_bytes(data)
@@ -159,29 +144,13 @@ def test_a_rerun_skips_what_is_finished_and_valid(scenes, single, results, tmp_p
     copied = shutil.copytree(scenes, tmp_path / "scenes")
     moved = [replace(j, request=replace(j.request, scene=replace(j.request.scene, path=str(copied / j.name))))
              for j in jobs_of(scenes, results)]  # fmt: skip
-    assert all(finished(j) is None for j in moved)
-    assert [s.record.how for s in run_farm(moved, HereEngine())] == ["kept", "kept"] and finished(moved[0])
+    assert all(record.finished(j) is None for j in moved)
+    assert [s.record.how for s in run_farm(moved, HereEngine())] == ["kept", "kept"] and record.finished(moved[0])
     os.utime(copied / "s0" / "images" / "000.png", (0, 0))
-    assert finished(moved[0]) is None and finished(moved[1])
+    assert record.finished(moved[0]) is None and record.finished(moved[1])
     (status,) = run_farm(jobs_of(scenes, results, steps=4)[:1], HereEngine())
     assert (status.record.how, status.record.steps) == ("redone", 4) and (results / "s0" / "run.old1").is_dir()
-
-
-def test_links_that_double_a_scene_at_each_level_are_not_listed(tmp_path, monkeypatch):
-    """40 folders with two links each to the next would be a million million folders."""
-    monkeypatch.setattr(record, "MOST_FILES", 100)
-    for level in range(7):
-        (tmp_path / f"{level}").mkdir()
-        for name in "ab":
-            (tmp_path / f"{level}" / name).symlink_to(tmp_path / f"{level + 1}")
-    (tmp_path / "7").mkdir()
-    for level in ("0", "3"):
-        (tmp_path / level / "image.png").touch()
-    assert record.source_stamp(tmp_path / "3") and not record.source_stamp(tmp_path / "0")  # 31 folders, and 255
-
-
-def test_settings_that_follow_from_the_views_are_the_same_settings(scenes, tmp_path):
-    """The record of a run has settings that were left open as chosen: the finished run is kept all the same."""
+    # the record of a run has settings that were left open as chosen: the finished run is kept all the same
     (job, _) = jobs_of(scenes, tmp_path, half_resolution=None)
     run_farm([job], HereEngine())
     (tmp_path / "s0" / record.RECORD).unlink()
@@ -194,7 +163,7 @@ class Alone(Exception):
 
 
 def test_a_second_farm_on_the_folder_takes_over_what_the_first_one_does(scenes, unfitted, tmp_path):
-    """While the first farm is in the middle of a job, the second one does the other and waits; neither job is done twice."""
+    """It does the other job and waits; neither job is done twice; what another farm finishes is found done."""
     jobs, second = jobs_of(scenes, tmp_path), HereEngine()
 
     def show(statuses):
@@ -209,10 +178,6 @@ def test_a_second_farm_on_the_folder_takes_over_what_the_first_one_does(scenes, 
     first = HereEngine(meanwhile)
     statuses = run_farm(jobs, first)
     assert first.begun == ["s0"] and second.begun == ["s1"] and [s.state for s in statuses] == ["done", "done"]
-
-
-def test_what_another_farm_finishes_is_taken_over_when_its_lock_is_gone(scenes, unfitted, tmp_path):
-    """A farm that waits for a job looks again, and finds it done."""
     jobs, engine = jobs_of(scenes, tmp_path / "out"), HereEngine()
     with contextlib.ExitStack() as other:
         other.enter_context(hold_folder(jobs[0].folder))
@@ -243,7 +208,10 @@ def test_crashes_and_lack_of_memory_cost_one_scene_and_are_tried_again(
     monkeypatch.setattr(work, "ensure_run", fail)
     statuses = run_farm(jobs, HereEngine())
     assert [s.state for s in statuses] == ["failed", "done"] and statuses[0].attempts == attempts
-    assert read_job_record(jobs[0].folder).message == statuses[0].record.message and str(error) in statuses[0].record.message
+    assert (
+        record.read_job_record(jobs[0].folder).message == statuses[0].record.message
+        and str(error) in statuses[0].record.message
+    )
     monkeypatch.setattr(work, "ensure_run", unfitted)
     assert [s.state for s in run_farm(jobs, HereEngine())] == ["done", "done"]
 
@@ -279,24 +247,19 @@ def test_a_class_of_a_preset_file_is_found_by_another_process(scenes, tmp_path, 
         del sys.modules[name]
     kept = {n: c for n, c in STRATEGIES._classes.items() if c.__module__.startswith("warpgs.")}
     monkeypatch.setattr(STRATEGIES, "_classes", kept)
-    found = job_of(text)
+    found = record.job_of(text)
     assert STRATEGIES.find(found.request.config.strategy).__name__ == "Mine" and found.text() == text
 
 
-def test_a_job_as_text_is_the_same_job(scenes, tmp_path):
+def test_a_job_as_text_is_the_same_job(scenes, tmp_path, monkeypatch):
     (job, _) = jobs_of(scenes, tmp_path)
-    assert job_of(job.text()) == job and job_of(job.text()).identity() == job.identity()
+    assert record.job_of(job.text()) == job and record.job_of(job.text()).identity() == job.identity()
     elsewhere = replace(job, request=replace(job.request, device="cuda"))
     assert elsewhere.identity() != job.identity(), "photographs have another size on a GPU"
-
-
-def test_slots(monkeypatch):
-    """GPUs take turns, under the names that the user's own variable gives them."""
-    monkeypatch.setattr("torch.cuda.is_available", lambda: True)
-    monkeypatch.setattr("torch.cuda.device_count", lambda: 2)
-    monkeypatch.setattr("torch.cuda.current_device", lambda: 0)
-    monkeypatch.setattr("torch.cuda.get_device_name", lambda _: "a GPU")
-    monkeypatch.setattr("torch.get_num_threads", lambda: 8)
+    # GPUs take turns, under the names that the user's own variable gives them
+    torch = {"cuda.is_available": True, "cuda.device_count": 2, "cuda.current_device": 0, "cuda.get_device_name": "a GPU"}
+    for name, value in (torch | {"get_num_threads": 8}).items():
+        monkeypatch.setattr(f"torch.{name}", lambda *_, value=value: value)
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "3,5")
     with pytest.raises(UsageError, match="--slots and --per-gpu must be numbers from 1"):
         local_slots("cuda", 0, 2)
@@ -332,8 +295,6 @@ def test_engines_of_clusters_give_the_same_bytes(scenes, single, tmp_path, monke
     jobs = jobs_of(scenes, tmp_path / "out")
     killed = tmp_path / "killed"
     if kind == "ray":
-        from warpgs.pipeline.farm.ray import RayEngine
-
         if importlib.util.find_spec("ray") is None:  # what is imported before the engine listens at every interface
             pytest.skip("ray is not installed")
         engine = RayEngine("cpu", 2, 1)
@@ -374,7 +335,7 @@ def _die_once(mark):
 
     def work(text, threads):
         def on_step(report):
-            if report.step == 4 and job_of(text).name == "s0" and not Path(mark).exists():
+            if report.step == 4 and record.job_of(text).name == "s0" and not Path(mark).exists():
                 Path(mark).touch()
                 os.kill(os.getpid(), signal.SIGKILL)
 
@@ -386,35 +347,39 @@ def _die_once(mark):
 # What a farm is given: folders, globs, and files of jobs that anybody may have written.
 
 
-def test_folders_and_globs(tmp_path):
-    """Each folder is a scene, hidden ones are not; equal names are told apart by the folders above."""
+def test_folders_globs_and_lines_of_flags(tmp_path, monkeypatch):
+    """Folders are scenes, hidden ones are not; lines are flags, with paths from the file; links without end are not listed."""
     for name in ("b/scene", "a/scene", ".hidden"):
         (tmp_path / name).mkdir(parents=True)
-    assert [j[:2] for j in list_jobs(str(tmp_path))] == [("a", tmp_path / "a"), ("b", tmp_path / "b")]
-    assert [j[0] for j in list_jobs(f"{tmp_path}/*/scene")] == ["a-scene", "b-scene"]
+    assert [j[:2] for j in record.list_jobs(str(tmp_path))] == [("a", tmp_path / "a"), ("b", tmp_path / "b")]
+    assert [j[0] for j in record.list_jobs(f"{tmp_path}/*/scene")] == ["a-scene", "b-scene"]
     with pytest.raises(UsageError, match="no scene found"):
-        list_jobs(f"{tmp_path}/*/nothing")
+        record.list_jobs(f"{tmp_path}/*/nothing")
     write_scenes(tmp_path / "more", 1)
     with pytest.raises(UsageError, match="is a single scene: fit it with `warpgs fit`"):
-        list_jobs(str(tmp_path / "more" / "s0"))
-
-
-def test_lines_are_flags_of_fit(tmp_path):
-    """Relative paths are from the file; booleans are switches, in groups too; the longest name is one of a folder."""
+        record.list_jobs(str(tmp_path / "more" / "s0"))
+    # relative paths are from the file; booleans are switches, in groups too; the longest name is one of a folder
     path, long = tmp_path / "jobs.jsonl", 66 * "写"
     line = '{"scene": "x", "steps": 5, "refine_poses": true, "method.pm": false}'
     path.write_text(f"{line}\n\n{json.dumps({'scene': '/y', 'name': long})}", "utf-8")
-    first, second = list_jobs(str(path))
+    first, second = record.list_jobs(str(path))
     assert first == ("x", tmp_path / "x", ("--steps=5", "--refine-poses", "--method.no-pm"))
     assert second == (long, Path("/y"), ())
     (tmp_path / f"{long}.old1").mkdir()
     path.write_text('{"scene": "a/x"}\n{"scene": "b/X"}')
     with pytest.raises(UsageError, match=r"jobs\.jsonl: two jobs have the name 'X'"):
-        list_jobs(str(path))
-
-
-def test_lines_that_are_no_jobs(tmp_path):
-    """One sentence, with the number of the line where it is the line's fault."""
+        record.list_jobs(str(path))
+    # 40 folders with two links each to the next would be a million million folders
+    monkeypatch.setattr(record, "MOST_FILES", 100)
+    levels = [tmp_path / f"{level}" for level in range(8)]
+    for level, below in zip(levels, [*levels[1:], None]):
+        level.mkdir()
+        for name in "ab" if below else "":
+            (level / name).symlink_to(below)
+    for level in (levels[0], levels[3]):
+        (level / "image.png").touch()
+    assert record.source_stamp(levels[3]) and not record.source_stamp(levels[0])  # 31 folders, and 255
+    # lines that are no jobs end in one sentence, with the number of the line where it is the line's fault
     path = tmp_path / "jobs.jsonl"
     for word, values in {
         "is not a valid name": [{"name": n} for n in ("../b", "index.html", ".b", 101 * "x")], "must be text": [{"steps": [1]}],
@@ -427,7 +392,7 @@ def test_lines_that_are_no_jobs(tmp_path):
         for value in values:
             path.write_text(value if isinstance(value, str) else json.dumps({"scene": "a"} | value), "utf-8")
             with pytest.raises(DataError, match=word):
-                list_jobs(str(path))
+                record.list_jobs(str(path))
 
 
 # Slurm's engine: private files, nothing unpickled, and each way in which a job of Slurm can end.
@@ -500,7 +465,7 @@ def test_pickles_planted_in_the_results_are_never_loaded(cluster, job, tmp_path)
 
     def begin(job):
         start(job)
-        write_record(job.folder, JobRecord(job.name, job.identity(), "failed", message="no luck"))
+        record.write_record(job.folder, record.JobRecord(job.name, job.identity(), "failed", message="no luck"))
         cluster.end("70", "failed")
 
     engine.start = begin
@@ -521,7 +486,7 @@ def test_a_job_goes_to_its_node_as_json_in_a_private_folder(cluster, job, tmp_pa
     assert program == "sbatch" and words[:5] == ["exec", sys.executable, "-P", "-m", "warpgs.pipeline.farm.slurm"]
     assert {"--time=90", "--cpus-per-task=3", "--gpus-per-node=1", "--partition=gpu"} <= set(options)
     text, answer = map(Path, words[5:7])
-    assert job_of(text.read_text()) == job and words[7] == "3"
+    assert record.job_of(text.read_text()) == job and words[7] == "3"
     folder = text.parent
     assert folder.parent == tmp_path / "cache" / "warpgs" / "slurm" and answer.parent == folder
     assert stat.S_IMODE(folder.stat().st_mode) == 0o700 and folder.stat().st_uid == os.getuid()
@@ -626,8 +591,7 @@ def test_commands_are_called_without_a_shell(tmp_path, monkeypatch):
     assert slurm._call("squeue", "$(id)", script="text\n")[1] == "$(id) text 1 .\n"
 
 
-# Ray's engine joins the cluster that is named, or starts a private one; it takes none that another user could have
-# planted.
+# Ray's engine joins the cluster that is named, or starts a private one; it takes none that another user could have planted.
 
 
 @pytest.fixture

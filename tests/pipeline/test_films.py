@@ -15,26 +15,10 @@ import warpgs
 from tests.scenes import ring, three_gaussians
 from warpgs.errors import DataError, UsageError
 from warpgs.geometry import look_at, project_points
-from warpgs.pipeline.films import film
+from warpgs.pipeline.films import film, paths
 from warpgs.pipeline.films.film import FilmPlan, FilmSettings, fault_notes, fault_of, plan_film, render_film
-from warpgs.pipeline.films.paths import (
-    BY_KIND,
-    Keyframe,
-    camera_path,
-    common_up,
-    framed,
-    path_of,
-    read_keyframes,
-    rig_among,
-    rig_of,
-    through,
-    tour_of,
-)
 from warpgs.pipeline.model.table import FittedModel
 from warpgs.scene import Camera, Normalization
-
-# Films of a model: choices are said, empty frames noticed, keyframes read or refused, and the files are those asked
-# for.
 
 UNITS = Normalization(np.array([1.0, 2.0, 3.0]), 0.5)
 
@@ -64,7 +48,7 @@ def test_keyframes_of_a_viewer_give_back_its_cameras(model, tmp_path):
         assert np.allclose(got.viewmat, model.cameras()[f"{wanted}.png"].viewmat, atol=1e-9)
     assert cameras[0].K[0, 2] == 20 and cameras[0].K[1, 2] == 16  # a viewer's axis is the middle of its image
     assert 2 * math.atan(0.5 * cameras[-1].height / cameras[-1].K[1, 1]) == pytest.approx(0.3)
-    center = rig_of(list(model.cameras().values()), 2.2).center
+    center = paths.rig_of(list(model.cameras().values()), 2.2).center
     for camera in cameras:  # all three look at one point, and so does every frame between them
         seen = camera.viewmat[:3, :3] @ center + camera.viewmat[:3, 3]
         assert np.abs(seen[:2]).max() < 0.15 and 2 < seen[2] < 2.5
@@ -99,7 +83,7 @@ def test_keyframes_that_are_none_are_refused(model, tmp_path, change, words):
         found = change(keyframe(model, 0, 0.0))
         path.write_text(found if isinstance(found, str) else json.dumps(found))
     with pytest.raises(DataError, match=words):
-        read_keyframes(path, model.cameras()["0.png"], UNITS)
+        paths.read_keyframes(path, model.cameras()["0.png"], UNITS)
 
 
 def test_what_was_chosen_is_said(model, monkeypatch):
@@ -120,14 +104,10 @@ def test_what_was_chosen_is_said(model, monkeypatch):
         plan_film(model, "orbit", FilmSettings())
     with pytest.raises(UsageError, match=r"unknown path 'turntabel'; did you mean turntable\?"):
         plan_film(model, "turntabel", FilmSettings())
-
-
-@pytest.mark.parametrize(
-    "wrong", [{"size": (8, 100)}, {"fov_y": 0.001}, {"seconds": 0.0}, {"seconds": math.nan}, {"seconds": 1e9}, {"frames": 0}]
-)
-def test_settings_out_of_range_are_refused(wrong):
-    with pytest.raises(UsageError):
-        FilmSettings(**wrong)
+    wrong = [{"size": (8, 100)}, {"fov_y": 0.001}, {"frames": 0}, *({"seconds": s} for s in (0.0, math.nan, 1e9))]
+    for settings in wrong:
+        with pytest.raises(UsageError):
+            FilmSettings(**settings)
 
 
 def test_empty_and_black_frames_are_noticed(model, tmp_path):
@@ -163,7 +143,7 @@ def test_what_no_photograph_saw_gets_a_note(model, tmp_path, path, settings, adv
     """A film that is wider than the photographs, or leaves them, says so and what to do; others have no such note."""
     if path == "own":
         first = model.cameras()["0.png"]
-        aside = [dataclasses.replace(first, viewmat=first.viewmat @ _moved(x)) for x in (0.0, -0.6)]
+        aside = [dataclasses.replace(first, viewmat=first.viewmat @ (np.eye(4) + x * np.eye(4, k=3))) for x in (0.0, -0.6)]
         plan = FilmPlan([(str(i), c) for i, c in enumerate(aside)], 0.0, "", [])
     else:
         plan = plan_film(model, path, FilmSettings(frames=2, **settings))
@@ -171,15 +151,8 @@ def test_what_no_photograph_saw_gets_a_note(model, tmp_path, path, settings, adv
     assert len(notes) == (advice is not None)
     if advice:
         frames = "1 of 2 frames have over 10% of their pixels outside all photographs (frames 1)"
-        assert notes[0].startswith(frames if path == "own" else "2 of 2 frames") and notes[0].endswith(
-            f"expect artefacts there; {advice}"
-        )
-
-
-def _moved(x: float) -> np.ndarray:
-    motion = np.eye(4)
-    motion[0, 3] = x
-    return motion
+        assert notes[0].startswith(frames if path == "own" else "2 of 2 frames")
+        assert notes[0].endswith(f"expect artefacts there; {advice}")
 
 
 def test_a_film_alone_and_six_frames_on_a_sheet(model, tmp_path, capsys):
@@ -267,8 +240,8 @@ def walk(count: int = 12) -> list[Camera]:
     ],
 )
 def test_the_rig_is_found(cameras, kind, all_round):
-    rig = rig_of(cameras, 2.0)
-    assert rig.kind == kind and rig.kind in BY_KIND
+    rig = paths.rig_of(cameras, 2.0)
+    assert rig.kind == kind and rig.kind in paths.BY_KIND
     if kind != "free":
         assert (rig.span is None) == all_round
     if kind in ("ring", "forward"):
@@ -278,12 +251,12 @@ def test_the_rig_is_found(cameras, kind, all_round):
 def test_a_film_of_one_side_stays_near_the_photographs():
     """Over a wide arc it goes from one to the next; a spiral is as far from the scene as the photographs, and among them."""
     wide, narrow = around(np.arange(0, 70, 12)), around(np.arange(0, 31, 6))
-    assert [path_of(rig_of(c, 2.0)) for c in (wide, narrow)] == ["interpolate", "spiral"]
-    rig = rig_of(narrow, 2.0)
+    assert [paths.path_of(paths.rig_of(c, 2.0)) for c in (wide, narrow)] == ["interpolate", "spiral"]
+    rig = paths.rig_of(narrow, 2.0)
     centers = np.array([c.center for c in narrow])
     ahead = rig.center - centers.mean(0)
     ahead /= np.linalg.norm(ahead)
-    path = camera_path("spiral", rig, narrow, 40)
+    path = paths.camera_path("spiral", rig, narrow, 40)
     for c in path:
         assert abs(project_points(c, rig.center[None])[0][0] - c.K[:2, 2]).max() < 1e-6
         assert np.allclose(c.viewmat[:3, :3] @ c.viewmat[:3, :3].T, np.eye(3), atol=1e-12)
@@ -317,10 +290,24 @@ def test_a_film_has_the_shape_of_most_photographs():
     cameras = around(np.arange(0, 60, 12))
     tall = [dataclasses.replace(c, width=30, height=40, K=c.K[[1, 0, 2]][:, [1, 0, 2]]) for c in cameras[1:]]
     mixed = [cameras[0], *tall]
-    rig = rig_of(mixed, 4.0)
-    keys = tour_of(mixed, [rig.reach(c) for c in mixed], 2.0, 100)[0]
-    for path in (camera_path("spiral", rig, mixed, 3), camera_path("turntable", rig, mixed, 3), through(keys, 5)):
+    rig = paths.rig_of(mixed, 4.0)
+    keys = paths.tour_of(mixed, [rig.reach(c) for c in mixed], 2.0, 100)[0]
+    for path in (
+        paths.camera_path("spiral", rig, mixed, 3),
+        paths.camera_path("turntable", rig, mixed, 3),
+        paths.through(keys, 5),
+    ):
         assert {(c.width, c.height) for c in path} == {(30, 40)}
+    # a new size keeps the vertical field of view and where the axis meets the image, and square pixels stay square
+    camera = ring(1)[0]
+    wide = paths.framed(camera, (160, 64), None)
+    assert wide.K[0, 0] == wide.K[1, 1] == pytest.approx(2 * camera.K[1, 1]) and (wide.width, wide.height) == (160, 64)
+    assert paths.framed(camera, (80, 64)).K == pytest.approx(camera.K * [[2], [2], [1]])
+    near = paths.framed(camera, None, math.radians(40))
+    assert 2 * math.degrees(math.atan(0.5 * near.height / near.K[1, 1])) == pytest.approx(40)
+    assert paths.framed(camera) == camera
+    turned = paths.framed(Camera(camera.viewmat, K, 40, 30), turned=True)
+    assert turned.K.tolist() == [[55, 0, 15], [0, 50, 20], [0, 0, 1]] and (turned.width, turned.height) == (30, 40)
 
 
 @pytest.mark.parametrize("roll", [(0, 0), (90, 90), (3, -4)])
@@ -328,11 +315,11 @@ def test_a_film_has_the_shape_of_most_photographs():
 def test_a_ring_is_circled_level_whatever_way_the_photographs_lie(kind, roll):
     """Every frame has the object at its centre, upright, from the distance and height of the cameras; sides are swapped."""
     cameras = [rolled(c, roll[i % 2]) for i, c in enumerate(around(np.arange(0, 360, 24)))]
-    rig = rig_of(cameras, 1.0)
+    rig = paths.rig_of(cameras, 1.0)
     assert rig.turned == (abs(roll[0]) == 90) and np.abs(rig.up - UP).max() < 1e-6
-    for up in (rig_among(cameras, TARGET + 0.1 * np.eye(3)).up, common_up(cameras)):
+    for up in (paths.rig_among(cameras, TARGET + 0.1 * np.eye(3)).up, paths.common_up(cameras)):
         assert np.abs(up - UP).max() < 1e-6
-    path = camera_path(kind, rig, cameras, 9)
+    path = paths.camera_path(kind, rig, cameras, 9)
     for c in path:
         seen = c.viewmat[:3, :3] @ TARGET + c.viewmat[:3, 3]
         # focus_point is pulled to the mean centre by a millionth of the distance between them
@@ -351,14 +338,14 @@ def test_up_is_the_side_that_people_stand_on(rolls):
     cameras = [rolled(c, rolls[i % 2]) for i, c in enumerate(around(np.arange(0, 360, 24)))]
     flip = np.diag([1.0, -1, -1, 1])
     flipped = [Camera(c.viewmat @ flip, c.K, c.width, c.height) for c in cameras]
-    assert rig_of(cameras, 1.0).up @ UP > 0.999 and rig_of(flipped, 1.0).up @ (flip[:3, :3] @ UP) > 0.999
+    assert paths.rig_of(cameras, 1.0).up @ UP > 0.999 and paths.rig_of(flipped, 1.0).up @ (flip[:3, :3] @ UP) > 0.999
 
 
 @pytest.mark.parametrize("cameras", [around(np.arange(0, 190, 20)), around(np.arange(0, 50, 12))])
 def test_a_turntable_never_goes_where_no_camera_was(cameras):
     """It swings through the cameras' azimuths and back, with the object in every frame."""
-    rig = rig_of(cameras, 4.0)
-    path = camera_path("turntable", rig, cameras, 40)
+    rig = paths.rig_of(cameras, 4.0)
+    path = paths.camera_path("turntable", rig, cameras, 40)
     nearest = [min(np.linalg.norm(c.center - v.center) for v in cameras) for c in path]
     assert max(nearest) < 1.0 and max(np.linalg.norm(a.center - b.center) for a, b in zip(path, path[1:] + path[:1])) < 0.9
     for c in path:
@@ -369,24 +356,45 @@ def test_a_turntable_never_goes_where_no_camera_was(cameras):
 @pytest.mark.parametrize(("roll", "azimuths"), [(0, [0, 110, 235]), (90, [0, 110, 235]), (-90, [10, 80, 150, 290])])
 def test_three_photographs_are_enough_to_know_what_is_up(roll, azimuths):
     """Any three centres lie in a plane, which says nothing where the photographs were taken from different heights."""
-    rig = rig_of([rolled(c, roll) for c in around(azimuths)], 1.0)
+    rig = paths.rig_of([rolled(c, roll) for c in around(azimuths)], 1.0)
     assert rig.turned == (roll != 0) and rig.up @ UP > 0.999
     heights = [around([a], e)[0] for a, e in zip(azimuths, (0, 50, 10, 40))]
-    assert not rig_of(heights, 1.0).turned and rig_of(heights, 1.0).up @ UP > 0.9
+    assert not paths.rig_of(heights, 1.0).turned and paths.rig_of(heights, 1.0).up @ UP > 0.9
 
 
-def test_close_photographs_from_below_do_not_tilt_a_film():
-    """Eight cameras on an arc and two below, nearer to the subject: a plane through them leans, but the cameras are level."""
-    cameras = [*around(np.linspace(-55, 50, 8), 5.0), *around([-10, 15], -20.0, 1.6)]
-    cameras = [rolled(c, 4 * (-1) ** i) for i, c in enumerate(cameras)]
-    assert rig_of(cameras, 4.0).up @ UP > math.cos(math.radians(5))
-
-
-def test_in_a_room_a_film_looks_around():
+def test_rooms_close_photographs_rings_and_closed_splines():
     cameras = room()
-    path = camera_path("turntable", rig_of(cameras, 2.0), cameras, 8)
+    path = paths.camera_path("turntable", paths.rig_of(cameras, 2.0), cameras, 8)
     assert all(np.allclose(c.center, TARGET, atol=1e-9) and abs(c.viewmat[2, :3] @ UP) < 1e-6 for c in path)
     assert np.linalg.norm(np.mean([c.viewmat[2, :3] for c in path], axis=0)) < 1e-6
+    # of eight cameras on an arc and two below, nearer: a plane through them leans, but the cameras are level
+    cameras = [*around(np.linspace(-55, 50, 8), 5.0), *around([-10, 15], -20.0, 1.6)]
+    cameras = [rolled(c, 4 * (-1) ** i) for i, c in enumerate(cameras)]
+    assert paths.rig_of(cameras, 4.0).up @ UP > math.cos(math.radians(5))
+    # between two far views of a ring the path goes around, not through
+    cameras = around([0, 70, 140, 220, 290])
+    rig = paths.rig_of(cameras, 2.0)
+    keys, closed, _ = paths.tour_of(cameras, [rig.reach(c) for c in cameras], 2.0, 100)
+    for c in paths.through(keys, 60, closed=closed):
+        seen = c.viewmat[:3, :3] @ TARGET + c.viewmat[:3, 3]
+        assert np.abs(seen[:2]).max() < 1e-4 and abs(seen[2] - 4) < 0.05
+    # neither position nor rotation, whose quaternion comes back as its opposite, has a corner where the spline closes
+    keys = around([0, 90, 180, 270, 0])
+    frames = 400
+    path = paths.through([paths.Keyframe(c, float(i)) for i, c in enumerate(keys)], frames, closed=True)
+    eyes, axes = np.array([c.center for c in path]), np.array([c.viewmat[:3, :3] for c in path])
+    for values in (eyes, axes.reshape(frames, 9)):
+        speed = np.diff(np.concatenate([values, values[:2]]), axis=0)
+        assert np.abs(np.diff(speed, axis=0)).max() < 0.1 * np.abs(speed).max()
+    # a tour of views whose names say nothing goes from neighbour to neighbour, and of too many views through some
+    azimuths = np.arange(0, 300, 20)
+    shuffled = around(azimuths[np.random.default_rng(0).permutation(15)])
+    keys, _, by_name = paths.tour_of(shuffled, [0.0] * 15, 4.0, 100)
+    legs = [np.linalg.norm(a.camera.center - b.camera.center) for a, b in itertools.pairwise(keys)]
+    assert not by_name and len(legs) == 14 and max(legs) < 1.5
+    assert paths.tour_of(around(azimuths), [0.0] * 15, 4.0, 100)[2]
+    keys, closed, _ = paths.tour_of(around(azimuths), [0.0] * 15, 4.0, 6)
+    assert len(keys) - closed == 6
 
 
 @pytest.mark.parametrize(
@@ -396,12 +404,12 @@ def test_in_a_room_a_film_looks_around():
 )
 def test_a_tour_passes_through_the_cameras(cameras, closed):
     """At a keyframe's time the path is that camera, and from frame to frame it neither jumps nor jerks."""
-    rig = rig_of(cameras, 2.0)
-    keys, is_closed, by_name = tour_of(cameras, [rig.reach(c) for c in cameras], 4.0, 100)
+    rig = paths.rig_of(cameras, 2.0)
+    keys, is_closed, by_name = paths.tour_of(cameras, [rig.reach(c) for c in cameras], 4.0, 100)
     assert {id(k.camera) for k in keys} == {id(c) for c in cameras} and is_closed is closed
     end = keys[-1].seconds
     assert end == pytest.approx(4.0)
-    path = through(keys, 2001)
+    path = paths.through(keys, 2001)
     for key in keys:
         at = path[round(key.seconds / end * 2000)]
         assert np.linalg.norm(at.center - key.camera.center) < 0.03 and at.viewmat[2] @ key.camera.viewmat[2] > 0.999
@@ -410,49 +418,3 @@ def test_a_tour_passes_through_the_cameras(cameras, closed):
     assert steps.max() < 20 * np.median(steps)
     assert np.linalg.norm(np.diff(eyes, 2, axis=0), axis=1).max() < 0.15 * np.median(steps)
     assert np.allclose(path[0].viewmat, cameras[0].viewmat, atol=1e-9) or not by_name
-
-
-def test_a_tour_around_an_object_keeps_it_in_every_frame():
-    """Between two far views of a ring the path goes around, not through."""
-    cameras = around([0, 70, 140, 220, 290])
-    rig = rig_of(cameras, 2.0)
-    keys, closed, _ = tour_of(cameras, [rig.reach(c) for c in cameras], 2.0, 100)
-    for c in through(keys, 60, closed=closed):
-        seen = c.viewmat[:3, :3] @ TARGET + c.viewmat[:3, 3]
-        assert np.abs(seen[:2]).max() < 1e-4 and abs(seen[2] - 4) < 0.05
-
-
-def test_a_tour_of_views_whose_names_say_nothing_goes_from_neighbour_to_neighbour():
-    """And of too many views it passes through some."""
-    azimuths = np.arange(0, 300, 20)
-    shuffled = around(azimuths[np.random.default_rng(0).permutation(15)])
-    keys, _, by_name = tour_of(shuffled, [0.0] * 15, 4.0, 100)
-    legs = [np.linalg.norm(a.camera.center - b.camera.center) for a, b in itertools.pairwise(keys)]
-    assert not by_name and len(legs) == 14 and max(legs) < 1.5
-    assert tour_of(around(azimuths), [0.0] * 15, 4.0, 100)[2]
-    keys, closed, _ = tour_of(around(azimuths), [0.0] * 15, 4.0, 6)
-    assert len(keys) - closed == 6
-
-
-def test_a_closed_spline_has_no_corner_where_it_closes():
-    """Neither in position nor in rotation, whose quaternion comes back as its opposite."""
-    keys = around([0, 90, 180, 270, 0])
-    frames = 400
-    path = through([Keyframe(c, float(i)) for i, c in enumerate(keys)], frames, closed=True)
-    eyes, axes = np.array([c.center for c in path]), np.array([c.viewmat[:3, :3] for c in path])
-    for values in (eyes, axes.reshape(frames, 9)):
-        speed = np.diff(np.concatenate([values, values[:2]]), axis=0)
-        assert np.abs(np.diff(speed, axis=0)).max() < 0.1 * np.abs(speed).max()
-
-
-def test_size_and_field_of_view():
-    """A new size keeps the vertical field of view and where the axis meets the image, and square pixels stay square."""
-    camera = ring(1)[0]
-    wide = framed(camera, (160, 64), None)
-    assert wide.K[0, 0] == wide.K[1, 1] == pytest.approx(2 * camera.K[1, 1]) and (wide.width, wide.height) == (160, 64)
-    assert framed(camera, (80, 64)).K == pytest.approx(camera.K * [[2], [2], [1]])
-    near = framed(camera, None, math.radians(40))
-    assert 2 * math.degrees(math.atan(0.5 * near.height / near.K[1, 1])) == pytest.approx(40)
-    assert framed(camera) == camera
-    turned = framed(Camera(camera.viewmat, K, 40, 30), turned=True)
-    assert turned.K.tolist() == [[55, 0, 15], [0, 50, 20], [0, 0, 1]] and (turned.width, turned.height) == (30, 40)

@@ -60,9 +60,7 @@ from warpgs.pipeline.train.settings import FitConfig
 from warpgs.pipeline.train.strategies.base import STRATEGIES
 from warpgs.pipeline.train.strategies.sampling import MethodConfig
 from warpgs.report.images import BOXES, crops, disagreement, sheet
-from warpgs.synthetic.demo import split_spec, write_demo
-
-# Tables of a study: the figures that were measured, in three notations that agree.
+from warpgs.synthetic.demo import split_spec
 
 BASE, OTHER = [20.0, 20.2, 20.1], [20.6, 20.7, 20.8]
 GAP = paired_difference(OTHER, BASE)
@@ -104,9 +102,7 @@ def test_markdown_holds_means_deviations_and_differences():
     gaps = {"b": {"psnr": paired_difference([21.0], [20.0])}}
     figures, gaps = cells(markdown(table_of(samples=one, differences=gaps, metrics=("psnr",))))
     assert figures[2][1] == "20.00" and gaps[2][1] == "+1.00"
-
-
-def test_ablation_has_check_marks_in_every_notation():
+    # an ablation has check marks in every notation
     t = table_of(switches=("Hier", "S_{rend}"), marks={"full": (True, True), "no a_b|c": (False, True)})
     figures, _ = cells(markdown(t))
     assert figures[0][:3] == ["row", "Hier", "S_rend"] and [r[1:3] for r in figures[2:]] == [["✓", "✓"], ["✗", "✓"]]
@@ -116,8 +112,8 @@ def test_ablation_has_check_marks_in_every_notation():
     assert head[1:3] == ["Hier", "S_rend"] and [r[1:3] for r in rows if r[3] == "psnr"] == [[1, 1], [0, 1]]
 
 
-def test_csv_keeps_every_digit():
-    """What was not measured is empty, not zero."""
+def test_csv_keeps_every_digit_and_latex_is_balanced_and_escaped():
+    """What was not measured is empty, not zero; names cannot break a table: TeX reads ^^5c as a backslash."""
     head, *rows = csv_rows(table_of())
     rows = {(r[0], r[1]): dict(zip(head, r, strict=True)) for r in rows}
     r = rows["no a_b|c", "psnr"]
@@ -125,10 +121,6 @@ def test_csv_keeps_every_digit():
     assert found == [sample(OTHER).mean, sample(OTHER).sd, GAP.mean, GAP.low, GAP.high] and r["pairs"] == 3
     assert rows["full", "psnr"]["difference"] == rows["full", "psnr"]["pairs"] == rows["full", "lpips"]["mean"] == ""
     assert len(rows) == 6
-
-
-def test_latex_is_balanced_and_escaped():
-    """Names cannot break the table: TeX reads ^^5c as a backslash, and an empty line as the end of a paragraph."""
     tex = latex(table_of())
     assert tex.count("{") == tex.count("}") and tex.count("$") % 2 == 0 and "\\begin{tabular}{lcccr}" in tex
     assert "no a\\_b|c" in tex and "100 \\%" in tex and "paired by seed, with a 95 \\% t int" in tex
@@ -138,16 +130,19 @@ def test_latex_is_balanced_and_escaped():
     assert words in latex(table_of(caption="\\a^^5cinput{b}~c\n\nd"))
 
 
-def test_small_differences_keep_their_digits():
+def test_small_differences_keep_their_digits_and_few_measurements_have_no_spread():
     """No minus zero, and an interval without 0 does not end at 0."""
     assert interval(paired_difference([20.0, 20.0, 20.001], [20.0, 20.001, 20.0]), 2) == "+0.00 [+0.00, +0.00]"
     assert interval(paired_difference([19.9986, 19.9988], [20.0, 20.0]), 2) == "-0.00130 [-0.00257, -0.00003]"
-
-
-def test_best_follows_the_direction_and_what_is_printed():
-    """Equal when printed is equally best; nothing measured has no best."""
+    # equal when printed is equally best; nothing measured has no best
     table = table_of(samples={str(v): {m: sample([v]) for m in ("psnr", "lpips")} for v in (20.0001, 20.0004, 21.0)})
     assert [table.best("psnr"), table.best("lpips")] == [21.0, 20.0] and math.isnan(table.best("ssim"))
+    d = paired_difference([2.0], [1.0])
+    assert d.mean == 1 and math.isnan(d.sd) and math.isnan(d.low) and not d.excludes_zero
+    assert family_confidence(1) == 0.95 and family_confidence(10) == pytest.approx(0.995)
+    assert math.isnan(sample([]).mean) and paired_difference([1.0, 2.0], [0.0, 1.0]).low == 1.0
+    with pytest.raises(ValueError):
+        paired_difference([1.0, 2.0], [1.0])
 
 
 # Studies: paired, resumable, honest about what is missing.
@@ -157,11 +152,8 @@ B = dataclasses.replace(A, preset="b", steps=16)
 
 
 @pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    """A demo scene with photographs of 48 x 36 px."""
-    folder = tmp_path_factory.mktemp("data") / "still"
-    write_demo(folder, views=8, width=48, height=36)
-    return SceneRequest(str(folder), split_spec(8))
+def scene(demo):
+    return SceneRequest(str(demo), split_spec(8))
 
 
 @pytest.fixture(scope="module")
@@ -171,21 +163,13 @@ def finished(scene, tmp_path_factory):
     return request, run_study(request)
 
 
-def test_a_study_without_a_split_holds_a_view_out_and_its_fits_do_the_same(scene, capsys):
-    """A fit of its own would train on every view."""
-    wanted = dataclasses.replace(scene, split=None)
-    asked, _, split = study._place(wanted, "cpu")
-    assert split.test == ("004.png",) and "no --split given: 004.png is held out" in capsys.readouterr().out
-    assert read_scene(asked)[1] == split and asked.max_side == CPU_MAX_SIDE
-
-
 def metrics_of(request, variant, seed):
     return json.loads((run_folder(request, "still", variant, seed) / "metrics.json").read_text())
 
 
-def test_every_run_is_an_ordinary_run_folder_and_every_file_of_the_study_is_there(finished):
-    """SCENE/VARIANT/SEED; the figure shows both settings and the held-out photographs."""
-    request, _ = finished
+def test_every_run_is_an_ordinary_run_folder_and_tables_are_of_these_runs(finished):
+    """SCENE/VARIANT/SEED; means, deviations and paired intervals are computed once more from the run folders."""
+    request, lines = finished
     for variant, steps in (("a", 8), ("b b", 16)):
         for seed in (0, 1):
             folder = request.out / "still" / variant.replace(" ", "-") / str(seed)
@@ -197,14 +181,8 @@ def test_every_run_is_an_ordinary_run_folder_and_every_file_of_the_study_is_ther
     image = Image.open(request.out / "figure.png")
     assert image.width > 3 * 180 and image.height > 200
     record = json.loads((request.out / "study.json").read_text())
-    assert (
-        record["seeds"] == 2 and set(record["variants"]) == {"a", "b b"} and len(record["scenes"]["still"]["fingerprint"]) == 64
-    )
-
-
-def test_table_is_of_these_runs(finished):
-    """Means, deviations and paired intervals, computed here once more from the run folders."""
-    request, lines = finished
+    assert record["seeds"] == 2 and set(record["variants"]) == {"a", "b b"}
+    assert len(record["scenes"]["still"]["fingerprint"]) == 64
     text = (request.out / "table.md").read_text()
     figures, gaps = cells(text)
     psnr = {v: [metrics_of(request, v, s)["test"]["psnr"] for s in (0, 1)] for v in ("a", "b b")}
@@ -307,9 +285,8 @@ def test_a_strategy_whose_code_was_edited_is_fitted_again(finished, tmp_path, mo
 )  # fmt: skip
 def test_what_makes_a_run_another_run(finished, tmp_path, monkeypatch, key, value, word):
     """Each of these alone forbids to keep it."""
-    monkeypatch.setattr(
-        "warpgs.pipeline.farm.work.fit_request", lambda request: SimpleNamespace(metrics={"fitted": request.resume})
-    )
+    fitted = lambda request: SimpleNamespace(metrics={"fitted": request.resume})  # noqa: E731
+    monkeypatch.setattr("warpgs.pipeline.farm.work.fit_request", fitted)
     request = copy_of(finished, tmp_path)
     folder = run_folder(request, "still", "a", 0)
     record = json.loads((folder / "config.json").read_text()) | {key: value}
@@ -405,7 +382,7 @@ def fail(text):
     return job_of(text).name, "crashed", "its process ended"
 
 
-def test_requests_that_make_no_sense(scene, tmp_path):
+def test_requests_that_make_no_sense(scene, tmp_path, capsys):
     """Found out before anything is fitted."""
     both = {"a": A, "b": B}
     for words, scenes, variants, seeds in (
@@ -420,6 +397,11 @@ def test_requests_that_make_no_sense(scene, tmp_path):
     with pytest.raises(DataError, match="no view is held out"):
         run_study(StudyRequest((dataclasses.replace(scene, split="all"),), {"a": A, "b": B}, 1, tmp_path / "x", "cpu"))
     assert not (tmp_path / "x").exists()
+    # without a split a view is held out, in its fits too: a fit of its own would train on every view
+    wanted = dataclasses.replace(scene, split=None)
+    asked, _, split = study._place(wanted, "cpu")
+    assert split.test == ("004.png",) and "no --split given: 004.png is held out" in capsys.readouterr().out
+    assert read_scene(asked)[1] == split and asked.max_side == CPU_MAX_SIDE
 
 
 def test_command_compares_presets(scene, tmp_path, capsys, monkeypatch):
@@ -465,10 +447,7 @@ def test_ablation_rows_switch_off_one_part_each():
     assert all(marks["full"]) and list(SWITCHES)[:7] == ["hier", "s_render", "s_semantic", "s_geometry", "ra", "agp", "pm"]
     with pytest.raises(UsageError, match="preset '3dgs' has no sampling events"):
         ablation_variants(FitConfig())
-
-
-def test_ablation_switches_on_what_a_preset_leaves_out():
-    """A preset without scores gets a row with each and one with all, and no row twice: uniform is the preset itself."""
+    # a preset without scores gets a row with each and one with all, and no row twice: uniform is the preset itself
     base = dataclasses.replace(FULL, strategy="sampling", strategy_config=None)
     variants, _ = ablation_variants(base)
     rows = "full", "residual only", "residual + semantics + geometry", "with s_semantic", "with s_geometry"
@@ -480,10 +459,8 @@ def test_ablation_switches_on_what_a_preset_leaves_out():
     assert "paper-literal" not in ablation_variants(PRESETS["paper-literal"])[0]
 
 
-def test_command_ablates(tmp_path, capsys, monkeypatch):
+def test_command_ablates(scene, tmp_path, capsys, monkeypatch):
     """`warpgs ablate` from flags to a table with check marks; two of its rows, for time."""
-    scene = tmp_path / "still"
-    write_demo(scene, views=8, width=48, height=36)
     monkeypatch.setitem(PRESETS._made, "whole", FULL)
     monkeypatch.setattr("warpgs.pipeline.study.study.ABLATION_ROWS", {n: ABLATION_ROWS[n] for n in ("full", "no pm")})
     monkeypatch.setenv("WARPGS_CACHE", str(tmp_path / "cache"))
@@ -495,14 +472,14 @@ def test_command_ablates(tmp_path, capsys, monkeypatch):
 
     monkeypatch.setattr("warpgs.pipeline.farm.work.fit_request", noted)
     flags = ["--preset", "whole", "--seeds", "1", "--steps", "2", "--device", "cpu", "--out", str(tmp_path / "out")]
-    assert main(["ablate", str(scene), "--split", split_spec(8), *flags]) == 0
+    assert main(["ablate", scene.path, "--split", scene.split, *flags]) == 0
     assert "[2/2] still, no pm, seed 0" in capsys.readouterr().out
     figures, gaps = cells((tmp_path / "out" / "table.md").read_text())
     assert figures[0][1:9] == ["Hier", "S_rend", "S_sem", "S_geo", "RA", "AGP", "PM", "Events"]
     assert [r[1:9] for r in figures[2:]] == [["✓"] * 8, ["✓"] * 6 + ["✗", "✓"]]
     assert gaps[2] == ["no pm", "not exercised", "not exercised", "not exercised", "-"]  # two steps end before any event
     assert asked == [(0, PaperConfig()), (0, PaperConfig(pm=False))]
-    assert main(["ablate", str(scene), "--out", str(tmp_path / "y"), "--preset", "3dgs"]) == 2
+    assert main(["ablate", scene.path, "--out", str(tmp_path / "y"), "--preset", "3dgs"]) == 2
     assert "ablate a preset with them" in capsys.readouterr().err
 
 
@@ -521,15 +498,6 @@ def test_interval_equals_scipys_paired_t(n, confidence):
     assert (d.mean, d.sd, d.count) == pytest.approx((np.mean(ours - base), np.std(ours - base, ddof=1), n))
     assert (d.low, d.high) == pytest.approx((expected.low, expected.high), rel=1e-9)
     assert d.excludes_zero == (stats.ttest_rel(ours, base).pvalue < 1 - confidence)
-
-
-def test_few_measurements_have_no_spread_and_unpaired_ones_are_refused():
-    d = paired_difference([2.0], [1.0])
-    assert d.mean == 1 and math.isnan(d.sd) and math.isnan(d.low) and not d.excludes_zero
-    assert family_confidence(1) == 0.95 and family_confidence(10) == pytest.approx(0.995)
-    assert math.isnan(sample([]).mean) and paired_difference([1.0, 2.0], [0.0, 1.0]).low == 1.0
-    with pytest.raises(ValueError):
-        paired_difference([1.0, 2.0], [1.0])
 
 
 # The plot of a study and its figure: every number is shown, nothing leaves its frame, crops lie where pictures differ.
@@ -559,11 +527,8 @@ def test_forest_draws_every_seed_and_prints_every_interval():
     assert xs[1] < xs[2] < xs[0] and xs[0] - xs[2] == pytest.approx(xs[2] - xs[1], abs=0.2)
     # more PSNR is better, more LPIPS is worse, and what the interval does not decide is neither
     assert [c.get("fill") for c in large] == [BETTER, WORSE, UNDECIDED]
-    assert [c.get("fill") for c in forest_of("lpips").findall(f"{SVG}circle") if c.get("r") == "5.5"] == [
-        WORSE,
-        BETTER,
-        UNDECIDED,
-    ]
+    means = [c for c in forest_of("lpips").findall(f"{SVG}circle") if c.get("r") == "5.5"]
+    assert [c.get("fill") for c in means] == [WORSE, BETTER, UNDECIDED]
     one = {"b": {"psnr": paired_difference([0.5], [0.0]), "lpips": paired_difference([], [])}}
     root = ElementTree.fromstring(forest(Table("t", ("psnr", "lpips"), {"a": {}, "b": {}}, one)))
     words = [t.text for t in root.findall(f"{SVG}text")]
@@ -571,8 +536,8 @@ def test_forest_draws_every_seed_and_prints_every_interval():
     assert "no pair of runs to compare" in forest(Table("t", ("lpips",), {"a": {}, "b": {}}, one))
 
 
-def test_crops_find_where_pictures_differ():
-    """The largest disagreement first, the next one beside it, none overlapping."""
+def test_crops_find_where_pictures_differ_and_a_sheet_shows_them():
+    """The largest disagreement first, none overlapping; a sheet has columns of one width, colours kept, and boxes."""
     truth = np.zeros((40, 60, 3), np.float32)
     a, b = truth.copy(), truth.copy()
     a[30:36, 44:54] = 0.9
@@ -588,10 +553,6 @@ def test_crops_find_where_pictures_differ():
     many = crops(np.random.default_rng(0).random((20, 20)), 10, 10, 9)
     assert 1 <= len(many) <= 4
     assert all(abs(a - c) >= 10 or abs(b - d) >= 10 for i, (a, b) in enumerate(many) for c, d in many[:i])
-
-
-def test_sheet_shows_every_picture_and_its_crops():
-    """Columns of one width; a flat picture keeps its colour; boxes and frames have the colours of their crop."""
     colors = [(0.2, 0.4, 0.6), (0.8, 0.1, 0.3), (0.5, 0.5, 0.1)]
     cells = [(np.full((30, 40, 3), c, np.float32), f"{i}.00 dB") for i, c in enumerate(colors)]
     data = sheet(["a", "b" * 90, "photograph"], [("scene, view", cells, [(2, 3, 8, 6), (20, 10, 8, 6)])] * 2)

@@ -156,13 +156,18 @@ def test_animation_holds_all_frames_in_colour_and_time(tmp_path, suffix):
     assert write_film(path, np.zeros((3, 8, 8, 3))) == 3  # which do not move
 
 
-def test_all_frames_of_a_gif_have_one_palette():
-    """Else what stands still would flicker."""
-    frames = [np.full((6, 6, 3), 40 * i, np.uint8) for i in range(5)]
-    assert len({bytes(image.getpalette()) for image in _with_one_palette(frames)}) == 1
-
-
-def test_an_animation_that_breaks_off_leaves_the_old_one(tmp_path, monkeypatch):
+def test_films_that_cannot_be_are_refused_and_gifs_have_one_palette(tmp_path, monkeypatch):
+    """What an encoder breaks off leaves the old film; all frames of a GIF have one palette, so that nothing flickers."""
+    with pytest.raises(UsageError, match=r"one of .mp4, .webm, .webp, .gif, got .avi"):
+        write_film(tmp_path / "a.avi", np.zeros((2, 8, 8, 3)))
+    with pytest.raises(UsageError, match=f"at most {MAX_FPS} frames per second"):
+        write_film(tmp_path / "a.gif", np.zeros((2, 8, 8, 3)), fps=MAX_FPS + 1)
+    monkeypatch.setattr("warpgs.report.film.MAX_BYTES", 500)
+    with pytest.raises(UsageError, match="at most 2 frames of this size"):
+        write_film(tmp_path / "a.gif", np.zeros((9, 8, 8, 3)))
+    assert not list(tmp_path.iterdir())
+    monkeypatch.undo()
+    monkeypatch.setattr(film_files, "h264_encoder", lambda: None)
     path = tmp_path / "a.webp"
     path.write_bytes(b"old")
 
@@ -174,14 +179,5 @@ def test_an_animation_that_breaks_off_leaves_the_old_one(tmp_path, monkeypatch):
     with pytest.raises(ResourceError, match="could not be encoded"):
         write_film(path, np.zeros((2, 8, 8, 3)))
     assert path.read_bytes() == b"old" and list(tmp_path.iterdir()) == [path]
-
-
-def test_films_that_cannot_be_are_refused(tmp_path, monkeypatch):
-    with pytest.raises(UsageError, match=r"one of .mp4, .webm, .webp, .gif, got .avi"):
-        write_film(tmp_path / "a.avi", np.zeros((2, 8, 8, 3)))
-    with pytest.raises(UsageError, match=f"at most {MAX_FPS} frames per second"):
-        write_film(tmp_path / "a.gif", np.zeros((2, 8, 8, 3)), fps=MAX_FPS + 1)
-    monkeypatch.setattr("warpgs.report.film.MAX_BYTES", 500)
-    with pytest.raises(UsageError, match="at most 2 frames of this size"):
-        write_film(tmp_path / "a.gif", np.zeros((9, 8, 8, 3)))
-    assert not list(tmp_path.iterdir())
+    frames = [np.full((6, 6, 3), 40 * i, np.uint8) for i in range(5)]
+    assert len({bytes(image.getpalette()) for image in _with_one_palette(frames)}) == 1

@@ -31,9 +31,8 @@ TOP = CONTACT_MARGIN + TITLE_SIZE + 18
 
 
 def corner(index, width, height, columns):
-    return CONTACT_MARGIN + index % columns * (width + CONTACT_GAP), TOP + CONTACT_HEAD + index // columns * (
-        CONTACT_HEAD + height + CONTACT_GAP
-    )
+    x, y = CONTACT_MARGIN + index % columns * (width + CONTACT_GAP), index // columns * (CONTACT_HEAD + height + CONTACT_GAP)
+    return x, TOP + CONTACT_HEAD + y
 
 
 def test_tiles_keep_their_pixels_and_order():
@@ -49,10 +48,7 @@ def test_tiles_keep_their_pixels_and_order():
         x, y = corner(i, 200, 150, 3)
         np.testing.assert_allclose(sheet[y : y + 150, x : x + 200], wanted, atol=0.51 / 255)
 
-
-def test_labels_ranges_and_text_are_drawn_on_paper():
-    """Labels, colour bars and text have ink in their places and paper around them; longer text has more."""
-
+    # labels, colour bars and text have ink in their places and paper around them; longer text has more
     def ink(part):
         return int((np.abs(part - np.float32(CONTACT_PAPER) / 255).max(-1) > 0.1).sum())
 
@@ -60,15 +56,11 @@ def test_labels_ranges_and_text_are_drawn_on_paper():
     short = contact_sheet("title", ["Depth: none."], tiles, columns=2, tile_width=300)
     long = contact_sheet("title", ["Depth: none.", "Semantics: saliency and edges."], tiles, columns=2, tile_width=300)
     (ax, ay), (bx, by), (cx, cy) = (corner(i, 300, 60, 2) for i in range(3))
-    assert (
-        ink(short[ay - CONTACT_HEAD : ay, ax : ax + 100]) > 50 and ink(short[ay - CONTACT_HEAD : ay, ax + 200 : ax + 300]) == 0
-    )
-    assert ink(short[by - CONTACT_HEAD : by, bx + 200 : bx + 300]) > 200, "a colour bar with its range"
+    first, second = short[ay - CONTACT_HEAD : ay, ax:], short[by - CONTACT_HEAD : by, bx:]
+    assert ink(first[:, :100]) > 50 and ink(first[:, 200:300]) == 0
+    assert ink(second[:, 200:300]) > 200, "a colour bar with its range"
     assert ink(short[:TOP, CONTACT_MARGIN:]) > 50 and ink(short[:, :CONTACT_MARGIN]) == 0 == ink(short[:, -CONTACT_MARGIN:])
     assert ink(long[cy + 4 :, cx:]) > ink(short[cy + 4 :, cx:]) > 50
-
-
-def test_a_range_above_one_is_scaled():
     values = np.array([[0, 1.25], [2.5, 9]], np.float32).repeat(60, 0).repeat(60, 1)
     sheet = contact_sheet("t", [], [Tile("m", values, "INFERNO", 2.5)], columns=2, tile_width=120)
     x, y = corner(0, 120, 120, 2)
@@ -80,12 +72,28 @@ def decode(data):
     return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
 
 
-def test_png_decodes_to_the_rounded_pixels_in_rgb_order():
+def test_png_and_webp_decode_to_the_pixels_and_images_side_by_side_keep_them(tmp_path):
+    """A smooth WebP is off by a few of 255; a wide one is reduced in proportion; threads may write one file."""
     image = np.random.default_rng(0).uniform(-0.2, 1.2, (9, 13, 3)).astype(np.float32)
     data = png(image)
     assert data.startswith(b"\x89PNG")
     np.testing.assert_array_equal(decode(data), np.round(np.clip(image, 0, 1) * 255).astype(np.uint8))
     assert decode(png(np.array([[[1.0, 0.5, 0.0]]])))[0, 0].tolist() == [255, 128, 0]
+    y, x = np.mgrid[0:60, 0:90] / 90
+    image = np.stack([x, y, 0.5 + 0.4 * np.sin(9 * x * y)], 2)
+    data = webp(image)
+    assert data[:4] == b"RIFF" and data[8:12] == b"WEBP" and len(data) < len(png(image)) / 4
+    assert np.abs(decode(data) - 255 * image).mean() < 3
+    assert decode(webp(png(image), width=45)).shape == (30, 45, 3)
+    assert decode(webp(np.zeros((3, 4000, 3)), width=100)).shape == (1, 100, 3)
+    images = [np.full((5, w, 3), v, np.float32) for w, v in ((4, 0.1), (6, 0.2))]
+    row = side_by_side(images, gap=2)
+    assert row.shape == (5, 12, 3) and (row[:, :4] == images[0]).all() and (row[:, 6:] == images[1]).all()
+    assert (row[:, 4:6] == 1).all()
+    contents = [bytes([i]) * 50_000 for i in range(8)]
+    with ThreadPoolExecutor(8) as pool:
+        list(pool.map(lambda c: [write_bytes(tmp_path / "a.png", c) for _ in range(20)], contents))
+    assert (tmp_path / "a.png").read_bytes() in contents and len(list(tmp_path.iterdir())) == 1
 
 
 @pytest.mark.parametrize("kind", [np.float32, np.float64])
@@ -96,15 +104,12 @@ def test_mean_over_channels_has_the_bits_of_numpy(kind):
         np.testing.assert_array_equal(channel_mean(own), own.mean(-1))
 
 
-def test_error_map_is_black_without_error_and_brighter_with_more():
+def test_error_map_is_brighter_with_more_and_depth_map_warm_near_cold_far_and_gray_where_nothing_is():
     reference = np.full((1, 5, 3), 0.4, np.float32)
     image = reference + np.array([0, 0.05, 0.15, 0.3, 0.5], np.float32)[None, :, None]
     brightness = error_map(image, reference).sum(-1)[0]
     assert brightness[0] < 0.1 and (np.diff(brightness[:4]) > 0).all() and brightness[4] == brightness[3]
     np.testing.assert_array_equal(error_map(reference - 0.15, reference), error_map(reference + 0.15, reference))
-
-
-def test_depth_map_is_warm_near_cold_far_and_gray_where_nothing_is():
     depth = np.linspace(1, 5, 50, dtype=np.float32)[None].repeat(2, 0)
     alpha = np.ones_like(depth)
     alpha[1, 10:20] = 0.2
@@ -116,28 +121,3 @@ def test_depth_map_is_warm_near_cold_far_and_gray_where_nothing_is():
     wall = depth_map(np.full((3, 4), 2.0), np.ones((3, 4)))
     assert np.isfinite(wall).all() and (wall == wall[0, 0]).all()
     assert (colors[1, 10:20] == GRAY).all() and (colors[1, 30] == GRAY).all() and not (colors[0] == GRAY).all(-1).any()
-
-
-def test_side_by_side_keeps_every_pixel():
-    images = [np.full((5, w, 3), v, np.float32) for w, v in ((4, 0.1), (6, 0.2))]
-    row = side_by_side(images, gap=2)
-    assert row.shape == (5, 12, 3) and (row[:, :4] == images[0]).all() and (row[:, 6:] == images[1]).all()
-    assert (row[:, 4:6] == 1).all()
-
-
-def test_threads_may_write_one_file(tmp_path):
-    contents = [bytes([i]) * 50_000 for i in range(8)]
-    with ThreadPoolExecutor(8) as pool:
-        list(pool.map(lambda c: [write_bytes(tmp_path / "a.png", c) for _ in range(20)], contents))
-    assert (tmp_path / "a.png").read_bytes() in contents and len(list(tmp_path.iterdir())) == 1
-
-
-def test_webp_is_small_and_shows_the_same():
-    """A smooth image is off by a few of 255; a wide one is reduced in proportion; a file's contents count as an image."""
-    y, x = np.mgrid[0:60, 0:90] / 90
-    image = np.stack([x, y, 0.5 + 0.4 * np.sin(9 * x * y)], 2)
-    data = webp(image)
-    assert data[:4] == b"RIFF" and data[8:12] == b"WEBP" and len(data) < len(png(image)) / 4
-    assert np.abs(decode(data) - 255 * image).mean() < 3
-    assert decode(webp(png(image), width=45)).shape == (30, 45, 3)
-    assert decode(webp(np.zeros((3, 4000, 3)), width=100)).shape == (1, 100, 3)

@@ -53,23 +53,11 @@ def test_the_overview_shows_gaussians_and_both_kinds_of_cameras(monkeypatch):
     seen = {color: colored(image, color) for color in (module.TRAIN_COLOR, module.TEST_COLOR)}
     assert min(seen.values()) > 100
     assert colored(render_overview(wall(), RasterizeOptions(), train, [], UP), module.TEST_COLOR) == 0
-
-
-def test_lines_behind_a_surface_are_hidden():
-    shown = Camera(np.eye(4), np.array([[10.0, 0, 20], [0, 10, 10], [0, 0, 1]]), 40, 20)
-    image, depth = np.full((20, 40, 3), 255, np.uint8), np.full((20, 40), np.inf)
-    depth[:, :20] = 1
-    module._draw(image, depth, shown, np.array([[[-3.0, 0, 2], [3, 0, 2]]]), "#000000")
-    dark = (image < 128).all(-1)
-    assert not dark[:, :18].any() and dark[:, 22:34].any(0).all()
-
-
-def test_no_gaussians_have_no_overview():
     empty = Gaussians(**{n: t[:0] for n, t in wall().tensors().items()})
     assert render_overview(empty, RasterizeOptions(), [camera(0)], [], UP) is None
 
 
-def test_frusta_start_at_the_camera_and_pass_through_the_image_corners():
+def test_frusta_pass_through_the_image_corners_and_hidden_lines_and_far_points_are_left_out():
     c = camera(0.3)
     lines = module.frusta([c], 0.5)
     assert lines.shape == (8, 2, 3)
@@ -78,6 +66,18 @@ def test_frusta_start_at_the_camera_and_pass_through_the_image_corners():
     np.testing.assert_allclose(in_camera[:, 2], 0.5)
     pixels = in_camera @ K.T
     np.testing.assert_allclose(pixels[:, :2] / pixels[:, 2:], [[0, 0], [320, 0], [320, 240], [0, 240]], atol=1e-9)
+    # lines behind a surface are hidden
+    shown = Camera(np.eye(4), np.array([[10.0, 0, 20], [0, 10, 10], [0, 0, 1]]), 40, 20)
+    image, depth = np.full((20, 40, 3), 255, np.uint8), np.full((20, 40), np.inf)
+    depth[:, :20] = 1
+    module._draw(image, depth, shown, np.array([[[-3.0, 0, 2], [3, 0, 2]]]), "#000000")
+    dark = (image < 128).all(-1)
+    assert not dark[:, :18].any() and dark[:, 22:34].any(0).all()
+    # of a grid all points count for the camera's place, of the two in a hundred far away none
+    grid = np.stack(np.meshgrid(np.linspace(-3, 3, 20), np.linspace(0, 2, 20), [1.0, 1.5]), -1).reshape(-1, 3)
+    far = np.random.default_rng(0).normal(size=(16, 3)) * 50 + 200
+    near = module.within(np.concatenate([grid, far]), module.EDGE)
+    assert near[: len(grid)].all() and not near[len(grid) :].any()
 
 
 @pytest.mark.parametrize("code, text", [(-11, "code -11"), (1, "code 1 (no display)")])
@@ -94,20 +94,15 @@ def test_a_crash_of_vtk_is_a_note_and_not_ours(monkeypatch, code, text):
     assert seen["VTK_DEFAULT_OPENGL_WINDOW"] == "vtkEGLRenderWindow"
 
 
-def test_a_hanging_driver_is_given_up(monkeypatch):
+def test_a_hanging_driver_is_given_up_and_a_machine_that_cannot_render_is_told_what_to_install(monkeypatch):
     def hang(command, timeout, **_):
         raise subprocess.TimeoutExpired(command, timeout)
 
     monkeypatch.setattr(module.subprocess, "run", hang)
     assert "did not finish" in probe_rendering()[1]
-
-
-def test_a_whole_wall_is_in_the_image_and_no_far_background():
-    """The points from which the camera's place follows: all of a grid, none of the two in a hundred far away."""
-    wall = np.stack(np.meshgrid(np.linspace(-3, 3, 20), np.linspace(0, 2, 20), [1.0, 1.5]), -1).reshape(-1, 3)
-    far = np.random.default_rng(0).normal(size=(16, 3)) * 50 + 200
-    shown = module.within(np.concatenate([wall, far]), module.EDGE)
-    assert shown[: len(wall)].all() and not shown[len(wall) :].any()
+    monkeypatch.setattr(module, "run_pyvista", lambda *_: (False, "pyvista ended with code -11"))
+    with pytest.raises(ResourceError, match=r"no plot: pyvista ended with code -11.*libegl1"):
+        plot((200, 100), "white")
 
 
 @pytest.mark.parametrize("aspect", [2.0, 0.5])
@@ -163,16 +158,8 @@ def test_what_lies_far_outside_is_left_out_and_what_is_huge_is_shrunk(sent):
         strip = np.asarray(image)[-18:].reshape(-1, 3)
     for color in (TRAIN_COLOR, "#ff0000"):
         assert (strip == [int(color[i : i + 2], 16) for i in (1, 3, 5)]).all(1).any()
-
-
-def test_without_a_legend_the_plot_fills_the_image(sent):
+    del sent["axes"]
     data = plot((200, 100), "white", train=[], test=[], legend=[], axes=None)
     with Image.open(io.BytesIO(data)) as image:
         assert image.size == (200, 100) and (np.asarray(image) == 128).all()
     assert "axes" not in sent
-
-
-def test_a_machine_that_cannot_render_is_told_what_to_install(monkeypatch):
-    monkeypatch.setattr(module, "run_pyvista", lambda *_: (False, "pyvista ended with code -11"))
-    with pytest.raises(ResourceError, match=r"no plot: pyvista ended with code -11.*libegl1"):
-        plot((200, 100), "white")

@@ -82,8 +82,8 @@ def write(path, **changes):
     return values, text, Parsed(text)
 
 
-def test_nothing_is_loaded_from_anywhere(tmp_path):
-    """And every view has a slider that a keyboard reaches."""
+def test_nothing_is_loaded_from_anywhere_and_sampling_is_shown(tmp_path):
+    """The policy allows the page's own script; each view has a slider for a keyboard; later events are in a fold."""
     _, text, page = write(tmp_path / "report.html")
     sliders = page.all("input")
     assert len(sliders) == 2 and all(s["type"] == "range" and "images/" in s["aria-label"] for s in sliders)
@@ -93,17 +93,17 @@ def test_nothing_is_loaded_from_anywhere(tmp_path):
     for _, attrs in page.tags:
         assert not {"href", "srcset", "action"} & set(attrs)
         assert re.match("data:image/(png|webp);base64,", attrs.get("src", "data:image/png;base64,"))
-
-
-def test_the_policy_allows_the_page_s_own_script_alone(tmp_path):
-    _, text, page = write(tmp_path / "report.html")
     (policy,) = [m["content"] for m in page.all("meta") if m.get("http-equiv") == "Content-Security-Policy"]
     (script,) = re.findall(r"<script>(.*?)</script>", text, re.S)
     assert f"script-src 'sha256-{base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()}';" in policy
     assert policy.startswith("default-src 'none';")
+    assert "Why Gaussians were placed" in page.text("h2") and "Two sentences." in page.text("p")
+    section = text[text.index("Why Gaussians") : text.index("<h2>Details")]
+    assert section.count("<details>") == 1 and section.index('alt="first"') < section.index("<details>")
+    assert section.index("<summary>later</summary>") < section.index('alt="later"')
 
 
-def test_all_images_are_embedded_byte_for_byte(tmp_path):
+def test_images_are_embedded_byte_for_byte_and_numbers_shown_as_given(tmp_path):
     values, _, page = write(tmp_path / "report.html")
     embedded = [base64.b64decode(a["src"].split(",", 1)[1], validate=True) for a in page.all("img")]
     given = [data for v in values["views"] for data in v[2:]]
@@ -112,10 +112,6 @@ def test_all_images_are_embedded_byte_for_byte(tmp_path):
     for data in embedded:
         assert cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR).shape == (6, 8, 3)
     assert all(a.get("alt") for a in page.all("img"))
-
-
-def test_every_number_given_is_shown_as_given(tmp_path):
-    values, _, page = write(tmp_path / "report.html")
     labels, figures = zip(*values["figures"])
     shown = page.text("b")
     assert [t for t in shown if t in figures] == list(figures)
@@ -129,13 +125,6 @@ def test_every_number_given_is_shown_as_given(tmp_path):
     assert json.loads("".join(page.text("pre"))) == values["record"]
 
 
-def test_settings_hold_no_folder_of_the_machine(tmp_path):
-    details = {"scene": {"path": "/home/me/fern", "masks": r"C:\Users\me\m.png"}, "tried": ["/data/a.py:Own", "data/fern", 7]}
-    _, text, page = write(tmp_path / "report.html", record=details)
-    shown = {"scene": {"path": "fern", "masks": "m.png"}, "tried": ["a.py:Own", "data/fern", 7]}
-    assert json.loads("".join(page.text("pre"))) == shown and "/me" not in text
-
-
 def test_names_from_files_cannot_become_markup(tmp_path):
     evil = '<script>alert("x")</script>&amp;\'"'
     view = (evil, evil, *(image(0.5) for _ in range(4)))
@@ -147,15 +136,11 @@ def test_names_from_files_cannot_become_markup(tmp_path):
     assert len(page.all("script")) == 1
     assert page.text("h1", "p", "li", "td") == [evil] * 5
     assert page.all("input")[0]["aria-label"].endswith(evil)
-
-
-def test_parts_that_are_not_there_leave_no_empty_heading(tmp_path):
-    _, _, page = write(
-        tmp_path / "report.html", notes=[], scores=[["view"]], views=[], curves=[], sampling=None, pictures=[], protocol={}
-    )
-    assert page.text("h2") == ["Details"] and not page.all("img") and not page.all("ul")
-    for held_out, words in ((True, "Held-out"), (False, "trained on")):
-        assert any(words in t for t in write(tmp_path / "report.html", held_out=held_out)[2].text("h2"))
+    # settings hold no folder of the machine
+    details = {"scene": {"path": "/home/me/fern", "masks": r"C:\Users\me\m.png"}, "tried": ["/data/a.py:Own", "data/fern", 7]}
+    _, text, page = write(tmp_path / "report.html", record=details)
+    shown = {"scene": {"path": "fern", "masks": "m.png"}, "tried": ["a.py:Own", "data/fern", 7]}
+    assert json.loads("".join(page.text("pre"))) == shown and "/me" not in text
 
 
 def test_what_nobody_acts_on_stands_in_the_last_section(tmp_path):
@@ -168,15 +153,11 @@ def test_what_nobody_acts_on_stands_in_the_last_section(tmp_path):
     first, overview = page.all("img")[:2]
     assert (first["alt"], overview["alt"]) == ("a new viewpoint", "the Gaussians") and "data:image/webp" in first["src"]
     assert text.count("--aspect:1.33") == 2
-
-
-def test_sampling_shows_the_first_image_and_the_others_on_request(tmp_path):
-    """The first event is open under its text, later ones in a fold with their caption."""
-    _, text, page = write(tmp_path / "report.html")
-    assert "Why Gaussians were placed" in page.text("h2") and "Two sentences." in page.text("p")
-    section = text[text.index("Why Gaussians") : text.index("<h2>Details")]
-    assert section.count("<details>") == 1 and section.index('alt="first"') < section.index("<details>")
-    assert section.index("<summary>later</summary>") < section.index('alt="later"')
+    nothing = {key: [] for key in ("notes", "views", "curves", "pictures")} | {"sampling": None, "protocol": {}}
+    _, _, page = write(tmp_path / "report.html", scores=[["view"]], **nothing)
+    assert page.text("h2") == ["Details"] and not page.all("img") and not page.all("ul")
+    for held_out, words in ((True, "Held-out"), (False, "trained on")):
+        assert any(words in t for t in write(tmp_path / "report.html", held_out=held_out)[2].text("h2"))
 
 
 @pytest.mark.parametrize("ys", [[0.0, 0.0, 0.0], [float("nan")] * 3, [1e-9, 2e-9, float("inf")], [-5e7, 0.0, 5e7]])
@@ -221,14 +202,11 @@ def test_every_event_is_a_line_of_strict_json(tmp_path):
     assert [[*line.values()] for line in lines] == [[1, 0.5, None, 7], [2, None, 21.5, 8]]
     log.close()
     assert math.isnan(read_events(path)[0]["psnr"]) and math.isnan(read_events(path)[1]["loss"])
-
-
-def steps_of(path):
-    return [e["step"] for e in read_events(path)]
-
-
-def test_a_resumed_log_ends_with_the_checkpoint(tmp_path):
-    """Later events and a line cut by a kill are dropped; a new fit starts empty, and a log may be missing."""
+    write_json(tmp_path / "a.json", {"a": [math.nan, 1.5], "b": (math.inf,), "c": {"d": 2}})
+    assert json.loads((tmp_path / "a.json").read_text()) == {"a": [None, 1.5], "b": [None], "c": {"d": 2}}
+    with pytest.raises(ResourceError, match="no"):
+        EventLog(tmp_path / "no" / "metrics.jsonl")
+    # a resumed log ends with the checkpoint: later events and a line cut by a kill are dropped; a log may be missing
     path = tmp_path / "metrics.jsonl"
     fill(path, range(1, 11))
     fill(path, range(7, 9), start=6)
@@ -247,14 +225,8 @@ def test_a_resumed_log_ends_with_the_checkpoint(tmp_path):
     assert read_events(path) == [{"step": 3}]
 
 
-def test_a_folder_that_is_not_there(tmp_path):
-    with pytest.raises(ResourceError, match="no"):
-        EventLog(tmp_path / "no" / "metrics.jsonl")
-
-
-def test_json_holds_no_nan(tmp_path):
-    write_json(tmp_path / "a.json", {"a": [math.nan, 1.5], "b": (math.inf,), "c": {"d": 2}})
-    assert json.loads((tmp_path / "a.json").read_text()) == {"a": [None, 1.5], "b": [None], "c": {"d": 2}}
+def steps_of(path):
+    return [e["step"] for e in read_events(path)]
 
 
 # The index of a farm and its live table: every job, whatever it is called.
@@ -265,14 +237,7 @@ ROWS = [
 ]  # fmt: skip
 
 
-def test_failures_are_counted_by_message():
-    """The name of the scene in it makes no other message; nothing of a name is markup."""
-    page = farm_page("a & b", [replace(r, thumbnail="x y/t.jpg" if r.name == "a" else "") for r in ROWS], 90)
-    assert "<td>SCENE: no images &lt;b&gt;</td><td>2</td><td>d, e</td>" in page and "<h1>a &amp; b</h1>" in page
-    assert 'src="x%20y/t.jpg"' in page and "2 jobs are not done yet" in page and "25.50 dB" in page
-
-
-def test_the_table_shows_running_jobs_the_last_ones_and_the_time_left():
+def test_the_table_shows_running_jobs_and_without_a_terminal_each_job_once(capsys):
     table = FarmTable(live=True)
     table.display = type("Live", (), {"update": lambda self, panel: None})()
     table.update(ROWS, 75.0)
@@ -281,11 +246,12 @@ def test_the_table_shows_running_jobs_the_last_ones_and_the_time_left():
     text = console.file.getvalue()
     assert "1 waiting  1 running  1 done  2 failed" in text and "left 1 min 15 s" in text
     assert "25.50 dB" in text and "\x1b" not in text and "\\x1b[31m" in text
-
-
-def test_without_a_terminal_each_job_is_a_line_once(capsys):
     with FarmTable(live=False) as table:
-        table.update(ROWS, None)
-        table.update(ROWS, None)
+        for _ in range(2):
+            table.update(ROWS, None)
     lines = capsys.readouterr().out.splitlines()
     assert [line.split("  ")[0] for line in lines[:3]] == ["a", "d", "e"] and len(lines) == 4
+    # the index counts failures by message; the name of the scene in it makes no other message; nothing of a name is markup
+    page = farm_page("a & b", [replace(r, thumbnail="x y/t.jpg" if r.name == "a" else "") for r in ROWS], 90)
+    assert "<td>SCENE: no images &lt;b&gt;</td><td>2</td><td>d, e</td>" in page and "<h1>a &amp; b</h1>" in page
+    assert 'src="x%20y/t.jpg"' in page and "2 jobs are not done yet" in page and "25.50 dB" in page

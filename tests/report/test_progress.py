@@ -38,7 +38,8 @@ def clock(monkeypatch):
     return now
 
 
-def test_plain_lines_come_about_every_ten_seconds(capsys, clock):
+def test_plain_lines_come_about_every_ten_seconds_and_a_live_view_has_all_values(capsys, clock):
+    """The live view shows the same values; nothing done prints nothing, and an error passes through."""
     with Progress(100, live=False) as progress:
         for step in range(1, 101):
             clock[0] += 0.5
@@ -49,6 +50,18 @@ def test_plain_lines_come_about_every_ten_seconds(capsys, clock):
     last = lines[-1]
     for word in ("step 100 of 100", "loss 0.2500", "train PSNR 20.50 dB", "Gaussians 12,345", "per step 500 ms", "left 0 s"):
         assert word in last
+    with Progress(10, live=True) as progress:
+        for step in range(1, 11):
+            progress.update(step=step, loss=0.125, psnr=33.0, count=4321, seconds=0.1)
+    out = capsys.readouterr().out
+    for word in ("10 of 10", "0.1250", "33.00 dB", "4,321", "left"):
+        assert word in out
+    with pytest.raises(KeyboardInterrupt), Progress(10) as progress:
+        assert progress.live is False
+        raise KeyboardInterrupt
+    with Progress(10, live=False):
+        pass
+    assert capsys.readouterr().out == ""
 
 
 def test_time_left_is_that_of_the_steps_to_come(capsys, clock):
@@ -61,6 +74,16 @@ def test_time_left_is_that_of_the_steps_to_come(capsys, clock):
         first, second = capsys.readouterr().out.splitlines()
     assert "step 401 of 1,000" in first and first.endswith("per step -  left -")
     assert "step 410 of 1,000" in second and "per step 2000 ms" in second and "left 19 min 40 s" in second
+    # less than a quarter slower is noise; more is told, since a time that stands still is wrong
+    with Progress(1000, live=False) as progress:
+        for step in range(1, 301):
+            seconds = 1.0 if step <= 100 else 1.15 if step <= 200 else 3.0
+            clock[0] += seconds
+            progress.update(step=step, loss=0.1, psnr=30.0, count=5, seconds=seconds)
+    left = {int(line.split()[1]): shown_left(line) for line in capsys.readouterr().out.splitlines()[1:]}
+    noisy = [left[s] for s in sorted(left) if s <= 200]
+    assert noisy == sorted(noisy, reverse=True)
+    assert max(left[s] for s in left if 200 < s <= 300) > 1800
 
 
 def shown_left(line: str) -> float:
@@ -88,48 +111,16 @@ def test_time_left_counts_the_growth_to_come_and_does_not_rise(capsys, clock, sp
     assert len(left) > 7 and left[-1] == (600, 0)
 
 
-def test_time_left_rises_where_the_machine_becomes_much_slower(capsys, clock):
-    """By less than a quarter it stays: that is noise; more is told, since a time that stands still is wrong."""
-    with Progress(1000, live=False) as progress:
-        for step in range(1, 301):
-            seconds = 1.0 if step <= 100 else 1.15 if step <= 200 else 3.0
-            clock[0] += seconds
-            progress.update(step=step, loss=0.1, psnr=30.0, count=5, seconds=seconds)
-    left = {int(line.split()[1]): shown_left(line) for line in capsys.readouterr().out.splitlines()[1:]}
-    noisy = [left[s] for s in sorted(left) if s <= 200]
-    assert noisy == sorted(noisy, reverse=True)
-    assert max(left[s] for s in left if 200 < s <= 300) > 1800
-
-
-def test_nothing_done_prints_nothing(capsys):
-    """And an error passes through; pytest has no terminal, so lines are plain."""
-    with pytest.raises(KeyboardInterrupt), Progress(10) as progress:
-        assert progress.live is False
-        raise KeyboardInterrupt
-    with Progress(10, live=False):
-        pass
-    assert capsys.readouterr().out == ""
-
-
-def test_live_view_shows_all_values_and_ends_cleanly(capsys):
-    with Progress(10, live=True) as progress:
-        for step in range(1, 11):
-            progress.update(step=step, loss=0.125, psnr=33.0, count=4321, seconds=0.1)
-    out = capsys.readouterr().out
-    for word in ("10 of 10", "0.1250", "33.00 dB", "4,321", "left"):
-        assert word in out
-
-
-@pytest.mark.parametrize(
-    "seconds, text",
-    [(59.4, "59 s"), (59.6, "1 min 00 s"), (125, "2 min 05 s"), (3599.7, "1 h 00 min"), (4260, "1 h 11 min")],
-)
-def test_durations(seconds, text):
-    assert duration(seconds) == text
-
-
-def test_stages_of_the_set_up_are_shown_at_once_and_then_every_few_seconds(clock):
-    """A stage's first line, and one every five seconds; another stage does not wait."""
+def test_durations_and_stages_of_the_set_up(clock):
+    for seconds, text in {
+        59.4: "59 s",
+        59.6: "1 min 00 s",
+        125: "2 min 05 s",
+        3599.7: "1 h 00 min",
+        4260: "1 h 11 min",
+    }.items():
+        assert duration(seconds) == text
+    # a stage's first line, and one every five seconds; another stage does not wait
     lines = []
     stages = Stages(lines.append)
     for view in range(20):
@@ -156,10 +147,7 @@ def test_in_a_terminal_a_stage_has_one_line_with_a_bar(terminal):
     assert "scoring" in text and "0 of 3 views" in text and "a note\n" in text and "image 12" in text
     assert text.count("scoring\n") == 0 and text.rindex("\x1b[?25h") > text.rindex("\x1b[?25l")
     assert module._STATUS.display is None
-
-
-def test_while_steps_are_taken_their_panel_shows_the_stages(terminal):
-    """One display has the terminal: what is told beside the steps, such as a wait for kernels, stands below the panel."""
+    # while steps are taken, what is told beside them, such as a wait for kernels, stands below their panel
     out, stages = terminal(), Stages()
     stages("setting up")
     with Progress(10, live=True) as progress:

@@ -11,21 +11,9 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from warpgs import device, folders
-from warpgs.device import (
-    available_bytes,
-    choose_kernel_cache,
-    container_memory,
-    format_bytes,
-    in_background,
-    installed_bytes,
-    machine_memory,
-    parse_bytes,
-    wake_gpu,
-)
+from warpgs import device, folders, locks
 from warpgs.errors import UsageError
-
-# Work in threads.
+from warpgs.priors.networks import cache_folder
 
 
 def test_results_keep_the_order_of_their_arguments_which_are_made_late():
@@ -44,34 +32,16 @@ def test_results_keep_the_order_of_their_arguments_which_are_made_late():
         ahead.append(len(made) - len(ahead))
         return i + one
 
-    assert in_background(work, arguments(), 2) == [*range(1, 10)]
+    assert device.in_background(work, arguments(), 2) == [*range(1, 10)]
     assert max(ahead) <= 4
     with pytest.raises(ZeroDivisionError):
-        in_background(lambda i: 1 // i, ((1,), (0,)))
-    assert in_background(work, ()) == []
-
-
-# Sizes in bytes: what is read, what is refused, what is written.
-
-
-class Driver:
-    """A CUDA driver that notes its calls."""
-
-    def __init__(self, failing: int):
-        self.calls, self.failing = [], failing
-
-    def cuInit(self, flags):
-        self.calls.append(("cuInit", flags))
-        return self.failing
-
-    def cuDevicePrimaryCtxRetain(self, context, handle):
-        self.calls.append(("cuDevicePrimaryCtxRetain", handle))
-        return 0
+        device.in_background(lambda i: 1 // i, ((1,), (0,)))
+    assert device.in_background(work, ()) == []
 
 
 def woken():
     """Start the driver, and wait for the end of that."""
-    wake_gpu()
+    device.wake_gpu()
     for thread in threading.enumerate():
         if thread.name == "driver":
             thread.join()
@@ -82,7 +52,11 @@ def woken():
 )
 def test_a_driver_is_started_for_a_torch_that_can_use_it(library, failing, count, tmp_path, monkeypatch):
     """With the context of the first device; nothing is raised without a device, a driver, or the whole of torch."""
-    driver, spec = Driver(failing), SimpleNamespace(submodule_search_locations=[str(tmp_path)])
+    calls, spec = [], SimpleNamespace(submodule_search_locations=[str(tmp_path)])
+    driver = SimpleNamespace(
+        cuInit=lambda flags: calls.append(("cuInit", flags)) or failing,
+        cuDevicePrimaryCtxRetain=lambda context, handle: calls.append(("cuDevicePrimaryCtxRetain", handle)) or 0,
+    )
     errors: list = []
     monkeypatch.setattr(threading, "excepthook", errors.append)
     monkeypatch.setattr("importlib.util.find_spec", lambda name: spec)
@@ -90,7 +64,7 @@ def test_a_driver_is_started_for_a_torch_that_can_use_it(library, failing, count
     woken()
     (tmp_path / "lib" / (library or "libtorch_cpu.so")).mkdir(parents=True)
     woken()
-    assert driver.calls == [("cuInit", 0), ("cuDevicePrimaryCtxRetain", 0)][:count]
+    assert calls == [("cuInit", 0), ("cuDevicePrimaryCtxRetain", 0)][:count]
     monkeypatch.undo()
     monkeypatch.setattr(threading, "excepthook", errors.append)
     woken()
@@ -115,22 +89,14 @@ cli.main(["fit", "scene"])
     assert done.stdout.split() == ["woken", fit, fit, fit, others, fit]
 
 
-@pytest.mark.parametrize(
-    ("text", "size"), [("2GiB", 2**31), ("512 MB", 512 * 10**6), ("1.5kib", 1536), (".5 TB", 5 * 10**11), ("7B", 7)]
-)
-def test_sizes_are_read(text, size):
-    assert parse_bytes(text) == size
-
-
-@pytest.mark.parametrize("text", ["", "2", "-1GiB", "1e3MB", "0.1B", "2GiB!", "9" * 400 + "B", "٣GiB"])
-def test_nonsense_is_no_size(text):
-    with pytest.raises(UsageError, match="memory limit"):
-        parse_bytes(text)
-
-
-def test_sizes_are_written():
+def test_sizes_are_read_and_written():
+    for text, size in {"2GiB": 2**31, "512 MB": 512 * 10**6, "1.5kib": 1536, ".5 TB": 5 * 10**11, "7B": 7}.items():
+        assert device.parse_bytes(text) == size
+    for text in ("", "2", "-1GiB", "1e3MB", "0.1B", "2GiB!", "9" * 400 + "B", "٣GiB"):
+        with pytest.raises(UsageError, match="memory limit"):
+            device.parse_bytes(text)
     sizes = {5: "5 B", 2048: "2 KiB", 3 * 2**20: "3.0 MiB", 2.5 * 2**30: "2.5 GiB", 2**41: "2.0 TiB"}
-    assert {n: format_bytes(n) for n in sizes} == sizes
+    assert {n: device.format_bytes(n) for n in sizes} == sizes
 
 
 # Memory and processor on systems that lack what this one has, by stand-ins for what they read.
@@ -152,9 +118,8 @@ def psutil_like(error=None, **found):
 @pytest.fixture
 def elsewhere(monkeypatch, tmp_path):
     """A machine without /proc and /sys, of 16 GiB, 10 of them free; nothing is remembered of this one."""
-    monkeypatch.setattr(device, "OWN_CGROUPS", tmp_path / "proc")
-    monkeypatch.setattr(device, "CGROUPS", tmp_path / "sys")
-    monkeypatch.setattr(device, "CPU_INFO", tmp_path / "cpuinfo")
+    for name, file in (("OWN_CGROUPS", "proc"), ("CGROUPS", "sys"), ("CPU_INFO", "cpuinfo")):
+        monkeypatch.setattr(device, name, tmp_path / file)
     monkeypatch.setitem(sys.modules, "psutil", psutil_like(total=16 * GIB, available=10 * GIB))
     forgotten = (device.installed_bytes, device._say_assumed)
     for f in forgotten:
@@ -172,19 +137,32 @@ def group(root, parts: str, **files):
         (folder / name.replace("__", ".")).write_text(f"{text}\n", "utf-8")
 
 
-def test_this_machine():
-    assert 2**28 < installed_bytes(CPU) < 2**46 and 2**20 < available_bytes(CPU) <= installed_bytes(CPU)
+def test_this_machine_and_memory_that_torch_holds_unused(monkeypatch):
+    assert 2**28 < device.installed_bytes(CPU) < 2**46 and 2**20 < device.available_bytes(CPU) <= device.installed_bytes(CPU)
     assert 1 <= device.usable_cores() <= (os.cpu_count() or 1) and device.processor_name()
+    # free on a CUDA device is what the driver says, and what torch has reserved and not given out
+    for name, value in (("mem_get_info", (1000, 5000)), ("memory_reserved", 300), ("memory_allocated", 20)):
+        monkeypatch.setattr(torch.cuda, name, lambda _, value=value: value)
+    assert device.available_bytes(torch.device("cuda", 0)) == 1280
 
 
 def test_without_control_groups(elsewhere):
     """What psutil says; a limit above the machine, or a file of nonsense, changes nothing."""
-    assert container_memory() is None and machine_memory() == (16 * GIB, 10 * GIB)
-    assert (installed_bytes(CPU), available_bytes(CPU)) == (16 * GIB, 10 * GIB)
+    assert device.container_memory() is None and device.machine_memory() == (16 * GIB, 10 * GIB)
+    assert (device.installed_bytes(CPU), device.available_bytes(CPU)) == (16 * GIB, 10 * GIB)
     group(elsewhere, "", memory__max=64 * GIB, memory__current=0)
-    assert machine_memory() == (16 * GIB, 10 * GIB)
+    assert device.machine_memory() == (16 * GIB, 10 * GIB)
     group(elsewhere, "", memory__max="-7 or so")
-    assert container_memory() is None
+    assert device.container_memory() is None
+    # limits of version 1: none is a large number; the group's path may lie outside of what the container sees
+    (elsewhere / "proc").write_text("4:cpu,memory:/docker/x\n1:name=systemd:/\n0::/\n", "utf-8")
+    none = {"memory__limit_in_bytes": 2**63 - 4096, "memory__usage_in_bytes": GIB}
+    group(elsewhere, "memory", **none)
+    assert device.container_memory() is None
+    group(elsewhere, "memory", memory__limit_in_bytes=2 * GIB, memory__stat=f"total_inactive_file {GIB // 2}")
+    assert device.machine_memory() == (2 * GIB, 3 * GIB // 2)
+    group(elsewhere, "memory/docker/x", memory__limit_in_bytes=GIB)  # what is used is not said
+    assert device.machine_memory() == (GIB, GIB)
 
 
 def test_limits_of_version_2(elsewhere):
@@ -193,11 +171,11 @@ def test_limits_of_version_2(elsewhere):
     group(elsewhere, "", memory__stat="anon 5")  # the root has no limit file
     group(elsewhere, "a", memory__max=4 * GIB, memory__current=3 * GIB, memory__stat=f"anon 1\ninactive_file {GIB}")
     group(elsewhere, "a/b", memory__max="max", memory__current=1)
-    assert container_memory() == machine_memory() == (4 * GIB, 2 * GIB)
+    assert device.container_memory() == device.machine_memory() == (4 * GIB, 2 * GIB)
     group(elsewhere, "a/b", memory__max=3 * GIB, memory__current=GIB, memory__stat="")
-    assert machine_memory() == (3 * GIB, 2 * GIB)
+    assert device.machine_memory() == (3 * GIB, 2 * GIB)
     group(elsewhere, "a", memory__current=6 * GIB)
-    assert machine_memory() == (3 * GIB, 0)
+    assert device.machine_memory() == (3 * GIB, 0)
 
 
 @pytest.mark.parametrize("own", ["0::/\n", "0::/../elsewhere\n", "", "odd\n0::\n", None])
@@ -206,19 +184,7 @@ def test_the_root_of_a_container_is_its_own_group(elsewhere, own):
     if own is not None:
         (elsewhere / "proc").write_text(own, "utf-8")
     group(elsewhere, "", memory__max=GIB, memory__current=2**20)
-    assert machine_memory() == (GIB, GIB - 2**20)
-
-
-def test_limits_of_version_1(elsewhere):
-    """No limit is a large number; the group's path may lie outside of what the container sees."""
-    (elsewhere / "proc").write_text("4:cpu,memory:/docker/x\n1:name=systemd:/\n0::/\n", "utf-8")
-    none = {"memory__limit_in_bytes": 2**63 - 4096, "memory__usage_in_bytes": GIB}
-    group(elsewhere, "memory", **none)
-    assert container_memory() is None
-    group(elsewhere, "memory", memory__limit_in_bytes=2 * GIB, memory__stat=f"total_inactive_file {GIB // 2}")
-    assert machine_memory() == (2 * GIB, 3 * GIB // 2)
-    group(elsewhere, "memory/docker/x", memory__limit_in_bytes=GIB)  # what is used is not said
-    assert machine_memory() == (GIB, GIB)
+    assert device.machine_memory() == (GIB, GIB - 2**20)
 
 
 REFUSALS = [PermissionError("/proc"), RuntimeError("host_statistics64"), None]
@@ -228,20 +194,12 @@ REFUSALS = [PermissionError("/proc"), RuntimeError("host_statistics64"), None]
 def test_a_system_that_says_nothing(elsewhere, monkeypatch, capsys, error):
     """A stated amount is assumed, with one line; a container's limit still counts."""
     monkeypatch.setitem(sys.modules, "psutil", None if error is None else psutil_like(error, total=GIB))
-    assert machine_memory() is None
-    assert [available_bytes(CPU), available_bytes(CPU), installed_bytes(CPU)] == [device.ASSUMED_BYTES] * 3
+    assert device.machine_memory() is None
+    assert [device.available_bytes(CPU), device.available_bytes(CPU), device.installed_bytes(CPU)] == [device.ASSUMED_BYTES] * 3
     said = capsys.readouterr().err
     assert said.count("\n") == 1 and "2 GiB are assumed" in said
     group(elsewhere, "", memory__max=GIB, memory__current=2**20)
-    assert available_bytes(CPU) == GIB - 2**20 and not capsys.readouterr().err
-
-
-def test_memory_that_torch_holds_unused_is_available(monkeypatch):
-    """Free on a CUDA device is what the driver says, and what torch has reserved and not given out."""
-    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda _: (1000, 5000))
-    monkeypatch.setattr(torch.cuda, "memory_reserved", lambda _: 300)
-    monkeypatch.setattr(torch.cuda, "memory_allocated", lambda _: 20)
-    assert available_bytes(torch.device("cuda", 0)) == 1280
+    assert device.available_bytes(CPU) == GIB - 2**20 and not capsys.readouterr().err
 
 
 def test_processors(elsewhere, monkeypatch):
@@ -259,8 +217,7 @@ def test_processors(elsewhere, monkeypatch):
         assert device.processor_name() == (processor or machine or "unknown")
 
 
-# Where kernels are compiled to: the usual folder, or a private one with a line that says so, or an error with its
-# remedy.
+# Where kernels are compiled to: the usual folder, a private one with a line that says so, or an error with its remedy.
 
 POSIX = pytest.mark.skipif(not hasattr(os, "getuid"), reason="mode bits say nothing on Windows")
 HOMES = ("HOME", "USERPROFILE", "HOMEDRIVE", "HOMEPATH", "LOCALAPPDATA", "XDG_CACHE_HOME", "WARP_CACHE_PATH", "WARPGS_CACHE")
@@ -328,10 +285,7 @@ def private(done: subprocess.CompletedProcess, reason: str) -> None:
 
 
 def test_a_home_that_cannot_be_written(python, tmp_path):
-    """A path below a file stands for /proc/1, a read-only disk and the like; kernels compile and run all the same.
-
-    If nothing else can be written either, every command ends with the code of resources, and the remedy.
-    """
+    """A path below a file stands for a read-only disk: kernels still run; if nothing else can be written, that is said."""
     (tmp_path / "file").write_text("")
     homes = dict.fromkeys(("HOME", "USERPROFILE", "LOCALAPPDATA"), str(tmp_path / "file" / "home"))
     private(python(COMPILE, **homes), "cannot be written")
@@ -349,7 +303,7 @@ def test_a_user_that_the_system_does_not_know(python, home, reason):
 
 def chosen(monkeypatch, folder) -> tuple[Path, str]:
     monkeypatch.setenv("WARP_CACHE_PATH", str(folder))
-    return choose_kernel_cache()
+    return device.choose_kernel_cache()
 
 
 def filled_cache(folder: Path) -> Path:
@@ -364,7 +318,10 @@ def test_a_sound_folder_is_used(monkeypatch, tmp_path):
     """It is made for this user alone; one that the user's program or Warp has set comes first."""
     assert chosen(monkeypatch, tmp_path / "new" / "cache") == ((tmp_path / "new" / "cache").resolve(), "")
     assert os.name == "nt" or (tmp_path / "new" / "cache").stat().st_mode & 0o777 == 0o700
-    assert choose_kernel_cache(str(tmp_path / "mine")) == ((tmp_path / "mine").resolve(), "")
+    assert device.choose_kernel_cache(str(tmp_path / "mine")) == ((tmp_path / "mine").resolve(), "")
+    monkeypatch.delattr(os, "getuid", raising=False)  # where files have no owners nothing is refused
+    tmp_path.chmod(0o777)
+    assert chosen(monkeypatch, tmp_path / "cache") == ((tmp_path / "cache").resolve(), "")
 
 
 @POSIX
@@ -384,8 +341,6 @@ def test_a_folder_that_others_can_write_to_is_refused(monkeypatch, tmp_path, whe
 @POSIX
 def test_groups_links_and_owners(monkeypatch, tmp_path):
     """A group of other users may not write, the user's own may; links in a cache and folders of others are not followed."""
-    from warpgs import locks
-
     cache = tmp_path / "cache"
     cache.mkdir()
     cache.chmod(0o775)
@@ -421,30 +376,24 @@ def test_what_another_user_owns_is_refused(monkeypatch, tmp_path, planted, refus
     assert (folder != cache.resolve()) == refused == ("other users can write to" in why)
 
 
-def test_where_files_have_no_owners_nothing_is_refused(monkeypatch, tmp_path):
-    monkeypatch.delattr(os, "getuid", raising=False)
-    tmp_path.chmod(0o777)
-    assert chosen(monkeypatch, tmp_path / "cache") == ((tmp_path / "cache").resolve(), "")
-
-
 def test_no_folder_is_ever_called_tilde(monkeypatch, tmp_path):
     """A ~ that nobody has replaced means the home folder; where that is not known, nothing is made."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
-    for name in ("HOME", "USERPROFILE"):
-        monkeypatch.setenv(name, str(tmp_path / "home"))
+
+    def homes(home):
+        for name in ("HOME", "USERPROFILE"):
+            monkeypatch.setenv(name, str(home))
+
+    homes(tmp_path / "home")
     assert chosen(monkeypatch, "~/k") == ((tmp_path / "home" / "k").resolve(), "")
     for home in ("~", "relative"):
-        for name in ("HOME", "USERPROFILE"):
-            monkeypatch.setenv(name, home)
+        homes(home)
         assert "an unknown home folder" in chosen(monkeypatch, "~/k")[1]
         monkeypatch.delenv("WARP_CACHE_PATH")
         monkeypatch.delenv("LOCALAPPDATA", raising=False)
-        assert folders.cache_home() is None and "no home" in choose_kernel_cache()[1]
-    from warpgs.priors.networks import cache_folder
-
-    for name in ("HOME", "USERPROFILE"):
-        monkeypatch.setenv(name, str(tmp_path / "home"))
+        assert folders.cache_home() is None and "no home" in device.choose_kernel_cache()[1]
+    homes(tmp_path / "home")
     monkeypatch.setenv("WARPGS_CACHE", "~/maps")  # of another cache, that of the networks' maps
     assert cache_folder() == tmp_path / "home" / "maps"
     assert {p.name for p in tmp_path.iterdir()} == {"home"}
@@ -459,7 +408,7 @@ def test_the_place_on_each_system(monkeypatch, tmp_path, system):
     for name in ("XDG_CACHE_HOME", "LOCALAPPDATA", "WARP_CACHE_PATH"):
         monkeypatch.delenv(name, raising=False)
     wanted = {"linux": ".cache/warp", "darwin": "Library/Caches/warp", "win32": "AppData/Local/NVIDIA/warp/Cache"}[system]
-    assert choose_kernel_cache() == ((tmp_path / wanted).resolve(), "")
+    assert device.choose_kernel_cache() == ((tmp_path / wanted).resolve(), "")
 
 
 # Idle threads of OpenMP: they sleep where warpgs is imported first, and a warning says so where they do not.

@@ -31,8 +31,8 @@ def refusal(folder) -> str:
     return str(e.value)
 
 
-def test_a_second_holder_is_told_whose_the_folder_is(tmp_path, monkeypatch):
-    """Number, machine, time and command of the holder; both may hold it one after the other."""
+def test_a_second_holder_is_told_whose_the_folder_is_and_impossible_paths_are_named(tmp_path, monkeypatch):
+    """Number, machine, time and command of the holder; a signature without sense is of another process; impossible paths."""
     monkeypatch.setattr(sys, "argv", ["/usr/bin/warpgs", "fit", "my scene", *["x"] * 200])
     with hold_folder(tmp_path) as notes:
         said = refusal(tmp_path)
@@ -43,13 +43,20 @@ def test_a_second_holder_is_told_whose_the_folder_is(tmp_path, monkeypatch):
     monkeypatch.setattr(sys, "argv", ["/lib/warpgs/__main__.py", "eval"])
     with hold_folder(tmp_path):
         assert "`warpgs eval`" in refusal(tmp_path)
-
-
-def test_a_signature_that_makes_no_sense_is_of_another_process(tmp_path):
     with hold_folder(tmp_path):
         for signature in (b"[" * 100_000, b"[]", b'{"command": ""}', bytes(1)):
             (tmp_path / LOCK).write_bytes(b"\n" + signature)
             assert refusal(tmp_path).startswith(f"{tmp_path}: another process is writing there")
+    (tmp_path / "made.ply").mkdir()
+    (tmp_path / "file").touch()
+    for name, message in (("made.ply", "made.ply: is a folder"), (300 * "a", "too long; choose a shorter")):
+        with pytest.raises(UsageError, match=message), hold_file(tmp_path / name):
+            pytest.fail("held")
+    for name in ("x" * 300, "file/below"):
+        with pytest.raises(ResourceError, match="choose another folder"), hold_folder(tmp_path / name):
+            pytest.fail("held")
+    with hold_file(tmp_path / "new" / "a.ply"):
+        assert "is writing there" in refusal(tmp_path / "new")
 
 
 def test_a_lock_file_alone_holds_nothing(tmp_path):
@@ -63,6 +70,16 @@ def test_a_lock_file_alone_holds_nothing(tmp_path):
     with hold_folder(tmp_path, "renders", "depth"):
         assert sorted(p.name for p in tmp_path.rglob("*")) == sorted([LOCK, "renders", "other", LEFT])
     assert not (tmp_path / LOCK).exists()
+    # after an error only a folder that was made here, with nothing in it, is removed again
+    base, own = tmp_path / "base", tmp_path / "base" / "own"
+    own.mkdir(parents=True)
+    for folder in (own, base / "made"):
+        with pytest.raises(ValueError, match="of the body"), hold_folder(folder):
+            raise ValueError("of the body")
+    with pytest.raises(ValueError, match="of the body"), hold_folder(base / "filled"):
+        (base / "filled" / "result").write_text("kept")
+        raise ValueError("of the body")
+    assert sorted(p.name for p in base.iterdir()) == ["filled", "own"]
 
 
 def test_a_lock_that_was_removed_meanwhile_is_taken_anew(tmp_path, monkeypatch):
@@ -80,10 +97,7 @@ def test_a_lock_that_was_removed_meanwhile_is_taken_anew(tmp_path, monkeypatch):
         assert len(calls) == 2 and (tmp_path / LOCK).is_file()
         assert str(os.getpid()) in refusal(tmp_path)
 
-
-def test_a_file_system_without_locks_is_noted(tmp_path, monkeypatch):
-    """The work goes on, and nothing is removed that may be another's."""
-
+    # where a file system has no locks the work goes on, and nothing is removed that may be another's
     def refuse(descriptor, blocking):
         raise OSError(errno.ENOSYS, "Function not implemented")
 
@@ -92,19 +106,6 @@ def test_a_file_system_without_locks_is_noted(tmp_path, monkeypatch):
     with hold_folder(tmp_path) as notes:
         assert len(notes) == 1 and "has no locks" in notes[0] and str(tmp_path) in notes[0]
     assert (tmp_path / LEFT).is_file()
-
-
-def test_only_a_folder_made_here_is_removed_again(tmp_path):
-    """After an error, and while nothing is in it; a folder of the user's own stays, and the error is the one that came."""
-    own = tmp_path / "own"
-    own.mkdir()
-    for folder in (own, tmp_path / "made"):
-        with pytest.raises(ValueError, match="of the body"), hold_folder(folder):
-            raise ValueError("of the body")
-    with pytest.raises(ValueError, match="of the body"), hold_folder(tmp_path / "filled"):
-        (tmp_path / "filled" / "result").write_text("kept")
-        raise ValueError("of the body")
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["filled", "own"]
 
 
 @pytest.mark.fault
@@ -120,17 +121,3 @@ def test_a_killed_holder_gives_the_folder_free(tmp_path):
         assert (tmp_path / LOCK).is_file()
         with hold_folder(tmp_path):
             assert str(os.getpid()) in refusal(tmp_path)
-
-
-def test_a_path_that_no_file_can_have_is_named_before_the_work(tmp_path):
-    """A folder, and a name beyond what the system takes; other names hold the folder of the file."""
-    (tmp_path / "made.ply").mkdir()
-    (tmp_path / "file").touch()
-    for name, message in (("made.ply", "made.ply: is a folder"), (300 * "a", "too long; choose a shorter")):
-        with pytest.raises(UsageError, match=message), hold_file(tmp_path / name):
-            pytest.fail("held")
-    for name in ("x" * 300, "file/below"):
-        with pytest.raises(ResourceError, match="choose another folder"), hold_folder(tmp_path / name):
-            pytest.fail("held")
-    with hold_file(tmp_path / "new" / "a.ply"):
-        assert "is writing there" in refusal(tmp_path / "new")

@@ -4,6 +4,7 @@ import ast
 import errno
 import io
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -11,20 +12,14 @@ from pathlib import Path
 
 import pytest
 
+import warpgs
+from tests.faults.tiny_runs import words_of
 from warpgs import process
+from warpgs.app import doctor
 from warpgs.app.cli import main
 from warpgs.export.ply import read_ply
 from warpgs.pipeline.run.folder import load_checkpoint
-from warpgs.process import (
-    CarefulStream,
-    answer,
-    careful_output,
-    hidden_stderr,
-    open_missing_descriptors,
-    output_to,
-    printable,
-    say,
-)
+from warpgs.report.progress import EventLog
 from warpgs.synthetic.demo import split_spec, write_demo
 
 # Output that cannot be written: said once, and no result is another for it.
@@ -67,16 +62,9 @@ def test_words_that_cannot_be_written(tmp_path, output):
             assert not said
 
 
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("streams") / "scene"
-    write_demo(folder, views=8, width=32, height=32)
-    return folder
-
-
-def fit_words(scene, out, steps=3):
+def fit_words(demo, out, steps=3):
     flags = ["--device", "cpu", "--preset", "3dgs", "--init.source", "random", "--init.random-count", "50"]
-    return ["fit", str(scene), "--split", split_spec(8), "--out", str(out), "--steps", str(steps), *flags]
+    return ["fit", str(demo), "--split", split_spec(8), "--out", str(out), "--steps", str(steps), *flags]
 
 
 class Broken(io.StringIO):
@@ -94,20 +82,20 @@ class Broken(io.StringIO):
 
 
 @pytest.mark.parametrize(("lines", "number"), [(0, errno.ENOSPC), (4, errno.EIO)])
-def test_a_fit_goes_on_without_its_output(scene, tmp_path, monkeypatch, lines, number):
+def test_a_fit_goes_on_without_its_output(demo, tmp_path, monkeypatch, lines, number):
     errors = io.StringIO()
     monkeypatch.setattr(sys, "stdout", Broken(lines, number))
     monkeypatch.setattr(sys, "stderr", errors)
-    assert main(fit_words(scene, tmp_path / "run")) == 0
+    assert main(fit_words(demo, tmp_path / "run")) == 0
     assert errors.getvalue() == f"warpgs: stdout cannot be written ({os.strerror(number)}){GOES_ON}"
     assert len(read_ply(tmp_path / "run" / "point_cloud.ply")) and (tmp_path / "run" / "report.html").is_file()
 
 
-def test_neither_stdout_nor_stderr(scene, tmp_path, monkeypatch):
+def test_neither_stdout_nor_stderr(demo, tmp_path, monkeypatch):
     """As under pythonw, or after `>&- 2>&-`: Python has no streams at all."""
     monkeypatch.setattr(sys, "stdout", None)
     monkeypatch.setattr(sys, "stderr", None)
-    assert main(fit_words(scene, tmp_path / "run")) == 0 and (tmp_path / "run" / "report.html").is_file()
+    assert main(fit_words(demo, tmp_path / "run")) == 0 and (tmp_path / "run" / "report.html").is_file()
     assert main(["export", str(tmp_path / "nothing"), "--to", "a.ply"]) == 3
     assert main(["doctor", "--device", "cpu"]) == 2
     assert main(["--help"]) == 4
@@ -117,49 +105,38 @@ def test_neither_stdout_nor_stderr(scene, tmp_path, monkeypatch):
     assert main(["export", "--nonsense"]) == 2
 
 
-def test_the_same_without_the_command_line(scene, tmp_path, monkeypatch, capfd):
+def test_the_same_without_the_command_line(demo, tmp_path, monkeypatch, capfd):
     """`warpgs.fit` in a program whose reader has gone; the program's own streams stay as they are."""
-    import warpgs
-
     stream = Broken(1, errno.EPIPE)
     monkeypatch.setattr(sys, "stdout", stream)
     monkeypatch.setattr(process, "_is_lost", False)
-    assert warpgs.fit(scene, warpgs.FitConfig(steps=2), out=tmp_path / "run", device="cpu").metrics["steps"] == 2
+    assert warpgs.fit(demo, warpgs.FitConfig(steps=2), out=tmp_path / "run", device="cpu").metrics["steps"] == 2
     assert sys.stdout is stream
     assert capfd.readouterr().err.count(GOES_ON) == 1
 
 
-def test_a_table_that_cannot_be_written(monkeypatch, capsys):
-    """The doctor's lines and tables, by rich and by `say`: code 4 for a full disk, none for a closed pipe."""
-    from warpgs.app import doctor
-
+def test_tables_answers_and_errors_of_the_program_itself(monkeypatch, capsys):
+    """Code 4 for a full disk, none for a closed pipe; an answer to another process fails; other errors are raised."""
     monkeypatch.setattr(doctor, "diagnose", lambda *_: [])
     for number, code in ((errno.ENOSPC, 4), (errno.EPIPE, 0)):
         monkeypatch.setattr(sys, "stdout", Broken(1, number))
         assert main(["doctor"]) == code
         assert capsys.readouterr().err.count("stdout cannot be written") == (code == 4)
-
-
-def test_an_answer_that_nobody_reads_is_an_error(monkeypatch, capsys):
-    """A process that works for another one ends with it."""
     monkeypatch.setattr(sys, "stdout", Broken(0, errno.EPIPE))
     monkeypatch.setattr(process, "_is_lost", False)
-    say("a line")
-    say("a line")
+    process.say("a line")
+    process.say("a line")
     assert capsys.readouterr().err.count("\n") == 1
     with pytest.raises(BrokenPipeError):
-        answer("a line")
-
-
-def test_what_is_no_failure_of_the_stream_is_raised(capsys):
-    """An error of the program itself, such as text that is none, is not taken for one."""
-    with careful_output(False), pytest.raises(TypeError):
+        process.answer("a line")
+    monkeypatch.undo()
+    with process.careful_output(False), pytest.raises(TypeError):
         sys.stdout.write(b"bytes")
     stream = io.TextIOWrapper(io.BytesIO(), "ascii")
     with pytest.raises(UnicodeEncodeError):
-        CarefulStream(stream).write("é")
+        process.CarefulStream(stream).write("é")
     stream.close()
-    careful = CarefulStream(stream)
+    careful = process.CarefulStream(stream)
     careful.write("a")
     careful.flush()
     assert isinstance(careful.failure, ValueError) and "closed file" in capsys.readouterr().err
@@ -182,7 +159,7 @@ sys.exit(0 if file > 2 and os.get_inheritable(1) and not os.fstat(file).st_size 
 def test_no_file_becomes_stdout_or_stderr(tmp_path, closed):
     code = CLOSED.format(closed=closed, path=str(tmp_path / "file"))
     assert subprocess.run([sys.executable, "-c", code], check=False, capture_output=True).returncode == 0
-    open_missing_descriptors()  # nothing to do
+    process.open_missing_descriptors()  # nothing to do
 
 
 def test_native_output_without_streams(monkeypatch, tmp_path):
@@ -190,17 +167,15 @@ def test_native_output_without_streams(monkeypatch, tmp_path):
     for stream in (None, Broken(0, errno.ENOSPC)):
         monkeypatch.setattr(sys, "stdout", stream)
         monkeypatch.setattr(sys, "stderr", stream)
-        with (tmp_path / "log").open("ab") as file, hidden_stderr(), output_to(file.fileno()):
+        with (tmp_path / "log").open("ab") as file, process.hidden_stderr(), process.output_to(file.fileno()):
             os.write(1, b"native\n")
     assert (tmp_path / "log").read_text() == 2 * "native\n"
 
 
 @with_sh
 @pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="this system has no SIGHUP")
-def test_a_terminal_that_hangs_up(scene, tmp_path, monkeypatch):
+def test_a_terminal_that_hangs_up(demo, tmp_path, monkeypatch):
     """SIGHUP comes and both streams fail: the step in progress is saved, and --resume continues from it."""
-    from warpgs.report.progress import EventLog
-
     write, streams = EventLog.write, [Broken(1000, errno.EIO), Broken(1000, errno.EIO)]
 
     def hang_up(log, **values):
@@ -214,7 +189,7 @@ def test_a_terminal_that_hangs_up(scene, tmp_path, monkeypatch):
         monkeypatch.setattr(EventLog, "write", hang_up)
         for name, stream in zip(("stdout", "stderr"), streams, strict=True):
             monkeypatch.setattr(sys, name, stream)
-        assert main(fit_words(scene, tmp_path / "run")) == 130
+        assert main(fit_words(demo, tmp_path / "run")) == 130
     finally:
         signal.signal(signal.SIGHUP, before)
     monkeypatch.undo()
@@ -225,35 +200,20 @@ def test_a_terminal_that_hangs_up(scene, tmp_path, monkeypatch):
 @with_sh
 @pytest.mark.slow
 @pytest.mark.parametrize("output", LOST)
-def test_a_fit_from_a_shell(scene, tmp_path, output):
+def test_a_fit_from_a_shell(demo, tmp_path, output):
     """In a process as a shell starts it: code 0, and all files, whatever became of its words."""
-    code, said = shell(fit_words(scene, tmp_path / "run"), output, tmp_path)
+    code, said = shell(fit_words(demo, tmp_path / "run"), output, tmp_path)
     assert code == 0 and (tmp_path / "run" / "report.html").is_file(), said
     assert said == (f"warpgs: stdout cannot be written ({LOST[output]}){GOES_ON}" if LOST[output] else "")
 
 
 @with_sh
 @pytest.mark.slow
-def test_every_command_goes_on(scene, tmp_path, monkeypatch):
+def test_every_command_goes_on(demo, tmp_path, monkeypatch):
     """What is written to files is there, and stderr holds one line on the output; a table is a product, and is not."""
-    run, cpu, split = str(tmp_path / "run"), ["--device", "cpu"], ["--split", split_spec(8)]
-    few = [*split, *cpu, "--steps", "2"]
-    commands = [
-        ["demo", str(tmp_path / "scene"), "--views", "8", "--width", "32", "--height", "32"],
-        ["fit", str(scene), "--out", run, *split, *cpu, "--steps", "30", "--preset", "quick"],
-        ["fit", "--out", run, "--resume"],
-        ["eval", run, *cpu],
-        ["render", run, "--frames", "2", "--path", "turntable", *cpu],
-        ["plot", run, *cpu],
-        ["export", run, "--to", str(tmp_path / "a.ply")],
-        ["convert", str(tmp_path / "a.ply"), str(tmp_path / "a.spz")],
-        ["prune", run, "--keep-psnr", "3", *cpu],
-        ["mesh", run, "--out", str(tmp_path / "m.glb"), "--resolution", "16", *cpu],
-        ["priors", "show", str(scene), *split, "--out", str(tmp_path / "priors")],
-        ["farm", str(scene.parent), "--out", str(tmp_path / "farm"), "--preset", "3dgs", *few],
-        ["doctor", "--warm"],
-        ["compare", str(scene), "--out", str(tmp_path / "study"), "--presets", "3dgs,mcmc", "--seeds", "1", *few],
-    ]
+    shutil.copytree(demo, demo.parent / "scenes" / "s0")
+    names = "demo fit resume eval render plot export convert prune mesh priors farm compare".split()
+    commands = [*(words_of(name, demo, tmp_path) for name in names), ["doctor", "--warm"]]
     for words in commands:
         errors = io.StringIO()
         monkeypatch.setattr(sys, "stdout", Broken(0, errno.ENOSPC))
@@ -261,8 +221,8 @@ def test_every_command_goes_on(scene, tmp_path, monkeypatch):
         assert main(words) == (4 if words[0] == "compare" else 0), errors.getvalue()
         said = errors.getvalue()
         assert said.count("\n") == 1 and "stdout cannot be written" in said, (words, said)
-    there = ["a.spz", "m.glb", "farm/index.html", "study/table.md", "run/plot.png", "run/eval.json", "run-pruned/config.json"]
-    assert all((tmp_path / name).is_file() for name in there)
+    there = "b.spz m.glb results/index.html study/table.md run/plot.png run/eval.json run-pruned/config.json"
+    assert all((tmp_path / name).is_file() for name in there.split())
 
 
 # What the program prints: text that no terminal obeys, in letters that the terminal has.
@@ -273,9 +233,15 @@ NASTY = "\x1b]0;owned\x07\x1b[2Ja\rb\nc\x9b31m\u202ed\u2066e\x7f\u2028f\ud800"
 
 def test_what_a_terminal_would_obey_is_printed_as_codes():
     """ESC, BEL, CR, line ends, C1, DEL, changes of direction, halves of characters; letters of all scripts stay."""
-    assert printable(NASTY) == r"\x1b]0;owned\x07\x1b[2Ja\rb\nc\x9b31m\u202ed\u2066e\x7f\u2028f\ud800"
+    assert process.printable(NASTY) == r"\x1b]0;owned\x07\x1b[2Ja\rb\nc\x9b31m\u202ed\u2066e\x7f\u2028f\ud800"
     for text in ("Straße, 写真 № 1", "می‌خواهم", "👩‍👩‍👧", "e\u0301 \u2013 \u201cx\u201d"):
-        assert printable(text) == text
+        assert process.printable(text) == text
+    # one file alone calls `print` or writes to stdout or stderr; a table of the doctor goes through rich, cell by cell
+    for path in (ROOT / "warpgs").rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+            if isinstance(node, ast.Call) and path.name != "process.py":
+                name = ast.unparse(node.func) if isinstance(node.func, (ast.Name, ast.Attribute)) else ""
+                assert name != "print" and not name.startswith(("sys.stdout.w", "sys.stderr.w")), path
 
 
 @pytest.mark.parametrize("encoding", ["ascii", "cp1252", "utf-8"])
@@ -283,18 +249,9 @@ def test_letters_that_a_terminal_does_not_have(monkeypatch, encoding):
     raw = io.BytesIO()
     stream = io.TextIOWrapper(raw, encoding)
     monkeypatch.setattr(sys, "stdout", stream)
-    say(f"写真{NASTY}")
+    process.say(f"写真{NASTY}")
     wanted = "写真" if encoding == "utf-8" else r"\u5199\u771f"
     assert raw.getvalue().decode(encoding).startswith(wanted) and b"\x1b" not in raw.getvalue()
-
-
-def test_one_place_prints():
-    """Only one file calls `print` or writes to stdout or stderr; a table of the doctor goes through rich, cell by cell."""
-    for path in (ROOT / "warpgs").rglob("*.py"):
-        for node in ast.walk(ast.parse(path.read_text("utf-8"))):
-            if isinstance(node, ast.Call) and path.name != "process.py":
-                name = ast.unparse(node.func) if isinstance(node.func, (ast.Name, ast.Attribute)) else ""
-                assert name != "print" and not name.startswith(("sys.stdout.w", "sys.stderr.w")), path
 
 
 def streams(monkeypatch, encoding):

@@ -28,9 +28,8 @@ from warpgs.pipeline.run.folder import load_checkpoint
 from warpgs.poses.photographs import _frames, scene_name
 from warpgs.process import ignored_signals, interrupting_signals, noted_signals, run_python, utf8_name
 from warpgs.report.film import write_film
+from warpgs.report.progress import EventLog
 from warpgs.synthetic.demo import split_spec, write_demo, write_object
-
-# What lies in the current folder never runs: a scene may come from anybody, and may hold a numpy.py.
 
 ROOT = Path(__file__).parent.parent.parent
 PLANTED = (
@@ -85,28 +84,20 @@ def test_no_fit_runs_what_lies_beside_a_scene(trap, tmp_path):
     assert run("-c", "import pyvista").returncode == 1 and "pyvista.py" in mark.read_text()
 
 
-def test_the_program_runs_nothing_from_the_current_folder(trap, program):
-    """Nor does `python -P -m warpgs`, even where the folder holds what Python itself imports first."""
-    folder, mark = trap
-    for name in EARLY:
-        (folder / f"{name}.py").write_text((folder / "json.py").read_text())
-    for command in ([program], ["-P", "-m", "warpgs"]):
-        done = run(*command, "demo", f"new{len(command)}", *SIZE)
-        assert done.returncode == 0 and (folder / f"new{len(command)}" / "images").is_dir(), done.stderr
-        assert not mark.exists(), mark.read_text()
+ASCII = pytest.mark.skipif(sys.platform != "linux", reason="locales and file names of Linux")
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="locales and file names of Linux")
-@pytest.mark.parametrize("early", [True, False])
-def test_python_that_starts_again_runs_nothing_from_the_current_folder(trap, program, early):
-    """In a locale whose file names are ASCII: the second Python is as safe as the first."""
+@pytest.mark.parametrize("early, ascii", [(True, False), *(pytest.param(e, True, marks=ASCII) for e in (True, False))])
+def test_the_program_runs_nothing_from_the_current_folder(trap, program, early, ascii):
+    """Even with what Python imports first planted there; where file names are ASCII it starts again, as safe as before."""
     folder, mark = trap
     for name in EARLY if early else ():
         (folder / f"{name}.py").write_text((folder / "json.py").read_text())
+    environment = {"LC_ALL": "C", "PYTHONUTF8": "0"} if ascii else {}
     for command in ([program], ["-P", "-m", "warpgs"]) if early else (["-m", "warpgs"],):
-        done = run(*command, "demo", f"new{len(command)}", *SIZE, LC_ALL="C", PYTHONUTF8="0")
+        done = run(*command, "demo", f"new{len(command)}", *SIZE, **environment)
         assert done.returncode == 0 and (folder / f"new{len(command)}" / "images").is_dir(), done.stderr
-        assert "started again" in done.stderr and not mark.exists(), mark.read_text()
+        assert ("started again" in done.stderr) == ascii and not mark.exists(), mark.read_text()
 
 
 @pytest.mark.fault
@@ -185,27 +176,21 @@ def starters(path: Path) -> list[str]:
     return found
 
 
-def test_one_file_alone_starts_processes():
+def test_one_file_alone_starts_processes(tmp_path):
     """And none starts a shell; the program itself may start again. The overview names an exception of `subprocess` alone."""
     for path in (ROOT / "warpgs").rglob("*.py"):
         names = ("run", "DEVNULL", "CompletedProcess", "Popen", "PIPE")
         allowed = {"process.py": {f"subprocess.{n}" for n in names} | {"os.execv"}}
         more = {"subprocess.TimeoutExpired"}
         assert set(starters(path)) <= allowed.get(path.name, set()) | more, path
-
-
-@pytest.mark.parametrize(
-    "text",
-    [
+    # the search finds what starts processes
+    for text in (
         "import os\nos.system('a')", "from os import popen", "import os as o\no.execvp('a', [])", "from subprocess import run",
-        "import subprocess as s\ns.Popen('a')", "f(shell=True)",
+        "import subprocess as s\ns.Popen('a')", "f(shell=True)", "import multiprocessing as m\nm.Process()",
         "import concurrent.futures\nconcurrent.futures.ProcessPoolExecutor()",
-        "import multiprocessing as m\nm.Process()",
-    ],
-)  # fmt: skip
-def test_the_search_finds_what_starts_processes(tmp_path, text):
-    (tmp_path / "a.py").write_text(text)
-    assert starters(tmp_path / "a.py")
+    ):  # fmt: skip
+        (tmp_path / "a.py").write_text(text)
+        assert starters(tmp_path / "a.py"), text
 
 
 # Ctrl-C, SIGTERM and SIGHUP: one sentence and one exit code wherever they come, and none where they are ignored.
@@ -225,13 +210,6 @@ def handlers():
     yield
     for number, handler in before.items():
         signal.signal(number, handler)
-
-
-@pytest.fixture(scope="module")
-def stop_signals_scene(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("signals") / "scene"
-    write_demo(folder, views=8, width=32, height=32)
-    return folder
 
 
 def fit(scene, out, *more):
@@ -255,24 +233,6 @@ def test_an_ignored_signal_stays_ignored(context, number):
 
 
 @pytest.mark.usefixtures("handlers")
-@pytest.mark.parametrize("number", SIGNALS)
-def test_a_signal_during_a_destructor_is_not_lost(number):
-    """Python throws away what a destructor raises: the first Ctrl-C would do nothing."""
-
-    class Thing:
-        def __del__(self):
-            signal.raise_signal(number)
-            raised.append("not in the destructor")
-
-    raised = []
-    with pytest.raises(KeyboardInterrupt), interrupting_signals():
-        Thing()
-        threading.Event().wait(60)  # ended by the signal that comes again
-        raised.append("not at all")
-    assert raised == []
-
-
-@pytest.mark.usefixtures("handlers")
 @pytest.mark.parametrize("context", CONTEXTS)
 def test_other_threads_leave_signals_alone(context):
     """Python lets the main thread alone set handlers."""
@@ -287,7 +247,8 @@ def test_other_threads_leave_signals_alone(context):
 
 @pytest.mark.usefixtures("handlers")
 @pytest.mark.parametrize("number", SIGNALS)
-def test_the_first_is_noted_and_the_second_raised(number):
+def test_the_second_signal_is_raised_and_none_is_lost_in_a_destructor(number):
+    """Python throws away what a destructor raises: there the first Ctrl-C would do nothing."""
     with noted_signals() as came:
         signal.raise_signal(number)
         assert came()
@@ -295,23 +256,35 @@ def test_the_first_is_noted_and_the_second_raised(number):
             signal.raise_signal(number)
     assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
 
+    class Thing:
+        def __del__(self):
+            signal.raise_signal(number)
+            raised.append("not in the destructor")
 
-STAGES = [
+    raised = []
+    with pytest.raises(KeyboardInterrupt), interrupting_signals():
+        Thing()
+        threading.Event().wait(60)  # ended by the signal that comes again
+        raised.append("not at all")
+    assert raised == []
+
+
+STAGES = (
     "fit.read_scene",
     "fit.Trainer",
     "fit.background_warmup",
     "fit.write_ply",
     "results.evaluate_run",
     "results.write_page",
-]
+)
 
 
 @pytest.mark.usefixtures("handlers")
 @pytest.mark.parametrize(("stage", "number"), [(s, SIGNALS[i % len(SIGNALS)].values[0]) for i, s in enumerate(STAGES)])
-def test_outside_the_steps_the_end_is_the_same(stop_signals_scene, tmp_path, capsys, monkeypatch, stage, number):
+def test_outside_the_steps_the_end_is_the_same(demo, tmp_path, capsys, monkeypatch, stage, number):
     """While the scene is read, priors are made, results are scored and written: code 130, and nothing but the sentence."""
     monkeypatch.setattr(f"warpgs.pipeline.run.{stage}", lambda *_, **__: signal.raise_signal(number))
-    assert fit(stop_signals_scene, tmp_path / "run") == 130
+    assert fit(demo, tmp_path / "run") == 130
     early = STAGES.index(stage) < 3
     assert capsys.readouterr().err == (UNSAVED if early else SENTENCE)
     assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
@@ -320,10 +293,8 @@ def test_outside_the_steps_the_end_is_the_same(stop_signals_scene, tmp_path, cap
 
 @pytest.mark.usefixtures("handlers")
 @pytest.mark.parametrize("number", SIGNALS)
-def test_within_the_steps_the_one_in_progress_is_saved(stop_signals_scene, tmp_path, capsys, monkeypatch, number):
+def test_within_the_steps_the_one_in_progress_is_saved(demo, tmp_path, capsys, monkeypatch, number):
     """And a second signal in the same step ends the fit without it."""
-    from warpgs.report.progress import EventLog
-
     write, times = EventLog.write, [1]
 
     def signalled(log, **values):
@@ -332,9 +303,9 @@ def test_within_the_steps_the_one_in_progress_is_saved(stop_signals_scene, tmp_p
             signal.raise_signal(number)
 
     monkeypatch.setattr(EventLog, "write", signalled)
-    assert fit(stop_signals_scene, tmp_path / "run") == 130 and load_checkpoint(tmp_path / "run")[1]["step"] == 1
+    assert fit(demo, tmp_path / "run") == 130 and load_checkpoint(tmp_path / "run")[1]["step"] == 1
     times[0] = 2
-    assert fit(stop_signals_scene, tmp_path / "run", "--resume") == 130 and load_checkpoint(tmp_path / "run")[1]["step"] == 1
+    assert fit(demo, tmp_path / "run", "--resume") == 130 and load_checkpoint(tmp_path / "run")[1]["step"] == 1
     assert capsys.readouterr().err == 2 * SENTENCE
     monkeypatch.undo()
     assert main(["fit", "--out", str(tmp_path / "run"), "--resume"]) == 0  # all else is as the run was started
@@ -435,15 +406,12 @@ def test_kept_memory_is_not_touched_for_the_first_time_again():
 
 
 @on_linux
-def test_bytes_that_are_no_text_are_printed_as_codes(tmp_path):
+def test_names_that_are_no_text_for_output_libraries_and_films(tmp_path, monkeypatch):
     assert readable(f"{BYTES} \ud800") == "b\\xe4ü \\ud800"
-    write_text(tmp_path / BYTES, BYTES)
-    assert (tmp_path / BYTES).read_text("utf-8") == "b\\xe4ü"
+    write_text(tmp_path / f"{BYTES}.text", BYTES)
+    assert (tmp_path / f"{BYTES}.text").read_text("utf-8") == "b\\xe4ü"
     assert scene_name(f"a/{BYTES}.png", b"\x89PNG\r\n\x1a\n") == "a/b%E4ü.png"
-
-
-@on_linux
-def test_a_name_that_a_library_can_take(tmp_path, monkeypatch):
+    # a name that a library can take
     folder = tmp_path / BYTES
     folder.mkdir()
     for path in (folder / "file", folder / f"{BYTES}.txt", tmp_path / "plain"):
@@ -456,13 +424,10 @@ def test_a_name_that_a_library_can_take(tmp_path, monkeypatch):
     monkeypatch.setattr(process, "DESCRIPTORS", tmp_path / "none")
     with pytest.raises(UsageError, match=r"b\\xe4ü/file: the name is not UTF-8"), utf8_name(folder / "file"):
         pass
-
-
-@on_linux
-def test_films(tmp_path):
-    """OpenCV ended the process at such a name; a film is written, checked and read."""
-    path = tmp_path / BYTES / f"{BYTES}.mp4"
-    path.parent.mkdir()
+    # OpenCV ended the process at such a name; a film is written, checked and read
+    monkeypatch.undo()
+    path = tmp_path / "films" / BYTES / f"{BYTES}.mp4"
+    path.parent.mkdir(parents=True)
     frames = [np.full((16, 16, 3), 0.2 * i, np.float32) for i in range(3)]
     assert write_film(path, frames) == 3 and [p.name for p in path.parent.iterdir()] == [path.name]
     assert len(list(_frames(path))) == 3
@@ -506,6 +471,9 @@ def test_a_fit_and_what_follows(scene, tmp_path, capsys):
     assert main(["export", str(run), "--to", str(tmp_path / f"{BYTES}.spz")]) == 0
     printed = capsys.readouterr().out
     assert "b\\xe4ü" in printed and BYTES not in printed
+    file = tmp_path / f"{BYTES}.py"
+    file.write_text("from warpgs.io.colmap import ColmapReader\nclass Own(ColmapReader):\n    pass\n")
+    assert main(["fit", str(scene), "--out", str(tmp_path / "run"), "--reader", f"{file}:Own", *flags(1)]) == 0
 
 
 @on_linux
@@ -531,13 +499,6 @@ def test_the_farm(scene, tmp_path):
     assert row["name"] == "sceneb\\xe4ü" and row["state"] == "done"
     assert "sceneb%E4%C3%BC/run/report.html" in page and "sceneb%E4%C3%BC/thumbnail.jpg" in page
     assert cv2.imdecode(np.fromfile(out / scene.name / "thumbnail.jpg", np.uint8), cv2.IMREAD_COLOR) is not None
-
-
-@on_linux
-def test_plug_ins(scene, tmp_path):
-    file = tmp_path / f"{BYTES}.py"
-    file.write_text("from warpgs.io.colmap import ColmapReader\nclass Own(ColmapReader):\n    pass\n")
-    assert main(["fit", str(scene), "--out", str(tmp_path / "run"), "--reader", f"{file}:Own", *flags(1)]) == 0
 
 
 @on_linux
@@ -589,20 +550,15 @@ def test_poses(tmp_path, capfd):
 
 
 @on_linux
-def test_python_that_takes_names_for_ascii(tmp_path):
-    """It is started again in its UTF-8 mode, once, which is said; letters are printed as the terminal has them."""
+def test_python_that_takes_names_for_ascii(tmp_path, monkeypatch):
+    """It is started again in its UTF-8 mode, once, which is said, with its own options and words."""
     program, ascii_names = ("-P", "-m", "warpgs"), {"LC_ALL": "C", "PYTHONUTF8": "0"}
     done = run(*program, "demo", str(tmp_path / "写"), "--views", "8", "--width", "32", "--height", "32", **ascii_names)
     said = done.stderr
     assert done.returncode == 0 and (tmp_path / "写" / "sparse").is_dir() and said.isascii(), said
     assert said.count("UTF-8 mode") == 1 and said.count("\n") == 1 and "\\u5199" in done.stdout
     assert run(*program, "--version", LC_ALL="C.UTF-8", PYTHONUTF8="0").stderr == ""
-
-
-@on_linux
-def test_starting_again_keeps_the_command(monkeypatch):
-    """The words, the interpreter's own options, and nothing twice."""
-    called: list[list[str]] = []
+    called: list[list[str]] = []  # the words, the interpreter's own options, and nothing twice
     monkeypatch.setattr(os, "execv", lambda program, words: called.append([program, *words]))
     monkeypatch.setattr(os, "environ", dict(os.environ))
     monkeypatch.setattr(sys, "getfilesystemencoding", lambda: "iso8859-1")

@@ -11,7 +11,7 @@ from warpgs.ranks import Allowance, WebGuard, listeners, loopback_interface, loo
 OWN = "127.0.0.1:8080"
 
 
-def test_a_taken_port_is_one_sentence():
+def test_taken_ports_and_hosts_that_are_this_machine(monkeypatch):
     with loopback_socket(0, "give another") as taken:
         taken.listen()
         port = taken.getsockname()[1]
@@ -19,10 +19,6 @@ def test_a_taken_port_is_one_sentence():
         for wrong in (port, 70000):
             with pytest.raises(UsageError, match=rf"port {wrong} cannot be used .*; give another"):
                 loopback_socket(wrong, "give another")
-
-
-def test_hosts_that_are_this_machine(monkeypatch):
-    """A name counts only if all its addresses are of the loopback interface."""
     assert loopback_of("127.0.0.1") == "127.0.0.1" and loopback_of("::1") == "::1" and loopback_of("192.0.2.1") is None
     known = {"both": ["::1", "127.0.0.1"], "mixed": ["127.0.0.1", "192.0.2.1"], "far": ["192.0.2.1"]}
 
@@ -70,16 +66,6 @@ def test_a_request_needs_the_token_and_our_names():
     assert guard.admitted_path(f"/{token}/index.html", [OWN], [own], True) is None
 
 
-def test_the_policy_names_this_server_alone():
-    """A host that is not ours does not come into a header."""
-    policy = WebGuard.headers(OWN, "word")["Content-Security-Policy"]
-    assert "connect-src 'self' ws://127.0.0.1:8080 data: blob:" in policy and "frame-ancestors 'none'" in policy
-    assert (
-        "default-src 'none'" in policy and "script-src 'nonce-word' " in policy and "script-src 'unsafe-inline'" not in policy
-    )
-    assert "ws:" not in WebGuard.headers("example.org; script-src *", "word")["Content-Security-Policy"]
-
-
 def test_what_others_can_reach_is_printed(capsys):
     """All of it in one line, but for sockets of the loopback address; and what listens in this process is found."""
     opened = [("rank 0", "127.0.0.1", 1), ("rank 0", "192.0.2.1", 2), ("gloo", "::ffff:127.0.0.1", 3), ("torchrun", "::", 4)]
@@ -91,10 +77,13 @@ def test_what_others_can_reach_is_printed(capsys):
     with loopback_socket(0, "") as own:
         own.listen()
         assert ("this process", *own.getsockname()) in listeners()
-
-
-def test_an_allowance_is_refilled_with_time():
-    """Three at once, then one each half second; no more than three after a long time."""
+    # a host that is not ours does not come into a header
+    policy = WebGuard.headers(OWN, "word")["Content-Security-Policy"]
+    assert "connect-src 'self' ws://127.0.0.1:8080 data: blob:" in policy and "frame-ancestors 'none'" in policy
+    assert "default-src 'none'" in policy and "script-src 'nonce-word' " in policy
+    assert "script-src 'unsafe-inline'" not in policy
+    assert "ws:" not in WebGuard.headers("example.org; script-src *", "word")["Content-Security-Policy"]
+    # an allowance is three at once, then one each half second
     now = [0.0]
     allowance = Allowance(2, 3, lambda: now[0])
     assert [allowance.take() for _ in range(4)] == [True, True, True, False]

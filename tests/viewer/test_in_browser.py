@@ -16,22 +16,11 @@ from warpgs.geometry import look_at, project_points
 from warpgs.render.rasterize import rasterize
 from warpgs.scene import Normalization
 from warpgs.synthetic.demo import split_spec, write_demo
+from warpgs.viewer import html
 from warpgs.viewer import server as connections
-from warpgs.viewer.html import (
-    SORT_FROM_DISK,
-    distance_ahead,
-    middle_first,
-    place_first_camera,
-    seen_at,
-    turning_limits,
-    write_html,
-)
 from warpgs.viewer.server import address, open_server, stop_server
 from warpgs.viewer.watch import live_view
 from warpgs.viewer.window import CROP, PATH, Window, content_of_run
-
-# The page of a model in a real browser, opened as a file: it shows what our rasterizer does, and asks nobody for
-# anything.
 
 pytest.importorskip("viser")
 WIDTH, HEIGHT = 700, 600
@@ -54,11 +43,6 @@ def crowd():
     return type(g)(**{n: t[order] for n, t in g.tensors().items()})
 
 
-def test_the_middle_of_the_cameras_comes_first():
-    cameras = [moved(x) for x in (4.0, 0.0, 1.5, 1.0)]
-    assert [c.center[0] for c in middle_first(cameras)] == [1.5, 4.0, 0.0, 1.0] and middle_first([]) == []
-
-
 UP, TARGET = np.array([0.0, -1, 0]), np.zeros(3)
 
 
@@ -70,12 +54,12 @@ def looking(azimuth, height=0.0):
 
 def degrees(cameras, target=TARGET):
     """Captured arc to the left, right, top and bottom, and the margin beyond it, in degrees."""
-    arc, margin = turning_limits(cameras, target, UP)
+    arc, margin = html.turning_limits(cameras, target, UP)
     return *np.degrees(arc), np.degrees(margin)
 
 
-def test_a_page_turns_as_far_as_the_photographs():
-    """To each side, with a margin of a quarter of the arc; all round there is no limit in yaw, and none with one camera."""
+def test_a_page_turns_as_far_as_the_photographs_and_shows_what_they_saw():
+    """To each side with a margin, about the scene's upward direction; a portrait photograph sees its own width."""
     narrow = [looking(np.radians(a)) for a in (0, -6, -3, 10)]
     np.testing.assert_allclose(degrees(narrow), [6, 10, 0, 0, 4], atol=1e-9)
     arc = [looking(np.radians(a), h) for a, h in ((0, 0), (-30, 0), (40, 0), (0, np.tan(np.radians(20))))]
@@ -89,29 +73,25 @@ def test_a_page_turns_as_far_as_the_photographs():
     around = degrees([looking(np.radians(a), 0.5) for a in range(0, 360, 45)])
     np.testing.assert_allclose(around, [np.inf, np.inf, 0, 0, 15], atol=1e-9)
     np.testing.assert_array_equal(degrees(arc[:1])[:4], np.inf)
-
-
-def test_a_page_turns_about_the_upward_direction_of_the_scene():
-    """Not about that of a camera that looks down: half a turn about it would end below the ground."""
+    # not about that of a camera that looks down: half a turn about it would end below the ground
     server = SimpleNamespace(scene=SimpleNamespace(set_up_direction=lambda up: None), initial_camera=SimpleNamespace())
     cameras = [looking(np.radians(a), 0.7) for a in range(0, 360, 45)]
-    up = place_first_camera(server, cameras[0], three_gaussians(), cameras)[1]
+    up = html.place_first_camera(server, cameras[0], three_gaussians(), cameras)[1]
     np.testing.assert_allclose(server.initial_camera.up, up)
     np.testing.assert_allclose(up, UP, atol=1e-6)
     down = dataclasses.replace(cameras[0], viewmat=look_at(np.array([0.0, -4, 0]), TARGET, np.array([0.0, 0, 1])))
-    up = place_first_camera(server, down, three_gaussians(), cameras)[1]  # the scene's is in the middle of its image
+    up = html.place_first_camera(server, down, three_gaussians(), cameras)[1]  # the scene's is in the middle of its image
     np.testing.assert_allclose(up, [0, 0, 1], atol=1e-6)
-
-
-def test_a_page_shows_what_the_photographs_saw():
-    """A portrait photograph sees its own width; cameras beside it add what they see of the plane through the target."""
+    # cameras beside the first add what they see of the plane through the target
     first = moved(0.0)
     K = np.array([[100.0, 0, 30], [0, 100, 60], [0, 0, 1]])
     portrait = dataclasses.replace(first, K=K, width=60, height=120)
     target = np.array([0, 0, 4.0])
-    np.testing.assert_allclose(seen_at([portrait], target), [0.3, 0.6])
+    np.testing.assert_allclose(html.seen_at([portrait], target), [0.3, 0.6])
     row = [dataclasses.replace(portrait, viewmat=moved(x).viewmat) for x in (0.0, -1.0, 2.0)]
-    np.testing.assert_allclose(seen_at(row, target), [0.3 + 1 / 4, 0.6])
+    np.testing.assert_allclose(html.seen_at(row, target), [0.3 + 1 / 4, 0.6])
+    cameras = [moved(x) for x in (4.0, 0.0, 1.5, 1.0)]
+    assert [c.center[0] for c in html.middle_first(cameras)] == [1.5, 4.0, 0.0, 1.0] and html.middle_first([]) == []
 
 
 TURNED = "(()=>{const t=__viserMutable.cameraControl;t.update(9);return t.azimuthAngle})()"
@@ -123,7 +103,7 @@ def test_a_page_stops_where_the_photographs_end(browser, tmp_path):
     """Softly; one window width of drag is the whole range, and a button switches the limits and the frame off."""
     path, cameras = tmp_path / "scene.html", [looking(np.radians(a)) for a in (0, -6, 10)]
     g = three_gaussians()
-    write_html(path, dataclasses.replace(g, means=g.means - g.means.mean(0)), cameras, background=(1.0, 0.2, 0.0))
+    html.write_html(path, dataclasses.replace(g, means=g.means - g.means.mean(0)), cameras, background=(1.0, 0.2, 0.0))
     browser.resize(WIDTH, HEIGHT)
     browser.open(path.as_uri())
     turned = "window.__viserMutable?.cameraControl?.rotate(0, 0, false)"
@@ -159,12 +139,9 @@ def moved(x):
 
 @pytest.mark.browser
 def test_a_page_tells_how_to_move_and_returns(browser, tmp_path):
-    """The line of help stands there, no scene tree does, and the key R and the button lead back to the first view.
-
-    The page says that it loads, until the scene is there.
-    """
+    """A line of help, no scene tree; the key R and a button lead back to the first view; loading is said."""
     path = tmp_path / "scene.html"
-    write_html(path, crowd(), [ring(3)[1]], title="my <scene>")
+    html.write_html(path, crowd(), [ring(3)[1]], title="my <scene>")
     body = path.read_text("utf-8").partition("<body>")[2]
     assert body.startswith('<div id="warpgs-loading"') and "Loading the scene" in body[:300]
     browser.open(path.as_uri())
@@ -195,7 +172,7 @@ def test_a_page_has_a_ruler(browser, tmp_path):
     g = dataclasses.replace(g, means=means, log_scales=0 * g.log_scales - 2.5, logit_opacities=0 * g.logit_opacities + 4)
     K = np.diag([20, 20, 1.0]) @ camera.K
     K[:2, 2] = 400, 320
-    write_html(path, g, [camera], normalization=Normalization(scale=0.25, unit="m"))
+    html.write_html(path, g, [camera], normalization=Normalization(scale=0.25, unit="m"))
     browser.resize(800, 640)
     browser.open(path.as_uri())
     ruler = "document.querySelector('#warpgs-ruler')"
@@ -220,14 +197,14 @@ def test_a_page_from_disk_shows_the_render(browser, tmp_path):
     K[:2, 2] = WIDTH / 2, HEIGHT / 2
     wanted = rasterize(g, dataclasses.replace(camera, K=K, width=WIDTH, height=HEIGHT)).rgb.clamp(0, 1).numpy()
     path = tmp_path / "scene.html"
-    assert write_html(path, g, [camera]) == [] and wanted[SHOWN].std() > 0.1
+    assert html.write_html(path, g, [camera]) == [] and wanted[SHOWN].std() > 0.1
     browser.resize(WIDTH, HEIGHT)
     browser.open(path.as_uri())
     image = browser.picture_of(lambda found: psnr(found, wanted) > 22)  # they are sorted by a worker, and fade in
     assert psnr(image, wanted) > 22, psnr(image, wanted)
     assert image[CORNER].min(-1).max() < 0.4  # no white letters
     assert not refused(browser), browser.console()
-    path.write_text(path.read_text("utf-8").replace(SORT_FROM_DISK, ""), "utf-8")
+    path.write_text(path.read_text("utf-8").replace(html.SORT_FROM_DISK, ""), "utf-8")
     browser.open(path.as_uri())
     before: list[np.ndarray] = []
     unsorted = browser.picture_of(lambda found: refused(browser) and settled(found, before))
@@ -238,7 +215,7 @@ def test_a_page_from_disk_shows_the_render(browser, tmp_path):
 def test_a_page_on_a_phone_shows_the_whole_width_of_the_first_image(browser, tmp_path):
     """A narrow window has a wider field of view, also after it was turned; a wide one has the camera's."""
     camera, path = ring(1)[0], tmp_path / "scene.html"
-    write_html(path, crowd(), [camera])
+    html.write_html(path, crowd(), [camera])
     tall, wide = (camera.height / camera.K[1, 1], camera.width / camera.K[0, 0])
     browser.resize(390, 844)
     browser.open(path.as_uri())
@@ -394,11 +371,11 @@ def test_the_viewer_has_the_limits_of_the_page(folder, browser):
     try:
         tilt = "window.__viserMutable?.nodeRefFromName?.['/limits/tilt']?.position"
         browser.wait(f"{tilt}?.z === 1")
-        ahead = distance_ahead(window.first, content.model.gaussians())
+        ahead = html.distance_ahead(window.first, content.model.gaussians())
         browser.wait(f"({TURNED}, Math.abs(__viserMutable.cameraControl.distance - {ahead}) < 1e-3)")
         first = browser.value(TURNED)
         browser.value("void __viserMutable.cameraControl.rotate(2, 0, false)")
-        arc, margin = turning_limits(window._rig, window._target, window._up)
+        arc, margin = html.turning_limits(window._rig, window._target, window._up)
         assert np.degrees(browser.value(TURNED) - first) == pytest.approx(np.degrees(arc[1] + 0.95 * margin), abs=0.1)
         window.panel.limits.value = False
         browser.wait(f"{tilt}?.z === 0")
@@ -444,7 +421,7 @@ def test_a_foreign_page_gets_nothing(folder, browser, kind):
 @pytest.mark.browser
 def test_a_page_from_disk_obeys_no_parameters(folder, browser, tmp_path):
     """It shows its own model, and asks nobody, whatever stands behind its address."""
-    write_html(tmp_path / "scene.html", content_of_run(folder / "run").model.gaussians())
+    html.write_html(tmp_path / "scene.html", content_of_run(folder / "run").model.gaussians())
     with site() as (foreign, seen):
         host = foreign.removeprefix("http://")
         for query in (

@@ -31,27 +31,7 @@ def test_half_precision_keeps_gaussians_of_any_scene():
     g.log_scales[7, 1] += math.log(1e6)  # one axis of a million medians is counted, and finite
     (_, covariances, *_), _, shortened = packed(g)
     assert shortened == 1 and np.abs(covariances).max() <= LARGEST_HALF and np.isfinite(covariances.astype(np.float16)).all()
-
-
-def test_colors_and_opacities_are_those_of_degree_0():
-    (*_, colors, opacities), _, _ = packed(three_gaussians())
-    np.testing.assert_allclose(colors, 255 * np.array([[0.9, 0.2, 0.1], [0.15, 0.8, 0.2], [0.2, 0.3, 0.95]]), atol=0.51)
-    np.testing.assert_allclose(opacities[:, 0], 255 * np.array([0.9, 0.85, 0.95]), atol=0.51)
-
-
-def test_poses_there_and_back():
-    for c in ring(5):
-        back = camera_at(wxyz_of(c), c.center, fov_y(c), c.width, c.height)
-        np.testing.assert_allclose(back.viewmat, c.viewmat, atol=1e-12)
-        assert abs(back.K[1, 1] - c.K[1, 1]) < 1e-9 and stands_at(back, c, 1e-9)
-    first, second = ring(2)
-    assert not stands_at(first, second, 1.0) and rig_among(ring(5), np.zeros((1, 3))).up @ [0, -1, 0] > 0.99
-    assert rig_among([camera_before(three_gaussians())], three_gaussians().means.numpy()).up @ [0, -1, 0] > 0.99
-    assert abs(distance_ahead(first, three_gaussians()) - 2.2) < 0.4
-    assert distance_ahead(camera_before(three_gaussians()), three_gaussians()) > 0.3
-
-
-def test_a_box_in_file_units_holds_the_same_points():
+    # a box in file units holds the same points
     turn = rotation_matrices(np.array([0.8, 0.0, 0.6, 0.0]))
     g, box = cloud(300), (np.array([0.2, 0.1, 4.0]), np.array([2.0, 1.0, 1.5]), turn)
     within = inside(g, box)
@@ -67,7 +47,19 @@ def test_a_box_in_file_units_holds_the_same_points():
     assert not inside(dataclasses.replace(g, means=torch.eye(3) * 1.1), (np.zeros(3), np.full(3, 2.0), np.eye(3))).any()
 
 
-def test_a_keyframe_is_camera_to_world_in_file_units():
+def test_colors_of_degree_0_poses_there_and_back_and_keyframes_in_file_units():
+    (*_, colors, opacities), _, _ = packed(three_gaussians())
+    np.testing.assert_allclose(colors, 255 * np.array([[0.9, 0.2, 0.1], [0.15, 0.8, 0.2], [0.2, 0.3, 0.95]]), atol=0.51)
+    np.testing.assert_allclose(opacities[:, 0], 255 * np.array([0.9, 0.85, 0.95]), atol=0.51)
+    for c in ring(5):
+        back = camera_at(wxyz_of(c), c.center, fov_y(c), c.width, c.height)
+        np.testing.assert_allclose(back.viewmat, c.viewmat, atol=1e-12)
+        assert abs(back.K[1, 1] - c.K[1, 1]) < 1e-9 and stands_at(back, c, 1e-9)
+    first, second = ring(2)
+    assert not stands_at(first, second, 1.0) and rig_among(ring(5), np.zeros((1, 3))).up @ [0, -1, 0] > 0.99
+    assert rig_among([camera_before(three_gaussians())], three_gaussians().means.numpy()).up @ [0, -1, 0] > 0.99
+    assert abs(distance_ahead(first, three_gaussians()) - 2.2) < 0.4
+    assert distance_ahead(camera_before(three_gaussians()), three_gaussians()) > 0.3
     n, c = Normalization(np.array([4.0, -2.0, 7.0]), 0.25), ring(3)[0]
     k = keyframe(c, 1.5, n)
     c2w = np.array(k["c2w"])

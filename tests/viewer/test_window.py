@@ -25,28 +25,10 @@ from warpgs.pipeline.run import level
 from warpgs.pipeline.run.folder import load_checkpoint, save_checkpoint
 from warpgs.synthetic.demo import split_spec, write_demo
 from warpgs.viewer import watch
+from warpgs.viewer import window as windows
 from warpgs.viewer.html import middle_first, wxyz_of
 from warpgs.viewer.server import open_server, stop_server
-from warpgs.viewer.window import (
-    COARSE_LAYER,
-    COVERAGE,
-    CROP,
-    DEPTH,
-    ERROR,
-    FINE_LAYER,
-    GAUSSIANS,
-    MAPS,
-    MAX_KEYFRAMES,
-    PATH,
-    RENDER,
-    Window,
-    box_json,
-    content_of_file,
-    content_of_run,
-    keyframe,
-    placed,
-    views_of,
-)
+from warpgs.viewer.window import CROP, PATH, Window, box_json, content_of_file, content_of_run, keyframe, placed, views_of
 
 pytest.importorskip("viser")
 zstandard = pytest.importorskip("zstandard")
@@ -65,9 +47,8 @@ def folder(tmp_path_factory):
 
 
 def fit(folder, name, on_model=None):
-    warpgs.fit(
-        str(folder / "scene"), CONFIG, split=split_spec(8), out=folder / name, device="cpu", verbose=False, on_model=on_model
-    )
+    options = {"split": split_spec(8), "out": folder / name, "device": "cpu", "verbose": False, "on_model": on_model}
+    warpgs.fit(str(folder / "scene"), CONFIG, **options)
 
 
 @pytest.fixture(scope="module")
@@ -101,17 +82,20 @@ def test_images_at_a_camera_are_those_of_the_rasterizer(window):
     camera = content.model.scene_cameras[name]
     assert window.maps.view_at(camera) == name
     rgb = warpgs.rasterize(content.model.gaussians(), camera, content.model.options()).rgb.detach().clamp(0, 1).numpy()
-    image, _ = window.maps.image(RENDER, camera, content.model.gaussians(), 3)
+    image, _ = window.maps.image(windows.RENDER, camera, content.model.gaussians(), 3)
     assert image.dtype == np.uint8 and np.abs(image / 255 - rgb).max() < 0.003
-    images = {k: window.maps.image(k, camera, content.model.gaussians(), 3) for k in (DEPTH, COVERAGE, ERROR)}
+    images = {
+        k: window.maps.image(k, camera, content.model.gaussians(), 3) for k in (windows.DEPTH, windows.COVERAGE, windows.ERROR)
+    }
     assert all(i.shape == (SIZE[1], SIZE[0], 3) for i, _ in images.values())
-    assert name in images[ERROR][1]
+    assert name in images[windows.ERROR][1]
     moved = camera.viewmat.copy()
     moved[0, 3] += 0.5
-    assert "step into a camera" in window.maps.image(ERROR, dataclasses.replace(camera, viewmat=moved), window.shown(), 3)[1]
-
-
-def test_an_image_is_placed_where_another_camera_sees_it(window):
+    assert (
+        "step into a camera"
+        in window.maps.image(windows.ERROR, dataclasses.replace(camera, viewmat=moved), window.shown(), 3)[1]
+    )
+    # an image is placed where another camera sees it
     camera = next(iter(window.content.model.scene_cameras.values()))
     K = camera.K * np.array([[2.0], [2.0], [1.0]])
     K[0, 2] += 6
@@ -120,15 +104,15 @@ def test_an_image_is_placed_where_another_camera_sees_it(window):
     np.testing.assert_allclose(out[20, 16:70, 0], (np.arange(16, 70) + 0.5 - 6) / 2 - 0.5, atol=0.02)
 
 
-def test_layers_and_the_crop_box_choose_what_is_shown(window):
-    """Fine and coarse make the whole; the box that is saved is the one that is seen, in file units."""
+def test_layers_and_the_crop_box_choose_what_is_shown_and_saved(window, tmp_path):
+    """Fine and coarse make the whole; keyframes are cameras of `warpgs render`, the box is that of `warpgs export`."""
     panel, count = window.panel, len(window.content.model.gaussians())
     shown = {}
-    for layer in (FINE_LAYER, COARSE_LAYER):
+    for layer in (windows.FINE_LAYER, windows.COARSE_LAYER):
         panel.layer.value = layer
         shown[layer] = len(window.shown())
     panel.layer.value = "all"
-    assert shown[FINE_LAYER] == (count + 2) // 3 and sum(shown.values()) == len(window.shown()) == count
+    assert shown[windows.FINE_LAYER] == (count + 2) // 3 and sum(shown.values()) == len(window.shown()) == count
     panel._crop.value = True
     assert 0 < len(window.shown()) < count
     n = window.content.model.normalization
@@ -137,10 +121,6 @@ def test_layers_and_the_crop_box_choose_what_is_shown(window):
     means = (window.shown().means.double().numpy() / n.scale + n.offset) - stored["center"]
     assert (np.abs(means @ np.array(stored["rotation"])) <= np.array(stored["size"]) / 2 + 1e-4).all()
     panel._crop.value = False
-
-
-def test_what_is_saved_is_rendered_and_exported(window, tmp_path):
-    """Keyframes are cameras of `warpgs render`, and the box is that of `warpgs export`: the same images and Gaussians."""
     panel, content, run = window.panel, window.content, str(window.content.stem)
     n, names = content.model.normalization, content.model.train[:2]
     panel._save(PATH, [keyframe(content.model.scene_cameras[name], 0.5 * i, n) for i, name in enumerate(names)])
@@ -163,8 +143,8 @@ def test_what_is_saved_is_rendered_and_exported(window, tmp_path):
     assert torch.equal(warpgs.read_ply(tmp_path / "a.ply").means, shown)
 
 
-def test_the_first_view_is_that_of_the_page(window):
-    """The middle training camera, as in scene.html; Reset leads a browser back, with the field of view."""
+def test_the_first_view_is_that_of_the_page_and_a_narrow_window_shows_the_whole_width(window):
+    """The middle training camera, as in scene.html; photographs there are hidden; a narrow window has a wider field of view."""
     model, server = window.content.model, window.server
     middle = middle_first([model.scene_cameras[n] for n in model.train])[0]
     assert middle is not model.scene_cameras[model.train[0]]
@@ -177,17 +157,9 @@ def test_the_first_view_is_that_of_the_page(window):
     back(SimpleNamespace(client=client))
     for name in ("position", "look_at", "fov"):
         np.testing.assert_allclose(getattr(client.camera, name), getattr(server.initial_camera, name), atol=1e-6)
-
-
-def test_cameras_where_the_page_starts_are_hidden_from_the_first_image_on(window):
-    """Their photographs would cover the model, also before the browser has sent the position of its camera."""
     visible = {name: frustum.visible for name, frustum in window._frusta.items()}
     first = next(n for n, c in window.content.model.scene_cameras.items() if c is window.first)
     assert not visible[first] and any(visible.values())
-
-
-def test_a_narrow_window_shows_the_whole_width_of_an_image(window):
-    """On a phone, when a browser connects and when it steps into a camera; a wide window keeps the camera's field of view."""
     camera = window.first
     for aspect, side in ((0.46, camera.width / camera.K[0, 0] / 0.46), (2.0, camera.height / camera.K[1, 1])):
         state = SimpleNamespace(aspect=aspect, on_update=lambda _: None, fov=0.1)
@@ -199,22 +171,29 @@ def test_a_narrow_window_shows_the_whole_width_of_an_image(window):
         assert state.fov == pytest.approx(2 * np.arctan(side / 2))
 
 
-def test_a_browser_gets_the_image_that_it_asks_for(window):
+def test_a_browser_gets_the_image_that_it_asks_for(window, monkeypatch):
     camera = window.content.model.scene_cameras[window.content.model.train[0]]
     sent = []
-    state = SimpleNamespace(
-        position=camera.center, wxyz=np.array([1.0, 0, 0, 0]), fov=0.8, image_width=64, image_height=48, update_timestamp=1.0
-    )
-    client = SimpleNamespace(
-        client_id=7, camera=state, scene=SimpleNamespace(set_background_image=lambda i, **_: sent.append(i))
-    )
-    window.panel.kind.value = DEPTH
+    size = {"image_width": 64, "image_height": 48, "update_timestamp": 1.0}
+    state = SimpleNamespace(position=camera.center, wxyz=np.array([1.0, 0, 0, 0]), fov=0.8, **size)
+    scene = SimpleNamespace(set_background_image=lambda i, **_: sent.append(i))
+    client = SimpleNamespace(client_id=7, camera=state, scene=scene)
+    window.panel.kind.value = windows.DEPTH
     window._render_for(client)
     window._render_for(client)
-    assert [i.shape for i in sent] == [(48, 64, 3)] and MAPS[DEPTH].split(",")[0] in window.panel._note.content
-    window.panel.kind.value = GAUSSIANS
+    assert [i.shape for i in sent] == [(48, 64, 3)] and windows.MAPS[windows.DEPTH].split(",")[0] in window.panel._note.content
+    window.panel.kind.value = windows.GAUSSIANS
     window._render_for(client)
     assert sent[-1].shape == (2, 2, 3) and not window.panel._note.visible
+    panel, told = window.panel, []
+    camera = window.content.model.scene_cameras[window.content.model.train[0]]
+    monkeypatch.setattr(panel, "keyframes", [])
+    monkeypatch.setattr(panel, "explain", told.append)
+    monkeypatch.setattr(window, "camera_of", lambda client: camera)
+    (append,) = button(window, "add this camera")._impl.update_cb
+    for _ in range(windows.MAX_KEYFRAMES + 3):
+        append(SimpleNamespace(client=None))
+    assert len(panel.keyframes) == windows.MAX_KEYFRAMES and told == ["a path has at most 1,000 keyframes"] * 3
 
 
 def test_an_unknown_wish_ends_no_thread(window, monkeypatch):
@@ -236,18 +215,6 @@ def test_an_unknown_wish_ends_no_thread(window, monkeypatch):
         window._wake.set()
         assert said_all.wait(60) and window._thread.is_alive()
     assert set(told) == {"no image: KeyError: 'unknown'"}
-
-
-def test_keyframes_are_bounded(window, monkeypatch):
-    panel, told = window.panel, []
-    camera = window.content.model.scene_cameras[window.content.model.train[0]]
-    monkeypatch.setattr(panel, "keyframes", [])
-    monkeypatch.setattr(panel, "explain", told.append)
-    monkeypatch.setattr(window, "camera_of", lambda client: camera)
-    (append,) = button(window, "add this camera")._impl.update_cb
-    for _ in range(MAX_KEYFRAMES + 3):
-        append(SimpleNamespace(client=None))
-    assert len(panel.keyframes) == MAX_KEYFRAMES and told == ["a path has at most 1,000 keyframes"] * 3
 
 
 @pytest.mark.skipif(os.name == "nt", reason="links need a right that users often lack")
