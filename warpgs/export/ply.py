@@ -343,6 +343,8 @@ _DC = ("f_dc_0", "f_dc_1", "f_dc_2")
 _RGB = ("red", "green", "blue")
 _SCALE = ("scale_0", "scale_1", "scale_2")
 _ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
+_FILTER = "filter_3D"
+"""Standard deviation of a ball that Mip-Splatting (Yu et al. 2024, section 4.1) convolves each stored Gaussian with."""
 _REST_COUNTS = (0, 9, 24, 45, 72)
 
 
@@ -395,11 +397,12 @@ def _write(
 def read_ply(path: str | os.PathLike[str], normalization: Normalization | None = None, *, units: str = "file") -> Gaussians:
     """Read Gaussians from a PLY file in the INRIA 3DGS layout, binary or ASCII; `read_gaussians` also reads compressed ones.
 
-    Properties and elements outside the layout are ignored. Other programs write opacities of 0 and 1 as infinite logits, and
-    axes of length 0 as log scales of -inf. These become finite numbers that look the same (`OPAQUE`, `FLAT`). Their Gaussians
-    with a NaN, another infinity or a rotation of zero length are left out with a warning; `read_gaussians` can refuse them
-    (``strict``). The number of rows is checked against the file size before memory is allocated. A file that declares
-    antialiasing causes a warning: render it with `RasterizeOptions.antialiased`.
+    Other properties and elements are ignored, but ``filter_3D`` of Mip-Splatting is applied, with a warning. Programs write
+    opacities of 0 and 1 as infinite logits, and axes of length 0 as log scales of -inf. These become finite numbers that look
+    the same (`OPAQUE`, `FLAT`). Gaussians of other programs with a NaN, another infinity or a rotation of zero length are left
+    out with a warning; `read_gaussians` can refuse them (``strict``). The number of rows is checked against the file size
+    before memory is allocated. A file that declares antialiasing causes a warning: render it with
+    `RasterizeOptions.antialiased`.
 
     Args:
         path: The file, written by `write_ply` or by another program with the same layout.
@@ -560,6 +563,14 @@ def _assemble(
         arrays["means"][part] = columns(_POSITION, shift=middle)
         arrays["log_scales"][part] = columns(_SCALE, least=FLAT)
         arrays["logit_opacities"][part] = columns(["opacity"], -OPAQUE, OPAQUE)[:, 0]
+        if filtered := _FILTER in (rows.dtype.names or ()):
+            narrow = arrays["log_scales"][part].astype(np.float64)
+            wide = 0.5 * np.logaddexp(2 * narrow, 2 * np.log(np.maximum(columns([_FILTER]), math.exp(FLAT))))
+            with np.errstate(invalid="ignore"):  # of rows that are left out
+                opacities = base.sigmoid(arrays["logit_opacities"][part]) * np.exp((narrow - wide).sum(1))
+            arrays["log_scales"][part], arrays["logit_opacities"][part] = wide, base.logits(opacities, 4 * math.exp(-OPAQUE))
+    if n and filtered:
+        notes.append(f"{path}: {_FILTER} of Mip-Splatting is applied to sizes and opacities")
     stored, scales = arrays["logit_opacities"], arrays["log_scales"]
     if n >= LEAST_JUDGED and stored.min() >= 0 and stored.max() <= 1 and scales.min() > 0:
         notes.append(
