@@ -343,8 +343,6 @@ _DC = ("f_dc_0", "f_dc_1", "f_dc_2")
 _RGB = ("red", "green", "blue")
 _SCALE = ("scale_0", "scale_1", "scale_2")
 _ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
-_FILTER = "filter_3D"
-"""Standard deviation of a ball that Mip-Splatting (Yu et al. 2024, section 4.1) convolves each stored Gaussian with."""
 _REST_COUNTS = (0, 9, 24, 45, 72)
 
 
@@ -376,8 +374,7 @@ def write_ply(
         warpgs.UsageError: The units are unknown, or scene units are given without a normalization.
         ValueError: A tensor has the wrong shape.
     """
-    path = Path(path)
-    _write(path, gaussians, normalization, units, antialiased, None)
+    _write(Path(path), gaussians, normalization, units, antialiased, None)
 
 
 def _write(
@@ -563,14 +560,15 @@ def _assemble(
         arrays["means"][part] = columns(_POSITION, shift=middle)
         arrays["log_scales"][part] = columns(_SCALE, least=FLAT)
         arrays["logit_opacities"][part] = columns(["opacity"], -OPAQUE, OPAQUE)[:, 0]
-        if filtered := _FILTER in (rows.dtype.names or ()):
+        # Mip-Splatting (Yu et al. 2024, section 4.1) convolves each Gaussian with a ball of this standard deviation
+        if filtered := "filter_3D" in (rows.dtype.names or ()):
             narrow = arrays["log_scales"][part].astype(np.float64)
-            wide = 0.5 * np.logaddexp(2 * narrow, 2 * np.log(np.maximum(columns([_FILTER]), math.exp(FLAT))))
+            wide = 0.5 * np.logaddexp(2 * narrow, 2 * np.log(np.maximum(columns(["filter_3D"]), math.exp(FLAT))))
             with np.errstate(invalid="ignore"):  # of rows that are left out
                 opacities = base.sigmoid(arrays["logit_opacities"][part]) * np.exp((narrow - wide).sum(1))
             arrays["log_scales"][part], arrays["logit_opacities"][part] = wide, base.logits(opacities, 4 * math.exp(-OPAQUE))
     if n and filtered:
-        notes.append(f"{path}: {_FILTER} of Mip-Splatting is applied to sizes and opacities")
+        notes.append(f"{path}: filter_3D of Mip-Splatting is applied to sizes and opacities")
     stored, scales = arrays["logit_opacities"], arrays["log_scales"]
     if n >= LEAST_JUDGED and stored.min() >= 0 and stored.max() <= 1 and scales.min() > 0:
         notes.append(
@@ -611,19 +609,16 @@ class PLY(_HeadedFormat):
     description = "layout of Kerbl et al. 2023, float32; every tool"
     cleaned = False
     max_degree = 4
+    decode = staticmethod(decode)
 
     def write(self, path: Path, gaussians: Gaussians, normalization: Normalization | None, units: str) -> None:
         """Write Gaussians with `write_ply`."""
         _write(path, gaussians, normalization, units, self.antialiased, self.origin)
 
     def read_stored(self, path: Path) -> Gaussians:
-        """Read Gaussians as `read_ply` does, or with `CompressedPLY` if the header announces that format."""
+        """Read Gaussians as `read_ply` does, or as `CompressedPLY` if the header announces that format."""
         if is_compressed(path, start_of(path)):
-            packed = CompressedPLY()
-            packed.strict = self.strict
-            gaussians = packed.read_stored(path)
-            self.notes, self.origin = packed.notes, packed.origin
-            return gaussians
+            return super().read_stored(path)
         self.notes = []
         gaussians, self.origin = _read(path, self.strict, self.notes)
         return gaussians
