@@ -204,6 +204,25 @@ def test_colours_in_bytes(tmp_path, form, rest):
         read_ply(path)
 
 
+@pytest.mark.parametrize("form", ["ascii", "binary_little_endian"])
+def test_the_filter_of_mip_splatting_is_applied(tmp_path, form):
+    """Each Gaussian is convolved with a ball of its own filter_3D, which keeps its mass; scales of 0 stay finite."""
+    log_scales = np.array([[-3.0, -2, -1], [-1, -1, -1], [-4, -np.inf, -1]])
+    opacities, widths, path = np.array([0.9, 0.5, 0.7]), np.array([0.2, 0.0, 0.1]), tmp_path / "a.ply"
+    logits = np.log(opacities) - np.log1p(-opacities)
+    rows = np.column_stack([np.ones((3, 6)), logits, log_scales, np.ones((3, 4)), widths]).astype("<f4")
+    text = "".join(" ".join(map(str, row)) + "\n" for row in rows.tolist()).encode()
+    head = ply(["element vertex 3", *PROPERTIES, "property float filter_3D"]).replace(b"binary_little_endian", form.encode())
+    path.write_bytes(head + (text if form == "ascii" else rows.tobytes()))
+    with pytest.warns(UserWarning, match=r"a\.ply: filter_3D of Mip-Splatting is applied to sizes and opacities") as caught:
+        back = read_ply(path)
+    assert len(caught) == 1
+    squares = np.exp(2 * log_scales) + widths[:, None] ** 2
+    wanted = opacities * np.sqrt(np.prod(np.exp(2 * log_scales) / squares, axis=1))
+    assert np.allclose(back.log_scales.exp().square(), squares, rtol=1e-5)
+    assert np.allclose(back.logit_opacities.sigmoid(), wanted, atol=1e-6) and bool(back.logit_opacities.isfinite().all())
+
+
 @pytest.mark.parametrize("own", [False, True])
 def test_gaussians_with_bad_numbers_are_left_out(tmp_path, own):
     """With a warning; in our own file, or if the caller is strict, they are an error."""

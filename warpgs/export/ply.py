@@ -374,8 +374,7 @@ def write_ply(
         warpgs.UsageError: The units are unknown, or scene units are given without a normalization.
         ValueError: A tensor has the wrong shape.
     """
-    path = Path(path)
-    _write(path, gaussians, normalization, units, antialiased, None)
+    _write(Path(path), gaussians, normalization, units, antialiased, None)
 
 
 def _write(
@@ -395,11 +394,12 @@ def _write(
 def read_ply(path: str | os.PathLike[str], normalization: Normalization | None = None, *, units: str = "file") -> Gaussians:
     """Read Gaussians from a PLY file in the INRIA 3DGS layout, binary or ASCII; `read_gaussians` also reads compressed ones.
 
-    Properties and elements outside the layout are ignored. Other programs write opacities of 0 and 1 as infinite logits, and
-    axes of length 0 as log scales of -inf. These become finite numbers that look the same (`OPAQUE`, `FLAT`). Their Gaussians
-    with a NaN, another infinity or a rotation of zero length are left out with a warning; `read_gaussians` can refuse them
-    (``strict``). The number of rows is checked against the file size before memory is allocated. A file that declares
-    antialiasing causes a warning: render it with `RasterizeOptions.antialiased`.
+    Other properties and elements are ignored, but ``filter_3D`` of Mip-Splatting is applied, with a warning. Programs write
+    opacities of 0 and 1 as infinite logits, and axes of length 0 as log scales of -inf. These become finite numbers that look
+    the same (`OPAQUE`, `FLAT`). Gaussians of other programs with a NaN, another infinity or a rotation of zero length are left
+    out with a warning; `read_gaussians` can refuse them (``strict``). The number of rows is checked against the file size
+    before memory is allocated. A file that declares antialiasing causes a warning: render it with
+    `RasterizeOptions.antialiased`.
 
     Args:
         path: The file, written by `write_ply` or by another program with the same layout.
@@ -560,6 +560,15 @@ def _assemble(
         arrays["means"][part] = columns(_POSITION, shift=middle)
         arrays["log_scales"][part] = columns(_SCALE, least=FLAT)
         arrays["logit_opacities"][part] = columns(["opacity"], -OPAQUE, OPAQUE)[:, 0]
+        # Mip-Splatting (Yu et al. 2024, section 4.1) convolves each Gaussian with a ball of this standard deviation
+        if filtered := "filter_3D" in (rows.dtype.names or ()):
+            narrow = arrays["log_scales"][part].astype(np.float64)
+            wide = 0.5 * np.logaddexp(2 * narrow, 2 * np.log(np.maximum(columns(["filter_3D"]), math.exp(FLAT))))
+            with np.errstate(invalid="ignore"):  # of rows that are left out
+                opacities = base.sigmoid(arrays["logit_opacities"][part]) * np.exp((narrow - wide).sum(1))
+            arrays["log_scales"][part], arrays["logit_opacities"][part] = wide, base.logits(opacities, 4 * math.exp(-OPAQUE))
+    if n and filtered:
+        notes.append(f"{path}: filter_3D of Mip-Splatting is applied to sizes and opacities")
     stored, scales = arrays["logit_opacities"], arrays["log_scales"]
     if n >= LEAST_JUDGED and stored.min() >= 0 and stored.max() <= 1 and scales.min() > 0:
         notes.append(
@@ -600,19 +609,16 @@ class PLY(_HeadedFormat):
     description = "layout of Kerbl et al. 2023, float32; every tool"
     cleaned = False
     max_degree = 4
+    decode = staticmethod(decode)
 
     def write(self, path: Path, gaussians: Gaussians, normalization: Normalization | None, units: str) -> None:
         """Write Gaussians with `write_ply`."""
         _write(path, gaussians, normalization, units, self.antialiased, self.origin)
 
     def read_stored(self, path: Path) -> Gaussians:
-        """Read Gaussians as `read_ply` does, or with `CompressedPLY` if the header announces that format."""
+        """Read Gaussians as `read_ply` does, or as `CompressedPLY` if the header announces that format."""
         if is_compressed(path, start_of(path)):
-            packed = CompressedPLY()
-            packed.strict = self.strict
-            gaussians = packed.read_stored(path)
-            self.notes, self.origin = packed.notes, packed.origin
-            return gaussians
+            return super().read_stored(path)
         self.notes = []
         gaussians, self.origin = _read(path, self.strict, self.notes)
         return gaussians

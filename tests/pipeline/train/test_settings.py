@@ -224,6 +224,7 @@ def test_keywords_replace_settings():
         (AlphaDifference, {"weight": -1.0}, "alpha.{} must be in"), (SmoothDepth, {"weight": NAN}, "{} must be in"),
         (NormalSmoothness, {"growth": 0}, "{}"), (DepthCorrelation, {"until": 2}, "{}"),
         (FitConfig, {"half_resolution": NAN}, "{} must be in"),
+        *((InitConfig, {"random_count": v}, "init.{} must be in") for v in (0, 10**9)),
         *((StoppingConfig, {"min_gain_db": v}, "stopping.{} must be at least 0 and finite") for v in (math.inf, NAN)),
         *((OptimizerConfig, b, "optimizer.{} must be in") for b in ({"opacities_decay": 0.2}, {"average_last": -0.1})),
         *((LimitConfig, b, "limits.{} must be in") for b in ({"max_size": -1}, {"max_reach": -1}, {"max_size": NAN})),
