@@ -6,14 +6,14 @@
 # a clean folder.
 # Python 3.11.16, all architectures
 FROM python:3.11-slim-bookworm@sha256:a36c24f9cbdf4fd0f52d67f0823eeac19c2028c637cecc392d97f980d4fec56b AS base
-# libEGL and Mesa: plots; libgomp: threads
+# libgomp: threads
 RUN apt-get update \
-    && apt-get install --yes --no-install-recommends libegl1 libgl1 libgl1-mesa-dri libglib2.0-0 libgomp1 \
+    && apt-get install --yes --no-install-recommends libglib2.0-0 libgomp1 \
     && rm -rf /var/lib/apt/lists/* \
     && useradd --create-home --uid 1000 warpgs \
     && install --directory --owner warpgs /opt/warpgs /data
 USER warpgs
-ENV PATH=/opt/warpgs/venv/bin:$PATH WARP_CACHE_PATH=/opt/warpgs/kernels PYTHONSAFEPATH=1 VTK_DEFAULT_OPENGL_WINDOW=vtkEGLRenderWindow
+ENV PATH=/opt/warpgs/venv/bin:$PATH WARP_CACHE_PATH=/opt/warpgs/kernels PYTHONSAFEPATH=1
 RUN python3 -m venv /opt/warpgs/venv && mkdir -p /opt/warpgs/kernels
 COPY --chown=warpgs pyproject.toml constraints.txt README.md LICENSE /opt/warpgs/source/
 COPY --chown=warpgs warpgs /opt/warpgs/source/warpgs

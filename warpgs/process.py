@@ -18,7 +18,7 @@ from typing import Any, NoReturn, TextIO, TypeVar, cast
 
 from warpgs.errors import ResourceError, UsageError
 from warpgs.files import DESCRIPTORS, FULL, readable
-from warpgs.folders import shared_locks, temporary_folder
+from warpgs.folders import shared_locks
 
 # Output that cannot be written: one line on stderr, and the command continues.
 #
@@ -405,40 +405,11 @@ def ignored_signals() -> Iterator[None]:
 # Other processes. Python processes import nothing from the folder that warpgs was called in; no shell is started.
 
 SAFE = {"PYTHONSAFEPATH": "1", "PYTHONIOENCODING": "utf-8"}
-ENDS_WITH_PARENT = (
-    "import os as _os, threading as _threading\n"
-    "_threading.Thread(target=lambda: (_os.read(0, 1), _os._exit(1)), daemon=True).start()\n"
-)
-"""Beginning of a program that ends once its stdin ends."""
 
 
 def end_with_parent() -> None:
     """Have this process end with its parent, even if the parent is killed: the stdin of this process ends then."""
     threading.Thread(target=lambda: (os.read(0, 1), os._exit(1)), daemon=True).start()
-
-
-def run_python(
-    code: str, *arguments: str, timeout: float, environment: dict[str, str] | None = None
-) -> subprocess.CompletedProcess[str]:
-    """Run Python code in another process, and return its exit code and its output."""
-    # The process works in an empty folder that is removed afterwards, and ends when this process is killed. Neither it
-    # nor its children import modules from the current folder (``-P``, PYTHONSAFEPATH), which may be an untrusted scene
-    # with a numpy.py.
-    read, write = os.pipe()  # an empty stdin, which ends with the block or this process; the child then ends
-    with temporary_folder() as folder, shared_locks() as locks, open(read, "rb") as stdin, open(write, "wb"):
-        return subprocess.run(
-            [sys.executable, "-P", "-c", ENDS_WITH_PARENT + code, *arguments],
-            env={**os.environ, **SAFE, **(environment or {})},
-            cwd=folder.path,
-            stdin=stdin,
-            pass_fds=locks,
-            capture_output=True,
-            text=True,
-            encoding="utf-8",
-            errors="replace",
-            timeout=timeout,
-            check=False,
-        )
 
 
 class ProcessFailed(Exception):
@@ -509,8 +480,9 @@ LAST_BYTES = 10_000
 class PythonWorker:
     """A process that runs a module of this package, takes lines on its stdin and answers on its stdout.
 
-    As in `run_python`, the process does not import modules from its folder. Only its parent handles Ctrl-C. The process
-    stops at the end of its stdin, which also ends if the parent is killed.
+    Neither it nor its children import modules from the current folder (``-P``, PYTHONSAFEPATH), which may be an untrusted scene
+    with a numpy.py. Only its parent handles Ctrl-C. The process stops at the end of its stdin, which also ends if the parent is
+    killed.
     """
 
     def __init__(

@@ -32,7 +32,6 @@ from warpgs.pipeline.run import commands as plot
 from warpgs.pipeline.run import results
 from warpgs.pipeline.study import study
 from warpgs.poses import mapping
-from warpgs.report.images import png
 
 SUBREAPER = 36
 """Number of Linux's prctl that gives a process the orphans of its children."""
@@ -57,9 +56,9 @@ class OneProcess:
         """Do nothing."""
 
 
-def plain_plot(*_, size: tuple[int, int], **others) -> bytes:
-    """Stand in for the renderer of plots, which takes seconds."""
-    return png(np.zeros((*size[::-1], 3), np.float32))
+def plain_overview(*_, size: tuple[int, int], **others) -> np.ndarray:
+    """Stand in for the picture of a plot, which takes seconds."""
+    return np.zeros((*size[::-1], 3), np.float32)
 
 
 @contextlib.contextmanager
@@ -98,7 +97,7 @@ def run_one(words: list[str]) -> int:
 
 def run(root: Path, at: int, trace: Path, commands: list[list[str]]) -> int:
     """Run commands; returns the exit code of the first that fails, or 0."""
-    results.render_overview, plot.render_plot = lambda *_: None, plain_plot
+    results.render_overview, plot.render_overview = lambda *_: None, plain_overview
     study.ABLATION_ROWS = {name: study.ABLATION_ROWS[name] for name in ("full", "no events")}
     with trace.open("wb", buffering=0) as log:
         for words in commands:

@@ -3,6 +3,8 @@
 import json
 import os
 import shutil
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -16,7 +18,6 @@ from warpgs.io.images import LoadedImage, turn_upright
 from warpgs.io.load import load_scene
 from warpgs.io.maps import in_pixels_of, resized
 from warpgs.pipeline.metrics.scores import score
-from warpgs.process import run_python
 
 SHAPE = (scenes.HEIGHT, scenes.WIDTH)
 RAMP = (np.arange(np.prod(SHAPE), dtype=np.uint16).reshape(SHAPE) * 10 + 1000).astype(np.uint16)
@@ -114,7 +115,8 @@ def test_an_array_that_gets_shorter_while_it_is_read_is_an_error(room, tmp_path)
     """Where the file was mapped into memory, SIGBUS ended the process."""
     path = tmp_path / "a.npy"
     np.save(path, np.zeros((9000, 17)))
-    done = run_python(SHORTER, room, str(path), timeout=60)
+    program = [sys.executable, "-c", SHORTER, room, str(path)]
+    done = subprocess.run(program, capture_output=True, text=True, timeout=60, check=False)
     assert done.returncode == 0 and f"{path}: cannot be read" in done.stdout and "shorter" in done.stdout, done.stderr
 
 

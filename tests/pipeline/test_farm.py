@@ -10,6 +10,7 @@ import shlex
 import shutil
 import signal
 import stat
+import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -32,7 +33,6 @@ from warpgs.pipeline.run.fit import fit_request
 from warpgs.pipeline.train.loss import LOSS_TERMS
 from warpgs.pipeline.train.presets import preset_settings
 from warpgs.pipeline.train.strategies.base import STRATEGIES
-from warpgs.process import run_python
 from warpgs.ranks import is_loopback, listeners
 
 
@@ -301,7 +301,8 @@ def test_engines_of_clusters_give_the_same_bytes(scenes, single, tmp_path, monke
         found = [ip for _, ip, _ in listeners()]
         assert len(found) > 3 and all(map(is_loopback, found))
         address = sys.modules["ray"].get_runtime_context().gcs_address
-        stranger = run_python(JOIN, address, timeout=120, environment={"RAY_AUTH_TOKEN": "0" * 64})
+        program, environment = [sys.executable, "-c", JOIN, address], os.environ | {"RAY_AUTH_TOKEN": "0" * 64}
+        stranger = subprocess.run(program, capture_output=True, text=True, timeout=120, env=environment, check=False)
         assert stranger.stdout == "refused\n", stranger.stderr
         engine._task = engine._ray.remote(**engine._options)(_die_once(str(killed)))
     else:

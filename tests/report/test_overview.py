@@ -1,18 +1,13 @@
 """The 3D overview of a report, and plots of scenes."""
 
-import io
-import subprocess
-
 import numpy as np
 import pytest
 import torch
-from PIL import Image, ImageColor
+from PIL import ImageColor
 
-from tests.scenes import ring
-from warpgs.errors import ResourceError
 from warpgs.render.options import RasterizeOptions
 from warpgs.report import overview as module
-from warpgs.report.overview import TRAIN_COLOR, probe_rendering, render_overview, render_plot
+from warpgs.report.overview import TRAIN_COLOR, render_overview, with_legend
 from warpgs.scene import C0, Camera, Gaussians
 
 UP = np.array([0.0, -1, 0])
@@ -43,21 +38,32 @@ def colored(image: np.ndarray, color: str) -> int:
     return int((np.abs(image - rgb).sum(-1) < 0.05).sum())
 
 
-def test_the_overview_shows_gaussians_and_both_kinds_of_cameras(monkeypatch):
-    """On white, in the colour without directions, without another process."""
-    monkeypatch.setattr(module, "run_python", None)
+def test_the_overview_shows_gaussians_and_both_kinds_of_cameras():
+    """On white, in the colour without directions."""
     train, test = [camera(a) for a in (-0.4, 0.0, 0.4)], [camera(0.2)]
     image = render_overview(wall(), RasterizeOptions(rule="fast"), train, test, UP)
-    assert image.shape == (module.HEIGHT, module.WIDTH, 3) and (image == 1).all(-1).mean() > 0.5
+    assert image.shape == (*module.SIZE[::-1], 3) and (image == 1).all(-1).mean() > 0.5
     assert (np.abs(image - 0.2).max(-1) < 0.02).sum() > 2000
     seen = {color: colored(image, color) for color in (module.TRAIN_COLOR, module.TEST_COLOR)}
     assert min(seen.values()) > 100
     assert colored(render_overview(wall(), RasterizeOptions(), train, [], UP), module.TEST_COLOR) == 0
+
+
+def test_lines_behind_a_surface_are_hidden():
+    shown = Camera(np.eye(4), np.array([[10.0, 0, 20], [0, 10, 10], [0, 0, 1]]), 40, 20)
+    image, depth = np.full((20, 40, 3), 255, np.uint8), np.full((20, 40), np.inf)
+    depth[:, :20] = 1
+    module._draw(image, depth, shown, np.array([[[-3.0, 0, 2], [3, 0, 2]]]), "#000000")
+    dark = (image < 128).all(-1)
+    assert not dark[:, :18].any() and dark[:, 22:34].any(0).all()
+
+
+def test_no_gaussians_have_no_overview():
     empty = Gaussians(**{n: t[:0] for n, t in wall().tensors().items()})
     assert render_overview(empty, RasterizeOptions(), [camera(0)], [], UP) is None
 
 
-def test_frusta_pass_through_the_image_corners_and_hidden_lines_and_far_points_are_left_out():
+def test_frusta_start_at_the_camera_and_pass_through_the_image_corners():
     c = camera(0.3)
     lines = module.frusta([c], 0.5)
     assert lines.shape == (8, 2, 3)
@@ -66,43 +72,14 @@ def test_frusta_pass_through_the_image_corners_and_hidden_lines_and_far_points_a
     np.testing.assert_allclose(in_camera[:, 2], 0.5)
     pixels = in_camera @ K.T
     np.testing.assert_allclose(pixels[:, :2] / pixels[:, 2:], [[0, 0], [320, 0], [320, 240], [0, 240]], atol=1e-9)
-    # lines behind a surface are hidden
-    shown = Camera(np.eye(4), np.array([[10.0, 0, 20], [0, 10, 10], [0, 0, 1]]), 40, 20)
-    image, depth = np.full((20, 40, 3), 255, np.uint8), np.full((20, 40), np.inf)
-    depth[:, :20] = 1
-    module._draw(image, depth, shown, np.array([[[-3.0, 0, 2], [3, 0, 2]]]), "#000000")
-    dark = (image < 128).all(-1)
-    assert not dark[:, :18].any() and dark[:, 22:34].any(0).all()
-    # of a grid all points count for the camera's place, of the two in a hundred far away none
-    grid = np.stack(np.meshgrid(np.linspace(-3, 3, 20), np.linspace(0, 2, 20), [1.0, 1.5]), -1).reshape(-1, 3)
+
+
+def test_a_whole_wall_is_in_the_image_and_no_far_background():
+    """The points from which the camera's place follows: all of a grid, none of the two in a hundred far away."""
+    wall = np.stack(np.meshgrid(np.linspace(-3, 3, 20), np.linspace(0, 2, 20), [1.0, 1.5]), -1).reshape(-1, 3)
     far = np.random.default_rng(0).normal(size=(16, 3)) * 50 + 200
-    near = module.within(np.concatenate([grid, far]), module.EDGE)
-    assert near[: len(grid)].all() and not near[len(grid) :].any()
-
-
-@pytest.mark.parametrize("code, text", [(-11, "code -11"), (1, "code 1 (no display)")])
-def test_a_crash_of_vtk_is_a_note_and_not_ours(monkeypatch, code, text):
-    seen = {}
-
-    def crash(command, env, **_):
-        seen.update(env)
-        return subprocess.CompletedProcess(command, code, "", "no display\n" if code > 0 else "")
-
-    monkeypatch.setattr(module.subprocess, "run", crash)
-    ok, why = probe_rendering()
-    assert not ok and text in why and "apt-get install libegl1 libgl1 libgl1-mesa-dri" in why
-    assert seen["VTK_DEFAULT_OPENGL_WINDOW"] == "vtkEGLRenderWindow"
-
-
-def test_a_hanging_driver_is_given_up_and_a_machine_that_cannot_render_is_told_what_to_install(monkeypatch):
-    def hang(command, timeout, **_):
-        raise subprocess.TimeoutExpired(command, timeout)
-
-    monkeypatch.setattr(module.subprocess, "run", hang)
-    assert "did not finish" in probe_rendering()[1]
-    monkeypatch.setattr(module, "run_pyvista", lambda *_: (False, "pyvista ended with code -11"))
-    with pytest.raises(ResourceError, match=r"no plot: pyvista ended with code -11.*libegl1"):
-        plot((200, 100), "white")
+    shown = module.within(np.concatenate([wall, far]), module.EDGE)
+    assert shown[: len(wall)].all() and not shown[len(wall) :].any()
 
 
 @pytest.mark.parametrize("aspect", [2.0, 0.5])
@@ -118,48 +95,26 @@ def test_everything_shown_is_in_the_image_and_fills_it(direction, aspect):
     assert (z > 0).all() and 0.85 < reach.max() < 1
 
 
-# Plots: the script gets what is to be shown, the legend stands below, and a machine that cannot render is told why.
+# Plots: another size, on black, without cameras, and the legend below.
 
 
-def plot(size, background, count: int = 400, **changes) -> bytes:
-    points = np.random.default_rng(0).normal(size=(count, 3)) * 0.3
-    points[0] = 1000
-    axes = np.broadcast_to(0.05 * np.eye(3), (count, 3, 3)).copy()
-    axes[1] *= 1e6
-    up, direction = np.array([0, -1.0, 0]), np.array([1.0, -0.5, -1])
-    contents = {"axes": axes, "train": ring(4), "test": ring(2), "legend": [("seen by 1", "#ff0000")]} | changes
-    colors = np.full((count, 3), 0.5)
-    return render_plot(points, colors, up=up, direction=direction, size=size, background=background, **contents)
+def test_a_plot_has_the_size_and_background_that_are_asked_for():
+    shown = render_overview(wall(), RasterizeOptions(), [camera(0)], [], UP, size=(200, 100), background="black", cameras=False)
+    assert shown.shape == (100, 200, 3) and (shown == 0).all(-1).mean() > 0.3 and colored(shown, TRAIN_COLOR) == 0
 
 
-@pytest.fixture
-def sent(monkeypatch) -> dict:
-    found: dict = {}
-
-    def instead(code, source, words, target):
-        with np.load(source) as data:
-            found.update(data)
-        found["words"] = words
-        size = module.json.loads(words)["size"]
-        Image.new("RGB", size, "gray").save(target, "PNG")
-        return True, ""
-
-    monkeypatch.setattr(module, "run_pyvista", instead)
-    return found
+def test_what_lies_far_outside_is_left_out():
+    far = wall(0.9)
+    far.means[:4] += 1000
+    near, options = wall(0.9), RasterizeOptions()
+    near = Gaussians(**{n: t[4:] for n, t in near.tensors().items()})
+    images = [render_overview(g, options, [camera(0)], [], UP, size=(64, 32)) for g in (far, near)]
+    assert np.abs(images[0] - images[1]).mean() < 0.01 and (images[0] < 1).any()
 
 
-def test_what_lies_far_outside_is_left_out_and_what_is_huge_is_shrunk(sent):
-    data = plot((400, 300), "black")
-    assert len(sent["points"]) == 399 and np.abs(sent["points"]).max() < 2
-    lengths = np.linalg.norm(sent["axes"], axis=1)
-    assert lengths[0].max() < 0.2 and lengths[1:].min() > 0.03
-    with Image.open(io.BytesIO(data)) as image:
-        assert image.size == (400, 300)
-        strip = np.asarray(image)[-18:].reshape(-1, 3)
-    for color in (TRAIN_COLOR, "#ff0000"):
-        assert (strip == [int(color[i : i + 2], 16) for i in (1, 3, 5)]).all(1).any()
-    del sent["axes"]
-    data = plot((200, 100), "white", train=[], test=[], legend=[], axes=None)
-    with Image.open(io.BytesIO(data)) as image:
-        assert image.size == (200, 100) and (np.asarray(image) == 128).all()
-    assert "axes" not in sent
+def test_the_legend_is_a_strip_below_the_image():
+    image = np.full((282, 400, 3), 0.5, np.float32)
+    found = with_legend(image, [("training cameras", TRAIN_COLOR), ("seen by 1", "#ff0000")], 300, "black")
+    assert found.shape == (300, 400, 3) and (found[:282] == image).all()
+    assert min(colored(found[282:], color) for color in (TRAIN_COLOR, "#ff0000")) > 10
+    assert with_legend(image, [], 282, "white") is not None

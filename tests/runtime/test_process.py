@@ -26,7 +26,7 @@ from warpgs.files import readable, write_text
 from warpgs.io.load import load_scene
 from warpgs.pipeline.run.folder import load_checkpoint
 from warpgs.poses.photographs import _frames, scene_name
-from warpgs.process import ignored_signals, interrupting_signals, noted_signals, run_python, utf8_name
+from warpgs.process import ignored_signals, interrupting_signals, noted_signals, utf8_name
 from warpgs.report.film import write_film
 from warpgs.report.progress import EventLog
 from warpgs.synthetic.demo import split_spec, write_demo, write_object
@@ -129,18 +129,6 @@ def test_no_command_runs_what_lies_beside_a_scene(trap, tmp_path, program):
     for name, (code, words) in commands.items():
         done = run(program, *words)
         assert done.returncode == code and not mark.exists(), f"{name}: {done.stdout}{done.stderr}"
-
-
-def test_a_process_of_ours_starts_in_a_folder_of_its_own(trap):
-    """An empty one, on no path of modules, also for what the process starts in turn; it is gone afterwards."""
-    _, mark = trap
-    code = "import os, sys, subprocess, json; print(json.dumps([os.getcwd(), os.listdir(), sys.argv[1:], os.environ['A']]))\n"
-    code += "subprocess.run([sys.executable, '-c', 'import pyvista'], capture_output=True)"
-    done = run_python(code, "x y", timeout=100, environment={"A": "é"})
-    assert done.returncode == 0, done.stderr
-    where, there, arguments, variable = ast.literal_eval(done.stdout)
-    assert there == [] and arguments == ["x y"] and variable == "é" and not Path(where).exists()
-    assert not mark.exists()
 
 
 STARTERS = {

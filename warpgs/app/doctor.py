@@ -10,7 +10,6 @@ import shutil
 import sys
 import tempfile
 from collections.abc import Callable, Iterable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -53,12 +52,9 @@ PACKAGES = (
     ("psutil", "psutil", False, "free memory"),
     ("safetensors", "safetensors", True, "checkpoints"),
     ("onnxruntime", "onnxruntime", False, "depth and feature networks"),
-    ("pyvista", "pyvista", False, "`warpgs plot` and `warpgs mesh`"),
-    ("vtk", "vtk", False, "`warpgs plot` and `warpgs mesh`"),
+    ("pyvista", "pyvista", False, "`warpgs mesh`"),
 )
 """Packages: name in the package index, module, whether a fit needs it, and the feature that does not work without it."""
-ONLY_LOCATED = ("pyvista", "vtk")
-"""Modules that another check imports in a subprocess, because importing VTK takes long."""
 EXTRAS = {
     "poses": ("pycolmap", "photographs without cameras"),
     "view": ("viser", "the viewer and HTML pages of models"),
@@ -89,9 +85,7 @@ def _python() -> Iterable[Finding]:
 def _package(distribution: str, name: str, required: bool, use: str) -> Finding:
     """Import a package, since an installed package may still lack a system library."""
     try:
-        if name in ONLY_LOCATED and importlib.util.find_spec(name) is None:
-            raise ModuleNotFoundError(f"No module named {name!r}")
-        module = None if name in ONLY_LOCATED else importlib.import_module(name)
+        module = importlib.import_module(name)
     except Exception as e:
         remedy = f"pip install {distribution}"
         if not isinstance(e, ModuleNotFoundError):
@@ -102,7 +96,7 @@ def _package(distribution: str, name: str, required: bool, use: str) -> Finding:
         detail = importlib.metadata.version(distribution)
     except importlib.metadata.PackageNotFoundError:  # built from source, or another build of the same module
         detail = str(getattr(module, "__version__", "of unknown version"))
-    if module is not None and name == "onnxruntime":
+    if name == "onnxruntime":
         names = [n.removesuffix("ExecutionProvider") for n in module.get_available_providers()]
         detail += f", providers: {', '.join(names)}"
     return Finding(distribution, OK, detail, required=required)
@@ -232,15 +226,6 @@ def _kernel_cache() -> Iterable[Finding]:
     yield Finding(topic, OK, f"{folder}, {format_bytes(size)}, writable{first}", required=True)
 
 
-def _rendering() -> Iterable[Finding]:
-    try:
-        sound, detail = importlib.import_module("warpgs.report.overview").probe_rendering()
-    except Exception as e:
-        sound, detail = False, _reason(e)
-    remedy = "pip install pyvista vtk; on a machine without a screen, also libEGL or libOSMesa (libosmesa6)"
-    yield _noted("Plots", sound, detail + ("" if sound else "; `warpgs plot` cannot render"), remedy)
-
-
 def _video() -> Iterable[Finding]:
     """Encode a few frames for real: a build of OpenCV may accept the codec and still write nothing."""
     sound, detail = True, "VP9 through OpenCV"
@@ -267,12 +252,8 @@ def _disk() -> Iterable[Finding]:
 
 
 CHECKS: tuple[Callable[[], Iterable[Finding]], ...] = (
-    _python, _packages, _extras, _processor, _cuda, _kernel_cache, _prior_cache, _rendering, _video, _disk,
+    _python, _packages, _extras, _processor, _cuda, _kernel_cache, _prior_cache, _video, _disk,
 )  # fmt: skip
-
-
-APART = frozenset({_rendering})
-"""Checks that wait for a subprocess; they run in parallel with the others."""
 
 
 def _findings(check: Callable[[], Iterable[Finding]]) -> list[Finding]:
@@ -286,12 +267,7 @@ def _findings(check: Callable[[], Iterable[Finding]]) -> list[Finding]:
 
 def diagnose(tell: Callable[[str], object] = lambda line: None) -> list[Finding]:
     """Check everything that a fit and its report need."""
-    with ThreadPoolExecutor(len(APART)) as pool:
-        apart = {check: pool.submit(_findings, check) for check in CHECKS if check in APART}
-        checks = [check for check in CHECKS if check not in APART]
-        found = {check: _findings(check) for check in counted(checks, tell, "checking this machine", "parts")}
-        found |= {check: future.result() for check, future in apart.items()}
-        return [f for check in CHECKS for f in found[check]]
+    return [f for check in counted(CHECKS, tell, "checking this machine", "parts") for f in _findings(check)]
 
 
 def print_report(findings: list[Finding], console=None) -> int:

@@ -19,13 +19,13 @@ from warpgs.errors import DataError, UsageError, WarpgsError
 from warpgs.export.base import format_of, read_with_antialiasing
 from warpgs.export.ply import write_ply
 from warpgs.files import filling, write_bytes, write_json, writing_into
-from warpgs.geometry import camera_extent, convert_camera, rotation_matrices
+from warpgs.geometry import camera_extent, convert_camera
 from warpgs.io.image_files import MAX_PIXELS
 from warpgs.io.load import Split, load_scene
 from warpgs.io.transforms import colmap_folder, read_cameras
 from warpgs.locks import hold_file, hold_folder
 from warpgs.pipeline.films import film
-from warpgs.pipeline.films.paths import rig_of
+from warpgs.pipeline.films.paths import rig_among
 from warpgs.pipeline.metrics.coverage import coverage_lines, coverage_of_run
 from warpgs.pipeline.metrics.lpips import Lpips
 from warpgs.pipeline.metrics.scores import Renders, counted_region, psnr, render_view, scored_region, to_8_bit
@@ -45,10 +45,10 @@ from warpgs.priors.views import PriorConfig, view_priors
 from warpgs.render.options import RasterizeOptions
 from warpgs.report.film import h264_encoder
 from warpgs.report.images import COVERAGE_LEGEND, Tile, contact_sheet, png
-from warpgs.report.overview import render_plot
+from warpgs.report.overview import LEGEND_HEIGHT, TEST_COLOR, TRAIN_COLOR, render_overview, with_legend
 from warpgs.report.page import image_names, renaming_notes
 from warpgs.report.progress import Stages, waiting
-from warpgs.scene import Camera, Gaussians, Normalization, Prior, Scene, View, base_colors
+from warpgs.scene import Camera, Gaussians, Normalization, PointCloud, Prior, Scene, View, base_coefficients
 
 RULE = "inria"
 """Default rule for files of Gaussians: most models were trained with it."""
@@ -302,10 +302,8 @@ CHOICES = {"--points": ("gaussians", "start"), "--color": ("own", "coverage"), "
 """Values of the flags of a plot."""
 SIZES = (64, 8192)
 """Smallest and largest side of a plot [px]."""
-MIN_OPACITY = 0.1
-"""Least opacity of a Gaussian that is shown: fainter ones are invisible."""
-MAX_POINTS = {"gaussians": 50_000, "start": 300_000}
-"""Largest number of Gaussians and of points shown; larger sets are sampled at random."""
+POINT_SIZE = 1e-3
+"""Standard deviation of a reconstruction's point as it is shown, as a fraction of the size of the scene."""
 CLASSES = (
     (0, "seen by no training view", "#d6219c"), (1, "by 1", "#f0a020"), (2, "by 2", "#a6bf3a"), (3, "by 3 to 5", "#2fa37c"),
     (6, "by 6 and more", "#2878b5"),
@@ -313,21 +311,23 @@ CLASSES = (
 """Least number of training views, description and colour of each class of coverage."""
 
 
-def _gaussians(stored: StoredRun, train: list[Camera], by_coverage: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return positions [N, 3], colours [N, 3] and axes [N, 3, 3] of the Gaussians that can be seen."""
-    gaussians = stored.gaussians()
-    shown = (torch.sigmoid(gaussians.logit_opacities) >= MIN_OPACITY).cpu()
-    colors = np.clip(base_colors(gaussians.sh[:, :1].cpu().numpy()), 0, 1)
-    if by_coverage:
-        tensors = [replace(c, viewmat=gaussians.means.new_tensor(c.viewmat), K=gaussians.means.new_tensor(c.K)) for c in train]
-        views = coverage(gaussians, tensors, stored.options())[1].cpu().numpy()
-        palette = np.array([[int(color[i : i + 2], 16) / 255 for i in (1, 3, 5)] for _, _, color in CLASSES])
-        colors = palette[np.searchsorted([least for least, _, _ in CLASSES], views, side="right") - 1]
-    means, quats, log_scales = (
-        t.detach().cpu().double()[shown] for t in (gaussians.means, gaussians.quats, gaussians.log_scales)
-    )
-    rotations = rotation_matrices(torch.nn.functional.normalize(quats, dim=1).numpy())
-    return means.numpy(), colors[shown.numpy()], rotations * np.exp(log_scales.numpy())[:, None]
+def _points(cloud: PointCloud, device: torch.device) -> Gaussians:
+    """Return small opaque Gaussians of the points and colours of a reconstruction."""
+    low, high = np.percentile(cloud.points, [5, 95], axis=0)
+    size = POINT_SIZE * max(float(np.linalg.norm(high - low)), 1e-6)
+    means, colors = (torch.as_tensor(a, dtype=torch.float32, device=device) for a in (cloud.points, cloud.colors))
+    quats = torch.nn.functional.pad(means.new_ones(len(means), 1), (0, 3))
+    scales, opacities = torch.full_like(means, math.log(size)), means.new_full((len(means),), 6.0)
+    return Gaussians(means, quats, scales, opacities, base_coefficients(colors)[:, None])
+
+
+def _by_coverage(gaussians: Gaussians, train: list[Camera], options: RasterizeOptions) -> Gaussians:
+    """Return Gaussians in the colours of `CLASSES`, by the number of training views that see them."""
+    like = gaussians.means.new_tensor
+    views = coverage(gaussians, [replace(c, viewmat=like(c.viewmat), K=like(c.K)) for c in train], options)[1].cpu().numpy()
+    palette = np.array([[int(color[i : i + 2], 16) / 255 for i in (1, 3, 5)] for _, _, color in CLASSES])
+    colors = palette[np.searchsorted([least for least, _, _ in CLASSES], views, side="right") - 1]
+    return replace(gaussians, sh=like(base_coefficients(colors))[:, None])
 
 
 def plot(
@@ -347,35 +347,31 @@ def plot(
     if out.suffix.lower() != ".png":
         raise UsageError(f"{out}: a plot is a .png file; give a name that ends in .png")
     stored, tell = open_run(folder, device_name), waiting()
-    tell("rendering depth")
-    found = stored.cameras()
+    found, gaussians = stored.cameras(), stored.gaussians()
     train, test = ([found[n] for n in names] for names in (stored.train, stored.test))
-    depth = film.depth_and_coverage(stored.gaussians(), train, stored.options())[0]
-    rig = rig_of(train, depth, stored.normalization.up)
-    azimuth = 0.0 if rig.span is None else 0.5 * (rig.span[0] + rig.span[1])
-    eye = rig.direction(azimuth + 0.7, max(rig.elevation + 0.35, 0.5))  # from above at an angle, behind cameras of one side
+    up = stored.normalization.up
+    up = rig_among(train, gaussians.means.cpu().numpy().astype(np.float64)).up if up is None else up
     if start:
         scene, _, _ = scene_of(stored)
         if scene.points is None or not len(scene.points):
             raise DataError(f"{scene.path}: its format ({scene.format}) has no points; leave out --points start")
-        at, colors, axes = scene.points.points, scene.points.colors, None
-    else:
-        at, colors, axes = _gaussians(stored, train, by_coverage)
-    if not len(at):
-        raise DataError(f"{folder}: no Gaussian has an opacity of {MIN_OPACITY} or more; there is nothing to show")
-    most = MAX_POINTS[points]
-    notes = stored.notes() + ([] if len(at) <= most else [f"showing a random sample of {most:,} of {len(at):,}"])
-    chosen = np.sort(np.random.default_rng(0).permutation(len(at))[:most])
-    legend = [(words, color) for _, words, color in CLASSES] if by_coverage else []
+        gaussians = _points(scene.points, gaussians.means.device)
+    elif by_coverage:
+        gaussians = _by_coverage(gaussians, train, stored.options())
+    legend = [("training cameras", TRAIN_COLOR), ("held-out cameras", TEST_COLOR)][: 1 + bool(test)] if cameras else []
+    legend += [(words, color) for _, words, color in CLASSES] if by_coverage else []
+    rows = size[1] - (round(LEGEND_HEIGHT * size[1]) if legend else 0)
     with hold_file(out) as held:
         tell("rendering the plot")
-        plot = render_plot(
-            at[chosen], colors[chosen], axes=None if axes is None else axes[chosen], train=train if cameras else [],
-            test=test if cameras else [], up=rig.up, direction=eye, legend=legend, size=size, background=background,
-        )  # fmt: skip
-        write_bytes(out, plot)
-    what = "points of the reconstruction" if start else f"Gaussians of opacity {MIN_OPACITY:g} or more"
-    return [*held, *notes, f"{len(at):,} {what}, {len(train)} training and {len(test)} held-out cameras in {out}"]
+        image = render_overview(
+            gaussians, stored.options(), train, test, up, size=(size[0], rows), background=background, cameras=cameras
+        )
+        if image is None:
+            raise DataError(f"{folder}: the model has no Gaussians; there is nothing to show")
+        write_bytes(out, png(with_legend(image, legend, size[1], background)))
+    what = "points of the reconstruction" if start else "Gaussians"
+    counts = f"{len(gaussians):,} {what}, {len(train)} training and {len(test)} held-out cameras"
+    return [*held, *stored.notes(), f"{counts} in {out}"]
 
 
 SOURCES = ("sweep", "flow")
