@@ -11,8 +11,7 @@ import torch
 import warpgs
 from bench import __main__ as bench_main
 from bench.lib import ops, pages, peers, performance_page, result_file, timing, training
-from bench.lib.inputs import camera as bench_camera
-from bench.lib.inputs import gaussians, image
+from bench.lib.inputs import camera as bench_camera, gaussians, image
 from bench.lib.naive import rasterize as bench_programs_rasterize
 from bench.lib.op_tasks import DEFAULT, OPS
 from bench.lib.ops import Bench, run

@@ -212,7 +212,6 @@ ELSEWHERE = {
     ("app/cli.py", "NamedTemporaryFile"): "details of a defect, in the folder for temporary files",
     ("process.py", "open wb"): "the null device",
     ("report/film.py", "VideoWriter"): "into the temporary file of `replacing`, which decodes it",
-    ("report/overview.py", "savez"): "into a temporary folder",
     ("poses/matching.py", "savez"): "into the file of `replacing`",
     ("report/images.py", "save"): "Pillow, into memory",
     ("report/film.py", "save"): "the same",

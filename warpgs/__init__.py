@@ -67,10 +67,7 @@ __all__ = [
 ]
 
 if TYPE_CHECKING:
-    from warpgs import export as export
-    from warpgs import io as io
-    from warpgs import kernels as kernels
-    from warpgs import train as train
+    from warpgs import export as export, io as io, kernels as kernels, train as train
     from warpgs.constants import Rule, rule_named
     from warpgs.errors import DataError, NotFiniteError, ResourceError, UsageError, WarpgsError
     from warpgs.export.base import Format
@@ -78,8 +75,7 @@ if TYPE_CHECKING:
     from warpgs.geometry import depth_normals, gaussian_normals, look_at
     from warpgs.io.folder import Reader
     from warpgs.io.load import load_scene
-    from warpgs.mesh.fuse import MeshOptions
-    from warpgs.mesh.fuse import fuse as fuse_mesh
+    from warpgs.mesh.fuse import MeshOptions, fuse as fuse_mesh
     from warpgs.pipeline.films.film import render_path
     from warpgs.pipeline.metrics.scores import ViewMetrics, evaluate
     from warpgs.pipeline.model.table import Model, load, save

@@ -16,8 +16,18 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from warpgs.errors import DataError, ResourceError, UsageError
-from warpgs.folders import NAMES as OWN_NAMES
-from warpgs.folders import WINDOWS, Folder, RefusedError, Temporary, is_below, open_folder, output_folder, sweep, temporary_file
+from warpgs.folders import (
+    NAMES as OWN_NAMES,
+    WINDOWS,
+    Folder,
+    RefusedError,
+    Temporary,
+    is_below,
+    open_folder,
+    output_folder,
+    sweep,
+    temporary_file,
+)
 
 # Opening of input files: only regular files of bounded size, so that no pipe hangs a command and no device fills its
 # memory.

@@ -58,21 +58,17 @@ if TYPE_CHECKING:
     from warpgs.pipeline.metrics.scores import quantiles
     from warpgs.pipeline.model.start import InitConfig
     from warpgs.pipeline.model.table import Column, DensityUpdate, Table
-    from warpgs.pipeline.train.loss import LossInputs, LossTerm, Target, photometric_loss, total
-    from warpgs.pipeline.train.loss import register as register_loss_term
+    from warpgs.pipeline.train.loss import LossInputs, LossTerm, Target, photometric_loss, register as register_loss_term, total
     from warpgs.pipeline.train.memory import most_instances
     from warpgs.pipeline.train.schedule import OptimizerConfig, Phases
     from warpgs.pipeline.train.step import captured_renderer, eager_renderer
-    from warpgs.pipeline.train.strategies.base import Growth, Settings, Strategy, StrategyContext
-    from warpgs.pipeline.train.strategies.base import register as register_strategy
+    from warpgs.pipeline.train.strategies.base import Growth, Settings, Strategy, StrategyContext, register as register_strategy
     from warpgs.pipeline.train.strategies.clone_split import CloneSplit, GradientGrowth
     from warpgs.pipeline.train.strategies.sampling import Rendered, Sampling
-    from warpgs.pipeline.train.view_modules import FittedViews, Tensors, ViewModule
-    from warpgs.pipeline.train.view_modules import register as register_view_module
+    from warpgs.pipeline.train.view_modules import FittedViews, Tensors, ViewModule, register as register_view_module
     from warpgs.pipeline.train.views import LearnedView, TrainingView
     from warpgs.ranks import join as join_ranks
     from warpgs.scene import Prior
-    from warpgs.schema import Checked, Within
-    from warpgs.schema import fields as state_schema
+    from warpgs.schema import Checked, Within, fields as state_schema
 else:
     __getattr__, __dir__ = lazy(__name__)

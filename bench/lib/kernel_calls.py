@@ -5,8 +5,7 @@ from __future__ import annotations
 import torch
 
 from warpgs.constants import Rule
-from warpgs.kernels import blend as blending
-from warpgs.kernels import sh, tiles, walk
+from warpgs.kernels import blend as blending, sh, tiles, walk
 from warpgs.kernels.ellipse import ProjectInputs, checked_factors
 from warpgs.kernels.falloff import Pass
 from warpgs.kernels.project import project_inputs

@@ -104,8 +104,7 @@ def _center(camera: Camera) -> torch.Tensor:
 
 def faster_gs(g: Gaussians, camera: Camera) -> Drawing:
     """Return the drawing of Faster-GS; without gradients, it uses its code for images alone."""
-    from FasterGSCudaBackend.torch_bindings.rasterization import RasterizerSettings, diff_rasterize
-    from FasterGSCudaBackend.torch_bindings.rasterization import rasterize as draw_alone
+    from FasterGSCudaBackend.torch_bindings.rasterization import RasterizerSettings, diff_rasterize, rasterize as draw_alone
 
     t = {name: v.detach() for name, v in g.tensors().items()}
     t |= {"sh0": t["sh"][:, :1], "sh_rest": t.pop("sh")[:, 1:], "logit_opacities": t["logit_opacities"][:, None]}

@@ -7,8 +7,7 @@ from collections.abc import Callable
 import torch
 
 from warpgs.kernels.update import Setting
-from warpgs.pipeline.model.table import DensityUpdate, Table
-from warpgs.pipeline.model.table import model_bytes as bytes_of
+from warpgs.pipeline.model.table import DensityUpdate, Table, model_bytes as bytes_of
 from warpgs.pipeline.train.loss import LossConfig, built_in_terms
 from warpgs.pipeline.train.schedule import OptimizerConfig, plan_phases
 from warpgs.pipeline.train.settings import FitConfig, settings_by_views

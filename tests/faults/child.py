@@ -28,8 +28,7 @@ from tests.faults.calls import Call, numbered
 from warpgs.app.cli import OWN_FILES, main
 from warpgs.pipeline.farm.job import Event
 from warpgs.pipeline.farm.work import run_job
-from warpgs.pipeline.run import commands as plot
-from warpgs.pipeline.run import results
+from warpgs.pipeline.run import commands as plot, results
 from warpgs.pipeline.study import study
 from warpgs.poses import mapping
 

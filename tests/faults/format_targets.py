@@ -21,8 +21,7 @@ from tests.faults.targets import Target, not_finite, register, writing
 from tests.gaussians import cloud
 from tests.io import scenes
 from warpgs.errors import DataError
-from warpgs.export import base, gltf, ply, sog, spz
-from warpgs.export import meshes_and_cameras as camera_writers
+from warpgs.export import base, gltf, meshes_and_cameras as camera_writers, ply, sog, spz
 from warpgs.export.base import arrays_of, gaussians_of
 from warpgs.io import transforms
 from warpgs.io.colmap import read_cameras, read_poses

@@ -12,12 +12,10 @@ import numpy as np
 from PIL import Image
 
 from tests.faults.mutations import Change, damage, number, png_bomb, rarely
-from tests.faults.scene_targets import nonsense as scene_nonsense
-from tests.faults.scene_targets import read_scene, write_masked
+from tests.faults.scene_targets import nonsense as scene_nonsense, read_scene, write_masked
 from tests.faults.targets import Target, not_finite, register, writing
 from tests.io import scenes
-from warpgs.io import folder as folders
-from warpgs.io import image_files, images, load
+from warpgs.io import folder as folders, image_files, images, load
 
 MAX_PIXELS = 20_000
 Pixels = tuple[np.ndarray, np.ndarray | None]

@@ -28,8 +28,7 @@ from warpgs.pipeline.metrics import lpips
 from warpgs.pipeline.run import folder
 from warpgs.pipeline.train import presets, settings
 from warpgs.pipeline.train.settings import FitConfig
-from warpgs.poses import find as poses_record
-from warpgs.poses import matching
+from warpgs.poses import find as poses_record, matching
 from warpgs.priors import flow, networks
 from warpgs.report import progress
 from warpgs.scene import Camera, Normalization, View

@@ -20,8 +20,7 @@ from warpgs.export.ply import start_of
 from warpgs.export.sog import SOG
 from warpgs.export.spz import SPZ
 from warpgs.files import read_file
-from warpgs.io import folder as folders
-from warpgs.io import images
+from warpgs.io import folder as folders, images
 from warpgs.io.folder import READERS
 from warpgs.io.load import load_scene
 from warpgs.io.maps import read_numbers

@@ -11,8 +11,7 @@ import pytest
 import warpgs
 from tests.io import scenes
 from warpgs.errors import DataError
-from warpgs.io import colmap, others
-from warpgs.io import transforms as camera_files
+from warpgs.io import colmap, others, transforms as camera_files
 from warpgs.io.load import coincident_views, load_scene, split_views
 from warpgs.pipeline.farm.job import list_jobs
 from warpgs.poses.find import _notes, advice, neighbours

@@ -16,8 +16,7 @@ from tests.reference.update import adam_reference
 from tests.tolerances import close
 from warpgs.constants import RULES
 from warpgs.errors import ResourceError
-from warpgs.kernels import ssim as ssim_module
-from warpgs.kernels import tiles
+from warpgs.kernels import ssim as ssim_module, tiles
 from warpgs.kernels.neighbours import mean_square_distances, morton_codes
 from warpgs.kernels.ssim import differences, ssim
 from warpgs.scene import Gaussians

@@ -6,8 +6,7 @@ import torch
 
 from tests.priors.rigs import rig, still_life
 from tests.reference import sweep as plane_costs
-from tests.reference.sweep import best_inverse
-from tests.reference.sweep import scanline_costs as defined
+from tests.reference.sweep import best_inverse, scanline_costs as defined
 from warpgs.geometry import back_project, seen_pixels
 from warpgs.kernels.sweep import LARGEST, best_inverses, lifted_pixels, occluding, scanline_costs
 from warpgs.priors.sweep import UNIT, matching_costs_cpu

@@ -13,8 +13,7 @@ from warpgs import rasterize
 from warpgs.app.cli import main
 from warpgs.errors import DataError, ResourceError, UsageError
 from warpgs.geometry import project_points, rotation_matrices
-from warpgs.mesh import fuse as fusing
-from warpgs.mesh import views
+from warpgs.mesh import fuse as fusing, views
 from warpgs.mesh.fuse import parts
 from warpgs.mesh.views import (
     SurfaceView,

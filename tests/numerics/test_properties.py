@@ -10,8 +10,7 @@ import math
 
 import pytest
 import torch
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
+from hypothesis import HealthCheck, given, settings, strategies as st
 
 from bench.lib.kernel_calls import bin_tiles, blend, project
 from tests.gaussians import SMOOTH, camera, cloud, leaves

@@ -23,8 +23,7 @@ from warpgs.app.cli import main
 from warpgs.errors import DataError, ResourceError, UsageError
 from warpgs.files import make_folder
 from warpgs.locks import hold_folder, private_shared_folder
-from warpgs.pipeline.farm import job as record
-from warpgs.pipeline.farm import slurm, work
+from warpgs.pipeline.farm import job as record, slurm, work
 from warpgs.pipeline.farm.farm import LocalEngine, local_slots, make_engine, run_farm
 from warpgs.pipeline.farm.ray import RayEngine
 from warpgs.pipeline.farm.slurm import SlurmEngine

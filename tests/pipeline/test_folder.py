@@ -9,8 +9,7 @@ import unicodedata
 
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 import warpgs
 from tests.pipeline.farms import HereEngine, jobs_of, write_scenes

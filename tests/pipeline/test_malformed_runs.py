@@ -11,8 +11,7 @@ from safetensors.torch import save
 
 from warpgs.app.cli import main
 from warpgs.errors import DataError
-from warpgs.pipeline.model.table import load as load_model
-from warpgs.pipeline.model.table import save as save_model
+from warpgs.pipeline.model.table import load as load_model, save as save_model
 from warpgs.pipeline.run import folder as checkpoint
 from warpgs.pipeline.run.folder import TENSORS, load_checkpoint, open_run, read_record, stored_request
 from warpgs.report.progress import read_events

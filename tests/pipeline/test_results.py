@@ -11,8 +11,7 @@ import torch
 
 from tests.gaussians import cloud
 from tests.mesh.balls import ball, cameras
-from tests.pipeline.test_sampling import CONFIG as UNIFORM
-from tests.pipeline.test_sampling import METHOD
+from tests.pipeline.test_sampling import CONFIG as UNIFORM, METHOD
 from tests.scenes import photos, priors, seeds, three_gaussians
 from warpgs.constants import RULES, TILE_SIZE
 from warpgs.errors import ResourceError, UsageError

@@ -24,8 +24,7 @@ from warpgs.pipeline.run import fit as module
 from warpgs.pipeline.run.fit import fit, pose_tasks, title_of, with_poses
 from warpgs.pipeline.run.folder import StoredRun, run_folder
 from warpgs.pipeline.run.request import SceneRequest
-from warpgs.poses import find, mapping
-from warpgs.poses import photographs as module_of_photographs
+from warpgs.poses import find, mapping, photographs as module_of_photographs
 from warpgs.poses.find import JSON, _check_found, advice, find_poses, needs_poses, reason, record_of, report_lines
 from warpgs.poses.mapping import Mapping
 from warpgs.poses.matching import choose_pairs, similarity

@@ -6,8 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from tests.scenes import ring
-from tests.scenes import textured_photos as photos
+from tests.scenes import ring, textured_photos as photos
 from warpgs.priors.photo_checks import check_photos, photo_notes
 
 GAIN = np.array([1.25, 1.0, 0.8], np.float32)

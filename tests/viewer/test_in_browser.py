@@ -16,8 +16,7 @@ from warpgs.geometry import look_at, project_points
 from warpgs.render.rasterize import rasterize
 from warpgs.scene import Normalization
 from warpgs.synthetic.demo import split_spec, write_demo
-from warpgs.viewer import html
-from warpgs.viewer import server as connections
+from warpgs.viewer import html, server as connections
 from warpgs.viewer.server import address, open_server, stop_server
 from warpgs.viewer.watch import live_view
 from warpgs.viewer.window import CROP, PATH, Window, content_of_run

@@ -24,8 +24,7 @@ from warpgs.pipeline.model.start import InitConfig
 from warpgs.pipeline.run import level
 from warpgs.pipeline.run.folder import load_checkpoint, save_checkpoint
 from warpgs.synthetic.demo import split_spec, write_demo
-from warpgs.viewer import watch
-from warpgs.viewer import window as windows
+from warpgs.viewer import watch, window as windows
 from warpgs.viewer.html import middle_first, wxyz_of
 from warpgs.viewer.server import open_server, stop_server
 from warpgs.viewer.window import CROP, PATH, Window, box_json, content_of_file, content_of_run, keyframe, placed, views_of

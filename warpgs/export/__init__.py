@@ -13,7 +13,6 @@ __all__ = [
 ]
 
 if TYPE_CHECKING:
-    from warpgs.export.base import Arrays, Format, read_gaussians, write_gaussians
-    from warpgs.export.base import register as register_format
+    from warpgs.export.base import Arrays, Format, read_gaussians, register as register_format, write_gaussians
 else:
     __getattr__, __dir__ = lazy(__name__)

@@ -18,8 +18,7 @@ __all__ = [
 ]
 
 if TYPE_CHECKING:
-    from warpgs.io.folder import Probe, Reader, SceneFolder, ViewList, view_name
-    from warpgs.io.folder import register as register_reader
+    from warpgs.io.folder import Probe, Reader, SceneFolder, ViewList, register as register_reader, view_name
     from warpgs.io.images import Lens, LoadedImage, ReadOptions
     from warpgs.io.maps import NamedMaps
 else:

@@ -14,12 +14,10 @@ import numpy as np
 from warpgs.errors import DataError
 from warpgs.files import is_within, read_file
 from warpgs.geometry import matmul, seen_pixels
-from warpgs.io import colmap
-from warpgs.io import folder as scenes
+from warpgs.io import colmap, folder as scenes
 from warpgs.io.folder import Probe, Reader, SceneFolder, ViewList, register
 from warpgs.io.images import BLACK, SUFFIXES, Lens, ReadOptions, list_images
-from warpgs.io.maps import SUFFIXES as MAPS
-from warpgs.io.maps import NamedMaps
+from warpgs.io.maps import SUFFIXES as MAPS, NamedMaps
 from warpgs.scene import ORIGIN, Camera, PointCloud, Scene, View, checked_origin
 from warpgs.schema import SchemaError, check_depth, check_parts
 

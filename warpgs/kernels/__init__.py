@@ -12,7 +12,6 @@ __all__ = [
 ]
 
 if TYPE_CHECKING:
-    from warpgs.kernels.cameras import CameraModel
-    from warpgs.kernels.cameras import register as register_camera_model
+    from warpgs.kernels.cameras import CameraModel, register as register_camera_model
 else:
     __getattr__, __dir__ = lazy(__name__)

@@ -8,8 +8,7 @@ from warpgs.constants import LARGEST_COEFFICIENT
 from warpgs.kernels import ellipse, sh
 from warpgs.kernels.cameras import types_of
 from warpgs.kernels.ellipse import PROJECTED_SIZE, arrays_of, make_projection, make_spans
-from warpgs.kernels.native import make_color
-from warpgs.kernels.native import make_functions as make_native
+from warpgs.kernels.native import make_color, make_functions as make_native
 
 Ints = wp.array(dtype=int)
 

@@ -26,8 +26,7 @@ from warpgs.kernels import launch
 from warpgs.kernels.ellipse import make_spans
 from warpgs.kernels.graphs import TORCH, Allocator
 from warpgs.kernels.launch import sort_pairs
-from warpgs.kernels.native import EXACT, SCALE, make_prefetch, source
-from warpgs.kernels.native import make_functions as make_native
+from warpgs.kernels.native import EXACT, SCALE, make_functions as make_native, make_prefetch, source
 from warpgs.kernels.project_cpu import LANES
 
 EACH = 4

@@ -7,8 +7,7 @@ import numpy as np
 import torch
 
 from warpgs.constants import Rule
-from warpgs.kernels import blend as blending
-from warpgs.kernels import launch, sh
+from warpgs.kernels import blend as blending, launch, sh
 from warpgs.kernels.blend import blend, blend_channels
 from warpgs.kernels.ellipse import ProjectInputs, checked_factors, nothing, packed_covariances
 from warpgs.kernels.falloff import Pass

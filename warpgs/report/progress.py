@@ -92,8 +92,7 @@ class _StatusLine:
 
     def _started(self):
         """Return rich's display of one task, which draws itself eight times a second until it is stopped."""
-        from rich.progress import BarColumn, SpinnerColumn, TextColumn, TimeElapsedColumn
-        from rich.progress import Progress as Display
+        from rich.progress import BarColumn, Progress as Display, SpinnerColumn, TextColumn, TimeElapsedColumn
 
         console, own = _console()
         columns = (

@@ -15,8 +15,7 @@ from tests.scenes import photos, priors, seeds
 from warpgs.errors import NotFiniteError, UsageError
 from warpgs.kernels.update import Setting, scheduled_lrs
 from warpgs.pipeline.model.start import InitConfig
-from warpgs.pipeline.train import batch as train_slots
-from warpgs.pipeline.train import step
+from warpgs.pipeline.train import batch as train_slots, step
 from warpgs.pipeline.train.batch import BatchSteps, SlotSums, Tree, check_ranks, check_renders, own_slots
 from warpgs.pipeline.train.presets import PRESETS
 from warpgs.pipeline.train.schedule import OptimizerConfig, PhaseConfig

@@ -25,8 +25,7 @@ from warpgs.kernels.neighbours import pixel_size
 from warpgs.kernels.update import SHIFT
 from warpgs.pipeline.films.paths import framed
 from warpgs.pipeline.metrics.scores import fitted_region, score
-from warpgs.pipeline.model import limits
-from warpgs.pipeline.model import start as init
+from warpgs.pipeline.model import limits, start as init
 from warpgs.pipeline.model.depth_points import carve, hull_points, in_empty_region, silhouettes
 from warpgs.pipeline.model.limits import LimitConfig, camera_rows
 from warpgs.pipeline.model.start import InitConfig, initial_points, random_points

@@ -27,8 +27,7 @@ from warpgs.pipeline.model.table import Table
 from warpgs.pipeline.paper.strategy import UNIFORM
 from warpgs.pipeline.run.fit import non_finite_parts
 from warpgs.pipeline.run.folder import TENSORS, load_checkpoint, save_checkpoint
-from warpgs.pipeline.train import setup
-from warpgs.pipeline.train import trainer as warmups
+from warpgs.pipeline.train import setup, trainer as warmups
 from warpgs.pipeline.train.loss import LossTerm, photometric_loss, register
 from warpgs.pipeline.train.presets import PRESETS
 from warpgs.pipeline.train.schedule import OptimizerConfig, log_linear, sh_degree

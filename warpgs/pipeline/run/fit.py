@@ -27,8 +27,7 @@ from warpgs.pipeline.metrics.scores import Renders, moved_fractions, moved_notes
 from warpgs.pipeline.model.edit import drop_unused_sh
 from warpgs.pipeline.model.limits import shape_figures, shape_summary
 from warpgs.pipeline.model.table import FittedModel, similarity_of
-from warpgs.pipeline.run import folder as folders
-from warpgs.pipeline.run import results
+from warpgs.pipeline.run import folder as folders, results
 from warpgs.pipeline.run.folder import CONFIG, METRICS_FILE, POSED_SCENE, TENSORS
 from warpgs.pipeline.run.precompile import compiled_ahead
 from warpgs.pipeline.run.request import FitRequest, SceneRequest, check_overrides, choose_device, choose_split, read_scene
