@@ -473,6 +473,17 @@ def test_few_views_do_not_decide_alone(hidden):
     assert len(tries[True]) <= edit.REPEATS + 1 and len(tries[False]) <= edit.TRIES * edit.REPEATS
 
 
+def test_degrees_stay_if_lower_ones_alone_lose_too_much_on_all_views():
+    """Gaussians are removed all the same."""
+    whole, cameras = cloud(400, degree=1), [torch_camera(c) for c in ring(3, 40, 30)]
+
+    def loss(made, on_all):
+        return 0.1 * (1 - len(made) / len(whole)) + (on_all and not bool((edit.stored_degrees(made.sh) == 1).all()))
+
+    made, lost = edit.prune_model(whole, cameras, RasterizeOptions(), 0, loss, 0.05, 1.0)
+    assert 0.2 < len(made) / len(whole) < 0.6 and lost <= 0.05
+
+
 FLAGS = f"--split {split_spec(8)} --steps 80 --device cpu --preset 3dgs --sh-every 20 --init.random-count 600".split()
 
 

@@ -30,7 +30,7 @@ def make_walk(real, tile_size: int, make_visit):
     @wp.kernel(enable_backward=False, module="unique", module_options=ROLLED)
     def walk(
         begin: int, settings: f.Blending, projected: wp.array2d(dtype=real), ranges: wp.array2d(dtype=int),
-        gaussian_ids: wp.array(dtype=int), slots: wp.array(dtype=int), per_camera: int, k: int,
+        gaussian_ids: wp.array(dtype=int), per_camera: int, k: int,
         # outputs of the visitor
         reals: wp.array(dtype=real), ids: wp.array(dtype=int), counts: wp.array(dtype=int),
     ):  # fmt: skip
@@ -80,9 +80,8 @@ def make_walk(real, tile_size: int, make_visit):
                                 if settings.inclusive != 0 or not finished:
                                     pixel = (camera * settings.height + top + row) * settings.width + left + part * strip + lane
                                     ended = visit(
-                                        pixel, instance, i - camera * per_camera, alpha * t[p], after, depth,
-                                        slots, k, reals, ids, counts,
-                                    )  # fmt: skip
+                                        pixel, i - camera * per_camera, alpha * t[p], after, depth, k, reals, ids, counts
+                                    )
                                     finished = finished or ended
                                 t[p] = wp.where(finished, real(0.0), after)
                                 unfinished -= wp.where(finished, 1, 0)
@@ -97,7 +96,7 @@ def make_median(real):
 
     @wp.func(inline=True)
     def visit(
-        pixel: int, instance: int, i: int, weight: real, after: real, depth: real, slots: wp.array(dtype=int), k: int,
+        pixel: int, i: int, weight: real, after: real, depth: real, k: int,
         depths: wp.array(dtype=real), ids: wp.array(dtype=int), counts: wp.array(dtype=int),
     ) -> bool:  # fmt: skip
         if after <= real(0.5):
@@ -113,7 +112,7 @@ def make_heaviest(real):
 
     @wp.func(inline=True)
     def visit(
-        pixel: int, instance: int, i: int, weight: real, after: real, depth: real, slots: wp.array(dtype=int), k: int,
+        pixel: int, i: int, weight: real, after: real, depth: real, k: int,
         weights: wp.array(dtype=real), ids: wp.array(dtype=int), counts: wp.array(dtype=int),
     ) -> bool:  # fmt: skip
         counts[pixel] += 1
@@ -274,7 +273,7 @@ def _walk(make_visit, projected: torch.Tensor, tiles: Tiles, settings: Pass, k: 
         kernel, inputs = (kernels.heaviest, [*inputs, *numbers]) if k else (kernels.median, inputs)
         launch.launch(kernel, len(tiles.ranges) * pixels, [*inputs, *outputs], device, block_dim=pixels)
         return
-    inputs += [tiles.slots, projected.shape[1], k, *outputs, *[tiles.ranges.new_empty(0)] * (3 - len(outputs))]
+    inputs += [projected.shape[1], k, *outputs, *[tiles.ranges.new_empty(0)] * (3 - len(outputs))]
     kernel = make_walk(real, tiles.size, make_visit)
     launch.launch(kernel, len(tiles.ranges), inputs, device, cost=10_000, block_dim=32)
 

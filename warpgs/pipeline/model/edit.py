@@ -276,21 +276,29 @@ def prune_model(
 
     The loss is at most ``allowed``. `sensitivities` ranks everything once; they also add up to a budget, of which degrees take
     `DEGREES_FRACTION`. The search is for the budget: it begins with ``first``, on few views, and is repeated for less if the
-    loss on all views is too large. ``cameras`` are those of all training views, tensors.
+    loss on all views is too large; degrees stay if lower ones alone lose too much there. ``cameras`` are those of all training
+    views, tensors.
     """
     space, removal, harmonics = sensitivities(gaussians, cameras, options, seed)
     scores, degrees, aim = importance(space, removal), stored_degrees(gaussians.sh), allowed
     most, tried = float((removal + harmonics).double().sum()) / DEGREES_FRACTION, dict[float, float]()
 
-    def smaller(budget: float) -> Gaussians:
-        lowered = torch.where(cheapest(harmonics, harmonics, DEGREES_FRACTION * budget), 0, degrees)
-        keep = ~cheapest(scores, removal, (1 - DEGREES_FRACTION) * budget)
-        return select(replace(gaussians, sh=truncated(gaussians.sh, lowered)), keep)
+    def lowered(budget: float) -> Gaussians:
+        chosen = cheapest(harmonics, harmonics, DEGREES_FRACTION * budget)
+        return replace(gaussians, sh=truncated(gaussians.sh, torch.where(chosen, 0, degrees)))
 
-    for _ in range(REPEATS):
+    def smaller(budget: float) -> Gaussians:
+        return select(lowered(budget) if lowers else gaussians, ~cheapest(scores, removal, (1 - DEGREES_FRACTION) * budget))
+
+    lowers = bool((degrees > 0).any())
+    for repeat in range(REPEATS):
         budget = largest_budget(tried, lambda budget: loss(smaller(budget), False), first, most, aim)
         model = by_degree(smaller(budget))
         if (lost := loss(model, True)) <= allowed:
             return model, lost
-        aim *= AIM * allowed / lost
+        if repeat == 0 and lowers and loss(lowered(budget), True) > allowed:
+            lowers = False
+            tried.clear()
+        else:
+            aim *= AIM * allowed / lost
     return by_degree(gaussians), 0.0
