@@ -57,7 +57,9 @@ def environment(checkout: Path, cache: Path, cores: str) -> dict[str, str]:
     """Return the environment in which a checkout runs: its own package and kernel cache, a thread for each core."""
     own = {"OMP_NUM_THREADS": str(len(cores.split(",")))} if cores else {}
     own["WARPGS_CACHE"] = tempfile.mkdtemp(dir=cache.parent)  # without maps of an earlier run
-    return os.environ | {"PYTHONPATH": str(checkout), "WARP_CACHE_PATH": str(cache)} | own
+    others = os.environ.get("PYTHONPATH")  # torch may be there
+    path = os.pathsep.join([str(checkout), *([others] if others else [])])
+    return os.environ | {"PYTHONPATH": path, "WARP_CACHE_PATH": str(cache)} | own
 
 
 def compile_kernels(checkout: Path, env: dict[str, str]) -> None:
