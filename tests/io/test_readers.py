@@ -13,7 +13,7 @@ import pytest
 from tests.io import scenes
 from tests.io.scenes import link, refused
 from warpgs.errors import UsageError
-from warpgs.io.folder import Probe, Reader, all_readers, find_reader
+from warpgs.io.folder import Probe, Reader, all_readers, find_reader, loaders
 from warpgs.io.load import load_scene
 from warpgs.scene import Camera, Normalization, Scene, View
 
@@ -234,3 +234,12 @@ def test_our_cameras_state_an_origin(tmp_path, kind):
     assert near.points is None or np.allclose(near.points.points, far.points.points, atol=1e-6)
     said = [n for n in far.notes if n.startswith("map coordinates") and "are relative to 441000" in n]
     assert len(said) == 1 and not any("map coordinates" in n for n in near.notes)
+
+
+@pytest.mark.parametrize(
+    ("cores", "free", "count"), [(2, 2**40, 2), (64, 2**40, 16), (64, 2**35, 8), (64, 2**30, 4), (64, None, 4)]
+)
+def test_more_images_are_read_at_a_time_where_memory_allows(cores, free, count, monkeypatch):
+    monkeypatch.setattr("warpgs.io.folder.usable_cores", lambda: cores)
+    monkeypatch.setattr("warpgs.io.folder.machine_memory", lambda: free and (free, free))
+    assert loaders() == count
