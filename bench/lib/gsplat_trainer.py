@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -57,6 +57,8 @@ class Settings:
     full_steps: int = 30_000
     """Length of the schedule that `refine_stop` belongs to."""
     refine_stop: int = 25_000
+    reset_every: int = 3000
+    """Steps between resets of the opacity, by the default strategy alone."""
     background: tuple[float, float, float] = BLACK
     """Colour behind the scene; gsplat's trainer uses black."""
 
@@ -75,6 +77,13 @@ def default_settings(steps: int) -> Settings:
     return Settings(
         steps, cap=0, strategy="default", init_opacity=0.1, init_scale=1.0, opacity_reg=0.0, scale_reg=0.0, refine_stop=15_000
     )
+
+
+def scaled_settings(strategy: str, steps: int, cap: int) -> Settings:
+    """Return the settings of a strategy with all counts of steps in proportion, as by ``--steps-scaler`` of its trainer."""
+    made = default_settings(steps) if strategy == "default" else Settings(steps, cap)
+    names = ("sh_every", "refine_start", "refine_every", "reset_every")
+    return replace(made, **{n: max(1, getattr(made, n) * steps // made.full_steps) for n in names})
 
 
 def own_scale(cameras: list[Camera], normalization: Normalization) -> float:
@@ -154,7 +163,7 @@ def strategy_of(s: Settings, size: float):
 
     times = {"refine_start_iter": s.refine_start, "refine_stop_iter": s.last_refinement, "refine_every": s.refine_every}
     if s.strategy == "default":
-        strategy = gsplat.DefaultStrategy(**times)
+        strategy = gsplat.DefaultStrategy(**times, reset_every=s.reset_every)
         return strategy, strategy.initialize_state(scene_scale=size)
     strategy = gsplat.MCMCStrategy(cap_max=s.cap, noise_lr=s.noise_lr, **times)
     return strategy, strategy.initialize_state()
@@ -179,9 +188,13 @@ def loaded(view: View, device: torch.device, scale: float) -> _Loaded:
 
 
 def train(
-    views: list[View], first: Gaussians, s: Settings, *, seed: int, scale: float, size: float, draw: Callable = render
-) -> dict:
-    """Train from the positions and colours of the first Gaussians, and return gsplat's parameters in its own world."""
+    views: list[View], first: Gaussians, s: Settings, *, seed: int, scale: float, size: float, draw: Callable = render,
+    watch: Callable[[int, dict], object] = lambda step, params: None,
+) -> dict:  # fmt: skip
+    """Train from the positions and colours of the first Gaussians, and return gsplat's parameters in its own world.
+
+    ``watch`` is called after each step with the number of steps and the parameters.
+    """
     device = first.means.device
     torch.manual_seed(seed)
     params = start(scale * first.means.detach(), C0 * first.sh.detach()[:, 0] + 0.5, s)
@@ -203,6 +216,7 @@ def train(
         schedule.step()
         last = {"lr": schedule.get_last_lr()[0]} if s.strategy == "mcmc" else {}
         strategy.step_post_backward(params=params, optimizers=optimizers, state=state, step=step, info=info, **last)
+        watch(step + 1, params)
     return params
 
 

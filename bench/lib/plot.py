@@ -38,6 +38,8 @@ class Panel:
     x_label: str
     y_label: str
     lines: tuple[Line, ...]
+    linear: bool = False
+    """True for a linear axis y, and more marks on the axis x."""
 
 
 def decades(values: Sequence[float]) -> tuple[int, int]:
@@ -105,27 +107,36 @@ def svg(title: str, width: float, height: float, parts: Sequence[str]) -> str:
     ]) + "\n"  # fmt: skip
 
 
+def _slope(left: float, bottom: float, y_range: tuple[int, int], x_range: tuple[float, float]) -> list[str]:
+    """Return a short line of slope 1 in the lower right corner, where growing series leave space."""
+    run = min(1.0, 0.4 * (x_range[1] - x_range[0]), 0.4 * (y_range[1] - y_range[0]))
+    along, rise = run * PLOT_WIDTH / (x_range[1] - x_range[0]), run * PLOT_HEIGHT / (y_range[1] - y_range[0])
+    end = left + PLOT_WIDTH - 44
+    line = f'<path d="M{end - along:.1f} {bottom - 10}l{along:.1f} {-rise:.1f}" stroke="#bbbbbb" fill="none"/>'
+    return [line, text(end + 5, bottom - 10 - rise + 5, "linear", size=10, color="#999999")]
+
+
 def _panel(panel: Panel, left: float, y_range: tuple[int, int], x_range: tuple[float, float]) -> list[str]:
+    height = (lambda y: y) if panel.linear else math.log10
+
     def px(x: float) -> float:
         return left + PLOT_WIDTH * (math.log10(x) - x_range[0]) / (x_range[1] - x_range[0])
 
     def py(y: float) -> float:
-        return TOP + PLOT_HEIGHT * (y_range[1] - math.log10(y)) / (y_range[1] - y_range[0])
+        return TOP + PLOT_HEIGHT * (y_range[1] - height(y)) / (y_range[1] - y_range[0])
 
     bottom, out = TOP + PLOT_HEIGHT, []
     out.append(text(left, TOP - 30, panel.title, size=13, bold=True))
     out.append(text(left, TOP - 12, panel.y_label, size=11, color="#666666"))
-    ys = [(py(10.0**e), number(10.0**e)) for e in range(y_range[0], y_range[1] + 1)]
-    xs = [(px(10.0**e), number(10.0**e)) for e in range(math.ceil(x_range[0]), math.floor(x_range[1]) + 1)]
+    marks = range(*y_range, max(1, (y_range[1] - y_range[0]) // 8)) if panel.linear else [10.0**e for e in range(*y_range)]
+    ys = [(py(y), number(y)) for y in (*marks, y_range[1] if panel.linear else 10.0 ** y_range[1])]
+    steps = (1, 2, 5) if panel.linear else (1,)
+    sizes = [k * 10.0**e for e in range(math.floor(x_range[0]), math.floor(x_range[1]) + 1) for k in steps]
+    xs = [(px(x), number(x)) for x in sizes if x_range[0] <= math.log10(x) <= x_range[1]]
     out += [*grid(left, TOP, bottom, xs, ys), text(left + PLOT_WIDTH / 2, bottom + 40, panel.x_label, **SMALL)]
 
-    # a short line of slope 1 in the lower right corner, where growing series leave space
-    run = min(1.0, 0.4 * (x_range[1] - x_range[0]), 0.4 * (y_range[1] - y_range[0]))
-    along, rise = run * PLOT_WIDTH / (x_range[1] - x_range[0]), run * PLOT_HEIGHT / (y_range[1] - y_range[0])
-    end = left + PLOT_WIDTH - 44
-    out.append(f'<path d="M{end - along:.1f} {bottom - 10}l{along:.1f} {-rise:.1f}" stroke="#bbbbbb" fill="none"/>')
-    out.append(text(end + 5, bottom - 10 - rise + 5, "linear", size=10, color="#999999"))
-
+    if not panel.linear:
+        out += _slope(left, bottom, y_range, x_range)
     labels = spread([py(line.points[-1][1]) for line in panel.lines], LINE_HEIGHT, TOP, bottom)
     for line, label_y in zip(panel.lines, labels):
         color, places = PALETTE[line.color % len(PALETTE)], [(px(x), py(y)) for x, y in line.points]
@@ -135,7 +146,9 @@ def _panel(panel: Panel, left: float, y_range: tuple[int, int], x_range: tuple[f
         out += [f'<circle cx="{x:.1f}" cy="{y:.1f}" r="3" fill="{color}"/>' for x, y in places]
         x, y = places[-1]
         edge = left + PLOT_WIDTH + 8
-        if abs(label_y - y) > 3 or edge - x > 14:  # a thread leads from the last point to a label that is not beside it
+        if line.label and (
+            abs(label_y - y) > 3 or edge - x > 14
+        ):  # a thread leads from the last point to a label that is not beside it
             thread = f"M{x + 5:.1f} {y:.1f}L{edge - 2:.1f} {label_y:.1f}"
             out.append(f'<path d="{thread}" stroke="{color}" stroke-opacity="0.35" fill="none"/>')
         out.append(text(edge + 1, label_y + 4, line.label, color=color))
@@ -148,7 +161,9 @@ def chart(title: str, panels: Sequence[Panel]) -> str:
     All panels have the same range of y, and those with the same label the same range of x.
     """
     panels = [p for p in panels if p.lines]
-    y_range = decades([y for p in panels for line in p.lines for _, y in line.points])
+    values = [y for p in panels for line in p.lines for _, y in line.points]
+    linear = any(p.linear for p in panels)
+    y_range = (math.floor(min(values)), math.floor(max(values)) + 1) if linear else decades(values)
     step = LEFT + PLOT_WIDTH + RIGHT
     out: list[str] = []
     for i, panel in enumerate(panels):
