@@ -2,6 +2,7 @@
 
 import functools
 import math
+import re
 import sys
 from dataclasses import dataclass
 from types import SimpleNamespace
@@ -10,11 +11,12 @@ import numpy as np
 import pytest
 import torch
 
-from bench.lib import gsplat_trainer, one_fit, pool, result_file, surfaces
+from bench.lib import gsplat_trainer, one_fit, pool, result_file, score_times, surfaces
 from bench.lib.arms import ABLATION, ARMS, LADDER, RIVALS, Arm, chosen_steps
 from bench.lib.backgrounds import ply_scores
 from bench.lib.gsplat_trainer import default_settings, strategy_of
 from bench.lib.one_fit import Fit, config_of, is_peer, peer_settings
+from bench.lib.points import exponent
 from bench.lib.pool import finished
 from bench.lib.preset_table import rival, sizes_table, tables
 from bench.lib.rivals_page import arms_table, other_steps_table
@@ -398,3 +400,65 @@ def test_samples_and_distances_of_triangles():
     wall = raycast.Plane((0, 0, 3.0), still_life()[0].texture)
     camera = Camera(np.eye(4), np.array([[30.0, 0, 16], [0, 30, 12], [0, 0, 1]]), 32, 24)
     assert np.allclose(surfaces.true_depth([wall], camera), 3) and surfaces.true_depth([wall], camera).shape == (24, 32)
+
+
+# PSNR against time: rivals in proportion to their whole schedules, stopped clocks, and the times at which scores are reached.
+
+
+def test_a_short_schedule_is_the_whole_one_in_proportion():
+    """As gsplat's trainer scales it; never below a step."""
+    names = ("sh_every", "refine_start", "refine_every", "reset_every", "last_refinement")
+    for strategy, steps, wanted in (
+        ("default", 7500, (250, 125, 25, 750, 3750)), ("mcmc", 7500, (250, 125, 25, 750, 6250)), ("mcmc", 60, (2, 1, 1, 6, 50)),
+    ):  # fmt: skip
+        s = gsplat_trainer.scaled_settings(strategy, steps, 9)
+        assert tuple(getattr(s, n) for n in names) == wanted and s.steps == steps
+        assert s.strategy == strategy and s.cap == (9 if strategy == "mcmc" else 0)
+
+
+def test_a_rival_is_scored_on_the_way_and_its_clock_stands_still(demo, fake_gsplat, monkeypatch, tmp_path):
+    """From the points that were written; the time of scores is in no time, and the last score is that of the last step."""
+    fit, points = Fit("r", "gsplat", 1, demo, split_spec(8), "", 1, "cpu"), tmp_path / "p.npz"
+    made = score_times.write_points(fit, points)
+    honest, clock = score_times.scores, SimpleNamespace(now=100.0)
+
+    def slow(*of) -> dict:
+        clock.now += 1000.0
+        return honest(*of)
+
+    def monotonic() -> float:
+        clock.now += 1.0
+        return clock.now
+
+    monkeypatch.setattr(score_times, "scores", slow)
+    monkeypatch.setattr(score_times.time, "monotonic", monotonic)
+    row = score_times.rival(fit, "gsplat MCMC", 8, 50, points, 100.0, (0.25, 0.5))
+    assert row["gaussians"] == made["points"] > 0 and [at["step"] for at in row["curve"]] == [2, 4]
+    times = [row["setup"], *(at["seconds"] for at in row["curve"]), row["seconds"]]
+    assert times == sorted(times) and times[-1] < 20, "scores took 2000 s"
+    assert 3 < row["curve"][0]["psnr"] < row["psnr"] < 40
+
+
+def test_the_first_time_at_which_a_score_is_reached():
+    """By any fit of a program or on its way; with the time of the first points where they are not its own."""
+    ours = {"row": "a", "program": "warpgs", "gaussians": 5, "setup": 1.0}
+    its = {"row": "a", "program": "gsplat", "points_seconds": 4.0}
+    rows = [
+        ours | {"steps": 10, "seconds": 8.0, "psnr": 24.0}, ours | {"steps": 20, "seconds": 12.0, "psnr": 26.0},
+        its | {"steps": 50, "seconds": 9.0, "psnr": 23.0, "curve": []},
+        its | {"steps": 100, "seconds": 30.0, "psnr": 25.0, "curve": [{"seconds": 11.0, "step": 30, "psnr": 23.5}]},
+    ]  # fmt: skip
+    lines = score_times.table(rows).splitlines()[2:]
+    assert lines[1] == "| a | gsplat | 100 | 2 | 23.00 | 9.0 | 13.0 | 8.0 | 1.62 |"
+    assert lines[2] == "| a | gsplat | 100 | 1 | 24.00 | 30.0 | 34.0 | 8.0 | 4.25 |"
+    assert lines[3] == "| a | gsplat | 100 | 0 | 25.00 | 30.0 | 34.0 | 12.0 | 2.83 |"
+    chart = score_times.picture(rows)
+    marks = [float(y) for y in re.findall(r'y="([\d.]+)" font-size="11" text-anchor="end"', chart)]
+    assert len(marks) == 5 and np.diff(marks) == pytest.approx(-75), "decibels are evenly spaced, 23 to 27"
+    assert chart.count("stroke-dasharray") == 1 and ">gsplat<" in chart and ">26<" in chart and "linear" not in chart
+
+
+def test_growth_is_the_slope_of_logarithms():
+    """Of a power it is the power; of two powers it lies between."""
+    assert exponent([(n, 3 * n**1.5) for n in (10, 100, 1000)]) == pytest.approx(1.5)
+    assert 1 < exponent([(n, n + n**2 / 100) for n in (1, 10, 100, 1000)]) < 2

@@ -22,6 +22,8 @@ import torch
 import warpgs
 from bench.lib import inputs, one_fit, result_file
 from bench.lib.arguments import parse
+from bench.lib.points import exponent
+from bench.lib.surfaces import true_points
 from bench.lib.tables import figure, markdown
 from bench.lib.timing import measure
 from bench.lib.training import Steps
@@ -65,19 +67,13 @@ def step(count: int, size: tuple[int, int], device: torch.device) -> dict:
 @functools.cache
 def truth(device: torch.device) -> Gaussians:
     """Return opaque Gaussians on the surfaces of the still life that six cameras see."""
-    shapes, light, found = still_life(), raycast.Light(), []
-    for camera in camera_path(6, 320, 240):
-        pixels = np.stack(np.meshgrid(np.arange(320), np.arange(240)), -1).reshape(-1, 2) + 0.5
-        rays = raycast.pixel_rays(camera.K, camera.viewmat, pixels)
-        t, index = raycast.cast(shapes, camera.center, rays)
-        x = (camera.center + t[:, None] * rays)[index >= 0]
-        found.append(np.concatenate([x, raycast.shade(shapes, light, x, index[index >= 0])], 1))
-    places, colors = torch.from_numpy(np.concatenate(found)).float().to(device).split(3, 1)
-    places = places.contiguous()
-    widths = 0.7 * mean_square_distances(places).sqrt().clamp(1e-4, 0.05)
-    quats = torch.tensor([1.0, 0, 0, 0], device=device).repeat(len(places), 1)
-    opacities = torch.full((len(places),), 4.0, device=device)
-    return Gaussians(places, quats, widths.log()[:, None].repeat(1, 3), opacities, ((colors - 0.5) / C0)[:, None].contiguous())
+    shapes, cameras = still_life(), camera_path(6, 320, 240)
+    images = [raycast.render(shapes, raycast.Light(), c.K, c.viewmat, c.width, c.height).reshape(-1, 3) for c in cameras]
+    arrays = (true_points(shapes, cameras), np.concatenate(images))
+    places, colors = (torch.as_tensor(a, dtype=torch.float32, device=device) for a in arrays)
+    widths = (0.7 * mean_square_distances(places).sqrt().clamp(1e-4, 0.05)).log()[:, None].expand(-1, 3).contiguous()
+    quats = torch.nn.functional.pad(places.new_ones(len(places), 1), (0, 3))
+    return Gaussians(places, quats, widths, places.new_full((len(places),), 4.0), ((colors - 0.5) / C0)[:, None])
 
 
 def scene_of(count: int, size: tuple[int, int], device: torch.device) -> Scene:
@@ -98,17 +94,9 @@ def fit(count: int, size: tuple[int, int], preset: str, device: torch.device) ->
         torch.cuda.empty_cache()
         torch.cuda.reset_peak_memory_stats(device)
     began = time.perf_counter()
-    config = one_fit.config_of(preset)
-    m = warpgs.fit(scene, config, device=device, verbose=False).metrics
-    row = {"setup": m["seconds"]["setup"], "training": m["seconds"]["training"], "total": time.perf_counter() - began}
-    row |= {"steps": m["steps"], "fitted_gaussians": m["gaussians"]}
+    m = warpgs.fit(scene, one_fit.config_of(preset), device=device, verbose=False).metrics
+    row = {**m["seconds"], "total": time.perf_counter() - began, "steps": m["steps"], "fitted_gaussians": m["gaussians"]}
     return row | ({"allocated_mib": round(m["peak_torch_bytes"] / 2**20)} if "peak_torch_bytes" in m else {})
-
-
-def exponent(points: list[tuple[float, float]]) -> float:
-    """Return the slope of the best line through the logarithms of (size, value)."""
-    x, y = np.log(np.array(points, dtype=np.float64)).T
-    return float(np.polyfit(x, y, 1)[0])
 
 
 def exponents(rows: list[dict]) -> list[dict]:
@@ -119,26 +107,22 @@ def exponents(rows: list[dict]) -> list[dict]:
         for name in figures:
             points = [(r[axis], r[name]) for r in own if r.get(name)]
             if len({x for x, _ in points}) > 1:
+                half, series = points[-max(2, (len(points) + 1) // 2) :], {"what": what, "axis": axis, "figure": name}
                 ends = {"least": points[0][0], "most": points[-1][0]}
-                half = points[-max(2, (len(points) + 1) // 2) :]
-                found.append(
-                    {"what": what, "axis": axis, "figure": name, **ends, "exponent": exponent(points), "upper": exponent(half)}
-                )
+                found.append(series | ends | {"exponent": exponent(points), "upper": exponent(half)})
     return found
 
 
 def tables(rows: list[dict]) -> str:
     """Return a line for each point, and one for each exponent."""
     figures = list(dict.fromkeys(n for names in AXES.values() for n in names))
-    lines = [
-        [r["what"], r["axis"], *(figure(r[s]) for s in SIZES), *(figure(r[n]) if n in r else "" for n in figures)] for r in rows
-    ]
+    lines = [[figure(r[n]) if n in r else "" for n in (*SIZES, *figures)] for r in rows]
     slopes = []
     for e in exponents(rows):
         span = f"{figure(e['least'])} to {figure(e['most'])}"
         slopes.append([e["what"], e["axis"], span, e["figure"], f"{e['exponent']:.2f}", f"{e['upper']:.2f}"])
-    words, head = ("what", "grows", "figure"), ["what", "grows", "range", "figure", "exponent", "upper half"]
-    return markdown(["what", "grows", *SIZES, *figures], lines, words) + "\n" + markdown(head, slopes, words)
+    last = ["what", "grows", "range", "figure", "exponent", "upper half"]
+    return markdown([*SIZES, *figures], lines) + "\n" + markdown(last, slopes, ("what", "grows", "figure"))
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -151,10 +135,8 @@ def main(arguments: list[str] | None = None) -> None:
     device, small = choose_device(a.device)[0], SMALL[0] * SMALL[1] / 1e6
     ended, rows = time.monotonic() + a.seconds, []
     one_fit.compile_all((a.preset,), str(device))
-    plan = [("step", "gaussians", n, small, 1) for n in a.counts] + [
-        ("step", "megapixels", a.gaussians, m, 1) for m in a.megapixels
-    ]
-    plan += [("fit", "views", 0, small, v) for v in a.views] + [("fit", "megapixels", 0, m, VIEWS) for m in a.megapixels]
+    plan = [("step", "gaussians", n, small, 1) for n in a.counts] + [("fit", "views", 0, small, v) for v in a.views]
+    plan += [(w, "megapixels", n, m, v) for m in a.megapixels for w, n, v in (("step", a.gaussians, 1), ("fit", 0, VIEWS))]
     plan.sort(key=lambda p: (p[0] == "fit", p[2] / 1e6 + p[3] * p[4]))
     for what, axis, count, megapixels, views in plan:
         if time.monotonic() > ended:

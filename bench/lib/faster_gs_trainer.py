@@ -8,11 +8,10 @@ cameras, views on the device, SSIM (fused, as in theirs), distances to neighbour
 
 from __future__ import annotations
 
-import contextlib
 import importlib
 import importlib.util
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 
@@ -64,17 +63,8 @@ def _morton(means: torch.Tensor) -> torch.Tensor:
     return torch.stack(bits).sum(0)
 
 
-@contextlib.contextmanager
-def _made_on(device: torch.device) -> Iterator[None]:
-    """Make new tensors on a device for a while; its framework always does, which would only slow its steps down."""
-    before = torch.get_default_device()
-    torch.set_default_device(device)
-    yield
-    torch.set_default_device(before)
-
-
 def _neighbours(points: torch.Tensor) -> torch.Tensor:
-    with _made_on(torch.device("cpu")):
+    with torch.device("cpu"):
         return mean_square_distances(points).clamp_min(1e-7).sqrt()
 
 
@@ -166,10 +156,8 @@ def _scaled(trainer, factor: float) -> list[tuple]:
         setattr(trainer, name, max(1, round(factor * getattr(trainer, name))))
     for call in (k for k in vars(type(trainer)).values() if getattr(k, "callback_type", None) == 0 and k.active is True):
         times = [call.start_iteration or 0, call.end_iteration, call.iteration_stride or 1]
-        own = [
-            getattr(trainer, t) if isinstance(t, str) else t if t in (None, 0, 1) else max(1, round(factor * t)) for t in times
-        ]
-        found.append((call, *own))
+        whole = [t if t in (None, 0, 1) or isinstance(t, str) else max(1, round(factor * t)) for t in times]
+        found.append((call, *(getattr(trainer, t) if isinstance(t, str) else t for t in whole)))
     return sorted(found, key=lambda c: -c[0].priority)
 
 
@@ -192,7 +180,7 @@ def train(
     trainer.OPTIMIZER = SimpleNamespace(**vars(trainer.OPTIMIZER) | {"LEARNING_RATE_MEANS_MAX_STEPS": steps})
     trainer.model = SimpleNamespace(gaussians=gaussians, ppisp=None, train=lambda: None)
     trainer.renderer = _Renderer(own.FasterGSCudaBackend, gaussians)
-    with _made_on(device):
+    with device:  # new tensors lie there; in its framework always, which would only slow its steps down
         trainer.create_sampler(None, views)
         trainer.setup_gaussians(None, views)
 

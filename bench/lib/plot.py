@@ -39,7 +39,7 @@ class Panel:
     y_label: str
     lines: tuple[Line, ...]
     linear: bool = False
-    """True for a linear axis y."""
+    """True for a linear axis y, and more marks on the axis x."""
 
 
 def decades(values: Sequence[float]) -> tuple[int, int]:
@@ -130,7 +130,9 @@ def _panel(panel: Panel, left: float, y_range: tuple[int, int], x_range: tuple[f
     out.append(text(left, TOP - 12, panel.y_label, size=11, color="#666666"))
     marks = range(*y_range, max(1, (y_range[1] - y_range[0]) // 8)) if panel.linear else [10.0**e for e in range(*y_range)]
     ys = [(py(y), number(y)) for y in (*marks, y_range[1] if panel.linear else 10.0 ** y_range[1])]
-    xs = [(px(10.0**e), number(10.0**e)) for e in range(math.ceil(x_range[0]), math.floor(x_range[1]) + 1)]
+    steps = (1, 2, 5) if panel.linear else (1,)
+    sizes = [k * 10.0**e for e in range(math.floor(x_range[0]), math.floor(x_range[1]) + 1) for k in steps]
+    xs = [(px(x), number(x)) for x in sizes if x_range[0] <= math.log10(x) <= x_range[1]]
     out += [*grid(left, TOP, bottom, xs, ys), text(left + PLOT_WIDTH / 2, bottom + 40, panel.x_label, **SMALL)]
 
     if not panel.linear:
@@ -144,7 +146,9 @@ def _panel(panel: Panel, left: float, y_range: tuple[int, int], x_range: tuple[f
         out += [f'<circle cx="{x:.1f}" cy="{y:.1f}" r="3" fill="{color}"/>' for x, y in places]
         x, y = places[-1]
         edge = left + PLOT_WIDTH + 8
-        if abs(label_y - y) > 3 or edge - x > 14:  # a thread leads from the last point to a label that is not beside it
+        if line.label and (
+            abs(label_y - y) > 3 or edge - x > 14
+        ):  # a thread leads from the last point to a label that is not beside it
             thread = f"M{x + 5:.1f} {y:.1f}L{edge - 2:.1f} {label_y:.1f}"
             out.append(f'<path d="{thread}" stroke="{color}" stroke-opacity="0.35" fill="none"/>')
         out.append(text(edge + 1, label_y + 4, line.label, color=color))

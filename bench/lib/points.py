@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 
 NAMES = {"count": "N", "degree": "degree", "cameras": "cameras", "threads": "threads"}
@@ -166,3 +167,9 @@ def diagonal(rows: list[dict]) -> list[Series]:
         if len(points) > 1:
             found.append(Series(*task, tuple(sorted(points.items())), {}))
     return found
+
+
+def exponent(points: list[tuple[float, float]]) -> float:
+    """Return the slope of the best line through the logarithms of (size, value)."""
+    x, y = np.log(np.array(points, dtype=np.float64)).T
+    return float(np.polyfit(x, y, 1)[0])
