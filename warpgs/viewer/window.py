@@ -322,7 +322,7 @@ class Panel:
         """Add controls that colour what a clean-up would remove, remove it, and put it back; they write nothing but a copy."""
         gui = self.server.gui
         with gui.add_folder("Clean up", expand_by_default=False, visible=shown):
-            self.in_colors = gui.add_checkbox("show what would go", False)
+            self.in_colors = gui.add_checkbox("preview", False, hint="colour what would go")
             self.reasons = {name: gui.add_checkbox(name, True, hint=words) for name, (words, *_) in REASONS.items()}
             counts = gui.add_markdown("")
             remove, undo, save = (gui.add_button(t) for t in ("remove", "undo", "save a copy"))
