@@ -1,6 +1,8 @@
 """The examples run as printed, on small defaults, and show what they promise."""
 
 import importlib.util
+import json
+import os
 import re
 import runpy
 import sys
@@ -46,6 +48,35 @@ def test_examples_show_what_they_promise(name, tmp_path, monkeypatch, capsys):
     assert promised(figure), printed
     assert re.search(r"\d\.\d", printed)
     assert np.asarray(Image.open(tmp_path / image)).std() > 5
+
+
+NOTEBOOK = EXAMPLES / "first_scene.ipynb"
+
+
+def test_a_notebook_is_stored_without_outputs():
+    cells = json.loads(NOTEBOOK.read_text("utf-8"))["cells"]
+    code = [c for c in cells if c["cell_type"] == "code"]
+    assert code and not any(c["outputs"] or c["execution_count"] for c in code)
+
+
+@pytest.mark.slow
+def test_the_notebook_shows_photographs_film_and_page(tmp_path, monkeypatch):
+    """Executed as a user does, but with fewer and smaller photographs; it opens no port but those of Jupyter."""
+    nbformat, nbclient = pytest.importorskip("nbformat"), pytest.importorskip("nbclient")
+    pytest.importorskip("ipykernel")
+    pytest.importorskip("viser")
+    monkeypatch.setenv("PATH", f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}")
+    text = NOTEBOOK.read_text("utf-8").replace("demo scene", "demo scene --views 8 --width 64 --height 48")
+    notebook = nbformat.reads(text, as_version=4)
+    nbformat.validate(notebook)
+    nbclient.NotebookClient(notebook, timeout=900, resources={"metadata": {"path": str(tmp_path)}}).execute()
+    data = [dict(o.get("data", {})) for c in notebook.cells if c.cell_type == "code" for o in c.outputs]
+    assert {"image/png", "image/webp"} <= {kind for d in data for kind in d}
+    texts = [d["text/html"] for d in data if "text/html" in d]
+    assert (
+        len(texts) == 1 and "__VISER_EMBED_DATA__" in texts[0] and any("held-out PSNR" in d.get("text/plain", "") for d in data)
+    )
+    assert all((tmp_path / name).is_file() for name in ("run/report.html", "film.webp", "scene.html"))
 
 
 class StandIn:

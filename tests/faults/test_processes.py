@@ -24,8 +24,8 @@ from warpgs.pipeline.run.export import export
 pytestmark = pytest.mark.fault
 KILLS = int(os.environ.get("WARPGS_KILLS", "0"))
 SHARES = {
-    "fit": 0.22, "resume": 0.15, "eval": 0.08, "render": 0.076, "prune": 0.06, "export": 0.026, "convert": 0.024, "mesh": 0.026,
-    "view": 0.026, "compare": 0.1, "worker": 0.1, "farm": 0.02, "poses": 0.092,
+    "fit": 0.2, "resume": 0.14, "eval": 0.08, "render": 0.076, "prune": 0.06, "export": 0.026, "convert": 0.024, "mesh": 0.026,
+    "view": 0.026, "compare": 0.1, "worker": 0.1, "farm": 0.02, "poses": 0.092, "level": 0.03,
 }  # fmt: skip
 """Parts of all kills by command: more for those with many calls, fewer for those that take long."""
 CASES = [(c, i) for c in tiny_runs.COMMANDS for i in range(round(SHARES[c] * KILLS))] or [("fit", 0)]
@@ -52,13 +52,15 @@ def check_after_kill(reference: tiny_runs.Reference, command: str, work: Path, b
     tiny_runs.check_whole(work, ended=False)
     now = tiny_runs.digests(work)
     assert before.keys() <= now.keys(), "lost"
-    made = {digest for _, _, digest in reference.calls[command]} | set(reference.after[command].values())
+    made = set(reference.after[command].values())
+    if command != "level":  # others write some files several times
+        made |= {digest for _, _, digest in reference.calls[command]}
     for path, digest in now.items():
         if tiny_runs.is_temporary(path):
             continue
         if not path.startswith(tiny_runs.OWN[command]):
             assert digest == before[path], f"{path} is not of this command"
-        elif path.endswith(tiny_runs.SAME_BYTES):
+        elif path.endswith(tiny_runs.SAME_BYTES) or command == "level":
             assert digest == before.get(path) or digest in made, f"{path} is neither the old file nor the new one"
 
 

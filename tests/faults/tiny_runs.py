@@ -32,6 +32,7 @@ HALF_WAY = 33
 """Step at which the run is interrupted that the other commands start from; its checkpoint is of step 30."""
 COMMANDS = (
     "fit", "resume", "render", "export", "convert", "mesh", "prune", "eval", "view", "compare", "worker", "farm", "poses",
+    "level",
 )  # fmt: skip
 """The commands that are killed; ``worker`` is a farm whose jobs run in its own process, so that their calls are seen."""
 NEEDS = {"view": "viser", "poses": "pycolmap"}
@@ -47,9 +48,10 @@ OWN = {
     "prune": ("run-pruned/",), "export": ("a.ply",), "convert": ("b.spz",), "mesh": ("m.glb",),
     "view": ("run/crop.json", "run/path.json"), "compare": ("study/",), "worker": ("results/",), "farm": ("results/",),
     "poses": ("posed/",), "plot": ("run/plot.png",), "priors": ("sheets/",), "ablate": ("ablation/",), "demo": ("made/",),
-    "convert-lpips": ("lpips.safetensors",),
+    "convert-lpips": ("lpips.safetensors",), "level": ("run/config.json", "run/point_cloud.ply"),
 }  # fmt: skip
-"""Beginnings of the paths that a command writes, for all commands that write; doctor reads alone."""
+"""Beginnings of the paths that a command writes, for all commands that write; doctor reads alone. After level, the others would
+make other files."""
 
 
 def can_run(command: str) -> bool:
@@ -92,6 +94,7 @@ def words_of(command: str, scene: Path, work: Path) -> list[str]:
         "plot": ["plot", run, *cpu],
         "priors": ["priors", "show", str(scene), "--split", split_spec(VIEWS), "--out", str(work / "sheets")],
         "ablate": ["ablate", str(scene), "--out", str(work / "ablation"), "--seeds", "1", *short],
+        "level": ["level", run, "--up", "photographs", *cpu],
         "demo": ["demo", str(work / "made"), "--views", "8", "--width", "32", "--height", "32"],
         "convert-lpips": [
             "convert-lpips", "--backbone", str(scene.parent / "alexnet.pth"), "--heads", str(scene.parent / "alex.pth"),

@@ -28,6 +28,7 @@ from warpgs.pipeline.films.film import render_path
 from warpgs.pipeline.metrics import scores
 from warpgs.pipeline.metrics.scores import score, summarize
 from warpgs.pipeline.model.start import InitConfig
+from warpgs.pipeline.run import fit as runs
 from warpgs.pipeline.run.commands import scene_of, view_psnrs
 from warpgs.pipeline.run.folder import METRICS, open_run
 from warpgs.pipeline.run.request import NO_SCORES, SceneRequest
@@ -64,6 +65,16 @@ def fitted(folder):
     scene = warpgs.load_scene(folder / "scene")
     result = warpgs.fit(scene, CONFIG, split=SPLIT, device="cpu", on_step=steps.append, verbose=False)
     return result, steps
+
+
+@pytest.mark.parametrize("long", [False, True])
+def test_a_short_fit_reports_no_moving_objects(folder, monkeypatch, long):
+    """Its edges are blurred, which looks like motion; a tenth of the default's steps is enough."""
+    monkeypatch.setattr(runs, "moved_fractions", lambda views, renders: [0.01] * len(views))
+    monkeypatch.setattr(runs, "steps_by_views", lambda views, opaque: STEPS * 10 + (not long))
+    result = warpgs.fit(str(folder / "scene"), CONFIG, split=SPLIT, device="cpu", verbose=False)
+    assert any("something may have moved" in note for note in result.notes) == long
+    assert (0.01 in [p["moved"] for p in result.metrics["photographs"]]) == long
 
 
 def test_command_and_function_are_one_fit(folder, fitted):

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from tests.gaussians import cloud, shapes_of
 from tests.io import scenes
@@ -27,6 +28,7 @@ from warpgs.io.transforms import read_cameras, stated_origin
 from warpgs.kernels.sh import basis
 from warpgs.pipeline.films.film import FilmSettings
 from warpgs.pipeline.model import edit
+from warpgs.pipeline.model.clean import REASONS, chosen_reasons, in_colors, reasons_of
 from warpgs.pipeline.model.limits import (
     LimitConfig,
     Limits,
@@ -46,7 +48,7 @@ from warpgs.pipeline.train.strategies.clone_split import DensityConfig
 from warpgs.pipeline.train.trainer import Trainer
 from warpgs.render.options import RasterizeOptions
 from warpgs.render.rasterize import rasterize
-from warpgs.scene import Camera, Gaussians, PointCloud
+from warpgs.scene import Camera, Gaussians, PointCloud, base_colors
 from warpgs.synthetic.demo import split_spec, write_demo
 from warpgs.viewer.window import content_of_file
 
@@ -385,6 +387,32 @@ def test_what_disturbs_is_counted_once():
     assert list(edit.disturbing(made)) == ["larger than the scene", "needles over 30 times as long as wide"]
 
 
+def test_a_clean_up_names_each_outlier():
+    """Faint, unseen, huge, thin, far and lonely ones, each by its reason; a sparse background and wide ones are no outliers."""
+    made = cloud(2000)
+    made.logit_opacities[:], made.log_scales[:] = 1, -4
+    made.log_scales[0] = 4
+    made.log_scales[1] = torch.tensor([2.5, -4.0, -5.0])
+    made.logit_opacities[2] = -5
+    made.means[3] = torch.tensor([0, 0, 1e3])
+    made.means[4:6, 1] += 12  # a pair that is alone
+    made.log_scales[5] = 1.5  # reaches its neighbours
+    made.means[100:400] = 4 * made.means[100:400] + torch.tensor([0, 0, 16.0])  # the background
+    maxima = torch.ones(2000)
+    maxima[[2, 6]] = 0
+    found = {name: where.nonzero()[:, 0].tolist() for name, where in reasons_of(made, maxima).items()}
+    assert found == {"opacity": [2], "unseen": [2, 6], "size": [0], "needles": [1], "distance": [3], "density": [3, 4]}
+    assert list(found) == list(REASONS) and "unseen" not in reasons_of(made, None)
+    assert [*reasons_of(edit.select(made, torch.arange(0)), None)] == ["opacity"]
+    shown = in_colors(made, {"size": torch.arange(2000) == 0, "opacity": torch.arange(2000) == 2})
+    colors = base_colors(shown.sh)
+    np.testing.assert_allclose(colors[[0, 2]], np.array([REASONS["size"][2], REASONS["opacity"][2]]) / 255, atol=1e-6)
+    assert shown.log_scales[0].max() < -2 and shown.logit_opacities[2] > 0 and torch.equal(shown.sh[3:], made.sh[3:])
+    for wrong in ("", "unseen,", "far", "show,all"):
+        with pytest.raises(UsageError, match="show, all, or some of opacity, unseen, size"):
+            chosen_reasons(wrong)
+
+
 def test_convert_says_what_it_did(tmp_path):
     made = cloud(100, degree=2)
     made.log_scales[7] = 4
@@ -602,6 +630,32 @@ def test_prune_keeps_its_promise(run, tmp_path, capsys):
     scores = json.loads((tmp_path / "a small one" / "eval.json").read_text())
     assert scores["train"]["psnr"] == pytest.approx(record["train_psnr"][1], abs=1e-9)
     assert scores["test"]["psnr"] == pytest.approx(record["test_psnr"][1], abs=1e-9)
+
+
+def test_a_clean_up_is_shown_before(run, tmp_path, capsys):
+    """Numbers by reason, the same when it is shown and done; a picture with the colours; the run keeps its bytes."""
+    words = ["prune", str(run), "--device", "cpu", "--clean"]
+    before = {p: p.read_bytes() for p in run.rglob("*") if p.is_file()}
+    assert main([*words, "show"]) == 0
+    shown = capsys.readouterr().out
+    assert re.search(r"([0-9,]+) seen by no training view \(unseen, magenta\)", shown) and "held-out PSNR" in shown
+    off = np.abs(np.asarray(Image.open(run / "clean.png").convert("RGB")).astype(int) - REASONS["unseen"][2]).max(2)
+    assert off[:, off.shape[1] // 2 :].min() < 70 < off[:, : off.shape[1] // 2].min(), "in colour at the right alone"
+    assert main([*words, "unseen,opacity", "--out", str(tmp_path / "clean")]) == 0
+    said = capsys.readouterr().out
+    assert "training PSNR" in said and f"{run} keeps the model before" in said
+    (run / "clean.png").unlink()
+    assert before == {p: p.read_bytes() for p in run.rglob("*") if p.is_file()}
+    record, count = json.loads((tmp_path / "clean" / "config.json").read_text())["pruned"], len(open_run(run, CPU).gaussians())
+    assert set(record["removed"]) == {"opacity", "unseen"} and 0 < record["removed"]["unseen"] < count / 2
+    assert len(open_run(tmp_path / "clean", CPU).gaussians()) == count - sum(record["removed"].values())
+    assert main(["prune", str(tmp_path / "clean"), "--clean", "size,opacity,unseen", "--device", "cpu"]) == 0
+    assert "none of" in capsys.readouterr().out and not (tmp_path / "clean-pruned").exists()
+    for more, message in (
+        (["show", "--out", str(tmp_path / "b")], "leave out --out"),
+        (["all", "--keep-psnr", "1"], "one of the two"),
+    ):
+        assert main([*words, *more]) == 2 and message in capsys.readouterr().err
 
 
 def test_bad_input_is_named(run, tmp_path, capsys, monkeypatch):

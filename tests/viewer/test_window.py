@@ -20,6 +20,7 @@ from warpgs.app.cli import main
 from warpgs.errors import DataError
 from warpgs.geometry import convert_gaussians
 from warpgs.pipeline.films.paths import fov_y
+from warpgs.pipeline.model.edit import any_of
 from warpgs.pipeline.model.start import InitConfig
 from warpgs.pipeline.run import level
 from warpgs.pipeline.run.folder import load_checkpoint, save_checkpoint
@@ -311,6 +312,57 @@ def test_the_ruler_picks_and_scales_as_the_command_does(folder, tmp_path):
         window.close()
         stop_server(server)
     assert warpgs.open_run(run).normalization.scale == pytest.approx(model.normalization.scale * units / 3)
+
+
+def pressed(window, label):
+    """Press a button of the panel; returns the note that is then shown."""
+    window.panel.explain("")
+    (press,) = button(window, label)._impl.update_cb
+    press(None)
+    return window.panel._note.content.replace("\\", "")
+
+
+@pytest.mark.parametrize("kind", ["run", "file"])
+def test_a_clean_up_is_shown_undone_and_saved(folder, tmp_path, kind):
+    """What would go is shown in colour, then removed, put back, and saved beside the model, which keeps its bytes."""
+    run = shutil.copytree(folder / "run", tmp_path / "run")
+    tensors, state = load_checkpoint(run)
+    tensors["params.logit_opacities"][:3], tensors["params.logit_opacities"][3:] = -6, 4
+    tensors["params.means"][3] = 1e4
+    save_checkpoint(run, tensors, state)
+    gaussians = warpgs.open_run(run, "cpu").gaussians()
+    if kind == "file":
+        warpgs.write_ply(tmp_path / "a.ply", gaussians, warpgs.open_run(run, "cpu").normalization)
+    before = {p: p.read_bytes() for p in tmp_path.rglob("*") if p.is_file()}
+    server = open_server(0)
+    window = Window(server, content_of_run(run) if kind == "run" else content_of_file(tmp_path / "a.ply"))
+    panel, whole = window.panel, window.shown()
+    try:
+        assert pressed(window, "undo") == "nothing was removed" and "remove first" in pressed(window, "save a copy")
+        panel.in_colors.value = True
+        shown = window.shown()
+        assert len(shown) == len(whole) and (shown.logit_opacities[:3].sigmoid() > 0.59).all()
+        changed = (shown.sh != whole.sh).flatten(1).any(1)
+        assert changed[:4].all() and torch.equal(changed, any_of(window.going().values(), changed)) and changed.sum() < 30
+        panel.reasons["opacity"].value = panel.reasons["unseen"].value = False
+        assert not window.going().keys() & {"opacity", "unseen"}
+        assert torch.equal(window.shown().sh[:3], whole.sh[:3])
+        panel.reasons["opacity"].value = panel.reasons["unseen"].value = True
+        assert not pressed(window, "remove") and len(window.shown()) == len(whole) - changed.sum()
+        assert pressed(window, "remove") == "nothing would go"
+        assert not pressed(window, "undo") and len(window.shown()) == len(whole)
+        pressed(window, "remove")
+        saved = [pressed(window, "save a copy") for _ in range(2)]
+        window.show(window.content)
+        assert len(window.shown()) == len(whole)  # a new checkpoint
+    finally:
+        window.close()
+        stop_server(server)
+    assert {p: p.read_bytes() for p in before} == before
+    for line, name in zip(saved, ("run-pruned", "run-pruned-2") if kind == "run" else ("a-pruned.ply", "a-pruned-2.ply")):
+        assert str(tmp_path / name) in line
+        left = warpgs.open_run(tmp_path / name).gaussians() if kind == "run" else warpgs.read_ply(tmp_path / name)
+        assert len(left) == len(whole) - changed.sum() and left.logit_opacities.min() > 0
 
 
 def test_a_page_names_nobody(folder, tmp_path, capsys):

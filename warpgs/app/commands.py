@@ -210,20 +210,27 @@ def level(
 
 
 def prune(
-    run: Positional[Path], *, keep_psnr: float = 0.1, out: Path | None = None, device: str = "auto", reader: str | None = None
-) -> list[str]:
-    """Shrink a finished model.
+    run: Positional[Path], *, keep_psnr: float | None = None, clean: str | None = None, out: Path | None = None,
+    device: str = "auto", reader: str | None = None,
+) -> list[str]:  # fmt: skip
+    """Shrink a finished model, or clean it up.
 
     Args:
         run: Run folder of `warpgs fit`; it is not changed.
-        keep_psnr: Largest drop of the mean PSNR over the training views [dB].
+        keep_psnr: Largest drop of the mean PSNR over the training views [dB]. Default: 0.1.
+        clean: Remove floaters instead: all, or some of opacity,unseen,size,needles,distance,density; show (write clean.png
+            into the run, which shows what would go).
         out: Run folder to write; must not exist yet. Default: RUN-pruned.
         device: auto, cpu or cuda.
         reader: User-defined reader, as for `warpgs fit --reader`.
     """
     from warpgs.pipeline.run import commands
 
-    return commands.prune(run, keep_psnr, out, device, reader, Stages())
+    if clean is None:
+        return commands.prune(run, 0.1 if keep_psnr is None else keep_psnr, out, device, reader, Stages())
+    if keep_psnr is not None:
+        raise UsageError("--keep-psnr and --clean: give one of the two; a run that one of them made can be given to the other")
+    return commands.clean(run, clean, out, device, reader, Stages())
 
 
 def evaluate(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import threading
 import time
 from collections.abc import Mapping
@@ -15,16 +16,18 @@ import torch
 
 from warpgs.errors import DataError, UsageError, WarpgsError
 from warpgs.export.base import format_of, read_with_antialiasing
+from warpgs.export.ply import write_ply
 from warpgs.files import read_file, readable, remove_leftovers, write_json
 from warpgs.geometry import camera_extent, convert_box, convert_camera, convert_gaussians, matmul, pose_of, rotation_matrices
 from warpgs.io.image_files import decode
 from warpgs.mesh.views import MIN_ALPHA
 from warpgs.pipeline.films.paths import fov_y
 from warpgs.pipeline.metrics.coverage import DepthView, classes_of, coverage_map, depth_views
-from warpgs.pipeline.model.edit import inside
+from warpgs.pipeline.model.clean import REASONS, counted_lines, in_colors, reasons_of
+from warpgs.pipeline.model.edit import any_of, coverage, first_reasons, inside, select
 from warpgs.pipeline.model.table import FittedModel
 from warpgs.pipeline.run import level
-from warpgs.pipeline.run.commands import RULE, scene_of
+from warpgs.pipeline.run.commands import RULE, scene_of, write_clean
 from warpgs.pipeline.run.folder import TENSORS, StoredRun, load_checkpoint, open_run
 from warpgs.pipeline.train.settings import FitConfig
 from warpgs.pipeline.train.strategies.sampling import FINE
@@ -233,6 +236,7 @@ class Panel:
         self._add_stepping()
         self._add_sampling()
         self._add_crop()
+        self._add_clean_up(maps)
         self._add_keyframes()
         self._add_ruler()
         self.tell(content)
@@ -313,6 +317,38 @@ class Panel:
             self._save(CROP, box_json(box, self.content.model.normalization))
 
         save.on_click(guarded(store, self.explain))
+
+    def _add_clean_up(self, shown: bool) -> None:
+        """Add controls that colour what a clean-up would remove, remove it, and put it back; they write nothing but a copy."""
+        gui = self.server.gui
+        with gui.add_folder("Clean up", expand_by_default=False, visible=shown):
+            self.in_colors = gui.add_checkbox("preview", False, hint="colour what would go")
+            self.reasons = {name: gui.add_checkbox(name, True, hint=words) for name, (words, *_) in REASONS.items()}
+            counts = gui.add_markdown("")
+            remove, undo, save = (gui.add_button(t) for t in ("remove", "undo", "save a copy"))
+
+        def show(_: Any = None) -> None:
+            if shows := bool(self.in_colors.value):
+                counts.content = "finding what would go"
+            found = self.window.going() if shows else {}
+            lines = counted_lines(found) or ["nothing would go"] * shows
+            removed = sum(int(where.sum()) for masks in self.window.removed for where in masks.values())
+            counts.content = "\n".join(f"- {line}" for line in [*lines, f"{removed:,} removed"])
+            self.window.redraw()
+
+        def take(_: Any) -> None:
+            self.window.remove()
+            show()
+
+        def put_back(_: Any) -> None:
+            self.window.undo()
+            show()
+
+        for control in (self.in_colors, *self.reasons.values()):
+            control.on_update(guarded(show, self.explain))
+        remove.on_click(guarded(take, self.explain))
+        undo.on_click(guarded(put_back, self.explain))
+        save.on_click(guarded(lambda _: self.explain(self.window.save_copy()), self.explain))
 
     def _add_keyframes(self) -> None:
         """Add controls that append the current camera to a path, and save the path."""
@@ -415,6 +451,8 @@ class Window:
         ahead = html.distance_ahead(self.first, content.model.gaussians())
         self.extent = camera_extent(cameras) if len(cameras) > 1 else 0.1 * ahead
         self.maps = Maps(content, self.extent)
+        self.removed: list[dict[str, torch.Tensor]] = []
+        self._reasons: dict[str, torch.Tensor] | None = None
         self._frusta: dict[str, Any] = {}
         self._drawn: dict[int, tuple[Any, ...]] = {}
         self._lock, self._wake, self._open = threading.RLock(), threading.Event(), True
@@ -433,6 +471,7 @@ class Window:
         """Show another state of the model, with the same cameras."""
         with self._lock:
             self.content, self.maps = content, Maps(content, self.extent)
+            self.removed, self._reasons = [], None
             self.panel.tell(content)
             self.redraw()
 
@@ -451,7 +490,54 @@ class Window:
         box = self.panel.crop_box()
         if box is not None:
             keep &= inside(gaussians, box)
+        if self.panel.in_colors.value:
+            gaussians = in_colors(gaussians, self.going())
+        keep &= ~self._gone()
         return Gaussians(**{n: t.detach()[keep] for n, t in gaussians.tensors().items()})
+
+    def _gone(self) -> torch.Tensor:
+        """Return which Gaussians were removed in the panel, bool [N]."""
+        masks = [where for found in self.removed for where in found.values()]
+        return any_of(masks, self.content.model.gaussians().logit_opacities)
+
+    def going(self) -> dict[str, torch.Tensor]:
+        """Return what the panel's reasons would remove of the Gaussians that are left, each under one reason, bool [N]."""
+        with self._lock:
+            model, left = self.content.model, ~self._gone()
+            if self._reasons is None:
+                cameras = [model.scene_cameras[name] for name in model.train]
+                maxima = coverage(model.gaussians(), cameras, model.options())[0] if cameras else None
+                self._reasons = reasons_of(model.gaussians(), maxima)
+            return first_reasons({n: w & left for n, w in self._reasons.items() if self.panel.reasons[n].value})
+
+    def remove(self) -> None:
+        """Remove what the panel's reasons name, in the viewer alone; UsageError if that is nothing, or everything."""
+        with self._lock:
+            found = self.going()
+            goes = any_of(found.values(), self._gone())
+            if not goes.any() or (goes | self._gone()).all():
+                raise UsageError("nothing would go" if not goes.any() else "everything would go; choose fewer reasons")
+            self.removed.append(found)
+
+    def undo(self) -> None:
+        """Put back what was removed last."""
+        if not self.removed:
+            raise UsageError("nothing was removed")
+        self.removed.pop()
+
+    def save_copy(self) -> str:
+        """Write what is left as a run folder, or as a PLY, beside the model; returns a line for the user."""
+        if not self.removed:
+            raise UsageError("nothing was removed; press remove first")
+        model, stem = self.content.model, self.content.stem.resolve()
+        names = (f"{stem.name}-pruned{more}" for more in itertools.chain([""], map("-{}".format, itertools.count(2))))
+        if isinstance(model, StoredRun):
+            found = {n: any_of([f[n] for f in self.removed if n in f], self._gone()) for n in self.panel.reasons}
+            return write_clean(model, next(p for n in names if not (p := stem.with_name(n)).exists()), found)[-1]
+        path = next(p for n in names if not (p := stem.with_name(f"{n}.ply")).exists())
+        left = select(model.gaussians(), ~self._gone())
+        write_ply(path, left, model.normalization, antialiased=model.antialiased)
+        return f"{len(left):,} Gaussians in {path}"
 
     def redraw(self) -> None:
         """Send the current view to the browsers: the Gaussians, or images at each browser's camera."""

@@ -2,7 +2,7 @@
 
 import json
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -86,6 +86,9 @@ NEEDLE_LENGTH = 0.2
 """A Gaussian beyond the ratio `NEEDLE` is removed if it is longer than this fraction of the scene's size: shorter needles are
 hairs and edges of a good model. With a tenth instead, removal costs up to 0.08 dB on held-out views
 (docs/decisions/014-formats.md)."""
+UNSEEN, LARGE = "seen by no training view", "larger than the scene"
+NEEDLES = f"needles over {NEEDLE:g} times as long as wide"
+"""Reasons to remove a Gaussian."""
 MAX_BOX_BYTES = 65536
 """Largest size of a file that describes a box [bytes]."""
 
@@ -149,24 +152,42 @@ def inside(gaussians: Gaussians, box: Box) -> torch.Tensor:
     return out
 
 
-def disturbing(gaussians: Gaussians, maxima: torch.Tensor | None = None) -> dict[str, torch.Tensor]:
-    """Return the floaters and needles, each under the first reason that applies, bool [N] by reason.
+def size_of(gaussians: Gaussians) -> float:
+    """Return the diagonal of the box that holds the means but for `INNER` at each end of each axis."""
+    low, high = np.quantile(gaussians.means.double().cpu().numpy(), [INNER, 1 - INNER], axis=0)
+    return max(math.sqrt(float(((high - low) ** 2).sum())), 1e-30)
+
+
+def floaters(gaussians: Gaussians, maxima: torch.Tensor | None = None) -> dict[str, torch.Tensor]:
+    """Return the floaters and needles, bool [N] by reason; several may apply to one Gaussian.
 
     ``maxima`` [N] are the largest blending weights over all training views, None without views.
     """
     if not len(gaussians):
         return {}
-    low, high = np.quantile(gaussians.means.double().cpu().numpy(), [INNER, 1 - INNER], axis=0)
-    size = max(math.sqrt(float(((high - low) ** 2).sum())), 1e-30)
+    size = size_of(gaussians)
     longest, middle = long_axes(gaussians.log_scales.double())
     needle = longest - middle > math.log(NEEDLE) + ROUNDING  # a fit holds many at the ratio itself
-    reasons = {} if maxima is None else {"seen by no training view": maxima < SEEN}
-    reasons["larger than the scene"] = longest > math.log(size)
-    reasons[f"needles over {NEEDLE:g} times as long as wide"] = needle & (longest > math.log(NEEDLE_LENGTH * size))
-    free = torch.ones_like(needle)
-    for reason, where in reasons.items():
-        reasons[reason], free = where & free, free & ~where
+    reasons = {} if maxima is None else {UNSEEN: maxima < SEEN}
+    reasons[LARGE] = longest > math.log(size)
+    reasons[NEEDLES] = needle & (longest > math.log(NEEDLE_LENGTH * size))
     return reasons
+
+
+def disturbing(gaussians: Gaussians, maxima: torch.Tensor | None = None) -> dict[str, torch.Tensor]:
+    """Return the `floaters`, each under its first reason alone."""
+    return first_reasons(floaters(gaussians, maxima))
+
+
+def first_reasons(reasons: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    """Return masks [N] in which each Gaussian has only the first of its reasons."""
+    masks = list(reasons.values())
+    return {reason: masks[i] & ~any_of(masks[:i], masks[i]) for i, reason in enumerate(reasons)}
+
+
+def any_of(masks: Iterable[torch.Tensor], like: torch.Tensor) -> torch.Tensor:
+    """Return where any of some masks [N] is true; nowhere without one, in the shape of ``like``."""
+    return torch.stack([torch.zeros_like(like, dtype=torch.bool), *masks]).any(0)
 
 
 def limit_degree(gaussians: Gaussians, degree: int) -> Gaussians:

@@ -19,7 +19,7 @@ from warpgs.errors import DataError, UsageError, WarpgsError
 from warpgs.export.base import format_of, read_with_antialiasing
 from warpgs.export.ply import write_ply
 from warpgs.files import filling, write_bytes, write_json, writing_into
-from warpgs.geometry import camera_extent, convert_camera
+from warpgs.geometry import camera_extent, convert_camera, in_image
 from warpgs.io.image_files import MAX_PIXELS
 from warpgs.io.load import Split, load_scene
 from warpgs.io.transforms import colmap_folder, read_cameras
@@ -30,6 +30,7 @@ from warpgs.pipeline.metrics.coverage import coverage_lines, coverage_of_run
 from warpgs.pipeline.metrics.lpips import Lpips
 from warpgs.pipeline.metrics.scores import Renders, counted_region, psnr, render_view, scored_region, to_8_bit
 from warpgs.pipeline.model import edit
+from warpgs.pipeline.model.clean import chosen_reasons, counted_lines, in_colors, reasons_of
 from warpgs.pipeline.model.edit import coverage
 from warpgs.pipeline.model.start import InitConfig, consistent_depths, seen_points
 from warpgs.pipeline.model.table import FittedModel, model_bytes, pack
@@ -294,6 +295,79 @@ def prune(
             if views
         ),
         f"in {out}: checkpoint, PLY; `warpgs eval {run}` scores it, `warpgs render {run}` renders it",
+    ]
+
+
+CLEAN = "clean.png"
+"""Picture of what a clean-up would remove, in the folder of a run."""
+
+
+def clean_picture(model: FittedModel, found: dict[str, torch.Tensor], views: list[View]) -> np.ndarray:
+    """Return a sheet of the view that shows most of what would go: before, in colours over the gray render, and after."""
+    gaussians, options = model.gaussians(), model.options()
+    goes = edit.any_of(found.values(), gaussians.logit_opacities)
+    means = gaussians.means[goes].cpu().double().numpy()
+    view = max(views, key=lambda v: int(in_image(v.camera, means).sum()))
+    before, after = (render_view(g, view, options)[0] for g in (gaussians, edit.select(gaussians, ~goes)))
+    colors, _, alpha = render_view(edit.select(in_colors(gaussians, found), goes), view, replace(options, background=None))
+    over = colors + (1 - alpha[..., None]) * before.mean(-1, keepdims=True)
+    tiles = [Tile("before", before), Tile("what would go, also behind surfaces", over), Tile("after", after)]
+    lines = [f"{int(goes.sum()):,} of {len(goes):,} Gaussians would go:", *counted_lines(found)]
+    return contact_sheet(view.name, lines, tiles, columns=2)
+
+
+def write_clean(
+    stored: StoredRun, out: Path, found: dict[str, torch.Tensor], scores: dict[str, list[float]] | None = None
+) -> list[str]:
+    """Write a run without the Gaussians of some masks [N] into a new folder; returns lines for the user."""
+    goes = edit.any_of(found.values(), stored.gaussians().logit_opacities)
+    left = edit.by_degree(edit.select(stored.gaussians(), ~goes))
+    figures = {
+        "source": str(stored.folder.resolve()), "removed": {name: int(where.sum()) for name, where in found.items()},
+        "count": [len(goes), len(left)], "psnr": scores,
+    }  # fmt: skip
+    # the new checkpoint has no increments of poses: its record holds the cameras after them
+    record = stored.record | {"pruned": figures, "cameras": {n: camera_values(c) for n, c in stored.scene_cameras.items()}}
+    held = _write(out, record, left, stored.step, stored.normalization)
+    return [*held, f"{len(left):,} Gaussians in {out}: checkpoint, PLY; {stored.folder} keeps the model before"]
+
+
+def clean(
+    folder: Path, wish: str, out: Path | None, device_name: str, reader: str | None = None,
+    tell: Callable[[str], object] = lambda line: None,
+) -> list[str]:  # fmt: skip
+    """Write a run without what ``wish`` names (`chosen_reasons`), or for show only a picture of that; returns lines."""
+    show = wish == "show"
+    names, (device, _) = chosen_reasons("all" if show else wish), choose_device(device_name)
+    if show and out is not None:
+        raise UsageError(f"--clean show writes {CLEAN} into the run; leave out --out, or choose what to remove")
+    stored = open_run(folder, device)
+    out = _new_folder(folder, out) if not show else folder / CLEAN
+    _, train, test = scene_of(stored, reader, tell)
+    tell("finding what would go")
+    before, options = stored.gaussians(), stored.options()
+    reasons = reasons_of(before, coverage(before, [TrainingView.of(v, device).camera for v in train], options)[0])
+    found = edit.first_reasons({name: reasons[name] for name in names if name in reasons})
+    goes = edit.any_of(found.values(), before.logit_opacities)
+    if (count := int(goes.sum())) in (0, len(goes)):
+        return [*stored.notes(), f"{'all' if count else 'none'} of {len(goes):,} Gaussians would go; nothing is changed"]
+    tell("scoring")
+    after, kinds = edit.select(before, ~goes), (("training", train), ("held-out", test))
+    scores = {k: [float(np.mean(view_psnrs(g, views, options))) for g in (before, after)] for k, views in kinds if views}
+    if show:
+        tell("drawing")
+        with hold_file(out) as last:
+            write_bytes(out, png(clean_picture(stored, found, train)))
+        home = shlex.quote(str(folder))
+        last.append(f"picture in {out}; `warpgs prune {home} --clean all`, or with some of these names, removes them")
+    else:
+        last = write_clean(stored, out, found, scores)
+    return [
+        *stored.notes(),
+        f"{count:,} of {len(goes):,} Gaussians {'would go' if show else 'removed'}:",
+        *(f"  {line}" for line in counted_lines(found)),
+        *(f"{kind} PSNR {old:.2f} -> {new:.2f} dB" for kind, (old, new) in scores.items()),
+        *last,
     ]
 
 
