@@ -89,7 +89,7 @@ def cells(text: str) -> list[list[list[str]]]:
     return found
 
 
-def test_markdown_holds_means_deviations_and_differences():
+def test_markdown_holds_means_deviations_differences_and_check_marks():
     """The best of a column is bold; an interval without 0 is marked; a figure without a spread stands alone."""
     text = markdown(table_of())
     assert text.startswith("Scores of held-out views: mean ± standard deviation over seeds, the best mean in bold:")
@@ -104,9 +104,6 @@ def test_markdown_holds_means_deviations_and_differences():
     gaps = {"b": {"psnr": paired_difference([21.0], [20.0])}}
     figures, gaps = cells(markdown(table_of(samples=one, differences=gaps, metrics=("psnr",))))
     assert figures[2][1] == "20.00" and gaps[2][1] == "+1.00"
-
-
-def test_ablation_has_check_marks_in_every_notation():
     t = table_of(switches=("Hier", "S_{rend}"), marks={"full": (True, True), "no a_b|c": (False, True)})
     figures, _ = cells(markdown(t))
     assert figures[0][:3] == ["row", "Hier", "S_rend"] and [r[1:3] for r in figures[2:]] == [["✓", "✓"], ["✗", "✓"]]
@@ -116,8 +113,8 @@ def test_ablation_has_check_marks_in_every_notation():
     assert head[1:3] == ["Hier", "S_rend"] and [r[1:3] for r in rows if r[3] == "psnr"] == [[1, 1], [0, 1]]
 
 
-def test_csv_keeps_every_digit():
-    """What was not measured is empty, not zero."""
+def test_csv_keeps_every_digit_and_latex_is_escaped():
+    """What was not measured is empty, not zero; TeX reads ^^5c as a backslash, and an empty line as the end of a paragraph."""
     head, *rows = csv_rows(table_of())
     rows = {(r[0], r[1]): dict(zip(head, r, strict=True)) for r in rows}
     r = rows["no a_b|c", "psnr"]
@@ -125,10 +122,6 @@ def test_csv_keeps_every_digit():
     assert found == [sample(OTHER).mean, sample(OTHER).sd, GAP.mean, GAP.low, GAP.high] and r["pairs"] == 3
     assert rows["full", "psnr"]["difference"] == rows["full", "psnr"]["pairs"] == rows["full", "lpips"]["mean"] == ""
     assert len(rows) == 6
-
-
-def test_latex_is_balanced_and_escaped():
-    """Names cannot break the table: TeX reads ^^5c as a backslash, and an empty line as the end of a paragraph."""
     tex = latex(table_of())
     assert tex.count("{") == tex.count("}") and tex.count("$") % 2 == 0 and "\\begin{tabular}{lcccr}" in tex
     assert "no a\\_b|c" in tex and "100 \\%" in tex and "paired by seed, with a 95 \\% t int" in tex
@@ -138,14 +131,10 @@ def test_latex_is_balanced_and_escaped():
     assert words in latex(table_of(caption="\\a^^5cinput{b}~c\n\nd"))
 
 
-def test_small_differences_keep_their_digits():
-    """No minus zero, and an interval without 0 does not end at 0."""
+def test_small_differences_keep_their_digits_and_the_best_follows_what_is_printed():
+    """No minus zero, and an interval without 0 does not end at 0; equal when printed is equally best."""
     assert interval(paired_difference([20.0, 20.0, 20.001], [20.0, 20.001, 20.0]), 2) == "+0.00 [+0.00, +0.00]"
     assert interval(paired_difference([19.9986, 19.9988], [20.0, 20.0]), 2) == "-0.00130 [-0.00257, -0.00003]"
-
-
-def test_best_follows_the_direction_and_what_is_printed():
-    """Equal when printed is equally best; nothing measured has no best."""
     table = table_of(samples={str(v): {m: sample([v]) for m in ("psnr", "lpips")} for v in (20.0001, 20.0004, 21.0)})
     assert [table.best("psnr"), table.best("lpips")] == [21.0, 20.0] and math.isnan(table.best("ssim"))
 
@@ -183,7 +172,7 @@ def metrics_of(request, variant, seed):
     return json.loads((run_folder(request, "still", variant, seed) / "metrics.json").read_text())
 
 
-def test_every_run_is_an_ordinary_run_folder_and_every_file_of_the_study_is_there(finished):
+def test_runs_files_and_table_of_a_study(finished):
     """SCENE/VARIANT/SEED; the figure shows both settings and the held-out photographs."""
     request, _ = finished
     for variant, steps in (("a", 8), ("b b", 16)):
@@ -200,10 +189,7 @@ def test_every_run_is_an_ordinary_run_folder_and_every_file_of_the_study_is_ther
     assert (
         record["seeds"] == 2 and set(record["variants"]) == {"a", "b b"} and len(record["scenes"]["still"]["fingerprint"]) == 64
     )
-
-
-def test_table_is_of_these_runs(finished):
-    """Means, deviations and paired intervals, computed here once more from the run folders."""
+    # means, deviations and paired intervals, computed here once more from the run folders
     request, lines = finished
     text = (request.out / "table.md").read_text()
     figures, gaps = cells(text)
@@ -443,7 +429,7 @@ def test_command_compares_presets(scene, tmp_path, capsys, monkeypatch):
 FULL = dataclasses.replace(A, preset="whole", strategy="paper", method=MethodConfig(hier=True))
 
 
-def test_ablation_rows_switch_off_one_part_each():
+def test_ablation_rows_switch_one_part_each():
     """Full, uniform sampling, one score more at a time, each other part off, no sampling, and the paper's settings; marks."""
     variants, marks = ablation_variants(FULL)
     scores = ["uniform", "residual only", "residual + semantics"]  # which is full without geometry
@@ -465,10 +451,7 @@ def test_ablation_rows_switch_off_one_part_each():
     assert all(marks["full"]) and list(SWITCHES)[:7] == ["hier", "s_render", "s_semantic", "s_geometry", "ra", "agp", "pm"]
     with pytest.raises(UsageError, match="preset '3dgs' has no sampling events"):
         ablation_variants(FitConfig())
-
-
-def test_ablation_switches_on_what_a_preset_leaves_out():
-    """A preset without scores gets a row with each and one with all, and no row twice: uniform is the preset itself."""
+    # with a row for each and one with all, and no row twice: uniform is the preset itself
     base = dataclasses.replace(FULL, strategy="sampling", strategy_config=None)
     variants, _ = ablation_variants(base)
     rows = "full", "residual only", "residual + semantics + geometry", "with s_semantic", "with s_geometry"
@@ -571,7 +554,7 @@ def test_forest_draws_every_seed_and_prints_every_interval():
     assert "no pair of runs to compare" in forest(Table("t", ("lpips",), {"a": {}, "b": {}}, one))
 
 
-def test_crops_find_where_pictures_differ():
+def test_crops_find_where_pictures_differ_and_a_sheet_shows_them():
     """The largest disagreement first, the next one beside it, none overlapping."""
     truth = np.zeros((40, 60, 3), np.float32)
     a, b = truth.copy(), truth.copy()
@@ -588,10 +571,7 @@ def test_crops_find_where_pictures_differ():
     many = crops(np.random.default_rng(0).random((20, 20)), 10, 10, 9)
     assert 1 <= len(many) <= 4
     assert all(abs(a - c) >= 10 or abs(b - d) >= 10 for i, (a, b) in enumerate(many) for c, d in many[:i])
-
-
-def test_sheet_shows_every_picture_and_its_crops():
-    """Columns of one width; a flat picture keeps its colour; boxes and frames have the colours of their crop."""
+    # columns of one width; a flat picture keeps its colour; boxes and frames have the colours of their crop
     colors = [(0.2, 0.4, 0.6), (0.8, 0.1, 0.3), (0.5, 0.5, 0.1)]
     cells = [(np.full((30, 40, 3), c, np.float32), f"{i}.00 dB") for i, c in enumerate(colors)]
     data = sheet(["a", "b" * 90, "photograph"], [("scene, view", cells, [(2, 3, 8, 6), (20, 10, 8, 6)])] * 2)
