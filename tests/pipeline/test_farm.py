@@ -180,15 +180,6 @@ def test_links_that_double_a_scene_at_each_level_are_not_listed(tmp_path, monkey
     assert record.source_stamp(tmp_path / "3") and not record.source_stamp(tmp_path / "0")  # 31 folders, and 255
 
 
-def test_settings_that_follow_from_the_views_are_the_same_settings(scenes, tmp_path):
-    """The record of a run has settings that were left open as chosen: the finished run is kept all the same."""
-    (job, _) = jobs_of(scenes, tmp_path, half_resolution=None)
-    run_farm([job], HereEngine())
-    (tmp_path / "s0" / record.RECORD).unlink()
-    (status,) = run_farm([job], HereEngine())
-    assert status.record.how == "kept"
-
-
 class Alone(Exception):
     """The second farm has nothing left but jobs of the first."""
 
@@ -209,10 +200,7 @@ def test_a_second_farm_on_the_folder_takes_over_what_the_first_one_does(scenes, 
     first = HereEngine(meanwhile)
     statuses = run_farm(jobs, first)
     assert first.begun == ["s0"] and second.begun == ["s1"] and [s.state for s in statuses] == ["done", "done"]
-
-
-def test_what_another_farm_finishes_is_taken_over_when_its_lock_is_gone(scenes, unfitted, tmp_path):
-    """A farm that waits for a job looks again, and finds it done."""
+    # a farm that waits for a job looks again, and finds it done
     jobs, engine = jobs_of(scenes, tmp_path / "out"), HereEngine()
     with contextlib.ExitStack() as other:
         other.enter_context(hold_folder(jobs[0].folder))
@@ -283,11 +271,17 @@ def test_a_class_of_a_preset_file_is_found_by_another_process(scenes, tmp_path, 
     assert STRATEGIES.find(found.request.config.strategy).__name__ == "Mine" and found.text() == text
 
 
-def test_a_job_as_text_is_the_same_job(scenes, tmp_path):
+def test_a_job_as_text_is_the_same_job_and_chosen_settings_are_the_same_settings(scenes, tmp_path):
+    """The record of a run has settings that were left open as chosen: the finished run is kept all the same."""
     (job, _) = jobs_of(scenes, tmp_path)
     assert job_of(job.text()) == job and job_of(job.text()).identity() == job.identity()
     elsewhere = replace(job, request=replace(job.request, device="cuda"))
     assert elsewhere.identity() != job.identity(), "photographs have another size on a GPU"
+    (job, _) = jobs_of(scenes, tmp_path, half_resolution=None)
+    run_farm([job], HereEngine())
+    (tmp_path / "s0" / record.RECORD).unlink()
+    (status,) = run_farm([job], HereEngine())
+    assert status.record.how == "kept"
 
 
 def test_slots(monkeypatch):
@@ -399,7 +393,7 @@ def test_folders_and_globs(tmp_path):
         list_jobs(str(tmp_path / "more" / "s0"))
 
 
-def test_lines_are_flags_of_fit(tmp_path):
+def test_lines_are_flags_of_fit_or_refused(tmp_path):
     """Relative paths are from the file; booleans are switches, in groups too; the longest name is one of a folder."""
     path, long = tmp_path / "jobs.jsonl", 66 * "写"
     line = '{"scene": "x", "steps": 5, "refine_poses": true, "method.pm": false}'
@@ -411,10 +405,6 @@ def test_lines_are_flags_of_fit(tmp_path):
     path.write_text('{"scene": "a/x"}\n{"scene": "b/X"}')
     with pytest.raises(UsageError, match=r"jobs\.jsonl: two jobs have the name 'X'"):
         list_jobs(str(path))
-
-
-def test_lines_that_are_no_jobs(tmp_path):
-    """One sentence, with the number of the line where it is the line's fault."""
     path = tmp_path / "jobs.jsonl"
     for word, values in {
         "is not a valid name": [{"name": n} for n in ("../b", "index.html", ".b", 101 * "x")], "must be text": [{"steps": [1]}],
@@ -556,7 +546,7 @@ def test_a_folder_that_others_can_write_to_is_refused(cluster, tmp_path):
 
 
 @with_slurm
-def test_each_end_of_a_job_is_an_event(cluster, job, capsys):
+def test_each_end_of_a_job_is_an_event_and_what_slurm_refuses_is_said(cluster, job, capsys, monkeypatch):
     """An answer; none, once Slurm has not listed the job three times; where Slurm does not answer, nothing is known."""
     engine = SlurmEngine("cpu", 1)
     for number, state in enumerate(("done", "failed", "held"), 70):
@@ -579,10 +569,6 @@ def test_each_end_of_a_job_is_an_event(cluster, job, capsys):
     ((_, state, reason),) = engine.wait(0)
     assert state == "crashed" and "unknown answer" in reason
     engine.close()
-
-
-@with_slurm
-def test_what_slurm_refuses_is_said(cluster, job, monkeypatch, capsys):
     engine = SlurmEngine("cpu", 1)
     cluster.fail["sbatch"] = "sbatch: error: invalid partition specified: nope\n"
     with pytest.raises(ResourceError, match="rejected job s0: sbatch: error: invalid partition"):
@@ -598,7 +584,7 @@ def test_what_slurm_refuses_is_said(cluster, job, monkeypatch, capsys):
 
 
 @with_slurm
-def test_the_process_of_a_job_answers_with_its_state(tmp_path, monkeypatch, capsys):
+def test_the_process_of_a_job_answers_with_its_state_and_calls_without_a_shell(tmp_path, monkeypatch, capsys):
     """Nothing where it is interrupted; a reason on stderr where the job cannot begin."""
     (tmp_path / "job").write_text("TEXT")
 
@@ -613,11 +599,7 @@ def test_the_process_of_a_job_answers_with_its_state(tmp_path, monkeypatch, caps
         answer = tmp_path / str(code)
         assert slurm.main(str(tmp_path / "job"), str(answer), "2") == code and answer.exists() == (code == 0)
     assert (tmp_path / "0").read_text() == "TEXT 2" and capsys.readouterr().err == "the loss term is not there\n"
-
-
-@with_slurm
-def test_commands_are_called_without_a_shell(tmp_path, monkeypatch):
-    """Their environment names no folder to import from but the package's, and hides no jobs; a missing one is a failure."""
+    # whose environment names no folder to import from but the package's, and hides no jobs
     monkeypatch.setenv("SQUEUE_STATES", "RUNNING")
     monkeypatch.setenv("PATH", str(tmp_path))
     assert slurm._call("squeue")[0] == 1
