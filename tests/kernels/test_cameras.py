@@ -46,8 +46,8 @@ def test_another_model_renders(device, dtype, max_instances):
     assert not torch.allclose(*images, atol=0.1)
 
 
-def test_unknown_models_are_refused():
-    """The error names the models there are."""
+def test_unknown_models_and_coefficients_of_another_number_are_refused():
+    """The error names the models there are, and both numbers; coefficients have no gradients."""
     cam = dataclasses.replace(camera(dtype=torch.float32), model="fish")
     message = "unknown camera model 'fish'; choose one of fisheye, opencv, orthographic, pinhole.* or import the file"
     with pytest.raises(UsageError, match=message):
@@ -55,10 +55,6 @@ def test_unknown_models_are_refused():
     options = {"width": 18, "height": 17, "degree": 1, "rule": RULES["exact"], "camera_model": "fish"}
     with pytest.raises(UsageError, match="unknown camera model 'fish'"):
         project(*cloud(3).tensors().values(), cam.viewmat[None], cam.K[None], **options)
-
-
-def test_coefficients_of_another_number_are_refused():
-    """The error names both numbers; coefficients that require gradients are refused, since they have none."""
     cam = parallel(dtype=torch.float32)
     for wrong in (None, 3):
         with pytest.raises(UsageError, match=f"'{NAME}' takes 4 coefficients of distortion, found {wrong or 0}; give .* zeros"):
@@ -162,10 +158,7 @@ def test_a_lens_without_distortion_is_a_pinhole(device):
     for one, other in zip(*found):
         # a hundred roundings of the largest number in a sum
         assert float((one - other).abs().max()) <= 100 * 2.3e-16 * float(one.abs().max())
-
-
-def test_none_is_no_coefficient_and_not_zeros(device):
-    """For a pinhole None and an empty array give the same bits; opencv with zeros differs by rounding (measured 4.7e-6)."""
+    # None and an empty array give a pinhole's bits; opencv with zeros differs by rounding (measured 4.7e-6)
     gaussians, cam = cloud(300, torch.float32, device), camera(75, 53, cameras=2, dtype=torch.float32, device=device)
     image = rasterize(gaussians, cam).rgb
     for empty in (cam.K.new_zeros(0), cam.K.new_zeros(2, 0)):

@@ -181,13 +181,11 @@ def make_reach():
 
 def reaches(opacities, cut, square_sigma, xs):
     found, falls = torch.zeros_like(opacities), torch.zeros_like(xs)
-    inputs = [opacities, cut, square_sigma, xs]
-    outputs = [found, falls]
-    launch.launch(make_reach(), len(opacities), [*inputs, *outputs], torch.device("cpu"))
+    launch.launch(make_reach(), len(opacities), [opacities, cut, square_sigma, xs, found, falls], torch.device("cpu"))
     return found, falls
 
 
-def test_reach_is_where_alpha_is_the_cut():
+def test_reach_is_where_alpha_is_the_cut_and_the_falloff_is_the_exponential():
     """At the reach alpha is a little below the cut; 0 stands for the whole box."""
     opacities, cut = torch.linspace(0.004, 1.0, 500, dtype=torch.float64), 1 / 255
     found, _ = reaches(opacities, cut, 0.0, torch.zeros(500))
@@ -198,10 +196,7 @@ def test_reach_is_where_alpha_is_the_cut():
     for no_cut, sigma in ((0.0, 0.0), (cut, 3.0), (0.0, 3.0)):
         assert not bool(reaches(opacities, no_cut, sigma, torch.zeros(500))[0].any())
     assert bool(reaches(opacities.clamp_min(0.6), 0.5, 0.0, torch.zeros(500))[0].all())
-
-
-def test_falloff_is_the_exponential():
-    """The error is the polynomial's 3e-7 where x is small, then that of rounding x, down to the bound."""
+    # the error of the falloff is the polynomial's 3e-7 where x is small, then that of rounding x, down to the bound
     x = torch.cat([torch.linspace(0, 152, 400_001), torch.tensor([153.0, 200.0, 1e4, 1e30])])
     _, found = reaches(torch.ones(len(x), dtype=torch.float64), 0.5, 0.0, x)
     error = (found.double() / torch.exp(-0.5 * x.double()).clamp_min(2.0**-110) - 1).abs()

@@ -59,7 +59,7 @@ def places(monkeypatch) -> list[int]:
 
 
 def test_kernels_are_captured_once_for_each_set_of_addresses(places):
-    """A loop that alternates between two sets captures twice; an input that moved is one more."""
+    """Two sets in turn are captured twice; addresses that always change are soon captured no more."""
     own, x = Noted(), torch.ones(4)
     work = GraphedFunction(doubled, own)
     places[:] = [1, 2] * 10
@@ -69,10 +69,7 @@ def test_kernels_are_captured_once_for_each_set_of_addresses(places):
     work(torch.ones(4))
     work(x)
     assert own.captures == 3
-
-
-def test_addresses_that_always_change_are_soon_captured_no_more(places):
-    """A loop that has replayed often enough may move now and then, and keeps the graphs of the last moves."""
+    # a loop that has replayed often enough may move now and then, and keeps the graphs of the last moves
     own, x = Noted(), torch.ones(4)
     work = GraphedFunction(doubled, own)
     places[:] = list(range(1000))
@@ -91,17 +88,13 @@ def test_addresses_that_always_change_are_soon_captured_no_more(places):
     assert own.captures == 2000 // (2 * MIN_REPLAYS) + 1
 
 
-def test_without_memory_for_a_capture_the_function_still_runs():
-    """The values are the same, and saved tensors are found in the block of their own call."""
+def test_without_memory_or_after_a_failed_capture_the_function_still_runs():
+    """With the same values, and saved tensors in the block of their own call; a failure warns once."""
     work = GraphedFunction(doubled, Full(CPU))
     calls = [work(torch.full((4,), float(k))) for k in range(2 * FREE_CAPTURES)]
     for k, ((out,), block) in enumerate(calls):
         assert torch.equal(out, torch.full((4,), 2.0 * k)) and torch.equal(work.saved(block)[0], torch.full((4,), 0.5 * k))
     assert work.replays == 0 and work.captures == FREE_CAPTURES + 1
-
-
-def test_a_failed_capture_warns_once_and_the_function_still_runs():
-    """Nothing is captured after that until the pool is released."""
 
     class Refusing(GraphPool):
         def capture(self, work):

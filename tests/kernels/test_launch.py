@@ -78,48 +78,29 @@ def everything():
     return [*rendering(CPU, 2), *similarity(CPU, 2), *state, mean_square_distances(moved[:91]), factors]
 
 
-@pytest.fixture
-def poisoned_memory():
-    """Fill what torch allocates with NaN and with the largest numbers: memory that nobody wrote may not be read."""
-    torch.use_deterministic_algorithms(True)
-    assert bool(torch.empty(3).isnan().all())
-    yield
-    torch.use_deterministic_algorithms(False)
-
-
-@pytest.fixture(scope="module")
-def whole():
-    """The results of one thread, each launch in one piece."""
-    count = torch.get_num_threads()
+def test_every_op_gives_the_same_bits_however_its_items_run(monkeypatch):
+    """In ranges of unequal length, or one by one from the last: they share nothing, none is left out, all memory is written."""
     torch.set_num_threads(1)
-    yield everything()
-    torch.set_num_threads(count)
-
-
-def test_every_op_gives_the_same_bits_in_ranges(monkeypatch, whole, poisoned_memory):
-    """However a launch is cut, items know their own number, share nothing, and none is left out.
-
-    Ranges of unequal length, none of which may cover for another: Warp counts a negative index from the end, and so a
-    kernel that goes backwards from the beginning of its range visits every item of equal ranges.
-    """
-    monkeypatch.setattr(launch, "SERIAL_WORK", 1)
-    monkeypatch.setattr(launch, "CHUNKS_PER_THREAD", 2)
-    torch.set_num_threads(4)
-    for i, (a, b) in enumerate(zip(whole, everything(), strict=True)):
-        assert torch.equal(a, b), i
-
-
-def test_items_run_in_any_order(monkeypatch, whole, poisoned_memory):
-    """One by one from the last to the first: the same bits, since none may rely on another having run."""
+    whole = everything()
 
     def backwards(kernel, count, inputs, device, **_):
         arrays = [launch.as_array(a, *array) if array else a for a, array in zip(inputs, launch._declared(kernel))]
         for i in reversed(range(count)):
             wp.launch(kernel, 1, inputs=[i, *arrays], device="cpu")
 
-    monkeypatch.setattr(launch, "launch", backwards)
-    for i, (a, b) in enumerate(zip(whole, everything(), strict=True)):
-        assert torch.equal(a, b), i
+    # Warp counts a negative index from the end: a kernel that went backwards would visit every item of equal ranges
+    monkeypatch.setattr(launch, "SERIAL_WORK", 1)
+    monkeypatch.setattr(launch, "CHUNKS_PER_THREAD", 2)
+    torch.set_num_threads(4)
+    torch.use_deterministic_algorithms(True)  # torch fills what it allocates with NaN and with the largest numbers
+    try:
+        assert bool(torch.empty(3).isnan().all())
+        for work in (launch.launch, backwards):
+            monkeypatch.setattr(launch, "launch", work)
+            for i, (a, b) in enumerate(zip(whole, everything(), strict=True)):
+                assert torch.equal(a, b), i
+    finally:
+        torch.use_deterministic_algorithms(False)
 
 
 @pytest.mark.parametrize("several", [False, True])
@@ -239,10 +220,7 @@ def test_a_forked_process_launches_in_threads_of_its_own():
 
 
 def interrupted_at(number: int, call) -> bool:
-    """Run ``call`` with a Ctrl-C where Python looks for one for the n-th time; return whether it came that far.
-
-    Python looks at the begin of a function and after a call into C.
-    """
+    """Run ``call`` with a Ctrl-C at the n-th begin of a function or end of a call into C; return whether it came that far."""
     left = number
 
     def profile(frame, event, _):
@@ -363,7 +341,8 @@ def test_a_recorded_launch_checks_type_and_device(device, wrong):
             launch.launch(mark, 3, [bad, rest], device)
 
 
-def test_devices_without_kernels_are_refused_by_name():
+@pytest.mark.filterwarnings("ignore:Accessing the data pointer of FakeTensor")
+def test_tensors_without_kernels_or_memory_are_refused_by_name():
     """Before a launch is looked up: meta stands for mps, xpu and the others."""
     g, cam = cloud(30), camera(dtype=torch.float32)
     rasterize(g, cam)
@@ -373,17 +352,10 @@ def test_devices_without_kernels_are_refused_by_name():
         rasterize(g, dataclasses.replace(cam, K=cam.K.to("meta")))
     with pytest.raises(ValueError, match="mark: the kernels run on cpu and cuda only, not on meta"):
         launch.launch(mark, 3, [], torch.device("meta"))
-
-
-@pytest.mark.filterwarnings("ignore:Accessing the data pointer of FakeTensor")
-def test_fake_tensors_are_refused():
-    """They have a device and no memory; under their mode every new tensor is one."""
-    g, cam = cloud(30), camera(dtype=torch.float32)
-    rasterize(g, cam)
     with FakeTensorMode(allow_non_fake_inputs=True) as mode:
         with pytest.raises(ValueError, match="means is a fake tensor, without memory"):
             rasterize(Gaussians(**{n: mode.from_tensor(t) for n, t in g.tensors().items()}), cam)
-        with pytest.raises(TypeError, match="not a FakeTensor without memory"):
+        with pytest.raises(TypeError, match="not a FakeTensor without memory"):  # under their mode every new tensor is one
             rasterize(g, cam)
 
 
@@ -412,6 +384,13 @@ def tell_apart(
 ):
     i = begin + wp.tid()
     found[i] = wp.float32(table.shape[0] * 100 + table.shape[1]) + 1000.0 * table[i, 1] + 1000000.0 * numbers[i]
+    found[i] = wp.float32(table.shape[0] * 100 + table.shape[1]) + 1000.0 * table[i, 1] + 1000000.0 * numbers[i]
+
+
+@wp.kernel(enable_backward=False)
+def second_of_row(begin: int, entries: wp.array(dtype=wp.float32), step: int, found: wp.array(dtype=wp.float32)):
+    i = begin + wp.tid()
+    found[i] = wp.float32(entries.shape[0]) + 1000.0 * entries[i * step + 1]
 
 
 def test_arguments_of_one_and_two_axes_share_the_memory_of_any_tensor():
@@ -424,6 +403,8 @@ def test_arguments_of_one_and_two_axes_share_the_memory_of_any_tensor():
         launch.launch(tell_apart, 6, [part, image, found], torch.device("cpu"))
         wanted = 603 + 1000 * part.reshape(6, 3)[:, 1] + 1e6 * image.reshape(-1)[:6]
         assert torch.equal(found, wanted), width
+        launch.launch(second_of_row, 6, [part, part.stride(-2), found], torch.device("cpu"))  # one axis spans what lies between
+        assert torch.equal(found, 5 * width + 3 + 1000 * part.reshape(6, 3)[:, 1]), width
     column = memory.view(1, 6, 10).transpose(0, 1)  # of images one pixel wide; its stride there is that of no row
     for image in (column, column[..., :4]):
         found = torch.zeros(6)
@@ -432,23 +413,6 @@ def test_arguments_of_one_and_two_axes_share_the_memory_of_any_tensor():
         assert torch.equal(found, wanted), image.shape
     for none, shape in ((part[..., :0], (0, 0)), (part[:0], (0, 3))):
         assert [launch.as_array(none, wp.float32, axes).shape for axes in (2, 1)] == [shape, (0,)]
-
-
-@wp.kernel(enable_backward=False)
-def second_of_row(begin: int, entries: wp.array(dtype=wp.float32), step: int, found: wp.array(dtype=wp.float32)):
-    i = begin + wp.tid()
-    found[i] = wp.float32(entries.shape[0]) + 1000.0 * entries[i * step + 1]
-
-
-def test_an_argument_of_one_axis_spans_what_lies_between_rows():
-    """Slices at the same address, of the same shape, whose rows lie at other distances; and those without rows."""
-    memory = torch.arange(60, dtype=torch.float32)
-    for width in (5, 10, 5):
-        part, found = memory.view(-1, 2, width)[:3][..., :3], torch.zeros(6)
-        arguments = [part, part.stride(-2), found]
-        launch.launch(second_of_row, 6, arguments, torch.device("cpu"))
-        assert torch.equal(found, 5 * width + 3 + 1000 * part.reshape(6, 3)[:, 1]), width
-    assert launch.as_array(part[:0], wp.float32, 1).shape == (0,)
 
 
 def test_check_names_what_disagrees():
@@ -483,10 +447,10 @@ def ask(allocator):
 
 
 def test_an_arena_gives_the_same_shapes_and_each_its_own_memory():
-    """A write to one tensor changes no other; addresses are those of the outputs and of both blocks."""
+    """A write to one tensor changes no other; saved ones are found again, at multiples of ALIGNMENT, in any such block."""
     sizes = SizingAllocator()
     wanted = [[(tuple(t.shape), t.dtype) for t in kind] for kind in ask(sizes)]
-    arena = Arena(sizes, BYTE)
+    arena, second = Arena(sizes, BYTE), Arena(sizes, BYTE)
     outputs, saved, workspace = found = ask(arena)
     for each in (found, ask(TORCH)):
         assert [[(tuple(t.shape), t.dtype) for t in kind] for kind in each] == wanted
@@ -495,16 +459,8 @@ def test_an_arena_gives_the_same_shapes_and_each_its_own_memory():
         t.fill_(number)
     assert all(bool((t == number).all()) for number, t in enumerate(every))
     assert all(a is b for a, b in zip(arena.outputs, outputs, strict=True))
-    assert arena.addresses() == tuple(t.data_ptr() for t in (*outputs, saved[0], workspace[0]))
-    assert Arena(sizes, BYTE).addresses() != arena.addresses()
-
-
-def test_saved_tensors_are_found_again_in_any_such_block():
-    """Places are multiples of ALIGNMENT, and hold for every block of that size."""
-    sizes = SizingAllocator()
-    ask(sizes)
-    first, second = Arena(sizes, BYTE), Arena(sizes, BYTE)
-    places = [first.place(t) for t in ask(first)[1]]
+    assert arena.addresses() == tuple(t.data_ptr() for t in (*outputs, saved[0], workspace[0])) != second.addresses()
+    places = [arena.place(t) for t in saved]
     assert all(begin % ALIGNMENT == 0 for begin, _, _ in places) and len({begin for begin, _, _ in places}) >= 2
     _, saved, _ = ask(second)
     for number, t in enumerate(saved):

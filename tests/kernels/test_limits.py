@@ -49,7 +49,7 @@ def test_adam_updates_the_smallest_tensors():
         assert torch.allclose(row, torch.tensor([moved]))
 
 
-def test_morton_codes_interleave_the_bits():
+def test_morton_codes_interleave_the_bits_and_neighbours_are_three():
     """Bit b of x, y and z are bits 3 b, 3 b + 1 and 3 b + 2; the box takes 2^21 cells a side."""
     cells = torch.randint(0, 2**21, (500, 3), generator=torch.Generator().manual_seed(0))
     cells[0], cells[1] = 0, 2**21 - 1
@@ -61,10 +61,6 @@ def test_morton_codes_interleave_the_bits():
         for axis in range(3):
             wanted |= ((cells[:, axis] >> b) & 1) << (3 * b + axis)
     assert torch.equal(morton_codes(points), wanted)
-
-
-def test_neighbours_are_three_unless_said_and_at_most_eight():
-    """The default, the most, and two points."""
     points = torch.rand(70, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     assert torch.equal(mean_square_distances(points), mean_square_distances(points, 3))
     assert not torch.equal(mean_square_distances(points, 8), mean_square_distances(points, 7))
@@ -106,7 +102,17 @@ def test_a_pixel_reaches_five_pixels(device):
 EXACT = RULES["exact"]
 
 
-def test_budget_is_met_to_the_byte():
+def test_one_running_sum_holds_both_numbers():
+    """The largest sum of each number of Gaussians stays below 2^63, and every number of instances that is allowed fits."""
+    for count in (1, 2, 3, 4095, 4096, 2_794_625, 2**23, 2**31 - 1):
+        unit = 2 ** tiles.sum_bits(count)
+        assert unit > tiles.MAX_INSTANCES and count * unit + unit - 1 < 2**63
+        assert tiles.split_sum(count * unit + unit - 1, count) == (count, unit - 1)
+    assert tiles.sums_fit(2_794_625, 240 * 135)  # 3840 x 2160 px
+    assert tiles.sums_fit(2**23, 2**16 - 1) and not tiles.sums_fit(2**23, 2**16)
+
+
+def test_budget_is_met_to_the_byte(monkeypatch):
     """As many instances as fit are allowed, one more is not; so are 2^30 - 1, and no more."""
     cpu = torch.device("cpu")
     tiles._check_total(1000, 1, cpu, 1, 148_000)
@@ -119,20 +125,7 @@ def test_budget_is_met_to_the_byte():
         tiles._check_total(2**30, 1, cpu, 1, None)
     with pytest.raises(ResourceError, match=r"need 148\.0 GiB, and the limit is 1\.0 GiB"):
         tiles._check_total(2**30 - 1, 1, cpu, 1, 2**30)
-
-
-def test_one_running_sum_holds_both_numbers():
-    """The largest sum of each number of Gaussians stays below 2^63, and every number of instances that is allowed fits."""
-    for count in (1, 2, 3, 4095, 4096, 2_794_625, 2**23, 2**31 - 1):
-        unit = 2 ** tiles.sum_bits(count)
-        assert unit > tiles.MAX_INSTANCES and count * unit + unit - 1 < 2**63
-        assert tiles.split_sum(count * unit + unit - 1, count) == (count, unit - 1)
-    assert tiles.sums_fit(2_794_625, 240 * 135)  # 3840 x 2160 px
-    assert tiles.sums_fit(2**23, 2**16 - 1) and not tiles.sums_fit(2**23, 2**16)
-
-
-def test_free_memory_is_asked_for_only_where_it_may_matter(monkeypatch):
-    """Below a twentieth of the machine nobody asks; from there on four fifths of what is free is the limit."""
+    # from a twentieth of the machine on four fifths of what is free is the limit
     cpu = torch.device("cpu")
     asked = []
     monkeypatch.setattr(tiles, "installed_bytes", lambda _: 20 * 148_000)
@@ -184,17 +177,6 @@ def one_a_tile(device, columns=3, rows=3):
     return gaussians, cam
 
 
-def test_tiles_of_one_instance_each(device):
-    """Every instance begins and ends a tile; the default tile is 16 px."""
-    gaussians, cam = one_a_tile(device)
-    projected, counts, made = binned(gaussians, cam)
-    assert made.size == 16 and made.ranges.tolist() == [[i, i + 1] for i in range(9)]
-    assert made.gaussian_ids.tolist() == list(range(9)) and made.total.tolist() == [9]
-    assert torch.equal(counts, run(gaussians, cam, tile_size=16)[1])
-    single = calls.bin_tiles(projected[:, 4:5], counts[:, 4:5], width=48, height=48, rule=EXACT)
-    assert single.total.tolist() == [1] and single.ranges[4].tolist() == [0, 1] and single.gaussian_ids.tolist() == [0]
-
-
 def test_nothing_has_no_length(device):
     """No Gaussians, and none that is seen: every list is empty and the total is 0."""
     for gaussians in (cloud(0, device=device), cloud(3, device=device)):
@@ -205,10 +187,16 @@ def test_nothing_has_no_length(device):
         assert len(made.starts) == len(made.counts) == len(gaussians.means) and made.total.tolist() == [0]
 
 
-def test_counts_that_differ_from_what_is_found(device):
-    """One counted too many belongs to no tile, one too few is left out; nobody else's slots are touched."""
+def test_tiles_of_one_instance_each_with_wrong_counts_and_little_capacity(device):
+    """Every instance begins and ends a tile; the default tile is 16 px."""
     gaussians, cam = one_a_tile(device)
-    projected, counts = run(gaussians, cam)
+    projected, counts, made = binned(gaussians, cam)
+    assert made.size == 16 and made.ranges.tolist() == [[i, i + 1] for i in range(9)]
+    assert made.gaussian_ids.tolist() == list(range(9)) and made.total.tolist() == [9]
+    assert torch.equal(counts, run(gaussians, cam, tile_size=16)[1])
+    single = calls.bin_tiles(projected[:, 4:5], counts[:, 4:5], width=48, height=48, rule=EXACT)
+    assert single.total.tolist() == [1] and single.ranges[4].tolist() == [0, 1] and single.gaussian_ids.tolist() == [0]
+    # one counted too many belongs to no tile, one too few is left out; nobody else's slots are touched
     more, fewer = counts.clone(), counts.clone()
     more[0, 3] += 1
     fewer[0, 3] -= 1
@@ -218,11 +206,7 @@ def test_counts_that_differ_from_what_is_found(device):
     assert sorted(made.slots.tolist()) == list(range(10)) and made.gaussian_ids.tolist()[:9] == list(range(9))
     made = calls.bin_tiles(projected, fewer, **size)
     assert made.gaussian_ids.tolist() == [0, 1, 2, 4, 5, 6, 7, 8] and made.ranges[3].tolist() in ([0, 0], [3, 3])
-
-
-def test_capacity_to_the_instance(device):
-    """An exact capacity is no overflow; one less is, and the cut lists fit."""
-    gaussians, cam = one_a_tile(device)
+    # an exact capacity is no overflow; one less is, and the cut lists fit
     gaussians.log_scales.add_(2.2)  # several tiles each
     projected, counts = run(gaussians, cam)
     total = int(counts.sum())
@@ -284,17 +268,6 @@ def test_nothing_is_drawn_behind_a_stop(device, dtype, rule):
     close("gradient", maxima[0], wanted[3].amax((1, 2)))
     (gradient,) = torch.autograd.grad(rgb[..., 0].sum(), projected)
     close("gradient", gradient[0, :, 6], wanted[3].sum((1, 2)))
-
-
-def test_an_alpha_equal_to_the_cut_or_to_the_most(device, dtype):
-    """An alpha at the cut is blended; at the largest alpha the opacity still has its gradient, above it has none."""
-    rule = dataclasses.replace(EXACT, alpha_cut=2.0**-8, alpha_max=0.5)
-    projected, (_, alpha, _), (_, maxima) = plain([2.0**-8, 2.0**-9, 0.5, 0.75], device, dtype, rule)
-    first, second = 2.0**-8, (1 - 2.0**-8) * 0.5
-    assert maxima.tolist() == [[first, 0.0, second, second / 2]]
-    (gradient,) = torch.autograd.grad(alpha.sum(), projected)
-    opened = gradient[0, :, 5] != 0
-    assert opened.tolist() == [True, False, True, False]
 
 
 def needles(count, device):
@@ -461,17 +434,22 @@ def test_slots_of_no_tile_add_nothing(device, dtype, extra):
     assert torch.equal(*found) if extra < 40 else off <= 1e-6  # a longer list is summed by a warp, in another order
 
 
-def test_layers_that_draw_nothing_have_no_gradient(device, dtype):
-    """Every other one is below the cut, among them the first of each batch of 32."""
+def test_layers_at_cuts_without_alpha_and_over_a_single_pixel(device, dtype):
+    """An alpha at the cut is blended; at the largest alpha the opacity still has its gradient, above it has none."""
+    rule = dataclasses.replace(EXACT, alpha_cut=2.0**-8, alpha_max=0.5)
+    projected, (_, alpha, _), (_, maxima) = plain([2.0**-8, 2.0**-9, 0.5, 0.75], device, dtype, rule)
+    first, second = 2.0**-8, (1 - 2.0**-8) * 0.5
+    assert maxima.tolist() == [[first, 0.0, second, second / 2]]
+    (gradient,) = torch.autograd.grad(alpha.sum(), projected)
+    opened = gradient[0, :, 5] != 0
+    assert opened.tolist() == [True, False, True, False]
+    # every other one is below the cut, among them the first of each batch of 32
     with Filled(math.nan, 0):
         projected, (rgb, _, _), (sums, maxima) = plain([0.001, 0.02] * 50, device, dtype, EXACT)
         (gradient,) = torch.autograd.grad(rgb.sum(), projected)
     assert not bool(gradient[0, ::2].any()) and not bool(sums[0, ::2].any()) and not bool(maxima[0, ::2].any())
     assert bool((gradient[0, 1::2, 5:9] > 0).all()) and bool((sums[0, 1::2] > 0).all())
-
-
-def test_layers_over_a_single_pixel_a_small_picture_and_none(device, dtype):
-    """More layers than are taken at a time; sums over the image's pixels alone; a first layer that crosses the stop."""
+    # more layers than are taken at a time; a first layer that crosses the stop
     projected, (_, alpha, _), _ = plain([0.01] * 100, device, dtype, EXACT, side=1)
     assert abs(float(alpha.detach()) - (1 - 0.99**100)) < (1e-5 if dtype == torch.float32 else 1e-12)
     assert bool((torch.autograd.grad(alpha.sum(), projected)[0][0, :, 5] > 0).all())

@@ -244,8 +244,8 @@ def native_bodies():
                 yield path.name, node.args[0]
 
 
-def test_no_cuda_text_stands_in_python():
-    """Every body comes from a file, and every file is read by name or included."""
+def test_cuda_text_comes_from_files(tmp_path):
+    """Every body comes from a file, and every file is read by name or included; whole words alone become numbers."""
     bodies = list(native_bodies())
     assert len(bodies) >= 20
     others = [f"{file}: {ast.unparse(body)}" for file, body in bodies if not isinstance(body, ast.Call)]
@@ -256,10 +256,6 @@ def test_no_cuda_text_stands_in_python():
     named |= {f"blend_{body.args[0].value}.cu" for _, body in bodies if ast.unparse(body.func) == "_source"}
     text = "".join((FOLDER / name).read_text("utf-8") for name in named)
     assert {name for name in FILES if name in named or f'#include "{name}"' in text} == FILES
-
-
-def test_names_are_replaced_and_files_included(tmp_path):
-    """Whole words alone become numbers, also in a file that is included."""
     (tmp_path / "body.cu").write_text('#include "blend_common.cu"\nint SIDES = SIDE;\n')
     text = source(str(tmp_path / "body.cu"), SIDE=8)
     assert text.startswith("// Declarations") and "WIDE = 8 / 8" in text and text.endswith("int SIDES = 8;\n")

@@ -76,13 +76,6 @@ def test_it_is_the_fraction_of_the_distance_to_the_nearest(device, cameras):
     assert found.dtype == torch.float32 and torch.allclose(found.cpu().double(), exact, rtol=1e-6, atol=1e-5)
 
 
-def test_camera_reach_at_a_camera_and_without_gaussians(device):
-    """The smallest size; nothing from nothing."""
-    center = torch.tensor([[1.0, 2.0, 3.0]], device=device)
-    assert float(camera_reach(center, center, 0.5)) == pytest.approx(math.log(SMALLEST_REACH))
-    assert camera_reach(center[:0], center, 0.5).shape == (0,)
-
-
 # Sizes of a pixel at Gaussians, against angles and depths in float64.
 
 CPU = torch.device("cpu")
@@ -131,8 +124,11 @@ def test_a_row_says_what_a_camera_sees(device):
     assert camera_rows([pinhole, *ring(3)], device).shape == (4, 9)
 
 
-def test_pixel_size_at_a_camera_and_without_gaussians(device):
+def test_sizes_at_a_camera_and_without_gaussians(device):
     """The smallest size; nothing from nothing; a NaN is seen by none."""
+    center = torch.tensor([[1.0, 2.0, 3.0]], device=device)
+    assert float(camera_reach(center, center, 0.5)) == pytest.approx(math.log(SMALLEST_REACH))
+    assert camera_reach(center[:0], center, 0.5).shape == (0,)
     given = rows(1).to(device)
     assert float(pixel_size(given[:, :3].contiguous(), given, 0.5)) == pytest.approx(math.log(SMALLEST_PIXEL))
     assert pixel_size(given[:0, :3], given, 0.5).shape == (0,)

@@ -320,16 +320,6 @@ def test_without_a_filter_a_flat_gaussian_is_culled_and_no_other(device):
     assert counts.tolist() == [[1, 0, 0, 1, 0]] and bool(torch.isfinite(projected).all())
 
 
-def test_quaternions_up_to_the_shortest_and_longest(device, dtype):
-    """The shortest length itself gives a rotation, a shorter one does not; likewise for the longest."""
-    gaussians, cam = facing(5, dtype, device)
-    shortest = torch.tensor(SHORTEST_QUAT, dtype=dtype)
-    gaussians.quats[:, 0] = torch.stack(
-        [shortest, torch.nextafter(shortest, 0 * shortest), 0.999 / shortest, 1.001 / shortest, shortest**0]
-    )
-    assert (run(gaussians, cam)[1] > 0).tolist() == [[True, False, True, False, True]]
-
-
 def test_the_farthest_depth_pixel_and_coefficient_are_drawn(device, dtype):
     """Each range holds its end, and not the next number."""
     K = torch.eye(3, dtype=dtype, device=device)[None]
@@ -351,8 +341,15 @@ def test_the_farthest_depth_pixel_and_coefficient_are_drawn(device, dtype):
         assert not drawn(**{name: (slot, torch.nextafter(end, 2 * end))}), (name, slot)
 
 
-def test_an_opacity_equal_to_the_cut_is_drawn_and_none_is_not(device, dtype):
-    """sigmoid(0) is 1/2 to the bit; an opacity that rounds to 0 is culled even without a cut."""
+def test_quaternions_at_their_ends_and_an_opacity_at_the_cut_are_drawn(device, dtype):
+    """The shortest length itself gives a rotation, a shorter one does not; likewise for the longest."""
+    gaussians, cam = facing(5, dtype, device)
+    shortest = torch.tensor(SHORTEST_QUAT, dtype=dtype)
+    gaussians.quats[:, 0] = torch.stack(
+        [shortest, torch.nextafter(shortest, 0 * shortest), 0.999 / shortest, 1.001 / shortest, shortest**0]
+    )
+    assert (run(gaussians, cam)[1] > 0).tolist() == [[True, False, True, False, True]]
+    # sigmoid(0) is 1/2 to the bit; an opacity that rounds to 0 is culled even without a cut
     gaussians, cam = facing(3, dtype, device)
     gaussians.logit_opacities[:] = torch.tensor([0.0, -1e-3, -1000.0], dtype=dtype)
     half = dataclasses.replace(EXACT, alpha_cut=0.5)
@@ -385,10 +382,7 @@ def test_factors_of_the_largest_shrink_as_the_scale_grows(device, log_scale):
 
 
 def test_a_colour_of_exactly_zero_has_no_gradient():
-    """The clamp begins at zero: its slope there is that of the flat side; just above it is one.
-
-    On a CPU, whose rounding of the product makes it zero to the bit.
-    """
+    """On a CPU, whose rounding makes it zero to the bit: the slope of the clamp is that of the flat side; above it is one."""
     gaussians, cam = facing(2, torch.float64)
     gaussians.sh[:, 1:] = 0
     gaussians.sh[0, 0], gaussians.sh[1, 0] = -0.5 / C0, (1e-9 - 0.5) / C0
@@ -399,29 +393,22 @@ def test_a_colour_of_exactly_zero_has_no_gradient():
     assert not bool(moving.sh.grad[0].any()) and bool((moving.sh.grad[1, 0] != 0).all())
 
 
-def boxes(rule, device):
-    """Half sides of the box in float64, and the covariances, of a cloud seen by two cameras."""
-    gaussians, cam = cloud(200, torch.float64, device), camera(400, 300, cameras=2, device=device)
-    projected, counts = run(gaussians, cam, rule)
-    _, covs, *_, opacities = reference_result(gaussians, cam, rule=rule)
-    seen = counts.cpu() > 0
-    assert int(seen.sum()) > 100
-    return projected.cpu()[seen][:, 10:], covs[seen], opacities.expand(2, -1)[seen]
-
-
-def test_boxes_reach_to_the_cut(device):
-    """Half sides are the reach, at which alpha is the cut, times the standard deviations."""
-    found, covs, opacities = boxes(EXACT, device)
-    reach = (2 * torch.log(opacities / EXACT.alpha_cut)).sqrt()
-    wanted = reach[:, None] * torch.stack([covs[:, 0, 0], covs[:, 1, 1]], -1).sqrt()
-    assert bool((found >= wanted).all()) and bool((found <= wanted * (1 + 1e-3)).all())
-
-
-def test_squares_are_three_sigma_rounded_up(device):
-    """The classic rule: three times the longest standard deviation, a whole number of pixels."""
-    found, covs, _ = boxes(RULES["inria"], device)
-    wanted = torch.ceil(3 * torch.linalg.eigvalsh(covs)[:, 1].sqrt())
-    assert torch.equal(found, wanted[:, None].expand(-1, 2))
+def test_boxes_reach_to_the_cut_and_squares_are_three_sigma_rounded_up(device):
+    """The reach, at which alpha is the cut, times the standard deviations; or three times the longest one, in whole pixels."""
+    for rule in (EXACT, RULES["inria"]):
+        gaussians, cam = cloud(200, torch.float64, device), camera(400, 300, cameras=2, device=device)
+        projected, counts = run(gaussians, cam, rule)
+        _, covs, *_, opacities = reference_result(gaussians, cam, rule=rule)
+        seen = counts.cpu() > 0
+        assert int(seen.sum()) > 100
+        found, covs, opacities = projected.cpu()[seen][:, 10:], covs[seen], opacities.expand(2, -1)[seen]
+        if rule is EXACT:
+            reach = (2 * torch.log(opacities / EXACT.alpha_cut)).sqrt()
+            wanted = reach[:, None] * torch.stack([covs[:, 0, 0], covs[:, 1, 1]], -1).sqrt()
+            assert bool((found >= wanted).all()) and bool((found <= wanted * (1 + 1e-3)).all())
+        else:
+            wanted = torch.ceil(3 * torch.linalg.eigvalsh(covs)[:, 1].sqrt())
+            assert torch.equal(found, wanted[:, None].expand(-1, 2))
 
 
 def test_squares_grow_with_the_longest_axis(device, dtype):
@@ -433,14 +420,6 @@ def test_squares_grow_with_the_longest_axis(device, dtype):
     fraction = projected[0, :, 10:] / sizes[:, None]
     assert counts.tolist() == [[1, 1, 1]] and bool((fraction > 3).all())
     assert torch.allclose(fraction, fraction[:1].expand_as(fraction), rtol=1e-4)
-
-
-def test_no_cut_asks_for_every_tile_however_far(device):
-    """Half sides without a cut cover any image; tiles have 16 px unless it is said."""
-    gaussians, cam = facing(1, device=device)
-    projected, counts = run(gaussians, cam, SMOOTH, window=(0, 0, 16, 16))
-    assert bool((projected[0, :, 10:] >= 1e30).all()) and counts.tolist() == [[1]]
-    assert run(*facing(1, device=device, size=17), SMOOTH)[1].tolist() == [[4]]
 
 
 @pytest.mark.parametrize("wanted", ["viewmats", "Ks"])
@@ -481,8 +460,13 @@ def test_colours_and_gradients_of_near_gaussians(device):
     close("gradient", moving.means.grad, other.means.grad)
 
 
-def test_one_gaussian_takes_its_factor(device):
-    """It holds for a single Gaussian, too, with half of its opacity, or none."""
+def test_no_cut_asks_for_every_tile_and_one_gaussian_takes_its_factor(device):
+    """Half sides without a cut cover any image; tiles have 16 px unless it is said."""
+    gaussians, cam = facing(1, device=device)
+    projected, counts = run(gaussians, cam, SMOOTH, window=(0, 0, 16, 16))
+    assert bool((projected[0, :, 10:] >= 1e30).all()) and counts.tolist() == [[1]]
+    assert run(*facing(1, device=device, size=17), SMOOTH)[1].tolist() == [[4]]
+    # a single Gaussian, with half of its opacity, or none
     gaussians, cam = facing(1, device=device)
     full = run(gaussians, cam, SMOOTH)[0][0, 0, 5]
     for factor in (0.5, 1.0):

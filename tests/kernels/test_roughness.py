@@ -33,13 +33,10 @@ def test_the_map_equals_the_reference_and_the_gradient_has_its_bits(device, dtyp
         assert torch.equal(*(torch.autograd.grad(values, depth, v)[0] for values in (found, wanted)))
 
 
-def test_gradcheck(device):
+def test_gradcheck_and_an_opacity_that_is_nan(device):
     depth, *others = maps(7, 6, device=device)
     depth = depth + (depth == 0)
     assert torch.autograd.gradcheck(lambda d: roughness(d, *others), [depth.requires_grad_()])
-
-
-def test_an_opacity_that_is_nan_reaches_the_loss_and_shapes_are_checked():
     depth, alpha, *others, _ = maps(3, 3)
     alpha, depth = torch.full_like(alpha, torch.nan), torch.full_like(depth, torch.nan)
     assert roughness(depth, alpha, *others, None).isnan().sum() == 5  # all but the corners

@@ -7,20 +7,7 @@ from tests.reference.ssim import ssim_reference
 from tests.tolerances import close
 from warpgs.kernels.ssim import differences, ssim
 
-SIZES = [
-    (1, 1),
-    (1, 17),
-    (17, 1),
-    (5, 7),
-    (9, 5),
-    (9, 6),
-    (10, 11),
-    (16, 16),
-    (15, 32),
-    (32, 17),
-    (17, 33),
-    (33, 47),
-]
+SIZES = [(1, 1), (1, 17), (17, 1), (5, 7), (9, 5), (9, 6), (10, 11), (16, 16), (15, 32), (32, 17), (17, 33), (33, 47)]
 
 
 def images(height, width, dtype=torch.float64, device="cpu"):
@@ -49,16 +36,12 @@ def test_maps_sums_and_gradients_equal_the_convolution(device, dtype, height, wi
             close("gradient", leaf.grad, image64.grad)
 
 
-def test_gradcheck(device):
-    """Finite differences agree with the backward kernels, of the map and of the sums over a batch."""
+def test_gradcheck_and_batches(device):
+    """Finite differences agree with the backward kernels, of the map and of sums over a batch, which has its images' bits."""
     image, target = images(7, 9, device=device)
     assert torch.autograd.gradcheck(lambda a: ssim(a, target), [image.requires_grad_()], eps=1e-6, atol=1e-8, rtol=1e-5)
     image, target = (torch.stack([t, t.flip(0)]) for t in images(10, 9, device=device))
     assert torch.autograd.gradcheck(lambda a: differences(a, target), [image.requires_grad_()], eps=1e-6, atol=1e-7, rtol=1e-5)
-
-
-def test_batch_equals_single_images(device):
-    """A batch gives the same bits as its images one by one."""
     a, b = images(20, 21, torch.float32, device)
     batch = ssim(torch.stack([a, b]), torch.stack([b, a]))
     assert torch.equal(batch[0], ssim(a, b)) and torch.equal(batch[1], ssim(b, a))

@@ -67,13 +67,6 @@ def test_every_drawn_tile_is_listed(device, width, height, tile_size):
     assert sum(map(len, found)) <= 1.1 * needed_total + 30
 
 
-def test_without_a_cut_every_tile_is_listed(device):
-    """A cut of 0 has no edge, so all visible Gaussians are in all tiles."""
-    gaussians, cam = cloud(5, torch.float32, device), camera(40, 40, cameras=1, dtype=torch.float32, device=device)
-    _, _, tiles = binned(gaussians, cam, SMOOTH)
-    assert tiles.ranges.cpu().tolist() == [[5 * i, 5 * i + 5] for i in range(9)]
-
-
 @pytest.mark.parametrize("extra", [1, 3, 40])
 def test_tiles_that_are_counted_and_not_found_are_no_tiles(device, extra):
     """A count above what a Gaussian touches, as rounding may give, leaves marked slots and the same lists."""
@@ -90,8 +83,11 @@ def test_tiles_that_are_counted_and_not_found_are_no_tiles(device, extra):
     assert torch.equal(tiles.slots.sort().values, torch.arange(length + added, dtype=torch.int32, device=device))
 
 
-def test_budget_is_checked_in_64_bits_before_allocation(device):
-    """Three Gaussians of 1e9 tiles each are refused by number, a small budget by bytes; the message helps."""
+def test_every_tile_is_listed_without_a_cut_and_the_budget_is_checked_in_64_bits(device):
+    """A cut of 0 has no edge; sizes are refused by number, by bytes, and before allocation."""
+    gaussians, cam = cloud(5, torch.float32, device), camera(40, 40, cameras=1, dtype=torch.float32, device=device)
+    _, _, tiles = binned(gaussians, cam, SMOOTH)
+    assert tiles.ranges.cpu().tolist() == [[5 * i, 5 * i + 5] for i in range(9)]
     gaussians, cam = cloud(3, torch.float32, device), camera(40, 30, cameras=1, dtype=torch.float32, device=device)
     projected, counts, _ = binned(gaussians, cam)
     with pytest.raises(ResourceError, match=r"3,000,000,000 \(Gaussian, tile\) instances.*far too large"):
@@ -105,8 +101,7 @@ def test_lists_without_slots_are_the_same(device):
     gaussians, cam = cloud(300, torch.float32, device), camera(64, 48, cameras=2, dtype=torch.float32, device=device)
     projected, _, tiles = binned(gaussians, cam)
     bare = binned(gaussians, cam, slotted=False)[2]
-    assert len(bare.slots) == 0
-    assert torch.equal(bare.ranges, tiles.ranges)
+    assert len(bare.slots) == 0 and torch.equal(bare.ranges, tiles.ranges)
     assert torch.equal(bare.gaussian_ids, tiles.gaussian_ids)
     size = {"width": cam.width, "height": cam.height, "rule": EXACT}
     backgrounds = torch.rand(2, 3, device=device)
@@ -137,10 +132,7 @@ def test_room_for_visible_gaussians_changes_no_list(device):
             assert torch.equal(made.ranges, wanted.ranges) and int(made.total) == total
             assert torch.equal(made.gaussian_ids[:total], wanted.gaussian_ids) and torch.equal(made.slots[:total], wanted.slots)
             assert torch.equal(made.starts[counts.view(-1) > 0], wanted.starts[counts.view(-1) > 0])
-
-
-def test_running_sums_count_more_than_a_word_of_instances(device):
-    """Two numbers in one sum, against numbers counted apart, where the instances exceed 2^37."""
+    # two numbers in one sum, against numbers counted apart, where the instances exceed 2^37
     counts = torch.tensor([0, 2**31 - 1, 1, 0, 5] * 70, dtype=torch.int32, device=device)
     seen, total = int((counts > 0).sum()), int(counts.sum(dtype=torch.int64))
     assert total > 2**37

@@ -80,30 +80,7 @@ def test_colors_equal_numpy(device, dtype):
     assert (np.abs(sums.cpu().numpy() - wanted_sums) > BOUND[dtype]).mean() <= limit
 
 
-def test_cosines_equal_numpy(device, dtype):
-    """Of maps with steps, holes and sky, and of a single pixel."""
-    for i, c in enumerate(cameras()):
-        depth = maps(i)[0]
-        depth[10:15, 12] = depth[20, 5:9] = 0  # a column and a row of holes
-        found = face_cosines(*tensors([depth], dtype, device), c).cpu().numpy()
-        assert np.abs(found - reference.faced(depth, c)).max() < BOUND[dtype]
-    alone = face_cosines(*tensors([np.full((1, 1), 2.0)], dtype, device), dataclasses.replace(c, width=1, height=1))
-    assert float(alone) == pytest.approx(float(reference.faced(np.full((1, 1), 2.0), c)[0, 0]), abs=1e-5)
-
-
-def test_cosines_are_those_of_a_plane(device):
-    """A slanted plane is seen as it is, but for the curve of its depth from one pixel to the next; a step does not bend it."""
-    c, normal = cameras()[1], np.array([0.5, 0.3, -1.0])
-    pixels = np.stack(np.meshgrid(np.arange(SIZE[0]), np.arange(SIZE[1])), -1) + 0.5
-    rays = np.concatenate([pixels, np.ones((*pixels.shape[:2], 1))], -1) @ np.linalg.inv(c.K).T
-    depth = -2.5 / (rays @ normal)
-    wanted = np.abs(rays @ normal) / np.linalg.norm(normal) / np.linalg.norm(rays, axis=-1)
-    depth[:, 30:] += 2
-    found = face_cosines(*tensors([depth], torch.float64, device), c).cpu().numpy()
-    assert np.abs(found - wanted)[:, :30].max() < 0.02
-
-
-def test_borders(device, dtype):
+def test_borders_and_steps(device, dtype):
     """Positions and differences that are exact: the left and upper border belong to the image, the others do not."""
     c = Camera(np.eye(4), np.array([[8.0, 0, 4], [0, 8, 4], [0, 0, 1]]), 8, 8)
     depth, one = tensors([np.full((8, 8), 2.0), np.ones((8, 8))], dtype, device)
@@ -118,11 +95,7 @@ def test_borders(device, dtype):
     inside = [[1, 1, 0], [1, 1, 0], [0, 0, 0]]  # at depth 2; at depth 3, the truncation behind, the whole grid is
     assert grid[1][:, :, 0].tolist() == inside and bool((grid[1][:, :, 1] == 1).all())
     assert bool((grid[0][:, :, 1] == -1).all()) and not bool(grid[0][:, :, 0].any())
-
-
-def test_depths_as_far_apart_as_the_truncation_are_two_surfaces(device, dtype):
-    """A point between pixels of two depths has that of its pixel from there on, and what lies between below."""
-    c = Camera(np.eye(4), np.array([[8.0, 0, 4], [0, 8, 4], [0, 0, 1]]), 8, 8)
+    # a point between pixels of two depths has that of its pixel from the truncation on, and what lies between below
     depth = np.full((8, 8), 2.0)
     depth[4:] = 2.5
     found = []
@@ -133,6 +106,23 @@ def test_depths_as_far_apart_as_the_truncation_are_two_surfaces(device, dtype):
     assert found == pytest.approx([0.5, 0.35], abs=1e-3)
 
 
-def test_another_camera_model_is_refused():
+def test_cosines_equal_numpy_and_those_of_a_plane(device, dtype):
+    """Of maps with steps, holes and sky, and of a single pixel."""
+    for i, c in enumerate(cameras()):
+        depth = maps(i)[0]
+        depth[10:15, 12] = depth[20, 5:9] = 0  # a column and a row of holes
+        found = face_cosines(*tensors([depth], dtype, device), c).cpu().numpy()
+        assert np.abs(found - reference.faced(depth, c)).max() < BOUND[dtype]
+    alone = face_cosines(*tensors([np.full((1, 1), 2.0)], dtype, device), dataclasses.replace(c, width=1, height=1))
+    assert float(alone) == pytest.approx(float(reference.faced(np.full((1, 1), 2.0), c)[0, 0]), abs=1e-5)
+    # but for the curve of its depth from one pixel to the next; a step does not bend it
+    c, normal = cameras()[1], np.array([0.5, 0.3, -1.0])
+    pixels = np.stack(np.meshgrid(np.arange(SIZE[0]), np.arange(SIZE[1])), -1) + 0.5
+    rays = np.concatenate([pixels, np.ones((*pixels.shape[:2], 1))], -1) @ np.linalg.inv(c.K).T
+    depth = -2.5 / (rays @ normal)
+    wanted = np.abs(rays @ normal) / np.linalg.norm(normal) / np.linalg.norm(rays, axis=-1)
+    depth[:, 30:] += 2
+    found = face_cosines(*tensors([depth], torch.float64, device), c).cpu().numpy()
+    assert np.abs(found - wanted)[:, :30].max() < 0.02
     with pytest.raises(UsageError, match="pinhole"):
         face_cosines(torch.ones(SIZE[1], SIZE[0]), dataclasses.replace(cameras(1)[0], model="fisheye"))

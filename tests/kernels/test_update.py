@@ -53,14 +53,10 @@ def test_steps_equal_torch(device, dtype, shape, head):
 
 
 def test_zero_gradient_moves_nothing(device, dtype):
-    """No gradient, no step and no NaN, although both moments are zero."""
+    """No gradient, no step and no NaN, although both moments are zero; no rows are fine."""
     param, _ = problem(dtype, device)
     found, mean, square = run(param, [torch.zeros_like(param)], lr=0.1)
     assert torch.equal(found, param) and not bool(mean.any()) and not bool(square.any())
-
-
-def test_empty_input():
-    """No rows are fine."""
     empty = torch.zeros(0, 3)
     skip = torch.zeros(1, dtype=torch.int32)
     adam_scheduled(empty, empty, empty.clone(), empty.clone(), torch.tensor(scheduled_lrs(0.1, 1)), skip, head=0)
@@ -74,18 +70,14 @@ def factors(device, p: float, step: int = 1, seed: int = 0) -> torch.Tensor:
     return opacity_dropout(COUNT, torch.tensor(settings, dtype=torch.float32, device=device), seed)
 
 
-def test_frequencies(device):
-    """Both values occur as often as the probability says (within 3.9 standard deviations), for several steps and seeds."""
+def test_factors_are_as_frequent_as_they_should_and_follow_from_seed_and_step(device):
+    """Within 3.9 standard deviations; another step or seed hides others, neighbours are independent, and p = 0 hides none."""
     for p, step, seed in ((0.2, 1, 0), (0.05, 9_999, 0), (0.5, 3, 7)):
         values, chances = expected_factors(p)
         drawn = factors(device, p, step, seed).double().cpu()
         dropped = int((drawn == 0).sum())
         assert torch.allclose(drawn[drawn > 0], torch.tensor(values[1]), rtol=1e-6)
         assert abs(dropped - COUNT * chances[0]) < 3.9 * (COUNT * chances.prod()) ** 0.5
-
-
-def test_factors_follow_from_seed_and_step(device):
-    """Repeatable; another step or seed hides others, neighbours are independent, and p = 0 hides none."""
     first = factors(device, 0.5, 4, 2)
     assert torch.equal(first, factors(device, 0.5, 4, 2)) and bool((factors(device, 0.0) == 1).all())
     for other in (factors(device, 0.5, 5, 2), factors(device, 0.5, 4, 3)):

@@ -112,11 +112,7 @@ def _images(case: Case, keep: torch.Tensor, device) -> tuple[dict, torch.Tensor]
 
 
 def failures(case: Case, device) -> tuple[list[str], int]:
-    """What is wrong with a scene, and how many Gaussians were drawn of it.
-
-    All pictures and gradients are finite; a Gaussian with a non-finite parameter has gradients of exactly zero, and without
-    such Gaussians pictures and the others' gradients are the same bits.
-    """
+    """What is wrong with a scene whose non-finite Gaussians should not be there, and how many Gaussians were drawn of it."""
     wrong = []
     bad = non_finite(case.gaussians)
     found, drawn = _images(case, torch.ones_like(bad), device)
@@ -137,10 +133,7 @@ def failures(case: Case, device) -> tuple[list[str], int]:
 
 
 def documented(gaussians: Gaussians, cam: Camera, near: float) -> tuple[torch.Tensor, torch.Tensor]:
-    """Which Gaussians the ranges of docs/conventions.md let through, and which of all are safe to compare; float64, both [N].
-
-    Not safe are those within 1e-4 of a limit, and ellipses longer than ASPECT times their width.
-    """
+    """Gaussians that docs/conventions.md lets through, and those 1e-4 from all limits and not longer than ASPECT, both [N]."""
     means, quats, log_scales, logits, sh = (t.double() for t in gaussians.tensors().values())
     view, K = cam.viewmat[0].double(), cam.K[0].double()
     p = means @ view[:3, :3].T + view[:3, 3]
@@ -167,9 +160,7 @@ def documented(gaussians: Gaussians, cam: Camera, near: float) -> tuple[torch.Te
 
 
 def reference_error(seed: int, number: int, device, count: int = 24) -> tuple[float, int, int]:
-    """Largest difference from the float64 reference of a small scene of finite extremes, without cut-offs: colour per unit of
-    the largest coefficient, alpha, and depth times alpha per unit of the largest depth; how many were compared and drawn.
-    """
+    """Largest difference of a scene of finite extremes from float64, over the largest value; counts of compared, drawn."""
     generator = torch.Generator().manual_seed(1_000_003 * seed + number)
     finite = [v for v in VALUES if math.isfinite(v)]
     gaussians, _ = poison(cloud(count, seed=number), 0.8, generator, finite)

@@ -78,27 +78,13 @@ def test_dense_twin_equals_plain_loop(rule, tile_size):
         assert torch.equal(a, b[16:32, 16:64])
 
 
-def test_the_square_of_inria_is_seen():
-    """The scene above is one where it matters; else the comparison would prove nothing."""
+def test_references_are_what_they_claim():
+    """The model has no cut-offs, p32 is r64c in float32, and the square of `inria` matters in the scene above."""
     inputs, frame = small()
     exact = inputs.to(torch.float64)
     squareless = dataclasses.replace(RULES["inria"], square_sigma=0.0)
     a, b = (r64c(exact, frame, rule, 8).alpha for rule in (RULES["inria"], squareless))
     assert float((a - b).detach().abs().max()) > 1e-3
-
-
-def test_the_model_has_no_cut_offs():
-    """Transmittance of opaque and faint layers alike is the product over all of them."""
-    scene = SCENES["faint_fog"]()
-    exact, frame = scene.inputs().to(torch.float64), scene.frame()._replace(window=(10, 10, 4, 4))
-    rule = RULES["exact"]
-    assert not bool(r64c(exact, frame, rule).alpha.any())
-    free = r64(exact, frame, rule).alpha
-    assert torch.equal(free, r64c(exact, frame, model(rule)).alpha) and float(free.detach().min()) > 0.5
-
-
-def test_p32_is_r64c_in_float32():
-    """The same figures to float32's rounding, which float64 inputs are refused for."""
     inputs, frame = small()
     rule = RULES["exact"]
     a, b = p32(inputs.to(torch.float32), frame, rule).rgb, r64c(inputs.to(torch.float64), frame, rule).rgb
@@ -107,6 +93,12 @@ def test_p32_is_r64c_in_float32():
         p32(inputs.to(torch.float64), frame, rule)
     with pytest.raises(TypeError, match=r"torch\.float64"):
         r64c(inputs.to(torch.float32), frame, rule)
+    scene = SCENES["faint_fog"]()
+    exact, frame = scene.inputs().to(torch.float64), scene.frame()._replace(window=(10, 10, 4, 4))
+    rule = RULES["exact"]
+    assert not bool(r64c(exact, frame, rule).alpha.any())
+    free = r64(exact, frame, rule).alpha
+    assert torch.equal(free, r64c(exact, frame, model(rule)).alpha) and float(free.detach().min()) > 0.5
 
 
 @pytest.mark.parametrize("reason", ["cut", "stop", "clamp", "order", "near"])

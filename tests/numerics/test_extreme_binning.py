@@ -50,17 +50,6 @@ def binned(gaussians: Gaussians, cam: Camera, rule=EXACT, tile_size: int = 16, *
     return projected, counts, bin_tiles(projected, counts, **size, **options)
 
 
-def test_counts_beyond_the_packed_sum_are_told_exactly(device):
-    """140,000 Gaussians over all tiles of an 8K picture are more than 2^36 instances, and 2^36 is what counts as a Gaussian.
-
-    In one running sum the two numbers would run into each other; the error has both right, and nothing is allocated.
-    """
-    projected = torch.zeros(1, 140_000, 12, device=device)
-    counts = torch.full((1, 140_000), 518_400, dtype=torch.int32, device=device)
-    with pytest.raises(ResourceError, match=r"140,000 visible .* 518400 of 518400 tiles .* 72,576,000,000"):
-        bin_tiles(projected, counts, width=7680, height=4320, tile_size=8, rule=EXACT)
-
-
 @pytest.mark.slow
 def test_full_screen_gaussians_at_4k_are_listed(device):
     """The same with memory enough (2 GB): every tile lists all 3000, in order."""
@@ -73,8 +62,13 @@ def test_full_screen_gaussians_at_4k_are_listed(device):
     assert bool((ids == torch.arange(3000, dtype=torch.int32, device=device)).all())
 
 
-def test_sizes_beyond_32_bits_are_refused(device):
-    """An axis, a launch and a number of tiles that would wrap around are errors that say what to do."""
+def test_counts_and_sizes_beyond_their_bits_are_refused(device):
+    """140,000 Gaussians over all tiles of 8K, more instances than a packed sum holds: both numbers are right in the error."""
+    projected = torch.zeros(1, 140_000, 12, device=device)
+    counts = torch.full((1, 140_000), 518_400, dtype=torch.int32, device=device)
+    with pytest.raises(ResourceError, match=r"140,000 visible .* 518400 of 518400 tiles .* 72,576,000,000"):
+        bin_tiles(projected, counts, width=7680, height=4320, tile_size=8, rule=EXACT)
+    # an axis, a launch and a number of tiles that would wrap around
     huge = torch.zeros(1, device=device).expand(2**31)
     with pytest.raises(ResourceError, match=r"2,147,483,648 entries .* fewer Gaussians"):
         launch.as_array(huge, None, 1)

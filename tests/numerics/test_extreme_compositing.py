@@ -42,11 +42,7 @@ def gradients(loss, gaussians):
 @pytest.mark.parametrize("count", [16, 5000])
 @pytest.mark.parametrize("opacity", [1.0, 1 - 1e-7, 0.004])
 def test_stacks(device, count, opacity):
-    """C1: layers of full and of hardly any opacity. Finite, and transmittance is recovered from the last layer to the first.
-
-    To 1e-5 on CUDA, which starts again from a stored state every 64 layers. On a CPU the rounding of 1 / (1 - alpha), at most
-    2^-25, adds up where all layers have one alpha: 7e-5 after 2298 of 0.004. Where alphas differ it averages out (next test).
-    """
+    """C1: layers of full and of hardly any opacity. Finite, and transmittance is recovered from the last layer to the first."""
     logits = torch.full((count,), min(40.0, math.log(opacity / max(1 - opacity, 1e-18))))
     gaussians, cam = layers([opacity] * count, 2, device=device, logits=logits)
     rgb, alpha, depth = images(gaussians, cam, background=1.0)
@@ -59,6 +55,7 @@ def test_stacks(device, count, opacity):
     assert end == count or (1 - each) ** end <= 1.001e-4 < (1 - each) ** (end - 1)
     wanted = each * (1 - each) ** torch.arange(end, dtype=torch.float64)
     error = (weights[:end] / wanted - 1).abs()
+    # CUDA starts again from a stored state every 64 layers; on a CPU the rounding of 1 / (1 - alpha) adds up for equal alphas
     assert float(error[0]) <= (1e-5 if device.type == "cuda" else max(1e-6, end * 2.0**-24))
     assert float(error.max()) <= 1e-4  # measured 7.0e-5
 
@@ -109,7 +106,7 @@ def test_opacity_logits(device, dtype, logit):
         assert not any(bool(t[0].any()) for t in v.values())
 
 
-def test_fog_below_the_cut(device):
+def test_fog_resets_and_leaks(device):
     """C4: 1000 layers of alpha 0.0039, below 1/255. They hide 98 % in truth, and nothing under every rule with the cut."""
     gaussians, cam = layers([0.0039] * 1000, device=device)
     for rule in RULES.values():
@@ -118,10 +115,7 @@ def test_fog_below_the_cut(device):
         assert not any(bool(v.any()) for v in gradients(rgb.sum(), gaussians).values())
     alpha = images(gaussians, cam, dataclasses.replace(EXACT, alpha_cut=0.0))[1].detach()
     assert float((alpha - (1 - (1 - 0.0039) ** 1000)).abs().max()) <= 1e-5
-
-
-def test_opacities_after_a_reset_keep_their_gradient(device):
-    """C5: with every opacity at 0.01, the reset of Kerbl et al., at least 99 % of what is visible still has a gradient."""
+    # C5: with every opacity at 0.01, the reset of Kerbl et al., of at least 99 % of what is visible
     gaussians, cam = cloud(3000, device=device), camera(160, 120, cameras=1, dtype=torch.float32, device=device)
     gaussians.logit_opacities[:] = math.log(0.01 / 0.99)
     gaussians = leaves(gaussians)
@@ -130,10 +124,7 @@ def test_opacities_after_a_reset_keep_their_gradient(device):
     visible = r.visible[0]
     assert int(visible.sum()) > 1000
     assert float((v[visible] != 0).float().mean()) >= 0.99
-
-
-def test_what_leaks_through_opaque_layers(device):
-    """C7: black layers over white. `exact` leaves 1e-4 of it at most, the exclusive stop up to stop / (1 - alpha_max)."""
+    # C7: black layers over white; `exact` leaves 1e-4 at most, the exclusive stop up to stop / (1 - alpha_max)
     full = 1 - 1e-7
     for rule, opacities, low, high in (
         ("exact", [full, full], 0.0, 1.0001e-4),
@@ -265,10 +256,7 @@ def exponential(cuda: bool):
 
 
 def test_exponential_in_ulps(device):
-    """C11: the exponential that blending uses, over all that it is given: where it is drawn, and far beyond.
-
-    Relative to the exact value of its float32 argument, so that the rounding of the argument is counted too.
-    """
+    """C11: the exponential that blending uses, where it is drawn and far beyond, beside the exact value of its argument."""
     generator = torch.Generator().manual_seed(0)
     radii = torch.cat(
         [

@@ -112,7 +112,7 @@ def test_pruning_everything_leaves_one_and_the_fit_goes_on(device, monkeypatch):
     assert len(fit.gaussians) == 1
 
 
-def test_a_set_of_none_is_legal(device):
+def test_a_set_of_none_is_legal_and_refinement_that_changes_nothing_changes_no_bit(device):
     """No rows: a step, refinement, a change of the set and columns work on nothing."""
     g = cloud(0, device=device)
     table = Table.of_gaussians(g, {"seen": Column(0.0)})
@@ -125,10 +125,7 @@ def test_a_set_of_none_is_legal(device):
     )  # fmt: skip
     assert len(change.keep) == len(change.parents) == len(table) == 0
     assert all(t.shape[0] == 0 for t in table.state().values())
-
-
-def test_refinement_that_changes_nothing_changes_no_bit(device):
-    """Nothing pulled at and nothing faint: all rows stay, with their moments."""
+    # nothing pulled at and nothing faint: all rows stay, with their moments
     g = cloud(30, device=device)
     g.logit_opacities[:] = 1.0
     change = refine(

@@ -32,14 +32,10 @@ def test_every_value_in_every_slot(device, slot):
         assert failures(case, device)[0] == []
 
 
-def test_random_scenes(device):
-    """Ten scenes, a poisoned share of up to 95 %."""
+def test_random_scenes_and_finite_extremes(device):
+    """Ten scenes, a poisoned share of up to 95 %; what is drawn of finite extremes is what float64 draws."""
     for number in range(10):
         assert failures(make_case(1, number, largest=2000), device)[0] == [], number
-
-
-def test_finite_extremes_equal_float64(device):
-    """What is drawn of finite extremes is what float64 draws; the same Gaussians are culled."""
     drawn = 0
     for number in range(20):
         error, _, visible = reference_error(2, number, device)

@@ -92,10 +92,7 @@ def gradients(gaussians: Gaussians, cam: Camera, options: RasterizeOptions, weig
 
 
 def sensitivity(gaussians: Gaussians, cam: Camera, name: str, sizes: torch.Tensor, weights=None) -> float:
-    """Sum over the Gaussians of |d pictures / d parameter| times sizes [N]: changes of the pictures by relative errors of 1.
-
-    The mean over four random mixes of all pixels estimates the norm over pixels. In their plain sum, signs would cancel.
-    """
+    """Sum over the Gaussians of |d pictures / d parameter|, a mean over four random mixes of pixels, times sizes [N]."""
     moving = leaves(gaussians)
     render = rasterize(moving, cam, RasterizeOptions(rule=SMOOTH))
     weights = torch.ones_like(upstream(render)) if weights is None else weights

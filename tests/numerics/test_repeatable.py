@@ -47,16 +47,8 @@ def other_bits(device) -> list[torch.Tensor]:
     view = Camera(np.eye(4), np.array([[150.0, 0, 75], [0, 150, 65], [0, 0, 1]]), 150, 130)
     integrate(distances, weights, (-1.0, -1.0, 2.0), 0.05, 0.2, view, 3 + image[..., 0], target[..., 0].contiguous())
     assert bool(weights.any())
-    found = [
-        sums,
-        leaf.grad,
-        ssim(image, target),
-        mean_square_distances(points),
-        param,
-        squared_error(image, target),
-        distances,
-    ]
-    return [t.detach() for t in found]
+    found = [sums, leaf.grad, ssim(image, target), mean_square_distances(points), param, squared_error(image, target)]
+    return [t.detach() for t in (*found, distances)]
 
 
 def test_50_repeats_give_the_same_bits(device):
@@ -143,32 +135,11 @@ def test_atomic_sums_differ_by_rounding_alone(device):
 KERNELS = sorted((Path(__file__).parents[2] / "warpgs/kernels").glob("*.py"))
 
 
-def is_kernel(decorator: ast.expr) -> bool:
-    """Whether a decorator is wp.kernel or a partial of it."""
-    return ast.unparse(getattr(decorator, "func", decorator)) in ("wp.kernel", "kernel")
-
-
 def warp_functions(tree: ast.AST) -> list[ast.FunctionDef]:
     """Functions that Warp compiles: its kernels and functions, but not the stubs of native ones."""
     functions = [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)]
     names = ("wp.func", "wp.kernel", "kernel")
     return [f for f in functions if any(ast.unparse(getattr(d, "func", d)) in names for d in f.decorator_list)]
-
-
-def test_no_adjoint_is_generated():
-    """Every kernel has enable_backward=False: dynamic loops are not replayed in adjoints that Warp makes itself."""
-    count = 0
-    for path in KERNELS:
-        text = path.read_text("utf-8")
-        for f in warp_functions(ast.parse(text)):
-            for d in f.decorator_list:
-                if is_kernel(d):
-                    count += 1
-                    # options may be shared: then they are spelled where they are made
-                    said = ast.unparse(d) if "options" not in ast.unparse(d) else text
-                    said = said if ast.unparse(d) != "kernel" else text
-                    assert "enable_backward=False" in said or '"enable_backward": False' in said, f"{path.name}: {f.name}"
-    assert count >= 25
 
 
 def bare_floats(function: ast.FunctionDef) -> list[int]:
@@ -181,8 +152,20 @@ def bare_floats(function: ast.FunctionDef) -> list[int]:
     return [n.lineno for n in own if isinstance(n, ast.Constant) and isinstance(n.value, float) and id(n) not in wrapped]
 
 
-def test_no_constant_is_hidden_float32():
-    """In functions made by scalar type every float is real(...); a bare one would be float32 in float64 kernels too."""
+def test_no_adjoint_is_generated_and_no_constant_is_hidden_float32():
+    """Every kernel has enable_backward=False; in functions made by scalar type every float is real(...)."""
+    count = 0
+    for path in KERNELS:
+        text = path.read_text("utf-8")
+        for f in warp_functions(ast.parse(text)):
+            for d in f.decorator_list:
+                if ast.unparse(getattr(d, "func", d)) in ("wp.kernel", "kernel"):
+                    count += 1
+                    # options may be shared: then they are spelled where they are made
+                    said = ast.unparse(d) if "options" not in ast.unparse(d) else text
+                    said = said if ast.unparse(d) != "kernel" else text
+                    assert "enable_backward=False" in said or '"enable_backward": False' in said, f"{path.name}: {f.name}"
+    assert count >= 25
     checked = 0
     for path in KERNELS:
         for maker in ast.walk(ast.parse(path.read_text("utf-8"))):
@@ -220,10 +203,7 @@ print("checked")
 
 @pytest.mark.slow
 def test_no_access_out_of_bounds(tmp_path):
-    """All ops once with Warp's bounds checks, which end the process; on a CPU: unoptimised kernels of 1024 threads want more
-    registers than a multiprocessor has, and compute-sanitizer looks after them. The check of written numbers does not apply:
-    it also stops at what entries held before they were written, and at quotients that a branch-free kernel does not select.
-    """
+    """All ops once with Warp's bounds checks, which end the process; on a CPU: on CUDA compute-sanitizer looks after them."""
     done = subprocess.run(
         [sys.executable, "-c", DEBUG, "cpu"], capture_output=True, text=True, check=False,
         env={**os.environ, "WARP_CACHE_PATH": str(tmp_path)},

@@ -521,7 +521,7 @@ def test_a_folder_that_others_can_write_to_is_refused(cluster, tmp_path):
 
 
 @with_slurm
-def test_each_end_of_a_job_is_an_event(cluster, job, capsys):
+def test_each_end_of_a_job_is_an_event_and_what_slurm_refuses_is_said(cluster, job, capsys, monkeypatch):
     """An answer; none, once Slurm has not listed the job three times; where Slurm does not answer, nothing is known."""
     engine = SlurmEngine("cpu", 1)
     for number, state in enumerate(("done", "failed", "held"), 70):
@@ -544,10 +544,6 @@ def test_each_end_of_a_job_is_an_event(cluster, job, capsys):
     ((_, state, reason),) = engine.wait(0)
     assert state == "crashed" and "unknown answer" in reason
     engine.close()
-
-
-@with_slurm
-def test_what_slurm_refuses_is_said(cluster, job, monkeypatch, capsys):
     engine = SlurmEngine("cpu", 1)
     cluster.fail["sbatch"] = "sbatch: error: invalid partition specified: nope\n"
     with pytest.raises(ResourceError, match="rejected job s0: sbatch: error: invalid partition"):
@@ -563,7 +559,7 @@ def test_what_slurm_refuses_is_said(cluster, job, monkeypatch, capsys):
 
 
 @with_slurm
-def test_the_process_of_a_job_answers_with_its_state(tmp_path, monkeypatch, capsys):
+def test_the_process_of_a_job_answers_with_its_state_and_calls_without_a_shell(tmp_path, monkeypatch, capsys):
     """Nothing where it is interrupted; a reason on stderr where the job cannot begin."""
     (tmp_path / "job").write_text("TEXT")
 
@@ -578,11 +574,7 @@ def test_the_process_of_a_job_answers_with_its_state(tmp_path, monkeypatch, caps
         answer = tmp_path / str(code)
         assert slurm.main(str(tmp_path / "job"), str(answer), "2") == code and answer.exists() == (code == 0)
     assert (tmp_path / "0").read_text() == "TEXT 2" and capsys.readouterr().err == "the loss term is not there\n"
-
-
-@with_slurm
-def test_commands_are_called_without_a_shell(tmp_path, monkeypatch):
-    """Their environment names no folder to import from but the package's, and hides no jobs; a missing one is a failure."""
+    # whose environment names no folder to import from but the package's, and hides no jobs
     monkeypatch.setenv("SQUEUE_STATES", "RUNNING")
     monkeypatch.setenv("PATH", str(tmp_path))
     assert slurm._call("squeue")[0] == 1

@@ -93,10 +93,7 @@ def test_command_and_function_are_one_fit(folder, fitted):
     assert (result.train, result.test) == (run.train, run.test) and len(result.test) > 0
     views = [warpgs.load_scene(folder / "scene").view(n) for n in result.test]
     assert warpgs.evaluate(result.gaussians(), views, result.options())[0].psnr == stored["views"][0]["psnr"]
-
-
-def test_a_fit_tells_where_its_time_went(folder, fitted):
-    """The parts sum to the total, which is more than the fit's own count; only a command has imports before its fit."""
+    # the parts sum to the total; only a command has imports before its fit
     stored = json.loads((folder / "run" / "metrics.json").read_text())
     for metrics in (stored, fitted[0].metrics):
         times = dict(metrics["wall_seconds"])
@@ -314,20 +311,7 @@ def command(folder, out, *more, steps=GIVEN_STEPS):
     return ["fit", str(folder / "scene"), "--out", str(out), *flags, *more]
 
 
-def test_a_run_says_and_keeps_what_was_given(given_folder, capsys):
-    """Notes before the first step and after the last, figures of each view, and the settings by which the scene is read."""
-    record, metrics = (json.loads((given_folder / "run" / f).read_text()) for f in ("config.json", "metrics.json"))
-    notes = html.unescape((given_folder / "run" / "report.html").read_text())
-    assert "depth maps: 7 of 8 views, 100.0% of their pixels, metric (a unit is 0.001 for integers" in notes
-    assert "given depth: used in 5 of 6 views" in notes
-    assert "median difference of rendered depth" in notes and "start: " in notes and "by given depth and sweep" in notes
-    assert record["scene"]["depths"] == str(given_folder / "depths") and record["scene"]["depth_kind"] == "metric"
-    rows = metrics["given"]["depth"]["views"]
-    assert len(rows) == 5 and all(r["coverage"] > 0.9 and 0 < r["difference"] < 0.5 for r in rows)
-    assert main(["eval", str(given_folder / "run"), "--device", "cpu"]) == 0
-
-
-def test_maps_decide_whether_a_run_continues(given_folder, tmp_path, capsys):
+def test_maps_decide_whether_a_run_continues_and_a_wrong_unit_is_named(given_folder, tmp_path, capsys):
     """The same maps give the same bits as an uninterrupted run; other maps are another scene."""
     run = tmp_path / "run"
     maps = ["--depths", str(given_folder / "depths")]
@@ -348,11 +332,8 @@ def test_maps_decide_whether_a_run_continues(given_folder, tmp_path, capsys):
     assert "the scene" in capsys.readouterr().err
     assert main(command(given_folder, run, *maps, "--resume")) == 0
     assert f"all {GIVEN_STEPS} steps are taken; only the images, scores and report are made again" in capsys.readouterr().out
-
-
-def test_a_wrong_unit_is_named_before_the_first_step(given_folder, tmp_path, capsys):
-    """With the ratio, view by view, and the flag that mends it; it mends it."""
-    out = tmp_path / "run"
+    # with the ratio, view by view, and the flag that mends it
+    out = tmp_path / "wrong"
     assert main(command(given_folder, out, "--depths", str(given_folder / "depths"), "--depth-unit", "1")) == 3
     said = capsys.readouterr().err
     assert "no depth map can be used" in said and "times those that the views confirm" in said and "--depth-unit" in said
@@ -360,7 +341,17 @@ def test_a_wrong_unit_is_named_before_the_first_step(given_folder, tmp_path, cap
     assert main(command(given_folder, out, "--depths", "nowhere")) == 3 and "no such folder" in capsys.readouterr().err
 
 
-def test_a_weight_of_0_leaves_the_loss_of_given_depth_out(given_folder):
+def test_a_run_says_and_keeps_what_was_given(given_folder, capsys):
+    """Notes before the first step and after the last, figures of each view, and the settings by which the scene is read."""
+    record, metrics = (json.loads((given_folder / "run" / f).read_text()) for f in ("config.json", "metrics.json"))
+    notes = html.unescape((given_folder / "run" / "report.html").read_text())
+    assert "depth maps: 7 of 8 views, 100.0% of their pixels, metric (a unit is 0.001 for integers" in notes
+    assert "given depth: used in 5 of 6 views" in notes
+    assert "median difference of rendered depth" in notes and "start: " in notes and "by given depth and sweep" in notes
+    assert record["scene"]["depths"] == str(given_folder / "depths") and record["scene"]["depth_kind"] == "metric"
+    rows = metrics["given"]["depth"]["views"]
+    assert len(rows) == 5 and all(r["coverage"] > 0.9 and 0 < r["difference"] < 0.5 for r in rows)
+    assert main(["eval", str(given_folder / "run"), "--device", "cpu"]) == 0
     scene = warpgs.load_scene(given_folder / "scene", depths=given_folder / "depths")
     fitted = warpgs.fit(scene, "3dgs", split=GIVEN_SPLIT, steps=2, device="cpu", verbose=False, loss_depth_weight=0.0)
     assert fitted.metrics["given"] == {} and any("given depth: used in 5" in n for n in fitted.notes)
@@ -471,17 +462,13 @@ def test_the_mean_colour_is_of_training_pixels_that_count(tmp_path):
 
 
 def test_cut_out_objects_keep_the_background_of_the_scene(tmp_path):
-    """Whether they know their opacity or stand on black."""
+    """Whether they know their opacity or stand on black; transparent pixels change with another one, and come back."""
     scene = load_scene(scenes.write_blender(tmp_path))
     color, note = choose_background("auto", scene, list(scene.views))
     assert color == (1, 1, 1) and "#ffffff, since the views show a cut-out object" in note
     assert choose_background("scene", scene, list(scene.views))[1] == "background: #ffffff, from the scene's files"
     black = [dataclasses.replace(v, image=v.image * (v.alpha[..., None] > 0), alpha=None) for v in scene.views]
     assert choose_background("auto", dataclasses.replace(scene, background=(0, 0, 0)), black)[0] == (0, 0, 0)
-
-
-def test_transparent_pixels_change_with_the_background_and_come_back(tmp_path):
-    scene = load_scene(scenes.write_blender(tmp_path))
     half = [dataclasses.replace(v, alpha=v.alpha * np.float32(0.5), image=(v.image + 1) / 2) for v in scene.views]
     scene = dataclasses.replace(scene, views=tuple(half))
     other = over_background(scene, (0.0, 0.5, 1.0))
@@ -523,7 +510,7 @@ def view(alpha=None, mask=None):
     return View("a.png", camera, np.full((12, 16, 3), 0.4, np.float32), mask, alpha=alpha)
 
 
-def test_scores_of_opacity_are_over_the_pixels_of_each_kind():
+def test_scores_of_opacity_and_straight_alpha():
     """Empty, object and edge have an error of their own; masked pixels do not count."""
     alpha = np.zeros((12, 16), np.float32)
     alpha[:, 4:12], alpha[:, 12:] = 1, 0.6
@@ -539,9 +526,6 @@ def test_scores_of_opacity_are_over_the_pixels_of_each_kind():
     assert m.opacity["psnr_whole"] == pytest.approx(10 * np.log10(4 * 25)) and m.opacity["psnr_foreground"] == np.inf
     assert score(view(), image, alpha=rendered).opacity == {} == score(view(alpha), image).opacity
     assert set(m.opacity) == set(scores.ALPHA_VARIANTS)
-
-
-def test_means_are_over_the_views_that_have_such_pixels():
     whole, half = np.ones((12, 16), np.float32), np.ones((12, 16), np.float32)
     half[:, :8] = 0
     image = np.full((12, 16, 3), 0.5, np.float32)
@@ -551,9 +535,7 @@ def test_means_are_over_the_views_that_have_such_pixels():
     line = score_line(means)
     assert ", PSNR of the foreground 19.83 dB" in line and ", alpha where empty 0.500, alpha in the object 0.750" in line
     assert "alpha" not in score_line(summarize(rows[2:]))
-
-
-def test_straight_alpha_shows_the_image_again_over_any_background():
+    # the image again, over any background
     rng = np.random.default_rng(0)
     colors, alpha = rng.uniform(0, 1, (6, 7, 3)).astype(np.float32), rng.uniform(0, 1, (6, 7)).astype(np.float32)
     alpha[0] = 0
@@ -577,17 +559,14 @@ def run(tmp_path_factory):
     return folder / "run"
 
 
-def test_metrics_config_and_report_speak_of_opacity(run):
+def test_metrics_report_and_renders_know_the_opacity(run, tmp_path, capsys):
+    """Over the background of the fit the transparent image is the opaque one; films have the colour."""
     metrics, record = (json.loads((run / n).read_text()) for n in ("metrics.json", "config.json"))
     assert set(scores.ALPHA_VARIANTS) <= set(metrics["test"]) & set(metrics["views"][0]) & set(metrics["variants"])
     assert metrics["test"]["psnr"] == metrics["test"]["psnr_whole"] and record["transparent"] is True
     METRICS(metrics, "")
     assert "alpha where empty" in (run / "report.html").read_text()
     assert open_run(run, "cpu").transparent
-
-
-def test_renders_are_transparent_unless_a_colour_is_named(run, tmp_path, capsys):
-    """Over the background of the fit the transparent image is the opaque one; films have the colour."""
     stored = open_run(run, "cpu")
     images = {}
     for name in ("auto", "white", "#0000ff"):

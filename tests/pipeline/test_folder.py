@@ -101,18 +101,6 @@ def test_whatever_writes_into_a_run_waits_for_nobody(folder, tmp_path, capsys):
         fit(folder, run)
 
 
-def test_export_and_prune_remove_what_killed_ones_left(folder, tmp_path):
-    """Files and folders under temporary names; the user's own stay."""
-    run, cpu = str(folder / "run"), ["--device", "cpu"]
-    for words in (["export", run, "--to", str(tmp_path / "a.ply")], ["prune", run, "--out", str(tmp_path / "b"), *cpu]):
-        (tmp_path / LEFT).mkdir()
-        (tmp_path / LEFT / "config.json").touch()
-        (tmp_path / LEFT.replace("0", "1")).touch()
-        (tmp_path / "own.tmp").touch()
-        assert main(words) == 0
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.ply", "b", "own.tmp"]
-
-
 @pytest.mark.parametrize("key", ["config", "fingerprint"])
 def test_a_checkpoint_of_another_fit_is_not_continued(folder, tmp_path, key):
     """It was copied from a run with another seed, or on other data: nothing of either run is lost."""
@@ -130,8 +118,16 @@ def test_a_checkpoint_of_another_fit_is_not_continued(folder, tmp_path, key):
     assert contents(tmp_path / "run") == before
 
 
-def test_commands_on_a_run_that_has_not_ended_print_that(folder, tmp_path):
-    """Render, export and evaluation; none does for a finished run."""
+def test_what_killed_commands_left_is_removed_and_a_fit_that_has_not_ended_is_named(folder, tmp_path):
+    """Files and folders under temporary names; the user's own stay; none is named for a finished run."""
+    run, cpu = str(folder / "run"), ["--device", "cpu"]
+    for words in (["export", run, "--to", str(tmp_path / "a.ply")], ["prune", run, "--out", str(tmp_path / "b"), *cpu]):
+        (tmp_path / LEFT).mkdir()
+        (tmp_path / LEFT / "config.json").touch()
+        (tmp_path / LEFT.replace("0", "1")).touch()
+        (tmp_path / "own.tmp").touch()
+        assert main(words) == 0
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.ply", "b", "own.tmp"]
     run = shutil.copytree(folder / "run", tmp_path / "run")
     commands = [
         lambda: export(run, tmp_path / "a.ply"), lambda: evaluate(run, "cpu"),
@@ -144,8 +140,14 @@ def test_commands_on_a_run_that_has_not_ended_print_that(folder, tmp_path):
         assert "--resume" in line
 
 
-def test_a_fit_that_was_killed_before_it_had_a_record_can_be_begun_again(folder, tmp_path):
-    """The folder holds a lock file and half of config.json, which is as good as empty."""
+def test_folders_of_errors_and_of_killed_fits(folder, tmp_path):
+    """A folder of the user's own outlives any error; one that the fit made goes."""
+    (tmp_path / "own").mkdir()
+    for out in ("own", "made"):
+        with pytest.raises(DataError, match="no such folder"):
+            warpgs.fit(tmp_path / "nowhere", CONFIG, out=tmp_path / out, device="cpu")
+    assert [p.name for p in tmp_path.iterdir()] == ["own"]
+    # a lock file and half of config.json are as good as empty
     out = tmp_path / "run"
     out.mkdir()
     (out / LOCK).write_text("")
@@ -158,15 +160,6 @@ def test_a_fit_that_was_killed_before_it_had_a_record_can_be_begun_again(folder,
     (tmp_path / "users" / "a.tmp.123.456").write_text("not ours")
     with pytest.raises(UsageError, match="exists already"):
         fit(folder, tmp_path / "users")
-
-
-def test_a_folder_of_the_users_own_outlives_an_error(folder, tmp_path):
-    """Whatever the error; one that the fit made goes."""
-    (tmp_path / "own").mkdir()
-    for out in ("own", "made"):
-        with pytest.raises(DataError, match="no such folder"):
-            warpgs.fit(tmp_path / "nowhere", CONFIG, out=tmp_path / out, device="cpu")
-    assert [p.name for p in tmp_path.iterdir()] == ["own"]
 
 
 @pytest.mark.skipif(os.name == "nt", reason="Windows has other limits and rights")

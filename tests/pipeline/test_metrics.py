@@ -52,24 +52,6 @@ from warpgs.synthetic.demo import camera_path, still_life
 # Scores, what guessing would score, and camera paths.
 
 
-def test_psnr_of_known_errors():
-    a = np.full((8, 9, 3), 0.5, np.float32)
-    assert psnr(a + 0.1, a) == pytest.approx(20, abs=1e-4) and psnr(a, a) == math.inf
-    region = np.zeros((8, 9), bool)
-    region[:4] = True
-    b = a.copy()
-    b[4:] = 1
-    assert psnr(b, a, region) == math.inf and psnr(b, a) < 10
-    for wrong, error, message in (
-        (region.astype(int), TypeError, "region must be bool, not int64; give region > 0"),
-        (region[1:], ValueError, "region must have shape"),
-    ):
-        with pytest.raises(error, match=message):
-            psnr(b, a, wrong)
-    with pytest.raises(ValueError, match="both images must have one shape"):
-        psnr(b[:1], a)  # which numpy would broadcast
-
-
 def test_scores_are_of_the_saved_picture():
     """LPIPS joins the figures where it is measured."""
     view = photos(1)[0]
@@ -99,19 +81,6 @@ def test_ssim_without_the_border_is_scikit_images(height, width):
             continue
         given = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False, "data_range": 1, "channel_axis": -1}
         assert found == pytest.approx(structural_similarity(a.astype(float), b.astype(float), **given), abs=2e-6)
-
-
-def test_counted_region():
-    view = photos(1)[0]
-    bright = View("a", view.camera, np.full_like(view.image, 0.5))
-    assert counted_region(bright) == (None, "all")
-    dark = np.zeros_like(view.image)
-    dark[10:20, 10:20] = 0.7
-    region, name = counted_region(View("a", view.camera, dark))
-    assert name == "foreground" and int(region.sum()) == 100
-    mask = np.zeros(view.image.shape[:2], bool)
-    mask[0] = True
-    assert counted_region(View("a", view.camera, dark, mask))[1] == "mask"
 
 
 class Witness:
@@ -151,7 +120,32 @@ def test_masked_view_is_scored_by_the_dtu_recipe(kind):
     assert a.ssim == pytest.approx(float(ssim_reference(*pair).mean()), abs=1e-5)
 
 
-def test_guesses():
+def test_psnr_of_known_errors_regions_and_guesses():
+    a = np.full((8, 9, 3), 0.5, np.float32)
+    assert psnr(a + 0.1, a) == pytest.approx(20, abs=1e-4) and psnr(a, a) == math.inf
+    region = np.zeros((8, 9), bool)
+    region[:4] = True
+    b = a.copy()
+    b[4:] = 1
+    assert psnr(b, a, region) == math.inf and psnr(b, a) < 10
+    for wrong, error, message in (
+        (region.astype(int), TypeError, "region must be bool, not int64; give region > 0"),
+        (region[1:], ValueError, "region must have shape"),
+    ):
+        with pytest.raises(error, match=message):
+            psnr(b, a, wrong)
+    with pytest.raises(ValueError, match="both images must have one shape"):
+        psnr(b[:1], a)  # which numpy would broadcast
+    view = photos(1)[0]
+    bright = View("a", view.camera, np.full_like(view.image, 0.5))
+    assert counted_region(bright) == (None, "all")
+    dark = np.zeros_like(view.image)
+    dark[10:20, 10:20] = 0.7
+    region, name = counted_region(View("a", view.camera, dark))
+    assert name == "foreground" and int(region.sum()) == 100
+    mask = np.zeros(view.image.shape[:2], bool)
+    mask[0] = True
+    assert counted_region(View("a", view.camera, dark, mask))[1] == "mask"
     views = photos(3)
     g = baselines([views[0], views[2]], [views[1]])
     mean = to_8_bit((views[0].image + views[2].image) / 2)
@@ -159,9 +153,6 @@ def test_guesses():
     assert g["mean_photo"] == pytest.approx(psnr(mean, views[1].image, region))
     assert baselines(photos(2, 20, 16), [views[1]]) == {}
     assert summarize([]) == {}
-
-
-def test_extent_and_focus_of_an_arc():
     cameras = ring(5)
     assert np.linalg.norm(focus_point(cameras)) < 1e-4
     assert 1.0 < camera_extent(cameras) < 2.2 and camera_extent(cameras[:1]) == 0
@@ -201,7 +192,7 @@ def test_what_one_view_alone_shows_is_named(alone):
     assert len(notes) == alone and all("2.png" in n and "of its pixels" in n for n in notes)
 
 
-def test_it_takes_two_others_that_show_the_place():
+def test_what_moved_takes_two_other_views_and_a_good_fit():
     views, renders = _scene()
     views[2] = _with_patch(views[2])
     elsewhere = [(rgb, depth if i == 2 else 2 * depth, alpha) for i, (rgb, depth, alpha) in enumerate(renders)]
@@ -211,11 +202,6 @@ def test_it_takes_two_others_that_show_the_place():
     mask[16:34, 22:42] = False
     masked = [dataclasses.replace(v, mask=mask) if i == 2 else v for i, v in enumerate(views)]
     assert moved_fractions(views, renders)[2] > 0 and not any(moved_fractions(masked, renders))
-
-
-def test_no_region_stands_out_of_what_fits_badly_as_a_whole():
-    views, renders = _scene()
-    views[2] = _with_patch(views[2])
     early = [(rgb + np.float32(0.01), *rest) for rgb, *rest in renders]  # all views are far from their renders
     assert moved_fractions(views, renders)[2] > 0 and not any(moved_fractions(views, early))
     views[2] = dataclasses.replace(views[2], image=views[2].image + np.float32(0.1))
@@ -324,25 +310,6 @@ def plane(width: int = 30, height: int = 20, depth: float = 2.0) -> tuple[Camera
     return Camera(np.eye(4), K, width, height), torch.full((height, width), depth)
 
 
-def test_views_that_saw_nothing_of_it():
-    camera, depth = plane()
-    away = Camera(look_at(np.zeros(3), np.array([0.0, 0, -1]), np.array([0.0, -1, 0])), camera.K, 30, 20)
-    others = [(away, depth), (camera, depth / 2), (camera, 2 * depth), (camera, 0 * depth)]
-    counts, difference = coverage_map(depth, camera, others)
-    assert not counts.any() and (difference == 0.5).all()  # of the nearer wall, as a share of the depth
-    assert (coverage_map(depth, camera, [*others, (camera, 1.01 * depth)])[0] == 1).all()
-
-
-def test_pixels_without_surface_are_nobodys():
-    camera, depth = plane()
-    depth[:5] = 0
-    counts, difference = coverage_map(depth, camera, [(camera, depth)] * 300)
-    assert (counts[5:] == 300).all() and not counts[:5].any() and bool(torch.isinf(difference[:5]).all())
-    for transparent, name in ((True, "background"), (False, "0")):
-        classes = classes_of(counts, (depth <= 0) & transparent)
-        assert (np.sum(list(classes.values()), 0) == 1).all() and classes[name][:5].all() and classes["2+"][5:].all()
-
-
 def test_masks_hide_and_many_pixels_are_rendered_smaller(monkeypatch):
     cameras, g = ring(3), three_gaussians()
     mask = np.ones((32, 40), bool)
@@ -371,16 +338,6 @@ def test_a_render_is_made_once_while_there_is_room(monkeypatch):
     assert len(made) == 4
 
 
-def test_photographs_tell_the_error_to_expect():
-    """None from one view; two photographs of one wall that differ by 0.1 give 0.01 at the first class, and fill the others."""
-    camera, depth = plane()
-    views = [View(f"{i}", camera, np.full((20, 30, 3), 0.4 + 0.1 * i, np.float32)) for i in range(2)]
-    training = [(camera, depth)] * 2
-    assert photo_errors(views[:1], training[:1]) is None
-    errors = photo_errors(views, training)
-    assert errors.shape == (len(BINS),) and errors == pytest.approx(0.01, rel=1e-5)
-
-
 def test_scores_split_into_what_they_are_made_of(tmp_path):
     """Pixels and errors of the classes add up to the whole score; the figures fit the schema; each view has its image."""
     views = photos(5)
@@ -404,8 +361,28 @@ def test_scores_split_into_what_they_are_made_of(tmp_path):
     assert again["classes"] == found["classes"]
 
 
-def test_image_leaves_what_was_seen():
-    """Pixels that two views saw are as rendered; the others are tinted, and stripes tell the two tints apart in gray, too."""
+def test_views_that_saw_nothing_and_pixels_without_surface():
+    camera, depth = plane()
+    away = Camera(look_at(np.zeros(3), np.array([0.0, 0, -1]), np.array([0.0, -1, 0])), camera.K, 30, 20)
+    others = [(away, depth), (camera, depth / 2), (camera, 2 * depth), (camera, 0 * depth)]
+    counts, difference = coverage_map(depth, camera, others)
+    assert not counts.any() and (difference == 0.5).all()  # of the nearer wall, as a share of the depth
+    assert (coverage_map(depth, camera, [*others, (camera, 1.01 * depth)])[0] == 1).all()
+    camera, depth = plane()
+    depth[:5] = 0
+    counts, difference = coverage_map(depth, camera, [(camera, depth)] * 300)
+    assert (counts[5:] == 300).all() and not counts[:5].any() and bool(torch.isinf(difference[:5]).all())
+    for transparent, name in ((True, "background"), (False, "0")):
+        classes = classes_of(counts, (depth <= 0) & transparent)
+        assert (np.sum(list(classes.values()), 0) == 1).all() and classes[name][:5].all() and classes["2+"][5:].all()
+    # none from one view; two of one wall that differ by 0.1 give 0.01 at the first class, and fill the others
+    camera, depth = plane()
+    views = [View(f"{i}", camera, np.full((20, 30, 3), 0.4 + 0.1 * i, np.float32)) for i in range(2)]
+    training = [(camera, depth)] * 2
+    assert photo_errors(views[:1], training[:1]) is None
+    errors = photo_errors(views, training)
+    assert errors.shape == (len(BINS),) and errors == pytest.approx(0.01, rel=1e-5)
+    # the others are tinted, and stripes tell the two tints apart in gray, too
     image = np.full((16, 24, 3), 0.5, np.float32)
     unseen, once = np.zeros((2, 16, 24), bool)
     unseen[:, :8], once[:, 8:16] = True, True
@@ -521,7 +498,7 @@ class Evil:
 
 
 @ALEX
-def test_bad_sources_are_named(files, tmp_path):
+def test_bad_and_packed_sources_are_named(files, tmp_path):
     net, features, _, backbone, heads_file = files
     out = tmp_path / "x.safetensors"
 
@@ -548,22 +525,6 @@ def test_bad_sources_are_named(files, tmp_path):
     refused("features.0.weight", backbone=saved(other))
     nan = {f"features.{k}": torch.full_like(v, float("nan")) for k, v in features.state_dict().items()}
     refused("not finite", backbone=saved(nan))
-
-
-@ALEX
-def test_weights_are_the_same_where_files_cannot_be_mapped(files, tmp_path, monkeypatch):
-    from safetensors.torch import load_file
-
-    notes = convert_lpips(files[3], files[4], tmp_path / "mapped")
-    assert len(notes) == 3 and "not torchvision's published file" in notes[1] and "neither v0.0 nor v0.1" in notes[2]
-    monkeypatch.setattr("warpgs.files.DESCRIPTORS", tmp_path / "none")
-    convert_lpips(files[3], files[4], tmp_path / "read")
-    mapped, read = (load_file(tmp_path / name) for name in ("mapped", "read"))
-    assert mapped.keys() == read.keys() and all(torch.equal(t, read[n]) for n, t in mapped.items())
-
-
-@ALEX
-def test_packed_weights_are_refused_before_they_are_unpacked(files, tmp_path):
     import zipfile
 
     for packing, words in (
@@ -606,10 +567,18 @@ def test_bad_weights_are_named(weights, tmp_path, monkeypatch):
 
 
 @ALEX
-def test_command(files, tmp_path, capsys):
+def test_the_command_and_files_that_cannot_be_mapped(files, tmp_path, capsys, monkeypatch):
     net, _, _, backbone, heads = files
     out = tmp_path / "made.safetensors"
     assert main(["convert-lpips", "--backbone", str(backbone), "--heads", str(heads), "--out", str(out)]) == 0
     assert net in capsys.readouterr().out and out.is_file()
     assert main(["convert-lpips", "--backbone", str(backbone), "--heads", str(heads), "--out", str(out)]) == 2
     assert "exists" in capsys.readouterr().err
+    from safetensors.torch import load_file
+
+    notes = convert_lpips(files[3], files[4], tmp_path / "mapped")
+    assert len(notes) == 3 and "not torchvision's published file" in notes[1] and "neither v0.0 nor v0.1" in notes[2]
+    monkeypatch.setattr("warpgs.files.DESCRIPTORS", tmp_path / "none")
+    convert_lpips(files[3], files[4], tmp_path / "read")
+    mapped, read = (load_file(tmp_path / name) for name in ("mapped", "read"))
+    assert mapped.keys() == read.keys() and all(torch.equal(t, read[n]) for n, t in mapped.items())

@@ -75,43 +75,7 @@ def update(keep, added: dict, parents, **more) -> DensityUpdate:
     return DensityUpdate(torch.tensor(keep, dtype=torch.int64), added, torch.tensor(parents, dtype=torch.int64), **more)
 
 
-def test_a_skipped_step_changes_no_bit_and_rows_are_reordered_together():
-    made = table()
-    before = snapshot(made)
-    adam_step(made, {n: torch.ones_like(t) for n, t in made.params.items()}, step=2, skip=1)
-    assert all(torch.equal(t, before[n]) for n, t in made.state().items())
-    order = torch.tensor([3, 0, 4, 2, 1])
-    made.reorder(order)
-    assert all(torch.equal(t, before[n][order]) for n, t in made.state().items())
-    assert all(t.requires_grad and t.is_leaf for t in made.params.values())
-
-
-def test_kept_rows_keep_everything_and_new_rows_start_anew():
-    """Survivors keep all bits; new rows have moments of 0, and columns of their parent, of the change, or the fill."""
-    made = table()
-    before, keep = snapshot(made), [0, 3, 4]
-    added = {n: t[:2] + 1 for n, t in cloud(5).tensors().items()}
-    made.apply(update(keep, added, [-1, -1]))
-    assert len(made) == 5
-    for name, t in made.state().items():
-        assert torch.equal(t[:3], before[name][keep]), name
-        group, _, short = name.partition(".")
-        if group == "params":
-            assert torch.equal(t[3:], added[short])
-        elif group != "columns":
-            assert bool(before[name].any()) and not bool(t[3:].any())
-    assert all(t.requires_grad and t.is_leaf and t.is_contiguous() for t in made.params.values())
-    made = table()
-    added = {n: t[:3] for n, t in cloud(5).tensors().items()}
-    made.apply(update([4, 0], added, [3, -1, 0]))
-    assert made.columns["age"].tolist() == [14, 10, 13, -1, 10]
-    assert made.columns["seen"].tolist() == [4, 0, 0.5, 0.5, 0.5]
-    made.apply(update([0], added, [2, -1, -1], columns={"age": 99, "seen": 7}))
-    assert made.columns["age"].tolist() == [14, 13, 99, 99] and made.columns["seen"].tolist() == [4, 7, 7, 7]
-    assert made.columns["age"].dtype is torch.int32 and made.columns["seen"].dtype is torch.float32
-
-
-def test_overwritten_rows_start_again_before_rows_come_and_go():
+def test_overwritten_rows_and_reset_opacities_start_again():
     """Indices refer to rows before the change. Parameters that are not named and columns stay; moments of the row become 0."""
     made = table()
     before = snapshot(made)
@@ -126,10 +90,7 @@ def test_overwritten_rows_start_again_before_rows_come_and_go():
         assert torch.equal(t[same], before[name][kept][same]), name
         if name.startswith("exp_avg"):
             assert bool(before[name][3].any()) and not bool(t[2].any()), name
-
-
-def test_opacity_reset_caps_and_forgets():
-    """No opacity stays above the cap, lower ones stay, and the moments of opacities, and of nothing else, are zero."""
+    # no opacity stays above the cap, lower ones stay, and moments of nothing else are zero
     g = cloud(2)
     g.logit_opacities[:] = torch.logit(torch.tensor([0.9, 0.004]))
     made = table(gaussians=g)
@@ -163,7 +124,37 @@ def test_state_comes_back_bit_for_bit():
     assert len(empty) == 3 and empty.state() == {}
 
 
-def test_a_change_that_is_not_whole_is_refused():
+def test_kept_rows_keep_everything_and_new_rows_start_anew():
+    """Survivors keep all bits; new rows have moments of 0, and columns of their parent, of the change, or the fill."""
+    made = table()
+    before = snapshot(made)
+    adam_step(made, {n: torch.ones_like(t) for n, t in made.params.items()}, step=2, skip=1)
+    assert all(torch.equal(t, before[n]) for n, t in made.state().items())
+    order = torch.tensor([3, 0, 4, 2, 1])
+    made.reorder(order)
+    assert all(torch.equal(t, before[n][order]) for n, t in made.state().items())
+    assert all(t.requires_grad and t.is_leaf for t in made.params.values())
+    made = table()
+    before, keep = snapshot(made), [0, 3, 4]
+    added = {n: t[:2] + 1 for n, t in cloud(5).tensors().items()}
+    made.apply(update(keep, added, [-1, -1]))
+    assert len(made) == 5
+    for name, t in made.state().items():
+        assert torch.equal(t[:3], before[name][keep]), name
+        group, _, short = name.partition(".")
+        if group == "params":
+            assert torch.equal(t[3:], added[short])
+        elif group != "columns":
+            assert bool(before[name].any()) and not bool(t[3:].any())
+    assert all(t.requires_grad and t.is_leaf and t.is_contiguous() for t in made.params.values())
+    made = table()
+    added = {n: t[:3] for n, t in cloud(5).tensors().items()}
+    made.apply(update([4, 0], added, [3, -1, 0]))
+    assert made.columns["age"].tolist() == [14, 10, 13, -1, 10]
+    assert made.columns["seen"].tolist() == [4, 0, 0.5, 0.5, 0.5]
+    made.apply(update([0], added, [2, -1, -1], columns={"age": 99, "seen": 7}))
+    assert made.columns["age"].tolist() == [14, 13, 99, 99] and made.columns["seen"].tolist() == [4, 7, 7, 7]
+    assert made.columns["age"].dtype is torch.int32 and made.columns["seen"].dtype is torch.float32
     made = table(4)
     before = snapshot(made)
     added = {n: t.detach()[:2] for n, t in made.params.items()}
@@ -180,6 +171,58 @@ CAMERAS, VIEWS = (torch.zeros(1, 3), torch.zeros(1, 9)), photos(4)
 
 def params(log_scales: torch.Tensor) -> dict[str, torch.Tensor]:
     return {"log_scales": log_scales.clone(), "logit_opacities": torch.linspace(-8, 8, len(log_scales))}
+
+
+def test_figures_count_needles_and_what_is_beyond_and_the_radius_holds_cameras_and_points():
+    scales = torch.log(torch.tensor([[62.0, 2.0, 2.0], [3.0, 3.0, 0.01], [9.0, 1.0, 1.0]]))
+    logits = torch.logit(torch.tensor([0.1, 0.5, 0.4]))
+    model = Gaussians(**(cloud(3).tensors() | {"log_scales": scales, "logit_opacities": logits}))
+    f = shape_figures(model, LimitConfig(max_size=1.0, max_ratio=8.0, max_reach=0), 50.0, 2.0, ring(4))
+    assert f["needles"] == pytest.approx(1 / 3) and f["needles_by_opacity"] == pytest.approx(0.1, rel=1e-5)
+    assert f["thin"] == pytest.approx(2 / 3) and f["beyond"] == 2
+    assert f["largest_over_radius"] == pytest.approx(62 / 50) and f["largest_over_extent"] == pytest.approx(31)
+    assert shape_figures(model, LimitConfig(max_size=0, max_ratio=0, max_reach=0), 50.0, 2.0, ring(4))["beyond"] == 0
+    assert "33.3%" in shape_summary(f) and "2 exceed the limits" in shape_summary(f)
+    cameras = ring(4)
+    center = np.mean([c.center for c in cameras], axis=0)
+    ball = center + 5 * np.eye(3)[np.arange(30) % 3]
+    ball[:2] += 1e4
+    colors = np.zeros((30, 3), np.float32)
+    assert scene_radius(cameras, PointCloud(ball, colors)) == pytest.approx(5)
+    near = PointCloud(center + 1e-3 * np.eye(3), colors[:3])
+    assert scene_radius(cameras, near) > max(np.linalg.norm(c.center - center) for c in cameras)
+
+
+def test_a_fit_ends_within_its_limits():
+    """Rates of scales that make needles in a few steps: none is left where limits are on, some are where they are off."""
+    config = FitConfig(
+        steps=40, init=InitConfig(source="points"), strategy="mcmc", optimizer=OptimizerConfig(scales_lr=0.5),
+        density=DensityConfig(start=5, every=10), limits=LimitConfig(max_size=0.2, max_ratio=3.0),
+    )  # fmt: skip
+    free = dataclasses.replace(config, limits=LimitConfig(0.0, 0.0, 0.0))
+    beyond = []
+    for c in (config, free):
+        fit = Trainer(VIEWS, seeds(), c, CPU)
+        while fit.step < c.steps:
+            fit.advance()
+        beyond.append(
+            shape_figures(fit.gaussians, config.limits, fit.radius, fit.context.extent, [v.camera for v in VIEWS])["beyond"]
+        )
+    assert beyond[0] == 0 < beyond[1]
+    config = FitConfig(steps=2, init=InitConfig(source="points"))
+    fit = Trainer(VIEWS, seeds(), config, CPU)
+    fit.strategy.due = lambda step: step == config.steps
+
+    def update(step):
+        added = {n: t.detach()[:1].clone() for n, t in fit.table.params.items()}
+        added["log_scales"] += torch.tensor([[20.0, 0.0, 0.0]])
+        yield DensityUpdate(torch.arange(len(fit.table)), added, torch.tensor([0]))
+
+    fit.strategy.update = update
+    fit.advance()
+    fit.advance()
+    assert len(fit.gaussians) == len(seeds()) + 1
+    assert shape_figures(fit.gaussians, config.limits, fit.radius, fit.context.extent, [v.camera for v in VIEWS])["beyond"] == 0
 
 
 def test_axes_are_cut_and_needles_thickened():
@@ -206,10 +249,7 @@ def test_axes_are_cut_and_needles_thickened():
     assert all(torch.equal(t.nan_to_num(7), before[n].nan_to_num(7)) for n, t in found.items())
     limits.hold(found, CAMERAS, YES)
     assert bool(found["log_scales"][1].isnan().any()) and float(found["log_scales"][0].max()) == 0
-
-
-def test_no_gaussian_reaches_a_camera():
-    """Its longest axis is at most a third of the distance to the nearest of two cameras; a small one stays as it is."""
+    # its longest axis is at most a third of the distance to the nearest of two cameras
     found = params(torch.log(torch.tensor([[9.0, 1.0, 1e-3], [0.5, 0.2, 0.1], [math.inf, 1.0, 1.0]])))
     found["means"] = torch.tensor([[0.0, 0, 6], [0, 0, 6], [0, 0, 6]])
     limits, centers = LimitConfig(max_ratio=0).at(1.0, 100.0), torch.tensor([[0.0, 0, 0], [0, 0, 20]])
@@ -221,92 +261,10 @@ def test_no_gaussian_reaches_a_camera():
     over = shape_figures(model, LimitConfig(), 100.0, 1.0, cameras)["largest_over_distance"]
     nearest = min(np.linalg.norm(c.center - [0, 0, 6]) for c in cameras)
     assert over == pytest.approx(2 / nearest, rel=1e-5)
-
-
-def test_the_radius_holds_cameras_and_nine_tenths_of_the_points():
-    cameras = ring(4)
-    center = np.mean([c.center for c in cameras], axis=0)
-    ball = center + 5 * np.eye(3)[np.arange(30) % 3]
-    ball[:2] += 1e4
-    colors = np.zeros((30, 3), np.float32)
-    assert scene_radius(cameras, PointCloud(ball, colors)) == pytest.approx(5)
-    near = PointCloud(center + 1e-3 * np.eye(3), colors[:3])
-    assert scene_radius(cameras, near) > max(np.linalg.norm(c.center - center) for c in cameras)
-
-
-def test_figures_count_needles_and_what_is_beyond():
-    scales = torch.log(torch.tensor([[62.0, 2.0, 2.0], [3.0, 3.0, 0.01], [9.0, 1.0, 1.0]]))
-    logits = torch.logit(torch.tensor([0.1, 0.5, 0.4]))
-    model = Gaussians(**(cloud(3).tensors() | {"log_scales": scales, "logit_opacities": logits}))
-    f = shape_figures(model, LimitConfig(max_size=1.0, max_ratio=8.0, max_reach=0), 50.0, 2.0, ring(4))
-    assert f["needles"] == pytest.approx(1 / 3) and f["needles_by_opacity"] == pytest.approx(0.1, rel=1e-5)
-    assert f["thin"] == pytest.approx(2 / 3) and f["beyond"] == 2
-    assert f["largest_over_radius"] == pytest.approx(62 / 50) and f["largest_over_extent"] == pytest.approx(31)
-    assert shape_figures(model, LimitConfig(max_size=0, max_ratio=0, max_reach=0), 50.0, 2.0, ring(4))["beyond"] == 0
-    assert "33.3%" in shape_summary(f) and "2 exceed the limits" in shape_summary(f)
-
-
-def test_a_fit_ends_within_its_limits():
-    """Rates of scales that make needles in a few steps: none is left where limits are on, some are where they are off."""
-    config = FitConfig(
-        steps=40, init=InitConfig(source="points"), strategy="mcmc", optimizer=OptimizerConfig(scales_lr=0.5),
-        density=DensityConfig(start=5, every=10), limits=LimitConfig(max_size=0.2, max_ratio=3.0),
-    )  # fmt: skip
-    free = dataclasses.replace(config, limits=LimitConfig(0.0, 0.0, 0.0))
-    beyond = []
-    for c in (config, free):
-        fit = Trainer(VIEWS, seeds(), c, CPU)
-        while fit.step < c.steps:
-            fit.advance()
-        beyond.append(
-            shape_figures(fit.gaussians, config.limits, fit.radius, fit.context.extent, [v.camera for v in VIEWS])["beyond"]
-        )
-    assert beyond[0] == 0 < beyond[1]
-
-
-def test_what_a_change_of_the_set_adds_is_within_the_limits():
-    config = FitConfig(steps=2, init=InitConfig(source="points"))
-    fit = Trainer(VIEWS, seeds(), config, CPU)
-    fit.strategy.due = lambda step: step == config.steps
-
-    def update(step):
-        added = {n: t.detach()[:1].clone() for n, t in fit.table.params.items()}
-        added["log_scales"] += torch.tensor([[20.0, 0.0, 0.0]])
-        yield DensityUpdate(torch.arange(len(fit.table)), added, torch.tensor([0]))
-
-    fit.strategy.update = update
-    fit.advance()
-    fit.advance()
-    assert len(fit.gaussians) == len(seeds()) + 1
-    assert shape_figures(fit.gaussians, config.limits, fit.radius, fit.context.extent, [v.camera for v in VIEWS])["beyond"] == 0
-
-
-def test_the_ratio_is_held_from_its_time_on_and_at_the_last_step():
     config = LimitConfig()
     assert [config.at(p, 2.0).ratio for p in (0.0, 0.7, 0.71, 1.0)] == [math.inf, math.inf, 30, 30]
     assert config.at(0.0, 3.0).largest == 3.0
     assert LimitConfig(0.0, 0.0, 0.0).at(1.0, 2.0) == Limits()
-
-
-def test_coefficients_above_the_degree_vanish_and_are_not_stored():
-    sh = 1 + torch.rand(5, 25, 3)
-    cut = truncated(sh, torch.tensor([0, 1, 2, 3, 4]))
-    for d, count in enumerate((1, 4, 9, 16, 25)):
-        assert torch.equal(cut[d, :count], sh[d, :count]) and not bool(cut[d, count:].any())
-    assert edit.stored_degrees(cut).tolist() == [0, 1, 2, 3, 4]
-    assert torch.equal(unpack(pack(cut, edit.stored_degrees(cut)), edit.stored_degrees(cut)), cut)
-    assert edit.stored_degrees(torch.zeros(2, 1, 3)).tolist() == [0, 0]
-    degrees = torch.tensor([0, 0, 1, 1, 1, 2])
-    sh = truncated(torch.randn(6, 16, 3), degrees)
-    packed = pack(sh, degrees)  # fewer bytes
-    assert packed.numel() == 3 * (2 * 1 + 3 * 4 + 9) and torch.equal(unpack(packed, degrees), sh[:, :9])
-    assert model_bytes(degrees) == 4 * (6 * 11 + packed.numel())
-    with pytest.raises(ValueError, match="ascend"):
-        pack(sh, degrees.flip(0))
-    made = dataclasses.replace(cloud(5, degree=3), sh=truncated(torch.ones(5, 16, 3), torch.ones(5)))
-    assert edit.drop_unused_sh(made).sh.shape == edit.limit_degree(made, 1).sh.shape == (5, 4, 3)
-    with pytest.raises(UsageError, match="degrees 0 to 4"):
-        edit.limit_degree(made, 5)
 
 
 TURN = edit.rotation_about(np.array([1.0, -2.0, 0.5]), 1.1)
@@ -335,7 +293,7 @@ def test_up_becomes_minus_y(up):
 
 
 def test_boxes(tmp_path):
-    """Of numbers, of JSON and of files; turned ones, too."""
+    """Of numbers, of JSON and of files; turned ones, too; and those that are none."""
     made = cloud(200)
     plain = edit.inside(made, edit.box_of("-1,-1,3,1,1,5"))
     assert torch.equal(plain, (made.means - torch.tensor([0.0, 0, 4])).abs().amax(1) <= 1)
@@ -357,22 +315,33 @@ def test_boxes(tmp_path):
             edit.box_of(str(path))
     with pytest.raises(DataError, match="cannot be read as a box"):
         edit.box_of(str(tmp_path / "none.json"))
-
-
-@pytest.mark.parametrize(
-    "text,match",
-    [
-        ("1,2,3", "takes 6 finite"), ("[" * 9000, "six numbers"), ("0,0,0,1,1,0", "longer than 0"),
-        ("0,0,0,1,1,NaN", "finite"),
+    for text, match in (
+        ("1,2,3", "takes 6 finite"), ("[" * 9000, "six numbers"), ("0,0,0,1,1,0", "longer than 0"), ("0,0,0,1,1,NaN", "finite"),
         ('{"center": [0,0,0], "size": [1,1,1], "rotation": [[2,0,0],[0,1,0],[0,0,1]]}', "must be a rotation matrix"),
-    ],
-)  # fmt: skip
-def test_boxes_that_are_none(text, match):
-    with pytest.raises(UsageError, match=match):
-        edit.box_of(text)
+    ):  # fmt: skip
+        with pytest.raises(UsageError, match=match):
+            edit.box_of(text)
 
 
-def test_what_disturbs_is_counted_once():
+def test_coefficients_above_the_degree_vanish_and_what_disturbs_is_counted_once():
+    sh = 1 + torch.rand(5, 25, 3)
+    cut = truncated(sh, torch.tensor([0, 1, 2, 3, 4]))
+    for d, count in enumerate((1, 4, 9, 16, 25)):
+        assert torch.equal(cut[d, :count], sh[d, :count]) and not bool(cut[d, count:].any())
+    assert edit.stored_degrees(cut).tolist() == [0, 1, 2, 3, 4]
+    assert torch.equal(unpack(pack(cut, edit.stored_degrees(cut)), edit.stored_degrees(cut)), cut)
+    assert edit.stored_degrees(torch.zeros(2, 1, 3)).tolist() == [0, 0]
+    degrees = torch.tensor([0, 0, 1, 1, 1, 2])
+    sh = truncated(torch.randn(6, 16, 3), degrees)
+    packed = pack(sh, degrees)  # fewer bytes
+    assert packed.numel() == 3 * (2 * 1 + 3 * 4 + 9) and torch.equal(unpack(packed, degrees), sh[:, :9])
+    assert model_bytes(degrees) == 4 * (6 * 11 + packed.numel())
+    with pytest.raises(ValueError, match="ascend"):
+        pack(sh, degrees.flip(0))
+    made = dataclasses.replace(cloud(5, degree=3), sh=truncated(torch.ones(5, 16, 3), torch.ones(5)))
+    assert edit.drop_unused_sh(made).sh.shape == edit.limit_degree(made, 1).sh.shape == (5, 4, 3)
+    with pytest.raises(UsageError, match="degrees 0 to 4"):
+        edit.limit_degree(made, 5)
     made = cloud(100)
     made.log_scales[:] = -5
     made.log_scales[0] = 4  # larger than the scene, and seen by nobody
@@ -676,9 +645,6 @@ def test_bad_input_is_named(run, tmp_path, capsys, monkeypatch):
             prune(run, keep, None, "cpu")
     monkeypatch.chdir(run)
     assert _new_folder(Path("."), None) == run.parent / f"{run.name}-pruned"
-
-
-def test_a_pruned_run_cannot_be_continued(run, tmp_path, capsys):
     prune(run, 1.0, tmp_path / "small", "cpu")
     scene = json.loads((run / "config.json").read_text())["scene"]["path"]
     assert main(["fit", scene, "--out", str(tmp_path / "small"), "--resume", *FLAGS]) == 2
@@ -766,7 +732,7 @@ def test_cameras_turn_with_their_gaussians(tmp_path):
         convert(tmp_path / "cameras.json", tmp_path / "c.txt")
 
 
-def test_cameras_of_colmap(tmp_path):
+def test_cameras_of_colmap_and_files_that_hold_none(tmp_path):
     scenes.write_colmap(tmp_path)
     with pytest.raises(UsageError, match="exists already"):
         write_cameras(tmp_path / "sparse", make_cameras())
@@ -777,24 +743,16 @@ def test_cameras_of_colmap(tmp_path):
     assert "photo" not in (tmp_path / "transforms.json").read_text()
     for below in ("sparse", "sparse/0"):
         assert list(read_cameras(tmp_path / below)[0]) == list(found)
-
-
-ROW = '"position": [0, 0, %s], "width": 9, "height": 9, "fx": 9, "fy": 9}]'
-
-
-@pytest.mark.parametrize(
-    "text,match",
-    [
+    row = '"position": [0, 0, %s], "width": 9, "height": 9, "fx": 9, "fy": 9}]'
+    for text, match in (
         ("[]", "holds no camera"), ("{}", "no list 'frames'"), ("[" * 10000, "cannot be read as JSON"),
-        ('[{"rotation": [[1,0,0],[0,1,0],[0,0,1]], ' + ROW % "1e999", "camera 0"),
-        ('[{"rotation": [[2,0,0],[0,1,0],[0,0,1]], ' + ROW % "0", "camera 0"),
+        ('[{"rotation": [[1,0,0],[0,1,0],[0,0,1]], ' + row % "1e999", "camera 0"),
+        ('[{"rotation": [[2,0,0],[0,1,0],[0,0,1]], ' + row % "0", "camera 0"),
         ('{"frames": [{"transform_matrix": [[1]], "w": 9, "h": 9, "fl_x": 9}]}', "frame 0"),
-    ],
-)  # fmt: skip
-def test_files_that_hold_no_cameras(text, match, tmp_path):
-    (tmp_path / "cameras.json").write_text(text)
-    with pytest.raises(DataError, match=match):
-        read_cameras(tmp_path / "cameras.json")
+    ):  # fmt: skip
+        (tmp_path / "cameras.json").write_text(text)
+        with pytest.raises(DataError, match=match):
+            read_cameras(tmp_path / "cameras.json")
 
 
 def test_commands_count_what_a_file_loses(tmp_path, capsys):
@@ -808,26 +766,7 @@ def test_commands_count_what_a_file_loses(tmp_path, capsys):
     assert len(content_of_file(path).model.gaussians()) == 49 and "1 of 50 Gaussians left out" in capsys.readouterr().out
 
 
-def test_a_file_renders_antialiased(tmp_path):
-    made = cloud(50)
-    made.log_scales.sub_(2)  # below a pixel
-    write_gaussians(tmp_path / "a.ply", made, units="file")
-    write_cameras(tmp_path / "cameras.json", make_cameras())
-    model, _ = open_file(tmp_path / "a.ply", tmp_path / "cameras.json", "exact", "cpu", antialiased=True)
-    camera = torch_camera(next(iter(model.cameras().values())))
-    image, plain = (rasterize(model.gaussians(), camera, options).rgb for options in (model.options(), RasterizeOptions()))
-    assert torch.equal(image, rasterize(model.gaussians(), camera, RasterizeOptions(antialiased=True)).rgb)
-    assert float(image.sum()) < 0.7 * float(plain.sum())
-    file = f"render {tmp_path}/a.ply --cameras {tmp_path}/cameras.json --path views --device cpu".split()
-    frames = []
-    for flags in (["--antialiased"], []):
-        assert main([*file, "--out", str(tmp_path / f"out{len(flags)}"), *flags]) == 0
-        frames.append(sorted((tmp_path / f"out{len(flags)}").glob("*.png"))[0].read_bytes())
-    assert frames[0] != frames[1]
-    assert main(["render", str(tmp_path), "--antialiased"]) == UsageError.exit_code
-
-
-def test_render_of_a_file(tmp_path):
+def test_render_of_a_file_plain_and_antialiased(tmp_path):
     write_gaussians(tmp_path / "a.spz", cloud(50), units="file")
     write_cameras(tmp_path / "cameras.json", make_cameras())
     out, settings = tmp_path / "out", FilmSettings()
@@ -846,3 +785,19 @@ def test_render_of_a_file(tmp_path):
     with pytest.raises(UsageError, match="unknown rule 'other'"):
         render(tmp_path / "a.spz", "views", out, settings, "cpu", file_of=(tmp_path / "cameras.json", "other"))
     assert json.loads((tmp_path / "cameras.json").read_text())[0]["img_name"] == "0000"
+    made = cloud(50)
+    made.log_scales.sub_(2)  # below a pixel
+    write_gaussians(tmp_path / "a.ply", made, units="file")
+    write_cameras(tmp_path / "cameras.json", make_cameras())
+    model, _ = open_file(tmp_path / "a.ply", tmp_path / "cameras.json", "exact", "cpu", antialiased=True)
+    camera = torch_camera(next(iter(model.cameras().values())))
+    image, plain = (rasterize(model.gaussians(), camera, options).rgb for options in (model.options(), RasterizeOptions()))
+    assert torch.equal(image, rasterize(model.gaussians(), camera, RasterizeOptions(antialiased=True)).rgb)
+    assert float(image.sum()) < 0.7 * float(plain.sum())
+    file = f"render {tmp_path}/a.ply --cameras {tmp_path}/cameras.json --path views --device cpu".split()
+    frames = []
+    for flags in (["--antialiased"], []):
+        assert main([*file, "--out", str(tmp_path / f"out{len(flags)}"), *flags]) == 0
+        frames.append(sorted((tmp_path / f"out{len(flags)}").glob("*.png"))[0].read_bytes())
+    assert frames[0] != frames[1]
+    assert main(["render", str(tmp_path), "--antialiased"]) == UsageError.exit_code

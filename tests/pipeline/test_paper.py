@@ -53,7 +53,7 @@ def grid(height: int = 40, width: int = 50) -> tuple[torch.Tensor, torch.Tensor]
     return x, y
 
 
-def test_blur_keeps_constants_and_sums():
+def test_blurred_and_normalized_scores():
     """A constant stays, an impulse becomes the Gaussian itself."""
     assert torch.allclose(blur(torch.full((9, 8), 0.3)), torch.tensor(0.3))
     impulse = torch.zeros(21, 21)
@@ -61,10 +61,7 @@ def test_blur_keeps_constants_and_sums():
     x, y = grid(21, 21)
     expected = torch.exp(-0.5 * ((x - 10) ** 2 + (y - 10) ** 2))
     assert torch.allclose(blur(impulse), expected / expected[7:14, 7:14].sum(), atol=1e-4)
-
-
-def test_normalized_is_robust_and_scale_free():
-    """One wild pixel changes nothing; a factor and an offset change nothing; a constant has score 0."""
+    # one wild pixel, a factor and an offset change nothing; a constant has score 0
     score = torch.rand(50, 60, generator=torch.Generator().manual_seed(0))
     spoiled = score.clone()
     spoiled[0, 0] = 1e6
@@ -93,7 +90,7 @@ def test_geometry_score_finds_the_step_and_the_curved_patch(monkeypatch):
     assert found[2.0] > found[0.0] + 0.1
 
 
-def test_semantic_score_is_the_papers_product():
+def test_scores_weights_and_gate_are_those_of_the_paper():
     """F_seg (omega_boundary + omega_foreground), up to the scale of the view."""
     generator = torch.Generator().manual_seed(1)
     confidence, boundary, foreground = torch.rand(3, 30, 40, generator=generator)
@@ -101,19 +98,13 @@ def test_semantic_score_is_the_papers_product():
     score = semantic_score(confidence, boundary, foreground)
     inner = (score > 0) & (score < 1)
     assert np.corrcoef(score[inner], product[inner])[0, 1] > 0.999999
-
-
-def test_render_score_is_the_length_of_the_colour_difference():
-    """Largest where the pictures differ most, by the norm over channels."""
+    # by the norm over channels
     image, rendered = torch.zeros(30, 30, 3), torch.zeros(30, 30, 3)
     rendered[4:14, 4:14] = torch.tensor([0.3, 0.0, 0.4])  # length 0.5
     rendered[18:28, 18:28, 0] = 0.45
     score = render_score(rendered, image)
     assert score[9, 9] == 1 and abs(float(score[23, 23]) - 0.9) < 5e-3 and score[0, 29] == 0
-
-
-def test_weights_renormalise_and_importance_is_the_weighted_sum():
-    """The rows of the ablation table; without any score every pixel counts the same."""
+    # the rows of the ablation table; without any score every pixel counts the same
     for switches, expected in (
         ((True, True, True), (0.4, 0.2, 0.4)), ((False, True, True), (0, 1 / 3, 2 / 3)), ((True, False, True), (0.5, 0, 0.5)),
         ((True, True, False), (2 / 3, 1 / 3, 0)), ((False, False, False), (0, 0, 0)),
@@ -122,10 +113,7 @@ def test_weights_renormalise_and_importance_is_the_weighted_sum():
     values = tuple(torch.full((2, 3), v) for v in (0.5, 0.25, 1.0))
     assert torch.allclose(importance(values, (0.4, 0.2, 0.4)), torch.tensor(0.65))
     assert torch.equal(importance(values, (0, 0, 0)), torch.ones(2, 3))
-
-
-def test_gate_keeps_the_quantile_and_never_starves():
-    """40 % pass at quantile 0.6; where too few would, the quantile falls; a constant score lets all valid pixels pass."""
+    # where too few would pass, the quantile falls; a constant score lets all valid pixels pass
     score = torch.rand(50, 40, generator=torch.Generator().manual_seed(0))
     valid = torch.ones(50, 40, dtype=torch.bool)
     gate, used = geometry_gate(score, valid, 0.6, 10)
@@ -210,7 +198,7 @@ def test_gain_is_the_fall_of_the_error_of_all_views(monkeypatch):
     np.testing.assert_allclose(expected.numpy() / scale, np.array(measured) / scale, atol=GAIN)
 
 
-def test_gain_counts_where_a_point_is_seen_and_pixels_count():
+def test_gain_counts_where_points_are_seen_and_views_agree():
     """None behind the wall, outside of the image, or where masks leave out every pixel."""
     shown = views(blob)
     center = shown[0].camera.viewmat[:3, :3].T @ -shown[0].camera.viewmat[:3, 3]
@@ -221,10 +209,7 @@ def test_gain_counts_where_a_point_is_seen_and_pixels_count():
     masked = [dataclasses.replace(v, mask=torch.zeros_like(v.image[..., 0])) for v in shown]
     assert gains(torch.zeros(1, 3), white, residuals(masked)).item() == 0
 
-
-def test_a_residual_that_other_views_contradict_has_no_gain():
-    """A bright patch in one view: a gain alone, none beside a view in which the same wall is darker than its render."""
-
+    # a bright patch has none beside a view in which the wall is darker than its render
     def patch(image, number):
         changed = image.copy()
         rows, columns = (slice(18, 30), slice(26, 38)) if number == 0 else (slice(0, 48), slice(0, 64))
@@ -301,10 +286,6 @@ def test_without_its_parts_it_is_the_strategy_sampling(tiny):
     configs = dataclasses.replace(CONFIG, strategy="sampling"), with_own(**dataclasses.asdict(UNIFORM)), CONFIG
     plain, uniform, full = (advanced(trainer(c)).gaussians.means for c in configs)
     assert torch.equal(plain, uniform) and not (plain.shape == full.shape and torch.equal(plain, full))
-
-
-def test_unknown_semantics_leave_the_weights_to_the_others(tiny):
-    """A view of which semantics say nothing is scored by the other two, whose weights sum to 1."""
     blank = [dataclasses.replace(p, boundary=p.boundary * 0, foreground=p.foreground * 0) for p in priors(photos(3, 32, 32))]
     fit = trainer(given=blank)
     render, semantic, geometry, total = fit.strategy.sample(1, {0: fit.views[0]}, 0.01, 0.5)[2][0].scores.values()

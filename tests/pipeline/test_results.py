@@ -157,18 +157,15 @@ def test_error_is_the_difference_of_the_pictures(device):
         FitConfig(rule="quick")
 
 
-def test_nothing_traded_is_said_and_is_as_small_as_float32(device):
-    """Rule exact: the arithmetic alone, and no second time; kernels and truth leave out a Gaussian that is no number."""
+def test_exact_trades_nothing_and_the_seed_draws_views_and_parts(device):
+    """The arithmetic alone, and no second time; kernels and truth leave out a Gaussian that is no number."""
     found = rule_report_of(crowd(device), photos(5, 150, 100), EXACT, seed=3)
     assert 0 < found["mean"] < 2e-6 and "exact_ms" not in found and found["psnr"] > 90
     assert "has the cut-offs of 3DGS" in found["summary"] and "random training views" in found["summary"]
     g = crowd(CPU)
     g.means[5] = float("nan")
     assert rule_report_of(g, photos(1, 150, 100), EXACT, seed=0)["mean"] < 2e-6
-
-
-def test_the_seed_draws_views_and_parts():
-    """Three views, parts of 64 px on tile edges or the picture's, others for another seed."""
+    # three views, parts of 64 px on tile edges or the picture's, others for another seed
     g, seen = crowd(CPU), photos(6, 150, 100)
     first, again, other = (rule_report_of(g, seen, EXACT, seed=s) for s in (0, 0, 1))
     assert first["views"] == again["views"] and first["mean"] == again["mean"] and first["views"] != other["views"]
@@ -262,7 +259,23 @@ def tile(sheet: np.ndarray, index: int, view, text: float = 1.25, width: int = 3
 
 
 @pytest.mark.usefixtures("tiny")
-def test_two_events_are_shown_steps(run):
+def test_uniform_events_show_no_scores(tmp_path):
+    """Nor a disparity, as no prior was made; the words say that nothing was scored."""
+    fit, seen = Trainer(photos(3), seeds(), dataclasses.replace(CONFIG, strategy="sampling"), CPU), []
+    fit.strategy.on_event = lambda step, views: seen.append(views)
+    while not seen:
+        fit.advance()
+    drawn, view = seen[0][1], fit.views[1]
+    assert fit.disparities == [] and not drawn.scores
+    sheet = view_sheet("01.png", 8, view, None, drawn, fit.strategy)
+    one_row = tile(np.zeros((10**4, 10**4)), 0, view).shape[0] + round(1.25 * CONTACT_HEAD) + round(1.25 * TITLE_SIZE)
+    assert sheet.shape[0] == one_row + 2 * CONTACT_MARGIN + 18  # render, image, gate, pixels, words
+    words = sampling_report_of(fit, tmp_path)[0]
+    assert "uniformly at random" in words and "All scores have weight 0, so no score is shown." in words
+
+
+@pytest.mark.usefixtures("tiny")
+def test_events_are_shown_as_they_were_and_figures_add_up(run):
     """The first, and the first of the second half of phase 2; each has a file with a sheet for each of the three views."""
     phases = plan_phases(PhaseConfig(2000, 3000), 10_000)
     first, middle = sorted(shown_steps(phases))
@@ -274,11 +287,7 @@ def test_two_events_are_shown_steps(run):
     assert [int(f.stem) for f in files] == sorted(shown_steps(fit.phases)) and len(files) == 2
     image = cv2.imread(str(files[0]))
     assert image.shape[0] % 3 == 0 and image.shape[1] == 2 * CONTACT_MARGIN + 5 * 320 + 4 * CONTACT_GAP
-
-
-@pytest.mark.usefixtures("tiny")
-def test_tiles_show_what_the_event_saw(run):
-    """Each map in its place, values as colours; dots at the drawn pixels and nowhere else; the gate in two colours."""
+    # each map in its place; dots at the drawn pixels and nowhere else; the gate in two colours
     fit, _, seen = run
     step, event = seen[0]
     drawn, view = event[1], fit.views[1]
@@ -298,27 +307,7 @@ def test_tiles_show_what_the_event_saw(run):
     wanted = np.zeros((H, W), bool)
     wanted[tuple(drawn.at.T.numpy())] = True
     assert wanted.sum() == len(drawn.at) > 5 and np.array_equal(marked, wanted)
-
-
-@pytest.mark.usefixtures("tiny")
-def test_uniform_events_show_no_scores(tmp_path):
-    """Nor a disparity, as no prior was made; the words say that nothing was scored."""
-    fit, seen = Trainer(photos(3), seeds(), dataclasses.replace(CONFIG, strategy="sampling"), CPU), []
-    fit.strategy.on_event = lambda step, views: seen.append(views)
-    while not seen:
-        fit.advance()
-    drawn, view = seen[0][1], fit.views[1]
-    assert fit.disparities == [] and not drawn.scores
-    sheet = view_sheet("01.png", 8, view, None, drawn, fit.strategy)
-    one_row = tile(np.zeros((10**4, 10**4)), 0, view).shape[0] + round(1.25 * CONTACT_HEAD) + round(1.25 * TITLE_SIZE)
-    assert sheet.shape[0] == one_row + 2 * CONTACT_MARGIN + 18  # render, image, gate, pixels, words
-    words = sampling_report_of(fit, tmp_path)[0]
-    assert "uniformly at random" in words and "All scores have weight 0, so no score is shown." in words
-
-
-@pytest.mark.usefixtures("tiny")
-def test_figures_add_up(run):
-    """Counts are those of the fit's own list; layers make up the set."""
+    # counts are those of the fit's own list; layers make up the set
     fit, _, seen = run
     figures = event_figures(fit)
     assert figures["events"] == {

@@ -76,7 +76,7 @@ def drawn_counts(score: torch.Tensor, gate: torch.Tensor, count: int, repeats: i
     return counts
 
 
-def test_frequencies_are_proportional_to_the_score():
+def test_pixels_are_drawn_by_their_score_without_replacement():
     """One pixel a draw: chi-square against S / sum S within the gate, never outside it."""
     score = torch.arange(1.0, 25).reshape(4, 6)
     gate = torch.ones(4, 6, dtype=torch.bool)
@@ -85,18 +85,12 @@ def test_frequencies_are_proportional_to_the_score():
     expected = (score * gate).numpy() / float((score * gate).sum())
     assert not counts[2].any()
     assert chisquare(counts[gate], 4000 * expected[gate]).pvalue > 1e-4
-
-
-def test_several_pixels_are_drawn_without_replacement():
-    """Of two pixels out of three with weights 1, 1, 2, the heavy one is missing in one draw of six (successive sampling)."""
+    # of two of three with weights 1, 1, 2, the heavy one is missing in one draw of six
     score = torch.tensor([[1.0, 1.0, 2.0]])
     counts = drawn_counts(score, torch.ones(1, 3, dtype=torch.bool), 2, 3000)[0]
     # P(missing heavy) = 2 * (1/4) (1/3) = 1/6
     assert chisquare([counts[2], 3000 - counts[2]], [2500, 500]).pvalue > 1e-4
-
-
-def test_pixels_without_score_are_never_drawn_and_fewer_come_back():
-    """Asked for five, two have a score: two come back."""
+    # asked for five, two have a score: two come back
     score = torch.zeros(3, 4)
     score[1, 2], score[0, 3] = 0.5, 1e-6
     at = sample_pixels(score, torch.ones(3, 4, dtype=torch.bool), 5, drawn_numbers(score, torch.Generator()))
@@ -158,17 +152,13 @@ def test_without_adaptive_placement_the_highest_are_taken():
     assert int((score[gate] >= lowest).sum()) == 5
 
 
-def test_valid_pixels_have_depth_and_lie_inside(monkeypatch):
-    """Thin, infinite, masked and border pixels are out."""
+def test_fine_gaussians_stand_behind_valid_pixels(monkeypatch):
+    """Thin, infinite, masked and border pixels are out; centre, colour, opacity, and a width of one pixel at their depth."""
     monkeypatch.undo()
     alpha, depth, mask = torch.ones(10, 12), torch.ones(10, 12), torch.ones(10, 12)
     alpha[4, 4], depth[4, 5], depth[4, 6], mask[4, 7] = 0.4, torch.inf, 0, 0
     valid = valid_pixels(alpha, depth, mask)
     assert valid.sum() == 6 * 8 - 4 and not bool(valid[4, 4:8].any()) and not bool(valid[:2].any())
-
-
-def test_fine_gaussians_stand_behind_their_pixels():
-    """Centre, colour, opacity, and a width of one pixel at their depth."""
     camera = ring(5)[3]
     tensors = Camera(
         *(torch.as_tensor(t, dtype=torch.float32) for t in (camera.viewmat, camera.K)), camera.width, camera.height
@@ -205,10 +195,7 @@ def test_short_fit_has_all_phases():
 
 
 def test_protected_gaussian_survives_its_protection_and_no_step_longer(monkeypatch):
-    """An opacity pushed down every step stays at the least for T_protect steps after the event, then falls.
-
-    In a step that is not taken nothing changes.
-    """
+    """An opacity pushed down every step stays at the least for T_protect steps after the event; not in a step not taken."""
     monkeypatch.setattr(sampling, "PROTECTED_STEPS", 5)
     fit = fitted(steps=0)
     fit.table.apply(grown(fit, 2, [-1], columns={"level": FINE, "created_step": 7}))
@@ -224,21 +211,8 @@ def test_protected_gaussian_survives_its_protection_and_no_step_longer(monkeypat
         assert logits[:2].tolist() == [-10.0, -10.0]
 
 
-def test_children_are_as_old_as_their_parent():
-    """Rows that grew from another take its layer and age; sampled rows have their own; of gradients nothing is known."""
-    fit = fitted(steps=0)
-    for name in ("grad_sum", "seen_count"):
-        fit.table.columns[name] += 1
-    fit.table.apply(grown(fit, 2, [-1, -1], columns={"level": FINE, "created_step": 3}))
-    fit.table.apply(grown(fit, [1, 2], [3, 0]))
-    columns = fit.table.columns
-    assert columns["level"].tolist() == [COARSE, FINE, FINE, COARSE]
-    assert columns["created_step"].tolist() == [NOT_SAMPLED, 3, 3, NOT_SAMPLED] and NOT_SAMPLED < -(10**8)
-    assert columns["grad_sum"].tolist() == columns["seen_count"].tolist() == [1, 0, 0, 0]
-
-
-def test_coarse_layer_is_stable_and_fine_layer_grows():
-    """From phase 2 on coarse Gaussians are not added to; each step moves them a tenth as far; fine ones come and multiply."""
+def test_coarse_layer_is_stable_and_fine_layer_grows_until_phase_three(monkeypatch):
+    """Coarse Gaussians are not added to; each step moves them a tenth as far; fine ones come and multiply."""
     fit = fitted(steps=8)
     before = fit.gaussians.means.clone()
     coarse = int((~fit.strategy.fine).sum())
@@ -251,10 +225,6 @@ def test_coarse_layer_is_stable_and_fine_layer_grows():
     advanced(fit)
     assert int((~fit.strategy.fine).sum()) <= coarse and int(fit.strategy.fine.sum()) > event["added"]
     assert [e["step"] for e in fit.strategy.events] == list(fit.phases.events)
-
-
-def test_nothing_is_added_in_phase_three(monkeypatch):
-    """From the end of phase 2 on no rows come, and without a removal none goes."""
     fit = fitted(steps=29)
     before = fit.table.columns["created_step"].clone()
     monkeypatch.setattr(fit.strategy, "prunes_unseen", False)
@@ -290,8 +260,18 @@ def test_gaussians_that_no_view_shows_are_removed(monkeypatch):
     assert not any(fit.strategy.prunes(s) for s in range(41))
 
 
-def test_full_fine_layer_frees_its_least_contributors():
-    """At the cap an event removes as many unprotected fine Gaussians as it adds; without unprotected ones it adds fewer."""
+def test_children_are_as_old_as_their_parent_and_a_full_layer_frees_its_least():
+    """Rows that grew from another take its layer and age; sampled rows have their own; of gradients nothing is known."""
+    fit = fitted(steps=0)
+    for name in ("grad_sum", "seen_count"):
+        fit.table.columns[name] += 1
+    fit.table.apply(grown(fit, 2, [-1, -1], columns={"level": FINE, "created_step": 3}))
+    fit.table.apply(grown(fit, [1, 2], [3, 0]))
+    columns = fit.table.columns
+    assert columns["level"].tolist() == [COARSE, FINE, FINE, COARSE]
+    assert columns["created_step"].tolist() == [NOT_SAMPLED, 3, 3, NOT_SAMPLED] and NOT_SAMPLED < -(10**8)
+    assert columns["grad_sum"].tolist() == columns["seen_count"].tolist() == [1, 0, 0, 0]
+    # without unprotected ones an event adds fewer
     fit = fitted(steps=8)
     cap = len(fit.strategy.events) and int(fit.strategy.fine.sum())
     most = cap / int((~fit.strategy.fine).sum())
@@ -318,16 +298,13 @@ def test_fine_gaussians_stand_at_confirmed_depths(gated):
     assert bool((columns >= 20).any()) != gated and not torch.allclose(z[columns >= 20].mean(), torch.tensor(1.25), atol=0.05)
 
 
-def test_dropout_falls_with_the_number_of_views():
-    """Full up to three training views, then in proportion; it grows over the fit from 0."""
+def test_few_views_have_dropout_and_a_sweep():
+    """Full dropout up to three training views, then in proportion; it grows over the fit from 0."""
     plain = dataclasses.replace(CONFIG, strategy="clone_split", method=MethodConfig())
     few, many = (Trainer(photos(n), seeds(), plain, CPU) for n in (3, 6))
     assert few.dropout == pytest.approx(0.2) and many.dropout == pytest.approx(0.1)
     assert few.settings(1)[Setting.DROPOUT] == 0 and few.settings(40)[Setting.DROPOUT] == pytest.approx(0.2)
-
-
-def test_auto_start_sweeps_few_views():
-    """Up to `sweep_up_to` views the start comes from confirmed depths; beyond it from points or at random."""
+    # beyond `sweep_up_to` views the start comes from points or at random
     views = photos(3, 64, 48)
     for most, word in ((3, "sweep"), (2, "random")):
         start = initial_points(views, None, InitConfig(sweep_up_to=most, random_count=200), np.random.default_rng(0))

@@ -99,6 +99,7 @@ def test_points_of_the_reconstruction_fill_what_no_depth_confirms():
 
 
 def test_merging_takes_the_mean_of_a_cell():
+    """Points of a cell are added up in their order, whatever the parts and chunks; cells come in the order of their place."""
     points = np.array([[0.1, 0.1, 0.1], [0.3, 0.3, 0.3], [1.2, 0.1, 0.1], [0.2, 0.2, 0.2]])
     (cells,) = merge_cells([points], [np.array([1.0, 1.1, 0.9, 4.0])])
     assert cells[0] == cells[1] and len(set(cells.tolist())) == 3
@@ -110,10 +111,6 @@ def test_merging_takes_the_mean_of_a_cell():
     (near,) = merge_cells([points], [np.full(200, 0.25)])
     far = np.concatenate(merge_cells([points, np.array([[1e14, -1e14, 1e14]])], [np.full(200, 0.25), np.full(1, 0.25)]))
     assert np.array_equal(far[:200][:, None] == far[:200], near[:, None] == near) and (far[200] != far[:200]).all()
-
-
-def test_merging_in_parts_gives_the_bits_of_one_sum():
-    """Points of a cell are added up in their order, whatever the parts and chunks; cells come in the order of their place."""
     generator = np.random.default_rng(0)
     points, colors = generator.uniform(-2, 2, (CHUNK + 500, 3)), generator.uniform(size=(CHUNK + 500, 3)).astype(np.float32)
     widths = generator.uniform(0.2, 0.5, len(points))
@@ -146,7 +143,7 @@ def test_filled_points_come_last_and_hide_nothing():
     assert np.array_equal(few.points, more.points) and "filled" not in notes[2] and "filled" in notes[1]
 
 
-def test_free_space_and_bounds():
+def test_free_space_bounds_and_objects_on_black():
     """Nearer than the surface: hides it. On it, behind it, in the view itself, or where nothing was found: does not."""
     camera = Camera(np.eye(4), np.array([[10.0, 0, 5], [0, 10, 5], [0, 0, 1]]), 10, 10)
     views = [View("a", camera, np.zeros((10, 10, 3), np.float32))] * 2
@@ -159,9 +156,6 @@ def test_free_space_and_bounds():
     near, far = depth_bounds(views[0], points, (1, 2))
     assert near == pytest.approx(2.04 / 1.3) and far == pytest.approx(3.96 * 3)
     assert depth_bounds(views[0], points[:5], (1, 2)) == depth_bounds(views[0], -points, (1, 2)) == (1, 2)
-
-
-def test_objects_on_black_get_points_on_the_object_only():
     camera = ring(1)[0]
     y, x = np.mgrid[:32, :40] + 0.5
     ball = (x - 20) ** 2 + (y - 16) ** 2 < 64
@@ -262,7 +256,7 @@ def test_nothing_is_extrapolated_of_parts_of_images():
     assert len(bent) > 20 and in_image(view.camera, bent.points).all()
 
 
-def test_extrapolated_points_come_last():
+def test_extrapolated_points_come_last_or_a_start_says_why_there_are_none():
     views, _ = known()
     config = InitConfig(source="sweep", merge_px=4, fill_px=8)
     plain, more = (
@@ -280,10 +274,6 @@ def test_extrapolated_points_come_last():
     extrapolated = {tuple(p) for p in more.cloud.points[count:]}
     are = [tuple(p) in extrapolated for p in fewer.cloud.points]
     assert sum(are) == fewer.extrapolated > 0 and all(are[-fewer.extrapolated :])
-
-
-def test_a_start_without_extrapolated_points_says_why():
-    views, _ = known()
     corner = np.ones(views[0].image.shape[:2], bool)
     corner[:4, :4] = False
     masked = [dataclasses.replace(v, mask=corner) for v in views]

@@ -87,7 +87,7 @@ def cells(text: str) -> list[list[list[str]]]:
     return found
 
 
-def test_markdown_holds_means_deviations_and_differences():
+def test_markdown_holds_means_deviations_differences_and_check_marks():
     """The best of a column is bold; an interval without 0 is marked; a figure without a spread stands alone."""
     text = markdown(table_of())
     assert text.startswith("Scores of held-out views: mean ± standard deviation over seeds, the best mean in bold:")
@@ -425,7 +425,7 @@ def test_command_compares_presets(scene, tmp_path, capsys, monkeypatch):
 FULL = dataclasses.replace(A, preset="whole", strategy="paper", method=MethodConfig(hier=True))
 
 
-def test_ablation_rows_switch_off_one_part_each():
+def test_ablation_rows_switch_one_part_each():
     """Full, uniform sampling, one score more at a time, each other part off, no sampling, and the paper's settings; marks."""
     variants, marks = ablation_variants(FULL)
     scores = ["uniform", "residual only", "residual + semantics"]  # which is full without geometry

@@ -296,16 +296,13 @@ def test_a_run_of_photographs_has_their_name_and_ends_with_what_to_do(tmp_path, 
     assert title_of(scene, tmp_path) == tmp_path.name
 
 
-def test_other_requests_stay_as_they_are(tmp_path, photographs, found):
+def test_other_requests_stay_as_they_are_and_splits_are_checked_first(tmp_path, photographs, found, monkeypatch):
     for request in (SceneRequest(str(found[0])), SceneRequest(str(photographs), reader="llff"), SceneRequest("")):
         assert with_poses(request, tmp_path, print) == (request, [])
     with pytest.raises(UsageError, match=r"--matcher requires a folder of photographs without cameras; leave it out for"):
         with_poses(SceneRequest(str(found[0]), matcher="x.onnx"), tmp_path, print)
     with pytest.raises(UsageError, match="needs a run folder; give out="):
         with_poses(SceneRequest(str(photographs)), None, print)
-
-
-def test_a_split_that_is_not_understood_is_refused_before_poses_are_found(tmp_path, photographs, monkeypatch):
     monkeypatch.setattr(module, "find_poses", lambda *_, **__: pytest.fail("poses are found"))
     for spec in ("every8", "every:1", "tset=0.png", "llff:9", "dtu:3"):
         with pytest.raises((UsageError, DataError), match="split"):
@@ -353,15 +350,6 @@ def test_files_without_their_metadata_have_the_same_pixels(progressive):
     assert without_png_metadata(coded[:33] + text + coded[33:] + b"more") == coded
 
 
-def test_what_exif_says_of_the_lens(tmp_path):
-    """The equivalent focal length is by the diagonal: 34 mm of 43.3 on 4:3 is 0.98 longer sides; the size is that upright."""
-    (tmp_path / "a.jpg").write_bytes(with_exif(np.zeros((80, 60, 3), np.uint8), 8))
-    p = prepare(tmp_path / "a.jpg", tmp_path, tmp_path / "small.png")
-    assert (p.width, p.height, p.orientation, p.device) == (80, 60, 8, "ACME Phone 7 34 mm")
-    assert p.focal == pytest.approx(34 / np.hypot(36, 24) * 100 / 80)
-    assert cv2.imread(str(tmp_path / "small.png")).shape == (60, 80, 3)
-
-
 @pytest.mark.parametrize(
     ("files", "photographs", "notes"),
     [
@@ -383,7 +371,13 @@ def test_masks_and_images_of_earlier_runs_are_no_photographs(tmp_path, files, ph
     assert [p.relative_to(tmp_path).as_posix() for p in found] == photographs.split() and said == notes
 
 
-def test_frames_of_a_video_are_sharp_and_evenly_spaced(tmp_path):
+def test_exif_of_the_lens_and_frames_of_a_video(tmp_path):
+    """The equivalent focal length is by the diagonal: 34 mm of 43.3 on 4:3 is 0.98 longer sides; the size is that upright."""
+    (tmp_path / "a.jpg").write_bytes(with_exif(np.zeros((80, 60, 3), np.uint8), 8))
+    p = prepare(tmp_path / "a.jpg", tmp_path, tmp_path / "small.png")
+    assert (p.width, p.height, p.orientation, p.device) == (80, 60, 8, "ACME Phone 7 34 mm")
+    assert p.focal == pytest.approx(34 / np.hypot(36, 24) * 100 / 80)
+    assert cv2.imread(str(tmp_path / "small.png")).shape == (60, 80, 3)
     film(tmp_path / "a.avi", 12)
     (tmp_path / "frames").mkdir()
     assert write_frames(tmp_path / "a.avi", tmp_path / "frames", 4, lambda line: None) == 12
@@ -409,14 +403,6 @@ def unposed(names, focal=None) -> list[Photograph]:
     return [Photograph(f"{n}.png", Path(f"{n}.png"), 320, 240, 1, "", focal, "0") for n in names]
 
 
-def test_too_few_that_fit_together_are_told_with_their_links():
-    """The pairs that do match, once each, and who matches nobody."""
-    found = found_mapping(views={}, keypoints=(900,) * 5, matches={(0, 1): 525, (2, 3): 292})
-    words = r"e\.png matches no other; c\.png and d\.png share 292 matches; a\.png and b\.png share 525"
-    with pytest.raises(DataError, match=words):
-        _check_found(Path("in"), found, unposed("abcde"))
-
-
 @pytest.mark.parametrize(("focal", "count", "said"), [(None, 5, True), (None, 6, False), (0.8, 5, False)])
 def test_a_record_says_that_few_photographs_do_not_tell_the_focal_length(focal, count, said):
     """Where EXIF does not tell it, up to five of them."""
@@ -426,20 +412,7 @@ def test_a_record_says_that_few_photographs_do_not_tell_the_focal_length(focal, 
     assert any(f"An estimate from {count} photographs is often 5 % off" in n for n in notes) is said
 
 
-def test_a_record_says_what_does_not_repeat_and_who_has_no_pose():
-    """Its lines name the photographs without a pose, why, and what to do."""
-    photographs = unposed("abcde")
-    assert not any("run to run" in n for n in record_of(found_mapping(), photographs, "0", [])["notes"])
-    record = record_of(found_mapping(method="global"), photographs, "0", ["a note"])
-    assert record["notes"][0] == "a note" and record["notes"][-1].endswith("from run to run")
-    lines = report_lines(record)
-    assert "poses found for 3 of 5 photographs" in lines[1] and "What to photograph next:" in lines
-    assert lines[8].startswith("d.png  NO POSE: it has 600 keypoints and 9 matches with c.png")
-    nobody = {"notes": ["a note"], "photographs": [], "advice": []}  # records are files that anybody may have changed
-    assert report_lines(nobody)[0] == "a note"
-
-
-def test_reasons_and_advice():
+def test_records_reasons_and_advice():
     """Lost and blank photographs first, then wide gaps, then weak links; nothing where all is well."""
     names, found = ["a", "b", "c", "d", "e"], found_mapping()
     assert reason(found, 3, names) == "has 600 keypoints and 9 matches with c, too few of them at places of known depth"
@@ -465,3 +438,18 @@ def test_reasons_and_advice():
     )
     well = found_mapping(keypoints=(900, 800), matches={(0, 1): 200}, views=dict(list(found.views.items())[:2]))
     assert advice(well, ["a", "b"]) == []
+    # its lines name the photographs without a pose, why, and what to do
+    photographs = unposed("abcde")
+    assert not any("run to run" in n for n in record_of(found_mapping(), photographs, "0", [])["notes"])
+    record = record_of(found_mapping(method="global"), photographs, "0", ["a note"])
+    assert record["notes"][0] == "a note" and record["notes"][-1].endswith("from run to run")
+    lines = report_lines(record)
+    assert "poses found for 3 of 5 photographs" in lines[1] and "What to photograph next:" in lines
+    assert lines[8].startswith("d.png  NO POSE: it has 600 keypoints and 9 matches with c.png")
+    nobody = {"notes": ["a note"], "photographs": [], "advice": []}  # records are files that anybody may have changed
+    assert report_lines(nobody)[0] == "a note"
+    # the pairs that do match, once each, and who matches nobody
+    found = found_mapping(views={}, keypoints=(900,) * 5, matches={(0, 1): 525, (2, 3): 292})
+    words = r"e\.png matches no other; c\.png and d\.png share 292 matches; a\.png and b\.png share 525"
+    with pytest.raises(DataError, match=words):
+        _check_found(Path("in"), found, unposed("abcde"))

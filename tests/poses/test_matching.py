@@ -75,12 +75,6 @@ def test_a_network_of_another_kind_is_refused_before_any_work(sfm, tmp_path, pho
     assert "none.onnx: the model cannot be read" in said and not (tmp_path / "out").exists()
 
 
-def test_matches_are_mutual_and_similar():
-    a, b = whole([[1, 0, 0], [0, 1, 0], [1, 0.1, 0], [0, 0, 1]]), whole([[0, 1, 0.1], [1, 0.01, 0], [0, -1, 0.5]])
-    assert mutual_matches(a, b).tolist() == [[0, 1], [1, 0]]
-    assert mutual_matches(a, np.zeros((0, 3), np.int16)).shape == (0, 2)
-
-
 class Sift:
     """A matcher whose keypoints are OpenCV's."""
 
@@ -134,8 +128,11 @@ class Upright:
         return np.zeros((len(rows), 2), np.float32), whole(rows)
 
 
-def test_turns_of_photographs_are_found():
+def test_matches_are_mutual_and_turns_are_found():
     """Two of four are turned, one of them matches the others by way of the other alone."""
+    a, b = whole([[1, 0, 0], [0, 1, 0], [1, 0.1, 0], [0, 0, 1]]), whole([[0, 1, 0.1], [1, 0.01, 0], [0, -1, 0.5]])
+    assert mutual_matches(a, b).tolist() == [[0, 1], [1, 0]]
+    assert mutual_matches(a, np.zeros((0, 3), np.int16)).shape == (0, 2)
     image = np.random.default_rng(1).integers(0, 255, (8, 8, 3))
     images = [image, np.rot90(image), image, np.rot90(image, 2)]
     assert quarter_turns(Upright(), images, [(0, 1), (0, 2), (1, 2), (1, 3)]) == [0, 3, 0, 2]

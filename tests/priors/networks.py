@@ -48,14 +48,8 @@ def whole_attribute(name: str, number: int) -> bytes:
 
 
 def graph(nodes: list[bytes], tensors: list[bytes], inputs: list[bytes], outputs: list[bytes]) -> bytes:
-    parts = (
-        [(1, n) for n in nodes]
-        + [(2, "g")]
-        + [(5, t) for t in tensors]
-        + [(11, v) for v in inputs]
-        + [(12, v) for v in outputs]
-    )
-    return b"".join(field(n, v) for n, v in parts)
+    parts = {1: nodes, 2: ["g"], 5: tensors, 11: inputs, 12: outputs}
+    return b"".join(field(number, value) for number, values in parts.items() for value in values)
 
 
 def model(body: bytes, more: bytes = b"") -> bytes:

@@ -77,10 +77,7 @@ def test_depth_is_exact_and_judged_by_the_foot_on_the_line():
         assert np.max(np.abs(depth / depths - 1)) < 1e-9 and np.allclose(residual, np.abs(push), atol=1e-9)
         inside = (matches >= 0).all(1) & (matches[:, 0] < 64) & (matches[:, 1] < 48)
         assert np.array_equal(valid, inside) and 100 < inside.sum() < len(inside)
-
-
-def test_rays_that_meet_nowhere_before_both_cameras_are_rejected():
-    """Beyond the vanishing point, without a baseline, at the epipole, and where a match is no number."""
+    # beyond the vanishing point, without a baseline, at the epipole, where a match is no number
     a, b, _ = rig()
     pixels = pixel_grid(a)
     depth, residual, _, valid = epipolar_depth(a, b, pixels, matches_of(a, b, -true_depths(len(pixels))))
@@ -91,9 +88,6 @@ def test_rays_that_meet_nowhere_before_both_cameras_are_rejected():
     unknown = np.array([[np.nan, 1], [1, np.inf], [-np.inf, 2], [np.nan, np.nan]])
     for other, at, matches in ((a, pixels, pixels), (ahead, epipole, epipole), (b, pixels[:4], unknown)):
         assert not epipolar_depth(a, other, at, matches)[3].any()
-
-
-def test_parallax_below_the_floor_is_rejected():
     a, b, _ = rig()
     pixels, floor = pixel_grid(a), 2.0
     depths = np.geomspace(3, 3000, len(pixels))
@@ -103,10 +97,7 @@ def test_parallax_below_the_floor_is_rejected():
     cosine = (rays[0] * rays[1]).sum(1) / np.linalg.norm(rays[0], axis=1) / np.linalg.norm(rays[1], axis=1)
     angle = np.degrees(np.arccos(cosine))
     assert not valid[angle < floor - 1e-3].any() and valid[angle > floor + 1e-3].any()
-
-
-def test_sensitivity_is_the_derivative_along_the_line():
-    """It equals the change of the depth with the match moved by 1e-4 px along the line."""
+    # the change of the depth with the match moved by 1e-4 px along the line
     a, b, _ = rig()
     pixels = pixel_grid(a)
     matches = matches_of(a, b, true_depths(len(pixels)))
@@ -117,36 +108,19 @@ def test_sensitivity_is_the_derivative_along_the_line():
     assert not np.allclose(sensitivity[good], sensitivity[good].mean(), rtol=0.1)
 
 
-def test_the_least_sensitive_candidate_is_taken():
-    """A pixel without one gets 0 and infinity."""
+def test_candidates_and_neighbours_are_chosen():
+    """A pixel without a candidate gets 0 and infinity; ties of views by order, without the view itself."""
     depths = np.array([[1.0, 2, 3, 4, 9], [5, 6, 7, 8, 9]])
     sensitivities = np.array([[0.2, 0.1, 0.3, np.inf, 0.1], [0.1, 0.3, 0.1, 0.5, 0.1]])
     valid = np.array([[True, True, True, True, False], [True, True, False, False, False]])
     depth, sensitivity = least_sensitive(depths, sensitivities, valid)
     assert depth.tolist() == [5, 2, 3, 4, 0] and sensitivity.tolist() == [0.1, 0.1, 0.3, np.inf, np.inf]
-
-
-def test_nearest_views_come_first():
-    """Ties by order, without the view itself."""
     views = []
     for x in (0.0, 3.0, 1.0, -1.0):
         viewmat = np.eye(4)
         viewmat[0, 3] = -x
         views.append(View(str(x), Camera(viewmat, np.eye(3), 4, 4), np.zeros((4, 4, 3), np.float32)))
     assert nearest_views(views, 0, 9) == [2, 3, 1] and nearest_views(views, 1, 2) == [2, 0]
-
-
-def test_round_trip_measures_the_way_back():
-    """A constant flow and its opposite return to the start; half a pixel off shows; a match outside never returns."""
-    pixels = np.array([[2.5, 3.5], [7.5, 3.5], [9.5, 3.5]])
-    back = np.full((8, 10, 2), [-2.0, 0.5], np.float32)
-    distance = round_trip(pixels + np.array([2, -0.5]), pixels, back)
-    assert np.allclose(distance[:2], 0, atol=1e-6) and distance[2] == np.inf
-    assert np.allclose(round_trip(pixels[:2] + np.array([2, 0]), pixels[:2], back), 0.5, atol=1e-6)
-    ramp = np.zeros((8, 10, 2), np.float32)
-    ramp[..., 0] = -0.25 * (np.arange(10) + 0.5)
-    assert np.allclose(round_trip(pixels[:2] / 0.75 * [1, 0.75], pixels[:2], ramp)[:1], 0, atol=0.01)
-    assert (round_trip(np.full((2, 2), np.nan), pixels[:2], back) == np.inf).all()
 
 
 def test_depth_of_a_view_from_flow():
@@ -170,16 +144,6 @@ def test_depth_of_a_view_from_flow():
 # Flow from files, from OpenCV and from a network.
 
 
-def test_flo_round_trip(tmp_path):
-    """Every bit comes back; what is not finite comes back as unknown."""
-    flow = np.random.default_rng(0).normal(0, 30, (5, 7, 2)).astype(np.float32)
-    flow[2, 3] = np.nan, 1
-    write_flo(tmp_path / "a.flo", flow)
-    again = read_flo(tmp_path / "a.flo")
-    unknown = np.isnan(again).all(2)
-    assert unknown.sum() == 1 and unknown[2, 3] and np.array_equal(again[~unknown], flow[~unknown])
-
-
 @pytest.mark.parametrize("raw, reason", [
     (None, "cannot be read"), (b"PIEH", "not a Middlebury"), (b"JUNK" + bytes(20), "not a Middlebury"),
     (b"PIEH" + struct.pack("<ii", -4, 3), "-4 x 3"), (b"PIEH" + struct.pack("<ii", 2**30, 2**30) + bytes(8), "sides must be"),
@@ -193,7 +157,7 @@ def test_malformed_flo_is_named(tmp_path, raw, reason):
         read_flo(tmp_path / "bad.flo")
 
 
-def test_resize_scales_the_steps():
+def test_flow_is_resized_and_measured_on_its_way_back():
     """An affine motion stays the same motion at every size, also where the second image has a size of its own."""
     x, y = np.meshgrid(np.arange(40) + 0.5, np.arange(30) + 0.5)
     flow = np.stack([2 + 0.1 * x, -1 + 0.05 * y], 2).astype(np.float32)
@@ -203,9 +167,19 @@ def test_resize_scales_the_steps():
     other = resize_flow(flow, 40, 30, (20, 15))
     assert np.allclose(np.stack([x, y], 2) + other, (np.stack([x, y], 2) + flow) / 2, atol=0.01)
     assert resize_flow(flow, 40, 30) is flow
+    # half a pixel off shows; a match outside never returns
+    pixels = np.array([[2.5, 3.5], [7.5, 3.5], [9.5, 3.5]])
+    back = np.full((8, 10, 2), [-2.0, 0.5], np.float32)
+    distance = round_trip(pixels + np.array([2, -0.5]), pixels, back)
+    assert np.allclose(distance[:2], 0, atol=1e-6) and distance[2] == np.inf
+    assert np.allclose(round_trip(pixels[:2] + np.array([2, 0]), pixels[:2], back), 0.5, atol=1e-6)
+    ramp = np.zeros((8, 10, 2), np.float32)
+    ramp[..., 0] = -0.25 * (np.arange(10) + 0.5)
+    assert np.allclose(round_trip(pixels[:2] / 0.75 * [1, 0.75], pixels[:2], ramp)[:1], 0, atol=0.01)
+    assert (round_trip(np.full((2, 2), np.nan), pixels[:2], back) == np.inf).all()
 
 
-def test_folder_of_flow(tmp_path):
+def test_folder_and_files_of_flow(tmp_path):
     """Both naming schemes are found and resized; a missing pair is None, a folder without flow an error."""
     views, depths = still_life()
     with pytest.raises(DataError, match=r"000-to-001\.flo"):
@@ -217,6 +191,13 @@ def test_folder_of_flow(tmp_path):
     assert np.array_equal(between(0, 1), flow(0, 1)) and between(0, 1) is between(0, 1) and between(2, 0) is None
     assert np.median(np.abs(between(1, 0) - flow(1, 0))) < 0.02
     assert flo_names(views, 0, 2) == ["000-to-002.flo", "000_0_2.flo", "000.png_0_2.flo"]
+    # every bit comes back; what is not finite comes back as unknown
+    flow = np.random.default_rng(0).normal(0, 30, (5, 7, 2)).astype(np.float32)
+    flow[2, 3] = np.nan, 1
+    write_flo(tmp_path / "a.flo", flow)
+    again = read_flo(tmp_path / "a.flo")
+    unknown = np.isnan(again).all(2)
+    assert unknown.sum() == 1 and unknown[2, 3] and np.array_equal(again[~unknown], flow[~unknown])
 
 
 @pytest.mark.parametrize("kind, limit", [("dis", 0.5), ("deepflow", 1.0), ("sparse", 2.0)])

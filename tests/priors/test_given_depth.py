@@ -38,17 +38,6 @@ def error(found: ViewDepth, true: np.ndarray) -> np.ndarray:
     return np.abs(found.depth / true - 1)[found.valid]
 
 
-def test_a_line_is_found_beside_outliers():
-    """Scale and shift to 0.1 % with noise of 1 % and a fifth of the values wrong; constant values have no scale."""
-    rng = np.random.default_rng(0)
-    x = rng.uniform(0, 1, 2000)
-    y = (3 * x + 0.7) * (1 + 0.01 * rng.standard_normal(2000))
-    y[:400] = rng.uniform(0.5, 4, 400)
-    scale, shift = fit_line(x, y)
-    assert scale == pytest.approx(3, rel=2e-3) and shift == pytest.approx(0.7, abs=2e-3)
-    assert fit_line(np.ones(60), y[:60])[0] == 0
-
-
 @pytest.mark.parametrize("kind", ["relative", "disparity"])
 def test_a_map_of_unknown_scale_and_shift_is_fitted(kind):
     """To searched depth, whose errors are larger than those of the fitted map; 0 stays no depth."""
@@ -63,7 +52,15 @@ def test_a_map_of_unknown_scale_and_shift_is_fitted(kind):
     assert np.median(np.abs(found / true - 1)[5:]) < 0.5 * np.median(error(swept()[1], true))
 
 
-def test_a_map_is_fitted_to_points_where_nothing_was_searched():
+def test_a_line_is_found_beside_outliers_and_points_fit_where_nothing_was_searched():
+    """Scale and shift to 0.1 % with noise of 1 % and a fifth of the values wrong; constant values have no scale."""
+    rng = np.random.default_rng(0)
+    x = rng.uniform(0, 1, 2000)
+    y = (3 * x + 0.7) * (1 + 0.01 * rng.standard_normal(2000))
+    y[:400] = rng.uniform(0.5, 4, 400)
+    scale, shift = fit_line(x, y)
+    assert scale == pytest.approx(3, rel=2e-3) and shift == pytest.approx(0.7, abs=2e-3)
+    assert fit_line(np.ones(60), y[:60])[0] == 0
     views, depths = still_life()
     at = np.random.default_rng(0).integers(0, (160, 120), (80, 2))
     points = back_project(views[0].camera, at + 0.5, depths[0][at[:, 1], at[:, 0]])
@@ -91,22 +88,6 @@ def test_maps_that_contradict_are_refused_with_figures():
     found, notes = combined([cases["its depths are 99"], given(views[1], depths[1]), views[2]])
     assert "used in 1 of 3 views" in notes[0] and f"1 maps are not used: {views[0].name}: its depths are 99" in notes[1]
     assert found[0] is swept()[0] and found[0].given is None and found[1].given is not None
-
-
-def test_metric_depth_comes_before_searched_depth_and_sparse_depth_joins_it():
-    views, depths = still_life()
-    rng = np.random.default_rng(0)
-    noisy = [d * (1 + 0.01 * rng.standard_normal(d.shape)) for d in depths]
-    found, notes = combined([given(v, d) for v, d in zip(views, noisy)])
-    for d, true, before in zip(found, depths, swept()):
-        assert d.coverage > 0.98 > before.coverage and np.median(error(d, true)) < 0.008
-        assert np.isfinite(d.sensitivity[d.valid]).all()
-    assert "used in 3 of 3 views; median difference" in notes[0]
-    sparse = [np.where(rng.random(d.shape) < 0.02, d, 0) for d in depths]
-    found, _ = combined([given(v, d) for v, d in zip(views, sparse)])
-    for d, s, before in zip(found, sparse, swept()):
-        assert (d.valid >= before.valid).all() and np.allclose(d.depth[d.given > 0], s[d.given > 0], rtol=1e-6)
-        assert (d.given > 0).sum() > 0.95 * (s > 0).sum()
 
 
 def test_depth_that_other_views_look_through_is_left_out(monkeypatch):
@@ -139,7 +120,20 @@ def test_a_fitted_map_that_is_not_exact_fills_gaps_and_replaces_outliers():
         assert d.coverage > 0.98 and np.median(error(d, true)) < 0.005
 
 
-def test_confidence_below_half_places_nothing():
+def test_metric_depth_comes_before_searched_depth_and_sparse_or_uncertain_depth_joins_it():
+    views, depths = still_life()
+    rng = np.random.default_rng(0)
+    noisy = [d * (1 + 0.01 * rng.standard_normal(d.shape)) for d in depths]
+    found, notes = combined([given(v, d) for v, d in zip(views, noisy)])
+    for d, true, before in zip(found, depths, swept()):
+        assert d.coverage > 0.98 > before.coverage and np.median(error(d, true)) < 0.008
+        assert np.isfinite(d.sensitivity[d.valid]).all()
+    assert "used in 3 of 3 views; median difference" in notes[0]
+    sparse = [np.where(rng.random(d.shape) < 0.02, d, 0) for d in depths]
+    found, _ = combined([given(v, d) for v, d in zip(views, sparse)])
+    for d, s, before in zip(found, sparse, swept()):
+        assert (d.valid >= before.valid).all() and np.allclose(d.depth[d.given > 0], s[d.given > 0], rtol=1e-6)
+        assert (d.given > 0).sum() > 0.95 * (s > 0).sum()
     views, depths = still_life()
     confidence = np.where(np.arange(160) < 80, 0.4, 0.6).astype(np.float32)[None].repeat(120, 0)
     found, _ = with_given_depth([given(v, d, confidence=confidence) for v, d in zip(views, depths)], None, NO_POINTS)

@@ -103,8 +103,8 @@ OUTSIDE = nw.external_tensor("k", (1,), "weights.bin")
 CONSTANT = nw.field(1, "value") + nw.field(5, OUTSIDE) + nw.field(20, 4)
 
 
-def placed(where: str) -> bytes:
-    """Return a model with a tensor of a side file in one of the places that a model has for tensors."""
+def placed() -> dict[str, bytes]:
+    """Return models with a tensor of a side file in each of the places that a model has for tensors."""
     x, y = nw.value("x", FREE), nw.value("y", FREE)
     add, constant = nw.node("Add", ["x", "k"], ["y"]), nw.node("Constant", [], ["k"], attributes=nw.field(5, CONSTANT))
     inner, own = nw.graph([constant], [], [], []), nw.field(1, "Own") + nw.field(10, "own")
@@ -123,21 +123,18 @@ def placed(where: str) -> bytes:
         "graph of a default": nw.model(plain, nw.field(25, own + nw.field(11, nw.field(1, "body") + nw.field(6, inner)))),
         "first step of training": nw.model(plain, nw.field(20, nw.field(1, inner))),
         "training": nw.model(plain, nw.field(20, nw.field(2, inner))),
-    }[where]
+    }
 
 
-@pytest.mark.parametrize(
-    "where",
-    [
-        "initializer", "attribute", "branch", "sparse values", "sparse indices", "list of tensors", "function",
-        "default of a function", "graph of a default", "first step of training", "training",
-    ],
-)  # fmt: skip
+PLACED = placed()
+
+
+@pytest.mark.parametrize("where", PLACED)
 def test_weights_in_another_file_are_refused_though_it_exists(tmp_path, where, monkeypatch):
     np.ones(1, "<f4").tofile(tmp_path / "weights.bin")
     monkeypatch.chdir(tmp_path)  # onnxruntime would look for them here
     with pytest.raises(DataError, match="weights of 'k' are in another file"):
-        opened(tmp_path, placed(where))
+        opened(tmp_path, PLACED[where])
 
 
 def test_what_protobuf_would_read_otherwise_is_refused(tmp_path):
@@ -190,10 +187,8 @@ def endless() -> bytes:
     """Return a network with a Loop that never ends."""
     image, yes = (1, 3, "h", "w"), nw.field(2, 9) + nw.field(8, "yes") + nw.field(9, b"\1")
     steps = [nw.node("Identity", ["c"], ["c2"]), nw.node("Neg", ["v"], ["v2"])]
-    ins, outs = (
-        [nw.value("i", (), 7), nw.value("c", (), 9), nw.value("v", image)],
-        [nw.value("c2", (), 9), nw.value("v2", image)],
-    )
+    ins = [nw.value("i", (), 7), nw.value("c", (), 9), nw.value("v", image)]
+    outs = [nw.value("c2", (), 9), nw.value("v2", image)]
     body = nw.field(5, nw.field(1, "body") + nw.field(6, nw.graph(steps, [], ins, outs)) + nw.field(20, 5))
     loop = nw.node("Loop", ["", "yes", "x"], ["y"], attributes=body)
     return nw.model(nw.graph([loop], [yes], [nw.value("x", image)], [nw.value("y", image)]))
@@ -351,14 +346,12 @@ def test_resizing_keeps_pixel_centres(tmp_path):
     np.testing.assert_allclose(found, scaled(x.clip(2, 94) / 200 + y.clip(2, 62) / 150), atol=1e-5)
 
 
-def test_free_inputs_keep_proportions_and_multiples():
+def test_sizes_of_free_inputs_and_resizing():
+    """Proportions and multiples are kept; linear up, mean down."""
     how = Preprocessing(384, 32, *HALF, "disparity")
     assert how.free_size(378, 504) == (384, 512) and how.free_size(1920, 1080) == (672, 384)
     assert how.free_size(10, 10_000)[0] == 384
     assert Preprocessing(518, 14, *HALF, "disparity").free_size(378, 504) == (518, 686)
-
-
-def test_resize_is_linear_up_and_mean_down():
     image = photo(8, 12)
     np.testing.assert_allclose(resize(image, 4, 6), image.reshape(4, 2, 6, 2, 3).mean((1, 3)), atol=1e-6)
     wide = resize(np.float32([[0, 1]]), 1, 4)
@@ -382,22 +375,6 @@ def described(path):
     return describe(Network(path), DEFAULTS, "depth")
 
 
-def test_the_side_file_comes_before_what_is_usual(tmp_path):
-    """Also the documented one."""
-    path, side = nw.depth_network(tmp_path / "d.onnx"), tmp_path / "d.onnx.json"
-    how, notes = described(path)
-    assert how == DEFAULTS
-    assert notes == [
-        "d.onnx: assumed size 384, multiple 32, mean 0.5 0.5 0.5, std 0.5 0.5 0.5, output disparity; "
-        "to change them, write d.onnx.json"
-    ]
-    side.write_text(json.dumps({"size": 518, "multiple": 14, "mean": IMAGENET[0], "std": IMAGENET[1], "output": "depth"}))
-    assert described(path) == (Preprocessing(518, 14, *IMAGENET, "depth"), [])
-    page = Path(__file__).parents[2] / "docs" / "priors.md"
-    side.write_text(*re.findall(r"```json\n(.*?)```", page.read_text("utf-8"), re.DOTALL))
-    assert described(path) == (Preprocessing(518, 14, *IMAGENET, "disparity"), [])
-
-
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -418,7 +395,20 @@ def test_side_files_with_faults(tmp_path, text, message):
         described(nw.depth_network(tmp_path / "d.onnx"))
 
 
-def test_a_size_against_the_graph_is_refused(tmp_path):
+def test_the_side_file_comes_before_what_is_usual_and_not_against_the_graph(tmp_path):
+    """Also the documented one."""
+    path, side = nw.depth_network(tmp_path / "d.onnx"), tmp_path / "d.onnx.json"
+    how, notes = described(path)
+    assert how == DEFAULTS
+    assert notes == [
+        "d.onnx: assumed size 384, multiple 32, mean 0.5 0.5 0.5, std 0.5 0.5 0.5, output disparity; "
+        "to change them, write d.onnx.json"
+    ]
+    side.write_text(json.dumps({"size": 518, "multiple": 14, "mean": IMAGENET[0], "std": IMAGENET[1], "output": "depth"}))
+    assert described(path) == (Preprocessing(518, 14, *IMAGENET, "depth"), [])
+    page = Path(__file__).parents[2] / "docs" / "priors.md"
+    side.write_text(*re.findall(r"```json\n(.*?)```", page.read_text("utf-8"), re.DOTALL))
+    assert described(path) == (Preprocessing(518, 14, *IMAGENET, "disparity"), [])
     path = nw.depth_network(tmp_path / "d.onnx", size=(32, 48))
     (tmp_path / "d.onnx.json").write_text(json.dumps({"size": 32}))
     assert described(path)[0].mean == DEFAULTS.mean
@@ -453,8 +443,16 @@ def test_gaps_are_filled_up_to_the_colour_edge_and_not_across():
     np.testing.assert_allclose(again, found, atol=1e-4)
 
 
-def test_badly_conditioned_depths_yield():
-    """Every tenth depth is wrong by half; where its sensitivity is large too, the map hardly changes."""
+def test_weights_are_those_of_inverse_depth():
+    """Depths 1 and 2 with equally uncertain inverses get the same weight on one surface."""
+    columns = np.arange(90) // 30 + np.zeros((40, 1), int)
+    image = np.repeat((0.1 + 0.4 * columns)[..., None], 3, 2).astype(np.float32)
+    board = np.indices((40, 90)).sum(0) % 2 == 0
+    depth = np.where((columns == 0) | ((columns == 1) & board), 1.0, 2.0)
+    found = complete_disparity(image, depth, np.ones(depth.shape, bool), 0.1 * depth**2)
+    assert abs(found[5:-5, 35:55].mean() - 0.5) < 0.02
+    assert found[:, :25].min() > 0.95 and found[:, 65:].max() < 0.05
+    # every tenth depth is wrong by half; where its sensitivity is large too, the map hardly changes
     image, inverse, near = two_planes()
     rng = np.random.default_rng(2)
     valid, wrong = rng.random(near.shape) < 0.3, rng.random(near.shape) < 0.1
@@ -465,17 +463,6 @@ def test_badly_conditioned_depths_yield():
         errors.append(np.abs(complete_disparity(image, depth, valid, sensitivity) - truth).mean())
     right, warned, fooled = errors
     assert warned < 1.1 * right and fooled > 1.7 * right, errors
-
-
-def test_weights_are_those_of_inverse_depth():
-    """Depths 1 and 2 with equally uncertain inverses get the same weight on one surface."""
-    columns = np.arange(90) // 30 + np.zeros((40, 1), int)
-    image = np.repeat((0.1 + 0.4 * columns)[..., None], 3, 2).astype(np.float32)
-    board = np.indices((40, 90)).sum(0) % 2 == 0
-    depth = np.where((columns == 0) | ((columns == 1) & board), 1.0, 2.0)
-    found = complete_disparity(image, depth, np.ones(depth.shape, bool), 0.1 * depth**2)
-    assert abs(found[5:-5, 35:55].mean() - 0.5) < 0.02
-    assert found[:, :25].min() > 0.95 and found[:, 65:].max() < 0.05
 
 
 def test_lone_wild_and_missing_depths():
@@ -506,13 +493,6 @@ def shapes(height=32, width=64):
     image[8:20, 6:24, 0], labels[8:20, 6:24] = 0.9, 3
     image[12:30, 40:58, 2], labels[12:30, 40:58] = 0.7, 15
     return image, labels
-
-
-def test_sides_of_reduced_images_are_quick_to_transform():
-    """The largest product of 2, 3 and 5 up to a length."""
-    products = sorted(2**a * 3**b * 5**c for a in range(10) for b in range(6) for c in range(4))
-    for length in (1, 7, 193, 258, 511, 997):
-        assert _fast_length(length) == max(p for p in products if p <= length)
 
 
 def brute_boundary(labels):
@@ -562,19 +542,20 @@ def test_another_number_of_classes_is_refused(tmp_path, count):
         class_probabilities(Network(path), PLAIN, shapes()[0])
 
 
-def test_boundary_scales_with_the_width_and_is_nothing_without_labels():
+def test_boundaries_and_known_foreground():
     assert (boundary_weight(np.zeros((5, 7), int)) == 0).all()
     labels = np.zeros((4, 1000), int)
     labels[:, 500:] = 1
     weight = boundary_weight(labels)
     assert weight[0, 499] == weight[0, 500] == 1
     np.testing.assert_allclose(weight[2, 504], np.exp(-0.5), rtol=1e-6)  # 4 px at 1000 px
-
-
-def test_when_foreground_is_known():
     for foreground, boundary, known in ((0.02, 1, True), (0.009, 1, False), (0.1, 0, False), (0.9, 0, True)):
         maps = np.full((10, 10), float(boundary)), np.full((10, 10), foreground)
         assert knows_foreground(*maps) is known, "without a boundary every label is background, or an object"
+    # the largest product of 2, 3 and 5 up to a length
+    products = sorted(2**a * 3**b * 5**c for a in range(10) for b in range(6) for c in range(4))
+    for length in (1, 7, 193, 258, 511, 997):
+        assert _fast_length(length) == max(p for p in products if p <= length)
 
 
 def test_classical_maps_show_an_object_and_its_outline():

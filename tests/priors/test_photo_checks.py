@@ -35,15 +35,6 @@ def _with(views, index, image):
     return changed
 
 
-def test_photographs_without_faults_are_not_named(sharp):
-    """All are compared with two others or more, and all figures lie near 1."""
-    checks = check_photos(sharp)
-    assert photo_notes(checks) == []
-    assert [c.name for c in checks] == [v.name for v in sharp]
-    assert all(c.compared_with >= 2 for c in checks)
-    assert all(0.9 < c.sharpness < 1.12 and 0.95 < c.brightness < 1.05 for c in checks)
-
-
 @pytest.mark.parametrize("index", [0, 2])
 def test_a_blurred_photograph_is_named_alone(sharp, index):
     """A shake of 3 px, at the end of the row and in the middle."""
@@ -65,16 +56,19 @@ def test_exposure_is_measured(sharp, gain):
         assert f"{views[1].name} ({checks[1].brightness:.2f} x as bright)" in photo_notes(checks)[0]
 
 
-def test_white_balance_is_told_from_exposure(sharp):
-    """A warmer photograph of the same brightness."""
+def test_faults_are_told_apart_and_what_cannot_be_compared_is_said(sharp):
+    """All are compared with two others or more, and all figures lie near 1 without a fault."""
+    checks = check_photos(sharp)
+    assert photo_notes(checks) == []
+    assert [c.name for c in checks] == [v.name for v in sharp]
+    assert all(c.compared_with >= 2 for c in checks)
+    assert all(0.9 < c.sharpness < 1.12 and 0.95 < c.brightness < 1.05 for c in checks)
+    # a warmer photograph of the same brightness
     checks = check_photos(_with(sharp, 3, sharp[3].image * GAIN))
     assert [c.name for c in checks if c.tinted] == [sharp[3].name] and not any(c.exposed_otherwise for c in checks)
     assert checks[3].channels == pytest.approx(tuple(GAIN), rel=0.05)
     assert "white balance" in photo_notes(checks)[0]
-
-
-def test_what_cannot_be_compared_is_said(sharp):
-    """An even image matches nothing: no figure is made up for it, nor lost for the others."""
+    # an even image matches nothing: no figure is made up for it, nor lost for the others
     checks = check_photos(_with(sharp, 4, np.full_like(sharp[4].image, 0.5)))
     assert (checks[4].compared_with, checks[4].sharpness, checks[4].brightness, checks[4].channels) == (0, None, None, None)
     assert photo_notes(checks) == [f"blur and exposure not checked, too few matches: {sharp[4].name}"]

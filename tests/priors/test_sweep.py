@@ -30,7 +30,7 @@ from warpgs.scene import Camera, View
 CPU, PLANES = torch.device("cpu"), np.linspace(1 / 12, 1 / 2, 40)
 
 
-def test_homography_and_inverse_depth_agree_with_projection():
+def test_homographies_and_planes():
     """A plane's homography, the inverse-depth formula and plain geometry put a pixel in the same place."""
     a, b, _ = rig()
     pixels = pixel_grid(a)
@@ -42,10 +42,7 @@ def test_homography_and_inverse_depth_agree_with_projection():
     several = plane_homographies(a, [b], np.array([0.2, 1 / 3.7]))
     assert several.shape == (2, 1, 3, 3) and np.allclose(several[1, 0], plane_homography(a, b, 1 / 3.7), rtol=1e-12, atol=1e-12)
     assert np.isnan(project_inverse(a, b, pixels[:1], np.array([1e3]))).all() or b.viewmat[2, 3] > 0
-
-
-def test_planes_are_half_a_pixel_apart():
-    """No match inside both images moves farther than asked between planes; fewer planes where they are capped or needless."""
+    # no match inside both images moves farther; fewer planes where they are capped or needless
     a, b, _ = rig()
     inverses = plane_inverses(a, [b], (2.5, 6.0))
     assert inverses[0] == pytest.approx(1 / 6) and inverses[-1] == pytest.approx(1 / 2.5) and 8 < len(inverses) < 256
@@ -81,10 +78,7 @@ def test_only_consistent_depth_counts():
     assert np.isinf(patch.sensitivity[~patch.valid]).all() and (patch.depth[~patch.valid] == 0).all()
     still = consistent_depth([views[0], views[0]], [inverses[0]] * 2, 0, (1,))
     assert still.coverage == 0 and "agrees" in still.notes[0]
-
-
-def test_sensitivity_is_depth_per_pixel():
-    """A change of depth by the sensitivity moves the match by a pixel, in the view where it moves most."""
+    # a change of depth by it moves the match by a pixel, in the view where it moves most
     views, depths = still_life()
     found = consistent_depth(views, [1 / d for d in depths], 1, (0, 2))
     pixels, z = pixel_grid(views[1].camera), depths[1].ravel()
@@ -168,10 +162,7 @@ def test_costs_agree(device):
     assert off.max() < 2e-3 and np.quantile(off, 0.999) < 2e-4 + 0.5 / UNIT and off.mean() < 5e-6 + 0.25 / UNIT
     silent = wanted == NEUTRAL
     assert 0.001 < silent.mean() < 0.5 and (found[silent] == NEUTRAL).mean() > 0.999
-
-
-def test_costs_of_another_size_agree(device):
-    """The other view has another size, and planes behind its camera are neutral in both."""
+    # planes behind the other camera are neutral in both
     generator = np.random.default_rng(0)
     texture = generator.uniform(0.1, 0.9, (30, 60, 3)).astype(np.float32)
     K = np.array([[40.0, 0, 20], [0, 40, 15], [0, 0, 1]])
@@ -184,7 +175,7 @@ def test_costs_of_another_size_agree(device):
     assert np.abs(found - wanted).max() < 1e-4 + 0.5 / UNIT and (wanted != NEUTRAL).mean() > 0.3
 
 
-def test_paths_are_those_of_the_definition(device):
+def test_paths_and_parabolas_are_those_of_the_definition(device):
     """Paths agree to the last unit with the recursion written pixel by pixel; an edge of the image lets depth jump."""
     generator = np.random.default_rng(1)
     costs = generator.integers(0, UNIT + 1, (9, 7, 12)).astype(np.int16)
@@ -197,10 +188,7 @@ def test_paths_are_those_of_the_definition(device):
     found = sweep.path_costs(torch.from_numpy(costs).to(device), image, 0.05, 0.6)
     assert np.array_equal(found.cpu().numpy(), scanline_costs(costs, down, across, round(0.05 * UNIT))) and np.ptp(down) > 500
     assert 4 * (1 + sweep.LARGE_STEP) * UNIT + 4 < 2**15  # no sum of four paths overflows
-
-
-def test_parabola_agrees(device):
-    """Inverse depths agree between planes, at the first and last plane, and where costs are flat."""
+    # between planes, at the first and last plane, and where costs are flat
     generator = np.random.default_rng(2)
     costs = generator.integers(0, 1000, (6, 5, 40)).astype(np.float32)
     costs[0], costs[1, :, 0], costs[2, :, -1] = 7.0, -1.0, -1.0

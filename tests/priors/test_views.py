@@ -77,9 +77,6 @@ def test_networks_give_the_maps_and_the_notes_say_what_was_assumed(tmp_path):
     assert "d.onnx (SHA-256 " in prior.depth_source and "s.onnx (SHA-256 " in prior.semantics_source
     text = "\n".join(notes)
     assert "d.onnx: assumed multiple 32, output disparity" in text and "s.onnx: assumed multiple 32;" in text
-
-
-def test_output_depth_turns_the_map_over(tmp_path):
     image = 0.5 + 0.5 * np.random.default_rng(0).random((32, 32, 3), np.float32)
     (disparity,), _ = view_priors([view(image)], networks(tmp_path, DEPTH))
     (depth,), notes = view_priors([view(image)], networks(tmp_path, DEPTH | {"output": "depth"}))
@@ -119,16 +116,13 @@ def test_a_region_stands_in_where_the_network_finds_no_foreground(tmp_path):
     assert "no score for c.png, 0.png, 1.png, 2.png, 3.png and 2 more views, which have hardly any foreground" in text
 
 
-def test_a_region_beats_saliency():
+def test_regions_and_classical_sources_say_so():
     """Without any depth, geometry does not count."""
     (prior,), notes = view_priors([view(shapes()[0])], PriorConfig(), regions=[REGION])
     assert (prior.foreground == REGION).all() and (prior.confidence == 1).all()
     assert any("a mask is more reliable than saliency" in n and isinstance(n, Detail) for n in notes)
     assert not prior.disparity.any() and prior.depth_source == "none"
     assert any("neither a network nor other views gave depth" in n for n in notes)
-
-
-def test_classical_sources_say_so():
     image, inverse, near = two_planes()
     valid = np.random.default_rng(1).random(near.shape) < 0.1
     consistent = ViewDepth(np.where(valid, 1 / inverse, 0), valid, np.where(valid, 0.01, np.inf))
@@ -195,18 +189,12 @@ def test_neighbours_see_the_same_from_another_side():
     overlap, matching = sight
     assert overlap[0, 1] > 0.99 and matching[0, 1] < 0.01 < 0.8 < matching[0, 2]
     assert (np.diag(matching) == 0).all() and (overlap[0, 3:] == 0).all()
-
-
-def test_views_that_share_nothing_take_the_nearest():
-    """Where sampled points find nothing shared, the nearest cameras among those allowed are taken."""
+    # of those allowed
     cameras = ring([0, 90, 180, 200])
     sight = shared_sight(cameras, [(0.5, 1)] * 4)
     assert not sight[1].any()
     assert matching_views(sight, cameras, 0, 2, range(4)) == [1, 3] and matching_views(sight, cameras, 0, 2, [2, 3]) == [3, 2]
-
-
-def test_few_views_cover_all():
-    """Of two dense groups and one lone view, every one gets a view; few views are all taken, and none twice."""
+    # of two dense groups and one lone view, every one gets a view; none is taken twice
     cameras = ring([0, 1, 2, 3, 4, 120, 121, 122, 240])
     sight = shared_sight(cameras, [(3, 5)] * 9)
     taken = spread_views(sight, 3)

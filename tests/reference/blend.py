@@ -10,10 +10,7 @@ from warpgs.constants import SMALLEST_WEIGHT
 
 
 def blend_reference(means, covs, opacities, colors, depths, background, width, height, rule, keep=None, tile_size=16):
-    """One camera: rgb [H, W, 3], alpha [H, W], depth [H, W], weights [N, H, W]; inputs [N, ...], background [3].
-
-    ``keep`` [N] bool leaves Gaussians out as culling would.
-    """
+    """One camera: rgb [H, W, 3], alpha, depth [H, W], weights [N, H, W]; inputs [N, ...]; ``keep`` [N] culls the others."""
     ys, xs = torch.meshgrid(
         torch.arange(height, dtype=means.dtype) + 0.5, torch.arange(width, dtype=means.dtype) + 0.5, indexing="ij"
     )

@@ -55,10 +55,7 @@ class Images(NamedTuple):
 
 
 class ProjectedGaussians(NamedTuple):
-    """Gaussians in the image, front to back: means [N, 2], conics xx, xy, yy [N, 3], opacities, colours [N, 3], depths.
-
-    ``ids`` are their places among the inputs, ``sigmas`` [N, 2] the axes in pixels, shortest first, without a gradient.
-    """
+    """Gaussians front to back: conics xx, xy, yy; ``ids`` among the inputs; ``sigmas`` [N, 2] of the axes [px], short first."""
 
     means: torch.Tensor
     conics: torch.Tensor

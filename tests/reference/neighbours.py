@@ -27,10 +27,7 @@ def log_reach(means: np.ndarray, centers: np.ndarray, fraction: float, smallest:
 
 
 def log_pixel(means: np.ndarray, cameras: np.ndarray, fraction: float, smallest: float) -> np.ndarray:
-    """Logarithm of a fraction of the smallest pixel at each mean [N, 3] of the cameras [C, 9] that see it.
-
-    Angles from the axis are compared with that of the cone; ``smallest`` stands for the size where none sees it.
-    """
+    """Log of a fraction of the smallest pixel at each mean [N, 3] of the cameras [C, 9] that see it, or of ``smallest``."""
     rows = cameras.astype(float)
     away = means.astype(float)[:, None] - rows[None, :, :3]
     distances = np.linalg.norm(away, axis=2)

@@ -6,10 +6,7 @@ from tests.reference.sh import colors_reference
 
 
 def product(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
-    """Return the matrix product of ``a`` [..., I, J] and ``b`` [..., J, K], each sum from the first term to the last.
-
-    A library picks order and fused multiply-adds by the processor; in float32 its choice would be part of what P32 errs.
-    """
+    """Matrix product of ``a`` [..., I, J] and ``b`` [..., J, K], summed in order: a library would pick one by the processor."""
     total = a[..., :, 0, None] * b[..., None, 0, :]
     for j in range(1, a.shape[-1]):
         total = total + a[..., :, j, None] * b[..., None, j, :]

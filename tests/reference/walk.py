@@ -26,10 +26,7 @@ def heaviest_reference(means, covs, opacities, depths, k, width, height, rule, t
 
 
 def median_depth_reference(means, covs, opacities, depths, width, height, rule, tile_size=16):
-    """One camera: the depth [H, W] of the Gaussian that leaves half of a pixel's light, or less; 0 where none does.
-
-    Weights come from `blend_reference`: what has been blended up to a Gaussian is a sum, not a product as in the kernel.
-    """
+    """One camera: depth [H, W] of the Gaussian that leaves at most half of a pixel's light, by a sum of weights; 0 for none."""
     colors, black = torch.zeros(len(means), 3, dtype=means.dtype), torch.zeros(3, dtype=means.dtype)
     weights = blend_reference(
         means, covs, opacities, colors, depths, black, width, height, rule, tile_size=tile_size

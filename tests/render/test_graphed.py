@@ -69,20 +69,6 @@ def batch(**size) -> ProjectInputs:
     return inputs_of(leaves(cloud(20)), camera(dtype=torch.float32, **size))
 
 
-def test_the_third_of_equal_calls_is_captured(recorder):
-    """Another camera is the same call; other tensors, settings or another background are not, and begin anew."""
-    own, other = batch(), batch()
-    moved = own._replace(viewmats=own.viewmats + 1, Ks=own.Ks * 2)
-    background = torch.zeros(1, 3)
-    assert [recorder.render(s, None, SETTINGS) for s in (own, moved, own, own)] == [None] * (MIN_CALLS - 1) + ["images"] * 2
-    assert Counted.made == 1
-    assert recorder.render(other, None, SETTINGS) is None and recorder.rasterizer is None
-    assert recorder.render(own, background, SETTINGS) is None
-    assert recorder.render(own, None, dataclasses.replace(SETTINGS, sh_count=1)) is None
-    recorder.clear()
-    assert [recorder.render(other, None, SETTINGS) for _ in range(3)][-1] == "images" and Counted.made == 2
-
-
 def test_a_rasterizer_that_is_too_small_is_made_anew_for_the_most_seen(recorder):
     """With four cameras in turn, of which one sees twice as much, it is made twice in all, not in every round."""
     own, found = batch(), []
@@ -174,10 +160,7 @@ def test_a_graphed_rasterizer_gives_the_same_bits(surroundings):
     wanted = results(g, cams, backgrounds)
     for each in found[MIN_CALLS - 1 :]:
         assert all(torch.equal(a, b) for a, b in itertools.zip_longest(each, wanted))
-
-
-def test_images_without_gradients_have_the_same_bits(surroundings):
-    """And keep nothing for a backward pass."""
+    # and keep nothing for a backward pass
     g, own = leaves(cloud(300)), Recorder(Full(CPU), gradients=False)
     cam = camera(70, 50, 2, torch.float32)
     settings = pass_of(cam, g.sh_degree, RULES["exact"])
@@ -260,8 +243,19 @@ def test_backward_passes_are_counted(small, loss):
             projected_means([projected], False)
 
 
-def test_after_a_failed_capture_calls_run_without_graphs(recorder):
-    """They do so until the recorder is cleared."""
+def test_the_third_of_equal_calls_is_captured(recorder):
+    """Another camera is the same call; other tensors, settings or another background are not, and begin anew."""
+    own, other = batch(), batch()
+    moved = own._replace(viewmats=own.viewmats + 1, Ks=own.Ks * 2)
+    background = torch.zeros(1, 3)
+    assert [recorder.render(s, None, SETTINGS) for s in (own, moved, own, own)] == [None] * (MIN_CALLS - 1) + ["images"] * 2
+    assert Counted.made == 1
+    assert recorder.render(other, None, SETTINGS) is None and recorder.rasterizer is None
+    assert recorder.render(own, background, SETTINGS) is None
+    assert recorder.render(own, None, dataclasses.replace(SETTINGS, sh_count=1)) is None
+    recorder.clear()
+    assert [recorder.render(other, None, SETTINGS) for _ in range(3)][-1] == "images" and Counted.made == 2
+    # until the recorder is cleared
     own = batch()
     recorder.graphs.failed = True
     assert [recorder.render(own, None, SETTINGS) for _ in range(9)] == [None] * 9
@@ -269,7 +263,7 @@ def test_after_a_failed_capture_calls_run_without_graphs(recorder):
     assert [recorder.render(own, None, SETTINGS) for _ in range(MIN_CALLS)][-1] == "images"
 
 
-def test_torchs_default_type_does_not_matter(small):
+def test_a_default_type_does_not_matter_and_a_change_in_number_is_an_error(small):
     """A default background is of the Gaussians' type."""
     g, own, cam = small
     usual = torch.get_default_dtype()
@@ -279,10 +273,7 @@ def test_torchs_default_type_does_not_matter(small):
     finally:
         torch.set_default_dtype(usual)
     assert torch.equal(found[0][0], rasterize(g, cam).rgb)
-
-
-def test_gaussians_that_change_in_number_before_the_backward_pass(small):
-    """A swap that autograd does not see is an error, not a write beside the gradients."""
+    # a swap that autograd does not see would write beside the gradients
     g, own, cam = small
     found = first_graphed(own, g, cam)
     g.means.data = torch.zeros(70, 3)

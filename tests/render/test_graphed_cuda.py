@@ -52,10 +52,7 @@ def replays() -> int:
 
 
 def loop(record: bool, steps: int = 9, change: float = 0.01, keep: bool = True, **options):
-    """Return images, projected Gaussians, counts and gradients of each step of a loop whose parameters move in place.
-
-    Without ``keep`` the loop holds on to nothing on the GPU.
-    """
+    """Images, projected Gaussians, counts and gradients of each step; without ``keep`` it holds nothing on the GPU."""
     g, cams = scene()
     seen, params = [], list(g.tensors().values())
     for step in range(steps):

@@ -20,12 +20,6 @@ from warpgs.scene import ActivatedGaussians, CovarianceGaussians
 activated, with_covariances = (functools.partial(of_kind, kind) for kind in ("activated", "covariances"))
 
 
-def covariances(given):
-    """Covariances [N, 3, 3] of Gaussians by scales, differentiable by torch."""
-    axes = rotation_matrices(given.quats / given.quats.norm(dim=-1, keepdim=True)) * given.scales[:, None]
-    return axes @ axes.mT
-
-
 def gone(given, number, cam):
     """Whether one Gaussian of four is not there, and has no gradient."""
     r = rasterize(given, cam)
@@ -81,19 +75,6 @@ def test_opacity_1_and_scale_0_render(device, dtype):
     assert not bool(stored_v["logit_opacities"].any()) and bool(found[0][1]["opacities"].any())
 
 
-def test_colors_need_no_harmonics():
-    """``sh`` may be left out where colours are given, and nowhere else."""
-    stored, cam = cloud(50), camera(dtype=torch.float32)
-    given, values = activated(stored), torch.rand(50, 5)
-    options = RasterizeOptions(colors=values)
-    covariances = CovarianceGaussians(given.means, torch.eye(3).repeat(50, 1, 1), given.opacities, given.sh)
-    for whole in (given, covariances):
-        bare = dataclasses.replace(whole, sh=None)
-        assert torch.equal(rasterize(bare, cam, options).rgb, rasterize(whole, cam, options).rgb)
-        with pytest.raises(UsageError, match=r"no sh: give sh=..., or RasterizeOptions\(colors=...\)"):
-            rasterize(bare, cam)
-
-
 def test_what_is_no_number_is_culled(device):
     """NaN and infinity anywhere in scales, opacities and covariances; an opacity of 0 or less; a negative definite matrix."""
     cam = camera(dtype=torch.float32, device=device)
@@ -114,8 +95,17 @@ def test_what_is_no_number_is_culled(device):
         assert gone(g, 2, cam), covar
 
 
-def test_wrong_input_is_named():
-    """Errors name the fields that were given."""
+def test_missing_harmonics_and_wrong_input_are_named():
+    """``sh`` may be left out where colours are given, and nowhere else; errors name the fields that were given."""
+    stored, cam = cloud(50), camera(dtype=torch.float32)
+    given, values = activated(stored), torch.rand(50, 5)
+    options = RasterizeOptions(colors=values)
+    covariances = CovarianceGaussians(given.means, torch.eye(3).repeat(50, 1, 1), given.opacities, given.sh)
+    for whole in (given, covariances):
+        bare = dataclasses.replace(whole, sh=None)
+        assert torch.equal(rasterize(bare, cam, options).rgb, rasterize(whole, cam, options).rgb)
+        with pytest.raises(UsageError, match=r"no sh: give sh=..., or RasterizeOptions\(colors=...\)"):
+            rasterize(bare, cam)
     given, other, cam = activated(cloud(5)), with_covariances(cloud(5)), camera(dtype=torch.float32)
     for g, name, wrong, error in (
         (given, "scales", given.scales[:3], ValueError), (given, "opacities", given.opacities[:, None], ValueError),
@@ -143,7 +133,8 @@ def test_images_and_gradients_are_those_of_scales(device, dtype, antialiased):
         for a, b in zip(ours, wanted, strict=True):
             close(name, a, b)
     quats, scales = (t.detach().clone().requires_grad_() for t in (scaled.quats, scaled.scales))
-    covariances(dataclasses.replace(scaled, quats=quats, scales=scales)).backward(given.covars.grad)
+    axes = rotation_matrices(quats / quats.norm(dim=-1, keepdim=True)) * scales[:, None]
+    (axes @ axes.mT).backward(given.covars.grad)
     close("gradient", quats.grad, scaled.quats.grad)
     close("gradient", scales.grad, scaled.scales.grad)
 
@@ -172,7 +163,7 @@ def test_gradients_at_a_low_rank(device, rank):
         assert abs(float(slope.detach())) > 1e-3
 
 
-def test_the_symmetric_part_counts(device, dtype):
+def test_the_symmetric_part_counts_and_a_negative_eigenvalue_as_0(device, dtype):
     """An antisymmetric part changes no bit, and the gradient is symmetric."""
     given, cam = with_covariances(cloud(30, dtype, device)), camera(dtype=dtype, device=device)
     with torch.no_grad():  # powers of two, so that sums are exact
@@ -182,10 +173,7 @@ def test_the_symmetric_part_counts(device, dtype):
     assert torch.equal(rasterize(given, cam).rgb, rasterize(skewed, cam).rgb)
     rasterize(given, cam).rgb.square().sum().backward()
     assert torch.equal(given.covars.grad, given.covars.grad.mT) and bool(given.covars.grad.any())
-
-
-def test_a_negative_eigenvalue_counts_as_0_or_culls(device, dtype):
-    """Within rounding the image is that of 0; beyond, the Gaussian is not there, and its neighbours keep their bits."""
+    # beyond rounding the Gaussian is not there, and its neighbours keep their bits
     cam, others = camera(dtype=dtype, device=device), [0, 2, 3]
     turn = rotations(torch.tensor([[0.3, 0.8, -0.4, 0.2]], dtype=torch.float64))[0]
     found = {}
@@ -262,17 +250,6 @@ def test_one_row_of_coefficients_is_for_all_cameras(device, model):
         assert torch.equal(rasterize(gaussians, dataclasses.replace(cam, distortion=shared)).rgb, each)
 
 
-def test_one_K_is_for_all_cameras(device):
-    """Its gradient is the sum of those of the cameras."""
-    gaussians, cam = cloud(50, device=device), camera(20, 12, cameras=2, dtype=torch.float32, device=device)
-    shared, each = cam.K[0].clone().requires_grad_(), cam.K[:1].repeat(2, 1, 1).requires_grad_()
-    images = [rasterize(gaussians, dataclasses.replace(cam, K=K)).rgb for K in (shared, each)]
-    assert torch.equal(*images)
-    for image in images:
-        image.square().sum().backward()
-    assert torch.allclose(shared.grad, each.grad.sum(0)) and bool(shared.grad.any())
-
-
 @pytest.mark.parametrize(
     "change, message",
     [
@@ -289,8 +266,15 @@ def test_cameras_that_do_not_fit_together(change, message):
         rasterize(cloud(5), dataclasses.replace(cam, **change))
 
 
-def test_gaussians_move_to_a_device(device):
-    """All five tensors, with gradients back to those that moved."""
+def test_one_K_is_for_all_cameras_and_gaussians_move_to_a_device(device):
+    """Gradients are sums over the cameras, and go back to the tensors that moved."""
+    gaussians, cam = cloud(50, device=device), camera(20, 12, cameras=2, dtype=torch.float32, device=device)
+    shared, each = cam.K[0].clone().requires_grad_(), cam.K[:1].repeat(2, 1, 1).requires_grad_()
+    images = [rasterize(gaussians, dataclasses.replace(cam, K=K)).rgb for K in (shared, each)]
+    assert torch.equal(*images)
+    for image in images:
+        image.square().sum().backward()
+    assert torch.allclose(shared.grad, each.grad.sum(0)) and bool(shared.grad.any())
     gaussians = leaves(cloud(5))
     moved = gaussians.to(device)
     assert all(t.device.type == device.type for t in moved.tensors().values())
@@ -325,10 +309,7 @@ def test_lists_have_the_bits_of_separate_calls(device):
             assert torch.equal(a.rgb, b.rgb) and torch.equal(a.depth, b.depth)
         for a, b in zip(*(gradients(renders[2:], each[0][2:]) for renders in (separate, together)), strict=True):
             assert torch.equal(a, b) and bool(a.any())
-
-
-def test_lists_that_do_not_go_together(device):
-    """Lengths are compared, and what is no camera is named; no camera gives no render."""
+    # lengths are compared, and what is no camera is named; no camera gives no render
     scene, cams = cloud(5, device=device), cameras(device)
     assert rasterize(scene, []) == []
     with pytest.raises(ValueError, match="2 gaussians for 3 cameras: give one for all, or one for each camera"):

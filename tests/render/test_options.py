@@ -73,15 +73,11 @@ def test_options_are_checked_where_they_are_made():
     RasterizeOptions(near=np.float32(1), far=2, window=[np.int64(0), 0, 16, 16], capacity=2**30 - 1, absgrad=np.bool_(True))
 
 
-def test_a_background_is_numbers():
-    """Words of the command line are not."""
+def test_a_background_is_numbers_and_a_full_device_no_wrong_background(monkeypatch):
+    """Words of the command line are no numbers; what fails on the device keeps its own error."""
     for value in ("white", ["a", "b", "c"], None.__class__):
         with pytest.raises(TypeError, match=r"background must be numbers, shape \[3\] or \[C, 3\], not"):
             rasterize(cloud(1), camera(37, 30), RasterizeOptions(background=value))
-
-
-def test_a_full_device_is_not_called_a_wrong_background(monkeypatch):
-    """The default background is made on the device; what fails there keeps its own error."""
 
     def full(*_, **__):
         raise torch.OutOfMemoryError("out of memory")
@@ -451,16 +447,12 @@ renderer_config""".split()
 """Arguments of gsplat 1.6.0's rasterization, in its order."""
 
 
-def test_the_code_runs(capsys):
-    """The block with warpgs prints the shapes that its comment states."""
+def test_the_page_on_gsplat_runs_and_has_every_argument(capsys):
+    """The block with warpgs prints the shapes that its comment states; the page stays short."""
     (block,) = [b for b in collect(PAGE.name, PAGE.read_text("utf-8")) if b.python and b.code]
     exec(compile(block.code, PAGE.name, "exec"), {})
     printed = re.findall(r"\[[\d, ]+\]", capsys.readouterr().out)
     assert printed == re.findall(r"\[[\d, ]+\]", block.code.splitlines()[-1].split("#")[1])
-
-
-def test_every_argument_has_a_row():
-    """No argument of gsplat is left out, and none is invented; the page stays short."""
     text = PAGE.read_text("utf-8")
     table = text.split("## Arguments")[1].split("## Results")[0]
     named = [name for row in table.splitlines()[4:] for name in re.findall(r"`(\w+)`", row.split("|")[1] if "|" in row else "")]

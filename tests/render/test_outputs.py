@@ -137,11 +137,7 @@ def scalar(render):
 
 @pytest.mark.parametrize("colors", [None, 5], ids=["harmonics", "channels"])
 def test_absgrad_sums_the_magnitude_of_each_pixels_gradient(device, colors):
-    """Against one backward pass for each pixel, in float64; gradients stay the same.
-
-    Where no channels are given, and on a CPU, they have the same bits. On CUDA float64 takes five channels in two passes, but
-    magnitudes take one: sums differ by rounding.
-    """
+    """Against one backward pass for each pixel, in float64; gradients stay the same."""
     gaussians, cam = leaves(hand_placed(device=device, degree=1)), camera(13, 11, cameras=2, device=device)
     values = None if colors is None else torch.randn(6, colors, generator=torch.Generator().manual_seed(0)).to(gaussians.means)
     found = []
@@ -150,7 +146,8 @@ def test_absgrad_sums_the_magnitude_of_each_pixels_gradient(device, colors):
         means2d = r.means2d
         v = torch.autograd.grad(scalar(r), list(gaussians.tensors().values()), retain_graph=True, allow_unused=True)
         found.append((means2d.grad, *(t for t in v if t is not None)))
-    error = 1e-13 if device.type == "cuda" and colors else 0.0  # 143 pixels round by 2e-14 of the largest value at most
+    # on CUDA float64 takes five channels in two passes, magnitudes one: 143 pixels round by 2e-14 of the largest value at most
+    error = 1e-13 if device.type == "cuda" and colors else 0.0
     assert all(float((a - b).abs().max()) <= error * float(a.abs().max()) for a, b in zip(*found))
     absgrad, images = means2d.absgrad, [r.rgb, r.alpha, r.depth]  # before further passes add to it
     upstream = torch.autograd.grad(scalar(r), images, retain_graph=True)
@@ -193,10 +190,7 @@ def test_a_strategy_holds_the_projected_means():
     assert bool(once.any()) and torch.equal(means2d.grad, 2 * once) and torch.equal(means2d.grad, r.projected.grad[..., :2])
     assert not hasattr(means2d, "absgrad")
     assert torch.equal(means2d.detach(), r.projected.detach()[..., :2])
-
-
-def test_means2d_after_the_backward_pass_is_an_error():
-    """Its gradients are gone; a render that was not read yet may be read after a pass through another one."""
+    # a render that was not read yet may be read after a pass through another one
     gaussians, cam = leaves(cloud(50)), camera(dtype=torch.float32)
     r, other = rasterize(gaussians, cam), rasterize(gaussians, cam)
     r.rgb.sum().backward()
@@ -206,10 +200,7 @@ def test_means2d_after_the_backward_pass_is_an_error():
     means2d = other.means2d
     other.rgb.sum().backward()
     assert bool(means2d.grad.any()) and other.means2d is means2d
-
-
-def test_a_missing_absgrad_names_the_option():
-    """Where the option is off, and before the backward pass; means are plain tensors in other operations."""
+    # means are plain tensors in other operations
     for options in (RasterizeOptions(), RasterizeOptions(absgrad=True)):
         means2d = rasterize(leaves(cloud(5)), camera(dtype=torch.float32), options).means2d
         with pytest.raises(AttributeError, match=r"RasterizeOptions\(absgrad=True\) and a backward pass"):
@@ -217,10 +208,7 @@ def test_a_missing_absgrad_names_the_option():
         with pytest.raises(AttributeError, match="has no attribute 'other'"):
             _ = means2d.other
         assert type(means2d + 1) is type(means2d.detach()) is torch.Tensor
-
-
-def test_absgrad_takes_one_pass():
-    """Magnitudes of several passes do not add up to that of their sum."""
+    # magnitudes of several passes do not add up to that of their sum
     gaussians, cam = cloud(5), camera(dtype=torch.float32)
     for options in ({"features": torch.ones(5, 2)}, {"colors": torch.ones(5, 12)}):
         with pytest.raises(UsageError, match="absgrad supports at most 11 channels of colors, and no features"):
@@ -293,16 +281,11 @@ def test_a_second_derivative_is_refused(options):
             second(v.square().sum())
 
 
-def test_create_graph_alone_changes_no_gradient():
-    """A gradient that is not differentiated again is the same with and without it."""
+def test_create_graph_changes_no_gradient_and_transforms_of_functions_are_refused():
+    """torch.func cannot see into kernels; the error names the way that works."""
     gaussians, loss = transforms_scene()
     plain, graph = (torch.autograd.grad(loss(gaussians.means), gaussians.means, create_graph=c)[0] for c in (False, True))
     assert torch.equal(plain, graph.detach()) and bool(plain.any()) and graph.requires_grad
-
-
-def test_transforms_of_functions_are_refused():
-    """torch.func cannot see into kernels; the error names the way that works."""
-    gaussians, loss = transforms_scene()
     means = gaussians.means.detach()
     calls = {
         "grad": lambda: torch.func.grad(loss)(means),

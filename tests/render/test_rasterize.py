@@ -23,17 +23,6 @@ from warpgs.render.reference import reference_image
 from warpgs.scene import ActivatedGaussians, Camera, CovarianceGaussians, Gaussians
 
 
-def test_one_camera_has_no_leading_axis(device):
-    """A single camera gives images without a batch axis, equal to a batch of one; numpy cameras work too."""
-    gaussians, cam = cloud(50, device=device), camera(20, 12, dtype=torch.float32, device=device)
-    single = rasterize(gaussians, cam)
-    batch = rasterize(gaussians, dataclasses.replace(cam, viewmat=cam.viewmat[None], K=cam.K[None]))
-    assert single.rgb.shape == (12, 20, 3) and single.alpha.shape == single.depth.shape == (12, 20)
-    assert torch.equal(single.rgb, batch.rgb[0]) and single.visible.shape == (1, 50)
-    plain = Camera(cam.viewmat.cpu().double().numpy(), cam.K.cpu().double().numpy(), 20, 12)
-    assert isinstance(plain.viewmat, np.ndarray) and torch.equal(rasterize(gaussians, plain).rgb, single.rgb)
-
-
 def test_capacity_changes_nothing_but_says_when_it_is_too_small(device):
     """A larger capacity gives the same bits of images and gradients; one too small sets overflow, and nothing else breaks."""
     gaussians, cam = leaves(cloud(200, device=device)), camera(70, 50, dtype=torch.float32, device=device)
@@ -67,9 +56,15 @@ def test_native_kernels_agree_with_generic_ones(size):
         assert float((a.double() - b).norm()) <= 1e-5 * float(b.norm())
 
 
-def test_errors_name_the_cause(device):
-    """A scene too large for its budget, and an image without pixels."""
+def test_one_camera_has_no_leading_axis_and_errors_name_the_cause(device):
+    """A single camera gives images without a batch axis, equal to a batch of one; numpy cameras work too."""
     gaussians, cam = cloud(50, device=device), camera(20, 12, dtype=torch.float32, device=device)
+    single = rasterize(gaussians, cam)
+    batch = rasterize(gaussians, dataclasses.replace(cam, viewmat=cam.viewmat[None], K=cam.K[None]))
+    assert single.rgb.shape == (12, 20, 3) and single.alpha.shape == single.depth.shape == (12, 20)
+    assert torch.equal(single.rgb, batch.rgb[0]) and single.visible.shape == (1, 50)
+    plain = Camera(cam.viewmat.cpu().double().numpy(), cam.K.cpu().double().numpy(), 20, 12)
+    assert isinstance(plain.viewmat, np.ndarray) and torch.equal(rasterize(gaussians, plain).rgb, single.rgb)
     with pytest.raises(ResourceError, match="raise the memory budget"):
         rasterize(gaussians, cam, RasterizeOptions(memory_budget=1))
     with pytest.raises(ValueError, match="at least 1 x 1"):
@@ -456,18 +451,14 @@ def test_equals_the_reference(degree):
     assert float((crop - wanted[3:11, 5:14]).abs().max()) < 1e-13
 
 
-def test_equals_the_kernels(device):
-    """A cloud dense enough that pixels stop early; the kernels in float64."""
+def test_the_reference_equals_the_kernels_and_draws_nothing_hidden(device):
+    """A cloud dense enough that pixels stop early; Gaussians behind the camera, or fainter than the cut, do not show."""
     g, cam = cloud(600, torch.float64, device), camera(75, 53, device=device)
     g = dataclasses.replace(g, logit_opacities=g.logit_opacities + 4)
     wanted = rasterize(g, cam, RasterizeOptions(background=BACKGROUND))
     found = reference_image(g, cam, (16, 0, 59, 53), BACKGROUND.to(device), 1)
     assert float((found - wanted.rgb[:, 16:]).abs().max()) < 1e-12
     assert float((1 - wanted.alpha).min()) < 1e-4  # some pixels stopped
-
-
-def test_what_is_not_drawn_does_not_show(device):
-    """Behind the camera, and fainter than the cut: the background to the bit."""
     g, cam = cloud(20, torch.float64, device), camera(device=device)
     for hidden in (
         dataclasses.replace(g, means=-g.means),

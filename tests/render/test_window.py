@@ -23,9 +23,9 @@ def scene(dtype, device):
     return cloud(400, dtype, device), camera(*SIZE, cameras=2, dtype=dtype, device=device), background
 
 
-def test_chunks_hold_no_more_instances_than_asked_for():
+def test_chunks_keep_to_their_number_and_notice_changed_sources():
     """Every chunk but a single tile keeps to the number; together they are the window."""
-    gaussians, cam, _ = scene(torch.float32, "cpu")
+    gaussians, cam, background = scene(torch.float32, "cpu")
     found = list(chunks(pass_of(cam, 1, RULES["exact"], window=(16, 16, 59, 37)), 150, inputs_of(gaussians, cam)))
     covered = torch.zeros(SIZE[1], SIZE[0], dtype=torch.int32)
     for settings, counts in found:
@@ -33,11 +33,7 @@ def test_chunks_hold_no_more_instances_than_asked_for():
         covered[y : y + height, x : x + width] += 1
         assert int(counts.sum()) <= 150 or (width <= 16 and height <= 16)
     assert len(found) > 4 and bool((covered[16:, 16:] == 1).all()) and int(covered.sum()) == 59 * 37
-
-
-def test_sources_changed_before_the_gradient_are_noticed():
-    """A chunk that would be rendered again from other Gaussians is an error, not a wrong gradient."""
-    gaussians, cam, background = scene(torch.float32, "cpu")
+    # an error, not a wrong gradient
     g = leaves(gaussians)
     r = rasterize(g, cam, RasterizeOptions(background=background, max_instances=100))
     with torch.no_grad():

@@ -154,10 +154,7 @@ def test_views_of_a_step_share_its_gradient_and_add_to_statistics():
         assert torch.equal(4 * one.table.columns[name], four.table.columns[name])
     for name, moment in one.table.exp_avg.items():
         assert torch.allclose(moment / (1 - 0.9), four.table.exp_avg[name] / (1 - 0.9**4), rtol=1e-5)
-
-
-def test_rates_follow_the_square_root_of_the_batch():
-    """Learning rates times 2 for four views, with corrections for decay rates to the power of four."""
+    # with corrections for decay rates to the power of four
     fit = Trainer(photos(2), seeds(), dataclasses.replace(PLAIN, batch=4), CPU)
     row, lrs = fit._lr_row(3), fit.lrs(3)
     assert row[:3] == scheduled_lrs(2 * lrs["means"], 3, (0.9**4, 0.999**4))
@@ -177,19 +174,6 @@ def test_a_fit_with_batches_continues_with_the_same_bits(tmp_path):
 
     whole, again = advanced(begun()), continued(begun, 7, tmp_path)
     assert same_bits(whole, again) and len(whole.table) > 61
-
-
-def test_a_loss_that_is_no_number_names_its_view_and_harms_nothing():
-    """A NaN in one photograph of three: the Gaussians are those before the step, and its views come again."""
-    views = photos(3)
-    bad = View("bad", views[1].camera, np.full_like(views[1].image, np.nan))
-    fit = Trainer([views[0], bad, views[2]], seeds(), dataclasses.replace(PLAIN, batch=3), CPU)
-    before = {n: t.clone() for n, t in fit.state()[0].items() if n != "generator"}
-    with pytest.raises(NotFiniteError, match="became nan at step 1") as found:
-        fit.advance()
-    order = list(reversed(fit.order))
-    assert found.value.view == 1 and order[found.value.slot] == 1 and sorted(order) == [0, 1, 2] and fit.step == 0
-    assert all(torch.equal(before[n], t) for n, t in fit.state()[0].items() if n in before)
 
 
 def in_series(fit: Trainer) -> Trainer:
@@ -215,8 +199,18 @@ def test_several_steps_at_once_are_those_one_by_one():
     assert np.isfinite(losses).all() and losses == [again.advance()[0].loss for _ in range(20)]
 
 
-def test_a_loss_that_is_no_number_ends_a_series_before_its_step():
-    """The photograph without numbers is in step 3 of 10: two steps are taken, and the views of the others come again."""
+def test_a_loss_that_is_no_number_names_its_view_and_ends_a_series():
+    """A NaN in one photograph of three: the Gaussians are those before the step, and its views come again."""
+    views = photos(3)
+    bad = View("bad", views[1].camera, np.full_like(views[1].image, np.nan))
+    fit = Trainer([views[0], bad, views[2]], seeds(), dataclasses.replace(PLAIN, batch=3), CPU)
+    before = {n: t.clone() for n, t in fit.state()[0].items() if n != "generator"}
+    with pytest.raises(NotFiniteError, match="became nan at step 1") as found:
+        fit.advance()
+    order = list(reversed(fit.order))
+    assert found.value.view == 1 and order[found.value.slot] == 1 and sorted(order) == [0, 1, 2] and fit.step == 0
+    assert all(torch.equal(before[n], t) for n, t in fit.state()[0].items() if n in before)
+    # in step 3 of 10: two steps are taken, and the views of the others come again
     views = photos(9)
     views[4] = View("bad", views[4].camera, np.full_like(views[4].image, np.nan))
     config = dataclasses.replace(PLAIN, batch=2, steps=10)
@@ -374,10 +368,7 @@ EVENTS = dataclasses.replace(METHOD, steps=20, phases=PhaseConfig(600, 400))
     ],
 )  # fmt: skip
 def test_recorded_steps_equal_single_steps(make, config):
-    """Through densification, opacity resets, changes of degree and size, dropout, events and protection, in batches or not.
-
-    A term that ends on the way changes the result.
-    """
+    """Through densification, resets, changes of degree and size, dropout, events, protection, and a term that ends."""
     single, said = fitted(make(), recorded=False, config=config)
     recorded, reports = fitted(make(), recorded=True, config=config)
     a, b = single.state()[0], recorded.state()[0]

@@ -127,8 +127,8 @@ def test_a_step_renders_by_the_views_own_camera(fit, captured):
         assert first_error(fit, number, captured) == pytest.approx(wanted, rel=1e-6) and wanted > 1e-3
 
 
-def test_a_step_in_chunks_renders_the_same(fit):
-    """Chunks count the tiles of each window by the same camera; its coefficients move Gaussians by tiles."""
+def test_chunks_memory_and_half_sizes_know_the_model(fit):
+    """Chunks count the tiles of each window by the same camera; coefficients do not depend on the size, and stacks have one."""
     whole, chunks = rendered_alone(fit, 1), rendered_alone(fit, 1, max_instances=20)
     assert torch.equal(whole, chunks)
     camera = ring(1, 160, 128)[0]
@@ -136,17 +136,10 @@ def test_a_step_in_chunks_renders_the_same(fit):
         c = bent(camera, (0.8 * number, 0.0, -0.8 * number, 0.0))
         renders = [rasterize(three_gaussians(), c, RasterizeOptions(max_instances=most)) for most in (None, 20)]
         assert torch.equal(renders[0].rgb, renders[1].rgb) and float(renders[0].alpha.max()) > 0.5
-
-
-def test_memory_is_planned_for_the_instances_of_the_model(fit):
     options = RasterizeOptions(rule=fit.config.rule, sh_degree=0)
-    cameras = [v.camera for v in views()]
-    pinholes = [dataclasses.replace(c, model="pinhole", distortion=None) for c in cameras]
-    check_instances(fit, [(cameras, options), (pinholes, options)])
-
-
-def test_half_size_views_and_stacks_keep_the_model(fit):
-    """Coefficients do not depend on the size; stacks hold views of one model."""
+    own = [v.camera for v in views()]
+    pinholes = [dataclasses.replace(c, model="pinhole", distortion=None) for c in own]
+    check_instances(fit, [(own, options), (pinholes, options)])
     for shown, view in zip(fit.views, views()):
         for camera in (shown.camera, half_size(shown).camera):
             assert camera.model == NAME and np.allclose(camera.distortion, view.camera.distortion)
@@ -189,26 +182,21 @@ LENS = ("OPENCV_FISHEYE", "fisheye", (2.0, 0, 0, 0))
 LENS_CPU = ["--device", "cpu"]
 
 
-def write_lens_demo(folder) -> None:
-    """Write the demo scene as a fisheye takes it: its images through the lens, and cameras that say so."""
-    write_demo(folder, views=8, width=64, height=48)
-    cameras = folder / "sparse" / "0" / "cameras.txt"
+@pytest.fixture(scope="module")
+def lens_run(tmp_path_factory):
+    """A run of the default preset on the demo scene as a fisheye takes it: images through the lens, cameras that say so."""
+    folder = tmp_path_factory.mktemp("lens")
+    write_demo(folder / "scene", views=8, width=64, height=48)
+    cameras = folder / "scene" / "sparse" / "0" / "cameras.txt"
     number, _, width, height, *K = cameras.read_text().splitlines()[-1].split()
     fx, fy, cx, cy = map(float, K)
     x, y = np.meshgrid(np.arange(64) + 0.5, np.arange(48) + 0.5)
     rays = geometry.from_plane(LENS[1], np.array(LENS[2]), np.stack([(x - cx) / fx, (y - cy) / fy], -1))
     at = rays[..., :2] / rays[..., 2:] * [fx, fy] + [cx - 0.5, cy - 0.5]
-    for path in list_images(folder / "images"):
+    for path in list_images(folder / "scene" / "images"):
         image = cv2.imread(str(path))[..., ::-1]
         save(path, cv2.remap(image, *np.moveaxis(at.astype(np.float32), -1, 0), cv2.INTER_LINEAR))
     cameras.write_text(f"{number} {LENS[0]} {width} {height} {' '.join(K)} {' '.join(map(str, LENS[2]))}\n")
-
-
-@pytest.fixture(scope="module")
-def lens_run(tmp_path_factory):
-    """A run of the default preset through the lens."""
-    folder = tmp_path_factory.mktemp("lens")
-    write_lens_demo(folder / "scene")
     flags = ["--lenses", "native", "--steps", "8", "--split", split_spec(8), *LENS_CPU]
     assert main(["fit", str(folder / "scene"), "--out", str(folder / "run"), *flags]) == 0
     return folder / "run"
@@ -438,7 +426,7 @@ def alpha_errors(fit: Trainer, views: list[View]) -> tuple[float, float]:
     return float(np.stack(alphas)[true < 0.02].mean()), float(1 - np.stack(alphas)[true > 0.9].mean())
 
 
-def test_an_image_over_another_background():
+def test_views_carry_their_opacity_over_any_background():
     """Opaque pixels stay, empty ones show the other colour, and render and photograph have the same background."""
     view = cutouts(1)[0]
     shift = torch.tensor([-0.9, -0.3, 0.0])
@@ -448,10 +436,7 @@ def test_an_image_over_another_background():
     shifts = np.array([random_shift(3, step, WHITE) for step in range(200)])
     assert (shifts <= 0).all() and (shifts >= -1).all() and np.allclose(shifts.mean(0), -0.5, atol=0.1)
     assert random_shift(3, 7, WHITE) == random_shift(3, 7, WHITE) != random_shift(4, 7, WHITE)
-
-
-def test_views_carry_their_opacity():
-    """An opaque view among others gets one; at half the size it is a mean, and stacks share its memory."""
+    # an opaque view among others gets one; at half the size it is a mean, and stacks share its memory
     first, second = cutouts(2)
     both = with_alpha([dataclasses.replace(first, alpha=None), second])
     assert (both[0].alpha == 1).all() and both[1] is second
@@ -522,7 +507,7 @@ def test_opaque_views_have_no_shift_and_an_estimated_opacity_is_a_target_only_wh
     assert fit.views[0].countable is not None and fit.layout.sizes.cutout
 
 
-def test_hull_of_a_ball():
+def test_hull_of_a_ball_and_starts_on_it():
     """All points lie near its surface, in its colour, and none in the empty region of a view."""
     views = balls()
     cloud, how = hull_points(views, 2)
@@ -534,22 +519,12 @@ def test_hull_of_a_ball():
     assert not in_empty_region(shapes, cloud.points).any()
     assert in_empty_region(shapes, np.array([[0, 0, 0], [0, 0.6, 0], [0.6, 0, 0]])).tolist() == [False, True, True]
     assert hull_points([views[0], dataclasses.replace(views[1], alpha=None)], 2)[0].points.shape == (0, 3)
-
-
-def test_one_view_in_many_may_err():
-    """A hole in one silhouette of twelve carves nothing; the same hole in a second one does."""
-    views = balls(12)
-    torn = dataclasses.replace(views[0], alpha=np.zeros_like(views[0].alpha))
-    assert len(carve(silhouettes([torn, *views[1:]]))[0]) > 100
-    also = dataclasses.replace(views[1], alpha=np.zeros_like(views[1].alpha))
-    assert len(carve(silhouettes([torn, also, *views[2:]]))[0]) == 0
-
-
-def test_starts_stand_on_the_object():
-    """Whatever the source, no point lies in a place that is empty in a view."""
-    views = balls()
+    # a hole in one silhouette of twelve carves nothing; the same hole in a second one does
+    many = balls(12)
+    torn, also = (dataclasses.replace(v, alpha=np.zeros_like(v.alpha)) for v in many[:2])
+    assert len(carve(silhouettes([torn, *many[1:]]))[0]) > 100 and len(carve(silhouettes([torn, also, *many[2:]]))[0]) == 0
+    # whatever the source, no point starts in a place that is empty in a view
     assert fitted_region(views[0])[1] == "object"
-    shapes = silhouettes(views)
     everywhere = PointCloud(np.random.default_rng(0).uniform(-0.8, 0.8, (3000, 3)), np.ones((3000, 3), np.float32))
     starts = [initial_points(views, everywhere, InitConfig(source=s), np.random.default_rng(0)) for s in ("hull", "points")]
     assert "left out: they are in an empty area of a view" in starts[1].how

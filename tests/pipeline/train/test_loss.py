@@ -209,16 +209,6 @@ def test_unevenness_is_a_weighted_mean_of_angles():
     assert torch.autograd.gradcheck(lambda n: unevenness(n, image), random)
 
 
-def test_normals_example_a_fit_with_the_term_is_smoother():
-    def found(config: FitConfig) -> float:
-        fit = advanced(Trainer(photos(4), seeds(), config, CPU))
-        renders = [(v, rasterize(fit.gaussians, v.camera)) for v in fit.views]
-        depths = [(v, torch.where(r.alpha > 0.5, r.depth, 0)) for v, r in renders]
-        return sum(float(unevenness(depth_normals(v.camera, d), v.image)) for v, d in depths)
-
-    assert found(SMOOTH) < 0.8 * found(dataclasses.replace(SMOOTH, loss_terms=()))
-
-
 @pytest.mark.cuda
 @pytest.mark.parametrize("batch", [1, 2])
 @pytest.mark.parametrize("given", [False, True], ids=["weight by step", "given maps"])
@@ -261,7 +251,7 @@ def target_of(term, **fields) -> torch.Tensor:
     return found
 
 
-def test_depth_term_is_a_mean_of_inverse_depths_over_their_median():
+def test_terms_on_given_depth_and_normals_are_means_with_the_right_gradients():
     """By hand: weights, pixels without depth, transparent and masked ones; no unit of length matters."""
     given = torch.tensor([[2.0, 4.0, 0.0, 4.0, 8.0]])
     weight = torch.tensor([[1.0, 0.5, 1.0, 1.0, 1.0]])
@@ -276,9 +266,11 @@ def test_depth_term_is_a_mean_of_inverse_depths_over_their_median():
     nothing = target_of(GivenDepthDifference(), depth=0 * given)
     assert float(inverse_depth_difference(depth, alpha, nothing, None)) == 0
     assert torch.isnan(inverse_depth_difference(depth * torch.nan, alpha, target, mask))
-
-
-def test_given_terms_gradients_in_float64():
+    normals = torch.tensor([[[0.0, 0, -1], [0, 0, -1], [0, 0, 0], [1, 0, 0]]])
+    given = torch.tensor([[[0.0, 0, -1], [0.6, 0, -0.8], [0, 0, -1], [0, 0, 0]]])
+    assert float(normal_difference(normals, given, None)) == pytest.approx(0.5 * 0.2)
+    assert float(normal_difference(normals, given, torch.tensor([[1.0, 0, 1, 1]]))) == 0
+    assert float(normal_difference(normals, 0 * given, None)) == 0
     g = torch.Generator().manual_seed(0)
     depth = (torch.rand(5, 6, generator=g, dtype=torch.float64) + 1).requires_grad_()
     given = torch.rand(5, 6, generator=g, dtype=torch.float64) + 1
@@ -289,14 +281,6 @@ def test_given_terms_gradients_in_float64():
     other = torch.nn.functional.normalize(torch.rand(5, 6, 3, generator=g, dtype=torch.float64) - 0.5, dim=-1)
     other[2] = 0
     assert torch.autograd.gradcheck(lambda n: normal_difference(n, other, None), normals.requires_grad_())
-
-
-def test_normal_term_is_a_mean_of_angles():
-    normals = torch.tensor([[[0.0, 0, -1], [0, 0, -1], [0, 0, 0], [1, 0, 0]]])
-    given = torch.tensor([[[0.0, 0, -1], [0.6, 0, -0.8], [0, 0, -1], [0, 0, 0]]])
-    assert float(normal_difference(normals, given, None)) == pytest.approx(0.5 * 0.2)
-    assert float(normal_difference(normals, given, torch.tensor([[1.0, 0, 1, 1]]))) == 0
-    assert float(normal_difference(normals, 0 * given, None)) == 0
 
 
 def test_half_size_keeps_means():
@@ -320,25 +304,6 @@ def test_half_size_keeps_means():
     assert half_size(TrainingView.of(view, CPU)).maps == {}
 
 
-def test_terms_follow_from_the_views_and_the_weights():
-    assert [t.name for t in Trainer(mapped(2), seeds(), CONFIG, CPU).terms] == ["photometric", "given_depth", "given_normals"]
-    assert built_in_terms(LossConfig()) == (Photometric(0.2),)
-    assert built_in_terms(LossConfig(alpha_weight=0.3), True) == (Photometric(0.2), AlphaDifference(0.3))
-    assert built_in_terms(LossConfig(alpha_weight=0, depth_weight=0, normal_weight=0), True, True, True) == (Photometric(0.2),)
-
-
-def test_a_fit_with_maps_is_nearer_to_them():
-    def off(loss: LossConfig) -> float:
-        fit, found = advanced(Trainer(mapped(), seeds(), dataclasses.replace(CONFIG, loss=loss), CPU)), []
-        for v in mapped()[:-1]:
-            r, given = rasterize(fit.gaussians, v.camera), torch.as_tensor(v.depth.values)
-            at = (given > 0) & (r.alpha > 0.5)
-            found.append(float((r.depth[at] / given[at] - 1).abs().mean()))
-        return float(np.mean(found))
-
-    assert off(CONFIG.loss) < 0.85 * off(LossConfig(depth_weight=0, normal_weight=0))
-
-
 @pytest.mark.parametrize("term", ["depth", "normals", "smooth"])
 def test_plan_covers_the_terms(term):
     """The maps that stay, and what the terms and their gradients take."""
@@ -349,8 +314,12 @@ def test_plan_covers_the_terms(term):
     assert found <= planned <= 1.25 * found + 20_000, (found, planned)
 
 
-def test_depth_by_a_network_takes_the_same_way():
+def test_terms_follow_from_the_views_the_weights_and_a_network():
     """`--depth-guides`: the network's disparity is fitted to what views confirm, and in the loss; it needs a network."""
+    assert [t.name for t in Trainer(mapped(2), seeds(), CONFIG, CPU).terms] == ["photometric", "given_depth", "given_normals"]
+    assert built_in_terms(LossConfig()) == (Photometric(0.2),)
+    assert built_in_terms(LossConfig(alpha_weight=0.3), True) == (Photometric(0.2), AlphaDifference(0.3))
+    assert built_in_terms(LossConfig(alpha_weight=0, depth_weight=0, normal_weight=0), True, True, True) == (Photometric(0.2),)
     views, depths = still_life()
     maps = [np.ones_like(d, np.float32) for d in depths]
     priors = [Prior((3 / d).astype(np.float32), *[m] * 3, "a network", "none") for d, m in zip(depths, maps)]
@@ -396,19 +365,13 @@ def test_a_plane_is_smooth_and_a_bend_is_not():
     alpha[1, 0] = mask[0, 1] = 0
     assert abs(flat(bent, alpha=alpha) - rough / 2) < 1e-12 and abs(flat(bent, mask=mask) - rough / 2) < 1e-12
     assert flat(torch.ones(2, 2)) == 0 and torch.isnan(torch.tensor(flat(bent * torch.nan)))
-
-
-def test_smooth_depth_gradients_in_float64():
-    """Below the bound, and 0 beyond it."""
+    # gradients below the bound
     g = torch.Generator().manual_seed(0)
     depth = (1 + 0.02 * torch.rand(5, 6, generator=g, dtype=torch.float64)).requires_grad_()
     image, weight = torch.rand(5, 6, 3, generator=g, dtype=torch.float64), torch.rand(5, 6, generator=g, dtype=torch.float64)
     alpha = torch.ones(5, 6, dtype=torch.float64)
     assert torch.autograd.gradcheck(lambda d: depth_roughness(d, alpha, image, weight, None), depth)
-
-
-def test_confirmed_pixels_count_less():
-    """All count alike where no depth is consistent."""
+    # all count alike where no depth is consistent
     view = TrainingView.of(photos(1, 4, 4)[0], CPU)
     assert torch.equal(SmoothDepth().needs(view, None)["smooth_depth"], torch.ones(4, 4))
     consistent = torch.zeros(4, 4)
@@ -417,7 +380,27 @@ def test_confirmed_pixels_count_less():
     assert torch.equal(found, torch.where(consistent > 0, CONFIRMED, 1.0))
 
 
-def test_smooth_depth_a_fit_with_the_term_is_smoother():
+def test_fits_follow_their_terms():
+    """Normals and depth are smoother, and depth is nearer to given maps, than without the term."""
+
+    def found(config: FitConfig) -> float:
+        fit = advanced(Trainer(photos(4), seeds(), config, CPU))
+        renders = [(v, rasterize(fit.gaussians, v.camera)) for v in fit.views]
+        depths = [(v, torch.where(r.alpha > 0.5, r.depth, 0)) for v, r in renders]
+        return sum(float(unevenness(depth_normals(v.camera, d), v.image)) for v, d in depths)
+
+    assert found(SMOOTH) < 0.8 * found(dataclasses.replace(SMOOTH, loss_terms=()))
+
+    def off(loss: LossConfig) -> float:
+        fit, found = advanced(Trainer(mapped(), seeds(), dataclasses.replace(CONFIG, loss=loss), CPU)), []
+        for v in mapped()[:-1]:
+            r, given = rasterize(fit.gaussians, v.camera), torch.as_tensor(v.depth.values)
+            at = (given > 0) & (r.alpha > 0.5)
+            found.append(float((r.depth[at] / given[at] - 1).abs().mean()))
+        return float(np.mean(found))
+
+    assert off(CONFIG.loss) < 0.85 * off(LossConfig(depth_weight=0, normal_weight=0))
+
     def rough(weight: float) -> float:
         config = FitConfig(
             steps=40, init=InitConfig(source="points", opacity=0.9), sh_degree=0, half_resolution=0.5,
@@ -449,7 +432,7 @@ def correlation(depth, alpha, disparity, mask) -> float:
 
 @pytest.mark.parametrize("masked", [False, True])
 def test_depth_term_is_one_minus_the_correlation(dtype, masked):
-    """Over the opaque pixels that the mask keeps: what the others hold changes nothing."""
+    """Over the opaque pixels that the mask keeps: what the others hold changes nothing, and they have no gradient."""
     depth, alpha, disparity, mask = maps(dtype)
     mask = mask if masked else None
     value = float(depth_disagreement(depth, alpha, disparity, mask))
@@ -458,11 +441,7 @@ def test_depth_term_is_one_minus_the_correlation(dtype, masked):
     assert 10 < int(hidden.sum()) < 80
     other = depth_disagreement(torch.where(hidden, 0, depth), alpha, torch.where(hidden, 1, disparity), mask)
     assert float(other) == value
-
-
-@pytest.mark.parametrize("masked", [False, True])
-def test_gradient_of_the_depth_term(masked):
-    """Against central differences in float64; hidden pixels have none, and alpha only decides what counts."""
+    # against central differences in float64; alpha only decides what counts
     depth, alpha, disparity, mask = maps()
     mask = mask if masked else None
     depth.requires_grad_(), alpha.requires_grad_()
@@ -528,7 +507,7 @@ def guided(config: FitConfig, given: list[Prior]) -> Trainer:
     return advanced(Trainer(photos(3), seeds(), config, CPU, priors=given))
 
 
-def test_a_fit_follows_its_priors():
+def test_a_fit_follows_its_priors_until_the_term_ends():
     """Whichever way round the prior is: depth comes nearer to it than it began, and than under the other."""
     straight = priors(photos(3))
     turned = [dataclasses.replace(p, disparity=1 - p.disparity) for p in straight]
@@ -536,10 +515,7 @@ def test_a_fit_follows_its_priors():
     fits = [guided(GUIDED, given) for given in (straight, turned)]
     for given, own, other in ((straight, *fits), (turned, *reversed(fits))):
         assert agreement(own, given) > max(agreement(start, given), agreement(other, given)) + 0.1
-
-
-def test_term_ends_when_it_should():
-    """Off from the first step on it is as if it had no weight, to the bit; while it is on it is not."""
+    # off from the first step on it is as if it had no weight, to the bit
     plain = guided(dataclasses.replace(GUIDED, loss_terms=()), priors(photos(3)))
     for until, same in ((0.0, True), (0.5, False)):
         fit = guided(dataclasses.replace(GUIDED, loss_terms=(DepthCorrelation(0.5, until),)), priors(photos(3)))

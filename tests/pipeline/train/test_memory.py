@@ -81,16 +81,6 @@ def test_plan_covers_a_step_and_not_much_more(change, size, count, changes):
     assert fit.memory["planned"] >= 0.95 * planned and found <= planned <= 1.25 * found + 20_000
 
 
-def test_plan_covers_density_events():
-    """A set that doubles within a step: the heaviest moment is then the growing itself."""
-    fit = Trainer(photos(2), seeds(4000), GROWING, CPU)
-    fit.advance()
-    found = measured(fit, 1)
-    layout, after = fit.layout, len(fit.gaussians)
-    assert after > 5000
-    assert found <= layout.held(after) + layout.event(4000, after) <= 1.1 * found
-
-
 def test_plan_covers_sampling_events(monkeypatch):
     """Scores, renderings and contributions of all views, and the fine Gaussians that they lead to."""
     views = photos(3, 200, 150)
@@ -107,11 +97,6 @@ def test_plan_covers_sampling_events(monkeypatch):
     assert len(fit.strategy.events) > 2 and any(e["evicted"] for e in fit.strategy.events) and before <= after
     planned = max(fit.layout.step(after, instances(fit)), fit.layout.held(after) + fit.layout.event(before, after))
     assert found <= planned <= 1.35 * found
-
-
-def bytes_of_tensors(tensors) -> int:
-    """Bytes of the memory of tensors, what several share counted once."""
-    return sum({s._cdata: s.nbytes() for s in (t.untyped_storage() for t in tensors)}.values())
 
 
 @pytest.mark.parametrize("stops", [False, True])
@@ -132,11 +117,19 @@ def test_plan_counts_what_lasts(strategy, stops):
             if name != "numbers":
                 tensors += [t for t in (value if isinstance(value, tuple) else [value]) if isinstance(t, torch.Tensor)]
     tensors += [t for s in fit.stacks.values() for rows in s.maps.values() for t in rows]
-    assert fit.layout.held(500) == bytes_of_tensors(tensors)
+    storages = (t.untyped_storage() for t in tensors)  # what several share is counted once
+    assert fit.layout.held(500) == sum({s._cdata: s.nbytes() for s in storages}.values())
 
 
-def test_plan_covers_held_out_blocks():
-    """Whole views beside those without their blocks, through growth and its end."""
+def test_plan_covers_density_events_and_held_out_blocks():
+    """A set that doubles within a step: the heaviest moment is then the growing itself."""
+    fit = Trainer(photos(2), seeds(4000), GROWING, CPU)
+    fit.advance()
+    found = measured(fit, 1)
+    layout, after = fit.layout, len(fit.gaussians)
+    assert after > 5000
+    assert found <= layout.held(after) + layout.event(4000, after) <= 1.1 * found
+    # whole views beside those without their blocks, through growth and its end
     views = photos(4, 200, 150)
     config = dataclasses.replace(GROWING, steps=30, sh_every=15, stopping=StoppingConfig(min_gain_db=50.0))
     fit = Trainer(views, seeds(1500), config, CPU)
@@ -181,10 +174,7 @@ def test_kernels_declare_what_they_allocate(device):
     slack = 64 + 5 * 256 * 4 * sizes.cuda  # single numbers; states come in whole chunks
     assert abs(declared["loss"] - unseen - left) <= slack
     assert abs(declared["blending"] - unseen - most) <= 2 * slack
-
-
-def test_the_order_of_tiles_is_part_of_a_sampling_event():
-    """On CUDA it takes 33 numbers a tile while a view is rendered; later in a step the image's gradient takes more."""
+    # on CUDA it takes 33 numbers a tile while a view is rendered; the image's gradient takes more
     one, other = (StepSizes(240, 200, 56, cuda=cuda, count=2000, instances=9000) for cuda in (True, False))
     order = 15 * 13 * 132
     assert blend.step_bytes(one)["sampling"] - blend.step_bytes(other)["sampling"] == order < 12 * one.pixels
@@ -403,10 +393,7 @@ def test_a_change_with_nothing_saved_before_ends_the_fit_and_other_errors_pass(m
 
 
 class OtherProgram:
-    """A program beside the fit that takes memory of the device and gives it back, as this process sees it.
-
-    torch is limited to what would be left, and is told so: other tests on the device see nothing of it, and it nothing of them.
-    """
+    """A program that takes memory of the device and gives it back, as this process sees it: torch is limited to the rest."""
 
     def __init__(self, monkeypatch):
         self.held, self.free, self.limit = [], torch.cuda.mem_get_info, 0
@@ -476,9 +463,7 @@ def test_a_device_without_memory_ends_the_fit_which_goes_on_later(other):
 
 @pytest.mark.cuda
 def test_2000_steps_beside_a_program_that_comes_and_goes(other):
-    """All but 8 MiB to 1 GiB is taken for half of each 100 steps. The fit goes on, or ends with class 4 and is continued from
-    what it saved; each of the 2000 steps is reported, and the end is finite.
-    """
+    """All but 8 MiB to 1 GiB is taken for half of each 100 steps; the fit goes on, or ends with class 4 and is continued."""
     density = dataclasses.replace(BUSY.density, every=25, stop_fraction=0.9)
     config = dataclasses.replace(BUSY, steps=2000, density=density, max_gaussians=30_000)
     random, states, seen, ended, said = np.random.default_rng(0), [], set(), 0, []

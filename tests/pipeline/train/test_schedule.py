@@ -108,18 +108,12 @@ def test_a_fraction_of_every_opacity_goes():
     decay_opacities(logits, 0.01, GOING)
     error = (logits.double().sigmoid() / (0.99 * before) - 1).abs().max()
     assert float(error) < OPACITY_DECAY
-
-
-def test_what_is_faint_or_infinite_stays_and_nothing_hides_a_nan():
-    """Beyond the least logit nothing decays; full opacity becomes 1 less the fraction; NaN stays NaN."""
+    # beyond the least logit nothing decays; full opacity becomes 1 less the fraction; NaN stays NaN
     logits = torch.tensor([-math.inf, 2 * LEAST_LOGIT, math.inf, math.nan])
     decay_opacities(logits, 0.25, GOING)
     assert logits[:2].tolist() == [-math.inf, 2 * LEAST_LOGIT] and logits[3].isnan()
     assert math.isclose(float(logits[2].sigmoid()), 0.75, rel_tol=1e-6)
-
-
-def test_a_step_that_is_not_taken_changes_nothing():
-    """Nor does a decay of 0, or of less than a rounding."""
+    # nor does a decay of 0, or of less than a rounding
     logits = torch.linspace(-3, 3, 7)
     for fraction, going in ((0.1, torch.tensor([False])), (0.0, GOING), (1e-300, GOING)):
         now = logits.clone()
@@ -174,21 +168,6 @@ def test_samples_are_even_and_end_with_the_last_step(steps, fraction):
     assert reached == (samples or [steps])
 
 
-def test_the_result_is_the_mean_of_the_last_steps():
-    """Of every parameter, also of view modules, in the bits of a sum and one division; all steps before are unchanged."""
-    fit, single = trainer(), trainer(plain(CONFIG))
-    assert finish(fit, 15).keys() >= {"means", "sh", "views.exposure_affine"}
-    finish(single, 15)
-    kept = [finish(single, step) for step in range(16, 21)]
-    result = finish(fit)
-    for name, value in result.items():
-        total = kept[0][name].clone()
-        for params in kept[1:]:
-            total += params[name]
-        assert torch.equal(value, total / 5), name
-    assert not torch.equal(result["means"], kept[-1]["means"])
-
-
 def test_the_error_of_a_mean_has_a_bound():
     """n samples in float32: at most n 2^-24 of the largest, for values of any size."""
     generator = torch.Generator().manual_seed(5)
@@ -211,8 +190,20 @@ def test_a_continued_fit_has_the_same_bits(tmp_path, stop):
     assert same_bits(advanced(trainer()), continued(trainer, stop, tmp_path))
 
 
-def test_a_change_of_the_set_restarts_the_mean():
-    """Rows before and after are other Gaussians: only the steps after the change count."""
+def test_the_result_is_the_mean_of_the_last_steps_since_a_change_of_the_set():
+    """Of every parameter, also of view modules, in the bits of a sum and one division; all steps before are unchanged."""
+    fit, single = trainer(), trainer(plain(CONFIG))
+    assert finish(fit, 15).keys() >= {"means", "sh", "views.exposure_affine"}
+    finish(single, 15)
+    kept = [finish(single, step) for step in range(16, 21)]
+    result = finish(fit)
+    for name, value in result.items():
+        total = kept[0][name].clone()
+        for params in kept[1:]:
+            total += params[name]
+        assert torch.equal(value, total / 5), name
+    assert not torch.equal(result["means"], kept[-1]["means"])
+    # rows before and after are other Gaussians: only the steps after the change count
     config = dataclasses.replace(CONFIG, density=DensityConfig(start=5, every=9, stop_fraction=1.0, gradient=1e-9))
     fit, single = trainer(config), trainer(plain(config))
     finish(fit, 17)
@@ -225,8 +216,8 @@ def test_a_change_of_the_set_restarts_the_mean():
     assert torch.equal(finish(fit)["means"], expected)
 
 
-def test_a_damaged_mean_is_refused():
-    """A missing or unknown sum, another shape or type, and a count that is none."""
+def test_a_damaged_mean_is_refused_and_the_memory_plan_counts_the_sums():
+    """A missing or unknown sum, another shape or type, and a count that is none; one more copy of the parameters."""
     fit = trainer()
     finish(fit, 18)
     tensors, values = fit.state()
@@ -240,10 +231,6 @@ def test_a_damaged_mean_is_refused():
     for name in ("mean.count", "mean.sh"):
         with pytest.raises(DataError, match="stored mean"):
             trainer().load({n: t for n, t in tensors.items() if n != name}, values)
-
-
-def test_the_memory_plan_counts_the_sums():
-    """One more copy of the parameters."""
     fit = trainer()
     summed, without = (Layout(fit.table, fit.views, averaged=averaged) for averaged in (True, False))
     assert fit.layout.averaged and not trainer(plain(CONFIG)).layout.averaged
@@ -392,23 +379,6 @@ def test_continued_fit_equals_uninterrupted_one(tmp_path, strategy, at):
 
 
 @pytest.mark.usefixtures("tiny")
-def test_growth_does_not_end_while_views_have_half_size():
-    assert (
-        begun(GROWING, None).stopping.ended < 24 < begun(dataclasses.replace(GROWING, half_resolution=0.4), None).stopping.ended
-    )
-
-
-@pytest.mark.usefixtures("tiny")
-def test_errors_of_other_blocks_are_refused():
-    """A stored state whose measurements are not of these blocks."""
-    fit = begun(GROWING, 13)
-    tensors, plain = fit.stopping.state()
-    assert plain["measured"]
-    with pytest.raises(DataError, match=r"left-out blocks have shape.*fit again"):
-        Stopping(AT_ONCE).load(tensors, plain)
-
-
-@pytest.mark.usefixtures("tiny")
 @pytest.mark.parametrize(
     ("views", "share", "words"),
     [
@@ -428,10 +398,19 @@ def test_without_evidence_it_is_the_plain_fit(views, share, words, monkeypatch):
 
 
 @pytest.mark.usefixtures("tiny")
-def test_only_the_product_presets_stop_early():
-    """The baselines and the paper take their planned steps; the default's strategy samples."""
+def test_when_growth_may_end():
+    """Not while views have half size, and only in product presets; a stored state with errors of other blocks is refused."""
+    assert (
+        begun(GROWING, None).stopping.ended < 24 < begun(dataclasses.replace(GROWING, half_resolution=0.4), None).stopping.ended
+    )
+    # the baselines and the paper take their planned steps; the default's strategy samples
     stops = {name for name, c in PRESETS.items() if c.stopping.min_gain_db != 0}
     assert stops == {"default", "quick"} and {PRESETS[n].strategy for n in stops} == {"sampling"}
+    fit = begun(GROWING, 13)
+    tensors, plain = fit.stopping.state()
+    assert plain["measured"]
+    with pytest.raises(DataError, match=r"left-out blocks have shape.*fit again"):
+        Stopping(AT_ONCE).load(tensors, plain)
 
 
 @pytest.mark.usefixtures("tiny")
@@ -475,7 +454,7 @@ def test_growth_that_may_have_bought_something_goes_on():
     assert gain(below, 0.01 * below)[0] < 0.5 and gain(seen, 0.01 * seen)[0] > 15
 
 
-def test_blocks_do_not_overlap_and_keep_to_the_picture():
+def test_blocks_are_drawn_and_hidden():
     """Their number, side and place for a picture of usual size; masked-out blocks are no evidence; a seed decides them."""
     drawn = sample_blocks(views(), 0.1, 5)
     for rows, columns in drawn:
@@ -494,10 +473,7 @@ def test_blocks_do_not_overlap_and_keep_to_the_picture():
     assert sample_blocks(views(1, 40, 32), 0.1, 0)[0][0].shape[1] == 4
     assert [len(r) for r, _ in sample_blocks(views(3), 0.01, 0)] == [4] * 3 and len(sample_blocks(views(1), 0.01, 0)[0][0]) == 8
     assert sample_blocks(views(1, 1600, 1200), 0.1, 0)[0][0].shape[1] == SIDES[1]
-
-
-def test_hidden_blocks_and_their_errors():
-    """A view without its blocks keeps its other pixels; the errors are those of the blocks' pixels that count."""
+    # a view without its blocks keeps its other pixels; the errors are those of the blocks' pixels that count
     mask = np.ones((128, 160), bool)
     mask[:, :7] = False
     seen = views(mask=mask)

@@ -92,9 +92,7 @@ def test_a_file_starts_from_another(tmp_path):
     assert (config.preset, config.steps, config.sh_degree, config.init.opacity) == ("my.toml", None, None, 0.1)
     assert all(word in origin for word in (str(first), str(second), "preset 3dgs", "init.merge-px", "sh-degree"))
     assert preset_settings(written(tmp_path, "steps = 7"))[0].strategy == PRESETS["default"].strategy
-
-
-def test_a_file_has_settings_of_the_strategy_and_of_loss_terms(tmp_path):
+    # settings of the strategy and of loss terms
     path = written(
         tmp_path,
         'strategy = "mcmc"\nloss-terms = "alpha"\n[mcmc]\nnoise-lr = 1e4\n[alpha]\nweight = 0.5\n',
@@ -157,7 +155,7 @@ def test_a_file_that_is_none_is_refused(tmp_path, data, said):
     assert str(tmp_path / "my.toml") in str(error.value) and len(str(error.value)) < 400
 
 
-def test_objects_and_mappings_are_presets(own):
+def test_objects_mappings_and_registered_names_are_presets(own, monkeypatch):
     assert preset_settings(f"{own}:PLAIN")[0] == FitConfig(steps=5)
     config, origin = preset_settings(f"{own}:SOME")
     assert config.init.opacity == 0.5 and config.max_steps == 300 and "), preset quick" in origin
@@ -172,9 +170,6 @@ def test_objects_and_mappings_are_presets(own):
             preset_settings(wrong)
     with pytest.raises(UsageError, match="3 is not a preset"):
         preset_settings(3)
-
-
-def test_presets_are_listed_and_a_registered_one_is_taken_by_name(monkeypatch):
     assert list(warpgs.PRESETS) == ["default", "3dgs", "mcmc", "paper-literal", "quick"]
     monkeypatch.setattr(PRESETS, "_made", dict(PRESETS._made))
     PRESETS.register("mine", FitConfig(steps=3), "three steps")
@@ -182,38 +177,6 @@ def test_presets_are_listed_and_a_registered_one_is_taken_by_name(monkeypatch):
     for name in ("default", "a:b", "a.toml", ""):
         with pytest.raises(UsageError, match="cannot be registered"):
             PRESETS.register(name, FitConfig())
-
-
-def test_every_setting_has_a_keyword_of_its_own():
-    """As the flag, with underscores; none is an argument of the fit or an option of reading."""
-    for config in (FitConfig(), PRESETS["mcmc"], dataclasses.replace(PRESETS["default"], loss_terms=(AlphaDifference(2.0),))):
-        names = setting_names(config)
-        assert len({*map(keyword, names)}) == len(names) > 60
-        assert not {*map(keyword, names)} & {*inspect.signature(fit).parameters}
-    assert {"steps", "sh_degree", "init.opacity", "depth_model", "method.sampler.fraction"} <= {*setting_names(FitConfig())}
-
-
-def test_keywords_replace_settings():
-    """Flat, or a group as a mapping or its dataclass; numbers of numpy are numbers; classes stand for themselves."""
-    made = with_settings(
-        FitConfig(),
-        {"steps": np.int64(30), "sh_degree": 1, "init_opacity": 0.3, "dropout": np.float32(0.5), "density": {"every": 7}},
-        "x",
-    )
-    assert (made.steps, made.sh_degree, made.init.opacity, made.dropout, made.density.every) == (30, 1, 0.3, 0.5, 7)
-    assert type(made.steps) is int and type(made.dropout) is float
-    made = with_settings(FitConfig(), {"init": InitConfig(opacity=0.3), "loss_terms": (AlphaDifference(0.2),)}, "x")
-    assert made.init.opacity == 0.3 and made.loss_terms == (AlphaDifference(0.2),)
-    made = with_settings(made, {"alpha_weight": 0.25, "strategy": "mcmc", "mcmc_every": 9}, "x")
-    assert made.loss_terms[0].weight == 0.25 and made.strategy_config.every == 9
-    assert with_settings(made, {"steps": None}, "x").steps is None
-    for wrong, said in (
-        ({3: 1}, "3 is not a setting's name"),
-        ({"loss_terms": 3}, "must be names"),
-        ({"opacity": 0.3}, "mean init.opacity"),
-    ):
-        with pytest.raises(UsageError, match=said):
-            with_settings(FitConfig(), wrong, "x")
 
 
 @pytest.mark.parametrize(
@@ -244,8 +207,34 @@ def test_a_value_out_of_range_is_refused_by_its_flag(kind, bad, said):
         kind(**bad)
 
 
-def test_view_modules_are_switched_and_set_by_keyword():
-    """By their own names, as flags do, and by the list; each has settings."""
+def test_keywords_replace_settings():
+    """Each setting has a keyword: flat, or a group as a mapping or dataclass; view modules are switched by their own names."""
+    # as the flag, with underscores; none is an argument of the fit or an option of reading
+    for config in (FitConfig(), PRESETS["mcmc"], dataclasses.replace(PRESETS["default"], loss_terms=(AlphaDifference(2.0),))):
+        names = setting_names(config)
+        assert len({*map(keyword, names)}) == len(names) > 60
+        assert not {*map(keyword, names)} & {*inspect.signature(fit).parameters}
+    assert {"steps", "sh_degree", "init.opacity", "depth_model", "method.sampler.fraction"} <= {*setting_names(FitConfig())}
+    # numbers of numpy are numbers; classes stand for themselves
+    made = with_settings(
+        FitConfig(),
+        {"steps": np.int64(30), "sh_degree": 1, "init_opacity": 0.3, "dropout": np.float32(0.5), "density": {"every": 7}},
+        "x",
+    )
+    assert (made.steps, made.sh_degree, made.init.opacity, made.dropout, made.density.every) == (30, 1, 0.3, 0.5, 7)
+    assert type(made.steps) is int and type(made.dropout) is float
+    made = with_settings(FitConfig(), {"init": InitConfig(opacity=0.3), "loss_terms": (AlphaDifference(0.2),)}, "x")
+    assert made.init.opacity == 0.3 and made.loss_terms == (AlphaDifference(0.2),)
+    made = with_settings(made, {"alpha_weight": 0.25, "strategy": "mcmc", "mcmc_every": 9}, "x")
+    assert made.loss_terms[0].weight == 0.25 and made.strategy_config.every == 9
+    assert with_settings(made, {"steps": None}, "x").steps is None
+    for wrong, said in (
+        ({3: 1}, "3 is not a setting's name"),
+        ({"loss_terms": 3}, "must be names"),
+        ({"opacity": 0.3}, "mean init.opacity"),
+    ):
+        with pytest.raises(UsageError, match=said):
+            with_settings(FitConfig(), wrong, "x")
     config = with_settings(
         PRESETS["default"], {"exposure": True, "refine_poses_start": 0.5, "refine_poses": True}, "here", keywords=True
     )
@@ -408,17 +397,6 @@ def test_quick_is_never_slower_than_default(device, views, width, height):
     assert settings_by_views(given, train, device)[0].steps == 700
 
 
-def test_the_time_of_a_cpu_limits_the_steps():
-    """All degrees of the harmonics are in use when growth begins; one layer has fewer steps; the loss of quality is said."""
-    for views in (3, 12):
-        limited, whole = (chosen(views, device)[0] for device in ("cpu", "cuda"))
-        assert limited.steps < SMOOTH_STEPS <= whole.steps and whole.sh_every == 500
-        assert limited.sh_degree * limited.sh_every <= plan_phases(limited.phases, limited.steps).refine
-    assert "--no-cpu-limit takes all, about 11 min, and raised PSNR by 0.3 to 1.6 dB" in chosen(10, "cpu")[1]
-    one, two = (chosen(3, "cpu", method_hier=hier)[0].steps for hier in (False, True))
-    assert abs(ONE_LAYER * one - two) < 2 and one < two
-
-
 @pytest.mark.parametrize(("preset", "views", "width", "height", "start", "seconds"), [
     ("quick", 30, 1333, 1000, 200_000, 30),
     ("quick", 40, 967, 541, 180_000, 30), ("quick", 40, 800, 450, 106_000, 30), ("quick", 300, 800, 600, 225_000, 30),
@@ -450,8 +428,16 @@ def test_times_of_steps_are_those_that_were_measured(steps, views, width, height
     assert abs(step_times(made, views, width * height, start)[0].sum() / seconds - 1) < 0.25
 
 
-def test_times_of_steps_follow_the_growth():
-    """From the first points to three times as many at the events; events take longer, and views of half size less time."""
+def test_the_time_of_a_cpu_limits_steps_and_images():
+    """All degrees of the harmonics are in use when growth begins; one layer has fewer steps; the loss of quality is said."""
+    for views in (3, 12):
+        limited, whole = (chosen(views, device)[0] for device in ("cpu", "cuda"))
+        assert limited.steps < SMOOTH_STEPS <= whole.steps and whole.sh_every == 500
+        assert limited.sh_degree * limited.sh_every <= plan_phases(limited.phases, limited.steps).refine
+    assert "--no-cpu-limit takes all, about 11 min, and raised PSNR by 0.3 to 1.6 dB" in chosen(10, "cpu")[1]
+    one, two = (chosen(3, "cpu", method_hier=hier)[0].steps for hier in (False, True))
+    assert abs(ONE_LAYER * one - two) < 2 and one < two
+    # from the first points to three times as many at the events, which take longer; views of half size take less time
     made, _ = settings_by_views(dataclasses.replace(PRESETS["default"], steps=600), [view_stub(800, 450)] * 40, "cpu")
     events = plan_phases(made.phases, 600).events
     times, counts = step_times(made, 40, 360_000, 100_000)
@@ -464,16 +450,13 @@ def test_times_of_steps_follow_the_growth():
     capped = step_times(dataclasses.replace(made, max_gaussians=150_000), 40, 360_000, 100_000)
     assert capped[1][-1] == 150_000 and capped[0].sum() < times.sum()
     assert step_times(dataclasses.replace(made, batch=2), 40, 360_000, 100_000)[0].sum() > 1.5 * times.sum()
-
-
-def test_a_fit_on_a_cpu_has_smaller_images_unless_told():
-    """A side or a factor that is given holds on both devices, and a run that remembers its size keeps it."""
+    # a side or a factor that is given holds on both devices, and a run that remembers its size keeps it
     for device, side in (("cpu", 800), ("cuda", 1600)):
-        chosen = SceneRequest("scene").with_scale(device)
-        assert (chosen.downscale, chosen.max_side) == (1, side)
+        request = SceneRequest("scene").with_scale(device)
+        assert (request.downscale, request.max_side) == (1, side)
         assert SceneRequest("scene", max_side=1200).with_scale(device).max_side == 1200
         assert SceneRequest("scene", downscale=2).with_scale(device).max_side == 0
-        assert chosen.with_scale("cpu") == chosen == chosen.with_scale("cuda")
+        assert request.with_scale("cpu") == request == request.with_scale("cuda")
 
 
 # Settings of earlier versions: what replaces them, and runs that were stored with them.
@@ -514,19 +497,6 @@ def test_a_removed_setting_names_what_replaces_it(name, tmp_path):
     assert note in str(error.value)
 
 
-def test_a_time_between_checkpoints_changes_no_result():
-    assert upgraded(FitConfig().to_json() | {"checkpoint_seconds": 0.0}) == (FitConfig().to_json(), [])
-
-
-def test_flags_that_switched_off_and_the_old_strategy_are_named(capsys):
-    for flag, words in (("--density.no-morton-order", "morton-order was removed"), ("--no-cache", "WARPGS_CACHE"),
-                        ("--method.no-events", "--strategy clone_split")):  # fmt: skip
-        assert main(["fit", "scene", "--out", "run", flag]) == 2
-        assert words in capsys.readouterr().err
-    with pytest.raises(UsageError, match="now sampling, or paper"):
-        with_settings(FitConfig(), {"strategy": "importance_sampling"}, "x")
-
-
 @pytest.mark.parametrize("preset", ["default", "3dgs", "mcmc"])
 def test_stored_settings_are_those_of_the_preset(preset):
     """Without loss, and with the same fingerprint; of a strategy that sampled uniformly, nothing else is left."""
@@ -539,8 +509,15 @@ def test_stored_settings_are_those_of_the_preset(preset):
         FitConfig.from_json(values)
 
 
-def test_strategies_follow_from_the_switches():
-    """Scores, a gate, rendered depth or no protection were the paper's; without events it was clone_split."""
+def test_old_flags_settings_and_strategies_are_named(capsys):
+    assert upgraded(FitConfig().to_json() | {"checkpoint_seconds": 0.0}) == (FitConfig().to_json(), [])
+    for flag, words in (("--density.no-morton-order", "morton-order was removed"), ("--no-cache", "WARPGS_CACHE"),
+                        ("--method.no-events", "--strategy clone_split")):  # fmt: skip
+        assert main(["fit", "scene", "--out", "run", flag]) == 2
+        assert words in capsys.readouterr().err
+    with pytest.raises(UsageError, match="now sampling, or paper"):
+        with_settings(FitConfig(), {"strategy": "importance_sampling"}, "x")
+    # scores, a gate, rendered depth or no protection were the paper's; without events it was clone_split
     base = PRESETS["paper-literal"]
     paper = {
         "s_render": True,

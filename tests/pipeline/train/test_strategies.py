@@ -44,17 +44,6 @@ def gaussians_of(scales: list[float], opacities: list[float]) -> Gaussians:
     return g
 
 
-def test_small_ones_are_cloned_large_ones_split_faint_ones_removed():
-    """Rows: 0 small and pulled, 1 large and pulled, 2 faint, 3 left alone."""
-    g = gaussians_of([0.005, 0.5, 0.005, 0.005], [0.5, 0.5, 0.001, 0.5])
-    change = run(g, [1.0, 1.0, 1.0, 0.0])
-    assert change.keep.tolist() == [0, 3]
-    assert len(change.added["means"]) == 3  # one clone, two children
-    assert torch.equal(change.added["means"][0], g.means[0])
-    assert torch.allclose(change.added["log_scales"][1:], g.log_scales[1] - math.log(1.6))
-    assert not torch.equal(change.added["means"][1], change.added["means"][2])
-
-
 def test_children_lie_where_their_parent_does():
     """The children of many equal parents have the parent's mean and covariance (a needle turned by 60 degrees)."""
     count = 4000
@@ -72,28 +61,27 @@ def test_children_lie_where_their_parent_does():
     assert float((offsets.T @ offsets / len(offsets) - wanted).abs().max()) < 0.02
 
 
-def test_the_cap_lets_only_the_strongest_grow():
-    """With room for one, the most pulled Gaussian is cloned; with none, nothing is."""
+def test_small_ones_are_cloned_large_ones_split_faint_ones_removed(monkeypatch):
+    """Rows: 0 small and pulled, 1 large and pulled, 2 faint, 3 left alone."""
+    g = gaussians_of([0.005, 0.5, 0.005, 0.005], [0.5, 0.5, 0.001, 0.5])
+    change = run(g, [1.0, 1.0, 1.0, 0.0])
+    assert change.keep.tolist() == [0, 3]
+    assert len(change.added["means"]) == 3  # one clone, two children
+    assert torch.equal(change.added["means"][0], g.means[0])
+    assert torch.allclose(change.added["log_scales"][1:], g.log_scales[1] - math.log(1.6))
+    assert not torch.equal(change.added["means"][1], change.added["means"][2])
+    # with room for one, the most pulled Gaussian is cloned; with none, nothing is
     g = gaussians_of([0.005] * 4, [0.5] * 4)
     change = run(g, [1.0, 3.0, 2.0, 0.0], capacity=5)
     assert torch.equal(change.added["means"], g.means[1:2])
     assert len(run(g, [1.0] * 4, capacity=4).added["means"]) == 0
-
-
-def test_huge_ones_go_only_after_a_reset():
-    """Size pruning waits for the first opacity reset, as in the reference."""
+    # size pruning waits for the first opacity reset, as in the reference
     g = gaussians_of([0.5, 0.005], [0.5, 0.5])
     assert run(g, [0, 0]).keep.tolist() == [0, 1]
     assert run(g, [0, 0], after_reset=True).keep.tolist() == [1]
-
-
-def test_one_gaussian_always_survives():
-    """Where all are faint, or not a number, the most opaque stays."""
+    # the most opaque stays where all are faint
     assert run(gaussians_of([0.1] * 3, [0.001, 0.003, 0.002]), [0, 0, 0]).keep.tolist() == [1]
-
-
-def test_protected_are_not_pruned_and_only_the_growing_grow(monkeypatch):
-    """Two faint ones, one of them protected; two that are pulled at, one of which may grow."""
+    # two faint ones, one of them protected; two that are pulled at, one of which may grow
     monkeypatch.setattr(clone_split, "CLONE_SIZE", 1.0)
     gaussians = gaussians_of([0.1] * 4, [0.001, 0.001, 0.5, 0.5])
     pull = torch.tensor([0.0, 0, 1, 1])
@@ -105,7 +93,7 @@ def test_protected_are_not_pruned_and_only_the_growing_grow(monkeypatch):
     assert change.keep.tolist() == [0, 2, 3] and change.parents.tolist() == [2]
 
 
-def test_rates_of_scales_may_fall():
+def test_when_scales_slow_down_and_growth_begins():
     """Log-linear to the share that is left at the last step, from where the set settles; level where nothing is asked for."""
     falling = OptimizerConfig(scales_lr=0.1, scales_decay=0.01)
 
@@ -115,10 +103,7 @@ def test_rates_of_scales_may_fall():
     assert lrs(0.0, 0.0, 0.5, 1.0) == pytest.approx([0.1, 0.01, 0.001])
     assert lrs(0.5, 0.0, 0.5, 0.75, 1.0) == pytest.approx([0.1, 0.1, 0.01, 0.001])
     assert OptimizerConfig(scales_lr=0.1).lrs(1.0, 1.0)["log_scales"] == pytest.approx(0.1)
-
-
-def test_growth_begins_after_a_quarter_of_a_short_fit():
-    """And ends when phase 3 begins, or after the fraction that is asked for in a fit without phases."""
+    # and ends when phase 3 begins, or after the fraction that is asked for in a fit without phases
     for strategy, ends in (("clone_split", 20), ("mcmc", 33)):
         config = FitConfig(steps=40, init=InitConfig(source="points"), strategy=strategy)
         growth = Trainer(photos(2), seeds(), config, CPU).strategy.growth()
@@ -152,16 +137,6 @@ def test_relocated_gaussians_render_as_the_one_they_stand_for(copies):
     assert copies == 1 or bool((new < opacities).all())
 
 
-def test_relocation_in_float32_is_that_of_float64():
-    """At the ends of the range of opacities, for every number of copies."""
-    opacities = torch.tensor([0.005, 0.5, 1 - 2**-24])
-    for copies in range(1, MAX_COPIES + 1):
-        found = relocated(opacities, torch.full((3,), copies))
-        wanted = relocated(opacities.double(), torch.full((3,), copies))
-        for a, b in zip(found, wanted):
-            assert torch.allclose(a.double(), b, rtol=1e-6, atol=0) and bool((a > 0).all())
-
-
 def test_noise_has_each_gaussians_covariance_and_spares_the_opaque(device):
     """Of many equal needles: covariance Sigma^2 of the move, nothing for opaque ones or for a step that is not taken."""
     g = cloud(20_000, device=device)
@@ -188,8 +163,14 @@ def test_noise_has_each_gaussians_covariance_and_spares_the_opaque(device):
     assert torch.equal(g.means, again)
 
 
-def test_the_dead_are_relocated_and_the_set_grows_to_its_cap():
-    """After an event no Gaussian is dead, and none was removed; the set grows by a fraction up to the cap."""
+def test_relocation_in_float32_and_of_the_dead():
+    """At the ends of the range of opacities, for every number of copies; the set grows by a fraction up to the cap."""
+    opacities = torch.tensor([0.005, 0.5, 1 - 2**-24])
+    for copies in range(1, MAX_COPIES + 1):
+        found = relocated(opacities, torch.full((3,), copies))
+        wanted = relocated(opacities.double(), torch.full((3,), copies))
+        for a, b in zip(found, wanted):
+            assert torch.allclose(a.double(), b, rtol=1e-6, atol=0) and bool((a > 0).all())
     trainer = trained(steps=9)
     trainer.table.params["logit_opacities"].detach()[:20] = -8.0
     before = len(trainer.table)
@@ -239,8 +220,8 @@ class Gray(LossTerm):
 
 
 @pytest.mark.usefixtures("registries_as_they_were")
-def test_a_term_without_a_name_of_its_own_is_refused():
-    """A run folder could not tell it: never registered, or only by the name of the class that it derives from."""
+def test_terms_without_a_name_or_map_of_their_own_are_refused():
+    """A run folder could not tell a term that is not registered, or has the name of the class that it derives from."""
     with pytest.raises(UsageError, match=r"the loss term Gray has no registered name.*register_loss_term"):
         dataclasses.replace(PLAIN, loss_terms=(Gray(),))
     LOSS_TERMS.register("gray")(Gray)
@@ -255,11 +236,7 @@ def test_a_term_without_a_name_of_its_own_is_refused():
     config = dataclasses.replace(PLAIN, loss_terms=(Gray(3.0),))
     assert FitConfig.from_json(config.to_json()) == config
 
-
-@pytest.mark.usefixtures("registries_as_they_were")
-def test_two_terms_with_one_name_for_a_map_are_refused():
-    """The message names both, where one would have silently read what the other asked for."""
-
+    # one would have silently read what the other asked for
     @LOSS_TERMS.register("first")
     @dataclass(frozen=True)
     class First(LossTerm):

@@ -78,15 +78,6 @@ def test_random_points_stand_on_an_object_on_black():
     assert (empty_votes(views, regions, cloud.points) == 0).all()
 
 
-def test_nearest_points():
-    """Against a search tree, over more pairs than are held at a time, the nearest first."""
-    from scipy.spatial import cKDTree
-
-    generator = np.random.default_rng(0)
-    points, queries = generator.uniform(0, 500, (700, 2)), generator.uniform(0, 500, (3000, 2))
-    assert np.array_equal(nearest(points, queries, 5), cKDTree(points).query(queries, k=5)[1])
-
-
 def test_same_seed_same_bits_and_threads_do_not_matter():
     """Two fits with one seed agree bit for bit, also for another number of threads; another seed does not."""
     torch.set_num_threads(1)
@@ -113,7 +104,7 @@ def test_order_of_the_gaussians_changes_nothing_but_their_order(monkeypatch):
     assert len(results[0]) > 2 * len(seeds()) and results[0] == results[1]
 
 
-def test_loss_of_known_images():
+def test_losses_views_and_schedules():
     """L1 alone is the mean difference; equal images have loss 0, and so has a masked view, without a gradient."""
     a, b = torch.full((12, 12, 3), 0.75), torch.full((12, 12, 3), 0.5)
     assert abs(float(photometric_loss(a, b, None, 0.0)) - 0.25) < 1e-7
@@ -122,24 +113,24 @@ def test_loss_of_known_images():
     loss = photometric_loss(image, torch.rand(9, 8, 3), torch.zeros(9, 8))
     loss.backward()
     assert float(loss.detach()) == 0 and not bool(image.grad.any())
-
-
-def test_every_view_comes_once_before_any_comes_again():
-    """Views are drawn like cards."""
+    # views are drawn like cards
     fit = fitted(FitConfig(steps=9, init=InitConfig(source="points")), 0)
     drawn = [fit.next_view() for _ in range(12)]
     assert all(sorted(drawn[i : i + 4]) == [0, 1, 2, 3] for i in (0, 4, 8))
-
-
-def test_schedules():
-    """Ends and middle of the log-linear decay; degrees rise one at a time."""
+    # ends and middle of the log-linear decay; degrees rise one at a time
     assert log_linear(1e-2, 1e-4, 0) == pytest.approx(1e-2) and log_linear(1e-2, 1e-4, 1) == pytest.approx(1e-4)
     assert log_linear(1e-2, 1e-4, 0.5) == pytest.approx(1e-3)
     assert [sh_degree(s, 10, 2) for s in (1, 10, 11, 21, 500)] == [0, 0, 1, 2, 2]
 
 
-def test_first_gaussians():
+def test_first_gaussians_and_nearest_points():
     """Width from the three nearest, colour from the point, coincident points with a floor, a lone one with a ceiling."""
+    # against a search tree, over more pairs than are held at a time, the nearest first
+    from scipy.spatial import cKDTree
+
+    generator = np.random.default_rng(0)
+    points, queries = generator.uniform(0, 500, (700, 2)), generator.uniform(0, 500, (3000, 2))
+    assert np.array_equal(nearest(points, queries, 5), cKDTree(points).query(queries, k=5)[1])
     points = np.array([[0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 2], [50, 50, 50]], float)
     cloud = PointCloud(points, np.full((5, 3), 0.8, np.float32))
     g = initial_gaussians(cloud, InitConfig(opacity=0.1), 3, extent=100.0, device=CPU)
@@ -177,7 +168,7 @@ def test_a_start_of_more_points_than_allowed_is_drawn_from():
     assert len(fitted(config, 25).gaussians) <= most
 
 
-def test_config_survives_json():
+def test_config_survives_json_and_every_preset_is_described():
     """What a run folder stores gives the same configuration back; an unknown field is refused."""
     stored = json.loads(json.dumps(BUSY.to_json()))
     assert FitConfig.from_json(stored) == BUSY and FitConfig.from_json(stored).fingerprint() == BUSY.fingerprint()
@@ -186,10 +177,7 @@ def test_config_survives_json():
     earlier = {**stored, "loss": stored["loss"] | {"exposure_weight": 0.01}}  # a setting without effect, since removed
     assert FitConfig.from_json(earlier) == BUSY
     assert all(isinstance(p, FitConfig) and p.preset == name for name, p in PRESETS.items())
-
-
-def test_every_preset_is_named_and_described():
-    """By a line about it, which the help shows, and in the table of docs/presets.md."""
+    # by a line about it, which the help shows, and in the table of docs/presets.md
     assert all(PRESETS.described().values())
     table = (Path(__file__).parents[3] / "docs" / "presets.md").read_text("utf-8")
     rows = " ".join(line.split("|")[1] for line in table.splitlines() if line.startswith("| `"))
@@ -371,7 +359,7 @@ def test_only_a_free_gpu_is_warmed_up(monkeypatch):
             assert ready() is None
 
 
-def test_what_goes_wrong_is_raised(monkeypatch):
+def test_what_goes_wrong_is_raised_and_nothing_goes_on_after_the_block(monkeypatch):
     """By what waits for the end, in the thread that waits."""
 
     def fail(*_):
@@ -381,10 +369,7 @@ def test_what_goes_wrong_is_raised(monkeypatch):
     monkeypatch.setattr(torch.cuda, "device", lambda _: torch.no_grad())  # there may be none here
     with background_warmup(PRESETS["default"], CUDA) as ready, pytest.raises(RuntimeError, match="out of order"):
         ready()
-
-
-def test_nothing_goes_on_after_the_block(monkeypatch):
-    """An error in the block, such as a scene with nothing to start from, ends the warmup after the step it is in."""
+    # an error in the block, such as a scene with nothing to start from, ends the warmup after the step it is in
     began, ended = threading.Event(), []
 
     def endless(config, device, stopped):
@@ -394,7 +379,6 @@ def test_nothing_goes_on_after_the_block(monkeypatch):
         ended.append(threading.current_thread())
 
     monkeypatch.setattr(warmups, "warm_up", endless)
-    monkeypatch.setattr(torch.cuda, "device", lambda _: torch.no_grad())
     with pytest.raises(DataError), background_warmup(PRESETS["default"], CUDA):
         began.wait()
         raise DataError("nothing to start from")
