@@ -102,6 +102,9 @@ def test_a_call_is_that_of_rasterize(version, form, center, device):
     if version == "2024":
         assert torch.equal(further[0], wanted.movedim(-1, 0))
 
+    clip = same["means3D"].detach() @ own.projmatrix[:3] + own.projmatrix[3]
+    places = (clip[:, :2] / clip[:, 3:] + 1) / 2 * torch.tensor([WIDTH, HEIGHT], device=device)
+    torch.testing.assert_close(render.means2d.detach()[0, radii > 0], places[radii > 0], rtol=1e-5, atol=1e-3)
     means2d, weights = render.means2d, torch.rand(3, HEIGHT, WIDTH, generator=torch.Generator().manual_seed(1)).to(device)
     for first, more in ((image, further), (render.rgb.movedim(-1, 0), [wanted.movedim(-1, 0)] if version == "2024" else [])):
         loss = (first * weights).sum() + sum(m.sum() for m in more if m.requires_grad)
