@@ -7,7 +7,7 @@ import torch
 
 import warpgs
 from tests.reference.project import rotations
-from warpgs.compat.inria import GaussianRasterizationSettings, GaussianRasterizer
+from warpgs.compat.inria import GaussianRasterizationSettings, GaussianRasterizer, _camera
 
 WIDTH, HEIGHT, COUNT = 40, 30, 50
 FOCAL, CENTER = (32.0, 30.0), (22.0, 14.0)
@@ -110,17 +110,17 @@ def test_a_call_is_that_of_rasterize(version, form, center, device):
         loss = (first * weights).sum() + sum(m.sum() for m in more if m.requires_grad)
         torch.autograd.grad(loss, given["opacities"] if first is image else same["opacities"], retain_graph=True)
         loss.backward(retain_graph=True)
-        loss.backward()
+        (2 * loss).backward()
     half = torch.tensor([WIDTH / 2, HEIGHT / 2], device=device)
-    pixels = means2d.grad[0] * 2 / 3  # the first of three passes went to the opacities alone
+    pixels = means2d.grad[0] * 3 / 4  # the first pass, a fourth, went to the opacities alone
     torch.testing.assert_close(given["means2D"].grad[:, :2], pixels * half, rtol=1e-6, atol=0)
     assert not given["means2D"].grad[:, 2].any() and bool(given["means2D"].grad[:, :2].any())
     for name in given.keys() - {"means2D"}:
         assert torch.equal(given[name].grad, same[name].grad) and bool(given[name].grad.any()), name
 
 
-def test_a_point_and_a_pose():
-    """A pose gets gradients; markVisible has the near plane; nothing needs gradients, and results may be edited in place."""
+def test_a_pose_a_plane_and_a_middle():
+    """A pose gets gradients, and images may be edited; depth 0 is culled; the middle of a large image is exact."""
     own, given = settings(), {name: value.detach() for name, value in scene().items()}
     view = own.viewmatrix.clone().requires_grad_()
     image, _ = GaussianRasterizer(own._replace(viewmatrix=view))(**given)
@@ -130,6 +130,13 @@ def test_a_point_and_a_pose():
     depths = torch.tensor([0.0, 0.19, 0.21, math.nan])
     points = (torch.stack([torch.zeros(4), torch.zeros(4), depths], -1) - own.viewmatrix[3, :3]) @ own.viewmatrix[:3, :3].T
     assert GaussianRasterizer(own).markVisible(points).tolist() == [False, False, True, False]
+    front = {"viewmatrix": torch.eye(4), "projmatrix": torch.linalg.inv(own.viewmatrix) @ own.projmatrix}
+    given["means3D"] = (given["means3D"] * (torch.arange(COUNT) > 0)[:, None]).requires_grad_()
+    _, _, inverse = GaussianRasterizer(settings("2024", **front))(**given)
+    inverse.sum().backward()
+    assert bool(given["means3D"].grad.isfinite().all()) and bool(given["means3D"].grad.any())
+    large = settings(center=(WIDTH / 2, HEIGHT / 2), image_width=50 * WIDTH, image_height=50 * HEIGHT)
+    assert _camera(large).K[:2, 2].tolist() == [25 * WIDTH, 25 * HEIGHT]
 
 
 @pytest.mark.parametrize(

@@ -90,7 +90,8 @@ def _camera(settings: GaussianRasterizationSettings) -> Camera:
     lens = [[1 / tangents[0], 0, 0], [0, 1 / tangents[1], 0], [*off, 1], [0, 0, 0]]
     given = projection[:, [0, 1, 3]]  # the third column, for a depth buffer, has no meaning here
     error = (pose @ pose.new_tensor(lens) - given).abs()
-    if not bool((error <= POSE_TOLERANCE * given.abs().amax(1, keepdim=True)).all()):
+    largest = given.abs().amax(1, keepdim=True).clamp_min(1e-3)  # a camera at the origin has a translation of rounding errors
+    if not bool((error <= POSE_TOLERANCE * largest).all()):
         raise UsageError(
             "projmatrix is not viewmatrix times a projection of tanfovx and tanfovy: give both matrices transposed, for row "
             "vectors, and projmatrix = viewmatrix @ projection"
@@ -200,7 +201,7 @@ class GaussianRasterizer(nn.Module):
         render = rasterize(gaussians, camera, options)
         if render.projected.requires_grad:
             render.projected.register_hook(lambda gradient: kept.append(gradient[0, :, :2]))
-        radii = torch.where(render.visible, render.projected.detach()[..., 10], 0).clamp_max(2**30).int()[0]
+        radii = render.projected.detach()[0, :, 10].clamp_max(2**30).int()
         results = _planes(render.rgb), radii
         if render.features is not None:
             return *results, _planes(render.features)
