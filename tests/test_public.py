@@ -27,7 +27,7 @@ from warpgs.synthetic.demo import camera_path, still_life
 from warpgs.synthetic.raycast import Light, render
 
 ROOT = Path(warpgs.__file__).parent
-BELOW = ("train", "kernels", "io", "export", "compat.gsplat")
+BELOW = ("train", "kernels", "io", "export", "compat.gsplat", "compat.inria")
 FACES = {name: importlib.import_module(name) for name in ("warpgs", *(f"warpgs.{n}" for n in BELOW))}
 NAMES = [f"{face}.{name}" for face, module in FACES.items() for name in module.__all__]
 PAGES = [ROOT.parent / "README.md", ROOT.parent / "CONTRIBUTING.md", *sorted((ROOT.parent / "docs").glob("*.md"))]
@@ -35,7 +35,7 @@ PAGES = [ROOT.parent / "README.md", ROOT.parent / "CONTRIBUTING.md", *sorted((RO
 
 def seen_by_type_checkers(face: str) -> dict[str, tuple[str, str]]:
     """Module and name there of each name that a face imports under TYPE_CHECKING, or defines; modules are left out."""
-    if face == "warpgs.compat.gsplat":
+    if face.startswith("warpgs.compat."):
         return {name: (face, name) for name in FACES[face].__all__}
     tree = ast.parse(Path(FACES[face].__file__).read_text("utf-8"))
     (block,) = (n for n in tree.body if isinstance(n, ast.If) and ast.unparse(n.test) == "TYPE_CHECKING")
@@ -130,7 +130,7 @@ def named(code: str) -> set[str]:
         elif isinstance(node, ast.Import):
             found |= {a.name for a in node.names if a.name.startswith("warpgs.")}
         elif isinstance(node, ast.Attribute) and re.fullmatch(r"warpgs(\.\w+)+", text := ast.unparse(node)):
-            found.add(re.match(r"warpgs\.(?:(?:train|kernels|io|export|compat\.gsplat)\.)?\w+", text)[0])
+            found.add(re.match(r"warpgs\.(?:(?:train|kernels|io|export|compat\.gsplat|compat\.inria)\.)?\w+", text)[0])
     return found
 
 

@@ -1,7 +1,8 @@
 """Public names: how a face loads them on first use, and where a name is that older code imports from within the package.
 
-The faces are `warpgs`, `warpgs.train`, `warpgs.kernels`, `warpgs.io`, `warpgs.export` and `warpgs.compat.gsplat`. Everything
-else may move. Inside the package, names are imported from the modules that define them, so that faces make no circle.
+The faces are `warpgs`, `warpgs.train`, `warpgs.kernels`, `warpgs.io`, `warpgs.export`, `warpgs.compat.gsplat` and
+`warpgs.compat.inria`. Everything else may move. Inside the package, names are imported from the modules that define them, so
+that faces make no circle.
 """
 
 import functools

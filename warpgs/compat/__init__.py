@@ -1,1 +1,1 @@
-"""Functions of other packages under their own names and arguments: `warpgs.compat.gsplat`."""
+"""Functions of other packages under their own names and arguments: `warpgs.compat.gsplat` and `warpgs.compat.inria`."""

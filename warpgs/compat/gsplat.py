@@ -92,8 +92,8 @@ MISSING = {
 """Why arguments are missing, or what to use; None, False and `RollingShutterType.GLOBAL` are accepted."""
 
 
-def _check_supported(arguments: dict[str, Any]) -> None:
-    """Raise UnsupportedError with the name and the reason of every argument of `rasterization` that has no meaning here."""
+def _check_arguments(arguments: dict[str, Any]) -> None:
+    """Raise UnsupportedError with name and reason of all arguments without a meaning here; ValueError for missing colours."""
     refused = {}
     for why, names in MISSING.items():
         for name in names:
@@ -118,6 +118,8 @@ def _check_supported(arguments: dict[str, Any]) -> None:
             refused[f"{name} with camera_model={model!r}"] = "this lens has no such coefficients"
     if refused:
         raise UnsupportedError("\n".join(f"warpgs does not support {name}: {why}" for name, why in refused.items()))
+    if arguments["colors"] is None and "RGB" in (mode := arguments["render_mode"]):
+        raise ValueError(f"colors must be given in render_mode {mode!r}: only D and ED have none")
 
 
 def _lens(model: str, radial: Tensor | None, tangential: Tensor | None, poses: Tensor) -> tuple[str, Tensor | None]:
@@ -129,6 +131,24 @@ def _lens(model: str, radial: Tensor | None, tangential: Tensor | None, poses: T
     radial = poses.new_zeros(*poses.shape[:-2], 6) if radial is None else radial
     tangential = poses.new_zeros(*poses.shape[:-2], 2) if tangential is None else tangential
     return "opencv", torch.cat([radial[..., :2], tangential, radial[..., 2:]], -1)
+
+
+def _channels(
+    means: Tensor, viewmats: Tensor, colors: Tensor | None, degree: int | None, backgrounds: Tensor | None,
+    features: Tensor | None, features_degree: int | None,
+) -> tuple[Tensor | None, Tensor | None, int | None, Tensor | None, Tensor | None, Tensor | None]:  # fmt: skip
+    """Return harmonics or colours, the degree of harmonics, backgrounds, features and their backgrounds, for our rasterizer."""
+    harmonics, behind = None, None
+    assert colors is not None  # `_check_arguments` has refused it
+    if features is not None and backgrounds is not None and backgrounds.shape[-1] > (count := colors.shape[-1]):
+        backgrounds, behind = backgrounds[..., :count], backgrounds[..., count:]
+    if degree is not None and colors.shape[-1] == 3:
+        harmonics, colors = colors[:, : coefficient_count(degree)], None
+    elif degree is not None:
+        colors, degree = (spherical_harmonics(degree, means, viewmats, colors) + 0.5).clamp_min(0), None
+    if features is not None and features_degree is not None:
+        features = spherical_harmonics(features_degree, means, viewmats, features) + 0.5
+    return harmonics, colors, degree, backgrounds, features, behind
 
 
 BY_VIEW = ("viewmats", "Ks", "distortion", "backgrounds")
@@ -227,20 +247,12 @@ def rasterization(
         UsageError: An option is out of range.
         ValueError: A shape is wrong, or a value of a camera, as in `warpgs.rasterize`.
     """
-    _check_supported(locals())
-    batch, cameras, features, harmonics, behind = means.shape[:-2], viewmats.shape[-3], extra_signals, None, None
+    _check_arguments(locals())
+    batch, cameras = means.shape[:-2], viewmats.shape[-3]
     if "RGB" not in render_mode:
         colors, backgrounds, sh_degree = means.new_zeros(*means.shape[:-1], 1), None, None
-    if colors is None:
-        raise ValueError(f"colors must be given in render_mode {render_mode!r}: only D and ED have none")
-    if features is not None and backgrounds is not None and backgrounds.shape[-1] > (channels := colors.shape[-1]):
-        backgrounds, behind = backgrounds[..., :channels], backgrounds[..., channels:]
-    if sh_degree is not None and colors.shape[-1] == 3:
-        harmonics, colors = colors[:, : coefficient_count(sh_degree)], None
-    elif sh_degree is not None:
-        colors, sh_degree = (spherical_harmonics(sh_degree, means, viewmats, colors) + 0.5).clamp_min(0), None
-    if features is not None and extra_signals_sh_degree is not None:
-        features = spherical_harmonics(extra_signals_sh_degree, means, viewmats, features) + 0.5
+    channels = _channels(means, viewmats, colors, sh_degree, backgrounds, extra_signals, extra_signals_sh_degree)
+    harmonics, colors, sh_degree, backgrounds, features, behind = channels
     lens, distortion = _lens(camera_model, radial_coeffs, tangential_coeffs, viewmats)
     rule, size = replace(rule_named("gsplat-1.6"), low_pass=eps2d), TILE_SIZE if tile_size is None else tile_size
     # an opacity factor holds for all cameras of a call, so a clip needs a call for each camera
