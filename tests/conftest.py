@@ -3,6 +3,7 @@
 import gc
 import os
 import re
+import sys
 
 if "PYTEST_XDIST_WORKER" in os.environ:
     os.environ["OMP_NUM_THREADS"] = "1"  # workers share the cores; tests that are about threads set their number
@@ -101,7 +102,7 @@ def no_overview_in_reports():
 
 @pytest.fixture
 def registries_as_they_were(monkeypatch):
-    """Forget what a test registers."""
+    """Forget what a test registers, and the files that it loads, which would not register again."""
     from warpgs.pipeline.train.loss import LOSS_TERMS
     from warpgs.pipeline.train.strategies.base import STRATEGIES
     from warpgs.pipeline.train.view_modules import VIEW_MODULES
@@ -109,6 +110,10 @@ def registries_as_they_were(monkeypatch):
     for registry in (STRATEGIES, LOSS_TERMS, VIEW_MODULES):
         registry.names()
         monkeypatch.setattr(registry, "_classes", dict(registry._classes))
+    before = set(sys.modules)
+    yield
+    for name in {n for n in sys.modules if n.startswith("_warpgs_")} - before:
+        del sys.modules[name]
 
 
 @pytest.fixture(autouse=True)

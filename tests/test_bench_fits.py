@@ -12,14 +12,14 @@ import pytest
 import torch
 
 from bench.lib import gsplat_trainer, one_fit, pool, result_file, score_times, surfaces
-from bench.lib.arms import ABLATION, ARMS, LADDER, RIVALS, Arm, chosen_steps
+from bench.lib.arms import ABLATION, ARMS, LADDER, PAPERS, RIVALS, Arm, chosen_steps
 from bench.lib.backgrounds import ply_scores
 from bench.lib.gsplat_trainer import default_settings, strategy_of
 from bench.lib.one_fit import Fit, config_of, is_peer, peer_settings
 from bench.lib.points import exponent
 from bench.lib.pool import finished
 from bench.lib.preset_table import rival, sizes_table, tables
-from bench.lib.rivals_page import arms_table, other_steps_table
+from bench.lib.rivals_page import arms_table, other_steps_table, rows_of, scene_of
 from bench.lib.scenes import PHOTOGRAPHS, ROWS, Row, folds, left_out, photographs, row_of, scene_at
 from tests import gaussians as sets
 from tests.scenes import photos
@@ -285,7 +285,7 @@ def test_a_preset_changes_what_it_names_and_nothing_else():
 @pytest.mark.usefixtures("registries_as_they_were")
 @pytest.mark.parametrize("views", [3, 6])
 def test_all_arms_share_start_background_and_degree(views):
-    """Those of `default`, for any number of views; only the ladder's first arm starts at random."""
+    """Those of `default`, for any number of views; the ladder's first arm starts at random, NexusGS from flow."""
     train = photos(views)
     default = settings_by_views(config_of("default"), train, "cpu")[0]
     for arm in (*RIVALS, *LADDER, *ABLATION):
@@ -297,7 +297,7 @@ def test_all_arms_share_start_background_and_degree(views):
         assert (own.sh_degree, own.background) == (default.sh_degree, "auto"), arm.words
         start = (own.init.merge_px, own.init.fill_px, own.init.opacity, own.init.scale_factor)
         same = start == (8, 32, default.init.opacity, default.init.scale_factor) and own.init.source in ("auto", "sweep")
-        assert same != (arm is LADDER[0]), arm.words
+        assert same != (arm in (LADDER[0], PAPERS[0])), arm.words
 
 
 @pytest.mark.usefixtures("registries_as_they_were")
@@ -315,6 +315,11 @@ def test_the_page_pairs_each_method_with_its_base():
     assert "| c | 7 | 19.10 / 0.500 (2 seeds) | -1.00 |" in table
     again = arms_table((*arms, Arm("d", "quick")), rows, ["fern:3"], above=True).splitlines()
     assert again[-2:] == ["| c | 7 | 19.10 / 0.500 (2 seeds) | -2.10 |", "| d |  |  |  |"]
+    arms = (Arm("a", "default", (), (20.5, 0.7, "its paper")), *arms[1:])
+    again = arms_table(arms, rows, ["fern:3"], above=False).splitlines()
+    assert "| a | 4,500 | 20.10 / 0.500 |  | 20.50 / 0.700, its paper |" in again and again[-1].endswith("| -1.00 |  |")
+    assert rows_of([{"row": r} for r in ("llff/room@llff:3", "horns:3", "fern:3")]) == ["fern:3", "horns:3", "llff/room@llff:3"]
+    assert [scene_of(n) for n in ("fern:3", "llff/room@llff:3")] == ["fern", "room"]
     arms = (Arm("a", "default"), Arm("b", "3dgs", (10, 20)))
     rows = results("fern:3", "3dgs:steps=10", [21.0, 21.4]) + results("fern:3", "3dgs:steps=20", [20.0])
     rows += results("fern:3", "default", [22.0, 22.0, 25.0])

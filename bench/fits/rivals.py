@@ -33,8 +33,8 @@ WHAT = "scores, sizes and times of methods by row and seed, under one rule"
 
 
 def work(fit: Fit) -> int:
-    """Return roughly the time of a fit, in steps: a step of two models takes as long as four."""
-    return steps_in(fit.preset) * (4 if "CorGS" in fit.preset else 1)
+    """Return roughly the time of a fit, in steps: a step of two models takes as long as four, one with more renders as two."""
+    return steps_in(fit.preset) * (4 if "CorGS" in fit.preset else 2 if "rivals/" in fit.preset else 1)
 
 
 class Study:

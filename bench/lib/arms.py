@@ -29,19 +29,43 @@ class Arm:
     """Preset with its settings, as `bench.lib.one_fit.Fit` takes it, without steps that are chosen."""
     steps: tuple[int, ...] = ()
     """Numbers of steps to choose from; empty for those of the preset."""
+    published: tuple[float, float, str] | None = None
+    """PSNR [dB] and SSIM of the method on LLFF with three views, means of eight scenes, and who reports them. Not comparable
+    with ours: other starts, and other scenes."""
 
     def with_steps(self, steps: int) -> str:
         """Return the preset with a number of steps."""
         return f"{self.preset}{',' if ':' in self.preset else ':'}steps={steps}"
 
 
+def _paper(words: str, published: tuple[float, float, str] | None, rule: str = ONE_RULE) -> Arm:
+    """Return the arm of a method in `examples/rivals`, of the file and preset with the method's name in small letters."""
+    name = words.lower()
+    return Arm(words, f"examples/rivals/{name}.py:{name}:{rule}", PAPER_STEPS, published)
+
+
+PAPER_STEPS = (500, 1000, 2000, 4000)
+"""Numbers of steps of the papers' methods; CoR-GS took 750 and 1500 on rows of three views."""
+XIONG = "Xiong et al."
+"""Authors of a table of many methods: the paper of `CITATION.cff`."""
+OWN_START = "background=auto,sh_degree=null"
+"""Rule for a method that is mostly its start."""
 COR_GS = f"3dgs:strategy=examples/11_cor_gs.py:CorGS,density.gradient=0.0005,{ONE_RULE}"
 GSPLAT = "gsplat:sh_degree=auto,background=mean"
+PAPERS = (
+    _paper("NexusGS", (21.07, 0.738, XIONG), OWN_START),
+    _paper("FSGS", (20.43, 0.682, XIONG)),
+    _paper("DNGaussian", (19.12, 0.591, XIONG)),
+    _paper("DropGaussian", None),
+    _paper("Binocular3DGS", (21.36, 0.744, "rerun of ReDI-GS")),
+)
+"""Methods of papers as plug-ins, all with the start of `ONE_RULE` but NexusGS."""
 RIVALS = (
     Arm("`default` without extrapolated points", f"default:{NO_EXTRAPOLATION}"),
     Arm("`default`", "default"),
-    Arm("`3dgs`", f"3dgs:{ONE_RULE}", STEPS),
-    Arm("CoR-GS", COR_GS, (750, 1500, 3000, 6000)),
+    Arm("`3dgs`", f"3dgs:{ONE_RULE}", STEPS, (18.54, 0.588, XIONG)),
+    Arm("CoR-GS", COR_GS, (750, 1500, 3000, 6000), (20.45, 0.712, XIONG)),
+    *PAPERS,
     Arm("gsplat", GSPLAT, STEPS),
     Arm("gsplat, as many steps as `default`", f"{GSPLAT},steps={OPAQUE_STEPS}"),
     Arm("gsplat, 7,000 steps", f"{GSPLAT},steps=7000"),
@@ -76,7 +100,7 @@ ABLATION = (
     Arm("no dropout", "default:dropout=0"),
 )
 """One part of `default` changed."""
-ARMS = {"rivals": RIVALS, "ladder": LADDER, "ablation": ABLATION}
+ARMS = {"rivals": RIVALS, "papers": (RIVALS[0], *PAPERS), "ladder": LADDER, "ablation": ABLATION}
 
 
 def steps_in(preset: str) -> int:

@@ -27,7 +27,7 @@ from warpgs.pipeline.paper.strategy import UNIFORM
 from warpgs.pipeline.run.commands import prune
 from warpgs.pipeline.run.precompile import precompile_kernels
 from warpgs.pipeline.run.request import SceneRequest
-from warpgs.pipeline.train.presets import PRESETS
+from warpgs.pipeline.train.presets import PRESETS, preset_settings
 from warpgs.pipeline.train.schedule import mean_color
 from warpgs.pipeline.train.settings import DEGREES, FitConfig
 from warpgs.pipeline.train.strategies.base import STRATEGIES
@@ -77,12 +77,13 @@ def config_of(preset: str, seed: int = 0) -> FitConfig:
     """Return the settings of one of our presets with a seed; ``default`` is the preset of a user who gives none.
 
     ``PRESET:a.b=value,c=value`` changes the named settings; values are JSON, or text without quotes. A strategy may be
-    ``FILE.py:CLASS``; its own settings come after it, by the names of their flags, as in ``lottery.growth=0.2``.
+    ``FILE.py:CLASS``; its own settings come after it, by the names of their flags, as in ``lottery.growth=0.2``. The preset
+    may be ``FILE.py:NAME``.
     """
-    name, _, changes = preset.removeprefix(PRUNED).partition(":")
-    if name not in PRESETS:
+    file, name, changes = re.fullmatch(r"(.+?\.py:(?=\w+(?::|$)))?([^:]*):?(.*)", preset.removeprefix(PRUNED)).groups()
+    if not file and name not in PRESETS:
         raise UsageError(f"preset {name!r} is not one of {', '.join(PRESETS)}")
-    values = PRESETS[name].to_json() | {"seed": seed}
+    values = preset_settings(f"{file or ''}{name}")[0].to_json() | {"seed": seed}
     _change(values, preset, _present(changes))
     return FitConfig.from_json(values)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import statistics
 from collections.abc import Sequence
+from pathlib import Path
 
 from bench.lib import result_file
 from bench.lib.arms import LADDER, RIVALS, Arm, chosen_steps, steps_in
@@ -25,10 +26,22 @@ def preset_in(rows: list[dict], row: str, arm: Arm) -> str | None:
     return preset if preset in held_out else None
 
 
+def rows_of(rows: list[dict]) -> list[str]:
+    """Return the names of the rows of results: those that have a name in their order, then others."""
+    found = dict.fromkeys(r["row"] for r in rows)
+    return [*(n for n in ROWS if n in found), *sorted(found.keys() - ROWS.keys())]
+
+
+def scene_of(name: str) -> str:
+    """Return the scene of a row for a heading: fern of fern:3, room of llff/room@llff:3."""
+    return Path(name.partition("@")[0]).name.partition(":")[0]
+
+
 def arms_table(arms: Sequence[Arm], rows: list[dict], names: Sequence[str], above: bool) -> str:
-    """Return PSNR and SSIM of each arm on each row, with its steps, and the difference in PSNR to the base by seed."""
+    """Return PSNR and SSIM of each arm on each row, its steps, the difference in PSNR to the base, and published scores."""
     held_out = [r for r in rows if not r.get("left_out")]
     found, confidence, body = by_seed(held_out), family_confidence(len(arms) - 1), []
+    published = any(arm.published for arm in arms)
     for place, arm in enumerate(arms):
         body.append([arm.words])
         for name in names:
@@ -47,8 +60,13 @@ def arms_table(arms: Sequence[Arm], rows: list[dict], names: Sequence[str], abov
             count = "" if len(own) == max(len(s) for s in found.values()) else f" ({len(own)} seed{'s' * (len(own) > 1)})"
             score = " / ".join(f"{statistics.mean(r[k] for r in own.values()):.{n}f}" for k, n in (("psnr", 2), ("ssim", 3)))
             body[-1] += [f"{steps_in(preset):,}", score + count, change]
-    scenes = [name.split(":")[0] for name in names]
+        if published:
+            body[-1].append(
+                "" if arm.published is None else f"{arm.published[0]:.2f} / {arm.published[1]:.3f}, {arm.published[2]}"
+            )
+    scenes = [scene_of(name) for name in names]
     head = [heading for s in scenes for heading in (f"{s}: steps", "PSNR / SSIM", "change" if above else "difference")]
+    head += ["published, LLFF of 3 views"] * published
     return markdown(["step" if above else "method", *head], body, ["step" if above else "method"])
 
 
@@ -57,8 +75,9 @@ def _page_table(name: str, arms: Sequence[Arm], above: bool) -> str:
     tables = []
     for machine, result in result_file.stored(name).items():
         rows = result["rows"]
-        names = [n for n in ROWS if any(r["row"] == n for r in rows)]
-        tables.append(arms_table(arms, rows, names, above) + "\n" + result_file.source(f"{name}_{machine}"))
+        names = rows_of(rows)
+        measured = [arm for arm in arms if any(preset_in(rows, n, arm) for n in names)]
+        tables.append(arms_table(measured, rows, names, above) + "\n" + result_file.source(f"{name}_{machine}"))
     command = f"python -m bench.fits.rivals DATA --rows fern:3 horns:3 --set {name} --out FILE"
     return "\n".join(tables) or f"Not measured yet: `{command}`.\n"
 
@@ -83,9 +102,7 @@ def other_steps_table(arms: Sequence[Arm], rows: list[dict], names: Sequence[str
                 own = found.get((name, preset))
                 if own and preset != preset_in(rows, name, arm):
                     psnr = [r["psnr"] for r in own.values()]
-                    body.append(
-                        [name.split(":")[0], arm.words, f"{steps_in(preset):,}", f"{mean_sd(psnr)} ({len(psnr)} seeds)"]
-                    )
+                    body.append([scene_of(name), arm.words, f"{steps_in(preset):,}", f"{mean_sd(psnr)} ({len(psnr)} seeds)"])
                     seeds = sorted(own.keys() & first.keys())
                     body[-1].append(
                         f"{statistics.mean(own[s]['psnr'] - first[s]['psnr'] for s in seeds):+.2f}" if seeds else ""
@@ -99,6 +116,6 @@ def other_steps() -> str:
     tables = []
     for machine, result in result_file.stored("rivals").items():
         rows = result["rows"]
-        names = [n for n in ROWS if any(r["row"] == n for r in rows)]
+        names = rows_of(rows)
         tables.append(other_steps_table(RIVALS, rows, names) + f"\nSource: `rivals_{machine}.json`.\n")
     return "\n".join(tables)
