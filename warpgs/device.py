@@ -80,6 +80,12 @@ def keep_all_freed_memory() -> None:
     _set_malloc((M_ARENA_MAX, 1), (M_MMAP_MAX, 0), (M_TRIM_THRESHOLD, 2**31 - 1), (M_TOP_PAD, 2**26))
 
 
+def return_freed_memory() -> None:
+    """Let glibc return the memory that it keeps to the system, which then counts as free."""
+    with contextlib.suppress(AttributeError, OSError, TypeError):  # no glibc
+        ctypes.CDLL(None).malloc_trim(0)
+
+
 MAX_THREADS = 16
 """Most threads of `in_background`: each holds the images of one view."""
 

@@ -5,6 +5,7 @@ import dataclasses
 import hashlib
 import json
 import math
+from concurrent.futures import CancelledError
 from dataclasses import replace
 
 import numpy as np
@@ -336,6 +337,9 @@ def test_a_render_is_made_once_while_there_is_room(monkeypatch):
     assert all(np.array_equal(a, b) for a, b in zip(first[2], again[2]))
     coverage_of_run(None, g, views[:1], views[1:2], RasterizeOptions(), names={}, renders=renders)
     assert len(made) == 4
+    renders.ended = True  # a fit that ends with an error: the thread of the coverage stops
+    with pytest.raises(CancelledError):
+        coverage_of_run(None, g, views[:1], views[1:2], RasterizeOptions(), names={}, renders=renders)
 
 
 def test_scores_split_into_what_they_are_made_of(tmp_path):

@@ -640,7 +640,7 @@ def test_bad_input_is_named(run, tmp_path, capsys, monkeypatch):
         assert main(["prune", *words, "--device", "cpu"]) == code
         assert message in capsys.readouterr().err
     assert [p.name for p in tmp_path.iterdir()] == ["there"]
-    for keep in (0, math.nan, math.inf):
+    for keep in (0, 1e-9, 5000, math.nan, math.inf):
         with pytest.raises(UsageError, match="keep-psnr"):
             prune(run, keep, None, "cpu")
     monkeypatch.chdir(run)

@@ -256,6 +256,8 @@ def test_gaussians_that_no_view_shows_are_removed(monkeypatch):
     assert [s for s in range(41) if fit.strategy.prunes(s)] == [28, 37]
     resets = dataclasses.replace(CONFIG, density=dataclasses.replace(CONFIG.density, reset_every=3))
     assert not any(fitted(resets, 0).strategy.prunes(s) for s in range(41))  # after a reset nothing is seen
+    long = plan_phases(PhaseConfig(coarse=2000, stable=3000), 30_000)
+    assert max(sampling.removals(long, 87)) == 28_500  # not among the steps that are averaged
     monkeypatch.setattr(sampling, "PRUNE_LEAST", 14)
     assert not any(fit.strategy.prunes(s) for s in range(41))
 

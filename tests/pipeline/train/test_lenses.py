@@ -475,6 +475,10 @@ def test_opacity_counts_only_away_from_an_object_on_black():
     assert torch.equal(empty, expected)
     inputs = LossInputs({"alpha": torch.full((480, 640), 0.2)}, Target(view.image, None, {"empty": empty}), None, None, None)
     assert float(EmptyOpacity(0.5)(inputs)) == pytest.approx(0.5 * 0.2 * (1 - 108 * 108 / (480 * 640)), rel=1e-5)
+    mask = torch.zeros(480, 640)
+    mask[:, :300] = 1  # 4 columns of it are near the object
+    masked = dataclasses.replace(inputs, target=dataclasses.replace(inputs.target, mask=mask))
+    assert float(EmptyOpacity(0.5)(masked)) == pytest.approx(0.5 * 0.2 * (1 - 4 * 108 / (480 * 300)), rel=1e-5)
     assert not EmptyOpacity().needs(dataclasses.replace(view, alpha=None), None)["empty"].any()
 
 

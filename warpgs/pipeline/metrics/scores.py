@@ -4,6 +4,7 @@ import math
 import threading
 import warnings
 from collections.abc import Iterable, Sequence
+from concurrent.futures import CancelledError
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Protocol, runtime_checkable
 
@@ -195,12 +196,15 @@ class Renders:
         """Begin without a render."""
         self._parts, self._left = (gaussians, options), KEPT_BYTES
         self._kept: dict[int, tuple[Camera, tuple[np.ndarray, np.ndarray, np.ndarray]]] = {}
-        self._lock = threading.Lock()
+        self._lock, self.ended = threading.Lock(), False
+        """Whether the fit ends with an error: threads that still render get one, too."""
 
     @torch.no_grad()
     def __call__(self, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return colours [H, W, 3], depth [u] [H, W] and alpha [H, W] as numpy arrays, which nobody may change."""
         with self._lock:
+            if self.ended:
+                raise CancelledError
             if id(camera) in self._kept:  # a kept camera lives, so no other has its id
                 return self._kept[id(camera)][1]
             gaussians, options = self._parts

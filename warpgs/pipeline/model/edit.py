@@ -321,5 +321,5 @@ def prune_model(
             lowers = False
             tried.clear()
         else:
-            aim *= AIM * allowed / lost
+            aim = AIM * min(aim, tried.get(budget, aim)) * allowed / lost
     return by_degree(gaussians), 0.0

@@ -248,8 +248,8 @@ def prune(
     tell: Callable[[str], object] = lambda line: None,
 ) -> list[str]:  # fmt: skip
     """Shrink a run into a new folder whose mean training PSNR falls by at most ``keep_psnr`` [dB]; returns lines."""
-    if not 0 < keep_psnr < math.inf:
-        raise UsageError(f"--keep-psnr must be above 0 dB, not {keep_psnr}; a loss of 0.1 dB is invisible")
+    if not 1e-6 <= keep_psnr <= 100:
+        raise UsageError(f"--keep-psnr must be in [1e-6, 100] dB, not {keep_psnr}; a loss of 0.1 dB is invisible")
     device, _ = choose_device(device_name)
     stored = open_run(folder, device)
     out = _new_folder(folder, out)

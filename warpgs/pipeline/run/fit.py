@@ -413,16 +413,17 @@ def fit(
         began = time.perf_counter()
         lpips = None if lpips_weights is None else Lpips(Path(lpips_weights), chosen)
         read, request, parts, found = _read(scene, split, chosen, out, progress, ranks)
-        thread, stopped = beside.enter_context(ThreadPoolExecutor(1)), threading.Event()
-        beside.callback(stopped.set)
-        views = itertools.takewhile(lambda _: not stopped.is_set(), read.views)
-        hashed = thread.submit(lambda: read.fingerprint if isinstance(scene, Scene) else fingerprint(views))
         job = FitJob(
             scene=read, request=request, split=parts, config=config, device=chosen, where=where, out=own, lpips=lpips,
             notes=[*notes, *origin, *held, *found], verbose=verbose, on_step=on_step, on_model=on_model, ranks=ranks,
             began=began, clock=clock, progress=progress, compiled=compiled,
         )  # fmt: skip
         _settle(job, time_budget)
+        thread, stopped = beside.enter_context(ThreadPoolExecutor(1)), threading.Event()
+        beside.callback(stopped.set)
+        views = itertools.takewhile(lambda _: not stopped.is_set(), read.views)
+        # only now: a time budget is measured without another thread
+        hashed = thread.submit(lambda: read.fingerprint if isinstance(scene, Scene) else fingerprint(views))
         trainer, record, checks = _prepare(job, out if resume else None, hashed.result)
         if own is not None and not resume:
             write_json(own / CONFIG, record)
@@ -616,11 +617,16 @@ def _score(
     scored = (job.out, gaussians, train, test, options)
     with ThreadPoolExecutor(1) as thread:
         covered = test and compare and thread.submit(coverage_of_run, *scored, names=names, renders=renders)
-        with section("scoring"):
-            metrics = results.evaluate_run(*scored, job.lpips, names=names, renders=renders, tell=tell)
-        if covered:
-            with section("coverage"):
-                metrics["coverage"] = covered.result()
+        try:
+            with section("scoring"):
+                metrics = results.evaluate_run(*scored, job.lpips, names=names, renders=renders, tell=tell)
+            if covered:
+                tell("checking coverage")
+                with section("coverage"):
+                    metrics["coverage"] = covered.result()
+        except BaseException:  # an interrupt does not wait for all of the coverage
+            renders.ended = True
+            raise
     tell("checking float32 accuracy")
     rule = results.rule_report_of(gaussians, train, options, seed=c.seed, half_resolution=trainer.half_resolution)
     shape = shape_figures(gaussians, c.limits, trainer.radius, trainer.context.extent, [v.camera for v in train])

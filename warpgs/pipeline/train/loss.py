@@ -296,14 +296,16 @@ class EmptyOpacity(LossTerm, group="empty."):
         return {"empty": 1 - near[0, 0]}
 
     def bytes(self, sizes: StepSizes) -> Needs:
-        """Return the bytes of the product and its gradient, and of the copy of the map on CUDA."""
+        """Return the bytes of the products and a gradient, and of the copy of the map on CUDA."""
         copy = FLOAT * sizes.pixels * sizes.cuda
-        return {**dict.fromkeys(STEP, copy), LOSS: copy + 2 * FLOAT * sizes.pixels}
+        return {**dict.fromkeys(STEP, copy), LOSS: copy + (2 + sizes.masked) * FLOAT * sizes.pixels}
 
     def __call__(self, inputs: LossInputs) -> torch.Tensor:
-        """Compute ``weight`` times the sum of the opacities of empty pixels, divided by the number of pixels, shape []."""
-        alpha = inputs.outputs["alpha"]
-        return total(alpha * inputs.target.maps["empty"]) * (self.weight / alpha.numel())
+        """Compute ``weight`` times the sum of opacities of empty pixels, divided by the number of unmasked pixels, shape []."""
+        opacities, mask = inputs.outputs["alpha"] * inputs.target.maps["empty"], inputs.target.mask
+        if mask is None:
+            return total(opacities) * (self.weight / opacities.numel())
+        return total(opacities * mask) / mask.sum().clamp_min(1) * self.weight
 
 
 # Loss terms for given depth and normals, for views that have them.

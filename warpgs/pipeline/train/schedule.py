@@ -107,7 +107,7 @@ class PhaseConfig(Checked, group="phases."):
     coarse: Annotated[int, Within(0)] = 0
     """Steps of phase 1, with only the coarse layer; 2000 in the paper. If this and ``stable`` are 0, the fit has no phases."""
     stable: Annotated[int, Within(0)] = 0
-    """Steps of phase 3, in which no Gaussians are added or removed; 3000 in the paper."""
+    """Steps of phase 3, in which no Gaussians are added, and only unseen ones are removed; 3000 in the paper."""
     least: Annotated[float, Within(1, math.inf, ")")] = 1.0
     """Smallest number of steps from the first sampling event to the second in a short fit, which shortens this interval. On a
     CPU an event takes as long as ten steps."""

@@ -31,7 +31,7 @@ from warpgs.pipeline.train.schedule import OptimizerConfig, PhaseConfig, color_o
 from warpgs.pipeline.train.stopping import StoppingConfig
 from warpgs.pipeline.train.strategies.base import STRATEGIES, Settings, find_strategy
 from warpgs.pipeline.train.strategies.clone_split import DensityConfig
-from warpgs.pipeline.train.strategies.sampling import MAX_VIEWS, MAX_WEIGHED, MethodConfig, removals
+from warpgs.pipeline.train.strategies.sampling import AVERAGE_LAST, MAX_VIEWS, MAX_WEIGHED, MethodConfig, removals
 from warpgs.pipeline.train.view_modules import VIEW_MODULES, ViewModule
 from warpgs.plugins import Registry, flag_group, own_code
 from warpgs.priors.views import PriorConfig
@@ -517,9 +517,9 @@ EXTRAPOLATED_VIEWS, EXTRAPOLATED_DECAY = 4, 0.0015
 """Largest number of opaque views for a start with extrapolated points, in fits of at least `SMOOTH_STEPS` steps; and the decay
 of opacities with such points. Fits with more views or fewer steps were not measured
 (docs/decisions/026-extrapolated-points.md)."""
-AVERAGE_LAST, AVERAGED_VIEWS = 0.05, 20
-"""Fraction of the steps over which parameters are averaged at the end, and fewest training views with this mean. With 12 views
-the gain is at most 0.04 dB (docs/decisions/029-mean-of-the-last-steps.md)."""
+AVERAGED_VIEWS = 20
+"""Fewest training views with the mean of the last steps. With 12 views the gain is at most 0.04 dB
+(docs/decisions/029-mean-of-the-last-steps.md)."""
 MIN_GAIN_DB = 0.1
 """Gain of held-out blocks below which growth ends [dB]. Nothing is held out if the time limit on a CPU shortens the fit: it is
 too short to end earlier, and a measurement renders every view (docs/decisions/025-time-on-a-cpu.md)."""

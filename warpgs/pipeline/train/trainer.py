@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from warpgs.clock import section
-from warpgs.device import available_bytes, format_bytes, is_out_of_memory, no_memory_message
+from warpgs.device import available_bytes, format_bytes, is_out_of_memory, no_memory_message, return_freed_memory
 from warpgs.errors import DataError, NotFiniteError, OutOfMemoryError, ResourceError, UsageError
 from warpgs.io.images import without_masked
 from warpgs.kernels.update import NOT_FINITE, Setting
@@ -293,6 +293,7 @@ class Trainer:
         self.taker.clear()
         if self.device.type == "cuda":
             torch.cuda.empty_cache()
+        return_freed_memory()
         held = self.layout.held(len(self.table))
         self.memory_limit, self.captured = held + available_bytes(self.device) * 4 // 5, False
         if self.config.memory_limit is not None:
@@ -320,7 +321,7 @@ class Trainer:
         steps = range(first, first + count)
         buffers.load([row for _, row in places[:count]], [self._lr_row(s) for s in steps], [self.settings(s) for s in steps])
         self.chosen = chosen
-        if self.layout.graphs:
+        if self.layout.graphs and self.stopping.ended is None:
             self.strategy.before_steps(steps[-1])
         try:
             self.taker.take(
@@ -432,6 +433,7 @@ class Trainer:
             sums=self.taker.kept_sums, averaged=self.mean.fraction > 0,
         )  # fmt: skip
         most = most_instances(self.gaussians, [v.camera for v in shown], self.context.render_options())
+        return_freed_memory()  # that of reading
         self.memory = plan(
             self.layout, count=len(self.table), instances=most, most=c.max_gaussians, limit=self.memory_limit,
             available=available_bytes(self.device), capacity_factor=CAPACITY_FACTOR,

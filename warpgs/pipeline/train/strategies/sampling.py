@@ -44,14 +44,18 @@ PROTECTED_STEPS, PROTECTED_OPACITY = 500, 0.05
 PRUNE_EVERY, PRUNE_VIEWS, PRUNE_LEAST, PRUNE_LATE = 500, 40, 8, (0, 13 / 16, 3 / 8)
 """Steps between removals of unseen Gaussians while the set grows: at most a tenth of the fit, but at least the second number
 for each view, since a removal renders all of them. Fewest steps for each view of a fit with any removal, which takes as long as
-0.8 steps for each view. And times of the last removals as fractions of phase 3, all before the steps over which parameters are
-averaged; the third only in a fit that is long enough for three by the second number."""
+0.8 steps for each view. And times of the last removals as fractions of phase 3, the third only in a fit that is long enough for
+three by the second number."""
+AVERAGE_LAST = 0.05
+"""Fraction of the steps over which parameters are averaged at the end (docs/decisions/029-mean-of-the-last-steps.md). Removals
+are before them: the mean begins anew after a removal."""
 
 
 def removals(p: Phases, views: int) -> set[int]:
     """Return the numbers of steps done when Gaussians that none of some views shows are removed."""
     most = max(p.planned // (PRUNE_VIEWS * max(1, views)), 2) if p.planned >= PRUNE_LEAST * views else 0
-    late = {p.stable_start + int(part * (p.steps - p.stable_start)) for part in PRUNE_LATE[:most]}
+    last = p.steps - int(AVERAGE_LAST * p.steps)
+    late = {min(p.stable_start + int(part * (p.steps - p.stable_start)), last) for part in PRUNE_LATE[:most]}
     every = max(1, min(PRUNE_EVERY, p.planned // 10), PRUNE_VIEWS * views)
     return {s for s in range(every, p.stable_start, every) if s > p.refine} | {s for s in late if s < p.steps}
 
