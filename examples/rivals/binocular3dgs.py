@@ -30,7 +30,7 @@ from warpgs.train import (
 
 import torch
 
-SPARE, MIN_INSTANCES = 2, 100_000
+SPARE, MIN_INSTANCES = 3, 100_000
 """Capacity for (Gaussian, tile) instances of a captured render: `SPARE` times the most instances of a training view, plus
 `MIN_INSTANCES`."""
 MIN_ALPHA = 0.5

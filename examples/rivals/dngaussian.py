@@ -29,9 +29,9 @@ from warpgs.train import (
 
 import torch
 
-SPARE, MIN_INSTANCES = 4, 100_000
-"""Capacity for (Gaussian, tile) instances of a captured render: `SPARE` times the most instances of a training view, plus
-`MIN_INSTANCES`. Hard depth has more instances, since a Gaussian of higher opacity touches more tiles."""
+SPARE, MIN_INSTANCES = 3, 100_000
+"""Capacity for (Gaussian, tile) instances of a captured render: `SPARE` times the most instances of hard depth in a training
+view, plus `MIN_INSTANCES`. Opaque Gaussians touch more tiles."""
 MIN_ALPHA = 0.5
 """Opacity above which a pixel has a depth."""
 SMALLEST = 1e-3
@@ -132,7 +132,7 @@ class DNGaussian(CloneSplit):
         context, options = self.context, self.context.render_options()
         self.render = eager_renderer(options, None)
         if context.device.type == "cuda":
-            most = most_instances(context.gaussians, [v.camera for v in context.views], options)
+            most = most_instances(self.opaque(context.gaussians), [v.camera for v in context.views], options)
             self.render = captured_renderer(options, SPARE * most + MIN_INSTANCES, self.overflow)
 
     def regularisation(self, phase: Hashable, gaussians: warpgs.Gaussians) -> torch.Tensor:
@@ -147,12 +147,16 @@ class DNGaussian(CloneSplit):
         viewmat, K, given, mask = (t.index_select(0, view) for t in (self.viewmats, self.Ks, self.disparities, self.masks))
         camera = dataclasses.replace(self.context.views[0].camera, viewmat=viewmat, K=K)
         fixed = {n: t.detach() for n, t in gaussians.tensors().items()}
-        logit = math.log(self.config.opacity / (1 - self.config.opacity))
-        hard = fixed | {"means": gaussians.means, "logit_opacities": torch.full_like(fixed["logit_opacities"], logit)}
-        soft = fixed | {"logit_opacities": gaussians.logit_opacities}
-        renders = (self.render(warpgs.Gaussians(**t), camera, 0, None, None) for t in (hard, soft))
+        hard = self.opaque(warpgs.Gaussians(**(fixed | {"means": gaussians.means})))
+        soft = warpgs.Gaussians(**(fixed | {"logit_opacities": gaussians.logit_opacities}))
+        renders = (self.render(g, camera, 0, None, None) for g in (hard, soft))
         one, other = (self._term(r, given[0], mask[0]) for r in renders)
         return one, other
+
+    def opaque(self, gaussians: warpgs.Gaussians) -> warpgs.Gaussians:
+        """Return the Gaussians with the opacity of hard depth."""
+        logit = math.log(self.config.opacity / (1 - self.config.opacity))
+        return dataclasses.replace(gaussians, logit_opacities=torch.full_like(gaussians.logit_opacities, logit))
 
     def _term(self, render: warpgs.Render, given: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
         """Return the difference of a render's depth to a disparity [H, W], shape []; 0 if the disparity is unknown."""
