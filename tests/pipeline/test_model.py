@@ -377,6 +377,7 @@ def test_a_clean_up_names_each_outlier():
     colors = base_colors(shown.sh)
     np.testing.assert_allclose(colors[[0, 2]], np.array([REASONS["size"][2], REASONS["opacity"][2]]) / 255, atol=1e-6)
     assert shown.log_scales[0].max() < -2 and shown.logit_opacities[2] > 0 and torch.equal(shown.sh[3:], made.sh[3:])
+    assert chosen_reasons("all, unseen") == tuple(REASONS) and chosen_reasons("size, unseen") == ("size", "unseen")
     for wrong in ("", "unseen,", "far", "show,all"):
         with pytest.raises(UsageError, match="show, all, or some of opacity, unseen, size"):
             chosen_reasons(wrong)
@@ -428,7 +429,10 @@ def test_largest_budget(limit, power):
     """At nearly the whole limit, never above it, after few tries from far off; at a step between both sides of it."""
     tried = {}
     budget = edit.largest_budget(tried, lambda b: (b / limit) ** power, 1.0, 1e9, 1.0)
-    assert edit.AIM <= (budget / limit) ** power <= 1 and len(tried) <= 5
+    assert edit.AIM <= (budget / limit) ** power <= 1 and len(tried) <= 6
+    bounded = {}
+    budget = edit.largest_budget(bounded, lambda b: 40 * (1 - math.exp(-((b / limit) ** power) / 10)), 1e6, 1e9, 3.0)
+    assert edit.AIM * 3 <= bounded[budget] <= 3
     tried = {}
     budget = edit.largest_budget(tried, lambda b: 1e-9 + 1e3 * (b > limit), 1.0, 1e9, 1.0)
     assert 0 < budget <= limit and len(tried) == edit.TRIES

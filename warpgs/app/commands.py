@@ -217,7 +217,7 @@ def prune(
 
     Args:
         run: Run folder of `warpgs fit`; it is not changed.
-        keep_psnr: Largest drop of the mean PSNR over the training views [dB]. Default: 0.1.
+        keep_psnr: Largest drop of the mean PSNR over the training views [dB]; 0.1 without --clean.
         clean: Remove floaters instead: all, or some of opacity,unseen,size,needles,distance,density; show (write clean.png
             into the run, which shows what would go).
         out: Run folder to write; must not exist yet. Default: RUN-pruned.

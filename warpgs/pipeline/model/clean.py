@@ -67,10 +67,10 @@ def reasons_of(gaussians: Gaussians, maxima: torch.Tensor | None) -> dict[str, t
 
 def chosen_reasons(text: str) -> tuple[str, ...]:
     """Return the reasons of a text: names separated by commas, or all."""
-    names = tuple(REASONS) if text == "all" else tuple(text.split(","))
-    if unknown := [n for n in names if n not in REASONS]:
+    words = [word.strip() for word in text.split(",")]
+    if unknown := [word for word in words if word not in (*REASONS, "all")]:
         raise UsageError(f"--clean {unknown[0][:60]}: give show, all, or some of {', '.join(REASONS)}, separated by commas")
-    return names
+    return tuple(REASONS) if "all" in words else tuple(words)
 
 
 def counted_lines(found: dict[str, torch.Tensor]) -> list[str]:

@@ -215,8 +215,8 @@ def levelling(up: np.ndarray) -> np.ndarray:
     return rotation_about(axis if angle % math.pi > 1e-12 else np.array([1.0, 0.0, 0.0]), angle)
 
 
-TRIES = 6
-"""Largest number of models that a search tries on few views."""
+TRIES = 12
+"""Largest number of models that a search tries on few views; about four are needed."""
 AIM = 0.9
 """A search ends at this part of the allowed loss; it costs about 1 % of the Gaussians that could be removed."""
 DEGREES_FRACTION = 1 / 3
@@ -234,8 +234,8 @@ def largest_budget(
 ) -> float:
     """Return the largest budget that was tried and has at most the allowed loss, or 0; adds to ``tried``, the losses by budget.
 
-    The loss is about a power of the budget: the next one is on the line through the nearest two losses, in logarithms, and
-    inside of the budgets that are known to be too small and too large. ``first`` is tried first; none is above ``most``.
+    The loss is about a power of the budget: the next one is on the line through the nearest two losses, in logarithms. Between
+    budgets that are known to be too small and too large, every second one is in the middle: a large loss has an upper bound. ``first`` is tried first; none is above ``most``.
     """
     target = math.sqrt(AIM) * allowed
     for _ in range(TRIES):
@@ -251,7 +251,8 @@ def largest_budget(
             power = math.log(losses[1] / losses[0]) / (ends[1] - ends[0]) if len(near) > 1 else 1.0
             step = math.log(target / allowed / losses[0]) / min(5.0, max(0.2, power))
             if low > 0 and high < math.inf:
-                step = (ends[1] - ends[0]) * min(0.9, max(0.1, step / (ends[1] - ends[0])))
+                part = 0.5 if len(tried) % 2 else min(0.9, max(0.1, step / (ends[1] - ends[0])))
+                step = part * (ends[1] - ends[0])
             at = min(most, near[0] * math.exp(step))
         tried[min(at, most)] = loss(min(at, most))
     return max((budget for budget, lost in tried.items() if lost <= allowed), default=0.0)
