@@ -235,7 +235,8 @@ def largest_budget(
     """Return the largest budget that was tried and has at most the allowed loss, or 0; adds to ``tried``, the losses by budget.
 
     The loss is about a power of the budget: the next one is on the line through the nearest two losses, in logarithms. Between
-    budgets that are known to be too small and too large, every second one is in the middle: a large loss has an upper bound. ``first`` is tried first; none is above ``most``.
+    budgets that are known to be too small and too large, every second one is in the middle: a large loss has an upper bound.
+    ``first`` is tried first; none is above ``most``.
     """
     target = math.sqrt(AIM) * allowed
     for _ in range(TRIES):

@@ -598,7 +598,7 @@ def _finish(job: FitJob, trainer: Trainer, record: dict[str, Any], checks: list[
 
 SHARP = 0.1
 """Least part of `steps_by_views` after which views are compared for moving objects. In static scenes, blurred edges were
-reported at .01 and .05 of them, and nothing at .19."""
+reported at .01 and .05 of them."""
 
 
 def _score(
