@@ -118,7 +118,9 @@ def test_units_and_the_default_strategy_of_gsplat(fake_gsplat, monkeypatch):
     monkeypatch.setitem(sys.modules, "gsplat", SimpleNamespace(DefaultStrategy=default))
     s = default_settings(7000)
     strategy, state = strategy_of(s, 2.5)
-    assert strategy.told == {"refine_start_iter": 500, "refine_stop_iter": 3500, "refine_every": 100} and state == 2.5
+    told = {"refine_start_iter": 500, "refine_stop_iter": 3500, "refine_every": 100, "reset_every": 3000}
+    assert strategy.told == told
+    assert state == 2.5
     assert (s.init_opacity, s.init_scale, s.opacity_reg, s.scale_reg) == (0.1, 1.0, 0.0, 0.0)
 
 
@@ -188,21 +190,6 @@ def test_a_fit_gives_a_row_and_the_peer_starts_from_the_same_points(demo, fake_g
         counts[preset] = row.get("points")
     seen = scene_at(str(demo), 1).points.seen_by(set(split_views(scene_at(str(demo), 1), split_spec(8)).train), least=2)
     assert counts[one_fit.PEER_POINTS] == len(seen) != counts[one_fit.PEER] > 0
-
-
-def test_the_default_strategy_has_its_own_settings(fake_gsplat, monkeypatch):
-    """Refinement up to half of the steps, no regularizers, opacity 0.1; its state knows the size of the scene."""
-    made = SimpleNamespace(
-        DefaultStrategy=lambda **k: SimpleNamespace(told=k, initialize_state=lambda scene_scale: scene_scale)
-    )
-    monkeypatch.setitem(sys.modules, "gsplat", made)
-    s = default_settings(7000)
-    strategy, state = strategy_of(s, 2.5)
-    assert (
-        strategy.told == {"refine_start_iter": 500, "refine_stop_iter": 3500, "refine_every": 100, "reset_every": 3000}
-        and state == 2.5
-    )
-    assert (s.init_opacity, s.init_scale, s.opacity_reg, s.scale_reg) == (0.1, 1.0, 0.0, 0.0)
 
 
 def results(row: str, preset: str, scores: list[float], **more) -> list[dict]:
