@@ -117,5 +117,7 @@ def other_steps() -> str:
     for machine, result in result_file.stored("rivals").items():
         rows = result["rows"]
         names = rows_of(rows)
-        tables.append(other_steps_table(RIVALS, rows, names) + f"\nSource: `rivals_{machine}.json`.\n")
+        table = other_steps_table(RIVALS, rows, names)
+        if len(table.splitlines()) > 2:  # more than the heading
+            tables.append(table + f"\nSource: `rivals_{machine}.json`.\n")
     return "\n".join(tables)
