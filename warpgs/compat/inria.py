@@ -98,7 +98,7 @@ def _camera(settings: GaussianRasterizationSettings) -> Camera:
         )
     # the product of both matrices is rounded, in float32 by up to a thousandth of a pixel
     (fx, cx), (fy, cy) = ((s / (2 * t), round(s / 2 * (1 + o), 3)) for s, t, o in zip((width, height), tangents, off))
-    K = torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64)
+    K = torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64, device="cpu")
     return Camera(settings.viewmatrix.reshape(4, 4).T, K, width, height)
 
 
