@@ -300,6 +300,8 @@ def test_harmonics_and_rotations():
     torch.testing.assert_close(packed, wanted[mask])
     between = gsplat.spherical_harmonics(2, means, poses, coeffs, viewmats_rs=poses.flip(1))
     torch.testing.assert_close(between[:, 0], between[:, 1])
+    with pytest.raises(ValueError, match=r"viewmats must have shape \[..., C, 4, 4\], not \[4, 4\]; viewmats\[None\]"):
+        gsplat.rasterization(**scene() | {"viewmats": torch.eye(4)})
     with pytest.raises(ValueError, match="at least 25 rows"):
         gsplat.spherical_harmonics(4, means, poses, coeffs)
     two = gsplat.rasterization(**scene((2,)) | {"colors": coeffs[..., :2].float()}, sh_degree=2)[0]

@@ -146,6 +146,7 @@ def test_a_pose_a_plane_and_a_middle():
         ({"debug": True}, {}, "debug=True is not supported: .*give False"),
         ({"tanfovx": 0.5}, {}, "projmatrix is not viewmatrix times"),
         ({"viewmatrix": pose()}, {}, "give both matrices transposed"),
+        ({"viewmatrix": pose().to("meta")}, {}, "viewmatrix is on meta, projmatrix on cpu; move both"),
         ({"projmatrix": torch.full((4, 4), math.nan)}, {}, "projmatrix is not viewmatrix times"),
         ({}, {"colors_precomp": torch.ones(COUNT, 3)}, "give either shs or colors_precomp"),
         ({}, {"shs": None}, "give either shs or colors_precomp"),

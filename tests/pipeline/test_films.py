@@ -176,6 +176,8 @@ def test_a_film_alone_and_six_frames_on_a_sheet(model, tmp_path, capsys):
         render_film(model, mixed, tmp_path / "a.mp4", FilmSettings())
     with pytest.raises(UsageError, match="no camera"):
         warpgs.render_path(model, [], out=tmp_path / "x")
+    with pytest.raises(TypeError, match=r"not Gaussians; `warpgs\.rasterize` renders"):
+        warpgs.render_path(model.gaussians(), out=tmp_path / "x")
 
 
 # Paths of films: what the cameras are is found from their poses, and every frame sees what matters.

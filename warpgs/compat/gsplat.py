@@ -120,6 +120,8 @@ def _check_arguments(arguments: dict[str, Any]) -> None:
         raise UnsupportedError("\n".join(f"warpgs does not support {name}: {why}" for name, why in refused.items()))
     if arguments["colors"] is None and "RGB" in (mode := arguments["render_mode"]):
         raise ValueError(f"colors must be given in render_mode {mode!r}: only D and ED have none")
+    if (poses := arguments["viewmats"]).ndim < 3 or poses.shape[-2:] != (4, 4):
+        raise ValueError(f"viewmats must have shape [..., C, 4, 4], not {list(poses.shape)}; viewmats[None] is one camera")
 
 
 def _lens(model: str, radial: Tensor | None, tangential: Tensor | None, poses: Tensor) -> tuple[str, Tensor | None]:

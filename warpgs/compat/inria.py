@@ -84,6 +84,8 @@ class _Screen(torch.autograd.Function):
 def _camera(settings: GaussianRasterizationSettings) -> Camera:
     """Return the camera of the settings; UsageError where their matrices and angles contradict each other."""
     height, width, *tangents = settings[:4]
+    if (where := settings.viewmatrix.device) != settings.projmatrix.device:
+        raise UsageError(f"viewmatrix is on {where}, projmatrix on {settings.projmatrix.device}; move both to the Gaussians")
     matrices = settings.viewmatrix.detach().reshape(4, 4), settings.projmatrix.detach().reshape(4, 4)
     pose, projection = torch.stack(matrices).double().cpu()  # both at once, since a GPU is waited for
     off = [float(pose[:3, 2] @ projection[:3, axis]) for axis in (0, 1)]

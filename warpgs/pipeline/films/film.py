@@ -392,8 +392,12 @@ def render_path(
     Raises:
         DataError: A file of keyframes cannot be read.
         ResourceError: A file cannot be written, or another process writes into the folder.
+        TypeError: The model is none.
         UsageError: The path or the units are unknown, or a number is out of its range.
     """
+    if not isinstance(model, FittedModel):
+        kind = type(model).__name__
+        raise TypeError(f"model must be the result of fit or open_run, not {kind}; `warpgs.rasterize` renders Gaussians alone")
     settings = FilmSettings(frames, seconds, fps, size, fov_y, background)
     if isinstance(path, str):
         plan = plan_film(model, path, settings)
