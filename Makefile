@@ -20,7 +20,7 @@ EXTRAS ?= dev,formats,poses,ray,view
 export WARPGS_EXTRAS_INSTALLED := 1
 endif
 
-.PHONY: demo install lint types docs docs-links docs-run test test-slow test-fault test-browser test-audit test-cuda release clean
+.PHONY: demo install lint types docs docs-links docs-run test test-slow test-fault test-browser test-cuda release clean
 
 # LOCKED=1: only files whose hashes stand in requirements.lock; else, from wherever pip is told, the versions of constraints.txt
 $(VENV)/installed: pyproject.toml constraints.txt requirements.lock
@@ -51,7 +51,7 @@ demo: install
 # pytest run.
 PYTEST := $(BIN)/python -m pytest -q
 
-UNMARKED := -n 2 --dist worksteal -m "not slow and not fault and not browser and not audit and not cuda"
+UNMARKED := -n 2 --dist worksteal -m "not slow and not fault and not browser and not cuda"
 ifdef ROOM
 test: install
 	$(PYTEST) $(UNMARKED) tests/$(ROOM)
@@ -85,7 +85,7 @@ docs-run: install
 
 # Run these before a change is called done: CONTRIBUTING.md says which one when. Properties get more examples here;
 # `make test-fault FUZZ=200000` gives the readers that many damaged files (2000 where nothing is said).
-test-slow test-fault test-browser test-audit test-cuda: test-%: install
+test-slow test-fault test-browser test-cuda: test-%: install
 	$(PYTEST) -m $*
 	$(if $(filter slow,$*),$(PYTEST) -m "not slow and not cuda" --hypothesis-profile=many $(PROPERTIES))
 PROPERTIES := $(addprefix tests/,numerics/test_properties.py numerics/test_extreme_training.py io/test_splits.py export/test_ply.py)
