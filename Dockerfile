@@ -2,8 +2,7 @@
 #   docker build --target cpu --tag warpgs:cpu .
 #   docker build --target cuda --tag warpgs:cuda .
 #   docker run --gpus all --volume "$PWD:/data" warpgs:cuda farm scenes --out results
-# Nothing runs as root but the installation of the system's libraries. `python -m tools.run_dockerfile cpu` runs the other RUN lines in
-# a clean folder.
+# Nothing runs as root but the installation of the system's libraries.
 # Python 3.11.16, all architectures
 FROM python:3.11-slim-bookworm@sha256:a36c24f9cbdf4fd0f52d67f0823eeac19c2028c637cecc392d97f980d4fec56b AS base
 # libgomp: threads

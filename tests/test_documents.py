@@ -16,7 +16,6 @@ from PIL import Image
 
 from bench.lib import result_file
 from tests.scenes import view_stub
-from tools.run_dockerfile import instructions, of_target, run
 from tools.run_docs import collect, main, pages, prepare, run_blocks, shortened
 from warpgs import PRESETS, read_ply
 from warpgs.app.cli import ASKING
@@ -416,37 +415,3 @@ def test_blocks_run_in_order_and_failures_are_named(tmp_path):
     text = "```bash\nmkdir tour && cd tour\n```\n```bash\ntouch a\n```\n```python\nopen('b', 'w')\n```\n"
     assert run_blocks(collect("x.md", text), tmp_path, tmp_path) == []
     assert (tmp_path / "tour" / "a").exists() and (tmp_path / "tour" / "b").exists()
-
-
-# The lines of a Dockerfile that run without Docker: those of a target, in their order, in a clean folder.
-
-TEXT = """
-FROM somewhere AS base
-# a comment
-RUN apt-get update \\
-    && apt-get install everything
-USER me
-ENV WHERE=/opt/warpgs/a
-RUN mkdir -p /opt/warpgs/a
-FROM base AS cpu
-ARG NAME=b
-RUN touch "$WHERE/$NAME"
-FROM base AS cuda
-RUN false
-"""
-
-
-def test_lines_of_a_target_run_in_the_folder_and_those_of_root_do_not(tmp_path, monkeypatch):
-    monkeypatch.setattr("tools.run_dockerfile.CHECK", "true")
-    steps = of_target(instructions(TEXT), "cpu")
-    assert [word for word, _ in steps] == ["RUN", "USER", "ENV", "RUN", "ARG", "RUN"]
-    (left_out,) = run(steps, tmp_path, {"NAME": "c"})
-    assert "apt-get install everything" in left_out and [p.name for p in (tmp_path / "a").iterdir()] == ["c"]
-    # only the system's libraries are installed before USER; every file that COPY names is there
-    found = instructions(text_of("Dockerfile"))
-    for target in ("cpu", "cuda"):
-        steps = of_target(found, target)
-        words = [word for word, _ in steps]
-        assert words.count("USER") == 1 and words[: words.index("USER")] == ["RUN"] and words[-1] == "CMD"
-        for rest in (rest for word, rest in steps if word == "COPY"):
-            assert all((ROOT / name).exists() for name in rest.split()[:-1] if not name.startswith("--"))

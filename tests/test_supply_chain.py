@@ -9,7 +9,6 @@ from types import SimpleNamespace
 import pytest
 
 from tests.conftest import without_missing_extras
-from tools.run_dockerfile import instructions
 
 ROOT = Path(__file__).parent.parent
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
@@ -97,10 +96,17 @@ def test_actions_and_images_are_named_by_what_they_contain():
     used = [n for p in (ROOT / ".github").rglob("*.yml") for n in re.findall(r"uses:.*", p.read_text("utf-8"))]
     assert used and [n for n in used if not re.fullmatch(r"uses: [\w./-]+@[0-9a-f]{40}  # v[0-9.]+", n)] == []
     assert len(set(used)) == len({n.partition("@")[0] for n in used}), "one version of each"
-    found = instructions((ROOT / "Dockerfile").read_text("utf-8"))
-    bases = [rest.split()[0] for word, rest in found if word == "FROM"]
-    stages = {rest.split()[2] for word, rest in found if word == "FROM"}
+    bases, stages = zip(*re.findall(r"^FROM (\S+) AS (\S+)$", (ROOT / "Dockerfile").read_text("utf-8"), re.MULTILINE))
     assert [b for b in bases if b not in stages and not re.fullmatch(r"[\w./-]+:[\w.-]+@sha256:[0-9a-f]{64}", b)] == []
+
+
+def test_an_image_installs_as_its_user_files_that_are_there():
+    """Root installs the system's libraries alone; what COPY names is in the project."""
+    text = (ROOT / "Dockerfile").read_text("utf-8")
+    root, _, user = text.partition("USER warpgs\n")
+    assert root.count("\nRUN ") == 1 and "apt-get install" in root and user.count("\nRUN ") >= 6 and "USER" not in user
+    named = [name for line in re.findall(r"^COPY --chown=warpgs (.*)$", user, re.MULTILINE) for name in line.split()[:-1]]
+    assert named and [name for name in named if not (ROOT / name).exists()] == []
 
 
 @pytest.mark.parametrize(
