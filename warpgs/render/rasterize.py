@@ -193,6 +193,33 @@ def _check_arguments(gaussians: RasterizedGaussians, camera: Camera, options: Ra
     sh = gaussians.tensors()["sh"]
     if sh.ndim != 3 or sh.shape[1] != (gaussians.sh_degree + 1) ** 2:
         raise ValueError(f"sh must have shape [N, K, 3], where K is 1, 4, 9, 16 or 25, not {list(sh.shape)}")
+    _check_activated(gaussians)
+
+
+ACTIVATED = {
+    "opacities": (2.0, "in [0, 1]; torch.sigmoid makes them from logits"),
+    "scales": (math.inf, "at least 0; torch.exp makes them from log scales"),
+}
+"""Values above which parameters are refused, as below -1, and their range with the fix; steps of an optimizer may leave it."""
+_LOOKED_AT: set[torch.device] = set()
+"""CUDA devices on which Gaussians were rendered: values there are checked once, since reading them waits for the device."""
+
+
+def _check_activated(gaussians: RasterizedGaussians) -> None:
+    """Raise ValueError where opacities are logits, or scales logarithms; on CUDA only in the first call."""
+    device = gaussians.means.device
+    if isinstance(gaussians, Gaussians) or device in _LOOKED_AT:
+        return
+    if device.type == "cuda" and torch.cuda.is_current_stream_capturing():
+        return
+    for name, (most, fix) in ACTIVATED.items():
+        values = getattr(gaussians, name, gaussians.means[:0])
+        if values.numel() and values.layout == torch.strided and values.is_floating_point():
+            low, high = map(float, values.detach().aminmax())
+            if -math.inf < low < -1 or most < high < math.inf:
+                raise ValueError(f"{name} are from {low:.3g} to {high:.3g}, but must be {fix}")
+    if device.type == "cuda":
+        _LOOKED_AT.add(device)
 
 
 def _check_tensor(name: str, value: Any) -> None:
@@ -312,7 +339,8 @@ def rasterize(
         TypeError: An argument has the wrong type; or a scalar type is neither float32 nor float64, or scalar types differ.
         UsageError: The rule, the tile size or the camera model is unknown; the window cuts tiles; options exclude each other or
             are out of range; a transform of torch.func is active; or a second derivative is requested.
-        ValueError: A shape or device is wrong (the message names argument, expected and found); the near or far plane is out
+        ValueError: A shape is wrong, or tensors of ``gaussians`` are on different devices (the message names argument, expected
+            and found); opacities are logits or scales logarithms (on CUDA only in the first call); the near or far plane is out
             of range; a pixel is outside the image; or lists differ in length. For cameras that are not on a GPU, also: an array
             has a non-finite number, ``K`` has a skew or a focal length of 0, ``viewmat`` scales or shears, or either matrix has
             a wrong last row.
