@@ -184,9 +184,19 @@ def _digest(cls: type) -> str:
 
 def own_places(classes: Iterable[type]) -> list[str]:
     """Return where `module_of` finds the modules of classes from outside warpgs; the running script is left out."""
-    modules = {c.__module__ for c in classes if not is_ours(c)} - {"__main__"}
-    files = {m: getattr(sys.modules.get(m), "__file__", None) if m.startswith(_PREFIX) else m for m in modules}
-    return sorted(str(place) for place in files.values() if place)
+    return sorted({spec.rpartition(":")[0] for _, spec in own_specs(classes)})
+
+
+def own_specs(classes: Iterable[type]) -> list[tuple[str, str]]:
+    """Return registered name and ``module:Class`` or ``file.py:Class`` of the classes from outside warpgs and the script."""
+    specs = []
+    for c in classes:
+        place = c.__module__
+        if place.startswith(_PREFIX):
+            place = getattr(sys.modules.get(place), "__file__", None) or "__main__"
+        if not is_ours(c) and place != "__main__":
+            specs.append((str(getattr(c, "name", c.__qualname__)), f"{place}:{c.__qualname__}"))
+    return specs
 
 
 def module_digest(module: ModuleType | None) -> str:

@@ -360,7 +360,7 @@ def test_calls_of_other_programs_launch_nothing_else(device, monkeypatch):
         sum(values.sum() for values in (image, *depths) if values.requires_grad).backward()
     given = means.clone().requires_grad_(), shape["rotations"], means / 9, means[:, 0] / 2, shape["shs"], pose[None]
     gsplat.rasterization(*given, lens[None, :3, :3], 32, 32, sh_degree=3, render_mode="RGB+ED")[0].sum().backward()
-    cuda = device == "cuda"
+    cuda = device.type == "cuda"
     warmed = {(kernel.module, block) for kernel, block in fit_kernels(cuda) + precompile.call_kernels(cuda)}
     assert len(launched) > 8 and launched <= warmed, {m.name for m, _ in launched - warmed}
 
