@@ -189,14 +189,9 @@ def own_places(classes: Iterable[type]) -> list[str]:
 
 def own_specs(classes: Iterable[type]) -> list[tuple[str, str]]:
     """Return registered name and ``module:Class`` or ``file.py:Class`` of the classes from outside warpgs and the script."""
-    specs = []
-    for c in classes:
-        place = c.__module__
-        if place.startswith(_PREFIX):
-            place = getattr(sys.modules.get(place), "__file__", None) or "__main__"
-        if not is_ours(c) and place != "__main__":
-            specs.append((str(getattr(c, "name", c.__qualname__)), f"{place}:{c.__qualname__}"))
-    return specs
+    own = [c for c in classes if not is_ours(c) and c.__module__ != "__main__"]
+    places = [getattr(sys.modules.get(m), "__file__", "") if (m := c.__module__).startswith(_PREFIX) else m for c in own]
+    return [(str(getattr(c, "name", c.__qualname__)), f"{place}:{c.__qualname__}") for c, place in zip(own, places) if place]
 
 
 def module_digest(module: ModuleType | None) -> str:

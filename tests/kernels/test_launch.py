@@ -540,6 +540,32 @@ def test_two_processes_compile_a_module_once(cache):
     assert other.communicate()[0] == "[1, 2, 3]\n" and other.returncode == 0
 
 
+@wp.func
+def doubled_sum(count: int) -> int:
+    total = count
+    for i in range(3):
+        total += wp.static(2 * i)
+    return total
+
+
+@wp.kernel(enable_backward=False, module="unique")
+def first_of_two(begin: int, seen: wp.array(dtype=int)):
+    seen[begin + wp.tid()] = doubled_sum(1)
+
+
+@wp.kernel(enable_backward=False, module="unique")
+def second_of_two(begin: int, seen: wp.array(dtype=int)):
+    seen[begin + wp.tid()] = doubled_sum(2)
+
+
+def test_a_module_has_its_name_whatever_was_compiled_before(cache):
+    """Else a process that finds the first of two modules in the cache would not find the second, and compile it anew."""
+    name = native.module_name(second_of_two.module, 1)
+    native.load_module(first_of_two.module, wp.get_device("cpu"), 1)
+    second_of_two.module.mark_modified()
+    assert native.module_name(second_of_two.module, 1) == name
+
+
 def test_a_loaded_module_takes_no_lock(cache, monkeypatch):
     """Neither the second launch nor any later one opens a file."""
     seen = torch.zeros(3, dtype=torch.int32)

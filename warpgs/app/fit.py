@@ -2,6 +2,7 @@
 
 import dataclasses
 import inspect
+import itertools
 import os
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -184,15 +185,13 @@ def _config(a: Any, base: FitConfig, terms: Parts, modules: Parts) -> FitConfig:
 
 def _continuing(arguments: list[str]) -> tuple[list[str], list[str], list[str]] | None:
     """Return flags, scene and user code of arguments that continue a run without giving its settings; None for others."""
-    words = [w for a in arguments for w in (a.split("=", 1) if a.startswith("--") else [a])]
+    words = iter([w for a in arguments for w in (a.split("=", 1) if a.startswith("--") else [a])])
     kept, scene, code = list[str](), list[str](), list[str]()
-    while words:
-        word, *words = words
+    for word in words:
         if word in CONTINUING:
-            count = CONTINUING[word]
-            kept, words = [*kept, word, *words[:count]], words[count:]
-        elif word in NAMING and words and ":" in words[0]:
-            code += [name for name in words.pop(0).split(",") if ":" in name]
+            kept += [word, *itertools.islice(words, CONTINUING[word])]
+        elif word in NAMING and ":" in (names := next(words, "")):
+            code += [name for name in names.split(",") if ":" in name]
         elif word.startswith("-") or scene:
             return None
         else:
@@ -204,14 +203,13 @@ def _continuing(arguments: list[str]) -> tuple[list[str], list[str], list[str]] 
 
 def _continued(arguments: list[str], scene: list[str], code: list[str], about: str) -> FitRequest:
     """Return the request that continues a run with its original settings."""
-    from warpgs.pipeline.run.folder import check_there, stored_request
+    from warpgs.pipeline.run.folder import stored_request
 
     a = flags.parse_flags(Request, arguments, "warpgs fit", about)
     view_port = _machine(a)
     for name in code:
         load_object("code", name)
     request = stored_request(a.out, scene[0] if scene else None, code)
-    check_there(request.scene.path, a.out)
     say(f"continuing the run: preset {request.config.preset}, {request.config.steps:,} steps, {request.scene.path}")
     device = request.device if flags.word_after(arguments, "--device") is None else a.device
     return dataclasses.replace(request, device=device, view_port=view_port, lpips_weights=a.lpips_weights)

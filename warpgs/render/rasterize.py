@@ -196,11 +196,6 @@ def _check_arguments(gaussians: RasterizedGaussians, camera: Camera, options: Ra
     _check_activated(gaussians)
 
 
-ACTIVATED = {
-    "opacities": (2.0, "in [0, 1]; torch.sigmoid makes them from logits"),
-    "scales": (math.inf, "at least 0; torch.exp makes them from log scales"),
-}
-"""Values above which parameters are refused, as below -1, and their range with the fix; steps of an optimizer may leave it."""
 _LOOKED_AT: set[torch.device] = set()
 """CUDA devices on which Gaussians were rendered: values there are checked once, since reading them waits for the device."""
 
@@ -210,9 +205,9 @@ def _check_activated(gaussians: RasterizedGaussians) -> None:
     device = gaussians.means.device
     if isinstance(gaussians, Gaussians) or device in _LOOKED_AT:
         return
-    if device.type == "cuda" and torch.cuda.is_current_stream_capturing():
-        return
-    for name, (most, fix) in ACTIVATED.items():
+    # bounds that the steps of an optimizer may cross, but hardly any model's logits and log scales keep
+    logits, logs = "in [0, 1]; torch.sigmoid makes them from logits", "at least 0; torch.exp makes them from log scales"
+    for name, most, fix in (("opacities", 2.0, logits), ("scales", math.inf, logs)):
         values = getattr(gaussians, name, gaussians.means[:0])
         if values.numel() and values.layout == torch.strided and values.is_floating_point():
             low, high = map(float, values.detach().aminmax())

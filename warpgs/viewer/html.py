@@ -14,19 +14,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
+from warpgs import geometry
 from warpgs.device import format_bytes
 from warpgs.errors import DataError
 from warpgs.files import write_text
-from warpgs.geometry import (
-    convert_camera,
-    convert_gaussians,
-    look_at,
-    matmul,
-    near_cameras,
-    pose_at,
-    quaternions,
-    rotation_matrices,
-)
+from warpgs.geometry import convert_camera, convert_gaussians, look_at, matmul, pose_at, quaternions, rotation_matrices
 from warpgs.locks import hold_file
 from warpgs.pipeline.films.paths import fov_y, rig_among
 from warpgs.pipeline.run.export import NO_FILTERS, Filters, file_gaussians, filtered
@@ -166,7 +158,7 @@ def middle_first(cameras: Sequence[Camera]) -> list[Camera]:
     if not cameras:
         return []
     centers = np.array([c.center for c in cameras])
-    near = near_cameras(centers)  # what is between a lone camera and the rest, no photograph shows
+    near = geometry.near_cameras(centers)  # what is between a lone camera and the rest, no photograph shows
     cameras, centers = [c for c, kept in zip(cameras, near) if kept], centers[near]
     nearest = int(np.argmin(np.linalg.norm(centers - centers.mean(0), axis=1)))
     return [cameras[nearest], *cameras[:nearest], *cameras[nearest + 1 :]]

@@ -271,8 +271,7 @@ def record_of(
         "normalization": similarity_values(scene.normalization),
         "background": scene.background, "transparent": scene.transparent,
         "config": config.to_json(), "config_hash": config.fingerprint(), "own_code": config.own_code(),
-        "own_files": dict(own_specs(config.plugged_in())),
-        "device": device.type, "versions": versions(),
+        "own_files": dict(own_specs(config.plugged_in())), "device": device.type, "versions": versions(),
         "cameras": {v.name: camera_values(v.camera) for v in scene.views},
     }  # fmt: skip
 
@@ -428,18 +427,22 @@ class StoredRun(FittedModel):
             DataError: The scene was passed from Python and has no folder, or the folder is not there any more.
             UsageError: The scene was read with another user-defined reader.
         """
-        request = _stored_scene(self.folder, self.record, reader)
-        check_there(request.path, self.folder)
-        return request
+        return _stored_scene(self.folder, self.record, reader)
 
 
-def _stored_scene(folder: Path, record: dict[str, Any], reader: str | None) -> SceneRequest:
-    """Return the scene of a run's record, as `StoredRun.scene_request` does."""
-    if record["scene"]["path"] is None:
+def _stored_scene(folder: Path, record: dict[str, Any], reader: str | None, moved: str | None = None) -> SceneRequest:
+    """Return the scene of a run's record, as `StoredRun.scene_request` does, with its maps where it was ``moved``."""
+    values, old = record["scene"], record["scene"]["path"]
+    if old is None:
         raise DataError(
             f"{folder}: the scene was passed from Python and has no folder; score the model in Python with warpgs.evaluate"
         )
-    request = SceneRequest(**record["scene"])
+    if moved is not None:
+        new = os.path.realpath(moved)
+        values = {
+            n: new + v[len(old) :] if isinstance(v, str) and Path(v).is_relative_to(old) else v for n, v in values.items()
+        }
+    request = SceneRequest(**values)
     if not os.path.exists(request.path) and (folder / POSED_SCENE / POSES).is_file():
         request = replace(request, path=str(folder / POSED_SCENE))  # the run folder was moved, and its scene with it
     if request.reader is not None and ":" in request.reader and reader != request.reader:
@@ -447,16 +450,12 @@ def _stored_scene(folder: Path, record: dict[str, Any], reader: str | None) -> S
             f"{folder}: the scene was read with user code. A run folder never decides which code is loaded; give --reader "
             f"{request.reader} again"
         )
-    return request
-
-
-def check_there(path: str, folder: Path) -> None:
-    """Raise a DataError if the scene of a run is not at its path any more."""
-    if not os.path.exists(path):
+    if not os.path.exists(request.path):
         raise DataError(
-            f"{path}: the scene of {folder} is gone; if it was moved, `warpgs fit NEW_PLACE --out {shlex.quote(str(folder))} "
-            "--resume` stores its new place, and makes scores and report again"
+            f"{request.path}: the scene of {folder} is gone; if it was moved, `warpgs fit NEW_PLACE --out "
+            f"{shlex.quote(str(folder))} --resume` stores its new place, and makes scores and report again"
         )
+    return request
 
 
 def stored_request(folder: Path, moved: str | None = None, code: Collection[str] = ()) -> FitRequest:
@@ -468,12 +467,7 @@ def stored_request(folder: Path, moved: str | None = None, code: Collection[str]
     for field, registry in PLUGGED.items():
         for name in filter(code.__contains__, _names(record["config"], field)):
             registry.load(name)
-    scene = _stored_scene(folder, record, reader)
-    if moved is not None:
-        maps: dict[str, Any] = {n: Path(v) for n in ("score_masks", "depths", "normals") if (v := getattr(scene, n))}
-        new = Path(os.path.realpath(moved))
-        maps = {n: str(new / v.relative_to(scene.path)) for n, v in maps.items() if v.is_relative_to(scene.path)}
-        scene = replace(scene, path=str(new), **maps)
+    scene = _stored_scene(folder, record, reader, moved)
     try:
         config = FitConfig.from_json(record["config"])
     except (UsageError, SchemaError) as e:
