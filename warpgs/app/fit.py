@@ -197,7 +197,7 @@ def _continuing(arguments: list[str]) -> tuple[list[str], list[str], list[str]] 
         else:
             scene.append(word)
     # beside a scene, --out may hold only the poses of a fit that ended before its first step
-    begun = not scene or (Path(flags.word_after(kept, "--out") or "") / "config.json").is_file()
+    begun = not scene or os.path.isfile(os.path.join(flags.word_after(kept, "--out") or "", "config.json"))
     return (kept, scene, code) if "--resume" in kept and begun else None
 
 

@@ -334,11 +334,11 @@ def rasterize(
         TypeError: An argument has the wrong type; or a scalar type is neither float32 nor float64, or scalar types differ.
         UsageError: The rule, the tile size or the camera model is unknown; the window cuts tiles; options exclude each other or
             are out of range; a transform of torch.func is active; or a second derivative is requested.
-        ValueError: A shape is wrong, or tensors of ``gaussians`` are on different devices (the message names argument, expected
-            and found); opacities are logits or scales logarithms (on CUDA only in the first call); the near or far plane is out
-            of range; a pixel is outside the image; or lists differ in length. For cameras that are not on a GPU, also: an array
-            has a non-finite number, ``K`` has a skew or a focal length of 0, ``viewmat`` scales or shears, or either matrix has
-            a wrong last row.
+        ValueError: A shape is wrong, or Gaussians, colours and features are on different devices (the message names argument,
+            expected and found); opacities are logits or scales logarithms (on CUDA only in the first call); the near or far
+            plane is out of range; a pixel is outside the image; or lists differ in length. For cameras that are not on a GPU,
+            also: an array has a non-finite number, ``K`` has a skew or a focal length of 0, ``viewmat`` scales or shears, or
+            either matrix has a wrong last row.
     """
     if torch.compiler.is_dynamo_compiling():
         torch._dynamo.graph_break(msg="rasterize runs outside of compiled graphs: leave out fullgraph=True")

@@ -323,10 +323,7 @@ SAME = {
 def check_same(record: dict[str, Any], stored: dict[str, Any], out: Path) -> None:
     """Check that a continued run has the same data, views, settings, user code and kind of device as before."""
     if "pruned" in stored:
-        raise UsageError(
-            f"--resume: {out} is a pruned model without the state of its fit; resume the original run, "
-            f"{stored['pruned']['source']}"
-        )
+        raise UsageError(f"--resume: {out} is a pruned model, without the state of a fit; resume {stored['pruned']['source']}")
     _check_lost(stored, out)
     _check_named_again({name for field in PLUGGED for name in _names(record["config"], field)}, stored, out)
     for key, words in SAME.items():
@@ -434,9 +431,7 @@ def _stored_scene(folder: Path, record: dict[str, Any], reader: str | None, move
     """Return the scene of a run's record, as `StoredRun.scene_request` does, with its maps where it was ``moved``."""
     values, old = record["scene"], record["scene"]["path"]
     if old is None:
-        raise DataError(
-            f"{folder}: the scene was passed from Python and has no folder; score the model in Python with warpgs.evaluate"
-        )
+        raise DataError(f"{folder}: the scene was passed from Python and has no folder; score it there with warpgs.evaluate")
     if moved is not None:
         new = os.path.realpath(moved)
         values = {
@@ -446,10 +441,7 @@ def _stored_scene(folder: Path, record: dict[str, Any], reader: str | None, move
     if not os.path.exists(request.path) and (folder / POSED_SCENE / POSES).is_file():
         request = replace(request, path=str(folder / POSED_SCENE))  # the run folder was moved, and its scene with it
     if request.reader is not None and ":" in request.reader and reader != request.reader:
-        raise UsageError(
-            f"{folder}: the scene was read with user code. A run folder never decides which code is loaded; give --reader "
-            f"{request.reader} again"
-        )
+        raise UsageError(f"{folder}: the scene was read with user code, which no run loads; give --reader {request.reader}")
     if not os.path.exists(request.path):
         raise DataError(
             f"{request.path}: the scene of {folder} is gone; if it was moved, `warpgs fit NEW_PLACE --out "
