@@ -250,6 +250,8 @@ def test_arguments_of_gsplat_become_ours(arguments, camera_options, options):
         ({"colors": None}, "colors must be given in render_mode 'RGB'"),
         ({"means": torch.zeros(2, COUNT, 3)}, r"quats must have the batch axes \[2\] of means, not shape \[40, 4\]"),
         ({"backgrounds": torch.zeros(2, 4)}, "background must have shape"),
+        ({"opacities": torch.full((COUNT,), -4.0)}, r"opacities are from -4 to -4, .*; torch.sigmoid makes them from logits"),
+        ({"scales": torch.full((COUNT, 3), -4.0)}, "scales are from -4 to -4, .*; torch.exp makes them from log scales"),
     ],
 )
 def test_other_arguments_are_refused_by_name(arguments, message):

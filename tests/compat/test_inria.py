@@ -153,11 +153,13 @@ def test_a_pose_a_plane_and_a_middle():
         ({}, {"cov3D_precomp": torch.ones(COUNT, 6)}, "give either scales and rotations, or cov3D_precomp"),
         ({}, {"scales": None}, "give either scales and rotations, or cov3D_precomp"),
         ({}, {"scales": None, "rotations": None}, "give either scales and rotations, or cov3D_precomp"),
+        ({}, {"opacities": torch.randn(COUNT, 1) * 5}, r"opacities are from .*; torch.sigmoid makes them from logits"),
+        ({}, {"scales": torch.full((COUNT, 3), -4.0)}, "scales are from -4 to -4, .*; torch.exp makes them from log scales"),
         ({}, {"means2D": torch.zeros(COUNT, 2)}, r"means2D must have the shape of means3D, \[50, 3\], not \[50, 2\]"),
     ],
 )
 def test_what_is_wrong_is_named(fields, arguments, message):
-    kind = ValueError if "means2D" in arguments else warpgs.UsageError
+    kind = ValueError if "means2D" in arguments or "torch" in message else warpgs.UsageError
     with pytest.raises(kind, match=message):
         GaussianRasterizer(settings(**fields))(**scene() | arguments)
 

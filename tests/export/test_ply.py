@@ -1,3 +1,4 @@
+import dataclasses
 import os
 import re
 import struct
@@ -129,6 +130,14 @@ def test_non_finite_is_refused_by_name_and_the_old_file_stays(tmp_path, name, va
     with pytest.raises(DataError, match=rf"a\.ply.*1 of \d+ values of {name} are not finite"):
         write_ply(path, model, Normalization())
     assert path.read_bytes() == b"old" and list(tmp_path.iterdir()) == [path]
+
+
+def test_opacities_given_as_logits_are_named(tmp_path):
+    """Written nevertheless: a small model may have such logits."""
+    model = dataclasses.replace(make(), logit_opacities=torch.linspace(0.1, 0.9, len(make())))
+    with pytest.warns(UserWarning, match=r"a\.ply: all logit_opacities are in \[0, 1\].*stored\(\) makes logits"):
+        write_ply(tmp_path / "a.ply", model, Normalization())
+    assert torch.equal(read_ply(tmp_path / "a.ply").logit_opacities, model.logit_opacities)
 
 
 def test_units_folders_and_files_that_cannot_be_used(tmp_path):

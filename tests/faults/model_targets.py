@@ -263,7 +263,7 @@ def run_files(root: Path) -> list[Path]:
     names = tuple(v.name for v in scene.views)
     request, split = SceneRequest(str(root / "scene")).with_scale("cpu"), Split(names[1:], names[:1])
     record = folder.record_of(request, PRESETS["quick"], scene, split, ["a note"], torch.device("cpu"))
-    record["scene"]["path"], record["versions"] = "/scene", {"warpgs": "0.2.0"}  # the same on every machine
+    record["scene"]["path"], record["versions"] = "/", {"warpgs": "0.2.0"}  # the same on every machine
     write_json(root / folder.CONFIG, record)
     checkpoints(root)
     return [root / folder.CONFIG]

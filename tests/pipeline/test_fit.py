@@ -311,6 +311,24 @@ def command(folder, out, *more, steps=GIVEN_STEPS):
     return ["fit", str(folder / "scene"), "--out", str(out), *flags, *more]
 
 
+def test_a_run_finds_a_scene_that_was_moved(given_folder, tmp_path, capsys):
+    """With the maps in it: the commands name what stores its new place, for which no other flag is needed."""
+    shutil.copytree(given_folder / "scene", tmp_path / "scene")
+    shutil.copytree(given_folder / "depths", tmp_path / "scene" / "maps")
+    run, new, score = tmp_path / "run", tmp_path / "new place", ["eval", str(tmp_path / "run"), "--device", "cpu"]
+    assert main(command(tmp_path, run, "--depths", str(tmp_path / "scene" / "maps"))) == 0
+    (tmp_path / "scene").rename(new)
+    capsys.readouterr()
+    for words in (score, ["fit", "--out", str(run), "--resume"]):
+        assert main(words) == 3
+        said = capsys.readouterr().err
+        assert f"scene: the scene of {run} is gone; if it was moved, `warpgs fit NEW_PLACE --out {run} --resume`" in said
+    assert main(["fit", str(given_folder / "scene"), "--out", str(run), "--resume"]) == 3  # without the maps
+    assert main(["fit", str(new), "--out", str(run), "--resume", "--device", "cpu"]) == 0
+    stored = json.loads((run / "config.json").read_text())["scene"]
+    assert stored["path"] == str(new) and stored["depths"] == str(new / "maps") and main(score) == 0
+
+
 def test_maps_decide_whether_a_run_continues_and_a_wrong_unit_is_named(given_folder, tmp_path, capsys):
     """The same maps give the same bits as an uninterrupted run; other maps are another scene."""
     run = tmp_path / "run"

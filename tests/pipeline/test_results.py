@@ -123,6 +123,8 @@ def test_a_fit_ends_with_its_score_its_size_its_time_and_what_to_do_next(tmp_pat
     assert unscored[0] == "training PSNR 30.25 dB (no score of new views: no view is held out)"
     assert unscored[1].endswith("1.0 MiB, in 5 s: import 5 s")
     assert "held-out" not in " ".join(unscored) and "next:" not in unscored
+    scored, unscored = (result_lines(metrics | more | {"region": "foreground"}, None)[0] for more in ({}, quick | {"test": {}}))
+    assert scored.endswith("(2 views over foreground)") and "training PSNR 30.25 dB over foreground (no score" in unscored
 
 
 # What a fit says it traded: errors that are true, the same for the same seed, and quick to find.

@@ -11,6 +11,7 @@ from tests.example_terms import DepthCorrelation
 from tests.priors.rigs import still_life, write_flo
 from tests.scenes import photos, priors, ring, seeds
 from warpgs.app.cli import main
+from warpgs.compat import gsplat, inria
 from warpgs.geometry import back_project, in_image, project_points
 from warpgs.kernels import launch as interop
 from warpgs.pipeline.metrics.scores import render_view, score
@@ -340,12 +341,37 @@ def test_a_fit_launches_nothing_else(device, strategy, recorded, monkeypatch):
     assert len(launched) > 8 and launched <= warmed and {1, 32, 64, 128, 256} <= {block for _, _, block in warmed}
 
 
+def test_calls_of_other_programs_launch_nothing_else(device, monkeypatch):
+    """Their colours, inverse and median depths, with gradients, on their form of Gaussians."""
+    launched, launch = set(), interop.launch
+
+    def note(kernel, count, inputs, where, *, block_dim=256, **more):
+        launched.add((kernel.module, 1 if where.type == "cpu" else block_dim))
+        launch(kernel, count, inputs, where, block_dim=block_dim, **more)
+
+    monkeypatch.setattr(interop, "launch", note)
+    means, pose = torch.rand(9, 3, device=device) + 1, torch.eye(4, device=device)
+    lens = torch.tensor([[2.0, 0, 0, 0], [0, 2, 0, 0], [0, 0, 1, 1], [0, 0, 0, 0]], device=device)
+    for fields in ((), (False,), (False, False)):
+        settings = (32, 32, 0.5, 0.5, means.new_zeros(3), 1.0, pose, lens, 3, means.new_zeros(3), False, *fields)
+        given = {"means3D": means.clone().requires_grad_(), "means2D": torch.zeros_like(means), "opacities": means[:, :1] / 2}
+        shape = {"scales": means / 9, "rotations": torch.ones(9, 4, device=device), "shs": means.new_zeros(9, 16, 3)}
+        image, _, *depths = inria.GaussianRasterizer(inria.GaussianRasterizationSettings(*settings))(**given, **shape)
+        sum(values.sum() for values in (image, *depths) if values.requires_grad).backward()
+    given = means.clone().requires_grad_(), shape["rotations"], means / 9, means[:, 0] / 2, shape["shs"], pose[None]
+    gsplat.rasterization(*given, lens[None, :3, :3], 32, 32, sh_degree=3, render_mode="RGB+ED")[0].sum().backward()
+    cuda = device.type == "cuda"
+    warmed = {(kernel.module, block) for kernel, block in fit_kernels(cuda) + precompile.call_kernels(cuda)}
+    assert len(launched) > 8 and launched <= warmed, {m.name for m, _ in launched - warmed}
+
+
 @pytest.mark.slow
 def test_the_second_call_finds_all_in_the_cache(tmp_path, monkeypatch, capsys):
     """One small module in an empty cache: compiled by the first call, found by the second, which knows nothing of the first."""
     monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path))
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 0)
     monkeypatch.setattr(precompile, "fit_kernels", lambda cuda: [(nothing, 1)])
+    monkeypatch.setattr(precompile, "call_kernels", lambda cuda: [])
     said = []
     for _ in range(2):
         assert main(["doctor", "--warm"]) == 0

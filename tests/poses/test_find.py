@@ -314,7 +314,8 @@ def test_a_run_that_was_moved_finds_its_scene(tmp_path, found):
     """The record holds where the scene lay; where nothing is there any more, the run's own scene is read."""
     options = {"path": str(tmp_path / "gone" / "scene"), "downscale": 2}
     run = SimpleNamespace(folder=tmp_path, record={"scene": options})
-    assert StoredRun.scene_request(run).path == options["path"]
+    with pytest.raises(DataError, match=r"scene: the scene of .* is gone; .*`warpgs fit NEW_PLACE --out .* --resume`"):
+        StoredRun.scene_request(run)
     (tmp_path / "scene").mkdir()
     shutil.copy(found[0] / "poses.json", tmp_path / "scene")
     assert StoredRun.scene_request(run) == SceneRequest(str(tmp_path / "scene"), downscale=2)

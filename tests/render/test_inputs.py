@@ -4,6 +4,7 @@ import dataclasses
 import functools
 import itertools
 import math
+import sys
 
 import pytest
 import torch
@@ -116,6 +117,20 @@ def test_missing_harmonics_and_wrong_input_are_named():
             rasterize(dataclasses.replace(g, **{name: wrong}), cam)
     with pytest.raises(TypeError, match=r"gaussian_normals needs quats and scales"):
         gaussian_normals(other, cam)
+
+
+def test_logits_and_logarithms_are_named(device, monkeypatch):
+    """In place of opacities and scales. On CUDA only the first call reads them; an optimizer may step past a bound."""
+    module, stored = sys.modules[rasterize.__module__], cloud(50, device=device)
+    cam = camera(dtype=torch.float32, device=device)
+    logits, given = stored.logit_opacities.detach() * 4 - 3, activated(stored)
+    messages = r"opacities are from .*, but must be in \[0, 1\]; torch.sigmoid", "scales are from .* at least 0; torch.exp"
+    wrong = {"opacities": logits}, {"scales": stored.log_scales}
+    for g, values, words in zip((given, given, with_covariances(stored)), (*wrong, wrong[0]), (*messages, messages[0])):
+        monkeypatch.setattr(module, "_LOOKED_AT", set())
+        with pytest.raises(ValueError, match=words):
+            rasterize(dataclasses.replace(g, **values), cam)
+    rasterize(dataclasses.replace(given, opacities=given.opacities * 1.9 - 0.9, scales=given.scales - 0.5), cam)
 
 
 @pytest.mark.parametrize("antialiased", [False, pytest.param(True, marks=pytest.mark.slow)])

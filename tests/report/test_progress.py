@@ -48,7 +48,7 @@ def test_plain_lines_come_about_every_ten_seconds_and_a_live_view_has_all_values
     assert 5 <= len(lines) <= 7
     assert all("\x1b" not in line for line in lines)
     last = lines[-1]
-    for word in ("step 100 of 100", "loss 0.2500", "train PSNR 20.50 dB", "Gaussians 12,345", "per step 500 ms", "left 0 s"):
+    for word in ("step 100 of 100", "loss 0.2500", "training PSNR 20.50 dB", "Gaussians 12,345", "per step 500 ms", "left 0 s"):
         assert word in last
     with Progress(10, live=True) as progress:
         for step in range(1, 11):

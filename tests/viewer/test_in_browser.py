@@ -69,6 +69,11 @@ def test_a_page_turns_as_far_as_the_photographs_and_shows_what_they_saw():
     left, right = np.degrees(np.arctan2([1, 2], 4))
     np.testing.assert_allclose(degrees(row, row[0].center + np.array([0, 0, 4.0])), [left, right, 0, 0, (left + right) / 4])
     np.testing.assert_allclose(degrees([moved(0.0), moved(1e-3)])[4], 2)  # never stuck
+    # a photograph far off the rest is left out: no other one shows what is between
+    few = [looking(np.radians(a)) for a in (3, -6, 0, 6, 10)]
+    np.testing.assert_allclose(degrees(html.middle_first([*few, looking(np.radians(80))])), [9, 7, 0, 0, 4], atol=1e-9)
+    near = html.middle_first([looking(np.radians(20 * a)) for a in range(7)])
+    np.testing.assert_allclose(degrees(near), [60, 60, 0, 0, 15], atol=1e-9)
     around = degrees([looking(np.radians(a), 0.5) for a in range(0, 360, 45)])
     np.testing.assert_allclose(around, [np.inf, np.inf, 0, 0, 15], atol=1e-9)
     np.testing.assert_array_equal(degrees(arc[:1])[:4], np.inf)

@@ -313,7 +313,7 @@ def run(arguments: list[str], about: str) -> int:
         """Check this machine.
 
         Args:
-            warm: Compile the kernels of a fit with pinhole cameras for this machine's devices, and skip the checks.
+            warm: Compile the kernels of fits and of warpgs.compat, for pinhole cameras, and skip the checks.
         """
         if warm:
             with fast_imports():

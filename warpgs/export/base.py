@@ -118,6 +118,10 @@ def arrays_to_write(
                     f"{path}: not written, {bad} of {array.size} values of {name} are not finite, and no viewer can show them. "
                     "Export an earlier checkpoint, or fit again with a lower learning rate."
                 )
+    logits = arrays["logit_opacities"]
+    if logits.size and 0 <= logits.min() < logits.max() <= 1:
+        words = "all logit_opacities are in [0, 1], as opacities are; ActivatedGaussians(...).stored() makes logits"
+        warnings.warn(f"{path}: {words} and log scales", stacklevel=2)
     if origin.any():
         arrays = {name: array.astype(np.float32) for name, array in arrays.items()}
     return arrays, origin

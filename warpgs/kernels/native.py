@@ -182,7 +182,7 @@ def told_of_compiling(listener: Callable[[str], object]) -> Iterator[list[float]
 
 
 SILENT = 2.0
-"""Time of compiling after which a line is printed if there is no listener [s]; modules with shorter gaps count as one."""
+"""Time of compiling after which a process prints a line if there is no listener [s]; modules with shorter gaps count as one."""
 _since = _until = -math.inf
 _said = False
 
@@ -191,19 +191,16 @@ def _say_compiling() -> None:
     global _said
     if not _said:
         _said = True
-        say(
-            "warpgs: compiling kernels, once on this machine, for up to a minute; `warpgs doctor --warm` does it",
-            error=True,
-        )
+        say("warpgs: compiling kernels, once on this machine, for up to a minute", error=True)
 
 
 @contextlib.contextmanager
 def _announced() -> Iterator[None]:
     """Print a line on stderr if the body, with the bodies just before it, takes more than `SILENT`."""
-    global _since, _until, _said
+    global _since, _until
     now = time.perf_counter()
     if now - _until > SILENT:
-        _since, _said = now, False
+        _since = now
     timer = threading.Timer(max(0.0, _since + SILENT - now), _say_compiling)
     timer.daemon = True
     timer.start()
@@ -240,10 +237,21 @@ def _load(module: wp.Module, device: wp.Device, block_dim: int, tells: bool = Tr
             listener(name)
         with _announced() if compiles and not told else contextlib.nullcontext():
             loaded = module.load(device, block_dim=block_dim)
+        if compiles:
+            _as_before(module)
         for _, seconds in told:
             seconds.append(time.perf_counter() - began)
     _LOADED.add((module, device.context, block_dim))
     return loaded
+
+
+def _as_before(module: wp.Module) -> None:
+    """Take from the functions that a module shares what compiling them left there: Warp hashes it with later modules."""
+    # another process, which finds this module in the cache, would not find the later ones, and compile them anew
+    hashers = getattr(module, "hashers", {}).values()
+    for function in {f for hasher in hashers for f in hasher.function_hashes}:
+        for overload in (function.user_overloads | function.user_templates).values():
+            overload.adj.deferred_static_expressions = []
 
 
 def is_cached(name: str) -> bool:

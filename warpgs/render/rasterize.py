@@ -193,6 +193,28 @@ def _check_arguments(gaussians: RasterizedGaussians, camera: Camera, options: Ra
     sh = gaussians.tensors()["sh"]
     if sh.ndim != 3 or sh.shape[1] != (gaussians.sh_degree + 1) ** 2:
         raise ValueError(f"sh must have shape [N, K, 3], where K is 1, 4, 9, 16 or 25, not {list(sh.shape)}")
+    _check_activated(gaussians)
+
+
+_LOOKED_AT: set[torch.device] = set()
+"""CUDA devices on which Gaussians were rendered: values there are checked once, since reading them waits for the device."""
+
+
+def _check_activated(gaussians: RasterizedGaussians) -> None:
+    """Raise ValueError where opacities are logits, or scales logarithms; on CUDA only in the first call."""
+    device = gaussians.means.device
+    if isinstance(gaussians, Gaussians) or device in _LOOKED_AT:
+        return
+    # bounds that the steps of an optimizer may cross, but hardly any model's logits and log scales keep
+    logits, logs = "in [0, 1]; torch.sigmoid makes them from logits", "at least 0; torch.exp makes them from log scales"
+    for name, most, fix in (("opacities", 2.0, logits), ("scales", math.inf, logs)):
+        values = getattr(gaussians, name, gaussians.means[:0])
+        if values.numel() and values.layout == torch.strided and values.is_floating_point():
+            low, high = map(float, values.detach().aminmax())
+            if -math.inf < low < -1 or most < high < math.inf:
+                raise ValueError(f"{name} are from {low:.3g} to {high:.3g}, but must be {fix}")
+    if device.type == "cuda":
+        _LOOKED_AT.add(device)
 
 
 def _check_tensor(name: str, value: Any) -> None:
@@ -312,10 +334,11 @@ def rasterize(
         TypeError: An argument has the wrong type; or a scalar type is neither float32 nor float64, or scalar types differ.
         UsageError: The rule, the tile size or the camera model is unknown; the window cuts tiles; options exclude each other or
             are out of range; a transform of torch.func is active; or a second derivative is requested.
-        ValueError: A shape or device is wrong (the message names argument, expected and found); the near or far plane is out
-            of range; a pixel is outside the image; or lists differ in length. For cameras that are not on a GPU, also: an array
-            has a non-finite number, ``K`` has a skew or a focal length of 0, ``viewmat`` scales or shears, or either matrix has
-            a wrong last row.
+        ValueError: A shape is wrong, or Gaussians, colours and features are on different devices (the message names argument,
+            expected and found); opacities are logits or scales logarithms (on CUDA only in the first call); the near or far
+            plane is out of range; a pixel is outside the image; or lists differ in length. For cameras that are not on a GPU,
+            also: an array has a non-finite number, ``K`` has a skew or a focal length of 0, ``viewmat`` scales or shears, or
+            either matrix has a wrong last row.
     """
     if torch.compiler.is_dynamo_compiling():
         torch._dynamo.graph_break(msg="rasterize runs outside of compiled graphs: leave out fullgraph=True")

@@ -217,7 +217,7 @@ class Progress:
         return [
             ("step", f"{self.step:,} of {self.total:,}"),
             ("loss", "-" if self.loss is None else f"{self.loss:.4f}"),
-            ("train PSNR", "-" if self.psnr is None else f"{self.psnr:.2f} dB"),
+            ("training PSNR", "-" if self.psnr is None else f"{self.psnr:.2f} dB"),
             ("Gaussians", f"{self.count:,}"),
             ("per step", "-" if self.seconds is None else f"{1000 * self.seconds:.0f} ms"),
             ("left", "-" if self.left is None else duration(self.left)),

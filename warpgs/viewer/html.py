@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
+from warpgs import geometry
 from warpgs.device import format_bytes
 from warpgs.errors import DataError
 from warpgs.files import write_text
@@ -153,10 +154,12 @@ def place_first_camera(
 
 
 def middle_first(cameras: Sequence[Camera]) -> list[Camera]:
-    """Return cameras, first the camera nearest to the mean of all centres, then the others in order."""
+    """Return cameras that are not far off the rest, first the one nearest to their mean centre, then the others in order."""
     if not cameras:
         return []
     centers = np.array([c.center for c in cameras])
+    near = geometry.near_cameras(centers)  # what is between a lone camera and the rest, no photograph shows
+    cameras, centers = [c for c, kept in zip(cameras, near) if kept], centers[near]
     nearest = int(np.argmin(np.linalg.norm(centers - centers.mean(0), axis=1)))
     return [cameras[nearest], *cameras[:nearest], *cameras[nearest + 1 :]]
 

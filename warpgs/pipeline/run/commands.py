@@ -37,7 +37,7 @@ from warpgs.pipeline.model.table import FittedModel, model_bytes, pack
 from warpgs.pipeline.paper.scores import CURVATURE, geometry_score, semantic_score
 from warpgs.pipeline.run.folder import CONFIG, IMAGE_FOLDERS, StoredRun, camera_values, open_run, save_checkpoint, with_cameras
 from warpgs.pipeline.run.request import NO_SCORES, SceneRequest, choose_device, read_scene
-from warpgs.pipeline.run.results import evaluate_run, protocol_of, score_line
+from warpgs.pipeline.run.results import evaluate_run, over_region, protocol_of, score_line
 from warpgs.pipeline.train.schedule import color_of, over_background
 from warpgs.pipeline.train.settings import FitConfig
 from warpgs.pipeline.train.trainer import train_views
@@ -154,7 +154,7 @@ def evaluate(
         write_json(folder / "eval.json", metrics)
     lines = [*stored.notes(), *held, *renaming_notes(names)]
     if not test:
-        return [*lines, f"no view is held out; training PSNR {metrics['train']['psnr']:.2f} dB"]
+        return [*lines, f"no view is held out; training PSNR {metrics['train']['psnr']:.2f} dB{over_region(metrics)}"]
     for row in metrics["views"]:
         kinds = {"alpha_empty": "where empty", "alpha_object": "in the object"}
         alphas = [f", alpha {row[k]:.3f} {words}" for k, words in kinds.items() if not math.isnan(row.get(k, math.nan))]

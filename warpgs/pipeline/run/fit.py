@@ -522,6 +522,8 @@ def _prepare(job: FitJob, resumed: Path | None, hashed: Callable[[], str]) -> tu
     if record is not None and resumed is not None:
         stored = folders.read_record(resumed)
         folders.check_same(record, stored, resumed)
+        if job.out is not None and record["scene"]["path"] != stored["scene"]["path"]:  # the scene was moved
+            write_json(job.out / CONFIG, stored | {"scene": record["scene"]})
         job.scene = replace(job.scene, normalization=similarity_of(stored["normalization"], str(resumed / CONFIG)))
         if (resumed / TENSORS).is_file():
             state = folders.load_checkpoint(resumed)

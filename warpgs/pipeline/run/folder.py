@@ -8,7 +8,7 @@ import math
 import os
 import platform
 import shlex
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Any, get_type_hints
@@ -26,7 +26,9 @@ from warpgs.kernels.cameras import check_camera
 from warpgs.locks import check_free, hold_folder
 from warpgs.pipeline.model.table import SIMILARITY, FittedModel, checked_gaussians, similarity_of, similarity_values, unpack
 from warpgs.pipeline.run.request import FitRequest, SceneRequest, choose_device
-from warpgs.pipeline.train.settings import FitConfig, fingerprint, upgraded
+from warpgs.pipeline.train.settings import PARTS, FitConfig, fingerprint, upgraded
+from warpgs.pipeline.train.strategies.base import STRATEGIES
+from warpgs.plugins import own_specs
 from warpgs.poses.find import JSON as POSES
 from warpgs.scene import Camera, Scene
 from warpgs.schema import SchemaError, fields, flag, items, mapping, number, one_of, or_null, real, text, whole
@@ -75,7 +77,10 @@ _RECORD = fields(
         ),
         "cameras": mapping(_CAMERA, _view_name),
     },
-    {"scene_format": text, "transparent": flag, "own_code": mapping(text), "pruned": fields({"source": text})},
+    {
+        "scene_format": text, "transparent": flag, "own_code": mapping(text), "own_files": mapping(text),
+        "pruned": fields({"source": text}),
+    },
 )  # fmt: skip
 
 
@@ -266,7 +271,7 @@ def record_of(
         "normalization": similarity_values(scene.normalization),
         "background": scene.background, "transparent": scene.transparent,
         "config": config.to_json(), "config_hash": config.fingerprint(), "own_code": config.own_code(),
-        "device": device.type, "versions": versions(),
+        "own_files": dict(own_specs(config.plugged_in())), "device": device.type, "versions": versions(),
         "cameras": {v.name: camera_values(v.camera) for v in scene.views},
     }  # fmt: skip
 
@@ -318,12 +323,9 @@ SAME = {
 def check_same(record: dict[str, Any], stored: dict[str, Any], out: Path) -> None:
     """Check that a continued run has the same data, views, settings, user code and kind of device as before."""
     if "pruned" in stored:
-        raise UsageError(
-            f"--resume: {out} is a pruned model without the state of its fit; resume the original run, "
-            f"{stored['pruned']['source']}"
-        )
+        raise UsageError(f"--resume: {out} is a pruned model, without the state of a fit; resume {stored['pruned']['source']}")
     _check_lost(stored, out)
-    _check_named_again(record["config"], stored["config"], out)
+    _check_named_again({name for field in PLUGGED for name in _names(record["config"], field)}, stored, out)
     for key, words in SAME.items():
         now: Any = plain(record[key])
         then = stored.get(key, {})
@@ -370,19 +372,27 @@ def check_checkpoint(state: dict[str, Any], stored: dict[str, Any], out: Path) -
             )
 
 
-def _check_named_again(now: dict[str, Any], then: dict[str, Any], out: Path) -> None:
-    """Raise a UsageError if a run used code from outside warpgs that is not named again."""
-    for field in ("strategy", "loss_terms", "view_modules"):
-        named, needed = (
-            [value] if isinstance(value := config.get(field, []), str) else [part["name"] for part in value]
-            for config in (now, then)
+PLUGGED: dict[str, Any] = {"strategy": STRATEGIES, **PARTS}
+"""Registries of classes by the field of the settings that names them."""
+
+
+def _names(config: dict[str, Any], field: str) -> list[str]:
+    """Return the names of classes in a field of stored settings."""
+    return [value] if isinstance(value := config[field], str) else [part["name"] for part in value]
+
+
+def _check_named_again(named: set[str], stored: dict[str, Any], out: Path, reader: str | None = None) -> None:
+    """Raise a UsageError if a run used code from outside warpgs, or such a reader, that is not named again."""
+    files, needed = stored.get("own_files", {}), {"reader": [reader] if reader and ":" in reader else []}
+    for field, registry in PLUGGED.items():
+        lacking = [n for n in _names(stored["config"], field) if ":" in n or (n in files and n not in registry.names())]
+        needed[field] = [n if ":" in n else files[n] for n in lacking]
+    if set().union(*needed.values()) - named:
+        flags = (f"--{field.replace('_', '-')} {shlex.quote(','.join(names))}" for field, names in needed.items() if names)
+        raise UsageError(
+            f"--resume: the run in {out} was fitted with user code. A run folder never decides which code is loaded; name it: "
+            f"`warpgs fit --out {shlex.quote(str(out))} --resume {' '.join(flags)}`"
         )
-        outside = [name for name in needed if ":" in name]
-        if set(outside) - set(named):
-            raise UsageError(
-                f"--resume: the run in {out} was fitted with user code. A run folder never decides which code is loaded; give "
-                f"--{field.replace('_', '-')} {','.join(outside)} again"
-            )
 
 
 @dataclass(frozen=True, repr=False)
@@ -411,38 +421,45 @@ class StoredRun(FittedModel):
                 selects code.
 
         Raises:
-            DataError: The scene was passed from Python and has no folder.
+            DataError: The scene was passed from Python and has no folder, or the folder is not there any more.
             UsageError: The scene was read with another user-defined reader.
         """
         return _stored_scene(self.folder, self.record, reader)
 
 
-def _stored_scene(folder: Path, record: dict[str, Any], reader: str | None) -> SceneRequest:
-    """Return the scene of a run's record, as `StoredRun.scene_request` does."""
-    if record["scene"]["path"] is None:
-        raise DataError(
-            f"{folder}: the scene was passed from Python and has no folder; score the model in Python with warpgs.evaluate"
-        )
-    request = SceneRequest(**record["scene"])
+def _stored_scene(folder: Path, record: dict[str, Any], reader: str | None, moved: str | None = None) -> SceneRequest:
+    """Return the scene of a run's record, as `StoredRun.scene_request` does, with its maps where it was ``moved``."""
+    values, old = record["scene"], record["scene"]["path"]
+    if old is None:
+        raise DataError(f"{folder}: the scene was passed from Python and has no folder; score it there with warpgs.evaluate")
+    if moved is not None:
+        new = os.path.realpath(moved)
+        values = {
+            n: new + v[len(old) :] if isinstance(v, str) and Path(v).is_relative_to(old) else v for n, v in values.items()
+        }
+    request = SceneRequest(**values)
     if not os.path.exists(request.path) and (folder / POSED_SCENE / POSES).is_file():
         request = replace(request, path=str(folder / POSED_SCENE))  # the run folder was moved, and its scene with it
     if request.reader is not None and ":" in request.reader and reader != request.reader:
-        raise UsageError(
-            f"{folder}: the scene was read with user code. A run folder never decides which code is loaded; give --reader "
-            f"{request.reader} again"
+        raise UsageError(f"{folder}: the scene was read with user code, which no run loads; give --reader {request.reader}")
+    if not os.path.exists(request.path):
+        raise DataError(
+            f"{request.path}: the scene of {folder} is gone; if it was moved, `warpgs fit NEW_PLACE --out "
+            f"{shlex.quote(str(folder))} --resume` stores its new place, and makes scores and report again"
         )
     return request
 
 
-def stored_request(folder: Path) -> FitRequest:
-    """Return the request that continues a run, with the scene and all settings that the run was started with."""
+def stored_request(folder: Path, moved: str | None = None, code: Collection[str] = ()) -> FitRequest:
+    """Return the request that continues a run with its scene, which may have ``moved``, and settings; ``code`` was loaded."""
     record = read_record(folder)
     _check_lost(record, folder)
-    try:
-        scene = _stored_scene(folder, record, None)
-        _check_named_again({}, record["config"], folder)
-    except UsageError as e:
-        raise UsageError(f"{e}, with the scene and all other flags of the run") from e
+    reader = record["scene"].get("reader")
+    _check_named_again({*code}, record, folder, reader)
+    for field, registry in PLUGGED.items():
+        for name in filter(code.__contains__, _names(record["config"], field)):
+            registry.load(name)
+    scene = _stored_scene(folder, record, reader, moved)
     try:
         config = FitConfig.from_json(record["config"])
     except (UsageError, SchemaError) as e:

@@ -78,6 +78,15 @@ def fit_kernels(cuda: bool) -> list[tuple[wp.Kernel, int]]:
     ]  # fmt: skip
 
 
+def call_kernels(cuda: bool) -> list[tuple[wp.Kernel, int]]:
+    """Return further kernels, as `fit_kernels` does, of `rasterize` with scales and opacities, and of `warpgs.compat`."""
+    room, variant = project_cuda if cuda else project_cpu, (wp.float32, CAMERA_MODEL, "activated", False, sh.BASES)
+    median = walk.make_native(TILE_SIZE).median if cuda else walk.make_walk(wp.float32, TILE_SIZE, walk.make_median)
+    backward = room.make_backward(*variant, *([] if cuda else [False]))
+    kernels = room.make_forward(*variant), backward, blend.make_kernels(wp.float32, COLORS).color, median
+    return list(zip(kernels, (BLOCK, BLOCK, THREADS, TILE_SIZE**2) if cuda else (1, 1, 1, 1)))
+
+
 def scoring() -> wp.Kernel:
     """Return the kernel that computes SSIM for scores, on the CPU."""
     kernel: wp.Kernel = ssim.make_kernels(wp.float32, False).forward
@@ -98,7 +107,7 @@ def compiled_ahead(device: torch.device) -> Iterator[list[tuple[wp.Kernel, int]]
 
 
 def precompile_kernels(devices: list[torch.device] | None = None) -> Iterator[tuple[str, str, int, bool, float]]:
-    """Compile and load the modules of fits, by default on the CPU and all CUDA devices.
+    """Compile and load the modules of fits and of `call_kernels`, by default on the CPU and all CUDA devices.
 
     Yields device, kernel, block size, whether the module was not in the cache, and the time since the start [s], of each.
     """
@@ -107,7 +116,7 @@ def precompile_kernels(devices: list[torch.device] | None = None) -> Iterator[tu
     began, wall = time.perf_counter(), time.time()
     for device in devices:
         with compiled_ahead(device) as kernels:
-            for kernel, block in kernels:
+            for kernel, block in [*kernels, *call_kernels(device.type == "cuda")]:
                 path = Path(load_module(kernel.module, launch.warp_device(device), block).binary_path)
                 name = f"{kernel.func.__module__.rpartition('.')[2]}.{kernel.func.__name__}"
                 yield str(device), name, block, path.stat().st_mtime >= wall, time.perf_counter() - began

@@ -355,11 +355,17 @@ def summary_line(metrics: dict[str, Any]) -> str:
     return f"{score_line(metrics['test'])}; {size}, {duration(metrics['seconds']['total'])}"
 
 
+def over_region(metrics: dict[str, Any]) -> str:
+    """Return the pixels that the scores of metrics.json are of, as the end of a phrase; empty for all pixels."""
+    return "" if (region := metrics.get("region", "all")) == "all" else f" over {region}"
+
+
 def result_lines(metrics: dict[str, Any], out: Path | None, tasks: Sequence[str] = ()) -> list[str]:
     """Return the final lines of a fit from metrics.json: scores, size, time, what to do, report, next steps."""
-    lines = [f"training PSNR {metrics['train']['psnr']:.2f} dB (no score of new views: no view is held out)"]
+    over = over_region(metrics)
+    lines = [f"training PSNR {metrics['train']['psnr']:.2f} dB{over} (no score of new views: no view is held out)"]
     if metrics["test"]:
-        lines = [f"held-out {score_line(metrics['test'])} ({len(metrics['views'])} views)"]
+        lines = [f"held-out {score_line(metrics['test'])} ({len(metrics['views'])} views{over})"]
         best = ", ".join(f"{BASELINES.get(name, name)} {value:.2f} dB" for name, value in metrics["baselines"].items())
         lines += [f"  for comparison, without a fit: {best}"] if best else []
         lines += [f"  {metrics['coverage']['summary']}"] if "coverage" in metrics else []
@@ -431,7 +437,7 @@ def evaluate_run(
         "test": summarize(rows), "train": summarize(train_rows),
         "views": [r.row() for r in rows],
         "variants": variants(lpips, any(r.opacity for r in found)),
-        "baselines": plain.result(),
+        "baselines": plain.result(), "region": ", ".join(sorted({r.region for r in found})),
     }  # fmt: skip
 
 
@@ -479,11 +485,11 @@ def new_view(
 def _figures(metrics: dict[str, Any], seconds: float) -> list[tuple[str, str]]:
     """Return the main figures of the page as pairs of label and value."""
     test = metrics["test"]
-    held_out = [("training PSNR: no score of new views", f"{metrics['train']['psnr']:.2f} dB")]
+    held_out = [(f"training PSNR{over_region(metrics)}: no score of new views", f"{metrics['train']['psnr']:.2f} dB")]
     if test:
         best = max(metrics["baselines"].values(), default=math.nan)
         held_out = [
-            ("held-out PSNR", f"{test['psnr']:.2f} dB"), ("held-out SSIM", f"{test['ssim']:.3f}"),
+            (f"held-out PSNR{over_region(metrics)}", f"{test['psnr']:.2f} dB"), ("held-out SSIM", f"{test['ssim']:.3f}"),
             ("best without a fit", f"{best:.2f} dB"),
             *((LABELS[k], f"{test[k]:.3f}") for k in ("alpha_empty", "alpha_object") if k in test),
         ]  # fmt: skip
@@ -524,10 +530,9 @@ def write_report(
         pictures = [(threads.submit(webp, image), words) for image, words in opening]
         images = _images(shown, renders, {r["name"]: r for r in metrics["views"]}, tell)
     events = read_events(out / "metrics.jsonl")
-    curves = [
-        curve(title, [e["step"] for e in events], [e.get(name, math.nan) for e in events], unit)
-        for title, name, unit in (("Training loss", "loss", ""), ("Training PSNR", "psnr", "dB"), ("Gaussians", "count", ""))
-    ]
+    named = ("Training loss", "loss", ""), ("Training PSNR of whole images", "psnr", "dB"), ("Gaussians", "count", "")
+    steps = [e["step"] for e in events]
+    curves = [curve(title, steps, [e.get(name, math.nan) for e in events], unit) for title, name, unit in named]
     keys = [k for k in LABELS if k in metrics["test"]]
     table = [["view", *(LABELS[k] for k in keys), "pixels"]] + [
         [r["name"], *(f"{r.get(k, math.nan):.{2 if k.startswith('psnr') else 4}f}" for k in keys), r["region"]]
