@@ -124,9 +124,7 @@ def parse_bytes(text: str) -> int:
     found = re.fullmatch(r"\s*([0-9]+(?:\.[0-9]+)?|\.[0-9]+)\s*([A-Za-z]+)\s*", text)
     units = {u.lower(): b for u, b in UNITS.items()}
     if not found or found[2].lower() not in units:
-        raise UsageError(
-            f"memory limit {text[:40]!r} is not a size: give a number and a unit of {', '.join(UNITS)}, such as 2GiB"
-        )
+        raise UsageError(f"memory limit {text[:40]!r} is not a size: give a number and one of {', '.join(UNITS)}, such as 2GiB")
     size = float(found[1]) * units[found[2].lower()]
     if not 1 <= size < 2**63:
         raise UsageError(f"memory limit {text[:40]!r} must be at least one byte and less than 2^63")
@@ -326,8 +324,7 @@ def _machine_or_assumed() -> Memory:
 @functools.cache
 def _say_assumed() -> None:
     say(
-        f"warpgs: the memory of this system is unknown (neither psutil nor a container reports it); "
-        f"{ASSUMED_BYTES / 2**30:.0f} GiB are assumed",
+        f"warpgs: neither psutil nor a container reports the memory; {ASSUMED_BYTES / 2**30:.0f} GiB are assumed",
         error=True,
     )
 
@@ -366,8 +363,7 @@ def prepare_kernel_cache() -> tuple[Path, str]:
     folder, refused = choose_kernel_cache(warp.config.kernel_cache_dir)
     if refused:
         say(
-            f"warpgs: {refused}; kernels are compiled into {folder} for this process only, which takes a "
-            f"minute or two. {REMEDY}",
+            f"warpgs: {refused}; kernels are compiled into {folder} for this process only (minutes). {REMEDY}",
             error=True,
         )
     if refused or warp.config.kernel_cache_dir is None:

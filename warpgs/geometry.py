@@ -351,10 +351,7 @@ def depth_normals(camera: Camera, depth: torch.Tensor) -> torch.Tensor:
 
     check_pinhole(camera)
     if tuple(depth.shape) != (camera.height, camera.width):
-        raise UsageError(
-            f"depth must have the shape [{camera.height}, {camera.width}] of the camera's image, not {list(depth.shape)}; "
-            "scale width, height and K of the camera to the map"
-        )
+        raise UsageError(f"depth is {list(depth.shape)}, not [{camera.height}, {camera.width}]; scale the camera's size and K")
     height, width = depth.shape
     if min(height, width) < 3:
         return depth.new_zeros(height, width, 3)

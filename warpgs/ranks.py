@@ -261,8 +261,7 @@ class RankWatch:
                 lost = 0
             if lost is not None and not self.leaving.is_set():
                 self.fail(
-                    f"warpgs: rank {lost} of {self.count} was lost, so this fit stops; --resume continues from the last "
-                    "checkpoint, with any number of ranks"
+                    f"warpgs: rank {lost} of {self.count} was lost: this fit stops; --resume it, with any number of ranks"
                 )
                 os._exit(ResourceError.exit_code)
 
@@ -470,9 +469,7 @@ def join(device: str) -> Ranks:
         store = _store(address, port, count, home, hosts=rank == 0 and not agent)
         watch = RankWatch(rank, count, store, _store(address, port, count, home, hosts=False))
     except RuntimeError as e:
-        raise ResourceError(
-            f"rank {rank} of {count} cannot reach the others at {address}:{port} ({str(e).splitlines()[0][:200]})"
-        ) from e
+        raise ResourceError(f"rank {rank} of {count} cannot reach {address}:{port} ({str(e).splitlines()[0][:200]})") from e
     backend = "nccl" if cuda else "gloo"
     _joined = Group(rank, count, backend, watch)
     if cuda:

@@ -73,8 +73,8 @@ def test_keyframes_of_a_viewer_give_back_its_cameras(model, tmp_path):
         (lambda k: [k] * 10_001, "1 to 10,000"),
         (lambda k: [{"c2w": k["c2w"], "fov_y": 1.0}], "seconds is missing"),
         (None, "no such file; give a .json file of keyframes"),
-        (lambda k: "{", "cannot be read as keyframes"),
-        (lambda k: "[" * 100_000, "cannot be read as keyframes"),
+        (lambda k: "{", "no keyframes"),
+        (lambda k: "[" * 100_000, "no keyframes"),
     ],
 )
 def test_keyframes_that_are_none_are_refused(model, tmp_path, change, words):

@@ -159,7 +159,7 @@ def test_kept_rows_keep_everything_and_new_rows_start_anew():
     before = snapshot(made)
     added = {n: t.detach()[:2] for n, t in made.params.items()}
     for bad, parents in ((added, 1), ({n: t for n, t in added.items() if n != "sh"}, 2)):
-        with pytest.raises(UsageError, match="one row for each entry of parents"):
+        with pytest.raises(UsageError, match="give each row a parent"):
             made.apply(DensityUpdate(torch.arange(4), bad, torch.full((parents,), -1)))
     assert all(torch.equal(t, before[n]) for n, t in made.state().items()) and len(made) == 4
 

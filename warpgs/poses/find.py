@@ -153,8 +153,7 @@ def record_of(found: Mapping, photographs: Sequence[photos.Photograph], digest: 
         )
     if found.method == "global":
         remarks.append(
-            "global mapping is used, because it joined more photographs than incremental mapping; results of global mapping "
-            "differ a little from run to run"
+            "global mapping joined more photographs than incremental mapping; results differ a little from run to run"
         )
     return {
         "format": FORMAT, "source_sha256": digest, "photographs": rows, "notes": [*notes, *remarks],

@@ -114,10 +114,7 @@ def _lines(job: Json, folder: Path) -> Iterator[Json]:
     except ProcessFailed as e:
         if disk_is_full(folder, e.errors):
             # the work folder is temporary, and its name means nothing to the user
-            raise ResourceError(
-                f"{folder.parents[1]}: its disk is full, so pycolmap cannot write features and matches. Free some disk space, "
-                "or choose another --out"
-            ) from e
+            raise ResourceError(f"{folder.parents[1]}: its disk is full; free some space, or choose another --out") from e
         why = f"pycolmap ended with code {e.code}; it may have had too little memory"
         raise ResourceError(f"{why}. Its last message: {e.errors[-LAST_WORDS:].replace(chr(10), ' ')}") from e
 

@@ -146,10 +146,7 @@ class Matcher(Model):
         there = scores > 0
         inside = (keypoints >= 0) & (keypoints <= [w, h])
         if not (inside[there].all() and (np.abs(np.linalg.norm(descriptors[there], axis=1) - 1) < 1e-2).all()):
-            raise DataError(
-                f"{self.path}: its keypoints are outside the image, or its descriptors do not have length 1; export it with "
-                "keypoints in pixels and normalised descriptors"
-            )
+            raise DataError(f"{self.path}: keypoints must be in the image, descriptors of length 1; export it again")
 
 
 def _network_size(height: int, width: int, side: int) -> tuple[int, int]:

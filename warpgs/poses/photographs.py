@@ -79,9 +79,7 @@ def _frames(path: Path) -> Iterator[np.ndarray]:
         capture = cv2.VideoCapture(name, cv2.CAP_FFMPEG)
     try:
         if not capture.isOpened():
-            raise DataError(
-                f"{path}: OpenCV cannot read it as a video; convert it to an mp4 file with H.264, or give its frames"
-            )
+            raise DataError(f"{path}: OpenCV cannot read it as a video; convert it to mp4 with H.264, or give its frames")
         size = capture.get(cv2.CAP_PROP_FRAME_WIDTH) * capture.get(cv2.CAP_PROP_FRAME_HEIGHT)
         if not 0 < size <= MAX_FRAME_PIXELS:
             raise DataError(f"{path}: its frames have {size:,.0f} pixels, not 1 to {MAX_FRAME_PIXELS:,}; convert the video")
@@ -164,10 +162,7 @@ def to_jpeg(
     if not paths:
         return {}
     if importlib.util.find_spec("pi_heif") is None:
-        raise UsageError(
-            f"{paths[0]}: is a HEIC photograph, and the package pi-heif is not installed; "
-            f"{install_extras('poses')}, or convert all HEIC files to JPEG"
-        )
+        raise UsageError(f"{paths[0]}: HEIC, but pi-heif is not installed; {install_extras('poses')}, or convert all to JPEG")
     copies = {p: folder / f"{p.relative_to(root).as_posix()}.jpg" for p in paths}
     for copy in copies.values():
         make_folder(copy.parent)

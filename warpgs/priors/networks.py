@@ -86,9 +86,7 @@ class Network(Model):
             raise DataError(f"{path}: its input is {text}; {needed}")
         self.layout = "nchw" if dims[1] == 3 or (dims[1] is None and dims[3] != 3) else "nhwc"
         if self.layout == "nhwc" and dims[3] != 3:
-            raise DataError(
-                f"{path}: neither the second nor the last axis of its input, {text}, has the 3 channels of an image"
-            )
+            raise DataError(f"{path}: neither the second nor the last axis of its input, {text}, has the 3 channels of images")
         self.type = TYPES[kind]
         self.size = fixed_size(self.path, dims[2:] if self.layout == "nchw" else dims[1:3])
 

@@ -53,10 +53,7 @@ def class_probabilities(network: networks.Network, preprocessing: networks.Prepr
     """Return the probability of each of the 21 classes at each pixel of an image [H, W, 3], float32 [H, W, 21]."""
     output = network.run(preprocessing.prepare(network, image))
     if output.ndim != 4 or output.shape[0] != 1 or CLASSES not in (output.shape[1], output.shape[3]):
-        raise DataError(
-            f"{network.path}: its output has the shape {output.shape}; scores of the {CLASSES} PASCAL VOC classes, "
-            f"1 x {CLASSES} x height x width, are needed"
-        )
+        raise DataError(f"{network.path}: its output, {output.shape}, is not [1, {CLASSES}, height, width], scores of VOC")
     scores = output[0].transpose(1, 2, 0) if output.shape[1] == CLASSES else output[0]
     are_probabilities = bool((scores >= 0).all()) and np.allclose(scores.sum(-1), 1, atol=1e-3)
     scores = networks.resize(scores, *image.shape[:2])

@@ -38,9 +38,7 @@ def _for_each(name: str, array: Any, like: torch.Tensor, axes: int = 2) -> torch
     tensor, cameras = as_batch(array, like, axes), like.shape[0]
     own = list(tensor.shape[1:])
     if tensor.ndim != axes + 1 or tensor.shape[0] not in (1, cameras):
-        raise ValueError(
-            f"camera.{name} must have shape {own} or {[cameras, *own]} to match camera.viewmat, not {list(array.shape)}"
-        )
+        raise ValueError(f"camera.{name} must have shape {own} or {[cameras, *own]}, as viewmat, not {list(array.shape)}")
     return tensor if tensor.shape[0] == cameras else tensor.expand(cameras, *own).contiguous()
 
 

@@ -267,9 +267,7 @@ def _check_plan(plan: FilmPlan, out: Path, coverage: bool, sheet: bool) -> tuple
         raise UsageError(f"{out}: unknown film suffix; use {', '.join(SUFFIXES)}, or a folder without a suffix for images")
     one_size = len({(c.width, c.height) for _, c in plan.cameras}) == 1
     if (alone or sheet) and not one_size:
-        raise UsageError(
-            f"{out}: the views differ in size, but a film or sheet needs one size; give --size, or a folder without --sheet"
-        )
+        raise UsageError(f"{out}: views differ in size, but a film or sheet needs one; give --size, or a folder, no --sheet")
     if alone and coverage:
         raise UsageError(f"{out}: coverage images are PNG files; give a folder instead of a film")
     return alone, one_size

@@ -424,10 +424,7 @@ def read_keyframes(path: Path, template: Camera, normalization: Normalization) -
     except FileNotFoundError as e:
         raise DataError(f"{path}: no such file; give a .json file of keyframes, as the viewer saves it") from e
     except (OSError, schema.SchemaError) as e:
-        raise DataError(
-            f"{path}: cannot be read as keyframes ({unread_reason(e)}); give a JSON list of objects with c2w (4 rows of 4), "
-            "fov_y [rad] and seconds"
-        ) from e
+        raise DataError(f"{path}: no keyframes ({unread_reason(e)}); list objects of c2w (4 x 4), fov_y [rad], seconds") from e
     if not 1 <= len(values) <= MAX_KEYFRAMES:
         raise DataError(f"{path}: holds {len(values)} keyframes; a path needs 1 to {MAX_KEYFRAMES:,}")
     K = np.array([[template.K[0, 0], 0, 0.5 * template.width], [0, template.K[1, 1], 0.5 * template.height], [0, 0, 1.0]])
@@ -447,8 +444,7 @@ def read_keyframes(path: Path, template: Camera, normalization: Normalization) -
             raise DataError(f"{path}: fov_y of keyframe {i} is {value['fov_y']:g} rad; give radians, below 3.1")
         if result and not MIN_SECONDS <= value["seconds"] - values[i - 1]["seconds"] <= MAX_SECONDS:
             raise DataError(
-                f"{path}: seconds of keyframe {i} must be {MIN_SECONDS:g} to {MAX_SECONDS:g} above those of keyframe {i - 1}; "
-                "sort the keyframes by time"
+                f"{path}: keyframe {i} must be {MIN_SECONDS:g} to {MAX_SECONDS:g} s after the last; sort by seconds"
             )
         viewmat = geometry.pose_at(geometry.nearest_rotation(rotation).T, matrix[:3, 3])
         camera = geometry.convert_camera(replace(template, viewmat=viewmat), normalization, "file", "scene")

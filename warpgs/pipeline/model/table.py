@@ -227,10 +227,7 @@ class Table:
             added = {n: t.detach()[:0] for n, t in self.params.items()}
         rows = {n: len(added[n]) if n in added else None for n in self.params}
         if any(count != len(parents) for count in rows.values()):
-            raise UsageError(
-                f"a DensityUpdate has {len(parents)} parents but adds {rows} rows: each parameter needs one row for "
-                "each entry of parents (-1 for a row without a parent)"
-            )
+            raise UsageError(f"a DensityUpdate has {len(parents)} parents and {rows} rows: give each row a parent, -1 for none")
         if update.overwritten is not None:
             for name, value in update.values.items():
                 self.params[name].detach()[update.overwritten] = value.to(self.params[name].dtype)

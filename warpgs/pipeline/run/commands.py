@@ -68,17 +68,13 @@ def open_file(
     ``rule`` None is exact for files that name warpgs, else inria; ``near`` [file units] None is that of the rule.
     """
     if cameras is None:
-        raise UsageError(
-            f"{path}: a file of Gaussians has no cameras; give --cameras cameras.json, transforms.json, or a scene"
-        )
+        raise UsageError(f"{path}: a file of Gaussians has no cameras; give --cameras cameras.json, transforms.json or a scene")
     rule_named(rule or RULE)
     where, _ = choose_device(device)
     found, notes = _cameras_of(cameras)
     for name, c in found.items():
         if c.width * c.height > MAX_PIXELS:
-            raise DataError(
-                f"{cameras}, {name}: an image of {c.width} x {c.height} px has over {MAX_PIXELS:,} pixels; give a smaller size"
-            )
+            raise DataError(f"{cameras}, {name}: {c.width} x {c.height} px are over {MAX_PIXELS:,} pixels; give a smaller size")
     # the unit stays that of the file, since the near plane of a rule is in that unit; our fits have that of `load_scene`
     own = rule is None and format_of(path).is_own(path)
     extent = camera_extent(list(found.values())) if own else 0.0

@@ -282,10 +282,7 @@ def with_poses(
         if record["source_sha256"] != source_digest(source, request.allow_outside):
             raise UsageError(f"{scene} holds poses of other photographs than {source}; give another --out")
     elif ranks > 1:
-        raise UsageError(
-            f"{source}: has no cameras, and each of {ranks} ranks would find its own poses; run `warpgs poses {source} --out "
-            "SCENE` first, and fit SCENE"
-        )
+        raise UsageError(f"{source}: has no cameras, and ranks find none; run `warpgs poses {source} --out SCENE`, fit SCENE")
     else:
         if "=" not in (spec := request.split or "all") and not is_video(source):  # refuse what all photographs are too few for
             root = image_root(source)
@@ -443,9 +440,7 @@ def _checked_settings(
     config, origin = chosen_settings(preset, overrides)
     check_ranks(config.batch, ranks)
     if time_budget is not None and ranks.count > 1:
-        raise UsageError(
-            f"--time-budget: each of {ranks.count} ranks would measure its own speed and choose other steps; give --steps"
-        )
+        raise UsageError(f"--time-budget: each of {ranks.count} ranks would choose its own number of steps; give --steps")
     return config, origin
 
 
@@ -454,9 +449,7 @@ def _checked_source(scene: Scene | SceneRequest | str | Path, split: str | None)
     if isinstance(scene, (str, Path)):
         scene = SceneRequest(str(scene))
     if not isinstance(scene, (Scene, SceneRequest)):
-        raise UsageError(
-            f"scene must be a warpgs.Scene or a folder, not {type(scene).__name__}; give Scene(path, format, views)"
-        )
+        raise UsageError(f"scene must be a Scene or a folder, not {type(scene).__name__}; give Scene(path, format, views)")
     if isinstance(scene, SceneRequest):
         scene = replace(scene, split=scene.split if split is None else split)
         split = scene.split

@@ -87,9 +87,7 @@ def choose_device(name: str | torch.device) -> tuple[torch.device, str]:
     if device.type != "cuda":
         raise UsageError(f"device {device} has no kernels: give auto, cpu, cuda or cuda:N")
     if not torch.cuda.is_available():
-        raise ResourceError(
-            "--device cuda: torch finds no CUDA device; run `warpgs doctor` for the reason, or use --device cpu"
-        )
+        raise ResourceError("--device cuda: torch finds no CUDA device; `warpgs doctor` tells why; or use --device cpu")
     if device.index is None:
         device = torch.device("cuda", torch.cuda.current_device())
     return device, f"on {torch.cuda.get_device_name(device)}"
@@ -100,10 +98,7 @@ def choose_split(scene: Scene, spec: str | None) -> tuple[Split, list[str]]:
     split = split_views(scene, "all" if spec is None else spec)
     notes = [] if split.test else [NO_SCORES]
     if (spec or "").startswith("dtu:") and any(v.mask is not None for v in scene.views):
-        notes.append(
-            "masks hide pixels from the fit, unlike in the published DTU protocol; put object masks for scoring only into a "
-            "folder idrmasks, or give them with --score-masks"
-        )
+        notes.append("masks hide pixels from the fit, unlike in the published DTU protocol; score with --score-masks instead")
     for test, train in coincident_views(scene, split):
         notes.append(f"{test} is held out, but training view {train} has the same pose, so this score does not test new views")
     return split, notes

@@ -42,10 +42,7 @@ MAX_RENDERS = 2**24
 def check_ranks(batch: int, ranks: Ranks) -> None:
     """Check that every process has a view in each step of ``batch`` views."""
     if batch < ranks.count:
-        raise UsageError(
-            f"--batch {batch} is less than the number of ranks, {ranks.count}; give --batch {ranks.count} or a multiple "
-            "of it, or start fewer ranks"
-        )
+        raise UsageError(f"--batch {batch} is below the {ranks.count} ranks; give a multiple of them, or start fewer ranks")
 
 
 def check_renders(batch: int, steps: int) -> None:

@@ -52,9 +52,7 @@ class _Outputs(dict[str, torch.Tensor]):
         self.term = term
 
     def __missing__(self, name: str) -> torch.Tensor:
-        raise UsageError(
-            f"the loss term {self.term.name!r} reads the output {name!r}, but did not request it; add it to needs_outputs"
-        )
+        raise UsageError(f"the loss term {self.term.name!r} reads the output {name!r}; add it to needs_outputs")
 
 
 @dataclass(frozen=True)

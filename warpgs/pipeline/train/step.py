@@ -351,9 +351,7 @@ class StepTaker:
             self._capacities[kind, plan] = instance_capacity(self.table.gaussians, now, plan.degree, self.options)
         wanted = self._capacities[kind, plan]
         if max_instances is not None and wanted > max_instances:
-            raise OverLimitError(
-                f"a captured step would need capacity for {wanted:,} instances, but the limit allows {max_instances:,}"
-            )
+            raise OverLimitError(f"a captured step needs capacity for {wanted:,} instances; the limit allows {max_instances:,}")
         return wanted
 
     def capture(self, work: Callable[[], object], buffers: StepBuffers) -> CapturedGraph:

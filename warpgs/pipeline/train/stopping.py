@@ -275,9 +275,7 @@ class Stopping:
         shape = (len(plain["measured"]), self.held if self.active else 0)
         measured = tensors.get("stopping.measured", torch.zeros(0, shape[1], dtype=torch.float32, device="cpu"))
         if measured.shape != shape:
-            raise DataError(
-                f"the stored errors of the left-out blocks have shape {list(measured.shape)}, not {list(shape)}; fit again"
-            )
+            raise DataError(f"stored errors of left-out blocks have shape {list(measured.shape)}, not {list(shape)}; fit again")
         self.ended, self.why = plain["ended"], plain["why"]
         self.measurements = list(plain["measurements"])
         self.measured = list(zip(plain["measured"], measured))

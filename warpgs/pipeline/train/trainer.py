@@ -110,10 +110,7 @@ class ParameterMean:
         kinds = {n: (t.shape, t.dtype) for n, t in stored.items()}
         counted = count is not None and count.shape == (1,) and count.dtype == torch.int64 and int(count) > 0
         if not counted or kinds != {n: (t.shape, t.dtype) for n, t in params.items()}:
-            raise DataError(
-                "the stored mean of the parameters is damaged, or does not belong to these parameters; restore the file, or "
-                "fit the scene again"
-            )
+            raise DataError("the stored mean of the parameters is damaged, or of another fit; restore it, or fit again")
         self.count = int(count)
         self.sums = {n: t.to(params[n].device).clone() for n, t in stored.items()}
 
@@ -134,10 +131,7 @@ def check_state(
     try:
         torch.Generator().set_state(tensors["generator"])
     except (KeyError, TypeError, RuntimeError) as e:
-        raise DataError(
-            "the stored state is incomplete: generator (the state of the random numbers) is missing or damaged; restore the "
-            "file, or fit the scene again"
-        ) from e
+        raise DataError("generator, the state of the random numbers, is missing or damaged; restore it, or fit again") from e
 
 
 DROPOUT_VIEWS = 3
@@ -304,8 +298,7 @@ class Trainer:
         except UsageError as e:
             raise ResourceError(str(e)) from e
         self.messages.append(
-            f"memory: step {self.step + 1} ran out of memory; from now on, steps run without CUDA graphs, within "
-            f"{format_bytes(self.memory_limit)}"
+            f"memory: step {self.step + 1} ran out of memory; now without CUDA graphs, in {format_bytes(self.memory_limit)}"
         )
 
     def _advance(self, limit: int) -> list[StepReport]:

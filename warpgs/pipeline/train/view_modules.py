@@ -220,9 +220,7 @@ class Exposure(ViewModule, group="exposure."):
         """Check that no view has an alpha channel: an exposure would change the background with the object."""
         for v in views:
             if v.alpha is not None:
-                raise UsageError(
-                    f"--exposure does not support images with an alpha channel, such as {v.name}; leave out --exposure"
-                )
+                raise UsageError(f"--exposure cannot fit images with an alpha channel, such as {v.name}; omit --exposure")
 
     def parameters(self, views: Sequence[View]) -> dict[str, torch.Tensor]:
         """Return zeros, shape [V, 12]."""

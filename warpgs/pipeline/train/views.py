@@ -57,9 +57,7 @@ class LearnedViews:
             returned(module, "parameters", own, Mapping, what, each=torch.Tensor, shape=(len(views),))
             for name in own.keys() & first.keys():
                 other = next(m.name for m, names in zip(modules, self._names) if name in names)
-                raise UsageError(
-                    f"the view modules {other!r} and {module.name!r} both have a parameter {name!r}; rename it in one of them"
-                )
+                raise UsageError(f"the view modules {other!r} and {module.name!r} both have a parameter {name!r}; rename one")
             rates = returned(module, "lrs", module.lrs(0.0, 1.0), Mapping, what := "a rate for each parameter, by name")
             returned(module, "lrs", {n: rates.get(n) for n in own}, Mapping, what, each=(int, float))
             first |= {n: t.to(device, torch.float32) for n, t in own.items()}
