@@ -14,6 +14,7 @@ from warpgs.geometry import matmul, pinhole_of, project_points
 from warpgs.kernels.launch import MAX_SIZE
 from warpgs.kernels.tsdf import gather_colors, integrate
 from warpgs.mesh.views import DEPTHS, SAMPLES, SurfaceView, SurfaceViews, agreed, depth_map, neighbours, sample_surface
+from warpgs.process import Say, silent
 from warpgs.render.options import RasterizeOptions
 from warpgs.report.images import resized
 from warpgs.scene import Box, Camera, Gaussians, Mesh
@@ -271,7 +272,7 @@ class FusedMesh:
 
 def fuse(
     gaussians: Gaussians, cameras: Sequence[Camera], render: RasterizeOptions, options: MeshOptions = MeshOptions(), *,
-    stage: Callable[[str], object] = lambda line: None, planned: Callable[[GridPlan, str], object] = lambda plan, memory: None,
+    stage: Say = silent, planned: Callable[[GridPlan, str], object] = lambda plan, memory: None,
 ) -> FusedMesh:  # fmt: skip
     """Make a mesh of the surfaces that cameras see; ``planned`` gets the grid and its memory before it is allocated."""
     # Areas that no camera sees, or on which cameras disagree, stay open. Views are used three times: for the extent of the

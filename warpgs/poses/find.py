@@ -16,6 +16,7 @@ from warpgs.io.image_files import MAX_PIXELS, unread_note
 from warpgs.poses import photographs as photos
 from warpgs.poses.mapping import EXHAUSTIVE, LEARNED, Mapping, camera_groups, cameras_of, check_installed, find_model
 from warpgs.poses.matching import Matcher, write_matches
+from warpgs.process import Say, silent
 
 MIN_KEYPOINTS = 100
 """Keypoints below which a photograph shows too little to match: a blank wall, darkness, blur."""
@@ -234,7 +235,7 @@ def find_poses(
     max_pixels: int = MAX_PIXELS,
     allow_outside: bool = False,
     matcher: str | Path | None = None,
-    progress: photos.Progress = lambda line: None,
+    progress: photos.Say = silent,
 ) -> dict[str, Any]:
     """Find the poses of photographs or of a video's sharpest frames; write a scene folder, whole or not at all."""
     source, out = Path(source), Path(out)
@@ -267,7 +268,7 @@ def find_poses(
 
 def _with_network(
     network: Matcher, found: Mapping, photographs: list[photos.Photograph], names: list[str], kind: str, work: Path,
-    progress: photos.Progress, threads: int,
+    progress: Say, threads: int,
 ) -> tuple[Mapping, list[str]]:  # fmt: skip
     """Return the model from the network's matches if it has more photographs than SIFT's, and notes."""
     # the network, which is less accurate, runs only if SIFT leaves photographs without a pose
@@ -323,7 +324,7 @@ def _check(source: Path, out: Path, allow_outside: bool) -> None:
 
 
 def _prepared(
-    source: Path, work: Path, frames: int, max_pixels: int, progress: photos.Progress
+    source: Path, work: Path, frames: int, max_pixels: int, progress: Say
 ) -> tuple[list[photos.Photograph], list[str], list[str]]:
     """Return the photographs of a source, the names of their copies in ``work``/small, and notes for the user."""
     notes, root = [], source

@@ -16,8 +16,8 @@ from warpgs.device import usable_cores
 from warpgs.errors import ResourceError, UsageError, install_extras
 from warpgs.files import disk_is_full, write_json, write_text
 from warpgs.poses.matching import choose_pairs
-from warpgs.poses.photographs import MATCHING_SIDE, Photograph, Progress
-from warpgs.process import ProcessFailed, answer, end_with_parent, python_lines
+from warpgs.poses.photographs import MATCHING_SIDE, Photograph
+from warpgs.process import ProcessFailed, Say, answer, end_with_parent, python_lines
 
 EXHAUSTIVE = 60
 """Largest number of photographs of which all pairs are matched; for more photographs, pairs are chosen."""
@@ -124,7 +124,7 @@ def find_model(
     names: list[str],
     kind: str,
     folder: Path,
-    progress: Progress,
+    progress: Say,
     threads: int = 0,
     learned: bool = False,
 ) -> Mapping:

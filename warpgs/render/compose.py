@@ -14,7 +14,7 @@ from warpgs.kernels.falloff import Pass
 from warpgs.kernels.project import project_inputs
 from warpgs.kernels.tiles import AS_NEEDED, InstanceMemory, Tiles, bin_tiles
 from warpgs.kernels.walk import contributions, heaviest, median_depth
-from warpgs.scene import ActivatedGaussians, Camera, CovarianceGaussians, RasterizedGaussians
+from warpgs.scene import ActivatedGaussians, Camera, CovarianceGaussians, RasterizedGaussians, Tensors
 
 # `rasterize`, chunked and graphed rendering and the training step all call these functions, each with its own way to
 # allocate memory.
@@ -104,9 +104,7 @@ def images_of(
     return blend_channels(projected, tiles, colors, backgrounds, settings)
 
 
-def further_of(
-    projected: torch.Tensor, tiles: Tiles, settings: Pass, weights: bool, median: bool, k: int
-) -> dict[str, torch.Tensor]:
+def further_of(projected: torch.Tensor, tiles: Tiles, settings: Pass, weights: bool, median: bool, k: int) -> Tensors:
     """Return further fields of `Render` by name: weights [C, N], median depth [C, H, W], and the ``k`` heaviest Gaussians."""
     found = {}
     if weights:

@@ -11,7 +11,7 @@ import re
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -19,7 +19,7 @@ from warpgs import schema
 from warpgs.errors import ResourceError
 from warpgs.files import appending, plain, read_file, write_bytes
 from warpgs.folders import RefusedError
-from warpgs.process import careful, printable, say
+from warpgs.process import Say, careful, printable, say, silent
 
 PLAIN_INTERVAL = 10.0
 """Seconds between two plain lines on the steps of a fit."""
@@ -118,7 +118,7 @@ class Stages(contextlib.AbstractContextManager["Stages"]):
     first line of a stage is shown at once, and then one every few seconds; a repeated line is skipped.
     """
 
-    def __init__(self, show: Callable[[str], object] = say, *, live: bool | None = None):
+    def __init__(self, show: Say = say, *, live: bool | None = None):
         """Print plain lines with ``show``; with ``live`` None, write in place if ``show`` is the default, in a terminal."""
         self.show, self.printed, self.shown = show, {}, set()
         self.live = (show is say and is_live()) if live is None else live
@@ -147,7 +147,7 @@ class Stages(contextlib.AbstractContextManager["Stages"]):
 
 def waiting() -> Stages:
     """Return stages that are shown only in a terminal, for waits that a log need not mention."""
-    return Stages(lambda line: None, live=is_live())
+    return Stages(silent, live=is_live())
 
 
 class Progress:

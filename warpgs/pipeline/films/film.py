@@ -3,7 +3,7 @@
 import collections
 import itertools
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -18,7 +18,7 @@ from warpgs.mesh.views import MIN_ALPHA
 from warpgs.pipeline.films import paths
 from warpgs.pipeline.metrics.coverage import classes_of, coverage_map, depth_views, fraction_outside
 from warpgs.pipeline.model.table import FittedModel
-from warpgs.process import say
+from warpgs.process import Say, say, silent
 from warpgs.render.options import RasterizeOptions
 from warpgs.render.rasterize import rasterize
 from warpgs.report.film import SUFFIXES, write_film
@@ -307,7 +307,7 @@ def render_film(
     *,
     coverage: bool | Sequence[View] = False,
     sheet: bool = False,
-    tell: Callable[[str], object] = lambda line: None,
+    tell: Say = silent,
 ) -> tuple[list[Path], list[str]]:
     """Render a plan to PNG files and film.mp4, or to a film alone; ``sheet`` adds six frames in one image. Files and notes."""
     alone, one_size = _check_plan(plan, out, bool(coverage), sheet)

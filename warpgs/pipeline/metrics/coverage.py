@@ -1,7 +1,7 @@
 """Scores by coverage: how many training views saw the surface of each pixel."""
 
 import itertools
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ from warpgs.kernels.ssim import ssim
 from warpgs.mesh.views import MIN_ALPHA, TOLERANCE, depth_difference, seen_from
 from warpgs.pipeline.metrics.scores import Renders, psnr_of, scored_pair
 from warpgs.priors.given_depth import pinhole_view
-from warpgs.process import counted
+from warpgs.process import Say, counted, silent
 from warpgs.render.options import RasterizeOptions
 from warpgs.render.rasterize import rasterize
 from warpgs.report.images import COVERAGE_LEGEND, channel_mean, coverage_image, png, webp
@@ -218,7 +218,7 @@ EXPECTED = (
 
 def coverage_of_run(
     out: Path | None, gaussians: Gaussians, train: Sequence[View], test: Sequence[View], options: RasterizeOptions, *,
-    names: Mapping[str, str], renders: Renders | None = None, tell: Callable[[str], object] = lambda line: None,
+    names: Mapping[str, str], renders: Renders | None = None, tell: Say = silent,
 ) -> dict[str, Any]:  # fmt: skip
     """Split the scores of held-out views by coverage, and save an image of each view in ``out``, if any."""
     tell("checking coverage")

@@ -5,7 +5,6 @@ import itertools
 import math
 import os
 import shlex
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -43,13 +42,14 @@ from warpgs.pipeline.train.settings import FitConfig
 from warpgs.pipeline.train.trainer import train_views
 from warpgs.pipeline.train.views import TrainingView
 from warpgs.priors.views import PriorConfig, view_priors
+from warpgs.process import Say, silent
 from warpgs.render.options import RasterizeOptions
 from warpgs.report.film import h264_encoder
 from warpgs.report.images import COVERAGE_LEGEND, Tile, contact_sheet, png
 from warpgs.report.overview import LEGEND_HEIGHT, TEST_COLOR, TRAIN_COLOR, render_overview, with_legend
 from warpgs.report.page import image_names, renaming_notes
 from warpgs.report.progress import Stages, waiting
-from warpgs.scene import Camera, Gaussians, Normalization, PointCloud, Prior, Scene, View, base_coefficients
+from warpgs.scene import Camera, Gaussians, Normalization, PointCloud, Prior, Scene, Tensors, View, base_coefficients
 
 RULE = "inria"
 """Default rule for files of Gaussians: most models were trained with it."""
@@ -111,9 +111,7 @@ VP9 = (
 """Note on a film in .mp4 without an encoder of H.264."""
 
 
-def scene_of(
-    stored: StoredRun, reader: str | None = None, tell: Callable[[str], object] | None = None
-) -> tuple[Scene, list[View], list[View]]:
+def scene_of(stored: StoredRun, reader: str | None = None, tell: Say | None = None) -> tuple[Scene, list[View], list[View]]:
     """Read the scene of a run, with its training and held-out views; refuse a scene that has changed since the fit."""
     scene, _, _ = read_scene(stored.scene_request(reader), tell)
     if scene.fingerprint != stored.record["fingerprint"]:
@@ -241,7 +239,7 @@ def _write(out: Path, record: dict[str, Any], made: Gaussians, step: int, normal
 
 def prune(
     folder: Path, keep_psnr: float, out: Path | None, device_name: str, reader: str | None = None,
-    tell: Callable[[str], object] = lambda line: None,
+    tell: Say = silent,
 ) -> list[str]:  # fmt: skip
     """Shrink a run into a new folder whose mean training PSNR falls by at most ``keep_psnr`` [dB]; returns lines."""
     if not 1e-6 <= keep_psnr <= 100:
@@ -298,7 +296,7 @@ CLEAN = "clean.png"
 """Picture of what a clean-up would remove, in the folder of a run."""
 
 
-def clean_picture(model: FittedModel, found: dict[str, torch.Tensor], views: list[View]) -> np.ndarray:
+def clean_picture(model: FittedModel, found: Tensors, views: list[View]) -> np.ndarray:
     """Return a sheet of the view that shows most of what would go: before, in colours over the gray render, and after."""
     gaussians, options = model.gaussians(), model.options()
     goes = edit.any_of(found.values(), gaussians.logit_opacities)
@@ -312,9 +310,7 @@ def clean_picture(model: FittedModel, found: dict[str, torch.Tensor], views: lis
     return contact_sheet(view.name, lines, tiles, columns=2)
 
 
-def write_clean(
-    stored: StoredRun, out: Path, found: dict[str, torch.Tensor], scores: dict[str, list[float]] | None = None
-) -> list[str]:
+def write_clean(stored: StoredRun, out: Path, found: Tensors, scores: dict[str, list[float]] | None = None) -> list[str]:
     """Write a run without the Gaussians of some masks [N] into a new folder; returns lines for the user."""
     goes = edit.any_of(found.values(), stored.gaussians().logit_opacities)
     left = edit.by_degree(edit.select(stored.gaussians(), ~goes))
@@ -330,7 +326,7 @@ def write_clean(
 
 def clean(
     folder: Path, wish: str, out: Path | None, device_name: str, reader: str | None = None,
-    tell: Callable[[str], object] = lambda line: None,
+    tell: Say = silent,
 ) -> list[str]:  # fmt: skip
     """Write a run without what ``wish`` names (`chosen_reasons`), or for show only a picture of that; returns lines."""
     show = wish == "show"

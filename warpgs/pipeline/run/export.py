@@ -3,7 +3,7 @@
 import copy
 import math
 import shlex
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -23,6 +23,7 @@ from warpgs.pipeline.films.paths import common_up
 from warpgs.pipeline.model import edit
 from warpgs.pipeline.run.folder import CONFIG, StoredRun, open_run
 from warpgs.pipeline.run.request import choose_device
+from warpgs.process import Say
 from warpgs.scene import Camera, Gaussians, Normalization, base_colors
 
 
@@ -253,7 +254,7 @@ def _cameras_written(
 
 def mesh(
     folder: Path, target: Path, options: MeshOptions, device_name: str, *, crop: str | None = None,
-    stage: Callable[[str], object], say: Callable[[str], object],
+    stage: Say, say: Say,
 ) -> list[str]:  # fmt: skip
     """Write the mesh of the surfaces that a run's training views see, in file units, as is ``voxel``; returns lines."""
     check_suffix(target)

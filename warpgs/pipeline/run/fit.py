@@ -46,7 +46,7 @@ from warpgs.poses.find import JSON, TEXT, find_poses, needs_poses, read_poses_re
 from warpgs.poses.photographs import find_photographs, image_root, is_video
 from warpgs.priors.networks import in_threads
 from warpgs.priors.photo_checks import PhotoCheck, check_photos, photo_notes
-from warpgs.process import Detail, Task, counted, noted_signals, say
+from warpgs.process import Detail, Say, Task, counted, noted_signals, say, silent
 from warpgs.ranks import ALONE, Ranks
 from warpgs.report.page import image_names, renaming_notes
 from warpgs.report.progress import EventLog, Progress, Stages, duration
@@ -73,7 +73,7 @@ class FitJob:
     ranks: Ranks
     began: float
     clock: Clock
-    progress: Callable[[str], object]
+    progress: Say
     compiled: list[float]
     """Time of each compilation so far [s]."""
 
@@ -265,9 +265,7 @@ def batched_notes(config: FitConfig, ranks: Ranks) -> list[str]:
     return [views] * (config.batch > 1) + [processes] * (ranks.count > 1)
 
 
-def with_poses(
-    request: SceneRequest, out: Path | None, progress: Callable[[str], object], ranks: int = 1
-) -> tuple[SceneRequest, list[str]]:
+def with_poses(request: SceneRequest, out: Path | None, progress: Say, ranks: int = 1) -> tuple[SceneRequest, list[str]]:
     """Find the poses of photographs without cameras, or read them from the run folder ``out``; returns request and notes."""
     source = Path(request.path)
     if request.reader is not None or request.reconstruction is not None or not request.path or not needs_poses(source):
@@ -390,7 +388,7 @@ def fit(
     scene = _checked_source(scene, split)
     verbose, own = ranks.first and verbose, out if ranks.first else None
     folder = contextlib.nullcontext(list[str]()) if own is None else folders.run_folder(own, resume)
-    stages = Stages() if verbose else Stages(lambda line: None)
+    stages = Stages() if verbose else Stages(silent)
     with (
         torch.inference_mode(False),  # a caller's own mode would end the first step
         torch.enable_grad(),
@@ -460,7 +458,7 @@ def _checked_source(scene: Scene | SceneRequest | str | Path, split: str | None)
 
 def _read(
     scene: Scene | SceneRequest, split: str | None, device: torch.device, out: Path | None,
-    progress: Callable[[str], object], ranks: Ranks,
+    progress: Say, ranks: Ranks,
 ) -> tuple[Scene, SceneRequest, Split, list[str]]:  # fmt: skip
     """Read a scene, without its fingerprint, and find its poses where it has none; return it with request, split and notes."""
     if isinstance(scene, Scene):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
@@ -13,6 +13,7 @@ from warpgs.errors import ResourceError, UsageError
 from warpgs.io.images import SceneOptions, image_scale
 from warpgs.io.load import Split, coincident_views, read_folder, split_views
 from warpgs.pipeline.train.settings import FitConfig
+from warpgs.process import Say
 from warpgs.scene import Scene
 
 CPU_MAX_SIDE = 800
@@ -104,9 +105,7 @@ def choose_split(scene: Scene, spec: str | None) -> tuple[Split, list[str]]:
     return split, notes
 
 
-def read_scene(
-    request: SceneRequest, progress: Callable[[str], object] | None = None, *, hashed: bool = True
-) -> tuple[Scene, Split, list[str]]:
+def read_scene(request: SceneRequest, progress: Say | None = None, *, hashed: bool = True) -> tuple[Scene, Split, list[str]]:
     """Load a scene and split its views; returns both with the notes for the user. Arguments are those of `read_folder`."""
     scene = read_folder(request.path, request, request.reader, progress, hashed=hashed)
     split, notes = choose_split(scene, request.split)

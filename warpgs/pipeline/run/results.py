@@ -33,7 +33,7 @@ from warpgs.pipeline.train.schedule import Phases
 from warpgs.pipeline.train.strategies.sampling import SampledView, Sampling
 from warpgs.pipeline.train.trainer import Trainer
 from warpgs.pipeline.train.views import TrainingView
-from warpgs.process import Detail, counted
+from warpgs.process import Detail, Say, counted, silent
 from warpgs.render.options import RasterizeOptions
 from warpgs.render.rasterize import rasterize
 from warpgs.render.reference import reference_image
@@ -401,7 +401,7 @@ def evaluate_run(
     *,
     names: dict[str, str] | None = None,
     renders: Renders | None = None,
-    tell: Callable[[str], object] = lambda line: None,
+    tell: Say = silent,
 ) -> dict[str, Any]:
     """Score held-out and training views, and save a render and depth map of each held-out (else training) view in ``out``."""
     for folder in () if out is None else ("renders", "depth"):
@@ -435,7 +435,7 @@ def evaluate_run(
     }  # fmt: skip
 
 
-def _images(shown: list[View], renders: Renders, rows: dict[str, Any], tell: Callable[[str], object]) -> list[tuple[Any, ...]]:
+def _images(shown: list[View], renders: Renders, rows: dict[str, Any], tell: Say) -> list[tuple[Any, ...]]:
     """Render the views that the page shows, and encode their images."""
     captions = []
     for view in shown:
@@ -504,7 +504,7 @@ def write_report(
     sampling: Callable[[], Section | None],
     renders: Renders,
     times: Callable[[], dict[str, float]],
-    tell: Callable[[str], object] = lambda line: None,
+    tell: Say = silent,
 ) -> None:
     """Write report.html of a scored run, from metrics.json, config.json (``record``), metrics.jsonl and new renders."""
     train, test = [scene.view(n) for n in split.train], [scene.view(n) for n in split.test]

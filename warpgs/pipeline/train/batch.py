@@ -15,6 +15,7 @@ from warpgs.pipeline.train.strategies.base import Strategy
 from warpgs.pipeline.train.views import Kind, LearnedViews, ViewStack
 from warpgs.ranks import Ranks
 from warpgs.render.options import RasterizeOptions
+from warpgs.scene import Tensors
 
 # Sums over the views of a step (slots), in one order for any number of processes.
 #
@@ -287,7 +288,7 @@ class BatchSteps(StepTaker):
 
     @torch.no_grad()
     def _add(
-        self, slot: int, place: int, gradients: list[torch.Tensor], statistics: Mapping[str, torch.Tensor],
+        self, slot: int, place: int, gradients: list[torch.Tensor], statistics: Tensors,
         parts: list[torch.Tensor], adds: bool,
     ) -> None:  # fmt: skip
         """Add the contribution of a slot to the parts of a sum, or overwrite the parts; ``place`` as in `_contribution`."""
@@ -302,7 +303,7 @@ class BatchSteps(StepTaker):
             said[STOP : STOP + 1].fill_(1.0)
 
     def _prepared(
-        self, gradients: list[torch.Tensor], statistics: Mapping[str, torch.Tensor], plan: StepPlan, captured: bool
+        self, gradients: list[torch.Tensor], statistics: Tensors, plan: StepPlan, captured: bool
     ) -> tuple[SlotSums, list[Callable[[], object]]]:
         """Return sums, and the functions that update by them; their shapes are those of a view's contribution."""
         shapes = [*(tuple(t.shape) for t in (*gradients, *statistics.values())), (FLAGS + self.tree.batch,)]
@@ -321,7 +322,7 @@ class BatchSteps(StepTaker):
         return self.sums, self._update[1]
 
     def _functions(
-        self, plan: StepPlan, sums: SlotSums, gradients: list[torch.Tensor], statistics: dict[str, torch.Tensor]
+        self, plan: StepPlan, sums: SlotSums, gradients: list[torch.Tensor], statistics: Tensors
     ) -> list[Callable[[], object]]:
         """Return the functions of an update by sums; every second one is an exchange between processes."""
         b, lrs, divided = self.buffers, self._lrs, sums.divided

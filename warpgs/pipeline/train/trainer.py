@@ -34,9 +34,9 @@ from warpgs.pipeline.train.views import LearnedViews, TrainingView, half_size, s
 from warpgs.plugins import is_ours, returned
 from warpgs.priors.networks import in_threads
 from warpgs.priors.sweep import sweep_depths
-from warpgs.process import Detail
+from warpgs.process import Detail, Say, silent
 from warpgs.ranks import ALONE, Ranks
-from warpgs.scene import Camera, Gaussians, PointCloud, Prior, Scene, View
+from warpgs.scene import Camera, Gaussians, PointCloud, Prior, Scene, Tensors, View
 from warpgs.schema import Schema, SchemaError, anything, fields, items, mapping, number, text, whole
 
 # Mean of the parameters over the last steps of a fit; after the last step it replaces the parameters.
@@ -75,7 +75,7 @@ class ParameterMean:
         return min((s - step for s in self.samples(steps) if s > step), default=steps - step)
 
     @torch.no_grad()
-    def update(self, step: int, steps: int, params: Mapping[str, torch.Tensor]) -> bool:
+    def update(self, step: int, steps: int, params: Tensors) -> bool:
         """Take a sample if it is due; after the last step, replace the parameters by the mean in place, and return True."""
         if step not in self.samples(steps):
             return False
@@ -100,7 +100,7 @@ class ParameterMean:
         count = torch.tensor([self.count], dtype=torch.int64, device="cpu")
         return {f"{PREFIX}{n}": t for n, t in self.sums.items()} | {f"{PREFIX}count": count}
 
-    def load(self, tensors: Mapping[str, torch.Tensor], params: Mapping[str, torch.Tensor]) -> None:
+    def load(self, tensors: Tensors, params: Tensors) -> None:
         """Load what `state` returned, for these current parameters, or raise DataError."""
         self.restart()
         stored = {n.removeprefix(PREFIX): t for n, t in tensors.items() if n.startswith(PREFIX)}
@@ -115,9 +115,7 @@ class ParameterMean:
         self.sums = {n: t.to(params[n].device).clone() for n, t in stored.items()}
 
 
-def check_state(
-    tensors: Mapping[str, torch.Tensor], plain: dict[str, Any], *, views: int, steps: int, strategy: Schema, stopping: Schema
-) -> None:
+def check_state(tensors: Tensors, plain: dict[str, Any], *, views: int, steps: int, strategy: Schema, stopping: Schema) -> None:
     """Raise DataError unless the parts of a stored state that are not rows of a table are valid; `Table.load` checks rows."""
     state = fields({
         "step": whole(0, steps), "order": items(whole(0, views - 1)), "extent": number(above=0), "notes": items(text),
@@ -147,7 +145,7 @@ class Trainer:
     def __init__(
         self, train: list[View], points: PointCloud | None, config: FitConfig, device: torch.device,
         background: tuple[float, float, float] = (0.0, 0.0, 0.0), priors: list[Prior] | None = None,
-        ready: Callable[[], object] = lambda: None, *, progress: Callable[[str], object] = lambda line: None,
+        ready: Callable[[], object] = lambda: None, *, progress: Say = silent,
         ranks: Ranks = ALONE,
     ):  # fmt: skip
         """Set up the initial Gaussians.

@@ -15,14 +15,12 @@ from warpgs.pipeline.metrics.scores import MATCHED_RULE, matched_psnr, render_vi
 from warpgs.pipeline.train.schedule import LearningRate, log_linear
 from warpgs.plugins import Registry
 from warpgs.render.options import RasterizeOptions
-from warpgs.scene import Camera, Gaussians, View
+from warpgs.scene import Camera, Gaussians, Tensors, View
 from warpgs.schema import Checked, Within
 
 CAMERA_BYTES = 4 * (16 + 9)
 """Bytes per Gaussian if cameras are learned: its part of the gradients of view matrix and intrinsics, before the sum over
 Gaussians."""
-Tensors = Mapping[str, torch.Tensor]
-"""Parameters of views, or values computed from them, by name."""
 
 
 @dataclass(frozen=True)

@@ -14,9 +14,9 @@ from warpgs.device import FLOAT, STEP, Needs, StepSizes
 from warpgs.errors import UsageError
 from warpgs.pipeline.metrics.scores import OPAQUE
 from warpgs.pipeline.model.table import Table
-from warpgs.pipeline.train.view_modules import Tensors, ViewModule
+from warpgs.pipeline.train.view_modules import ViewModule
 from warpgs.plugins import returned
-from warpgs.scene import Camera, View
+from warpgs.scene import Camera, Tensors, View
 
 
 def there(array: Any, device: torch.device) -> Any:
@@ -121,7 +121,7 @@ class TrainingView:
     """1 for unmasked pixels, 0 for masked ones, shape [H, W]; None without a mask."""
     consistent: torch.Tensor | None = None
     """Geometrically consistent z-depth [u], 0 where no other view confirms it, shape [H, W]; None if not computed."""
-    maps: Mapping[str, torch.Tensor] = field(default_factory=dict)
+    maps: Tensors = field(default_factory=dict)
     """Maps for loss terms (`LossTerm.needs`), by name, each of shape [H, W] or [H, W, C]."""
     alpha: torch.Tensor | None = None
     """Opacity of the subject, in [0, 1], shape [H, W]; None if no training view has one (`with_alpha`)."""
