@@ -240,12 +240,9 @@ def is_out_of_memory(error: BaseException) -> bool:
 
 def no_memory_message(error: BaseException, purpose: str = "", *, fitting: bool = True) -> str:
     """Return the message for a lack of memory, with remedies; these name flags of the fit if ``fitting`` is True."""
-    remedy = (
-        "Reduce the memory of the fit with --memory-limit or --downscale, or end other programs; --resume continues from the "
-        "last checkpoint"
-        if fitting
-        else "End other programs, and try again"
-    )
+    remedy = "End other programs, and try again"
+    if fitting:
+        remedy = "Give --memory-limit or --downscale, or end other programs; --resume continues from the last checkpoint"
     reason = (str(error).strip() or type(error).__name__).splitlines()[0].partition(" GPU ")[0].rstrip(".")
     return f"out of memory{purpose} ({reason[:200]}). {remedy}"
 

@@ -181,11 +181,9 @@ def read_poses_record(folder: Path) -> dict[str, Any]:
     """Read poses.json of a scene whose poses were found."""
     path = folder / JSON
     try:
-        record: dict[str, Any] = schema.read(path, folder)
-        _RECORD(record, "")
+        return schema.read(path, folder, _RECORD)
     except (OSError, schema.SchemaError) as e:
         raise DataError(f"{path}: cannot be read ({e}); find the poses again with `warpgs poses`") from e
-    return record
 
 
 MIN_PHOTOGRAPHS = 3
@@ -235,7 +233,7 @@ def find_poses(
     max_pixels: int = MAX_PIXELS,
     allow_outside: bool = False,
     matcher: str | Path | None = None,
-    progress: photos.Say = silent,
+    progress: Say = silent,
 ) -> dict[str, Any]:
     """Find the poses of photographs or of a video's sharpest frames; write a scene folder, whole or not at all."""
     source, out = Path(source), Path(out)

@@ -167,12 +167,10 @@ def read_side_file(model: Path) -> dict:
     if not os.path.lexists(path):
         return {}
     try:
-        values: dict = schema.read(path)
-        _DESCRIPTION(values, "")
+        return schema.read(path, rule=_DESCRIPTION)
     except (OSError, schema.SchemaError) as e:
         why = unread_reason(e) if isinstance(e, OSError) else e
         raise DataError(f"{path}: cannot be read ({why}); fix it, with keys out of {', '.join(KEYS)}, or remove it") from e
-    return values
 
 
 def describe(network: Network, defaults: Preprocessing, kind: str) -> tuple[Preprocessing, list[str]]:

@@ -130,11 +130,7 @@ def rendered(template: str, **contents: object) -> str:
         loader=jinja2.FileSystemLoader(Path(__file__).parent / "templates"), autoescape=True, trim_blocks=True,
         lstrip_blocks=True, undefined=jinja2.StrictUndefined,
     )  # fmt: skip
-    environment.filters |= {
-        "data_uri": _data_uri,
-        "aspect": _aspect,
-        "address": lambda path: quote(path, errors="surrogateescape"),
-    }
+    environment.filters |= {"data_uri": _data_uri, "aspect": _aspect, "address": lambda p: quote(p, errors="surrogateescape")}
     page = environment.get_template(template)
     own = "".join(page.blocks["script"](page.new_context())) if "script" in page.blocks else ""
     code = own.partition("<script>")[2].partition("</script>")[0]

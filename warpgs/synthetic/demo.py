@@ -221,10 +221,7 @@ def _write(folder: Path, views: int, least: int, train: int, size: tuple[int, in
             write_bytes(temporary / path, content)
 
 
-def write_demo(
-    folder: Path, *, views: int = 24, width: int = 320, height: int = 240, seed: int = 0,
-    tell: Say = silent,
-) -> str:  # fmt: skip
+def write_demo(folder: Path, *, views: int = 24, width: int = 320, height: int = 240, seed: int = 0, tell: Say = silent) -> str:
     """Write the demo scene as a COLMAP folder: images, cameras, and exact points with their tracks.
 
     The same arguments give the same bytes on the same machine and library versions.

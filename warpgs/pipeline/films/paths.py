@@ -494,7 +494,7 @@ def midways(rig: Rig, cameras: list[Camera], most: int) -> list[tuple[int, int, 
     distances = np.array(_distances(cameras))
     np.fill_diagonal(distances, np.inf)
     pairs = sorted({(min(i, j), max(i, j)) for i, j in enumerate(distances.argmin(1).tolist())}) if len(cameras) > 1 else []
-    chosen = [pairs[i] for i in np.unique(np.linspace(0, len(pairs) - 1, min(most, len(pairs))).round().astype(int))]
+    chosen = geometry.evenly_spaced(pairs, most)
     frames = [framed(upright(rig, c)) for c in cameras]
     ends = [[Keyframe(frames[k], t, rig.reach(cameras[k])) for t, k in enumerate(pair)] for pair in chosen]
     return [(i, j, through(keyframes, 3)[1]) for (i, j), keyframes in zip(chosen, ends)]
@@ -508,9 +508,7 @@ def tour_of(cameras: list[Camera], reaches: list[float], seconds: float, most: i
     named, near = list(range(len(cameras))), _neighbour_tour(distances)
     lengths = [float(sum(distances[a][b] for a, b in itertools.pairwise(o))) for o in (named, near)]
     by_name = lengths[0] <= MAX_DETOUR * lengths[1]
-    order = named if by_name else near
-    if len(order) > most:
-        order = [order[i] for i in np.unique(np.linspace(0, len(order) - 1, max(most, 2)).round().astype(int))]
+    order = geometry.evenly_spaced(named if by_name else near, max(most, 2))
     legs = [distances[a][b] for a, b in itertools.pairwise(order)]
     closed = len(order) > 3 and distances[order[-1]][order[0]] < 2 * max(legs)
     if closed:

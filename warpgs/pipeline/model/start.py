@@ -224,11 +224,7 @@ def consistent_points(
             if len(extrapolated):
                 notes[-1] += f", {len(extrapolated):,} extrapolated where no view looks"
             elif config.extrapolate:
-                why = (
-                    ""
-                    if depth_points.all_count(views)
-                    else ", because masks, an alpha channel or a black background hide parts of views"
-                )
+                why = ", because masks, alpha or a black background hide parts" * (not depth_points.all_count(views))
                 notes[-1] += f", none extrapolated{why}"
             how = "\n".join((notes[-1], *given, *(f"    {n}" for n in notes[:-1])))
             return Start(depth_points.joined((cloud, extrapolated)), how, depths, len(extrapolated))

@@ -253,9 +253,8 @@ def _cameras_written(
 
 
 def mesh(
-    folder: Path, target: Path, options: MeshOptions, device_name: str, *, crop: str | None = None,
-    stage: Say, say: Say,
-) -> list[str]:  # fmt: skip
+    folder: Path, target: Path, options: MeshOptions, device_name: str, *, crop: str | None = None, stage: Say, say: Say
+) -> list[str]:
     """Write the mesh of the surfaces that a run's training views see, in file units, as is ``voxel``; returns lines."""
     check_suffix(target)
     device, _ = choose_device(device_name)

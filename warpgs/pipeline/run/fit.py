@@ -457,9 +457,8 @@ def _checked_source(scene: Scene | SceneRequest | str | Path, split: str | None)
 
 
 def _read(
-    scene: Scene | SceneRequest, split: str | None, device: torch.device, out: Path | None,
-    progress: Say, ranks: Ranks,
-) -> tuple[Scene, SceneRequest, Split, list[str]]:  # fmt: skip
+    scene: Scene | SceneRequest, split: str | None, device: torch.device, out: Path | None, progress: Say, ranks: Ranks
+) -> tuple[Scene, SceneRequest, Split, list[str]]:
     """Read a scene, without its fingerprint, and find its poses where it has none; return it with request, split and notes."""
     if isinstance(scene, Scene):
         parts, notes = choose_split(scene, split)
@@ -628,10 +627,9 @@ def _score(
         moved = {v.name: f for v, f in zip(train, fractions, strict=True)}
     complexity, cameras, scale = complexity_figures(trainer), folders.cameras_of(scene), scene.normalization.scale
     modules = {
-        m.name: m.figures(
-            FittedViews(learned.params_of(m), job.split.train, test, given, cameras, scale, gaussians, options)
-        ) for m in learned.modules
-    }  # fmt: skip
+        m.name: m.figures(FittedViews(learned.params_of(m), job.split.train, test, given, cameras, scale, gaussians, options))
+        for m in learned.modules
+    }
     mapped = results.given_figures(train, trainer.views, renders)
     table: list[tuple[dict[str, Any], list[str]]] = [  # figures of metrics.json, and their sentences in the report
         ({"rule": rule}, [Detail(rule["summary"])]),

@@ -9,7 +9,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import torch
@@ -19,7 +19,7 @@ from warpgs.constants import TILE_SIZE
 from warpgs.device import format_bytes, in_background
 from warpgs.errors import ResourceError
 from warpgs.files import make_folder, read_file, write_bytes
-from warpgs.geometry import CENTRAL, MODELS, depth_normals
+from warpgs.geometry import CENTRAL, MODELS, depth_normals, evenly_spaced
 from warpgs.io.image_files import decode
 from warpgs.io.load import Split
 from warpgs.mesh.views import MIN_ALPHA
@@ -43,7 +43,6 @@ from warpgs.report.page import Section, curve, image_names, write_page
 from warpgs.report.progress import duration, read_events
 from warpgs.scene import Camera, Gaussians, Scene, View
 
-T = TypeVar("T")
 GIVEN = {
     "given_depth": ("depth", "given depth: median difference of rendered depth {:.2%} (worst view {:.2%})"),
     "given_normals": (
@@ -224,11 +223,6 @@ def view_sheet(
         mean = score[at[:, 0], at[:, 1]].mean() if len(at) else 0
         lines.append(f"Mean importance: {mean:.2f} at the sampled pixels, {score.mean():.2f} over the view.")
     return contact_sheet(f"{name}, step {step:,}", lines, tiles, columns=5, tile_width=320, text=1.25)
-
-
-def evenly_spaced(values: Sequence[T], most: int) -> list[T]:
-    """Return up to ``most`` of some values."""
-    return [values[i] for i in np.unique(np.linspace(0, len(values) - 1, min(most, len(values))).round().astype(int))]
 
 
 def _on_host(sampled: SampledView) -> SampledView:

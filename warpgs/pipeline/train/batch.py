@@ -288,9 +288,8 @@ class BatchSteps(StepTaker):
 
     @torch.no_grad()
     def _add(
-        self, slot: int, place: int, gradients: list[torch.Tensor], statistics: Tensors,
-        parts: list[torch.Tensor], adds: bool,
-    ) -> None:  # fmt: skip
+        self, slot: int, place: int, gradients: list[torch.Tensor], statistics: Tensors, parts: list[torch.Tensor], adds: bool
+    ) -> None:
         """Add the contribution of a slot to the parts of a sum, or overwrite the parts; ``place`` as in `_contribution`."""
         said = parts[-1]
         if not adds:

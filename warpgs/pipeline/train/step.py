@@ -297,9 +297,8 @@ class StepTaker:
 
     @torch.no_grad()
     def settle(
-        self, plan: StepPlan, gradients: list[torch.Tensor], statistics: Tensors, settings: torch.Tensor,
-        going: torch.Tensor,
-    ) -> None:  # fmt: skip
+        self, plan: StepPlan, gradients: list[torch.Tensor], statistics: Tensors, settings: torch.Tensor, going: torch.Tensor
+    ) -> None:
         """Apply the changes after Adam: opacity decay, the strategy's own changes, limits, statistics."""
         table = self.table
         used = gradients[list(table.params).index("logit_opacities")] != 0 if plan.spares_unused else None

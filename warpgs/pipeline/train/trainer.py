@@ -440,9 +440,7 @@ class Trainer:
 
     def state(self) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
         """Return tensors by name, of any shape [...], and plain values from which the fit continues with the same bits."""
-        own = returned(
-            self.strategy, "state", self.strategy.state(), tuple, "tensors by name, and plain values, two dictionaries"
-        )
+        own = returned(self.strategy, "state", self.strategy.state(), tuple, "two dictionaries, tensors and plain values")
         (tensors, strategy), (errors, stopping) = own, self.stopping.state()
         views = {f"views.{n}": t for n, t in self.learned.table.state().items()}
         tensors = {**self.table.state(), **views, **self.mean.state(), **tensors, **errors}

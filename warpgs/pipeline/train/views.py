@@ -91,11 +91,8 @@ class LearnedViews:
 
     def regularisation(self, values: Tensors) -> dict[str, torch.Tensor]:
         """Return the terms that modules add to the loss of a view with these values [...], shape [] each, by module name."""
-        terms = {m.name: (m, m.regularisation(values)) for m in self.modules}
-        what = "a tensor of shape [], or None"
-        return {
-            n: returned(m, "regularisation", t, torch.Tensor, what, shape=()) for n, (m, t) in terms.items() if t is not None
-        }
+        terms, what = [(m, m.regularisation(values)) for m in self.modules], "a tensor of shape [], or None"
+        return {m.name: returned(m, "regularisation", t, torch.Tensor, what, shape=()) for m, t in terms if t is not None}
 
     def cameras(self, given: Mapping[str, Camera], train: Sequence[str], test: Sequence[str]) -> Mapping[str, Camera]:
         """Return the current cameras of all views, by name; arguments are those of `ViewModule.cameras`."""
