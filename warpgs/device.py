@@ -320,10 +320,7 @@ def _machine_or_assumed() -> Memory:
 
 @functools.cache
 def _say_assumed() -> None:
-    say(
-        f"warpgs: neither psutil nor a container reports the memory; {ASSUMED_BYTES / 2**30:.0f} GiB are assumed",
-        error=True,
-    )
+    say(f"warpgs: neither psutil nor a container reports the memory; {ASSUMED_BYTES / 2**30:.0f} GiB are assumed", error=True)
 
 
 def _text(path: Path) -> str:
@@ -359,10 +356,7 @@ def prepare_kernel_cache() -> tuple[Path, str]:
 
     folder, refused = choose_kernel_cache(warp.config.kernel_cache_dir)
     if refused:
-        say(
-            f"warpgs: {refused}; kernels are compiled into {folder} for this process only (minutes). {REMEDY}",
-            error=True,
-        )
+        say(f"warpgs: {refused}; kernels are compiled into {folder} for this process only (minutes). {REMEDY}", error=True)
     if refused or warp.config.kernel_cache_dir is None:
         warp.config.kernel_cache_dir = str(folder)
     return folder, refused

@@ -260,9 +260,7 @@ class RankWatch:
             except RuntimeError:  # the store is gone, and with it the process that held it
                 lost = 0
             if lost is not None and not self.leaving.is_set():
-                self.fail(
-                    f"warpgs: rank {lost} of {self.count} was lost: this fit stops; --resume it, with any number of ranks"
-                )
+                self.fail(f"warpgs: rank {lost} of {self.count} was lost: the fit stops; --resume it, with any number of ranks")
                 os._exit(ResourceError.exit_code)
 
     def is_lost(self, rank: int) -> bool:

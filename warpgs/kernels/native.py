@@ -191,10 +191,7 @@ def _say_compiling() -> None:
     global _said
     if not _said:
         _said = True
-        say(
-            "warpgs: compiling kernels, once on this machine, for up to a minute; `warpgs doctor --warm` does it",
-            error=True,
-        )
+        say("warpgs: compiling kernels, once on this machine, for up to a minute; `warpgs doctor --warm` does it", error=True)
 
 
 @contextlib.contextmanager

@@ -153,9 +153,7 @@ def record_of(found: Mapping, photographs: Sequence[photos.Photograph], digest: 
             "Add photographs from more directions"
         )
     if found.method == "global":
-        remarks.append(
-            "global mapping joined more photographs than incremental mapping; results differ a little from run to run"
-        )
+        remarks.append("global mapping joined more photographs than incremental mapping; results differ a little between runs")
     return {
         "format": FORMAT, "source_sha256": digest, "photographs": rows, "notes": [*notes, *remarks],
         "advice": advice(found, names), "mean_reprojection_error_px": found.error, "points": found.points,

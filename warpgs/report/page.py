@@ -17,9 +17,7 @@ from warpgs.process import Detail, Task
 
 MOST_BYTES = 100
 """Longest name that is kept unchanged, without suffix: any file system allows it."""
-NOT_EVERYWHERE = re.compile(
-    r'^\.|[<>:"\\|?*\x00-\x1f\x7f]|^(con|prn|aux|nul|com\d|lpt\d)(\.|$)|^$|[\ud800-\udfff]', re.IGNORECASE
-)
+NOT_EVERYWHERE = re.compile(r'^\.|[<>:"\\|?*\x00-\x1f\x7f]|^(con|prn|aux|nul|com\d|lpt\d)(\.|$)|^$|[\ud800-\udfff]', re.I)
 """Names that hide a file, that are not UTF-8, or that Windows does not take."""
 
 

@@ -216,9 +216,8 @@ def rig_of(cameras: list[Camera], depth: float, level: np.ndarray | None = None)
 
 def rig_among(cameras: list[Camera], points: np.ndarray) -> Rig:
     """Return the arrangement of training cameras around their subject among points [N, 3] [u]."""
-    depths = np.concatenate(
-        [geometry.matmul(points - c.center, c.viewmat[2, :3]) for c in cameras[:: max(1, len(cameras) // 5)]]
-    )
+    some = cameras[:: max(1, len(cameras) // 5)]
+    depths = np.concatenate([geometry.matmul(points - c.center, c.viewmat[2, :3]) for c in some])
     ahead = depths[depths > 0]
     return rig_of(cameras, float(np.median(ahead)) if len(ahead) else 1.0)
 
@@ -443,9 +442,7 @@ def read_keyframes(path: Path, template: Camera, normalization: Normalization) -
         if value["fov_y"] > 3.1:
             raise DataError(f"{path}: fov_y of keyframe {i} is {value['fov_y']:g} rad; give radians, below 3.1")
         if result and not MIN_SECONDS <= value["seconds"] - values[i - 1]["seconds"] <= MAX_SECONDS:
-            raise DataError(
-                f"{path}: keyframe {i} must be {MIN_SECONDS:g} to {MAX_SECONDS:g} s after the last; sort by seconds"
-            )
+            raise DataError(f"{path}: keyframe {i} must be {MIN_SECONDS:g} to {MAX_SECONDS:g} s after the last; sort by time")
         viewmat = geometry.pose_at(geometry.nearest_rotation(rotation).T, matrix[:3, 3])
         camera = geometry.convert_camera(replace(template, viewmat=viewmat), normalization, "file", "scene")
         result.append(Keyframe(framed(camera, None, value["fov_y"]), value["seconds"] - values[0]["seconds"]))

@@ -24,8 +24,8 @@ from warpgs.scene import GivenDepth, PointCloud, Prior, View
 
 
 def prepare(
-    train: list[View], points: PointCloud | None, config: FitConfig, generator: np.random.Generator, device: torch.device,
-    priors: list[Prior] | None, ready: Callable[[], object], progress: Say = silent,
+    train: list[View], points: PointCloud | None, config: FitConfig, device: torch.device, priors: list[Prior] | None,
+    ready: Callable[[], object], progress: Say = silent,
 ) -> tuple[list[View], Start, list[Prior] | None, list[str]]:  # fmt: skip
     """Return views (with depth from a network if it guides the fit), initial points, priors (if needed), and notes.
 
@@ -48,7 +48,7 @@ def prepare(
     def start() -> Start:
         progress("finding initial points")
         with section("first points"):
-            return _start_of(train, points, config, generator, usable, progress)
+            return _start_of(train, points, config, np.random.default_rng(config.seed), usable, progress)
 
     notes = []
     if priors is None and needs_priors(config):

@@ -115,7 +115,7 @@ class ParameterMean:
         self.sums = {n: t.to(params[n].device).clone() for n, t in stored.items()}
 
 
-def check_state(tensors: Tensors, plain: dict[str, Any], *, views: int, steps: int, strategy: Schema, stopping: Schema) -> None:
+def check_state(tensors: Tensors, plain: dict[str, Any], views: int, steps: int, *, strategy: Schema, stopping: Schema) -> None:
     """Raise DataError unless the parts of a stored state that are not rows of a table are valid; `Table.load` checks rows."""
     state = fields({
         "step": whole(0, steps), "order": items(whole(0, views - 1)), "extent": number(above=0), "notes": items(text),
@@ -164,9 +164,7 @@ class Trainer:
         self.generator = torch.Generator().manual_seed(c.seed)
         self.notes: list[str]
         """Notes on choices made before the first step, for the user."""
-        train, start, priors, self.notes = prepare(
-            train, points, c, np.random.default_rng(c.seed), device, priors, ready, progress
-        )
+        train, start, priors, self.notes = prepare(train, points, c, device, priors, ready, progress)
         self.messages: list[str] = []
         """Messages for the user that were not shown yet."""
         cameras = [v.camera for v in train]
@@ -454,9 +452,7 @@ class Trainer:
 
     def load(self, tensors: dict[str, torch.Tensor], plain: dict[str, Any]) -> None:
         """Load what `state` returned, ``tensors`` of shape [...] by name, or raise DataError."""
-        check_state(
-            tensors, plain, views=len(self.views), steps=self.phases.planned, strategy=self.strategy.STATE, stopping=STATE
-        )
+        check_state(tensors, plain, len(self.views), self.phases.planned, strategy=self.strategy.STATE, stopping=STATE)
         self.step, self.order = plain["step"], list(plain["order"])
         self.context.phases = replace(self.phases, stable_start=plain["stable_start"], steps=plain["steps"])
         self.context.extent = plain["extent"]
