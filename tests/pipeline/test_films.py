@@ -68,7 +68,7 @@ def test_keyframes_of_a_viewer_give_back_its_cameras(model, tmp_path):
         (lambda k: [{**k, "c2w": [[math.nan] * 4] * 4}], "c2w"),
         (lambda k: [{**k, "fov_y": 50}], "give radians"),
         (lambda k: [{**k, "fov_y": 0}], "fov_y"),
-        (lambda k: [k, {**k, "seconds": 5e-324}], "keyframe 1 must be 0.001 to 86400 above those of keyframe 0"),
+        (lambda k: [k, {**k, "seconds": 5e-324}], "keyframe 1 must be 0.001 to 86400 s after the last"),
         (lambda k: [k, {**k, "seconds": 1e300}], "keyframe 1 must be 0.001 to 86400"),
         (lambda k: [k] * 10_001, "1 to 10,000"),
         (lambda k: [{"c2w": k["c2w"], "fov_y": 1.0}], "seconds is missing"),
