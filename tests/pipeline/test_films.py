@@ -172,7 +172,7 @@ def test_a_film_alone_and_six_frames_on_a_sheet(model, tmp_path, capsys):
         render_film(model, plan, tmp_path / "a.webp", FilmSettings(), coverage=True)
     (_, first), (_, second), *_ = plan.cameras
     mixed = dataclasses.replace(plan, cameras=[("0", first), ("1", dataclasses.replace(second, width=50))])
-    with pytest.raises(UsageError, match="the views differ in size"):
+    with pytest.raises(UsageError, match="views differ in size"):
         render_film(model, mixed, tmp_path / "a.mp4", FilmSettings())
     with pytest.raises(UsageError, match="no camera"):
         warpgs.render_path(model, [], out=tmp_path / "x")
