@@ -128,7 +128,7 @@ def check_onnx(data: bytes, path: Path) -> None:
                 )
             if kind == "node" and (domain := _text(part, NODE_DOMAIN)) not in DOMAINS:
                 if (operator := (domain, _text(part, NODE_TYPE))) not in own:
-                    raise DataError(f"{path}: {'::'.join(operator)} is no operator of ONNX; export with standard operators")
+                    raise DataError(f"{path}: {'::'.join(operator)} is not part of ONNX; export with standard operators")
     except (ValueError, IndexError) as e:
         raise DataError(f"{path}: not an ONNX model ({e}); give a file written by `torch.onnx.export` or a similar tool") from e
 
