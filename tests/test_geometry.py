@@ -258,7 +258,7 @@ def test_gradient_of_normals():
     assert bool(normals(depth, cam.viewmat, cam.K).isnan().any())
     assert not bool(geometry.depth_normals(dataclasses.replace(cam, height=2), depth[:2]).any())
     for other in (depth[:5], depth.T, depth[None]):
-        with pytest.raises(UsageError, match=r"depth must have the shape \[6, 7\] of the camera's image, not .*scale"):
+        with pytest.raises(UsageError, match=r"depth is .*, not \[6, 7\]; scale"):
             geometry.depth_normals(cam, other)
 
 

@@ -124,9 +124,7 @@ def parse_bytes(text: str) -> int:
     found = re.fullmatch(r"\s*([0-9]+(?:\.[0-9]+)?|\.[0-9]+)\s*([A-Za-z]+)\s*", text)
     units = {u.lower(): b for u, b in UNITS.items()}
     if not found or found[2].lower() not in units:
-        raise UsageError(
-            f"memory limit {text[:40]!r} is not a size: give a number and a unit of {', '.join(UNITS)}, such as 2GiB"
-        )
+        raise UsageError(f"memory limit {text[:40]!r} is not a size: give a number and one of {', '.join(UNITS)}, such as 2GiB")
     size = float(found[1]) * units[found[2].lower()]
     if not 1 <= size < 2**63:
         raise UsageError(f"memory limit {text[:40]!r} must be at least one byte and less than 2^63")
@@ -242,12 +240,9 @@ def is_out_of_memory(error: BaseException) -> bool:
 
 def no_memory_message(error: BaseException, purpose: str = "", *, fitting: bool = True) -> str:
     """Return the message for a lack of memory, with remedies; these name flags of the fit if ``fitting`` is True."""
-    remedy = (
-        "Reduce the memory of the fit with --memory-limit or --downscale, or end other programs; --resume continues from the "
-        "last checkpoint"
-        if fitting
-        else "End other programs, and try again"
-    )
+    remedy = "End other programs, and try again"
+    if fitting:
+        remedy = "Give --memory-limit or --downscale, or end other programs; --resume continues from the last checkpoint"
     reason = (str(error).strip() or type(error).__name__).splitlines()[0].partition(" GPU ")[0].rstrip(".")
     return f"out of memory{purpose} ({reason[:200]}). {remedy}"
 
@@ -325,11 +320,7 @@ def _machine_or_assumed() -> Memory:
 
 @functools.cache
 def _say_assumed() -> None:
-    say(
-        f"warpgs: the memory of this system is unknown (neither psutil nor a container reports it); "
-        f"{ASSUMED_BYTES / 2**30:.0f} GiB are assumed",
-        error=True,
-    )
+    say(f"warpgs: neither psutil nor a container reports the memory; {ASSUMED_BYTES / 2**30:.0f} GiB are assumed", error=True)
 
 
 def _text(path: Path) -> str:
@@ -365,11 +356,7 @@ def prepare_kernel_cache() -> tuple[Path, str]:
 
     folder, refused = choose_kernel_cache(warp.config.kernel_cache_dir)
     if refused:
-        say(
-            f"warpgs: {refused}; kernels are compiled into {folder} for this process only, which takes a "
-            f"minute or two. {REMEDY}",
-            error=True,
-        )
+        say(f"warpgs: {refused}; kernels are compiled into {folder} for this process only (minutes). {REMEDY}", error=True)
     if refused or warp.config.kernel_cache_dir is None:
         warp.config.kernel_cache_dir = str(folder)
     return folder, refused

@@ -86,10 +86,7 @@ class Folder(contextlib.AbstractContextManager["Folder"]):
         with contextlib.suppress(FileNotFoundError):
             found = self.lstat(name)
             if stat.S_ISLNK(found.st_mode) or getattr(found, "st_reparse_tag", 0) == JUNCTION:
-                raise RefusedError(
-                    f"{self.path / name}: is a link, and links inside of a results folder are not followed; put the file or "
-                    "folder itself there, or remove the link. The results folder itself may be a link"
-                )
+                raise RefusedError(f"{self.path / name}: is a link, not followed in a results folder; put its target there")
 
     def open(self, name: str, flags: int, mode: int = 0o666) -> int:
         """Open a file, and return its descriptor."""
@@ -207,10 +204,7 @@ def open_folder(path: Path, make: bool = False) -> Folder:
 
 
 def _replaced(path: Path) -> RefusedError:
-    return RefusedError(
-        f"{path}: the folder was moved, removed or replaced while this command wrote into it. Put it "
-        "back, or choose another folder"
-    )
+    return RefusedError(f"{path}: the folder was moved, removed or replaced meanwhile; put it back, or choose another")
 
 
 # Temporary files and folders: the owner locks its file, or a file beside its folder; any process may remove unlocked ones.
@@ -383,9 +377,6 @@ def private_folder() -> Path:
     try:
         made = stack.enter_context(temporary_folder())
     except OSError as e:
-        raise ResourceError(
-            f"no folder for temporary files can be written ({e.strerror or e}). Set TMPDIR (TEMP on Windows) to a folder that "
-            "you may write to"
-        ) from e
+        raise ResourceError(f"no temporary folder can be written ({e.strerror or e}); set TMPDIR (TEMP on Windows)") from e
     atexit.register(stack.close)
     return made.path

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
@@ -17,6 +17,12 @@ if TYPE_CHECKING:
     import torch
 
     from warpgs.scene import Array
+T = TypeVar("T")
+
+
+def evenly_spaced(values: Sequence[T], most: int) -> list[T]:
+    """Return up to ``most`` of some values."""
+    return [values[i] for i in np.unique(np.linspace(0, len(values) - 1, min(most, len(values))).round().astype(int))]
 
 
 # Camera models outside of the kernels: from positions in camera axes to the image plane and back, for arrays or
@@ -351,10 +357,7 @@ def depth_normals(camera: Camera, depth: torch.Tensor) -> torch.Tensor:
 
     check_pinhole(camera)
     if tuple(depth.shape) != (camera.height, camera.width):
-        raise UsageError(
-            f"depth must have the shape [{camera.height}, {camera.width}] of the camera's image, not {list(depth.shape)}; "
-            "scale width, height and K of the camera to the map"
-        )
+        raise UsageError(f"depth is {list(depth.shape)}, not [{camera.height}, {camera.width}]; scale the camera's size and K")
     height, width = depth.shape
     if min(height, width) < 3:
         return depth.new_zeros(height, width, 3)

@@ -192,8 +192,5 @@ def private_shared_folder(base: Path | None) -> Iterator[Path]:
             made = stack.enter_context(Temporary(above))
             above.mkdir(made.name, 0o700)
         except OSError as e:
-            raise ResourceError(
-                f"{base}: Slurm's job files cannot be written ({e.strerror or e}); name another private folder that all nodes "
-                "see with --slurm-folder"
-            ) from e
+            raise ResourceError(f"{base}: not writable ({e.strerror or e}); name another private, shared --slurm-folder") from e
         yield made.path

@@ -128,10 +128,7 @@ def check_onnx(data: bytes, path: Path) -> None:
                 )
             if kind == "node" and (domain := _text(part, NODE_DOMAIN)) not in DOMAINS:
                 if (operator := (domain, _text(part, NODE_TYPE))) not in own:
-                    raise DataError(
-                        f"{path}: the operator {'::'.join(operator)} is not part of ONNX and would need foreign code to run. "
-                        "Export the model with standard operators"
-                    )
+                    raise DataError(f"{path}: {'::'.join(operator)} is not part of ONNX; export with standard operators")
     except (ValueError, IndexError) as e:
         raise DataError(f"{path}: not an ONNX model ({e}); give a file written by `torch.onnx.export` or a similar tool") from e
 
@@ -259,6 +256,5 @@ class Model:
         except Exception as e:  # onnxruntime's errors share no base but Exception
             shape = " x ".join(map(str, images[0].shape))
             raise DataError(
-                f"{self.path}: onnxruntime cannot run it on an input of {shape} ({_first_line(e)}); describe its input in "
-                f"{self.path.name}.json, or export it again"
+                f"{self.path}: onnxruntime refuses an input of {shape} ({_first_line(e)}); describe it in {self.path.name}.json"
             ) from e

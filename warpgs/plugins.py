@@ -47,9 +47,7 @@ class Registry(Generic[T]):
         def decorate(cls: type[T]) -> type[T]:
             before = self._classes.get(name)
             if before is not None and is_ours(before) and not is_ours(cls):
-                raise UsageError(
-                    f"{cls.__name__}: {name!r} is a {self.kind} of warpgs itself; register yours under another name"
-                )
+                raise UsageError(f"{cls.__name__}: {name!r} is a {self.kind} of warpgs; register yours under another name")
             cls.name = name
             self._classes[name] = cls
             return cls

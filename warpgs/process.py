@@ -149,6 +149,8 @@ def careful(stream: TextIO) -> TextIO:
 
 
 T = TypeVar("T")
+Say = Callable[[str], object]
+"""A function that shows a line to the user, such as `say`."""
 
 HIDDEN = {"Cc", "Cf", "Cs", "Zl", "Zp"}
 """Categories of characters that move the cursor, change the direction of text, end a line, or are surrogates."""
@@ -205,7 +207,11 @@ def answer(line: object, error: bool = False) -> None:
     print(printable(line).encode(encoding, "backslashreplace").decode(encoding), file=stream, flush=True)
 
 
-def counted(items: Sequence[T], tell: Callable[[str], object], what: str, unit: str) -> Iterator[T]:
+def silent(line: str) -> None:
+    """Show nothing."""
+
+
+def counted(items: Sequence[T], tell: Say, what: str, unit: str) -> Iterator[T]:
     """Yield items; before each item, print how many are done: ``scoring: 3 of 12 views``."""
     for done, item in enumerate(items):
         tell(f"{what}: {done} of {len(items)} {unit}")

@@ -260,10 +260,7 @@ class RankWatch:
             except RuntimeError:  # the store is gone, and with it the process that held it
                 lost = 0
             if lost is not None and not self.leaving.is_set():
-                self.fail(
-                    f"warpgs: rank {lost} of {self.count} was lost, so this fit stops; --resume continues from the last "
-                    "checkpoint, with any number of ranks"
-                )
+                self.fail(f"warpgs: rank {lost} of {self.count} was lost: the fit stops; --resume it, with any number of ranks")
                 os._exit(ResourceError.exit_code)
 
     def is_lost(self, rank: int) -> bool:
@@ -470,9 +467,7 @@ def join(device: str) -> Ranks:
         store = _store(address, port, count, home, hosts=rank == 0 and not agent)
         watch = RankWatch(rank, count, store, _store(address, port, count, home, hosts=False))
     except RuntimeError as e:
-        raise ResourceError(
-            f"rank {rank} of {count} cannot reach the others at {address}:{port} ({str(e).splitlines()[0][:200]})"
-        ) from e
+        raise ResourceError(f"rank {rank} of {count} cannot reach {address}:{port} ({str(e).splitlines()[0][:200]})") from e
     backend = "nccl" if cuda else "gloo"
     _joined = Group(rank, count, backend, watch)
     if cuda:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Sized
+from collections.abc import Iterable, Mapping, Sized
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
     Array = np.ndarray | torch.Tensor
 
+Tensors = Mapping[str, "torch.Tensor"]
+"""Tensors by name."""
 C0 = 0.28209479177387814
 """Harmonic of degree 0, 1/2 sqrt(1/pi): a colour is 1/2 + C0 times its coefficient."""
 

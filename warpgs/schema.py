@@ -65,13 +65,15 @@ def check_depth(value: Any, most: int) -> None:
             raise SchemaError(f"is nested deeper than {most} lists and objects")
 
 
-def read(path: Path, below: Path | None = None) -> Any:
-    """Return the value of a JSON file."""
-    return parse(read_input(path, MAX_BYTES, below))
-
-
 def anything(value: Any, place: str) -> None:
     """Allow every value."""
+
+
+def read(path: Path, below: Path | None = None, rule: Schema = anything) -> Any:
+    """Return the value of a JSON file that keeps a rule."""
+    value = parse(read_input(path, MAX_BYTES, below))
+    rule(value, "")
+    return value
 
 
 def flag(value: Any, place: str) -> None:

@@ -65,10 +65,10 @@ if TYPE_CHECKING:
     from warpgs.pipeline.train.strategies.base import Growth, Settings, Strategy, StrategyContext, register as register_strategy
     from warpgs.pipeline.train.strategies.clone_split import CloneSplit, GradientGrowth
     from warpgs.pipeline.train.strategies.sampling import Rendered, Sampling
-    from warpgs.pipeline.train.view_modules import FittedViews, Tensors, ViewModule, register as register_view_module
+    from warpgs.pipeline.train.view_modules import FittedViews, ViewModule, register as register_view_module
     from warpgs.pipeline.train.views import LearnedView, TrainingView
     from warpgs.ranks import join as join_ranks
-    from warpgs.scene import Prior
+    from warpgs.scene import Prior, Tensors
     from warpgs.schema import Checked, Within, fields as state_schema
 else:
     __getattr__, __dir__ = lazy(__name__)

@@ -251,7 +251,7 @@ def test_mistakes_get_one_line_and_their_exit_code(scene, run, tmp_path, capsys)
         said = failure(capsys, 3, command, str(tmp_path / "my-ran"), *others)
         assert "my-ran: no such f" in said and said.endswith("; did you mean my-run?")
     said = failure(capsys, 2, "convert", str(run), "a b.ply")
-    assert f"is a run folder; use `warpgs export {run} --to 'a b.ply'`" in said
+    assert f"is a run; use `warpgs export {run} --to 'a b.ply'`" in said
     (tmp_path / "model.spz").touch()
     assert "model.spz: is a file, not the folder of a run" in failure(capsys, 3, "eval", str(tmp_path / "model.spz"))
     again = ["fit", str(scene), "--split", split_spec(9), "--out", str(run), "--resume", "--device", "cpu", "--downscale", "2"]

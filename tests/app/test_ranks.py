@@ -62,10 +62,7 @@ def test_any_number_of_processes_fits_the_same_model(demo, tmp_path, capsys, fir
     found = ended(lost)
     assert [code for code, _, _ in found] == [4] * (first - 1) + [-signal.SIGKILL]
     lines = [line for _, _, errors in found for line in errors.splitlines() if line.startswith("warpgs")]
-    assert lines == [
-        f"warpgs: rank {first - 1} of {first} was lost, so this fit stops; --resume continues from the last checkpoint, "
-        "with any number of ranks"
-    ]
+    assert lines == [f"warpgs: rank {first - 1} of {first} was lost: the fit stops; --resume it, with any number of ranks"]
 
     if then == 1:
         assert main(["fit", *flags, *shared, "--resume"]) == 0

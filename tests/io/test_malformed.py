@@ -71,8 +71,8 @@ def test_truncations_and_wrong_counts_are_noticed(name, tmp_path):
             read_all(tmp_path, "bin")
     (right,) = struct.unpack_from("<Q", files[name])
     for count, words in (
-        *((c, rf"announces {c:,} records but holds bytes for at most \d+") for c in (100, 2**40, 2**64 - 1)),
-        (right - 1, r"\d+ bytes follow the last record, so its count of records is wrong. Copy"),
+        *((c, rf"{c:,} records announced, \d+ fit: truncated") for c in (100, 2**40, 2**64 - 1)),
+        (right - 1, r"\d+ bytes follow the last of its records. Copy"),
     ):
         scenes.write_files(tmp_path, files | {name: struct.pack("<Q", count) + files[name][8:]})
         with pytest.raises(DataError, match=f"{name}: {words}"):
@@ -227,8 +227,8 @@ def test_points_that_are_not_finite_are_left_out(kind, tmp_path):
         ("cameras.txt", "1\n", r"cameras.txt, line 1: cannot be understood"),
         ("cameras.txt", b"\xff\xfe", r"cameras.txt, line 1: cannot be understood"),
         ("images.txt", "1 1 0 0 0 0 0 3 1 photo0.png\n2 1 0 0 0 0 0 3 1 photo1.png\n", r"images.txt, line 2: expected"),
-        ("images.txt", "", r"has 0 usable views.*at least 2"),
-        ("images.txt", "1 1 0 0 0 0 0 3 1 photo0.png\n\n", r"has 1 usable view.*at least 2. Add images"),
+        ("images.txt", "", r": 0 usable views.*at least 2"),
+        ("images.txt", "1 1 0 0 0 0 0 3 1 photo0.png\n\n", r": 1 usable view.*at least 2. Add images"),
     ],
 )
 def test_broken_text_files(name, content, message, tmp_path):
@@ -298,7 +298,7 @@ SCALED = (np.array(scenes.opengl(1)) @ np.diag([2.0, 2, 2, 1])).tolist()
         ({"mask_path": "../m.png"}, r"frame 1 .*, mask: '../m.png' points outside the scene folder"),
         ({"mask_path": "m.png"}, r"frame 1 .*: its mask .*m.png is missing; restore it, or remove mask_path"),
         ({"file_path": "images/photo0.png"}, r"the image 'images/photo0.png' is listed twice"),
-        ({"fl_x": -1}, r"frame 1 .*: focal lengths \[-1.0, 20.0\] px must be positive"),
+        ({"fl_x": -1}, r"frame 1 .*: focal lengths \[-1.0, 20.0\] px must be over 0."),
         ({"fl_x": True}, r"frame 1 .*: fl_x is True, not a finite number"),
         ({"fl_x": 10**400}, r"frame 1 .*: fl_x is too large"),
         ({"cx": "8"}, r"frame 1 .*: cx is '8', not a finite number; write it .* without quotes"),
@@ -417,7 +417,7 @@ SKEW = np.block([[np.array([[20, 5, 8], [0, 20, 6], [0, 0, 1.0]]), np.zeros((3, 
         ({"world_mat_4": None, "world_mat_7": np.eye(4)}, r"image '000004.png': world_mat_4 is missing"),
         ({"world_mat_1": np.zeros((4, 4))}, r"image '000001.png': the projection matrix is not finite or not invertible"),
         ({"world_mat_1": np.full((4, 4), np.nan)}, r"cameras.npz: world_mat_1 must be finite and \[4, 4\]"),
-        ({"scale_mat_1": np.eye(3)}, r"cameras.npz: scale_mat_1 must be finite and \[4, 4\]; its shape is \[3, 3\]"),
+        ({"scale_mat_1": np.eye(3)}, r"cameras.npz: scale_mat_1 must be finite and \[4, 4\], not \[3, 3\]"),
         ({"world_mat_1": SKEW}, r"image '000001.png': the camera is skewed by 5 px"),
     ],
 )
@@ -433,8 +433,8 @@ def test_dtu_archives(changes, message, tmp_path):
     [
         ("5\n", "6\n", r"tiny_par.txt: announces 6 images and lists 5; it is truncated"),
         ("5\n", "x\n", r"tiny_par.txt: cannot be understood"),
-        ("photo1.png 20.0", "photo1.png nan", r"tiny_par.txt, line 3, image 'photo1.png': needs 21 finite numbers .*has 20"),
-        ("photo1.png 20.0", "photo1.png", r"line 3, image 'photo1.png': needs 21 finite numbers .*has 20"),
+        ("photo1.png 20.0", "photo1.png nan", r"tiny_par.txt, line 3, image 'photo1.png': needs 21 finite numbers"),
+        ("photo1.png 20.0", "photo1.png", r"line 3, image 'photo1.png': needs 21 finite numbers"),
         ("photo1.png 20.0 0.0", "photo1.png 20.0 3.0", r"line 3, image 'photo1.png': the camera is skewed by 3 px"),
         ("photo1.png 20.0", "photo1.png -20.0", r"line 3, image 'photo1.png': focal lengths"),
         ("photo1.png 20.0", "photo9.png 20.0", r"photo9.png: the image file is missing"),

@@ -195,7 +195,7 @@ def test_folders_without_maps(tmp_path):
 def test_sizes_beyond_the_limit_and_links_are_refused(tmp_path):
     scene, maps = scenes.write_colmap(tmp_path / "scene"), tmp_path / "maps"
     write_maps(maps, np.ones((60, 80), np.float32), suffix=".npy")
-    refused(scene, "80 x 60 px, more than the limit of 200 pixels", depths=maps, max_pixels=200)
+    refused(scene, "80 x 60 px are over 200", depths=maps, max_pixels=200)
     (maps / "photo0.npy").rename(tmp_path / "outside.npy")
     link(maps / "photo0.npy", tmp_path / "outside.npy")
     refused(scene, r"photo0\.npy: a link points outside the folder of maps", depths=maps)
@@ -289,7 +289,7 @@ def test_sizes_and_orientations_of_maps_and_ids_of_names():
     stored = RAMP.astype(np.float32)
     upright = turn_upright(stored, 6)
     assert (in_pixels_of(image, stored, "a.npy") == upright).all() and (in_pixels_of(image, upright, "a.npy") == upright).all()
-    with pytest.raises(DataError, match="rotated by an EXIF tag"):
+    with pytest.raises(DataError, match="EXIF rotates its image"):
         in_pixels_of(image, facing(), "n.npy")
     # the id of a name is the number that differs from name to name
     for names, ids in (

@@ -113,8 +113,8 @@ def test_explicit_names(spec, train, test):
         ("train=z,z.jpg", r"train names z.jpg twice"),
         ("train=z;test=z", r"views z.jpg are in training and in test"),
         ("train=;test=z", r"leaves no training view"),
-        ("llff:4", r"needs 4 training views, but 3 remain of 4"),
-        ("dtu:3", r"needs 49 views, and the scene has 4"),
+        ("llff:4", r"needs 4 views, 3 of 4 remain without every 8th"),
+        ("dtu:3", r"needs 49 views, not 4"),
         ("blender:8", r"found 0 and 0"),
     ],
 )

@@ -68,13 +68,13 @@ def test_keyframes_of_a_viewer_give_back_its_cameras(model, tmp_path):
         (lambda k: [{**k, "c2w": [[math.nan] * 4] * 4}], "c2w"),
         (lambda k: [{**k, "fov_y": 50}], "give radians"),
         (lambda k: [{**k, "fov_y": 0}], "fov_y"),
-        (lambda k: [k, {**k, "seconds": 5e-324}], "keyframe 1 must be 0.001 to 86400 above those of keyframe 0"),
+        (lambda k: [k, {**k, "seconds": 5e-324}], "keyframe 1 must be 0.001 to 86400 s after the last"),
         (lambda k: [k, {**k, "seconds": 1e300}], "keyframe 1 must be 0.001 to 86400"),
         (lambda k: [k] * 10_001, "1 to 10,000"),
         (lambda k: [{"c2w": k["c2w"], "fov_y": 1.0}], "seconds is missing"),
         (None, "no such file; give a .json file of keyframes"),
-        (lambda k: "{", "cannot be read as keyframes"),
-        (lambda k: "[" * 100_000, "cannot be read as keyframes"),
+        (lambda k: "{", "no keyframes"),
+        (lambda k: "[" * 100_000, "no keyframes"),
     ],
 )
 def test_keyframes_that_are_none_are_refused(model, tmp_path, change, words):
@@ -172,7 +172,7 @@ def test_a_film_alone_and_six_frames_on_a_sheet(model, tmp_path, capsys):
         render_film(model, plan, tmp_path / "a.webp", FilmSettings(), coverage=True)
     (_, first), (_, second), *_ = plan.cameras
     mixed = dataclasses.replace(plan, cameras=[("0", first), ("1", dataclasses.replace(second, width=50))])
-    with pytest.raises(UsageError, match="the views differ in size"):
+    with pytest.raises(UsageError, match="views differ in size"):
         render_film(model, mixed, tmp_path / "a.mp4", FilmSettings())
     with pytest.raises(UsageError, match="no camera"):
         warpgs.render_path(model, [], out=tmp_path / "x")

@@ -159,7 +159,7 @@ def test_kept_rows_keep_everything_and_new_rows_start_anew():
     before = snapshot(made)
     added = {n: t.detach()[:2] for n, t in made.params.items()}
     for bad, parents in ((added, 1), ({n: t for n, t in added.items() if n != "sh"}, 2)):
-        with pytest.raises(UsageError, match="one row for each entry of parents"):
+        with pytest.raises(UsageError, match="give each row a parent"):
             made.apply(DensityUpdate(torch.arange(4), bad, torch.full((parents,), -1)))
     assert all(torch.equal(t, before[n]) for n, t in made.state().items()) and len(made) == 4
 
@@ -778,7 +778,7 @@ def test_render_of_a_file_plain_and_antialiased(tmp_path):
     assert any("cut-offs of inria" in line for line in lines) and any("the background is black" in line for line in lines)
     assert len(list(out.glob("*.png"))) == 3
     write_cameras(tmp_path / "transforms.json", [replace(c, K=1000 * c.K, width=20000, height=20000) for c in make_cameras()])
-    with pytest.raises(DataError, match="20000 x 20000 px has over 100,000,000 pixels"):
+    with pytest.raises(DataError, match="20000 x 20000 px are over 100,000,000 pixels"):
         render(tmp_path / "a.spz", "views", out, settings, "cpu", file_of=(tmp_path / "transforms.json", None))
     assert main(["render", str(tmp_path / "none.ply"), "--cameras", str(tmp_path / "cameras.json")]) == DataError.exit_code
     assert main(["render", str(tmp_path), "--cameras", str(tmp_path / "cameras.json")]) == UsageError.exit_code

@@ -441,9 +441,9 @@ def test_records_reasons_and_advice():
     assert advice(well, ["a", "b"]) == []
     # its lines name the photographs without a pose, why, and what to do
     photographs = unposed("abcde")
-    assert not any("run to run" in n for n in record_of(found_mapping(), photographs, "0", [])["notes"])
+    assert not any("between runs" in n for n in record_of(found_mapping(), photographs, "0", [])["notes"])
     record = record_of(found_mapping(method="global"), photographs, "0", ["a note"])
-    assert record["notes"][0] == "a note" and record["notes"][-1].endswith("from run to run")
+    assert record["notes"][0] == "a note" and record["notes"][-1].endswith("between runs")
     lines = report_lines(record)
     assert "poses found for 3 of 5 photographs" in lines[1] and "What to photograph next:" in lines
     assert lines[8].startswith("d.png  NO POSE: it has 600 keypoints and 9 matches with c.png")

@@ -57,8 +57,8 @@ def test_keypoints_are_in_pixels_of_the_photograph(tmp_path):
         ((AT, SCORES, UNIT[:, :0]), {}, "have 0 numbers, not 1 to 256"),
         ((AT, SCORES, np.ones((3, 300))), {}, "have 300 numbers"),
         ((AT * np.nan, SCORES, UNIT), {}, "contain NaN"),
-        ((AT * 100, SCORES, UNIT), {}, "are outside the image"),
-        ((AT, SCORES, UNIT * 2), {}, "do not have length 1"),
+        ((AT * 100, SCORES, UNIT), {}, "keypoints must be in the image"),
+        ((AT, SCORES, UNIT * 2), {}, "descriptors of length 1"),
     ],
 )
 def test_networks_that_are_no_matchers_are_refused(tmp_path, arrays, options, message):

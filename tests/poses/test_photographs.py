@@ -282,5 +282,5 @@ def test_a_file_that_cannot_be_read_is_named(tmp_path, monkeypatch, capsys):
     with pytest.raises(DataError, match=r"a\.heic: the image cannot be decoded: the decoder ended with code -11\. Restore it"):
         convert(tmp_path, HEIC)
     monkeypatch.setitem(sys.modules, "pi_heif", None)
-    with pytest.raises(UsageError, match=r"a\.heic: is a HEIC photograph, .*`pip install '.*(pi-heif|poses).*`.*, or convert"):
+    with pytest.raises(UsageError, match=r"a\.heic: HEIC, .*`pip install '.*(pi-heif|poses).*`.*, or convert"):
         convert(tmp_path, HEIC)

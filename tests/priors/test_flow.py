@@ -245,7 +245,7 @@ def test_files_that_are_no_flow_network(tmp_path):
         flow_between(views, network(tmp_path / "one.onnx", np.zeros((2, 3)), np.zeros(2), inputs=("a",)))
     shape = (1, 3, "h", "w")
     graph = nw.graph([nw.node("Add", ["a", "b"], ["y"])], [], [nw.value(n, shape) for n in "ab"], [nw.value("y", shape)])
-    with pytest.raises(DataError, match="export the upsampled flow"):
+    with pytest.raises(DataError, match="export it upsampled"):
         flow_between(views, nw.write(tmp_path / "sum.onnx", nw.model(graph)))(0, 1)
     with pytest.raises(UsageError, match="deepflow"):
         flow_between(views, str(tmp_path / "nowhere"))

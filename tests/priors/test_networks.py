@@ -538,7 +538,7 @@ def test_a_coarse_network_puts_labels_where_they_are(tmp_path):
 @pytest.mark.parametrize("count", [1, 20])
 def test_another_number_of_classes_is_refused(tmp_path, count):
     path = nw.write(tmp_path / "s.onnx", nw.linear(np.random.default_rng(0).normal(size=(count, 3)), np.zeros(count)))
-    with pytest.raises(DataError, match=f"{count}, 32, 64.*21 PASCAL VOC classes"):
+    with pytest.raises(DataError, match=rf"{count}, 32, 64.*\[1, 21, height"):
         class_probabilities(Network(path), PLAIN, shapes()[0])
 
 

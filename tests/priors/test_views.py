@@ -149,7 +149,7 @@ def test_a_network_of_the_other_kind_is_refused(tmp_path):
     depth, labels = nw.depth_network(tmp_path / "d.onnx"), nw.segmentation_network(tmp_path / "s.onnx")
     with pytest.raises(DataError, match="is it a depth network"):
         view_priors([view(shapes()[0])], PriorConfig(depth_model=labels))
-    with pytest.raises(DataError, match="21 PASCAL VOC classes"):
+    with pytest.raises(DataError, match=r"\[1, 21, height"):
         view_priors([view(shapes()[0])], PriorConfig(segmentation_model=depth))
     for path, flag, output in ((depth, "depth_model", "classes"), (labels, "segmentation_model", "depth")):
         (tmp_path / f"{path}.json").write_text(json.dumps({"output": output}))

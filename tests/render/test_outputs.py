@@ -211,7 +211,7 @@ def test_a_strategy_holds_the_projected_means():
     # magnitudes of several passes do not add up to that of their sum
     gaussians, cam = cloud(5), camera(dtype=torch.float32)
     for options in ({"features": torch.ones(5, 2)}, {"colors": torch.ones(5, 12)}):
-        with pytest.raises(UsageError, match="absgrad supports at most 11 channels of colors, and no features"):
+        with pytest.raises(UsageError, match="absgrad takes at most 11 channels of colors and no features"):
             rasterize(gaussians, cam, RasterizeOptions(absgrad=True, **options))
 
 

@@ -17,7 +17,7 @@ from typing import Literal
 from warpgs.app.flags import call
 from warpgs.device import ASSUMED_BYTES, format_bytes, machine_memory, prepare_kernel_cache, processor_name, usable_cores
 from warpgs.errors import ResourceError, install_extras
-from warpgs.process import counted, fast_imports, hidden_stderr, printable
+from warpgs.process import Say, counted, fast_imports, hidden_stderr, printable, silent
 from warpgs.report.progress import Stages, waiting
 
 OK, MISSING, NOTE = "ok", "missing", "note"
@@ -265,7 +265,7 @@ def _findings(check: Callable[[], Iterable[Finding]]) -> list[Finding]:
         return [Finding(topic, NOTE, f"the check itself failed: {_reason(e)}", "report this as a bug")]
 
 
-def diagnose(tell: Callable[[str], object] = lambda line: None) -> list[Finding]:
+def diagnose(tell: Say = silent) -> list[Finding]:
     """Check everything that a fit and its report need."""
     return [f for check in counted(CHECKS, tell, "checking this machine", "parts") for f in _findings(check)]
 

@@ -12,10 +12,7 @@ OWN = ("engine", "slots", "per-gpu", "threads", "minutes", "partition", "slurm-f
 """Flags of the farm itself; all others are those of `warpgs fit`."""
 SWITCHES = ("help", "help-all")
 """Flags of the farm that take no value."""
-MORE = (
-    "Every job takes the flags of `warpgs fit`, such as --preset, --split, --steps and --device, but not --resume, --view, "
-    "--view-port and --time-budget."
-)
+MORE = "Every job takes the flags of `warpgs fit`, but not --resume, --view, --view-port and --time-budget."
 
 
 def run(arguments: list[str], about: str) -> int:

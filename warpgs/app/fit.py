@@ -237,9 +237,7 @@ def request_of(arguments: list[str], about: str) -> FitRequest:
     flags.check_range("--steps", config.steps or 1, 1, flags.MAX_WHOLE)
     if a.time_budget is not None:
         if a.resume or flags.word_after(arguments, "--steps"):
-            raise UsageError(
-                "--time-budget chooses the number of steps; leave out --steps. To continue a run, give only --out RUN --resume"
-            )
+            raise UsageError("--time-budget chooses the steps; leave out --steps. To continue, give only --out RUN --resume")
         check_budget(a.time_budget)
     notes = (origin_note(origin, base, config),)
     if flags.word_after(arguments, "--preset") is None:

@@ -94,10 +94,7 @@ def _camera(settings: GaussianRasterizationSettings) -> Camera:
     error = (pose @ pose.new_tensor(lens) - given).abs()
     largest = given.abs().amax(1, keepdim=True).clamp_min(1e-3)  # a camera at the origin has a translation of rounding errors
     if not bool((error <= POSE_TOLERANCE * largest).all()):
-        raise UsageError(
-            "projmatrix is not viewmatrix times a projection of tanfovx and tanfovy: give both matrices transposed, for row "
-            "vectors, and projmatrix = viewmatrix @ projection"
-        )
+        raise UsageError("projmatrix is not viewmatrix times a projection of tanfovx, tanfovy; give both matrices transposed")
     # the product of both matrices is rounded, in float32 by up to a thousandth of a pixel
     (fx, cx), (fy, cy) = ((s / (2 * t), round(s / 2 * (1 + o), 3)) for s, t, o in zip((width, height), tangents, off))
     K = torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64, device="cpu")

@@ -43,9 +43,7 @@ _AXES = (
 
 def malformed(path: Path, what: str) -> DataError:
     """Return a DataError about a file that does not match its suffix, with the fix."""
-    return DataError(
-        f"{path}: not a usable {path.suffix or 'model'} file: {what}. Export the model again, or use another format."
-    )
+    return DataError(f"{path}: not a usable {path.suffix or 'model'} file: {what}. Export it again, or use another format.")
 
 
 def by_rows(n: int, shape: tuple[int, ...], rows: Callable[[slice], np.ndarray]) -> np.ndarray:
@@ -114,10 +112,7 @@ def arrays_to_write(
         for name, array in arrays.items():
             bad = array.size - int(np.isfinite(array).sum())
             if bad:
-                raise DataError(
-                    f"{path}: not written, {bad} of {array.size} values of {name} are not finite, and no viewer can show them. "
-                    "Export an earlier checkpoint, or fit again with a lower learning rate."
-                )
+                raise DataError(f"{path}: {bad} of {array.size} values of {name} are not finite; export an earlier checkpoint")
     logits = arrays["logit_opacities"]
     if logits.size and 0 <= logits.min() < logits.max() <= 1:
         words = "all logit_opacities are in [0, 1], as opacities are; ActivatedGaussians(...).stored() makes logits"
@@ -160,10 +155,7 @@ def usable(
         if count == len(bad) or strict():
             raise error(path, reason)
         if notes is not None:
-            notes.append(
-                f"{path}: {count:,} of {len(bad):,} Gaussians left out, with a number that is not finite or a rotation of zero "
-                f"length ({reason})"
-            )
+            notes.append(f"{path}: {count:,} of {len(bad):,} Gaussians left out, not finite or with a zero rotation ({reason})")
         arrays = {name: array[~bad] for name, array in arrays.items()}
     return Gaussians(**{name: torch.from_numpy(array) for name, array in arrays.items()})
 
@@ -498,17 +490,12 @@ def find_format(choice: str | type[Format] | Format) -> Format:
     A string with a colon imports the module or file, which runs its code: never pass a string from an untrusted file.
     """
     if not isinstance(choice, (str, type, Format)):
-        raise UsageError(
-            f"{choice!r} is not a format; give a name, module:Class, or a class or object derived from warpgs.Format"
-        )
+        raise UsageError(f"{choice!r} is not a format; give a name, module:Class, or a class or object of warpgs.Format")
     found = (
         choice if isinstance(choice, Format) else FORMATS.load(choice)() if isinstance(choice, str) else FORMATS.find(choice)()
     )
     if not re.fullmatch(r"(\.[a-z0-9_-]+)+", found.suffix):
-        raise UsageError(
-            f"the format {type(found).__name__} has the suffix {found.suffix!r}; set it to a dot and lower-case letters or "
-            "digits, such as '.mine'"
-        )
+        raise UsageError(f"the suffix {found.suffix!r} of {type(found).__name__} must be a dot and lower-case letters, digits")
     return found
 
 

@@ -174,15 +174,11 @@ def _places(path: Path, document: dict[str, Any], mesh: int) -> list[np.ndarray]
         left += [(child, place) for child in reversed(node.get("children", []))]
         if node.get("mesh") == mesh:
             if "EXT_mesh_gpu_instancing" in (node.get("extensions") or ()):
-                raise base.malformed(
-                    path, f"node {i} repeats the Gaussians with EXT_mesh_gpu_instancing, which is not supported"
-                )
+                raise base.malformed(path, f"node {i} repeats the Gaussians (EXT_mesh_gpu_instancing), which is not supported")
             product = place[:3, :3].T @ place[:3, :3]
             square = np.trace(product) / 3
             if not (square > 0 and np.isfinite(place).all() and np.abs(product / square - np.eye(3)).max() <= MAX_SHEAR):
-                raise base.malformed(
-                    path, f"node {i} scales the Gaussians by different factors, by 0 or with shear; apply it in another program"
-                )
+                raise base.malformed(path, f"node {i} scales Gaussians by different factors, 0 or with shear; apply it first")
             found.append(place)
     if len(found) > MAX_COPIES or (not found and any(n.get("mesh") == mesh for n in nodes)):
         raise base.malformed(path, f"its scene shows the Gaussians {len(found)} times (supported: 1 to {MAX_COPIES})")
@@ -213,9 +209,7 @@ def _split(path: Path, data: bytes) -> tuple[dict[str, Any], bytes | memoryview]
             raise base.malformed(path, "its header is truncated")
         _, version, total, size, kind = struct.unpack_from("<IIIII", data)
         if version != 2 or kind != JSON_CHUNK or not 20 + size <= total <= len(data):
-            raise base.malformed(
-                path, f"its header is invalid: version {version}, {total} bytes, in a file of {len(data)} bytes"
-            )
+            raise base.malformed(path, f"its header is invalid: version {version}, {total} bytes, in a file of {len(data)}")
         text, rest = data[20 : 20 + size], memoryview(data)[20 + size : total]
         if len(rest) >= 8:
             size, kind = struct.unpack_from("<II", rest)

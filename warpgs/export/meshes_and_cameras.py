@@ -142,9 +142,7 @@ def _glb(path: Path, mesh: Mesh, up: np.ndarray | None, origin: np.ndarray) -> l
     if origin.any():
         text["extras"] = _stated(origin)
     if starts[-1] > MAX_BYTES:
-        raise DataError(
-            f"{path}: a mesh of {starts[-1]:,} bytes is beyond the 4 GiB of a .glb file; ask for fewer triangles, or write .ply"
-        )
+        raise DataError(f"{path}: a mesh of {starts[-1]:,} bytes is over the 4 GiB of .glb; ask for less, or write .ply")
     return glb(text, *arrays)
 
 

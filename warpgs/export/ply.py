@@ -93,8 +93,7 @@ def parse_header(path: Path, head: bytes) -> tuple[list[Element], int]:
                 mode = " ".join(words).lower().replace(":", " ").split()
                 if mode[:1] == ["splatrendermode"] and len(mode) == 2 and mode[1] not in ("default", "mip"):
                     raise DataError(
-                        f"{path}: its Gaussians need the render mode {mode[1][:40]!r}, which is not supported. Train or export "
-                        "them in the mode 'default' or 'mip'."
+                        f"{path}: render mode {mode[1][:40]!r} is not supported; train or export with mode 'default' or 'mip'"
                     )
             case [] | ["obj_info", *_]:
                 pass

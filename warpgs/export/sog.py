@@ -215,9 +215,7 @@ def _quats(path: Path, pixels: np.ndarray, n: int) -> np.ndarray:
     """Return the rotations [N, 4] that ``pixels`` [P, 4] store."""
     largest = pixels[:n, 3]
     if (largest < 252).any():
-        raise base.malformed(
-            path, f"the rotation of Gaussian {int(np.argmax(largest < 252))} does not name its largest component"
-        )
+        raise base.malformed(path, f"the rotation of Gaussian {int(np.argmax(largest < 252))} names no largest component")
     return base.by_rows(
         n, (4,), lambda p: base.from_smallest_three(largest[p].astype(np.int64) - 252, (pixels[p, :3] / 255 - 0.5) * base.SQRT2)
     )
@@ -232,9 +230,7 @@ def _check_contents(path: Path, file: BinaryIO, size: int) -> None:
     locator, end = (last := file.read())[:-22], last[-22:]
     plain = end[:4] == b"PK\5\6" and end[-2:] == b"\0\0" and locator[:4] != b"PK\6\7"
     if not plain or int.from_bytes(end[12:16], "little") > MAX_CONTENTS_BYTES:
-        raise base.malformed(
-            path, f"its table of contents is not at the end of the file, or has more than {MAX_CONTENTS_BYTES:,} bytes"
-        )
+        raise base.malformed(path, f"its table of contents is not at the end of the file, or over {MAX_CONTENTS_BYTES:,} bytes")
 
 
 def _member(path: Path, archive: zipfile.ZipFile, name: object, most: int) -> bytes:

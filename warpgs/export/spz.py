@@ -49,10 +49,7 @@ def fractional_bits(means: np.ndarray) -> int:
     while bits >= 0 and largest * 2.0**bits > 2**23 - 1:
         bits -= 1
     if bits < 0:
-        raise DataError(
-            f"SPZ coordinates must be at most 8388607 in absolute value, and one has {largest:.0f}; move the scene to the "
-            "origin, or write .ply"
-        )
+        raise DataError(f"SPZ coordinates reach 8388607, and one is {largest:.0f}; move the scene to the origin, or write .ply")
     return bits
 
 
@@ -200,9 +197,7 @@ def _streams(path: Path, data: bytes, sizes: list[int], count: int, place: int) 
             continue
         packed, plain = struct.unpack_from("<QQ", data, place + 16 * i)
         if plain != size or start + packed > len(data):
-            raise base.malformed(
-                path, f"stream {i} announces {packed} packed and {plain} unpacked bytes, but should unpack to {size}"
-            )
+            raise base.malformed(path, f"stream {i} announces {packed} packed and {plain} unpacked bytes, not {size} unpacked")
         with decompressor.stream_reader(view[start : start + packed]) as reader:
             yield functools.partial(_decompressed, path, reader, i, size)
             if _decompressed(path, reader, i, size, 1, end=True):

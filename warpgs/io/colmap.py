@@ -54,10 +54,7 @@ class _BinaryFile:
     def raw(self, size: int) -> bytes:
         """Return the next bytes unchanged."""
         if size > len(self.data) - self.at:
-            raise DataError(
-                f"{self.path}: the file ends in the middle of a record, at byte {len(self.data)}; "
-                "it is truncated. Copy it again"
-            )
+            raise DataError(f"{self.path}: the file ends in the middle of a record, at byte {len(self.data)}. Copy it again")
         self.at += size
         return self.data[self.at - size : self.at]
 
@@ -70,10 +67,7 @@ class _BinaryFile:
         (count,) = self.take("Q")
         capacity = (len(self.data) - self.at) // smallest
         if count > capacity:
-            raise DataError(
-                f"{self.path}: announces {count:,} records but holds bytes for at most {capacity:,}; it is truncated or not "
-                "a COLMAP file. Copy it again"
-            )
+            raise DataError(f"{self.path}: {count:,} records announced, {capacity:,} fit: truncated or foreign. Copy it again")
         return count
 
     def text(self) -> str:
@@ -87,10 +81,7 @@ class _BinaryFile:
     def end(self) -> None:
         """Raise a DataError where bytes follow the last record, which means a wrong count."""
         if self.at != len(self.data):
-            raise DataError(
-                f"{self.path}: {len(self.data) - self.at} bytes follow the last record, so its count "
-                "of records is wrong. Copy it again"
-            )
+            raise DataError(f"{self.path}: {len(self.data) - self.at} bytes follow the last of its records. Copy it again")
 
 
 def _lines(path: Path) -> Iterator[tuple[int, str]]:
@@ -234,10 +225,7 @@ def read_poses(path: Path) -> dict[int, Pose]:
         # the line of observations always follows, but may be empty
         line, text = next(lines, (0, ""))
         if len(text.split()) % 3:
-            raise DataError(
-                f"{path}, line {line}: expected the observations of image {pose[0]!r} as X Y POINT, or an empty line; "
-                "write the file again"
-            )
+            raise DataError(f"{path}, line {line}: expected X Y POINT of image {pose[0]!r}, or an empty line; write it again")
     return poses
 
 

@@ -136,10 +136,7 @@ def image_ids(names: list[str]) -> list[int] | None:
 def protocol_ids(names: list[str], wanted: tuple[int, ...], least: int, where: str) -> dict[int, str]:
     """Return the names of the images with the wanted ids."""
     if len(names) < least:
-        raise DataError(
-            f"{where}: the protocol needs {least} views, and the scene has {len(names)}; restore the scan, or use llff:K or "
-            "every:N"
-        )
+        raise DataError(f"{where}: the protocol needs {least} views, not {len(names)}; restore them, or use llff:K, every:N")
     ids = image_ids(names)
     if ids is None:
         return {i: names[i] for i in wanted}
@@ -163,9 +160,7 @@ def rigid(viewmat: np.ndarray, where: str) -> np.ndarray:
     # entries of a rotation are at most 1; the bound keeps the squares of wild ones from overflowing
     error = float(np.abs(R @ R.T - np.eye(3)).max()) if np.abs(R).max() < 1e3 else np.inf
     if error > POSE_TOLERANCE:
-        raise DataError(
-            f"{where}: the pose is not rigid (R R^T is off by {error:.2g}): it scales or shears. Give pure rotations"
-        )
+        raise DataError(f"{where}: the pose is not rigid (R R^T is off by {error:.2g}): it scales or shears. Give rotations")
     if np.linalg.det(R) < 0:
         raise DataError(f"{where}: the pose mirrors the scene (determinant -1); two axes are probably swapped")
     result = np.eye(4)

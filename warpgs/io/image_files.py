@@ -71,9 +71,7 @@ def format_of(data: bytes) -> str:
 RAW_SUFFIXES = (".dng", ".cr2", ".cr3", ".nef", ".nrw", ".arw", ".raf", ".rw2", ".orf", ".pef", ".srw")
 """Suffixes of RAW files of cameras; many begin like a TIFF, and their first image is a small preview."""
 HEIC = "a HEIC photograph, which is supported only for finding poses (warpgs poses); convert all HEIC files to JPEG"
-RAW = (
-    "a RAW file, which is not supported; convert all RAW files to JPEG or 16-bit PNG, with the same settings and white balance"
-)
+RAW = "a RAW file, which is not supported; convert all to JPEG or 16-bit PNG, with the same settings and white balance"
 
 
 def unread_format(path: Path, head: bytes) -> str | None:

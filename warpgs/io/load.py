@@ -140,10 +140,7 @@ def _every_8th(names: list[str], count: int, spec: str) -> Split:
     test = tuple(n for i, n in enumerate(names) if i % 8 == 0)
     pool = [n for i, n in enumerate(names) if i % 8]
     if not 1 <= count <= len(pool):
-        raise DataError(
-            f"split {spec}: needs {count} training views, but {len(pool)} remain of {len(names)} after every 8th is held out; "
-            "ask for fewer"
-        )
+        raise DataError(f"split {spec}: needs {count} views, {len(pool)} of {len(names)} remain without every 8th; take fewer")
     # np.round goes half to even, as the published id tables do
     ids = np.round(np.linspace(0, len(pool) - 1, count)).astype(int)
     return Split(tuple(pool[i] for i in ids), test)
@@ -339,10 +336,7 @@ def add_score_masks(views: list[View], folder: Path, scene: SceneFolder) -> tupl
         raise DataError(f"{folder}: the masks have no distinct numbers; name them 000.png, 001.png, ... by id")
     masks = dict(zip(numbers, files))
     if ids is None:
-        raise DataError(
-            f"{folder}: masks are matched by image id, but the images ({views[0].name}, ...) have no numbers that tell "
-            "them apart; name them by id"
-        )
+        raise DataError(f"{folder}: masks have image ids, the images ({views[0].name}, ...) no distinct ones; name them by id")
     missing = sorted(set(ids) - set(masks))
     if missing:
         shown = ", ".join(map(str, missing[:8])) + (", ..." if len(missing) > 8 else "")
@@ -517,9 +511,7 @@ def _exclusions(options: ReadOptions, names: list[str]) -> list[str]:
     out = options.excluded
     for pattern in options.patterns():
         if not any(matches(name, pattern) for name in out):
-            raise DataError(
-                f"--exclude {pattern[:80]}: no view has this name; the nearest names are {_nearest(names, pattern)}"
-            )
+            raise DataError(f"--exclude {pattern[:80]}: no view has this name; the nearest are {_nearest(names, pattern)}")
     return [f"left out by --exclude: {len(out)} image{'s' if len(out) != 1 else ''}: {scenes.listed(out)}"] if out else []
 
 
@@ -549,10 +541,7 @@ def doubtful_notes(views: list[View], points: PointCloud | None) -> list[str]:
             0.0 if points is None or not len(points) else float(np.median(np.linalg.norm(points.points - middle, axis=1)))
         )
     if spread < max(MIN_EXTENT, MIN_BASELINE * min(distance, MAX_COORDINATE)):
-        notes.append(
-            f"all cameras are within {spread:.2g} units of one place: pure rotation gives no depth; move the camera between "
-            "photographs"
-        )
+        notes.append(f"all cameras are within {spread:.2g} units: pure rotation gives no depth; move between photographs")
     off = [v for v in views if not all(0 <= v.camera.K[i, 2] <= n for i, n in ((0, v.camera.width), (1, v.camera.height)))]
     if off:
         x, y = off[0].camera.K[:2, 2]
@@ -576,15 +565,11 @@ def doubtful_notes(views: list[View], points: PointCloud | None) -> list[str]:
         equal.setdefault(hashlib.sha256(np.ascontiguousarray(v.image).data).digest(), []).append(v.name)
     blank = [v.name for v, pixels in zip(views, few) if not (_varies(pixels) or _varies(v.image))]
     if blank:
-        notes.append(
-            f"{len(blank)} of {len(views)} photographs have a single colour, such as {blank[0]}; leave them out (--exclude)"
-        )
+        notes.append(f"{len(blank)} of {len(views)} photographs have a single colour, such as {blank[0]}; --exclude them")
     same = [names for names in equal.values() if len(names) > 1]
     if same:
         count = sum(map(len, same))
-        notes.append(
-            f"{count} of {len(views)} photographs have equal pixels, such as {same[0][0]} and {same[0][1]}; remove copies"
-        )
+        notes.append(f"{count} of {len(views)} photographs have equal pixels, as {same[0][0]} and {same[0][1]}; remove copies")
     return notes
 
 
@@ -599,8 +584,8 @@ def _finished(root: Path, reader: Reader, scene: Scene, notes: list[str], option
     if len(views) < 2:
         reasons = f" ({'; '.join(more)})" if more else ""
         raise DataError(
-            f"{root}: the scene has {len(views)} usable view{'s' if len(views) != 1 else ''}{reasons}; depth needs at least 2. "
-            "Add images with cameras"
+            f"{root}: {len(views)} usable view{'s' if len(views) != 1 else ''}{reasons}; depth needs at least 2. Add images "
+            "with cameras"
         )
     if options.black_is_empty and not any(scene.background):
         views, note = cut_from_black(views)

@@ -109,8 +109,7 @@ def read_numbers(path: Path, max_pixels: int = MAX_PIXELS) -> np.ndarray:
         raise DataError(f"{path}: must be an array [height, width] or [height, width, 3], not {list(found.shape)}")
     if found.shape[0] * found.shape[1] > max_pixels:
         raise DataError(
-            f"{path}: the map is {found.shape[1]} x {found.shape[0]} px, more than the limit of {max_pixels:,} pixels; shrink "
-            "it, or raise the limit with --max-pixels"
+            f"{path}: {found.shape[1]} x {found.shape[0]} px are over {max_pixels:,}; shrink it, or raise --max-pixels"
         )
     native = found.dtype.newbyteorder("=")
     kind = native if native in (np.uint8, np.uint16) else np.float32
@@ -123,9 +122,7 @@ def _gray(path: Path, raw: np.ndarray, what: str) -> np.ndarray:
         return raw
     if raw.shape[2] == 1 or (raw.shape[2] == 3 and (raw == raw[..., :1]).all()):
         return raw[..., 0]
-    raise DataError(
-        f"{path}: is a colour image of {raw.shape[2]} channels, not a {what}; save the values as NPY or gray 16-bit PNG"
-    )
+    raise DataError(f"{path}: is a colour image of {raw.shape[2]} channels, not a {what}; save NPY or gray 16-bit PNG")
 
 
 def read_depth(path: Path, options: ReadOptions) -> np.ndarray:
@@ -133,19 +130,14 @@ def read_depth(path: Path, options: ReadOptions) -> np.ndarray:
     raw = _gray(path, read_numbers(path, options.max_pixels), "depth map")
     metric = options.depth_kind == "metric"
     if raw.dtype == np.uint8 and metric:
-        raise DataError(
-            f"{path}: has 8 bits, too few for metric depth; save 16-bit PNG, or give --depth-kind relative or disparity"
-        )
+        raise DataError(f"{path}: has 8 bits, too few for metric depth; save 16, or give --depth-kind relative or disparity")
     values = raw.astype(np.float32)
     finite = np.isfinite(values)
     if not finite.any():
         raise DataError(f"{path}: no depth is finite; write the map again, or remove the file")
     values = np.where(finite, values, 0)
     if (values < 0).any():
-        raise DataError(
-            f"{path}: {int((values < 0).sum()):,} depths are negative, down to {values.min():.4g}; depth must be positive "
-            f"along the camera's axis, or 0 for missing values"
-        )
+        raise DataError(f"{path}: {int((values < 0).sum()):,} depths are negative, down to {values.min():.4g}; mark gaps by 0")
     if metric:
         unit = options.depth_unit or (MILLIMETRES if raw.dtype.kind == "u" else 1.0)
         with np.errstate(over="ignore"):
@@ -246,14 +238,11 @@ def in_pixels_of(loaded: LoadedImage, values: np.ndarray, path: Path) -> np.ndar
     rows, columns = values.shape[:2]
     if loaded.orientation in (5, 6, 7, 8) and _same_aspect(values.shape, (width, height)):
         if values.ndim == 3:
-            raise DataError(
-                f"{path}: its image is rotated by an EXIF tag, and normals are not rotated with it; save both upright"
-            )
+            raise DataError(f"{path}: EXIF rotates its image, and normals are not rotated with it; save both upright")
         values = turn_upright(values, loaded.orientation)
     elif not _same_aspect(values.shape, (height, width)):
         raise DataError(
-            f"{path}: the map is {columns} x {rows} px, its image {width} x {height}: the aspects differ. Give a map of the "
-            "whole image"
+            f"{path}: is {columns} x {rows} px, its image {width} x {height}: the aspects differ. Give a map of the whole image"
         )
     final = loaded.image.shape[:2]
     if loaded.undone is not None:
@@ -316,10 +305,7 @@ class GivenMaps:
 
     def _depth(self, loaded: LoadedImage, path: Path, confidence: Path | None, options: ReadOptions) -> GivenDepth:
         if loaded.camera_model not in CENTRAL or loaded.camera_model == "fisheye":
-            raise UsageError(
-                f"{path}: depth is not supported for the camera model {loaded.camera_model}; leave out --lenses "
-                f"native, or the map ({DEPTHS} none)"
-            )
+            raise UsageError(f"{path}: no depth for {loaded.camera_model} lenses; omit --lenses native, or give {DEPTHS} none")
         stored = read_depth(path, options)
         values, sure = in_pixels_of(loaded, stored, path), None
         if confidence is not None:
@@ -327,17 +313,12 @@ class GivenMaps:
             sure = in_pixels_of(loaded, np.where(stored > 0, known, 0), confidence)
             values = np.where(sure > 0, values, 0)
         if not values.any():
-            raise DataError(
-                f"{path}: no pixel has a depth after mask, confidence and --downscale; remove the file: depth maps are optional"
-            )
+            raise DataError(f"{path}: no pixel has a depth after mask, confidence and --downscale; remove it: it is optional")
         return GivenDepth(values, options.depth_kind, sure)
 
     def _normals(self, loaded: LoadedImage, path: Path) -> np.ndarray:
         if loaded.camera_model != "pinhole":
-            raise UsageError(
-                f"{path}: normals need pinholes, not the camera model {loaded.camera_model}; leave out --lenses native, or the "
-                f"map ({NORMALS} none)"
-            )
+            raise UsageError(f"{path}: no normals for {loaded.camera_model} lenses; omit --lenses native, or {NORMALS} none")
         normals = in_pixels_of(loaded, read_normals(path, self.options), path)
         size = np.linalg.norm(normals, axis=-1, keepdims=True)
         normals = np.divide(normals, size, out=np.zeros_like(normals), where=size > 0.5)

@@ -55,10 +55,7 @@ class LLFFReader(Reader):
         images, factor, note = scene.images()
         files = list_images(images)
         if len(files) != len(rows):
-            raise DataError(
-                f"{path}: has {len(rows)} poses, but {images} holds {len(files)} images. They are matched in sorted order, so "
-                "one missing or extra file would give every image the wrong pose. Copy the scene again, or remake the array."
-            )
+            raise DataError(f"{path}: has {len(rows)} poses, but {images} holds {len(files)} images. Copy the scene again")
         views = ViewList(options)
         for file, row in zip(files, rows):
             name = file.relative_to(images).as_posix()
@@ -135,9 +132,7 @@ def _read_matrices(path: Path) -> dict[str, np.ndarray]:
         raise DataError(f"{path}: cannot be read as an archive of arrays ({type(e).__name__}: {e}); copy it again") from e
     for key, matrix in matrices.items():
         if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
-            raise DataError(
-                f"{path}: {key} must be finite and [4, 4]; its shape is {list(matrix.shape)}. Copy the archive again"
-            )
+            raise DataError(f"{path}: {key} must be finite and [4, 4], not {list(matrix.shape)}. Copy the archive again")
     return matrices
 
 
@@ -183,10 +178,7 @@ class DTUReader(Reader):
         files = list_images(images)
         cameras = sum(key.startswith("world_mat_") for key in matrices)
         if not files or cameras != len(files):
-            raise DataError(
-                f"{path}: has {cameras} cameras, but {images} holds {len(files)} images. They are matched in sorted order, so "
-                "the counts must agree. Copy the scene again"
-            )
+            raise DataError(f"{path}: has {cameras} cameras, but {images} holds {len(files)} images. Copy the scene again")
         masks, views = _masks(folder, files), ViewList(options)
         for i, file in enumerate(files):
             name = file.relative_to(images).as_posix()
@@ -228,15 +220,11 @@ def read_camera_rows(path: Path) -> list[tuple[int, str, np.ndarray]]:
                 continue
             values = np.array([float(x) for x in words[1:]])
             if len(values) != 21 or not np.isfinite(values).all():
-                raise DataError(
-                    f"{path}, line {number}, image {words[0]!r}: needs 21 finite numbers (K, R, t), has "
-                    f"{int(np.isfinite(values).sum())}. Copy the file again"
-                )
+                raise DataError(f"{path}, line {number}, image {words[0]!r}: needs 21 finite numbers. Copy it again")
             rows.append((number, words[0], values))
     except (OSError, ValueError) as e:
         raise DataError(
-            f"{path}: cannot be understood ({unread_reason(e)}); expected a count of images in the first line, then a line "
-            "with a name and 21 numbers for each image. Copy the file again"
+            f"{path}: cannot be understood ({unread_reason(e)}); needs a count, then names with 21 numbers. Copy it again"
         ) from e
     if count != len(rows):
         raise DataError(f"{path}: announces {count or 0} images and lists {len(rows)}; it is truncated. Copy it again")

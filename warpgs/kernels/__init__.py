@@ -6,10 +6,7 @@ from typing import TYPE_CHECKING
 
 from warpgs.faces import lazy
 
-__all__ = [
-    "CameraModel",
-    "register_camera_model",
-]
+__all__ = ["CameraModel", "register_camera_model"]
 
 if TYPE_CHECKING:
     from warpgs.kernels.cameras import CameraModel, register as register_camera_model

@@ -47,9 +47,7 @@ def make_backward(real, tile_size: int, channels: int, absgrad: bool = False, de
             pixels.g[c * stride + p] = v_rgb[o + c]
 
     @wp.func(inline=True)
-    def behind_of(
-        p: wp.int32, camera: wp.int32, backgrounds: wp.array2d(dtype=real), pixels: wp.ref[r.Pixels]
-    ) -> real:  # fmt: skip
+    def behind_of(p: wp.int32, camera: wp.int32, backgrounds: wp.array2d(dtype=real), pixels: wp.ref[r.Pixels]) -> real:
         """Return the product of a pixel's upstream gradient with the background."""
         product = backgrounds[camera, 0] * at(pixels.g[p])
         for c in range(1, wp.static(channels)):
@@ -251,9 +249,7 @@ def make_backward(real, tile_size: int, channels: int, absgrad: bool = False, de
             held.totals[n] = (at(held.halves[o]) + at(held.halves[o + 2])) + (at(held.halves[o + 1]) + at(held.halves[o + 3]))
 
     @wp.func(inline=True)
-    def store(
-        j: wp.int32, g: wp.ref[b.Batch], held: wp.ref[r.Held], slot: wp.int32, v_slots: wp.array2d(dtype=real)
-    ):  # fmt: skip
+    def store(j: wp.int32, g: wp.ref[b.Batch], held: wp.ref[r.Held], slot: wp.int32, v_slots: wp.array2d(dtype=real)):
         """Store the gradient of an instance: the sums times factors that they share."""
         o = (j & group_bits) * values
         u11 = at(g.u11[j])

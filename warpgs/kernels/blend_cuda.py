@@ -128,9 +128,7 @@ def make_gather(tile_size: int, with_depth: bool, atomic: bool, channels: int = 
 
 
 @functools.cache
-def make_backward(
-    tile_size: int, with_depth: bool, chunk: int, atomic: bool, channels: int = COLORS, absgrad: bool = False
-):  # fmt: skip
+def make_backward(tile_size: int, with_depth: bool, chunk: int, atomic: bool, channels: int = COLORS, absgrad: bool = False):
     """Make the backward kernels: sums per instance, then per Gaussian (or ``atomic`` additions, in no fixed order)."""
     Blending = make_struct(wp.float32)
     numbers = {"CHUNK": chunk, **_flags(with_depth, atomic, absgrad)}
@@ -258,8 +256,6 @@ def backward(
 
 def instance_weights(projected: torch.Tensor, tiles: Tiles, settings: Pass, ends: torch.Tensor, weights: torch.Tensor) -> None:
     """Write sum and maximum of each instance's blending weight over its tile's pixels, in slot order, to ``weights`` [M, 2]."""
-    inputs = [
-        settings.struct(tiles.size, wp.float32), projected, tiles.ranges, tiles.gaussian_ids, tiles.slots, ends, weights
-    ]  # fmt: skip
+    inputs = [settings.struct(tiles.size, wp.float32), projected, tiles.ranges, tiles.gaussian_ids, tiles.slots, ends, weights]
     kernel, pixels = make_kernels(tiles.size).contributions, tiles.size * tiles.size
     launch.launch(kernel, tiles.ranges.shape[0] * pixels, inputs, projected.device, block_dim=pixels)

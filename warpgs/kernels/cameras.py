@@ -67,19 +67,14 @@ def check_camera(camera: Camera) -> type[CameraModel]:
     found = 0 if camera.distortion is None else camera.distortion.shape[-1]
     if found and not model.coefficients:
         others = ', or give model="opencv" (8) or model="fisheye" (4)' if camera.model == "pinhole" else ""
-        raise UsageError(
-            f"the camera model {camera.model!r} takes no distortion, found {found} coefficients; leave distortion out{others}"
-        )
+        raise UsageError(f"the camera model {camera.model!r} takes no distortion, found {found} coefficients; omit it{others}")
     if found != model.coefficients:
         raise UsageError(
             f"the camera model {camera.model!r} takes {model.coefficients} coefficients of distortion, found {found}; give "
             "Camera.distortion the shape [P] or [C, P], zeros for a lens without distortion"
         )
     if getattr(camera.distortion, "requires_grad", False):
-        raise UsageError(
-            "gradients of distortion coefficients are not supported, only those of the pose and of K: give "
-            "Camera.distortion.detach()"
-        )
+        raise UsageError("gradients of distortion coefficients are not supported: give Camera.distortion.detach()")
     return model
 
 

@@ -152,10 +152,7 @@ def checked_factors(means: torch.Tensor, factors: torch.Tensor | None) -> torch.
         return nothing((0,), means.dtype, means.device)
     launch.check(means=(means, "N 3"), opacity_factors=(factors, "N"))
     if factors.requires_grad and torch.is_grad_enabled():
-        raise UsageError(
-            "gradients of opacity_factors are not supported: give opacity_factors.detach(), or multiply the opacities "
-            "themselves"
-        )
+        raise UsageError("opacity_factors have no gradients: give opacity_factors.detach(), or multiply opacities")
     return factors.detach()
 
 

@@ -290,10 +290,7 @@ def make_batches(real, tile_size: int, channels: int):
             j += 1
 
     @wp.func(inline=True)
-    def find_rows(
-        left: wp.int32, top: wp.int32, last: wp.int32, count: wp.int32, until: wp.ref[strip_ints],
-        b: wp.ref[Batch],
-    ):  # fmt: skip
+    def find_rows(left: wp.int32, top: wp.int32, last: wp.int32, count: wp.int32, until: wp.ref[strip_ints], b: wp.ref[Batch]):
         """Find the rows that the Gaussians reach; an instance skips strips whose ``until`` is not above its number."""
         e12 = lane_reals()
         e22 = lane_reals()

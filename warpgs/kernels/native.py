@@ -21,7 +21,7 @@ from warpgs.clock import section
 from warpgs.device import REMEDY, usable_cores
 from warpgs.errors import ResourceError
 from warpgs.files import make_folder
-from warpgs.process import say
+from warpgs.process import Say, say
 
 FOLDER = importlib.resources.files("warpgs") / "kernels" / "cuda"
 """Folder of the files."""
@@ -166,14 +166,14 @@ def module_name(module: wp.Module, block_dim: int) -> str:
 _LOADED: set[tuple[wp.Module, object, int]] = set()
 """Modules that this process has loaded, each with the context of its device and its number of threads per block."""
 
-_LISTENERS: list[tuple[Callable[[str], object], list[float]]] = []
+_LISTENERS: list[tuple[Say, list[float]]] = []
 """Functions to call for each module that has to be compiled, each with a list of compile times [s]."""
 
 
 @contextlib.contextmanager
-def told_of_compiling(listener: Callable[[str], object]) -> Iterator[list[float]]:
+def told_of_compiling(listener: Say) -> Iterator[list[float]]:
     """Call ``listener``, from any thread, with each module that will be compiled; yield a list of their compile times [s]."""
-    entry: tuple[Callable[[str], object], list[float]] = listener, []
+    entry: tuple[Say, list[float]] = listener, []
     _LISTENERS.append(entry)
     try:
         yield entry[1]

@@ -436,9 +436,7 @@ def make_kernels(real, native: bool):
     )  # fmt: skip
 
 
-def running_counts(
-    counts: torch.Tensor, real, allocator: Allocator = TORCH, out: torch.Tensor | None = None
-) -> torch.Tensor:  # fmt: skip
+def running_counts(counts: torch.Tensor, real, allocator: Allocator = TORCH, out: torch.Tensor | None = None) -> torch.Tensor:
     """Return running sums int64 [S] of counts [C * N]; a visible Gaussian adds its count and 2^`sum_bits` (see `split_sum`)."""
     device, count, native = counts.device, len(counts), counts.is_cuda
     sums, threads = sum_entries(count, native)

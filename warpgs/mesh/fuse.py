@@ -10,10 +10,11 @@ import torch
 
 from warpgs.device import available_bytes, format_bytes
 from warpgs.errors import DataError, ResourceError, UsageError
-from warpgs.geometry import matmul, pinhole_of, project_points
+from warpgs.geometry import evenly_spaced, matmul, pinhole_of, project_points
 from warpgs.kernels.launch import MAX_SIZE
 from warpgs.kernels.tsdf import gather_colors, integrate
 from warpgs.mesh.views import DEPTHS, SAMPLES, SurfaceView, SurfaceViews, agreed, depth_map, neighbours, sample_surface
+from warpgs.process import Say, silent
 from warpgs.render.options import RasterizeOptions
 from warpgs.report.images import resized
 from warpgs.scene import Box, Camera, Gaussians, Mesh
@@ -271,7 +272,7 @@ class FusedMesh:
 
 def fuse(
     gaussians: Gaussians, cameras: Sequence[Camera], render: RasterizeOptions, options: MeshOptions = MeshOptions(), *,
-    stage: Callable[[str], object] = lambda line: None, planned: Callable[[GridPlan, str], object] = lambda plan, memory: None,
+    stage: Say = silent, planned: Callable[[GridPlan, str], object] = lambda plan, memory: None,
 ) -> FusedMesh:  # fmt: skip
     """Make a mesh of the surfaces that cameras see; ``planned`` gets the grid and its memory before it is allocated."""
     # Areas that no camera sees, or on which cameras disagree, stay open. Views are used three times: for the extent of the
@@ -361,7 +362,7 @@ def textured(mesh: Mesh, views: SurfaceViews, truncation: float, footprint: floa
     ends = mesh.vertices[mesh.faces]
     if np.median(np.linalg.norm(ends - np.roll(ends, 1, 1), axis=2)) < COARSE * footprint:
         return mesh
-    chosen = np.unique(np.linspace(0, len(views.cameras) - 1, TEXTURE_VIEWS).round().astype(int)).tolist()
+    chosen = evenly_spaced(range(len(views.cameras)), TEXTURE_VIEWS)
     size = np.max([(views.cameras[i].width, views.cameras[i].height) for i in chosen], axis=0)
     columns = max(1, round(math.sqrt(len(chosen) * size[1] / size[0])))
     grid = np.array([columns, -(-len(chosen) // columns)])

@@ -1,6 +1,6 @@
 """Depth of a model's surface as many views see it, and where the views agree."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,6 +10,7 @@ from warpgs.constants import NEAR
 from warpgs.geometry import back_project, pinhole_of, relative_pose, rotation_matrices
 from warpgs.kernels.tsdf import face_cosines
 from warpgs.priors.sweep import matching_views, shared_sight
+from warpgs.process import Say, silent
 from warpgs.render.options import RasterizeOptions
 from warpgs.render.rasterize import rasterize
 from warpgs.scene import Camera, Gaussians
@@ -141,7 +142,7 @@ class SurfaceViews:
 
     def __init__(
         self, gaussians: Gaussians, cameras: Sequence[Camera], options: RasterizeOptions, depth: str,
-        stage: Callable[[str], object] = lambda line: None, fill: bool = False,
+        stage: Say = silent, fill: bool = False,
     ) -> None:  # fmt: skip
         """Prepare to render a model from all cameras by one of `DEPTHS`; ``stage`` shows a line before each view."""
         self._render = lambda camera: surface_view(gaussians, camera, options, depth, fill)

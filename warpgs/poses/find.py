@@ -16,6 +16,7 @@ from warpgs.io.image_files import MAX_PIXELS, unread_note
 from warpgs.poses import photographs as photos
 from warpgs.poses.mapping import EXHAUSTIVE, LEARNED, Mapping, camera_groups, cameras_of, check_installed, find_model
 from warpgs.poses.matching import Matcher, write_matches
+from warpgs.process import Say, silent
 
 MIN_KEYPOINTS = 100
 """Keypoints below which a photograph shows too little to match: a blank wall, darkness, blur."""
@@ -152,10 +153,7 @@ def record_of(found: Mapping, photographs: Sequence[photos.Photograph], digest: 
             "Add photographs from more directions"
         )
     if found.method == "global":
-        remarks.append(
-            "global mapping is used, because it joined more photographs than incremental mapping; results of global mapping "
-            "differ a little from run to run"
-        )
+        remarks.append("global mapping joined more photographs than incremental mapping; results differ a little between runs")
     return {
         "format": FORMAT, "source_sha256": digest, "photographs": rows, "notes": [*notes, *remarks],
         "advice": advice(found, names), "mean_reprojection_error_px": found.error, "points": found.points,
@@ -181,11 +179,9 @@ def read_poses_record(folder: Path) -> dict[str, Any]:
     """Read poses.json of a scene whose poses were found."""
     path = folder / JSON
     try:
-        record: dict[str, Any] = schema.read(path, folder)
-        _RECORD(record, "")
+        return schema.read(path, folder, _RECORD)
     except (OSError, schema.SchemaError) as e:
         raise DataError(f"{path}: cannot be read ({e}); find the poses again with `warpgs poses`") from e
-    return record
 
 
 MIN_PHOTOGRAPHS = 3
@@ -235,7 +231,7 @@ def find_poses(
     max_pixels: int = MAX_PIXELS,
     allow_outside: bool = False,
     matcher: str | Path | None = None,
-    progress: photos.Progress = lambda line: None,
+    progress: Say = silent,
 ) -> dict[str, Any]:
     """Find the poses of photographs or of a video's sharpest frames; write a scene folder, whole or not at all."""
     source, out = Path(source), Path(out)
@@ -268,7 +264,7 @@ def find_poses(
 
 def _with_network(
     network: Matcher, found: Mapping, photographs: list[photos.Photograph], names: list[str], kind: str, work: Path,
-    progress: photos.Progress, threads: int,
+    progress: Say, threads: int,
 ) -> tuple[Mapping, list[str]]:  # fmt: skip
     """Return the model from the network's matches if it has more photographs than SIFT's, and notes."""
     # the network, which is less accurate, runs only if SIFT leaves photographs without a pose
@@ -324,7 +320,7 @@ def _check(source: Path, out: Path, allow_outside: bool) -> None:
 
 
 def _prepared(
-    source: Path, work: Path, frames: int, max_pixels: int, progress: photos.Progress
+    source: Path, work: Path, frames: int, max_pixels: int, progress: Say
 ) -> tuple[list[photos.Photograph], list[str], list[str]]:
     """Return the photographs of a source, the names of their copies in ``work``/small, and notes for the user."""
     notes, root = [], source

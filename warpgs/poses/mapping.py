@@ -16,8 +16,8 @@ from warpgs.device import usable_cores
 from warpgs.errors import ResourceError, UsageError, install_extras
 from warpgs.files import disk_is_full, write_json, write_text
 from warpgs.poses.matching import choose_pairs
-from warpgs.poses.photographs import MATCHING_SIDE, Photograph, Progress
-from warpgs.process import ProcessFailed, answer, end_with_parent, python_lines
+from warpgs.poses.photographs import MATCHING_SIDE, Photograph
+from warpgs.process import ProcessFailed, Say, answer, end_with_parent, python_lines
 
 EXHAUSTIVE = 60
 """Largest number of photographs of which all pairs are matched; for more photographs, pairs are chosen."""
@@ -114,10 +114,7 @@ def _lines(job: Json, folder: Path) -> Iterator[Json]:
     except ProcessFailed as e:
         if disk_is_full(folder, e.errors):
             # the work folder is temporary, and its name means nothing to the user
-            raise ResourceError(
-                f"{folder.parents[1]}: its disk is full, so pycolmap cannot write features and matches. Free some disk space, "
-                "or choose another --out"
-            ) from e
+            raise ResourceError(f"{folder.parents[1]}: its disk is full; free some space, or choose another --out") from e
         why = f"pycolmap ended with code {e.code}; it may have had too little memory"
         raise ResourceError(f"{why}. Its last message: {e.errors[-LAST_WORDS:].replace(chr(10), ' ')}") from e
 
@@ -127,7 +124,7 @@ def find_model(
     names: list[str],
     kind: str,
     folder: Path,
-    progress: Progress,
+    progress: Say,
     threads: int = 0,
     learned: bool = False,
 ) -> Mapping:

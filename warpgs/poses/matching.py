@@ -1,6 +1,6 @@
 """Matches between photographs: which pairs, and the network that matches them."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +9,7 @@ from warpgs.errors import DataError
 from warpgs.files import replacing
 from warpgs.io.image_files import decode_png
 from warpgs.onnx import Model, fixed_size
+from warpgs.process import Say
 
 # Pairs of photographs that are worth matching, where all pairs would be too many: neighbours in order, and look-alikes.
 #
@@ -146,10 +147,7 @@ class Matcher(Model):
         there = scores > 0
         inside = (keypoints >= 0) & (keypoints <= [w, h])
         if not (inside[there].all() and (np.abs(np.linalg.norm(descriptors[there], axis=1) - 1) < 1e-2).all()):
-            raise DataError(
-                f"{self.path}: its keypoints are outside the image, or its descriptors do not have length 1; export it with "
-                "keypoints in pixels and normalised descriptors"
-            )
+            raise DataError(f"{self.path}: keypoints must be in the image, descriptors of length 1; export it again")
 
 
 def _network_size(height: int, width: int, side: int) -> tuple[int, int]:
@@ -190,9 +188,7 @@ def quarter_turns(matcher: Matcher, images: Iterable[np.ndarray], pairs: Sequenc
     return [(t - first) % 4 for t in turns]
 
 
-def write_matches(
-    matcher: Matcher, images: Sequence[Path], out: Path, kind: str, exhaustive: int, progress: Callable[[str], object]
-) -> list[int]:
+def write_matches(matcher: Matcher, images: Sequence[Path], out: Path, kind: str, exhaustive: int, progress: Say) -> list[int]:
     """Write keypoints and matches of photographs for the worker; return the indices of the photographs that it rotated."""
     found = []
     for i, image in enumerate(images):

@@ -8,7 +8,7 @@ import json
 import math
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -19,10 +19,8 @@ from warpgs.errors import DataError, UsageError, install_extras
 from warpgs.files import UNDECODABLE, inside, make_folder, read_start, unread_reason, write_bytes, write_json
 from warpgs.io import image_files
 from warpgs.io.images import list_images, turn_upright
-from warpgs.process import ProcessFailed, answer, end_with_parent, hidden_stderr, python_lines, utf8_name
+from warpgs.process import ProcessFailed, Say, answer, end_with_parent, hidden_stderr, python_lines, silent, utf8_name
 
-Progress = Callable[[str], object]
-"""Called with lines for the user about the current work."""
 DROPPED = {0xFE, *range(0xE0, 0xF0)} - {0xE0, 0xEE}
 """JPEG segments without effect on pixels: comments and those of applications, except JFIF and Adobe, which name the colours."""
 KEPT_CHUNKS = (b"IHDR", b"PLTE", b"tRNS", b"IDAT", b"IEND")
@@ -79,9 +77,7 @@ def _frames(path: Path) -> Iterator[np.ndarray]:
         capture = cv2.VideoCapture(name, cv2.CAP_FFMPEG)
     try:
         if not capture.isOpened():
-            raise DataError(
-                f"{path}: OpenCV cannot read it as a video; convert it to an mp4 file with H.264, or give its frames"
-            )
+            raise DataError(f"{path}: OpenCV cannot read it as a video; convert it to mp4 with H.264, or give its frames")
         size = capture.get(cv2.CAP_PROP_FRAME_WIDTH) * capture.get(cv2.CAP_PROP_FRAME_HEIGHT)
         if not 0 < size <= MAX_FRAME_PIXELS:
             raise DataError(f"{path}: its frames have {size:,.0f} pixels, not 1 to {MAX_FRAME_PIXELS:,}; convert the video")
@@ -127,7 +123,7 @@ def sharpest(values: list[float], count: int) -> list[int]:
     return [a + int(np.argmax(values[a:b])) for a, b in itertools.pairwise(bounds)]
 
 
-def write_frames(path: Path, folder: Path, count: int, progress: Progress) -> int:
+def write_frames(path: Path, folder: Path, count: int, progress: Say) -> int:
     """Write the sharpest frame of each of ``count`` equal parts of a video as PNG; return the video's number of frames."""
     import cv2
 
@@ -157,17 +153,12 @@ def is_heic(path: Path) -> bool:
     return image_files.brand(image_files.read_image_file(path, start=image_files.BRANDS_END)) == "HEIC"
 
 
-def to_jpeg(
-    paths: Sequence[Path], root: Path, folder: Path, max_pixels: int, progress: Progress = lambda line: None
-) -> dict[Path, Path]:
+def to_jpeg(paths: Sequence[Path], root: Path, folder: Path, max_pixels: int, progress: Say = silent) -> dict[Path, Path]:
     """Write upright JPEG copies of HEIC files below ``root``, without private EXIF, into ``folder``; return each one's copy."""
     if not paths:
         return {}
     if importlib.util.find_spec("pi_heif") is None:
-        raise UsageError(
-            f"{paths[0]}: is a HEIC photograph, and the package pi-heif is not installed; "
-            f"{install_extras('poses')}, or convert all HEIC files to JPEG"
-        )
+        raise UsageError(f"{paths[0]}: HEIC, but pi-heif is not installed; {install_extras('poses')}, or convert all to JPEG")
     copies = {p: folder / f"{p.relative_to(root).as_posix()}.jpg" for p in paths}
     for copy in copies.values():
         make_folder(copy.parent)

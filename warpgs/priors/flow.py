@@ -290,10 +290,7 @@ def read_flo(path: Path) -> np.ndarray:
     if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
         raise DataError(f"{path}: its header gives {width} x {height} px; sides must be 1 to {MAX_SIDE}. Write the flow again")
     if len(raw) != 12 + 8 * width * height:
-        raise DataError(
-            f"{path}: {len(raw)} bytes, but {width} x {height} px take {12 + 8 * width * height}; it is truncated or "
-            f"damaged. Copy or write it again"
-        )
+        raise DataError(f"{path}: {len(raw)} bytes, but {width} x {height} px take {12 + 8 * width * height}. Write it again")
     flow = np.frombuffer(raw, "<f4", offset=12).reshape(height, width, 2)
     return np.where((np.abs(flow) < MIN_UNKNOWN).all(2, keepdims=True), flow, np.float32(np.nan)).astype(np.float32)
 
@@ -426,8 +423,7 @@ def _network(path: Path) -> Callable[[View, View], np.ndarray]:
         flows = [f for f in found if np.shape(f) == (1, 2, size[1], size[0])]
         if not flows:
             raise DataError(
-                f"{path}: no output has the shape [1, 2, {size[1]}, {size[0]}] of a flow: {[np.shape(f) for f in found]}; "
-                "export the upsampled flow"
+                f"{path}: none of {[np.shape(f) for f in found]} is a flow [1, 2, {size[1]}, {size[0]}]; export it upsampled"
             )
         return resize_flow(np.ascontiguousarray(flows[-1][0].transpose(1, 2, 0), dtype=np.float32), w, h)
 
@@ -446,7 +442,5 @@ def flow_between(views: Sequence[View], kind: str) -> FlowBetween:
     elif path.suffix == ".onnx" and path.is_file():
         method = _network(path)
     else:
-        raise UsageError(
-            f"flow {kind!r} is neither one of {', '.join(KINDS)} nor a folder of .flo files nor an .onnx file; check the path"
-        )
+        raise UsageError(f"flow {kind!r} is none of {', '.join(KINDS)}, no folder of .flo files, no .onnx file; check the path")
     return functools.cache(lambda i, j: _same_size(views, i, j, method))

@@ -86,9 +86,7 @@ class Network(Model):
             raise DataError(f"{path}: its input is {text}; {needed}")
         self.layout = "nchw" if dims[1] == 3 or (dims[1] is None and dims[3] != 3) else "nhwc"
         if self.layout == "nhwc" and dims[3] != 3:
-            raise DataError(
-                f"{path}: neither the second nor the last axis of its input, {text}, has the 3 channels of an image"
-            )
+            raise DataError(f"{path}: neither the second nor the last axis of its input, {text}, has the 3 channels of images")
         self.type = TYPES[kind]
         self.size = fixed_size(self.path, dims[2:] if self.layout == "nchw" else dims[1:3])
 
@@ -169,12 +167,10 @@ def read_side_file(model: Path) -> dict:
     if not os.path.lexists(path):
         return {}
     try:
-        values: dict = schema.read(path)
-        _DESCRIPTION(values, "")
+        return schema.read(path, rule=_DESCRIPTION)
     except (OSError, schema.SchemaError) as e:
         why = unread_reason(e) if isinstance(e, OSError) else e
         raise DataError(f"{path}: cannot be read ({why}); fix it, with keys out of {', '.join(KEYS)}, or remove it") from e
-    return values
 
 
 def describe(network: Network, defaults: Preprocessing, kind: str) -> tuple[Preprocessing, list[str]]:

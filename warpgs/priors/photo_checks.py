@@ -6,7 +6,7 @@ differences in blur and colour, not in content (docs/scenes.md, "Photograph chec
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
@@ -15,7 +15,7 @@ import torch
 
 from warpgs.priors.flow import Features, agreeing_matches, sift_features
 from warpgs.priors.networks import single_threaded_opencv, without_ipp
-from warpgs.process import Task
+from warpgs.process import Say, Task, silent
 from warpgs.scene import View
 
 MIN_SHARPNESS = 0.87
@@ -132,7 +132,7 @@ def _typical(differences: list[float]) -> float | None:
     return 0.0 if middle[0] < 0 < middle[1] else min(middle, key=abs)
 
 
-def check_photos(views: Sequence[View], progress: Callable[[str], object] = lambda line: None) -> list[PhotoCheck]:
+def check_photos(views: Sequence[View], progress: Say = silent) -> list[PhotoCheck]:
     """Compare each photograph with the nearest ones; ``views`` include those that are held out."""
     count, began = len(views), time.monotonic()
     pairs = _pairs(views)

@@ -345,9 +345,8 @@ def consistent_depth(
     sensitivity = np.full(own.shape, np.inf)
     for j in others:
         agrees = check_round_trip(
-            views[index].camera, views[j].camera, own, inverses[j], sensitivity, most=MAX_ROUND_TRIP,
-            min_parallax=MIN_PARALLAX,
-        )  # fmt: skip
+            views[index].camera, views[j].camera, own, inverses[j], sensitivity, most=MAX_ROUND_TRIP, min_parallax=MIN_PARALLAX
+        )
         if not agrees.any():
             notes.append(f"no depth agrees with {views[j].name}")
     valid = np.isfinite(sensitivity)

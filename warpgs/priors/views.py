@@ -13,7 +13,7 @@ import numpy as np
 from warpgs.errors import DataError, UsageError
 from warpgs.onnx import PROVIDERS
 from warpgs.priors import networks
-from warpgs.process import Detail, counted
+from warpgs.process import Detail, Say, counted, silent
 from warpgs.scene import Prior, View
 from warpgs.schema import Checked
 
@@ -53,10 +53,7 @@ def class_probabilities(network: networks.Network, preprocessing: networks.Prepr
     """Return the probability of each of the 21 classes at each pixel of an image [H, W, 3], float32 [H, W, 21]."""
     output = network.run(preprocessing.prepare(network, image))
     if output.ndim != 4 or output.shape[0] != 1 or CLASSES not in (output.shape[1], output.shape[3]):
-        raise DataError(
-            f"{network.path}: its output has the shape {output.shape}; scores of the {CLASSES} PASCAL VOC classes, "
-            f"1 x {CLASSES} x height x width, are needed"
-        )
+        raise DataError(f"{network.path}: its output, {output.shape}, is not [1, {CLASSES}, height, width], scores of VOC")
     scores = output[0].transpose(1, 2, 0) if output.shape[1] == CLASSES else output[0]
     are_probabilities = bool((scores >= 0).all()) and np.allclose(scores.sum(-1), 1, atol=1e-3)
     scores = networks.resize(scores, *image.shape[:2])
@@ -122,7 +119,7 @@ def classical_semantics(image: np.ndarray) -> Maps:
     return np.maximum(foreground, 1 - foreground), boundary, foreground
 
 
-def classical_maps(images: Sequence[np.ndarray], tell: Callable[[str], object] = lambda line: None) -> list[Maps]:
+def classical_maps(images: Sequence[np.ndarray], tell: Say = silent) -> list[Maps]:
     """Return `classical_semantics` of each image, each by one thread, so that results do not depend on their number."""
     with networks.single_threaded_opencv(), ThreadPoolExecutor(os.cpu_count() or 1, initializer=networks.without_ipp) as pool:
         made = [pool.submit(classical_semantics, image) for image in images]
@@ -249,7 +246,7 @@ def view_priors(
     depths: Callable[[], Sequence[ViewDepth] | None] = lambda: None,
     regions: Sequence[np.ndarray | None] | None = None,
     threads: int = 0,
-    tell: Callable[[str], object] = lambda line: None,
+    tell: Say = silent,
 ) -> tuple[list[Prior], list[str]]:
     """Return a prior for the pixels of each view before anything is fitted, and notes on choices and assumptions."""
     notes: list[str] = []

@@ -14,7 +14,7 @@ from warpgs.kernels.falloff import Pass
 from warpgs.kernels.project import project_inputs
 from warpgs.kernels.tiles import AS_NEEDED, InstanceMemory, Tiles, bin_tiles
 from warpgs.kernels.walk import contributions, heaviest, median_depth
-from warpgs.scene import ActivatedGaussians, Camera, CovarianceGaussians, RasterizedGaussians
+from warpgs.scene import ActivatedGaussians, Camera, CovarianceGaussians, RasterizedGaussians, Tensors
 
 # `rasterize`, chunked and graphed rendering and the training step all call these functions, each with its own way to
 # allocate memory.
@@ -38,9 +38,7 @@ def _for_each(name: str, array: Any, like: torch.Tensor, axes: int = 2) -> torch
     tensor, cameras = as_batch(array, like, axes), like.shape[0]
     own = list(tensor.shape[1:])
     if tensor.ndim != axes + 1 or tensor.shape[0] not in (1, cameras):
-        raise ValueError(
-            f"camera.{name} must have shape {own} or {[cameras, *own]} to match camera.viewmat, not {list(array.shape)}"
-        )
+        raise ValueError(f"camera.{name} must have shape {own} or {[cameras, *own]}, as viewmat, not {list(array.shape)}")
     return tensor if tensor.shape[0] == cameras else tensor.expand(cameras, *own).contiguous()
 
 
@@ -106,9 +104,7 @@ def images_of(
     return blend_channels(projected, tiles, colors, backgrounds, settings)
 
 
-def further_of(
-    projected: torch.Tensor, tiles: Tiles, settings: Pass, weights: bool, median: bool, k: int
-) -> dict[str, torch.Tensor]:
+def further_of(projected: torch.Tensor, tiles: Tiles, settings: Pass, weights: bool, median: bool, k: int) -> Tensors:
     """Return further fields of `Render` by name: weights [C, N], median depth [C, H, W], and the ``k`` heaviest Gaussians."""
     found = {}
     if weights:

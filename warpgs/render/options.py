@@ -144,14 +144,9 @@ class RasterizeOptions:
         if self.tile_size not in TILE_SIZES:
             raise UsageError(f"tile size {self.tile_size} is not one of {', '.join(map(str, TILE_SIZES))}")
         if self.max_instances is not None and (self.capacity is not None or self.max_instances < 1):
-            raise UsageError(
-                "max_instances must be at least 1, and cannot be combined with capacity; found "
-                f"max_instances={self.max_instances}, capacity={self.capacity}"
-            )
+            raise UsageError(f"max_instances must be at least 1 ({self.max_instances}), without capacity ({self.capacity})")
         if self.pixels is not None and (self.window or self.contributions or self.capacity is not None):
-            raise UsageError(
-                "RasterizeOptions.pixels cannot be combined with window, contributions or capacity; leave out pixels"
-            )
+            raise UsageError("RasterizeOptions.pixels cannot be combined with window, contributions or capacity; omit pixels")
         if self.capacity is not None and self.capacity > MAX_INSTANCES:
             raise UsageError(f"capacity must be at most {MAX_INSTANCES:,}, not {self.capacity:,}")
         if self.error_bound and self.capacity is not None:

@@ -64,9 +64,7 @@ def check_arrays(camera: Camera) -> None:
 def _check_type(name: str, array: Any) -> None:
     """Raise TypeError where a value is not a dense array of real numbers, and ValueError for a device without kernels."""
     if not isinstance(array, (np.ndarray, torch.Tensor)):
-        raise TypeError(
-            f"camera.{name} must be a numpy array or a tensor, not {type(array).__name__}; numpy.array or torch.stack makes one"
-        )
+        raise TypeError(f"camera.{name} must be a numpy array or a tensor, not {type(array).__name__}; use torch.stack")
     kind = str(array.dtype).removeprefix("torch.")
     if isinstance(array, torch.Tensor):
         launch.check_device(f"camera.{name}", array)
@@ -86,10 +84,7 @@ def _check_intrinsics(matrix: list[list[float]], where: str) -> None:
     if max(map(abs, (left, middle, last - 1))) > K_TOLERANCE:
         raise ValueError(f"{where} must have the last row 0, 0, 1, not {left:g}, {middle:g}, {last:g}; divide K by K[2, 2]")
     if max(abs(skew), abs(below)) > K_TOLERANCE:
-        raise ValueError(
-            f"{where} has a skew of {skew or below:g} px, which is not supported: K must be [[fx, 0, cx], [0, fy, cy], "
-            "[0, 0, 1]]; undistort the images"
-        )
+        raise ValueError(f"{where} has a skew of {skew or below:g} px, which is not supported; undistort the images")
 
 
 def _check_pose(matrix: list[list[float]], where: str) -> None:
@@ -133,10 +128,7 @@ def window_of(pixels: torch.Tensor, camera: Camera, tile_size: int) -> Window:
     flat = pixels.reshape(-1, 2)
     (left, top), (right, bottom) = torch.stack([flat.amin(0), flat.amax(0)]).tolist()
     if left < 0 or top < 0 or right >= camera.width or bottom >= camera.height:
-        raise ValueError(
-            f"pixels reach from column {left} to {right} and from row {top} to {bottom}, beyond the image of "
-            f"{camera.width} x {camera.height} px"
-        )
+        raise ValueError(f"pixels in columns {left}-{right}, rows {top}-{bottom} leave the {camera.width} x {camera.height} px")
     x, y = left // tile_size * tile_size, top // tile_size * tile_size
     width = min((right // tile_size + 1) * tile_size, camera.width) - x
     height = min((bottom // tile_size + 1) * tile_size, camera.height) - y
@@ -233,8 +225,7 @@ def _checked_window(camera: Camera, options: RasterizeOptions) -> Window:
     inside = 0 <= x < x + w <= width and 0 <= y < y + h <= height
     if not inside or x % side or y % side or ((x + w) % side and x + w != width) or ((y + h) % side and y + h != height):
         raise UsageError(
-            f"window {options.window} does not fit: in an image of {width} x {height} px its edges must be multiples of "
-            f"{side} px or at the image's edges"
+            f"window {options.window}: its edges must be multiples of {side} px, or edges of the {width} x {height} px image"
         )
     return x, y, w, h
 
@@ -372,9 +363,7 @@ def _render(gaussians: RasterizedGaussians, camera: Camera, options: RasterizeOp
     colors = _checked_channels("colors", options.colors, inputs)
     features = _checked_channels("features", options.features, inputs)
     if options.absgrad and (features is not None or (colors is not None and colors.shape[-1] > WIDTHS[-1])):
-        raise UsageError(
-            f"absgrad supports at most {WIDTHS[-1]} channels of colors, and no features: render more in a second call"
-        )
+        raise UsageError(f"absgrad takes at most {WIDTHS[-1]} channels of colors and no features: render more in a second call")
     if options.max_error is not None:
         if compose.needs_slots(t for t in (*inputs, options.background) if isinstance(t, torch.Tensor)):
             raise UsageError("max_error renders without gradients: call rasterize under torch.no_grad(), or leave it out")

@@ -127,9 +127,8 @@ class FarmTable:
         more = len(running) - MOST_RUNNING
         rest = [Text(f"and {more} more running", style="dim")] if more > 0 else []
         messages = [
-            Text(printable(f"{r.name}: {r.message}"), style="dim", no_wrap=True, overflow="ellipsis")
-            for r in last if r.message
-        ]  # fmt: skip
+            Text(printable(f"{r.name}: {r.message}"), style="dim", no_wrap=True, overflow="ellipsis") for r in last if r.message
+        ]
         return Group(bar, Text(self.summary(), style="bold"), table, *rest, *messages)
 
 

@@ -101,8 +101,7 @@ def write_film(path: Path, frames: Iterable[np.ndarray], fps: int = 30) -> int:
         if found != sizes:
             raise ResourceError(
                 f"{path}: cannot be written; only {sum(f == s for f, s in zip(found, sizes))} of {len(sizes)} frames could be "
-                "read back. The disk is full, or the encoder failed; the old file is untouched. Free some disk space, or "
-                "write elsewhere"
+                "read back. Disk full, or the encoder failed; the old file is untouched. Free disk space, or write elsewhere"
             )
 
     with replacing(path, check, suffix=suffix) as (_, temporary), utf8_name(temporary) as name:

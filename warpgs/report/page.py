@@ -17,9 +17,7 @@ from warpgs.process import Detail, Task
 
 MOST_BYTES = 100
 """Longest name that is kept unchanged, without suffix: any file system allows it."""
-NOT_EVERYWHERE = re.compile(
-    r'^\.|[<>:"\\|?*\x00-\x1f\x7f]|^(con|prn|aux|nul|com\d|lpt\d)(\.|$)|^$|[\ud800-\udfff]', re.IGNORECASE
-)
+NOT_EVERYWHERE = re.compile(r'^\.|[<>:"\\|?*\x00-\x1f\x7f]|^(con|prn|aux|nul|com\d|lpt\d)(\.|$)|^$|[\ud800-\udfff]', re.I)
 """Names that hide a file, that are not UTF-8, or that Windows does not take."""
 
 
@@ -130,11 +128,7 @@ def rendered(template: str, **contents: object) -> str:
         loader=jinja2.FileSystemLoader(Path(__file__).parent / "templates"), autoescape=True, trim_blocks=True,
         lstrip_blocks=True, undefined=jinja2.StrictUndefined,
     )  # fmt: skip
-    environment.filters |= {
-        "data_uri": _data_uri,
-        "aspect": _aspect,
-        "address": lambda path: quote(path, errors="surrogateescape"),
-    }
+    environment.filters |= {"data_uri": _data_uri, "aspect": _aspect, "address": lambda p: quote(p, errors="surrogateescape")}
     page = environment.get_template(template)
     own = "".join(page.blocks["script"](page.new_context())) if "script" in page.blocks else ""
     code = own.partition("<script>")[2].partition("</script>")[0]

@@ -11,15 +11,13 @@ import re
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, BinaryIO
 
 from warpgs import schema
-from warpgs.errors import ResourceError
-from warpgs.files import appending, plain, read_file, write_bytes
-from warpgs.folders import RefusedError
-from warpgs.process import careful, printable, say
+from warpgs.files import appending, plain, read_file, writable, write_bytes
+from warpgs.process import Say, careful, printable, say, silent
 
 PLAIN_INTERVAL = 10.0
 """Seconds between two plain lines on the steps of a fit."""
@@ -118,7 +116,7 @@ class Stages(contextlib.AbstractContextManager["Stages"]):
     first line of a stage is shown at once, and then one every few seconds; a repeated line is skipped.
     """
 
-    def __init__(self, show: Callable[[str], object] = say, *, live: bool | None = None):
+    def __init__(self, show: Say = say, *, live: bool | None = None):
         """Print plain lines with ``show``; with ``live`` None, write in place if ``show`` is the default, in a terminal."""
         self.show, self.printed, self.shown = show, {}, set()
         self.live = (show is say and is_live()) if live is None else live
@@ -147,7 +145,7 @@ class Stages(contextlib.AbstractContextManager["Stages"]):
 
 def waiting() -> Stages:
     """Return stages that are shown only in a terminal, for waits that a log need not mention."""
-    return Stages(lambda line: None, live=is_live())
+    return Stages(silent, live=is_live())
 
 
 class Progress:
@@ -276,7 +274,7 @@ class EventLog:
         """Drop the events of all steps after ``step``; 0 empties the log."""
         if self._file is not None:
             self.close()
-        with self._writing():
+        with writable(self.path):
             kept = [e for e in read_events(self.path) if e["step"] <= step] if step and self.path.is_file() else []
             # The old log stays until the shortened one is on the disk.
             write_bytes(self.path, *(_line(e) for e in kept))
@@ -284,28 +282,19 @@ class EventLog:
 
     def write(self, *, step: int, **values: object) -> None:
         """Append the event of one step; NaN and infinity become null."""
-        with self._writing():
+        with writable(self.path):
             self._file.write(_line({"step": step, **values}))
 
     def flush(self) -> None:
         """Flush the log and sync it to the disk, so that it never lags behind a checkpoint."""
-        with self._writing():
+        with writable(self.path):
             self._file.flush()
             os.fsync(self._file.fileno())
 
     def close(self) -> None:
         """Flush and close the log, which takes no further events."""
-        with self._writing():
+        with writable(self.path):
             self._file.close()
-
-    @contextlib.contextmanager
-    def _writing(self) -> Iterator[None]:
-        try:
-            yield
-        except RefusedError as e:
-            raise ResourceError(f"{self.path}: cannot be written, as {e}") from e
-        except OSError as e:
-            raise ResourceError(f"{self.path}: cannot be written ({e.strerror or e}). Free some disk space") from e
 
 
 def read_events(path: Path) -> list[dict]:

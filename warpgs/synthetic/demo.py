@@ -10,7 +10,7 @@ import numpy as np
 from warpgs.errors import ResourceError, UsageError
 from warpgs.files import filling, is_empty, make_folder, write_bytes
 from warpgs.geometry import look_at, matmul, pose_of
-from warpgs.process import counted
+from warpgs.process import Say, counted, silent
 from warpgs.scene import Camera
 from warpgs.synthetic import raycast
 from warpgs.synthetic.raycast import Box, Cylinder, Light, Plane, Shape, Sphere, Texture, Torus
@@ -221,10 +221,7 @@ def _write(folder: Path, views: int, least: int, train: int, size: tuple[int, in
             write_bytes(temporary / path, content)
 
 
-def write_demo(
-    folder: Path, *, views: int = 24, width: int = 320, height: int = 240, seed: int = 0,
-    tell: Callable[[str], object] = lambda line: None,
-) -> str:  # fmt: skip
+def write_demo(folder: Path, *, views: int = 24, width: int = 320, height: int = 240, seed: int = 0, tell: Say = silent) -> str:
     """Write the demo scene as a COLMAP folder: images, cameras, and exact points with their tracks.
 
     The same arguments give the same bytes on the same machine and library versions.
@@ -420,7 +417,7 @@ def _transforms(cameras: list[Camera]) -> str:
 
 def write_object(
     folder: Path, *, form: str = "transforms", views: int = 24, width: int = 320, height: int = 240, seed: int = 0,
-    tell: Callable[[str], object] = lambda line: None,
+    tell: Say = silent,
 ) -> str:  # fmt: skip
     """Write an object as a scene folder: RGBA images with straight colours, or RGB images with soft masks."""
     if form not in FORMATS:

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 from warpgs import schema
 from warpgs.errors import DataError, ResourceError, WarpgsError, install_extras
-from warpgs.process import say
+from warpgs.process import Say, say
 from warpgs.ranks import HOST, Allowance, WebGuard, loopback_socket
 from warpgs.schema import Schema, SchemaError
 
@@ -33,7 +33,7 @@ def said(error: BaseException) -> str:
     return line if isinstance(error, WarpgsError) else f"{type(error).__name__}: {line}"
 
 
-def guarded(callback: Callable[..., Any], tell: Callable[[str], object] | None = None) -> Callable[..., None]:
+def guarded(callback: Callable[..., Any], tell: Say | None = None) -> Callable[..., None]:
     """Wrap a callback: if it raises an error for the user, ``tell`` it; else, or without ``tell``, print one line on stderr."""
 
     @functools.wraps(callback)

@@ -286,9 +286,8 @@ class Panel:
                 event.client.gui.add_image(image, format="jpeg")
                 event.client.gui.add_button("close").on_click(lambda _: modal.close())
 
-        self.server.gui.add_button("show sampling", hint="where fine Gaussians were placed").on_click(
-            guarded(show, self.explain)
-        )
+        button = self.server.gui.add_button("show sampling", hint="where fine Gaussians were placed")
+        button.on_click(guarded(show, self.explain))
 
     def _add_crop(self) -> None:
         """Add a box that the user moves and rotates by its handles, and saves."""
@@ -336,18 +335,10 @@ class Panel:
             counts.content = "\n".join(f"- {line}" for line in [*lines, f"{removed:,} removed"])
             self.window.redraw()
 
-        def take(_: Any) -> None:
-            self.window.remove()
-            show()
-
-        def put_back(_: Any) -> None:
-            self.window.undo()
-            show()
-
         for control in (self.in_colors, *self.reasons.values()):
             control.on_update(guarded(show, self.explain))
-        remove.on_click(guarded(take, self.explain))
-        undo.on_click(guarded(put_back, self.explain))
+        remove.on_click(guarded(lambda _: show(self.window.remove()), self.explain))
+        undo.on_click(guarded(lambda _: show(self.window.undo()), self.explain))
         save.on_click(guarded(lambda _: self.explain(self.window.save_copy()), self.explain))
 
     def _add_keyframes(self) -> None:

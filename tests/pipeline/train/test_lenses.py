@@ -216,8 +216,7 @@ def test_depth_found_in_other_views_is_that_of_the_lens(lens_run):
     """Where the sweep finds depth, exact points of the scene lie there in half of the pixels."""
     scene = warpgs.load_scene(lens_run.parent / "scene", lenses="native")
     config, _ = settings_by_views(FitConfig(steps=2, init=InitConfig(source="sweep")), list(scene.views), "cpu")
-    cpu, generator = torch.device("cpu"), np.random.default_rng(0)
-    depths = prepare(list(scene.views), None, config, generator, cpu, [], lambda: None)[1].depths
+    depths = prepare(list(scene.views), None, config, torch.device("cpu"), [], lambda: None)[1].depths
     errors = []
     for view, found in zip(scene.views, depths, strict=True):
         own = np.array([view.name in t for t in scene.points.tracks])

@@ -393,7 +393,7 @@ def test_the_device_is_asked_for_last(changes, monkeypatch):
     monkeypatch.setattr(setup, "view_priors", lambda *a, depths, **k: (order.append("semantics"), depths(), ([], []))[-1])
     monkeypatch.setattr(start, "sweep_depths", lambda v, b, device, progress: (order.append(str(device)), consistent(v))[1])
     config = dataclasses.replace(PRESETS["default"], strategy="paper", strategy_config=None, **changes)
-    _, begun, *_ = prepare(views, None, config, np.random.default_rng(0), CUDA, None, lambda: order.append("ready"))
+    _, begun, *_ = prepare(views, None, config, CUDA, None, lambda: order.append("ready"))
     swept = ["ready", "cpu" if "memory_limit" in changes else "cuda"] if "init" not in changes else []
     assert order == ["semantics", *swept, "ready"] and len(begun.cloud) > 100
 

@@ -290,7 +290,7 @@ def test_strategies_see_the_exposures_of_now():
 def test_no_exposure_beside_an_opacity_and_matched_colours_score_as_equal():
     """A render of half the brightness and another tint is the photograph after the map; a photograph of one colour, too."""
     views = [dataclasses.replace(v, alpha=np.ones(v.image.shape[:2], np.float32)) for v in scenes.photos(3)]
-    with pytest.raises(UsageError, match=r"--exposure does not support images with an alpha channel, such as 00.png"):
+    with pytest.raises(UsageError, match=r"--exposure cannot fit images with an alpha channel, such as 00.png"):
         Trainer(views, scenes.seeds(), FitConfig(steps=4, view_modules=(Exposure(),)), CPU)
     view = scenes.photos(1)[0]
     assert matched_psnr(view, 0.5 * view.image[..., ::-1] + 0.1) > 45

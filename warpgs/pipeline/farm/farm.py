@@ -40,9 +40,7 @@ def local_slots(device: str, slots: int | None, per_gpu: int) -> list[Slot]:
     if not 1 <= count <= MAX_SLOTS or not 1 <= per_gpu <= MAX_SLOTS:
         raise UsageError(f"--slots and --per-gpu must be numbers from 1 to {MAX_SLOTS}, not {slots} and {per_gpu}")
     if gpus and count > gpus * per_gpu:
-        raise UsageError(
-            f"--slots {count}: {gpus} GPUs with --per-gpu {per_gpu} have {gpus * per_gpu} slots; give a larger --per-gpu"
-        )
+        raise UsageError(f"--slots {count}: {gpus} GPUs with --per-gpu {per_gpu} have {gpus * per_gpu}; give more --per-gpu")
     threads = max(1, torch.get_num_threads() // count)
     if not gpus:
         return [("cpu", threads, {})] * count

@@ -256,11 +256,9 @@ def write_record(folder: Path, record: JobRecord) -> None:
 def read_job_record(folder: Path) -> JobRecord | None:
     """Read the record of a job; None if it is missing or incomplete."""
     try:
-        values = schema.read(folder / RECORD, folder)
-        _SCHEMA(values, "")
+        return JobRecord(**schema.read(folder / RECORD, folder, _SCHEMA))
     except (OSError, schema.SchemaError):
         return None
-    return JobRecord(**values)
 
 
 def file_digest(path: Path) -> str:

@@ -39,9 +39,7 @@ class RayEngine:
         room = min(found.get("CPU", 0) / threads, found.get("GPU", 0) / gpus if gpus else float("inf"))
         self.slots = slots or int(room)
         if self.slots < 1:
-            raise UsageError(
-                f"no job of {threads} threads and {gpus:g} GPUs fits into Ray's cluster ({found}); give fewer --threads"
-            )
+            raise UsageError(f"no job of {threads} threads, {gpus:g} GPUs fits into Ray's cluster ({found}); lower --threads")
         environment = {"env_vars": {"PYTHONSAFEPATH": "1"}}
         self._options = {"num_cpus": threads, "num_gpus": gpus, "max_retries": 1, "runtime_env": environment}
         self._running: dict[Any, str] = {}

@@ -39,11 +39,9 @@ measured later, None if it failed; and a note for readers of the results, empty 
 def _scores(path: Path) -> dict[str, Any] | None:
     """Read metrics.json or eval.json; None if it is missing or incomplete."""
     try:
-        value: dict[str, Any] = schema.read(path, path.parent)
-        METRICS(value, "")
+        return schema.read(path, path.parent, METRICS)
     except (OSError, schema.SchemaError):
         return None
-    return value
 
 
 def _difference(record: dict[str, Any], config: FitConfig, fingerprint: str, split: Split | None, device: str) -> str:

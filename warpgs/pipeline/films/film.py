@@ -3,7 +3,7 @@
 import collections
 import itertools
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -18,7 +18,7 @@ from warpgs.mesh.views import MIN_ALPHA
 from warpgs.pipeline.films import paths
 from warpgs.pipeline.metrics.coverage import classes_of, coverage_map, depth_views, fraction_outside
 from warpgs.pipeline.model.table import FittedModel
-from warpgs.process import say
+from warpgs.process import Say, say, silent
 from warpgs.render.options import RasterizeOptions
 from warpgs.render.rasterize import rasterize
 from warpgs.report.film import SUFFIXES, write_film
@@ -267,9 +267,7 @@ def _check_plan(plan: FilmPlan, out: Path, coverage: bool, sheet: bool) -> tuple
         raise UsageError(f"{out}: unknown film suffix; use {', '.join(SUFFIXES)}, or a folder without a suffix for images")
     one_size = len({(c.width, c.height) for _, c in plan.cameras}) == 1
     if (alone or sheet) and not one_size:
-        raise UsageError(
-            f"{out}: the views differ in size, but a film or sheet needs one size; give --size, or a folder without --sheet"
-        )
+        raise UsageError(f"{out}: views differ in size, but a film or sheet needs one; give --size, or a folder, no --sheet")
     if alone and coverage:
         raise UsageError(f"{out}: coverage images are PNG files; give a folder instead of a film")
     return alone, one_size
@@ -309,7 +307,7 @@ def render_film(
     *,
     coverage: bool | Sequence[View] = False,
     sheet: bool = False,
-    tell: Callable[[str], object] = lambda line: None,
+    tell: Say = silent,
 ) -> tuple[list[Path], list[str]]:
     """Render a plan to PNG files and film.mp4, or to a film alone; ``sheet`` adds six frames in one image. Files and notes."""
     alone, one_size = _check_plan(plan, out, bool(coverage), sheet)

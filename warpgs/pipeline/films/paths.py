@@ -216,9 +216,8 @@ def rig_of(cameras: list[Camera], depth: float, level: np.ndarray | None = None)
 
 def rig_among(cameras: list[Camera], points: np.ndarray) -> Rig:
     """Return the arrangement of training cameras around their subject among points [N, 3] [u]."""
-    depths = np.concatenate(
-        [geometry.matmul(points - c.center, c.viewmat[2, :3]) for c in cameras[:: max(1, len(cameras) // 5)]]
-    )
+    some = cameras[:: max(1, len(cameras) // 5)]
+    depths = np.concatenate([geometry.matmul(points - c.center, c.viewmat[2, :3]) for c in some])
     ahead = depths[depths > 0]
     return rig_of(cameras, float(np.median(ahead)) if len(ahead) else 1.0)
 
@@ -424,10 +423,7 @@ def read_keyframes(path: Path, template: Camera, normalization: Normalization) -
     except FileNotFoundError as e:
         raise DataError(f"{path}: no such file; give a .json file of keyframes, as the viewer saves it") from e
     except (OSError, schema.SchemaError) as e:
-        raise DataError(
-            f"{path}: cannot be read as keyframes ({unread_reason(e)}); give a JSON list of objects with c2w (4 rows of 4), "
-            "fov_y [rad] and seconds"
-        ) from e
+        raise DataError(f"{path}: no keyframes ({unread_reason(e)}); list objects of c2w (4 x 4), fov_y [rad], seconds") from e
     if not 1 <= len(values) <= MAX_KEYFRAMES:
         raise DataError(f"{path}: holds {len(values)} keyframes; a path needs 1 to {MAX_KEYFRAMES:,}")
     K = np.array([[template.K[0, 0], 0, 0.5 * template.width], [0, template.K[1, 1], 0.5 * template.height], [0, 0, 1.0]])
@@ -446,10 +442,7 @@ def read_keyframes(path: Path, template: Camera, normalization: Normalization) -
         if value["fov_y"] > 3.1:
             raise DataError(f"{path}: fov_y of keyframe {i} is {value['fov_y']:g} rad; give radians, below 3.1")
         if result and not MIN_SECONDS <= value["seconds"] - values[i - 1]["seconds"] <= MAX_SECONDS:
-            raise DataError(
-                f"{path}: seconds of keyframe {i} must be {MIN_SECONDS:g} to {MAX_SECONDS:g} above those of keyframe {i - 1}; "
-                "sort the keyframes by time"
-            )
+            raise DataError(f"{path}: keyframe {i} must be {MIN_SECONDS:g} to {MAX_SECONDS:g} s after the last; sort by time")
         viewmat = geometry.pose_at(geometry.nearest_rotation(rotation).T, matrix[:3, 3])
         camera = geometry.convert_camera(replace(template, viewmat=viewmat), normalization, "file", "scene")
         result.append(Keyframe(framed(camera, None, value["fov_y"]), value["seconds"] - values[0]["seconds"]))
@@ -498,7 +491,7 @@ def midways(rig: Rig, cameras: list[Camera], most: int) -> list[tuple[int, int, 
     distances = np.array(_distances(cameras))
     np.fill_diagonal(distances, np.inf)
     pairs = sorted({(min(i, j), max(i, j)) for i, j in enumerate(distances.argmin(1).tolist())}) if len(cameras) > 1 else []
-    chosen = [pairs[i] for i in np.unique(np.linspace(0, len(pairs) - 1, min(most, len(pairs))).round().astype(int))]
+    chosen = geometry.evenly_spaced(pairs, most)
     frames = [framed(upright(rig, c)) for c in cameras]
     ends = [[Keyframe(frames[k], t, rig.reach(cameras[k])) for t, k in enumerate(pair)] for pair in chosen]
     return [(i, j, through(keyframes, 3)[1]) for (i, j), keyframes in zip(chosen, ends)]
@@ -512,9 +505,7 @@ def tour_of(cameras: list[Camera], reaches: list[float], seconds: float, most: i
     named, near = list(range(len(cameras))), _neighbour_tour(distances)
     lengths = [float(sum(distances[a][b] for a, b in itertools.pairwise(o))) for o in (named, near)]
     by_name = lengths[0] <= MAX_DETOUR * lengths[1]
-    order = named if by_name else near
-    if len(order) > most:
-        order = [order[i] for i in np.unique(np.linspace(0, len(order) - 1, max(most, 2)).round().astype(int))]
+    order = geometry.evenly_spaced(named if by_name else near, max(most, 2))
     legs = [distances[a][b] for a, b in itertools.pairwise(order)]
     closed = len(order) > 3 and distances[order[-1]][order[0]] < 2 * max(legs)
     if closed:

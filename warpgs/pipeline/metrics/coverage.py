@@ -1,7 +1,7 @@
 """Scores by coverage: how many training views saw the surface of each pixel."""
 
 import itertools
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,14 +13,14 @@ from torch.nn.functional import interpolate
 from warpgs.constants import NEAR
 from warpgs.device import in_background
 from warpgs.files import make_folder, read_file, write_bytes
-from warpgs.geometry import check_pinhole, pinhole_of
+from warpgs.geometry import check_pinhole, evenly_spaced, pinhole_of
 from warpgs.io.image_files import decode
 from warpgs.io.images import without_masked
 from warpgs.kernels.ssim import ssim
 from warpgs.mesh.views import MIN_ALPHA, TOLERANCE, depth_difference, seen_from
 from warpgs.pipeline.metrics.scores import Renders, psnr_of, scored_pair
 from warpgs.priors.given_depth import pinhole_view
-from warpgs.process import counted
+from warpgs.process import Say, counted, silent
 from warpgs.render.options import RasterizeOptions
 from warpgs.render.rasterize import rasterize
 from warpgs.report.images import COVERAGE_LEGEND, channel_mean, coverage_image, png, webp
@@ -108,9 +108,7 @@ def fraction_outside(depth: torch.Tensor, camera: Camera, photographs: Sequence[
     return float(outside.float().mean())
 
 
-CLASSES = {
-    "0": "seen by no training view", "1": "seen by one", "2+": "seen by two or more", "background": "transparent, empty",
-}  # fmt: skip
+CLASSES = {"0": "seen by no training view", "1": "seen by one", "2+": "seen by two or more", "background": "transparent, empty"}
 """Classes of pixels, with a description of each for the user. If no view of a scene has an alpha channel, no pixel is
 background."""
 BINS = (0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, np.inf)
@@ -125,7 +123,7 @@ def photo_errors(train: Sequence[View], training: Sequence[DepthView]) -> np.nda
     # Each photograph is warped to another view by the model's depth and compared with the photograph there, pixel by pixel. The
     # result estimates the error of a pixel from its least depth difference to a training view. The estimate uses the data that
     # the model was fitted to. It includes differences between the photographs, such as reflections and exposure.
-    chosen = np.unique(np.linspace(0, len(train) - 1, min(PROBED, len(train))).round().astype(int))
+    chosen = evenly_spaced(range(len(train)), PROBED)
     photos = {i: _photo(train[i], training[i][1]) for i in chosen}
 
     def compared() -> Iterator[tuple[np.ndarray, np.ndarray]]:
@@ -218,7 +216,7 @@ EXPECTED = (
 
 def coverage_of_run(
     out: Path | None, gaussians: Gaussians, train: Sequence[View], test: Sequence[View], options: RasterizeOptions, *,
-    names: Mapping[str, str], renders: Renders | None = None, tell: Callable[[str], object] = lambda line: None,
+    names: Mapping[str, str], renders: Renders | None = None, tell: Say = silent,
 ) -> dict[str, Any]:  # fmt: skip
     """Split the scores of held-out views by coverage, and save an image of each view in ``out``, if any."""
     tell("checking coverage")

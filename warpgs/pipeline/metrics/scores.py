@@ -237,9 +237,8 @@ NOTICED = 0.5 / 255
 
 
 def evaluate(
-    gaussians: Gaussians | Fitted, views: Sequence[View], options: RasterizeOptions | None = None,
-    lpips: Lpips | None = None,
-) -> list[ViewMetrics]:  # fmt: skip
+    gaussians: Gaussians | Fitted, views: Sequence[View], options: RasterizeOptions | None = None, lpips: Lpips | None = None
+) -> list[ViewMetrics]:
     """Render views and score each against its image, as a fit does.
 
     Args:

@@ -8,7 +8,7 @@ import torch
 from warpgs.errors import UsageError
 from warpgs.geometry import logit
 from warpgs.pipeline.model.edit import LARGE, NEEDLES, SEEN, UNSEEN, any_of, floaters, size_of
-from warpgs.scene import Gaussians, base_coefficients
+from warpgs.scene import Gaussians, Tensors, base_coefficients
 
 REASONS = {
     "opacity": ("opacity below 4/255", "blue", (0, 114, 255)),
@@ -73,13 +73,13 @@ def chosen_reasons(text: str) -> tuple[str, ...]:
     return tuple(REASONS) if "all" in words else tuple(words)
 
 
-def counted_lines(found: dict[str, torch.Tensor]) -> list[str]:
+def counted_lines(found: Tensors) -> list[str]:
     """Return a line for each reason that applies to some Gaussians [N], with their number and their colour."""
     return [f"{n:,} {REASONS[r][0]} ({r}, {REASONS[r][1]})" for r, where in found.items() if (n := int(where.sum()))]
 
 
 @torch.no_grad()
-def in_colors(gaussians: Gaussians, found: dict[str, torch.Tensor]) -> Gaussians:
+def in_colors(gaussians: Gaussians, found: Tensors) -> Gaussians:
     """Return Gaussians with those of each mask [N] in the colour of its reason, no fainter and no larger than can be seen."""
     means, quats, log_scales, logits, sh = (t.clone() for t in gaussians.tensors().values())
     for reason, where in found.items():

@@ -10,7 +10,7 @@ import torch
 
 from warpgs import geometry
 from warpgs.kernels.neighbours import camera_reach, pixel_size
-from warpgs.scene import Camera, Gaussians, PointCloud
+from warpgs.scene import Camera, Gaussians, PointCloud, Tensors
 from warpgs.schema import Checked, Within
 
 WITHIN = 0.9
@@ -37,9 +37,7 @@ class Limits:
     """Smallest standard deviation of an axis [px], in the camera that samples the Gaussian most finely; 0 for no such limit."""
 
     @torch.no_grad()
-    def hold(
-        self, params: dict[str, torch.Tensor], cameras: tuple[torch.Tensor, torch.Tensor], going: torch.Tensor | None = None
-    ) -> None:
+    def hold(self, params: Tensors, cameras: tuple[torch.Tensor, torch.Tensor], going: torch.Tensor | None = None) -> None:
         """Bring ``log_scales`` [N, 3] of Gaussians at ``means`` [N, 3] within the limits, in place; twice is as once.
 
         Axes are raised to the smallest size, then cut to the largest, which has priority. If the longest axis is then too long

@@ -18,6 +18,7 @@ from warpgs.pipeline.model import depth_points
 from warpgs.priors.flow import flow_between, flow_depth, triangulate_matches
 from warpgs.priors.given_depth import any_given, with_given_depth
 from warpgs.priors.sweep import CPU, sweep_depths
+from warpgs.process import Say, silent
 from warpgs.scene import Camera, Gaussians, PointCloud, View, ViewDepth, base_coefficients
 from warpgs.schema import Checked, Within
 
@@ -33,8 +34,8 @@ DEPTH_SPREAD = 0.1
 """Standard deviation of the logarithm of depth around a matched point."""
 
 
-Device, Say = Callable[[], torch.device], Callable[[str], object]
-"""A function that waits until the device to sweep on may be used, and returns it; one that shows a line of progress."""
+Device = Callable[[], torch.device]
+"""A function that waits until the device to sweep on may be used, and returns it."""
 
 
 def camera_depths(views: list[View]) -> tuple[float, float]:
@@ -186,7 +187,7 @@ class Start(NamedTuple):
 
 
 def consistent_depths(
-    views: list[View], known: PointCloud, config: InitConfig, device: Device = lambda: CPU, progress: Say = lambda line: None
+    views: list[View], known: PointCloud, config: InitConfig, device: Device = lambda: CPU, progress: Say = silent
 ) -> list[ViewDepth]:
     """Return the geometrically consistent depth of each of at least two views, by flow or by sweeping planes.
 
@@ -223,11 +224,7 @@ def consistent_points(
             if len(extrapolated):
                 notes[-1] += f", {len(extrapolated):,} extrapolated where no view looks"
             elif config.extrapolate:
-                why = (
-                    ""
-                    if depth_points.all_count(views)
-                    else ", because masks, an alpha channel or a black background hide parts of views"
-                )
+                why = ", because masks, alpha or a black background hide parts" * (not depth_points.all_count(views))
                 notes[-1] += f", none extrapolated{why}"
             how = "\n".join((notes[-1], *given, *(f"    {n}" for n in notes[:-1])))
             return Start(depth_points.joined((cloud, extrapolated)), how, depths, len(extrapolated))
@@ -282,7 +279,7 @@ def on_object(start: Start, views: list[View]) -> Start:
 
 def initial_points(
     views: list[View], points: PointCloud | None, config: InitConfig, generator: np.random.Generator,
-    device: Device = lambda: CPU, progress: Say = lambda line: None,
+    device: Device = lambda: CPU, progress: Say = silent,
 ) -> Start:  # fmt: skip
     """Return the points to start from; DataError if there are none. Arguments are those of `consistent_depths`."""
     check_points(views, points, config)

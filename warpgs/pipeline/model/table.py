@@ -21,7 +21,7 @@ from warpgs.kernels.neighbours import morton_codes
 from warpgs.kernels.sh import MAX_DEGREE
 from warpgs.kernels.update import BETAS, adam_scheduled, scheduled_lrs
 from warpgs.render.options import RasterizeOptions
-from warpgs.scene import Camera, Gaussians, Normalization
+from warpgs.scene import Camera, Gaussians, Normalization, Tensors
 from warpgs.version import __version__
 
 FLOAT = 4
@@ -87,7 +87,7 @@ class DensityUpdate:
 
     keep: torch.Tensor
     """Indices of the surviving rows in ascending order, int64, shape [S]."""
-    added: Mapping[str, torch.Tensor] = field(default_factory=dict)
+    added: Tensors = field(default_factory=dict)
     """New rows of each parameter, shape [A, ...]; their moments start at zero. Empty if no row is added."""
     parents: torch.Tensor = field(default_factory=lambda: torch.empty(0, dtype=torch.int64, device="cpu"))
     """Index, before the change, of the parent of each new row, -1 without a parent, int64, shape [A]."""
@@ -97,7 +97,7 @@ class DensityUpdate:
     overwritten: torch.Tensor | None = None
     """Indices, before the change, of the rows to overwrite: parameters are replaced, and moments restart at zero. Int64, shape
     [R]; None to overwrite no row."""
-    values: Mapping[str, torch.Tensor] = field(default_factory=dict)
+    values: Tensors = field(default_factory=dict)
     """Parameters of the overwritten rows, shape [R, ...]; parameters left out are unchanged."""
 
 
@@ -112,7 +112,7 @@ class Table:
     room: int = 0
     """Number of rows for which `settle` took memory."""
 
-    def __init__(self, params: Mapping[str, torch.Tensor], columns: Mapping[str, Column], device: torch.device, count: int):
+    def __init__(self, params: Tensors, columns: Mapping[str, Column], device: torch.device, count: int):
         """Begin with zero moments and filled columns.
 
         Args:
@@ -186,7 +186,7 @@ class Table:
 
     @torch.no_grad()
     def adam_step(
-        self, gradients: Mapping[str, torch.Tensor], lrs: torch.Tensor, skip: torch.Tensor,
+        self, gradients: Tensors, lrs: torch.Tensor, skip: torch.Tensor,
         factors: torch.Tensor | None = None, rows: slice = slice(None),
     ) -> None:  # fmt: skip
         """Update parameters with Adam, if ``skip`` [1] is 0.
@@ -227,10 +227,7 @@ class Table:
             added = {n: t.detach()[:0] for n, t in self.params.items()}
         rows = {n: len(added[n]) if n in added else None for n in self.params}
         if any(count != len(parents) for count in rows.values()):
-            raise UsageError(
-                f"a DensityUpdate has {len(parents)} parents but adds {rows} rows: each parameter needs one row for "
-                "each entry of parents (-1 for a row without a parent)"
-            )
+            raise UsageError(f"a DensityUpdate has {len(parents)} parents and {rows} rows: give each row a parent, -1 for none")
         if update.overwritten is not None:
             for name, value in update.values.items():
                 self.params[name].detach()[update.overwritten] = value.to(self.params[name].dtype)
@@ -345,7 +342,7 @@ class Table:
         """Return all tensors by flat names, such as ``params.means``, for a checkpoint."""
         return {f"{group}.{n}": t.detach() for group, tensors in self._groups().items() for n, t in tensors.items()}
 
-    def load(self, state: Mapping[str, torch.Tensor]) -> None:
+    def load(self, state: Tensors) -> None:
         """Load what `state` returned.
 
         Raises:
@@ -501,7 +498,7 @@ def load(path: str | Path, device: str | torch.device = "cpu") -> Model:
     return Model(convert_gaussians(gaussians, normalization, units, "scene"), normalization)
 
 
-def checked_gaussians(tensors: Mapping[str, torch.Tensor], where: str) -> Gaussians:
+def checked_gaussians(tensors: Tensors, where: str) -> Gaussians:
     """Return the tensors of a file as Gaussians; DataError that begins with ``where`` if they are not."""
     names = Gaussians.__dataclass_fields__
     missing = [n for n in names if n not in tensors]

@@ -5,7 +5,6 @@ import itertools
 import math
 import os
 import shlex
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -19,7 +18,7 @@ from warpgs.errors import DataError, UsageError, WarpgsError
 from warpgs.export.base import format_of, read_with_antialiasing
 from warpgs.export.ply import write_ply
 from warpgs.files import filling, write_bytes, write_json, writing_into
-from warpgs.geometry import camera_extent, convert_camera, in_image
+from warpgs.geometry import camera_extent, convert_camera, evenly_spaced, in_image
 from warpgs.io.image_files import MAX_PIXELS
 from warpgs.io.load import Split, load_scene
 from warpgs.io.transforms import colmap_folder, read_cameras
@@ -43,13 +42,14 @@ from warpgs.pipeline.train.settings import FitConfig
 from warpgs.pipeline.train.trainer import train_views
 from warpgs.pipeline.train.views import TrainingView
 from warpgs.priors.views import PriorConfig, view_priors
+from warpgs.process import Say, silent
 from warpgs.render.options import RasterizeOptions
 from warpgs.report.film import h264_encoder
 from warpgs.report.images import COVERAGE_LEGEND, Tile, contact_sheet, png
 from warpgs.report.overview import LEGEND_HEIGHT, TEST_COLOR, TRAIN_COLOR, render_overview, with_legend
 from warpgs.report.page import image_names, renaming_notes
 from warpgs.report.progress import Stages, waiting
-from warpgs.scene import Camera, Gaussians, Normalization, PointCloud, Prior, Scene, View, base_coefficients
+from warpgs.scene import Camera, Gaussians, Normalization, PointCloud, Prior, Scene, Tensors, View, base_coefficients
 
 RULE = "inria"
 """Default rule for files of Gaussians: most models were trained with it."""
@@ -68,17 +68,13 @@ def open_file(
     ``rule`` None is exact for files that name warpgs, else inria; ``near`` [file units] None is that of the rule.
     """
     if cameras is None:
-        raise UsageError(
-            f"{path}: a file of Gaussians has no cameras; give --cameras cameras.json, transforms.json, or a scene"
-        )
+        raise UsageError(f"{path}: a file of Gaussians has no cameras; give --cameras cameras.json, transforms.json or a scene")
     rule_named(rule or RULE)
     where, _ = choose_device(device)
     found, notes = _cameras_of(cameras)
     for name, c in found.items():
         if c.width * c.height > MAX_PIXELS:
-            raise DataError(
-                f"{cameras}, {name}: an image of {c.width} x {c.height} px has over {MAX_PIXELS:,} pixels; give a smaller size"
-            )
+            raise DataError(f"{cameras}, {name}: {c.width} x {c.height} px are over {MAX_PIXELS:,} pixels; give a smaller size")
     # the unit stays that of the file, since the near plane of a rule is in that unit; our fits have that of `load_scene`
     own = rule is None and format_of(path).is_own(path)
     extent = camera_extent(list(found.values())) if own else 0.0
@@ -115,9 +111,7 @@ VP9 = (
 """Note on a film in .mp4 without an encoder of H.264."""
 
 
-def scene_of(
-    stored: StoredRun, reader: str | None = None, tell: Callable[[str], object] | None = None
-) -> tuple[Scene, list[View], list[View]]:
+def scene_of(stored: StoredRun, reader: str | None = None, tell: Say | None = None) -> tuple[Scene, list[View], list[View]]:
     """Read the scene of a run, with its training and held-out views; refuse a scene that has changed since the fit."""
     scene, _, _ = read_scene(stored.scene_request(reader), tell)
     if scene.fingerprint != stored.record["fingerprint"]:
@@ -199,9 +193,7 @@ def render(
     *others, last = files
     if last.suffix.lower() == ".mp4" and h264_encoder() is None:
         notes.append(VP9)
-    notes += faults + (
-        [f"sheet of {min(film.SHEET_FRAMES, len(plan.cameras))} frames in {film.sheet_path(out)}"] if sheet else []
-    )
+    notes += faults + [f"sheet of {min(film.SHEET_FRAMES, len(plan.cameras))} frames in {film.sheet_path(out)}"] * sheet
     if last == out:
         return [*notes, f"{len(plan.cameras)} frames in {out}"]
     if last.name == film.FILM:
@@ -229,24 +221,24 @@ def _new_folder(folder: Path, out: Path | None) -> Path:
     return out
 
 
-def _write(out: Path, record: dict[str, Any], made: Gaussians, step: int, normalization: Normalization) -> list[str]:
-    """Write the new run folder atomically; returns notes for the user."""
+def _write(out: Path, stored: StoredRun, figures: dict[str, Any], made: Gaussians) -> list[str]:
+    """Write the new run folder, whose record has ``figures``, atomically; returns notes for the user."""
+    # the new checkpoint has no increments of poses: its record holds the cameras after them
+    record = stored.record | {"pruned": figures, "cameras": {n: camera_values(c) for n, c in stored.scene_cameras.items()}}
     tensors, degrees = {f"params.{n}": t for n, t in made.tensors().items() if n != "sh"}, edit.stored_degrees(made.sh)
     tensors |= {"params.sh_packed": pack(made.sh, degrees), "degrees": degrees}
     with hold_folder(out.parent) as notes:
         _new_folder(out, out)  # another process may have made it before this one held the folder above
         with filling(out) as temporary:
             write_json(temporary / CONFIG, record)
-            save_checkpoint(temporary, tensors, {"step": step})
-            antialiased = record["config"].get("antialiased", False)
-            write_ply(temporary / "point_cloud.ply", made, normalization, antialiased=antialiased)
+            save_checkpoint(temporary, tensors, {"step": stored.step})
+            write_ply(temporary / "point_cloud.ply", made, stored.normalization, antialiased=stored.antialiased)
     return notes
 
 
 def prune(
-    folder: Path, keep_psnr: float, out: Path | None, device_name: str, reader: str | None = None,
-    tell: Callable[[str], object] = lambda line: None,
-) -> list[str]:  # fmt: skip
+    folder: Path, keep_psnr: float, out: Path | None, device_name: str, reader: str | None = None, tell: Say = silent
+) -> list[str]:
     """Shrink a run into a new folder whose mean training PSNR falls by at most ``keep_psnr`` [dB]; returns lines."""
     if not 1e-6 <= keep_psnr <= 100:
         raise UsageError(f"--keep-psnr must be in [1e-6, 100] dB, not {keep_psnr}; a loss of 0.1 dB is invisible")
@@ -259,7 +251,7 @@ def prune(
     psnrs = view_psnrs(before, train, options)
     if not math.isfinite(whole := float(np.mean(psnrs))):
         raise DataError(f"{stored.folder}: training PSNR is {whole} dB, so its loss cannot be limited; fit again")
-    few = sorted({round(i) for i in np.linspace(0, len(train) - 1, TRIED_VIEWS).tolist()})
+    few = evenly_spaced(range(len(train)), TRIED_VIEWS)
 
     def loss(gaussians: Gaussians, on_all: bool) -> float:
         rows = range(len(train)) if on_all else few
@@ -281,9 +273,7 @@ def prune(
         "source": str(folder.resolve()), "keep_psnr": keep_psnr, "count": counts, "bytes": sizes, "mean_degree": means,
         "train_psnr": scores[0], "test_psnr": scores[1] if test else None,
     }  # fmt: skip
-    # the new checkpoint has no increments of poses: its record holds the cameras after them
-    record = stored.record | {"pruned": figures, "cameras": {n: camera_values(c) for n, c in stored.scene_cameras.items()}}
-    held, run = _write(out, record, made, stored.step, stored.normalization), shlex.quote(str(out))
+    held, run = _write(out, stored, figures, made), shlex.quote(str(out))
     return [
         *stored.notes(),
         *held,
@@ -302,7 +292,7 @@ CLEAN = "clean.png"
 """Picture of what a clean-up would remove, in the folder of a run."""
 
 
-def clean_picture(model: FittedModel, found: dict[str, torch.Tensor], views: list[View]) -> np.ndarray:
+def clean_picture(model: FittedModel, found: Tensors, views: list[View]) -> np.ndarray:
     """Return a sheet of the view that shows most of what would go: before, in colours over the gray render, and after."""
     gaussians, options = model.gaussians(), model.options()
     goes = edit.any_of(found.values(), gaussians.logit_opacities)
@@ -316,9 +306,7 @@ def clean_picture(model: FittedModel, found: dict[str, torch.Tensor], views: lis
     return contact_sheet(view.name, lines, tiles, columns=2)
 
 
-def write_clean(
-    stored: StoredRun, out: Path, found: dict[str, torch.Tensor], scores: dict[str, list[float]] | None = None
-) -> list[str]:
+def write_clean(stored: StoredRun, out: Path, found: Tensors, scores: dict[str, list[float]] | None = None) -> list[str]:
     """Write a run without the Gaussians of some masks [N] into a new folder; returns lines for the user."""
     goes = edit.any_of(found.values(), stored.gaussians().logit_opacities)
     left = edit.by_degree(edit.select(stored.gaussians(), ~goes))
@@ -326,16 +314,13 @@ def write_clean(
         "source": str(stored.folder.resolve()), "removed": {name: int(where.sum()) for name, where in found.items()},
         "count": [len(goes), len(left)], "psnr": scores,
     }  # fmt: skip
-    # the new checkpoint has no increments of poses: its record holds the cameras after them
-    record = stored.record | {"pruned": figures, "cameras": {n: camera_values(c) for n, c in stored.scene_cameras.items()}}
-    held = _write(out, record, left, stored.step, stored.normalization)
+    held = _write(out, stored, figures, left)
     return [*held, f"{len(left):,} Gaussians in {out}: checkpoint, PLY; {stored.folder} keeps the model before"]
 
 
 def clean(
-    folder: Path, wish: str, out: Path | None, device_name: str, reader: str | None = None,
-    tell: Callable[[str], object] = lambda line: None,
-) -> list[str]:  # fmt: skip
+    folder: Path, wish: str, out: Path | None, device_name: str, reader: str | None = None, tell: Say = silent
+) -> list[str]:
     """Write a run without what ``wish`` names (`chosen_reasons`), or for show only a picture of that; returns lines."""
     show = wish == "show"
     names, (device, _) = chosen_reasons("all" if show else wish), choose_device(device_name)

@@ -3,7 +3,7 @@
 import copy
 import math
 import shlex
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -23,6 +23,7 @@ from warpgs.pipeline.films.paths import common_up
 from warpgs.pipeline.model import edit
 from warpgs.pipeline.run.folder import CONFIG, StoredRun, open_run
 from warpgs.pipeline.run.request import choose_device
+from warpgs.process import Say
 from warpgs.scene import Camera, Gaussians, Normalization, base_colors
 
 
@@ -151,9 +152,7 @@ def convert(
     for unused in (f for f in given if not (f.fits(source) or f.fits(target))):
         format_of(target, unused)  # says that its name is another
     if (source / CONFIG).is_file():
-        raise UsageError(
-            f"{source}: is a run folder; use `warpgs export {shlex.quote(str(source))} --to {shlex.quote(str(target))}`"
-        )
+        raise UsageError(f"{source}: is a run; use `warpgs export {shlex.quote(str(source))} --to {shlex.quote(str(target))}`")
     read, kind = (format_of(p, next((f for f in given if f.fits(p)), None)) for p in (source, target))
     rotation_of(filters.rotate, None)  # before anything is read
     read = copy.copy(read)
@@ -198,9 +197,7 @@ def _written(
         color = "".join(f"{round(255 * v):02x}" for v in stored.background)
         lines.append(f"the file does not store the background colour of the fit, #{color}; set it in your viewer")
     if antialiased and not kind.declares:
-        lines.append(
-            f"{kind.suffix} files cannot declare that the model is antialiased; choose the antialiased mode in your viewer"
-        )
+        lines.append(f"{kind.suffix} files cannot say a model is antialiased; choose the antialiased mode in your viewer")
     if kind.sorted:
         gaussians = edit.select(gaussians, torch.argsort(morton_codes(gaussians.means), stable=True))
     kind = copy.copy(kind)
@@ -245,9 +242,7 @@ def _cameras_written(
         shown = gaussians.logit_opacities.argsort(descending=True, stable=True)[:MAX_POINTS]
         turned = gaussians if rotation is None else rotate(gaussians, rotation)
         points = turned.means[shown].numpy(), base_colors(gaussians.sh[shown]).numpy()
-        lines.append(
-            f"points3D.txt has the positions and colours of {len(shown):,} Gaussians, for trainers that start from points"
-        )
+        lines.append(f"points3D.txt has positions and colours of {len(shown):,} Gaussians, for trainers that start from points")
     with hold_file(target) as notes:
         lines += write_cameras(target, cameras, list(named) if keep_names else None, points, origin)
     lines += origin_line(origin)
@@ -258,9 +253,8 @@ def _cameras_written(
 
 
 def mesh(
-    folder: Path, target: Path, options: MeshOptions, device_name: str, *, crop: str | None = None,
-    stage: Callable[[str], object], say: Callable[[str], object],
-) -> list[str]:  # fmt: skip
+    folder: Path, target: Path, options: MeshOptions, device_name: str, *, crop: str | None = None, stage: Say, say: Say
+) -> list[str]:
     """Write the mesh of the surfaces that a run's training views see, in file units, as is ``voxel``; returns lines."""
     check_suffix(target)
     device, _ = choose_device(device_name)

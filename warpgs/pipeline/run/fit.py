@@ -46,7 +46,7 @@ from warpgs.poses.find import JSON, TEXT, find_poses, needs_poses, read_poses_re
 from warpgs.poses.photographs import find_photographs, image_root, is_video
 from warpgs.priors.networks import in_threads
 from warpgs.priors.photo_checks import PhotoCheck, check_photos, photo_notes
-from warpgs.process import Detail, Task, counted, noted_signals, say
+from warpgs.process import Detail, Say, Task, counted, noted_signals, say, silent
 from warpgs.ranks import ALONE, Ranks
 from warpgs.report.page import image_names, renaming_notes
 from warpgs.report.progress import EventLog, Progress, Stages, duration
@@ -73,7 +73,7 @@ class FitJob:
     ranks: Ranks
     began: float
     clock: Clock
-    progress: Callable[[str], object]
+    progress: Say
     compiled: list[float]
     """Time of each compilation so far [s]."""
 
@@ -265,9 +265,7 @@ def batched_notes(config: FitConfig, ranks: Ranks) -> list[str]:
     return [views] * (config.batch > 1) + [processes] * (ranks.count > 1)
 
 
-def with_poses(
-    request: SceneRequest, out: Path | None, progress: Callable[[str], object], ranks: int = 1
-) -> tuple[SceneRequest, list[str]]:
+def with_poses(request: SceneRequest, out: Path | None, progress: Say, ranks: int = 1) -> tuple[SceneRequest, list[str]]:
     """Find the poses of photographs without cameras, or read them from the run folder ``out``; returns request and notes."""
     source = Path(request.path)
     if request.reader is not None or request.reconstruction is not None or not request.path or not needs_poses(source):
@@ -282,10 +280,7 @@ def with_poses(
         if record["source_sha256"] != source_digest(source, request.allow_outside):
             raise UsageError(f"{scene} holds poses of other photographs than {source}; give another --out")
     elif ranks > 1:
-        raise UsageError(
-            f"{source}: has no cameras, and each of {ranks} ranks would find its own poses; run `warpgs poses {source} --out "
-            "SCENE` first, and fit SCENE"
-        )
+        raise UsageError(f"{source}: has no cameras, and ranks find none; run `warpgs poses {source} --out SCENE`, fit SCENE")
     else:
         if "=" not in (spec := request.split or "all") and not is_video(source):  # refuse what all photographs are too few for
             root = image_root(source)
@@ -393,7 +388,7 @@ def fit(
     scene = _checked_source(scene, split)
     verbose, own = ranks.first and verbose, out if ranks.first else None
     folder = contextlib.nullcontext(list[str]()) if own is None else folders.run_folder(own, resume)
-    stages = Stages() if verbose else Stages(lambda line: None)
+    stages = Stages() if verbose else Stages(silent)
     with (
         torch.inference_mode(False),  # a caller's own mode would end the first step
         torch.enable_grad(),
@@ -443,9 +438,7 @@ def _checked_settings(
     config, origin = chosen_settings(preset, overrides)
     check_ranks(config.batch, ranks)
     if time_budget is not None and ranks.count > 1:
-        raise UsageError(
-            f"--time-budget: each of {ranks.count} ranks would measure its own speed and choose other steps; give --steps"
-        )
+        raise UsageError(f"--time-budget: each of {ranks.count} ranks would choose its own number of steps; give --steps")
     return config, origin
 
 
@@ -454,9 +447,7 @@ def _checked_source(scene: Scene | SceneRequest | str | Path, split: str | None)
     if isinstance(scene, (str, Path)):
         scene = SceneRequest(str(scene))
     if not isinstance(scene, (Scene, SceneRequest)):
-        raise UsageError(
-            f"scene must be a warpgs.Scene or a folder, not {type(scene).__name__}; give Scene(path, format, views)"
-        )
+        raise UsageError(f"scene must be a Scene or a folder, not {type(scene).__name__}; give Scene(path, format, views)")
     if isinstance(scene, SceneRequest):
         scene = replace(scene, split=scene.split if split is None else split)
         split = scene.split
@@ -466,9 +457,8 @@ def _checked_source(scene: Scene | SceneRequest | str | Path, split: str | None)
 
 
 def _read(
-    scene: Scene | SceneRequest, split: str | None, device: torch.device, out: Path | None,
-    progress: Callable[[str], object], ranks: Ranks,
-) -> tuple[Scene, SceneRequest, Split, list[str]]:  # fmt: skip
+    scene: Scene | SceneRequest, split: str | None, device: torch.device, out: Path | None, progress: Say, ranks: Ranks
+) -> tuple[Scene, SceneRequest, Split, list[str]]:
     """Read a scene, without its fingerprint, and find its poses where it has none; return it with request, split and notes."""
     if isinstance(scene, Scene):
         parts, notes = choose_split(scene, split)
@@ -639,10 +629,9 @@ def _score(
         moved = {v.name: f for v, f in zip(train, fractions, strict=True)}
     complexity, cameras, scale = complexity_figures(trainer), folders.cameras_of(scene), scene.normalization.scale
     modules = {
-        m.name: m.figures(
-            FittedViews(learned.params_of(m), job.split.train, test, given, cameras, scale, gaussians, options)
-        ) for m in learned.modules
-    }  # fmt: skip
+        m.name: m.figures(FittedViews(learned.params_of(m), job.split.train, test, given, cameras, scale, gaussians, options))
+        for m in learned.modules
+    }
     mapped = results.given_figures(train, trainer.views, renders)
     table: list[tuple[dict[str, Any], list[str]]] = [  # figures of metrics.json, and their sentences in the report
         ({"rule": rule}, [Detail(rule["summary"])]),

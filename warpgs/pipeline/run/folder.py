@@ -251,9 +251,7 @@ def _cameras(stored: dict[str, Any], path: Path) -> dict[str, Camera]:
             if not rigid:
                 raise UsageError(f"viewmat must be a rotation and a translation within {MAX_TRANSLATION:g}, above 0, 0, 0, 1")
             if not (off <= K_TOLERANCE and all(least <= abs(f) <= most for f in (K[0, 0], K[1, 1]))):
-                raise UsageError(
-                    f"K must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], with focal lengths in {least:g} to {most:g}"
-                )
+                raise UsageError(f"K must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], focal lengths {least:g} to {most:g}")
         except UsageError as e:
             raise DataError(f"{path}: incomplete or damaged: cameras.{name[:60]}: {e}; {RESTORE}") from e
     return found
@@ -323,7 +321,7 @@ SAME = {
 def check_same(record: dict[str, Any], stored: dict[str, Any], out: Path) -> None:
     """Check that a continued run has the same data, views, settings, user code and kind of device as before."""
     if "pruned" in stored:
-        raise UsageError(f"--resume: {out} is a pruned model, without the state of a fit; resume {stored['pruned']['source']}")
+        raise UsageError(f"--resume: {out} is pruned, without the state of its fit; resume {stored['pruned']['source']}")
     _check_lost(stored, out)
     _check_named_again({name for field in PLUGGED for name in _names(record["config"], field)}, stored, out)
     for key, words in SAME.items():
@@ -366,10 +364,7 @@ def check_checkpoint(state: dict[str, Any], stored: dict[str, Any], out: Path) -
         if found != wanted:
             if isinstance(found, dict) and isinstance(wanted, dict):
                 key = ", ".join(k for k in {**found, **wanted} if found.get(k) != wanted.get(k))
-            raise DataError(
-                f"--resume: {out / TENSORS} and {CONFIG} beside it belong to different fits: {key} differs. Restore both "
-                "files of one run, or fit again into a new --out"
-            )
+            raise DataError(f"--resume: {key} differs between {out / TENSORS} and {CONFIG}; restore both, or fit again")
 
 
 PLUGGED: dict[str, Any] = {"strategy": STRATEGIES, **PARTS}
@@ -431,7 +426,7 @@ def _stored_scene(folder: Path, record: dict[str, Any], reader: str | None, move
     """Return the scene of a run's record, as `StoredRun.scene_request` does, with its maps where it was ``moved``."""
     values, old = record["scene"], record["scene"]["path"]
     if old is None:
-        raise DataError(f"{folder}: the scene was passed from Python and has no folder; score it there with warpgs.evaluate")
+        raise DataError(f"{folder}: its scene was passed from Python; score it in Python, with warpgs.evaluate")
     if moved is not None:
         new = os.path.realpath(moved)
         values = {
@@ -441,7 +436,7 @@ def _stored_scene(folder: Path, record: dict[str, Any], reader: str | None, move
     if not os.path.exists(request.path) and (folder / POSED_SCENE / POSES).is_file():
         request = replace(request, path=str(folder / POSED_SCENE))  # the run folder was moved, and its scene with it
     if request.reader is not None and ":" in request.reader and reader != request.reader:
-        raise UsageError(f"{folder}: the scene was read with user code, which no run loads; give --reader {request.reader}")
+        raise UsageError(f"{folder}: its scene needs user code, which no folder may load; give --reader {request.reader} again")
     if not os.path.exists(request.path):
         raise DataError(
             f"{request.path}: the scene of {folder} is gone; if it was moved, `warpgs fit NEW_PLACE --out "

@@ -203,10 +203,7 @@ def located(run: StoredRun, folder: Path | None) -> Levelled:
         scale, rotation, translation, offs, sure = similarity(centers, targets, agree)
         count, offs = int(agree.sum()), offs[agree > 0]
     if count < 3 or not sure:
-        raise DataError(
-            f"--gps: {count} of {len(paths)} photographs have GPS in EXIF that fits the poses; 3 are needed, not on a line. "
-            + remedy
-        )
+        raise DataError(f"--gps: {count} of {len(paths)} photographs have GPS that fits; 3 not on a line are needed. " + remedy)
     line = f"GPS of {len(offs)} of {len(rows)} photographs is {np.median(offs):.2f} m (median), at most {offs.max():.2f} m off"
     line += "; x is east, y north, z up [m] from latitude {:.7f}, longitude {:.7f}, height {:.1f} m".format(*place)
     return Normalization(translation, 1 / scale, rotation.T, rotation[2], "m", place), line

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
@@ -13,6 +13,7 @@ from warpgs.errors import ResourceError, UsageError
 from warpgs.io.images import SceneOptions, image_scale
 from warpgs.io.load import Split, coincident_views, read_folder, split_views
 from warpgs.pipeline.train.settings import FitConfig
+from warpgs.process import Say
 from warpgs.scene import Scene
 
 CPU_MAX_SIDE = 800
@@ -87,9 +88,7 @@ def choose_device(name: str | torch.device) -> tuple[torch.device, str]:
     if device.type != "cuda":
         raise UsageError(f"device {device} has no kernels: give auto, cpu, cuda or cuda:N")
     if not torch.cuda.is_available():
-        raise ResourceError(
-            "--device cuda: torch finds no CUDA device; run `warpgs doctor` for the reason, or use --device cpu"
-        )
+        raise ResourceError("--device cuda: torch finds no CUDA device; `warpgs doctor` tells why; or use --device cpu")
     if device.index is None:
         device = torch.device("cuda", torch.cuda.current_device())
     return device, f"on {torch.cuda.get_device_name(device)}"
@@ -100,18 +99,13 @@ def choose_split(scene: Scene, spec: str | None) -> tuple[Split, list[str]]:
     split = split_views(scene, "all" if spec is None else spec)
     notes = [] if split.test else [NO_SCORES]
     if (spec or "").startswith("dtu:") and any(v.mask is not None for v in scene.views):
-        notes.append(
-            "masks hide pixels from the fit, unlike in the published DTU protocol; put object masks for scoring only into a "
-            "folder idrmasks, or give them with --score-masks"
-        )
+        notes.append("masks hide pixels from the fit, unlike in the published DTU protocol; score with --score-masks instead")
     for test, train in coincident_views(scene, split):
         notes.append(f"{test} is held out, but training view {train} has the same pose, so this score does not test new views")
     return split, notes
 
 
-def read_scene(
-    request: SceneRequest, progress: Callable[[str], object] | None = None, *, hashed: bool = True
-) -> tuple[Scene, Split, list[str]]:
+def read_scene(request: SceneRequest, progress: Say | None = None, *, hashed: bool = True) -> tuple[Scene, Split, list[str]]:
     """Load a scene and split its views; returns both with the notes for the user. Arguments are those of `read_folder`."""
     scene = read_folder(request.path, request, request.reader, progress, hashed=hashed)
     split, notes = choose_split(scene, request.split)

@@ -9,7 +9,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import torch
@@ -19,7 +19,7 @@ from warpgs.constants import TILE_SIZE
 from warpgs.device import format_bytes, in_background
 from warpgs.errors import ResourceError
 from warpgs.files import make_folder, read_file, write_bytes
-from warpgs.geometry import CENTRAL, MODELS, depth_normals
+from warpgs.geometry import CENTRAL, MODELS, depth_normals, evenly_spaced
 from warpgs.io.image_files import decode
 from warpgs.io.load import Split
 from warpgs.mesh.views import MIN_ALPHA
@@ -33,7 +33,7 @@ from warpgs.pipeline.train.schedule import Phases
 from warpgs.pipeline.train.strategies.sampling import SampledView, Sampling
 from warpgs.pipeline.train.trainer import Trainer
 from warpgs.pipeline.train.views import TrainingView
-from warpgs.process import Detail, counted
+from warpgs.process import Detail, Say, counted, silent
 from warpgs.render.options import RasterizeOptions
 from warpgs.render.rasterize import rasterize
 from warpgs.render.reference import reference_image
@@ -43,7 +43,6 @@ from warpgs.report.page import Section, curve, image_names, write_page
 from warpgs.report.progress import duration, read_events
 from warpgs.scene import Camera, Gaussians, Scene, View
 
-T = TypeVar("T")
 GIVEN = {
     "given_depth": ("depth", "given depth: median difference of rendered depth {:.2%} (worst view {:.2%})"),
     "given_normals": (
@@ -226,11 +225,6 @@ def view_sheet(
     return contact_sheet(f"{name}, step {step:,}", lines, tiles, columns=5, tile_width=320, text=1.25)
 
 
-def evenly_spaced(values: Sequence[T], most: int) -> list[T]:
-    """Return up to ``most`` of some values."""
-    return [values[i] for i in np.unique(np.linspace(0, len(values) - 1, min(most, len(values))).round().astype(int))]
-
-
 def _on_host(sampled: SampledView) -> SampledView:
     """Return a copy with its maps in host memory."""
     maps = {n: getattr(sampled, n).cpu() for n in ("rendered", "gate", "at")}
@@ -407,7 +401,7 @@ def evaluate_run(
     *,
     names: dict[str, str] | None = None,
     renders: Renders | None = None,
-    tell: Callable[[str], object] = lambda line: None,
+    tell: Say = silent,
 ) -> dict[str, Any]:
     """Score held-out and training views, and save a render and depth map of each held-out (else training) view in ``out``."""
     for folder in () if out is None else ("renders", "depth"):
@@ -441,7 +435,7 @@ def evaluate_run(
     }  # fmt: skip
 
 
-def _images(shown: list[View], renders: Renders, rows: dict[str, Any], tell: Callable[[str], object]) -> list[tuple[Any, ...]]:
+def _images(shown: list[View], renders: Renders, rows: dict[str, Any], tell: Say) -> list[tuple[Any, ...]]:
     """Render the views that the page shows, and encode their images."""
     captions = []
     for view in shown:
@@ -510,7 +504,7 @@ def write_report(
     sampling: Callable[[], Section | None],
     renders: Renders,
     times: Callable[[], dict[str, float]],
-    tell: Callable[[str], object] = lambda line: None,
+    tell: Say = silent,
 ) -> None:
     """Write report.html of a scored run, from metrics.json, config.json (``record``), metrics.jsonl and new renders."""
     train, test = [scene.view(n) for n in split.train], [scene.view(n) for n in split.test]

@@ -115,9 +115,7 @@ class StudyRequest:
         if not names:
             raise UsageError("name at least one scene folder")
         if len(set(names)) < len(names):
-            raise UsageError(
-                f"two scene folders have the same name ({', '.join(names)}), but it names their results; rename one"
-            )
+            raise UsageError(f"two scene folders are named {', '.join(names)}, which names their results; rename one")
 
 
 def scene_name(request: SceneRequest) -> str:

@@ -15,6 +15,7 @@ from warpgs.pipeline.train.strategies.base import Strategy
 from warpgs.pipeline.train.views import Kind, LearnedViews, ViewStack
 from warpgs.ranks import Ranks
 from warpgs.render.options import RasterizeOptions
+from warpgs.scene import Tensors
 
 # Sums over the views of a step (slots), in one order for any number of processes.
 #
@@ -42,10 +43,7 @@ MAX_RENDERS = 2**24
 def check_ranks(batch: int, ranks: Ranks) -> None:
     """Check that every process has a view in each step of ``batch`` views."""
     if batch < ranks.count:
-        raise UsageError(
-            f"--batch {batch} is less than the number of ranks, {ranks.count}; give --batch {ranks.count} or a multiple "
-            "of it, or start fewer ranks"
-        )
+        raise UsageError(f"--batch {batch} is below the {ranks.count} ranks; give a multiple of them, or start fewer ranks")
 
 
 def check_renders(batch: int, steps: int) -> None:
@@ -290,9 +288,8 @@ class BatchSteps(StepTaker):
 
     @torch.no_grad()
     def _add(
-        self, slot: int, place: int, gradients: list[torch.Tensor], statistics: Mapping[str, torch.Tensor],
-        parts: list[torch.Tensor], adds: bool,
-    ) -> None:  # fmt: skip
+        self, slot: int, place: int, gradients: list[torch.Tensor], statistics: Tensors, parts: list[torch.Tensor], adds: bool
+    ) -> None:
         """Add the contribution of a slot to the parts of a sum, or overwrite the parts; ``place`` as in `_contribution`."""
         said = parts[-1]
         if not adds:
@@ -305,7 +302,7 @@ class BatchSteps(StepTaker):
             said[STOP : STOP + 1].fill_(1.0)
 
     def _prepared(
-        self, gradients: list[torch.Tensor], statistics: Mapping[str, torch.Tensor], plan: StepPlan, captured: bool
+        self, gradients: list[torch.Tensor], statistics: Tensors, plan: StepPlan, captured: bool
     ) -> tuple[SlotSums, list[Callable[[], object]]]:
         """Return sums, and the functions that update by them; their shapes are those of a view's contribution."""
         shapes = [*(tuple(t.shape) for t in (*gradients, *statistics.values())), (FLAGS + self.tree.batch,)]
@@ -324,7 +321,7 @@ class BatchSteps(StepTaker):
         return self.sums, self._update[1]
 
     def _functions(
-        self, plan: StepPlan, sums: SlotSums, gradients: list[torch.Tensor], statistics: dict[str, torch.Tensor]
+        self, plan: StepPlan, sums: SlotSums, gradients: list[torch.Tensor], statistics: Tensors
     ) -> list[Callable[[], object]]:
         """Return the functions of an update by sums; every second one is an exchange between processes."""
         b, lrs, divided = self.buffers, self._lrs, sums.divided

@@ -18,7 +18,7 @@ from warpgs.kernels.roughness import roughness
 from warpgs.kernels.ssim import difference_bytes, differences
 from warpgs.pipeline.train.views import TrainingView
 from warpgs.plugins import Registry, is_ours, returned
-from warpgs.scene import Camera, Gaussians, Prior
+from warpgs.scene import Camera, Gaussians, Prior, Tensors
 from warpgs.schema import Checked, Within
 
 SSIM_WEIGHT = 0.2
@@ -37,7 +37,7 @@ class Target:
     """Colours in [0, 1], shape [H, W, 3]."""
     mask: torch.Tensor | None
     """1 for unmasked pixels, 0 for masked ones, shape [H, W]; None without a mask."""
-    maps: Mapping[str, torch.Tensor]
+    maps: Tensors
     """Maps that loss terms requested (`LossTerm.needs`), by name, each of shape [H, W] or [H, W, C]."""
     alpha: torch.Tensor | None = None
     """Opacity of the subject, in [0, 1], shape [H, W]; None if no training view has one. ``image`` and the render have the same
@@ -47,21 +47,19 @@ class Target:
 class _Outputs(dict[str, torch.Tensor]):
     """Images of a render that a term requested; reading another one raises an error."""
 
-    def __init__(self, term: LossTerm, images: Mapping[str, torch.Tensor]):
+    def __init__(self, term: LossTerm, images: Tensors):
         super().__init__({n: images[n] for n in term.needs_outputs})
         self.term = term
 
     def __missing__(self, name: str) -> torch.Tensor:
-        raise UsageError(
-            f"the loss term {self.term.name!r} reads the output {name!r}, but did not request it; add it to needs_outputs"
-        )
+        raise UsageError(f"the loss term {self.term.name!r} reads the output {name!r}; add it to needs_outputs")
 
 
 @dataclass(frozen=True)
 class LossInputs:
     """Render, view and Gaussians of a step, for computing a loss term; all tensors are on the device of the fit."""
 
-    outputs: Mapping[str, torch.Tensor]
+    outputs: Tensors
     """Images of the render named in `LossTerm.needs_outputs`: ``rgb`` [H, W, 3], the colour over the background, after view
     modules; ``alpha`` [H, W], the accumulated opacity in [0, 1]; ``depth`` [H, W], the expected z-depth [u], 0 where nothing is
     blended. Differentiable."""

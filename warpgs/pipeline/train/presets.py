@@ -147,10 +147,7 @@ def preset_word(preset: str) -> str:
 
 def _named(name: str) -> tuple[FitConfig, str]:
     if name not in PRESETS:
-        raise UsageError(
-            f"preset {name!r} is not one of {', '.join(PRESETS)}; choose one, or give a {SUFFIX} file, module:NAME or "
-            "path/to/file.py:NAME"
-        )
+        raise UsageError(f"preset {name!r} is not one of {', '.join(PRESETS)}, a {SUFFIX} file, module:NAME or file.py:NAME")
     return PRESETS[name], f"preset {name}"
 
 

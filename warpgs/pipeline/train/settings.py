@@ -732,10 +732,8 @@ def within_budget(config: FitConfig, seconds: float, views: list[View], device: 
     steps = min(int((seconds - setup) / step), most)
     if steps < MIN_TIMED_STEPS:
         raise UsageError(
-            f"time-budget {seconds:g} s is too short: "
-            f"{MIN_TIMED_STEPS} steps would take {setup + MIN_TIMED_STEPS * step:.0f} s "
-            f"on this machine ({1000 * probe:.0f} ms for an image with gradients); give more time, "
-            "or smaller images with --downscale"
+            f"time-budget {seconds:g} s is too short: {MIN_TIMED_STEPS} steps would take {setup + MIN_TIMED_STEPS * step:.0f} "
+            f"s here ({1000 * probe:.0f} ms for an image with gradients); give more time, or --downscale"
         )
     needed = setup + steps * step
     return dataclasses.replace(config, steps=steps), (

@@ -19,13 +19,13 @@ from warpgs.pipeline.train.strategies.base import find_strategy
 from warpgs.pipeline.train.views import TrainingView, there, with_alpha
 from warpgs.priors.given_depth import any_given, check_given, lens_depth, pinhole_view, with_given_depth
 from warpgs.priors.views import view_priors
-from warpgs.process import Detail
+from warpgs.process import Detail, Say, silent
 from warpgs.scene import GivenDepth, PointCloud, Prior, View
 
 
 def prepare(
-    train: list[View], points: PointCloud | None, config: FitConfig, generator: np.random.Generator, device: torch.device,
-    priors: list[Prior] | None, ready: Callable[[], object], progress: Callable[[str], object] = lambda line: None,
+    train: list[View], points: PointCloud | None, config: FitConfig, device: torch.device, priors: list[Prior] | None,
+    ready: Callable[[], object], progress: Say = silent,
 ) -> tuple[list[View], Start, list[Prior] | None, list[str]]:  # fmt: skip
     """Return views (with depth from a network if it guides the fit), initial points, priors (if needed), and notes.
 
@@ -48,7 +48,7 @@ def prepare(
     def start() -> Start:
         progress("finding initial points")
         with section("first points"):
-            return _start_of(train, points, config, generator, usable, progress)
+            return _start_of(train, points, config, np.random.default_rng(config.seed), usable, progress)
 
     notes = []
     if priors is None and needs_priors(config):
@@ -72,7 +72,7 @@ def prepare(
 
 def _start_of(
     train: list[View], points: PointCloud | None, config: FitConfig, generator: np.random.Generator,
-    usable: Callable[[], torch.device], progress: Callable[[str], object],
+    usable: Callable[[], torch.device], progress: Say,
 ) -> Start:  # fmt: skip
     """Return the initial points and the depths found with them; arguments are those of `prepare` and `initial_points`."""
     # searches along lines need pinhole images; given points need no search

@@ -23,7 +23,7 @@ from warpgs.plugins import returned
 from warpgs.render.compose import compose, count_instances, inputs_of
 from warpgs.render.options import RasterizeOptions, image_settings
 from warpgs.render.rasterize import rasterize
-from warpgs.scene import Camera, Gaussians, Render
+from warpgs.scene import Camera, Gaussians, Render, Tensors
 
 # Decay of opacities: each step lowers every opacity by a fraction, so that Gaussians without support in the photographs
 # fade.
@@ -235,7 +235,7 @@ class StepTaker:
 
     def view_gradients(
         self, views: ViewStack, buffers: StepBuffers, plan: StepPlan, render: Renderer
-    ) -> tuple[list[torch.Tensor], Mapping[str, torch.Tensor], torch.Tensor, torch.Tensor, torch.Tensor]:
+    ) -> tuple[list[torch.Tensor], Tensors, torch.Tensor, torch.Tensor, torch.Tensor]:
         """Render the next view; return its gradients and statistics, learning rates, settings [7], and whether it goes on [1].
 
         Gradients are in the order of the parameters. Loss and stop flag go to ``buffers``.
@@ -257,7 +257,7 @@ class StepTaker:
 
     def forward(
         self, views: ViewStack, buffers: StepBuffers, plan: StepPlan, render: Renderer
-    ) -> tuple[Render, LossInputs, Mapping[str, torch.Tensor], torch.Tensor, torch.Tensor]:
+    ) -> tuple[Render, LossInputs, Tensors, torch.Tensor, torch.Tensor]:
         """Render the next view; return the render, inputs of the loss, terms of view modules, learning rates and settings."""
         gaussians = self.table.gaussians
         lrs, settings, viewmat, K, image = buffers.begin(views)
@@ -297,9 +297,8 @@ class StepTaker:
 
     @torch.no_grad()
     def settle(
-        self, plan: StepPlan, gradients: list[torch.Tensor], statistics: Mapping[str, torch.Tensor], settings: torch.Tensor,
-        going: torch.Tensor,
-    ) -> None:  # fmt: skip
+        self, plan: StepPlan, gradients: list[torch.Tensor], statistics: Tensors, settings: torch.Tensor, going: torch.Tensor
+    ) -> None:
         """Apply the changes after Adam: opacity decay, the strategy's own changes, limits, statistics."""
         table = self.table
         used = gradients[list(table.params).index("logit_opacities")] != 0 if plan.spares_unused else None
@@ -351,9 +350,7 @@ class StepTaker:
             self._capacities[kind, plan] = instance_capacity(self.table.gaussians, now, plan.degree, self.options)
         wanted = self._capacities[kind, plan]
         if max_instances is not None and wanted > max_instances:
-            raise OverLimitError(
-                f"a captured step would need capacity for {wanted:,} instances, but the limit allows {max_instances:,}"
-            )
+            raise OverLimitError(f"a captured step needs capacity for {wanted:,} instances; the limit allows {max_instances:,}")
         return wanted
 
     def capture(self, work: Callable[[], object], buffers: StepBuffers) -> CapturedGraph:

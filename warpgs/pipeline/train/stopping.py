@@ -1,7 +1,7 @@
 """When a fit stops: scores of held-out blocks of pixels."""
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Annotated, Any
 
@@ -17,7 +17,7 @@ from warpgs.plugins import returned
 from warpgs.process import Detail
 from warpgs.render.options import RasterizeOptions
 from warpgs.render.rasterize import rasterize
-from warpgs.scene import Gaussians
+from warpgs.scene import Gaussians, Tensors
 from warpgs.schema import Checked, Within
 
 # Held-out blocks of pixels; the gain on these blocks, compared with its noise, ends a fit early (docs/decisions/020).
@@ -270,14 +270,12 @@ class Stopping:
             "measurements": list(self.measurements),
         }  # fmt: skip
 
-    def load(self, tensors: Mapping[str, torch.Tensor], plain: dict[str, Any]) -> None:
+    def load(self, tensors: Tensors, plain: dict[str, Any]) -> None:
         """Load what `state` returned, or raise DataError if the errors do not belong to these blocks."""
         shape = (len(plain["measured"]), self.held if self.active else 0)
         measured = tensors.get("stopping.measured", torch.zeros(0, shape[1], dtype=torch.float32, device="cpu"))
         if measured.shape != shape:
-            raise DataError(
-                f"the stored errors of the left-out blocks have shape {list(measured.shape)}, not {list(shape)}; fit again"
-            )
+            raise DataError(f"stored errors of left-out blocks have shape {list(measured.shape)}, not {list(shape)}; fit again")
         self.ended, self.why = plain["ended"], plain["why"]
         self.measurements = list(plain["measurements"])
         self.measured = list(zip(plain["measured"], measured))

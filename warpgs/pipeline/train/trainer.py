@@ -34,9 +34,9 @@ from warpgs.pipeline.train.views import LearnedViews, TrainingView, half_size, s
 from warpgs.plugins import is_ours, returned
 from warpgs.priors.networks import in_threads
 from warpgs.priors.sweep import sweep_depths
-from warpgs.process import Detail
+from warpgs.process import Detail, Say, silent
 from warpgs.ranks import ALONE, Ranks
-from warpgs.scene import Camera, Gaussians, PointCloud, Prior, Scene, View
+from warpgs.scene import Camera, Gaussians, PointCloud, Prior, Scene, Tensors, View
 from warpgs.schema import Schema, SchemaError, anything, fields, items, mapping, number, text, whole
 
 # Mean of the parameters over the last steps of a fit; after the last step it replaces the parameters.
@@ -75,7 +75,7 @@ class ParameterMean:
         return min((s - step for s in self.samples(steps) if s > step), default=steps - step)
 
     @torch.no_grad()
-    def update(self, step: int, steps: int, params: Mapping[str, torch.Tensor]) -> bool:
+    def update(self, step: int, steps: int, params: Tensors) -> bool:
         """Take a sample if it is due; after the last step, replace the parameters by the mean in place, and return True."""
         if step not in self.samples(steps):
             return False
@@ -100,7 +100,7 @@ class ParameterMean:
         count = torch.tensor([self.count], dtype=torch.int64, device="cpu")
         return {f"{PREFIX}{n}": t for n, t in self.sums.items()} | {f"{PREFIX}count": count}
 
-    def load(self, tensors: Mapping[str, torch.Tensor], params: Mapping[str, torch.Tensor]) -> None:
+    def load(self, tensors: Tensors, params: Tensors) -> None:
         """Load what `state` returned, for these current parameters, or raise DataError."""
         self.restart()
         stored = {n.removeprefix(PREFIX): t for n, t in tensors.items() if n.startswith(PREFIX)}
@@ -110,17 +110,12 @@ class ParameterMean:
         kinds = {n: (t.shape, t.dtype) for n, t in stored.items()}
         counted = count is not None and count.shape == (1,) and count.dtype == torch.int64 and int(count) > 0
         if not counted or kinds != {n: (t.shape, t.dtype) for n, t in params.items()}:
-            raise DataError(
-                "the stored mean of the parameters is damaged, or does not belong to these parameters; restore the file, or "
-                "fit the scene again"
-            )
+            raise DataError("the stored mean of the parameters is damaged, or of another fit; restore it, or fit again")
         self.count = int(count)
         self.sums = {n: t.to(params[n].device).clone() for n, t in stored.items()}
 
 
-def check_state(
-    tensors: Mapping[str, torch.Tensor], plain: dict[str, Any], *, views: int, steps: int, strategy: Schema, stopping: Schema
-) -> None:
+def check_state(tensors: Tensors, plain: dict[str, Any], views: int, steps: int, *, strategy: Schema, stopping: Schema) -> None:
     """Raise DataError unless the parts of a stored state that are not rows of a table are valid; `Table.load` checks rows."""
     state = fields({
         "step": whole(0, steps), "order": items(whole(0, views - 1)), "extent": number(above=0), "notes": items(text),
@@ -134,10 +129,7 @@ def check_state(
     try:
         torch.Generator().set_state(tensors["generator"])
     except (KeyError, TypeError, RuntimeError) as e:
-        raise DataError(
-            "the stored state is incomplete: generator (the state of the random numbers) is missing or damaged; restore the "
-            "file, or fit the scene again"
-        ) from e
+        raise DataError("generator, the state of the random numbers, is missing or damaged; restore it, or fit again") from e
 
 
 DROPOUT_VIEWS = 3
@@ -153,7 +145,7 @@ class Trainer:
     def __init__(
         self, train: list[View], points: PointCloud | None, config: FitConfig, device: torch.device,
         background: tuple[float, float, float] = (0.0, 0.0, 0.0), priors: list[Prior] | None = None,
-        ready: Callable[[], object] = lambda: None, *, progress: Callable[[str], object] = lambda line: None,
+        ready: Callable[[], object] = lambda: None, *, progress: Say = silent,
         ranks: Ranks = ALONE,
     ):  # fmt: skip
         """Set up the initial Gaussians.
@@ -172,9 +164,7 @@ class Trainer:
         self.generator = torch.Generator().manual_seed(c.seed)
         self.notes: list[str]
         """Notes on choices made before the first step, for the user."""
-        train, start, priors, self.notes = prepare(
-            train, points, c, np.random.default_rng(c.seed), device, priors, ready, progress
-        )
+        train, start, priors, self.notes = prepare(train, points, c, device, priors, ready, progress)
         self.messages: list[str] = []
         """Messages for the user that were not shown yet."""
         cameras = [v.camera for v in train]
@@ -304,8 +294,7 @@ class Trainer:
         except UsageError as e:
             raise ResourceError(str(e)) from e
         self.messages.append(
-            f"memory: step {self.step + 1} ran out of memory; from now on, steps run without CUDA graphs, within "
-            f"{format_bytes(self.memory_limit)}"
+            f"memory: step {self.step + 1} ran out of memory; now without CUDA graphs, in {format_bytes(self.memory_limit)}"
         )
 
     def _advance(self, limit: int) -> list[StepReport]:
@@ -449,9 +438,7 @@ class Trainer:
 
     def state(self) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
         """Return tensors by name, of any shape [...], and plain values from which the fit continues with the same bits."""
-        own = returned(
-            self.strategy, "state", self.strategy.state(), tuple, "tensors by name, and plain values, two dictionaries"
-        )
+        own = returned(self.strategy, "state", self.strategy.state(), tuple, "two dictionaries, tensors and plain values")
         (tensors, strategy), (errors, stopping) = own, self.stopping.state()
         views = {f"views.{n}": t for n, t in self.learned.table.state().items()}
         tensors = {**self.table.state(), **views, **self.mean.state(), **tensors, **errors}
@@ -465,9 +452,7 @@ class Trainer:
 
     def load(self, tensors: dict[str, torch.Tensor], plain: dict[str, Any]) -> None:
         """Load what `state` returned, ``tensors`` of shape [...] by name, or raise DataError."""
-        check_state(
-            tensors, plain, views=len(self.views), steps=self.phases.planned, strategy=self.strategy.STATE, stopping=STATE
-        )
+        check_state(tensors, plain, len(self.views), self.phases.planned, strategy=self.strategy.STATE, stopping=STATE)
         self.step, self.order = plain["step"], list(plain["order"])
         self.context.phases = replace(self.phases, stable_start=plain["stable_start"], steps=plain["steps"])
         self.context.extent = plain["extent"]

@@ -15,14 +15,12 @@ from warpgs.pipeline.metrics.scores import MATCHED_RULE, matched_psnr, render_vi
 from warpgs.pipeline.train.schedule import LearningRate, log_linear
 from warpgs.plugins import Registry
 from warpgs.render.options import RasterizeOptions
-from warpgs.scene import Camera, Gaussians, View
+from warpgs.scene import Camera, Gaussians, Tensors, View
 from warpgs.schema import Checked, Within
 
 CAMERA_BYTES = 4 * (16 + 9)
 """Bytes per Gaussian if cameras are learned: its part of the gradients of view matrix and intrinsics, before the sum over
 Gaussians."""
-Tensors = Mapping[str, torch.Tensor]
-"""Parameters of views, or values computed from them, by name."""
 
 
 @dataclass(frozen=True)
@@ -220,9 +218,7 @@ class Exposure(ViewModule, group="exposure."):
         """Check that no view has an alpha channel: an exposure would change the background with the object."""
         for v in views:
             if v.alpha is not None:
-                raise UsageError(
-                    f"--exposure does not support images with an alpha channel, such as {v.name}; leave out --exposure"
-                )
+                raise UsageError(f"--exposure cannot fit images with an alpha channel, such as {v.name}; omit --exposure")
 
     def parameters(self, views: Sequence[View]) -> dict[str, torch.Tensor]:
         """Return zeros, shape [V, 12]."""

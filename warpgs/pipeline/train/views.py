@@ -14,9 +14,9 @@ from warpgs.device import FLOAT, STEP, Needs, StepSizes
 from warpgs.errors import UsageError
 from warpgs.pipeline.metrics.scores import OPAQUE
 from warpgs.pipeline.model.table import Table
-from warpgs.pipeline.train.view_modules import Tensors, ViewModule
+from warpgs.pipeline.train.view_modules import ViewModule
 from warpgs.plugins import returned
-from warpgs.scene import Camera, View
+from warpgs.scene import Camera, Tensors, View
 
 
 def there(array: Any, device: torch.device) -> Any:
@@ -57,9 +57,7 @@ class LearnedViews:
             returned(module, "parameters", own, Mapping, what, each=torch.Tensor, shape=(len(views),))
             for name in own.keys() & first.keys():
                 other = next(m.name for m, names in zip(modules, self._names) if name in names)
-                raise UsageError(
-                    f"the view modules {other!r} and {module.name!r} both have a parameter {name!r}; rename it in one of them"
-                )
+                raise UsageError(f"the view modules {other!r} and {module.name!r} both have a parameter {name!r}; rename one")
             rates = returned(module, "lrs", module.lrs(0.0, 1.0), Mapping, what := "a rate for each parameter, by name")
             returned(module, "lrs", {n: rates.get(n) for n in own}, Mapping, what, each=(int, float))
             first |= {n: t.to(device, torch.float32) for n, t in own.items()}
@@ -93,11 +91,8 @@ class LearnedViews:
 
     def regularisation(self, values: Tensors) -> dict[str, torch.Tensor]:
         """Return the terms that modules add to the loss of a view with these values [...], shape [] each, by module name."""
-        terms = {m.name: (m, m.regularisation(values)) for m in self.modules}
-        what = "a tensor of shape [], or None"
-        return {
-            n: returned(m, "regularisation", t, torch.Tensor, what, shape=()) for n, (m, t) in terms.items() if t is not None
-        }
+        terms, what = [(m, m.regularisation(values)) for m in self.modules], "a tensor of shape [], or None"
+        return {m.name: returned(m, "regularisation", t, torch.Tensor, what, shape=()) for m, t in terms if t is not None}
 
     def cameras(self, given: Mapping[str, Camera], train: Sequence[str], test: Sequence[str]) -> Mapping[str, Camera]:
         """Return the current cameras of all views, by name; arguments are those of `ViewModule.cameras`."""
@@ -123,7 +118,7 @@ class TrainingView:
     """1 for unmasked pixels, 0 for masked ones, shape [H, W]; None without a mask."""
     consistent: torch.Tensor | None = None
     """Geometrically consistent z-depth [u], 0 where no other view confirms it, shape [H, W]; None if not computed."""
-    maps: Mapping[str, torch.Tensor] = field(default_factory=dict)
+    maps: Tensors = field(default_factory=dict)
     """Maps for loss terms (`LossTerm.needs`), by name, each of shape [H, W] or [H, W, C]."""
     alpha: torch.Tensor | None = None
     """Opacity of the subject, in [0, 1], shape [H, W]; None if no training view has one (`with_alpha`)."""

@@ -14,7 +14,7 @@ from warpgs.pipeline.train.schedule import Phases
 from warpgs.pipeline.train.views import TrainingView
 from warpgs.plugins import Registry, returned
 from warpgs.render.options import RasterizeOptions
-from warpgs.scene import Gaussians, Prior
+from warpgs.scene import Gaussians, Prior, Tensors
 from warpgs.schema import anything
 
 T = TypeVar("T")
@@ -189,9 +189,7 @@ class Strategy:
             going: True if the step is taken, bool, shape [1]; if False, nothing may change.
         """
 
-    def statistics(
-        self, phase: Hashable, v_projected: torch.Tensor, visible: torch.Tensor, size: tuple[int, int]
-    ) -> Mapping[str, torch.Tensor]:
+    def statistics(self, phase: Hashable, v_projected: torch.Tensor, visible: torch.Tensor, size: tuple[int, int]) -> Tensors:
         """Return the values that a view of a step adds to columns, by name of the column, shape [N] each.
 
         The values must depend on this view only, because other views of the step may be in other processes. They must be 0
@@ -241,7 +239,7 @@ class Strategy:
         """
         return {}, {}
 
-    def load(self, tensors: Mapping[str, torch.Tensor], plain: dict[str, Any]) -> None:
+    def load(self, tensors: Tensors, plain: dict[str, Any]) -> None:
         """Load what `state` returned."""
 
 

@@ -11,7 +11,7 @@ from warpgs import geometry, schema
 from warpgs.pipeline.model.table import Column, DensityUpdate
 from warpgs.pipeline.train.schedule import PhaseConfig
 from warpgs.pipeline.train.strategies.base import Growth, Strategy, StrategyContext, register
-from warpgs.scene import Gaussians
+from warpgs.scene import Gaussians, Tensors
 from warpgs.schema import Checked, Within
 
 # Growth by gradient: clone, split and prune (Kerbl et al. 2023, section 5.2), as a part of strategies.
@@ -212,9 +212,7 @@ class CloneSplit(Strategy):
         """Return whether gradients are gathered in a step."""
         return self.gradients.gathers(step)
 
-    def statistics(
-        self, phase: Hashable, v_projected: torch.Tensor, visible: torch.Tensor, size: tuple[int, int]
-    ) -> Mapping[str, torch.Tensor]:
+    def statistics(self, phase: Hashable, v_projected: torch.Tensor, visible: torch.Tensor, size: tuple[int, int]) -> Tensors:
         """Return statistics of gradients, [N] each; ``v_projected`` has shape [1, N, 12], ``visible`` [1, N]."""
         return self.gradients.statistics(v_projected, visible, size) if phase else {}
 
@@ -233,6 +231,6 @@ class CloneSplit(Strategy):
         """Return no tensors [...], and whether opacities were reset."""
         return {}, self.gradients.state()
 
-    def load(self, tensors: Mapping[str, torch.Tensor], plain: dict[str, Any]) -> None:
+    def load(self, tensors: Tensors, plain: dict[str, Any]) -> None:
         """Load whether opacities were reset; ``tensors`` [...] are not read."""
         self.gradients.load(plain)

@@ -23,7 +23,7 @@ from warpgs.pipeline.train.views import TrainingView, half_size_camera
 from warpgs.plugins import is_ours
 from warpgs.render.options import RasterizeOptions
 from warpgs.render.rasterize import rasterize
-from warpgs.scene import Camera, Gaussians, base_coefficients
+from warpgs.scene import Camera, Gaussians, Tensors, base_coefficients
 from warpgs.schema import Checked, Within
 
 COARSE, FINE = 0, 1
@@ -94,7 +94,7 @@ class SampledView:
     """Index of the training view."""
     rendered: torch.Tensor
     """Colours before the event, shape [H, W, 3]."""
-    scores: Mapping[str, torch.Tensor]
+    scores: Tensors
     """Scores by name, each [H, W] in [0, 1]; the last one is their sum, the importance. Empty for uniform sampling."""
     gate: torch.Tensor
     """Pixels that could be sampled, bool, shape [H, W]."""
@@ -370,9 +370,7 @@ class Sampling(Strategy):
             held = self.is_protected(settings[Setting.NUMBER]) & going
             logits.copy_(torch.where(held, logits.clamp_min(logit(PROTECTED_OPACITY)), logits))
 
-    def statistics(
-        self, phase: Any, v_projected: torch.Tensor, visible: torch.Tensor, size: tuple[int, int]
-    ) -> dict[str, torch.Tensor]:
+    def statistics(self, phase: Any, v_projected: torch.Tensor, visible: torch.Tensor, size: tuple[int, int]) -> Tensors:
         """Return statistics of gradients, [N] each; ``v_projected`` has shape [1, N, 12], ``visible`` [1, N]."""
         return self.gradients.statistics(v_projected, visible, size) if phase[0] else {}
 
@@ -434,7 +432,7 @@ class Sampling(Strategy):
         """Return no tensors [...], and the events so far."""
         return {}, {**self.gradients.state(), "events": self.events}
 
-    def load(self, tensors: Mapping[str, torch.Tensor], plain: dict[str, Any]) -> None:
+    def load(self, tensors: Tensors, plain: dict[str, Any]) -> None:
         """Load the events so far; ``tensors`` [...] are not read."""
         self.gradients.load(plain)
         self.events = plain["events"]
