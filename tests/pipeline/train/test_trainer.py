@@ -413,7 +413,7 @@ def test_priors_are_made_where_an_event_reads_them(setting, needed, monkeypatch)
     own = {"strategy": "paper", "strategy_config": dataclasses.replace(UNIFORM, **setting)} if setting else {}
     priors = PriorConfig(segmentation_model="labels.onnx")
     config = dataclasses.replace(base, **own, init=InitConfig(source="random"), priors=priors)
-    *_, notes = prepare(photos(2), None, config, np.random.default_rng(0), WARMUP_CPU, None, lambda: None)
+    *_, notes = prepare(photos(2), None, config, WARMUP_CPU, None, lambda: None)
     assert bool(asked) == needed
     assert any("--segmentation-model is not used" in note for note in notes) != needed
 
@@ -429,7 +429,7 @@ def test_missing_points_and_views_are_said_before_anything_takes_time(monkeypatc
     monkeypatch.setattr(setup, "view_priors", lambda *a, **k: pytest.fail("begun"))
     config = dataclasses.replace(PRESETS["default"], init=InitConfig(source="points"))
     with pytest.raises(DataError, match="needs 3D points"):
-        prepare(photos(2), None, config, np.random.default_rng(0), WARMUP_CPU, None, lambda: pytest.fail("asked"))
+        prepare(photos(2), None, config, WARMUP_CPU, None, lambda: pytest.fail("asked"))
     with pytest.raises(DataError, match="no training view"):
         Trainer([], seeds(), FitConfig(), CPU)
 
