@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 import torch
 
+from bench.fits import rivals
 from bench.lib import gsplat_trainer, one_fit, pool, result_file, score_times, surfaces
-from bench.lib.arms import ABLATION, ARMS, LADDER, PAPERS, RIVALS, Arm, chosen_steps
+from bench.lib.arms import ABLATION, ARMS, LADDER, NETWORK, PAPERS, RIVALS, Arm, chosen_steps, steps_in
 from bench.lib.backgrounds import ply_scores
 from bench.lib.gsplat_trainer import default_settings, strategy_of
 from bench.lib.one_fit import Fit, config_of, is_peer, peer_settings
@@ -275,7 +276,7 @@ def test_all_arms_share_start_background_and_degree(views):
     """Those of `default`, for any number of views; the ladder's first arm starts at random, NexusGS from flow."""
     train = photos(views)
     default = settings_by_views(config_of("default"), train, "cpu")[0]
-    for arm in (*RIVALS, *LADDER, *ABLATION):
+    for arm in (*RIVALS, *(a for a in PAPERS if "paper-literal" not in a.preset), *LADDER, *ABLATION):
         if is_peer(arm.preset):
             peer = peer_settings(arm.preset, train)
             assert (peer.sh_degree, peer.background) == (default.sh_degree, mean_color(train)), arm.words
@@ -284,7 +285,30 @@ def test_all_arms_share_start_background_and_degree(views):
         assert (own.sh_degree, own.background) == (default.sh_degree, "auto"), arm.words
         start = (own.init.merge_px, own.init.fill_px, own.init.opacity, own.init.scale_factor)
         same = start == (8, 32, default.init.opacity, default.init.scale_factor) and own.init.source in ("auto", "sweep")
-        assert same != (arm in (LADDER[0], PAPERS[0])), arm.words
+        assert same != (arm is LADDER[0] or arm.words == "NexusGS"), arm.words
+
+
+def test_first_seeds_come_before_further_ones_and_long_fits_last(monkeypatch, tmp_path):
+    """Arms without their network or gsplat are left out; a path comes from the environment, and its name stays in the row."""
+    monkeypatch.delenv(NETWORK, raising=False)
+    monkeypatch.setattr(rivals, "find_spec", lambda name: None)
+    monkeypatch.setattr(rivals, "plan", lambda row, preset, seed, folder, place, count, device: [
+        Fit(row, preset, seed, folder, "s", "a.png" if count else "", 1, device)
+    ])  # fmt: skip
+    a, rows = SimpleNamespace(set="papers", arms=99, seeds=2, folds=1), {"fern:3": ROWS["fern:3"]}
+    study = rivals.Study(a, rows, {"fern:3": "f"}, torch.device("cpu"))
+    words = [arm.words for arm in study.arms]
+    assert "`paper-literal`" in words and not any("network" in w or "gsplat" in w for w in words)
+    assert [(f.preset, f.seed) for f in study.scored([], False)] == [(arm.preset, 0) for arm in (*PAPERS[:2], PAPERS[-2])]
+    tuning = study.tuning()
+    assert len(tuning) == sum(len(arm.steps) for arm in study.arms) and all(f.seed == 0 and f.left_out for f in tuning)
+    done = [t.key | {"psnr": 20.0 + i} for i, t in enumerate(tuning)]
+    fits = study.scored(done, True)
+    assert [f.seed for f in fits] == [0] * len(words) + [1] * len(words) and fits[-1].preset == "paper-literal"
+    monkeypatch.setenv(NETWORK, str(tmp_path / "n.onnx"))
+    arm = PAPERS[-1]
+    assert not rivals.missing(arm) and "$" in arm.preset and str(tmp_path) not in arm.preset
+    assert config_of(arm.preset).priors.segmentation_model == str(tmp_path / "n.onnx") and steps_in(arm.preset) == 30_000
 
 
 @pytest.mark.usefixtures("registries_as_they_were")

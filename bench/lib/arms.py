@@ -5,9 +5,10 @@ from __future__ import annotations
 import re
 import statistics
 from collections import defaultdict
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from warpgs.errors import UsageError
+from warpgs.pipeline.train.presets import PRESETS
 from warpgs.pipeline.train.settings import OPAQUE_STEPS
 
 ONE_RULE = "background=auto,sh_degree=null,init.source=sweep,init.merge_px=8,init.fill_px=32"
@@ -44,34 +45,48 @@ def _paper(words: str, published: tuple[float, float, str] | None, rule: str = O
     return Arm(words, f"examples/rivals/{name}.py:{name}:{rule}", PAPER_STEPS, published)
 
 
-PAPER_STEPS = (500, 1000, 2000, 4000)
-"""Numbers of steps of the papers' methods; CoR-GS took 750 and 1500 on rows of three views."""
+PAPER_STEPS = (500, 1500, 4000)
+"""Numbers of steps of the papers' methods."""
+FEW_STEPS = (250, 500, 1000)
+"""Numbers of steps of `3dgs` and gsplat beside the papers' methods: of `STEPS`, those that rows of three views choose."""
 XIONG = "Xiong et al."
 """Authors of a table of many methods: the paper of `CITATION.cff`."""
 OWN_START = "background=auto,sh_degree=null"
 """Rule for a method that is mostly its start."""
 COR_GS = f"3dgs:strategy=examples/11_cor_gs.py:CorGS,density.gradient=0.0005,{ONE_RULE}"
 GSPLAT = "gsplat:sh_degree=auto,background=mean"
-PAPERS = (
-    _paper("NexusGS", (21.07, 0.738, XIONG), OWN_START),
-    _paper("FSGS", (20.43, 0.682, XIONG)),
-    _paper("DNGaussian", (19.12, 0.591, XIONG)),
-    _paper("DropGaussian", None),
-    _paper("Binocular3DGS", (21.36, 0.744, "rerun of ReDI-GS")),
-)
-"""Methods of papers as plug-ins, all with the start of `ONE_RULE` but NexusGS."""
-RIVALS = (
+NETWORK = "SEGMENTATION"
+"""Environment variable with the path of a segmentation network, an ONNX file of 21 classes."""
+OURS = (
     Arm("`default` without extrapolated points", f"default:{NO_EXTRAPOLATION}"),
     Arm("`default`", "default"),
+)
+RIVALS = (
+    *OURS,
     Arm("`3dgs`", f"3dgs:{ONE_RULE}", STEPS, (18.54, 0.588, XIONG)),
     Arm("CoR-GS", COR_GS, (750, 1500, 3000, 6000), (20.45, 0.712, XIONG)),
-    *PAPERS,
     Arm("gsplat", GSPLAT, STEPS),
     Arm("gsplat, as many steps as `default`", f"{GSPLAT},steps={OPAQUE_STEPS}"),
     Arm("gsplat, 7,000 steps", f"{GSPLAT},steps=7000"),
     Arm("gsplat, 30,000 steps", f"{GSPLAT},steps=30000"),
 )
 """Methods under one rule: start (but for extrapolated points), background, degree and scores are those of `default`."""
+PAPERS = (
+    *OURS,
+    replace(RIVALS[2], steps=FEW_STEPS),
+    replace(RIVALS[3], steps=(750, 1500, 3000)),
+    _paper("NexusGS", (21.07, 0.738, XIONG), OWN_START),
+    _paper("FSGS", (20.43, 0.682, XIONG)),
+    _paper("DNGaussian", (19.12, 0.591, XIONG)),
+    _paper("DropGaussian", None),
+    _paper("Binocular3DGS", (21.36, 0.744, "rerun of ReDI-GS")),
+    replace(RIVALS[4], steps=FEW_STEPS),
+    Arm("`paper-literal`", "paper-literal", (), (21.17, 0.746, XIONG)),
+    Arm("`paper-literal`, segmentation by a network", f"paper-literal:priors.segmentation_model=${NETWORK}"),
+)
+"""Methods of papers as plug-ins with the start of `ONE_RULE`, but NexusGS; and the paper's own settings and steps."""
+DTU = tuple(replace(PAPERS[n], published=None) for n in (1, 2, 3, 4, 9))
+"""Methods on an object of DTU."""
 LADDER = (
     Arm("`3dgs`, random points", "3dgs:background=auto,sh_degree=null", STEPS),
     Arm("`3dgs`, start from the depth sweep", f"3dgs:{ONE_RULE}", STEPS),
@@ -100,12 +115,15 @@ ABLATION = (
     Arm("no dropout", "default:dropout=0"),
 )
 """One part of `default` changed."""
-ARMS = {"rivals": RIVALS, "papers": (RIVALS[0], *PAPERS), "ladder": LADDER, "ablation": ABLATION}
+ARMS = {"rivals": RIVALS, "papers": PAPERS, "dtu": DTU, "ladder": LADDER, "ablation": ABLATION}
 
 
 def steps_in(preset: str) -> int:
     """Return the steps that a preset sets, else those of `default` for few views."""
-    return int(match[1]) if (match := re.search(r"[:,]steps=(\d+)", preset)) else OPAQUE_STEPS
+    if match := re.search(r"[:,]steps=(\d+)", preset):
+        return int(match[1])
+    named = PRESETS.get(preset.partition(":")[0])
+    return (named.steps if named else None) or OPAQUE_STEPS
 
 
 def chosen_steps(rows: list[dict], row: str, arm: Arm) -> int:

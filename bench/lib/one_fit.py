@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import gc
 import json
+import os
 import re
 import statistics
 import tempfile
@@ -127,7 +128,7 @@ def _change(values: dict, preset: str, changes: str) -> None:
         try:
             place[last] = json.loads(value)
         except json.JSONDecodeError:
-            place[last] = value
+            place[last] = os.path.expandvars(value)  # a path of this machine: $NAME
         if key == "strategy":
             kind = STRATEGIES.load(value).Config
             values["strategy_config"] = None if kind is None else dataclasses.asdict(kind())
