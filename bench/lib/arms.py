@@ -74,7 +74,7 @@ RIVALS = (
 PAPERS = (
     *OURS,
     replace(RIVALS[2], steps=FEW_STEPS),
-    replace(RIVALS[3], steps=(750, 1500, 3000)),
+    replace(RIVALS[3], steps=(500, 1000, 2000)),
     _paper("NexusGS", (21.07, 0.738, XIONG), OWN_START),
     _paper("FSGS", (20.43, 0.682, XIONG)),
     _paper("DNGaussian", (19.12, 0.591, XIONG)),
