@@ -117,7 +117,7 @@ def _change(values: dict, preset: str, changes: str) -> None:
     """Change nested values as a preset says after its colon; settings of a strategy stand in the group of its flags."""
     for change in filter(None, changes.split(",")):
         key, sep, value = change.partition("=")
-        *groups, last = key.split(".")
+        *groups, last = key.replace("-", "_").split(".")
         place = values
         for group in groups:
             if place is values and values.get("strategy_config") is not None and group == flag_group(values["strategy"]):
