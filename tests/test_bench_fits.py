@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from bench.fits import rivals
-from bench.lib import gsplat_trainer, one_fit, pool, result_file, score_times, surfaces
+from bench.lib import arm_fits, gsplat_trainer, one_fit, pool, result_file, score_times, surfaces
 from bench.lib.arms import ABLATION, ARMS, LADDER, NETWORK, PAPERS, RIVALS, Arm, chosen_steps, steps_in
 from bench.lib.backgrounds import ply_scores
 from bench.lib.gsplat_trainer import default_settings, strategy_of
@@ -291,12 +290,12 @@ def test_all_arms_share_start_background_and_degree(views):
 def test_first_seeds_come_before_further_ones_and_long_fits_last(monkeypatch, tmp_path):
     """Arms without their network or gsplat are left out; a path comes from the environment, and its name stays in the row."""
     monkeypatch.delenv(NETWORK, raising=False)
-    monkeypatch.setattr(rivals, "find_spec", lambda name: None)
-    monkeypatch.setattr(rivals, "plan", lambda row, preset, seed, folder, place, count, device: [
+    monkeypatch.setattr(arm_fits, "find_spec", lambda name: None)
+    monkeypatch.setattr(arm_fits, "plan", lambda row, preset, seed, folder, place, count, device: [
         Fit(row, preset, seed, folder, "s", "a.png" if count else "", 1, device)
     ])  # fmt: skip
     a, rows = SimpleNamespace(set="papers", arms=99, seeds=2, folds=1), {"fern:3": ROWS["fern:3"]}
-    study = rivals.Study(a, rows, {"fern:3": "f"}, torch.device("cpu"))
+    study = arm_fits.ArmFits(a, rows, {"fern:3": "f"}, torch.device("cpu"))
     words = [arm.words for arm in study.arms]
     assert "`paper-literal`" in words and not any("network" in w or "gsplat" in w for w in words)
     assert [(f.preset, f.seed) for f in study.scored([], False)] == [(arm.preset, 0) for arm in (*PAPERS[:2], PAPERS[-2])]
@@ -307,7 +306,7 @@ def test_first_seeds_come_before_further_ones_and_long_fits_last(monkeypatch, tm
     assert [f.seed for f in fits] == [0] * len(words) + [1] * len(words) and fits[-1].preset == "paper-literal"
     monkeypatch.setenv(NETWORK, str(tmp_path / "n.onnx"))
     arm = PAPERS[-1]
-    assert not rivals.missing(arm) and "$" in arm.preset and str(tmp_path) not in arm.preset
+    assert not arm_fits.missing(arm) and "$" in arm.preset and str(tmp_path) not in arm.preset
     assert config_of(arm.preset).priors.segmentation_model == str(tmp_path / "n.onnx") and steps_in(arm.preset) == 30_000
 
 
