@@ -314,7 +314,8 @@ def test_first_seeds_come_before_further_ones_and_long_fits_last(monkeypatch, tm
 def test_the_page_pairs_each_method_with_its_base():
     """Pairs by seed with the first arm or the one above; few seeds have no interval; other steps stand beside the first arm."""
     arms = (Arm("a", "default"), Arm("b", "3dgs", (10, 20)), Arm("c", "mcmc:steps=7"))
-    rows = results("fern:3", "default", [20.0, 20.2, 20.1]) + results("fern:3", "3dgs:steps=20", [21.0, 21.4, 21.2])
+    rows = results("fern:3", "default", [20.0, 20.2, 20.1], steps=4500)
+    rows += results("fern:3", "3dgs:steps=20", [21.0, 21.4, 21.2], steps=20)
     rows += results("fern:3", "mcmc:steps=7", [19.0, 19.2])
     rows += [{"row": "fern:3", "preset": f"3dgs:steps={n}", "seed": 0, "left_out": "x", "psnr": float(n)} for n in (10, 20)]
     table = arms_table(arms, rows, ["fern:3"], above=False).splitlines()

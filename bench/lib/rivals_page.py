@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from bench.lib import result_file
-from bench.lib.arms import DTU, LADDER, PAPERS, RERUNS, RIVALS, Arm, chosen_steps, steps_in
+from bench.lib.arms import DTU, LADDER, PAPERS, RERUNS, RIVALS, Arm, chosen_steps
 from bench.lib.preset_table import by_seed
 from bench.lib.scenes import ROWS, row_of
 from bench.lib.tables import markdown
@@ -49,6 +49,7 @@ def arms_table(arms: Sequence[Arm], rows: list[dict], names: Sequence[str], abov
     """Return PSNR and SSIM of each arm on each row, its steps, and the difference in PSNR to the base."""
     held_out = [r for r in rows if not r.get("left_out")]
     found, confidence, body = by_seed(held_out), family_confidence(len(arms) - 1), []
+    usual = statistics.mode(len(seeds) for (name, _), seeds in found.items() if name in names)
     for place, arm in enumerate(arms):
         body.append([arm.words])
         for name in names:
@@ -64,9 +65,9 @@ def arms_table(arms: Sequence[Arm], rows: list[dict], names: Sequence[str], abov
             change = (
                 f"{d.mean:+.2f} [{d.low:+.2f}, {d.high:+.2f}]" if len(seeds) >= SEEDS else f"{d.mean:+.2f}" if seeds else ""
             )
-            count = "" if len(own) == max(len(s) for s in found.values()) else f" ({len(own)} seed{'s' * (len(own) > 1)})"
+            count = "" if len(own) == usual else f" ({len(own)} seed{'s' * (len(own) > 1)})"
             score = " / ".join(f"{statistics.mean(r[k] for r in own.values()):.{n}f}" for k, n in (("psnr", 2), ("ssim", 3)))
-            body[-1] += [f"{steps_in(preset):,}", score + count, change]
+            body[-1] += [f"{statistics.mean(r['steps'] for r in own.values()):,.0f}", score + count, change]
     head = [h for s in headings(names) for h in (f"{s}: steps", "PSNR / SSIM", "change" if above else "difference")]
     return markdown(["step" if above else "method", *head], body, ["step" if above else "method"])
 
@@ -82,16 +83,18 @@ def _page_table(name: str, arms: Sequence[Arm], above: bool, command: str = "", 
     for machine, result in _stored(name).items():
         rows = result["rows"]
         names = rows_of(rows)
-        measured = [arm for arm in arms if any(preset_in(rows, n, arm) for n in names)]
         parts = [names[i : i + width] for i in range(0, len(names), width)]
-        tables += [*(arms_table(measured, rows, part, above) for part in parts), result_file.source(f"{name}_{machine}")]
+        for part in parts:
+            shown = [arm for arm in arms if any(preset_in(rows, n, arm) for n in part)]
+            tables.append(arms_table(shown, rows, part, above))
+        tables.append(result_file.source(f"{name}_{machine}"))
     command = command or f"--rows fern:3 horns:3 --set {name}"
     return "\n".join(tables) or f"Not measured yet: `python -m bench.fits.rivals DATA {command} --out FILE`.\n"
 
 
 def rivals() -> str:
     """Return the table of gsplat's trainer with more steps."""
-    return _page_table("rivals", (RIVALS[0], *RIVALS[4:]), above=False)
+    return _page_table("rivals", (RIVALS[0], RIVALS[5], RIVALS[7]), above=False)
 
 
 def papers() -> str:
