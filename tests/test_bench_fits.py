@@ -294,7 +294,7 @@ def test_first_seeds_come_before_further_ones_and_long_fits_last(monkeypatch, tm
     monkeypatch.setattr(arm_fits, "plan", lambda row, preset, seed, folder, place, count, device: [
         Fit(row, preset, seed, folder, "s", "a.png" if count else "", 1, device)
     ])  # fmt: skip
-    a, rows = SimpleNamespace(set="papers", arms=99, seeds=2, folds=1), {"fern:3": ROWS["fern:3"]}
+    a, rows = SimpleNamespace(set="papers", arms=99, seeds=3, folds=1), {"fern:3": ROWS["fern:3"]}
     study = arm_fits.ArmFits(a, rows, {"fern:3": "f"}, torch.device("cpu"))
     words = [arm.words for arm in study.arms]
     assert "`paper-literal`" in words and not any("network" in w or "gsplat" in w for w in words)
@@ -303,7 +303,9 @@ def test_first_seeds_come_before_further_ones_and_long_fits_last(monkeypatch, tm
     assert len(tuning) == sum(len(arm.steps) for arm in study.arms) and all(f.seed == 0 and f.left_out for f in tuning)
     done = [t.key | {"psnr": 20.0 + i} for i, t in enumerate(tuning)]
     fits = study.scored(done, True)
-    assert [f.seed for f in fits] == [0] * len(words) + [1] * len(words) and fits[-1].preset == "paper-literal"
+    others = len(words) - 1
+    assert [f.seed for f in fits] == [0] * (others + 1) + [1] * others + [2] * others + [1, 2]
+    assert [f.preset for f in fits[-2:]] == ["paper-literal"] * 2
     monkeypatch.setenv(NETWORK, str(tmp_path / "n.onnx"))
     arm = PAPERS[-1]
     assert not arm_fits.missing(arm) and "$" in arm.preset and str(tmp_path) not in arm.preset
