@@ -11,15 +11,15 @@ import numpy as np
 import pytest
 import torch
 
-from bench.lib import gsplat_trainer, one_fit, pool, result_file, score_times, surfaces
-from bench.lib.arms import ABLATION, ARMS, LADDER, PAPERS, RIVALS, Arm, chosen_steps
+from bench.lib import arm_fits, gsplat_trainer, one_fit, pool, result_file, score_times, surfaces
+from bench.lib.arms import ABLATION, ARMS, LADDER, NETWORK, PAPERS, RIVALS, Arm, chosen_steps, steps_in
 from bench.lib.backgrounds import ply_scores
 from bench.lib.gsplat_trainer import default_settings, strategy_of
 from bench.lib.one_fit import Fit, config_of, is_peer, peer_settings
 from bench.lib.points import exponent
 from bench.lib.pool import finished
 from bench.lib.preset_table import rival, sizes_table, tables
-from bench.lib.rivals_page import arms_table, other_steps_table, rows_of, scene_of
+from bench.lib.rivals_page import arms_table, headings, reruns_table, rows_of, scene_of
 from bench.lib.scenes import PHOTOGRAPHS, ROWS, Row, folds, left_out, photographs, row_of, scene_at
 from tests import gaussians as sets
 from tests.scenes import photos
@@ -257,7 +257,7 @@ def test_a_stopped_comparison_goes_on(tmp_path, monkeypatch, capsys):
 
 def test_a_preset_changes_what_it_names_and_nothing_else():
     """Values by name in the preset's settings; what sets nothing is refused."""
-    made = one_fit.config_of("quick:optimizer.scales_decay=0.5,init.source=flow,steps=7", 3).to_json()
+    made = one_fit.config_of("quick:optimizer.scales-decay=0.5,init.source=flow,steps=7", 3).to_json()
     base = PRESETS["quick"].to_json() | {"seed": 3}
     base["optimizer"]["scales_decay"], base["init"]["source"], base["steps"] = 0.5, "flow", 7
     assert made == base and one_fit.config_of("pruned/quick") == PRESETS["quick"]
@@ -275,7 +275,7 @@ def test_all_arms_share_start_background_and_degree(views):
     """Those of `default`, for any number of views; the ladder's first arm starts at random, NexusGS from flow."""
     train = photos(views)
     default = settings_by_views(config_of("default"), train, "cpu")[0]
-    for arm in (*RIVALS, *LADDER, *ABLATION):
+    for arm in (*RIVALS, *(a for a in PAPERS if "paper-literal" not in a.preset), *LADDER, *ABLATION):
         if is_peer(arm.preset):
             peer = peer_settings(arm.preset, train)
             assert (peer.sh_degree, peer.background) == (default.sh_degree, mean_color(train)), arm.words
@@ -284,14 +284,40 @@ def test_all_arms_share_start_background_and_degree(views):
         assert (own.sh_degree, own.background) == (default.sh_degree, "auto"), arm.words
         start = (own.init.merge_px, own.init.fill_px, own.init.opacity, own.init.scale_factor)
         same = start == (8, 32, default.init.opacity, default.init.scale_factor) and own.init.source in ("auto", "sweep")
-        assert same != (arm in (LADDER[0], PAPERS[0])), arm.words
+        assert same != (arm is LADDER[0] or arm.words == "NexusGS"), arm.words
+
+
+def test_first_seeds_come_before_further_ones_and_long_fits_last(monkeypatch, tmp_path):
+    """Arms without their network or gsplat are left out; a path comes from the environment, and its name stays in the row."""
+    monkeypatch.delenv(NETWORK, raising=False)
+    monkeypatch.setattr(arm_fits, "find_spec", lambda name: None)
+    monkeypatch.setattr(arm_fits, "plan", lambda row, preset, seed, folder, place, count, device: [
+        Fit(row, preset, seed, folder, "s", "a.png" if count else "", 1, device)
+    ])  # fmt: skip
+    a, rows = SimpleNamespace(set="papers", arms=99, seeds=3, folds=1), {"fern:3": ROWS["fern:3"]}
+    study = arm_fits.ArmFits(a, rows, {"fern:3": "f"}, torch.device("cpu"))
+    words = [arm.words for arm in study.arms]
+    assert "`paper-literal`" in words and not any("network" in w or "gsplat" in w for w in words)
+    assert [(f.preset, f.seed) for f in study.scored([], False)] == [(arm.preset, 0) for arm in (*PAPERS[:2], PAPERS[-2])]
+    tuning = study.tuning()
+    assert len(tuning) == sum(len(arm.steps) for arm in study.arms) and all(f.seed == 0 and f.left_out for f in tuning)
+    done = [t.key | {"psnr": 20.0 + i} for i, t in enumerate(tuning)]
+    fits = study.scored(done, True)
+    others = len(words) - 1
+    assert [f.seed for f in fits] == [0] * (others + 1) + [1] * others + [2] * others + [1, 2]
+    assert [f.preset for f in fits[-2:]] == ["paper-literal"] * 2
+    monkeypatch.setenv(NETWORK, str(tmp_path / "n.onnx"))
+    arm = PAPERS[-1]
+    assert not arm_fits.missing(arm) and "$" in arm.preset and str(tmp_path) not in arm.preset
+    assert config_of(arm.preset).priors.segmentation_model == str(tmp_path / "n.onnx") and steps_in(arm.preset) == 30_000
 
 
 @pytest.mark.usefixtures("registries_as_they_were")
 def test_the_page_pairs_each_method_with_its_base():
     """Pairs by seed with the first arm or the one above; few seeds have no interval; other steps stand beside the first arm."""
     arms = (Arm("a", "default"), Arm("b", "3dgs", (10, 20)), Arm("c", "mcmc:steps=7"))
-    rows = results("fern:3", "default", [20.0, 20.2, 20.1]) + results("fern:3", "3dgs:steps=20", [21.0, 21.4, 21.2])
+    rows = results("fern:3", "default", [20.0, 20.2, 20.1], steps=4500)
+    rows += results("fern:3", "3dgs:steps=20", [21.0, 21.4, 21.2], steps=20)
     rows += results("fern:3", "mcmc:steps=7", [19.0, 19.2])
     rows += [{"row": "fern:3", "preset": f"3dgs:steps={n}", "seed": 0, "left_out": "x", "psnr": float(n)} for n in (10, 20)]
     table = arms_table(arms, rows, ["fern:3"], above=False).splitlines()
@@ -302,16 +328,22 @@ def test_the_page_pairs_each_method_with_its_base():
     assert "| c | 7 | 19.10 / 0.500 (2 seeds) | -1.00 |" in table
     again = arms_table((*arms, Arm("d", "quick")), rows, ["fern:3"], above=True).splitlines()
     assert again[-2:] == ["| c | 7 | 19.10 / 0.500 (2 seeds) | -2.10 |", "| d |  |  |  |"]
-    arms = (Arm("a", "default", (), (20.5, 0.7, "its paper")), *arms[1:])
-    again = arms_table(arms, rows, ["fern:3"], above=False).splitlines()
-    assert "| a | 4,500 | 20.10 / 0.500 |  | 20.50 / 0.700, its paper |" in again and again[-1].endswith("| -1.00 |  |")
     assert rows_of([{"row": r} for r in ("llff/room@llff:3", "horns:3", "fern:3")]) == ["fern:3", "horns:3", "llff/room@llff:3"]
     assert [scene_of(n) for n in ("fern:3", "llff/room@llff:3")] == ["fern", "room"]
-    arms = (Arm("a", "default"), Arm("b", "3dgs", (10, 20)))
-    rows = results("fern:3", "3dgs:steps=10", [21.0, 21.4]) + results("fern:3", "3dgs:steps=20", [20.0])
-    rows += results("fern:3", "default", [22.0, 22.0, 25.0])
-    rows += [{"row": "fern:3", "preset": f"3dgs:steps={n}", "seed": 0, "left_out": "x", "psnr": float(n)} for n in (10, 20)]
-    assert other_steps_table(arms, rows, ["fern:3"]).splitlines()[2:] == ["| fern | b | 10 | 21.20 ± 0.28 (2 seeds) | -0.80 |"]
+    assert headings(["fern:3", "llff/room@llff:3"]) == ["fern", "room"] and headings(["fern:3"]) == ["fern"]
+    assert headings([f"dtu_scan37@dtu:{n}@4" for n in (3, 6)]) == ["dtu:3", "dtu:6"]
+
+
+def test_a_method_far_below_its_authors_code_is_not_reproduced():
+    """The distance is of means over seeds; more than 0.4 dB on one scene decides; a scene without ours has none."""
+    arms = (Arm("FSGS", "fsgs"), Arm("CoR-GS", "cor"), Arm("a", "default"))
+    rows = results("fern:3", "fsgs", [21.4, 21.6]) + results("horns:3", "fsgs", [21.0]) + results("fern:3", "cor", [22.0])
+    assert reruns_table(arms, rows, ["fern:3", "horns:3"]).splitlines()[2:] == [
+        "| FSGS | 21.90 / 0.721 | -0.40 | 20.19 / 0.716 | +0.81 | reproduced |",
+        "| CoR-GS | 22.29 / 0.745 | -0.29 | 19.02 / 0.689 |  | reproduced |",
+    ]
+    rows += results("horns:3", "cor", [18.6])
+    assert reruns_table(arms, rows, ["fern:3", "horns:3"]).splitlines()[3].endswith("| -0.42 | not reproduced |")
 
 
 @pytest.mark.usefixtures("registries_as_they_were")

@@ -97,7 +97,7 @@ BY_HAND = {
     ("evaluation.md", "| key | definition"): "definitions",
     ("numerics.md", "| change | time"): "a summary of two files of results, with charts of both",
     ("presets.md", "| setting | rule"): "compared with the rule itself, below",
-    ("results.md", "| method | `fern`"): "published scores, each with its source",
+    ("results.md", "| cited | networks"): "published scores, each with its source",
     ("tiles.md", "| bound | margin"): "derived margins",
 }
 """Tables with numbers that no file of results holds: page, first words, reason."""

@@ -130,7 +130,7 @@ def test_fsgs_adds_gaussians_on_long_edges_and_correlates_depth():
 
 
 def test_dngaussian_compares_normalised_patches_and_moves_what_each_term_may():
-    """Equal up to scale and offset: 0; reversed: 4, and 0.4 by the image; hard depth moves means alone, soft one opacities."""
+    """Equal up to scale and offset: 0; reversed: 0.4, and 4 by the image; hard depth moves means alone, soft one opacities."""
     config = preset("dngaussian")
     own, a = module(config), torch.tensor([[1.0, 2.0], [3.0, 4.0]])
     every = torch.ones(2, 2, dtype=torch.bool)
@@ -142,7 +142,7 @@ def test_dngaussian_compares_normalised_patches_and_moves_what_each_term_may():
     )
     settings = own.DnConfig(patch=2, tolerance=0)
     found = float(own.depth_difference(two, given, torch.ones(2, 4, dtype=torch.bool), settings))
-    assert found == pytest.approx(2 + 0.1 * float(gap.mean()), rel=1e-4)
+    assert found == pytest.approx(0.1 * 2 + float(gap.mean()), rel=1e-4)
     strategy = short(config).strategy
     table = strategy.context.table
     for term, names in zip(strategy.terms(table.gaussians), ({"means"}, {"logit_opacities"}), strict=True):

@@ -21,7 +21,7 @@ WORDS = {
     "rows": "named rows, or FOLDER@SPLIT@DOWNSCALE",
     "seconds": "time after which no further fit begins [s]",
     "seeds": "number of seeds, or the seeds themselves where the default is a list",
-    "set": "comparison: rivals, papers, ladder or ablation (bench/lib/arms.py)",
+    "set": "comparison: rivals, papers, dtu, ladder or ablation (bench/lib/arms.py)",
     "shrink": "factor by which both sides of images shrink further, to try the program",
     "split": "as in `warpgs fit --split`",
     "threads": "CPU threads; 0 for as many as there are",

@@ -5,9 +5,10 @@ from __future__ import annotations
 import re
 import statistics
 from collections import defaultdict
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from warpgs.errors import UsageError
+from warpgs.pipeline.train.presets import PRESETS
 from warpgs.pipeline.train.settings import OPAQUE_STEPS
 
 ONE_RULE = "background=auto,sh_degree=null,init.source=sweep,init.merge_px=8,init.fill_px=32"
@@ -29,49 +30,65 @@ class Arm:
     """Preset with its settings, as `bench.lib.one_fit.Fit` takes it, without steps that are chosen."""
     steps: tuple[int, ...] = ()
     """Numbers of steps to choose from; empty for those of the preset."""
-    published: tuple[float, float, str] | None = None
-    """PSNR [dB] and SSIM of the method on LLFF with three views, means of eight scenes, and who reports them. Not comparable
-    with ours: other starts, and other scenes."""
 
     def with_steps(self, steps: int) -> str:
         """Return the preset with a number of steps."""
         return f"{self.preset}{',' if ':' in self.preset else ':'}steps={steps}"
 
 
-def _paper(words: str, published: tuple[float, float, str] | None, rule: str = ONE_RULE) -> Arm:
+def _paper(words: str, rule: str = ONE_RULE) -> Arm:
     """Return the arm of a method in `examples/rivals`, of the file and preset with the method's name in small letters."""
     name = words.lower()
-    return Arm(words, f"examples/rivals/{name}.py:{name}:{rule}", PAPER_STEPS, published)
+    return Arm(words, f"examples/rivals/{name}.py:{name}:{rule}", PAPER_STEPS)
 
 
-PAPER_STEPS = (500, 1000, 2000, 4000)
-"""Numbers of steps of the papers' methods; CoR-GS took 750 and 1500 on rows of three views."""
-XIONG = "Xiong et al."
-"""Authors of a table of many methods: the paper of `CITATION.cff`."""
+PAPER_STEPS = (500, 1500, 4000)
+"""Numbers of steps of the papers' methods."""
+FEW_STEPS = (250, 500, 1000)
+"""Numbers of steps of `3dgs` and gsplat beside the papers' methods: of `STEPS`, those that rows of three views choose."""
 OWN_START = "background=auto,sh_degree=null"
 """Rule for a method that is mostly its start."""
 COR_GS = f"3dgs:strategy=examples/11_cor_gs.py:CorGS,density.gradient=0.0005,{ONE_RULE}"
 GSPLAT = "gsplat:sh_degree=auto,background=mean"
-PAPERS = (
-    _paper("NexusGS", (21.07, 0.738, XIONG), OWN_START),
-    _paper("FSGS", (20.43, 0.682, XIONG)),
-    _paper("DNGaussian", (19.12, 0.591, XIONG)),
-    _paper("DropGaussian", None),
-    _paper("Binocular3DGS", (21.36, 0.744, "rerun of ReDI-GS")),
-)
-"""Methods of papers as plug-ins, all with the start of `ONE_RULE` but NexusGS."""
-RIVALS = (
+NETWORK = "SEGMENTATION"
+"""Environment variable with the path of a segmentation network, an ONNX file of 21 classes."""
+OURS = (
     Arm("`default` without extrapolated points", f"default:{NO_EXTRAPOLATION}"),
     Arm("`default`", "default"),
-    Arm("`3dgs`", f"3dgs:{ONE_RULE}", STEPS, (18.54, 0.588, XIONG)),
-    Arm("CoR-GS", COR_GS, (750, 1500, 3000, 6000), (20.45, 0.712, XIONG)),
-    *PAPERS,
+)
+RIVALS = (
+    *OURS,
+    Arm("`3dgs`", f"3dgs:{ONE_RULE}", STEPS),
+    Arm("CoR-GS", COR_GS, (750, 1500, 3000, 6000)),
     Arm("gsplat", GSPLAT, STEPS),
     Arm("gsplat, as many steps as `default`", f"{GSPLAT},steps={OPAQUE_STEPS}"),
     Arm("gsplat, 7,000 steps", f"{GSPLAT},steps=7000"),
     Arm("gsplat, 30,000 steps", f"{GSPLAT},steps=30000"),
 )
 """Methods under one rule: start (but for extrapolated points), background, degree and scores are those of `default`."""
+PAPERS = (
+    *OURS,
+    replace(RIVALS[2], steps=FEW_STEPS),
+    replace(RIVALS[3], steps=(500, 1000, 2000)),
+    _paper("NexusGS", OWN_START),
+    _paper("FSGS"),
+    _paper("DNGaussian"),
+    _paper("DropGaussian"),
+    _paper("Binocular3DGS"),
+    replace(RIVALS[4], steps=FEW_STEPS),
+    Arm("`paper-literal`", "paper-literal"),
+    Arm("`paper-literal`, segmentation by a network", f"paper-literal:priors.segmentation_model=${NETWORK}"),
+)
+"""Methods of papers as plug-ins with the start of `ONE_RULE`, but NexusGS; and the paper's own settings and steps."""
+RERUNS = {
+    "CoR-GS": {"fern": (22.29, 0.745), "horns": (19.02, 0.689)},
+    "FSGS": {"fern": (21.90, 0.721), "horns": (20.19, 0.716)},
+    "DNGaussian": {"fern": (20.51, 0.654), "horns": (19.25, 0.639)},
+    "Binocular3DGS": {"fern": (22.58, 0.758), "horns": (20.61, 0.751)},
+}
+"""PSNR [dB] and SSIM that the authors' code reached at our size and split, one run each: docs/ablation of myduynn04/ReDI-GS."""
+DTU = tuple(PAPERS[n] for n in (1, 2, 3, 4, 9))
+"""Methods on an object of DTU."""
 LADDER = (
     Arm("`3dgs`, random points", "3dgs:background=auto,sh_degree=null", STEPS),
     Arm("`3dgs`, start from the depth sweep", f"3dgs:{ONE_RULE}", STEPS),
@@ -100,12 +117,15 @@ ABLATION = (
     Arm("no dropout", "default:dropout=0"),
 )
 """One part of `default` changed."""
-ARMS = {"rivals": RIVALS, "papers": (RIVALS[0], *PAPERS), "ladder": LADDER, "ablation": ABLATION}
+ARMS = {"rivals": RIVALS, "papers": PAPERS, "dtu": DTU, "ladder": LADDER, "ablation": ABLATION}
 
 
 def steps_in(preset: str) -> int:
     """Return the steps that a preset sets, else those of `default` for few views."""
-    return int(match[1]) if (match := re.search(r"[:,]steps=(\d+)", preset)) else OPAQUE_STEPS
+    if match := re.search(r"[:,]steps=(\d+)", preset):
+        return int(match[1])
+    named = PRESETS.get(preset.partition(":")[0])
+    return (named.steps if named else None) or OPAQUE_STEPS
 
 
 def chosen_steps(rows: list[dict], row: str, arm: Arm) -> int:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import gc
 import json
+import os
 import re
 import statistics
 import tempfile
@@ -116,7 +117,7 @@ def _change(values: dict, preset: str, changes: str) -> None:
     """Change nested values as a preset says after its colon; settings of a strategy stand in the group of its flags."""
     for change in filter(None, changes.split(",")):
         key, sep, value = change.partition("=")
-        *groups, last = key.split(".")
+        *groups, last = key.replace("-", "_").split(".")
         place = values
         for group in groups:
             if place is values and values.get("strategy_config") is not None and group == flag_group(values["strategy"]):
@@ -127,7 +128,7 @@ def _change(values: dict, preset: str, changes: str) -> None:
         try:
             place[last] = json.loads(value)
         except json.JSONDecodeError:
-            place[last] = value
+            place[last] = os.path.expandvars(value)  # a path of this machine: $NAME
         if key == "strategy":
             kind = STRATEGIES.load(value).Config
             values["strategy_config"] = None if kind is None else dataclasses.asdict(kind())

@@ -18,8 +18,11 @@ PARTS: dict[str, Callable[[], dict[str, str]]] = {
     "results.md": lambda: {
         "ablation": results_page.ablation(),
         "views": results_page.views(),
+        "untouched": results_page.untouched(),
         "rivals": rivals_page.rivals(),
-        "other steps": rivals_page.other_steps(),
+        "papers": rivals_page.papers(),
+        "reruns": rivals_page.reruns(),
+        "dtu": rivals_page.dtu(),
         "ladder of default": rivals_page.ladder_of_default(),
     },
 }

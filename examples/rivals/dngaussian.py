@@ -4,10 +4,12 @@
 
 Hard depth is rendered with one opacity, 0.95, for all Gaussians, and moves only their means; soft depth is rendered as it is,
 and changes only opacities. Both are compared with the depth map of a training view: that of `--depths` or `--depth-model`, else
-of the depth sweep. Maps are normalised in patches by the patch's own standard deviation, and with weight 0.1 by the image's.
+of the depth sweep. Maps are normalised in patches by the image's standard deviation, and with weight 0.1 by the patch's own.
 Maps are inverse depths here, as networks give them.
-Missing here: the neural colour field, patches of a random size (5 to 17 px in the paper), and the learning rates for a start
-from random points.
+Constants are those of the authors' `scripts/run_llff.sh` and `train_llff.py` (Fictionarry/DNGaussian, 14c3c6a4, 3b7feac7); that
+the paper has the same ones is not confirmed.
+Missing here: the neural colour field, patches of a random size (5 to 17 px), own Adam steps of both terms, penalties on shapes
+and opacities, smooth depth after 3000 steps, and the learning rates for a start from random points.
 """
 
 import dataclasses
@@ -44,13 +46,15 @@ class DnConfig:
 
     weight: float = 1.0
     """Weight of the depth terms."""
-    whole: float = 0.1
-    """Weight of patches that are normalised by the image's standard deviation, beside those normalised by their own."""
+    whole: float = 1.0
+    """Weight of patches that are normalised by the image's standard deviation (Global-Local Depth Normalization)."""
+    local: float = 0.1
+    """Weight of patches that are normalised by their own standard deviation (Global-Local Depth Normalization)."""
     opacity: float = 0.95
-    """Opacity of all Gaussians in hard depth."""
+    """Opacity of all Gaussians in hard depth (tau; Hard Depth Regularization)."""
     patch: int = 11
-    """Side of a patch [px]."""
-    tolerance: float = 0.01
+    """Side of a patch [px]: the middle of 5 to 17."""
+    tolerance: float = 0.00025
     """Difference of normalised maps up to which a pixel has no loss."""
 
 
@@ -86,7 +90,7 @@ def depth_difference(
         local.append(centred / deviation((centred * centred).sum(1, keepdim=True), pixels))
         whole.append(centred / deviation(total(spread * spread), every))
     loss = found.new_zeros(())
-    for (one, other), weight in ((local, 1.0), (whole, config.whole)):
+    for (one, other), weight in ((local, config.local), (whole, config.whole)):
         gap = (one - other).abs()
         loss = loss + weight * total(torch.where(gap > config.tolerance, gap * gap, 0)) / every
     return loss
@@ -196,5 +200,4 @@ dngaussian = {
     "density.gradient": 1.3e-3,
     "density.stop-fraction": 1.0,
     "density.prune-size": 0,
-    "density.reset-every": 3000,
 }

@@ -5,8 +5,11 @@
 A Gaussian is far from its neighbours if its mean distance to the three nearest ones exceeds a threshold. Then a Gaussian is
 added in the middle of each edge to them (`FSGS`). Rendered depth correlates with a depth map of the view (`FsgsDepth`): that of
 `--depths`, else the disparity of `--depth-model`, else of the depth sweep.
-Missing here: the network DPT in the loop, which estimates depth of renders from random cameras; and the paper's threshold of 10
-is in units of COLMAP, ours is in extents of the scene.
+Constants are those of the authors' `train.py` and `arguments` (VITA-Group/FSGS, 034e21ba); that the paper has the same ones
+is not confirmed.
+Missing here: the network DPT in the loop, which estimates depth of renders from random cameras (weight 0.5, from step 2000 to
+9500). The authors add Gaussians only at those larger than the extent, whose mean squared distance exceeds 5 extents in units of
+the files; ours is a distance in extents of the scene.
 """
 
 from __future__ import annotations
@@ -44,9 +47,10 @@ class FsgsConfig:
     """Settings of the strategy."""
 
     distance: float = 1.0
-    """Mean distance to the nearest Gaussians above which some are added, as a fraction of the scene's extent."""
+    """Mean distance to the nearest Gaussians above which some are added, as a fraction of the scene's extent
+    (Proximity-guided Gaussian Unpooling). The authors' threshold is 0.9 to 1.3 extents on fern, horns, room and trex."""
     until: float = 0.2
-    """Fraction of the steps after which none are added by distance; 2000 of 10,000 in the paper."""
+    """Fraction of the steps after which none are added by distance: 2000 of 10,000."""
 
 
 def neighbours(means: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -111,7 +115,7 @@ class FsgsDepth(warpgs.LossTerm):
     weight: float = 0.05
     """Weight of the term, in [0, 1000]."""
     until: float = 0.95
-    """Fraction of the steps in which the term is active; in the paper its weight falls to 0.001 then."""
+    """Fraction of the steps in which the term is active: 9500 of 10,000; the authors' weight falls to 0.001 then."""
 
     def needs(self, view: TrainingView, prior: Prior | None) -> dict[str, torch.Tensor]:
         """Return depth, negated disparity where none is given, and 1 where the map is known, else 0, shape [H, W, 2]."""

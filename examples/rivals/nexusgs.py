@@ -5,7 +5,8 @@
 Of the paper: the start by flow, with depth where the match is at most 1 px from its epipolar line, of the source view that is
 least sensitive to errors along the line (`--init.source flow`), and a point for each such pixel (`merge-px` and `fill-px` 0);
 growth until the last step with a threshold of 5e-4, into four Gaussians (`NexusGS`); opacities lowered to 0.05 every 3000
-steps; a scale rate of 0.03. Ours: checks of the flow there and back, the parallax and the sign of the depth.
+steps; a scale rate of 0.03. Constants are those of the authors' code for LLFF; that the paper has the same ones is not
+confirmed. Ours: checks of the flow there and back, the parallax and the sign of the depth.
 Missing here: the flow of FlowFormer++; give its files or its network with `--init.flow`, which is `dis` otherwise.
 """
 
@@ -27,7 +28,7 @@ class NexusConfig:
     """Settings of the strategy."""
 
     children: int = 4
-    """Gaussians that replace a split one."""
+    """Gaussians that replace a split one; not confirmed by the paper."""
 
 
 def split(rows: dict[str, torch.Tensor], children: int, generator: torch.Generator) -> dict[str, torch.Tensor]:
