@@ -338,7 +338,7 @@ def test_masks_that_cannot_be_used(tmp_path):
     path = tmp_path / "masks" / "photo0.png"
     for i in range(scenes.VIEWS):
         scenes.save(path.with_name(f"photo{i}.png"), np.zeros((12, 16), np.uint8))
-    scenes.refused(tmp_path, r": 0 usable views \(.*masks that keep no pixel.*--mask-keeps.*photo0.png")
+    scenes.refused(tmp_path, r"has 0 usable views \(.*masks that keep no pixel.*--mask-keeps.*photo0.png")
     for i in range(1, scenes.VIEWS):
         path.with_name(f"photo{i}.png").unlink()
     scenes.save(path, np.full((12, 30), 255, np.uint8))

@@ -227,8 +227,8 @@ def test_points_that_are_not_finite_are_left_out(kind, tmp_path):
         ("cameras.txt", "1\n", r"cameras.txt, line 1: cannot be understood"),
         ("cameras.txt", b"\xff\xfe", r"cameras.txt, line 1: cannot be understood"),
         ("images.txt", "1 1 0 0 0 0 0 3 1 photo0.png\n2 1 0 0 0 0 0 3 1 photo1.png\n", r"images.txt, line 2: expected"),
-        ("images.txt", "", r": 0 usable views.*at least 2"),
-        ("images.txt", "1 1 0 0 0 0 0 3 1 photo0.png\n\n", r": 1 usable view.*at least 2. Add images"),
+        ("images.txt", "", r"has 0 usable views.*at least 2"),
+        ("images.txt", "1 1 0 0 0 0 0 3 1 photo0.png\n\n", r"has 1 usable view.*at least 2. Add images"),
     ],
 )
 def test_broken_text_files(name, content, message, tmp_path):

@@ -584,8 +584,8 @@ def _finished(root: Path, reader: Reader, scene: Scene, notes: list[str], option
     if len(views) < 2:
         reasons = f" ({'; '.join(more)})" if more else ""
         raise DataError(
-            f"{root}: {len(views)} usable view{'s' if len(views) != 1 else ''}{reasons}; depth needs at least 2. Add images "
-            "with cameras"
+            f"{root}: the scene has {len(views)} usable view{'s' if len(views) != 1 else ''}{reasons}; depth needs at least 2. "
+            "Add images with cameras"
         )
     if options.black_is_empty and not any(scene.background):
         views, note = cut_from_black(views)
