@@ -121,7 +121,7 @@ class Rule:
                 raise UsageError(f"Rule.{name} must be at least 0 and below 1, not {getattr(self, name)}")
         if not 0 < self.alpha_max <= LARGEST_ALPHA:
             raise UsageError(
-                f"Rule.alpha_max must be in (0, 1) as float32, not {self.alpha_max}: gradients divide by 1 - alpha"
+                f"Rule.alpha_max must be in (0, 1) as float32, not {self.alpha_max}: gradients divide by 1 - alpha; give 0.999"
             )
         for name in ("low_pass", "square_sigma"):
             if not 0 <= getattr(self, name) < math.inf:

@@ -71,7 +71,7 @@ def test_truncations_and_wrong_counts_are_noticed(name, tmp_path):
             read_all(tmp_path, "bin")
     (right,) = struct.unpack_from("<Q", files[name])
     for count, words in (
-        *((c, rf"{c:,} records announced, \d+ fit: truncated") for c in (100, 2**40, 2**64 - 1)),
+        *((c, rf"announces {c:,} records and holds at most \d+: truncated") for c in (100, 2**40, 2**64 - 1)),
         (right - 1, r"\d+ bytes follow the last of its records. Copy"),
     ):
         scenes.write_files(tmp_path, files | {name: struct.pack("<Q", count) + files[name][8:]})

@@ -112,7 +112,10 @@ def arrays_to_write(
         for name, array in arrays.items():
             bad = array.size - int(np.isfinite(array).sum())
             if bad:
-                raise DataError(f"{path}: {bad} of {array.size} values of {name} are not finite; export an earlier checkpoint")
+                raise DataError(
+                    f"{path}: {bad} of {array.size} values of {name} are not finite; export an earlier checkpoint, or fit "
+                    "again with a lower learning rate"
+                )
     logits = arrays["logit_opacities"]
     if logits.size and 0 <= logits.min() < logits.max() <= 1:
         words = "all logit_opacities are in [0, 1], as opacities are; ActivatedGaussians(...).stored() makes logits"

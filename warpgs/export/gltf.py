@@ -178,7 +178,10 @@ def _places(path: Path, document: dict[str, Any], mesh: int) -> list[np.ndarray]
             product = place[:3, :3].T @ place[:3, :3]
             square = np.trace(product) / 3
             if not (square > 0 and np.isfinite(place).all() and np.abs(product / square - np.eye(3)).max() <= MAX_SHEAR):
-                raise base.malformed(path, f"node {i} scales Gaussians by different factors, 0 or with shear; apply it first")
+                raise base.malformed(
+                    path,
+                    f"node {i} scales Gaussians by different factors, 0 or with shear; apply that scale in another program",
+                )
             found.append(place)
     if len(found) > MAX_COPIES or (not found and any(n.get("mesh") == mesh for n in nodes)):
         raise base.malformed(path, f"its scene shows the Gaussians {len(found)} times (supported: 1 to {MAX_COPIES})")

@@ -67,7 +67,10 @@ class _BinaryFile:
         (count,) = self.take("Q")
         capacity = (len(self.data) - self.at) // smallest
         if count > capacity:
-            raise DataError(f"{self.path}: {count:,} records announced, {capacity:,} fit: truncated or foreign. Copy it again")
+            raise DataError(
+                f"{self.path}: announces {count:,} records and holds at most {capacity:,}: truncated, or not of COLMAP. Copy it "
+                "again"
+            )
         return count
 
     def text(self) -> str:

@@ -17,6 +17,9 @@ from warpgs.io.images import Lens, ReadOptions, list_images
 from warpgs.io.maps import array_numbers, mapped_array
 from warpgs.scene import Scene
 
+IN_ORDER = "They are matched in sorted order, so one file too many or too few would give all a wrong pose. Copy the scene again"
+"""Why the numbers of cameras and images must be equal, for messages."""
+
 # LLFF scenes: poses_bounds.npy, one row of 17 numbers per image in sorted-name order (Mildenhall et al. 2019).
 
 FILE = "poses_bounds.npy"
@@ -55,7 +58,7 @@ class LLFFReader(Reader):
         images, factor, note = scene.images()
         files = list_images(images)
         if len(files) != len(rows):
-            raise DataError(f"{path}: has {len(rows)} poses, but {images} holds {len(files)} images. Copy the scene again")
+            raise DataError(f"{path}: has {len(rows)} poses, but {images} holds {len(files)} images. {IN_ORDER}")
         views = ViewList(options)
         for file, row in zip(files, rows):
             name = file.relative_to(images).as_posix()
@@ -178,7 +181,7 @@ class DTUReader(Reader):
         files = list_images(images)
         cameras = sum(key.startswith("world_mat_") for key in matrices)
         if not files or cameras != len(files):
-            raise DataError(f"{path}: has {cameras} cameras, but {images} holds {len(files)} images. Copy the scene again")
+            raise DataError(f"{path}: has {cameras} cameras, but {images} holds {len(files)} images. {IN_ORDER}")
         masks, views = _masks(folder, files), ViewList(options)
         for i, file in enumerate(files):
             name = file.relative_to(images).as_posix()

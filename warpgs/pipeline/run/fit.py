@@ -280,7 +280,10 @@ def with_poses(request: SceneRequest, out: Path | None, progress: Say, ranks: in
         if record["source_sha256"] != source_digest(source, request.allow_outside):
             raise UsageError(f"{scene} holds poses of other photographs than {source}; give another --out")
     elif ranks > 1:
-        raise UsageError(f"{source}: has no cameras, and ranks find none; run `warpgs poses {source} --out SCENE`, fit SCENE")
+        raise UsageError(
+            f"{source}: has no cameras, and each of {ranks} ranks would find its own poses; run `warpgs poses {source} --out "
+            "SCENE` first, and fit SCENE"
+        )
     else:
         if "=" not in (spec := request.split or "all") and not is_video(source):  # refuse what all photographs are too few for
             root = image_root(source)
