@@ -182,14 +182,9 @@ def _digest(cls: type) -> str:
 
 def own_places(classes: Iterable[type]) -> list[str]:
     """Return where `module_of` finds the modules of classes from outside warpgs; the running script is left out."""
-    return sorted({spec.rpartition(":")[0] for _, spec in own_specs(classes)})
-
-
-def own_specs(classes: Iterable[type]) -> list[tuple[str, str]]:
-    """Return registered name and ``module:Class`` or ``file.py:Class`` of the classes from outside warpgs and the script."""
-    own = [c for c in classes if not is_ours(c) and c.__module__ != "__main__"]
-    places = [getattr(sys.modules.get(m), "__file__", "") if (m := c.__module__).startswith(_PREFIX) else m for c in own]
-    return [(str(getattr(c, "name", c.__qualname__)), f"{place}:{c.__qualname__}") for c, place in zip(own, places) if place]
+    modules = {c.__module__ for c in classes if not is_ours(c)} - {"__main__"}
+    files = {m: getattr(sys.modules.get(m), "__file__", None) if m.startswith(_PREFIX) else m for m in modules}
+    return sorted(str(place) for place in files.values() if place)
 
 
 def module_digest(module: ModuleType | None) -> str:

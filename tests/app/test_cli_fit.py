@@ -11,11 +11,10 @@ import pytest
 from warpgs.app.cli import main
 from warpgs.app.fit import request_of
 from warpgs.app.flags import flags_of, settings_of
-from warpgs.errors import UsageError, field_docs
+from warpgs.errors import field_docs
 from warpgs.pipeline.train.loss import AlphaDifference
 from warpgs.pipeline.train.presets import PRESETS
 from warpgs.pipeline.train.settings import FitConfig
-from warpgs.pipeline.train.strategies.base import STRATEGIES
 from warpgs.pipeline.train.strategies.mcmc import MCMCConfig
 from warpgs.synthetic.demo import split_spec, write_demo
 
@@ -57,17 +56,6 @@ class Opaque(loss.LossTerm):
     def __call__(self, inputs):
         return self.weight * inputs.outputs["alpha"].mean()
 '''
-PRESET = """
-import warpgs.train as train
-
-
-@train.register_strategy("listed")
-class Listed(train.Strategy):
-    pass
-
-
-listed = {"base": "3dgs", "strategy": Listed, "steps": 3, "init.source": "random", "init.random-count": 40}
-"""
 
 
 def parsed(*flags):
@@ -153,8 +141,6 @@ def plugged(tmp_path_factory):
     named = ["--strategy", f"{folder}/mine.py:SlowGrowth", "--slow-growth.rate", "0.75", "--loss-terms"]
     named.append(f"{folder}/mine.py:Opaque")
     assert main([*command, *named, "--reader", f"{folder}/mine.py:Folder"]) == 0
-    (folder / "listed.py").write_text(PRESET)
-    assert main(["fit", command[1], "--out", str(folder / "listed"), "--preset", f"{folder}/listed.py:listed"]) == 0
     return folder, command, named
 
 
@@ -173,46 +159,27 @@ def test_settings_of_plug_ins_reach_the_run(plugged, capsys):
 
 @pytest.mark.slow
 def test_a_run_folder_never_decides_what_code_is_loaded(plugged):
-    """In a new process: eval asks for the reader by name, --resume for all of it, and go on once it is named."""
+    """In a new process: eval asks for the reader by name, --resume for strategy and term, and go on once they are named."""
     folder, command, named = plugged
-    reader, alone = f"{folder}/mine.py:Folder", ["fit", "--resume", "--out"]
-    score, preset = ["eval", str(folder / "run"), "--device", "cpu"], [*alone, str(folder / "listed")]
-    code = ["--reader", reader, *named[:2], *named[4:]]
+    reader = f"{folder}/mine.py:Folder"
+    score = ["eval", str(folder / "run"), "--device", "cpu"]
     commands = [
-        score, [*command, "--resume"], [*alone, str(folder / "run")], preset,
-        [*command, "--resume", *named[:4]], [*score, "--reader", reader], [*command, "--resume", *named],
-        ["fit", "--out", str(folder / "run"), "--resume", *code], [*preset, "--preset", f"{folder}/listed.py:listed"],
+        score, [*command, "--resume"], [*command, "--resume", *named[:4]], [*score, "--reader", reader],
+        [*command, "--resume", *named],
     ]  # fmt: skip
     probe = (
         "import contextlib, io, json, sys\nfrom warpgs.app.cli import main\nfor words in json.load(sys.stdin):\n"
         "    with contextlib.redirect_stdout(io.StringIO()) as out, contextlib.redirect_stderr(io.StringIO()) as err:\n"
         "        code = main(words)\n"
-        "    loaded = any('_warpgs_' in n for n in sys.modules)\n"
+        "    loaded = any('mine' in n.rpartition('_warpgs_')[2] and '_warpgs_' in n for n in sys.modules)\n"
         "    print(json.dumps([code, loaded, out.getvalue(), err.getvalue()]))"
     )
     done = subprocess.run([sys.executable, "-c", probe], input=json.dumps(commands), capture_output=True, text=True, check=True)
-    unread, unnamed, bare, listed, half, scored, *resumed = map(json.loads, done.stdout.splitlines())
+    unread, unnamed, half, scored, resumed = map(json.loads, done.stdout.splitlines())
     assert unread[:2] == [2, False] and f"--reader {reader}" in unread[3]
     assert unnamed[:2] == [2, False] and f"--strategy {named[1]}" in unnamed[3]
-    assert bare[:2] == [2, False] and f"name it: `warpgs fit --out {folder}/run --resume {' '.join(code)}`" in bare[3]
-    assert listed[:2] == [2, False] and f"--out {folder}/listed --resume --strategy {folder}/listed.py:Listed`" in listed[3]
     assert half[:2] == [2, True] and f"--loss-terms {named[5]}" in half[3]
-    assert scored[0] == 0 and all(code == 0 and "continued from step 3" in said for code, _, said, _ in resumed)
-
-
-def test_a_run_names_the_code_that_continues_it(plugged, monkeypatch):
-    """Also of a class that a preset's file registers under a name of its own; only the words of the command load it."""
-    folder, _, named = plugged
-    with pytest.raises(UsageError, match=f"--resume --reader {folder}/mine.py:Folder --strategy {named[1]} --loss-terms"):
-        request_of(["--out", str(folder / "run"), "--resume"], "")
-    monkeypatch.setattr(STRATEGIES, "_classes", {n: c for n, c in STRATEGIES._classes.items() if n != "listed"})
-    resumed = ["--out", str(folder / "listed"), "--resume"]
-    with pytest.raises(UsageError, match=f"--resume --strategy {folder}/listed.py:Listed`"):
-        request_of(resumed, "")
-    name = next(n for n in sys.modules if n.startswith("_warpgs_listed_"))
-    monkeypatch.delitem(sys.modules, name)
-    config = request_of([*resumed, "--strategy", f"{folder}/listed.py:Listed"], "").config
-    assert config.strategy == "listed" and config.steps == 3 and sys.modules[name]
+    assert scored[0] == 0 and resumed[0] == 0 and "continued from step 3" in resumed[2]
 
 
 @pytest.mark.parametrize("found", [False, pytest.param(True, marks=pytest.mark.slow)])

@@ -558,9 +558,14 @@ def second_of_two(begin: int, seen: wp.array(dtype=int)):
     seen[begin + wp.tid()] = doubled_sum(2)
 
 
-def test_a_module_has_its_name_whatever_was_compiled_before(cache):
+@pytest.mark.parametrize("empty", [False, True], ids=["no folder", "a folder without a binary"])
+def test_a_module_has_its_name_whatever_was_compiled_before(cache, monkeypatch, empty):
     """Else a process that finds the first of two modules in the cache would not find the second, and compile it anew."""
+    monkeypatch.setattr(native, "_LOADED", set())
+    first_of_two.module.unload()
     name = native.module_name(second_of_two.module, 1)
+    if empty:  # as of a processor of another kind with the same home folder
+        (cache / native.module_name(first_of_two.module, 1)).mkdir(parents=True)
     native.load_module(first_of_two.module, wp.get_device("cpu"), 1)
     second_of_two.module.mark_modified()
     assert native.module_name(second_of_two.module, 1) == name

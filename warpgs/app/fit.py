@@ -25,7 +25,7 @@ from warpgs.pipeline.train.presets import PRESETS, origin_note, preset_settings
 from warpgs.pipeline.train.settings import FitConfig, check_budget, parts_named
 from warpgs.pipeline.train.strategies.base import STRATEGIES
 from warpgs.pipeline.train.view_modules import VIEW_MODULES
-from warpgs.plugins import Registry, flag_group, load_object
+from warpgs.plugins import Registry, flag_group
 from warpgs.process import be_quiet, fast_imports, say
 from warpgs.ranks import join, place
 
@@ -55,8 +55,6 @@ def scene_of(a: Any, path: str) -> SceneRequest:
 
 CONTINUING = {"--out": 1, "--resume": 0, "--device": 1, "--threads": 1, "--view": 0, "--view-port": 1, "--lpips-weights": 1}
 """Flags that may accompany --resume when a run keeps its settings, and the number of values of each."""
-NAMING = ("--preset", "--strategy", "--loss-terms", "--view-modules", "--reader")
-"""Flags that may then name the user's own code, as module:NAME or FILE.py:NAME."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -183,33 +181,29 @@ def _config(a: Any, base: FitConfig, terms: Parts, modules: Parts) -> FitConfig:
     return dataclasses.replace(config, loss_terms=found, view_modules=learned)
 
 
-def _continuing(arguments: list[str]) -> tuple[list[str], list[str], list[str]] | None:
-    """Return flags, scene and user code of arguments that continue a run without giving its settings; None for others."""
+def _continuing(arguments: list[str]) -> tuple[list[str], list[str]] | None:
+    """Return flags and scene of arguments that continue a run without giving its settings; None for others."""
     words = iter([w for a in arguments for w in (a.split("=", 1) if a.startswith("--") else [a])])
-    kept, scene, code = list[str](), list[str](), list[str]()
+    kept, scene = list[str](), list[str]()
     for word in words:
         if word in CONTINUING:
             kept += [word, *itertools.islice(words, CONTINUING[word])]
-        elif word in NAMING and ":" in (names := next(words, "")):
-            code += [name for name in names.split(",") if ":" in name]
         elif word.startswith("-") or scene:
             return None
         else:
             scene.append(word)
     # beside a scene, --out may hold only the poses of a fit that ended before its first step
     begun = not scene or os.path.isfile(os.path.join(flags.word_after(kept, "--out") or "", "config.json"))
-    return (kept, scene, code) if "--resume" in kept and begun else None
+    return (kept, scene) if "--resume" in kept and begun else None
 
 
-def _continued(arguments: list[str], scene: list[str], code: list[str], about: str) -> FitRequest:
+def _continued(arguments: list[str], scene: list[str], about: str) -> FitRequest:
     """Return the request that continues a run with its original settings."""
     from warpgs.pipeline.run.folder import stored_request
 
     a = flags.parse_flags(Request, arguments, "warpgs fit", about)
     view_port = _machine(a)
-    for name in code:
-        load_object("code", name)
-    request = stored_request(a.out, scene[0] if scene else None, code)
+    request = stored_request(a.out, scene[0] if scene else None)
     say(f"continuing the run: preset {request.config.preset}, {request.config.steps:,} steps, {request.scene.path}")
     device = request.device if flags.word_after(arguments, "--device") is None else a.device
     return dataclasses.replace(request, device=device, view_port=view_port, lpips_weights=a.lpips_weights)

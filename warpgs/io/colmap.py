@@ -68,8 +68,7 @@ class _BinaryFile:
         capacity = (len(self.data) - self.at) // smallest
         if count > capacity:
             raise DataError(
-                f"{self.path}: announces {count:,} records and holds at most {capacity:,}: truncated, or not of COLMAP. Copy it "
-                "again"
+                f"{self.path}: announces {count:,} records and holds at most {capacity:,}: truncated or foreign. Copy it again"
             )
         return count
 

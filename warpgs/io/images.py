@@ -166,7 +166,9 @@ class Lens:
         if not (1 <= self.width <= MAX_INTRINSIC and 1 <= self.height <= MAX_INTRINSIC):
             raise DataError(f"{where}: the camera's image size {self.width} x {self.height} px is impossible; fix the file")
         if not ((f >= MIN_FOCAL * np.array([self.width, self.height])) & (f < MAX_INTRINSIC)).all():
-            raise DataError(f"{where}: focal lengths {f.tolist()} px must be over {MIN_FOCAL} of the sides; calibrate again")
+            raise DataError(
+                f"{where}: focal lengths {f.tolist()} px must be over {MIN_FOCAL} of the sides, and finite; calibrate again"
+            )
         if not (np.abs(c) < MAX_INTRINSIC).all():
             raise DataError(f"{where}: the principal point {c.tolist()} px is not finite or too large; calibrate again")
         if not (np.abs(self.distortion) < MAX_DISTORTION).all():

@@ -237,8 +237,7 @@ def _load(module: wp.Module, device: wp.Device, block_dim: int, tells: bool = Tr
             listener(name)
         with _announced() if compiles and not told else contextlib.nullcontext():
             loaded = module.load(device, block_dim=block_dim)
-        if compiles:
-            _as_before(module)
+        _as_before(module)
         for _, seconds in told:
             seconds.append(time.perf_counter() - began)
     _LOADED.add((module, device.context, block_dim))
@@ -248,10 +247,10 @@ def _load(module: wp.Module, device: wp.Device, block_dim: int, tells: bool = Tr
 def _as_before(module: wp.Module) -> None:
     """Take from the functions that a module shares what compiling them left there: Warp hashes it with later modules."""
     # another process, which finds this module in the cache, would not find the later ones, and compile them anew
-    hashers = getattr(module, "hashers", {}).values()
-    for function in {f for hasher in hashers for f in hasher.function_hashes}:
-        for overload in (function.user_overloads | function.user_templates).values():
-            overload.adj.deferred_static_expressions = []
+    with contextlib.suppress(AttributeError):  # Warp's own fields: in a version without them, modules may be compiled twice
+        for function in {f for hasher in module.hashers.values() for f in hasher.function_hashes}:
+            for overload in (function.user_overloads | function.user_templates).values():
+                overload.adj.deferred_static_expressions = []
 
 
 def is_cached(name: str) -> bool:

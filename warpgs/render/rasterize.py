@@ -64,7 +64,7 @@ def check_arrays(camera: Camera) -> None:
 def _check_type(name: str, array: Any) -> None:
     """Raise TypeError where a value is not a dense array of real numbers, and ValueError for a device without kernels."""
     if not isinstance(array, (np.ndarray, torch.Tensor)):
-        raise TypeError(f"camera.{name} must be a numpy array or a tensor, not {type(array).__name__}; use torch.stack")
+        raise TypeError(f"camera.{name} must be a numpy array or a tensor, not {type(array).__name__}; give numpy.array(...)")
     kind = str(array.dtype).removeprefix("torch.")
     if isinstance(array, torch.Tensor):
         launch.check_device(f"camera.{name}", array)
@@ -194,8 +194,8 @@ _LOOKED_AT: set[torch.device] = set()
 
 def _check_activated(gaussians: RasterizedGaussians) -> None:
     """Raise ValueError where opacities are logits, or scales logarithms; on CUDA only in the first call."""
-    device = gaussians.means.device
-    if isinstance(gaussians, Gaussians) or device in _LOOKED_AT:
+    device, cuda = gaussians.means.device, gaussians.means.is_cuda
+    if isinstance(gaussians, Gaussians) or device in _LOOKED_AT or (cuda and torch.cuda.is_current_stream_capturing()):
         return
     # bounds that the steps of an optimizer may cross, but hardly any model's logits and log scales keep
     logits, logs = "in [0, 1]; torch.sigmoid makes them from logits", "at least 0; torch.exp makes them from log scales"
@@ -205,7 +205,7 @@ def _check_activated(gaussians: RasterizedGaussians) -> None:
             low, high = map(float, values.detach().aminmax())
             if -math.inf < low < -1 or most < high < math.inf:
                 raise ValueError(f"{name} are from {low:.3g} to {high:.3g}, but must be {fix}")
-    if device.type == "cuda":
+    if cuda:
         _LOOKED_AT.add(device)
 
 

@@ -436,7 +436,7 @@ class Window:
         self.server, self.content = server, content
         cameras = list(content.model.scene_cameras.values())
         train = [content.model.scene_cameras[n] for n in content.model.train]
-        # the limits include held-out cameras, too, because the user can step into each
+        # the limits include held-out cameras, too, because the user can step into each, without those far off the rest
         self._rig = [*html.middle_first(train), *html.middle_first(cameras)] or [html.camera_before(content.model.gaussians())]
         self.first = self._rig[0]
         ahead = html.distance_ahead(self.first, content.model.gaussians())

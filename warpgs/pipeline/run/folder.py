@@ -8,7 +8,7 @@ import math
 import os
 import platform
 import shlex
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Any, get_type_hints
@@ -26,9 +26,7 @@ from warpgs.kernels.cameras import check_camera
 from warpgs.locks import check_free, hold_folder
 from warpgs.pipeline.model.table import SIMILARITY, FittedModel, checked_gaussians, similarity_of, similarity_values, unpack
 from warpgs.pipeline.run.request import FitRequest, SceneRequest, choose_device
-from warpgs.pipeline.train.settings import PARTS, FitConfig, fingerprint, upgraded
-from warpgs.pipeline.train.strategies.base import STRATEGIES
-from warpgs.plugins import own_specs
+from warpgs.pipeline.train.settings import FitConfig, fingerprint, upgraded
 from warpgs.poses.find import JSON as POSES
 from warpgs.scene import Camera, Scene
 from warpgs.schema import SchemaError, fields, flag, items, mapping, number, one_of, or_null, real, text, whole
@@ -78,7 +76,7 @@ _RECORD = fields(
         "cameras": mapping(_CAMERA, _view_name),
     },
     {
-        "scene_format": text, "transparent": flag, "own_code": mapping(text), "own_files": mapping(text),
+        "scene_format": text, "transparent": flag, "own_code": mapping(text),
         "pruned": fields({"source": text}),
     },
 )  # fmt: skip
@@ -269,7 +267,7 @@ def record_of(
         "normalization": similarity_values(scene.normalization),
         "background": scene.background, "transparent": scene.transparent,
         "config": config.to_json(), "config_hash": config.fingerprint(), "own_code": config.own_code(),
-        "own_files": dict(own_specs(config.plugged_in())), "device": device.type, "versions": versions(),
+        "device": device.type, "versions": versions(),
         "cameras": {v.name: camera_values(v.camera) for v in scene.views},
     }  # fmt: skip
 
@@ -323,7 +321,7 @@ def check_same(record: dict[str, Any], stored: dict[str, Any], out: Path) -> Non
     if "pruned" in stored:
         raise UsageError(f"--resume: {out} is pruned, without the state of its fit; resume {stored['pruned']['source']}")
     _check_lost(stored, out)
-    _check_named_again({name for field in PLUGGED for name in _names(record["config"], field)}, stored, out)
+    _check_named_again(record["config"], stored["config"], out)
     for key, words in SAME.items():
         now: Any = plain(record[key])
         then = stored.get(key, {})
@@ -367,27 +365,19 @@ def check_checkpoint(state: dict[str, Any], stored: dict[str, Any], out: Path) -
             raise DataError(f"--resume: {key} differs between {out / TENSORS} and {CONFIG}; restore both, or fit again")
 
 
-PLUGGED: dict[str, Any] = {"strategy": STRATEGIES, **PARTS}
-"""Registries of classes by the field of the settings that names them."""
-
-
-def _names(config: dict[str, Any], field: str) -> list[str]:
-    """Return the names of classes in a field of stored settings."""
-    return [value] if isinstance(value := config[field], str) else [part["name"] for part in value]
-
-
-def _check_named_again(named: set[str], stored: dict[str, Any], out: Path, reader: str | None = None) -> None:
-    """Raise a UsageError if a run used code from outside warpgs, or such a reader, that is not named again."""
-    files, needed = stored.get("own_files", {}), {"reader": [reader] if reader and ":" in reader else []}
-    for field, registry in PLUGGED.items():
-        lacking = [n for n in _names(stored["config"], field) if ":" in n or (n in files and n not in registry.names())]
-        needed[field] = [n if ":" in n else files[n] for n in lacking]
-    if set().union(*needed.values()) - named:
-        flags = (f"--{field.replace('_', '-')} {shlex.quote(','.join(names))}" for field, names in needed.items() if names)
-        raise UsageError(
-            f"--resume: the run in {out} was fitted with user code. A run folder never decides which code is loaded; name it: "
-            f"`warpgs fit --out {shlex.quote(str(out))} --resume {' '.join(flags)}`"
+def _check_named_again(now: dict[str, Any], then: dict[str, Any], out: Path) -> None:
+    """Raise a UsageError if a run used code from outside warpgs that is not named again."""
+    for field in ("strategy", "loss_terms", "view_modules"):
+        named, needed = (
+            [value] if isinstance(value := config.get(field, []), str) else [part["name"] for part in value]
+            for config in (now, then)
         )
+        outside = [name for name in needed if ":" in name]
+        if set(outside) - set(named):
+            raise UsageError(
+                f"--resume: the run in {out} was fitted with user code. A run folder never decides which code is loaded; give "
+                f"--{field.replace('_', '-')} {','.join(outside)} again"
+            )
 
 
 @dataclass(frozen=True, repr=False)
@@ -445,20 +435,20 @@ def _stored_scene(folder: Path, record: dict[str, Any], reader: str | None, move
     return request
 
 
-def stored_request(folder: Path, moved: str | None = None, code: Collection[str] = ()) -> FitRequest:
-    """Return the request that continues a run with its scene, which may have ``moved``, and settings; ``code`` was loaded."""
+def stored_request(folder: Path, moved: str | None = None) -> FitRequest:
+    """Return the request that continues a run, with all its settings, and its scene, which may have ``moved``."""
     record = read_record(folder)
     _check_lost(record, folder)
-    reader = record["scene"].get("reader")
-    _check_named_again({*code}, record, folder, reader)
-    for field, registry in PLUGGED.items():
-        for name in filter(code.__contains__, _names(record["config"], field)):
-            registry.load(name)
-    scene = _stored_scene(folder, record, reader, moved)
+    try:
+        scene = _stored_scene(folder, record, None, moved)
+        _check_named_again({}, record["config"], folder)
+    except UsageError as e:
+        raise UsageError(f"{e}, with the scene and all other flags of the run") from e
     try:
         config = FitConfig.from_json(record["config"])
     except (UsageError, SchemaError) as e:
-        raise DataError(f"{folder / CONFIG}: invalid settings ({e}); {RESTORE}") from e
+        fix = f"{RESTORE}; a name of your own code needs the whole command of the fit, with --resume"
+        raise DataError(f"{folder / CONFIG}: invalid settings ({e}); {fix}") from e
     return FitRequest(scene, folder, config, record["device"], resume=True)
 
 
