@@ -84,10 +84,10 @@ MAX_COMPARED = 60
 """Letters of a mistyped name that are compared."""
 
 
-def did_you_mean(word: str, known: Iterable[str]) -> str:
-    """Return the question "did you mean ...?" for the nearest of the ``known`` names; empty if none is near."""
+def did_you_mean(word: str, known: Iterable[str], least: float = 0.6) -> str:
+    """Return "did you mean ...?" for the nearest of the ``known`` names; empty if none has the ``least`` likeness, 0 to 1."""
     plain = {name.lstrip("-"): name for name in known}  # dashes would make all short flags alike
-    near = difflib.get_close_matches(word.lstrip("-")[:MAX_COMPARED], plain, 1)
+    near = difflib.get_close_matches(word.lstrip("-")[:MAX_COMPARED], plain, 1, least)
     return f"did you mean {plain[near[0]]}?" if near else ""
 
 

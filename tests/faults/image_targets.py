@@ -266,7 +266,7 @@ ANY |= {"jpeg": JPEGS["4440"], "gif": encoded("GIF", "P"), "avif": encoded("AVIF
 ANY |= {"bmp": encoded("BMP", "L"), "heic": struct.pack(">I8s", 12, b"ftypheic")}
 RLE, NO_PIXELS = struct.pack("<I", 1), b"WEBPVP8X" + struct.pack("<IIHI", 10, 0, 4, 0)
 ANY |= {"packed": ANY["bmp"][:30] + RLE + ANY["bmp"][34:], "no pixels": b"RIFF" + struct.pack("<I", 22) + NO_PIXELS}
-ANY_PARSER = (image_files.format_of, image_files._raster, image_files.decode, image_files._size, image_files._decoded)
+ANY_PARSER = (image_files.format_of, image_files._raster, image_files.decode, image_files.header_size, image_files._decoded)
 add("any image", ANY, ANY_PARSER, (header,))
 
 

@@ -4,6 +4,7 @@ import dataclasses
 import itertools
 import json
 import math
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -91,6 +92,12 @@ def test_what_was_chosen_is_said(model, monkeypatch):
     plan = plan_film(model, "auto", FilmSettings(frames=4))
     assert len(plan.cameras) == 4 and plan.notes[1:] == ["path: spiral"]
     assert plan.notes[0].startswith("5 cameras on one side of the scene, over 6")
+    low, high = (
+        dataclasses.replace(c, viewmat=look_at(eye, np.zeros(3), np.array([0, -1.0, 0])))
+        for c, eye in zip(model.cameras().values(), np.array([[0, 0, -4.0], [0, -4 * math.sin(0.8), -4 * math.cos(0.8)]]))
+    )
+    above = dataclasses.replace(model, scene_cameras={"0.png": low, "1.png": high}, train=("0.png", "1.png"))
+    assert plan_film(above, "auto", FilmSettings()).notes[0] == "2 cameras on one side of the scene, over 46 degrees"
     plan = plan_film(model, "turntable", FilmSettings(seconds=0.5, fps=12, size=(64, 20), fov_y=0.5))
     assert [(c.width, c.height) for _, c in plan.cameras] == [(64, 20)] * 6 and "there and back" in plan.notes[-1]
     assert 2 * math.atan(10 / plan.cameras[0][1].K[1, 1]) == pytest.approx(0.5)
@@ -155,12 +162,16 @@ def test_what_no_photograph_saw_gets_a_note(model, tmp_path, path, settings, adv
         assert notes[0].endswith(f"expect artefacts there; {advice}")
 
 
-def test_a_film_alone_and_six_frames_on_a_sheet(model, tmp_path, capsys):
+def test_a_film_alone_and_six_frames_on_a_sheet(model, tmp_path, capsys, monkeypatch):
     """The suffix decides; a folder has an image for each frame as well, and a sheet is three frames wide."""
     assert warpgs.render_path(model, "turntable", out=tmp_path / "a.gif", frames=8) == [tmp_path / "a.gif"]
     assert "path: turntable, there and back" in capsys.readouterr().err
     plan = plan_film(model, "turntable", FilmSettings(frames=8))
     files, _ = render_film(model, plan, tmp_path / "a.webp", FilmSettings(), sheet=True)
+    ticks, lines = itertools.count(0, 10), []
+    monkeypatch.setattr(film, "time", SimpleNamespace(perf_counter=lambda: next(ticks)))
+    render_film(model, plan, tmp_path / "a.webp", FilmSettings(), tell=lines.append)
+    assert lines[:2] == ["rendering 8 frames", "rendering: 2 of 8 frames, 1 min 00 s left"] and lines[-1] == "writing a.webp"
     shape = 2 * 32 + 4, 3 * 40 + 8, 3
     assert files == [tmp_path / "a.webp"] and cv2.imread(str(tmp_path / "a-sheet.png")).shape == shape
     render_film(model, plan, tmp_path / "images", FilmSettings())

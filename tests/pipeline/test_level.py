@@ -139,7 +139,7 @@ def test_files_get_a_length_and_a_level_ground(run, tmp_path, capsys):
     """Gaussians, cameras and mesh are in metres within 1 %, level within 1 degree, over a ground at 0; also if done twice."""
     ends = [(0, (20.5, 50.5)), (6, (70.5, 20.5))]
     length = steps(np.concatenate([surface(view, np.array([pixel]))[0] for view, pixel in ends]))[0]
-    commands = ["--scale", *picks(ends), length], ["--ground", *picks(ground())]
+    commands = ["--scale", *picks(ends), f"{100 * length}cm"], ["--ground", *picks(ground())]
     assert [sh("level", run, *words) for words in commands] == [0, 0]
     said = capsys.readouterr().out
     percent, tilt = (float(re.search(rf"uncertain by ([0-9.]+) {unit}", said)[1]) for unit in ("%", "degrees"))
@@ -240,6 +240,27 @@ def test_coordinates_of_given_points_are_new_after_a_command(run, capsys):
             np.testing.assert_allclose(getattr(again, key), getattr(n, key), rtol=1e-6, atol=1e-6)
         capsys.readouterr()
     assert sh("level", run, "--ground", *picks(ground())) == 0 and "now at" not in capsys.readouterr().out
+
+
+def test_pixels_are_those_of_the_fit_and_a_wall_is_no_ground(run, made, tmp_path, capsys):
+    """Larger files and points on a wall are answered; a level that replaces another says so."""
+    shutil.copytree(made / "scene", tmp_path / "scene")
+    with Image.open(tmp_path / "scene" / NAMES[1]) as image:
+        image.resize((192, 144)).save(tmp_path / "scene" / NAMES[1])
+    record = json.loads((run / "config.json").read_text())
+    record["scene"]["path"] = str(tmp_path / "scene")
+    (run / "config.json").write_text(json.dumps(record))
+    wall = np.array([[0, 0, 0], [0.5, 0, 0], [0, 0.5, 0]]) @ TILT.T / UNIT
+    assert sh("level", run, "--ground", *(",".join(map(str, point)) for point in wall)) == 0
+    said = capsys.readouterr().out
+    assert re.search("this tips the photographs by [6-9][0-9] degrees: are the points on a wall", said)
+    assert f"`warpgs level {run} --up photographs` undoes it" in said and not re.search("replaces|pixels refer", said)
+    assert sh("level", run, "--ground", *picks(ground())) == 0
+    said = capsys.readouterr().out
+    assert "this replaces the earlier level" in said and "wall" not in said
+    assert "photographs of 96 x 72 px as fitted; the file has 192 x 144" in said
+    assert sh("level", run, "--scale", f"{NAMES[0]}:20,50", f"{NAMES[6]}:70,20", "35mm") == 0
+    assert "; pixels refer to photographs of 96 x 72 px as fitted\n" in capsys.readouterr().out
 
 
 def test_a_second_camera_that_disagrees_adds_to_the_error(run, monkeypatch):
@@ -364,6 +385,10 @@ BAD = {
     "negative": (["--scale", "0,0,0", "1,2,3", "-2"], "the length must be above 0 m, not -2"),
     "unknown": (["--scale", "images/00.png:9,3", f"{NAMES[0]}:9,3", "1"], "no view 'images/00.png'; did you mean images/00"),
     "nan": (["--scale", "1,2,nan", "1,2,3", "1"], "a point, VIEW:x,y or x,y,z, takes 3 finite numbers"),
+    "unit": (
+        ["--scale", "0,0,0", "1,0,0", "20in"],
+        r"a length, such as 1.2 \(metres\), 20cm or 35mm, takes one finite number, not",
+    ),
     "in line": (["--ground", "0,0,0", "1,0,0", "2,0,0"], "equal or nearly on a line"),
     "nothing": ([], "give one of --scale"),
     "both": (["--up", "photographs", "--ground", "0,0,0", "1,0,0", "0,1,0"], "give one of --scale"),

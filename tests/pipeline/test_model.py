@@ -613,7 +613,12 @@ def test_a_clean_up_is_shown_before(run, tmp_path, capsys):
     shown = capsys.readouterr().out
     assert re.search(r"([0-9,]+) seen by no training view \(unseen, magenta\)", shown) and "held-out PSNR" in shown
     off = np.abs(np.asarray(Image.open(run / "clean.png").convert("RGB")).astype(int) - REASONS["unseen"][2]).max(2)
-    assert off[:, off.shape[1] // 2 :].min() < 70 < off[:, : off.shape[1] // 2].min(), "in colour at the right alone"
+    third = off.shape[1] // 3
+    assert off[:, third : 2 * third].min() < 70 < min(off[:, :third].min(), off[:, 2 * third :].min()), (
+        "in colour in the middle"
+    )
+    assert off[off.shape[0] // 2 :, third : 2 * third].min() > 70, "and above alone; below, the model from beside"
+    assert "if smears remain, cut them off: save a crop box in `warpgs view " in shown
     assert main([*words, "unseen,opacity", "--out", str(tmp_path / "clean")]) == 0
     said = capsys.readouterr().out
     assert "training PSNR" in said and f"{run} keeps the model before" in said

@@ -130,6 +130,11 @@ def test_durations_and_stages_of_the_set_up(clock):
         stages("compiling kernels")
         clock[0] += 60
     assert lines == [*(f"finding depth: view {v} of 20" for v in (0, 5, 10, 15)), "compiling kernels"]
+    lines.clear()
+    for frame in range(300):  # ten minutes
+        stages(f"rendering: {frame} of 300 frames")
+        clock[0] += 2
+    assert lines == [f"rendering: {frame} of 300 frames" for frame in range(0, 300, 15)]
 
 
 def test_in_a_terminal_a_stage_has_one_line_with_a_bar(terminal):

@@ -150,6 +150,8 @@ GROUPS = {
 """Names of the commands by purpose."""
 
 
+OTHER_WORDS = {"run": "fit", "train": "fit", "video": "render", "movie": "render", "clean": "prune", "ply": "export"}
+"""Commands by other words for them."""
 PRINTING = ("doctor", "compare", "ablate")
 """Commands that print their result on the terminal."""
 OWN_FILES = ("fit", "farm", "doctor")
@@ -209,7 +211,7 @@ def _run(arguments: list[str]) -> int:
         except OSError as e:  # torch's libraries end the process there
             raise UsageError("the current folder was deleted; change to another one") from e
         if name not in COMMANDS:
-            hint = did_you_mean(name, COMMANDS) or f"choose one of {', '.join(COMMANDS)}"
+            hint = did_you_mean(OTHER_WORDS.get(name.lower(), name), COMMANDS, 0.8) or f"choose one of {', '.join(COMMANDS)}"
             raise UsageError(f"unknown command {name!r}; {hint}")
         if name == "fit" and {"-h", "--help"} & {*arguments}:  # before the import, which costs seconds
             for line in help_lines(COMMANDS[name]):

@@ -119,7 +119,7 @@ def render(
         seconds: Duration of the film [s]. Default: chosen by the path.
         fps: Frames per second of the film.
         frames: Number of frames. Default: seconds times fps.
-        size: Width and height of the frames [px]. Default: those of the photographs.
+        size: Width and height of the frames [px], such as 1080 1920 or 1080x1920. Default: those of the photographs.
         fov: Vertical field of view [deg]. Default: that of the photographs.
         background: auto (the fit's colour; images of cut-out objects are transparent PNGs), black, white, #rrggbb or r,g,b in
             [0, 1].
@@ -190,14 +190,14 @@ def mesh(
 
 
 def level(
-    run: Positional[Path], *, scale: tuple[str, str, float] | None = None, ground: tuple[str, str, str] | None = None,
+    run: Positional[Path], *, scale: tuple[str, str, str] | None = None, ground: tuple[str, str, str] | None = None,
     up: Literal["photographs"] | None = None, gps: tuple[Path, ...] | None = None, device: str = "auto",
 ) -> list[str]:  # fmt: skip
     """Give a run's files real sizes.
 
     Args:
         run: Run folder of `warpgs fit`; its PLY is written again, and every later export has the new coordinates.
-        scale: Such as a.jpg:410,220 b.jpg:95,310 1.2: two points, and the length between them [m].
+        scale: Such as a.jpg:410,220 b.jpg:95,310 1.2: two points, and the length between them, in metres, or such as 20cm.
             A point is VIEW:X,Y (a pixel of a photograph at the size of the fit) or X,Y,Z (coordinates in the run's files).
         ground: Three points of the ground, which becomes level.
         up: photographs, to level by how the photographs were held.

@@ -5,6 +5,7 @@ import dataclasses
 import functools
 import io
 import os
+import re
 import shutil
 import types
 import typing
@@ -18,6 +19,8 @@ from warpgs.process import say
 
 REMOVED = {"--repeat": "the error of the fit itself names step, view, loss term and tensors"}
 """What replaces flags that are gone, by their names with dashes."""
+SPELLED = {"--size": "1080 1920", "--scale": "a.jpg:41,22 b.jpg:95,31 1.2", "--ground": "a.jpg:30,59 a.jpg:20,56 b.jpg:40,58"}
+"""Examples of flags that take several values."""
 MAX_THREADS = 4096
 """Most threads that a flag takes."""
 MIN_COLUMNS = 40
@@ -74,7 +77,8 @@ def _columns() -> Iterator[None]:
 def parse_flags(kind: Callable[..., Any], arguments: list[str], program: str, description: str) -> Any:
     """Return the instance of a dataclass of flags for the arguments of a command line."""
     words = ["--help" if word == "--help-all" else word for word in arguments]
-    complaint, registry = io.StringIO(), tyro.constructors.ConstructorRegistry()
+    words = [part for flag, word in zip(["", *words], words) for part in (word.split("x") if flag == "--size" else [word])]
+    complaint, help_text, registry = io.StringIO(), io.StringIO(), tyro.constructors.ConstructorRegistry()
     registry.primitive_rule(_open_value)
     try:
         with contextlib.redirect_stderr(complaint), _columns():
@@ -82,14 +86,20 @@ def parse_flags(kind: Callable[..., Any], arguments: list[str], program: str, de
     except SystemExit as e:
         if not e.code:  # after the help
             raise
-    for word in arguments:
-        flag = word.partition("=")[0].replace("_", "-")
-        if flag.startswith("--"):
-            from warpgs.pipeline.train.settings import removed_note
+    said = re.sub(r"\[/?bold\]", "", complaint.getvalue())
+    with contextlib.redirect_stdout(help_text), contextlib.suppress(SystemExit), _columns():
+        tyro.cli(kind, args=["--help"], prog=program, registry=registry)
+    known = {*re.findall(r"--[\w.-]+", help_text.getvalue())}
+    for flag in (word.partition("=")[0].replace("_", "-") for word in arguments if word.startswith("--")):
+        from warpgs.pipeline.train.settings import removed_note
 
-            if note := f"{flag} was removed: {REMOVED[flag]}" if flag in REMOVED else removed_note(flag[2:]):
-                raise UsageError(note)
-    for line in complaint.getvalue().splitlines():
+        if note := f"{flag} was removed: {REMOVED[flag]}" if flag in REMOVED else removed_note(flag[2:]):
+            raise UsageError(note)
+        if flag not in known and flag not in said.replace("_", "-"):  # tyro took the word after it for its value
+            raise UsageError(f"unknown flag {flag}; `{program} --help-all` lists the flags")
+        if flag in SPELLED and re.search(f"(parsing|argument) '?{flag}", said):
+            raise UsageError(f"{flag}: write it as {flag} {SPELLED[flag]}; `{program} --help-all` shows what it takes")
+    for line in said.splitlines():
         say(line, error=True)
     raise UsageError(f"wrong arguments, as shown above; `{program} --help-all` lists them")
 

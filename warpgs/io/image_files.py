@@ -147,7 +147,7 @@ def _loaded(image: ImageFile.ImageFile) -> ImageFile.ImageFile:
     return image
 
 
-def _size(name: str, data: bytes) -> tuple[int, int]:
+def header_size(name: str, data: bytes) -> tuple[int, int]:
     """Return width and height [px] by the header alone."""
     if name == "JPEG":
         import simplejpeg
@@ -457,7 +457,7 @@ def _raster(path: Path, data: bytes, max_pixels: int) -> np.ndarray:
         raise DataError(f"{path}: is {unread}")
     try:
         name = format_of(data)
-        width, height = _size(name, data)
+        width, height = header_size(name, data)
         pixels = width * height
         if pixels > max_pixels:
             raise DataError(

@@ -21,8 +21,8 @@ from warpgs.process import Say, careful, printable, say, silent
 
 PLAIN_INTERVAL = 10.0
 """Seconds between two plain lines on the steps of a fit."""
-STAGE_INTERVAL = 5.0
-"""Seconds between two plain lines on one stage."""
+STAGE_INTERVAL, STAGE_LINES = 5.0, 20
+"""Least seconds between two plain lines on one stage, and most lines on a stage that counts."""
 SMOOTHING = 0.05
 """Weight of the newest value in the running means that are shown."""
 FORGETTING = 0.98
@@ -113,12 +113,12 @@ class Stages(contextlib.AbstractContextManager["Stages"]):
 
     The text before the last colon names a stage; numbers after it, such as ``7 of 24``, make a bar. In a terminal one line
     with the bar and the stage's time is rewritten in place. It goes at `clear` or at the end of a ``with`` block. Elsewhere the
-    first line of a stage is shown at once, and then one every few seconds; a repeated line is skipped.
+    first line of a stage is shown at once, and then one every few seconds, at most about `STAGE_LINES` in all.
     """
 
     def __init__(self, show: Say = say, *, live: bool | None = None):
         """Print plain lines with ``show``; with ``live`` None, write in place if ``show`` is the default, in a terminal."""
-        self.show, self.printed, self.shown = show, {}, set()
+        self.show, self.printed = show, {}
         self.live = (show is say and is_live()) if live is None else live
 
     def __exit__(self, *error) -> None:
@@ -127,14 +127,15 @@ class Stages(contextlib.AbstractContextManager["Stages"]):
 
     def __call__(self, line: str) -> None:
         """Show a line; a plain line is skipped if its stage had one a moment ago."""
-        stage, now = line.rpartition(":")[0] or line, time.perf_counter()
+        stage, now, counted = line.rpartition(":")[0] or line, time.perf_counter(), COUNTED.search(line)
+        done, total = (int(n.replace(",", "")) for n in counted.groups()) if counted else (0, 0)
+        state, (last, before) = STAGE_LINES * done // total if total else line, self.printed.get(stage, (-STAGE_INTERVAL, None))
         if self.live and _PANELS:
             _PANELS[-1].doing = line
         elif self.live:
             _STATUS.show(line)
-        elif line not in self.shown and now - self.printed.get(stage, -STAGE_INTERVAL) >= STAGE_INTERVAL:
-            self.printed[stage] = now
-            self.shown.add(line)
+        elif state != before and now - last >= STAGE_INTERVAL:
+            self.printed[stage] = now, state
             self.show(line)
 
     def clear(self) -> None:

@@ -7,6 +7,7 @@ import inspect
 import itertools
 import json
 import math
+import re
 import sys
 
 import numpy as np
@@ -435,6 +436,8 @@ def test_the_time_of_a_cpu_limits_steps_and_images():
         assert limited.steps < SMOOTH_STEPS <= whole.steps and whole.sh_every == 500
         assert limited.sh_degree * limited.sh_every <= plan_phases(limited.phases, limited.steps).refine
     assert "--no-cpu-limit takes all, about 11 min, and raised PSNR by 0.3 to 1.6 dB" in chosen(10, "cpu")[1]
+    nearly = settings_by_views(PRESETS["quick"], [view_stub(450, 800)] * 9, "cpu")[1][-1]
+    assert re.search("the fit takes 29[0-9] of 300 steps; --no-cpu-limit takes all, about 1 min$", nearly), nearly
     one, two = (chosen(3, "cpu", method_hier=hier)[0].steps for hier in (False, True))
     assert abs(ONE_LAYER * one - two) < 2 and one < two
     # from the first points to three times as many at the events, which take longer; views of half size take less time

@@ -3,6 +3,7 @@
 import collections
 import itertools
 import math
+import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -24,6 +25,7 @@ from warpgs.render.rasterize import rasterize
 from warpgs.report.film import SUFFIXES, write_film
 from warpgs.report.images import coverage_image, frame_sheet, png, straight_alpha
 from warpgs.report.page import image_names
+from warpgs.report.progress import duration
 from warpgs.scene import Camera, Gaussians, View
 
 EMPTY = 0.1
@@ -212,7 +214,7 @@ def plan_film(model: FittedModel, path: str, settings: FilmSettings) -> FilmPlan
         remedy = "c2w of keyframes is camera-to-world in OpenCV axes, in the units of the scene's files"
         nearer = _nearer(cameras, train, "move the keyframes nearer to the photographs' cameras")
         return FilmPlan(_numbered(cameras), coverage, remedy, [words], nearer)
-    notes = [f"{len(train)} {'training ' if model.test else ''}cameras {rig.describe()}"]
+    notes = [f"{len(train)} {'training ' if model.test else ''}cameras {rig.describe(train)}"]
     if rig.turned:
         notes.append("the photographs are rotated; the film takes its upward direction from the common plane of the cameras")
     kind = paths.path_of(rig) if path == "auto" else path
@@ -221,13 +223,11 @@ def plan_film(model: FittedModel, path: str, settings: FilmSettings) -> FilmPlan
         left_out = len(train) - len(far) if path == "auto" and len(far) > 1 else 0
         cameras, words = _tour(rig, far if left_out else train, settings)
         words += f"; {left_out} close-ups are left out" * bool(left_out)
-        if path == "auto" and rig.kind == "forward":
-            words += "; --path turntable is calmer"
+        words += "; --path turntable is calmer" * (path == "auto" and rig.kind == "forward")
         remedy, nearer = EMPTY_VIEW, "--coverage marks these places"
     else:
         cameras = paths.camera_path(kind, rig, train, settings.count(SECONDS))
-        there_and_back = ", there and back over the captured area" if rig.span is not None and kind == "turntable" else ""
-        words = f"path: {kind}{there_and_back}"
+        words = f"path: {kind}" + ", there and back over the captured area" * (rig.span is not None and kind == "turntable")
         remedy = nearer = "--path interpolate stays at the training views"
     cameras = [paths.framed(c, settings.size, settings.fov_y) for c in cameras]
     return FilmPlan(_numbered(cameras), coverage, remedy, [*notes, words], _nearer(cameras, train, nearer))
@@ -258,7 +258,7 @@ COVERAGE = "coverage"
 """Subfolder for images that mark regions by the number of training views that saw them."""
 
 
-def _check_plan(plan: FilmPlan, out: Path, coverage: bool, sheet: bool) -> tuple[bool, bool]:
+def check_plan(plan: FilmPlan, out: Path, coverage: bool, sheet: bool) -> tuple[bool, bool]:
     """Return whether ``out`` is a film and not a folder, and whether all frames have one size."""
     if not plan.cameras:
         raise UsageError("no camera to render; give at least one")
@@ -310,7 +310,7 @@ def render_film(
     tell: Say = silent,
 ) -> tuple[list[Path], list[str]]:
     """Render a plan to PNG files and film.mp4, or to a film alone; ``sheet`` adds six frames in one image. Files and notes."""
-    alone, one_size = _check_plan(plan, out, bool(coverage), sheet)
+    alone, one_size = check_plan(plan, out, bool(coverage), sheet)
     folder, film = (out.parent, out) if alone else (out, out / FILM)
     if alone:
         check_file_path(out)
@@ -320,9 +320,14 @@ def render_film(
     chosen, count, straight = [], len(plan.cameras), model.transparent and settings.background is None
 
     def images() -> Iterator[np.ndarray]:
-        frames = _frames(model, [c for _, c in plan.cameras], settings, coverage)
+        frames, began = _frames(model, [c for _, c in plan.cameras], settings, coverage), 0.0
+        tell(f"rendering {count} frames")
         for i in range(count):
-            tell(f"rendering: {i + 1} of {count} frames")
+            if i == 1:  # the first frame also waits for kernels and memory
+                began = time.perf_counter()
+            elif i:
+                left = (time.perf_counter() - began) / (i - 1) * (count - i)
+                tell(f"rendering: {i} of {count} frames, {duration(left)} left")
             image, alpha, outside, covered = next(frames)
             faults.append(fault_of(image, alpha, plan.coverage, outside))
             if files:

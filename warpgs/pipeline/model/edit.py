@@ -100,7 +100,8 @@ def numbers_of(value: Any, shape: tuple[int, ...], what: str) -> np.ndarray:
     except (ValueError, TypeError, OverflowError):
         array = np.empty(0)
     if array.shape != shape or not np.isfinite(array).all():
-        raise UsageError(f"{what} takes {' x '.join(map(str, shape))} finite numbers, not {str(value)[:60]}")
+        count = " x ".join(map(str, shape)) or "one"
+        raise UsageError(f"{what} takes {count} finite number{'s' * bool(shape)}, not {str(value)[:60]}")
     return array
 
 

@@ -42,7 +42,7 @@ from warpgs.pipeline.train.settings import FitConfig
 from warpgs.pipeline.train.trainer import train_views
 from warpgs.pipeline.train.views import TrainingView
 from warpgs.priors.views import PriorConfig, view_priors
-from warpgs.process import Say, silent
+from warpgs.process import Say, say, silent
 from warpgs.render.options import RasterizeOptions
 from warpgs.report.film import h264_encoder
 from warpgs.report.images import COVERAGE_LEGEND, Tile, contact_sheet, png
@@ -105,8 +105,8 @@ def _cameras_of(path: Path) -> tuple[dict[str, Camera], list[str]]:
 
 
 VP9 = (
-    "the film is VP9, which browsers and VLC play; with an ffmpeg on the PATH that encodes H.264, films are H.264, "
-    "which all players play (OpenCV's wheels have no encoder for it)"
+    "the film will be VP9, which browsers and VLC play, but many phones do not; for H.264, which all play, install ffmpeg "
+    "(https://ffmpeg.org/download.html) and repeat the command"
 )
 """Note on a film in .mp4 without an encoder of H.264."""
 
@@ -181,6 +181,9 @@ def render(
     settings = replace(settings, background=color)
     plan = film.plan_film(stored, path, settings)
     training: list[View] | bool = False
+    alone, one_size = film.check_plan(plan, out, coverage, sheet)
+    if one_size and (not alone or out.suffix.lower() == ".mp4") and h264_encoder() is None:
+        say(VP9)
     if coverage:
         try:
             training = scene_of(stored)[1] if isinstance(stored, StoredRun) else True
@@ -189,16 +192,12 @@ def render(
             notes.append(f"masked-out regions are shown as seen, since the scene cannot be read: {e}")
         notes.append(f"images in {out / film.COVERAGE}: {COVERAGE_LEGEND}")
     with contextlib.nullcontext() if named else writing_into(home):
-        files, faults = film.render_film(stored, plan, out, settings, coverage=training, sheet=sheet, tell=tell)
-    *others, last = files
-    if last.suffix.lower() == ".mp4" and h264_encoder() is None:
-        notes.append(VP9)
+        _, faults = film.render_film(stored, plan, out, settings, coverage=training, sheet=sheet, tell=tell)
     notes += faults + [f"sheet of {min(film.SHEET_FRAMES, len(plan.cameras))} frames in {film.sheet_path(out)}"] * sheet
-    if last == out:
+    if alone:
         return [*notes, f"{len(plan.cameras)} frames in {out}"]
-    if last.name == film.FILM:
-        return [*notes, f"{len(others)} images and {film.FILM} in {out}"]
-    return [*notes, f"{len(files)} images in {out}; no film, since the views differ in size"]
+    ending = f" and {film.FILM} in {out}" if one_size else f" in {out}; no film, since the views differ in size"
+    return [*notes, f"{len(plan.cameras)} images{ending}"]
 
 
 def view_psnrs(gaussians: Gaussians, views: list[View], options: RasterizeOptions) -> np.ndarray:
@@ -293,17 +292,21 @@ CLEAN = "clean.png"
 
 
 def clean_picture(model: FittedModel, found: Tensors, views: list[View]) -> np.ndarray:
-    """Return a sheet of the view that shows most of what would go: before, in colours over the gray render, and after."""
+    """Return a sheet: before, what would go in colours over gray, and after, in one view; and from beside the cameras."""
     gaussians, options = model.gaussians(), model.options()
     goes = edit.any_of(found.values(), gaussians.logit_opacities)
     means = gaussians.means[goes].cpu().double().numpy()
     view = max(views, key=lambda v: int(in_image(v.camera, means).sum()))
-    before, after = (render_view(g, view, options)[0] for g in (gaussians, edit.select(gaussians, ~goes)))
+    pair, cameras, up = (gaussians, edit.select(gaussians, ~goes)), [v.camera for v in views], -view.camera.viewmat[1, :3]
+    before, after = (render_view(g, view, options)[0] for g in pair)
     colors, _, alpha = render_view(edit.select(in_colors(gaussians, found), goes), view, replace(options, background=None))
     over = colors + (1 - alpha[..., None]) * before.mean(-1, keepdims=True)
     tiles = [Tile("before", before), Tile("what would go, also behind surfaces", over), Tile("after", after)]
+    for when, g in zip(("before", "after"), pair):
+        image = render_overview(g, options, cameras, [], up, size=before.shape[1::-1], background="black", cameras=False)
+        tiles += [Tile(f"from beside the photographs, {when}", image)] if image is not None else []
     lines = [f"{int(goes.sum()):,} of {len(goes):,} Gaussians would go:", *counted_lines(found)]
-    return contact_sheet(view.name, lines, tiles, columns=2)
+    return contact_sheet(view.name, lines, tiles, columns=3)
 
 
 def write_clean(stored: StoredRun, out: Path, found: Tensors, scores: dict[str, list[float]] | None = None) -> list[str]:
@@ -345,6 +348,8 @@ def clean(
             write_bytes(out, png(clean_picture(stored, found, train)))
         home = shlex.quote(str(folder))
         last.append(f"picture in {out}; `warpgs prune {home} --clean all`, or with some of these names, removes them")
+        box = f"save a crop box in `warpgs view {home}`, then `warpgs export {home} --to FILE --crop {home}/crop.json`"
+        last.append(f"if smears remain, cut them off: {box}")
     else:
         last = write_clean(stored, out, found, scores)
     return [

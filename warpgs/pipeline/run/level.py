@@ -2,6 +2,7 @@
 
 import contextlib
 import math
+import shlex
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -10,11 +11,11 @@ import numpy as np
 import torch
 
 from warpgs import schema
-from warpgs.errors import DataError, ResourceError, UsageError, did_you_mean, similar_folder
+from warpgs.errors import DataError, ResourceError, UsageError, WarpgsError, did_you_mean, similar_folder
 from warpgs.export.ply import write_ply
 from warpgs.files import write_json
 from warpgs.geometry import back_project, convert_points, matmul, project_points
-from warpgs.io.image_files import BRANDS_END, brand, read_gps, read_image_file
+from warpgs.io.image_files import BRANDS_END, brand, format_of, header_size, read_gps, read_image_file
 from warpgs.locks import hold_folder
 from warpgs.mesh.views import CONTRIBUTORS, MIN_ALPHA, surface_depth
 from warpgs.pipeline.model.edit import drop_unused_sh, levelling, numbers_of
@@ -31,6 +32,8 @@ HIDDEN = 0.1
 """Another camera does not see a point that is behind its rendered depth by more than this fraction."""
 LEAST = 1e-6
 """Least distance of picked points [u]."""
+TIPPED = 45.0
+"""Median angle [deg] between the ground's normal and the photographs' upward axes above which the points may be on a wall."""
 LEANING = math.radians(3)
 """Angle from level at which the weight of a photograph is halved."""
 SURE = 1.0
@@ -43,7 +46,7 @@ EARTH, SQUARED = 6378137.0, 0.00669437999014
 def pixel_depth(model: FittedModel, camera: Camera, x: float, y: float, what: str = "the point") -> tuple[float, float]:
     """Return the rendered depth [u] at a pixel, and its standard deviation in 5 x 5 pixels [u]; UsageError on background."""
     if not (0 <= x < camera.width and 0 <= y < camera.height):
-        raise UsageError(f"{what}: outside of the image, which has {camera.width} x {camera.height} px in this run")
+        raise UsageError(f"{what}: outside of the image, which has {camera.width} x {camera.height} px in this run, as fitted")
     r = rasterize(model.gaussians(), camera, replace(model.options(), heaviest=CONTRIBUTORS * (camera.model == "pinhole")))
     depth, alpha, row, column = r.depth, r.alpha.cpu().numpy(), int(y), int(x)
     if camera.model == "pinhole":  # as in meshes: the mean depth makes steps on slanted surfaces
@@ -70,6 +73,16 @@ def place_at(model: FittedModel, camera: Camera, x: float, y: float, what: str =
     return point, matmul(moves.T, moves)
 
 
+def fitted_size(run: StoredRun, name: str) -> str:
+    """Return the size of a view, in words, and that of its photograph if its file is found and has another size."""
+    home, camera, more = Path(run.record["scene"]["path"] or run.folder), run.scene_cameras[name], ""
+    with contextlib.suppress(StopIteration, ValueError, WarpgsError):
+        data = read_image_file(next(f for f in (home / "images" / name, home / name) if f.is_file()))
+        size = header_size(format_of(data), data)
+        more = "; the file has {} x {}".format(*size) * (sorted(size) != sorted((camera.width, camera.height)))
+    return f"{camera.width} x {camera.height} px as fitted{more}"
+
+
 def picked(run: StoredRun, text: str) -> Place:
     """Return the place of VIEW:x,y, a pixel of a photograph, or of x,y,z in file units, which counts as exact."""
     name, colon, words = text.rpartition(":")
@@ -91,6 +104,13 @@ def distance(n: Normalization, first: Place, second: Place) -> tuple[float, floa
     return length / n.scale, math.sqrt((matmul(first[1] + second[1], apart) * apart).sum()) / length**2
 
 
+def metres(text: str) -> float:
+    """Return the length [m] of a text such as 1.2, 1.2m, 20cm or 35mm."""
+    unit = next((u for u in ("mm", "cm", "m") if text.endswith(u)), "")
+    number = numbers_of(text.removesuffix(unit), (), f"--scale {text[:40]}: a length, such as 1.2 (metres), 20cm or 35mm,")
+    return float(number) * {"mm": 1e-3, "cm": 1e-2}.get(unit, 1.0)
+
+
 def scaled(n: Normalization, first: Place, second: Place, length: float) -> Levelled:
     """Give files the scale at which two places are ``length`` [m] apart."""
     if not 0 < length < math.inf:
@@ -104,11 +124,12 @@ def upright(n: Normalization, up: np.ndarray, ground: np.ndarray | None = None) 
     """Turn files so that ``up`` [3] of the scene is up: -y, or z after GPS. Off maps, ``ground`` [3] [u] gets height 0."""
     wanted, own = (np.array([0.0, -1, 0]) if v is None else matmul(n.rotation.T, v) for v in (n.up, up))
     turn, degrees = matmul(levelling(wanted).T, levelling(own)), np.degrees(np.arccos(np.clip((wanted * own).sum(), -1, 1)))
-    offset = n.origin + matmul(turn, n.offset - n.origin)
+    offset, again = n.origin + matmul(turn, n.offset - n.origin), n.up is not None and not np.allclose(n.up, up, atol=1e-6)
     n = replace(n, rotation=matmul(n.rotation, turn.T), offset=offset, up=up)
     if ground is not None and n.place is None and not n.origin.any():
         n = replace(n, offset=offset - wanted * (convert_points(ground[None], n, "scene", "file") * wanted).sum())
-    return n, f"{'z' if wanted[2] > 0.5 else '-y'} is up in files, which were turned by {degrees:.1f} degrees"
+    more = "; this replaces the earlier level" * again
+    return n, f"{'z' if wanted[2] > 0.5 else '-y'} is up in files, which were turned by {degrees:.1f} degrees{more}"
 
 
 def grounded(run: StoredRun, places: Sequence[Place]) -> Levelled:
@@ -123,6 +144,11 @@ def grounded(run: StoredRun, places: Sequence[Place]) -> Levelled:
     # a point's error along the normal tilts the plane about the opposite side
     tilts = [math.sqrt((matmul(error, normal) * normal).sum()) * side / area for (_, error), side in zip(places, sides)]
     n, line = upright(run.normalization, normal, corners[0])
+    cosines = [-(run.scene_cameras[name].viewmat[1, :3] * normal).sum() for name in run.train]
+    tipped = math.degrees(math.acos(np.clip(np.median(cosines), -1, 1)))
+    if tipped > TIPPED:
+        line += f"; this tips the photographs by {tipped:.0f} degrees: are the points on a wall? "
+        line += f"`warpgs level {shlex.quote(str(run.folder))} --up photographs` undoes it"
     return n, f"{line}; the ground's tilt is uncertain by {math.degrees(math.hypot(*tilts)):.2g} degrees"
 
 
@@ -140,8 +166,6 @@ def photographed(run: StoredRun) -> Levelled:
         weights = 1 / (1 + (leaning[:, None] / LEANING) ** 2)
     n, line = upright(run.normalization, up)
     more = "; all look one way, so their tilt forwards remains: --ground is better" * int(np.linalg.eigvalsh(second)[1] < 0.03)
-    if run.normalization.up is not None and not np.allclose(run.normalization.up, up, atol=1e-6):
-        more += "; this replaces the earlier level"
     return n, f"{line}; {len(rights)} photographs lean by {np.degrees(np.median(abs(leaning))):.2g} degrees (median){more}"
 
 
@@ -227,7 +251,7 @@ def store(folder: Path, device_name: str, change: Callable[[StoredRun], Levelled
 
 
 def level(
-    folder: Path, device_name: str, scale: tuple[str, str, float] | None = None, ground: tuple[str, str, str] | None = None,
+    folder: Path, device_name: str, scale: tuple[str, str, str] | None = None, ground: tuple[str, str, str] | None = None,
     photographs: bool = False, gps: tuple[Path, ...] | None = None,
 ) -> list[str]:  # fmt: skip
     """Set scale, upward direction or place of a run's files, with the options of `warpgs level`; returns lines for the user."""
@@ -235,11 +259,13 @@ def level(
         raise UsageError("give one of --scale, --ground, --up and --gps, with at most one folder")
 
     def change(run: StoredRun) -> Levelled:
-        texts = scale[:2] if scale else ground or ()
+        texts, length = (scale[:2], metres(scale[2])) if scale else (ground or (), 0.0)
         places = [picked(run, text) for text in texts]
         if not places:
             return photographed(run) if photographs else located(run, *(gps or [None]))
-        n, line = scaled(run.normalization, *places, scale[2]) if scale else grounded(run, places)
+        n, line = scaled(run.normalization, *places, length) if scale else grounded(run, places)
+        if names := dict.fromkeys(text.rpartition(":")[0] for text in texts if ":" in text):
+            line += f"; pixels refer to photographs of {' and '.join(dict.fromkeys(fitted_size(run, name) for name in names))}"
         if all(":" in text for text in texts):  # pixels stay where they are; coordinates move with the files
             return n, line
         points = np.round(convert_points(np.array([point for point, _ in places]), n, "scene", "file"), 9) + 0.0
