@@ -223,7 +223,10 @@ def _sync(folder: Folder) -> None:
     try:
         folder.sync()
     except OSError as e:
-        raise ResourceError(f"{folder.path}: written, but the disk does not confirm it ({e.strerror or e}); check disk") from e
+        raise ResourceError(
+            f"{folder.path}: was written, but the disk does not confirm it ({e.strerror or e}); check the disk and the last "
+            "written files"
+        ) from e
 
 
 def write_bytes(path: Path, *chunks: bytes | memoryview) -> None:

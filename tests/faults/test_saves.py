@@ -107,7 +107,7 @@ def save_pruned(s: Saved) -> None:
     if (s.folder / "pruned").exists():  # then the next command is another one
         with hold_folder(s.folder):
             return
-    _write(s.folder / "pruned", s.run.record, limit_degree(s.gaussians, 0), s.run.step, s.run.normalization)
+    _write(s.folder / "pruned", s.run, {"source": "run"}, limit_degree(s.gaussians, 0))
 
 
 def save_held(s: Saved) -> None:

@@ -3,6 +3,7 @@
 import ast
 import contextlib
 import csv
+import importlib
 import io
 import json
 import os
@@ -309,6 +310,7 @@ def test_more_signals_while_the_program_ends(monkeypatch, capsys):
         finally:
             signal.raise_signal(signal.SIGINT)
 
+    importlib.import_module("warpgs.app.commands")  # a module that is imported later would keep the patched name
     monkeypatch.setattr("warpgs.pipeline.run.export.export", tidy)
     say = process.say
     monkeypatch.setattr(process, "say", lambda *a, **k: (signal.raise_signal(signal.SIGINT), say(*a, **k)))

@@ -43,7 +43,9 @@ _AXES = (
 
 def malformed(path: Path, what: str) -> DataError:
     """Return a DataError about a file that does not match its suffix, with the fix."""
-    return DataError(f"{path}: not a usable {path.suffix or 'model'} file: {what}. Export it again, or use another format.")
+    return DataError(
+        f"{path}: not a usable {path.suffix or 'model'} file: {what}. Export the model again, or use another format."
+    )
 
 
 def by_rows(n: int, shape: tuple[int, ...], rows: Callable[[slice], np.ndarray]) -> np.ndarray:

@@ -541,7 +541,9 @@ def doubtful_notes(views: list[View], points: PointCloud | None) -> list[str]:
             0.0 if points is None or not len(points) else float(np.median(np.linalg.norm(points.points - middle, axis=1)))
         )
     if spread < max(MIN_EXTENT, MIN_BASELINE * min(distance, MAX_COORDINATE)):
-        notes.append(f"all cameras are within {spread:.2g} units: pure rotation gives no depth; move between photographs")
+        notes.append(
+            f"all cameras are within {spread:.2g} units of one place: pure rotation gives no depth; move between photographs"
+        )
     off = [v for v in views if not all(0 <= v.camera.K[i, 2] <= n for i, n in ((0, v.camera.width), (1, v.camera.height)))]
     if off:
         x, y = off[0].camera.K[:2, 2]
