@@ -125,6 +125,7 @@ def test_a_fit_ends_with_its_score_its_size_its_time_and_what_to_do_next(tmp_pat
     assert "held-out" not in " ".join(unscored) and "next:" not in unscored
     scored, unscored = (result_lines(metrics | more | {"region": "foreground"}, None)[0] for more in ({}, quick | {"test": {}}))
     assert scored.endswith("(2 views over foreground)") and "training PSNR 30.25 dB over foreground (no score" in unscored
+    assert result_lines(metrics | {"region": "mask"}, None)[0].endswith("(2 views over unmasked pixels)")
 
 
 # What a fit says it traded: errors that are true, the same for the same seed, and quick to find.

@@ -351,7 +351,7 @@ def summary_line(metrics: dict[str, Any]) -> str:
 
 def over_region(metrics: dict[str, Any]) -> str:
     """Return the pixels that the scores of metrics.json are of, as the end of a phrase; empty for all pixels."""
-    return "" if (region := metrics.get("region", "all")) == "all" else f" over {region}"
+    return {"all": "", "mask": " over unmasked pixels"}.get(region := metrics.get("region", "all"), f" over {region}")
 
 
 def result_lines(metrics: dict[str, Any], out: Path | None, tasks: Sequence[str] = ()) -> list[str]:
