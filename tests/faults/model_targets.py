@@ -64,7 +64,17 @@ def ply_files(root: Path) -> list[Path]:
     rows = np.frombuffer(body, "<f4").reshape(3, -1).tolist()
     lines = "".join(" ".join(map(repr, row)) + "\n" for row in rows)
     (root / "c.ply").write_bytes(head.replace(b"binary_little_endian", b"ascii") + b"end_header\n" + lines.encode())
-    return [root / "a.ply", root / "b.ply", root / "c.ply"]
+    # as nerfstudio exports colours, and a rotation of zero length
+    names = [line.split()[-1] for line in head.decode().splitlines() if line.startswith("property")]
+    kinds = [(n, "u1" if "f_dc" in n else "<f4") for n in names]
+    table = np.array(
+        [tuple(0 if "f_dc" in n or ("rot" in n and not i) else v for n, v in zip(names, row)) for i, row in enumerate(rows)],
+        kinds,
+    )
+    for i, color in enumerate((b"red", b"green", b"blue")):
+        head = head.replace(b"float f_dc_%d" % i, b"uchar " + color)
+    (root / "d.ply").write_bytes(head + b"end_header\n" + table.tobytes())
+    return [root / f"{name}.ply" for name in "abcd"]
 
 
 PLY = (ply._read, parse_header, ply._locate_vertices, ply._check_properties, ply._assemble, ply_error)

@@ -158,12 +158,20 @@ end_header
 """
 
 
-def write_ply(root: Path) -> None:
+def binary_ply() -> bytes:
+    """The points of `PLY` as numbers, with coefficients of Gaussians in place of colours."""
+    head = PLY[: PLY.index(b"end_header") + 11].replace(b"ascii", b"binary_little_endian")
+    for name, i in ((b"red", b"0"), (b"green", b"1"), (b"blue", b"2")):
+        head = head.replace(b"uchar " + name, b"float f_dc_" + i)
+    return head + np.array([[0.1, 0.2, 0.3, 1, -1, 0.5], [-0.2, 0.1, 0, 0, 0, 0]], "<f4").tobytes()
+
+
+def write_ply(root: Path, points: bytes = PLY) -> None:
     """Write a reconstruction with its points as PLY, and names with another suffix than the files."""
     scenes.write_colmap_txt(root, names=tuple(f"C:\\photo{i}.png" for i in range(scenes.VIEWS)))
     scenes.save_images(root / "images")
     (root / "sparse" / "points3D.txt").unlink()
-    (root / "sparse" / "points3D.ply").write_bytes(PLY)
+    (root / "sparse" / "points3D.ply").write_bytes(points)
 
 
 def write_nerfstudio(root: Path) -> None:
@@ -177,7 +185,8 @@ COLMAP = {
     "bin": radial(scenes.write_colmap, "OPENCV", 0.01, 0.001, 0.001, 0.001), "txt": scenes.write_colmap_txt,
     "radial": radial(scenes.write_colmap_txt, "SIMPLE_RADIAL", 0.01),
     "small stems": functools.partial(write_small, names=tuple(f"photo{i}.bmp" for i in range(scenes.VIEWS))),
-    "ply": write_ply, "small order": functools.partial(write_small, names=tuple(f"image{i}.bmp" for i in range(scenes.VIEWS))),
+    "ply": write_ply, "binary ply": functools.partial(write_ply, points=binary_ply()),
+    "small order": functools.partial(write_small, names=tuple(f"image{i}.bmp" for i in range(scenes.VIEWS))),
 }  # fmt: skip
 FRAMES = {
     "own": write_frames, "ngp": scenes.write_ngp, "blender": scenes.write_blender, "ply": write_nerfstudio,
