@@ -110,9 +110,13 @@ def check_file_path(path: Path) -> None:
 
 
 def check_free(folder: Path) -> None:
-    """Check, without writing, that no process holds a folder; a folder that cannot be read counts as free."""
+    """Check that no process holds a folder, and remove a killed one's lock; a folder that cannot be read counts as free."""
     with contextlib.suppress(OSError), open_folder(folder) as opened:
-        os.close(_locked(opened, os.O_RDWR)[0])
+        descriptor, locked = _locked(opened, os.O_RDWR)
+        if locked:
+            unlock(opened, LOCK, descriptor)
+        else:
+            os.close(descriptor)
 
 
 @contextlib.contextmanager

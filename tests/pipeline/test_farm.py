@@ -21,7 +21,7 @@ import pytest
 from tests.pipeline.farms import HereEngine, install_slurm, jobs_of, write_scenes
 from warpgs.app.cli import main
 from warpgs.errors import DataError, ResourceError, UsageError
-from warpgs.files import make_folder
+from warpgs.files import LOCK, make_folder
 from warpgs.locks import hold_folder, private_shared_folder
 from warpgs.pipeline.farm import job as record, slurm, work
 from warpgs.pipeline.farm.farm import LocalEngine, local_slots, make_engine, run_farm
@@ -131,8 +131,10 @@ def test_processes_give_the_bytes_of_single_fits_and_one_that_is_killed_is_repla
 
 def test_a_rerun_skips_what_is_finished_and_valid(scenes, single, results, tmp_path):
     """A changed byte starts that job alone; other times of files are no other data; another setting is another run."""
-    engine = HereEngine()
+    engine, left = HereEngine(), results / "s1" / LOCK
+    left.touch()  # by a farm that was killed after the job's last file
     assert [s.state for s in run_farm(jobs_of(scenes, results), engine)] == ["done", "done"] and engine.begun == []
+    assert not left.exists()
     ply = results / "s1" / "run" / record.PLY
     data = bytearray(ply.read_bytes())
     data[-1] ^= 1

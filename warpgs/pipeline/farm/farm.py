@@ -14,7 +14,7 @@ from pathlib import Path
 
 from warpgs.errors import FolderHeldError, ResourceError, UsageError
 from warpgs.files import remove_leftovers, write_csv, write_text, writing_into
-from warpgs.locks import hold_folder
+from warpgs.locks import check_free, hold_folder
 from warpgs.pipeline.farm.job import PLY, THUMBNAIL, Engine, Event, FarmJob, JobRecord, finished, read_job_record, write_record
 from warpgs.pipeline.run.request import choose_device
 from warpgs.process import PythonWorker, say
@@ -198,6 +198,8 @@ class _Farm:
         for status in self.all:
             record = finished(status.job)
             if record is not None:
+                with contextlib.suppress(FolderHeldError):
+                    check_free(status.job.folder)
                 self._end(status, record)
         self.waiting = deque(s for s in self.all if not s.ended)
 
