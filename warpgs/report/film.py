@@ -3,14 +3,17 @@
 import contextlib
 import functools
 import io
+import itertools
 import os
 import shutil
-from collections.abc import Callable, Iterable, Iterator
+import tempfile
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
 from PIL import Image
 
+from warpgs.device import in_background, usable_cores
 from warpgs.errors import DataError, ResourceError, UsageError
 from warpgs.files import replacing, write_bytes
 from warpgs.process import fed_program, hidden_stderr, run_program, utf8_name
@@ -105,7 +108,10 @@ def write_film(path: Path, frames: Iterable[np.ndarray], fps: int = 30) -> int:
             )
 
     with replacing(path, check, suffix=suffix) as (_, temporary), utf8_name(temporary) as name:
-        _encode(path, name, frames, fps, sizes)
+        if suffix == ".mp4" and (program := h264_encoder()):
+            _encode_h264(program, name, _even(path, frames, sizes), fps)
+        else:
+            _encode_vp9(path, name, _even(path, frames, sizes), fps)
     return len(sizes)
 
 
@@ -119,41 +125,74 @@ def h264_encoder() -> str | None:
     return program if run_program(program, *probe.split(), timeout=5)[0] == 0 else None
 
 
-Writer = tuple[Callable[[np.ndarray], object], Callable[[], object]]
-"""Function that writes a frame, 8-bit [H, W, 3], and function that ends the file."""
+def _even(path: Path, frames: Iterable[np.ndarray], sizes: list[tuple[int, int]]) -> Iterator[np.ndarray]:
+    """Yield frames as 8-bit values with even sides, and write the size of each, [width, height], to a list."""
+    for pixels in _checked(path, frames):
+        height, width = (s // 2 * 2 for s in pixels.shape[:2])
+        sizes.append((width, height))
+        yield np.ascontiguousarray(pixels[:height, :width])
 
 
-def _writer(path: Path, temporary: str, fps: int, size: tuple[int, int]) -> Writer:
-    """Return the writer of a video of frames of ``size``, [width, height]."""
+def _vp9(path: Path, name: str, fps: int, frame: np.ndarray, properties: tuple[int, ...] = ()):
+    """Return OpenCV's writer of VP9 for frames as large as ``frame``."""
     import cv2
 
-    if path.suffix.lower() == ".mp4" and (program := h264_encoder()):
-        given = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", "{}x{}".format(*size), "-r", str(fps), "-i", "-"]
-        colors = "scale=out_color_matrix=bt709:out_range=tv,setparams=colorspace=bt709:color_primaries=bt709:color_trc=bt709"
-        codec = ["-vf", colors, "-c:v", "h264", "-pix_fmt", "yuv420p", "-movflags", "+faststart"]
-        folder, name = os.path.split(temporary)  # the folder may be a descriptor of this process
-        return fed_program(program, "-v", "quiet", "-y", *given, *codec, name, folder=folder)
     # for .webm OpenCV warns on stderr of an unknown tag, but writes VP9
-    with hidden_stderr() if path.suffix.lower() == ".webm" else contextlib.nullcontext():
-        writer = cv2.VideoWriter(temporary, cv2.VideoWriter_fourcc(*"vp09"), fps, size)
+    with hidden_stderr() if name.endswith(".webm") else contextlib.nullcontext():
+        codec, (height, width) = cv2.VideoWriter_fourcc(*"vp09"), frame.shape[:2]
+        writer = cv2.VideoWriter(name, cv2.CAP_FFMPEG, codec, fps, (width, height), properties)
     if not writer.isOpened():
         raise ResourceError(f"{path}: cannot be written; the folder is not writable, or OpenCV lacks a VP9 encoder")
-    return lambda pixels: writer.write(np.ascontiguousarray(pixels[..., ::-1])), writer.release
+    return writer
 
 
-def _encode(path: Path, temporary: str, frames: Iterable[np.ndarray], fps: int, sizes: list[tuple[int, int]]) -> None:
-    """Write frames to a temporary file, and the size of each, [width, height], to a list."""
-    writer: Writer | None = None
+def _encode_h264(program: str, temporary: str, frames: Iterator[np.ndarray], fps: int) -> None:
+    """Write 8-bit frames to a temporary file by ffmpeg."""
+    first = next(frames)
+    size = f"{first.shape[1]}x{first.shape[0]}"
+    given = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", size, "-r", str(fps), "-i", "-"]
+    colors = "scale=out_color_matrix=bt709:out_range=tv,setparams=colorspace=bt709:color_primaries=bt709:color_trc=bt709"
+    codec = ["-vf", colors, "-c:v", "h264", "-pix_fmt", "yuv420p", "-movflags", "+faststart"]
+    folder, name = os.path.split(temporary)  # the folder may be a descriptor of this process
+    write, end = fed_program(program, "-v", "quiet", "-y", *given, *codec, name, folder=folder)
     try:
-        for pixels in _checked(path, frames):
-            height, width = (s // 2 * 2 for s in pixels.shape[:2])
-            writer = writer or _writer(path, temporary, fps, (width, height))
-            sizes.append((width, height))
+        for pixels in itertools.chain((first,), frames):
             with contextlib.suppress(BrokenPipeError):  # frames are missing then, which is noticed afterwards
-                writer[0](np.ascontiguousarray(pixels[:height, :width]))
+                write(pixels)
     finally:
-        if writer is not None:
-            writer[1]()
+        end()
+
+
+PART = 30
+"""Frames from one key frame to the next. libvpx needs .1 s and more for a frame of 504 x 378 px: each thread encodes a part."""
+
+
+def _encode_vp9(path: Path, temporary: str, frames: Iterator[np.ndarray], fps: int) -> None:
+    """Write 8-bit frames to a temporary file: threads encode parts, whose packets are then put into one file."""
+    import cv2
+
+    first = next(frames)
+    frames = itertools.chain((first,), frames)
+    packets_as_they_are = (cv2.VIDEOWRITER_PROP_RAW_VIDEO, 1, cv2.VIDEOWRITER_PROP_KEY_INTERVAL, PART)
+    film = _vp9(path, temporary, fps, first, packets_as_they_are)
+
+    def encode(name: str, part: list[np.ndarray]) -> str:
+        encoder = _vp9(path, name, fps, first)
+        for pixels in part:
+            encoder.write(np.ascontiguousarray(pixels[..., ::-1]))
+        encoder.release()
+        return name
+
+    with tempfile.TemporaryDirectory() as folder:
+        parts = iter(lambda: list(itertools.islice(frames, PART)), [])
+        threads = min(usable_cores(), MAX_BYTES // (PART * first.nbytes))
+        names = in_background(encode, ((f"{folder}/{i}.mp4", p) for i, p in enumerate(parts)), max(2, threads))
+        for name in names:
+            packets = cv2.VideoCapture(name, cv2.CAP_FFMPEG, (cv2.CAP_PROP_FORMAT, -1))
+            while (read := packets.read())[0]:
+                film.write(read[1])
+            packets.release()
+    film.release()
 
 
 def _decoded_sizes(path: Path) -> list[tuple[int, int]]:
