@@ -41,4 +41,4 @@ def filled(page: str, parts: dict[str, str]) -> str:
 def files() -> dict[str, str]:
     """Return all pages with generated parts, and the charts, by their path under docs/."""
     pages = {name: filled((DOCS / name).read_text("utf-8"), parts()) for name, parts in PARTS.items()}
-    return pages | performance_page.plots(result_file.stored("ops"))
+    return pages | performance_page.plots(result_file.stored("ops")) | performance_page.time_to_score()

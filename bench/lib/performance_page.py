@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import statistics
 
-from bench.lib import rasterizers_page, result_file
+from bench.lib import rasterizers_page, result_file, score_times
 from bench.lib.plot import Line, Panel, chart
 from bench.lib.points import BASE, SIZES, Point, Series, along, diagonal, tasks
 from bench.lib.tables import figure, markdown
@@ -83,6 +83,9 @@ def fits_table(results: dict[str, dict]) -> str:
         ("wall_h200", "fern", "fern, 3 photographs of 504 x 378 px, H200"),
         ("wall_h200", "temple", "temple, 4 photographs of 640 x 480 px, H200"),
         ("wall_h200", "fox", "fox, 8 photographs of 1080 x 1920 px, H200"),
+        ("rows_h200", "fox:8", "fox, 8 photographs of 270 x 480 px, H200"),
+        ("dense_h200", "fox:all", "fox, 43 photographs of 270 x 480 px, H200"),
+        ("dense_h200", "horns:54", "horns, 54 photographs of 504 x 378 px, H200"),
         ("fern_cpu2", "", "fern, 3 photographs of 504 x 378 px, 2 cores"),
         ("temple_cpu2", "", "temple, 12 photographs of 640 x 480 px, 2 cores"),
     ):
@@ -166,14 +169,25 @@ def plots(results: dict[str, dict]) -> dict[str, str]:
     return made
 
 
+def time_to_score() -> dict[str, str]:
+    """Return charts of PSNR against wall time by path under docs/, two scenes in each."""
+    rows = next(iter(result_file.stored("time_to_score").values()))["rows"]
+    scenes = list(dict.fromkeys(r["row"] for r in rows))
+    pairs = (scenes[i : i + 2] for i in range(0, len(scenes), 2))
+    made = (score_times.picture([r for r in rows if r["row"] in pair]) for pair in pairs)
+    return {f"plots/time_to_score_{i}.svg": svg for i, svg in enumerate(made, 1)}
+
+
 def parts() -> dict[str, str]:
     """Return the generated parts of docs/performance.md by name."""
     ops, others, steps, turns = (result_file.stored(kind) for kind in ("ops", "rasterizers", "training_steps", "turns"))
+    times = result_file.stored("time_to_score")
     sources, beside = _sources("ops", ops), next(iter(others.values()))
     return {
         "sizes": sizes_table(ops) + sources,
         "rasterizers": rasterizers_page.times_table(beside) + _sources("rasterizers", others),
         "steps": rasterizers_page.steps_table(next(iter(steps.values()))) + _sources("training_steps", steps),
         "whole fits": fits_table(turns) + _sources("turns", turns),
+        "time to score": score_times.table(next(iter(times.values()))["rows"], (3.0, 0.0)) + _sources("time_to_score", times),
         "ops": ops_table(ops),
     }

@@ -95,13 +95,13 @@ def runs_of(rows: list[dict], scene: str, program: str) -> list[dict]:
     return [r for r in rows if (r["row"], r["program"]) == (scene, program)]
 
 
-def table(rows: list[dict]) -> str:
-    """Return, for each rival and scene, the times at which it and we reach its last score, and less."""
+def table(rows: list[dict], marks: tuple[float, ...] = BELOW) -> str:
+    """Return, for each rival and scene, the times at which it and we reach its last score, and some dB less."""
     body = []
     for scene, program in dict.fromkeys((r["row"], r["program"]) for r in rows if r["program"] in RIVALS):
         runs = runs_of(rows, scene, program)
         longest, we = max(runs, key=lambda r: r["steps"]), runs_of(rows, scene, OURS)
-        for below in BELOW:
+        for below in marks:
             target = longest["psnr"] - below
             times = [reached(runs, target), reached(runs, target, points=True), reached(we, target)]
             cells = [f"{t:.1f}" for t in times] + [f"{times[1] / times[2]:.2f}"]
