@@ -28,6 +28,14 @@ INFO = {
 MODEL, SETTINGS = "gaussians.safetensors", "settings.json"
 
 
+def value_of(setting: Any) -> Any:
+    """Return a number, truth value or list that `--set` passed as text; other text as it is."""
+    try:
+        return json.loads(setting) if isinstance(setting, str) else setting
+    except ValueError:
+        return setting
+
+
 def camera_of(camera: Any, normalization: warpgs.Normalization) -> warpgs.Camera:
     """Return a camera of nerfbaselines, world from camera in the axes of OpenCV, in scene units."""
     pose, (fx, fy, cx, cy) = camera.poses.astype(np.float64), camera.intrinsics.astype(np.float64)
@@ -72,7 +80,8 @@ class Warpgs(Method):  # type: ignore[misc]
         """Load a checkpoint, or keep the training set for the first iteration."""
         self.checkpoint, self.dataset = checkpoint, train_dataset
         self.model: warpgs.Model | None = None
-        self.settings: dict[str, Any] = {"arguments": config_overrides or {}, "background": [0, 0, 0], "antialiased": False}
+        arguments = {name: value_of(setting) for name, setting in (config_overrides or {}).items()}
+        self.settings: dict[str, Any] = {"arguments": arguments, "background": [0, 0, 0], "antialiased": False}
         self.device = "cuda" if torch.cuda.is_available() else "cpu"
         if checkpoint is not None:
             self.model = warpgs.load(Path(checkpoint) / MODEL, self.device)
@@ -97,15 +106,18 @@ class Warpgs(Method):  # type: ignore[misc]
         result = warpgs.fit(
             scene_of(self.dataset, background), device=self.device, on_step=reports.append, **self.settings["arguments"]
         )
-        self.model = result
-        self.settings |= {"background": background, "antialiased": result.antialiased}
+        self.model, self.checkpoint = result, None
+        self.settings |= {"background": result.background, "antialiased": result.antialiased}
         return {"loss": reports[-1].loss, "psnr": reports[-1].psnr, "num_gaussians": float(reports[-1].count)}
 
     def save(self, path: str) -> None:
         """Write the model and its settings into a folder."""
         assert self.model is not None, "there is no model before the first iteration"
         os.makedirs(path, exist_ok=True)
-        warpgs.save(Path(path) / MODEL, self.model.gaussians(), self.model.normalization)
+        if self.checkpoint is None:
+            warpgs.save(Path(path) / MODEL, self.model.gaussians(), self.model.normalization)
+        else:  # the same bytes again: a safetensors header has no fixed order
+            (Path(path) / MODEL).write_bytes((Path(self.checkpoint) / MODEL).read_bytes())
         (Path(path) / SETTINGS).write_text(json.dumps(self.settings), "utf-8")
 
     def render(self, camera: Any, *, options: dict[str, Any] | None = None) -> dict[str, np.ndarray]:
@@ -120,11 +132,12 @@ class Warpgs(Method):  # type: ignore[misc]
         return {name: image.cpu().numpy() for name, image in images.items()}
 
 
-register(
-    {
-        "id": "warpgs",
-        "method_class": "nerfbaselines_warpgs:Warpgs",
-        "backends_order": ["python"],
-        "metadata": {"name": "warpgs", "description": "Sparse-view Gaussian splatting with NVIDIA Warp."},
-    }
-)
+if __name__ != "nerfbaselines_warpgs":  # nerfbaselines runs this file to register it, and then imports it
+    register(
+        {
+            "id": "warpgs",
+            "method_class": "nerfbaselines_warpgs:Warpgs",
+            "backends_order": ["python"],
+            "metadata": {"name": "warpgs", "description": "Sparse-view Gaussian splatting with NVIDIA Warp."},
+        }
+    )

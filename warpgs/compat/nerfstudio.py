@@ -71,14 +71,16 @@ class WarpgsModelConfig(SplatfactoModelConfig):
     _target: type = field(default_factory=lambda: WarpgsModel)
     preset: str = "default"
     """Preset of warpgs, or a .toml file with settings of the fit"""
-    background_color: Literal["random", "black", "white"] = "black"
-    """Colour behind the Gaussians in renders; random for the viewer's"""
+    background_color: Literal["random", "black", "white"] = "random"
+    """Colour behind the Gaussians; random for the one that warpgs chooses, such as the mean of the images"""
 
 
 class WarpgsModel(SplatfactoModel):
     """A splatfacto model that our rasterizer renders."""
 
     config: WarpgsModelConfig
+    behind: Tensor
+    """Colour behind the Gaussians, shape [3]."""
 
     def populate_modules(self) -> None:
         """Begin with random Gaussians, which the fit replaces."""
@@ -92,6 +94,7 @@ class WarpgsModel(SplatfactoModel):
             )
         self.seed_points = None
         super().populate_modules()
+        self.register_buffer("behind", torch.zeros(3))
 
     def get_param_groups(self) -> dict[str, list[torch.nn.Parameter]]:
         """Return nothing to optimise: the fit has its own optimizer."""
@@ -101,31 +104,31 @@ class WarpgsModel(SplatfactoModel):
         """Return no callbacks: the fit has its own strategy."""
         return []
 
-    def take(self, gaussians: warpgs.Gaussians) -> None:
-        """Copy Gaussians [N]; absent coefficients of harmonics become 0."""
-        values = {n: t.detach().clone() for n, t in gaussians.tensors().items()}
-        rest = values["means"].new_zeros(len(gaussians), self.features_rest.shape[1], 3)
+    def take(self, fitted: Any) -> None:
+        """Copy the N Gaussians and the background of a `warpgs.FitResult`; absent coefficients of harmonics become 0."""
+        values = {n: t.detach().clone() for n, t in fitted.gaussians().tensors().items()}
+        rest = values["means"].new_zeros(len(values["means"]), self.features_rest.shape[1], 3)
         rest[:, : values["sh"].shape[1] - 1] = values["sh"][:, 1:]
         named = {
             "means": values["means"], "scales": values["log_scales"], "quats": values["quats"],
             "features_dc": values["sh"][:, 0], "features_rest": rest, "opacities": values["logit_opacities"][:, None],
         }  # fmt: skip
         self.gauss_params = torch.nn.ParameterDict({n: torch.nn.Parameter(t, requires_grad=False) for n, t in named.items()})
+        self.behind = fitted.options().background
 
     def get_outputs(self, camera: Cameras) -> dict[str, Tensor]:
         """Return rgb, depth, accumulation and background of one camera, shape [H, W, D]."""
-        background = self._get_background_color()
         kept = slice(None) if self.crop_box is None else self.crop_box.within(self.means)
         parts = {n: t[kept] for n, t in self.gauss_params.items()}
         sh = torch.cat([parts["features_dc"][:, None], parts["features_rest"]], 1)
         shapes = parts["means"], parts["quats"], parts["scales"], parts["opacities"].squeeze(-1)
-        options = warpgs.RasterizeOptions(background=background, antialiased=self.config.rasterize_mode == "antialiased")
+        options = warpgs.RasterizeOptions(background=self.behind, antialiased=self.config.rasterize_mode == "antialiased")
         render = warpgs.rasterize(warpgs.Gaussians(*shapes, sh), camera_of(camera, 0), options)
         return {
             "rgb": render.rgb.clamp(0, 1),
             "depth": torch.where(render.alpha > 0, render.depth, render.depth.max())[..., None],
             "accumulation": render.alpha[..., None],
-            "background": background.expand_as(render.rgb),
+            "background": self.behind.expand_as(render.rgb),
         }
 
 
@@ -150,14 +153,16 @@ class WarpgsTrainer(Trainer):
         data, model, config = self.pipeline.datamanager, self.pipeline.model, self.config
         data.train_dataparser_outputs.save_dataparser_transform(Path(self.base_dir) / "dataparser_transforms.json")
         self._init_viewer_state()
-        steps = {"steps": config.max_num_iterations} if config.max_num_iterations else {}
+        chosen: dict[str, Any] = {"steps": config.max_num_iterations} if config.max_num_iterations else {}
+        if model.config.background_color != "random":
+            chosen["background"] = model.config.background_color
         antialiased = model.config.rasterize_mode == "antialiased"
         with self.train_lock:
             result = warpgs.fit(
                 scene_of(data), model.config.preset, device=self.device, on_model=self.after_step, antialiased=antialiased,
-                seed=config.machine.seed, **steps,
+                seed=config.machine.seed, **chosen,
             )  # fmt: skip
-            model.take(result.gaussians())
+            model.take(result)
         self.step = result.step
         self._after_train()
 
@@ -167,7 +172,7 @@ class WarpgsTrainer(Trainer):
         show = self.viewer_state is not None and fitted.step % SHOWN == 0
         if save or show:
             self.step = fitted.step
-            self.pipeline.model.take(fitted.gaussians())
+            self.pipeline.model.take(fitted)
         if save:
             self.save_checkpoint(fitted.step)
         if show:
