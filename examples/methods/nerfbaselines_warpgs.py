@@ -43,7 +43,8 @@ def camera_of(camera: Any, normalization: warpgs.Normalization) -> warpgs.Camera
     viewmat[:3, :3] = pose[:3, :3].T
     viewmat[:3, 3] = -viewmat[:3, :3] @ (normalization.scale * (pose[:3, 3] - normalization.offset))
     K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
-    return warpgs.Camera(viewmat, K, *map(int, camera.image_sizes))
+    width, height = map(int, camera.image_sizes)
+    return warpgs.Camera(viewmat, K, width, height)
 
 
 def scene_of(dataset: dict[str, Any], background: list[float]) -> warpgs.Scene:
@@ -56,7 +57,7 @@ def scene_of(dataset: dict[str, Any], background: list[float]) -> warpgs.Scene:
         image = dataset["images"][i].astype(np.float32) / 255
         alpha = image[..., 3] if image.shape[-1] == 4 else None
         if alpha is not None:
-            image = image[..., :3] * alpha[..., None] + np.float32(background) * (1 - alpha[..., None])
+            image = image[..., :3] * alpha[..., None] + np.array(background, np.float32) * (1 - alpha[..., None])
         mask = None if dataset["masks"] is None else dataset["masks"][i] > 0
         name = os.path.relpath(dataset["image_paths"][i], dataset["image_paths_root"])
         views.append(warpgs.View(name, camera_of(camera, normalization), image, mask=mask, alpha=alpha))
