@@ -315,3 +315,24 @@ def test_harmonics_and_rotations():
     # a fisheye that is sorted by z has distances alone: a key that would be wrong is absent
     meta = gsplat.rasterization(**scene(), camera_model="fisheye")[2]
     assert "depths" not in meta and "conics" in meta
+
+
+def test_a_decoder_of_anysplat_changes_its_import_alone():
+    """Covariances beside shapes, a near plane of almost 0, a clip, and depth as fourth channel, which is split off."""
+    given, coeffs = scene(), torch.rand(COUNT, 16, 3, generator=torch.Generator().manual_seed(3)) - 0.5
+    axes = rotations(given["quats"]) * given["scales"][:, None]
+    covars = (axes @ axes.mT).requires_grad_()
+    shapes = [given[n] for n in ("means", "quats", "scales", "opacities")]
+    options = {"sh_degree": 3, "render_mode": "RGB+D", "packed": False, "near_plane": 1e-10, "radius_clip": 0.1}
+    options |= {"backgrounds": torch.ones(1, 3), "rasterize_mode": "classic"}
+    images, depths = [], []
+    for i in range(VIEWS):
+        camera = given["viewmats"].inverse()[i : i + 1].inverse(), given["Ks"][i : i + 1], WIDTH, HEIGHT
+        render, alpha, _ = gsplat.rasterization(*shapes, coeffs, *camera, covars=covars, **options)
+        image, depth = torch.split(render, [3, 1], dim=-1)
+        wanted, opacity, _ = gsplat.rasterization(*shapes, coeffs, *camera, **options)
+        torch.testing.assert_close((render, alpha), (wanted, opacity), atol=1e-4, rtol=1e-4)
+        images.append(image.clamp(0, 1).permute(0, 3, 1, 2))
+        depths.append(depth)
+    (torch.cat(images).mean() + torch.cat(depths).mean()).backward()
+    assert torch.cat(images).shape == (VIEWS, 3, HEIGHT, WIDTH) and bool(covars.grad.any()) and bool(alpha.any())
