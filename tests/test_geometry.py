@@ -56,7 +56,9 @@ def test_gaussians_and_cameras_together_look_the_same_in_both_units():
 def test_model_and_ply_files_know_their_units(tmp_path, units):
     g = cloud(30, degree=1)
     given = convert_gaussians(g, N, "scene", units)
-    save(tmp_path / "m.safetensors", given, N, units=units)
+    for name in ("again.safetensors", "m.safetensors"):
+        save(tmp_path / name, given, N, units=units)
+    assert (tmp_path / name).read_bytes() == (tmp_path / "again.safetensors").read_bytes()
     write_ply(tmp_path / "m.ply", given, N, units=units)
     model = load(tmp_path / "m.safetensors")
     for wanted in ("scene", "file"):

@@ -97,6 +97,29 @@ def read_file(
         raise DataError(f"{path}: {what}cannot be read ({unread_reason(e)}); {fix}") from e
 
 
+DTYPES = {
+    "torch.float64": "F64", "torch.float32": "F32", "torch.int64": "I64", "torch.int32": "I32", "torch.uint8": "U8",
+    "torch.bool": "BOOL",
+}  # fmt: skip
+"""Names of scalar types in a safetensors file."""
+
+
+def tensor_pieces(tensors: dict[str, Any], metadata: dict[str, str]) -> list[memoryview | bytes]:
+    """Return a safetensors file in pieces, the same for the same tensors; those of CPU tensors share their memory."""
+    import torch
+
+    ordered = sorted(tensors.items(), key=lambda item: (-item[1].element_size(), item[0]))  # aligned for every reader
+    parts = [t.detach().cpu().contiguous().reshape(-1).view(torch.uint8) for _, t in ordered]
+    header: dict[str, Any] = {"__metadata__": metadata}
+    end = 0
+    for (name, t), part in zip(ordered, parts):
+        begin, end = end, end + len(part)
+        header[name] = {"dtype": DTYPES[str(t.dtype)], "shape": list(t.shape), "data_offsets": [begin, end]}
+    text = json.dumps(header).encode()
+    text += b" " * (-len(text) % 8)
+    return [len(text).to_bytes(8, "little"), text, *(p.numpy().data for p in parts)]
+
+
 def tensors_of(data: bytes) -> tuple[dict[str, Any], dict[str, Any]]:
     """Return the tensors [...] of a safetensors file by name, on the CPU, and its metadata; ValueError if it is damaged."""
     from safetensors import SafetensorError

@@ -15,7 +15,7 @@ import torch.nn.functional as F
 
 from warpgs import files
 from warpgs.errors import DataError, UsageError
-from warpgs.files import open_input, read_tensors, remove_leftovers, unread_reason, write_bytes
+from warpgs.files import open_input, read_tensors, remove_leftovers, tensor_pieces, unread_reason, write_bytes
 
 FORMAT = "warpgs-lpips-1"
 MAX_PICKLE = 2**20
@@ -150,8 +150,6 @@ def _net_of(heads: dict[str, torch.Tensor], path: Path) -> Net:
 
 def convert_lpips(backbone: Path, heads: Path, out: Path) -> list[str]:
     """Join a torchvision backbone and LPIPS heads into a file without pickles; returns lines on the file and its sources."""
-    from safetensors.torch import save
-
     if os.path.exists(out):
         raise UsageError(f"{out} exists already; choose another --out")
     head_state, head_hash = _read_state(heads)
@@ -172,7 +170,7 @@ def convert_lpips(backbone: Path, heads: Path, out: Path) -> list[str]:
         "format": FORMAT, "net": net.name, "version": version, "backbone_sha256": backbone_hash, "heads_sha256": head_hash,
     }  # fmt: skip
     remove_leftovers(out.parent)
-    write_bytes(out, save(tensors, metadata))
+    write_bytes(out, *tensor_pieces(tensors, metadata))
     notes = [f"{out}: LPIPS with {net.title}, heads of version {version}"]
     if not backbone_hash.startswith(net.published):
         notes.append(f"{backbone} is not torchvision's published file (SHA-256 {net.published}...); scores are not comparable")

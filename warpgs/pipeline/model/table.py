@@ -15,7 +15,7 @@ import torch
 
 from warpgs import schema
 from warpgs.errors import DataError, UsageError
-from warpgs.files import read_tensors, write_bytes
+from warpgs.files import read_tensors, tensor_pieces, write_bytes
 from warpgs.geometry import check_stored, checked_normalization, convert_camera, convert_gaussians, logit
 from warpgs.kernels.neighbours import morton_codes
 from warpgs.kernels.sh import MAX_DEGREE
@@ -463,15 +463,12 @@ def save(path: str | Path, gaussians: Gaussians, normalization: Normalization | 
         UsageError: The units are unknown, or scene units are given without a normalization.
         ValueError: The shapes of the tensors do not match.
     """
-    from safetensors.torch import save as to_bytes
-
     where = f"{path}: not written"
     _check_values(gaussians, where)
     normalization = checked_normalization(normalization, units, where)
     similarity = {name: json.dumps(value) for name, value in similarity_values(normalization).items()}
     header = {"format": FORMAT, "version": __version__, "units": units} | similarity
-    tensors = {n: t.detach().cpu().contiguous() for n, t in gaussians.tensors().items()}
-    write_bytes(Path(path), to_bytes(tensors, header))
+    write_bytes(Path(path), *tensor_pieces(gaussians.tensors(), header))
 
 
 def load(path: str | Path, device: str | torch.device = "cpu") -> Model:

@@ -19,7 +19,7 @@ import torch
 from warpgs import schema
 from warpgs.constants import K_TOLERANCE, POSE_TOLERANCE, RULES
 from warpgs.errors import DataError, NotFiniteError, UsageError, similar_folder
-from warpgs.files import is_empty, open_input, plain, tensors_of, unread_reason, write_bytes
+from warpgs.files import is_empty, open_input, plain, tensor_pieces, tensors_of, unread_reason, write_bytes
 from warpgs.io.images import CHOICES
 from warpgs.io.load import Split
 from warpgs.kernels.cameras import check_camera
@@ -102,25 +102,7 @@ METRICS = fields(
 TENSORS = "checkpoint.safetensors"
 FORMAT = 2
 """Version of the format of run folders: config.json and the checkpoint. warpgs 0.1.0 wrote version 1."""
-DTYPES = {
-    torch.float64: "F64", torch.float32: "F32", torch.int64: "I64", torch.int32: "I32", torch.uint8: "U8", torch.bool: "BOOL",
-}  # fmt: skip
-"""Names of scalar types in the format."""
 RESTORE = "restore the file, or fit the scene again"
-
-
-def safetensors_chunks(tensors: dict[str, torch.Tensor], metadata: dict[str, str]) -> list[memoryview | bytes]:
-    """Return a safetensors file in pieces; pieces of CPU tensors share their memory, so nothing is copied."""
-    ordered = sorted(tensors.items(), key=lambda item: (-item[1].element_size(), item[0]))  # aligned for every reader
-    parts = [t.detach().cpu().contiguous().reshape(-1).view(torch.uint8) for _, t in ordered]
-    header: dict[str, Any] = {"__metadata__": metadata}
-    end = 0
-    for (name, t), part in zip(ordered, parts):
-        begin, end = end, end + len(part)
-        header[name] = {"dtype": DTYPES[t.dtype], "shape": list(t.shape), "data_offsets": [begin, end]}
-    text = json.dumps(header).encode()
-    text += b" " * (-len(text) % 8)
-    return [len(text).to_bytes(8, "little"), text, *(p.numpy().data for p in parts)]
 
 
 def save_checkpoint(folder: Path, tensors: dict[str, torch.Tensor], state: dict[str, Any]) -> Path:
@@ -135,7 +117,7 @@ def save_checkpoint(folder: Path, tensors: dict[str, torch.Tensor], state: dict[
                 "--resume would repeat the same steps; fit again into a new --out with lower learning rates"
             )
     metadata = {"format": str(FORMAT), "version": __version__, "state": json.dumps(state)}
-    chunks, digest = safetensors_chunks(tensors, metadata), hashlib.sha256()
+    chunks, digest = tensor_pieces(tensors, metadata), hashlib.sha256()
     for chunk in chunks:
         digest.update(chunk)
     write_bytes(path, *chunks, digest.digest())
