@@ -587,7 +587,7 @@ def limited_on_cpu(config: FitConfig, views: int, pixels: float) -> tuple[int, i
 
     ``pixels`` are those of a view.
     """
-    assert config.steps is not None and config.half_resolution is not None
+    assert config.steps is not None and config.half_resolution is not None and config.sh_degree is not None
     least, each, upper = CPU_SECONDS
     limit = min(least + each * views, upper, FIRST_LOOK * config.max_steps)
     start = first_points(config, views, pixels)
@@ -611,7 +611,7 @@ def limited_on_cpu(config: FitConfig, views: int, pixels: float) -> tuple[int, i
     capped = f", with at most {most:,} Gaussians" if most < config.max_gaussians else ""
     return steps, most, (
         f"to save time on a CPU, the fit takes {steps:,} of {config.steps:,} steps{capped}; --no-cpu-limit takes all, about "
-        f"{all_steps / 60:.0f} min" + f", and raised PSNR by {GAIN_DB}" * (steps < NEARLY_ALL * config.steps)
+        f"{max(1, round(all_steps / 60))} min" + f", and raised PSNR by {GAIN_DB}" * (steps < NEARLY_ALL * config.steps)
     )  # fmt: skip
 
 
