@@ -56,8 +56,8 @@ class FitConfig(Checked):
     """Number of views that each step renders; their gradients are averaged. Learning rates are multiplied by the square root of
     this number (docs/many-gpus.md). Several GPUs share the views of a step."""
     cpu_limit: bool = True
-    """Limit steps and Gaussians on a CPU, if --steps is None: at most as many as two cores finish in 1 to 20 minutes, depending
-    on the number of views and on --max-steps."""
+    """Limit steps and Gaussians on a CPU, if --steps is None: at most as many as two cores finish in 10 s to 20 minutes,
+    depending on the number of views and on --max-steps."""
     seed: Annotated[int, Within(0, 2**31 - 1)] = 0
     """Seed of all random numbers; the same seed, data and kind of device give the same bytes."""
     rule: str = "exact"
@@ -523,23 +523,21 @@ AVERAGED_VIEWS = 20
 MIN_GAIN_DB = 0.1
 """Gain of held-out blocks below which growth ends [dB]. Nothing is held out if the time limit on a CPU shortens the fit: it is
 too short to end earlier, and a measurement renders every view (docs/decisions/025-time-on-a-cpu.md)."""
-CPU_PIXELS = 1.55e6
-"""Pixels per second that two cores of 2.5 GHz train with about as many Gaussians as pixels; with fewer Gaussians, up to three
-times as many pixels."""
-CPU_SECONDS = 45.0, 4.0, 1200.0
+CPU_SECONDS = 5.0, 5.0, 1200.0
 """Default time limit of a fit on a CPU [s]: constant part, part for each view, and upper bound of the sum."""
-CPU_TIMES = 6.8e-8, 3.1e-7, 1.2e-8
-"""Time of a step on two idle cores of 2.5 GHz: for a pixel, for a Gaussian, and for each coefficient of the harmonics of a
-Gaussian [s]. Measured as processor time over two threads (docs/decisions/025-time-on-a-cpu.md)."""
+CPU_TIMES = 0.002, 6.8e-8, 3.3e-7, 1.3e-8
+"""Time of a step on two idle cores of 2.5 GHz: its constant part, for a pixel, for a Gaussian, and for each coefficient of the
+harmonics of a Gaussian [s] (docs/decisions/025-time-on-a-cpu.md)."""
+GAUSSIANS_SHARE = 0.75
+"""Largest fraction of the mean step that Gaussians take where the time limit on a CPU shortens a fit."""
 EVENT_TIMES = 1.0, 0.6, 0.8
 """Time of an event, in steps: for each view that is sampled, for each view that ranks Gaussians for eviction, and for each view
 that shows which Gaussians to remove."""
-SWEPT_VIEWS = 30
-"""Views whose pixels, over the area of a merged cell, give about the number of first points; more add no points."""
+FIRST_POINTS, FIRST_POWER, SWEPT_VIEWS = 2.4, 0.64, 30
+"""Number of first points over that of the merged cells of one view, for one view; exponent of its growth with the number of
+views; and number of views above which it does not grow."""
 FIRST_LOOK = 0.1
 """Upper bound of the time limit on a CPU for each of ``max_steps`` [s]: half a minute for the 300 of preset `quick`."""
-ONE_LAYER = 1.1
-"""Time of a step on a CPU with one layer of Gaussians, relative to a step with two layers, where there are fewer Gaussians."""
 MEANS_LR, SH_LR, CPU_RATES, CPU_RATES_VIEWS = 1.6e-4, 2.5e-3, 2.5, 9
 """Learning rates of the means and of the constant colour; and the factor of both if the time limit on a CPU shortens the fit
 and there are more than `CPU_RATES_VIEWS` views (docs/decisions/025-time-on-a-cpu.md)."""
@@ -563,7 +561,8 @@ def step_times(config: FitConfig, views: int, pixels: float, start: int, done: i
     """
     assert config.steps is not None and config.half_resolution is not None  # `settings_by_views` has chosen
     assert config.sh_degree is not None
-    (of_pixel, of_gaussian, of_coefficient), sampler, steps = CPU_TIMES, config.method.sampler, np.arange(1, config.steps + 1)
+    (constant, of_pixel, of_gaussian, of_coefficient), sampler = CPU_TIMES, config.method.sampler
+    steps = np.arange(1, config.steps + 1)
     phases, samples = plan_phases(config.phases, config.steps), find_strategy(config.strategy).samples
     due = np.isin(steps, phases.events) & samples
     removed = np.isin(steps, list(removals(phases, views))) & samples
@@ -571,11 +570,16 @@ def step_times(config: FitConfig, views: int, pixels: float, start: int, done: i
     wanted = start + added * np.cumsum(due & (steps > done))
     most = max(start, min(config.max_gaussians, (1 + sampler.max_fraction) * start))
     counts, weighed = np.minimum(wanted, most), np.where(wanted > most, len(range(0, views, -(-views // MAX_WEIGHED))), 0)
-    full = of_pixel * pixels + (of_gaussian + of_coefficient * (config.sh_degree + 1) ** 2) * counts
+    full = constant + of_pixel * pixels + (of_gaussian + of_coefficient * (config.sh_degree + 1) ** 2) * counts
     half = 0.75 * of_pixel * pixels * (steps <= config.half_resolution * config.steps)
     events_in_steps = due * (EVENT_TIMES[0] * min(views, MAX_VIEWS) + EVENT_TIMES[1] * weighed)
     events_in_steps += removed * (EVENT_TIMES[2] * views)
     return config.batch * (full - half) + events_in_steps * full, counts
+
+
+def first_points(config: FitConfig, views: int, pixels: float) -> int:
+    """Return the expected number of first points of a sweep; fewer are found on an object before an empty background."""
+    return round(FIRST_POINTS * min(views, SWEPT_VIEWS) ** FIRST_POWER * pixels / max(1.0, config.init.merge_px) ** 2)
 
 
 def limited_on_cpu(config: FitConfig, views: int, pixels: float) -> tuple[int, int, str]:
@@ -583,26 +587,31 @@ def limited_on_cpu(config: FitConfig, views: int, pixels: float) -> tuple[int, i
 
     ``pixels`` are those of a view.
     """
-    assert config.steps is not None and config.half_resolution is not None
+    assert config.steps is not None and config.half_resolution is not None and config.sh_degree is not None
     least, each, upper = CPU_SECONDS
-    limit, most = min(least + each * views, upper, FIRST_LOOK * config.max_steps), config.max_gaussians
-    rendered = pixels * config.batch * (1 - 0.75 * config.half_resolution)  # half the size is a quarter of the pixels
-    seconds = config.steps * rendered * (1.0 if config.method.hier else ONE_LAYER) / CPU_PIXELS
-    steps = max(1, int(config.steps * min(1.0, limit / seconds)))
-    start = round(min(views, SWEPT_VIEWS) * pixels / max(1.0, config.init.merge_px) ** 2)
+    limit = min(least + each * views, upper, FIRST_LOOK * config.max_steps)
+    start = first_points(config, views, pixels)
 
-    def planned(most: int) -> float:
+    def seconds(steps: int, most: int) -> float:
         fit = dataclasses.replace(config, steps=steps, max_gaussians=most)
         return float(step_times(fit, views, pixels, min(start, most))[0].sum())
 
-    if planned(most) > limit:
-        most = min(most, 1000 * max(1, bisect_right(range(1000, most, 1000), limit, key=planned)))
+    steps, most, all_steps = config.steps, config.max_gaussians, seconds(config.steps, config.max_gaussians)
+    if all_steps > limit:
+        constant, of_pixel, of_gaussian, of_coefficient = CPU_TIMES
+        alike = constant + of_pixel * pixels * (1 - 0.75 * config.half_resolution)  # half the size is a quarter of the pixels
+        alike /= of_gaussian + of_coefficient * (config.sh_degree + 1) ** 2
+        share = 1000 * max(1, round(GAUSSIANS_SHARE / (1 - GAUSSIANS_SHARE) * alike / 1000))
+        fewest = min(most, share) if share < (1 + config.method.sampler.max_fraction) * start else most
+        steps = max(1, bisect_right(range(1, steps + 1), limit, key=lambda n: seconds(n, fewest)))
+        every = 1000 * bisect_right(range(1000, most, 1000), limit, key=lambda n: seconds(steps, n))
+        most = max(fewest, every) if steps == config.steps else fewest
     if (steps, most) == (config.steps, config.max_gaussians):
         return steps, most, ""
     capped = f", with at most {most:,} Gaussians" if most < config.max_gaussians else ""
     return steps, most, (
         f"to save time on a CPU, the fit takes {steps:,} of {config.steps:,} steps{capped}; --no-cpu-limit takes all, about "
-        f"{seconds / 60:.0f} min" + f", and raised PSNR by {GAIN_DB}" * (steps < NEARLY_ALL * config.steps)
+        f"{max(1, round(all_steps / 60))} min" + f", and raised PSNR by {GAIN_DB}" * (steps < NEARLY_ALL * config.steps)
     )  # fmt: skip
 
 
