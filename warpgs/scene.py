@@ -205,7 +205,7 @@ class Scene:
     path: str
     """Folder that was read."""
     format: str
-    """Name of the dataset format: colmap, transforms, llff, dtu, middlebury, or that of your own reader."""
+    """Name of the dataset format: colmap, transforms, llff, dtu, middlebury, metashape, realityscan, or that of your own."""
     views: tuple[View, ...]
     """All views, sorted by name."""
     points: PointCloud | None = None

@@ -68,7 +68,16 @@ OPENING = {
     "ZipFile", "fdopen", "memmap", "loadtxt", "genfromtxt", "load_file", "open_memmap",
 }  # fmt: skip
 """Names of functions and classes that open a file or decode what one holds."""
-PARSING = {"json.load", "json.loads", "np.load", "schema.parse", "schema.read", "torch.load", "msgspec.msgpack.decode"}
+PARSING = {
+    "ElementTree.fromstring",
+    "json.load",
+    "json.loads",
+    "np.load",
+    "schema.parse",
+    "schema.read",
+    "torch.load",
+    "msgspec.msgpack.decode",
+}
 """The same with their modules."""
 
 READERS = {
@@ -84,6 +93,11 @@ READERS = {
         "origin_stated": "cameras",
     },
     "io/image_files.py": {"_raster": "any image", "read_image_file": "any image"},
+    "io/capture.py": {
+        "CaptureReader.files": "metashape",
+        "_xml": "metashape",
+        "RealityScanReader.rows": "realityscan",
+    },
     "io/others.py": {"_read_matrices": "dtu", "read_camera_rows": "middlebury"},
     "io/maps.py": {"mapped_array": "given maps", "array_numbers": "given maps"},
     "pipeline/farm/work.py": {"_scores": "scores", "write_thumbnail": "render of a job"},
