@@ -84,7 +84,13 @@ READERS = {
     "export/base.py": {"reading": "splat", "Format.origin_in": "origin"},
     "export/ply.py": {"_read": "ply"},
     "export/gltf.py": {"_split": "glTF"},
-    "export/sog.py": {"SOG._meta_of": "SOG", "decode": "SOG", "_member": "SOG", "_meta": "SOG", "_pixels": "SOG"},
+    "export/sog.py": {
+        "_members": "SOG",
+        "_member": "SOG",
+        "_meta": "SOG",
+        "_pixels": "SOG",
+        "_beside": "SOG folder",
+    },
     "io/transforms.py": {"_json": "cameras"},
     "io/colmap.py": {
         "_BinaryFile.__init__": "colmap",
@@ -136,7 +142,7 @@ DIGEST = "reads bytes that it does not look into"
 SYSTEM = "reads what the system says"
 LAYER = "opens for others, which are named here"
 REASONS = {
-    "export/sog.py": {"SOG._meta_of": "SOG", "encode": "writes"},
+    "export/sog.py": {"encode": "writes", "SOG.store": OWN},
     "files.py": {"appending": "writes", "read_file": LAYER, "read_tensors": LAYER, "tensors_of": LAYER,
         "open_input": LAYER, "read_input": LAYER, "read_start": LAYER, "input_digest": LAYER},
     "folders.py": {"Folder.__init__": LAYER, "Folder.open": LAYER, "Folder.open_regular": LAYER,
