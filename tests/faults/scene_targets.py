@@ -226,8 +226,8 @@ REALITYSCAN = {
     "native": functools.partial(scenes.write_realityscan, lens="", header=scenes.RC_HEADER.partition(",px")[0]),
 }  # fmt: skip
 SHARED = (capture.CaptureReader, capture._points, capture._lens)
-XML = (capture._xml, capture._Builder, capture._numbers, capture._similarity, capture._sensor_lens, capture.MetashapeReader)
-CSV = (capture._header, capture._film_lens, capture._turn, capture.RealityScanReader)
+XML = (capture._xml, capture._Builder, capture._numbers, capture._sensor_lens, capture.MetashapeReader)
+CSV = (capture._film_lens, capture.RealityScanReader)
 add("metashape", METASHAPE, (*SHARED, *XML), (rarely(xml_bomb, text_number), text_number, text_line))
 add("realityscan", REALITYSCAN, (*SHARED, *CSV), TEXT)
 

@@ -226,6 +226,9 @@ def spaced(values) -> str:
     return " ".join(repr(float(v)) for v in np.ravel(values))
 
 
+METASHAPE_CAMERA = f'<camera sensor_id="0" label="a"><transform>{spaced(np.eye(4))}</transform></camera>'
+
+
 def metashape_xml(terms: str = "", camera: str = "", kind: str = "frame", labels=LABELS) -> str:
     """Return cameras as Agisoft XML, with terms of the calibration, and with cameras behind ours."""
     R, s, t = COMPONENT

@@ -787,7 +787,7 @@ def test_lenses_of_realityscan(tall, tmp_path):
     assert K[0, 0] == pytest.approx(20) and K[:2, 2].tolist() == ([6, 8] if tall else [8, 6])
     # forums.unrealengine.com/t/different-rotation-of-cameras-in-xmp-and-csv/710449
     row = "photo0.png,0,0,0,163.736597399311,83.4154313461628,174.386496244756,30"
-    (tmp_path / "calib.csv").write_text(f"{','.join(COLUMNS)}\n{row}\n")
+    (tmp_path / "calib.csv").write_text(f"#name,{','.join(COLUMNS)}\n{row}\n")
     xmp = [[0.98259, 0.18543, -0.01122], [-0.03211, 0.11008, -0.99340], [-0.18297, 0.97647, 0.114]]
     np.testing.assert_allclose(RealityScanReader().rows(tmp_path / "calib.csv")[0][2][:3, :3], xmp, atol=2e-4)
 

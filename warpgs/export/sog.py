@@ -79,10 +79,10 @@ def encode(arrays: base.Arrays, antialiased: bool = False, origin: np.ndarray | 
     meta["quats"] = {"files": ["quats.webp"]}
     image("quats.webp", *base.rounded(255 * (others / base.SQRT2 + 0.5), 255).T, largest + 252)
     book, labels = codebook(base.with_least_scale(arrays["log_scales"]))
-    meta["scales"] = {"codebook": _short(book), "files": ["scales.webp"]}
+    meta["scales"] = {"codebook": book.tolist(), "files": ["scales.webp"]}
     image("scales.webp", *labels.T)
     book, labels = codebook(arrays["sh"][:, 0])
-    meta["sh0"] = {"codebook": _short(book), "files": ["sh0.webp"]}
+    meta["sh0"] = {"codebook": book.tolist(), "files": ["sh0.webp"]}
     image("sh0.webp", *labels.T, base.rounded(255 * base.sigmoid(arrays["logit_opacities"]), 255))
     if k > 1:
         opacities = base.sigmoid(arrays["logit_opacities"]) + 1e-3
@@ -91,7 +91,7 @@ def encode(arrays: base.Arrays, antialiased: bool = False, origin: np.ndarray | 
         padded = np.full((COLUMNS * -(-len(rows) // COLUMNS), k - 1, 4), 255, "u1")
         padded[: len(rows), :, :3] = pixels.reshape(len(rows), k - 1, 3)
         names = ["shN_centroids.webp", "shN_labels.webp"]
-        meta["shN"] = {"count": len(rows), "bands": math.isqrt(k) - 1, "codebook": _short(book), "files": names}
+        meta["shN"] = {"count": len(rows), "bands": math.isqrt(k) - 1, "codebook": book.tolist(), "files": names}
         files[names[0]] = _webp(padded.reshape(-1, COLUMNS * (k - 1), 4))
         image(names[1], labels & 255, labels >> 8)
     files = {META: json.dumps(meta, separators=(",", ":")).encode()} | files
@@ -117,14 +117,9 @@ def codebook(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         cuts = np.concatenate([[0], ends, [len(ordered)]])
         counts = np.diff(cuts)
         entries = np.where(counts > 0, np.diff(sums[cuts]) / np.maximum(counts, 1), entries)
-    entries = np.sort(entries).astype(np.float32).astype(np.float64)  # readers hold them in float32
+    entries = np.array([float(str(v)) for v in np.sort(entries).astype(np.float32)])  # readers hold them in float32
     labels = np.searchsorted(0.5 * (entries[1:] + entries[:-1]), values.astype(np.float64))
     return entries, labels.astype("u1")
-
-
-def _short(values: np.ndarray) -> list[float]:
-    """Return numbers with no more digits than float32 has."""
-    return [float(str(v)) for v in values.astype(np.float32)]
 
 
 def _palette(rows: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -394,9 +389,8 @@ class SOG(base.Format):
         make_folder(path.parent)
         remove_file(path)
         with zipfile.ZipFile(io.BytesIO(b"".join(pieces))) as archive:
-            meta, *images = archive.namelist()
-            for name in (*images, meta):
-                write_bytes(path if name == meta else path.with_name(name), archive.read(name))
+            for name in reversed(archive.namelist()):
+                write_bytes(path if name == META else path.with_name(name), archive.read(name))
 
     def origin_in(self, path: Path) -> object:
         """Return the origin in meta.json."""

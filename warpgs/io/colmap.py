@@ -116,12 +116,12 @@ def origin_stated(path: Path) -> np.ndarray:
 
 
 @contextmanager
-def _understood(path: Path, line: int):
-    """Turn errors of parsing a line into a DataError that names file and line."""
+def understood(where: str, *errors: type[Exception]) -> Iterator[None]:
+    """Turn errors of parsing, and others that are named, into a DataError that names the place."""
     try:
         yield
-    except (ValueError, IndexError, OverflowError) as e:
-        raise DataError(f"{path}, line {line}: cannot be understood ({e}); write the file again") from e
+    except (ValueError, LookupError, OverflowError, *errors) as e:
+        raise DataError(f"{where}: cannot be understood ({str(e)[:120]}); write the file again") from e
 
 
 NAN = re.compile(rb"[-+]?(?:nan\([a-z]*\)|1\.#(?:ind|qnan|snan)\d*)", re.IGNORECASE)
@@ -134,7 +134,7 @@ def _number(word: str) -> float:
 
 
 def _expect(condition: bool, message: str) -> None:
-    """Raise a ValueError for `_understood` where a line breaks a rule."""
+    """Raise a ValueError for `understood` where a line breaks a rule."""
     if not condition:
         raise ValueError(message)
 
@@ -195,7 +195,7 @@ def read_cameras(path: Path, native: bool = False) -> dict[int, Lens]:
         return cameras
     counts = dict(readable.values())
     for line, words in _rows(path):
-        with _understood(path, line):
+        with understood(f"{path}, line {line}"):
             number, model, parameters = int(words[0]), words[1], tuple(_number(w) for w in words[4:])
             allow(model, parameters)
             _expect(len(parameters) == counts[model], f"{model} has {counts[model]} parameters, not {len(parameters)}")
@@ -223,7 +223,7 @@ def read_poses(path: Path) -> dict[int, Pose]:
     for line, text in lines:
         if not text.strip() or text.lstrip().startswith("#"):
             continue
-        with _understood(path, line):
+        with understood(f"{path}, line {line}"):
             words = text.split(maxsplit=9)
             values = tuple(_number(w) for w in words[1:8])
             pose = (words[9].rstrip(), int(words[8]), values[:4], values[4:])
@@ -283,7 +283,7 @@ def read_points(path: Path, names: dict[int, str], notes: list[str] | None = Non
         r.end()
     else:
         for line, words in _rows(path):
-            with _understood(path, line):
+            with understood(f"{path}, line {line}"):
                 _expect(len(words) >= 8 and len(words) % 2 == 0, "a point needs 8 numbers, then pairs IMAGE OBSERVATION")
                 points.append(tuple(_number(w) for w in words[1:4]))
                 colors.append(tuple(_number(w) for w in words[4:7]))
