@@ -121,7 +121,7 @@ def understood(where: str, *errors: type[Exception]) -> Iterator[None]:
     try:
         yield
     except (ValueError, LookupError, OverflowError, *errors) as e:
-        raise DataError(f"{where}: cannot be understood ({str(e)[:120]}); write the file again") from e
+        raise DataError(f"{where}: cannot be understood ({e}); write the file again") from e
 
 
 NAN = re.compile(rb"[-+]?(?:nan\([a-z]*\)|1\.#(?:ind|qnan|snan)\d*)", re.IGNORECASE)
