@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from warpgs.export.base import write_gaussians
 from warpgs.geometry import convert_camera, convert_gaussians, near_cameras
 from warpgs.io.load import normalize_view
 from warpgs.render.options import RasterizeOptions
-from warpgs.scene import Camera, View
+from warpgs.scene import ActivatedGaussians, Camera, PointCloud, Scene, View
 
 N = Normalization(np.array([3.0, -2.0, 0.5]), 0.25)
 
@@ -70,6 +71,36 @@ def test_model_and_ply_files_know_their_units(tmp_path, units):
     torch.testing.assert_close(load(tmp_path / "m.safetensors").gaussians(units).means, given.means)
 
 
+def test_gaussians_without_a_scene_are_in_file_units(tmp_path):
+    """What `read_ply` returns can be written as it is; with a normalization, it is the scene's."""
+    g = cloud(3)
+    for write, name in ((write_ply, "a.ply"), (write_gaussians, "b.ply")):
+        write(tmp_path / name, g)
+        assert torch.equal(read_ply(tmp_path / name).means, g.means)
+        write(tmp_path / name, g, N)
+        assert not torch.allclose(read_ply(tmp_path / name).means, g.means)
+
+
+def test_texts_of_records_have_shapes():
+    """No values, and no field that has its default."""
+    g, c = cloud(3, degree=2), Camera(np.eye(4), np.eye(3), 16, 12)
+    assert repr(g) == "Gaussians(means=[3, 3], quats=[3, 4], log_scales=[3, 3], logit_opacities=[3], sh=[3, 9, 3])"
+    tensors = [g.means, g.quats, g.log_scales.exp(), g.logit_opacities.sigmoid()]
+    assert repr(ActivatedGaussians(*tensors)) == "ActivatedGaussians(means=[3, 3], quats=[3, 4], scales=[3, 3], opacities=[3])"
+    assert repr(c) == "Camera(viewmat=[4, 4], K=[3, 3], width=16, height=12)"
+    view = View("a.png", c, np.zeros((12, 16, 3), np.float32))
+    assert repr(view) == f"View(name='a.png', camera={c!r}, image=[12, 16, 3])"
+    points = PointCloud(np.zeros((2, 3)), np.zeros((2, 3), np.float32))
+    assert repr(points) == "PointCloud(points=[2, 3], colors=[2, 3])"
+    assert (
+        repr(Scene("there", "colmap", (view,) * 4, points))
+        == f"Scene(path='there', format='colmap', views=[4], points={points!r})"
+    )
+    assert repr(replace(g, means=None)) and repr(replace(c, viewmat=[1], model="fisheye")).endswith(
+        "height=12, model='fisheye')"
+    )
+
+
 def test_mistakes_are_named(tmp_path):
     """Unknown units, scene units without a scene, no similarity, numbers that are not finite, and files of others."""
     g = cloud(3)
@@ -77,7 +108,7 @@ def test_mistakes_are_named(tmp_path):
         convert_gaussians(g, N, "scene", "metres")
     for call in (save, write_ply):
         with pytest.raises(UsageError, match="units='scene' requires normalization="):
-            call(tmp_path / "a", g)
+            call(tmp_path / "a", g, units="scene")
         for scale, offset in ((0.0, [0, 0, 0]), (np.nan, [0, 0, 0]), (1.0, [0, 0]), (1.0, [0, 0, np.inf])):
             with pytest.raises(DataError, match="is not a similarity"):
                 call(tmp_path / "a", g, Normalization(np.array(offset), scale))

@@ -6,7 +6,7 @@ import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sized
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
@@ -36,6 +36,19 @@ def base_coefficients(colors: np.ndarray | torch.Tensor) -> np.ndarray | torch.T
     return (colors - 0.5) / C0
 
 
+def _with_shapes(self: Any) -> str:
+    """Return the text of a record: shapes of arrays, numbers of entries, and no field that has its default."""
+    shown = []
+    for entry in fields(self):
+        value = getattr(self, entry.name)
+        if not entry.repr or value is None or value is entry.default:
+            continue
+        shape = getattr(value, "shape", None)
+        text = f"[{len(value)}]" if isinstance(value, (tuple, list)) else repr(value)[:80]
+        shown.append(f"{entry.name}={text if shape is None else list(shape)}")
+    return f"{type(self).__name__}({', '.join(shown)})"
+
+
 # Data types of the whole package: scenes, models and renders.
 #
 # Conventions (docs/conventions.md): camera_from_world poses, OpenCV axes (+x right, +y down, +z forward), pixel centres
@@ -63,6 +76,8 @@ class Camera:
     distortion: Array | None = None
     """Coefficients, shape [P] (shared by all cameras) or [C, P]; None for models without coefficients. opencv has k1 k2 p1 p2
     k3 k4 k5 k6, fisheye k1 to k4; zeros mean an ideal lens. A tensor that requires gradients is an error."""
+
+    __repr__ = _with_shapes
 
     @property
     def center(self) -> np.ndarray:
@@ -112,6 +127,7 @@ class View:
     normals: np.ndarray | None = None
     """Given normals: unit vectors towards the camera, in camera axes (+x right, +y down, +z forward), float32, shape [H, W, 3];
     0 for missing values. None without normals."""
+    __repr__ = _with_shapes
 
 
 @dataclass(frozen=True)
@@ -124,6 +140,8 @@ class PointCloud:
     """Colours in [0, 1], float32, shape [N, 3]."""
     tracks: tuple[frozenset[str], ...] | None = None
     """Names of the views that saw each point, length N; None if the format does not store them."""
+
+    __repr__ = _with_shapes
 
     def __len__(self) -> int:
         """Return the number of points."""
@@ -205,22 +223,24 @@ class Scene:
     path: str
     """Folder that was read."""
     format: str
-    """Name of the dataset format: colmap, transforms, llff, dtu, middlebury, or that of your own reader."""
+    """Name of the dataset format: colmap, transforms, llff, dtu, middlebury, metashape, realityscan, or that of your own."""
     views: tuple[View, ...]
     """All views, sorted by name."""
     points: PointCloud | None = None
     """Sparse points of the reconstruction; None if the format has none."""
-    normalization: Normalization = field(default_factory=Normalization)
+    normalization: Normalization = field(default_factory=Normalization, repr=False)
     """Similarity from file to scene coordinates."""
-    notes: tuple[str, ...] = ()
+    notes: tuple[str, ...] = field(default=(), repr=False)
     """Messages about choices made while reading (skipped images, undistortion, the chosen image folder)."""
-    fingerprint: str = ""
+    fingerprint: str = field(default="", repr=False)
     """SHA-256 over names, cameras, pixels, masks and given maps of the views, hexadecimal."""
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    background: tuple[float, float, float] = field(default=(0.0, 0.0, 0.0), repr=False)
     """Background colour, as implied by the format (white for Blender's transparent images)."""
-    pixels: str = ""
+    pixels: str = field(default="", repr=False)
     """Source of the pixels: the image folder, and whether they are as stored or area-resampled. Scores against `images_8` and
     against `images` resampled by 8 cannot be compared."""
+
+    __repr__ = _with_shapes
 
     @property
     def transparent(self) -> bool:
@@ -341,6 +361,8 @@ class Gaussians(_GaussianSet):
     sh: torch.Tensor
     """Spherical-harmonics coefficients, shape [N, K, 3] with K = (degree + 1)^2, K in {1, 4, 9, 16, 25}."""
 
+    __repr__ = _with_shapes
+
     def to(self, device: str | torch.device) -> Gaussians:
         """Return the same N Gaussians on a device. Differentiable, as `torch.Tensor.to` is."""
         return Gaussians(**{name: t.to(device) for name, t in self.tensors().items()})
@@ -366,6 +388,8 @@ class ActivatedGaussians(_GaussianSet):
     sh: torch.Tensor | None = None
     """Spherical-harmonics coefficients, shape [N, K, 3] as in `Gaussians`; None with ``RasterizeOptions.colors``."""
 
+    __repr__ = _with_shapes
+
     def stored(self) -> Gaussians:
         """Return the same N Gaussians by log scales and logits: scale 0 becomes -inf, opacity 1 inf, which no file stores."""
         means, quats, scales, opacities, sh = self.tensors().values()
@@ -387,6 +411,7 @@ class CovarianceGaussians(_GaussianSet):
     """Opacities in [0, 1], shape [N]."""
     sh: torch.Tensor | None = None
     """Spherical-harmonics coefficients, shape [N, K, 3] as in `Gaussians`; None with ``RasterizeOptions.colors``."""
+    __repr__ = _with_shapes
 
 
 RasterizedGaussians = Gaussians | ActivatedGaussians | CovarianceGaussians

@@ -19,7 +19,7 @@ import torch
 from tests.faults import format_targets
 from tests.gaussians import cloud, shapes_of
 from warpgs.app.cli import main
-from warpgs.errors import DataError, UsageError
+from warpgs.errors import DataError, ResourceError, UsageError
 from warpgs.export import base, gltf, sog, spz
 from warpgs.export.base import (
     FORMATS,
@@ -246,9 +246,8 @@ def test_names_say_the_format_and_bad_numbers_and_long_palettes(tmp_path, monkey
     with pytest.raises(UsageError, match=r"format \.obj is not supported; use one of"):
         format_of("a.obj")
     (tmp_path / "meta.json").touch()
-    for unpacked in (tmp_path, tmp_path / "meta.json"):
-        with pytest.raises(UsageError, match="is an unpacked SOG model; pack its folder into one file, with `zip -j"):
-            read_gaussians(unpacked)
+    with pytest.raises(UsageError, match=r"is the folder of a SOG model; give .*meta\.json"):
+        read_gaussians(tmp_path)
     with pytest.raises(DataError, match="holds no Gaussian"):
         write_gaussians(tmp_path / "a.sog", model(n=0), units="file")
     with pytest.raises(DataError, match="cannot be read"):
@@ -274,6 +273,61 @@ def test_names_say_the_format_and_bad_numbers_and_long_palettes(tmp_path, monkey
     back = read_gaussians(tmp_path / "a.sog")
     assert 0.02 < differences(made, back)["rest"] < float(made.sh[:, 1:].max() - made.sh[:, 1:].min())
     assert len(torch.unique(back.sh[:, 1:], dim=0)) <= 64
+
+
+def test_palettes_follow_the_number_of_gaussians(tmp_path):
+    """An eighth of the rows; repeated rows are exact, but for a few; opaque Gaussians decide over faint ones."""
+    n, rows = 20_000, 500
+    made = arrays_of(model(n, degree=2))
+    made["sh"][:, 1:] = made["sh"][np.random.default_rng(0).integers(rows, size=n), 1:]
+    found, labels = sog._palette(made["sh"][:, 1:].reshape(n, -1).astype(float), np.ones(n))
+    assert rows <= len(found) <= n // 8
+    assert list(dict.fromkeys(labels.tolist())) == [*range(len(found))]  # in the order of their use
+    exact = (np.abs(found[labels].reshape(n, -1, 3) - made["sh"][:, 1:]) < 1e-9).all((1, 2))
+    assert exact.mean() > 0.99
+    write_gaussians(tmp_path / "a.sog", gaussians_of(tmp_path, made), units="file")
+    back = arrays_of(read_gaussians(tmp_path / "a.sog"))["sh"][:, 1:]
+    assert rows <= len(np.unique(back, axis=0)) <= len(found) and np.abs(back - made["sh"][:, 1:])[exact].max() <= 0.02
+    values, opaque = np.random.default_rng(1).normal(size=(n, 9)), np.arange(n) % 50 == 0
+    found, labels = sog._palette(values, np.where(opaque, 1, 1e-3))
+    error = np.abs(found[labels] - values).mean(1)
+    assert error[opaque].mean() < 0.7 * error[~opaque].mean()
+
+
+def test_sog_in_a_folder(tmp_path):
+    """Of the same images as in the archive; names and links lead to no other folder, and a half-written model is none."""
+    made, archive, path = model(200), tmp_path / "a.sog", tmp_path / "new" / "folder" / "meta.json"
+    for there in (archive, path):
+        write_gaussians(there, made, Normalization(np.array([441_000.0, 5_500_000, 130])), antialiased=True)
+    files = {p.name: p.read_bytes() for p in path.parent.iterdir()}
+    assert files == format_targets.members_of(archive.read_bytes())
+    with pytest.warns(UserWarning, match="its Gaussians are antialiased"):
+        back, packed = read_gaussians(path), read_gaussians(archive)
+    assert back.means.dtype == torch.float64 and all(torch.equal(a, packed.tensors()[n]) for n, a in back.tensors().items())
+    lines = convert(path, tmp_path / "other" / "meta.json")
+    assert re.search(r"200 Gaussians in .*meta.json, \d+ KiB", lines[-1])
+    assert len(read_gaussians(tmp_path / "other" / "meta.json")) == 200
+    assert sog.SOG().size(path) == sum(map(len, files.values()))
+    for name in ("../a.sog", "folder/../meta.json", str(archive), "..", "", 3, "gone.webp", "a\\b.webp"):
+        meta = json.loads(files["meta.json"])
+        meta["quats"]["files"][0] = name
+        refused(
+            path,
+            json.dumps(meta).encode(),
+            f"not a usable .json file: {re.escape(repr(str(name)[:40]))} is not a file beside it",
+        )
+    path.write_bytes(files["meta.json"])
+    (path.parent / "quats.webp").rename(tmp_path / "quats.webp")
+    (path.parent / "quats.webp").symlink_to(tmp_path / "quats.webp")
+    refused(path, files["meta.json"], "'quats.webp' is not a file beside it")
+    with pytest.raises(DataError, match="not finite"):
+        write_gaussians(path, dataclasses.replace(made, means=made.means * torch.nan), units="file")
+    assert path.is_file()
+    (path.parent / "sh0.webp").unlink()
+    (path.parent / "sh0.webp").mkdir()
+    with pytest.raises(ResourceError, match=r"sh0.webp: .*cannot be written"):
+        write_gaussians(path, made, units="file")
+    assert not path.exists()
 
 
 @pytest.mark.parametrize("suffix", [s for s in SUFFIXES if s != ".ply"])

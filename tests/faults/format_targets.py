@@ -200,6 +200,26 @@ def sog_image(data: bytes, rng: np.random.Generator) -> bytes:
 SOG = (sog.decode, sog._member, sog._pixels, sog._book, sog._palette_rows, sog._within)
 add("SOG", ".sog", SOG, (sog_member, sog_member, rarely(sog_image, rarely(mutations.zip_bomb, sog_member))))
 
+
+def sog_folder(root: Path) -> list[Path]:
+    base.write_gaussians(root / "meta.json", cloud(5), units="file")
+    return sorted(root.iterdir())
+
+
+def sog_part(data: bytes, rng: np.random.Generator) -> bytes:
+    """Change a file of a folder: values of meta.json, or the bytes of an image, or put another one in its place."""
+    if data[:1] == b"{":
+        return json_value(data, rng)
+    return mutations.large_webp() if rng.random() < 0.02 else damage(data, rng)
+
+
+register(
+    Target(
+        "SOG folder", sog_folder, lambda root, path: base.read_gaussians(root / "meta.json"),
+        (*SOG, sog._beside, sog._members, gaussians_of), (sog_part, sog_part, text_number), None, nonsense,
+    )
+)  # fmt: skip
+
 # ---- glTF --------------------------------------------------------------------------------------------------------------
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from tests.faults.mutations import Change, json_value, many_rows, rarely, text_line, text_number
 from tests.faults.targets import Target, not_finite, register
 from tests.io import scenes
-from warpgs.io import colmap, load, maps, others, transforms
+from warpgs.io import capture, colmap, load, maps, others, transforms
 from warpgs.scene import Scene
 
 MAX_PIXELS = 10_000
@@ -206,6 +206,30 @@ add("transforms", FRAMES, FRAMES_PARSER, (rarely(many_rows, json_value), json_va
 add("llff", {"a": scenes.write_llff}, (others.read_poses_bounds, others.LLFFReader), (matrices_changed,))
 add("dtu", {"a": write_dtu}, DTU, (matrices_changed,))
 add("middlebury", {"a": scenes.write_middlebury}, MIDDLEBURY, TEXT)
+
+
+def xml_bomb(data: bytes, rng: np.random.Generator) -> bytes:
+    """Put entities that double, or many tags, in front of the document."""
+    doubled = "".join(f"<!ENTITY e{i + 1} '&e{i};&e{i};'>" for i in range(40)).encode()
+    if rng.random() < 0.5:
+        return b"<!DOCTYPE d [<!ENTITY e0 'ha'>" + doubled + b"]>" + data.replace(b"<chunk", b"<a>&e40;</a><chunk")
+    return data.replace(b"<cameras>", b"<cameras>" + b"<a/>" * int(rng.integers(2**12, 2**20)))
+
+
+TERMS = "".join(f"<{t}>0.01</{t}>" for t in ("cx", "cy", "b1", "k1", "k2", "k3", "p1", "p2"))
+METASHAPE = {
+    "frame": functools.partial(scenes.write_metashape, terms=TERMS),
+    "native fisheye": functools.partial(scenes.write_metashape, terms="<k4>0.01</k4>", kind="fisheye"),
+}  # fmt: skip
+REALITYSCAN = {
+    "lens": functools.partial(scenes.write_realityscan, lens="0.01,0.01,0.01,0.01,0.01,0,0.01,0.01"),
+    "native": functools.partial(scenes.write_realityscan, lens="", header=scenes.RC_HEADER.partition(",px")[0]),
+}  # fmt: skip
+SHARED = (capture.CaptureReader, capture._points, capture._lens)
+XML = (capture._xml, capture._Builder, capture._numbers, capture._sensor_lens, capture.MetashapeReader)
+CSV = (capture._film_lens, capture.RealityScanReader)
+add("metashape", METASHAPE, (*SHARED, *XML), (rarely(xml_bomb, text_number), text_number, text_line))
+add("realityscan", REALITYSCAN, (*SHARED, *CSV), TEXT)
 
 
 def write_maps(folder: Path) -> list[Path]:

@@ -68,14 +68,29 @@ OPENING = {
     "ZipFile", "fdopen", "memmap", "loadtxt", "genfromtxt", "load_file", "open_memmap",
 }  # fmt: skip
 """Names of functions and classes that open a file or decode what one holds."""
-PARSING = {"json.load", "json.loads", "np.load", "schema.parse", "schema.read", "torch.load", "msgspec.msgpack.decode"}
+PARSING = {
+    "ElementTree.fromstring",
+    "json.load",
+    "json.loads",
+    "np.load",
+    "schema.parse",
+    "schema.read",
+    "torch.load",
+    "msgspec.msgpack.decode",
+}
 """The same with their modules."""
 
 READERS = {
     "export/base.py": {"reading": "splat", "Format.origin_in": "origin"},
     "export/ply.py": {"_read": "ply"},
     "export/gltf.py": {"_split": "glTF"},
-    "export/sog.py": {"SOG._meta_of": "SOG", "decode": "SOG", "_member": "SOG", "_meta": "SOG", "_pixels": "SOG"},
+    "export/sog.py": {
+        "_members": "SOG",
+        "_member": "SOG",
+        "_meta": "SOG",
+        "_pixels": "SOG",
+        "_beside": "SOG folder",
+    },
     "io/transforms.py": {"_json": "cameras"},
     "io/colmap.py": {
         "_BinaryFile.__init__": "colmap",
@@ -84,6 +99,11 @@ READERS = {
         "origin_stated": "cameras",
     },
     "io/image_files.py": {"_raster": "any image", "read_image_file": "any image"},
+    "io/capture.py": {
+        "CaptureReader.files": "metashape",
+        "_xml": "metashape",
+        "RealityScanReader.rows": "realityscan",
+    },
     "io/others.py": {"_read_matrices": "dtu", "read_camera_rows": "middlebury"},
     "io/maps.py": {"mapped_array": "given maps", "array_numbers": "given maps"},
     "pipeline/farm/work.py": {"_scores": "scores", "write_thumbnail": "render of a job"},
@@ -122,7 +142,7 @@ DIGEST = "reads bytes that it does not look into"
 SYSTEM = "reads what the system says"
 LAYER = "opens for others, which are named here"
 REASONS = {
-    "export/sog.py": {"SOG._meta_of": "SOG", "encode": "writes"},
+    "export/sog.py": {"encode": "writes", "SOG.store": OWN},
     "files.py": {"appending": "writes", "read_file": LAYER, "read_tensors": LAYER, "tensors_of": LAYER,
         "open_input": LAYER, "read_input": LAYER, "read_start": LAYER, "input_digest": LAYER},
     "folders.py": {"Folder.__init__": LAYER, "Folder.open": LAYER, "Folder.open_regular": LAYER,

@@ -216,6 +216,81 @@ def write_middlebury(root: Path) -> Path:
     return root
 
 
+COMPONENT = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), 2.0, np.array([0.5, -0.2, 0.1])
+"""Rotation, scale and translation from the coordinates of Metashape's component to those of the scene."""
+LABELS = tuple(n.removesuffix(".png") for n in NAMES)
+
+
+def spaced(values) -> str:
+    """Return numbers in full, with spaces between them."""
+    return " ".join(repr(float(v)) for v in np.ravel(values))
+
+
+METASHAPE_CAMERA = f'<camera sensor_id="0" label="a"><transform>{spaced(np.eye(4))}</transform></camera>'
+
+
+def metashape_xml(terms: str = "", camera: str = "", kind: str = "frame", labels=LABELS) -> str:
+    """Return cameras as Agisoft XML, with terms of the calibration, and with cameras behind ours."""
+    R, s, t = COMPONENT
+    rows = []
+    for i, label in enumerate(labels):
+        pose = np.linalg.inv(VIEWMATS[i])
+        pose[:3, 3] = R.T @ (pose[:3, 3] - t) / s
+        pose[:3, :3] = R.T @ pose[:3, :3]
+        rows.append(
+            f'<camera id="{i}" sensor_id="0" component_id="1" label="{label}"><transform>{spaced(pose)}</transform></camera>'
+        )
+    moved = f"<rotation>{spaced(R)}</rotation><translation>{spaced(t)}</translation><scale>{s}</scale>"
+    size = f'<resolution width="{WIDTH}" height="{HEIGHT}"/>'
+    initial = f'<calibration type="{kind}" class="initial">{size}<f>9</f></calibration>'
+    calibration = f'<calibration type="{kind}" class="adjusted">{size}<f>{FOCAL}</f>{terms}</calibration>'
+    return (
+        f'<?xml version="1.0" encoding="UTF-8"?>\n<document version="2.0.0"><chunk label="Chunk 1"><sensors>'
+        f'<sensor id="0" type="{kind}">{size}{initial}{calibration}</sensor></sensors>'
+        f'<components><component id="1"><transform>{moved}</transform></component></components>'
+        f'<cameras><group label="a">{"".join(rows[:2])}</group>{"".join(rows[2:])}{camera}</cameras></chunk></document>'
+    )
+
+
+def points_ply(points: np.ndarray = POINTS) -> bytes:
+    """Return points of the same colour as text."""
+    head = "ply\nformat ascii 1.0\nelement vertex {}\n" + "".join(f"property float {c}\n" for c in "xyz")
+    head += "".join(f"property uchar {c}\n" for c in ("red", "green", "blue")) + "end_header\n"
+    return (head.format(len(points)) + "".join(f"{spaced(p)} 255 0 51\n" for p in points)).encode()
+
+
+def write_metashape(root: Path, **options) -> Path:
+    save_images(root / "images")
+    (root / "cameras.xml").write_text(metashape_xml(**options))
+    (root / "points.ply").write_bytes(points_ply())
+    return root
+
+
+RC_HEADER = "#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2"
+
+
+def angles(R: np.ndarray) -> np.ndarray:
+    """Return heading, pitch and roll [deg] of camera to world with OpenGL axes, Rz(-heading) Rx(pitch) Ry(roll)."""
+    return np.degrees([np.arctan2(R[0, 1], R[1, 1]), np.arcsin(R[2, 1]), np.arctan2(-R[2, 0], R[2, 2])])
+
+
+def realityscan_csv(lens: str = "0,0,0,0,0,0,0,0", header: str = RC_HEADER, names=NAMES) -> str:
+    """Return cameras as RealityScan's CSV, with the principal point and the distortion of all."""
+    lines = [f"#cameras {len(names)}", header]
+    for i, name in enumerate(names):
+        pose = np.array(opengl(i))
+        numbers = [*pose[:3, 3], *angles(pose[:3, :3]), FOCAL * 36 / WIDTH]
+        lines.append(",".join([name, *(repr(float(v)) for v in numbers), *([lens] if lens else [])]))
+    return "\r\n".join(lines) + "\r\n"
+
+
+def write_realityscan(root: Path, **options) -> Path:
+    save_images(root)
+    (root / "calib.csv").write_text(realityscan_csv(**options))
+    (root / "calib.ply").write_bytes(points_ply())
+    return root
+
+
 WRITERS = {
     "colmap": write_colmap,
     "colmap text": write_colmap_txt,
@@ -225,6 +300,8 @@ WRITERS = {
     "llff": write_llff,
     "dtu": write_dtu,
     "middlebury": write_middlebury,
+    "metashape": write_metashape,
+    "realityscan": write_realityscan,
 }
 
 

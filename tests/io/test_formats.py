@@ -13,6 +13,7 @@ from tests.io.scenes import refused
 from warpgs import geometry
 from warpgs.errors import DataError, UsageError
 from warpgs.geometry import project_points
+from warpgs.io.capture import COLUMNS, RealityScanReader
 from warpgs.io.load import load_scene, split_views
 from warpgs.io.transforms import read_cameras
 from warpgs.pipeline.metrics.scores import counted_region
@@ -696,3 +697,113 @@ def test_paths_of_nerfstudio_that_cannot_be_used(changes, message, tmp_path):
     path.write_text(json.dumps(viewer_path(**changes)))
     with pytest.raises(DataError, match=message):
         read_cameras(path)
+
+
+# Programs for photogrammetry: Metashape and RealityScan.
+
+
+def radial(x, y, k1, k2, k3=0.0, k4=0.0):
+    r2 = x * x + y * y
+    return 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3 + k4 * r2**4
+
+
+def camera_points(i, points):
+    return (scenes.VIEWMATS[i, :3, :3] @ points.T).T + scenes.VIEWMATS[i, :3, 3]
+
+
+def metashape_pixels(points, f, cx, cy, b1=0.0, k1=0.0, k2=0.0, k3=0.0, p1=0.0, p2=0.0, k4=0.0, fisheye=False):
+    """Project points of the camera [N, 3] to pixels [N, 2], as the user manual of Metashape defines it."""
+    x, y = points[:, 0] / points[:, 2], points[:, 1] / points[:, 2]
+    if fisheye:
+        r = np.hypot(x, y)
+        x, y = x * np.arctan(r) / r, y * np.arctan(r) / r
+    r2, d = x * x + y * y, radial(x, y, k1, k2, k3, k4)
+    u = x * d + p1 * (r2 + 2 * x * x) + 2 * p2 * x * y
+    v = y * d + p2 * (r2 + 2 * y * y) + 2 * p1 * x * y
+    return np.stack([scenes.WIDTH / 2 + cx + (f + b1) * u, scenes.HEIGHT / 2 + cy + f * v], 1)
+
+
+def realityscan_pixels(points, px, py, k1, k2, k3, t1, t2):
+    """Project points of the camera [N, 3] to pixels [N, 2], as RealityScan does."""
+    x, y = points[:, 0] / points[:, 2], points[:, 1] / points[:, 2]
+    r2, d = x * x + y * y, radial(x, y, k1, k2, k3)
+    u, v = x * d + t1 * (r2 + 2 * x * x) + 2 * t2 * x * y, y * d + t2 * (r2 + 2 * y * y) + 2 * t1 * x * y
+    side = scenes.WIDTH  # the longer one
+    return np.stack([scenes.WIDTH / 2 + px * side + 20 * u, scenes.HEIGHT / 2 + py * side + 20 * v], 1)
+
+
+def projected(root):
+    """Return the pixels of the points in the first view of a scene with native lenses, and the scene."""
+    scene = load_scene(root, lenses="native")
+    n = scene.normalization
+    return project_points(scene.views[0].camera, n.scale * (scenes.POINTS - n.offset))[0], scene
+
+
+METASHAPE = {"cx": 0.3, "cy": -0.2, "k1": 0.08, "k2": -0.03}
+
+
+@pytest.mark.parametrize(
+    "kind,terms",
+    [
+        ("frame", METASHAPE | {"b1": 0.7, "k3": 0.01, "p1": 0.02, "p2": -0.01}),
+        ("fisheye", METASHAPE | {"k3": 0.01, "k4": -0.02}),
+    ],
+)
+def test_lenses_of_metashape(kind, terms, tmp_path):
+    """Points land where the manual of the program puts them; names have no suffix, the last camera is not aligned."""
+    xml = "".join(f"<{name}>{value}</{name}>" for name, value in terms.items()) + "<b2>0.001</b2><k5/>"
+    off = '<camera id="9" sensor_id="0" label="photo9" enabled="false"><transform>1</transform></camera>'
+    scenes.write_metashape(tmp_path, terms=xml, kind=kind, camera=f'<camera id="8" sensor_id="7" label="photo8"/>{off}')
+    scenes.save_images(tmp_path / "images", ["photo8.png"])
+    pixels, scene = projected(tmp_path)
+    expected = metashape_pixels(camera_points(0, scenes.POINTS), 20, fisheye=kind == "fisheye", **terms)
+    np.testing.assert_allclose(pixels, expected, atol=1e-7)
+    assert np.abs(expected - metashape_pixels(camera_points(0, scenes.POINTS), 20, 0.3, -0.2)).max() > 1e-3
+    assert scene.format == "metashape" and [v.name for v in scene.views] == list(scenes.NAMES)
+    assert {"1 files in images have no pose in the reconstruction and are left out", "points taken from points.ply"} <= {
+        *scene.notes
+    }
+    np.testing.assert_allclose(
+        scene.points.points / scene.normalization.scale + scene.normalization.offset, scenes.POINTS, atol=1e-12
+    )
+    if kind == "fisheye":
+        refused(tmp_path, "images of fisheye lenses cannot be undistorted; keep the lens with --lenses native")
+    else:
+        assert any("undistorted (frame)" in note for note in load_scene(tmp_path).notes)
+
+
+@pytest.mark.parametrize("tall", [False, True])
+def test_lenses_of_realityscan(tall, tmp_path):
+    """Lengths are relative to the longer side; the angles give the rotation of the XMP file of the same export."""
+    lens = (0.01, -0.02, 0.08, -0.03, 0.01, 0.02, -0.01)
+    scenes.write_realityscan(tmp_path, lens="0.01,-0.02,0.08,-0.03,0.01,0,0.02,-0.01")
+    pixels, scene = projected(tmp_path)
+    np.testing.assert_allclose(pixels, realityscan_pixels(camera_points(0, scenes.POINTS), *lens), atol=1e-7)
+    assert scene.format == "realityscan" and "points taken from calib.ply" in scene.notes
+    if tall:
+        scenes.save_images(tmp_path, width=scenes.HEIGHT, height=scenes.WIDTH)
+    scenes.write_files(tmp_path, {"calib.csv": scenes.realityscan_csv("", scenes.RC_HEADER.partition(",px")[0]).encode()})
+    K = load_scene(tmp_path).views[0].camera.K
+    assert K[0, 0] == pytest.approx(20) and K[:2, 2].tolist() == ([6, 8] if tall else [8, 6])
+    # forums.unrealengine.com/t/different-rotation-of-cameras-in-xmp-and-csv/710449
+    row = "photo0.png,0,0,0,163.736597399311,83.4154313461628,174.386496244756,30"
+    (tmp_path / "calib.csv").write_text(f"#name,{','.join(COLUMNS)}\n{row}\n")
+    xmp = [[0.98259, 0.18543, -0.01122], [-0.03211, 0.11008, -0.99340], [-0.18297, 0.97647, 0.114]]
+    np.testing.assert_allclose(RealityScanReader().rows(tmp_path / "calib.csv")[0][2][:3, :3], xmp, atol=2e-4)
+
+
+def test_points_in_other_coordinates_and_missing_photographs_of_capture_programs(tmp_path):
+    """Points that no view sees are left out; of several files of cameras, the first is taken."""
+    scenes.write_metashape(tmp_path)
+    (tmp_path / "z.xml").write_text(scenes.metashape_xml())
+    (tmp_path / "a.xml").write_text("<other/>")
+    (tmp_path / "images" / "photo1.png").unlink()
+    (tmp_path / "points.ply").write_bytes(scenes.points_ply(scenes.POINTS + 90))
+    scene = load_scene(tmp_path)
+    assert len(scene.views) == 4 and scene.points is None
+    assert scene.notes[0] == "cameras taken from cameras.xml; z.xml ignored"
+    assert "skipped: 1 of 5 images have no image file: photo1" in scene.notes
+    assert any("the points of points.ply are left out: 0% of them are in some view; export cameras" in n for n in scene.notes)
+    refused(tmp_path, "1 of 5 images have no image file: photo1. Restore them", strict=True)
+    (tmp_path / "points.ply").unlink()
+    assert any("no PLY file is beside cameras.xml" in n for n in load_scene(tmp_path).notes)

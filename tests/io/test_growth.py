@@ -11,7 +11,7 @@ import pytest
 import warpgs
 from tests.io import scenes
 from warpgs.errors import DataError
-from warpgs.io import colmap, others, transforms as camera_files
+from warpgs.io import capture, colmap, others, transforms as camera_files
 from warpgs.io.load import coincident_views, load_scene, split_views
 from warpgs.pipeline.farm.job import list_jobs
 from warpgs.poses.find import _notes, advice, neighbours
@@ -106,6 +106,15 @@ def test_points_parameters_jobs_events_photographs_and_views(tmp_path):
         path.write_text(f"{n}\n" + "".join(f"{i}.png {'1 ' * 21}\n" for i in range(n)))
         return lambda: others.read_camera_rows(path)
 
+    def xml(n):
+        (tmp_path / f"{n}.xml").write_text(scenes.metashape_xml(camera=scenes.METASHAPE_CAMERA * n))
+        return lambda: capture.MetashapeReader().rows(tmp_path / f"{n}.xml")
+
+    def table(n):
+        text = scenes.realityscan_csv(names=scenes.NAMES[:1])
+        (tmp_path / f"{n}.csv").write_text(text + f"{text.splitlines()[-1]}\n" * n)
+        return lambda: capture.RealityScanReader().rows(tmp_path / f"{n}.csv")
+
     def jobs(n):
         path = tmp_path / f"{n}.jsonl"
         path.write_text("".join(json.dumps({"scene": f"s{i}", "steps": 5}) + "\n" for i in range(n)))
@@ -125,7 +134,7 @@ def test_points_parameters_jobs_events_photographs_and_views(tmp_path):
         split = split_views(views, "every:2")
         return lambda: (coincident_views(views, split), [views.view(v.name) for v in views.views], image_names(split.train))
 
-    for make in (points, parameters, jobs, events, lookups):
+    for make in (points, parameters, xml, table, jobs, events, lookups):
         grows(make)
     with pytest.raises(KeyError):
         scene(3).view("none")

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import struct
 import sys
 from pathlib import Path
@@ -449,3 +450,83 @@ def test_middlebury_files(old, new, message, tmp_path):
     assert old in text
     path.write_text(text.replace(old, new, 1))
     refused(tmp_path, message)
+
+
+# ---- Metashape and RealityScan ---------------------------------------------------------------------------------------
+
+ENTITIES = "".join(f'<!ENTITY e{i + 1} "{f"&e{i};" * 10}">' for i in range(9))
+BOMB = f'<?xml version="1.0"?><!DOCTYPE document [<!ENTITY e0 "ha">{ENTITIES}]><document><chunk>&e9;</chunk></document>'
+
+
+@pytest.mark.parametrize(
+    "change,message",
+    [
+        (lambda s: BOMB, "cameras.xml: cannot be understood .it has a DOCTYPE, which Metashape does not write.; write the"),
+        (lambda s: s[:-20], r"cameras.xml: cannot be understood .unclosed token.*; write the file again"),
+        (lambda s: s.replace("<cameras>", "<cameras>" + "<a/>" * 2**19), "it has more than 524,288 parts"),
+        (lambda s: s.replace("chunk", "part").replace("<part", "<!--<chunk--><part"), "has no chunk"),
+        (lambda s: s.replace("<f>20.0</f>", "<f>20.0</f><k4>0.1</k4>"), "sensor 0: k4 of a frame camera is not supported"),
+        (lambda s: s.replace("<f>20.0</f>", "<f>20.0</f><b2>3</b2>"), "sensor 0: b2 of a frame camera is not supported"),
+        (lambda s: s.replace("<f>20.0</f>", "<f>nan</f>"), "sensor 0: cannot be understood .<f> needs 1 finite numbers"),
+        (lambda s: s.replace("<f>20.0</f>", ""), "sensor 0: focal lengths .0.0, 0.0. px must be over"),
+        (lambda s: s.replace("<f>20.0</f>", "<f>-20</f>"), "focal lengths .* calibrate again"),
+        (lambda s: s.replace('sensor id="0"', 'sensor id="1"'), "sensor 0: cannot be understood .it has no calibration; align"),
+        (lambda s: s.replace('type="frame"', 'type="spherical"'), "sensor 0: spherical cameras are not supported"),
+        (lambda s: s.replace('width="16"', 'width="x"'), "sensor 0: cannot be understood .invalid literal"),
+        (lambda s: s.replace("<scale>2.0", "<scale>0"), "camera 'photo0': cannot be understood .its scale is 0"),
+        (lambda s: s.replace("<rotation>0.0 -1.0", "<rotation>0.0 -3.0"), "camera 'photo0': the pose is not rigid"),
+        (lambda s: s.replace("</transform></camera>", " 1</transform></camera>"), "photo0': .*<transform> needs 16 finite"),
+        (lambda s: s.replace("UTF-8", "UTF-9"), "unknown encoding: UTF-9"),
+        (lambda s: s.replace("</group>", "</group><camera sensor_id='0'><transform/></camera>"), "<transform> needs 16 finite"),
+        (lambda s: s.replace('label="photo1"', 'label="photo0"'), "'photo0.png' is listed twice"),
+        (lambda s: s.replace('label="photo1"', 'label="../../a"'), "points outside the scene folder"),
+        (lambda s: s.replace('label="photo1"', ""), "'' is not a file name"),
+    ],
+)  # fmt: skip
+def test_metashape_files(change, message, tmp_path):
+    scenes.write_metashape(tmp_path / "scene")
+    path = tmp_path / "scene" / "cameras.xml"
+    path.write_text(change(path.read_text()))
+    refused(tmp_path / "scene", message)
+
+
+@pytest.mark.parametrize(
+    "old,new,message",
+    [
+        (",0,0,0,0,0,0,0,0", ",0,0,0,0,0,0.1,0,0", "line 3: k4 is not supported; align with the distortion model Brown3"),
+        (
+            "0,0,0,0,0,0,0,0",
+            "0,0,0",
+            r"calib.csv, line 3: cannot be understood \(zip\(\) argument .*; write the file again",
+        ),
+        (",0,0,0,0,0,0,0,0", ",0,0,nan,0,0,0,0,0", "distortion .* of the Brown lens is impossible"),
+        (",0,0,0,0,0,0,0,0", ",1e300,0,0,0,0,0,0,0", "line 3, image 'photo0.png': the principal point"),
+        (",45.0,", ",-45.0,", "image 'photo0.png': focal lengths"),
+        ("photo0.png,", "photo0.png,x,", "line 3: cannot be understood"),
+        ("photo1.png", "photo0.png", "'photo0.png' is listed twice"),
+        ("photo1.png", "../a.png", "points outside the scene folder"),
+        ("photo1.png", '"photo1.png', "line .*: cannot be understood"),
+    ],
+)
+def test_realityscan_files(old, new, message, tmp_path):
+    scenes.write_realityscan(tmp_path / "scene")
+    path = tmp_path / "scene" / "calib.csv"
+    assert old in path.read_text()
+    path.write_text(path.read_text().replace(old, new))
+    refused(tmp_path / "scene", message)
+
+
+def test_large_and_unreadable_files_of_cameras(tmp_path, monkeypatch):
+    """A bound holds for their bytes; files that cannot be opened, and those without photographs, are no cameras."""
+    for write, name in ((scenes.write_metashape, "cameras.xml"), (scenes.write_realityscan, "calib.csv")):
+        root = write(tmp_path / name)
+        with monkeypatch.context() as patch:
+            patch.setattr("warpgs.io.capture.MAX_BYTES", 100)
+            refused(root, f"{name}: cannot be read .is larger than 100 bytes.; export the cameras again")
+        for photograph in root.rglob("*.png"):
+            photograph.unlink()
+        shutil.rmtree(root / "images", ignore_errors=True)
+        refused(root, f"{name} lacks its photographs, beside it or in images")
+        (root / name).unlink()
+        (root / name).mkdir()
+        refused(root, "no scene format found")

@@ -83,6 +83,11 @@ def side_file(path: Path) -> Path:
     return path.with_name(f"{path.name}.origin.json")
 
 
+def given_units(normalization: Normalization | None, units: str | None) -> str:
+    """Return the units of Gaussians to write: if None are given, those of the scene if there is a normalization, else file."""
+    return units or ("file" if normalization is None else "scene")
+
+
 def from_origin(gaussians: Gaussians, origin: np.ndarray, normalization: Normalization, units: str) -> Gaussians:
     """Return Gaussians in file units about an ``origin`` [3] in scene units, or in file units: float64 unless it is 0."""
     if units == "file" and origin.any():
@@ -364,6 +369,14 @@ class Format:
         """Return whether a file name has the suffix of the format."""
         return Path(path).name.lower().endswith(self.suffix)
 
+    def size(self, path: Path) -> int:
+        """Return the bytes of a model on disk."""
+        return path.stat().st_size
+
+    def store(self, path: Path, pieces: Iterable[bytes]) -> None:
+        """Write the pieces of a file, replacing an existing one."""
+        write_bytes(path, *pieces)
+
     def write(self, path: Path, gaussians: Gaussians, normalization: Normalization | None, units: str) -> None:
         """Write Gaussians, with the arguments of `warpgs.export.write_gaussians`.
 
@@ -382,7 +395,7 @@ class Format:
                 f"sh[:, :{(self.max_degree + 1) ** 2}], or write .ply"
             )
         pieces = returned(self, "encode", self.encode(arrays), Iterable, "an iterable of bytes")
-        write_bytes(path, *(returned(self, "encode", p, BYTES, "an iterable of bytes") for p in pieces))
+        self.store(path, [returned(self, "encode", p, BYTES, "an iterable of bytes") for p in pieces])
         if type(self).origin_in is Format.origin_in:
             if self.origin.any():
                 write_json(side_file(path), {ORIGIN: self.origin.tolist()})
@@ -518,9 +531,8 @@ def format_of(path: str | os.PathLike[str], choice: str | type[Format] | Format 
     name = Path(path).name.lower()
     if name.endswith(".htm"):
         raise UsageError(f"{path}: format .htm is not supported; did you mean {path}l?")
-    if name == "meta.json" or (Path(path) / "meta.json").is_file():
-        pack = "zip -j scene.sog FOLDER/meta.json FOLDER/*.webp"
-        raise UsageError(f"{path}: is an unpacked SOG model; pack its folder into one file, with `{pack}`, and give that")
+    if (Path(path) / "meta.json").is_file():
+        raise UsageError(f"{path}: is the folder of a SOG model; give {Path(path) / 'meta.json'}")
     cameras = "; cameras are named cameras.json, transforms.json or sparse" if name.endswith(".json") else ""
     raise UsageError(
         f"{path}: format {Path(path).suffix or '(none)'} is not supported; use one of {', '.join(k.suffix for k in known)}, or "
@@ -533,7 +545,7 @@ def write_gaussians(
     gaussians: Gaussians,
     normalization: Normalization | None = None,
     *,
-    units: str = "scene",
+    units: str | None = None,
     format: str | type[Format] | Format | None = None,
     antialiased: bool = False,
 ) -> None:
@@ -545,7 +557,7 @@ def write_gaussians(
         path: The file; an existing one is replaced.
         gaussians: N Gaussians, on any device; at least one, except in a .ply file.
         normalization: Similarity from file to scene units; needed where ``units`` is scene.
-        units: Units of ``gaussians``: scene, or file to write them unchanged.
+        units: Units of ``gaussians``: scene, or file to write them unchanged. None: scene with a normalization, file without.
         format: Name of a format, or a `Format` of your own: an object, a class, ``module:Class`` or
             ``path/to/file.py:Class``. None for the format of the suffix.
         antialiased: True for Gaussians to be rendered with `RasterizeOptions.antialiased`. PLY, SPZ and SOG declare it.
@@ -561,7 +573,7 @@ def write_gaussians(
     """
     chosen = copy.copy(format_of(path, format))
     chosen.antialiased = antialiased
-    chosen.write(Path(path), gaussians, normalization, units)
+    chosen.write(Path(path), gaussians, normalization, given_units(normalization, units))
 
 
 def read_gaussians(

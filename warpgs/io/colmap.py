@@ -6,7 +6,7 @@ Other files of a reconstruction (rigs, frames, project.ini) hold nothing that a 
 import re
 import struct
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path, PurePosixPath
@@ -43,6 +43,10 @@ Model = tuple[Path, str, list[str]]
 Pose = tuple[str, int, tuple[float, ...], tuple[float, ...]]
 """A row of the images file: path below the image folder, number of the camera, and camera_from_world: rotation wxyz and
 translation [file units]."""
+
+
+Posed = tuple[str, Lens | Callable[[int, int], Lens], np.ndarray]
+"""Path below the image folder, lens (or a function that returns it for the size of the image), camera_from_world [4, 4]."""
 
 
 class _BinaryFile:
@@ -112,12 +116,12 @@ def origin_stated(path: Path) -> np.ndarray:
 
 
 @contextmanager
-def _understood(path: Path, line: int):
-    """Turn errors of parsing a line into a DataError that names file and line."""
+def understood(where: str, *errors: type[Exception]) -> Iterator[None]:
+    """Turn errors of parsing, and others that are named, into a DataError that names the place."""
     try:
         yield
-    except (ValueError, IndexError, OverflowError) as e:
-        raise DataError(f"{path}, line {line}: cannot be understood ({e}); write the file again") from e
+    except (ValueError, LookupError, OverflowError, *errors) as e:
+        raise DataError(f"{where}: cannot be understood ({e}); write the file again") from e
 
 
 NAN = re.compile(rb"[-+]?(?:nan\([a-z]*\)|1\.#(?:ind|qnan|snan)\d*)", re.IGNORECASE)
@@ -130,7 +134,7 @@ def _number(word: str) -> float:
 
 
 def _expect(condition: bool, message: str) -> None:
-    """Raise a ValueError for `_understood` where a line breaks a rule."""
+    """Raise a ValueError for `understood` where a line breaks a rule."""
     if not condition:
         raise ValueError(message)
 
@@ -191,7 +195,7 @@ def read_cameras(path: Path, native: bool = False) -> dict[int, Lens]:
         return cameras
     counts = dict(readable.values())
     for line, words in _rows(path):
-        with _understood(path, line):
+        with understood(f"{path}, line {line}"):
             number, model, parameters = int(words[0]), words[1], tuple(_number(w) for w in words[4:])
             allow(model, parameters)
             _expect(len(parameters) == counts[model], f"{model} has {counts[model]} parameters, not {len(parameters)}")
@@ -219,7 +223,7 @@ def read_poses(path: Path) -> dict[int, Pose]:
     for line, text in lines:
         if not text.strip() or text.lstrip().startswith("#"):
             continue
-        with _understood(path, line):
+        with understood(f"{path}, line {line}"):
             words = text.split(maxsplit=9)
             values = tuple(_number(w) for w in words[1:8])
             pose = (words[9].rstrip(), int(words[8]), values[:4], values[4:])
@@ -279,7 +283,7 @@ def read_points(path: Path, names: dict[int, str], notes: list[str] | None = Non
         r.end()
     else:
         for line, words in _rows(path):
-            with _understood(path, line):
+            with understood(f"{path}, line {line}"):
                 _expect(len(words) >= 8 and len(words) % 2 == 0, "a point needs 8 numbers, then pairs IMAGE OBSERVATION")
                 points.append(tuple(_number(w) for w in words[1:4]))
                 colors.append(tuple(_number(w) for w in words[4:7]))
@@ -476,6 +480,39 @@ def _image_paths(
     return paths | found, scenes.matched_note(found, images.name, scene.root)
 
 
+def add_views(
+    scene: SceneFolder, views: ViewList, base: str, file: Path, names: list[str], rows: Sequence[Posed]
+) -> tuple[dict[str, str], list[str]]:
+    """Add the views of the rows of a file whose images are in the folder ``base``.
+
+    Returns the names of the views by ``names``, which are all in the file, also of cameras without a row, and notes.
+    """
+    options = scene.options
+    images, factor, resized = scene.images(base)
+    flat = PurePosixPath(base).name not in IMAGES
+    files = [p for p in list_images(images) if not flat or p.parent == images]
+    paths, matched = _image_paths(scene, images, base, names, files, str(file))
+    notes, missing = [resized] * bool(resized) + matched, list[str]()
+    named: dict[str, str] = {}
+    for name, lens, viewmat in rows:
+        path = paths[name]
+        of_file = scenes.is_absolute(name) or not PurePosixPath(name).suffix
+        view = scenes.view_name(path.relative_to(images).as_posix() if of_file and images in path.parents else name)
+        if options.excludes(view):
+            continue
+        if not path.is_file():
+            missing.append(name)
+            continue
+        named[name] = views.claim(view, f"{file}, image {name!r}")
+        mask = scene.mask_of(path, images, images / "masks" if flat else None)
+        views.add(view, viewmat, partial(scene.image, path, lens, downscale=factor, mask=mask))
+    unposed = len(set(files) - set(paths.values()))
+    if unposed:
+        notes.append(f"{unposed} files in {images.name} have no pose in the reconstruction and are left out")
+    notes += scenes.missing_note(missing, len(rows), "images", file, options.strict)
+    return named, notes + views.notes(options) + scene.mask_notes()
+
+
 @register("colmap")
 class ColmapReader(Reader):
     """COLMAP reconstructions, binary or text, with their image folder."""
@@ -510,35 +547,13 @@ class ColmapReader(Reader):
         stored = read_poses(scene.inside(file))
         lenses = read_cameras(scene.inside(model / f"cameras.{kind}"), options.lenses == "native")
         poses, unaligned = without_unaligned(stored, lenses, file, options.strict)
-        base = image_base(folder, model) or "images"
-        images, factor, resized = scene.images(base)
-        flat = PurePosixPath(base).name not in IMAGES
-        files = [p for p in list_images(images) if not flat or p.parent == images]
-        paths, notes = _image_paths(scene, images, base, [name for name, *_ in stored.values()], files, str(file))
+        base, views = image_base(folder, model) or "images", ViewList(options)
         place = model.relative_to(folder).as_posix() if model.is_relative_to(folder) else str(model)
         if not chosen and (base != "images" or place not in ("sparse/0", "sparse", ".")):
             chosen = f"cameras taken from {place}, images from {base}"
-        notes, views, missing = [note for note in (chosen, resized, *unaligned) if note] + notes, ViewList(options), []
-        named: dict[str, str] = {}  # names of the views by name of the reconstruction
-        for name, lens, viewmat in posed_lenses(poses, lenses, file):
-            path = paths[name]
-            view = scenes.view_name(
-                path.relative_to(images).as_posix() if scenes.is_absolute(name) and images in path.parents else name
-            )
-            if options.excludes(view):
-                continue
-            if not path.is_file():
-                missing.append(name)
-                continue
-            named[name] = views.claim(view, f"{file}, image {name!r}")
-            mask = scene.mask_of(path, images, images / "masks" if flat else None)
-            views.add(view, viewmat, partial(scene.image, path, lens, downscale=factor, mask=mask))
-        unposed = len(set(files) - set(paths.values()))
-        if unposed:
-            notes.append(f"{unposed} files in {images.name} have no pose in the reconstruction and are left out")
-        notes += (
-            scenes.missing_note(missing, len(poses), "images", file, options.strict) + views.notes(options) + scene.mask_notes()
-        )
+        names, rows = [name for name, *_ in stored.values()], list(posed_lenses(poses, lenses, file))
+        named, found = add_views(scene, views, base, file, names, rows)
+        notes = [note for note in (chosen, *unaligned, *found) if note]
         there = {v.name for v in views.views}  # without those that are left out
         names = {n: named[p[0]] for n, p in poses.items() if named.get(p[0]) in there}
         points, more = self._points(scene, model, kind, names)

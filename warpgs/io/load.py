@@ -383,8 +383,9 @@ def load_scene(
 
     Args:
         path: The scene folder.
-        reader: Name of a format (colmap, transforms, llff, dtu, middlebury), or a `Reader` of your own: an object, a class,
-            ``module:Class`` or ``path/to/file.py:Class``. None for the built-in reader that recognises the folder.
+        reader: Name of a format (colmap, transforms, llff, dtu, middlebury, metashape, realityscan), or a `Reader` of your own:
+            an object, a class, ``module:Class`` or ``path/to/file.py:Class``. None for the built-in reader that recognises the
+            folder.
         downscale: Factor by which both image sides shrink; a folder `images_N` is used if it exists. None for 1.
         max_side: Largest image side [px], 0 for no limit; larger images are reduced to it, and the intrinsics with them. None
             means 1600 if ``downscale`` is None, too, and no limit otherwise.

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from warpgs.errors import DataError, WarpgsError, similar_folder
-from warpgs.export.base import suffixes
+from warpgs.export.base import all_formats, suffixes
 from warpgs.pipeline.model.table import FittedModel
 from warpgs.pipeline.run.folder import CONFIG, read_record
 from warpgs.pipeline.run.request import choose_device
@@ -40,7 +40,7 @@ def view(path: Path, port: int = PORT, device: str = "auto", reader: str | None 
     elif not path.exists():
         near = similar_folder(path) or "give a run folder or a file of Gaussians"
         raise DataError(f"{path}: no such file or folder; {near}")
-    elif not path.name.lower().endswith(tuple(suffixes())) or not path.is_file():
+    elif not any(kind.fits(path) for kind in all_formats()) or not path.is_file():
         what = f"a run folder ({CONFIG} in it) nor a file of Gaussians ({', '.join(suffixes())})"
         raise DataError(f"{path}: is neither {what}; give one of these")
     require_viser()

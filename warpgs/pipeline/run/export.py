@@ -213,7 +213,7 @@ def _written(
             more = f"; axis lengths of {other:,} Gaussians change by more than 10 %" if other else ""
             lines.append(f"the format rounds positions, by at most {moved:.2g} {_unit(stored)}{more}")
     lines += ([kind.note] if kind.note else []) + origin_line(origin)
-    return [*notes, *lines, f"{len(gaussians):,} Gaussians in {target}, {format_bytes(target.stat().st_size)}"]
+    return [*notes, *lines, f"{len(gaussians):,} Gaussians in {target}, {format_bytes(kind.size(target))}"]
 
 
 def _check_for_cameras(filters: Filters, formats: Sequence[object]) -> None:
