@@ -96,6 +96,13 @@ def test_a_page_turns_as_far_as_the_photographs_and_shows_what_they_saw():
     np.testing.assert_allclose(html.seen_at(row, target), [0.3 + 1 / 4, 0.6])
     cameras = [moved(x) for x in (4.0, 0.0, 1.5, 1.0)]
     assert [c.center[0] for c in html.middle_first(cameras)] == [1.5, 4.0, 0.0, 1.0] and html.middle_first([]) == []
+    # photographs on their side: the page starts upright, as films and the report do
+    roll = np.array([[0.0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+    lying = [dataclasses.replace(c, viewmat=roll @ c.viewmat) for c in (looking(a, 0.3) for a in np.arange(8) * np.pi / 4)]
+    lying = html.middle_first(lying)
+    assert (lying[0].width, lying[0].height) == (lying[1].height, lying[1].width)
+    np.testing.assert_allclose(html.place_first_camera(server, lying[0], three_gaussians(), lying)[1], UP, atol=1e-6)
+    assert -lying[0].viewmat[1] @ [*UP, 0] > 0.9
 
 
 TURNED = "(()=>{const t=__viserMutable.cameraControl;t.update(9);return t.azimuthAngle})()"

@@ -20,7 +20,7 @@ from warpgs.errors import DataError
 from warpgs.files import write_text
 from warpgs.geometry import convert_camera, convert_gaussians, look_at, matmul, pose_at, quaternions, rotation_matrices
 from warpgs.locks import hold_file
-from warpgs.pipeline.films.paths import fov_y, rig_among
+from warpgs.pipeline.films.paths import fov_y, rig_among, rig_of, upright
 from warpgs.pipeline.run.export import NO_FILTERS, Filters, file_gaussians, filtered
 from warpgs.pipeline.run.folder import open_run
 from warpgs.scene import Camera, Gaussians, Normalization, base_colors
@@ -143,7 +143,7 @@ def place_first_camera(
     target = camera.center + distance_ahead(camera, gaussians) * np.asarray(camera.viewmat[2, :3])
     points, own = gaussians.means.detach().cpu().double().numpy(), -np.asarray(camera.viewmat[1, :3])
     up = rig_among(list(cameras), points).up if level is None else level
-    up = up if (up * own).sum() > 0.5 else own  # the camera looks along it, or lies on its side
+    up = up if (up * own).sum() > 0.5 else own  # the camera looks along it
     server.scene.set_up_direction(up)
     server.initial_camera.position = camera.center
     server.initial_camera.look_at = target
@@ -154,14 +154,15 @@ def place_first_camera(
 
 
 def middle_first(cameras: Sequence[Camera]) -> list[Camera]:
-    """Return cameras that are not far off the rest, first the one nearest to their mean centre, then the others in order."""
+    """Return cameras that are not far off the rest, first the one nearest to their mean centre, upright, then the others."""
     if not cameras:
         return []
     centers = np.array([c.center for c in cameras])
     near = geometry.near_cameras(centers)  # what is between a lone camera and the rest, no photograph shows
     cameras, centers = [c for c, kept in zip(cameras, near) if kept], centers[near]
     nearest = int(np.argmin(np.linalg.norm(centers - centers.mean(0), axis=1)))
-    return [cameras[nearest], *cameras[:nearest], *cameras[nearest + 1 :]]
+    first = upright(rig_of(cameras, 1.0), cameras[nearest])  # no part of whether photographs lie depends on the depth
+    return [first, *cameras[:nearest], *cameras[nearest + 1 :]]
 
 
 def turning_limits(cameras: Sequence[Camera], target: np.ndarray, up: np.ndarray) -> tuple[np.ndarray, float]:
