@@ -94,6 +94,8 @@ def test_a_page_turns_as_far_as_the_photographs_and_shows_what_they_saw():
     np.testing.assert_allclose(html.seen_at([portrait], target), [0.3, 0.6])
     row = [dataclasses.replace(portrait, viewmat=moved(x).viewmat) for x in (0.0, -1.0, 2.0)]
     np.testing.assert_allclose(html.seen_at(row, target), [0.3 + 1 / 4, 0.6])
+    # but not what one of five sees, which stays vague
+    np.testing.assert_allclose(html.seen_at([portrait] * 3 + row[1:], target), [0.3, 0.6])
     cameras = [moved(x) for x in (4.0, 0.0, 1.5, 1.0)]
     assert [c.center[0] for c in html.middle_first(cameras)] == [1.5, 4.0, 0.0, 1.0] and html.middle_first([]) == []
     # photographs on their side: the page starts upright, as films and the report do

@@ -201,16 +201,19 @@ def add_limits(
 
 def seen_at(cameras: Sequence[Camera], target: np.ndarray) -> tuple[float, float]:
     """Return half the width and height, at distance 1 from the first camera, of what cameras see at the target's depth."""
-    first, points = cameras[0], []
+    first, ends = cameras[0], []
     axis = np.asarray(first.viewmat[2, :3])
     for c in cameras:
         corners = np.array([[x, y, 1.0] for x in (0, c.width) for y in (0, c.height)])
         rays = matmul(matmul(corners, np.linalg.inv(c.K).T), np.asarray(c.viewmat[:3, :3]))
         slopes = (rays * axis).sum(1)
         depths = ((target - c.center) * axis).sum() / np.where(slopes > 0.3, slopes, math.inf)  # not along the plane
-        points.append(c.center + depths[depths > 0, None] * rays[depths > 0])
-    x, y, z = matmul(np.concatenate(points) - first.center, np.asarray(first.viewmat[:3, :3]).T).T
-    return float(min((x / z).max(), -(x / z).min())), float(min((y / z).max(), -(y / z).min()))
+        if (depths > 0).any():
+            seen = c.center + depths[depths > 0, None] * rays[depths > 0] - first.center
+            x, y, z = matmul(seen, np.asarray(first.viewmat[:3, :3]).T).T
+            ends.append([(x / z).max(), -(x / z).min(), (y / z).max(), -(y / z).min()])
+    right, left, below, above = np.quantile(ends, 0.6, axis=0, method="higher")  # what fewer cameras see is vague
+    return float(min(right, left)), float(min(below, above))
 
 
 def plain_background(color: Sequence[float]) -> np.ndarray:
