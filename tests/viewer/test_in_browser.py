@@ -164,7 +164,8 @@ def test_a_page_tells_how_to_move_and_returns(browser, tmp_path):
     assert browser.value("document.title") == "my <scene>" and "Drag to turn" in browser.value("document.body.innerText")
     browser.resize(390, 844)  # on a phone, the buttons are in one row; words are legible before a white wall, too
     assert browser.value("new Set([...document.querySelectorAll('#warpgs-help button')].map(b=>b.offsetTop)).size") == 1
-    assert browser.value("getComputedStyle(document.querySelector('#warpgs-help span')).backgroundColor") == "rgba(0, 0, 0, 0.45)"
+    color = browser.value("getComputedStyle(document.querySelector('#warpgs-help span')).backgroundColor")
+    assert color == "rgba(0, 0, 0, 0.45)"
     assert browser.value("document.querySelector('[aria-label$=\"scene tree\"]').checkVisibility()") is False
     place = "JSON.stringify(__viserMutable.camera.position.toArray().map(x => Math.round(1e3 * x)))"
     browser.wait("document.querySelector('#warpgs-help button').checkVisibility()")
