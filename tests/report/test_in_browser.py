@@ -7,6 +7,7 @@ import pytest
 
 from tests.report.test_page import write
 from warpgs.report.film import write_film
+from warpgs.report.images import png
 
 GRAPHICS = ("--disable-gpu",)
 """The rasterizer of `Chromium` has other colours of films."""
@@ -18,7 +19,7 @@ input.value=10;input.dispatchEvent(new Event('input'));
 return {images:drawn.length,broken:drawn.filter(i=>!i.naturalWidth).length,
 flat:drawn.filter(i=>!i.getBoundingClientRect().height).length,
 moved:before!==getComputedStyle(slider.querySelector('.top')).clipPath,
-wide:document.documentElement.scrollWidth-innerWidth}})()"""
+view:slider.getBoundingClientRect().height,wide:document.documentElement.scrollWidth-innerWidth}})()"""
 
 
 def probed(browser, page, width: int) -> dict:
@@ -32,10 +33,11 @@ def probed(browser, page, width: int) -> dict:
 @pytest.mark.parametrize("width", [1280, 500])
 def test_page_opens_whole(browser, tmp_path, width):
     path = tmp_path / "report.html"
-    write(path)
+    write(path, views=[("a.png", "a portrait", *[png(np.full((32, 18, 3), 0.5, np.float32))] * 4)] * 2)
     found = probed(browser, path, width)
     assert found["images"] >= 10 and found["moved"] and found["wide"] <= 0
     assert (found["broken"], found["flat"]) == (0, 0) and browser.console() == []
+    assert found["view"] <= 0.85 * 900
 
 
 @pytest.mark.browser

@@ -101,6 +101,8 @@ def test_nothing_is_loaded_from_anywhere_and_sampling_is_shown(tmp_path):
     section = text[text.index("Why Gaussians") : text.index("<h2>Details")]
     assert section.count("<details>") == 1 and section.index('alt="first"') < section.index("<details>")
     assert section.index("<summary>later</summary>") < section.index('alt="later"')
+    folds = re.findall(r"<summary><h2>(.*?)</h2></summary>", text)
+    assert folds == ["How it was scored", "Why Gaussians were placed", "Details"]
 
 
 def test_images_are_embedded_byte_for_byte_and_numbers_shown_as_given(tmp_path):
@@ -152,7 +154,7 @@ def test_what_nobody_acts_on_stands_in_the_last_section(tmp_path):
     assert [text.index(words) for words in order] == sorted(map(text.index, order))
     first, overview = page.all("img")[:2]
     assert (first["alt"], overview["alt"]) == ("a new viewpoint", "the Gaussians") and "data:image/webp" in first["src"]
-    assert text.count("--aspect:1.33") == 2
+    assert text.count("--aspect:1.33") == 4
     nothing = {key: [] for key in ("notes", "views", "curves", "pictures")} | {"sampling": None, "protocol": {}}
     _, _, page = write(tmp_path / "report.html", scores=[["view"]], **nothing)
     assert page.text("h2") == ["Details"] and not page.all("img") and not page.all("ul")

@@ -94,8 +94,17 @@ def test_a_page_turns_as_far_as_the_photographs_and_shows_what_they_saw():
     np.testing.assert_allclose(html.seen_at([portrait], target), [0.3, 0.6])
     row = [dataclasses.replace(portrait, viewmat=moved(x).viewmat) for x in (0.0, -1.0, 2.0)]
     np.testing.assert_allclose(html.seen_at(row, target), [0.3 + 1 / 4, 0.6])
+    # but not what one of five sees, which stays vague
+    np.testing.assert_allclose(html.seen_at([portrait] * 3 + row[1:], target), [0.3, 0.6])
     cameras = [moved(x) for x in (4.0, 0.0, 1.5, 1.0)]
     assert [c.center[0] for c in html.middle_first(cameras)] == [1.5, 4.0, 0.0, 1.0] and html.middle_first([]) == []
+    # photographs on their side: the page starts upright, as films and the report do
+    roll = np.array([[0.0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+    lying = [dataclasses.replace(c, viewmat=roll @ c.viewmat) for c in (looking(a, 0.3) for a in np.arange(8) * np.pi / 4)]
+    lying = html.middle_first(lying)
+    assert (lying[0].width, lying[0].height) == (lying[1].height, lying[1].width)
+    np.testing.assert_allclose(html.place_first_camera(server, lying[0], three_gaussians(), lying)[1], UP, atol=1e-6)
+    assert -lying[0].viewmat[1] @ [*UP, 0] > 0.9
 
 
 TURNED = "(()=>{const t=__viserMutable.cameraControl;t.update(9);return t.azimuthAngle})()"
@@ -153,6 +162,10 @@ def test_a_page_tells_how_to_move_and_returns(browser, tmp_path):
     browser.wait("document.querySelector('[aria-label$=\"scene tree\"]') !== null")
     browser.wait("document.querySelector('#warpgs-loading') === null")
     assert browser.value("document.title") == "my <scene>" and "Drag to turn" in browser.value("document.body.innerText")
+    browser.resize(390, 844)  # on a phone, the buttons are in one row; words are legible before a white wall, too
+    assert browser.value("new Set([...document.querySelectorAll('#warpgs-help button')].map(b=>b.offsetTop)).size") == 1
+    color = browser.value("getComputedStyle(document.querySelector('#warpgs-help span')).backgroundColor")
+    assert color == "rgba(0, 0, 0, 0.45)"
     assert browser.value("document.querySelector('[aria-label$=\"scene tree\"]').checkVisibility()") is False
     place = "JSON.stringify(__viserMutable.camera.position.toArray().map(x => Math.round(1e3 * x)))"
     browser.wait("document.querySelector('#warpgs-help button').checkVisibility()")

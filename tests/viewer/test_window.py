@@ -28,7 +28,18 @@ from warpgs.synthetic.demo import split_spec, write_demo
 from warpgs.viewer import watch, window as windows
 from warpgs.viewer.html import middle_first, wxyz_of
 from warpgs.viewer.server import open_server, stop_server
-from warpgs.viewer.window import CROP, PATH, Window, box_json, content_of_file, content_of_run, keyframe, placed, views_of
+from warpgs.viewer.window import (
+    CROP,
+    PATH,
+    Window,
+    box_json,
+    content_of_file,
+    content_of_run,
+    frustum_scale,
+    keyframe,
+    placed,
+    views_of,
+)
 
 pytest.importorskip("viser")
 zstandard = pytest.importorskip("zstandard")
@@ -160,6 +171,13 @@ def test_the_first_view_is_that_of_the_page_and_a_narrow_window_shows_the_whole_
     visible = {name: frustum.visible for name, frustum in window._frusta.items()}
     first = next(n for n, c in window.content.model.scene_cameras.items() if c is window.first)
     assert not visible[first] and any(visible.values())
+    # viser keeps the volume of a frustum: with a long lens, a picture far ahead would cover the model
+    K = np.diag([10.0, 10.0, 1]) @ middle.K
+    sizes = frustum_scale(middle, 0.4), frustum_scale(dataclasses.replace(middle, K=K), 0.4)
+    tangents = (middle.height / 2 / focal for focal in (middle.K[1, 1], K[1, 1]))
+    aspect = middle.width / middle.height
+    ahead = [size / np.cbrt(t**2 * aspect / 3) for size, t in zip(sizes, tangents)]
+    assert sizes[0] == 0.4 and ahead == pytest.approx([0.97, 1], rel=0.03)
     camera = window.first
     for aspect, side in ((0.46, camera.width / camera.K[0, 0] / 0.46), (2.0, camera.height / camera.K[1, 1])):
         state = SimpleNamespace(aspect=aspect, on_update=lambda _: None, fov=0.1)

@@ -20,7 +20,7 @@ from warpgs.errors import DataError
 from warpgs.files import write_text
 from warpgs.geometry import convert_camera, convert_gaussians, look_at, matmul, pose_at, quaternions, rotation_matrices
 from warpgs.locks import hold_file
-from warpgs.pipeline.films.paths import fov_y, rig_among
+from warpgs.pipeline.films.paths import fov_y, rig_among, rig_of, upright
 from warpgs.pipeline.run.export import NO_FILTERS, Filters, file_gaussians, filtered
 from warpgs.pipeline.run.folder import open_run
 from warpgs.scene import Camera, Gaussians, Normalization, base_colors
@@ -143,7 +143,7 @@ def place_first_camera(
     target = camera.center + distance_ahead(camera, gaussians) * np.asarray(camera.viewmat[2, :3])
     points, own = gaussians.means.detach().cpu().double().numpy(), -np.asarray(camera.viewmat[1, :3])
     up = rig_among(list(cameras), points).up if level is None else level
-    up = up if (up * own).sum() > 0.5 else own  # the camera looks along it, or lies on its side
+    up = up if (up * own).sum() > 0.5 else own  # the camera looks along it
     server.scene.set_up_direction(up)
     server.initial_camera.position = camera.center
     server.initial_camera.look_at = target
@@ -154,14 +154,15 @@ def place_first_camera(
 
 
 def middle_first(cameras: Sequence[Camera]) -> list[Camera]:
-    """Return cameras that are not far off the rest, first the one nearest to their mean centre, then the others in order."""
+    """Return cameras that are not far off the rest, first the one nearest to their mean centre, upright, then the others."""
     if not cameras:
         return []
     centers = np.array([c.center for c in cameras])
     near = geometry.near_cameras(centers)  # what is between a lone camera and the rest, no photograph shows
     cameras, centers = [c for c, kept in zip(cameras, near) if kept], centers[near]
     nearest = int(np.argmin(np.linalg.norm(centers - centers.mean(0), axis=1)))
-    return [cameras[nearest], *cameras[:nearest], *cameras[nearest + 1 :]]
+    first = upright(rig_of(cameras, 1.0), cameras[nearest])  # no part of whether photographs lie depends on the depth
+    return [first, *cameras[:nearest], *cameras[nearest + 1 :]]
 
 
 def turning_limits(cameras: Sequence[Camera], target: np.ndarray, up: np.ndarray) -> tuple[np.ndarray, float]:
@@ -200,16 +201,19 @@ def add_limits(
 
 def seen_at(cameras: Sequence[Camera], target: np.ndarray) -> tuple[float, float]:
     """Return half the width and height, at distance 1 from the first camera, of what cameras see at the target's depth."""
-    first, points = cameras[0], []
+    first, ends = cameras[0], []
     axis = np.asarray(first.viewmat[2, :3])
     for c in cameras:
         corners = np.array([[x, y, 1.0] for x in (0, c.width) for y in (0, c.height)])
         rays = matmul(matmul(corners, np.linalg.inv(c.K).T), np.asarray(c.viewmat[:3, :3]))
         slopes = (rays * axis).sum(1)
         depths = ((target - c.center) * axis).sum() / np.where(slopes > 0.3, slopes, math.inf)  # not along the plane
-        points.append(c.center + depths[depths > 0, None] * rays[depths > 0])
-    x, y, z = matmul(np.concatenate(points) - first.center, np.asarray(first.viewmat[:3, :3]).T).T
-    return float(min((x / z).max(), -(x / z).min())), float(min((y / z).max(), -(y / z).min()))
+        if (depths > 0).any():
+            seen = c.center + depths[depths > 0, None] * rays[depths > 0] - first.center
+            x, y, z = matmul(seen, np.asarray(first.viewmat[:3, :3]).T).T
+            ends.append([(x / z).max(), -(x / z).min(), (y / z).max(), -(y / z).min()])
+    right, left, below, above = np.quantile(ends, 0.6, axis=0, method="higher")  # what fewer cameras see is vague
+    return float(min(right, left)), float(min(below, above))
 
 
 def plain_background(color: Sequence[float]) -> np.ndarray:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import math
 import threading
 import time
 from collections.abc import Mapping
@@ -555,7 +556,8 @@ class Window:
         for number, (name, camera) in enumerate(model.scene_cameras.items()):
             view = self.content.views.get(name)
             frustum = self.server.scene.add_camera_frustum(
-                f"/cameras/{number}", fov_y(camera), camera.width / camera.height, scale=size, thickness=0.02 * size,
+                f"/cameras/{number}", fov_y(camera), camera.width / camera.height, thickness=0.02 * size,
+                scale=frustum_scale(camera, size),
                 color=TEST_COLOR if name in model.test else TRAIN_COLOR, image=None if view is None else _small(view.image),
                 format="jpeg", wxyz=html.wxyz_of(camera), position=camera.center, cast_shadow=False, receive_shadow=False,
             )  # fmt: skip
@@ -649,6 +651,13 @@ class Window:
             image, note = self.maps.image(kind, camera, self.shown(), degree)
         client.scene.set_background_image(image, format="jpeg", jpeg_quality=90)
         self.panel.explain(note)
+
+
+def frustum_scale(camera: Camera, size: float) -> float:
+    """Return viser's scale of a frustum: ``size`` [u], or less, so that its picture is at most 2.5 sizes ahead."""
+    # viser keeps the volume of frusta, so that those of long lenses reach far ahead: their pictures would cover the model
+    tangent = math.tan(0.5 * fov_y(camera))
+    return size * min(1.0, 2.5 * (tangent**2 * camera.width / camera.height / 3) ** (1 / 3))
 
 
 def _small(image: np.ndarray) -> np.ndarray:
