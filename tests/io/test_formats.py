@@ -820,3 +820,10 @@ def test_labels_of_metashape_have_neither_suffix_nor_folder(folder, tmp_path):
     if folder:
         scenes.save_images(tmp_path / "images" / "right", ["a.0001.png"])
         assert len(load_scene(tmp_path).views) == 4
+
+
+def test_columns_of_realityscan_may_be_named_without_a_mark(tmp_path):
+    """The first line names the columns, with # or without."""
+    scenes.write_realityscan(tmp_path)
+    (tmp_path / "calib.csv").write_text(scenes.realityscan_csv().replace("#name", "name").partition("\r\n")[2])
+    assert len(load_scene(tmp_path).views) == 5
