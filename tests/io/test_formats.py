@@ -807,3 +807,23 @@ def test_points_in_other_coordinates_and_missing_photographs_of_capture_programs
     refused(tmp_path, "1 of 5 images have no image file: photo1. Restore them", strict=True)
     (tmp_path / "points.ply").unlink()
     assert any("no PLY file is beside cameras.xml" in n for n in load_scene(tmp_path).notes)
+
+
+@pytest.mark.parametrize("folder", ["", "left"])
+def test_labels_of_metashape_have_neither_suffix_nor_folder(folder, tmp_path):
+    """What follows a dot in a label is no suffix; a photograph in a folder is found if no other one has its name."""
+    scenes.write_metashape(tmp_path, labels=[f"a.{i:04}" for i in range(5)])
+    (tmp_path / "images" / folder).mkdir(exist_ok=True)
+    for i, name in enumerate(scenes.NAMES):
+        (tmp_path / "images" / name).rename(tmp_path / "images" / folder / f"a.{i:04}.png")
+    assert [v.name for v in load_scene(tmp_path).views] == [f"{folder}/a.{i:04}.png".lstrip("/") for i in range(5)]
+    if folder:
+        scenes.save_images(tmp_path / "images" / "right", ["a.0001.png"])
+        assert len(load_scene(tmp_path).views) == 4
+
+
+def test_columns_of_realityscan_may_be_named_without_a_mark(tmp_path):
+    """The first line names the columns, with # or without."""
+    scenes.write_realityscan(tmp_path)
+    (tmp_path / "calib.csv").write_text(scenes.realityscan_csv().replace("#name", "name").partition("\r\n")[2])
+    assert len(load_scene(tmp_path).views) == 5

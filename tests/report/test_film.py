@@ -121,6 +121,18 @@ def test_a_film_that_did_not_fit_on_the_disk_leaves_the_old_one(tmp_path):
     assert write_film(path, noise) == 20 and path.read_bytes() != old
 
 
+def test_few_frames_wait_if_they_are_large(tmp_path, monkeypatch):
+    """Frames of all threads, and of the part that waits for one, take no more memory than an animated image."""
+    run, waiting = film_files.in_background, []
+
+    def recorded(encode, parts, threads):
+        return run(lambda name, part: waiting.append((threads + 1) * len(part)) or encode(name, part), parts, threads)
+
+    monkeypatch.setattr(film_files, "in_background", recorded)
+    monkeypatch.setattr(film_files, "MAX_BYTES", 15 * 16 * 16 * 3)
+    assert write_film(tmp_path / "a.mp4", np.zeros((12, 16, 16, 3))) == 12 and max(waiting) <= 15
+
+
 def test_an_encoder_that_drops_frames_is_noticed(tmp_path, monkeypatch):
     """A frame that never reaches the encoder, or the file, is missed when the film is read back."""
     path, made = tmp_path / "a.mp4", cv2.VideoWriter

@@ -236,7 +236,7 @@ class RealityScanReader(CaptureReader):
                 cells = next(reader, None)
                 if cells is None:
                     return rows
-                if not any(cells) or cells[0].startswith("#"):  # "#cameras 5", then the names of the columns
+                if not (header and any(cells)) or cells[0].startswith("#"):  # "#cameras 5", then the names of the columns
                     header = [cell.strip().lstrip("#") for cell in cells]
                     continue
                 row = dict(zip(header, cells, strict=True))

@@ -441,9 +441,9 @@ def _image_paths(
 ) -> tuple[dict[str, Path], list[str]]:
     """Return the image file by name of the reconstruction, and notes for the user; missing files keep the path of their name.
 
-    A name may begin with the image folder. Names without a file are matched without suffix and case, and absolute ones by file
-    name, if only one file fits. Files of reduced images (images_8) may also have other names (LLFF's image000.png): they are
-    matched in sorted order if the counts agree.
+    A name may begin with the image folder. Names without a file are matched without suffix and case; absolute ones, and labels
+    with neither suffix nor folder, by file name, if only one file fits. Files of reduced images (images_8) may also have other
+    names (LLFF's image000.png): they are matched in sorted order if the counts agree.
     """
     outside = {n for n in names if scenes.is_absolute(n) and not (scene.options.allow_outside and (images / n).is_file())}
     paths = {n: scene.child(images, n, where) for n in names if n not in outside}
@@ -465,6 +465,7 @@ def _image_paths(
             match = scene.child(scene.root, plain, where)
         else:
             match = by_path.get(scenes.name_key(plain)) or by_path.get(scenes.name_key(inner))
+            match = match or by_name.get(scenes.name_key(f"{plain}."))  # a label such as frame.0001
         if match is not None:
             found[n] = match
     claims = Counter(found.values())
@@ -496,7 +497,7 @@ def add_views(
     named: dict[str, str] = {}
     for name, lens, viewmat in rows:
         path = paths[name]
-        of_file = scenes.is_absolute(name) or not PurePosixPath(name).suffix
+        of_file = scenes.is_absolute(name) or path.stem == PurePosixPath(name).name or not PurePosixPath(name).suffix
         view = scenes.view_name(path.relative_to(images).as_posix() if of_file and images in path.parents else name)
         if options.excludes(view):
             continue

@@ -164,7 +164,7 @@ def _encode_h264(program: str, temporary: str, frames: Iterator[np.ndarray], fps
 
 
 PART = 30
-"""Frames from one key frame to the next. libvpx needs .1 s and more for a frame of 504 x 378 px: each thread encodes a part."""
+"""Most frames between key frames. libvpx needs .1 s and more for a frame of 504 x 378 px: each thread encodes a part."""
 
 
 def _encode_vp9(path: Path, temporary: str, frames: Iterator[np.ndarray], fps: int) -> None:
@@ -173,7 +173,9 @@ def _encode_vp9(path: Path, temporary: str, frames: Iterator[np.ndarray], fps: i
 
     first = next(frames)
     frames = itertools.chain((first,), frames)
-    packets_as_they_are = (cv2.VIDEOWRITER_PROP_RAW_VIDEO, 1, cv2.VIDEOWRITER_PROP_KEY_INTERVAL, PART)
+    threads = max(2, min(usable_cores(), MAX_BYTES // (PART * first.nbytes)))
+    size = max(1, min(PART, MAX_BYTES // ((threads + 1) * first.nbytes)))  # one part for each thread, and one that waits
+    packets_as_they_are = (cv2.VIDEOWRITER_PROP_RAW_VIDEO, 1, cv2.VIDEOWRITER_PROP_KEY_INTERVAL, size)
     film = _vp9(path, temporary, fps, first, packets_as_they_are)
 
     def encode(name: str, part: list[np.ndarray]) -> str:
@@ -184,9 +186,8 @@ def _encode_vp9(path: Path, temporary: str, frames: Iterator[np.ndarray], fps: i
         return name
 
     with tempfile.TemporaryDirectory() as folder:
-        parts = iter(lambda: list(itertools.islice(frames, PART)), [])
-        threads = min(usable_cores(), MAX_BYTES // (PART * first.nbytes))
-        names = in_background(encode, ((f"{folder}/{i}.mp4", p) for i, p in enumerate(parts)), max(2, threads))
+        parts = iter(lambda: list(itertools.islice(frames, size)), [])
+        names = in_background(encode, ((f"{folder}/{i}.mp4", p) for i, p in enumerate(parts)), threads)
         for name in names:
             packets = cv2.VideoCapture(name, cv2.CAP_FFMPEG, (cv2.CAP_PROP_FORMAT, -1))
             while (read := packets.read())[0]:
