@@ -71,5 +71,6 @@ def test_the_metadata_name_version_licence_pythons_and_command(release):
     assert named == ["11", "12", "13"]
     with zipfile.ZipFile(release[0]) as archive:
         commands = archive.read(f"warpgs-{__version__}.dist-info/entry_points.txt").decode()
-    assert commands.split() == ["[console_scripts]", "warpgs", "=", "warpgs.app.cli:main"]
+    plugin = ["[nerfstudio.method_configs]", "warpgs", "=", "warpgs.compat.nerfstudio:METHOD"]
+    assert commands.split() == ["[console_scripts]", "warpgs", "=", "warpgs.app.cli:main", *plugin]
     assert f"\nversion: {__version__}\n" in (ROOT / "CITATION.cff").read_text("utf-8")

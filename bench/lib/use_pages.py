@@ -22,8 +22,6 @@ FORMATS = {
     ".splat": ("antimatter15, 8 bits", "0", "small viewers"),
 }
 """Encoding, SH degrees and programs of each file format."""
-COLOR_BYTES = {".glb": 8, ".gltf": 8 * 4 / 3}
-"""Bytes of a Gaussian's `COLOR_0`, four uint16, also as base64: younger than the measurement."""
 
 
 def _result(name: str) -> tuple[dict, str]:
@@ -61,7 +59,7 @@ def formats() -> str:
     body = []
     for name, (encoding, degrees, programs) in FORMATS.items():
         r = rows[name]
-        cells = [f"{r['bytes'] / r['gaussians'] + COLOR_BYTES.get(name, 0):.0f}", f"{r['loss_db']:.3f}"]
+        cells = [f"{r['bytes'] / r['gaussians']:.0f}", f"{r['loss_db']:.3f}"]
         body.append([f"`{name}`", encoding, degrees, *cells, programs])
     body.append(["`.html`", "compressed, with a viewer of 0.8 MB", "0", "about 35", "", "any browser"])
     head = ["file", "encoding", "SH degrees", "bytes per Gaussian", "loss [dB]", "opens in"]

@@ -166,7 +166,7 @@ REASONS = {
     "priors/export.py": {"_own_weights": "reads weights of 45 MB with safetensors, as the readers named here do",
         "package_files": "reads files whose SHA-256 must be known", "_backbone": "loads weights whose SHA-256 is known",
         "onnx_bytes": OWN},
-    "report/film.py": {"_decoded_sizes": OWN},
+    "report/film.py": {"_encode_vp9": OWN, "_decoded_sizes": OWN},
     "report/images.py": {"webp": OWN},
     "report/page.py": {"_aspect": OWN},
     "kernels/native.py": {"source": "reads a file of the package",

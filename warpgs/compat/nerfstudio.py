@@ -33,9 +33,9 @@ SHOWN = 10
 
 def camera_of(cameras: Cameras, index: int) -> warpgs.Camera:
     """Return one of nerfstudio's cameras (x right, y up, z backward) as a pinhole, as splatfacto does."""
-    turned = torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)
+    turned = torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64, device="cpu")
     pose = cameras.camera_to_worlds[index].detach().cpu().double()
-    viewmat = torch.eye(4, dtype=torch.float64)
+    viewmat = torch.eye(4, dtype=torch.float64, device="cpu")
     viewmat[:3, :3] = (pose[:, :3] * turned).mT
     viewmat[:3, 3] = -viewmat[:3, :3] @ pose[:, 3]
     K = cameras.get_intrinsics_matrices()[index].detach().cpu().double()
@@ -94,7 +94,7 @@ class WarpgsModel(SplatfactoModel):
             )
         self.seed_points = None
         super().populate_modules()
-        self.register_buffer("behind", torch.zeros(3))
+        self.register_buffer("behind", torch.zeros(3, dtype=torch.float32, device="cpu"))
 
     def get_param_groups(self) -> dict[str, list[torch.nn.Parameter]]:
         """Return nothing to optimise: the fit has its own optimizer."""

@@ -20,7 +20,7 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from warpgs.export import base
-from warpgs.files import is_within, make_folder, read_input, remove_file, write_bytes
+from warpgs.files import is_within, make_folder, read_file, remove_file, write_bytes
 from warpgs.scene import ORIGIN
 
 META = "meta.json"
@@ -216,10 +216,10 @@ def _size(path: Path) -> int:
 
 def _beside(path: Path, name: object, most: int) -> bytes:
     """Return a file of at most ``most`` bytes beside meta.json: one that a plain name names, and no link to another folder."""
-    plain = isinstance(name, str) and name == Path(name).name and not {*name} & {*"\\:\0"}
-    if not plain or not is_within(other := path.parent / str(name), path.parent) or not other.is_file():
-        raise base.malformed(path, f"{str(name)[:40]!r} is not a file beside it")
-    return read_input(other, most)
+    plain = isinstance(name, str) and name == Path(name).name != "" and not {*name} & {*"\\:\0"}
+    if not plain or not is_within(other := path.parent / str(name), path.parent):
+        raise base.malformed(path, f"{str(name)[:40]!r} is not a file beside it, or is a link to another folder")
+    return read_file(other, None, most, "copy the whole folder again")
 
 
 def _meta(path: Path, member: Callable[[object, int], bytes]) -> dict[str, Any]:

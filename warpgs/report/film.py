@@ -185,7 +185,7 @@ def _encode_vp9(path: Path, temporary: str, frames: Iterator[np.ndarray], fps: i
         encoder.release()
         return name
 
-    with tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory() as made, utf8_name(Path(made)) as folder:
         parts = iter(lambda: list(itertools.islice(frames, size)), [])
         names = in_background(encode, ((f"{folder}/{i}.mp4", p) for i, p in enumerate(parts)), threads)
         for name in names:

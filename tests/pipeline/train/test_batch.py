@@ -308,7 +308,7 @@ def test_a_batch_costs_memory_and_on_a_cpu_steps():
     config = PRESETS["default"]
     for device, fewer in (("cpu", 8), ("cuda", 1)):
         one, eight = (settings_by_views(dataclasses.replace(config, batch=b), views, device)[0].steps for b in (1, 8))
-        assert eight == one // fewer > 0
+        assert 0 < one // fewer <= eight <= one // fewer + 1  # a part of a step on a CPU does not depend on the batch
     views = photos(4)
     one, eight = (Trainer(views, seeds(), dataclasses.replace(PLAIN, batch=b), CPU).layout for b in (1, 8))
     assert eight.held(1000) - one.held(1000) == 3 * (one.table.row_bytes + 8) * 1000
