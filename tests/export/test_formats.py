@@ -330,6 +330,23 @@ def test_sog_in_a_folder(tmp_path):
     assert not path.exists()
 
 
+def test_sog_that_does_not_fit_on_the_disk_leaves_the_old_one(tmp_path):
+    """All images are on the disk before the first is replaced; a limit on the size of files stands for a full disk."""
+    resource = pytest.importorskip("resource", reason="Windows has no limit on the size of files")
+    path, limits = tmp_path / "meta.json", resource.getrlimit(resource.RLIMIT_FSIZE)
+    write_gaussians(path, model(200), units="file")
+    old = {p.name: p.read_bytes() for p in tmp_path.iterdir()}
+    resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, limits[1]))
+    try:
+        with pytest.raises(ResourceError, match=r"cannot be written.*the old file is untouched"):
+            write_gaussians(path, model(3000), units="file")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert {p.name: p.read_bytes() for p in tmp_path.iterdir()} == old
+    write_gaussians(path, model(3000), units="file")
+    assert len(read_gaussians(path)) == 3000
+
+
 @pytest.mark.parametrize("suffix", [s for s in SUFFIXES if s != ".ply"])
 def test_golden_files(suffix):
     """The bytes of today are read tomorrow; `make(seed=5)` wrote them."""
