@@ -71,16 +71,6 @@ def test_model_and_ply_files_know_their_units(tmp_path, units):
     torch.testing.assert_close(load(tmp_path / "m.safetensors").gaussians(units).means, given.means)
 
 
-def test_gaussians_without_a_scene_are_in_file_units(tmp_path):
-    """What `read_ply` returns can be written as it is; with a normalization, it is the scene's."""
-    g = cloud(3)
-    for write, name in ((write_ply, "a.ply"), (write_gaussians, "b.ply")):
-        write(tmp_path / name, g)
-        assert torch.equal(read_ply(tmp_path / name).means, g.means)
-        write(tmp_path / name, g, N)
-        assert not torch.allclose(read_ply(tmp_path / name).means, g.means)
-
-
 def test_texts_of_records_have_shapes():
     """No values, and no field that has its default."""
     g, c = cloud(3, degree=2), Camera(np.eye(4), np.eye(3), 16, 12)
@@ -108,7 +98,7 @@ def test_mistakes_are_named(tmp_path):
         convert_gaussians(g, N, "scene", "metres")
     for call in (save, write_ply):
         with pytest.raises(UsageError, match="units='scene' requires normalization="):
-            call(tmp_path / "a", g, units="scene")
+            call(tmp_path / "a", g)
         for scale, offset in ((0.0, [0, 0, 0]), (np.nan, [0, 0, 0]), (1.0, [0, 0]), (1.0, [0, 0, np.inf])):
             with pytest.raises(DataError, match="is not a similarity"):
                 call(tmp_path / "a", g, Normalization(np.array(offset), scale))

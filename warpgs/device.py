@@ -97,10 +97,14 @@ def in_background(function: Callable[..., T], arguments: Iterable[tuple[Any, ...
     jobs: list[Future[T]] = []
     threads = threads or max(2, min(MAX_THREADS, usable_cores()))
     with ThreadPoolExecutor(threads) as pool:
-        for own in arguments:
-            jobs.append(pool.submit(function, *own))
-            if len(jobs) > threads:
-                jobs[-threads].result()  # not all arguments in memory at once
+        try:
+            for own in arguments:
+                jobs.append(pool.submit(function, *own))
+                if len(jobs) > threads:
+                    jobs[-threads].result()  # not all arguments in memory at once
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
     return [j.result() for j in jobs]
 
 

@@ -308,7 +308,7 @@ def test_sog_in_a_folder(tmp_path):
     assert re.search(r"200 Gaussians in .*meta.json, \d+ KiB", lines[-1])
     assert len(read_gaussians(tmp_path / "other" / "meta.json")) == 200
     assert sog.SOG().size(path) == sum(map(len, files.values()))
-    for name in ("../a.sog", "folder/../meta.json", str(archive), "..", "", 3, "gone.webp", "a\\b.webp"):
+    for name in ("../a.sog", "folder/../meta.json", str(archive), "..", "", 3, "a\\b.webp"):
         meta = json.loads(files["meta.json"])
         meta["quats"]["files"][0] = name
         refused(
@@ -328,6 +328,23 @@ def test_sog_in_a_folder(tmp_path):
     with pytest.raises(ResourceError, match=r"sh0.webp: .*cannot be written"):
         write_gaussians(path, made, units="file")
     assert not path.exists()
+
+
+def test_sog_that_does_not_fit_on_the_disk_leaves_the_old_one(tmp_path):
+    """All images are on the disk before the first is replaced; a limit on the size of files stands for a full disk."""
+    resource = pytest.importorskip("resource", reason="Windows has no limit on the size of files")
+    path, limits = tmp_path / "meta.json", resource.getrlimit(resource.RLIMIT_FSIZE)
+    write_gaussians(path, model(200), units="file")
+    old = {p.name: p.read_bytes() for p in tmp_path.iterdir()}
+    resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, limits[1]))
+    try:
+        with pytest.raises(ResourceError, match=r"cannot be written.*the old file is untouched"):
+            write_gaussians(path, model(3000), units="file")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert {p.name: p.read_bytes() for p in tmp_path.iterdir()} == old
+    write_gaussians(path, model(3000), units="file")
+    assert len(read_gaussians(path)) == 3000
 
 
 @pytest.mark.parametrize("suffix", [s for s in SUFFIXES if s != ".ply"])

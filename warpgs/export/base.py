@@ -83,11 +83,6 @@ def side_file(path: Path) -> Path:
     return path.with_name(f"{path.name}.origin.json")
 
 
-def given_units(normalization: Normalization | None, units: str | None) -> str:
-    """Return the units of Gaussians to write: if None are given, those of the scene if there is a normalization, else file."""
-    return units or ("file" if normalization is None else "scene")
-
-
 def from_origin(gaussians: Gaussians, origin: np.ndarray, normalization: Normalization, units: str) -> Gaussians:
     """Return Gaussians in file units about an ``origin`` [3] in scene units, or in file units: float64 unless it is 0."""
     if units == "file" and origin.any():
@@ -545,7 +540,7 @@ def write_gaussians(
     gaussians: Gaussians,
     normalization: Normalization | None = None,
     *,
-    units: str | None = None,
+    units: str = "scene",
     format: str | type[Format] | Format | None = None,
     antialiased: bool = False,
 ) -> None:
@@ -557,7 +552,7 @@ def write_gaussians(
         path: The file; an existing one is replaced.
         gaussians: N Gaussians, on any device; at least one, except in a .ply file.
         normalization: Similarity from file to scene units; needed where ``units`` is scene.
-        units: Units of ``gaussians``: scene, or file to write them unchanged. None: scene with a normalization, file without.
+        units: Units of ``gaussians``: scene, or file to write them unchanged.
         format: Name of a format, or a `Format` of your own: an object, a class, ``module:Class`` or
             ``path/to/file.py:Class``. None for the format of the suffix.
         antialiased: True for Gaussians to be rendered with `RasterizeOptions.antialiased`. PLY, SPZ and SOG declare it.
@@ -573,7 +568,7 @@ def write_gaussians(
     """
     chosen = copy.copy(format_of(path, format))
     chosen.antialiased = antialiased
-    chosen.write(Path(path), gaussians, normalization, given_units(normalization, units))
+    chosen.write(Path(path), gaussians, normalization, units)
 
 
 def read_gaussians(

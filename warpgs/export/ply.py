@@ -346,8 +346,8 @@ _REST_COUNTS = (0, 9, 24, 45, 72)
 
 
 def write_ply(
-    path: str | os.PathLike[str], gaussians: Gaussians, normalization: Normalization | None = None, *,
-    units: str | None = None, antialiased: bool = False,
+    path: str | os.PathLike[str], gaussians: Gaussians, normalization: Normalization | None = None, *, units: str = "scene",
+    antialiased: bool = False,
 ) -> None:  # fmt: skip
     """Write Gaussians to a PLY file in the units of the scene's files.
 
@@ -362,7 +362,7 @@ def write_ply(
             [N], spherical harmonics [N, K, 3] with K in {1, 4, 9, 16, 25}.
         normalization: Similarity from file to scene units of the fitted scene, ``x_scene = scale * (x_file - offset)``;
             required if ``units`` is scene.
-        units: Units of ``gaussians``: scene, or file to write them unchanged. None: scene with a normalization, file without.
+        units: Units of ``gaussians``: scene, or file to write them unchanged.
         antialiased: True for Gaussians to be rendered with `RasterizeOptions.antialiased`; the header declares it.
 
     Raises:
@@ -373,7 +373,7 @@ def write_ply(
         warpgs.UsageError: The units are unknown, or scene units are given without a normalization.
         ValueError: A tensor has the wrong shape.
     """
-    _write(Path(path), gaussians, normalization, base.given_units(normalization, units), antialiased, None)
+    _write(Path(path), gaussians, normalization, units, antialiased, None)
 
 
 def _write(

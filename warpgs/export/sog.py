@@ -12,7 +12,7 @@ import os
 import struct
 import zipfile
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -20,7 +20,7 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from warpgs.export import base
-from warpgs.files import is_within, make_folder, read_file, remove_file, write_bytes
+from warpgs.files import is_within, make_folder, read_file, remove_file, replacing
 from warpgs.scene import ORIGIN
 
 META = "meta.json"
@@ -383,14 +383,17 @@ class SOG(base.Format):
         return encode(arrays, self.antialiased, self.origin)
 
     def store(self, path: Path, pieces: Iterable[bytes]) -> None:
-        """Write the archive, or its files into the folder of meta.json, which is removed first and written last."""
+        """Write the archive, or its files beside meta.json, which is removed once all are on the disk, and comes last."""
         if not is_unpacked(path):
             return super().store(path, pieces)
         make_folder(path.parent)
-        remove_file(path)
-        with zipfile.ZipFile(io.BytesIO(b"".join(pieces))) as archive:
-            for name in reversed(archive.namelist()):
-                write_bytes(path if name == META else path.with_name(name), archive.read(name))
+        with zipfile.ZipFile(io.BytesIO(b"".join(pieces))) as archive, ExitStack() as stack:
+            for name in archive.namelist():  # meta.json is the first, and so the last to be replaced
+                data, target = archive.read(name), path if name == META else path.with_name(name)
+                file, _ = stack.enter_context(replacing(target, size=len(data)))
+                file.write(data)
+                file.flush()
+            remove_file(path)
 
     def origin_in(self, path: Path) -> object:
         """Return the origin in meta.json."""

@@ -68,7 +68,7 @@ class CaptureReader(Reader):
         scene, views = SceneFolder(folder, options), ViewList(options)
         rows = self.rows(scene.inside(path))
         base = colmap.image_base(folder, folder) or "images"
-        _, found = colmap.add_views(scene, views, base, path, [name for name, *_ in rows], rows)
+        _, found = colmap.add_views(scene, views, base, path, [name for name, *_ in rows], rows, labels=True)
         points, said = _points(scene, path, views.views)
         pixels = scene.pixel_source(by_folder=True)
         return self.scene(folder, views.views, notes + found + said, points=points, pixels=pixels)
@@ -167,9 +167,12 @@ class MetashapeReader(CaptureReader):
 
     def rows(self, path: Path) -> list[Posed]:
         """See `CaptureReader.rows`."""
-        chunk = _xml(path).find("chunk")
-        if chunk is None:
-            raise DataError(f"{path}: has no chunk; {FIX}, as Agisoft XML")
+        chunks = [c for c in _xml(path).iterfind("chunk") if c.find("cameras//transform") is not None]
+        if len(chunks) != 1:
+            raise DataError(
+                f"{path}: has {len(chunks)} chunks with aligned cameras, not one; {FIX}, of one chunk, as Agisoft XML"
+            )
+        chunk = chunks[0]
         sensors = {s.get("id"): s for s in chunk.iterfind("sensors/sensor")}
         places = {c.get("id"): c.find("transform") for c in chunk.iterfind("components/component")}
         lenses, rows = dict[str | None, Lens](), list[Posed]()

@@ -482,9 +482,9 @@ def _image_paths(
 
 
 def add_views(
-    scene: SceneFolder, views: ViewList, base: str, file: Path, names: list[str], rows: Sequence[Posed]
+    scene: SceneFolder, views: ViewList, base: str, file: Path, names: list[str], rows: Sequence[Posed], labels: bool = False
 ) -> tuple[dict[str, str], list[str]]:
-    """Add the views of the rows of a file whose images are in the folder ``base``.
+    """Add the views of the rows of a file whose images are in the folder ``base``; ``labels`` may lack their suffix.
 
     Returns the names of the views by ``names``, which are all in the file, also of cameras without a row, and notes.
     """
@@ -497,7 +497,7 @@ def add_views(
     named: dict[str, str] = {}
     for name, lens, viewmat in rows:
         path = paths[name]
-        of_file = scenes.is_absolute(name) or path.stem == PurePosixPath(name).name or not PurePosixPath(name).suffix
+        of_file = scenes.is_absolute(name) or labels
         view = scenes.view_name(path.relative_to(images).as_posix() if of_file and images in path.parents else name)
         if options.excludes(view):
             continue

@@ -179,7 +179,7 @@ def _encode_vp9(path: Path, temporary: str, frames: Iterator[np.ndarray], fps: i
     film = _vp9(path, temporary, fps, first, packets_as_they_are)
 
     def encode(name: str, part: list[np.ndarray]) -> str:
-        encoder = _vp9(path, name, fps, first)
+        encoder = _vp9(Path(name), name, fps, first)
         for pixels in part:
             encoder.write(np.ascontiguousarray(pixels[..., ::-1]))
         encoder.release()
