@@ -169,9 +169,7 @@ class MetashapeReader(CaptureReader):
         """See `CaptureReader.rows`."""
         chunks = [c for c in _xml(path).iterfind("chunk") if c.find("cameras//transform") is not None]
         if len(chunks) != 1:
-            raise DataError(
-                f"{path}: has {len(chunks)} chunks with aligned cameras, not one; {FIX}, of one chunk, as Agisoft XML"
-            )
+            raise DataError(f"{path}: has {len(chunks)} chunks with aligned cameras, not one; {FIX}, as Agisoft XML")
         chunk = chunks[0]
         sensors = {s.get("id"): s for s in chunk.iterfind("sensors/sensor")}
         places = {c.get("id"): c.find("transform") for c in chunk.iterfind("components/component")}
