@@ -408,3 +408,19 @@ def test_picks_that_cannot_be_honoured(run, capsys, kind):
     error = capsys.readouterr().err
     assert len(error.splitlines()) == 1 and re.search(message, error), error
     assert {p: p.read_bytes() for p in run.rglob("*") if p.is_file()} == before
+
+
+def test_a_wavy_surface_is_averaged_and_another_one_left_out():
+    """A slanted plane with waves beside a step: its depth at the step and in its middle, where single pixels are off by 1 %."""
+    y, x = np.mgrid[0:360, 0:480]
+    plane = 1 / (0.2 + 7e-5 * x - 4e-5 * y)
+    depth = plane * (1 + 0.01 * np.sin(0.6 * x) * np.cos(0.7 * y))
+    depth[:, 270:] *= 1.5
+    depth[150, 180] *= 1.02
+    depth[0, 0] = np.inf  # background
+    for row, column in ((150, 180), (121, 269), (9, 7), (359, 91), (181, 270)):
+        z, spread = level.plane_depth(depth, row, column)
+        true = plane[row, column] * (1.5 if column >= 270 else 1)
+        assert abs(z / true - 1) < 3e-3 and 3e-3 < spread / true < 1e-2
+    alone = np.where(np.arange(4 * 9).reshape(4, 9) == 13, 2.0, np.inf)
+    assert level.plane_depth(alone, 1, 4) == (2.0, 0.0)
