@@ -202,21 +202,28 @@ add("SOG", ".sog", SOG, (sog_member, sog_member, rarely(sog_image, rarely(mutati
 
 
 def sog_folder(root: Path) -> list[Path]:
-    base.write_gaussians(root / "meta.json", cloud(5), units="file")
+    base.write_gaussians(root / "meta.json", cloud(5), units="file", antialiased=True)
     return sorted(root.iterdir())
 
 
 def sog_part(data: bytes, rng: np.random.Generator) -> bytes:
-    """Change a file of a folder: values of meta.json, or the bytes of an image, or put another one in its place."""
+    """Change a file of a folder: values of meta.json, half of them outside codebooks, or an image, or put another one there."""
     if data[:1] == b"{":
-        return json_value(data, rng)
+        try:
+            meta = json.loads(data)
+            key = sorted(meta)[int(rng.integers(len(meta)))]
+        except ValueError:  # changed before
+            return damage(data, rng)
+        other = json.dumps(meta | {key: (-1, 10**9, "x", None, [], {})[int(rng.integers(6))]}).encode()
+        return other if rng.random() < 0.5 else json_value(data, rng)
     return mutations.large_webp() if rng.random() < 0.02 else damage(data, rng)
 
 
 register(
     Target(
         "SOG folder", sog_folder, lambda root, path: base.read_gaussians(root / "meta.json"),
-        (*SOG, sog._beside, sog._members, gaussians_of), (sog_part, sog_part, text_number), None, nonsense,
+        (*(f for f in SOG if f is not sog._member), sog._beside, gaussians_of), (sog_part, sog_part, text_number), None,
+        nonsense, lines=0.85,  # meta.json is one of six files
     )
 )  # fmt: skip
 
