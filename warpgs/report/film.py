@@ -6,7 +6,6 @@ import io
 import itertools
 import os
 import shutil
-import tempfile
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
@@ -16,6 +15,7 @@ from PIL import Image
 from warpgs.device import in_background, usable_cores
 from warpgs.errors import DataError, ResourceError, UsageError
 from warpgs.files import replacing, write_bytes
+from warpgs.folders import temporary_folder
 from warpgs.process import fed_program, hidden_stderr, run_program, utf8_name
 
 ANIMATIONS = (".webp", ".gif")
@@ -185,7 +185,7 @@ def _encode_vp9(path: Path, temporary: str, frames: Iterator[np.ndarray], fps: i
         encoder.release()
         return name
 
-    with tempfile.TemporaryDirectory() as made, utf8_name(Path(made)) as folder:
+    with temporary_folder() as made, utf8_name(made.path) as folder:
         parts = iter(lambda: list(itertools.islice(frames, size)), [])
         names = in_background(encode, ((f"{folder}/{i}.mp4", p) for i, p in enumerate(parts)), threads)
         for name in names:
