@@ -7,7 +7,7 @@ import warp as wp
 
 from warpgs.constants import SMALLEST_WEIGHT
 from warpgs.kernels.falloff import ABREAST, BATCH, COLORS, STRIP, TOGETHER, VALUES, make_batches, make_functions, make_records
-from warpgs.kernels.native import ROLLED, make_prefetch
+from warpgs.kernels.native import ROLLED, IntRows, Ints, make_prefetch
 
 # The backward blending kernel in plain Warp, one task per tile; used on the CPU, and for float64 on every device.
 #
@@ -22,6 +22,7 @@ def make_backward(real, tile_size: int, channels: int, absgrad: bool = False, de
     f = make_functions(real)
     r = make_records(real, tile_size, channels, absgrad)
     b = make_batches(real, tile_size, channels)
+    Reals, Rows = wp.array(dtype=real), wp.array2d(dtype=real)
     at, at_int = b.at, b.at_int
     count = VALUES + channels - COLORS + 2 * absgrad
     values, together_values = count, TOGETHER * count
@@ -41,13 +42,13 @@ def make_backward(real, tile_size: int, channels: int, absgrad: bool = False, de
     apart, touches = spacing, -(-(tile_size - 1) // spacing) + 1
 
     @wp.func(inline=True)
-    def load_channels(o: wp.int32, p: wp.int32, v_rgb: wp.array(dtype=real), pixels: wp.ref[r.Pixels]):
+    def load_channels(o: wp.int32, p: wp.int32, v_rgb: Reals, pixels: wp.ref[r.Pixels]):
         """Load the upstream gradient of a pixel's channels, whose first has the index ``o``."""
         for c in range(wp.static(channels)):
             pixels.g[c * stride + p] = v_rgb[o + c]
 
     @wp.func(inline=True)
-    def behind_of(p: wp.int32, camera: wp.int32, backgrounds: wp.array2d(dtype=real), pixels: wp.ref[r.Pixels]) -> real:
+    def behind_of(p: wp.int32, camera: wp.int32, backgrounds: Rows, pixels: wp.ref[r.Pixels]) -> real:
         """Return the product of a pixel's upstream gradient with the background."""
         product = backgrounds[camera, 0] * at(pixels.g[p])
         for c in range(1, wp.static(channels)):
@@ -56,9 +57,8 @@ def make_backward(real, tile_size: int, channels: int, absgrad: bool = False, de
 
     @wp.func(inline=True)
     def load_depth(
-        o: wp.int32, p: wp.int32, weights: wp.array(dtype=real), depth: wp.array(dtype=real), v_alpha: wp.array(dtype=real),
-        v_depth: wp.array(dtype=real), pixels: wp.ref[r.Pixels],
-    ):  # fmt: skip
+        o: wp.int32, p: wp.int32, weights: Reals, depth: Reals, v_alpha: Reals, v_depth: Reals, pixels: wp.ref[r.Pixels]
+    ):
         """Load what the gradients of depth and alpha add to the effect of a Gaussian on a pixel."""
         if wp.static(deep):
             v_w = real(0.0)
@@ -70,10 +70,9 @@ def make_backward(real, tile_size: int, channels: int, absgrad: bool = False, de
 
     @wp.func(inline=True)
     def load_pixels(
-        place: wp.vec3i, settings: f.Blending, backgrounds: wp.array2d(dtype=real), transmittances: wp.array(dtype=real),
-        weights: wp.array(dtype=real), depth: wp.array(dtype=real), ends: wp.array(dtype=int),
-        v_rgb: wp.array(dtype=real), pitch: wp.int32, v_alpha: wp.array(dtype=real), v_depth: wp.array(dtype=real),
-        pixels: wp.ref[r.Pixels], until: wp.ref[b.strip_ints],
+        place: wp.vec3i, settings: f.Blending, backgrounds: Rows, transmittances: Reals, weights: Reals, depth: Reals,
+        ends: Ints, v_rgb: Reals, pitch: wp.int32, v_alpha: Reals, v_depth: Reals, pixels: wp.ref[r.Pixels],
+        until: wp.ref[b.strip_ints],
     ) -> wp.int32:  # fmt: skip
         """Load the pixels, and for each strip one past the last instance that it blended; return the largest of these."""
         camera = place[0]
@@ -249,7 +248,7 @@ def make_backward(real, tile_size: int, channels: int, absgrad: bool = False, de
             held.totals[n] = (at(held.halves[o]) + at(held.halves[o + 2])) + (at(held.halves[o + 1]) + at(held.halves[o + 3]))
 
     @wp.func(inline=True)
-    def store(j: wp.int32, g: wp.ref[b.Batch], held: wp.ref[r.Held], slot: wp.int32, v_slots: wp.array2d(dtype=real)):
+    def store(j: wp.int32, g: wp.ref[b.Batch], held: wp.ref[r.Held], slot: wp.int32, v_slots: Rows):
         """Store the gradient of an instance: the sums times factors that they share."""
         o = (j & group_bits) * values
         u11 = at(g.u11[j])
@@ -273,13 +272,11 @@ def make_backward(real, tile_size: int, channels: int, absgrad: bool = False, de
 
     @wp.kernel(enable_backward=False, module="unique", module_options=ROLLED)
     def backward(
-        begin: int, settings: f.Blending, projected: wp.array(dtype=b.record), ranges: wp.array2d(dtype=int),
-        gaussian_ids: wp.array(dtype=int), slots: wp.array(dtype=int), backgrounds: wp.array2d(dtype=real),
-        transmittances: wp.array(dtype=real), weights: wp.array(dtype=real), depth: wp.array(dtype=real),
-        ends: wp.array(dtype=int), v_rgb: wp.array(dtype=real), pitch: int,
-        v_alpha: wp.array(dtype=real), v_depth: wp.array(dtype=real),
+        begin: int, settings: f.Blending, projected: wp.array(dtype=b.record), ranges: IntRows, gaussian_ids: Ints, slots: Ints,
+        backgrounds: Rows, transmittances: Reals, weights: Reals, depth: Reals, ends: Ints, v_rgb: Reals, pitch: int,
+        v_alpha: Reals, v_depth: Reals,
         # outputs, zero on entry
-        v_slots: wp.array2d(dtype=real),
+        v_slots: Rows,
     ):  # fmt: skip
         tile = ranges.shape[0] - 1 - begin - wp.tid()  # from the last on, as the instances
         place = f.place_of(tile, side, settings)
@@ -363,6 +360,7 @@ def make_forward(real, tile_size: int, channels: int):
     strip, parts, abreast = STRIP, tile_size // STRIP, ABREAST
     batch, bits, together = FORWARD_BATCH, FORWARD_BATCH - 1, FORWARD_TOGETHER
     outside, smallest = real(-1.0), real(SMALLEST_WEIGHT)
+    Reals, Rows = wp.array(dtype=real), wp.array2d(dtype=real)
 
     # Loops over channels have a static length and are unrolled, so they are kept apart from loops that must stay rolled.
     @wp.func(inline=True)
@@ -395,9 +393,7 @@ def make_forward(real, tile_size: int, channels: int):
             strip_sums[2 * c * strip + lane] = at(strip_sums[2 * c * strip + lane]) + w * at(color[c * batch + j])
 
     @wp.func(inline=True)
-    def add_background(
-        camera: wp.int32, p: wp.int32, t: real, backgrounds: wp.array2d(dtype=real), sums: wp.ref[tile_channels]
-    ):
+    def add_background(camera: wp.int32, p: wp.int32, t: real, backgrounds: Rows, sums: wp.ref[tile_channels]):
         """Add the background to the sums of a pixel."""
         for c in range(wp.static(channels)):
             sums[c * tile_stride + p] = at(sums[c * tile_stride + p]) + t * backgrounds[camera, c]
@@ -409,18 +405,17 @@ def make_forward(real, tile_size: int, channels: int):
             joined[p * per_pixel + c] = at(sums[c * tile_stride + p])
 
     @wp.func(inline=True)
-    def store_channels(o: wp.int32, p: wp.int32, joined: wp.ref[tile_channels], rgb: wp.array(dtype=real)):
+    def store_channels(o: wp.int32, p: wp.int32, joined: wp.ref[tile_channels], rgb: Reals):
         """Store the channels of a pixel, whose first has the index ``o``."""
         for c in range(wp.static(channels)):
             rgb[o + c] = at(joined[p * per_pixel + c])
 
     @wp.kernel(enable_backward=False, module="unique", module_options=ROLLED)
     def forward(
-        begin: int, settings: f.Blending, projected: wp.array(dtype=record), ranges: wp.array2d(dtype=int),
-        gaussian_ids: wp.array(dtype=int), backgrounds: wp.array2d(dtype=real),
+        begin: int, settings: f.Blending, projected: wp.array(dtype=record), ranges: IntRows, gaussian_ids: Ints,
+        backgrounds: Rows,
         # outputs, and the distance of pixels in the first
-        rgb: wp.array(dtype=real), pitch: int, alpha_out: wp.array(dtype=real), depth: wp.array(dtype=real),
-        transmittances: wp.array(dtype=real), weights: wp.array(dtype=real), ends: wp.array(dtype=int),
+        rgb: Reals, pitch: int, alpha_out: Reals, depth: Reals, transmittances: Reals, weights: Reals, ends: Ints,
     ):  # fmt: skip
         tile = begin + wp.tid()
         place = f.place_of(tile, side, settings)

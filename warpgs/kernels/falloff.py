@@ -10,6 +10,7 @@ from warp.types import vector
 
 from warpgs.constants import TILE_SIZE, Rule
 from warpgs.kernels import sh
+from warpgs.kernels.native import Ints
 from warpgs.kernels.tiles import grid
 
 
@@ -264,8 +265,8 @@ def make_batches(real, tile_size: int, channels: int):
 
     @wp.func(inline=True)
     def load(
-        projected: wp.array(dtype=record), gaussian_ids: wp.array(dtype=int), last: wp.int32, count: wp.int32,
-        whole_tiles: wp.int32, b: wp.ref[Batch],
+        projected: wp.array(dtype=record), gaussian_ids: Ints, last: wp.int32, count: wp.int32, whole_tiles: wp.int32,
+        b: wp.ref[Batch],
     ):  # fmt: skip
         """Load the Gaussians of ``count`` instances, from the last on backwards."""
         j = int(0)

@@ -15,7 +15,7 @@ import torch
 import warp as wp
 
 from warpgs.kernels import launch
-from warpgs.kernels.native import cuda_kernel, source
+from warpgs.kernels.native import Floats, cuda_kernel, source
 
 MAX_GRAPHS = 8
 """Largest number of graphs of a function, one for each set of addresses; a loop that keeps its last result alternates between
@@ -124,7 +124,7 @@ def make_fetch():
     """Make the kernel of `fetch`."""
 
     @cuda_kernel(source("allocator_fetch.cu"), "begin + wp.tid()", "warpgs.runtime.allocator.fetch")
-    def fetch(item: int, table: wp.uint64, first: int, second: int, out: wp.array(dtype=float)): ...
+    def fetch(item: int, table: wp.uint64, first: int, second: int, out: Floats): ...
 
     return fetch
 

@@ -27,6 +27,12 @@ FOLDER = importlib.resources.files("warpgs") / "kernels" / "cuda"
 """Folder of the files."""
 
 
+Ints, IntRows = wp.array(dtype=int), wp.array2d(dtype=int)
+Floats, FloatRows = wp.array(dtype=float), wp.array2d(dtype=float)
+Longs = wp.array(dtype=wp.int64)
+"""Arguments of kernels: arrays of numbers, and tables of them."""
+
+
 def source(name: str, **numbers: object) -> str:
     """Return the CUDA text of a file of `FOLDER`, with its includes, and names in capitals replaced by ``numbers``."""
     text = re.sub(r'^#include "([\w.]+)"\n', lambda found: source(found[1]), (FOLDER / name).read_text("utf-8"), flags=re.M)
@@ -95,7 +101,7 @@ def make_functions():
         """
 
     @wp.func_native(source("native_store_row.cu"))
-    def store_row(records: wp.array2d(dtype=float), i: int, v: vec12):
+    def store_row(records: FloatRows, i: int, v: vec12):
         """Write row i of an array of rows of 12 floats, 16-byte aligned."""
 
     @wp.func_native(source("native_clear_rows.cu", BLOCK=BLOCK))

@@ -8,6 +8,7 @@ import torch
 import warp as wp
 
 from warpgs.kernels import launch
+from warpgs.kernels.native import FloatRows, Floats, Ints
 
 BOX = 32
 """Number of points in a box, and of boxes in a box of the next level; the highest level has at most this number of boxes. A
@@ -56,8 +57,8 @@ def make_knn_kernels(real):
 
     @wp.kernel(enable_backward=False, module=f"warpgs.kernels.knn.{real.__name__}")
     def search(
-        begin: int, points: wp.array(dtype=vec3), lower: wp.array(dtype=vec3), upper: wp.array(dtype=vec3),
-        starts: wp.array(dtype=int), k: int,
+        begin: int, points: wp.array(dtype=vec3), lower: wp.array(dtype=vec3), upper: wp.array(dtype=vec3), starts: Ints,
+        k: int,
         # outputs
         mean_squares: wp.array(dtype=real),
     ):  # fmt: skip
@@ -158,7 +159,7 @@ def make_reach_kernel():
     def bound(
         begin: int, means: wp.array(dtype=wp.vec3), centers: wp.array(dtype=wp.vec3), fraction: float,
         # outputs
-        log_sizes: wp.array(dtype=float),
+        log_sizes: Floats,
     ):  # fmt: skip
         i = begin + wp.tid()
         nearest = wp.length_sq(means[i] - centers[0])
@@ -195,9 +196,9 @@ def make_pixel_kernel():
 
     @wp.kernel(enable_backward=False, module="warpgs.kernels.pixel_size")
     def bound(
-        begin: int, means: wp.array(dtype=wp.vec3), cameras: wp.array2d(dtype=float), fraction: float,
+        begin: int, means: wp.array(dtype=wp.vec3), cameras: FloatRows, fraction: float,
         # outputs
-        log_sizes: wp.array(dtype=float),
+        log_sizes: Floats,
     ):  # fmt: skip
         i = begin + wp.tid()
         smallest = float(wp.inf)

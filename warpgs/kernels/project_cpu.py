@@ -9,12 +9,10 @@ from warpgs.constants import LARGEST_COEFFICIENT
 from warpgs.kernels import ellipse, sh
 from warpgs.kernels.cameras import types_of
 from warpgs.kernels.ellipse import PROJECTED_SIZE, arrays_of, make_projection, make_spans
-from warpgs.kernels.native import EXACT
+from warpgs.kernels.native import EXACT, Ints
 
 LANES = 16
 """Gaussians of a task."""
-
-Ints = wp.array(dtype=int)
 
 
 @functools.cache

@@ -8,9 +8,7 @@ from warpgs.constants import LARGEST_COEFFICIENT
 from warpgs.kernels import ellipse, sh
 from warpgs.kernels.cameras import types_of
 from warpgs.kernels.ellipse import PROJECTED_SIZE, arrays_of, make_projection, make_spans
-from warpgs.kernels.native import make_color, make_functions as make_native
-
-Ints = wp.array(dtype=int)
+from warpgs.kernels.native import Ints, make_color, make_functions as make_native
 
 
 def _module(kind: str, real, camera_model: str, parameters: str, antialiased: bool, bases: int) -> str:

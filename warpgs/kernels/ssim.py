@@ -10,7 +10,7 @@ import warp as wp
 from warpgs.device import FLOAT, StepSizes
 from warpgs.kernels import launch
 from warpgs.kernels.launch import first_order, keep, kept
-from warpgs.kernels.native import ROLLED, cuda_kernel, make_prefetch, source
+from warpgs.kernels.native import ROLLED, Floats, cuda_kernel, make_prefetch, source
 
 RADIUS = 5
 """Half size of the window [px]."""
@@ -46,6 +46,7 @@ def make_functions(real):
     w0, w1, w2, w3, w4, w5 = (real(w) for w in WINDOW[RADIUS:])
     vec6 = wp.types.vector(6, real)
     channels = CHANNELS
+    Reals = wp.array(dtype=real)
 
     @wp.func
     def tap(k: wp.int32) -> real:
@@ -63,7 +64,7 @@ def make_functions(real):
         return wp.max(first, 0) + lane
 
     @wp.func
-    def across(m: wp.array(dtype=real), first: wp.int32, lane: wp.int32) -> real:
+    def across(m: Reals, first: wp.int32, lane: wp.int32) -> real:
         """Return the weighted sum over the columns of the window; ``first`` + ``lane`` is the leftmost column."""
         o = at(first, lane)
         s = w5 * (m[o] + m[o + 10 * channels])
@@ -118,6 +119,7 @@ def make_kernels(real, summed: bool):
     vec11i = wp.types.vector(TAPS, wp.int32)
     values = wp.types.vector(LANES, real)
     several = wp.types.vector(5 * LANES, real)
+    Reals = wp.array(dtype=real)
     prefetch = make_prefetch(real)
     kernel = functools.partial(wp.kernel, enable_backward=False, module="unique", module_options=ROLLED)
 
@@ -138,7 +140,7 @@ def make_kernels(real, summed: bool):
         return w
 
     @wp.func
-    def clear_padding(scratch: wp.array(dtype=real), first: wp.int32, columns: wp.int32, rows: wp.int32):
+    def clear_padding(scratch: Reals, first: wp.int32, columns: wp.int32, rows: wp.int32):
         for row in range(rows):
             o = first + row * (columns + 2 * PADDING)
             for k in range(PADDING):
@@ -148,9 +150,7 @@ def make_kernels(real, summed: bool):
     # Warp unrolls loops that hold a `wp.static`: inside the loop over lanes, they would keep the latter from vectorising.
 
     @wp.func
-    def down_pairs(
-        a: wp.array(dtype=real), b: wp.array(dtype=real), o: vec11i, w: vec11, x: wp.int32, lane: wp.int32
-    ) -> f.vec5:
+    def down_pairs(a: Reals, b: Reals, o: vec11i, w: vec11, x: wp.int32, lane: wp.int32) -> f.vec5:
         s = f.vec5()
         for k in range(TAPS):
             s = f.add_pair(s, w[wp.static(k)], a[f.at(o[k] + x, lane)], b[f.at(o[k] + x, lane)])
@@ -162,7 +162,7 @@ def make_kernels(real, summed: bool):
             sums[k * LANES + lane] = s[k]
 
     @wp.func
-    def down(m: wp.array(dtype=real), o: vec11i, w: vec11, x: wp.int32, lane: wp.int32) -> real:
+    def down(m: Reals, o: vec11i, w: vec11, x: wp.int32, lane: wp.int32) -> real:
         s = w[0] * m[f.at(o[0] + x, lane)]
         for k in range(1, TAPS):
             s += w[wp.static(k)] * m[f.at(o[k] + x, lane)]
@@ -170,11 +170,9 @@ def make_kernels(real, summed: bool):
 
     @kernel
     def forward(
-        begin: int, a: wp.array(dtype=real), b: wp.array(dtype=real), height: int, blocks: int, columns: int,
-        scratch: wp.array(dtype=real),
+        begin: int, a: Reals, b: Reals, height: int, blocks: int, columns: int, scratch: Reals,
         # outputs: the similarity, or per task the sums of 1 - similarity and of |a - b|; the partials
-        result: wp.array(dtype=real), by_mean: wp.array(dtype=real), by_variance: wp.array(dtype=real),
-        by_gap: wp.array(dtype=real),
+        result: Reals, by_mean: Reals, by_variance: Reals, by_gap: Reals,
     ):  # fmt: skip
         task = begin + wp.tid()
         image = task // blocks
@@ -229,11 +227,10 @@ def make_kernels(real, summed: bool):
 
     @kernel
     def backward(
-        begin: int, a: wp.array(dtype=real), b: wp.array(dtype=real), by_mean: wp.array(dtype=real),
-        by_variance: wp.array(dtype=real), by_gap: wp.array(dtype=real), v_result: wp.array(dtype=real),
-        height: int, blocks: int, columns: int, scratch: wp.array(dtype=real),
+        begin: int, a: Reals, b: Reals, by_mean: Reals, by_variance: Reals, by_gap: Reals, v_result: Reals, height: int,
+        blocks: int, columns: int, scratch: Reals,
         # outputs
-        v_a: wp.array(dtype=real),
+        v_a: Reals,
     ):  # fmt: skip
         task = begin + wp.tid()
         image = task // blocks
@@ -290,19 +287,17 @@ def make_cuda_kernels():
 
     @cuda_kernel(source("ssim_forward.cu", **numbers), block, module)
     def forward(
-        block: int, a: wp.array(dtype=float), b: wp.array(dtype=float), height: int, columns: int, summed: int,
+        block: int, a: Floats, b: Floats, height: int, columns: int, summed: int,
         # outputs: the similarities, or two sums per block; and the partials by mean, variance and gap
-        result: wp.array(dtype=float), by_mean: wp.array(dtype=float), by_variance: wp.array(dtype=float),
-        by_gap: wp.array(dtype=float),
+        result: Floats, by_mean: Floats, by_variance: Floats, by_gap: Floats,
     ): ...  # fmt: skip
 
     @cuda_kernel(source("ssim_backward.cu", **numbers), block, module)
     def backward(
-        block: int, a: wp.array(dtype=float), b: wp.array(dtype=float), v_result: wp.array(dtype=float),
-        by_mean: wp.array(dtype=float), by_variance: wp.array(dtype=float), by_gap: wp.array(dtype=float),
-        height: int, columns: int, summed: int,
+        block: int, a: Floats, b: Floats, v_result: Floats, by_mean: Floats, by_variance: Floats, by_gap: Floats, height: int,
+        columns: int, summed: int,
         # outputs
-        v_a: wp.array(dtype=float),
+        v_a: Floats,
     ): ...  # fmt: skip
 
     return SimpleNamespace(forward=forward, backward=backward)

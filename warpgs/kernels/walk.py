@@ -10,7 +10,7 @@ from warpgs.kernels import blend_cuda, launch
 from warpgs.kernels.blend import check_slots, composite, is_native, make_segments
 from warpgs.kernels.ellipse import PROJECTED_SIZE
 from warpgs.kernels.falloff import ABREAST, STRIP, TOGETHER, Pass, make_functions, make_struct
-from warpgs.kernels.native import ROLLED, SCALE, cuda_kernel, make_prefetch, source
+from warpgs.kernels.native import ROLLED, SCALE, Floats, IntRows, Ints, cuda_kernel, make_prefetch, source
 from warpgs.kernels.tiles import Tiles
 
 # These are separate passes, so that `blend` does not become slower. Alpha comes from the same operations as in `blend`, so that
@@ -21,6 +21,7 @@ from warpgs.kernels.tiles import Tiles
 def make_walk(real, tile_size: int, make_visit):
     """Make the generic kernel, one task per tile; it calls a visitor for each blended (Gaussian, pixel)."""
     f, visit = make_functions(real), make_visit(real)
+    Reals, Rows = wp.array(dtype=real), wp.array2d(dtype=real)
     tile_reals = wp.types.vector(tile_size * (tile_size + 1), real)
     strip_reals = wp.types.vector(STRIP, real)
     side = tile_size
@@ -29,10 +30,9 @@ def make_walk(real, tile_size: int, make_visit):
 
     @wp.kernel(enable_backward=False, module="unique", module_options=ROLLED)
     def walk(
-        begin: int, settings: f.Blending, projected: wp.array2d(dtype=real), ranges: wp.array2d(dtype=int),
-        gaussian_ids: wp.array(dtype=int), per_camera: int, k: int,
+        begin: int, settings: f.Blending, projected: Rows, ranges: IntRows, gaussian_ids: Ints, per_camera: int, k: int,
         # outputs of the visitor
-        reals: wp.array(dtype=real), ids: wp.array(dtype=int), counts: wp.array(dtype=int),
+        reals: Reals, ids: Ints, counts: Ints,
     ):  # fmt: skip
         tile = begin + wp.tid()
         place = f.place_of(tile, side, settings)
@@ -93,12 +93,12 @@ def make_walk(real, tile_size: int, make_visit):
 @functools.cache
 def make_median(real):
     """Make the visitor that writes the depth at which a pixel has lost half of its light, and finishes the pixel there."""
+    Reals = wp.array(dtype=real)
 
     @wp.func(inline=True)
     def visit(
-        pixel: int, i: int, weight: real, after: real, depth: real, k: int,
-        depths: wp.array(dtype=real), ids: wp.array(dtype=int), counts: wp.array(dtype=int),
-    ) -> bool:  # fmt: skip
+        pixel: int, i: int, weight: real, after: real, depth: real, k: int, depths: Reals, ids: Ints, counts: Ints
+    ) -> bool:
         if after <= real(0.5):
             depths[pixel] = depth
         return after <= real(0.5)
@@ -109,12 +109,12 @@ def make_median(real):
 @functools.cache
 def make_heaviest(real):
     """Make the visitor that puts a Gaussian into its pixel's sorted list of k, behind those of equal weight."""
+    Reals = wp.array(dtype=real)
 
     @wp.func(inline=True)
     def visit(
-        pixel: int, i: int, weight: real, after: real, depth: real, k: int,
-        weights: wp.array(dtype=real), ids: wp.array(dtype=int), counts: wp.array(dtype=int),
-    ) -> bool:  # fmt: skip
+        pixel: int, i: int, weight: real, after: real, depth: real, k: int, weights: Reals, ids: Ints, counts: Ints
+    ) -> bool:
         counts[pixel] += 1
         first = pixel * k
         if weight > weights[first + k - 1]:
@@ -133,7 +133,7 @@ def make_heaviest(real):
 @functools.cache
 def make_weights(real, tile_size: int):
     """Make the kernel of `contributions`, one task per tile; its loops over a strip have no branch, so that they vectorise."""
-    f = make_functions(real)
+    f, Rows = make_functions(real), wp.array2d(dtype=real)
     tile_reals = wp.types.vector(tile_size * (tile_size + 1), real)
     strip_reals = wp.types.vector(STRIP, real)
     prefetch, ahead = make_prefetch(real, 2), TOGETHER
@@ -142,10 +142,9 @@ def make_weights(real, tile_size: int):
 
     @wp.kernel(enable_backward=False, module="unique", module_options=ROLLED)
     def weigh(
-        begin: int, settings: f.Blending, projected: wp.array2d(dtype=real), ranges: wp.array2d(dtype=int),
-        gaussian_ids: wp.array(dtype=int), slots: wp.array(dtype=int),
+        begin: int, settings: f.Blending, projected: Rows, ranges: IntRows, gaussian_ids: Ints, slots: Ints,
         # outputs: sum and maximum of each instance
-        weights: wp.array2d(dtype=real),
+        weights: Rows,
     ):  # fmt: skip
         tile = begin + wp.tid()
         place = f.place_of(tile, side, settings)
@@ -247,18 +246,16 @@ def make_native(tile_size: int):
 
     @cuda_kernel(source("median_depth.cu", **numbers), tile, f"warpgs.kernels.median_depth.{tile_size}")
     def median(
-        tile: int, settings: Blending, projected: wp.array(dtype=float), ranges: wp.array(dtype=int),
-        gaussian_ids: wp.array(dtype=int),
+        tile: int, settings: Blending, projected: Floats, ranges: Ints, gaussian_ids: Ints,
         # outputs
-        depths: wp.array(dtype=float),
+        depths: Floats,
     ): ...  # fmt: skip
 
     @cuda_kernel(source("heaviest.cu", **numbers), tile, f"warpgs.kernels.heaviest.{tile_size}")
     def heaviest(
-        tile: int, settings: Blending, projected: wp.array(dtype=float), ranges: wp.array(dtype=int),
-        gaussian_ids: wp.array(dtype=int), per_camera: int, k: int,
+        tile: int, settings: Blending, projected: Floats, ranges: Ints, gaussian_ids: Ints, per_camera: int, k: int,
         # outputs
-        weights: wp.array(dtype=float), ids: wp.array(dtype=int), counts: wp.array(dtype=int),
+        weights: Floats, ids: Ints, counts: Ints,
     ): ...  # fmt: skip
 
     return SimpleNamespace(median=median, heaviest=heaviest)

@@ -14,6 +14,7 @@ import torch
 import warp as wp
 
 from warpgs.kernels import launch
+from warpgs.kernels.native import Floats
 from warpgs.kernels.update import Setting
 from warpgs.pipeline.model.table import DensityUpdate
 from warpgs.pipeline.train.strategies.base import Growth, Strategy, register
@@ -77,8 +78,8 @@ def make_kernel() -> wp.Kernel:
 
     @wp.kernel(enable_backward=False, module="warpgs.pipeline.train.strategies.mcmc")
     def perturb(
-        begin: int, settings: wp.array(dtype=float), seed: int, noise_lr: float, going: wp.array(dtype=wp.bool),
-        quats: wp.array(dtype=wp.vec4), log_scales: wp.array(dtype=wp.vec3), logits: wp.array(dtype=float),
+        begin: int, settings: Floats, seed: int, noise_lr: float, going: wp.array(dtype=wp.bool),
+        quats: wp.array(dtype=wp.vec4), log_scales: wp.array(dtype=wp.vec3), logits: Floats,
         # outputs
         means: wp.array(dtype=wp.vec3),
     ):  # fmt: skip
