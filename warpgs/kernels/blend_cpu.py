@@ -302,7 +302,7 @@ def make_backward(real, tile_size: int, channels: int, absgrad: bool = False, de
                 prefetch_value(v_rgb, (o + part * apart) * pitch)
         while last > first:
             count = wp.min(batch, last - first)
-            b.load(projected, gaussian_ids, last - 1, count, settings.whole_tiles, gaussians)
+            b.load(projected, gaussian_ids, last - 1, -1, count, settings.whole_tiles, gaussians)
             b.find_rows(left, top, last - 1, count, until, gaussians)
             j = int(0)
             while j < count:
@@ -330,50 +330,32 @@ def make_backward(real, tile_size: int, channels: int, absgrad: bool = False, de
 # A task cuts the rows of its tile into strips. The innermost loops run over the pixels of one strip without branches
 # and are kept rolled, so that the compiler vectorises them (docs/blend.md, section 5).
 
-FORWARD_BATCH = 64
-"""Gaussians that the forward pass processes at a time, strip by strip; a power of 2, since BATCH - 1 masks indices."""
-FORWARD_TOGETHER = 16
-"""Gaussians of a batch that are tested together, in a loop that vectorises; divides `FORWARD_BATCH`."""
-
 
 @functools.cache
 def make_forward(real, tile_size: int, channels: int):
     """Make the forward kernel for one scalar type, tile size and number of channels."""
-    f = make_functions(real)
+    f, b = make_functions(real), make_batches(real, tile_size, channels)
     # Vectors rather than local arrays: the compiler must see that they do not overlap. They are one row longer than
     # the tile, so that they are not 4096 bytes apart: there a load of one would wait for a store to the other (4K aliasing).
     tile_reals = wp.types.vector(tile_size * (tile_size + 1), real)
     tile_ints = wp.types.vector(tile_size * (tile_size + 1), wp.int32)
     strip_reals = wp.types.vector(STRIP, real)
     strip_ints = wp.types.vector(STRIP, wp.int32)
-    batch_reals = wp.types.vector(FORWARD_BATCH, real)
-    batch_ints = wp.types.vector(FORWARD_BATCH, wp.int32)
-    batch_strips = wp.types.vector(FORWARD_BATCH * STRIP, real)
-    record = wp.types.vector(9 + channels, real)
-    prefetch = make_prefetch(record)
+    batch_reals = wp.types.vector(BATCH, real)
+    batch_ints = wp.types.vector(BATCH, wp.int32)
+    batch_strips = wp.types.vector(BATCH * STRIP, real)
+    at, prefetch = b.at, make_prefetch(b.record)
     # of several channels, one after the other
     tile_channels = wp.types.vector(channels * tile_size * (tile_size + 1), real)
     strip_channels = wp.types.vector(2 * channels * STRIP, real)
-    batch_channels = wp.types.vector(channels * FORWARD_BATCH, real)
-    place_z, per_pixel, per_row = 6 + channels, channels, channels * tile_size
+    per_pixel, per_row = channels, channels * tile_size
     tile_stride, side, pixels = tile_size * (tile_size + 1), tile_size, tile_size * tile_size
     strip, parts, abreast = STRIP, tile_size // STRIP, ABREAST
-    batch, bits, together = FORWARD_BATCH, FORWARD_BATCH - 1, FORWARD_TOGETHER
+    batch, bits, together = BATCH, BATCH - 1, TOGETHER
     outside, smallest = real(-1.0), real(SMALLEST_WEIGHT)
     Reals, Rows = wp.array(dtype=real), wp.array2d(dtype=real)
 
     # Loops over channels have a static length and are unrolled, so they are kept apart from loops that must stay rolled.
-    @wp.func(inline=True)
-    def at(entry: wp.ref[real]) -> real:
-        """Return an entry of a vector that is taken by reference; Warp would copy the vector otherwise."""
-        return entry
-
-    @wp.func(inline=True)
-    def load_channels(projected: wp.array(dtype=record), i: wp.int32, j: wp.int32, color: wp.ref[batch_channels]):
-        """Load the channels of a Gaussian of the batch."""
-        for c in range(wp.static(channels)):
-            color[c * batch + j] = projected[i][6 + c]
-
     @wp.func(inline=True)
     def load_strip(base: wp.int32, lane: wp.int32, sums: wp.ref[tile_channels], strip_sums: wp.ref[strip_channels]):
         """Load the sums of a pixel of a strip."""
@@ -387,10 +369,10 @@ def make_forward(real, tile_size: int, channels: int):
             sums[c * tile_stride + base + lane] = at(strip_sums[2 * c * strip + lane])
 
     @wp.func(inline=True)
-    def add_channels(w: real, lane: wp.int32, j: wp.int32, color: wp.ref[batch_channels], strip_sums: wp.ref[strip_channels]):
+    def add_channels(w: real, lane: wp.int32, j: wp.int32, g: wp.ref[b.Batch], strip_sums: wp.ref[strip_channels]):
         """Add the channels of a Gaussian to the sums of a pixel of a strip."""
         for c in range(wp.static(channels)):
-            strip_sums[2 * c * strip + lane] = at(strip_sums[2 * c * strip + lane]) + w * at(color[c * batch + j])
+            strip_sums[2 * c * strip + lane] = at(strip_sums[2 * c * strip + lane]) + w * at(g.color[c * batch + j])
 
     @wp.func(inline=True)
     def add_background(camera: wp.int32, p: wp.int32, t: real, backgrounds: Rows, sums: wp.ref[tile_channels]):
@@ -412,7 +394,7 @@ def make_forward(real, tile_size: int, channels: int):
 
     @wp.kernel(enable_backward=False, module="unique", module_options=ROLLED)
     def forward(
-        begin: int, settings: f.Blending, projected: wp.array(dtype=record), ranges: IntRows, gaussian_ids: Ints,
+        begin: int, settings: f.Blending, projected: wp.array(dtype=b.record), ranges: IntRows, gaussian_ids: Ints,
         backgrounds: Rows,
         # outputs, and the distance of pixels in the first
         rgb: Reals, pitch: int, alpha_out: Reals, depth: Reals, transmittances: Reals, weights: Reals, ends: Ints,
@@ -444,16 +426,7 @@ def make_forward(real, tile_size: int, channels: int):
         strip_total = strip_reals()
         strip_end = strip_ints()
         # The Gaussians of a batch: values; u11 times the pixels of a strip; values shared in a row; those that reach a strip.
-        mx = batch_reals()
-        my = batch_reals()
-        u11 = batch_reals()
-        u12 = batch_reals()
-        u22 = batch_reals()
-        opacity = batch_reals()
-        color = batch_channels()
-        distance = batch_reals()
-        aside = batch_reals()
-        limit = batch_reals()
+        g = b.Batch()
         ramp = batch_strips()
         e12 = batch_reals()
         e22 = batch_reals()
@@ -469,32 +442,14 @@ def make_forward(real, tile_size: int, channels: int):
         while first < last:
             count = wp.min(batch, last - first)
             for j in range(batch):
-                limit[j] = real(-1.0)  # reaches nothing
-            j = int(0)
-            while j < count:
-                i = gaussian_ids[wp.max(first + j, 0)]
-                if f.never(i):
-                    break
-                mx[j] = projected[i][0]
-                my[j] = projected[i][1]
-                u11[j] = projected[i][2]
-                u12[j] = projected[i][3]
-                u22[j] = projected[i][4]
-                opacity[j] = projected[i][5]
-                load_channels(projected, i, j, color)
-                distance[j] = projected[i][place_z]
-                bounds = f.bounds_of(
-                    mx[j], my[j], u11[j], u22[j], projected[i][place_z + 1], projected[i][place_z + 2], settings.whole_tiles
-                )
-                aside[j] = bounds[0]
-                limit[j] = bounds[1]
-                j += 1
+                g.limit[j] = real(-1.0)  # reaches nothing
+            b.load(projected, gaussian_ids, first, 1, count, settings.whole_tiles, g)
             j = int(0)
             while j < count:
                 o = j & bits
                 j += 1
                 for lane in range(strip):
-                    ramp[o * strip + lane] = f.apart(u11[o] * real(lane))
+                    ramp[o * strip + lane] = f.apart(at(g.u11[o]) * real(lane))
             left_open = int(0)
             for row in range(side):
                 y = real(settings.origin_y + top + row) + real(0.5)
@@ -506,9 +461,9 @@ def make_forward(real, tile_size: int, channels: int):
                     o = group & bits
                     group += together
                     for lane in range(together):
-                        dy = y - my[o + lane]
-                        e2 = u22[o + lane] * dy
-                        e12[o + lane] = f.apart(u12[o + lane] * dy)
+                        dy = y - at(g.y[o + lane])
+                        e2 = at(g.u22[o + lane]) * dy
+                        e12[o + lane] = f.apart(at(g.u12[o + lane]) * dy)
                         e22[o + lane] = f.apart(e2 * e2)
                 for part in range(parts):
                     base = wp.max(row * side + part * strip, 0)
@@ -524,8 +479,10 @@ def make_forward(real, tile_size: int, channels: int):
                             group += together
                             for lane in range(together):
                                 j = o + lane
-                                start[j] = f.apart(u11[j] * (x - mx[j])) + e12[j]
-                                hits[j] = wp.where(f.reaches(start[j], u11[j], e22[j], aside[j], limit[j]), 1, 0)
+                                start[j] = f.apart(at(g.u11[j]) * (x - at(g.x[j]))) + e12[j]
+                                hits[j] = wp.where(
+                                    f.reaches(start[j], at(g.u11[j]), e22[j], at(g.aside[j]), at(g.limit[j])), 1, 0
+                                )
                         reaching = int(0)
                         group = int(0)
                         while group < count:
@@ -543,9 +500,9 @@ def make_forward(real, tile_size: int, channels: int):
                                     j = list[o + n] & bits
                                     e1[n] = start[j] + ramp[j * strip + lane]
                                     e2_squared[n] = e22[j]
-                                g = f.falloffs(wp.cw_mul(e1, e1) + e2_squared)
+                                found = f.falloffs(wp.cw_mul(e1, e1) + e2_squared)
                                 for n in range(abreast):
-                                    raw = opacity[list[o + n] & bits] * g[n]
+                                    raw = at(g.opacity[list[o + n] & bits]) * found[n]
                                     alpha = wp.where(settings.alpha_max < raw, settings.alpha_max, raw)
                                     alphas[(o + n) * strip + lane] = wp.where(alpha >= settings.alpha_cut, alpha, real(0.0))
                         for lane in range(strip):
@@ -570,8 +527,8 @@ def make_forward(real, tile_size: int, channels: int):
                                 strip_t[lane] = wp.where(blended, after, strip_t[lane])
                                 strip_passed[lane] = after
                                 strip_end[lane] = wp.where(w > real(0.0), number, strip_end[lane])
-                                add_channels(w, lane, j, color, strip_sums)
-                                strip_z[lane] = strip_z[lane] + w * distance[j]
+                                add_channels(w, lane, j, g, strip_sums)
+                                strip_z[lane] = strip_z[lane] + w * at(g.z[j])
                                 strip_total[lane] = strip_total[lane] + w
                         for lane in range(strip):
                             t[base + lane] = strip_t[lane]

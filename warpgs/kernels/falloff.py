@@ -265,13 +265,13 @@ def make_batches(real, tile_size: int, channels: int):
 
     @wp.func(inline=True)
     def load(
-        projected: wp.array(dtype=record), gaussian_ids: Ints, last: wp.int32, count: wp.int32, whole_tiles: wp.int32,
-        b: wp.ref[Batch],
+        projected: wp.array(dtype=record), gaussian_ids: Ints, first: wp.int32, way: wp.int32, count: wp.int32,
+        whole_tiles: wp.int32, b: wp.ref[Batch],
     ):  # fmt: skip
-        """Load the Gaussians of ``count`` instances, from the last on backwards."""
+        """Load the Gaussians of ``count`` instances from the first on, forwards or backwards (``way`` 1 or -1)."""
         j = int(0)
         while j < count:
-            i = gaussian_ids[wp.max(last - j, 0)]
+            i = gaussian_ids[wp.max(first + way * j, 0)]
             if f.never(i):
                 break
             b.x[j & bits] = projected[i][0]
