@@ -119,7 +119,7 @@ def composite(
         settings.struct(tiles.size, real), projected, tiles.ranges, tiles.gaussian_ids, backgrounds, rgb,
         launch.row_stride(rgb), alpha, depth, transmittances, weights, ends,
     ]  # fmt: skip
-    kernel = blend_cpu.make_kernels(real, tiles.size, channels).forward
+    kernel = blend_cpu.make_forward(real, tiles.size, channels)
     launch.launch(kernel, len(tiles.ranges), inputs, device, cost=10_000, block_dim=32)
     return rgb, alpha, depth, transmittances, weights, ends, allocator.saved((0,), projected.dtype, device)
 
@@ -170,7 +170,7 @@ def composite_gradients(
         transmittances, weights, depth, ends, v_rgb, launch.row_stride(v_rgb),
         *(nothing if v is None else v.contiguous() for v in (v_alpha, v_depth)), v_slots,
     ]  # fmt: skip
-    kernel = blend_cpu.make_kernels(real, tiles.size, channels, settings.absgrad, deep).backward
+    kernel = blend_cpu.make_backward(real, tiles.size, channels, settings.absgrad, deep)
     launch.launch(kernel, len(tiles.ranges), inputs, device, cost=10_000, block_dim=32)
     inputs = [v_slots, tiles.starts, tiles.counts, v_projected]
     tasks, kernel = -(-len(tiles.counts) // SUMMED), make_segments(real, values, projected.shape[-1]).sum_gradients

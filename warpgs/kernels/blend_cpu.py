@@ -1,12 +1,11 @@
 """Blending kernels in plain Warp, one task per tile; used on the CPU, and for float64 on every device."""
 
 import functools
-from types import SimpleNamespace
 
 import warp as wp
 
 from warpgs.constants import SMALLEST_WEIGHT
-from warpgs.kernels.falloff import ABREAST, BATCH, COLORS, STRIP, TOGETHER, VALUES, make_batches, make_functions, make_records
+from warpgs.kernels.falloff import ABREAST, BATCH, COLORS, STRIP, TOGETHER, VALUES, make_batches, make_functions
 from warpgs.kernels.native import ROLLED, IntRows, Ints, make_prefetch
 
 # The backward blending kernel in plain Warp, one task per tile; used on the CPU, and for float64 on every device.
@@ -20,12 +19,11 @@ from warpgs.kernels.native import ROLLED, IntRows, Ints, make_prefetch
 def make_backward(real, tile_size: int, channels: int, absgrad: bool = False, deep: bool = True):
     """Make the backward kernel; without ``deep``, depth and alpha have no gradient, and their data is not read."""
     f = make_functions(real)
-    r = make_records(real, tile_size, channels, absgrad)
     b = make_batches(real, tile_size, channels)
     Reals, Rows = wp.array(dtype=real), wp.array2d(dtype=real)
     at, at_int = b.at, b.at_int
-    count = VALUES + channels - COLORS + 2 * absgrad
-    values, together_values = count, TOGETHER * count
+    values = VALUES + channels - COLORS + 2 * absgrad
+    together_values = TOGETHER * values
     prefetch, prefetch_slot = make_prefetch(b.record), make_prefetch(real, 2)
     prefetch_end, prefetch_value = make_prefetch(wp.int32), make_prefetch(real)
     stride, side, pixels_of_tile = tile_size * (tile_size + 1), tile_size, tile_size * tile_size
@@ -40,15 +38,63 @@ def make_backward(real, tile_size: int, channels: int, absgrad: bool = False, de
     # values of a row of gradients that are at most 64 bytes apart
     spacing = max(1, 64 // ((4 if real is wp.float32 else 8) * channels))
     apart, touches = spacing, -(-(tile_size - 1) // spacing) + 1
+    # Entries of pixels follow in the order of `make_batches`. Vectors are one row longer than the tile: see `make_forward`.
+    # Channels are stored one after the other. In a gradient, the two magnitudes follow the channels if ``absgrad`` is set. The
+    # compiler puts records 8 bytes before a cache line; with a vector of 2 in front, no strip lies in two lines.
+    lead_reals, trail_reals, strip_reals = (wp.types.vector(n, real) for n in (2, 14, STRIP))
+    tile_reals = wp.types.vector(tile_size * (tile_size + 1), real)
+
+    @wp.struct
+    class Pixels:
+        """Values of each pixel of a tile."""
+
+        lead: lead_reals
+        t: tile_reals  # transmittance behind the current instance, then before it
+        behind: tile_reals  # sum of w d over what lies behind, background included
+        g: wp.types.vector(channels * tile_size * (tile_size + 1), real)  # upstream gradient of the channels
+        v_z: tile_reals
+        v_w: tile_reals
+        end: wp.types.vector(tile_size * (tile_size + 1), wp.int32)  # one past the last instance that was blended
+        trail: trail_reals
+
+    @wp.struct
+    class Shades:
+        """Gradient and weight of the current instance at each pixel that it reaches."""
+
+        lead: lead_reals
+        falloff: wp.types.vector((tile_size + ABREAST) * STRIP, real)  # of one column of strips, and of a few rows beyond it
+        v: tile_reals  # gradient of the falloff
+        w: tile_reals  # blending weight
+        trail: trail_reals
+
+    @wp.struct
+    class Gradient:
+        """Sums of one instance's gradient, by place in a strip."""
+
+        e1: strip_reals
+        y: strip_reals
+        xx: strip_reals
+        xy: strip_reals
+        yy: strip_reals
+        opacity: strip_reals
+        color: wp.types.vector((channels + 2 * absgrad) * STRIP, real)
+        z: strip_reals
+
+    @wp.struct
+    class Held:
+        """Sums of several instances' gradients, one instance after the other."""
+
+        halves: wp.types.vector(TOGETHER * values * (STRIP // 2), real)  # by place in half a strip
+        totals: wp.types.vector(TOGETHER * values, real)
 
     @wp.func(inline=True)
-    def load_channels(o: wp.int32, p: wp.int32, v_rgb: Reals, pixels: wp.ref[r.Pixels]):
+    def load_channels(o: wp.int32, p: wp.int32, v_rgb: Reals, pixels: wp.ref[Pixels]):
         """Load the upstream gradient of a pixel's channels, whose first has the index ``o``."""
         for c in range(wp.static(channels)):
             pixels.g[c * stride + p] = v_rgb[o + c]
 
     @wp.func(inline=True)
-    def behind_of(p: wp.int32, camera: wp.int32, backgrounds: Rows, pixels: wp.ref[r.Pixels]) -> real:
+    def behind_of(p: wp.int32, camera: wp.int32, backgrounds: Rows, pixels: wp.ref[Pixels]) -> real:
         """Return the product of a pixel's upstream gradient with the background."""
         product = backgrounds[camera, 0] * at(pixels.g[p])
         for c in range(1, wp.static(channels)):
@@ -57,7 +103,7 @@ def make_backward(real, tile_size: int, channels: int, absgrad: bool = False, de
 
     @wp.func(inline=True)
     def load_depth(
-        o: wp.int32, p: wp.int32, weights: Reals, depth: Reals, v_alpha: Reals, v_depth: Reals, pixels: wp.ref[r.Pixels]
+        o: wp.int32, p: wp.int32, weights: Reals, depth: Reals, v_alpha: Reals, v_depth: Reals, pixels: wp.ref[Pixels]
     ):
         """Load what the gradients of depth and alpha add to the effect of a Gaussian on a pixel."""
         if wp.static(deep):
@@ -71,7 +117,7 @@ def make_backward(real, tile_size: int, channels: int, absgrad: bool = False, de
     @wp.func(inline=True)
     def load_pixels(
         place: wp.vec3i, settings: f.Blending, backgrounds: Rows, transmittances: Reals, weights: Reals, depth: Reals,
-        ends: Ints, v_rgb: Reals, pitch: wp.int32, v_alpha: Reals, v_depth: Reals, pixels: wp.ref[r.Pixels],
+        ends: Ints, v_rgb: Reals, pitch: wp.int32, v_alpha: Reals, v_depth: Reals, pixels: wp.ref[Pixels],
         until: wp.ref[b.strip_ints],
     ) -> wp.int32:  # fmt: skip
         """Load the pixels, and for each strip one past the last instance that it blended; return the largest of these."""
@@ -109,7 +155,7 @@ def make_backward(real, tile_size: int, channels: int, absgrad: bool = False, de
         return last
 
     @wp.func(inline=True)
-    def effect(j: wp.int32, p: wp.int32, g: wp.ref[b.Batch], pixels: wp.ref[r.Pixels]) -> real:
+    def effect(j: wp.int32, p: wp.int32, g: wp.ref[b.Batch], pixels: wp.ref[Pixels]) -> real:
         """Return the effect d of a Gaussian on a pixel."""
         product = at(g.color[j]) * at(pixels.g[p])
         for c in range(1, wp.static(channels)):
@@ -119,7 +165,7 @@ def make_backward(real, tile_size: int, channels: int, absgrad: bool = False, de
         return product
 
     @wp.func(inline=True)
-    def add_channels(w: real, p: wp.int32, lane: wp.int32, pixels: wp.ref[r.Pixels], s: wp.ref[r.Gradient]):
+    def add_channels(w: real, p: wp.int32, lane: wp.int32, pixels: wp.ref[Pixels], s: wp.ref[Gradient]):
         """Add a pixel's contribution to the gradient of the channels and of the depth."""
         for c in range(wp.static(channels)):
             s.color[c * strip + lane] = at(s.color[c * strip + lane]) + w * at(pixels.g[c * stride + p])
@@ -127,7 +173,7 @@ def make_backward(real, tile_size: int, channels: int, absgrad: bool = False, de
             s.z[lane] = at(s.z[lane]) + w * at(pixels.v_z[p])
 
     @wp.func(inline=True)
-    def add_magnitudes(u12: real, u22: real, v_e1: real, v_y: real, lane: wp.int32, s: wp.ref[r.Gradient]):
+    def add_magnitudes(u12: real, u22: real, v_e1: real, v_y: real, lane: wp.int32, s: wp.ref[Gradient]):
         """Add the magnitudes of a pixel's contributions to the gradient of the mean, if they are requested."""
         if wp.static(absgrad):
             x = wp.static(channels * STRIP) + lane
@@ -138,7 +184,7 @@ def make_backward(real, tile_size: int, channels: int, absgrad: bool = False, de
     @wp.func(inline=True)
     def walk(
         j: wp.int32, instance: wp.int32, left: wp.int32, settings: f.Blending, g: wp.ref[b.Batch], rows: wp.ref[b.Rows],
-        pixels: wp.ref[r.Pixels], shades: wp.ref[r.Shades],
+        pixels: wp.ref[Pixels], shades: wp.ref[Shades],
     ):  # fmt: skip
         """Walk back past a Gaussian: find its weights and the gradients of its falloff, and what lies before it."""
         u11 = at(g.u11[j])
@@ -187,11 +233,11 @@ def make_backward(real, tile_size: int, channels: int, absgrad: bool = False, de
 
     @wp.func(inline=True)
     def sum_up(
-        j: wp.int32, left: wp.int32, g: wp.ref[b.Batch], rows: wp.ref[b.Rows], pixels: wp.ref[r.Pixels],
-        shades: wp.ref[r.Shades],
-    ) -> r.Gradient:  # fmt: skip
+        j: wp.int32, left: wp.int32, g: wp.ref[b.Batch], rows: wp.ref[b.Rows], pixels: wp.ref[Pixels],
+        shades: wp.ref[Shades],
+    ) -> Gradient:  # fmt: skip
         """Return the sums over the strips that a Gaussian of the batch reaches."""
-        s = r.Gradient()
+        s = Gradient()
         u11 = at(g.u11[j])
         u12 = at(g.u12[j])
         u22 = at(g.u22[j])
@@ -221,13 +267,13 @@ def make_backward(real, tile_size: int, channels: int, absgrad: bool = False, de
         return s
 
     @wp.func(inline=True)
-    def hold_channels(o: wp.int32, lane: wp.int32, s: wp.ref[r.Gradient], held: wp.ref[r.Held]):
+    def hold_channels(o: wp.int32, lane: wp.int32, s: wp.ref[Gradient], held: wp.ref[Held]):
         """Keep the sums of the channels at a place in half a strip."""
         for k in range(wp.static(channels + 2 * absgrad)):
             held.halves[o + (6 + k) * half] = at(s.color[k * strip + lane]) + at(s.color[k * strip + half + lane])
 
     @wp.func(inline=True)
-    def hold(j: wp.int32, s: wp.ref[r.Gradient], held: wp.ref[r.Held]):
+    def hold(j: wp.int32, s: wp.ref[Gradient], held: wp.ref[Held]):
         """Keep the sums of a Gaussian until a group is complete; the two halves of a strip are added here."""
         o = (j & group_bits) * (values * half)
         for lane in range(half):
@@ -241,14 +287,14 @@ def make_backward(real, tile_size: int, channels: int, absgrad: bool = False, de
             hold_channels(o + lane, lane, s, held)
 
     @wp.func(inline=True)
-    def fold(held: wp.ref[r.Held]):
+    def fold(held: wp.ref[Held]):
         """Add up the sums that `hold` keeps of each Gaussian, always in the same order."""
         for n in range(together_values):
             o = n * half
             held.totals[n] = (at(held.halves[o]) + at(held.halves[o + 2])) + (at(held.halves[o + 1]) + at(held.halves[o + 3]))
 
     @wp.func(inline=True)
-    def store(j: wp.int32, g: wp.ref[b.Batch], held: wp.ref[r.Held], slot: wp.int32, v_slots: Rows):
+    def store(j: wp.int32, g: wp.ref[b.Batch], held: wp.ref[Held], slot: wp.int32, v_slots: Rows):
         """Store the gradient of an instance: the sums times factors that they share."""
         o = (j & group_bits) * values
         u11 = at(g.u11[j])
@@ -282,12 +328,12 @@ def make_backward(real, tile_size: int, channels: int, absgrad: bool = False, de
         place = f.place_of(tile, side, settings)
         left = settings.origin_x + place[1]
         top = settings.origin_y + place[2]
-        pixels = r.Pixels()
+        pixels = Pixels()
         until = b.strip_ints()
         gaussians = b.Batch()
         rows = b.Rows()
-        shades = r.Shades()
-        held = r.Held()
+        shades = Shades()
+        held = Held()
         first = ranges[tile, 0]
         last = load_pixels(
             place, settings, backgrounds, transmittances, weights, depth, ends, v_rgb, pitch, v_alpha, v_depth, pixels, until
@@ -584,12 +630,3 @@ def make_forward(real, tile_size: int, channels: int):
                     lane += 1
 
     return forward
-
-
-@functools.cache
-def make_kernels(real, tile_size: int, channels: int = COLORS, absgrad: bool = False, deep: bool = True):
-    """Make the forward and backward kernels; arguments are those of `make_backward`."""
-    return SimpleNamespace(
-        forward=make_forward(real, tile_size, channels),
-        backward=make_backward(real, tile_size, channels, absgrad, deep),
-    )

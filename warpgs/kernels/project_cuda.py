@@ -8,7 +8,7 @@ from warpgs.constants import LARGEST_COEFFICIENT
 from warpgs.kernels import ellipse, sh
 from warpgs.kernels.cameras import types_of
 from warpgs.kernels.ellipse import PROJECTED_SIZE, arrays_of, make_projection, make_spans
-from warpgs.kernels.native import Ints, make_color, make_functions as make_native
+from warpgs.kernels.native import Ints, clear_rows, compact, make_color, store_row
 
 
 def _module(kind: str, real, camera_model: str, parameters: str, antialiased: bool, bases: int) -> str:
@@ -27,7 +27,6 @@ def make_forward(real, camera_model: str, parameters: str = "stored", antialiase
     _, vec3, _, mat33, mat44, Reals = types_of(real)
     Vec3s, Vec4s, Mat33s, Mat44s, Rows, Vec3Rows = arrays_of(real)
     color_of = make_color(bases).color if native else None
-    compact = make_native().compact if native else None
     vec12 = wp.types.vector(PROJECTED_SIZE, real)
 
     @wp.func
@@ -35,7 +34,7 @@ def make_forward(real, camera_model: str, parameters: str = "stored", antialiase
         for k in range(wp.static(PROJECTED_SIZE)):
             projected[i, k] = values[k]
 
-    store = make_native().store_row if native else store_values
+    store = store_row if native else store_values
     module = _module("forward", real, camera_model, parameters, antialiased, bases)
 
     @wp.func
@@ -164,8 +163,6 @@ def make_backward(real, camera_model: str, parameters: str = "stored", antialias
     functions = sh.make_functions(real, bases)
     _, vec3, vec4, mat33, mat44, Reals = types_of(real)
     Vec3s, Vec4s, Mat33s, Mat44s, Rows, Vec3Rows = arrays_of(real)
-    compact = make_native().compact if native else None
-    clear_rows = make_native().clear_rows if native else None
     color_backward = make_color(bases).color_backward if native else None
 
     # three blocks to a multiprocessor: enough registers

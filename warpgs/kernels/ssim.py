@@ -278,29 +278,27 @@ THREADS = 256
 """Threads of a block."""
 
 
-@functools.cache
-def make_cuda_kernels():
-    """Make the forward and backward kernels; their argument ``summed`` is 1 for the two sums of `differences`, 0 for a map."""
-    numbers = {"WINDOW": ", ".join(f"{w!r}f" for w in WINDOW), "C1": f"{C1!r}f", "C2": f"{C2!r}f"}
+NUMBERS = {"WINDOW": ", ".join(f"{w!r}f" for w in WINDOW), "C1": f"{C1!r}f", "C2": f"{C2!r}f"}
+"""Numbers in the CUDA text."""
 
-    block, module = f"wp.tid() // {THREADS}", "warpgs.kernels.ssim_cuda"
 
-    @cuda_kernel(source("ssim_forward.cu", **numbers), block, module)
-    def forward(
-        block: int, a: Floats, b: Floats, height: int, columns: int, summed: int,
-        # outputs: the similarities, or two sums per block; and the partials by mean, variance and gap
-        result: Floats, by_mean: Floats, by_variance: Floats, by_gap: Floats,
-    ): ...  # fmt: skip
+@cuda_kernel(source("ssim_forward.cu", **NUMBERS), f"wp.tid() // {THREADS}", "warpgs.kernels.ssim_cuda")
+def cuda_forward(
+    block: int, a: Floats, b: Floats, height: int, columns: int, summed: int,
+    # outputs: the similarities, or two sums per block; and the partials by mean, variance and gap
+    result: Floats, by_mean: Floats, by_variance: Floats, by_gap: Floats,
+):  # fmt: skip
+    """Compute the similarity of a square of pixels; ``summed`` is 1 for the two sums of `differences`, 0 for a map."""
 
-    @cuda_kernel(source("ssim_backward.cu", **numbers), block, module)
-    def backward(
-        block: int, a: Floats, b: Floats, v_result: Floats, by_mean: Floats, by_variance: Floats, by_gap: Floats, height: int,
-        columns: int, summed: int,
-        # outputs
-        v_a: Floats,
-    ): ...  # fmt: skip
 
-    return SimpleNamespace(forward=forward, backward=backward)
+@cuda_kernel(source("ssim_backward.cu", **NUMBERS), f"wp.tid() // {THREADS}", "warpgs.kernels.ssim_cuda")
+def cuda_backward(
+    block: int, a: Floats, b: Floats, v_result: Floats, by_mean: Floats, by_variance: Floats, by_gap: Floats, height: int,
+    columns: int, summed: int,
+    # outputs
+    v_a: Floats,
+):  # fmt: skip
+    """Compute the gradient of a square of pixels."""
 
 
 # Structural similarity with an 11 x 11 Gaussian window (Wang et al. 2004), separable, forward and backward.
@@ -331,7 +329,7 @@ class _Ssim(torch.autograd.Function):
         partials = [torch.empty_like(image) for _ in range(3)]
         if native:
             inputs = [image, target, height, columns, int(summed), result, *partials]
-            launch.launch(make_cuda_kernels().forward, tasks * THREADS, inputs, image.device, block_dim=THREADS)
+            launch.launch(cuda_forward, tasks * THREADS, inputs, image.device, block_dim=THREADS)
         else:
             kernel = make_kernels(launch.real_of(image), summed).forward
             workspace = image.new_empty(tasks * 5 * (columns + 2 * PADDING))
@@ -349,7 +347,7 @@ class _Ssim(torch.autograd.Function):
         v_image, v_result = torch.empty_like(image), v_result.contiguous()
         if _native(image):
             inputs = [image, target, v_result, *partials, height, columns, int(ctx.summed), v_image]
-            launch.launch(make_cuda_kernels().backward, tasks * THREADS, inputs, image.device, block_dim=THREADS)
+            launch.launch(cuda_backward, tasks * THREADS, inputs, image.device, block_dim=THREADS)
         else:
             fields = partials if ctx.summed else [v_result * t for t in partials]  # v_result is then not read
             workspace = image.new_empty(tasks * 3 * (columns + 2 * PADDING))

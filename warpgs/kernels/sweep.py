@@ -1,6 +1,5 @@
 """Plane sweeps: depths of the planes, their costs, and the scanlines that smooth them."""
 
-import functools
 import math
 from collections.abc import Sequence
 
@@ -544,20 +543,15 @@ LARGEST = 2**13 - 1
 """Largest cost plus penalties: the sum of four paths then fits into signed 16 bits."""
 
 
-@functools.cache
-def make_follow():
-    """Make the kernel for CUDA, of `BLOCK` threads per line: costs of the paths along it, both ways, add to ``total``."""
-
-    @cuda_kernel(source("scanlines.cu", FAR_AWAY=FAR_AWAY), f"(begin + wp.tid()) // {BLOCK}", "warpgs.kernels.scanlines")
-    def follow(
-        line: int, costs: ShortRows, bounds: Ints, small: int, planes: int,
-        # pixels of a line: where it starts, from one to the next, how many; the same for the steps between them
-        line_step: int, pixel_step: int, length: int, line_edge: int, pixel_edge: int,
-        # outputs
-        path: IntRows, total: ShortRows,
-    ): ...  # fmt: skip
-
-    return follow
+@cuda_kernel(source("scanlines.cu", FAR_AWAY=FAR_AWAY), f"(begin + wp.tid()) // {BLOCK}", "warpgs.kernels.scanlines")
+def follow(
+    line: int, costs: ShortRows, bounds: Ints, small: int, planes: int,
+    # pixels of a line: where it starts, from one to the next, how many; the same for the steps between them
+    line_step: int, pixel_step: int, length: int, line_edge: int, pixel_edge: int,
+    # outputs
+    path: IntRows, total: ShortRows,
+):  # fmt: skip
+    """Add the costs of the paths along a line, both ways, to ``total``, on CUDA by `BLOCK` threads per line."""
 
 
 def scanline_costs(costs: torch.Tensor, down: torch.Tensor, across: torch.Tensor, small: int) -> torch.Tensor:
@@ -582,5 +576,5 @@ def scanline_costs(costs: torch.Tensor, down: torch.Tensor, across: torch.Tensor
             launch.launch(follow_cpu, lines, [*inputs, path, total], costs.device, cost=cost)
         else:
             path = torch.empty(lines, 2 * (planes + 2), dtype=torch.int32, device=costs.device)
-            launch.launch(make_follow(), BLOCK * lines, [*inputs, path, total], costs.device, block_dim=BLOCK)
+            launch.launch(follow, BLOCK * lines, [*inputs, path, total], costs.device, block_dim=BLOCK)
     return total[..., :planes]

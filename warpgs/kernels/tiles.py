@@ -22,11 +22,11 @@ from warpgs.device import (
     installed_bytes,
 )
 from warpgs.errors import ResourceError
-from warpgs.kernels import launch
+from warpgs.kernels import launch, native as cuda
 from warpgs.kernels.ellipse import PROJECTED_SIZE, make_spans
 from warpgs.kernels.graphs import TORCH, Allocator
 from warpgs.kernels.launch import sort_pairs
-from warpgs.kernels.native import EXACT, SCALE, IntRows, Ints, Longs, make_functions as make_native, make_prefetch, source
+from warpgs.kernels.native import EXACT, SCALE, IntRows, Ints, Longs, make_prefetch, source
 from warpgs.kernels.project_cpu import LANES, make_lanes
 
 EACH = 4
@@ -109,7 +109,6 @@ def make_emit(real, slotted: bool, ranked: bool = False):
     s = make_spans(real)
     vec3, Rows = wp.types.vector(3, real), wp.array2d(dtype=real)
     vec2i = s.vec2i
-    lanes = make_native()
     write = make_write(slotted)
 
     @wp.func
@@ -163,38 +162,38 @@ def make_emit(real, slotted: bool, ranked: bool = False):
         first_tile = (i // per_camera) * tiles - corner
         # The warp writes the rows of its 32 Gaussians together: a lane finds the columns of a row, then each a tile.
         lane = wp.tid() % 32
-        row_end = lanes.running_sum(rows[1] - rows[0])
+        row_end = cuda.running_sum(rows[1] - rows[0])
         row_begin = row_end - (rows[1] - rows[0])
-        row_count = lanes.broadcast(row_end, 31)
+        row_count = cuda.broadcast(row_end, 31)
         batch = int(0)
         while batch < row_count:
-            owner = lanes.holder(row_end, batch + lane)
-            g = lanes.broadcast(i, owner)
-            row = lanes.broadcast(rows[0], owner) + batch + lane - lanes.broadcast(row_begin, owner)
+            owner = cuda.holder(row_end, batch + lane)
+            g = cuda.broadcast(i, owner)
+            row = cuda.broadcast(rows[0], owner) + batch + lane - cuda.broadcast(row_begin, owner)
             span = vec2i(0, 0)
             if batch + lane < row_count:
                 span = span_of(projected, g, row, alpha_cut, square_sigma, origin_x, width, tile_size)
-            tile_end = lanes.running_sum(span[1] - span[0])
+            tile_end = cuda.running_sum(span[1] - span[0])
             tile_begin = tile_end - (span[1] - span[0])
-            tile_count = lanes.broadcast(tile_end, 31)
+            tile_count = cuda.broadcast(tile_end, 31)
             # a Gaussian's slots go on from where its rows of the last batch ended
             first = wp.max(row_begin - batch, 0)
-            to_slot = lanes.broadcast(slot, owner) - lanes.broadcast(tile_begin, lanes.broadcast(first, owner))
-            to_key = lanes.broadcast(first_tile, owner) + row * columns + span[0] - tile_begin
-            limit = lanes.broadcast(end, owner)
+            to_slot = cuda.broadcast(slot, owner) - cuda.broadcast(tile_begin, cuda.broadcast(first, owner))
+            to_key = cuda.broadcast(first_tile, owner) + row * columns + span[0] - tile_begin
+            limit = cuda.broadcast(end, owner)
             done = int(0)
             while done < tile_count:
-                at = lanes.holder(tile_end, done + lane)
-                to = done + lane + lanes.broadcast(to_slot, at)
-                key = done + lane + lanes.broadcast(to_key, at)
-                owner_of = lanes.broadcast(g, at)
+                at = cuda.holder(tile_end, done + lane)
+                to = done + lane + cuda.broadcast(to_slot, at)
+                key = done + lane + cuda.broadcast(to_key, at)
+                owner_of = cuda.broadcast(g, at)
                 if wp.static(ranked):
-                    owner_of = j - lane + lanes.broadcast(owner, at)
-                if to < lanes.broadcast(limit, at) and done + lane < tile_count:
+                    owner_of = j - lane + cuda.broadcast(owner, at)
+                if to < cuda.broadcast(limit, at) and done + lane < tile_count:
                     write(to, key, owner_of, keys, slots, owners)
                 done += 32
-            written = lanes.broadcast(tile_end, wp.clamp(row_end - batch - 1, 0, 31))
-            written -= lanes.broadcast(tile_begin, wp.min(first, 31))
+            written = cuda.broadcast(tile_end, wp.clamp(row_end - batch - 1, 0, 31))
+            written -= cuda.broadcast(tile_begin, wp.min(first, 31))
             if row_begin < batch + 32 and row_end > batch and rows[1] > rows[0]:
                 slot += written
             batch += 32
@@ -319,7 +318,6 @@ def sum_entries(count: int, native: bool) -> tuple[int, int]:
 @functools.cache
 def make_kernels(real, native: bool):
     """Make the kernels for one scalar type; ``native`` is True for CUDA, where each warp has one entry of the running sums."""
-    lanes = make_native() if native else None
     width, each = _of_sum(native)
     ints, reals = wp.types.vector(each, wp.int32), wp.types.vector(each, real)
     Reals, Rows = wp.array(dtype=real), wp.array2d(dtype=real)
@@ -355,7 +353,7 @@ def make_kernels(real, native: bool):
             if i <= last and touched > 0:
                 own += (wp.int64(1) << wp.int64(bits)) + wp.int64(touched)
         if wp.static(native):
-            own = lanes.whole_sum(own)
+            own = cuda.whole_sum(own)
         if thread % width == 0 and first <= last:
             packed[entry] = own
 
@@ -386,8 +384,8 @@ def make_kernels(real, native: bool):
         upto = byte
         whole = byte
         if wp.static(native):
-            upto = lanes.running_sum(byte)
-            whole = lanes.broadcast(upto, 31)
+            upto = cuda.running_sum(byte)
+            whole = cuda.broadcast(upto, 31)
         for k in range(wp.static(each)):
             passed -= (whole >> (8 * k)) & 255
         for k in range(wp.static(each)):

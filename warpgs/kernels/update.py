@@ -240,7 +240,6 @@ def scheduled_update(
     parameter: Floats, mean: Floats, square: Floats,
 ):  # fmt: skip
     """Update four elements per thread, with learning rates in memory, so that a graph can replay it."""
-    ...
 
 
 def scheduled_lrs(lr: float, step: int, betas: tuple[float, float] = BETAS, head_lr: float | None = None) -> list[float]:

@@ -244,35 +244,28 @@ def make_native(tile_size: int):
     numbers = {"SIDE": tile_size, "SCALE": SCALE, "STRIDE": PROJECTED_SIZE}
     tile = f"wp.tid() // {tile_size * tile_size}"
 
-    @cuda_kernel(source("median_depth.cu", **numbers), tile, f"warpgs.kernels.median_depth.{tile_size}")
-    def median(
-        tile: int, settings: Blending, projected: Floats, ranges: Ints, gaussian_ids: Ints,
-        # outputs
-        depths: Floats,
-    ): ...  # fmt: skip
-
-    @cuda_kernel(source("heaviest.cu", **numbers), tile, f"warpgs.kernels.heaviest.{tile_size}")
-    def heaviest(
+    def walk(
         tile: int, settings: Blending, projected: Floats, ranges: Ints, gaussian_ids: Ints, per_camera: int, k: int,
         # outputs
-        weights: Floats, ids: Ints, counts: Ints,
+        reals: Floats, ids: Ints, counts: Ints,
     ): ...  # fmt: skip
 
-    return SimpleNamespace(median=median, heaviest=heaviest)
+    return SimpleNamespace(
+        median=cuda_kernel(source("median_depth.cu", **numbers), tile, f"warpgs.kernels.median_depth.{tile_size}")(walk),
+        heaviest=cuda_kernel(source("heaviest.cu", **numbers), tile, f"warpgs.kernels.heaviest.{tile_size}")(walk),
+    )
 
 
 def _walk(make_visit, projected: torch.Tensor, tiles: Tiles, settings: Pass, k: int, *outputs: torch.Tensor) -> None:
     """Launch the kernel of a visitor over projected Gaussians [C, N, 12]; outputs may be fewer than its three."""
-    real, device, pixels = launch.real_of(projected), projected.device, tiles.size * tiles.size
-    inputs = [settings.struct(tiles.size, real), projected, tiles.ranges, tiles.gaussian_ids]
+    real, device, count, pixels = launch.real_of(projected), projected.device, len(tiles.ranges), tiles.size * tiles.size
+    inputs = [settings.struct(tiles.size, real), projected, tiles.ranges, tiles.gaussian_ids, projected.shape[1], k, *outputs]
+    inputs += [tiles.ranges.new_empty(0)] * (3 - len(outputs))
     if is_native(projected):
-        kernels, numbers = make_native(tiles.size), (projected.shape[1], k)
-        kernel, inputs = (kernels.heaviest, [*inputs, *numbers]) if k else (kernels.median, inputs)
-        launch.launch(kernel, len(tiles.ranges) * pixels, [*inputs, *outputs], device, block_dim=pixels)
-        return
-    inputs += [projected.shape[1], k, *outputs, *[tiles.ranges.new_empty(0)] * (3 - len(outputs))]
-    kernel = make_walk(real, tiles.size, make_visit)
-    launch.launch(kernel, len(tiles.ranges), inputs, device, cost=10_000, block_dim=32)
+        kernels = make_native(tiles.size)
+        launch.launch(kernels.heaviest if k else kernels.median, count * pixels, inputs, device, block_dim=pixels)
+    else:
+        launch.launch(make_walk(real, tiles.size, make_visit), count, inputs, device, cost=10_000, block_dim=32)
 
 
 def median_depth(projected: torch.Tensor, tiles: Tiles, settings: Pass) -> torch.Tensor:
