@@ -110,8 +110,8 @@ def make_functions(real):
 
 
 @functools.cache
-def make_kernels(real, summed: bool):
-    """Make the generic kernels, of one task per block of rows; ``summed`` for sums over the image instead of a map."""
+def make_kernel(real, summed: bool, backward: bool):
+    """Make a generic kernel, of one task per block of rows; ``summed`` for sums over the image instead of a map."""
     # The sums of a row are in ``scratch``, where each task has a few rows of its own. A row is processed in steps of `LANES`
     # elements; the last step starts early, to end with the row, and elements that it computes again get the same values.
     f = make_functions(real)
@@ -120,8 +120,7 @@ def make_kernels(real, summed: bool):
     values = wp.types.vector(LANES, real)
     several = wp.types.vector(5 * LANES, real)
     Reals = wp.array(dtype=real)
-    prefetch = make_prefetch(real)
-    kernel = functools.partial(wp.kernel, enable_backward=False, module="unique", module_options=ROLLED)
+    prefetch, fields = make_prefetch(real), 3 if backward else 5
 
     @wp.func
     def starts_of(y: wp.int32, height: wp.int32, image: wp.int32, columns: wp.int32) -> vec11i:
@@ -168,18 +167,20 @@ def make_kernels(real, summed: bool):
             s += w[wp.static(k)] * m[f.at(o[k] + x, lane)]
         return s
 
-    @kernel
-    def forward(
+    @wp.kernel(enable_backward=False, module="unique", module_options=ROLLED)
+    def walk(
         begin: int, a: Reals, b: Reals, height: int, blocks: int, columns: int, scratch: Reals,
-        # outputs: the similarity, or per task the sums of 1 - similarity and of |a - b|; the partials
+        # outputs, in the backward pass inputs: the similarity, or per task the sums of 1 - similarity and of |a - b|; partials
         result: Reals, by_mean: Reals, by_variance: Reals, by_gap: Reals,
+        # output of the backward pass
+        v_a: Reals,
     ):  # fmt: skip
         task = begin + wp.tid()
         image = task // blocks
         top = (task - image * blocks) * BLOCK
         stride = columns + 2 * PADDING
-        first = task * 5 * stride
-        clear_padding(scratch, first, columns, 5)
+        first = task * fields * stride
+        clear_padding(scratch, first, columns, fields)
         sums = several()
         unlike = values()
         error = values()
@@ -188,35 +189,59 @@ def make_kernels(real, summed: bool):
             w = taps_of(y, height)
             for step in range((columns + LANES - 1) // LANES):
                 x = wp.min(step * LANES, columns - LANES)
-                prefetch(a, o[10] + columns + x)  # of the row that the next window adds: too many streams for the processor
-                prefetch(b, o[10] + columns + x)
-                for lane in range(LANES):
-                    put(down_pairs(a, b, o, w, x, lane), lane, sums)
-                for k in range(5):
+                # of the row that the next window adds: too many streams for the processor
+                if wp.static(backward):
+                    prefetch(by_mean, o[10] + columns + x)
+                    prefetch(by_variance, o[10] + columns + x)
+                    prefetch(by_gap, o[10] + columns + x)
+                    for lane in range(LANES):
+                        sums[lane] = down(by_mean, o, w, x, lane)
+                        sums[LANES + lane] = down(by_variance, o, w, x, lane)
+                        sums[2 * LANES + lane] = down(by_gap, o, w, x, lane)
+                else:
+                    prefetch(a, o[10] + columns + x)
+                    prefetch(b, o[10] + columns + x)
+                    for lane in range(LANES):
+                        put(down_pairs(a, b, o, w, x, lane), lane, sums)
+                for k in range(fields):
                     for lane in range(LANES):
                         scratch[f.at(first + k * stride + PADDING + x, lane)] = sums[k * LANES + lane]
             row = (image * height + y) * columns
             for step in range((columns + LANES - 1) // LANES):
                 x = wp.min(step * LANES, columns - LANES)
-                fresh = step * LANES - x  # elements before this one were counted in the step before
-                for lane in range(LANES):
-                    t = f.score(
-                        f.across(scratch, first + x, lane), f.across(scratch, first + stride + x, lane),
-                        f.across(scratch, first + 2 * stride + x, lane), f.across(scratch, first + 3 * stride + x, lane),
-                        f.across(scratch, first + 4 * stride + x, lane),
-                    )  # fmt: skip
-                    put(f.vec5(t[0], t[1], t[2], t[3], real(0.0)), lane, sums)
-                    if wp.static(summed):
-                        unlike[lane] = unlike[lane] + wp.where(lane >= fresh, real(1.0) - t[0], real(0.0))
-                        gap = wp.abs(a[f.at(row + x, lane)] - b[f.at(row + x, lane)])
-                        error[lane] = error[lane] + wp.where(lane >= fresh, gap, real(0.0))
-                for lane in range(LANES):
-                    if not wp.static(summed):
-                        result[f.at(row + x, lane)] = sums[lane]
-                    by_mean[f.at(row + x, lane)] = sums[LANES + lane]
-                    by_variance[f.at(row + x, lane)] = sums[2 * LANES + lane]
-                    by_gap[f.at(row + x, lane)] = sums[3 * LANES + lane]
-        if wp.static(summed):
+                if wp.static(backward):
+                    for lane in range(LANES):
+                        p = a[f.at(row + x, lane)]
+                        d = p - b[f.at(row + x, lane)]
+                        v = f.across(scratch, first + stride + x, lane) * p
+                        v = v + f.across(scratch, first + 2 * stride + x, lane) * d
+                        v = f.across(scratch, first + x, lane) + real(2.0) * v
+                        if wp.static(summed):
+                            sign = wp.where(d > real(0.0), result[1], wp.where(d < real(0.0), -result[1], real(0.0)))
+                            v = sign - result[0] * v
+                        sums[lane] = v
+                    for lane in range(LANES):
+                        v_a[f.at(row + x, lane)] = sums[lane]
+                else:
+                    fresh = step * LANES - x  # elements before this one were counted in the step before
+                    for lane in range(LANES):
+                        t = f.score(
+                            f.across(scratch, first + x, lane), f.across(scratch, first + stride + x, lane),
+                            f.across(scratch, first + 2 * stride + x, lane), f.across(scratch, first + 3 * stride + x, lane),
+                            f.across(scratch, first + 4 * stride + x, lane),
+                        )  # fmt: skip
+                        put(f.vec5(t[0], t[1], t[2], t[3], real(0.0)), lane, sums)
+                        if wp.static(summed):
+                            unlike[lane] = unlike[lane] + wp.where(lane >= fresh, real(1.0) - t[0], real(0.0))
+                            gap = wp.abs(a[f.at(row + x, lane)] - b[f.at(row + x, lane)])
+                            error[lane] = error[lane] + wp.where(lane >= fresh, gap, real(0.0))
+                    for lane in range(LANES):
+                        if not wp.static(summed):
+                            result[f.at(row + x, lane)] = sums[lane]
+                        by_mean[f.at(row + x, lane)] = sums[LANES + lane]
+                        by_variance[f.at(row + x, lane)] = sums[2 * LANES + lane]
+                        by_gap[f.at(row + x, lane)] = sums[3 * LANES + lane]
+        if wp.static(summed and not backward):
             unlike_sum = real(0.0)
             error_sum = real(0.0)
             for lane in range(LANES):
@@ -225,51 +250,7 @@ def make_kernels(real, summed: bool):
             result[2 * task] = unlike_sum
             result[2 * task + 1] = error_sum
 
-    @kernel
-    def backward(
-        begin: int, a: Reals, b: Reals, by_mean: Reals, by_variance: Reals, by_gap: Reals, v_result: Reals, height: int,
-        blocks: int, columns: int, scratch: Reals,
-        # outputs
-        v_a: Reals,
-    ):  # fmt: skip
-        task = begin + wp.tid()
-        image = task // blocks
-        top = (task - image * blocks) * BLOCK
-        stride = columns + 2 * PADDING
-        first = task * 3 * stride
-        clear_padding(scratch, first, columns, 3)
-        sums = several()
-        for y in range(top, wp.min(top + BLOCK, height)):
-            o = starts_of(y, height, image, columns)
-            w = taps_of(y, height)
-            for step in range((columns + LANES - 1) // LANES):
-                x = wp.min(step * LANES, columns - LANES)
-                prefetch(by_mean, o[10] + columns + x)
-                prefetch(by_variance, o[10] + columns + x)
-                prefetch(by_gap, o[10] + columns + x)
-                for lane in range(LANES):
-                    sums[lane] = down(by_mean, o, w, x, lane)
-                    sums[LANES + lane] = down(by_variance, o, w, x, lane)
-                    sums[2 * LANES + lane] = down(by_gap, o, w, x, lane)
-                for k in range(3):
-                    for lane in range(LANES):
-                        scratch[f.at(first + k * stride + PADDING + x, lane)] = sums[k * LANES + lane]
-            row = (image * height + y) * columns
-            for step in range((columns + LANES - 1) // LANES):
-                x = wp.min(step * LANES, columns - LANES)
-                for lane in range(LANES):
-                    p = a[f.at(row + x, lane)]
-                    d = p - b[f.at(row + x, lane)]
-                    v = f.across(scratch, first + stride + x, lane) * p + f.across(scratch, first + 2 * stride + x, lane) * d
-                    v = f.across(scratch, first + x, lane) + real(2.0) * v
-                    if wp.static(summed):
-                        sign = wp.where(d > real(0.0), v_result[1], wp.where(d < real(0.0), -v_result[1], real(0.0)))
-                        v = sign - v_result[0] * v
-                    sums[lane] = v
-                for lane in range(LANES):
-                    v_a[f.at(row + x, lane)] = sums[lane]
-
-    return SimpleNamespace(forward=forward, backward=backward)
+    return walk
 
 
 SIDE = 16
@@ -331,9 +312,9 @@ class _Ssim(torch.autograd.Function):
             inputs = [image, target, height, columns, int(summed), result, *partials]
             launch.launch(cuda_forward, tasks * THREADS, inputs, image.device, block_dim=THREADS)
         else:
-            kernel = make_kernels(launch.real_of(image), summed).forward
             workspace = image.new_empty(tasks * 5 * (columns + 2 * PADDING))
-            inputs = [image, target, height, blocks, columns, workspace, result, *partials]
+            inputs = [image, target, height, blocks, columns, workspace, result, *partials, image.new_empty(0)]
+            kernel = make_kernel(launch.real_of(image), summed, False)
             launch.launch(kernel, tasks, inputs, image.device, cost=BLOCK * columns)
         keep(ctx, image, target, *partials)
         ctx.summed, ctx.tasks = summed, tasks
@@ -351,8 +332,8 @@ class _Ssim(torch.autograd.Function):
         else:
             fields = partials if ctx.summed else [v_result * t for t in partials]  # v_result is then not read
             workspace = image.new_empty(tasks * 3 * (columns + 2 * PADDING))
-            inputs = [image, target, *fields, v_result, height, -(-height // BLOCK), columns, workspace, v_image]
-            kernel = make_kernels(launch.real_of(image), ctx.summed).backward
+            inputs = [image, target, height, -(-height // BLOCK), columns, workspace, v_result, *fields, v_image]
+            kernel = make_kernel(launch.real_of(image), ctx.summed, True)
             launch.launch(kernel, tasks, inputs, image.device, cost=BLOCK * columns)
         return v_image, None, None
 

@@ -47,16 +47,19 @@ def fit_kernels(cuda: bool) -> list[tuple[wp.Kernel, int]]:
     of_renders += [blend.make_segments(real).gather_weights, mcmc.move]
     rough = [*vars(roughness.make_kernels(real)).values()]
     if not cuda:
-        variant, summed = (CAMERA_MODEL, "stored", False, sh.BASES), ssim.make_kernels(real, True)
+        variant, summed = (
+            (CAMERA_MODEL, "stored", False, sh.BASES),
+            [ssim.make_kernel(real, True, way) for way in (False, True)],
+        )
         color, deep = (blend_cpu.make_backward(real, TILE_SIZE, COLORS, deep=deep) for deep in (False, True))
         kernels = [
             sweep.match, sweep.best, sweep.follow_cpu, start, project_cpu.make_forward(real, *variant), update.sample, lists,
-            *of_steps, blend_cpu.make_forward(real, TILE_SIZE, COLORS), summed.forward, summed.backward, *rough, color,
+            *of_steps, blend_cpu.make_forward(real, TILE_SIZE, COLORS), *summed, *rough, color,
             blend.make_segments(real, VALUES, 9 + COLORS).sum_gradients, project_cpu.make_backward(real, *variant, False),
             *(update.make_adam_kernel(real, split, update.LANES) for split in (True, False)), neighbours.bound_by_reach,
             # after the first step
             of_renders[0], of_renders[1], walk.make_weights(real, TILE_SIZE), update.squared_errors,
-            scoring(), *of_renders[2:], ssim.make_kernels(real, False).backward, deep,
+            scoring(), *of_renders[2:], ssim.make_kernel(real, False, True), deep,
         ]  # fmt: skip
         return [(kernel, 1) for kernel in kernels]
     warps = 32 * blend_cuda.WARPS
@@ -89,7 +92,7 @@ def call_kernels(cuda: bool) -> list[tuple[wp.Kernel, int]]:
 
 def scoring() -> wp.Kernel:
     """Return the kernel that computes SSIM for scores, on the CPU."""
-    kernel: wp.Kernel = ssim.make_kernels(wp.float32, False).forward
+    kernel: wp.Kernel = ssim.make_kernel(wp.float32, False, False)
     return kernel
 
 
