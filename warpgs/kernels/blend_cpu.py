@@ -27,7 +27,7 @@ def make_backward(real, tile_size: int, channels: int, absgrad: bool = False, de
     prefetch, prefetch_slot = make_prefetch(b.record), make_prefetch(real, 2)
     prefetch_end, prefetch_value = make_prefetch(wp.int32), make_prefetch(real)
     stride, side, pixels_of_tile = tile_size * (tile_size + 1), tile_size, tile_size * tile_size
-    strip, half, abreast = STRIP, STRIP // 2, ABREAST
+    strip, half = STRIP, STRIP // 2
     parts, strips = tile_size // STRIP, tile_size * (tile_size // STRIP)
     batch, together = BATCH, TOGETHER
     # masks of indices, whose ranges are powers of 2
@@ -62,7 +62,7 @@ def make_backward(real, tile_size: int, channels: int, absgrad: bool = False, de
         """Gradient and weight of the current instance at each pixel that it reaches."""
 
         lead: lead_reals
-        falloff: wp.types.vector((tile_size + ABREAST) * STRIP, real)  # of one column of strips, and of a few rows beyond it
+        falloff: b.column_reals  # of one column of strips, and of a few rows beyond it
         v: tile_reals  # gradient of the falloff
         w: tile_reals  # blending weight
         trail: trail_reals
@@ -189,23 +189,11 @@ def make_backward(real, tile_size: int, channels: int, absgrad: bool = False, de
         """Walk back past a Gaussian: find its weights and the gradients of its falloff, and what lies before it."""
         u11 = at(g.u11[j])
         opacity = at(g.opacity[j])
-        e1 = f.abreast()
-        e22 = f.abreast()
         for part in range(parts):
             row = at_int(g.begin[part * batch + j])
             end = at_int(g.end[part * batch + j])
             at_left = f.apart(u11 * (real(left + part * strip) + real(0.5) - at(g.x[j])))
-            # Falloffs have a loop of their own, several strips at a time, since each is a long chain of dependent operations.
-            k = int(0)
-            while k < end - row:
-                for lane in range(strip):
-                    for n in range(abreast):
-                        e1[n] = at_left + at(rows.e12[(row + k + n) & row_bits]) + at(rows.ramp[lane])
-                        e22[n] = at(rows.e22[(row + k + n) & row_bits])
-                    found = f.falloffs(wp.cw_mul(e1, e1) + e22)
-                    for n in range(abreast):
-                        shades.falloff[(k + n) * strip + lane] = found[n]
-                k += abreast  # the last few may lie beyond the end; their values are not read
+            b.find_falloffs(at_left, row, end, rows, shades.falloff)
             k = int(0)
             while row < end:
                 o = (part * side + row) & strip_bits
@@ -355,11 +343,14 @@ def make_backward(real, tile_size: int, channels: int, absgrad: bool = False, de
                 last -= 1
                 prefetch(projected, gaussian_ids[wp.max(last - batch, 0)])  # also those of the next tile
                 prefetch_slot(v_slots, slots[wp.max(last - together, 0)])
-                b.find_row_values(j & bits, top, gaussians, rows)
-                walk(j & bits, last, left, settings, gaussians, rows, pixels, shades)
+                n = j & bits
+                b.find_row_values(
+                    at(gaussians.y[n]), at(gaussians.u11[n]), at(gaussians.u12[n]), at(gaussians.u22[n]), top, rows
+                )
+                walk(n, last, left, settings, gaussians, rows, pixels, shades)
                 # Apart from the walk, since both together would need more than 16 registers.
-                sums = sum_up(j & bits, left, gaussians, rows, pixels, shades)
-                hold(j & bits, sums, held)
+                sums = sum_up(n, left, gaussians, rows, pixels, shades)
+                hold(n, sums, held)
                 j += 1
                 if j % together == 0 or j == count:
                     fold(held)

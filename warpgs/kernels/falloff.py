@@ -219,7 +219,9 @@ def make_batches(real, tile_size: int, channels: int):
     strip_ints = vector(tile_size * (tile_size // STRIP), wp.int32)
     side = wp.constant(tile_size)
     parts = wp.constant(tile_size // STRIP)
-    bits = wp.constant(BATCH - 1)
+    bits, row_bits = wp.constant(BATCH - 1), wp.constant(tile_size - 1)
+    abreast = wp.constant(ABREAST)
+    column_reals = vector((tile_size + ABREAST) * STRIP, real)
     place_z = wp.constant(6 + channels)
 
     @wp.struct
@@ -323,12 +325,8 @@ def make_batches(real, tile_size: int, channels: int):
                         b.end[o] = wp.max(at_int(b.end[o]), wp.where(hit, row + 1, 0))
 
     @wp.func(inline=True)
-    def find_row_values(j: wp.int32, top: wp.int32, b: wp.ref[Batch], rows: wp.ref[Rows]):
+    def find_row_values(y: real, u11: real, u12: real, u22: real, top: wp.int32, rows: wp.ref[Rows]):
         """Compute the values of a Gaussian on all rows."""
-        u11 = at(b.u11[j])
-        u12 = at(b.u12[j])
-        u22 = at(b.u22[j])
-        y = at(b.y[j])
         for row in range(side):
             dy = real(top + row) + real(0.5) - y
             e2 = u22 * dy
@@ -338,9 +336,26 @@ def make_batches(real, tile_size: int, channels: int):
         for lane in range(STRIP):
             rows.ramp[lane] = f.apart(u11 * real(lane))
 
+    @wp.func(inline=True)
+    def find_falloffs(at_left: real, first: wp.int32, end: wp.int32, rows: wp.ref[Rows], falloffs: wp.ref[column_reals]):
+        """Compute the falloffs on the strips of a column, from row ``first`` on; ``at_left`` is e1 at the left, less e12."""
+        # in a loop of their own, several strips at a time, since each is a long chain of dependent operations
+        e1 = f.abreast()
+        squares = f.abreast()
+        k = int(0)
+        while k < end - first:
+            for lane in range(STRIP):
+                for n in range(abreast):
+                    e1[n] = at_left + at(rows.e12[(first + k + n) & row_bits]) + at(rows.ramp[lane])
+                    squares[n] = at(rows.e22[(first + k + n) & row_bits])
+                found = f.falloffs(wp.cw_mul(e1, e1) + squares)
+                for n in range(abreast):
+                    falloffs[(k + n) * STRIP + lane] = found[n]
+            k += abreast  # the last few may lie beyond the end; their values are not read
+
     return SimpleNamespace(
-        record=record, Batch=Batch, Rows=Rows, strip_ints=strip_ints, at=at, at_int=at_int, load=load, find_rows=find_rows,
-        find_row_values=find_row_values,
+        record=record, Batch=Batch, Rows=Rows, strip_ints=strip_ints, column_reals=column_reals, at=at, at_int=at_int,
+        load=load, find_rows=find_rows, find_row_values=find_row_values, find_falloffs=find_falloffs,
     )  # fmt: skip
 
 

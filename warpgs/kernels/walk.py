@@ -9,7 +9,7 @@ import warp as wp
 from warpgs.kernels import blend_cuda, launch
 from warpgs.kernels.blend import check_slots, composite, is_native, make_segments
 from warpgs.kernels.ellipse import PROJECTED_SIZE
-from warpgs.kernels.falloff import ABREAST, STRIP, TOGETHER, Pass, make_functions, make_struct
+from warpgs.kernels.falloff import COLORS, STRIP, TOGETHER, Pass, make_batches, make_functions, make_struct
 from warpgs.kernels.native import ROLLED, SCALE, Floats, IntRows, Ints, cuda_kernel, make_prefetch, source
 from warpgs.kernels.tiles import Tiles
 
@@ -133,12 +133,11 @@ def make_heaviest(real):
 @functools.cache
 def make_weights(real, tile_size: int):
     """Make the kernel of `contributions`, one task per tile; its loops over a strip have no branch, so that they vectorise."""
-    f, Rows = make_functions(real), wp.array2d(dtype=real)
+    f, b, Rows = make_functions(real), make_batches(real, tile_size, COLORS), wp.array2d(dtype=real)
     tile_reals = wp.types.vector(tile_size * (tile_size + 1), real)
     strip_reals = wp.types.vector(STRIP, real)
-    prefetch, ahead = make_prefetch(real, 2), TOGETHER
-    row_reals, column_reals = wp.types.vector(tile_size, real), wp.types.vector((tile_size + ABREAST) * STRIP, real)
-    side, strip, parts, abreast, bits, outside = tile_size, STRIP, tile_size // STRIP, ABREAST, tile_size - 1, real(-1.0)
+    at, prefetch, ahead = b.at, make_prefetch(real, 2), TOGETHER
+    side, strip, parts, outside = tile_size, STRIP, tile_size // STRIP, real(-1.0)
 
     @wp.kernel(enable_backward=False, module="unique", module_options=ROLLED)
     def weigh(
@@ -155,14 +154,10 @@ def make_weights(real, tile_size: int):
             for column in range(side):
                 inside = place[1] + column < settings.width and place[2] + row < settings.height
                 t[row * side + column] = wp.where(inside, real(1.0), outside)
-        ramp = strip_reals()
         sums = strip_reals()
         maxima = strip_reals()
-        e12 = row_reals()
-        e22 = row_reals()
-        e1 = f.abreast()
-        squares = f.abreast()
-        falloffs = column_reals()  # of a column of strips
+        rows = b.Rows()
+        falloffs = b.column_reals()  # of a column of strips
         left_open = int(1)
         instance = ranges[tile, 0]
         while instance < ranges[tile, 1] and left_open > 0:
@@ -178,32 +173,18 @@ def make_weights(real, tile_size: int):
             opacity = projected[i, 5]
             bounds = f.bounds_of(mx, my, u11, u22, projected[i, 10], projected[i, 11], settings.whole_tiles)
             for lane in range(strip):
-                ramp[lane] = f.apart(u11 * real(lane))
                 sums[lane] = real(0.0)
                 maxima[lane] = real(0.0)
-            for row in range(side):
-                dy = real(top + row) + real(0.5) - my
-                e2 = u22 * dy
-                e12[row] = f.apart(u12 * dy)
-                e22[row] = f.apart(e2 * e2)
+            b.find_row_values(my, u11, u12, u22, top, rows)
             for part in range(parts):
                 at_left = f.apart(u11 * (real(left + part * strip) + real(0.5) - mx))
                 first = int(side)
                 end = int(0)
                 for row in range(side):
-                    hit = f.reaches(at_left + e12[row], u11, e22[row], bounds[0], bounds[1])
+                    hit = f.reaches(at_left + at(rows.e12[row]), u11, at(rows.e22[row]), bounds[0], bounds[1])
                     first = wp.min(first, wp.where(hit, row, side))
                     end = wp.max(end, wp.where(hit, row + 1, 0))
-                k = int(0)
-                while k < end - first:
-                    for lane in range(strip):
-                        for n in range(abreast):
-                            e1[n] = at_left + e12[(first + k + n) & bits] + ramp[lane]
-                            squares[n] = e22[(first + k + n) & bits]
-                        found = f.falloffs(wp.cw_mul(e1, e1) + squares)
-                        for n in range(abreast):
-                            falloffs[(k + n) * strip + lane] = found[n]
-                    k += abreast  # the last few may lie beyond the end; their values are not read
+                b.find_falloffs(at_left, first, end, rows, falloffs)
                 k = int(0)
                 while k < end - first:
                     base = wp.max((first + k) * side + part * strip, 0)
