@@ -23,11 +23,11 @@ from warpgs.device import (
 )
 from warpgs.errors import ResourceError
 from warpgs.kernels import launch, native as cuda
-from warpgs.kernels.ellipse import PROJECTED_SIZE, make_spans
+from warpgs.kernels.ellipse import make_spans
 from warpgs.kernels.graphs import TORCH, Allocator
 from warpgs.kernels.launch import sort_pairs
 from warpgs.kernels.native import EXACT, SCALE, IntRows, Ints, Longs, make_prefetch, source
-from warpgs.kernels.project_cpu import LANES, make_lanes
+from warpgs.kernels.project_cpu import LANES
 
 EACH = 4
 """Number of items per thread in short kernels on CUDA: with one item, waiting for its load would take longer than the work."""
@@ -223,7 +223,7 @@ def make_emit_cpu(real, slotted: bool):
     vec3, Rows = wp.types.vector(3, real), wp.array2d(dtype=real)
     lane_reals = wp.types.vector(LANES, real)
     lane_ints = wp.types.vector(LANES, wp.int32)
-    lanes, row = LANES, make_lanes(real, PROJECTED_SIZE)
+    lanes = LANES
     write, prefetch, prefetch_count = make_write(slotted), make_prefetch(real, 2), make_prefetch(wp.int32)
 
     @wp.kernel(enable_backward=False, module="unique", module_options=EXACT)
@@ -244,8 +244,14 @@ def make_emit_cpu(real, slotted: bool):
         first_tile = lane_ints()
         slot = lane_ints()
         end = lane_ints()
+        x = lane_reals()
+        y = lane_reals()
+        u11 = lane_reals()
+        u12 = lane_reals()
+        u22 = lane_reals()
         reach = lane_reals()
-        records = row.vectors()
+        half_width = lane_reals()
+        half_height = lane_reals()
         for lane in range(used):
             i = order[first + lane]
             touched = tile_counts[i]
@@ -260,14 +266,20 @@ def make_emit_cpu(real, slotted: bool):
             end[lane] = int(last)
             slot[lane] = int(last) - touched
             starts[i] = int(last) - touched
-            row.load(projected, i, lane, records)
+            x[lane] = projected[i, 0]
+            y[lane] = projected[i, 1]
+            u11[lane] = projected[i, 2]
+            u12[lane] = projected[i, 3]
+            u22[lane] = projected[i, 4]
+            reach[lane] = projected[i, 5]
+            half_width[lane] = projected[i, 10]
+            half_height[lane] = projected[i, 11]
         begin_row = lane_ints()
         end_row = lane_ints()
         begin_column = lane_ints()
         end_column = lane_ints()
         for lane in range(lanes):
-            p = row.get(records, lane)
-            rows = s.tile_rows(p[1], p[11], origin_y, height, tile_size)
+            rows = s.tile_rows(y[lane], half_height[lane], origin_y, height, tile_size)
             touches = slot[lane] < end[lane]
             begin_row[lane] = wp.where(touches, rows[0], 0)
             end_row[lane] = wp.where(touches, rows[1], 0)
@@ -275,15 +287,16 @@ def make_emit_cpu(real, slotted: bool):
         for lane in range(used):
             most = wp.max(most, end_row[lane] - begin_row[lane])
             if slot[lane] < end[lane]:
-                reach[lane] = s.reach_of(records[5 * lanes + lane], alpha_cut, square_sigma)
+                reach[lane] = s.reach_of(reach[lane], alpha_cut, square_sigma)
         for k in range(most):
             for lane in range(lanes):
-                y = begin_row[lane] + k
-                p = row.get(records, lane)
-                factor = vec3(p[2], p[3], p[4])
-                span = s.tile_columns(p[0], p[1], factor, reach[lane], p[10], p[11], y, origin_x, width, tile_size)
+                row = begin_row[lane] + k
+                span = s.tile_columns(
+                    x[lane], y[lane], vec3(u11[lane], u12[lane], u22[lane]), reach[lane], half_width[lane], half_height[lane],
+                    row, origin_x, width, tile_size,
+                )  # fmt: skip
                 begin_column[lane] = span[0]
-                end_column[lane] = wp.where(y < end_row[lane], span[1], 0)
+                end_column[lane] = wp.where(row < end_row[lane], span[1], 0)
             for lane in range(used):
                 to = slot[lane]
                 key = first_tile[lane] + (begin_row[lane] + k) * columns + begin_column[lane]
