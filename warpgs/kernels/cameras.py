@@ -141,7 +141,7 @@ def make_linear(real: type) -> SimpleNamespace:
         def project_axes(position: vec3, K: mat33, lens: Reals, point: vec2, axes: mat33) -> Rows:
             j = jacobian(position, K, lens, point)
             turned = wp.transpose(axes)
-            return Rows(turned * j.first, turned * j.second)
+            return Rows(turned * j.first, turned * j.second)  # type: ignore[call-arg]  # a struct of Warp
 
         @wp.func
         def axes_backward(position: vec3, K: mat33, lens: Reals, point: vec2, v_first: vec3, v_second: vec3) -> mat33:
@@ -429,7 +429,7 @@ def _make_distortion(real: type) -> SimpleNamespace:
         m2 = two * (k5 + t * three * k6)
         value = (one + t * (k1 + t * (k2 + t * k3))) / m
         first = (k1 + t * (two * k2 + t * three * k3) - value * m1) / m
-        return Radial(value, first, (two * (k2 + t * three * k3) - two * first * m1 - value * m2) / m, m)
+        return Radial(value, first, (two * (k2 + t * three * k3) - two * first * m1 - value * m2) / m, m)  # type: ignore[call-arg]
 
     @wp.func
     def distort(a: real, b: real, lens: Reals) -> Distorted:
