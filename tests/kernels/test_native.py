@@ -53,7 +53,6 @@ def test_long_lists_come_first(count):
 @functools.cache
 def small_kernels() -> SimpleNamespace:
     """A kernel for each function, and one for the test of a block of pixels."""
-    lanes = native.make_functions()
     numbers = {"SIDE": 16, "STATE": 5, "WARPS": 2, "STRIDE": 12, "SCALE": blend_cuda.SCALE}
 
     @wp.func_native(
@@ -77,7 +76,7 @@ def small_kernels() -> SimpleNamespace:
     @wp.kernel(enable_backward=False, module="unique")
     def deal(begin: int, wanted: wp.array(dtype=int), found: wp.array(dtype=int)):
         i = begin + wp.tid()
-        found[i] = lanes.compact(i, wanted[i])
+        found[i] = native.compact(i, wanted[i])
 
     return SimpleNamespace(block=block, deal=deal)
 

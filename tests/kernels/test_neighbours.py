@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 
 from tests.reference.neighbours import log_pixel, log_reach, mean_square_distances_reference
 from tests.scenes import ring
-from warpgs.kernels.neighbours import SMALLEST_PIXEL, SMALLEST_REACH, camera_reach, mean_square_distances, pixel_size
+from warpgs.kernels.neighbours import SMALLEST, camera_reach, mean_square_distances, pixel_size
 from warpgs.pipeline.model.limits import camera_rows
 from warpgs.scene import Camera
 
@@ -71,7 +71,7 @@ def test_it_is_the_fraction_of_the_distance_to_the_nearest(device, cameras):
     generator = torch.Generator().manual_seed(cameras)
     means = torch.randn(1000, 3, generator=generator) * torch.logspace(-3, 6, 1000)[:, None]
     centers = torch.randn(cameras, 3, generator=generator)
-    exact = torch.from_numpy(log_reach(means.numpy(), centers.numpy(), 1 / 3, SMALLEST_REACH))
+    exact = torch.from_numpy(log_reach(means.numpy(), centers.numpy(), 1 / 3, SMALLEST))
     found = camera_reach(means.to(device), centers.to(device), 1 / 3)
     assert found.dtype == torch.float32 and torch.allclose(found.cpu().double(), exact, rtol=1e-6, atol=1e-5)
 
@@ -99,11 +99,11 @@ def test_it_is_the_smallest_pixel_of_those_that_see_it(device, cameras):
     generator = torch.Generator().manual_seed(cameras)
     means = torch.randn(2000, 3, generator=generator) * torch.logspace(-2, 4, 2000)[:, None]
     given = rows(cameras)
-    exact = torch.from_numpy(log_pixel(means.numpy(), given.numpy(), 0.4, SMALLEST_PIXEL))
+    exact = torch.from_numpy(log_pixel(means.numpy(), given.numpy(), 0.4, SMALLEST))
     found = pixel_size(means.to(device), given.to(device), 0.4).cpu().double()
     same = torch.isclose(found, exact, rtol=1e-5, atol=1e-5)
     assert found.dtype == torch.float64 and float(same.double().mean()) > 0.998
-    seen = exact > math.log(2 * SMALLEST_PIXEL)
+    seen = exact > math.log(2 * SMALLEST)
     assert bool(seen.any()) and (cameras == 40 or not bool(seen.all()))
 
 
@@ -120,17 +120,17 @@ def test_a_row_says_what_a_camera_sees(device):
     ):
         found = pixel_size(means.to(device), camera_rows([camera], device), 1.0).cpu()
         for size, expected in zip(found.exp().tolist(), wanted, strict=True):
-            assert size == pytest.approx(SMALLEST_PIXEL if expected is None else expected, rel=1e-5)
+            assert size == pytest.approx(SMALLEST if expected is None else expected, rel=1e-5)
     assert camera_rows([pinhole, *ring(3)], device).shape == (4, 9)
 
 
 def test_sizes_at_a_camera_and_without_gaussians(device):
     """The smallest size; nothing from nothing; a NaN is seen by none."""
     center = torch.tensor([[1.0, 2.0, 3.0]], device=device)
-    assert float(camera_reach(center, center, 0.5)) == pytest.approx(math.log(SMALLEST_REACH))
+    assert float(camera_reach(center, center, 0.5)) == pytest.approx(math.log(SMALLEST))
     assert camera_reach(center[:0], center, 0.5).shape == (0,)
     given = rows(1).to(device)
-    assert float(pixel_size(given[:, :3].contiguous(), given, 0.5)) == pytest.approx(math.log(SMALLEST_PIXEL))
+    assert float(pixel_size(given[:, :3].contiguous(), given, 0.5)) == pytest.approx(math.log(SMALLEST))
     assert pixel_size(given[:0, :3], given, 0.5).shape == (0,)
     broken = torch.full((1, 3), math.nan, device=device)
-    assert float(pixel_size(broken, given, 0.5)) == pytest.approx(math.log(SMALLEST_PIXEL))
+    assert float(pixel_size(broken, given, 0.5)) == pytest.approx(math.log(SMALLEST))

@@ -14,7 +14,7 @@ from warpgs.kernels import blend_cpu, blend_cuda, launch
 from warpgs.kernels.falloff import COLORS, LARGEST_STOP, VALUES, WIDTHS, Pass
 from warpgs.kernels.graphs import TORCH, Allocator
 from warpgs.kernels.launch import first_order, keep, kept
-from warpgs.kernels.native import ROLLED, make_prefetch
+from warpgs.kernels.native import ROLLED, Ints, make_prefetch
 from warpgs.kernels.tiles import Tiles
 
 
@@ -42,12 +42,13 @@ def make_segments(real, values: int = VALUES, width: int = 9 + COLORS):
     """Make the kernels that sum gradient slots of ``values`` numbers, always in slot order, into rows of ``width`` numbers."""
     reals = wp.types.vector(values, real)
     record = wp.types.vector(width, real)
+    Reals, Rows = wp.array(dtype=real), wp.array2d(dtype=real)
     prefetch = make_prefetch(reals)
     lanes = SUMMED
 
     @wp.kernel(enable_backward=False, module="unique", module_options=ROLLED)
     def sum_gradients(
-        begin: int, v_slots: wp.array(dtype=reals), starts: wp.array(dtype=int), counts: wp.array(dtype=int),
+        begin: int, v_slots: wp.array(dtype=reals), starts: Ints, counts: Ints,
         # outputs
         v_projected: wp.array(dtype=record),
     ):  # fmt: skip
@@ -68,9 +69,9 @@ def make_segments(real, values: int = VALUES, width: int = 9 + COLORS):
 
     @wp.kernel(enable_backward=False, module=f"warpgs.kernels.blend.{real.__name__}.{values}")
     def gather_weights(
-        begin: int, weights: wp.array2d(dtype=real), starts: wp.array(dtype=int), counts: wp.array(dtype=int),
+        begin: int, weights: Rows, starts: Ints, counts: Ints,
         # outputs
-        sums: wp.array(dtype=real), maxima: wp.array(dtype=real),
+        sums: Reals, maxima: Reals,
     ):  # fmt: skip
         i = begin + wp.tid()
         total = real(0.0)
@@ -118,7 +119,7 @@ def composite(
         settings.struct(tiles.size, real), projected, tiles.ranges, tiles.gaussian_ids, backgrounds, rgb,
         launch.row_stride(rgb), alpha, depth, transmittances, weights, ends,
     ]  # fmt: skip
-    kernel = blend_cpu.make_kernels(real, tiles.size, channels).forward
+    kernel = blend_cpu.make_forward(real, tiles.size, channels)
     launch.launch(kernel, len(tiles.ranges), inputs, device, cost=10_000, block_dim=32)
     return rgb, alpha, depth, transmittances, weights, ends, allocator.saved((0,), projected.dtype, device)
 
@@ -169,7 +170,7 @@ def composite_gradients(
         transmittances, weights, depth, ends, v_rgb, launch.row_stride(v_rgb),
         *(nothing if v is None else v.contiguous() for v in (v_alpha, v_depth)), v_slots,
     ]  # fmt: skip
-    kernel = blend_cpu.make_kernels(real, tiles.size, channels, settings.absgrad, deep).backward
+    kernel = blend_cpu.make_backward(real, tiles.size, channels, settings.absgrad, deep)
     launch.launch(kernel, len(tiles.ranges), inputs, device, cost=10_000, block_dim=32)
     inputs = [v_slots, tiles.starts, tiles.counts, v_projected]
     tasks, kernel = -(-len(tiles.counts) // SUMMED), make_segments(real, values, projected.shape[-1]).sum_gradients
@@ -265,12 +266,13 @@ def make_kernels(real, width: int):
     module = f"warpgs.kernels.blend_channels.{real.__name__}.{width}"
     geometry, box = GEOMETRY, GEOMETRY + COLORS
     own, rest = width, GEOMETRY + width
+    Rows = wp.array2d(dtype=real)
 
     @wp.kernel(enable_backward=False, module=module)
     def color(
-        begin: int, projected: wp.array2d(dtype=real), counts: wp.array(dtype=int), colors: wp.array2d(dtype=real), first: int,
+        begin: int, projected: Rows, counts: Ints, colors: Rows, first: int,
         # outputs
-        colored: wp.array2d(dtype=real),
+        colored: Rows,
     ):  # fmt: skip
         i = begin + wp.tid()
         if counts[i] > 0:  # rows of others are not read
@@ -288,9 +290,9 @@ def make_kernels(real, width: int):
 
     @wp.kernel(enable_backward=False, module=module)
     def add(
-        begin: int, v: wp.array2d(dtype=real), counts: wp.array(dtype=int), first: int,
+        begin: int, v: Rows, counts: Ints, first: int,
         # outputs, which the kernel adds to
-        v_projected: wp.array2d(dtype=real), v_colors: wp.array2d(dtype=real),
+        v_projected: Rows, v_colors: Rows,
     ):  # fmt: skip
         row = begin + wp.tid()
         rows = v_colors.shape[0]

@@ -1,13 +1,12 @@
 """Blending kernels in plain Warp, one task per tile; used on the CPU, and for float64 on every device."""
 
 import functools
-from types import SimpleNamespace
 
 import warp as wp
 
 from warpgs.constants import SMALLEST_WEIGHT
-from warpgs.kernels.falloff import ABREAST, BATCH, COLORS, STRIP, TOGETHER, VALUES, make_batches, make_functions, make_records
-from warpgs.kernels.native import ROLLED, make_prefetch
+from warpgs.kernels.falloff import ABREAST, BATCH, COLORS, STRIP, TOGETHER, VALUES, make_batches, make_functions
+from warpgs.kernels.native import ROLLED, IntRows, Ints, make_prefetch
 
 # The backward blending kernel in plain Warp, one task per tile; used on the CPU, and for float64 on every device.
 #
@@ -20,15 +19,15 @@ from warpgs.kernels.native import ROLLED, make_prefetch
 def make_backward(real, tile_size: int, channels: int, absgrad: bool = False, deep: bool = True):
     """Make the backward kernel; without ``deep``, depth and alpha have no gradient, and their data is not read."""
     f = make_functions(real)
-    r = make_records(real, tile_size, channels, absgrad)
     b = make_batches(real, tile_size, channels)
+    Reals, Rows = wp.array(dtype=real), wp.array2d(dtype=real)
     at, at_int = b.at, b.at_int
-    count = VALUES + channels - COLORS + 2 * absgrad
-    values, together_values = count, TOGETHER * count
+    values = VALUES + channels - COLORS + 2 * absgrad
+    together_values = TOGETHER * values
     prefetch, prefetch_slot = make_prefetch(b.record), make_prefetch(real, 2)
     prefetch_end, prefetch_value = make_prefetch(wp.int32), make_prefetch(real)
     stride, side, pixels_of_tile = tile_size * (tile_size + 1), tile_size, tile_size * tile_size
-    strip, half, abreast = STRIP, STRIP // 2, ABREAST
+    strip, half = STRIP, STRIP // 2
     parts, strips = tile_size // STRIP, tile_size * (tile_size // STRIP)
     batch, together = BATCH, TOGETHER
     # masks of indices, whose ranges are powers of 2
@@ -39,15 +38,63 @@ def make_backward(real, tile_size: int, channels: int, absgrad: bool = False, de
     # values of a row of gradients that are at most 64 bytes apart
     spacing = max(1, 64 // ((4 if real is wp.float32 else 8) * channels))
     apart, touches = spacing, -(-(tile_size - 1) // spacing) + 1
+    # Entries of pixels follow in the order of `make_batches`. Vectors are one row longer than the tile: see `make_forward`.
+    # Channels are stored one after the other. In a gradient, the two magnitudes follow the channels if ``absgrad`` is set. The
+    # compiler puts records 8 bytes before a cache line; with a vector of 2 in front, no strip lies in two lines.
+    lead_reals, trail_reals, strip_reals = (wp.types.vector(n, real) for n in (2, 14, STRIP))
+    tile_reals = wp.types.vector(tile_size * (tile_size + 1), real)
+
+    @wp.struct
+    class Pixels:
+        """Values of each pixel of a tile."""
+
+        lead: lead_reals
+        t: tile_reals  # transmittance behind the current instance, then before it
+        behind: tile_reals  # sum of w d over what lies behind, background included
+        g: wp.types.vector(channels * tile_size * (tile_size + 1), real)  # upstream gradient of the channels
+        v_z: tile_reals
+        v_w: tile_reals
+        end: wp.types.vector(tile_size * (tile_size + 1), wp.int32)  # one past the last instance that was blended
+        trail: trail_reals
+
+    @wp.struct
+    class Shades:
+        """Gradient and weight of the current instance at each pixel that it reaches."""
+
+        lead: lead_reals
+        falloff: b.column_reals  # of one column of strips, and of a few rows beyond it
+        v: tile_reals  # gradient of the falloff
+        w: tile_reals  # blending weight
+        trail: trail_reals
+
+    @wp.struct
+    class Gradient:
+        """Sums of one instance's gradient, by place in a strip."""
+
+        e1: strip_reals
+        y: strip_reals
+        xx: strip_reals
+        xy: strip_reals
+        yy: strip_reals
+        opacity: strip_reals
+        color: wp.types.vector((channels + 2 * absgrad) * STRIP, real)
+        z: strip_reals
+
+    @wp.struct
+    class Held:
+        """Sums of several instances' gradients, one instance after the other."""
+
+        halves: wp.types.vector(TOGETHER * values * (STRIP // 2), real)  # by place in half a strip
+        totals: wp.types.vector(TOGETHER * values, real)
 
     @wp.func(inline=True)
-    def load_channels(o: wp.int32, p: wp.int32, v_rgb: wp.array(dtype=real), pixels: wp.ref[r.Pixels]):
+    def load_channels(o: wp.int32, p: wp.int32, v_rgb: Reals, pixels: wp.ref[Pixels]):
         """Load the upstream gradient of a pixel's channels, whose first has the index ``o``."""
         for c in range(wp.static(channels)):
             pixels.g[c * stride + p] = v_rgb[o + c]
 
     @wp.func(inline=True)
-    def behind_of(p: wp.int32, camera: wp.int32, backgrounds: wp.array2d(dtype=real), pixels: wp.ref[r.Pixels]) -> real:
+    def behind_of(p: wp.int32, camera: wp.int32, backgrounds: Rows, pixels: wp.ref[Pixels]) -> real:
         """Return the product of a pixel's upstream gradient with the background."""
         product = backgrounds[camera, 0] * at(pixels.g[p])
         for c in range(1, wp.static(channels)):
@@ -56,9 +103,8 @@ def make_backward(real, tile_size: int, channels: int, absgrad: bool = False, de
 
     @wp.func(inline=True)
     def load_depth(
-        o: wp.int32, p: wp.int32, weights: wp.array(dtype=real), depth: wp.array(dtype=real), v_alpha: wp.array(dtype=real),
-        v_depth: wp.array(dtype=real), pixels: wp.ref[r.Pixels],
-    ):  # fmt: skip
+        o: wp.int32, p: wp.int32, weights: Reals, depth: Reals, v_alpha: Reals, v_depth: Reals, pixels: wp.ref[Pixels]
+    ):
         """Load what the gradients of depth and alpha add to the effect of a Gaussian on a pixel."""
         if wp.static(deep):
             v_w = real(0.0)
@@ -70,10 +116,9 @@ def make_backward(real, tile_size: int, channels: int, absgrad: bool = False, de
 
     @wp.func(inline=True)
     def load_pixels(
-        place: wp.vec3i, settings: f.Blending, backgrounds: wp.array2d(dtype=real), transmittances: wp.array(dtype=real),
-        weights: wp.array(dtype=real), depth: wp.array(dtype=real), ends: wp.array(dtype=int),
-        v_rgb: wp.array(dtype=real), pitch: wp.int32, v_alpha: wp.array(dtype=real), v_depth: wp.array(dtype=real),
-        pixels: wp.ref[r.Pixels], until: wp.ref[b.strip_ints],
+        place: wp.vec3i, settings: f.Blending, backgrounds: Rows, transmittances: Reals, weights: Reals, depth: Reals,
+        ends: Ints, v_rgb: Reals, pitch: wp.int32, v_alpha: Reals, v_depth: Reals, pixels: wp.ref[Pixels],
+        until: wp.ref[b.strip_ints],
     ) -> wp.int32:  # fmt: skip
         """Load the pixels, and for each strip one past the last instance that it blended; return the largest of these."""
         camera = place[0]
@@ -110,7 +155,7 @@ def make_backward(real, tile_size: int, channels: int, absgrad: bool = False, de
         return last
 
     @wp.func(inline=True)
-    def effect(j: wp.int32, p: wp.int32, g: wp.ref[b.Batch], pixels: wp.ref[r.Pixels]) -> real:
+    def effect(j: wp.int32, p: wp.int32, g: wp.ref[b.Batch], pixels: wp.ref[Pixels]) -> real:
         """Return the effect d of a Gaussian on a pixel."""
         product = at(g.color[j]) * at(pixels.g[p])
         for c in range(1, wp.static(channels)):
@@ -120,7 +165,7 @@ def make_backward(real, tile_size: int, channels: int, absgrad: bool = False, de
         return product
 
     @wp.func(inline=True)
-    def add_channels(w: real, p: wp.int32, lane: wp.int32, pixels: wp.ref[r.Pixels], s: wp.ref[r.Gradient]):
+    def add_channels(w: real, p: wp.int32, lane: wp.int32, pixels: wp.ref[Pixels], s: wp.ref[Gradient]):
         """Add a pixel's contribution to the gradient of the channels and of the depth."""
         for c in range(wp.static(channels)):
             s.color[c * strip + lane] = at(s.color[c * strip + lane]) + w * at(pixels.g[c * stride + p])
@@ -128,7 +173,7 @@ def make_backward(real, tile_size: int, channels: int, absgrad: bool = False, de
             s.z[lane] = at(s.z[lane]) + w * at(pixels.v_z[p])
 
     @wp.func(inline=True)
-    def add_magnitudes(u12: real, u22: real, v_e1: real, v_y: real, lane: wp.int32, s: wp.ref[r.Gradient]):
+    def add_magnitudes(u12: real, u22: real, v_e1: real, v_y: real, lane: wp.int32, s: wp.ref[Gradient]):
         """Add the magnitudes of a pixel's contributions to the gradient of the mean, if they are requested."""
         if wp.static(absgrad):
             x = wp.static(channels * STRIP) + lane
@@ -139,28 +184,16 @@ def make_backward(real, tile_size: int, channels: int, absgrad: bool = False, de
     @wp.func(inline=True)
     def walk(
         j: wp.int32, instance: wp.int32, left: wp.int32, settings: f.Blending, g: wp.ref[b.Batch], rows: wp.ref[b.Rows],
-        pixels: wp.ref[r.Pixels], shades: wp.ref[r.Shades],
+        pixels: wp.ref[Pixels], shades: wp.ref[Shades],
     ):  # fmt: skip
         """Walk back past a Gaussian: find its weights and the gradients of its falloff, and what lies before it."""
         u11 = at(g.u11[j])
         opacity = at(g.opacity[j])
-        e1 = f.abreast()
-        e22 = f.abreast()
         for part in range(parts):
             row = at_int(g.begin[part * batch + j])
             end = at_int(g.end[part * batch + j])
             at_left = f.apart(u11 * (real(left + part * strip) + real(0.5) - at(g.x[j])))
-            # Falloffs have a loop of their own, several strips at a time, since each is a long chain of dependent operations.
-            k = int(0)
-            while k < end - row:
-                for lane in range(strip):
-                    for n in range(abreast):
-                        e1[n] = at_left + at(rows.e12[(row + k + n) & row_bits]) + at(rows.ramp[lane])
-                        e22[n] = at(rows.e22[(row + k + n) & row_bits])
-                    found = f.falloffs(wp.cw_mul(e1, e1) + e22)
-                    for n in range(abreast):
-                        shades.falloff[(k + n) * strip + lane] = found[n]
-                k += abreast  # the last few may lie beyond the end; their values are not read
+            b.find_falloffs(at_left, row, end, rows, shades.falloff)
             k = int(0)
             while row < end:
                 o = (part * side + row) & strip_bits
@@ -188,11 +221,11 @@ def make_backward(real, tile_size: int, channels: int, absgrad: bool = False, de
 
     @wp.func(inline=True)
     def sum_up(
-        j: wp.int32, left: wp.int32, g: wp.ref[b.Batch], rows: wp.ref[b.Rows], pixels: wp.ref[r.Pixels],
-        shades: wp.ref[r.Shades],
-    ) -> r.Gradient:  # fmt: skip
+        j: wp.int32, left: wp.int32, g: wp.ref[b.Batch], rows: wp.ref[b.Rows], pixels: wp.ref[Pixels],
+        shades: wp.ref[Shades],
+    ) -> Gradient:  # fmt: skip
         """Return the sums over the strips that a Gaussian of the batch reaches."""
-        s = r.Gradient()
+        s = Gradient()
         u11 = at(g.u11[j])
         u12 = at(g.u12[j])
         u22 = at(g.u22[j])
@@ -222,13 +255,13 @@ def make_backward(real, tile_size: int, channels: int, absgrad: bool = False, de
         return s
 
     @wp.func(inline=True)
-    def hold_channels(o: wp.int32, lane: wp.int32, s: wp.ref[r.Gradient], held: wp.ref[r.Held]):
+    def hold_channels(o: wp.int32, lane: wp.int32, s: wp.ref[Gradient], held: wp.ref[Held]):
         """Keep the sums of the channels at a place in half a strip."""
         for k in range(wp.static(channels + 2 * absgrad)):
             held.halves[o + (6 + k) * half] = at(s.color[k * strip + lane]) + at(s.color[k * strip + half + lane])
 
     @wp.func(inline=True)
-    def hold(j: wp.int32, s: wp.ref[r.Gradient], held: wp.ref[r.Held]):
+    def hold(j: wp.int32, s: wp.ref[Gradient], held: wp.ref[Held]):
         """Keep the sums of a Gaussian until a group is complete; the two halves of a strip are added here."""
         o = (j & group_bits) * (values * half)
         for lane in range(half):
@@ -242,14 +275,14 @@ def make_backward(real, tile_size: int, channels: int, absgrad: bool = False, de
             hold_channels(o + lane, lane, s, held)
 
     @wp.func(inline=True)
-    def fold(held: wp.ref[r.Held]):
+    def fold(held: wp.ref[Held]):
         """Add up the sums that `hold` keeps of each Gaussian, always in the same order."""
         for n in range(together_values):
             o = n * half
             held.totals[n] = (at(held.halves[o]) + at(held.halves[o + 2])) + (at(held.halves[o + 1]) + at(held.halves[o + 3]))
 
     @wp.func(inline=True)
-    def store(j: wp.int32, g: wp.ref[b.Batch], held: wp.ref[r.Held], slot: wp.int32, v_slots: wp.array2d(dtype=real)):
+    def store(j: wp.int32, g: wp.ref[b.Batch], held: wp.ref[Held], slot: wp.int32, v_slots: Rows):
         """Store the gradient of an instance: the sums times factors that they share."""
         o = (j & group_bits) * values
         u11 = at(g.u11[j])
@@ -273,24 +306,22 @@ def make_backward(real, tile_size: int, channels: int, absgrad: bool = False, de
 
     @wp.kernel(enable_backward=False, module="unique", module_options=ROLLED)
     def backward(
-        begin: int, settings: f.Blending, projected: wp.array(dtype=b.record), ranges: wp.array2d(dtype=int),
-        gaussian_ids: wp.array(dtype=int), slots: wp.array(dtype=int), backgrounds: wp.array2d(dtype=real),
-        transmittances: wp.array(dtype=real), weights: wp.array(dtype=real), depth: wp.array(dtype=real),
-        ends: wp.array(dtype=int), v_rgb: wp.array(dtype=real), pitch: int,
-        v_alpha: wp.array(dtype=real), v_depth: wp.array(dtype=real),
+        begin: int, settings: f.Blending, projected: wp.array(dtype=b.record), ranges: IntRows, gaussian_ids: Ints, slots: Ints,
+        backgrounds: Rows, transmittances: Reals, weights: Reals, depth: Reals, ends: Ints, v_rgb: Reals, pitch: int,
+        v_alpha: Reals, v_depth: Reals,
         # outputs, zero on entry
-        v_slots: wp.array2d(dtype=real),
+        v_slots: Rows,
     ):  # fmt: skip
         tile = ranges.shape[0] - 1 - begin - wp.tid()  # from the last on, as the instances
         place = f.place_of(tile, side, settings)
         left = settings.origin_x + place[1]
         top = settings.origin_y + place[2]
-        pixels = r.Pixels()
+        pixels = Pixels()
         until = b.strip_ints()
         gaussians = b.Batch()
         rows = b.Rows()
-        shades = r.Shades()
-        held = r.Held()
+        shades = Shades()
+        held = Held()
         first = ranges[tile, 0]
         last = load_pixels(
             place, settings, backgrounds, transmittances, weights, depth, ends, v_rgb, pitch, v_alpha, v_depth, pixels, until
@@ -305,18 +336,21 @@ def make_backward(real, tile_size: int, channels: int, absgrad: bool = False, de
                 prefetch_value(v_rgb, (o + part * apart) * pitch)
         while last > first:
             count = wp.min(batch, last - first)
-            b.load(projected, gaussian_ids, last - 1, count, settings.whole_tiles, gaussians)
+            b.load(projected, gaussian_ids, last - 1, -1, count, settings.whole_tiles, gaussians)
             b.find_rows(left, top, last - 1, count, until, gaussians)
             j = int(0)
             while j < count:
                 last -= 1
                 prefetch(projected, gaussian_ids[wp.max(last - batch, 0)])  # also those of the next tile
                 prefetch_slot(v_slots, slots[wp.max(last - together, 0)])
-                b.find_row_values(j & bits, top, gaussians, rows)
-                walk(j & bits, last, left, settings, gaussians, rows, pixels, shades)
+                n = j & bits
+                b.find_row_values(
+                    at(gaussians.y[n]), at(gaussians.u11[n]), at(gaussians.u12[n]), at(gaussians.u22[n]), top, rows
+                )
+                walk(n, last, left, settings, gaussians, rows, pixels, shades)
                 # Apart from the walk, since both together would need more than 16 registers.
-                sums = sum_up(j & bits, left, gaussians, rows, pixels, shades)
-                hold(j & bits, sums, held)
+                sums = sum_up(n, left, gaussians, rows, pixels, shades)
+                hold(n, sums, held)
                 j += 1
                 if j % together == 0 or j == count:
                     fold(held)
@@ -333,49 +367,32 @@ def make_backward(real, tile_size: int, channels: int, absgrad: bool = False, de
 # A task cuts the rows of its tile into strips. The innermost loops run over the pixels of one strip without branches
 # and are kept rolled, so that the compiler vectorises them (docs/blend.md, section 5).
 
-FORWARD_BATCH = 64
-"""Gaussians that the forward pass processes at a time, strip by strip; a power of 2, since BATCH - 1 masks indices."""
-FORWARD_TOGETHER = 16
-"""Gaussians of a batch that are tested together, in a loop that vectorises; divides `FORWARD_BATCH`."""
-
 
 @functools.cache
 def make_forward(real, tile_size: int, channels: int):
     """Make the forward kernel for one scalar type, tile size and number of channels."""
-    f = make_functions(real)
+    f, b = make_functions(real), make_batches(real, tile_size, channels)
     # Vectors rather than local arrays: the compiler must see that they do not overlap. They are one row longer than
     # the tile, so that they are not 4096 bytes apart: there a load of one would wait for a store to the other (4K aliasing).
     tile_reals = wp.types.vector(tile_size * (tile_size + 1), real)
     tile_ints = wp.types.vector(tile_size * (tile_size + 1), wp.int32)
     strip_reals = wp.types.vector(STRIP, real)
     strip_ints = wp.types.vector(STRIP, wp.int32)
-    batch_reals = wp.types.vector(FORWARD_BATCH, real)
-    batch_ints = wp.types.vector(FORWARD_BATCH, wp.int32)
-    batch_strips = wp.types.vector(FORWARD_BATCH * STRIP, real)
-    record = wp.types.vector(9 + channels, real)
-    prefetch = make_prefetch(record)
+    batch_reals = wp.types.vector(BATCH, real)
+    batch_ints = wp.types.vector(BATCH, wp.int32)
+    batch_strips = wp.types.vector(BATCH * STRIP, real)
+    at, prefetch = b.at, make_prefetch(b.record)
     # of several channels, one after the other
     tile_channels = wp.types.vector(channels * tile_size * (tile_size + 1), real)
     strip_channels = wp.types.vector(2 * channels * STRIP, real)
-    batch_channels = wp.types.vector(channels * FORWARD_BATCH, real)
-    place_z, per_pixel, per_row = 6 + channels, channels, channels * tile_size
+    per_pixel, per_row = channels, channels * tile_size
     tile_stride, side, pixels = tile_size * (tile_size + 1), tile_size, tile_size * tile_size
     strip, parts, abreast = STRIP, tile_size // STRIP, ABREAST
-    batch, bits, together = FORWARD_BATCH, FORWARD_BATCH - 1, FORWARD_TOGETHER
+    batch, bits, together = BATCH, BATCH - 1, TOGETHER
     outside, smallest = real(-1.0), real(SMALLEST_WEIGHT)
+    Reals, Rows = wp.array(dtype=real), wp.array2d(dtype=real)
 
     # Loops over channels have a static length and are unrolled, so they are kept apart from loops that must stay rolled.
-    @wp.func(inline=True)
-    def at(entry: wp.ref[real]) -> real:
-        """Return an entry of a vector that is taken by reference; Warp would copy the vector otherwise."""
-        return entry
-
-    @wp.func(inline=True)
-    def load_channels(projected: wp.array(dtype=record), i: wp.int32, j: wp.int32, color: wp.ref[batch_channels]):
-        """Load the channels of a Gaussian of the batch."""
-        for c in range(wp.static(channels)):
-            color[c * batch + j] = projected[i][6 + c]
-
     @wp.func(inline=True)
     def load_strip(base: wp.int32, lane: wp.int32, sums: wp.ref[tile_channels], strip_sums: wp.ref[strip_channels]):
         """Load the sums of a pixel of a strip."""
@@ -389,15 +406,13 @@ def make_forward(real, tile_size: int, channels: int):
             sums[c * tile_stride + base + lane] = at(strip_sums[2 * c * strip + lane])
 
     @wp.func(inline=True)
-    def add_channels(w: real, lane: wp.int32, j: wp.int32, color: wp.ref[batch_channels], strip_sums: wp.ref[strip_channels]):
+    def add_channels(w: real, lane: wp.int32, j: wp.int32, g: wp.ref[b.Batch], strip_sums: wp.ref[strip_channels]):
         """Add the channels of a Gaussian to the sums of a pixel of a strip."""
         for c in range(wp.static(channels)):
-            strip_sums[2 * c * strip + lane] = at(strip_sums[2 * c * strip + lane]) + w * at(color[c * batch + j])
+            strip_sums[2 * c * strip + lane] = at(strip_sums[2 * c * strip + lane]) + w * at(g.color[c * batch + j])
 
     @wp.func(inline=True)
-    def add_background(
-        camera: wp.int32, p: wp.int32, t: real, backgrounds: wp.array2d(dtype=real), sums: wp.ref[tile_channels]
-    ):
+    def add_background(camera: wp.int32, p: wp.int32, t: real, backgrounds: Rows, sums: wp.ref[tile_channels]):
         """Add the background to the sums of a pixel."""
         for c in range(wp.static(channels)):
             sums[c * tile_stride + p] = at(sums[c * tile_stride + p]) + t * backgrounds[camera, c]
@@ -409,18 +424,17 @@ def make_forward(real, tile_size: int, channels: int):
             joined[p * per_pixel + c] = at(sums[c * tile_stride + p])
 
     @wp.func(inline=True)
-    def store_channels(o: wp.int32, p: wp.int32, joined: wp.ref[tile_channels], rgb: wp.array(dtype=real)):
+    def store_channels(o: wp.int32, p: wp.int32, joined: wp.ref[tile_channels], rgb: Reals):
         """Store the channels of a pixel, whose first has the index ``o``."""
         for c in range(wp.static(channels)):
             rgb[o + c] = at(joined[p * per_pixel + c])
 
     @wp.kernel(enable_backward=False, module="unique", module_options=ROLLED)
     def forward(
-        begin: int, settings: f.Blending, projected: wp.array(dtype=record), ranges: wp.array2d(dtype=int),
-        gaussian_ids: wp.array(dtype=int), backgrounds: wp.array2d(dtype=real),
+        begin: int, settings: f.Blending, projected: wp.array(dtype=b.record), ranges: IntRows, gaussian_ids: Ints,
+        backgrounds: Rows,
         # outputs, and the distance of pixels in the first
-        rgb: wp.array(dtype=real), pitch: int, alpha_out: wp.array(dtype=real), depth: wp.array(dtype=real),
-        transmittances: wp.array(dtype=real), weights: wp.array(dtype=real), ends: wp.array(dtype=int),
+        rgb: Reals, pitch: int, alpha_out: Reals, depth: Reals, transmittances: Reals, weights: Reals, ends: Ints,
     ):  # fmt: skip
         tile = begin + wp.tid()
         place = f.place_of(tile, side, settings)
@@ -449,16 +463,7 @@ def make_forward(real, tile_size: int, channels: int):
         strip_total = strip_reals()
         strip_end = strip_ints()
         # The Gaussians of a batch: values; u11 times the pixels of a strip; values shared in a row; those that reach a strip.
-        mx = batch_reals()
-        my = batch_reals()
-        u11 = batch_reals()
-        u12 = batch_reals()
-        u22 = batch_reals()
-        opacity = batch_reals()
-        color = batch_channels()
-        distance = batch_reals()
-        aside = batch_reals()
-        limit = batch_reals()
+        g = b.Batch()
         ramp = batch_strips()
         e12 = batch_reals()
         e22 = batch_reals()
@@ -474,32 +479,14 @@ def make_forward(real, tile_size: int, channels: int):
         while first < last:
             count = wp.min(batch, last - first)
             for j in range(batch):
-                limit[j] = real(-1.0)  # reaches nothing
-            j = int(0)
-            while j < count:
-                i = gaussian_ids[wp.max(first + j, 0)]
-                if f.never(i):
-                    break
-                mx[j] = projected[i][0]
-                my[j] = projected[i][1]
-                u11[j] = projected[i][2]
-                u12[j] = projected[i][3]
-                u22[j] = projected[i][4]
-                opacity[j] = projected[i][5]
-                load_channels(projected, i, j, color)
-                distance[j] = projected[i][place_z]
-                bounds = f.bounds_of(
-                    mx[j], my[j], u11[j], u22[j], projected[i][place_z + 1], projected[i][place_z + 2], settings.whole_tiles
-                )
-                aside[j] = bounds[0]
-                limit[j] = bounds[1]
-                j += 1
+                g.limit[j] = real(-1.0)  # reaches nothing
+            b.load(projected, gaussian_ids, first, 1, count, settings.whole_tiles, g)
             j = int(0)
             while j < count:
                 o = j & bits
                 j += 1
                 for lane in range(strip):
-                    ramp[o * strip + lane] = f.apart(u11[o] * real(lane))
+                    ramp[o * strip + lane] = f.apart(at(g.u11[o]) * real(lane))
             left_open = int(0)
             for row in range(side):
                 y = real(settings.origin_y + top + row) + real(0.5)
@@ -511,9 +498,9 @@ def make_forward(real, tile_size: int, channels: int):
                     o = group & bits
                     group += together
                     for lane in range(together):
-                        dy = y - my[o + lane]
-                        e2 = u22[o + lane] * dy
-                        e12[o + lane] = f.apart(u12[o + lane] * dy)
+                        dy = y - at(g.y[o + lane])
+                        e2 = at(g.u22[o + lane]) * dy
+                        e12[o + lane] = f.apart(at(g.u12[o + lane]) * dy)
                         e22[o + lane] = f.apart(e2 * e2)
                 for part in range(parts):
                     base = wp.max(row * side + part * strip, 0)
@@ -529,8 +516,10 @@ def make_forward(real, tile_size: int, channels: int):
                             group += together
                             for lane in range(together):
                                 j = o + lane
-                                start[j] = f.apart(u11[j] * (x - mx[j])) + e12[j]
-                                hits[j] = wp.where(f.reaches(start[j], u11[j], e22[j], aside[j], limit[j]), 1, 0)
+                                start[j] = f.apart(at(g.u11[j]) * (x - at(g.x[j]))) + e12[j]
+                                hits[j] = wp.where(
+                                    f.reaches(start[j], at(g.u11[j]), e22[j], at(g.aside[j]), at(g.limit[j])), 1, 0
+                                )
                         reaching = int(0)
                         group = int(0)
                         while group < count:
@@ -548,9 +537,9 @@ def make_forward(real, tile_size: int, channels: int):
                                     j = list[o + n] & bits
                                     e1[n] = start[j] + ramp[j * strip + lane]
                                     e2_squared[n] = e22[j]
-                                g = f.falloffs(wp.cw_mul(e1, e1) + e2_squared)
+                                found = f.falloffs(wp.cw_mul(e1, e1) + e2_squared)
                                 for n in range(abreast):
-                                    raw = opacity[list[o + n] & bits] * g[n]
+                                    raw = at(g.opacity[list[o + n] & bits]) * found[n]
                                     alpha = wp.where(settings.alpha_max < raw, settings.alpha_max, raw)
                                     alphas[(o + n) * strip + lane] = wp.where(alpha >= settings.alpha_cut, alpha, real(0.0))
                         for lane in range(strip):
@@ -575,8 +564,8 @@ def make_forward(real, tile_size: int, channels: int):
                                 strip_t[lane] = wp.where(blended, after, strip_t[lane])
                                 strip_passed[lane] = after
                                 strip_end[lane] = wp.where(w > real(0.0), number, strip_end[lane])
-                                add_channels(w, lane, j, color, strip_sums)
-                                strip_z[lane] = strip_z[lane] + w * distance[j]
+                                add_channels(w, lane, j, g, strip_sums)
+                                strip_z[lane] = strip_z[lane] + w * at(g.z[j])
                                 strip_total[lane] = strip_total[lane] + w
                         for lane in range(strip):
                             t[base + lane] = strip_t[lane]
@@ -632,12 +621,3 @@ def make_forward(real, tile_size: int, channels: int):
                     lane += 1
 
     return forward
-
-
-@functools.cache
-def make_kernels(real, tile_size: int, channels: int = COLORS, absgrad: bool = False, deep: bool = True):
-    """Make the forward and backward kernels; arguments are those of `make_backward`."""
-    return SimpleNamespace(
-        forward=make_forward(real, tile_size, channels),
-        backward=make_backward(real, tile_size, channels, absgrad, deep),
-    )

@@ -16,7 +16,7 @@ from warpgs.device import FLOAT, StepSizes
 from warpgs.kernels import launch
 from warpgs.kernels.falloff import COLORS, LARGEST_STOP, Pass, make_struct
 from warpgs.kernels.graphs import TORCH, Allocator
-from warpgs.kernels.native import SCALE, cuda_kernel, source
+from warpgs.kernels.native import SCALE, FloatRows, Floats, Ints, Longs, cuda_kernel, source
 from warpgs.kernels.tiles import RECORD_SIZE, Tiles, grid
 
 CHUNKS = (64, 128, 256)
@@ -67,13 +67,11 @@ def make_forward(tile_size: int, save: bool, per: int, channels: int = COLORS, p
 
     @cuda_kernel(_source("forward", tile_size, channels, **numbers), "wp.tid() // 32", module)
     def forward(
-        item: int, settings: Blending, chunk: int, projected: wp.array(dtype=float), counts: wp.array(dtype=int),
-        order: wp.array(dtype=int), ranges: wp.array(dtype=int), gaussian_ids: wp.array(dtype=int),
-        backgrounds: wp.array(dtype=float), max_error: float, rounding: float,
+        item: int, settings: Blending, chunk: int, projected: Floats, counts: Ints, order: Ints, ranges: Ints,
+        gaussian_ids: Ints, backgrounds: Floats, max_error: float, rounding: float,
         # outputs
-        rgb: wp.array2d(dtype=float), alpha_out: wp.array(dtype=float), depth: wp.array(dtype=float),
-        transmittances: wp.array(dtype=float), weights: wp.array(dtype=float), ends: wp.array(dtype=int),
-        states: wp.array2d(dtype=float), bounds: wp.array(dtype=float),
+        rgb: FloatRows, alpha_out: Floats, depth: Floats, transmittances: Floats, weights: Floats, ends: Ints,
+        states: FloatRows, bounds: Floats,
     ): ...  # fmt: skip
 
     return forward
@@ -88,17 +86,16 @@ def make_kernels(tile_size: int):
 
     @cuda_kernel(source("blend_order.cu", RANKS=RANKS), "begin + wp.tid()", module)
     def order_tiles(
-        tile: int, ranges: wp.array(dtype=int), count: int,
+        tile: int, ranges: Ints, count: int,
         # outputs; counts are zero on entry
-        counts: wp.array(dtype=int), order: wp.array(dtype=int),
+        counts: Ints, order: Ints,
     ): ...  # fmt: skip
 
     @cuda_kernel(_source("contributions", tile_size, COLORS), f"wp.tid() // {tile_size * tile_size}", module)
     def contributions(
-        tile: int, settings: Blending, projected: wp.array(dtype=float), ranges: wp.array(dtype=int),
-        gaussian_ids: wp.array(dtype=int), slots: wp.array(dtype=int), ends: wp.array(dtype=int),
+        tile: int, settings: Blending, projected: Floats, ranges: Ints, gaussian_ids: Ints, slots: Ints, ends: Ints,
         # outputs, zero on entry
-        instance_weights: wp.array(dtype=float),
+        instance_weights: Floats,
     ): ...  # fmt: skip
 
     return SimpleNamespace(order_tiles=order_tiles, contributions=contributions)
@@ -118,10 +115,9 @@ def make_gather(tile_size: int, with_depth: bool, atomic: bool, channels: int = 
 
     @cuda_kernel(_source("gather", tile_size, channels, **_flags(with_depth, atomic, absgrad)), "wp.tid()", name)
     def gather(
-        i: int, projected: wp.array(dtype=float), starts: wp.array(dtype=int), counts: wp.array(dtype=int),
-        v_slots: wp.array2d(dtype=float),
+        i: int, projected: Floats, starts: Ints, counts: Ints, v_slots: FloatRows,
         # outputs
-        v_projected: wp.array(dtype=float),
+        v_projected: Floats,
     ): ...  # fmt: skip
 
     return gather
@@ -141,14 +137,12 @@ def make_backward(tile_size: int, with_depth: bool, chunk: int, atomic: bool, ch
 
     @cuda_kernel(_source("backward", tile_size, channels, **numbers), "wp.tid() // 32", name, **registers)
     def backward(
-        item: int, settings: Blending, capacity: int, no_tile: int, projected: wp.array(dtype=float),
-        keys: wp.array(dtype=int), ranges: wp.array(dtype=int), gaussian_ids: wp.array(dtype=int), slots: wp.array(dtype=int),
-        totals: wp.array(dtype=wp.int64), backgrounds: wp.array(dtype=float),
-        rgb: wp.array2d(dtype=float), depth: wp.array(dtype=float), transmittances: wp.array(dtype=float),
-        weights: wp.array(dtype=float), ends: wp.array(dtype=int), states: wp.array2d(dtype=float),
-        v_rgb: wp.array2d(dtype=float), v_alpha: wp.array(dtype=float), v_depth: wp.array(dtype=float),
+        item: int, settings: Blending, capacity: int, no_tile: int, projected: Floats, keys: Ints, ranges: Ints,
+        gaussian_ids: Ints, slots: Ints, totals: Longs, backgrounds: Floats, rgb: FloatRows, depth: Floats,
+        transmittances: Floats, weights: Floats, ends: Ints, states: FloatRows, v_rgb: FloatRows, v_alpha: Floats,
+        v_depth: Floats,
         # outputs
-        v_slots: wp.array2d(dtype=float),
+        v_slots: FloatRows,
     ): ...  # fmt: skip
 
     return SimpleNamespace(backward=backward, gather=make_gather(tile_size, with_depth, atomic, channels, absgrad))

@@ -105,13 +105,6 @@ def make_linear(real: type) -> SimpleNamespace:
         v_K: mat33
 
     @wp.func
-    def rows_of(first: vec3, second: vec3) -> Rows:
-        rows = Rows()
-        rows.first = first
-        rows.second = second
-        return rows
-
-    @wp.func
     def intrinsics_of(fx: real, fy: real, center: vec2) -> mat33:
         v_K = mat33()
         v_K[0, 0] = fx
@@ -119,13 +112,6 @@ def make_linear(real: type) -> SimpleNamespace:
         v_K[0, 2] = center[0]
         v_K[1, 2] = center[1]
         return v_K
-
-    @wp.func
-    def gradients_of(v_position: vec3, v_K: mat33) -> Gradients:
-        gradients = Gradients()
-        gradients.v_position = v_position
-        gradients.v_K = v_K
-        return gradients
 
     @wp.func
     def in_front(position: vec3, lens: Reals, near: real) -> wp.bool:
@@ -155,7 +141,7 @@ def make_linear(real: type) -> SimpleNamespace:
         def project_axes(position: vec3, K: mat33, lens: Reals, point: vec2, axes: mat33) -> Rows:
             j = jacobian(position, K, lens, point)
             turned = wp.transpose(axes)
-            return rows_of(turned * j.first, turned * j.second)
+            return Rows(turned * j.first, turned * j.second)  # type: ignore[call-arg]  # a struct of Warp
 
         @wp.func
         def axes_backward(position: vec3, K: mat33, lens: Reals, point: vec2, v_first: vec3, v_second: vec3) -> mat33:
@@ -165,8 +151,8 @@ def make_linear(real: type) -> SimpleNamespace:
         return {"project_axes": project_axes, "axes_backward": axes_backward}
 
     return SimpleNamespace(
-        Rows=Rows, Gradients=Gradients, rows_of=rows_of, intrinsics_of=intrinsics_of, gradients_of=gradients_of,
-        in_front=in_front, z_of=z_of, unclamped=unclamped, clamped=clamped, products=products,
+        Rows=Rows, Gradients=Gradients, intrinsics_of=intrinsics_of, in_front=in_front, z_of=z_of, unclamped=unclamped,
+        clamped=clamped, products=products,
     )  # fmt: skip
 
 
@@ -202,7 +188,7 @@ class Pinhole(CameraModel):
                 jy * axes[1, 1] + jyz * axes[2, 1],
                 jy * axes[1, 2] + jyz * axes[2, 2],
             )
-            return linear.rows_of(first, second)
+            return linear.Rows(first, second)
 
         @wp.func
         def axes_backward(position: vec3, K: mat33, lens: Reals, point: vec2, v_first: vec3, v_second: vec3) -> mat33:
@@ -249,7 +235,7 @@ class Pinhole(CameraModel):
                 v_K[1, 1] = v_K[1, 1] - v_jyz * y * inv_z * inv_z
             else:
                 v_K[1, 2] = v_K[1, 2] + v_jyz * inv_z
-            return linear.gradients_of(vec3(v_x, v_y, v_z), v_K)
+            return linear.Gradients(vec3(v_x, v_y, v_z), v_K)
 
         return SimpleNamespace(
             in_range=linear.in_front, depth_of=linear.z_of, pixel_of=pixel_of, expansion_point=linear.clamped,
@@ -275,7 +261,7 @@ class Orthographic(CameraModel):
         @wp.func
         def jacobian(position: vec3, K: mat33, lens: Reals, point: vec2) -> linear.Rows:
             zero = real(0.0)
-            return linear.rows_of(vec3(K[0, 0], zero, zero), vec3(zero, K[1, 1], zero))
+            return linear.Rows(vec3(K[0, 0], zero, zero), vec3(zero, K[1, 1], zero))
 
         @wp.func
         def position_backward(
@@ -285,7 +271,7 @@ class Orthographic(CameraModel):
             fx = v_pixel[0] * position[0] + wp.dot(v_first, axes[0])
             fy = v_pixel[1] * position[1] + wp.dot(v_second, axes[1])
             v_position = vec3(v_pixel[0] * K[0, 0], v_pixel[1] * K[1, 1], v_depth)
-            return linear.gradients_of(v_position, linear.intrinsics_of(fx, fy, v_pixel))
+            return linear.Gradients(v_position, linear.intrinsics_of(fx, fy, v_pixel))
 
         return SimpleNamespace(
             in_range=linear.in_front, depth_of=linear.z_of, pixel_of=pixel_of, expansion_point=linear.unclamped,
@@ -346,7 +332,7 @@ class OpenCV(CameraModel):
             d = lensed.distort(a, b, lens)
             first = K[0, 0] * inv_z * vec3(d.aa, d.ab, -(d.aa * a + d.ab * b))
             second = K[1, 1] * inv_z * vec3(d.ab, d.bb, -(d.ab * a + d.bb * b))
-            return linear.rows_of(first, second)
+            return linear.Rows(first, second)
 
         @wp.func
         def position_backward(
@@ -395,7 +381,7 @@ class OpenCV(CameraModel):
                 v_K[1, 1] = v_K[1, 1] - v_eb * b / K[1, 1]
                 v_K[1, 2] = v_K[1, 2] - v_eb * b0 / (K[1, 1] * mean.b)
             v_z = -(v_a * a0 + v_b * b0 + first * jx + second * jy) * inv_z + v_depth
-            return linear.gradients_of(vec3(v_a * inv_z, v_b * inv_z, v_z), v_K)
+            return linear.Gradients(vec3(v_a * inv_z, v_b * inv_z, v_z), v_K)
 
         return SimpleNamespace(
             in_range=in_range, depth_of=linear.z_of, pixel_of=pixel_of, expansion_point=linear.clamped,
@@ -441,12 +427,9 @@ def _make_distortion(real: type) -> SimpleNamespace:
         m = one + t * (k4 + t * (k5 + t * k6))
         m1 = k4 + t * (two * k5 + t * three * k6)
         m2 = two * (k5 + t * three * k6)
-        r = Radial()
-        r.denominator = m
-        r.value = (one + t * (k1 + t * (k2 + t * k3))) / m
-        r.first = (k1 + t * (two * k2 + t * three * k3) - r.value * m1) / m
-        r.second = (two * (k2 + t * three * k3) - two * r.first * m1 - r.value * m2) / m
-        return r
+        value = (one + t * (k1 + t * (k2 + t * k3))) / m
+        first = (k1 + t * (two * k2 + t * three * k3) - value * m1) / m
+        return Radial(value, first, (two * (k2 + t * three * k3) - two * first * m1 - value * m2) / m, m)  # type: ignore[call-arg]
 
     @wp.func
     def distort(a: real, b: real, lens: Reals) -> Distorted:
@@ -539,7 +522,7 @@ class Fisheye(CameraModel):
             jy = K[1, 1] / distance
             first = vec3(jx * (p.G + x * x * p.H), jx * x * y * p.H, jx * x * p.E)
             second = vec3(jy * x * y * p.H, jy * (p.G + y * y * p.H), jy * y * p.E)
-            return linear.rows_of(first, second)
+            return linear.Rows(first, second)
 
         @wp.func
         def position_backward(
@@ -568,7 +551,7 @@ class Fisheye(CameraModel):
             fx = v_pixel[0] * x * p.G + v_row0[0] * (p.G + x * x * p.H) + v_row0[1] * x * y * p.H + v_row0[2] * x * p.E
             fy = v_pixel[1] * y * p.G + v_row1[0] * x * y * p.H + v_row1[1] * (p.G + y * y * p.H) + v_row1[2] * y * p.E
             v_position = vec3(v_x, v_y, v_z) / distance + v_depth * unit
-            return linear.gradients_of(v_position, linear.intrinsics_of(fx, fy, v_pixel))
+            return linear.Gradients(v_position, linear.intrinsics_of(fx, fy, v_pixel))
 
         return SimpleNamespace(
             in_range=in_range, depth_of=radial.distance, pixel_of=pixel_of, expansion_point=linear.unclamped,

@@ -95,10 +95,8 @@ def make_covariance(real):
         """Return the gradient of Sigma from those of the projected covariance; ``first`` and ``second`` are J R."""
         V = v11 * wp.outer(first, first) + v12 * (wp.outer(first, second) + wp.outer(second, first))
         V += v22 * wp.outer(second, second)
-        g = Packed()
-        g.off = vec4(V[0, 1] + V[1, 0], V[0, 2] + V[2, 0], V[1, 2] + V[2, 1], real(0.0))
-        g.diagonal = vec3(V[0, 0], V[1, 1], V[2, 2])
-        return g
+        off = vec4(V[0, 1] + V[1, 0], V[0, 2] + V[2, 0], V[1, 2] + V[2, 1], real(0.0))
+        return Packed(off, vec3(V[0, 0], V[1, 1], V[2, 2]))
 
     return SimpleNamespace(factor=factor, gradient=gradient)
 

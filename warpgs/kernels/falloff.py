@@ -10,6 +10,7 @@ from warp.types import vector
 
 from warpgs.constants import TILE_SIZE, Rule
 from warpgs.kernels import sh
+from warpgs.kernels.native import Ints
 from warpgs.kernels.tiles import grid
 
 
@@ -218,7 +219,9 @@ def make_batches(real, tile_size: int, channels: int):
     strip_ints = vector(tile_size * (tile_size // STRIP), wp.int32)
     side = wp.constant(tile_size)
     parts = wp.constant(tile_size // STRIP)
-    bits = wp.constant(BATCH - 1)
+    bits, row_bits = wp.constant(BATCH - 1), wp.constant(tile_size - 1)
+    abreast = wp.constant(ABREAST)
+    column_reals = vector((tile_size + ABREAST) * STRIP, real)
     place_z = wp.constant(6 + channels)
 
     @wp.struct
@@ -264,13 +267,13 @@ def make_batches(real, tile_size: int, channels: int):
 
     @wp.func(inline=True)
     def load(
-        projected: wp.array(dtype=record), gaussian_ids: wp.array(dtype=int), last: wp.int32, count: wp.int32,
+        projected: wp.array(dtype=record), gaussian_ids: Ints, first: wp.int32, way: wp.int32, count: wp.int32,
         whole_tiles: wp.int32, b: wp.ref[Batch],
     ):  # fmt: skip
-        """Load the Gaussians of ``count`` instances, from the last on backwards."""
+        """Load the Gaussians of ``count`` instances from the first on, forwards or backwards (``way`` 1 or -1)."""
         j = int(0)
         while j < count:
-            i = gaussian_ids[wp.max(last - j, 0)]
+            i = gaussian_ids[wp.max(first + way * j, 0)]
             if f.never(i):
                 break
             b.x[j & bits] = projected[i][0]
@@ -322,12 +325,8 @@ def make_batches(real, tile_size: int, channels: int):
                         b.end[o] = wp.max(at_int(b.end[o]), wp.where(hit, row + 1, 0))
 
     @wp.func(inline=True)
-    def find_row_values(j: wp.int32, top: wp.int32, b: wp.ref[Batch], rows: wp.ref[Rows]):
+    def find_row_values(y: real, u11: real, u12: real, u22: real, top: wp.int32, rows: wp.ref[Rows]):
         """Compute the values of a Gaussian on all rows."""
-        u11 = at(b.u11[j])
-        u12 = at(b.u12[j])
-        u22 = at(b.u22[j])
-        y = at(b.y[j])
         for row in range(side):
             dy = real(top + row) + real(0.5) - y
             e2 = u22 * dy
@@ -337,9 +336,26 @@ def make_batches(real, tile_size: int, channels: int):
         for lane in range(STRIP):
             rows.ramp[lane] = f.apart(u11 * real(lane))
 
+    @wp.func(inline=True)
+    def find_falloffs(at_left: real, first: wp.int32, end: wp.int32, rows: wp.ref[Rows], falloffs: wp.ref[column_reals]):
+        """Compute the falloffs on the strips of a column, from row ``first`` on; ``at_left`` is e1 at the left, less e12."""
+        # in a loop of their own, several strips at a time, since each is a long chain of dependent operations
+        e1 = f.abreast()
+        squares = f.abreast()
+        k = int(0)
+        while k < end - first:
+            for lane in range(STRIP):
+                for n in range(abreast):
+                    e1[n] = at_left + at(rows.e12[(first + k + n) & row_bits]) + at(rows.ramp[lane])
+                    squares[n] = at(rows.e22[(first + k + n) & row_bits])
+                found = f.falloffs(wp.cw_mul(e1, e1) + squares)
+                for n in range(abreast):
+                    falloffs[(k + n) * STRIP + lane] = found[n]
+            k += abreast  # the last few may lie beyond the end; their values are not read
+
     return SimpleNamespace(
-        record=record, Batch=Batch, Rows=Rows, strip_ints=strip_ints, at=at, at_int=at_int, load=load, find_rows=find_rows,
-        find_row_values=find_row_values,
+        record=record, Batch=Batch, Rows=Rows, strip_ints=strip_ints, column_reals=column_reals, at=at, at_int=at_int,
+        load=load, find_rows=find_rows, find_row_values=find_row_values, find_falloffs=find_falloffs,
     )  # fmt: skip
 
 
@@ -349,63 +365,3 @@ VALUES = 10
 """Number of gradient values of an instance with a colour: all values of a projected Gaussian but the last two, its box."""
 WIDTHS = (COLORS, 7, 11)
 """Numbers of channels for which kernels are compiled: with nine other values a projected Gaussian fills whole 16-byte loads."""
-
-
-@functools.cache
-def make_records(real, tile_size: int, channels: int, absgrad: bool):
-    """Make the records for one scalar type, tile size and number of channels."""
-    # Entries of pixels follow in the order of `make_batches`. Vectors are one row longer than the tile: see
-    # `blend_cpu.make_forward`. Channels are stored one after the other. In a gradient, the two magnitudes follow the channels
-    # if ``absgrad`` is set. The compiler puts records 8 bytes before a cache line; with this vector in front, no strip lies in
-    # two lines.
-    lead_reals = vector(2, real)
-    trail_reals = vector(14, real)
-    tile_reals = vector(tile_size * (tile_size + 1), real)
-    strip_reals = vector(STRIP, real)
-
-    count = VALUES + channels - COLORS + 2 * absgrad
-
-    @wp.struct
-    class Pixels:
-        """Values of each pixel of a tile."""
-
-        lead: lead_reals
-        t: tile_reals  # transmittance behind the current instance, then before it
-        behind: tile_reals  # sum of w d over what lies behind, background included
-        g: vector(channels * tile_size * (tile_size + 1), real)  # upstream gradient of the channels
-        v_z: tile_reals
-        v_w: tile_reals
-        end: vector(tile_size * (tile_size + 1), wp.int32)  # one past the last instance that was blended
-        trail: trail_reals
-
-    @wp.struct
-    class Shades:
-        """Gradient and weight of the current instance at each pixel that it reaches."""
-
-        lead: lead_reals
-        falloff: vector((tile_size + ABREAST) * STRIP, real)  # of one column of strips, and of a few rows beyond it
-        v: tile_reals  # gradient of the falloff
-        w: tile_reals  # blending weight
-        trail: trail_reals
-
-    @wp.struct
-    class Gradient:
-        """Sums of one instance's gradient, by place in a strip."""
-
-        e1: strip_reals
-        y: strip_reals
-        xx: strip_reals
-        xy: strip_reals
-        yy: strip_reals
-        opacity: strip_reals
-        color: vector((channels + 2 * absgrad) * STRIP, real)
-        z: strip_reals
-
-    @wp.struct
-    class Held:
-        """Sums of several instances' gradients, one instance after the other."""
-
-        halves: vector(TOGETHER * count * (STRIP // 2), real)  # by place in half a strip
-        totals: vector(TOGETHER * count, real)
-
-    return SimpleNamespace(Held=Held, Pixels=Pixels, Shades=Shades, Gradient=Gradient)

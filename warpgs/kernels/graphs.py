@@ -15,7 +15,7 @@ import torch
 import warp as wp
 
 from warpgs.kernels import launch
-from warpgs.kernels.native import cuda_kernel, source
+from warpgs.kernels.native import Floats, cuda_kernel, source
 
 MAX_GRAPHS = 8
 """Largest number of graphs of a function, one for each set of addresses; a loop that keeps its last result alternates between
@@ -119,19 +119,14 @@ def part(block: torch.Tensor, begin: int, shape: tuple[int, ...], dtype: torch.d
     return block[begin : begin + math.prod(shape) * dtype.itemsize].view(dtype).view(shape)
 
 
-@functools.cache
-def make_fetch():
-    """Make the kernel of `fetch`."""
-
-    @cuda_kernel(source("allocator_fetch.cu"), "begin + wp.tid()", "warpgs.runtime.allocator.fetch")
-    def fetch(item: int, table: wp.uint64, first: int, second: int, out: wp.array(dtype=float)): ...
-
-    return fetch
+@cuda_kernel(source("allocator_fetch.cu"), "begin + wp.tid()", "warpgs.runtime.allocator.fetch")
+def fetch_kernel(item: int, table: wp.uint64, first: int, second: int, out: Floats):
+    """Copy the numbers of `fetch`, one a thread."""
 
 
 def fetch(table: int, first: int, second: int, out: torch.Tensor) -> None:
     """Fill ``out`` from a table of three addresses, read when the kernel runs; ``second`` counts the first two's numbers."""
-    launch.launch(make_fetch(), out.numel(), [table, first, second, out], out.device)
+    launch.launch(fetch_kernel, out.numel(), [table, first, second, out], out.device)
 
 
 _CAPTURING = threading.Lock()

@@ -27,6 +27,12 @@ FOLDER = importlib.resources.files("warpgs") / "kernels" / "cuda"
 """Folder of the files."""
 
 
+Ints, IntRows = wp.array(dtype=int), wp.array2d(dtype=int)
+Floats, FloatRows = wp.array(dtype=float), wp.array2d(dtype=float)
+Longs = wp.array(dtype=wp.int64)
+"""Arguments of kernels: arrays of numbers, and tables of them."""
+
+
 def source(name: str, **numbers: object) -> str:
     """Return the CUDA text of a file of `FOLDER`, with its includes, and names in capitals replaced by ``numbers``."""
     text = re.sub(r'^#include "([\w.]+)"\n', lambda found: source(found[1]), (FOLDER / name).read_text("utf-8"), flags=re.M)
@@ -82,46 +88,45 @@ BLOCK = 128
 """Threads of a block in kernels that call `compact` or `clear_rows`."""
 
 
-@functools.cache
-def make_functions():
-    """Make the functions, for CUDA; `make_color` makes the functions on colours."""
-    vec12 = wp.types.vector(12, wp.float32)
+# Functions for CUDA; `make_color` makes those on colours.
 
-    @wp.func_native(source("native_compact.cu", BLOCK=BLOCK))
-    def compact(item: int, wanted: int) -> int:
-        """Return the wanted items of the block's threads, assigned to its first threads in order; -1 for other threads.
 
-        All BLOCK threads of the block must call it.
-        """
+@wp.func_native(source("native_compact.cu", BLOCK=BLOCK))
+def compact(item: int, wanted: int) -> int:
+    """Return the wanted items of the block's threads, assigned to its first threads in order; -1 for other threads.
 
-    @wp.func_native(source("native_store_row.cu"))
-    def store_row(records: wp.array2d(dtype=float), i: int, v: vec12):
-        """Write row i of an array of rows of 12 floats, 16-byte aligned."""
+    All BLOCK threads of the block must call it.
+    """
 
-    @wp.func_native(source("native_clear_rows.cu", BLOCK=BLOCK))
-    def clear_rows(item: int, kept: int, sh: wp.array2d(dtype=wp.vec3)):
-        """Set the rows of the block's items to zero, except those that are kept. All BLOCK threads must call it."""
 
-    @wp.func_native(source("native_broadcast.cu"))
-    def broadcast(value: int, lane: int) -> int:
-        """Return the value that a lane of the warp holds. All 32 lanes of the warp must call this and the next three."""
+@wp.func_native(source("native_store_row.cu"))
+def store_row(records: FloatRows, i: int, v: wp.types.vector(12, wp.float32)):
+    """Write row i of an array of rows of 12 floats, 16-byte aligned."""
 
-    @wp.func_native(source("native_running_sum.cu"))
-    def running_sum(value: int) -> int:
-        """Return the sum over this lane of the warp and those before it."""
 
-    @wp.func_native(source("native_whole_sum.cu"))
-    def whole_sum(value: wp.int64) -> wp.int64:
-        """Return the sum over all lanes of the warp."""
+@wp.func_native(source("native_clear_rows.cu", BLOCK=BLOCK))
+def clear_rows(item: int, kept: int, sh: wp.array2d(dtype=wp.vec3)):
+    """Set the rows of the block's items to zero, except those that are kept. All BLOCK threads must call it."""
 
-    @wp.func_native(source("native_holder.cu"))
-    def holder(running_sum: int, item: int) -> int:
-        """Return the first lane of the warp whose running sum exceeds ``item``, or the last lane."""
 
-    return SimpleNamespace(
-        compact=compact, store_row=store_row, clear_rows=clear_rows, broadcast=broadcast,
-        running_sum=running_sum, whole_sum=whole_sum, holder=holder,
-    )  # fmt: skip
+@wp.func_native(source("native_broadcast.cu"))
+def broadcast(value: int, lane: int) -> int:
+    """Return the value that a lane of the warp holds. All 32 lanes of the warp must call this and the next three."""
+
+
+@wp.func_native(source("native_running_sum.cu"))
+def running_sum(value: int) -> int:
+    """Return the sum over this lane of the warp and those before it."""
+
+
+@wp.func_native(source("native_whole_sum.cu"))
+def whole_sum(value: wp.int64) -> wp.int64:
+    """Return the sum over all lanes of the warp."""
+
+
+@wp.func_native(source("native_holder.cu"))
+def holder(running_sum: int, item: int) -> int:
+    """Return the first lane of the warp whose running sum exceeds ``item``, or the last lane."""
 
 
 @functools.cache

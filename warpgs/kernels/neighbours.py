@@ -8,6 +8,7 @@ import torch
 import warp as wp
 
 from warpgs.kernels import launch
+from warpgs.kernels.native import FloatRows, Floats, Ints
 
 BOX = 32
 """Number of points in a box, and of boxes in a box of the next level; the highest level has at most this number of boxes. A
@@ -56,8 +57,8 @@ def make_knn_kernels(real):
 
     @wp.kernel(enable_backward=False, module=f"warpgs.kernels.knn.{real.__name__}")
     def search(
-        begin: int, points: wp.array(dtype=vec3), lower: wp.array(dtype=vec3), upper: wp.array(dtype=vec3),
-        starts: wp.array(dtype=int), k: int,
+        begin: int, points: wp.array(dtype=vec3), lower: wp.array(dtype=vec3), upper: wp.array(dtype=vec3), starts: Ints,
+        k: int,
         # outputs
         mean_squares: wp.array(dtype=real),
     ):  # fmt: skip
@@ -146,34 +147,29 @@ def mean_square_distances(points: torch.Tensor, k: int = 3) -> torch.Tensor:
     return result
 
 
-SMALLEST_REACH = 1e-12
-"""Smallest size [u], for a Gaussian at a camera."""
+SMALLEST = 1e-12
+"""Smallest size [u], for a Gaussian at a camera or in no camera's image."""
 
 
-@functools.cache
-def make_reach_kernel():
-    """Make the kernel."""
-
-    @wp.kernel(enable_backward=False, module="warpgs.kernels.camera_reach")
-    def bound(
-        begin: int, means: wp.array(dtype=wp.vec3), centers: wp.array(dtype=wp.vec3), fraction: float,
-        # outputs
-        log_sizes: wp.array(dtype=float),
-    ):  # fmt: skip
-        i = begin + wp.tid()
-        nearest = wp.length_sq(means[i] - centers[0])
-        for j in range(1, centers.shape[0]):
-            nearest = wp.min(nearest, wp.length_sq(means[i] - centers[j]))
-        # in float64, since the rounding of float32's logarithm depends on the processor
-        size = wp.sqrt(wp.float64(nearest)) * wp.float64(fraction)
-        log_sizes[i] = wp.float32(wp.log(wp.max(size, wp.float64(1e-12))))
-
-    return bound
+@wp.kernel(enable_backward=False, module="warpgs.kernels.camera_reach")
+def bound_by_reach(
+    begin: int, means: wp.array(dtype=wp.vec3), centers: wp.array(dtype=wp.vec3), fraction: float,
+    # outputs
+    log_sizes: Floats,
+):  # fmt: skip
+    """Find the size by the distance to the nearest camera."""
+    i = begin + wp.tid()
+    nearest = wp.length_sq(means[i] - centers[0])
+    for j in range(1, centers.shape[0]):
+        nearest = wp.min(nearest, wp.length_sq(means[i] - centers[j]))
+    # in float64, since the rounding of float32's logarithm depends on the processor
+    size = wp.sqrt(wp.float64(nearest)) * wp.float64(fraction)
+    log_sizes[i] = wp.float32(wp.log(wp.max(size, wp.float64(SMALLEST))))
 
 
 def camera_reach(means: torch.Tensor, centers: torch.Tensor, fraction: float) -> torch.Tensor:
-    """Return log(``fraction`` x distance of means [N, 3] to the nearest of centers [C, 3]), from log(`SMALLEST_REACH`)."""
-    return _log_sizes(make_reach_kernel(), means, centers, fraction)
+    """Return log(``fraction`` x distance of means [N, 3] to the nearest of centers [C, 3]), from log(`SMALLEST`)."""
+    return _log_sizes(bound_by_reach, means, centers, fraction)
 
 
 def _log_sizes(kernel, means: torch.Tensor, cameras: torch.Tensor, fraction: float) -> torch.Tensor:
@@ -182,41 +178,34 @@ def _log_sizes(kernel, means: torch.Tensor, cameras: torch.Tensor, fraction: flo
     return log_sizes
 
 
-SMALLEST_PIXEL = 1e-12
-"""Smallest size [u], for a Gaussian at a camera or in no camera's image."""
 COLUMNS = 9
 """Number of values of a camera: centre [u] (3), axis of view in the world (3), focal length [px], cosine of the angle between
 the axis and the border of the image, and 1 if the size of a pixel grows with distance (fisheye), 0 if with depth."""
 
 
-@functools.cache
-def make_pixel_kernel():
-    """Make the kernel."""
-
-    @wp.kernel(enable_backward=False, module="warpgs.kernels.pixel_size")
-    def bound(
-        begin: int, means: wp.array(dtype=wp.vec3), cameras: wp.array2d(dtype=float), fraction: float,
-        # outputs
-        log_sizes: wp.array(dtype=float),
-    ):  # fmt: skip
-        i = begin + wp.tid()
-        smallest = float(wp.inf)
-        for j in range(cameras.shape[0]):
-            away = means[i] - wp.vec3(cameras[j, 0], cameras[j, 1], cameras[j, 2])
-            depth = wp.dot(away, wp.vec3(cameras[j, 3], cameras[j, 4], cameras[j, 5]))
-            distance = wp.length(away)
-            size = wp.where(cameras[j, 8] > 0.5, distance, depth) / cameras[j, 6]
-            if depth >= cameras[j, 7] * distance and size < smallest:
-                smallest = size
-        # in float64, since the rounding of float32's logarithm depends on the processor
-        size64 = wp.where(smallest < wp.inf, wp.float64(smallest) * wp.float64(fraction), wp.float64(0.0))
-        log_sizes[i] = wp.float32(wp.log(wp.max(size64, wp.float64(1e-12))))
-
-    return bound
+@wp.kernel(enable_backward=False, module="warpgs.kernels.pixel_size")
+def bound_by_pixel(
+    begin: int, means: wp.array(dtype=wp.vec3), cameras: FloatRows, fraction: float,
+    # outputs
+    log_sizes: Floats,
+):  # fmt: skip
+    """Find the size of the smallest pixel."""
+    i = begin + wp.tid()
+    smallest = float(wp.inf)
+    for j in range(cameras.shape[0]):
+        away = means[i] - wp.vec3(cameras[j, 0], cameras[j, 1], cameras[j, 2])
+        depth = wp.dot(away, wp.vec3(cameras[j, 3], cameras[j, 4], cameras[j, 5]))
+        distance = wp.length(away)
+        size = wp.where(cameras[j, 8] > 0.5, distance, depth) / cameras[j, 6]
+        if depth >= cameras[j, 7] * distance and size < smallest:
+            smallest = size
+    # in float64, since the rounding of float32's logarithm depends on the processor
+    size64 = wp.where(smallest < wp.inf, wp.float64(smallest) * wp.float64(fraction), wp.float64(0.0))
+    log_sizes[i] = wp.float32(wp.log(wp.max(size64, wp.float64(SMALLEST))))
 
 
 def pixel_size(means: torch.Tensor, cameras: torch.Tensor, fraction: float) -> torch.Tensor:
     """Return log(``fraction`` x smallest pixel size at means [N, 3]) over cameras [C, 9] (`COLUMNS`) that see them, [N]."""
     # The pixel size of a camera is depth / focal length, or distance / focal length for a fisheye (Yu et al. 2024,
     # Mip-Splatting, section 4.1). A camera sees the points in the cone around its image.
-    return _log_sizes(make_pixel_kernel(), means, cameras, fraction)
+    return _log_sizes(bound_by_pixel, means, cameras, fraction)

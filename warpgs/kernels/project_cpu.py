@@ -9,18 +9,16 @@ from warpgs.constants import LARGEST_COEFFICIENT
 from warpgs.kernels import ellipse, sh
 from warpgs.kernels.cameras import types_of
 from warpgs.kernels.ellipse import PROJECTED_SIZE, arrays_of, make_projection, make_spans
-from warpgs.kernels.native import EXACT
+from warpgs.kernels.native import EXACT, Ints
 
 LANES = 16
 """Gaussians of a task."""
-
-Ints = wp.array(dtype=int)
 
 
 @functools.cache
 def make_lanes(real, size: int):
     """Make the type of vectors of ``size`` numbers for all lanes, and its functions; a loop over the lanes vectorises."""
-    vector = wp.types.vector(size, real)
+    vector, Rows = wp.types.vector(size, real), wp.array2d(dtype=real)
     lane_vectors = wp.types.vector(size * LANES, real)  # each number of all lanes is contiguous
     count = wp.constant(size)
 
@@ -36,6 +34,12 @@ def make_lanes(real, size: int):
             to[wp.static(k * LANES) + lane] = v[k]
 
     @wp.func(inline=True)
+    def load(rows: Rows, i: wp.int32, lane: wp.int32, to: wp.ref[lane_vectors]):
+        """Store a row of a table in a lane."""
+        for k in range(count):
+            to[wp.static(k * LANES) + lane] = rows[i, k]
+
+    @wp.func(inline=True)
     def add(hit: bool, v: vector, lane: wp.int32, to: wp.ref[lane_vectors]):
         """Add to the vector of a lane if it is hit."""
         for k in range(count):
@@ -49,7 +53,7 @@ def make_lanes(real, size: int):
             v[k] = at(vectors[wp.static(k * LANES) + lane])
         return v
 
-    return SimpleNamespace(vectors=lane_vectors, put=put, add=add, get=get)
+    return SimpleNamespace(vectors=lane_vectors, vector=vector, put=put, load=load, add=add, get=get)
 
 
 @functools.cache
@@ -90,7 +94,7 @@ def make_forward(real, camera_model: str, parameters: str, antialiased: bool, ba
     m = make_projection(real, camera_model, parameters, lanes=True)
     s = make_spans(real, lanes=True)
     g = make_shapes(real, parameters)
-    three, four, basis = make_lanes(real, 3), make_lanes(real, 4), make_lanes(real, bases)
+    three, four, row, basis = (make_lanes(real, size) for size in (3, 4, PROJECTED_SIZE, bases))
     basis_of = sh.make_functions(real, bases).basis
     _, vec3, _, _, _, Reals = types_of(real)
     Vec3s, Vec4s, Mat33s, Mat44s, Rows, Vec3Rows = arrays_of(real)
@@ -130,16 +134,9 @@ def make_forward(real, camera_model: str, parameters: str, antialiased: bool, ba
                 opacity[lane] = opacity[lane] * opacity_factors[n]
 
         valid = lane_ints()
-        pixel_x = lane_reals()
-        pixel_y = lane_reals()
-        u11 = lane_reals()
-        u12 = lane_reals()
-        u22 = lane_reals()
-        depth = lane_reals()
+        rows = row.vectors()  # without colours, and at first without sides
         shrink = lane_reals()
-        a = lane_reals()
-        b = lane_reals()
-        c = lane_reals()
+        covariances = three.vectors()
         for lane in range(LANES):
             e = m.ellipse(
                 three.get(shapes.mean, lane), four.get(shapes.quat, lane), three.get(shapes.scale, lane),
@@ -154,44 +151,44 @@ def make_forward(real, camera_model: str, parameters: str, antialiased: bool, ba
             found = wp.where(o - o == real(0.0), found, 0)
             found = wp.where(o > real(0.0), found, 0)
             valid[lane] = wp.where(o >= alpha_cut, found, 0)
-            pixel_x[lane] = e.pixel[0]
-            pixel_y[lane] = e.pixel[1]
-            u11[lane] = factor[0]
-            u12[lane] = factor[1]
-            u22[lane] = factor[2]
-            depth[lane] = m.depth_of(e.position)
+            v = row.vector()
+            v[0] = e.pixel[0]
+            v[1] = e.pixel[1]
+            v[2] = factor[0]
+            v[3] = factor[1]
+            v[4] = factor[2]
+            v[5] = o
+            v[9] = m.depth_of(e.position)
+            row.put(v, lane, rows)
             shrink[lane] = e.shrink
-            a[lane] = e.a
-            b[lane] = e.b
-            c[lane] = e.c
+            three.put(vec3(e.a, e.b, e.c), lane, covariances)
 
         reach = lane_reals()
         for lane in range(used):
             if valid[lane] != 0:
                 reach[lane] = s.reach_of(opacity[lane], alpha_cut, square_sigma)
-        half_width = lane_reals()
-        half_height = lane_reals()
         begin_row = lane_ints()
         end_row = lane_ints()
         tiles = lane_ints()
         for lane in range(LANES):
-            half = s.half_sides(a[lane], b[lane], c[lane], shrink[lane], reach[lane], alpha_cut, square_sigma)
-            rows = s.tile_rows(pixel_y[lane], half[1], origin_y, window_height, tile_size)
-            begin_row[lane] = wp.where(valid[lane] != 0, rows[0], 0)
-            end_row[lane] = wp.where(valid[lane] != 0, rows[1], 0)
-            half_width[lane] = half[0]
-            half_height[lane] = half[1]
+            c = three.get(covariances, lane)
+            half = s.half_sides(c[0], c[1], c[2], shrink[lane], reach[lane], alpha_cut, square_sigma)
+            p = row.get(rows, lane)
+            span = s.tile_rows(p[1], half[1], origin_y, window_height, tile_size)
+            begin_row[lane] = wp.where(valid[lane] != 0, span[0], 0)
+            end_row[lane] = wp.where(valid[lane] != 0, span[1], 0)
+            rows[10 * LANES + lane] = half[0]
+            rows[11 * LANES + lane] = half[1]
         most = int(0)
         for lane in range(used):
             most = wp.max(most, end_row[lane] - begin_row[lane])
         for k in range(most):
             for lane in range(LANES):
-                row = begin_row[lane] + k
-                columns = s.tile_columns(
-                    pixel_x[lane], pixel_y[lane], vec3(u11[lane], u12[lane], u22[lane]), reach[lane], half_width[lane],
-                    half_height[lane], row, origin_x, window_width, tile_size,
-                )  # fmt: skip
-                tiles[lane] = tiles[lane] + wp.where(row < end_row[lane], columns[1] - columns[0], 0)
+                y = begin_row[lane] + k
+                p = row.get(rows, lane)
+                factor = vec3(p[2], p[3], p[4])
+                span = s.tile_columns(p[0], p[1], factor, reach[lane], p[10], p[11], y, origin_x, window_width, tile_size)
+                tiles[lane] = tiles[lane] + wp.where(y < end_row[lane], span[1] - span[0], 0)
 
         # last, since it reads the most
         values = basis.vectors()
@@ -215,21 +212,13 @@ def make_forward(real, camera_model: str, parameters: str, antialiased: bool, ba
                 if not (m.finite3(color) and wp.max(largest) <= real(LARGEST_COEFFICIENT)):
                     tiles[lane] = 0
             tile_counts[i] = tiles[lane]
+            v = row.vector()
             if tiles[lane] > 0:
-                projected[i, 0] = pixel_x[lane]
-                projected[i, 1] = pixel_y[lane]
-                projected[i, 2] = u11[lane]
-                projected[i, 3] = u12[lane]
-                projected[i, 4] = u22[lane]
-                projected[i, 5] = opacity[lane]
+                v = row.get(rows, lane)
                 for channel in range(3):
-                    projected[i, 6 + channel] = wp.max(color[channel], real(0.0))
-                projected[i, 9] = depth[lane]
-                projected[i, 10] = half_width[lane]
-                projected[i, 11] = half_height[lane]
-            else:
-                for k in range(PROJECTED_SIZE):
-                    projected[i, k] = real(0.0)
+                    v[6 + channel] = wp.max(color[channel], real(0.0))
+            for k in range(PROJECTED_SIZE):
+                projected[i, k] = v[k]
 
     return forward
 
@@ -306,9 +295,8 @@ def make_backward(real, camera_model: str, parameters: str, antialiased: bool, b
                 i = camera * count + first + lane
                 seen[lane] = wp.where(tile_counts[i] > 0, 1, 0)
                 if tile_counts[i] > 0:
-                    for k in range(wp.static(PROJECTED_SIZE)):
-                        rows[k * LANES + lane] = projected[i, k]
-                        v_rows[k * LANES + lane] = v_projected[i, k]
+                    row.load(projected, i, lane, rows)
+                    row.load(v_projected, i, lane, v_rows)
             for lane in range(LANES):
                 g = f.shape(
                     three.get(shapes.mean, lane), four.get(shapes.quat, lane), three.get(shapes.scale, lane),

@@ -8,9 +8,7 @@ from warpgs.constants import LARGEST_COEFFICIENT
 from warpgs.kernels import ellipse, sh
 from warpgs.kernels.cameras import types_of
 from warpgs.kernels.ellipse import PROJECTED_SIZE, arrays_of, make_projection, make_spans
-from warpgs.kernels.native import make_color, make_functions as make_native
-
-Ints = wp.array(dtype=int)
+from warpgs.kernels.native import Ints, clear_rows, compact, make_color, store_row
 
 
 def _module(kind: str, real, camera_model: str, parameters: str, antialiased: bool, bases: int) -> str:
@@ -26,10 +24,9 @@ def make_forward(real, camera_model: str, parameters: str = "stored", antialiase
     m = make_projection(real, camera_model, parameters)
     s = make_spans(real)
     basis = sh.make_functions(real, bases).basis
-    _, vec3, _, mat33, mat44, Reals = types_of(real)
+    _, vec3, *_, mat44, Reals = types_of(real)
     Vec3s, Vec4s, Mat33s, Mat44s, Rows, Vec3Rows = arrays_of(real)
     color_of = make_color(bases).color if native else None
-    compact = make_native().compact if native else None
     vec12 = wp.types.vector(PROJECTED_SIZE, real)
 
     @wp.func
@@ -37,57 +34,8 @@ def make_forward(real, camera_model: str, parameters: str = "stored", antialiase
         for k in range(wp.static(PROJECTED_SIZE)):
             projected[i, k] = values[k]
 
-    store = make_native().store_row if native else store_values
+    store = store_row if native else store_values
     module = _module("forward", real, camera_model, parameters, antialiased, bases)
-
-    @wp.func
-    def project_one(
-        i: int, n: int, view: mat44, K: mat33, lens: Reals,
-        means: Vec3s, quats: Vec4s, log_scales: Vec3s,
-        logit_opacities: Reals, opacity_factors: Reals,
-        width: int, height: int, origin_x: int, origin_y: int, window_width: int, window_height: int, tile_size: int,
-        near: real, far: real, low_pass: real, alpha_cut: real, square_sigma: real, projected: Rows,
-    ):  # fmt: skip
-        """Write row i without its colour; return the number of tiles touched. Where that is 0 nothing is written."""
-        e = m.ellipse(means[n], quats[n], log_scales[n], view, K, lens, real(width), real(height), near, low_pass)
-        if e.valid == 0 or not (m.depth_of(e.position) <= far):
-            return 0
-        opacity = m.opacity_of(logit_opacities[n])
-        if opacity_factors.shape[0] > 0:
-            opacity *= opacity_factors[n]
-        if wp.static(antialiased):
-            opacity *= m.compensation(e)
-        if not (wp.isfinite(opacity) and opacity > real(0.0) and opacity >= alpha_cut):
-            return 0
-
-        factor = m.factor_of(e)
-        if not m.finite3(factor):
-            return 0
-
-        reach = s.reach_of(opacity, alpha_cut, square_sigma)
-        half = s.half_sides(e.a, e.b, e.c, e.shrink, reach, alpha_cut, square_sigma)
-        rows = s.tile_rows(e.pixel[1], half[1], origin_y, window_height, tile_size)
-        tiles = int(0)
-        for row in range(rows[0], rows[1]):
-            columns = s.tile_columns(
-                e.pixel[0], e.pixel[1], factor, reach, half[0], half[1], row, origin_x, window_width, tile_size
-            )
-            tiles += columns[1] - columns[0]
-        if tiles == 0:
-            return 0
-
-        result = vec12()
-        result[0] = e.pixel[0]
-        result[1] = e.pixel[1]
-        result[2] = factor[0]
-        result[3] = factor[1]
-        result[4] = factor[2]
-        result[5] = opacity
-        result[9] = m.depth_of(e.position)
-        result[10] = half[0]
-        result[11] = half[1]
-        store(projected, i, result)
-        return tiles
 
     @wp.func
     def color_one(
@@ -134,17 +82,35 @@ def make_forward(real, camera_model: str, parameters: str = "stored", antialiase
         seen = int(0)
         if i < viewmats.shape[0] * count:
             camera = i // count
-            tiles = project_one(
-                i, i - camera * count, viewmats[camera], Ks[camera], lenses[camera], means, quats, log_scales,
-                logit_opacities, opacity_factors,
-                width, height, origin_x, origin_y, window_width, window_height, tile_size,
-                near, far, low_pass, alpha_cut, square_sigma, projected,
+            n = i - camera * count
+            values = vec12()  # without the colour
+            e = m.ellipse(
+                means[n], quats[n], log_scales[n], viewmats[camera], Ks[camera], lenses[camera],
+                real(width), real(height), near, low_pass,
             )  # fmt: skip
-            tile_counts[i] = tiles
-            if tiles == 0:
-                store(projected, i, vec12())
-            else:
-                seen = 1
+            if e.valid != 0 and m.depth_of(e.position) <= far:
+                opacity = m.opacity_of(logit_opacities[n])
+                if opacity_factors.shape[0] > 0:
+                    opacity *= opacity_factors[n]
+                if wp.static(antialiased):
+                    opacity *= m.compensation(e)
+                factor = m.factor_of(e)
+                if wp.isfinite(opacity) and opacity > real(0.0) and opacity >= alpha_cut and m.finite3(factor):
+                    reach = s.reach_of(opacity, alpha_cut, square_sigma)
+                    half = s.half_sides(e.a, e.b, e.c, e.shrink, reach, alpha_cut, square_sigma)
+                    rows = s.tile_rows(e.pixel[1], half[1], origin_y, window_height, tile_size)
+                    for row in range(rows[0], rows[1]):
+                        columns = s.tile_columns(
+                            e.pixel[0], e.pixel[1], factor, reach, half[0], half[1], row, origin_x, window_width, tile_size
+                        )
+                        seen += columns[1] - columns[0]
+                    if seen > 0:
+                        values = vec12(
+                            e.pixel[0], e.pixel[1], factor[0], factor[1], factor[2], opacity, real(0.0), real(0.0), real(0.0),
+                            m.depth_of(e.position), half[0], half[1],
+                        )  # fmt: skip
+            tile_counts[i] = seen
+            store(projected, i, values)
         if wp.static(native):
             i = compact(i, seen)
         elif seen == 0:
@@ -166,8 +132,6 @@ def make_backward(real, camera_model: str, parameters: str = "stored", antialias
     functions = sh.make_functions(real, bases)
     _, vec3, vec4, mat33, mat44, Reals = types_of(real)
     Vec3s, Vec4s, Mat33s, Mat44s, Rows, Vec3Rows = arrays_of(real)
-    compact = make_native().compact if native else None
-    clear_rows = make_native().clear_rows if native else None
     color_backward = make_color(bases).color_backward if native else None
 
     # three blocks to a multiprocessor: enough registers

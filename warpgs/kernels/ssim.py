@@ -10,7 +10,7 @@ import warp as wp
 from warpgs.device import FLOAT, StepSizes
 from warpgs.kernels import launch
 from warpgs.kernels.launch import first_order, keep, kept
-from warpgs.kernels.native import ROLLED, cuda_kernel, make_prefetch, source
+from warpgs.kernels.native import ROLLED, Floats, cuda_kernel, make_prefetch, source
 
 RADIUS = 5
 """Half size of the window [px]."""
@@ -46,6 +46,7 @@ def make_functions(real):
     w0, w1, w2, w3, w4, w5 = (real(w) for w in WINDOW[RADIUS:])
     vec6 = wp.types.vector(6, real)
     channels = CHANNELS
+    Reals = wp.array(dtype=real)
 
     @wp.func
     def tap(k: wp.int32) -> real:
@@ -63,7 +64,7 @@ def make_functions(real):
         return wp.max(first, 0) + lane
 
     @wp.func
-    def across(m: wp.array(dtype=real), first: wp.int32, lane: wp.int32) -> real:
+    def across(m: Reals, first: wp.int32, lane: wp.int32) -> real:
         """Return the weighted sum over the columns of the window; ``first`` + ``lane`` is the leftmost column."""
         o = at(first, lane)
         s = w5 * (m[o] + m[o + 10 * channels])
@@ -109,8 +110,8 @@ def make_functions(real):
 
 
 @functools.cache
-def make_kernels(real, summed: bool):
-    """Make the generic kernels, of one task per block of rows; ``summed`` for sums over the image instead of a map."""
+def make_kernel(real, summed: bool, backward: bool):
+    """Make a generic kernel, of one task per block of rows; ``summed`` for sums over the image instead of a map."""
     # The sums of a row are in ``scratch``, where each task has a few rows of its own. A row is processed in steps of `LANES`
     # elements; the last step starts early, to end with the row, and elements that it computes again get the same values.
     f = make_functions(real)
@@ -118,8 +119,8 @@ def make_kernels(real, summed: bool):
     vec11i = wp.types.vector(TAPS, wp.int32)
     values = wp.types.vector(LANES, real)
     several = wp.types.vector(5 * LANES, real)
-    prefetch = make_prefetch(real)
-    kernel = functools.partial(wp.kernel, enable_backward=False, module="unique", module_options=ROLLED)
+    Reals = wp.array(dtype=real)
+    prefetch, fields = make_prefetch(real), 3 if backward else 5
 
     @wp.func
     def starts_of(y: wp.int32, height: wp.int32, image: wp.int32, columns: wp.int32) -> vec11i:
@@ -138,7 +139,7 @@ def make_kernels(real, summed: bool):
         return w
 
     @wp.func
-    def clear_padding(scratch: wp.array(dtype=real), first: wp.int32, columns: wp.int32, rows: wp.int32):
+    def clear_padding(scratch: Reals, first: wp.int32, columns: wp.int32, rows: wp.int32):
         for row in range(rows):
             o = first + row * (columns + 2 * PADDING)
             for k in range(PADDING):
@@ -148,9 +149,7 @@ def make_kernels(real, summed: bool):
     # Warp unrolls loops that hold a `wp.static`: inside the loop over lanes, they would keep the latter from vectorising.
 
     @wp.func
-    def down_pairs(
-        a: wp.array(dtype=real), b: wp.array(dtype=real), o: vec11i, w: vec11, x: wp.int32, lane: wp.int32
-    ) -> f.vec5:
+    def down_pairs(a: Reals, b: Reals, o: vec11i, w: vec11, x: wp.int32, lane: wp.int32) -> f.vec5:
         s = f.vec5()
         for k in range(TAPS):
             s = f.add_pair(s, w[wp.static(k)], a[f.at(o[k] + x, lane)], b[f.at(o[k] + x, lane)])
@@ -162,26 +161,26 @@ def make_kernels(real, summed: bool):
             sums[k * LANES + lane] = s[k]
 
     @wp.func
-    def down(m: wp.array(dtype=real), o: vec11i, w: vec11, x: wp.int32, lane: wp.int32) -> real:
+    def down(m: Reals, o: vec11i, w: vec11, x: wp.int32, lane: wp.int32) -> real:
         s = w[0] * m[f.at(o[0] + x, lane)]
         for k in range(1, TAPS):
             s += w[wp.static(k)] * m[f.at(o[k] + x, lane)]
         return s
 
-    @kernel
-    def forward(
-        begin: int, a: wp.array(dtype=real), b: wp.array(dtype=real), height: int, blocks: int, columns: int,
-        scratch: wp.array(dtype=real),
-        # outputs: the similarity, or per task the sums of 1 - similarity and of |a - b|; the partials
-        result: wp.array(dtype=real), by_mean: wp.array(dtype=real), by_variance: wp.array(dtype=real),
-        by_gap: wp.array(dtype=real),
+    @wp.kernel(enable_backward=False, module="unique", module_options=ROLLED)
+    def walk(
+        begin: int, a: Reals, b: Reals, height: int, blocks: int, columns: int, scratch: Reals,
+        # outputs, in the backward pass inputs: the similarity, or per task the sums of 1 - similarity and of |a - b|; partials
+        result: Reals, by_mean: Reals, by_variance: Reals, by_gap: Reals,
+        # output of the backward pass
+        v_a: Reals,
     ):  # fmt: skip
         task = begin + wp.tid()
         image = task // blocks
         top = (task - image * blocks) * BLOCK
         stride = columns + 2 * PADDING
-        first = task * 5 * stride
-        clear_padding(scratch, first, columns, 5)
+        first = task * fields * stride
+        clear_padding(scratch, first, columns, fields)
         sums = several()
         unlike = values()
         error = values()
@@ -190,35 +189,59 @@ def make_kernels(real, summed: bool):
             w = taps_of(y, height)
             for step in range((columns + LANES - 1) // LANES):
                 x = wp.min(step * LANES, columns - LANES)
-                prefetch(a, o[10] + columns + x)  # of the row that the next window adds: too many streams for the processor
-                prefetch(b, o[10] + columns + x)
-                for lane in range(LANES):
-                    put(down_pairs(a, b, o, w, x, lane), lane, sums)
-                for k in range(5):
+                # of the row that the next window adds: too many streams for the processor
+                if wp.static(backward):
+                    prefetch(by_mean, o[10] + columns + x)
+                    prefetch(by_variance, o[10] + columns + x)
+                    prefetch(by_gap, o[10] + columns + x)
+                    for lane in range(LANES):
+                        sums[lane] = down(by_mean, o, w, x, lane)
+                        sums[LANES + lane] = down(by_variance, o, w, x, lane)
+                        sums[2 * LANES + lane] = down(by_gap, o, w, x, lane)
+                else:
+                    prefetch(a, o[10] + columns + x)
+                    prefetch(b, o[10] + columns + x)
+                    for lane in range(LANES):
+                        put(down_pairs(a, b, o, w, x, lane), lane, sums)
+                for k in range(fields):
                     for lane in range(LANES):
                         scratch[f.at(first + k * stride + PADDING + x, lane)] = sums[k * LANES + lane]
             row = (image * height + y) * columns
             for step in range((columns + LANES - 1) // LANES):
                 x = wp.min(step * LANES, columns - LANES)
-                fresh = step * LANES - x  # elements before this one were counted in the step before
-                for lane in range(LANES):
-                    t = f.score(
-                        f.across(scratch, first + x, lane), f.across(scratch, first + stride + x, lane),
-                        f.across(scratch, first + 2 * stride + x, lane), f.across(scratch, first + 3 * stride + x, lane),
-                        f.across(scratch, first + 4 * stride + x, lane),
-                    )  # fmt: skip
-                    put(f.vec5(t[0], t[1], t[2], t[3], real(0.0)), lane, sums)
-                    if wp.static(summed):
-                        unlike[lane] = unlike[lane] + wp.where(lane >= fresh, real(1.0) - t[0], real(0.0))
-                        gap = wp.abs(a[f.at(row + x, lane)] - b[f.at(row + x, lane)])
-                        error[lane] = error[lane] + wp.where(lane >= fresh, gap, real(0.0))
-                for lane in range(LANES):
-                    if not wp.static(summed):
-                        result[f.at(row + x, lane)] = sums[lane]
-                    by_mean[f.at(row + x, lane)] = sums[LANES + lane]
-                    by_variance[f.at(row + x, lane)] = sums[2 * LANES + lane]
-                    by_gap[f.at(row + x, lane)] = sums[3 * LANES + lane]
-        if wp.static(summed):
+                if wp.static(backward):
+                    for lane in range(LANES):
+                        p = a[f.at(row + x, lane)]
+                        d = p - b[f.at(row + x, lane)]
+                        v = f.across(scratch, first + stride + x, lane) * p
+                        v = v + f.across(scratch, first + 2 * stride + x, lane) * d
+                        v = f.across(scratch, first + x, lane) + real(2.0) * v
+                        if wp.static(summed):
+                            sign = wp.where(d > real(0.0), result[1], wp.where(d < real(0.0), -result[1], real(0.0)))
+                            v = sign - result[0] * v
+                        sums[lane] = v
+                    for lane in range(LANES):
+                        v_a[f.at(row + x, lane)] = sums[lane]
+                else:
+                    fresh = step * LANES - x  # elements before this one were counted in the step before
+                    for lane in range(LANES):
+                        t = f.score(
+                            f.across(scratch, first + x, lane), f.across(scratch, first + stride + x, lane),
+                            f.across(scratch, first + 2 * stride + x, lane), f.across(scratch, first + 3 * stride + x, lane),
+                            f.across(scratch, first + 4 * stride + x, lane),
+                        )  # fmt: skip
+                        put(f.vec5(t[0], t[1], t[2], t[3], real(0.0)), lane, sums)
+                        if wp.static(summed):
+                            unlike[lane] = unlike[lane] + wp.where(lane >= fresh, real(1.0) - t[0], real(0.0))
+                            gap = wp.abs(a[f.at(row + x, lane)] - b[f.at(row + x, lane)])
+                            error[lane] = error[lane] + wp.where(lane >= fresh, gap, real(0.0))
+                    for lane in range(LANES):
+                        if not wp.static(summed):
+                            result[f.at(row + x, lane)] = sums[lane]
+                        by_mean[f.at(row + x, lane)] = sums[LANES + lane]
+                        by_variance[f.at(row + x, lane)] = sums[2 * LANES + lane]
+                        by_gap[f.at(row + x, lane)] = sums[3 * LANES + lane]
+        if wp.static(summed and not backward):
             unlike_sum = real(0.0)
             error_sum = real(0.0)
             for lane in range(LANES):
@@ -227,52 +250,7 @@ def make_kernels(real, summed: bool):
             result[2 * task] = unlike_sum
             result[2 * task + 1] = error_sum
 
-    @kernel
-    def backward(
-        begin: int, a: wp.array(dtype=real), b: wp.array(dtype=real), by_mean: wp.array(dtype=real),
-        by_variance: wp.array(dtype=real), by_gap: wp.array(dtype=real), v_result: wp.array(dtype=real),
-        height: int, blocks: int, columns: int, scratch: wp.array(dtype=real),
-        # outputs
-        v_a: wp.array(dtype=real),
-    ):  # fmt: skip
-        task = begin + wp.tid()
-        image = task // blocks
-        top = (task - image * blocks) * BLOCK
-        stride = columns + 2 * PADDING
-        first = task * 3 * stride
-        clear_padding(scratch, first, columns, 3)
-        sums = several()
-        for y in range(top, wp.min(top + BLOCK, height)):
-            o = starts_of(y, height, image, columns)
-            w = taps_of(y, height)
-            for step in range((columns + LANES - 1) // LANES):
-                x = wp.min(step * LANES, columns - LANES)
-                prefetch(by_mean, o[10] + columns + x)
-                prefetch(by_variance, o[10] + columns + x)
-                prefetch(by_gap, o[10] + columns + x)
-                for lane in range(LANES):
-                    sums[lane] = down(by_mean, o, w, x, lane)
-                    sums[LANES + lane] = down(by_variance, o, w, x, lane)
-                    sums[2 * LANES + lane] = down(by_gap, o, w, x, lane)
-                for k in range(3):
-                    for lane in range(LANES):
-                        scratch[f.at(first + k * stride + PADDING + x, lane)] = sums[k * LANES + lane]
-            row = (image * height + y) * columns
-            for step in range((columns + LANES - 1) // LANES):
-                x = wp.min(step * LANES, columns - LANES)
-                for lane in range(LANES):
-                    p = a[f.at(row + x, lane)]
-                    d = p - b[f.at(row + x, lane)]
-                    v = f.across(scratch, first + stride + x, lane) * p + f.across(scratch, first + 2 * stride + x, lane) * d
-                    v = f.across(scratch, first + x, lane) + real(2.0) * v
-                    if wp.static(summed):
-                        sign = wp.where(d > real(0.0), v_result[1], wp.where(d < real(0.0), -v_result[1], real(0.0)))
-                        v = sign - v_result[0] * v
-                    sums[lane] = v
-                for lane in range(LANES):
-                    v_a[f.at(row + x, lane)] = sums[lane]
-
-    return SimpleNamespace(forward=forward, backward=backward)
+    return walk
 
 
 SIDE = 16
@@ -281,31 +259,27 @@ THREADS = 256
 """Threads of a block."""
 
 
-@functools.cache
-def make_cuda_kernels():
-    """Make the forward and backward kernels; their argument ``summed`` is 1 for the two sums of `differences`, 0 for a map."""
-    numbers = {"WINDOW": ", ".join(f"{w!r}f" for w in WINDOW), "C1": f"{C1!r}f", "C2": f"{C2!r}f"}
+NUMBERS = {"WINDOW": ", ".join(f"{w!r}f" for w in WINDOW), "C1": f"{C1!r}f", "C2": f"{C2!r}f"}
+"""Numbers in the CUDA text."""
 
-    block, module = f"wp.tid() // {THREADS}", "warpgs.kernels.ssim_cuda"
 
-    @cuda_kernel(source("ssim_forward.cu", **numbers), block, module)
-    def forward(
-        block: int, a: wp.array(dtype=float), b: wp.array(dtype=float), height: int, columns: int, summed: int,
-        # outputs: the similarities, or two sums per block; and the partials by mean, variance and gap
-        result: wp.array(dtype=float), by_mean: wp.array(dtype=float), by_variance: wp.array(dtype=float),
-        by_gap: wp.array(dtype=float),
-    ): ...  # fmt: skip
+@cuda_kernel(source("ssim_forward.cu", **NUMBERS), f"wp.tid() // {THREADS}", "warpgs.kernels.ssim_cuda")
+def cuda_forward(
+    block: int, a: Floats, b: Floats, height: int, columns: int, summed: int,
+    # outputs: the similarities, or two sums per block; and the partials by mean, variance and gap
+    result: Floats, by_mean: Floats, by_variance: Floats, by_gap: Floats,
+):  # fmt: skip
+    """Compute the similarity of a square of pixels; ``summed`` is 1 for the two sums of `differences`, 0 for a map."""
 
-    @cuda_kernel(source("ssim_backward.cu", **numbers), block, module)
-    def backward(
-        block: int, a: wp.array(dtype=float), b: wp.array(dtype=float), v_result: wp.array(dtype=float),
-        by_mean: wp.array(dtype=float), by_variance: wp.array(dtype=float), by_gap: wp.array(dtype=float),
-        height: int, columns: int, summed: int,
-        # outputs
-        v_a: wp.array(dtype=float),
-    ): ...  # fmt: skip
 
-    return SimpleNamespace(forward=forward, backward=backward)
+@cuda_kernel(source("ssim_backward.cu", **NUMBERS), f"wp.tid() // {THREADS}", "warpgs.kernels.ssim_cuda")
+def cuda_backward(
+    block: int, a: Floats, b: Floats, v_result: Floats, by_mean: Floats, by_variance: Floats, by_gap: Floats, height: int,
+    columns: int, summed: int,
+    # outputs
+    v_a: Floats,
+):  # fmt: skip
+    """Compute the gradient of a square of pixels."""
 
 
 # Structural similarity with an 11 x 11 Gaussian window (Wang et al. 2004), separable, forward and backward.
@@ -336,11 +310,11 @@ class _Ssim(torch.autograd.Function):
         partials = [torch.empty_like(image) for _ in range(3)]
         if native:
             inputs = [image, target, height, columns, int(summed), result, *partials]
-            launch.launch(make_cuda_kernels().forward, tasks * THREADS, inputs, image.device, block_dim=THREADS)
+            launch.launch(cuda_forward, tasks * THREADS, inputs, image.device, block_dim=THREADS)
         else:
-            kernel = make_kernels(launch.real_of(image), summed).forward
             workspace = image.new_empty(tasks * 5 * (columns + 2 * PADDING))
-            inputs = [image, target, height, blocks, columns, workspace, result, *partials]
+            inputs = [image, target, height, blocks, columns, workspace, result, *partials, image.new_empty(0)]
+            kernel = make_kernel(launch.real_of(image), summed, False)
             launch.launch(kernel, tasks, inputs, image.device, cost=BLOCK * columns)
         keep(ctx, image, target, *partials)
         ctx.summed, ctx.tasks = summed, tasks
@@ -354,12 +328,12 @@ class _Ssim(torch.autograd.Function):
         v_image, v_result = torch.empty_like(image), v_result.contiguous()
         if _native(image):
             inputs = [image, target, v_result, *partials, height, columns, int(ctx.summed), v_image]
-            launch.launch(make_cuda_kernels().backward, tasks * THREADS, inputs, image.device, block_dim=THREADS)
+            launch.launch(cuda_backward, tasks * THREADS, inputs, image.device, block_dim=THREADS)
         else:
             fields = partials if ctx.summed else [v_result * t for t in partials]  # v_result is then not read
             workspace = image.new_empty(tasks * 3 * (columns + 2 * PADDING))
-            inputs = [image, target, *fields, v_result, height, -(-height // BLOCK), columns, workspace, v_image]
-            kernel = make_kernels(launch.real_of(image), ctx.summed).backward
+            inputs = [image, target, height, -(-height // BLOCK), columns, workspace, v_result, *fields, v_image]
+            kernel = make_kernel(launch.real_of(image), ctx.summed, True)
             launch.launch(kernel, tasks, inputs, image.device, cost=BLOCK * columns)
         return v_image, None, None
 

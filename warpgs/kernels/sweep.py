@@ -1,6 +1,5 @@
 """Plane sweeps: depths of the planes, their costs, and the scanlines that smooth them."""
 
-import functools
 import math
 from collections.abc import Sequence
 
@@ -10,12 +9,15 @@ import warp as wp
 
 from warpgs import geometry
 from warpgs.kernels import launch
-from warpgs.kernels.native import EXACT, cuda_kernel, source
+from warpgs.kernels.native import EXACT, Floats, IntRows, Ints, Longs, cuda_kernel, source
 from warpgs.scene import Camera
 
 # Depths of a plane sweep on a CPU: the best plane of each pixel, and round trips through another view's depth.
 #
 # Kernels use float64 and one task per pixel. No operations are fused, so depths are the same bits on any processor.
+
+Shorts, ShortRows = wp.array(dtype=wp.int16), wp.array2d(dtype=wp.int16)
+FloatRows, DoubleRows = wp.array2d(dtype=float), wp.array2d(dtype=wp.float64)
 
 BEHIND = 1e-9
 """Ratio of a point's depth to its depth in the first view, up to which the point counts as behind a camera."""
@@ -25,7 +27,7 @@ STEP = 1e-3
 
 @wp.kernel(enable_backward=False, module="warpgs.kernels.plane_depths")
 def best(
-    begin: int, costs: wp.array2d(dtype=wp.int16), planes: int, first: wp.float64, step: wp.float64,
+    begin: int, costs: ShortRows, planes: int, first: wp.float64, step: wp.float64,
     # outputs
     inverses: wp.array(dtype=wp.float64),
 ):  # fmt: skip
@@ -59,10 +61,10 @@ def project(turn: wp.mat33d, shift: wp.vec3d, x: wp.float64, y: wp.float64, w: w
 
 @wp.kernel(enable_backward=False, module="warpgs.kernels.plane_depths")
 def check(
-    begin: int, own: wp.array2d(dtype=wp.float64), found: wp.array2d(dtype=wp.float64), turn: wp.mat33d, shift: wp.vec3d,
-    turn_back: wp.mat33d, shift_back: wp.vec3d, to_ray: wp.mat33d, center: wp.vec3d, most: wp.float64, cosine: wp.float64,
+    begin: int, own: DoubleRows, found: DoubleRows, turn: wp.mat33d, shift: wp.vec3d, turn_back: wp.mat33d,
+    shift_back: wp.vec3d, to_ray: wp.mat33d, center: wp.vec3d, most: wp.float64, cosine: wp.float64,
     # outputs
-    sensitivity: wp.array2d(dtype=wp.float64), agrees: wp.array2d(dtype=wp.uint8),
+    sensitivity: DoubleRows, agrees: wp.array2d(dtype=wp.uint8),
 ):  # fmt: skip
     """Follow a pixel into another view and back."""
     i = begin + wp.tid()
@@ -94,10 +96,9 @@ def check(
 
 @wp.kernel(enable_backward=False, module="warpgs.kernels.plane_depths")
 def lift(
-    begin: int, pixels: wp.array(dtype=wp.int64), width: wp.int64, depths: wp.array(dtype=wp.float32), to_ray: wp.mat33d,
-    turn: wp.mat33d, shift: wp.vec3d,
+    begin: int, pixels: Longs, width: wp.int64, depths: Floats, to_ray: wp.mat33d, turn: wp.mat33d, shift: wp.vec3d,
     # outputs
-    points: wp.array2d(dtype=wp.float64),
+    points: DoubleRows,
 ):  # fmt: skip
     """Find the world point at the centre of a pixel and at its z-depth."""
     i = begin + wp.tid()
@@ -114,8 +115,7 @@ def lift(
 
 @wp.kernel(enable_backward=False, module="warpgs.kernels.plane_depths")
 def occlude(
-    begin: int, points: wp.array2d(dtype=wp.float64), cameras: wp.array2d(dtype=wp.float64), camera: int,
-    depths: wp.array2d(dtype=wp.float32), fraction: float,
+    begin: int, points: DoubleRows, cameras: DoubleRows, camera: int, depths: FloatRows, fraction: float,
     # outputs
     hides: wp.array(dtype=wp.uint8),
 ):  # fmt: skip
@@ -238,8 +238,8 @@ def mirror(i: wp.int32, count: wp.int32) -> wp.int32:
 
 @wp.func
 def warp_row(
-    y: wp.int32, pitch: wp.int32, images: wp.array(dtype=wp.int32), offset: wp.int32, other_width: wp.int32,
-    other_height: wp.int32, h: wp.array(dtype=wp.float32), first: wp.int32, ring: wp.array(dtype=wp.int32), into: wp.int32,
+    y: wp.int32, pitch: wp.int32, images: Ints, offset: wp.int32, other_width: wp.int32, other_height: wp.int32, h: Floats,
+    first: wp.int32, ring: Ints, into: wp.int32,
 ):  # fmt: skip
     """Write a row of the other image as the first camera sees it: centred colours, below -MIDDLE outside."""
     fy = float(y)
@@ -279,9 +279,8 @@ def warp_row(
 
 @wp.func
 def add_row(
-    own: wp.array(dtype=wp.int32), row: wp.int32, ring: wp.array(dtype=wp.int32), slot: wp.int32, sign: wp.int32,
-    sums: wp.int32, side: wp.int32, pitch: wp.int32,
-):  # fmt: skip
+    own: Ints, row: wp.int32, ring: Ints, slot: wp.int32, sign: wp.int32, sums: wp.int32, side: wp.int32, pitch: wp.int32
+):
     """Add a row to the sums over the columns of windows, or subtract it; the sums lie behind the rows in ``ring``."""
     s = ints()
     q = ints()
@@ -302,9 +301,8 @@ def add_row(
 
 @wp.func
 def correlate_row(
-    own_sums: wp.array(dtype=wp.int32), roots: wp.array(dtype=wp.float32), row: wp.int32,
-    ring: wp.array(dtype=wp.int32), slot: wp.int32, sums: wp.int32, side: wp.int32, pitch: wp.int32, radius: wp.int32,
-    noise: wp.float32, number: wp.int32, totals: wp.array(dtype=wp.float32), total: wp.int32, least: wp.int32,
+    own_sums: Ints, roots: Floats, row: wp.int32, ring: Ints, slot: wp.int32, sums: wp.int32, side: wp.int32, pitch: wp.int32,
+    radius: wp.int32, noise: wp.float32, number: wp.int32, totals: Floats, total: wp.int32, least: wp.int32,
 ):  # fmt: skip
     """Add the costs of a row to their sum over the other images, and to the smallest."""
     whole = float((2 * radius + 1) * (2 * radius + 1))
@@ -341,7 +339,7 @@ def correlate_row(
 
 
 @wp.func
-def mirror_columns(ring: wp.array(dtype=wp.int32), sums: wp.int32, radius: wp.int32, width: wp.int32):
+def mirror_columns(ring: Ints, sums: wp.int32, radius: wp.int32, width: wp.int32):
     """Write the sums over columns beyond both borders of the image."""
     for k in range(1, radius + 1):
         ring[sums - k] = ring[sums + mirror(-k, width)]
@@ -350,13 +348,12 @@ def mirror_columns(ring: wp.array(dtype=wp.int32), sums: wp.int32, radius: wp.in
 
 @wp.kernel(enable_backward=False, module="unique", module_options=EXACT)
 def match(
-    begin: int, own: wp.array(dtype=int), own_sums: wp.array(dtype=int), roots: wp.array(dtype=float),
-    images: wp.array(dtype=int), shapes: wp.array(dtype=int), h: wp.array(dtype=float), height: int, width: int,
+    begin: int, own: Ints, own_sums: Ints, roots: Floats, images: Ints, shapes: Ints, h: Floats, height: int, width: int,
     pitch: int, others: int, planes: int, padded: int, radius: int, noise: float, unit: int,
     # rows of the other image and sums over columns; costs; costs as whole numbers, of a task each
-    ring: wp.array(dtype=int), totals: wp.array(dtype=float), found: wp.array(dtype=wp.int16),
+    ring: Ints, totals: Floats, found: Shorts,
     # outputs
-    costs: wp.array(dtype=wp.int16),
+    costs: Shorts,
 ):  # fmt: skip
     """Compute the costs of some rows at some planes."""
     task = begin + wp.tid()
@@ -488,13 +485,13 @@ FAR_AWAY_16 = 2**14
 
 @wp.kernel(enable_backward=False, module="unique", module_options=EXACT)
 def follow_cpu(
-    begin: int, costs: wp.array(dtype=wp.int16), bounds: wp.array(dtype=int), small: int, planes: int,
+    begin: int, costs: Shorts, bounds: Ints, small: int, planes: int,
     # pixels of a line: where it starts, from one to the next, how many; the same for the steps between them
     line_step: int, pixel_step: int, length: int, line_edge: int, pixel_edge: int,
     # two rows of costs for each line
-    path: wp.array(dtype=wp.int16),
+    path: Shorts,
     # outputs, added to
-    total: wp.array(dtype=wp.int16),
+    total: Shorts,
 ):  # fmt: skip
     """Add the costs of the paths along a line, both ways, `LANES` planes at a time."""
     line = begin + wp.tid()
@@ -546,20 +543,15 @@ LARGEST = 2**13 - 1
 """Largest cost plus penalties: the sum of four paths then fits into signed 16 bits."""
 
 
-@functools.cache
-def make_follow():
-    """Make the kernel for CUDA, of `BLOCK` threads per line: costs of the paths along it, both ways, add to ``total``."""
-
-    @cuda_kernel(source("scanlines.cu", FAR_AWAY=FAR_AWAY), f"(begin + wp.tid()) // {BLOCK}", "warpgs.kernels.scanlines")
-    def follow(
-        line: int, costs: wp.array2d(dtype=wp.int16), bounds: wp.array(dtype=int), small: int, planes: int,
-        # pixels of a line: where it starts, from one to the next, how many; the same for the steps between them
-        line_step: int, pixel_step: int, length: int, line_edge: int, pixel_edge: int,
-        # outputs
-        path: wp.array2d(dtype=int), total: wp.array2d(dtype=wp.int16),
-    ): ...  # fmt: skip
-
-    return follow
+@cuda_kernel(source("scanlines.cu", FAR_AWAY=FAR_AWAY), f"(begin + wp.tid()) // {BLOCK}", "warpgs.kernels.scanlines")
+def follow(
+    line: int, costs: ShortRows, bounds: Ints, small: int, planes: int,
+    # pixels of a line: where it starts, from one to the next, how many; the same for the steps between them
+    line_step: int, pixel_step: int, length: int, line_edge: int, pixel_edge: int,
+    # outputs
+    path: IntRows, total: ShortRows,
+):  # fmt: skip
+    """Add the costs of the paths along a line, both ways, to ``total``, on CUDA by `BLOCK` threads per line."""
 
 
 def scanline_costs(costs: torch.Tensor, down: torch.Tensor, across: torch.Tensor, small: int) -> torch.Tensor:
@@ -584,5 +576,5 @@ def scanline_costs(costs: torch.Tensor, down: torch.Tensor, across: torch.Tensor
             launch.launch(follow_cpu, lines, [*inputs, path, total], costs.device, cost=cost)
         else:
             path = torch.empty(lines, 2 * (planes + 2), dtype=torch.int32, device=costs.device)
-            launch.launch(make_follow(), BLOCK * lines, [*inputs, path, total], costs.device, block_dim=BLOCK)
+            launch.launch(follow, BLOCK * lines, [*inputs, path, total], costs.device, block_dim=BLOCK)
     return total[..., :planes]

@@ -22,11 +22,11 @@ from warpgs.device import (
     installed_bytes,
 )
 from warpgs.errors import ResourceError
-from warpgs.kernels import launch
+from warpgs.kernels import launch, native as cuda
 from warpgs.kernels.ellipse import make_spans
 from warpgs.kernels.graphs import TORCH, Allocator
 from warpgs.kernels.launch import sort_pairs
-from warpgs.kernels.native import EXACT, SCALE, make_functions as make_native, make_prefetch, source
+from warpgs.kernels.native import EXACT, SCALE, IntRows, Ints, Longs, make_prefetch, source
 from warpgs.kernels.project_cpu import LANES
 
 EACH = 4
@@ -44,10 +44,9 @@ def make_find_ranges(slotted: bool, native: bool):
 
     @wp.kernel(enable_backward=False, grid_stride=False, module=module)
     def find_ranges(
-        begin: int, keys: wp.array(dtype=int), slots: wp.array(dtype=int), owners: wp.array(dtype=int), count: int,
-        no_tile: int,
+        begin: int, keys: Ints, slots: Ints, owners: Ints, count: int, no_tile: int,
         # outputs; ranges zero on entry
-        ids: wp.array(dtype=int), ranges: wp.array2d(dtype=int),
+        ids: Ints, ranges: IntRows,
     ):  # fmt: skip
         first = begin + wp.tid()
         apart = (count + each - 1) // each
@@ -90,9 +89,7 @@ def make_write(slotted: bool):
     """Make the function that writes an instance; arguments are those of `make_emit`."""
 
     @wp.func
-    def write(
-        slot: int, key: int, owner: int, keys: wp.array(dtype=int), slots: wp.array(dtype=int), owners: wp.array(dtype=int)
-    ):
+    def write(slot: int, key: int, owner: int, keys: Ints, slots: Ints, owners: Ints):
         keys[slot] = key
         if wp.static(slotted):
             slots[slot] = slot
@@ -110,16 +107,14 @@ def make_emit(real, slotted: bool, ranked: bool = False):
     # ``no_tile``. Without ``slotted``, the number of the Gaussian takes the place of the slot. With ``ranked``, its place in
     # the order of depth does, and ``owners`` are `Tiles.packed`.
     s = make_spans(real)
-    vec3 = wp.types.vector(3, real)
+    vec3, Rows = wp.types.vector(3, real), wp.array2d(dtype=real)
     vec2i = s.vec2i
-    lanes = make_native()
     write = make_write(slotted)
 
     @wp.func
     def span_of(
-        projected: wp.array2d(dtype=real), i: int, row: int, alpha_cut: real, square_sigma: real,
-        origin_x: int, width: int, tile_size: int,
-    ) -> vec2i:  # fmt: skip
+        projected: Rows, i: int, row: int, alpha_cut: real, square_sigma: real, origin_x: int, width: int, tile_size: int
+    ) -> vec2i:
         factor = vec3(projected[i, 2], projected[i, 3], projected[i, 4])
         reach = s.reach_of(projected[i, 5], alpha_cut, square_sigma)
         return s.tile_columns(
@@ -127,20 +122,18 @@ def make_emit(real, slotted: bool, ranked: bool = False):
         )
 
     @wp.func_native(source("blend_pack.cu", SCALE=SCALE, LARGEST_HALF=f"{LARGEST_HALF}f"))
-    def pack(j: int, i: int, count: int, projected: wp.array2d(dtype=real), records: wp.array(dtype=int)): ...
+    def pack(j: int, i: int, count: int, projected: Rows, records: Ints): ...
 
     module = f"warpgs.kernels.tiles.emit.{real.__name__}.{int(slotted)}{'.ranked' * ranked}"
 
     # five blocks to a multiprocessor
     @wp.kernel(enable_backward=False, grid_stride=False, cuda_max_registers=48, module=module)
     def emit(
-        begin: int, projected: wp.array2d(dtype=real), order: wp.array(dtype=int), tile_counts: wp.array(dtype=int),
-        ends: wp.array(dtype=wp.int64), count: int, per_camera: int,
-        origin_x: int, origin_y: int, width: int, height: int, tile_size: int,
-        alpha_cut: real, square_sigma: real, columns: int, tiles: int, no_tile: int, capacity: int,
+        begin: int, projected: Rows, order: Ints, tile_counts: Ints, ends: Longs, count: int, per_camera: int, origin_x: int,
+        origin_y: int, width: int, height: int, tile_size: int, alpha_cut: real, square_sigma: real, columns: int, tiles: int,
+        no_tile: int, capacity: int,
         # outputs
-        starts: wp.array(dtype=int), keys: wp.array(dtype=int), slots: wp.array(dtype=int), owners: wp.array(dtype=int),
-        overflow: wp.array(dtype=int),
+        starts: Ints, keys: Ints, slots: Ints, owners: Ints, overflow: Ints,
     ):  # fmt: skip
         j = begin + wp.tid()
         corner = (origin_y // tile_size) * columns + origin_x // tile_size  # rows and columns count from the image's corner
@@ -169,38 +162,38 @@ def make_emit(real, slotted: bool, ranked: bool = False):
         first_tile = (i // per_camera) * tiles - corner
         # The warp writes the rows of its 32 Gaussians together: a lane finds the columns of a row, then each a tile.
         lane = wp.tid() % 32
-        row_end = lanes.running_sum(rows[1] - rows[0])
+        row_end = cuda.running_sum(rows[1] - rows[0])
         row_begin = row_end - (rows[1] - rows[0])
-        row_count = lanes.broadcast(row_end, 31)
+        row_count = cuda.broadcast(row_end, 31)
         batch = int(0)
         while batch < row_count:
-            owner = lanes.holder(row_end, batch + lane)
-            g = lanes.broadcast(i, owner)
-            row = lanes.broadcast(rows[0], owner) + batch + lane - lanes.broadcast(row_begin, owner)
+            owner = cuda.holder(row_end, batch + lane)
+            g = cuda.broadcast(i, owner)
+            row = cuda.broadcast(rows[0], owner) + batch + lane - cuda.broadcast(row_begin, owner)
             span = vec2i(0, 0)
             if batch + lane < row_count:
                 span = span_of(projected, g, row, alpha_cut, square_sigma, origin_x, width, tile_size)
-            tile_end = lanes.running_sum(span[1] - span[0])
+            tile_end = cuda.running_sum(span[1] - span[0])
             tile_begin = tile_end - (span[1] - span[0])
-            tile_count = lanes.broadcast(tile_end, 31)
+            tile_count = cuda.broadcast(tile_end, 31)
             # a Gaussian's slots go on from where its rows of the last batch ended
             first = wp.max(row_begin - batch, 0)
-            to_slot = lanes.broadcast(slot, owner) - lanes.broadcast(tile_begin, lanes.broadcast(first, owner))
-            to_key = lanes.broadcast(first_tile, owner) + row * columns + span[0] - tile_begin
-            limit = lanes.broadcast(end, owner)
+            to_slot = cuda.broadcast(slot, owner) - cuda.broadcast(tile_begin, cuda.broadcast(first, owner))
+            to_key = cuda.broadcast(first_tile, owner) + row * columns + span[0] - tile_begin
+            limit = cuda.broadcast(end, owner)
             done = int(0)
             while done < tile_count:
-                at = lanes.holder(tile_end, done + lane)
-                to = done + lane + lanes.broadcast(to_slot, at)
-                key = done + lane + lanes.broadcast(to_key, at)
-                owner_of = lanes.broadcast(g, at)
+                at = cuda.holder(tile_end, done + lane)
+                to = done + lane + cuda.broadcast(to_slot, at)
+                key = done + lane + cuda.broadcast(to_key, at)
+                owner_of = cuda.broadcast(g, at)
                 if wp.static(ranked):
-                    owner_of = j - lane + lanes.broadcast(owner, at)
-                if to < lanes.broadcast(limit, at) and done + lane < tile_count:
+                    owner_of = j - lane + cuda.broadcast(owner, at)
+                if to < cuda.broadcast(limit, at) and done + lane < tile_count:
                     write(to, key, owner_of, keys, slots, owners)
                 done += 32
-            written = lanes.broadcast(tile_end, wp.clamp(row_end - batch - 1, 0, 31))
-            written -= lanes.broadcast(tile_begin, wp.min(first, 31))
+            written = cuda.broadcast(tile_end, wp.clamp(row_end - batch - 1, 0, 31))
+            written -= cuda.broadcast(tile_begin, wp.min(first, 31))
             if row_begin < batch + 32 and row_end > batch and rows[1] > rows[0]:
                 slot += written
             batch += 32
@@ -227,7 +220,7 @@ def make_emit(real, slotted: bool, ranked: bool = False):
 def make_emit_cpu(real, slotted: bool):
     """Make the kernel; arguments are those of `make_emit`."""
     s = make_spans(real, lanes=True)
-    vec3 = wp.types.vector(3, real)
+    vec3, Rows = wp.types.vector(3, real), wp.array2d(dtype=real)
     lane_reals = wp.types.vector(LANES, real)
     lane_ints = wp.types.vector(LANES, wp.int32)
     lanes = LANES
@@ -235,13 +228,11 @@ def make_emit_cpu(real, slotted: bool):
 
     @wp.kernel(enable_backward=False, module="unique", module_options=EXACT)
     def emit(
-        begin: int, projected: wp.array2d(dtype=real), order: wp.array(dtype=int), tile_counts: wp.array(dtype=int),
-        ends: wp.array(dtype=wp.int64), count: int, per_camera: int,
-        origin_x: int, origin_y: int, width: int, height: int, tile_size: int,
-        alpha_cut: real, square_sigma: real, columns: int, tiles: int, no_tile: int, capacity: int,
+        begin: int, projected: Rows, order: Ints, tile_counts: Ints, ends: Longs, count: int, per_camera: int, origin_x: int,
+        origin_y: int, width: int, height: int, tile_size: int, alpha_cut: real, square_sigma: real, columns: int, tiles: int,
+        no_tile: int, capacity: int,
         # outputs
-        starts: wp.array(dtype=int), keys: wp.array(dtype=int), slots: wp.array(dtype=int), owners: wp.array(dtype=int),
-        overflow: wp.array(dtype=int),
+        starts: Ints, keys: Ints, slots: Ints, owners: Ints, overflow: Ints,
     ):  # fmt: skip
         first = (begin + wp.tid()) * lanes
         used = wp.min(lanes, count - first)
@@ -340,16 +331,16 @@ def sum_entries(count: int, native: bool) -> tuple[int, int]:
 @functools.cache
 def make_kernels(real, native: bool):
     """Make the kernels for one scalar type; ``native`` is True for CUDA, where each warp has one entry of the running sums."""
-    lanes = make_native() if native else None
     width, each = _of_sum(native)
     ints, reals = wp.types.vector(each, wp.int32), wp.types.vector(each, real)
+    Reals, Rows = wp.array(dtype=real), wp.array2d(dtype=real)
     module = f"warpgs.kernels.tiles.{real.__name__}.{int(native)}"
 
     @wp.kernel(enable_backward=False, grid_stride=False, module=module)
     def depth_keys(
-        begin: int, projected: wp.array2d(dtype=real), tile_counts: wp.array(dtype=int),
+        begin: int, projected: Rows, tile_counts: Ints,
         # outputs
-        keys: wp.array(dtype=real), ids: wp.array(dtype=int),
+        keys: Reals, ids: Ints,
     ):  # fmt: skip
         i = begin + wp.tid()
         ids[i] = i
@@ -360,9 +351,9 @@ def make_kernels(real, native: bool):
 
     @wp.kernel(enable_backward=False, grid_stride=False, module=module)
     def pack_counts(
-        begin: int, tile_counts: wp.array(dtype=int), bits: int,
+        begin: int, tile_counts: Ints, bits: int,
         # outputs
-        packed: wp.array(dtype=wp.int64),
+        packed: Longs,
     ):  # fmt: skip
         thread = begin + wp.tid()
         entry = thread // width
@@ -375,16 +366,15 @@ def make_kernels(real, native: bool):
             if i <= last and touched > 0:
                 own += (wp.int64(1) << wp.int64(bits)) + wp.int64(touched)
         if wp.static(native):
-            own = lanes.whole_sum(own)
+            own = cuda.whole_sum(own)
         if thread % width == 0 and first <= last:
             packed[entry] = own
 
     @wp.kernel(enable_backward=False, grid_stride=False, module=module)
     def visible_keys(
-        begin: int, projected: wp.array2d(dtype=real), tile_counts: wp.array(dtype=int), packed: wp.array(dtype=wp.int64),
-        bits: int, limit: int,
+        begin: int, projected: Rows, tile_counts: Ints, packed: Longs, bits: int, limit: int,
         # outputs
-        keys: wp.array(dtype=real), ids: wp.array(dtype=int),
+        keys: Reals, ids: Ints,
     ):  # fmt: skip
         thread = begin + wp.tid()
         entry = thread // width
@@ -407,8 +397,8 @@ def make_kernels(real, native: bool):
         upto = byte
         whole = byte
         if wp.static(native):
-            upto = lanes.running_sum(byte)
-            whole = lanes.broadcast(upto, 31)
+            upto = cuda.running_sum(byte)
+            whole = cuda.broadcast(upto, 31)
         for k in range(wp.static(each)):
             passed -= (whole >> (8 * k)) & 255
         for k in range(wp.static(each)):
@@ -424,9 +414,9 @@ def make_kernels(real, native: bool):
 
     @wp.kernel(enable_backward=False, grid_stride=False, module=module)
     def ordered_counts(
-        begin: int, order: wp.array(dtype=int), tile_counts: wp.array(dtype=int),
+        begin: int, order: Ints, tile_counts: Ints,
         # outputs
-        counts: wp.array(dtype=wp.int64),
+        counts: Longs,
     ):  # fmt: skip
         j = begin + wp.tid()
         counts[j] = wp.int64(tile_counts[order[j]])

@@ -21,6 +21,7 @@ from warpgs.scene import Camera
 def make_kernels(real):
     """Make the kernels for one scalar type."""
     vec3 = wp.types.vector(3, real)
+    Reals, Rows = wp.array(dtype=real), wp.array2d(dtype=real)
     mat33 = wp.types.matrix((3, 3), real)
     mat44 = wp.types.matrix((4, 4), real)
     module = f"warpgs.kernels.tsdf.{real.__name__}"
@@ -47,9 +48,9 @@ def make_kernels(real):
 
     @wp.kernel(enable_backward=False, module=module)
     def face(
-        begin: int, depth: wp.array2d(dtype=real), Ks: wp.array(dtype=mat33),
+        begin: int, depth: Rows, Ks: wp.array(dtype=mat33),
         # outputs
-        cosines: wp.array2d(dtype=real),
+        cosines: Rows,
     ):  # fmt: skip
         i = begin + wp.tid()
         K = Ks[0]
@@ -77,7 +78,7 @@ def make_kernels(real):
         cosines[row, column] = cosine
 
     @wp.func
-    def depth_at(depth: wp.array2d(dtype=real), u: real, v: real, row: wp.int32, column: wp.int32, most: real) -> real:
+    def depth_at(depth: Rows, u: real, v: real, row: wp.int32, column: wp.int32, most: real) -> real:
         """Return the depth interpolated between four pixels where they show one surface, else that of the pixel itself."""
         nearest = depth[row, column]
         left = int(wp.floor(u - real(0.5)))
@@ -100,10 +101,9 @@ def make_kernels(real):
     @wp.kernel(enable_backward=False, module=module)
     def integrate(
         begin: int, origins: wp.array(dtype=vec3), voxel: real, truncation: real, size_y: int, size_z: int,
-        viewmats: wp.array(dtype=mat44), Ks: wp.array(dtype=mat33),
-        depth: wp.array2d(dtype=real), pixel_weights: wp.array2d(dtype=real),
+        viewmats: wp.array(dtype=mat44), Ks: wp.array(dtype=mat33), depth: Rows, pixel_weights: Rows,
         # outputs, read first
-        distances: wp.array(dtype=real), weights: wp.array(dtype=real),
+        distances: Reals, weights: Reals,
     ):  # fmt: skip
         i = begin + wp.tid()
         column_of_grid = i // size_z
@@ -128,9 +128,9 @@ def make_kernels(real):
     @wp.kernel(enable_backward=False, module=module)
     def gather(
         begin: int, points: wp.array(dtype=vec3), most: real, viewmats: wp.array(dtype=mat44), Ks: wp.array(dtype=mat33),
-        depth: wp.array2d(dtype=real), pixel_weights: wp.array2d(dtype=real), image: wp.array2d(dtype=vec3),
+        depth: Rows, pixel_weights: Rows, image: wp.array2d(dtype=vec3),
         # outputs, added to
-        sums: wp.array(dtype=vec3), weights: wp.array(dtype=real),
+        sums: wp.array(dtype=vec3), weights: Reals,
     ):  # fmt: skip
         i = begin + wp.tid()
         K = Ks[0]

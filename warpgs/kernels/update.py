@@ -7,7 +7,7 @@ import torch
 import warp as wp
 
 from warpgs.kernels import launch
-from warpgs.kernels.native import ROLLED, cuda_kernel, source
+from warpgs.kernels.native import ROLLED, FloatRows, Floats, Ints, Longs, cuda_kernel, source
 
 # Bookkeeping of a captured step: its settings are read at the start, and its loss is stored at the end.
 #
@@ -51,12 +51,10 @@ SHIFT = slice(Setting.RED, Setting.BLUE + 1)
 
 @wp.kernel(enable_backward=False, module="warpgs.kernels.update")
 def begin_kernel(
-    begin: int, counter: wp.array(dtype=wp.int64), view_rows: wp.array(dtype=wp.int64),
-    lr_rows: wp.array2d(dtype=float), setting_rows: wp.array2d(dtype=float),
-    viewmats: wp.array2d(dtype=float), Ks: wp.array2d(dtype=float), targets: wp.array2d(dtype=float),
+    begin: int, counter: Longs, view_rows: Longs, lr_rows: FloatRows, setting_rows: FloatRows, viewmats: FloatRows,
+    Ks: FloatRows, targets: FloatRows,
     # outputs
-    lrs: wp.array(dtype=float), settings: wp.array(dtype=float),
-    viewmat: wp.array(dtype=float), K: wp.array(dtype=float), target: wp.array(dtype=float),
+    lrs: Floats, settings: Floats, viewmat: Floats, K: Floats, target: Floats,
 ):  # fmt: skip
     """Copy what a step needs, by its number and the number of its view."""
     i = begin + wp.tid()
@@ -76,10 +74,9 @@ def begin_kernel(
 
 @wp.kernel(enable_backward=False, module="warpgs.kernels.update")
 def end_kernel(
-    begin: int, loss: wp.array(dtype=float), mse: wp.array(dtype=float),
+    begin: int, loss: Floats, mse: Floats,
     # outputs; all but the last are read, too
-    counter: wp.array(dtype=wp.int64), stop: wp.array(dtype=int), history: wp.array2d(dtype=float),
-    going: wp.array(dtype=wp.bool),
+    counter: Longs, stop: Ints, history: FloatRows, going: wp.array(dtype=wp.bool),
 ):  # fmt: skip
     """Store the loss and the error of a step, and count it."""
     step = int(counter[begin])
@@ -97,9 +94,9 @@ error_values = wp.types.vector(ERROR_LANES, wp.float32)
 
 @wp.kernel(enable_backward=False, module="unique", module_options=ROLLED)
 def squared_errors(
-    begin: int, rgb: wp.array(dtype=float), target: wp.array(dtype=float),
+    begin: int, rgb: Floats, target: Floats,
     # outputs
-    sums: wp.array(dtype=float),
+    sums: Floats,
 ):  # fmt: skip
     """Sum squared errors on a CPU, one task per `ERROR_SEGMENT` elements."""
     task = begin + wp.tid()
@@ -172,7 +169,7 @@ SEGMENT = 4096
 @functools.cache
 def make_adam_kernel(real, split: bool, lanes: int):
     """Make the update kernel; ``split`` where the first numbers of each row have a learning rate of their own."""
-    values = wp.types.vector(lanes, real)
+    values, Reals = wp.types.vector(lanes, real), wp.array(dtype=real)
 
     @wp.func
     def decayed(m: real, g: real, beta1: real, rest1: real) -> real:
@@ -191,10 +188,10 @@ def make_adam_kernel(real, split: bool, lanes: int):
 
     @wp.kernel(enable_backward=False, module="unique", module_options=ROLLED)
     def update(
-        begin: int, gradient: wp.array(dtype=real), length: int, row: int, head: int, head_lr: real, lr: real,
-        beta1: real, beta2: real, rest1: real, rest2: real, root_correction2: real, eps: real,
+        begin: int, gradient: Reals, length: int, row: int, head: int, head_lr: real, lr: real, beta1: real, beta2: real,
+        rest1: real, rest2: real, root_correction2: real, eps: real,
         # outputs
-        parameter: wp.array(dtype=real), mean: wp.array(dtype=real), square: wp.array(dtype=real),
+        parameter: Reals, mean: Reals, square: Reals,
     ):  # fmt: skip
         task = begin + wp.tid()
         first = task * length
@@ -237,13 +234,12 @@ def make_adam_kernel(real, split: bool, lanes: int):
 
 @cuda_kernel(source("adam_update.cu"), "wp.tid()", "warpgs.kernels.adam.scheduled")
 def scheduled_update(
-    four: int, gradient: wp.array(dtype=float), row: int, head: int, lrs: wp.array(dtype=float),
-    beta1: float, beta2: float, rest1: float, rest2: float, eps: float, skip: wp.array(dtype=int),
+    four: int, gradient: Floats, row: int, head: int, lrs: Floats, beta1: float, beta2: float, rest1: float, rest2: float,
+    eps: float, skip: Ints,
     # outputs
-    parameter: wp.array(dtype=float), mean: wp.array(dtype=float), square: wp.array(dtype=float),
+    parameter: Floats, mean: Floats, square: Floats,
 ):  # fmt: skip
     """Update four elements per thread, with learning rates in memory, so that a graph can replay it."""
-    ...
 
 
 def scheduled_lrs(lr: float, step: int, betas: tuple[float, float] = BETAS, head_lr: float | None = None) -> list[float]:
@@ -293,9 +289,9 @@ def update_rows(param, grad, exp_avg, exp_avg_sq, lrs: list[float], head: int, b
 
 @wp.kernel(enable_backward=False, module="warpgs.kernels.update")
 def decay(
-    begin: int, logits: wp.array(dtype=float), factor: wp.float64,
+    begin: int, logits: Floats, factor: wp.float64,
     # outputs
-    decayed: wp.array(dtype=float),
+    decayed: Floats,
 ):  # fmt: skip
     """Multiply the opacity of a logit."""
     i = begin + wp.tid()
@@ -323,9 +319,9 @@ def opacity_decay(logits: torch.Tensor, factor: float) -> torch.Tensor:
 
 @wp.kernel(enable_backward=False, module="warpgs.kernels.update")
 def sample(
-    begin: int, settings: wp.array(dtype=float), seed: int,
+    begin: int, settings: Floats, seed: int,
     # outputs
-    factors: wp.array(dtype=float),
+    factors: Floats,
 ):  # fmt: skip
     """Draw a factor; the settings are in memory, so that a CUDA graph can replay it."""
     i = begin + wp.tid()

@@ -9,8 +9,8 @@ import warp as wp
 from warpgs.kernels import blend_cuda, launch
 from warpgs.kernels.blend import check_slots, composite, is_native, make_segments
 from warpgs.kernels.ellipse import PROJECTED_SIZE
-from warpgs.kernels.falloff import ABREAST, STRIP, TOGETHER, Pass, make_functions, make_struct
-from warpgs.kernels.native import ROLLED, SCALE, cuda_kernel, make_prefetch, source
+from warpgs.kernels.falloff import COLORS, STRIP, TOGETHER, Pass, make_batches, make_functions, make_struct
+from warpgs.kernels.native import ROLLED, SCALE, Floats, IntRows, Ints, cuda_kernel, make_prefetch, source
 from warpgs.kernels.tiles import Tiles
 
 # These are separate passes, so that `blend` does not become slower. Alpha comes from the same operations as in `blend`, so that
@@ -21,6 +21,7 @@ from warpgs.kernels.tiles import Tiles
 def make_walk(real, tile_size: int, make_visit):
     """Make the generic kernel, one task per tile; it calls a visitor for each blended (Gaussian, pixel)."""
     f, visit = make_functions(real), make_visit(real)
+    Reals, Rows = wp.array(dtype=real), wp.array2d(dtype=real)
     tile_reals = wp.types.vector(tile_size * (tile_size + 1), real)
     strip_reals = wp.types.vector(STRIP, real)
     side = tile_size
@@ -29,10 +30,9 @@ def make_walk(real, tile_size: int, make_visit):
 
     @wp.kernel(enable_backward=False, module="unique", module_options=ROLLED)
     def walk(
-        begin: int, settings: f.Blending, projected: wp.array2d(dtype=real), ranges: wp.array2d(dtype=int),
-        gaussian_ids: wp.array(dtype=int), per_camera: int, k: int,
+        begin: int, settings: f.Blending, projected: Rows, ranges: IntRows, gaussian_ids: Ints, per_camera: int, k: int,
         # outputs of the visitor
-        reals: wp.array(dtype=real), ids: wp.array(dtype=int), counts: wp.array(dtype=int),
+        reals: Reals, ids: Ints, counts: Ints,
     ):  # fmt: skip
         tile = begin + wp.tid()
         place = f.place_of(tile, side, settings)
@@ -93,12 +93,12 @@ def make_walk(real, tile_size: int, make_visit):
 @functools.cache
 def make_median(real):
     """Make the visitor that writes the depth at which a pixel has lost half of its light, and finishes the pixel there."""
+    Reals = wp.array(dtype=real)
 
     @wp.func(inline=True)
     def visit(
-        pixel: int, i: int, weight: real, after: real, depth: real, k: int,
-        depths: wp.array(dtype=real), ids: wp.array(dtype=int), counts: wp.array(dtype=int),
-    ) -> bool:  # fmt: skip
+        pixel: int, i: int, weight: real, after: real, depth: real, k: int, depths: Reals, ids: Ints, counts: Ints
+    ) -> bool:
         if after <= real(0.5):
             depths[pixel] = depth
         return after <= real(0.5)
@@ -109,12 +109,12 @@ def make_median(real):
 @functools.cache
 def make_heaviest(real):
     """Make the visitor that puts a Gaussian into its pixel's sorted list of k, behind those of equal weight."""
+    Reals = wp.array(dtype=real)
 
     @wp.func(inline=True)
     def visit(
-        pixel: int, i: int, weight: real, after: real, depth: real, k: int,
-        weights: wp.array(dtype=real), ids: wp.array(dtype=int), counts: wp.array(dtype=int),
-    ) -> bool:  # fmt: skip
+        pixel: int, i: int, weight: real, after: real, depth: real, k: int, weights: Reals, ids: Ints, counts: Ints
+    ) -> bool:
         counts[pixel] += 1
         first = pixel * k
         if weight > weights[first + k - 1]:
@@ -133,19 +133,17 @@ def make_heaviest(real):
 @functools.cache
 def make_weights(real, tile_size: int):
     """Make the kernel of `contributions`, one task per tile; its loops over a strip have no branch, so that they vectorise."""
-    f = make_functions(real)
+    f, b, Rows = make_functions(real), make_batches(real, tile_size, COLORS), wp.array2d(dtype=real)
     tile_reals = wp.types.vector(tile_size * (tile_size + 1), real)
     strip_reals = wp.types.vector(STRIP, real)
-    prefetch, ahead = make_prefetch(real, 2), TOGETHER
-    row_reals, column_reals = wp.types.vector(tile_size, real), wp.types.vector((tile_size + ABREAST) * STRIP, real)
-    side, strip, parts, abreast, bits, outside = tile_size, STRIP, tile_size // STRIP, ABREAST, tile_size - 1, real(-1.0)
+    at, prefetch, ahead = b.at, make_prefetch(real, 2), TOGETHER
+    side, strip, parts, outside = tile_size, STRIP, tile_size // STRIP, real(-1.0)
 
     @wp.kernel(enable_backward=False, module="unique", module_options=ROLLED)
     def weigh(
-        begin: int, settings: f.Blending, projected: wp.array2d(dtype=real), ranges: wp.array2d(dtype=int),
-        gaussian_ids: wp.array(dtype=int), slots: wp.array(dtype=int),
+        begin: int, settings: f.Blending, projected: Rows, ranges: IntRows, gaussian_ids: Ints, slots: Ints,
         # outputs: sum and maximum of each instance
-        weights: wp.array2d(dtype=real),
+        weights: Rows,
     ):  # fmt: skip
         tile = begin + wp.tid()
         place = f.place_of(tile, side, settings)
@@ -156,14 +154,10 @@ def make_weights(real, tile_size: int):
             for column in range(side):
                 inside = place[1] + column < settings.width and place[2] + row < settings.height
                 t[row * side + column] = wp.where(inside, real(1.0), outside)
-        ramp = strip_reals()
         sums = strip_reals()
         maxima = strip_reals()
-        e12 = row_reals()
-        e22 = row_reals()
-        e1 = f.abreast()
-        squares = f.abreast()
-        falloffs = column_reals()  # of a column of strips
+        rows = b.Rows()
+        falloffs = b.column_reals()  # of a column of strips
         left_open = int(1)
         instance = ranges[tile, 0]
         while instance < ranges[tile, 1] and left_open > 0:
@@ -179,32 +173,18 @@ def make_weights(real, tile_size: int):
             opacity = projected[i, 5]
             bounds = f.bounds_of(mx, my, u11, u22, projected[i, 10], projected[i, 11], settings.whole_tiles)
             for lane in range(strip):
-                ramp[lane] = f.apart(u11 * real(lane))
                 sums[lane] = real(0.0)
                 maxima[lane] = real(0.0)
-            for row in range(side):
-                dy = real(top + row) + real(0.5) - my
-                e2 = u22 * dy
-                e12[row] = f.apart(u12 * dy)
-                e22[row] = f.apart(e2 * e2)
+            b.find_row_values(my, u11, u12, u22, top, rows)
             for part in range(parts):
                 at_left = f.apart(u11 * (real(left + part * strip) + real(0.5) - mx))
                 first = int(side)
                 end = int(0)
                 for row in range(side):
-                    hit = f.reaches(at_left + e12[row], u11, e22[row], bounds[0], bounds[1])
+                    hit = f.reaches(at_left + at(rows.e12[row]), u11, at(rows.e22[row]), bounds[0], bounds[1])
                     first = wp.min(first, wp.where(hit, row, side))
                     end = wp.max(end, wp.where(hit, row + 1, 0))
-                k = int(0)
-                while k < end - first:
-                    for lane in range(strip):
-                        for n in range(abreast):
-                            e1[n] = at_left + e12[(first + k + n) & bits] + ramp[lane]
-                            squares[n] = e22[(first + k + n) & bits]
-                        found = f.falloffs(wp.cw_mul(e1, e1) + squares)
-                        for n in range(abreast):
-                            falloffs[(k + n) * strip + lane] = found[n]
-                    k += abreast  # the last few may lie beyond the end; their values are not read
+                b.find_falloffs(at_left, first, end, rows, falloffs)
                 k = int(0)
                 while k < end - first:
                     base = wp.max((first + k) * side + part * strip, 0)
@@ -245,37 +225,28 @@ def make_native(tile_size: int):
     numbers = {"SIDE": tile_size, "SCALE": SCALE, "STRIDE": PROJECTED_SIZE}
     tile = f"wp.tid() // {tile_size * tile_size}"
 
-    @cuda_kernel(source("median_depth.cu", **numbers), tile, f"warpgs.kernels.median_depth.{tile_size}")
-    def median(
-        tile: int, settings: Blending, projected: wp.array(dtype=float), ranges: wp.array(dtype=int),
-        gaussian_ids: wp.array(dtype=int),
+    def walk(
+        tile: int, settings: Blending, projected: Floats, ranges: Ints, gaussian_ids: Ints, per_camera: int, k: int,
         # outputs
-        depths: wp.array(dtype=float),
+        reals: Floats, ids: Ints, counts: Ints,
     ): ...  # fmt: skip
 
-    @cuda_kernel(source("heaviest.cu", **numbers), tile, f"warpgs.kernels.heaviest.{tile_size}")
-    def heaviest(
-        tile: int, settings: Blending, projected: wp.array(dtype=float), ranges: wp.array(dtype=int),
-        gaussian_ids: wp.array(dtype=int), per_camera: int, k: int,
-        # outputs
-        weights: wp.array(dtype=float), ids: wp.array(dtype=int), counts: wp.array(dtype=int),
-    ): ...  # fmt: skip
-
-    return SimpleNamespace(median=median, heaviest=heaviest)
+    return SimpleNamespace(
+        median=cuda_kernel(source("median_depth.cu", **numbers), tile, f"warpgs.kernels.median_depth.{tile_size}")(walk),
+        heaviest=cuda_kernel(source("heaviest.cu", **numbers), tile, f"warpgs.kernels.heaviest.{tile_size}")(walk),
+    )
 
 
 def _walk(make_visit, projected: torch.Tensor, tiles: Tiles, settings: Pass, k: int, *outputs: torch.Tensor) -> None:
     """Launch the kernel of a visitor over projected Gaussians [C, N, 12]; outputs may be fewer than its three."""
-    real, device, pixels = launch.real_of(projected), projected.device, tiles.size * tiles.size
-    inputs = [settings.struct(tiles.size, real), projected, tiles.ranges, tiles.gaussian_ids]
+    real, device, count, pixels = launch.real_of(projected), projected.device, len(tiles.ranges), tiles.size * tiles.size
+    inputs = [settings.struct(tiles.size, real), projected, tiles.ranges, tiles.gaussian_ids, projected.shape[1], k, *outputs]
+    inputs += [tiles.ranges.new_empty(0)] * (3 - len(outputs))
     if is_native(projected):
-        kernels, numbers = make_native(tiles.size), (projected.shape[1], k)
-        kernel, inputs = (kernels.heaviest, [*inputs, *numbers]) if k else (kernels.median, inputs)
-        launch.launch(kernel, len(tiles.ranges) * pixels, [*inputs, *outputs], device, block_dim=pixels)
-        return
-    inputs += [projected.shape[1], k, *outputs, *[tiles.ranges.new_empty(0)] * (3 - len(outputs))]
-    kernel = make_walk(real, tiles.size, make_visit)
-    launch.launch(kernel, len(tiles.ranges), inputs, device, cost=10_000, block_dim=32)
+        kernels = make_native(tiles.size)
+        launch.launch(kernels.heaviest if k else kernels.median, count * pixels, inputs, device, block_dim=pixels)
+    else:
+        launch.launch(make_walk(real, tiles.size, make_visit), count, inputs, device, cost=10_000, block_dim=32)
 
 
 def median_depth(projected: torch.Tensor, tiles: Tiles, settings: Pass) -> torch.Tensor:

@@ -11,7 +11,7 @@ const int y = (in_camera / columns) * SIDE + (block / WIDE) * 4 + lane / 8;
 const bool inside = x < width && y < height;
 const float px = origin_x + x + 0.5f, py = origin_y + y + 0.5f;
 const long long pixel = ((long long)camera * height + y) * width + x;
-float* own_weights = weights.data + pixel * k;
+float* own_weights = reals.data + pixel * k;
 int* own_ids = ids.data + pixel * k;
 float T = 1.0f, last = 0.0f;
 int blended = 0;

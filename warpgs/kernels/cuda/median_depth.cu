@@ -41,4 +41,4 @@ for (int first = begin; first < end; first += BATCH) {
     }
 }
 if (inside)
-    depths.data[((long long)camera * height + y) * width + x] = found;
+    reals.data[((long long)camera * height + y) * width + x] = found;

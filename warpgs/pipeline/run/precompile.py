@@ -44,19 +44,22 @@ def fit_kernels(cuda: bool) -> list[tuple[wp.Kernel, int]]:
     real, emit = wp.float32, tiles.make_emit if cuda else tiles.make_emit_cpu
     of_steps, of_renders = ([emit(real, slotted), tiles.make_find_ranges(slotted, cuda)] for slotted in (True, False))
     start, lists = neighbours.make_knn_kernels(real).search, tiles.make_kernels(real, cuda).pack_counts
-    of_renders += [blend.make_segments(real).gather_weights, mcmc.make_kernel()]
+    of_renders += [blend.make_segments(real).gather_weights, mcmc.move]
     rough = [*vars(roughness.make_kernels(real)).values()]
     if not cuda:
-        variant, summed = (CAMERA_MODEL, "stored", False, sh.BASES), ssim.make_kernels(real, True)
-        color, deep = (blend_cpu.make_kernels(real, TILE_SIZE, deep=deep) for deep in (False, True))
+        variant, summed = (
+            (CAMERA_MODEL, "stored", False, sh.BASES),
+            [ssim.make_kernel(real, True, way) for way in (False, True)],
+        )
+        color, deep = (blend_cpu.make_backward(real, TILE_SIZE, COLORS, deep=deep) for deep in (False, True))
         kernels = [
             sweep.match, sweep.best, sweep.follow_cpu, start, project_cpu.make_forward(real, *variant), update.sample, lists,
-            *of_steps, color.forward, summed.forward, summed.backward, *rough, color.backward,
+            *of_steps, blend_cpu.make_forward(real, TILE_SIZE, COLORS), *summed, *rough, color,
             blend.make_segments(real, VALUES, 9 + COLORS).sum_gradients, project_cpu.make_backward(real, *variant, False),
-            *(update.make_adam_kernel(real, split, update.LANES) for split in (True, False)), neighbours.make_reach_kernel(),
+            *(update.make_adam_kernel(real, split, update.LANES) for split in (True, False)), neighbours.bound_by_reach,
             # after the first step
             of_renders[0], of_renders[1], walk.make_weights(real, TILE_SIZE), update.squared_errors,
-            scoring(), *of_renders[2:], ssim.make_kernels(real, False).backward, deep.backward,
+            scoring(), *of_renders[2:], ssim.make_kernel(real, False, True), deep,
         ]  # fmt: skip
         return [(kernel, 1) for kernel in kernels]
     warps = 32 * blend_cuda.WARPS
@@ -65,13 +68,13 @@ def fit_kernels(cuda: bool) -> list[tuple[wp.Kernel, int]]:
         [blend_cuda.make_backward(TILE_SIZE, depth, chunk, False) for chunk in blend_cuda.CHUNKS] for depth in (False, True)
     )
     return [
-        (sweep.make_follow(), sweep.BLOCK), (start, THREADS), (project_cuda.make_forward(real, CAMERA_MODEL), BLOCK),
+        (sweep.follow, sweep.BLOCK), (start, THREADS), (project_cuda.make_forward(real, CAMERA_MODEL), BLOCK),
         *((kernel, THREADS) for kernel in (update.sample, lists, *of_steps)),
         (blend_cuda.make_kernels(TILE_SIZE).order_tiles, blend_cuda.ORDER_THREADS), *save,
-        (ssim.make_cuda_kernels().forward, ssim.THREADS), *((kernel, THREADS) for kernel in rough),
+        (ssim.cuda_forward, ssim.THREADS), *((kernel, THREADS) for kernel in rough),
         *((each.backward, warps) for each in color),
         (color[0].gather, THREADS), (project_cuda.make_backward(real, CAMERA_MODEL), BLOCK),
-        *((kernel, THREADS) for kernel in (update.scheduled_update, graphs.make_fetch(), neighbours.make_reach_kernel())),
+        *((kernel, THREADS) for kernel in (update.scheduled_update, graphs.fetch_kernel, neighbours.bound_by_reach)),
         # after the first step
         *((kernel, THREADS) for kernel in of_renders), *show,
         *((each.backward, warps) for each in deep), (deep[0].gather, THREADS),
@@ -89,7 +92,7 @@ def call_kernels(cuda: bool) -> list[tuple[wp.Kernel, int]]:
 
 def scoring() -> wp.Kernel:
     """Return the kernel that computes SSIM for scores, on the CPU."""
-    kernel: wp.Kernel = ssim.make_kernels(wp.float32, False).forward
+    kernel: wp.Kernel = ssim.make_kernel(wp.float32, False, False)
     return kernel
 
 

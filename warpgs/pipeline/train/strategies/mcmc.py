@@ -4,7 +4,6 @@
 """
 
 import dataclasses
-import functools
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -14,6 +13,7 @@ import torch
 import warp as wp
 
 from warpgs.kernels import launch
+from warpgs.kernels.native import Floats
 from warpgs.kernels.update import Setting
 from warpgs.pipeline.model.table import DensityUpdate
 from warpgs.pipeline.train.strategies.base import Growth, Strategy, register
@@ -71,33 +71,28 @@ def relocated(opacities: torch.Tensor, copies: torch.Tensor) -> tuple[torch.Tens
     return new.to(opacities), (o / integral).to(opacities)
 
 
-@functools.cache
-def make_kernel() -> wp.Kernel:
-    """Return the kernel of `perturb`."""
-
-    @wp.kernel(enable_backward=False, module="warpgs.pipeline.train.strategies.mcmc")
-    def perturb(
-        begin: int, settings: wp.array(dtype=float), seed: int, noise_lr: float, going: wp.array(dtype=wp.bool),
-        quats: wp.array(dtype=wp.vec4), log_scales: wp.array(dtype=wp.vec3), logits: wp.array(dtype=float),
-        # outputs
-        means: wp.array(dtype=wp.vec3),
-    ):  # fmt: skip
-        i = begin + wp.tid()
-        if not going[0]:
-            return
-        # one stream of numbers for each seed and step, one part of it for each Gaussian
-        state = wp.rand_init(wp.randi(wp.rand_init(seed, int(settings[Setting.NUMBER]))), i)
-        noise = wp.vec3(wp.randn(state), wp.randn(state), wp.randn(state))
-        q = quats[i]
-        rotation = wp.quat_to_matrix(wp.normalize(wp.quat(q[1], q[2], q[3], q[0])))
-        s = log_scales[i]
-        variances = wp.vec3(wp.exp(2.0 * s[0]), wp.exp(2.0 * s[1]), wp.exp(2.0 * s[2]))
-        opacity = 1.0 / (1.0 + wp.exp(-logits[i]))
-        gate = 1.0 / (1.0 + wp.exp(wp.static(GATE_SLOPE) * (opacity - wp.static(GATE_OPACITY))))
-        moved = rotation * wp.cw_mul(variances, wp.transpose(rotation) * noise)
-        means[i] = means[i] + moved * (gate * noise_lr * settings[Setting.MEANS_LR])
-
-    return perturb
+@wp.kernel(enable_backward=False, module="warpgs.pipeline.train.strategies.mcmc")
+def move(
+    begin: int, settings: Floats, seed: int, noise_lr: float, going: wp.array(dtype=wp.bool),
+    quats: wp.array(dtype=wp.vec4), log_scales: wp.array(dtype=wp.vec3), logits: Floats,
+    # outputs
+    means: wp.array(dtype=wp.vec3),
+):  # fmt: skip
+    """Add noise to the mean of a Gaussian."""
+    i = begin + wp.tid()
+    if not going[0]:
+        return
+    # one stream of numbers for each seed and step, one part of it for each Gaussian
+    state = wp.rand_init(wp.randi(wp.rand_init(seed, int(settings[Setting.NUMBER]))), i)
+    noise = wp.vec3(wp.randn(state), wp.randn(state), wp.randn(state))
+    q = quats[i]
+    rotation = wp.quat_to_matrix(wp.normalize(wp.quat(q[1], q[2], q[3], q[0])))
+    s = log_scales[i]
+    variances = wp.vec3(wp.exp(2.0 * s[0]), wp.exp(2.0 * s[1]), wp.exp(2.0 * s[2]))
+    opacity = 1.0 / (1.0 + wp.exp(-logits[i]))
+    gate = 1.0 / (1.0 + wp.exp(wp.static(GATE_SLOPE) * (opacity - wp.static(GATE_OPACITY))))
+    moved = rotation * wp.cw_mul(variances, wp.transpose(rotation) * noise)
+    means[i] = means[i] + moved * (gate * noise_lr * settings[Setting.MEANS_LR])
 
 
 def perturb(gaussians: Gaussians, settings: torch.Tensor, going: torch.Tensor, *, seed: int, noise_lr: float) -> None:
@@ -108,7 +103,7 @@ def perturb(gaussians: Gaussians, settings: torch.Tensor, going: torch.Tensor, *
     """
     g = {n: t.detach() for n, t in gaussians.tensors().items()}
     inputs = [settings, seed, noise_lr, going, g["quats"], g["log_scales"], g["logit_opacities"], g["means"]]
-    launch.launch(make_kernel(), len(gaussians), inputs, settings.device)
+    launch.launch(move, len(gaussians), inputs, settings.device)
 
 
 @register("mcmc")
