@@ -3,7 +3,8 @@
 `engines` fits demo scenes one by one with `warpgs fit`, and then with each engine; it also kills a worker during a job, and
 starts two farms on one folder. `packing` needs CUDA. Every slot of a GPU gets --fits fits of one scene, each with its own seed,
 after a tiny fit that starts the process of the slot. It runs on one GPU with several numbers of slots, then with the best
-number on several GPUs.
+number on several GPUs; a slot has the same number of threads in every row. `captures` needs CUDA, too: it runs a list of jobs,
+as `warpgs farm` takes it, on each number of GPUs, with the last of --per-gpu, and compares the PLY files with the first ones.
 """
 
 from __future__ import annotations
@@ -24,9 +25,10 @@ import torch
 
 from bench.lib import result_file
 from bench.lib.arguments import parse
+from warpgs.app.farm import jobs_of as farm_jobs
 from warpgs.device import usable_cores
 from warpgs.pipeline.farm.farm import JobStatus, LocalEngine, Slot, make_engine, run_farm
-from warpgs.pipeline.farm.job import LOG, PLY, Engine, FarmJob, file_digest
+from warpgs.pipeline.farm.job import LOG, PLY, Engine, FarmJob, file_digest, list_jobs
 from warpgs.pipeline.run.request import FitRequest, SceneRequest
 from warpgs.pipeline.train.presets import PRESETS
 from warpgs.pipeline.train.settings import FitConfig
@@ -140,31 +142,48 @@ def engines(scenes: int, steps: int, slots: int, work: Path) -> list[dict]:
     return rows
 
 
-def pack(scene: SceneRequest, config: FitConfig, out: Path, slots: list[Slot], fits: int) -> dict:
-    """Return fits per hour with some slots, each of which gets ``fits`` fits after a tiny one."""
-    engine = LocalEngine(slots)
+def gpu_slots(gpus: int, per_gpu: int, most_gpus: int) -> list[Slot]:
+    """Return slots that share GPUs, each with the threads that it has on ``most_gpus`` GPUs."""
+    threads = max(1, usable_cores() // (most_gpus * per_gpu))
+    return [("cuda", threads, {"CUDA_VISIBLE_DEVICES": str(i % gpus)}) for i in range(gpus * per_gpu)]
 
-    def jobs(kind: str, count: int, settings: FitConfig) -> list[FarmJob]:
-        return [
-            FarmJob(n, FitRequest(scene, out / n / "run", dataclasses.replace(settings, seed=i), "cuda"), out / n, out)
-            for i, n in enumerate(f"{kind}{i}" for i in range(count))
-        ]
+
+def seeds_of(scene: SceneRequest, config: FitConfig, out: Path, kind: str, count: int) -> list[FarmJob]:
+    """Return jobs of one scene with a seed each."""
+    return [
+        FarmJob(n, FitRequest(scene, out / n / "run", dataclasses.replace(config, seed=i), "cuda"), out / n, out)
+        for i, n in enumerate(f"{kind}{i}" for i in range(count))
+    ]
+
+
+def pack(slots: list[Slot], tiny: list[FarmJob], jobs: list[FarmJob]) -> dict:
+    """Run jobs in slots that each had a tiny one; return fits per hour, and for each GPU how long it idled at the end [s]."""
+    engine, gpu_of = LocalEngine(slots), {}
+
+    def show(_: list[JobStatus]) -> None:
+        """Note on which GPU a job runs."""
+        for name, number in engine.workers().items():
+            if name not in gpu_of:
+                variables = Path(f"/proc/{number}/environ").read_text("utf-8", "replace").split("\0")
+                gpu_of[name] = next(v.partition("=")[2] for v in variables if v.startswith("CUDA_VISIBLE_DEVICES="))
 
     try:
-        run_farm(jobs("tiny", len(slots), dataclasses.replace(config, steps=20)), engine)
-        count, began = fits * len(slots), time.perf_counter()
-        statuses = run_farm(jobs("fit", count, config), engine)
-        seconds = time.perf_counter() - began
+        run_farm(tiny, engine)
+        began = time.monotonic()
+        statuses = run_farm(jobs, engine, show)
+        seconds = time.monotonic() - began
     finally:
         engine.close()
     took = [s.seconds for s in statuses if s.state == "done"]
     failures = [s.record.message if s.record else s.state for s in statuses if s.state != "done"]
     if failures:
-        print(f"{len(failures)} of {count} fits failed, the first: {failures[0]}", file=sys.stderr)
+        print(f"{len(failures)} of {len(jobs)} fits failed, the first: {failures[0]}", file=sys.stderr)
+    ends = {gpu: max(s.began + s.seconds for s in statuses if gpu_of.get(s.job.name) == gpu) for gpu in gpu_of.values()}
     return {
         "fits": len(took), "failed": len(failures), "seconds": seconds, "fits_per_hour": 3600 * len(took) / seconds,
         "mean_seconds_of_a_fit": sum(took) / max(1, len(took)),
-        "mean_psnr": sum(s.record.psnr or 0 for s in statuses if s.record) / count,
+        "mean_psnr": sum(s.record.psnr or 0 for s in statuses if s.record) / len(jobs),
+        "idle_at_the_end": {gpu: round(began + seconds - end, 2) for gpu, end in sorted(ends.items())},
     }  # fmt: skip
 
 
@@ -175,14 +194,13 @@ def packing(a: Namespace, work: Path) -> Iterator[dict]:
         a.scene, a.split = work / "demo", "train=000.png,012.png,023.png;test=006.png,018.png"
     scene = SceneRequest(str(a.scene.resolve()), a.split, downscale=a.downscale)
     config = PRESETS["default"] if a.steps is None else dataclasses.replace(PRESETS["default"], steps=a.steps)
-    there, best, alone = torch.cuda.device_count(), 0, {}
+    tiny = dataclasses.replace(config, steps=20)
+    counts, best, alone = [g for g in a.gpus if g <= torch.cuda.device_count()], 0, {}
 
     def measure(gpus: int, per_gpu: int) -> dict:
-        threads = max(1, usable_cores() // (gpus * per_gpu))
-        slots = [("cuda", threads, {"CUDA_VISIBLE_DEVICES": str(i % gpus)}) for i in range(gpus * per_gpu)]
-        out = work / f"{gpus}x{per_gpu}"
-        out.mkdir()
-        row = {"gpus": gpus, "per_gpu": per_gpu, "threads": threads, **pack(scene, config, out, slots, a.fits)}
+        slots, out = gpu_slots(gpus, per_gpu, max(counts)), work / f"{gpus}x{per_gpu}"
+        first, jobs = (seeds_of(scene, c, out, k, n * len(slots)) for c, k, n in ((tiny, "tiny", 1), (config, "fit", a.fits)))
+        row = {"gpus": gpus, "per_gpu": per_gpu, "threads": slots[0][1], **pack(slots, first, jobs)}
         shutil.rmtree(out)
         return row
 
@@ -191,17 +209,35 @@ def packing(a: Namespace, work: Path) -> Iterator[dict]:
         yield row
         if row["fits_per_hour"] > alone.get("fits_per_hour", 0):
             best, alone = per_gpu, row
-    for gpus in a.gpus:
-        if 1 < gpus <= there:
+    for gpus in counts:
+        if gpus > 1:
             row = measure(gpus, best)
             yield row | {"efficiency": row["fits_per_hour"] / (gpus * alone["fits_per_hour"])}
+
+
+def captures(a: Namespace, work: Path) -> Iterator[dict]:
+    """Yield a row for each number of GPUs on which a list of jobs of different sizes runs."""
+    listed, wanted = list_jobs(str(a.scene)), None
+    counts = [g for g in a.gpus if g <= torch.cuda.device_count()]
+    for gpus in counts:
+        slots, out = gpu_slots(gpus, a.per_gpu[-1], max(counts)), work / f"{gpus}"
+        jobs = farm_jobs(listed, ["--device", "cuda"], out)
+        request = dataclasses.replace(jobs[0].request, config=dataclasses.replace(jobs[0].request.config, steps=20))
+        tiny = [
+            FarmJob(n, dataclasses.replace(request, out=out / n / "run"), out / n, out) for n in map(str, range(len(slots)))
+        ]
+        row = {"gpus": gpus, "per_gpu": a.per_gpu[-1], "threads": slots[0][1], **pack(slots, tiny, jobs)}
+        written = digests(out, [j.name for j in jobs])
+        wanted = wanted or written
+        yield row | {"same_bytes": written == wanted}
+        shutil.rmtree(out)
 
 
 def main() -> None:
     """Parse, measure, print, write."""
     a = parse(
-        __doc__, None, {"what": ("engines", "packing"), "scene?": Path}, split=str, downscale=int, scenes=20, steps=int,
-        slots=2, per_gpu=[1, 2, 4, 8, 12], gpus=[1, 2, 4, 8], fits=4, work=Path, out=Path,
+        __doc__, None, {"what": ("engines", "packing", "captures"), "scene?": Path}, split=str, downscale=int, scenes=20,
+        steps=int, slots=2, per_gpu=[1, 2, 4, 8, 12], gpus=[1, 2, 4, 8], fits=4, work=Path, out=Path,
     )  # fmt: skip
     with tempfile.TemporaryDirectory() as temporary:
         work = (a.work or Path(temporary)).resolve()
@@ -209,7 +245,7 @@ def main() -> None:
         if a.what == "engines":
             found, device = engines(a.scenes, a.steps or 100, a.slots, work), torch.device("cpu")
         else:
-            found, device = packing(a, work), torch.device("cuda")
+            found, device = (packing if a.what == "packing" else captures)(a, work), torch.device("cuda")
         rows = []
         for row in found:  # a row that took minutes is kept when a later one fails
             rows.append(row)

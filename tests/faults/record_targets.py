@@ -119,12 +119,12 @@ def jobs_with_flags(root: Path, path: Path) -> list:
     """Read the flags of each job, too, as the command does."""
     try:
         with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
-            return farm_command._jobs(job.list_jobs(str(path)), [], root / "out")
+            return farm_command.jobs_of(job.list_jobs(str(path)), [], root / "out")
     except UsageError as e:  # a wrong flag is told by its job, and the file is named on the command line
         raise UsageError(f"{path}: {e}") from e
 
 
-register(Target("flags of jobs", job_files, jobs_with_flags, (farm_command._jobs,), LINE_CHANGES, lines=0.7, share=0.01))
+register(Target("flags of jobs", job_files, jobs_with_flags, (farm_command.jobs_of,), LINE_CHANGES, lines=0.7, share=0.01))
 
 # ---- found poses, events, locks ----------------------------------------------------------------------------------------
 

@@ -42,7 +42,7 @@ def run(arguments: list[str], about: str) -> int:
             partition: Slurm's partition.
             slurm_folder: Folder for slurm's job files, private and visible to all nodes. Default: ~/.cache/warpgs/slurm.
         """
-        requested = _jobs(list_jobs(jobs), shared, out)
+        requested = jobs_of(list_jobs(jobs), shared, out)
         place = make_engine(
             requested[0].request.device, engine, slots=slots, per_gpu=per_gpu, threads=threads, minutes=minutes,
             partition=partition, slurm_folder=slurm_folder,
@@ -73,7 +73,7 @@ def _divided(arguments: list[str]) -> tuple[list[str], list[str]]:
     return own, shared
 
 
-def _jobs(listed: list[ListedJob], shared: list[str], out: Path) -> list[FarmJob]:
+def jobs_of(listed: list[ListedJob], shared: list[str], out: Path) -> list[FarmJob]:
     """Return the jobs, each with settings from the shared arguments and from its own arguments."""
     requests: dict = {}
     jobs = []
