@@ -1,10 +1,10 @@
 """Farms of small fits: equal bytes and time by engine, and fits per hour by scenes that share a GPU and by GPUs.
 
 `engines` fits demo scenes one by one with `warpgs fit`, and then with each engine; it also kills a worker during a job, and
-starts two farms on one folder. `packing` needs CUDA. Every slot of a GPU gets --fits fits of one scene, each with its own seed,
-after a tiny fit that starts the process of the slot. It runs on one GPU with several numbers of slots, then with the best
-number on several GPUs; a slot has the same number of threads in every row. `captures` needs CUDA, too: it runs a list of jobs,
-as `warpgs farm` takes it, on each number of GPUs, with the last of --per-gpu, and compares the PLY files with the first ones.
+starts two farms on one folder. `packing` and `captures` need CUDA; in every row a GPU has the same number of cores, and a slot
+of threads. `packing` gives every slot --fits fits of one scene, each with its own seed, after a tiny fit that starts the
+process of the slot, on one GPU with several numbers of slots, then with the best number on several GPUs. `captures` runs a list
+of jobs, as `warpgs farm` takes it, on each number of GPUs, and compares the PLY files with the first ones.
 """
 
 from __future__ import annotations
@@ -26,7 +26,6 @@ import torch
 from bench.lib import result_file
 from bench.lib.arguments import parse
 from warpgs.app.farm import jobs_of as farm_jobs
-from warpgs.device import usable_cores
 from warpgs.pipeline.farm.farm import JobStatus, LocalEngine, Slot, make_engine, run_farm
 from warpgs.pipeline.farm.job import LOG, PLY, Engine, FarmJob, file_digest, list_jobs
 from warpgs.pipeline.run.request import FitRequest, SceneRequest
@@ -142,9 +141,13 @@ def engines(scenes: int, steps: int, slots: int, work: Path) -> list[dict]:
     return rows
 
 
+CORES = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
+
+
 def gpu_slots(gpus: int, per_gpu: int, most_gpus: int) -> list[Slot]:
-    """Return slots that share GPUs, each with the threads that it has on ``most_gpus`` GPUs."""
-    threads = max(1, usable_cores() // (most_gpus * per_gpu))
+    """Leave as many cores to this process as these GPUs have on a machine of ``most_gpus``; return slots that share them."""
+    os.sched_setaffinity(0, CORES[: len(CORES) * gpus // most_gpus])  # processes of slots inherit it
+    threads = max(1, len(CORES) // (most_gpus * per_gpu))
     return [("cuda", threads, {"CUDA_VISIBLE_DEVICES": str(i % gpus)}) for i in range(gpus * per_gpu)]
 
 

@@ -9,7 +9,7 @@ import sys
 import pytest
 
 from warpgs.app.cli import main
-from warpgs.app.fit import request_of
+from warpgs.app.fit import request_of, tell_preset
 from warpgs.app.flags import flags_of, settings_of
 from warpgs.errors import field_docs
 from warpgs.pipeline.train.loss import AlphaDifference
@@ -102,6 +102,7 @@ def test_without_flags_the_settings_are_the_presets(preset):
 def test_flags_change_what_they_name(capsys):
     found = parsed("--memory-limit", "2GiB", "--init.source=random", "--no-cuda-graph", "--max-gaussians", "900")
     assert (found.memory_limit, found.init.source, found.cuda_graph, found.max_gaussians) == (2 * 2**30, "random", False, 900)
+    tell_preset([], found)
     assert found.preset == "default" and "preset default: any capture" in capsys.readouterr().out
     found = parsed("--strategy=mcmc", "--mcmc.noise-lr", "1e4", "--loss-terms", "alpha", "--alpha.weight", "0.5")
     assert found.strategy_config == MCMCConfig(noise_lr=1e4) and found.loss_terms == (AlphaDifference(0.5),)

@@ -273,11 +273,11 @@ def test_the_command_fits_a_file_of_jobs_and_writes_its_index(scenes, tmp_path, 
     jobs = tmp_path / "jobs.jsonl"
     lines = [{"scene": str(scenes / "s0"), "name": "a", "seed": 3}, {"scene": "gone", "name": "b & c"}]
     jobs.write_text("\n".join(map(json.dumps, lines)))
-    words = ["farm", str(jobs), "--out", str(tmp_path / "out"), "--device", "cpu", "--preset", "3dgs", "--steps", "2"]
+    words = ["farm", str(jobs), "--out", str(tmp_path / "out"), "--device", "cpu", "--steps", "2"]
     words += ["--init.source", "random", "--init.random-count=50", "--split", "every:4"]
     assert main(words) == 4
     printed = capsys.readouterr()
-    assert "1 of 2 jobs failed" in printed.err and "1 done" in printed.out
+    assert "1 of 2 jobs failed" in printed.err and "1 done" in printed.out and printed.out.count("preset default:") == 1
     page, table = (tmp_path / "out" / "index.html").read_text(), (tmp_path / "out" / "results.csv").read_text()
     rows = list(csv.DictReader(table.splitlines()))
     assert [(r["name"], r["state"], r["steps"]) for r in rows] == [("a", "done", "2"), ("b & c", "failed", "0")]

@@ -3,7 +3,7 @@
 import dataclasses
 from pathlib import Path
 
-from warpgs.app.fit import request_of
+from warpgs.app.fit import request_of, tell_preset
 from warpgs.app.flags import call
 from warpgs.errors import UsageError
 from warpgs.pipeline.farm.job import FARM_FLAGS, FarmJob, ListedJob, list_jobs
@@ -43,6 +43,7 @@ def run(arguments: list[str], about: str) -> int:
             slurm_folder: Folder for slurm's job files, private and visible to all nodes. Default: ~/.cache/warpgs/slurm.
         """
         requested = jobs_of(list_jobs(jobs), shared, out)
+        tell_preset(shared, requested[0].request.config)
         place = make_engine(
             requested[0].request.device, engine, slots=slots, per_gpu=per_gpu, threads=threads, minutes=minutes,
             partition=partition, slurm_folder=slurm_folder,

@@ -234,9 +234,13 @@ def request_of(arguments: list[str], about: str) -> FitRequest:
             raise UsageError("--time-budget chooses the steps; leave out --steps. To continue, give only --out RUN --resume")
         check_budget(a.time_budget)
     notes = (origin_note(origin, base, config),)
-    if flags.word_after(arguments, "--preset") is None:
-        say(f"preset {base.preset}: {PRESETS.described()[base.preset]}")
     return FitRequest(scene, a.out, config, a.device, a.resume, a.lpips_weights, a.time_budget, notes, view_port)
+
+
+def tell_preset(arguments: list[str], config: FitConfig) -> None:
+    """Say which preset is used where the arguments name none."""
+    if flags.word_after(arguments, "--preset") is None:
+        say(f"preset {config.preset}: {PRESETS.described()[config.preset]}")
 
 
 def run(arguments: list[str], about: str) -> int:
@@ -246,6 +250,8 @@ def run(arguments: list[str], about: str) -> int:
     with timed(Clock(since_start())):
         with section("import"):
             request = request_of(arguments, about)
+            if not request.resume:
+                tell_preset(arguments, request.config)
             with fast_imports():
                 from warpgs.pipeline.run.fit import fit_request
         ranks = join(request.device)
