@@ -259,8 +259,6 @@ def mesh(
     check_suffix(target)
     device, _ = choose_device(device_name)
     run = open_run(folder, device)
-    if not run.train:
-        raise DataError(f"{folder}: the run has no training views, so coverage is unknown; fit again")
     cameras, scale, up = training_cameras(run), run.normalization.scale, upward(run)
     if options.voxel is not None:
         options = replace(options, voxel=options.voxel * scale)
