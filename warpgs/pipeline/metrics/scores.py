@@ -187,7 +187,7 @@ class Renders:
 
     def __init__(self, gaussians: Gaussians, options: RasterizeOptions):
         """Begin without a render."""
-        self._parts, self._left = (gaussians, options), KEPT_BYTES
+        self.gaussians, self.options, self._left = gaussians, options, KEPT_BYTES
         self._kept: dict[int, tuple[Camera, tuple[np.ndarray, np.ndarray, np.ndarray]]] = {}
         self._lock, self.ended = threading.Lock(), False
         """Whether the fit ends with an error: threads that still render get one, too."""
@@ -200,8 +200,7 @@ class Renders:
                 raise CancelledError
             if id(camera) in self._kept:  # a kept camera lives, so no other has its id
                 return self._kept[id(camera)][1]
-            gaussians, options = self._parts
-            r = rasterize(gaussians, camera, options)
+            r = rasterize(self.gaussians, camera, self.options)
             images = r.rgb.cpu().numpy(), r.depth.cpu().numpy(), r.alpha.cpu().numpy()
             if (size := sum(a.nbytes for a in images)) <= self._left:
                 self._left -= size

@@ -135,12 +135,11 @@ def evaluate(
     stored, tell = open_run(folder, device), waiting()
     scene, train, test = scene_of(stored, reader, tell)
     request, names = stored.scene_request(reader), image_names(v.name for v in scene.views)
-    scored = (folder, stored.gaussians(), train, test, stored.options())
-    renders = Renders(stored.gaussians(), stored.options())
+    scored = (folder, Renders(stored.gaussians(), stored.options()), train, test)
     with hold_folder(folder, *IMAGE_FOLDERS) as held:
-        metrics = evaluate_run(*scored, lpips, names=names, renders=renders, tell=tell)
+        metrics = evaluate_run(*scored, lpips, names=names, tell=tell)
         if by_coverage and test:
-            metrics["coverage"] = coverage_of_run(*scored, names=names, renders=renders, tell=tell)
+            metrics["coverage"] = coverage_of_run(*scored, names=names, tell=tell)
         metrics |= {
             "protocol": protocol_of(scene, request.split, request.downscale, train, test),
             "config_hash": stored.record["config_hash"], "steps": stored.step,
