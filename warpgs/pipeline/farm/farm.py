@@ -320,7 +320,6 @@ def write_index(folder: Path, statuses: list[JobStatus], seconds: float) -> None
     write_csv(folder / TABLE, lines)
 
 
-ENGINES = ("local", "ray", "slurm")
 SHOW_INTERVAL = 0.2
 """Shortest time between two updates of the table [s]."""
 INDEX_INTERVAL = 30.0
@@ -332,8 +331,6 @@ def make_engine(
     partition: str | None = None, slurm_folder: Path | None = None,
 ) -> Engine:  # fmt: skip
     """Make an engine by its name, with the options of `warpgs farm`."""
-    if engine not in ENGINES:
-        raise UsageError(f"--engine {engine!r} is not one of {', '.join(ENGINES)}")
     if engine == "local":
         return LocalEngine(local_slots(device, slots, per_gpu))
     if min(1 if slots is None else slots, per_gpu, threads, minutes) < 1:
