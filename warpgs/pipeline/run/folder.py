@@ -20,7 +20,6 @@ from warpgs import schema
 from warpgs.constants import K_TOLERANCE, POSE_TOLERANCE, RULES
 from warpgs.errors import DataError, NotFiniteError, UsageError, similar_folder
 from warpgs.files import is_empty, open_input, plain, tensor_pieces, tensors_of, unread_reason, write_bytes
-from warpgs.io.images import CHOICES
 from warpgs.io.load import Split
 from warpgs.kernels.cameras import check_camera
 from warpgs.locks import check_free, hold_folder
@@ -59,7 +58,7 @@ _CAMERA = fields(
 _SCENE = fields(
     {"path": or_null(text)},
     {name: schema.of_type(hint) for name, hint in get_type_hints(SceneRequest).items() if name != "path"}
-    | {name: one_of(*choices) for name, choices in CHOICES.items()}
+    | {name: one_of(*choices) for name, choices in schema.rules_of(SceneRequest)}
     | {"downscale": whole(1)},
     others=False,
 )
