@@ -251,7 +251,7 @@ class Checked:
             UsageError: A value is not allowed.
         """
         kind: Any = type(self)
-        for name, rule in _rules(kind):
+        for name, rule in rules_of(kind):
             value = getattr(self, name)
             if value is None or (rule.allows(value) if isinstance(rule, Within) else value in rule):
                 continue
@@ -261,7 +261,7 @@ class Checked:
 
 
 @functools.cache
-def _rules(kind: type) -> tuple[tuple[str, Any], ...]:
+def rules_of(kind: type) -> tuple[tuple[str, Any], ...]:
     """Return name and rule of each field with a range or a list of values."""
     hints = typing.get_type_hints(kind, include_extras=True)
     rules = ((name, rule) for name, hint in hints.items() for rule in getattr(_inner(hint), "__metadata__", ()))

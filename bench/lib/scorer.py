@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from warpgs.geometry import convert_gaussians
+from warpgs.pipeline.metrics.scores import Renders
 from warpgs.pipeline.run.commands import scene_of
 from warpgs.pipeline.run.folder import StoredRun, open_run
 from warpgs.pipeline.run.results import evaluate_run
@@ -21,7 +22,7 @@ class Scorer:
         self.own = self._psnr(self.run.gaussians())
 
     def _psnr(self, gaussians: Gaussians) -> float:
-        metrics = evaluate_run(None, gaussians, *self.views, self.run.options())
+        metrics = evaluate_run(None, Renders(gaussians, self.run.options()), *self.views)
         return float(metrics["test"]["psnr"])
 
     def loss(self, gaussians: Gaussians) -> float:

@@ -153,14 +153,16 @@ def test_plot(run, tmp_path, capsys, words):
     assert ("points of the reconstruction" if "start" in words else " Gaussians, ") in said
 
 
-def test_plots_that_cannot_be_are_refused(run, capsys):
+def test_choices_that_cannot_be_are_refused(run, capsys):
     """With what can be given."""
     for words, why in (
-        ("--points stars", "gaussians, start"), ("--color red", "own, coverage"), ("--size 9 9", "64 to 8192"),
-        ("--background red", "white, black"), ("--out a.jpg", "is a .png"),
+        ("--points stars", "'start')"), ("--color red", "'coverage')"), ("--size 9 9", "64 to 8192"),
+        ("--background red", "'black')"), ("--out a.jpg", "is a .png"),
         ("--points start --color coverage", "coverage needs Gaussians"),
     ):  # fmt: skip
         assert why in failure(capsys, 2, "plot", str(run), *words.split())
+    assert "'flow')" in failure(capsys, 2, "priors", "show", str(run), "--out", str(run), "--source", "lidar")
+    assert "'slurm')" in failure(capsys, 2, "farm", str(run), "--out", str(run), "--engine", "pbs")
 
 
 @pytest.mark.parametrize("command", ["export", "convert"])

@@ -603,7 +603,7 @@ def test_errors_name_the_way_to_keep_a_lens(lenses, values, message, tmp_path):
     """Undistorting stays the default; terms that no model here has are refused either way."""
     scenes.write_transforms(tmp_path, scenes.transforms_json(fl_x=F, **values))
     refused(tmp_path, message, **({} if lenses == "undistort" else {"lenses": lenses}))
-    with pytest.raises(UsageError, match="--lenses must be undistort or native, not 'both'"):
+    with pytest.raises(UsageError, match="--lenses must be one of undistort, native, not 'both'"):
         load_scene(tmp_path, lenses="both")
 
 

@@ -349,8 +349,8 @@ def test_masks_that_cannot_be_used(tmp_path):
     assert load_scene(tmp_path).views[0].mask.all()
     path.unlink()
     assert "--masks cutout changes nothing: no image has a mask file" in load_scene(tmp_path, masks="cutout").notes
-    wrong = [({"masks": "cut"}, "--masks must be ignore or cutout, not 'cut'")]
-    wrong += [({"mask_keeps": "gray"}, "--mask-keeps must be white or black, not 'gray'")]
+    wrong = [({"masks": "cut"}, "--masks must be one of ignore, cutout, not 'cut'")]
+    wrong += [({"mask_keeps": "gray"}, "--mask-keeps must be one of white, black, not 'gray'")]
     wrong += [({"downscale": d}, "--downscale must be a whole number of at least 1") for d in (0, -1, 2.0, True, "2")]
     for options, words in wrong:
         with pytest.raises(UsageError, match=words):

@@ -20,6 +20,7 @@ from warpgs.files import LOCK, writing_into
 from warpgs.locks import hold_folder
 from warpgs.pipeline.farm.farm import run_farm
 from warpgs.pipeline.films.film import FilmSettings
+from warpgs.pipeline.metrics.scores import Renders
 from warpgs.pipeline.model.start import InitConfig, initial_gaussians
 from warpgs.pipeline.run import fit as fit_module
 from warpgs.pipeline.run.commands import evaluate, render
@@ -339,6 +340,6 @@ def test_images_of_views_with_like_names_are_all_written(tmp_path):
     for view, name in zip(views, wanted):
         object.__setattr__(view, "name", name)
     gaussians = initial_gaussians(seeds(), InitConfig(), 3, 1.0, torch.device("cpu"))
-    evaluate_run(tmp_path, gaussians, views[4:], views[:4], RasterizeOptions())
+    evaluate_run(tmp_path, Renders(gaussians, RasterizeOptions()), views[4:], views[:4])
     for folder in ("renders", "depth"):
         assert len(list((tmp_path / folder).iterdir())) == 4

@@ -61,7 +61,7 @@ def test_scores_are_those_of_their_views(scene, tmp_path):
     """Each row is the score of its view, whoever finished first; means are over these; every held-out view has its files."""
     gaussians, views = scene
     test, train, options = views[:10], views[10:], RasterizeOptions()
-    found = evaluate_run(tmp_path, gaussians, train, test, options)
+    found = evaluate_run(tmp_path, Renders(gaussians, options), train, test)
     wanted = [score(v, render_view(gaussians, v, options)[0]).row() for v in views]
     assert found["views"] == wanted[:10] and len({r["psnr"] for r in wanted}) == 12
     assert found["train"]["psnr"] == pytest.approx(sum(r["psnr"] for r in wanted[10:]) / 2)
@@ -73,13 +73,13 @@ def test_scores_are_those_of_their_views(scene, tmp_path):
 def test_without_held_out_views_training_views_are_pictured(scene, tmp_path, monkeypatch):
     """No score is called held-out; a full disk ends the evaluation with its error, although another thread met it."""
     gaussians, views = scene
-    options = RasterizeOptions()
-    found = evaluate_run(tmp_path, gaussians, views[:2], [], options)
+    renders = Renders(gaussians, RasterizeOptions())
+    found = evaluate_run(tmp_path, renders, views[:2], [])
     assert found["test"] == {} and found["views"] == [] and found["baselines"] == {} and found["train"]["psnr"] > 5
     assert len(list((tmp_path / "renders").iterdir())) == 2
     monkeypatch.setattr(results, "write_bytes", full)
     with pytest.raises(ResourceError, match="no space left"):
-        evaluate_run(tmp_path, gaussians, views[:1], views[1:3], options)
+        evaluate_run(tmp_path, renders, views[:1], views[1:3])
 
 
 def test_the_first_image_is_a_new_view_where_two_photographs_agree():
@@ -90,13 +90,13 @@ def test_the_first_image_is_a_new_view_where_two_photographs_agree():
     views = [View(name, c, np.zeros((72, 72, 3), np.float32)) for name, c in zip("abcd", [*away, *cameras(near)])]
     render = Renders(ball(), RasterizeOptions())
     rig = rig_among([v.camera for v in views[2:]], ball().means.numpy())
-    ((image, words),) = new_view(rig, views, ball(), RasterizeOptions(), render)
+    ((image, words),) = new_view(rig, views, render)
     assert words == "a new viewpoint, between c and d"
     middle = rasterize(ball(), cameras(np.array([[0, 0, -1.0]]))[0]).rgb.numpy()
     np.testing.assert_allclose(image, middle, atol=0.15)
     flat = [dataclasses.replace(v, camera=dataclasses.replace(v.camera, model="orthographic")) for v in views]
     for none in (views[2:3], flat):
-        assert new_view(rig, none, ball(), RasterizeOptions(), render) == []
+        assert new_view(rig, none, render) == []
 
 
 def test_a_fit_ends_with_its_score_its_size_its_time_and_what_to_do_next(tmp_path):

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from tests.priors.rigs import exact_depth, still_life
-from warpgs.errors import DataError, UsageError
+from warpgs.errors import DataError
 from warpgs.geometry import back_project
 from warpgs.pipeline.model.start import InitConfig, initial_points
 from warpgs.priors import given_depth
-from warpgs.priors.given_depth import align, check_given, fit_line, lens_depth, pinhole_view, votes, with_given_depth
+from warpgs.priors.given_depth import align, fit_line, lens_depth, pinhole_view, votes, with_given_depth
 from warpgs.priors.sweep import sweep_depths
 from warpgs.scene import GivenDepth, PointCloud, View, ViewDepth
 from warpgs.synthetic import demo
@@ -159,22 +159,6 @@ def test_the_start_is_at_the_given_depth():
     assert np.array_equal(start.cloud.points, again.cloud.points)
     alone = initial_points(mapped[:1], None, config, np.random.default_rng(0))
     assert "1 of these views without a comparison" in alone.how and len(alone.cloud) > 500
-
-
-def test_maps_from_python_are_checked():
-    """Size, kind and values, by view and name."""
-    view, depth = still_life()[0][0], still_life()[1][0].astype(np.float32)
-    wrong = {
-        "the map of depth has shape": given(view, depth[:-1]), "depth kind 'deep'": given(view, depth, "deep"),
-        "the map of depth holds values": given(view, -depth),
-        "the map of confidence holds values": given(view, depth, confidence=depth),
-        "the map of normals has shape": dataclasses.replace(view, normals=depth),
-        "the map of normals holds values": dataclasses.replace(view, normals=np.full((*depth.shape, 3), np.nan, np.float32)),
-    }  # fmt: skip
-    for reason, bad in wrong.items():
-        with pytest.raises(UsageError, match=f"view {view.name}: .*{reason}"):
-            check_given([bad])
-    check_given([given(view, depth, confidence=np.ones_like(depth))])
 
 
 def test_depth_in_the_pixels_of_a_lens():

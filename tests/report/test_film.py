@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from warpgs.errors import DataError, ResourceError, UsageError
+from warpgs.errors import ResourceError, UsageError
 from warpgs.report import film as film_files
 from warpgs.report.film import MAX_FPS, _with_one_palette, write_film
 
@@ -94,12 +94,8 @@ def test_frames_that_make_no_film_leave_the_old_one(tmp_path, name):
         yield np.zeros((16, 16, 3))
         raise RuntimeError("renderer")
 
-    for wrong, error, words in (
-        ([], DataError, "no frames"), (frames(), RuntimeError, "renderer"),
-        ([np.zeros((16, 16, 3)), np.zeros((32, 32, 3))], DataError, "frame 1 is 32 x 32 px, the first 16 x 16 px"),
-    ):  # fmt: skip
-        with pytest.raises(error, match=words):
-            write_film(path, wrong)
+    with pytest.raises(RuntimeError, match="renderer"):
+        write_film(path, frames())
     assert path.read_bytes() == b"old" and list(tmp_path.iterdir()) == [path]
     with pytest.raises(ResourceError, match="cannot be written"):
         write_film(tmp_path / "no" / name, [np.zeros((16, 16, 3))])
@@ -170,8 +166,6 @@ def test_animation_holds_all_frames_in_colour_and_time(tmp_path, suffix):
 
 def test_films_that_cannot_be_are_refused_and_gifs_have_one_palette(tmp_path, monkeypatch):
     """What an encoder breaks off leaves the old film; all frames of a GIF have one palette, so that nothing flickers."""
-    with pytest.raises(UsageError, match=r"one of .mp4, .webm, .webp, .gif, got .avi"):
-        write_film(tmp_path / "a.avi", np.zeros((2, 8, 8, 3)))
     with pytest.raises(UsageError, match=f"at most {MAX_FPS} frames per second"):
         write_film(tmp_path / "a.gif", np.zeros((2, 8, 8, 3)), fps=MAX_FPS + 1)
     monkeypatch.setattr("warpgs.report.film.MAX_BYTES", 500)

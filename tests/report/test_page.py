@@ -6,7 +6,6 @@ import io
 import json
 import math
 import re
-from dataclasses import replace
 from html.parser import HTMLParser
 
 import cv2
@@ -16,8 +15,9 @@ from rich.console import Console
 
 from warpgs.errors import ResourceError
 from warpgs.files import write_json
+from warpgs.pipeline.farm.job import JobRecord
+from warpgs.pipeline.farm.table import FarmTable, farm_page
 from warpgs.process import Detail, Task
-from warpgs.report.farm import FarmTable, JobRow, farm_page
 from warpgs.report.images import png, webp
 from warpgs.report.page import curve, write_page
 from warpgs.report.progress import EventLog, read_events
@@ -234,8 +234,9 @@ def steps_of(path):
 # The index of a farm and its live table: every job, whatever it is called.
 
 ROWS = [
-    JobRow("a", "done", 500, 61.0, 25.5, 1200), JobRow("b\x1b[31m", "running", 40, 3.0), JobRow("c", "waiting"),
-    JobRow("d", "failed", message="d: no images <b>"), JobRow("e", "failed", message="e: no images <b>"),
+    JobRecord("a", "", "done", seconds=61.0, psnr=25.5, gaussians=1200, steps=500),
+    JobRecord("b\x1b[31m", "", "running", seconds=3.0, steps=40), JobRecord("c", "", "waiting"),
+    JobRecord("d", "", "failed", message="d: no images <b>"), JobRecord("e", "", "failed", message="e: no images <b>"),
 ]  # fmt: skip
 
 
@@ -254,6 +255,6 @@ def test_the_table_shows_running_jobs_and_without_a_terminal_each_job_once(capsy
     lines = capsys.readouterr().out.splitlines()
     assert [line.split("  ")[0] for line in lines[:3]] == ["a", "d", "e"] and len(lines) == 4
     # the index counts failures by message; the name of the scene in it makes no other message; nothing of a name is markup
-    page = farm_page("a & b", [replace(r, thumbnail="x y/t.jpg" if r.name == "a" else "") for r in ROWS], 90)
+    page = farm_page("a & b", [(r, "x y/t.jpg" if r.name == "a" else "", "") for r in ROWS], 90)
     assert "<td>SCENE: no images &lt;b&gt;</td><td>2</td><td>d, e</td>" in page and "<h1>a &amp; b</h1>" in page
     assert 'src="x%20y/t.jpg"' in page and "2 jobs are not done yet" in page and "25.50 dB" in page

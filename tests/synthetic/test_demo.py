@@ -156,9 +156,8 @@ def test_demos_that_cannot_be_written(tmp_path):
         error = ResourceError if name == "file/below" else UsageError
         with pytest.raises(error, match=words):
             demo.write_demo(tmp_path / name, **(SIZE | change))
-    for change, words in (({"form": "llff"}, "transforms or colmap"), ({"views": 8}, "at least 9 views")):
-        with pytest.raises(UsageError, match=words):
-            demo.write_object(tmp_path / "d", **change)
+    with pytest.raises(UsageError, match="at least 9 views"):
+        demo.write_object(tmp_path / "d", views=8)
     assert sorted(p.name for p in tmp_path.rglob("*")) == ["file", "full", "mine"]
 
 

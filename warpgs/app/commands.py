@@ -145,8 +145,9 @@ def render(
 
 
 def plot(
-    run: Positional[Path], *, out: Path | None = None, points: str = "gaussians", color: str = "own",
-    background: str = "white", size: tuple[int, int] = (1600, 1000), cameras: bool = True, device: str = "auto",
+    run: Positional[Path], *, out: Path | None = None, points: Literal["gaussians", "start"] = "gaussians",
+    color: Literal["own", "coverage"] = "own", background: Literal["white", "black"] = "white",
+    size: tuple[int, int] = (1600, 1000), cameras: bool = True, device: str = "auto",
 ) -> list[str]:  # fmt: skip
     """Plot a run's cameras and Gaussians.
 
@@ -313,7 +314,7 @@ def show_priors() -> Command:
     def show(
         scene: Positional[Path], *, out: Path, split: str | None = None, downscale: int | None = None,
         max_side: int | None = None, allow_outside: bool = False, max_pixels: int = MAX_PIXELS, threads: int = 0,
-        source: str = "sweep", priors: OmitArgPrefixes[PriorConfig],
+        source: Literal["sweep", "flow"] = "sweep", priors: OmitArgPrefixes[PriorConfig],
     ) -> list[str]:  # fmt: skip
         """Write depth and saliency.
 

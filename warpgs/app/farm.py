@@ -2,6 +2,7 @@
 
 import dataclasses
 from pathlib import Path
+from typing import Literal
 
 from warpgs.app.fit import request_of, tell_preset
 from warpgs.app.flags import call
@@ -24,8 +25,9 @@ def run(arguments: list[str], about: str) -> int:
     own, shared = _divided(arguments)
 
     def farm(
-        jobs: Positional[str], *, out: Path, engine: str = "local", slots: int | None = None, per_gpu: int = 1,
-        threads: int = 1, minutes: int = 240, partition: str | None = None, slurm_folder: Path | None = None,
+        jobs: Positional[str], *, out: Path, engine: Literal["local", "ray", "slurm"] = "local",
+        slots: int | None = None, per_gpu: int = 1, threads: int = 1, minutes: int = 240, partition: str | None = None,
+        slurm_folder: Path | None = None,
     ) -> None:  # fmt: skip
         """Fit many scenes.
 

@@ -227,9 +227,7 @@ def _frame(name: str, camera: Camera) -> dict[str, object]:
     }  # fmt: skip
 
 
-def _colmap(
-    names: list[str], cameras: list[Camera], points: tuple[np.ndarray, np.ndarray] | None
-) -> dict[str, str]:  # fmt: skip
+def _colmap(names: list[str], cameras: list[Camera], points: tuple[np.ndarray, np.ndarray] | None) -> dict[str, str]:
     """Return COLMAP's text files by name: a camera for each lens, images, and points that no image names."""
     import torch
 

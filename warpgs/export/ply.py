@@ -528,7 +528,7 @@ def _check_properties(path: Path, properties: list[tuple[str, str]]) -> int:
 
 def _assemble(
     path: Path, read: Callable[[slice], np.ndarray], n: int, rest: int, strict: bool, notes: list[str], origin: np.ndarray
-) -> tuple[Gaussians, np.ndarray]:  # fmt: skip
+) -> tuple[Gaussians, np.ndarray]:
     """Return the Gaussians of N structured rows, which are read in their order, and their ``origin`` [3]; see `usable`.
 
     Doubles far from 0 become float32 about a point near the first rows, which is added to the origin.

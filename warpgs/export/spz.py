@@ -150,7 +150,7 @@ def _coordinate_system(path: Path, extensions: bytes | bytearray) -> int:
 
 def _parts_of_gzip(
     path: Path, stream: gzip.GzipFile, n: int, sizes: list[int], extensions: bytearray | None
-) -> Iterator[Section]:  # fmt: skip
+) -> Iterator[Section]:
     """Yield the sections of a file of version 2 or 3, each to be read to its end before the next; then fill ``extensions``."""
 
     def read(size: int) -> bytes:

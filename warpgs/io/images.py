@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 
@@ -15,6 +16,7 @@ from warpgs import geometry
 from warpgs.errors import DataError, UsageError
 from warpgs.io.image_files import MAX_PIXELS, decode, read_exif, read_image_file
 from warpgs.scene import DEPTH_KINDS, GivenDepth, View
+from warpgs.schema import Checked
 
 BLACK = (0.0, 0.0, 0.0)
 REDUCED = "reduced to "
@@ -57,9 +59,9 @@ class SceneOptions:
     """Images to leave out: names or patterns such as blurry*, with or without folder and suffix, separated by commas."""
     allow_outside: bool = False
     """Allow names and links that point to files outside the scene folder."""
-    masks: str = "ignore"
+    masks: Annotated[str, ("ignore", "cutout")] = "ignore"
     """Treatment of masked-out pixels: ignore (left out of fit and scores) or cutout (transparent)."""
-    mask_keeps: str = "white"
+    mask_keeps: Annotated[str, ("white", "black")] = "white"
     """Colour of a mask file that keeps a pixel: white or black."""
     black_is_empty: bool = True
     """Make dark pixels around the object transparent, if every image shows an object on a black background."""
@@ -69,7 +71,7 @@ class SceneOptions:
     """Largest number of pixels of a stored image or mask."""
     max_side: int | None = None
     """Largest image side [px], 0 for no limit. None: no limit with --downscale; otherwise 1600, or 800 in a fit on a CPU."""
-    lenses: str = "undistort"
+    lenses: Annotated[str, ("undistort", "native")] = "undistort"
     """Treatment of lens distortion: undistort (images are resampled to a pinhole) or native (the model is rendered through the
     lens). Fisheyes need native."""
     depths: str | None = None
@@ -77,17 +79,17 @@ class SceneOptions:
     Default: the maps that transforms.json names; with the value none, these maps are ignored."""
     normals: str | None = None
     """Folder of normal maps, RGB PNG of (n + 1) / 2 or NPY, with the names of the images."""
-    depth_kind: str = "metric"
+    depth_kind: Annotated[str, DEPTH_KINDS] = "metric"
     """Meaning of the depth maps: metric (lengths in units of the cameras), relative (lengths of unknown scale and shift) or
     disparity (inverse lengths of unknown scale and shift, as networks give)."""
     depth_unit: float | None = None
     """Length of one unit of a metric depth map, in units of the cameras. None: 0.001 for integer maps, 1 for float maps."""
-    normal_axes: str = "opencv"
+    normal_axes: Annotated[str, ("opencv", "opengl")] = "opencv"
     """Camera axes of the normals: opencv (y down, z forward) or opengl (y up, z back)."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class ReadOptions(SceneOptions):
+class ReadOptions(SceneOptions, Checked, group="--"):
     """Options as a reader gets them: checked, with the image sizes that follow from the defaults."""
 
     downscale: int = 1
@@ -117,10 +119,7 @@ class ReadOptions(SceneOptions):
             number = getattr(self, name)
             if isinstance(number, bool) or not isinstance(number, int) or number < least:
                 raise UsageError(f"--{name.replace('_', '-')} must be a whole number {needs}, not {number!r}")
-        for name, choices in CHOICES.items():
-            if getattr(self, name) not in choices:
-                listed = f"{choices[0]} or {choices[1]}" if len(choices) == 2 else f"one of {', '.join(choices)}"
-                raise UsageError(f"--{name.replace('_', '-')} must be {listed}, not {getattr(self, name)!r}")
+        super().__post_init__()
         unit = self.depth_unit
         if unit is not None and (isinstance(unit, bool) or not isinstance(unit, (int, float)) or not 0 < unit < math.inf):
             raise UsageError(f"--depth-unit must be a finite number above 0, not {unit!r}")
@@ -130,13 +129,6 @@ def matches(name: str, pattern: str) -> bool:
     """Return whether a view's name matches a name or glob pattern, whole or by its end, with suffix or without."""
     end = "/".join(name.split("/")[-1 - pattern.count("/") :])
     return any(n == pattern or fnmatchcase(n, pattern) for n in (name, end, end.rpartition(".")[0]))
-
-
-CHOICES = {
-    "masks": ("ignore", "cutout"), "lenses": ("undistort", "native"), "mask_keeps": ("white", "black"),
-    "depth_kind": DEPTH_KINDS, "normal_axes": ("opencv", "opengl"),
-}  # fmt: skip
-"""Values of the options that have a choice."""
 
 
 @dataclass(frozen=True)

@@ -448,7 +448,7 @@ def read_folder(
     given = {f.name: getattr(options, f.name) for f in fields(SceneOptions)}
     checked = ReadOptions(**given | {"downscale": factor, "max_side": side, "on_image": on_image})
     try:
-        if root.is_file() or not root.is_dir():
+        if not root.is_dir():
             fix = "give a folder of photographs, or of images with their cameras"
             found = f"is a file; {fix}" if root.is_file() else f"no such folder; {similar_folder(root) or fix}"
             raise DataError(f"{root}: {found}")

@@ -9,7 +9,7 @@ import numpy as np
 from warpgs import geometry
 from warpgs.errors import DataError, UsageError
 from warpgs.priors.flow import nearest_views, no_depth, pixel_grid
-from warpgs.scene import DEPTH_KINDS, Camera, GivenDepth, PointCloud, View, ViewDepth
+from warpgs.scene import Camera, GivenDepth, PointCloud, View, ViewDepth
 
 # Given depth: converted to the scene's units, checked against consistent depth, and used instead of the depth of a
 # sweep.
@@ -69,24 +69,6 @@ class Alignment:
 def any_given(views: Sequence[View]) -> bool:
     """Return whether any view has given depth."""
     return any(v.depth is not None for v in views)
-
-
-def check_given(views: Sequence[View]) -> None:
-    """Check the given maps of views that were made in Python; `load_scene` has checked those that it read."""
-    for v in views:
-        size = v.image.shape[:2]
-        depth, sure = (None, None) if v.depth is None else (v.depth.values, v.depth.confidence)
-        maps = [("depth", depth, size, 0, np.inf), ("confidence", sure, size, 0, 1)]
-        for name, values, wanted, low, high in (*maps, ("normals", v.normals, (*size, 3), -1.01, 1.01)):
-            if values is None:
-                continue
-            what = f"view {v.name}: the map of {name}"
-            if values.shape != wanted:
-                raise UsageError(f"{what} has shape {list(values.shape)}, the image needs {list(wanted)}")
-            if not (np.isfinite(values).all() and values.min() >= low and values.max() <= high):
-                raise UsageError(f"{what} holds values that are non-finite or out of range; use 0 for missing values")
-        if v.depth is not None and v.depth.kind not in DEPTH_KINDS:
-            raise UsageError(f"view {v.name}: depth kind {v.depth.kind!r} is not one of {', '.join(DEPTH_KINDS)}")
 
 
 def fit_line(values: np.ndarray, wanted: np.ndarray) -> tuple[float, float]:

@@ -312,8 +312,6 @@ def complete_disparity(image: np.ndarray, depth: np.ndarray, valid: np.ndarray, 
     import cv2
 
     valid = valid & (depth > 0) & np.isfinite(depth)
-    if not valid.any():
-        raise DataError("no pixel has a depth, so there is nothing to complete; use --depth-model, or other views")
     inverse = 1 / depth[valid].astype(np.float64)
     inverse = np.clip(inverse, *np.percentile(inverse, CLIP))
     low, high = inverse.min(), inverse.max()

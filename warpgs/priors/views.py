@@ -110,9 +110,7 @@ def classical_semantics(image: np.ndarray) -> Maps:
     pixels = np.round(np.clip(image, 0, 1) * 255).astype(np.uint8)
     flat = np.clip(cv2.ximgproc.l0Smooth(pixels, None, L0_WEIGHT, L0_GROWTH), 0, 255).astype(np.uint8)
     boundary = _falloff(cv2.Canny(flat, EDGE_LOW, EDGE_HIGH) > 0)
-    done, saliency = cv2.saliency.StaticSaliencyFineGrained_create().computeSaliency(pixels)
-    if not done:
-        raise DataError(f"the saliency of an image of {image.shape[1]} x {image.shape[0]} px cannot be computed")
+    saliency = cv2.saliency.StaticSaliencyFineGrained_create().computeSaliency(pixels)[1]
     even = cv2.ximgproc.fastGlobalSmootherFilter(flat, saliency.astype(np.float32), SMOOTHING, 8.0)
     low, high = np.percentile(even, [2, 98])
     foreground = np.clip((even - low) / max(high - low, 1e-6), 0, 1).astype(np.float32)

@@ -13,7 +13,7 @@ import numpy as np
 from PIL import Image
 
 from warpgs.device import in_background, usable_cores
-from warpgs.errors import DataError, ResourceError, UsageError
+from warpgs.errors import ResourceError, UsageError
 from warpgs.files import replacing, write_bytes
 from warpgs.folders import temporary_folder
 from warpgs.process import fed_program, hidden_stderr, run_program, utf8_name
@@ -29,23 +29,14 @@ PALETTE_PIXELS = 2**18
 """Number of pixels, taken from all frames, from which a GIF's palette is chosen."""
 
 
-def _checked(path: Path, frames: Iterable[np.ndarray]) -> Iterator[np.ndarray]:
-    """Yield frames as 8-bit values; a DataError if their sizes differ, as OpenCV drops such frames, or there are none."""
-    first = None
-    for i, frame in enumerate(frames):
-        first = first or frame.shape[:2]
-        if frame.shape[:2] != first:
-            (h, w), (height, width) = first, frame.shape[:2]
-            raise DataError(f"{path}: frame {i} is {width} x {height} px, the first {w} x {h} px")
-        yield np.round(np.clip(frame, 0, 1) * 255).astype(np.uint8)
-    if first is None:
-        raise DataError(f"{path}: there are no frames to write")
+def _bytes_of(frame: np.ndarray) -> np.ndarray:
+    return np.round(np.clip(frame, 0, 1) * 255).astype(np.uint8)
 
 
 def _pixels(path: Path, frames: Iterable[np.ndarray]) -> list[np.ndarray]:
-    """Return frames as 8-bit values, after checking their number and size."""
+    """Return frames as 8-bit values, after checking their size in memory."""
     result: list[np.ndarray] = []
-    for pixels in _checked(path, frames):
+    for pixels in map(_bytes_of, frames):
         result.append(pixels)
         if len(result) * pixels.nbytes > MAX_BYTES:
             raise UsageError(
@@ -64,7 +55,7 @@ def _with_one_palette(pixels: list[np.ndarray]) -> list:
 
 
 def write_animation(path: Path, frames: Iterable[np.ndarray], fps: int) -> int:
-    """Write frames [H, W, 3] in [0, 1], all of one size, as an animated WebP or GIF; returns their number."""
+    """Write frames [H, W, 3] in [0, 1], at least one and all of one size, as an animated WebP or GIF; returns their number."""
     # Equal frames in a row become one frame that is shown longer.
     if fps > MAX_FPS:
         raise UsageError(f"{path}: browsers show at most {MAX_FPS} frames per second of an animated image, not {fps}")
@@ -88,15 +79,13 @@ SUFFIXES = (*VIDEOS, *ANIMATIONS)
 
 
 def write_film(path: Path, frames: Iterable[np.ndarray], fps: int = 30) -> int:
-    """Write frames [H, W, 3] in [0, 1], all of one size, as a film in the format that the path's suffix names."""
+    """Write frames [H, W, 3] in [0, 1], at least one and all of one size, as a film of the format that the suffix names."""
     # A video is VP9, which OpenCV's wheels bring and current browsers play; .mp4 is H.264 if this machine has an encoder.
     # An odd height loses a row, an odd width a column. An animated image (.webp, .gif) runs in a loop. The film is decoded
     # before it replaces an older one, because the encoder does not report a full disk.
     suffix = path.suffix.lower()
     if suffix in ANIMATIONS:
         return write_animation(path, frames, fps)
-    if suffix not in VIDEOS:
-        raise UsageError(f"{path}: a film must end in one of {', '.join(SUFFIXES)}, got {suffix or 'no suffix'}")
     sizes: list[tuple[int, int]] = []
 
     def check(film: Path) -> None:
@@ -109,9 +98,9 @@ def write_film(path: Path, frames: Iterable[np.ndarray], fps: int = 30) -> int:
 
     with replacing(path, check, suffix=suffix) as (_, temporary), utf8_name(temporary) as name:
         if suffix == ".mp4" and (program := h264_encoder()):
-            _encode_h264(program, name, _even(path, frames, sizes), fps)
+            _encode_h264(program, name, _even(frames, sizes), fps)
         else:
-            _encode_vp9(path, name, _even(path, frames, sizes), fps)
+            _encode_vp9(path, name, _even(frames, sizes), fps)
     return len(sizes)
 
 
@@ -125,9 +114,9 @@ def h264_encoder() -> str | None:
     return program if run_program(program, *probe.split(), timeout=5)[0] == 0 else None
 
 
-def _even(path: Path, frames: Iterable[np.ndarray], sizes: list[tuple[int, int]]) -> Iterator[np.ndarray]:
+def _even(frames: Iterable[np.ndarray], sizes: list[tuple[int, int]]) -> Iterator[np.ndarray]:
     """Yield frames as 8-bit values with even sides, and write the size of each, [width, height], to a list."""
-    for pixels in _checked(path, frames):
+    for pixels in map(_bytes_of, frames):
         height, width = (s // 2 * 2 for s in pixels.shape[:2])
         sizes.append((width, height))
         yield np.ascontiguousarray(pixels[:height, :width])

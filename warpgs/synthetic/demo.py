@@ -420,8 +420,6 @@ def write_object(
     tell: Say = silent,
 ) -> str:  # fmt: skip
     """Write an object as a scene folder: RGBA images with straight colours, or RGB images with soft masks."""
-    if form not in FORMATS:
-        raise UsageError(f"a demo object is written as {' or '.join(FORMATS)}, not as {form!r}")
 
     def contents() -> dict[str, bytes]:
         shapes, cameras, files = cut_out_object(seed), ring_cameras(views, width, height), {}

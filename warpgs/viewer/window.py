@@ -24,6 +24,7 @@ from warpgs.io.image_files import decode
 from warpgs.mesh.views import MIN_ALPHA
 from warpgs.pipeline.films.paths import fov_y
 from warpgs.pipeline.metrics.coverage import DepthView, classes_of, coverage_map, depth_views
+from warpgs.pipeline.metrics.scores import Renders
 from warpgs.pipeline.model.clean import REASONS, counted_lines, in_colors, reasons_of
 from warpgs.pipeline.model.edit import any_of, coverage, first_reasons, inside, select
 from warpgs.pipeline.model.table import FittedModel
@@ -187,7 +188,7 @@ class Maps:
         if self._depths is None:
             model, views = self.content.model, self.content.views
             masks = [v.mask if (v := views.get(n)) else None for n in model.train]
-            self._depths = depth_views(model.gaussians(), [model.cameras()[n] for n in model.train], options, masks)
+            self._depths = depth_views(Renders(model.gaussians(), options), [model.cameras()[n] for n in model.train], masks)
         return self._depths
 
 

@@ -16,9 +16,9 @@ from warpgs.errors import FolderHeldError, ResourceError, UsageError
 from warpgs.files import remove_leftovers, write_csv, write_text, writing_into
 from warpgs.locks import check_free, hold_folder
 from warpgs.pipeline.farm.job import PLY, THUMBNAIL, Engine, Event, FarmJob, JobRecord, finished, read_job_record, write_record
+from warpgs.pipeline.farm.table import Card, FarmTable, farm_page
 from warpgs.pipeline.run.request import choose_device
 from warpgs.process import PythonWorker, say
-from warpgs.report.farm import FarmTable, JobRow, farm_page
 
 WORKER = "warpgs.pipeline.farm.worker"
 SECONDS_TO_SAVE = 60.0
@@ -292,36 +292,34 @@ COLUMNS = (
 """Columns of results.csv."""
 
 
-def row_of(status: JobStatus) -> JobRow:
-    """Return the row of a job in tables."""
+def row_of(status: JobStatus) -> JobRecord:
+    """Return the row of a job in tables: its record, or what is known so far, with the message to show."""
     r, note = status.record, status.notes[-1] if status.notes else ""
     if r is None:
         took = time.monotonic() - status.began if status.state == "running" else 0.0
-        return JobRow(status.job.name, status.state, status.step, took, message=note)
-    message = (r.message if r.state == "failed" else "" if status.attempts else "finished before") or note
-    return JobRow(r.name, status.state, r.steps, r.seconds, r.psnr, r.gaussians, message, r.ssim, r.ply_bytes)
+        return JobRecord(status.job.name, "", status.state, message=note, seconds=took, steps=status.step)
+    return replace(r, message=(r.message if r.state == "failed" else "" if status.attempts else "finished before") or note)
 
 
 def write_index(folder: Path, statuses: list[JobStatus], seconds: float) -> None:
     """Write index.html and results.csv of a farm."""
-    rows: list[JobRow] = []
+    cards: list[Card] = []
     lines: list[tuple[object, ...]] = [COLUMNS]
     for status in statuses:
         r, job, scene, row = status.record, status.job, status.job.request.scene.path, row_of(status)
         files = [p if p.is_file() else None for p in (job.folder / THUMBNAIL, job.request.out / "report.html")]
         thumbnail, report = ("" if p is None else p.relative_to(folder).as_posix() for p in files)
         message = row.message.replace(f"{Path(scene).parent}{os.sep}", "")  # a page is sent
-        rows.append(replace(row, message=message, thumbnail=thumbnail, report=report))
+        cards.append((replace(row, message=message), thumbnail, report))
         if r is None:
             lines.append((job.name, scene, status.state, *[""] * (len(COLUMNS) - 3)))
         else:  # csv writes None as an empty field
             figures = r.psnr, r.ssim, r.gaussians, r.steps, r.ply_bytes, round(r.seconds, 3)
             lines.append((r.name, scene, r.state, r.how, *figures, r.files.get(PLY, ""), r.message))
-    write_text(folder / INDEX, farm_page(folder.resolve().name, rows, seconds))
+    write_text(folder / INDEX, farm_page(folder.resolve().name, cards, seconds))
     write_csv(folder / TABLE, lines)
 
 
-ENGINES = ("local", "ray", "slurm")
 SHOW_INTERVAL = 0.2
 """Shortest time between two updates of the table [s]."""
 INDEX_INTERVAL = 30.0
@@ -333,8 +331,6 @@ def make_engine(
     partition: str | None = None, slurm_folder: Path | None = None,
 ) -> Engine:  # fmt: skip
     """Make an engine by its name, with the options of `warpgs farm`."""
-    if engine not in ENGINES:
-        raise UsageError(f"--engine {engine!r} is not one of {', '.join(ENGINES)}")
     if engine == "local":
         return LocalEngine(local_slots(device, slots, per_gpu))
     if min(1 if slots is None else slots, per_gpu, threads, minutes) < 1:

@@ -214,7 +214,7 @@ class JobRecord:
     identity: str
     """Digest of the job, `FarmJob.identity`."""
     state: str
-    """done or failed."""
+    """done or failed; in a table also waiting, running, or elsewhere (another farm works on it)."""
     how: str = ""
     """kept, continued, fitted or redone."""
     message: str = ""

@@ -18,6 +18,7 @@ from warpgs.locks import check_file_path, hold_folder
 from warpgs.mesh.views import MIN_ALPHA
 from warpgs.pipeline.films import paths
 from warpgs.pipeline.metrics.coverage import classes_of, coverage_map, depth_views, fraction_outside
+from warpgs.pipeline.metrics.scores import Renders
 from warpgs.pipeline.model.table import FittedModel
 from warpgs.process import Say, say, silent
 from warpgs.render.options import RasterizeOptions
@@ -287,7 +288,7 @@ def _frames(
         options = replace(options, background=gaussians.means.new_tensor(settings.background))
     photographs, views = [model.cameras()[n] for n in model.train], coverage if isinstance(coverage, Sequence) else []
     cut_out, masks = any(v.alpha is not None for v in views), [v.mask for v in views] or None
-    training = depth_views(gaussians, [v.camera for v in views] or photographs, options, masks) if coverage else None
+    training = depth_views(Renders(gaussians, options), [v.camera for v in views] or photographs, masks) if coverage else None
     shown = options if coverage else options.for_display(gaussians)  # coverage needs exact depths
     for camera in cameras:
         with torch.no_grad():

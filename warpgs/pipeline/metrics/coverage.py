@@ -21,11 +21,9 @@ from warpgs.mesh.views import MIN_ALPHA, TOLERANCE, depth_difference, seen_from
 from warpgs.pipeline.metrics.scores import Renders, psnr_of, scored_pair
 from warpgs.priors.given_depth import pinhole_view
 from warpgs.process import Say, counted, silent
-from warpgs.render.options import RasterizeOptions
-from warpgs.render.rasterize import rasterize
 from warpgs.report.images import COVERAGE_LEGEND, channel_mean, coverage_image, png, webp
 from warpgs.report.page import Section
-from warpgs.scene import Camera, Gaussians, View
+from warpgs.scene import Camera, View
 
 GRID = 32
 """Number of points along the longer side of an image that `fraction_outside` checks."""
@@ -40,19 +38,14 @@ DepthView = tuple[Camera, torch.Tensor]
 
 @torch.no_grad()
 def depth_views(
-    gaussians: Gaussians, cameras: Sequence[Camera], options: RasterizeOptions,
-    masks: Sequence[np.ndarray | None] | None = None, renders: Renders | None = None,
-) -> list[DepthView]:  # fmt: skip
+    renders: Renders, cameras: Sequence[Camera], masks: Sequence[np.ndarray | None] | None = None
+) -> list[DepthView]:
     """Render the depth of every training view once, 0 outside ``masks`` [H, W]; smaller if all maps exceed `MAX_PIXELS`."""
     factor = min(1.0, (MAX_PIXELS / max(1, sum(c.width * c.height for c in cameras))) ** 0.5)
     views = []
     for camera, mask in zip(cameras, masks or [None] * len(cameras)):
         small = _resized(pinhole_of(camera), factor)
-        if renders is None:
-            r = rasterize(gaussians, small, options)
-            depth, alpha = r.depth, r.alpha
-        else:
-            _, depth, alpha = (torch.from_numpy(a).to(gaussians.means.device) for a in renders(small))
+        _, depth, alpha = (torch.from_numpy(a).to(renders.gaussians.means.device) for a in renders(small))
         depth = torch.where(alpha >= MIN_ALPHA, depth, 0)
         if mask is not None:
             counts = torch.as_tensor(mask, dtype=torch.float32, device=depth.device)[None, None]
@@ -215,23 +208,21 @@ EXPECTED = (
 
 
 def coverage_of_run(
-    out: Path | None, gaussians: Gaussians, train: Sequence[View], test: Sequence[View], options: RasterizeOptions, *,
-    names: Mapping[str, str], renders: Renders | None = None, tell: Say = silent,
-) -> dict[str, Any]:  # fmt: skip
+    out: Path | None, renders: Renders, train: list[View], test: list[View], *, names: Mapping[str, str], tell: Say = silent
+) -> dict[str, Any]:
     """Split the scores of held-out views by coverage, and save an image of each view in ``out``, if any."""
     tell("checking coverage")
     if out is not None:
         make_folder(out / FOLDER)
-    renders = renders or Renders(gaussians, options)
     train, test = ([pinhole_view(v) for v in views] for views in (train, test))
-    training = depth_views(gaussians, [v.camera for v in train], options, [v.mask for v in train], renders)
+    training = depth_views(renders, [v.camera for v in train], [v.mask for v in train])
     errors = photo_errors(train, training)
     transparent = any(v.alpha is not None for v in (*train, *test))
 
     def covered() -> Iterator[tuple[View, np.ndarray, torch.Tensor, torch.Tensor, np.ndarray]]:
         for view in counted(test, tell, "checking coverage", "views"):
             image, depth, alpha = renders(view.camera)
-            surface = torch.from_numpy(np.where(alpha >= MIN_ALPHA, depth, 0)).to(gaussians.means.device)
+            surface = torch.from_numpy(np.where(alpha >= MIN_ALPHA, depth, 0)).to(renders.gaussians.means.device)
             counts, difference = coverage_map(surface, view.camera, training)
             yield view, image, counts.cpu(), ((surface <= 0) & transparent).cpu(), _bin(difference)
 

@@ -75,15 +75,8 @@ def psnr_of(mse: float) -> float:
 
 def psnr(image: np.ndarray, target: np.ndarray, region: np.ndarray | None = None) -> float:
     """Return the PSNR [dB] of two images in [0, 1], over all channels of the pixels in ``region`` [H, W]; infinite if equal."""
-    shape = list(image.shape)
-    if image.shape != target.shape:
-        raise ValueError(f"psnr: both images must have one shape, not {shape} and {list(target.shape)}; resize one")
     difference = image.astype(np.float64) - target
     if region is not None:
-        if region.dtype != bool:
-            raise TypeError(f"psnr: region must be bool, not {region.dtype}; give region > 0")
-        if region.shape != image.shape[:2]:
-            raise ValueError(f"psnr: region must have shape {shape[:2]}, not {list(region.shape)}; resize it")
         difference = np.compress(region.ravel(), difference.reshape(region.size, *image.shape[2:]), axis=0)
     mse = float(np.square(difference, out=difference).mean())
     # numpy's logarithm, which sometimes rounds differently from math.log10: published figures stay the same
@@ -194,7 +187,7 @@ class Renders:
 
     def __init__(self, gaussians: Gaussians, options: RasterizeOptions):
         """Begin without a render."""
-        self._parts, self._left = (gaussians, options), KEPT_BYTES
+        self.gaussians, self.options, self._left = gaussians, options, KEPT_BYTES
         self._kept: dict[int, tuple[Camera, tuple[np.ndarray, np.ndarray, np.ndarray]]] = {}
         self._lock, self.ended = threading.Lock(), False
         """Whether the fit ends with an error: threads that still render get one, too."""
@@ -207,8 +200,7 @@ class Renders:
                 raise CancelledError
             if id(camera) in self._kept:  # a kept camera lives, so no other has its id
                 return self._kept[id(camera)][1]
-            gaussians, options = self._parts
-            r = rasterize(gaussians, camera, options)
+            r = rasterize(self.gaussians, camera, self.options)
             images = r.rgb.cpu().numpy(), r.depth.cpu().numpy(), r.alpha.cpu().numpy()
             if (size := sum(a.nbytes for a in images)) <= self._left:
                 self._left -= size

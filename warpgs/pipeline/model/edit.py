@@ -30,7 +30,7 @@ PROBES = 16
 
 @torch.no_grad()
 def coverage(gaussians: Gaussians, cameras: list[Camera], options: RasterizeOptions) -> tuple[torch.Tensor, torch.Tensor]:
-    """Render all views (tensors); return each Gaussian's largest blending weight [N], and how many views see it, int64 [N].
+    """Render all views; return each Gaussian's largest blending weight [N], and how many views see it, int64 [N].
 
     The largest weight is the score of RadSplat (arXiv 2403.13806); a sum of weights would be small for thin Gaussians. Rays end
     where less than `ALPHA_CUT` of the light is left, which no weight exceeds; so smaller weights may be too small.

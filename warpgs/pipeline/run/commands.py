@@ -40,7 +40,6 @@ from warpgs.pipeline.run.results import evaluate_run, over_region, protocol_of, 
 from warpgs.pipeline.train.schedule import color_of, over_background
 from warpgs.pipeline.train.settings import FitConfig
 from warpgs.pipeline.train.trainer import train_views
-from warpgs.pipeline.train.views import TrainingView
 from warpgs.priors.views import PriorConfig, view_priors
 from warpgs.process import Say, say, silent
 from warpgs.render.options import RasterizeOptions
@@ -135,12 +134,11 @@ def evaluate(
     stored, tell = open_run(folder, device), waiting()
     scene, train, test = scene_of(stored, reader, tell)
     request, names = stored.scene_request(reader), image_names(v.name for v in scene.views)
-    scored = (folder, stored.gaussians(), train, test, stored.options())
-    renders = Renders(stored.gaussians(), stored.options())
+    scored = (folder, Renders(stored.gaussians(), stored.options()), train, test)
     with hold_folder(folder, *IMAGE_FOLDERS) as held:
-        metrics = evaluate_run(*scored, lpips, names=names, renders=renders, tell=tell)
+        metrics = evaluate_run(*scored, lpips, names=names, tell=tell)
         if by_coverage and test:
-            metrics["coverage"] = coverage_of_run(*scored, names=names, renders=renders, tell=tell)
+            metrics["coverage"] = coverage_of_run(*scored, names=names, tell=tell)
         metrics |= {
             "protocol": protocol_of(scene, request.split, request.downscale, train, test),
             "config_hash": stored.record["config_hash"], "steps": stored.step,
@@ -257,10 +255,10 @@ def prune(
         tell(f"trying smaller models: number {next(tried)}, {len(gaussians):,} Gaussians, {len(rows)} views")
         return float(np.mean(psnrs[rows] - view_psnrs(gaussians, [train[i] for i in rows], options)))
 
-    cameras = [TrainingView.of(v, device).camera for v in train]
     # the changes of all images that would lower PSNR by this much if they had nothing to do with the errors
     values = np.array([v.image.size for v in train])
     first = float((values * 10 ** (-psnrs / 10)).sum()) * (10 ** (keep_psnr / 10) - 1)
+    cameras = [v.camera for v in train]
     made, lost = edit.prune_model(before, cameras, options, stored.record["config"]["seed"], loss, keep_psnr, first)
     tell("scoring the smaller model")
     degrees = [edit.stored_degrees(g.sh) for g in (before, made)]
@@ -334,7 +332,7 @@ def clean(
     _, train, test = scene_of(stored, reader, tell)
     tell("finding what would go")
     before, options = stored.gaussians(), stored.options()
-    reasons = reasons_of(before, coverage(before, [TrainingView.of(v, device).camera for v in train], options)[0])
+    reasons = reasons_of(before, coverage(before, [v.camera for v in train], options)[0])
     found = edit.first_reasons({name: reasons[name] for name in names if name in reasons})
     goes = edit.any_of(found.values(), before.logit_opacities)
     if (count := int(goes.sum())) in (0, len(goes)):
@@ -362,7 +360,6 @@ def clean(
 
 
 PLOT = "plot.png"
-CHOICES = {"--points": ("gaussians", "start"), "--color": ("own", "coverage"), "--background": ("white", "black")}
 """Values of the flags of a plot."""
 SIZES = (64, 8192)
 """Smallest and largest side of a plot [px]."""
@@ -387,11 +384,10 @@ def _points(cloud: PointCloud, device: torch.device) -> Gaussians:
 
 def _by_coverage(gaussians: Gaussians, train: list[Camera], options: RasterizeOptions) -> Gaussians:
     """Return Gaussians in the colours of `CLASSES`, by the number of training views that see them."""
-    like = gaussians.means.new_tensor
-    views = coverage(gaussians, [replace(c, viewmat=like(c.viewmat), K=like(c.K)) for c in train], options)[1].cpu().numpy()
+    views = coverage(gaussians, train, options)[1].cpu().numpy()
     palette = np.array([[int(color[i : i + 2], 16) / 255 for i in (1, 3, 5)] for _, _, color in CLASSES])
     colors = palette[np.searchsorted([least for least, _, _ in CLASSES], views, side="right") - 1]
-    return replace(gaussians, sh=like(base_coefficients(colors))[:, None])
+    return replace(gaussians, sh=gaussians.means.new_tensor(base_coefficients(colors))[:, None])
 
 
 def plot(
@@ -399,9 +395,6 @@ def plot(
     background: str = "white", size: tuple[int, int] = (1600, 1000), cameras: bool = True,
 ) -> list[str]:  # fmt: skip
     """Write a plot of a run as PNG, with the options of `warpgs plot`; returns lines for the user."""
-    for (name, known), value in zip(CHOICES.items(), (points, color, background)):
-        if value not in known:
-            raise UsageError(f"{name} {value}: give one of {', '.join(known)}")
     if not all(SIZES[0] <= s <= SIZES[1] for s in size):
         raise UsageError(f"--size {size[0]} {size[1]}: each side must have {SIZES[0]} to {SIZES[1]} px")
     start, by_coverage = points == "start", color == "coverage"
@@ -438,9 +431,6 @@ def plot(
     return [*held, *stored.notes(), f"{counts} in {out}"]
 
 
-SOURCES = ("sweep", "flow")
-
-
 def prior_sheet(view: View, prior: Prior) -> np.ndarray:
     """Return one sheet, [rows, columns, 3] in [0, 1]: image, the four maps, and the two scores computed from them."""
     disparity, *semantics = map(torch.from_numpy, (prior.disparity, prior.confidence, prior.boundary, prior.foreground))
@@ -464,8 +454,6 @@ def prior_sheet(view: View, prior: Prior) -> np.ndarray:
 
 def show_priors(request: SceneRequest, config: PriorConfig, source: str, out: Path, threads: int = 0) -> list[str]:
     """Write a sheet of the priors of each training view as PNG; ``source`` finds depth without a network. Returns lines."""
-    if source not in SOURCES:
-        raise UsageError(f"source {source!r} is not one of {', '.join(SOURCES)}")
     scene, split, notes = read_scene(request)
     views = [scene.view(name) for name in split.train]
     names = image_names(v.name for v in scene.views)

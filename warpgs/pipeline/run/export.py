@@ -59,10 +59,7 @@ def filtered(
     if cleaned if filters.clean is None else filters.clean:
         maxima = None
         if stored is not None:  # the largest blending weight of each Gaussian over the training views
-            model = stored.gaussians()
-            like = model.means.new_tensor
-            views = [replace(c, viewmat=like(c.viewmat), K=like(c.K)) for c in training_cameras(stored)]
-            maxima = edit.coverage(model, views, stored.options())[0]
+            maxima = edit.coverage(stored.gaussians(), training_cameras(stored), stored.options())[0]
         removed = edit.disturbing(gaussians, maxima)
         counts = {reason: int((where & keep).sum()) for reason, where in removed.items()}
         if words := [f"{count:,} {reason}" for reason, count in counts.items() if count]:
@@ -259,8 +256,6 @@ def mesh(
     check_suffix(target)
     device, _ = choose_device(device_name)
     run = open_run(folder, device)
-    if not run.train:
-        raise DataError(f"{folder}: the run has no training views, so coverage is unknown; fit again")
     cameras, scale, up = training_cameras(run), run.normalization.scale, upward(run)
     if options.voxel is not None:
         options = replace(options, voxel=options.voxel * scale)

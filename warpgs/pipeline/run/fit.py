@@ -577,12 +577,11 @@ def _finish(job: FitJob, trainer: Trainer, record: dict[str, Any], checks: list[
         job.notes += pose_tasks(job.out)
         if job.out is not None:
             write_json(job.out / METRICS_FILE, metrics)
-            options, record["notes"] = trainer.context.render_options(), job.notes
+            record["notes"] = job.notes
             with section("report"):
                 results.write_report(
-                    job.out, job.scene, job.split, trainer.gaussians, options, metrics, record,
-                    title=title_of(Path(job.scene.path), job.out), sampling=sampled.result, renders=renders,
-                    times=job.clock.seconds, tell=job.progress,
+                    job.out, job.scene, job.split, renders, metrics, record, title=title_of(Path(job.scene.path), job.out),
+                    sampling=sampled.result, times=job.clock.seconds, tell=job.progress,
                 )  # fmt: skip
             metrics["wall_seconds"] = job.clock.seconds()
             write_json(job.out / METRICS_FILE, metrics)  # again, with the time of the report
@@ -605,16 +604,15 @@ def _score(
     renders: Renders,
 ) -> dict[str, Any]:
     """Score the finished fit, with the ``given`` cameras from before it; returns the contents of metrics.json."""
-    c, scene, train, test, gaussians = job.config, job.scene, job.train, job.test, trainer.gaussians
+    c, scene, train, test, gaussians, options = job.config, job.scene, job.train, job.test, renders.gaussians, renders.options
     peak = {"peak_torch_bytes": torch.cuda.max_memory_allocated(job.device)} if job.device.type == "cuda" else {}
     names, learned = image_names(v.name for v in scene.views), trainer.learned
-    options, tell, compare = trainer.context.render_options(), job.progress, not job.other_models
-    scored = (job.out, gaussians, train, test, options)
+    tell, compare, scored = job.progress, not job.other_models, (job.out, renders, train, test)
     with ThreadPoolExecutor(1) as thread:
-        covered = test and compare and thread.submit(coverage_of_run, *scored, names=names, renders=renders)
+        covered = test and compare and thread.submit(coverage_of_run, *scored, names=names)
         try:
             with section("scoring"):
-                metrics = results.evaluate_run(*scored, job.lpips, names=names, renders=renders, tell=tell)
+                metrics = results.evaluate_run(*scored, job.lpips, names=names, tell=tell)
             if covered:
                 tell("checking coverage")
                 with section("coverage"):

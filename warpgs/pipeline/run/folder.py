@@ -17,10 +17,9 @@ import numpy as np
 import torch
 
 from warpgs import schema
-from warpgs.constants import K_TOLERANCE, POSE_TOLERANCE, RULES
+from warpgs.constants import RULES
 from warpgs.errors import DataError, NotFiniteError, UsageError, similar_folder
 from warpgs.files import is_empty, open_input, plain, tensor_pieces, tensors_of, unread_reason, write_bytes
-from warpgs.io.images import CHOICES
 from warpgs.io.load import Split
 from warpgs.kernels.cameras import check_camera
 from warpgs.locks import check_free, hold_folder
@@ -28,6 +27,7 @@ from warpgs.pipeline.model.table import SIMILARITY, FittedModel, checked_gaussia
 from warpgs.pipeline.run.request import FitRequest, SceneRequest, choose_device
 from warpgs.pipeline.train.settings import FitConfig, fingerprint, upgraded
 from warpgs.poses.find import JSON as POSES
+from warpgs.render.rasterize import check_arrays
 from warpgs.scene import Camera, Scene
 from warpgs.schema import SchemaError, fields, flag, items, mapping, number, one_of, or_null, real, text, whole
 from warpgs.version import __version__
@@ -59,7 +59,7 @@ _CAMERA = fields(
 _SCENE = fields(
     {"path": or_null(text)},
     {name: schema.of_type(hint) for name, hint in get_type_hints(SceneRequest).items() if name != "path"}
-    | {name: one_of(*choices) for name, choices in CHOICES.items()}
+    | {name: one_of(*choices) for name, choices in schema.rules_of(SceneRequest)}
     | {"downscale": whole(1)},
     others=False,
 )
@@ -217,22 +217,18 @@ def camera_values(camera: Camera) -> dict[str, Any]:
 
 def _cameras(stored: dict[str, Any], path: Path) -> dict[str, Camera]:
     """Return the cameras of a file, from `camera_values`, by name; DataError if `rasterize` would refuse one."""
-    found = {}
+    found, (least, most) = {}, FOCAL_LENGTHS
     for name, values in stored.items():
         arrays = {k: np.array(values[k], np.float64) for k in ("viewmat", "K", "distortion") if values.get(k) is not None}
         camera = found[name] = Camera(**(values | arrays))
-        pose, K, (least, most) = arrays["viewmat"], arrays["K"], FOCAL_LENGTHS
-        off = max(abs(K[0, 1]), abs(K[1, 0]), *np.abs(K[2] - (0, 0, 1)))
-        with np.errstate(over="ignore", invalid="ignore"):  # where products overflow, no comparison is true
-            rigid = np.abs(pose[:3, :3] @ pose[:3, :3].T - np.eye(3)).max() <= POSE_TOLERANCE
-        rigid &= np.abs(pose[3] - (0, 0, 0, 1)).max() <= POSE_TOLERANCE and np.abs(pose[:3, 3]).max() <= MAX_TRANSLATION
         try:
             check_camera(camera)
-            if not rigid:
-                raise UsageError(f"viewmat must be a rotation and a translation within {MAX_TRANSLATION:g}, above 0, 0, 0, 1")
-            if not (off <= K_TOLERANCE and all(least <= abs(f) <= most for f in (K[0, 0], K[1, 1]))):
-                raise UsageError(f"K must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], focal lengths {least:g} to {most:g}")
-        except UsageError as e:
+            check_arrays(camera)
+            if np.abs(camera.viewmat[:3, 3]).max() > MAX_TRANSLATION:
+                raise UsageError(f"viewmat must have a translation within {MAX_TRANSLATION:g}")
+            if not all(least <= abs(f) <= most for f in (camera.K[0, 0], camera.K[1, 1])):
+                raise UsageError(f"K must have focal lengths of {least:g} to {most:g}")
+        except (UsageError, ValueError) as e:
             raise DataError(f"{path}: incomplete or damaged: cameras.{name[:60]}: {e}; {RESTORE}") from e
     return found
 

@@ -26,7 +26,7 @@ from warpgs.mesh.views import MIN_ALPHA
 from warpgs.pipeline.films.paths import Rig, midways, rig_among
 from warpgs.pipeline.metrics.coverage import coverage_map, coverage_section, depth_views
 from warpgs.pipeline.metrics.lpips import Lpips
-from warpgs.pipeline.metrics.scores import Renders, baselines, psnr_of, render_view, score, summarize, variants
+from warpgs.pipeline.metrics.scores import Renders, baselines, psnr_of, score, summarize, variants
 from warpgs.pipeline.paper.scores import SUPPORT
 from warpgs.pipeline.train.loss import GIVEN_MIN_ALPHA
 from warpgs.pipeline.train.schedule import Phases
@@ -393,14 +393,12 @@ def protocol_of(scene: Scene, spec: str | None, downscale: int, train: list[View
 
 def evaluate_run(
     out: Path | None,
-    gaussians: Gaussians,
+    renders: Renders,
     train: list[View],
     test: list[View],
-    options: RasterizeOptions,
     lpips: Lpips | None = None,
     *,
     names: dict[str, str] | None = None,
-    renders: Renders | None = None,
     tell: Say = silent,
 ) -> dict[str, Any]:
     """Score held-out and training views, and save a render and depth map of each held-out (else training) view in ``out``."""
@@ -417,7 +415,7 @@ def evaluate_run(
 
     def jobs() -> Iterator[tuple[Any, ...]]:
         for view in counted([*test, *train], tell, "scoring", "views"):
-            image, depth, alpha = renders(view.camera) if renders else render_view(gaussians, view, options)
+            image, depth, alpha = renders(view.camera)
             yield save, "renders", view, beside, image, view.image
             yield save, "depth", view, depth_map, depth, alpha
             yield score, view, image, lpips if view.name in held_out else None, alpha
@@ -459,17 +457,15 @@ NEW_VIEWS = 8
 """Largest number of viewpoints from which the first image of the page is chosen."""
 
 
-def new_view(
-    rig: Rig, train: list[View], gaussians: Gaussians, options: RasterizeOptions, renders: Renders
-) -> list[tuple[np.ndarray, str]]:
+def new_view(rig: Rig, train: list[View], renders: Renders) -> list[tuple[np.ndarray, str]]:
     """Return the render midway between two training views that both show most of it, with its caption; empty without one."""
     best, picture = -1.0, []
     if not all(v.camera.model in CENTRAL for v in train):
         return []
     for i, j, camera in midways(rig, [v.camera for v in train], NEW_VIEWS):
         image, depth, alpha = renders(camera)
-        pair = depth_views(gaussians, [train[k].camera for k in (i, j)], options, [train[k].mask for k in (i, j)], renders)
-        surface = torch.from_numpy(np.where(alpha >= MIN_ALPHA, depth, 0)).to(gaussians.means.device)
+        pair = depth_views(renders, [train[k].camera for k in (i, j)], [train[k].mask for k in (i, j)])
+        surface = torch.from_numpy(np.where(alpha >= MIN_ALPHA, depth, 0)).to(renders.gaussians.means.device)
         covered = float((coverage_map(surface, camera, pair)[0] == 2).double().mean())
         if covered > best:
             best, picture = covered, [(image, f"a new viewpoint, between {train[i].name} and {train[j].name}")]
@@ -495,14 +491,12 @@ def write_report(
     out: Path,
     scene: Scene,
     split: Split,
-    gaussians: Gaussians,
-    options: RasterizeOptions,
+    renders: Renders,
     metrics: dict[str, Any],
     record: dict[str, Any],
     *,
     title: str,
     sampling: Callable[[], Section | None],
-    renders: Renders,
     times: Callable[[], dict[str, float]],
     tell: Say = silent,
 ) -> None:
@@ -510,15 +504,15 @@ def write_report(
     train, test = [scene.view(n) for n in split.train], [scene.view(n) for n in split.test]
     tell("making the report")
     cameras = [v.camera for v in train], [v.camera for v in test]
-    rig = rig_among(cameras[0], gaussians.means.detach().cpu().numpy().astype(np.float64))
+    rig = rig_among(cameras[0], renders.gaussians.means.detach().cpu().numpy().astype(np.float64))
     covered, shown = None, evenly_spaced(test or train, SHOWN_VIEWS)
     with ThreadPoolExecutor() as threads:  # images are encoded while others are rendered
         threads.submit(import_module, "jinja2")  # takes a tenth of a second, at the end
         if "coverage" in metrics:
             names = image_names(v.name for v in scene.views)
             covered = threads.submit(coverage_section, out, metrics["coverage"], [v.name for v in shown], names)
-        opening = new_view(rig, train, gaussians, options, renders)
-        overview = render_overview(gaussians, options, *cameras, rig.up)
+        opening = new_view(rig, train, renders)
+        overview = render_overview(renders.gaussians, renders.options, *cameras, rig.up)
         if overview is not None:
             opening.append((overview, "the Gaussians, training cameras teal" + ", held-out cameras orange" * bool(test)))
         pictures = [(threads.submit(webp, image), words) for image, words in opening]

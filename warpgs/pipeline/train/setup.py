@@ -17,7 +17,7 @@ from warpgs.pipeline.train.loss import LossTerm, built_in_terms, maps_of
 from warpgs.pipeline.train.settings import FitConfig
 from warpgs.pipeline.train.strategies.base import find_strategy
 from warpgs.pipeline.train.views import TrainingView, there, with_alpha
-from warpgs.priors.given_depth import any_given, check_given, lens_depth, pinhole_view, with_given_depth
+from warpgs.priors.given_depth import any_given, lens_depth, pinhole_view, with_given_depth
 from warpgs.priors.views import view_priors
 from warpgs.process import Detail, Say, silent
 from warpgs.scene import GivenDepth, PointCloud, Prior, View
@@ -36,7 +36,6 @@ def prepare(
         check_camera(view.camera)
     _check_models(train, config)  # before anything takes time
     check_points(train, points, config.init)
-    check_given(train)
     where = device if config.memory_limit is None else torch.device("cpu")
 
     def usable() -> torch.device:

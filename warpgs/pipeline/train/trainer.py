@@ -155,8 +155,6 @@ class Trainer:
         lines on the work before the first step. A fit has the same bits for any number of ``ranks``, which share the views of a
         step.
         """
-        if not train:
-            raise DataError("there is no training view; leave at least one in --split")
         for module in config.view_modules:
             module.check(train)
         train = in_threads(without_masked, train)  # so that no pixel under a mask has an influence

@@ -7,10 +7,10 @@ import sys
 import textwrap
 import time
 from collections import Counter, defaultdict
-from dataclasses import dataclass
 from typing import Any
 
 from warpgs.device import format_bytes
+from warpgs.pipeline.farm.job import JobRecord
 from warpgs.process import careful, printable, say
 from warpgs.report.page import rendered
 from warpgs.report.progress import PLAIN_INTERVAL, duration, is_live, waiting
@@ -23,36 +23,10 @@ MOST_RUNNING = 12
 """Largest number of rows for running jobs."""
 
 
-@dataclass(frozen=True)
-class JobRow:
-    """A row of the table: one job."""
-
-    name: str
-    state: str
-    """waiting, running, elsewhere (in another process), done or failed."""
-    step: int = 0
-    """Steps done; 0 if unknown."""
-    seconds: float = 0.0
-    """Time that the job has taken [s]."""
-    psnr: float | None = None
-    """Mean PSNR over held-out views [dB]."""
-    gaussians: int = 0
-    message: str = ""
-    """Reason of a failure, or a note."""
-    ssim: float | None = None
-    """Mean SSIM over held-out views."""
-    ply_bytes: int = 0
-    """Size of the PLY file."""
-    thumbnail: str = ""
-    """Path of the job's image, relative to the page; empty without one."""
-    report: str = ""
-    """Path of the job's report, relative to the page; empty without one."""
-
-
-def row_values(row: JobRow) -> tuple[str, ...]:
+def row_values(row: JobRecord) -> tuple[str, ...]:
     """Return the cells of a row: name, state, steps, time, PSNR, Gaussians, message."""
     return (
-        row.name, row.state, f"{row.step:,}" if row.step else "", duration(row.seconds) if row.seconds else "",
+        row.name, row.state, f"{row.steps:,}" if row.steps else "", duration(row.seconds) if row.seconds else "",
         "" if row.psnr is None else f"{row.psnr:.2f} dB", f"{row.gaussians:,}" if row.gaussians else "", row.message,
     )  # fmt: skip
 
@@ -64,9 +38,9 @@ class FarmTable:
         """Prepare; ``live`` None shows the table only in a terminal."""
         self.live = is_live() if live is None else live
         self.began = self.printed = time.monotonic()
-        self.rows: list[JobRow] = []
+        self.rows: list[JobRecord] = []
         self.left: float | None = None
-        self.ended: dict[str, JobRow] = {}
+        self.ended: dict[str, JobRecord] = {}
         self.display: Any = None
 
     def __enter__(self) -> FarmTable:
@@ -88,7 +62,7 @@ class FarmTable:
         elif error[0] is not None:
             say(self.summary())
 
-    def update(self, rows: list[JobRow], left: float | None) -> None:
+    def update(self, rows: list[JobRecord], left: float | None) -> None:
         """Show the jobs, and the time left [s] where it is known."""
         ended = [r for r in rows if r.state in ("done", "failed") and r.name not in self.ended]
         self.ended |= {r.name: r for r in ended}
@@ -136,7 +110,7 @@ SHORT = 120
 """Largest number of letters of a message on a card; the table of failures shows the whole message."""
 
 
-def _facts(row: JobRow) -> str:
+def _facts(row: JobRecord) -> str:
     """Return a card's text: scores and sizes, the message of a failure, or the state."""
     _, _, _, seconds, psnr, gaussians, message = row_values(row)
     failed = row.state == "failed"
@@ -148,7 +122,7 @@ def _facts(row: JobRow) -> str:
     return ", ".join(filter(None, facts)) or row.state
 
 
-def _failures(rows: list[JobRow]) -> list[tuple[str, list[str]]]:
+def _failures(rows: list[JobRecord]) -> list[tuple[str, list[str]]]:
     """Return each message of failed jobs with the names of the jobs, the most frequent first."""
     by_message: dict[str, list[str]] = defaultdict(list)
     for row in rows:
@@ -157,8 +131,13 @@ def _failures(rows: list[JobRow]) -> list[tuple[str, list[str]]]:
     return sorted(by_message.items(), key=lambda item: -len(item[1]))
 
 
-def farm_page(title: str, rows: list[JobRow], seconds: float) -> str:
+Card = tuple[JobRecord, str, str]
+"""A job, and the paths of its image and its report, relative to the page; empty without one."""
+
+
+def farm_page(title: str, cards: list[Card], seconds: float) -> str:
     """Return the page of a farm, with its jobs in the order given, ``seconds`` after it began."""
+    rows = [row for row, _, _ in cards]
     states = Counter(r.state for r in rows)
     scores = [r.psnr for r in rows if r.psnr is not None]
     figures = [
@@ -168,5 +147,5 @@ def farm_page(title: str, rows: list[JobRow], seconds: float) -> str:
     ]  # fmt: skip
     left = len(rows) - states["done"] - states["failed"]
     line = f"{left:,} jobs are not done yet; load the page again later." if left else "All jobs have ended."
-    cards = [(r, _facts(r)) for r in rows]
-    return rendered("farm.html", title=title, line=line, figures=figures, failures=_failures(rows), cards=cards)
+    given = [(row, _facts(row), *paths) for row, *paths in cards]
+    return rendered("farm.html", title=title, line=line, figures=figures, failures=_failures(rows), cards=given)
