@@ -188,6 +188,6 @@ def parts() -> dict[str, str]:
         "rasterizers": rasterizers_page.times_table(beside) + _sources("rasterizers", others),
         "steps": rasterizers_page.steps_table(next(iter(steps.values()))) + _sources("training_steps", steps),
         "whole fits": fits_table(turns) + _sources("turns", turns),
-        "time to score": score_times.table(next(iter(times.values()))["rows"], (3.0, 0.0)) + _sources("time_to_score", times),
+        "time to score": score_times.table(next(iter(times.values()))["rows"]) + _sources("time_to_score", times),
         "ops": ops_table(ops),
     }

@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from bench.lib import result_file
 from bench.lib.arms import SCORES
 from bench.lib.preset_table import by_seed
-from bench.lib.scenes import ROWS
 from bench.lib.tables import markdown, mean_sd
 from warpgs.pipeline.study.tables import family_confidence, paired_difference
 
@@ -93,10 +92,9 @@ def views() -> str:
     for name, (scene, count) in CAPTURES.items():
         rows = [list(found.get((name, preset), {}).values()) for preset in PRESETS]
         cells = (_scores(r) if r else "" for r in rows)
-        body.append([f"{scene}, {count}", f"`{ROWS[name].split}`", *cells])
-    heads = [*(f"`{p}`" for p in PRESETS[:-1]), f"gsplat {others['versions']['gsplat']}"]
-    head = ["scene, views", "split", *heads]
-    return markdown(head, body, head[:2]) + own_source + source
+        body.append([f"{scene}, {count}", *cells])
+    head = ["scene, views", *(f"`{p}`" for p in PRESETS[:-1]), f"gsplat {others['versions']['gsplat']}"]
+    return table(head, body) + own_source + source
 
 
 def untouched() -> str:
