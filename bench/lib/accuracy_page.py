@@ -35,11 +35,12 @@ def _most(rows: list[dict]) -> str:
 
 
 def budget_text(results: dict[str, dict]) -> str:
-    """Return a table of the first machine, images and gradients by scene under `exact`, and a sentence on each machine."""
+    """Return a table of the first machine, images and gradients by scene under `exact`, and whether each meets the limits."""
     parts = []
     for stem, result in results.items():
         kept = "All limits are met." if not result["broken"] else "Broken: " + "; ".join(result["broken"]) + "."
-        parts.append(f"{_machine(stem, result)} {kept} {_most(result['rows'])} All: `bench/results/budget_{stem}.json`.\n")
+        most = "" if parts else f" {_most(result['rows'])}"
+        parts.append(f"{_machine(stem, result)} {kept}{most} All: `bench/results/budget_{stem}.json`.\n")
         if len(parts) > 1:
             continue
         lines = []
