@@ -4,6 +4,7 @@ import gc
 import os
 import re
 import sys
+from pathlib import Path
 
 if "PYTEST_XDIST_WORKER" in os.environ:
     os.environ["OMP_NUM_THREADS"] = "1"  # workers share the cores; tests that are about threads set their number
@@ -89,6 +90,31 @@ def demo(tmp_path_factory):
     folder = tmp_path_factory.mktemp("demo") / "still"
     write_demo(folder, views=8, width=48, height=36)
     return folder
+
+
+@pytest.fixture(scope="session")
+def scene(tmp_path_factory):
+    """Folder of a scene of nine photographs of 64 x 48 px, which no test changes."""
+    from warpgs.synthetic.demo import write_demo
+
+    folder = tmp_path_factory.mktemp("nine") / "scene"
+    write_demo(folder, views=9, width=64, height=48)
+    return folder
+
+
+@pytest.fixture
+def heeding() -> list[str]:
+    """Beginning of a command that heeds Ctrl-C, also in tests in the background, where a shell has it ignored."""
+    code = "import signal, sys; signal.signal(2, signal.default_int_handler); from warpgs.app.cli import main; sys.exit(main())"
+    return [sys.executable, "-c", code]
+
+
+@pytest.fixture
+def own_file(tmp_path):
+    """Write a user's Python file below the test's folder; its modules are forgotten afterwards."""
+    yield lambda name, text: (tmp_path / name).write_text(text) and tmp_path / name
+    for name in [n for n, m in sys.modules.items() if Path(getattr(m, "__file__", None) or "/").parent == tmp_path]:
+        del sys.modules[name]
 
 
 @pytest.fixture(autouse=True, scope="session")

@@ -151,7 +151,6 @@ def hand_made(device: str) -> dict:
 def test_performance_tables_hold_the_results():
     """Tables, fractions of the roof; charts are well-formed; the same results give the same bytes."""
     results = {"a": hand_made("cpu"), "b": hand_made("cuda")}
-    assert "| 100,000, 504 x 378 | 2 cores |  | 100 |  |" in performance_page.sizes_table(results)
     assert "| render both | 100 | 25 | 100 | 25 |" in performance_page.ops_table(results)
     svgs = performance_page.plots(results)
     assert svgs == performance_page.plots(json.loads(json.dumps(dict(reversed(results.items())))))

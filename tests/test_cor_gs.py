@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from tests.pipeline.train.fits import advanced
 from tests.scenes import photos, seeds
 from warpgs import rasterize
 from warpgs.errors import UsageError
@@ -58,12 +59,6 @@ def fit(module, steps: int = 12, views: int = 3, gradient: float = 1e-5, **own) 
         strategy_config=module.CorConfig(**({"every": 6} | own)),
     )  # fmt: skip
     return Trainer(photos(views), seeds(), config, CPU)
-
-
-def advanced(trainer: Trainer, until: int) -> Trainer:
-    while trainer.step < until:
-        trainer.advance()
-    return trainer
 
 
 def test_a_continued_fit_equals_an_uninterrupted_one(module):

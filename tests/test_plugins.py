@@ -43,14 +43,10 @@ def registry(registries_as_they_were) -> Registry:
 
 
 @pytest.fixture
-def own(tmp_path, monkeypatch):
+def own(tmp_path, monkeypatch, own_file):
     """A user's file, importable as a module too; it leaves a mark each time that it runs."""
-    path = tmp_path / "own_strategy.py"
-    path.write_text(OWN)
     monkeypatch.syspath_prepend(tmp_path)
-    yield path
-    for name in [n for n, m in sys.modules.items() if getattr(m, "__file__", None) == str(path)]:
-        del sys.modules[name]
+    return own_file("own_strategy.py", OWN)
 
 
 def test_registered_classes_are_found_by_name(registry):

@@ -94,8 +94,8 @@ def test_the_table_names_the_first_stage_that_differs():
     changed = stages | {"torch.exp": "0", "3dgs: last PLY": "0", "quick: last PLY": "0"}
     rows = [row("x", stages), row("x", changed, "cuda"), row("y", changed)]
     lines = same_bits.table(rows).splitlines()[2:]
-    assert [line.split(" | ")[-2:] for line in lines[:2]] == [["none", "none |"]] * 2
-    assert lines[2].endswith("| torch.exp | 3dgs: last PLY |")
+    assert [line.split(" | ")[-2:] for line in lines[:2]] == [["0", "none |"]] * 2
+    assert lines[2].endswith("| 1 | 3dgs: last PLY |")
     # one of another label, kind of device or size of the scene is added
     rows = [row("x", {"a": "0"}), row("y", {"a": "0"})]
     assert same_bits.placed(rows, row("x", {"a": "1"})) == [row("x", {"a": "1"}), rows[1]]

@@ -34,7 +34,6 @@ LEFT_OUT = (
     (r"warpgs .*--device cuda\b", "GPU"),
     (r"torchrun ", "several GPUs"),
     (r"make (demo|test|install)\b", "the workflow test runs it"),
-    (r'pip install "\$\(ls dist', "the workflow test installs a wheel"),
     (r"(python3 -m venv|source .*activate|pip install '?(\.|torch)|git clone)", "installing, which --install runs"),
 )
 """Patterns of lines that are left out, with reasons."""

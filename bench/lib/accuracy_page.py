@@ -5,9 +5,6 @@ from __future__ import annotations
 from bench.lib import result_file, same_bits
 from bench.lib.tables import markdown
 
-RENAMED = {"gsplat": "gsplat-1.5"}
-"""Current names of rules that had other names when results were stored."""
-
 
 def _e(value: float) -> str:
     return f"{value:.1e}" if value else "0"
@@ -38,19 +35,18 @@ def _most(rows: list[dict]) -> str:
 
 
 def budget_text(results: dict[str, dict]) -> str:
-    """Return a table of the first machine, images and gradients by scene, and a sentence on each machine."""
+    """Return a table of the first machine, images and gradients by scene under `exact`, and whether each meets the limits."""
     parts = []
     for stem, result in results.items():
         kept = "All limits are met." if not result["broken"] else "Broken: " + "; ".join(result["broken"]) + "."
-        parts.append(f"{_machine(stem, result)} {kept} {_most(result['rows'])} All: `bench/results/budget_{stem}.json`.\n")
+        most = "" if parts else f" {_most(result['rows'])}"
+        parts.append(f"{_machine(stem, result)} {kept}{most} All: `bench/results/budget_{stem}.json`.\n")
         if len(parts) > 1:
             continue
         lines = []
-        for row in result["rows"]:
-            rule = RENAMED.get(row["rule"], row["rule"])
-            name = row["scene"] + ("" if rule == "exact" else f", `{rule}`")
+        for row in (r for r in result["rows"] if r["rule"] == "exact"):
             both = _worst(row)
-            lines.append([name, *(_e(both[k]) for k in ("E mean", "E max", "P32 max", "A max", "rel L2"))])
+            lines.append([row["scene"], *(_e(both[k]) for k in ("E mean", "E max", "P32 max", "A max", "rel L2"))])
         parts.append(markdown(["scene", "image: mean E", "max E", "max P32", "max A", "gradient: relative L2"], lines))
     return "\n".join(parts)
 

@@ -19,7 +19,6 @@ PARTS: dict[str, Callable[[], dict[str, str]]] = {
         "ablation": results_page.ablation(),
         "views": results_page.views(),
         "untouched": results_page.untouched(),
-        "rivals": rivals_page.rivals(),
         "papers": rivals_page.papers(),
         "reruns": rivals_page.reruns(),
         "dtu": rivals_page.dtu(),

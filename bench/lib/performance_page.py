@@ -6,7 +6,7 @@ import statistics
 
 from bench.lib import rasterizers_page, result_file, score_times
 from bench.lib.plot import Line, Panel, chart
-from bench.lib.points import BASE, SIZES, Point, Series, along, diagonal, tasks
+from bench.lib.points import BASE, Point, Series, along, diagonal, tasks
 from bench.lib.tables import figure, markdown
 from bench.lib.timing import DISTURBED, OURS
 
@@ -16,28 +16,10 @@ COLORS = {
 }  # fmt: skip
 WORDS = ("op", "direction", "machine", "Gaussians, image", "capture")
 """Columns that hold words."""
-POINTS = (Point(100_000), Point(1_000_000), Point(1_000_000, 1920, 1080))
-"""Sizes of the table of renders and training steps."""
-WHOLE = (("render", "forward"), ("render", "both"), ("step", "step"))
-"""Ops and directions of that table."""
 
 
 def _sources(kind: str, results: dict[str, dict]) -> str:
     return "\n" + "\n".join(result_file.source(f"{kind}_{stem}") for stem in results)
-
-
-def _sizes(row: dict, names: list[str]) -> list[str]:
-    cells = []
-    for name in names:
-        if name == "image":
-            cells.append(f"{row['width']} x {row['height']}" if "width" in row else "")
-        else:
-            cells.append(f"{row[name]:,}" if name in row else "")
-    return cells
-
-
-def _key(row: dict) -> tuple:
-    return tuple(row.get(s, 0) for s in SIZES)
 
 
 def _timing(row: dict | None) -> str:
@@ -61,19 +43,6 @@ def _find(result: dict, task: tuple[str, str, str], point: Point) -> dict | None
     """Return the row of a task (op, program, direction) at a point."""
     rows = (r for r in result["rows"] if (r["op"], r["program"], r["direction"]) == task)
     return next((r for r in rows if _plain(r) and _at(r, point)), None)
-
-
-def sizes_table(results: dict[str, dict]) -> str:
-    """Return times of rendering and training steps by size and machine."""
-    body = []
-    for point in POINTS:
-        for result in results.values():
-            rows = [_find(result, (op, OURS, direction), point) for op, direction in WHOLE]
-            if any(rows):
-                size = f"{point.count:,}, {point.width} x {point.height}"
-                body.append([size, result_file.machine_name(result), *map(_timing, rows)])
-    head = ["Gaussians, image", "machine", "render [ms]", "with gradients [ms]", "training step [ms]"]
-    return markdown(head, body, WORDS)
 
 
 def fits_table(results: dict[str, dict]) -> str:
@@ -182,12 +151,11 @@ def parts() -> dict[str, str]:
     """Return the generated parts of docs/performance.md by name."""
     ops, others, steps, turns = (result_file.stored(kind) for kind in ("ops", "rasterizers", "training_steps", "turns"))
     times = result_file.stored("time_to_score")
-    sources, beside = _sources("ops", ops), next(iter(others.values()))
+    beside = next(iter(others.values()))
     return {
-        "sizes": sizes_table(ops) + sources,
         "rasterizers": rasterizers_page.times_table(beside) + _sources("rasterizers", others),
         "steps": rasterizers_page.steps_table(next(iter(steps.values()))) + _sources("training_steps", steps),
         "whole fits": fits_table(turns) + _sources("turns", turns),
-        "time to score": score_times.table(next(iter(times.values()))["rows"], (3.0, 0.0)) + _sources("time_to_score", times),
-        "ops": ops_table(ops),
+        "time to score": score_times.table(next(iter(times.values()))["rows"]) + _sources("time_to_score", times),
+        "ops": ops_table(ops) + _sources("ops", ops),
     }

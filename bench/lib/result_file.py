@@ -110,7 +110,7 @@ def machine_name(values: dict) -> str:
 
 
 def source(name: str) -> str:
-    """Return a line on a kept result for the pages: file, machine, commit, command without its output, note."""
+    """Return a line on a kept result for the pages: file, machine, commit, command without its output, if it has a note."""
     values = read(FOLDER / f"{name}.json")
     machine = machine_name(values)
     if values["machine"]["device"] == "cpu":
@@ -119,7 +119,7 @@ def source(name: str) -> str:
     fence = "``" if "`" in command else "`"
     ran = f"{fence}{command}{fence}" if command else "command not kept"
     commit = values.get("commits", {}).get("new") or values["commit"] or "not kept"
-    note = f" {values['note']}" if values.get("note") else ""
+    note = " More: its `note`." if values.get("note") else ""
     return f"Source: `{name}.json`; {machine}; commit {commit}; {ran}.{note}\n"
 
 

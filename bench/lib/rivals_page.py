@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from bench.lib import result_file
-from bench.lib.arms import DTU, LADDER, PAPERS, RERUNS, RIVALS, Arm, chosen_steps
+from bench.lib.arms import DTU, LADDER, PAPERS, RERUNS, Arm, chosen_steps
 from bench.lib.preset_table import by_seed
 from bench.lib.scenes import ROWS, row_of
 from bench.lib.tables import markdown
@@ -90,11 +90,6 @@ def _page_table(name: str, arms: Sequence[Arm], above: bool, command: str = "", 
         tables.append(result_file.source(f"{name}_{machine}"))
     command = command or f"--rows fern:3 horns:3 --set {name}"
     return "\n".join(tables) or f"Not measured yet: `python -m bench.fits.rivals DATA {command} --out FILE`.\n"
-
-
-def rivals() -> str:
-    """Return the table of gsplat's trainer with more steps."""
-    return _page_table("rivals", (RIVALS[0], RIVALS[5], RIVALS[7]), above=False)
 
 
 def papers() -> str:

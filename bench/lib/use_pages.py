@@ -67,20 +67,19 @@ def formats() -> str:
 
 
 def programs() -> str:
-    """Return the table of other programs: formats in both directions, largest differences in steps, and exceptions."""
+    """Return the largest difference in steps, and the table of other programs: formats in both directions, exceptions."""
     result, source = _result("third_party")
-    body = []
+    body, steps = [], []
     for program in (name for name, state in result["programs"].items() if not state.startswith("not run")):
         cells, exceptions = [program], {}
         for way in ("to", "from"):
             rows = [r for r in result["rows"] if (r["program"], r["direction"]) == (program, way) and r["scene"] != "files"]
             names = [re.sub(r"^(m|v\d)(?=\.)", "", r["format"]) for r in rows]
-            steps = [d / (r["steps"][k] or 1) for r in rows if r["verdict"] == "same" for k, d in r["largest"].items()]
-            same = dict.fromkeys(f"`{n}`" for n, r in zip(names, rows) if r["verdict"] == "same")
-            cells += [", ".join(same), f"{max(steps):.2g}" if steps else ""]
+            steps += [d / (r["steps"][k] or 1) for r in rows if r["verdict"] == "same" for k, d in r["largest"].items()]
+            cells.append(", ".join(dict.fromkeys(f"`{n}`" for n, r in zip(names, rows) if r["verdict"] == "same")))
             for n, r in zip(names, rows):
                 if r["verdict"] != "same":
                     exceptions.setdefault(r["verdict"], {})[f"`{r['format'] if 'read' in r['verdict'] else n}`"] = None
         body.append([*cells, "; ".join(f"{', '.join(n)} {verdict}" for verdict, n in exceptions.items())])
-    head = ["program", "reads", "steps", "writes", "steps ", "exceptions"]
-    return markdown(head, body, ("program", "reads", "writes", "exceptions")) + source
+    head = ["program", "reads", "writes", "exceptions"]
+    return f"Largest difference to what warpgs reads: {max(steps):.2g} step.\n\n" + markdown(head, body, head) + source

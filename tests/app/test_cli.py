@@ -35,14 +35,7 @@ from warpgs.pipeline.train.settings import FitConfig
 from warpgs.pipeline.train.strategies.base import STRATEGIES, Strategy
 from warpgs.pipeline.train.view_modules import VIEW_MODULES
 from warpgs.report import progress
-from warpgs.synthetic.demo import split_spec, write_demo
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("data") / "scene"
-    write_demo(folder, views=9, width=64, height=48)
-    return folder
+from warpgs.synthetic.demo import split_spec
 
 
 @pytest.fixture(scope="module")

@@ -726,16 +726,11 @@ class Written(Format):
 
 
 @pytest.fixture
-def own(tmp_path, monkeypatch):
-    """The file, which is forgotten after the test."""
+def own(tmp_path, monkeypatch, own_file):
     FORMATS.names()
     monkeypatch.setattr(FORMATS, "_classes", dict(FORMATS._classes))
-    path = tmp_path / "mine.py"
-    path.write_text(OWN)
     write_gaussians(tmp_path / "a.ply", cloud(40), units="file")
-    yield path
-    for name in [n for n, m in sys.modules.items() if getattr(m, "__file__", None) == str(path)]:
-        del sys.modules[name]
+    return own_file("mine.py", OWN)
 
 
 def test_one_file_adds_a_format(own, tmp_path, capsys):

@@ -62,14 +62,15 @@ def all_targets() -> dict[str, Target]:
     return TARGETS
 
 
-def _codes(thing: object) -> Iterator[types.CodeType]:
+def codes_of(thing: object) -> Iterator[types.CodeType]:
+    """Yield the code of a module's, class's or function's own functions."""
     if isinstance(thing, types.ModuleType):
         own = (v for v in vars(thing).values() if getattr(v, "__module__", None) == thing.__name__)
         for value in own:
-            yield from _codes(value)
+            yield from codes_of(value)
     elif isinstance(thing, type):
         for value in vars(thing).values():
-            yield from _codes(getattr(value, "__func__", getattr(value, "fget", value)))
+            yield from codes_of(getattr(value, "__func__", getattr(value, "fget", value)))
     elif callable(thing) and hasattr(inner := getattr(thing, "__wrapped__", thing), "__code__"):
         yield inner.__code__
     elif isinstance(thing, types.CodeType):
@@ -80,7 +81,7 @@ def parser_lines(target: Target) -> dict[str, set[int]]:
     """Return the numbers of the lines that can run in a reader's parser, by file."""
     lines: dict[str, set[int]] = {}
     names = {inspect.getfile(inspect.unwrap(p)) for p in target.parser}
-    stack = [code for part in target.parser for code in _codes(part)]
+    stack = [code for part in target.parser for code in codes_of(part)]
     while stack:
         code = stack.pop()
         stack += [c for c in code.co_consts if isinstance(c, types.CodeType)]

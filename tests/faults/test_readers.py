@@ -1,6 +1,8 @@
 """Readers of foreign files under the fuzzer: all are there, all understand or refuse, within bounds of time and memory."""
 
 import ast
+import contextlib
+import functools
 import os
 import sys
 import threading
@@ -14,7 +16,7 @@ import warpgs
 from tests.faults import bounds
 from tests.faults.bounds import size_of
 from tests.faults.fuzz import JUDGED, Tally, Worker, fuzz, missed, shallow, shares, table
-from tests.faults.targets import Target, all_targets, parser_lines
+from tests.faults.targets import Target, all_targets, codes_of, parser_lines
 from warpgs.errors import DataError
 from warpgs.pipeline.metrics import lpips
 
@@ -23,17 +25,6 @@ FEW, ENOUGH = 10_000, 50_000
 """Numbers of inputs from which on the share past the first check is judged, and the lines reached."""
 SEED = int(os.environ.get("FUZZ_SEED", "29100"))
 NAMES = sorted(all_targets())
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_a_few_damaged_files(name, tmp_path, monkeypatch):
-    monkeypatch.setattr(lpips, "NETS", dict(lpips.NETS))  # the reader of weights is given a small network
-    worker = Worker(all_targets()[name], seed=1, folder=tmp_path)
-    count = max(1, round(12 * all_targets()[name].share))
-    for index in range(count):
-        worker.run(index)
-    assert not worker.tally.failures
-    assert worker.tally.accepted + worker.tally.refused == worker.tally.inputs == count
 
 
 @pytest.mark.fault
@@ -80,60 +71,12 @@ PARSING = {
 }
 """The same with their modules."""
 
-READERS = {
-    "export/base.py": {"reading": "splat", "Format.origin_in": "origin"},
-    "export/ply.py": {"_read": "ply"},
-    "export/gltf.py": {"_split": "glTF"},
-    "export/sog.py": {
-        "_members": "SOG",
-        "_member": "SOG",
-        "_meta": "SOG",
-        "_pixels": "SOG",
-        "_beside": "SOG folder",
-    },
-    "io/transforms.py": {"_json": "cameras"},
-    "io/colmap.py": {
-        "_BinaryFile.__init__": "colmap",
-        "_lines": "colmap",
-        "read_ply_points": "colmap",
-        "origin_stated": "cameras",
-    },
-    "io/image_files.py": {"_raster": "any image", "read_image_file": "any image"},
-    "io/capture.py": {
-        "CaptureReader.files": "metashape",
-        "_xml": "metashape",
-        "RealityScanReader.rows": "realityscan",
-    },
-    "io/others.py": {"_read_matrices": "dtu", "read_camera_rows": "middlebury"},
-    "io/maps.py": {"mapped_array": "given maps", "array_numbers": "given maps"},
-    "pipeline/farm/work.py": {"_scores": "scores", "write_thumbnail": "render of a job"},
-    "pipeline/farm/job.py": {"_read": "list of jobs", "read_job_record": "record of a job"},
-    "pipeline/films/paths.py": {"read_keyframes": "keyframes"},
-    "pipeline/metrics/lpips.py": {
-        "_check_unpacked": "LPIPS state dict",
-        "_read_state": "LPIPS state dict",
-        "read_lpips": "LPIPS weights",
-    },
-    "pipeline/model/edit.py": {"_box_of_file": "crop box", "box_of": "crop box"},
-    "pipeline/model/table.py": {"load": "model file"},
-    "pipeline/run/folder.py": {"load_checkpoint": "checkpoint", "read_record": "run record"},
-    "pipeline/train/presets.py": {"_read": "preset"},
-    "poses/photographs.py": {
-        "_coded_again": "heic",
-        "to_jpeg": "heic by its process",
-        "_check_container": "video",
-        "_frames": "video",
-    },
-    "poses/find.py": {"read_poses_record": "record of poses"},
-    "priors/networks.py": {"MapCache._read": "stored maps", "read_side_file": "description of a network"},
-    "priors/flow.py": {"read_flo": "flow"},
-    "report/progress.py": {"read_events": "events"},
-    "locks.py": {"_signed": "signature of a lock"},
-    "onnx.py": {"read_model": "network", "start_session": "network"},
-    "schema.py": {"parse": "scores", "read": "scores"},
-    "viewer/server.py": {"read_frame": "frame of a websocket"},
-}
-"""Name of the fuzzer's reader by file and function."""
+UNLISTED = (
+    ("export/base.py", "reading", "splat"), ("export/sog.py", "_members", "SOG"), ("export/sog.py", "_meta", "SOG"),
+    ("io/image_files.py", "read_image_file", "any image"), ("poses/photographs.py", "_check_container", "video"),
+    ("pipeline/metrics/lpips.py", "_check_unpacked", "LPIPS state dict"),
+)  # fmt: skip
+"""Functions that a reader of the fuzzer calls, but does not name as its parser: file, function, reader."""
 
 OWN = "reads what this process wrote just before"
 PIPE = "reads lines of a process that warpgs started, by a pipe that nobody else writes to"
@@ -198,36 +141,56 @@ def opening(node: ast.AST, where: str = "", inside: bool = False) -> Iterator[st
         yield from opening(child, where, inside)
 
 
-def test_every_reader_is_fuzzed_or_has_a_reason():
-    """Else add a reader to a module of tests/faults, and name it here; a name left over would hide the next such function."""
+@functools.cache
+def openings() -> set[tuple[str, str]]:
+    """Return the file and name of each function of the package that opens or parses input."""
     files = {p.relative_to(PACKAGE).as_posix(): ast.parse(p.read_text("utf-8")) for p in PACKAGE.rglob("*.py")}
-    found = {(f, function) for f, tree in files.items() for function in opening(tree)}
-    named = {(f, n) for table in (READERS, REASONS) for f, names in table.items() for n in names}
-    assert found == named
-    assert {n for names in READERS.values() for n in names.values()} <= set(all_targets())
+    return {(f, function) for f, tree in files.items() for function in opening(tree)}
 
 
-BY_TARGET = {t: [(f, n) for f, names in READERS.items() for n, of in names.items() if of == t] for t in all_targets()}
+def parsing(name: str) -> set[tuple[str, str]]:
+    """Return the functions among `openings` that a reader of the fuzzer stands for."""
+    codes = (code for part in all_targets()[name].parser for code in codes_of(part))
+    found = {(code.co_filename.removeprefix(f"{PACKAGE.as_posix()}/"), code.co_qualname) for code in codes}
+    return openings() & found | {(file, function) for file, function, reader in UNLISTED if reader == name}
 
 
-@pytest.mark.parametrize("target", [t for t, functions in BY_TARGET.items() if functions])
-def test_the_fuzzer_calls_the_reader(target, tmp_path, monkeypatch):
-    """The valid files of a target go through the functions that it stands for."""
-    monkeypatch.setattr(lpips, "NETS", dict(lpips.NETS))
+def test_every_reader_is_fuzzed_or_has_a_reason():
+    """Else add a reader to a module of tests/faults, or its reason here; a name left over would hide the next such function."""
+    assert openings() - set().union(*map(parsing, NAMES)) == {(f, n) for f, names in REASONS.items() for n in names}
+    assert {(f, n) for f, n, _ in UNLISTED} <= openings()
+
+
+@contextlib.contextmanager
+def noted_calls() -> Iterator[set[tuple[str, str]]]:
+    """Note the file and name of each function that is called; images load in threads."""
     called = set()
 
     def note(frame, event, argument):
         if event == "call":
             called.add((frame.f_code.co_filename, frame.f_code.co_qualname))
 
-    threading.setprofile(note)  # images load in threads
+    threading.setprofile(note)
     sys.setprofile(note)
     try:
-        Worker(all_targets()[target], 0, tmp_path)
+        yield called
     finally:
         sys.setprofile(None)
         threading.setprofile(None)
-    assert {(str(PACKAGE / f), n) for f, n in BY_TARGET[target]} <= called
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_few_damaged_files(name, tmp_path, monkeypatch):
+    """And the valid files of a reader go through the functions that it stands for."""
+    monkeypatch.setattr(lpips, "NETS", dict(lpips.NETS))  # the reader of weights is given a small network
+    with noted_calls() as called:
+        worker = Worker(all_targets()[name], seed=1, folder=tmp_path)
+    assert {(str(PACKAGE / f), n) for f, n in parsing(name)} <= called
+    count = max(1, round(12 * all_targets()[name].share))
+    for index in range(count):
+        worker.run(index)
+    assert not worker.tally.failures
+    assert worker.tally.accepted + worker.tally.refused == worker.tally.inputs == count
 
 
 # What the fuzzer calls a defect is one, what it bounds is bounded, and it knows what gets past a check.

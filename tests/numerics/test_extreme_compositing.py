@@ -239,18 +239,16 @@ def exponential(cuda: bool):
     @wp.func_native(source("blend_common.cu", **numbers) + f"return falloff({blend_cuda.SCALE} * e1, {blend_cuda.SCALE} * e2);")
     def native(e1: float, e2: float) -> float: ...
 
-    if cuda:
+    @wp.func
+    def plain(e1: float, e2: float):
+        return falloff(e1 * e1 + e2 * e2)
 
-        @wp.kernel(enable_backward=False, module="unique")
-        def kernel(begin: int, e: wp.array2d(dtype=float), found: wp.array(dtype=float)):
-            i = begin + wp.tid()
-            found[i] = native(e[i, 0], e[i, 1])
-    else:
+    used = native if cuda else plain
 
-        @wp.kernel(enable_backward=False, module="unique")
-        def kernel(begin: int, e: wp.array2d(dtype=float), found: wp.array(dtype=float)):
-            i = begin + wp.tid()
-            found[i] = falloff(e[i, 0] * e[i, 0] + e[i, 1] * e[i, 1])
+    @wp.kernel(enable_backward=False, module="unique")
+    def kernel(begin: int, e: wp.array2d(dtype=float), found: wp.array(dtype=float)):
+        i = begin + wp.tid()
+        found[i] = used(e[i, 0], e[i, 1])
 
     return kernel
 

@@ -378,14 +378,6 @@ def test_a_run_says_and_keeps_what_was_given(given_folder, capsys):
 # `warpgs priors show` as a user types it.
 
 
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    """A small demo scene."""
-    folder = tmp_path_factory.mktemp("data") / "scene"
-    write_demo(folder, views=9, width=64, height=48)
-    return folder
-
-
 @pytest.fixture
 def own_cache(tmp_path, monkeypatch):
     """Nothing goes to the user's cache."""

@@ -309,17 +309,23 @@ def test_a_fit_spares_what_no_view_shows(device, extrapolated, monkeypatch):
 def nothing(begin: int): ...
 
 
-@pytest.mark.parametrize("recorded", [True, False])
-@pytest.mark.parametrize("strategy", ["paper", "mcmc"])
-def test_a_fit_launches_nothing_else(device, strategy, recorded, monkeypatch):
-    """Start, steps with and without masks, density events and scores: every module and size of blocks is among the warmed."""
-    launched, launch = set(), interop.launch
+@pytest.fixture
+def launched(monkeypatch):
+    """Kind of device, module and size of blocks of each launch of a test."""
+    found, launch = set(), interop.launch
 
     def note(kernel, count, inputs, where, *, block_dim=256, **more):
-        launched.add((where.type, kernel.module, 1 if where.type == "cpu" else block_dim))
+        found.add((where.type, kernel.module, 1 if where.type == "cpu" else block_dim))
         launch(kernel, count, inputs, where, block_dim=block_dim, **more)
 
     monkeypatch.setattr(interop, "launch", note)
+    return found
+
+
+@pytest.mark.parametrize("recorded", [True, False])
+@pytest.mark.parametrize("strategy", ["paper", "mcmc"])
+def test_a_fit_launches_nothing_else(device, strategy, recorded, monkeypatch, launched):
+    """Start, steps with and without masks, density events and scores: every module and size of blocks is among the warmed."""
     views = photos(3)
     views[0] = dataclasses.replace(views[0], mask=np.ones(views[0].image.shape[:2], bool))
     monkeypatch.setattr(sampling, "MIN_ALPHA", 0.05)
@@ -341,15 +347,8 @@ def test_a_fit_launches_nothing_else(device, strategy, recorded, monkeypatch):
     assert len(launched) > 8 and launched <= warmed and {1, 32, 64, 128, 256} <= {block for _, _, block in warmed}
 
 
-def test_calls_of_other_programs_launch_nothing_else(device, monkeypatch):
+def test_calls_of_other_programs_launch_nothing_else(device, launched):
     """Their colours, inverse and median depths, with gradients, on their form of Gaussians."""
-    launched, launch = set(), interop.launch
-
-    def note(kernel, count, inputs, where, *, block_dim=256, **more):
-        launched.add((kernel.module, 1 if where.type == "cpu" else block_dim))
-        launch(kernel, count, inputs, where, block_dim=block_dim, **more)
-
-    monkeypatch.setattr(interop, "launch", note)
     means, pose = torch.rand(9, 3, device=device) + 1, torch.eye(4, device=device)
     lens = torch.tensor([[2.0, 0, 0, 0], [0, 2, 0, 0], [0, 0, 1, 1], [0, 0, 0, 0]], device=device)
     for fields in ((), (False,), (False, False)):
@@ -361,8 +360,8 @@ def test_calls_of_other_programs_launch_nothing_else(device, monkeypatch):
     given = means.clone().requires_grad_(), shape["rotations"], means / 9, means[:, 0] / 2, shape["shs"], pose[None]
     gsplat.rasterization(*given, lens[None, :3, :3], 32, 32, sh_degree=3, render_mode="RGB+ED")[0].sum().backward()
     cuda = device.type == "cuda"
-    warmed = {(kernel.module, block) for kernel, block in fit_kernels(cuda) + precompile.call_kernels(cuda)}
-    assert len(launched) > 8 and launched <= warmed, {m.name for m, _ in launched - warmed}
+    warmed = {(device.type, kernel.module, block) for kernel, block in fit_kernels(cuda) + precompile.call_kernels(cuda)}
+    assert len(launched) > 8 and launched <= warmed, {m.name for _, m, _ in launched - warmed}
 
 
 @pytest.mark.slow

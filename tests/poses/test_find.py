@@ -226,13 +226,9 @@ def test_a_reconstruction_deep_in_the_photographs_is_named(tmp_path, photographs
 
 @pytest.mark.skipif(sys.platform == "win32", reason="there are no process groups")
 @pytest.mark.parametrize("everyone", [False, True], ids=["warpgs alone", "its group, as a terminal does"])
-def test_ctrl_c_ends_both_processes_and_leaves_nothing(sfm, tmp_path, photographs, everyone):
+def test_ctrl_c_ends_both_processes_and_leaves_nothing(sfm, tmp_path, photographs, everyone, heeding):
     """One sentence, exit code 130, no process and no file left."""
-    # tests may run in the background, where a shell has Ctrl-C ignored and their children inherit that
-    heeding = (
-        "import signal, sys; signal.signal(2, signal.default_int_handler); from warpgs.app.cli import main; sys.exit(main())"
-    )
-    command = [sys.executable, "-c", heeding, "poses", str(photographs), "--out", str(tmp_path / "deep" / "scene")]
+    command = [*heeding, "poses", str(photographs), "--out", str(tmp_path / "deep" / "scene")]
     process = subprocess.Popen(
         [*command, "--threads", "1"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
     )

@@ -49,18 +49,11 @@ from warpgs.pipeline.train.view_modules import Exposure
 from warpgs.pipeline.train.views import TrainingView
 from warpgs.render.options import RasterizeOptions
 from warpgs.render.rasterize import rasterize
-from warpgs.synthetic.demo import split_spec, write_demo
+from warpgs.synthetic.demo import split_spec
 
 # The number of steps that fits into a time, and one clear message where none does.
 
 CPU = torch.device("cpu")
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("data") / "scene"
-    write_demo(folder, views=9, width=64, height=48)
-    return folder
 
 
 def test_more_time_more_steps(monkeypatch):
@@ -414,11 +407,10 @@ def test_when_growth_may_end():
 
 
 @pytest.mark.usefixtures("tiny")
-def test_command_line_says_why_growth_stopped(tmp_path, capsys):
+def test_command_line_says_why_growth_stopped(scene, tmp_path, capsys):
     """A whole run with early stopping and --max-gaussians: terminal, metrics.json and report."""
-    write_demo(tmp_path / "scene", views=8, width=64, height=48)
-    flags = ["--split", split_spec(8), "--steps", "60", "--device", "cpu", "--preset", "3dgs", "--stopping.min-gain-db", "0.1"]
-    assert main(["fit", str(tmp_path / "scene"), "--out", str(tmp_path / "run"), *flags, "--max-gaussians", "900"]) == 0
+    flags = ["--split", split_spec(9), "--steps", "60", "--device", "cpu", "--preset", "3dgs", "--stopping.min-gain-db", "0.1"]
+    assert main(["fit", str(scene), "--out", str(tmp_path / "run"), *flags, "--max-gaussians", "900"]) == 0
     words = capsys.readouterr().out
     metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
     c = metrics["complexity"]

@@ -8,7 +8,6 @@ import itertools
 import json
 import math
 import re
-import sys
 
 import numpy as np
 import pytest
@@ -64,12 +63,8 @@ NUMBER = 3
 
 
 @pytest.fixture
-def own(tmp_path):
-    path = tmp_path / "own.py"
-    path.write_text(OWN)
-    yield path
-    for name in [n for n, m in sys.modules.items() if getattr(m, "__file__", None) == str(path)]:
-        del sys.modules[name]
+def own(own_file):
+    return own_file("own.py", OWN)
 
 
 def written(folder, text, name="my.toml"):

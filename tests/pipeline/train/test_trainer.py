@@ -207,15 +207,11 @@ def test_checkpoint_that_is_not_whole_is_refused(tmp_path):
 
 
 @pytest.mark.skipif(os.name == "nt", reason="Windows has no such signals between processes")
-def test_interrupted_fit_saves_the_step_in_progress(tmp_path):
+def test_interrupted_fit_saves_the_step_in_progress(tmp_path, heeding):
     """Ctrl-C ends with exit code 130 and a checkpoint of the last whole step, from which --resume goes on."""
     write_demo(tmp_path / "scene", views=8, width=48, height=36)
-    # tests may run in the background, where a shell has Ctrl-C ignored and their children inherit that
-    heeding = (
-        "import signal, sys; signal.signal(2, signal.default_int_handler); from warpgs.app.cli import main; sys.exit(main())"
-    )
     command = [
-        sys.executable, "-c", heeding, "fit", str(tmp_path / "scene"), "--split", split_spec(8), "--steps", "100000",
+        *heeding, "fit", str(tmp_path / "scene"), "--split", split_spec(8), "--steps", "100000",
         "--device", "cpu", "--out", str(tmp_path / "run"), "--preset", "3dgs", "--init.source", "random",
         "--init.random-count", "60",
     ]  # fmt: skip
