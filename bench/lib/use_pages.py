@@ -29,13 +29,16 @@ def _result(name: str) -> tuple[dict, str]:
 
 
 def packing() -> str:
-    """Return the table of fits that share a GPU."""
-    result, source = _result("farm_h200")
-    body = []
-    for r in result["rows"]:
-        gpus = "" if r["gpus"] == 1 else f" on each of {r['gpus']} H200"
-        body.append([f"{r['per_gpu']}{gpus}", f"{r['fits_per_hour']:,.0f}", f"{r['mean_seconds_of_a_fit']:.1f} s"])
-    return table(["`--per-gpu`", "fits per hour", "time per fit"], body) + source
+    """Return the table of fits that share GPUs: one scene many times, then captures of different sizes."""
+    body, sources = [], ""
+    names = {"farm_h200": "fern, 3000 steps", "farm_gpus_h200": "fern, 1500 steps", "farm_captures_h200": "40 captures, 1500 steps"}
+    for file, jobs in names.items():
+        result, source = _result(file)
+        sources += source
+        for r in result["rows"]:
+            cells = [f"{r['gpus']}", f"{r['per_gpu']}", f"{r['fits_per_hour']:,.0f}", f"{r['mean_seconds_of_a_fit']:.1f} s"]
+            body.append([jobs, *cells, f"{r['seconds']:.0f} s"])
+    return table(["jobs", "GPUs", "`--per-gpu`", "fits per hour", "time per fit", "wall time"], body) + sources
 
 
 def ranks() -> str:
