@@ -24,6 +24,8 @@ from warpgs.locks import open_to_others
 from warpgs.process import say
 
 if TYPE_CHECKING:
+    from concurrent.futures import Future
+
     import torch
 
 T = TypeVar("T")
@@ -87,24 +89,37 @@ def return_freed_memory() -> None:
 
 
 MAX_THREADS = 16
-"""Most threads of `in_background`: each holds the images of one view."""
+"""Most threads of `background`: each holds the images of one view."""
+
+
+@contextlib.contextmanager
+def background(threads: int = 0) -> Iterator[Callable[..., Future[Any]]]:
+    """Yield a function that starts a call in a thread, and waits while many others wait; in the end all calls are done."""
+    from concurrent.futures import ThreadPoolExecutor
+
+    jobs: list[Future[Any]] = []
+    threads = threads or max(2, min(MAX_THREADS, usable_cores()))
+
+    def start(function: Callable[..., T], *arguments: Any) -> Future[T]:
+        jobs.append(pool.submit(function, *arguments))
+        if len(jobs) > threads:
+            jobs[-threads].result()  # not all arguments in memory at once
+        return jobs[-1]
+
+    with ThreadPoolExecutor(threads) as pool:
+        try:
+            yield start
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
+    for job in jobs:
+        job.result()  # raises what the call raised
 
 
 def in_background(function: Callable[..., T], arguments: Iterable[tuple[Any, ...]], threads: int = 0) -> list[T]:
     """Return a function's results in order, computed by threads while further arguments are made; few arguments wait."""
-    from concurrent.futures import Future, ThreadPoolExecutor
-
-    jobs: list[Future[T]] = []
-    threads = threads or max(2, min(MAX_THREADS, usable_cores()))
-    with ThreadPoolExecutor(threads) as pool:
-        try:
-            for own in arguments:
-                jobs.append(pool.submit(function, *own))
-                if len(jobs) > threads:
-                    jobs[-threads].result()  # not all arguments in memory at once
-        except BaseException:
-            pool.shutdown(cancel_futures=True)
-            raise
+    with background(threads) as start:
+        jobs = [start(function, *own) for own in arguments]
     return [j.result() for j in jobs]
 
 

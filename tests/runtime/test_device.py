@@ -36,6 +36,8 @@ def test_results_keep_the_order_of_their_arguments_which_are_made_late():
     assert max(ahead) <= 4
     with pytest.raises(ZeroDivisionError):
         device.in_background(lambda i: 1 // i, ((1,), (0,)))
+    with pytest.raises(ZeroDivisionError), device.background(2) as start:
+        start(lambda: 1 // 0)  # nobody asks for its result
     assert device.in_background(work, ()) == []
 
 

@@ -152,8 +152,9 @@ def _encode_h264(program: str, temporary: str, frames: Iterator[np.ndarray], fps
         end()
 
 
-PART = 30
-"""Most frames between key frames. libvpx needs .1 s and more for a frame of 504 x 378 px: each thread encodes a part."""
+PART = 15
+"""Most frames between key frames. libvpx needs .05 to .2 s for a frame of 504 x 378 px: each thread encodes a part. Parts of 30
+frames make files a third larger, 0.5 dB nearer to the frames."""
 
 
 def _encode_vp9(path: Path, temporary: str, frames: Iterator[np.ndarray], fps: int) -> None:

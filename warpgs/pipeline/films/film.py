@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from warpgs.device import background
 from warpgs.errors import UsageError, did_you_mean
 from warpgs.files import make_folder, write_bytes
 from warpgs.geometry import convert_camera
@@ -320,24 +321,28 @@ def render_film(
     faults: list[str] = []
     chosen, count, straight = [], len(plan.cameras), model.transparent and settings.background is None
 
+    def write(file: Path, image: np.ndarray, alpha: np.ndarray | None = None) -> None:
+        write_bytes(file, png(image if alpha is None else straight_alpha(image, alpha, model.background)))
+
     def images() -> Iterator[np.ndarray]:
         frames, began = _frames(model, [c for _, c in plan.cameras], settings, coverage), 0.0
         tell(f"rendering {count} frames")
-        for i in range(count):
-            if i == 1:  # the first frame also waits for kernels and memory
-                began = time.perf_counter()
-            elif i:
-                left = (time.perf_counter() - began) / (i - 1) * (count - i)
-                tell(f"rendering: {i} of {count} frames, {duration(left)} left")
-            image, alpha, outside, covered = next(frames)
-            faults.append(fault_of(image, alpha, plan.coverage, outside))
-            if files:
-                write_bytes(files[i], png(straight_alpha(image, alpha, model.background) if straight else image))
-            if covered is not None:
-                write_bytes(out / COVERAGE / files[i].name, png(covered))
-            if i in {k * count // SHEET_FRAMES for k in range(SHEET_FRAMES)}:
-                chosen.append(image)
-            yield image
+        with background() as start:
+            for i in range(count):
+                if i == 1:  # the first frame also waits for kernels and memory
+                    began = time.perf_counter()
+                elif i:
+                    left = (time.perf_counter() - began) / (i - 1) * (count - i)
+                    tell(f"rendering: {i} of {count} frames, {duration(left)} left")
+                image, alpha, outside, covered = next(frames)
+                faults.append(fault_of(image, alpha, plan.coverage, outside))
+                if files:
+                    start(write, files[i], image, alpha if straight else None)
+                if covered is not None:
+                    start(write, out / COVERAGE / files[i].name, covered)
+                if i in {k * count // SHEET_FRAMES for k in range(SHEET_FRAMES)}:
+                    chosen.append(image)
+                yield image
         if one_size:
             tell(f"writing {film.name}")
 
