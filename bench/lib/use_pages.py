@@ -31,7 +31,11 @@ def _result(name: str) -> tuple[dict, str]:
 def packing() -> str:
     """Return the table of fits that share GPUs: one scene many times, then captures of different sizes."""
     body, sources = [], ""
-    names = {"farm_h200": "fern, 3000 steps", "farm_gpus_h200": "fern, 1500 steps", "farm_captures_h200": "40 captures, 1500 steps"}
+    names = {
+        "farm_h200": "fern, 3000 steps",
+        "farm_gpus_h200": "fern, 1500 steps",
+        "farm_captures_h200": "40 captures, 1500 steps",
+    }
     for file, jobs in names.items():
         result, source = _result(file)
         sources += source
