@@ -15,8 +15,8 @@ from rich.console import Console
 
 from warpgs.errors import ResourceError
 from warpgs.files import write_json
+from warpgs.pipeline.farm.farm import FarmTable, farm_page
 from warpgs.pipeline.farm.job import JobRecord
-from warpgs.pipeline.farm.table import FarmTable, farm_page
 from warpgs.process import Detail, Task
 from warpgs.report.images import png, webp
 from warpgs.report.page import curve, write_page
