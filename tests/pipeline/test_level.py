@@ -232,7 +232,9 @@ def test_coordinates_of_given_points_are_new_after_a_command(run, capsys):
     ground_points, ends = ["0,0,0", "1,0,0.2", "0.1,1,0"], ["0.1,0.2,0.3", "-0.2,0.4,0.1"]
     for words, length in ((["--scale", *ends], ["2"]), (["--ground", *ground_points], [])):
         assert sh("level", run, *words, *length) == 0
-        said = re.search(r"the points are now at (.+) \(", capsys.readouterr().out)
+        text = capsys.readouterr().out
+        said = re.search(r"the points are now at (.+) \(", text)
+        assert "count as exact" in text and "uncertain" not in text
         n = open_run(run, "cpu").normalization
         assert sh("level", run, words[0], *said[1].split(), *length) == 0
         again = open_run(run, "cpu").normalization
