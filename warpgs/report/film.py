@@ -131,7 +131,10 @@ def _vp9(path: Path, name: str, fps: int, frame: np.ndarray, properties: tuple[i
         codec, (height, width) = cv2.VideoWriter_fourcc(*"vp09"), frame.shape[:2]
         writer = cv2.VideoWriter(name, cv2.CAP_FFMPEG, codec, fps, (width, height), properties)
     if not writer.isOpened():
-        raise ResourceError(f"{path}: cannot be written; the folder is not writable, or OpenCV lacks a VP9 encoder")
+        raise ResourceError(
+            f"{path}: cannot be written; disk full, folder not writable, or OpenCV lacks a VP9 encoder. Free disk "
+            "space, or write elsewhere"
+        )
     return writer
 
 
