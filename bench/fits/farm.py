@@ -10,6 +10,7 @@ of jobs, as `warpgs farm` takes it, on each number of GPUs, and compares the PLY
 from __future__ import annotations
 
 import dataclasses
+import json
 import os
 import shutil
 import signal
@@ -181,10 +182,16 @@ def pack(slots: list[Slot], tiny: list[FarmJob], jobs: list[FarmJob]) -> dict:
     failures = [s.record.message if s.record else s.state for s in statuses if s.state != "done"]
     if failures:
         print(f"{len(failures)} of {len(jobs)} fits failed, the first: {failures[0]}", file=sys.stderr)
+    sections = [
+        json.loads((s.job.request.out / "metrics.json").read_text("utf-8"))["wall_seconds"]
+        for s in statuses
+        if s.state == "done"
+    ]
     ends = {gpu: max(s.began + s.seconds for s in statuses if gpu_of.get(s.job.name) == gpu) for gpu in gpu_of.values()}
     return {
         "fits": len(took), "failed": len(failures), "seconds": seconds, "fits_per_hour": 3600 * len(took) / seconds,
         "mean_seconds_of_a_fit": sum(took) / max(1, len(took)),
+        "mean_sections": {n: round(sum(r.get(n, 0.0) for r in sections) / len(sections), 2) for n in (sections or [{}])[0]},
         "mean_psnr": sum(s.record.psnr or 0 for s in statuses if s.record) / len(jobs),
         "idle_at_the_end": {gpu: round(began + seconds - end, 2) for gpu, end in sorted(ends.items())},
     }  # fmt: skip
