@@ -1,15 +1,17 @@
 """Other rasterizers behind one call, with stand-ins for what needs CUDA, and their tables."""
 
 import dataclasses
+import inspect
 import sys
 from types import SimpleNamespace
 
 import numpy as np
 import torch
 
-from bench.lib import inputs, judge, peers, rasterizers, rasterizers_page
+from bench.lib import gsplat_calls, inputs, judge, peers, rasterizers, rasterizers_page
 from bench.lib.rasterizers import Drawing
 from warpgs import RasterizeOptions, rasterize
+from warpgs.compat import gsplat as compat
 from warpgs.constants import RULES, Rule
 from warpgs.export.base import half_turn
 from warpgs.kernels.ssim import ssim
@@ -141,3 +143,28 @@ def test_the_judge_of_other_programs_finds_what_differs():
     assert verdict(means=ours["means"][:39]) == "39 instead of 40 Gaussians"
     turned, mirrored = ours["means"][:, [1, 2, 0]] + 5, ours["means"] * (1, 1, -1)
     assert judge.rigid(ours["means"], turned) < 1e-9 < 0.1 < judge.rigid(ours["means"], mirrored)
+
+
+def test_calls_of_gsplat_are_compared():
+    """A program beside itself differs in nothing; what another one changes, lacks, packs or refuses is in the row."""
+    rasterization, size = compat.rasterization, (60, 40, 24)
+    both = {gsplat_calls.OURS: rasterization, gsplat_calls.GSPLAT: rasterization}
+    known = {n for f in (gsplat_calls.inputs, rasterization) for n in inspect.signature(f).parameters}
+    assert all(call.keys() <= known for call in gsplat_calls.CALLS.values())
+    for name in ("absgrad, packed", "batch 1 x 2, packed", "like AnySplat", "D, dense"):
+        row = gsplat_calls.row_of(gsplat_calls.CALLS[name], both, *size, 2)
+        assert row["meta"]["differ"] == {} and row["meta"]["absent"] == [] and set(row["ms"]) == set(both), name
+        assert all(value in (None, [0.0, 0.0]) for value in row["gradients"].values()) and row["alpha_levels"] == [0.0, 0.0]
+    assert row["gradients"]["colors"] is None and "image_levels" not in row
+
+    def other(colors, packed, **arguments):
+        image, alphas, meta = rasterization(colors=1.5 * colors, packed=True, **arguments)
+        meta = dict(meta) | {"more": 1}
+        meta["tile_size"] += 1
+        return image + 1 / 255, alphas, meta
+
+    row = gsplat_calls.row_of({"absgrad": True}, both | {gsplat_calls.GSPLAT: other}, *size, 2)
+    assert row["image_levels"][0] > 1 and 0.3 < row["gradients"]["colors"][0] < 0.4 and row["meta"]["absent"] == ["more"]
+    assert row["meta"]["differ"]["tile_size"] == "16 and 17" and 0.1 < row["meta"]["means2d.absgrad"][0] < 0.4
+    assert row["meta"]["differ"]["means2d"] == [0.0, 0.0], "rows are compared by Gaussian"
+    assert "sparse_grad" in gsplat_calls.row_of({"sparse_grad": True}, both, *size, 2)["refused"][gsplat_calls.OURS]
