@@ -18,57 +18,33 @@ SMOOTHNESS = (1e2, 1e4, 1e6)
 """Strengths of the smoother, in order. A stronger smoother reaches farther; each pixel uses the first that reaches it."""
 COLOR_SIGMA = 8.0
 """Colour difference [1/255] at which the weight between neighbours falls to 1/e."""
-MIN_FRACTION = 1e-2
-"""Smallest smoothed weight at which a plane counts."""
-FITS, OUTLIER = 5, 0.03
-"""Number of fits of each plane; and residual at which a pixel's weight in the next fit falls to a half, as a fraction of the
-view's median inverse depth. It is above the steps of a sweep and below those at the borders of objects."""
-LEAST_VARIANCE = 0.06**2 / 12
-"""Slopes fade where the positions of a fit vary less than in squares of 6 % of the image width [image widths^2]."""
-PLANE_PIXELS = 50_000
-"""Number of pixels to which an image is reduced for the fits, which take a tenth of a second then."""
+MIN_FRACTION = 1e-3
+"""Smallest fraction of a smoothed value that must come from consistent pixels."""
 
 
 def complete(depth: np.ndarray, valid: np.ndarray, image: np.ndarray) -> np.ndarray:
-    """Fill a depth map [u], [H, W], by planes fitted to nearby valid depths of similar colour; the median where none reach."""
-    # An edge-aware smoother (Min et al. 2014) averages the moments of a plane in inverse depth. Refitted without outliers, the
-    # plane is that of one surface. Measured in docs/decisions/007-coarse-start.md.
+    """Fill a depth map [u], [H, W], by edge-aware averages of inverse depth; the median where no valid depth reaches."""
+    # Smoothed inverse depths by the smoothed mask (Min et al. 2014): planes stay planes, and far surfaces are not pulled near.
+    # Measured in docs/decisions/007-coarse-start.md.
     import cv2
 
     if not valid.any():
         return np.zeros(depth.shape, np.float32)
     inverse = np.where(valid, 1 / np.where(valid, depth, 1), 0).astype(np.float32)
-    median, low, high = np.median(inverse[valid]), inverse[valid].min(), inverse[valid].max()
-    shrink = min(1.0, (PLANE_PIXELS / valid.size) ** 0.5)
-    width, height = (max(1, round(shrink * n)) for n in valid.shape[::-1])
-    y, x = np.mgrid[:height, :width].astype(np.float32) / width - 0.5
     guide = (image * 255).round().clip(0, 255).astype(np.uint8)
+    filled = np.full(depth.shape, np.median(inverse[valid]))
+    left = np.ones(depth.shape, bool)
     with single_threaded_opencv():
-        guide, known, d = (
-            cv2.resize(a, (width, height), interpolation=cv2.INTER_AREA) for a in (guide, valid.astype(np.float32), inverse)
-        )
-        d /= median * np.where(known > 0, known, 1)
-        filled, left = np.ones_like(d), np.ones(d.shape, bool)
         for strength in SMOOTHNESS:
-            smoother = cv2.ximgproc.createFastGlobalSmootherFilter(guide, strength * shrink**2, COLOR_SIGMA)
-            weights = known
-            for _ in range(FITS):
-                fraction = smoother.filter(weights)
-                reached = fraction > MIN_FRACTION
-                mx, my, md, xx, xy, yy, xd, yd = (
-                    smoother.filter(weights * a) / np.where(reached, fraction, 1)
-                    for a in (x, y, d, x * x, x * y, y * y, x * d, y * d)
-                )
-                xx, xy, yy = xx - mx * mx + LEAST_VARIANCE, xy - mx * my, yy - my * my + LEAST_VARIANCE
-                xd, yd = xd - mx * md, yd - my * md
-                plane = md + ((yy * xd - xy * yd) * (x - mx) + (xx * yd - xy * xd) * (y - my)) / (xx * yy - xy * xy)
-                weights = known / (1 + ((d - plane) / OUTLIER) ** 2)
-            np.copyto(filled, plane, where=left & reached)
-            left &= ~reached
+            smoother = cv2.ximgproc.createFastGlobalSmootherFilter(guide, strength, COLOR_SIGMA)
+            fraction = smoother.filter(valid.astype(np.float32))
+            filled_now = left & (fraction > MIN_FRACTION)
+            filled[filled_now] = smoother.filter(inverse)[filled_now] / fraction[filled_now]
+            left &= ~filled_now
             if not left.any():
                 break
-        filled = cv2.resize(filled, depth.shape[::-1], interpolation=cv2.INTER_LINEAR)
-    return np.where(valid, depth, 1 / (median * filled).clip(low, high)).astype(np.float32)
+    low, high = inverse[valid].min(), inverse[valid].max()
+    return np.where(valid, depth, 1 / filled.clip(low, high)).astype(np.float32)
 
 
 SAMPLES = 4
