@@ -168,8 +168,11 @@ def test_pairs_are_chosen_and_copies_are_small(sfm, tmp_path, photographs, found
     monkeypatch.setattr(mapping, "EXHAUSTIVE", 5)
     for room in (mapping, module_of_photographs):
         monkeypatch.setattr(room, "MATCHING_SIDE", 216)
-    record = find_poses(photographs, tmp_path / "out")
+    said: list[str] = []
+    record = find_poses(photographs, tmp_path / "out", progress=said.append)
     assert all(p["registered"] for p in record["photographs"]) and record["pairs_tried"] == 15
+    # a second step would index the descriptors again
+    assert [line for line in said if line.startswith("matching")] == ["matching: pair 1 of 15"]
     assert [c["width"] for c in record["cameras"]] == [c["width"] for c in found[1]["cameras"]]
 
 

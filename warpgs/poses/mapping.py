@@ -181,7 +181,7 @@ def _say(**values: Any) -> None:
 
 
 def _in_steps(items: list, words: str, least: int = 1) -> Iterator[list]:
-    """Yield a list in about twenty parts, each after a line of progress."""
+    """Yield a list in about twenty parts of at least so many items, each after a line of progress."""
     step = max(least, len(items) // 20)
     for begin in range(0, len(items), step):
         _say(progress=f"{words} {begin + 1} of {len(items)}")
@@ -265,7 +265,8 @@ def match(pycolmap: Any, job: Json) -> Json:
     matching.num_threads, matching.use_gpu = job["threads"], False
     chosen = pycolmap.ImportedPairingOptions()
     chosen.match_list_path = PAIRS
-    for some in _in_steps(pairs, "matching: pair"):
+    # each step indexes the descriptors of its photographs anew; an index costs about as much as matching a pair
+    for some in _in_steps(pairs, "matching: pair", 5 * len(order)):
         _write_pairs(some, job)
         pycolmap.match_image_pairs(DATABASE, matching, chosen, verification, pycolmap.Device.cpu)
     return matched(pycolmap, job, len(pairs))
