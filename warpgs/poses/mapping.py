@@ -265,7 +265,7 @@ def match(pycolmap: Any, job: Json) -> Json:
     matching.num_threads, matching.use_gpu = job["threads"], False
     chosen = pycolmap.ImportedPairingOptions()
     chosen.match_list_path = PAIRS
-    # each step indexes the descriptors of its photographs anew; an index costs about half as much as matching a pair
+    # each step indexes the descriptors of its photographs anew; an index costs about as much as matching a pair
     for some in _in_steps(pairs, "matching: pair", 5 * len(order)):
         _write_pairs(some, job)
         pycolmap.match_image_pairs(DATABASE, matching, chosen, verification, pycolmap.Device.cpu)
