@@ -1,21 +1,23 @@
-"""Who may write: one writer a folder, and folders that only their owner can read."""
+"""Who may write: one writer a folder or a file, and folders that only their owner can read."""
 
 import contextlib
 import datetime
 import errno
+import hashlib
 import json
 import os
 import platform
 import shlex
 import stat
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
 from warpgs import schema
 from warpgs.errors import FolderHeldError, ResourceError, UsageError
 from warpgs.files import LOCK, remove_leftovers, writable, writing_into
-from warpgs.folders import Folder, Temporary, cache_home, lock, open_folder, sweep, sweep_temporary_files, unlock
+from warpgs.folders import LOCKED, Folder, Temporary, cache_home, lock, open_folder, sweep, sweep_temporary_files, unlock
 
 
 def open_to_others(folder: Path, depth: int = 0) -> Path | None:
@@ -67,7 +69,7 @@ MOST_LETTERS = 200
 
 
 @contextlib.contextmanager
-def hold_folder(folder: Path, *parts: str) -> Iterator[list[str]]:
+def hold_folder(folder: Path, *parts: str, name: str = LOCK) -> Iterator[list[str]]:
     """Lock a folder, and make it if it is missing, so that no other process writes into it during the block."""
     # The system releases the lock when the process that holds it ends, even if it is killed. The lock also excludes
     # processes in other containers. The lock file names the holder. Leftovers of killed writers are removed from the
@@ -77,9 +79,9 @@ def hold_folder(folder: Path, *parts: str) -> Iterator[list[str]]:
     sweep_temporary_files()
     with writing_into(folder) as made:
         try:
-            with open_folder(folder) as opened, _held(opened) as locked:
-                for name in (".", *parts):
-                    remove_leftovers(folder / name)
+            with open_folder(folder) as opened, _held(opened, name) as locked:
+                for part in (".", *parts):
+                    remove_leftovers(folder / part)
                 note = f"{folder}: its file system has no locks; do not start a second process that writes there"
                 yield [] if locked else [note]
         except BaseException:
@@ -91,9 +93,12 @@ def hold_folder(folder: Path, *parts: str) -> Iterator[list[str]]:
 
 @contextlib.contextmanager
 def hold_file(path: Path) -> Iterator[list[str]]:
-    """Hold the folder of a file that the block writes; see `hold_folder`."""
+    """Lock a file that the block writes, in a folder that no process holds; see `hold_folder`."""
+    # other processes may write other files of the folder; a lock of a killed process is swept as other leftovers are
     check_file_path(path)
-    with hold_folder(path.parent) as notes:
+    check_free(path.parent)
+    name = f".warpgs-{hashlib.sha256(os.fsencode(path.name)).hexdigest()[:16]}.tmp{LOCKED}"
+    with hold_folder(path.parent, name=name) as notes:
         yield notes
 
 
@@ -112,7 +117,7 @@ def check_file_path(path: Path) -> None:
 def check_free(folder: Path) -> None:
     """Check that no process holds a folder, and remove a killed one's lock; a folder that cannot be read counts as free."""
     with contextlib.suppress(OSError), open_folder(folder) as opened:
-        descriptor, locked = _locked(opened, os.O_RDWR)
+        descriptor, locked = _locked(opened, LOCK, os.O_RDWR)
         if locked:
             unlock(opened, LOCK, descriptor)
         else:
@@ -120,11 +125,11 @@ def check_free(folder: Path) -> None:
 
 
 @contextlib.contextmanager
-def _held(folder: Folder) -> Iterator[bool]:
-    """Hold the lock of a folder; yields whether the file system has locks."""
+def _held(folder: Folder, name: str) -> Iterator[bool]:
+    """Hold a lock in a folder; yields whether the file system has locks."""
     while True:
-        with writable(folder.path, f"make the folder and its lock {LOCK} writable, or choose another folder"):
-            descriptor, locked = _locked(folder, os.O_RDWR | os.O_CREAT)
+        with writable(folder.path, f"make the folder and its lock {name} writable, or choose another folder"):
+            descriptor, locked = _locked(folder, name, os.O_RDWR | os.O_CREAT)
         # the last holder may have removed the lock file between the two calls; then other processes lock a new file
         if not locked or os.fstat(descriptor).st_nlink:
             break
@@ -136,14 +141,17 @@ def _held(folder: Folder) -> Iterator[bool]:
             file.write(_signature())
         yield bool(locked)
     finally:
-        unlock(folder, LOCK, descriptor)
+        unlock(folder, name, descriptor)
 
 
-def _locked(folder: Folder, flags: int) -> tuple[int, bool | None]:
-    """Open and lock the lock file of a folder; return its descriptor, and None where its file system has no locks."""
-    descriptor = folder.open_regular(LOCK, flags)
+def _locked(folder: Folder, name: str, flags: int) -> tuple[int, bool | None]:
+    """Open and lock a lock file of a folder; return its descriptor, and None where its file system has no locks."""
+    descriptor = folder.open_regular(name, flags)
     try:
         locked = lock(descriptor)
+        if locked is False and name != LOCK:  # perhaps a sweep has it, for a moment
+            time.sleep(0.1)
+            locked = lock(descriptor)
         if locked is False:
             os.lseek(descriptor, 1, os.SEEK_SET)
             raise FolderHeldError(

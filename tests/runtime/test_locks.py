@@ -1,4 +1,4 @@
-"""One process at a time writes into a folder; who dies gives it free; whoever comes second is told whose it is."""
+"""One process at a time writes into a folder, or a file; who dies gives it free; whoever comes second is told whose it is."""
 
 import errno
 import os
@@ -55,8 +55,37 @@ def test_a_second_holder_is_told_whose_the_folder_is_and_impossible_paths_are_na
     for name in ("x" * 300, "file/below"):
         with pytest.raises(ResourceError, match="choose another folder"), hold_folder(tmp_path / name):
             pytest.fail("held")
-    with hold_file(tmp_path / "new" / "a.ply"):
-        assert "is writing there" in refusal(tmp_path / "new")
+
+
+def test_two_files_of_a_folder_are_written_at_once(tmp_path):
+    """The same file is refused, also one of a folder that is held; what a killed writer of a file left is swept."""
+    one, two = tmp_path / "new" / "a.ply", tmp_path / "new" / "b.ply"
+    with hold_file(one), hold_file(two) as notes:
+        assert notes == [] and is_empty(one.parent)
+        with pytest.raises(ResourceError, match="is writing there"), hold_file(one):
+            pytest.fail("held twice")
+        left = [p.read_bytes() for p in one.parent.iterdir()]
+    assert len(left) == 2 and not list(one.parent.iterdir())
+    (one.parent / f"{LEFT}.lock").write_bytes(left[0])
+    with hold_folder(one.parent):
+        assert [p.name for p in one.parent.iterdir()] == [LOCK]
+        with pytest.raises(ResourceError, match="is writing there"), hold_file(two):
+            pytest.fail("held twice")
+
+
+def test_a_sweep_does_not_refuse_a_file(tmp_path, monkeypatch):
+    """Another process finds the new lock before it is locked here: it holds it for a moment, and removes it."""
+    lock, calls = folders.lock_descriptor, []
+
+    def late(descriptor, blocking):
+        calls.append(descriptor)
+        if len(calls) == 1:
+            next(tmp_path.glob("*.lock")).unlink()
+        return len(calls) > 1 and lock(descriptor, blocking=blocking)
+
+    monkeypatch.setattr(folders, "lock_descriptor", late)
+    with hold_file(tmp_path / "a.ply"):
+        assert len(calls) == 4 and len(list(tmp_path.iterdir())) == 1  # the last call is the own sweep
 
 
 def test_a_lock_file_alone_holds_nothing(tmp_path):

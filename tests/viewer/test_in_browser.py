@@ -405,6 +405,22 @@ def test_the_viewer_has_the_limits_of_the_page(folder, browser):
 
 
 @pytest.mark.browser
+def test_the_panel_of_a_phone_starts_folded(folder, browser):
+    """A tap on its bar opens it; in a wide window it is open."""
+    bar = 'document.querySelector(\'[style*="bottom: 0"] [style*="cursor: pointer"]\')'
+    with viewing(folder, "view") as server:
+        browser.resize(390, 844)
+        browser.open(address(server))
+        browser.wait(f"{bar} && !{TEXT}.includes('step into') && {bar}.getBoundingClientRect().top > 750")
+        browser.value(f"{bar}.click()")
+        browser.wait(f"{TEXT}.includes('step into') && {bar}.getBoundingClientRect().top < 600")
+        browser.resize(WIDTH, HEIGHT)
+        browser.open(address(server))
+        browser.wait(f"{TEXT}.includes('step into')")
+        assert trouble(browser) == []
+
+
+@pytest.mark.browser
 @pytest.mark.parametrize("kind", ["view", "fit --view"])
 def test_a_foreign_page_gets_nothing(folder, browser, kind):
     """Frames, sockets, requests and forms, with and without the address, from another site: nothing opens or is written."""

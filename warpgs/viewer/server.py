@@ -90,11 +90,17 @@ TURNING = (
 ).replace("LIMITS", LIMITS)
 """JavaScript that keeps the camera where photographs show the scene: it turns freely within the captured arc, and ever less
 in the margin beyond. A drag over the width of the window turns through the whole range."""
+FOLD = (
+    "if(matchMedia('(max-width:36em)').matches){const fold=()=>{"
+    'const bar=document.querySelector(\'[style*="bottom: 0"] [style*="cursor: pointer"]\');'
+    "bar?bar.click():requestAnimationFrame(fold)};fold()}"
+)
+"""JavaScript that folds the panel on a phone, where viser opens it over the lower half of the scene."""
 
 
 def live_page(text: str, nonce: str) -> str:
     """Return viser's page for a content policy that only runs scripts with a nonce."""
-    own = f"<script>{NO_PARAMETERS}{NO_TEXT_AS_CODE}{_MARK_LOADED.replace('NONCE', nonce)}{TURNING}</script>"
+    own = f"<script>{NO_PARAMETERS}{NO_TEXT_AS_CODE}{_MARK_LOADED.replace('NONCE', nonce)}{TURNING}{FOLD}</script>"
     return text.replace("<head>", f"<head>{own}", 1).replace("<script", f'<script nonce="{nonce}"')
 
 

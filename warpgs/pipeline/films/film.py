@@ -15,7 +15,7 @@ from warpgs.device import background
 from warpgs.errors import UsageError, did_you_mean
 from warpgs.files import make_folder, write_bytes
 from warpgs.geometry import convert_camera
-from warpgs.locks import check_file_path, hold_folder
+from warpgs.locks import hold_file, hold_folder
 from warpgs.mesh.views import MIN_ALPHA
 from warpgs.pipeline.films import paths
 from warpgs.pipeline.metrics.coverage import classes_of, coverage_map, depth_views, fraction_outside
@@ -314,8 +314,6 @@ def render_film(
     """Render a plan to PNG files and film.mp4, or to a film alone; ``sheet`` adds six frames in one image. Files and notes."""
     alone, one_size = check_plan(plan, out, bool(coverage), sheet)
     folder, film = (out.parent, out) if alone else (out, out / FILM)
-    if alone:
-        check_file_path(out)
     files = [] if alone else [folder / f"{name}.png" for name, _ in plan.cameras]
     older = [] if alone else [p for p in folder.glob("*.png") if p not in files and p.name != SHEET]
     faults: list[str] = []
@@ -346,7 +344,7 @@ def render_film(
         if one_size:
             tell(f"writing {film.name}")
 
-    with hold_folder(folder, *([] if alone else [COVERAGE])) as notes:
+    with hold_file(out) if alone else hold_folder(out, COVERAGE) as notes:
         if coverage:
             make_folder(out / COVERAGE)
         if one_size:
