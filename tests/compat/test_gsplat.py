@@ -335,4 +335,6 @@ def test_a_decoder_of_anysplat_changes_its_import_alone():
         images.append(image.clamp(0, 1).permute(0, 3, 1, 2))
         depths.append(depth)
     (torch.cat(images).mean() + torch.cat(depths).mean()).backward()
-    assert torch.cat(images).shape == (VIEWS, 3, HEIGHT, WIDTH) and bool(covars.grad.any()) and bool(alpha.any())
+    assert torch.cat(images).shape == (VIEWS, 3, HEIGHT, WIDTH) and bool(alpha.any())
+    # gsplat reads the upper triangle, which has the whole gradient
+    assert bool(covars.grad.triu(1).any()) and not bool(covars.grad.tril(-1).any())

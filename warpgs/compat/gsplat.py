@@ -220,7 +220,7 @@ def rasterization(
         distributed: Not supported.
         camera_model: pinhole, ortho or fisheye. Fisheyes are sorted by distance.
         segmented: Ignored: it changes no result.
-        covars: Covariances [u^2] in place of ``quats`` and ``scales``, shape [..., N, 3, 3].
+        covars: Covariances [u^2] in place of ``quats`` and ``scales``, shape [..., N, 3, 3]; the upper triangle is read.
         with_ut: Not supported.
         with_eval3d: Not supported.
         return_normals: Not supported.
@@ -260,7 +260,9 @@ def rasterization(
     # an opacity factor holds for all cameras of a call, so a clip needs a call for each camera
     views = [slice(c, c + 1) for c in range(cameras)] if radius_clip > 0 else [slice(None)]
     kind: Any = ActivatedGaussians if covars is None else CovarianceGaussians
-    form = {"quats": quats, "scales": scales} if covars is None else {"covars": covars}
+    form = {"quats": quats, "scales": scales}
+    if covars is not None:
+        form = {"covars": covars.triu() + covars.triu(1).mT}  # the upper triangle alone is read, and has the whole gradient
     renders = []
     for scene, view in [(scene, view) for scene in range(batch.numel()) for view in views]:
         of = functools.partial(_part, batch, scene, view)
