@@ -533,6 +533,9 @@ GAUSSIANS_SHARE = 0.75
 EVENT_TIMES = 1.0, 0.6, 0.8
 """Time of an event, in steps: for each view that is sampled, for each view that ranks Gaussians for eviction, and for each view
 that shows which Gaussians to remove."""
+GROWN_TIMES, GROWN, SATURATED = (0.003, 3e-8, 4.3e-7, 1.3e-8), 35.0, 0.2
+"""What is printed allows for growth by gradients: `CPU_TIMES` of fits with it, Gaussians that it adds in a step, and their
+largest number for each pixel of all views (docs/decisions/025-time-on-a-cpu.md)."""
 FIRST_POINTS, FIRST_POWER, SWEPT_VIEWS = 2.4, 0.64, 30
 """Number of first points over that of the merged cells of one view, for one view; exponent of its growth with the number of
 views; and number of views above which it does not grow."""
@@ -553,15 +556,17 @@ def steps_by_views(views: int, opaque: bool = True) -> int:
     return min(MAX_STEPS, round(MIN_STEPS * max(1.0, views / FEW) ** STEPS_POWER))
 
 
-def step_times(config: FitConfig, views: int, pixels: float, start: int, done: int = 0) -> tuple[np.ndarray, np.ndarray]:
+def step_times(
+    config: FitConfig, views: int, pixels: float, start: int, done: int = 0, growing: bool = False
+) -> tuple[np.ndarray, np.ndarray]:
     """Return the expected time of each step on two cores [s], and the expected number of Gaussians in it, shape [steps] each.
 
-    There are ``start`` Gaussians after ``done`` steps; sampling events add more up to the limits. ``pixels`` are those of a
-    view.
+    There are ``start`` Gaussians after ``done`` steps; sampling events add more up to the limits, and gradients, too, if
+    ``growing``. ``pixels`` are those of a view.
     """
     assert config.steps is not None and config.half_resolution is not None  # `settings_by_views` has chosen
     assert config.sh_degree is not None
-    (constant, of_pixel, of_gaussian, of_coefficient), sampler = CPU_TIMES, config.method.sampler
+    (constant, of_pixel, of_gaussian, of_coefficient), sampler = GROWN_TIMES if growing else CPU_TIMES, config.method.sampler
     steps = np.arange(1, config.steps + 1)
     phases, samples = plan_phases(config.phases, config.steps), find_strategy(config.strategy).samples
     due = np.isin(steps, phases.events) & samples
@@ -569,7 +574,12 @@ def step_times(config: FitConfig, views: int, pixels: float, start: int, done: i
     added = sampler.fraction * pixels * min(views, MAX_VIEWS)
     wanted = start + added * np.cumsum(due & (steps > done))
     most = max(start, min(config.max_gaussians, (1 + sampler.max_fraction) * start))
-    counts, weighed = np.minimum(wanted, most), np.where(wanted > most, len(range(0, views, -(-views // MAX_WEIGHED))), 0)
+    counts = np.minimum(wanted, most)
+    if growing:
+        adding = samples & (steps > max(done, phases.refine)) & (steps <= phases.stable_start)
+        room = min(config.max_gaussians, SATURATED * views * pixels)
+        counts = np.clip(counts + GROWN * np.cumsum(adding), counts, max(most, room))
+    weighed = np.where(wanted > most, len(range(0, views, -(-views // MAX_WEIGHED))), 0)
     full = constant + of_pixel * pixels + (of_gaussian + of_coefficient * (config.sh_degree + 1) ** 2) * counts
     half = 0.75 * of_pixel * pixels * (steps <= config.half_resolution * config.steps)
     events_in_steps = due * (EVENT_TIMES[0] * min(views, MAX_VIEWS) + EVENT_TIMES[1] * weighed)
@@ -609,9 +619,10 @@ def limited_on_cpu(config: FitConfig, views: int, pixels: float) -> tuple[int, i
     if (steps, most) == (config.steps, config.max_gaussians):
         return steps, most, ""
     capped = f", with at most {most:,} Gaussians" if most < config.max_gaussians else ""
+    whole = float(step_times(config, views, pixels, start, growing=True)[0].sum())
     return steps, most, (
         f"to save time on a CPU, the fit takes {steps:,} of {config.steps:,} steps{capped}; --no-cpu-limit takes all, about "
-        f"{max(1, round(all_steps / 60))} min" + f", and raised PSNR by {GAIN_DB}" * (steps < NEARLY_ALL * config.steps)
+        f"{max(1, round(whole / 60))} min" + f", and raised PSNR by {GAIN_DB}" * (steps < NEARLY_ALL * config.steps)
     )  # fmt: skip
 
 
