@@ -533,9 +533,9 @@ GAUSSIANS_SHARE = 0.75
 EVENT_TIMES = 1.0, 0.6, 0.8
 """Time of an event, in steps: for each view that is sampled, for each view that ranks Gaussians for eviction, and for each view
 that shows which Gaussians to remove."""
-GROWN_TIMES, GROWN, SATURATED = (0.003, 3e-8, 4.3e-7, 1.3e-8), 35.0, 0.2
-"""What is printed allows for growth by gradients: `CPU_TIMES` of fits with it, Gaussians that it adds in a step, and their
-largest number for each pixel of all views (docs/decisions/025-time-on-a-cpu.md)."""
+GROWN, SATURATED = 25.0, 0.2
+"""Gaussians that growth by gradients adds in a step, and their largest number for each pixel of all views while it adds to them
+(docs/decisions/025-time-on-a-cpu.md). The printed time allows for them."""
 FIRST_POINTS, FIRST_POWER, SWEPT_VIEWS = 2.4, 0.64, 30
 """Number of first points over that of the merged cells of one view, for one view; exponent of its growth with the number of
 views; and number of views above which it does not grow."""
@@ -566,7 +566,7 @@ def step_times(
     """
     assert config.steps is not None and config.half_resolution is not None  # `settings_by_views` has chosen
     assert config.sh_degree is not None
-    (constant, of_pixel, of_gaussian, of_coefficient), sampler = GROWN_TIMES if growing else CPU_TIMES, config.method.sampler
+    (constant, of_pixel, of_gaussian, of_coefficient), sampler = CPU_TIMES, config.method.sampler
     steps = np.arange(1, config.steps + 1)
     phases, samples = plan_phases(config.phases, config.steps), find_strategy(config.strategy).samples
     due = np.isin(steps, phases.events) & samples
