@@ -1,9 +1,10 @@
 """Real sizes: scale, upward direction and geographic place of a run's files, by picked points, poses or GPS."""
 
 import contextlib
+import functools
 import math
 import shlex
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,12 +21,15 @@ from warpgs.locks import hold_folder
 from warpgs.mesh.views import CONTRIBUTORS, MIN_ALPHA, surface_depth
 from warpgs.pipeline.model.edit import drop_unused_sh, levelling, numbers_of
 from warpgs.pipeline.model.table import FittedModel, similarity_values
+from warpgs.pipeline.run.commands import scene_of
 from warpgs.pipeline.run.folder import CONFIG, StoredRun, open_run, read_record
 from warpgs.render.rasterize import rasterize
 from warpgs.scene import Camera, Normalization
 
 Place = tuple[np.ndarray, np.ndarray]
 """Point of the scene [3] [u], and the covariance of its error [3, 3] [u²]."""
+Match = Callable[[tuple[int, int], float, Sequence[float]], tuple[float, float] | None]
+"""From pixel, depth and slopes of the model's surface to depth and spread in photographs, if it is found there."""
 Levelled = tuple[Normalization, str]
 """New similarity, and a line for the user."""
 HIDDEN = 0.1
@@ -34,6 +38,12 @@ AROUND, SAME, TRIMS = 0.025, 0.04, 5
 """Half the window around a pick, relative to the longer side; relative difference of depth of one surface; rounds of the fit.
 On the demo, against single pixels: distances of over 4 units within 1.1 instead of 2.5 %, the ground within 0.5 instead of 1
 degree (median of 35 choices of three points)."""
+SEARCH, STEPS, PATCH, NEAR, ALIKE = 0.04, 81, 5, 4, 0.98
+"""Largest relative change of a pick's inverse depth by other photographs; number of candidates; half the side of the compared
+patch [px]; number of nearest photographs; and least correlation with each of them. On the demo, three of four picks are
+matched: error of depth 0.08 instead of 0.23 % (median); of lengths 0.21 instead of 0.40 %."""
+FLAT = 0.01
+"""Least standard deviation of a patch with texture."""
 EXACT = "the given coordinates count as exact"
 LEAST = 1e-6
 """Least distance of picked points [u]."""
@@ -48,8 +58,8 @@ EARTH, SQUARED = 6378137.0, 0.00669437999014
 
 
 @torch.no_grad()
-def pixel_depth(model: FittedModel, camera: Camera, x: float, y: float, what: str = "the point") -> tuple[float, float]:
-    """Return the depth [u] of the surface at a pixel, and its spread [u]; UsageError on background."""
+def pixel_depth(model: FittedModel, camera: Camera, x: float, y: float, what: str = "the point") -> tuple[float, ...]:
+    """Return what `plane_depth` does for the surface at a pixel; UsageError on background."""
     if not (0 <= x < camera.width and 0 <= y < camera.height):
         raise UsageError(f"{what}: outside of the image, which has {camera.width} x {camera.height} px in this run, as fitted")
     r = rasterize(model.gaussians(), camera, replace(model.options(), heaviest=CONTRIBUTORS * (camera.model == "pinhole")))
@@ -61,8 +71,11 @@ def pixel_depth(model: FittedModel, camera: Camera, x: float, y: float, what: st
     return plane_depth(np.where(alpha >= MIN_ALPHA, depth.cpu().numpy().astype(np.float64), np.inf), row, column)
 
 
-def plane_depth(depth: np.ndarray, row: int, column: int) -> tuple[float, float]:
-    """Return the depth at a pixel of the plane through its neighbours [H, W], and their spread about it [u]."""
+def plane_depth(depth: np.ndarray, row: int, column: int) -> tuple[float, ...]:
+    """Return the depth at a pixel of the plane through its neighbours [H, W], their spread about it [u], and its slopes.
+
+    Slopes are those of the inverse depth over that at the pixel, to the right and down [1/px].
+    """
     # a surface that was fitted to photographs is wavy, and the inverse depth of a plane is linear in pixels; neighbours of
     # another depth are of another surface, and those far off the plane are trimmed
     half, here = max(2, round(AROUND * max(depth.shape))), 1 / depth[row, column]
@@ -75,17 +88,69 @@ def plane_depth(depth: np.ndarray, row: int, column: int) -> tuple[float, float]
         plane = np.linalg.lstsq(terms[kept], inverse[kept], rcond=None)[0]
         off = np.abs(terms @ plane - inverse)
         kept = off <= 2.5 * 1.4826 * np.median(off[kept]) + 1e-9 * here  # of normal errors, 99 % stay
-    return float(1 / plane[0]), float(np.sqrt(np.square(off[kept]).mean()) / here**2)
+    spread = np.sqrt(np.square(off[kept]).mean()) / here**2
+    return tuple(map(float, (1 / plane[0], spread, plane[1] / plane[0], plane[2] / plane[0])))
 
 
-def place_at(model: FittedModel, camera: Camera, x: float, y: float, what: str = "the point") -> Place:
-    """Return the surface point at a pixel; its errors are half a pixel, the spread of depth, and what a second camera shows."""
-    z, spread = pixel_depth(model, camera, x, y, what)
+def matched_depth(
+    photographs: dict[str, np.ndarray], cameras: Mapping[str, Camera], name: str, pixel: tuple[int, int], depth: float,
+    slopes: Sequence[float],
+) -> tuple[float, float] | None:  # fmt: skip
+    """Return depth and spread [u] at a pixel (column, row) at which its patch looks alike in at least two other photographs.
+
+    ``photographs`` are grey [H, W], by name. None if the patch has no texture, or too few others show it as clearly.
+    """
+    import cv2
+
+    (column, row), camera, image = pixel, cameras[name], photographs.get(name)
+    if image is None or camera.model != "pinhole" or min(column, row, *(np.array(image.shape[::-1]) - pixel - 1)) < PATCH:
+        return None
+    down, right = np.mgrid[-PATCH : PATCH + 1, -PATCH : PATCH + 1].reshape(2, -1)
+    changes = np.linspace(-SEARCH, SEARCH, STEPS)
+    inverse = (1 + slopes[0] * right + slopes[1] * down) / depth * (1 + changes[:, None])
+    pixels = np.tile(np.column_stack([column + right, row + down]) + 0.5, (STEPS, 1))
+    points, wanted = back_project(camera, pixels, 1 / inverse.ravel()), _standard(image[row + down, column + right])
+    aside = sorted((float(np.linalg.norm(cameras[n].center - camera.center)), n) for n in photographs if n != name)
+    found = []
+    for _, other in aside[:NEAR]:
+        places, ahead = project_points(cameras[other], points)
+        x, y = np.where(ahead > 0, places.T - 0.5, -1).astype(np.float32)
+        seen = cv2.remap(photographs[other], x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=np.nan)
+        alike = (_standard(seen.reshape(STEPS, -1)) * wanted).sum(1)
+        best = int(np.argmax(np.where(np.isfinite(alike), alike, -1)))
+        around = alike[best - 1 : best + 2]
+        if len(around) == 3 and around[1] >= ALIKE and (bend := 2 * around[1] - around[0] - around[2]) > 0:  # false for NaN
+            found.append((bend, changes[best] + (around[2] - around[0]) / (2 * bend) * (changes[1] - changes[0])))
+    if len(found) < 2:
+        return None
+    weights, shifts = np.array(found).T  # the sharper a maximum, the surer its place
+    shift = (weights * shifts).sum() / weights.sum()
+    spread = math.sqrt((weights * (shifts - shift) ** 2).sum() / weights.sum() / (len(found) - 1))
+    return float(depth / (1 + shift)), depth * spread
+
+
+def _standard(patches: np.ndarray) -> np.ndarray:
+    """Return patches [..., N] less their means, with length 1; NaN without texture."""
+    patches = patches - patches.mean(-1, keepdims=True)
+    lengths = np.linalg.norm(patches, axis=-1, keepdims=True)
+    return patches / np.where(lengths > FLAT * math.sqrt(patches.shape[-1]), lengths, np.nan)
+
+
+def place_at(
+    model: FittedModel, camera: Camera, x: float, y: float, what: str = "the point", match: Match = lambda *_: None
+) -> Place:
+    """Return the surface point at a pixel; its errors are half a pixel, the spread of depth, and what a second camera shows.
+
+    ``match`` may find the depth in photographs, from pixel, depth and slopes; then the spread is theirs, without second camera.
+    """
+    z, spread, *slopes = pixel_depth(model, camera, x, y, what)
+    matched = match((int(x), int(y)), z, slopes)
+    z, spread = matched or (z, spread)
     pixels = np.array([[0.5, 0.5], [0.5, 0.5], [1, 0.5], [0.5, 1]]) + np.floor([x, y])
     point, *others = back_project(camera, pixels, np.array([z, z + spread, z, z]))
     moves = others - point
     aside = [(float(np.linalg.norm(c.center - camera.center)), c) for c in map(model.scene_cameras.get, model.train)]
-    for _, c in sorted((pair for pair in aside if pair[0] > 1e-3 * z), key=lambda pair: pair[0])[:4]:
+    for _, c in sorted((pair for pair in aside if pair[0] > 1e-3 * z), key=lambda pair: pair[0])[: 0 if matched else 4]:
         pixel, (ahead,) = project_points(c, point[None])
         with contextlib.suppress(UsageError):  # it does not see the point
             if ahead > 0 and (seen := pixel_depth(model, c, *pixel[0])[0]) >= (1 - HIDDEN) * ahead:
@@ -104,7 +169,15 @@ def fitted_size(run: StoredRun, name: str) -> str:
     return f"{camera.width} x {camera.height} px as fitted{more}"
 
 
-def picked(run: StoredRun, text: str) -> Place:
+def grey_photographs(run: StoredRun) -> tuple[dict[str, np.ndarray], str]:
+    """Return the training photographs of a run, grey float32 [H, W] by name, and an empty text; else none, and why."""
+    try:
+        return {v.name: v.image.mean(-1, dtype=np.float32) for v in scene_of(run)[1]}, ""
+    except WarpgsError as e:
+        return {}, f"; the depth of picks is the model's alone, because the photographs cannot be read: {e}"
+
+
+def picked(run: StoredRun, text: str, photographs: dict[str, np.ndarray]) -> Place:
     """Return the place of VIEW:x,y, a pixel of a photograph, or of x,y,z in file units, which counts as exact."""
     name, colon, words = text.rpartition(":")
     numbers = numbers_of(words.split(","), (2 if colon else 3,), f"{text[:80]}: a point, VIEW:x,y or x,y,z,")
@@ -113,7 +186,8 @@ def picked(run: StoredRun, text: str) -> Place:
     if name not in run.scene_cameras:
         near = did_you_mean(name, run.scene_cameras) or f"give a name such as {run.train[0]}"
         raise UsageError(f"{text[:80]}: the run has no view {name[:80]!r}; {near}")
-    return place_at(run, run.scene_cameras[name], *numbers, text)
+    match = functools.partial(matched_depth, photographs, run.scene_cameras, name)
+    return place_at(run, run.scene_cameras[name], *numbers, text, match)
 
 
 def distance(n: Normalization, first: Place, second: Place) -> tuple[float, float]:
@@ -283,12 +357,15 @@ def level(
 
     def change(run: StoredRun) -> Levelled:
         texts, length = (scale[:2], metres(scale[2])) if scale else (ground or (), 0.0)
-        places = [picked(run, text) for text in texts]
+        grey, why = grey_photographs(run) if any(":" in text for text in texts) else ({}, "")
+        places = [picked(run, text, grey) for text in texts]
         if not places:
             return photographed(run) if photographs else located(run, *(gps or [None]))
         n, line = scaled(run.normalization, *places, length) if scale else grounded(run, places)
         if names := dict.fromkeys(text.rpartition(":")[0] for text in texts if ":" in text):
-            line += f"; pixels refer to photographs of {' and '.join(dict.fromkeys(fitted_size(run, name) for name in names))}"
+            line += (
+                f"; pixels refer to photographs of {' and '.join(dict.fromkeys(fitted_size(run, name) for name in names))}{why}"
+            )
         if all(":" in text for text in texts):  # pixels stay where they are; coordinates move with the files
             return n, line
         points = np.round(convert_points(np.array([point for point, _ in places]), n, "scene", "file"), 9) + 0.0
