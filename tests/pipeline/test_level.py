@@ -142,6 +142,7 @@ def test_files_get_a_length_and_a_level_ground(run, tmp_path, capsys):
     commands = ["--scale", *picks(ends), f"{100 * length}cm"], ["--ground", *picks(ground())]
     assert [sh("level", run, *words) for words in commands] == [0, 0]
     said = capsys.readouterr().out
+    assert re.search("fitted; [12] of 2 picks were matched in other photographs", said), said
     percent, tilt = (float(re.search(rf"uncertain by ([0-9.]+) {unit}", said)[1]) for unit in ("%", "degrees"))
     n = open_run(run, "cpu").normalization
     turns, centers = poses(run, tmp_path / "cameras")

@@ -320,7 +320,7 @@ def test_the_ruler_picks_and_scales_as_the_command_does(folder, tmp_path):
         measured(0)
         store(None)
         assert "pick two points first" in panel._note.content
-        places = [level.picked(model, f"{model.train[0]}:{columns[i]},{rows[i]}", {}) for i in (0, -1)]
+        places = [level.picked(model, f"{model.train[0]}:{columns[i]},{rows[i]}") for i in (0, -1)]
         units, error = level.distance(model.normalization, *places)
         assert measured(-1) == f"{units:.4g} units, uncertain by {100 * error:.2g} %"
         button(window, "length [m]").value = 3.0

@@ -177,8 +177,11 @@ def grey_photographs(run: StoredRun) -> tuple[dict[str, np.ndarray], str]:
         return {}, f"; the depth of picks is the model's alone, because the photographs cannot be read: {e}"
 
 
-def picked(run: StoredRun, text: str, photographs: dict[str, np.ndarray]) -> Place:
-    """Return the place of VIEW:x,y, a pixel of a photograph, or of x,y,z in file units, which counts as exact."""
+def picked(run: StoredRun, text: str, match: Callable[..., tuple[float, float] | None] = lambda *_: None) -> Place:
+    """Return the place of VIEW:x,y, a pixel of a photograph, or of x,y,z in file units, which counts as exact.
+
+    ``match`` is that of `place_at`, after the name of the view.
+    """
     name, colon, words = text.rpartition(":")
     numbers = numbers_of(words.split(","), (2 if colon else 3,), f"{text[:80]}: a point, VIEW:x,y or x,y,z,")
     if not colon:
@@ -186,8 +189,7 @@ def picked(run: StoredRun, text: str, photographs: dict[str, np.ndarray]) -> Pla
     if name not in run.scene_cameras:
         near = did_you_mean(name, run.scene_cameras) or f"give a name such as {run.train[0]}"
         raise UsageError(f"{text[:80]}: the run has no view {name[:80]!r}; {near}")
-    match = functools.partial(matched_depth, photographs, run.scene_cameras, name)
-    return place_at(run, run.scene_cameras[name], *numbers, text, match)
+    return place_at(run, run.scene_cameras[name], *numbers, text, functools.partial(match, name))
 
 
 def distance(n: Normalization, first: Place, second: Place) -> tuple[float, float]:
@@ -358,14 +360,20 @@ def level(
     def change(run: StoredRun) -> Levelled:
         texts, length = (scale[:2], metres(scale[2])) if scale else (ground or (), 0.0)
         grey, why = grey_photographs(run) if any(":" in text for text in texts) else ({}, "")
-        places = [picked(run, text, grey) for text in texts]
+        matches: list[bool] = []
+
+        def match(*pick) -> tuple[float, float] | None:
+            found = matched_depth(grey, run.scene_cameras, *pick)
+            matches.append(found is not None)
+            return found
+
+        places = [picked(run, text, match) for text in texts]
         if not places:
             return photographed(run) if photographs else located(run, *(gps or [None]))
         n, line = scaled(run.normalization, *places, length) if scale else grounded(run, places)
         if names := dict.fromkeys(text.rpartition(":")[0] for text in texts if ":" in text):
-            line += (
-                f"; pixels refer to photographs of {' and '.join(dict.fromkeys(fitted_size(run, name) for name in names))}{why}"
-            )
+            line += f"; pixels refer to photographs of {' and '.join(dict.fromkeys(fitted_size(run, name) for name in names))}"
+            line += why or f"; {sum(matches)} of {len(matches)} picks were matched in other photographs"
         if all(":" in text for text in texts):  # pixels stay where they are; coordinates move with the files
             return n, line
         points = np.round(convert_points(np.array([point for point, _ in places]), n, "scene", "file"), 9) + 0.0
