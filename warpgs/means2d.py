@@ -69,9 +69,11 @@ def projected_means(
         raise UsageError("read render.means2d before the backward pass: gradients of earlier passes are not kept")
     means2d = select(torch.cat([part.detach()[..., :2] for part in parts])).as_subclass(ProjectedMeans)
     columns = {"grad": slice(0, 2)} | ({"absgrad": slice(10, 12)} if absgrad else {})
+    # a hook that held a part would be held by that part's graph: a cycle through C++ that nothing frees
+    sizes = [part.shape for part in parts]
 
     def keep(i: int, gradient: torch.Tensor) -> None:
-        each = [gradient.detach() if j == i else torch.zeros_like(part) for j, part in enumerate(parts)]
+        each = [gradient.detach() if j == i else gradient.new_zeros(size) for j, size in enumerate(sizes)]
         for name, place in columns.items():  # the passes through the other parts add theirs
             before, found = getattr(means2d, name, None), select(torch.cat([values[..., place] for values in each]))
             setattr(means2d, name, found if before is None else before + found)

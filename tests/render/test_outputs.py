@@ -2,6 +2,8 @@
 
 import copy
 import dataclasses
+import functools
+import gc
 import itertools
 import pickle
 import subprocess
@@ -13,7 +15,9 @@ import torch
 
 from tests.gaussians import LENSES, SMOOTH, camera, cloud, hand_placed, leaves, lens_camera, of_kind
 from tests.tolerances import close
+from warpgs.compat import gsplat
 from warpgs.errors import UsageError
+from warpgs.render.graphed import MIN_CALLS
 from warpgs.render.options import RasterizeOptions
 from warpgs.render.rasterize import rasterize
 from warpgs.scene import Camera, Render
@@ -175,6 +179,58 @@ def test_absgrad_does_not_depend_on_how_it_is_rendered(device, options):
         scalar(r).backward()
         found.append(means2d.absgrad)
     assert float((found[0] - found[1]).norm()) <= 1e-5 * float(found[0].norm())
+
+
+def native_call(device, **options):
+    """Gradients by `rasterize`, whose results are all read."""
+    render = rasterize(
+        leaves(cloud(50, device=device)), camera(40, 24, dtype=torch.float32, device=device), RasterizeOptions(**options)
+    )
+    return [render.rgb, render.means2d, *(getattr(render, name) for name in OUTPUTS)]
+
+
+def gsplat_call(device, **arguments):
+    """Gradients by `compat.gsplat.rasterization`, whose dictionary is read."""
+    given, cam = leaves(cloud(50, device=device)), camera(40, 24, dtype=torch.float32, device=device)
+    tensors = given.means, given.quats, given.log_scales.exp(), given.logit_opacities.sigmoid(), given.sh
+    poses = (torch.as_tensor(t, device=device)[None] for t in (cam.viewmat, cam.K))
+    images, alphas, meta = gsplat.rasterization(*tensors, *poses, cam.width, cam.height, sh_degree=0, **arguments)
+    meta["means2d"].retain_grad()
+    return [images, alphas, *(meta[name] for name in meta)]
+
+
+@pytest.mark.parametrize("backward", [True, False], ids=["backward", "dropped"])
+@pytest.mark.parametrize(
+    "call",
+    [
+        native_call,
+        functools.partial(native_call, absgrad=True, max_instances=60),
+        functools.partial(native_call, median_depth=True, contributions=True, heaviest=2, error_bound=True),
+        functools.partial(gsplat_call, packed=True, render_mode="RGB+ED"),
+        functools.partial(gsplat_call, packed=False, absgrad=True),
+        functools.partial(gsplat_call, packed=False, radius_clip=1.0),
+    ],
+    ids=["native", "chunks", "outputs", "gsplat-packed", "gsplat", "gsplat-clip"],
+)
+def test_a_call_leaves_no_tensor_behind(call, backward, device):
+    """Memory of a loop does not grow: a hook or a node that held its own graph would never be freed."""
+
+    def tensors():
+        gc.collect()
+        return [t for t in gc.get_objects() if issubclass(type(t), torch.Tensor)]
+
+    def run():
+        results = call(device)
+        if backward:
+            results[0].sum().backward()
+
+    for _ in range(MIN_CALLS + 2):  # caches fill, and CUDA captures its graphs
+        run()
+    before = tensors()
+    known = {id(t) for t in before}
+    for _ in range(3):
+        run()
+    assert [t.shape for t in tensors() if id(t) not in known] == []
 
 
 def test_a_strategy_holds_the_projected_means():
