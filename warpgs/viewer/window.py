@@ -392,7 +392,8 @@ class Panel:
             scene.add_icosphere(f"/ruler/{len(places)}", 0.01 * self.window.extent, (255, 221, 51), position=place[0])
             if len(places) == 2:
                 distance, error = level.distance(n, *places)
-                self.measured.content = f"{distance:.4g} {n.unit}, uncertain by {100 * error:.2g} %"
+                matches = level.matches(places, self.window.photographs())
+                self.measured.content = f"{distance:.4g} {n.unit}, uncertain by {100 * error:.2g} %{matches}"
 
         def store(_: Any) -> None:
             if len(places) != 2:
@@ -593,7 +594,11 @@ class Window:
         model = self.content.model
         camera = self.camera_of(client, MAP_SIDE[model.gaussians().means.device.type])
         with self._lock:
-            return level.place_at(model, camera, x * camera.width, y * camera.height)
+            return level.place_at(model, camera, x * camera.width, y * camera.height, self.photographs())
+
+    def photographs(self) -> dict[str, np.ndarray]:
+        """Return the training photographs [H, W, 3] by name; none if the scene cannot be read."""
+        return {n: self.content.views[n].image for n in self.content.model.train if n in self.content.views}
 
     def _connected(self, client: viser.ClientHandle) -> None:
         client.camera.fov = fov_y(self.first, client.camera.aspect)
