@@ -157,7 +157,7 @@ def test_layers_and_the_crop_box_choose_what_is_shown_and_saved(window, tmp_path
 def test_the_first_view_is_that_of_the_page_and_a_narrow_window_shows_the_whole_width(window):
     """The middle training camera, as in scene.html; photographs there are hidden; a narrow window has a wider field of view."""
     model, server = window.content.model, window.server
-    middle = middle_first([model.scene_cameras[n] for n in model.train])[0]
+    middle = middle_first([model.scene_cameras[n] for n in model.train], model.gaussians())[0]
     assert middle is not model.scene_cameras[model.train[0]]
     np.testing.assert_array_equal(server.initial_camera.position, middle.center)
     client = SimpleNamespace(atomic=contextlib.nullcontext, camera=SimpleNamespace(aspect=2.0))
