@@ -268,19 +268,21 @@ def test_pixels_are_those_of_the_fit_and_a_wall_is_no_ground(run, made, tmp_path
     assert alone.startswith("the depth of picks is the model's alone, without photographs: they cannot be read: ")
 
 
-def test_a_second_camera_that_disagrees_adds_to_the_error(run, monkeypatch):
-    """By the distance of the point that it shows; one from which the point is hidden does not."""
+def test_the_error_of_a_pick_depends_on_what_confirms_it(run, monkeypatch):
+    """Photographs, another camera of the model, from which it is not hidden, or nothing; a larger spread of depth counts."""
     stored = open_run(run, "cpu")
     first, second = (stored.scene_cameras[name] for name in stored.train[:2])
     model = SimpleNamespace(scene_cameras=stored.scene_cameras, train=stored.train[:2])
-    depths: dict[int, tuple[float, float]] = {}
-    monkeypatch.setattr(level, "pixel_depth", lambda _, camera, *more: depths[id(camera)])
-    for factor, seen in ((1.05, True), (0.8, False)):
-        ahead = project_points(second, back_project(first, np.array([[48.5, 36.5]]), np.array([2.0])))[1][0]
-        depths |= {id(first): (2.0, 0.0), id(second): (factor * ahead, 0.0)}
-        _, error, matched = level.place_at(model, first, 48, 36, {})
-        axis = second.viewmat[2, :3]
-        assert (math.sqrt(axis @ error @ axis) > 0.049 * ahead) == seen and not matched
+    ahead = project_points(second, back_project(first, np.array([[48.5, 36.5]]), np.array([2.0])))[1][0]
+    for spread, shown, matched, wanted in (
+        (0.0, 1.05, (2.0, 1e-4), 0.003), (0.0, 1.05, None, 0.025), (0.0, 0.8, None, 0.2), (0.3, 1.05, None, 0.15)
+    ):  # fmt: skip
+        depths = {id(first): (2.0, spread), id(second): (shown * ahead, 0.0)}
+        monkeypatch.setattr(level, "pixel_depth", lambda _, camera, *more, depths=depths: depths[id(camera)])
+        monkeypatch.setattr(level, "matched_depth", lambda *_, matched=matched: matched)
+        _, error, known = level.place_at(model, first, 48, 36, {})
+        axis, pixel = first.viewmat[2, :3], 1 / first.K[0, 0]
+        assert known == (matched is not None) and 0.999 * wanted < math.sqrt(axis @ error @ axis) / 2 < wanted + pixel
 
 
 def test_photographs_show_what_is_up():
