@@ -71,8 +71,8 @@ def test_a_page_turns_as_far_as_the_photographs_and_shows_what_they_saw():
     np.testing.assert_allclose(degrees([moved(0.0), moved(1e-3)])[4], 2)  # never stuck
     # a photograph far off the rest is left out: no other one shows what is between
     few = [looking(np.radians(a)) for a in (3, -6, 0, 6, 10)]
-    np.testing.assert_allclose(degrees(html.middle_first([*few, looking(np.radians(80))])), [9, 7, 0, 0, 4], atol=1e-9)
-    near = html.middle_first([looking(np.radians(20 * a)) for a in range(7)])
+    np.testing.assert_allclose(degrees(html.middle_first([*few, looking(np.radians(80))], crowd())), [9, 7, 0, 0, 4], atol=1e-9)
+    near = html.middle_first([looking(np.radians(20 * a)) for a in range(7)], crowd())
     np.testing.assert_allclose(degrees(near), [60, 60, 0, 0, 15], atol=1e-9)
     around = degrees([looking(np.radians(a), 0.5) for a in range(0, 360, 45)])
     np.testing.assert_allclose(around, [np.inf, np.inf, 0, 0, 15], atol=1e-9)
@@ -97,11 +97,15 @@ def test_a_page_turns_as_far_as_the_photographs_and_shows_what_they_saw():
     # but not what one of five sees, which stays vague
     np.testing.assert_allclose(html.seen_at([portrait] * 3 + row[1:], target), [0.3, 0.6])
     cameras = [moved(x) for x in (4.0, 0.0, 1.5, 1.0)]
-    assert [c.center[0] for c in html.middle_first(cameras)] == [1.5, 4.0, 0.0, 1.0] and html.middle_first([]) == []
+    wall = dataclasses.replace(crowd(), means=crowd().means * 0.1 + crowd().means.new_tensor([0, 0, 40.0]))
+    assert [c.center[0] for c in html.middle_first(cameras, wall)] == [1.5, 4.0, 0.0, 1.0] and html.middle_first([], wall) == []
+    # a close-up in the middle shows less than the others
+    cameras[2] = dataclasses.replace(cameras[2], K=cameras[2].K * [[40, 1, 1], [1, 40, 1], [1, 1, 1]])
+    assert html.middle_first(cameras, wall)[0].center[0] == 1.0
     # photographs on their side: the page starts upright, as films and the report do
     roll = np.array([[0.0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
     lying = [dataclasses.replace(c, viewmat=roll @ c.viewmat) for c in (looking(a, 0.3) for a in np.arange(8) * np.pi / 4)]
-    lying = html.middle_first(lying)
+    lying = html.middle_first(lying, crowd())
     assert (lying[0].width, lying[0].height) == (lying[1].height, lying[1].width)
     np.testing.assert_allclose(html.place_first_camera(server, lying[0], three_gaussians(), lying)[1], UP, atol=1e-6)
     assert -lying[0].viewmat[1] @ [*UP, 0] > 0.9

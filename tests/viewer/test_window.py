@@ -157,7 +157,7 @@ def test_layers_and_the_crop_box_choose_what_is_shown_and_saved(window, tmp_path
 def test_the_first_view_is_that_of_the_page_and_a_narrow_window_shows_the_whole_width(window):
     """The middle training camera, as in scene.html; photographs there are hidden; a narrow window has a wider field of view."""
     model, server = window.content.model, window.server
-    middle = middle_first([model.scene_cameras[n] for n in model.train])[0]
+    middle = middle_first([model.scene_cameras[n] for n in model.train], model.gaussians())[0]
     assert middle is not model.scene_cameras[model.train[0]]
     np.testing.assert_array_equal(server.initial_camera.position, middle.center)
     client = SimpleNamespace(atomic=contextlib.nullcontext, camera=SimpleNamespace(aspect=2.0))
@@ -291,8 +291,11 @@ def test_a_run_is_followed_until_it_is_interrupted(folder, monkeypatch, capsys):
     assert all(words in told for words in ("waiting for the first checkpoint", "step 12", "http://127.0.0.1:1/word/"))
 
 
-def test_the_ruler_picks_and_scales_as_the_command_does(folder, tmp_path):
-    """Two clicks at a training camera are its pixels on the command line; a typed length becomes the scale of the files."""
+def test_the_ruler_picks_and_scales_as_the_command_does(folder, tmp_path, monkeypatch):
+    """Two clicks at a training camera are its pixels on the command line; a typed length becomes the scale of the files.
+
+    Clicks are matched in training photographs, as by the command; without them, the panel says that depth is the model's.
+    """
     run = shutil.copytree(folder / "run", tmp_path / "run")
     record, (tensors, state) = json.loads((run / "config.json").read_text()), load_checkpoint(run)
     for values in record["cameras"].values():  # a browser's camera has its principal point in the middle
@@ -301,8 +304,10 @@ def test_the_ruler_picks_and_scales_as_the_command_does(folder, tmp_path):
     tensors["params.logit_opacities"][:] = 4
     save_checkpoint(run, tensors, state)
     server = open_server(0)
-    window = Window(server, content_of_run(run))
-    model, panel = window.content.model, window.panel
+    content = content_of_run(run)
+    window = Window(server, dataclasses.replace(content, views=views_of(content)[0]))
+    model, panel, asked = window.content.model, window.panel, []
+    monkeypatch.setattr(level, "matched_depth", lambda photographs, *pick: asked.append((*photographs,)) or (2.0, 0.01))
     camera = model.scene_cameras[model.train[0]]
     rows, columns = np.nonzero(warpgs.rasterize(model.gaussians(), camera, model.options()).alpha.detach().numpy() > 0.6)
     eye = SimpleNamespace(wxyz=wxyz_of(camera), position=camera.center, fov=fov_y(camera))
@@ -320,12 +325,16 @@ def test_the_ruler_picks_and_scales_as_the_command_does(folder, tmp_path):
         measured(0)
         store(None)
         assert "pick two points first" in panel._note.content
-        places = [level.picked(model, f"{model.train[0]}:{columns[i]},{rows[i]}") for i in (0, -1)]
+        photographs, _ = level.photographs_of(model)
+        places = [level.picked(model, f"{model.train[0]}:{columns[i]},{rows[i]}", photographs) for i in (0, -1)]
         units, error = level.distance(model.normalization, *places)
-        assert measured(-1) == f"{units:.4g} units, uncertain by {100 * error:.2g} %"
+        told = f"{units:.4g} units, uncertain by {100 * error:.2g} %; 2 of 2 picks were matched in training photographs"
+        assert measured(-1) == told and asked == [model.train] * 4
         button(window, "length [m]").value = 3.0
         store(None)
         assert "in metres" in panel.measured.content and measured(0, -1).startswith("3 m,")
+        window.show(dataclasses.replace(window.content, views={}))
+        assert measured(0, -1).endswith("%; the depth of picks is the model's alone, without photographs")
     finally:
         window.close()
         stop_server(server)

@@ -39,15 +39,16 @@ def wxyz_of(camera: Camera) -> np.ndarray:
     return quaternions(torch.from_numpy(np.asarray(camera.viewmat)[None, :3, :3].transpose(0, 2, 1).copy()))[0].numpy()
 
 
+def _seen(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return which points [N, 3] [u] are in a camera's image, bool [N], and the depths of all [N] [u]."""
+    pixels, depths = geometry.project_points(camera, points)
+    return (depths > 0) & (pixels > 0).all(1) & (pixels < [camera.width, camera.height]).all(1), depths
+
+
 def distance_ahead(camera: Camera, gaussians: Gaussians) -> float:
     """Return the median depth [u] of the means that a camera sees, or 1 if it sees none; the view turns about this depth."""
-    means = gaussians.means.detach().cpu().double().numpy()
-    points = matmul(means, camera.viewmat[:3, :3].T) + camera.viewmat[:3, 3]
-    z = points[:, 2]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        x, y = (np.abs(points[:, i] / z * camera.K[i, i]) / size for i, size in ((0, camera.width), (1, camera.height)))
-    seen = (z > 0) & (x < 0.5) & (y < 0.5)
-    return float(np.median(z[seen])) if seen.any() else 1.0
+    seen, depths = _seen(camera, gaussians.means.detach().cpu().double().numpy())
+    return float(np.median(depths[seen])) if seen.any() else 1.0
 
 
 def camera_at(wxyz: Any, position: Any, fov: float, width: int, height: int) -> Camera:
@@ -153,16 +154,27 @@ def place_first_camera(
     return target, up
 
 
-def middle_first(cameras: Sequence[Camera]) -> list[Camera]:
-    """Return cameras that are not far off the rest, first the one nearest to their mean centre, upright, then the others."""
+MOST = 0.95
+"""A page starts at a photograph that covers at least this part of what the best one covers: not at a close-up in the middle."""
+
+
+def middle_first(cameras: Sequence[Camera], gaussians: Gaussians) -> list[Camera]:
+    """Return cameras that are not far off the rest, first, upright, the one at which a view starts, then the others.
+
+    It is the nearest to their mean centre of those that show most of the Gaussians that the others show.
+    """
     if not cameras:
         return []
     centers = np.array([c.center for c in cameras])
     near = geometry.near_cameras(centers)  # what is between a lone camera and the rest, no photograph shows
     cameras, centers = [c for c, kept in zip(cameras, near) if kept], centers[near]
-    nearest = int(np.argmin(np.linalg.norm(centers - centers.mean(0), axis=1)))
-    first = upright(rig_of(cameras, 1.0), cameras[nearest])  # no part of whether photographs lie depends on the depth
-    return [first, *cameras[:nearest], *cameras[nearest + 1 :]]
+    means = gaussians.means.detach().cpu().double().numpy()
+    seen = np.array([_seen(c, means[:: 1 + len(means) // 10_000])[0] for c in cameras], float)
+    covered = (matmul(seen, seen.T) / np.maximum(seen.sum(1), 1)).sum(1)  # of each other one, the part that is seen
+    asides = np.linalg.norm(centers - centers.mean(0), axis=1)
+    first = int(np.argmin(np.where(covered >= MOST * covered.max(), asides, math.inf)))
+    upward = upright(rig_of(cameras, 1.0), cameras[first])  # no part of whether photographs lie depends on the depth
+    return [upward, *cameras[:first], *cameras[first + 1 :]]
 
 
 def turning_limits(cameras: Sequence[Camera], target: np.ndarray, up: np.ndarray) -> tuple[np.ndarray, float]:
@@ -264,7 +276,7 @@ def write_html(
 
 
 def export_html(folder: Path, target: Path, filters: Filters = NO_FILTERS) -> list[str]:
-    """Write a run as one HTML file that starts at the middle training camera; returns lines for the user."""
+    """Write a run as one HTML file that starts at a training camera in the middle; returns lines for the user."""
     require_viser()
     run = open_run(folder, "cpu")
     gaussians, rotation, lines = filtered(file_gaussians(run), run, filters, True, run.normalization.origin)
@@ -279,7 +291,7 @@ def export_html(folder: Path, target: Path, filters: Filters = NO_FILTERS) -> li
     cameras = [convert_camera(c, found, "file", "scene") for c in cameras]
     with hold_file(target) as held:
         title = target.stem.encode("utf-8", "replace").decode()  # ? for bytes that are not UTF-8
-        notes = write_html(target, gaussians, middle_first(cameras), run.background, title, found)
+        notes = write_html(target, gaussians, middle_first(cameras, gaussians), run.background, title, found)
     if run.antialiased:
         notes.append("the page shows the model without antialiasing: too bright from afar and in small windows")
     size = format_bytes(target.stat().st_size)

@@ -392,7 +392,8 @@ class Panel:
             scene.add_icosphere(f"/ruler/{len(places)}", 0.01 * self.window.extent, (255, 221, 51), position=place[0])
             if len(places) == 2:
                 distance, error = level.distance(n, *places)
-                self.measured.content = f"{distance:.4g} {n.unit}, uncertain by {100 * error:.2g} %"
+                matches = level.matches(places, self.window.photographs())
+                self.measured.content = f"{distance:.4g} {n.unit}, uncertain by {100 * error:.2g} %{matches}"
 
         def store(_: Any) -> None:
             if len(places) != 2:
@@ -439,9 +440,11 @@ class Window:
         cameras = list(content.model.scene_cameras.values())
         train = [content.model.scene_cameras[n] for n in content.model.train]
         # the limits include held-out cameras, too, because the user can step into each, without those far off the rest
-        self._rig = [*html.middle_first(train), *html.middle_first(cameras)] or [html.camera_before(content.model.gaussians())]
+        gaussians = content.model.gaussians()
+        rigs = (html.middle_first(some, gaussians) for some in (train, cameras))
+        self._rig = [*itertools.chain(*rigs)] or [html.camera_before(gaussians)]
         self.first = self._rig[0]
-        ahead = html.distance_ahead(self.first, content.model.gaussians())
+        ahead = html.distance_ahead(self.first, gaussians)
         self.extent = camera_extent(cameras) if len(cameras) > 1 else 0.1 * ahead
         self.maps = Maps(content, self.extent)
         self.removed: list[dict[str, torch.Tensor]] = []
@@ -450,7 +453,7 @@ class Window:
         self._drawn: dict[int, tuple[Any, ...]] = {}
         self._lock, self._wake, self._open = threading.RLock(), threading.Event(), True
         rig, up = cameras or [self.first], content.model.normalization.up
-        self._target, self._up = html.place_first_camera(server, self.first, content.model.gaussians(), rig, up)
+        self._target, self._up = html.place_first_camera(server, self.first, gaussians, rig, up)
         server.scene.set_background_image(html.plain_background(content.model.background), format="png")
         self.panel = Panel(server, content, self, maps)
         self.limit()
@@ -593,7 +596,11 @@ class Window:
         model = self.content.model
         camera = self.camera_of(client, MAP_SIDE[model.gaussians().means.device.type])
         with self._lock:
-            return level.place_at(model, camera, x * camera.width, y * camera.height)
+            return level.place_at(model, camera, x * camera.width, y * camera.height, self.photographs())
+
+    def photographs(self) -> dict[str, np.ndarray]:
+        """Return the training photographs [H, W, 3] by name; none if the scene cannot be read."""
+        return {n: self.content.views[n].image for n in self.content.model.train if n in self.content.views}
 
     def _connected(self, client: viser.ClientHandle) -> None:
         client.camera.fov = fov_y(self.first, client.camera.aspect)
