@@ -111,7 +111,6 @@ REASONS = {
         "onnx_bytes": OWN},
     "report/film.py": {"_encode_vp9": OWN, "_decoded_sizes": OWN},
     "report/images.py": {"webp": OWN},
-    "report/page.py": {"_aspect": OWN},
     "kernels/native.py": {"source": "reads a file of the package",
         "exclusive": "opens a lock"},
     "clock.py": {"_age": SYSTEM},

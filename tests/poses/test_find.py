@@ -164,15 +164,19 @@ def test_videos_that_cannot_work(sfm, tmp_path, capfd):
 
 
 def test_pairs_are_chosen_and_copies_are_small(sfm, tmp_path, photographs, found, monkeypatch):
-    """As for many and large photographs: copies of less than their size are matched; cameras are of full size."""
+    """As for many and large photographs: copies of less than their size are matched; cameras are of full size.
+
+    Progress on matching comes between its pairs, too.
+    """
     monkeypatch.setattr(mapping, "EXHAUSTIVE", 5)
+    monkeypatch.setattr(mapping, "PROGRESS_INTERVAL", 0.001)
     for room in (mapping, module_of_photographs):
         monkeypatch.setattr(room, "MATCHING_SIDE", 216)
     said: list[str] = []
     record = find_poses(photographs, tmp_path / "out", progress=said.append)
     assert all(p["registered"] for p in record["photographs"]) and record["pairs_tried"] == 15
-    # a second step would index the descriptors again
-    assert [line for line in said if line.startswith("matching")] == ["matching: pair 1 of 15"]
+    done = [int(counted[1]) for line in said if (counted := re.fullmatch(r"matching: (\d+) of 15 pairs", line))]
+    assert done[0] == 0 and done == sorted(done) and len(set(done)) > 3
     assert [c["width"] for c in record["cameras"]] == [c["width"] for c in found[1]["cameras"]]
 
 

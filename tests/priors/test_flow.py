@@ -12,6 +12,7 @@ from tests.priors.rigs import rig, still_life, write_flo
 from warpgs.errors import DataError, UsageError
 from warpgs.geometry import back_project, project_points
 from warpgs.priors.flow import (
+    _ratio_matches,
     epipolar_depth,
     flo_names,
     flow_between,
@@ -249,3 +250,20 @@ def test_files_that_are_no_flow_network(tmp_path):
         flow_between(views, nw.write(tmp_path / "sum.onnx", nw.model(graph)))(0, 1)
     with pytest.raises(UsageError, match="deepflow"):
         flow_between(views, str(tmp_path / "nowhere"))
+
+
+# Matches of SIFT descriptors.
+
+
+@pytest.mark.parametrize(("first", "second"), [(2, 2), (31, 33), (64, 1), (100, 65)])
+def test_matches_pass_lowes_test_of_exact_distances(first, second):
+    """As by integers, for any number of descriptors, of the largest distances and of ties."""
+    generator = np.random.default_rng(first)
+    a, b = (generator.integers(0, 256, (n, 128)).astype(np.uint8) for n in (first, second))
+    a[: len(b) // 2] = np.clip(b[: len(b) // 2][: len(a)].astype(int) + generator.integers(-9, 9), 0, 255)[: len(a)]
+    a[0], a[-1], b[0], b[-1] = 3, 255, 0, b[len(b) // 2]
+    squares = np.square(a[:, None].astype(int) - b).sum(-1)
+    order = np.argsort(squares, axis=1, kind="stable")
+    wanted = [(i, o[0]) for i, o in enumerate(order) if len(b) > 1 and squares[i, o[0]] < 0.64 * squares[i, o[1]]]
+    assert len(wanted) >= (len(b) > 1) and _ratio_matches(a, b).tolist() == [list(map(int, w)) for w in wanted]
+    assert _ratio_matches(a, None).shape == _ratio_matches(a[:1], b).shape == (0, 2)

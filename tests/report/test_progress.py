@@ -111,6 +111,19 @@ def test_time_left_counts_the_growth_to_come_and_does_not_rise(capsys, clock, sp
     assert len(left) > 7 and left[-1] == (600, 0)
 
 
+def test_a_step_takes_no_sum_over_those_left(clock):
+    """They are tens of thousands in fits of many views."""
+
+    class Times(list):
+        def __getitem__(self, _):
+            pytest.fail("asked again")
+
+    with Progress(3, planned=Times([1.0, 2.0, 4.0]), live=False) as progress:
+        for step in (1, 2):
+            progress.update(step=step, loss=0.1, psnr=30.0, count=5, seconds=6.0)
+        assert progress.left == 12
+
+
 def test_durations_and_stages_of_the_set_up(clock):
     for seconds, text in {
         59.4: "59 s",

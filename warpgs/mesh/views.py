@@ -1,5 +1,6 @@
 """Depth of a model's surface as many views see it, and where the views agree."""
 
+import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
@@ -264,7 +265,8 @@ def depth_difference(
     columns = [(left + i).clamp(0, width - 1).long() for i in (0, 1)]
     rows = [(top + i).clamp(0, height - 1).long() * width for i in (0, 1)]
     # the nearest of the four depths around the point, since depth varies within a pixel on a slanted surface
-    flat = surface.flatten()
-    around = torch.stack([flat[r + c] for r in rows for c in columns])
-    least = torch.where(around > 0, (around - z).abs(), torch.inf).amin(0)
+    known = torch.where(surface > 0, surface, torch.inf)
+    least = torch.full_like(z, torch.inf)
+    for row, column in itertools.product(rows, columns):
+        torch.minimum(least, known.take(row + column).sub_(z).abs_(), out=least)
     return u, v, torch.where(inside, least / z, torch.inf)

@@ -5,6 +5,7 @@ import itertools
 import json
 import sys
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -25,6 +26,8 @@ JOB, LEARNED = "job.json", "learned.npz"
 """Names of the files with the worker's input, and with keypoints and matches of a network."""
 IMAGES, DATABASE, PAIRS, MODELS, MODEL = "small", "matches.db", "pairs.txt", "models", "model"
 """Names in the folder that the worker runs in: relative, since pycolmap takes names in UTF-8 alone."""
+PROGRESS_INTERVAL = 2.0
+"""Time between two lines of progress on matching [s]."""
 LAST_WORDS = 500
 """Number of letters of pycolmap's last message that an error shows."""
 Json = dict[str, Any]
@@ -101,6 +104,7 @@ def _job(photographs: list[Photograph], names: list[str], kind: str, folder: Pat
     return {
         "names": names, "camera_of": of, "cameras": cameras, "kind": kind, "threads": threads, "exhaustive": EXHAUSTIVE,
         "sizes": [(p.width, p.height) for p in photographs], "scene_names": [p.name for p in photographs], "learned": learned,
+        "interval": PROGRESS_INTERVAL,
     }  # fmt: skip
 
 
@@ -265,10 +269,14 @@ def match(pycolmap: Any, job: Json) -> Json:
     matching.num_threads, matching.use_gpu = job["threads"], False
     chosen = pycolmap.ImportedPairingOptions()
     chosen.match_list_path = PAIRS
-    # each step indexes the descriptors of its photographs anew; an index costs about as much as matching a pair
-    for some in _in_steps(pairs, "matching: pair", 5 * len(order)):
-        _write_pairs(some, job)
-        pycolmap.match_image_pairs(DATABASE, matching, chosen, verification, pycolmap.Device.cpu)
+    _write_pairs(pairs, job)
+    # one call, since each call indexes the descriptors of its photographs anew; meanwhile the rows of its results are counted
+    with pycolmap.Database.open(DATABASE) as database, ThreadPoolExecutor(1) as thread:
+        call = thread.submit(pycolmap.match_image_pairs, DATABASE, matching, chosen, verification, pycolmap.Device.cpu)
+        while not call.done():
+            _say(progress=f"matching: {database.num_matched_image_pairs()} of {len(pairs)} pairs")
+            wait([call], job["interval"])
+        call.result()
     return matched(pycolmap, job, len(pairs))
 
 

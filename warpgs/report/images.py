@@ -86,11 +86,13 @@ def error_map(image: np.ndarray, reference: np.ndarray, largest: float = 0.3) ->
 def depth_map(depth: np.ndarray, alpha: np.ndarray) -> np.ndarray:
     """Return colours [H, W, 3] of inverse depth, near warm, far cold; gray where alpha is at most 0.5 or depth is 0."""
     valid = (alpha > 0.5) & (depth > 0)
-    colors = np.full((*depth.shape, 3), GRAY, np.float32)
+    values = np.zeros(depth.shape)
     if valid.any():
         inverse = 1 / depth[valid]
         low, high = np.percentile(inverse, [2, 98])
-        colors[valid] = colored(((inverse - low) / max(high - low, 1e-12))[:, None], "TURBO")[:, 0]
+        values[valid] = (inverse - low) / max(high - low, 1e-12)
+    colors = colored(values, "TURBO")
+    colors[~valid] = GRAY
     return colors
 
 

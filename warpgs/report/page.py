@@ -2,7 +2,6 @@
 
 import base64
 import hashlib
-import io
 import json
 import math
 import re
@@ -13,6 +12,7 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 from urllib.parse import quote
 
 from warpgs.files import write_text
+from warpgs.io.image_files import format_of, header_size
 from warpgs.process import Detail, Task
 
 MOST_BYTES = 100
@@ -142,10 +142,8 @@ def _data_uri(data: bytes) -> str:
 
 def _aspect(data: bytes) -> float:
     """Return the width of an image file in units of its height."""
-    from PIL import Image
-
-    with Image.open(io.BytesIO(data)) as image:
-        return image.width / image.height
+    width, height = header_size(format_of(data), data)
+    return width / height
 
 
 def _without_folders(value: object) -> object:

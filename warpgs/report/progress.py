@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import itertools
 import json
 import math
 import os
@@ -161,7 +162,8 @@ class Progress:
         ``planned`` is the expected time of each step, in any unit; None: all are equal.
         """
         self.total, self.told, self.step = total, done, done
-        self.planned = [1.0] * total if planned is None else planned
+        self.planned = [0.0, *itertools.accumulate([1.0] * total if planned is None else planned)]
+        """Expected time up to the end of each step, from 0."""
         self.took = self.expected = 0.0
         """Sums of measured and planned times of the last steps, with falling weights."""
         self.left: float | None = None
@@ -203,8 +205,8 @@ class Progress:
         if seconds is not None:
             self.seconds = _mean(self.seconds, seconds)
             self.took = FORGETTING * self.took + seconds
-            self.expected = FORGETTING * self.expected + self.planned[step - 1]
-            left = self.took / self.expected * sum(self.planned[step : self.total])
+            self.expected = FORGETTING * self.expected + self.planned[step] - self.planned[step - 1]
+            left = self.took / self.expected * (self.planned[self.total] - self.planned[step])
             if self.left is None or not self.left < left < (1 + NOISE) * self.left:
                 self.left = left
         now = time.perf_counter()

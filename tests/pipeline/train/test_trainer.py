@@ -17,6 +17,7 @@ import torch
 import warpgs
 from tests.pipeline.train.fits import advanced
 from tests.scenes import photos, priors, seeds
+from warpgs.clock import Clock, timed
 from warpgs.errors import DataError, NotFiniteError, UsageError
 from warpgs.geometry import look_at
 from warpgs.kernels.neighbours import morton_codes
@@ -450,3 +451,17 @@ def test_a_fit_is_the_same_after_a_background_warmup():
         run(fit, lambda _: None, lambda _: None, lambda: False)
         fits.append(fit.gaussians.tensors())
     assert all(torch.equal(fits[0][n], fits[1][n]) for n in fits[0])
+
+
+def test_reports_of_steps_count_as_their_time():
+    """On the clock of a fit."""
+    now, views = [0.0], photos(2)
+    fit = Trainer(views, seeds(), dataclasses.replace(CHOSEN["quick"], steps=6), WARMUP_CPU, priors=priors(views))
+
+    def on_step(_) -> None:
+        now[0] += 1
+
+    with timed(Clock(now=lambda: now[0])) as clock:
+        run(fit, on_step, lambda _: None, lambda: False)
+    times = clock.seconds()
+    assert times["other"] == 0 and sum(s for name, s in times.items() if name.startswith("steps (phase ")) == 6

@@ -409,14 +409,18 @@ def fit(
             if ranks.first:
                 beside.enter_context(compiled_ahead(chosen))
         began = time.perf_counter()
-        lpips = None if lpips_weights is None else Lpips(Path(lpips_weights), chosen)
+        lpips = None
+        if lpips_weights is not None:
+            with section("scoring"):
+                lpips = Lpips(Path(lpips_weights), chosen)
         read, request, parts, found = _read(scene, split, chosen, out, progress, ranks)
         job = FitJob(
             scene=read, request=request, split=parts, config=config, device=chosen, where=where, out=own, lpips=lpips,
             notes=[*notes, *origin, *held, *found], verbose=verbose, on_step=on_step, on_model=on_model, ranks=ranks,
             began=began, clock=clock, progress=progress, compiled=compiled,
         )  # fmt: skip
-        _settle(job, time_budget)
+        with section("set-up"):
+            _settle(job, time_budget)
         thread, stopped = beside.enter_context(ThreadPoolExecutor(1)), threading.Event()
         beside.callback(stopped.set)
         views = itertools.takewhile(lambda _: not stopped.is_set(), read.views)
@@ -424,7 +428,8 @@ def fit(
         hashed = thread.submit(lambda: read.fingerprint if isinstance(scene, Scene) else fingerprint(views))
         trainer, record, checks = _prepare(job, out if resume else None, hashed.result)
         if own is not None and not resume:
-            write_json(own / CONFIG, record)
+            with section("writing"):
+                write_json(own / CONFIG, record)
         result = _finish(job, trainer, record, checks)
     ranks.leave()
     return result
@@ -576,7 +581,8 @@ def _finish(job: FitJob, trainer: Trainer, record: dict[str, Any], checks: list[
         metrics["wall_seconds"] = job.clock.seconds()
         job.notes += pose_tasks(job.out)
         if job.out is not None:
-            write_json(job.out / METRICS_FILE, metrics)
+            with section("writing"):
+                write_json(job.out / METRICS_FILE, metrics)
             record["notes"] = job.notes
             with section("report"):
                 results.write_report(

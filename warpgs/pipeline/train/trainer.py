@@ -486,9 +486,9 @@ def run(
     """
     every, saved, ran_out = trainer.config.checkpoint_every, time.monotonic(), -1
     while trainer.step < trainer.steps:
-        reports, failure = [], None
+        reports, failure, phase = [], None, f"steps (phase {trainer.phases.number(trainer.step)})"
         try:
-            with section(f"steps (phase {trainer.phases.number(trainer.step)})"):
+            with section(phase):
                 reports = trainer.advance(every - trainer.step % every)
         except OutOfMemoryError as e:
             failure = e.with_traceback(None)  # whose frames hold tensors
@@ -504,8 +504,9 @@ def run(
                     save(trainer)
                 raise
             continue
-        for report in reports:
-            on_step(report)
+        with section(phase):
+            for report in reports:
+                on_step(report)
         stop = trainer.taker.agreed(stopped())
         due = trainer.step % every == 0 and (every < ALL_SAVED or time.monotonic() - saved >= CHECKPOINT_SECONDS)
         if stop or due or trainer.step == trainer.steps:
