@@ -58,7 +58,7 @@ class CameraModel:
 
 CAMERA_MODELS = Registry("camera model", CameraModel, "warpgs.kernels.cameras")
 """Camera models by name."""
-register = CAMERA_MODELS.register
+register = register_camera_model = CAMERA_MODELS.register
 
 
 def check_camera(camera: Camera) -> type[CameraModel]:

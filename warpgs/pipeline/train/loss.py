@@ -119,7 +119,7 @@ class LossTerm(Checked):
 
 LOSS_TERMS = Registry("loss term", LossTerm, "warpgs.pipeline.train.loss")
 """Loss terms by name."""
-register = LOSS_TERMS.register
+register = register_loss_term = LOSS_TERMS.register
 
 
 def term_values(terms: Sequence[LossTerm], inputs: LossInputs) -> list[torch.Tensor]:

@@ -143,7 +143,7 @@ class ViewModule(Checked):
 
 VIEW_MODULES = Registry("view module", ViewModule, __name__)
 """View modules by name; those in the modules of this folder are built in."""
-register = VIEW_MODULES.register
+register = register_view_module = VIEW_MODULES.register
 
 
 # Exposure of training views: an affine map of rendered colours for each view, learned with the Gaussians.
