@@ -134,8 +134,8 @@ def make_linear(real: type) -> SimpleNamespace:
             wp.clamp(pixel[1], -margin * height, height + margin * height),
         )
 
-    def products(jacobian: Callable[..., Any]) -> dict[str, object]:
-        """Return ``project_axes`` and ``axes_backward`` of a model by its ``jacobian(position, K, lens, point) -> Rows``."""
+    def model(jacobian: Callable[..., Any], **functions: Any) -> SimpleNamespace:
+        """Return the functions of a model: the given ones, and those by its ``jacobian(position, K, lens, point) -> Rows``."""
 
         @wp.func
         def project_axes(position: vec3, K: mat33, lens: Reals, point: vec2, axes: mat33) -> Rows:
@@ -148,11 +148,12 @@ def make_linear(real: type) -> SimpleNamespace:
             j = jacobian(position, K, lens, point)
             return wp.outer(j.first, v_first) + wp.outer(j.second, v_second)
 
-        return {"project_axes": project_axes, "axes_backward": axes_backward}
+        usual = {"in_range": in_front, "depth_of": z_of, "expansion_point": clamped}
+        return SimpleNamespace(project_axes=project_axes, axes_backward=axes_backward, **usual | functions)
 
     return SimpleNamespace(
         Rows=Rows, Gradients=Gradients, intrinsics_of=intrinsics_of, in_front=in_front, z_of=z_of, unclamped=unclamped,
-        clamped=clamped, products=products,
+        clamped=clamped, model=model,
     )  # fmt: skip
 
 
@@ -273,10 +274,8 @@ class Orthographic(CameraModel):
             v_position = vec3(v_pixel[0] * K[0, 0], v_pixel[1] * K[1, 1], v_depth)
             return linear.Gradients(v_position, linear.intrinsics_of(fx, fy, v_pixel))
 
-        return SimpleNamespace(
-            in_range=linear.in_front, depth_of=linear.z_of, pixel_of=pixel_of, expansion_point=linear.unclamped,
-            position_backward=position_backward, **linear.products(jacobian),
-        )  # fmt: skip
+        unclamped = linear.unclamped
+        return linear.model(jacobian, pixel_of=pixel_of, expansion_point=unclamped, position_backward=position_backward)
 
 
 @register("opencv")
@@ -383,10 +382,7 @@ class OpenCV(CameraModel):
             v_z = -(v_a * a0 + v_b * b0 + first * jx + second * jy) * inv_z + v_depth
             return linear.Gradients(vec3(v_a * inv_z, v_b * inv_z, v_z), v_K)
 
-        return SimpleNamespace(
-            in_range=in_range, depth_of=linear.z_of, pixel_of=pixel_of, expansion_point=linear.clamped,
-            position_backward=position_backward, **linear.products(jacobian),
-        )  # fmt: skip
+        return linear.model(jacobian, in_range=in_range, pixel_of=pixel_of, position_backward=position_backward)
 
 
 @functools.cache
@@ -553,9 +549,9 @@ class Fisheye(CameraModel):
             v_position = vec3(v_x, v_y, v_z) / distance + v_depth * unit
             return linear.Gradients(v_position, linear.intrinsics_of(fx, fy, v_pixel))
 
-        return SimpleNamespace(
-            in_range=in_range, depth_of=radial.distance, pixel_of=pixel_of, expansion_point=linear.unclamped,
-            position_backward=position_backward, **linear.products(jacobian),
+        return linear.model(
+            jacobian, in_range=in_range, depth_of=radial.distance, pixel_of=pixel_of, expansion_point=linear.unclamped,
+            position_backward=position_backward,
         )  # fmt: skip
 
 

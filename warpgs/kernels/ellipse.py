@@ -173,8 +173,7 @@ class _PackedCovariances(torch.autograd.Function):
 
 def packed_covariances(covars: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Return the symmetric part of covariances [N, 3, 3] as xy, xz, yz and a 0 [N, 4], and diagonals [N, 3]. Differentiable."""
-    found: tuple[torch.Tensor, torch.Tensor] = _PackedCovariances.apply(covars)
-    return found
+    return _PackedCovariances.apply(covars)
 
 
 @functools.cache
@@ -418,13 +417,11 @@ def make_projection(real, camera_model: str, parameters: str = "stored", lanes: 
             )  # fmt: skip
         return vec4(d[0], d[1], d[2], length * largest)
 
-    return SimpleNamespace(
-        Ellipse=Ellipse, ellipse=ellipse, factor_of=factor_of, compensation=compensation,
-        sigmoid=sigmoid, opacity_of=opacity_of, scales_of=scales_of,
-        direction=direction, finite3=finite3, project_axes=camera.project_axes,
-        rotation=r.rotation, rotation_backward=r.rotation_backward, rotation_of=r.rotation_of,
-        depth_of=camera.depth_of, axes_backward=camera.axes_backward, position_backward=camera.position_backward,
-    )  # fmt: skip
+    own = {
+        "Ellipse": Ellipse, "ellipse": ellipse, "factor_of": factor_of, "compensation": compensation, "sigmoid": sigmoid,
+        "opacity_of": opacity_of, "scales_of": scales_of, "direction": direction, "finite3": finite3,
+    }  # fmt: skip
+    return SimpleNamespace(**vars(camera) | vars(r) | own)
 
 
 @functools.cache

@@ -38,17 +38,12 @@ class Allocator:
         """Return a new tensor of a shape [...]."""
         return torch.empty(shape, dtype=dtype, device=device)
 
-    def output(self, shape: tuple[int, ...], dtype: torch.dtype, device: torch.device) -> torch.Tensor:
-        """Return a new tensor of a shape [...] that the caller may keep."""
-        return self.new("output", shape, dtype, device)
-
-    def saved(self, shape: tuple[int, ...], dtype: torch.dtype, device: torch.device) -> torch.Tensor:
-        """Return a new tensor of a shape [...] that the backward pass needs."""
-        return self.new("saved", shape, dtype, device)
-
-    def workspace(self, shape: tuple[int, ...], dtype: torch.dtype, device: torch.device) -> torch.Tensor:
-        """Return a new tensor of a shape [...] that is needed only until the function returns."""
-        return self.new("workspace", shape, dtype, device)
+    output = functools.partialmethod(new, "output")
+    """Return a new tensor of a shape [...] that the caller may keep."""
+    saved = functools.partialmethod(new, "saved")
+    """Return a new tensor of a shape [...] that the backward pass needs."""
+    workspace = functools.partialmethod(new, "workspace")
+    """Return a new tensor of a shape [...] that is needed only until the function returns."""
 
 
 TORCH = Allocator()
@@ -173,9 +168,10 @@ class CapturedGraph:
         finally:
             caller.wait_stream(stream)
 
-    def replay(self) -> None:
-        """Run the graph on the current stream."""
+    def replay(self) -> object:
+        """Run the graph on the current stream; return what the work returned."""
         self._graph.replay()
+        return self.result
 
     def pool(self) -> tuple[int, int]:
         """Return the handle of the graph's memory, for graphs that share it."""
@@ -276,8 +272,7 @@ class GraphedFunction:
     def _run(self, arena: Arena, inputs: tuple[torch.Tensor | None, ...]) -> None:
         """Call the function without a graph."""
         arena.begin()  # a capture may have ended half way
-        found = self.function(arena, *inputs)
-        self._places = [arena.place(t) for t in found]
+        self._places = [arena.place(t) for t in self.function(arena, *inputs)]
 
     def _capture(self, key: tuple[int, ...], arena: Arena, inputs: tuple[torch.Tensor | None, ...]) -> CapturedGraph | None:
         """Return a new graph; None if a capture would not pay or is not possible."""

@@ -265,9 +265,7 @@ class _Recorded:
         raise TypeError(f"{self.kernel.key}: {label} must be {self.dtypes[i]} on {kind}, not {found}")
 
 
-@functools.cache
-def _recorded(kernel, device: torch.device, block_dim: int) -> _Recorded:
-    return _Recorded(kernel, device, block_dim)
+_recorded = functools.cache(_Recorded)
 
 
 class _OfThread(threading.local):
@@ -497,8 +495,7 @@ def first_order(backward: Callable[..., Any]) -> Callable[..., Any]:
 def without_gradient(name: str, values: torch.Tensor, source: torch.Tensor) -> torch.Tensor:
     """Return values [...]; a gradient through them is an error where ``source`` [...] requires gradients."""
     message = f"{name} has no gradient: use {name}.detach(), or a loss of rgb, alpha, depth or features instead"
-    found: torch.Tensor = _Refusing.apply(message, values, source)
-    return found
+    return _Refusing.apply(message, values, source)
 
 
 def refuse_transforms() -> None:

@@ -189,14 +189,11 @@ def told_of_compiling(listener: Say) -> Iterator[list[float]]:
 SILENT = 2.0
 """Time of compiling after which a process prints a line if there is no listener [s]; modules with shorter gaps count as one."""
 _since = _until = -math.inf
-_said = False
 
 
+@functools.cache
 def _say_compiling() -> None:
-    global _said
-    if not _said:
-        _said = True
-        say("warpgs: compiling kernels, once on this machine, for up to a minute", error=True)
+    say("warpgs: compiling kernels, once on this machine, for up to a minute", error=True)
 
 
 @contextlib.contextmanager

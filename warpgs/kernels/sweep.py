@@ -572,8 +572,7 @@ def scanline_costs(costs: torch.Tensor, down: torch.Tensor, across: torch.Tensor
         inputs = [costs, bounds.contiguous(), small, padded, *steps, length, *edges]
         if cpu:
             path = torch.empty(lines * 2 * (padded + 2 * LANES), dtype=torch.int16, device="cpu")
-            cost = max(1, length * padded // 20)
-            launch.launch(follow_cpu, lines, [*inputs, path, total], costs.device, cost=cost)
+            launch.launch(follow_cpu, lines, [*inputs, path, total], costs.device, cost=max(1, length * padded // 20))
         else:
             path = torch.empty(lines, 2 * (planes + 2), dtype=torch.int32, device=costs.device)
             launch.launch(follow, BLOCK * lines, [*inputs, path, total], costs.device, block_dim=BLOCK)

@@ -431,8 +431,7 @@ def running_counts(counts: torch.Tensor, real, allocator: Allocator = TORCH, out
     device, count, native = counts.device, len(counts), counts.is_cuda
     sums, threads = sum_entries(count, native)
     packed = allocator.workspace((sums,), torch.int64, device) if out is None else out
-    kernel = make_kernels(real, native).pack_counts
-    launch.launch(kernel, threads, [counts, sum_bits(count), packed], device)
+    launch.launch(make_kernels(real, native).pack_counts, threads, [counts, sum_bits(count), packed], device)
     return torch.cumsum(packed, 0, out=packed)
 
 

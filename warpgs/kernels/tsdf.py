@@ -182,8 +182,7 @@ def integrate(
         depth.new_tensor([origin]), voxel, truncation, *distances.shape[1:], *_pose(camera, depth), depth, pixel_weights,
         distances, weights,
     ]  # fmt: skip
-    kernels = make_kernels(launch.real_of(depth))
-    launch.launch(kernels.integrate, distances.numel(), inputs, depth.device, cost=3)
+    launch.launch(make_kernels(launch.real_of(depth)).integrate, distances.numel(), inputs, depth.device, cost=3)
 
 
 def gather_colors(
@@ -192,5 +191,4 @@ def gather_colors(
 ) -> None:  # fmt: skip
     """Add one view's weighted colours in place to the points [N, 3] on the surface that it sees, within ``tolerance`` [u]."""
     inputs = [points, tolerance, *_pose(camera, points), depth, pixel_weights, image, sums, weights]
-    kernels = make_kernels(launch.real_of(points))
-    launch.launch(kernels.gather, len(points), inputs, points.device, cost=5)
+    launch.launch(make_kernels(launch.real_of(points)).gather, len(points), inputs, points.device, cost=5)

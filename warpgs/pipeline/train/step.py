@@ -340,7 +340,7 @@ class StepTaker:
                 render = captured_renderer(self.options, capacity, buffers.stop)
                 work = functools.partial(function, stacks[kind], buffers, plan, render)
                 self._graphs[kind, plan] = self.capture(work, buffers)
-        return [functools.partial(_replay, self._graphs[kind, plan]) for kind in kinds]
+        return [self._graphs[kind, plan].replay for kind in kinds]
 
     def capacity(self, kind: Kind, stacks: Mapping[Kind, ViewStack], plan: StepPlan, max_instances: int | None) -> int:
         """Return the capacity of captured steps with a kind of view, or raise OverLimitError above ``max_instances``."""
@@ -381,12 +381,6 @@ class StepTaker:
     def stopped_slot(self) -> int:
         """Return the first slot that stopped the last steps; 0 if none did, or in steps of one view."""
         return 0
-
-
-def _replay(graph: CapturedGraph) -> object:
-    """Replay a graph, and return what its work returned."""
-    graph.replay()
-    return graph.result
 
 
 @torch.no_grad()
