@@ -99,8 +99,7 @@ def _ray_lengths(rays: np.ndarray, others: np.ndarray, tau: np.ndarray) -> tuple
     z = (np.cross(others, tau) * normal).sum(1) / square
     # cross with the ray: mu (other x ray) = tau x ray
     mu = -(np.cross(tau, rays) * normal).sum(1) / square
-    sine = np.sqrt(square / ((rays**2).sum(1) * (others**2).sum(1)))
-    return z, mu, sine
+    return z, mu, np.sqrt(square / ((rays**2).sum(1) * (others**2).sum(1)))
 
 
 def round_trip(matches: np.ndarray, pixels: np.ndarray, back: np.ndarray) -> np.ndarray:
@@ -347,8 +346,7 @@ def _same_size(views: Sequence[View], i: int, j: int, compute: Callable[[View, V
     first, second = views[i], views[j]
     a, b = first.camera, second.camera
     if (a.width, a.height) != (b.width, b.height):
-        image = cv2.resize(second.image, (a.width, a.height), interpolation=cv2.INTER_AREA)
-        second = View(second.name, b, image)
+        second = View(second.name, b, cv2.resize(second.image, (a.width, a.height), interpolation=cv2.INTER_AREA))
     flow = compute(first, second)
     return flow if flow is None else resize_flow(flow, a.width, a.height, (b.width, b.height))
 
@@ -383,9 +381,8 @@ def _sparse(views: Sequence[View]) -> FlowBetween:
         (a, da), (b, db) = features[i], features[j]
         ids = _ratio_matches(da, db)
         a, b = a[ids[:, 0]], b[ids[:, 1]]
-        F = fundamental(views[i].camera, views[j].camera)[0]
         # OpenCV's pixel centres are at whole numbers
-        lines = homogeneous(a + 0.5) @ F.T
+        lines = homogeneous(a + 0.5) @ fundamental(views[i].camera, views[j].camera)[0].T
         with np.errstate(divide="ignore", invalid="ignore"):
             off = np.abs((lines[:, :2] * (b + 0.5)).sum(1) + lines[:, 2]) / np.linalg.norm(lines[:, :2], axis=1)
         a, b = a[off < LINE_DISTANCE], b[off < LINE_DISTANCE]

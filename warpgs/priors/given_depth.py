@@ -99,8 +99,7 @@ def references(view: View, found: ViewDepth | None, known: PointCloud) -> tuple[
     assert view.depth is not None
     sure = np.zeros(view.depth.values.shape) if found is None else np.where(found.valid, found.depth, 0).astype(np.float64)
     if known.tracks is not None:
-        own = known.seen_by({view.name})
-        _, rows, columns, z = geometry.seen_pixels(view.camera, own.points)
+        _, rows, columns, z = geometry.seen_pixels(view.camera, known.seen_by({view.name}).points)
         order = np.argsort(-z, kind="stable")  # of two in one pixel the nearer is written last
         sure[rows[order], columns[order]] = z[order]
     at = (view.depth.values > 0) & (sure > 0)

@@ -140,8 +140,7 @@ def resize(image: np.ndarray, height: int, width: int) -> np.ndarray:
     """Return an image [H, W] or [H, W, C] at another size, float32, pixel centres aligned at +0.5."""
     import cv2
 
-    shrinks = height <= image.shape[0] and width <= image.shape[1]
-    method = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
+    method = cv2.INTER_AREA if height <= image.shape[0] and width <= image.shape[1] else cv2.INTER_LINEAR
     if image.ndim == 2:
         return cv2.resize(np.ascontiguousarray(image, np.float32), (width, height), interpolation=method)
     # OpenCV averages over areas in at most four channels at a time

@@ -69,8 +69,7 @@ def _sampled(camera: Camera, bounds: tuple[float, float]) -> np.ndarray:
     x, y = (a.ravel() for a in np.meshgrid(along * camera.width, along * camera.height))
     near, far = bounds
     depths = [near * (far / near) ** ((k + 0.5) / DEPTHS) for k in range(DEPTHS)]
-    pixels = np.tile(np.stack([x, y], 1), (DEPTHS, 1))
-    return geometry.back_project(camera, pixels, np.repeat(depths, len(x)))
+    return geometry.back_project(camera, np.tile(np.stack([x, y], 1), (DEPTHS, 1)), np.repeat(depths, len(x)))
 
 
 def shared_sight(cameras: Sequence[Camera], bounds: Sequence[tuple[float, float]]) -> Sight:
@@ -93,8 +92,7 @@ def shared_sight(cameras: Sequence[Camera], bounds: Sequence[tuple[float, float]
         rays /= np.maximum(np.sqrt((rays**2).sum(2, keepdims=True)), 1e-12)
         turned = 1 - (rays * rays[i]).sum(2)  # 1 - cosine grows with the square of a small angle
         alike = np.clip((lost - turned) / (lost - most), 0, 1)
-        close = np.clip(1 - np.sqrt(np.maximum(turned, 0) / lost), 0, 1)
-        overlap[i] = (seen * close).mean(1)
+        overlap[i] = (seen * np.clip(1 - np.sqrt(np.maximum(turned, 0) / lost), 0, 1)).mean(1)
         matching[i] = (seen * alike * np.clip(turned / least, 0, 1)).mean(1)
         matching[i, i] = 0
     return np.round(overlap, 9), np.round(matching, 9)  # rounding errors must not decide
