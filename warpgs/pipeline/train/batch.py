@@ -158,8 +158,7 @@ class SlotSums:
         ``slot`` is a function of a slot's number, the tensors of a sum, and a flag: True to add to them, False to overwrite
         them. Divided rows then hold the sum of this process's slots only, until `sum_own_rows` is called.
         """
-        own = self.tree.nodes[self.tree.ranks.rank]
-        for row, node in enumerate(own):
+        for row, node in enumerate(self.tree.nodes[self.tree.ranks.rank]):
             self._add_node(node, row, slot)
         if self.tree.ranks.count == 1:
             self._average(0, self.rows[0])
@@ -176,8 +175,7 @@ class SlotSums:
 
     def share(self, tensor: torch.Tensor) -> None:
         """Send this process's rows of a tensor [N, ...], contiguous and shaped like the large tensor, to all others."""
-        divided = tensor[: self.divided].view(-1)
-        self.tree.ranks.gather(tensor[self.own_rows].view(-1), divided)
+        self.tree.ranks.gather(tensor[self.own_rows].view(-1), tensor[: self.divided].view(-1))
 
     def _add_node(self, node: Node, row: int, slot: Callable[[int, list[torch.Tensor], bool], None]) -> None:
         """Add the slots of a node into a row; the following rows are scratch memory."""

@@ -333,8 +333,7 @@ def inverse_depth_difference(
     shown = shown if mask is None else shown & (mask > 0)
     weight = torch.where(shown, target[..., 1], 0)
     inverse = target[..., 2] / torch.where(shown & (target[..., 1] > 0), depth, 1)
-    off = torch.where(weight > 0, (inverse - target[..., 0]).abs(), 0)
-    return total(off) / total(weight).clamp_min(1e-6)
+    return total(torch.where(weight > 0, (inverse - target[..., 0]).abs(), 0)) / total(weight).clamp_min(1e-6)
 
 
 @register("given_depth")
@@ -377,8 +376,7 @@ def normal_difference(normals: torch.Tensor, target: torch.Tensor, mask: torch.T
     # the root in float64, since the rounding of float32's depends on the processor (MKL)
     length = target.square().sum(-1).double().sqrt().to(target.dtype)
     weight = torch.where(shown, length, 0)
-    off = torch.where(weight > 0, length - (normals * target).sum(-1), 0)
-    return total(off) / total(weight).clamp_min(1e-6)
+    return total(torch.where(weight > 0, length - (normals * target).sum(-1), 0)) / total(weight).clamp_min(1e-6)
 
 
 @register("given_normals")

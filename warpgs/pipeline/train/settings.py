@@ -461,8 +461,7 @@ def _typed(value: Any, hint: Any, name: str) -> Any:
         value = float(value)
     if typing.get_origin(hint) is tuple:
         of_type(hint)(list(value) if isinstance(value, tuple) else value, name)
-        kinds = typing.get_args(hint)
-        return tuple(_typed(v, kinds[0], name) for v in value)
+        return tuple(_typed(v, typing.get_args(hint)[0], name) for v in value)
     of_type(hint)(value, name)
     return float(value) if hint is float else value
 

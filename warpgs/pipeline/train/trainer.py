@@ -245,8 +245,7 @@ class Trainer:
         half = step <= self.half_resolution * self.phases.planned
         limits = c.limits.at(1.0 if step >= self.steps else self.progress(step), self.radius, c.antialiased)
         phase = returned(self.strategy, "phase", self.strategy.phase(step), Hashable, "a hashable value")
-        decay = c.optimizer.opacities_decay
-        return StepPlan(self.degree(step), half, terms, phase, limits, decay, self.extrapolated)
+        return StepPlan(self.degree(step), half, terms, phase, limits, c.optimizer.opacities_decay, self.extrapolated)
 
     def next_view(self) -> int:
         """Return the index of the next view. The order is random; each view comes once before any view comes again."""
@@ -456,8 +455,7 @@ class Trainer:
         self.context.extent = plain["extent"]
         self.notes = [*map(Detail, plain["notes"])]  # shown when the fit began
         self.table.load(tensors)
-        of_views = {n.removeprefix("views."): t for n, t in tensors.items() if n.startswith("views.")}
-        self.learned.table.load(of_views)
+        self.learned.table.load({n.removeprefix("views."): t for n, t in tensors.items() if n.startswith("views.")})
         self.mean.load(tensors, self.taker.params)
         self.strategy.load(tensors, plain["strategy"])
         self.stopping.load(tensors, plain["stopping"])

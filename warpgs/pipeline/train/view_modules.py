@@ -239,8 +239,7 @@ class Exposure(ViewModule, group="exposure."):
 
     def regularisation(self, values: Tensors) -> torch.Tensor:
         """Return ``weight`` times the sum of squares of [A - 1 | b], shape []: it pulls exposures towards the identity."""
-        square = values[EXPOSURE].double().square().sum()
-        return (self.weight * square).to(values[EXPOSURE].dtype)
+        return (self.weight * values[EXPOSURE].double().square().sum()).to(values[EXPOSURE].dtype)
 
     def bytes(self, sizes: StepSizes) -> Needs:
         """Return the bytes of the render after its exposure, which exists beside the plain render."""
@@ -334,8 +333,7 @@ def focal_factors(params: Tensors, numbers: torch.Tensor) -> torch.Tensor:
 
 def zoomed(K: torch.Tensor, factor: torch.Tensor) -> torch.Tensor:
     """Return intrinsics [B, 3, 3] with fx and fy times a factor [B]; differentiable."""
-    focal = K[:, :2, :2] * factor[:, None, None]
-    return torch.cat([torch.cat([focal, K[:, :2, 2:]], 2), K[:, 2:]], 1)
+    return torch.cat([torch.cat([K[:, :2, :2] * factor[:, None, None], K[:, :2, 2:]], 2), K[:, 2:]], 1)
 
 
 def similarity(given: Sequence[Camera], refined: Sequence[Camera]) -> tuple[np.ndarray, float, np.ndarray]:

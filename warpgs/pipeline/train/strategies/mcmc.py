@@ -167,5 +167,4 @@ class MCMC(Strategy):
             return DensityUpdate(everything, copies, sampled, overwritten=sources, values=values)
         nothing = {n: v[:0] for n, v in values.items()}
         both = {n: torch.cat([v, copies[n]]) for n, v in values.items()}
-        rows = torch.cat([sources, onto])
-        return DensityUpdate(everything, nothing, sampled[:0], overwritten=rows, values=both)
+        return DensityUpdate(everything, nothing, sampled[:0], overwritten=torch.cat([sources, onto]), values=both)
