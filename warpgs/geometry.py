@@ -277,8 +277,7 @@ def project_points(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.n
         plane = np.where(seen[:, None], plane, 0) * camera.K[[0, 1], [0, 1]] + camera.K[:2, 2]
         return plane, np.where(seen, depth_of(camera.model, in_camera), 0)
     safe = np.where(z == 0, np.finfo(float).tiny, z)
-    pixels = matmul(in_camera / safe[:, None], camera.K.T)
-    return pixels[:, :2], z
+    return matmul(in_camera / safe[:, None], camera.K.T)[:, :2], z
 
 
 def back_project(camera: Camera, pixels: np.ndarray, depths: np.ndarray) -> np.ndarray:
@@ -323,8 +322,7 @@ def project_tensors(camera: Camera, points: torch.Tensor) -> tuple[torch.Tensor,
     in_camera = (points[:, None] * viewmat[:3, :3]).sum(2) + viewmat[:3, 3]
     seen, depth = on_lens(camera.model, camera.distortion, in_camera), depth_of(camera.model, in_camera)
     plane = to_plane(camera.model, camera.distortion, torch.where(seen[:, None], in_camera, torch.ones_like(in_camera)))
-    pixels = torch.stack([K[i, i] * plane[:, i] + K[i, 2] for i in range(2)], 1)
-    return pixels, torch.where(seen, depth, 0)
+    return torch.stack([K[i, i] * plane[:, i] + K[i, 2] for i in range(2)], 1), torch.where(seen, depth, 0)
 
 
 def _at_depth(camera: Camera, rays: Any, depths: Any) -> Any:

@@ -152,8 +152,7 @@ class PointCloud:
         if self.tracks is None:
             return self
         keep = np.array([len(names & t) >= least for t in self.tracks], dtype=bool)
-        tracks = tuple(t for t, k in zip(self.tracks, keep) if k)
-        return PointCloud(self.points[keep], self.colors[keep], tracks)
+        return PointCloud(self.points[keep], self.colors[keep], tuple(t for t, k in zip(self.tracks, keep) if k))
 
 
 ORIGIN = "warpgs_origin"

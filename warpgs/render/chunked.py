@@ -88,8 +88,7 @@ def blend_chunked(
 ) -> Images:  # fmt: skip
     """Composite [C, N, 12] chunk by chunk, to the bits of `images_of`; the backward pass renders each chunk again."""
     # only the inputs are saved; about 1.5 times the time of `blend`, with memory for one chunk's instances
-    images: Images = _BlendChunked.apply(projected, backgrounds, colors, settings, most, memory, *inputs.detached())
-    return images
+    return _BlendChunked.apply(projected, backgrounds, colors, settings, most, memory, *inputs.detached())
 
 
 def further_chunked(

@@ -142,8 +142,7 @@ class GraphedRasterizer:
         (v_projected,), _ = self._backward_blend(*saved, *v_images)
         if not wants_backgrounds:
             return v_projected, None
-        transmittances = self._forward_blend.saved(saved[5])[6]
-        return v_projected, blend.background_gradient(transmittances, v_images[0])
+        return v_projected, blend.background_gradient(self._forward_blend.saved(saved[5])[6], v_images[0])
 
     def project_gradients(self, saved: tuple[torch.Tensor, ...], v_projected: torch.Tensor | None, wants_camera: bool):
         """Return the gradients of the seven tensors that `project` takes, in their shapes [...]."""
@@ -306,8 +305,7 @@ _RECORDERS: dict[tuple[torch.device, int, bool], Recorder] = {}
 def recorder(device: torch.device, gradients: bool = True) -> Recorder:
     """Return the recorder of torch's current stream on a CUDA device, for calls with or without ``gradients``."""
     key = (device, launch.warp_stream(device).cuda_stream, gradients)
-    found = _RECORDERS.get(key)
-    return found or _RECORDERS.setdefault(key, Recorder(GraphPool(device), gradients))
+    return _RECORDERS.get(key) or _RECORDERS.setdefault(key, Recorder(GraphPool(device), gradients))
 
 
 def clear_graph_cache() -> None:

@@ -45,8 +45,7 @@ def _project(gaussians: Gaussians, camera: Camera, degree: int, antialiased: boo
     colors = torch.einsum("nk,nkc->nc", sh.basis(directions)[:, :count], coefficients[visible, :count])
     colors = (colors + 0.5).clamp_min(0)
     reach = torch.sqrt(2 * torch.log(opacities / rule.alpha_cut))[:, None] + 0.01  # slightly beyond alpha = cut
-    half = reach * torch.sqrt(torch.diagonal(covariances, dim1=-2, dim2=-1))
-    return pixels, half, factors, opacities, colors
+    return pixels, reach * torch.sqrt(torch.diagonal(covariances, dim1=-2, dim2=-1)), factors, opacities, colors
 
 
 def _pixels(

@@ -135,15 +135,13 @@ def photo_errors(train: Sequence[View], training: Sequence[DepthView]) -> np.nda
         return None
     errors = np.divide(total, count, out=np.full(len(BINS), np.nan), where=count > 0)
     known = np.flatnonzero(count)
-    filled: np.ndarray = errors[known[np.maximum(np.searchsorted(known, np.arange(len(BINS)), "right") - 1, 0)]]
-    return filled
+    return errors[known[np.maximum(np.searchsorted(known, np.arange(len(BINS)), "right") - 1, 0)]]
 
 
 def _bin(difference: torch.Tensor) -> np.ndarray:
     """Return the class of `BINS` of each difference, uint8."""
     bounds = torch.tensor(BINS, dtype=torch.float32, device=difference.device)
-    classes: np.ndarray = torch.bucketize(difference, bounds, out_int32=True).to(torch.uint8).cpu().numpy()
-    return classes
+    return torch.bucketize(difference, bounds, out_int32=True).to(torch.uint8).cpu().numpy()
 
 
 def _photo(view: View, depth: torch.Tensor) -> torch.Tensor:
@@ -234,8 +232,7 @@ def coverage_of_run(
 
     sums = in_background(finish, covered())
     views = [{"name": v.name, "classes": _row(own, errors is not None)} for v, own in zip(test, sums)]
-    total = {c: sum((own[c] for own in sums), np.zeros(4)) for c in CLASSES}
-    pooled = _row(total, errors is not None)
+    pooled = _row({c: sum((own[c] for own in sums), np.zeros(4)) for c in CLASSES}, errors is not None)
     unseen = pooled.get("0")
     summary = "every held-out pixel was seen by a training view"
     if unseen:

@@ -385,8 +385,7 @@ def _reduced(view: View, rgb: np.ndarray, depth: np.ndarray, alpha: np.ndarray) 
     around = np.ones((3, 3), np.uint8)
     beyond = np.maximum(np.maximum(cv2.erode(image, around) - rgb, rgb - cv2.dilate(image, around)), 0).mean(-1)
     side = max(3, round(width / SMOOTHING) | 1)
-    K = np.diag([width / c.width, height / c.height, 1]) @ c.K
-    small = replace(c, K=K, width=width, height=height)
+    small = replace(c, K=np.diag([width / c.width, height / c.height, 1]) @ c.K, width=width, height=height)
     return small, cv2.blur(beyond, (side, side)), depth, (alpha > 0.5) & (depth > 0) & (mask > 0)
 
 
@@ -436,8 +435,7 @@ def moved_fractions(views: Sequence[View], renders: Iterable[tuple[np.ndarray, n
         return round(float(areas[areas >= MIN_AREA].sum()), 4)
 
     compared = [i for i, m in enumerate(misfits) if usual <= HIGH_MISFIT and m <= MAX_MISFIT * max(usual, LOW_MISFIT)]
-    found = in_background(fraction, ((i,) for i in compared))
-    for i, value in zip(compared, found):
+    for i, value in zip(compared, in_background(fraction, ((i,) for i in compared))):
         fractions[i] = value
     return fractions
 

@@ -283,8 +283,7 @@ def _beyond(views: Sequence[View], i: int, depth: np.ndarray) -> PointCloud:
     down, across = (np.arange(BEYOND_PX // 2 - pad, n + pad, BEYOND_PX) for n in (height, width))
     inverse = _mean_around(1 / depth, DEPTH_PX, down, across)
     image = _mean_around(view.image, COLOR_PX, down, across)
-    outside = ((down < 0) | (down >= height))[:, None] | (across < 0) | (across >= width)
-    rows, columns = np.nonzero(outside)
+    rows, columns = np.nonzero(((down < 0) | (down >= height))[:, None] | (across < 0) | (across >= width))
     pixels = np.stack([across[columns], down[rows]], 1) + 0.5
     points = geometry.back_project(view.camera, pixels, 1 / inverse[rows, columns].astype(float))
     unseen = ~np.any([geometry.in_image(v.camera, points) for v in views], axis=0)
@@ -435,8 +434,7 @@ def _surface(cells: np.ndarray, half: float, shapes: Sequence[Silhouette]) -> np
         inside[at] += full | ~there
         seen[at] += there
         at = at[empty[at] <= len(shapes) // TOLERANT]
-    kept = (seen[at] >= max(2.0, SEEN * len(shapes))) & (inside[at] < len(shapes))
-    return cells[at[kept]]
+    return cells[at[(seen[at] >= max(2.0, SEEN * len(shapes))) & (inside[at] < len(shapes))]]
 
 
 def _seen_colors(shapes: Sequence[Silhouette], cells: np.ndarray, width: float) -> tuple[np.ndarray, np.ndarray]:
