@@ -134,7 +134,7 @@ def make_linear(real: type) -> SimpleNamespace:
             wp.clamp(pixel[1], -margin * height, height + margin * height),
         )
 
-    def model(jacobian: Callable[..., Any], **functions: Any) -> SimpleNamespace:
+    def products(jacobian: Callable[..., Any], **functions: Any) -> SimpleNamespace:
         """Return the functions of a model: the given ones, and those by its ``jacobian(position, K, lens, point) -> Rows``."""
 
         @wp.func
@@ -153,7 +153,7 @@ def make_linear(real: type) -> SimpleNamespace:
 
     return SimpleNamespace(
         Rows=Rows, Gradients=Gradients, intrinsics_of=intrinsics_of, in_front=in_front, z_of=z_of, unclamped=unclamped,
-        clamped=clamped, model=model,
+        clamped=clamped, products=products,
     )  # fmt: skip
 
 
@@ -275,7 +275,7 @@ class Orthographic(CameraModel):
             return linear.Gradients(v_position, linear.intrinsics_of(fx, fy, v_pixel))
 
         unclamped = linear.unclamped
-        return linear.model(jacobian, pixel_of=pixel_of, expansion_point=unclamped, position_backward=position_backward)
+        return linear.products(jacobian, pixel_of=pixel_of, expansion_point=unclamped, position_backward=position_backward)
 
 
 @register("opencv")
@@ -382,14 +382,13 @@ class OpenCV(CameraModel):
             v_z = -(v_a * a0 + v_b * b0 + first * jx + second * jy) * inv_z + v_depth
             return linear.Gradients(vec3(v_a * inv_z, v_b * inv_z, v_z), v_K)
 
-        return linear.model(jacobian, in_range=in_range, pixel_of=pixel_of, position_backward=position_backward)
+        return linear.products(jacobian, in_range=in_range, pixel_of=pixel_of, position_backward=position_backward)
 
 
 @functools.cache
 def _make_distortion(real: type) -> SimpleNamespace:
     vec2, *_, Reals = types_of(real)
-    one = real(1.0)
-    two = real(2.0)
+    one, two = real(1.0), real(2.0)
 
     @wp.struct
     class Radial:
@@ -549,7 +548,7 @@ class Fisheye(CameraModel):
             v_position = vec3(v_x, v_y, v_z) / distance + v_depth * unit
             return linear.Gradients(v_position, linear.intrinsics_of(fx, fy, v_pixel))
 
-        return linear.model(
+        return linear.products(
             jacobian, in_range=in_range, depth_of=radial.distance, pixel_of=pixel_of, expansion_point=linear.unclamped,
             position_backward=position_backward,
         )  # fmt: skip

@@ -41,12 +41,9 @@ BLOCK = 8
 @functools.cache
 def make_functions(real):
     """Make the functions that the kernels of both kinds of device share, for one scalar type."""
-    vec4 = wp.types.vector(4, real)
-    vec5 = wp.types.vector(5, real)
+    vec4, vec5, vec6 = (wp.types.vector(size, real) for size in (4, 5, 6))
     w0, w1, w2, w3, w4, w5 = (real(w) for w in WINDOW[RADIUS:])
-    vec6 = wp.types.vector(6, real)
-    channels = CHANNELS
-    Reals = wp.array(dtype=real)
+    channels, Reals = CHANNELS, wp.array(dtype=real)
 
     @wp.func
     def tap(k: wp.int32) -> real:
@@ -115,11 +112,8 @@ def make_kernel(real, summed: bool, backward: bool):
     # The sums of a row are in ``scratch``, where each task has a few rows of its own. A row is processed in steps of `LANES`
     # elements; the last step starts early, to end with the row, and elements that it computes again get the same values.
     f = make_functions(real)
-    vec11 = wp.types.vector(TAPS, real)
-    vec11i = wp.types.vector(TAPS, wp.int32)
-    values = wp.types.vector(LANES, real)
-    several = wp.types.vector(5 * LANES, real)
-    Reals = wp.array(dtype=real)
+    vec11, values, several = (wp.types.vector(size, real) for size in (TAPS, LANES, 5 * LANES))
+    vec11i, Reals = wp.types.vector(TAPS, wp.int32), wp.array(dtype=real)
     prefetch, fields = make_prefetch(real), 3 if backward else 5
 
     @wp.func

@@ -9,18 +9,7 @@ import torch
 import warp as wp
 
 from warpgs.constants import LARGEST_HALF, TILE_SIZE
-from warpgs.device import (
-    BINNING,
-    BLENDING,
-    FLOAT,
-    LOSS,
-    SAMPLING,
-    Needs,
-    StepSizes,
-    available_bytes,
-    format_bytes,
-    installed_bytes,
-)
+from warpgs.device import BINNING, BLENDING, FLOAT, LOSS, SAMPLING, Needs, StepSizes, format_bytes, free_for
 from warpgs.errors import ResourceError
 from warpgs.kernels import launch, native as cuda
 from warpgs.kernels.ellipse import make_spans
@@ -221,8 +210,7 @@ def make_emit_cpu(real, slotted: bool):
     """Make the kernel; arguments are those of `make_emit`."""
     s = make_spans(real, lanes=True)
     vec3, Rows = wp.types.vector(3, real), wp.array2d(dtype=real)
-    lane_reals = wp.types.vector(LANES, real)
-    lane_ints = wp.types.vector(LANES, wp.int32)
+    lane_reals, lane_ints = (wp.types.vector(LANES, kind) for kind in (real, wp.int32))
     lanes = LANES
     write, prefetch, prefetch_count = make_write(slotted), make_prefetch(real, 2), make_prefetch(wp.int32)
 
@@ -537,11 +525,8 @@ def step_bytes(sizes: StepSizes) -> Needs:
 def _check_total(total: int, visible: int, device: torch.device, tiles: int, budget_bytes: int | None) -> None:
     """Raise ResourceError where the instances exceed the budget, or the number that kernels can index."""
     needed = total * BYTES_PER_INSTANCE
-    # a query of the free memory takes at least 0.1 ms; small requests, below a twentieth of the memory, skip it
     countable = total <= MAX_INSTANCES
-    if countable and budget_bytes is None and needed < installed_bytes(device) // 20:
-        return
-    budget = available_bytes(device) * 4 // 5 if budget_bytes is None else budget_bytes
+    budget = 0.8 * free_for(needed, device) if budget_bytes is None else budget_bytes
     if countable and needed <= budget:
         return
     limit = format_bytes(budget) if countable else f"{MAX_INSTANCES:,} instances"

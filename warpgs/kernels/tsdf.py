@@ -22,8 +22,7 @@ def make_kernels(real):
     """Make the kernels for one scalar type."""
     vec3 = wp.types.vector(3, real)
     Reals, Rows = wp.array(dtype=real), wp.array2d(dtype=real)
-    mat33 = wp.types.matrix((3, 3), real)
-    mat44 = wp.types.matrix((4, 4), real)
+    mat33, mat44 = (wp.types.matrix((n, n), real) for n in (3, 4))
     module = f"warpgs.kernels.tsdf.{real.__name__}"
     near = real(NEAR)
 

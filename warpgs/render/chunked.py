@@ -86,7 +86,7 @@ def blend_chunked(
     projected: torch.Tensor, backgrounds: torch.Tensor, settings: Pass, most: int, inputs: ProjectInputs,
     memory: InstanceMemory = AS_NEEDED, colors: torch.Tensor | None = None,
 ) -> Images:  # fmt: skip
-    """Composite [C, N, 12] chunk by chunk, to the bits of `images_of`; the backward pass renders each chunk again."""
+    """Composite [C, N, 12] chunk by chunk, to the bits of `blend`; the backward pass renders each chunk again."""
     # only the inputs are saved; about 1.5 times the time of `blend`, with memory for one chunk's instances
     return _BlendChunked.apply(projected, backgrounds, colors, settings, most, memory, *inputs.detached())
 

@@ -12,9 +12,10 @@ import numpy as np
 import torch
 
 from warpgs.constants import K_TOLERANCE, POSE_TOLERANCE
-from warpgs.device import available_bytes, installed_bytes
+from warpgs.device import free_for
 from warpgs.errors import ResourceError, UsageError
 from warpgs.kernels import launch
+from warpgs.kernels.blend import blend
 from warpgs.kernels.blend_cuda import image_tile
 from warpgs.kernels.cameras import check_camera
 from warpgs.kernels.ellipse import ProjectInputs
@@ -249,9 +250,7 @@ def _check_memory(window: Window, layers: list[Layer], heaviest: int, like: torc
     channels = sum(backgrounds.shape[1] + 4 for _, backgrounds in layers)  # and alpha, depth, transmittance, sum of weights
     channels += 2 * heaviest
     needed = len(layers[0][1]) * window[2] * window[3] * channels * like.element_size()
-    if needed < installed_bytes(like.device) // 20:  # a query of the free memory takes 0.1 ms
-        return
-    free = available_bytes(like.device)
+    free = free_for(needed, like.device)
     if needed > free:
         raise ResourceError(
             f"images of {window[2]} x {window[3]} px need {needed:,} bytes, and {free:,} are free on {like.device}: render "
@@ -436,7 +435,7 @@ def _rasterize(
         slotted = options.contributions or compose.needs_slots([projected, *(t for layer in layers for t in layer)])
         listed = None if pixels is None else listed_tiles(pixels, settings, len(projected))
         tiles = bin_tiles(projected, tile_counts, settings, memory, slotted, listed)
-        images = [compose.images_of(projected, tiles, backgrounds, settings, colors) for colors, backgrounds in layers]
+        images = [blend(projected, tiles, backgrounds, settings, colors) for colors, backgrounds in layers]
         maps = compose.further_of(projected, tiles, settings, *further)
         if overflow is not None:
             maps["overflow"] = overflow
