@@ -189,7 +189,7 @@ ARCHITECTURE = 75
 def modules() -> dict[str, wp.Module]:
     """Modules of all kernels that a fit launches on CUDA, and of those that only the public op launches."""
     kernels = [k for k, _ in fit_kernels(True)]
-    kernels += [walk.make_native(size, name) for size in (8, 16) for name in ("median_depth", "heaviest")]
+    kernels += [k for size in (8, 16) for k in vars(walk.make_native(size)).values()]
     variants = list(itertools.product(("stored", "activated", "covariances"), (True, False)))  # parameters, antialiased
     for variant in [*variants, ("stored", False, 25)]:
         both = project_cuda.make_forward, project_cuda.make_backward

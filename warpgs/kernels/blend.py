@@ -13,7 +13,6 @@ from warpgs.device import BINNING, BLENDING, FLOAT, LOSS, PROJECTION, SAMPLING, 
 from warpgs.kernels import blend_cpu, blend_cuda, launch
 from warpgs.kernels.falloff import COLORS, LARGEST_STOP, VALUES, WIDTHS, Pass
 from warpgs.kernels.graphs import TORCH, Allocator
-from warpgs.kernels.launch import first_order, keep, kept
 from warpgs.kernels.native import ROLLED, Ints, make_prefetch
 from warpgs.kernels.tiles import Tiles
 
@@ -312,15 +311,15 @@ class _Blend(torch.autograd.Function):
         alpha, depth, *saved = found
         if save:
             # all as saved tensors, which are freed after the backward pass
-            keep(ctx, projected, colors, backgrounds, image, depth, *saved, *tiles.tensors())
+            launch.keep(ctx, projected, colors, backgrounds, image, depth, *saved, *tiles.tensors())
             ctx.tile_size, ctx.visible, ctx.settings = tiles.size, tiles.visible, settings
         ctx.set_materialize_grads(False)
         return image, alpha, depth
 
     @staticmethod
-    @first_order
+    @launch.first_order
     def backward(ctx, *v_images):
-        projected, colors, backgrounds, image, *tensors = kept(ctx)
+        projected, colors, backgrounds, image, *tensors = launch.kept(ctx)
         shared, tiles = tensors[:5], Tiles(ctx.tile_size, *tensors[5:], ctx.visible)
         v_image, v_alpha, v_depth = v_images = [None if v is None else v.contiguous() for v in v_images]
         v_backgrounds = background_gradient(shared[1], v_image, image.shape[-1]) if ctx.needs_input_grad[2] else None

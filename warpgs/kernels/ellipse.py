@@ -11,7 +11,6 @@ from warpgs.constants import COVARIANCE_TOLERANCE, FARTHEST_PIXEL, LARGEST_AXIS,
 from warpgs.errors import UsageError
 from warpgs.kernels import launch, sh
 from warpgs.kernels.cameras import CAMERA_MODELS, types_of
-from warpgs.kernels.launch import first_order
 
 
 @functools.cache
@@ -163,7 +162,7 @@ class _PackedCovariances(torch.autograd.Function):
         return off, covars.diagonal(dim1=1, dim2=2).contiguous()
 
     @staticmethod
-    @first_order
+    @launch.first_order
     def backward(ctx, v_off, v_diagonal):
         v_covars = torch.diag_embed(v_diagonal)
         for k, (i, j) in enumerate(OFF_DIAGONAL):
@@ -171,9 +170,8 @@ class _PackedCovariances(torch.autograd.Function):
         return (v_covars,)
 
 
-def packed_covariances(covars: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return the symmetric part of covariances [N, 3, 3] as xy, xz, yz and a 0 [N, 4], and diagonals [N, 3]. Differentiable."""
-    return _PackedCovariances.apply(covars)
+packed_covariances = _PackedCovariances.apply
+"""Return the symmetric part of covariances [N, 3, 3] as xy, xz, yz and a 0 [N, 4], and diagonals [N, 3]. Differentiable."""
 
 
 @functools.cache

@@ -38,12 +38,17 @@ class Allocator:
         """Return a new tensor of a shape [...]."""
         return torch.empty(shape, dtype=dtype, device=device)
 
-    output = functools.partialmethod(new, "output")
-    """Return a new tensor of a shape [...] that the caller may keep."""
-    saved = functools.partialmethod(new, "saved")
-    """Return a new tensor of a shape [...] that the backward pass needs."""
-    workspace = functools.partialmethod(new, "workspace")
-    """Return a new tensor of a shape [...] that is needed only until the function returns."""
+    def output(self, shape: tuple[int, ...], dtype: torch.dtype, device: torch.device) -> torch.Tensor:
+        """Return a new tensor of a shape [...] that the caller may keep."""
+        return self.new("output", shape, dtype, device)
+
+    def saved(self, shape: tuple[int, ...], dtype: torch.dtype, device: torch.device) -> torch.Tensor:
+        """Return a new tensor of a shape [...] that the backward pass needs."""
+        return self.new("saved", shape, dtype, device)
+
+    def workspace(self, shape: tuple[int, ...], dtype: torch.dtype, device: torch.device) -> torch.Tensor:
+        """Return a new tensor of a shape [...] that is needed only until the function returns."""
+        return self.new("workspace", shape, dtype, device)
 
 
 TORCH = Allocator()

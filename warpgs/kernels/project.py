@@ -13,7 +13,6 @@ from warpgs.kernels.cameras import CAMERA_MODELS
 from warpgs.kernels.ellipse import PROJECTED_SIZE, ProjectInputs
 from warpgs.kernels.falloff import Pass
 from warpgs.kernels.graphs import TORCH, Allocator
-from warpgs.kernels.launch import first_order, keep, kept
 from warpgs.kernels.native import BLOCK
 from warpgs.kernels.project_cpu import LANES
 
@@ -59,16 +58,16 @@ class _Project(torch.autograd.Function):
     def forward(ctx, settings, *tensors):
         inputs = ProjectInputs(*(t.contiguous() for t in tensors))
         projected, tile_counts = project_tensors(inputs, settings)
-        keep(ctx, *inputs[:-1], projected, tile_counts)
+        launch.keep(ctx, *inputs[:-1], projected, tile_counts)
         ctx.settings = settings
         ctx.mark_non_differentiable(tile_counts)
         ctx.set_materialize_grads(False)  # else torch makes zeros for the counts
         return projected, tile_counts
 
     @staticmethod
-    @first_order
+    @launch.first_order
     def backward(ctx, v_projected, _):
-        *inputs, projected, tile_counts = kept(ctx)
+        *inputs, projected, tile_counts = launch.kept(ctx)
         wants_camera = ctx.needs_input_grad[6] or ctx.needs_input_grad[7]  # viewmats and Ks, behind the settings
         found = project_gradients(inputs, ctx.settings, projected, tile_counts, v_projected, wants_camera=wants_camera)
         return None, *found, None, None

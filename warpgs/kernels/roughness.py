@@ -13,7 +13,6 @@ import torch
 import warp as wp
 
 from warpgs.kernels import launch
-from warpgs.kernels.launch import first_order, keep, kept
 from warpgs.kernels.native import EXACT
 
 MIN_ALPHA = 0.3
@@ -100,13 +99,13 @@ class _Roughness(torch.autograd.Function):
         rough, slopes = torch.empty_like(depth), depth.new_empty(*depth.shape, 2)
         inputs = [depth, *others, depth.shape[1], rough, slopes]
         launch.launch(make_kernels(launch.real_of(depth)).forward, depth.numel(), inputs, depth.device, cost=5)
-        keep(ctx, depth, slopes, others[3])
+        launch.keep(ctx, depth, slopes, others[3])
         return rough
 
     @staticmethod
-    @first_order
+    @launch.first_order
     def backward(ctx, v_roughness):
-        depth, slopes, weight = kept(ctx)
+        depth, slopes, weight = launch.kept(ctx)
         v_depth = torch.empty_like(depth)
         inputs = [depth, slopes, weight, v_roughness.contiguous(), depth.shape[1], v_depth]
         launch.launch(make_kernels(launch.real_of(depth)).backward, depth.numel(), inputs, depth.device, cost=5)

@@ -9,7 +9,6 @@ import warp as wp
 
 from warpgs.device import FLOAT, StepSizes
 from warpgs.kernels import launch
-from warpgs.kernels.launch import first_order, keep, kept
 from warpgs.kernels.native import ROLLED, Floats, cuda_kernel, make_prefetch, source
 
 RADIUS = 5
@@ -310,14 +309,14 @@ class _Ssim(torch.autograd.Function):
             inputs = [image, target, height, blocks, columns, workspace, result, *partials, image.new_empty(0)]
             kernel = make_kernel(launch.real_of(image), summed, False)
             launch.launch(kernel, tasks, inputs, image.device, cost=BLOCK * columns)
-        keep(ctx, image, target, *partials)
+        launch.keep(ctx, image, target, *partials)
         ctx.summed, ctx.tasks = summed, tasks
         return result.sum(0) if summed else result
 
     @staticmethod
-    @first_order
+    @launch.first_order
     def backward(ctx, v_result):
-        image, target, *partials = kept(ctx)
+        image, target, *partials = launch.kept(ctx)
         height, columns, tasks = image.shape[1], image.shape[2] * CHANNELS, ctx.tasks
         v_image, v_result = torch.empty_like(image), v_result.contiguous()
         if _native(image):

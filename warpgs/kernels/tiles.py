@@ -14,7 +14,6 @@ from warpgs.errors import ResourceError
 from warpgs.kernels import launch, native as cuda
 from warpgs.kernels.ellipse import make_spans
 from warpgs.kernels.graphs import TORCH, Allocator
-from warpgs.kernels.launch import sort_pairs
 from warpgs.kernels.native import EXACT, SCALE, IntRows, Ints, Longs, make_prefetch, source
 from warpgs.kernels.project_cpu import LANES
 
@@ -564,7 +563,7 @@ def _depth_order(
     else:
         inputs = [projected, counts, packed, sum_bits(count), visible, depths, order]
         launch.launch(k.visible_keys, sum_entries(count, native)[1], inputs, device)
-    sort_pairs(depths, order, visible)
+    launch.sort_pairs(depths, order, visible)
     return order, visible, total
 
 
@@ -616,7 +615,7 @@ def bin_tiles(
         if listed is not None:
             own, kept = keys[:total], torch.cat([listed, listed.new_zeros(1)])
             own.masked_fill_(~kept[own.long()], no_tile)
-        sort_pairs(keys, slots, total, end_bit=no_tile.bit_length())
+        launch.sort_pairs(keys, slots, total, end_bit=no_tile.bit_length())
         ids = slots[total:] if slotted else slots[:total]  # the second half of the buffers is free again
         inputs = [keys, slots, owners, total, no_tile, ids, ranges]
         launch.launch(make_find_ranges(slotted, native), -(-total // EACH) if native else total, inputs, device)

@@ -1,6 +1,7 @@
 """Walks along the rays over binned Gaussians: the median depth, the heaviest Gaussians, and the contributions."""
 
 import functools
+from types import SimpleNamespace
 
 import torch
 import warp as wp
@@ -214,8 +215,8 @@ def make_weights(real, tile_size: int):
 
 
 @functools.cache
-def make_native(tile_size: int, name: str):
-    """Make the CUDA kernel in float32 of the text ``name`` for one tile size, a thread block per tile."""
+def make_native(tile_size: int):
+    """Make the CUDA kernels in float32 for one tile size, a thread block per tile."""
     Blending = make_struct(wp.float32)
     numbers = {"SIDE": tile_size, "SCALE": SCALE, "STRIDE": PROJECTED_SIZE}
     tile = f"wp.tid() // {tile_size * tile_size}"
@@ -226,7 +227,10 @@ def make_native(tile_size: int, name: str):
         reals: Floats, ids: Ints, counts: Ints,
     ): ...  # fmt: skip
 
-    return cuda_kernel(source(f"{name}.cu", **numbers), tile, f"warpgs.kernels.{name}.{tile_size}")(walk)
+    return SimpleNamespace(
+        median=cuda_kernel(source("median_depth.cu", **numbers), tile, f"warpgs.kernels.median_depth.{tile_size}")(walk),
+        heaviest=cuda_kernel(source("heaviest.cu", **numbers), tile, f"warpgs.kernels.heaviest.{tile_size}")(walk),
+    )
 
 
 def _walk(make_visit, projected: torch.Tensor, tiles: Tiles, settings: Pass, k: int, *outputs: torch.Tensor) -> None:
@@ -235,8 +239,8 @@ def _walk(make_visit, projected: torch.Tensor, tiles: Tiles, settings: Pass, k: 
     inputs = [settings.struct(tiles.size, real), projected, tiles.ranges, tiles.gaussian_ids, projected.shape[1], k, *outputs]
     inputs += [tiles.ranges.new_empty(0)] * (3 - len(outputs))
     if is_native(projected):
-        kernel = make_native(tiles.size, "heaviest" if k else "median_depth")
-        launch.launch(kernel, count * pixels, inputs, device, block_dim=pixels)
+        kernels = make_native(tiles.size)
+        launch.launch(kernels.heaviest if k else kernels.median, count * pixels, inputs, device, block_dim=pixels)
     else:
         launch.launch(make_walk(real, tiles.size, make_visit), count, inputs, device, cost=10_000, block_dim=32)
 

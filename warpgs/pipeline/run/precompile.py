@@ -84,7 +84,7 @@ def fit_kernels(cuda: bool) -> list[tuple[wp.Kernel, int]]:
 def call_kernels(cuda: bool) -> list[tuple[wp.Kernel, int]]:
     """Return further kernels, as `fit_kernels` does, of `rasterize` with scales and opacities, and of `warpgs.compat`."""
     room, variant = project_cuda if cuda else project_cpu, (wp.float32, CAMERA_MODEL, "activated", False, sh.BASES)
-    median = walk.make_native(TILE_SIZE, "median_depth") if cuda else walk.make_walk(wp.float32, TILE_SIZE, walk.make_median)
+    median = walk.make_native(TILE_SIZE).median if cuda else walk.make_walk(wp.float32, TILE_SIZE, walk.make_median)
     backward = room.make_backward(*variant, *([] if cuda else [False]))
     kernels = room.make_forward(*variant), backward, blend.make_kernels(wp.float32, COLORS).color, median
     return list(zip(kernels, (BLOCK, BLOCK, THREADS, TILE_SIZE**2) if cuda else (1, 1, 1, 1)))
