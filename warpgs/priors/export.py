@@ -10,6 +10,7 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -105,22 +106,9 @@ def package_files() -> dict[str, bytes]:
 
 def _backbone() -> torch.nn.Module:
     """Return XFeat's network, which maps an image [1, 3, h, w] to descriptors, keypoint logits and reliability of each cell."""
-    files = package_files()
-
-    class Checked(importlib.abc.InspectLoader):
-        """Loader of the checked bytes: loading by path would read the file again, or a planted .pyc in its place."""
-
-        def get_source(self, fullname: str) -> str:
-            return files["model.py"].decode("utf-8")
-
-        def is_package(self, fullname: str) -> bool:
-            return False
-
-    loader = Checked()
-    spec = importlib.util.spec_from_loader(f"{PACKAGE}_model", loader)
-    assert spec is not None
-    module = importlib.util.module_from_spec(spec)
-    loader.exec_module(module)
+    files, module = package_files(), ModuleType(f"{PACKAGE}_model")
+    # the checked bytes: loading by path would read the file again, or a planted .pyc in its place
+    exec(compile(files["model.py"], "model.py", "exec"), vars(module))
     network: torch.nn.Module = module.XFeatModel()
     # weights_only: tensors and plain containers, nothing that could run
     network.load_state_dict(torch.load(io.BytesIO(files["weights/xfeat.pt"]), map_location="cpu", weights_only=True))
@@ -232,10 +220,10 @@ def _dpt(request: ExportRequest) -> torch.nn.Module:
             backbone_out_indices=[0, 1, 2, 3], neck_hidden_sizes=[16, 24, 32, 32], fusion_hidden_size=16,
             initializer_range=0.2,
         )  # fmt: skip
-        return _one_output(DPTForDepthEstimation(config), "predicted_depth")
+        return _OneOutput(DPTForDepthEstimation(config), "predicted_depth")
     name = request.weights or DPT_WEIGHTS
     try:
-        return _one_output(DPTForDepthEstimation.from_pretrained(name, use_safetensors=True), "predicted_depth")
+        return _OneOutput(DPTForDepthEstimation.from_pretrained(name, use_safetensors=True), "predicted_depth")
     except (OSError, ValueError) as e:
         why = f"the weights cannot be loaded ({str(e).splitlines()[0][:200]})"
         raise DataError(f"{name}: {why}; connect to the internet to download them, or name their folder with --weights") from e
@@ -301,21 +289,18 @@ def _fcn_resnet50(request: ExportRequest) -> torch.nn.Module:
 
     # trained on the images of COCO that show VOC's 21 classes
     weights = None if request.random_weights else FCN_ResNet50_Weights.COCO_WITH_VOC_LABELS_V1
-    return _one_output(fcn_resnet50(weights=weights, weights_backbone=None, num_classes=CLASSES), "out")
+    return _OneOutput(fcn_resnet50(weights=weights, weights_backbone=None, num_classes=CLASSES), "out")
 
 
-def _one_output(network: torch.nn.Module, name: str) -> torch.nn.Module:
-    """Return a network with one of the named outputs of another."""
+class _OneOutput(torch.nn.Module):
+    """A network with one of the named outputs of another."""
 
-    class OneOutput(torch.nn.Module):
-        def __init__(self):
-            super().__init__()
-            self.network = network
+    def __init__(self, network: torch.nn.Module, name: str):
+        super().__init__()
+        self.network, self.name = network, name
 
-        def forward(self, pixel_values):
-            return self.network(pixel_values)[name]
-
-    return OneOutput()
+    def forward(self, pixel_values):
+        return self.network(pixel_values)[self.name]
 
 
 def build(request: ExportRequest) -> torch.nn.Module:

@@ -10,7 +10,6 @@ import numpy as np
 from warpgs import geometry
 from warpgs.errors import DataError, UsageError
 from warpgs.files import read_file
-from warpgs.geometry import check_pinhole
 from warpgs.onnx import Model
 from warpgs.priors.networks import in_threads
 from warpgs.scene import Camera, PointCloud, View, ViewDepth
@@ -56,8 +55,8 @@ def homogeneous(pixels: np.ndarray) -> np.ndarray:
 
 def fundamental(first: Camera, second: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return F [3, 3], and R_st [3, 3] and tau [3] of ``X_second = R_st (X_first + tau)``, of a pair of cameras."""
-    check_pinhole(first)
-    check_pinhole(second)
+    geometry.check_pinhole(first)
+    geometry.check_pinhole(second)
     R_s, t_s = first.viewmat[:3, :3], first.viewmat[:3, 3]
     R_t, t_t = second.viewmat[:3, :3], second.viewmat[:3, 3]
     R_st = R_t @ R_s.T

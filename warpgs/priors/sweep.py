@@ -8,7 +8,6 @@ import torch
 
 from warpgs import geometry
 from warpgs.device import format_bytes, installed_bytes
-from warpgs.geometry import check_pinhole, matmul
 from warpgs.kernels.sweep import NEUTRAL, best_inverses, check_round_trip, plane_costs, scanline_costs
 from warpgs.priors.flow import homogeneous, no_depth
 from warpgs.priors.networks import in_threads, single_threaded_opencv
@@ -64,7 +63,7 @@ itself."""
 
 def _sampled(camera: Camera, bounds: tuple[float, float]) -> np.ndarray:
     """Return points [S, 3] that a camera may see: at a grid of pixels, and depths evenly spaced in their logarithm."""
-    check_pinhole(camera)
+    geometry.check_pinhole(camera)
     along = (np.arange(SAMPLES) + 0.5) / SAMPLES
     x, y = (a.ravel() for a in np.meshgrid(along * camera.width, along * camera.height))
     near, far = bounds
@@ -159,11 +158,11 @@ MIN_PARALLAX = 0.5
 
 def project_inverse(first: Camera, second: Camera, pixels: np.ndarray, inverse: np.ndarray) -> np.ndarray:
     """Project pixels [N, 2] at inverse depths [1/u] [N] into the second image; return positions [px] [N, 2], NaN if behind."""
-    check_pinhole(first)
-    check_pinhole(second)
+    geometry.check_pinhole(first)
+    geometry.check_pinhole(second)
     rotation, translation = geometry.relative_pose(first, second)
-    rays = matmul(homogeneous(pixels), geometry.inverse(first.K).T)
-    p = matmul(matmul(rays, rotation.T) + inverse[:, None] * translation, second.K.T)
+    rays = geometry.matmul(homogeneous(pixels), geometry.inverse(first.K).T)
+    p = geometry.matmul(geometry.matmul(rays, rotation.T) + inverse[:, None] * translation, second.K.T)
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(p[:, 2:] > 1e-9, p[:, :2] / p[:, 2:], np.nan)
 
@@ -187,8 +186,8 @@ def plane_inverses(
 
 def plane_homography(first: Camera, second: Camera, inverse: float | np.ndarray) -> np.ndarray:
     """Return H [..., 3, 3] from first to second by planes z = 1 / inverse [...], for pixel centres at integers (OpenCV)."""
-    check_pinhole(first)
-    check_pinhole(second)
+    geometry.check_pinhole(first)
+    geometry.check_pinhole(second)
     rotation, translation = geometry.relative_pose(first, second)
     H = rotation + np.asarray(inverse)[..., None, None] * np.outer(translation, [0, 0, 1])
     back, shift = (np.array([[1, 0, s], [0, 1, s], [0, 0, 1]]) for s in (-0.5, 0.5))

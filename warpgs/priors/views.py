@@ -6,7 +6,7 @@ import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import numpy as np
 
@@ -14,12 +14,8 @@ from warpgs.errors import DataError, UsageError
 from warpgs.onnx import PROVIDERS
 from warpgs.priors import networks
 from warpgs.process import Detail, Say, counted, silent
-from warpgs.scene import Prior, View
+from warpgs.scene import Prior, View, ViewDepth
 from warpgs.schema import Checked
-
-if TYPE_CHECKING:
-    from warpgs.scene import ViewDepth
-
 
 # Semantics of an image as three maps: confidence of the labels, their boundaries, and foreground.
 #
