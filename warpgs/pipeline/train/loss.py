@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import math
 from collections.abc import Mapping, Sequence
@@ -401,7 +400,7 @@ class GivenNormalsDifference(LossTerm, group="given-normals."):
         """Compute ``weight`` times `normal_difference` of the rendered depth's normals, shape []."""
         depth = torch.where(inputs.outputs["alpha"] <= GIVEN_MIN_ALPHA, 0, inputs.outputs["depth"])
         # in the axes of the camera, like the given normals: a refined pose gets no gradient
-        camera = dataclasses.replace(inputs.camera, viewmat=torch.eye(4, dtype=depth.dtype, device=depth.device))
+        camera = replace(inputs.camera, viewmat=torch.eye(4, dtype=depth.dtype, device=depth.device))
         target = inputs.target
         return self.weight * normal_difference(depth_normals(camera, depth), target.maps["given_normals"], target.mask)
 

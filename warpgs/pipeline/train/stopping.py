@@ -7,7 +7,6 @@ from typing import Annotated, Any
 
 import torch
 
-from warpgs import schema
 from warpgs.errors import DataError
 from warpgs.pipeline.metrics.scores import psnr_of
 from warpgs.pipeline.model.table import DensityUpdate
@@ -18,7 +17,7 @@ from warpgs.process import Detail
 from warpgs.render.options import RasterizeOptions
 from warpgs.render.rasterize import rasterize
 from warpgs.scene import Gaussians, Tensors
-from warpgs.schema import Checked, Within
+from warpgs.schema import Checked, Within, fields, items, or_null, real, text, whole
 
 # Held-out blocks of pixels; the gain on these blocks, compared with its noise, ends a fit early (docs/decisions/020).
 #
@@ -137,11 +136,11 @@ class StoppingConfig(Checked, group="stopping."):
     0.1, or 0 if --cpu-limit shortens the fit."""
 
 
-_COUNT = schema.whole(0)
-STATE = schema.fields({
-    "ended": schema.or_null(_COUNT), "why": schema.text, "measured": schema.items(_COUNT),
-    "measurements": schema.items(schema.fields({
-        "step": _COUNT, "count": _COUNT, "held_out_psnr": schema.real, "gain": schema.real, "noise": schema.real,
+_COUNT = whole(0)
+STATE = fields({
+    "ended": or_null(_COUNT), "why": text, "measured": items(_COUNT),
+    "measurements": items(fields({
+        "step": _COUNT, "count": _COUNT, "held_out_psnr": real, "gain": real, "noise": real,
     }, others=False)),
 })  # fmt: skip
 """Schema of the plain values in a checkpoint."""

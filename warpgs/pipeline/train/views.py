@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch.nn.functional import interpolate
 
 from warpgs.device import FLOAT, STEP, Needs, StepSizes
 from warpgs.errors import UsageError
@@ -209,7 +208,7 @@ def half_size(view: TrainingView) -> TrainingView:
     width, height = camera.width, camera.height
 
     def mean(channels: torch.Tensor) -> torch.Tensor:
-        return interpolate(channels[None], (height, width), mode="area")[0]
+        return torch.nn.functional.interpolate(channels[None], (height, width), mode="area")[0]
 
     def smaller(t: torch.Tensor) -> torch.Tensor:
         return mean(t[None])[0] if t.ndim == 2 else mean(t.permute(2, 0, 1)).permute(1, 2, 0).contiguous()

@@ -3,10 +3,9 @@
 "3D Gaussian Splatting as Markov Chain Monte Carlo", arXiv 2404.09591. Equation numbers are that paper's.
 """
 
-import dataclasses
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 import torch
@@ -115,7 +114,7 @@ class MCMC(Strategy):
     @classmethod
     def warmup_config(cls, own):
         """Return the settings with an event after every step."""
-        return dataclasses.replace(own, start=0, every=1)
+        return replace(own, start=0, every=1)
 
     def growth(self) -> Growth:
         """Return the times of relocation and addition."""
