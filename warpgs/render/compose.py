@@ -8,7 +8,6 @@ import torch
 
 from warpgs.constants import Rule
 from warpgs.kernels import blend as blending, launch, sh
-from warpgs.kernels.blend import blend
 from warpgs.kernels.ellipse import ProjectInputs, checked_factors, nothing, packed_covariances
 from warpgs.kernels.falloff import Pass
 from warpgs.kernels.project import project_inputs
@@ -87,7 +86,7 @@ def bin_and_blend(
 ) -> Images:  # fmt: skip
     """Bin and blend projected Gaussians [C, N, 12]; ``colors`` as in `blend`."""
     tiles = bin_tiles(projected, tile_counts, settings, memory, needs_slots((projected, backgrounds, colors)))
-    return blend(projected, tiles, backgrounds, settings, colors)
+    return blending.blend(projected, tiles, backgrounds, settings, colors)
 
 
 def needs_slots(tensors: Iterable[torch.Tensor | None]) -> bool:

@@ -23,7 +23,6 @@ from warpgs.kernels.cameras import CAMERA_MODELS
 from warpgs.kernels.ellipse import ProjectInputs
 from warpgs.kernels.falloff import Pass
 from warpgs.kernels.graphs import MIN_REPLAYS, Allocator, GraphedFunction, GraphPool, fetch
-from warpgs.kernels.launch import first_order, keep, kept
 from warpgs.kernels.tiles import BYTES_PER_INSTANCE, InstanceMemory, Tiles, grid, running_counts, split_sum, sums_fit
 from warpgs.means2d import count_passes
 from warpgs.render.compose import composite_into
@@ -159,17 +158,17 @@ class _Projected(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, rasterizer, cameras, projection, passes, *inputs):
-        keep(ctx, *inputs[:5], cameras, *projection)  # viewmats and Ks are in cameras
+        launch.keep(ctx, *inputs[:5], cameras, *projection)  # viewmats and Ks are in cameras
         ctx.rasterizer, ctx.passes = rasterizer, passes
         ctx.set_materialize_grads(False)
         return projection[0]
 
     @staticmethod
-    @first_order
+    @launch.first_order
     def backward(ctx, v_projected):
         ctx.passes.append(True)
         wants_camera = ctx.needs_input_grad[9] or ctx.needs_input_grad[10]  # viewmats and Ks
-        return None, None, None, None, *ctx.rasterizer.project_gradients(kept(ctx), v_projected, wants_camera)
+        return None, None, None, None, *ctx.rasterizer.project_gradients(launch.kept(ctx), v_projected, wants_camera)
 
 
 class _Blended(torch.autograd.Function):
@@ -178,16 +177,16 @@ class _Blended(torch.autograd.Function):
     @staticmethod
     def forward(ctx, projected, backgrounds, rasterizer, counts, images, block, passes):
         rgb, _, depth = images
-        keep(ctx, projected, counts, backgrounds, rgb, depth, block)
+        launch.keep(ctx, projected, counts, backgrounds, rgb, depth, block)
         ctx.rasterizer, ctx.passes = rasterizer, passes
         ctx.set_materialize_grads(False)
         return tuple(images)
 
     @staticmethod
-    @first_order
+    @launch.first_order
     def backward(ctx, *v_images):
         ctx.passes.append(True)
-        found = ctx.rasterizer.blend_gradients(kept(ctx), v_images, ctx.needs_input_grad[1])
+        found = ctx.rasterizer.blend_gradients(launch.kept(ctx), v_images, ctx.needs_input_grad[1])
         return *found, None, None, None, None, None
 
 

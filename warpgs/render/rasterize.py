@@ -20,7 +20,6 @@ from warpgs.kernels.blend_cuda import image_tile
 from warpgs.kernels.cameras import check_camera
 from warpgs.kernels.ellipse import ProjectInputs
 from warpgs.kernels.falloff import WIDTHS, Pass
-from warpgs.kernels.launch import refuse_transforms, without_gradient
 from warpgs.kernels.project import project_inputs
 from warpgs.kernels.tiles import BYTES_PER_INSTANCE, InstanceMemory, bin_tiles, grid
 from warpgs.means2d import count_passes
@@ -345,7 +344,7 @@ def rasterize(
 
 def _render(gaussians: RasterizedGaussians, camera: Camera, options: RasterizeOptions) -> Render:
     """Return what `rasterize` returns for one camera or a batch [C, ...] of them."""
-    refuse_transforms()
+    launch.refuse_transforms()
     _check_arguments(gaussians, camera, options)
     check_camera(camera)
     inputs = compose.inputs_of(gaussians, camera, options.opacity_factors)
@@ -393,7 +392,7 @@ def _render(gaussians: RasterizedGaussians, camera: Camera, options: RasterizeOp
     for name in WITHOUT_GRADIENT:  # a gradient through an output that has none becomes an error
         if (values := getattr(render, name)) is not None:
             source = render.rgb if name == "error_bound" else render.projected
-            refusing[name] = without_gradient(name, values, source)
+            refusing[name] = launch.without_gradient(name, values, source)
     return replace(render, **refusing)
 
 
@@ -426,9 +425,9 @@ def _rasterize(
     if most is not None and budget is not None:
         most = min(most, budget // BYTES_PER_INSTANCE)
     if most is not None and int(tile_counts.sum()) > most:
-        frame = settings, most, inputs, InstanceMemory(budget)
-        images = [blend_chunked(projected, backgrounds, *frame, colors) for colors, backgrounds in layers]
-        maps = further_chunked(projected, *frame, *further) if any(further) else {}
+        memory, own = InstanceMemory(budget), inputs.detached()
+        images = [blend_chunked(projected, behind, colors, settings, most, memory, *own) for colors, behind in layers]
+        maps = further_chunked(projected, settings, most, own, memory, *further) if any(further) else {}
     else:
         overflow = None if options.capacity is None else torch.zeros(1, dtype=torch.int32, device=projected.device)
         memory = InstanceMemory(budget, options.capacity, overflow)

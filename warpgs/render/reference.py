@@ -4,7 +4,6 @@ import torch
 
 from warpgs import geometry
 from warpgs.constants import FRUSTUM_MARGIN, RULES
-from warpgs.geometry import rotation_matrices
 from warpgs.kernels import sh
 from warpgs.scene import Camera, Gaussians
 
@@ -34,7 +33,7 @@ def _project(gaussians: Gaussians, camera: Camera, degree: int, antialiased: boo
     visible = visible[torch.argsort(depths[visible], stable=True)]
     positions, opacities = positions[visible], opacities[visible]
     pixels, jacobians = _pixels(camera, K, lens, positions)
-    axes = jacobians @ rotation @ rotation_matrices(unit[visible]) @ torch.diag_embed(log_scales[visible].exp())
+    axes = jacobians @ rotation @ geometry.rotation_matrices(unit[visible]) @ torch.diag_embed(log_scales[visible].exp())
     covariances = axes @ axes.mT + rule.low_pass * torch.eye(2, dtype=torch.float64, device=means.device)
     if antialiased:
         opacities = opacities * (torch.linalg.det(axes @ axes.mT).clamp_min(0) / torch.linalg.det(covariances)).sqrt()

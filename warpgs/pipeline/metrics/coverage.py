@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch.nn.functional import interpolate
 
 from warpgs.constants import NEAR
 from warpgs.device import in_background
@@ -49,7 +48,7 @@ def depth_views(
         depth = torch.where(alpha >= MIN_ALPHA, depth, 0)
         if mask is not None:
             counts = torch.as_tensor(mask, dtype=torch.float32, device=depth.device)[None, None]
-            depth = torch.where(interpolate(counts, depth.shape, mode="area")[0, 0] > 0.5, depth, 0)
+            depth = torch.where(torch.nn.functional.interpolate(counts, depth.shape, mode="area")[0, 0] > 0.5, depth, 0)
         views.append((small, depth))
     return views
 
@@ -149,7 +148,7 @@ def _photo(view: View, depth: torch.Tensor) -> torch.Tensor:
     image = torch.as_tensor(without_masked(view).image, dtype=torch.float32, device=depth.device)
     if image.shape[:2] == depth.shape:
         return image
-    return interpolate(image.permute(2, 0, 1)[None], depth.shape, mode="area")[0].permute(1, 2, 0)
+    return torch.nn.functional.interpolate(image.permute(2, 0, 1)[None], depth.shape, mode="area")[0].permute(1, 2, 0)
 
 
 def _sampled(image: torch.Tensor, u: torch.Tensor, v: torch.Tensor) -> torch.Tensor:
