@@ -89,15 +89,9 @@ def is_native(projected: torch.Tensor) -> bool:
 
 
 def composite(
-    projected: torch.Tensor,
-    tiles: Tiles,
-    backgrounds: torch.Tensor,
-    settings: Pass,
-    *,
-    save: bool,
-    allocator: Allocator = TORCH,
-    image: torch.Tensor | None = None,
-) -> tuple[torch.Tensor, ...]:
+    projected: torch.Tensor, tiles: Tiles, backgrounds: torch.Tensor, settings: Pass, *, save: bool,
+    allocator: Allocator = TORCH, image: torch.Tensor | None = None,
+) -> tuple[torch.Tensor, ...]:  # fmt: skip
     """Return rgb [C, H, W, D]; alpha, depth, transmittances, weights and ends [C, H, W]; and states. Nothing is checked."""
     # ``image`` may be a slice of the channels of an image; on CUDA in float32 it may have fewer than D channels: then only the
     # first ones are written. Without ``save``, transmittances and weights may be empty. With `Pass.max_error`: rgb, alpha,
@@ -141,14 +135,9 @@ def _rounded(projected: torch.Tensor, tiles: Tiles, backgrounds: torch.Tensor, s
 
 
 def composite_gradients(
-    projected: torch.Tensor,
-    tiles: Tiles,
-    backgrounds: torch.Tensor,
-    settings: Pass,
-    saved: Sequence[torch.Tensor],
-    v_images: Sequence[torch.Tensor | None],
-    allocator: Allocator = TORCH,
-) -> torch.Tensor:
+    projected: torch.Tensor, tiles: Tiles, backgrounds: torch.Tensor, settings: Pass, saved: Sequence[torch.Tensor],
+    v_images: Sequence[torch.Tensor | None], allocator: Allocator = TORCH,
+) -> torch.Tensor:  # fmt: skip
     """Return the gradient of ``projected`` [C, N, 9 + D], from `composite`'s results except alpha. Nothing is checked."""
     # Only those channels of ``rgb`` are read that have a gradient. On CUDA in float32 the gradient of ``rgb`` may have fewer
     # than D channels; the others have gradient 0.
@@ -270,7 +259,7 @@ def _padded(values: torch.Tensor, width: int) -> torch.Tensor:
 
 def _groups(
     projected: torch.Tensor, tiles: Tiles, colors: torch.Tensor, backgrounds: torch.Tensor, width: int
-) -> Iterator[tuple[slice, torch.Tensor, torch.Tensor]]:  # fmt: skip
+) -> Iterator[tuple[slice, torch.Tensor, torch.Tensor]]:
     """Yield for each pass a slice of the D channels, Gaussians [C, N, 9 + G] with these channels, and backgrounds [C, G]."""
     # The Gaussians share their memory: use them before you request the next. Zeros fill up the last group.
     count, real = colors.shape[-1], launch.real_of(colors)

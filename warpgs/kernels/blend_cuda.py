@@ -175,15 +175,9 @@ def image_tile(settings: Pass) -> int:
 
 
 def forward(
-    projected: torch.Tensor,
-    tiles: Tiles,
-    backgrounds: torch.Tensor,
-    settings: Pass,
-    *,
-    save: bool,
-    allocator: Allocator = TORCH,
-    image: torch.Tensor | None = None,
-) -> tuple[torch.Tensor, ...]:
+    projected: torch.Tensor, tiles: Tiles, backgrounds: torch.Tensor, settings: Pass, *, save: bool,
+    allocator: Allocator = TORCH, image: torch.Tensor | None = None,
+) -> tuple[torch.Tensor, ...]:  # fmt: skip
     """Return what `blend.composite` returns; states [S, P] have a row for each chunk of instances."""
     device, channels, packed = projected.device, backgrounds.shape[1], tiles.packed is not None
     shape = (backgrounds.shape[0], *settings.window[:1:-1])
@@ -213,14 +207,9 @@ def forward(
 
 
 def backward(
-    projected: torch.Tensor,
-    tiles: Tiles,
-    backgrounds: torch.Tensor,
-    settings: Pass,
-    saved: Sequence[torch.Tensor],
-    v_images: Sequence[torch.Tensor | None],
-    allocator: Allocator = TORCH,
-) -> torch.Tensor:
+    projected: torch.Tensor, tiles: Tiles, backgrounds: torch.Tensor, settings: Pass, saved: Sequence[torch.Tensor],
+    v_images: Sequence[torch.Tensor | None], allocator: Allocator = TORCH,
+) -> torch.Tensor:  # fmt: skip
     """Return the gradient of ``projected`` [C, N, 9 + D], from `forward`'s results except alpha; None is a zero gradient."""
     rgb, depth, transmittances, weights, ends, states = saved
     v_rgb, v_alpha, v_depth = v_images

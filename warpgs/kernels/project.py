@@ -74,15 +74,9 @@ class _Project(torch.autograd.Function):
 
 
 def project_gradients(
-    inputs: Sequence[torch.Tensor],
-    settings: Pass,
-    projected: torch.Tensor,
-    tile_counts: torch.Tensor,
-    v_projected: torch.Tensor | None,
-    *,
-    wants_camera: bool,
-    allocator: Allocator = TORCH,
-) -> list[torch.Tensor | None]:
+    inputs: Sequence[torch.Tensor], settings: Pass, projected: torch.Tensor, tile_counts: torch.Tensor,
+    v_projected: torch.Tensor | None, *, wants_camera: bool, allocator: Allocator = TORCH,
+) -> list[torch.Tensor | None]:  # fmt: skip
     """Return the gradients of the first seven inputs, those of viewmats and Ks None unless wanted. Nothing is checked."""
     real, device = launch.real_of(projected), projected.device
     rule = settings.rule

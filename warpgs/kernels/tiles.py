@@ -410,7 +410,7 @@ def make_kernels(real, native: bool):
 
     return SimpleNamespace(
         depth_keys=depth_keys, pack_counts=pack_counts, visible_keys=visible_keys, ordered_counts=ordered_counts
-    )  # fmt: skip
+    )
 
 
 def running_counts(counts: torch.Tensor, real, allocator: Allocator = TORCH, out: torch.Tensor | None = None) -> torch.Tensor:
