@@ -9,12 +9,9 @@ import torch
 
 from warpgs.errors import UsageError
 from warpgs.kernels.update import end_step
-from warpgs.pipeline.model.table import Table
 from warpgs.pipeline.train.step import StepBuffers, StepPlan, StepTaker, steps_at_once
-from warpgs.pipeline.train.strategies.base import Strategy
-from warpgs.pipeline.train.views import Kind, LearnedViews, ViewStack
+from warpgs.pipeline.train.views import Kind
 from warpgs.ranks import Ranks
-from warpgs.render.options import RasterizeOptions
 from warpgs.scene import Tensors
 
 # Sums over the views of a step (slots), in one order for any number of processes.
@@ -220,12 +217,9 @@ and the first slot's reason to stop the step."""
 class BatchSteps(StepTaker):
     """Steps of B views each."""
 
-    def __init__(
-        self, table: Table, views: LearnedViews, strategy: Strategy, cameras: Sequence[torch.Tensor],
-        options: RasterizeOptions, dropout_seed: int | None, tree: Tree,
-    ):  # fmt: skip
-        """Begin without memory for sums."""
-        super().__init__(table, views, strategy, cameras, options, dropout_seed)
+    def __init__(self, *parts: Any, tree: Tree):
+        """Begin without memory for sums; ``parts`` are those of `StepTaker`."""
+        super().__init__(*parts)
         b = self.buffers
         self.tree, self.kept_sums = tree, tree.buffers
         self.slots = StepBuffers(b.device, 1, steps_at_once(tree.batch) * len(tree.slots))
@@ -247,24 +241,21 @@ class BatchSteps(StepTaker):
         self._update = None
         super().clear()
 
-    def take(
-        self, places: list[tuple[Kind, int]], settings: Callable[[], Sequence[tuple[float, ...]]],
-        stacks: Mapping[Kind, ViewStack], plan: StepPlan, max_instances: int | None, *, captured: bool,
-    ) -> None:  # fmt: skip
+    def take(self, places: list[tuple[Kind, int]], settings: Callable[[], Sequence[tuple[float, ...]]], plan: StepPlan) -> None:
         """Take the steps of `buffers`; places and settings are those of the slots of all processes, step by step."""
         slots, batch = self.tree.slots, self.tree.batch
-        if captured and max_instances is not None:  # in all processes, or one alone would go on without graphs
+        # in all processes, or one alone would go on without graphs
+        if self.captured and self.strategy.context.max_instances is not None:
             for kind in dict.fromkeys(kind for kind, _ in places):
-                self.capacity(kind, stacks, plan, max_instances)
+                self.capacity(kind, plan)
         own, rows = [i for i in range(len(places)) if i % batch in slots], settings()
         self.slots.load([places[i][1] for i in own], [[1.0]] * len(own), [rows[i] for i in own])
-        kinds = [places[i][0] for i in own]
-        works = self.works(self.view_gradients, kinds, self.slots, stacks, plan, max_instances, captured=captured)
+        works = self.works(self.view_gradients, [places[i][0] for i in own], self.slots, plan)
         update: list[Callable[[], object]] = []
         for begin in range(0, len(own), len(slots)):  # a step each
             first = [self._contribution(begin, works)]  # the strategy's statistics determine the sums
             if not update:
-                sums, update = self._prepared(*first[0], plan, captured)
+                sums, update = self._prepared(*first[0], plan)
 
             def add(slot: int, parts: list[torch.Tensor], adds: bool) -> None:
                 place = begin + slot - slots.start  # noqa: B023
@@ -300,7 +291,7 @@ class BatchSteps(StepTaker):
             said[STOP : STOP + 1].fill_(1.0)
 
     def _prepared(
-        self, gradients: list[torch.Tensor], statistics: Tensors, plan: StepPlan, captured: bool
+        self, gradients: list[torch.Tensor], statistics: Tensors, plan: StepPlan
     ) -> tuple[SlotSums, list[Callable[[], object]]]:
         """Return sums, and the functions that update by them; their shapes are those of a view's contribution."""
         shapes = [*(tuple(t.shape) for t in (*gradients, *statistics.values())), (FLAGS + self.tree.batch,)]
@@ -313,7 +304,7 @@ class BatchSteps(StepTaker):
         if self._update is None or self._update[0] != plan:
             parts, count = self.sums.parts(), len(gradients)
             functions = self._functions(plan, self.sums, parts[:count], dict(zip(statistics, parts[count:-1], strict=True)))
-            if captured and self.cuda:  # all but the exchanges between processes
+            if self.captured and self.cuda:  # all but the exchanges between processes
                 functions = [f if k % 2 else self.capture(f, self.buffers).replay for k, f in enumerate(functions)]
             self._update = plan, functions
         return self.sums, self._update[1]

@@ -216,6 +216,9 @@ class StepTaker:
             """Stream of captures, always the same one: torch reuses freed memory only on the stream that used it before."""
             self.memory = GraphMemory(device)
             """Account of the memory that torch keeps for deleted graphs."""
+        self.stacks: Mapping[Kind, ViewStack] = {}
+        """Views to step through; the trainer sets them, and whether steps are ``captured``."""
+        self.captured = False
         self._graphs: dict[tuple[Kind, StepPlan], CapturedGraph] = {}
         self._capacities: dict[tuple[Kind, StepPlan], int] = {}
 
@@ -308,45 +311,43 @@ class StepTaker:
         for name, value in statistics.items():
             table.columns[name] += value
 
-    def take(
-        self, places: list[tuple[Kind, int]], settings: Callable[[], Sequence[tuple[float, ...]]],
-        stacks: Mapping[Kind, ViewStack], plan: StepPlan, max_instances: int | None, *, captured: bool,
-    ) -> None:  # fmt: skip
+    def take(self, places: list[tuple[Kind, int]], settings: Callable[[], Sequence[tuple[float, ...]]], plan: StepPlan) -> None:
         """Take the steps whose learning rates and settings the buffers hold, with the views at these kinds and rows.
 
         With several views in a step, ``places`` and ``settings`` list those of each slot, step by step. A view has at most
-        ``max_instances`` (Gaussian, tile) instances at a time; if a graph would exceed them, OverLimitError is raised, and
-        nothing was changed.
+        `StrategyContext.max_instances` (Gaussian, tile) instances at a time; if a graph would exceed them, OverLimitError is
+        raised, and nothing was changed.
         """
-        kinds = [kind for kind, _ in places]
-        for work in self.works(self.step, kinds, self.buffers, stacks, plan, max_instances, captured=captured):
+        for work in self.works(self.step, [kind for kind, _ in places], self.buffers, plan):
             work()
 
     def works(
         self, function: Callable[[ViewStack, StepBuffers, StepPlan, Renderer], object], kinds: Sequence[Kind],
-        buffers: StepBuffers, stacks: Mapping[Kind, ViewStack], plan: StepPlan, max_instances: int | None, *, captured: bool,
+        buffers: StepBuffers, plan: StepPlan,
     ) -> list[Callable[[], Any]]:  # fmt: skip
         """Return the work of ``function`` for a view of each of some kinds; missing graphs are captured first."""
-        if not (captured and self.cuda):
+        max_instances = self.strategy.context.max_instances
+        if not (self.captured and self.cuda):
             render = eager_renderer(self.options, max_instances)
-            return [functools.partial(function, stacks[kind], buffers, plan, render) for kind in kinds]
+            return [functools.partial(function, self.stacks[kind], buffers, plan, render) for kind in kinds]
         if self.table.settle():
             self.clear()
         self._graphs = {k: g for k, g in self._graphs.items() if k[1] == plan}
         for kind in dict.fromkeys(kinds):
             if (kind, plan) not in self._graphs:
-                capacity = self.capacity(kind, stacks, plan, max_instances)
+                capacity = self.capacity(kind, plan)
                 self.memory.give_back(0 if max_instances is not None else DEAD_BYTES)
                 render = captured_renderer(self.options, capacity, buffers.stop)
-                work = functools.partial(function, stacks[kind], buffers, plan, render)
+                work = functools.partial(function, self.stacks[kind], buffers, plan, render)
                 self._graphs[kind, plan] = self.capture(work, buffers)
         return [self._graphs[kind, plan].replay for kind in kinds]
 
-    def capacity(self, kind: Kind, stacks: Mapping[Kind, ViewStack], plan: StepPlan, max_instances: int | None) -> int:
+    def capacity(self, kind: Kind, plan: StepPlan) -> int:
         """Return the capacity of captured steps with a kind of view, or raise OverLimitError above ``max_instances``."""
+        max_instances = self.strategy.context.max_instances
         self._capacities = {k: c for k, c in self._capacities.items() if k[1] == plan}
         if (kind, plan) not in self._capacities:
-            now = current(stacks[kind], self.views)
+            now = current(self.stacks[kind], self.views)
             self._capacities[kind, plan] = instance_capacity(self.table.gaussians, now, plan.degree, self.options)
         wanted = self._capacities[kind, plan]
         if max_instances is not None and wanted > max_instances:

@@ -200,7 +200,7 @@ class Trainer:
         self.mean = ParameterMean(c.optimizer.average_last)
         limiting, seed = (camera_centers(cameras, device), camera_rows(cameras, device)), c.seed if self.dropout > 0 else None
         parts = self.table, self.learned, self.strategy, limiting, self.context.render_options(), seed
-        self.taker = StepTaker(*parts) if c.batch == 1 else BatchSteps(*parts, Tree(c.batch, ranks))
+        self.taker = StepTaker(*parts) if c.batch == 1 else BatchSteps(*parts, tree=Tree(c.batch, ranks))
         views, self.disparities = prepared_views(train, start, priors, c, self.terms, device)
         self.context.priors = priors or []
         self.set_views(with_learned(views, self.learned))
@@ -307,13 +307,11 @@ class Trainer:
         steps = range(first, first + count)
         buffers.load([row for _, row in places[:count]], [self._lr_row(s) for s in steps], [self.settings(s) for s in steps])
         self.chosen = chosen
+        self.taker.stacks, self.taker.captured = self.stacks, self.layout.graphs > 0
         if self.layout.graphs and self.stopping.ended is None:
             self.strategy.before_steps(steps[-1])
         try:
-            self.taker.take(
-                places, lambda: [self.settings(step, slot) for step in steps for slot in range(self.batch)],
-                self.stacks, plan, self.context.max_instances, captured=self.layout.graphs > 0,
-            )  # fmt: skip
+            self.taker.take(places, lambda: [self.settings(step, n) for step in steps for n in range(self.batch)], plan)
         except OverLimitError as e:
             self.taker.clear()
             self.layout.graphs = 0
