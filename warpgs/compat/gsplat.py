@@ -23,17 +23,6 @@ from warpgs.render.options import RasterizeOptions, image_settings
 from warpgs.render.rasterize import rasterize
 from warpgs.scene import ActivatedGaussians, Camera, CovarianceGaussians, RasterizedGaussians, Render
 
-__all__ = [
-    "RendererConfig",
-    "RendererConfig_MixedBatch",
-    "RendererConfig_ParallelBatch",
-    "RollingShutterType",
-    "UnsupportedError",
-    "quat_to_rotmat",
-    "rasterization",
-    "spherical_harmonics",
-]
-
 
 def __dir__() -> list[str]:
     """Return the public names."""
@@ -56,11 +45,6 @@ class RollingShutterType(enum.IntEnum):
 
 class RendererConfig:
     """Base class of gsplat's choices of kernels."""
-
-    def __init__(self) -> None:
-        """Raise TypeError for the base class itself."""
-        if type(self) is RendererConfig:
-            raise TypeError("RendererConfig is a base class: use RendererConfig_MixedBatch()")
 
 
 class RendererConfig_MixedBatch(RendererConfig):
@@ -401,3 +385,6 @@ def quat_to_rotmat(quats: Tensor) -> Tensor:
         Rotation matrices, shape [..., 3, 3].
     """
     return torch.as_tensor(rotation_matrices(torch.nn.functional.normalize(quats, dim=-1)))
+
+
+__all__ = [name for name in sorted(globals()) if name[0] != "_" and getattr(globals()[name], "__module__", "") == __name__]
