@@ -210,11 +210,8 @@ class GraphPool:
         self.failed = False
         """True once a capture failed for another reason than lack of memory."""
         self._keeper: CapturedGraph | None = None
-
-    @functools.cached_property
-    def byte(self) -> torch.Tensor:
+        self.byte = torch.empty(0, dtype=torch.uint8, device=device)
         """Empty tensor of bytes on the device, shape [0]."""
-        return torch.empty(0, dtype=torch.uint8, device=self.device)
 
     @functools.cached_property
     def _aside(self) -> torch.cuda.Stream:

@@ -7,7 +7,6 @@ import torch
 import warp as wp
 
 from warpgs.device import BINNING, BLENDING, FLOAT, LOSS, PROJECTION, SAMPLING, Needs, StepSizes
-from warpgs.errors import UsageError
 from warpgs.kernels import launch, project_cpu, project_cuda
 from warpgs.kernels.cameras import CAMERA_MODELS
 from warpgs.kernels.ellipse import PROJECTED_SIZE, ProjectInputs
@@ -115,8 +114,6 @@ def project_inputs(inputs: ProjectInputs, settings: Pass) -> tuple[torch.Tensor,
         viewmats=(inputs.viewmats, "C 4 4"), Ks=(inputs.Ks, "C 3 3"),
         distortion=(inputs.distortion, f"C {model.coefficients}"),
     )  # fmt: skip
-    if inputs.distortion.requires_grad:
-        raise UsageError("gradients of distortion coefficients are not supported: give distortion.detach()")
     if sizes["K"] < settings.sh_count:
         degree = math.isqrt(settings.sh_count) - 1
         raise ValueError(f"sh has {sizes['K']} coefficients per channel, but degree {degree} needs {settings.sh_count}")

@@ -211,8 +211,6 @@ LOW = WHITE + 1
 """Added to colours while they are interpolated, so that the colour outside of an image, -`WHITE`, becomes positive."""
 MIDDLE = 2048
 """Subtracted from colours before they are multiplied, which keeps sums small."""
-MAX_RADIUS = 3
-"""Largest half side of a window [px]: 49 squares of the largest colour, `WHITE` + `MIDDLE`, fit into 32 bits with a sign."""
 NEUTRAL = 0.5
 """Cost of correlation 0: where a plane projects outside of the other image, or a window has no texture."""
 
@@ -443,13 +441,12 @@ def plane_costs(
     gray: np.ndarray, others: Sequence[np.ndarray], homographies: np.ndarray, window: int, noise: float, unit: int
 ) -> torch.Tensor:
     """Return the costs int16 [H, W, P] of an image [H, W] against others, warped by homographies [D, N, 3, 3] of D planes."""
+    # A window has at most 7 px: 49 squares of the largest colour, `WHITE` + `MIDDLE`, fit into 32 bits with a sign.
     # The cost of one other image is 0.5 (1 - correlation), with ``noise`` added to the variance; ``unit`` stands for cost 1.
     # The result is half the mean of these costs plus half the smallest: an image that does not see the point contributes, but
     # cannot outvote one that does. Pixel centres are at integers. P is D rounded up to a multiple of `LANES`; costs past D are
     # ``unit``.
     radius = window // 2
-    if not 1 <= radius <= MAX_RADIUS:
-        raise ValueError(f"window must be 3 to {2 * MAX_RADIUS + 1} px, not {window}")
     height, width = gray.shape
     pitch, padded = (-(-n // LANES) * LANES for n in (width, len(homographies)))
     centred = (_whole(gray) - MIDDLE).astype(np.int64)

@@ -1,6 +1,6 @@
 """Chunked rendering: windows of an image, each with at most a given number of (Gaussian, tile) pairs, called instances."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import torch
@@ -10,7 +10,7 @@ from warpgs.kernels.falloff import Pass
 from warpgs.kernels.launch import first_order, keep, kept
 from warpgs.kernels.project import project_inputs
 from warpgs.kernels.tiles import InstanceMemory, bin_tiles
-from warpgs.render.compose import bin_and_blend, further_of
+from warpgs.render.compose import Images, bin_and_blend, further_of
 
 
 def halves(settings: Pass) -> tuple[Pass, ...]:
@@ -82,7 +82,7 @@ class _BlendChunked(torch.autograd.Function):
         return *gradients, *(None for _ in range(3 + 3 + len(inputs) - len(gradients)))
 
 
-blend_chunked = _BlendChunked.apply
+blend_chunked: Callable[..., Images] = _BlendChunked.apply
 """Composite [C, N, 12] chunk by chunk, to the bits of `blend`; the backward pass renders each chunk again."""
 # only the inputs are saved; about 1.5 times the time of `blend`, with memory for one chunk's instances
 
