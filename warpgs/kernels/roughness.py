@@ -11,6 +11,7 @@ from types import SimpleNamespace
 
 import torch
 import warp as wp
+from torch import Tensor
 
 from warpgs.kernels import launch
 from warpgs.kernels.native import EXACT
@@ -112,10 +113,7 @@ class _Roughness(torch.autograd.Function):
         return v_depth, None, None, None, None, None
 
 
-def roughness(
-    depth: torch.Tensor, alpha: torch.Tensor, rows: torch.Tensor, columns: torch.Tensor, weight: torch.Tensor,
-    mask: torch.Tensor | None,
-) -> torch.Tensor:  # fmt: skip
+def roughness(depth: Tensor, alpha: Tensor, rows: Tensor, columns: Tensor, weight: Tensor, mask: Tensor | None) -> Tensor:
     """Return the roughness of each pixel [H, W]: of depth [u], by opacity, weight and mask [H, W].
 
     ``rows`` [H, W - 2] and ``columns`` [H - 2, W] weigh the edges between the two neighbours of a pixel. The gradient is by

@@ -7,6 +7,7 @@ from typing import Any
 
 import torch
 import warp as wp
+from torch import Tensor
 
 from warpgs.constants import LARGEST_HALF, TILE_SIZE
 from warpgs.device import BINNING, BLENDING, FLOAT, LOSS, SAMPLING, Needs, StepSizes, format_bytes, free_for
@@ -413,7 +414,7 @@ def make_kernels(real, native: bool):
     )
 
 
-def running_counts(counts: torch.Tensor, real, allocator: Allocator = TORCH, out: torch.Tensor | None = None) -> torch.Tensor:
+def running_counts(counts: Tensor, real, allocator: Allocator = TORCH, out: Tensor | None = None) -> Tensor:
     """Return running sums int64 [S] of counts [C * N]; a visible Gaussian adds its count and 2^`sum_bits` (see `split_sum`)."""
     device, count, native = counts.device, len(counts), counts.is_cuda
     sums, threads = sum_entries(count, native)
@@ -457,28 +458,28 @@ class Tiles:
 
     size: int
     """Side of a tile [px]."""
-    ranges: torch.Tensor
+    ranges: Tensor
     """First instance of each tile and one past its last, int32, shape [C * tiles, 2]."""
-    gaussian_ids: torch.Tensor
+    gaussian_ids: Tensor
     """Flat Gaussian number of each instance, int32, shape [M]."""
-    slots: torch.Tensor
+    slots: Tensor
     """Position of an instance before the tile sort, int32, shape [M]. Before the sort, the instances of a Gaussian are
     neighbours. So each instance owns a row for its gradient, and the rows are summed in a fixed order, without atomics."""
-    starts: torch.Tensor
+    starts: Tensor
     """First slot of each Gaussian that has any, int32, shape [C * N]."""
-    counts: torch.Tensor
+    counts: Tensor
     """Number of slots of each Gaussian, int32, shape [C * N]."""
-    tile_ids: torch.Tensor
+    tile_ids: Tensor
     """Tile of each instance, int32, shape [M]; C * tiles for an entry that belongs to no tile."""
-    total: torch.Tensor
+    total: Tensor
     """Actual number of instances, int64, shape [1], for kernels; with a capacity, M is the capacity."""
     visible: int = 0
     """Number of Gaussians that have instances; with a capacity, an upper bound."""
-    packed: torch.Tensor | None = None
+    packed: Tensor | None = None
     """With `Pass.max_error` on CUDA in float32: records of the visible Gaussians in order of depth (blend_pack.cu), float32,
     shape [8 V + 8]; the last one starts with the largest colour. ``gaussian_ids`` are then places in this order."""
 
-    def tensors(self) -> tuple[torch.Tensor, ...]:
+    def tensors(self) -> tuple[Tensor, ...]:
         """Return all tensors [...], in the order of the constructor."""
         return self.ranges, self.gaussian_ids, self.slots, self.starts, self.counts, self.tile_ids, self.total
 
@@ -492,12 +493,12 @@ class InstanceMemory:
     capacity: int | None = None
     """Number of instances to allocate for. The actual number is then not read from the device, so the work can be captured as a
     CUDA graph. None for the actual number. Unused entries have a tile number that no tile has."""
-    overflow: torch.Tensor | None = None
+    overflow: Tensor | None = None
     """Set to 1 where there are more instances than the capacity: the lists are then cut short and must not be used. Int32,
     shape [1]; needed with a capacity."""
     allocator: Allocator = TORCH
     """Provider of the lists' memory."""
-    visible: tuple[torch.Tensor, int] | None = None
+    visible: tuple[Tensor, int] | None = None
     """Running sums of `running_counts` [S], and the number of visible Gaussians to allocate for, if instances have a capacity
     too; None to sort all Gaussians. If the last of the sums shows more of them, the lists must not be used."""
 
@@ -536,9 +537,7 @@ def _check_total(total: int, visible: int, device: torch.device, tiles: int, bud
     )
 
 
-def _depth_order(
-    projected: torch.Tensor, counts: torch.Tensor, tiles: int, memory: InstanceMemory
-) -> tuple[torch.Tensor, int, int]:
+def _depth_order(projected: Tensor, counts: Tensor, tiles: int, memory: InstanceMemory) -> tuple[Tensor, int, int]:
     """Return Gaussian numbers from front to back, int32; how many of them are visible; and the number of instances."""
     # With a capacity nothing is read from the device: all Gaussians count as visible, or as many as the capacity holds.
     # Invisible ones come last, and the number of instances is the capacity.
@@ -568,8 +567,8 @@ def _depth_order(
 
 
 def bin_tiles(
-    projected: torch.Tensor, tile_counts: torch.Tensor, settings: Any, memory: InstanceMemory = AS_NEEDED,
-    slotted: bool = True, listed: torch.Tensor | None = None,
+    projected: Tensor, tile_counts: Tensor, settings: Any, memory: InstanceMemory = AS_NEEDED,
+    slotted: bool = True, listed: Tensor | None = None,
 ) -> Tiles:  # fmt: skip
     """Return for every tile of the window the Gaussians [C, N, 12] that touch it, front to back. Not differentiable."""
     # ``settings`` are a `falloff.Pass`. Without ``slotted``, which gradients and `contributions` need, slots stay empty.

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from warpgs.errors import DataError, ResourceError, UsageError, install_extras
 from warpgs.files import read_file, read_input, remove_leftovers, write_bytes, write_text
@@ -26,9 +27,7 @@ from warpgs.priors.views import CLASSES
 REMEDY = install_extras("export")
 
 
-def onnx_bytes(
-    network: torch.nn.Module, image: torch.Tensor, outputs: Sequence[str], sizes: dict[int, Any] | None = None
-) -> bytes:
+def onnx_bytes(network: torch.nn.Module, image: Tensor, outputs: Sequence[str], sizes: dict[int, Any] | None = None) -> bytes:
     """Return the ONNX file of a network for an ``image`` [1, 3, h, w]; ``sizes`` are the sizes that its axes may have."""
     try:
         import onnxscript  # noqa: F401
@@ -52,7 +51,7 @@ def onnx_bytes(
         exporter.setLevel(before)
 
 
-def _try(data: bytes, out: Path, outputs: Sequence[str], image: torch.Tensor) -> list[np.ndarray]:
+def _try(data: bytes, out: Path, outputs: Sequence[str], image: Tensor) -> list[np.ndarray]:
     """Return what onnxruntime makes of an image with the bytes of ``out``, which is not yet written."""
     check_onnx(data, out)
     return [np.asarray(a) for a in start_session(data, out, "cpu", 0).run(list(outputs), {"image": image.numpy()})]
@@ -264,7 +263,7 @@ def _fcn_resnet18(request: ExportRequest) -> torch.nn.Module:
     return network
 
 
-def _own_weights(path: str | None) -> dict[str, torch.Tensor]:
+def _own_weights(path: str | None) -> dict[str, Tensor]:
     """Return the tensors [...] of the user's weights by name, before any library of networks is loaded."""
     if path is None:
         raise UsageError(

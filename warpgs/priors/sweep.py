@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from warpgs import geometry
 from warpgs.device import format_bytes, installed_bytes
@@ -220,15 +221,13 @@ def step_limits(colors: np.ndarray, small_step: float = SMALL_STEP, large_step: 
     return np.rint(np.maximum(large_step * np.exp(-jumps / EDGE), 1.5 * small_step) * UNIT).astype(np.int16)
 
 
-def matching_costs_cpu(view: View, others: Sequence[View], inverses: np.ndarray, window: int = WINDOW) -> torch.Tensor:
+def matching_costs_cpu(view: View, others: Sequence[View], inverses: np.ndarray, window: int = WINDOW) -> Tensor:
     """Return the disagreement of views at D inverse depths [1/u] in units of 1 / `UNIT`, as `plane_costs` does."""
     homographies = plane_homographies(view.camera, [o.camera for o in others], inverses)
     return plane_costs(gray_of(view), [gray_of(o) for o in others], homographies, window, NOISE, UNIT)
 
 
-def path_costs(
-    costs: torch.Tensor, image: np.ndarray, small_step: float = SMALL_STEP, large_step: float = LARGE_STEP
-) -> torch.Tensor:
+def path_costs(costs: Tensor, image: np.ndarray, small_step: float = SMALL_STEP, large_step: float = LARGE_STEP) -> Tensor:
     """Return the sum of the semi-global path costs from four sides, int16 [H, W, D], in units of 1 / `UNIT`."""
     down, across = (
         torch.from_numpy(step_limits(colors, small_step, large_step).astype(np.int32)).to(costs.device)
@@ -253,10 +252,10 @@ def needed_bytes(view: View, planes: int) -> int:
 
 def matching_costs_cuda(
     view: View, others: Sequence[View], inverses: np.ndarray, device: torch.device, window: int = WINDOW
-) -> torch.Tensor:
+) -> Tensor:
     """Return the costs of `matching_costs_cpu`, without its padding planes, int16, shape [H, W, D], on the device."""
 
-    def box(maps: torch.Tensor) -> torch.Tensor:
+    def box(maps: Tensor) -> Tensor:
         r = window // 2
         return torch.nn.functional.avg_pool2d(torch.nn.functional.pad(maps, (r, r, r, r), mode="reflect"), window, 1)
 
@@ -292,7 +291,7 @@ def matching_costs_cuda(
     return costs
 
 
-def best_inverse(costs: torch.Tensor, inverses: np.ndarray) -> torch.Tensor:
+def best_inverse(costs: Tensor, inverses: np.ndarray) -> Tensor:
     """Return inverse depths [1/u] as `best_inverses` does, float64, shape [H, W], on the device."""
     k = costs.argmin(2, keepdim=True).clamp(1, len(inverses) - 2)
     left, middle, right = (costs.gather(2, k + o).double() for o in (-1, 0, 1))
@@ -302,7 +301,7 @@ def best_inverse(costs: torch.Tensor, inverses: np.ndarray) -> torch.Tensor:
 
 
 @torch.no_grad()
-def inverse_depths_cuda(view: View, others: Sequence[View], planes: np.ndarray, device: torch.device) -> torch.Tensor:
+def inverse_depths_cuda(view: View, others: Sequence[View], planes: np.ndarray, device: torch.device) -> Tensor:
     """Return inverse depths [1/u] of a view, float64, [H, W], by sweeping planes against at least one other view."""
     return best_inverse(path_costs(matching_costs_cuda(view, others, planes, device), view.image), planes)
 
@@ -402,7 +401,7 @@ def sweep_depths(
                 inverses[i] = inverse_depths_cpu(small[i], compared, planes[i])
             progress(done, len(swept))
         # only now, so that a GPU works on one view while the next is prepared
-        inverses = {i: t.cpu().numpy() if isinstance(t, torch.Tensor) else t for i, t in inverses.items()}
+        inverses = {i: t.cpu().numpy() if isinstance(t, Tensor) else t for i, t in inverses.items()}
         note = f"not swept: the {len(swept)} swept views (of {len(views)}) see most of the scene"
         out = [no_depth(v, note, searched=False) for v in views]
 

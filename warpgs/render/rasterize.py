@@ -10,6 +10,7 @@ from typing import Any, overload
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from warpgs.constants import K_TOLERANCE, POSE_TOLERANCE
 from warpgs.device import free_for
@@ -63,10 +64,10 @@ def check_arrays(camera: Camera) -> None:
 
 def _check_type(name: str, array: Any) -> None:
     """Raise TypeError where a value is not a dense array of real numbers, and ValueError for a device without kernels."""
-    if not isinstance(array, (np.ndarray, torch.Tensor)):
+    if not isinstance(array, (np.ndarray, Tensor)):
         raise TypeError(f"camera.{name} must be a numpy array or a tensor, not {type(array).__name__}; give numpy.array(...)")
     kind = str(array.dtype).removeprefix("torch.")
-    if isinstance(array, torch.Tensor):
+    if isinstance(array, Tensor):
         launch.check_device(f"camera.{name}", array)
         if array.layout != torch.strided:
             raise TypeError(f"camera.{name} must be dense, not {array.layout}; camera.{name}.to_dense() converts it")
@@ -108,10 +109,10 @@ INTEGERS = (torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64)
 """Types of pixel coordinates."""
 
 
-def checked_pixels(pixels: torch.Tensor, cameras: int, device: torch.device) -> torch.Tensor:
+def checked_pixels(pixels: Tensor, cameras: int, device: torch.device) -> Tensor:
     """Return pixels [P, 2] or [C, P, 2] of C cameras as int64 on a device, shape [1, P, 2] or [C, P, 2]."""
-    if not isinstance(pixels, torch.Tensor) or pixels.dtype not in INTEGERS:
-        found = pixels.dtype if isinstance(pixels, torch.Tensor) else type(pixels).__name__
+    if not isinstance(pixels, Tensor) or pixels.dtype not in INTEGERS:
+        found = pixels.dtype if isinstance(pixels, Tensor) else type(pixels).__name__
         raise TypeError(f"pixels must be a tensor of whole numbers, not {found}: columns and rows, from 0 at the upper left")
     if pixels.layout != torch.strided:
         raise TypeError(f"pixels must be dense, not {pixels.layout}; pixels.to_dense() converts them")
@@ -121,7 +122,7 @@ def checked_pixels(pixels: torch.Tensor, cameras: int, device: torch.device) -> 
     return found if found.ndim == 3 else found[None]
 
 
-def window_of(pixels: torch.Tensor, camera: Camera, tile_size: int) -> Window:
+def window_of(pixels: Tensor, camera: Camera, tile_size: int) -> Window:
     """Return the smallest window of whole tiles that holds pixels [..., P, 2]; the pixels are read from the device."""
     if not pixels.shape[-2]:
         return 0, 0, min(tile_size, camera.width), min(tile_size, camera.height)
@@ -135,7 +136,7 @@ def window_of(pixels: torch.Tensor, camera: Camera, tile_size: int) -> Window:
     return x, y, width, height
 
 
-def listed_tiles(pixels: torch.Tensor, settings: Pass, cameras: int) -> torch.Tensor:
+def listed_tiles(pixels: Tensor, settings: Pass, cameras: int) -> Tensor:
     """Return a mask [T] over the tiles of C cameras, for `bin_tiles`: True where one of ``pixels`` [1 or C, P, 2] is inside."""
     (x, y, width, height), size = settings.window, settings.tile_size
     columns, rows = grid(width, height, size)
@@ -146,7 +147,7 @@ def listed_tiles(pixels: torch.Tensor, settings: Pass, cameras: int) -> torch.Te
     return listed
 
 
-def at_pixels(image: torch.Tensor, pixels: torch.Tensor, window: Window) -> torch.Tensor:
+def at_pixels(image: Tensor, pixels: Tensor, window: Window) -> Tensor:
     """Read a window's images [C, H, W, ...] at pixels [1, P, 2] or [C, P, 2]; return values [C, P, ...]. Differentiable."""
     cameras = torch.arange(len(image), device=image.device)[:, None]
     return image[cameras, pixels[..., 1] - window[1], pixels[..., 0] - window[0]]
@@ -211,7 +212,7 @@ def _check_activated(gaussians: RasterizedGaussians) -> None:
 
 def _check_tensor(name: str, value: Any) -> None:
     """Raise TypeError where a value is not a tensor, and ValueError for a device without kernels."""
-    if not isinstance(value, torch.Tensor):
+    if not isinstance(value, Tensor):
         raise TypeError(f"{name} must be a tensor, not {type(value).__name__}; torch.as_tensor makes one")
     launch.check_device(name, value)
 
@@ -230,11 +231,11 @@ def _checked_window(camera: Camera, options: RasterizeOptions) -> Window:
     return x, y, w, h
 
 
-def _checked_channels(name: str, values: torch.Tensor | None, inputs: ProjectInputs) -> torch.Tensor | None:
+def _checked_channels(name: str, values: Tensor | None, inputs: ProjectInputs) -> Tensor | None:
     """Return channels, given as [N, D] or [C, N, D], in shape [1, N, D] or [C, N, D]."""
     if values is None:
         return None
-    pattern = "C N D" if isinstance(values, torch.Tensor) and values.ndim == 3 else "N D"
+    pattern = "C N D" if isinstance(values, Tensor) and values.ndim == 3 else "N D"
     if pattern == "C N D" and name == "colors" and len(values) == len(inputs.means) != len(inputs.viewmats):
         found = list(values.shape)
         raise ValueError(f"colors {found} are neither [N, D] nor [C, N, D]: give spherical harmonics as sh of the Gaussians")
@@ -244,7 +245,7 @@ def _checked_channels(name: str, values: torch.Tensor | None, inputs: ProjectInp
     return values if values.ndim == 3 else values[None]
 
 
-def _check_memory(window: Window, layers: list[Layer], heaviest: int, like: torch.Tensor) -> None:
+def _check_memory(window: Window, layers: list[Layer], heaviest: int, like: Tensor) -> None:
     """Raise ResourceError where the images [C, H, W, D] of the layers need more memory than the device of ``like`` has free."""
     channels = sum(backgrounds.shape[1] + 4 for _, backgrounds in layers)  # and alpha, depth, transmittance, sum of weights
     channels += 2 * heaviest
@@ -257,18 +258,18 @@ def _check_memory(window: Window, layers: list[Layer], heaviest: int, like: torc
         )
 
 
-Layer = tuple[torch.Tensor | None, torch.Tensor]
+Layer = tuple[Tensor | None, Tensor]
 """Values that are blended into one image: channels of each Gaussian [1, N, D] or [C, N, D], None for the spherical harmonics;
 and backgrounds [C, D]."""
 
 
-def _as_tensor(values: Any) -> torch.Tensor:
+def _as_tensor(values: Any) -> Tensor:
     """Return numbers as a tensor, where they are or on the CPU, whatever torch's default device; an array is copied."""
     values = values.copy() if isinstance(values, np.ndarray) else values
     return torch.as_tensor(values, device=getattr(values, "device", "cpu"))
 
 
-def _layer(name: str, background: Any, colors: torch.Tensor | None, inputs: ProjectInputs) -> Layer:
+def _layer(name: str, background: Any, colors: Tensor | None, inputs: ProjectInputs) -> Layer:
     """Return channels [..., D] with their background (one, a batch, or None for zeros); ``name`` is the background's option."""
     channels, like = 3 if colors is None else colors.shape[-1], inputs.viewmats
     if background is None:  # outside of the try block: a full GPU is not a wrong background
@@ -363,7 +364,7 @@ def _render(gaussians: RasterizedGaussians, camera: Camera, options: RasterizeOp
     if options.absgrad and (features is not None or (colors is not None and colors.shape[-1] > WIDTHS[-1])):
         raise UsageError(f"absgrad takes at most {WIDTHS[-1]} channels of colors and no features: render more in a second call")
     if options.max_error is not None:
-        if compose.needs_slots(t for t in (*inputs, options.background) if isinstance(t, torch.Tensor)):
+        if compose.needs_slots(t for t in (*inputs, options.background) if isinstance(t, Tensor)):
             raise UsageError("max_error renders without gradients: call rasterize under torch.no_grad(), or leave it out")
         settings = replace(settings, max_error=float(options.max_error))
         if inputs.means.is_cuda and inputs.means.dtype == torch.float32:
@@ -397,12 +398,12 @@ def _render(gaussians: RasterizedGaussians, camera: Camera, options: RasterizeOp
 
 
 @torch.no_grad()
-def _error_bound(rgb: torch.Tensor, gaussians: RasterizedGaussians, camera: Camera, options: RasterizeOptions) -> torch.Tensor:
+def _error_bound(rgb: Tensor, gaussians: RasterizedGaussians, camera: Camera, options: RasterizeOptions) -> Tensor:
     """Return a bound [..., H, W] on the error of colours [..., H, W, D]; see `RasterizeOptions.error_bound`."""
 
     def doubled(holder: Any) -> dict[str, Any]:
         values = {f.name: getattr(holder, f.name) for f in fields(holder)}
-        return {n: v.double() if isinstance(v, torch.Tensor) and v.is_floating_point() else v for n, v in values.items()}
+        return {n: v.double() if isinstance(v, Tensor) and v.is_floating_point() else v for n, v in values.items()}
 
     only_rgb: dict[str, Any] = {"features": None, "feature_background": None, "contributions": False, "median_depth": False}
     only_rgb |= {"heaviest": 0, "absgrad": False}
@@ -416,7 +417,7 @@ def _error_bound(rgb: torch.Tensor, gaussians: RasterizedGaussians, camera: Came
 
 
 def _rasterize(
-    inputs: ProjectInputs, layers: list[Layer], settings: Pass, options: RasterizeOptions, pixels: torch.Tensor | None
+    inputs: ProjectInputs, layers: list[Layer], settings: Pass, options: RasterizeOptions, pixels: Tensor | None
 ) -> tuple[Any, ...]:
     """Return images, projected Gaussians [C, N, 12], tile counts [C, N], and the further fields of `Render` by name."""
     projected, tile_counts = project_inputs(inputs, settings)
@@ -443,9 +444,7 @@ def _rasterize(
     return images[0], projected, tile_counts, maps
 
 
-def _as_render(
-    camera: Camera, images: Sequence[torch.Tensor], projected: torch.Tensor, tile_counts: torch.Tensor, **maps: Any
-) -> Render:
+def _as_render(camera: Camera, images: Sequence[Tensor], projected: Tensor, tile_counts: Tensor, **maps: Any) -> Render:
     """Return the render, with images [C, H, W, ...] that have no leading axis for a single camera."""
     if len(camera.viewmat.shape) == 2:  # not image[0], whose gradient would be a copy among zeros
         images = [image.squeeze(0) for image in images]
@@ -460,7 +459,7 @@ FASTEST_FIRST = ("fast", "balanced", "exact")
 """Rules to choose from; each skips all that the next one skips, and more."""
 DEFAULTS = RasterizeOptions()
 """Default options."""
-MEASURES: dict[str, Callable[[torch.Tensor], torch.Tensor]] = {"mean": torch.mean, "max": torch.amax}
+MEASURES: dict[str, Callable[[Tensor], Tensor]] = {"mean": torch.mean, "max": torch.amax}
 """Reductions over the pixels of a view, by name."""
 
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from typing import Annotated, ClassVar
 
 import torch
+from torch import Tensor
 
 from warpgs.device import FLOAT, LOSS, STEP, Needs, StepSizes
 from warpgs.errors import UsageError
@@ -32,25 +33,25 @@ OUTPUTS = ("rgb", "alpha", "depth")
 class Target:
     """Image, mask and maps of a view, with which a step compares the render."""
 
-    image: torch.Tensor
+    image: Tensor
     """Colours in [0, 1], shape [H, W, 3]."""
-    mask: torch.Tensor | None
+    mask: Tensor | None
     """1 for unmasked pixels, 0 for masked ones, shape [H, W]; None without a mask."""
     maps: Tensors
     """Maps that loss terms requested (`LossTerm.needs`), by name, each of shape [H, W] or [H, W, C]."""
-    alpha: torch.Tensor | None = None
+    alpha: Tensor | None = None
     """Opacity of the subject, in [0, 1], shape [H, W]; None if no training view has one. ``image`` and the render have the same
     background, which changes at each step."""
 
 
-class _Outputs(dict[str, torch.Tensor]):
+class _Outputs(dict[str, Tensor]):
     """Images of a render that a term requested; reading another one raises an error."""
 
     def __init__(self, term: LossTerm, images: Tensors):
         super().__init__({n: images[n] for n in term.needs_outputs})
         self.term = term
 
-    def __missing__(self, name: str) -> torch.Tensor:
+    def __missing__(self, name: str) -> Tensor:
         raise UsageError(f"the loss term {self.term.name!r} reads the output {name!r}; add it to needs_outputs")
 
 
@@ -69,7 +70,7 @@ class LossInputs:
     camera: Camera
     """Camera of the view at the size of the images: ``viewmat`` [4, 4], camera_from_world [u], and ``K`` [3, 3] [px] are
     tensors. If poses are refined, this is the refined pose of the step, and it is differentiable."""
-    step: torch.Tensor
+    step: Tensor
     """Number of the step, from 1: an integer as float32, shape []. It is a tensor, because a captured step is replayed
     for later steps; `LossTerm.active` gets the number on the host."""
 
@@ -85,7 +86,7 @@ class LossTerm(Checked):
     needs_priors: ClassVar[bool] = False
     """True if `needs` reads the priors of the views, which are then computed before the fit."""
 
-    def needs(self, view: TrainingView, prior: Prior | None) -> dict[str, torch.Tensor]:
+    def needs(self, view: TrainingView, prior: Prior | None) -> dict[str, Tensor]:
         """Return the maps of a view that the term reads, by name, each of shape [H, W] or [H, W, C].
 
         No two terms of a fit may use the same name for a map.
@@ -104,7 +105,7 @@ class LossTerm(Checked):
         """
         return {LOSS: 4 * FLOAT * sizes.pixels if "depth" in self.needs_outputs else 0}
 
-    def __call__(self, inputs: LossInputs) -> torch.Tensor:
+    def __call__(self, inputs: LossInputs) -> Tensor:
         """Compute the term, a differentiable value of shape [], or 0; it must not read back from the device.
 
         Args:
@@ -121,7 +122,7 @@ LOSS_TERMS = Registry("loss term", LossTerm, "warpgs.pipeline.train.loss")
 register = register_loss_term = LOSS_TERMS.register
 
 
-def term_values(terms: Sequence[LossTerm], inputs: LossInputs) -> list[torch.Tensor]:
+def term_values(terms: Sequence[LossTerm], inputs: LossInputs) -> list[Tensor]:
     """Compute each term from the outputs that it needs; returns values of shape [], in the order of the terms.
 
     A user-defined term with a constant value other than 0 has no effect, and raises UsageError.
@@ -130,7 +131,7 @@ def term_values(terms: Sequence[LossTerm], inputs: LossInputs) -> list[torch.Ten
     trained = torch.is_grad_enabled() and any(t.requires_grad for t in inputs.outputs.values())
     for term in terms:
         value = term(replace(inputs, outputs=_Outputs(term, inputs.outputs)))
-        values.append(returned(term, "__call__", value, torch.Tensor, "a tensor of shape []", shape=()))
+        values.append(returned(term, "__call__", value, Tensor, "a tensor of shape []", shape=()))
         if value.requires_grad or is_ours(type(term)) or not trained:
             continue
         if not (value.is_cuda and torch.cuda.is_current_stream_capturing()) and bool(value != 0):
@@ -150,7 +151,7 @@ ROW = 1024
 """Values in a row, for sums of values that have no rows."""
 
 
-def total(values: torch.Tensor) -> torch.Tensor:
+def total(values: Tensor) -> Tensor:
     """Return the sum of values [N] or [H, ...], shape [], with the same bits for any number of CPU threads.
 
     On a CPU, torch's sum of a whole tensor depends on the number of threads, so rows are summed first.
@@ -171,13 +172,13 @@ def check_outputs(terms: Sequence[LossTerm]) -> None:
                 raise UsageError(f"{needs}; choose needs_outputs from {', '.join(OUTPUTS)}")
 
 
-def maps_of(terms: Sequence[LossTerm], view: TrainingView, prior: Prior | None) -> dict[str, torch.Tensor]:
+def maps_of(terms: Sequence[LossTerm], view: TrainingView, prior: Prior | None) -> dict[str, Tensor]:
     """Return the maps of a view that terms need, by name, each of shape [H, W] or [H, W, C]."""
     owners: dict[str, str] = {}
-    maps: dict[str, torch.Tensor] = {}
+    maps: dict[str, Tensor] = {}
     for term in terms:
         own, size = term.needs(view, prior), view.image.shape[:2]
-        returned(term, "needs", own, Mapping, "maps [H, W] or [H, W, C] by name", each=torch.Tensor, shape=size)
+        returned(term, "needs", own, Mapping, "maps [H, W] or [H, W, C] by name", each=Tensor, shape=size)
         for name, values in own.items():
             if name in maps:
                 both = f"{owners[name]!r} and {term.name!r}"
@@ -190,7 +191,7 @@ def maps_of(terms: Sequence[LossTerm], view: TrainingView, prior: Prior | None) 
 
 
 @functools.cache
-def _weights(fraction: float, count: int, dtype: torch.dtype, device: torch.device) -> torch.Tensor:
+def _weights(fraction: float, count: int, dtype: torch.dtype, device: torch.device) -> Tensor:
     """Return the weights [2] of the sums of 1 - SSIM and of absolute differences over ``count`` numbers.
 
     They stay cached, because CUDA graphs refer to their memory.
@@ -199,9 +200,7 @@ def _weights(fraction: float, count: int, dtype: torch.dtype, device: torch.devi
         return torch.tensor([fraction / count, (1 - fraction) / count], dtype=dtype, device=device)
 
 
-def photometric_loss(
-    rgb: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None, ssim_weight: float = 0.2
-) -> torch.Tensor:
+def photometric_loss(rgb: Tensor, target: Tensor, mask: Tensor | None, ssim_weight: float = 0.2) -> Tensor:
     """Return the loss of a rendered image: (1 - lambda) L1 + lambda (1 - SSIM).
 
     Args:
@@ -240,7 +239,7 @@ class Photometric(LossTerm):
         masked = 7 * FLOAT * sizes.pixels if sizes.masked else 0  # two images, and the mask's own
         return {LOSS: difference_bytes(sizes) + masked}
 
-    def __call__(self, inputs: LossInputs) -> torch.Tensor:
+    def __call__(self, inputs: LossInputs) -> Tensor:
         """Compute `photometric_loss` of the render and the view's image, shape []."""
         return photometric_loss(inputs.outputs["rgb"], inputs.target.image, inputs.target.mask, self.ssim_weight)
 
@@ -258,7 +257,7 @@ class AlphaDifference(LossTerm, group="alpha."):
         """Return the bytes of the difference, its magnitude and its gradient."""
         return {LOSS: 3 * FLOAT * sizes.pixels}
 
-    def __call__(self, inputs: LossInputs) -> torch.Tensor:
+    def __call__(self, inputs: LossInputs) -> Tensor:
         """Compute ``weight`` times the mean absolute difference of opacities over the unmasked pixels, shape []."""
         alpha, target = inputs.outputs["alpha"], inputs.target
         if target.alpha is None:
@@ -284,7 +283,7 @@ class EmptyOpacity(LossTerm, group="empty."):
     weight: Weight = EMPTY_WEIGHT
     """Weight of the term, in [0, 1000]."""
 
-    def needs(self, view: TrainingView, prior: Prior | None) -> dict[str, torch.Tensor]:
+    def needs(self, view: TrainingView, prior: Prior | None) -> dict[str, Tensor]:
         """Return 1 for pixels at least `AWAY` from the object, 0 for others and without an opacity, shape [H, W]."""
         if view.alpha is None:
             return {"empty": torch.zeros_like(view.image[..., 0])}
@@ -297,7 +296,7 @@ class EmptyOpacity(LossTerm, group="empty."):
         copy = FLOAT * sizes.pixels * sizes.cuda
         return {**dict.fromkeys(STEP, copy), LOSS: copy + (2 + sizes.masked) * FLOAT * sizes.pixels}
 
-    def __call__(self, inputs: LossInputs) -> torch.Tensor:
+    def __call__(self, inputs: LossInputs) -> Tensor:
         """Compute ``weight`` times the sum of opacities of empty pixels, divided by the number of unmasked pixels, shape []."""
         opacities, mask = inputs.outputs["alpha"] * inputs.target.maps["empty"], inputs.target.mask
         if mask is None:
@@ -320,9 +319,7 @@ NORMAL_MAPS = 26
 """Number of maps with one float per pixel for the normal term; points, differences and normals count as three each."""
 
 
-def inverse_depth_difference(
-    depth: torch.Tensor, alpha: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None
-) -> torch.Tensor:
+def inverse_depth_difference(depth: Tensor, alpha: Tensor, target: Tensor, mask: Tensor | None) -> Tensor:
     """Compute the weighted mean absolute difference of relative inverse depths, shape []; 0 if no pixel is compared.
 
     ``target`` [H, W, 3] is weight times q / d, weight, and weight times q [u], for given depth d and its median q: averages of
@@ -344,7 +341,7 @@ class GivenDepthDifference(LossTerm, group="given-depth."):
     weight: Weight = 0.3
     """Weight of the term, in [0, 1000]."""
 
-    def needs(self, view: TrainingView, prior: Prior | None) -> dict[str, torch.Tensor]:
+    def needs(self, view: TrainingView, prior: Prior | None) -> dict[str, Tensor]:
         """Return weight times q / d, weight, and weight times q, [H, W, 3], for depth d with median q; 0 without depth."""
         given = view.depth
         if given is None:
@@ -359,13 +356,13 @@ class GivenDepthDifference(LossTerm, group="given-depth."):
         copy = 3 * FLOAT * sizes.pixels * sizes.cuda
         return {**dict.fromkeys(STEP, copy), LOSS: copy + DEPTH_MAPS * FLOAT * sizes.pixels}
 
-    def __call__(self, inputs: LossInputs) -> torch.Tensor:
+    def __call__(self, inputs: LossInputs) -> Tensor:
         """Compute ``weight`` times `inverse_depth_difference`, shape []."""
         depth, alpha, target = inputs.outputs["depth"], inputs.outputs["alpha"], inputs.target
         return self.weight * inverse_depth_difference(depth, alpha, target.maps["given_depth"], target.mask)
 
 
-def normal_difference(normals: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None) -> torch.Tensor:
+def normal_difference(normals: Tensor, target: Tensor, mask: Tensor | None) -> Tensor:
     """Compute the weighted mean of 1 - cos of the angle between normals [H, W, 3], shape [], in [0, 2]; 0 if no pixel has both.
 
     Missing normals are 0. The weight is the length of the given normals, which is below 1 for averages over pixels.
@@ -387,7 +384,7 @@ class GivenNormalsDifference(LossTerm, group="given-normals."):
     weight: Weight = 0.03
     """Weight of the term, in [0, 1000]."""
 
-    def needs(self, view: TrainingView, prior: Prior | None) -> dict[str, torch.Tensor]:
+    def needs(self, view: TrainingView, prior: Prior | None) -> dict[str, Tensor]:
         """Return the view's normals in its camera's axes [H, W, 3]; 0 where none are given."""
         return {"given_normals": torch.zeros_like(view.image) if view.normals is None else view.normals}
 
@@ -396,7 +393,7 @@ class GivenNormalsDifference(LossTerm, group="given-normals."):
         copy = 3 * FLOAT * sizes.pixels * sizes.cuda
         return {**dict.fromkeys(STEP, copy), LOSS: copy + NORMAL_MAPS * FLOAT * sizes.pixels}
 
-    def __call__(self, inputs: LossInputs) -> torch.Tensor:
+    def __call__(self, inputs: LossInputs) -> Tensor:
         """Compute ``weight`` times `normal_difference` of the rendered depth's normals, shape []."""
         depth = torch.where(inputs.outputs["alpha"] <= GIVEN_MIN_ALPHA, 0, inputs.outputs["depth"])
         # in the axes of the camera, like the given normals: a refined pose gets no gradient
@@ -419,9 +416,7 @@ MAPS = 8
 """Number of maps with one float per pixel that the term and its gradient hold at the loss."""
 
 
-def depth_roughness(
-    depth: torch.Tensor, alpha: torch.Tensor, image: torch.Tensor, weight: torch.Tensor, mask: torch.Tensor | None
-) -> torch.Tensor:
+def depth_roughness(depth: Tensor, alpha: Tensor, image: Tensor, weight: Tensor, mask: Tensor | None) -> Tensor:
     """Compute the mean roughness of depth, shape [], from depth, opacity, weights and a mask [H, W] and colours [H, W, 3]."""
     gaps = image[:, :-2] - image[:, 2:], image[:-2] - image[2:]
     rows, columns = (torch.exp(-gap.abs().mean(-1) / EDGE) for gap in gaps)
@@ -437,7 +432,7 @@ class SmoothDepth(LossTerm, group="smooth-depth."):
     weight: Weight = 1.0
     """Weight of the term, in [0, 1000]."""
 
-    def needs(self, view: TrainingView, prior: Prior | None) -> dict[str, torch.Tensor]:
+    def needs(self, view: TrainingView, prior: Prior | None) -> dict[str, Tensor]:
         """Return the weights of the view's pixels, shape [H, W]: `CONFIRMED` where depth is consistent, else 1."""
         ones = torch.ones_like(view.image[..., 0])
         return {"smooth_depth": ones if view.consistent is None else torch.where(view.consistent > 0, CONFIRMED, ones)}
@@ -447,7 +442,7 @@ class SmoothDepth(LossTerm, group="smooth-depth."):
         copy = FLOAT * sizes.pixels * sizes.cuda
         return {**dict.fromkeys(STEP, copy), LOSS: copy + MAPS * FLOAT * sizes.pixels}
 
-    def __call__(self, inputs: LossInputs) -> torch.Tensor:
+    def __call__(self, inputs: LossInputs) -> Tensor:
         """Compute ``weight`` times `depth_roughness`, shape []."""
         depth, alpha, target = inputs.outputs["depth"], inputs.outputs["alpha"], inputs.target
         return self.weight * depth_roughness(depth, alpha, target.image, target.maps["smooth_depth"], target.mask)
