@@ -234,14 +234,9 @@ def _names(names: list[str]) -> str:
 
 
 def view_priors(
-    views: Sequence[View],
-    config: PriorConfig,
-    *,
-    depths: Callable[[], Sequence[ViewDepth] | None] = lambda: None,
-    regions: Sequence[np.ndarray | None] | None = None,
-    threads: int = 0,
-    tell: Say = silent,
-) -> tuple[list[Prior], list[str]]:
+    views: Sequence[View], config: PriorConfig, *, depths: Callable[[], Sequence[ViewDepth] | None] = lambda: None,
+    regions: Sequence[np.ndarray | None] | None = None, threads: int = 0, tell: Say = silent,
+) -> tuple[list[Prior], list[str]]:  # fmt: skip
     """Return a prior for the pixels of each view before anything is fitted, and notes on choices and assumptions."""
     notes: list[str] = []
     classical = config.segmentation_model is None

@@ -467,12 +467,9 @@ def train_views(scene: Scene, names: tuple[str, ...]) -> list[View]:
 
 
 def run(
-    trainer: Trainer,
-    on_step: Callable[[StepReport], None],
-    save: Callable[[Trainer], None],
-    stopped: Callable[[], bool],
+    trainer: Trainer, on_step: Callable[[StepReport], None], save: Callable[[Trainer], None], stopped: Callable[[], bool],
     restore: Callable[[Trainer], bool] = lambda _: False,
-) -> None:
+) -> None:  # fmt: skip
     """Take all remaining steps; report each, and save at intervals and at the end.
 
     A step that runs out of memory is tried once more with less memory (`Trainer.spare_memory`). If the state is incomplete, for
