@@ -233,11 +233,9 @@ def _fcn_resnet18(request: ExportRequest) -> torch.nn.Module:
     given = None if request.random_weights else _own_weights(request.weights)
     from transformers import ResNetBackbone, ResNetConfig
 
-    stages = ["stage2", "stage3", "stage4"]
     sizes = [16, 24, 32, 48] if request.random_weights else [64, 128, 256, 512]
-    config = ResNetConfig(
-        depths=[2, 2, 2, 2], layer_type="basic", out_features=stages, embedding_size=sizes[0], hidden_sizes=sizes
-    )
+    layers = {"depths": [2, 2, 2, 2], "layer_type": "basic", "out_features": ["stage2", "stage3", "stage4"]}
+    config = ResNetConfig(**layers, embedding_size=sizes[0], hidden_sizes=sizes)
 
     class FCN(torch.nn.Module):
         def __init__(self):

@@ -217,13 +217,11 @@ def agreeing_matches(
     return ids[good], found[good]
 
 
-def _triangulate(
-    a: View, b: View, pixels_a: np.ndarray, pixels_b: np.ndarray, min_angle: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the points [u] midway between the rays of each match, shape [N, 3], and True where they pass the checks [N]."""
+def _triangulate(a: View, b: View, at_a: np.ndarray, at_b: np.ndarray, min_angle: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the points [u] midway between the rays of each match [N, 3], and True where they pass the checks [N]."""
     origins = [v.camera.center for v in (a, b)]
     rays = []
-    for view, pixels in ((a, pixels_a), (b, pixels_b)):
+    for view, pixels in ((a, at_a), (b, at_b)):
         far = geometry.back_project(view.camera, pixels, np.ones(len(pixels))) - view.camera.center
         rays.append(far / np.linalg.norm(far, axis=1, keepdims=True))
     baseline = origins[1] - origins[0]
@@ -234,7 +232,7 @@ def _triangulate(
     t = (cosine * along[0] - along[1]) / sine2
     points = 0.5 * (origins[0] + s[:, None] * rays[0] + origins[1] + t[:, None] * rays[1])
     good = (s > 0) & (t > 0) & (sine2 > np.sin(np.radians(min_angle)) ** 2)
-    for view, pixels in ((a, pixels_a), (b, pixels_b)):
+    for view, pixels in ((a, at_a), (b, at_b)):
         projected, z = geometry.project_points(view.camera, points)
         with np.errstate(over="ignore"):  # points beside the camera are infinitely far from their pixels
             good &= (z > 0) & (np.linalg.norm(projected - pixels, axis=1) < MAX_ERROR)

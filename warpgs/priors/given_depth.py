@@ -133,9 +133,7 @@ def align(view: View, found: ViewDepth | None, known: PointCloud) -> Alignment:
     return Alignment(scale, shift, count, float(np.median(off)), why_not)
 
 
-def votes(
-    views: Sequence[View], depths: Sequence[np.ndarray], index: int, near: int = NEIGHBORS
-) -> tuple[np.ndarray, np.ndarray]:
+def votes(views: Sequence[View], depths: Sequence[np.ndarray], index: int) -> tuple[np.ndarray, np.ndarray]:
     """Count the other views that confirm each depth of a view, and that see through it, int [H, W] each."""
     own = depths[index]
     step = math.ceil(math.sqrt(np.count_nonzero(own) / MAX_POINTS)) if own.any() else 1
@@ -144,7 +142,7 @@ def votes(
     pixels, z = np.stack([columns, rows], 1) * step + 0.5, coarse[rows, columns].astype(np.float64)
     points = geometry.back_project(views[index].camera, pixels, z)
     counts = np.zeros((2, *coarse.shape), int)
-    for j in nearest_views(views, index, near):
+    for j in nearest_views(views, index, NEIGHBORS):
         seen, r, c, there = geometry.seen_pixels(views[j].camera, points)
         other = depths[j][r, c]
         known = other > 0

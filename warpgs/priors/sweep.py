@@ -250,14 +250,12 @@ def needed_bytes(view: View, planes: int) -> int:
     return view.camera.width * view.camera.height * (4 * planes + 4 * MAPS * min(planes, PLANES_AT_ONCE))
 
 
-def matching_costs_cuda(
-    view: View, others: Sequence[View], inverses: np.ndarray, device: torch.device, window: int = WINDOW
-) -> Tensor:
+def matching_costs_cuda(view: View, others: Sequence[View], inverses: np.ndarray, device: torch.device) -> Tensor:
     """Return the costs of `matching_costs_cpu`, without its padding planes, int16, shape [H, W, D], on the device."""
 
     def box(maps: Tensor) -> Tensor:
-        r = window // 2
-        return torch.nn.functional.avg_pool2d(torch.nn.functional.pad(maps, (r, r, r, r), mode="reflect"), window, 1)
+        r = WINDOW // 2
+        return torch.nn.functional.avg_pool2d(torch.nn.functional.pad(maps, (r, r, r, r), mode="reflect"), WINDOW, 1)
 
     own, *grays = [torch.from_numpy(gray_of(v))[None, None].to(device) for v in (view, *others)]
     width, height = view.camera.width, view.camera.height
@@ -332,9 +330,7 @@ def _reduced(view: View) -> View:
     return View(view.name, replace(c, K=K, width=width, height=height), image)
 
 
-def consistent_depth(
-    views: Mapping[int, View], inverses: Mapping[int, np.ndarray], index: int, others: Sequence[int]
-) -> ViewDepth:
+def consistent_depth(views: dict[int, View], inverses: dict[int, np.ndarray], index: int, others: Sequence[int]) -> ViewDepth:
     """Return the depth of one view where it is geometrically consistent with the depth of at least one other view."""
     # a point returns to its pixel by the other view's depth; the sensitivity is the smallest among the consistent views
     own, notes = inverses[index], []
