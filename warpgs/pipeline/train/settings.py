@@ -375,9 +375,8 @@ def _with_parts(config: FitConfig, given: Mapping[str, Any], own_code: bool) -> 
     strategy = given.get("strategy")
     if strategy is not None and strategy != config.strategy:
         kind = _found(STRATEGIES, strategy, own_code)
-        config = dataclasses.replace(
-            config, strategy=STRATEGIES.name_of(kind), strategy_config=None if kind.Config is None else kind.Config()
-        )
+        own = None if kind.Config is None else kind.Config()
+        config = dataclasses.replace(config, strategy=STRATEGIES.name_of(kind), strategy_config=own)
     for field, registry in PARTS.items():
         if field in given:
             changes: dict[str, Any] = {field: parts_named(registry, field, given[field], own_code)}

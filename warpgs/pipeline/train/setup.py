@@ -58,10 +58,8 @@ def prepare(
     elif priors is None:
         notes = _unused_networks(config)
     if config.priors.depth_guides and priors is not None:
-        train = [
-            v if v.depth is not None else replace(v, depth=GivenDepth(p.disparity, "disparity"))
-            for v, p in zip(train, priors, strict=True)
-        ]
+        guides = [v.depth or GivenDepth(p.disparity, "disparity") for v, p in zip(train, priors, strict=True)]
+        train = [replace(v, depth=guide) for v, guide in zip(train, guides)]
     found = start()
     usable()
     lines = f"start: {found.how}".splitlines()

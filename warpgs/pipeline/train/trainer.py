@@ -183,9 +183,8 @@ class Trainer:
         """Views still to come in the current pass over all views, in reverse order."""
         self.extrapolated = start.extrapolated > 0
         """True if the start has extrapolated points: opacity decay then spares Gaussians that a step does not use."""
-        self.table = Table.of_gaussians(
-            initial_gaussians(start.cloud, c.init, c.sh_degree, extent, device, start.extrapolated), {}
-        )
+        first = initial_gaussians(start.cloud, c.init, c.sh_degree, extent, device, start.extrapolated)
+        self.table = Table.of_gaussians(first, {})
         self.context = StrategyContext(
             c.groups(), c.strategy_config, self.table, self.generator, c.seed, plan_phases(c.phases, c.steps), extent, c.rule,
             self.background, antialiased=c.antialiased,
@@ -337,10 +336,8 @@ class Trainer:
                 self._hold()
             counts[-1] = len(self.table)
         seconds = (time.perf_counter() - begin) / max(1, done)
-        return [
-            StepReport(first + k, loss, psnr_of(max(mse, 1e-12)), counts[k], seconds)
-            for k, (loss, mse) in enumerate(history[:done])
-        ]
+        each = zip(steps, counts, history)  # history has the next step, too
+        return [StepReport(step, loss, psnr_of(max(mse, 1e-12)), count, seconds) for step, count, (loss, mse) in each]
 
     def _hold(self) -> None:
         """Hold all Gaussians to the limits of the last step."""
