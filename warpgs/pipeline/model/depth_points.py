@@ -59,9 +59,8 @@ def merge_cells(points: Parts, widths: Parts, cell: float = 1.0) -> list[np.ndar
     ones) lie on grids of unequal fineness, so every cell is a few pixels wide.
     """
     cells = [np.zeros(len(p), np.int64) for p in points]
-    chunks = [
-        [array[k : k + CHUNK] for array in part] for part in zip(points, widths, cells) for k in range(0, len(part[0]), CHUNK)
-    ]
+    parts = [*zip(points, widths, cells)]
+    chunks = [[array[k : k + CHUNK] for array in part] for part in parts for k in range(0, len(part[0]), CHUNK)]
 
     def grid(points: np.ndarray, widths: np.ndarray) -> list[np.ndarray]:  # [N] each: the level, and three coordinates in it
         level = np.round(np.log2(cell * widths)).astype(np.int64)
