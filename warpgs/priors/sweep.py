@@ -229,10 +229,8 @@ def matching_costs_cpu(view: View, others: Sequence[View], inverses: np.ndarray,
 
 def path_costs(costs: Tensor, image: np.ndarray, small_step: float = SMALL_STEP, large_step: float = LARGE_STEP) -> Tensor:
     """Return the sum of the semi-global path costs from four sides, int16 [H, W, D], in units of 1 / `UNIT`."""
-    down, across = (
-        torch.from_numpy(step_limits(colors, small_step, large_step).astype(np.int32)).to(costs.device)
-        for colors in (image, image.swapaxes(0, 1))
-    )
+    limits = (step_limits(colors, small_step, large_step) for colors in (image, image.swapaxes(0, 1)))
+    down, across = (torch.from_numpy(steps.astype(np.int32)).to(costs.device) for steps in limits)
     return scanline_costs(costs, down, across.T, round(small_step * UNIT))
 
 

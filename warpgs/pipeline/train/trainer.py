@@ -228,10 +228,6 @@ class Trainer:
         """Steps of the fit: those of the settings, or fewer if phase 3 begins early."""
         return self.phases.steps
 
-    def progress(self, step: int) -> float:
-        """Return the fraction of the fit that is done before a step, in [0, 1]."""
-        return self.phases.progress(step)
-
     def degree(self, step: int) -> int:
         """Return the degree of the harmonics in use at a step."""
         c = self.config
@@ -242,7 +238,7 @@ class Trainer:
         c = self.config
         terms = tuple(t for t in self.terms if t.active(step, self.phases.planned))
         half = step <= self.half_resolution * self.phases.planned
-        limits = c.limits.at(1.0 if step >= self.steps else self.progress(step), self.radius, c.antialiased)
+        limits = c.limits.at(1.0 if step >= self.steps else self.phases.progress(step), self.radius, c.antialiased)
         phase = returned(self.strategy, "phase", self.strategy.phase(step), Hashable, "a hashable value")
         return StepPlan(self.degree(step), half, terms, phase, limits, c.optimizer.opacities_decay, self.extrapolated)
 
@@ -345,14 +341,14 @@ class Trainer:
 
     def _lr_row(self, step: int) -> list[float]:
         """Return the learning rates of a step as `StepBuffers` holds them: of the Gaussians, then of view modules."""
-        own, lrs = self.lrs(step), self.learned.lrs(self.progress(step), self.context.extent)
+        own, lrs = self.lrs(step), self.learned.lrs(self.phases.progress(step), self.context.extent)
         return self.table.lr_row(own, step, self.config.optimizer.head_lrs) + self.learned.table.lr_row(lrs, step, {})
 
     def lrs(self, step: int) -> dict[str, float]:
         """Return the learning rate of each parameter of the Gaussians at a step."""
         c, phases = self.config, self.phases
         stable_start = phases.stable_start / phases.planned if c.phases.stable and phases.stable_start < phases.planned else 0.0
-        return c.optimizer.lrs(self.progress(step), self.context.extent, stable_start)
+        return c.optimizer.lrs(self.phases.progress(step), self.context.extent, stable_start)
 
     def settings(self, step: int, slot: int | None = None) -> tuple[float, ...]:
         """Return the settings of a step (`Setting`), or of a slot, which has its own index for random numbers."""
@@ -360,7 +356,9 @@ class Trainer:
         # else Gaussians of the background colour could cover empty areas
         shift = random_shift(self.config.seed, number, self.scene_background) if self.cutout else (0.0, 0.0, 0.0)
         means_lr = math.sqrt(self.batch) * self.lrs(step)["means"]
-        return Setting.row(dropout=self.dropout * self.progress(step), number=number, step=step, means_lr=means_lr, shift=shift)
+        return Setting.row(
+            dropout=self.dropout * self.phases.progress(step), number=number, step=step, means_lr=means_lr, shift=shift
+        )
 
     def is_due(self, step: int) -> bool:
         """Return whether the set of Gaussians changes, or left-out blocks are measured, after a step."""

@@ -18,6 +18,8 @@ from warpgs.render.options import RasterizeOptions
 from warpgs.scene import Camera, Gaussians, Tensors, View
 from warpgs.schema import Checked, Within
 
+Cameras = Mapping[str, Camera]
+"""Cameras by the names of their views."""
 CAMERA_BYTES = 4 * (16 + 9)
 """Bytes per Gaussian if cameras are learned: its part of the gradients of view matrix and intrinsics, before the sum over
 Gaussians."""
@@ -33,9 +35,9 @@ class FittedViews:
     """Names of the training views, in the order of their parameters."""
     test: Sequence[View]
     """Held-out views, with their cameras after the fit."""
-    given: Mapping[str, Camera]
+    given: Cameras
     """Camera of each view before the fit, in scene units [u], by name."""
-    cameras: Mapping[str, Camera]
+    cameras: Cameras
     """Camera of each view after the fit, in scene units [u], by name."""
     scale: float
     """Scene units per unit of the scene's files."""
@@ -121,9 +123,7 @@ class ViewModule(Checked):
         """
         return {}
 
-    def cameras(
-        self, given: Mapping[str, Camera], train: Sequence[str], test: Sequence[str], params: Tensors
-    ) -> Mapping[str, Camera]:
+    def cameras(self, given: Cameras, train: Sequence[str], test: Sequence[str], params: Tensors) -> Cameras:
         """Return the cameras of all views after the fit, for scores and renders; by default the given ones.
 
         The images of held-out views are not available, so that nothing is learned from them.
@@ -351,9 +351,7 @@ def similarity(given: Sequence[Camera], refined: Sequence[Camera]) -> tuple[np.n
     return R, scale, b.mean(0) - scale * matmul(R, a.mean(0))
 
 
-def refined_cameras(
-    given: Mapping[str, Camera], train: Sequence[str], test: Sequence[str], params: Tensors
-) -> dict[str, Camera]:
+def refined_cameras(given: Cameras, train: Sequence[str], test: Sequence[str], params: Tensors) -> dict[str, Camera]:
     """Return the cameras of all views after refinement: training ones by their own increments, held-out ones by `POSE_RULE`.
 
     If focal lengths are learned, a held-out view has the focal length of the training views of its camera. If no training view
@@ -379,9 +377,7 @@ def refined_cameras(
     return found
 
 
-def pose_figures(
-    given: Mapping[str, Camera], refined: Mapping[str, Camera], train: Sequence[str], held_out: bool, scale: float
-) -> dict[str, Any]:
+def pose_figures(given: Cameras, refined: Cameras, train: Sequence[str], held_out: bool, scale: float) -> dict[str, Any]:
     """Return the changes by refinement, for metrics.json; ``scale`` is scene units per unit of the scene's files.
 
     ``views`` has the turn [degrees] and the shift of the centre [units of the files] of each training view; ``cameras`` the
@@ -460,9 +456,7 @@ class RefinePoses(ViewModule, group="refine-poses."):
         """Return the bytes of the gradient of the camera."""
         return {PROJECTION: CAMERA_BYTES * sizes.count}
 
-    def cameras(
-        self, given: Mapping[str, Camera], train: Sequence[str], test: Sequence[str], params: Tensors
-    ) -> Mapping[str, Camera]:
+    def cameras(self, given: Cameras, train: Sequence[str], test: Sequence[str], params: Tensors) -> Cameras:
         """Return `refined_cameras`."""
         return refined_cameras(given, train, test, params)
 
