@@ -307,8 +307,7 @@ class _Ssim(torch.autograd.Function):
         else:
             workspace = image.new_empty(tasks * 5 * (columns + 2 * PADDING))
             inputs = [image, target, height, blocks, columns, workspace, result, *partials, image.new_empty(0)]
-            kernel = make_kernel(launch.real_of(image), summed, False)
-            launch.launch(kernel, tasks, inputs, image.device, cost=BLOCK * columns)
+            launch.launch(make_kernel(launch.real_of(image), summed, False), tasks, inputs, image.device, cost=BLOCK * columns)
         launch.keep(ctx, image, target, *partials)
         ctx.summed, ctx.tasks = summed, tasks
         return result.sum(0) if summed else result

@@ -453,16 +453,14 @@ def plane_costs(
     own_sums, squares = _window_sums(centred, radius), _window_sums(centred * centred, radius)
     added = noise * window**2 * WHITE**2
     roots = 1 / np.sqrt(squares - own_sums**2 / window**2 + added)
-    beside = [(0, 0), (0, pitch - width)]
     own, sums, roots = (
-        torch.from_numpy(np.pad(a, beside).astype(t).ravel())
+        torch.from_numpy(np.pad(a, [(0, 0), (0, pitch - width)]).astype(t).ravel())
         for a, t in ((centred, np.int32), (own_sums, np.int32), (roots, np.float32))
     )
     images = [_packed(g) for g in others]
     starts = np.cumsum([0, *(len(i) for i in images[:-1])])
     shapes = np.array([(s, g.shape[1], g.shape[0]) for s, g in zip(starts, others)], np.int32)
-    blocks = padded // PLANES
-    tasks = -(-height // ROWS) * blocks
+    tasks = -(-height // ROWS) * (padded // PLANES)
     ring = torch.empty(tasks * (window * pitch + 3 * (pitch + 2 * radius)), dtype=torch.int32, device="cpu")
     totals = torch.empty(tasks * 2 * ROWS * pitch, dtype=torch.float32, device="cpu")
     found = torch.empty(tasks * ROWS * PLANES * pitch, dtype=torch.int16, device="cpu")

@@ -142,8 +142,7 @@ def begin_step(
         viewmats.new_empty(1, 4, 4), Ks.new_empty(1, 3, 3), targets.new_empty(targets.shape[1:]),
     )  # fmt: skip
     rows = [t.view(len(t), -1) for t in (lr_rows, setting_rows, viewmats, Ks, targets)]
-    count = max(16, *(t.numel() for t in found))
-    launch.launch(begin_kernel, count, [counter, view_rows, *rows, *found], counter.device)
+    launch.launch(begin_kernel, max(16, *(t.numel() for t in found)), [counter, view_rows, *rows, *found], counter.device)
     return found
 
 

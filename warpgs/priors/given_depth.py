@@ -278,5 +278,4 @@ def _lens_pixels(camera: Camera) -> np.ndarray:
     positions = np.concatenate([plane, np.ones((len(plane), 1))], 1)
     with np.errstate(all="ignore"):
         found = geometry.to_plane(camera.model, camera.distortion, positions) * camera.K[[0, 1], [0, 1]] + camera.K[:2, 2]
-    seen = geometry.on_lens(camera.model, camera.distortion, positions)
-    return np.where(seen[:, None] & np.isfinite(found), found, -1e6)
+    return np.where(geometry.on_lens(camera.model, camera.distortion, positions)[:, None] & np.isfinite(found), found, -1e6)

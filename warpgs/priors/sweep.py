@@ -274,8 +274,7 @@ def matching_costs_cuda(view: View, others: Sequence[View], inverses: np.ndarray
             # with centres as grid_sample has them without align_corners; with it, torch would load cuDNN
             at = torch.stack([(2 * p[i] / p[2] + 1) / n - 1 for i, n in enumerate(sides)], -1)  # [P, H, W, 2]
             # outside is -1, which is less than any colour, also where a pixel is partly outside
-            raised = (gray + 1).expand(len(H), -1, -1, -1)
-            warped = torch.nn.functional.grid_sample(raised, at, align_corners=False) - 1
+            warped = torch.nn.functional.grid_sample((gray + 1).expand(len(H), -1, -1, -1), at, align_corners=False) - 1
             m = box(warped)
             v = (box(warped * warped) - m * m).clamp(min=0) + NOISE
             cost = 0.5 - 0.5 * (box(own * warped) - mean * m) / (variance * v).sqrt()

@@ -132,8 +132,7 @@ def window_of(pixels: Tensor, camera: Camera, tile_size: int) -> Window:
         raise ValueError(f"pixels in columns {left}-{right}, rows {top}-{bottom} leave the {camera.width} x {camera.height} px")
     x, y = left // tile_size * tile_size, top // tile_size * tile_size
     width = min((right // tile_size + 1) * tile_size, camera.width) - x
-    height = min((bottom // tile_size + 1) * tile_size, camera.height) - y
-    return x, y, width, height
+    return x, y, width, min((bottom // tile_size + 1) * tile_size, camera.height) - y
 
 
 def listed_tiles(pixels: Tensor, settings: Pass, cameras: int) -> Tensor:
@@ -392,8 +391,7 @@ def _render(gaussians: RasterizedGaussians, camera: Camera, options: RasterizeOp
     refusing: dict[str, Any] = {}
     for name in WITHOUT_GRADIENT:  # a gradient through an output that has none becomes an error
         if (values := getattr(render, name)) is not None:
-            source = render.rgb if name == "error_bound" else render.projected
-            refusing[name] = launch.without_gradient(name, values, source)
+            refusing[name] = launch.without_gradient(name, values, render.rgb if name == "error_bound" else render.projected)
     return replace(render, **refusing)
 
 

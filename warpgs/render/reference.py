@@ -82,8 +82,7 @@ def _block(g: Ellipses, corner: Tensor, size: tuple[int, int], steps: Tensor, ba
     power = (A * dx * dx)[:, None] + (B * dy)[..., None] * dx[:, None] + (C * dy * dy)[..., None]
     alpha = opacities[near, None] * torch.exp(power.flatten(1))
     alpha = torch.where(alpha >= rule.alpha_cut, alpha.clamp_max(rule.alpha_max), 0.0)
-    after = torch.cumprod(1 - alpha, 0)
-    before = torch.cat([torch.ones_like(alpha[:1]), after[:-1]])
+    before = torch.cat([torch.ones_like(alpha[:1]), torch.cumprod(1 - alpha, 0)[:-1]])
     weights = torch.where(before >= rule.transmittance_stop, alpha * before, 0.0)
     return weights.T @ colors[near] + (1 - weights.sum(0))[:, None] * background.double()
 

@@ -226,8 +226,7 @@ def _elsewhere(
     for rank in ranks[: len(points)]:
         free[rank] = False
     alone = [free[rank] for rank in ranks[len(points) :]]
-    kept = ([p[a] for p, a in zip(parts, alone)] for parts in (more, colors, cells[len(points) :]))
-    return merge(*kept), alone
+    return merge(*([p[a] for p, a in zip(parts, alone)] for parts in (more, colors, cells[len(points) :]))), alone
 
 
 # Extrapolated points where no view looks: beyond the images, and behind the near side of depth edges.
@@ -308,8 +307,7 @@ def _behind(views: Sequence[View], i: int, depth: np.ndarray, confirmed: Sequenc
     rows, columns = np.mgrid[BEHIND_PX // 2 : depth.shape[0] : BEHIND_PX, BEHIND_PX // 2 : depth.shape[1] : BEHIND_PX]
     hidden = far[rows, columns] > EDGE * depth[rows, columns]
     rows, columns = rows[hidden], columns[hidden]
-    pixels = np.stack([columns, rows], 1) + 0.5
-    points = geometry.back_project(view.camera, pixels, far[rows, columns].astype(float))
+    points = geometry.back_project(view.camera, np.stack([columns, rows], 1) + 0.5, far[rows, columns].astype(float))
     image = _mean_around(view.image, BEHIND_COLOR_PX, *map(np.arange, depth.shape)).reshape(-1, 3)
     keep = ~in_free_space(points, views, confirmed, i)
     return PointCloud(points[keep], image[source[rows, columns]][keep].astype(np.float32))

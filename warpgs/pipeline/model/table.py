@@ -248,8 +248,7 @@ class Table:
 
     def _check(self, update: DensityUpdate, capacity: int | None) -> None:
         """Check the indices and values of a change, and the size of the set after it."""
-        indices = {"keep": update.keep, "overwritten": update.overwritten, "parents": update.parents}
-        for name, rows in indices.items():
+        for name, rows in {"keep": update.keep, "overwritten": update.overwritten, "parents": update.parents}.items():
             if rows is None:
                 continue
             if not isinstance(rows, torch.Tensor) or rows.dtype != torch.int64 or rows.ndim != 1:

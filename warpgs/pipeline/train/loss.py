@@ -418,8 +418,7 @@ MAPS = 8
 
 def depth_roughness(depth: Tensor, alpha: Tensor, image: Tensor, weight: Tensor, mask: Tensor | None) -> Tensor:
     """Compute the mean roughness of depth, shape [], from depth, opacity, weights and a mask [H, W] and colours [H, W, 3]."""
-    gaps = image[:, :-2] - image[:, 2:], image[:-2] - image[2:]
-    rows, columns = (torch.exp(-gap.abs().mean(-1) / EDGE) for gap in gaps)
+    rows, columns = (torch.exp(-gap.abs().mean(-1) / EDGE) for gap in (image[:, :-2] - image[:, 2:], image[:-2] - image[2:]))
     return total(roughness(depth, alpha, rows, columns, weight, mask)) / depth.numel()
 
 

@@ -567,8 +567,7 @@ def step_times(
     phases, samples = plan_phases(config.phases, config.steps), find_strategy(config.strategy).samples
     due = np.isin(steps, phases.events) & samples
     removed = np.isin(steps, list(removals(phases, views))) & samples
-    added = sampler.fraction * pixels * min(views, MAX_VIEWS)
-    wanted = start + added * np.cumsum(due & (steps > done))
+    wanted = start + sampler.fraction * pixels * min(views, MAX_VIEWS) * np.cumsum(due & (steps > done))
     most = max(start, min(config.max_gaussians, (1 + sampler.max_fraction) * start))
     counts = np.minimum(wanted, most)
     if growing:

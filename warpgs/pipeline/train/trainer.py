@@ -546,8 +546,7 @@ def warm_up(config: FitConfig, device: torch.device, stopped: Callable[[], bool]
         viewmat = np.eye(4)
         viewmat[0, 3] = x
         views.append(View(f"{x}", Camera(viewmat, K, SIDE, SIDE), generator.random((SIDE, SIDE, 3), np.float32)))
-    points = generator.uniform([-1, -1, 2], [1, 1, 4], (POINTS, 3))
-    cloud = PointCloud(points, generator.random((POINTS, 3), np.float32))
+    cloud = PointCloud(generator.uniform([-1, -1, 2], [1, 1, 4], (POINTS, 3)), generator.random((POINTS, 3), np.float32))
     maps = [generator.random((SIDE, SIDE), np.float32) for _ in range(4)]
     small = replace(
         config, steps=STEPS, memory_limit=None, init=replace(config.init, source="points"),

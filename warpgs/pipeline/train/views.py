@@ -84,8 +84,7 @@ class LearnedViews:
     def before_render(self, camera: Camera, values: Tensors) -> Camera:
         """Return the camera that views are rendered from; arguments are those of `ViewModule.before_render`."""
         for module in self.modules:
-            shown = module.before_render(camera, values)
-            camera = returned(module, "before_render", shown, Camera, "a Camera")
+            camera = returned(module, "before_render", module.before_render(camera, values), Camera, "a Camera")
         return camera
 
     def regularisation(self, values: Tensors) -> dict[str, torch.Tensor]:
@@ -181,8 +180,7 @@ def view_bytes(views: Iterable[TrainingView]) -> int:
     a CPU, stacks have no memory of their own.
     """
     tensors = (t for v in views for t in (v.image, v.mask, v.alpha, v.consistent, *v.maps.values()))
-    storages = (t.untyped_storage() for t in tensors if t is not None)
-    return sum({s.data_ptr(): s.nbytes() for s in storages}.values())
+    return sum({s.data_ptr(): s.nbytes() for s in (t.untyped_storage() for t in tensors if t is not None)}.values())
 
 
 def with_alpha(views: Sequence[View]) -> list[View]:
