@@ -19,12 +19,12 @@ from warpgs.kernels.tiles import Tiles
 
 def step_bytes(sizes: StepSizes) -> Needs:
     """Return the bytes of images, of data for the backward pass, and of gradient slots at each moment of a step."""
-    slots, states = blend_cuda.instance_bytes(sizes) if sizes.cuda else (FLOAT * VALUES * sizes.instances, 0)
+    # the tile order is gone before the loss, which takes more
+    slots, states, order = blend_cuda.step_bytes(sizes) if sizes.cuda else (FLOAT * VALUES * sizes.instances, 0, 0)
     images = (COLORS + 2) * FLOAT * sizes.pixels  # colour, alpha, depth
     kept = 3 * FLOAT * sizes.pixels + states  # transmittance, weight, end
     lean = not (sizes.depth or sizes.cutout)  # only colour has a gradient
     upstream = (COLORS if lean else COLORS + 2) * FLOAT * sizes.pixels
-    order = blend_cuda.order_bytes(sizes) if sizes.cuda else 0  # gone before the loss, which takes more
     whole = images + upstream if sizes.chunked else 0  # images of the frame exist beside those of a chunk
     return {
         BINNING: whole, LOSS: images + (0 if sizes.chunked else kept), BLENDING: kept + slots + images + (whole or upstream),

@@ -154,17 +154,11 @@ def chunk_of(tiles: int, deterministic: bool) -> int:
     return CHUNKS[larger if deterministic else max(larger, 1)]
 
 
-def instance_bytes(sizes: StepSizes) -> tuple[int, int]:
-    """Return the bytes of a step's gradient slots, and of the states that blending leaves for its backward pass."""
-    columns, rows = (0, 0) if sizes.chunked else grid(sizes.width, sizes.height, TILE_SIZE)
-    state = FLOAT * STATE * TILE_SIZE * TILE_SIZE // chunk_of(columns * rows, True)
-    return FLOAT * STRIDE * sizes.instances, state * sizes.instances
-
-
-def order_bytes(sizes: StepSizes) -> int:
-    """Return the bytes of the tile order, which the forward pass frees at its end."""
+def step_bytes(sizes: StepSizes) -> tuple[int, int, int]:
+    """Return the bytes of a step's gradient slots, of the states for the backward pass, and of the tile order."""
     columns, rows = grid(sizes.width, sizes.height, TILE_SIZE)
-    return FLOAT * RANKS * columns * rows
+    state = FLOAT * STATE * TILE_SIZE * TILE_SIZE // chunk_of(0 if sizes.chunked else columns * rows, True)
+    return FLOAT * STRIDE * sizes.instances, state * sizes.instances, FLOAT * RANKS * columns * rows
 
 
 def image_tile(settings: Pass) -> int:
