@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated, ClassVar
 
@@ -244,6 +244,13 @@ class Photometric(LossTerm):
         return photometric_loss(inputs.outputs["rgb"], inputs.target.image, inputs.target.mask, self.ssim_weight)
 
 
+def _weighted_mean(values: Tensor, mask: Tensor | None, weight: float) -> Tensor:
+    """Return ``weight`` times the mean of values [H, W] over the unmasked pixels, shape []."""
+    if mask is None:
+        return total(values) * (weight / values.numel())
+    return total(values * mask) / mask.sum().clamp_min(1) * weight
+
+
 @register("alpha")
 @dataclass(frozen=True)
 class AlphaDifference(LossTerm, group="alpha."):
@@ -262,10 +269,13 @@ class AlphaDifference(LossTerm, group="alpha."):
         alpha, target = inputs.outputs["alpha"], inputs.target
         if target.alpha is None:
             return alpha.new_zeros(())
-        difference = (alpha - target.alpha).abs()
-        if target.mask is None:
-            return total(difference) * (self.weight / target.alpha.numel())
-        return total(difference * target.mask) / target.mask.sum().clamp_min(1) * self.weight
+        return _weighted_mean((alpha - target.alpha).abs(), target.mask, self.weight)
+
+
+def _map_bytes(sizes: StepSizes, channels: int, maps: int) -> Needs:
+    """Return the bytes of maps at the loss, and of the copy of a term's map with ``channels`` on CUDA."""
+    copy = channels * FLOAT * sizes.pixels * sizes.cuda
+    return {**dict.fromkeys(STEP, copy), LOSS: copy + maps * FLOAT * sizes.pixels}
 
 
 EMPTY_WEIGHT = 0.3
@@ -293,15 +303,11 @@ class EmptyOpacity(LossTerm, group="empty."):
 
     def bytes(self, sizes: StepSizes) -> Needs:
         """Return the bytes of the products and a gradient, and of the copy of the map on CUDA."""
-        copy = FLOAT * sizes.pixels * sizes.cuda
-        return {**dict.fromkeys(STEP, copy), LOSS: copy + (2 + sizes.masked) * FLOAT * sizes.pixels}
+        return _map_bytes(sizes, 1, 2 + sizes.masked)
 
     def __call__(self, inputs: LossInputs) -> Tensor:
         """Compute ``weight`` times the sum of opacities of empty pixels, divided by the number of unmasked pixels, shape []."""
-        opacities, mask = inputs.outputs["alpha"] * inputs.target.maps["empty"], inputs.target.mask
-        if mask is None:
-            return total(opacities) * (self.weight / opacities.numel())
-        return total(opacities * mask) / mask.sum().clamp_min(1) * self.weight
+        return _weighted_mean(inputs.outputs["alpha"] * inputs.target.maps["empty"], inputs.target.mask, self.weight)
 
 
 # Loss terms for given depth and normals, for views that have them.
@@ -353,8 +359,7 @@ class GivenDepthDifference(LossTerm, group="given-depth."):
 
     def bytes(self, sizes: StepSizes) -> Needs:
         """Return the bytes of the term's maps, and of the copy of its target on CUDA."""
-        copy = 3 * FLOAT * sizes.pixels * sizes.cuda
-        return {**dict.fromkeys(STEP, copy), LOSS: copy + DEPTH_MAPS * FLOAT * sizes.pixels}
+        return _map_bytes(sizes, 3, DEPTH_MAPS)
 
     def __call__(self, inputs: LossInputs) -> Tensor:
         """Compute ``weight`` times `inverse_depth_difference`, shape []."""
@@ -390,8 +395,7 @@ class GivenNormalsDifference(LossTerm, group="given-normals."):
 
     def bytes(self, sizes: StepSizes) -> Needs:
         """Return the bytes of points, differences and normals, and of the copy of the target on CUDA."""
-        copy = 3 * FLOAT * sizes.pixels * sizes.cuda
-        return {**dict.fromkeys(STEP, copy), LOSS: copy + NORMAL_MAPS * FLOAT * sizes.pixels}
+        return _map_bytes(sizes, 3, NORMAL_MAPS)
 
     def __call__(self, inputs: LossInputs) -> Tensor:
         """Compute ``weight`` times `normal_difference` of the rendered depth's normals, shape []."""
@@ -438,8 +442,7 @@ class SmoothDepth(LossTerm, group="smooth-depth."):
 
     def bytes(self, sizes: StepSizes) -> Needs:
         """Return the bytes of the term's maps, and of the copy of its weights on CUDA."""
-        copy = FLOAT * sizes.pixels * sizes.cuda
-        return {**dict.fromkeys(STEP, copy), LOSS: copy + MAPS * FLOAT * sizes.pixels}
+        return _map_bytes(sizes, 1, MAPS)
 
     def __call__(self, inputs: LossInputs) -> Tensor:
         """Compute ``weight`` times `depth_roughness`, shape []."""
@@ -471,15 +474,11 @@ def built_in_terms(
 
     ``black`` says that an opacity was estimated from black backgrounds.
     """
-    terms: list[LossTerm] = [Photometric()]
-    if cutout and config.alpha_weight > 0:
-        terms.append(AlphaDifference(config.alpha_weight))
-    elif black and config.alpha_weight > 0:
-        terms.append(EmptyOpacity(EMPTY_WEIGHT * config.alpha_weight))
-    if config.smooth_weight:
-        terms.append(SmoothDepth(config.smooth_weight))
-    if depth and config.depth_weight > 0:
-        terms.append(GivenDepthDifference(config.depth_weight))
-    if normals and config.normal_weight > 0:
-        terms.append(GivenNormalsDifference(config.normal_weight))
-    return tuple(terms)
+    terms: list[tuple[bool, Callable[[float], LossTerm], float]] = [
+        (cutout, AlphaDifference, config.alpha_weight),
+        (black and not cutout, EmptyOpacity, EMPTY_WEIGHT * config.alpha_weight),
+        (True, SmoothDepth, config.smooth_weight or 0.0),
+        (depth, GivenDepthDifference, config.depth_weight),
+        (normals, GivenNormalsDifference, config.normal_weight),
+    ]
+    return (Photometric(), *(kind(weight) for applies, kind, weight in terms if applies and weight > 0))

@@ -102,6 +102,8 @@ class LearnedViews:
 
 Kind = tuple[int, int, bool, str]
 """Width and height [px] of a view, whether it has a mask, and its camera model."""
+Place = tuple[Kind, int]
+"""Kind of a view, and its row in the stack of that kind."""
 
 
 @dataclass(frozen=True)
@@ -263,9 +265,7 @@ def stacked(tensors: Sequence[torch.Tensor]) -> Rows:
     return first.as_strided((len(tensors), *first.shape), (first.numel(), *first.stride()))
 
 
-def stack_views(
-    views: list[TrainingView], count: int
-) -> tuple[list[TrainingView], dict[Kind, ViewStack], list[tuple[Kind, int]]]:
+def stack_views(views: list[TrainingView], count: int) -> tuple[list[TrainingView], dict[Kind, ViewStack], list[Place]]:
     """Stack views by size, by whether they have a mask, and by camera model.
 
     Views after the first ``count`` are the same views at another size. Returns the views, whose pixels are parts of the stacks,
@@ -316,9 +316,7 @@ def current(stack: ViewStack, learned: LearnedViews) -> ViewStack:
 
 
 @torch.no_grad()
-def show_learned(
-    views: list[TrainingView], stacks: Mapping[Kind, ViewStack], places: list[tuple[Kind, int]], learned: LearnedViews
-) -> None:
+def show_learned(views: list[TrainingView], stacks: dict[Kind, ViewStack], places: list[Place], learned: LearnedViews) -> None:
     """Write the current learned values into the views of `with_learned`; density strategies render these views."""
     if not learned.modules:
         return
