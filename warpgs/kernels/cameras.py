@@ -85,6 +85,11 @@ def types_of(real: type) -> tuple[Any, ...]:
     return *vectors, wp.types.matrix((3, 3), real), wp.types.matrix((4, 4), real), wp.array(dtype=real)
 
 
+def named(*functions: Any, **more: Any) -> SimpleNamespace:
+    """Return a namespace of Warp's functions, kernels and structs by their own names, and of ``more``."""
+    return SimpleNamespace(**{f.key.rpartition("__")[2]: f for f in functions}, **more)
+
+
 @functools.cache
 def make_linear(real: type) -> SimpleNamespace:
     """Make the structs, products and functions that models share, for one scalar type, wp.float32 or wp.float64."""
@@ -151,10 +156,7 @@ def make_linear(real: type) -> SimpleNamespace:
         usual = {"in_range": in_front, "depth_of": z_of, "expansion_point": clamped}
         return SimpleNamespace(project_axes=project_axes, axes_backward=axes_backward, **usual | functions)
 
-    return SimpleNamespace(
-        Rows=Rows, Gradients=Gradients, intrinsics_of=intrinsics_of, in_front=in_front, z_of=z_of, unclamped=unclamped,
-        clamped=clamped, products=products,
-    )  # fmt: skip
+    return named(Rows, Gradients, intrinsics_of, in_front, z_of, unclamped, clamped, products=products)
 
 
 @register("pinhole")

@@ -10,7 +10,7 @@ import warp as wp
 from warpgs.constants import COVARIANCE_TOLERANCE, FARTHEST_PIXEL, LARGEST_AXIS, SHORTEST_QUAT, SMALLEST_DETERMINANT
 from warpgs.errors import UsageError
 from warpgs.kernels import launch, sh
-from warpgs.kernels.cameras import CAMERA_MODELS, types_of
+from warpgs.kernels.cameras import CAMERA_MODELS, named, types_of
 
 
 @functools.cache
@@ -227,9 +227,7 @@ def make_rotations(real):
         """Return the rotation of a view matrix."""
         return mat33(view[0, 0], view[0, 1], view[0, 2], view[1, 0], view[1, 1], view[1, 2], view[2, 0], view[2, 1], view[2, 2])
 
-    return SimpleNamespace(
-        quat_length=quat_length, rotation=rotation, rotation_backward=rotation_backward, rotation_of=rotation_of
-    )
+    return named(quat_length, rotation, rotation_backward, rotation_of)
 
 
 SHRINKS = 6
@@ -503,10 +501,7 @@ def make_spans(real, lanes: bool = False):
             half_height = reach * wp.sqrt(c) / shrink
         return vec2(half_width, half_height)
 
-    return SimpleNamespace(
-        tile_range=tile_range, tile_rows=tile_rows, tile_columns=tile_columns, reach_of=reach_of, half_sides=half_sides,
-        vec2i=vec2i,
-    )  # fmt: skip
+    return named(tile_range, tile_rows, tile_columns, reach_of, half_sides, vec2i=vec2i)
 
 
 # Gradients of one projected Gaussian, for all backward kernels of `project`. Comments name sections of docs/project.md.
@@ -681,6 +676,4 @@ def make_functions(real, camera_model: str, parameters: str, antialiased: bool, 
             v_view[row, 3] = v_t[row]
         return v_view
 
-    return SimpleNamespace(
-        ShapeGradient=ShapeGradient, shape=shape, color=color, centered=centered, logit=logit, view_gradient=view_gradient
-    )
+    return named(ShapeGradient, shape, color, centered, logit, view_gradient)

@@ -2,7 +2,6 @@
 
 import functools
 from dataclasses import dataclass
-from types import SimpleNamespace
 from typing import Any
 
 import torch
@@ -13,6 +12,7 @@ from warpgs.constants import LARGEST_HALF, TILE_SIZE
 from warpgs.device import BINNING, BLENDING, FLOAT, LOSS, SAMPLING, Needs, StepSizes, format_bytes, free_for
 from warpgs.errors import ResourceError
 from warpgs.kernels import launch, native as cuda
+from warpgs.kernels.cameras import named
 from warpgs.kernels.ellipse import make_spans
 from warpgs.kernels.graphs import TORCH, Allocator
 from warpgs.kernels.native import EXACT, SCALE, IntRows, Ints, Longs, make_prefetch, source
@@ -409,9 +409,7 @@ def make_kernels(real, native: bool):
         j = begin + wp.tid()
         counts[j] = wp.int64(tile_counts[order[j]])
 
-    return SimpleNamespace(
-        depth_keys=depth_keys, pack_counts=pack_counts, visible_keys=visible_keys, ordered_counts=ordered_counts
-    )
+    return named(depth_keys, pack_counts, visible_keys, ordered_counts)
 
 
 def running_counts(counts: Tensor, real, allocator: Allocator = TORCH, out: Tensor | None = None) -> Tensor:
