@@ -139,7 +139,9 @@ def make_linear(real: type) -> SimpleNamespace:
             wp.clamp(pixel[1], -margin * height, height + margin * height),
         )
 
-    def products(jacobian: Callable[..., Any], **functions: Any) -> SimpleNamespace:
+    usual = {"in_range": in_front, "depth_of": z_of, "expansion_point": clamped}
+
+    def products(jacobian: Callable[..., Any], *functions: Any, **more: Any) -> SimpleNamespace:
         """Return the functions of a model: the given ones, and those by its ``jacobian(position, K, lens, point) -> Rows``."""
 
         @wp.func
@@ -153,10 +155,9 @@ def make_linear(real: type) -> SimpleNamespace:
             j = jacobian(position, K, lens, point)
             return wp.outer(j.first, v_first) + wp.outer(j.second, v_second)
 
-        usual = {"in_range": in_front, "depth_of": z_of, "expansion_point": clamped}
-        return SimpleNamespace(project_axes=project_axes, axes_backward=axes_backward, **usual | functions)
+        return SimpleNamespace(**usual | vars(named(project_axes, axes_backward, *functions, **more)))
 
-    return named(Rows, Gradients, intrinsics_of, in_front, z_of, unclamped, clamped, products=products)
+    return named(Rows, Gradients, intrinsics_of, unclamped, usual=usual, products=products)
 
 
 @register("pinhole")
@@ -240,10 +241,7 @@ class Pinhole(CameraModel):
                 v_K[1, 2] = v_K[1, 2] + v_jyz * inv_z
             return linear.Gradients(vec3(v_x, v_y, v_z), v_K)
 
-        return SimpleNamespace(
-            in_range=linear.in_front, depth_of=linear.z_of, pixel_of=pixel_of, expansion_point=linear.clamped,
-            position_backward=position_backward, project_axes=project_axes, axes_backward=axes_backward,
-        )  # fmt: skip
+        return named(pixel_of, project_axes, axes_backward, position_backward, **linear.usual)
 
 
 @register("orthographic")
@@ -276,8 +274,7 @@ class Orthographic(CameraModel):
             v_position = vec3(v_pixel[0] * K[0, 0], v_pixel[1] * K[1, 1], v_depth)
             return linear.Gradients(v_position, linear.intrinsics_of(fx, fy, v_pixel))
 
-        unclamped = linear.unclamped
-        return linear.products(jacobian, pixel_of=pixel_of, expansion_point=unclamped, position_backward=position_backward)
+        return linear.products(jacobian, pixel_of, position_backward, expansion_point=linear.unclamped)
 
 
 @register("opencv")
@@ -384,7 +381,7 @@ class OpenCV(CameraModel):
             v_z = -(v_a * a0 + v_b * b0 + first * jx + second * jy) * inv_z + v_depth
             return linear.Gradients(vec3(v_a * inv_z, v_b * inv_z, v_z), v_K)
 
-        return linear.products(jacobian, in_range=in_range, pixel_of=pixel_of, position_backward=position_backward)
+        return linear.products(jacobian, in_range, pixel_of, position_backward)
 
 
 @functools.cache
@@ -550,10 +547,8 @@ class Fisheye(CameraModel):
             v_position = vec3(v_x, v_y, v_z) / distance + v_depth * unit
             return linear.Gradients(v_position, linear.intrinsics_of(fx, fy, v_pixel))
 
-        return linear.products(
-            jacobian, in_range=in_range, depth_of=radial.distance, pixel_of=pixel_of, expansion_point=linear.unclamped,
-            position_backward=position_backward,
-        )  # fmt: skip
+        own = {"depth_of": radial.distance, "expansion_point": linear.unclamped}
+        return linear.products(jacobian, in_range, pixel_of, position_backward, **own)
 
 
 @functools.cache
