@@ -187,6 +187,7 @@ def describe(network: Network, defaults: Preprocessing, kind: str) -> tuple[Prep
     return Preprocessing(**values), notes
 
 
+Arrays = tuple[np.ndarray, ...]
 CODE = 1
 """Version of the code between image and maps; increased whenever the same inputs would produce other maps."""
 
@@ -211,9 +212,7 @@ class MapCache:
     def __init__(self, folder: Path):
         self.folder, self.notes, self.found, self.made = folder, list[str](), 0, 0
 
-    def maps(
-        self, image: np.ndarray, names: tuple[str, ...], decided_by: dict, make: Callable[[], tuple[np.ndarray, ...]]
-    ) -> tuple[np.ndarray, ...]:
+    def maps(self, image: np.ndarray, names: tuple[str, ...], decided_by: dict, make: Callable[[], Arrays]) -> Arrays:
         """Return one map per name, float32 [H, W], of an image [H, W, 3], read from disk or computed by ``make``."""
         path = self._path(image, names, decided_by)
         maps = self._read(path, names, image.shape[:2])
@@ -231,7 +230,7 @@ class MapCache:
         key.update(np.ascontiguousarray(image).data)
         return self.folder / f"{key.hexdigest()}.safetensors"
 
-    def _read(self, path: Path, names: tuple[str, ...], shape: tuple[int, int]) -> tuple[np.ndarray, ...] | None:
+    def _read(self, path: Path, names: tuple[str, ...], shape: tuple[int, int]) -> Arrays | None:
         import safetensors
         from safetensors.numpy import load
 
@@ -248,7 +247,7 @@ class MapCache:
         self.notes.append(f"{path}: a stored map was damaged and was computed again")
         return None
 
-    def _write(self, path: Path, names: tuple[str, ...], maps: tuple[np.ndarray, ...]) -> None:
+    def _write(self, path: Path, names: tuple[str, ...], maps: Arrays) -> None:
         from safetensors.numpy import save
 
         try:

@@ -152,7 +152,7 @@ class PriorConfig(Checked):
             raise UsageError("--depth-guides requires --depth-model; for maps from files, give --depths instead")
 
 
-Source = Callable[[int], tuple[tuple[np.ndarray, ...], str]]
+Source = Callable[[int], tuple[networks.Arrays, str]]
 """Function from the index of a view to its maps, float32 [H, W] each, and a phrase on their source."""
 
 
@@ -169,13 +169,12 @@ def _by_network(
     decided_by = {"model": network.sha256, "provider": config.onnx_provider, **asdict(how)}
     names = ("disparity",) if is_depth else ("confidence", "boundary", "foreground")
 
-    def maps(i: int) -> tuple[tuple[np.ndarray, ...], str]:
-        image = views[i].image
+    def made(image: np.ndarray) -> networks.Arrays:
+        return (networks.network_disparity(network, how, image),) if is_depth else network_semantics(network, how, image)
 
-        def make() -> tuple[np.ndarray, ...]:
-            return (networks.network_disparity(network, how, image),) if is_depth else network_semantics(network, how, image)
-
-        return cache.maps(image, names, decided_by, make), f"{how.output} by {network.title}"
+    def maps(i: int) -> tuple[networks.Arrays, str]:
+        found = cache.maps(views[i].image, names, decided_by, lambda: made(views[i].image))
+        return found, f"{how.output} by {network.title}"
 
     return maps
 
@@ -192,7 +191,7 @@ def _by_views(views: Sequence[View], depths: Sequence[ViewDepth] | None, notes: 
     if poor:
         notes.append(f"no consistent depth in {', '.join(poor)}, so there is no geometry score there; --depth-model adds depth")
 
-    def disparity(i: int) -> tuple[tuple[np.ndarray, ...], str]:
+    def disparity(i: int) -> tuple[networks.Arrays, str]:
         view, d = views[i], depths[i]
         if d.valid.sum() < MIN_CONSISTENT:
             return (np.zeros(d.depth.shape, np.float32),), "none"
