@@ -244,9 +244,8 @@ def rasterization(
     # an opacity factor holds for all cameras of a call, so a clip needs a call for each camera
     views = [slice(c, c + 1) for c in range(cameras)] if radius_clip > 0 else [slice(None)]
     kind: Any = ActivatedGaussians if covars is None else CovarianceGaussians
-    form = {"quats": quats, "scales": scales}
-    if covars is not None:
-        form = {"covars": covars.triu() + covars.triu(1).mT}  # the upper triangle alone is read, and has the whole gradient
+    # the upper triangle of covariances alone is read, and has the whole gradient
+    form = {"quats": quats, "scales": scales} if covars is None else {"covars": covars.triu() + covars.triu(1).mT}
     renders = []
     for scene, view in [(scene, view) for scene in range(batch.numel()) for view in views]:
         of = functools.partial(_part, batch, scene, view)

@@ -246,8 +246,8 @@ def _checked_channels(name: str, values: Tensor | None, inputs: ProjectInputs) -
 
 def _check_memory(window: Window, layers: list[Layer], heaviest: int, like: Tensor) -> None:
     """Raise ResourceError where the images [C, H, W, D] of the layers need more memory than the device of ``like`` has free."""
-    channels = sum(backgrounds.shape[1] + 4 for _, backgrounds in layers)  # and alpha, depth, transmittance, sum of weights
-    channels += 2 * heaviest
+    # and alpha, depth, transmittance, sum of weights
+    channels = sum(backgrounds.shape[1] + 4 for _, backgrounds in layers) + 2 * heaviest
     needed = len(layers[0][1]) * window[2] * window[3] * channels * like.element_size()
     free = free_for(needed, like.device)
     if needed > free:
@@ -350,9 +350,7 @@ def _render(gaussians: RasterizedGaussians, camera: Camera, options: RasterizeOp
     inputs = compose.inputs_of(gaussians, camera, options.opacity_factors)
     degree = gaussians.sh_degree if options.sh_degree is None else options.sh_degree
     degree = degree if options.colors is None else 0  # unused harmonics: read as few as possible
-    pixels = None
-    if options.pixels is not None:
-        pixels = checked_pixels(options.pixels, len(inputs.viewmats), inputs.means.device)
+    pixels = None if options.pixels is None else checked_pixels(options.pixels, len(inputs.viewmats), inputs.means.device)
     window = _checked_window(camera, options) if pixels is None else window_of(pixels, camera, options.tile_size)
     shared = {n: getattr(options, n) for n in ("tile_size", "absgrad", "antialiased", "deterministic")}
     settings = compose.pass_of(
