@@ -230,9 +230,7 @@ def over_background(scene: Scene, color: Color) -> Scene:
     shift = np.float32(color) - np.float32(scene.background)
 
     def moved(v: View) -> View:
-        if v.alpha is None:
-            return v
-        return replace(v, image=np.clip(v.image + (1 - v.alpha[..., None]) * shift, 0, 1))
+        return v if v.alpha is None else replace(v, image=np.clip(v.image + (1 - v.alpha[..., None]) * shift, 0, 1))
 
     return replace(scene, background=color, views=tuple(map(moved, scene.views)))
 

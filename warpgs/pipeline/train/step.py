@@ -268,9 +268,7 @@ class StepTaker:
             alpha, shift = buffers.of_view(views.alphas), settings[SHIFT]
             image = over(image, alpha, shift)
         target = Target(image, mask, {n: buffers.of_view(t) for n, t in views.maps.items()}, alpha)
-        factors = None
-        if self.dropout_seed is not None:
-            factors = opacity_dropout(len(gaussians), settings, self.dropout_seed)
+        factors = None if self.dropout_seed is None else opacity_dropout(len(gaussians), settings, self.dropout_seed)
         distortion = None if views.camera.distortion is None else buffers.of_view(views.camera.distortion)[None]
         camera = self.views.before_render(replace(views.camera, viewmat=viewmat, K=K, distortion=distortion), values)
         rendered = render(gaussians, camera, plan.degree, factors, shift)
