@@ -10,7 +10,6 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -105,9 +104,22 @@ def package_files() -> dict[str, bytes]:
 
 def _backbone() -> torch.nn.Module:
     """Return XFeat's network, which maps an image [1, 3, h, w] to descriptors, keypoint logits and reliability of each cell."""
-    files, module = package_files(), ModuleType(f"{PACKAGE}_model")
-    # the checked bytes: loading by path would read the file again, or a planted .pyc in its place
-    exec(compile(files["model.py"], "model.py", "exec"), vars(module))
+    files = package_files()
+
+    class Checked(importlib.abc.InspectLoader):
+        """Loader of the checked bytes: loading by path would read the file again, or a planted .pyc in its place."""
+
+        def get_source(self, fullname: str) -> str:
+            return files["model.py"].decode("utf-8")
+
+        def is_package(self, fullname: str) -> bool:
+            return False
+
+    loader = Checked()
+    spec = importlib.util.spec_from_loader(f"{PACKAGE}_model", loader)
+    assert spec is not None
+    module = importlib.util.module_from_spec(spec)
+    loader.exec_module(module)
     network: torch.nn.Module = module.XFeatModel()
     # weights_only: tensors and plain containers, nothing that could run
     network.load_state_dict(torch.load(io.BytesIO(files["weights/xfeat.pt"]), map_location="cpu", weights_only=True))
