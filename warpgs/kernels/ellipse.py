@@ -170,8 +170,10 @@ class _PackedCovariances(torch.autograd.Function):
         return (v_covars,)
 
 
-packed_covariances = _PackedCovariances.apply
-"""Return the symmetric part of covariances [N, 3, 3] as xy, xz, yz and a 0 [N, 4], and diagonals [N, 3]. Differentiable."""
+def packed_covariances(covars: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return the symmetric part of covariances [N, 3, 3] as xy, xz, yz and a 0 [N, 4], and diagonals [N, 3]. Differentiable."""
+    found: tuple[torch.Tensor, torch.Tensor] = _PackedCovariances.apply(covars)
+    return found
 
 
 @functools.cache
