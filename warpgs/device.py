@@ -7,6 +7,7 @@ import ctypes
 import errno
 import functools
 import importlib.util
+import math
 import os
 import platform
 import re
@@ -244,6 +245,12 @@ def available_bytes(device: torch.device) -> int:
         free, _ = torch.cuda.mem_get_info(device)
         return free + torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
     return _machine_or_assumed()[1]
+
+
+def free_for(needed: int, device: torch.device) -> float:
+    """Return the memory that is free for a request [bytes]; infinite, without a query, if there is always enough for it."""
+    # a query takes at least 0.1 ms; small requests, below a twentieth of the memory, skip it
+    return math.inf if needed < installed_bytes(device) // 20 else available_bytes(device)
 
 
 def is_out_of_memory(error: BaseException) -> bool:

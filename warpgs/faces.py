@@ -71,7 +71,10 @@ OLD = {
 
 
 def lazy(face: str) -> tuple[Callable[[str], object], Callable[[], list[str]]]:
-    """Return ``__getattr__`` and ``__dir__`` of a face: the names that it imports for type checkers load on first use."""
+    """Return ``__getattr__`` and ``__dir__`` of a face: the names that it imports for type checkers load on first use.
+
+    Its ``__all__`` has all of them but the faces below it.
+    """
     # Importing torch and Warp at once would delay `warpgs --help` by seconds. The imports are read from the face's
     # source, which is always there: Warp compiles kernels from their source, too.
 
@@ -87,6 +90,8 @@ def lazy(face: str) -> tuple[Callable[[str], object], Callable[[], list[str]]]:
 
     def get(name: str) -> object:
         """Import a public name on first use."""
+        if name == "__all__":
+            return sorted(n for n, (home, _) in places().items() if home != face)
         if name not in places():
             raise AttributeError(f"module {face!r} has no attribute {name!r}")
         home, attribute = places()[name]

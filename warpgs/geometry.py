@@ -71,8 +71,7 @@ def to_plane(model: str, distortion: Array | None, positions: Array) -> Array:
         return library.stack([x, y], -1)
     if model == "fisheye":
         r = library.hypot(x, y)
-        angle = library.arctan2(r, z)
-        scale = _bent(angle, distortion)[0] / library.where(r > 0, r, 1)
+        scale = _bent(library.arctan2(r, z), distortion)[0] / library.where(r > 0, r, 1)
         scale = library.where(r > 0, scale, 1 / library.where(z == 0, 1, z))
         return library.stack([x * scale, y * scale], -1)
     a, b = x / z, y / z
@@ -277,8 +276,7 @@ def project_points(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.n
         plane = np.where(seen[:, None], plane, 0) * camera.K[[0, 1], [0, 1]] + camera.K[:2, 2]
         return plane, np.where(seen, depth_of(camera.model, in_camera), 0)
     safe = np.where(z == 0, np.finfo(float).tiny, z)
-    pixels = matmul(in_camera / safe[:, None], camera.K.T)
-    return pixels[:, :2], z
+    return matmul(in_camera / safe[:, None], camera.K.T)[:, :2], z
 
 
 def back_project(camera: Camera, pixels: np.ndarray, depths: np.ndarray) -> np.ndarray:
@@ -323,8 +321,7 @@ def project_tensors(camera: Camera, points: torch.Tensor) -> tuple[torch.Tensor,
     in_camera = (points[:, None] * viewmat[:3, :3]).sum(2) + viewmat[:3, 3]
     seen, depth = on_lens(camera.model, camera.distortion, in_camera), depth_of(camera.model, in_camera)
     plane = to_plane(camera.model, camera.distortion, torch.where(seen[:, None], in_camera, torch.ones_like(in_camera)))
-    pixels = torch.stack([K[i, i] * plane[:, i] + K[i, 2] for i in range(2)], 1)
-    return pixels, torch.where(seen, depth, 0)
+    return torch.stack([K[i, i] * plane[:, i] + K[i, 2] for i in range(2)], 1), torch.where(seen, depth, 0)
 
 
 def _at_depth(camera: Camera, rays: Any, depths: Any) -> Any:
@@ -404,15 +401,12 @@ def gaussian_normals(gaussians: Gaussians | ActivatedGaussians, camera: Camera) 
     viewmat = torch.as_tensor(camera.viewmat).detach().to(means)
     center = -(viewmat[..., :3, :3] * viewmat[..., :3, 3:]).sum(-2)
     away = viewmat[..., 2:3, :3] if camera.model == "orthographic" else means.detach() - center[..., None, :]
-    faces = (normals.detach() * away).sum(-1, keepdim=True) <= 0
-    return torch.where(faces, normals, -normals)
+    return torch.where((normals.detach() * away).sum(-1, keepdim=True) <= 0, normals, -normals)
 
 
 def in_image(camera: Camera, points: np.ndarray) -> np.ndarray:
     """Return a mask [N], True where a world point [N, 3] is in front of the camera and inside its image."""
-    seen = np.zeros(len(points), bool)
-    seen[seen_pixels(camera, points)[0]] = True
-    return seen
+    return np.isin(np.arange(len(points)), seen_pixels(camera, points)[0])
 
 
 def seen_pixels(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

@@ -490,6 +490,9 @@ def join(device: str) -> Ranks:
     return _joined
 
 
+join_ranks = join
+
+
 def _store(address: str, port: int, count: int, home: str | None, *, hosts: bool) -> dist.Store:
     """Connect to the store of all ranks; this process holds it if ``hosts``. ``home`` is the result of `_stay_home`."""
     import torch.distributed as dist

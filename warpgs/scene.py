@@ -36,28 +36,33 @@ def base_coefficients(colors: np.ndarray | torch.Tensor) -> np.ndarray | torch.T
     return (colors - 0.5) / C0
 
 
-def _with_shapes(self: Any) -> str:
-    """Return the text of a record: shapes of arrays, numbers of entries, and no field that has its default."""
-    shown = []
-    for entry in fields(self):
-        value = getattr(self, entry.name)
-        if not entry.repr or value is None or value is entry.default:
-            continue
-        shape = getattr(value, "shape", None)
-        text = f"[{len(value)}]" if isinstance(value, (tuple, list)) else repr(value)[:80]
-        shown.append(f"{entry.name}={text if shape is None else list(shape)}")
-    return f"{type(self).__name__}({', '.join(shown)})"
-
-
 # Data types of the whole package: scenes, models and renders.
 #
 # Conventions (docs/conventions.md): camera_from_world poses, OpenCV axes (+x right, +y down, +z forward), pixel centres
 # at +0.5, quaternions wxyz, log scales, logit opacities, colours in [0, 1]. Lengths are in scene units [u].
 
 
+class _Record:
+    """A dataclass with short text."""
+
+    __dataclass_fields__: ClassVar[dict[str, Any]]
+
+    def __repr__(self) -> str:
+        """Return the shapes of arrays, the numbers of entries, and no field that has its default."""
+        shown = []
+        for entry in fields(self):
+            value = getattr(self, entry.name)
+            if not entry.repr or value is None or value is entry.default:
+                continue
+            shape = getattr(value, "shape", None)
+            text = f"[{len(value)}]" if isinstance(value, (tuple, list)) else repr(value)[:80]
+            shown.append(f"{entry.name}={text if shape is None else list(shape)}")
+        return f"{type(self).__name__}({', '.join(shown)})"
+
+
 @document_fields
-@dataclass(frozen=True)
-class Camera:
+@dataclass(frozen=True, repr=False)
+class Camera(_Record):
     """One camera, or a batch of C cameras that share an image size and a camera model.
 
     Readers return cameras with numpy float64 arrays. The rasterizer also accepts torch tensors and computes their gradients.
@@ -76,8 +81,6 @@ class Camera:
     distortion: Array | None = None
     """Coefficients, shape [P] (shared by all cameras) or [C, P]; None for models without coefficients. opencv has k1 k2 p1 p2
     k3 k4 k5 k6, fisheye k1 to k4; zeros mean an ideal lens. A tensor that requires gradients is an error."""
-
-    __repr__ = _with_shapes
 
     @property
     def center(self) -> np.ndarray:
@@ -103,8 +106,8 @@ class GivenDepth:
 
 
 @document_fields
-@dataclass(frozen=True)
-class View:
+@dataclass(frozen=True, repr=False)
+class View(_Record):
     """An image with its camera."""
 
     name: str
@@ -127,11 +130,10 @@ class View:
     normals: np.ndarray | None = None
     """Given normals: unit vectors towards the camera, in camera axes (+x right, +y down, +z forward), float32, shape [H, W, 3];
     0 for missing values. None without normals."""
-    __repr__ = _with_shapes
 
 
-@dataclass(frozen=True)
-class PointCloud:
+@dataclass(frozen=True, repr=False)
+class PointCloud(_Record):
     """Coloured 3D points."""
 
     points: np.ndarray
@@ -140,8 +142,6 @@ class PointCloud:
     """Colours in [0, 1], float32, shape [N, 3]."""
     tracks: tuple[frozenset[str], ...] | None = None
     """Names of the views that saw each point, length N; None if the format does not store them."""
-
-    __repr__ = _with_shapes
 
     def __len__(self) -> int:
         """Return the number of points."""
@@ -152,8 +152,7 @@ class PointCloud:
         if self.tracks is None:
             return self
         keep = np.array([len(names & t) >= least for t in self.tracks], dtype=bool)
-        tracks = tuple(t for t, k in zip(self.tracks, keep) if k)
-        return PointCloud(self.points[keep], self.colors[keep], tracks)
+        return PointCloud(self.points[keep], self.colors[keep], tuple(t for t, k in zip(self.tracks, keep) if k))
 
 
 ORIGIN = "warpgs_origin"
@@ -216,8 +215,8 @@ def checked_origin(values: object, where: str) -> np.ndarray:
 
 
 @document_fields
-@dataclass(frozen=True)
-class Scene:
+@dataclass(frozen=True, repr=False)
+class Scene(_Record):
     """A scene: views, points and notes, in the conventions of docs/conventions.md."""
 
     path: str
@@ -239,8 +238,6 @@ class Scene:
     pixels: str = field(default="", repr=False)
     """Source of the pixels: the image folder, and whether they are as stored or area-resampled. Scores against `images_8` and
     against `images` resampled by 8 cannot be compared."""
-
-    __repr__ = _with_shapes
 
     @property
     def transparent(self) -> bool:
@@ -323,12 +320,11 @@ class ViewDepth:
         return float(self.valid.mean())
 
 
-class _GaussianSet:
+class _GaussianSet(_Record):
     """What sets of Gaussians have in common, whatever their parameters."""
 
     means: torch.Tensor
     sh: torch.Tensor | None
-    __dataclass_fields__: ClassVar[dict[str, Any]]
 
     def __len__(self) -> int:
         """Return the number of Gaussians."""
@@ -346,7 +342,7 @@ class _GaussianSet:
 
 
 @document_fields
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Gaussians(_GaussianSet):
     """A set of N Gaussians with the parameters that a fit optimises; the kernels apply exp, sigmoid and normalisation."""
 
@@ -361,15 +357,13 @@ class Gaussians(_GaussianSet):
     sh: torch.Tensor
     """Spherical-harmonics coefficients, shape [N, K, 3] with K = (degree + 1)^2, K in {1, 4, 9, 16, 25}."""
 
-    __repr__ = _with_shapes
-
     def to(self, device: str | torch.device) -> Gaussians:
         """Return the same N Gaussians on a device. Differentiable, as `torch.Tensor.to` is."""
         return Gaussians(**{name: t.to(device) for name, t in self.tensors().items()})
 
 
 @document_fields
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class ActivatedGaussians(_GaussianSet):
     """A set of N Gaussians given by scales and opacities, for `rasterize`; fits and files use `Gaussians`.
 
@@ -388,8 +382,6 @@ class ActivatedGaussians(_GaussianSet):
     sh: torch.Tensor | None = None
     """Spherical-harmonics coefficients, shape [N, K, 3] as in `Gaussians`; None with ``RasterizeOptions.colors``."""
 
-    __repr__ = _with_shapes
-
     def stored(self) -> Gaussians:
         """Return the same N Gaussians by log scales and logits: scale 0 becomes -inf, opacity 1 inf, which no file stores."""
         means, quats, scales, opacities, sh = self.tensors().values()
@@ -397,7 +389,7 @@ class ActivatedGaussians(_GaussianSet):
 
 
 @document_fields
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class CovarianceGaussians(_GaussianSet):
     """A set of N Gaussians given by covariances and opacities, for `rasterize`; fits and files use `Gaussians`."""
 
@@ -411,7 +403,6 @@ class CovarianceGaussians(_GaussianSet):
     """Opacities in [0, 1], shape [N]."""
     sh: torch.Tensor | None = None
     """Spherical-harmonics coefficients, shape [N, K, 3] as in `Gaussians`; None with ``RasterizeOptions.colors``."""
-    __repr__ = _with_shapes
 
 
 RasterizedGaussians = Gaussians | ActivatedGaussians | CovarianceGaussians

@@ -188,6 +188,9 @@ def fields(needed: Mapping[str, Schema], more: Mapping[str, Schema] | None = Non
     return check
 
 
+state_schema = fields
+
+
 def of_type(hint: Any) -> Schema:
     """Return the schema of a field's values by its type hint: bool, int, float, str or a tuple, each also as ``... | None``.
 

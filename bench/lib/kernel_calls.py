@@ -28,8 +28,8 @@ def blend(projected, made, backgrounds, **window):
 
 
 def blend_channels(projected, made, colors, backgrounds, **window):
-    """Return the result of `blend.blend_channels` for a window."""
-    return blending.blend_channels(projected, made, colors, backgrounds, _pass(**window))
+    """Return the result of `blend.blend` with other colours for a window."""
+    return blending.blend(projected, made, backgrounds, _pass(**window), colors)
 
 
 def median_depth(projected, made, **window):

@@ -597,7 +597,7 @@ def test_a_long_wait_for_modules_is_announced_once(cache, monkeypatch):
     """Where no listener tells of it, as in `rasterize` from Python: also not of the modules of a later backward pass."""
     said, came = [], threading.Event()
     monkeypatch.setattr(native, "say", lambda line, error: (said.append((line, error)), came.set()))
-    monkeypatch.setattr(native, "_said", False)
+    native._say_compiling.cache_clear()
 
     class Slow:
         name = "slow"
@@ -619,7 +619,7 @@ def test_a_long_wait_for_modules_is_announced_once(cache, monkeypatch):
     assert [error for _, error in said] == [True] and "compiling kernels" in said[0][0]
     load(2e9)
     assert len(said) == 1
-    monkeypatch.setattr(native, "_said", False)
+    native._say_compiling.cache_clear()
     with native.told_of_compiling(lambda name: None):
         load(3e9)
     assert len(said) == 1

@@ -128,8 +128,8 @@ def test_budget_is_met_to_the_byte(monkeypatch):
     # from a twentieth of the machine on four fifths of what is free is the limit
     cpu = torch.device("cpu")
     asked = []
-    monkeypatch.setattr(tiles, "installed_bytes", lambda _: 20 * 148_000)
-    monkeypatch.setattr(tiles, "available_bytes", lambda _: asked.append(1) or 5 * 37_000)
+    monkeypatch.setattr("warpgs.device.installed_bytes", lambda _: 20 * 148_000)
+    monkeypatch.setattr("warpgs.device.available_bytes", lambda _: asked.append(1) or 5 * 37_000)
     tiles._check_total(999, 1, cpu, 1, None)
     assert not asked
     tiles._check_total(1000, 1, cpu, 1, None)
@@ -137,7 +137,7 @@ def test_budget_is_met_to_the_byte(monkeypatch):
     with pytest.raises(ResourceError):
         tiles._check_total(1001, 1, cpu, 1, None)
     asked.clear()
-    monkeypatch.setattr(tiles, "installed_bytes", lambda _: 2**60)
+    monkeypatch.setattr("warpgs.device.installed_bytes", lambda _: 2**60)
     tiles._check_total(2**30 - 1, 1, cpu, 1, None)
     assert not asked
 

@@ -244,12 +244,12 @@ def test_sensitivities_are_squared_changes_of_images():
             hidden = RasterizeOptions(opacity_factors=(torch.arange(3) != i).float())
             exact[1, i] += (rasterize(g, c, hidden).rgb - image).square().sum().item()
             exact[2, i] += (rasterize(dataclasses.replace(g, sh=flat), c).rgb - image).square().sum().item()
-    estimates = torch.stack([torch.stack(sensitivities(g, small, RasterizeOptions(), seed)) for seed in range(49)])
+    estimates = torch.stack([sensitivities(g, small, RasterizeOptions(), seed) for seed in range(49)])
     error = estimates.std(0) / 7
     assert bool((exact > 1e-3).all()) and bool(((estimates.mean(0) - exact).abs() < 4 * error + 1e-3 * exact).all())
     assert bool((error < 0.25 * exact).all())
     with torch.no_grad():
-        assert torch.equal(torch.stack(sensitivities(g, small, RasterizeOptions(), 0)), estimates[0])
+        assert torch.equal(sensitivities(g, small, RasterizeOptions(), 0), estimates[0])
 
 
 def ray_depth(camera: Camera) -> torch.Tensor:

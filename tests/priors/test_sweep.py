@@ -149,7 +149,9 @@ def device(request):
 
 def computed(view: View, others: list[View], inverses: np.ndarray, device: torch.device, window: int = 7) -> np.ndarray:
     """Return costs in the layout of the reference, [D, H, W]."""
-    found = sweep.matching_costs_cuda(view, others, inverses, device, window)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sweep, "WINDOW", window)
+        found = sweep.matching_costs_cuda(view, others, inverses, device)
     return found.cpu().numpy().transpose(2, 0, 1) / UNIT
 
 

@@ -23,17 +23,6 @@ from warpgs.render.options import RasterizeOptions, image_settings
 from warpgs.render.rasterize import rasterize
 from warpgs.scene import ActivatedGaussians, Camera, CovarianceGaussians, RasterizedGaussians, Render
 
-__all__ = [
-    "RendererConfig",
-    "RendererConfig_MixedBatch",
-    "RendererConfig_ParallelBatch",
-    "RollingShutterType",
-    "UnsupportedError",
-    "quat_to_rotmat",
-    "rasterization",
-    "spherical_harmonics",
-]
-
 
 def __dir__() -> list[str]:
     """Return the public names."""
@@ -56,11 +45,6 @@ class RollingShutterType(enum.IntEnum):
 
 class RendererConfig:
     """Base class of gsplat's choices of kernels."""
-
-    def __init__(self) -> None:
-        """Raise TypeError for the base class itself."""
-        if type(self) is RendererConfig:
-            raise TypeError("RendererConfig is a base class: use RendererConfig_MixedBatch()")
 
 
 class RendererConfig_MixedBatch(RendererConfig):
@@ -260,9 +244,8 @@ def rasterization(
     # an opacity factor holds for all cameras of a call, so a clip needs a call for each camera
     views = [slice(c, c + 1) for c in range(cameras)] if radius_clip > 0 else [slice(None)]
     kind: Any = ActivatedGaussians if covars is None else CovarianceGaussians
-    form = {"quats": quats, "scales": scales}
-    if covars is not None:
-        form = {"covars": covars.triu() + covars.triu(1).mT}  # the upper triangle alone is read, and has the whole gradient
+    # the upper triangle of covariances alone is read, and has the whole gradient
+    form = {"quats": quats, "scales": scales} if covars is None else {"covars": covars.triu() + covars.triu(1).mT}
     renders = []
     for scene, view in [(scene, view) for scene in range(batch.numel()) for view in views]:
         of = functools.partial(_part, batch, scene, view)
@@ -401,3 +384,6 @@ def quat_to_rotmat(quats: Tensor) -> Tensor:
         Rotation matrices, shape [..., 3, 3].
     """
     return torch.as_tensor(rotation_matrices(torch.nn.functional.normalize(quats, dim=-1)))
+
+
+__all__ = [name for name in sorted(globals()) if name[0] != "_" and getattr(globals()[name], "__module__", "") == __name__]

@@ -181,12 +181,10 @@ class GaussianRasterizer(nn.Module):
         if means2D.shape != means3D.shape:
             raise ValueError(f"means2D must have the shape of means3D, {list(means3D.shape)}, not {list(means2D.shape)}")
         if means2D.requires_grad:
-            half = camera.width / 2, camera.height / 2
-            means = _Screen.apply(means3D, means2D, kept, half)  # type: ignore[no-untyped-call]
+            means = _Screen.apply(means3D, means2D, kept, (camera.width / 2, camera.height / 2))  # type: ignore[no-untyped-call]
         gaussians: RasterizedGaussians
         if cov3D_precomp is not None:
-            covars = cov3D_precomp[:, PACKED].reshape(-1, 3, 3)
-            gaussians = CovarianceGaussians(means, covars, opacities.reshape(-1), shs)
+            gaussians = CovarianceGaussians(means, cov3D_precomp[:, PACKED].reshape(-1, 3, 3), opacities.reshape(-1), shs)
         else:
             assert scales is not None and rotations is not None  # checked above
             scales = scales if settings.scale_modifier == 1 else scales * settings.scale_modifier
@@ -200,8 +198,7 @@ class GaussianRasterizer(nn.Module):
         render = rasterize(gaussians, camera, options)
         if render.projected.requires_grad:
             render.projected.register_hook(lambda gradient: kept.append(gradient[0, :, :2]))
-        radii = render.projected.detach()[0, :, 10].clamp_max(2**30).int()
-        results = _planes(render.rgb), radii
+        results = _planes(render.rgb), render.projected.detach()[0, :, 10].clamp_max(2**30).int()
         if render.features is not None:
             return *results, _planes(render.features)
         if render.median_depth is not None:

@@ -4,15 +4,13 @@ from typing import TYPE_CHECKING
 
 from warpgs.faces import lazy
 
-__all__ = [
-    "Arrays",
-    "Format",
-    "read_gaussians",
-    "register_format",
-    "write_gaussians",
-]
-
 if TYPE_CHECKING:
-    from warpgs.export.base import Arrays, Format, read_gaussians, register as register_format, write_gaussians
+    from warpgs.export.base import (
+        Arrays as Arrays,
+        Format as Format,
+        read_gaussians as read_gaussians,
+        register_format as register_format,
+        write_gaussians as write_gaussians,
+    )
 else:
     __getattr__, __dir__ = lazy(__name__)

@@ -430,7 +430,7 @@ def warn_of_antialiasing(path: Path) -> None:
 
 FORMATS: Registry[Format] = Registry("format", Format, __package__)
 """File formats of Gaussians by name; those in the modules of `warpgs.export` are built in."""
-register = FORMATS.register
+register = register_format = FORMATS.register
 
 
 # The .splat format of antimatter15's viewer: 32 bytes a Gaussian, without spherical harmonics above degree 0.

@@ -4,22 +4,16 @@ from typing import TYPE_CHECKING
 
 from warpgs.faces import lazy
 
-__all__ = [
-    "Lens",
-    "LoadedImage",
-    "NamedMaps",
-    "Probe",
-    "ReadOptions",
-    "Reader",
-    "SceneFolder",
-    "ViewList",
-    "register_reader",
-    "view_name",
-]
-
 if TYPE_CHECKING:
-    from warpgs.io.folder import Probe, Reader, SceneFolder, ViewList, register as register_reader, view_name
-    from warpgs.io.images import Lens, LoadedImage, ReadOptions
-    from warpgs.io.maps import NamedMaps
+    from warpgs.io.folder import (
+        Probe as Probe,
+        Reader as Reader,
+        SceneFolder as SceneFolder,
+        ViewList as ViewList,
+        register_reader as register_reader,
+        view_name as view_name,
+    )
+    from warpgs.io.images import Lens as Lens, LoadedImage as LoadedImage, ReadOptions as ReadOptions
+    from warpgs.io.maps import NamedMaps as NamedMaps
 else:
     __getattr__, __dir__ = lazy(__name__)

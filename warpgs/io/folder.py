@@ -91,7 +91,7 @@ class Reader(abc.ABC):
 
 READERS: Registry[Reader] = Registry("reader", Reader, __package__)  # type: ignore[type-abstract]
 
-register = READERS.register
+register = register_reader = READERS.register
 """Class decorator ``@register("name")`` that adds a reader to the built-in ones."""
 
 

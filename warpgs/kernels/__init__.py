@@ -6,9 +6,7 @@ from typing import TYPE_CHECKING
 
 from warpgs.faces import lazy
 
-__all__ = ["CameraModel", "register_camera_model"]
-
 if TYPE_CHECKING:
-    from warpgs.kernels.cameras import CameraModel, register as register_camera_model
+    from warpgs.kernels.cameras import CameraModel as CameraModel, register_camera_model as register_camera_model
 else:
     __getattr__, __dir__ = lazy(__name__)

@@ -13,19 +13,18 @@ from warpgs.device import BINNING, BLENDING, FLOAT, LOSS, PROJECTION, SAMPLING, 
 from warpgs.kernels import blend_cpu, blend_cuda, launch
 from warpgs.kernels.falloff import COLORS, LARGEST_STOP, VALUES, WIDTHS, Pass
 from warpgs.kernels.graphs import TORCH, Allocator
-from warpgs.kernels.launch import first_order, keep, kept
 from warpgs.kernels.native import ROLLED, Ints, make_prefetch
 from warpgs.kernels.tiles import Tiles
 
 
 def step_bytes(sizes: StepSizes) -> Needs:
     """Return the bytes of images, of data for the backward pass, and of gradient slots at each moment of a step."""
-    slots, states = blend_cuda.instance_bytes(sizes) if sizes.cuda else (FLOAT * VALUES * sizes.instances, 0)
+    # the tile order is gone before the loss, which takes more
+    slots, states, order = blend_cuda.step_bytes(sizes) if sizes.cuda else (FLOAT * VALUES * sizes.instances, 0, 0)
     images = (COLORS + 2) * FLOAT * sizes.pixels  # colour, alpha, depth
     kept = 3 * FLOAT * sizes.pixels + states  # transmittance, weight, end
     lean = not (sizes.depth or sizes.cutout)  # only colour has a gradient
     upstream = (COLORS if lean else COLORS + 2) * FLOAT * sizes.pixels
-    order = blend_cuda.order_bytes(sizes) if sizes.cuda else 0  # gone before the loss, which takes more
     whole = images + upstream if sizes.chunked else 0  # images of the frame exist beside those of a chunk
     return {
         BINNING: whole, LOSS: images + (0 if sizes.chunked else kept), BLENDING: kept + slots + images + (whole or upstream),
@@ -40,8 +39,7 @@ SUMMED = 16
 @functools.cache
 def make_segments(real, values: int = VALUES, width: int = 9 + COLORS):
     """Make the kernels that sum gradient slots of ``values`` numbers, always in slot order, into rows of ``width`` numbers."""
-    reals = wp.types.vector(values, real)
-    record = wp.types.vector(width, real)
+    reals, record = (wp.types.vector(size, real) for size in (values, width))
     Reals, Rows = wp.array(dtype=real), wp.array2d(dtype=real)
     prefetch = make_prefetch(reals)
     lanes = SUMMED
@@ -91,15 +89,9 @@ def is_native(projected: torch.Tensor) -> bool:
 
 
 def composite(
-    projected: torch.Tensor,
-    tiles: Tiles,
-    backgrounds: torch.Tensor,
-    settings: Pass,
-    *,
-    save: bool,
-    allocator: Allocator = TORCH,
-    image: torch.Tensor | None = None,
-) -> tuple[torch.Tensor, ...]:
+    projected: torch.Tensor, tiles: Tiles, backgrounds: torch.Tensor, settings: Pass, *, save: bool,
+    allocator: Allocator = TORCH, image: torch.Tensor | None = None,
+) -> tuple[torch.Tensor, ...]:  # fmt: skip
     """Return rgb [C, H, W, D]; alpha, depth, transmittances, weights and ends [C, H, W]; and states. Nothing is checked."""
     # ``image`` may be a slice of the channels of an image; on CUDA in float32 it may have fewer than D channels: then only the
     # first ones are written. Without ``save``, transmittances and weights may be empty. With `Pass.max_error`: rgb, alpha,
@@ -143,14 +135,9 @@ def _rounded(projected: torch.Tensor, tiles: Tiles, backgrounds: torch.Tensor, s
 
 
 def composite_gradients(
-    projected: torch.Tensor,
-    tiles: Tiles,
-    backgrounds: torch.Tensor,
-    settings: Pass,
-    saved: Sequence[torch.Tensor],
-    v_images: Sequence[torch.Tensor | None],
-    allocator: Allocator = TORCH,
-) -> torch.Tensor:
+    projected: torch.Tensor, tiles: Tiles, backgrounds: torch.Tensor, settings: Pass, saved: Sequence[torch.Tensor],
+    v_images: Sequence[torch.Tensor | None], allocator: Allocator = TORCH,
+) -> torch.Tensor:  # fmt: skip
     """Return the gradient of ``projected`` [C, N, 9 + D], from `composite`'s results except alpha. Nothing is checked."""
     # Only those channels of ``rgb`` are read that have a gradient. On CUDA in float32 the gradient of ``rgb`` may have fewer
     # than D channels; the others have gradient 0.
@@ -186,54 +173,10 @@ def background_gradient(transmittances: torch.Tensor, v_rgb: torch.Tensor | None
     return torch.stack([(transmittances * v_rgb[..., k]).sum((1, 2)) for k in range(channels)], 1)
 
 
-class _Blend(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, projected, backgrounds, tiles, settings):
-        projected, backgrounds = projected.contiguous(), backgrounds.contiguous()
-        save = any(ctx.needs_input_grad)
-        if save:
-            check_slots(tiles)
-        rgb, alpha, depth, *rest = composite(projected, tiles, backgrounds, settings, save=save)
-        if settings.max_error:
-            return rgb, alpha, depth, *rest
-        if save:
-            # all as saved tensors, which are freed after the backward pass
-            keep(ctx, projected, backgrounds, rgb, depth, *rest, *tiles.tensors())
-            ctx.tile_size, ctx.settings = tiles.size, settings
-        ctx.set_materialize_grads(False)
-        return rgb, alpha, depth
-
-    @staticmethod
-    @first_order
-    def backward(ctx, *v_images):
-        projected, backgrounds, *tensors = kept(ctx)
-        saved, tiles = tensors[:6], Tiles(ctx.tile_size, *tensors[6:])
-        v_images = [None if v is None else v.contiguous() for v in v_images]
-        v_projected = composite_gradients(projected, tiles, backgrounds, ctx.settings, saved, v_images)
-        v_backgrounds = background_gradient(saved[2], v_images[0]) if ctx.needs_input_grad[1] else None
-        return v_projected, v_backgrounds, None, None
-
-
-def without_gradients(*tensors: torch.Tensor) -> tuple[torch.Tensor, ...]:
-    """Return tensors of any shape [...], detached if autograd is off: leaf tensors would otherwise still require gradients."""
-    return tensors if torch.is_grad_enabled() else tuple(t.detach() for t in tensors)
-
-
 def check_slots(tiles: Tiles) -> None:
     """Raise ValueError unless the tiles have slots, which gradients need."""
     if len(tiles.slots) != len(tiles.gaussian_ids):
         raise ValueError("gradients and contributions need tiles with slots: make the tiles with bin_tiles(slotted=True)")
-
-
-def blend(
-    projected: torch.Tensor, tiles: Tiles, backgrounds: torch.Tensor, settings: Pass
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Composite C images of H x W pixels (Kerbl et al. 2023, eq. 3): return rgb [C, H, W, 3], alpha and depth [C, H, W]."""
-    # Differentiable in the first ten values of ``projected`` [C, N, 12] and in ``backgrounds`` [C, 3]; a clamped alpha has
-    # gradient zero. Derivation: docs/blend.md. Depth is the mean [u] under the blending weights, 0 where they sum to less than
-    # SMALLEST_WEIGHT. ``deterministic=False`` adds gradients atomically on CUDA in float32. ``absgrad`` puts sums of magnitudes
-    # of the mean's gradient in the place of the gradient of the last two values of ``projected``.
-    return _Blend.apply(*without_gradients(projected, backgrounds), tiles, settings)
 
 
 # Compositing of any number of channels: each Gaussian has D values instead of a colour.
@@ -316,7 +259,7 @@ def _padded(values: torch.Tensor, width: int) -> torch.Tensor:
 
 def _groups(
     projected: torch.Tensor, tiles: Tiles, colors: torch.Tensor, backgrounds: torch.Tensor, width: int
-) -> Iterator[tuple[slice, torch.Tensor, torch.Tensor]]:  # fmt: skip
+) -> Iterator[tuple[slice, torch.Tensor, torch.Tensor]]:
     """Yield for each pass a slice of the D channels, Gaussians [C, N, 9 + G] with these channels, and backgrounds [C, G]."""
     # The Gaussians share their memory: use them before you request the next. Zeros fill up the last group.
     count, real = colors.shape[-1], launch.real_of(colors)
@@ -328,41 +271,51 @@ def _groups(
         yield channels, colored, _padded(backgrounds[:, channels], width).contiguous()
 
 
-class _BlendChannels(torch.autograd.Function):
+class _Blend(torch.autograd.Function):
     @staticmethod
     def forward(ctx, projected, colors, backgrounds, tiles, settings):
         save = any(ctx.needs_input_grad)
         if save:
             check_slots(tiles)
-        projected, colors = projected.contiguous(), colors.contiguous()
-        image = projected.new_empty(len(projected), *settings.window[:1:-1], colors.shape[-1])
-        found = None
-        width = _width(projected, colors.shape[-1], settings.absgrad)
-        for channels, colored, behind in _groups(projected, tiles, colors, backgrounds, width):
-            # the first pass computes everything that does not depend on the channels
-            part = image[..., channels]
-            whole = part.shape[-1] == behind.shape[-1]
-            rgb, *rest = composite(
-                colored, tiles, behind, settings, save=save and found is None,
-                image=part if whole or is_native(projected) else None,
-            )  # fmt: skip
-            if rgb is not part:
-                part.copy_(rgb[..., : part.shape[-1]])
-            found = found or rest
+        projected, found = projected.contiguous(), None
+        if colors is None:
+            backgrounds = backgrounds.contiguous()
+            image, *found = composite(projected, tiles, backgrounds, settings, save=save)
+            if settings.max_error:
+                return image, *found
+        else:
+            colors, width = colors.contiguous(), _width(projected, colors.shape[-1], settings.absgrad)
+            image = projected.new_empty(len(projected), *settings.window[:1:-1], colors.shape[-1])
+            for channels, colored, behind in _groups(projected, tiles, colors, backgrounds, width):
+                # the first pass computes everything that does not depend on the channels
+                part = image[..., channels]
+                whole = part.shape[-1] == behind.shape[-1]
+                rgb, *rest = composite(
+                    colored, tiles, behind, settings, save=save and found is None,
+                    image=part if whole or is_native(projected) else None,
+                )  # fmt: skip
+                if rgb is not part:
+                    part.copy_(rgb[..., : part.shape[-1]])
+                found = found or rest
         alpha, depth, *saved = found
         if save:
-            keep(ctx, projected, colors, backgrounds, image, depth, *saved, *tiles.tensors())
+            # all as saved tensors, which are freed after the backward pass
+            launch.keep(ctx, projected, colors, backgrounds, image, depth, *saved, *tiles.tensors())
             ctx.tile_size, ctx.visible, ctx.settings = tiles.size, tiles.visible, settings
         ctx.set_materialize_grads(False)
         return image, alpha, depth
 
     @staticmethod
-    @first_order
-    def backward(ctx, v_image, v_alpha, v_depth):
-        projected, colors, backgrounds, image, *tensors = kept(ctx)
+    @launch.first_order
+    def backward(ctx, *v_images):
+        projected, colors, backgrounds, image, *tensors = launch.kept(ctx)
         shared, tiles = tensors[:5], Tiles(ctx.tile_size, *tensors[5:], ctx.visible)
+        v_image, v_alpha, v_depth = v_images = [None if v is None else v.contiguous() for v in v_images]
+        v_backgrounds = background_gradient(shared[1], v_image, image.shape[-1]) if ctx.needs_input_grad[2] else None
+        if colors is None:
+            v_projected = composite_gradients(projected, tiles, backgrounds, ctx.settings, [image, *shared], v_images)
+            return v_projected, None, v_backgrounds, None, None
         v_projected, v_colors = torch.zeros_like(projected), torch.zeros_like(colors)
-        v_image, v_alpha, v_depth = (None if v is None else v.contiguous() for v in (v_image, v_alpha, v_depth))
         real, width = launch.real_of(projected), _width(projected, colors.shape[-1], ctx.settings.absgrad)
         for channels, colored, behind in _groups(projected, tiles, colors, backgrounds, width):
             first = channels.start
@@ -379,14 +332,22 @@ class _BlendChannels(torch.autograd.Function):
             v = composite_gradients(colored, tiles, behind, ctx.settings, saved, v_images)
             inputs, count = [v, tiles.counts, first, v_projected, v_colors], v_colors.shape[0] * v_colors.shape[1]
             launch.launch(make_kernels(real, width).add, count, inputs, v.device, cost=5)
-        v_backgrounds = background_gradient(shared[1], v_image, colors.shape[-1]) if ctx.needs_input_grad[2] else None
         return v_projected, v_colors, v_backgrounds, None, None
 
 
-def blend_channels(
-    projected: torch.Tensor, tiles: Tiles, colors: torch.Tensor, backgrounds: torch.Tensor, settings: Pass
+def blend(
+    projected: torch.Tensor, tiles: Tiles, backgrounds: torch.Tensor, settings: Pass, colors: torch.Tensor | None = None
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Composite images [C, H, W, D] of any number of channels; colors [C or 1, N, D], backgrounds [C, D]; else as `blend`."""
-    # Differentiable in ``colors``, ``backgrounds`` and the projected Gaussians, except their colours and boxes. Gradients are
-    # summed over the passes in a fixed order; with ``absgrad``, so are magnitudes.
-    return _BlendChannels.apply(*without_gradients(projected, colors, backgrounds), tiles, settings)
+    """Composite C images of H x W pixels (Kerbl et al. 2023, eq. 3): return rgb [C, H, W, 3], alpha and depth [C, H, W].
+
+    With ``colors`` [C or 1, N, D], any number of channels, the Gaussians have these instead: images and backgrounds have D.
+    """
+    # Differentiable in the first ten values of ``projected`` [C, N, 12], in ``backgrounds`` [C, 3] and in ``colors``; a clamped
+    # alpha has gradient zero. Derivation: docs/blend.md. Depth is the mean [u] under the blending weights, 0 where they sum to
+    # less than SMALLEST_WEIGHT. ``deterministic=False`` adds gradients atomically on CUDA in float32. ``absgrad`` puts sums of
+    # magnitudes of the mean's gradient in the place of the gradient of the last two values of ``projected``. Gradients of
+    # ``colors`` are summed over the passes in a fixed order.
+    tensors = projected, colors, backgrounds
+    if not torch.is_grad_enabled():  # leaf tensors would still require gradients
+        tensors = (None if t is None else t.detach() for t in tensors)
+    return _Blend.apply(*tensors, tiles, settings)

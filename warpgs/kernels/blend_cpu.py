@@ -374,19 +374,14 @@ def make_forward(real, tile_size: int, channels: int):
     f, b = make_functions(real), make_batches(real, tile_size, channels)
     # Vectors rather than local arrays: the compiler must see that they do not overlap. They are one row longer than
     # the tile, so that they are not 4096 bytes apart: there a load of one would wait for a store to the other (4K aliasing).
-    tile_reals = wp.types.vector(tile_size * (tile_size + 1), real)
-    tile_ints = wp.types.vector(tile_size * (tile_size + 1), wp.int32)
-    strip_reals = wp.types.vector(STRIP, real)
-    strip_ints = wp.types.vector(STRIP, wp.int32)
-    batch_reals = wp.types.vector(BATCH, real)
-    batch_ints = wp.types.vector(BATCH, wp.int32)
-    batch_strips = wp.types.vector(BATCH * STRIP, real)
+    tile_stride, side, pixels = tile_size * (tile_size + 1), tile_size, tile_size * tile_size
+    sizes = tile_stride, STRIP, BATCH
+    tile_reals, strip_reals, batch_reals, batch_strips = (wp.types.vector(n, real) for n in (*sizes, BATCH * STRIP))
+    tile_ints, strip_ints, batch_ints = (wp.types.vector(n, wp.int32) for n in sizes)
     at, prefetch = b.at, make_prefetch(b.record)
     # of several channels, one after the other
-    tile_channels = wp.types.vector(channels * tile_size * (tile_size + 1), real)
-    strip_channels = wp.types.vector(2 * channels * STRIP, real)
+    tile_channels, strip_channels = (wp.types.vector(channels * n, real) for n in (tile_stride, 2 * STRIP))
     per_pixel, per_row = channels, channels * tile_size
-    tile_stride, side, pixels = tile_size * (tile_size + 1), tile_size, tile_size * tile_size
     strip, parts, abreast = STRIP, tile_size // STRIP, ABREAST
     batch, bits, together = BATCH, BATCH - 1, TOGETHER
     outside, smallest = real(-1.0), real(SMALLEST_WEIGHT)

@@ -154,17 +154,11 @@ def chunk_of(tiles: int, deterministic: bool) -> int:
     return CHUNKS[larger if deterministic else max(larger, 1)]
 
 
-def instance_bytes(sizes: StepSizes) -> tuple[int, int]:
-    """Return the bytes of a step's gradient slots, and of the states that blending leaves for its backward pass."""
-    columns, rows = (0, 0) if sizes.chunked else grid(sizes.width, sizes.height, TILE_SIZE)
-    state = FLOAT * STATE * TILE_SIZE * TILE_SIZE // chunk_of(columns * rows, True)
-    return FLOAT * STRIDE * sizes.instances, state * sizes.instances
-
-
-def order_bytes(sizes: StepSizes) -> int:
-    """Return the bytes of the tile order, which the forward pass frees at its end."""
+def step_bytes(sizes: StepSizes) -> tuple[int, int, int]:
+    """Return the bytes of a step's gradient slots, of the states for the backward pass, and of the tile order."""
     columns, rows = grid(sizes.width, sizes.height, TILE_SIZE)
-    return FLOAT * RANKS * columns * rows
+    state = FLOAT * STATE * TILE_SIZE * TILE_SIZE // chunk_of(0 if sizes.chunked else columns * rows, True)
+    return FLOAT * STRIDE * sizes.instances, state * sizes.instances, FLOAT * RANKS * columns * rows
 
 
 def image_tile(settings: Pass) -> int:
@@ -175,15 +169,9 @@ def image_tile(settings: Pass) -> int:
 
 
 def forward(
-    projected: torch.Tensor,
-    tiles: Tiles,
-    backgrounds: torch.Tensor,
-    settings: Pass,
-    *,
-    save: bool,
-    allocator: Allocator = TORCH,
-    image: torch.Tensor | None = None,
-) -> tuple[torch.Tensor, ...]:
+    projected: torch.Tensor, tiles: Tiles, backgrounds: torch.Tensor, settings: Pass, *, save: bool,
+    allocator: Allocator = TORCH, image: torch.Tensor | None = None,
+) -> tuple[torch.Tensor, ...]:  # fmt: skip
     """Return what `blend.composite` returns; states [S, P] have a row for each chunk of instances."""
     device, channels, packed = projected.device, backgrounds.shape[1], tiles.packed is not None
     shape = (backgrounds.shape[0], *settings.window[:1:-1])
@@ -213,14 +201,9 @@ def forward(
 
 
 def backward(
-    projected: torch.Tensor,
-    tiles: Tiles,
-    backgrounds: torch.Tensor,
-    settings: Pass,
-    saved: Sequence[torch.Tensor],
-    v_images: Sequence[torch.Tensor | None],
-    allocator: Allocator = TORCH,
-) -> torch.Tensor:
+    projected: torch.Tensor, tiles: Tiles, backgrounds: torch.Tensor, settings: Pass, saved: Sequence[torch.Tensor],
+    v_images: Sequence[torch.Tensor | None], allocator: Allocator = TORCH,
+) -> torch.Tensor:  # fmt: skip
     """Return the gradient of ``projected`` [C, N, 9 + D], from `forward`'s results except alpha; None is a zero gradient."""
     rgb, depth, transmittances, weights, ends, states = saved
     v_rgb, v_alpha, v_depth = v_images

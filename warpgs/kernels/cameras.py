@@ -58,7 +58,7 @@ class CameraModel:
 
 CAMERA_MODELS = Registry("camera model", CameraModel, "warpgs.kernels.cameras")
 """Camera models by name."""
-register = CAMERA_MODELS.register
+register = register_camera_model = CAMERA_MODELS.register
 
 
 def check_camera(camera: Camera) -> type[CameraModel]:
@@ -83,6 +83,11 @@ def types_of(real: type) -> tuple[Any, ...]:
     """Return vectors of 2, 3 and 4, matrices of 3 x 3 and 4 x 4, and an array of a scalar type."""
     vectors = [wp.types.vector(size, real) for size in (2, 3, 4)]
     return *vectors, wp.types.matrix((3, 3), real), wp.types.matrix((4, 4), real), wp.array(dtype=real)
+
+
+def named(*functions: Any, **more: Any) -> SimpleNamespace:
+    """Return a namespace of Warp's functions, kernels and structs by their own names, and of ``more``."""
+    return SimpleNamespace(**{f.key.rpartition("__")[2]: f for f in functions}, **more)
 
 
 @functools.cache
@@ -134,8 +139,10 @@ def make_linear(real: type) -> SimpleNamespace:
             wp.clamp(pixel[1], -margin * height, height + margin * height),
         )
 
-    def products(jacobian: Callable[..., Any]) -> dict[str, object]:
-        """Return ``project_axes`` and ``axes_backward`` of a model by its ``jacobian(position, K, lens, point) -> Rows``."""
+    usual = {"in_range": in_front, "depth_of": z_of, "expansion_point": clamped}
+
+    def products(jacobian: Callable[..., Any], *functions: Any, **more: Any) -> SimpleNamespace:
+        """Return the functions of a model: the given ones, and those by its ``jacobian(position, K, lens, point) -> Rows``."""
 
         @wp.func
         def project_axes(position: vec3, K: mat33, lens: Reals, point: vec2, axes: mat33) -> Rows:
@@ -148,12 +155,9 @@ def make_linear(real: type) -> SimpleNamespace:
             j = jacobian(position, K, lens, point)
             return wp.outer(j.first, v_first) + wp.outer(j.second, v_second)
 
-        return {"project_axes": project_axes, "axes_backward": axes_backward}
+        return SimpleNamespace(**usual | vars(named(project_axes, axes_backward, *functions, **more)))
 
-    return SimpleNamespace(
-        Rows=Rows, Gradients=Gradients, intrinsics_of=intrinsics_of, in_front=in_front, z_of=z_of, unclamped=unclamped,
-        clamped=clamped, products=products,
-    )  # fmt: skip
+    return named(Rows, Gradients, intrinsics_of, unclamped, usual=usual, products=products)
 
 
 @register("pinhole")
@@ -237,10 +241,7 @@ class Pinhole(CameraModel):
                 v_K[1, 2] = v_K[1, 2] + v_jyz * inv_z
             return linear.Gradients(vec3(v_x, v_y, v_z), v_K)
 
-        return SimpleNamespace(
-            in_range=linear.in_front, depth_of=linear.z_of, pixel_of=pixel_of, expansion_point=linear.clamped,
-            position_backward=position_backward, project_axes=project_axes, axes_backward=axes_backward,
-        )  # fmt: skip
+        return named(pixel_of, project_axes, axes_backward, position_backward, **linear.usual)
 
 
 @register("orthographic")
@@ -273,10 +274,7 @@ class Orthographic(CameraModel):
             v_position = vec3(v_pixel[0] * K[0, 0], v_pixel[1] * K[1, 1], v_depth)
             return linear.Gradients(v_position, linear.intrinsics_of(fx, fy, v_pixel))
 
-        return SimpleNamespace(
-            in_range=linear.in_front, depth_of=linear.z_of, pixel_of=pixel_of, expansion_point=linear.unclamped,
-            position_backward=position_backward, **linear.products(jacobian),
-        )  # fmt: skip
+        return linear.products(jacobian, pixel_of, position_backward, expansion_point=linear.unclamped)
 
 
 @register("opencv")
@@ -383,17 +381,13 @@ class OpenCV(CameraModel):
             v_z = -(v_a * a0 + v_b * b0 + first * jx + second * jy) * inv_z + v_depth
             return linear.Gradients(vec3(v_a * inv_z, v_b * inv_z, v_z), v_K)
 
-        return SimpleNamespace(
-            in_range=in_range, depth_of=linear.z_of, pixel_of=pixel_of, expansion_point=linear.clamped,
-            position_backward=position_backward, **linear.products(jacobian),
-        )  # fmt: skip
+        return linear.products(jacobian, in_range, pixel_of, position_backward)
 
 
 @functools.cache
 def _make_distortion(real: type) -> SimpleNamespace:
     vec2, *_, Reals = types_of(real)
-    one = real(1.0)
-    two = real(2.0)
+    one, two = real(1.0), real(2.0)
 
     @wp.struct
     class Radial:
@@ -553,10 +547,8 @@ class Fisheye(CameraModel):
             v_position = vec3(v_x, v_y, v_z) / distance + v_depth * unit
             return linear.Gradients(v_position, linear.intrinsics_of(fx, fy, v_pixel))
 
-        return SimpleNamespace(
-            in_range=in_range, depth_of=radial.distance, pixel_of=pixel_of, expansion_point=linear.unclamped,
-            position_backward=position_backward, **linear.products(jacobian),
-        )  # fmt: skip
+        own = {"depth_of": radial.distance, "expansion_point": linear.unclamped}
+        return linear.products(jacobian, in_range, pixel_of, position_backward, **own)
 
 
 @functools.cache

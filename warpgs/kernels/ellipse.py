@@ -10,8 +10,7 @@ import warp as wp
 from warpgs.constants import COVARIANCE_TOLERANCE, FARTHEST_PIXEL, LARGEST_AXIS, SHORTEST_QUAT, SMALLEST_DETERMINANT
 from warpgs.errors import UsageError
 from warpgs.kernels import launch, sh
-from warpgs.kernels.cameras import CAMERA_MODELS, types_of
-from warpgs.kernels.launch import first_order
+from warpgs.kernels.cameras import CAMERA_MODELS, named, types_of
 
 
 @functools.cache
@@ -163,7 +162,7 @@ class _PackedCovariances(torch.autograd.Function):
         return off, covars.diagonal(dim1=1, dim2=2).contiguous()
 
     @staticmethod
-    @first_order
+    @launch.first_order
     def backward(ctx, v_off, v_diagonal):
         v_covars = torch.diag_embed(v_diagonal)
         for k, (i, j) in enumerate(OFF_DIAGONAL):
@@ -230,9 +229,7 @@ def make_rotations(real):
         """Return the rotation of a view matrix."""
         return mat33(view[0, 0], view[0, 1], view[0, 2], view[1, 0], view[1, 1], view[1, 2], view[2, 0], view[2, 1], view[2, 2])
 
-    return SimpleNamespace(
-        quat_length=quat_length, rotation=rotation, rotation_backward=rotation_backward, rotation_of=rotation_of
-    )
+    return named(quat_length, rotation, rotation_backward, rotation_of)
 
 
 SHRINKS = 6
@@ -418,13 +415,11 @@ def make_projection(real, camera_model: str, parameters: str = "stored", lanes: 
             )  # fmt: skip
         return vec4(d[0], d[1], d[2], length * largest)
 
-    return SimpleNamespace(
-        Ellipse=Ellipse, ellipse=ellipse, factor_of=factor_of, compensation=compensation,
-        sigmoid=sigmoid, opacity_of=opacity_of, scales_of=scales_of,
-        direction=direction, finite3=finite3, project_axes=camera.project_axes,
-        rotation=r.rotation, rotation_backward=r.rotation_backward, rotation_of=r.rotation_of,
-        depth_of=camera.depth_of, axes_backward=camera.axes_backward, position_backward=camera.position_backward,
-    )  # fmt: skip
+    own = {
+        "Ellipse": Ellipse, "ellipse": ellipse, "factor_of": factor_of, "compensation": compensation, "sigmoid": sigmoid,
+        "opacity_of": opacity_of, "scales_of": scales_of, "direction": direction, "finite3": finite3,
+    }  # fmt: skip
+    return SimpleNamespace(**vars(camera) | vars(r) | own)
 
 
 @functools.cache
@@ -508,10 +503,7 @@ def make_spans(real, lanes: bool = False):
             half_height = reach * wp.sqrt(c) / shrink
         return vec2(half_width, half_height)
 
-    return SimpleNamespace(
-        tile_range=tile_range, tile_rows=tile_rows, tile_columns=tile_columns, reach_of=reach_of, half_sides=half_sides,
-        vec2i=vec2i,
-    )  # fmt: skip
+    return named(tile_range, tile_rows, tile_columns, reach_of, half_sides, vec2i=vec2i)
 
 
 # Gradients of one projected Gaussian, for all backward kernels of `project`. Comments name sections of docs/project.md.
@@ -686,6 +678,4 @@ def make_functions(real, camera_model: str, parameters: str, antialiased: bool, 
             v_view[row, 3] = v_t[row]
         return v_view
 
-    return SimpleNamespace(
-        ShapeGradient=ShapeGradient, shape=shape, color=color, centered=centered, logit=logit, view_gradient=view_gradient
-    )
+    return named(ShapeGradient, shape, color, centered, logit, view_gradient)

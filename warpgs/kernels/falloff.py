@@ -210,19 +210,11 @@ def make_batches(real, tile_size: int, channels: int):
     # A tile is stored in columns as wide as a strip, one after the other. The strips of a column that a Gaussian reaches are
     # contiguous, since an ellipse is convex. So only the first of their rows and one past the last are stored.
     f = make_functions(real)
-    record = vector(9 + channels, real)
-    batch_reals = vector(BATCH, real)
-    batch_rows = vector((tile_size // STRIP) * BATCH, wp.int32)
-    row_reals = vector(tile_size, real)
-    strip_reals = vector(STRIP, real)
-    lane_reals = vector(TOGETHER, real)
-    strip_ints = vector(tile_size * (tile_size // STRIP), wp.int32)
-    side = wp.constant(tile_size)
-    parts = wp.constant(tile_size // STRIP)
+    sizes = 9 + channels, BATCH, tile_size, STRIP, TOGETHER, (tile_size + ABREAST) * STRIP
+    record, batch_reals, row_reals, strip_reals, lane_reals, column_reals = (vector(n, real) for n in sizes)
+    batch_rows, strip_ints = (vector((tile_size // STRIP) * n, wp.int32) for n in (BATCH, tile_size))
+    side, parts, abreast, place_z = map(wp.constant, (tile_size, tile_size // STRIP, ABREAST, 6 + channels))
     bits, row_bits = wp.constant(BATCH - 1), wp.constant(tile_size - 1)
-    abreast = wp.constant(ABREAST)
-    column_reals = vector((tile_size + ABREAST) * STRIP, real)
-    place_z = wp.constant(6 + channels)
 
     @wp.struct
     class Batch:

@@ -173,9 +173,10 @@ class CapturedGraph:
         finally:
             caller.wait_stream(stream)
 
-    def replay(self) -> None:
-        """Run the graph on the current stream."""
+    def replay(self) -> object:
+        """Run the graph on the current stream; return what the work returned."""
         self._graph.replay()
+        return self.result
 
     def pool(self) -> tuple[int, int]:
         """Return the handle of the graph's memory, for graphs that share it."""
@@ -209,11 +210,8 @@ class GraphPool:
         self.failed = False
         """True once a capture failed for another reason than lack of memory."""
         self._keeper: CapturedGraph | None = None
-
-    @functools.cached_property
-    def byte(self) -> torch.Tensor:
+        self.byte = torch.empty(0, dtype=torch.uint8, device=device)
         """Empty tensor of bytes on the device, shape [0]."""
-        return torch.empty(0, dtype=torch.uint8, device=self.device)
 
     @functools.cached_property
     def _aside(self) -> torch.cuda.Stream:
@@ -276,8 +274,7 @@ class GraphedFunction:
     def _run(self, arena: Arena, inputs: tuple[torch.Tensor | None, ...]) -> None:
         """Call the function without a graph."""
         arena.begin()  # a capture may have ended half way
-        found = self.function(arena, *inputs)
-        self._places = [arena.place(t) for t in found]
+        self._places = [arena.place(t) for t in self.function(arena, *inputs)]
 
     def _capture(self, key: tuple[int, ...], arena: Arena, inputs: tuple[torch.Tensor | None, ...]) -> CapturedGraph | None:
         """Return a new graph; None if a capture would not pay or is not possible."""

@@ -189,14 +189,11 @@ def told_of_compiling(listener: Say) -> Iterator[list[float]]:
 SILENT = 2.0
 """Time of compiling after which a process prints a line if there is no listener [s]; modules with shorter gaps count as one."""
 _since = _until = -math.inf
-_said = False
 
 
+@functools.cache
 def _say_compiling() -> None:
-    global _said
-    if not _said:
-        _said = True
-        say("warpgs: compiling kernels, once on this machine, for up to a minute", error=True)
+    say("warpgs: compiling kernels, once on this machine, for up to a minute", error=True)
 
 
 @contextlib.contextmanager
@@ -242,20 +239,16 @@ def _load(module: wp.Module, device: wp.Device, block_dim: int, tells: bool = Tr
             listener(name)
         with _announced() if compiles and not told else contextlib.nullcontext():
             loaded = module.load(device, block_dim=block_dim)
-        _as_before(module)
+        # Take from the functions that the module shares what compiling them left there, since Warp hashes it with later
+        # modules: another process, which finds this module in the cache, would not find those, and compile them anew.
+        with contextlib.suppress(AttributeError):  # Warp's own fields: without them, modules may be compiled twice
+            for function in {f for hasher in module.hashers.values() for f in hasher.function_hashes}:
+                for overload in (function.user_overloads | function.user_templates).values():
+                    overload.adj.deferred_static_expressions = []
         for _, seconds in told:
             seconds.append(time.perf_counter() - began)
     _LOADED.add((module, device.context, block_dim))
     return loaded
-
-
-def _as_before(module: wp.Module) -> None:
-    """Take from the functions that a module shares what compiling them left there: Warp hashes it with later modules."""
-    # another process, which finds this module in the cache, would not find the later ones, and compile them anew
-    with contextlib.suppress(AttributeError):  # Warp's own fields: in a version without them, modules may be compiled twice
-        for function in {f for hasher in module.hashers.values() for f in hasher.function_hashes}:
-            for overload in (function.user_overloads | function.user_templates).values():
-                overload.adj.deferred_static_expressions = []
 
 
 def is_cached(name: str) -> bool:

@@ -21,8 +21,7 @@ MAX_NEIGHBORS = 8
 @functools.cache
 def make_knn_kernels(real):
     """Make the kernels for one scalar type; points are sorted along the Morton curve."""
-    vec3 = wp.types.vector(3, real)
-    vec8 = wp.types.vector(MAX_NEIGHBORS, real)
+    vec3, vec8 = (wp.types.vector(size, real) for size in (3, MAX_NEIGHBORS))
 
     @wp.kernel(enable_backward=False, module=f"warpgs.kernels.knn.{real.__name__}")
     def bounds(

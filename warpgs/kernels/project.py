@@ -7,13 +7,11 @@ import torch
 import warp as wp
 
 from warpgs.device import BINNING, BLENDING, FLOAT, LOSS, PROJECTION, SAMPLING, Needs, StepSizes
-from warpgs.errors import UsageError
 from warpgs.kernels import launch, project_cpu, project_cuda
 from warpgs.kernels.cameras import CAMERA_MODELS
 from warpgs.kernels.ellipse import PROJECTED_SIZE, ProjectInputs
 from warpgs.kernels.falloff import Pass
 from warpgs.kernels.graphs import TORCH, Allocator
-from warpgs.kernels.launch import first_order, keep, kept
 from warpgs.kernels.native import BLOCK
 from warpgs.kernels.project_cpu import LANES
 
@@ -59,31 +57,25 @@ class _Project(torch.autograd.Function):
     def forward(ctx, settings, *tensors):
         inputs = ProjectInputs(*(t.contiguous() for t in tensors))
         projected, tile_counts = project_tensors(inputs, settings)
-        keep(ctx, *inputs[:-1], projected, tile_counts)
+        launch.keep(ctx, *inputs[:-1], projected, tile_counts)
         ctx.settings = settings
         ctx.mark_non_differentiable(tile_counts)
         ctx.set_materialize_grads(False)  # else torch makes zeros for the counts
         return projected, tile_counts
 
     @staticmethod
-    @first_order
+    @launch.first_order
     def backward(ctx, v_projected, _):
-        *inputs, projected, tile_counts = kept(ctx)
+        *inputs, projected, tile_counts = launch.kept(ctx)
         wants_camera = ctx.needs_input_grad[6] or ctx.needs_input_grad[7]  # viewmats and Ks, behind the settings
         found = project_gradients(inputs, ctx.settings, projected, tile_counts, v_projected, wants_camera=wants_camera)
         return None, *found, None, None
 
 
 def project_gradients(
-    inputs: Sequence[torch.Tensor],
-    settings: Pass,
-    projected: torch.Tensor,
-    tile_counts: torch.Tensor,
-    v_projected: torch.Tensor | None,
-    *,
-    wants_camera: bool,
-    allocator: Allocator = TORCH,
-) -> list[torch.Tensor | None]:
+    inputs: Sequence[torch.Tensor], settings: Pass, projected: torch.Tensor, tile_counts: torch.Tensor,
+    v_projected: torch.Tensor | None, *, wants_camera: bool, allocator: Allocator = TORCH,
+) -> list[torch.Tensor | None]:  # fmt: skip
     """Return the gradients of the first seven inputs, those of viewmats and Ks None unless wanted. Nothing is checked."""
     real, device = launch.real_of(projected), projected.device
     rule = settings.rule
@@ -122,8 +114,6 @@ def project_inputs(inputs: ProjectInputs, settings: Pass) -> tuple[torch.Tensor,
         viewmats=(inputs.viewmats, "C 4 4"), Ks=(inputs.Ks, "C 3 3"),
         distortion=(inputs.distortion, f"C {model.coefficients}"),
     )  # fmt: skip
-    if inputs.distortion.requires_grad:
-        raise UsageError("gradients of distortion coefficients are not supported: give distortion.detach()")
     if sizes["K"] < settings.sh_count:
         degree = math.isqrt(settings.sh_count) - 1
         raise ValueError(f"sh has {sizes['K']} coefficients per channel, but degree {degree} needs {settings.sh_count}")

@@ -98,8 +98,7 @@ def make_forward(real, camera_model: str, parameters: str, antialiased: bool, ba
     basis_of = sh.make_functions(real, bases).basis
     _, vec3, _, _, _, Reals = types_of(real)
     Vec3s, Vec4s, Mat33s, Mat44s, Rows, Vec3Rows = arrays_of(real)
-    lane_reals = wp.types.vector(LANES, real)
-    lane_ints = wp.types.vector(LANES, wp.int32)
+    lane_reals, lane_ints = (wp.types.vector(LANES, kind) for kind in (real, wp.int32))
 
     @wp.kernel(enable_backward=False, module="unique", module_options=EXACT)
     def forward(
@@ -235,8 +234,7 @@ def make_backward(real, camera_model: str, parameters: str, antialiased: bool, b
     _, vec3, _, mat33, mat44, Reals = types_of(real)
     Vec3s, Vec4s, Mat33s, Mat44s, Rows, Vec3Rows = arrays_of(real)
     vec9 = wp.types.vector(9, real)
-    lane_reals = wp.types.vector(LANES, real)
-    lane_ints = wp.types.vector(LANES, wp.int32)
+    lane_reals, lane_ints = (wp.types.vector(LANES, kind) for kind in (real, wp.int32))
 
     @wp.struct
     class CameraParts:

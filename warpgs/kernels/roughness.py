@@ -11,9 +11,9 @@ from types import SimpleNamespace
 
 import torch
 import warp as wp
+from torch import Tensor
 
 from warpgs.kernels import launch
-from warpgs.kernels.launch import first_order, keep, kept
 from warpgs.kernels.native import EXACT
 
 MIN_ALPHA = 0.3
@@ -100,23 +100,20 @@ class _Roughness(torch.autograd.Function):
         rough, slopes = torch.empty_like(depth), depth.new_empty(*depth.shape, 2)
         inputs = [depth, *others, depth.shape[1], rough, slopes]
         launch.launch(make_kernels(launch.real_of(depth)).forward, depth.numel(), inputs, depth.device, cost=5)
-        keep(ctx, depth, slopes, others[3])
+        launch.keep(ctx, depth, slopes, others[3])
         return rough
 
     @staticmethod
-    @first_order
+    @launch.first_order
     def backward(ctx, v_roughness):
-        depth, slopes, weight = kept(ctx)
+        depth, slopes, weight = launch.kept(ctx)
         v_depth = torch.empty_like(depth)
         inputs = [depth, slopes, weight, v_roughness.contiguous(), depth.shape[1], v_depth]
         launch.launch(make_kernels(launch.real_of(depth)).backward, depth.numel(), inputs, depth.device, cost=5)
         return v_depth, None, None, None, None, None
 
 
-def roughness(
-    depth: torch.Tensor, alpha: torch.Tensor, rows: torch.Tensor, columns: torch.Tensor, weight: torch.Tensor,
-    mask: torch.Tensor | None,
-) -> torch.Tensor:  # fmt: skip
+def roughness(depth: Tensor, alpha: Tensor, rows: Tensor, columns: Tensor, weight: Tensor, mask: Tensor | None) -> Tensor:
     """Return the roughness of each pixel [H, W]: of depth [u], by opacity, weight and mask [H, W].
 
     ``rows`` [H, W - 2] and ``columns`` [H - 2, W] weigh the edges between the two neighbours of a pixel. The gradient is by

@@ -9,7 +9,6 @@ import warp as wp
 
 from warpgs.device import FLOAT, StepSizes
 from warpgs.kernels import launch
-from warpgs.kernels.launch import first_order, keep, kept
 from warpgs.kernels.native import ROLLED, Floats, cuda_kernel, make_prefetch, source
 
 RADIUS = 5
@@ -41,12 +40,9 @@ BLOCK = 8
 @functools.cache
 def make_functions(real):
     """Make the functions that the kernels of both kinds of device share, for one scalar type."""
-    vec4 = wp.types.vector(4, real)
-    vec5 = wp.types.vector(5, real)
+    vec4, vec5, vec6 = (wp.types.vector(size, real) for size in (4, 5, 6))
     w0, w1, w2, w3, w4, w5 = (real(w) for w in WINDOW[RADIUS:])
-    vec6 = wp.types.vector(6, real)
-    channels = CHANNELS
-    Reals = wp.array(dtype=real)
+    channels, Reals = CHANNELS, wp.array(dtype=real)
 
     @wp.func
     def tap(k: wp.int32) -> real:
@@ -115,11 +111,8 @@ def make_kernel(real, summed: bool, backward: bool):
     # The sums of a row are in ``scratch``, where each task has a few rows of its own. A row is processed in steps of `LANES`
     # elements; the last step starts early, to end with the row, and elements that it computes again get the same values.
     f = make_functions(real)
-    vec11 = wp.types.vector(TAPS, real)
-    vec11i = wp.types.vector(TAPS, wp.int32)
-    values = wp.types.vector(LANES, real)
-    several = wp.types.vector(5 * LANES, real)
-    Reals = wp.array(dtype=real)
+    vec11, values, several = (wp.types.vector(size, real) for size in (TAPS, LANES, 5 * LANES))
+    vec11i, Reals = wp.types.vector(TAPS, wp.int32), wp.array(dtype=real)
     prefetch, fields = make_prefetch(real), 3 if backward else 5
 
     @wp.func
@@ -314,16 +307,15 @@ class _Ssim(torch.autograd.Function):
         else:
             workspace = image.new_empty(tasks * 5 * (columns + 2 * PADDING))
             inputs = [image, target, height, blocks, columns, workspace, result, *partials, image.new_empty(0)]
-            kernel = make_kernel(launch.real_of(image), summed, False)
-            launch.launch(kernel, tasks, inputs, image.device, cost=BLOCK * columns)
-        keep(ctx, image, target, *partials)
+            launch.launch(make_kernel(launch.real_of(image), summed, False), tasks, inputs, image.device, cost=BLOCK * columns)
+        launch.keep(ctx, image, target, *partials)
         ctx.summed, ctx.tasks = summed, tasks
         return result.sum(0) if summed else result
 
     @staticmethod
-    @first_order
+    @launch.first_order
     def backward(ctx, v_result):
-        image, target, *partials = kept(ctx)
+        image, target, *partials = launch.kept(ctx)
         height, columns, tasks = image.shape[1], image.shape[2] * CHANNELS, ctx.tasks
         v_image, v_result = torch.empty_like(image), v_result.contiguous()
         if _native(image):

@@ -211,8 +211,6 @@ LOW = WHITE + 1
 """Added to colours while they are interpolated, so that the colour outside of an image, -`WHITE`, becomes positive."""
 MIDDLE = 2048
 """Subtracted from colours before they are multiplied, which keeps sums small."""
-MAX_RADIUS = 3
-"""Largest half side of a window [px]: 49 squares of the largest colour, `WHITE` + `MIDDLE`, fit into 32 bits with a sign."""
 NEUTRAL = 0.5
 """Cost of correlation 0: where a plane projects outside of the other image, or a window has no texture."""
 
@@ -443,29 +441,26 @@ def plane_costs(
     gray: np.ndarray, others: Sequence[np.ndarray], homographies: np.ndarray, window: int, noise: float, unit: int
 ) -> torch.Tensor:
     """Return the costs int16 [H, W, P] of an image [H, W] against others, warped by homographies [D, N, 3, 3] of D planes."""
+    # A window has at most 7 px: 49 squares of the largest colour, `WHITE` + `MIDDLE`, fit into 32 bits with a sign.
     # The cost of one other image is 0.5 (1 - correlation), with ``noise`` added to the variance; ``unit`` stands for cost 1.
     # The result is half the mean of these costs plus half the smallest: an image that does not see the point contributes, but
     # cannot outvote one that does. Pixel centres are at integers. P is D rounded up to a multiple of `LANES`; costs past D are
     # ``unit``.
     radius = window // 2
-    if not 1 <= radius <= MAX_RADIUS:
-        raise ValueError(f"window must be 3 to {2 * MAX_RADIUS + 1} px, not {window}")
     height, width = gray.shape
     pitch, padded = (-(-n // LANES) * LANES for n in (width, len(homographies)))
     centred = (_whole(gray) - MIDDLE).astype(np.int64)
     own_sums, squares = _window_sums(centred, radius), _window_sums(centred * centred, radius)
     added = noise * window**2 * WHITE**2
     roots = 1 / np.sqrt(squares - own_sums**2 / window**2 + added)
-    beside = [(0, 0), (0, pitch - width)]
     own, sums, roots = (
-        torch.from_numpy(np.pad(a, beside).astype(t).ravel())
+        torch.from_numpy(np.pad(a, [(0, 0), (0, pitch - width)]).astype(t).ravel())
         for a, t in ((centred, np.int32), (own_sums, np.int32), (roots, np.float32))
     )
     images = [_packed(g) for g in others]
     starts = np.cumsum([0, *(len(i) for i in images[:-1])])
     shapes = np.array([(s, g.shape[1], g.shape[0]) for s, g in zip(starts, others)], np.int32)
-    blocks = padded // PLANES
-    tasks = -(-height // ROWS) * blocks
+    tasks = -(-height // ROWS) * (padded // PLANES)
     ring = torch.empty(tasks * (window * pitch + 3 * (pitch + 2 * radius)), dtype=torch.int32, device="cpu")
     totals = torch.empty(tasks * 2 * ROWS * pitch, dtype=torch.float32, device="cpu")
     found = torch.empty(tasks * ROWS * PLANES * pitch, dtype=torch.int16, device="cpu")
@@ -572,8 +567,7 @@ def scanline_costs(costs: torch.Tensor, down: torch.Tensor, across: torch.Tensor
         inputs = [costs, bounds.contiguous(), small, padded, *steps, length, *edges]
         if cpu:
             path = torch.empty(lines * 2 * (padded + 2 * LANES), dtype=torch.int16, device="cpu")
-            cost = max(1, length * padded // 20)
-            launch.launch(follow_cpu, lines, [*inputs, path, total], costs.device, cost=cost)
+            launch.launch(follow_cpu, lines, [*inputs, path, total], costs.device, cost=max(1, length * padded // 20))
         else:
             path = torch.empty(lines, 2 * (planes + 2), dtype=torch.int32, device=costs.device)
             launch.launch(follow, BLOCK * lines, [*inputs, path, total], costs.device, block_dim=BLOCK)

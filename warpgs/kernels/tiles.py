@@ -2,30 +2,19 @@
 
 import functools
 from dataclasses import dataclass
-from types import SimpleNamespace
 from typing import Any
 
 import torch
 import warp as wp
+from torch import Tensor
 
 from warpgs.constants import LARGEST_HALF, TILE_SIZE
-from warpgs.device import (
-    BINNING,
-    BLENDING,
-    FLOAT,
-    LOSS,
-    SAMPLING,
-    Needs,
-    StepSizes,
-    available_bytes,
-    format_bytes,
-    installed_bytes,
-)
+from warpgs.device import BINNING, BLENDING, FLOAT, LOSS, SAMPLING, Needs, StepSizes, format_bytes, free_for
 from warpgs.errors import ResourceError
 from warpgs.kernels import launch, native as cuda
+from warpgs.kernels.cameras import named
 from warpgs.kernels.ellipse import make_spans
 from warpgs.kernels.graphs import TORCH, Allocator
-from warpgs.kernels.launch import sort_pairs
 from warpgs.kernels.native import EXACT, SCALE, IntRows, Ints, Longs, make_prefetch, source
 from warpgs.kernels.project_cpu import LANES
 
@@ -221,8 +210,7 @@ def make_emit_cpu(real, slotted: bool):
     """Make the kernel; arguments are those of `make_emit`."""
     s = make_spans(real, lanes=True)
     vec3, Rows = wp.types.vector(3, real), wp.array2d(dtype=real)
-    lane_reals = wp.types.vector(LANES, real)
-    lane_ints = wp.types.vector(LANES, wp.int32)
+    lane_reals, lane_ints = (wp.types.vector(LANES, kind) for kind in (real, wp.int32))
     lanes = LANES
     write, prefetch, prefetch_count = make_write(slotted), make_prefetch(real, 2), make_prefetch(wp.int32)
 
@@ -421,18 +409,15 @@ def make_kernels(real, native: bool):
         j = begin + wp.tid()
         counts[j] = wp.int64(tile_counts[order[j]])
 
-    return SimpleNamespace(
-        depth_keys=depth_keys, pack_counts=pack_counts, visible_keys=visible_keys, ordered_counts=ordered_counts
-    )  # fmt: skip
+    return named(depth_keys, pack_counts, visible_keys, ordered_counts)
 
 
-def running_counts(counts: torch.Tensor, real, allocator: Allocator = TORCH, out: torch.Tensor | None = None) -> torch.Tensor:
+def running_counts(counts: Tensor, real, allocator: Allocator = TORCH, out: Tensor | None = None) -> Tensor:
     """Return running sums int64 [S] of counts [C * N]; a visible Gaussian adds its count and 2^`sum_bits` (see `split_sum`)."""
     device, count, native = counts.device, len(counts), counts.is_cuda
     sums, threads = sum_entries(count, native)
     packed = allocator.workspace((sums,), torch.int64, device) if out is None else out
-    kernel = make_kernels(real, native).pack_counts
-    launch.launch(kernel, threads, [counts, sum_bits(count), packed], device)
+    launch.launch(make_kernels(real, native).pack_counts, threads, [counts, sum_bits(count), packed], device)
     return torch.cumsum(packed, 0, out=packed)
 
 
@@ -471,28 +456,28 @@ class Tiles:
 
     size: int
     """Side of a tile [px]."""
-    ranges: torch.Tensor
+    ranges: Tensor
     """First instance of each tile and one past its last, int32, shape [C * tiles, 2]."""
-    gaussian_ids: torch.Tensor
+    gaussian_ids: Tensor
     """Flat Gaussian number of each instance, int32, shape [M]."""
-    slots: torch.Tensor
+    slots: Tensor
     """Position of an instance before the tile sort, int32, shape [M]. Before the sort, the instances of a Gaussian are
     neighbours. So each instance owns a row for its gradient, and the rows are summed in a fixed order, without atomics."""
-    starts: torch.Tensor
+    starts: Tensor
     """First slot of each Gaussian that has any, int32, shape [C * N]."""
-    counts: torch.Tensor
+    counts: Tensor
     """Number of slots of each Gaussian, int32, shape [C * N]."""
-    tile_ids: torch.Tensor
+    tile_ids: Tensor
     """Tile of each instance, int32, shape [M]; C * tiles for an entry that belongs to no tile."""
-    total: torch.Tensor
+    total: Tensor
     """Actual number of instances, int64, shape [1], for kernels; with a capacity, M is the capacity."""
     visible: int = 0
     """Number of Gaussians that have instances; with a capacity, an upper bound."""
-    packed: torch.Tensor | None = None
+    packed: Tensor | None = None
     """With `Pass.max_error` on CUDA in float32: records of the visible Gaussians in order of depth (blend_pack.cu), float32,
     shape [8 V + 8]; the last one starts with the largest colour. ``gaussian_ids`` are then places in this order."""
 
-    def tensors(self) -> tuple[torch.Tensor, ...]:
+    def tensors(self) -> tuple[Tensor, ...]:
         """Return all tensors [...], in the order of the constructor."""
         return self.ranges, self.gaussian_ids, self.slots, self.starts, self.counts, self.tile_ids, self.total
 
@@ -506,12 +491,12 @@ class InstanceMemory:
     capacity: int | None = None
     """Number of instances to allocate for. The actual number is then not read from the device, so the work can be captured as a
     CUDA graph. None for the actual number. Unused entries have a tile number that no tile has."""
-    overflow: torch.Tensor | None = None
+    overflow: Tensor | None = None
     """Set to 1 where there are more instances than the capacity: the lists are then cut short and must not be used. Int32,
     shape [1]; needed with a capacity."""
     allocator: Allocator = TORCH
     """Provider of the lists' memory."""
-    visible: tuple[torch.Tensor, int] | None = None
+    visible: tuple[Tensor, int] | None = None
     """Running sums of `running_counts` [S], and the number of visible Gaussians to allocate for, if instances have a capacity
     too; None to sort all Gaussians. If the last of the sums shows more of them, the lists must not be used."""
 
@@ -538,11 +523,8 @@ def step_bytes(sizes: StepSizes) -> Needs:
 def _check_total(total: int, visible: int, device: torch.device, tiles: int, budget_bytes: int | None) -> None:
     """Raise ResourceError where the instances exceed the budget, or the number that kernels can index."""
     needed = total * BYTES_PER_INSTANCE
-    # a query of the free memory takes at least 0.1 ms; small requests, below a twentieth of the memory, skip it
     countable = total <= MAX_INSTANCES
-    if countable and budget_bytes is None and needed < installed_bytes(device) // 20:
-        return
-    budget = available_bytes(device) * 4 // 5 if budget_bytes is None else budget_bytes
+    budget = 0.8 * free_for(needed, device) if budget_bytes is None else budget_bytes
     if countable and needed <= budget:
         return
     limit = format_bytes(budget) if countable else f"{MAX_INSTANCES:,} instances"
@@ -553,9 +535,7 @@ def _check_total(total: int, visible: int, device: torch.device, tiles: int, bud
     )
 
 
-def _depth_order(
-    projected: torch.Tensor, counts: torch.Tensor, tiles: int, memory: InstanceMemory
-) -> tuple[torch.Tensor, int, int]:
+def _depth_order(projected: Tensor, counts: Tensor, tiles: int, memory: InstanceMemory) -> tuple[Tensor, int, int]:
     """Return Gaussian numbers from front to back, int32; how many of them are visible; and the number of instances."""
     # With a capacity nothing is read from the device: all Gaussians count as visible, or as many as the capacity holds.
     # Invisible ones come last, and the number of instances is the capacity.
@@ -580,13 +560,13 @@ def _depth_order(
     else:
         inputs = [projected, counts, packed, sum_bits(count), visible, depths, order]
         launch.launch(k.visible_keys, sum_entries(count, native)[1], inputs, device)
-    sort_pairs(depths, order, visible)
+    launch.sort_pairs(depths, order, visible)
     return order, visible, total
 
 
 def bin_tiles(
-    projected: torch.Tensor, tile_counts: torch.Tensor, settings: Any, memory: InstanceMemory = AS_NEEDED,
-    slotted: bool = True, listed: torch.Tensor | None = None,
+    projected: Tensor, tile_counts: Tensor, settings: Any, memory: InstanceMemory = AS_NEEDED,
+    slotted: bool = True, listed: Tensor | None = None,
 ) -> Tiles:  # fmt: skip
     """Return for every tile of the window the Gaussians [C, N, 12] that touch it, front to back. Not differentiable."""
     # ``settings`` are a `falloff.Pass`. Without ``slotted``, which gradients and `contributions` need, slots stay empty.
@@ -632,7 +612,7 @@ def bin_tiles(
         if listed is not None:
             own, kept = keys[:total], torch.cat([listed, listed.new_zeros(1)])
             own.masked_fill_(~kept[own.long()], no_tile)
-        sort_pairs(keys, slots, total, end_bit=no_tile.bit_length())
+        launch.sort_pairs(keys, slots, total, end_bit=no_tile.bit_length())
         ids = slots[total:] if slotted else slots[:total]  # the second half of the buffers is free again
         inputs = [keys, slots, owners, total, no_tile, ids, ranges]
         launch.launch(make_find_ranges(slotted, native), -(-total // EACH) if native else total, inputs, device)

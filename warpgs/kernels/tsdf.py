@@ -22,8 +22,7 @@ def make_kernels(real):
     """Make the kernels for one scalar type."""
     vec3 = wp.types.vector(3, real)
     Reals, Rows = wp.array(dtype=real), wp.array2d(dtype=real)
-    mat33 = wp.types.matrix((3, 3), real)
-    mat44 = wp.types.matrix((4, 4), real)
+    mat33, mat44 = (wp.types.matrix((n, n), real) for n in (3, 4))
     module = f"warpgs.kernels.tsdf.{real.__name__}"
     near = real(NEAR)
 
@@ -182,8 +181,7 @@ def integrate(
         depth.new_tensor([origin]), voxel, truncation, *distances.shape[1:], *_pose(camera, depth), depth, pixel_weights,
         distances, weights,
     ]  # fmt: skip
-    kernels = make_kernels(launch.real_of(depth))
-    launch.launch(kernels.integrate, distances.numel(), inputs, depth.device, cost=3)
+    launch.launch(make_kernels(launch.real_of(depth)).integrate, distances.numel(), inputs, depth.device, cost=3)
 
 
 def gather_colors(
@@ -192,5 +190,4 @@ def gather_colors(
 ) -> None:  # fmt: skip
     """Add one view's weighted colours in place to the points [N, 3] on the surface that it sees, within ``tolerance`` [u]."""
     inputs = [points, tolerance, *_pose(camera, points), depth, pixel_weights, image, sums, weights]
-    kernels = make_kernels(launch.real_of(points))
-    launch.launch(kernels.gather, len(points), inputs, points.device, cost=5)
+    launch.launch(make_kernels(launch.real_of(points)).gather, len(points), inputs, points.device, cost=5)

@@ -5,6 +5,7 @@ from enum import IntEnum
 
 import torch
 import warp as wp
+from torch import Tensor
 
 from warpgs.kernels import launch
 from warpgs.kernels.native import ROLLED, FloatRows, Floats, Ints, Longs, cuda_kernel, source
@@ -122,7 +123,7 @@ def squared_errors(
     sums[task] = total
 
 
-def squared_error(rgb: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
+def squared_error(rgb: Tensor, target: Tensor) -> Tensor:
     """Return the sum of squared errors of an image [H, W, 3] clamped to [0, 1]; the same bits on any number of CPU threads."""
     if rgb.device.type != "cpu" or rgb.dtype != torch.float32:
         return torch.nn.functional.mse_loss(rgb.clamp(0, 1), target, reduction="sum")
@@ -133,23 +134,19 @@ def squared_error(rgb: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
 
 
 def begin_step(
-    counter: torch.Tensor, view_rows: torch.Tensor, lr_rows: torch.Tensor, setting_rows: torch.Tensor,
-    viewmats: torch.Tensor, Ks: torch.Tensor, targets: torch.Tensor,
-) -> tuple[torch.Tensor, ...]:  # fmt: skip
+    counter: Tensor, view_rows: Tensor, lr_rows: Tensor, setting_rows: Tensor, viewmats: Tensor, Ks: Tensor, targets: Tensor
+) -> tuple[Tensor, ...]:
     """Return lrs [R], settings [S], viewmat [1, 4, 4], K [1, 3, 3] and target [H, W, 3] of the step in the counter [1]."""
     found = (
         lr_rows.new_empty(lr_rows.shape[1]), setting_rows.new_empty(setting_rows.shape[1]),
         viewmats.new_empty(1, 4, 4), Ks.new_empty(1, 3, 3), targets.new_empty(targets.shape[1:]),
     )  # fmt: skip
     rows = [t.view(len(t), -1) for t in (lr_rows, setting_rows, viewmats, Ks, targets)]
-    count = max(16, *(t.numel() for t in found))
-    launch.launch(begin_kernel, count, [counter, view_rows, *rows, *found], counter.device)
+    launch.launch(begin_kernel, max(16, *(t.numel() for t in found)), [counter, view_rows, *rows, *found], counter.device)
     return found
 
 
-def end_step(
-    loss: torch.Tensor, mse: torch.Tensor, counter: torch.Tensor, stop: torch.Tensor, history: torch.Tensor
-) -> torch.Tensor:
+def end_step(loss: Tensor, mse: Tensor, counter: Tensor, stop: Tensor, history: Tensor) -> Tensor:
     """Store a step's loss and error in ``history`` [B, 2]; count the step if ``stop`` [1] is 0, and return that, bool, [1]."""
     going = torch.empty(1, dtype=torch.bool, device=loss.device)
     launch.launch(end_kernel, 1, [loss, mse, counter, stop, history, going], loss.device)
@@ -249,8 +246,8 @@ def scheduled_lrs(lr: float, step: int, betas: tuple[float, float] = BETAS, head
 
 
 def adam_scheduled(
-    param: torch.Tensor, grad: torch.Tensor, exp_avg: torch.Tensor, exp_avg_sq: torch.Tensor, lrs: torch.Tensor,
-    skip: torch.Tensor, *, head: int, betas: tuple[float, float] = BETAS, eps: float = EPS,
+    param: Tensor, grad: Tensor, exp_avg: Tensor, exp_avg_sq: Tensor, lrs: Tensor,
+    skip: Tensor, *, head: int, betas: tuple[float, float] = BETAS, eps: float = EPS,
 ) -> None:  # fmt: skip
     """Update rows [N, ...] and their moments in place, as `torch.optim.Adam` does, unless ``skip`` [1] is not 0."""
     # ``lrs`` [3] are those of `scheduled_lrs`; the first ``head`` numbers of each row take the first. All tensors are float32
@@ -304,7 +301,7 @@ def decay(
     decayed[i] = wp.where(wp.isnan(x), logits[i], wp.float32(value))
 
 
-def opacity_decay(logits: torch.Tensor, factor: float) -> torch.Tensor:
+def opacity_decay(logits: Tensor, factor: float) -> Tensor:
     """Return the logits [N], float32, after multiplying the opacities by a factor in (0, 1); a NaN stays NaN."""
     launch.check(logits=(logits, "N"))
     if not 0 < factor < 1:
@@ -331,7 +328,7 @@ def sample(
     factors[i] = wp.where(wp.randf(state) >= p, 1.0 / (1.0 - p), 0.0)
 
 
-def opacity_dropout(count: int, settings: torch.Tensor, seed: int) -> torch.Tensor:
+def opacity_dropout(count: int, settings: Tensor, seed: int) -> Tensor:
     """Return factors [N] for the opacities: 0 with probability p (`Setting.DROPOUT`), else 1 / (1 - p)."""
     # They depend only on p, ``seed``, the number of the step or view and the Gaussian's row, so they are the same on every
     # device and in a resumed fit.

@@ -22,11 +22,8 @@ def make_walk(real, tile_size: int, make_visit):
     """Make the generic kernel, one task per tile; it calls a visitor for each blended (Gaussian, pixel)."""
     f, visit = make_functions(real), make_visit(real)
     Reals, Rows = wp.array(dtype=real), wp.array2d(dtype=real)
-    tile_reals = wp.types.vector(tile_size * (tile_size + 1), real)
-    strip_reals = wp.types.vector(STRIP, real)
-    side = tile_size
-    strip = STRIP
-    parts = tile_size // STRIP
+    tile_reals, strip_reals = (wp.types.vector(n, real) for n in (tile_size * (tile_size + 1), STRIP))
+    side, strip, parts = tile_size, STRIP, tile_size // STRIP
 
     @wp.kernel(enable_backward=False, module="unique", module_options=ROLLED)
     def walk(
@@ -134,8 +131,7 @@ def make_heaviest(real):
 def make_weights(real, tile_size: int):
     """Make the kernel of `contributions`, one task per tile; its loops over a strip have no branch, so that they vectorise."""
     f, b, Rows = make_functions(real), make_batches(real, tile_size, COLORS), wp.array2d(dtype=real)
-    tile_reals = wp.types.vector(tile_size * (tile_size + 1), real)
-    strip_reals = wp.types.vector(STRIP, real)
+    tile_reals, strip_reals = (wp.types.vector(n, real) for n in (tile_size * (tile_size + 1), STRIP))
     at, prefetch, ahead = b.at, make_prefetch(real, 2), TOGETHER
     side, strip, parts, outside = tile_size, STRIP, tile_size // STRIP, real(-1.0)
 

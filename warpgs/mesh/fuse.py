@@ -389,3 +389,6 @@ def textured(mesh: Mesh, views: SurfaceViews, truncation: float, footprint: floa
             gain * view.image.cpu().numpy(), width, height
         )
     return replace(mesh, texture=texture, uv=(uv / texture.shape[1::-1]).astype(np.float32))
+
+
+fuse_mesh = fuse

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from warpgs.errors import DataError, ResourceError, UsageError, install_extras
 from warpgs.files import read_file, read_input, remove_leftovers, write_bytes, write_text
@@ -25,9 +26,7 @@ from warpgs.priors.views import CLASSES
 REMEDY = install_extras("export")
 
 
-def onnx_bytes(
-    network: torch.nn.Module, image: torch.Tensor, outputs: Sequence[str], sizes: dict[int, Any] | None = None
-) -> bytes:
+def onnx_bytes(network: torch.nn.Module, image: Tensor, outputs: Sequence[str], sizes: dict[int, Any] | None = None) -> bytes:
     """Return the ONNX file of a network for an ``image`` [1, 3, h, w]; ``sizes`` are the sizes that its axes may have."""
     try:
         import onnxscript  # noqa: F401
@@ -51,7 +50,7 @@ def onnx_bytes(
         exporter.setLevel(before)
 
 
-def _try(data: bytes, out: Path, outputs: Sequence[str], image: torch.Tensor) -> list[np.ndarray]:
+def _try(data: bytes, out: Path, outputs: Sequence[str], image: Tensor) -> list[np.ndarray]:
     """Return what onnxruntime makes of an image with the bytes of ``out``, which is not yet written."""
     check_onnx(data, out)
     return [np.asarray(a) for a in start_session(data, out, "cpu", 0).run(list(outputs), {"image": image.numpy()})]
@@ -232,10 +231,10 @@ def _dpt(request: ExportRequest) -> torch.nn.Module:
             backbone_out_indices=[0, 1, 2, 3], neck_hidden_sizes=[16, 24, 32, 32], fusion_hidden_size=16,
             initializer_range=0.2,
         )  # fmt: skip
-        return _one_output(DPTForDepthEstimation(config), "predicted_depth")
+        return _OneOutput(DPTForDepthEstimation(config), "predicted_depth")
     name = request.weights or DPT_WEIGHTS
     try:
-        return _one_output(DPTForDepthEstimation.from_pretrained(name, use_safetensors=True), "predicted_depth")
+        return _OneOutput(DPTForDepthEstimation.from_pretrained(name, use_safetensors=True), "predicted_depth")
     except (OSError, ValueError) as e:
         why = f"the weights cannot be loaded ({str(e).splitlines()[0][:200]})"
         raise DataError(f"{name}: {why}; connect to the internet to download them, or name their folder with --weights") from e
@@ -246,11 +245,9 @@ def _fcn_resnet18(request: ExportRequest) -> torch.nn.Module:
     given = None if request.random_weights else _own_weights(request.weights)
     from transformers import ResNetBackbone, ResNetConfig
 
-    stages = ["stage2", "stage3", "stage4"]
     sizes = [16, 24, 32, 48] if request.random_weights else [64, 128, 256, 512]
-    config = ResNetConfig(
-        depths=[2, 2, 2, 2], layer_type="basic", out_features=stages, embedding_size=sizes[0], hidden_sizes=sizes
-    )
+    layers = {"depths": [2, 2, 2, 2], "layer_type": "basic", "out_features": ["stage2", "stage3", "stage4"]}
+    config = ResNetConfig(**layers, embedding_size=sizes[0], hidden_sizes=sizes)
 
     class FCN(torch.nn.Module):
         def __init__(self):
@@ -276,7 +273,7 @@ def _fcn_resnet18(request: ExportRequest) -> torch.nn.Module:
     return network
 
 
-def _own_weights(path: str | None) -> dict[str, torch.Tensor]:
+def _own_weights(path: str | None) -> dict[str, Tensor]:
     """Return the tensors [...] of the user's weights by name, before any library of networks is loaded."""
     if path is None:
         raise UsageError(
@@ -301,21 +298,18 @@ def _fcn_resnet50(request: ExportRequest) -> torch.nn.Module:
 
     # trained on the images of COCO that show VOC's 21 classes
     weights = None if request.random_weights else FCN_ResNet50_Weights.COCO_WITH_VOC_LABELS_V1
-    return _one_output(fcn_resnet50(weights=weights, weights_backbone=None, num_classes=CLASSES), "out")
+    return _OneOutput(fcn_resnet50(weights=weights, weights_backbone=None, num_classes=CLASSES), "out")
 
 
-def _one_output(network: torch.nn.Module, name: str) -> torch.nn.Module:
-    """Return a network with one of the named outputs of another."""
+class _OneOutput(torch.nn.Module):
+    """A network with one of the named outputs of another."""
 
-    class OneOutput(torch.nn.Module):
-        def __init__(self):
-            super().__init__()
-            self.network = network
+    def __init__(self, network: torch.nn.Module, name: str):
+        super().__init__()
+        self.network, self.name = network, name
 
-        def forward(self, pixel_values):
-            return self.network(pixel_values)[name]
-
-    return OneOutput()
+    def forward(self, pixel_values):
+        return self.network(pixel_values)[self.name]
 
 
 def build(request: ExportRequest) -> torch.nn.Module:

@@ -10,7 +10,6 @@ import numpy as np
 from warpgs import geometry
 from warpgs.errors import DataError, UsageError
 from warpgs.files import read_file
-from warpgs.geometry import check_pinhole
 from warpgs.onnx import Model
 from warpgs.priors.networks import in_threads
 from warpgs.scene import Camera, PointCloud, View, ViewDepth
@@ -56,8 +55,8 @@ def homogeneous(pixels: np.ndarray) -> np.ndarray:
 
 def fundamental(first: Camera, second: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return F [3, 3], and R_st [3, 3] and tau [3] of ``X_second = R_st (X_first + tau)``, of a pair of cameras."""
-    check_pinhole(first)
-    check_pinhole(second)
+    geometry.check_pinhole(first)
+    geometry.check_pinhole(second)
     R_s, t_s = first.viewmat[:3, :3], first.viewmat[:3, 3]
     R_t, t_t = second.viewmat[:3, :3], second.viewmat[:3, 3]
     R_st = R_t @ R_s.T
@@ -99,8 +98,7 @@ def _ray_lengths(rays: np.ndarray, others: np.ndarray, tau: np.ndarray) -> tuple
     z = (np.cross(others, tau) * normal).sum(1) / square
     # cross with the ray: mu (other x ray) = tau x ray
     mu = -(np.cross(tau, rays) * normal).sum(1) / square
-    sine = np.sqrt(square / ((rays**2).sum(1) * (others**2).sum(1)))
-    return z, mu, sine
+    return z, mu, np.sqrt(square / ((rays**2).sum(1) * (others**2).sum(1)))
 
 
 def round_trip(matches: np.ndarray, pixels: np.ndarray, back: np.ndarray) -> np.ndarray:
@@ -240,13 +238,11 @@ def agreeing_matches(
     return ids[good], found[good]
 
 
-def _triangulate(
-    a: View, b: View, pixels_a: np.ndarray, pixels_b: np.ndarray, min_angle: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the points [u] midway between the rays of each match, shape [N, 3], and True where they pass the checks [N]."""
+def _triangulate(a: View, b: View, at_a: np.ndarray, at_b: np.ndarray, min_angle: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the points [u] midway between the rays of each match [N, 3], and True where they pass the checks [N]."""
     origins = [v.camera.center for v in (a, b)]
     rays = []
-    for view, pixels in ((a, pixels_a), (b, pixels_b)):
+    for view, pixels in ((a, at_a), (b, at_b)):
         far = geometry.back_project(view.camera, pixels, np.ones(len(pixels))) - view.camera.center
         rays.append(far / np.linalg.norm(far, axis=1, keepdims=True))
     baseline = origins[1] - origins[0]
@@ -257,7 +253,7 @@ def _triangulate(
     t = (cosine * along[0] - along[1]) / sine2
     points = 0.5 * (origins[0] + s[:, None] * rays[0] + origins[1] + t[:, None] * rays[1])
     good = (s > 0) & (t > 0) & (sine2 > np.sin(np.radians(min_angle)) ** 2)
-    for view, pixels in ((a, pixels_a), (b, pixels_b)):
+    for view, pixels in ((a, at_a), (b, at_b)):
         projected, z = geometry.project_points(view.camera, points)
         with np.errstate(over="ignore"):  # points beside the camera are infinitely far from their pixels
             good &= (z > 0) & (np.linalg.norm(projected - pixels, axis=1) < MAX_ERROR)
@@ -368,8 +364,7 @@ def _same_size(views: Sequence[View], i: int, j: int, compute: Callable[[View, V
     first, second = views[i], views[j]
     a, b = first.camera, second.camera
     if (a.width, a.height) != (b.width, b.height):
-        image = cv2.resize(second.image, (a.width, a.height), interpolation=cv2.INTER_AREA)
-        second = View(second.name, b, image)
+        second = View(second.name, b, cv2.resize(second.image, (a.width, a.height), interpolation=cv2.INTER_AREA))
     flow = compute(first, second)
     return flow if flow is None else resize_flow(flow, a.width, a.height, (b.width, b.height))
 
@@ -404,9 +399,8 @@ def _sparse(views: Sequence[View]) -> FlowBetween:
         (a, da), (b, db) = features[i], features[j]
         ids = _ratio_matches(da, db)
         a, b = a[ids[:, 0]], b[ids[:, 1]]
-        F = fundamental(views[i].camera, views[j].camera)[0]
         # OpenCV's pixel centres are at whole numbers
-        lines = homogeneous(a + 0.5) @ F.T
+        lines = homogeneous(a + 0.5) @ fundamental(views[i].camera, views[j].camera)[0].T
         with np.errstate(divide="ignore", invalid="ignore"):
             off = np.abs((lines[:, :2] * (b + 0.5)).sum(1) + lines[:, 2]) / np.linalg.norm(lines[:, :2], axis=1)
         a, b = a[off < LINE_DISTANCE], b[off < LINE_DISTANCE]

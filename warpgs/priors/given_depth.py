@@ -99,8 +99,7 @@ def references(view: View, found: ViewDepth | None, known: PointCloud) -> tuple[
     assert view.depth is not None
     sure = np.zeros(view.depth.values.shape) if found is None else np.where(found.valid, found.depth, 0).astype(np.float64)
     if known.tracks is not None:
-        own = known.seen_by({view.name})
-        _, rows, columns, z = geometry.seen_pixels(view.camera, own.points)
+        _, rows, columns, z = geometry.seen_pixels(view.camera, known.seen_by({view.name}).points)
         order = np.argsort(-z, kind="stable")  # of two in one pixel the nearer is written last
         sure[rows[order], columns[order]] = z[order]
     at = (view.depth.values > 0) & (sure > 0)
@@ -134,9 +133,7 @@ def align(view: View, found: ViewDepth | None, known: PointCloud) -> Alignment:
     return Alignment(scale, shift, count, float(np.median(off)), why_not)
 
 
-def votes(
-    views: Sequence[View], depths: Sequence[np.ndarray], index: int, near: int = NEIGHBORS
-) -> tuple[np.ndarray, np.ndarray]:
+def votes(views: Sequence[View], depths: Sequence[np.ndarray], index: int) -> tuple[np.ndarray, np.ndarray]:
     """Count the other views that confirm each depth of a view, and that see through it, int [H, W] each."""
     own = depths[index]
     step = math.ceil(math.sqrt(np.count_nonzero(own) / MAX_POINTS)) if own.any() else 1
@@ -145,7 +142,7 @@ def votes(
     pixels, z = np.stack([columns, rows], 1) * step + 0.5, coarse[rows, columns].astype(np.float64)
     points = geometry.back_project(views[index].camera, pixels, z)
     counts = np.zeros((2, *coarse.shape), int)
-    for j in nearest_views(views, index, near):
+    for j in nearest_views(views, index, NEIGHBORS):
         seen, r, c, there = geometry.seen_pixels(views[j].camera, points)
         other = depths[j][r, c]
         known = other > 0
@@ -281,5 +278,4 @@ def _lens_pixels(camera: Camera) -> np.ndarray:
     positions = np.concatenate([plane, np.ones((len(plane), 1))], 1)
     with np.errstate(all="ignore"):
         found = geometry.to_plane(camera.model, camera.distortion, positions) * camera.K[[0, 1], [0, 1]] + camera.K[:2, 2]
-    seen = geometry.on_lens(camera.model, camera.distortion, positions)
-    return np.where(seen[:, None] & np.isfinite(found), found, -1e6)
+    return np.where(geometry.on_lens(camera.model, camera.distortion, positions)[:, None] & np.isfinite(found), found, -1e6)

@@ -140,8 +140,7 @@ def resize(image: np.ndarray, height: int, width: int) -> np.ndarray:
     """Return an image [H, W] or [H, W, C] at another size, float32, pixel centres aligned at +0.5."""
     import cv2
 
-    shrinks = height <= image.shape[0] and width <= image.shape[1]
-    method = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
+    method = cv2.INTER_AREA if height <= image.shape[0] and width <= image.shape[1] else cv2.INTER_LINEAR
     if image.ndim == 2:
         return cv2.resize(np.ascontiguousarray(image, np.float32), (width, height), interpolation=method)
     # OpenCV averages over areas in at most four channels at a time
@@ -188,6 +187,7 @@ def describe(network: Network, defaults: Preprocessing, kind: str) -> tuple[Prep
     return Preprocessing(**values), notes
 
 
+Arrays = tuple[np.ndarray, ...]
 CODE = 1
 """Version of the code between image and maps; increased whenever the same inputs would produce other maps."""
 
@@ -212,9 +212,7 @@ class MapCache:
     def __init__(self, folder: Path):
         self.folder, self.notes, self.found, self.made = folder, list[str](), 0, 0
 
-    def maps(
-        self, image: np.ndarray, names: tuple[str, ...], decided_by: dict, make: Callable[[], tuple[np.ndarray, ...]]
-    ) -> tuple[np.ndarray, ...]:
+    def maps(self, image: np.ndarray, names: tuple[str, ...], decided_by: dict, make: Callable[[], Arrays]) -> Arrays:
         """Return one map per name, float32 [H, W], of an image [H, W, 3], read from disk or computed by ``make``."""
         path = self._path(image, names, decided_by)
         maps = self._read(path, names, image.shape[:2])
@@ -232,7 +230,7 @@ class MapCache:
         key.update(np.ascontiguousarray(image).data)
         return self.folder / f"{key.hexdigest()}.safetensors"
 
-    def _read(self, path: Path, names: tuple[str, ...], shape: tuple[int, int]) -> tuple[np.ndarray, ...] | None:
+    def _read(self, path: Path, names: tuple[str, ...], shape: tuple[int, int]) -> Arrays | None:
         import safetensors
         from safetensors.numpy import load
 
@@ -249,7 +247,7 @@ class MapCache:
         self.notes.append(f"{path}: a stored map was damaged and was computed again")
         return None
 
-    def _write(self, path: Path, names: tuple[str, ...], maps: tuple[np.ndarray, ...]) -> None:
+    def _write(self, path: Path, names: tuple[str, ...], maps: Arrays) -> None:
         from safetensors.numpy import save
 
         try:

@@ -5,10 +5,10 @@ from dataclasses import replace
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from warpgs import geometry
 from warpgs.device import format_bytes, installed_bytes
-from warpgs.geometry import check_pinhole, matmul
 from warpgs.kernels.sweep import NEUTRAL, best_inverses, check_round_trip, plane_costs, scanline_costs
 from warpgs.priors.flow import homogeneous, no_depth
 from warpgs.priors.networks import in_threads, single_threaded_opencv
@@ -64,13 +64,12 @@ itself."""
 
 def _sampled(camera: Camera, bounds: tuple[float, float]) -> np.ndarray:
     """Return points [S, 3] that a camera may see: at a grid of pixels, and depths evenly spaced in their logarithm."""
-    check_pinhole(camera)
+    geometry.check_pinhole(camera)
     along = (np.arange(SAMPLES) + 0.5) / SAMPLES
     x, y = (a.ravel() for a in np.meshgrid(along * camera.width, along * camera.height))
     near, far = bounds
     depths = [near * (far / near) ** ((k + 0.5) / DEPTHS) for k in range(DEPTHS)]
-    pixels = np.tile(np.stack([x, y], 1), (DEPTHS, 1))
-    return geometry.back_project(camera, pixels, np.repeat(depths, len(x)))
+    return geometry.back_project(camera, np.tile(np.stack([x, y], 1), (DEPTHS, 1)), np.repeat(depths, len(x)))
 
 
 def shared_sight(cameras: Sequence[Camera], bounds: Sequence[tuple[float, float]]) -> Sight:
@@ -93,8 +92,7 @@ def shared_sight(cameras: Sequence[Camera], bounds: Sequence[tuple[float, float]
         rays /= np.maximum(np.sqrt((rays**2).sum(2, keepdims=True)), 1e-12)
         turned = 1 - (rays * rays[i]).sum(2)  # 1 - cosine grows with the square of a small angle
         alike = np.clip((lost - turned) / (lost - most), 0, 1)
-        close = np.clip(1 - np.sqrt(np.maximum(turned, 0) / lost), 0, 1)
-        overlap[i] = (seen * close).mean(1)
+        overlap[i] = (seen * np.clip(1 - np.sqrt(np.maximum(turned, 0) / lost), 0, 1)).mean(1)
         matching[i] = (seen * alike * np.clip(turned / least, 0, 1)).mean(1)
         matching[i, i] = 0
     return np.round(overlap, 9), np.round(matching, 9)  # rounding errors must not decide
@@ -161,11 +159,11 @@ MIN_PARALLAX = 0.5
 
 def project_inverse(first: Camera, second: Camera, pixels: np.ndarray, inverse: np.ndarray) -> np.ndarray:
     """Project pixels [N, 2] at inverse depths [1/u] [N] into the second image; return positions [px] [N, 2], NaN if behind."""
-    check_pinhole(first)
-    check_pinhole(second)
+    geometry.check_pinhole(first)
+    geometry.check_pinhole(second)
     rotation, translation = geometry.relative_pose(first, second)
-    rays = matmul(homogeneous(pixels), geometry.inverse(first.K).T)
-    p = matmul(matmul(rays, rotation.T) + inverse[:, None] * translation, second.K.T)
+    rays = geometry.matmul(homogeneous(pixels), geometry.inverse(first.K).T)
+    p = geometry.matmul(geometry.matmul(rays, rotation.T) + inverse[:, None] * translation, second.K.T)
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(p[:, 2:] > 1e-9, p[:, :2] / p[:, 2:], np.nan)
 
@@ -189,8 +187,8 @@ def plane_inverses(
 
 def plane_homography(first: Camera, second: Camera, inverse: float | np.ndarray) -> np.ndarray:
     """Return H [..., 3, 3] from first to second by planes z = 1 / inverse [...], for pixel centres at integers (OpenCV)."""
-    check_pinhole(first)
-    check_pinhole(second)
+    geometry.check_pinhole(first)
+    geometry.check_pinhole(second)
     rotation, translation = geometry.relative_pose(first, second)
     H = rotation + np.asarray(inverse)[..., None, None] * np.outer(translation, [0, 0, 1])
     back, shift = (np.array([[1, 0, s], [0, 1, s], [0, 0, 1]]) for s in (-0.5, 0.5))
@@ -223,20 +221,16 @@ def step_limits(colors: np.ndarray, small_step: float = SMALL_STEP, large_step: 
     return np.rint(np.maximum(large_step * np.exp(-jumps / EDGE), 1.5 * small_step) * UNIT).astype(np.int16)
 
 
-def matching_costs_cpu(view: View, others: Sequence[View], inverses: np.ndarray, window: int = WINDOW) -> torch.Tensor:
+def matching_costs_cpu(view: View, others: Sequence[View], inverses: np.ndarray, window: int = WINDOW) -> Tensor:
     """Return the disagreement of views at D inverse depths [1/u] in units of 1 / `UNIT`, as `plane_costs` does."""
     homographies = plane_homographies(view.camera, [o.camera for o in others], inverses)
     return plane_costs(gray_of(view), [gray_of(o) for o in others], homographies, window, NOISE, UNIT)
 
 
-def path_costs(
-    costs: torch.Tensor, image: np.ndarray, small_step: float = SMALL_STEP, large_step: float = LARGE_STEP
-) -> torch.Tensor:
+def path_costs(costs: Tensor, image: np.ndarray, small_step: float = SMALL_STEP, large_step: float = LARGE_STEP) -> Tensor:
     """Return the sum of the semi-global path costs from four sides, int16 [H, W, D], in units of 1 / `UNIT`."""
-    down, across = (
-        torch.from_numpy(step_limits(colors, small_step, large_step).astype(np.int32)).to(costs.device)
-        for colors in (image, image.swapaxes(0, 1))
-    )
+    limits = (step_limits(colors, small_step, large_step) for colors in (image, image.swapaxes(0, 1)))
+    down, across = (torch.from_numpy(steps.astype(np.int32)).to(costs.device) for steps in limits)
     return scanline_costs(costs, down, across.T, round(small_step * UNIT))
 
 
@@ -254,14 +248,12 @@ def needed_bytes(view: View, planes: int) -> int:
     return view.camera.width * view.camera.height * (4 * planes + 4 * MAPS * min(planes, PLANES_AT_ONCE))
 
 
-def matching_costs_cuda(
-    view: View, others: Sequence[View], inverses: np.ndarray, device: torch.device, window: int = WINDOW
-) -> torch.Tensor:
+def matching_costs_cuda(view: View, others: Sequence[View], inverses: np.ndarray, device: torch.device) -> Tensor:
     """Return the costs of `matching_costs_cpu`, without its padding planes, int16, shape [H, W, D], on the device."""
 
-    def box(maps: torch.Tensor) -> torch.Tensor:
-        r = window // 2
-        return torch.nn.functional.avg_pool2d(torch.nn.functional.pad(maps, (r, r, r, r), mode="reflect"), window, 1)
+    def box(maps: Tensor) -> Tensor:
+        r = WINDOW // 2
+        return torch.nn.functional.avg_pool2d(torch.nn.functional.pad(maps, (r, r, r, r), mode="reflect"), WINDOW, 1)
 
     own, *grays = [torch.from_numpy(gray_of(v))[None, None].to(device) for v in (view, *others)]
     width, height = view.camera.width, view.camera.height
@@ -282,8 +274,7 @@ def matching_costs_cuda(
             # with centres as grid_sample has them without align_corners; with it, torch would load cuDNN
             at = torch.stack([(2 * p[i] / p[2] + 1) / n - 1 for i, n in enumerate(sides)], -1)  # [P, H, W, 2]
             # outside is -1, which is less than any colour, also where a pixel is partly outside
-            raised = (gray + 1).expand(len(H), -1, -1, -1)
-            warped = torch.nn.functional.grid_sample(raised, at, align_corners=False) - 1
+            warped = torch.nn.functional.grid_sample((gray + 1).expand(len(H), -1, -1, -1), at, align_corners=False) - 1
             m = box(warped)
             v = (box(warped * warped) - m * m).clamp(min=0) + NOISE
             cost = 0.5 - 0.5 * (box(own * warped) - mean * m) / (variance * v).sqrt()
@@ -295,7 +286,7 @@ def matching_costs_cuda(
     return costs
 
 
-def best_inverse(costs: torch.Tensor, inverses: np.ndarray) -> torch.Tensor:
+def best_inverse(costs: Tensor, inverses: np.ndarray) -> Tensor:
     """Return inverse depths [1/u] as `best_inverses` does, float64, shape [H, W], on the device."""
     k = costs.argmin(2, keepdim=True).clamp(1, len(inverses) - 2)
     left, middle, right = (costs.gather(2, k + o).double() for o in (-1, 0, 1))
@@ -305,7 +296,7 @@ def best_inverse(costs: torch.Tensor, inverses: np.ndarray) -> torch.Tensor:
 
 
 @torch.no_grad()
-def inverse_depths_cuda(view: View, others: Sequence[View], planes: np.ndarray, device: torch.device) -> torch.Tensor:
+def inverse_depths_cuda(view: View, others: Sequence[View], planes: np.ndarray, device: torch.device) -> Tensor:
     """Return inverse depths [1/u] of a view, float64, [H, W], by sweeping planes against at least one other view."""
     return best_inverse(path_costs(matching_costs_cuda(view, others, planes, device), view.image), planes)
 
@@ -336,9 +327,7 @@ def _reduced(view: View) -> View:
     return View(view.name, replace(c, K=K, width=width, height=height), image)
 
 
-def consistent_depth(
-    views: Mapping[int, View], inverses: Mapping[int, np.ndarray], index: int, others: Sequence[int]
-) -> ViewDepth:
+def consistent_depth(views: dict[int, View], inverses: dict[int, np.ndarray], index: int, others: Sequence[int]) -> ViewDepth:
     """Return the depth of one view where it is geometrically consistent with the depth of at least one other view."""
     # a point returns to its pixel by the other view's depth; the sensitivity is the smallest among the consistent views
     own, notes = inverses[index], []
@@ -405,7 +394,7 @@ def sweep_depths(
                 inverses[i] = inverse_depths_cpu(small[i], compared, planes[i])
             progress(done, len(swept))
         # only now, so that a GPU works on one view while the next is prepared
-        inverses = {i: t.cpu().numpy() if isinstance(t, torch.Tensor) else t for i, t in inverses.items()}
+        inverses = {i: t.cpu().numpy() if isinstance(t, Tensor) else t for i, t in inverses.items()}
         note = f"not swept: the {len(swept)} swept views (of {len(views)}) see most of the scene"
         out = [no_depth(v, note, searched=False) for v in views]
 

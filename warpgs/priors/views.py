@@ -6,7 +6,7 @@ import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import numpy as np
 
@@ -14,12 +14,8 @@ from warpgs.errors import DataError, UsageError
 from warpgs.onnx import PROVIDERS
 from warpgs.priors import networks
 from warpgs.process import Detail, Say, counted, silent
-from warpgs.scene import Prior, View
+from warpgs.scene import Prior, View, ViewDepth
 from warpgs.schema import Checked
-
-if TYPE_CHECKING:
-    from warpgs.scene import ViewDepth
-
 
 # Semantics of an image as three maps: confidence of the labels, their boundaries, and foreground.
 #
@@ -156,7 +152,7 @@ class PriorConfig(Checked):
             raise UsageError("--depth-guides requires --depth-model; for maps from files, give --depths instead")
 
 
-Source = Callable[[int], tuple[tuple[np.ndarray, ...], str]]
+Source = Callable[[int], tuple[networks.Arrays, str]]
 """Function from the index of a view to its maps, float32 [H, W] each, and a phrase on their source."""
 
 
@@ -173,13 +169,12 @@ def _by_network(
     decided_by = {"model": network.sha256, "provider": config.onnx_provider, **asdict(how)}
     names = ("disparity",) if is_depth else ("confidence", "boundary", "foreground")
 
-    def maps(i: int) -> tuple[tuple[np.ndarray, ...], str]:
-        image = views[i].image
+    def made(image: np.ndarray) -> networks.Arrays:
+        return (networks.network_disparity(network, how, image),) if is_depth else network_semantics(network, how, image)
 
-        def make() -> tuple[np.ndarray, ...]:
-            return (networks.network_disparity(network, how, image),) if is_depth else network_semantics(network, how, image)
-
-        return cache.maps(image, names, decided_by, make), f"{how.output} by {network.title}"
+    def maps(i: int) -> tuple[networks.Arrays, str]:
+        found = cache.maps(views[i].image, names, decided_by, lambda: made(views[i].image))
+        return found, f"{how.output} by {network.title}"
 
     return maps
 
@@ -196,7 +191,7 @@ def _by_views(views: Sequence[View], depths: Sequence[ViewDepth] | None, notes: 
     if poor:
         notes.append(f"no consistent depth in {', '.join(poor)}, so there is no geometry score there; --depth-model adds depth")
 
-    def disparity(i: int) -> tuple[tuple[np.ndarray, ...], str]:
+    def disparity(i: int) -> tuple[networks.Arrays, str]:
         view, d = views[i], depths[i]
         if d.valid.sum() < MIN_CONSISTENT:
             return (np.zeros(d.depth.shape, np.float32),), "none"
@@ -238,14 +233,9 @@ def _names(names: list[str]) -> str:
 
 
 def view_priors(
-    views: Sequence[View],
-    config: PriorConfig,
-    *,
-    depths: Callable[[], Sequence[ViewDepth] | None] = lambda: None,
-    regions: Sequence[np.ndarray | None] | None = None,
-    threads: int = 0,
-    tell: Say = silent,
-) -> tuple[list[Prior], list[str]]:
+    views: Sequence[View], config: PriorConfig, *, depths: Callable[[], Sequence[ViewDepth] | None] = lambda: None,
+    regions: Sequence[np.ndarray | None] | None = None, threads: int = 0, tell: Say = silent,
+) -> tuple[list[Prior], list[str]]:  # fmt: skip
     """Return a prior for the pixels of each view before anything is fitted, and notes on choices and assumptions."""
     notes: list[str] = []
     classical = config.segmentation_model is None

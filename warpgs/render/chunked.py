@@ -1,6 +1,6 @@
 """Chunked rendering: windows of an image, each with at most a given number of (Gaussian, tile) pairs, called instances."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import torch
@@ -9,7 +9,7 @@ from warpgs.kernels.ellipse import ProjectInputs
 from warpgs.kernels.falloff import Pass
 from warpgs.kernels.launch import first_order, keep, kept
 from warpgs.kernels.project import project_inputs
-from warpgs.kernels.tiles import AS_NEEDED, InstanceMemory, bin_tiles
+from warpgs.kernels.tiles import InstanceMemory, bin_tiles
 from warpgs.render.compose import Images, bin_and_blend, further_of
 
 
@@ -82,14 +82,9 @@ class _BlendChunked(torch.autograd.Function):
         return *gradients, *(None for _ in range(3 + 3 + len(inputs) - len(gradients)))
 
 
-def blend_chunked(
-    projected: torch.Tensor, backgrounds: torch.Tensor, settings: Pass, most: int, inputs: ProjectInputs,
-    memory: InstanceMemory = AS_NEEDED, colors: torch.Tensor | None = None,
-) -> Images:  # fmt: skip
-    """Composite [C, N, 12] chunk by chunk, to the bits of `images_of`; the backward pass renders each chunk again."""
-    # only the inputs are saved; about 1.5 times the time of `blend`, with memory for one chunk's instances
-    images: Images = _BlendChunked.apply(projected, backgrounds, colors, settings, most, memory, *inputs.detached())
-    return images
+blend_chunked: Callable[..., Images] = _BlendChunked.apply
+"""Composite [C, N, 12] chunk by chunk, to the bits of `blend`; the backward pass renders each chunk again."""
+# only the inputs are saved; about 1.5 times the time of `blend`, with memory for one chunk's instances
 
 
 def further_chunked(
@@ -99,7 +94,7 @@ def further_chunked(
     """Return what `further_of` does for projected Gaussians [C, N, 12], chunk by chunk; images have the same bits."""
     found: dict[str, torch.Tensor] = {}
     _, _, width, height = settings.window
-    for part, counts in chunks(settings, most, inputs.detached()):
+    for part, counts in chunks(settings, most, inputs):
         tiles = bin_tiles(projected, counts, part, memory, contributions)
         for name, values in further_of(projected, tiles, part, contributions, median, k).items():
             if name == "weight_sums":

@@ -8,7 +8,6 @@ import torch
 
 from warpgs.constants import Rule
 from warpgs.kernels import blend as blending, launch, sh
-from warpgs.kernels.blend import blend, blend_channels
 from warpgs.kernels.ellipse import ProjectInputs, checked_factors, nothing, packed_covariances
 from warpgs.kernels.falloff import Pass
 from warpgs.kernels.project import project_inputs
@@ -85,23 +84,14 @@ def bin_and_blend(
     projected: torch.Tensor, tile_counts: torch.Tensor, backgrounds: torch.Tensor, settings: Pass,
     memory: InstanceMemory = AS_NEEDED, colors: torch.Tensor | None = None,
 ) -> Images:  # fmt: skip
-    """Bin and blend projected Gaussians [C, N, 12]; ``colors`` as in `images_of`."""
+    """Bin and blend projected Gaussians [C, N, 12]; ``colors`` as in `blend`."""
     tiles = bin_tiles(projected, tile_counts, settings, memory, needs_slots((projected, backgrounds, colors)))
-    return images_of(projected, tiles, backgrounds, settings, colors)
+    return blending.blend(projected, tiles, backgrounds, settings, colors)
 
 
 def needs_slots(tensors: Iterable[torch.Tensor | None]) -> bool:
     """Return whether autograd is on and one of the tensors, of any shape [...], requires gradients."""
     return torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in tensors)
-
-
-def images_of(
-    projected: torch.Tensor, tiles: Tiles, backgrounds: torch.Tensor, settings: Pass, colors: torch.Tensor | None = None
-) -> Images:
-    """Return the images of binned Gaussians: in their own colours, or in channels [1, N, D] or [C, N, D] of ``colors``."""
-    if colors is None:
-        return blend(projected, tiles, backgrounds, settings)
-    return blend_channels(projected, tiles, colors, backgrounds, settings)
 
 
 def further_of(projected: torch.Tensor, tiles: Tiles, settings: Pass, weights: bool, median: bool, k: int) -> Tensors:

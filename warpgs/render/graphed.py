@@ -23,7 +23,6 @@ from warpgs.kernels.cameras import CAMERA_MODELS
 from warpgs.kernels.ellipse import ProjectInputs
 from warpgs.kernels.falloff import Pass
 from warpgs.kernels.graphs import MIN_REPLAYS, Allocator, GraphedFunction, GraphPool, fetch
-from warpgs.kernels.launch import first_order, keep, kept
 from warpgs.kernels.tiles import BYTES_PER_INSTANCE, InstanceMemory, Tiles, grid, running_counts, split_sum, sums_fit
 from warpgs.means2d import count_passes
 from warpgs.render.compose import composite_into
@@ -69,10 +68,7 @@ class GraphedRasterizer:
         )
         self._sums: torch.Tensor | None = None
         self._no_factors = torch.empty(0, dtype=torch.float32, device=self.device)
-
-    @functools.cached_property
-    def _black(self) -> torch.Tensor:
-        return torch.zeros(self.cameras, 3, dtype=torch.float32, device=self.device)
+        self._black = torch.zeros(cameras, 3, dtype=torch.float32, device=self.device)
 
     def render(self, inputs: ProjectInputs, backgrounds: torch.Tensor | None):
         """Return images, projected Gaussians [C, N, 12] and tile counts [C, N]; None if the call exceeds the capacity."""
@@ -142,8 +138,7 @@ class GraphedRasterizer:
         (v_projected,), _ = self._backward_blend(*saved, *v_images)
         if not wants_backgrounds:
             return v_projected, None
-        transmittances = self._forward_blend.saved(saved[5])[6]
-        return v_projected, blend.background_gradient(transmittances, v_images[0])
+        return v_projected, blend.background_gradient(self._forward_blend.saved(saved[5])[6], v_images[0])
 
     def project_gradients(self, saved: tuple[torch.Tensor, ...], v_projected: torch.Tensor | None, wants_camera: bool):
         """Return the gradients of the seven tensors that `project` takes, in their shapes [...]."""
@@ -160,17 +155,17 @@ class _Projected(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, rasterizer, cameras, projection, passes, *inputs):
-        keep(ctx, *inputs[:5], cameras, *projection)  # viewmats and Ks are in cameras
+        launch.keep(ctx, *inputs[:5], cameras, *projection)  # viewmats and Ks are in cameras
         ctx.rasterizer, ctx.passes = rasterizer, passes
         ctx.set_materialize_grads(False)
         return projection[0]
 
     @staticmethod
-    @first_order
+    @launch.first_order
     def backward(ctx, v_projected):
         ctx.passes.append(True)
         wants_camera = ctx.needs_input_grad[9] or ctx.needs_input_grad[10]  # viewmats and Ks
-        return None, None, None, None, *ctx.rasterizer.project_gradients(kept(ctx), v_projected, wants_camera)
+        return None, None, None, None, *ctx.rasterizer.project_gradients(launch.kept(ctx), v_projected, wants_camera)
 
 
 class _Blended(torch.autograd.Function):
@@ -179,16 +174,16 @@ class _Blended(torch.autograd.Function):
     @staticmethod
     def forward(ctx, projected, backgrounds, rasterizer, counts, images, block, passes):
         rgb, _, depth = images
-        keep(ctx, projected, counts, backgrounds, rgb, depth, block)
+        launch.keep(ctx, projected, counts, backgrounds, rgb, depth, block)
         ctx.rasterizer, ctx.passes = rasterizer, passes
         ctx.set_materialize_grads(False)
         return tuple(images)
 
     @staticmethod
-    @first_order
+    @launch.first_order
     def backward(ctx, *v_images):
         ctx.passes.append(True)
-        found = ctx.rasterizer.blend_gradients(kept(ctx), v_images, ctx.needs_input_grad[1])
+        found = ctx.rasterizer.blend_gradients(launch.kept(ctx), v_images, ctx.needs_input_grad[1])
         return *found, None, None, None, None, None
 
 
@@ -306,8 +301,7 @@ _RECORDERS: dict[tuple[torch.device, int, bool], Recorder] = {}
 def recorder(device: torch.device, gradients: bool = True) -> Recorder:
     """Return the recorder of torch's current stream on a CUDA device, for calls with or without ``gradients``."""
     key = (device, launch.warp_stream(device).cuda_stream, gradients)
-    found = _RECORDERS.get(key)
-    return found or _RECORDERS.setdefault(key, Recorder(GraphPool(device), gradients))
+    return _RECORDERS.get(key) or _RECORDERS.setdefault(key, Recorder(GraphPool(device), gradients))
 
 
 def clear_graph_cache() -> None:

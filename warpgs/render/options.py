@@ -137,9 +137,8 @@ class RasterizeOptions:
             value = getattr(self, name)
             if value is not None and (isinstance(value, bool) or not isinstance(value, Real)):
                 raise UsageError(f"{name} must be a number, not {value!r}")
-        if self.window is not None and not (
-            isinstance(self.window, (tuple, list)) and len(self.window) == 4 and all(map(_is_whole, self.window))
-        ):
+        four = isinstance(self.window, (tuple, list)) and len(self.window) == 4 and all(map(_is_whole, self.window))
+        if self.window is not None and not four:
             raise UsageError(f"window must be four whole numbers, not {self.window!r}")
         if self.tile_size not in TILE_SIZES:
             raise UsageError(f"tile size {self.tile_size} is not one of {', '.join(map(str, TILE_SIZES))}")

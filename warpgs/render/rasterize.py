@@ -10,16 +10,17 @@ from typing import Any, overload
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from warpgs.constants import K_TOLERANCE, POSE_TOLERANCE
-from warpgs.device import available_bytes, installed_bytes
+from warpgs.device import free_for
 from warpgs.errors import ResourceError, UsageError
 from warpgs.kernels import launch
+from warpgs.kernels.blend import blend
 from warpgs.kernels.blend_cuda import image_tile
 from warpgs.kernels.cameras import check_camera
 from warpgs.kernels.ellipse import ProjectInputs
 from warpgs.kernels.falloff import WIDTHS, Pass
-from warpgs.kernels.launch import refuse_transforms, without_gradient
 from warpgs.kernels.project import project_inputs
 from warpgs.kernels.tiles import BYTES_PER_INSTANCE, InstanceMemory, bin_tiles, grid
 from warpgs.means2d import count_passes
@@ -63,10 +64,10 @@ def check_arrays(camera: Camera) -> None:
 
 def _check_type(name: str, array: Any) -> None:
     """Raise TypeError where a value is not a dense array of real numbers, and ValueError for a device without kernels."""
-    if not isinstance(array, (np.ndarray, torch.Tensor)):
+    if not isinstance(array, (np.ndarray, Tensor)):
         raise TypeError(f"camera.{name} must be a numpy array or a tensor, not {type(array).__name__}; give numpy.array(...)")
     kind = str(array.dtype).removeprefix("torch.")
-    if isinstance(array, torch.Tensor):
+    if isinstance(array, Tensor):
         launch.check_device(f"camera.{name}", array)
         if array.layout != torch.strided:
             raise TypeError(f"camera.{name} must be dense, not {array.layout}; camera.{name}.to_dense() converts it")
@@ -108,10 +109,10 @@ INTEGERS = (torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64)
 """Types of pixel coordinates."""
 
 
-def checked_pixels(pixels: torch.Tensor, cameras: int, device: torch.device) -> torch.Tensor:
+def checked_pixels(pixels: Tensor, cameras: int, device: torch.device) -> Tensor:
     """Return pixels [P, 2] or [C, P, 2] of C cameras as int64 on a device, shape [1, P, 2] or [C, P, 2]."""
-    if not isinstance(pixels, torch.Tensor) or pixels.dtype not in INTEGERS:
-        found = pixels.dtype if isinstance(pixels, torch.Tensor) else type(pixels).__name__
+    if not isinstance(pixels, Tensor) or pixels.dtype not in INTEGERS:
+        found = pixels.dtype if isinstance(pixels, Tensor) else type(pixels).__name__
         raise TypeError(f"pixels must be a tensor of whole numbers, not {found}: columns and rows, from 0 at the upper left")
     if pixels.layout != torch.strided:
         raise TypeError(f"pixels must be dense, not {pixels.layout}; pixels.to_dense() converts them")
@@ -121,7 +122,7 @@ def checked_pixels(pixels: torch.Tensor, cameras: int, device: torch.device) -> 
     return found if found.ndim == 3 else found[None]
 
 
-def window_of(pixels: torch.Tensor, camera: Camera, tile_size: int) -> Window:
+def window_of(pixels: Tensor, camera: Camera, tile_size: int) -> Window:
     """Return the smallest window of whole tiles that holds pixels [..., P, 2]; the pixels are read from the device."""
     if not pixels.shape[-2]:
         return 0, 0, min(tile_size, camera.width), min(tile_size, camera.height)
@@ -131,11 +132,10 @@ def window_of(pixels: torch.Tensor, camera: Camera, tile_size: int) -> Window:
         raise ValueError(f"pixels in columns {left}-{right}, rows {top}-{bottom} leave the {camera.width} x {camera.height} px")
     x, y = left // tile_size * tile_size, top // tile_size * tile_size
     width = min((right // tile_size + 1) * tile_size, camera.width) - x
-    height = min((bottom // tile_size + 1) * tile_size, camera.height) - y
-    return x, y, width, height
+    return x, y, width, min((bottom // tile_size + 1) * tile_size, camera.height) - y
 
 
-def listed_tiles(pixels: torch.Tensor, settings: Pass, cameras: int) -> torch.Tensor:
+def listed_tiles(pixels: Tensor, settings: Pass, cameras: int) -> Tensor:
     """Return a mask [T] over the tiles of C cameras, for `bin_tiles`: True where one of ``pixels`` [1 or C, P, 2] is inside."""
     (x, y, width, height), size = settings.window, settings.tile_size
     columns, rows = grid(width, height, size)
@@ -146,7 +146,7 @@ def listed_tiles(pixels: torch.Tensor, settings: Pass, cameras: int) -> torch.Te
     return listed
 
 
-def at_pixels(image: torch.Tensor, pixels: torch.Tensor, window: Window) -> torch.Tensor:
+def at_pixels(image: Tensor, pixels: Tensor, window: Window) -> Tensor:
     """Read a window's images [C, H, W, ...] at pixels [1, P, 2] or [C, P, 2]; return values [C, P, ...]. Differentiable."""
     cameras = torch.arange(len(image), device=image.device)[:, None]
     return image[cameras, pixels[..., 1] - window[1], pixels[..., 0] - window[0]]
@@ -211,7 +211,7 @@ def _check_activated(gaussians: RasterizedGaussians) -> None:
 
 def _check_tensor(name: str, value: Any) -> None:
     """Raise TypeError where a value is not a tensor, and ValueError for a device without kernels."""
-    if not isinstance(value, torch.Tensor):
+    if not isinstance(value, Tensor):
         raise TypeError(f"{name} must be a tensor, not {type(value).__name__}; torch.as_tensor makes one")
     launch.check_device(name, value)
 
@@ -230,11 +230,11 @@ def _checked_window(camera: Camera, options: RasterizeOptions) -> Window:
     return x, y, w, h
 
 
-def _checked_channels(name: str, values: torch.Tensor | None, inputs: ProjectInputs) -> torch.Tensor | None:
+def _checked_channels(name: str, values: Tensor | None, inputs: ProjectInputs) -> Tensor | None:
     """Return channels, given as [N, D] or [C, N, D], in shape [1, N, D] or [C, N, D]."""
     if values is None:
         return None
-    pattern = "C N D" if isinstance(values, torch.Tensor) and values.ndim == 3 else "N D"
+    pattern = "C N D" if isinstance(values, Tensor) and values.ndim == 3 else "N D"
     if pattern == "C N D" and name == "colors" and len(values) == len(inputs.means) != len(inputs.viewmats):
         found = list(values.shape)
         raise ValueError(f"colors {found} are neither [N, D] nor [C, N, D]: give spherical harmonics as sh of the Gaussians")
@@ -244,14 +244,12 @@ def _checked_channels(name: str, values: torch.Tensor | None, inputs: ProjectInp
     return values if values.ndim == 3 else values[None]
 
 
-def _check_memory(window: Window, layers: list[Layer], heaviest: int, like: torch.Tensor) -> None:
+def _check_memory(window: Window, layers: list[Layer], heaviest: int, like: Tensor) -> None:
     """Raise ResourceError where the images [C, H, W, D] of the layers need more memory than the device of ``like`` has free."""
-    channels = sum(backgrounds.shape[1] + 4 for _, backgrounds in layers)  # and alpha, depth, transmittance, sum of weights
-    channels += 2 * heaviest
+    # and alpha, depth, transmittance, sum of weights
+    channels = sum(backgrounds.shape[1] + 4 for _, backgrounds in layers) + 2 * heaviest
     needed = len(layers[0][1]) * window[2] * window[3] * channels * like.element_size()
-    if needed < installed_bytes(like.device) // 20:  # a query of the free memory takes 0.1 ms
-        return
-    free = available_bytes(like.device)
+    free = free_for(needed, like.device)
     if needed > free:
         raise ResourceError(
             f"images of {window[2]} x {window[3]} px need {needed:,} bytes, and {free:,} are free on {like.device}: render "
@@ -259,18 +257,18 @@ def _check_memory(window: Window, layers: list[Layer], heaviest: int, like: torc
         )
 
 
-Layer = tuple[torch.Tensor | None, torch.Tensor]
+Layer = tuple[Tensor | None, Tensor]
 """Values that are blended into one image: channels of each Gaussian [1, N, D] or [C, N, D], None for the spherical harmonics;
 and backgrounds [C, D]."""
 
 
-def _as_tensor(values: Any) -> torch.Tensor:
+def _as_tensor(values: Any) -> Tensor:
     """Return numbers as a tensor, where they are or on the CPU, whatever torch's default device; an array is copied."""
     values = values.copy() if isinstance(values, np.ndarray) else values
     return torch.as_tensor(values, device=getattr(values, "device", "cpu"))
 
 
-def _layer(name: str, background: Any, colors: torch.Tensor | None, inputs: ProjectInputs) -> Layer:
+def _layer(name: str, background: Any, colors: Tensor | None, inputs: ProjectInputs) -> Layer:
     """Return channels [..., D] with their background (one, a batch, or None for zeros); ``name`` is the background's option."""
     channels, like = 3 if colors is None else colors.shape[-1], inputs.viewmats
     if background is None:  # outside of the try block: a full GPU is not a wrong background
@@ -346,15 +344,13 @@ def rasterize(
 
 def _render(gaussians: RasterizedGaussians, camera: Camera, options: RasterizeOptions) -> Render:
     """Return what `rasterize` returns for one camera or a batch [C, ...] of them."""
-    refuse_transforms()
+    launch.refuse_transforms()
     _check_arguments(gaussians, camera, options)
     check_camera(camera)
     inputs = compose.inputs_of(gaussians, camera, options.opacity_factors)
     degree = gaussians.sh_degree if options.sh_degree is None else options.sh_degree
     degree = degree if options.colors is None else 0  # unused harmonics: read as few as possible
-    pixels = None
-    if options.pixels is not None:
-        pixels = checked_pixels(options.pixels, len(inputs.viewmats), inputs.means.device)
+    pixels = None if options.pixels is None else checked_pixels(options.pixels, len(inputs.viewmats), inputs.means.device)
     window = _checked_window(camera, options) if pixels is None else window_of(pixels, camera, options.tile_size)
     shared = {n: getattr(options, n) for n in ("tile_size", "absgrad", "antialiased", "deterministic")}
     settings = compose.pass_of(
@@ -365,7 +361,7 @@ def _render(gaussians: RasterizedGaussians, camera: Camera, options: RasterizeOp
     if options.absgrad and (features is not None or (colors is not None and colors.shape[-1] > WIDTHS[-1])):
         raise UsageError(f"absgrad takes at most {WIDTHS[-1]} channels of colors and no features: render more in a second call")
     if options.max_error is not None:
-        if compose.needs_slots(t for t in (*inputs, options.background) if isinstance(t, torch.Tensor)):
+        if compose.needs_slots(t for t in (*inputs, options.background) if isinstance(t, Tensor)):
             raise UsageError("max_error renders without gradients: call rasterize under torch.no_grad(), or leave it out")
         settings = replace(settings, max_error=float(options.max_error))
         if inputs.means.is_cuda and inputs.means.dtype == torch.float32:
@@ -393,18 +389,17 @@ def _render(gaussians: RasterizedGaussians, camera: Camera, options: RasterizeOp
     refusing: dict[str, Any] = {}
     for name in WITHOUT_GRADIENT:  # a gradient through an output that has none becomes an error
         if (values := getattr(render, name)) is not None:
-            source = render.rgb if name == "error_bound" else render.projected
-            refusing[name] = without_gradient(name, values, source)
+            refusing[name] = launch.without_gradient(name, values, render.rgb if name == "error_bound" else render.projected)
     return replace(render, **refusing)
 
 
 @torch.no_grad()
-def _error_bound(rgb: torch.Tensor, gaussians: RasterizedGaussians, camera: Camera, options: RasterizeOptions) -> torch.Tensor:
+def _error_bound(rgb: Tensor, gaussians: RasterizedGaussians, camera: Camera, options: RasterizeOptions) -> Tensor:
     """Return a bound [..., H, W] on the error of colours [..., H, W, D]; see `RasterizeOptions.error_bound`."""
 
     def doubled(holder: Any) -> dict[str, Any]:
         values = {f.name: getattr(holder, f.name) for f in fields(holder)}
-        return {n: v.double() if isinstance(v, torch.Tensor) and v.is_floating_point() else v for n, v in values.items()}
+        return {n: v.double() if isinstance(v, Tensor) and v.is_floating_point() else v for n, v in values.items()}
 
     only_rgb: dict[str, Any] = {"features": None, "feature_background": None, "contributions": False, "median_depth": False}
     only_rgb |= {"heaviest": 0, "absgrad": False}
@@ -418,7 +413,7 @@ def _error_bound(rgb: torch.Tensor, gaussians: RasterizedGaussians, camera: Came
 
 
 def _rasterize(
-    inputs: ProjectInputs, layers: list[Layer], settings: Pass, options: RasterizeOptions, pixels: torch.Tensor | None
+    inputs: ProjectInputs, layers: list[Layer], settings: Pass, options: RasterizeOptions, pixels: Tensor | None
 ) -> tuple[Any, ...]:
     """Return images, projected Gaussians [C, N, 12], tile counts [C, N], and the further fields of `Render` by name."""
     projected, tile_counts = project_inputs(inputs, settings)
@@ -427,16 +422,16 @@ def _rasterize(
     if most is not None and budget is not None:
         most = min(most, budget // BYTES_PER_INSTANCE)
     if most is not None and int(tile_counts.sum()) > most:
-        frame = settings, most, inputs, InstanceMemory(budget)
-        images = [blend_chunked(projected, backgrounds, *frame, colors) for colors, backgrounds in layers]
-        maps = further_chunked(projected, *frame, *further) if any(further) else {}
+        memory, own = InstanceMemory(budget), inputs.detached()
+        images = [blend_chunked(projected, behind, colors, settings, most, memory, *own) for colors, behind in layers]
+        maps = further_chunked(projected, settings, most, own, memory, *further) if any(further) else {}
     else:
         overflow = None if options.capacity is None else torch.zeros(1, dtype=torch.int32, device=projected.device)
         memory = InstanceMemory(budget, options.capacity, overflow)
         slotted = options.contributions or compose.needs_slots([projected, *(t for layer in layers for t in layer)])
         listed = None if pixels is None else listed_tiles(pixels, settings, len(projected))
         tiles = bin_tiles(projected, tile_counts, settings, memory, slotted, listed)
-        images = [compose.images_of(projected, tiles, backgrounds, settings, colors) for colors, backgrounds in layers]
+        images = [blend(projected, tiles, backgrounds, settings, colors) for colors, backgrounds in layers]
         maps = compose.further_of(projected, tiles, settings, *further)
         if overflow is not None:
             maps["overflow"] = overflow
@@ -445,9 +440,7 @@ def _rasterize(
     return images[0], projected, tile_counts, maps
 
 
-def _as_render(
-    camera: Camera, images: Sequence[torch.Tensor], projected: torch.Tensor, tile_counts: torch.Tensor, **maps: Any
-) -> Render:
+def _as_render(camera: Camera, images: Sequence[Tensor], projected: Tensor, tile_counts: Tensor, **maps: Any) -> Render:
     """Return the render, with images [C, H, W, ...] that have no leading axis for a single camera."""
     if len(camera.viewmat.shape) == 2:  # not image[0], whose gradient would be a copy among zeros
         images = [image.squeeze(0) for image in images]
@@ -462,7 +455,7 @@ FASTEST_FIRST = ("fast", "balanced", "exact")
 """Rules to choose from; each skips all that the next one skips, and more."""
 DEFAULTS = RasterizeOptions()
 """Default options."""
-MEASURES: dict[str, Callable[[torch.Tensor], torch.Tensor]] = {"mean": torch.mean, "max": torch.amax}
+MEASURES: dict[str, Callable[[Tensor], Tensor]] = {"mean": torch.mean, "max": torch.amax}
 """Reductions over the pixels of a view, by name."""
 
 

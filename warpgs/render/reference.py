@@ -1,10 +1,10 @@
 """Reference image of rule ``exact`` in float64, computed without the kernels: errors are measured against it."""
 
 import torch
+from torch import Tensor
 
 from warpgs import geometry
 from warpgs.constants import FRUSTUM_MARGIN, RULES
-from warpgs.geometry import rotation_matrices
 from warpgs.kernels import sh
 from warpgs.scene import Camera, Gaussians
 
@@ -12,7 +12,7 @@ BLOCK = 16
 """Side of the blocks of pixels that are composited at a time [px]."""
 
 
-Ellipses = tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]
+Ellipses = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
 """The visible Gaussians in the image, from front to back: projected means [N, 2] [px]; half sides [N, 2] [px] of the box that
 holds every pixel with alpha at or above the cut-off; factors [N, 3] of dx^2, dx dy and dy^2 in the exponent; opacities [N]; and
 colours [N, 3]."""
@@ -34,7 +34,7 @@ def _project(gaussians: Gaussians, camera: Camera, degree: int, antialiased: boo
     visible = visible[torch.argsort(depths[visible], stable=True)]
     positions, opacities = positions[visible], opacities[visible]
     pixels, jacobians = _pixels(camera, K, lens, positions)
-    axes = jacobians @ rotation @ rotation_matrices(unit[visible]) @ torch.diag_embed(log_scales[visible].exp())
+    axes = jacobians @ rotation @ geometry.rotation_matrices(unit[visible]) @ torch.diag_embed(log_scales[visible].exp())
     covariances = axes @ axes.mT + rule.low_pass * torch.eye(2, dtype=torch.float64, device=means.device)
     if antialiased:
         opacities = opacities * (torch.linalg.det(axes @ axes.mT).clamp_min(0) / torch.linalg.det(covariances)).sqrt()
@@ -45,18 +45,15 @@ def _project(gaussians: Gaussians, camera: Camera, degree: int, antialiased: boo
     colors = torch.einsum("nk,nkc->nc", sh.basis(directions)[:, :count], coefficients[visible, :count])
     colors = (colors + 0.5).clamp_min(0)
     reach = torch.sqrt(2 * torch.log(opacities / rule.alpha_cut))[:, None] + 0.01  # slightly beyond alpha = cut
-    half = reach * torch.sqrt(torch.diagonal(covariances, dim1=-2, dim2=-1))
-    return pixels, half, factors, opacities, colors
+    return pixels, reach * torch.sqrt(torch.diagonal(covariances, dim1=-2, dim2=-1)), factors, opacities, colors
 
 
-def _pixels(
-    camera: Camera, K: torch.Tensor, lens: torch.Tensor | None, positions: torch.Tensor
-) -> tuple[torch.Tensor, torch.Tensor]:
+def _pixels(camera: Camera, K: Tensor, lens: Tensor | None, positions: Tensor) -> tuple[Tensor, Tensor]:
     """Return projected positions [px], shape [N, 2], of ``positions`` [N, 3] in camera axes, and the Jacobians [N, 2, 3]."""
     z, focal, center = positions[:, 2:], torch.stack([K[0, 0], K[1, 1]]), K[:2, 2]
     size = torch.tensor([camera.width, camera.height], dtype=torch.float64, device=K.device)
 
-    def clamped(pixels: torch.Tensor) -> torch.Tensor:
+    def clamped(pixels: Tensor) -> Tensor:
         return torch.minimum(torch.maximum(pixels, -FRUSTUM_MARGIN * size), (1 + FRUSTUM_MARGIN) * size)
 
     if camera.model == "pinhole":
@@ -75,7 +72,7 @@ def _pixels(
     return pixels, focal[:, None] * torch.stack(rows, 1)
 
 
-def _block(g: Ellipses, corner: torch.Tensor, size: tuple[int, int], steps: torch.Tensor, background: torch.Tensor):
+def _block(g: Ellipses, corner: Tensor, size: tuple[int, int], steps: Tensor, background: Tensor):
     """Return the colours [w * h, 3] of a block of ``size`` w x h, by rows; ``steps`` are offsets of pixel centres."""
     rule, (w, h), (pixels, half, factors, opacities, colors) = RULES["exact"], size, g
     extent = torch.tensor([w, h], dtype=torch.float64, device=corner.device)
@@ -85,17 +82,16 @@ def _block(g: Ellipses, corner: torch.Tensor, size: tuple[int, int], steps: torc
     power = (A * dx * dx)[:, None] + (B * dy)[..., None] * dx[:, None] + (C * dy * dy)[..., None]
     alpha = opacities[near, None] * torch.exp(power.flatten(1))
     alpha = torch.where(alpha >= rule.alpha_cut, alpha.clamp_max(rule.alpha_max), 0.0)
-    after = torch.cumprod(1 - alpha, 0)
-    before = torch.cat([torch.ones_like(alpha[:1]), after[:-1]])
+    before = torch.cat([torch.ones_like(alpha[:1]), torch.cumprod(1 - alpha, 0)[:-1]])
     weights = torch.where(before >= rule.transmittance_stop, alpha * before, 0.0)
     return weights.T @ colors[near] + (1 - weights.sum(0))[:, None] * background.double()
 
 
 @torch.no_grad()
 def reference_image(
-    gaussians: Gaussians, camera: Camera, window: tuple[int, int, int, int], background: torch.Tensor, degree: int,
+    gaussians: Gaussians, camera: Camera, window: tuple[int, int, int, int], background: Tensor, degree: int,
     antialiased: bool = False,
-) -> torch.Tensor:  # fmt: skip
+) -> Tensor:  # fmt: skip
     """Return the colours [h, w, 3] in a window [px] of one image under rule ``exact``, in float64, not clamped."""
     geometry.check_known(camera.model)
     g, device = _project(gaussians, camera, degree, antialiased), gaussians.means.device

@@ -137,7 +137,7 @@ def test_a_batch_of_one_view_is_a_step_of_one_view():
     views = photos(3)
     one, batch = (Trainer(views, seeds(61), METHOD, CPU, priors=priors(views)) for _ in range(2))
     t = batch.taker
-    batch.taker = BatchSteps(t.table, t.views, t.strategy, t.cameras, t.options, t.dropout_seed, Tree(1, ALONE))
+    batch.taker = BatchSteps(t.table, t.views, t.strategy, t.cameras, t.options, t.dropout_seed, tree=Tree(1, ALONE))
     advanced(one, 24), advanced(batch, 24)
     assert len(one.strategy.events) > 1 and same_bits(one, batch)
 

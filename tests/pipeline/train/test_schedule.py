@@ -302,7 +302,7 @@ def test_any_strategy_is_stopped(strategy):
     assert (count > early.measurements[-1]["count"]) == (strategy == "sampling")
     while fit.step < fit.steps:
         assert fit.advance()[0].count == count
-    assert fit.progress(fit.steps) == pytest.approx(1.0)
+    assert fit.phases.progress(fit.steps) == pytest.approx(1.0)
     c = complexity(fit)
     assert c["held_out"] and c["count"] == count and c["ended"] == at
     assert c["marginal_db"] == c["measurements"][-1]["gain"]

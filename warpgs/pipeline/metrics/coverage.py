@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch.nn.functional import interpolate
 
 from warpgs.constants import NEAR
 from warpgs.device import in_background
@@ -49,7 +48,7 @@ def depth_views(
         depth = torch.where(alpha >= MIN_ALPHA, depth, 0)
         if mask is not None:
             counts = torch.as_tensor(mask, dtype=torch.float32, device=depth.device)[None, None]
-            depth = torch.where(interpolate(counts, depth.shape, mode="area")[0, 0] > 0.5, depth, 0)
+            depth = torch.where(torch.nn.functional.interpolate(counts, depth.shape, mode="area")[0, 0] > 0.5, depth, 0)
         views.append((small, depth))
     return views
 
@@ -135,15 +134,13 @@ def photo_errors(train: Sequence[View], training: Sequence[DepthView]) -> np.nda
         return None
     errors = np.divide(total, count, out=np.full(len(BINS), np.nan), where=count > 0)
     known = np.flatnonzero(count)
-    filled: np.ndarray = errors[known[np.maximum(np.searchsorted(known, np.arange(len(BINS)), "right") - 1, 0)]]
-    return filled
+    return errors[known[np.maximum(np.searchsorted(known, np.arange(len(BINS)), "right") - 1, 0)]]
 
 
 def _bin(difference: torch.Tensor) -> np.ndarray:
     """Return the class of `BINS` of each difference, uint8."""
     bounds = torch.tensor(BINS, dtype=torch.float32, device=difference.device)
-    classes: np.ndarray = torch.bucketize(difference, bounds, out_int32=True).to(torch.uint8).cpu().numpy()
-    return classes
+    return torch.bucketize(difference, bounds, out_int32=True).to(torch.uint8).cpu().numpy()
 
 
 def _photo(view: View, depth: torch.Tensor) -> torch.Tensor:
@@ -151,7 +148,7 @@ def _photo(view: View, depth: torch.Tensor) -> torch.Tensor:
     image = torch.as_tensor(without_masked(view).image, dtype=torch.float32, device=depth.device)
     if image.shape[:2] == depth.shape:
         return image
-    return interpolate(image.permute(2, 0, 1)[None], depth.shape, mode="area")[0].permute(1, 2, 0)
+    return torch.nn.functional.interpolate(image.permute(2, 0, 1)[None], depth.shape, mode="area")[0].permute(1, 2, 0)
 
 
 def _sampled(image: torch.Tensor, u: torch.Tensor, v: torch.Tensor) -> torch.Tensor:
@@ -234,8 +231,7 @@ def coverage_of_run(
 
     sums = in_background(finish, covered())
     views = [{"name": v.name, "classes": _row(own, errors is not None)} for v, own in zip(test, sums)]
-    total = {c: sum((own[c] for own in sums), np.zeros(4)) for c in CLASSES}
-    pooled = _row(total, errors is not None)
+    pooled = _row({c: sum((own[c] for own in sums), np.zeros(4)) for c in CLASSES}, errors is not None)
     unseen = pooled.get("0")
     summary = "every held-out pixel was seen by a training view"
     if unseen:

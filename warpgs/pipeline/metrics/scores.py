@@ -124,9 +124,8 @@ class ViewMetrics:
     def row(self) -> dict[str, Any]:
         """Return all scores by name, flat, as in result files."""
         row: dict[str, Any] = asdict(self)
-        for scores in (row.pop("opacity"), row.pop("lpips")):
-            row |= scores
-        return row
+        opacity, lpips = row.pop("opacity"), row.pop("lpips")
+        return {**row, **opacity, **lpips}
 
 
 def to_8_bit(image: np.ndarray) -> np.ndarray:
@@ -379,14 +378,12 @@ def _reduced(view: View, rgb: np.ndarray, depth: np.ndarray, alpha: np.ndarray) 
     shrink = min(1.0, (MAX_PIXELS / (c.width * c.height)) ** 0.5)
     size = width, height = max(1, int(c.width * shrink)), max(1, int(c.height * shrink))
     photo, mask = without_masked(view).image, np.ones(alpha.shape) if view.mask is None else view.mask
-    colors = (photo, np.clip(rgb, 0, 1))
-    image, rgb = (cv2.resize(a.astype(np.float32), size, interpolation=cv2.INTER_AREA) for a in colors)
+    image, rgb = (cv2.resize(a.astype(np.float32), size, interpolation=cv2.INTER_AREA) for a in (photo, np.clip(rgb, 0, 1)))
     depth, alpha, mask = (cv2.resize(a.astype(np.float32), size, interpolation=cv2.INTER_NEAREST) for a in (depth, alpha, mask))
     around = np.ones((3, 3), np.uint8)
     beyond = np.maximum(np.maximum(cv2.erode(image, around) - rgb, rgb - cv2.dilate(image, around)), 0).mean(-1)
     side = max(3, round(width / SMOOTHING) | 1)
-    K = np.diag([width / c.width, height / c.height, 1]) @ c.K
-    small = replace(c, K=K, width=width, height=height)
+    small = replace(c, K=np.diag([width / c.width, height / c.height, 1]) @ c.K, width=width, height=height)
     return small, cv2.blur(beyond, (side, side)), depth, (alpha > 0.5) & (depth > 0) & (mask > 0)
 
 
@@ -436,8 +433,7 @@ def moved_fractions(views: Sequence[View], renders: Iterable[tuple[np.ndarray, n
         return round(float(areas[areas >= MIN_AREA].sum()), 4)
 
     compared = [i for i, m in enumerate(misfits) if usual <= HIGH_MISFIT and m <= MAX_MISFIT * max(usual, LOW_MISFIT)]
-    found = in_background(fraction, ((i,) for i in compared))
-    for i, value in zip(compared, found):
+    for i, value in zip(compared, in_background(fraction, ((i,) for i in compared))):
         fractions[i] = value
     return fractions
 

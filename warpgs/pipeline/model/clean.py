@@ -83,8 +83,7 @@ def in_colors(gaussians: Gaussians, found: Tensors) -> Gaussians:
     """Return Gaussians with those of each mask [N] in the colour of its reason, no fainter and no larger than can be seen."""
     means, quats, log_scales, logits, sh = (t.clone() for t in gaussians.tensors().values())
     for reason, where in found.items():
-        color = means.new_tensor(REASONS[reason][2]) / 255
-        sh[where], sh[where, 0] = 0.0, base_coefficients(color)
+        sh[where], sh[where, 0] = 0.0, base_coefficients(means.new_tensor(REASONS[reason][2]) / 255)
         logits[where] = logits[where].clamp(min=logit(SHOWN_OPACITY))
         log_scales[where] = log_scales[where].clamp(max=math.log(SHOWN_SIZE * size_of(gaussians)))
     return Gaussians(means, quats, log_scales, logits, sh)

@@ -59,9 +59,8 @@ def merge_cells(points: Parts, widths: Parts, cell: float = 1.0) -> list[np.ndar
     ones) lie on grids of unequal fineness, so every cell is a few pixels wide.
     """
     cells = [np.zeros(len(p), np.int64) for p in points]
-    chunks = [
-        [array[k : k + CHUNK] for array in part] for part in zip(points, widths, cells) for k in range(0, len(part[0]), CHUNK)
-    ]
+    parts = [*zip(points, widths, cells)]
+    chunks = [[array[k : k + CHUNK] for array in part] for part in parts for k in range(0, len(part[0]), CHUNK)]
 
     def grid(points: np.ndarray, widths: np.ndarray) -> list[np.ndarray]:  # [N] each: the level, and three coordinates in it
         level = np.round(np.log2(cell * widths)).astype(np.int64)
@@ -227,8 +226,7 @@ def _elsewhere(
     for rank in ranks[: len(points)]:
         free[rank] = False
     alone = [free[rank] for rank in ranks[len(points) :]]
-    kept = ([p[a] for p, a in zip(parts, alone)] for parts in (more, colors, cells[len(points) :]))
-    return merge(*kept), alone
+    return merge(*([p[a] for p, a in zip(parts, alone)] for parts in (more, colors, cells[len(points) :]))), alone
 
 
 # Extrapolated points where no view looks: beyond the images, and behind the near side of depth edges.
@@ -283,8 +281,7 @@ def _beyond(views: Sequence[View], i: int, depth: np.ndarray) -> PointCloud:
     down, across = (np.arange(BEYOND_PX // 2 - pad, n + pad, BEYOND_PX) for n in (height, width))
     inverse = _mean_around(1 / depth, DEPTH_PX, down, across)
     image = _mean_around(view.image, COLOR_PX, down, across)
-    outside = ((down < 0) | (down >= height))[:, None] | (across < 0) | (across >= width)
-    rows, columns = np.nonzero(outside)
+    rows, columns = np.nonzero(((down < 0) | (down >= height))[:, None] | (across < 0) | (across >= width))
     pixels = np.stack([across[columns], down[rows]], 1) + 0.5
     points = geometry.back_project(view.camera, pixels, 1 / inverse[rows, columns].astype(float))
     unseen = ~np.any([geometry.in_image(v.camera, points) for v in views], axis=0)
@@ -310,8 +307,7 @@ def _behind(views: Sequence[View], i: int, depth: np.ndarray, confirmed: Sequenc
     rows, columns = np.mgrid[BEHIND_PX // 2 : depth.shape[0] : BEHIND_PX, BEHIND_PX // 2 : depth.shape[1] : BEHIND_PX]
     hidden = far[rows, columns] > EDGE * depth[rows, columns]
     rows, columns = rows[hidden], columns[hidden]
-    pixels = np.stack([columns, rows], 1) + 0.5
-    points = geometry.back_project(view.camera, pixels, far[rows, columns].astype(float))
+    points = geometry.back_project(view.camera, np.stack([columns, rows], 1) + 0.5, far[rows, columns].astype(float))
     image = _mean_around(view.image, BEHIND_COLOR_PX, *map(np.arange, depth.shape)).reshape(-1, 3)
     keep = ~in_free_space(points, views, confirmed, i)
     return PointCloud(points[keep], image[source[rows, columns]][keep].astype(np.float32))
@@ -435,8 +431,7 @@ def _surface(cells: np.ndarray, half: float, shapes: Sequence[Silhouette]) -> np
         inside[at] += full | ~there
         seen[at] += there
         at = at[empty[at] <= len(shapes) // TOLERANT]
-    kept = (seen[at] >= max(2.0, SEEN * len(shapes))) & (inside[at] < len(shapes))
-    return cells[at[kept]]
+    return cells[at[(seen[at] >= max(2.0, SEEN * len(shapes))) & (inside[at] < len(shapes))]]
 
 
 def _seen_colors(shapes: Sequence[Silhouette], cells: np.ndarray, width: float) -> tuple[np.ndarray, np.ndarray]:

@@ -49,10 +49,8 @@ def coverage(gaussians: Gaussians, cameras: list[Camera], options: RasterizeOpti
 
 
 @torch.enable_grad()  # the caller may have switched gradients off
-def sensitivities(
-    gaussians: Gaussians, cameras: list[Camera], options: RasterizeOptions, seed: int
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Estimate three squared changes of the images for each Gaussian, summed over pixels, at least 0, shape [N].
+def sensitivities(gaussians: Gaussians, cameras: list[Camera], options: RasterizeOptions, seed: int) -> torch.Tensor:
+    """Estimate three squared changes of the images for each Gaussian, summed over pixels, at least 0, shape [3, N].
 
     The first is the trace of PUP-3DGS' sensitivity, in units of the Gaussian's width (arXiv 2406.10219, eq. 6: the sum over
     pixels of the outer product of the colour's gradient with respect to mean and scale). PUP uses the log-determinant instead.
@@ -77,7 +75,7 @@ def sensitivities(
             total[0] += ((means * width).square().sum(1) + scales.square().sum(1)) / probes
             total[1] += (logits / clear).square() / probes
             total[2] += torch.einsum("nk,nk->n", sh.flatten(1)[:, 3:], harmonics).square() / probes  # fast on a CPU
-    return total[0], total[1], total[2]
+    return total
 
 
 INNER = 0.02

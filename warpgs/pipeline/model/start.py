@@ -1,8 +1,7 @@
 """The first Gaussians of a fit: from points, depth or random places."""
 
-import dataclasses
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, NamedTuple
 
 import numpy as np
@@ -292,7 +291,7 @@ def initial_points(
     usable = seen_points(views, points)
     by_depth = config.source in ("sweep", "flow")
     if config.source == "auto" and (sweeps(config, len(views)) or any_given(views)):
-        by_depth, config = True, dataclasses.replace(config, source="sweep")
+        by_depth, config = True, replace(config, source="sweep")
     if by_depth:
         start = consistent_points(views, usable, config, generator, device, progress)
     elif config.source == "points" or (config.source == "auto" and len(usable) >= MIN_POINTS):

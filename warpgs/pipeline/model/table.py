@@ -149,16 +149,6 @@ class Table:
         """Bytes of the parameters of a row."""
         return sum(t.element_size() * t[0].numel() for t in self.params.values())
 
-    def lasting_bytes(self) -> int:
-        """Return the bytes of a row that persist between steps: parameters, two moments and columns."""
-        return 3 * self.row_bytes + sum(c.element_size() for c in self.columns.values())
-
-    def growth_bytes(self, before: int, after: int) -> int:
-        """Return the bytes needed to add rows: the new rows, one tensor before and after the change, and indices."""
-        added = min(2 * (after - before), after)  # a split replaces one row by two
-        largest = max(t.element_size() * t[0].numel() for t in self.params.values())
-        return self.row_bytes * added + largest * (before + after) + 8 * after
-
     @property
     def gaussians(self) -> Gaussians:
         """The current parameters as Gaussians; they require gradients."""
@@ -248,8 +238,7 @@ class Table:
 
     def _check(self, update: DensityUpdate, capacity: int | None) -> None:
         """Check the indices and values of a change, and the size of the set after it."""
-        indices = {"keep": update.keep, "overwritten": update.overwritten, "parents": update.parents}
-        for name, rows in indices.items():
+        for name, rows in {"keep": update.keep, "overwritten": update.overwritten, "parents": update.parents}.items():
             if rows is None:
                 continue
             if not isinstance(rows, torch.Tensor) or rows.dtype != torch.int64 or rows.ndim != 1:

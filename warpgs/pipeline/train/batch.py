@@ -6,15 +6,13 @@ from itertools import accumulate
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from warpgs.errors import UsageError
 from warpgs.kernels.update import end_step
-from warpgs.pipeline.model.table import Table
 from warpgs.pipeline.train.step import StepBuffers, StepPlan, StepTaker, steps_at_once
-from warpgs.pipeline.train.strategies.base import Strategy
-from warpgs.pipeline.train.views import Kind, LearnedViews, ViewStack
+from warpgs.pipeline.train.views import Kind
 from warpgs.ranks import Ranks
-from warpgs.render.options import RasterizeOptions
 from warpgs.scene import Tensors
 
 # Sums over the views of a step (slots), in one order for any number of processes.
@@ -27,6 +25,8 @@ from warpgs.scene import Tensors
 SUMMED = 2
 """Number of statistics of a Gaussian that are summed with the gradients of several views: sum of its gradients, and number of
 renders."""
+Works = list[Callable[[], Any]]
+"""Functions that are called one after the other."""
 Node = tuple[int, int]
 """Slots of a subtree: the first, and the last plus one."""
 ALIGNMENT = 16
@@ -83,7 +83,7 @@ def depth(node: Node) -> int:
     return max(depth(left), (1 + depth(right)) if right[1] - right[0] > 1 else 1)
 
 
-def finished(node: Node, known: Mapping[Node, torch.Tensor]) -> torch.Tensor:
+def finished(node: Node, known: Mapping[Node, Tensor]) -> Tensor:
     """Return the sum of a node from known sums of its subtrees, shape [...]; the known sums are overwritten."""
     if node in known:
         return known[node]
@@ -147,19 +147,18 @@ class SlotSums:
         each = self.divided // self.tree.ranks.count
         return slice(self.tree.ranks.rank * each, (self.tree.ranks.rank + 1) * each)
 
-    def parts(self, row: int = 0) -> list[torch.Tensor]:
+    def parts(self, row: int = 0) -> list[Tensor]:
         """Return the summed tensors of one row, each in its own shape [...]; they share the memory of the row."""
         sized = zip(self.starts, self.shapes, strict=True)
         return [self.rows[row, start : start + torch.Size(s).numel()].view(s) for start, s in sized]
 
-    def add_up(self, slot: Callable[[int, list[torch.Tensor], bool], None]) -> list[torch.Tensor]:
+    def add_up(self, slot: Callable[[int, list[Tensor], bool], None]) -> list[Tensor]:
         """Add the slots of all processes; every process gets the same sums of the tensors, in their shapes [...].
 
         ``slot`` is a function of a slot's number, the tensors of a sum, and a flag: True to add to them, False to overwrite
         them. Divided rows then hold the sum of this process's slots only, until `sum_own_rows` is called.
         """
-        own = self.tree.nodes[self.tree.ranks.rank]
-        for row, node in enumerate(own):
+        for row, node in enumerate(self.tree.nodes[self.tree.ranks.rank]):
             self._add_node(node, row, slot)
         if self.tree.ranks.count == 1:
             self._average(0, self.rows[0])
@@ -174,12 +173,11 @@ class SlotSums:
         sums = self._own_sums(slice(0, self.divided * self._width))
         self.rows[0, own.start * self._width : own.stop * self._width] = sums
 
-    def share(self, tensor: torch.Tensor) -> None:
+    def share(self, tensor: Tensor) -> None:
         """Send this process's rows of a tensor [N, ...], contiguous and shaped like the large tensor, to all others."""
-        divided = tensor[: self.divided].view(-1)
-        self.tree.ranks.gather(tensor[self.own_rows].view(-1), divided)
+        self.tree.ranks.gather(tensor[self.own_rows].view(-1), tensor[: self.divided].view(-1))
 
-    def _add_node(self, node: Node, row: int, slot: Callable[[int, list[torch.Tensor], bool], None]) -> None:
+    def _add_node(self, node: Node, row: int, slot: Callable[[int, list[Tensor], bool], None]) -> None:
         """Add the slots of a node into a row; the following rows are scratch memory."""
         if node[1] - node[0] == 1:
             slot(node[0], self.parts(row), False)
@@ -192,7 +190,7 @@ class SlotSums:
             self._add_node(right, row + 1, slot)
             self.rows[row].add_(self.rows[row + 1])
 
-    def _own_sums(self, place: slice) -> torch.Tensor:
+    def _own_sums(self, place: slice) -> Tensor:
         """Finish the sums of this process's part of the numbers in ``place``; all parts have equal size, [S]."""
         tree, ranks = self.tree, self.tree.ranks
         sent = self.rows[: tree.width, place].view(tree.width, ranks.count, -1).transpose(0, 1).contiguous()
@@ -202,7 +200,7 @@ class SlotSums:
         self._average(place.start + ranks.rank * len(own), own)
         return own
 
-    def _average(self, start: int, sums: torch.Tensor) -> None:
+    def _average(self, start: int, sums: Tensor) -> None:
         """Divide the means among sums [S] by the number of slots; ``start`` is the place of ``sums`` in a whole sum."""
         for first, end in self.means:
             sums[max(0, first - start) : max(0, end - start)].mul_(1 / self.tree.batch)
@@ -222,12 +220,9 @@ and the first slot's reason to stop the step."""
 class BatchSteps(StepTaker):
     """Steps of B views each."""
 
-    def __init__(
-        self, table: Table, views: LearnedViews, strategy: Strategy, cameras: Sequence[torch.Tensor],
-        options: RasterizeOptions, dropout_seed: int | None, tree: Tree,
-    ):  # fmt: skip
-        """Begin without memory for sums."""
-        super().__init__(table, views, strategy, cameras, options, dropout_seed)
+    def __init__(self, *parts: Any, tree: Tree):
+        """Begin without memory for sums; ``parts`` are those of `StepTaker`."""
+        super().__init__(*parts)
         b = self.buffers
         self.tree, self.kept_sums = tree, tree.buffers
         self.slots = StepBuffers(b.device, 1, steps_at_once(tree.batch) * len(tree.slots))
@@ -240,7 +235,7 @@ class BatchSteps(StepTaker):
         """Means of gradients, and sums of statistics and of ``said``, with the shapes of the last step."""
         self.large = ""
         """Parameter whose rows the sums may divide among processes."""
-        self._update: tuple[StepPlan, list[Callable[[], object]]] | None = None
+        self._update: tuple[StepPlan, Works] | None = None
         self._lrs, self._settings = torch.zeros_like(b.lr_rows[0]), torch.zeros_like(b.setting_rows[0])
         self._going = torch.zeros(1, dtype=torch.bool, device=b.device)
 
@@ -249,26 +244,23 @@ class BatchSteps(StepTaker):
         self._update = None
         super().clear()
 
-    def take(
-        self, places: list[tuple[Kind, int]], settings: Callable[[], Sequence[tuple[float, ...]]],
-        stacks: Mapping[Kind, ViewStack], plan: StepPlan, max_instances: int | None, *, captured: bool,
-    ) -> None:  # fmt: skip
+    def take(self, places: list[tuple[Kind, int]], settings: Callable[[], Sequence[tuple[float, ...]]], plan: StepPlan) -> None:
         """Take the steps of `buffers`; places and settings are those of the slots of all processes, step by step."""
         slots, batch = self.tree.slots, self.tree.batch
-        if captured and max_instances is not None:  # in all processes, or one alone would go on without graphs
+        # in all processes, or one alone would go on without graphs
+        if self.captured and self.strategy.context.max_instances is not None:
             for kind in dict.fromkeys(kind for kind, _ in places):
-                self.capacity(kind, stacks, plan, max_instances)
+                self.capacity(kind, plan)
         own, rows = [i for i in range(len(places)) if i % batch in slots], settings()
         self.slots.load([places[i][1] for i in own], [[1.0]] * len(own), [rows[i] for i in own])
-        kinds = [places[i][0] for i in own]
-        works = self.works(self.view_gradients, kinds, self.slots, stacks, plan, max_instances, captured=captured)
-        update: list[Callable[[], object]] = []
+        works = self.works(self.view_gradients, [places[i][0] for i in own], self.slots, plan)
+        update: Works = []
         for begin in range(0, len(own), len(slots)):  # a step each
             first = [self._contribution(begin, works)]  # the strategy's statistics determine the sums
             if not update:
-                sums, update = self._prepared(*first[0], plan, captured)
+                sums, update = self._prepared(*first[0], plan)
 
-            def add(slot: int, parts: list[torch.Tensor], adds: bool) -> None:
+            def add(slot: int, parts: list[Tensor], adds: bool) -> None:
                 place = begin + slot - slots.start  # noqa: B023
                 self._add(slot, place, *(first.pop() if first else self._contribution(place, works)), parts, adds)  # noqa: B023
 
@@ -279,7 +271,7 @@ class BatchSteps(StepTaker):
             for moments in (self.table.exp_avg, self.table.exp_avg_sq):
                 sums.share(moments[self.large])
 
-    def _contribution(self, place: int, works: list[Callable[[], Any]]) -> tuple[list[torch.Tensor], dict[str, torch.Tensor]]:
+    def _contribution(self, place: int, works: Works) -> tuple[list[Tensor], dict[str, Tensor]]:
         """Return the gradients and statistics of a view; ``place`` counts this process's slots of all steps."""
         self.slots.counter.fill_(place)
         self.slots.stop.zero_()
@@ -288,7 +280,7 @@ class BatchSteps(StepTaker):
 
     @torch.no_grad()
     def _add(
-        self, slot: int, place: int, gradients: list[torch.Tensor], statistics: Tensors, parts: list[torch.Tensor], adds: bool
+        self, slot: int, place: int, gradients: list[Tensor], statistics: Tensors, parts: list[Tensor], adds: bool
     ) -> None:
         """Add the contribution of a slot to the parts of a sum, or overwrite the parts; ``place`` as in `_contribution`."""
         said = parts[-1]
@@ -301,9 +293,7 @@ class BatchSteps(StepTaker):
         if self.told_to_stop and slot == self.tree.slots.start:
             said[STOP : STOP + 1].fill_(1.0)
 
-    def _prepared(
-        self, gradients: list[torch.Tensor], statistics: Tensors, plan: StepPlan, captured: bool
-    ) -> tuple[SlotSums, list[Callable[[], object]]]:
+    def _prepared(self, gradients: list[Tensor], statistics: Tensors, plan: StepPlan) -> tuple[SlotSums, Works]:
         """Return sums, and the functions that update by them; their shapes are those of a view's contribution."""
         shapes = [*(tuple(t.shape) for t in (*gradients, *statistics.values())), (FLAGS + self.tree.batch,)]
         if self.sums is None or self.sums.shapes != shapes:
@@ -315,14 +305,12 @@ class BatchSteps(StepTaker):
         if self._update is None or self._update[0] != plan:
             parts, count = self.sums.parts(), len(gradients)
             functions = self._functions(plan, self.sums, parts[:count], dict(zip(statistics, parts[count:-1], strict=True)))
-            if captured and self.cuda:  # all but the exchanges between processes
+            if self.captured and self.cuda:  # all but the exchanges between processes
                 functions = [f if k % 2 else self.capture(f, self.buffers).replay for k, f in enumerate(functions)]
             self._update = plan, functions
         return self.sums, self._update[1]
 
-    def _functions(
-        self, plan: StepPlan, sums: SlotSums, gradients: list[torch.Tensor], statistics: Tensors
-    ) -> list[Callable[[], object]]:
+    def _functions(self, plan: StepPlan, sums: SlotSums, gradients: list[Tensor], statistics: Tensors) -> Works:
         """Return the functions of an update by sums; every second one is an exchange between processes."""
         b, lrs, divided = self.buffers, self._lrs, sums.divided
 

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated, ClassVar
 
 import torch
+from torch import Tensor
 
 from warpgs.device import FLOAT, LOSS, STEP, Needs, StepSizes
 from warpgs.errors import UsageError
@@ -33,25 +33,25 @@ OUTPUTS = ("rgb", "alpha", "depth")
 class Target:
     """Image, mask and maps of a view, with which a step compares the render."""
 
-    image: torch.Tensor
+    image: Tensor
     """Colours in [0, 1], shape [H, W, 3]."""
-    mask: torch.Tensor | None
+    mask: Tensor | None
     """1 for unmasked pixels, 0 for masked ones, shape [H, W]; None without a mask."""
     maps: Tensors
     """Maps that loss terms requested (`LossTerm.needs`), by name, each of shape [H, W] or [H, W, C]."""
-    alpha: torch.Tensor | None = None
+    alpha: Tensor | None = None
     """Opacity of the subject, in [0, 1], shape [H, W]; None if no training view has one. ``image`` and the render have the same
     background, which changes at each step."""
 
 
-class _Outputs(dict[str, torch.Tensor]):
+class _Outputs(dict[str, Tensor]):
     """Images of a render that a term requested; reading another one raises an error."""
 
     def __init__(self, term: LossTerm, images: Tensors):
         super().__init__({n: images[n] for n in term.needs_outputs})
         self.term = term
 
-    def __missing__(self, name: str) -> torch.Tensor:
+    def __missing__(self, name: str) -> Tensor:
         raise UsageError(f"the loss term {self.term.name!r} reads the output {name!r}; add it to needs_outputs")
 
 
@@ -70,7 +70,7 @@ class LossInputs:
     camera: Camera
     """Camera of the view at the size of the images: ``viewmat`` [4, 4], camera_from_world [u], and ``K`` [3, 3] [px] are
     tensors. If poses are refined, this is the refined pose of the step, and it is differentiable."""
-    step: torch.Tensor
+    step: Tensor
     """Number of the step, from 1: an integer as float32, shape []. It is a tensor, because a captured step is replayed
     for later steps; `LossTerm.active` gets the number on the host."""
 
@@ -86,7 +86,7 @@ class LossTerm(Checked):
     needs_priors: ClassVar[bool] = False
     """True if `needs` reads the priors of the views, which are then computed before the fit."""
 
-    def needs(self, view: TrainingView, prior: Prior | None) -> dict[str, torch.Tensor]:
+    def needs(self, view: TrainingView, prior: Prior | None) -> dict[str, Tensor]:
         """Return the maps of a view that the term reads, by name, each of shape [H, W] or [H, W, C].
 
         No two terms of a fit may use the same name for a map.
@@ -105,7 +105,7 @@ class LossTerm(Checked):
         """
         return {LOSS: 4 * FLOAT * sizes.pixels if "depth" in self.needs_outputs else 0}
 
-    def __call__(self, inputs: LossInputs) -> torch.Tensor:
+    def __call__(self, inputs: LossInputs) -> Tensor:
         """Compute the term, a differentiable value of shape [], or 0; it must not read back from the device.
 
         Args:
@@ -119,10 +119,10 @@ class LossTerm(Checked):
 
 LOSS_TERMS = Registry("loss term", LossTerm, "warpgs.pipeline.train.loss")
 """Loss terms by name."""
-register = LOSS_TERMS.register
+register = register_loss_term = LOSS_TERMS.register
 
 
-def term_values(terms: Sequence[LossTerm], inputs: LossInputs) -> list[torch.Tensor]:
+def term_values(terms: Sequence[LossTerm], inputs: LossInputs) -> list[Tensor]:
     """Compute each term from the outputs that it needs; returns values of shape [], in the order of the terms.
 
     A user-defined term with a constant value other than 0 has no effect, and raises UsageError.
@@ -131,7 +131,7 @@ def term_values(terms: Sequence[LossTerm], inputs: LossInputs) -> list[torch.Ten
     trained = torch.is_grad_enabled() and any(t.requires_grad for t in inputs.outputs.values())
     for term in terms:
         value = term(replace(inputs, outputs=_Outputs(term, inputs.outputs)))
-        values.append(returned(term, "__call__", value, torch.Tensor, "a tensor of shape []", shape=()))
+        values.append(returned(term, "__call__", value, Tensor, "a tensor of shape []", shape=()))
         if value.requires_grad or is_ours(type(term)) or not trained:
             continue
         if not (value.is_cuda and torch.cuda.is_current_stream_capturing()) and bool(value != 0):
@@ -151,7 +151,7 @@ ROW = 1024
 """Values in a row, for sums of values that have no rows."""
 
 
-def total(values: torch.Tensor) -> torch.Tensor:
+def total(values: Tensor) -> Tensor:
     """Return the sum of values [N] or [H, ...], shape [], with the same bits for any number of CPU threads.
 
     On a CPU, torch's sum of a whole tensor depends on the number of threads, so rows are summed first.
@@ -172,13 +172,13 @@ def check_outputs(terms: Sequence[LossTerm]) -> None:
                 raise UsageError(f"{needs}; choose needs_outputs from {', '.join(OUTPUTS)}")
 
 
-def maps_of(terms: Sequence[LossTerm], view: TrainingView, prior: Prior | None) -> dict[str, torch.Tensor]:
+def maps_of(terms: Sequence[LossTerm], view: TrainingView, prior: Prior | None) -> dict[str, Tensor]:
     """Return the maps of a view that terms need, by name, each of shape [H, W] or [H, W, C]."""
     owners: dict[str, str] = {}
-    maps: dict[str, torch.Tensor] = {}
+    maps: dict[str, Tensor] = {}
     for term in terms:
         own, size = term.needs(view, prior), view.image.shape[:2]
-        returned(term, "needs", own, Mapping, "maps [H, W] or [H, W, C] by name", each=torch.Tensor, shape=size)
+        returned(term, "needs", own, Mapping, "maps [H, W] or [H, W, C] by name", each=Tensor, shape=size)
         for name, values in own.items():
             if name in maps:
                 both = f"{owners[name]!r} and {term.name!r}"
@@ -191,7 +191,7 @@ def maps_of(terms: Sequence[LossTerm], view: TrainingView, prior: Prior | None) 
 
 
 @functools.cache
-def _weights(fraction: float, count: int, dtype: torch.dtype, device: torch.device) -> torch.Tensor:
+def _weights(fraction: float, count: int, dtype: torch.dtype, device: torch.device) -> Tensor:
     """Return the weights [2] of the sums of 1 - SSIM and of absolute differences over ``count`` numbers.
 
     They stay cached, because CUDA graphs refer to their memory.
@@ -200,9 +200,7 @@ def _weights(fraction: float, count: int, dtype: torch.dtype, device: torch.devi
         return torch.tensor([fraction / count, (1 - fraction) / count], dtype=dtype, device=device)
 
 
-def photometric_loss(
-    rgb: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None, ssim_weight: float = 0.2
-) -> torch.Tensor:
+def photometric_loss(rgb: Tensor, target: Tensor, mask: Tensor | None, ssim_weight: float = 0.2) -> Tensor:
     """Return the loss of a rendered image: (1 - lambda) L1 + lambda (1 - SSIM).
 
     Args:
@@ -241,9 +239,16 @@ class Photometric(LossTerm):
         masked = 7 * FLOAT * sizes.pixels if sizes.masked else 0  # two images, and the mask's own
         return {LOSS: difference_bytes(sizes) + masked}
 
-    def __call__(self, inputs: LossInputs) -> torch.Tensor:
+    def __call__(self, inputs: LossInputs) -> Tensor:
         """Compute `photometric_loss` of the render and the view's image, shape []."""
         return photometric_loss(inputs.outputs["rgb"], inputs.target.image, inputs.target.mask, self.ssim_weight)
+
+
+def _weighted_mean(values: Tensor, mask: Tensor | None, weight: float) -> Tensor:
+    """Return ``weight`` times the mean of values [H, W] over the unmasked pixels, shape []."""
+    if mask is None:
+        return total(values) * (weight / values.numel())
+    return total(values * mask) / mask.sum().clamp_min(1) * weight
 
 
 @register("alpha")
@@ -259,15 +264,18 @@ class AlphaDifference(LossTerm, group="alpha."):
         """Return the bytes of the difference, its magnitude and its gradient."""
         return {LOSS: 3 * FLOAT * sizes.pixels}
 
-    def __call__(self, inputs: LossInputs) -> torch.Tensor:
+    def __call__(self, inputs: LossInputs) -> Tensor:
         """Compute ``weight`` times the mean absolute difference of opacities over the unmasked pixels, shape []."""
         alpha, target = inputs.outputs["alpha"], inputs.target
         if target.alpha is None:
             return alpha.new_zeros(())
-        difference = (alpha - target.alpha).abs()
-        if target.mask is None:
-            return total(difference) * (self.weight / target.alpha.numel())
-        return total(difference * target.mask) / target.mask.sum().clamp_min(1) * self.weight
+        return _weighted_mean((alpha - target.alpha).abs(), target.mask, self.weight)
+
+
+def _map_bytes(sizes: StepSizes, channels: int, maps: int) -> Needs:
+    """Return the bytes of maps at the loss, and of the copy of a term's map with ``channels`` on CUDA."""
+    copy = channels * FLOAT * sizes.pixels * sizes.cuda
+    return {**dict.fromkeys(STEP, copy), LOSS: copy + maps * FLOAT * sizes.pixels}
 
 
 EMPTY_WEIGHT = 0.3
@@ -285,7 +293,7 @@ class EmptyOpacity(LossTerm, group="empty."):
     weight: Weight = EMPTY_WEIGHT
     """Weight of the term, in [0, 1000]."""
 
-    def needs(self, view: TrainingView, prior: Prior | None) -> dict[str, torch.Tensor]:
+    def needs(self, view: TrainingView, prior: Prior | None) -> dict[str, Tensor]:
         """Return 1 for pixels at least `AWAY` from the object, 0 for others and without an opacity, shape [H, W]."""
         if view.alpha is None:
             return {"empty": torch.zeros_like(view.image[..., 0])}
@@ -295,15 +303,11 @@ class EmptyOpacity(LossTerm, group="empty."):
 
     def bytes(self, sizes: StepSizes) -> Needs:
         """Return the bytes of the products and a gradient, and of the copy of the map on CUDA."""
-        copy = FLOAT * sizes.pixels * sizes.cuda
-        return {**dict.fromkeys(STEP, copy), LOSS: copy + (2 + sizes.masked) * FLOAT * sizes.pixels}
+        return _map_bytes(sizes, 1, 2 + sizes.masked)
 
-    def __call__(self, inputs: LossInputs) -> torch.Tensor:
+    def __call__(self, inputs: LossInputs) -> Tensor:
         """Compute ``weight`` times the sum of opacities of empty pixels, divided by the number of unmasked pixels, shape []."""
-        opacities, mask = inputs.outputs["alpha"] * inputs.target.maps["empty"], inputs.target.mask
-        if mask is None:
-            return total(opacities) * (self.weight / opacities.numel())
-        return total(opacities * mask) / mask.sum().clamp_min(1) * self.weight
+        return _weighted_mean(inputs.outputs["alpha"] * inputs.target.maps["empty"], inputs.target.mask, self.weight)
 
 
 # Loss terms for given depth and normals, for views that have them.
@@ -321,9 +325,7 @@ NORMAL_MAPS = 26
 """Number of maps with one float per pixel for the normal term; points, differences and normals count as three each."""
 
 
-def inverse_depth_difference(
-    depth: torch.Tensor, alpha: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None
-) -> torch.Tensor:
+def inverse_depth_difference(depth: Tensor, alpha: Tensor, target: Tensor, mask: Tensor | None) -> Tensor:
     """Compute the weighted mean absolute difference of relative inverse depths, shape []; 0 if no pixel is compared.
 
     ``target`` [H, W, 3] is weight times q / d, weight, and weight times q [u], for given depth d and its median q: averages of
@@ -333,8 +335,7 @@ def inverse_depth_difference(
     shown = shown if mask is None else shown & (mask > 0)
     weight = torch.where(shown, target[..., 1], 0)
     inverse = target[..., 2] / torch.where(shown & (target[..., 1] > 0), depth, 1)
-    off = torch.where(weight > 0, (inverse - target[..., 0]).abs(), 0)
-    return total(off) / total(weight).clamp_min(1e-6)
+    return total(torch.where(weight > 0, (inverse - target[..., 0]).abs(), 0)) / total(weight).clamp_min(1e-6)
 
 
 @register("given_depth")
@@ -346,7 +347,7 @@ class GivenDepthDifference(LossTerm, group="given-depth."):
     weight: Weight = 0.3
     """Weight of the term, in [0, 1000]."""
 
-    def needs(self, view: TrainingView, prior: Prior | None) -> dict[str, torch.Tensor]:
+    def needs(self, view: TrainingView, prior: Prior | None) -> dict[str, Tensor]:
         """Return weight times q / d, weight, and weight times q, [H, W, 3], for depth d with median q; 0 without depth."""
         given = view.depth
         if given is None:
@@ -358,16 +359,15 @@ class GivenDepthDifference(LossTerm, group="given-depth."):
 
     def bytes(self, sizes: StepSizes) -> Needs:
         """Return the bytes of the term's maps, and of the copy of its target on CUDA."""
-        copy = 3 * FLOAT * sizes.pixels * sizes.cuda
-        return {**dict.fromkeys(STEP, copy), LOSS: copy + DEPTH_MAPS * FLOAT * sizes.pixels}
+        return _map_bytes(sizes, 3, DEPTH_MAPS)
 
-    def __call__(self, inputs: LossInputs) -> torch.Tensor:
+    def __call__(self, inputs: LossInputs) -> Tensor:
         """Compute ``weight`` times `inverse_depth_difference`, shape []."""
         depth, alpha, target = inputs.outputs["depth"], inputs.outputs["alpha"], inputs.target
         return self.weight * inverse_depth_difference(depth, alpha, target.maps["given_depth"], target.mask)
 
 
-def normal_difference(normals: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None) -> torch.Tensor:
+def normal_difference(normals: Tensor, target: Tensor, mask: Tensor | None) -> Tensor:
     """Compute the weighted mean of 1 - cos of the angle between normals [H, W, 3], shape [], in [0, 2]; 0 if no pixel has both.
 
     Missing normals are 0. The weight is the length of the given normals, which is below 1 for averages over pixels.
@@ -377,8 +377,7 @@ def normal_difference(normals: torch.Tensor, target: torch.Tensor, mask: torch.T
     # the root in float64, since the rounding of float32's depends on the processor (MKL)
     length = target.square().sum(-1).double().sqrt().to(target.dtype)
     weight = torch.where(shown, length, 0)
-    off = torch.where(weight > 0, length - (normals * target).sum(-1), 0)
-    return total(off) / total(weight).clamp_min(1e-6)
+    return total(torch.where(weight > 0, length - (normals * target).sum(-1), 0)) / total(weight).clamp_min(1e-6)
 
 
 @register("given_normals")
@@ -390,20 +389,19 @@ class GivenNormalsDifference(LossTerm, group="given-normals."):
     weight: Weight = 0.03
     """Weight of the term, in [0, 1000]."""
 
-    def needs(self, view: TrainingView, prior: Prior | None) -> dict[str, torch.Tensor]:
+    def needs(self, view: TrainingView, prior: Prior | None) -> dict[str, Tensor]:
         """Return the view's normals in its camera's axes [H, W, 3]; 0 where none are given."""
         return {"given_normals": torch.zeros_like(view.image) if view.normals is None else view.normals}
 
     def bytes(self, sizes: StepSizes) -> Needs:
         """Return the bytes of points, differences and normals, and of the copy of the target on CUDA."""
-        copy = 3 * FLOAT * sizes.pixels * sizes.cuda
-        return {**dict.fromkeys(STEP, copy), LOSS: copy + NORMAL_MAPS * FLOAT * sizes.pixels}
+        return _map_bytes(sizes, 3, NORMAL_MAPS)
 
-    def __call__(self, inputs: LossInputs) -> torch.Tensor:
+    def __call__(self, inputs: LossInputs) -> Tensor:
         """Compute ``weight`` times `normal_difference` of the rendered depth's normals, shape []."""
         depth = torch.where(inputs.outputs["alpha"] <= GIVEN_MIN_ALPHA, 0, inputs.outputs["depth"])
         # in the axes of the camera, like the given normals: a refined pose gets no gradient
-        camera = dataclasses.replace(inputs.camera, viewmat=torch.eye(4, dtype=depth.dtype, device=depth.device))
+        camera = replace(inputs.camera, viewmat=torch.eye(4, dtype=depth.dtype, device=depth.device))
         target = inputs.target
         return self.weight * normal_difference(depth_normals(camera, depth), target.maps["given_normals"], target.mask)
 
@@ -422,12 +420,9 @@ MAPS = 8
 """Number of maps with one float per pixel that the term and its gradient hold at the loss."""
 
 
-def depth_roughness(
-    depth: torch.Tensor, alpha: torch.Tensor, image: torch.Tensor, weight: torch.Tensor, mask: torch.Tensor | None
-) -> torch.Tensor:
+def depth_roughness(depth: Tensor, alpha: Tensor, image: Tensor, weight: Tensor, mask: Tensor | None) -> Tensor:
     """Compute the mean roughness of depth, shape [], from depth, opacity, weights and a mask [H, W] and colours [H, W, 3]."""
-    gaps = image[:, :-2] - image[:, 2:], image[:-2] - image[2:]
-    rows, columns = (torch.exp(-gap.abs().mean(-1) / EDGE) for gap in gaps)
+    rows, columns = (torch.exp(-gap.abs().mean(-1) / EDGE) for gap in (image[:, :-2] - image[:, 2:], image[:-2] - image[2:]))
     return total(roughness(depth, alpha, rows, columns, weight, mask)) / depth.numel()
 
 
@@ -440,17 +435,16 @@ class SmoothDepth(LossTerm, group="smooth-depth."):
     weight: Weight = 1.0
     """Weight of the term, in [0, 1000]."""
 
-    def needs(self, view: TrainingView, prior: Prior | None) -> dict[str, torch.Tensor]:
+    def needs(self, view: TrainingView, prior: Prior | None) -> dict[str, Tensor]:
         """Return the weights of the view's pixels, shape [H, W]: `CONFIRMED` where depth is consistent, else 1."""
         ones = torch.ones_like(view.image[..., 0])
         return {"smooth_depth": ones if view.consistent is None else torch.where(view.consistent > 0, CONFIRMED, ones)}
 
     def bytes(self, sizes: StepSizes) -> Needs:
         """Return the bytes of the term's maps, and of the copy of its weights on CUDA."""
-        copy = FLOAT * sizes.pixels * sizes.cuda
-        return {**dict.fromkeys(STEP, copy), LOSS: copy + MAPS * FLOAT * sizes.pixels}
+        return _map_bytes(sizes, 1, MAPS)
 
-    def __call__(self, inputs: LossInputs) -> torch.Tensor:
+    def __call__(self, inputs: LossInputs) -> Tensor:
         """Compute ``weight`` times `depth_roughness`, shape []."""
         depth, alpha, target = inputs.outputs["depth"], inputs.outputs["alpha"], inputs.target
         return self.weight * depth_roughness(depth, alpha, target.image, target.maps["smooth_depth"], target.mask)
@@ -480,15 +474,11 @@ def built_in_terms(
 
     ``black`` says that an opacity was estimated from black backgrounds.
     """
-    terms: list[LossTerm] = [Photometric()]
-    if cutout and config.alpha_weight > 0:
-        terms.append(AlphaDifference(config.alpha_weight))
-    elif black and config.alpha_weight > 0:
-        terms.append(EmptyOpacity(EMPTY_WEIGHT * config.alpha_weight))
-    if config.smooth_weight:
-        terms.append(SmoothDepth(config.smooth_weight))
-    if depth and config.depth_weight > 0:
-        terms.append(GivenDepthDifference(config.depth_weight))
-    if normals and config.normal_weight > 0:
-        terms.append(GivenNormalsDifference(config.normal_weight))
-    return tuple(terms)
+    terms: list[tuple[bool, Callable[[float], LossTerm], float]] = [
+        (cutout, AlphaDifference, config.alpha_weight),
+        (black and not cutout, EmptyOpacity, EMPTY_WEIGHT * config.alpha_weight),
+        (True, SmoothDepth, config.smooth_weight or 0.0),
+        (depth, GivenDepthDifference, config.depth_weight),
+        (normals, GivenNormalsDifference, config.normal_weight),
+    ]
+    return (Photometric(), *(kind(weight) for applies, kind, weight in terms if applies and weight > 0))

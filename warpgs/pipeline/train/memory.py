@@ -58,8 +58,9 @@ class Layout:
 
     def held(self, count: int) -> int:
         """Return the bytes that persist between steps: parameters, their moments and sums, columns, sums over slots, views."""
-        sums = self.sums * (self.table.row_bytes + SUMMED * FLOAT) + self.averaged * self.table.row_bytes
-        return (self.table.lasting_bytes() + sums) * count + self.view_bytes
+        columns = sum(c.element_size() for c in self.table.columns.values())
+        each = (3 + self.averaged) * self.table.row_bytes + columns + self.sums * (self.table.row_bytes + SUMMED * FLOAT)
+        return each * count + self.view_bytes
 
     def moments(self, count: int, instances: int, chunked: bool) -> dict[str, int]:
         """Return the bytes in addition to `held` at each moment of a step that may be the heaviest."""
@@ -70,8 +71,10 @@ class Layout:
         return needs
 
     def event(self, before: int, after: int) -> int:
-        """Return the bytes in addition to ``held(after)`` while Gaussians are added."""
-        return self.table.growth_bytes(before, after)
+        """Return the bytes in addition to ``held(after)`` while rows are added: they, one tensor twice, and indices."""
+        added = min(2 * (after - before), after)  # a split replaces one row by two
+        largest = max(t.element_size() * t[0].numel() for t in self.table.params.values())
+        return self.table.row_bytes * added + largest * (before + after) + 8 * after
 
     def step(self, count: int, instances: int, chunked: bool = False, graphs: int | None = None) -> int:
         """Return the bytes at the heaviest moment of a step; each CUDA graph keeps memory of its own."""

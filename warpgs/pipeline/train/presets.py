@@ -67,12 +67,7 @@ class Presets(Mapping[str, "FitConfig"]):
 
     def described(self) -> dict[str, str]:
         """Return a line about each preset, by name."""
-        return {name: self._about_of(name) for name in self}
-
-    def _about_of(self, name: str) -> str:
-        if name not in self._about and name in self._files:
-            self._about[name] = str(_read(self._files[name])[0].get("about", ""))
-        return self._about.get(name, "")
+        return {name: str(_read(path)[0].get("about", "")) for name, path in self._files.items()} | self._about
 
     def __getitem__(self, name: str) -> FitConfig:
         if name not in self._made:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import re
 from collections.abc import Sequence
@@ -231,11 +230,9 @@ def over_background(scene: Scene, color: Color) -> Scene:
     shift = np.float32(color) - np.float32(scene.background)
 
     def moved(v: View) -> View:
-        if v.alpha is None:
-            return v
-        return dataclasses.replace(v, image=np.clip(v.image + (1 - v.alpha[..., None]) * shift, 0, 1))
+        return v if v.alpha is None else replace(v, image=np.clip(v.image + (1 - v.alpha[..., None]) * shift, 0, 1))
 
-    return dataclasses.replace(scene, background=color, views=tuple(map(moved, scene.views)))
+    return replace(scene, background=color, views=tuple(map(moved, scene.views)))
 
 
 def over(image: torch.Tensor, alpha: torch.Tensor, shift: torch.Tensor) -> torch.Tensor:

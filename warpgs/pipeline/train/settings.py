@@ -11,11 +11,9 @@ import numbers
 import statistics
 import time
 import types
-import typing
 from bisect import bisect_right
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 import torch
@@ -41,7 +39,7 @@ from warpgs.scene import Camera, Gaussians, View
 from warpgs.schema import Checked, SchemaError, Within, anything, mapping, of_type
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class FitConfig(Checked):
     """All settings of a fit."""
 
@@ -198,14 +196,14 @@ PARTS: dict[str, Registry[Any]] = {"loss_terms": LOSS_TERMS, "view_modules": VIE
 def _compose(kind: type, values: dict[str, Any], place: str) -> Any:
     """Return a settings dataclass from nested plain values; its fields that are dataclasses are composed in turn."""
     mapping(anything)(values, place)
-    kinds, composed = typing.get_type_hints(kind), {}
+    kinds, composed = get_type_hints(kind), {}
     for name, value in values.items():
         where, of = f"{place}.{name}", kinds.get(name, Any)
         if isinstance(of, type) and dataclasses.is_dataclass(of):
             composed[name] = _compose(of, value, where)
         elif name not in (*PARTS, "strategy_config"):  # these are composed before
             of_type(of)(list(value) if isinstance(value, tuple) else value, where)
-            listed = any(typing.get_origin(part) is tuple for part in (of, *typing.get_args(of)))
+            listed = any(get_origin(part) is tuple for part in (of, *get_args(of)))
             composed[name] = tuple(value) if listed and isinstance(value, list) else value
         else:
             composed[name] = value
@@ -377,9 +375,8 @@ def _with_parts(config: FitConfig, given: Mapping[str, Any], own_code: bool) -> 
     strategy = given.get("strategy")
     if strategy is not None and strategy != config.strategy:
         kind = _found(STRATEGIES, strategy, own_code)
-        config = dataclasses.replace(
-            config, strategy=STRATEGIES.name_of(kind), strategy_config=None if kind.Config is None else kind.Config()
-        )
+        own = None if kind.Config is None else kind.Config()
+        config = dataclasses.replace(config, strategy=STRATEGIES.name_of(kind), strategy_config=own)
     for field, registry in PARTS.items():
         if field in given:
             changes: dict[str, Any] = {field: parts_named(registry, field, given[field], own_code)}
@@ -429,7 +426,7 @@ def _leaves(config: FitConfig) -> dict[str, tuple[Path, Any]]:
 
 
 def _below(kind: type, prefix: str, path: Path) -> Iterator[tuple[str, tuple[Path, Any]]]:
-    hints = typing.get_type_hints(kind)
+    hints = get_type_hints(kind)
     for f in dataclasses.fields(kind):
         hint, here = hints[f.name], (*path, f.name)
         if isinstance(hint, type) and dataclasses.is_dataclass(hint):
@@ -450,8 +447,8 @@ def _typed(value: Any, hint: Any, name: str) -> Any:
     """Return a value converted to the type of its field; SchemaError if the type does not match."""
     if name == "memory_limit" and isinstance(value, str) and value.lower() != "none":
         return parse_bytes(value)
-    parts = typing.get_args(hint)
-    if typing.get_origin(hint) in (typing.Union, types.UnionType) and type(None) in parts:
+    parts = get_args(hint)
+    if get_origin(hint) in (Union, types.UnionType) and type(None) in parts:
         if value is None or (isinstance(value, str) and value.lower() == "none"):
             return None
         (hint,) = (p for p in parts if p is not type(None))
@@ -459,10 +456,9 @@ def _typed(value: Any, hint: Any, name: str) -> Any:
         value = int(value)
     elif isinstance(value, numbers.Real) and not isinstance(value, (bool, int)):
         value = float(value)
-    if typing.get_origin(hint) is tuple:
+    if get_origin(hint) is tuple:
         of_type(hint)(list(value) if isinstance(value, tuple) else value, name)
-        kinds = typing.get_args(hint)
-        return tuple(_typed(v, kinds[0], name) for v in value)
+        return tuple(_typed(v, get_args(hint)[0], name) for v in value)
     of_type(hint)(value, name)
     return float(value) if hint is float else value
 
@@ -571,8 +567,7 @@ def step_times(
     phases, samples = plan_phases(config.phases, config.steps), find_strategy(config.strategy).samples
     due = np.isin(steps, phases.events) & samples
     removed = np.isin(steps, list(removals(phases, views))) & samples
-    added = sampler.fraction * pixels * min(views, MAX_VIEWS)
-    wanted = start + added * np.cumsum(due & (steps > done))
+    wanted = start + sampler.fraction * pixels * min(views, MAX_VIEWS) * np.cumsum(due & (steps > done))
     most = max(start, min(config.max_gaussians, (1 + sampler.max_fraction) * start))
     counts = np.minimum(wanted, most)
     if growing:

@@ -56,12 +56,12 @@ def prepare(
         with section("priors"):
             priors, notes = view_priors(train, config.priors, depths=lambda: start().depths, regions=regions, tell=progress)
     elif priors is None:
-        notes = _unused_networks(config)
+        switches = {"depth": "--depth-guides or --strategy paper", "segmentation": "--strategy paper"}
+        unused = [kind for kind in switches if getattr(config.priors, f"{kind}_model") is not None]
+        notes = [f"--{kind}-model is not used by this fit; to use it, add {switches[kind]}" for kind in unused]
     if config.priors.depth_guides and priors is not None:
-        train = [
-            v if v.depth is not None else replace(v, depth=GivenDepth(p.disparity, "disparity"))
-            for v, p in zip(train, priors, strict=True)
-        ]
+        guides = [v.depth or GivenDepth(p.disparity, "disparity") for v, p in zip(train, priors, strict=True)]
+        train = [replace(v, depth=guide) for v, guide in zip(train, guides)]
     found = start()
     usable()
     lines = f"start: {found.how}".splitlines()
@@ -83,13 +83,6 @@ def _start_of(
     if found.depths is not None:
         found = found._replace(depths=[lens_depth(v.camera, d) for v, d in zip(train, found.depths, strict=True)])
     return subsample(found, config.max_gaussians, generator)
-
-
-def _unused_networks(config: FitConfig) -> list[str]:
-    """Return notes on networks that are given although the fit reads no priors."""
-    switches = {"depth": "--depth-guides or --strategy paper", "segmentation": "--strategy paper"}
-    named = [kind for kind in switches if getattr(config.priors, f"{kind}_model") is not None]
-    return [f"--{kind}-model is not used by this fit; to use it, add {switches[kind]}" for kind in named]
 
 
 def _check_models(train: list[View], config: FitConfig) -> None:

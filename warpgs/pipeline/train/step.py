@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from warpgs.device import available_bytes, keep_freed_memory
 from warpgs.errors import ResourceError
@@ -36,7 +37,7 @@ LEAST_LOGIT = -15.0
 
 
 @torch.no_grad()
-def decay_opacities(logits: torch.Tensor, fraction: float, going: torch.Tensor, used: torch.Tensor | None = None) -> None:
+def decay_opacities(logits: Tensor, fraction: float, going: Tensor, used: Tensor | None = None) -> None:
     """Lower opacities (logits [N]) by a fraction in place, of Gaussians ``used`` [N] or all, if ``going`` [1] is True."""
     kept = 1 - fraction
     if kept == 1:  # also a fraction below the rounding of float64
@@ -117,7 +118,7 @@ class StepBuffers:
         done, stop = int(self.counter), int(self.stop)
         return done, stop, self.history[: done + 1].tolist()
 
-    def begin(self, views: ViewStack) -> tuple[torch.Tensor, ...]:
+    def begin(self, views: ViewStack) -> tuple[Tensor, ...]:
         """Return learning rates, settings [7], viewmat [1, 4, 4], K [1, 3, 3] and image [H, W, 3] of the current step."""
         cameras = views.camera
         if self.device.type == "cpu":  # no copies
@@ -127,15 +128,15 @@ class StepBuffers:
         rows = (self.view_rows, self.lr_rows, self.setting_rows, cameras.viewmat, cameras.K, views.images)
         return begin_step(self.counter, *rows)
 
-    def of_view(self, maps: Rows) -> torch.Tensor:
+    def of_view(self, maps: Rows) -> Tensor:
         """Return the entry of the step's view in maps [V, ...]. Call it before `end_step` counts the step."""
         if self.device.type == "cpu":
             return maps[int(self.view_rows[int(self.counter)])]
-        assert isinstance(maps, torch.Tensor)  # on CUDA stacks are tensors
+        assert isinstance(maps, Tensor)  # on CUDA stacks are tensors
         return maps.index_select(0, self.view_rows.index_select(0, self.counter))[0]
 
 
-Renderer = Callable[[Gaussians, Camera, int, "torch.Tensor | None", "torch.Tensor | None"], Render]
+Renderer = Callable[[Gaussians, Camera, int, "Tensor | None", "Tensor | None"], Render]
 """Function that renders for a camera with a leading axis of 1. Arguments: Gaussians, camera, degree, opacity factors, and a
 shift of the background [3]."""
 
@@ -143,9 +144,7 @@ shift of the background [3]."""
 def eager_renderer(options: RasterizeOptions, max_instances: int | None) -> Renderer:
     """Return a renderer that allocates memory for each render, and renders in chunks of at most ``max_instances``."""
 
-    def render(
-        gaussians: Gaussians, camera: Camera, degree: int, factors: torch.Tensor | None, shift: torch.Tensor | None
-    ) -> Render:
+    def render(gaussians: Gaussians, camera: Camera, degree: int, factors: Tensor | None, shift: Tensor | None) -> Render:
         behind = options.background if shift is None else options.background + shift
         own = replace(
             options, sh_degree=degree, background=behind, opacity_factors=factors, max_instances=max_instances,
@@ -156,13 +155,11 @@ def eager_renderer(options: RasterizeOptions, max_instances: int | None) -> Rend
     return render
 
 
-def captured_renderer(options: RasterizeOptions, capacity: int, overflow: torch.Tensor) -> Renderer:
+def captured_renderer(options: RasterizeOptions, capacity: int, overflow: Tensor) -> Renderer:
     """Return a renderer with a fixed capacity of instances, which sets ``overflow`` [1] if they do not fit."""
     backgrounds, memory = options.background[None], InstanceMemory(capacity=capacity, overflow=overflow)
 
-    def render(
-        gaussians: Gaussians, camera: Camera, degree: int, factors: torch.Tensor | None, shift: torch.Tensor | None
-    ) -> Render:
+    def render(gaussians: Gaussians, camera: Camera, degree: int, factors: Tensor | None, shift: Tensor | None) -> Render:
         behind = backgrounds if shift is None else backgrounds + shift
         settings = image_settings(camera, degree, options)
         images, projected, tile_counts = compose(inputs_of(gaussians, camera, factors), behind, settings, memory)
@@ -177,11 +174,11 @@ def _single(batch: Render) -> Render:
     return replace(batch, **{n: getattr(batch, n).squeeze(0) for n in ("rgb", "alpha", "depth")})
 
 
-def total_loss(plan: StepPlan, inputs: LossInputs, strategy: Strategy, of_views: Sequence[torch.Tensor] = ()) -> torch.Tensor:
+def total_loss(plan: StepPlan, inputs: LossInputs, strategy: Strategy, of_views: Sequence[Tensor] = ()) -> Tensor:
     """Return the sum of the loss terms, the terms of view modules (``of_views`` [] each) and the strategy's term, shape []."""
     values = [*term_values(plan.terms, inputs), *of_views]
     extra = strategy.regularisation(plan.phase, inputs.gaussians)
-    returned(strategy, "regularisation", extra, (torch.Tensor, type(None)), "a tensor of shape [], or None", shape=())
+    returned(strategy, "regularisation", extra, (Tensor, type(None)), "a tensor of shape [], or None", shape=())
     return sum(values[1:] if extra is None else [*values[1:], extra], values[0])
 
 
@@ -202,7 +199,7 @@ class StepTaker:
     """Number of sums of gradients that a step of several views keeps."""
 
     def __init__(
-        self, table: Table, views: LearnedViews, strategy: Strategy, cameras: Sequence[torch.Tensor],
+        self, table: Table, views: LearnedViews, strategy: Strategy, cameras: Sequence[Tensor],
         options: RasterizeOptions, dropout_seed: int | None = None,
     ):  # fmt: skip
         """Begin without captured steps; ``cameras`` are for limits of sizes, and without a seed there is no dropout."""
@@ -216,11 +213,14 @@ class StepTaker:
             """Stream of captures, always the same one: torch reuses freed memory only on the stream that used it before."""
             self.memory = GraphMemory(device)
             """Account of the memory that torch keeps for deleted graphs."""
+        self.stacks: Mapping[Kind, ViewStack] = {}
+        """Views to step through; the trainer sets them, and whether steps are ``captured``."""
+        self.captured = False
         self._graphs: dict[tuple[Kind, StepPlan], CapturedGraph] = {}
         self._capacities: dict[tuple[Kind, StepPlan], int] = {}
 
     @property
-    def params(self) -> dict[str, torch.Tensor]:
+    def params(self) -> dict[str, Tensor]:
         """All parameters by name, of any shape [...]: of the Gaussians, and of view modules as ``views.NAME``."""
         return self.table.params | {f"views.{n}": t for n, t in self.views.table.params.items()}
 
@@ -235,7 +235,7 @@ class StepTaker:
 
     def view_gradients(
         self, views: ViewStack, buffers: StepBuffers, plan: StepPlan, render: Renderer
-    ) -> tuple[list[torch.Tensor], Tensors, torch.Tensor, torch.Tensor, torch.Tensor]:
+    ) -> tuple[list[Tensor], Tensors, Tensor, Tensor, Tensor]:
         """Render the next view; return its gradients and statistics, learning rates, settings [7], and whether it goes on [1].
 
         Gradients are in the order of the parameters. Loss and stop flag go to ``buffers``.
@@ -251,13 +251,13 @@ class StepTaker:
             size = views.camera.width, views.camera.height
             statistics = self.strategy.statistics(plan.phase, v_projected, rendered.visible & going, size)
             what, names = "a tensor [N] for each of some of its columns, by name", self.table.columns
-            sizes = {"each": torch.Tensor, "shape": (len(self.table),), "names": names}
+            sizes = {"each": Tensor, "shape": (len(self.table),), "names": names}
             returned(self.strategy, "statistics", statistics, Mapping, what, **sizes)
         return gradients, statistics, lrs, settings, going
 
     def forward(
         self, views: ViewStack, buffers: StepBuffers, plan: StepPlan, render: Renderer
-    ) -> tuple[Render, LossInputs, Tensors, torch.Tensor, torch.Tensor]:
+    ) -> tuple[Render, LossInputs, Tensors, Tensor, Tensor]:
         """Render the next view; return the render, inputs of the loss, terms of view modules, learning rates and settings."""
         gaussians = self.table.gaussians
         lrs, settings, viewmat, K, image = buffers.begin(views)
@@ -268,9 +268,7 @@ class StepTaker:
             alpha, shift = buffers.of_view(views.alphas), settings[SHIFT]
             image = over(image, alpha, shift)
         target = Target(image, mask, {n: buffers.of_view(t) for n, t in views.maps.items()}, alpha)
-        factors = None
-        if self.dropout_seed is not None:
-            factors = opacity_dropout(len(gaussians), settings, self.dropout_seed)
+        factors = None if self.dropout_seed is None else opacity_dropout(len(gaussians), settings, self.dropout_seed)
         distortion = None if views.camera.distortion is None else buffers.of_view(views.camera.distortion)[None]
         camera = self.views.before_render(replace(views.camera, viewmat=viewmat, K=K, distortion=distortion), values)
         rendered = render(gaussians, camera, plan.degree, factors, shift)
@@ -282,23 +280,20 @@ class StepTaker:
 
     @torch.no_grad()
     def descend(
-        self, plan: StepPlan, gradients: list[torch.Tensor], lrs: torch.Tensor, stop: torch.Tensor, names: list[str],
-        rows: slice = slice(None),
-    ) -> None:  # fmt: skip
+        self, plan: StepPlan, gradients: list[Tensor], lrs: Tensor, stop: Tensor, names: list[str], rows: slice = slice(None)
+    ) -> None:
         """Update rows of named parameters of the Gaussians by Adam, and view modules with the means, if ``stop`` [1] is 0."""
         table, views = self.table, self.views.table
         split, own = 3 * len(table.params), dict(zip(table.params, gradients))
         factors = self.strategy.lr_factors(plan.phase) if "means" in names else None
         what = "factors, shape [N], or None"
-        returned(self.strategy, "lr_factors", factors, (torch.Tensor, type(None)), what, shape=(len(table),))
+        returned(self.strategy, "lr_factors", factors, (Tensor, type(None)), what, shape=(len(table),))
         table.adam_step({n: own[n] for n in names}, lrs[:split], stop, factors, rows)
         if "means" in names:
             views.adam_step(dict(zip(views.params, gradients[len(own) :])), lrs[split:], stop)
 
     @torch.no_grad()
-    def settle(
-        self, plan: StepPlan, gradients: list[torch.Tensor], statistics: Tensors, settings: torch.Tensor, going: torch.Tensor
-    ) -> None:
+    def settle(self, plan: StepPlan, gradients: list[Tensor], statistics: Tensors, settings: Tensor, going: Tensor) -> None:
         """Apply the changes after Adam: opacity decay, the strategy's own changes, limits, statistics."""
         table = self.table
         used = gradients[list(table.params).index("logit_opacities")] != 0 if plan.spares_unused else None
@@ -308,45 +303,43 @@ class StepTaker:
         for name, value in statistics.items():
             table.columns[name] += value
 
-    def take(
-        self, places: list[tuple[Kind, int]], settings: Callable[[], Sequence[tuple[float, ...]]],
-        stacks: Mapping[Kind, ViewStack], plan: StepPlan, max_instances: int | None, *, captured: bool,
-    ) -> None:  # fmt: skip
+    def take(self, places: list[tuple[Kind, int]], settings: Callable[[], Sequence[tuple[float, ...]]], plan: StepPlan) -> None:
         """Take the steps whose learning rates and settings the buffers hold, with the views at these kinds and rows.
 
         With several views in a step, ``places`` and ``settings`` list those of each slot, step by step. A view has at most
-        ``max_instances`` (Gaussian, tile) instances at a time; if a graph would exceed them, OverLimitError is raised, and
-        nothing was changed.
+        `StrategyContext.max_instances` (Gaussian, tile) instances at a time; if a graph would exceed them, OverLimitError is
+        raised, and nothing was changed.
         """
-        kinds = [kind for kind, _ in places]
-        for work in self.works(self.step, kinds, self.buffers, stacks, plan, max_instances, captured=captured):
+        for work in self.works(self.step, [kind for kind, _ in places], self.buffers, plan):
             work()
 
     def works(
         self, function: Callable[[ViewStack, StepBuffers, StepPlan, Renderer], object], kinds: Sequence[Kind],
-        buffers: StepBuffers, stacks: Mapping[Kind, ViewStack], plan: StepPlan, max_instances: int | None, *, captured: bool,
+        buffers: StepBuffers, plan: StepPlan,
     ) -> list[Callable[[], Any]]:  # fmt: skip
         """Return the work of ``function`` for a view of each of some kinds; missing graphs are captured first."""
-        if not (captured and self.cuda):
+        max_instances = self.strategy.context.max_instances
+        if not (self.captured and self.cuda):
             render = eager_renderer(self.options, max_instances)
-            return [functools.partial(function, stacks[kind], buffers, plan, render) for kind in kinds]
+            return [functools.partial(function, self.stacks[kind], buffers, plan, render) for kind in kinds]
         if self.table.settle():
             self.clear()
         self._graphs = {k: g for k, g in self._graphs.items() if k[1] == plan}
         for kind in dict.fromkeys(kinds):
             if (kind, plan) not in self._graphs:
-                capacity = self.capacity(kind, stacks, plan, max_instances)
+                capacity = self.capacity(kind, plan)
                 self.memory.give_back(0 if max_instances is not None else DEAD_BYTES)
                 render = captured_renderer(self.options, capacity, buffers.stop)
-                work = functools.partial(function, stacks[kind], buffers, plan, render)
+                work = functools.partial(function, self.stacks[kind], buffers, plan, render)
                 self._graphs[kind, plan] = self.capture(work, buffers)
-        return [functools.partial(_replay, self._graphs[kind, plan]) for kind in kinds]
+        return [self._graphs[kind, plan].replay for kind in kinds]
 
-    def capacity(self, kind: Kind, stacks: Mapping[Kind, ViewStack], plan: StepPlan, max_instances: int | None) -> int:
+    def capacity(self, kind: Kind, plan: StepPlan) -> int:
         """Return the capacity of captured steps with a kind of view, or raise OverLimitError above ``max_instances``."""
+        max_instances = self.strategy.context.max_instances
         self._capacities = {k: c for k, c in self._capacities.items() if k[1] == plan}
         if (kind, plan) not in self._capacities:
-            now = current(stacks[kind], self.views)
+            now = current(self.stacks[kind], self.views)
             self._capacities[kind, plan] = instance_capacity(self.table.gaussians, now, plan.degree, self.options)
         wanted = self._capacities[kind, plan]
         if max_instances is not None and wanted > max_instances:
@@ -381,12 +374,6 @@ class StepTaker:
     def stopped_slot(self) -> int:
         """Return the first slot that stopped the last steps; 0 if none did, or in steps of one view."""
         return 0
-
-
-def _replay(graph: CapturedGraph) -> object:
-    """Replay a graph, and return what its work returned."""
-    graph.replay()
-    return graph.result
 
 
 @torch.no_grad()

@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 from typing import Annotated, Any
 
 import torch
+from torch import Tensor
 
-from warpgs import schema
 from warpgs.errors import DataError
 from warpgs.pipeline.metrics.scores import psnr_of
 from warpgs.pipeline.model.table import DensityUpdate
@@ -18,7 +18,7 @@ from warpgs.process import Detail
 from warpgs.render.options import RasterizeOptions
 from warpgs.render.rasterize import rasterize
 from warpgs.scene import Gaussians, Tensors
-from warpgs.schema import Checked, Within
+from warpgs.schema import Checked, Within, fields, items, or_null, real, text, whole
 
 # Held-out blocks of pixels; the gain on these blocks, compared with its noise, ends a fit early (docs/decisions/020).
 #
@@ -37,7 +37,7 @@ MAX_FRACTION = 0.1
 """Largest fraction of the pixels that may be held out in small images to reach `MIN_BLOCKS`, even if less was requested."""
 
 
-Blocks = tuple[torch.Tensor, torch.Tensor]
+Blocks = tuple[Tensor, Tensor]
 """Rows [B, side, 1] and columns [B, 1, side] of the pixels of squares of one view, int64 on its device; no two overlap."""
 
 
@@ -66,7 +66,7 @@ def sample_blocks(views: list[TrainingView], fraction: float, seed: int) -> list
     return sampled
 
 
-def rendered(gaussians: Gaussians, view: TrainingView, options: RasterizeOptions) -> torch.Tensor:
+def rendered(gaussians: Gaussians, view: TrainingView, options: RasterizeOptions) -> Tensor:
     """Return the colours of a model as a training view shows them, shape [H, W, 3]."""
     return view.seen(rasterize(gaussians, view.camera, options).rgb)
 
@@ -79,9 +79,7 @@ def masked(view: TrainingView, blocks: Blocks, *, inside: bool) -> TrainingView:
 
 
 @torch.no_grad()
-def block_errors(
-    gaussians: Gaussians, views: list[TrainingView], blocks: list[Blocks], options: RasterizeOptions
-) -> torch.Tensor:
+def block_errors(gaussians: Gaussians, views: list[TrainingView], blocks: list[Blocks], options: RasterizeOptions) -> Tensor:
     """Return the mean squared error of every block over its unmasked pixels, float64 on the CPU, shape [B] over all views."""
     errors = [torch.zeros(0, dtype=torch.float64, device="cpu")]
     for view, held in zip(views, blocks, strict=True):
@@ -92,12 +90,12 @@ def block_errors(
     return torch.cat(errors)
 
 
-def decibels(errors: torch.Tensor) -> float:
+def decibels(errors: Tensor) -> float:
     """Return the PSNR [dB] of the mean of block errors [B], including the error floor; NaN without blocks."""
     return psnr_of(float(errors.mean()) + FLOOR) if len(errors) else math.nan
 
 
-def gain(before: torch.Tensor, after: torch.Tensor) -> tuple[float, float]:
+def gain(before: Tensor, after: Tensor) -> tuple[float, float]:
     """Return the mean decrease of the errors of blocks [B] by a change, and its standard error [dB].
 
     The gain of a block is ten times the decimal logarithm of the ratio of its errors, with the floor added to both. The
@@ -137,11 +135,11 @@ class StoppingConfig(Checked, group="stopping."):
     0.1, or 0 if --cpu-limit shortens the fit."""
 
 
-_COUNT = schema.whole(0)
-STATE = schema.fields({
-    "ended": schema.or_null(_COUNT), "why": schema.text, "measured": schema.items(_COUNT),
-    "measurements": schema.items(schema.fields({
-        "step": _COUNT, "count": _COUNT, "held_out_psnr": schema.real, "gain": schema.real, "noise": schema.real,
+_COUNT = whole(0)
+STATE = fields({
+    "ended": or_null(_COUNT), "why": text, "measured": items(_COUNT),
+    "measurements": items(fields({
+        "step": _COUNT, "count": _COUNT, "held_out_psnr": real, "gain": real, "noise": real,
     }, others=False)),
 })  # fmt: skip
 """Schema of the plain values in a checkpoint."""
@@ -174,7 +172,7 @@ class Stopping:
         """Steps done when the blocks are measured: when growth begins, and after each interval."""
         self.earliest = 0.0
         """Last step in which views have half size. Growth ends after it at the earliest."""
-        self.measured: list[tuple[int, torch.Tensor]] = []
+        self.measured: list[tuple[int, Tensor]] = []
         """For every measurement, the steps done and the errors of the blocks [B]."""
 
     def begin(self, context: StrategyContext, strategy: Strategy, half_resolution: float) -> list[str]:
@@ -249,7 +247,7 @@ class Stopping:
         self.measured.append((step, errors))
         return self.why != ""
 
-    def _reason(self, step: int, errors: torch.Tensor) -> str:
+    def _reason(self, step: int, errors: Tensor) -> str:
         """Return why growth ends after a step with these errors of the blocks [B]; empty if growth continues."""
         since, earlier = next((m for m in reversed(self.measured) if m[0] * LATELY <= step), (0, None))
         # in the first third of its time, or while views are half their size, it is too early
@@ -262,7 +260,7 @@ class Stopping:
             return f"all its planned steps are done ({self.measurements[-1]['gain']:+.3f} dB since the previous measurement)"
         return ""
 
-    def state(self) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
+    def state(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
         """Return the errors of the blocks at every measurement, shape [M, B], and plain values, for resuming."""
         tensors = {"stopping.measured": torch.stack([e for _, e in self.measured])} if self.measured else {}
         return tensors, {

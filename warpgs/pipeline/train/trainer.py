@@ -183,9 +183,8 @@ class Trainer:
         """Views still to come in the current pass over all views, in reverse order."""
         self.extrapolated = start.extrapolated > 0
         """True if the start has extrapolated points: opacity decay then spares Gaussians that a step does not use."""
-        self.table = Table.of_gaussians(
-            initial_gaussians(start.cloud, c.init, c.sh_degree, extent, device, start.extrapolated), {}
-        )
+        first = initial_gaussians(start.cloud, c.init, c.sh_degree, extent, device, start.extrapolated)
+        self.table = Table.of_gaussians(first, {})
         self.context = StrategyContext(
             c.groups(), c.strategy_config, self.table, self.generator, c.seed, plan_phases(c.phases, c.steps), extent, c.rule,
             self.background, antialiased=c.antialiased,
@@ -200,7 +199,7 @@ class Trainer:
         self.mean = ParameterMean(c.optimizer.average_last)
         limiting, seed = (camera_centers(cameras, device), camera_rows(cameras, device)), c.seed if self.dropout > 0 else None
         parts = self.table, self.learned, self.strategy, limiting, self.context.render_options(), seed
-        self.taker = StepTaker(*parts) if c.batch == 1 else BatchSteps(*parts, Tree(c.batch, ranks))
+        self.taker = StepTaker(*parts) if c.batch == 1 else BatchSteps(*parts, tree=Tree(c.batch, ranks))
         views, self.disparities = prepared_views(train, start, priors, c, self.terms, device)
         self.context.priors = priors or []
         self.set_views(with_learned(views, self.learned))
@@ -229,10 +228,6 @@ class Trainer:
         """Steps of the fit: those of the settings, or fewer if phase 3 begins early."""
         return self.phases.steps
 
-    def progress(self, step: int) -> float:
-        """Return the fraction of the fit that is done before a step, in [0, 1]."""
-        return self.phases.progress(step)
-
     def degree(self, step: int) -> int:
         """Return the degree of the harmonics in use at a step."""
         c = self.config
@@ -243,10 +238,9 @@ class Trainer:
         c = self.config
         terms = tuple(t for t in self.terms if t.active(step, self.phases.planned))
         half = step <= self.half_resolution * self.phases.planned
-        limits = c.limits.at(1.0 if step >= self.steps else self.progress(step), self.radius, c.antialiased)
+        limits = c.limits.at(1.0 if step >= self.steps else self.phases.progress(step), self.radius, c.antialiased)
         phase = returned(self.strategy, "phase", self.strategy.phase(step), Hashable, "a hashable value")
-        decay = c.optimizer.opacities_decay
-        return StepPlan(self.degree(step), half, terms, phase, limits, decay, self.extrapolated)
+        return StepPlan(self.degree(step), half, terms, phase, limits, c.optimizer.opacities_decay, self.extrapolated)
 
     def next_view(self) -> int:
         """Return the index of the next view. The order is random; each view comes once before any view comes again."""
@@ -308,13 +302,11 @@ class Trainer:
         steps = range(first, first + count)
         buffers.load([row for _, row in places[:count]], [self._lr_row(s) for s in steps], [self.settings(s) for s in steps])
         self.chosen = chosen
+        self.taker.stacks, self.taker.captured = self.stacks, self.layout.graphs > 0
         if self.layout.graphs and self.stopping.ended is None:
             self.strategy.before_steps(steps[-1])
         try:
-            self.taker.take(
-                places, lambda: [self.settings(step, slot) for step in steps for slot in range(self.batch)],
-                self.stacks, plan, self.context.max_instances, captured=self.layout.graphs > 0,
-            )  # fmt: skip
+            self.taker.take(places, lambda: [self.settings(step, n) for step in steps for n in range(self.batch)], plan)
         except OverLimitError as e:
             self.taker.clear()
             self.layout.graphs = 0
@@ -340,10 +332,8 @@ class Trainer:
                 self._hold()
             counts[-1] = len(self.table)
         seconds = (time.perf_counter() - begin) / max(1, done)
-        return [
-            StepReport(first + k, loss, psnr_of(max(mse, 1e-12)), counts[k], seconds)
-            for k, (loss, mse) in enumerate(history[:done])
-        ]
+        each = zip(steps, counts, history)  # history has the next step, too
+        return [StepReport(step, loss, psnr_of(max(mse, 1e-12)), count, seconds) for step, count, (loss, mse) in each]
 
     def _hold(self) -> None:
         """Hold all Gaussians to the limits of the last step."""
@@ -351,14 +341,14 @@ class Trainer:
 
     def _lr_row(self, step: int) -> list[float]:
         """Return the learning rates of a step as `StepBuffers` holds them: of the Gaussians, then of view modules."""
-        own, lrs = self.lrs(step), self.learned.lrs(self.progress(step), self.context.extent)
+        own, lrs = self.lrs(step), self.learned.lrs(self.phases.progress(step), self.context.extent)
         return self.table.lr_row(own, step, self.config.optimizer.head_lrs) + self.learned.table.lr_row(lrs, step, {})
 
     def lrs(self, step: int) -> dict[str, float]:
         """Return the learning rate of each parameter of the Gaussians at a step."""
         c, phases = self.config, self.phases
         stable_start = phases.stable_start / phases.planned if c.phases.stable and phases.stable_start < phases.planned else 0.0
-        return c.optimizer.lrs(self.progress(step), self.context.extent, stable_start)
+        return c.optimizer.lrs(self.phases.progress(step), self.context.extent, stable_start)
 
     def settings(self, step: int, slot: int | None = None) -> tuple[float, ...]:
         """Return the settings of a step (`Setting`), or of a slot, which has its own index for random numbers."""
@@ -366,7 +356,9 @@ class Trainer:
         # else Gaussians of the background colour could cover empty areas
         shift = random_shift(self.config.seed, number, self.scene_background) if self.cutout else (0.0, 0.0, 0.0)
         means_lr = math.sqrt(self.batch) * self.lrs(step)["means"]
-        return Setting.row(dropout=self.dropout * self.progress(step), number=number, step=step, means_lr=means_lr, shift=shift)
+        return Setting.row(
+            dropout=self.dropout * self.phases.progress(step), number=number, step=step, means_lr=means_lr, shift=shift
+        )
 
     def is_due(self, step: int) -> bool:
         """Return whether the set of Gaussians changes, or left-out blocks are measured, after a step."""
@@ -456,8 +448,7 @@ class Trainer:
         self.context.extent = plain["extent"]
         self.notes = [*map(Detail, plain["notes"])]  # shown when the fit began
         self.table.load(tensors)
-        of_views = {n.removeprefix("views."): t for n, t in tensors.items() if n.startswith("views.")}
-        self.learned.table.load(of_views)
+        self.learned.table.load({n.removeprefix("views."): t for n, t in tensors.items() if n.startswith("views.")})
         self.mean.load(tensors, self.taker.params)
         self.strategy.load(tensors, plain["strategy"])
         self.stopping.load(tensors, plain["stopping"])
@@ -471,12 +462,9 @@ def train_views(scene: Scene, names: tuple[str, ...]) -> list[View]:
 
 
 def run(
-    trainer: Trainer,
-    on_step: Callable[[StepReport], None],
-    save: Callable[[Trainer], None],
-    stopped: Callable[[], bool],
+    trainer: Trainer, on_step: Callable[[StepReport], None], save: Callable[[Trainer], None], stopped: Callable[[], bool],
     restore: Callable[[Trainer], bool] = lambda _: False,
-) -> None:
+) -> None:  # fmt: skip
     """Take all remaining steps; report each, and save at intervals and at the end.
 
     A step that runs out of memory is tried once more with less memory (`Trainer.spare_memory`). If the state is incomplete, for
@@ -559,8 +547,7 @@ def warm_up(config: FitConfig, device: torch.device, stopped: Callable[[], bool]
         viewmat = np.eye(4)
         viewmat[0, 3] = x
         views.append(View(f"{x}", Camera(viewmat, K, SIDE, SIDE), generator.random((SIDE, SIDE, 3), np.float32)))
-    points = generator.uniform([-1, -1, 2], [1, 1, 4], (POINTS, 3))
-    cloud = PointCloud(points, generator.random((POINTS, 3), np.float32))
+    cloud = PointCloud(generator.uniform([-1, -1, 2], [1, 1, 4], (POINTS, 3)), generator.random((POINTS, 3), np.float32))
     maps = [generator.random((SIDE, SIDE), np.float32) for _ in range(4)]
     small = replace(
         config, steps=STEPS, memory_limit=None, init=replace(config.init, source="points"),

@@ -18,6 +18,8 @@ from warpgs.render.options import RasterizeOptions
 from warpgs.scene import Camera, Gaussians, Tensors, View
 from warpgs.schema import Checked, Within
 
+Cameras = Mapping[str, Camera]
+"""Cameras by the names of their views."""
 CAMERA_BYTES = 4 * (16 + 9)
 """Bytes per Gaussian if cameras are learned: its part of the gradients of view matrix and intrinsics, before the sum over
 Gaussians."""
@@ -33,9 +35,9 @@ class FittedViews:
     """Names of the training views, in the order of their parameters."""
     test: Sequence[View]
     """Held-out views, with their cameras after the fit."""
-    given: Mapping[str, Camera]
+    given: Cameras
     """Camera of each view before the fit, in scene units [u], by name."""
-    cameras: Mapping[str, Camera]
+    cameras: Cameras
     """Camera of each view after the fit, in scene units [u], by name."""
     scale: float
     """Scene units per unit of the scene's files."""
@@ -121,9 +123,7 @@ class ViewModule(Checked):
         """
         return {}
 
-    def cameras(
-        self, given: Mapping[str, Camera], train: Sequence[str], test: Sequence[str], params: Tensors
-    ) -> Mapping[str, Camera]:
+    def cameras(self, given: Cameras, train: Sequence[str], test: Sequence[str], params: Tensors) -> Cameras:
         """Return the cameras of all views after the fit, for scores and renders; by default the given ones.
 
         The images of held-out views are not available, so that nothing is learned from them.
@@ -143,7 +143,7 @@ class ViewModule(Checked):
 
 VIEW_MODULES = Registry("view module", ViewModule, __name__)
 """View modules by name; those in the modules of this folder are built in."""
-register = VIEW_MODULES.register
+register = register_view_module = VIEW_MODULES.register
 
 
 # Exposure of training views: an affine map of rendered colours for each view, learned with the Gaussians.
@@ -239,8 +239,7 @@ class Exposure(ViewModule, group="exposure."):
 
     def regularisation(self, values: Tensors) -> torch.Tensor:
         """Return ``weight`` times the sum of squares of [A - 1 | b], shape []: it pulls exposures towards the identity."""
-        square = values[EXPOSURE].double().square().sum()
-        return (self.weight * square).to(values[EXPOSURE].dtype)
+        return (self.weight * values[EXPOSURE].double().square().sum()).to(values[EXPOSURE].dtype)
 
     def bytes(self, sizes: StepSizes) -> Needs:
         """Return the bytes of the render after its exposure, which exists beside the plain render."""
@@ -334,8 +333,7 @@ def focal_factors(params: Tensors, numbers: torch.Tensor) -> torch.Tensor:
 
 def zoomed(K: torch.Tensor, factor: torch.Tensor) -> torch.Tensor:
     """Return intrinsics [B, 3, 3] with fx and fy times a factor [B]; differentiable."""
-    focal = K[:, :2, :2] * factor[:, None, None]
-    return torch.cat([torch.cat([focal, K[:, :2, 2:]], 2), K[:, 2:]], 1)
+    return torch.cat([torch.cat([K[:, :2, :2] * factor[:, None, None], K[:, :2, 2:]], 2), K[:, 2:]], 1)
 
 
 def similarity(given: Sequence[Camera], refined: Sequence[Camera]) -> tuple[np.ndarray, float, np.ndarray]:
@@ -353,9 +351,7 @@ def similarity(given: Sequence[Camera], refined: Sequence[Camera]) -> tuple[np.n
     return R, scale, b.mean(0) - scale * matmul(R, a.mean(0))
 
 
-def refined_cameras(
-    given: Mapping[str, Camera], train: Sequence[str], test: Sequence[str], params: Tensors
-) -> dict[str, Camera]:
+def refined_cameras(given: Cameras, train: Sequence[str], test: Sequence[str], params: Tensors) -> dict[str, Camera]:
     """Return the cameras of all views after refinement: training ones by their own increments, held-out ones by `POSE_RULE`.
 
     If focal lengths are learned, a held-out view has the focal length of the training views of its camera. If no training view
@@ -381,9 +377,7 @@ def refined_cameras(
     return found
 
 
-def pose_figures(
-    given: Mapping[str, Camera], refined: Mapping[str, Camera], train: Sequence[str], held_out: bool, scale: float
-) -> dict[str, Any]:
+def pose_figures(given: Cameras, refined: Cameras, train: Sequence[str], held_out: bool, scale: float) -> dict[str, Any]:
     """Return the changes by refinement, for metrics.json; ``scale`` is scene units per unit of the scene's files.
 
     ``views`` has the turn [degrees] and the shift of the centre [units of the files] of each training view; ``cameras`` the
@@ -462,9 +456,7 @@ class RefinePoses(ViewModule, group="refine-poses."):
         """Return the bytes of the gradient of the camera."""
         return {PROJECTION: CAMERA_BYTES * sizes.count}
 
-    def cameras(
-        self, given: Mapping[str, Camera], train: Sequence[str], test: Sequence[str], params: Tensors
-    ) -> Mapping[str, Camera]:
+    def cameras(self, given: Cameras, train: Sequence[str], test: Sequence[str], params: Tensors) -> Cameras:
         """Return `refined_cameras`."""
         return refined_cameras(given, train, test, params)
 

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch.nn.functional import interpolate
 
 from warpgs.device import FLOAT, STEP, Needs, StepSizes
 from warpgs.errors import UsageError
@@ -85,8 +84,7 @@ class LearnedViews:
     def before_render(self, camera: Camera, values: Tensors) -> Camera:
         """Return the camera that views are rendered from; arguments are those of `ViewModule.before_render`."""
         for module in self.modules:
-            shown = module.before_render(camera, values)
-            camera = returned(module, "before_render", shown, Camera, "a Camera")
+            camera = returned(module, "before_render", module.before_render(camera, values), Camera, "a Camera")
         return camera
 
     def regularisation(self, values: Tensors) -> dict[str, torch.Tensor]:
@@ -104,6 +102,8 @@ class LearnedViews:
 
 Kind = tuple[int, int, bool, str]
 """Width and height [px] of a view, whether it has a mask, and its camera model."""
+Place = tuple[Kind, int]
+"""Kind of a view, and its row in the stack of that kind."""
 
 
 @dataclass(frozen=True)
@@ -182,8 +182,7 @@ def view_bytes(views: Iterable[TrainingView]) -> int:
     a CPU, stacks have no memory of their own.
     """
     tensors = (t for v in views for t in (v.image, v.mask, v.alpha, v.consistent, *v.maps.values()))
-    storages = (t.untyped_storage() for t in tensors if t is not None)
-    return sum({s.data_ptr(): s.nbytes() for s in storages}.values())
+    return sum({s.data_ptr(): s.nbytes() for s in (t.untyped_storage() for t in tensors if t is not None)}.values())
 
 
 def with_alpha(views: Sequence[View]) -> list[View]:
@@ -209,7 +208,7 @@ def half_size(view: TrainingView) -> TrainingView:
     width, height = camera.width, camera.height
 
     def mean(channels: torch.Tensor) -> torch.Tensor:
-        return interpolate(channels[None], (height, width), mode="area")[0]
+        return torch.nn.functional.interpolate(channels[None], (height, width), mode="area")[0]
 
     def smaller(t: torch.Tensor) -> torch.Tensor:
         return mean(t[None])[0] if t.ndim == 2 else mean(t.permute(2, 0, 1)).permute(1, 2, 0).contiguous()
@@ -266,9 +265,7 @@ def stacked(tensors: Sequence[torch.Tensor]) -> Rows:
     return first.as_strided((len(tensors), *first.shape), (first.numel(), *first.stride()))
 
 
-def stack_views(
-    views: list[TrainingView], count: int
-) -> tuple[list[TrainingView], dict[Kind, ViewStack], list[tuple[Kind, int]]]:
+def stack_views(views: list[TrainingView], count: int) -> tuple[list[TrainingView], dict[Kind, ViewStack], list[Place]]:
     """Stack views by size, by whether they have a mask, and by camera model.
 
     Views after the first ``count`` are the same views at another size. Returns the views, whose pixels are parts of the stacks,
@@ -319,9 +316,7 @@ def current(stack: ViewStack, learned: LearnedViews) -> ViewStack:
 
 
 @torch.no_grad()
-def show_learned(
-    views: list[TrainingView], stacks: Mapping[Kind, ViewStack], places: list[tuple[Kind, int]], learned: LearnedViews
-) -> None:
+def show_learned(views: list[TrainingView], stacks: dict[Kind, ViewStack], places: list[Place], learned: LearnedViews) -> None:
     """Write the current learned values into the views of `with_learned`; density strategies render these views."""
     if not learned.modules:
         return

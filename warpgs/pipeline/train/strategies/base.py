@@ -252,5 +252,5 @@ def changes_of(strategy: Strategy, method: str, changes: Any) -> Iterator[Densit
 
 STRATEGIES: Registry[Strategy] = Registry("strategy", Strategy, __package__, "warpgs.pipeline.paper")
 """Strategies by name; those in the modules of this folder and of the paper's are built in."""
-register = STRATEGIES.register
+register = register_strategy = STRATEGIES.register
 find_strategy = STRATEGIES.find

@@ -89,8 +89,7 @@ def refine(
             pull = torch.where(growing, pull, 0)
         free = max(0, capacity - len(gaussians))
         if int(grows.sum()) > free:
-            strongest = torch.topk(pull, free).indices
-            grows = torch.zeros_like(grows).index_fill(0, strongest, True) & grows
+            grows = torch.zeros_like(grows).index_fill(0, torch.topk(pull, free).indices, True) & grows
         small = scales <= CLONE_SIZE * extent
         faint = ~(logits >= geometry.logit(PRUNE_OPACITY))
         if after_reset and config.prune_size > 0:

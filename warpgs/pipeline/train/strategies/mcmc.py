@@ -3,10 +3,9 @@
 "3D Gaussian Splatting as Markov Chain Monte Carlo", arXiv 2404.09591. Equation numbers are that paper's.
 """
 
-import dataclasses
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 import torch
@@ -115,7 +114,7 @@ class MCMC(Strategy):
     @classmethod
     def warmup_config(cls, own):
         """Return the settings with an event after every step."""
-        return dataclasses.replace(own, start=0, every=1)
+        return replace(own, start=0, every=1)
 
     def growth(self) -> Growth:
         """Return the times of relocation and addition."""
@@ -167,5 +166,4 @@ class MCMC(Strategy):
             return DensityUpdate(everything, copies, sampled, overwritten=sources, values=values)
         nothing = {n: v[:0] for n, v in values.items()}
         both = {n: torch.cat([v, copies[n]]) for n, v in values.items()}
-        rows = torch.cat([sources, onto])
-        return DensityUpdate(everything, nothing, sampled[:0], overwritten=rows, values=both)
+        return DensityUpdate(everything, nothing, sampled[:0], overwritten=torch.cat([sources, onto]), values=both)

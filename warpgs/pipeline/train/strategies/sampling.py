@@ -1,15 +1,13 @@
 """Sampling: fine Gaussians are added behind pixels of the training views, in two layers, and protected for some steps."""
 
-import dataclasses
 import math
 from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, NamedTuple
 
 import torch
 
-from warpgs import schema
 from warpgs.constants import ALPHA_CUT
 from warpgs.device import FLOAT, SAMPLING, Needs, StepSizes
 from warpgs.geometry import back_project_tensors, logit
@@ -24,7 +22,7 @@ from warpgs.plugins import is_ours
 from warpgs.render.options import RasterizeOptions
 from warpgs.render.rasterize import rasterize
 from warpgs.scene import Camera, Gaussians, Tensors, base_coefficients
-from warpgs.schema import Checked, Within
+from warpgs.schema import Checked, Within, fields, items, real, whole
 
 COARSE, FINE = 0, 1
 """Numbers of the layers: of Gaussians that were not sampled, and of sampled ones."""
@@ -172,15 +170,15 @@ def fine_gaussians(
 
 def weight_sums(gaussians: Gaussians, cameras: list[Camera], options: RasterizeOptions) -> torch.Tensor:
     """Return the sum of blending weights of each Gaussian over at most `MAX_WEIGHED` cameras, evenly spaced, shape [N]."""
-    weigh = dataclasses.replace(options, contributions=True)
+    weigh = replace(options, contributions=True)
     total = torch.zeros(len(gaussians), device=gaussians.means.device, dtype=torch.float32)
     for camera in cameras[:: -(-len(cameras) // MAX_WEIGHED)]:
         total += rasterize(gaussians, camera, weigh).weight_sums[0]
     return total
 
 
-_COUNT = schema.whole(0)
-EVENT = schema.fields({"step": _COUNT, "added": _COUNT, "evicted": _COUNT, "quantiles": schema.items(schema.real)})
+_COUNT = whole(0)
+EVENT = fields({"step": _COUNT, "added": _COUNT, "evicted": _COUNT, "quantiles": items(real)})
 """Schema of a stored event."""
 
 
@@ -208,7 +206,7 @@ class Sampling(Strategy):
     `importance`.
     """
 
-    STATE = staticmethod(schema.fields({**GradientGrowth.STATE, "events": schema.items(EVENT)}))
+    STATE = staticmethod(fields({**GradientGrowth.STATE, "events": items(EVENT)}))
     samples = True
     consistent: bool = True
     """Whether new Gaussians are placed at the depth that other views confirm, where it exists, instead of rendered depth."""
