@@ -186,6 +186,8 @@ class Trainer:
         self.table = Table.of_gaussians(
             initial_gaussians(start.cloud, c.init, c.sh_degree, extent, device, start.extrapolated), {}
         )
+        self.first_count = len(self.table)
+        """Number of Gaussians before the first step."""
         self.context = StrategyContext(
             c.groups(), c.strategy_config, self.table, self.generator, c.seed, plan_phases(c.phases, c.steps), extent, c.rule,
             self.background, antialiased=c.antialiased,
