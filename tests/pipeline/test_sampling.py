@@ -63,6 +63,7 @@ def test_a_continued_fit_expects_the_same_gaussians_and_only_the_rest_of_the_tim
     assert len(later.table) > 2 * len(begun.table) and times == same
     assert before.startswith("40 steps take") and after.startswith("10 steps take")
     assert before.partition("; ")[2] == after.partition("; ")[2]
+    assert planned_times(job, advanced(later))[1] == []
 
 
 def grown(fit: Trainer, keep: int | list[int], parents: list[int], **more) -> DensityUpdate:
