@@ -134,6 +134,10 @@ def test_render_paths(run, tmp_path, path, pictures, capsys, monkeypatch):
     assert said.startswith("the film will be VP9, ") and said.count("install ffmpeg") == 1
     assert f"rendering {pictures} frames\nrendering: 2 of {pictures} frames, " in said
     assert f"sheet of {min(6, pictures)} frames in {tmp_path / 'sheet.png'}" in said
+    if path == "spiral":  # the advice is not repeated, except for a film that shall be .mp4
+        for out, times in ((tmp_path, 0), (tmp_path / "a.webp", 0), (tmp_path / "a.mp4", 1), (tmp_path / "a.mp4", 1)):
+            assert main(["render", str(run), "--path", path, "--frames", "2", "--out", str(out), "--device", "cpu"]) == 0
+            assert capsys.readouterr().out.count("install ffmpeg") == times
 
 
 @pytest.mark.parametrize("words", [["--color", "coverage"], ["--points", "start", "--background", "black"], ["--no-cameras"]])

@@ -867,6 +867,16 @@ def test_glb_holds_the_mesh(tmp_path):
         v, q = np.array(up, float) / np.linalg.norm(up), np.array([x, y, z])
         turned = v + 2 * np.cross(q, np.cross(q, v) + w * v)
         assert np.allclose(turned, [0, 1, 0], atol=1e-6) and np.isclose(x * x + y * y + z * z + w * w, 1)
+    # and what lies ahead to -z, unless that is up or down
+    for up, ahead, front in (
+        ((0, 0, 3), (0, 5, 1), (0, 1, 0)),
+        ((0, -1, 0), (0, 0, 1), (0, 0, 1)),
+        ((0, 0, 1), (0, 0, -2), None),
+    ):
+        q = rotation_to_y(np.array(up, float), np.array(ahead, float))
+        turn = rotation_matrices(torch.tensor([[q[3], *q[:3]]], dtype=torch.float64))[0].numpy()
+        assert np.allclose(turn @ up, [0, np.linalg.norm(up), 0]) and np.isclose(np.linalg.det(turn), 1)
+        assert np.allclose(turn @ front, [0, 0, -1]) if front else q == rotation_to_y(np.array(up, float))
 
 
 def test_glb_holds_the_texture(tmp_path):

@@ -20,14 +20,13 @@ from warpgs.export.ply import start_of
 from warpgs.export.sog import SOG
 from warpgs.export.spz import SPZ
 from warpgs.files import read_file
-from warpgs.io import folder as folders, images
+from warpgs.io import folder as folders, image_files, images
 from warpgs.io.folder import READERS
 from warpgs.io.load import load_scene
 from warpgs.io.maps import read_numbers
 from warpgs.pipeline.farm.job import file_digest
 from warpgs.pipeline.metrics import lpips
 from warpgs.plugins import Registry
-from warpgs.poses import photographs
 from warpgs.poses.find import find_poses, source_digest
 from warpgs.priors import export
 from warpgs.report.progress import read_events
@@ -44,7 +43,7 @@ def package(path):
 
 
 MORE = {
-    **{f"a{suffix}": lambda p: find_poses(p, p.parent / "out") for suffix in photographs.SUFFIXES},
+    **{f"a{suffix}": lambda p: find_poses(p, p.parent / "out") for suffix in image_files.VIDEO_SUFFIXES},
     **{f"mask{suffix}": folders.read_mask for suffix in images.SUFFIXES},
     "b.ply": warpgs.read_ply, "c.ply": start_of, "b.spz": lambda p: SPZ().is_antialiased(p),
     "b.sog": lambda p: SOG().is_antialiased(p), "artefact": file_digest, "render.png": lambda p: read_file(p, p.parent),

@@ -1,6 +1,7 @@
 """Meshes: depth along rays, agreement of views, the grid, its triangles, and a ball that becomes a ball."""
 
 import dataclasses
+import json
 import re
 
 import numpy as np
@@ -176,7 +177,7 @@ def stored(monkeypatch, tmp_path_factory):
     (folder / METRICS_FILE).touch()
     run = StoredRun(
         ball(), Normalization(np.array([10.0, 20, 30]), 0.5), views, tuple(views)[:9], tuple(views)[9:], "exact", (0, 0, 0), 7,
-        folder, {},
+        folder, {"scene": {"path": None}},
     )  # fmt: skip
     monkeypatch.setattr(run_mesh, "open_run", lambda folder, device: run)
     return run
@@ -187,7 +188,8 @@ def test_the_command_writes_in_units_of_the_files(stored, tmp_path, capsys):
     assert main(["mesh", "run", "--out", str(tmp_path / "a.ply"), "--voxel", "0.16", "--device", "cpu"]) == 0
     text = capsys.readouterr().out
     assert text.index("voxel 0.16 units of the scene's files") < text.index("fusing depth: view 1 of 9")
-    assert "was not observed by the 9 training views" in text and "triangles extracted" in text
+    assert "was not observed by the 9 training views; the mesh is open there; try --crop auto and --fill-holes\n" in text
+    assert "triangles extracted" in text
 
     def vertices():
         head, body = (tmp_path / "a.ply").read_bytes().split(b"end_header\n", 1)
@@ -199,6 +201,7 @@ def test_the_command_writes_in_units_of_the_files(stored, tmp_path, capsys):
     low, high = (np.array([10, 20, 30]) + (CENTER + s) / 0.5 for s in ([-2, -2, -2], [0, 2, 2]))
     words = ["--crop", ",".join(f"{v:g}" for v in (*low, *high)), "--fill-holes", "--voxel", "0.16", "--device", "cpu"]
     assert main(["mesh", "run", "--out", str(tmp_path / "a.glb"), *words]) == 0
+    assert "the mesh is open there\n" in capsys.readouterr().out
     assert main(["mesh", "run", "--out", str(tmp_path / "a.ply"), *words]) == 0
     assert len(vertices()) > 100 and (vertices() >= low).all() and (vertices() <= high).all()
     assert b"TEXCOORD_0" in (tmp_path / "a.glb").read_bytes()
@@ -216,6 +219,21 @@ def test_upright_where_the_cameras_agree(stored, tmp_path, capsys):
             stored.scene_cameras[name] = dataclasses.replace(c, viewmat=half @ c.viewmat)
         assert main(["mesh", "run", "--out", str(tmp_path / "a.glb"), "--resolution", "24", "--device", "cpu"]) == 0
         assert ("may be tilted in a viewer" in capsys.readouterr().out) == upside_down
+
+
+def test_the_front_faces_the_viewer_where_coordinates_are_made_up(stored, tmp_path):
+    """Cameras on the +z side of a .glb file, if their poses were found from photographs; given coordinates keep their axes."""
+    sides, turns = cameras(np.array([[1, 0, 0.2], [1, 0, -0.2], [1, 0, 0]])), []
+    stored.scene_cameras.update(zip(stored.train, 3 * sides))
+    for made_up in (False, True):
+        if made_up:
+            (stored.folder / "scene").mkdir()
+            (stored.folder / "scene" / "poses.json").touch()
+        assert main(["mesh", "run", "--out", str(tmp_path / "a.glb"), "--resolution", "24", "--device", "cpu"]) == 0
+        x, y, z, w = json.loads((tmp_path / "a.glb").read_bytes()[20:].partition(b"BIN\0")[0][:-4])["nodes"][0]["rotation"]
+        turns.append(rotation_matrices(torch.tensor([[w, x, y, z]], dtype=torch.float64))[0].numpy())
+    assert all(np.allclose(turn @ [0, -1, 0], [0, 1, 0]) for turn in turns)
+    assert np.allclose(turns[0] @ [-1, 0, 0], [-1, 0, 0]) and np.allclose(turns[1] @ [-1, 0, 0], [0, 0, -1])
 
 
 @pytest.mark.parametrize(

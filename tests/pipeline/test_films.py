@@ -101,6 +101,10 @@ def test_what_was_chosen_is_said(model, monkeypatch):
     plan = plan_film(model, "turntable", FilmSettings(seconds=0.5, fps=12, size=(64, 20), fov_y=0.5))
     assert [(c.width, c.height) for _, c in plan.cameras] == [(64, 20)] * 6 and "there and back" in plan.notes[-1]
     assert 2 * math.atan(10 / plan.cameras[0][1].K[1, 1]) == pytest.approx(0.5)
+    for size, lost, fov in (((160, 64), "height", "17 to 34"), ((80, 128), "width", "34 to 63"), ((80, 64), "", "")):
+        notes = [n for n in plan_film(model, "spiral", FilmSettings(frames=2, size=size)).notes if "shape" in n]
+        said = f"frames have another shape than the photographs, and show 50% of their {lost}; --fov {fov} shows more"
+        assert notes == [said] * bool(lost)
     plan = plan_film(model, "interpolate", FilmSettings(frames=13))
     assert plan.notes[-1].startswith("path: interpolate, through 3 of 5 cameras in the given order")
     assert [n for n, _ in plan_film(model, "views", FilmSettings()).cameras] == [f"{i}" for i in range(5)]
@@ -141,7 +145,7 @@ def test_empty_and_black_frames_are_noticed(model, tmp_path):
     [
         ("auto", {}, None),
         ("interpolate", {}, None),
-        ("auto", {"size": (160, 32)}, "keep the shape and the field of view of the photographs"),
+        ("auto", {"size": (160, 32)}, None),
         ("spiral", {"fov_y": 1.0}, "keep the shape and the field of view of the photographs"),
         ("own", {}, "move the cameras nearer to the photographs' cameras"),
     ],
@@ -155,11 +159,13 @@ def test_what_no_photograph_saw_gets_a_note(model, tmp_path, path, settings, adv
     else:
         plan = plan_film(model, path, FilmSettings(frames=2, **settings))
     notes = [n for n in render_film(model, plan, tmp_path / "a.webp", FilmSettings())[1] if "outside all photographs" in n]
-    assert len(notes) == (advice is not None)
+    ahead = film.foreseen(model, plan, FilmSettings())  # the same without the numbers, before the frames are rendered
+    assert len(notes) == len(ahead) == (advice is not None)
     if advice:
         frames = "1 of 2 frames have over 10% of their pixels outside all photographs (frames 1)"
         assert notes[0].startswith(frames if path == "own" else "2 of 2 frames")
-        assert notes[0].endswith(f"expect artefacts there; {advice}")
+        assert notes[0].endswith(f"expect artefacts there; {advice}") and ahead[0].endswith(f"expect artefacts there; {advice}")
+        assert ahead[0].startswith("1 of 2 frames looked at" if path == "own" else "2 of 2 frames looked at")
 
 
 def test_a_film_alone_and_six_frames_on_a_sheet(model, tmp_path, capsys, monkeypatch):
@@ -311,10 +317,11 @@ def test_a_film_has_the_shape_of_most_photographs():
         paths.through(keys, 5),
     ):
         assert {(c.width, c.height) for c in path} == {(30, 40)}
-    # a new size keeps the vertical field of view and where the axis meets the image, and square pixels stay square
+    # a new size shows no more than the photograph in either direction; the axis stays in place, and square pixels stay square
     camera = ring(1)[0]
-    wide = paths.framed(camera, (160, 64), None)
-    assert wide.K[0, 0] == wide.K[1, 1] == pytest.approx(2 * camera.K[1, 1]) and (wide.width, wide.height) == (160, 64)
+    for size in ((160, 64), (80, 128)):
+        other = paths.framed(camera, size, None)
+        assert other.K[0, 0] == other.K[1, 1] == pytest.approx(4 * camera.K[1, 1]) and (other.width, other.height) == size
     assert paths.framed(camera, (80, 64)).K == pytest.approx(camera.K * [[2], [2], [1]])
     near = paths.framed(camera, None, math.radians(40))
     assert 2 * math.degrees(math.atan(0.5 * near.height / near.K[1, 1])) == pytest.approx(40)

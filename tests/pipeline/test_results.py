@@ -121,6 +121,8 @@ def test_a_fit_ends_with_its_score_its_size_its_time_and_what_to_do_next(tmp_pat
     quick = {"seconds": {"total": 4.0}, "wall_seconds": {"import": 5.0, "total": 5.0}}
     unscored = result_lines(metrics | {"test": {}} | quick, None)
     assert unscored[0] == "training PSNR 30.25 dB (no score of new views: no view is held out)"
+    figures = results._figures(metrics | {"test": {}}, 1.0)
+    assert figures[0] == ("training PSNR: how well the photographs are repeated, not how good new views are", "30.25 dB")
     assert unscored[1].endswith("1.0 MiB, in 5 s: import 5 s")
     assert "held-out" not in " ".join(unscored) and "next:" not in unscored
     scored, unscored = (result_lines(metrics | more | {"region": "foreground"}, None)[0] for more in ({}, quick | {"test": {}}))

@@ -2,6 +2,8 @@
 
 import dataclasses
 import itertools
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,6 +17,7 @@ from warpgs.kernels.update import Setting
 from warpgs.pipeline.model.start import InitConfig, initial_points
 from warpgs.pipeline.model.table import DensityUpdate
 from warpgs.pipeline.paper.strategy import Paper
+from warpgs.pipeline.run.fit import planned_times
 from warpgs.pipeline.train.schedule import PhaseConfig, plan_phases
 from warpgs.pipeline.train.settings import FitConfig
 from warpgs.pipeline.train.strategies import sampling
@@ -49,6 +52,18 @@ def tiny(monkeypatch):
 
 def fitted(config: FitConfig = CONFIG, steps: int | None = None) -> Trainer:
     return advanced(Trainer(photos(3), seeds(), config, CPU), steps)
+
+
+def test_a_continued_fit_expects_the_same_gaussians_and_only_the_rest_of_the_time():
+    """Not three times those it has by then."""
+    job: Any = SimpleNamespace(device=CPU, config=CONFIG, train=photos(3))
+    begun, later = fitted(steps=0), fitted(steps=0)
+    later.load(*fitted(steps=30).state())
+    (times, (before,)), (same, (after,)) = (planned_times(job, fit) for fit in (begun, later))
+    assert len(later.table) > 2 * len(begun.table) and times == same
+    assert before.startswith("40 steps take") and after.startswith("10 steps take")
+    assert before.partition("; ")[2] == after.partition("; ")[2]
+    assert planned_times(job, advanced(later))[1] == []
 
 
 def grown(fit: Trainer, keep: int | list[int], parents: list[int], **more) -> DensityUpdate:

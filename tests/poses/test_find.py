@@ -364,10 +364,16 @@ def test_files_without_their_metadata_have_the_same_pixels(progressive):
             "a.png b/c.png g/h.png",
             ["skipped as earlier runs: b/run, posed", "photographs by folder: 1 in the folder itself, 1 in b, 1 in g"],
         ),
+        (
+            "photos/a.png photos/.cache/b.png .trash/c.png env/pyvenv.cfg env/lib/d.png code/.git/HEAD code/docs/e.png "
+            "run/renders/f.png run/config.json run/metrics.jsonl",
+            "photos/a.png",
+            ["skipped as earlier runs: run", "skipped as software: code, env"],
+        ),
     ],
 )
-def test_masks_and_images_of_earlier_runs_are_no_photographs(tmp_path, files, photographs, notes):
-    """A run below the photographs is left out with all below it, also one that holds found poses alone; both are named."""
+def test_masks_and_images_of_runs_and_software_are_no_photographs(tmp_path, files, photographs, notes):
+    """A run below the photographs is left out with all below it, also one that holds found poses alone; so is software."""
     for name in files.split():
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).touch()

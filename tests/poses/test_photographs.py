@@ -20,6 +20,7 @@ from tests.poses.conftest import film, with_exif
 from tests.test_files import special
 from warpgs.errors import DataError, UsageError
 from warpgs.io.image_files import NO_EXIF, parse_exif, read_exif
+from warpgs.io.load import load_scene
 from warpgs.pipeline.run.fit import with_poses
 from warpgs.pipeline.run.request import SceneRequest
 from warpgs.poses import find, photographs
@@ -87,6 +88,20 @@ def test_links_inside_are_followed_and_a_pipe_is_no_photograph(folder):
         special("pipe", folder / "x.png")
     with pytest.raises(Searched):
         find_poses(folder, folder.parent / "out")
+
+
+def test_a_video_among_photographs_is_named_with_the_command_that_takes_its_frames(folder, tmp_path):
+    """As a note beside photographs, and as the error in a folder without."""
+    (folder / "clip.MP4").touch()
+    named = f"clip.MP4 is a video; `warpgs fit {folder / 'clip.MP4'}` takes its frames"
+    (tmp_path / "work" / "small").mkdir(parents=True)
+    assert f"left out: {named}" in find._prepared(folder, tmp_path / "work", 60, 10**6, lambda line: None)[2]
+    (tmp_path / "videos").mkdir()
+    (folder / "clip.MP4").rename(tmp_path / "videos" / "clip.MP4")
+    for command in (load_scene, lambda path: find_poses(path, tmp_path / "out")):
+        with pytest.raises(DataError) as e:
+            command(tmp_path / "videos")
+        assert str(e.value) == f"{tmp_path / 'videos'}: {named.replace(str(folder), str(tmp_path / 'videos'))}"
 
 
 def test_two_photographs_of_one_name_in_the_scene_are_refused(folder):

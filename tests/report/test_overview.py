@@ -49,6 +49,12 @@ def test_the_overview_shows_gaussians_and_both_kinds_of_cameras():
     assert colored(render_overview(wall(), RasterizeOptions(), train, [], UP), module.TEST_COLOR) == 0
 
 
+def test_without_a_background_it_is_that_of_the_fit():
+    own = RasterizeOptions(background=torch.tensor([0.2, 0.4, 0.6]))
+    image = render_overview(wall(), own, [camera(0)], [], UP, size=(64, 32), background=None, cameras=False)
+    np.testing.assert_allclose(image[0, 0], [0.2, 0.4, 0.6], atol=0.01)
+
+
 def test_lines_behind_a_surface_are_hidden():
     shown = Camera(np.eye(4), np.array([[10.0, 0, 20], [0, 10, 10], [0, 0, 1]]), 40, 20)
     image, depth = np.full((20, 40, 3), 255, np.uint8), np.full((20, 40), np.inf)

@@ -120,7 +120,7 @@ def render(
         fps: Frames per second of the film.
         frames: Number of frames. Default: seconds times fps.
         size: Width and height of the frames [px], such as 1080 1920 or 1080x1920. Default: those of the photographs.
-        fov: Vertical field of view [deg]. Default: that of the photographs.
+        fov: Vertical field of view [deg]. Default: that of the photographs, or less where --size has another shape.
         background: auto (the fit's colour; images of cut-out objects are transparent PNGs), black, white, #rrggbb or r,g,b in
             [0, 1].
         sheet: Also write six frames in one image: sheet.png.

@@ -29,9 +29,13 @@ def check_suffix(path: str | os.PathLike[str]) -> None:
 
 
 def write_mesh(
-    path: str | os.PathLike[str], mesh: Mesh, up: np.ndarray | None = None, origin: np.ndarray | None = None
-) -> None:
-    """Write a mesh to a .ply or .glb file, atomically; the file states the ``origin`` [3] that its vertices are about."""
+    path: str | os.PathLike[str], mesh: Mesh, up: np.ndarray | None = None, origin: np.ndarray | None = None,
+    ahead: np.ndarray | None = None,
+) -> None:  # fmt: skip
+    """Write a mesh to a .ply or .glb file, atomically; the file states the ``origin`` [3] that its vertices are about.
+
+    In a .glb file, ``up`` [3] becomes +y, and a viewer looks along ``ahead`` [3], if they are given.
+    """
     path, origin = Path(path), np.zeros(3) if origin is None else origin
     check_suffix(path)
     if not (np.isfinite(mesh.vertices).all() and np.isfinite(mesh.colors).all()):
@@ -41,7 +45,7 @@ def write_mesh(
     if path.suffix.lower() == ".ply":
         write_bytes(path, *_ply(mesh, origin))
     else:
-        write_bytes(path, *_glb(path, mesh, up, origin))
+        write_bytes(path, *_glb(path, mesh, None if up is None else rotation_to_y(up, ahead), origin))
 
 
 def _comment(start: str, origin: np.ndarray) -> str:
@@ -70,9 +74,19 @@ def _ply(mesh: Mesh, origin: np.ndarray) -> list[bytes]:
     return [header.encode("ascii"), vertices.tobytes(), faces.tobytes()]
 
 
-def rotation_to_y(up: np.ndarray) -> list[float]:
-    """Return the shortest rotation that turns a direction [3], of any length, to +y, as a unit quaternion xyzw, shape [4]."""
-    x, y, z = np.asarray(up, np.float64) / np.linalg.norm(up)
+def rotation_to_y(up: np.ndarray, ahead: np.ndarray | None = None) -> list[float]:
+    """Return the rotation of a direction [3] to +y, and of a level one ``ahead`` to -z, as a unit quaternion xyzw, shape [4].
+
+    Without ``ahead``, or if it is upright, the rotation is the shortest.
+    """
+    x, y, z = unit_up = np.asarray(up, np.float64) / np.linalg.norm(up)
+    side = np.zeros(3) if ahead is None else np.cross(ahead, unit_up)
+    if (length := np.linalg.norm(side)) > 1e-6:
+        import torch
+
+        rows = np.stack([side / length, unit_up, np.cross(side / length, unit_up)])
+        w, *xyz = quaternions(torch.from_numpy(rows[None]))[0].tolist()
+        return [*xyz, w]
     if y < -1 + 1e-12:
         return [1.0, 0.0, 0.0, 0.0]
     q = np.array([-z, 0.0, x, 1.0 + y])  # cross product of up and +y, and 1 plus their dot product
@@ -89,8 +103,8 @@ def _jpeg(pixels: np.ndarray) -> bytes:
     return data.getvalue() + b"\0" * (-len(data.getvalue()) % 4)
 
 
-def _glb(path: Path, mesh: Mesh, up: np.ndarray | None, origin: np.ndarray) -> list[bytes]:
-    """Return the chunks of a glTF 2.0 file: one node, one unlit mesh, positions, and colours or a texture.
+def _glb(path: Path, mesh: Mesh, rotation: list[float] | None, origin: np.ndarray) -> list[bytes]:
+    """Return the chunks of a glTF 2.0 file: one turned node, one unlit mesh, positions, and colours or a texture.
 
     Positions are float32 relative to their middle, the node's translation, because float32 is coarse far from the origin.
     """
@@ -121,12 +135,11 @@ def _glb(path: Path, mesh: Mesh, up: np.ndarray | None, origin: np.ndarray) -> l
         (5126, "VEC2", len(positions), {}),
     ]
     starts = np.cumsum([0, *map(len, arrays)]).tolist()
-    rotation = [0.0, 0.0, 0.0, 1.0] if up is None else rotation_to_y(up)
     text = {
         "asset": {"version": "2.0", "generator": f"warpgs {__version__}"},
         "extensionsUsed": ["KHR_materials_unlit"],
         "scene": 0, "scenes": [{"nodes": [0]}],
-        "nodes": [{"children": [1], "rotation": rotation}, {"mesh": 0, "translation": middle.tolist()}],
+        "nodes": [{"children": [1], "rotation": rotation or [0.0, 0.0, 0.0, 1.0]}, {"mesh": 0, "translation": middle.tolist()}],
         "materials": [material], **textures,
         "meshes": [{"primitives": [{"attributes": attributes, "indices": 2, "material": 0}]}],
         "buffers": [{"byteLength": starts[-1]}],

@@ -70,6 +70,8 @@ def format_of(data: bytes) -> str:
 
 RAW_SUFFIXES = (".dng", ".cr2", ".cr3", ".nef", ".nrw", ".arw", ".raf", ".rw2", ".orf", ".pef", ".srw")
 """Suffixes of RAW files of cameras; many begin like a TIFF, and their first image is a small preview."""
+VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
+"""Suffixes of video files, whose frames `warpgs.poses.photographs` takes."""
 HEIC = "a HEIC photograph, which is supported only for finding poses (warpgs poses); convert all HEIC files to JPEG"
 RAW = "a RAW file, which is not supported; convert all to JPEG or 16-bit PNG, with the same settings and white balance"
 
@@ -82,9 +84,11 @@ def unread_format(path: Path, head: bytes) -> str | None:
 
 
 def unread_note(folder: Path) -> str:
-    """Return a sentence on the RAW files of a folder, known by their suffix; empty for none."""
-    files = sorted(p for p in folder.glob("*") if p.suffix.lower() in RAW_SUFFIXES and p.name[0] != ".")
-    return f"{files[0].name} is {RAW}{f' ({len(files)} such files)' * (len(files) > 1)}" if files else ""
+    """Return a sentence on the RAW files and videos of a folder, known by their suffix; empty for none."""
+    files = sorted(p for p in folder.glob("[!.]*") if p.is_file())
+    raw, videos = ([p for p in files if p.suffix.lower() in known] for known in (RAW_SUFFIXES, VIDEO_SUFFIXES))
+    kinds = (raw, RAW), (videos, f"a video; `warpgs fit {videos[0]}` takes its frames" if videos else "")
+    return "; ".join(f"{f[0].name} is {what}{f' ({len(f)} such files)' * (len(f) > 1)}" for f, what in kinds if f)
 
 
 MAX_PIXELS = 100_000_000

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
+import os
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
@@ -202,8 +203,11 @@ class LoadedImage:
 
 def list_images(folder: Path) -> list[Path]:
     """Return the image files below a folder, sorted by relative POSIX path."""
-    # hidden files are leavings of file managers ("._image.jpg"), not images
-    files = [p for p in folder.rglob("*") if p.suffix.lower() in SUFFIXES and p.name[0] != "." and p.is_file()]
+    # hidden files and folders are leavings of other programs ("._image.jpg", ".cache"), not images
+    files = list[Path]()
+    for above, folders, names in os.walk(folder):
+        folders[:] = [name for name in folders if name[0] != "."]
+        files += [p for name in names if name[0] != "." and (p := Path(above, name)).suffix.lower() in SUFFIXES and p.is_file()]
     return sorted(files, key=lambda p: p.relative_to(folder).as_posix())
 
 

@@ -7,7 +7,7 @@ import itertools
 import json
 import math
 import sys
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -47,8 +47,6 @@ def without_png_metadata(data: bytes) -> bytes:
     return b"".join(parts)
 
 
-SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
-"""Suffixes of video files."""
 SHARPNESS_SIDE = 640
 """Longer side at which frames are compared for sharpness [px]: small enough to average out noise and compression artefacts."""
 MAX_FRAMES = 100_000
@@ -65,7 +63,7 @@ BOXES = (b"ftyp", b"moov", b"mdat", b"wide", b"free", b"skip", b"pnot")
 
 def is_video(path: Path) -> bool:
     """Return whether a path is a file with the suffix of a video."""
-    return path.suffix.lower() in SUFFIXES and path.is_file()
+    return path.suffix.lower() in image_files.VIDEO_SUFFIXES and path.is_file()
 
 
 def _frames(path: Path) -> Iterator[np.ndarray]:
@@ -217,6 +215,8 @@ MASK_FOLDERS = ("mask", "masks", "idrmasks")
 """Folders beside or below photographs that hold masks."""
 RUN_FILES = ("metrics.jsonl", "checkpoint.safetensors")
 """Files that identify, with a config.json, the folder of a run."""
+SOFTWARE_FILES = ("pyvenv.cfg", ".git")
+"""Files, one of which marks a virtual environment or a repository."""
 SHOWN_FOLDERS = 10
 """Largest number of folders of photographs that a note names."""
 MATCHING_SIDE = 2000
@@ -255,38 +255,39 @@ def image_root(folder: Path) -> Path:
     return inner if inner.is_dir() and list_images(inner) else folder
 
 
-def _is_run(folder: Path) -> bool:
-    """Return whether the files of a folder are those of a run."""
-    if (folder / "scene" / "poses.json").is_file():  # a fit that has found poses only
-        return True
-    return (folder / "config.json").is_file() and any((folder / name).is_file() for name in RUN_FILES)
+def _why_skipped(folder: Path) -> str:
+    """Return what a folder holds by its files, if that is an earlier run or software; else an empty string."""
+    if any((folder / name).exists() for name in SOFTWARE_FILES):
+        return "software"
+    # a fit that has found poses only has no config.json
+    run = (folder / "config.json").is_file() and any((folder / name).is_file() for name in RUN_FILES)
+    return "earlier runs" if run or (folder / "scene" / "poses.json").is_file() else ""
 
 
 def models_below(folder: Path) -> Iterator[Path]:
     """Yield the folders below ``folder`` with a COLMAP reconstruction, relative to it, without those of earlier runs."""
-    is_run = functools.cache(_is_run)
+    why_skipped = functools.cache(_why_skipped)
     for file in sorted(folder.rglob("images.*")):
         pair = file.suffix in (".bin", ".txt") and file.with_name(f"cameras{file.suffix}").is_file()
-        if pair and file.parent != folder and not any(is_run(p) for p in file.parents if folder in p.parents):
+        if pair and file.parent != folder and not any(why_skipped(p) for p in file.parents if folder in p.parents):
             yield file.parent.relative_to(folder)
 
 
 def find_photographs(folder: Path) -> tuple[list[Path], list[str]]:
-    """Return the image files of a folder by name, without masks and earlier runs, and notes on these runs and on subfolders."""
-    root = image_root(folder)
-    is_run = functools.cache(_is_run)
-    files, runs = [], set()
+    """Return the image files of a folder by name, without masks, earlier runs and software, and notes on skipped folders."""
+    root, why_skipped = image_root(folder), functools.cache(_why_skipped)
+    files, skipped = [], defaultdict[str, set[str]](set)
     for path in list_images(root):
         parents = [root / p for p in path.relative_to(root).parents[-2::-1]]  # the outermost first, without the root
-        run = next(filter(is_run, parents), None)
-        if run is not None:
-            runs.add(run.relative_to(root).as_posix())
+        other = next(filter(why_skipped, parents), None)
+        if other is not None:
+            skipped[why_skipped(other)].add(other.relative_to(root).as_posix())
         elif not {p.name for p in parents} & set(MASK_FOLDERS):
             files.append(path)
     count = Counter(p.parent.relative_to(root).as_posix() for p in files)
     places = [f"{n} in {'the folder itself' if name == '.' else name}" for name, n in sorted(count.items())]
     more = [f"{len(places) - SHOWN_FOLDERS} more folders"] if len(places) > SHOWN_FOLDERS else []
-    notes = [f"skipped as earlier runs: {', '.join(sorted(runs))}"] if runs else []
+    notes = [f"skipped as {why}: {', '.join(sorted(others))}" for why, others in sorted(skipped.items())]
     if len(places) > 1:
         notes.append(f"photographs by folder: {', '.join([*places[:SHOWN_FOLDERS], *more])}")
     return files, notes

@@ -72,9 +72,12 @@ def within(points: np.ndarray, margin: float) -> np.ndarray:
 
 def render_overview(
     gaussians: Gaussians, options: RasterizeOptions, train: list[Camera], test: list[Camera], up: np.ndarray, *,
-    size: tuple[int, int] = SIZE, background: str = "white", cameras: bool = True,
+    size: tuple[int, int] = SIZE, background: str | None = "white", cameras: bool = True,
 ) -> np.ndarray | None:  # fmt: skip
-    """Render training and held-out cameras among Gaussians, ``up`` [3] upwards; colours [H, W, 3], None without Gaussians."""
+    """Render training and held-out cameras among Gaussians, ``up`` [3] upwards; colours [H, W, 3], None without Gaussians.
+
+    A ``background`` of None is that of the options.
+    """
     points = gaussians.means.detach().cpu().numpy().astype(np.float64)
     if not len(points):
         return None
@@ -99,9 +102,11 @@ def render_overview(
     near = torch.from_numpy(within(points, OUTSIDE)).to(gaussians.means.device)
     inside = Gaussians(**{n: t.detach()[near] for n, t in gaussians.tensors().items()})
     # the first harmonic alone: the others are not trained for directions beside the photographs
-    behind = torch.full((3,), float(background == "white"), dtype=torch.float32, device=gaussians.means.device)
+    if background is not None:
+        behind = torch.full((3,), float(background == "white"), dtype=torch.float32, device=gaussians.means.device)
+        options = replace(options, background=behind)
     with torch.no_grad():
-        render = rasterize(inside, camera, replace(options, background=behind, sh_degree=0))
+        render = rasterize(inside, camera, replace(options, sh_degree=0))
     depth = torch.where(render.alpha > 0.5, render.depth, torch.inf).cpu().numpy()
     image = np.round(255 * render.rgb.clamp(0, 1).cpu().numpy()).astype(np.uint8)
     for segments, color in lines:

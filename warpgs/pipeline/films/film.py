@@ -117,7 +117,7 @@ class FilmSettings:
     size: tuple[int, int] | None = None
     """Width and height [px]; None for the size of the photographs."""
     fov_y: float | None = None
-    """Vertical field of view [rad]; None for the field of view of the photographs."""
+    """Vertical field of view [rad]; None for that of the photographs, or less if frames of another shape would show more."""
     background: tuple[float, float, float] | None = None
     """Colour behind the scene, in [0, 1]; None for the background of the fit."""
 
@@ -209,7 +209,8 @@ def plan_film(model: FittedModel, path: str, settings: FilmSettings) -> FilmPlan
             raise UsageError("--path views gives one image for each view; leave out --frames and --seconds")
         names = image_names(scene)
         shown = [(names[n], paths.framed(c, settings.size, settings.fov_y)) for n, c in scene.items()]
-        return FilmPlan(shown, coverage, EMPTY_VIEW, [], _nearer([c for _, c in shown], train, "--coverage marks these places"))
+        nearer = _nearer([c for _, c in shown], train, "--coverage marks these places")
+        return FilmPlan(shown, coverage, EMPTY_VIEW, _cropped(train[0], settings), nearer)
     rig = paths.rig_of(train, depth, model.normalization.up)
     if path.lower().endswith(".json"):
         cameras, words = _keyframes(model, Path(path), rig, train[0], settings)
@@ -231,8 +232,21 @@ def plan_film(model: FittedModel, path: str, settings: FilmSettings) -> FilmPlan
         cameras = paths.camera_path(kind, rig, train, settings.count(SECONDS))
         words = f"path: {kind}" + ", there and back over the captured area" * (rig.span is not None and kind == "turntable")
         remedy = nearer = "--path interpolate stays at the training views"
+    notes += _cropped(cameras[0], settings)
     cameras = [paths.framed(c, settings.size, settings.fov_y) for c in cameras]
     return FilmPlan(_numbered(cameras), coverage, remedy, [*notes, words], _nearer(cameras, train, nearer))
+
+
+def _cropped(camera: Camera, settings: FilmSettings) -> list[str]:
+    """Return a line for the user on what frames of another shape do not show of a photograph."""
+    if settings.size is None or settings.fov_y is not None:
+        return []
+    zooms = settings.size[0] / camera.width, settings.size[1] / camera.height
+    now, whole = (math.degrees(2 * math.atan(0.5 * settings.size[1] / (z * camera.K[1, 1]))) for z in (max(zooms), min(zooms)))
+    return [
+        f"frames have another shape than the photographs, and show {min(zooms) / max(zooms):.0%} of their "
+        f"{'height' if zooms[0] > zooms[1] else 'width'}; --fov {now:.0f} to {whole:.0f} shows more"
+    ] * (max(zooms) > WIDER * min(zooms))
 
 
 def _nearer(cameras: Sequence[Camera], train: Sequence[Camera], path: str) -> str:
@@ -299,6 +313,14 @@ def _frames(
             classes = classes_of(coverage_map(surface, camera, training)[0], (surface <= 0) & cut_out)
             covered = coverage_image(image, classes["0"], classes["1"])
         yield image, r.alpha.cpu().numpy(), fraction_outside(surface, camera, photographs, not model.transparent), covered
+
+
+def foreseen(model: FittedModel, plan: FilmPlan, settings: FilmSettings) -> list[str]:
+    """Return a line for the user if some frames of a film show areas outside all photographs, by a few small renders."""
+    every = max(1, len(plan.cameras) // SHEET_FRAMES)
+    few = [paths.framed(c, (c.width // 4, c.height // 4)) for _, c in plan.cameras[::every]]
+    count = sum(outside > OUTSIDE for _, _, outside, _ in _frames(model, few, settings, False))
+    return [f"{count} of {len(few)} frames looked at {ARE_OUTSIDE}: expect artefacts there; {plan.nearer}"] * bool(count)
 
 
 def render_film(
@@ -388,7 +410,8 @@ def render_path(
         fps: Frames per second of the film.
         seconds: Duration of the film [s]; None for the default of the path. Ignored with your own cameras.
         size: Width and height of the frames [px]; None for the size of the photographs. Ignored with your own cameras.
-        fov_y: Vertical field of view [rad]; None for the field of view of the photographs. Ignored with your own cameras.
+        fov_y: Vertical field of view [rad]; None for that of the photographs, or less if frames of another shape would show
+            more. Ignored with your own cameras.
         background: Colour behind the scene, in [0, 1]; None for the background of the fit.
         coverage: True to also write images into the subfolder coverage, with magenta stripes on pixels that no training view
             saw, and amber stripes on pixels that one view saw. Or the training views, to respect their masks.

@@ -247,7 +247,10 @@ LIMITS = {"width": (16, 8192), "fov": (1.0, 170.0)}
 
 
 def framed(camera: Camera, size: tuple[int, int] | None = None, fov_y: float | None = None, turned: bool = False) -> Camera:
-    """Return a pinhole camera with the size [px] and field of view [rad] of a film; ``turned`` swaps width and height."""
+    """Return a pinhole camera with the size [px] and vertical field of view [rad] of a film; ``turned`` swaps the sides.
+
+    Without a field of view, a frame of another shape is a part of what the camera sees.
+    """
     camera = geometry.pinhole_of(camera)
     K, width, height = camera.K, camera.width, camera.height
     if turned:
@@ -255,7 +258,7 @@ def framed(camera: Camera, size: tuple[int, int] | None = None, fov_y: float | N
     if size is None and fov_y is None:
         return replace(camera, K=K, width=width, height=height)
     new = size or (width, height)
-    fy = K[1, 1] * new[1] / height if fov_y is None else 0.5 * new[1] / math.tan(0.5 * fov_y)
+    fy = K[1, 1] * max(new[0] / width, new[1] / height) if fov_y is None else 0.5 * new[1] / math.tan(0.5 * fov_y)
     fx, zoom = fy * K[0, 0] / K[1, 1], fy / K[1, 1]
     cx, cy = (0.5 * new[i] + zoom * (K[i, 2] - 0.5 * old) for i, old in enumerate((width, height)))
     return replace(camera, K=np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]]), width=new[0], height=new[1])

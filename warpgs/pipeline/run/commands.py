@@ -180,8 +180,11 @@ def render(
     plan = film.plan_film(stored, path, settings)
     training: list[View] | bool = False
     alone, one_size = film.check_plan(plan, out, coverage, sheet)
-    if one_size and (not alone or out.suffix.lower() == ".mp4") and h264_encoder() is None:
+    told = not alone and any(p.is_file() for p in (out / film.FILM, *home.glob(f"path-*/{film.FILM}")))
+    if one_size and not told and (not alone or out.suffix.lower() == ".mp4") and h264_encoder() is None:
         say(VP9)
+    for line in film.foreseen(stored, plan, settings):
+        say(line)
     if coverage:
         try:
             training = scene_of(stored)[1] if isinstance(stored, StoredRun) else True
@@ -301,7 +304,7 @@ def clean_picture(model: FittedModel, found: Tensors, views: list[View]) -> np.n
     over = colors + (1 - alpha[..., None]) * before.mean(-1, keepdims=True)
     tiles = [Tile("before", before), Tile("what would go, also behind surfaces", over), Tile("after", after)]
     for when, g in zip(("before", "after"), pair):
-        image = render_overview(g, options, cameras, [], up, size=before.shape[1::-1], background="black", cameras=False)
+        image = render_overview(g, options, cameras, [], up, size=before.shape[1::-1], background=None, cameras=False)
         tiles += [Tile(f"from beside the photographs, {when}", image)] if image is not None else []
     lines = [f"{int(goes.sum()):,} of {len(goes):,} Gaussians would go:", *counted_lines(found)]
     return contact_sheet(view.name, lines, tiles, columns=3)

@@ -21,8 +21,9 @@ from warpgs.locks import hold_file
 from warpgs.mesh.fuse import GridPlan, MeshOptions, fuse
 from warpgs.pipeline.films.paths import common_up
 from warpgs.pipeline.model import edit
-from warpgs.pipeline.run.folder import CONFIG, StoredRun, open_run
+from warpgs.pipeline.run.folder import CONFIG, POSED_SCENE, StoredRun, open_run
 from warpgs.pipeline.run.request import choose_device
+from warpgs.poses.find import JSON as POSES
 from warpgs.process import Say
 from warpgs.scene import Camera, Gaussians, Normalization, base_colors
 
@@ -105,6 +106,14 @@ def upward(stored: StoredRun) -> np.ndarray | None:
     """Return the upward direction [3] in a run's files: as levelled, else as its cameras agree; None if they do not."""
     n = stored.normalization
     return common_up(training_cameras(stored)) if n.up is None else matmul(n.rotation.T, n.up)
+
+
+def _ahead(stored: StoredRun) -> np.ndarray | None:
+    """Return the mean viewing direction [3] in a run's files if their axes are arbitrary: poses were found, and no place."""
+    scenes = stored.folder / POSED_SCENE, Path(stored.record["scene"]["path"] or stored.folder)
+    if stored.normalization.place is not None or not any((scene / POSES).is_file() for scene in scenes):
+        return None
+    return matmul(stored.normalization.rotation.T, np.mean([c.viewmat[2, :3] for c in training_cameras(stored)], axis=0))
 
 
 def rotation_of(wish: str | None, up: np.ndarray | None) -> np.ndarray | None:
@@ -273,12 +282,13 @@ def mesh(
     with hold_file(target) as notes:
         found = fuse(run.scene_gaussians, cameras, run.options(), options, stage=stage, planned=planned)
         made = replace(found.mesh, vertices=convert_points(found.mesh.vertices, run.normalization.local, "scene", "file"))
-        write_mesh(target, made, up, run.normalization.origin)
+        write_mesh(target, made, up, run.normalization.origin, _ahead(run))
+    remedies = ["--crop auto"] * (options.crop is None) + ["--fill-holes"] * (not options.fill_holes)
     lines = [
         f"{found.extracted:,} triangles extracted, {found.removed:,} small parts removed; the mesh has "
         f"{len(made.faces):,} triangles and {len(made.vertices):,} vertices",
         f"{100 * found.unseen:.1f} % of the volume, such as backs and insides, was not observed by the {len(cameras)} training "
-        "views; the mesh is open there",
+        "views; the mesh is open there" + (f"; try {' and '.join(remedies)}" if remedies else ""),
     ]
     if found.uncolored:
         lines.append(f"{found.uncolored:,} vertices without an observed colour take the colour of the nearest coloured vertex")

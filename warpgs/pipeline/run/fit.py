@@ -190,10 +190,10 @@ def planned_times(job: FitJob, trainer: Trainer) -> tuple[Sequence[float] | None
         return None, []
     pixels, config = max(v.camera.width * v.camera.height for v in job.train), job.config
     config = replace(config, max_gaussians=min(config.max_gaussians, trainer.context.capacity))
-    times, counts = step_times(config, len(job.train), pixels, len(trainer.table), trainer.step, growing=True)
+    times, counts = step_times(config, len(job.train), pixels, trainer.first_count, growing=True)
     left, last = times[trainer.step : trainer.steps], counts[trainer.steps - 1]
-    took = f"{len(left):,} steps take about {duration(left.sum())} on two idle cores"
-    return times.tolist(), [f"{took}, besides start and report; they end with about {float(f'{last:.2g}'):,.0f} Gaussians"]
+    took = f"{len(left):,} steps take about {duration(left.sum())} on two idle cores, besides start and report"
+    return times.tolist(), [f"{took}; they end with about {float(f'{last:.2g}'):,.0f} Gaussians"] * (len(left) > 0)
 
 
 def _explained(job: FitJob, trainer: Trainer, error: NotFiniteError, view: int) -> NotFiniteError:

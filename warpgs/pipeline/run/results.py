@@ -475,7 +475,8 @@ def new_view(rig: Rig, train: list[View], renders: Renders) -> list[tuple[np.nda
 def _figures(metrics: dict[str, Any], seconds: float) -> list[tuple[str, str]]:
     """Return the main figures of the page as pairs of label and value."""
     test = metrics["test"]
-    held_out = [(f"training PSNR{over_region(metrics)}: no score of new views", f"{metrics['train']['psnr']:.2f} dB")]
+    meaning = "how well the photographs are repeated, not how good new views are"
+    held_out = [(f"training PSNR{over_region(metrics)}: {meaning}", f"{metrics['train']['psnr']:.2f} dB")]
     if test:
         best = max(metrics["baselines"].values(), default=math.nan)
         held_out = [

@@ -553,12 +553,12 @@ def steps_by_views(views: int, opaque: bool = True) -> int:
 
 
 def step_times(
-    config: FitConfig, views: int, pixels: float, start: int, done: int = 0, growing: bool = False
+    config: FitConfig, views: int, pixels: float, start: int, growing: bool = False
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the expected time of each step on two cores [s], and the expected number of Gaussians in it, shape [steps] each.
 
-    There are ``start`` Gaussians after ``done`` steps; sampling events add more up to the limits, and gradients, too, if
-    ``growing``. ``pixels`` are those of a view.
+    There are ``start`` Gaussians at first; sampling events add more up to the limits, and gradients, too, if ``growing``.
+    ``pixels`` are those of a view.
     """
     assert config.steps is not None and config.half_resolution is not None  # `settings_by_views` has chosen
     assert config.sh_degree is not None
@@ -567,11 +567,11 @@ def step_times(
     phases, samples = plan_phases(config.phases, config.steps), find_strategy(config.strategy).samples
     due = np.isin(steps, phases.events) & samples
     removed = np.isin(steps, list(removals(phases, views))) & samples
-    wanted = start + sampler.fraction * pixels * min(views, MAX_VIEWS) * np.cumsum(due & (steps > done))
+    wanted = start + sampler.fraction * pixels * min(views, MAX_VIEWS) * np.cumsum(due)
     most = max(start, min(config.max_gaussians, (1 + sampler.max_fraction) * start))
     counts = np.minimum(wanted, most)
     if growing:
-        adding = samples & (steps > max(done, phases.refine)) & (steps <= phases.stable_start)
+        adding = samples & (steps > phases.refine) & (steps <= phases.stable_start)
         room = min(config.max_gaussians, SATURATED * views * pixels)
         counts = np.clip(counts + GROWN * np.cumsum(adding), counts, max(most, room))
     weighed = np.where(wanted > most, len(range(0, views, -(-views // MAX_WEIGHED))), 0)

@@ -185,6 +185,8 @@ class Trainer:
         """True if the start has extrapolated points: opacity decay then spares Gaussians that a step does not use."""
         first = initial_gaussians(start.cloud, c.init, c.sh_degree, extent, device, start.extrapolated)
         self.table = Table.of_gaussians(first, {})
+        self.first_count = len(self.table)
+        """Number of Gaussians before the first step."""
         self.context = StrategyContext(
             c.groups(), c.strategy_config, self.table, self.generator, c.seed, plan_phases(c.phases, c.steps), extent, c.rule,
             self.background, antialiased=c.antialiased,
