@@ -161,25 +161,21 @@ def _lens(where: str, model: str, width: int, height: int, p: tuple[float, ...],
     return lens.checked(where) if np.isfinite(p).all() else lens  # the images of other lenses are left out
 
 
-def _unknown_model(path: Path, model: object, known: dict[int, tuple[str, int]]) -> DataError:
-    supported = ", ".join(name for name, _ in known.values())
-    kept = known is MODELS and model in [name for name, _ in NATIVE_MODELS.values()]
-    return DataError(
-        f"{path}: camera model {model} is not supported (supported: {supported}). "
-        f"Run `colmap image_undistorter` and give its output folder{', or fit with --lenses native' if kept else ''}"
-    )
-
-
 def read_cameras(path: Path, native: bool = False) -> dict[int, Lens]:
     """Return lenses by camera number from cameras.bin or cameras.txt; ``native`` also allows models without undistortion."""
     cameras: dict[int, Lens] = {}
-    known, readable = MODELS | NATIVE_MODELS if native else MODELS, MODELS | NATIVE_MODELS
+    readable = MODELS | NATIVE_MODELS
+    counts = dict(readable.values())
+    known = counts if native else dict(MODELS.values())
 
     def allow(model: object, parameters: tuple[float, ...] = ()) -> None:
         """Refuse a model; FULL_OPENCV without rational terms is OPENCV with k3, which can be undistorted."""
-        plain = model == "FULL_OPENCV" and not any(parameters[9:])
-        if not plain and model not in [name for name, _ in known.values()]:
-            raise _unknown_model(path, model, known)
+        if model not in known and not (model == "FULL_OPENCV" and not any(parameters[9:])):
+            kept = ", or fit with --lenses native" if model in counts else ""
+            raise DataError(
+                f"{path}: camera model {model} is not supported (supported: {', '.join(known)}). "
+                f"Run `colmap image_undistorter` and give its output folder{kept}"
+            )
 
     if path.suffix == ".bin":
         r = _BinaryFile(path)
@@ -193,7 +189,6 @@ def read_cameras(path: Path, native: bool = False) -> dict[int, Lens]:
             _store(cameras, number, _lens(where, name, width, height, parameters, native), where)
         r.end()
         return cameras
-    counts = dict(readable.values())
     for line, words in _rows(path):
         with understood(f"{path}, line {line}"):
             number, model, parameters = int(words[0]), words[1], tuple(_number(w) for w in words[4:])
@@ -406,10 +401,8 @@ def reconstruction(root: Path, named: str | None = None) -> tuple[Model | None, 
     names = [m[0].relative_to(root).as_posix() for m in models]
     counts = ", ".join(f"{name}: {size}" for name, size in zip(names, sizes))
     chosen = best[0].relative_to(root).as_posix()
-    return (
-        best,
-        f"{chosen} is the largest of {len(models)} reconstructions (images in {counts}); --reconstruction FOLDER takes another",
-    )
+    among = f"of {len(models)} reconstructions (images in {counts})"
+    return best, f"{chosen} is the largest {among}; --reconstruction FOLDER takes another"
 
 
 def _size(model: Model) -> int:

@@ -21,8 +21,8 @@ from warpgs.constants import POSE_TOLERANCE
 from warpgs.device import machine_memory, usable_cores
 from warpgs.errors import DataError, UsageError, shortened
 from warpgs.files import inside, is_within
-from warpgs.geometry import matmul, nearest_rotation, rotation_matrices
-from warpgs.io.image_files import MAX_PIXELS, READ, decode, unread_note
+from warpgs.geometry import matmul, nearest_rotation, pose_at, pose_of, rotation_matrices
+from warpgs.io.image_files import READ, decode, unread_note
 from warpgs.io.images import BLACK, REDUCED, SUFFIXES, Lens, LoadedImage, ReadOptions, list_images, load_image
 from warpgs.io.maps import NOTHING_NAMED, GivenMaps, NamedMaps
 from warpgs.plugins import Registry
@@ -163,10 +163,7 @@ def rigid(viewmat: np.ndarray, where: str) -> np.ndarray:
         raise DataError(f"{where}: the pose is not rigid (R R^T is off by {error:.2g}): it scales or shears. Give rotations")
     if np.linalg.det(R) < 0:
         raise DataError(f"{where}: the pose mirrors the scene (determinant -1); two axes are probably swapped")
-    result = np.eye(4)
-    result[:3, :3] = nearest_rotation(R)
-    result[:3, 3] = viewmat[:3, 3]
-    return result
+    return pose_of(nearest_rotation(R), viewmat[:3, 3])
 
 
 def quat_rotation(quat: tuple[float, ...], where: str) -> np.ndarray:
@@ -188,10 +185,7 @@ def from_camera_to_world(matrix: np.ndarray, where: str, *, opengl: bool) -> np.
     if opengl:
         pose[:3, 1:3] *= -1
     pose = rigid(pose, where)
-    result = np.eye(4)
-    result[:3, :3] = pose[:3, :3].T
-    result[:3, 3] = -matmul(pose[:3, :3].T, pose[:3, 3])
-    return result
+    return pose_at(pose[:3, :3].T, pose[:3, 3])
 
 
 def about(viewmat: np.ndarray, origin: np.ndarray) -> np.ndarray:
@@ -329,7 +323,7 @@ class SceneFolder:
 
     def mask(self, path: Path) -> np.ndarray:
         """Return the weights of a mask file of the scene: float32 [H, W], 1 to keep a pixel, 0 to mask it out."""
-        gray = read_mask(self.inside(path), "white", self.options.max_pixels)
+        gray = np.ascontiguousarray(decode(self.inside(path), self.options.max_pixels)[0][..., 0])
         binary = self._thread.binary = 0 < float(gray.max()) < 1.5 / 255
         gray = (gray > 0).astype(np.float32) if binary else gray
         return gray if self.options.mask_keeps == "white" else 1 - gray
@@ -428,12 +422,6 @@ class SceneFolder:
             name = folder.name
         how = f"area-resampled by {factor}" if factor > 1 else "as stored"
         return f"{name} {how}, {REDUCED}at most {self.options.max_side} px a side" if self._reduced else f"{name} {how}"
-
-
-def read_mask(path: Path, keeps: str = "white", max_pixels: int = MAX_PIXELS) -> np.ndarray:
-    """Return the weight of each pixel from a mask file, float32 [H, W] in [0, 1]; ``keeps`` is the colour of kept pixels."""
-    gray = np.ascontiguousarray(decode(path, max_pixels)[0][..., 0])
-    return gray if keeps == "white" else 1 - gray
 
 
 def resampling_note(downscale: int) -> list[str]:

@@ -74,13 +74,6 @@ HEIC = "a HEIC photograph, which is supported only for finding poses (warpgs pos
 RAW = "a RAW file, which is not supported; convert all to JPEG or 16-bit PNG, with the same settings and white balance"
 
 
-def unread_format(path: Path, head: bytes) -> str | None:
-    """Return a remedy for a photograph of an unsupported format, by RAW's suffix or its first bytes; None for other files."""
-    if path.suffix.lower() in RAW_SUFFIXES or brand(head) == "RAW":
-        return RAW
-    return HEIC if brand(head) == "HEIC" else None
-
-
 def unread_note(folder: Path) -> str:
     """Return a sentence on the RAW files of a folder, known by their suffix; empty for none."""
     files = sorted(p for p in folder.glob("*") if p.suffix.lower() in RAW_SUFFIXES and p.name[0] != ".")
@@ -452,9 +445,9 @@ def _raster(path: Path, data: bytes, max_pixels: int) -> np.ndarray:
     """Return the pixels as stored, [H, W] or [H, W, C] with colours in BGR order, of any type that OpenCV has."""
     import cv2
 
-    pixels = 0
-    if unread := unread_format(path, data[:32]):
-        raise DataError(f"{path}: is {unread}")
+    pixels, kind = 0, "RAW" if path.suffix.lower() in RAW_SUFFIXES else brand(data)
+    if kind in ("HEIC", "RAW"):
+        raise DataError(f"{path}: is {RAW if kind == 'RAW' else HEIC}")
     try:
         name = format_of(data)
         width, height = header_size(name, data)

@@ -13,7 +13,7 @@ import numpy as np
 
 from warpgs.errors import DataError
 from warpgs.files import is_within, read_file
-from warpgs.geometry import matmul, seen_pixels
+from warpgs.geometry import matmul, pose_of, seen_pixels
 from warpgs.io import colmap, folder as scenes
 from warpgs.io.folder import Probe, Reader, SceneFolder, ViewList, register
 from warpgs.io.images import BLACK, SUFFIXES, Lens, ReadOptions, list_images
@@ -69,16 +69,16 @@ def read_json(path: Path) -> dict:
     return values
 
 
-def _number(frame: dict, shared: dict, key: str) -> float | None:
-    """Return a number of the frame, else of the file; None if both lack it, ValueError if it is not finite."""
+def _number(frame: dict, shared: dict, key: str, where: str) -> float | None:
+    """Return a number of the frame, else of the file; None if both lack it, DataError if it is not finite."""
     value = frame.get(key, shared.get(key))
     if value is None:
         return None
     try:
         if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
-            raise ValueError(f"{key} is {value!r}, not a finite number; write it as one, without quotes")
+            raise DataError(f"{where}: {key} is {value!r}, not a finite number; write it as one, without quotes")
     except OverflowError as e:
-        raise ValueError(f"{key} is too large") from e
+        raise DataError(f"{where}: {key} is too large") from e
     return float(value)
 
 
@@ -93,28 +93,23 @@ def lens_of(frame: dict, shared: dict, width: int, height: int, where: str, nati
             f"first{kept if model == FISHEYE else ''}"
         )
     fisheye = native and bool(model == FISHEYE or frame.get("is_fisheye", shared.get("is_fisheye")))
-    try:
-        size = [_number(frame, shared, "w"), _number(frame, shared, "h")]
-        width, height = (int(given) if given is not None else own for given, own in zip(size, (width, height)))
-        f, c = [], []
-        for axis, side in (("x", width), ("y", height)):
-            focal, angle = _number(frame, shared, f"fl_{axis}"), _number(frame, shared, f"camera_angle_{axis}")
-            if focal is None and angle is not None:
-                if not 0 < angle < math.pi:
-                    raise ValueError(f"camera_angle_{axis} is {angle} rad, not between 0 and pi")
-                focal = 0.5 * side / math.tan(0.5 * angle)
-            center = _number(frame, shared, f"c{axis}")
-            f.append(focal)
-            c.append(side / 2 if center is None else center)
-        terms = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3")
-        distortion = [_number(frame, shared, k) or 0.0 for k in terms]
-        unread = [k for k in UNSUPPORTED_TERMS if not (fisheye and k in ("k4", "is_fisheye"))]
-        other = [k for k in (*unread, *(("p1", "p2") if fisheye else ())) if frame.get(k, shared.get(k))]
-        if other:
-            why = "is not supported for a fisheye" if fisheye else "belongs to a fisheye or rational lens, not supported here"
-            raise ValueError(f"{other[0]} {why}. Undistort the images{kept if other[0] == 'is_fisheye' else ''}")
-    except ValueError as e:
-        raise DataError(f"{where}: {e}") from e
+    number = partial(_number, frame, shared, where=where)
+    width, height = (own if (given := number(key)) is None else int(given) for key, own in (("w", width), ("h", height)))
+    f, c = [], []
+    for axis, side in (("x", width), ("y", height)):
+        focal, angle, center = number(f"fl_{axis}"), number(f"camera_angle_{axis}"), number(f"c{axis}")
+        if focal is None and angle is not None:
+            if not 0 < angle < math.pi:
+                raise DataError(f"{where}: camera_angle_{axis} is {angle} rad, not between 0 and pi")
+            focal = 0.5 * side / math.tan(0.5 * angle)
+        f.append(focal)
+        c.append(side / 2 if center is None else center)
+    distortion = [number(k) or 0.0 for k in (("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3"))]
+    unread = [k for k in UNSUPPORTED_TERMS if not (fisheye and k in ("k4", "is_fisheye"))]
+    other = [k for k in (*unread, *(("p1", "p2") if fisheye else ())) if frame.get(k, shared.get(k))]
+    if other:
+        why = "is not supported for a fisheye" if fisheye else "belongs to a fisheye or rational lens, not supported here"
+        raise DataError(f"{where}: {other[0]} {why}. Undistort the images{kept if other[0] == 'is_fisheye' else ''}")
     fx = f[0] if f[0] is not None else f[1]
     if fx is None:
         raise DataError(f"{where}: has neither fl_x nor camera_angle_x, so its focal length is unknown; add one of them")
@@ -220,12 +215,9 @@ def _named_maps(scene: SceneFolder, named: Named, shared: dict, frame: dict, whe
             raise DataError(f"{where}: {key} is {found.name}, but maps must be {' or '.join(MAPS)}; --{flag} none skips it")
         return found
 
-    try:
-        unit = _number(frame, shared, "depth_unit_scale_factor")
-        if unit is not None and not unit > 0:
-            raise ValueError(f"depth_unit_scale_factor is {unit}; it must be above 0")
-    except ValueError as e:
-        raise DataError(f"{where}: {e}") from e
+    unit = _number(frame, shared, "depth_unit_scale_factor", where)
+    if unit is not None and not unit > 0:
+        raise DataError(f"{where}: depth_unit_scale_factor is {unit}; it must be above 0")
     return NamedMaps(path("depth_file_path", "depths"), path("normal_file_path", "normals"), unit)
 
 
@@ -248,10 +240,7 @@ def _points(scene: SceneFolder, file: Path, named: Named, shared: dict, views: l
     if shared.get("applied_transform") is None or not len(points):
         return points, taken
     matrix = matrix_of({"transform_matrix": shared["applied_transform"]}, f"{file}, applied_transform")[:3]
-    try:
-        scale = _number({}, shared, "applied_scale")
-    except ValueError as e:
-        raise DataError(f"{file}: {e}") from e
+    scale = _number({}, shared, "applied_scale", str(file))
     moved = (1.0 if scale is None else scale) * (matmul(points.points, matrix[:, :3].T) + matrix[:, 3])
     other = PointCloud(moved, points.colors)
     if _disagreement(other, views) < CLEARLY * _disagreement(points, views):
@@ -388,9 +377,8 @@ def _inria(path: Path, rows: list[Any]) -> Iterator[Row]:
     for i, row in enumerate(rows):
         where = f"{path}, camera {i}"
         try:
-            pose = np.eye(4)
-            pose[:3, :3] = np.array(row["rotation"], np.float64).reshape(3, 3)
-            pose[:3, 3] = np.array(row["position"], np.float64).reshape(3)
+            rotation, position = np.array(row["rotation"], np.float64), np.array(row["position"], np.float64)
+            pose = pose_of(rotation.reshape(3, 3), position.reshape(3))
             width, height, fx, fy = (float(row[key]) for key in ("width", "height", "fx", "fy"))
             K = np.array([[fx, 0, width / 2], [0, fy, height / 2], [0, 0, 1]])
             lens = Lens(K, int(width), int(height))
