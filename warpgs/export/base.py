@@ -48,6 +48,16 @@ def malformed(path: Path, what: str) -> DataError:
     )
 
 
+class MalformedError(ValueError):
+    """Invalid content of a file, in words that `reading` completes with the path and the fix."""
+
+
+def expect(condition: object, what: str) -> None:
+    """Raise a `MalformedError` unless a condition holds; ``what`` is wrong with the content otherwise."""
+    if not condition:
+        raise MalformedError(what)
+
+
 def by_rows(n: int, shape: tuple[int, ...], rows: Callable[[slice], np.ndarray]) -> np.ndarray:
     """Return an array, float32 [n, *shape], made of pieces of at most `ROWS` rows that are requested in order.
 
@@ -168,8 +178,7 @@ def usable(
 def sigmoid(logits: np.ndarray) -> np.ndarray:
     """Return 1 / (1 + exp(-x)) in float64 without overflow, in the shape [N] of ``logits``."""
     small = np.exp(-np.abs(logits.astype(np.float64)))
-    result: np.ndarray = np.where(logits >= 0, 1, small) / (1 + small)
-    return result
+    return np.asarray(np.where(logits >= 0, 1, small) / (1 + small))
 
 
 def logits(opacities: np.ndarray, quantum: float) -> np.ndarray:
@@ -242,8 +251,7 @@ splat-transform. Lower ones, of axes without length, would take the steps of the
 
 def with_least_scale(log_scales: np.ndarray) -> np.ndarray:
     """Return log scales [N, 3], at least `FLATTEST`."""
-    raised: np.ndarray = np.maximum(log_scales, min(FLATTEST, float(log_scales.max()) + FLATTEST), dtype=log_scales.dtype)
-    return raised
+    return np.asarray(np.maximum(log_scales, min(FLATTEST, float(log_scales.max()) + FLATTEST), dtype=log_scales.dtype))
 
 
 def rounded(values: np.ndarray, most: int) -> np.ndarray:
@@ -275,7 +283,8 @@ def reading(path: Path, whole: bool = False) -> Iterator[BinaryIO]:
         with file, np.errstate(all="ignore"):  # infinities and NaN are named afterwards, with their Gaussian
             yield file
     except BROKEN as e:
-        raise malformed(path, f"its content is invalid ({type(e).__name__}: {str(e)[:80]})") from e
+        own = isinstance(e, MalformedError)
+        raise malformed(path, str(e) if own else f"its content is invalid ({type(e).__name__}: {str(e)[:80]})") from e
 
 
 class Format:
@@ -443,38 +452,6 @@ _TINY = 1e-37
 """Least axis length that is written and read: the logarithm of 0 is not finite."""
 
 
-def encode(arrays: Arrays) -> list[bytes]:
-    """Return the bytes of a file; harmonics above degree 0 are lost, and colours outside of [0, 1] clamped."""
-    rows = np.empty(len(arrays["means"]), _ROW)
-    rows["mean"] = arrays["means"]
-    rows["scale"] = np.clip(np.exp(arrays["log_scales"].astype(np.float64)), _TINY, 3e38)
-    rows["rgba"][:, :3] = rounded(255 * base_colors(arrays["sh"][:, :1].astype(np.float64)), 255)
-    rows["rgba"][:, 3] = rounded(255 * sigmoid(arrays["logit_opacities"]), 255)
-    rows["quat"] = rounded(128 * unit_quats(arrays["quats"]) + 128, 255)
-    return [rows.tobytes()]
-
-
-def decode(path: Path, data: bytes) -> Arrays:
-    """Return the Gaussians of a file's bytes."""
-    if not data:
-        raise malformed(path, "it is empty")
-    if len(data) % _ROW.itemsize:
-        raise malformed(path, f"its {len(data)} bytes are not a multiple of {_ROW.itemsize}")
-    rows = np.frombuffer(data, _ROW)
-    n = len(rows)
-    for part in parts(n):
-        if (rows["scale"][part] < 0).any():
-            row = part.start + int(np.argwhere(rows["scale"][part] < 0)[0][0])
-            raise malformed(path, f"an axis of Gaussian {row} has a negative length")
-    return {
-        "means": by_rows(n, (3,), lambda p: rows["mean"][p]),
-        "quats": by_rows(n, (4,), lambda p: (rows["quat"][p].astype(np.float64) - 128) / 128),
-        "log_scales": by_rows(n, (3,), lambda p: np.log(np.maximum(rows["scale"][p].astype(np.float64), _TINY))),
-        "logit_opacities": by_rows(n, (), lambda p: logits(rows["rgba"][p, 3] / 255, 1 / 255)),
-        "sh": by_rows(n, (1, 3), lambda p: base_coefficients(rows["rgba"][p, None, :3].astype(np.float64) / 255)),
-    }
-
-
 @register("splat")
 class Splat(Format):
     """The .splat format."""
@@ -482,8 +459,34 @@ class Splat(Format):
     suffix = ".splat"
     description = "antimatter15, 8 bits, no view-dependent colours; small viewers"
     max_degree = 0
-    encode = staticmethod(encode)
-    decode = staticmethod(decode)
+
+    def encode(self, arrays: Arrays) -> list[bytes]:
+        """Return the bytes of a file; harmonics above degree 0 are lost, and colours outside of [0, 1] clamped."""
+        rows = np.empty(len(arrays["means"]), _ROW)
+        rows["mean"] = arrays["means"]
+        rows["scale"] = np.clip(np.exp(arrays["log_scales"].astype(np.float64)), _TINY, 3e38)
+        rows["rgba"][:, :3] = rounded(255 * base_colors(arrays["sh"][:, :1].astype(np.float64)), 255)
+        rows["rgba"][:, 3] = rounded(255 * sigmoid(arrays["logit_opacities"]), 255)
+        rows["quat"] = rounded(128 * unit_quats(arrays["quats"]) + 128, 255)
+        return [rows.tobytes()]
+
+    def decode(self, path: Path, data: bytes) -> Arrays:
+        """Return the Gaussians of a file's bytes."""
+        expect(data, "it is empty")
+        expect(len(data) % _ROW.itemsize == 0, f"its {len(data)} bytes are not a multiple of {_ROW.itemsize}")
+        rows = np.frombuffer(data, _ROW)
+        n = len(rows)
+        for part in parts(n):
+            negative = (rows["scale"][part] < 0).any(1)
+            row = part.start + int(negative.argmax())
+            expect(not negative.any(), f"an axis of Gaussian {row} has a negative length")
+        return {
+            "means": by_rows(n, (3,), lambda p: rows["mean"][p]),
+            "quats": by_rows(n, (4,), lambda p: (rows["quat"][p].astype(np.float64) - 128) / 128),
+            "log_scales": by_rows(n, (3,), lambda p: np.log(np.maximum(rows["scale"][p].astype(np.float64), _TINY))),
+            "logit_opacities": by_rows(n, (), lambda p: logits(rows["rgba"][p, 3] / 255, 1 / 255)),
+            "sh": by_rows(n, (1, 3), lambda p: base_coefficients(rows["rgba"][p, None, :3].astype(np.float64) / 255)),
+        }
 
 
 def all_formats() -> list[Format]:
@@ -520,9 +523,8 @@ def format_of(path: str | os.PathLike[str], choice: str | type[Format] | Format 
             raise UsageError(f"{path}: expected a name that ends in {chosen.suffix}, for the format {chosen.name}")
         return chosen
     known = all_formats()
-    for kind in known:
-        if kind.fits(path):
-            return kind
+    if (kind := next((k for k in known if k.fits(path)), None)) is not None:
+        return kind
     name = Path(path).name.lower()
     if name.endswith(".htm"):
         raise UsageError(f"{path}: format .htm is not supported; did you mean {path}l?")

@@ -14,6 +14,7 @@ import numpy as np
 
 from warpgs.errors import DataError
 from warpgs.export import base
+from warpgs.export.base import expect
 from warpgs.files import replacing
 from warpgs.geometry import checked_normalization
 from warpgs.scene import ORIGIN, Gaussians, Normalization, base_coefficients, base_colors, checked_origin
@@ -179,22 +180,19 @@ def is_compressed(path: Path, data: bytes) -> bool:
 def decode(path: Path, data: bytes) -> base.Arrays:
     """Return the Gaussians of a file's bytes."""
     elements, start = parse_header(path, data[:MAX_HEADER_BYTES])
-    if ASCII.search(data[:start]):
-        raise base.malformed(path, "it is compressed, but in ASCII")
+    expect(not ASCII.search(data[:start]), "it is compressed, but in ASCII")
     tables = {}
     for element in elements:
         name, _, properties = element
-        if name in tables or not properties or LIST in dict(properties).values():
-            raise base.malformed(path, f"its element {name[:40]!r} is invalid")
-        tables[name], start = _table(path, data, element, start)
-    chunk, vertex, sh = tables.get("chunk"), tables.get("vertex"), tables.get("sh")
-    if chunk is None or vertex is None:
-        raise base.malformed(path, "the element chunk or vertex is missing")
+        sound = name not in tables and properties and LIST not in dict(properties).values()
+        expect(sound, f"its element {name[:40]!r} is invalid")
+        tables[name], start = _table(data, element, start)
+    expect({"chunk", "vertex"} <= tables.keys(), "the element chunk or vertex is missing")
+    chunk, vertex, sh = tables["chunk"], tables["vertex"], tables.get("sh")
     n = len(vertex)
-    if len(chunk) != -(-n // CHUNK):
-        raise base.malformed(path, f"it has {len(chunk)} chunks, but {n} Gaussians need {-(-n // CHUNK)}")
-    position, rotation, scale, color = (_column(path, vertex, name, "<u4") for name in _VERTEX_NAMES)
-    bounds = [_bounds(path, chunk, group) for group in _GROUPS]
+    expect(len(chunk) == -(-n // CHUNK), f"it has {len(chunk)} chunks, but {n} Gaussians need {-(-n // CHUNK)}")
+    position, rotation, scale, color = (_column(vertex, name, "<u4") for name in _VERTEX_NAMES)
+    bounds = [_bounds(chunk, group) for group in _GROUPS]
 
     def values(i: int, packed: np.ndarray, bits: tuple[int, ...], part: slice) -> np.ndarray:
         """Return the unpacked values of the i-th group [P, 3], scaled to the bounds of their chunks if there are bounds."""
@@ -212,7 +210,7 @@ def decode(path: Path, data: bytes) -> base.Arrays:
         first = base_coefficients(values(2, color, (8, 8, 8, 8), part))[:, None]
         return first if rest is None else np.concatenate([first, rest(part)], 1)
 
-    rest, k = (None, 1) if sh is None else _harmonics(path, sh, n)
+    rest, k = (None, 1) if sh is None else _harmonics(sh, n)
     return {
         "sh": base.by_rows(n, (k, 3), harmonics),
         "means": base.by_rows(n, (3,), lambda p: values(0, position, _BITS, p)),
@@ -224,22 +222,20 @@ def decode(path: Path, data: bytes) -> base.Arrays:
     }
 
 
-def _bounds(path: Path, chunk: np.ndarray, group: tuple[str, ...]) -> list[np.ndarray] | None:
+def _bounds(chunk: np.ndarray, group: tuple[str, ...]) -> list[np.ndarray] | None:
     """Return the bounds of each chunk, two arrays float64 [C, 3]; None for the colours of older files, which span 0 to 1."""
     if group == _GROUPS[2] and "min_r" not in (chunk.dtype.names or ()):
         return None
-    return [
-        np.stack([_column(path, chunk, f"{end}_{name}", "<f4") for name in group], 1).astype(np.float64)
-        for end in ("min", "max")
-    ]
+    columns = ([_column(chunk, f"{end}_{name}", "<f4") for name in group] for end in ("min", "max"))
+    return [np.stack(column, 1).astype(np.float64) for column in columns]
 
 
-def _harmonics(path: Path, sh: np.ndarray, n: int) -> tuple[Callable[[slice], np.ndarray], int]:
+def _harmonics(sh: np.ndarray, n: int) -> tuple[Callable[[slice], np.ndarray], int]:
     """Return a function for the coefficients above degree 0 [P, K - 1, 3] of some rows, and K."""
     count = len(sh.dtype.names or ())
-    if len(sh) != n or count // 3 + 1 not in base.SH_SIZES or count % 3:
-        raise base.malformed(path, f"{len(sh)} rows of {count} harmonics do not fit {n} Gaussians")
-    columns = [_column(path, sh, f"f_rest_{i}", "u1") for i in range(count)]
+    fits = len(sh) == n and count // 3 + 1 in base.SH_SIZES and count % 3 == 0
+    expect(fits, f"{len(sh)} rows of {count} harmonics do not fit {n} Gaussians")
+    columns = [_column(sh, f"f_rest_{i}", "u1") for i in range(count)]
 
     def rows(part: slice) -> np.ndarray:
         levels = np.empty((part.stop - part.start, count))
@@ -251,23 +247,20 @@ def _harmonics(path: Path, sh: np.ndarray, n: int) -> tuple[Callable[[slice], np
     return rows, count // 3 + 1
 
 
-def _table(path: Path, data: bytes, element: Element, start: int) -> tuple[np.ndarray, int]:
+def _table(data: bytes, element: Element, start: int) -> tuple[np.ndarray, int]:
     """Return the rows of an element that begins at byte ``start`` of the file, and the byte at which the next one begins."""
     name, count, properties = element
-    if len(dict(properties)) < len(properties):
-        raise base.malformed(path, f"a property of {name[:40]!r} appears twice")
+    expect(len(dict(properties)) == len(properties), f"a property of {name[:40]!r} appears twice")
     dtype = np.dtype(properties)
-    end = start + count * dtype.itemsize
-    if end > len(data):
-        rows = f"{count} rows of {name[:40]!r}"
-        raise base.malformed(path, f"truncated: {rows} end at byte {end}, but the file has {len(data)} bytes")
+    end, rows = start + count * dtype.itemsize, f"{count} rows of {name[:40]!r}"
+    expect(end <= len(data), f"truncated: {rows} end at byte {end}, but the file has {len(data)} bytes")
     return np.frombuffer(data, dtype, count, start), end
 
 
-def _column(path: Path, table: np.ndarray, name: str, kind: str) -> np.ndarray:
-    """Return a column of a table; DataError where it is missing or of another type."""
-    if name not in (table.dtype.names or ()) or table.dtype[name] != np.dtype(kind):
-        raise base.malformed(path, f"the property {name} is missing, or has the wrong type")
+def _column(table: np.ndarray, name: str, kind: str) -> np.ndarray:
+    """Return a column of a table; `MalformedError` where it is missing or of another type."""
+    there = name in (table.dtype.names or ()) and table.dtype[name] == np.dtype(kind)
+    expect(there, f"the property {name} is missing, or has the wrong type")
     return table[name]
 
 
