@@ -160,6 +160,8 @@ PAUSES = (0.05, 0.1, 0.2, 0.4, 0.8)
 """Pauses between attempts to replace a file on Windows [s]: a virus scanner holds a new file open for about that long."""
 FULL = (errno.ENOSPC, errno.EDQUOT)
 """Errors of a full disk, or of an exhausted disk quota."""
+NO_FOLDER_SYNC = (errno.EINVAL, errno.ENOTSUP, errno.EBADF, errno.EACCES)
+"""Errors of file systems that cannot sync a folder."""
 DESCRIPTORS = Path("/proc/self/fd")
 """Folder in which Linux lists the open files and folders of this process; libraries can open paths through it."""
 
@@ -244,12 +246,14 @@ def filling(folder: Path) -> Iterator[Path]:
 def _sync(folder: Folder) -> None:
     """Sync a folder to the disk, so that the names in it survive a power failure."""
     try:
-        folder.sync()
+        if folder.descriptor is not None:  # Windows has no such call
+            os.fsync(folder.descriptor)
     except OSError as e:
-        raise ResourceError(
-            f"{folder.path}: was written, but the disk does not confirm it ({e.strerror or e}); check the disk and the last "
-            "written files"
-        ) from e
+        if e.errno not in NO_FOLDER_SYNC:
+            raise ResourceError(
+                f"{folder.path}: was written, but the disk does not confirm it ({e.strerror or e}); check the disk and the "
+                "last written files"
+            ) from e
 
 
 def write_bytes(path: Path, *chunks: bytes | memoryview) -> None:

@@ -33,8 +33,6 @@ WINDOWS = sys.platform == "win32"
 NO_FOLLOW = getattr(os, "O_NOFOLLOW", 0)
 JUNCTION = 0xA0000003
 """Tag of Windows for a folder that leads elsewhere."""
-NO_FOLDER_SYNC = (errno.EINVAL, errno.ENOTSUP, errno.EBADF, errno.EACCES)
-"""Errors of file systems that cannot sync a folder."""
 
 
 class RefusedError(OSError):
@@ -144,15 +142,6 @@ class Folder(contextlib.AbstractContextManager["Folder"]):
     def names(self) -> list[str]:
         """Return the names of all entries."""
         return os.listdir(self.path if self.descriptor is None else self.descriptor)
-
-    def sync(self) -> None:
-        """Sync the names to the disk, so that they survive a power failure; Windows has no such call."""
-        try:
-            if self.descriptor is not None:
-                os.fsync(self.descriptor)
-        except OSError as e:
-            if e.errno not in NO_FOLDER_SYNC:
-                raise
 
 
 _ROOTS: list[Folder] = []
