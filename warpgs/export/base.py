@@ -18,7 +18,7 @@ from typing import Any, BinaryIO, ClassVar
 
 import numpy as np
 
-from warpgs.errors import DataError, UsageError
+from warpgs.errors import DataError, MalformedError, UsageError, expect
 from warpgs.files import open_input, read_input, unread_reason, write_bytes, write_json
 from warpgs.geometry import checked_normalization, convert_gaussians, rotate
 from warpgs.plugins import Registry, returned
@@ -46,16 +46,6 @@ def malformed(path: Path, what: str) -> DataError:
     return DataError(
         f"{path}: not a usable {path.suffix or 'model'} file: {what}. Export the model again, or use another format."
     )
-
-
-class MalformedError(ValueError):
-    """Invalid content of a file, in words that `reading` completes with the path and the fix."""
-
-
-def expect(condition: object, what: str) -> None:
-    """Raise a `MalformedError` unless a condition holds; ``what`` is wrong with the content otherwise."""
-    if not condition:
-        raise MalformedError(what)
 
 
 def by_rows(n: int, shape: tuple[int, ...], rows: Callable[[slice], np.ndarray]) -> np.ndarray:

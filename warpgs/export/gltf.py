@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
+from warpgs.errors import expect
 from warpgs.export import base
-from warpgs.export.base import expect
 from warpgs.geometry import pose_of, rotation_matrices
 from warpgs.scene import ORIGIN, base_colors
 

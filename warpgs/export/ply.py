@@ -12,9 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
-from warpgs.errors import DataError
+from warpgs.errors import DataError, expect
 from warpgs.export import base
-from warpgs.export.base import expect
 from warpgs.files import replacing
 from warpgs.geometry import checked_normalization
 from warpgs.scene import ORIGIN, Gaussians, Normalization, base_coefficients, base_colors, checked_origin
@@ -60,25 +59,16 @@ def is_own(head: bytes) -> bool:
     return any("\n".join(mode_comments(antialiased)).encode() in head for antialiased in (True, False))
 
 
-def is_antialiased(head: bytes) -> bool:
-    """Return whether a parsed header declares antialiasing; the last such comment decides."""
-    found = False
-    for line in head.partition(b"end_header")[0].decode("utf-8", "replace").lower().replace(":", " ").splitlines():
-        match line.split():
-            case ["comment", "splatrendermode", mode]:
-                found = mode == "mip"
-            case ["comment", "antialiased", value]:
-                found = value in ("1", "true")
-    return found
-
-
 def ply_error(path: Path, what: str) -> DataError:
     """Return a DataError about a malformed file, with the remedy."""
     return DataError(f"{path}: not a usable Gaussian PLY file: {what}. {REMEDY}")
 
 
-def parse_header(path: Path, head: bytes) -> tuple[list[Element], int]:
-    """Return the elements of the header in the first bytes of a file, and the offset [bytes] of the data behind it."""
+def parse_header(path: Path, head: bytes) -> tuple[list[Element], int, bool]:
+    """Return the elements of the header in the first bytes of a file, and the offset [bytes] of the data behind it.
+
+    Also returns whether it declares antialiasing; the last such comment decides.
+    """
     if not re.match(rb"ply[ \t]*\r?\n", head):
         raise ply_error(path, "it does not start with 'ply'")
     end = re.search(rb"^end_header[ \t]*\r?\n", head, re.MULTILINE)
@@ -87,15 +77,18 @@ def parse_header(path: Path, head: bytes) -> tuple[list[Element], int]:
     lines = head[: end.start()].decode("utf-8", "replace").split("\n")[1:]  # comments may have any encoding
 
     elements: list[Element] = []
-    formats = []
+    formats, antialiased = [], False
     for line in lines:
         match line.split():
             case ["comment", *words]:
-                mode = " ".join(words).lower().replace(":", " ").split()
-                if mode[:1] == ["splatrendermode"] and len(mode) == 2 and mode[1] not in ("default", "mip"):
-                    raise DataError(
-                        f"{path}: render mode {mode[1][:40]!r} is not supported; train or export with mode 'default' or 'mip'"
-                    )
+                match " ".join(words).lower().replace(":", " ").split():
+                    case ["splatrendermode", "default" | "mip" as mode]:
+                        antialiased = mode == "mip"
+                    case ["splatrendermode", mode]:
+                        fix = "train or export with mode 'default' or 'mip'"
+                        raise DataError(f"{path}: render mode {mode[:40]!r} is not supported; {fix}")
+                    case ["antialiased", value]:
+                        antialiased = value in ("1", "true")
             case [] | ["obj_info", *_]:
                 pass
             case ["format", *words]:
@@ -113,7 +106,7 @@ def parse_header(path: Path, head: bytes) -> tuple[list[Element], int]:
         raise ply_error(path, f"its format is {given}, not one of {', '.join(_FORMATS)}")
     order = _FORMATS[formats[0]]
     elements = [(name, n, [(key, kind.replace("<", order)) for key, kind in given]) for name, n, given in elements]
-    return elements, end.end()
+    return elements, end.end(), antialiased
 
 
 # The compressed PLY of PlayCanvas and SuperSplat: 16 bytes a Gaussian, and one more byte per harmonic and channel.
@@ -173,13 +166,13 @@ def start_of(path: Path) -> bytes:
 
 def is_compressed(path: Path, data: bytes) -> bool:
     """Return whether the header of a .ply file announces this format; DataError if the file has no header."""
-    elements, _ = parse_header(path, data[:MAX_HEADER_BYTES])
+    elements, *_ = parse_header(path, data[:MAX_HEADER_BYTES])
     return any(name == "vertex" and "packed_position" in dict(properties) for name, _, properties in elements)
 
 
 def decode(path: Path, data: bytes) -> base.Arrays:
     """Return the Gaussians of a file's bytes."""
-    elements, start = parse_header(path, data[:MAX_HEADER_BYTES])
+    elements, start, _ = parse_header(path, data[:MAX_HEADER_BYTES])
     expect(not ASCII.search(data[:start]), "it is compressed, but in ASCII")
     tables = {}
     for element in elements:
@@ -294,7 +287,7 @@ class _HeadedFormat(base.Format):
 
     def is_antialiased(self, path: Path) -> bool:
         """Return whether the header declares antialiasing."""
-        return is_antialiased(start_of(path))
+        return parse_header(path, start_of(path))[2]
 
     def is_own(self, path: Path) -> bool:
         """Return whether the header has the comments of warpgs."""
@@ -411,7 +404,7 @@ def read_ply(path: str | os.PathLike[str], normalization: Normalization | None =
     notes: list[str] = []
     normalization = checked_normalization(normalization, units, str(path))
     gaussians = base.from_origin(*_read(path, False, notes), normalization, units)
-    if is_antialiased(start_of(path)):
+    if parse_header(path, start_of(path))[2]:
         base.warn_of_antialiasing(path)
     for note in notes:
         warnings.warn(note, stacklevel=2)
@@ -423,7 +416,7 @@ def _read(path: Path, strict: bool, notes: list[str]) -> tuple[Gaussians, np.nda
     with base.reading(path) as file:
         size = os.fstat(file.fileno()).st_size
         head = file.read(MAX_HEADER_BYTES)
-        elements, start = parse_header(path, head)
+        elements, start, _ = parse_header(path, head)
         file.seek(start)
         text, own = ASCII.search(head[:start]), is_own(head[:start])
         vertex, start = _locate_vertices(path, elements, start)

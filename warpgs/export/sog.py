@@ -19,8 +19,8 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
+from warpgs.errors import expect
 from warpgs.export import base
-from warpgs.export.base import expect
 from warpgs.files import is_within, make_folder, read_file, remove_file, replacing
 from warpgs.scene import ORIGIN
 

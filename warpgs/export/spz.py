@@ -16,9 +16,8 @@ from typing import BinaryIO
 
 import numpy as np
 
-from warpgs.errors import DataError, UsageError, install_extras
+from warpgs.errors import DataError, MalformedError, UsageError, expect, install_extras
 from warpgs.export import base
-from warpgs.export.base import expect
 
 Section = Callable[[int], bytes]
 """Function that returns the next bytes of a section, exactly as many as are requested."""
@@ -201,7 +200,7 @@ def _decompressed(reader: BinaryIO, i: int, whole: int, size: int, *, end: bool 
         data = reader.read(size)
     except _zstandard().ZstdError as e:
         what = f"stream {i} is not a zstd stream, or asks for more than {MAX_WINDOW >> 20} MiB"
-        raise base.MalformedError(what) from e
+        raise MalformedError(what) from e
     expect(len(data) == size or end, f"stream {i} does not hold its {whole} bytes")
     return data
 

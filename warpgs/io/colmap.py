@@ -13,7 +13,7 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from warpgs.errors import DataError
+from warpgs.errors import DataError, expect
 from warpgs.files import open_input, read_file
 from warpgs.geometry import pose_of
 from warpgs.io import folder as scenes
@@ -133,12 +133,6 @@ def _number(word: str) -> float:
     return float("nan" if "n" in word.lower() and NAN.fullmatch(word.encode()) else word)
 
 
-def _expect(condition: bool, message: str) -> None:
-    """Raise a ValueError for `understood` where a line breaks a rule."""
-    if not condition:
-        raise ValueError(message)
-
-
 def _store(table: dict, key: int, value: object, where: str) -> None:
     if key in table:
         raise DataError(f"{where}: id {key} is given twice; write the file again")
@@ -193,10 +187,10 @@ def read_cameras(path: Path, native: bool = False) -> dict[int, Lens]:
         with understood(f"{path}, line {line}"):
             number, model, parameters = int(words[0]), words[1], tuple(_number(w) for w in words[4:])
             allow(model, parameters)
-            _expect(len(parameters) == counts[model], f"{model} has {counts[model]} parameters, not {len(parameters)}")
+            expect(len(parameters) == counts[model], f"{model} has {counts[model]} parameters, not {len(parameters)}")
             where = f"{path}, line {line}, camera {number}"
             width, height = float(words[2]), float(words[3])  # some exports write 1920.0
-            _expect(width % 1 == height % 1 == 0, f"the size {width:g} x {height:g} px is not whole")
+            expect(width % 1 == height % 1 == 0, f"the size {width:g} x {height:g} px is not whole")
             _store(cameras, number, _lens(where, model, int(width), int(height), parameters, native), where)
     return cameras
 
@@ -279,7 +273,7 @@ def read_points(path: Path, names: dict[int, str], notes: list[str] | None = Non
     else:
         for line, words in _rows(path):
             with understood(f"{path}, line {line}"):
-                _expect(len(words) >= 8 and len(words) % 2 == 0, "a point needs 8 numbers, then pairs IMAGE OBSERVATION")
+                expect(len(words) >= 8 and len(words) % 2 == 0, "a point needs 8 numbers, then pairs IMAGE OBSERVATION")
                 points.append(tuple(_number(w) for w in words[1:4]))
                 colors.append(tuple(_number(w) for w in words[4:7]))
                 tracks.append(frozenset(names[i] for w in words[8::2] if (i := int(w)) in names))
@@ -324,23 +318,23 @@ def read_ply_points(path: Path, notes: list[str] | None = None) -> PointCloud:
     data = read_file(path, fix="fix its permissions or copy it again")
     head, mark, rest = data[: 2**16].partition(b"end_header")
     try:
-        _expect(data[:3] == b"ply" and bool(mark), "it has no PLY header")
+        expect(data[:3] == b"ply" and mark, "it has no PLY header")
         lines = [line.split() for line in head.decode("ascii", "replace").splitlines()]
         order = PLY_ORDERS[next(w[1] for w in lines if w[:1] == ["format"])]
         elements = [i for i, w in enumerate(lines) if w[:1] == ["element"]]
-        _expect(bool(elements) and lines[elements[0]][1] == "vertex", "its first element is not vertex")
+        expect(elements and lines[elements[0]][1] == "vertex", "its first element is not vertex")
         count = int(lines[elements[0]][2])
         rows = [w for w in lines[elements[0] : [*elements, len(lines)][1]] if w[:1] == ["property"]]
         kinds = {w[2]: PLY_TYPES[w[1]] for w in rows}
-        _expect(count >= 0 and len(kinds) == len(rows), "its header is inconsistent")
-        _expect({"x", "y", "z"} <= kinds.keys(), "its vertices lack x, y or z")
+        expect(count >= 0 and len(kinds) == len(rows), "its header is inconsistent")
+        expect({"x", "y", "z"} <= kinds.keys(), "its vertices lack x, y or z")
         body = data[len(head) + len(mark) + rest.find(b"\n") + 1 :]
         if order:
             table = np.frombuffer(body, np.dtype([(n, order + k) for n, k in kinds.items()]), count)
             values = {n: table[n].astype(np.float64) for n in kinds}
         else:
             words = np.array([row.split()[: len(kinds)] for row in NAN.sub(b"nan", body).splitlines()[:count]], np.float64)
-            _expect(count == len(words), f"it lists {len(words)} of {count} points")
+            expect(count == len(words), f"it lists {len(words)} of {count} points")
             values = dict(zip(kinds, words.reshape(count, len(kinds)).T))
     except (ValueError, KeyError, IndexError, OverflowError, StopIteration) as e:
         raise DataError(f"{path}: the points cannot be understood ({e}); export them again as PLY, or remove the file") from e
