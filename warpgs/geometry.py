@@ -613,15 +613,12 @@ def harmonics_rotation(rotation: np.ndarray) -> torch.Tensor:
     """
     import torch
 
-    points, weights = [], []
-    for z, weight in (*_NODES, *((-z, w) for z, w in _NODES[1:])):
-        for i in range(_AZIMUTHS):
-            angle, radius = 2 * math.pi * i / _AZIMUTHS, math.sqrt(1 - z * z)
-            points.append([radius * math.cos(angle), radius * math.sin(angle), z])
-            weights.append(weight * 2 * math.pi / _AZIMUTHS)
-    d = np.array(points)
+    nodes = [*_NODES, *((-z, w) for z, w in _NODES[1:])]
+    points = [(z, math.sqrt(1 - z * z), 2 * math.pi * i / _AZIMUTHS) for z, _ in nodes for i in range(_AZIMUTHS)]
+    d = np.array([[radius * math.cos(angle), radius * math.sin(angle), z] for z, radius, angle in points])
+    weights = np.array([w * 2 * math.pi / _AZIMUTHS for _, w in nodes]).repeat(_AZIMUTHS)
     here, there = harmonics(d), harmonics(matmul(d, np.asarray(rotation, np.float64)))
-    return torch.from_numpy(np.einsum("i,ij,ik->jk", np.array(weights), here, there))
+    return torch.from_numpy(np.einsum("i,ij,ik->jk", weights, here, there))
 
 
 def rotate(gaussians: Gaussians, rotation: np.ndarray) -> Gaussians:

@@ -117,10 +117,9 @@ def check_onnx(data: bytes, path: Path) -> None:
             count += size(part) if kind == "node" else 0
             expect(count <= MAX_NODES, f"more than {MAX_NODES:,} nodes once its functions are inlined")
             if kind == "tensor" and any(n == TENSOR_EXTERNAL or (n == TENSOR_LOCATION and v != 0) for n, v in part):
-                raise DataError(
-                    f"{path}: the weights of {_text(part, TENSOR_NAME) or 'a constant'!r} are in another file, which is not "
-                    "read. Save the model as one file: `onnx.save(onnx.load(FILE), OUT)`, or export it without external data"
-                )
+                weights = f"the weights of {_text(part, TENSOR_NAME) or 'a constant'!r} are in another file, which is not read"
+                fix = "`onnx.save(onnx.load(FILE), OUT)`, or export it without external data"
+                raise DataError(f"{path}: {weights}. Save the model as one file: {fix}")
             if kind == "node" and (domain := _text(part, NODE_DOMAIN)) not in DOMAINS:
                 if (operator := (domain, _text(part, NODE_TYPE))) not in own:
                     raise DataError(f"{path}: {'::'.join(operator)} is not part of ONNX; export with standard operators")
@@ -250,6 +249,5 @@ class Model:
             return [np.asarray(output) for output in answer]
         except Exception as e:  # onnxruntime's errors share no base but Exception
             shape = " x ".join(map(str, images[0].shape))
-            raise DataError(
-                f"{self.path}: onnxruntime refuses an input of {shape} ({_first_line(e)}); describe it in {self.path.name}.json"
-            ) from e
+            fix = f"describe it in {self.path.name}.json"
+            raise DataError(f"{self.path}: onnxruntime refuses an input of {shape} ({_first_line(e)}); {fix}") from e
