@@ -309,7 +309,7 @@ def camera_nonsense(found: dict) -> str:
 
 CAMERAS = (
     transforms.read_cameras, transforms._inria, transforms._transforms, transforms.colmap_folder, transforms._colmap,
-    transforms._json, transforms.read_json, transforms._number, transforms.lens_of, transforms.matrix_of, transforms._origin,
+    transforms._json, transforms.read_json, transforms._number, transforms.lens_of, transforms.matrix_of,
     read_cameras, read_poses,
 )  # fmt: skip
 CAMERA_CHANGES = (rarely(mutations.many_rows, json_value), json_value, text_number, text_line)

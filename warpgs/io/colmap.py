@@ -14,7 +14,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from warpgs.errors import DataError, expect
-from warpgs.files import open_input, read_file
+from warpgs.files import PLY_TYPES, open_input, read_file
 from warpgs.geometry import pose_of
 from warpgs.io import folder as scenes
 from warpgs.io.folder import Probe, Reader, SceneFolder, ViewList, register
@@ -66,15 +66,17 @@ class _BinaryFile:
         """Return the next values, little endian."""
         return struct.unpack("<" + layout, self.raw(struct.calcsize("<" + layout)))
 
-    def count(self, smallest: int) -> int:
-        """Return a record count; DataError where the bytes that are left cannot hold so many records."""
+    def records(self, smallest: int) -> Iterator["_BinaryFile"]:
+        """Yield this file for each record; DataError where their count does not fit the bytes, ``smallest`` for each."""
         (count,) = self.take("Q")
         capacity = (len(self.data) - self.at) // smallest
         if count > capacity:
-            raise DataError(
-                f"{self.path}: announces {count:,} records and holds at most {capacity:,}: truncated or foreign. Copy it again"
-            )
-        return count
+            fix = "truncated or foreign. Copy it again"
+            raise DataError(f"{self.path}: announces {count:,} records and holds at most {capacity:,}: {fix}")
+        for _ in range(count):
+            yield self
+        if self.at != len(self.data):
+            raise DataError(f"{self.path}: {len(self.data) - self.at} bytes follow the last of its records. Copy it again")
 
     def text(self) -> str:
         """Return the next name, which ends in a zero byte."""
@@ -83,11 +85,6 @@ class _BinaryFile:
             raise DataError(f"{self.path}: a name has no end, so the file is truncated; copy it again")
         raw, self.at = self.data[self.at : end], end + 1
         return raw.decode("utf-8", "surrogateescape")
-
-    def end(self) -> None:
-        """Raise a DataError where bytes follow the last record, which means a wrong count."""
-        if self.at != len(self.data):
-            raise DataError(f"{self.path}: {len(self.data) - self.at} bytes follow the last of its records. Copy it again")
 
 
 def _lines(path: Path) -> Iterator[tuple[int, str]]:
@@ -166,14 +163,11 @@ def read_cameras(path: Path, native: bool = False) -> dict[int, Lens]:
         """Refuse a model; FULL_OPENCV without rational terms is OPENCV with k3, which can be undistorted."""
         if model not in known and not (model == "FULL_OPENCV" and not any(parameters[9:])):
             kept = ", or fit with --lenses native" if model in counts else ""
-            raise DataError(
-                f"{path}: camera model {model} is not supported (supported: {', '.join(known)}). "
-                f"Run `colmap image_undistorter` and give its output folder{kept}"
-            )
+            fix = f"Run `colmap image_undistorter` and give its output folder{kept}"
+            raise DataError(f"{path}: camera model {model} is not supported (supported: {', '.join(known)}). {fix}")
 
     if path.suffix == ".bin":
-        r = _BinaryFile(path)
-        for _ in range(r.count(24)):
+        for r in _BinaryFile(path).records(24):
             number, model, width, height = r.take("iiQQ")
             name, count = readable.get(model, (OTHER_MODELS.get(model, model), 0))
             allow(name)
@@ -181,7 +175,6 @@ def read_cameras(path: Path, native: bool = False) -> dict[int, Lens]:
             allow(name, parameters)
             where = f"{path}, camera {number}"
             _store(cameras, number, _lens(where, name, width, height, parameters, native), where)
-        r.end()
         return cameras
     for line, words in _rows(path):
         with understood(f"{path}, line {line}"):
@@ -199,14 +192,12 @@ def read_poses(path: Path) -> dict[int, Pose]:
     """Return poses by image number from images.bin or images.txt."""
     poses: dict[int, Pose] = {}
     if path.suffix == ".bin":
-        r = _BinaryFile(path)
-        for _ in range(r.count(73)):
+        for r in _BinaryFile(path).records(73):
             number, *values, camera = r.take("i7di")
             pose = (r.text(), camera, tuple(values[:4]), tuple(values[4:]))
             (observed,) = r.take("Q")
             r.raw(24 * observed)
             _store(poses, number, pose, str(path))
-        r.end()
         return poses
     lines = _lines(path)
     for line, text in lines:
@@ -262,14 +253,12 @@ def read_points(path: Path, names: dict[int, str], notes: list[str] | None = Non
     colors: list[tuple[float, ...]] = []
     tracks: list[frozenset[str]] = []
     if path.suffix == ".bin":
-        r = _BinaryFile(path)
-        for _ in range(r.count(51)):
+        for r in _BinaryFile(path).records(51):
             _, x, y, z, red, green, blue, _, length = r.take("Q3d3BdQ")
             track = np.frombuffer(r.raw(8 * length), "<i4")[::2]
             points.append((x, y, z))
             colors.append((red, green, blue))
             tracks.append(frozenset(names[i] for i in track.tolist() if i in names))
-        r.end()
     else:
         for line, words in _rows(path):
             with understood(f"{path}, line {line}"):
@@ -300,10 +289,6 @@ def _cloud(
     return PointCloud(positions, np.clip(colors, 0, 255).astype(np.float32) / np.float32(1 if fractions else 255), tracks)
 
 
-PLY_TYPES = {
-    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2", "uint16": "u2",
-    "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4", "double": "f8", "float64": "f8",
-}  # fmt: skip
 PLY_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 
 COLORS = [c.split() for c in ("red green blue", "r g b", "diffuse_red diffuse_green diffuse_blue", "f_dc_0 f_dc_1 f_dc_2")]

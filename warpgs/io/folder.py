@@ -145,10 +145,9 @@ def protocol_ids(names: list[str], wanted: tuple[int, ...], least: int, where: s
     missing = [i for i in range(max(least, len(names))) if i not in by_id]
     if missing:
         shown = ", ".join(map(str, missing[:8])) + (", ..." if len(missing) > 8 else "")
-        raise DataError(
-            f"{where}: images with the ids {shown} are missing (ids are counted from 0, names run from {names[0]} to "
-            f"{names[-1]}); restore them, because the protocol's ids would otherwise select other views"
-        )
+        counted = f"(ids are counted from 0, names run from {names[0]} to {names[-1]})"
+        fix = "restore them, because the protocol's ids would otherwise select other views"
+        raise DataError(f"{where}: images with the ids {shown} are missing {counted}; {fix}")
     return {i: by_id[i] for i in wanted}
 
 
@@ -376,10 +375,9 @@ class SceneFolder:
             of_unmasked, of_known = ({f for n in names for f in masks.get(n, [])} for names in (unmasked, known))
             if lone := [f for f in files if f in of_unmasked or f not in of_known]:
                 image = min(unmasked.values())
-                notes.append(
-                    f"{len(lone)} of {len(files)} files in {folder.name} match no image or several, such as "
-                    f"{lone[0].relative_to(folder)}; name a mask like its image: {image.with_suffix('.png')} or {image}.png"
-                )
+                lost = f"{len(lone)} of {len(files)} files in {folder.name} match no image or several"
+                fix = f"name a mask like its image: {image.with_suffix('.png')} or {image}.png"
+                notes.append(f"{lost}, such as {lone[0].relative_to(folder)}; {fix}")
         return notes
 
     def images(self, base: str = "images") -> tuple[Path, int, str]:
@@ -568,18 +566,15 @@ class ViewList:
         notes = [f"{n} image{'s' if n != 1 else ''} {what}" for what, n in sorted(self._done.items())]
         if self._narrow:
             name, left = min(self._narrow.items(), key=lambda item: item[1])
-            notes.append(
-                f"the lens distortion leaves few pixels of {len(self._narrow)} images, {left:.0%} of {name}; check the "
-                "distortion, or use --lenses native"
-            )
+            fix = "check the distortion, or use --lenses native"
+            notes.append(f"the lens distortion leaves few pixels of {len(self._narrow)} images, {left:.0%} of {name}; {fix}")
         cutout = options is not None and options.masks == "cutout"
         if options is None or not self._kept:
             return [*notes, "--masks cutout changes nothing: no image has a mask file"] if cutout else notes
         mean = math.fsum(self._kept.values()) / len(self._kept)
-        notes.append(
-            f"masks keep {mean:.1%} of the pixels, the {options.mask_keeps} ones (--mask-keeps {options.mask_keeps}); "
-            f"the others {'are transparent' if cutout else 'are ignored'} (--masks {options.masks})"
-        )
+        others = f"the others {'are transparent' if cutout else 'are ignored'} (--masks {options.masks})"
+        kept = f"the {options.mask_keeps} ones (--mask-keeps {options.mask_keeps})"
+        notes.append(f"masks keep {mean:.1%} of the pixels, {kept}; {others}")
         out = "" if cutout else ", so that their views are left out (see --mask-keeps)"
         for fraction, what in ((0.0, f"keep no pixel{out}"), (1.0, "keep every pixel")):
             names = [n for n, kept in self._kept.items() if kept == fraction]

@@ -431,35 +431,23 @@ def _raster(path: Path, data: bytes, max_pixels: int) -> np.ndarray:
         width, height = header_size(name, data)
         pixels = width * height
         if pixels > max_pixels:
-            raise DataError(
-                f"{path}: the image is {width} x {height} px, more than the limit of {max_pixels:,} pixels; shrink it, or "
-                f"raise the limit with --max-pixels {pixels} (decoding then needs {BYTES_PER_PIXEL * pixels / 2**30:.1f} GiB)"
-            )
+            size = f"the image is {width} x {height} px, more than the limit of {max_pixels:,} pixels"
+            needs = f"--max-pixels {pixels} (decoding then needs {BYTES_PER_PIXEL * pixels / 2**30:.1f} GiB)"
+            raise DataError(f"{path}: {size}; shrink it, or raise the limit with {needs}")
         expect(pixels, f"it has {width} x {height} px")
         raster = _decoded(name, data)
         if raster is None:
             # IMREAD_UNCHANGED also ignores the EXIF orientation: the camera, not the tag, determines how the raster lies
             raster = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
         expect(raster is not None and raster.shape[:2] == (height, width), "its pixels cannot be read")
-    except cv2.error as e:
-        if e.code == cv2.Error.StsNoMem:
-            raise ResourceError(_too_large(path, pixels)) from e
-        raise _damaged(path, "OpenCV cannot read it") from e
-    except MemoryError as e:
-        raise ResourceError(_too_large(path, pixels)) from e
-    except ValueError as e:
-        raise _damaged(path, str(e)) from e
+    except (cv2.error, MemoryError, ValueError) as e:
+        if isinstance(e, MemoryError) or getattr(e, "code", None) == cv2.Error.StsNoMem:
+            needs = f"needs {BYTES_PER_PIXEL * pixels / 2**30:.1f} GiB of free memory"
+            raise ResourceError(f"{path}: decoding the image {needs}; shrink the image, or end other programs") from e
+        reason = "OpenCV cannot read it" if isinstance(e, cv2.error) else e
+        fix = "Restore it from its source; if it looks right, save it as PNG"
+        raise DataError(f"{path}: the image cannot be decoded: {reason}. {fix}") from e
     return raster
-
-
-def _damaged(path: Path, reason: str) -> DataError:
-    fix = "Restore it from its source; if it looks right, save it as PNG"
-    return DataError(f"{path}: the image cannot be decoded: {reason}. {fix}")
-
-
-def _too_large(path: Path, pixels: int) -> str:
-    needed = BYTES_PER_PIXEL * pixels / 2**30
-    return f"{path}: decoding the image needs {needed:.1f} GiB of free memory; shrink the image, or end other programs"
 
 
 def decode_png(path: Path, max_pixels: int = MAX_PIXELS) -> np.ndarray:

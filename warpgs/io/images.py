@@ -158,9 +158,8 @@ class Lens:
         if not (1 <= self.width <= MAX_INTRINSIC and 1 <= self.height <= MAX_INTRINSIC):
             raise DataError(f"{where}: the camera's image size {self.width} x {self.height} px is impossible; fix the file")
         if not ((f >= MIN_FOCAL * np.array([self.width, self.height])) & (f < MAX_INTRINSIC)).all():
-            raise DataError(
-                f"{where}: focal lengths {f.tolist()} px must be over {MIN_FOCAL} of the sides, and finite; calibrate again"
-            )
+            fix = "calibrate again"
+            raise DataError(f"{where}: focal lengths {f.tolist()} px must be over {MIN_FOCAL} of the sides, and finite; {fix}")
         if not (np.abs(c) < MAX_INTRINSIC).all():
             raise DataError(f"{where}: the principal point {c.tolist()} px is not finite or too large; calibrate again")
         if not (np.abs(self.distortion) < MAX_DISTORTION).all():
@@ -312,17 +311,13 @@ def _reached(model: str, distortion: tuple[float, ...], intrinsics: tuple[float,
 
 def _native(loaded: LoadedImage, lens: Lens) -> LoadedImage:
     """Keep the pixels and record the camera model; pixels that the lens does not reach are masked out."""
-    height, width = loaded.image.shape[:2]
     model, count = ("fisheye", 4) if lens.fisheye else ("opencv", 8)
-    distortion = np.zeros(count)
-    distortion[: len(lens.distortion)] = lens.distortion
-    K = loaded.K
-    mask = _reached(model, tuple(distortion), (K[0, 0], K[1, 1], K[0, 2], K[1, 2]), width, height)
+    distortion, K = np.pad(np.array(lens.distortion, np.float64), (0, count - len(lens.distortion))), loaded.K
+    mask = _reached(model, tuple(distortion), (K[0, 0], K[1, 1], K[0, 2], K[1, 2]), *loaded.image.shape[1::-1])
     if loaded.mask is not None:
         mask = mask & loaded.mask
     done = (*loaded.done, f"kept with the distortion of their lens ({lens.model})")
-    kept = None if mask.all() else mask
-    return replace(loaded, mask=kept, done=done, camera_model=model, distortion=distortion)
+    return replace(loaded, mask=None if mask.all() else mask, done=done, camera_model=model, distortion=distortion)
 
 
 def _shrink(path: Path, loaded: LoadedImage, downscale: int, max_side: int) -> LoadedImage:
@@ -336,10 +331,8 @@ def _shrink(path: Path, loaded: LoadedImage, downscale: int, max_side: int) -> L
         return loaded
     small_w, small_h = round(width / factor), round(height / factor)
     if min(small_w, small_h) < MIN_SIDE:
-        raise UsageError(
-            f"{flags} leaves {small_w} x {small_h} px of {path} ({width} x {height} px); "
-            f"both sides must keep at least {MIN_SIDE} px. Choose a smaller factor or a longer side"
-        )
+        fix = f"both sides must keep at least {MIN_SIDE} px. Choose a smaller factor or a longer side"
+        raise UsageError(f"{flags} leaves {small_w} x {small_h} px of {path} ({width} x {height} px); {fix}")
     K = np.diag([small_w / width, small_h / height, 1.0]) @ loaded.K
     mask = None if loaded.mask is None else _resize(loaded.mask.astype(np.float32), small_w, small_h) > 0.5
     hides = loaded.mask if loaded.undone is None else None  # what the mask of an undistorted image hides is filled already
@@ -360,10 +353,8 @@ def _fit_mask(path: Path, mask: np.ndarray, stored: tuple[int, int], upright: tu
         return mask
     # rounding a size may change it by one pixel of the smaller raster
     if abs(mask.shape[1] * height - mask.shape[0] * width) > max(height, width, *mask.shape):
-        raise DataError(
-            f"{path}: its mask is {mask.shape[1]} x {mask.shape[0]} px, the image {width} x {height}: the aspects differ. "
-            "Give a mask made from this image"
-        )
+        fix = "the aspects differ. Give a mask made from this image"
+        raise DataError(f"{path}: its mask is {mask.shape[1]} x {mask.shape[0]} px, the image {width} x {height}: {fix}")
     resized = _resize(mask.astype(np.float32), width, height)
     return resized > 0.5 if mask.dtype == bool else resized
 
@@ -374,10 +365,9 @@ def _upright(path: Path, lens: Lens, image: np.ndarray, data: bytes) -> int:
         return 1
     orientation = read_exif(data)[0]
     if orientation not in (5, 6, 7, 8) or not _fits(image.shape[1::-1], lens):
-        raise DataError(
-            f"{path}: the image is {image.shape[1]} x {image.shape[0]} px, its camera {lens.width} x {lens.height}: the "
-            "aspects differ, so the intrinsics cannot belong to it. Give the images that the cameras were made from."
-        )
+        sizes = f"the image is {image.shape[1]} x {image.shape[0]} px, its camera {lens.width} x {lens.height}"
+        fix = "the aspects differ, so the intrinsics cannot belong to it. Give the images that the cameras were made from."
+        raise DataError(f"{path}: {sizes}: {fix}")
     return orientation
 
 
@@ -469,7 +459,7 @@ def dark_pixels(image: np.ndarray) -> np.ndarray | None:
     border = np.concatenate([image[0], image[-1], image[:, 0], image[:, -1]]).max(-1) < DARK
     if border.mean() < 0.5:  # as in most photographs, whose other pixels take 40 ms per million
         return None
-    dark: np.ndarray = image.max(-1) < DARK
+    dark = np.asarray(image.max(-1) < DARK)
     return dark if dark.mean() >= DARK_FRACTION and not dark.all() else None
 
 
@@ -484,8 +474,7 @@ def empty_pixels(dark: np.ndarray) -> np.ndarray:
     _, labels, found, _ = cv2.connectedComponentsWithStats(dark.astype(np.uint8), connectivity=4)
     empty = found[:, cv2.CC_STAT_AREA] >= HOLE * dark.size
     empty[np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]])] = True
-    pixels: np.ndarray = dark & empty[labels]
-    return pixels
+    return np.asarray(dark & empty[labels])
 
 
 def cut_from_black(views: list[View]) -> tuple[list[View], str]:
@@ -503,7 +492,5 @@ def cut_from_black(views: list[View]) -> tuple[list[View], str]:
         empty += float(nothing.mean()) / len(views)
         alpha = 1 - nothing.astype(np.float32)
         done.append(replace(v, image=v.image * alpha[..., None], alpha=alpha, alpha_estimated=True))
-    return done, (
-        f"every image shows an object on black: the dark pixels around the object and in its holes ({empty:.1%} of all "
-        f"pixels) become transparent; --no-black-is-empty keeps them"
-    )
+    these = f"the dark pixels around the object and in its holes ({empty:.1%} of all pixels)"
+    return done, f"every image shows an object on black: {these} become transparent; --no-black-is-empty keeps them"

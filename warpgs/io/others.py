@@ -226,9 +226,8 @@ def read_camera_rows(path: Path) -> list[tuple[int, str, np.ndarray]]:
                 raise DataError(f"{path}, line {number}, image {words[0]!r}: needs 21 finite numbers. Copy it again")
             rows.append((number, words[0], values))
     except (OSError, ValueError) as e:
-        raise DataError(
-            f"{path}: cannot be understood ({unread_reason(e)}); needs a count, then names with 21 numbers. Copy it again"
-        ) from e
+        fix = "needs a count, then names with 21 numbers. Copy it again"
+        raise DataError(f"{path}: cannot be understood ({unread_reason(e)}); {fix}") from e
     if count != len(rows):
         raise DataError(f"{path}: announces {count or 0} images and lists {len(rows)}; it is truncated. Copy it again")
     return rows

@@ -88,10 +88,8 @@ def lens_of(frame: dict, shared: dict, width: int, height: int, where: str, nati
     kept = ", or fit them with --lenses native" if not native else ""
     known = (*MODELS, FISHEYE) if native else MODELS
     if model not in known:
-        raise DataError(
-            f"{where}: camera model {model[:40]} is not supported (supported: {', '.join(known)}). Undistort the images "
-            f"first{kept if model == FISHEYE else ''}"
-        )
+        fix = f"Undistort the images first{kept if model == FISHEYE else ''}"
+        raise DataError(f"{where}: camera model {model[:40]} is not supported (supported: {', '.join(known)}). {fix}")
     fisheye = native and bool(model == FISHEYE or frame.get("is_fisheye", shared.get("is_fisheye")))
     number = partial(_number, frame, shared, where=where)
     width, height = (own if (given := number(key)) is None else int(given) for key, own in (("w", width), ("h", height)))
@@ -129,11 +127,6 @@ def matrix_of(frame: dict, where: str) -> np.ndarray:
     if matrix.shape not in ((3, 4), (4, 4)):
         raise DataError(f"{where}: transform_matrix must be [4, 4], not {list(matrix.shape)}; write the file again")
     return matrix
-
-
-def _origin(values: dict, where: str) -> np.ndarray:
-    """Return the origin [3] that a file of ours states, 0 without one."""
-    return checked_origin(values.get(ORIGIN, (0, 0, 0)), where)
 
 
 def _image_path(scene: SceneFolder, folder: Path, name: object, where: str) -> Path:
@@ -286,12 +279,11 @@ class TransformsReader(Reader):
         """See `Reader.read`."""
         background = WHITE if is_blender(folder) else BLACK
         scene, views, notes = SceneFolder(folder, options), ViewList(options), []
-        missing: list[str] = []
-        total, points = 0, None
+        missing, total, points = list[str](), 0, None
         for file in files_of(folder):
             shared = read_json(scene.inside(file))
             total += len(shared["frames"])
-            origin = _origin(shared, str(file))
+            origin = checked_origin(shared.get(ORIGIN, (0, 0, 0)), str(file))
             paths, matched = _image_paths(scene, file, shared["frames"])
             moved = dict[str, Path]()
             named = partial(_named_file, scene, file.parent, {*paths.values()}, moved)
@@ -369,7 +361,7 @@ def stated_origin(path: Path) -> np.ndarray:
         return colmap.origin_stated(model / f"images.{kind}")
     values = _json(path, "check the path, or write the file again")
     first = values[0] if isinstance(values, list) and values else values
-    return _origin(first if isinstance(first, dict) else {}, str(path))
+    return checked_origin((first if isinstance(first, dict) else {}).get(ORIGIN, (0, 0, 0)), str(path))
 
 
 def _inria(path: Path, rows: list[Any]) -> Iterator[Row]:
@@ -382,7 +374,7 @@ def _inria(path: Path, rows: list[Any]) -> Iterator[Row]:
             width, height, fx, fy = (float(row[key]) for key in ("width", "height", "fx", "fy"))
             K = np.array([[fx, 0, width / 2], [0, fy, height / 2], [0, 0, 1]])
             lens = Lens(K, int(width), int(height))
-            name, origin = str(row.get("img_name", i)), _origin(row, where)
+            name, origin = str(row.get("img_name", i)), checked_origin(row.get(ORIGIN, (0, 0, 0)), where)
         except (KeyError, TypeError, ValueError, OverflowError, AttributeError) as e:
             raise DataError(f"{where}: needs rotation, position, width, height, fx and fy as numbers; correct the entry") from e
         yield name, scenes.about(scenes.from_camera_to_world(pose, where, opengl=False), origin), lens.checked(where)
@@ -410,7 +402,7 @@ def _drawn(path: Path, values: dict[str, Any]) -> Iterator[Row]:
 def _transforms(path: Path) -> Iterator[Row]:
     """Yield the cameras of frames; the file must give its image size."""
     shared = read_json(path)
-    origin = _origin(shared, str(path))
+    origin = checked_origin(shared.get(ORIGIN, (0, 0, 0)), str(path))
     for i, frame in enumerate(shared["frames"]):
         where = f"{path}, frame {i}"
         if not isinstance(frame, dict):
