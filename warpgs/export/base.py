@@ -43,9 +43,8 @@ _AXES = (
 
 def malformed(path: Path, what: str) -> DataError:
     """Return a DataError about a file that does not match its suffix, with the fix."""
-    return DataError(
-        f"{path}: not a usable {path.suffix or 'model'} file: {what}. Export the model again, or use another format."
-    )
+    fix = "Export the model again, or use another format."
+    return DataError(f"{path}: not a usable {path.suffix or 'model'} file: {what}. {fix}")
 
 
 def by_rows(n: int, shape: tuple[int, ...], rows: Callable[[slice], np.ndarray]) -> np.ndarray:
@@ -76,6 +75,11 @@ def origin_of(points: np.ndarray) -> np.ndarray:
         return np.zeros(3)
     low, high = np.percentile(points, [5, 95], axis=0)
     return Normalization((low + high) / 2, 1 / (float(np.linalg.norm(high - low)) or 1.0)).origin
+
+
+def origin_comment(origin: np.ndarray | None, start: str = "comment") -> str:
+    """Return the line of a text file that states an origin [3]; empty for 0."""
+    return f"{start} {ORIGIN} {' '.join(map(repr, origin.tolist()))}\n" if origin is not None and origin.any() else ""
 
 
 def side_file(path: Path) -> Path:
@@ -114,10 +118,8 @@ def arrays_to_write(
         for name, array in arrays.items():
             bad = array.size - int(np.isfinite(array).sum())
             if bad:
-                raise DataError(
-                    f"{path}: {bad} of {array.size} values of {name} are not finite; export an earlier checkpoint, or fit "
-                    "again with a lower learning rate"
-                )
+                fix = "export an earlier checkpoint, or fit again with a lower learning rate"
+                raise DataError(f"{path}: {bad} of {array.size} values of {name} are not finite; {fix}")
     logits = arrays["logit_opacities"]
     if logits.size and 0 <= logits.min() < logits.max() <= 1:
         words = "all logit_opacities are in [0, 1], as opacities are; ActivatedGaussians(...).stored() makes logits"
@@ -383,11 +385,9 @@ class Format:
         if self.max_degree == 0:
             arrays["sh"] = arrays["sh"][:, :1]
         elif gaussians.sh_degree > self.max_degree:
-            raise DataError(
-                f"{path}: not written, {self.suffix} files hold harmonics up to degree {self.max_degree}, not "
-                f"{gaussians.sh_degree}. Drop higher degrees with --sh-degree {self.max_degree}, in Python with "
-                f"sh[:, :{(self.max_degree + 1) ** 2}], or write .ply"
-            )
+            most = f"{self.suffix} files hold harmonics up to degree {self.max_degree}, not {gaussians.sh_degree}"
+            fix = f"--sh-degree {self.max_degree}, in Python with sh[:, :{(self.max_degree + 1) ** 2}], or write .ply"
+            raise DataError(f"{path}: not written, {most}. Drop higher degrees with {fix}")
         pieces = returned(self, "encode", self.encode(arrays), Iterable, "an iterable of bytes")
         self.store(path, [returned(self, "encode", p, BYTES, "an iterable of bytes") for p in pieces])
         if type(self).origin_in is Format.origin_in:
@@ -497,9 +497,8 @@ def find_format(choice: str | type[Format] | Format) -> Format:
     """
     if not isinstance(choice, (str, type, Format)):
         raise UsageError(f"{choice!r} is not a format; give a name, module:Class, or a class or object of warpgs.Format")
-    found = (
-        choice if isinstance(choice, Format) else FORMATS.load(choice)() if isinstance(choice, str) else FORMATS.find(choice)()
-    )
+    kind = FORMATS.load(choice) if isinstance(choice, str) else choice if isinstance(choice, Format) else FORMATS.find(choice)
+    found = kind if isinstance(kind, Format) else kind()
     if not re.fullmatch(r"(\.[a-z0-9_-]+)+", found.suffix):
         raise UsageError(f"the suffix {found.suffix!r} of {type(found).__name__} must be a dot and lower-case letters, digits")
     return found
@@ -521,10 +520,9 @@ def format_of(path: str | os.PathLike[str], choice: str | type[Format] | Format 
     if (Path(path) / "meta.json").is_file():
         raise UsageError(f"{path}: is the folder of a SOG model; give {Path(path) / 'meta.json'}")
     cameras = "; cameras are named cameras.json, transforms.json or sparse" if name.endswith(".json") else ""
-    raise UsageError(
-        f"{path}: format {Path(path).suffix or '(none)'} is not supported; use one of {', '.join(k.suffix for k in known)}, or "
-        f"give a format of your own{cameras}. `warpgs export` makes a page, too (.html), and `warpgs mesh` a mesh (.ply, .glb)"
-    )
+    one = f"use one of {', '.join(k.suffix for k in known)}, or give a format of your own{cameras}"
+    others = "`warpgs export` makes a page, too (.html), and `warpgs mesh` a mesh (.ply, .glb)"
+    raise UsageError(f"{path}: format {Path(path).suffix or '(none)'} is not supported; {one}. {others}")
 
 
 def write_gaussians(

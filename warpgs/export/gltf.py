@@ -119,9 +119,8 @@ def decode(path: Path, data: bytes) -> base.Arrays:
     whole = degrees and degrees == list(range(len(degrees)))
     expect(whole, f"it has harmonics of degrees {degrees}, but degrees must start at 0 and have no gap")
     orders = [(math.isqrt(k), k - math.isqrt(k) ** 2) for k in range(base.SH_SIZES[degrees[-1]])]
-    means, turns, scales, opacities = (
-        values(name) for name in ("POSITION", *(f"{EXTENSION}:{n}" for n in ("ROTATION", "SCALE", "OPACITY")))
-    )
+    means = values("POSITION")
+    turns, scales, opacities = (values(f"{EXTENSION}:{name}") for name in ("ROTATION", "SCALE", "OPACITY"))
     harmonics = [values(f"{EXTENSION}:SH_DEGREE_{d}_COEF_{c}") for d, c in orders]
     n = len(means)
     expect(all(len(v) == n for v in (turns, scales, opacities, *harmonics)), "its attributes differ in length")
@@ -133,12 +132,8 @@ def decode(path: Path, data: bytes) -> base.Arrays:
         expect(not (lengths < 0).any(), "an axis has a negative length")
         return np.log(np.maximum(lengths, _TINY))
 
-    sh = np.empty((n, len(harmonics), 3), np.float32)
-    for k, table in enumerate(harmonics):
-        for part in base.parts(n):
-            sh[part, k] = _rows(table, part)
     arrays = {
-        "sh": sh,
+        "sh": base.by_rows(n, (len(harmonics), 3), lambda p: np.stack([_rows(table, p) for table in harmonics], 1)),
         "means": base.by_rows(n, (3,), lambda p: _rows(means, p)),
         "quats": base.by_rows(n, (4,), lambda p: _rows(turns, p)[:, [3, 0, 1, 2]]),
         "log_scales": base.by_rows(n, (3,), logs),
@@ -277,9 +272,8 @@ def _accessor(document: dict[str, Any], body: bytes | memoryview, index: object,
     stride = count(view, "byteStride", size) or size
     start, offset, length = count(view, "byteOffset", 0), count(accessor, "byteOffset", 0), count(view, "byteLength")
     last = offset + (rows - 1) * stride + size if rows else 0
-    expect(
-        stride >= size and start + length <= len(body) and last <= length, f"accessor {index} reaches beyond its {length} bytes"
-    )
+    within = stride >= size and start + length <= len(body) and last <= length
+    expect(within, f"accessor {index} reaches beyond its {length} bytes")
     if not rows:
         return np.empty((0, width), np.float32)
     numbers = np.ndarray((rows, width), dtype, body, start + offset, (stride, dtype.itemsize))

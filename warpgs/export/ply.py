@@ -14,7 +14,7 @@ import numpy as np
 
 from warpgs.errors import DataError, expect
 from warpgs.export import base
-from warpgs.files import replacing
+from warpgs.files import PLY_TYPES, replacing
 from warpgs.geometry import checked_normalization
 from warpgs.scene import ORIGIN, Gaussians, Normalization, base_coefficients, base_colors, checked_origin
 
@@ -22,11 +22,7 @@ MAX_HEADER_BYTES = 65536
 """Largest accepted header [bytes]; real headers have some two thousand."""
 REMEDY = "Export the model again with warpgs, or with any tool that writes the binary layout of the INRIA 3DGS code."
 
-_TYPES = {
-    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "<i2", "int16": "<i2", "ushort": "<u2", "uint16": "<u2",
-    "int": "<i4", "int32": "<i4", "uint": "<u4", "uint32": "<u4", "float": "<f4", "float32": "<f4", "double": "<f8",
-    "float64": "<f8",
-}  # fmt: skip
+_TYPES = {name: kind if kind.endswith("1") else f"<{kind}" for name, kind in PLY_TYPES.items()}
 _FORMATS = {"binary_little_endian 1.0": "<", "binary_big_endian 1.0": ">", "ascii 1.0": "<"}
 """Formats that are read, with their byte order in numpy; the numbers of an ASCII file do not need one."""
 ASCII = re.compile(rb"^format[ \t]+ascii", re.MULTILINE)
@@ -43,13 +39,8 @@ def mode_comments(antialiased: bool) -> tuple[str, str]:
     return f"comment SplatRenderMode: {'mip' if antialiased else 'default'}", f"comment antialiased {int(antialiased)}"
 
 
-def origin_comment(origin: np.ndarray | None) -> list[str]:
-    """Return the comment that states an origin [3], if it is not 0."""
-    return [] if origin is None or not origin.any() else [f"comment {ORIGIN} {' '.join(map(repr, origin.tolist()))}"]
-
-
 def origin_stated(head: bytes) -> list[str] | None:
-    """Return the words of the comment that `origin_comment` made; None without one."""
+    """Return the words of the comment that `base.origin_comment` made; None without one."""
     line = re.search(rf"^comment {ORIGIN} (.*)$".encode(), head.partition(b"end_header")[0], re.MULTILINE)
     return None if line is None else line[1].decode("utf-8", "replace").split()
 
@@ -146,14 +137,11 @@ def encode(arrays: base.Arrays, antialiased: bool, origin: np.ndarray | None = N
     rows = np.stack([position, rotation, scale, _pack(rgba, (8, 8, 8, 8))], 1).astype("<u4")
     rest = arrays["sh"][:, 1:].astype(np.float64).transpose(0, 2, 1).reshape(n, -1)
     harmonics = np.clip(np.floor((rest / SH_RANGE + 0.5) * 256), 0, 255).astype("u1")
-    lines = ["ply", "format binary_little_endian 1.0", *mode_comments(antialiased), *origin_comment(origin)]
-    lines.append(f"element chunk {len(bounds[0])}")
-    lines += [f"property float {name}" for name in _CHUNK_NAMES]
+    lines = [f"element chunk {len(bounds[0])}", *(f"property float {name}" for name in _CHUNK_NAMES)]
     lines += [f"element vertex {n}", *(f"property uint {name}" for name in _VERTEX_NAMES)]
     if k > 1:
         lines += [f"element sh {n}", *(f"property uchar f_rest_{i}" for i in range(3 * (k - 1)))]
-    header = ("\n".join([*lines, "end_header"]) + "\n").encode("ascii")
-    return [header, np.concatenate(bounds, 1).tobytes(), rows.tobytes(), harmonics.tobytes()]
+    return [_header(lines, antialiased, origin), np.concatenate(bounds, 1).tobytes(), rows.tobytes(), harmonics.tobytes()]
 
 
 def start_of(path: Path) -> bytes:
@@ -199,6 +187,9 @@ def decode(path: Path, data: bytes) -> base.Arrays:
         packed = rotation[part].astype(np.int64)
         return base.from_smallest_three(packed >> 30, (_unpack(packed & (2**30 - 1), (10, 10, 10)) - 0.5) * base.SQRT2)
 
+    def opacities(part: slice) -> np.ndarray:
+        return base.logits(_unpack(color[part].astype(np.int64), (8, 8, 8, 8))[:, 3], 1 / 255)
+
     def harmonics(part: slice) -> np.ndarray:
         first = base_coefficients(values(2, color, (8, 8, 8, 8), part))[:, None]
         return first if rest is None else np.concatenate([first, rest(part)], 1)
@@ -209,9 +200,7 @@ def decode(path: Path, data: bytes) -> base.Arrays:
         "means": base.by_rows(n, (3,), lambda p: values(0, position, _BITS, p)),
         "quats": base.by_rows(n, (4,), quats),
         "log_scales": base.by_rows(n, (3,), lambda p: values(1, scale, _BITS, p)),
-        "logit_opacities": base.by_rows(
-            n, (), lambda p: base.logits(_unpack(color[p].astype(np.int64), (8, 8, 8, 8))[:, 3], 1 / 255)
-        ),
+        "logit_opacities": base.by_rows(n, (), opacities),
     }
 
 
@@ -369,7 +358,7 @@ def _write(
     """Write Gaussians as `write_ply` does, about an ``origin`` [3] if one is given."""
     arrays, origin = base.arrays_to_write(path, gaussians, normalization, units, origin)
     n, k = arrays["sh"].shape[:2]
-    header = _header(n, 3 * (k - 1), antialiased, origin)
+    header = _header([f"element vertex {n}", *(f"property float {v}" for v in _names(3 * (k - 1)))], antialiased, origin)
     with replacing(path, size=len(header) + 4 * n * (14 + 3 * k)) as (file, _):
         file.write(header)
         for start in range(0, n, CHUNK_ROWS):
@@ -458,11 +447,10 @@ def _names(rest: int) -> list[str]:
     return [*_POSITION, "nx", "ny", "nz", *_DC, *(f"f_rest_{i}" for i in range(rest)), "opacity", *_SCALE, *_ROTATION]
 
 
-def _header(n: int, rest: int, antialiased: bool, origin: np.ndarray) -> bytes:
-    """Return the header of a file with ``n`` Gaussians and ``rest`` coefficients above degree 0."""
-    lines = ["ply", "format binary_little_endian 1.0", *mode_comments(antialiased), *origin_comment(origin)]
-    lines += [f"element vertex {n}", *(f"property float {name}" for name in _names(rest))]
-    return ("\n".join([*lines, "end_header"]) + "\n").encode("ascii")
+def _header(elements: list[str], antialiased: bool, origin: np.ndarray | None) -> bytes:
+    """Return the header of a file with the lines of its elements."""
+    lines = ["ply", "format binary_little_endian 1.0", *mode_comments(antialiased), *base.origin_comment(origin).splitlines()]
+    return ("\n".join([*lines, *elements, "end_header"]) + "\n").encode("ascii")
 
 
 def _rows(arrays: dict[str, np.ndarray]) -> np.ndarray:
@@ -530,10 +518,8 @@ def _assemble(
         if part.start == 0 and all(rows.dtype[name].itemsize == 8 for name in _POSITION):
             middle = base.origin_of(np.stack([rows[name] for name in _POSITION], 1).astype(np.float64))
         columns = functools.partial(_columns, rows, part.start, bad[part], reasons)
-        if _DC[0] in (rows.dtype.names or ()):
-            arrays["sh"][part, 0] = columns(_DC)
-        else:
-            arrays["sh"][part, 0] = base_coefficients(columns(_RGB) / 255)
+        coefficients = _DC[0] in (rows.dtype.names or ())
+        arrays["sh"][part, 0] = columns(_DC) if coefficients else base_coefficients(columns(_RGB) / 255)
         if rest:
             above = columns([f"f_rest_{i}" for i in range(rest)])
             arrays["sh"][part, 1:] = above.reshape(len(rows), 3, k).transpose(0, 2, 1)
@@ -556,11 +542,9 @@ def _assemble(
         notes.append(f"{path}: filter_3D of Mip-Splatting is applied to sizes and opacities")
     stored, scales = arrays["logit_opacities"], arrays["log_scales"]
     if n >= LEAST_JUDGED and stored.min() >= 0 and stored.max() <= 1 and scales.min() > 0:
-        notes.append(
-            f"{path}: all opacities are from {stored.min():.2g} to {stored.max():.2g} and all log scales above 0, as if stored "
-            "after the sigmoid and the exponential; they are read as logits and logarithms. If images are foggy, export the "
-            "model again without activations"
-        )
+        values = f"all opacities are from {stored.min():.2g} to {stored.max():.2g} and all log scales above 0"
+        why = "as if stored after the sigmoid and the exponential; they are read as logits and logarithms"
+        notes.append(f"{path}: {values}, {why}. If images are foggy, export the model again without activations")
     return base.usable(path, arrays, bad, next(iter(reasons), ""), lambda: strict, notes, ply_error), origin + middle
 
 

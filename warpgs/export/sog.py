@@ -272,9 +272,11 @@ def _quats(pixels: np.ndarray, n: int) -> np.ndarray:
     largest = pixels[:n, 3]
     none = largest < 252
     expect(not none.any(), f"the rotation of Gaussian {int(none.argmax())} names no largest component")
-    return base.by_rows(
-        n, (4,), lambda p: base.from_smallest_three(largest[p].astype(np.int64) - 252, (pixels[p, :3] / 255 - 0.5) * base.SQRT2)
-    )
+
+    def rows(p: slice) -> np.ndarray:
+        return base.from_smallest_three(largest[p].astype(np.int64) - 252, (pixels[p, :3] / 255 - 0.5) * base.SQRT2)
+
+    return base.by_rows(n, (4,), rows)
 
 
 def _check_contents(file: BinaryIO, size: int) -> None:
