@@ -331,9 +331,8 @@ def show_priors() -> Command:
             priors: Networks.
         """
         check_range("--threads", threads, 0, MAX_THREADS)
-        request = SceneRequest(
-            str(scene), split, downscale=downscale, max_side=max_side, allow_outside=allow_outside, max_pixels=max_pixels
-        )
+        sizes = {"downscale": downscale, "max_side": max_side, "max_pixels": max_pixels}
+        request = SceneRequest(str(scene), split, allow_outside=allow_outside, **sizes)
         return commands.show_priors(request, priors, source, out, threads)
 
     return show, "write depth and saliency of each training view as images"

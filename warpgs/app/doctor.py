@@ -132,10 +132,8 @@ def _cuda() -> Iterable[Finding]:
         yield Finding("CUDA", NOTE, f"not checked: {_reason(e)}", "install torch first")
         return
     if torch.version.cuda is None:
-        yield Finding(
-            "CUDA", NOTE, f"none: this torch ({torch.__version__}) is built without CUDA; {slower}",
-            "with an NVIDIA GPU: install a CUDA build of torch, see pytorch.org/get-started",
-        )  # fmt: skip
+        remedy = "with an NVIDIA GPU: install a CUDA build of torch, see pytorch.org/get-started"
+        yield Finding("CUDA", NOTE, f"none: this torch ({torch.__version__}) is built without CUDA; {slower}", remedy)
         return
     if not torch.cuda.is_available():
         driver = "no NVIDIA driver was found" if shutil.which("nvidia-smi") is None else "torch cannot use the driver"
@@ -211,11 +209,9 @@ def _kernel_cache() -> Iterable[Finding]:
     try:
         folder = Path(_quiet_warp().config.kernel_cache_dir)
         refused = prepare_kernel_cache()[1]
-    except ResourceError as e:
-        yield Finding(topic, MISSING, str(e), "set WARP_CACHE_PATH or TMPDIR to a folder that you may write to", True)
-        return
     except Exception as e:
-        yield Finding(topic, MISSING, _reason(e), "fix warp-lang first", True)
+        known, remedy = isinstance(e, ResourceError), "set WARP_CACHE_PATH or TMPDIR to a folder that you may write to"
+        yield Finding(topic, MISSING, str(e) if known else _reason(e), remedy if known else "fix warp-lang first", True)
         return
     if refused:
         remedy = "set WARP_CACHE_PATH to a folder that only you may write to"

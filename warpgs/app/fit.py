@@ -120,12 +120,11 @@ def _preset(arguments: list[str]) -> tuple[FitConfig, str]:
 
 def _choices() -> str:
     """Return the names that can be chosen, as text for the user."""
-    plug_ins: dict[str, Registry[Any]] = {
-        "strategies": STRATEGIES, "loss terms": LOSS_TERMS, "readers": READERS, "camera models": CAMERA_MODELS,
-        "view modules": VIEW_MODULES,
+    kinds: dict[str, Any] = {
+        "presets": PRESETS, "strategies": STRATEGIES, "loss terms": LOSS_TERMS, "readers": READERS,
+        "camera models": CAMERA_MODELS, "view modules": VIEW_MODULES,
     }  # fmt: skip
-    lines = {"presets": PRESETS.described(), **{title: registry.described() for title, registry in plug_ins.items()}}
-    return "\n\n".join(flags.listed(title, about) for title, about in lines.items())
+    return "\n\n".join(flags.listed(title, kind.described()) for title, kind in kinds.items())
 
 
 def _read_by(metavar: str, read: Callable[[str], Any], kind: type, text: Callable[[Any], str]) -> Any:

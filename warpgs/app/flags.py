@@ -4,6 +4,7 @@ import contextlib
 import dataclasses
 import functools
 import io
+import itertools
 import os
 import re
 import shutil
@@ -143,12 +144,8 @@ def listed(title: str, lines: Mapping[str, str]) -> str:
 def word_after(arguments: list[str], flag: str) -> str | None:
     """Return the value of a flag that determines the other flags; None if it is not given."""
     found = None
-    for i, word in enumerate(arguments):
+    for word, after in itertools.zip_longest(arguments, arguments[1:]):
         name, given, value = word.partition("=")
-        if name.replace("_", "-") != flag:  # tyro accepts _ and -
-            continue
-        if given:
-            found = value
-        elif i + 1 < len(arguments):
-            found = arguments[i + 1]
+        if name.replace("_", "-") == flag:  # tyro accepts _ and -
+            found = value if given else found if after is None else after
     return found
