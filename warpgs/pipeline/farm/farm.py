@@ -376,9 +376,8 @@ class FarmTable:
         bar.add_row(ProgressBar(total=max(1, len(self.rows)), completed=len(self.ended), width=78))
         more = len(running) - MOST_RUNNING
         rest = [Text(f"and {more} more running", style="dim")] if more > 0 else []
-        messages = [
-            Text(printable(f"{r.name}: {r.message}"), style="dim", no_wrap=True, overflow="ellipsis") for r in last if r.message
-        ]
+        words = (printable(f"{r.name}: {r.message}") for r in last if r.message)
+        messages = (Text(line, style="dim", no_wrap=True, overflow="ellipsis") for line in words)
         return Group(bar, Text(self.summary(), style="bold"), table, *rest, *messages)
 
 
@@ -524,7 +523,5 @@ def check_failures(statuses: list[JobStatus]) -> None:
     if failed:
         first = failed[0].record
         names = ", ".join(s.job.name for s in failed[:5]) + ("" if len(failed) <= 5 else f" and {len(failed) - 5} more")
-        raise ResourceError(
-            f"{len(failed)} of {len(statuses)} jobs failed: {names}; {INDEX} has their messages. First message: "
-            f"{first.message.rstrip('.') if first else 'unknown'}. Repeat the command to try them again"
-        )
+        fix = f"First message: {first.message.rstrip('.') if first else 'unknown'}. Repeat the command to try them again"
+        raise ResourceError(f"{len(failed)} of {len(statuses)} jobs failed: {names}; {INDEX} has their messages. {fix}")

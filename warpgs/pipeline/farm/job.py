@@ -72,9 +72,8 @@ def job_of(text: str) -> FarmJob:
         for part in config[key]:
             registry.load(part["name"])
     weights = None if v["lpips_weights"] is None else Path(v["lpips_weights"])
-    request = FitRequest(
-        scene, Path(v["out"]), FitConfig.from_json(config), v["device"], lpips_weights=weights, notes=tuple(v["notes"])
-    )
+    fit = scene, Path(v["out"]), FitConfig.from_json(config), v["device"]
+    request = FitRequest(*fit, lpips_weights=weights, notes=tuple(v["notes"]))
     return FarmJob(v["name"], request, Path(v["folder"]), Path(v["results"]))
 
 
@@ -127,10 +126,8 @@ def list_jobs(jobs: str) -> list[ListedJob]:
         if any(r.probe(path) is not None for r in all_readers()):
             raise UsageError(f"{jobs} is a single scene: fit it with `warpgs fit`, or give its parent folder")
         found = _named(sorted(p for p in path.iterdir() if p.is_dir() and not p.name.startswith(".")))
-    elif path.suffix == ".jsonl":
-        found = _read(path)
     else:
-        found = _named(sorted(Path(p) for p in glob.glob(jobs)))
+        found = _read(path) if path.suffix == ".jsonl" else _named(sorted(Path(p) for p in glob.glob(jobs)))
     if not found:
         raise UsageError(f"{jobs}: no scene found; give a folder of scenes, a glob in quotes, or a .jsonl file")
     taken: set[str] = set()

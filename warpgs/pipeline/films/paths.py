@@ -304,10 +304,8 @@ def _turn(rig: Rig, frames: int, turns: int, rise: float) -> list[np.ndarray]:
             azimuth = 0.5 * (rig.span[0] + rig.span[1]) + 0.5 * reach * math.sin(azimuth)
         elevation = float(np.clip(rig.elevation + rise * math.sin(2 * np.pi * t), -MAX_ELEVATION, MAX_ELEVATION))
         direction = rig.direction(azimuth, elevation)
-        if rig.kind == "room":
-            poses.append(geometry.look_at(rig.center, rig.center + direction, rig.up))
-        else:
-            poses.append(geometry.look_at(rig.center + rig.distance * direction, rig.center, rig.up))
+        inwards = rig.center + rig.distance * direction, rig.center
+        poses.append(geometry.look_at(*((rig.center, rig.center + direction) if rig.kind == "room" else inwards), rig.up))
     return poses
 
 
@@ -323,10 +321,9 @@ def camera_path(kind: str, rig: Rig, cameras: list[Camera], frames: int) -> list
     """Return cameras on a closed path, turntable or spiral, with size and intrinsics of a typical one of ``cameras``."""
     if kind == "turntable":
         poses = _turn(rig, frames, 1, 0.0)
-    elif rig.kind == "forward":
-        poses = _spiral_to_one_side(rig, cameras, frames)
     else:
-        poses = _turn(rig, frames, 2, rig.rise)
+        forward = rig.kind == "forward"
+        poses = _spiral_to_one_side(rig, cameras, frames) if forward else _turn(rig, frames, 2, rig.rise)
     template = framed(typical(cameras), turned=rig.turned)
     return [replace(template, viewmat=pose) for pose in poses]
 
@@ -439,10 +436,8 @@ def read_keyframes(path: Path, template: Camera, normalization: Normalization) -
         right_handed = float((np.cross(rotation[0], rotation[1]) * rotation[2]).sum()) > 0
         rigid = np.abs(square - np.eye(3)).max() <= MAX_SKEW and right_handed and (matrix[3] == (0, 0, 0, 1)).all()
         if not rigid or np.abs(matrix[:3, 3]).max() > MAX_REACH:
-            raise DataError(
-                f"{path}: c2w of keyframe {i} must be a rigid camera-to-world matrix: its upper left 3 x 3 a rotation, "
-                f"its last column within {MAX_REACH:g}, and its last row 0 0 0 1"
-            )
+            fix = f"its upper left 3 x 3 a rotation, its last column within {MAX_REACH:g}, and its last row 0 0 0 1"
+            raise DataError(f"{path}: c2w of keyframe {i} must be a rigid camera-to-world matrix: {fix}")
         if value["fov_y"] > 3.1:
             raise DataError(f"{path}: fov_y of keyframe {i} is {value['fov_y']:g} rad; give radians, below 3.1")
         if result and not MIN_SECONDS <= value["seconds"] - values[i - 1]["seconds"] <= MAX_SECONDS:
@@ -464,8 +459,7 @@ def _distances(cameras: list[Camera]) -> list[list[float]]:
     centers, rotations = np.array([c.center for c in cameras]), np.array([c.viewmat[:3, :3] for c in cameras]).reshape(-1, 9)
     apart = np.sqrt(((centers[:, None] - centers[None]) ** 2).sum(-1))
     cosines = np.clip((geometry.matmul(rotations, rotations.T) - 1) / 2, -1, 1)
-    distances: list[list[float]] = (apart / max(float(apart.max()), 1e-12) + np.arccos(cosines) + 1e-6).tolist()
-    return distances
+    return (apart / max(float(apart.max()), 1e-12) + np.arccos(cosines) + 1e-6).tolist()
 
 
 def _neighbour_tour(distances: list[list[float]]) -> list[int]:

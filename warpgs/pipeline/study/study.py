@@ -232,10 +232,9 @@ def _protocols(runs: Runs) -> list[str]:
         if scene not in lines:
             p = metrics["protocol"]
             masks = f"; {p['score_masks']} views scored within object masks" if p["score_masks"] else ""
-            lines[scene] = (
-                f"{scene}: split {p['split']}; {p['training_views']} training and {p['held_out_views']} held-out views; "
-                f"{', '.join(p['resolution'])} px from {p['ground_truth']}{masks}"
-            )
+            counts = f"{p['training_views']} training and {p['held_out_views']} held-out views"
+            images = f"{', '.join(p['resolution'])} px from {p['ground_truth']}{masks}"
+            lines[scene] = f"{scene}: split {p['split']}; {counts}; {images}"
             variants |= metrics["variants"]
     taken = [f"{name} {' or '.join(f'{n:,}' for n in sorted(of))}" for name, of in steps.items()]
     definitions = [f"{LABELS.get(k, k)}: {v}" for k, v in variants.items()]
@@ -266,10 +265,8 @@ def write_study(request: StudyRequest, runs: Runs, places: Places, device: torch
     parts = [f"# {table.caption}", text]
     if len(scenes) > 1:
         parts += [f"## {s}\n\n{tables.markdown(_table(request, runs, [s], s))}" for s in scenes]
-    parts += [
-        "## How it was scored\n\n" + "\n".join([*_protocols(runs), f"- device: {device_name}"]),
-        "## Notes\n\n" + "\n".join(f"- {n}" for n in notes),
-    ]
+    scored = "\n".join([*_protocols(runs), f"- device: {device_name}"])
+    parts += [f"## How it was scored\n\n{scored}", "## Notes\n\n" + "\n".join(f"- {n}" for n in notes)]
     write_text(out / "table.md", "\n\n".join(p.strip() for p in parts) + "\n")
     write_csv(out / "table.csv", tables.csv_rows(table))
     write_text(out / "table.tex", tables.latex(table))
@@ -322,11 +319,10 @@ def ablation_variants(base: FitConfig) -> tuple[dict[str, FitConfig], dict[str, 
         raise UsageError(f"preset {base.preset!r} has no sampling events; ablate a preset with them, such as default")
     variants: dict[str, FitConfig] = {}
     marks: dict[str, tuple[bool, ...]] = {}
+    # the steps are the preset's, so that rows differ in the method alone
+    paper = dataclasses.replace(PRESETS[PAPER], steps=base.steps, max_steps=base.max_steps, cpu_limit=base.cpu_limit)
     for row, switches in ABLATION_ROWS.items():
-        if switches is None:  # the steps are the preset's, so that rows differ in the method alone
-            changed = dataclasses.replace(PRESETS[PAPER], steps=base.steps, max_steps=base.max_steps, cpu_limit=base.cpu_limit)
-        else:
-            changed = _switched(base, switches)
+        changed = paper if switches is None else _switched(base, switches)
         if base.preset != row and changed not in variants.values():
             variants[row] = changed
             events = changed.strategy != "clone_split"
@@ -374,8 +370,7 @@ def _run_all(request: StudyRequest, places: Places, device: torch.device, lpips:
             for variant, config in request.variants.items():
                 key, config = (name, variant, seed), dataclasses.replace(config, seed=seed)
                 out = run_folder(request, *key)
-                fit = FitRequest(place[0], out, config, request.device, lpips_weights=request.lpips_weights)
-                fits[key] = place, fit
+                fits[key] = place, FitRequest(place[0], out, config, request.device, lpips_weights=request.lpips_weights)
     farmed = {}
     if request.engine is not None:
         names = ["-".join(map(str, key)).replace(" ", "-") for key in fits]
