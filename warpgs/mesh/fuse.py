@@ -385,7 +385,6 @@ def textured(mesh: Mesh, views: SurfaceViews, truncation: float, footprint: floa
         width, height = (cell * [view.camera.width, view.camera.height] / size).astype(int).clip(1)
         largest[better] = area[better]
         uv[better] = start + places[better] * [width / view.camera.width, height / view.camera.height]
-        texture[start[1] : start[1] + height, start[0] : start[0] + width] = resized(
-            gain * view.image.cpu().numpy(), width, height
-        )
+        image = resized(gain * view.image.cpu().numpy(), width, height)
+        texture[start[1] : start[1] + height, start[0] : start[0] + width] = image
     return replace(mesh, texture=texture, uv=(uv / texture.shape[1::-1]).astype(np.float32))

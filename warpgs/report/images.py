@@ -279,11 +279,9 @@ def contact_sheet(
     rows = -(-(len(tiles) + 1) // columns)
     label_size, text_size, title_size, head = (round(text * v) for v in (LABEL_SIZE, TEXT_SIZE, TITLE_SIZE, CONTACT_HEAD))
     top = CONTACT_MARGIN + title_size + 18
-    size = (
-        2 * CONTACT_MARGIN + columns * tile_width + (columns - 1) * CONTACT_GAP,
-        top + rows * (head + tile_height) + (rows - 1) * CONTACT_GAP + CONTACT_MARGIN,
-    )
-    sheet = Image.new("RGB", size, CONTACT_PAPER)
+    across = 2 * CONTACT_MARGIN + columns * tile_width + (columns - 1) * CONTACT_GAP
+    down = top + rows * (head + tile_height) + (rows - 1) * CONTACT_GAP + CONTACT_MARGIN
+    sheet = Image.new("RGB", (across, down), CONTACT_PAPER)
     draw = ImageDraw.Draw(sheet)
     fonts = {s: ImageFont.load_default(s) for s in (label_size, text_size, title_size)}
     draw.text((CONTACT_MARGIN, CONTACT_MARGIN - 4), title, CONTACT_INK, fonts[title_size])
