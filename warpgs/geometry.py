@@ -71,8 +71,7 @@ def to_plane(model: str, distortion: Array | None, positions: Array) -> Array:
         return library.stack([x, y], -1)
     if model == "fisheye":
         r = library.hypot(x, y)
-        angle = library.arctan2(r, z)
-        scale = _bent(angle, distortion)[0] / library.where(r > 0, r, 1)
+        scale = _bent(library.arctan2(r, z), distortion)[0] / library.where(r > 0, r, 1)
         scale = library.where(r > 0, scale, 1 / library.where(z == 0, 1, z))
         return library.stack([x * scale, y * scale], -1)
     a, b = x / z, y / z
@@ -287,8 +286,7 @@ def back_project(camera: Camera, pixels: np.ndarray, depths: np.ndarray) -> np.n
     A pixel that a lens does not reach gives NaN.
     """
     if camera.model == "pinhole":
-        homogeneous = np.concatenate([pixels, np.ones((len(pixels), 1))], axis=1)
-        in_camera = depths[:, None] * matmul(homogeneous, inverse(camera.K).T)
+        in_camera = depths[:, None] * matmul(np.concatenate([pixels, np.ones((len(pixels), 1))], axis=1), inverse(camera.K).T)
     else:
         plane = (pixels - camera.K[:2, 2]) / camera.K[[0, 1], [0, 1]]
         in_camera = _at_depth(camera, from_plane(camera.model, camera.distortion, plane), depths)
@@ -404,8 +402,7 @@ def gaussian_normals(gaussians: Gaussians | ActivatedGaussians, camera: Camera) 
     viewmat = torch.as_tensor(camera.viewmat).detach().to(means)
     center = -(viewmat[..., :3, :3] * viewmat[..., :3, 3:]).sum(-2)
     away = viewmat[..., 2:3, :3] if camera.model == "orthographic" else means.detach() - center[..., None, :]
-    faces = (normals.detach() * away).sum(-1, keepdim=True) <= 0
-    return torch.where(faces, normals, -normals)
+    return torch.where((normals.detach() * away).sum(-1, keepdim=True) <= 0, normals, -normals)
 
 
 def in_image(camera: Camera, points: np.ndarray) -> np.ndarray:
@@ -466,8 +463,7 @@ def focus_point(cameras: list[Camera]) -> np.ndarray:
         right += matmul(m, c.center)
     # a tiny pull to the mean centre keeps the system solvable when all axes are parallel
     weight = 1e-6 * len(cameras)
-    mean = np.mean([c.center for c in cameras], axis=0)
-    return matmul(inverse(normal + weight * np.eye(3)), right + weight * mean)
+    return matmul(inverse(normal + weight * np.eye(3)), right + weight * np.mean([c.center for c in cameras], axis=0))
 
 
 def pose_of(rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:

@@ -58,8 +58,7 @@ class Registry(Generic[T]):
         """Return the names of the registered classes, sorted; names of the form ``module:Class`` are left out."""
         if not self._searched:
             for name in self.packages:
-                package = importlib.import_module(name)
-                for module in pkgutil.iter_modules(getattr(package, "__path__", [])):
+                for module in pkgutil.iter_modules(getattr(importlib.import_module(name), "__path__", [])):
                     importlib.import_module(f"{name}.{module.name}")
             self._searched = True
         return sorted(n for n in self._classes if ":" not in n)
@@ -153,8 +152,7 @@ def load_object(kind: str, spec: str) -> object:
                 advice = f"set PYTHONPATH={path.parent} and give {path.stem}:{name or 'NAME'}, or use one file"
         raise UsageError(f"the {kind} {spec!r} cannot be imported ({e}); {advice}") from e
     except Exception as e:  # whatever a user's module raises
-        last = traceback.extract_tb(e.__traceback__)[-1]
-        what, at = (e.msg, e) if isinstance(e, SyntaxError) else (e, last)
+        what, at = (e.msg, e) if isinstance(e, SyntaxError) else (e, traceback.extract_tb(e.__traceback__)[-1])
         why = f"{type(e).__name__}: {what} ({at.filename}, line {at.lineno})"
         raise UsageError(f"the {kind} {spec!r} cannot be loaded: {why}; correct that code, or omit the {kind}") from e
     if not hasattr(module, name):

@@ -190,8 +190,7 @@ def of_type(hint: Any) -> Schema:
         kinds = [of_type(p) for p in parts if p is not type(None)]
         return or_null(kinds[0]) if len(kinds) == 1 and type(None) in parts else anything
     if typing.get_origin(hint) is tuple:
-        endless = len(parts) == 2 and parts[1] is Ellipsis
-        return items(of_type(parts[0]), None if endless else len(parts))
+        return items(of_type(parts[0]), None if len(parts) == 2 and parts[1] is Ellipsis else len(parts))
     return {bool: flag, int: whole(), float: number(), str: text}.get(hint, anything)
 
 

@@ -109,8 +109,7 @@ def arrays_to_write(
         origin = normalization.origin
         if units == "file":
             # float32 has lost the digits that an origin would keep
-            exact = gaussians.means.element_size() > 4
-            origin = origin_of(arrays_of(gaussians)["means"]) if exact else np.zeros(3)
+            origin = origin_of(arrays_of(gaussians)["means"]) if gaussians.means.element_size() > 4 else np.zeros(3)
             moved = gaussians.means - gaussians.means.new_tensor(origin) if origin.any() else gaussians.means
             local = replace(gaussians, means=moved)
     for g in (gaussians, local):
@@ -190,10 +189,8 @@ def smallest_three(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Split unit quaternions into the index of their largest component and the other three."""
     q = unit_quats(quats)
     largest = np.abs(q).argmax(axis=1)
-    rows = np.arange(len(q))
-    q = q * np.where(q[rows, largest] < 0, -1.0, 1.0)[:, None]
-    keep = np.arange(4)[None] != largest[:, None]
-    return largest, q[keep].reshape(len(q), 3)
+    q = q * np.where(q[np.arange(len(q)), largest] < 0, -1.0, 1.0)[:, None]
+    return largest, q[np.arange(4)[None] != largest[:, None]].reshape(len(q), 3)
 
 
 def from_smallest_three(largest: np.ndarray, others: np.ndarray) -> np.ndarray:
@@ -468,8 +465,7 @@ class Splat(Format):
         n = len(rows)
         for part in parts(n):
             negative = (rows["scale"][part] < 0).any(1)
-            row = part.start + int(negative.argmax())
-            expect(not negative.any(), f"an axis of Gaussian {row} has a negative length")
+            expect(not negative.any(), f"an axis of Gaussian {part.start + int(negative.argmax())} has a negative length")
         return {
             "means": by_rows(n, (3,), lambda p: rows["mean"][p]),
             "quats": by_rows(n, (4,), lambda p: (rows["quat"][p].astype(np.float64) - 128) / 128),

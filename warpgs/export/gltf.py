@@ -211,8 +211,7 @@ def _split(data: bytes) -> tuple[dict[str, Any], bytes | memoryview]:
             body = rest[8 : 8 + size]
     else:
         text = data
-    parts = text.count(b"[") + text.count(b"{")
-    expect(parts <= MAX_PARTS, f"its JSON has more than {MAX_PARTS:,} lists and objects")
+    expect(text.count(b"[") + text.count(b"{") <= MAX_PARTS, f"its JSON has more than {MAX_PARTS:,} lists and objects")
     expect(text.count(b",") <= MAX_VALUES, f"its JSON has more than {MAX_VALUES:,} values")
     document = json.loads(text)
     expect(isinstance(document, dict), "its JSON is not an object")
@@ -238,8 +237,7 @@ def _primitive(document: dict[str, Any]) -> tuple[dict[str, Any], int]:
     kernel, space = extension.get("kernel"), extension.get("colorSpace")
     given = f"kernel {str(kernel)[:40]!r} or colour space {str(space)[:40]!r} is not supported"
     expect((kernel, space) == ("ellipse", COLOR_SPACE), f"{given} (supported: 'ellipse', {COLOR_SPACE!r})")
-    more = extension.get("extensions")
-    expect(not more, "its Gaussians are compressed by a further extension; export them uncompressed")
+    expect(not extension.get("extensions"), "its Gaussians are compressed by a further extension; export them uncompressed")
     return found[0]
 
 

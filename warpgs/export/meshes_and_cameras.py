@@ -228,11 +228,9 @@ def _colmap(names: list[str], cameras: list[Camera], points: tuple[np.ndarray, n
         lens = (c.width, c.height, *(float(v) for v in (c.K[0, 0], c.K[1, 1], c.K[0, 2], c.K[1, 2])))
         number = lenses.setdefault(lens, len(lenses) + 1)
         values = [*quat, *(float(v) for v in c.viewmat[:3, 3])]
-        name = names[i - 1]
-        rows.append(f"{i} {' '.join(map(repr, values))} {number} {name}\n\n")  # the second line would hold its points
+        rows.append(f"{i} {' '.join(map(repr, values))} {number} {names[i - 1]}\n\n")  # the second line would hold its points
     positions, colors = (np.empty((0, 3)),) * 2 if points is None else points
-    levels = np.round(255 * np.clip(colors, 0, 1)).astype(int).tolist()
-    shown = enumerate(zip(positions.tolist(), levels), 1)
+    shown = enumerate(zip(positions.tolist(), np.round(255 * np.clip(colors, 0, 1)).astype(int).tolist()), 1)
     return {
         "cameras.txt": "".join(f"{n} PINHOLE {' '.join(map(repr, lens))}\n" for lens, n in lenses.items()),
         "images.txt": "".join(rows),

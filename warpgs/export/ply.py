@@ -482,8 +482,7 @@ def _check_properties(path: Path, properties: list[tuple[str, str]]) -> int:
     """Return the number of coefficients above degree 0; DataError where the layout is incomplete."""
     names = [name for name, _ in properties]
     if len(set(names)) < len(names):
-        twice = Counter(names).most_common(1)[0][0]
-        raise ply_error(path, f"property {twice[:40]!r} appears twice")
+        raise ply_error(path, f"property {Counter(names).most_common(1)[0][0][:40]!r} appears twice")
     rest = sum(bool(re.fullmatch(r"f_rest_[0-9]+", name)) for name in names)
     if rest not in _REST_COUNTS:
         raise ply_error(path, f"it has {rest} f_rest properties, but degrees 0 to 4 have 0, 9, 24, 45 or 72")
@@ -521,8 +520,7 @@ def _assemble(
         coefficients = _DC[0] in (rows.dtype.names or ())
         arrays["sh"][part, 0] = columns(_DC) if coefficients else base_coefficients(columns(_RGB) / 255)
         if rest:
-            above = columns([f"f_rest_{i}" for i in range(rest)])
-            arrays["sh"][part, 1:] = above.reshape(len(rows), 3, k).transpose(0, 2, 1)
+            arrays["sh"][part, 1:] = columns([f"f_rest_{i}" for i in range(rest)]).reshape(len(rows), 3, k).transpose(0, 2, 1)
         quats = arrays["quats"][part] = columns(_ROTATION)
         zero = ~quats.any(axis=1)
         if zero.any():

@@ -110,17 +110,14 @@ def codebook(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """
     ordered = np.sort(values.reshape(-1).astype(np.float64))
     even = np.linspace(ordered[0], ordered[-1], LEVELS)
-    quantiles = ordered[np.linspace(0, len(ordered) - 1, LEVELS).astype(np.int64)]
-    entries = 0.5 * (even + quantiles)
+    entries = 0.5 * (even + ordered[np.linspace(0, len(ordered) - 1, LEVELS).astype(np.int64)])
     sums = np.concatenate([[0], np.cumsum(ordered)])
     for _ in range(ROUNDS):
-        ends = np.searchsorted(ordered, 0.5 * (entries[1:] + entries[:-1]))
-        cuts = np.concatenate([[0], ends, [len(ordered)]])
+        cuts = np.concatenate([[0], np.searchsorted(ordered, 0.5 * (entries[1:] + entries[:-1])), [len(ordered)]])
         counts = np.diff(cuts)
         entries = np.where(counts > 0, np.diff(sums[cuts]) / np.maximum(counts, 1), entries)
     entries = np.array([float(str(v)) for v in np.sort(entries).astype(np.float32)])  # readers hold them in float32
-    labels = np.searchsorted(0.5 * (entries[1:] + entries[:-1]), values.astype(np.float64))
-    return entries, labels.astype("u1")
+    return entries, np.searchsorted(0.5 * (entries[1:] + entries[:-1]), values.astype(np.float64)).astype("u1")
 
 
 def _palette(rows: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -60,8 +60,7 @@ def _sections(a: base.Arrays, bits: int, version: int) -> list[bytes]:
     scales = base.rounded(16 * (a["log_scales"].astype(np.float64) + 10), 255)
     xyzw = base.unit_quats(a["quats"])[:, [1, 2, 3, 0]]
     if version == 2:
-        positive = xyzw * np.where(xyzw[:, 3:] < 0, -1, 1)
-        rotations = base.rounded(127.5 * positive[:, :3] + 127.5, 255).astype("u1").tobytes()
+        rotations = base.rounded(127.5 * (xyzw * np.where(xyzw[:, 3:] < 0, -1, 1))[:, :3] + 127.5, 255).astype("u1").tobytes()
     else:
         largest, others = base.smallest_three(xyzw)
         packed = largest << 30
@@ -165,8 +164,7 @@ def _checked(size: int, header: tuple[int, ...], versions: tuple[int, ...]) -> l
     """Return the sizes of the sections [bytes]; `MalformedError` where the header does not fit a file of ``size`` bytes."""
     magic, version, n, degree, bits = header
     expect(magic == MAGIC, "it does not start with the SPZ signature")
-    known = ", ".join(map(str, versions))
-    expect(version in versions, f"version {version} is not supported here (supported: {known})")
+    expect(version in versions, f"version {version} is not supported here (supported: {', '.join(map(str, versions))})")
     expect(degree <= 4, f"harmonics of degree {degree} are not supported (supported: 0 to 4)")
     expect(bits <= MAX_FRACTIONAL_BITS, f"its coordinates have {bits} fractional bits, more than {MAX_FRACTIONAL_BITS}")
     sizes = [9 * n, n, 3 * n, 3 * n, (3 if version == 2 else 4) * n, 3 * degree * (degree + 2) * n]

@@ -70,8 +70,7 @@ class CaptureReader(Reader):
         base = colmap.image_base(folder, folder) or "images"
         _, found = colmap.add_views(scene, views, base, path, [name for name, *_ in rows], rows, labels=True)
         points, said = _points(scene, path, views.views)
-        pixels = scene.pixel_source(by_folder=True)
-        return self.scene(folder, views.views, notes + found + said, points=points, pixels=pixels)
+        return self.scene(folder, views.views, notes + found + said, points=points, pixels=scene.pixel_source(by_folder=True))
 
 
 def _points(scene: SceneFolder, path: Path, views: list[View]) -> tuple[PointCloud | None, list[str]]:
@@ -144,8 +143,7 @@ def _sensor_lens(sensor: ElementTree.Element | None, where: str) -> Lens:
         raise DataError(f"{where}: {lacking[0]} of a {kind} camera is not supported; {fix}")
     # Metashape's p1 is OpenCV's p2
     order = ("k1", "k2", "k3", "k4") if kind == "fisheye" else ("k1", "k2", "p2", "p1", "k3")
-    center = [terms["cx"], terms["cy"]]
-    return _lens(terms["f"], terms["b1"], center, resolution, [terms[t] for t in order], kind, where)
+    return _lens(terms["f"], terms["b1"], [terms["cx"], terms["cy"]], resolution, [terms[t] for t in order], kind, where)
 
 
 @register("metashape")

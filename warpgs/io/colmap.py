@@ -147,8 +147,7 @@ def _lens(where: str, model: str, width: int, height: int, p: tuple[float, ...],
         fy, distortion = fx, p[3:]
         if distortion and not fisheye:  # SIMPLE_RADIAL has k1, RADIAL k1 and k2
             distortion = (*distortion, *[0.0] * (4 - len(distortion)))
-    K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
-    lens = Lens(K, width, height, tuple(distortion), model, fisheye)
+    lens = Lens(np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]]), width, height, tuple(distortion), model, fisheye)
     return lens.checked(where) if np.isfinite(p).all() else lens  # the images of other lenses are left out
 
 
@@ -442,8 +441,7 @@ def _image_paths(
             found[n] = match
     claims = Counter(found.values())
     found = {n: p for n, p in found.items() if claims[p] == 1 and p not in taken}
-    reduced = images != scene.root / base
-    if reduced and len(lost) == len(names) == len(files) > len(found):
+    if images != scene.root / base and len(lost) == len(names) == len(files) > len(found):
         pairs = dict(zip(sorted(names), files))
         order = f"images of {images.name} matched in sorted order, because their names differ"
         return pairs, [f"{order} ({min(names)} is {pairs[min(names)].name})"]
@@ -480,8 +478,7 @@ def add_views(
         mask = scene.mask_of(path, images, images / "masks" if flat else None)
         views.add(view, viewmat, partial(scene.image, path, lens, downscale=factor, mask=mask))
     unposed = len(set(files) - set(paths.values()))
-    if unposed:
-        notes.append(f"{unposed} files in {images.name} have no pose in the reconstruction and are left out")
+    notes += [f"{unposed} files in {images.name} have no pose in the reconstruction and are left out"] * bool(unposed)
     notes += scenes.missing_note(missing, len(rows), "images", file, options.strict)
     return named, notes + views.notes(options) + scene.mask_notes()
 
@@ -530,8 +527,7 @@ class ColmapReader(Reader):
         there = {v.name for v in views.views}  # without those that are left out
         names = {n: named[p[0]] for n, p in poses.items() if named.get(p[0]) in there}
         points, more = self._points(scene, model, kind, names)
-        pixels = scene.pixel_source(by_folder=True)
-        return self.scene(folder, views.views, notes + more, points=points, pixels=pixels)
+        return self.scene(folder, views.views, notes + more, points=points, pixels=scene.pixel_source(by_folder=True))
 
     def _points(self, scene: SceneFolder, model: Path, kind: str, names: dict[int, str]) -> tuple[PointCloud | None, list[str]]:
         """Return the points of a reconstruction, else those of points3D.ply beside it, and notes."""

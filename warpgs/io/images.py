@@ -210,8 +210,7 @@ def turn_upright(array: np.ndarray, orientation: int) -> np.ndarray:
     """Rotate or mirror a raster [H, W, ...] upright by its EXIF orientation."""
     if orientation in (5, 6, 7, 8):
         array = np.swapaxes(array, 0, 1)
-    flips = {2: (1,), 3: (0, 1), 4: (0,), 6: (1,), 7: (0, 1), 8: (0,)}.get(orientation, ())
-    for axis in flips:
+    for axis in {2: (1,), 3: (0, 1), 4: (0,), 6: (1,), 7: (0, 1), 8: (0,)}.get(orientation, ()):
         array = np.flip(array, axis)
     return np.ascontiguousarray(array)
 
@@ -233,8 +232,7 @@ def _fold_radius2(distortion: tuple[float, ...]) -> float:
     k1, k2, k3 = distortion[0], distortion[1], distortion[4] if len(distortion) > 4 else 0.0
     # roots of 1 + 3 k1 x + 5 k2 x^2 + 7 k3 x^3 through u = 1 / x, whose first coefficient is never small
     roots = np.roots([1.0, 3 * k1, 5 * k2, 7 * k3])
-    real = roots[np.abs(roots.imag) < 1e-9 * (1 + np.abs(roots.real))].real
-    largest = float(max(real, default=0.0))
+    largest = float(max(roots[np.abs(roots.imag) < 1e-9 * (1 + np.abs(roots.real))].real, default=0.0))
     return 1 / largest if largest > MIN_FOLD else np.inf
 
 
@@ -255,8 +253,7 @@ def nearest_unmasked(raster: np.ndarray, mask: np.ndarray | None) -> np.ndarray:
         return raster
     if not mask.any():
         return np.zeros_like(raster)
-    masked = (~mask).astype(np.uint8)
-    labels = cv2.distanceTransformWithLabels(masked, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)[1]
+    labels = cv2.distanceTransformWithLabels((~mask).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)[1]
     places = np.flatnonzero(mask)[labels[~mask] - 1]  # labels count the unmasked pixels row by row, from 1
     filled = raster.copy()
     filled[~mask] = raster.reshape(-1, *raster.shape[2:])[places]
@@ -290,10 +287,9 @@ def _undistort(loaded: LoadedImage, lens: Lens) -> LoadedImage:
     inside &= y2[:, None] + x2 < _fold_radius2(lens.distortion)
     if loaded.mask is not None:
         inside &= cv2.remap(loaded.mask.astype(np.float32), map_x, map_y, cv2.INTER_LINEAR) > 0.5
-    edge = cv2.BORDER_REPLICATE
 
     def moved(raster: np.ndarray) -> np.ndarray:
-        return cv2.remap(nearest_unmasked(raster, loaded.mask), map_x, map_y, cv2.INTER_LINEAR, borderMode=edge)
+        return cv2.remap(nearest_unmasked(raster, loaded.mask), map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
     image, alpha = moved(loaded.image), None if loaded.alpha is None else moved(loaded.alpha)
     done = (*loaded.done, f"undistorted ({lens.model})")

@@ -280,8 +280,7 @@ def coincident_views(scene: Scene, split: Split) -> list[tuple[str, str]]:
 
     Two cameras count as the same if all entries of their poses differ by less than a thousandth; lengths are in camera extents.
     """
-    extent = max(camera_extent([v.camera for v in scene.views]), 1e-9)
-    unit = np.array([[1, 1, 1, 1 / extent]] * 3 + [[1] * 4])
+    unit = np.array([[1, 1, 1, 1 / max(camera_extent([v.camera for v in scene.views]), 1e-9)]] * 3 + [[1] * 4])
     poses = {v.name: v.camera.viewmat * unit for v in scene.views}
     trained = np.stack([poses[b] for b in split.train])
     same = ((a, np.abs(trained - poses[a]).max((1, 2)) < 1e-3) for a in split.test)
@@ -298,8 +297,7 @@ def _fit(path: Path, mask: np.ndarray, view: View) -> np.ndarray:
     import cv2
 
     height, width = view.image.shape[:2]
-    ratio = (mask.shape[1] / mask.shape[0]) / (width / height)
-    if not abs(ratio - 1) <= ASPECT_TOLERANCE:
+    if not abs((mask.shape[1] / mask.shape[0]) / (width / height) - 1) <= ASPECT_TOLERANCE:
         sizes = f"the mask is {mask.shape[1]} x {mask.shape[0]} px, its image {view.name} {width} x {height}"
         fix = "the aspects differ by more than two percent. Give the masks of these images"
         raise DataError(f"{path}: {sizes}: {fix}")
@@ -472,8 +470,7 @@ def detect(root: Path) -> tuple[Reader, list[str]]:
         raise DataError(f"{root}: {photographs}no scene format found. Looked for: {known}{remedy}")
     taken, *others = complete
     notes = [f"{lack}; {taken.name} is complete and is used instead" for lack in broken]
-    if others:
-        notes.append(f"the folder also holds {' and '.join(r.name for r in others)}: {taken.name} is used")
+    notes += [f"the folder also holds {' and '.join(r.name for r in others)}: {taken.name} is used"] if others else []
     return taken, notes
 
 

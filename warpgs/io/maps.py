@@ -111,8 +111,7 @@ def read_numbers(path: Path, max_pixels: int = MAX_PIXELS) -> np.ndarray:
         fix = "shrink it, or raise --max-pixels"
         raise DataError(f"{path}: {found.shape[1]} x {found.shape[0]} px are over {max_pixels:,}; {fix}")
     native = found.dtype.newbyteorder("=")
-    kind = native if native in (np.uint8, np.uint16) else np.float32
-    return array_numbers(path, found, kind, "save the map alone")
+    return array_numbers(path, found, native if native in (np.uint8, np.uint16) else np.float32, "save the map alone")
 
 
 def _gray(path: Path, raw: np.ndarray, what: str) -> np.ndarray:
@@ -159,8 +158,7 @@ def read_confidence(path: Path, shape: tuple[int, ...], max_pixels: int = MAX_PI
         raise DataError(f"{path}: is {raw.shape[1]} x {raw.shape[0]} px, its depth map {shape[1]} x {shape[0]}; {fix}")
     values = raw.astype(np.float32)
     if raw.dtype.kind == "u":
-        largest = int(raw.max())
-        values /= 2 if 0 < largest <= 2 else np.iinfo(raw.dtype).max
+        values /= 2 if 0 < int(raw.max()) <= 2 else np.iinfo(raw.dtype).max
     if not ((values >= 0) & (values <= 1)).all():
         raise DataError(f"{path}: confidence must be in [0, 1], but ranges from {values.min():.4g} to {values.max():.4g}")
     return values
@@ -336,8 +334,7 @@ class GivenMaps:
 def check_found(views: Sequence[View], options: ReadOptions) -> list[str]:
     """Return notes on the maps of a scene's views."""
     notes = []
-    flags = {"depth": (options.depths, DEPTHS), "normals": (options.normals, NORMALS)}
-    for name, (path, flag) in flags.items():
+    for name, (path, flag) in {"depth": (options.depths, DEPTHS), "normals": (options.normals, NORMALS)}.items():
         having = [v for v in views if getattr(v, name) is not None]
         if path not in (None, NONE) and not having:
             names = [key for key in map_files(Path(path), flag, True) if not key.endswith(CONFIDENCE)]

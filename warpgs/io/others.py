@@ -213,8 +213,7 @@ def read_camera_rows(path: Path) -> list[tuple[int, str, np.ndarray]]:
     """Return line number, image name and the numbers K, R, t, float64, shape [21], of each camera."""
     rows, count = [], None
     try:
-        text = read_input(path, MAX_BYTES).decode("utf-8-sig")
-        for number, line in enumerate(io.StringIO(text), 1):
+        for number, line in enumerate(io.StringIO(read_input(path, MAX_BYTES).decode("utf-8-sig")), 1):
             words = line.split()
             if not words:
                 continue

@@ -372,8 +372,7 @@ def _inria(path: Path, rows: list[Any]) -> Iterator[Row]:
             rotation, position = np.array(row["rotation"], np.float64), np.array(row["position"], np.float64)
             pose = pose_of(rotation.reshape(3, 3), position.reshape(3))
             width, height, fx, fy = (float(row[key]) for key in ("width", "height", "fx", "fy"))
-            K = np.array([[fx, 0, width / 2], [0, fy, height / 2], [0, 0, 1]])
-            lens = Lens(K, int(width), int(height))
+            lens = Lens(np.array([[fx, 0, width / 2], [0, fy, height / 2], [0, 0, 1]]), int(width), int(height))
             name, origin = str(row.get("img_name", i)), checked_origin(row.get(ORIGIN, (0, 0, 0)), where)
         except (KeyError, TypeError, ValueError, OverflowError, AttributeError) as e:
             raise DataError(f"{where}: needs rotation, position, width, height, fx and fy as numbers; correct the entry") from e

@@ -58,8 +58,7 @@ def straight_alpha(image: np.ndarray, alpha: np.ndarray, background: tuple[float
 def resized(image: np.ndarray, width: int, height: int):
     """Return colours in [0, 1], [H, W, 3], at another size, as a Pillow image; areas are averaged if the width shrinks."""
     pixels = Image.fromarray(np.round(np.clip(image, 0, 1) * 255).astype(np.uint8))
-    way = Image.Resampling.BOX if width < image.shape[1] else Image.Resampling.BICUBIC
-    return pixels.resize((width, height), way)
+    return pixels.resize((width, height), Image.Resampling.BOX if width < image.shape[1] else Image.Resampling.BICUBIC)
 
 
 def colored(values: np.ndarray, name: str) -> np.ndarray:
@@ -151,8 +150,7 @@ def coverage_image(image: np.ndarray, unseen: np.ndarray, once: np.ndarray) -> n
     image = np.ascontiguousarray(np.clip(image, 0, 1), np.float32)
     height, width = unseen.shape
     period = max(4, round(max(height, width) / STRIPES))
-    diagonals = np.arange(height + width - 1) % period < period / 2
-    stripe = np.lib.stride_tricks.sliding_window_view(diagonals, width)
+    stripe = np.lib.stride_tricks.sliding_window_view(np.arange(height + width - 1) % period < period / 2, width)
     for pixels, share, tint in ((unseen & stripe, 0.75, UNSEEN), (unseen & ~stripe, 0.3, UNSEEN), (once & ~unseen, 0.45, ONCE)):
         at, shade = np.flatnonzero(pixels), np.float32(share)
         # gray beneath the tint: the colours of the image would change its hue
@@ -198,8 +196,7 @@ def sheet(headings: list[str], strips: list[Strip]) -> bytes:
     canvas = Image.new("RGB", (width, height), PAPER)
     draw = ImageDraw.Draw(canvas)
     for i, heading in enumerate(headings):
-        middle = MARGIN + i * (column + GAP) + column / 2
-        draw.text((middle, MARGIN + 18), fitted(heading, bold), INK, bold, anchor="ms")
+        draw.text((MARGIN + i * (column + GAP) + column / 2, MARGIN + 18), fitted(heading, bold), INK, bold, anchor="ms")
     y = MARGIN + HEAD
     for title, cells, boxes, inner, tall, zoom in rows:
         draw.line((MARGIN, y, width - MARGIN, y), (217, 220, 225))

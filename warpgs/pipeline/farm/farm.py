@@ -40,8 +40,7 @@ def local_slots(device: str, slots: int | None, per_gpu: int) -> list[Slot]:
     """Return the slots of this machine."""
     import torch
 
-    kind = choose_device(device)[0].type
-    gpus = torch.cuda.device_count() if kind == "cuda" else 0
+    gpus = torch.cuda.device_count() if choose_device(device)[0].type == "cuda" else 0
     count = (gpus * per_gpu if gpus else 1) if slots is None else slots
     if not 1 <= count <= MAX_SLOTS or not 1 <= per_gpu <= MAX_SLOTS:
         raise UsageError(f"--slots and --per-gpu must be numbers from 1 to {MAX_SLOTS}, not {slots} and {per_gpu}")
@@ -287,8 +286,7 @@ def seconds_left(statuses: list[JobStatus], slots: int) -> float | None:
         return None
     mean, now = sum(took) / len(took), time.monotonic()
     left = sum(max(0.0, mean - (now - s.began)) if s.state == "running" else mean for s in statuses if not s.ended)
-    count = sum(not s.ended for s in statuses)
-    return left / max(1, min(slots, count))
+    return left / max(1, min(slots, sum(not s.ended for s in statuses)))
 
 
 STATES = ("waiting", "running", "elsewhere", "done", "failed")

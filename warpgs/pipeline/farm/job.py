@@ -39,10 +39,8 @@ class FarmJob:
     def identity(self) -> str:
         """Return an identifier of all inputs except the images: the first 16 hexadecimal digits of their SHA-256."""
         r = self.request
-        weights = None if r.lpips_weights is None else str(r.lpips_weights)
-        values = [asdict(r.scene), r.config.to_json(), weights, r.device]
-        if own := r.config.own_code():
-            values.append(own)
+        values = [asdict(r.scene), r.config.to_json(), None if r.lpips_weights is None else str(r.lpips_weights), r.device]
+        values += [own] if (own := r.config.own_code()) else []
         return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()[:16]
 
     def text(self) -> str:
@@ -165,8 +163,7 @@ def _read(path: Path) -> list[ListedJob]:
             values = schema.parse(line)
             _LINE(values, "")
             scene = Path(os.path.abspath(path.parent / values.pop("scene")))
-            name = values.pop("name", scene.name)
-            found.append((name, scene, tuple(_flag(key, value) for key, value in values.items())))
+            found.append((values.pop("name", scene.name), scene, tuple(_flag(key, value) for key, value in values.items())))
         except schema.SchemaError as e:
             raise DataError(f'{path}, line {number}: {e}; write {{"scene": FOLDER, "steps": 500}}') from e
     return found

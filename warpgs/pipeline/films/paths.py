@@ -176,18 +176,15 @@ def _kind(cameras: list[Camera], focus: np.ndarray, depth: float) -> str:
     """Return one of `NAMES`; a ring may still turn out to be from one side."""
     centers, forwards = np.array([c.center for c in cameras]), np.array([c.viewmat[2, :3] for c in cameras])
     to_focus = focus - centers
-    distances = np.sqrt((to_focus * to_focus).sum(1))
-    cosines = (to_focus * forwards).sum(1) / np.maximum(distances, 1e-12)
+    cosines = (to_focus * forwards).sum(1) / np.maximum(np.sqrt((to_focus * to_focus).sum(1)), 1e-12)
     if (cosines > MIN_COSINE).mean() >= MIN_AGREEMENT:
         return "ring"
     offsets = centers - centers.mean(0)
     mean = forwards.mean(0)
     if _length(mean) > MIN_FORWARD:
-        along = np.abs(geometry.matmul(offsets, _unit(mean))).max()
-        return "forward" if along < depth else "free"
+        return "forward" if np.abs(geometry.matmul(offsets, _unit(mean))).max() < depth else "free"
     spread = math.sqrt((offsets * offsets).sum(1).max())
-    outwards = (cosines < -MIN_COSINE).mean() >= MIN_AGREEMENT
-    return "room" if outwards or spread < 0.5 * depth else "free"
+    return "room" if (cosines < -MIN_COSINE).mean() >= MIN_AGREEMENT or spread < 0.5 * depth else "free"
 
 
 def rig_of(cameras: list[Camera], depth: float, level: np.ndarray | None = None) -> Rig:
@@ -209,8 +206,7 @@ def rig_of(cameras: list[Camera], depth: float, level: np.ndarray | None = None)
         focus = centers.mean(0) if kind == "room" else (centers + depth * forwards).mean(0)
     up, turned = _upward(cameras, focus)
     up = up if level is None else level
-    directions = forwards if kind == "room" else centers - focus
-    azimuths, elevations, first = _azimuths(directions, up)
+    azimuths, elevations, first = _azimuths(forwards if kind == "room" else centers - focus, up)
     distances = np.sqrt(((centers - focus) ** 2).sum(1))
     return Rig(
         kind, focus, up, first, _span(azimuths), float(np.quantile(distances, FAR)), float(elevations.mean()),
@@ -322,8 +318,7 @@ def camera_path(kind: str, rig: Rig, cameras: list[Camera], frames: int) -> list
     if kind == "turntable":
         poses = _turn(rig, frames, 1, 0.0)
     else:
-        forward = rig.kind == "forward"
-        poses = _spiral_to_one_side(rig, cameras, frames) if forward else _turn(rig, frames, 2, rig.rise)
+        poses = _spiral_to_one_side(rig, cameras, frames) if rig.kind == "forward" else _turn(rig, frames, 2, rig.rise)
     template = framed(typical(cameras), turned=rig.turned)
     return [replace(template, viewmat=pose) for pose in poses]
 

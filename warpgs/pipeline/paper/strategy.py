@@ -91,8 +91,7 @@ class Paper(Sampling):
         for view, prior in zip(self.context.views, self.context.priors):
             given = (prior.disparity, prior.confidence, prior.boundary, prior.foreground)
             disparity, *maps = (torch.as_tensor(m, dtype=torch.float32, device=view.image.device) for m in given)
-            valid = None if view.countable is None else view.countable > 0
-            self.geometry.append(scores.geometry_score(disparity, valid))
+            self.geometry.append(scores.geometry_score(disparity, None if view.countable is None else view.countable > 0))
             semantic = scores.semantic_score(*maps)
             self.semantic.append(semantic if bool(semantic.any()) else None)
 

@@ -80,10 +80,8 @@ def open_file(
     normalization = Normalization(np.mean([c.center for c in found.values()], axis=0), 1 / extent if extent > 0 else 1.0)
     gaussians, declared, lost = read_with_antialiasing(path, normalization, "scene")
     notes += lost
-    if note := format_of(path).note:
-        notes.append(note)
-    if declared:
-        notes.append(f"{path.name} declares an antialiased model; renders use a pixel filter of {LOW_PASS:g} px²")
+    notes += [note] if (note := format_of(path).note) else []
+    notes += [f"{path.name} declares an antialiased model; renders use a pixel filter of {LOW_PASS:g} px²"] * declared
     if own:
         notes.append(f"rendered with the cut-offs of {FitConfig.rule}, as warpgs fits; --rule chooses others")
     elif rule is None:

@@ -536,8 +536,7 @@ def _finish(job: FitJob, trainer: Trainer, record: dict[str, Any], checks: list[
     counts = f"{len(job.train)} views to fit, {len(job.test)} held out"
     job.say(f"{job.scene.path}: {job.scene.format}, {counts}, {camera.width} x {camera.height} px, {job.where}")
     job.notes = []
-    planned = planned_times(job, trainer)[1]
-    job.note(*chosen, *batched_notes(job.config, job.ranks), plan_summary(trainer.memory), *planned)
+    job.note(*chosen, *batched_notes(job.config, job.ranks), plan_summary(trainer.memory), *planned_times(job, trainer)[1])
     setup = time.perf_counter() - job.began
     take_steps(job, trainer)
     seconds = {"setup": setup, "training": time.perf_counter() - job.began - setup}

@@ -420,5 +420,4 @@ def run_study(request: StudyRequest) -> list[str]:
             failed = [o for (_, v, _), o in runs.items() if v == name]
             if all(metrics is None for _, metrics, _ in failed):
                 raise DataError(f"every run of {name} failed, so nothing can be compared; first error: {failed[0][2]}")
-        lines = write_study(request, runs, places, device, where.removeprefix("on "))
-        return [*lines, f"in {request.out}: {', '.join(FILES)}"]
+        return [*write_study(request, runs, places, device, where.removeprefix("on ")), f"in {request.out}: {', '.join(FILES)}"]
