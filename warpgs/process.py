@@ -12,7 +12,7 @@ import sys
 import tempfile
 import threading
 import unicodedata
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NoReturn, TextIO, TypeVar, cast
 
@@ -25,14 +25,11 @@ from warpgs.folders import shared_locks
 # Causes are a closed pipe, a full disk, a closed descriptor or a closed terminal. After the first failed write, all
 # output goes to the null device, including that of native libraries.
 
-NAMES = ("stdin", "stdout", "stderr")
-"""Standard streams by their descriptors."""
-
 
 def open_missing_descriptors() -> None:
     """Open the null device instead of a closed stdin, stdout or stderr."""
     # Otherwise the next file that is opened gets the free descriptor, and output is written into that file.
-    for number in range(len(NAMES)):
+    for number in range(3):
         try:
             os.fstat(number)
         except OSError:
@@ -196,6 +193,12 @@ def say(line: object = "", *, error: bool = False) -> None:
         if not (error or _is_lost):
             _is_lost = True
             _lost(e, GOES_ON)
+
+
+def say_lines(lines: Iterable[object], *, error: bool = False) -> None:
+    """Print lines as `say` does."""
+    for line in lines:
+        say(line, error=error)
 
 
 def answer(line: object, error: bool = False) -> None:
@@ -494,11 +497,6 @@ class PythonWorker:
             stdout=subprocess.PIPE, stderr=self._errors, text=True, encoding="utf-8", errors="replace", pass_fds=locks,
             start_new_session=True,
         )  # fmt: skip
-
-    @property
-    def number(self) -> int:
-        """Number of the process."""
-        return self._process.pid
 
     def send(self, line: str) -> bool:
         """Send a line; return False where the process has ended."""

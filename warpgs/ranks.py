@@ -145,11 +145,9 @@ class WebGuard:
         if any(origin != f"http://{hosts[0]}" for origin in origins) or (upgrade and len(origins) != 1):
             return None
         first, _, rest = target.removeprefix("/").partition("/")
-        if not target.startswith("/") or not hmac.compare_digest(_bytes(first), _bytes(self.token)):
+        if not target.startswith("/") or not hmac.compare_digest(first.encode("utf-8", "surrogateescape"), self.token.encode()):
             return None
-        if not _PLAIN.fullmatch(rest) or ".." in rest or (upgrade and rest):
-            return None
-        return f"/{rest}"
+        return f"/{rest}" if _PLAIN.fullmatch(rest) and ".." not in rest and not (upgrade and rest) else None
 
     @staticmethod
     def headers(host: str, nonce: str) -> dict[str, str]:
@@ -172,10 +170,6 @@ def _is_own(host: str) -> bool:
     """Return whether a value of ``Host`` is one of `NAMES`, with or without a port."""
     name, colon, port = host.partition(":")
     return name in NAMES and (not colon or (port.isascii() and port.isdecimal() and len(port) <= 5))
-
-
-def _bytes(text: str) -> bytes:
-    return text.encode("utf-8", "surrogateescape")
 
 
 BEAT_SECONDS = 1.0

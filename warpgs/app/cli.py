@@ -36,8 +36,7 @@ def report_defect(error: Exception, arguments: list[str]) -> int:
             f.write(details.encode("utf-8", "backslashreplace"))
         where = f"in {f.name}"
     except OSError:  # no folder can be written
-        for line in details.splitlines():
-            process.say(line, error=True)
+        process.say_lines(details.splitlines(), error=True)
         where = "above"
     said = f"{type(error).__name__}: {error}"
     if own := own_frame(error):
@@ -188,8 +187,7 @@ def main(arguments: list[str] | None = None) -> int:
 def _run(arguments: list[str]) -> int:
     """Run one command; an error becomes one line and an exit code."""
     if not arguments or arguments[0] in ("-h", "--help", "help"):
-        for line in _help().splitlines():
-            process.say(line)
+        process.say_lines(_help().splitlines())
         return 0 if arguments else 2
     if arguments[0] in ("--version", "-V"):
         process.say(f"warpgs {__version__}")
@@ -204,8 +202,7 @@ def _run(arguments: list[str]) -> int:
             hint = did_you_mean(OTHER_WORDS.get(name.lower(), name), COMMANDS, 0.8) or f"choose one of {', '.join(COMMANDS)}"
             raise UsageError(f"unknown command {name!r}; {hint}")
         if name == "fit" and {"-h", "--help"} & {*arguments}:  # before the import, which costs seconds
-            for line in help_lines(COMMANDS[name]):
-                process.say(line)
+            process.say_lines(help_lines(COMMANDS[name]))
             return 0
         with waiting() as wait:
             if not ASKING & {*arguments} and os.environ.get("RANK", "0") == "0":  # until the command reports its own progress

@@ -16,7 +16,7 @@ from typing import Annotated, Any, TypeVar
 import tyro  # noqa: TID253 - only a command imports this file
 
 from warpgs.errors import UsageError, field_docs
-from warpgs.process import say
+from warpgs.process import say_lines
 
 REMOVED = {"--repeat": "the error of the fit itself names step, view, loss term and tensors"}
 """What replaces flags that are gone, by their names with dashes."""
@@ -100,8 +100,7 @@ def parse_flags(kind: Callable[..., Any], arguments: list[str], program: str, de
             raise UsageError(f"unknown flag {flag}; `{program} --help-all` lists the flags")
         if flag in SPELLED and re.search(f"(parsing|argument) '?{flag}", said):
             raise UsageError(f"{flag}: write it as {flag} {SPELLED[flag]}; `{program} --help-all` shows what it takes")
-    for line in said.splitlines():
-        say(line, error=True)
+    say_lines(said.splitlines(), error=True)
     raise UsageError(f"wrong arguments, as shown above; `{program} --help-all` lists them")
 
 

@@ -69,10 +69,6 @@ class LocalEngine:
         for thread in self._threads:
             thread.start()
 
-    def workers(self) -> dict[str, int]:
-        """Return the numbers of the processes at work, by job."""
-        return {name: worker.number for name, worker in self._workers.items()}
-
     def start(self, job: FarmJob) -> None:
         """Start a job in an idle process, or in a new one."""
         self._jobs.put((job.name, job.text()))

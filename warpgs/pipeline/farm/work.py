@@ -28,7 +28,7 @@ from warpgs.pipeline.run.request import FitRequest, choose_device, read_scene
 from warpgs.pipeline.train.schedule import StepReport
 from warpgs.pipeline.train.settings import FitConfig, settings_by_views
 from warpgs.pipeline.train.trainer import train_views
-from warpgs.process import output_to, say
+from warpgs.process import output_to, say, say_lines
 from warpgs.version import __version__
 
 Outcome = tuple[str, dict[str, Any] | None, str]
@@ -156,8 +156,7 @@ def fit_job(job: jobs.FarmJob, on_step: Callable[[StepReport], object] | None = 
         how, metrics, message, again = "failed", None, str(e), full or not ours
         if not ours:
             message = no_memory_message(e) if full else f"internal error, {type(e).__name__}: {e}"
-        for line in "".join(traceback.format_exception(e)).splitlines():
-            say(line)
+        say_lines("".join(traceback.format_exception(e)).splitlines())
     state, took = "failed" if how == "failed" else "done", time.perf_counter() - began
     record = jobs.JobRecord(job.name, job.identity(), state, how, message, again, source, took)
     if metrics is not None:

@@ -5,6 +5,7 @@ import gc
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +30,7 @@ from warpgs.pipeline.study.tables import GAUSSIANS, METRICS, Sample, Table, pair
 from warpgs.pipeline.train.presets import PRESETS, preset_settings, preset_word
 from warpgs.pipeline.train.settings import FitConfig, settings_by_views
 from warpgs.pipeline.train.trainer import train_views
-from warpgs.process import say
+from warpgs.process import say, say_lines
 from warpgs.report.images import Strip, crops, disagreement, sheet
 from warpgs.scene import Scene, View
 
@@ -365,12 +366,10 @@ def _run_all(request: StudyRequest, places: Places, device: torch.device, lpips:
     """Make all runs, or read the results of a farm; seed by seed, so that an interrupted study has complete pairs."""
     runs: Runs = {}
     fits: dict[Key, tuple[Place, FitRequest]] = {}
-    for seed in range(request.seeds):
-        for name, place in places.items():
-            for variant, config in request.variants.items():
-                key, config = (name, variant, seed), dataclasses.replace(config, seed=seed)
-                out = run_folder(request, *key)
-                fits[key] = place, FitRequest(place[0], out, config, request.device, lpips_weights=request.lpips_weights)
+    for seed, (name, place), (variant, config) in product(range(request.seeds), places.items(), request.variants.items()):
+        key, config = (name, variant, seed), dataclasses.replace(config, seed=seed)
+        out = run_folder(request, *key)
+        fits[key] = place, FitRequest(place[0], out, config, request.device, lpips_weights=request.lpips_weights)
     farmed = {}
     if request.engine is not None:
         names = ["-".join(map(str, key)).replace(" ", "-") for key in fits]
@@ -407,8 +406,7 @@ def run_study(request: StudyRequest) -> list[str]:
     lpips = {} if request.lpips_weights is None else Lpips(request.lpips_weights, device).variants()
     places = {scene_name(asked): _place(asked, device.type) for asked in request.scenes}
     with hold_folder(request.out) as notes:
-        for note in notes:
-            say(note)
+        say_lines(notes)
         counts = {"scene": len(places), "setting": len(request.variants), "seed": request.seeds}
         say(", ".join([*(f"{n} {word}{'' if n == 1 else 's'}" for word, n in counts.items()), where]))
         try:
