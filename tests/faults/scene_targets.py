@@ -194,7 +194,7 @@ FRAMES = {
     "exr": write_exr,
 }  # fmt: skip
 FRAMES_PARSER = (
-    transforms.files_of, transforms.is_blender, transforms._json, transforms.read_json, transforms._inner_names,
+    transforms.files_of, transforms._json, transforms.read_json, transforms._inner_names,
     transforms._image_paths,
     transforms._number, transforms.lens_of, transforms.matrix_of, transforms._image_path,
     transforms._named_maps, transforms._points, transforms._disagreement, transforms.TransformsReader,

@@ -97,20 +97,16 @@ def encode(arrays: base.Arrays, version: int = VERSION, antialiased: bool = Fals
 
 def decode(path: Path, data: bytes) -> base.Arrays:
     """Return the Gaussians of a file's bytes, in the axes of PLY."""
-    if data[:2] == b"\x1f\x8b":
-        stream = gzip.GzipFile(fileobj=io.BytesIO(data))
-        head = stream.read(HEADER.size)
-        expect(len(head) == HEADER.size, "its header is truncated")
-        magic, version, n, degree, bits, flags, _ = HEADER.unpack(head)
-        sizes = _checked(len(data), (magic, version, n, degree, bits), (2, 3))
-        extensions = bytearray()
-        sections = _parts_of_gzip(stream, n, sizes, extensions if flags & EXTENDED else None)
-    else:
-        expect(len(data) >= HEADER_4.size, "its header is truncated")
-        magic, version, n, degree, bits, flags, count, place = HEADER_4.unpack_from(data)
-        sizes = _checked(len(data), (magic, version, n, degree, bits), (4,))
-        extensions = bytearray(data[HEADER_4.size : place] if flags & EXTENDED else b"")
-        sections = _streams(data, sizes, count, place)
+    packed = data[:2] == b"\x1f\x8b"
+    stream: BinaryIO = gzip.GzipFile(fileobj=io.BytesIO(data)) if packed else io.BytesIO(data)
+    layout, versions = (HEADER, (2, 3)) if packed else (HEADER_4, (4,))
+    head = stream.read(layout.size)
+    expect(len(head) == layout.size, "its header is truncated")
+    magic, version, n, degree, bits, flags, *places = layout.unpack(head)
+    sizes = _checked(len(data), (magic, version, n, degree, bits), versions)
+    extensions = bytearray(data[layout.size : places[1]] if flags & EXTENDED and not packed else b"")
+    more = extensions if flags & EXTENDED else None
+    sections = _parts_of_gzip(stream, n, sizes, more) if packed else _streams(data, sizes, *places)
     arrays = _unpack(sections, n, degree, bits, version)
     next(sections, None)  # checks the end of the last section
     if (system := _coordinate_system(extensions)) == RUB:
@@ -144,7 +140,7 @@ def _coordinate_system(extensions: bytes | bytearray) -> int:
     return RUB
 
 
-def _parts_of_gzip(stream: gzip.GzipFile, n: int, sizes: list[int], extensions: bytearray | None) -> Iterator[Section]:
+def _parts_of_gzip(stream: BinaryIO, n: int, sizes: list[int], extensions: bytearray | None) -> Iterator[Section]:
     """Yield the sections of a file of version 2 or 3, each to be read to its end before the next; then fill ``extensions``."""
 
     def read(size: int) -> bytes:

@@ -55,12 +55,9 @@ def brand(data: bytes) -> str | None:
 
 def format_of(data: bytes) -> str:
     """Return the format of an image file by its first bytes; ValueError for one that is not supported."""
-    for start, name in STARTS.items():
-        if data.startswith(start):
-            return name
-    if brand(data) == "AVIF":
-        return "AVIF"
-    raise ValueError(f"it is not a {READ} file" if data else "it is empty")
+    found = next((name for start, name in STARTS.items() if data.startswith(start)), brand(data))
+    expect(found not in (None, "HEIC", "RAW"), f"it is not a {READ} file" if data else "it is empty")
+    return str(found)
 
 
 # Unsupported formats of photographs, and remedies.
@@ -148,12 +145,9 @@ def header_size(name: str, data: bytes) -> tuple[int, int]:
         with _decoder("{}"):
             height, width, *_ = simplejpeg.decode_jpeg_header(data)
         return width, height
-    if name == "PNG":  # Pillow would unpack texts first
-        return _png_size(data)
-    if name == "WEBP":
-        return _webp_size(data)
-    if name == "TIFF":
-        return _tiff_size(_tiff_tags(data))
+    # Pillow would unpack the texts of a PNG first
+    if size_of := {"PNG": _png_size, "WEBP": _webp_size, "TIFF": lambda data: _tiff_size(_tiff_tags(data))}.get(name):
+        return size_of(data)
     with _opened(name, data) as image:
         return image.size
 

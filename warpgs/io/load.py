@@ -189,13 +189,12 @@ def _finder(names: list[str], spec: str) -> Callable[[str], str]:
         return table
 
     def find(wanted: str) -> str:
-        for count in (0, wanted.count("/") + 1):
-            for plain in (False, True):
-                matches = by_end(plain, count).get(wanted, [])
-                if len(matches) == 1:
-                    return matches[0]
-                if matches:
-                    raise DataError(f"split {spec}: {wanted!r} could be any of {', '.join(matches[:5])}; give the whole name")
+        for count, plain in itertools.product((0, wanted.count("/") + 1), (False, True)):
+            matches = by_end(plain, count).get(wanted, [])
+            if len(matches) == 1:
+                return matches[0]
+            if matches:
+                raise DataError(f"split {spec}: {wanted!r} could be any of {', '.join(matches[:5])}; give the whole name")
         raise DataError(f"split {spec}: no view {wanted!r}; the nearest names are {_nearest(names, wanted)}")
 
     return find

@@ -42,11 +42,6 @@ def files_of(root: Path) -> list[Path]:
     return [single] if single.is_file() else [root / f for f in BLENDER_FILES if (root / f).is_file()]
 
 
-def is_blender(root: Path) -> bool:
-    """Return whether the folder has Blender's layout, with a white background behind transparent pixels."""
-    return not (root / "transforms.json").is_file() and bool(files_of(root))
-
-
 def _json(path: Path, fix: str) -> Any:
     """Return the values of a JSON file of bounded size."""
     try:
@@ -277,7 +272,7 @@ class TransformsReader(Reader):
 
     def read(self, folder: Path, options: ReadOptions) -> Scene:
         """See `Reader.read`."""
-        background = WHITE if is_blender(folder) else BLACK
+        background = BLACK if (folder / "transforms.json").is_file() else WHITE  # in Blender's layout
         scene, views, notes = SceneFolder(folder, options), ViewList(options), []
         missing, total, points = list[str](), 0, None
         for file in files_of(folder):
