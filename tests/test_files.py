@@ -17,7 +17,6 @@ from warpgs import files, folders
 from warpgs.errors import DataError, ResourceError, UsageError
 from warpgs.files import (
     LOCK,
-    OWN_NAMES,
     appending,
     disk_is_full,
     filling,
@@ -35,6 +34,7 @@ from warpgs.files import (
     unread_reason,
     write_bytes,
 )
+from warpgs.folders import NAMES as OWN_NAMES
 from warpgs.locks import hold_folder
 from warpgs.poses import mapping
 from warpgs.process import ProcessFailed

@@ -14,6 +14,7 @@ import re
 import sys
 import tempfile
 import threading
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -126,13 +127,8 @@ def in_background(function: Callable[..., T], arguments: Iterable[tuple[Any, ...
 
 def processor_name() -> str:
     """Return the processor's model where the system names it, else its kind; never empty."""
-    try:
-        for line in CPU_INFO.read_text("utf-8", errors="replace").splitlines():
-            if line.startswith("model name"):
-                return line.split(":", 1)[1].strip()
-    except OSError:
-        pass  # only on Linux
-    return platform.processor() or platform.machine() or "unknown"
+    found = re.search(r"^model name[^:\n]*:(.*)", _text(CPU_INFO), re.MULTILINE)  # only on Linux
+    return (found and found[1].strip()) or platform.processor() or platform.machine() or "unknown"
 
 
 UNITS = {"B": 1} | {f"{p}{u}": b**i for i, p in enumerate("KMGT", 1) for u, b in (("B", 1000), ("iB", 1024))}
@@ -212,11 +208,10 @@ Needs = Mapping[str, int]
 
 def add_needs(parts: Iterable[Callable[[StepSizes], Needs]], sizes: StepSizes) -> dict[str, int]:
     """Return the sum of the bytes that parts declare, by moment."""
-    total: dict[str, int] = {}
+    total = Counter[str]()
     for part in parts:
-        for moment, needed in part(sizes).items():
-            total[moment] = total.get(moment, 0) + needed
-    return total
+        total.update(part(sizes))
+    return dict(total)
 
 
 ASSUMED_BYTES = 2 * 2**30
@@ -351,8 +346,8 @@ def _say_assumed() -> None:
 
 def _text(path: Path) -> str:
     try:
-        return path.read_text("utf-8")
-    except (OSError, ValueError):
+        return path.read_text("utf-8", errors="replace")
+    except OSError:
         return ""
 
 

@@ -80,6 +80,16 @@ class OutOfMemoryError(ResourceError):
         self.intact = intact
 
 
+class MalformedError(ValueError):
+    """Invalid content of a file, in words that the function that opened the file completes with its path and the fix."""
+
+
+def expect(condition: object, what: str) -> None:
+    """Raise a `MalformedError` unless a condition holds; ``what`` is wrong with the content otherwise."""
+    if not condition:
+        raise MalformedError(what)
+
+
 MAX_COMPARED = 60
 """Letters of a mistyped name that are compared."""
 

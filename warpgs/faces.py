@@ -11,59 +11,50 @@ import sys
 from collections.abc import Callable
 from typing import Any
 
+
+def _moved(face: str, *names: str, **renamed: str) -> dict[str, str]:
+    """Return the places at a face of names, and of those that are ``renamed`` there."""
+    return {old: f"{face}.{now}" for old, now in (dict(zip(names, names)) | renamed).items()}
+
+
 OLD = {
-    "errors": {
-        name: f"warpgs.{name}" for name in ("DataError", "NotFiniteError", "ResourceError", "UsageError", "WarpgsError")
-    },
-    "export.arrays": {"Arrays": "warpgs.export.Arrays"},
-    "export.base": {"Format": "warpgs.export.Format", "register": "warpgs.export.register_format"},
-    "export.formats": {name: f"warpgs.export.{name}" for name in ("read_gaussians", "write_gaussians")},
-    "geometry": {name: f"warpgs.{name}" for name in ("depth_normals", "gaussian_normals", "look_at")},
-    "io.folders": {name: f"warpgs.io.{name}" for name in ("SceneFolder", "ViewList", "view_name")},
-    "io.given_maps": {"NamedMaps": "warpgs.io.NamedMaps"},
-    "io.images": {name: f"warpgs.io.{name}" for name in ("Lens", "LoadedImage")},
-    "io.map_files": {"MapOptions": "warpgs.io.ReadOptions"},
-    "io.readers": {
-        **{name: f"warpgs.io.{name}" for name in ("Probe", "Reader", "ReadOptions")},
-        "register": "warpgs.io.register_reader",
-    },
-    "kernels.cameras.base": {
-        "CameraModel": "warpgs.kernels.CameraModel",
-        "register": "warpgs.kernels.register_camera_model",
-    },
-    "kernels.ssim": {"ssim": "warpgs.train.ssim"},
-    "kernels.step_buffers": {"Setting": "warpgs.train.Setting"},
-    "mesh.fuse": {"MeshOptions": "warpgs.MeshOptions", "fuse": "warpgs.fuse_mesh"},
-    "pipeline.model.init": {"InitConfig": "warpgs.train.InitConfig"},
-    "pipeline.model.table": {name: f"warpgs.train.{name}" for name in ("Column", "DensityUpdate", "Table")},
-    "pipeline.train.context": {name: f"warpgs.train.{name}" for name in ("Growth", "Settings", "StrategyContext")},
-    "pipeline.train.learned_views": {"LearnedView": "warpgs.train.LearnedView"},
-    "pipeline.train.loss": {
-        **{name: f"warpgs.train.{name}" for name in ("LossInputs", "LossTerm", "Target", "total")},
-        "register": "warpgs.train.register_loss_term",
-    },
-    "pipeline.train.loss_terms.photometric": {"photometric_loss": "warpgs.train.photometric_loss"},
-    "pipeline.train.memory_plan": {"most_instances": "warpgs.train.most_instances"},
-    "pipeline.train.presets": {"PRESETS": "warpgs.PRESETS"},
-    "pipeline.train.schedule": {name: f"warpgs.train.{name}" for name in ("OptimizerConfig", "Phases")},
-    "pipeline.train.step": {name: f"warpgs.train.{name}" for name in ("captured_renderer", "eager_renderer")},
-    "pipeline.train.strategies.base": {
-        "Strategy": "warpgs.train.Strategy",
-        "register": "warpgs.train.register_strategy",
-    },
-    "pipeline.train.strategies.clone_split": {"CloneSplit": "warpgs.train.CloneSplit"},
-    "pipeline.train.strategies.gradient_growth": {"GradientGrowth": "warpgs.train.GradientGrowth"},
-    "pipeline.train.view_modules.base": {
-        **{name: f"warpgs.train.{name}" for name in ("FittedViews", "Tensors", "ViewModule")},
-        "register": "warpgs.train.register_view_module",
-    },
-    "pipeline.train.views": {"TrainingView": "warpgs.train.TrainingView"},
+    "errors": _moved("warpgs", "DataError", "NotFiniteError", "ResourceError", "UsageError", "WarpgsError"),
+    "export.arrays": _moved("warpgs.export", "Arrays"),
+    "export.base": _moved("warpgs.export", "Format", register="register_format"),
+    "export.formats": _moved("warpgs.export", "read_gaussians", "write_gaussians"),
+    "geometry": _moved("warpgs", "depth_normals", "gaussian_normals", "look_at"),
+    "io.folders": _moved("warpgs.io", "SceneFolder", "ViewList", "view_name"),
+    "io.given_maps": _moved("warpgs.io", "NamedMaps"),
+    "io.images": _moved("warpgs.io", "Lens", "LoadedImage"),
+    "io.map_files": _moved("warpgs.io", MapOptions="ReadOptions"),
+    "io.readers": _moved("warpgs.io", "Probe", "Reader", "ReadOptions", register="register_reader"),
+    "kernels.cameras.base": _moved("warpgs.kernels", "CameraModel", register="register_camera_model"),
+    "kernels.ssim": _moved("warpgs.train", "ssim"),
+    "kernels.step_buffers": _moved("warpgs.train", "Setting"),
+    "mesh.fuse": _moved("warpgs", "MeshOptions", fuse="fuse_mesh"),
+    "pipeline.model.init": _moved("warpgs.train", "InitConfig"),
+    "pipeline.model.table": _moved("warpgs.train", "Column", "DensityUpdate", "Table"),
+    "pipeline.train.context": _moved("warpgs.train", "Growth", "Settings", "StrategyContext"),
+    "pipeline.train.learned_views": _moved("warpgs.train", "LearnedView"),
+    "pipeline.train.loss": _moved("warpgs.train", "LossInputs", "LossTerm", "Target", "total", register="register_loss_term"),
+    "pipeline.train.loss_terms.photometric": _moved("warpgs.train", "photometric_loss"),
+    "pipeline.train.memory_plan": _moved("warpgs.train", "most_instances"),
+    "pipeline.train.presets": _moved("warpgs", "PRESETS"),
+    "pipeline.train.schedule": _moved("warpgs.train", "OptimizerConfig", "Phases"),
+    "pipeline.train.step": _moved("warpgs.train", "captured_renderer", "eager_renderer"),
+    "pipeline.train.strategies.base": _moved("warpgs.train", "Strategy", register="register_strategy"),
+    "pipeline.train.strategies.clone_split": _moved("warpgs.train", "CloneSplit"),
+    "pipeline.train.strategies.gradient_growth": _moved("warpgs.train", "GradientGrowth"),
+    "pipeline.train.view_modules.base": _moved(
+        "warpgs.train", "FittedViews", "Tensors", "ViewModule", register="register_view_module"
+    ),
+    "pipeline.train.views": _moved("warpgs.train", "TrainingView"),
     "report.images": {"png": "PIL.Image.Image.save"},
-    "rules": {"rule_named": "warpgs.rule_named"},
-    "runtime.ranks": {"join": "warpgs.train.join_ranks"},
-    "runtime.step_sizes": {name: f"warpgs.train.{name}" for name in ("Needs", "STEP", "StepSizes")},
+    "rules": _moved("warpgs", "rule_named"),
+    "runtime.ranks": _moved("warpgs.train", join="join_ranks"),
+    "runtime.step_sizes": _moved("warpgs.train", "Needs", "STEP", "StepSizes"),
     "scene": {"Prior": "warpgs.train.Prior", "Scene": "warpgs.Scene"},
-    "schema": {"fields": "warpgs.train.state_schema"},
+    "schema": _moved("warpgs.train", fields="state_schema"),
     "synthetic.demo": dict.fromkeys(("camera_path", "still_life", "write_demo"), "warpgs.write_demo"),
     "synthetic.raycast": dict.fromkeys(("Light", "render"), "warpgs.write_demo"),
 }

@@ -15,19 +15,9 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any, BinaryIO
 
+from warpgs import folders
 from warpgs.errors import DataError, ResourceError, UsageError
-from warpgs.folders import (
-    NAMES as OWN_NAMES,
-    WINDOWS,
-    Folder,
-    RefusedError,
-    Temporary,
-    is_below,
-    open_folder,
-    output_folder,
-    sweep,
-    temporary_file,
-)
+from warpgs.folders import WINDOWS, Folder, RefusedError, Temporary, is_below, open_folder, output_folder, sweep, temporary_file
 
 # Opening of input files: only regular files of bounded size, so that no pipe hangs a command and no device fills its
 # memory.
@@ -102,6 +92,11 @@ DTYPES = {
     "torch.bool": "BOOL",
 }  # fmt: skip
 """Names of scalar types in a safetensors file."""
+PLY_TYPES = {
+    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2", "uint16": "u2",
+    "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4", "double": "f8", "float64": "f8",
+}  # fmt: skip
+"""Scalar types of a PLY file, as numpy names them without the order of bytes."""
 
 
 def tensor_pieces(tensors: dict[str, Any], metadata: dict[str, str]) -> list[memoryview | bytes]:
@@ -160,6 +155,8 @@ PAUSES = (0.05, 0.1, 0.2, 0.4, 0.8)
 """Pauses between attempts to replace a file on Windows [s]: a virus scanner holds a new file open for about that long."""
 FULL = (errno.ENOSPC, errno.EDQUOT)
 """Errors of a full disk, or of an exhausted disk quota."""
+NO_FOLDER_SYNC = (errno.EINVAL, errno.ENOTSUP, errno.EBADF, errno.EACCES)
+"""Errors of file systems that cannot sync a folder."""
 DESCRIPTORS = Path("/proc/self/fd")
 """Folder in which Linux lists the open files and folders of this process; libraries can open paths through it."""
 
@@ -172,11 +169,8 @@ def writable(path: Path, remedy: str = "", done: str = "written", amount: str = 
     except RefusedError as e:
         raise ResourceError(f"{path}: cannot be {done}, as {e}") from e
     except OSError as e:
-        fix = remedy or (
-            "close the programs that have it open, or write elsewhere"
-            if WINDOWS and isinstance(e, PermissionError)
-            else "free some disk space, or write elsewhere"
-        )
+        held = WINDOWS and isinstance(e, PermissionError)
+        fix = remedy or f"{'close the programs that have it open' if held else 'free some disk space'}, or write elsewhere"
         raise ResourceError(f"{path}: {amount}cannot be {done} ({e.strerror or e}){note}; {fix}") from e
 
 
@@ -244,12 +238,12 @@ def filling(folder: Path) -> Iterator[Path]:
 def _sync(folder: Folder) -> None:
     """Sync a folder to the disk, so that the names in it survive a power failure."""
     try:
-        folder.sync()
+        if folder.descriptor is not None:  # Windows has no such call
+            os.fsync(folder.descriptor)
     except OSError as e:
-        raise ResourceError(
-            f"{folder.path}: was written, but the disk does not confirm it ({e.strerror or e}); check the disk and the last "
-            "written files"
-        ) from e
+        if e.errno not in NO_FOLDER_SYNC:
+            why = f"the disk does not confirm it ({e.strerror or e})"
+            raise ResourceError(f"{folder.path}: was written, but {why}; check the disk and the last written files") from e
 
 
 def write_bytes(path: Path, *chunks: bytes | memoryview) -> None:
@@ -287,9 +281,7 @@ def plain(value: object) -> object:
         return None
     if isinstance(value, dict):
         return {k: plain(v) for k, v in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [plain(v) for v in value]
-    return value
+    return [plain(v) for v in value] if isinstance(value, (list, tuple)) else value
 
 
 def appending(path: Path) -> BinaryIO:
@@ -338,7 +330,7 @@ def writing_into(folder: Path) -> Iterator[bool]:
 def is_empty(folder: Path) -> bool:
     """Return whether a folder is empty, except for a lock and leftovers of interrupted writes."""
     try:
-        return all(p.name == LOCK or OWN_NAMES.fullmatch(p.name) for p in folder.iterdir())
+        return all(p.name == LOCK or folders.NAMES.fullmatch(p.name) for p in folder.iterdir())
     except OSError as e:
         raise ResourceError(f"{folder}: cannot be read ({e.strerror or e}); choose a folder that you may read and write") from e
 

@@ -33,8 +33,6 @@ WINDOWS = sys.platform == "win32"
 NO_FOLLOW = getattr(os, "O_NOFOLLOW", 0)
 JUNCTION = 0xA0000003
 """Tag of Windows for a folder that leads elsewhere."""
-NO_FOLDER_SYNC = (errno.EINVAL, errno.ENOTSUP, errno.EBADF, errno.EACCES)
-"""Errors of file systems that cannot sync a folder."""
 
 
 class RefusedError(OSError):
@@ -86,10 +84,8 @@ class Folder(contextlib.AbstractContextManager["Folder"]):
         with contextlib.suppress(FileNotFoundError):
             found = self.lstat(name)
             if stat.S_ISLNK(found.st_mode) or getattr(found, "st_reparse_tag", 0) == JUNCTION:
-                raise RefusedError(
-                    f"{self.path / name}: is a link, and links inside of a results folder are not followed; put its target "
-                    "there. The results folder itself may be a link"
-                )
+                why = "is a link, and links inside of a results folder are not followed"
+                raise RefusedError(f"{self.path / name}: {why}; put its target there. The results folder itself may be a link")
 
     def open(self, name: str, flags: int, mode: int = 0o666) -> int:
         """Open a file, and return its descriptor."""
@@ -144,15 +140,6 @@ class Folder(contextlib.AbstractContextManager["Folder"]):
     def names(self) -> list[str]:
         """Return the names of all entries."""
         return os.listdir(self.path if self.descriptor is None else self.descriptor)
-
-    def sync(self) -> None:
-        """Sync the names to the disk, so that they survive a power failure; Windows has no such call."""
-        try:
-            if self.descriptor is not None:
-                os.fsync(self.descriptor)
-        except OSError as e:
-            if e.errno not in NO_FOLDER_SYNC:
-                raise
 
 
 _ROOTS: list[Folder] = []

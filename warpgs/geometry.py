@@ -285,8 +285,7 @@ def back_project(camera: Camera, pixels: np.ndarray, depths: np.ndarray) -> np.n
     A pixel that a lens does not reach gives NaN.
     """
     if camera.model == "pinhole":
-        homogeneous = np.concatenate([pixels, np.ones((len(pixels), 1))], axis=1)
-        in_camera = depths[:, None] * matmul(homogeneous, inverse(camera.K).T)
+        in_camera = depths[:, None] * matmul(np.concatenate([pixels, np.ones((len(pixels), 1))], axis=1), inverse(camera.K).T)
     else:
         plane = (pixels - camera.K[:2, 2]) / camera.K[[0, 1], [0, 1]]
         in_camera = _at_depth(camera, from_plane(camera.model, camera.distortion, plane), depths)
@@ -460,8 +459,7 @@ def focus_point(cameras: list[Camera]) -> np.ndarray:
         right += matmul(m, c.center)
     # a tiny pull to the mean centre keeps the system solvable when all axes are parallel
     weight = 1e-6 * len(cameras)
-    mean = np.mean([c.center for c in cameras], axis=0)
-    return matmul(inverse(normal + weight * np.eye(3)), right + weight * mean)
+    return matmul(inverse(normal + weight * np.eye(3)), right + weight * np.mean([c.center for c in cameras], axis=0))
 
 
 def pose_of(rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:
@@ -607,15 +605,12 @@ def harmonics_rotation(rotation: np.ndarray) -> torch.Tensor:
     """
     import torch
 
-    points, weights = [], []
-    for z, weight in (*_NODES, *((-z, w) for z, w in _NODES[1:])):
-        for i in range(_AZIMUTHS):
-            angle, radius = 2 * math.pi * i / _AZIMUTHS, math.sqrt(1 - z * z)
-            points.append([radius * math.cos(angle), radius * math.sin(angle), z])
-            weights.append(weight * 2 * math.pi / _AZIMUTHS)
-    d = np.array(points)
+    nodes = [*_NODES, *((-z, w) for z, w in _NODES[1:])]
+    points = [(z, math.sqrt(1 - z * z), 2 * math.pi * i / _AZIMUTHS) for z, _ in nodes for i in range(_AZIMUTHS)]
+    d = np.array([[radius * math.cos(angle), radius * math.sin(angle), z] for z, radius, angle in points])
+    weights = np.array([w * 2 * math.pi / _AZIMUTHS for _, w in nodes]).repeat(_AZIMUTHS)
     here, there = harmonics(d), harmonics(matmul(d, np.asarray(rotation, np.float64)))
-    return torch.from_numpy(np.einsum("i,ij,ik->jk", np.array(weights), here, there))
+    return torch.from_numpy(np.einsum("i,ij,ik->jk", weights, here, there))
 
 
 def rotate(gaussians: Gaussians, rotation: np.ndarray) -> Gaussians:

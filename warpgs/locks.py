@@ -91,15 +91,13 @@ def hold_folder(folder: Path, *parts: str, name: str = LOCK) -> Iterator[list[st
             raise
 
 
-@contextlib.contextmanager
-def hold_file(path: Path) -> Iterator[list[str]]:
+def hold_file(path: Path) -> contextlib.AbstractContextManager[list[str]]:
     """Lock a file that the block writes, in a folder that no process holds; see `hold_folder`."""
     # other processes may write other files of the folder; a lock of a killed process is swept as other leftovers are
     check_file_path(path)
     check_free(path.parent)
     name = f".warpgs-{hashlib.sha256(os.fsencode(path.name)).hexdigest()[:16]}.tmp{LOCKED}"
-    with hold_folder(path.parent, name=name) as notes:
-        yield notes
+    return hold_folder(path.parent, name=name)
 
 
 def check_file_path(path: Path) -> None:
@@ -154,10 +152,9 @@ def _locked(folder: Folder, name: str, flags: int) -> tuple[int, bool | None]:
             locked = lock(descriptor)
         if locked is False:
             os.lseek(descriptor, 1, os.SEEK_SET)
-            raise FolderHeldError(
-                f"{folder.path}: {_signed(os.read(descriptor, 2**16)) or 'another process'} is writing there. Wait until that "
-                "process ends, end it, or choose another folder"
-            )
+            holder = _signed(os.read(descriptor, 2**16)) or "another process"
+            fix = "Wait until that process ends, end it, or choose another folder"
+            raise FolderHeldError(f"{folder.path}: {holder} is writing there. {fix}")
         return descriptor, locked
     except BaseException:
         os.close(descriptor)
@@ -195,10 +192,9 @@ def private_shared_folder(base: Path | None) -> Iterator[Path]:
             base = base.resolve()
             others = open_to_others(base)
             if others is not None:
-                raise UsageError(
-                    f"{base}: not safe for Slurm's job files: other users can write to {others} and could run code as you; "
-                    "name a private folder that all nodes see with --slurm-folder"
-                )
+                risk = f"other users can write to {others} and could run code as you"
+                fix = "name a private folder that all nodes see with --slurm-folder"
+                raise UsageError(f"{base}: not safe for Slurm's job files: {risk}; {fix}")
             above = stack.enter_context(open_folder(base))
             sweep(above)
             made = stack.enter_context(Temporary(above))

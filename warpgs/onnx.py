@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from warpgs.device import usable_cores
-from warpgs.errors import DataError, ResourceError
+from warpgs.errors import DataError, ResourceError, expect
 from warpgs.files import read_file
 
 # Check of an ONNX file by its bytes, before onnxruntime loads it: nothing outside the file may be loaded.
@@ -67,11 +67,9 @@ def _message(data: memoryview) -> Message:
             value, at = _varint(data, at)
         else:
             length, at = _varint(data, at) if wire == 2 else ({1: 8, 5: 4}.get(wire, -1), at)
-            if not 0 <= length <= len(data) - at:
-                raise ValueError(f"a field of wire type {wire} reaches beyond the data")
+            expect(0 <= length <= len(data) - at, f"a field of wire type {wire} reaches beyond the data")
             value, at = data[at : at + length], at + length
-        if not 0 < number <= MAX_FIELD:
-            raise ValueError(f"invalid field number {number}")
+        expect(0 < number <= MAX_FIELD, f"invalid field number {number}")
         fields.append((number, value))
     return fields
 
@@ -84,8 +82,7 @@ def _text(message: Message, number: int) -> str:
 
 def _walk(kind: str, message: Message, depth: int = 0) -> Iterator[tuple[str, Message]]:
     """Yield a message and all that it holds, as far as `PARTS` leads; ValueError where graphs are nested too deep."""
-    if depth > MAX_NESTING:
-        raise ValueError(f"graphs nested deeper than {MAX_NESTING}")
+    expect(depth <= MAX_NESTING, f"graphs nested deeper than {MAX_NESTING}")
     yield kind, message
     for number, value in message:
         if (part := PARTS[kind].get(number)) and isinstance(value, memoryview):
@@ -111,21 +108,18 @@ def check_onnx(data: bytes, path: Path) -> None:
             """Return the number of nodes of which a node consists once its function is inlined."""
             operator = _text(part, NODE_DOMAIN), _text(part, NODE_TYPE)
             if operator not in sizes:
-                if above > MAX_NESTING:
-                    raise ValueError(f"functions nested deeper than {MAX_NESTING}, or that call themselves")
+                expect(above <= MAX_NESTING, f"functions nested deeper than {MAX_NESTING}, or that call themselves")
                 sizes[operator] = sum(size(inner, above + 1) for inner in own[operator]) if operator in own else 1
             return sizes[operator]
 
         count = 0
         for kind, part in _walk("model", model):
             count += size(part) if kind == "node" else 0
-            if count > MAX_NODES:
-                raise ValueError(f"more than {MAX_NODES:,} nodes once its functions are inlined")
+            expect(count <= MAX_NODES, f"more than {MAX_NODES:,} nodes once its functions are inlined")
             if kind == "tensor" and any(n == TENSOR_EXTERNAL or (n == TENSOR_LOCATION and v != 0) for n, v in part):
-                raise DataError(
-                    f"{path}: the weights of {_text(part, TENSOR_NAME) or 'a constant'!r} are in another file, which is not "
-                    "read. Save the model as one file: `onnx.save(onnx.load(FILE), OUT)`, or export it without external data"
-                )
+                weights = f"the weights of {_text(part, TENSOR_NAME) or 'a constant'!r} are in another file, which is not read"
+                fix = "`onnx.save(onnx.load(FILE), OUT)`, or export it without external data"
+                raise DataError(f"{path}: {weights}. Save the model as one file: {fix}")
             if kind == "node" and (domain := _text(part, NODE_DOMAIN)) not in DOMAINS:
                 if (operator := (domain, _text(part, NODE_TYPE))) not in own:
                     raise DataError(f"{path}: {'::'.join(operator)} is not part of ONNX; export with standard operators")
@@ -255,6 +249,5 @@ class Model:
             return [np.asarray(output) for output in answer]
         except Exception as e:  # onnxruntime's errors share no base but Exception
             shape = " x ".join(map(str, images[0].shape))
-            raise DataError(
-                f"{self.path}: onnxruntime refuses an input of {shape} ({_first_line(e)}); describe it in {self.path.name}.json"
-            ) from e
+            fix = f"describe it in {self.path.name}.json"
+            raise DataError(f"{self.path}: onnxruntime refuses an input of {shape} ({_first_line(e)}); {fix}") from e

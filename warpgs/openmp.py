@@ -26,8 +26,5 @@ def warn_if_spinning() -> None:
         frame, level = sys._getframe(), 1
         while frame.f_back and frame.f_globals.get("__name__", "").partition(".")[0] in ("warpgs", "torch"):
             frame, level = frame.f_back, level + 1
-        warnings.warn(
-            f"idle threads of torch slow down rendering on a CPU: import warpgs before torch, or set {VARIABLE}=passive",
-            RuntimeWarning,
-            stacklevel=level,
-        )
+        fix = f"import warpgs before torch, or set {VARIABLE}=passive"
+        warnings.warn(f"idle threads of torch slow down rendering on a CPU: {fix}", RuntimeWarning, stacklevel=level)

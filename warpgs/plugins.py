@@ -58,8 +58,7 @@ class Registry(Generic[T]):
         """Return the names of the registered classes, sorted; names of the form ``module:Class`` are left out."""
         if not self._searched:
             for name in self.packages:
-                package = importlib.import_module(name)
-                for module in pkgutil.iter_modules(getattr(package, "__path__", [])):
+                for module in pkgutil.iter_modules(getattr(importlib.import_module(name), "__path__", [])):
                     importlib.import_module(f"{name}.{module.name}")
             self._searched = True
         return sorted(n for n in self._classes if ":" not in n)
@@ -89,10 +88,8 @@ class Registry(Generic[T]):
         files = {os.path.realpath(file) for file in modules.values() if file}
         if len(modules) == 2 and len(files) == 1:
             (file,), module = files, min(modules, key=lambda name: name.startswith(_PREFIX))
-            return (
-                f"the file of the {self.kind} {cls.__qualname__} was loaded twice ({file}, and the module {module}); "
-                f"give {module}:NAME instead of {Path(file).name}:NAME, or use one file"
-            )
+            fix = f"give {module}:NAME instead of {Path(file).name}:NAME, or use one file"
+            return f"the file of the {self.kind} {cls.__qualname__} was loaded twice ({file}, and the module {module}); {fix}"
         return (
             f"the {self.kind} {cls.__qualname__} has no registered name; register it with "
             f'@warpgs.{_FACES.get(self.kind, "train")}.register_{self.kind.replace(" ", "_")}("name") above the class, '
@@ -108,10 +105,9 @@ class Registry(Generic[T]):
         if isinstance(name, str) and ":" in name:
             own = name.rpartition(":")[2]
             in_study = f'; in a study, use a preset in a .py file with "strategy": {own}' if self.kind == "strategy" else ""
-            raise UsageError(
-                f"the {self.kind} {name!r} is a class of your own. The file of a preset or run does not load your code: "
-                f"name the class on the command line, or pass it in Python{in_study}"
-            )
+            why = "a class of your own. The file of a preset or run does not load your code"
+            fix = f"name the class on the command line, or pass it in Python{in_study}"
+            raise UsageError(f"the {self.kind} {name!r} is {why}: {fix}")
         more = "import the file that registers it first, in Python" if self.kind == "camera model" else "give module:Class"
         raise UsageError(f"unknown {self.kind} {name!r}; choose one of {', '.join(self.names())}, or {more}")
 
@@ -156,12 +152,9 @@ def load_object(kind: str, spec: str) -> object:
                 advice = f"set PYTHONPATH={path.parent} and give {path.stem}:{name or 'NAME'}, or use one file"
         raise UsageError(f"the {kind} {spec!r} cannot be imported ({e}); {advice}") from e
     except Exception as e:  # whatever a user's module raises
-        last = traceback.extract_tb(e.__traceback__)[-1]
-        what, at = (e.msg, e) if isinstance(e, SyntaxError) else (e, last)
-        raise UsageError(
-            f"the {kind} {spec!r} cannot be loaded: {type(e).__name__}: {what} ({at.filename}, line {at.lineno}); correct that "
-            f"code, or omit the {kind}"
-        ) from e
+        what, at = (e.msg, e) if isinstance(e, SyntaxError) else (e, traceback.extract_tb(e.__traceback__)[-1])
+        why = f"{type(e).__name__}: {what} ({at.filename}, line {at.lineno})"
+        raise UsageError(f"the {kind} {spec!r} cannot be loaded: {why}; correct that code, or omit the {kind}") from e
     if not hasattr(module, name):
         raise UsageError(f"the {kind} {spec!r} does not exist: {where} does not define {name}; give a name that it defines")
     LOADED.add(module.__name__)

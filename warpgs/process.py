@@ -12,7 +12,7 @@ import sys
 import tempfile
 import threading
 import unicodedata
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NoReturn, TextIO, TypeVar, cast
 
@@ -25,14 +25,11 @@ from warpgs.folders import shared_locks
 # Causes are a closed pipe, a full disk, a closed descriptor or a closed terminal. After the first failed write, all
 # output goes to the null device, including that of native libraries.
 
-NAMES = ("stdin", "stdout", "stderr")
-"""Standard streams by their descriptors."""
-
 
 def open_missing_descriptors() -> None:
     """Open the null device instead of a closed stdin, stdout or stderr."""
     # Otherwise the next file that is opened gets the free descriptor, and output is written into that file.
-    for number in range(len(NAMES)):
+    for number in range(3):
         try:
             os.fstat(number)
         except OSError:
@@ -73,20 +70,20 @@ class CarefulStream:
 
     def write(self, text: str) -> int:
         """Write text, if the stream takes it; return its length."""
-        try:
-            if self.closed_at_start:
-                raise OSError(errno.EBADF, os.strerror(errno.EBADF))
-            if self.failure is None:
-                self.stream.write(text)
-        except (OSError, ValueError) as e:
-            self._lose(e)
+        self._try(lambda: self.stream.write(text), not self.closed_at_start)
         return len(text)
 
     def flush(self) -> None:
         """Flush the buffer, if the stream takes it."""
+        self._try(self.stream.flush)
+
+    def _try(self, call: Callable[[], object], is_open: bool = True) -> None:
+        """Call a method of the stream, unless it has failed before."""
         try:
+            if not is_open:
+                raise OSError(errno.EBADF, os.strerror(errno.EBADF))
             if self.failure is None:
-                self.stream.flush()
+                call()
         except (OSError, ValueError) as e:
             self._lose(e)
 
@@ -127,9 +124,8 @@ def careful_output(is_product: bool) -> Iterator[Callable[[int], int]]:
         for stream in streams:
             stream.flush()
         failure, number = out.failure, getattr(out.failure, "errno", None)
-        gone = isinstance(failure, BrokenPipeError) or (
-            sys.platform == "win32" and number == errno.EINVAL
-        )  # as with ``| head``
+        # as with ``| head``
+        gone = isinstance(failure, BrokenPipeError) or (sys.platform == "win32" and number == errno.EINVAL)
         if code or failure is None or not is_product or gone:
             return code
         _lost(failure, ("free some disk space, or " if number in FULL else "") + "send the output elsewhere")
@@ -172,10 +168,9 @@ class Task(str):
 
 def printable(text: object) -> str:
     """Return text with codes in place of control characters, such as ESC, and of bytes that are not text."""
-    return "".join(
-        c.encode("unicode_escape").decode() if unicodedata.category(c) in HIDDEN and c not in JOINERS else c
-        for c in readable(str(text))
-    )
+    letters = readable(str(text))
+    hidden = {c for c in letters if unicodedata.category(c) in HIDDEN and c not in JOINERS}
+    return "".join(c.encode("unicode_escape").decode() if c in hidden else c for c in letters)
 
 
 _quiet = _is_lost = False
@@ -198,6 +193,12 @@ def say(line: object = "", *, error: bool = False) -> None:
         if not (error or _is_lost):
             _is_lost = True
             _lost(e, GOES_ON)
+
+
+def say_lines(lines: Iterable[object], *, error: bool = False) -> None:
+    """Print lines as `say` does."""
+    for line in lines:
+        say(line, error=error)
 
 
 def answer(line: object, error: bool = False) -> None:
@@ -254,10 +255,8 @@ def hidden_stderr() -> Iterator[None]:
 def _flush(*numbers: int) -> None:
     """Flush stdout (1) or stderr (2), if there is one and it can be written."""
     for number in numbers:
-        stream = (sys.stdout, sys.stderr)[number - 1]
-        if stream is not None:
-            with contextlib.suppress(OSError, ValueError):
-                stream.flush()
+        with contextlib.suppress(AttributeError, OSError, ValueError):  # none, or nobody reads it
+            (sys.stdout, sys.stderr)[number - 1].flush()
 
 
 # File names that are not UTF-8: Linux allows any bytes in a name, and Python stores undecodable bytes as surrogates.
@@ -320,9 +319,7 @@ def leave(code: int) -> NoReturn:
     """End the process as `sys.exit` does, but let the system free all memory at once, that of a GPU, too."""
     threading._shutdown()  # waits for all threads but daemons
     atexit._run_exitfuncs()
-    for stream in (sys.stdout, sys.stderr):
-        with contextlib.suppress(AttributeError, OSError, ValueError):  # none, or nobody reads it
-            stream.flush()
+    _flush(1, 2)
     os._exit(code)
 
 
@@ -401,11 +398,9 @@ def noted_signals() -> Iterator[Callable[[], bool]]:
         yield lambda: came
 
 
-@contextlib.contextmanager
-def ignored_signals() -> Iterator[None]:
+def ignored_signals() -> contextlib.AbstractContextManager[None]:
     """Drop signals while the body prints the last lines of a program that is already ending."""
-    with _handled(signal.SIG_IGN):
-        yield
+    return _handled(signal.SIG_IGN)
 
 
 # Other processes. Python processes import nothing from the folder that warpgs was called in; no shell is started.
@@ -502,11 +497,6 @@ class PythonWorker:
             stdout=subprocess.PIPE, stderr=self._errors, text=True, encoding="utf-8", errors="replace", pass_fds=locks,
             start_new_session=True,
         )  # fmt: skip
-
-    @property
-    def number(self) -> int:
-        """Number of the process."""
-        return self._process.pid
 
     def send(self, line: str) -> bool:
         """Send a line; return False where the process has ended."""

@@ -62,9 +62,7 @@ def loopback_of(name: str) -> str | None:
         found = [str(info[4][0]) for info in socket.getaddrinfo(name, None, type=socket.SOCK_STREAM)]
     except (OSError, UnicodeError):  # the name cannot be resolved; connecting raises the error
         return None
-    if not found or not all(map(is_loopback, found)):
-        return None
-    return min(found, key=lambda a: (":" in a, a))
+    return min(found, key=lambda a: (":" in a, a)) if found and all(map(is_loopback, found)) else None
 
 
 def loopback_interface(host: str = HOST) -> str:
@@ -147,11 +145,9 @@ class WebGuard:
         if any(origin != f"http://{hosts[0]}" for origin in origins) or (upgrade and len(origins) != 1):
             return None
         first, _, rest = target.removeprefix("/").partition("/")
-        if not target.startswith("/") or not hmac.compare_digest(_bytes(first), _bytes(self.token)):
+        if not target.startswith("/") or not hmac.compare_digest(first.encode("utf-8", "surrogateescape"), self.token.encode()):
             return None
-        if not _PLAIN.fullmatch(rest) or ".." in rest or (upgrade and rest):
-            return None
-        return f"/{rest}"
+        return f"/{rest}" if _PLAIN.fullmatch(rest) and ".." not in rest and not (upgrade and rest) else None
 
     @staticmethod
     def headers(host: str, nonce: str) -> dict[str, str]:
@@ -174,10 +170,6 @@ def _is_own(host: str) -> bool:
     """Return whether a value of ``Host`` is one of `NAMES`, with or without a port."""
     name, colon, port = host.partition(":")
     return name in NAMES and (not colon or (port.isascii() and port.isdecimal() and len(port) <= 5))
-
-
-def _bytes(text: str) -> bytes:
-    return text.encode("utf-8", "surrogateescape")
 
 
 BEAT_SECONDS = 1.0
@@ -232,10 +224,9 @@ class RankWatch:
         until = time.monotonic() + seconds
         while missing := [r for r in range(self.count) if not self.store.check([f"beat/{r}"])]:
             if time.monotonic() > until:
-                raise ResourceError(
-                    f"only {self.count - len(missing)} of {self.count} ranks connected within {seconds:.0f} s; rank "
-                    f"{missing[0]} is missing. Start all ranks with the same MASTER_ADDR and MASTER_PORT"
-                )
+                there = f"only {self.count - len(missing)} of {self.count} ranks connected within {seconds:.0f} s"
+                fix = "Start all ranks with the same MASTER_ADDR and MASTER_PORT"
+                raise ResourceError(f"{there}; rank {missing[0]} is missing. {fix}")
             time.sleep(0.05)
 
     def texts(self, own: str) -> list[str]:
@@ -268,12 +259,10 @@ class RankWatch:
         if not self._own.check([f"beat/{rank}"]):
             return False  # it has not started yet
         found, now = self._own.get(f"beat/{rank}").decode(), time.monotonic()
-        last, since = self._seen.get(rank, ("", now))
-        if found != last:
+        if rank not in self._seen or self._seen[rank][0] != found:
             self._seen[rank] = (found, now)
-            since = now
         _, process, there = found.split("|", 2)
-        gone = is_gone(int(process)) if there == self.here else now - since > LOST_SECONDS
+        gone = is_gone(int(process)) if there == self.here else now - self._seen[rank][1] > LOST_SECONDS
         return gone and not self._own.check([f"left/{rank}"])
 
     def fail(self, line: str) -> None:
@@ -401,10 +390,9 @@ class Group(Ranks):
             yield
         except RuntimeError as e:
             time.sleep(LOST_SECONDS + 2 * BEAT_SECONDS)  # the thread ends this process once it knows the lost rank
-            raise ResourceError(
-                f"rank {self.rank} of {self.count} cannot exchange data with the others ({str(e).splitlines()[0][:200]}); "
-                "--resume continues from the last checkpoint"
-            ) from e
+            why = f"cannot exchange data with the others ({str(e).splitlines()[0][:200]})"
+            fix = "--resume continues from the last checkpoint"
+            raise ResourceError(f"rank {self.rank} of {self.count} {why}; {fix}") from e
 
     def texts(self, own):
         """Return the text ``own`` of each process, in the order of ranks."""
@@ -426,10 +414,8 @@ class Group(Ranks):
 def _number(name: str, least: int, most: int, default: str | None = None) -> int:
     text = os.environ.get(name, default)
     if text is None or not text.isdecimal() or not least <= int(text) <= most:
-        raise UsageError(
-            f"the environment variable {name} must be a whole number from {least} to {most}, not {text!r}; start the fit "
-            "with `torchrun --nproc_per_node N -m warpgs fit ...`, or unset RANK and WORLD_SIZE"
-        )
+        fix = "start the fit with `torchrun --nproc_per_node N -m warpgs fit ...`, or unset RANK and WORLD_SIZE"
+        raise UsageError(f"the environment variable {name} must be a whole number from {least} to {most}, not {text!r}; {fix}")
     return int(text)
 
 
@@ -472,16 +458,14 @@ def join(device: str) -> Ranks:
     _joined = Group(rank, count, backend, watch)
     if cuda:
         if torch.cuda.device_count() <= local:
-            raise ResourceError(
-                f"rank {rank} needs GPU {local} of this machine, but torch finds {torch.cuda.device_count()} GPUs, and NCCL "
-                "needs one for each process. Start fewer processes, or give --device cpu"
-            )
+            found = f"torch finds {torch.cuda.device_count()} GPUs, and NCCL needs one for each process"
+            fix = "Start fewer processes, or give --device cpu"
+            raise ResourceError(f"rank {rank} needs GPU {local} of this machine, but {found}. {fix}")
         torch.cuda.set_device(local)
     watch.meet(JOIN_SECONDS)
     try:
-        dist.init_process_group(
-            backend, store=dist.PrefixStore("group", store), rank=rank, world_size=count, timeout=EXCHANGE_TIME
-        )
+        group = dist.PrefixStore("group", store)
+        dist.init_process_group(backend, store=group, rank=rank, world_size=count, timeout=EXCHANGE_TIME)
     except RuntimeError as e:
         raise ResourceError(f"{backend} cannot connect the {count} ranks ({str(e).splitlines()[0][:200]})") from e
     if rank == 0:

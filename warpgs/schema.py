@@ -78,27 +78,24 @@ def read(path: Path, below: Path | None = None, rule: Schema = anything) -> Any:
 
 def flag(value: Any, place: str) -> None:
     """Allow true and false."""
-    if not isinstance(value, bool):
-        _refuse(value, place, "true or false")
+    _must(isinstance(value, bool), value, place, "true or false")
 
 
 def text(value: Any, place: str) -> None:
     """Allow text that can be a path: no zero byte, and no surrogates except those of undecodable bytes in names."""
-    if not isinstance(value, str):
-        _refuse(value, place, "text")
+    _must(isinstance(value, str), value, place, "text")
     try:
-        if b"\0" in value.encode("utf-8", "surrogateescape"):
-            _refuse(value, place, "text without a zero byte")
+        _must(b"\0" not in value.encode("utf-8", "surrogateescape"), value, place, "text without a zero byte")
     except UnicodeEncodeError:
-        _refuse(value, place, "text of whole characters")
+        _must(False, value, place, "text of whole characters")
 
 
 def one_of(*values: Any) -> Schema:
     """Return the schema of a value that is one of some JSON values; 1 and true are different values."""
+    wanted = f"one of {', '.join(map(str, values))}"
 
     def check(value: Any, place: str) -> None:
-        if not any(value == v and type(value) is type(v) for v in values):
-            _refuse(value, place, f"one of {', '.join(map(str, values))}")
+        _must(any(value == v and type(value) is type(v) for v in values), value, place, wanted)
 
     return check
 
@@ -108,8 +105,7 @@ def whole(low: int = -MAX_WHOLE, high: int = MAX_WHOLE) -> Schema:
     wanted = "a whole number of 64 bits" if (low, high) == (-MAX_WHOLE, MAX_WHOLE) else f"a whole number from {low} to {high}"
 
     def check(value: Any, place: str) -> None:
-        if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
-            _refuse(value, place, wanted)
+        _must(isinstance(value, int) and not isinstance(value, bool) and low <= value <= high, value, place, wanted)
 
     return check
 
@@ -117,19 +113,17 @@ def whole(low: int = -MAX_WHOLE, high: int = MAX_WHOLE) -> Schema:
 def real(value: Any, place: str) -> None:
     """Allow every number, NaN and infinity too."""
     plain = isinstance(value, float) or (isinstance(value, int) and not isinstance(value, bool) and abs(value) <= MAX_NUMBER)
-    if not plain:
-        _refuse(value, place, "a number")
+    _must(plain, value, place, "a number")
 
 
 def number(low: float = -math.inf, above: float = -math.inf, high: float = math.inf) -> Schema:
     """Return the schema of finite numbers that are at least ``low``, larger than ``above``, and at most ``high``."""
+    bounds = f" of at least {low:g}" * (low > -math.inf) + f" above {above:g}" * (above > -math.inf)
+    bounds += f" of at most {high:g}" * (high < math.inf)
 
     def check(value: Any, place: str) -> None:
         sound = not isinstance(value, bool) and isinstance(value, (int, float)) and abs(value) <= MAX_NUMBER
-        if not (sound and low <= value <= high and value > above):
-            bounds = f" of at least {low:g}" * (low > -math.inf) + f" above {above:g}" * (above > -math.inf)
-            bounds += f" of at most {high:g}" * (high < math.inf)
-            _refuse(value, place, f"a finite number{bounds}")
+        _must(sound and low <= value <= high and value > above, value, place, f"a finite number{bounds}")
 
     return check
 
@@ -148,8 +142,8 @@ def items(schema: Schema, count: int | None = None) -> Schema:
     """Return the schema of lists of items that ``schema`` allows, ``count`` of them if given."""
 
     def check(value: Any, place: str) -> None:
-        if not isinstance(value, list) or count not in (None, len(value)):
-            _refuse(value, place, "a list" if count is None else f"a list of {count}")
+        fits = isinstance(value, list) and count in (None, len(value))
+        _must(fits, value, place, "a list" if count is None else f"a list of {count}")
         for i, item in enumerate(value):
             schema(item, f"{place}[{i}]")
 
@@ -160,8 +154,7 @@ def mapping(schema: Schema, names: Schema = text) -> Schema:
     """Return the schema of objects: ``names`` must allow each name, ``schema`` each value."""
 
     def check(value: Any, place: str) -> None:
-        if not isinstance(value, dict):
-            _refuse(value, place, "an object")
+        _must(isinstance(value, dict), value, place, "an object")
         for name, item in value.items():
             names(name, f"a name in {place}")
             schema(item, f"{place}.{name}")
@@ -174,8 +167,7 @@ def fields(needed: Mapping[str, Schema], more: Mapping[str, Schema] | None = Non
     known = {**needed, **(more or {})}
 
     def check(value: Any, place: str) -> None:
-        if not isinstance(value, dict):
-            _refuse(value, place, "an object")
+        _must(isinstance(value, dict), value, place, "an object")
         for name in needed:
             if name not in value:
                 raise SchemaError(f"{place}.{name}".lstrip(".") + " is missing")
@@ -201,14 +193,15 @@ def of_type(hint: Any) -> Schema:
         kinds = [of_type(p) for p in parts if p is not type(None)]
         return or_null(kinds[0]) if len(kinds) == 1 and type(None) in parts else anything
     if typing.get_origin(hint) is tuple:
-        endless = len(parts) == 2 and parts[1] is Ellipsis
-        return items(of_type(parts[0]), None if endless else len(parts))
+        return items(of_type(parts[0]), None if len(parts) == 2 and parts[1] is Ellipsis else len(parts))
     return {bool: flag, int: whole(), float: number(), str: text}.get(hint, anything)
 
 
-def _refuse(value: Any, place: str, wanted: str) -> None:
-    found = repr(value)[:60] if isinstance(value, (str, float, bool, type(None))) else type(value).__name__
-    raise SchemaError(f"{place[:100] or 'it'} must be {wanted}, not {found}")
+def _must(sound: bool, value: Any, place: str, wanted: str) -> None:
+    """Refuse a value unless it is ``sound``."""
+    if not sound:
+        found = repr(value)[:60] if isinstance(value, (str, float, bool, type(None))) else type(value).__name__
+        raise SchemaError(f"{place[:100] or 'it'} must be {wanted}, not {found}")
 
 
 class Within(NamedTuple):
@@ -267,10 +260,5 @@ class Checked:
 def rules_of(kind: type) -> tuple[tuple[str, Any], ...]:
     """Return name and rule of each field with a range or a list of values."""
     hints = typing.get_type_hints(kind, include_extras=True)
-    rules = ((name, rule) for name, hint in hints.items() for rule in getattr(_inner(hint), "__metadata__", ()))
-    return tuple((name, rule) for name, rule in rules if isinstance(rule, tuple))
-
-
-def _inner(hint: Any) -> Any:
-    """Return the type of a hint ``... | None`` that carries metadata; the hint itself otherwise."""
-    return next((part for part in typing.get_args(hint) if hasattr(part, "__metadata__")), hint)
+    parts = ((name, part) for name, hint in hints.items() for part in (hint, *typing.get_args(hint)))  # of ``... | None``, too
+    return tuple((n, rule) for n, part in parts for rule in getattr(part, "__metadata__", ()) if isinstance(rule, tuple))

@@ -97,7 +97,7 @@ def kill_once(killed: list[str]) -> Callable[[list[JobStatus], Engine], None]:
         running = [s.job.name for s in statuses if s.state == "running" and s.step]
         if running and not killed:
             killed.append(running[0])
-            os.kill(engine.workers()[running[0]], signal.SIGKILL)
+            os.kill(engine._workers[running[0]]._process.pid, signal.SIGKILL)
 
     return show
 

@@ -202,7 +202,7 @@ def test_the_page_names_the_bytes_of_a_gaussian(suffix, tmp_path):
 def test_axes_and_nodes_on_disk(tmp_path):
     made = model(n=1, degree=0)
     x, y, z = made.means[0].tolist()
-    document, body = gltf._split(Path("a.glb"), b"".join(gltf.BinaryGltf().encode(arrays_of(made))))
+    document, body = gltf._split(b"".join(gltf.BinaryGltf().encode(arrays_of(made))))
     assert np.allclose(np.frombuffer(body, "<f4", 3), [-x, -y, z])  # y up
     plain = gzip.decompress(spz.encode(arrays_of(made))[0])
     fixed = [int.from_bytes(plain[16 + 3 * i : 19 + 3 * i], "little", signed=True) / 2.0 ** plain[13] for i in range(3)]
@@ -220,7 +220,7 @@ def test_axes_and_nodes_on_disk(tmp_path):
     assert back.dtype == torch.float64 and torch.allclose(back, wanted, rtol=0, atol=1e-6)
     # scales and positions may be plain integers; programs without Gaussians show points in linear colours, with opacities
     path, made = tmp_path / "a.glb", arrays_of(model(5, 1))
-    document, body = gltf._split(path, encoded(".glb"))
+    document, body = gltf._split(encoded(".glb"))
     color = document["accessors"][document["meshes"][0]["primitives"][0]["attributes"]["COLOR_0"]]
     assert (color["componentType"], color["type"], color["normalized"]) == (5123, "VEC4", True)
     view = document["bufferViews"][color["bufferView"]]
@@ -544,7 +544,7 @@ def test_archives_that_lie(change, match, tmp_path):
 
 def with_document(change):
     """Return a .glb whose document was changed."""
-    document, body = gltf._split(Path("a.glb"), encoded(".glb"))
+    document, body = gltf._split(encoded(".glb"))
     change(document)
     return format_targets.glb(json.dumps(document).encode(), bytes(body))
 

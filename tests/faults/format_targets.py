@@ -56,7 +56,7 @@ def add(name: str, suffix: str, parser: tuple, changes: tuple[Change, ...], prep
 
 COMPRESSED = (ply.decode, ply.is_compressed, ply._harmonics, ply._table, ply._column, ply._unpack)
 add("compressed PLY", ".compressed.ply", COMPRESSED, (ply_header(text_number), ply_header(text_line), ply_body, ply_body))
-add("splat", ".splat", (base.decode,), (number, number))
+add("splat", ".splat", (base.Splat.decode,), (number, number))
 
 # ---- SPZ ---------------------------------------------------------------------------------------------------------------
 
@@ -197,7 +197,7 @@ def sog_image(data: bytes, rng: np.random.Generator) -> bytes:
     return archive_of(members | {names[int(rng.integers(len(names)))]: mutations.large_webp()}) if names else data
 
 
-SOG = (sog.decode, sog._member, sog._pixels, sog._book, sog._palette_rows, sog._within)
+SOG = (sog.decode, sog._member, sog._pixels, sog._book, sog._palette_rows)
 add("SOG", ".sog", SOG, (sog_member, sog_member, rarely(sog_image, rarely(mutations.zip_bomb, sog_member))))
 
 
@@ -233,7 +233,7 @@ register(
 def gltf_files(root: Path) -> list[Path]:
     """Write both kinds, and one whose opacities and rotations are fractions in integers, shown by two nodes."""
     paths = [*written(".glb")(root), *written(".gltf")(root), root / "c.glb"]
-    document, part = gltf._split(paths[0], paths[0].read_bytes())
+    document, part = gltf._split(paths[0].read_bytes())
     body = bytes(part)
     values = np.arange(20, dtype="u1") * 12
     for i, (kind, width) in enumerate((("VEC4", 4), ("SCALAR", 1))):
@@ -260,7 +260,7 @@ def gltf_document(data: bytes, rng: np.random.Generator) -> bytes:
     if not data.startswith(b"glTF"):
         return json_value(data, rng)
     try:
-        document, body = gltf._split(Path("a.glb"), data)
+        document, body = gltf._split(data)
         return glb(json_value(json.dumps(document).encode(), rng), body)
     except (DataError, ValueError, KeyError, TypeError, struct.error, RecursionError):
         return data
@@ -309,7 +309,7 @@ def camera_nonsense(found: dict) -> str:
 
 CAMERAS = (
     transforms.read_cameras, transforms._inria, transforms._transforms, transforms.colmap_folder, transforms._colmap,
-    transforms._json, transforms.read_json, transforms._number, transforms.lens_of, transforms.matrix_of, transforms._origin,
+    transforms._json, transforms.read_json, transforms._number, transforms.lens_of, transforms.matrix_of,
     read_cameras, read_poses,
 )  # fmt: skip
 CAMERA_CHANGES = (rarely(mutations.many_rows, json_value), json_value, text_number, text_line)

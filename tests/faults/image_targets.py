@@ -279,6 +279,6 @@ def other_size(data: bytes, rng: np.random.Generator) -> bytes:
 
 
 MASKS = (
-    folders.SceneFolder.mask_of, folders.SceneFolder.mask, folders.read_mask, images._fit_mask, load._fit,
+    folders.SceneFolder.mask_of, folders.SceneFolder.mask, images._fit_mask, load._fit,
 )  # fmt: skip
 register(Target("masks", write_masked, read_scene, MASKS, (png_rows, png_rows, other_size), png_checksums, scene_nonsense))

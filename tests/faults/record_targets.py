@@ -76,7 +76,7 @@ SCORES = {
 SCHEMA = (
     schema.parse, schema.check_parts, schema.check_depth, schema.read, schema.text, schema.real, schema.whole(),
     schema.number(), schema.or_null(schema.text), schema.items(schema.text), schema.mapping(schema.text), schema.fields({}),
-    schema._refuse,
+    schema._must,
 )  # fmt: skip
 """What reads JSON and checks values, without what only makes a schema, once, when warpgs is imported."""
 add("scores", "metrics.json", SCORES, lambda root, path: work._scores(path), (work._scores, *SCHEMA))

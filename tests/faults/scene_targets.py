@@ -194,9 +194,9 @@ FRAMES = {
     "exr": write_exr,
 }  # fmt: skip
 FRAMES_PARSER = (
-    transforms.files_of, transforms.is_blender, transforms._json, transforms.read_json, transforms._inner_names,
+    transforms.files_of, transforms._json, transforms.read_json, transforms._inner_names,
     transforms._image_paths,
-    transforms._number, transforms.lens_of, transforms.matrix_of, transforms._origin, transforms._image_path,
+    transforms._number, transforms.lens_of, transforms.matrix_of, transforms._image_path,
     transforms._named_maps, transforms._points, transforms._disagreement, transforms.TransformsReader,
 )  # fmt: skip
 DTU = (others.decompose, others._centred, others._lens, others._read_matrices, others._number, others._masks, others.DTUReader)

@@ -12,7 +12,8 @@ import pytest
 from filelock import lock_descriptor
 
 from tests.faults import tiny_runs
-from warpgs.files import LOCK, OWN_NAMES
+from warpgs.files import LOCK
+from warpgs.folders import NAMES as OWN_NAMES
 from warpgs.pipeline.run.export import export
 
 # Commands that die before one of their calls: nothing is lost, nothing is half, and the next command goes on from there.

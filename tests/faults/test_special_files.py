@@ -7,6 +7,7 @@ import importlib.machinery
 import importlib.util
 import shutil
 import signal
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -44,7 +45,7 @@ def package(path):
 
 MORE = {
     **{f"a{suffix}": lambda p: find_poses(p, p.parent / "out") for suffix in image_files.VIDEO_SUFFIXES},
-    **{f"mask{suffix}": folders.read_mask for suffix in images.SUFFIXES},
+    **{f"mask{suffix}": folders.SceneFolder(Path(), images.ReadOptions(allow_outside=True)).mask for suffix in images.SUFFIXES},
     "b.ply": warpgs.read_ply, "c.ply": start_of, "b.spz": lambda p: SPZ().is_antialiased(p),
     "b.sog": lambda p: SOG().is_antialiased(p), "artefact": file_digest, "render.png": lambda p: read_file(p, p.parent),
     "metrics.jsonl": read_events, "a.npy": read_numbers, "model.py": package,

@@ -19,7 +19,8 @@ import torch
 
 from warpgs.export.base import read_gaussians
 from warpgs.export.ply import read_ply
-from warpgs.files import LOCK, OWN_NAMES
+from warpgs.files import LOCK
+from warpgs.folders import NAMES as OWN_NAMES
 from warpgs.pipeline.metrics.lpips import NETS
 from warpgs.pipeline.run.folder import load_checkpoint
 from warpgs.report.film import _decoded_sizes

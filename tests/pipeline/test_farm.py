@@ -116,7 +116,7 @@ def test_processes_give_the_bytes_of_single_fits_and_one_that_is_killed_is_repla
     def show(statuses):
         if (tmp_path / "mark").exists() and not killed:
             killed.append(statuses[0].step)
-            os.kill(engine.workers()["s0"], signal.SIGKILL)
+            os.kill(engine._workers["s0"]._process.pid, signal.SIGKILL)
 
     try:
         statuses = run_farm(jobs, engine, show, poll=0.1)

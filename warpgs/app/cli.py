@@ -21,31 +21,22 @@ FITTING = ("fit", "farm", "compare", "ablate")
 """Commands that fit, and take the flags of a fit."""
 
 
-def missing_package(error: Exception) -> str:
-    """Return the package that an import of warpgs's own code did not find; empty for other errors."""
-    name = error.name or "" if isinstance(error, ModuleNotFoundError) and not own_frame(error) else ""
-    package = name.partition(".")[0]
-    return "" if package == "warpgs" else package
-
-
 def report_defect(error: Exception, arguments: list[str]) -> int:
     """Store the traceback in a file for a bug report, and print one line; return the exit code."""
     import tempfile
     import traceback
 
-    if gone := missing_package(error):
+    gone = isinstance(error, ModuleNotFoundError) and not own_frame(error) and (error.name or "").partition(".")[0]
+    if gone and gone != "warpgs":
         line = f"warpgs: this command needs the Python package {gone}, which is missing; reinstall warpgs with pip"
         return last_words(line, UsageError.exit_code)
     details = f"warpgs {__version__} {' '.join(arguments)}\n\n{''.join(traceback.format_exception(error))}"
     try:
-        with tempfile.NamedTemporaryFile(
-            "w", prefix="warpgs-error-", suffix=".txt", delete=False, encoding="utf-8", errors="backslashreplace"
-        ) as f:
-            f.write(details)
+        with tempfile.NamedTemporaryFile(prefix="warpgs-error-", suffix=".txt", delete=False) as f:
+            f.write(details.encode("utf-8", "backslashreplace"))
         where = f"in {f.name}"
     except OSError:  # no folder can be written
-        for line in details.splitlines():
-            process.say(line, error=True)
+        process.say_lines(details.splitlines(), error=True)
         where = "above"
     said = f"{type(error).__name__}: {error}"
     if own := own_frame(error):
@@ -105,10 +96,8 @@ def _rows(pairs: Sequence[tuple[str, str]], width: int = 0) -> list[str]:
 def help_lines(about: str) -> list[str]:
     """Return the help of `warpgs fit` in at most 45 lines of 80 columns."""
     flags = [("SCENE", SCENE[0]), ("", SCENE[1])]
-    flags += [
-        (f"{name} {word}".strip(), text if default in ("", "False") else f"{text} [{default}]")
-        for name, word, default, text in FLAGS
-    ]
+    for name, word, default, text in FLAGS:
+        flags.append((f"{name} {word}".strip(), text if default in ("", "False") else f"{text} [{default}]"))
     return [
         f"warpgs fit: {about}", "", "usage: warpgs fit SCENE --out RUN [flags]", "",
         "flags most fits need, and their [defaults]:", *_rows(flags), "",
@@ -198,8 +187,7 @@ def main(arguments: list[str] | None = None) -> int:
 def _run(arguments: list[str]) -> int:
     """Run one command; an error becomes one line and an exit code."""
     if not arguments or arguments[0] in ("-h", "--help", "help"):
-        for line in _help().splitlines():
-            process.say(line)
+        process.say_lines(_help().splitlines())
         return 0 if arguments else 2
     if arguments[0] in ("--version", "-V"):
         process.say(f"warpgs {__version__}")
@@ -214,17 +202,13 @@ def _run(arguments: list[str]) -> int:
             hint = did_you_mean(OTHER_WORDS.get(name.lower(), name), COMMANDS, 0.8) or f"choose one of {', '.join(COMMANDS)}"
             raise UsageError(f"unknown command {name!r}; {hint}")
         if name == "fit" and {"-h", "--help"} & {*arguments}:  # before the import, which costs seconds
-            for line in help_lines(COMMANDS[name]):
-                process.say(line)
+            process.say_lines(help_lines(COMMANDS[name]))
             return 0
         with waiting() as wait:
             if not ASKING & {*arguments} and os.environ.get("RANK", "0") == "0":  # until the command reports its own progress
                 wait(f"starting {name}")
-                if (
-                    name == "fit"
-                    and "torch" not in sys.modules
-                    and not any(a.startswith(("--device", "--resume")) for a in arguments)
-                ):
+                chosen = any(a.startswith(("--device", "--resume")) for a in arguments)
+                if name == "fit" and "torch" not in sys.modules and not chosen:
                     wake_gpu()
             own = name in OWN_FILES
             with process.fast_imports():

@@ -12,7 +12,7 @@ from tyro.conf import OmitArgPrefixes, Positional, arg  # noqa: TID253 - flags a
 from warpgs.app.flags import MAX_THREADS, call, check_range, listed
 from warpgs.errors import UsageError
 from warpgs.io.image_files import MAX_PIXELS
-from warpgs.process import say
+from warpgs.process import say, say_lines
 from warpgs.report.progress import Stages, waiting
 
 
@@ -76,8 +76,7 @@ def poses(
         photographs, out, frames=frames, threads=threads, max_pixels=max_pixels, allow_outside=allow_outside, matcher=matcher,
         progress=Stages(),
     )  # fmt: skip
-    for line in report_lines(record):
-        say(line)
+    say_lines(report_lines(record))
     say(f"{out}: a COLMAP scene; the lines above are also in {out / TEXT}")
     say(f"next: warpgs fit {shlex.quote(str(out))} --out run")
 
@@ -276,8 +275,7 @@ def run(name: str, arguments: list[str], about: str) -> int:
     """Run a command, print the lines that it returns, and return its exit code; ``about`` describes it in its help."""
     if name == "priors":
         if arguments[:1] in (["-h"], ["--help"], ["--help-all"]):
-            for line in (f"warpgs priors: {about}", "", *PRIORS):
-                say(line)
+            say_lines((f"warpgs priors: {about}", "", *PRIORS))
             return 0
         if arguments[:1] not in (["show"], ["export"]):
             raise UsageError("priors: give show or export; `warpgs priors --help` shows how")
@@ -288,8 +286,7 @@ def run(name: str, arguments: list[str], about: str) -> int:
     else:
         command, more = {"export": export, "convert": convert, "compare": compare, "ablate": ablate}[name](arguments)
         about = f"{about}\n\n{more}"
-    for line in call(command, arguments, f"warpgs {name}", about) or ():
-        say(line)
+    say_lines(call(command, arguments, f"warpgs {name}", about) or ())
     return 0
 
 
@@ -331,9 +328,8 @@ def show_priors() -> Command:
             priors: Networks.
         """
         check_range("--threads", threads, 0, MAX_THREADS)
-        request = SceneRequest(
-            str(scene), split, downscale=downscale, max_side=max_side, allow_outside=allow_outside, max_pixels=max_pixels
-        )
+        sizes = {"downscale": downscale, "max_side": max_side, "max_pixels": max_pixels}
+        request = SceneRequest(str(scene), split, allow_outside=allow_outside, **sizes)
         return commands.show_priors(request, priors, source, out, threads)
 
     return show, "write depth and saliency of each training view as images"

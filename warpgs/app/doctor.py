@@ -129,26 +129,22 @@ def _cuda() -> Iterable[Finding]:
     try:
         import torch
     except Exception as e:
-        yield Finding("CUDA", NOTE, f"not checked: {_reason(e)}", "install torch first")
-        return
+        return [Finding("CUDA", NOTE, f"not checked: {_reason(e)}", "install torch first")]
     if torch.version.cuda is None:
-        yield Finding(
-            "CUDA", NOTE, f"none: this torch ({torch.__version__}) is built without CUDA; {slower}",
-            "with an NVIDIA GPU: install a CUDA build of torch, see pytorch.org/get-started",
-        )  # fmt: skip
-        return
+        remedy = "with an NVIDIA GPU: install a CUDA build of torch, see pytorch.org/get-started"
+        return [Finding("CUDA", NOTE, f"none: this torch ({torch.__version__}) is built without CUDA; {slower}", remedy)]
     if not torch.cuda.is_available():
         driver = "no NVIDIA driver was found" if shutil.which("nvidia-smi") is None else "torch cannot use the driver"
         remedy = f"install a driver that supports CUDA {torch.version.cuda}"
         if os.environ.get("CUDA_VISIBLE_DEVICES") in ("", "-1"):
             driver, remedy = "CUDA_VISIBLE_DEVICES hides every device", "unset CUDA_VISIBLE_DEVICES"
-        yield Finding("CUDA", NOTE, f"none: {driver}; {slower}", f"with an NVIDIA GPU: {remedy}")
-        return
+        return [Finding("CUDA", NOTE, f"none: {driver}; {slower}", f"with an NVIDIA GPU: {remedy}")]
+    found = []
     for i in range(torch.cuda.device_count()):
         p = torch.cuda.get_device_properties(i)
         detail = f"{p.name}, {format_bytes(p.total_memory)}, compute {p.major}.{p.minor}, torch for CUDA {torch.version.cuda}"
-        yield Finding(f"CUDA {i}", OK, detail)
-    yield _warp_cuda()
+        found.append(Finding(f"CUDA {i}", OK, detail))
+    return [*found, _warp_cuda()]
 
 
 def _quiet_warp():
@@ -200,9 +196,8 @@ def _prior_cache() -> Iterable[Finding]:
             pass
     except OSError as e:
         remedy = "set WARPGS_CACHE to a folder that you may write to"
-        yield Finding("Prior cache", NOTE, f"{folder} is not writable ({e.strerror}); networks run again each time", remedy)
-        return
-    yield Finding("Prior cache", OK, f"{folder}, {format_bytes(_size(folder))}, writable")
+        return [Finding("Prior cache", NOTE, f"{folder} is not writable ({e.strerror}); networks run again each time", remedy)]
+    return [Finding("Prior cache", OK, f"{folder}, {format_bytes(_size(folder))}, writable")]
 
 
 def _kernel_cache() -> Iterable[Finding]:
@@ -211,19 +206,15 @@ def _kernel_cache() -> Iterable[Finding]:
     try:
         folder = Path(_quiet_warp().config.kernel_cache_dir)
         refused = prepare_kernel_cache()[1]
-    except ResourceError as e:
-        yield Finding(topic, MISSING, str(e), "set WARP_CACHE_PATH or TMPDIR to a folder that you may write to", True)
-        return
     except Exception as e:
-        yield Finding(topic, MISSING, _reason(e), "fix warp-lang first", True)
-        return
+        known, remedy = isinstance(e, ResourceError), "set WARP_CACHE_PATH or TMPDIR to a folder that you may write to"
+        return [Finding(topic, MISSING, str(e) if known else _reason(e), remedy if known else "fix warp-lang first", True)]
     if refused:
         remedy = "set WARP_CACHE_PATH to a folder that only you may write to"
-        yield Finding(topic, NOTE, f"{refused}; every run compiles its kernels for up to a minute", remedy, True)
-        return
+        return [Finding(topic, NOTE, f"{refused}; every run compiles its kernels for up to a minute", remedy, True)]
     size = _size(folder)
     first = "" if size else "; empty: the first fit compiles for up to a minute"
-    yield Finding(topic, OK, f"{folder}, {format_bytes(size)}, writable{first}", required=True)
+    return [Finding(topic, OK, f"{folder}, {format_bytes(size)}, writable{first}", required=True)]
 
 
 def _video() -> Iterable[Finding]:

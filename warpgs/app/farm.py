@@ -58,8 +58,7 @@ def run(arguments: list[str], about: str) -> int:
 
 def _divided(arguments: list[str]) -> tuple[list[str], list[str]]:
     """Divide the arguments of a command line into those of the farm and those of every fit."""
-    own: list[str] = []
-    shared: list[str] = []
+    own, shared = list[str](), list[str]()
     target = own
     for word in arguments:
         flag, given, _ = word.removeprefix("--").partition("=")

@@ -109,8 +109,7 @@ def _view_modules(arguments: list[str], base: FitConfig) -> Parts:
 
 def _preset(arguments: list[str]) -> tuple[FitConfig, str]:
     """Return the settings that the flags start from, and a description of their source."""
-    name = flags.word_after(arguments, "--preset")
-    base, origin = preset_settings(name)
+    base, origin = preset_settings(flags.word_after(arguments, "--preset"))
     strategy = flags.word_after(arguments, "--strategy")
     if strategy is None or strategy == base.strategy:
         return base, origin
@@ -120,12 +119,11 @@ def _preset(arguments: list[str]) -> tuple[FitConfig, str]:
 
 def _choices() -> str:
     """Return the names that can be chosen, as text for the user."""
-    plug_ins: dict[str, Registry[Any]] = {
-        "strategies": STRATEGIES, "loss terms": LOSS_TERMS, "readers": READERS, "camera models": CAMERA_MODELS,
-        "view modules": VIEW_MODULES,
+    kinds: dict[str, Any] = {
+        "presets": PRESETS, "strategies": STRATEGIES, "loss terms": LOSS_TERMS, "readers": READERS,
+        "camera models": CAMERA_MODELS, "view modules": VIEW_MODULES,
     }  # fmt: skip
-    lines = {"presets": PRESETS.described(), **{title: registry.described() for title, registry in plug_ins.items()}}
-    return "\n\n".join(flags.listed(title, about) for title, about in lines.items())
+    return "\n\n".join(flags.listed(title, kind.described()) for title, kind in kinds.items())
 
 
 def _read_by(metavar: str, read: Callable[[str], Any], kind: type, text: Callable[[Any], str]) -> Any:
@@ -154,8 +152,7 @@ def _flags(base: FitConfig, terms: Parts, modules: Parts) -> type:
     own = {} if base.strategy_config is None else {flag_group(base.strategy): base.strategy_config}
     reading, unread = scene_flags(positional=True)
     fields.append(("reading", Annotated[reading, tyro.conf.arg(name="")], field(default=unread)))
-    kinds = (FitConfig, SceneRequest, Request)
-    taken = {f.name for kind in kinds for f in dataclasses.fields(kind)} | {"config", "reading"}
+    taken = {f.name for kind in (FitConfig, SceneRequest, Request) for f in dataclasses.fields(kind)} | {"config", "reading"}
     for name, settings in [*own.items(), *terms.items(), *modules.items()]:
         if name in taken:
             raise UsageError(f"the plug-in name {name} is taken by a flag of warpgs; rename the plug-in")

@@ -4,6 +4,7 @@ import contextlib
 import dataclasses
 import functools
 import io
+import itertools
 import os
 import re
 import shutil
@@ -15,7 +16,7 @@ from typing import Annotated, Any, TypeVar
 import tyro  # noqa: TID253 - only a command imports this file
 
 from warpgs.errors import UsageError, field_docs
-from warpgs.process import say
+from warpgs.process import say_lines
 
 REMOVED = {"--repeat": "the error of the fit itself names step, view, loss term and tensors"}
 """What replaces flags that are gone, by their names with dashes."""
@@ -99,8 +100,7 @@ def parse_flags(kind: Callable[..., Any], arguments: list[str], program: str, de
             raise UsageError(f"unknown flag {flag}; `{program} --help-all` lists the flags")
         if flag in SPELLED and re.search(f"(parsing|argument) '?{flag}", said):
             raise UsageError(f"{flag}: write it as {flag} {SPELLED[flag]}; `{program} --help-all` shows what it takes")
-    for line in said.splitlines():
-        say(line, error=True)
+    say_lines(said.splitlines(), error=True)
     raise UsageError(f"wrong arguments, as shown above; `{program} --help-all` lists them")
 
 
@@ -143,12 +143,8 @@ def listed(title: str, lines: Mapping[str, str]) -> str:
 def word_after(arguments: list[str], flag: str) -> str | None:
     """Return the value of a flag that determines the other flags; None if it is not given."""
     found = None
-    for i, word in enumerate(arguments):
+    for word, after in itertools.zip_longest(arguments, arguments[1:]):
         name, given, value = word.partition("=")
-        if name.replace("_", "-") != flag:  # tyro accepts _ and -
-            continue
-        if given:
-            found = value
-        elif i + 1 < len(arguments):
-            found = arguments[i + 1]
+        if name.replace("_", "-") == flag:  # tyro accepts _ and -
+            found = value if given else found if after is None else after
     return found

@@ -18,7 +18,7 @@ from typing import Any, BinaryIO, ClassVar
 
 import numpy as np
 
-from warpgs.errors import DataError, UsageError
+from warpgs.errors import DataError, MalformedError, UsageError, expect
 from warpgs.files import open_input, read_input, unread_reason, write_bytes, write_json
 from warpgs.geometry import checked_normalization, convert_gaussians, rotate
 from warpgs.plugins import Registry, returned
@@ -43,9 +43,8 @@ _AXES = (
 
 def malformed(path: Path, what: str) -> DataError:
     """Return a DataError about a file that does not match its suffix, with the fix."""
-    return DataError(
-        f"{path}: not a usable {path.suffix or 'model'} file: {what}. Export the model again, or use another format."
-    )
+    fix = "Export the model again, or use another format."
+    return DataError(f"{path}: not a usable {path.suffix or 'model'} file: {what}. {fix}")
 
 
 def by_rows(n: int, shape: tuple[int, ...], rows: Callable[[slice], np.ndarray]) -> np.ndarray:
@@ -78,6 +77,11 @@ def origin_of(points: np.ndarray) -> np.ndarray:
     return Normalization((low + high) / 2, 1 / (float(np.linalg.norm(high - low)) or 1.0)).origin
 
 
+def origin_comment(origin: np.ndarray | None, start: str = "comment") -> str:
+    """Return the line of a text file that states an origin [3]; empty for 0."""
+    return f"{start} {ORIGIN} {' '.join(map(repr, origin.tolist()))}\n" if origin is not None and origin.any() else ""
+
+
 def side_file(path: Path) -> Path:
     """Return the file that holds the origin of a file in a format without a place for it."""
     return path.with_name(f"{path.name}.origin.json")
@@ -105,8 +109,7 @@ def arrays_to_write(
         origin = normalization.origin
         if units == "file":
             # float32 has lost the digits that an origin would keep
-            exact = gaussians.means.element_size() > 4
-            origin = origin_of(arrays_of(gaussians)["means"]) if exact else np.zeros(3)
+            origin = origin_of(arrays_of(gaussians)["means"]) if gaussians.means.element_size() > 4 else np.zeros(3)
             moved = gaussians.means - gaussians.means.new_tensor(origin) if origin.any() else gaussians.means
             local = replace(gaussians, means=moved)
     for g in (gaussians, local):
@@ -114,10 +117,8 @@ def arrays_to_write(
         for name, array in arrays.items():
             bad = array.size - int(np.isfinite(array).sum())
             if bad:
-                raise DataError(
-                    f"{path}: {bad} of {array.size} values of {name} are not finite; export an earlier checkpoint, or fit "
-                    "again with a lower learning rate"
-                )
+                fix = "export an earlier checkpoint, or fit again with a lower learning rate"
+                raise DataError(f"{path}: {bad} of {array.size} values of {name} are not finite; {fix}")
     logits = arrays["logit_opacities"]
     if logits.size and 0 <= logits.min() < logits.max() <= 1:
         words = "all logit_opacities are in [0, 1], as opacities are; ActivatedGaussians(...).stored() makes logits"
@@ -168,8 +169,7 @@ def usable(
 def sigmoid(logits: np.ndarray) -> np.ndarray:
     """Return 1 / (1 + exp(-x)) in float64 without overflow, in the shape [N] of ``logits``."""
     small = np.exp(-np.abs(logits.astype(np.float64)))
-    result: np.ndarray = np.where(logits >= 0, 1, small) / (1 + small)
-    return result
+    return np.asarray(np.where(logits >= 0, 1, small) / (1 + small))
 
 
 def logits(opacities: np.ndarray, quantum: float) -> np.ndarray:
@@ -189,10 +189,8 @@ def smallest_three(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Split unit quaternions into the index of their largest component and the other three."""
     q = unit_quats(quats)
     largest = np.abs(q).argmax(axis=1)
-    rows = np.arange(len(q))
-    q = q * np.where(q[rows, largest] < 0, -1.0, 1.0)[:, None]
-    keep = np.arange(4)[None] != largest[:, None]
-    return largest, q[keep].reshape(len(q), 3)
+    q = q * np.where(q[np.arange(len(q)), largest] < 0, -1.0, 1.0)[:, None]
+    return largest, q[np.arange(4)[None] != largest[:, None]].reshape(len(q), 3)
 
 
 def from_smallest_three(largest: np.ndarray, others: np.ndarray) -> np.ndarray:
@@ -242,8 +240,7 @@ splat-transform. Lower ones, of axes without length, would take the steps of the
 
 def with_least_scale(log_scales: np.ndarray) -> np.ndarray:
     """Return log scales [N, 3], at least `FLATTEST`."""
-    raised: np.ndarray = np.maximum(log_scales, min(FLATTEST, float(log_scales.max()) + FLATTEST), dtype=log_scales.dtype)
-    return raised
+    return np.asarray(np.maximum(log_scales, min(FLATTEST, float(log_scales.max()) + FLATTEST), dtype=log_scales.dtype))
 
 
 def rounded(values: np.ndarray, most: int) -> np.ndarray:
@@ -275,7 +272,8 @@ def reading(path: Path, whole: bool = False) -> Iterator[BinaryIO]:
         with file, np.errstate(all="ignore"):  # infinities and NaN are named afterwards, with their Gaussian
             yield file
     except BROKEN as e:
-        raise malformed(path, f"its content is invalid ({type(e).__name__}: {str(e)[:80]})") from e
+        own = isinstance(e, MalformedError)
+        raise malformed(path, str(e) if own else f"its content is invalid ({type(e).__name__}: {str(e)[:80]})") from e
 
 
 class Format:
@@ -384,11 +382,9 @@ class Format:
         if self.max_degree == 0:
             arrays["sh"] = arrays["sh"][:, :1]
         elif gaussians.sh_degree > self.max_degree:
-            raise DataError(
-                f"{path}: not written, {self.suffix} files hold harmonics up to degree {self.max_degree}, not "
-                f"{gaussians.sh_degree}. Drop higher degrees with --sh-degree {self.max_degree}, in Python with "
-                f"sh[:, :{(self.max_degree + 1) ** 2}], or write .ply"
-            )
+            most = f"{self.suffix} files hold harmonics up to degree {self.max_degree}, not {gaussians.sh_degree}"
+            fix = f"--sh-degree {self.max_degree}, in Python with sh[:, :{(self.max_degree + 1) ** 2}], or write .ply"
+            raise DataError(f"{path}: not written, {most}. Drop higher degrees with {fix}")
         pieces = returned(self, "encode", self.encode(arrays), Iterable, "an iterable of bytes")
         self.store(path, [returned(self, "encode", p, BYTES, "an iterable of bytes") for p in pieces])
         if type(self).origin_in is Format.origin_in:
@@ -443,38 +439,6 @@ _TINY = 1e-37
 """Least axis length that is written and read: the logarithm of 0 is not finite."""
 
 
-def encode(arrays: Arrays) -> list[bytes]:
-    """Return the bytes of a file; harmonics above degree 0 are lost, and colours outside of [0, 1] clamped."""
-    rows = np.empty(len(arrays["means"]), _ROW)
-    rows["mean"] = arrays["means"]
-    rows["scale"] = np.clip(np.exp(arrays["log_scales"].astype(np.float64)), _TINY, 3e38)
-    rows["rgba"][:, :3] = rounded(255 * base_colors(arrays["sh"][:, :1].astype(np.float64)), 255)
-    rows["rgba"][:, 3] = rounded(255 * sigmoid(arrays["logit_opacities"]), 255)
-    rows["quat"] = rounded(128 * unit_quats(arrays["quats"]) + 128, 255)
-    return [rows.tobytes()]
-
-
-def decode(path: Path, data: bytes) -> Arrays:
-    """Return the Gaussians of a file's bytes."""
-    if not data:
-        raise malformed(path, "it is empty")
-    if len(data) % _ROW.itemsize:
-        raise malformed(path, f"its {len(data)} bytes are not a multiple of {_ROW.itemsize}")
-    rows = np.frombuffer(data, _ROW)
-    n = len(rows)
-    for part in parts(n):
-        if (rows["scale"][part] < 0).any():
-            row = part.start + int(np.argwhere(rows["scale"][part] < 0)[0][0])
-            raise malformed(path, f"an axis of Gaussian {row} has a negative length")
-    return {
-        "means": by_rows(n, (3,), lambda p: rows["mean"][p]),
-        "quats": by_rows(n, (4,), lambda p: (rows["quat"][p].astype(np.float64) - 128) / 128),
-        "log_scales": by_rows(n, (3,), lambda p: np.log(np.maximum(rows["scale"][p].astype(np.float64), _TINY))),
-        "logit_opacities": by_rows(n, (), lambda p: logits(rows["rgba"][p, 3] / 255, 1 / 255)),
-        "sh": by_rows(n, (1, 3), lambda p: base_coefficients(rows["rgba"][p, None, :3].astype(np.float64) / 255)),
-    }
-
-
 @register("splat")
 class Splat(Format):
     """The .splat format."""
@@ -482,8 +446,33 @@ class Splat(Format):
     suffix = ".splat"
     description = "antimatter15, 8 bits, no view-dependent colours; small viewers"
     max_degree = 0
-    encode = staticmethod(encode)
-    decode = staticmethod(decode)
+
+    def encode(self, arrays: Arrays) -> list[bytes]:
+        """Return the bytes of a file; harmonics above degree 0 are lost, and colours outside of [0, 1] clamped."""
+        rows = np.empty(len(arrays["means"]), _ROW)
+        rows["mean"] = arrays["means"]
+        rows["scale"] = np.clip(np.exp(arrays["log_scales"].astype(np.float64)), _TINY, 3e38)
+        rows["rgba"][:, :3] = rounded(255 * base_colors(arrays["sh"][:, :1].astype(np.float64)), 255)
+        rows["rgba"][:, 3] = rounded(255 * sigmoid(arrays["logit_opacities"]), 255)
+        rows["quat"] = rounded(128 * unit_quats(arrays["quats"]) + 128, 255)
+        return [rows.tobytes()]
+
+    def decode(self, path: Path, data: bytes) -> Arrays:
+        """Return the Gaussians of a file's bytes."""
+        expect(data, "it is empty")
+        expect(len(data) % _ROW.itemsize == 0, f"its {len(data)} bytes are not a multiple of {_ROW.itemsize}")
+        rows = np.frombuffer(data, _ROW)
+        n = len(rows)
+        for part in parts(n):
+            negative = (rows["scale"][part] < 0).any(1)
+            expect(not negative.any(), f"an axis of Gaussian {part.start + int(negative.argmax())} has a negative length")
+        return {
+            "means": by_rows(n, (3,), lambda p: rows["mean"][p]),
+            "quats": by_rows(n, (4,), lambda p: (rows["quat"][p].astype(np.float64) - 128) / 128),
+            "log_scales": by_rows(n, (3,), lambda p: np.log(np.maximum(rows["scale"][p].astype(np.float64), _TINY))),
+            "logit_opacities": by_rows(n, (), lambda p: logits(rows["rgba"][p, 3] / 255, 1 / 255)),
+            "sh": by_rows(n, (1, 3), lambda p: base_coefficients(rows["rgba"][p, None, :3].astype(np.float64) / 255)),
+        }
 
 
 def all_formats() -> list[Format]:
@@ -504,9 +493,8 @@ def find_format(choice: str | type[Format] | Format) -> Format:
     """
     if not isinstance(choice, (str, type, Format)):
         raise UsageError(f"{choice!r} is not a format; give a name, module:Class, or a class or object of warpgs.Format")
-    found = (
-        choice if isinstance(choice, Format) else FORMATS.load(choice)() if isinstance(choice, str) else FORMATS.find(choice)()
-    )
+    kind = FORMATS.load(choice) if isinstance(choice, str) else choice if isinstance(choice, Format) else FORMATS.find(choice)
+    found = kind if isinstance(kind, Format) else kind()
     if not re.fullmatch(r"(\.[a-z0-9_-]+)+", found.suffix):
         raise UsageError(f"the suffix {found.suffix!r} of {type(found).__name__} must be a dot and lower-case letters, digits")
     return found
@@ -520,19 +508,17 @@ def format_of(path: str | os.PathLike[str], choice: str | type[Format] | Format 
             raise UsageError(f"{path}: expected a name that ends in {chosen.suffix}, for the format {chosen.name}")
         return chosen
     known = all_formats()
-    for kind in known:
-        if kind.fits(path):
-            return kind
+    if (kind := next((k for k in known if k.fits(path)), None)) is not None:
+        return kind
     name = Path(path).name.lower()
     if name.endswith(".htm"):
         raise UsageError(f"{path}: format .htm is not supported; did you mean {path}l?")
     if (Path(path) / "meta.json").is_file():
         raise UsageError(f"{path}: is the folder of a SOG model; give {Path(path) / 'meta.json'}")
     cameras = "; cameras are named cameras.json, transforms.json or sparse" if name.endswith(".json") else ""
-    raise UsageError(
-        f"{path}: format {Path(path).suffix or '(none)'} is not supported; use one of {', '.join(k.suffix for k in known)}, or "
-        f"give a format of your own{cameras}. `warpgs export` makes a page, too (.html), and `warpgs mesh` a mesh (.ply, .glb)"
-    )
+    one = f"use one of {', '.join(k.suffix for k in known)}, or give a format of your own{cameras}"
+    others = "`warpgs export` makes a page, too (.html), and `warpgs mesh` a mesh (.ply, .glb)"
+    raise UsageError(f"{path}: format {Path(path).suffix or '(none)'} is not supported; {one}. {others}")
 
 
 def write_gaussians(

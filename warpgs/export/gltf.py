@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from warpgs.errors import expect
 from warpgs.export import base
 from warpgs.geometry import pose_of, rotation_matrices
 from warpgs.scene import ORIGIN, base_colors
@@ -101,46 +102,38 @@ def _document(arrays: base.Arrays, origin: np.ndarray | None) -> tuple[dict[str,
 
 def decode(path: Path, data: bytes) -> base.Arrays:
     """Return the Gaussians of a .glb or .gltf file's bytes, in the axes of PLY."""
-    document, body = _split(path, data)
+    document, body = _split(data)
     buffers = document.get("buffers")
-    if not isinstance(buffers, list) or len(buffers) != 1 or not isinstance(buffers[0], dict):
-        raise base.malformed(path, "it does not have exactly one buffer")
+    one = isinstance(buffers, list) and len(buffers) == 1 and isinstance(buffers[0], dict)
+    expect(one, "it does not have exactly one buffer")
     if (uri := buffers[0].get("uri")) is not None:
-        body = _inside(path, uri)
-    primitive, mesh = _primitive(path, document)
-    names, places = primitive["attributes"], _places(path, document, mesh)
+        body = _inside(uri)
+    primitive, mesh = _primitive(document)
+    names, places = primitive["attributes"], _places(document, mesh)
 
     def values(name: str) -> np.ndarray:
-        if name not in names:
-            raise base.malformed(path, f"the attribute {name} is missing")
-        return _accessor(path, document, body, names[name], whole=name in ("POSITION", f"{EXTENSION}:SCALE"))
+        expect(name in names, f"the attribute {name} is missing")
+        return _accessor(document, body, names[name], whole=name in ("POSITION", f"{EXTENSION}:SCALE"))
 
     degrees = [d for d in range(4) if f"{EXTENSION}:SH_DEGREE_{d}_COEF_0" in names]
-    if degrees != list(range(len(degrees))) or not degrees:
-        raise base.malformed(path, f"it has harmonics of degrees {degrees}, but degrees must start at 0 and have no gap")
+    whole = degrees and degrees == list(range(len(degrees)))
+    expect(whole, f"it has harmonics of degrees {degrees}, but degrees must start at 0 and have no gap")
     orders = [(math.isqrt(k), k - math.isqrt(k) ** 2) for k in range(base.SH_SIZES[degrees[-1]])]
-    means, turns, scales, opacities = (
-        values(name) for name in ("POSITION", *(f"{EXTENSION}:{n}" for n in ("ROTATION", "SCALE", "OPACITY")))
-    )
+    means = values("POSITION")
+    turns, scales, opacities = (values(f"{EXTENSION}:{name}") for name in ("ROTATION", "SCALE", "OPACITY"))
     harmonics = [values(f"{EXTENSION}:SH_DEGREE_{d}_COEF_{c}") for d, c in orders]
     n = len(means)
-    if any(len(v) != n for v in (turns, scales, opacities, *harmonics)):
-        raise base.malformed(path, "its attributes differ in length")
-    if {v.shape[1] for v in (means, scales, *harmonics)} != {3}:
-        raise base.malformed(path, "a position, scale or harmonic does not have three components")
+    expect(all(len(v) == n for v in (turns, scales, opacities, *harmonics)), "its attributes differ in length")
+    three = {v.shape[1] for v in (means, scales, *harmonics)} == {3}
+    expect(three, "a position, scale or harmonic does not have three components")
 
     def logs(part: slice) -> np.ndarray:
         lengths = _rows(scales, part)
-        if (lengths < 0).any():
-            raise base.malformed(path, "an axis has a negative length")
+        expect(not (lengths < 0).any(), "an axis has a negative length")
         return np.log(np.maximum(lengths, _TINY))
 
-    sh = np.empty((n, len(harmonics), 3), np.float32)
-    for k, table in enumerate(harmonics):
-        for part in base.parts(n):
-            sh[part, k] = _rows(table, part)
     arrays = {
-        "sh": sh,
+        "sh": base.by_rows(n, (len(harmonics), 3), lambda p: np.stack([_rows(table, p) for table in harmonics], 1)),
         "means": base.by_rows(n, (3,), lambda p: _rows(means, p)),
         "quats": base.by_rows(n, (4,), lambda p: _rows(turns, p)[:, [3, 0, 1, 2]]),
         "log_scales": base.by_rows(n, (3,), logs),
@@ -157,34 +150,32 @@ def decode(path: Path, data: bytes) -> base.Arrays:
     return arrays
 
 
-def _places(path: Path, document: dict[str, Any], mesh: int) -> list[np.ndarray]:
+def _places(document: dict[str, Any], mesh: int) -> list[np.ndarray]:
     """Return the transformation [4, 4] of each node that shows a mesh, with those of its parents."""
     nodes = document.get("nodes", [])
     below = {str(child) for n in nodes for child in n.get("children", [])}
     roots = [i for i in range(len(nodes)) if str(i) not in below]
     if document.get("scenes"):
-        roots = list(_item(path, document, "scenes", document.get("scene", 0)).get("nodes", []))
+        roots = list(_item(document, "scenes", document.get("scene", 0)).get("nodes", []))
     left, seen, found = [(i, np.eye(4)) for i in reversed(roots)], set(), []
     while left:
         i, above = left.pop()
-        node, place = _item(path, document, "nodes", i), above @ _matrix_of(_item(path, document, "nodes", i))
-        if i in seen:
-            raise base.malformed(path, f"node {i} has two parents")
+        node = _item(document, "nodes", i)
+        place = above @ _matrix_of(node)
+        expect(i not in seen, f"node {i} has two parents")
         seen.add(i)
         left += [(child, place) for child in reversed(node.get("children", []))]
         if node.get("mesh") == mesh:
-            if "EXT_mesh_gpu_instancing" in (node.get("extensions") or ()):
-                raise base.malformed(path, f"node {i} repeats the Gaussians (EXT_mesh_gpu_instancing), which is not supported")
+            repeated = "EXT_mesh_gpu_instancing" in (node.get("extensions") or ())
+            expect(not repeated, f"node {i} repeats the Gaussians (EXT_mesh_gpu_instancing), which is not supported")
             product = place[:3, :3].T @ place[:3, :3]
             square = np.trace(product) / 3
-            if not (square > 0 and np.isfinite(place).all() and np.abs(product / square - np.eye(3)).max() <= MAX_SHEAR):
-                raise base.malformed(
-                    path,
-                    f"node {i} scales Gaussians by different factors, 0 or with shear; apply that scale in another program",
-                )
+            alike = square > 0 and np.isfinite(place).all() and np.abs(product / square - np.eye(3)).max() <= MAX_SHEAR
+            scales = f"node {i} scales Gaussians by different factors, 0 or with shear"
+            expect(alike, f"{scales}; apply that scale in another program")
             found.append(place)
-    if len(found) > MAX_COPIES or (not found and any(n.get("mesh") == mesh for n in nodes)):
-        raise base.malformed(path, f"its scene shows the Gaussians {len(found)} times (supported: 1 to {MAX_COPIES})")
+    shown = len(found) <= MAX_COPIES and (found or not any(n.get("mesh") == mesh for n in nodes))
+    expect(shown, f"its scene shows the Gaussians {len(found)} times (supported: 1 to {MAX_COPIES})")
     return found or [np.eye(4)]
 
 
@@ -204,93 +195,83 @@ def _rows(block: np.ndarray, part: slice) -> np.ndarray:
     return np.maximum(block[part] / float(np.iinfo(block.dtype).max), -1.0)
 
 
-def _split(path: Path, data: bytes) -> tuple[dict[str, Any], bytes | memoryview]:
+def _split(data: bytes) -> tuple[dict[str, Any], bytes | memoryview]:
     """Return the document and the binary chunk (maybe empty) of a file."""
     body: bytes | memoryview = b""
     if data[:4] == b"glTF":
-        if len(data) < 20:
-            raise base.malformed(path, "its header is truncated")
+        expect(len(data) >= 20, "its header is truncated")
         _, version, total, size, kind = struct.unpack_from("<IIIII", data)
-        if version != 2 or kind != JSON_CHUNK or not 20 + size <= total <= len(data):
-            raise base.malformed(path, f"its header is invalid: version {version}, {total} bytes, in a file of {len(data)}")
+        sound = version == 2 and kind == JSON_CHUNK and 20 + size <= total <= len(data)
+        expect(sound, f"its header is invalid: version {version}, {total} bytes, in a file of {len(data)}")
         text, rest = data[20 : 20 + size], memoryview(data)[20 + size : total]
         if len(rest) >= 8:
             size, kind = struct.unpack_from("<II", rest)
-            if kind != BINARY_CHUNK:
-                raise base.malformed(path, f"its second chunk is not binary: type {kind:#010x}")
-            if size > len(rest) - 8:
-                raise base.malformed(path, f"its binary chunk of {size} bytes is truncated")
+            expect(kind == BINARY_CHUNK, f"its second chunk is not binary: type {kind:#010x}")
+            expect(size <= len(rest) - 8, f"its binary chunk of {size} bytes is truncated")
             body = rest[8 : 8 + size]
     else:
         text = data
-    if text.count(b"[") + text.count(b"{") > MAX_PARTS:
-        raise base.malformed(path, f"its JSON has more than {MAX_PARTS:,} lists and objects")
-    if text.count(b",") > MAX_VALUES:
-        raise base.malformed(path, f"its JSON has more than {MAX_VALUES:,} values")
+    expect(text.count(b"[") + text.count(b"{") <= MAX_PARTS, f"its JSON has more than {MAX_PARTS:,} lists and objects")
+    expect(text.count(b",") <= MAX_VALUES, f"its JSON has more than {MAX_VALUES:,} values")
     document = json.loads(text)
-    if not isinstance(document, dict):
-        raise base.malformed(path, "its JSON is not an object")
+    expect(isinstance(document, dict), "its JSON is not an object")
     return document, body
 
 
-def _inside(path: Path, uri: object) -> bytes:
+def _inside(uri: object) -> bytes:
     """Return the bytes of a data URI; other URIs are rejected, so that a file cannot choose other files to open."""
     head, comma, text = uri.partition(",") if isinstance(uri, str) else ("", "", "")
-    if not (head.startswith("data:") and head.endswith(";base64") and comma):
-        raise base.malformed(path, "its numbers are in another file, which is not opened; combine both into one .glb")
+    embedded = head.startswith("data:") and head.endswith(";base64") and comma
+    expect(embedded, "its numbers are in another file, which is not opened; combine both into one .glb")
     return base64.b64decode(text, validate=True)
 
 
-def _primitive(path: Path, document: dict[str, Any]) -> tuple[dict[str, Any], int]:
+def _primitive(document: dict[str, Any]) -> tuple[dict[str, Any], int]:
     """Return the one primitive of Gaussians and the number of its mesh; DataError for features that are not supported."""
-    if unknown := [str(e)[:40] for e in document.get("extensionsRequired", []) if e not in SUPPORTED]:
-        raise base.malformed(path, f"it requires the extension {unknown[0]}, which is not supported")
+    for name in document.get("extensionsRequired", []):
+        expect(name in SUPPORTED, f"it requires the extension {str(name)[:40]}, which is not supported")
     primitives = [(p, i) for i, mesh in enumerate(document.get("meshes", [])) for p in mesh["primitives"]]
     found = [(p, i) for p, i in primitives if EXTENSION in p.get("extensions", {})]
-    if len(found) != 1:
-        raise base.malformed(path, f"it has {len(found)} primitives with {EXTENSION}; exactly one is supported")
+    expect(len(found) == 1, f"it has {len(found)} primitives with {EXTENSION}; exactly one is supported")
     extension = found[0][0]["extensions"][EXTENSION]
     kernel, space = extension.get("kernel"), extension.get("colorSpace")
-    if (kernel, space) != ("ellipse", COLOR_SPACE):
-        given = f"kernel {str(kernel)[:40]!r} or colour space {str(space)[:40]!r} is not supported"
-        raise base.malformed(path, f"{given} (supported: 'ellipse', {COLOR_SPACE!r})")
-    if extension.get("extensions"):
-        raise base.malformed(path, "its Gaussians are compressed by a further extension; export them uncompressed")
+    given = f"kernel {str(kernel)[:40]!r} or colour space {str(space)[:40]!r} is not supported"
+    expect((kernel, space) == ("ellipse", COLOR_SPACE), f"{given} (supported: 'ellipse', {COLOR_SPACE!r})")
+    expect(not extension.get("extensions"), "its Gaussians are compressed by a further extension; export them uncompressed")
     return found[0]
 
 
-def _item(path: Path, document: dict[str, Any], table: str, at: object) -> dict[str, Any]:
+def _item(document: dict[str, Any], table: str, at: object) -> dict[str, Any]:
     """Return an object of a list of the document."""
     rows = document.get(table)
-    if not isinstance(rows, list) or type(at) is not int or not 0 <= at < len(rows) or not isinstance(rows[at], dict):
-        raise base.malformed(path, f"{table} {str(at)[:20]} does not exist")
-    row: dict[str, Any] = rows[at]
-    return row
+    there = isinstance(rows, list) and type(at) is int and 0 <= at < len(rows) and isinstance(rows[at], dict)
+    expect(there, f"{table} {str(at)[:20]} does not exist")
+    return rows[at]
 
 
-def _accessor(path: Path, document: dict[str, Any], body: bytes | memoryview, index: object, whole: bool) -> np.ndarray:
+def _accessor(document: dict[str, Any], body: bytes | memoryview, index: object, whole: bool) -> np.ndarray:
     """Return the numbers of an accessor, checked to lie in the file; ``whole`` to allow integers that are not normalised."""
 
     def count(row: dict[str, Any], key: str, default: int | None = None) -> int:
         value = row.get(key, default)
-        if type(value) is not int or not 0 <= value <= len(body):
-            raise base.malformed(path, f"{key} {str(value)[:20]!r} does not fit into the {len(body)} bytes of its buffer")
+        fits = type(value) is int and 0 <= value <= len(body)
+        expect(fits, f"{key} {str(value)[:20]!r} does not fit into the {len(body)} bytes of its buffer")
         return value
 
-    accessor = _item(path, document, "accessors", index)
-    view = _item(path, document, "bufferViews", accessor.get("bufferView"))
+    accessor = _item(document, "accessors", index)
+    view = _item(document, "bufferViews", accessor.get("bufferView"))
     kind, width = _KINDS.get(accessor.get("componentType")), _WIDTHS.get(accessor.get("type"))
-    if kind is None or width is None or "sparse" in accessor or view.get("buffer") != 0:
-        raise base.malformed(path, f"accessor {index} has an unsupported type")
+    plain = kind and width and "sparse" not in accessor and view.get("buffer") == 0
+    expect(plain, f"accessor {index} has an unsupported type")
     normalized = accessor.get("normalized") is True
-    if kind != "<f4" and not (normalized or whole):
-        raise base.malformed(path, f"accessor {index} contains integers that are not normalised")
+    expect(kind == "<f4" or normalized or whole, f"accessor {index} contains integers that are not normalised")
     dtype = np.dtype(kind)
     size, rows = dtype.itemsize * width, count(accessor, "count")
     stride = count(view, "byteStride", size) or size
     start, offset, length = count(view, "byteOffset", 0), count(accessor, "byteOffset", 0), count(view, "byteLength")
-    if stride < size or start + length > len(body) or (rows and offset + (rows - 1) * stride + size > length):
-        raise base.malformed(path, f"accessor {index} reaches beyond its {length} bytes")
+    last = offset + (rows - 1) * stride + size if rows else 0
+    within = stride >= size and start + length <= len(body) and last <= length
+    expect(within, f"accessor {index} reaches beyond its {length} bytes")
     if not rows:
         return np.empty((0, width), np.float32)
     numbers = np.ndarray((rows, width), dtype, body, start + offset, (stride, dtype.itemsize))
@@ -312,13 +293,13 @@ class BinaryGltf(base.Format):
     def origin_in(self, path: Path) -> object:
         """Return the origin in the document's extras."""
         with base.reading(path, whole=True) as file:
-            extras = _split(path, file.read())[0].get("extras")
+            extras = _split(file.read())[0].get("extras")
         return extras.get(ORIGIN) if isinstance(extras, dict) else None
 
     def is_own(self, path: Path) -> bool:
         """Return whether the document names warpgs as its generator."""
         with base.reading(path, whole=True) as file:
-            return bool(_split(path, file.read())[0].get("asset") == {"version": "2.0", "generator": "warpgs"})
+            return bool(_split(file.read())[0].get("asset") == {"version": "2.0", "generator": "warpgs"})
 
 
 @base.register("gltf")

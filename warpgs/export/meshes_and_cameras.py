@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from warpgs.errors import DataError, UsageError
+from warpgs.export.base import origin_comment
 from warpgs.export.gltf import glb, linear
 from warpgs.files import filling, is_empty, make_folder, write_bytes, write_json, write_text
 from warpgs.geometry import pinhole_of, pose_of, quaternions
@@ -42,15 +43,8 @@ def write_mesh(
         raise DataError(f"{path}: not written, the mesh holds numbers that are not finite; make it again")
     if mesh.faces.size and not (mesh.faces.min() >= 0 and mesh.faces.max() < len(mesh.vertices)):
         raise DataError(f"{path}: not written, a triangle refers to a missing vertex; make the mesh again")
-    if path.suffix.lower() == ".ply":
-        write_bytes(path, *_ply(mesh, origin))
-    else:
-        write_bytes(path, *_glb(path, mesh, None if up is None else rotation_to_y(up, ahead), origin))
-
-
-def _comment(start: str, origin: np.ndarray) -> str:
-    """Return the line of a text file that states an origin [3]; empty for 0."""
-    return f"{start} {ORIGIN} {' '.join(map(repr, origin.tolist()))}\n" if origin.any() else ""
+    turn = None if up is None else rotation_to_y(up, ahead)
+    write_bytes(path, *(_ply(mesh, origin) if path.suffix.lower() == ".ply" else _glb(path, mesh, turn, origin)))
 
 
 def _stated(origin: np.ndarray) -> dict[str, object]:
@@ -61,7 +55,7 @@ def _stated(origin: np.ndarray) -> dict[str, object]:
 def _ply(mesh: Mesh, origin: np.ndarray) -> list[bytes]:
     """Return header, vertices and faces: float32 positions, 8-bit colours, lists of three int32."""
     header = (
-        f"ply\nformat binary_little_endian 1.0\ncomment warpgs {__version__}\n{_comment('comment', origin)}"
+        f"ply\nformat binary_little_endian 1.0\ncomment warpgs {__version__}\n{origin_comment(origin)}"
         f"element vertex {len(mesh.vertices)}\n"
         "property float x\nproperty float y\nproperty float z\n"
         "property uchar red\nproperty uchar green\nproperty uchar blue\n"
@@ -90,8 +84,7 @@ def rotation_to_y(up: np.ndarray, ahead: np.ndarray | None = None) -> list[float
     if y < -1 + 1e-12:
         return [1.0, 0.0, 0.0, 0.0]
     q = np.array([-z, 0.0, x, 1.0 + y])  # cross product of up and +y, and 1 plus their dot product
-    unit: list[float] = (q / np.linalg.norm(q)).tolist()
-    return unit
+    return (q / np.linalg.norm(q)).tolist()
 
 
 def _jpeg(pixels: np.ndarray) -> bytes:
@@ -206,16 +199,14 @@ def write_cameras(
         with filling(path) as temporary:
             make_folder(temporary / "0")
             for name, text in _colmap(images, cameras, points).items():
-                write_text(temporary / "0" / name, _comment("#", origin) + text)
+                write_text(temporary / "0" / name, origin_comment(origin, "#") + text)
     else:
         stems = images if names is not None else [name.removesuffix(".png") for name in images]
         write_json(path, [_inria(i, n, c) | _stated(origin) for i, (n, c) in enumerate(zip(stems, cameras))])
         off = max((max(abs(c.K[0, 2] - c.width / 2), abs(c.K[1, 2] - c.height / 2)) for c in cameras), default=0.0)
         if off > MAX_OFF_CENTER:
-            notes.append(
-                "cameras.json stores no principal points, which are up to "
-                f"{off:.1f} px off the image centre; write transforms.json to keep them"
-            )
+            fix = "write transforms.json to keep them"
+            notes.append(f"cameras.json stores no principal points, which are up to {off:.1f} px off the image centre; {fix}")
     return notes
 
 
@@ -251,15 +242,11 @@ def _colmap(names: list[str], cameras: list[Camera], points: tuple[np.ndarray, n
         lens = (c.width, c.height, *(float(v) for v in (c.K[0, 0], c.K[1, 1], c.K[0, 2], c.K[1, 2])))
         number = lenses.setdefault(lens, len(lenses) + 1)
         values = [*quat, *(float(v) for v in c.viewmat[:3, 3])]
-        name = names[i - 1]
-        rows.append(f"{i} {' '.join(map(repr, values))} {number} {name}\n\n")  # the second line would hold its points
+        rows.append(f"{i} {' '.join(map(repr, values))} {number} {names[i - 1]}\n\n")  # the second line would hold its points
     positions, colors = (np.empty((0, 3)),) * 2 if points is None else points
-    levels = np.round(255 * np.clip(colors, 0, 1)).astype(int).tolist()
+    shown = enumerate(zip(positions.tolist(), np.round(255 * np.clip(colors, 0, 1)).astype(int).tolist()), 1)
     return {
         "cameras.txt": "".join(f"{n} PINHOLE {' '.join(map(repr, lens))}\n" for lens, n in lenses.items()),
         "images.txt": "".join(rows),
-        "points3D.txt": "".join(
-            f"{i} {' '.join(map(repr, place))} {' '.join(map(str, color))} 0\n"
-            for i, (place, color) in enumerate(zip(positions.tolist(), levels), 1)
-        ),
+        "points3D.txt": "".join(f"{i} {' '.join(map(repr, xyz))} {' '.join(map(str, rgb))} 0\n" for i, (xyz, rgb) in shown),
     }

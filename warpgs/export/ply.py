@@ -12,9 +12,9 @@ from pathlib import Path
 
 import numpy as np
 
-from warpgs.errors import DataError
+from warpgs.errors import DataError, expect
 from warpgs.export import base
-from warpgs.files import replacing
+from warpgs.files import PLY_TYPES, replacing
 from warpgs.geometry import checked_normalization
 from warpgs.scene import ORIGIN, Gaussians, Normalization, base_coefficients, base_colors, checked_origin
 
@@ -22,11 +22,7 @@ MAX_HEADER_BYTES = 65536
 """Largest accepted header [bytes]; real headers have some two thousand."""
 REMEDY = "Export the model again with warpgs, or with any tool that writes the binary layout of the INRIA 3DGS code."
 
-_TYPES = {
-    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "<i2", "int16": "<i2", "ushort": "<u2", "uint16": "<u2",
-    "int": "<i4", "int32": "<i4", "uint": "<u4", "uint32": "<u4", "float": "<f4", "float32": "<f4", "double": "<f8",
-    "float64": "<f8",
-}  # fmt: skip
+_TYPES = {name: kind if kind.endswith("1") else f"<{kind}" for name, kind in PLY_TYPES.items()}
 _FORMATS = {"binary_little_endian 1.0": "<", "binary_big_endian 1.0": ">", "ascii 1.0": "<"}
 """Formats that are read, with their byte order in numpy; the numbers of an ASCII file do not need one."""
 ASCII = re.compile(rb"^format[ \t]+ascii", re.MULTILINE)
@@ -43,13 +39,8 @@ def mode_comments(antialiased: bool) -> tuple[str, str]:
     return f"comment SplatRenderMode: {'mip' if antialiased else 'default'}", f"comment antialiased {int(antialiased)}"
 
 
-def origin_comment(origin: np.ndarray | None) -> list[str]:
-    """Return the comment that states an origin [3], if it is not 0."""
-    return [] if origin is None or not origin.any() else [f"comment {ORIGIN} {' '.join(map(repr, origin.tolist()))}"]
-
-
 def origin_stated(head: bytes) -> list[str] | None:
-    """Return the words of the comment that `origin_comment` made; None without one."""
+    """Return the words of the comment that `base.origin_comment` made; None without one."""
     line = re.search(rf"^comment {ORIGIN} (.*)$".encode(), head.partition(b"end_header")[0], re.MULTILINE)
     return None if line is None else line[1].decode("utf-8", "replace").split()
 
@@ -59,25 +50,16 @@ def is_own(head: bytes) -> bool:
     return any("\n".join(mode_comments(antialiased)).encode() in head for antialiased in (True, False))
 
 
-def is_antialiased(head: bytes) -> bool:
-    """Return whether a parsed header declares antialiasing; the last such comment decides."""
-    found = False
-    for line in head.partition(b"end_header")[0].decode("utf-8", "replace").lower().replace(":", " ").splitlines():
-        match line.split():
-            case ["comment", "splatrendermode", mode]:
-                found = mode == "mip"
-            case ["comment", "antialiased", value]:
-                found = value in ("1", "true")
-    return found
-
-
 def ply_error(path: Path, what: str) -> DataError:
     """Return a DataError about a malformed file, with the remedy."""
     return DataError(f"{path}: not a usable Gaussian PLY file: {what}. {REMEDY}")
 
 
-def parse_header(path: Path, head: bytes) -> tuple[list[Element], int]:
-    """Return the elements of the header in the first bytes of a file, and the offset [bytes] of the data behind it."""
+def parse_header(path: Path, head: bytes) -> tuple[list[Element], int, bool]:
+    """Return the elements of the header in the first bytes of a file, and the offset [bytes] of the data behind it.
+
+    Also returns whether it declares antialiasing; the last such comment decides.
+    """
     if not re.match(rb"ply[ \t]*\r?\n", head):
         raise ply_error(path, "it does not start with 'ply'")
     end = re.search(rb"^end_header[ \t]*\r?\n", head, re.MULTILINE)
@@ -86,15 +68,18 @@ def parse_header(path: Path, head: bytes) -> tuple[list[Element], int]:
     lines = head[: end.start()].decode("utf-8", "replace").split("\n")[1:]  # comments may have any encoding
 
     elements: list[Element] = []
-    formats = []
+    formats, antialiased = [], False
     for line in lines:
         match line.split():
             case ["comment", *words]:
-                mode = " ".join(words).lower().replace(":", " ").split()
-                if mode[:1] == ["splatrendermode"] and len(mode) == 2 and mode[1] not in ("default", "mip"):
-                    raise DataError(
-                        f"{path}: render mode {mode[1][:40]!r} is not supported; train or export with mode 'default' or 'mip'"
-                    )
+                match " ".join(words).lower().replace(":", " ").split():
+                    case ["splatrendermode", "default" | "mip" as mode]:
+                        antialiased = mode == "mip"
+                    case ["splatrendermode", mode]:
+                        fix = "train or export with mode 'default' or 'mip'"
+                        raise DataError(f"{path}: render mode {mode[:40]!r} is not supported; {fix}")
+                    case ["antialiased", value]:
+                        antialiased = value in ("1", "true")
             case [] | ["obj_info", *_]:
                 pass
             case ["format", *words]:
@@ -112,7 +97,7 @@ def parse_header(path: Path, head: bytes) -> tuple[list[Element], int]:
         raise ply_error(path, f"its format is {given}, not one of {', '.join(_FORMATS)}")
     order = _FORMATS[formats[0]]
     elements = [(name, n, [(key, kind.replace("<", order)) for key, kind in given]) for name, n, given in elements]
-    return elements, end.end()
+    return elements, end.end(), antialiased
 
 
 # The compressed PLY of PlayCanvas and SuperSplat: 16 bytes a Gaussian, and one more byte per harmonic and channel.
@@ -152,14 +137,11 @@ def encode(arrays: base.Arrays, antialiased: bool, origin: np.ndarray | None = N
     rows = np.stack([position, rotation, scale, _pack(rgba, (8, 8, 8, 8))], 1).astype("<u4")
     rest = arrays["sh"][:, 1:].astype(np.float64).transpose(0, 2, 1).reshape(n, -1)
     harmonics = np.clip(np.floor((rest / SH_RANGE + 0.5) * 256), 0, 255).astype("u1")
-    lines = ["ply", "format binary_little_endian 1.0", *mode_comments(antialiased), *origin_comment(origin)]
-    lines.append(f"element chunk {len(bounds[0])}")
-    lines += [f"property float {name}" for name in _CHUNK_NAMES]
+    lines = [f"element chunk {len(bounds[0])}", *(f"property float {name}" for name in _CHUNK_NAMES)]
     lines += [f"element vertex {n}", *(f"property uint {name}" for name in _VERTEX_NAMES)]
     if k > 1:
         lines += [f"element sh {n}", *(f"property uchar f_rest_{i}" for i in range(3 * (k - 1)))]
-    header = ("\n".join([*lines, "end_header"]) + "\n").encode("ascii")
-    return [header, np.concatenate(bounds, 1).tobytes(), rows.tobytes(), harmonics.tobytes()]
+    return [_header(lines, antialiased, origin), np.concatenate(bounds, 1).tobytes(), rows.tobytes(), harmonics.tobytes()]
 
 
 def start_of(path: Path) -> bytes:
@@ -172,29 +154,26 @@ def start_of(path: Path) -> bytes:
 
 def is_compressed(path: Path, data: bytes) -> bool:
     """Return whether the header of a .ply file announces this format; DataError if the file has no header."""
-    elements, _ = parse_header(path, data[:MAX_HEADER_BYTES])
+    elements, *_ = parse_header(path, data[:MAX_HEADER_BYTES])
     return any(name == "vertex" and "packed_position" in dict(properties) for name, _, properties in elements)
 
 
 def decode(path: Path, data: bytes) -> base.Arrays:
     """Return the Gaussians of a file's bytes."""
-    elements, start = parse_header(path, data[:MAX_HEADER_BYTES])
-    if ASCII.search(data[:start]):
-        raise base.malformed(path, "it is compressed, but in ASCII")
+    elements, start, _ = parse_header(path, data[:MAX_HEADER_BYTES])
+    expect(not ASCII.search(data[:start]), "it is compressed, but in ASCII")
     tables = {}
     for element in elements:
         name, _, properties = element
-        if name in tables or not properties or LIST in dict(properties).values():
-            raise base.malformed(path, f"its element {name[:40]!r} is invalid")
-        tables[name], start = _table(path, data, element, start)
-    chunk, vertex, sh = tables.get("chunk"), tables.get("vertex"), tables.get("sh")
-    if chunk is None or vertex is None:
-        raise base.malformed(path, "the element chunk or vertex is missing")
+        sound = name not in tables and properties and LIST not in dict(properties).values()
+        expect(sound, f"its element {name[:40]!r} is invalid")
+        tables[name], start = _table(data, element, start)
+    expect({"chunk", "vertex"} <= tables.keys(), "the element chunk or vertex is missing")
+    chunk, vertex, sh = tables["chunk"], tables["vertex"], tables.get("sh")
     n = len(vertex)
-    if len(chunk) != -(-n // CHUNK):
-        raise base.malformed(path, f"it has {len(chunk)} chunks, but {n} Gaussians need {-(-n // CHUNK)}")
-    position, rotation, scale, color = (_column(path, vertex, name, "<u4") for name in _VERTEX_NAMES)
-    bounds = [_bounds(path, chunk, group) for group in _GROUPS]
+    expect(len(chunk) == -(-n // CHUNK), f"it has {len(chunk)} chunks, but {n} Gaussians need {-(-n // CHUNK)}")
+    position, rotation, scale, color = (_column(vertex, name, "<u4") for name in _VERTEX_NAMES)
+    bounds = [_bounds(chunk, group) for group in _GROUPS]
 
     def values(i: int, packed: np.ndarray, bits: tuple[int, ...], part: slice) -> np.ndarray:
         """Return the unpacked values of the i-th group [P, 3], scaled to the bounds of their chunks if there are bounds."""
@@ -208,38 +187,37 @@ def decode(path: Path, data: bytes) -> base.Arrays:
         packed = rotation[part].astype(np.int64)
         return base.from_smallest_three(packed >> 30, (_unpack(packed & (2**30 - 1), (10, 10, 10)) - 0.5) * base.SQRT2)
 
+    def opacities(part: slice) -> np.ndarray:
+        return base.logits(_unpack(color[part].astype(np.int64), (8, 8, 8, 8))[:, 3], 1 / 255)
+
     def harmonics(part: slice) -> np.ndarray:
         first = base_coefficients(values(2, color, (8, 8, 8, 8), part))[:, None]
         return first if rest is None else np.concatenate([first, rest(part)], 1)
 
-    rest, k = (None, 1) if sh is None else _harmonics(path, sh, n)
+    rest, k = (None, 1) if sh is None else _harmonics(sh, n)
     return {
         "sh": base.by_rows(n, (k, 3), harmonics),
         "means": base.by_rows(n, (3,), lambda p: values(0, position, _BITS, p)),
         "quats": base.by_rows(n, (4,), quats),
         "log_scales": base.by_rows(n, (3,), lambda p: values(1, scale, _BITS, p)),
-        "logit_opacities": base.by_rows(
-            n, (), lambda p: base.logits(_unpack(color[p].astype(np.int64), (8, 8, 8, 8))[:, 3], 1 / 255)
-        ),
+        "logit_opacities": base.by_rows(n, (), opacities),
     }
 
 
-def _bounds(path: Path, chunk: np.ndarray, group: tuple[str, ...]) -> list[np.ndarray] | None:
+def _bounds(chunk: np.ndarray, group: tuple[str, ...]) -> list[np.ndarray] | None:
     """Return the bounds of each chunk, two arrays float64 [C, 3]; None for the colours of older files, which span 0 to 1."""
     if group == _GROUPS[2] and "min_r" not in (chunk.dtype.names or ()):
         return None
-    return [
-        np.stack([_column(path, chunk, f"{end}_{name}", "<f4") for name in group], 1).astype(np.float64)
-        for end in ("min", "max")
-    ]
+    columns = ([_column(chunk, f"{end}_{name}", "<f4") for name in group] for end in ("min", "max"))
+    return [np.stack(column, 1).astype(np.float64) for column in columns]
 
 
-def _harmonics(path: Path, sh: np.ndarray, n: int) -> tuple[Callable[[slice], np.ndarray], int]:
+def _harmonics(sh: np.ndarray, n: int) -> tuple[Callable[[slice], np.ndarray], int]:
     """Return a function for the coefficients above degree 0 [P, K - 1, 3] of some rows, and K."""
     count = len(sh.dtype.names or ())
-    if len(sh) != n or count // 3 + 1 not in base.SH_SIZES or count % 3:
-        raise base.malformed(path, f"{len(sh)} rows of {count} harmonics do not fit {n} Gaussians")
-    columns = [_column(path, sh, f"f_rest_{i}", "u1") for i in range(count)]
+    fits = len(sh) == n and count // 3 + 1 in base.SH_SIZES and count % 3 == 0
+    expect(fits, f"{len(sh)} rows of {count} harmonics do not fit {n} Gaussians")
+    columns = [_column(sh, f"f_rest_{i}", "u1") for i in range(count)]
 
     def rows(part: slice) -> np.ndarray:
         levels = np.empty((part.stop - part.start, count))
@@ -251,23 +229,20 @@ def _harmonics(path: Path, sh: np.ndarray, n: int) -> tuple[Callable[[slice], np
     return rows, count // 3 + 1
 
 
-def _table(path: Path, data: bytes, element: Element, start: int) -> tuple[np.ndarray, int]:
+def _table(data: bytes, element: Element, start: int) -> tuple[np.ndarray, int]:
     """Return the rows of an element that begins at byte ``start`` of the file, and the byte at which the next one begins."""
     name, count, properties = element
-    if len(dict(properties)) < len(properties):
-        raise base.malformed(path, f"a property of {name[:40]!r} appears twice")
+    expect(len(dict(properties)) == len(properties), f"a property of {name[:40]!r} appears twice")
     dtype = np.dtype(properties)
-    end = start + count * dtype.itemsize
-    if end > len(data):
-        rows = f"{count} rows of {name[:40]!r}"
-        raise base.malformed(path, f"truncated: {rows} end at byte {end}, but the file has {len(data)} bytes")
+    end, rows = start + count * dtype.itemsize, f"{count} rows of {name[:40]!r}"
+    expect(end <= len(data), f"truncated: {rows} end at byte {end}, but the file has {len(data)} bytes")
     return np.frombuffer(data, dtype, count, start), end
 
 
-def _column(path: Path, table: np.ndarray, name: str, kind: str) -> np.ndarray:
-    """Return a column of a table; DataError where it is missing or of another type."""
-    if name not in (table.dtype.names or ()) or table.dtype[name] != np.dtype(kind):
-        raise base.malformed(path, f"the property {name} is missing, or has the wrong type")
+def _column(table: np.ndarray, name: str, kind: str) -> np.ndarray:
+    """Return a column of a table; `MalformedError` where it is missing or of another type."""
+    there = name in (table.dtype.names or ()) and table.dtype[name] == np.dtype(kind)
+    expect(there, f"the property {name} is missing, or has the wrong type")
     return table[name]
 
 
@@ -301,7 +276,7 @@ class _HeadedFormat(base.Format):
 
     def is_antialiased(self, path: Path) -> bool:
         """Return whether the header declares antialiasing."""
-        return is_antialiased(start_of(path))
+        return parse_header(path, start_of(path))[2]
 
     def is_own(self, path: Path) -> bool:
         """Return whether the header has the comments of warpgs."""
@@ -383,7 +358,7 @@ def _write(
     """Write Gaussians as `write_ply` does, about an ``origin`` [3] if one is given."""
     arrays, origin = base.arrays_to_write(path, gaussians, normalization, units, origin)
     n, k = arrays["sh"].shape[:2]
-    header = _header(n, 3 * (k - 1), antialiased, origin)
+    header = _header([f"element vertex {n}", *(f"property float {v}" for v in _names(3 * (k - 1)))], antialiased, origin)
     with replacing(path, size=len(header) + 4 * n * (14 + 3 * k)) as (file, _):
         file.write(header)
         for start in range(0, n, CHUNK_ROWS):
@@ -418,7 +393,7 @@ def read_ply(path: str | os.PathLike[str], normalization: Normalization | None =
     notes: list[str] = []
     normalization = checked_normalization(normalization, units, str(path))
     gaussians = base.from_origin(*_read(path, False, notes), normalization, units)
-    if is_antialiased(start_of(path)):
+    if parse_header(path, start_of(path))[2]:
         base.warn_of_antialiasing(path)
     for note in notes:
         warnings.warn(note, stacklevel=2)
@@ -430,7 +405,7 @@ def _read(path: Path, strict: bool, notes: list[str]) -> tuple[Gaussians, np.nda
     with base.reading(path) as file:
         size = os.fstat(file.fileno()).st_size
         head = file.read(MAX_HEADER_BYTES)
-        elements, start = parse_header(path, head)
+        elements, start, _ = parse_header(path, head)
         file.seek(start)
         text, own = ASCII.search(head[:start]), is_own(head[:start])
         vertex, start = _locate_vertices(path, elements, start)
@@ -472,11 +447,10 @@ def _names(rest: int) -> list[str]:
     return [*_POSITION, "nx", "ny", "nz", *_DC, *(f"f_rest_{i}" for i in range(rest)), "opacity", *_SCALE, *_ROTATION]
 
 
-def _header(n: int, rest: int, antialiased: bool, origin: np.ndarray) -> bytes:
-    """Return the header of a file with ``n`` Gaussians and ``rest`` coefficients above degree 0."""
-    lines = ["ply", "format binary_little_endian 1.0", *mode_comments(antialiased), *origin_comment(origin)]
-    lines += [f"element vertex {n}", *(f"property float {name}" for name in _names(rest))]
-    return ("\n".join([*lines, "end_header"]) + "\n").encode("ascii")
+def _header(elements: list[str], antialiased: bool, origin: np.ndarray | None) -> bytes:
+    """Return the header of a file with the lines of its elements."""
+    lines = ["ply", "format binary_little_endian 1.0", *mode_comments(antialiased), *base.origin_comment(origin).splitlines()]
+    return ("\n".join([*lines, *elements, "end_header"]) + "\n").encode("ascii")
 
 
 def _rows(arrays: dict[str, np.ndarray]) -> np.ndarray:
@@ -508,8 +482,7 @@ def _check_properties(path: Path, properties: list[tuple[str, str]]) -> int:
     """Return the number of coefficients above degree 0; DataError where the layout is incomplete."""
     names = [name for name, _ in properties]
     if len(set(names)) < len(names):
-        twice = Counter(names).most_common(1)[0][0]
-        raise ply_error(path, f"property {twice[:40]!r} appears twice")
+        raise ply_error(path, f"property {Counter(names).most_common(1)[0][0][:40]!r} appears twice")
     rest = sum(bool(re.fullmatch(r"f_rest_[0-9]+", name)) for name in names)
     if rest not in _REST_COUNTS:
         raise ply_error(path, f"it has {rest} f_rest properties, but degrees 0 to 4 have 0, 9, 24, 45 or 72")
@@ -544,13 +517,10 @@ def _assemble(
         if part.start == 0 and all(rows.dtype[name].itemsize == 8 for name in _POSITION):
             middle = base.origin_of(np.stack([rows[name] for name in _POSITION], 1).astype(np.float64))
         columns = functools.partial(_columns, rows, part.start, bad[part], reasons)
-        if _DC[0] in (rows.dtype.names or ()):
-            arrays["sh"][part, 0] = columns(_DC)
-        else:
-            arrays["sh"][part, 0] = base_coefficients(columns(_RGB) / 255)
+        coefficients = _DC[0] in (rows.dtype.names or ())
+        arrays["sh"][part, 0] = columns(_DC) if coefficients else base_coefficients(columns(_RGB) / 255)
         if rest:
-            above = columns([f"f_rest_{i}" for i in range(rest)])
-            arrays["sh"][part, 1:] = above.reshape(len(rows), 3, k).transpose(0, 2, 1)
+            arrays["sh"][part, 1:] = columns([f"f_rest_{i}" for i in range(rest)]).reshape(len(rows), 3, k).transpose(0, 2, 1)
         quats = arrays["quats"][part] = columns(_ROTATION)
         zero = ~quats.any(axis=1)
         if zero.any():
@@ -570,11 +540,9 @@ def _assemble(
         notes.append(f"{path}: filter_3D of Mip-Splatting is applied to sizes and opacities")
     stored, scales = arrays["logit_opacities"], arrays["log_scales"]
     if n >= LEAST_JUDGED and stored.min() >= 0 and stored.max() <= 1 and scales.min() > 0:
-        notes.append(
-            f"{path}: all opacities are from {stored.min():.2g} to {stored.max():.2g} and all log scales above 0, as if stored "
-            "after the sigmoid and the exponential; they are read as logits and logarithms. If images are foggy, export the "
-            "model again without activations"
-        )
+        values = f"all opacities are from {stored.min():.2g} to {stored.max():.2g} and all log scales above 0"
+        why = "as if stored after the sigmoid and the exponential; they are read as logits and logarithms"
+        notes.append(f"{path}: {values}, {why}. If images are foggy, export the model again without activations")
     return base.usable(path, arrays, bad, next(iter(reasons), ""), lambda: strict, notes, ply_error), origin + middle
 
 

@@ -5,6 +5,7 @@ are entries of codebooks of 256 values. Harmonics above degree 0 have a palette 
 of Gaussians. Axes are those of PLY. Source: developer.playcanvas.com, "The SOG Format".
 """
 
+import contextlib
 import io
 import json
 import math
@@ -12,13 +13,13 @@ import os
 import struct
 import zipfile
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
 
+from warpgs.errors import expect
 from warpgs.export import base
 from warpgs.files import is_within, make_folder, read_file, remove_file, replacing
 from warpgs.scene import ORIGIN
@@ -109,17 +110,14 @@ def codebook(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """
     ordered = np.sort(values.reshape(-1).astype(np.float64))
     even = np.linspace(ordered[0], ordered[-1], LEVELS)
-    quantiles = ordered[np.linspace(0, len(ordered) - 1, LEVELS).astype(np.int64)]
-    entries = 0.5 * (even + quantiles)
+    entries = 0.5 * (even + ordered[np.linspace(0, len(ordered) - 1, LEVELS).astype(np.int64)])
     sums = np.concatenate([[0], np.cumsum(ordered)])
     for _ in range(ROUNDS):
-        ends = np.searchsorted(ordered, 0.5 * (entries[1:] + entries[:-1]))
-        cuts = np.concatenate([[0], ends, [len(ordered)]])
+        cuts = np.concatenate([[0], np.searchsorted(ordered, 0.5 * (entries[1:] + entries[:-1])), [len(ordered)]])
         counts = np.diff(cuts)
         entries = np.where(counts > 0, np.diff(sums[cuts]) / np.maximum(counts, 1), entries)
     entries = np.array([float(str(v)) for v in np.sort(entries).astype(np.float32)])  # readers hold them in float32
-    labels = np.searchsorted(0.5 * (entries[1:] + entries[:-1]), values.astype(np.float64))
-    return entries, labels.astype("u1")
+    return entries, np.searchsorted(0.5 * (entries[1:] + entries[:-1]), values.astype(np.float64)).astype("u1")
 
 
 def _palette(rows: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -172,36 +170,35 @@ def decode(path: Path, file: BinaryIO) -> base.Arrays:
     """Return the Gaussians of an open file; images much larger than the Gaussians need are rejected before decoding."""
     with _members(path, file) as (member, size):
         meta = _meta(path, member)
-        n = meta.get("count")
-        if meta.get("model", "default") not in ("default", "antialiased"):
-            raise base.malformed(path, f"its model {str(meta['model'])[:40]!r} is not supported")
-        if type(n) is not int or not 0 < n <= MAX_PER_BYTE * size + SMALL:
-            raise base.malformed(path, f"it announces {str(n)[:20]} Gaussians in only {size} bytes")
+        n, model = meta.get("count"), meta.get("model", "default")
+        expect(model in ("default", "antialiased"), f"its model {str(model)[:40]!r} is not supported")
+        few = type(n) is int and 0 < n <= MAX_PER_BYTE * size + SMALL
+        expect(few, f"it announces {str(n)[:20]} Gaussians in only {size} bytes")
         most = MAX_PIXEL_BYTES * (MAX_PIXELS * n + SMALL)
 
         def pixels(part: str, i: int) -> np.ndarray:
             name = meta[part]["files"][i]
-            return _pixels(path, str(name), member(name, most), n)
+            return _pixels(str(name), member(name, most), n)
 
         # one attribute after another, the largest first, to limit the peak memory
-        sh = _harmonics(path, meta, n, pixels, lambda name: member(name, MAX_PIXEL_BYTES * MAX_PALETTE_PIXELS))
-        opacities = _colors(_book(path, meta["sh0"]), pixels("sh0", 0), sh)
-        quats = _quats(path, pixels("quats", 0), n)
+        sh = _harmonics(meta, n, pixels, lambda name: member(name, MAX_PIXEL_BYTES * MAX_PALETTE_PIXELS))
+        opacities = _colors(_book(meta["sh0"]), pixels("sh0", 0), sh)
+        quats = _quats(pixels("quats", 0), n)
         means = _means(meta["means"], pixels("means", 0), pixels("means", 1), n)
-        scales, book = pixels("scales", 0), _book(path, meta["scales"])
+        scales, book = pixels("scales", 0), _book(meta["scales"])
         log_scales = base.by_rows(n, (3,), lambda p: book[scales[p, :3]])
     return {"means": means, "quats": quats, "log_scales": log_scales, "logit_opacities": opacities, "sh": sh}
 
 
-@contextmanager
+@contextlib.contextmanager
 def _members(path: Path, file: BinaryIO) -> Iterator[tuple[Callable[[object, int], bytes], int]]:
     """Yield a function that returns a file of a model, by its name and largest size [bytes], and the size of all [bytes]."""
     if is_unpacked(path):
         yield partial(_beside, path), _size(path)
     else:
-        _check_contents(path, file, size := file.seek(0, os.SEEK_END))
+        _check_contents(file, size := file.seek(0, os.SEEK_END))
         with zipfile.ZipFile(file) as archive:
-            yield partial(_member, path, archive), size
+            yield partial(_member, archive), size
 
 
 def is_unpacked(path: str | os.PathLike[str]) -> bool:
@@ -217,31 +214,33 @@ def _size(path: Path) -> int:
 def _beside(path: Path, name: object, most: int) -> bytes:
     """Return a file of at most ``most`` bytes beside meta.json: one that a plain name names, and no link to another folder."""
     plain = isinstance(name, str) and name == Path(name).name != "" and not {*name} & {*"\\:\0"}
-    if not plain or not is_within(other := path.parent / str(name), path.parent):
-        raise base.malformed(path, f"{str(name)[:40]!r} is not a file beside it, or is a link to another folder")
-    return read_file(other, None, most, "copy the whole folder again")
+    beside = plain and is_within(path.parent / str(name), path.parent)
+    expect(beside, f"{str(name)[:40]!r} is not a file beside it, or is a link to another folder")
+    return read_file(path.parent / str(name), None, most, "copy the whole folder again")
 
 
 def _meta(path: Path, member: Callable[[object, int], bytes]) -> dict[str, Any]:
     """Return meta.json; DataError where it is of another version."""
     meta = json.loads(member(path.name if is_unpacked(path) else META, MAX_META_BYTES))
-    if not isinstance(meta, dict) or meta.get("version") != 2:
-        raise base.malformed(path, "its meta.json is not of version 2")
+    expect(isinstance(meta, dict) and meta.get("version") == 2, "its meta.json is not of version 2")
     return meta
 
 
 def _harmonics(
-    path: Path, meta: dict[str, Any], n: int, pixels: Callable[[str, int], np.ndarray], member: Callable[[object], bytes]
+    meta: dict[str, Any], n: int, pixels: Callable[[str, int], np.ndarray], member: Callable[[object], bytes]
 ) -> np.ndarray:
     """Return the coefficients [N, K, 3] from the palette; the first of each Gaussian is not set yet."""
     if meta.get("shN") is None:
         return np.empty((n, 1, 3), np.float32)
-    rows = _palette_rows(path, meta["shN"], member(meta["shN"]["files"][0]))
+    rows = _palette_rows(meta["shN"], member(meta["shN"]["files"][0]))
     labels = pixels("shN", 1)
     sh = np.empty((n, 1 + rows.shape[1], 3), np.float32)
     for part in base.parts(n):
         label = labels[part, 0].astype(np.int64) | labels[part, 1].astype(np.int64) << 8
-        sh[part, 1:] = rows[_within(path, label, len(rows), part.start)]
+        beyond = label >= len(rows)
+        row = part.start + int(beyond.argmax())
+        expect(not beyond.any(), f"Gaussian {row} refers to harmonics beyond the {len(rows)} rows")
+        sh[part, 1:] = rows[label]
     return sh
 
 
@@ -265,56 +264,54 @@ def _means(part: dict[str, Any], lower: np.ndarray, upper: np.ndarray, n: int) -
     return base.by_rows(n, (3,), rows)
 
 
-def _quats(path: Path, pixels: np.ndarray, n: int) -> np.ndarray:
+def _quats(pixels: np.ndarray, n: int) -> np.ndarray:
     """Return the rotations [N, 4] that ``pixels`` [P, 4] store."""
     largest = pixels[:n, 3]
-    if (largest < 252).any():
-        raise base.malformed(path, f"the rotation of Gaussian {int(np.argmax(largest < 252))} names no largest component")
-    return base.by_rows(
-        n, (4,), lambda p: base.from_smallest_three(largest[p].astype(np.int64) - 252, (pixels[p, :3] / 255 - 0.5) * base.SQRT2)
-    )
+    none = largest < 252
+    expect(not none.any(), f"the rotation of Gaussian {int(none.argmax())} names no largest component")
+
+    def rows(p: slice) -> np.ndarray:
+        return base.from_smallest_three(largest[p].astype(np.int64) - 252, (pixels[p, :3] / 255 - 0.5) * base.SQRT2)
+
+    return base.by_rows(n, (4,), rows)
 
 
-def _check_contents(path: Path, file: BinaryIO, size: int) -> None:
-    """Raise a DataError if the end record of an archive announces a large table of contents, or is not plain.
+def _check_contents(file: BinaryIO, size: int) -> None:
+    """Raise a `MalformedError` if the end record of an archive announces a large table of contents, or is not plain.
 
     A plain record has no comment after it, and no zip64 locator before it. Archives beyond 4 GiB need the locator.
     """
     file.seek(max(0, size - 42))
     locator, end = (last := file.read())[:-22], last[-22:]
     plain = end[:4] == b"PK\5\6" and end[-2:] == b"\0\0" and locator[:4] != b"PK\6\7"
-    if not plain or int.from_bytes(end[12:16], "little") > MAX_CONTENTS_BYTES:
-        raise base.malformed(path, f"its table of contents is not at the end of the file, or over {MAX_CONTENTS_BYTES:,} bytes")
+    small = plain and int.from_bytes(end[12:16], "little") <= MAX_CONTENTS_BYTES
+    expect(small, f"its table of contents is not at the end of the file, or over {MAX_CONTENTS_BYTES:,} bytes")
 
 
-def _member(path: Path, archive: zipfile.ZipFile, name: object, most: int) -> bytes:
+def _member(archive: zipfile.ZipFile, name: object, most: int) -> bytes:
     """Return a file of the archive of at most ``most`` bytes, read into memory only: its name is never used as a path."""
-    if not isinstance(name, str) or name not in archive.namelist():
-        raise base.malformed(path, f"{str(name)[:40]!r} is not in the archive")
-    if archive.getinfo(name).file_size > most:
-        raise base.malformed(path, f"{name[:40]!r} would take {archive.getinfo(name).file_size} bytes")
+    expect(isinstance(name, str) and name in archive.namelist(), f"{str(name)[:40]!r} is not in the archive")
+    announced = archive.getinfo(name).file_size
+    expect(announced <= most, f"{name[:40]!r} would take {announced} bytes")
     with archive.open(name) as file:
         content = file.read(most + 1)
-    if len(content) > most:
-        raise base.malformed(path, f"{name[:40]!r} takes more than {most} bytes")
+    expect(len(content) <= most, f"{name[:40]!r} takes more than {most} bytes")
     return content
 
 
-def _pixels(path: Path, name: str, content: bytes, n: int) -> np.ndarray:
+def _pixels(name: str, content: bytes, n: int) -> np.ndarray:
     """Return the RGBA pixels [P, 4] of an image of at least ``n``; its size is checked before it is decoded."""
     import cv2
 
     width, height = _webp_size(content)
-    if not width * height:
-        raise base.malformed(path, f"{name[:40]!r} is not a lossless WebP image")
-    if not n <= width * height <= MAX_PIXELS * n + SMALL:
-        raise base.malformed(path, f"{name[:40]!r} has {width} x {height} pixels for {n} values")
-    try:
+    expect(width * height, f"{name[:40]!r} is not a lossless WebP image")
+    fits = n <= width * height <= MAX_PIXELS * n + SMALL
+    expect(fits, f"{name[:40]!r} has {width} x {height} pixels for {n} values")
+    image = None
+    with contextlib.suppress(cv2.error):
         image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
-    except cv2.error as e:
-        raise base.malformed(path, f"{name[:40]!r} is not a readable WebP image") from e
-    if image is None or image.shape[:2] != (height, width) or image.dtype != np.uint8 or image.ndim != 3:
-        raise base.malformed(path, f"{name[:40]!r} is not a readable WebP image")
+    read = image is not None and image.shape[:2] == (height, width) and image.dtype == np.uint8 and image.ndim == 3
+    expect(read, f"{name[:40]!r} is not a readable WebP image")
     if image.shape[2] == 4:
         return cv2.cvtColor(image, cv2.COLOR_BGRA2RGBA, image).reshape(-1, 4)
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGBA).reshape(-1, 4)
@@ -334,32 +331,22 @@ def _webp_size(data: bytes) -> tuple[int, int]:
     return 0, 0
 
 
-def _book(path: Path, part: dict[str, Any]) -> np.ndarray:
+def _book(part: dict[str, Any]) -> np.ndarray:
     """Return the 256 numbers of a codebook."""
     book = np.array(part["codebook"], np.float64)
-    if book.shape != (LEVELS,):
-        raise base.malformed(path, f"a codebook has the shape {book.shape}, not {LEVELS} numbers")
+    expect(book.shape == (LEVELS,), f"a codebook has the shape {book.shape}, not {LEVELS} numbers")
     return book
 
 
-def _palette_rows(path: Path, part: dict[str, Any], content: bytes) -> np.ndarray:
+def _palette_rows(part: dict[str, Any], content: bytes) -> np.ndarray:
     """Return the rows of the palette of harmonics [P, K - 1, 3]."""
     bands, count = part["bands"], part["count"]
-    if bands not in (1, 2, 3) or type(count) is not int or not 0 < count <= PALETTE:
-        raise base.malformed(path, f"its table of harmonics is invalid: {str(count)[:20]} rows, {str(bands)[:20]} degrees")
+    sound = bands in (1, 2, 3) and type(count) is int and 0 < count <= PALETTE
+    expect(sound, f"its table of harmonics is invalid: {str(count)[:20]} rows, {str(bands)[:20]} degrees")
     k = base.SH_SIZES[bands] - 1
-    pixels = _pixels(path, "harmonics", content, count * k)
-    if len(pixels) % (COLUMNS * k):
-        raise base.malformed(path, "its image of harmonics has an invalid width")
-    return _book(path, part).astype(np.float32)[pixels[: count * k, :3].reshape(count, k, 3)]
-
-
-def _within(path: Path, labels: np.ndarray, count: int, first: int) -> np.ndarray:
-    """Return the labels of the Gaussians from number ``first`` on; DataError if a label is not below ``count``."""
-    if (labels >= count).any():
-        row = first + int(np.argmax(labels >= count))
-        raise base.malformed(path, f"Gaussian {row} refers to harmonics beyond the {count} rows")
-    return labels
+    pixels = _pixels("harmonics", content, count * k)
+    expect(len(pixels) % (COLUMNS * k) == 0, "its image of harmonics has an invalid width")
+    return _book(part).astype(np.float32)[pixels[: count * k, :3].reshape(count, k, 3)]
 
 
 @base.register("sog")
@@ -387,7 +374,7 @@ class SOG(base.Format):
         if not is_unpacked(path):
             return super().store(path, pieces)
         make_folder(path.parent)
-        with zipfile.ZipFile(io.BytesIO(b"".join(pieces))) as archive, ExitStack() as stack:
+        with zipfile.ZipFile(io.BytesIO(b"".join(pieces))) as archive, contextlib.ExitStack() as stack:
             for name in archive.namelist():  # meta.json is the first, and so the last to be replaced
                 data, target = archive.read(name), path if name == META else path.with_name(name)
                 file, _ = stack.enter_context(replacing(target, size=len(data)))

@@ -16,7 +16,7 @@ from typing import BinaryIO
 
 import numpy as np
 
-from warpgs.errors import DataError, UsageError, install_extras
+from warpgs.errors import DataError, MalformedError, UsageError, expect, install_extras
 from warpgs.export import base
 
 Section = Callable[[int], bytes]
@@ -60,8 +60,7 @@ def _sections(a: base.Arrays, bits: int, version: int) -> list[bytes]:
     scales = base.rounded(16 * (a["log_scales"].astype(np.float64) + 10), 255)
     xyzw = base.unit_quats(a["quats"])[:, [1, 2, 3, 0]]
     if version == 2:
-        positive = xyzw * np.where(xyzw[:, 3:] < 0, -1, 1)
-        rotations = base.rounded(127.5 * positive[:, :3] + 127.5, 255).astype("u1").tobytes()
+        rotations = base.rounded(127.5 * (xyzw * np.where(xyzw[:, 3:] < 0, -1, 1))[:, :3] + 127.5, 255).astype("u1").tobytes()
     else:
         largest, others = base.smallest_three(xyzw)
         packed = largest << 30
@@ -98,25 +97,19 @@ def encode(arrays: base.Arrays, version: int = VERSION, antialiased: bool = Fals
 
 def decode(path: Path, data: bytes) -> base.Arrays:
     """Return the Gaussians of a file's bytes, in the axes of PLY."""
-    if data[:2] == b"\x1f\x8b":
-        stream = gzip.GzipFile(fileobj=io.BytesIO(data))
-        head = stream.read(HEADER.size)
-        if len(head) < HEADER.size:
-            raise base.malformed(path, "its header is truncated")
-        magic, version, n, degree, bits, flags, _ = HEADER.unpack(head)
-        sizes = _checked(path, len(data), (magic, version, n, degree, bits), (2, 3))
-        extensions = bytearray()
-        sections = _parts_of_gzip(path, stream, n, sizes, extensions if flags & EXTENDED else None)
-    else:
-        if len(data) < HEADER_4.size:
-            raise base.malformed(path, "its header is truncated")
-        magic, version, n, degree, bits, flags, count, place = HEADER_4.unpack_from(data)
-        sizes = _checked(path, len(data), (magic, version, n, degree, bits), (4,))
-        extensions = bytearray(data[HEADER_4.size : place] if flags & EXTENDED else b"")
-        sections = _streams(path, data, sizes, count, place)
+    packed = data[:2] == b"\x1f\x8b"
+    stream: BinaryIO = gzip.GzipFile(fileobj=io.BytesIO(data)) if packed else io.BytesIO(data)
+    layout, versions = (HEADER, (2, 3)) if packed else (HEADER_4, (4,))
+    head = stream.read(layout.size)
+    expect(len(head) == layout.size, "its header is truncated")
+    magic, version, n, degree, bits, flags, *places = layout.unpack(head)
+    sizes = _checked(len(data), (magic, version, n, degree, bits), versions)
+    extensions = bytearray(data[layout.size : places[1]] if flags & EXTENDED and not packed else b"")
+    more = extensions if flags & EXTENDED else None
+    sections = _parts_of_gzip(stream, n, sizes, more) if packed else _streams(data, sizes, *places)
     arrays = _unpack(sections, n, degree, bits, version)
     next(sections, None)  # checks the end of the last section
-    if (system := _coordinate_system(path, extensions)) == RUB:
+    if (system := _coordinate_system(extensions)) == RUB:
         base.half_turn_in_place(arrays, "x")
     else:
         base.transform_in_place(arrays, to_ply(system), np.zeros(3))
@@ -134,7 +127,7 @@ def to_ply(system: int) -> np.ndarray:
     return signs[[0, 2, 1]] * [[1], [1], [-1]] if bits & 8 else signs
 
 
-def _coordinate_system(path: Path, extensions: bytes | bytearray) -> int:
+def _coordinate_system(extensions: bytes | bytearray) -> int:
     """Return the number of the coordinate system that the extensions name; others are skipped, as is a truncated end."""
     at = 0
     while at + 8 <= len(extensions):
@@ -142,53 +135,44 @@ def _coordinate_system(path: Path, extensions: bytes | bytearray) -> int:
         at += 8 + size
         if kind == COORDINATE_SYSTEM and size >= 4 and at <= len(extensions):
             system = int.from_bytes(extensions[at - size : at - size + 4], "little")
-            if system > 16:
-                raise base.malformed(path, f"its coordinate system {system} is unknown (known: 1 to 16)")
+            expect(system <= 16, f"its coordinate system {system} is unknown (known: 1 to 16)")
             return system or RUB
     return RUB
 
 
-def _parts_of_gzip(
-    path: Path, stream: gzip.GzipFile, n: int, sizes: list[int], extensions: bytearray | None
-) -> Iterator[Section]:
+def _parts_of_gzip(stream: BinaryIO, n: int, sizes: list[int], extensions: bytearray | None) -> Iterator[Section]:
     """Yield the sections of a file of version 2 or 3, each to be read to its end before the next; then fill ``extensions``."""
 
     def read(size: int) -> bytes:
         data = stream.read(size)
-        if len(data) != size:
-            raise base.malformed(path, f"{n} Gaussians need {sum(sizes)} bytes, but the file has fewer")
+        expect(len(data) == size, f"{n} Gaussians need {sum(sizes)} bytes, but the file has fewer")
         return data
 
     for _ in sizes:
         yield read
     if extensions is not None:
         extensions += stream.read(MAX_EXTENSIONS)
-    if stream.read(1):  # at its end the checksum has been compared
-        raise base.malformed(path, f"{n} Gaussians need {sum(sizes)} bytes, but the file has more")
+    more = stream.read(1)  # at its end the checksum has been compared
+    expect(not more, f"{n} Gaussians need {sum(sizes)} bytes, but the file has more")
 
 
-def _checked(path: Path, size: int, header: tuple[int, ...], versions: tuple[int, ...]) -> list[int]:
-    """Return the sizes of the sections [bytes]; DataError where the header does not fit a file of ``size`` bytes."""
+def _checked(size: int, header: tuple[int, ...], versions: tuple[int, ...]) -> list[int]:
+    """Return the sizes of the sections [bytes]; `MalformedError` where the header does not fit a file of ``size`` bytes."""
     magic, version, n, degree, bits = header
-    if magic != MAGIC:
-        raise base.malformed(path, "it does not start with the SPZ signature")
-    if version not in versions:
-        raise base.malformed(path, f"version {version} is not supported here (supported: {', '.join(map(str, versions))})")
-    if degree > 4:
-        raise base.malformed(path, f"harmonics of degree {degree} are not supported (supported: 0 to 4)")
-    if bits > MAX_FRACTIONAL_BITS:
-        raise base.malformed(path, f"its coordinates have {bits} fractional bits, more than {MAX_FRACTIONAL_BITS}")
+    expect(magic == MAGIC, "it does not start with the SPZ signature")
+    expect(version in versions, f"version {version} is not supported here (supported: {', '.join(map(str, versions))})")
+    expect(degree <= 4, f"harmonics of degree {degree} are not supported (supported: 0 to 4)")
+    expect(bits <= MAX_FRACTIONAL_BITS, f"its coordinates have {bits} fractional bits, more than {MAX_FRACTIONAL_BITS}")
     sizes = [9 * n, n, 3 * n, 3 * n, (3 if version == 2 else 4) * n, 3 * degree * (degree + 2) * n]
-    if sum(sizes) > MAX_RATIO * size + SMALL:
-        raise base.malformed(path, f"it announces {n} Gaussians in only {size} bytes")
+    expect(sum(sizes) <= MAX_RATIO * size + SMALL, f"it announces {n} Gaussians in only {size} bytes")
     return sizes
 
 
-def _streams(path: Path, data: bytes, sizes: list[int], count: int, place: int) -> Iterator[Section]:
+def _streams(data: bytes, sizes: list[int], count: int, place: int) -> Iterator[Section]:
     """Yield the sections of a version-4 file, each to be read to its end before the next; an empty section has no stream."""
     wanted = [s for s in sizes if s]
-    if count != len(wanted) or place < HEADER_4.size or place + 16 * count > len(data):
-        raise base.malformed(path, f"its table of {count} streams at byte {place} is invalid")
+    sound = count == len(wanted) and place >= HEADER_4.size and place + 16 * count <= len(data)
+    expect(sound, f"its table of {count} streams at byte {place} is invalid")
     decompressor = _zstandard().ZstdDecompressor(max_window_size=MAX_WINDOW)
     view, i, start = memoryview(data), 0, place + 16 * count
     for size in sizes:
@@ -196,23 +180,22 @@ def _streams(path: Path, data: bytes, sizes: list[int], count: int, place: int) 
             yield bytes
             continue
         packed, plain = struct.unpack_from("<QQ", data, place + 16 * i)
-        if plain != size or start + packed > len(data):
-            raise base.malformed(path, f"stream {i} announces {packed} packed and {plain} unpacked bytes, not {size} unpacked")
+        fits = plain == size and start + packed <= len(data)
+        expect(fits, f"stream {i} announces {packed} packed and {plain} unpacked bytes, not {size} unpacked")
         with decompressor.stream_reader(view[start : start + packed]) as reader:
-            yield functools.partial(_decompressed, path, reader, i, size)
-            if _decompressed(path, reader, i, size, 1, end=True):
-                raise base.malformed(path, f"stream {i} does not hold its {size} bytes")
+            yield functools.partial(_decompressed, reader, i, size)
+            expect(not _decompressed(reader, i, size, 1, end=True), f"stream {i} does not hold its {size} bytes")
         i, start = i + 1, start + packed
 
 
-def _decompressed(path: Path, reader: BinaryIO, i: int, whole: int, size: int, *, end: bool = False) -> bytes:
+def _decompressed(reader: BinaryIO, i: int, whole: int, size: int, *, end: bool = False) -> bytes:
     """Return the next ``size`` of ``whole`` bytes of the i-th stream; fewer at its end."""
     try:
         data = reader.read(size)
     except _zstandard().ZstdError as e:
-        raise base.malformed(path, f"stream {i} is not a zstd stream, or asks for more than {MAX_WINDOW >> 20} MiB") from e
-    if len(data) != size and not end:
-        raise base.malformed(path, f"stream {i} does not hold its {whole} bytes")
+        what = f"stream {i} is not a zstd stream, or asks for more than {MAX_WINDOW >> 20} MiB"
+        raise MalformedError(what) from e
+    expect(len(data) == size or end, f"stream {i} does not hold its {whole} bytes")
     return data
 
 

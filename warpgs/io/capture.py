@@ -11,7 +11,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from warpgs.errors import DataError
+from warpgs.errors import DataError, expect
 from warpgs.files import read_file, read_start
 from warpgs.geometry import matmul, seen_pixels
 from warpgs.io import colmap, folder as scenes
@@ -70,8 +70,7 @@ class CaptureReader(Reader):
         base = colmap.image_base(folder, folder) or "images"
         _, found = colmap.add_views(scene, views, base, path, [name for name, *_ in rows], rows, labels=True)
         points, said = _points(scene, path, views.views)
-        pixels = scene.pixel_source(by_folder=True)
-        return self.scene(folder, views.views, notes + found + said, points=points, pixels=pixels)
+        return self.scene(folder, views.views, notes + found + said, points=points, pixels=scene.pixel_source(by_folder=True))
 
 
 def _points(scene: SceneFolder, path: Path, views: list[View]) -> tuple[PointCloud | None, list[str]]:
@@ -112,8 +111,7 @@ def _xml(path: Path) -> ElementTree.Element:
     """Return the root of an XML file of bounded size, without a DTD."""
     data = read_file(path, None, MAX_BYTES, FIX)
     with understood(str(path), ElementTree.ParseError):
-        if max(data.count(b"<"), data.count(b"=")) > MAX_PARTS:
-            raise ValueError(f"it has more than {MAX_PARTS:,} parts")
+        expect(max(data.count(b"<"), data.count(b"=")) <= MAX_PARTS, f"it has more than {MAX_PARTS:,} parts")
         return ElementTree.fromstring(data, ElementTree.XMLParser(target=_Builder()))
 
 
@@ -121,8 +119,7 @@ def _numbers(parent: ElementTree.Element | None, tag: str, default: list[float])
     """Return the numbers of the part with this tag, float64, as many as the ``default``, which stands for a missing part."""
     values = np.array([float(word) for word in (parent.findtext(tag) or "").split()] if parent is not None else [])
     values = values if len(values) else np.array(default)
-    if len(values) != len(default) or not np.isfinite(values).all():
-        raise ValueError(f"<{tag}> needs {len(default)} finite numbers")
+    expect(len(values) == len(default) and np.isfinite(values).all(), f"<{tag}> needs {len(default)} finite numbers")
     return values
 
 
@@ -130,8 +127,7 @@ def _sensor_lens(sensor: ElementTree.Element | None, where: str) -> Lens:
     """Return the lens of a sensor: u = width / 2 + cx + (f + b1) x' + b2 y', v = height / 2 + cy + f y'."""
     with understood(where):
         found = {} if sensor is None else {c.get("class", "adjusted"): c for c in sensor.findall("calibration")}
-        if not found:
-            raise ValueError("it has no calibration; align the photographs")
+        expect(found, "it has no calibration; align the photographs")
         calibration = found.get("adjusted", next(iter(found.values())))
         side = {} if (size := calibration.find("resolution")) is None else size.attrib
         names = ("f", "cx", "cy", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4")
@@ -147,8 +143,7 @@ def _sensor_lens(sensor: ElementTree.Element | None, where: str) -> Lens:
         raise DataError(f"{where}: {lacking[0]} of a {kind} camera is not supported; {fix}")
     # Metashape's p1 is OpenCV's p2
     order = ("k1", "k2", "k3", "k4") if kind == "fisheye" else ("k1", "k2", "p2", "p1", "k3")
-    center = [terms["cx"], terms["cy"]]
-    return _lens(terms["f"], terms["b1"], center, resolution, [terms[t] for t in order], kind, where)
+    return _lens(terms["f"], terms["b1"], [terms["cx"], terms["cy"]], resolution, [terms[t] for t in order], kind, where)
 
 
 @register("metashape")
@@ -187,8 +182,7 @@ class MetashapeReader(CaptureReader):
                 place = chunk.find("transform") if place is None else place
                 rotation = _numbers(place, "rotation", [1, 0, 0, 0, 1, 0, 0, 0, 1]).reshape(3, 3)
                 scale, translation = _numbers(place, "scale", [1])[0], _numbers(place, "translation", [0, 0, 0])
-                if not scale > 0:
-                    raise ValueError(f"its scale is {scale}, not above 0")
+                expect(scale > 0, f"its scale is {scale}, not above 0")
             pose[:3, 3] = scale * matmul(rotation, pose[:3, 3]) + translation
             pose[:3, :3] = matmul(rotation, pose[:3, :3])
             rows.append((name, lenses[sensor], scenes.from_camera_to_world(pose, where, opengl=False)))

@@ -13,8 +13,8 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from warpgs.errors import DataError
-from warpgs.files import open_input, read_file
+from warpgs.errors import DataError, expect
+from warpgs.files import PLY_TYPES, open_input, read_file
 from warpgs.geometry import pose_of
 from warpgs.io import folder as scenes
 from warpgs.io.folder import Probe, Reader, SceneFolder, ViewList, register
@@ -66,15 +66,17 @@ class _BinaryFile:
         """Return the next values, little endian."""
         return struct.unpack("<" + layout, self.raw(struct.calcsize("<" + layout)))
 
-    def count(self, smallest: int) -> int:
-        """Return a record count; DataError where the bytes that are left cannot hold so many records."""
+    def records(self, smallest: int) -> Iterator["_BinaryFile"]:
+        """Yield this file for each record; DataError where their count does not fit the bytes, ``smallest`` for each."""
         (count,) = self.take("Q")
         capacity = (len(self.data) - self.at) // smallest
         if count > capacity:
-            raise DataError(
-                f"{self.path}: announces {count:,} records and holds at most {capacity:,}: truncated or foreign. Copy it again"
-            )
-        return count
+            fix = "truncated or foreign. Copy it again"
+            raise DataError(f"{self.path}: announces {count:,} records and holds at most {capacity:,}: {fix}")
+        for _ in range(count):
+            yield self
+        if self.at != len(self.data):
+            raise DataError(f"{self.path}: {len(self.data) - self.at} bytes follow the last of its records. Copy it again")
 
     def text(self) -> str:
         """Return the next name, which ends in a zero byte."""
@@ -83,11 +85,6 @@ class _BinaryFile:
             raise DataError(f"{self.path}: a name has no end, so the file is truncated; copy it again")
         raw, self.at = self.data[self.at : end], end + 1
         return raw.decode("utf-8", "surrogateescape")
-
-    def end(self) -> None:
-        """Raise a DataError where bytes follow the last record, which means a wrong count."""
-        if self.at != len(self.data):
-            raise DataError(f"{self.path}: {len(self.data) - self.at} bytes follow the last of its records. Copy it again")
 
 
 def _lines(path: Path) -> Iterator[tuple[int, str]]:
@@ -133,12 +130,6 @@ def _number(word: str) -> float:
     return float("nan" if "n" in word.lower() and NAN.fullmatch(word.encode()) else word)
 
 
-def _expect(condition: bool, message: str) -> None:
-    """Raise a ValueError for `understood` where a line breaks a rule."""
-    if not condition:
-        raise ValueError(message)
-
-
 def _store(table: dict, key: int, value: object, where: str) -> None:
     if key in table:
         raise DataError(f"{where}: id {key} is given twice; write the file again")
@@ -156,34 +147,26 @@ def _lens(where: str, model: str, width: int, height: int, p: tuple[float, ...],
         fy, distortion = fx, p[3:]
         if distortion and not fisheye:  # SIMPLE_RADIAL has k1, RADIAL k1 and k2
             distortion = (*distortion, *[0.0] * (4 - len(distortion)))
-    K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
-    lens = Lens(K, width, height, tuple(distortion), model, fisheye)
+    lens = Lens(np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]]), width, height, tuple(distortion), model, fisheye)
     return lens.checked(where) if np.isfinite(p).all() else lens  # the images of other lenses are left out
-
-
-def _unknown_model(path: Path, model: object, known: dict[int, tuple[str, int]]) -> DataError:
-    supported = ", ".join(name for name, _ in known.values())
-    kept = known is MODELS and model in [name for name, _ in NATIVE_MODELS.values()]
-    return DataError(
-        f"{path}: camera model {model} is not supported (supported: {supported}). "
-        f"Run `colmap image_undistorter` and give its output folder{', or fit with --lenses native' if kept else ''}"
-    )
 
 
 def read_cameras(path: Path, native: bool = False) -> dict[int, Lens]:
     """Return lenses by camera number from cameras.bin or cameras.txt; ``native`` also allows models without undistortion."""
     cameras: dict[int, Lens] = {}
-    known, readable = MODELS | NATIVE_MODELS if native else MODELS, MODELS | NATIVE_MODELS
+    readable = MODELS | NATIVE_MODELS
+    counts = dict(readable.values())
+    known = counts if native else dict(MODELS.values())
 
     def allow(model: object, parameters: tuple[float, ...] = ()) -> None:
         """Refuse a model; FULL_OPENCV without rational terms is OPENCV with k3, which can be undistorted."""
-        plain = model == "FULL_OPENCV" and not any(parameters[9:])
-        if not plain and model not in [name for name, _ in known.values()]:
-            raise _unknown_model(path, model, known)
+        if model not in known and not (model == "FULL_OPENCV" and not any(parameters[9:])):
+            kept = ", or fit with --lenses native" if model in counts else ""
+            fix = f"Run `colmap image_undistorter` and give its output folder{kept}"
+            raise DataError(f"{path}: camera model {model} is not supported (supported: {', '.join(known)}). {fix}")
 
     if path.suffix == ".bin":
-        r = _BinaryFile(path)
-        for _ in range(r.count(24)):
+        for r in _BinaryFile(path).records(24):
             number, model, width, height = r.take("iiQQ")
             name, count = readable.get(model, (OTHER_MODELS.get(model, model), 0))
             allow(name)
@@ -191,17 +174,15 @@ def read_cameras(path: Path, native: bool = False) -> dict[int, Lens]:
             allow(name, parameters)
             where = f"{path}, camera {number}"
             _store(cameras, number, _lens(where, name, width, height, parameters, native), where)
-        r.end()
         return cameras
-    counts = dict(readable.values())
     for line, words in _rows(path):
         with understood(f"{path}, line {line}"):
             number, model, parameters = int(words[0]), words[1], tuple(_number(w) for w in words[4:])
             allow(model, parameters)
-            _expect(len(parameters) == counts[model], f"{model} has {counts[model]} parameters, not {len(parameters)}")
+            expect(len(parameters) == counts[model], f"{model} has {counts[model]} parameters, not {len(parameters)}")
             where = f"{path}, line {line}, camera {number}"
             width, height = float(words[2]), float(words[3])  # some exports write 1920.0
-            _expect(width % 1 == height % 1 == 0, f"the size {width:g} x {height:g} px is not whole")
+            expect(width % 1 == height % 1 == 0, f"the size {width:g} x {height:g} px is not whole")
             _store(cameras, number, _lens(where, model, int(width), int(height), parameters, native), where)
     return cameras
 
@@ -210,14 +191,12 @@ def read_poses(path: Path) -> dict[int, Pose]:
     """Return poses by image number from images.bin or images.txt."""
     poses: dict[int, Pose] = {}
     if path.suffix == ".bin":
-        r = _BinaryFile(path)
-        for _ in range(r.count(73)):
+        for r in _BinaryFile(path).records(73):
             number, *values, camera = r.take("i7di")
             pose = (r.text(), camera, tuple(values[:4]), tuple(values[4:]))
             (observed,) = r.take("Q")
             r.raw(24 * observed)
             _store(poses, number, pose, str(path))
-        r.end()
         return poses
     lines = _lines(path)
     for line, text in lines:
@@ -273,18 +252,16 @@ def read_points(path: Path, names: dict[int, str], notes: list[str] | None = Non
     colors: list[tuple[float, ...]] = []
     tracks: list[frozenset[str]] = []
     if path.suffix == ".bin":
-        r = _BinaryFile(path)
-        for _ in range(r.count(51)):
+        for r in _BinaryFile(path).records(51):
             _, x, y, z, red, green, blue, _, length = r.take("Q3d3BdQ")
             track = np.frombuffer(r.raw(8 * length), "<i4")[::2]
             points.append((x, y, z))
             colors.append((red, green, blue))
             tracks.append(frozenset(names[i] for i in track.tolist() if i in names))
-        r.end()
     else:
         for line, words in _rows(path):
             with understood(f"{path}, line {line}"):
-                _expect(len(words) >= 8 and len(words) % 2 == 0, "a point needs 8 numbers, then pairs IMAGE OBSERVATION")
+                expect(len(words) >= 8 and len(words) % 2 == 0, "a point needs 8 numbers, then pairs IMAGE OBSERVATION")
                 points.append(tuple(_number(w) for w in words[1:4]))
                 colors.append(tuple(_number(w) for w in words[4:7]))
                 tracks.append(frozenset(names[i] for w in words[8::2] if (i := int(w)) in names))
@@ -311,10 +288,6 @@ def _cloud(
     return PointCloud(positions, np.clip(colors, 0, 255).astype(np.float32) / np.float32(1 if fractions else 255), tracks)
 
 
-PLY_TYPES = {
-    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2", "uint16": "u2",
-    "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4", "double": "f8", "float64": "f8",
-}  # fmt: skip
 PLY_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 
 COLORS = [c.split() for c in ("red green blue", "r g b", "diffuse_red diffuse_green diffuse_blue", "f_dc_0 f_dc_1 f_dc_2")]
@@ -329,23 +302,23 @@ def read_ply_points(path: Path, notes: list[str] | None = None) -> PointCloud:
     data = read_file(path, fix="fix its permissions or copy it again")
     head, mark, rest = data[: 2**16].partition(b"end_header")
     try:
-        _expect(data[:3] == b"ply" and bool(mark), "it has no PLY header")
+        expect(data[:3] == b"ply" and mark, "it has no PLY header")
         lines = [line.split() for line in head.decode("ascii", "replace").splitlines()]
         order = PLY_ORDERS[next(w[1] for w in lines if w[:1] == ["format"])]
         elements = [i for i, w in enumerate(lines) if w[:1] == ["element"]]
-        _expect(bool(elements) and lines[elements[0]][1] == "vertex", "its first element is not vertex")
+        expect(elements and lines[elements[0]][1] == "vertex", "its first element is not vertex")
         count = int(lines[elements[0]][2])
         rows = [w for w in lines[elements[0] : [*elements, len(lines)][1]] if w[:1] == ["property"]]
         kinds = {w[2]: PLY_TYPES[w[1]] for w in rows}
-        _expect(count >= 0 and len(kinds) == len(rows), "its header is inconsistent")
-        _expect({"x", "y", "z"} <= kinds.keys(), "its vertices lack x, y or z")
+        expect(count >= 0 and len(kinds) == len(rows), "its header is inconsistent")
+        expect({"x", "y", "z"} <= kinds.keys(), "its vertices lack x, y or z")
         body = data[len(head) + len(mark) + rest.find(b"\n") + 1 :]
         if order:
             table = np.frombuffer(body, np.dtype([(n, order + k) for n, k in kinds.items()]), count)
             values = {n: table[n].astype(np.float64) for n in kinds}
         else:
             words = np.array([row.split()[: len(kinds)] for row in NAN.sub(b"nan", body).splitlines()[:count]], np.float64)
-            _expect(count == len(words), f"it lists {len(words)} of {count} points")
+            expect(count == len(words), f"it lists {len(words)} of {count} points")
             values = dict(zip(kinds, words.reshape(count, len(kinds)).T))
     except (ValueError, KeyError, IndexError, OverflowError, StopIteration) as e:
         raise DataError(f"{path}: the points cannot be understood ({e}); export them again as PLY, or remove the file") from e
@@ -406,10 +379,8 @@ def reconstruction(root: Path, named: str | None = None) -> tuple[Model | None, 
     names = [m[0].relative_to(root).as_posix() for m in models]
     counts = ", ".join(f"{name}: {size}" for name, size in zip(names, sizes))
     chosen = best[0].relative_to(root).as_posix()
-    return (
-        best,
-        f"{chosen} is the largest of {len(models)} reconstructions (images in {counts}); --reconstruction FOLDER takes another",
-    )
+    among = f"of {len(models)} reconstructions (images in {counts})"
+    return best, f"{chosen} is the largest {among}; --reconstruction FOLDER takes another"
 
 
 def _size(model: Model) -> int:
@@ -470,8 +441,7 @@ def _image_paths(
             found[n] = match
     claims = Counter(found.values())
     found = {n: p for n, p in found.items() if claims[p] == 1 and p not in taken}
-    reduced = images != scene.root / base
-    if reduced and len(lost) == len(names) == len(files) > len(found):
+    if images != scene.root / base and len(lost) == len(names) == len(files) > len(found):
         pairs = dict(zip(sorted(names), files))
         order = f"images of {images.name} matched in sorted order, because their names differ"
         return pairs, [f"{order} ({min(names)} is {pairs[min(names)].name})"]
@@ -508,8 +478,7 @@ def add_views(
         mask = scene.mask_of(path, images, images / "masks" if flat else None)
         views.add(view, viewmat, partial(scene.image, path, lens, downscale=factor, mask=mask))
     unposed = len(set(files) - set(paths.values()))
-    if unposed:
-        notes.append(f"{unposed} files in {images.name} have no pose in the reconstruction and are left out")
+    notes += [f"{unposed} files in {images.name} have no pose in the reconstruction and are left out"] * bool(unposed)
     notes += scenes.missing_note(missing, len(rows), "images", file, options.strict)
     return named, notes + views.notes(options) + scene.mask_notes()
 
@@ -558,8 +527,7 @@ class ColmapReader(Reader):
         there = {v.name for v in views.views}  # without those that are left out
         names = {n: named[p[0]] for n, p in poses.items() if named.get(p[0]) in there}
         points, more = self._points(scene, model, kind, names)
-        pixels = scene.pixel_source(by_folder=True)
-        return self.scene(folder, views.views, notes + more, points=points, pixels=pixels)
+        return self.scene(folder, views.views, notes + more, points=points, pixels=scene.pixel_source(by_folder=True))
 
     def _points(self, scene: SceneFolder, model: Path, kind: str, names: dict[int, str]) -> tuple[PointCloud | None, list[str]]:
         """Return the points of a reconstruction, else those of points3D.ply beside it, and notes."""

@@ -21,8 +21,8 @@ from warpgs.constants import POSE_TOLERANCE
 from warpgs.device import machine_memory, usable_cores
 from warpgs.errors import DataError, UsageError, shortened
 from warpgs.files import inside, is_within
-from warpgs.geometry import matmul, nearest_rotation, rotation_matrices
-from warpgs.io.image_files import MAX_PIXELS, READ, decode, unread_note
+from warpgs.geometry import matmul, nearest_rotation, pose_at, pose_of, rotation_matrices
+from warpgs.io.image_files import READ, decode, unread_note
 from warpgs.io.images import BLACK, REDUCED, SUFFIXES, Lens, LoadedImage, ReadOptions, list_images, load_image
 from warpgs.io.maps import NOTHING_NAMED, GivenMaps, NamedMaps
 from warpgs.plugins import Registry
@@ -145,10 +145,9 @@ def protocol_ids(names: list[str], wanted: tuple[int, ...], least: int, where: s
     missing = [i for i in range(max(least, len(names))) if i not in by_id]
     if missing:
         shown = ", ".join(map(str, missing[:8])) + (", ..." if len(missing) > 8 else "")
-        raise DataError(
-            f"{where}: images with the ids {shown} are missing (ids are counted from 0, names run from {names[0]} to "
-            f"{names[-1]}); restore them, because the protocol's ids would otherwise select other views"
-        )
+        counted = f"(ids are counted from 0, names run from {names[0]} to {names[-1]})"
+        fix = "restore them, because the protocol's ids would otherwise select other views"
+        raise DataError(f"{where}: images with the ids {shown} are missing {counted}; {fix}")
     return {i: by_id[i] for i in wanted}
 
 
@@ -163,10 +162,7 @@ def rigid(viewmat: np.ndarray, where: str) -> np.ndarray:
         raise DataError(f"{where}: the pose is not rigid (R R^T is off by {error:.2g}): it scales or shears. Give rotations")
     if np.linalg.det(R) < 0:
         raise DataError(f"{where}: the pose mirrors the scene (determinant -1); two axes are probably swapped")
-    result = np.eye(4)
-    result[:3, :3] = nearest_rotation(R)
-    result[:3, 3] = viewmat[:3, 3]
-    return result
+    return pose_of(nearest_rotation(R), viewmat[:3, 3])
 
 
 def quat_rotation(quat: tuple[float, ...], where: str) -> np.ndarray:
@@ -188,10 +184,7 @@ def from_camera_to_world(matrix: np.ndarray, where: str, *, opengl: bool) -> np.
     if opengl:
         pose[:3, 1:3] *= -1
     pose = rigid(pose, where)
-    result = np.eye(4)
-    result[:3, :3] = pose[:3, :3].T
-    result[:3, 3] = -matmul(pose[:3, :3].T, pose[:3, 3])
-    return result
+    return pose_at(pose[:3, :3].T, pose[:3, 3])
 
 
 def about(viewmat: np.ndarray, origin: np.ndarray) -> np.ndarray:
@@ -329,7 +322,7 @@ class SceneFolder:
 
     def mask(self, path: Path) -> np.ndarray:
         """Return the weights of a mask file of the scene: float32 [H, W], 1 to keep a pixel, 0 to mask it out."""
-        gray = read_mask(self.inside(path), "white", self.options.max_pixels)
+        gray = np.ascontiguousarray(decode(self.inside(path), self.options.max_pixels)[0][..., 0])
         binary = self._thread.binary = 0 < float(gray.max()) < 1.5 / 255
         gray = (gray > 0).astype(np.float32) if binary else gray
         return gray if self.options.mask_keeps == "white" else 1 - gray
@@ -382,10 +375,9 @@ class SceneFolder:
             of_unmasked, of_known = ({f for n in names for f in masks.get(n, [])} for names in (unmasked, known))
             if lone := [f for f in files if f in of_unmasked or f not in of_known]:
                 image = min(unmasked.values())
-                notes.append(
-                    f"{len(lone)} of {len(files)} files in {folder.name} match no image or several, such as "
-                    f"{lone[0].relative_to(folder)}; name a mask like its image: {image.with_suffix('.png')} or {image}.png"
-                )
+                lost = f"{len(lone)} of {len(files)} files in {folder.name} match no image or several"
+                fix = f"name a mask like its image: {image.with_suffix('.png')} or {image}.png"
+                notes.append(f"{lost}, such as {lone[0].relative_to(folder)}; {fix}")
         return notes
 
     def images(self, base: str = "images") -> tuple[Path, int, str]:
@@ -428,12 +420,6 @@ class SceneFolder:
             name = folder.name
         how = f"area-resampled by {factor}" if factor > 1 else "as stored"
         return f"{name} {how}, {REDUCED}at most {self.options.max_side} px a side" if self._reduced else f"{name} {how}"
-
-
-def read_mask(path: Path, keeps: str = "white", max_pixels: int = MAX_PIXELS) -> np.ndarray:
-    """Return the weight of each pixel from a mask file, float32 [H, W] in [0, 1]; ``keeps`` is the colour of kept pixels."""
-    gray = np.ascontiguousarray(decode(path, max_pixels)[0][..., 0])
-    return gray if keeps == "white" else 1 - gray
 
 
 def resampling_note(downscale: int) -> list[str]:
@@ -580,18 +566,15 @@ class ViewList:
         notes = [f"{n} image{'s' if n != 1 else ''} {what}" for what, n in sorted(self._done.items())]
         if self._narrow:
             name, left = min(self._narrow.items(), key=lambda item: item[1])
-            notes.append(
-                f"the lens distortion leaves few pixels of {len(self._narrow)} images, {left:.0%} of {name}; check the "
-                "distortion, or use --lenses native"
-            )
+            fix = "check the distortion, or use --lenses native"
+            notes.append(f"the lens distortion leaves few pixels of {len(self._narrow)} images, {left:.0%} of {name}; {fix}")
         cutout = options is not None and options.masks == "cutout"
         if options is None or not self._kept:
             return [*notes, "--masks cutout changes nothing: no image has a mask file"] if cutout else notes
         mean = math.fsum(self._kept.values()) / len(self._kept)
-        notes.append(
-            f"masks keep {mean:.1%} of the pixels, the {options.mask_keeps} ones (--mask-keeps {options.mask_keeps}); "
-            f"the others {'are transparent' if cutout else 'are ignored'} (--masks {options.masks})"
-        )
+        others = f"the others {'are transparent' if cutout else 'are ignored'} (--masks {options.masks})"
+        kept = f"the {options.mask_keeps} ones (--mask-keeps {options.mask_keeps})"
+        notes.append(f"masks keep {mean:.1%} of the pixels, {kept}; {others}")
         out = "" if cutout else ", so that their views are left out (see --mask-keeps)"
         for fraction, what in ((0.0, f"keep no pixel{out}"), (1.0, "keep every pixel")):
             names = [n for n, kept in self._kept.items() if kept == fraction]

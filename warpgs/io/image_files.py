@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from warpgs.errors import DataError, ResourceError
+from warpgs.errors import DataError, ResourceError, expect
 from warpgs.files import read_input, read_start, unread_reason
 
 if TYPE_CHECKING:
@@ -55,12 +55,9 @@ def brand(data: bytes) -> str | None:
 
 def format_of(data: bytes) -> str:
     """Return the format of an image file by its first bytes; ValueError for one that is not supported."""
-    for start, name in STARTS.items():
-        if data.startswith(start):
-            return name
-    if brand(data) == "AVIF":
-        return "AVIF"
-    raise ValueError(f"it is not a {READ} file" if data else "it is empty")
+    found = next((name for start, name in STARTS.items() if data.startswith(start)), brand(data))
+    expect(found not in (None, "HEIC", "RAW"), f"it is not a {READ} file" if data else "it is empty")
+    return str(found)
 
 
 # Unsupported formats of photographs, and remedies.
@@ -74,13 +71,6 @@ VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
 """Suffixes of video files, whose frames `warpgs.poses.photographs` takes."""
 HEIC = "a HEIC photograph, which is supported only for finding poses (warpgs poses); convert all HEIC files to JPEG"
 RAW = "a RAW file, which is not supported; convert all to JPEG or 16-bit PNG, with the same settings and white balance"
-
-
-def unread_format(path: Path, head: bytes) -> str | None:
-    """Return a remedy for a photograph of an unsupported format, by RAW's suffix or its first bytes; None for other files."""
-    if path.suffix.lower() in RAW_SUFFIXES or brand(head) == "RAW":
-        return RAW
-    return HEIC if brand(head) == "HEIC" else None
 
 
 def unread_note(folder: Path) -> str:
@@ -159,27 +149,21 @@ def header_size(name: str, data: bytes) -> tuple[int, int]:
         with _decoder("{}"):
             height, width, *_ = simplejpeg.decode_jpeg_header(data)
         return width, height
-    if name == "PNG":  # Pillow would unpack texts first
-        return _png_size(data)
-    if name == "WEBP":
-        return _webp_size(data)
-    if name == "TIFF":
-        return _tiff_size(_tiff_tags(data))
+    # Pillow would unpack the texts of a PNG first
+    if size_of := {"PNG": _png_size, "WEBP": _webp_size, "TIFF": lambda data: _tiff_size(_tiff_tags(data))}.get(name):
+        return size_of(data)
     with _opened(name, data) as image:
         return image.size
 
 
 def _png_size(data: bytes) -> tuple[int, int]:
     """Return width and height [px] of a PNG, whose chunks must lie in the file: OpenCV takes the memory that each announces."""
-    if len(data) < 33 or data[12:16] != b"IHDR":
-        raise ValueError("it has no header")
+    expect(len(data) >= 33 and data[12:16] == b"IHDR", "it has no header")
     at, kind = len(PNG_START), b""
     while kind != b"IEND" and at < len(data):
         length, kind = struct.unpack_from(">I4s", data, at) if at + 8 <= len(data) else (len(data), b"")
-        if at + 12 + length > len(data):
-            raise ValueError("it ends within a chunk")
-        if kind == b"IHDR" and at > len(PNG_START):
-            raise ValueError("it has two headers")  # the second may announce another size
+        expect(at + 12 + length <= len(data), "it ends within a chunk")
+        expect(kind != b"IHDR" or at == len(PNG_START), "it has two headers")  # the second may announce another size
         at += 12 + length
     return struct.unpack_from(">II", data, 16)
 
@@ -193,12 +177,11 @@ def _decoded(name: str, data: bytes) -> np.ndarray | None:
             pixels = np.asarray(image.convert("RGBA" if "A" in image.getbands() else "RGB"))
         return np.ascontiguousarray(pixels[..., [2, 1, 0, 3][: pixels.shape[2]]])
     if name == "WEBP":
-        if not any(kind in WEBP_PIXELS for kind, _ in _webp_chunks(data)):
-            raise ValueError("it holds no pixels")
+        expect(any(kind in WEBP_PIXELS for kind, _ in _webp_chunks(data)), "it holds no pixels")
     elif name in ("PNG", "BMP"):
         with _opened(name, data) as image:
-            if name == "BMP" and image.info.get("compression") in BMP_RLE:
-                raise ValueError("its pixels are compressed, so damage would not be detected; save it as PNG")
+            plain = name != "BMP" or image.info.get("compression") not in BMP_RLE
+            expect(plain, "its pixels are compressed, so damage would not be detected; save it as PNG")
             _loaded(image)
     else:
         _check_tiff(data)
@@ -232,18 +215,15 @@ def jpeg_segments(data: bytes) -> Iterator[tuple[int, bytes, bytes]]:
             return
         if marker in LONE:
             continue
-        if marker in (0, SOI) or at + 2 > len(data):
-            raise ValueError(f"it is broken at byte {at}")
+        expect(marker not in (0, SOI) and at + 2 <= len(data), f"it is broken at byte {at}")
         (length,) = struct.unpack_from(">H", data, at)
-        if length < 2 or at + length > len(data):
-            raise ValueError(f"it ends within a segment, at byte {len(data)}")
+        expect(length >= 2 and at + length <= len(data), f"it ends within a segment, at byte {len(data)}")
         contents = data[at + 2 : at + length]
         at += length
         if marker == SOS:
-            found = NEXT_MARKER.search(data, at)
-            if found is None:
-                raise ValueError("it ends within its coded data")
-            at = found.start()
+            ends = NEXT_MARKER.search(data, at)
+            expect(ends, "it ends within its coded data")
+            at = ends.start()
         yield marker, contents, data[begin:at]
 
 
@@ -252,26 +232,20 @@ def _check_scans(data: bytes) -> None:
     missing: dict[int, list[int]] = {}
     scans = 0
     for marker, body, _ in jpeg_segments(data):
-        if marker in OTHER_SOF:
-            raise ValueError("it is lossless, hierarchical or arithmetically coded; save it as PNG")
+        expect(marker not in OTHER_SOF, "it is lossless, hierarchical or arithmetically coded; save it as PNG")
         if marker in SOF:
-            if missing:
-                raise ValueError("it has two frame headers")
+            expect(not missing, "it has two frame headers")
             # number of low bits that are still unknown; 15 where nothing is known
             missing = {number: [15] * COEFFICIENTS for number in body[6::3]}
         elif marker == SOS:
             scans += 1
-            if scans > MAX_SCANS:
-                raise ValueError(f"it has more than {MAX_SCANS} scans; save it as PNG")
-            if not body or len(body) != 4 + 2 * body[0]:
-                raise ValueError("the header of a scan is broken")
+            expect(scans <= MAX_SCANS, f"it has more than {MAX_SCANS} scans; save it as PNG")
+            expect(body and len(body) == 4 + 2 * body[0], "the header of a scan is broken")
             first, last, bits = body[-3:]
             for number in body[1:-3:2]:
-                if number not in missing or not first <= last < COEFFICIENTS:
-                    raise ValueError("a scan does not belong to the frame")
+                expect(number in missing and first <= last < COEFFICIENTS, "a scan does not belong to the frame")
                 missing[number][first : last + 1] = [bits & 15] * (last + 1 - first)
-    if not missing or any(any(bits) for bits in missing.values()):
-        raise ValueError("some of its scans are missing")
+    expect(missing and not any(any(bits) for bits in missing.values()), "some of its scans are missing")
 
 
 def _decoded_jpeg(data: bytes) -> np.ndarray | None:
@@ -285,8 +259,7 @@ def _decoded_jpeg(data: bytes) -> np.ndarray | None:
             # all codes are read, though only every eighth pixel is made
             simplejpeg.decode_jpeg(data, "CMYK", min_height=1, min_width=1, min_factor=8, strict=True)
             return None
-        pixels: np.ndarray = simplejpeg.decode_jpeg(data, "GRAY" if colors == "Gray" else "BGR", strict=True)
-    return pixels
+        return simplejpeg.decode_jpeg(data, "GRAY" if colors == "Gray" else "BGR", strict=True)
 
 
 WEBP_PIXELS = (b"VP8 ", b"VP8L", b"ANMF")
@@ -295,16 +268,13 @@ WEBP_PIXELS = (b"VP8 ", b"VP8L", b"ANMF")
 
 def _webp_chunks(data: bytes) -> Iterator[tuple[bytes, memoryview]]:
     """Yield kind and contents of each chunk of a WebP; they must fill the length that the file announces."""
-    if len(data) < 20 or data[8:12] != b"WEBP":
-        raise ValueError("it is not a WebP file")
+    expect(len(data) >= 20 and data[8:12] == b"WEBP", "it is not a WebP file")
     view = memoryview(data)
     end, at = 8 + struct.unpack_from("<I", data, 4)[0], 12
-    if end > len(data):
-        raise ValueError(f"it ends early: it has {len(data)} bytes and announces {end}")
+    expect(end <= len(data), f"it ends early: it has {len(data)} bytes and announces {end}")
     while at < end:
         kind, length = struct.unpack_from("<4sI", data, at) if at + 8 <= end else (b"", end)
-        if at + 8 + length > end:
-            raise ValueError("it ends within a chunk")
+        expect(at + 8 + length <= end, "it ends within a chunk")
         yield kind, view[at + 8 : at + 8 + length]
         at += 8 + length + length % 2
 
@@ -350,8 +320,7 @@ class _Directory:
         if at is None:
             (at,) = self._unpack(self.pointer, 8 if big else 4)
         (count,) = self._unpack("Q" if big else "H", at)
-        if count > MAX_ENTRIES:
-            raise ValueError(f"its directory announces {count} tags")
+        expect(count <= MAX_ENTRIES, f"its directory announces {count} tags")
         at, room, self.repeats = at + (8 if big else 2), len(block), False
         for _ in range(count):
             tag, kind, length = self._unpack(entry, at)
@@ -400,18 +369,15 @@ class _Directory:
 def _tiff_tags(data: bytes) -> _Directory:
     """Return the tags of a TIFF; ValueError if they overlap, because Pillow and libtiff would copy each of them."""
     tags = _Directory(data)
-    if tags.repeats:
-        raise ValueError("it has two values of a tag")  # decoders differ in which of two sizes they take
-    if tags.overlaps:
-        raise ValueError("its tags overlap, or lie outside of the file")
+    expect(not tags.repeats, "it has two values of a tag")  # decoders differ in which of two sizes they take
+    expect(not tags.overlaps, "its tags overlap, or lie outside of the file")
     return tags
 
 
 def _tiff_size(tags: _Directory) -> tuple[int, int]:
     """Return width and height [px]."""
     width, height = tags.numbers(WIDTH), tags.numbers(HEIGHT)
-    if not width or not height:
-        raise ValueError("it has no size")
+    expect(width and height, "it has no size")
     return width[0], height[0]
 
 
@@ -419,8 +385,8 @@ def _check_tiff(data: bytes) -> None:
     """Check that a TIFF holds all its pixels: by Pillow, and by the checksum of Deflate, at which libtiff does not look."""
     tags = _tiff_tags(data)
     offsets, lengths = (tags.numbers(tag) for tag in (TILES if TILES[0] in tags.entries else STRIPS))
-    if any(offset + length > len(data) for offset, length in zip(offsets, lengths)):
-        raise ValueError("its strips or tiles lie outside of the file")
+    within = all(offset + length <= len(data) for offset, length in zip(offsets, lengths))
+    expect(within, "its strips or tiles lie outside of the file")
     if (tags.numbers(COMPRESSION) or (1,))[0] in DEFLATE:
         left = FILE_BYTES_PER_PIXEL * math.prod(_tiff_size(tags)) + EXTRA_FILE_BYTES
         for offset, length in zip(offsets, lengths):
@@ -447,8 +413,7 @@ def unpacked_size(packed: memoryview, limit: int) -> int:
             total += len(more)
     except zlib.error as e:
         raise ValueError(f"its compressed pixels are damaged ({e})") from e
-    if not stream.eof:
-        raise ValueError(f"its compressed pixels {'end early' if total <= limit else 'are more than it announces'}")
+    expect(stream.eof, f"its compressed pixels {'end early' if total <= limit else 'are more than it announces'}")
     return total
 
 
@@ -456,45 +421,31 @@ def _raster(path: Path, data: bytes, max_pixels: int) -> np.ndarray:
     """Return the pixels as stored, [H, W] or [H, W, C] with colours in BGR order, of any type that OpenCV has."""
     import cv2
 
-    pixels = 0
-    if unread := unread_format(path, data[:32]):
-        raise DataError(f"{path}: is {unread}")
+    pixels, kind = 0, "RAW" if path.suffix.lower() in RAW_SUFFIXES else brand(data)
+    if kind in ("HEIC", "RAW"):
+        raise DataError(f"{path}: is {RAW if kind == 'RAW' else HEIC}")
     try:
         name = format_of(data)
         width, height = header_size(name, data)
         pixels = width * height
         if pixels > max_pixels:
-            raise DataError(
-                f"{path}: the image is {width} x {height} px, more than the limit of {max_pixels:,} pixels; shrink it, or "
-                f"raise the limit with --max-pixels {pixels} (decoding then needs {BYTES_PER_PIXEL * pixels / 2**30:.1f} GiB)"
-            )
-        if not pixels:
-            raise ValueError(f"it has {width} x {height} px")
+            size = f"the image is {width} x {height} px, more than the limit of {max_pixels:,} pixels"
+            needs = f"--max-pixels {pixels} (decoding then needs {BYTES_PER_PIXEL * pixels / 2**30:.1f} GiB)"
+            raise DataError(f"{path}: {size}; shrink it, or raise the limit with {needs}")
+        expect(pixels, f"it has {width} x {height} px")
         raster = _decoded(name, data)
         if raster is None:
             # IMREAD_UNCHANGED also ignores the EXIF orientation: the camera, not the tag, determines how the raster lies
             raster = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-        if raster is None or raster.shape[:2] != (height, width):
-            raise ValueError("its pixels cannot be read")
-    except cv2.error as e:
-        if e.code == cv2.Error.StsNoMem:
-            raise ResourceError(_too_large(path, pixels)) from e
-        raise _damaged(path, "OpenCV cannot read it") from e
-    except MemoryError as e:
-        raise ResourceError(_too_large(path, pixels)) from e
-    except ValueError as e:
-        raise _damaged(path, str(e)) from e
+        expect(raster is not None and raster.shape[:2] == (height, width), "its pixels cannot be read")
+    except (cv2.error, MemoryError, ValueError) as e:
+        if isinstance(e, MemoryError) or getattr(e, "code", None) == cv2.Error.StsNoMem:
+            needs = f"needs {BYTES_PER_PIXEL * pixels / 2**30:.1f} GiB of free memory"
+            raise ResourceError(f"{path}: decoding the image {needs}; shrink the image, or end other programs") from e
+        reason = "OpenCV cannot read it" if isinstance(e, cv2.error) else e
+        fix = "Restore it from its source; if it looks right, save it as PNG"
+        raise DataError(f"{path}: the image cannot be decoded: {reason}. {fix}") from e
     return raster
-
-
-def _damaged(path: Path, reason: str) -> DataError:
-    fix = "Restore it from its source; if it looks right, save it as PNG"
-    return DataError(f"{path}: the image cannot be decoded: {reason}. {fix}")
-
-
-def _too_large(path: Path, pixels: int) -> str:
-    needed = BYTES_PER_PIXEL * pixels / 2**30
-    return f"{path}: decoding the image needs {needed:.1f} GiB of free memory; shrink the image, or end other programs"
 
 
 def decode_png(path: Path, max_pixels: int = MAX_PIXELS) -> np.ndarray:

@@ -159,9 +159,8 @@ class Lens:
         if not (1 <= self.width <= MAX_INTRINSIC and 1 <= self.height <= MAX_INTRINSIC):
             raise DataError(f"{where}: the camera's image size {self.width} x {self.height} px is impossible; fix the file")
         if not ((f >= MIN_FOCAL * np.array([self.width, self.height])) & (f < MAX_INTRINSIC)).all():
-            raise DataError(
-                f"{where}: focal lengths {f.tolist()} px must be over {MIN_FOCAL} of the sides, and finite; calibrate again"
-            )
+            fix = "calibrate again"
+            raise DataError(f"{where}: focal lengths {f.tolist()} px must be over {MIN_FOCAL} of the sides, and finite; {fix}")
         if not (np.abs(c) < MAX_INTRINSIC).all():
             raise DataError(f"{where}: the principal point {c.tolist()} px is not finite or too large; calibrate again")
         if not (np.abs(self.distortion) < MAX_DISTORTION).all():
@@ -215,8 +214,7 @@ def turn_upright(array: np.ndarray, orientation: int) -> np.ndarray:
     """Rotate or mirror a raster [H, W, ...] upright by its EXIF orientation."""
     if orientation in (5, 6, 7, 8):
         array = np.swapaxes(array, 0, 1)
-    flips = {2: (1,), 3: (0, 1), 4: (0,), 6: (1,), 7: (0, 1), 8: (0,)}.get(orientation, ())
-    for axis in flips:
+    for axis in {2: (1,), 3: (0, 1), 4: (0,), 6: (1,), 7: (0, 1), 8: (0,)}.get(orientation, ()):
         array = np.flip(array, axis)
     return np.ascontiguousarray(array)
 
@@ -238,8 +236,7 @@ def _fold_radius2(distortion: tuple[float, ...]) -> float:
     k1, k2, k3 = distortion[0], distortion[1], distortion[4] if len(distortion) > 4 else 0.0
     # roots of 1 + 3 k1 x + 5 k2 x^2 + 7 k3 x^3 through u = 1 / x, whose first coefficient is never small
     roots = np.roots([1.0, 3 * k1, 5 * k2, 7 * k3])
-    real = roots[np.abs(roots.imag) < 1e-9 * (1 + np.abs(roots.real))].real
-    largest = float(max(real, default=0.0))
+    largest = float(max(roots[np.abs(roots.imag) < 1e-9 * (1 + np.abs(roots.real))].real, default=0.0))
     return 1 / largest if largest > MIN_FOLD else np.inf
 
 
@@ -260,8 +257,7 @@ def nearest_unmasked(raster: np.ndarray, mask: np.ndarray | None) -> np.ndarray:
         return raster
     if not mask.any():
         return np.zeros_like(raster)
-    masked = (~mask).astype(np.uint8)
-    labels = cv2.distanceTransformWithLabels(masked, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)[1]
+    labels = cv2.distanceTransformWithLabels((~mask).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)[1]
     places = np.flatnonzero(mask)[labels[~mask] - 1]  # labels count the unmasked pixels row by row, from 1
     filled = raster.copy()
     filled[~mask] = raster.reshape(-1, *raster.shape[2:])[places]
@@ -295,10 +291,9 @@ def _undistort(loaded: LoadedImage, lens: Lens) -> LoadedImage:
     inside &= y2[:, None] + x2 < _fold_radius2(lens.distortion)
     if loaded.mask is not None:
         inside &= cv2.remap(loaded.mask.astype(np.float32), map_x, map_y, cv2.INTER_LINEAR) > 0.5
-    edge = cv2.BORDER_REPLICATE
 
     def moved(raster: np.ndarray) -> np.ndarray:
-        return cv2.remap(nearest_unmasked(raster, loaded.mask), map_x, map_y, cv2.INTER_LINEAR, borderMode=edge)
+        return cv2.remap(nearest_unmasked(raster, loaded.mask), map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
     image, alpha = moved(loaded.image), None if loaded.alpha is None else moved(loaded.alpha)
     done = (*loaded.done, f"undistorted ({lens.model})")
@@ -316,17 +311,13 @@ def _reached(model: str, distortion: tuple[float, ...], intrinsics: tuple[float,
 
 def _native(loaded: LoadedImage, lens: Lens) -> LoadedImage:
     """Keep the pixels and record the camera model; pixels that the lens does not reach are masked out."""
-    height, width = loaded.image.shape[:2]
     model, count = ("fisheye", 4) if lens.fisheye else ("opencv", 8)
-    distortion = np.zeros(count)
-    distortion[: len(lens.distortion)] = lens.distortion
-    K = loaded.K
-    mask = _reached(model, tuple(distortion), (K[0, 0], K[1, 1], K[0, 2], K[1, 2]), width, height)
+    distortion, K = np.pad(np.array(lens.distortion, np.float64), (0, count - len(lens.distortion))), loaded.K
+    mask = _reached(model, tuple(distortion), (K[0, 0], K[1, 1], K[0, 2], K[1, 2]), *loaded.image.shape[1::-1])
     if loaded.mask is not None:
         mask = mask & loaded.mask
     done = (*loaded.done, f"kept with the distortion of their lens ({lens.model})")
-    kept = None if mask.all() else mask
-    return replace(loaded, mask=kept, done=done, camera_model=model, distortion=distortion)
+    return replace(loaded, mask=None if mask.all() else mask, done=done, camera_model=model, distortion=distortion)
 
 
 def _shrink(path: Path, loaded: LoadedImage, downscale: int, max_side: int) -> LoadedImage:
@@ -340,10 +331,8 @@ def _shrink(path: Path, loaded: LoadedImage, downscale: int, max_side: int) -> L
         return loaded
     small_w, small_h = round(width / factor), round(height / factor)
     if min(small_w, small_h) < MIN_SIDE:
-        raise UsageError(
-            f"{flags} leaves {small_w} x {small_h} px of {path} ({width} x {height} px); "
-            f"both sides must keep at least {MIN_SIDE} px. Choose a smaller factor or a longer side"
-        )
+        fix = f"both sides must keep at least {MIN_SIDE} px. Choose a smaller factor or a longer side"
+        raise UsageError(f"{flags} leaves {small_w} x {small_h} px of {path} ({width} x {height} px); {fix}")
     K = np.diag([small_w / width, small_h / height, 1.0]) @ loaded.K
     mask = None if loaded.mask is None else _resize(loaded.mask.astype(np.float32), small_w, small_h) > 0.5
     hides = loaded.mask if loaded.undone is None else None  # what the mask of an undistorted image hides is filled already
@@ -364,10 +353,8 @@ def _fit_mask(path: Path, mask: np.ndarray, stored: tuple[int, int], upright: tu
         return mask
     # rounding a size may change it by one pixel of the smaller raster
     if abs(mask.shape[1] * height - mask.shape[0] * width) > max(height, width, *mask.shape):
-        raise DataError(
-            f"{path}: its mask is {mask.shape[1]} x {mask.shape[0]} px, the image {width} x {height}: the aspects differ. "
-            "Give a mask made from this image"
-        )
+        fix = "the aspects differ. Give a mask made from this image"
+        raise DataError(f"{path}: its mask is {mask.shape[1]} x {mask.shape[0]} px, the image {width} x {height}: {fix}")
     resized = _resize(mask.astype(np.float32), width, height)
     return resized > 0.5 if mask.dtype == bool else resized
 
@@ -378,10 +365,9 @@ def _upright(path: Path, lens: Lens, image: np.ndarray, data: bytes) -> int:
         return 1
     orientation = read_exif(data)[0]
     if orientation not in (5, 6, 7, 8) or not _fits(image.shape[1::-1], lens):
-        raise DataError(
-            f"{path}: the image is {image.shape[1]} x {image.shape[0]} px, its camera {lens.width} x {lens.height}: the "
-            "aspects differ, so the intrinsics cannot belong to it. Give the images that the cameras were made from."
-        )
+        sizes = f"the image is {image.shape[1]} x {image.shape[0]} px, its camera {lens.width} x {lens.height}"
+        fix = "the aspects differ, so the intrinsics cannot belong to it. Give the images that the cameras were made from."
+        raise DataError(f"{path}: {sizes}: {fix}")
     return orientation
 
 
@@ -473,7 +459,7 @@ def dark_pixels(image: np.ndarray) -> np.ndarray | None:
     border = np.concatenate([image[0], image[-1], image[:, 0], image[:, -1]]).max(-1) < DARK
     if border.mean() < 0.5:  # as in most photographs, whose other pixels take 40 ms per million
         return None
-    dark: np.ndarray = image.max(-1) < DARK
+    dark = np.asarray(image.max(-1) < DARK)
     return dark if dark.mean() >= DARK_FRACTION and not dark.all() else None
 
 
@@ -488,8 +474,7 @@ def empty_pixels(dark: np.ndarray) -> np.ndarray:
     _, labels, found, _ = cv2.connectedComponentsWithStats(dark.astype(np.uint8), connectivity=4)
     empty = found[:, cv2.CC_STAT_AREA] >= HOLE * dark.size
     empty[np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]])] = True
-    pixels: np.ndarray = dark & empty[labels]
-    return pixels
+    return np.asarray(dark & empty[labels])
 
 
 def cut_from_black(views: list[View]) -> tuple[list[View], str]:
@@ -507,7 +492,5 @@ def cut_from_black(views: list[View]) -> tuple[list[View], str]:
         empty += float(nothing.mean()) / len(views)
         alpha = 1 - nothing.astype(np.float32)
         done.append(replace(v, image=v.image * alpha[..., None], alpha=alpha, alpha_estimated=True))
-    return done, (
-        f"every image shows an object on black: the dark pixels around the object and in its holes ({empty:.1%} of all "
-        f"pixels) become transparent; --no-black-is-empty keeps them"
-    )
+    these = f"the dark pixels around the object and in its holes ({empty:.1%} of all pixels)"
+    return done, f"every image shows an object on black: {these} become transparent; --no-black-is-empty keeps them"

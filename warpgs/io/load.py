@@ -50,10 +50,9 @@ def normalization_of(views: list[View], points: PointCloud | None, where: str) -
     far = np.abs(centers).max(axis=1)
     if not (far < MAX_COORDINATE).all():
         worst = int(np.argmax(far))
-        raise DataError(
-            f"{where}, image {views[worst].name!r}: its camera centre {centers[worst].tolist()} is beyond "
-            f"{MAX_COORDINATE:.0e} units, so the scene cannot be scaled; estimate its pose again, or remove the image"
-        )
+        far_off = f"beyond {MAX_COORDINATE:.0e} units, so the scene cannot be scaled"
+        which = f"{where}, image {views[worst].name!r}: its camera centre {centers[worst].tolist()}"
+        raise DataError(f"{which} is {far_off}; estimate its pose again, or remove the image")
     centers = centers[near_cameras(centers, None if points is None else points.points)]
     offset = centers.mean(0)
     extent = 1.1 * float(np.linalg.norm(centers - offset, axis=1).max())
@@ -82,10 +81,8 @@ def normalize_points(points: PointCloud, n: Normalization, where: str) -> PointC
         moved = n.scale * (points.points - n.offset)
     far = int((~(np.abs(moved) < MAX_COORDINATE).all(axis=1)).sum())
     if far:
-        raise DataError(
-            f"{where}: {far} of {len(moved)} points are not finite, or farther than {MAX_COORDINATE:.0e} times the extent of "
-            "the cameras; remove them, or reconstruct again"
-        )
+        or_far = f"or farther than {MAX_COORDINATE:.0e} times the extent of the cameras"
+        raise DataError(f"{where}: {far} of {len(moved)} points are not finite, {or_far}; remove them, or reconstruct again")
     return replace(points, points=moved)
 
 
@@ -137,13 +134,12 @@ class Split:
 
 
 def _every_8th(names: list[str], count: int, spec: str) -> Split:
-    test = tuple(n for i, n in enumerate(names) if i % 8 == 0)
     pool = [n for i, n in enumerate(names) if i % 8]
     if not 1 <= count <= len(pool):
         raise DataError(f"split {spec}: needs {count} views, {len(pool)} of {len(names)} remain without every 8th; take fewer")
     # np.round goes half to even, as the published id tables do
     ids = np.round(np.linspace(0, len(pool) - 1, count)).astype(int)
-    return Split(tuple(pool[i] for i in ids), test)
+    return Split(tuple(pool[i] for i in ids), tuple(names[::8]))
 
 
 def _dtu(names: list[str], count: int, spec: str) -> Split:
@@ -164,10 +160,8 @@ def _blender(names: list[str], count: int, spec: str) -> Split:
     # r_10 sorts before r_2 by name; the ids count frames
     train, test = (sorted((n for n in names if n.split("/")[0] == s), key=_frame_number) for s in ("train", "test"))
     if len(train) <= max(BLENDER_TRAIN) or not test:
-        raise DataError(
-            f"split {spec}: the Blender protocol picks from 100 frames in train and 200 in test; found {len(train)} and "
-            f"{len(test)}. Restore the scene, or use llff:K or every:N"
-        )
+        there = f"found {len(train)} and {len(test)}. Restore the scene, or use llff:K or every:N"
+        raise DataError(f"split {spec}: the Blender protocol picks from 100 frames in train and 200 in test; {there}")
     return Split(tuple(train[i] for i in BLENDER_TRAIN), tuple(test[::8]))
 
 
@@ -195,13 +189,12 @@ def _finder(names: list[str], spec: str) -> Callable[[str], str]:
         return table
 
     def find(wanted: str) -> str:
-        for count in (0, wanted.count("/") + 1):
-            for plain in (False, True):
-                matches = by_end(plain, count).get(wanted, [])
-                if len(matches) == 1:
-                    return matches[0]
-                if matches:
-                    raise DataError(f"split {spec}: {wanted!r} could be any of {', '.join(matches[:5])}; give the whole name")
+        for count, plain in itertools.product((0, wanted.count("/") + 1), (False, True)):
+            matches = by_end(plain, count).get(wanted, [])
+            if len(matches) == 1:
+                return matches[0]
+            if matches:
+                raise DataError(f"split {spec}: {wanted!r} could be any of {', '.join(matches[:5])}; give the whole name")
         raise DataError(f"split {spec}: no view {wanted!r}; the nearest names are {_nearest(names, wanted)}")
 
     return find
@@ -262,8 +255,7 @@ def split_names(names: list[str], spec: str) -> Split:
     kind, number = spec.split(":")
     count = int(number)
     if kind == "every":
-        test = tuple(n for i, n in enumerate(names) if i % count == 0)
-        return Split(tuple(n for i, n in enumerate(names) if i % count), test)
+        return Split(tuple(n for i, n in enumerate(names) if i % count), tuple(names[::count]))
     return {"llff": _every_8th, "mip360": _every_8th, "dtu": _dtu, "blender": _blender}[kind](names, count, spec)
 
 
@@ -287,8 +279,7 @@ def coincident_views(scene: Scene, split: Split) -> list[tuple[str, str]]:
 
     Two cameras count as the same if all entries of their poses differ by less than a thousandth; lengths are in camera extents.
     """
-    extent = max(camera_extent([v.camera for v in scene.views]), 1e-9)
-    unit = np.array([[1, 1, 1, 1 / extent]] * 3 + [[1] * 4])
+    unit = np.array([[1, 1, 1, 1 / max(camera_extent([v.camera for v in scene.views]), 1e-9)]] * 3 + [[1] * 4])
     poses = {v.name: v.camera.viewmat * unit for v in scene.views}
     trained = np.stack([poses[b] for b in split.train])
     same = ((a, np.abs(trained - poses[a]).max((1, 2)) < 1e-3) for a in split.test)
@@ -305,12 +296,10 @@ def _fit(path: Path, mask: np.ndarray, view: View) -> np.ndarray:
     import cv2
 
     height, width = view.image.shape[:2]
-    ratio = (mask.shape[1] / mask.shape[0]) / (width / height)
-    if not abs(ratio - 1) <= ASPECT_TOLERANCE:
-        raise DataError(
-            f"{path}: the mask is {mask.shape[1]} x {mask.shape[0]} px, its image {view.name} {width} x {height}: the "
-            "aspects differ by more than two percent. Give the masks of these images"
-        )
+    if not abs((mask.shape[1] / mask.shape[0]) / (width / height) - 1) <= ASPECT_TOLERANCE:
+        sizes = f"the mask is {mask.shape[1]} x {mask.shape[0]} px, its image {view.name} {width} x {height}"
+        fix = "the aspects differ by more than two percent. Give the masks of these images"
+        raise DataError(f"{path}: {sizes}: {fix}")
     if mask.shape != (height, width):
         mask = cv2.resize(mask.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA) > 0.5
     if view.mask is not None:  # pixels outside the lens or under a mask file have no reference
@@ -340,15 +329,12 @@ def add_score_masks(views: list[View], folder: Path, scene: SceneFolder) -> tupl
     missing = sorted(set(ids) - set(masks))
     if missing:
         shown = ", ".join(map(str, missing[:8])) + (", ..." if len(missing) > 8 else "")
-        raise DataError(
-            f"{folder}: no mask for image id {shown} (ids are counted from 0; an image rect_001_... is id 0); the "
-            f"masks run from {files[0].name} to {files[-1].name}. Restore the missing ones"
-        )
+        counted = "(ids are counted from 0; an image rect_001_... is id 0)"
+        fix = f"the masks run from {files[0].name} to {files[-1].name}. Restore the missing ones"
+        raise DataError(f"{folder}: no mask for image id {shown} {counted}; {fix}")
     if min(ids) == 1 and 0 in masks and not scenes.named_by_dtu([v.name for v in views]):
-        raise DataError(
-            f"{folder}: the images start with 1 ({views[ids.index(1)].name}), the masks with 0, so the masks may be off by "
-            f"one; rename the images so that they count from 0, or remove mask 0"
-        )
+        fix = "so the masks may be off by one; rename the images so that they count from 0, or remove mask 0"
+        raise DataError(f"{folder}: the images start with 1 ({views[ids.index(1)].name}), the masks with 0, {fix}")
     done = [replace(v, score_mask=_fit(masks[i], scene.mask(masks[i]) > 0.5, v)) for i, v in zip(ids, views)]
     return done, f"scores use only pixels inside the masks in {folder}, matched by image id; the fit ignores these masks"
 
@@ -483,8 +469,7 @@ def detect(root: Path) -> tuple[Reader, list[str]]:
         raise DataError(f"{root}: {photographs}no scene format found. Looked for: {known}{remedy}")
     taken, *others = complete
     notes = [f"{lack}; {taken.name} is complete and is used instead" for lack in broken]
-    if others:
-        notes.append(f"the folder also holds {' and '.join(r.name for r in others)}: {taken.name} is used")
+    notes += [f"the folder also holds {' and '.join(r.name for r in others)}: {taken.name} is used"] if others else []
     return taken, notes
 
 
@@ -537,28 +522,25 @@ def doubtful_notes(views: list[View], points: PointCloud | None) -> list[str]:
     centers = np.array([v.camera.center for v in views])
     middle = centers.mean(0)
     spread = float(np.linalg.norm(centers - middle, axis=1).max())
-    with np.errstate(over="ignore", invalid="ignore"):
-        distance = (
-            0.0 if points is None or not len(points) else float(np.median(np.linalg.norm(points.points - middle, axis=1)))
-        )
+    distance = 0.0
+    if points is not None and len(points):
+        with np.errstate(over="ignore", invalid="ignore"):
+            distance = float(np.median(np.linalg.norm(points.points - middle, axis=1)))
     if spread < max(MIN_EXTENT, MIN_BASELINE * min(distance, MAX_COORDINATE)):
-        notes.append(
-            f"all cameras are within {spread:.2g} units of one place: pure rotation gives no depth; move between photographs"
-        )
+        fix = "move between photographs"
+        notes.append(f"all cameras are within {spread:.2g} units of one place: pure rotation gives no depth; {fix}")
     off = [v for v in views if not all(0 <= v.camera.K[i, 2] <= n for i, n in ((0, v.camera.width), (1, v.camera.height)))]
     if off:
         x, y = off[0].camera.K[:2, 2]
-        notes.append(
-            f"the principal point of {len(off)} of {len(views)} views is outside the image, as in {off[0].name}: {x:.0f}, "
-            f"{y:.0f} of {off[0].camera.width} x {off[0].camera.height} px; the intrinsics may be those of another size"
-        )
+        place = f"{x:.0f}, {y:.0f} of {off[0].camera.width} x {off[0].camera.height} px"
+        where = f"outside the image, as in {off[0].name}: {place}; the intrinsics may be those of another size"
+        notes.append(f"the principal point of {len(off)} of {len(views)} views is {where}")
     narrow = [v for v in views if not v.camera.K[0, 0] <= MAX_FOCAL * max(v.camera.width, v.camera.height)]
     if narrow:
         v = narrow[0]
-        notes.append(
-            f"the focal length of {len(narrow)} of {len(views)} views is over {MAX_FOCAL} times the longer side, as {v.name}: "
-            f"{v.camera.K[0, 0]:.0f} px at {v.camera.width} x {v.camera.height} px; calibrate again"
-        )
+        of = f"{len(narrow)} of {len(views)} views is over {MAX_FOCAL} times the longer side, as {v.name}"
+        size = f"{v.camera.K[0, 0]:.0f} px at {v.camera.width} x {v.camera.height} px"
+        notes.append(f"the focal length of {of}: {size}; calibrate again")
     # most photographs differ, and vary, in a few pixels already
     equal: dict[bytes, list[str]] = {}
     few = [v.image[::SPARSE, ::SPARSE] for v in views]
@@ -586,10 +568,8 @@ def _finished(root: Path, reader: Reader, scene: Scene, notes: list[str], option
     more = (*more, *_exclusions(options, [v.name for v in views]))
     if len(views) < 2:
         reasons = f" ({'; '.join(more)})" if more else ""
-        raise DataError(
-            f"{root}: the scene has {len(views)} usable view{'s' if len(views) != 1 else ''}{reasons}; depth needs at least 2. "
-            "Add images with cameras"
-        )
+        few = f"{len(views)} usable view{'s' if len(views) != 1 else ''}{reasons}; depth needs at least 2"
+        raise DataError(f"{root}: the scene has {few}. Add images with cameras")
     if options.black_is_empty and not any(scene.background):
         views, note = cut_from_black(views)
         more = (*more, note) if note else more

@@ -108,12 +108,10 @@ def read_numbers(path: Path, max_pixels: int = MAX_PIXELS) -> np.ndarray:
     if found.ndim not in (2, 3) or 0 in found.shape or (found.ndim == 3 and found.shape[2] > 4):
         raise DataError(f"{path}: must be an array [height, width] or [height, width, 3], not {list(found.shape)}")
     if found.shape[0] * found.shape[1] > max_pixels:
-        raise DataError(
-            f"{path}: {found.shape[1]} x {found.shape[0]} px are over {max_pixels:,}; shrink it, or raise --max-pixels"
-        )
+        fix = "shrink it, or raise --max-pixels"
+        raise DataError(f"{path}: {found.shape[1]} x {found.shape[0]} px are over {max_pixels:,}; {fix}")
     native = found.dtype.newbyteorder("=")
-    kind = native if native in (np.uint8, np.uint16) else np.float32
-    return array_numbers(path, found, kind, "save the map alone")
+    return array_numbers(path, found, native if native in (np.uint8, np.uint16) else np.float32, "save the map alone")
 
 
 def _gray(path: Path, raw: np.ndarray, what: str) -> np.ndarray:
@@ -156,13 +154,11 @@ def read_confidence(path: Path, shape: tuple[int, ...], max_pixels: int = MAX_PI
     """
     raw = _gray(path, read_numbers(path, max_pixels), "map of confidence")
     if raw.shape != shape:
-        raise DataError(
-            f"{path}: is {raw.shape[1]} x {raw.shape[0]} px, its depth map {shape[1]} x {shape[0]}; make both equal in size"
-        )
+        fix = "make both equal in size"
+        raise DataError(f"{path}: is {raw.shape[1]} x {raw.shape[0]} px, its depth map {shape[1]} x {shape[0]}; {fix}")
     values = raw.astype(np.float32)
     if raw.dtype.kind == "u":
-        largest = int(raw.max())
-        values /= 2 if 0 < largest <= 2 else np.iinfo(raw.dtype).max
+        values /= 2 if 0 < int(raw.max()) <= 2 else np.iinfo(raw.dtype).max
     if not ((values >= 0) & (values <= 1)).all():
         raise DataError(f"{path}: confidence must be in [0, 1], but ranges from {values.min():.4g} to {values.max():.4g}")
     return values
@@ -186,10 +182,9 @@ def read_normals(path: Path, options: ReadOptions) -> np.ndarray:
         raise DataError(f"{path}: contains no normals; remove the file: normals are optional")
     stray = float((~(np.abs(lengths[known] - 1) <= UNIT_TOLERANCE)).mean())
     if not stray <= MAX_STRAY:
-        raise DataError(
-            f"{path}: {stray:.0%} of its vectors are not unit normals (median length {float(np.median(lengths[known])):.3g}); "
-            "save PNG as (n + 1) / 2, or NPY with unit vectors"
-        )
+        median = float(np.median(lengths[known]))
+        fix = "save PNG as (n + 1) / 2, or NPY with unit vectors"
+        raise DataError(f"{path}: {stray:.0%} of its vectors are not unit normals (median length {median:.3g}); {fix}")
     known &= np.abs(lengths - 1) <= UNIT_TOLERANCE
     normals = np.where(known[..., None], values / np.where(known, lengths, 1)[..., None], 0).astype(np.float32)
     if options.normal_axes == "opengl":
@@ -241,9 +236,8 @@ def in_pixels_of(loaded: LoadedImage, values: np.ndarray, path: Path) -> np.ndar
             raise DataError(f"{path}: EXIF rotates its image, and normals are not rotated with it; save both upright")
         values = turn_upright(values, loaded.orientation)
     elif not _same_aspect(values.shape, (height, width)):
-        raise DataError(
-            f"{path}: is {columns} x {rows} px, its image {width} x {height}: the aspects differ. Give a map of the whole image"
-        )
+        fix = "Give a map of the whole image"
+        raise DataError(f"{path}: is {columns} x {rows} px, its image {width} x {height}: the aspects differ. {fix}")
     final = loaded.image.shape[:2]
     if loaded.undone is not None:
         values = resized(values, width, height)
@@ -286,10 +280,9 @@ class GivenMaps:
     def __init__(self, options: ReadOptions):
         """List the files of the folders in ``options``."""
         self.options = options
-        self.depths, self.normals = (
-            {} if path in (None, NONE) else map_files(Path(path), flag, options.allow_outside)
-            for path, flag in ((options.depths, DEPTHS), (options.normals, NORMALS))
-        )
+        named = (options.depths, DEPTHS), (options.normals, NORMALS)
+        outside = options.allow_outside
+        self.depths, self.normals = ({} if p in (None, NONE) else map_files(Path(p), flag, outside) for p, flag in named)
 
     def attached(self, loaded: LoadedImage, image: Path, named: NamedMaps = NOTHING_NAMED) -> LoadedImage:
         """Return an image with its maps, at the image's size; the user's folder has priority over maps named in the scene."""
@@ -331,26 +324,23 @@ class GivenMaps:
         if not known.any():
             raise DataError(f"{path}: no pixel inside the mask has a normal; remove the file: normals are optional")
         if away > 0.5:
-            other = "opencv" if self.options.normal_axes == "opengl" else "opengl"
-            raise DataError(
-                f"{path}: {away:.0%} of its normals face away from the camera in {self.options.normal_axes} axes; give "
-                f"--normal-axes {other}, or turn them towards the camera"
-            )
+            axes = self.options.normal_axes
+            other = "opencv" if axes == "opengl" else "opengl"
+            fix = f"give --normal-axes {other}, or turn them towards the camera"
+            raise DataError(f"{path}: {away:.0%} of its normals face away from the camera in {axes} axes; {fix}")
         return np.where((along <= 0)[..., None], normals, 0).astype(np.float32)
 
 
 def check_found(views: Sequence[View], options: ReadOptions) -> list[str]:
     """Return notes on the maps of a scene's views."""
     notes = []
-    flags = {"depth": (options.depths, DEPTHS), "normals": (options.normals, NORMALS)}
-    for name, (path, flag) in flags.items():
+    for name, (path, flag) in {"depth": (options.depths, DEPTHS), "normals": (options.normals, NORMALS)}.items():
         having = [v for v in views if getattr(v, name) is not None]
         if path not in (None, NONE) and not having:
             names = [key for key in map_files(Path(path), flag, True) if not key.endswith(CONFIDENCE)]
-            raise DataError(
-                f"{path}: none of its {len(names)} maps has the name of an image (the first is {names[0]!r}); name each map "
-                f"like its image, with .png or .npy, or give another {flag}"
-            )
+            count = f"none of its {len(names)} maps has the name of an image (the first is {names[0]!r})"
+            fix = f"name each map like its image, with .png or .npy, or give another {flag}"
+            raise DataError(f"{path}: {count}; {fix}")
         if not having:
             continue
         where = f"from {Path(path)}" if path is not None else f"listed in the scene's file; to ignore them, use {flag} none"

@@ -213,8 +213,7 @@ def read_camera_rows(path: Path) -> list[tuple[int, str, np.ndarray]]:
     """Return line number, image name and the numbers K, R, t, float64, shape [21], of each camera."""
     rows, count = [], None
     try:
-        text = read_input(path, MAX_BYTES).decode("utf-8-sig")
-        for number, line in enumerate(io.StringIO(text), 1):
+        for number, line in enumerate(io.StringIO(read_input(path, MAX_BYTES).decode("utf-8-sig")), 1):
             words = line.split()
             if not words:
                 continue
@@ -226,9 +225,8 @@ def read_camera_rows(path: Path) -> list[tuple[int, str, np.ndarray]]:
                 raise DataError(f"{path}, line {number}, image {words[0]!r}: needs 21 finite numbers. Copy it again")
             rows.append((number, words[0], values))
     except (OSError, ValueError) as e:
-        raise DataError(
-            f"{path}: cannot be understood ({unread_reason(e)}); needs a count, then names with 21 numbers. Copy it again"
-        ) from e
+        fix = "needs a count, then names with 21 numbers. Copy it again"
+        raise DataError(f"{path}: cannot be understood ({unread_reason(e)}); {fix}") from e
     if count != len(rows):
         raise DataError(f"{path}: announces {count or 0} images and lists {len(rows)}; it is truncated. Copy it again")
     return rows

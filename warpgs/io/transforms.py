@@ -13,7 +13,7 @@ import numpy as np
 
 from warpgs.errors import DataError
 from warpgs.files import is_within, read_file
-from warpgs.geometry import matmul, seen_pixels
+from warpgs.geometry import matmul, pose_of, seen_pixels
 from warpgs.io import colmap, folder as scenes
 from warpgs.io.folder import Probe, Reader, SceneFolder, ViewList, register
 from warpgs.io.images import BLACK, SUFFIXES, Lens, ReadOptions, list_images
@@ -42,11 +42,6 @@ def files_of(root: Path) -> list[Path]:
     return [single] if single.is_file() else [root / f for f in BLENDER_FILES if (root / f).is_file()]
 
 
-def is_blender(root: Path) -> bool:
-    """Return whether the folder has Blender's layout, with a white background behind transparent pixels."""
-    return not (root / "transforms.json").is_file() and bool(files_of(root))
-
-
 def _json(path: Path, fix: str) -> Any:
     """Return the values of a JSON file of bounded size."""
     try:
@@ -69,16 +64,16 @@ def read_json(path: Path) -> dict:
     return values
 
 
-def _number(frame: dict, shared: dict, key: str) -> float | None:
-    """Return a number of the frame, else of the file; None if both lack it, ValueError if it is not finite."""
+def _number(frame: dict, shared: dict, key: str, where: str) -> float | None:
+    """Return a number of the frame, else of the file; None if both lack it, DataError if it is not finite."""
     value = frame.get(key, shared.get(key))
     if value is None:
         return None
     try:
         if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
-            raise ValueError(f"{key} is {value!r}, not a finite number; write it as one, without quotes")
+            raise DataError(f"{where}: {key} is {value!r}, not a finite number; write it as one, without quotes")
     except OverflowError as e:
-        raise ValueError(f"{key} is too large") from e
+        raise DataError(f"{where}: {key} is too large") from e
     return float(value)
 
 
@@ -88,33 +83,26 @@ def lens_of(frame: dict, shared: dict, width: int, height: int, where: str, nati
     kept = ", or fit them with --lenses native" if not native else ""
     known = (*MODELS, FISHEYE) if native else MODELS
     if model not in known:
-        raise DataError(
-            f"{where}: camera model {model[:40]} is not supported (supported: {', '.join(known)}). Undistort the images "
-            f"first{kept if model == FISHEYE else ''}"
-        )
+        fix = f"Undistort the images first{kept if model == FISHEYE else ''}"
+        raise DataError(f"{where}: camera model {model[:40]} is not supported (supported: {', '.join(known)}). {fix}")
     fisheye = native and bool(model == FISHEYE or frame.get("is_fisheye", shared.get("is_fisheye")))
-    try:
-        size = [_number(frame, shared, "w"), _number(frame, shared, "h")]
-        width, height = (int(given) if given is not None else own for given, own in zip(size, (width, height)))
-        f, c = [], []
-        for axis, side in (("x", width), ("y", height)):
-            focal, angle = _number(frame, shared, f"fl_{axis}"), _number(frame, shared, f"camera_angle_{axis}")
-            if focal is None and angle is not None:
-                if not 0 < angle < math.pi:
-                    raise ValueError(f"camera_angle_{axis} is {angle} rad, not between 0 and pi")
-                focal = 0.5 * side / math.tan(0.5 * angle)
-            center = _number(frame, shared, f"c{axis}")
-            f.append(focal)
-            c.append(side / 2 if center is None else center)
-        terms = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3")
-        distortion = [_number(frame, shared, k) or 0.0 for k in terms]
-        unread = [k for k in UNSUPPORTED_TERMS if not (fisheye and k in ("k4", "is_fisheye"))]
-        other = [k for k in (*unread, *(("p1", "p2") if fisheye else ())) if frame.get(k, shared.get(k))]
-        if other:
-            why = "is not supported for a fisheye" if fisheye else "belongs to a fisheye or rational lens, not supported here"
-            raise ValueError(f"{other[0]} {why}. Undistort the images{kept if other[0] == 'is_fisheye' else ''}")
-    except ValueError as e:
-        raise DataError(f"{where}: {e}") from e
+    number = partial(_number, frame, shared, where=where)
+    width, height = (own if (given := number(key)) is None else int(given) for key, own in (("w", width), ("h", height)))
+    f, c = [], []
+    for axis, side in (("x", width), ("y", height)):
+        focal, angle, center = number(f"fl_{axis}"), number(f"camera_angle_{axis}"), number(f"c{axis}")
+        if focal is None and angle is not None:
+            if not 0 < angle < math.pi:
+                raise DataError(f"{where}: camera_angle_{axis} is {angle} rad, not between 0 and pi")
+            focal = 0.5 * side / math.tan(0.5 * angle)
+        f.append(focal)
+        c.append(side / 2 if center is None else center)
+    distortion = [number(k) or 0.0 for k in (("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3"))]
+    unread = [k for k in UNSUPPORTED_TERMS if not (fisheye and k in ("k4", "is_fisheye"))]
+    other = [k for k in (*unread, *(("p1", "p2") if fisheye else ())) if frame.get(k, shared.get(k))]
+    if other:
+        why = "is not supported for a fisheye" if fisheye else "belongs to a fisheye or rational lens, not supported here"
+        raise DataError(f"{where}: {other[0]} {why}. Undistort the images{kept if other[0] == 'is_fisheye' else ''}")
     fx = f[0] if f[0] is not None else f[1]
     if fx is None:
         raise DataError(f"{where}: has neither fl_x nor camera_angle_x, so its focal length is unknown; add one of them")
@@ -134,11 +122,6 @@ def matrix_of(frame: dict, where: str) -> np.ndarray:
     if matrix.shape not in ((3, 4), (4, 4)):
         raise DataError(f"{where}: transform_matrix must be [4, 4], not {list(matrix.shape)}; write the file again")
     return matrix
-
-
-def _origin(values: dict, where: str) -> np.ndarray:
-    """Return the origin [3] that a file of ours states, 0 without one."""
-    return checked_origin(values.get(ORIGIN, (0, 0, 0)), where)
 
 
 def _image_path(scene: SceneFolder, folder: Path, name: object, where: str) -> Path:
@@ -220,12 +203,9 @@ def _named_maps(scene: SceneFolder, named: Named, shared: dict, frame: dict, whe
             raise DataError(f"{where}: {key} is {found.name}, but maps must be {' or '.join(MAPS)}; --{flag} none skips it")
         return found
 
-    try:
-        unit = _number(frame, shared, "depth_unit_scale_factor")
-        if unit is not None and not unit > 0:
-            raise ValueError(f"depth_unit_scale_factor is {unit}; it must be above 0")
-    except ValueError as e:
-        raise DataError(f"{where}: {e}") from e
+    unit = _number(frame, shared, "depth_unit_scale_factor", where)
+    if unit is not None and not unit > 0:
+        raise DataError(f"{where}: depth_unit_scale_factor is {unit}; it must be above 0")
     return NamedMaps(path("depth_file_path", "depths"), path("normal_file_path", "normals"), unit)
 
 
@@ -248,10 +228,7 @@ def _points(scene: SceneFolder, file: Path, named: Named, shared: dict, views: l
     if shared.get("applied_transform") is None or not len(points):
         return points, taken
     matrix = matrix_of({"transform_matrix": shared["applied_transform"]}, f"{file}, applied_transform")[:3]
-    try:
-        scale = _number({}, shared, "applied_scale")
-    except ValueError as e:
-        raise DataError(f"{file}: {e}") from e
+    scale = _number({}, shared, "applied_scale", str(file))
     moved = (1.0 if scale is None else scale) * (matmul(points.points, matrix[:, :3].T) + matrix[:, 3])
     other = PointCloud(moved, points.colors)
     if _disagreement(other, views) < CLEARLY * _disagreement(points, views):
@@ -295,14 +272,13 @@ class TransformsReader(Reader):
 
     def read(self, folder: Path, options: ReadOptions) -> Scene:
         """See `Reader.read`."""
-        background = WHITE if is_blender(folder) else BLACK
+        background = BLACK if (folder / "transforms.json").is_file() else WHITE  # in Blender's layout
         scene, views, notes = SceneFolder(folder, options), ViewList(options), []
-        missing: list[str] = []
-        total, points = 0, None
+        missing, total, points = list[str](), 0, None
         for file in files_of(folder):
             shared = read_json(scene.inside(file))
             total += len(shared["frames"])
-            origin = _origin(shared, str(file))
+            origin = checked_origin(shared.get(ORIGIN, (0, 0, 0)), str(file))
             paths, matched = _image_paths(scene, file, shared["frames"])
             moved = dict[str, Path]()
             named = partial(_named_file, scene, file.parent, {*paths.values()}, moved)
@@ -380,7 +356,7 @@ def stated_origin(path: Path) -> np.ndarray:
         return colmap.origin_stated(model / f"images.{kind}")
     values = _json(path, "check the path, or write the file again")
     first = values[0] if isinstance(values, list) and values else values
-    return _origin(first if isinstance(first, dict) else {}, str(path))
+    return checked_origin((first if isinstance(first, dict) else {}).get(ORIGIN, (0, 0, 0)), str(path))
 
 
 def _inria(path: Path, rows: list[Any]) -> Iterator[Row]:
@@ -388,13 +364,11 @@ def _inria(path: Path, rows: list[Any]) -> Iterator[Row]:
     for i, row in enumerate(rows):
         where = f"{path}, camera {i}"
         try:
-            pose = np.eye(4)
-            pose[:3, :3] = np.array(row["rotation"], np.float64).reshape(3, 3)
-            pose[:3, 3] = np.array(row["position"], np.float64).reshape(3)
+            rotation, position = np.array(row["rotation"], np.float64), np.array(row["position"], np.float64)
+            pose = pose_of(rotation.reshape(3, 3), position.reshape(3))
             width, height, fx, fy = (float(row[key]) for key in ("width", "height", "fx", "fy"))
-            K = np.array([[fx, 0, width / 2], [0, fy, height / 2], [0, 0, 1]])
-            lens = Lens(K, int(width), int(height))
-            name, origin = str(row.get("img_name", i)), _origin(row, where)
+            lens = Lens(np.array([[fx, 0, width / 2], [0, fy, height / 2], [0, 0, 1]]), int(width), int(height))
+            name, origin = str(row.get("img_name", i)), checked_origin(row.get(ORIGIN, (0, 0, 0)), where)
         except (KeyError, TypeError, ValueError, OverflowError, AttributeError) as e:
             raise DataError(f"{where}: needs rotation, position, width, height, fx and fy as numbers; correct the entry") from e
         yield name, scenes.about(scenes.from_camera_to_world(pose, where, opengl=False), origin), lens.checked(where)
@@ -422,7 +396,7 @@ def _drawn(path: Path, values: dict[str, Any]) -> Iterator[Row]:
 def _transforms(path: Path) -> Iterator[Row]:
     """Yield the cameras of frames; the file must give its image size."""
     shared = read_json(path)
-    origin = _origin(shared, str(path))
+    origin = checked_origin(shared.get(ORIGIN, (0, 0, 0)), str(path))
     for i, frame in enumerate(shared["frames"]):
         where = f"{path}, frame {i}"
         if not isinstance(frame, dict):

@@ -166,8 +166,7 @@ def _compact(mesh: Mesh) -> Mesh:
     """Remove vertices that no triangle uses."""
     used = np.zeros(len(mesh.vertices), bool)
     used[mesh.faces] = True
-    numbers = np.cumsum(used) - 1
-    return Mesh(mesh.vertices[used], numbers[mesh.faces].astype(np.int32), mesh.colors[used])
+    return Mesh(mesh.vertices[used], (np.cumsum(used) - 1)[mesh.faces].astype(np.int32), mesh.colors[used])
 
 
 def parts(mesh: Mesh) -> tuple[int, np.ndarray]:
@@ -184,8 +183,7 @@ def parts(mesh: Mesh) -> tuple[int, np.ndarray]:
 def remove_small_parts(mesh: Mesh, fraction: float = MIN_PART) -> tuple[Mesh, int]:
     """Return a mesh without connected parts of less than ``fraction`` of all triangles, and the number of removed parts."""
     number, part = parts(mesh)
-    sizes = np.bincount(part, minlength=number)
-    keep = sizes >= max(1.0, fraction * len(mesh.faces))
+    keep = np.bincount(part, minlength=number) >= max(1.0, fraction * len(mesh.faces))
     return _compact(replace(mesh, faces=mesh.faces[keep[part]])), int((~keep).sum())
 
 
@@ -325,8 +323,7 @@ def seen_colors(vertices: np.ndarray, views: Iterable[SurfaceView], truncation: 
         if i == 0:
             points = torch.as_tensor(vertices, dtype=view.depth.dtype, device=view.depth.device)
             sums, weights = torch.zeros_like(points), torch.zeros_like(points[:, 0])
-        tolerance = COLOR_TOLERANCE * truncation
-        gather_colors(points, tolerance, view.camera, view.depth, view.weights, view.image, sums, weights)
+        gather_colors(points, COLOR_TOLERANCE * truncation, view.camera, view.depth, view.weights, view.image, sums, weights)
     known = (weights > 0).cpu().numpy()
     return sums.cpu().numpy() / np.maximum(weights.cpu().numpy(), np.finfo(np.float32).tiny)[:, None], known
 
@@ -385,9 +382,8 @@ def textured(mesh: Mesh, views: SurfaceViews, truncation: float, footprint: floa
         width, height = (cell * [view.camera.width, view.camera.height] / size).astype(int).clip(1)
         largest[better] = area[better]
         uv[better] = start + places[better] * [width / view.camera.width, height / view.camera.height]
-        texture[start[1] : start[1] + height, start[0] : start[0] + width] = resized(
-            gain * view.image.cpu().numpy(), width, height
-        )
+        image = resized(gain * view.image.cpu().numpy(), width, height)
+        texture[start[1] : start[1] + height, start[0] : start[0] + width] = image
     return replace(mesh, texture=texture, uv=(uv / texture.shape[1::-1]).astype(np.float32))
 
 

@@ -164,15 +164,13 @@ class SurfaceViews:
 
 def sample_surface(view: SurfaceView, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Return about ``count`` points of a view's certain surface, [N, 3] [u], and the width of a pixel there, [N] [u]."""
-    certain = torch.where(view.weights > UNCERTAIN, view.depth, 0)
-    depth, camera = certain.cpu().numpy().astype(np.float64), view.camera
+    depth, camera = torch.where(view.weights > UNCERTAIN, view.depth, 0).cpu().numpy().astype(np.float64), view.camera
     step = max(1, round((depth.size / count) ** 0.5))
     row, column = np.mgrid[step // 2 : depth.shape[0] : step, step // 2 : depth.shape[1] : step].reshape(2, -1)
     z = depth[row, column]
     seen = (z > 0) & np.isfinite(z)
     pixels = np.stack([column, row], 1)[seen] + 0.5
-    focal = float(np.sqrt(camera.K[0, 0] * camera.K[1, 1]))
-    return back_project(camera, pixels, z[seen]), z[seen] / focal
+    return back_project(camera, pixels, z[seen]), z[seen] / float(np.sqrt(camera.K[0, 0] * camera.K[1, 1]))
 
 
 # Agreement of views on depth: a mesh omits a point if other views see surfaces there, but none at the point's depth.

@@ -39,10 +39,8 @@ def _pixels(path: Path, frames: Iterable[np.ndarray]) -> list[np.ndarray]:
     for pixels in map(_bytes_of, frames):
         result.append(pixels)
         if len(result) * pixels.nbytes > MAX_BYTES:
-            raise UsageError(
-                f"{path}: an animated image takes at most {MAX_BYTES // pixels.nbytes} frames of this size; write .mp4 or "
-                ".webm, or fewer or smaller frames"
-            )
+            fix = "write .mp4 or .webm, or fewer or smaller frames"
+            raise UsageError(f"{path}: an animated image takes at most {MAX_BYTES // pixels.nbytes} frames of this size; {fix}")
     return result
 
 
@@ -91,10 +89,9 @@ def write_film(path: Path, frames: Iterable[np.ndarray], fps: int = 30) -> int:
     def check(film: Path) -> None:
         found = _decoded_sizes(film)
         if found != sizes:
-            raise ResourceError(
-                f"{path}: cannot be written; only {sum(f == s for f, s in zip(found, sizes))} of {len(sizes)} frames could be "
-                "read back. Disk full, or the encoder failed; the old file is untouched. Free disk space, or write elsewhere"
-            )
+            read = f"only {sum(f == s for f, s in zip(found, sizes))} of {len(sizes)} frames could be read back"
+            fix = "Disk full, or the encoder failed; the old file is untouched. Free disk space, or write elsewhere"
+            raise ResourceError(f"{path}: cannot be written; {read}. {fix}")
 
     with replacing(path, check, suffix=suffix) as (_, temporary), utf8_name(temporary) as name:
         if suffix == ".mp4" and (program := h264_encoder()):
@@ -131,10 +128,8 @@ def _vp9(path: Path, name: str, fps: int, frame: np.ndarray, properties: tuple[i
         codec, (height, width) = cv2.VideoWriter_fourcc(*"vp09"), frame.shape[:2]
         writer = cv2.VideoWriter(name, cv2.CAP_FFMPEG, codec, fps, (width, height), properties)
     if not writer.isOpened():
-        raise ResourceError(
-            f"{path}: cannot be written; disk full, folder not writable, or OpenCV lacks a VP9 encoder. Free disk "
-            "space, or write elsewhere"
-        )
+        fix = "disk full, folder not writable, or OpenCV lacks a VP9 encoder. Free disk space, or write elsewhere"
+        raise ResourceError(f"{path}: cannot be written; {fix}")
     return writer
 
 

@@ -58,8 +58,7 @@ def straight_alpha(image: np.ndarray, alpha: np.ndarray, background: tuple[float
 def resized(image: np.ndarray, width: int, height: int):
     """Return colours in [0, 1], [H, W, 3], at another size, as a Pillow image; areas are averaged if the width shrinks."""
     pixels = Image.fromarray(np.round(np.clip(image, 0, 1) * 255).astype(np.uint8))
-    way = Image.Resampling.BOX if width < image.shape[1] else Image.Resampling.BICUBIC
-    return pixels.resize((width, height), way)
+    return pixels.resize((width, height), Image.Resampling.BOX if width < image.shape[1] else Image.Resampling.BICUBIC)
 
 
 def colored(values: np.ndarray, name: str) -> np.ndarray:
@@ -153,8 +152,7 @@ def coverage_image(image: np.ndarray, unseen: np.ndarray, once: np.ndarray) -> n
     image = np.ascontiguousarray(np.clip(image, 0, 1), np.float32)
     height, width = unseen.shape
     period = max(4, round(max(height, width) / STRIPES))
-    diagonals = np.arange(height + width - 1) % period < period / 2
-    stripe = np.lib.stride_tricks.sliding_window_view(diagonals, width)
+    stripe = np.lib.stride_tricks.sliding_window_view(np.arange(height + width - 1) % period < period / 2, width)
     for pixels, share, tint in ((unseen & stripe, 0.75, UNSEEN), (unseen & ~stripe, 0.3, UNSEEN), (once & ~unseen, 0.45, ONCE)):
         at, shade = np.flatnonzero(pixels), np.float32(share)
         # gray beneath the tint: the colours of the image would change its hue
@@ -200,8 +198,7 @@ def sheet(headings: list[str], strips: list[Strip]) -> bytes:
     canvas = Image.new("RGB", (width, height), PAPER)
     draw = ImageDraw.Draw(canvas)
     for i, heading in enumerate(headings):
-        middle = MARGIN + i * (column + GAP) + column / 2
-        draw.text((middle, MARGIN + 18), fitted(heading, bold), INK, bold, anchor="ms")
+        draw.text((MARGIN + i * (column + GAP) + column / 2, MARGIN + 18), fitted(heading, bold), INK, bold, anchor="ms")
     y = MARGIN + HEAD
     for title, cells, boxes, inner, tall, zoom in rows:
         draw.line((MARGIN, y, width - MARGIN, y), (217, 220, 225))
@@ -281,11 +278,9 @@ def contact_sheet(
     rows = -(-(len(tiles) + 1) // columns)
     label_size, text_size, title_size, head = (round(text * v) for v in (LABEL_SIZE, TEXT_SIZE, TITLE_SIZE, CONTACT_HEAD))
     top = CONTACT_MARGIN + title_size + 18
-    size = (
-        2 * CONTACT_MARGIN + columns * tile_width + (columns - 1) * CONTACT_GAP,
-        top + rows * (head + tile_height) + (rows - 1) * CONTACT_GAP + CONTACT_MARGIN,
-    )
-    sheet = Image.new("RGB", size, CONTACT_PAPER)
+    across = 2 * CONTACT_MARGIN + columns * tile_width + (columns - 1) * CONTACT_GAP
+    down = top + rows * (head + tile_height) + (rows - 1) * CONTACT_GAP + CONTACT_MARGIN
+    sheet = Image.new("RGB", (across, down), CONTACT_PAPER)
     draw = ImageDraw.Draw(sheet)
     fonts = {s: ImageFont.load_default(s) for s in (label_size, text_size, title_size)}
     draw.text((CONTACT_MARGIN, CONTACT_MARGIN - 4), title, CONTACT_INK, fonts[title_size])

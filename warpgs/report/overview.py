@@ -29,8 +29,7 @@ def frusta(cameras: list[Camera], size: float) -> np.ndarray:
     lines = []
     for c in cameras:
         corners = np.array([[0, 0, 1], [c.width, 0, 1], [c.width, c.height, 1], [0, c.height, 1]], float)
-        rays = corners @ np.linalg.inv(c.K).T * size
-        world = (rays - c.viewmat[:3, 3]) @ c.viewmat[:3, :3]
+        world = (corners @ np.linalg.inv(c.K).T * size - c.viewmat[:3, 3]) @ c.viewmat[:3, :3]
         lines += [(c.center, p) for p in world] + [(world[i], world[(i + 1) % 4]) for i in range(4)]
     return np.array(lines)
 
@@ -126,8 +125,7 @@ def _draw(image: np.ndarray, depth: np.ndarray, camera: Camera, segments: np.nda
         columns, rows = np.clip(pixels.astype(int), 0, [camera.width - 1, camera.height - 1]).T
         seen = points[:, 2] < 1.01 * depth[rows, columns]
         fixed = np.round(16 * (pixels - 0.5)).astype(int).tolist()  # 4 bits after the point
-        changes = np.flatnonzero(np.diff(np.concatenate([[False], seen, [False]])))
-        for first, last in changes.reshape(-1, 2):
+        for first, last in np.flatnonzero(np.diff(np.concatenate([[False], seen, [False]]))).reshape(-1, 2):
             cv2.line(image, fixed[first], fixed[last - 1], rgb, 2, cv2.LINE_AA, 4)
 
 
@@ -156,5 +154,4 @@ def with_legend(image: np.ndarray, entries: list[tuple[str, str]], height: int, 
         draw.rectangle((x, y - side / 2, x + side, y + side / 2), color)
         draw.text((x + side + 0.5 * gap, y), words, INK[background], font, anchor="lm")
         x += side + 1.5 * gap + font.getlength(words)
-    legend = np.asarray(canvas, np.float32) / 255
-    return np.concatenate([image, legend[rows:]])
+    return np.concatenate([image, (np.asarray(canvas, np.float32) / 255)[rows:]])

@@ -90,10 +90,8 @@ def curve(title: str, xs: list[float], ys: list[float], unit: str = "") -> str:
     group = max(1, math.ceil(len(points) / MAX_POINTS))
     chunks = [points[i : i + group] for i in range(0, len(points), group)]
     points = [(sum(x for x, _ in c) / len(c), sum(y for _, y in c) / len(c)) for c in chunks]
-    head = (
-        f'<svg class="curve" viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{title}">'
-        f'<text x="0" y="13" class="title">{title}{f" [{unit}]" if unit else ""}</text>'
-    )
+    head = f'<svg class="curve" viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{title}">'
+    head += f'<text x="0" y="13" class="title">{title}{f" [{unit}]" if unit else ""}</text>'
     if not points:
         return head + f'<text x="{LEFT}" y="{HEIGHT / 2}">no data</text></svg>'
     x0, x1 = points[0][0], max(points[-1][0], points[0][0] + 1)

@@ -116,8 +116,7 @@ def _project(camera: Camera, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _sees(shapes: list[Shape], camera: Camera, x: np.ndarray, index: np.ndarray) -> np.ndarray:
     """Return whether a camera sees surface points [N, 3] [u] of the shapes ``index`` [N] well enough for a feature detector."""
     xy, depth = _project(camera, x)
-    size = np.array([camera.width, camera.height])
-    seen = (depth > 0) & (xy >= 2).all(axis=1) & (xy <= size - 2).all(axis=1)
+    seen = (depth > 0) & (xy >= 2).all(axis=1) & (xy <= np.array([camera.width, camera.height]) - 2).all(axis=1)
     for offset in ((0, 0), (-1.5, 0), (1.5, 0), (0, -1.5), (0, 1.5)):
         rows = np.flatnonzero(seen)
         t, which = raycast.cast(shapes, camera.center, raycast.pixel_rays(camera.K, camera.viewmat, xy[rows] + offset))
@@ -199,8 +198,7 @@ def _colmap(shapes: list[Shape], light: Light, cameras: list[Camera], seed: int,
     """Return the files of a COLMAP model with at most ``most`` points, by their path in the scene."""
     x, colors, seen = surface_points(shapes, light, cameras, np.random.default_rng([seed, 1]))
     some = np.linspace(0, len(x) - 1, min(most, len(x))).astype(int)
-    texts = colmap_text(cameras, x[some], colors[some], seen[some])
-    return {f"sparse/0/{name}": text.encode() for name, text in texts.items()}
+    return {f"sparse/0/{name}": text.encode() for name, text in colmap_text(cameras, x[some], colors[some], seen[some]).items()}
 
 
 def _write(folder: Path, views: int, least: int, train: int, size: tuple[int, int], contents: Callable[[], dict[str, bytes]]):

@@ -40,8 +40,7 @@ def local_slots(device: str, slots: int | None, per_gpu: int) -> list[Slot]:
     """Return the slots of this machine."""
     import torch
 
-    kind = choose_device(device)[0].type
-    gpus = torch.cuda.device_count() if kind == "cuda" else 0
+    gpus = torch.cuda.device_count() if choose_device(device)[0].type == "cuda" else 0
     count = (gpus * per_gpu if gpus else 1) if slots is None else slots
     if not 1 <= count <= MAX_SLOTS or not 1 <= per_gpu <= MAX_SLOTS:
         raise UsageError(f"--slots and --per-gpu must be numbers from 1 to {MAX_SLOTS}, not {slots} and {per_gpu}")
@@ -69,10 +68,6 @@ class LocalEngine:
         self._threads = [threading.Thread(target=self._serve, args=(slot,), daemon=True) for slot in slots]
         for thread in self._threads:
             thread.start()
-
-    def workers(self) -> dict[str, int]:
-        """Return the numbers of the processes at work, by job."""
-        return {name: worker.number for name, worker in self._workers.items()}
 
     def start(self, job: FarmJob) -> None:
         """Start a job in an idle process, or in a new one."""
@@ -287,8 +282,7 @@ def seconds_left(statuses: list[JobStatus], slots: int) -> float | None:
         return None
     mean, now = sum(took) / len(took), time.monotonic()
     left = sum(max(0.0, mean - (now - s.began)) if s.state == "running" else mean for s in statuses if not s.ended)
-    count = sum(not s.ended for s in statuses)
-    return left / max(1, min(slots, count))
+    return left / max(1, min(slots, sum(not s.ended for s in statuses)))
 
 
 STATES = ("waiting", "running", "elsewhere", "done", "failed")
@@ -376,9 +370,8 @@ class FarmTable:
         bar.add_row(ProgressBar(total=max(1, len(self.rows)), completed=len(self.ended), width=78))
         more = len(running) - MOST_RUNNING
         rest = [Text(f"and {more} more running", style="dim")] if more > 0 else []
-        messages = [
-            Text(printable(f"{r.name}: {r.message}"), style="dim", no_wrap=True, overflow="ellipsis") for r in last if r.message
-        ]
+        words = (printable(f"{r.name}: {r.message}") for r in last if r.message)
+        messages = (Text(line, style="dim", no_wrap=True, overflow="ellipsis") for line in words)
         return Group(bar, Text(self.summary(), style="bold"), table, *rest, *messages)
 
 
@@ -524,7 +517,5 @@ def check_failures(statuses: list[JobStatus]) -> None:
     if failed:
         first = failed[0].record
         names = ", ".join(s.job.name for s in failed[:5]) + ("" if len(failed) <= 5 else f" and {len(failed) - 5} more")
-        raise ResourceError(
-            f"{len(failed)} of {len(statuses)} jobs failed: {names}; {INDEX} has their messages. First message: "
-            f"{first.message.rstrip('.') if first else 'unknown'}. Repeat the command to try them again"
-        )
+        fix = f"First message: {first.message.rstrip('.') if first else 'unknown'}. Repeat the command to try them again"
+        raise ResourceError(f"{len(failed)} of {len(statuses)} jobs failed: {names}; {INDEX} has their messages. {fix}")

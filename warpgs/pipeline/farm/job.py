@@ -39,10 +39,8 @@ class FarmJob:
     def identity(self) -> str:
         """Return an identifier of all inputs except the images: the first 16 hexadecimal digits of their SHA-256."""
         r = self.request
-        weights = None if r.lpips_weights is None else str(r.lpips_weights)
-        values = [asdict(r.scene), r.config.to_json(), weights, r.device]
-        if own := r.config.own_code():
-            values.append(own)
+        values = [asdict(r.scene), r.config.to_json(), None if r.lpips_weights is None else str(r.lpips_weights), r.device]
+        values += [own] if (own := r.config.own_code()) else []
         return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()[:16]
 
     def text(self) -> str:
@@ -72,9 +70,8 @@ def job_of(text: str) -> FarmJob:
         for part in config[key]:
             registry.load(part["name"])
     weights = None if v["lpips_weights"] is None else Path(v["lpips_weights"])
-    request = FitRequest(
-        scene, Path(v["out"]), FitConfig.from_json(config), v["device"], lpips_weights=weights, notes=tuple(v["notes"])
-    )
+    fit = scene, Path(v["out"]), FitConfig.from_json(config), v["device"]
+    request = FitRequest(*fit, lpips_weights=weights, notes=tuple(v["notes"]))
     return FarmJob(v["name"], request, Path(v["folder"]), Path(v["results"]))
 
 
@@ -127,10 +124,8 @@ def list_jobs(jobs: str) -> list[ListedJob]:
         if any(r.probe(path) is not None for r in all_readers()):
             raise UsageError(f"{jobs} is a single scene: fit it with `warpgs fit`, or give its parent folder")
         found = _named(sorted(p for p in path.iterdir() if p.is_dir() and not p.name.startswith(".")))
-    elif path.suffix == ".jsonl":
-        found = _read(path)
     else:
-        found = _named(sorted(Path(p) for p in glob.glob(jobs)))
+        found = _read(path) if path.suffix == ".jsonl" else _named(sorted(Path(p) for p in glob.glob(jobs)))
     if not found:
         raise UsageError(f"{jobs}: no scene found; give a folder of scenes, a glob in quotes, or a .jsonl file")
     taken: set[str] = set()
@@ -168,8 +163,7 @@ def _read(path: Path) -> list[ListedJob]:
             values = schema.parse(line)
             _LINE(values, "")
             scene = Path(os.path.abspath(path.parent / values.pop("scene")))
-            name = values.pop("name", scene.name)
-            found.append((name, scene, tuple(_flag(key, value) for key, value in values.items())))
+            found.append((values.pop("name", scene.name), scene, tuple(_flag(key, value) for key, value in values.items())))
         except schema.SchemaError as e:
             raise DataError(f'{path}, line {number}: {e}; write {{"scene": FOLDER, "steps": 500}}') from e
     return found

@@ -36,8 +36,7 @@ class RayEngine:
             _connect(ray, address)
         gpus = 1 / per_gpu if device == "cuda" else 0
         found = ray.cluster_resources()
-        room = min(found.get("CPU", 0) / threads, found.get("GPU", 0) / gpus if gpus else float("inf"))
-        self.slots = slots or int(room)
+        self.slots = slots or int(min(found.get("CPU", 0) / threads, found.get("GPU", 0) / gpus if gpus else float("inf")))
         if self.slots < 1:
             raise UsageError(f"no job of {threads} threads, {gpus:g} GPUs fits into Ray's cluster ({found}); lower --threads")
         environment = {"env_vars": {"PYTHONSAFEPATH": "1"}}

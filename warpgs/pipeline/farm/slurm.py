@@ -151,8 +151,7 @@ def main(job: str, answer: str, threads: str) -> int:
     """Run a job; return the exit code."""
     try:
         with interrupting_signals():
-            state = run_job(Path(job).read_text("utf-8"), int(threads))
-            write_text(Path(answer), state)
+            write_text(Path(answer), run_job(Path(job).read_text("utf-8"), int(threads)))
     except KeyboardInterrupt:
         return 130
     except WarpgsError as e:

@@ -28,7 +28,7 @@ from warpgs.pipeline.run.request import FitRequest, choose_device, read_scene
 from warpgs.pipeline.train.schedule import StepReport
 from warpgs.pipeline.train.settings import FitConfig, settings_by_views
 from warpgs.pipeline.train.trainer import train_views
-from warpgs.process import output_to, say
+from warpgs.process import output_to, say, say_lines
 from warpgs.version import __version__
 
 Outcome = tuple[str, dict[str, Any] | None, str]
@@ -145,25 +145,20 @@ def run_job(text: str, threads: int = 0, on_step: Callable[[StepReport], object]
 def fit_job(job: jobs.FarmJob, on_step: Callable[[StepReport], object] | None = None) -> str:
     """Fit or continue a job, or keep a finished one, and write its record; returns the state as `run_job` does."""
     began, source, out = time.perf_counter(), jobs.source_stamp(Path(job.request.scene.path)), job.request.out
-    error: Exception | None = None
     again = False
     try:
         how, metrics, message = _ensure(job, on_step)
-    except Exception as e:  # whatever a fit raises is a result of this one job: the others go on
-        error, how, metrics, message = e, "failed", None, str(e)
-    if isinstance(error, FolderHeldError):
-        say(str(error))
+    except FolderHeldError as e:
+        say(str(e))
         return "held"
-    if error is not None:
-        ours, full = isinstance(error, WarpgsError), is_out_of_memory(error)
-        again = full or not ours
+    except Exception as e:  # whatever a fit raises is a result of this one job: the others go on
+        ours, full = isinstance(e, WarpgsError), is_out_of_memory(e)
+        how, metrics, message, again = "failed", None, str(e), full or not ours
         if not ours:
-            message = no_memory_message(error) if full else f"internal error, {type(error).__name__}: {error}"
-        for line in "".join(traceback.format_exception(error)).splitlines():
-            say(line)
-    record = jobs.JobRecord(
-        job.name, job.identity(), "failed" if error else "done", how, message, again, source, time.perf_counter() - began
-    )
+            message = no_memory_message(e) if full else f"internal error, {type(e).__name__}: {e}"
+        say_lines("".join(traceback.format_exception(e)).splitlines())
+    state, took = "failed" if how == "failed" else "done", time.perf_counter() - began
+    record = jobs.JobRecord(job.name, job.identity(), state, how, message, again, source, took)
     if metrics is not None:
         write_thumbnail(out / "renders", job.folder / jobs.THUMBNAIL)
         record = replace(

@@ -68,10 +68,8 @@ def cut_advice(model: FittedModel, cameras: Sequence[Camera]) -> str:
     depths = np.concatenate([means @ np.asarray(c.viewmat, np.float64)[2, :3] + float(c.viewmat[2, 3]) for c in cameras])
     depths = depths[depths > 0]
     share = float((depths < near).mean()) if len(depths) else 0.0
-    return (
-        f"{share:.0%} of the Gaussians in front of the cameras are nearer than the near plane, {near:g} units; "
-        f"lower it, such as with --near {np.median(depths) / 100:.1g}"
-    ) * (share > 0.5)
+    cut = f"{share:.0%} of the Gaussians in front of the cameras are nearer than the near plane, {near:g} units"
+    return f"{cut}; lower it, such as with --near {np.median(depths) / 100:.1g}" if share > 0.5 else ""
 
 
 def fault_notes(faults: list[str], remedy: str, nearer: str, cut: str = "") -> list[str]:

@@ -176,18 +176,15 @@ def _kind(cameras: list[Camera], focus: np.ndarray, depth: float) -> str:
     """Return one of `NAMES`; a ring may still turn out to be from one side."""
     centers, forwards = np.array([c.center for c in cameras]), np.array([c.viewmat[2, :3] for c in cameras])
     to_focus = focus - centers
-    distances = np.sqrt((to_focus * to_focus).sum(1))
-    cosines = (to_focus * forwards).sum(1) / np.maximum(distances, 1e-12)
+    cosines = (to_focus * forwards).sum(1) / np.maximum(np.sqrt((to_focus * to_focus).sum(1)), 1e-12)
     if (cosines > MIN_COSINE).mean() >= MIN_AGREEMENT:
         return "ring"
     offsets = centers - centers.mean(0)
     mean = forwards.mean(0)
     if _length(mean) > MIN_FORWARD:
-        along = np.abs(geometry.matmul(offsets, _unit(mean))).max()
-        return "forward" if along < depth else "free"
+        return "forward" if np.abs(geometry.matmul(offsets, _unit(mean))).max() < depth else "free"
     spread = math.sqrt((offsets * offsets).sum(1).max())
-    outwards = (cosines < -MIN_COSINE).mean() >= MIN_AGREEMENT
-    return "room" if outwards or spread < 0.5 * depth else "free"
+    return "room" if (cosines < -MIN_COSINE).mean() >= MIN_AGREEMENT or spread < 0.5 * depth else "free"
 
 
 def rig_of(cameras: list[Camera], depth: float, level: np.ndarray | None = None) -> Rig:
@@ -209,8 +206,7 @@ def rig_of(cameras: list[Camera], depth: float, level: np.ndarray | None = None)
         focus = centers.mean(0) if kind == "room" else (centers + depth * forwards).mean(0)
     up, turned = _upward(cameras, focus)
     up = up if level is None else level
-    directions = forwards if kind == "room" else centers - focus
-    azimuths, elevations, first = _azimuths(directions, up)
+    azimuths, elevations, first = _azimuths(forwards if kind == "room" else centers - focus, up)
     distances = np.sqrt(((centers - focus) ** 2).sum(1))
     return Rig(
         kind, focus, up, first, _span(azimuths), float(np.quantile(distances, FAR)), float(elevations.mean()),
@@ -307,10 +303,8 @@ def _turn(rig: Rig, frames: int, turns: int, rise: float) -> list[np.ndarray]:
             azimuth = 0.5 * (rig.span[0] + rig.span[1]) + 0.5 * reach * math.sin(azimuth)
         elevation = float(np.clip(rig.elevation + rise * math.sin(2 * np.pi * t), -MAX_ELEVATION, MAX_ELEVATION))
         direction = rig.direction(azimuth, elevation)
-        if rig.kind == "room":
-            poses.append(geometry.look_at(rig.center, rig.center + direction, rig.up))
-        else:
-            poses.append(geometry.look_at(rig.center + rig.distance * direction, rig.center, rig.up))
+        inwards = rig.center + rig.distance * direction, rig.center
+        poses.append(geometry.look_at(*((rig.center, rig.center + direction) if rig.kind == "room" else inwards), rig.up))
     return poses
 
 
@@ -326,10 +320,8 @@ def camera_path(kind: str, rig: Rig, cameras: list[Camera], frames: int) -> list
     """Return cameras on a closed path, turntable or spiral, with size and intrinsics of a typical one of ``cameras``."""
     if kind == "turntable":
         poses = _turn(rig, frames, 1, 0.0)
-    elif rig.kind == "forward":
-        poses = _spiral_to_one_side(rig, cameras, frames)
     else:
-        poses = _turn(rig, frames, 2, rig.rise)
+        poses = _spiral_to_one_side(rig, cameras, frames) if rig.kind == "forward" else _turn(rig, frames, 2, rig.rise)
     template = framed(typical(cameras), turned=rig.turned)
     return [replace(template, viewmat=pose) for pose in poses]
 
@@ -442,10 +434,8 @@ def read_keyframes(path: Path, template: Camera, normalization: Normalization) -
         right_handed = float((np.cross(rotation[0], rotation[1]) * rotation[2]).sum()) > 0
         rigid = np.abs(square - np.eye(3)).max() <= MAX_SKEW and right_handed and (matrix[3] == (0, 0, 0, 1)).all()
         if not rigid or np.abs(matrix[:3, 3]).max() > MAX_REACH:
-            raise DataError(
-                f"{path}: c2w of keyframe {i} must be a rigid camera-to-world matrix: its upper left 3 x 3 a rotation, "
-                f"its last column within {MAX_REACH:g}, and its last row 0 0 0 1"
-            )
+            fix = f"its upper left 3 x 3 a rotation, its last column within {MAX_REACH:g}, and its last row 0 0 0 1"
+            raise DataError(f"{path}: c2w of keyframe {i} must be a rigid camera-to-world matrix: {fix}")
         if value["fov_y"] > 3.1:
             raise DataError(f"{path}: fov_y of keyframe {i} is {value['fov_y']:g} rad; give radians, below 3.1")
         if result and not MIN_SECONDS <= value["seconds"] - values[i - 1]["seconds"] <= MAX_SECONDS:
@@ -467,8 +457,7 @@ def _distances(cameras: list[Camera]) -> list[list[float]]:
     centers, rotations = np.array([c.center for c in cameras]), np.array([c.viewmat[:3, :3] for c in cameras]).reshape(-1, 9)
     apart = np.sqrt(((centers[:, None] - centers[None]) ** 2).sum(-1))
     cosines = np.clip((geometry.matmul(rotations, rotations.T) - 1) / 2, -1, 1)
-    distances: list[list[float]] = (apart / max(float(apart.max()), 1e-12) + np.arccos(cosines) + 1e-6).tolist()
-    return distances
+    return (apart / max(float(apart.max()), 1e-12) + np.arccos(cosines) + 1e-6).tolist()
 
 
 def _neighbour_tour(distances: list[list[float]]) -> list[int]:

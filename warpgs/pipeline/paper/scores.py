@@ -43,12 +43,8 @@ def blur(image: torch.Tensor, sigma: float = BLUR) -> torch.Tensor:
 def normalized(score: torch.Tensor, valid: torch.Tensor | None = None) -> torch.Tensor:
     """Scale a score [H, W] so that its 2nd percentile over valid pixels [H, W] is 0 and its 98th 1, clipped; 0 if constant."""
     values = score.flatten() if valid is None else score[valid]
-    if len(values) == 0:
-        return torch.zeros_like(score)
-    low, high = quantiles(values, *PERCENTILES)
-    if not high > low:
-        return torch.zeros_like(score)
-    return ((score - low) / (high - low)).clamp(0, 1)
+    low, high = quantiles(values, *PERCENTILES) if len(values) else (0, 0)
+    return ((score - low) / (high - low)).clamp(0, 1) if high > low else torch.zeros_like(score)
 
 
 def geometry_score(disparity: torch.Tensor, valid: torch.Tensor | None = None) -> torch.Tensor:
@@ -88,9 +84,7 @@ def importance(scores: tuple[torch.Tensor, torch.Tensor, torch.Tensor], by: tupl
 
     If all weights are 0, S_importance is 1 everywhere, so that sampling is uniform.
     """
-    if sum(by) == 0:
-        return torch.ones_like(scores[0])
-    return sum(w * s for w, s in zip(by, scores))
+    return sum(w * s for w, s in zip(by, scores)) if sum(by) else torch.ones_like(scores[0])
 
 
 EVERY = 2

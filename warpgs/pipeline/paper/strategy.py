@@ -89,13 +89,10 @@ class Paper(Sampling):
     def setup(self) -> None:
         """Compute the semantic and the geometric score of each view, which do not change during the fit."""
         for view, prior in zip(self.context.views, self.context.priors):
-            maps = {
-                n: torch.as_tensor(getattr(prior, n), dtype=torch.float32, device=view.image.device)
-                for n in ("disparity", "confidence", "boundary", "foreground")
-            }
-            valid = None if view.countable is None else view.countable > 0
-            self.geometry.append(scores.geometry_score(maps.pop("disparity"), valid))
-            semantic = scores.semantic_score(**maps)
+            given = (prior.disparity, prior.confidence, prior.boundary, prior.foreground)
+            disparity, *maps = (torch.as_tensor(m, dtype=torch.float32, device=view.image.device) for m in given)
+            self.geometry.append(scores.geometry_score(disparity, None if view.countable is None else view.countable > 0))
+            semantic = scores.semantic_score(*maps)
             self.semantic.append(semantic if bool(semantic.any()) else None)
 
     def before_event(self, views: Mapping[int, TrainingView], rendered: Mapping[int, Rendered]) -> None:
@@ -112,11 +109,9 @@ class Paper(Sampling):
         by = self.config.weights(semantic is not None)
         if sum(by) == 0:
             return {}
-        residual = (
-            scores.normalized(scores.gain_map(view, depth, valid, self.residuals), valid)
-            if self.residuals
-            else scores.render_score(rgb, view.image, valid)
-        )
+        residual = scores.render_score(rgb, view.image, valid)
+        if self.residuals:
+            residual = scores.normalized(scores.gain_map(view, depth, valid, self.residuals), valid)
         zeros = torch.zeros_like(depth)
         parts = (residual, zeros if semantic is None else semantic, self.geometry[number] if self.geometry else zeros)
         names = (f"{w:.2f} {n}" for w, n in zip(by, ("S_render", "S_semantic", "S_geometry")))

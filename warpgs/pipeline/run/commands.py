@@ -80,10 +80,8 @@ def open_file(
     normalization = Normalization(np.mean([c.center for c in found.values()], axis=0), 1 / extent if extent > 0 else 1.0)
     gaussians, declared, lost = read_with_antialiasing(path, normalization, "scene")
     notes += lost
-    if note := format_of(path).note:
-        notes.append(note)
-    if declared:
-        notes.append(f"{path.name} declares an antialiased model; renders use a pixel filter of {LOW_PASS:g} px²")
+    notes += [note] if (note := format_of(path).note) else []
+    notes += [f"{path.name} declares an antialiased model; renders use a pixel filter of {LOW_PASS:g} px²"] * declared
     if own:
         notes.append(f"rendered with the cut-offs of {FitConfig.rule}, as warpgs fits; --rule chooses others")
     elif rule is None:
@@ -122,11 +120,7 @@ def scene_of(stored: StoredRun, reader: str | None = None, tell: Say | None = No
 
 
 def evaluate(
-    folder: Path,
-    device_name: str,
-    lpips_weights: Path | None = None,
-    reader: str | None = None,
-    by_coverage: bool = False,
+    folder: Path, device_name: str, lpips_weights: Path | None = None, reader: str | None = None, by_coverage: bool = False
 ) -> list[str]:
     """Score a run on its held-out views and render them again, into eval.json and images; returns lines for the user."""
     device, _ = choose_device(device_name)
@@ -274,16 +268,13 @@ def prune(
         "train_psnr": scores[0], "test_psnr": scores[1] if test else None,
     }  # fmt: skip
     held, run = _write(out, stored, figures, made), shlex.quote(str(out))
+    kinds = zip(("training", "held-out"), scores, (train, test))
     return [
         *stored.notes(),
         *held,
         f"{counts[0]:,} -> {counts[1]:,} Gaussians, mean SH degree {means[0]:.2f} -> {means[1]:.2f}",
         f"{format_bytes(sizes[0])} -> {format_bytes(sizes[1])} uncompressed, {sizes[0] / sizes[1]:.2f} times smaller",
-        *(
-            f"{kind} PSNR {old:.2f} -> {new:.2f} dB over {len(views)} views"
-            for kind, (old, new), views in zip(("training", "held-out"), scores, (train, test))
-            if views
-        ),
+        *(f"{kind} PSNR {old:.2f} -> {new:.2f} dB over {len(of)} views" for kind, (old, new), of in kinds if of),
         f"in {out}: checkpoint, PLY; `warpgs eval {run}` scores it, `warpgs render {run}` renders it",
     ]
 
@@ -423,9 +414,8 @@ def plot(
     rows = size[1] - (round(LEGEND_HEIGHT * size[1]) if legend else 0)
     with hold_file(out) as held:
         tell("rendering the plot")
-        image = render_overview(
-            gaussians, stored.options(), train, test, up, size=(size[0], rows), background=background, cameras=cameras
-        )
+        shown = {"size": (size[0], rows), "background": background, "cameras": cameras}
+        image = render_overview(gaussians, stored.options(), train, test, up, **shown)
         if image is None:
             raise DataError(f"{folder}: the model has no Gaussians; there is nothing to show")
         write_bytes(out, png(with_legend(image, legend, size[1], background)))

@@ -227,10 +227,8 @@ def non_finite_parts(trainer: Trainer, view: int, slot: int) -> tuple[list[str],
     tensors = {"image": inputs.target.image} | {f"map {n}": t for n, t in inputs.target.maps.items()}
     tensors |= trainer.taker.params | {f"rendered {n}": t for n, t in inputs.outputs.items()}
     wrong = {n: int((~torch.isfinite(t)).sum()) for n, t in tensors.items()}
-    return (
-        [n for n, v in values.items() if not bool(torch.isfinite(v).all())],
-        [f"{n} ({count:,} of {tensors[n].numel():,} values)" for n, count in wrong.items() if count],
-    )
+    broken = [n for n, v in values.items() if not bool(torch.isfinite(v).all())]
+    return broken, [f"{n} ({count:,} of {tensors[n].numel():,} values)" for n, count in wrong.items() if count]
 
 
 def check_equal(record: dict[str, Any], step: int | None, ranks: Ranks) -> None:
@@ -253,15 +251,11 @@ def check_equal(record: dict[str, Any], step: int | None, ranks: Ranks) -> None:
 
 def batched_notes(config: FitConfig, ranks: Ranks) -> list[str]:
     """Return sentences on views and processes of a step; empty if a step has one view."""
-    views = (
-        f"batch: each of the {config.steps:,} steps renders {config.batch} views and averages their gradients; "
-        f"learning rates are {config.batch**0.5:.3g} times those for one view"
-    )
+    rates = f"learning rates are {config.batch**0.5:.3g} times those for one view"
+    views = f"batch: each of the {config.steps:,} steps renders {config.batch} views and averages their gradients; {rates}"
     counts = sorted({len(own_slots(config.batch, ranks.count, rank)) for rank in range(ranks.count)})
-    processes = (
-        f"ranks: {ranks.count} processes ({ranks.backend}); each renders {' or '.join(map(str, counts))} views of a step; "
-        "the model has the same bits for any number of ranks"
-    )
+    each = f"each renders {' or '.join(map(str, counts))} views of a step; the model has the same bits for any number of ranks"
+    processes = f"ranks: {ranks.count} processes ({ranks.backend}); {each}"
     return [views] * (config.batch > 1) + [processes] * (ranks.count > 1)
 
 
@@ -280,10 +274,8 @@ def with_poses(request: SceneRequest, out: Path | None, progress: Say, ranks: in
         if record["source_sha256"] != source_digest(source, request.allow_outside):
             raise UsageError(f"{scene} holds poses of other photographs than {source}; give another --out")
     elif ranks > 1:
-        raise UsageError(
-            f"{source}: has no cameras, and each of {ranks} ranks would find its own poses; run `warpgs poses {source} --out "
-            "SCENE` first, and fit SCENE"
-        )
+        fix = f"run `warpgs poses {source} --out SCENE` first, and fit SCENE"
+        raise UsageError(f"{source}: has no cameras, and each of {ranks} ranks would find its own poses; {fix}")
     else:
         if "=" not in (spec := request.split or "all") and not is_video(source):  # refuse what all photographs are too few for
             root = image_root(source)
@@ -387,7 +379,13 @@ def fit(
         WarpgsError: Any other error that a user can fix, before the first step if possible.
     """
     out = None if out is None else Path(out)
-    config, origin = _checked_settings(preset, overrides, out, resume, time_budget, ranks)
+    if resume and out is None:
+        raise UsageError("resume requires out, the run folder to continue")
+    check_overrides(overrides)
+    config, origin = chosen_settings(preset, overrides)
+    check_ranks(config.batch, ranks)
+    if time_budget is not None and ranks.count > 1:
+        raise UsageError(f"--time-budget: each of {ranks.count} ranks would choose its own number of steps; give --steps")
     scene = _checked_source(scene, split)
     verbose, own = ranks.first and verbose, out if ranks.first else None
     folder = contextlib.nullcontext(list[str]()) if own is None else folders.run_folder(own, resume)
@@ -433,21 +431,6 @@ def fit(
         result = _finish(job, trainer, record, checks)
     ranks.leave()
     return result
-
-
-def _checked_settings(
-    preset: FitConfig | Mapping[str, Any] | str | Path | None, overrides: dict[str, object], out: Path | None, resume: bool,
-    time_budget: float | None, ranks: Ranks,
-) -> tuple[FitConfig, list[str]]:  # fmt: skip
-    """Return the settings and notes on their origin; refuse arguments of `fit` that do not go together."""
-    if resume and out is None:
-        raise UsageError("resume requires out, the run folder to continue")
-    check_overrides(overrides)
-    config, origin = chosen_settings(preset, overrides)
-    check_ranks(config.batch, ranks)
-    if time_budget is not None and ranks.count > 1:
-        raise UsageError(f"--time-budget: each of {ranks.count} ranks would choose its own number of steps; give --steps")
-    return config, origin
 
 
 def _checked_source(scene: Scene | SceneRequest | str | Path, split: str | None) -> Scene | SceneRequest:
@@ -558,8 +541,7 @@ def _finish(job: FitJob, trainer: Trainer, record: dict[str, Any], checks: list[
     counts = f"{len(job.train)} views to fit, {len(job.test)} held out"
     job.say(f"{job.scene.path}: {job.scene.format}, {counts}, {camera.width} x {camera.height} px, {job.where}")
     job.notes = []
-    planned = planned_times(job, trainer)[1]
-    job.note(*chosen, *batched_notes(job.config, job.ranks), plan_summary(trainer.memory), *planned)
+    job.note(*chosen, *batched_notes(job.config, job.ranks), plan_summary(trainer.memory), *planned_times(job, trainer)[1])
     setup = time.perf_counter() - job.began
     take_steps(job, trainer)
     seconds = {"setup": setup, "training": time.perf_counter() - job.began - setup}

@@ -48,14 +48,9 @@ def _view_name(value: Any, place: str) -> None:
         raise SchemaError(f"{place} must be the relative path of an image, not {value[:60]!r}")
 
 
-_CAMERA = fields(
-    {
-        "viewmat": items(items(number(), 4), 4), "K": items(items(number(), 3), 3), "width": whole(1, MAX_SIDE),
-        "height": whole(1, MAX_SIDE),
-    },
-    {"model": text, "distortion": items(number())},
-    others=False,
-)  # fmt: skip
+_MATRICES = {name: items(items(number(), size), size) for name, size in (("viewmat", 4), ("K", 3))}
+_SIZES = dict.fromkeys(("width", "height"), whole(1, MAX_SIDE))
+_CAMERA = fields(_MATRICES | _SIZES, {"model": text, "distortion": items(number())}, others=False)
 _SCENE = fields(
     {"path": or_null(text)},
     {name: schema.of_type(hint) for name, hint in get_type_hints(SceneRequest).items() if name != "path"}
@@ -112,10 +107,9 @@ def save_checkpoint(folder: Path, tensors: dict[str, torch.Tensor], state: dict[
     for name, t in tensors.items():
         # minimum and maximum suffice, without a copy: torch returns NaN if any value is NaN
         if t.is_floating_point() and t.numel() and not all(math.isfinite(float(v)) for v in t.aminmax()):
-            raise NotFiniteError(
-                f"{path} was not written: {name} holds non-finite values; results after the last checkpoint are invalid. "
-                "--resume would repeat the same steps; fit again into a new --out with lower learning rates"
-            )
+            lost = f"{name} holds non-finite values; results after the last checkpoint are invalid"
+            fix = "--resume would repeat the same steps; fit again into a new --out with lower learning rates"
+            raise NotFiniteError(f"{path} was not written: {lost}. {fix}")
     metadata = {"format": str(FORMAT), "version": __version__, "state": json.dumps(state)}
     chunks, digest = tensor_pieces(tensors, metadata), hashlib.sha256()
     for chunk in chunks:
@@ -149,10 +143,8 @@ def load_checkpoint(folder: Path) -> tuple[dict[str, torch.Tensor], dict[str, An
 
 def _other_version(words: str) -> str:
     """Return a message on a file of another version; ``words`` say which version wrote which file."""
-    return (
-        f"{words}, in a format that warpgs {__version__} does not read. Open it with that version, or fit the scene again into "
-        "a new --out; point_cloud.ply stays readable"
-    )
+    fix = "Open it with that version, or fit the scene again into a new --out; point_cloud.ply stays readable"
+    return f"{words}, in a format that warpgs {__version__} does not read. {fix}"
 
 
 def cameras_of(scene: Scene) -> dict[str, Camera]:
@@ -306,29 +298,23 @@ def check_same(record: dict[str, Any], stored: dict[str, Any], out: Path) -> Non
         if now == then:
             continue
         if key == "own_code":
-            raise UsageError(
-                f"--resume: the code of {', '.join(now or then)} has changed since the run in {out} began, or the run did not "
-                "record its version; restore the code, or give a new --out"
-            )
+            fix = "or the run did not record its version; restore the code, or give a new --out"
+            raise UsageError(f"--resume: the code of {', '.join(now or then)} has changed since the run in {out} began, {fix}")
         if isinstance(now, dict):
             words += f" ({', '.join(k for k in now | then if now.get(k) != then.get(k))})"
         scene = record["scene"].items() if key != "device" else ()
         was = [f"{k} was {stored['scene'].get(k)}" for k, v in scene if k != "path" and stored["scene"].get(k) != v]
         were = f" ({', '.join(was)})" if was else ""
-        raise UsageError(
-            f"--resume: {words} differs from the run in {out}{were}. To continue with the run's own flags, give only --out "
-            f"{shlex.quote(str(out))} --resume; for other flags, give a new --out"
-        )
+        fix = f"give only --out {shlex.quote(str(out))} --resume; for other flags, give a new --out"
+        raise UsageError(f"--resume: {words} differs from the run in {out}{were}. To continue with the run's own flags, {fix}")
 
 
 def _check_lost(stored: dict[str, Any], out: Path) -> None:
     """Raise a UsageError if a run has settings that this version lacks."""
     if lost := stored.get("lost"):
-        raise UsageError(
-            f"--resume: the run in {out} has settings that this version of warpgs does not have: {', '.join(lost)}. Resume it "
-            f"with the code that began it (warpgs {stored['versions'].get('warpgs', 'of that time')}), or fit again into a new "
-            "--out"
-        )
+        lacking = f"the run in {out} has settings that this version of warpgs does not have: {', '.join(lost)}"
+        code = f"the code that began it (warpgs {stored['versions'].get('warpgs', 'of that time')})"
+        raise UsageError(f"--resume: {lacking}. Resume it with {code}, or fit again into a new --out")
 
 
 def check_checkpoint(state: dict[str, Any], stored: dict[str, Any], out: Path) -> None:
@@ -352,10 +338,8 @@ def _check_named_again(now: dict[str, Any], then: dict[str, Any], out: Path) -> 
         )
         outside = [name for name in needed if ":" in name]
         if set(outside) - set(named):
-            raise UsageError(
-                f"--resume: the run in {out} was fitted with user code. A run folder never decides which code is loaded; give "
-                f"--{field.replace('_', '-')} {','.join(outside)} again"
-            )
+            fix = f"A run folder never decides which code is loaded; give --{field.replace('_', '-')} {','.join(outside)} again"
+            raise UsageError(f"--resume: the run in {out} was fitted with user code. {fix}")
 
 
 @dataclass(frozen=True, repr=False)
@@ -397,19 +381,17 @@ def _stored_scene(folder: Path, record: dict[str, Any], reader: str | None, move
         raise DataError(f"{folder}: its scene was passed from Python; score it in Python, with warpgs.evaluate")
     if moved is not None:
         new = os.path.realpath(moved)
-        values = {
-            n: new + v[len(old) :] if isinstance(v, str) and Path(v).is_relative_to(old) else v for n, v in values.items()
-        }
+        inside = {n: v for n, v in values.items() if isinstance(v, str) and Path(v).is_relative_to(old)}
+        values = values | {n: new + v[len(old) :] for n, v in inside.items()}
     request = SceneRequest(**values)
     if not os.path.exists(request.path) and (folder / POSED_SCENE / POSES).is_file():
         request = replace(request, path=str(folder / POSED_SCENE))  # the run folder was moved, and its scene with it
     if request.reader is not None and ":" in request.reader and reader != request.reader:
         raise UsageError(f"{folder}: its scene needs user code, which no folder may load; give --reader {request.reader} again")
     if not os.path.exists(request.path):
-        raise DataError(
-            f"{request.path}: the scene of {folder} is gone; if it was moved, `warpgs fit NEW_PLACE --out "
-            f"{shlex.quote(str(folder))} --resume` stores its new place, and makes scores and report again"
-        )
+        again = f"`warpgs fit NEW_PLACE --out {shlex.quote(str(folder))} --resume`"
+        fix = f"if it was moved, {again} stores its new place, and makes scores and report again"
+        raise DataError(f"{request.path}: the scene of {folder} is gone; {fix}")
     return request
 
 

@@ -10,25 +10,13 @@ import warp as wp
 
 from warpgs.constants import TILE_SIZE
 from warpgs.device import format_bytes
-from warpgs.kernels import (
-    blend,
-    blend_cpu,
-    blend_cuda,
-    graphs,
-    launch,
-    neighbours,
-    project_cpu,
-    project_cuda,
-    roughness,
-    sh,
-    ssim,
-    sweep,
-    tiles,
-    update,
-    walk,
-)
+from warpgs.kernels import blend, blend_cpu, blend_cuda, neighbours, project_cpu, project_cuda, ssim, sweep, tiles, update, walk
 from warpgs.kernels.falloff import COLORS, VALUES
+from warpgs.kernels.graphs import fetch_kernel
+from warpgs.kernels.launch import warp_device
 from warpgs.kernels.native import BLOCK, load_module, loaded_ahead
+from warpgs.kernels.roughness import make_kernels as roughness
+from warpgs.kernels.sh import BASES
 from warpgs.pipeline.train.strategies import mcmc
 from warpgs.process import say
 
@@ -45,12 +33,10 @@ def fit_kernels(cuda: bool) -> list[tuple[wp.Kernel, int]]:
     of_steps, of_renders = ([emit(real, slotted), tiles.make_find_ranges(slotted, cuda)] for slotted in (True, False))
     start, lists = neighbours.make_knn_kernels(real).search, tiles.make_kernels(real, cuda).pack_counts
     of_renders += [blend.make_segments(real).gather_weights, mcmc.move]
-    rough = [*vars(roughness.make_kernels(real)).values()]
+    rough = [*vars(roughness(real)).values()]
     if not cuda:
-        variant, summed = (
-            (CAMERA_MODEL, "stored", False, sh.BASES),
-            [ssim.make_kernel(real, True, way) for way in (False, True)],
-        )
+        variant = CAMERA_MODEL, "stored", False, BASES
+        summed = [ssim.make_kernel(real, True, way) for way in (False, True)]
         color, deep = (blend_cpu.make_backward(real, TILE_SIZE, COLORS, deep=deep) for deep in (False, True))
         kernels = [
             sweep.match, sweep.best, sweep.follow_cpu, start, project_cpu.make_forward(real, *variant), update.sample, lists,
@@ -74,7 +60,7 @@ def fit_kernels(cuda: bool) -> list[tuple[wp.Kernel, int]]:
         (ssim.cuda_forward, ssim.THREADS), *((kernel, THREADS) for kernel in rough),
         *((each.backward, warps) for each in color),
         (color[0].gather, THREADS), (project_cuda.make_backward(real, CAMERA_MODEL), BLOCK),
-        *((kernel, THREADS) for kernel in (update.scheduled_update, graphs.fetch_kernel, neighbours.bound_by_reach)),
+        *((kernel, THREADS) for kernel in (update.scheduled_update, fetch_kernel, neighbours.bound_by_reach)),
         # after the first step
         *((kernel, THREADS) for kernel in of_renders), *show,
         *((each.backward, warps) for each in deep), (deep[0].gather, THREADS),
@@ -83,7 +69,7 @@ def fit_kernels(cuda: bool) -> list[tuple[wp.Kernel, int]]:
 
 def call_kernels(cuda: bool) -> list[tuple[wp.Kernel, int]]:
     """Return further kernels, as `fit_kernels` does, of `rasterize` with scales and opacities, and of `warpgs.compat`."""
-    room, variant = project_cuda if cuda else project_cpu, (wp.float32, CAMERA_MODEL, "activated", False, sh.BASES)
+    room, variant = project_cuda if cuda else project_cpu, (wp.float32, CAMERA_MODEL, "activated", False, BASES)
     median = walk.make_native(TILE_SIZE).median if cuda else walk.make_walk(wp.float32, TILE_SIZE, walk.make_median)
     backward = room.make_backward(*variant, *([] if cuda else [False]))
     kernels = room.make_forward(*variant), backward, blend.make_kernels(wp.float32, COLORS).color, median
@@ -92,8 +78,7 @@ def call_kernels(cuda: bool) -> list[tuple[wp.Kernel, int]]:
 
 def scoring() -> wp.Kernel:
     """Return the kernel that computes SSIM for scores, on the CPU."""
-    kernel: wp.Kernel = ssim.make_kernel(wp.float32, False, False)
-    return kernel
+    return ssim.make_kernel(wp.float32, False, False)
 
 
 @contextlib.contextmanager
@@ -120,7 +105,7 @@ def precompile_kernels(devices: list[torch.device] | None = None) -> Iterator[tu
     for device in devices:
         with compiled_ahead(device) as kernels:
             for kernel, block in [*kernels, *call_kernels(device.type == "cuda")]:
-                path = Path(load_module(kernel.module, launch.warp_device(device), block).binary_path)
+                path = Path(load_module(kernel.module, warp_device(device), block).binary_path)
                 name = f"{kernel.func.__module__.rpartition('.')[2]}.{kernel.func.__name__}"
                 yield str(device), name, block, path.stat().st_mtime >= wall, time.perf_counter() - began
 
@@ -134,7 +119,5 @@ def print_warming(devices: list[torch.device] | None = None) -> None:
             say(f"{device}: {kernel}{'' if device == 'cpu' else f' in blocks of {block}'}, after {seconds:.1f} s")
     folder = Path(wp.config.kernel_cache_dir)
     size = sum(p.stat().st_size for p in folder.rglob("*") if p.is_file())
-    say(
-        f"{count} modules: {compiled} compiled, {count - compiled} were in the cache, "
-        f"{time.perf_counter() - began:.1f} s; {folder} holds {format_bytes(size)}"
-    )
+    took = f"{time.perf_counter() - began:.1f} s; {folder} holds {format_bytes(size)}"
+    say(f"{count} modules: {compiled} compiled, {count - compiled} were in the cache, {took}")

@@ -75,9 +75,7 @@ def check_overrides(overrides: Mapping[str, object]) -> None:
 
 def choose_device(name: str | torch.device) -> tuple[torch.device, str]:
     """Return the device for auto, cpu, cuda or cuda:N, or a given device itself, and a phrase for the user."""
-    if isinstance(name, torch.device):
-        device = name
-    elif re.fullmatch(r"cuda:[0-9]{1,3}", name):
+    if isinstance(name, torch.device) or re.fullmatch(r"cuda:[0-9]{1,3}", name):
         device = torch.device(name)
     elif name not in ("auto", "cpu", "cuda"):
         raise UsageError(f"device {name!r} is not one of auto, cpu, cuda, cuda:N")

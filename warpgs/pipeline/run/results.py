@@ -94,8 +94,7 @@ SIDE = 64
 
 def _window(camera: Camera, generator: np.random.Generator) -> tuple[int, int, int, int]:
     """Sample a part of an image, [left, top, width, height], with edges at tile edges or image edges."""
-    sizes = camera.width, camera.height
-    x, y = (TILE_SIZE * int(generator.integers(max(0, size - SIDE) // TILE_SIZE + 1)) for size in sizes)
+    x, y = (TILE_SIZE * int(generator.integers(max(0, size - SIDE) // TILE_SIZE + 1)) for size in (camera.width, camera.height))
     return x, y, min(SIDE, camera.width - x), min(SIDE, camera.height - y)
 
 
@@ -337,8 +336,7 @@ SHOWN_VIEWS = 6
 def score_line(scores: dict[str, float]) -> str:
     """Return mean scores as one line for the user."""
     parts = [f"PSNR {scores['psnr']:.2f} dB", f"SSIM {scores['ssim']:.3f}"]
-    if "psnr_foreground" in scores:
-        parts.append(f"PSNR of the foreground {scores['psnr_foreground']:.2f} dB")
+    parts += [f"PSNR of the foreground {scores['psnr_foreground']:.2f} dB"] if "psnr_foreground" in scores else []
     parts += [f"{LABELS[k]} {v:.3f}" for kind in ("alpha", "lpips") for k, v in scores.items() if k.startswith(kind)]
     return ", ".join([*parts, *([] if any(k.startswith("lpips") for k in scores) else ["LPIPS not measured"])])
 
@@ -363,8 +361,7 @@ def result_lines(metrics: dict[str, Any], out: Path | None, tasks: Sequence[str]
         best = ", ".join(f"{BASELINES.get(name, name)} {value:.2f} dB" for name, value in metrics["baselines"].items())
         lines += [f"  for comparison, without a fit: {best}"] if best else []
         lines += [f"  {metrics['coverage']['summary']}"] if "coverage" in metrics else []
-    compiling = metrics["seconds"].get("compiling", 0.0)
-    once = ", with kernels compiled once on this machine" if compiling >= 1 else ""
+    once = ", with kernels compiled once on this machine" if metrics["seconds"].get("compiling", 0.0) >= 1 else ""
     size = format_bytes(metrics["complexity"]["bytes"])
     times = metrics["wall_seconds"]
     lines.append(f"{metrics['gaussians']:,} Gaussians, {size}, in {duration(times['total'])}{once}: {largest(times)}")

@@ -5,6 +5,7 @@ import gc
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +30,7 @@ from warpgs.pipeline.study.tables import GAUSSIANS, METRICS, Sample, Table, pair
 from warpgs.pipeline.train.presets import PRESETS, preset_settings, preset_word
 from warpgs.pipeline.train.settings import FitConfig, settings_by_views
 from warpgs.pipeline.train.trainer import train_views
-from warpgs.process import say
+from warpgs.process import say, say_lines
 from warpgs.report.images import Strip, crops, disagreement, sheet
 from warpgs.scene import Scene, View
 
@@ -232,10 +233,9 @@ def _protocols(runs: Runs) -> list[str]:
         if scene not in lines:
             p = metrics["protocol"]
             masks = f"; {p['score_masks']} views scored within object masks" if p["score_masks"] else ""
-            lines[scene] = (
-                f"{scene}: split {p['split']}; {p['training_views']} training and {p['held_out_views']} held-out views; "
-                f"{', '.join(p['resolution'])} px from {p['ground_truth']}{masks}"
-            )
+            counts = f"{p['training_views']} training and {p['held_out_views']} held-out views"
+            images = f"{', '.join(p['resolution'])} px from {p['ground_truth']}{masks}"
+            lines[scene] = f"{scene}: split {p['split']}; {counts}; {images}"
             variants |= metrics["variants"]
     taken = [f"{name} {' or '.join(f'{n:,}' for n in sorted(of))}" for name, of in steps.items()]
     definitions = [f"{LABELS.get(k, k)}: {v}" for k, v in variants.items()]
@@ -266,10 +266,8 @@ def write_study(request: StudyRequest, runs: Runs, places: Places, device: torch
     parts = [f"# {table.caption}", text]
     if len(scenes) > 1:
         parts += [f"## {s}\n\n{tables.markdown(_table(request, runs, [s], s))}" for s in scenes]
-    parts += [
-        "## How it was scored\n\n" + "\n".join([*_protocols(runs), f"- device: {device_name}"]),
-        "## Notes\n\n" + "\n".join(f"- {n}" for n in notes),
-    ]
+    scored = "\n".join([*_protocols(runs), f"- device: {device_name}"])
+    parts += [f"## How it was scored\n\n{scored}", "## Notes\n\n" + "\n".join(f"- {n}" for n in notes)]
     write_text(out / "table.md", "\n\n".join(p.strip() for p in parts) + "\n")
     write_csv(out / "table.csv", tables.csv_rows(table))
     write_text(out / "table.tex", tables.latex(table))
@@ -322,11 +320,10 @@ def ablation_variants(base: FitConfig) -> tuple[dict[str, FitConfig], dict[str, 
         raise UsageError(f"preset {base.preset!r} has no sampling events; ablate a preset with them, such as default")
     variants: dict[str, FitConfig] = {}
     marks: dict[str, tuple[bool, ...]] = {}
+    # the steps are the preset's, so that rows differ in the method alone
+    paper = dataclasses.replace(PRESETS[PAPER], steps=base.steps, max_steps=base.max_steps, cpu_limit=base.cpu_limit)
     for row, switches in ABLATION_ROWS.items():
-        if switches is None:  # the steps are the preset's, so that rows differ in the method alone
-            changed = dataclasses.replace(PRESETS[PAPER], steps=base.steps, max_steps=base.max_steps, cpu_limit=base.cpu_limit)
-        else:
-            changed = _switched(base, switches)
+        changed = paper if switches is None else _switched(base, switches)
         if base.preset != row and changed not in variants.values():
             variants[row] = changed
             events = changed.strategy != "clone_split"
@@ -369,13 +366,10 @@ def _run_all(request: StudyRequest, places: Places, device: torch.device, lpips:
     """Make all runs, or read the results of a farm; seed by seed, so that an interrupted study has complete pairs."""
     runs: Runs = {}
     fits: dict[Key, tuple[Place, FitRequest]] = {}
-    for seed in range(request.seeds):
-        for name, place in places.items():
-            for variant, config in request.variants.items():
-                key, config = (name, variant, seed), dataclasses.replace(config, seed=seed)
-                out = run_folder(request, *key)
-                fit = FitRequest(place[0], out, config, request.device, lpips_weights=request.lpips_weights)
-                fits[key] = place, fit
+    for seed, (name, place), (variant, config) in product(range(request.seeds), places.items(), request.variants.items()):
+        key, config = (name, variant, seed), dataclasses.replace(config, seed=seed)
+        out = run_folder(request, *key)
+        fits[key] = place, FitRequest(place[0], out, config, request.device, lpips_weights=request.lpips_weights)
     farmed = {}
     if request.engine is not None:
         names = ["-".join(map(str, key)).replace(" ", "-") for key in fits]
@@ -412,8 +406,7 @@ def run_study(request: StudyRequest) -> list[str]:
     lpips = {} if request.lpips_weights is None else Lpips(request.lpips_weights, device).variants()
     places = {scene_name(asked): _place(asked, device.type) for asked in request.scenes}
     with hold_folder(request.out) as notes:
-        for note in notes:
-            say(note)
+        say_lines(notes)
         counts = {"scene": len(places), "setting": len(request.variants), "seed": request.seeds}
         say(", ".join([*(f"{n} {word}{'' if n == 1 else 's'}" for word, n in counts.items()), where]))
         try:
@@ -425,5 +418,4 @@ def run_study(request: StudyRequest) -> list[str]:
             failed = [o for (_, v, _), o in runs.items() if v == name]
             if all(metrics is None for _, metrics, _ in failed):
                 raise DataError(f"every run of {name} failed, so nothing can be compared; first error: {failed[0][2]}")
-        lines = write_study(request, runs, places, device, where.removeprefix("on "))
-        return [*lines, f"in {request.out}: {', '.join(FILES)}"]
+        return [*write_study(request, runs, places, device, where.removeprefix("on ")), f"in {request.out}: {', '.join(FILES)}"]

@@ -141,10 +141,8 @@ def _grid(head: list[str], body: list[list[str]], left: int) -> list[str]:
     """Return the lines of a Markdown table; the first ``left`` columns are text, the others numbers."""
     rows = [[c.replace("|", "\\|") for c in r] for r in [head, *body]]
     widths = [max(len(r[i]) for r in rows) for i in range(len(head))]
-    lines = [
-        "| " + " | ".join(c.ljust(w) if i < left else c.rjust(w) for i, (c, w) in enumerate(zip(r, widths))) + " |"
-        for r in rows
-    ]
+    padded = ([c.ljust(w) if i < left else c.rjust(w) for i, (c, w) in enumerate(zip(r, widths))] for r in rows)
+    lines = [f"| {' | '.join(cells)} |" for cells in padded]
     rule = "|" + "|".join("-" * (w + 2) if i < left else "-" * (w + 1) + ":" for i, w in enumerate(widths)) + "|"
     return [lines[0], rule, *lines[1:]]
 
@@ -237,20 +235,12 @@ LETTER = 7.2
 
 def _text(x: float, y: float, words: str, size: int = 12, anchor: str = "start", color: str = INK, weight: int = 400) -> str:
     """Return a text element at ``x``, ``y`` [px]."""
-    return (
-        f'<text x="{x:.1f}" y="{y:.1f}" font-size="{size}" text-anchor="{anchor}" fill="{color}" font-weight="{weight}">'
-        f"{escape(words)}</text>"
-    )
+    style = f'font-size="{size}" text-anchor="{anchor}" fill="{color}" font-weight="{weight}"'
+    return f'<text x="{x:.1f}" y="{y:.1f}" {style}>{escape(words)}</text>'
 
 
 def _dot(x: float, y: float, radius: float, color: str, more: str = "") -> str:
     return f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{radius}" fill="{color}"{more}/>'
-
-
-def _reach(differences: list[Sample], digits: int) -> float:
-    """Return half the width of a metric's axis, which is centred on 0 so that both signs have the same scale."""
-    values = [abs(v) for d in differences for v in (*d.values, d.low, d.high) if math.isfinite(v)]
-    return 1.08 * max(values, default=0.0) or 10.0**-digits
 
 
 def _line(table: Table, name: str, metric: str, y: float, x0: float, px: Callable[[float], float]) -> list[str]:
@@ -264,10 +254,8 @@ def _line(table: Table, name: str, metric: str, y: float, x0: float, px: Callabl
     parts = [_dot(px(v), y + 10, 2.8, color, ' fill-opacity="0.45"') for v in d.values]
     words = f"{d.mean:+.{digits}f}"
     if math.isfinite(d.low):
-        parts.append(
-            f'<path d="M{px(d.low):.1f} {y - 6:.1f}v12m0 -6H{px(d.high):.1f}m0 -6v12" fill="none" stroke="{color}" '
-            'stroke-width="2"/>'
-        )
+        bar = f"M{px(d.low):.1f} {y - 6:.1f}v12m0 -6H{px(d.high):.1f}m0 -6v12"
+        parts.append(f'<path d="{bar}" fill="none" stroke="{color}" stroke-width="2"/>')
         words += f"  [{d.low:+.{digits}f}, {d.high:+.{digits}f}]"
     parts.append(_dot(px(d.mean), y, 5.5, color, ' stroke="#ffffff" stroke-width="1.5"'))
     return [*parts, _text(right, y + 7, words, 11, color=color, weight=600 if d.excludes_zero else 400)]
@@ -297,7 +285,9 @@ def forest(table: Table) -> str:
         out.append(_text(MARGIN, y + ROW / 2 + 4, name, 13, weight=600 if name == base else 400))
     for k, (metric, differences) in enumerate(panels.items()):
         label, upwards, digits = METRICS[metric]
-        x0, reach = left + k * step, _reach(differences, digits)
+        values = [abs(v) for d in differences for v in (*d.values, d.low, d.high) if math.isfinite(v)]
+        # half the width of the axis, which is centred on 0 so that both signs have the same scale
+        x0, reach = left + k * step, 1.08 * max(values, default=0.0) or 10.0**-digits
 
         def px(value: float, x0: float = x0, reach: float = reach) -> float:
             return x0 + PANEL * (value + reach) / (2 * reach)
