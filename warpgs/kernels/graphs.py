@@ -210,8 +210,11 @@ class GraphPool:
         self.failed = False
         """True once a capture failed for another reason than lack of memory."""
         self._keeper: CapturedGraph | None = None
-        self.byte = torch.empty(0, dtype=torch.uint8, device=device)
+
+    @functools.cached_property
+    def byte(self) -> torch.Tensor:
         """Empty tensor of bytes on the device, shape [0]."""
+        return torch.empty(0, dtype=torch.uint8, device=self.device)
 
     @functools.cached_property
     def _aside(self) -> torch.cuda.Stream:
