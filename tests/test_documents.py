@@ -103,7 +103,7 @@ BY_HAND = {
 """Tables with numbers that no file of results holds: page, first words, reason."""
 
 
-GONE = "Run it at tag bench-2026-11"
+GONE = "Run it at commit 8a2863c12747"
 """Words of the source line of a table whose program is no longer part of `bench`."""
 
 

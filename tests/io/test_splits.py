@@ -128,6 +128,7 @@ def test_splits_that_the_scene_cannot_give(spec, message):
     [
         "", "llff", "llff:", "llff:0", "llff:-1", "llff:1.5", "llff:²", "llff:" + "9" * 5000, "LLFF:3", "dtu:4", "blender:7",
         "every:0", "every:1", "all:3", "train:a", "valid=a", "train=z;train=y", "train=z;nonsense", "../x",
+        ("z", "y"),
     ],
 )  # fmt: skip
 def test_splits_that_make_no_sense(spec):

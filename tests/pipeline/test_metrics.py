@@ -482,6 +482,9 @@ def test_file_says_what_it_was_made_of(files, weights):
     assert metadata["heads_sha256"] == hashlib.sha256(heads.read_bytes()).hexdigest()
     assert not any("classifier" in n for n in names)
     lpips = Lpips(weights, torch.device("cpu"))
+    view = View("a.png", Camera(np.eye(4), np.diag([40.0, 40, 1]), 40, 40), np.zeros((40, 40, 3), np.float32))
+    (scored,) = scores.evaluate(three_gaussians(), [view], RasterizeOptions(), str(weights))
+    assert set(scored.lpips) == set(lpips.variants())
     assert lpips.header["sha256"] == hashlib.sha256(weights.read_bytes()).hexdigest()
     assert set(lpips.variants()) == {f"lpips_{net}_{m}" for m in MODES}
     assert "[0, 1]" in lpips.variants()[f"lpips_{net}_legacy"] and "[-1, 1]" in lpips.variants()[f"lpips_{net}_standard"]

@@ -202,6 +202,8 @@ def _finder(names: list[str], spec: str) -> Callable[[str], str]:
 
 def check_spec(spec: str) -> None:
     """Check that the specification of a split can be understood, before a scene is read."""
+    if not isinstance(spec, str):
+        raise UsageError(f"split must be text, not {type(spec).__name__}; use {SPECS}")
     if "=" in spec:
         _named(spec)
     elif spec == "every:1":

@@ -414,7 +414,8 @@ def check(**tensors: tuple[torch.Tensor, str]) -> dict[str, int]:
             first_name, first = name, tensor
             check_device(name, tensor)
             if tensor.dtype not in REALS:
-                raise TypeError(f"{name} must be float32 or float64, not {tensor.dtype}; {name}.float() converts it")
+                levels = " / 255" * (tensor.dtype == torch.uint8)  # of an 8-bit image
+                raise TypeError(f"{name} must be float32 or float64, not {tensor.dtype}; {name}.float(){levels} converts it")
         if tensor.dtype != first.dtype:
             raise TypeError(f"{name} is {tensor.dtype} but {first_name} is {first.dtype}; give both the same type")
         if tensor.device != first.device:

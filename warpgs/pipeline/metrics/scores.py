@@ -6,6 +6,7 @@ import warnings
 from collections.abc import Iterable, Sequence
 from concurrent.futures import CancelledError
 from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -228,8 +229,9 @@ NOTICED = 0.5 / 255
 
 
 def evaluate(
-    gaussians: Gaussians | Fitted, views: Sequence[View], options: RasterizeOptions | None = None, lpips: Lpips | None = None
-) -> list[ViewMetrics]:
+    gaussians: Gaussians | Fitted, views: Sequence[View], options: RasterizeOptions | None = None,
+    lpips: Lpips | str | Path | None = None,
+) -> list[ViewMetrics]:  # fmt: skip
     """Render views and score each against its image, as a fit does.
 
     Args:
@@ -238,10 +240,10 @@ def evaluate(
         views: Views with images; use held-out views for a meaningful score.
         options: Options of the rasterizer; None for those of the fitted model. With Gaussians alone, None is a black background
             and the rule exact, with a warning if an opaque view shows much of the background.
-        lpips: `Lpips`, the network with its weights; None to skip LPIPS.
+        lpips: File of `warpgs convert-lpips`; None to leave LPIPS out.
 
     Returns:
-        The scores of each view, in order; `summarize` gives their means.
+        The scores of each view, in order.
 
     Raises:
         DataError: A field of a view is invalid; the message names the view, the field and the fix.
@@ -251,6 +253,7 @@ def evaluate(
         options = gaussians.options() if options is None else options
         gaussians = gaussians.gaussians()
     options = RasterizeOptions() if options is None else options
+    lpips = Lpips(Path(lpips), gaussians.means.device) if isinstance(lpips, (str, Path)) else lpips
     scores, doubts = [], []
     for v in views:
         image, _, alpha = render_view(gaussians, v, options)
