@@ -153,7 +153,6 @@ def rule_named(name: str) -> Rule:
     """
     if name in RULES:
         return RULES[name]
-    versions = [known for known in RULES if known.startswith(f"{name}-")]
-    if versions:
+    if versions := [known for known in RULES if known.startswith(f"{name}-")]:
         raise UsageError(f"rule {name!r} needs a version, because its cut-offs changed: choose {' or '.join(versions)}")
     raise UsageError(f"unknown rule {name!r}: choose one of {', '.join(RULES)}")

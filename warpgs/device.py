@@ -387,8 +387,7 @@ def choose_kernel_cache(configured: str | None = None) -> tuple[Path, str]:
     """Choose ``configured``, else WARP_CACHE_PATH, else Warp's default; a private folder if the chosen one is unusable."""
     folder, refused = _usual(configured)
     if folder is not None:
-        refused = _fault(folder)
-        if not refused:
+        if not (refused := _fault(folder)):
             return folder, ""
     try:
         own = private_folder() / "kernels"
@@ -406,8 +405,7 @@ def _usual(configured: str | None) -> tuple[Path | None, str]:
         if asked.startswith("~") and not folder.is_absolute():
             return None, f"the kernel cache {asked} is in an unknown home folder"
         return folder.resolve(), ""
-    home = cache_home()
-    if home is None:
+    if (home := cache_home()) is None:
         return None, "no home folder for a kernel cache"
     # where Warp's appdirs would put it; Warp adds its version
     return home.joinpath(*(("NVIDIA", "warp", "Cache") if sys.platform == "win32" else ("warp",))).resolve(), ""

@@ -122,8 +122,7 @@ class OldNames:
         def load_and_compare(module: Any) -> None:
             """Load a module; let it name the new places of what it lacks, and ask this finder for modules below it."""
             load(module)
-            lost = {n: new for n, new in own.items() if not hasattr(module, n)}
-            if lost:
+            if lost := {n: new for n, new in own.items() if not hasattr(module, n)}:
                 module.__getattr__ = lambda n: _raise_moved(name, n, lost)
             if below and not hasattr(module, "__path__"):
                 module.__path__ = []  # a folder that became a file

@@ -176,8 +176,7 @@ def is_below(path: Path) -> bool:
 def open_folder(path: Path, make: bool = False) -> Folder:
     """Open a folder, to use its entries; links on the way are followed, except below an open `output_folder`."""
     path = path.absolute()
-    roots = _roots(path)
-    if not roots:
+    if not (roots := _roots(path)):
         return Folder(path)
     try:
         found = Folder(roots[0].path)

@@ -275,8 +275,7 @@ def project_points(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.n
             seen = np.isfinite(plane).all(1) & on_lens(camera.model, camera.distortion, in_camera)
         plane = np.where(seen[:, None], plane, 0) * camera.K[[0, 1], [0, 1]] + camera.K[:2, 2]
         return plane, np.where(seen, depth_of(camera.model, in_camera), 0)
-    safe = np.where(z == 0, np.finfo(float).tiny, z)
-    return matmul(in_camera / safe[:, None], camera.K.T)[:, :2], z
+    return matmul(in_camera / np.where(z == 0, np.finfo(float).tiny, z)[:, None], camera.K.T)[:, :2], z
 
 
 def back_project(camera: Camera, pixels: np.ndarray, depths: np.ndarray) -> np.ndarray:
@@ -624,11 +623,10 @@ def rotate(gaussians: Gaussians, rotation: np.ndarray) -> Gaussians:
     turn = torch.tensor(np.asarray(rotation), dtype=torch.float64, device=means.device)
     coefficients = harmonics_rotation(rotation).to(means.device)[:k, :k]
     axes = torch.as_tensor(rotation_matrices(torch.nn.functional.normalize(quats.double(), dim=1)))
-    proper = turn if np.linalg.det(rotation) > 0 else -turn
     return replace(
         gaussians,
         means=torch.einsum("ij,nj->ni", turn, means.double()).to(means.dtype),
-        quats=quaternions(torch.einsum("ij,njk->nik", proper, axes)).to(quats.dtype),
+        quats=quaternions(torch.einsum("ij,njk->nik", turn if np.linalg.det(rotation) > 0 else -turn, axes)).to(quats.dtype),
         sh=torch.einsum("jk,nkc->njc", coefficients, gaussians.sh.double()).to(gaussians.sh.dtype),
     )
 

@@ -96,8 +96,7 @@ def hold_file(path: Path) -> contextlib.AbstractContextManager[list[str]]:
     # other processes may write other files of the folder; a lock of a killed process is swept as other leftovers are
     check_file_path(path)
     check_free(path.parent)
-    name = f".warpgs-{hashlib.sha256(os.fsencode(path.name)).hexdigest()[:16]}.tmp{LOCKED}"
-    return hold_folder(path.parent, name=name)
+    return hold_folder(path.parent, name=f".warpgs-{hashlib.sha256(os.fsencode(path.name)).hexdigest()[:16]}.tmp{LOCKED}")
 
 
 def check_file_path(path: Path) -> None:
@@ -190,8 +189,7 @@ def private_shared_folder(base: Path | None) -> Iterator[Path]:
         try:
             base.mkdir(mode=0o700, parents=True, exist_ok=True)
             base = base.resolve()
-            others = open_to_others(base)
-            if others is not None:
+            if (others := open_to_others(base)) is not None:
                 risk = f"other users can write to {others} and could run code as you"
                 fix = "name a private folder that all nodes see with --slurm-folder"
                 raise UsageError(f"{base}: not safe for Slurm's job files: {risk}; {fix}")

@@ -45,8 +45,7 @@ class Registry(Generic[T]):
         """Return a decorator that registers a class by a name and sets its ``name``."""
 
         def decorate(cls: type[T]) -> type[T]:
-            before = self._classes.get(name)
-            if before is not None and is_ours(before) and not is_ours(cls):
+            if (before := self._classes.get(name)) is not None and is_ours(before) and not is_ours(cls):
                 raise UsageError(f"{cls.__name__}: {name!r} is a {self.kind} of warpgs; register yours under another name")
             cls.name = name
             self._classes[name] = cls
@@ -233,8 +232,7 @@ def _line_about(cls: type) -> str:
 
 def flag_group(name: str) -> str:
     """Return the group name of the flags of a plug-in's settings: ``my_strategy`` for ``my.module:MyStrategy``."""
-    word = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", name.rpartition(":")[2])
-    return re.sub(r"\W", "_", word).lower()
+    return re.sub(r"\W", "_", re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", name.rpartition(":")[2])).lower()
 
 
 def own_frame(error: BaseException) -> str:

@@ -222,8 +222,7 @@ def counted(items: Sequence[T], tell: Say, what: str, unit: str) -> Iterator[T]:
 def accept_all_letters() -> None:
     """Print codes for letters that the terminal does not have, also in the output of other libraries to stdout and stderr."""
     for stream in (sys.stdout, sys.stderr):
-        reconfigure = getattr(stream, "reconfigure", None)
-        if reconfigure is not None:
+        if (reconfigure := getattr(stream, "reconfigure", None)) is not None:
             reconfigure(errors="backslashreplace")
 
 
@@ -424,8 +423,7 @@ class ProcessFailed(Exception):
 
 def _environment(more: dict[str, str] | None) -> dict[str, str]:
     """Return variables with which a process imports this package as this process does, and nothing from the current folder."""
-    home = str(Path(__file__).parents[1])
-    search = os.pathsep.join(p for p in (home, os.environ.get("PYTHONPATH", "")) if p)
+    search = os.pathsep.join(p for p in (str(Path(__file__).parents[1]), os.environ.get("PYTHONPATH", "")) if p)
     return {**os.environ, **SAFE, "PYTHONPATH": search, **(more or {})}
 
 

@@ -99,8 +99,7 @@ def listeners() -> list[tuple[str, str, int]]:
 
 def say_what_is_open(found: Sequence[tuple[str, str, int]]) -> None:
     """Print in one line which of the found sockets other machines can reach, if any."""
-    reached = [f"{who} at {ip}, port {port}" for who, ip, port in found if not is_loopback(ip)]
-    if reached:
+    if reached := [f"{who} at {ip}, port {port}" for who, ip, port in found if not is_loopback(ip)]:
         say(f"open to other machines, without encryption: {'; '.join(reached)}; use a network that you trust")
 
 
@@ -391,8 +390,7 @@ class Group(Ranks):
         except RuntimeError as e:
             time.sleep(LOST_SECONDS + 2 * BEAT_SECONDS)  # the thread ends this process once it knows the lost rank
             why = f"cannot exchange data with the others ({str(e).splitlines()[0][:200]})"
-            fix = "--resume continues from the last checkpoint"
-            raise ResourceError(f"rank {self.rank} of {self.count} {why}; {fix}") from e
+            raise ResourceError(f"rank {self.rank} of {self.count} {why}; --resume continues from the last checkpoint") from e
 
     def texts(self, own):
         """Return the text ``own`` of each process, in the order of ranks."""

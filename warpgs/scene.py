@@ -506,8 +506,7 @@ def checked_scene(scene: Scene, where: str = "") -> Scene:
     for i, note in enumerate(scene.notes):
         _check(f"{of}notes[{i}]", note, str, "give str(note)")
     views, points, background, n = checked_views(scene.views, where), scene.points, scene.background, scene.normalization
-    twice = [name for name, count in Counter(v.name for v in views).items() if count > 1]
-    if twice:
+    if twice := [name for name, count in Counter(v.name for v in views).items() if count > 1]:
         raise DataError(f"{where}view {twice[0]!r}: name must be unique; got two views of this name; rename or remove one")
     if points is not None:
         points = _checked_points(f"{of}points", points, {v.name for v in views})

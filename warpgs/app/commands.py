@@ -454,8 +454,7 @@ def compare(arguments: list[str]) -> Command:
             flags: Scenes and runs.
             presets: Presets as for `warpgs fit --preset`, separated by commas; the others are compared with the first.
         """
-        names = [n.strip() for n in presets.split(",") if n.strip()]
-        return run_study_of(flags, preset_variants(names, flags.steps), {})
+        return run_study_of(flags, preset_variants([n.strip() for n in presets.split(",") if n.strip()], flags.steps), {})
 
     return study, listed("presets", PRESETS.described())
 

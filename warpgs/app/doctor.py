@@ -116,8 +116,7 @@ def _extras() -> Iterable[Finding]:
 def _processor() -> Iterable[Finding]:
     yield Finding("CPU", OK, f"{processor_name()}, {usable_cores()} of {os.cpu_count()} cores usable")
     if (memory := machine_memory()) is None:
-        assumed = f"the system does not report its memory; {format_bytes(ASSUMED_BYTES)} are assumed"
-        yield Finding("Memory", NOTE, assumed)
+        yield Finding("Memory", NOTE, f"the system does not report its memory; {format_bytes(ASSUMED_BYTES)} are assumed")
         return
     detail = f"{format_bytes(memory[0])}, {format_bytes(memory[1])} available"
     yield _noted("Memory", memory[1] >= LOW_MEMORY, detail, "close other programs, or fit at a smaller image size")
@@ -286,8 +285,7 @@ def print_report(findings: list[Finding], console=None) -> int:
             remedies.add_row(f"[{styles[f.status]}]{escape(names.get(f.topic, f.topic))}[/]", escape(printable(f.remedy)))
     if remedies.row_count:
         console.print("[bold]What to do[/]", remedies, "", sep="\n")
-    stops = [names.get(f.topic, f.topic) for f in findings if f.status == MISSING and f.required]
-    if stops:
+    if stops := [names.get(f.topic, f.topic) for f in findings if f.status == MISSING and f.required]:
         console.print(f"[bold red]A fit cannot run yet[/]: {escape(', '.join(stops))}.")
         return ResourceError.exit_code
     console.print("[bold green]A fit can run here.[/]")

@@ -115,8 +115,7 @@ def arrays_to_write(
     for g in (gaussians, local):
         arrays = arrays_of(g)
         for name, array in arrays.items():
-            bad = array.size - int(np.isfinite(array).sum())
-            if bad:
+            if bad := array.size - int(np.isfinite(array).sum()):
                 fix = "export an earlier checkpoint, or fit again with a lower learning rate"
                 raise DataError(f"{path}: {bad} of {array.size} values of {name} are not finite; {fix}")
     logits = arrays["logit_opacities"]
@@ -347,8 +346,7 @@ class Format:
 
     def origin_in(self, path: Path) -> object:
         """Return the origin that a file states; None without one. By default it is in a side file."""
-        side = side_file(path)
-        if not side.is_file():
+        if not (side := side_file(path)).is_file():
             return None
         with reading(side, whole=True) as file:
             values = json.loads(file.read())
@@ -400,8 +398,7 @@ class Format:
             DataError: The file is missing or malformed.
         """
         normalization = checked_normalization(normalization, units, str(path))
-        gaussians = self.read_stored(path)
-        return from_origin(gaussians, np.zeros(3) if self.origin is None else self.origin, normalization, units)
+        return from_origin(self.read_stored(path), np.zeros(3) if self.origin is None else self.origin, normalization, units)
 
     def read_stored(self, path: Path) -> Gaussians:
         """Read Gaussians in file units about `origin`, which this sets, as float32."""

@@ -54,11 +54,10 @@ def glb(document: dict[str, Any], *body: bytes) -> list[bytes]:
 def _document(arrays: base.Arrays, origin: np.ndarray | None) -> tuple[dict[str, Any], bytes]:
     """Return the glTF document and its binary buffer."""
     a = base.half_turn({k: np.asarray(v) for k, v in arrays.items()}, "z")
-    scales = np.clip(np.exp(a["log_scales"].astype(np.float64)), _TINY, 3e38)
     attributes = {
         "POSITION": ("VEC3", a["means"]),
         f"{EXTENSION}:ROTATION": ("VEC4", base.unit_quats(a["quats"])[:, [1, 2, 3, 0]]),
-        f"{EXTENSION}:SCALE": ("VEC3", scales),
+        f"{EXTENSION}:SCALE": ("VEC3", np.clip(np.exp(a["log_scales"].astype(np.float64)), _TINY, 3e38)),
         f"{EXTENSION}:OPACITY": ("SCALAR", base.sigmoid(a["logit_opacities"])),
     }
     for k in range(a["sh"].shape[1]):
@@ -261,8 +260,7 @@ def _accessor(document: dict[str, Any], body: bytes | memoryview, index: object,
     accessor = _item(document, "accessors", index)
     view = _item(document, "bufferViews", accessor.get("bufferView"))
     kind, width = _KINDS.get(accessor.get("componentType")), _WIDTHS.get(accessor.get("type"))
-    plain = kind and width and "sparse" not in accessor and view.get("buffer") == 0
-    expect(plain, f"accessor {index} has an unsupported type")
+    expect(kind and width and "sparse" not in accessor and view.get("buffer") == 0, f"accessor {index} has an unsupported type")
     normalized = accessor.get("normalized") is True
     expect(kind == "<f4" or normalized or whole, f"accessor {index} contains integers that are not normalised")
     dtype = np.dtype(kind)

@@ -24,8 +24,7 @@ MAX_BYTES = 2**32 - 2**16
 
 def check_suffix(path: str | os.PathLike[str]) -> None:
     """Check that a mesh can be written to such a file."""
-    suffix = Path(path).suffix
-    if suffix.lower() not in SUFFIXES:
+    if (suffix := Path(path).suffix).lower() not in SUFFIXES:
         raise UsageError(f"{path}: format {suffix or '(none)'} is not supported; use {' or '.join(SUFFIXES)}")
 
 

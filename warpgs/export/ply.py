@@ -62,14 +62,12 @@ def parse_header(path: Path, head: bytes) -> tuple[list[Element], int, bool]:
     """
     if not re.match(rb"ply[ \t]*\r?\n", head):
         raise ply_error(path, "it does not start with 'ply'")
-    end = re.search(rb"^end_header[ \t]*\r?\n", head, re.MULTILINE)
-    if end is None:
+    if (end := re.search(rb"^end_header[ \t]*\r?\n", head, re.MULTILINE)) is None:
         raise ply_error(path, f"no 'end_header' line within the first {MAX_HEADER_BYTES} bytes")
-    lines = head[: end.start()].decode("utf-8", "replace").split("\n")[1:]  # comments may have any encoding
-
     elements: list[Element] = []
     formats, antialiased = [], False
-    for line in lines:
+    # comments may have any encoding
+    for line in head[: end.start()].decode("utf-8", "replace").split("\n")[1:]:
         match line.split():
             case ["comment", *words]:
                 match " ".join(words).lower().replace(":", " ").split():
@@ -415,8 +413,7 @@ def _read(path: Path, strict: bool, notes: list[str]) -> tuple[Gaussians, np.nda
         width = 2 * len(properties) if text else dtype.itemsize  # a number of one digit and a space
         end = file.tell() + n * width - 1 if text else start + n * width
         if end > size:
-            needed = f"{n} Gaussians of {width} bytes end at byte {end}"
-            raise ply_error(path, f"truncated: {needed}, but the file has {size} bytes")
+            raise ply_error(path, f"truncated: {n} Gaussians of {width} bytes end at byte {end}, but the file has {size} bytes")
         lines = (line.decode("ascii", "replace") for line in file if line.strip())
         if text:
             before = sum(count for _, count, _ in elements[: elements.index(vertex)])
@@ -517,8 +514,7 @@ def _assemble(
         if part.start == 0 and all(rows.dtype[name].itemsize == 8 for name in _POSITION):
             middle = base.origin_of(np.stack([rows[name] for name in _POSITION], 1).astype(np.float64))
         columns = functools.partial(_columns, rows, part.start, bad[part], reasons)
-        coefficients = _DC[0] in (rows.dtype.names or ())
-        arrays["sh"][part, 0] = columns(_DC) if coefficients else base_coefficients(columns(_RGB) / 255)
+        arrays["sh"][part, 0] = columns(_DC) if _DC[0] in (rows.dtype.names or ()) else base_coefficients(columns(_RGB) / 255)
         if rest:
             arrays["sh"][part, 1:] = columns([f"f_rest_{i}" for i in range(rest)]).reshape(len(rows), 3, k).transpose(0, 2, 1)
         quats = arrays["quats"][part] = columns(_ROTATION)

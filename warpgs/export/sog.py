@@ -152,8 +152,7 @@ def _means_of(rows: np.ndarray, weights: np.ndarray, count: int) -> tuple[np.nda
         if last:
             order = np.argsort(near, kind="stable")
             starts = np.unique(near[order], return_index=True)[1]
-            sums = np.add.reduceat((weights[:, None] * rows)[order], starts)
-            means = sums / np.add.reduceat(weights[order], starts)[:, None]
+            means = np.add.reduceat((weights[:, None] * rows)[order], starts) / np.add.reduceat(weights[order], starts)[:, None]
     return means, near
 
 
@@ -174,11 +173,10 @@ def decode(path: Path, file: BinaryIO) -> base.Arrays:
         expect(model in ("default", "antialiased"), f"its model {str(model)[:40]!r} is not supported")
         few = type(n) is int and 0 < n <= MAX_PER_BYTE * size + SMALL
         expect(few, f"it announces {str(n)[:20]} Gaussians in only {size} bytes")
-        most = MAX_PIXEL_BYTES * (MAX_PIXELS * n + SMALL)
 
         def pixels(part: str, i: int) -> np.ndarray:
             name = meta[part]["files"][i]
-            return _pixels(str(name), member(name, most), n)
+            return _pixels(str(name), member(name, MAX_PIXEL_BYTES * (MAX_PIXELS * n + SMALL)), n)
 
         # one attribute after another, the largest first, to limit the peak memory
         sh = _harmonics(meta, n, pixels, lambda name: member(name, MAX_PIXEL_BYTES * MAX_PALETTE_PIXELS))
@@ -305,8 +303,7 @@ def _pixels(name: str, content: bytes, n: int) -> np.ndarray:
 
     width, height = _webp_size(content)
     expect(width * height, f"{name[:40]!r} is not a lossless WebP image")
-    fits = n <= width * height <= MAX_PIXELS * n + SMALL
-    expect(fits, f"{name[:40]!r} has {width} x {height} pixels for {n} values")
+    expect(n <= width * height <= MAX_PIXELS * n + SMALL, f"{name[:40]!r} has {width} x {height} pixels for {n} values")
     image = None
     with contextlib.suppress(cv2.error):
         image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)

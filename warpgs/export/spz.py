@@ -57,7 +57,6 @@ def _sections(a: base.Arrays, bits: int, version: int) -> list[bytes]:
     """Return the attributes of RUB Gaussians in file order."""
     fixed = np.floor(a["means"].astype(np.float64) * 2.0**bits + 0.5).astype("<i4")
     colors = base.rounded(COLOR * a["sh"][:, 0].astype(np.float64) + 127.5, 255)
-    scales = base.rounded(16 * (a["log_scales"].astype(np.float64) + 10), 255)
     xyzw = base.unit_quats(a["quats"])[:, [1, 2, 3, 0]]
     if version == 2:
         rotations = base.rounded(127.5 * (xyzw * np.where(xyzw[:, 3:] < 0, -1, 1))[:, :3] + 127.5, 255).astype("u1").tobytes()
@@ -72,7 +71,7 @@ def _sections(a: base.Arrays, bits: int, version: int) -> list[bytes]:
         fixed.view("u1").reshape(-1, 4)[:, :3].tobytes(),
         base.rounded(255 * base.sigmoid(a["logit_opacities"]), 255).astype("u1").tobytes(),
         colors.astype("u1").tobytes(),
-        scales.astype("u1").tobytes(),
+        base.rounded(16 * (a["log_scales"].astype(np.float64) + 10), 255).astype("u1").tobytes(),
         rotations,
         base.rounded(128 * a["sh"][:, 1:].astype(np.float64) + 128, 255).astype("u1").tobytes(),
     ]
@@ -152,8 +151,8 @@ def _parts_of_gzip(stream: BinaryIO, n: int, sizes: list[int], extensions: bytea
         yield read
     if extensions is not None:
         extensions += stream.read(MAX_EXTENSIONS)
-    more = stream.read(1)  # at its end the checksum has been compared
-    expect(not more, f"{n} Gaussians need {sum(sizes)} bytes, but the file has more")
+    # at its end the checksum has been compared
+    expect(not stream.read(1), f"{n} Gaussians need {sum(sizes)} bytes, but the file has more")
 
 
 def _checked(size: int, header: tuple[int, ...], versions: tuple[int, ...]) -> list[int]:
@@ -170,8 +169,7 @@ def _checked(size: int, header: tuple[int, ...], versions: tuple[int, ...]) -> l
 
 def _streams(data: bytes, sizes: list[int], count: int, place: int) -> Iterator[Section]:
     """Yield the sections of a version-4 file, each to be read to its end before the next; an empty section has no stream."""
-    wanted = [s for s in sizes if s]
-    sound = count == len(wanted) and place >= HEADER_4.size and place + 16 * count <= len(data)
+    sound = count == len([s for s in sizes if s]) and place >= HEADER_4.size and place + 16 * count <= len(data)
     expect(sound, f"its table of {count} streams at byte {place} is invalid")
     decompressor = _zstandard().ZstdDecompressor(max_window_size=MAX_WINDOW)
     view, i, start = memoryview(data), 0, place + 16 * count
@@ -193,8 +191,7 @@ def _decompressed(reader: BinaryIO, i: int, whole: int, size: int, *, end: bool 
     try:
         data = reader.read(size)
     except _zstandard().ZstdError as e:
-        what = f"stream {i} is not a zstd stream, or asks for more than {MAX_WINDOW >> 20} MiB"
-        raise MalformedError(what) from e
+        raise MalformedError(f"stream {i} is not a zstd stream, or asks for more than {MAX_WINDOW >> 20} MiB") from e
     expect(len(data) == size or end, f"stream {i} does not hold its {whole} bytes")
     return data
 

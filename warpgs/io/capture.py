@@ -56,8 +56,7 @@ class CaptureReader(Reader):
 
     def probe(self, folder: Path) -> Probe | None:
         """See `Reader.probe`."""
-        files = self.files(folder)
-        if not files:
+        if not (files := self.files(folder)):
             return None
         return Probe(files[0].name, "" if colmap.image_base(folder, folder) else "its photographs, beside it or in images")
 
@@ -137,8 +136,7 @@ def _sensor_lens(sensor: ElementTree.Element | None, where: str) -> Lens:
     others = {"frame": ("k4", "p3", "p4"), "fisheye": ("p1", "p2", "p3", "p4")}.get(kind)
     if others is None:
         raise DataError(f"{where}: {kind[:40]} cameras are not supported; export frame cameras")
-    lacking = [t for t in others if terms[t]] + ["b2"] * (not abs(terms["b2"]) <= MAX_SKEW * abs(terms["f"]))
-    if lacking:
+    if lacking := [t for t in others if terms[t]] + ["b2"] * (not abs(terms["b2"]) <= MAX_SKEW * abs(terms["f"])):
         fix = "fix it to 0 in Tools > Camera Calibration and optimize the cameras, or export undistorted photographs"
         raise DataError(f"{where}: {lacking[0]} of a {kind} camera is not supported; {fix}")
     # Metashape's p1 is OpenCV's p2
@@ -228,8 +226,7 @@ class RealityScanReader(CaptureReader):
         while True:
             where = f"{path}, line {reader.line_num + 1}"
             with understood(where, csv.Error):
-                cells = next(reader, None)
-                if cells is None:
+                if (cells := next(reader, None)) is None:
                     return rows
                 if not (header and any(cells)) or cells[0].startswith("#"):  # "#cameras 5", then the names of the columns
                     header = [cell.strip().lstrip("#") for cell in cells]

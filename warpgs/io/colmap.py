@@ -80,8 +80,7 @@ class _BinaryFile:
 
     def text(self) -> str:
         """Return the next name, which ends in a zero byte."""
-        end = self.data.find(b"\0", self.at)
-        if end < 0:
+        if (end := self.data.find(b"\0", self.at)) < 0:
             raise DataError(f"{self.path}: a name has no end, so the file is truncated; copy it again")
         raw, self.at = self.data[self.at : end], end + 1
         return raw.decode("utf-8", "surrogateescape")
@@ -371,8 +370,7 @@ def reconstruction(root: Path, named: str | None = None) -> tuple[Model | None, 
     """Return the reconstruction ``named``, else the largest of `reconstructions` (None without any), and a note on it."""
     if named is not None:
         return _found(root / named), f"cameras taken from {named} (--reconstruction)"
-    models = reconstructions(root)
-    if len(models) < 2:
+    if len(models := reconstructions(root)) < 2:
         return (models[0] if models else None), ""
     sizes = [_size(m) for m in models]
     best = models[sizes.index(max(sizes))]
@@ -494,8 +492,7 @@ class ColmapReader(Reader):
 
     def probe(self, folder: Path) -> Probe | None:
         """See `Reader.probe`."""
-        models = reconstructions(folder)
-        if not models:
+        if not (models := reconstructions(folder)):
             return None
         base, usual = image_base(folder, models[0][0]), (folder / "sparse" / "0", folder / "sparse", folder)
         lacks = models[0][2] or ([] if base else ["its image folder, images"])

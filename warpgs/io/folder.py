@@ -137,13 +137,11 @@ def protocol_ids(names: list[str], wanted: tuple[int, ...], least: int, where: s
     """Return the names of the images with the wanted ids."""
     if len(names) < least:
         raise DataError(f"{where}: the protocol needs {least} views, not {len(names)}; restore them, or use llff:K, every:N")
-    ids = image_ids(names)
-    if ids is None:
+    if (ids := image_ids(names)) is None:
         return {i: names[i] for i in wanted}
     first = 1 if min(ids) == 1 and not named_by_dtu(names) else 0  # files renamed 001, 002, ... count from one
     by_id = {i - first: name for i, name in zip(ids, names)}
-    missing = [i for i in range(max(least, len(names))) if i not in by_id]
-    if missing:
+    if missing := [i for i in range(max(least, len(names))) if i not in by_id]:
         shown = ", ".join(map(str, missing[:8])) + (", ..." if len(missing) > 8 else "")
         counted = f"(ids are counted from 0, names run from {names[0]} to {names[-1]})"
         fix = "restore them, because the protocol's ids would otherwise select other views"
@@ -429,8 +427,7 @@ def resampling_note(downscale: int) -> list[str]:
 
 def name_key(name: str) -> str:
     """Return a name without suffix, with / between folders, in one spelling of its letters."""
-    plain = re.sub(r"(?<=[^/])\.[^./]*$", "", name.replace("\\", "/"))
-    return unicodedata.normalize("NFC", plain).casefold()
+    return unicodedata.normalize("NFC", re.sub(r"(?<=[^/])\.[^./]*$", "", name.replace("\\", "/"))).casefold()
 
 
 def by_key(files: dict[Path, str]) -> dict[str, Path]:
@@ -571,13 +568,11 @@ class ViewList:
         cutout = options is not None and options.masks == "cutout"
         if options is None or not self._kept:
             return [*notes, "--masks cutout changes nothing: no image has a mask file"] if cutout else notes
-        mean = math.fsum(self._kept.values()) / len(self._kept)
         others = f"the others {'are transparent' if cutout else 'are ignored'} (--masks {options.masks})"
         kept = f"the {options.mask_keeps} ones (--mask-keeps {options.mask_keeps})"
-        notes.append(f"masks keep {mean:.1%} of the pixels, {kept}; {others}")
+        notes.append(f"masks keep {math.fsum(self._kept.values()) / len(self._kept):.1%} of the pixels, {kept}; {others}")
         out = "" if cutout else ", so that their views are left out (see --mask-keeps)"
         for fraction, what in ((0.0, f"keep no pixel{out}"), (1.0, "keep every pixel")):
-            names = [n for n, kept in self._kept.items() if kept == fraction]
-            if names:
+            if names := [n for n, kept in self._kept.items() if kept == fraction]:
                 notes.append(f"masks that {what}: {', '.join(names[:5])}{' ...' if len(names) > 5 else ''} ({len(names)})")
         return notes

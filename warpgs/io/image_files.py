@@ -207,8 +207,7 @@ def jpeg_segments(data: bytes) -> Iterator[tuple[int, bytes, bytes]]:
     """Yield marker, contents and all bytes, with any coded data behind it, of each segment of a JPEG before the image's end."""
     at = 2
     while True:
-        found = MARKER.match(data, at)
-        if found is None:
+        if (found := MARKER.match(data, at)) is None:
             raise ValueError("it ends early" if at >= len(data) - 1 else f"no marker at byte {at}")
         begin, marker, at = at, found[1][0], found.end()
         if marker == EOI:
@@ -427,14 +426,12 @@ def _raster(path: Path, data: bytes, max_pixels: int) -> np.ndarray:
     try:
         name = format_of(data)
         width, height = header_size(name, data)
-        pixels = width * height
-        if pixels > max_pixels:
+        if (pixels := width * height) > max_pixels:
             size = f"the image is {width} x {height} px, more than the limit of {max_pixels:,} pixels"
             needs = f"--max-pixels {pixels} (decoding then needs {BYTES_PER_PIXEL * pixels / 2**30:.1f} GiB)"
             raise DataError(f"{path}: {size}; shrink it, or raise the limit with {needs}")
         expect(pixels, f"it has {width} x {height} px")
-        raster = _decoded(name, data)
-        if raster is None:
+        if (raster := _decoded(name, data)) is None:
             # IMREAD_UNCHANGED also ignores the EXIF orientation: the camera, not the tag, determines how the raster lies
             raster = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
         expect(raster is not None and raster.shape[:2] == (height, width), "its pixels cannot be read")

@@ -258,9 +258,9 @@ def nearest_unmasked(raster: np.ndarray, mask: np.ndarray | None) -> np.ndarray:
     if not mask.any():
         return np.zeros_like(raster)
     labels = cv2.distanceTransformWithLabels((~mask).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)[1]
-    places = np.flatnonzero(mask)[labels[~mask] - 1]  # labels count the unmasked pixels row by row, from 1
     filled = raster.copy()
-    filled[~mask] = raster.reshape(-1, *raster.shape[2:])[places]
+    # labels count the unmasked pixels row by row, from 1
+    filled[~mask] = raster.reshape(-1, *raster.shape[2:])[np.flatnonzero(mask)[labels[~mask] - 1]]
     return filled
 
 
@@ -336,9 +336,8 @@ def _shrink(path: Path, loaded: LoadedImage, downscale: int, max_side: int) -> L
     K = np.diag([small_w / width, small_h / height, 1.0]) @ loaded.K
     mask = None if loaded.mask is None else _resize(loaded.mask.astype(np.float32), small_w, small_h) > 0.5
     hides = loaded.mask if loaded.undone is None else None  # what the mask of an undistorted image hides is filled already
-    image = _resize(nearest_unmasked(loaded.image, hides), small_w, small_h)
     alpha = None if loaded.alpha is None else _resize(nearest_unmasked(loaded.alpha, hides), small_w, small_h)
-    return LoadedImage(image, mask, K, done, alpha, loaded.kept)
+    return LoadedImage(_resize(nearest_unmasked(loaded.image, hides), small_w, small_h), mask, K, done, alpha, loaded.kept)
 
 
 def _fit_mask(path: Path, mask: np.ndarray, stored: tuple[int, int], upright: tuple[int, int], orientation: int) -> np.ndarray:

@@ -125,8 +125,7 @@ class Split:
     test: tuple[str, ...]
 
     def __post_init__(self):
-        both = set(self.train) & set(self.test)
-        if both:
+        if both := set(self.train) & set(self.test):
             some = ", ".join(sorted(both)[:5])
             raise DataError(f"views {some} are in training and in test, so their scores would be meaningless; name each once")
         if not self.train:
@@ -138,8 +137,7 @@ def _every_8th(names: list[str], count: int, spec: str) -> Split:
     if not 1 <= count <= len(pool):
         raise DataError(f"split {spec}: needs {count} views, {len(pool)} of {len(names)} remain without every 8th; take fewer")
     # np.round goes half to even, as the published id tables do
-    ids = np.round(np.linspace(0, len(pool) - 1, count)).astype(int)
-    return Split(tuple(pool[i] for i in ids), tuple(names[::8]))
+    return Split(tuple(pool[i] for i in np.round(np.linspace(0, len(pool) - 1, count)).astype(int)), tuple(names[::8]))
 
 
 def _dtu(names: list[str], count: int, spec: str) -> Split:
@@ -228,8 +226,7 @@ def _explicit(names: list[str], spec: str) -> Split:
     find = _finder(names, spec)
     for key, values in _named(spec).items():
         found = [find(v.strip()) for v in values.split(",") if v.strip()]
-        twice = sorted(n for n, count in Counter(found).items() if count > 1)
-        if twice:
+        if twice := sorted(n for n, count in Counter(found).items() if count > 1):
             raise DataError(f"split {spec}: {key} names {twice[0]} twice; name every view once")
         parts[key] = tuple(found)
     named = {name for part in parts.values() for name in part}
@@ -300,8 +297,7 @@ def _fit(path: Path, mask: np.ndarray, view: View) -> np.ndarray:
     height, width = view.image.shape[:2]
     if not abs((mask.shape[1] / mask.shape[0]) / (width / height) - 1) <= ASPECT_TOLERANCE:
         sizes = f"the mask is {mask.shape[1]} x {mask.shape[0]} px, its image {view.name} {width} x {height}"
-        fix = "the aspects differ by more than two percent. Give the masks of these images"
-        raise DataError(f"{path}: {sizes}: {fix}")
+        raise DataError(f"{path}: {sizes}: the aspects differ by more than two percent. Give the masks of these images")
     if mask.shape != (height, width):
         mask = cv2.resize(mask.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA) > 0.5
     if view.mask is not None:  # pixels outside the lens or under a mask file have no reference
@@ -328,8 +324,7 @@ def add_score_masks(views: list[View], folder: Path, scene: SceneFolder) -> tupl
     masks = dict(zip(numbers, files))
     if ids is None:
         raise DataError(f"{folder}: masks have image ids, the images ({views[0].name}, ...) no distinct ones; name them by id")
-    missing = sorted(set(ids) - set(masks))
-    if missing:
+    if missing := sorted(set(ids) - set(masks)):
         shown = ", ".join(map(str, missing[:8])) + (", ..." if len(missing) > 8 else "")
         counted = "(ids are counted from 0; an image rect_001_... is id 0)"
         fix = f"the masks run from {files[0].name} to {files[-1].name}. Restore the missing ones"
@@ -483,8 +478,7 @@ def _probe(reader: Reader, root: Path) -> Probe | None:
 
 def _accepted(root: Path, reader: Reader) -> Reader:
     """Return a reader that the user chose; DataError where its format is not in the folder or not complete."""
-    probe = _probe(reader, root)
-    if probe is None:
+    if (probe := _probe(reader, root)) is None:
         others = [p.found for r in scenes.all_readers() if (p := _probe(r, root)) is not None]
         there = f"; the folder holds {' and '.join(others)}" if others else ""
         wanted = f" ({reader.description})" if reader.description else ""
@@ -550,11 +544,9 @@ def doubtful_notes(views: list[View], points: PointCloud | None) -> list[str]:
     for v in (v for v, pixels in zip(views, few) if often[pixels.tobytes()] > 1 and v.image.min() < v.image.max()):
         # views that show nothing are alike
         equal.setdefault(hashlib.sha256(np.ascontiguousarray(v.image).data).digest(), []).append(v.name)
-    blank = [v.name for v, pixels in zip(views, few) if not (_varies(pixels) or _varies(v.image))]
-    if blank:
+    if blank := [v.name for v, pixels in zip(views, few) if not (_varies(pixels) or _varies(v.image))]:
         notes.append(f"{len(blank)} of {len(views)} photographs have a single colour, such as {blank[0]}; --exclude them")
-    same = [names for names in equal.values() if len(names) > 1]
-    if same:
+    if same := [names for names in equal.values() if len(names) > 1]:
         count = sum(map(len, same))
         notes.append(f"{count} of {len(views)} photographs have equal pixels, as {same[0][0]} and {same[0][1]}; remove copies")
     return notes

@@ -137,9 +137,8 @@ def read_depth(path: Path, options: ReadOptions) -> np.ndarray:
     if (values < 0).any():
         raise DataError(f"{path}: {int((values < 0).sum()):,} depths are negative, down to {values.min():.4g}; mark gaps by 0")
     if metric:
-        unit = options.depth_unit or (MILLIMETRES if raw.dtype.kind == "u" else 1.0)
         with np.errstate(over="ignore"):
-            values = values * np.float32(unit)
+            values = values * np.float32(options.depth_unit or (MILLIMETRES if raw.dtype.kind == "u" else 1.0))
     if not values.any():
         raise DataError(f"{path}: contains no depth, all values are 0 or not finite; remove the file: maps are optional")
     if not values.max() < MAX_DEPTH:
@@ -339,8 +338,7 @@ def check_found(views: Sequence[View], options: ReadOptions) -> list[str]:
         if path not in (None, NONE) and not having:
             names = [key for key in map_files(Path(path), flag, True) if not key.endswith(CONFIDENCE)]
             count = f"none of its {len(names)} maps has the name of an image (the first is {names[0]!r})"
-            fix = f"name each map like its image, with .png or .npy, or give another {flag}"
-            raise DataError(f"{path}: {count}; {fix}")
+            raise DataError(f"{path}: {count}; name each map like its image, with .png or .npy, or give another {flag}")
         if not having:
             continue
         where = f"from {Path(path)}" if path is not None else f"listed in the scene's file; to ignore them, use {flag} none"

@@ -56,8 +56,7 @@ class LLFFReader(Reader):
         scene = SceneFolder(folder, options)
         rows = read_poses_bounds(scene.inside(path))
         images, factor, note = scene.images()
-        files = list_images(images)
-        if len(files) != len(rows):
+        if len(files := list_images(images)) != len(rows):
             raise DataError(f"{path}: has {len(rows)} poses, but {images} holds {len(files)} images. {IN_ORDER}")
         views = ViewList(options)
         for file, row in zip(files, rows):
@@ -214,8 +213,7 @@ def read_camera_rows(path: Path) -> list[tuple[int, str, np.ndarray]]:
     rows, count = [], None
     try:
         for number, line in enumerate(io.StringIO(read_input(path, MAX_BYTES).decode("utf-8-sig")), 1):
-            words = line.split()
-            if not words:
+            if not (words := line.split()):
                 continue
             if count is None:
                 count = int(words[0])

@@ -66,8 +66,7 @@ def read_json(path: Path) -> dict:
 
 def _number(frame: dict, shared: dict, key: str, where: str) -> float | None:
     """Return a number of the frame, else of the file; None if both lack it, DataError if it is not finite."""
-    value = frame.get(key, shared.get(key))
-    if value is None:
+    if (value := frame.get(key, shared.get(key))) is None:
         return None
     try:
         if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
@@ -293,16 +292,14 @@ class TransformsReader(Reader):
                 where = f"{where} ({name})"
                 viewmat = scenes.about(scenes.from_camera_to_world(matrix_of(frame, where), where, opengl=True), origin)
                 if frame.get("mask_path"):
-                    mask_file = named(frame["mask_path"], f"{where}, mask")
-                    if not mask_file.is_file():
+                    if not (mask_file := named(frame["mask_path"], f"{where}, mask")).is_file():
                         raise DataError(f"{where}: its mask {mask_file} is missing; restore it, or remove mask_path")
                     mask = partial(scene.mask, mask_file)
                 else:
                     mask = scene.mask_of(path, folder / "images")
                 lens = partial(lens_of, frame, shared, where=where, native=options.lenses == "native")
                 maps = _named_maps(scene, named, shared, frame, where)
-                load = partial(scene.image, path, lens, mask=mask, background=background, named=maps)
-                views.add(name, viewmat, load)
+                views.add(name, viewmat, partial(scene.image, path, lens, mask=mask, background=background, named=maps))
             if shared.get("ply_file_path"):
                 points, note = _points(scene, file, named, shared, views.views)
                 notes.append(note)

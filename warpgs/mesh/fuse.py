@@ -104,8 +104,7 @@ def plan_grid(
     margin = 2 * TRUNCATION * voxel
     shape: Any = tuple(int(n) for n in np.ceil((high - low + 2 * margin) / voxel) + 1)
     origin: Any = tuple((low - margin).tolist())
-    inside = ((points >= low - margin) & (points <= high + margin)).all(1).mean()
-    return GridPlan(origin, voxel, shape, float(inside))
+    return GridPlan(origin, voxel, shape, float(((points >= low - margin) & (points <= high + margin)).all(1).mean()))
 
 
 def check_memory(plan: GridPlan, device: torch.device) -> str:

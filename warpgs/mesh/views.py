@@ -47,9 +47,8 @@ def densest_depths(matrices: torch.Tensor, means: torch.Tensor, rays: torch.Tens
     """Return the z-depths [P, k] [u] at which Gaussians ``ids`` [P, k] are densest along rays [P, 3] with z = 1."""
     own, mean = matrices[ids], means[ids]
     along = (own * rays[:, None, None]).sum(-1)
-    center = (own * mean[:, :, None]).sum(-1)
     squared = (along * along).sum(-1)
-    depth = (along * center).sum(-1) / squared
+    depth = (along * (own * mean[:, :, None]).sum(-1)).sum(-1) / squared
     return torch.where((squared > 0) & torch.isfinite(depth) & (depth > 0), depth, mean[..., 2])
 
 
@@ -57,8 +56,7 @@ def weighted_median(depths: torch.Tensor, weights: torch.Tensor) -> torch.Tensor
     """Return the weighted median [P] of depths [P, k] with weights [P, k]; depths of weight 0 are ignored."""
     order = torch.where(weights > 0, depths, torch.inf).argsort(dim=1, stable=True)
     sums = weights.gather(1, order).cumsum(1)
-    half = (2 * sums >= sums[:, -1:]).int().argmax(1, keepdim=True)
-    return depths.gather(1, order.gather(1, half))[:, 0]
+    return depths.gather(1, order.gather(1, (2 * sums >= sums[:, -1:]).int().argmax(1, keepdim=True)))[:, 0]
 
 
 def _pixel_axes(camera: Camera, like: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

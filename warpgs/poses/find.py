@@ -32,11 +32,9 @@ MAX_ADVICE = 8
 
 def reason(found: Mapping, i: int, names: Sequence[str]) -> str:
     """Return why a photograph has no pose, in words that follow its name."""
-    keypoints = found.keypoints[i]
-    if keypoints < MIN_KEYPOINTS:
+    if (keypoints := found.keypoints[i]) < MIN_KEYPOINTS:
         return f"has {keypoints} keypoints, too few to match: a blank wall, darkness or blur"
-    best = found.links[i]
-    if not best:
+    if not (best := found.links[i]):
         return f"has {keypoints:,} keypoints and matches no other photograph"
     j, n = best[0]
     matched = f"has {keypoints:,} keypoints and {n} matches with {names[j]}"
@@ -217,8 +215,7 @@ def source_digest(source: Path, allow_outside: bool = False) -> str:
         return digest(source)
     root, total = photos.image_root(source), hashlib.sha256()
     for path in photos.photographs_inside(source, allow_outside):
-        name = path.relative_to(root).as_posix().encode("utf-8", "surrogateescape")
-        total.update(name + b"\0" + bytes.fromhex(digest(path)))
+        total.update(path.relative_to(root).as_posix().encode("utf-8", "surrogateescape") + b"\0" + bytes.fromhex(digest(path)))
     return total.hexdigest()
 
 
@@ -268,8 +265,7 @@ def _with_network(
 ) -> tuple[Mapping, list[str]]:  # fmt: skip
     """Return the model from the network's matches if it has more photographs than SIFT's, and notes."""
     # the network, which is less accurate, runs only if SIFT leaves photographs without a pose
-    count = len(found.views)
-    if count == len(photographs):
+    if (count := len(found.views)) == len(photographs):
         return found, [f"{network.title} is not used: SIFT finds the poses of all photographs, and is more accurate"]
     small, second = [work / "small" / n for n in names], work / "network"
     files.make_folder(second)
@@ -342,8 +338,7 @@ def _prepared(
             f"better 8 to 20 that overlap by two thirds{'; left out: ' + unread if unread else ''}"
         )
     photographs, names = [], []
-    copies = photos.to_jpeg([p for p in paths if photos.is_heic(p)], root, work / "heic", max_pixels, progress)
-    if copies:
+    if copies := photos.to_jpeg([p for p in paths if photos.is_heic(p)], root, work / "heic", max_pixels, progress):
         notes.append(f"{len(copies)} HEIC photograph{'s' if len(copies) != 1 else ''} converted to JPEG")
     for i, path in enumerate(paths):
         progress(f"reading photographs: {i + 1} of {len(paths)}")
@@ -364,8 +359,7 @@ def _notes(photographs: list[photos.Photograph]) -> list[str]:
     source = "from EXIF" if known == len(cameras) else "not in EXIF" if not known else f"from EXIF for {known} of them"
     many = "one camera is" if len(cameras) == 1 else f"{len(cameras)} cameras, one for each device, lens and image size, are"
     notes = [f"{many} assumed, focal length {source}"]
-    turned = sum(p.orientation != 1 for p in photographs)
-    if turned:
+    if turned := sum(p.orientation != 1 for p in photographs):
         notes.append(f"{turned} photograph{'s' if turned != 1 else ''} turned upright by EXIF")
     return notes
 
@@ -390,14 +384,13 @@ def _check_found(source: Path, found: Mapping, photographs: list[photos.Photogra
     if len(found.views) >= MIN_PHOTOGRAPHS:
         return
     count, blank = len(photographs), sum(k < MIN_KEYPOINTS for k in found.keypoints)
-    largest = max(found.matches.values(), default=0)
     if 2 * blank >= count:
         why = (
             f"{blank} of {count} photographs show almost nothing that can be matched (fewer than {MIN_KEYPOINTS} keypoints; "
             f"the best one has {max(found.keypoints):,}): a blank wall, darkness or blur. Take sharp photographs of textured "
             "things, in good light"
         )
-    elif not largest:
+    elif not max(found.matches.values(), default=0):
         why = f"no two of {count} photographs could be matched. Take photographs that overlap by two thirds, in small steps"
     else:
         why = (

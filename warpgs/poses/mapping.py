@@ -98,8 +98,7 @@ def _job(photographs: list[Photograph], names: list[str], kind: str, folder: Pat
     for p in cameras_of(photographs, of):
         scale = min(1.0, MATCHING_SIDE / max(p.width, p.height))
         width, height = round(scale * p.width), round(scale * p.height)
-        focal = None if p.focal is None else p.focal * max(width, height)
-        cameras.append({"focal": focal, "width": width, "height": height})
+        cameras.append({"focal": None if p.focal is None else p.focal * max(width, height), "width": width, "height": height})
     (folder / MODELS).mkdir()
     return {
         "names": names, "camera_of": of, "cameras": cameras, "kind": kind, "threads": threads, "exhaustive": EXHAUSTIVE,
@@ -252,8 +251,7 @@ def verify_learned(pycolmap: Any, job: Json) -> Json:
         for (i, j), rows in zip(pairs, matches, strict=True):
             numbers = order[i], order[j]
             if database.exists_two_view_geometry(*numbers):
-                agreed = database.read_two_view_geometry(*numbers).inlier_matches
-                if not len(agreed) >= MIN_RATIO * len(rows):
+                if not len(database.read_two_view_geometry(*numbers).inlier_matches) >= MIN_RATIO * len(rows):
                     database.delete_two_view_geometry(*numbers)
     return matched(pycolmap, job, len(pairs))
 
@@ -262,8 +260,7 @@ def match(pycolmap: Any, job: Json) -> Json:
     """Match pairs of photographs; return the result of `matched`."""
     with pycolmap.Database.open(DATABASE) as database:
         order = numbers_of(database, job)
-        few = len(order) <= job["exhaustive"]
-        found = [] if few else [database.read_descriptors(i).data for i in order]
+        found = [] if len(order) <= job["exhaustive"] else [database.read_descriptors(i).data for i in order]
     pairs = choose_pairs(found, job["kind"], SEED) if found else [(i, j) for j in range(len(order)) for i in range(j)]
     matching, verification = pycolmap.FeatureMatchingOptions(), verification_options(pycolmap)
     matching.num_threads, matching.use_gpu = job["threads"], False
@@ -310,8 +307,7 @@ def map_incrementally(pycolmap: Any, job: Json, keep_focal: bool = False) -> lis
 
     folder = Path(MODELS) / ("kept_focal" if keep_focal else "incremental")
     folder.mkdir()
-    models = pycolmap.incremental_mapping(DATABASE, IMAGES, str(folder), options, next_image_callback=on_next)
-    return list(models.values())
+    return list(pycolmap.incremental_mapping(DATABASE, IMAGES, str(folder), options, next_image_callback=on_next).values())
 
 
 def believes_exif(kept: list[Any], free: list[Any]) -> bool:
@@ -354,8 +350,7 @@ def finish(model: Any, job: Json) -> Json:
             point.xy = point.xy * scale
         image.name = job["scene_names"][i]
     for camera in model.cameras.values():
-        used = [i for i, v in views.items() if v["camera"] == camera.camera_id]
-        if used:
+        if used := [i for i, v in views.items() if v["camera"] == camera.camera_id]:
             camera.rescale(*job["sizes"][used[0]])
     Path(MODEL).mkdir(parents=True)
     model.write_binary(MODEL)

@@ -39,8 +39,7 @@ def vocabulary(descriptors: list[np.ndarray], seed: int = 0) -> np.ndarray:
         nearest = _nearest(rows, centers)
         counts = np.bincount(nearest, minlength=len(centers))
         sums = np.stack([np.bincount(nearest, column, len(centers)) for column in rows.T], 1)
-        means = np.round(sums / np.maximum(counts, 1)[:, None]).astype(np.float32)
-        centers = np.where(counts[:, None] > 0, means, centers)
+        centers = np.where(counts[:, None] > 0, np.round(sums / np.maximum(counts, 1)[:, None]).astype(np.float32), centers)
     return centers
 
 
@@ -55,8 +54,7 @@ def similarity(descriptors: list[np.ndarray], seed: int = 0) -> np.ndarray:
         return np.zeros((len(descriptors), len(descriptors)))
     words = vocabulary(descriptors, seed)
     counts = np.stack([np.bincount(_nearest(d.astype(np.float32), words), minlength=len(words)) for d in descriptors])
-    photographs = np.maximum((counts > 0).sum(0), 1)
-    vectors = np.sqrt(counts) * np.log(1 + len(descriptors) / photographs)
+    vectors = np.sqrt(counts) * np.log(1 + len(descriptors) / np.maximum((counts > 0).sum(0), 1))
     lengths = np.sqrt((vectors * vectors).sum(1, keepdims=True))
     vectors = vectors / np.where(lengths > 0, lengths, 1)
     return np.stack([(vectors * row).sum(1) for row in vectors])
@@ -68,8 +66,7 @@ def choose_pairs(descriptors: list[np.ndarray], kind: str, seed: int = 0) -> lis
     np.fill_diagonal(alike, -1)
     pairs = {(i, j) for i in range(count) for j in range(i + 1, min(count, i + 1 + NEIGHBOURS[kind]))}
     for i, row in enumerate(alike):
-        best = np.argsort(-row, kind="stable")[: LOOKALIKES[kind]]
-        pairs |= {(min(i, int(j)), max(i, int(j))) for j in best if row[j] >= 0}
+        pairs |= {(min(i, int(j)), max(i, int(j))) for j in np.argsort(-row, kind="stable")[: LOOKALIKES[kind]] if row[j] >= 0}
     return sorted(pairs)
 
 
@@ -122,11 +119,12 @@ class Matcher(Model):
 
         image = np.ascontiguousarray(np.rot90(image, turns))
         height, width = image.shape[:2]
-        h, w = self.size or _network_size(height, width, side)
+        scale = side / max(height, width) / MULTIPLE
+        h, w = self.size or (max(1, round(scale * height)) * MULTIPLE, max(1, round(scale * width)) * MULTIPLE)
         seen = cv2.resize(image, (w, h), interpolation=cv2.INTER_AREA if w <= width else cv2.INTER_CUBIC)
-        found = self.outputs_of((seen.astype(np.float32) / 255).transpose(2, 0, 1)[None], names=OUTPUTS)
-        self._check(*found, h, w)
-        keypoints, scores, descriptors = found
+        colors = (seen.astype(np.float32) / 255).transpose(2, 0, 1)[None]
+        keypoints, scores, descriptors = self.outputs_of(colors, names=OUTPUTS)
+        self._check(keypoints, scores, descriptors, h, w)
         order = np.argsort(-scores, kind="stable")[:most]
         order = order[scores[order] > 0]
         pixels = keypoints[order] * np.array([width / w, height / h])
@@ -148,12 +146,6 @@ class Matcher(Model):
         inside = (keypoints >= 0) & (keypoints <= [w, h])
         if not (inside[there].all() and (np.abs(np.linalg.norm(descriptors[there], axis=1) - 1) < 1e-2).all()):
             raise DataError(f"{self.path}: keypoints must be in the image, descriptors of length 1; export it again")
-
-
-def _network_size(height: int, width: int, side: int) -> tuple[int, int]:
-    """Return the height and width [px] at which a network sees a photograph, the longer one about ``side``."""
-    scale = side / max(height, width) / MULTIPLE
-    return max(1, round(scale * height)) * MULTIPLE, max(1, round(scale * width)) * MULTIPLE
 
 
 def mutual_matches(a: np.ndarray, b: np.ndarray) -> np.ndarray:

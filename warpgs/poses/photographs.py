@@ -109,8 +109,7 @@ def sharpness(frame: np.ndarray) -> float:
     import cv2
 
     gray = cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)
-    scale = SHARPNESS_SIDE / max(gray.shape)
-    if scale < 1:
+    if (scale := SHARPNESS_SIDE / max(gray.shape)) < 1:
         gray = cv2.resize(gray, (0, 0), fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     return float(cv2.Laplacian(gray.astype(np.float64), cv2.CV_64F).var())
 
@@ -323,16 +322,14 @@ def prepare(path: Path, root: Path, small: Path, max_pixels: int = image_files.M
     image = turn_upright(colors, orientation)
     del colors
     height, width = image.shape[:2]
-    scale = min(1.0, MATCHING_SIDE / max(width, height))
-    if scale < 1:
+    if (scale := min(1.0, MATCHING_SIDE / max(width, height))) < 1:
         size = max(1, round(scale * width)), max(1, round(scale * height))
         image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
     _, png = cv2.imencode(".png", np.round(255 * image[..., ::-1]).astype(np.uint8), [cv2.IMWRITE_PNG_COMPRESSION, 1])
     write_bytes(small, png.tobytes())
     focal = None if film is None else film / DIAGONAL_35MM * math.hypot(width, height) / max(width, height)
     device = " ".join(filter(None, names))[: image_files.MAX_TEXT] + ("" if film is None else f" {film:g} mm")
-    digest = hashlib.sha256(data).hexdigest()
-    return Photograph(scene_name(name, data), path, width, height, orientation, device, focal, digest)
+    return Photograph(scene_name(name, data), path, width, height, orientation, device, focal, hashlib.sha256(data).hexdigest())
 
 
 def write_copy(photograph: Photograph, folder: Path, max_pixels: int = image_files.MAX_PIXELS) -> None:

@@ -344,8 +344,7 @@ def export_network(request: ExportRequest, out: Path) -> list[str]:
         raise DataError(f"{out}: not written: onnxruntime and torch differ by {difference:.1e} deviations; try other versions")
     remove_leftovers(out.parent)
     write_bytes(out, data)
-    description = {"output": "disparity" if is_depth else "classes", "mean": mean, "std": std}
-    write_text(side_file(out), json.dumps(description) + "\n")
+    write_text(side_file(out), json.dumps({"output": "disparity" if is_depth else "classes", "mean": mean, "std": std}) + "\n")
     flag = "--depth-model" if is_depth else "--segmentation-model"
     trained = "small and untrained, for tests only; " if request.random_weights else ""
     return [

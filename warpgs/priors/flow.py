@@ -44,8 +44,7 @@ def pixel_grid(camera: Camera) -> np.ndarray:
 def nearest_views(views: Sequence[View], index: int, count: int) -> list[int]:
     """Return the indices of at most ``count`` other views, nearest camera centre first (ties by order)."""
     centers = np.array([v.camera.center for v in views])
-    distances = np.linalg.norm(centers - centers[index], axis=1)
-    return [int(j) for j in np.argsort(distances, kind="stable") if j != index][:count]
+    return [int(j) for j in np.argsort(np.linalg.norm(centers - centers[index], axis=1), kind="stable") if j != index][:count]
 
 
 def homogeneous(pixels: np.ndarray) -> np.ndarray:
@@ -435,8 +434,7 @@ def _network(path: Path) -> Callable[[View, View], np.ndarray]:
             for v in (first, second)
         ]
         found = network.outputs_of(*(t[None] for t in tensors))
-        flows = [f for f in found if np.shape(f) == (1, 2, size[1], size[0])]
-        if not flows:
+        if not (flows := [f for f in found if np.shape(f) == (1, 2, size[1], size[0])]):
             raise DataError(
                 f"{path}: none of {[np.shape(f) for f in found]} is a flow [1, 2, {size[1]}, {size[0]}]; export it upsampled"
             )

@@ -82,8 +82,7 @@ def fit_line(values: np.ndarray, wanted: np.ndarray) -> tuple[float, float]:
     shift = float(np.median(wanted - scale * values))
     for _ in range(ROUNDS):
         off = np.abs((scale * values + shift) / wanted - 1)
-        spread = max(1.5 * float(np.median(off)), 1e-6)
-        weight = 1 / (wanted**2 * (1 + (off / spread) ** 2))
+        weight = 1 / (wanted**2 * (1 + (off / max(1.5 * float(np.median(off)), 1e-6)) ** 2))
         total = weight.sum()
         x, y = values - (weight * values).sum() / total, wanted - (weight * wanted).sum() / total
         square = float((weight * x * x).sum())
@@ -238,8 +237,7 @@ def pinhole_view(view: View) -> View:
     mask, score_mask = (None if m is None else inside & (moved(m) > 0.5) for m in (view.mask, view.score_mask))
     mask = inside if mask is None else mask
     alpha = None if view.alpha is None else np.clip(moved(view.alpha), 0, 1) * inside
-    depth = view.depth
-    if depth is not None:
+    if (depth := view.depth) is not None:
         sure = None if depth.confidence is None else picked(depth.confidence)
         depth = replace(depth, values=picked(depth.values), confidence=sure)
     return replace(

@@ -199,8 +199,7 @@ def cache_folder() -> Path:
         if own.startswith("~") and not asked.is_absolute():
             raise ResourceError(f"WARPGS_CACHE: the home folder of {own} is unknown; give an absolute path")
         return asked
-    home = cache_home()
-    if home is None:
+    if (home := cache_home()) is None:
         say("warpgs: no home folder: maps are kept for this run only; set WARPGS_CACHE to a folder", error=True)
         return private_folder() / "maps"
     return home / "warpgs" / "Cache" if sys.platform == "win32" else home / "warpgs"
@@ -215,8 +214,7 @@ class MapCache:
     def maps(self, image: np.ndarray, names: tuple[str, ...], decided_by: dict, make: Callable[[], Arrays]) -> Arrays:
         """Return one map per name, float32 [H, W], of an image [H, W, 3], read from disk or computed by ``make``."""
         path = self._path(image, names, decided_by)
-        maps = self._read(path, names, image.shape[:2])
-        if maps is not None:
+        if (maps := self._read(path, names, image.shape[:2])) is not None:
             self.found += 1
             return maps
         maps = make()

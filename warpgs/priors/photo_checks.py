@@ -125,8 +125,7 @@ def _pairs(views: Sequence[View]) -> list[tuple[int, int]]:
 def _typical(differences: list[float]) -> float | None:
     """Return the median; with two middle values, the number between them nearest to 0; None if all are NaN."""
     # a faulty photograph differs from most others, so the choice does not hide it
-    known = sorted(d for d in differences if np.isfinite(d))
-    if not known:
+    if not (known := sorted(d for d in differences if np.isfinite(d))):
         return None
     middle = known[(len(known) - 1) // 2], known[len(known) // 2]
     return 0.0 if middle[0] < 0 < middle[1] else min(middle, key=abs)
@@ -161,8 +160,7 @@ def _check(name: str, differences: list[np.ndarray]) -> PhotoCheck:
         return PhotoCheck(name, 0, None, None, None)
     detail, *colors = (_typical([float(d[k]) for d in differences]) for k in range(4))
     factor = None if detail is None else round(math.exp(detail), 3)
-    known = [c for c in colors if c is not None]
-    if len(known) < 3:
+    if len(known := [c for c in colors if c is not None]) < 3:
         return PhotoCheck(name, len(differences), factor, None, None)
     channels = tuple(round(math.exp(c), 3) for c in known)
     return PhotoCheck(name, len(differences), factor, round(math.exp(sum(known) / 3), 3), channels)

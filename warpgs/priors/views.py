@@ -76,8 +76,8 @@ def _falloff(edge: np.ndarray) -> np.ndarray:
     if not edge.any():
         return np.zeros(edge.shape, np.float32)
     distance = cv2.distanceTransform((~edge).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    squares = np.rint(distance.astype(float) ** 2)  # whole numbers, without the rounding errors of their roots
-    return np.exp(-0.5 / (BOUNDARY_WIDTH * edge.shape[1]) ** 2 * squares).astype(np.float32)
+    # squares are whole numbers, without the rounding errors of their roots
+    return np.exp(-0.5 / (BOUNDARY_WIDTH * edge.shape[1]) ** 2 * np.rint(distance.astype(float) ** 2)).astype(np.float32)
 
 
 def network_semantics(network: networks.Network, preprocessing: networks.Preprocessing, image: np.ndarray) -> Maps:
@@ -187,8 +187,7 @@ def _by_views(views: Sequence[View], depths: Sequence[ViewDepth] | None, notes: 
     fractions = [float(d.valid.mean()) for d in depths]
     span = f"{min(fractions):.1%} to {max(fractions):.1%}"
     notes.append(Detail(f"depth: from the other views, {span} of a view's pixels, then filled in"))
-    poor = [v.name for v, d in zip(views, depths) if d.valid.sum() < MIN_CONSISTENT]
-    if poor:
+    if poor := [v.name for v, d in zip(views, depths) if d.valid.sum() < MIN_CONSISTENT]:
         notes.append(f"no consistent depth in {', '.join(poor)}, so there is no geometry score there; --depth-model adds depth")
 
     def disparity(i: int) -> tuple[networks.Arrays, str]:

@@ -81,14 +81,12 @@ def write_film(path: Path, frames: Iterable[np.ndarray], fps: int = 30) -> int:
     # A video is VP9, which OpenCV's wheels bring and current browsers play; .mp4 is H.264 if this machine has an encoder.
     # An odd height loses a row, an odd width a column. An animated image (.webp, .gif) runs in a loop. The film is decoded
     # before it replaces an older one, because the encoder does not report a full disk.
-    suffix = path.suffix.lower()
-    if suffix in ANIMATIONS:
+    if (suffix := path.suffix.lower()) in ANIMATIONS:
         return write_animation(path, frames, fps)
     sizes: list[tuple[int, int]] = []
 
     def check(film: Path) -> None:
-        found = _decoded_sizes(film)
-        if found != sizes:
+        if (found := _decoded_sizes(film)) != sizes:
             read = f"only {sum(f == s for f, s in zip(found, sizes))} of {len(sizes)} frames could be read back"
             fix = "Disk full, or the encoder failed; the old file is untouched. Free disk space, or write elsewhere"
             raise ResourceError(f"{path}: cannot be written; {read}. {fix}")
@@ -136,8 +134,7 @@ def _vp9(path: Path, name: str, fps: int, frame: np.ndarray, properties: tuple[i
 def _encode_h264(program: str, temporary: str, frames: Iterator[np.ndarray], fps: int) -> None:
     """Write 8-bit frames to a temporary file by ffmpeg."""
     first = next(frames)
-    size = f"{first.shape[1]}x{first.shape[0]}"
-    given = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", size, "-r", str(fps), "-i", "-"]
+    given = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{first.shape[1]}x{first.shape[0]}", "-r", str(fps), "-i", "-"]
     colors = "scale=out_color_matrix=bt709:out_range=tv,setparams=colorspace=bt709:color_primaries=bt709:color_trc=bt709"
     codec = ["-vf", colors, "-c:v", "h264", "-pix_fmt", "yuv420p", "-movflags", "+faststart"]
     folder, name = os.path.split(temporary)  # the folder may be a descriptor of this process
@@ -175,8 +172,7 @@ def _encode_vp9(path: Path, temporary: str, frames: Iterator[np.ndarray], fps: i
 
     with temporary_folder() as made, utf8_name(made.path) as folder:
         parts = iter(lambda: list(itertools.islice(frames, size)), [])
-        names = in_background(encode, ((f"{folder}/{i}.mp4", p) for i, p in enumerate(parts)), threads)
-        for name in names:
+        for name in in_background(encode, ((f"{folder}/{i}.mp4", p) for i, p in enumerate(parts)), threads):
             packets = cv2.VideoCapture(name, cv2.CAP_FFMPEG, (cv2.CAP_PROP_FORMAT, -1))
             while (read := packets.read())[0]:
                 film.write(read[1])

@@ -106,8 +106,8 @@ def render_overview(
         options = replace(options, background=behind)
     with torch.no_grad():
         render = rasterize(inside, camera, replace(options, sh_degree=0))
-    depth = torch.where(render.alpha > 0.5, render.depth, torch.inf).cpu().numpy()
     image = np.round(255 * render.rgb.clamp(0, 1).cpu().numpy()).astype(np.uint8)
+    depth = torch.where(render.alpha > 0.5, render.depth, torch.inf).cpu().numpy()
     for segments, color in lines:
         _draw(image, depth, camera, segments, color)
     return image / np.float32(255)

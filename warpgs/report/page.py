@@ -130,8 +130,8 @@ def rendered(template: str, **contents: object) -> str:
     page = environment.get_template(template)
     own = "".join(page.blocks["script"](page.new_context())) if "script" in page.blocks else ""
     code = own.partition("<script>")[2].partition("</script>")[0]
-    digest = base64.b64encode(hashlib.sha256(code.encode()).digest()).decode()  # the page's policy allows this script alone
-    return page.render(script_sha256=digest, **contents)
+    # the page's policy allows this script alone
+    return page.render(script_sha256=base64.b64encode(hashlib.sha256(code.encode()).digest()).decode(), **contents)
 
 
 def _data_uri(data: bytes) -> str:

@@ -168,8 +168,7 @@ def colmap_text(cameras: list[Camera], x: np.ndarray, colors: np.ndarray, seen: 
 
     K, first = cameras[0].K, cameras[0]
     camera_lines = ["# Camera list with one line of data per camera:", "#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]"]
-    parameters = join((K[0, 0], K[1, 1], K[0, 2], K[1, 2]), 6)
-    camera_lines.append(f"1 PINHOLE {first.width} {first.height} {parameters}")
+    camera_lines.append(f"1 PINHOLE {first.width} {first.height} {join((K[0, 0], K[1, 1], K[0, 2], K[1, 2]), 6)}")
     image_lines = [
         "# Image list with two lines of data per image:",
         "#   IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME",

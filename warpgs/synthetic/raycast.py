@@ -170,9 +170,8 @@ class Torus(Shape):
 
     def normal(self, p: np.ndarray) -> np.ndarray:
         """See ``Shape.normal``."""
-        across = np.maximum(np.hypot(p[:, 0], p[:, 2]), 1e-6)
         n = p.copy()
-        n[:, [0, 2]] *= (1 - self.ring / across)[:, None]
+        n[:, [0, 2]] *= (1 - self.ring / np.maximum(np.hypot(p[:, 0], p[:, 2]), 1e-6))[:, None]
         return n / np.linalg.norm(n, axis=1, keepdims=True)
 
 
@@ -214,8 +213,7 @@ def shade(shapes: Sequence[Shape], light: Light, x: np.ndarray, index: np.ndarra
     """Return colours [N, 3] of points ``x`` [N, 3] on shapes ``index`` [N]: albedo, soft light, contact shade, soft shadows."""
     rgb, normals = np.zeros_like(x), np.zeros_like(x)
     for i, shape in enumerate(shapes):
-        rows = np.flatnonzero(index == i)
-        if len(rows):
+        if len(rows := np.flatnonzero(index == i)):
             p = shape.local(x[rows])
             rgb[rows] = shape.texture(p)
             normals[rows] = matmul(shape.normal(p), shape.rotation.T.astype(x.dtype))
@@ -236,8 +234,7 @@ def shade(shapes: Sequence[Shape], light: Light, x: np.ndarray, index: np.ndarra
         clearance = (np.sqrt(np.maximum(square - along * along, 0)) - bulk) / np.maximum(along, 1e-3)
         edge = np.clip(0.5 + light.sharpness * clearance, 0, 1)
         lit[rows] *= np.where(along > 0, edge * edge * (3 - 2 * edge), 1)
-    brightness = light.ambient * open_sky + light.sun * lit * np.maximum(matmul(normals, to_light), 0)
-    return np.clip(rgb * brightness[:, None], 0, 1)
+    return np.clip(rgb * (light.ambient * open_sky + light.sun * lit * np.maximum(matmul(normals, to_light), 0))[:, None], 0, 1)
 
 
 def pixel_rays(K: np.ndarray, viewmat: np.ndarray, xy: np.ndarray) -> np.ndarray:
@@ -260,8 +257,7 @@ def render_rgba(
     for top in range(0, height, rows):
         bottom = min(top + rows, height)
         ys = (np.arange(top * samples, bottom * samples, dtype=np.float32) + 0.5) / samples
-        xy = np.stack(np.meshgrid(sub, ys), axis=-1).reshape(-1, 2)
-        d = pixel_rays(K, viewmat, xy)
+        d = pixel_rays(K, viewmat, np.stack(np.meshgrid(sub, ys), axis=-1).reshape(-1, 2))
         t, index = cast(shapes, origin, d)
         x = origin.astype(np.float32) + np.where(np.isfinite(t), t, 0)[:, None] * d
         tiles = (bottom - top, samples, width, samples)

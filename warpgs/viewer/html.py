@@ -64,8 +64,7 @@ def _pinhole(viewmat: np.ndarray, fov: float, width: int, height: int) -> Camera
 
 def camera_before(gaussians: Gaussians, width: int = 960, height: int = 720) -> Camera:
     """Return a camera at -z that sees the box between the 5th and 95th percentiles of the means, for models without cameras."""
-    means = gaussians.means.detach().cpu().double().numpy()
-    low, high = np.percentile(means, [5, 95], axis=0)
+    low, high = np.percentile(gaussians.means.detach().cpu().double().numpy(), [5, 95], axis=0)
     middle, radius = (low + high) / 2, max(0.5 * float(np.linalg.norm(high - low)), 1e-6)
     center = middle - np.array([0, 0, radius / math.sin(0.5 * FIELD_OF_VIEW)])
     return _pinhole(look_at(center, middle, np.array([0.0, -1, 0])), FIELD_OF_VIEW, width, height)
@@ -94,13 +93,11 @@ def packed(gaussians: Gaussians) -> tuple[tuple[np.ndarray, ...], float, int]:
     # bits remain; the square of an axis below 0.00017 u becomes 0. In units in which the median of the longest axes is
     # 1, nearly all squares keep eleven bits.
     means, quats, log_scales, logits, sh = (t.detach().cpu().double().numpy() for t in gaussians.tensors().values())
-    median = float(np.median(log_scales.max(1))) if len(means) else 0.0
-    scale = math.exp(median) / MEDIAN_AXIS
+    scale = math.exp(float(np.median(log_scales.max(1))) if len(means) else 0.0) / MEDIAN_AXIS
     longest = 0.5 * math.log(LARGEST_HALF) - 1e-3  # the diagonal of a rotated covariance is no longer than its longest axis
     relative = log_scales - math.log(scale)
-    axes = np.exp(np.minimum(relative, longest))
     rotations = rotation_matrices(quats / np.linalg.norm(quats, axis=1, keepdims=True))
-    covariances = np.einsum("nij,nj,nkj->nik", rotations, axes**2, rotations)
+    covariances = np.einsum("nij,nj,nkj->nik", rotations, np.exp(np.minimum(relative, longest)) ** 2, rotations)
     shown = np.clip(base_colors(sh), 0, 1), torch.sigmoid(torch.from_numpy(logits)).numpy()[:, None]
     colors, opacities = (np.round(255 * values).astype(np.uint8) for values in shown)
     arrays = (means / scale).astype(np.float32), covariances.astype(np.float32), colors, opacities
@@ -173,8 +170,8 @@ def middle_first(cameras: Sequence[Camera], gaussians: Gaussians) -> list[Camera
     covered = (matmul(seen, seen.T) / np.maximum(seen.sum(1), 1)).sum(1)  # of each other one, the part that is seen
     asides = np.linalg.norm(centers - centers.mean(0), axis=1)
     first = int(np.argmin(np.where(covered >= MOST * covered.max(), asides, math.inf)))
-    upward = upright(rig_of(cameras, 1.0), cameras[first])  # no part of whether photographs lie depends on the depth
-    return [upward, *cameras[:first], *cameras[first + 1 :]]
+    # no part of whether photographs lie depends on the depth
+    return [upright(rig_of(cameras, 1.0), cameras[first]), *cameras[:first], *cameras[first + 1 :]]
 
 
 def turning_limits(cameras: Sequence[Camera], target: np.ndarray, up: np.ndarray) -> tuple[np.ndarray, float]:
@@ -189,9 +186,8 @@ def turning_limits(cameras: Sequence[Camera], target: np.ndarray, up: np.ndarray
     ways /= np.maximum(np.linalg.norm(ways, axis=1, keepdims=True), 1e-12)
     heights = np.clip((ways * up).sum(1), -1, 1)
     flat = ways - heights[:, None] * up
-    side = np.cross(up, flat[0])
     level = np.abs(heights) < max(0.95, abs(heights[0]) + 1e-9)  # straight down there is no azimuth
-    azimuths = np.sort(np.arctan2((flat * side).sum(1), (flat * flat[0]).sum(1))[level])
+    azimuths = np.sort(np.arctan2((flat * np.cross(up, flat[0])).sum(1), (flat * flat[0]).sum(1))[level])
     gaps = np.diff(azimuths, append=azimuths[0] + 2 * math.pi)
     widest = int(np.argmax(gaps))  # the arc is all but the widest gap, and has the first camera at 0
     if gaps[widest] > ALL_ROUND:

@@ -281,8 +281,7 @@ class Rules:
 
     def add_headers(self, connection: Any, request: Any, response: Any) -> None:
         """Add the headers of every answer."""
-        hosts = request.headers.get_all("Host")
-        for name, value in self.guard.headers(hosts[0] if hosts else "", connection.nonce).items():
+        for name, value in self.guard.headers(next(iter(request.headers.get_all("Host")), ""), connection.nonce).items():
             response.headers[name] = value
 
 
@@ -383,9 +382,8 @@ def require_viser() -> None:
 
 def _refuses_others(port: int) -> bool:
     """Return whether the server answers 403 to a request without the token."""
-    request = f"GET / HTTP/1.1\r\nHost: {HOST}:{port}\r\n\r\n"
     with socket.create_connection((HOST, port), timeout=10) as stream:
-        stream.sendall(request.encode())
+        stream.sendall(f"GET / HTTP/1.1\r\nHost: {HOST}:{port}\r\n\r\n".encode())
         return stream.recv(64).startswith(b"HTTP/1.1 403 ")
 
 

@@ -95,8 +95,7 @@ def content_of_file(path: Path, device: str = "cpu") -> Content:
         say(f"  {note}")
     if not len(stored):
         raise DataError(f"{path}: contains no Gaussians; export the model again")
-    means = stored.means.double().numpy()
-    low, high = np.percentile(means, [5, 95], axis=0)
+    low, high = np.percentile(stored.means.double().numpy(), [5, 95], axis=0)
     normalization = Normalization((low + high) / 2, 1 / max(0.5 * float(np.linalg.norm(high - low)), 1e-12))
     gaussians = convert_gaussians(stored, normalization, "file", "scene")
     gaussians = dataclasses.replace(gaussians, **{n: t.float().to(device) for n, t in gaussians.tensors().items()})
@@ -264,8 +263,7 @@ class Panel:
         self._note.content, self._note.visible = _plain(note), bool(note)
 
     def _add_stepping(self) -> None:
-        names = {readable(name): name for name in self.content.model.scene_cameras}  # viser takes UTF-8 alone
-        if names:
+        if names := {readable(name): name for name in self.content.model.scene_cameras}:  # viser takes UTF-8 alone
             chooser = self.server.gui.add_dropdown("step into", (NOWHERE, *names), initial_value=NOWHERE)
 
             def step(event: Any) -> None:
@@ -312,8 +310,7 @@ class Panel:
         self._gizmo.on_update(guarded(lambda event: self.window.redraw() if event.phase == "end" else None))
 
         def store(_: Any) -> None:
-            box = self.crop_box()
-            if box is None:
+            if (box := self.crop_box()) is None:
                 return self.explain("no crop box yet: tick crop, and move the box")
             self._save(CROP, box_json(box, self.content.model.normalization))
 
@@ -331,8 +328,7 @@ class Panel:
         def show(_: Any = None) -> None:
             if shows := bool(self.in_colors.value):
                 counts.content = "finding what would go"
-            found = self.window.going() if shows else {}
-            lines = counted_lines(found) or ["nothing would go"] * shows
+            lines = counted_lines(self.window.going() if shows else {}) or ["nothing would go"] * shows
             removed = sum(int(where.sum()) for masks in self.window.removed for where in masks.values())
             counts.content = "\n".join(f"- {line}" for line in [*lines, f"{removed:,} removed"])
             self.window.redraw()
@@ -359,8 +355,7 @@ class Panel:
                 if len(self.keyframes) >= MAX_KEYFRAMES:
                     return self.explain(f"a path has at most {MAX_KEYFRAMES:,} keyframes")
                 at = self.keyframes[-1]["seconds"] + float(seconds.value) if self.keyframes else 0.0
-                camera = self.window.camera_of(event.client)
-                self.keyframes.append(keyframe(camera, at, self.content.model.normalization))
+                self.keyframes.append(keyframe(self.window.camera_of(event.client), at, self.content.model.normalization))
                 changed()
 
         def pop(_: Any) -> None:
@@ -444,8 +439,7 @@ class Window:
         rigs = (html.middle_first(some, gaussians) for some in (train, cameras))
         self._rig = [*itertools.chain(*rigs)] or [html.camera_before(gaussians)]
         self.first = self._rig[0]
-        ahead = html.distance_ahead(self.first, gaussians)
-        self.extent = camera_extent(cameras) if len(cameras) > 1 else 0.1 * ahead
+        self.extent = camera_extent(cameras) if len(cameras) > 1 else 0.1 * html.distance_ahead(self.first, gaussians)
         self.maps = Maps(content, self.extent)
         self.removed: list[dict[str, torch.Tensor]] = []
         self._reasons: dict[str, torch.Tensor] | None = None
@@ -483,8 +477,7 @@ class Window:
         keep = torch.ones(len(gaussians), dtype=torch.bool, device=gaussians.means.device)
         if fine is not None and layer != ALL_LAYERS:
             keep &= fine if layer == FINE_LAYER else ~fine
-        box = self.panel.crop_box()
-        if box is not None:
+        if (box := self.panel.crop_box()) is not None:
             keep &= inside(gaussians, box)
         if self.panel.in_colors.value:
             gaussians = in_colors(gaussians, self.going())
@@ -664,8 +657,7 @@ class Window:
 def frustum_scale(camera: Camera, size: float) -> float:
     """Return viser's scale of a frustum: ``size`` [u], or less, so that its picture is at most 2.5 sizes ahead."""
     # viser keeps the volume of frusta, so that those of long lenses reach far ahead: their pictures would cover the model
-    tangent = math.tan(0.5 * fov_y(camera))
-    return size * min(1.0, 2.5 * (tangent**2 * camera.width / camera.height / 3) ** (1 / 3))
+    return size * min(1.0, 2.5 * (math.tan(0.5 * fov_y(camera)) ** 2 * camera.width / camera.height / 3) ** (1 / 3))
 
 
 def _small(image: np.ndarray) -> np.ndarray:

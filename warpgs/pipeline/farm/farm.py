@@ -99,8 +99,7 @@ class LocalEngine:
                 self._workers[name] = worker
                 worker.send(json.dumps({"job": text, "threads": threads}))
             while state == "crashed" and (line := next(lines, None)) is not None:
-                values = json.loads(line)
-                if "step" in values:
+                if "step" in (values := json.loads(line)):
                     self._news.put((name, "running", values["step"]))
                 else:
                     state = values["state"]
@@ -197,8 +196,7 @@ class _Farm:
         self.held: dict[str, contextlib.ExitStack] = {}
         self.left, self.running = len(jobs), 0  # counted, since there may be a million
         for status in self.all:
-            record = finished(status.job)
-            if record is not None:
+            if (record := finished(status.job)) is not None:
                 with contextlib.suppress(FolderHeldError):
                     check_free(status.job.folder)
                 self._end(status, record)
@@ -277,8 +275,7 @@ class _Farm:
 
 def seconds_left(statuses: list[JobStatus], slots: int) -> float | None:
     """Estimate the time until all jobs are done [s] from the mean time of jobs done by this farm; None before one is done."""
-    took = [s.seconds for s in statuses if s.state == "done" and s.seconds]
-    if not took:
+    if not (took := [s.seconds for s in statuses if s.state == "done" and s.seconds]):
         return None
     mean, now = sum(took) / len(took), time.monotonic()
     left = sum(max(0.0, mean - (now - s.began)) if s.state == "running" else mean for s in statuses if not s.ended)
@@ -513,8 +510,7 @@ def run_and_show(jobs: list[FarmJob], engine: Engine, results: Path, *, live: bo
 
 def check_failures(statuses: list[JobStatus]) -> None:
     """Check that no job failed."""
-    failed = [s for s in statuses if s.state == "failed"]
-    if failed:
+    if failed := [s for s in statuses if s.state == "failed"]:
         first = failed[0].record
         names = ", ".join(s.job.name for s in failed[:5]) + ("" if len(failed) <= 5 else f" and {len(failed) - 5} more")
         fix = f"First message: {first.message.rstrip('.') if first else 'unknown'}. Repeat the command to try them again"

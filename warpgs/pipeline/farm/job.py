@@ -119,8 +119,7 @@ in addition to those of all jobs."""
 
 def list_jobs(jobs: str) -> list[ListedJob]:
     """List the jobs of a folder of scenes, a glob, or a .jsonl file, by name or in the order of the file."""
-    path = Path(jobs)
-    if path.is_dir():
+    if (path := Path(jobs)).is_dir():
         if any(r.probe(path) is not None for r in all_readers()):
             raise UsageError(f"{jobs} is a single scene: fit it with `warpgs fit`, or give its parent folder")
         found = _named(sorted(p for p in path.iterdir() if p.is_dir() and not p.name.startswith(".")))

@@ -53,8 +53,7 @@ class SlurmEngine:
         folder: Path | None = None,
     ):
         """Look for Slurm, and make a private folder."""
-        missing = [p for p in ("sbatch", "squeue", "scancel") if shutil.which(p) is None]
-        if missing:
+        if missing := [p for p in ("sbatch", "squeue", "scancel") if shutil.which(p) is None]:
             raise UsageError(f"--engine slurm needs Slurm's {', '.join(missing)}: run warpgs on a machine of the cluster")
         self.slots, self._threads = slots or QUEUED, threads
         self._options = [
@@ -107,8 +106,7 @@ class SlurmEngine:
         events: list[Event] = []
         for name, (slurm_id, base) in self._running.items():
             if f"{base.name}.answer" in there:
-                state = base.with_suffix(".answer").read_text("utf-8")
-                if state in STATES:
+                if (state := base.with_suffix(".answer").read_text("utf-8")) in STATES:
                     for suffix in SUFFIXES:
                         base.with_suffix(suffix).unlink(missing_ok=True)
                     events.append((name, state, ""))

@@ -200,8 +200,7 @@ def write_thumbnail(renders: Path, path: Path) -> None:
     """Write the first render of a run, if any, beside its photograph, as a small JPEG."""
     import cv2
 
-    first = min(renders.glob("*.png"), default=None)
-    if first is None:
+    if (first := min(renders.glob("*.png"), default=None)) is None:
         return
     image = np.round(255 * decode(first, data=files.read_file(first, renders.parent))[0][..., ::-1]).astype(np.uint8)
     pair = image[:, : image.shape[1] * 2 // 3]  # render, photograph, error

@@ -134,9 +134,7 @@ class FilmSettings:
 
     def count(self, seconds: float) -> int:
         """Return the number of frames of a film; ``seconds`` is its duration if the settings have none."""
-        if self.frames is not None:
-            return self.frames
-        return min(max(1, round((self.seconds or seconds) * self.fps)), MAX_FRAMES)
+        return self.frames or min(max(1, round((self.seconds or seconds) * self.fps)), MAX_FRAMES)
 
 
 @dataclass(frozen=True)

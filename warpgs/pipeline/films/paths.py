@@ -112,8 +112,7 @@ def _normal_of(vectors: np.ndarray, largest: float) -> np.ndarray | None:
     # without LAPACK (see `warpgs.geometry.matmul`). There is no plane if the vectors lie on a line, or if the smallest
     # eigenvalue is above ``largest`` times the sum of the others.
     covariance = (vectors[:, :, None] * vectors[:, None, :]).mean(0)
-    total = float(np.trace(covariance))
-    if not total > 0:
+    if not (total := float(np.trace(covariance))) > 0:
         return None
     power = geometry.inverse(covariance / total + 1e-9 * np.eye(3))
     for _ in range(12):

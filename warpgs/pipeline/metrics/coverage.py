@@ -87,8 +87,7 @@ def fraction_outside(depth: torch.Tensor, camera: Camera, photographs: Sequence[
         for few, many in ((small.height, camera.height), (small.width, camera.width))
     )
     points = depth[rows][:, columns].cpu()
-    shown = points > 0
-    if not shown.any():
+    if not (shown := points > 0).any():
         return 0.0
     outside = torch.ones_like(shown) if empty else shown
     points = torch.where(shown, points, points[shown].median())
@@ -122,8 +121,7 @@ def photo_errors(train: Sequence[View], training: Sequence[DepthView]) -> np.nda
         for i, j in itertools.permutations(chosen, 2):
             u, v, difference = (t.flatten() for t in depth_difference(training[i][1], training[i][0], *training[j]))
             at = torch.isfinite(difference).nonzero()[:, 0]
-            own = photos[i].reshape(-1, 3).index_select(0, at)
-            error = (_sampled(photos[j], u[at], v[at]) - own).double().square().mean(1)
+            error = (_sampled(photos[j], u[at], v[at]) - photos[i].reshape(-1, 3).index_select(0, at)).double().square().mean(1)
             yield _bin(difference[at]), error.cpu().numpy()
 
     def sums(index: np.ndarray, error: np.ndarray) -> np.ndarray:

@@ -129,8 +129,7 @@ def _check_unpacked(file: BinaryIO) -> None:
     if zipfile.is_zipfile(file):
         with zipfile.ZipFile(file) as archive:
             members = archive.infolist()
-        unpacked = sum(member.file_size for member in members)
-        if unpacked > file.seek(0, os.SEEK_END):
+        if (unpacked := sum(member.file_size for member in members)) > file.seek(0, os.SEEK_END):
             raise ValueError(f"it unpacks to {unpacked:,} bytes, more than its size")
         others = sum(member.file_size for member in members if Path(member.filename).parent.name != "data")
         if others > MAX_PICKLE:
@@ -239,8 +238,7 @@ class Lpips:
         # a metric must not depend on the device: torch's default lets CUDA round convolutions to 10 bits of mantissa
         with torch.backends.cudnn.flags(enabled=True, benchmark=False, deterministic=True, allow_tf32=False):
             for i, x in enumerate(self._features((pair - shift) / scale)):
-                head = self.tensors[f"lin{i}.model.1.weight"].view(-1, 1, 1)
-                total += float(((x[0] - x[1]).square() * head).sum(0).mean())
+                total += float(((x[0] - x[1]).square() * self.tensors[f"lin{i}.model.1.weight"].view(-1, 1, 1)).sum(0).mean())
         return total
 
     def measure(self, image: np.ndarray, target: np.ndarray) -> dict[str, float]:

@@ -79,8 +79,7 @@ def merge_cells(points: Parts, widths: Parts, cell: float = 1.0) -> list[np.ndar
         sides = [int(s) for s in high - low + 1]
         if math.prod(sides) >= 2**62:  # one number for all four sorts much faster than rows do, and in the same order
             rows = np.concatenate([np.stack(grid(*part), 1) for part in zip(points, widths)])
-            ends = np.cumsum([len(p) for p in points])[:-1]
-            return np.split(np.unique(rows, axis=0, return_inverse=True)[1].ravel(), ends)
+            return np.split(np.unique(rows, axis=0, return_inverse=True)[1].ravel(), np.cumsum([len(p) for p in points])[:-1])
         in_threads(lambda chunk: number(*chunk), chunks)
     return cells
 
@@ -128,8 +127,7 @@ def _lift(view: View, depth: np.ndarray, where: np.ndarray) -> Lifted:
     """Return world points [N, 3] [u], colours [N, 3] and pixel footprints [N] [u] of the pixels of a mask ``where`` [H, W]."""
     pixels = np.flatnonzero(where)
     z = depth.ravel()[pixels]
-    points = lifted_pixels(view.camera, pixels, z)
-    return points, view.image.reshape(-1, 3)[pixels], z.astype(float) / focal_length(view.camera)
+    return lifted_pixels(view.camera, pixels, z), view.image.reshape(-1, 3)[pixels], z.astype(float) / focal_length(view.camera)
 
 
 def focal_length(camera: Camera) -> float:
@@ -179,7 +177,6 @@ def coarse_points(
         return complete(depth, sure, views[i].image)
 
     filled_depths = dict(zip(searched, in_threads(completed, searched)))
-    others = [views[i] for i in searched], list(filled_depths.values())
 
     def lifted(i: int) -> tuple[Lifted, Lifted | None, str]:
         view, sure, (region, name) = views[i], consistent[i], regions[i]
@@ -189,7 +186,7 @@ def coarse_points(
         more = None
         if i in filled_depths:
             rows = _lift(view, filled_depths[i], ~sure & counted & (filled_depths[i] > 0))
-            keep = ~in_free_space(rows[0], *others, searched.index(i))
+            keep = ~in_free_space(rows[0], [views[k] for k in searched], list(filled_depths.values()), searched.index(i))
             more = rows[0][keep], rows[1][keep], rows[2][keep]
             text += f", {100 * keep.sum() / total:.0f} % filled"
         return _lift(view, depths[i].depth, sure), more, "; ".join((text, *depths[i].notes))
@@ -262,8 +259,7 @@ def extrapolated_points(views: Sequence[View], depths: Sequence[ViewDepth]) -> P
         return NOTHING
     known = [i for i, d in enumerate(depths) if d.searched and d.valid.any()]
     filled = dict(zip(known, in_threads(lambda i: complete(depths[i].depth, depths[i].valid, views[i].image), known)))
-    plain = [i for i in known if views[i].camera.model == "pinhole"]
-    clouds = in_threads(lambda i: _beyond(views, i, filled[i]), plain)
+    clouds = in_threads(lambda i: _beyond(views, i, filled[i]), [i for i in known if views[i].camera.model == "pinhole"])
     clouds += in_threads(lambda i: _behind(views, i, filled[i], [d.depth for d in depths]), known)
     return joined((NOTHING, *clouds))
 
@@ -362,8 +358,7 @@ class Silhouette:
         self.view, self.size = view, np.array([view.camera.width, view.camera.height])
         self.sums = np.zeros((opaque.shape[0] + 1, opaque.shape[1] + 1), np.int64)
         self.sums[1:, 1:] = opaque.cumsum(0, dtype=np.int64).cumsum(1)
-        border = np.concatenate([opaque[0], opaque[-1], opaque[:, 0], opaque[:, -1]])
-        self.cut = bool(border.any())
+        self.cut = bool(np.concatenate([opaque[0], opaque[-1], opaque[:, 0], opaque[:, -1]]).any())
         """True if the object reaches the border of the image, so that it may extend beyond it."""
 
     def look(self, points: np.ndarray, radius: np.ndarray | float, pixels: float = 0.0) -> tuple[np.ndarray, ...]:
@@ -467,8 +462,7 @@ def hull_points(views: Sequence[View], merge_px: float) -> tuple[PointCloud, str
     Views with an alpha channel carve; without two of them, or if the silhouettes do not overlap, there are no points. Points
     are merged in cells of ``merge_px`` [px]; 0 merges none.
     """
-    shapes = silhouettes(views)
-    if len(shapes) < 2:
+    if len(shapes := silhouettes(views)) < 2:
         return NOTHING, f"no hull: {len(shapes)} of {len(views)} views have an alpha channel; at least two are needed"
     cells, width = carve(shapes)
     if not len(cells):

@@ -270,15 +270,14 @@ def importance(space: torch.Tensor, removal: torch.Tensor) -> torch.Tensor:
 def cheapest(scores: torch.Tensor, changes: torch.Tensor, budget: float) -> torch.Tensor:
     """Return the rows of least score [N] whose changes [N] add up to at most ``budget``, bool [N]; at least one row is not."""
     order, chosen = torch.argsort(scores, stable=True), torch.zeros_like(scores, dtype=torch.bool)
-    sums = changes[order].double().cpu().cumsum(0)  # on a CPU one after another: the same bits each time
-    chosen[order[: min(int((sums <= budget).sum()), len(order) - 1)]] = True
+    # on a CPU one after another: the same bits each time
+    chosen[order[: min(int((changes[order].double().cpu().cumsum(0) <= budget).sum()), len(order) - 1)]] = True
     return chosen
 
 
 def stored_degrees(sh: torch.Tensor) -> torch.Tensor:
     """Return the highest degree at which coefficients [N, K, 3] of each Gaussian are not all zero, int32 [N]."""
-    bands = torch.arange(sh.shape[1], device=sh.device).add(0.5).sqrt().to(torch.int32)
-    return torch.where((sh != 0).any(2), bands, 0).amax(1)
+    return torch.where((sh != 0).any(2), torch.arange(sh.shape[1], device=sh.device).add(0.5).sqrt().to(torch.int32), 0).amax(1)
 
 
 def by_degree(gaussians: Gaussians) -> Gaussians:

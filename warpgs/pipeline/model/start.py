@@ -54,8 +54,7 @@ def nearest(points: np.ndarray, queries: np.ndarray, count: int) -> np.ndarray:
     rows = []
     # every pair, some rows at a time: a few hundred points take less time than importing a library of search trees
     for asked in torch.from_numpy(queries).split(max(1, PAIRS // max(1, len(known)))):
-        squares = sum((asked[:, i, None] - known[None, :, i]) ** 2 for i in range(2))
-        rows.append(squares.topk(count, largest=False).indices)
+        rows.append(sum((asked[:, i, None] - known[None, :, i]) ** 2 for i in range(2)).topk(count, largest=False).indices)
     return torch.cat(rows).numpy()
 
 
@@ -268,8 +267,7 @@ def on_object(start: Start, views: list[View]) -> Start:
     keep = ~depth_points.in_empty_region(shapes, cloud.points)
     if not shapes or keep.all():
         return start
-    count = int(keep.sum())
-    if count < MIN_POINTS:
+    if (count := int(keep.sum())) < MIN_POINTS:
         few = f"only {count} of these points are outside the empty areas of all views; check the poses"
         return start._replace(how=f"{start.how}\n{few}")
     how = f"{start.how}\n{len(keep) - count:,} of these points left out: they are in an empty area of a view"
@@ -309,8 +307,7 @@ def initial_points(
 
 def subsample(start: Start, most: int, generator: np.random.Generator) -> Start:
     """Return the start with at most ``most`` points, sampled at random; sparser points get wider Gaussians."""
-    count = len(start.cloud)
-    if count <= most:
+    if (count := len(start.cloud)) <= most:
         return start
     keep = np.sort(generator.permutation(count)[:most])
     how = f"{start.how}\nused {most:,} of these {count:,} points, sampled at random, because --max-gaussians is {most:,}"
@@ -337,8 +334,7 @@ def initial_gaussians(
     colors = torch.as_tensor(cloud.colors, dtype=torch.float32, device=device)
     count = len(points)
     # in float64, since the rounding of float32's roots and logarithms depends on the processor (MKL)
-    distances = mean_square_distances(points).double().sqrt()
-    scales = config.scale_factor * distances.clamp(1e-6 * extent, 0.1 * extent)
+    scales = config.scale_factor * mean_square_distances(points).double().sqrt().clamp(1e-6 * extent, 0.1 * extent)
     sh = points.new_zeros(count, coefficient_count(sh_degree), 3)
     sh[:, 0] = base_coefficients(colors)
     quats = points.new_tensor([1, 0, 0, 0]).repeat(count, 1)

@@ -170,8 +170,7 @@ class Table:
         """
         row, factor = [], math.sqrt(self.batch)
         for name in self.params:
-            head = factor * head_lrs[name] if name in head_lrs else None
-            row += scheduled_lrs(factor * lrs[name], step, self.betas, head)
+            row += scheduled_lrs(factor * lrs[name], step, self.betas, factor * head_lrs[name] if name in head_lrs else None)
         return row
 
     @torch.no_grad()
@@ -319,8 +318,8 @@ class Table:
 
     def reset_opacities(self, opacity: float) -> None:
         """Limit every opacity to this value in (0, 1), and reset the moments of all opacities (the reset of 3DGS)."""
-        limit = logit(opacity)  # in float64: the smallest float32 opacity would be 0
-        self.params["logit_opacities"] = self.params["logit_opacities"].detach().clamp(max=limit).requires_grad_()
+        # the logit is float64: the smallest float32 opacity would be 0
+        self.params["logit_opacities"] = self.params["logit_opacities"].detach().clamp(max=logit(opacity)).requires_grad_()
         for moments in (self.exp_avg, self.exp_avg_sq):
             moments["logit_opacities"].zero_()
 
@@ -487,8 +486,7 @@ def load(path: str | Path, device: str | torch.device = "cpu") -> Model:
 def checked_gaussians(tensors: Tensors, where: str) -> Gaussians:
     """Return the tensors of a file as Gaussians; DataError that begins with ``where`` if they are not."""
     names = Gaussians.__dataclass_fields__
-    missing = [n for n in names if n not in tensors]
-    if missing:
+    if missing := [n for n in names if n not in tensors]:
         raise DataError(f"{where}: {', '.join(missing)} missing; restore the file, or write it again")
     gaussians = Gaussians(**{n: tensors[n] for n in names})
     try:

@@ -26,8 +26,7 @@ def blur(image: torch.Tensor, sigma: float = BLUR) -> torch.Tensor:
     """Blur a map [H, W] by a Gaussian of standard deviation ``sigma`` [px], its border pixels repeated outwards."""
     radius = max(1, round(3 * sigma))
     # on the host, where exponentials of float64 have the same digits on every processor
-    offsets = torch.arange(-radius, radius + 1, dtype=torch.float64, device="cpu")
-    window = torch.exp(-0.5 * (offsets / sigma) ** 2)
+    window = torch.exp(-0.5 * (torch.arange(-radius, radius + 1, dtype=torch.float64, device="cpu") / sigma) ** 2)
     weights = (window / window.sum()).tolist()
     padded = torch.nn.functional.pad(image[None, None], (radius,) * 4, mode="replicate")[0, 0]
     # shifted sums rather than a convolution, for which CUDA would load a library of its own

@@ -245,10 +245,9 @@ def prune(
     psnrs = view_psnrs(before, train, options)
     if not math.isfinite(whole := float(np.mean(psnrs))):
         raise DataError(f"{stored.folder}: training PSNR is {whole} dB, so its loss cannot be limited; fit again")
-    few = evenly_spaced(range(len(train)), TRIED_VIEWS)
 
     def loss(gaussians: Gaussians, on_all: bool) -> float:
-        rows = range(len(train)) if on_all else few
+        rows = range(len(train)) if on_all else evenly_spaced(range(len(train)), TRIED_VIEWS)
         tell(f"trying smaller models: number {next(tried)}, {len(gaussians):,} Gaussians, {len(rows)} views")
         return float(np.mean(psnrs[rows] - view_psnrs(gaussians, [train[i] for i in rows], options)))
 
@@ -415,8 +414,7 @@ def plot(
     with hold_file(out) as held:
         tell("rendering the plot")
         shown = {"size": (size[0], rows), "background": background, "cameras": cameras}
-        image = render_overview(gaussians, stored.options(), train, test, up, **shown)
-        if image is None:
+        if (image := render_overview(gaussians, stored.options(), train, test, up, **shown)) is None:
             raise DataError(f"{folder}: the model has no Gaussians; there is nothing to show")
         write_bytes(out, png(with_legend(image, legend, size[1], background)))
     what = "points of the reconstruction" if start else "Gaussians"
@@ -436,9 +434,8 @@ def prior_sheet(view: View, prior: Prior) -> np.ndarray:
         Tile("S_semantic = confidence (boundary + foreground)", semantic_score(*semantics).numpy()),
         Tile(f"S_geometry = |grad D| + {CURVATURE:g} kappa", geometry_score(disparity).numpy()),
     ]
-    size = f"{view.camera.width} x {view.camera.height} px"
     lines = [
-        f"{size}. Scores are scaled to the 2nd and 98th percentile of the view.",
+        f"{view.camera.width} x {view.camera.height} px. Scores are scaled to the 2nd and 98th percentile of the view.",
         f"Depth: {prior.depth_source}.",
         f"Semantics: {prior.semantics_source}. Mean foreground {prior.foreground.mean():.1%}.",
     ]

@@ -150,8 +150,7 @@ def convert(
     if holds_cameras(target):
         _check_for_cameras(filters, formats)
         found, notes = read_cameras(source)
-        origin = stated_origin(source)
-        if not origin.any():
+        if not (origin := stated_origin(source)).any():
             origin = origin_of(np.array([c.center for c in found.values()]))
         return [*notes, *_cameras_written(found, common_up(list(found.values())), target, filters, origin)]
     given = [find_format(f) for f in formats]

@@ -154,8 +154,7 @@ def take_steps(job: FitJob, trainer: Trainer) -> None:
             slow, compiled = trainer.step, len(job.compiled)
         if progress is not None:
             progress.total = trainer.steps  # fewer, once the fit is known to end earlier
-            seconds = None if r.step <= slow else r.seconds
-            progress.update(step=r.step, loss=r.loss, psnr=r.psnr, count=r.count, seconds=seconds)
+            progress.update(step=r.step, loss=r.loss, psnr=r.psnr, count=r.count, seconds=None if r.step <= slow else r.seconds)
         if log is not None:
             log.write(step=r.step, loss=r.loss, psnr=r.psnr, count=r.count, seconds=round(r.seconds, 6))
         job.tell(trainer)
@@ -614,8 +613,7 @@ def _score(
     moved: dict[str, float] = {}
     if compare and trainer.step * c.batch >= SHARP * steps_by_views(len(train), not scene.transparent):
         shown = counted(train, tell, "checking for moving objects", "views")
-        fractions = moved_fractions(train, (renders(v.camera) for v in shown))
-        moved = {v.name: f for v, f in zip(train, fractions, strict=True)}
+        moved = {v.name: f for v, f in zip(train, moved_fractions(train, (renders(v.camera) for v in shown)), strict=True)}
     complexity, cameras, scale = complexity_figures(trainer), folders.cameras_of(scene), scene.normalization.scale
     modules = {
         m.name: m.figures(FittedViews(learned.params_of(m), job.split.train, test, given, cameras, scale, gaussians, options))

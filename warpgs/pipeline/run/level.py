@@ -214,8 +214,7 @@ def picked(run: StoredRun, text: str, photographs: Mapping[str, np.ndarray]) -> 
 def distance(n: Normalization, first: Place, second: Place) -> tuple[float, float]:
     """Return the distance of two places [file units] and its relative standard deviation; UsageError for equal places."""
     apart = second[0] - first[0]
-    length = float(np.linalg.norm(apart))
-    if not length > LEAST:
+    if not (length := float(np.linalg.norm(apart))) > LEAST:
         raise UsageError("the two points are equal; pick two that are apart")
     return length / n.scale, math.sqrt((matmul(first[1] + second[1], apart) * apart).sum()) / length**2
 
@@ -379,8 +378,7 @@ def level(
     def change(run: StoredRun) -> Levelled:
         texts, length = (scale[:2], metres(scale[2])) if scale else (ground or (), 0.0)
         photos, why = photographs_of(run) if any(":" in text for text in texts) else ({}, "")
-        places = [picked(run, text, photos) for text in texts]
-        if not places:
+        if not (places := [picked(run, text, photos) for text in texts]):
             return photographed(run) if photographs else located(run, *(gps or [None]))
         n, line = scaled(run.normalization, *places, length) if scale else grounded(run, places)
         if names := dict.fromkeys(text.rpartition(":")[0] for text in texts if ":" in text):

@@ -510,8 +510,7 @@ def write_report(
             names = image_names(v.name for v in scene.views)
             covered = threads.submit(coverage_section, out, metrics["coverage"], [v.name for v in shown], names)
         opening = new_view(rig, train, renders)
-        overview = render_overview(renders.gaussians, renders.options, *cameras, rig.up)
-        if overview is not None:
+        if (overview := render_overview(renders.gaussians, renders.options, *cameras, rig.up)) is not None:
             opening.append((overview, "the Gaussians, training cameras teal" + ", held-out cameras orange" * bool(test)))
         pictures = [(threads.submit(webp, image), words) for image, words in opening]
         images = _images(shown, renders, {r["name"]: r for r in metrics["views"]}, tell)

@@ -112,8 +112,7 @@ class StudyRequest:
             raise UsageError(f"--seeds must be a number from 1 to {MAX_SEEDS}, not {self.seeds}")
         if len(self.variants) < 2:
             raise UsageError(f"a comparison needs at least two settings, not {', '.join(self.variants) or 'none'}")
-        names = [scene_name(s) for s in self.scenes]
-        if not names:
+        if not (names := [scene_name(s) for s in self.scenes]):
             raise UsageError("name at least one scene folder")
         if len(set(names)) < len(names):
             raise UsageError(f"two scene folders are named {', '.join(names)}, which names their results; rename one")
@@ -334,8 +333,7 @@ def ablation_variants(base: FitConfig) -> tuple[dict[str, FitConfig], dict[str, 
 
 def _parts(config: FitConfig) -> dict[str, Any]:
     """Return the value of each switch but events: the layers, and the settings of strategy paper that its parts have."""
-    own = config.strategy_config if config.strategy == "paper" else UNIFORM
-    return {"hier": config.method.hier, **dataclasses.asdict(own)}
+    return {"hier": config.method.hier, **dataclasses.asdict(config.strategy_config if config.strategy == "paper" else UNIFORM)}
 
 
 def _switched(base: FitConfig, switches: Mapping[str, bool]) -> FitConfig:
