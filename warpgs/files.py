@@ -184,7 +184,7 @@ def replacing(
     # the link is replaced.
     amount = "" if size is None else f"{size / 2**20:.1f} MiB " if size >= 2**20 else f"{size:,} bytes "
     with (
-        writable(path, amount=amount, note="; the old file is untouched"),
+        writable(path, amount=amount, note="; the old file is untouched" * os.path.lexists(path)),
         open_folder(path.parent) as folder,
         temporary_file(folder, suffix) as (name, file),
     ):

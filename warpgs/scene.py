@@ -410,8 +410,8 @@ RasterizedGaussians = Gaussians | ActivatedGaussians | CovarianceGaussians
 
 
 @document_fields
-@dataclass(frozen=True)
-class Render:
+@dataclass(frozen=True, repr=False)
+class Render(_Record):
     """Result of the rasterizer for one camera (no leading axis) or for a batch of C cameras (leading axis C).
 
     With ``RasterizeOptions.pixels``, images have one axis P instead of H and W.

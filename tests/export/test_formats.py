@@ -340,6 +340,8 @@ def test_sog_that_does_not_fit_on_the_disk_leaves_the_old_one(tmp_path):
     try:
         with pytest.raises(ResourceError, match=r"cannot be written.*the old file is untouched"):
             write_gaussians(path, model(3000), units="file")
+        with pytest.raises(ResourceError, match=r"cannot be written(?!.*old file)"):
+            write_gaussians(tmp_path / "new.ply", model(3000), units="file")
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert {p.name: p.read_bytes() for p in tmp_path.iterdir()} == old

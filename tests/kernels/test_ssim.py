@@ -52,7 +52,7 @@ def test_bad_input_names_the_argument():
     a, b = images(8, 9)
     with pytest.raises(TypeError, match=r"image must be float32 or float64, .* image\.float\(\) / 255 converts it"):
         ssim((255 * a).byte(), (255 * b).byte())
-    with pytest.raises(ValueError, match="target has colours up to 2.*: divide both by 255"):
+    with pytest.raises(ValueError, match=r"target has colours up to 2.*: divide both by 255"):
         ssim(255 * a, 255 * b)
     with pytest.raises(ValueError, match="target"):
         ssim(a, b[:5])

@@ -181,6 +181,12 @@ def test_absgrad_does_not_depend_on_how_it_is_rendered(device, options):
     assert float((found[0] - found[1]).norm()) <= 1e-5 * float(found[0].norm())
 
 
+def test_a_render_prints_shapes():
+    """Not its tensors."""
+    text = repr(rasterize(cloud(5), camera(40, 24, dtype=torch.float32)))
+    assert text.startswith("Render(rgb=[24, 40, 3], alpha=[24, 40]") and len(text) < 200
+
+
 def native_call(device, **options):
     """Gradients by `rasterize`, whose results are all read."""
     render = rasterize(
