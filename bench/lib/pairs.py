@@ -43,7 +43,7 @@ def drawn_pairs(projected: torch.Tensor, tiles: Tiles, width: int, height: int, 
     background = projected.new_zeros(len(projected), 3)
     rgb = blend(projected.detach().requires_grad_(), tiles, background, width=width, height=height, rule=rule)[0]
     # one past the last instance each pixel blended: the only whole numbers by pixel that are kept
-    ends = next(t for t in rgb.grad_fn.saved_tensors if t.dtype == torch.int32 and t.shape == rgb.shape[:3])
+    ends = next(t for t in rgb.grad_fn.saved_tensors if t is not None and t.dtype == torch.int32 and t.shape == rgb.shape[:3])
     columns, rows = -(-width // tiles.size), -(-height // tiles.size)
     drawn = torch.empty(ends.numel(), dtype=torch.int32, device=projected.device)
     with launch.stream_of(projected.device):
