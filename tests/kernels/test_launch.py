@@ -644,13 +644,14 @@ class Later:
 
 def test_modules_that_the_cache_lacks_load_ahead(cache, monkeypatch):
     """In order and in threads, once all are named; a launch waits for its module, and has its error; the end begins none."""
-    events, cpu = [], wp.get_device("cpu")
+    events, cpu, left = [], wp.get_device("cpu"), []
     asked, loading, ended = (threading.Event() for _ in range(3))
 
     def fail():
         raise ResourceError("no memory")
 
     def last():
+        left.append(threading.current_thread().daemon)
         loading.set()
         assert ended.wait(20)
 
@@ -670,6 +671,7 @@ def test_modules_that_the_cache_lacks_load_ahead(cache, monkeypatch):
     assert events[: len(steps)] == [f"name {name}" for name in steps] and len(names) > len(steps) and not native._AHEAD
     assert loads[0] == "load first in compile" and "load second in MainThread" in loads
     assert [e.split()[1] for e in loads if e.endswith("compile")] == ["first", "second", "third"]
+    assert left == [False]  # the process waits for it: a compiler that is at work when the libraries close ends in a crash
 
 
 def test_after_an_error_none_waits_for_a_module(cache, monkeypatch):

@@ -365,7 +365,7 @@ def test_files_without_their_metadata_have_the_same_pixels(progressive):
             ["skipped as earlier runs: b/run, posed", "photographs by folder: 1 in the folder itself, 1 in b, 1 in g"],
         ),
         (
-            "photos/a.png photos/.cache/b.png .trash/c.png env/pyvenv.cfg env/lib/d.png code/.git/HEAD code/docs/e.png "
+            "photos/a.png photos/.cache/b.png .trash/c.png env/pyvenv.cfg env/lib/d.png code/pyproject.toml code/docs/e.png "
             "run/renders/f.png run/config.json run/metrics.jsonl",
             "photos/a.png",
             ["skipped as earlier runs: run", "skipped as software: code, env"],

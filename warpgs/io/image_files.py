@@ -13,6 +13,7 @@ import itertools
 import math
 import os
 import re
+import shlex
 import struct
 import threading
 import warnings
@@ -77,7 +78,7 @@ def unread_note(folder: Path) -> str:
     """Return a sentence on the RAW files and videos of a folder, known by their suffix; empty for none."""
     files = sorted(p for p in folder.glob("[!.]*") if p.is_file())
     raw, videos = ([p for p in files if p.suffix.lower() in known] for known in (RAW_SUFFIXES, VIDEO_SUFFIXES))
-    kinds = (raw, RAW), (videos, f"a video; `warpgs fit {videos[0]}` takes its frames" if videos else "")
+    kinds = (raw, RAW), (videos, f"a video; `warpgs fit {shlex.quote(str(videos[0]))}` takes its frames" if videos else "")
     return "; ".join(f"{f[0].name} is {what}{f' ({len(f)} such files)' * (len(f) > 1)}" for f, what in kinds if f)
 
 

@@ -204,7 +204,12 @@ def list_images(folder: Path) -> list[Path]:
     """Return the image files below a folder, sorted by relative POSIX path."""
     # hidden files and folders are leavings of other programs ("._image.jpg", ".cache"), not images
     files = list[Path]()
-    for above, folders, names in os.walk(folder):
+
+    def passed(error: OSError) -> None:
+        if not isinstance(error, (PermissionError, FileNotFoundError, NotADirectoryError)):
+            raise error
+
+    for above, folders, names in os.walk(folder, onerror=passed):
         folders[:] = [name for name in folders if name[0] != "."]
         files += [p for name in names if name[0] != "." and (p := Path(above, name)).suffix.lower() in SUFFIXES and p.is_file()]
     return sorted(files, key=lambda p: p.relative_to(folder).as_posix())

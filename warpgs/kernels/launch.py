@@ -265,7 +265,9 @@ class _Recorded:
         raise TypeError(f"{self.kernel.key}: {label} must be {self.dtypes[i]} on {kind}, not {found}")
 
 
-_recorded = functools.cache(_Recorded)
+@functools.cache
+def _recorded(kernel, device: torch.device, block_dim: int) -> _Recorded:
+    return _Recorded(kernel, device, block_dim)
 
 
 class _OfThread(threading.local):
@@ -379,10 +381,14 @@ def launch(kernel, count: int, inputs: Sequence, device: torch.device, *, cost: 
             packed = [as_array(value, *array) if array else value for value, array in zip(inputs, _declared(kernel))]
             wp.launch(kernel, count, inputs=[0, *packed], device="cpu", record_tape=False)
         return
-    recorded = _OF_THREAD.recorded.get(kernel) or _Recorded(kernel, device, 1)  # compiled for blocks of one thread
-    with _LOADING if recorded.command is None else contextlib.nullcontext():
+    recorded = _OF_THREAD.recorded.get(kernel)
+    if recorded is None:
+        with _LOADING:  # launches on a CPU are compiled for blocks of one thread
+            recorded = _Recorded(kernel, device, 1)
+            first = recorded.patched(count, inputs)
+        _OF_THREAD.recorded[kernel] = recorded  # only now: a launch that failed has no command
+    else:
         first = recorded.patched(count, inputs)
-    _OF_THREAD.recorded[kernel] = recorded  # only now: a launch that failed has no command
     threads = torch.get_num_threads()
     if threads == 1 or count == 1 or count * cost < SERIAL_WORK:
         first.launch()
@@ -461,9 +467,10 @@ def kept(ctx: Any) -> tuple[Any, ...]:
     for tensor, place in zip(tensors, ctx.places, strict=True):
         if tensor is None:
             continue
-        (*then, address), now = place, [tensor.shape, tensor.dtype, tensor.device]
-        if now != then or (address is not None and tensor.data_ptr() != address):
-            before, after = (f"{list(s)} {t} on {d}" for s, t, d in (then, now))
+        shape, dtype, device, address = place
+        now = tensor.shape, tensor.dtype, tensor.device
+        if now != (shape, dtype, device) or (address is not None and tensor.data_ptr() != address):
+            before, after = (f"{list(s)} {t} on {d}" for s, t, d in ((shape, dtype, device), now))
             raise RuntimeError(
                 f"the .data of a tensor was replaced between the forward and the backward pass ({before}, now {after}): "
                 "replace it after the backward pass, or render again"
@@ -491,7 +498,8 @@ def first_order(backward: Callable[..., Any]) -> Callable[..., Any]:
 def without_gradient(name: str, values: torch.Tensor, source: torch.Tensor) -> torch.Tensor:
     """Return values [...]; a gradient through them is an error where ``source`` [...] requires gradients."""
     message = f"{name} has no gradient: use {name}.detach(), or a loss of rgb, alpha, depth or features instead"
-    return _Refusing.apply(message, values, source)
+    found: torch.Tensor = _Refusing.apply(message, values, source)
+    return found
 
 
 def refuse_transforms() -> None:

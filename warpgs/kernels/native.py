@@ -299,9 +299,10 @@ def loaded_ahead(modules: Iterable[tuple[wp.Module, int]], device: wp.Device) ->
 
     _AHEAD.update(made)
     try:
+        # no daemons: a compiler that is at work when the process ends brings it down
         for jobs in waiting.values():
             for _ in range(min(PER_FLAGS, max(1, usable_cores() // 2), len(jobs))):
-                threading.Thread(target=work, args=(jobs,), name="compile", daemon=True).start()
+                threading.Thread(target=work, args=(jobs,), name="compile").start()
         yield
         wait([future for future in made.values() if not future.cancel()])
     finally:

@@ -7,6 +7,7 @@ import torch
 import warp as wp
 
 from warpgs.device import BINNING, BLENDING, FLOAT, LOSS, PROJECTION, SAMPLING, Needs, StepSizes
+from warpgs.errors import UsageError
 from warpgs.kernels import launch, project_cpu, project_cuda
 from warpgs.kernels.cameras import CAMERA_MODELS
 from warpgs.kernels.ellipse import PROJECTED_SIZE, ProjectInputs
@@ -106,6 +107,8 @@ def project_inputs(inputs: ProjectInputs, settings: Pass) -> tuple[torch.Tensor,
     # Differentiable in the first seven tensors (docs/project.md). A Gaussian is culled, with results and gradients zero, if its
     # depth is below ``rule.near`` or above ``rule.far``, its opacity is below the cut-off, its box is outside the window, or a
     # parameter that is read is non-finite or outside the ranges of docs/conventions.md.
+    if inputs.distortion.requires_grad:
+        raise UsageError("gradients of distortion coefficients are not supported: give distortion.detach()")
     model = CAMERA_MODELS.find(settings.camera_model)
     scales, opacities = ("log_scales", "logit_opacities") if settings.parameters == "stored" else ("scales", "opacities")
     sizes = launch.check(

@@ -1,5 +1,6 @@
 """Structure from motion in a process of its own: what pycolmap is asked, and what it answers."""
 
+import contextlib
 import importlib.util
 import itertools
 import json
@@ -271,7 +272,8 @@ def match(pycolmap: Any, job: Json) -> Json:
     with pycolmap.Database.open(DATABASE) as database, ThreadPoolExecutor(1) as thread:
         call = thread.submit(pycolmap.match_image_pairs, DATABASE, matching, chosen, verification, pycolmap.Device.cpu)
         while not call.done():
-            _say(progress=f"matching: {database.num_matched_image_pairs()} of {len(pairs)} pairs")
+            with contextlib.suppress(Exception):  # progress alone: the matching itself raises its errors below
+                _say(progress=f"matching: {database.num_matched_image_pairs()} of {len(pairs)} pairs")
             wait([call], job["interval"])
         call.result()
     return matched(pycolmap, job, len(pairs))

@@ -214,8 +214,8 @@ MASK_FOLDERS = ("mask", "masks", "idrmasks")
 """Folders beside or below photographs that hold masks."""
 RUN_FILES = ("metrics.jsonl", "checkpoint.safetensors")
 """Files that identify, with a config.json, the folder of a run."""
-SOFTWARE_FILES = ("pyvenv.cfg", ".git")
-"""Files, one of which marks a virtual environment or a repository."""
+SOFTWARE_FILES = ("pyvenv.cfg", "pyproject.toml")
+"""Files, one of which marks a virtual environment or the source of a program."""
 SHOWN_FOLDERS = 10
 """Largest number of folders of photographs that a note names."""
 MATCHING_SIDE = 2000

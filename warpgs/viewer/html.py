@@ -167,7 +167,7 @@ def middle_first(cameras: Sequence[Camera], gaussians: Gaussians) -> list[Camera
     cameras, centers = [c for c, kept in zip(cameras, near) if kept], centers[near]
     means = gaussians.means.detach().cpu().double().numpy()
     seen = np.array([_seen(c, means[:: 1 + len(means) // 10_000])[0] for c in cameras], float)
-    covered = (matmul(seen, seen.T) / np.maximum(seen.sum(1), 1)).sum(1)  # of each other one, the part that is seen
+    covered = (seen @ seen.T / np.maximum(seen.sum(1), 1)).sum(1)  # the seen part of each other one, exact
     asides = np.linalg.norm(centers - centers.mean(0), axis=1)
     first = int(np.argmin(np.where(covered >= MOST * covered.max(), asides, math.inf)))
     # no part of whether photographs lie depends on the depth

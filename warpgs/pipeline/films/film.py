@@ -14,7 +14,7 @@ import torch
 from warpgs.device import background
 from warpgs.errors import UsageError, did_you_mean
 from warpgs.files import make_folder, write_bytes
-from warpgs.geometry import convert_camera
+from warpgs.geometry import convert_camera, pinhole_of
 from warpgs.locks import hold_file, hold_folder
 from warpgs.mesh.views import MIN_ALPHA
 from warpgs.pipeline.films import paths
@@ -237,6 +237,7 @@ def _cropped(camera: Camera, settings: FilmSettings) -> list[str]:
     """Return a line for the user on what frames of another shape do not show of a photograph."""
     if settings.size is None or settings.fov_y is not None:
         return []
+    camera = pinhole_of(camera)
     zooms = settings.size[0] / camera.width, settings.size[1] / camera.height
     now, whole = (math.degrees(2 * math.atan(0.5 * settings.size[1] / (z * camera.K[1, 1]))) for z in (max(zooms), min(zooms)))
     return [

@@ -1,5 +1,6 @@
 """Files from a run: filtered Gaussians, cameras, meshes."""
 
+import contextlib
 import copy
 import math
 import shlex
@@ -278,10 +279,14 @@ def mesh(
             + (f"; {lost} of the observed surface is outside the grid and left out" if lost != "0.0 %" else "")
         )
 
+    ahead = None
+    if target.suffix.lower() == ".glb":
+        with contextlib.suppress(OSError):  # the scene that the fit read can be out of reach
+            ahead = _ahead(run)
     with hold_file(target) as notes:
         found = fuse(run.scene_gaussians, cameras, run.options(), options, stage=stage, planned=planned)
         made = replace(found.mesh, vertices=convert_points(found.mesh.vertices, run.normalization.local, "scene", "file"))
-        write_mesh(target, made, up, run.normalization.origin, _ahead(run))
+        write_mesh(target, made, up, run.normalization.origin, ahead)
     remedies = ["--crop auto"] * (options.crop is None) + ["--fill-holes"] * (not options.fill_holes)
     lines = [
         f"{found.extracted:,} triangles extracted, {found.removed:,} small parts removed; the mesh has "

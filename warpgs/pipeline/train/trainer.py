@@ -407,6 +407,7 @@ class Trainer:
         self.taker.clear()
         shown = [*views, *(half_size(v) for v in views if self.half_resolution > 0)]
         shown, self.stacks, self.places = stack_views(shown, len(views))
+        self.taker.stacks = self.stacks  # the old ones are freed
         self.context.views = shown[: len(views)]
         self.table.settles = self.taker.cuda and self.captured and self.memory_limit is None and self.by_rows
         self.layout = Layout(
