@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import math
-import os
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
@@ -203,16 +202,8 @@ class LoadedImage:
 def list_images(folder: Path) -> list[Path]:
     """Return the image files below a folder, sorted by relative POSIX path."""
     # hidden files and folders are leavings of other programs ("._image.jpg", ".cache"), not images
-    files = list[Path]()
-
-    def passed(error: OSError) -> None:
-        if not isinstance(error, (PermissionError, FileNotFoundError, NotADirectoryError)):
-            raise error
-
-    for above, folders, names in os.walk(folder, onerror=passed):
-        folders[:] = [name for name in folders if name[0] != "."]
-        files += [p for name in names if name[0] != "." and (p := Path(above, name)).suffix.lower() in SUFFIXES and p.is_file()]
-    return sorted(files, key=lambda p: p.relative_to(folder).as_posix())
+    names = (p.relative_to(folder) for p in folder.rglob("*") if p.suffix.lower() in SUFFIXES and p.is_file())
+    return [folder / name for name in sorted(names, key=Path.as_posix) if all(part[0] != "." for part in name.parts)]
 
 
 def turn_upright(array: np.ndarray, orientation: int) -> np.ndarray:

@@ -39,9 +39,7 @@ OPAQUE = 0.5
 
 def scored_region(view: View) -> tuple[np.ndarray | None, str]:
     """Return the pixels that a render is scored on, bool [H, W], and their name; None for all."""
-    if view.score_mask is not None:
-        return view.score_mask, "score mask"
-    return counted_region(view)
+    return counted_region(view) if view.score_mask is None else (view.score_mask, "score mask")
 
 
 def counted_region(view: View) -> tuple[np.ndarray | None, str]:

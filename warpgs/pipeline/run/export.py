@@ -1,8 +1,8 @@
 """Files from a run: filtered Gaussians, cameras, meshes."""
 
-import contextlib
 import copy
 import math
+import os
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -112,7 +112,7 @@ def upward(stored: StoredRun) -> np.ndarray | None:
 def _ahead(stored: StoredRun) -> np.ndarray | None:
     """Return the mean viewing direction [3] in a run's files if their axes are arbitrary: poses were found, and no place."""
     scenes = stored.folder / POSED_SCENE, Path(stored.record["scene"]["path"] or stored.folder)
-    if stored.normalization.place is not None or not any((scene / POSES).is_file() for scene in scenes):
+    if stored.normalization.place is not None or not any(os.path.isfile(scene / POSES) for scene in scenes):
         return None
     return matmul(stored.normalization.rotation.T, np.mean([c.viewmat[2, :3] for c in training_cameras(stored)], axis=0))
 
@@ -279,10 +279,7 @@ def mesh(
             + (f"; {lost} of the observed surface is outside the grid and left out" if lost != "0.0 %" else "")
         )
 
-    ahead = None
-    if target.suffix.lower() == ".glb":
-        with contextlib.suppress(OSError):  # the scene that the fit read can be out of reach
-            ahead = _ahead(run)
+    ahead = _ahead(run)
     with hold_file(target) as notes:
         found = fuse(run.scene_gaussians, cameras, run.options(), options, stage=stage, planned=planned)
         made = replace(found.mesh, vertices=convert_points(found.mesh.vertices, run.normalization.local, "scene", "file"))

@@ -211,9 +211,7 @@ class Stopping:
 
     def sh_every(self, every: int, highest: int) -> int:
         """Return the steps between rises of the degree, at most ``every``, so that ``highest`` is in use when growth begins."""
-        if not self.active or highest == 0:
-            return every
-        return max(1, min(every, self.marks[0] // highest))
+        return max(1, min(every, self.marks[0] // highest)) if self.active and highest else every
 
     def due(self, step: int) -> bool:
         """Return whether the blocks are measured after a step."""
