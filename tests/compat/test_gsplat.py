@@ -262,6 +262,8 @@ def test_other_arguments_are_refused_by_name(arguments, message):
         assert isinstance(caught.value, warpgs.UsageError) and isinstance(caught.value, RuntimeError)
     with pytest.raises(TypeError, match=r"means must be a tensor, not an array; torch\.as_tensor\(means\) makes one"):
         gsplat.rasterization(**scene() | {"means": scene()["means"].numpy()})
+    with pytest.raises(TypeError, match=r"use RendererConfig_MixedBatch\(\)"):
+        gsplat.RendererConfig()
     with pytest.raises(TypeError, match="renderer_config must be"):
         gsplat.rasterization(**scene(), renderer_config=1)
 

@@ -47,6 +47,11 @@ class RollingShutterType(enum.IntEnum):
 class RendererConfig:
     """Base class of gsplat's choices of kernels."""
 
+    def __init__(self) -> None:
+        """Raise TypeError for the base class itself, as gsplat's own test wants it."""
+        if type(self) is RendererConfig:
+            raise TypeError("RendererConfig is a base class: use RendererConfig_MixedBatch()")
+
 
 class RendererConfig_MixedBatch(RendererConfig):
     """gsplat's default, which changes nothing here."""
