@@ -221,10 +221,10 @@ def step_limits(colors: np.ndarray, small_step: float = SMALL_STEP, large_step: 
     return np.rint(np.maximum(large_step * np.exp(-jumps / EDGE), 1.5 * small_step) * UNIT).astype(np.int16)
 
 
-def matching_costs_cpu(view: View, others: Sequence[View], inverses: np.ndarray) -> Tensor:
+def matching_costs_cpu(view: View, others: Sequence[View], inverses: np.ndarray, window: int = WINDOW) -> Tensor:
     """Return the disagreement of views at D inverse depths [1/u] in units of 1 / `UNIT`, as `plane_costs` does."""
     homographies = plane_homographies(view.camera, [o.camera for o in others], inverses)
-    return plane_costs(gray_of(view), [gray_of(o) for o in others], homographies, WINDOW, NOISE, UNIT)
+    return plane_costs(gray_of(view), [gray_of(o) for o in others], homographies, window, NOISE, UNIT)
 
 
 def path_costs(costs: Tensor, image: np.ndarray, small_step: float = SMALL_STEP, large_step: float = LARGE_STEP) -> Tensor:
