@@ -184,7 +184,7 @@ def plane_costs_tasks(point: Point, device: torch.device, wanted: Wanted) -> Tas
     gray = np.random.default_rng(0).random((point.height, point.width), np.float32)
     there = np.tile(np.eye(3), (PLANES, 4, 1, 1))
     there[..., 0, 2] = np.arange(PLANES)[:, None] / 2
-    yield Task(OURS, "forward", lambda: plane_costs(gray, [gray] * 4, there, 7, 6e-5, 4096))
+    yield Task(OURS, "forward", lambda: plane_costs(gray, [(gray, None)] * 4, there, 7, 6e-5, 4096))
 
 
 def plane_depths_tasks(point: Point, device: torch.device, wanted: Wanted) -> Tasks:

@@ -1,5 +1,7 @@
 """The plane sweep: matching costs, costs of paths, and the best plane."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -15,13 +17,14 @@ from warpgs.scene import Camera, View
 
 @pytest.mark.parametrize("size", [(7, 160), (160, 5), (1, 1), (40, 70)])
 def test_costs_are_those_of_opencv(size):
-    """Costs differ from those of OpenCV's warps and blurs by rounding, in images of any size, and at their borders."""
+    """Costs differ from those of OpenCV's warps and blurs by rounding, in images of any size, at borders, and with masks."""
     height, width = size
     views = []
     for v in still_life()[0]:
         c = v.camera
         views.append(View(v.name, Camera(c.viewmat, c.K, width, height), np.resize(v.image[40:], (height, width, 3))))
     views[2] = still_life()[0][2]  # of another size
+    views[2] = replace(views[2], mask=np.random.default_rng(0).random((12, 16)).repeat(10, 0).repeat(10, 1) < 0.7)
     inverses = np.linspace(1 / 12, 1 / 2, 21)
     found = matching_costs_cpu(views[1], [views[0], views[2]], inverses, 7).numpy()
     wanted = plane_costs.matching_costs(views[1], [views[0], views[2]], inverses, 7).transpose(1, 2, 0)

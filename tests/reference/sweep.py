@@ -25,10 +25,12 @@ def matching_costs(view: View, others: Sequence[View], inverses: np.ndarray, win
         for other, gray in zip(others, grays):
             H = plane_homography(view.camera, other.camera, inverse)
             warped = cv2.warpPerspective(gray, H, size, flags=flags, borderMode=cv2.BORDER_CONSTANT, borderValue=-1)
+            kept = np.ones(gray.shape, np.uint8) if other.mask is None else other.mask.astype(np.uint8)
+            votes = cv2.warpPerspective(kept, H, size, flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP) > 0
             m = cv2.blur(warped, box)
             v = np.maximum(cv2.blur(warped * warped, box) - m * m, 0) + NOISE
             cost = 0.5 - 0.5 * (cv2.blur(own * warped, box) - mean * m) / np.sqrt(v * variance)
-            costs.append(np.where(warped >= 0, cost, NEUTRAL))
+            costs.append(np.where(votes & (warped >= 0), cost, NEUTRAL))
         total[:] = 0.5 * np.mean(costs, 0) + 0.5 * np.min(costs, 0)
     return planes
 

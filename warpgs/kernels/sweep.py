@@ -209,6 +209,8 @@ WHITE = 4095
 """Brightness 1 as an integer: so fine that rounding is far below the noise of 8-bit images."""
 LOW = WHITE + 1
 """Added to colours while they are interpolated, so that the colour outside of an image, -`WHITE`, becomes positive."""
+SILENT = 2 * LOW
+"""Bit above the colours, set for masked pixels, which have no vote: their colour counts in windows around others alone."""
 MIDDLE = 2048
 """Subtracted from colours before they are multiplied, which keeps sums small."""
 NEUTRAL = 0.5
@@ -239,7 +241,7 @@ def warp_row(
     y: wp.int32, pitch: wp.int32, images: Ints, offset: wp.int32, other_width: wp.int32, other_height: wp.int32, h: Floats,
     first: wp.int32, ring: Ints, into: wp.int32,
 ):  # fmt: skip
-    """Write a row of the other image as the first camera sees it: centred colours, below -MIDDLE outside."""
+    """Write a row of the other image as the first camera sees it: twice the centred colours, plus 1 where it has no vote."""
     fy = float(y)
     cx = h[first + 1] * fy + h[first + 2]
     cy = h[first + 4] * fy + h[first + 5]
@@ -268,9 +270,12 @@ def warp_row(
             i = wp.max(offset + (iv >> 8) * stride + (iu >> 8), 0)
             a = images[i]
             b = images[i + stride]
-            upper = (a & 65535) * (256 - wx) + (a >> 16) * wx
-            lower = (b & 65535) * (256 - wx) + (b >> 16) * wx
-            found[lane] = ((upper * (256 - wy) + lower * wy + 32768) >> 16) - (LOW + MIDDLE)
+            upper = (a & (SILENT - 1)) * (256 - wx) + ((a >> 16) & (SILENT - 1)) * wx
+            lower = (b & (SILENT - 1)) * (256 - wx) + ((b >> 16) & (SILENT - 1)) * wx
+            color = ((upper * (256 - wy) + lower * wy + 32768) >> 16) - LOW
+            nearest = wp.where(wy < 128, a, b)
+            masked = wp.where(wx < 128, nearest, nearest >> 16) & SILENT
+            found[lane] = 2 * (color - MIDDLE) + wp.where(color < 0 or masked != 0, 1, 0)
         for lane in range(LANES):
             ring[at(into + x, lane)] = found[lane]
 
@@ -286,7 +291,7 @@ def add_row(
     for step in range(pitch // LANES):
         x = step * LANES
         for lane in range(LANES):
-            w = ring[at(slot + x, lane)]
+            w = ring[at(slot + x, lane)] >> 1
             signed = sign * w
             s[lane] = ring[at(sums + x, lane)] + signed
             q[lane] = ring[at(sums + side + x, lane)] + signed * w
@@ -326,7 +331,7 @@ def correlate_row(
             variance = wp.max(float(q[lane]) - float(s[lane]) * mean, 0.0) + noise
             shared = float(p[lane]) - float(own_sums[at(row + x, lane)]) * mean
             cost = 0.5 - 0.5 * (shared * roots[at(row + x, lane)]) / wp.sqrt(variance)
-            cost = wp.where(ring[at(slot + x, lane)] >= -MIDDLE, cost, NEUTRAL)
+            cost = wp.where((ring[at(slot + x, lane)] & 1) == 0, cost, NEUTRAL)
             before = wp.where(number == 0, 0.0, totals[at(total + x, lane)])
             lowest = wp.where(number == 0, 2.0, totals[at(least + x, lane)])
             sum_out[lane] = before + cost
@@ -415,10 +420,10 @@ def match(
                 costs[at(pixel, k)] = found[at(whole + (y * PLANES + k) * pitch, x)]
 
 
-def _packed(gray: np.ndarray) -> np.ndarray:
+def _packed(gray: np.ndarray, mask: np.ndarray | None) -> np.ndarray:
     """Return colours, int32, with a border of one outside pixel; the upper half of each number holds the right neighbour."""
     framed = np.ones((gray.shape[0] + 3, gray.shape[1] + 2), np.int32)
-    framed[1:-2, 1:-1] = _whole(gray) + LOW
+    framed[1:-2, 1:-1] = _whole(gray) + LOW + (0 if mask is None else SILENT * ~mask)
     framed = framed.ravel()
     return framed | (np.roll(framed, -1) << 16)
 
@@ -438,9 +443,10 @@ def _window_sums(values: np.ndarray, radius: int) -> np.ndarray:
 
 
 def plane_costs(
-    gray: np.ndarray, others: Sequence[np.ndarray], homographies: np.ndarray, window: int, noise: float, unit: int
-) -> torch.Tensor:
-    """Return the costs int16 [H, W, P] of an image [H, W] against others, warped by homographies [D, N, 3, 3] of D planes."""
+    gray: np.ndarray, others: Sequence[tuple[np.ndarray, np.ndarray | None]], homographies: np.ndarray, window: int,
+    noise: float, unit: int,
+) -> torch.Tensor:  # fmt: skip
+    """Return the costs int16 [H, W, P] of an image [H, W] against others and their masks, by homographies [D, N, 3, 3]."""
     # A window has at most 7 px: 49 squares of the largest colour, `WHITE` + `MIDDLE`, fit into 32 bits with a sign.
     # The cost of one other image is 0.5 (1 - correlation), with ``noise`` added to the variance; ``unit`` stands for cost 1.
     # The result is half the mean of these costs plus half the smallest: an image that does not see the point contributes, but
@@ -457,9 +463,9 @@ def plane_costs(
         torch.from_numpy(np.pad(a, [(0, 0), (0, pitch - width)]).astype(t).ravel())
         for a, t in ((centred, np.int32), (own_sums, np.int32), (roots, np.float32))
     )
-    images = [_packed(g) for g in others]
+    images = [_packed(*o) for o in others]
     starts = np.cumsum([0, *(len(i) for i in images[:-1])])
-    shapes = np.array([(s, g.shape[1], g.shape[0]) for s, g in zip(starts, others)], np.int32)
+    shapes = np.array([(s, g.shape[1], g.shape[0]) for s, (g, _) in zip(starts, others)], np.int32)
     tasks = -(-height // ROWS) * (padded // PLANES)
     ring = torch.empty(tasks * (window * pitch + 3 * (pitch + 2 * radius)), dtype=torch.int32, device="cpu")
     totals = torch.empty(tasks * 2 * ROWS * pitch, dtype=torch.float32, device="cpu")

@@ -224,7 +224,7 @@ def step_limits(colors: np.ndarray, small_step: float = SMALL_STEP, large_step: 
 def matching_costs_cpu(view: View, others: Sequence[View], inverses: np.ndarray, window: int = WINDOW) -> Tensor:
     """Return the disagreement of views at D inverse depths [1/u] in units of 1 / `UNIT`, as `plane_costs` does."""
     homographies = plane_homographies(view.camera, [o.camera for o in others], inverses)
-    return plane_costs(gray_of(view), [gray_of(o) for o in others], homographies, window, NOISE, UNIT)
+    return plane_costs(gray_of(view), [(gray_of(o), o.mask) for o in others], homographies, window, NOISE, UNIT)
 
 
 def path_costs(costs: Tensor, image: np.ndarray, small_step: float = SMALL_STEP, large_step: float = LARGE_STEP) -> Tensor:
@@ -278,7 +278,11 @@ def matching_costs_cuda(view: View, others: Sequence[View], inverses: np.ndarray
             m = box(warped)
             v = (box(warped * warped) - m * m).clamp(min=0) + NOISE
             cost = 0.5 - 0.5 * (box(own * warped) - mean * m) / (variance * v).sqrt()
-            cost = torch.where(warped >= 0, cost, NEUTRAL)
+            votes = warped >= 0
+            if other.mask is not None:
+                mask = torch.from_numpy(other.mask).to(device, torch.float32).expand(len(H), 1, -1, -1)
+                votes &= torch.nn.functional.grid_sample(mask, at, "nearest", align_corners=False) > 0
+            cost = torch.where(votes, cost, NEUTRAL)
             total = total + cost
             least = cost if least is None else torch.minimum(least, cost)
         found = (0.5 * least + total * (0.5 / len(others))).clamp(0, 1) * UNIT
@@ -324,7 +328,12 @@ def _reduced(view: View) -> View:
     width, height = max(1, int(c.width * shrink)), max(1, int(c.height * shrink))
     K = np.diag([width / c.width, height / c.height, 1]) @ c.K
     image = cv2.resize(view.image, (width, height), interpolation=cv2.INTER_AREA)
-    return View(view.name, replace(c, K=K, width=width, height=height), image)
+    mask = (
+        None
+        if view.mask is None
+        else cv2.resize(view.mask.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST) > 0
+    )
+    return View(view.name, replace(c, K=K, width=width, height=height), image, mask)
 
 
 def consistent_depth(views: dict[int, View], inverses: dict[int, np.ndarray], index: int, others: Sequence[int]) -> ViewDepth:
