@@ -49,16 +49,16 @@ def fits_table(results: dict[str, dict]) -> str:
     """Return medians of whole commands by capture and machine."""
     body = []
     for name, scene, words in (
-        ("wall_h200", "fern", "fern, 3 photographs of 504 x 378 px, H200"),
-        ("wall_h200", "temple", "temple, 4 photographs of 640 x 480 px, H200"),
-        ("wall_h200", "fox", "fox, 8 photographs of 1080 x 1920 px, H200"),
+        ("rows_h200", "fern:3", "fern, 3 photographs of 504 x 378 px, H200"),
+        ("rows_h200", "temple:4", "temple, 4 photographs of 640 x 480 px, H200"),
+        ("wall_h200", "fox llff:8", "fox, 8 photographs of 1080 x 1920 px, H200"),
         ("rows_h200", "fox:8", "fox, 8 photographs of 270 x 480 px, H200"),
         ("dense_h200", "fox:all", "fox, 43 photographs of 270 x 480 px, H200"),
         ("dense_h200", "horns:54", "horns, 54 photographs of 504 x 378 px, H200"),
         ("fern_cpu2", "", "fern, 3 photographs of 504 x 378 px, 2 cores"),
         ("temple_cpu2", "", "temple, 12 photographs of 640 x 480 px, 2 cores"),
     ):
-        rows = [r for r in results[name]["rows"] if r["side"] == "new" and r.get("scene", "").startswith(scene)]
+        rows = [r for r in results[name]["rows"] if r["side"] == "new" and scene in ("", r.get("scene"))]
         middle = {key: statistics.median(r[key] for r in rows) for key in ("setup", "training", "wall", "psnr")}
         body.append([words, f"{rows[0]['steps']:,}", *(f"{middle[k]:.0f}" for k in ("setup", "training", "wall"))])
         body[-1].append(f"{middle['psnr']:.2f}")
