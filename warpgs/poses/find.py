@@ -4,6 +4,7 @@ import hashlib
 import math
 import shutil
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ import numpy as np
 
 from warpgs import files, schema
 from warpgs.errors import DataError, UsageError
-from warpgs.io.folder import all_readers
+from warpgs.io.folder import all_readers, loaders
 from warpgs.io.image_files import MAX_PIXELS, unread_note
 from warpgs.poses import photographs as photos
 from warpgs.poses.mapping import EXHAUSTIVE, LEARNED, Mapping, camera_groups, cameras_of, check_installed, find_model
@@ -337,14 +338,18 @@ def _prepared(
             f"{source}: has {len(paths)} {what}{'s' if len(paths) != 1 else ''}; poses need at least {MIN_PHOTOGRAPHS}, "
             f"better 8 to 20 that overlap by two thirds{'; left out: ' + unread if unread else ''}"
         )
-    photographs, names = [], []
+    photographs, names = [], [f"{i:06d}.png" for i in range(len(paths))]
     if copies := photos.to_jpeg([p for p in paths if photos.is_heic(p)], root, work / "heic", max_pixels, progress):
         notes.append(f"{len(copies)} HEIC photograph{'s' if len(copies) != 1 else ''} converted to JPEG")
-    for i, path in enumerate(paths):
-        progress(f"reading photographs: {i + 1} of {len(paths)}")
-        names.append(f"{i:06d}.png")
+
+    def prepared(path: Path, name: str) -> photos.Photograph:
         file, below = (copies[path], work / "heic") if path in copies else (path, root)
-        photographs.append(photos.prepare(file, below, work / "small" / names[-1], max_pixels))
+        return photos.prepare(file, below, work / "small" / name, max_pixels)
+
+    with ThreadPoolExecutor(loaders()) as pool:
+        for photograph in pool.map(prepared, paths, names):
+            photographs.append(photograph)
+            progress(f"reading photographs: {len(photographs)} of {len(paths)}")
     taken: dict[str, Path] = {}
     for p, path in zip(photographs, paths):
         if (same := taken.setdefault(p.name, path)) is not path:
