@@ -5,7 +5,7 @@ import importlib.util
 import itertools
 import json
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from functools import cached_property
@@ -184,9 +184,9 @@ def _say(**values: Any) -> None:
     answer(json.dumps(values))
 
 
-def _in_steps(items: list, words: str, least: int = 1) -> Iterator[list]:
-    """Yield a list in about twenty parts of at least so many items, each after a line of progress."""
-    step = max(least, len(items) // 20)
+def _in_steps(items: list, words: str) -> Iterator[list]:
+    """Yield a list in about twenty parts, each after a line of progress."""
+    step = max(1, len(items) // 20)
     for begin in range(0, len(items), step):
         _say(progress=f"{words} {begin + 1} of {len(items)}")
         yield items[begin : begin + step]
@@ -213,10 +213,29 @@ def extract(pycolmap: Any, job: Json) -> None:
     """Write the SIFT features of the photographs into the database."""
     options = pycolmap.FeatureExtractionOptions()
     options.num_threads, options.use_gpu, options.sift.peak_threshold = job["threads"], False, PEAK
-    mode, reader = pycolmap.CameraMode.AUTO, pycolmap.ImageReaderOptions()
-    # each thread processes one photograph
-    for names in _in_steps(job["names"], "finding features: photograph", job["threads"]):
-        pycolmap.extract_features(DATABASE, IMAGES, names, mode, reader, options, pycolmap.Device.cpu)
+    mode, reader, names = pycolmap.CameraMode.AUTO, pycolmap.ImageReaderOptions(), job["names"]
+    with pycolmap.Database.open(DATABASE) as database:
+        order = numbers_of(database, job)
+
+        def progress() -> str:
+            return f"finding features: {sum(map(database.exists_keypoints, order))} of {len(names)} photographs"
+
+        _watched(
+            lambda: pycolmap.extract_features(DATABASE, IMAGES, names, mode, reader, options, pycolmap.Device.cpu),
+            progress,
+            job,
+        )
+
+
+def _watched(call: Callable[[], object], progress: Callable[[], str], job: Json) -> None:
+    """Run a call of pycolmap, and tell meanwhile how far it is by the rows of its results."""
+    with ThreadPoolExecutor(1) as thread:
+        running = thread.submit(call)
+        while not running.done():
+            with contextlib.suppress(Exception):  # progress alone: the call itself raises its errors below
+                _say(progress=progress())
+            wait([running], job["interval"])
+        running.result()
 
 
 def numbers_of(database: Any, job: Json) -> list[int]:
@@ -268,14 +287,12 @@ def match(pycolmap: Any, job: Json) -> Json:
     chosen = pycolmap.ImportedPairingOptions()
     chosen.match_list_path = PAIRS
     _write_pairs(pairs, job)
-    # one call, since each call indexes the descriptors of its photographs anew; meanwhile the rows of its results are counted
-    with pycolmap.Database.open(DATABASE) as database, ThreadPoolExecutor(1) as thread:
-        call = thread.submit(pycolmap.match_image_pairs, DATABASE, matching, chosen, verification, pycolmap.Device.cpu)
-        while not call.done():
-            with contextlib.suppress(Exception):  # progress alone: the matching itself raises its errors below
-                _say(progress=f"matching: {database.num_matched_image_pairs()} of {len(pairs)} pairs")
-            wait([call], job["interval"])
-        call.result()
+    # one call, since each call indexes the descriptors of its photographs anew
+    with pycolmap.Database.open(DATABASE) as database:
+        _watched(
+            lambda: pycolmap.match_image_pairs(DATABASE, matching, chosen, verification, pycolmap.Device.cpu),
+            lambda: f"matching: {database.num_matched_image_pairs()} of {len(pairs)} pairs", job,
+        )  # fmt: skip
     return matched(pycolmap, job, len(pairs))
 
 
