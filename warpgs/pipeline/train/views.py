@@ -241,6 +241,13 @@ class ViewStack:
     """Opacity of the subject, shape [V, H, W]; None if no training view has one."""
 
 
+def batch_of(cameras: Sequence[Camera]) -> Camera:
+    """Return cameras of one image size and model, on a device, as one batch."""
+    distortion = None if cameras[0].distortion is None else torch.stack([c.distortion for c in cameras])
+    viewmats, Ks = torch.stack([c.viewmat for c in cameras]), torch.stack([c.K for c in cameras])
+    return replace(cameras[0], viewmat=viewmats, K=Ks, distortion=distortion)
+
+
 def camera_at(cameras: Camera, i: int) -> Camera:
     """Return camera ``i`` of a batch."""
     distortion = None if cameras.distortion is None else cameras.distortion[i]
@@ -280,11 +287,9 @@ def stack_views(views: list[TrainingView], count: int) -> tuple[list[TrainingVie
     stacks, shared = {}, list(views)
     for kind, numbers in rows.items():
         same = [views[i] for i in numbers]
-        given, first = [v.given for v in same], same[0]
-        distortion = None if first.given.distortion is None else torch.stack([c.distortion for c in given])
-        viewmats, Ks = torch.stack([c.viewmat for c in given]), torch.stack([c.K for c in given])
+        first = same[0]
         stacks[kind] = stack = ViewStack(
-            replace(first.given, viewmat=viewmats, K=Ks, distortion=distortion),
+            batch_of([v.given for v in same]),
             stacked([v.image for v in same]), None if first.mask is None else stacked([v.mask for v in same]),
             {n: stacked([v.maps[n] for v in same]) for n in first.maps},
             torch.tensor([i % count for i in numbers], device=first.image.device, dtype=torch.int64),

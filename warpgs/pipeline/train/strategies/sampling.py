@@ -1,5 +1,6 @@
 """Sampling: fine Gaussians are added behind pixels of the training views, in two layers, and protected for some steps."""
 
+import itertools
 import math
 from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -17,7 +18,7 @@ from warpgs.pipeline.model.table import Column, DensityUpdate
 from warpgs.pipeline.train.schedule import Phases
 from warpgs.pipeline.train.strategies.base import Growth, Strategy, StrategyContext, register
 from warpgs.pipeline.train.strategies.clone_split import GradientGrowth
-from warpgs.pipeline.train.views import TrainingView, half_size_camera
+from warpgs.pipeline.train.views import TrainingView, batch_of, half_size_camera
 from warpgs.plugins import is_ours
 from warpgs.render.options import RasterizeOptions
 from warpgs.render.rasterize import rasterize
@@ -30,8 +31,9 @@ NOT_SAMPLED = -(2**30)
 """Value of ``created_step`` in the coarse layer, whose Gaussians were not sampled."""
 MAX_VIEWS = 8
 """Largest number of views in which one event samples; of more views, a random subset is taken."""
-MAX_WEIGHED = 32
-"""Largest number of views over which blending weights are summed to choose Gaussians for eviction."""
+MAX_WEIGHED, WEIGHED_SIZE = 32, 2**21
+"""Largest number of views over which blending weights are summed to choose Gaussians for eviction; and, without a memory limit,
+of Gaussians or pixels of several views at a time, about 64 bytes each."""
 MIN_ALPHA, BORDER = 0.5, 2
 """Rendered opacity above which a pixel may receive a Gaussian, and width of the image border in which none is sampled [px]."""
 OPACITY = 0.1
@@ -170,10 +172,16 @@ def fine_gaussians(
 
 def weight_sums(gaussians: Gaussians, cameras: list[Camera], options: RasterizeOptions) -> torch.Tensor:
     """Return the sum of blending weights of each Gaussian over at most `MAX_WEIGHED` cameras, evenly spaced, shape [N]."""
-    weigh = replace(options, contributions=True)
+    weigh = replace(options, contributions=True, sh_degree=0)
     total = torch.zeros(len(gaussians), device=gaussians.means.device, dtype=torch.float32)
-    for camera in cameras[:: -(-len(cameras) // MAX_WEIGHED)]:
-        total += rasterize(gaussians, camera, weigh).weight_sums[0]
+    for _, same in itertools.groupby(cameras[:: -(-len(cameras) // MAX_WEIGHED)], lambda c: (c.width, c.height, c.model)):
+        left = [*same]
+        size = max(len(gaussians), left[0].width * left[0].height)
+        at_once = 1 if options.max_instances else max(1, WEIGHED_SIZE // size)
+        while left:
+            for weights in rasterize(gaussians, batch_of(left[:at_once]), weigh).weight_sums:
+                total += weights
+            left = left[at_once:]
     return total
 
 
