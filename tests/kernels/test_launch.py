@@ -661,7 +661,7 @@ def test_modules_that_the_cache_lacks_load_ahead(cache, monkeypatch):
     modules = {name: Later(name, "flags", events, step) for name, step in steps.items()}
     (cache / "there").mkdir(parents=True)
     with native.told_of_compiling(lambda name: asked.set()) as seconds:  # the launch waits, and says so
-        with native.loaded_ahead([(m, 1) for m in modules.values()], cpu):
+        with native.loaded_ahead([(m, 1, cpu) for m in modules.values()]):
             assert native.load_module(modules["first"], cpu, 1) and len(seconds) == 1
             assert loading.wait(20)
             with pytest.raises(ResourceError, match="no memory"):
@@ -684,7 +684,7 @@ def test_after_an_error_none_waits_for_a_module(cache, monkeypatch):
     modules = {name: Later(name, "flags", events, step) for name, step in steps.items()}
     (cache / "locks").mkdir(parents=True)
     with ThreadPoolExecutor(1) as other, native.told_of_compiling(lambda name: asked.set()):
-        with pytest.raises(KeyboardInterrupt), native.loaded_ahead([(m, 1) for m in modules.values()], cpu):
+        with pytest.raises(KeyboardInterrupt), native.loaded_ahead([(m, 1, cpu) for m in modules.values()]):
             launched = other.submit(native.load_module, modules["second"], cpu, 1)
             assert begun.wait(20) and asked.wait(20)
             raise KeyboardInterrupt

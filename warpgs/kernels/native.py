@@ -266,28 +266,28 @@ def lock_of(name: str, device: wp.Device) -> Path:
 _AHEAD: dict[tuple[wp.Module, object, int], Future[object]] = {}
 """Modules that threads of `loaded_ahead` are to load, by the key of `_LOADED`."""
 PER_FLAGS = 4
-"""Most threads that compile modules with the same compiler flags: each has to precompile Warp's headers first."""
+"""Most threads that compile modules for the CPU with the same flags: each has to precompile Warp's headers first."""
 
 
 @contextlib.contextmanager
-def loaded_ahead(modules: Iterable[tuple[wp.Module, int]], device: wp.Device) -> Iterator[None]:
-    """Compile and load modules that the cache lacks in threads during the block, in this order, each for a size of blocks.
+def loaded_ahead(modules: Iterable[tuple[wp.Module, int, wp.Device]]) -> Iterator[None]:
+    """Compile and load modules that the cache lacks in threads during the block, in this order, by size of blocks and device.
 
     `load_module` waits for such a module and raises its error. A module that is not begun when the block ends is left out, and
     after an error none is waited for.
     """
     # Names are computed before any module is compiled: Warp's hash of a module depends on which modules were compiled before
     # it in the process, and another process would not find it in the cache.
-    missing = [(m, block) for m, block in modules if not is_cached(module_name(m, block))]
-    made: dict[tuple[wp.Module, object, int], Future[object]] = {(m, device.context, block): Future() for m, block in missing}
-    waiting: dict[str, deque[tuple[wp.Module, int]]] = {}
-    for module, block in missing:
-        waiting.setdefault(module.options["cpu_compiler_flags"], deque()).append((module, block))
+    missing = [(m, block, device) for m, block, device in modules if not is_cached(module_name(m, block))]
+    made: dict[tuple[wp.Module, object, int], Future[object]] = {(m, on.context, block): Future() for m, block, on in missing}
+    waiting: dict[str | None, deque[tuple[wp.Module, int, wp.Device]]] = {}
+    for job in missing:
+        waiting.setdefault(None if job[2].is_cuda else job[0].options["cpu_compiler_flags"], deque()).append(job)
 
-    def work(jobs: deque[tuple[wp.Module, int]]) -> None:
+    def work(jobs: deque[tuple[wp.Module, int, wp.Device]]) -> None:
         while True:
             try:
-                module, block = jobs.popleft()
+                module, block, device = jobs.popleft()
             except IndexError:
                 return
             future = made[module, device.context, block]
@@ -300,8 +300,8 @@ def loaded_ahead(modules: Iterable[tuple[wp.Module, int]], device: wp.Device) ->
     _AHEAD.update(made)
     try:
         # no daemons: a compiler that is at work when the process ends brings it down
-        for jobs in waiting.values():
-            for _ in range(min(PER_FLAGS, max(1, usable_cores() // 2), len(jobs))):
+        for flags, jobs in waiting.items():
+            for _ in range(min(len(jobs) if flags is None else PER_FLAGS, max(1, usable_cores() // 2), len(jobs))):
                 threading.Thread(target=work, args=(jobs,), name="compile").start()
         yield
         wait([future for future in made.values() if not future.cancel()])

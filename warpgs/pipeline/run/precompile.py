@@ -82,16 +82,18 @@ def scoring() -> wp.Kernel:
 
 
 @contextlib.contextmanager
-def compiled_ahead(device: torch.device) -> Iterator[list[tuple[wp.Kernel, int]]]:
-    """Compile modules for the CPU that a fit needs and the cache lacks in threads during the block; yield `fit_kernels`.
+def compiled_ahead(*devices: torch.device, calls: bool = False) -> Iterator[list[tuple[wp.Kernel, int, torch.device]]]:
+    """Compile modules that fits on devices, and with ``calls`` `call_kernels`, need and the cache lacks, in threads.
 
-    A launch that needs a module waits for it or compiles it, and raises its error.
+    The threads begin no module after the block, which gets the kernels, block sizes and devices. A launch that needs a module
+    waits for it or compiles it, and raises its error.
     """
-    kernels = fit_kernels(device.type == "cuda")
-    # NVRTC compiles for one thread of a process at a time, and more processes gained .5 s (docs/decisions/032)
-    ahead = kernels if device.type == "cpu" else [(scoring(), 1)]
-    with loaded_ahead([(kernel.module, block) for kernel, block in ahead], wp.get_device("cpu")):
-        yield kernels
+    sets = [(device, device.type == "cuda") for device in devices]
+    jobs = [(*job, on) for on, cuda in sets for job in [*fit_kernels(cuda), *(call_kernels(cuda) if calls else ())]]
+    if all(cuda for _, cuda in sets):
+        jobs.append((scoring(), 1, torch.device("cpu")))
+    with loaded_ahead((kernel.module, block, warp_device(device)) for kernel, block, device in jobs):
+        yield jobs
 
 
 def precompile_kernels(devices: list[torch.device] | None = None) -> Iterator[tuple[str, str, int, bool, float]]:
@@ -102,12 +104,11 @@ def precompile_kernels(devices: list[torch.device] | None = None) -> Iterator[tu
     if devices is None:
         devices = [torch.device("cpu"), *(torch.device("cuda", i) for i in range(torch.cuda.device_count()))]
     began, wall = time.perf_counter(), time.time()
-    for device in devices:
-        with compiled_ahead(device) as kernels:
-            for kernel, block in [*kernels, *call_kernels(device.type == "cuda")]:
-                path = Path(load_module(kernel.module, warp_device(device), block).binary_path)
-                name = f"{kernel.func.__module__.rpartition('.')[2]}.{kernel.func.__name__}"
-                yield str(device), name, block, path.stat().st_mtime >= wall, time.perf_counter() - began
+    with compiled_ahead(*devices, calls=True) as jobs:
+        for kernel, block, device in jobs:
+            path = Path(load_module(kernel.module, warp_device(device), block).binary_path)
+            name = f"{kernel.func.__module__.rpartition('.')[2]}.{kernel.func.__name__}"
+            yield str(device), name, block, path.stat().st_mtime >= wall, time.perf_counter() - began
 
 
 def print_warming(devices: list[torch.device] | None = None) -> None:
