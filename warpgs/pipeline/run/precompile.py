@@ -25,6 +25,9 @@ THREADS = 256
 CAMERA_MODEL = "pinhole"
 """Camera model whose kernels are compiled: the model of scenes read without native lenses."""
 
+AFTER_STEP = 9
+"""Number of kernels at the end of `fit_kernels` on the CPU that are launched after the first step."""
+
 
 def fit_kernels(cuda: bool) -> list[tuple[wp.Kernel, int]]:
     """Return a kernel of each module that a fit on CUDA or on the CPU launches, with its block size, in the order of need."""
@@ -88,11 +91,11 @@ def compiled_ahead(*devices: torch.device, calls: bool = False) -> Iterator[list
     The threads begin no module after the block, which gets the kernels, block sizes and devices. A launch that needs a module
     waits for it or compiles it, and raises its error.
     """
-    sets = [(device, device.type == "cuda") for device in devices]
-    jobs = [(*job, on) for on, cuda in sets for job in [*fit_kernels(cuda), *(call_kernels(cuda) if calls else ())]]
-    if all(cuda for _, cuda in sets):
-        jobs.append((scoring(), 1, torch.device("cpu")))
-    with loaded_ahead((kernel.module, block, warp_device(device)) for kernel, block, device in jobs):
+    jobs = [] if (cpu := torch.device("cpu")) in devices else [(scoring(), 1, cpu)]
+    for device, cuda in [(device, device.type == "cuda") for device in devices]:
+        jobs += [(*job, device) for job in [*fit_kernels(cuda), *(call_kernels(cuda) if calls else ())]]
+    later = AFTER_STEP if devices == (cpu,) and not calls else 0
+    with loaded_ahead([(kernel.module, warp_device(device), block) for kernel, block, device in jobs], later):
         yield jobs
 
 
