@@ -1,5 +1,6 @@
 """Launches cover every item once and check their arguments; modules load once; an arena gives tensors at the same places."""
 
+import contextlib
 import dataclasses
 import os
 import subprocess
@@ -571,6 +572,14 @@ def test_a_module_has_its_name_whatever_was_compiled_before(cache, monkeypatch, 
     assert native.module_name(second_of_two.module, 1) == name
 
 
+def test_a_kernel_for_the_cpu_is_compiled_in_one_form(cache):
+    """Only for arrays without gaps; Warp would also compile the form for others."""
+    load_module_mark.module.unload()
+    native.load_module(load_module_mark.module, wp.get_device("cpu"), 1)
+    text = next(cache.rglob("*.cpp")).read_text("utf-8")
+    assert "_forward_tasks<true>(dim" in text and "_tasks<false>" not in text
+
+
 def test_a_loaded_module_takes_no_lock(cache, monkeypatch):
     """Neither the second launch nor any later one opens a file."""
     seen = torch.zeros(3, dtype=torch.int32)
@@ -661,7 +670,7 @@ def test_modules_that_the_cache_lacks_load_ahead(cache, monkeypatch):
     modules = {name: Later(name, "flags", events, step) for name, step in steps.items()}
     (cache / "there").mkdir(parents=True)
     with native.told_of_compiling(lambda name: asked.set()) as seconds:  # the launch waits, and says so
-        with native.loaded_ahead([(m, 1) for m in modules.values()], cpu):
+        with native.loaded_ahead([(m, cpu, 1) for m in modules.values()]):
             assert native.load_module(modules["first"], cpu, 1) and len(seconds) == 1
             assert loading.wait(20)
             with pytest.raises(ResourceError, match="no memory"):
@@ -674,6 +683,31 @@ def test_modules_that_the_cache_lacks_load_ahead(cache, monkeypatch):
     assert left == [False]  # the process waits for it: a compiler that is at work when the libraries close ends in a crash
 
 
+def test_the_last_modules_are_begun_once_the_others_are_done(cache, monkeypatch):
+    """Also those with other compiler flags, which another thread compiles; an error ends the wait for those not begun."""
+    events, cpu = [], wp.get_device("cpu")
+    begun, go = threading.Event(), threading.Event()
+    monkeypatch.setattr(native, "usable_cores", lambda: 2)
+    monkeypatch.setattr(native, "_LOADED", set())
+    steps = {"first": lambda: begun.set() or go.wait(20), "second": lambda: True, "other": lambda: True}
+    for name, error in (("", None), ("again", KeyboardInterrupt)):
+        modules = [Later(f"{kind}{name}", kind == "other", events, step) for kind, step in steps.items()]
+        with pytest.raises(error) if error else contextlib.nullcontext():
+            with native.loaded_ahead([(m, cpu, 1) for m in modules], later=1):
+                assert begun.wait(20) and not go.wait(0.2) and not any(e.startswith("load other") for e in events)
+                if error:
+                    raise error
+                go.set()
+                assert native.load_module(modules[2], cpu, 1)
+        go.set()
+        for thread in [t for t in threading.enumerate() if t.name.startswith("compile")]:
+            thread.join(20)
+        assert not any(t.name.startswith("compile") for t in threading.enumerate())
+        loads = [e.split()[1].removesuffix(name) for e in events if e.endswith("compile")]
+        assert loads == (["first", "other"] if error else ["first", "second", "other"])
+        events.clear(), begun.clear(), go.clear()
+
+
 def test_after_an_error_none_waits_for_a_module(cache, monkeypatch):
     """Not the block for the module at hand, and no thread for one that was not begun: it loads that itself."""
     events, cpu = [], wp.get_device("cpu")
@@ -684,7 +718,7 @@ def test_after_an_error_none_waits_for_a_module(cache, monkeypatch):
     modules = {name: Later(name, "flags", events, step) for name, step in steps.items()}
     (cache / "locks").mkdir(parents=True)
     with ThreadPoolExecutor(1) as other, native.told_of_compiling(lambda name: asked.set()):
-        with pytest.raises(KeyboardInterrupt), native.loaded_ahead([(m, 1) for m in modules.values()], cpu):
+        with pytest.raises(KeyboardInterrupt), native.loaded_ahead([(m, cpu, 1) for m in modules.values()]):
             launched = other.submit(native.load_module, modules["second"], cpu, 1)
             assert begun.wait(20) and asked.wait(20)
             raise KeyboardInterrupt

@@ -8,11 +8,11 @@ import math
 import re
 import threading
 import time
-from collections import deque
-from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import CancelledError, Future, wait
+from collections.abc import Callable, Iterator
+from concurrent.futures import CancelledError, Future, ThreadPoolExecutor, wait
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import warp as wp
 from filelock import lock_descriptor, unlock_descriptor
@@ -228,6 +228,13 @@ def load_module(module: wp.Module, device: wp.Device, block_dim: int):
         return _load(module, device, block_dim)  # raises an error of the thread, too
 
 
+def _packed_text(module: wp.Module, *given: object) -> tuple[object, ...]:
+    """Return what Warp's generator of text for the compiler does, without the forms of kernels for arrays with gaps."""
+    # Warp 1.19 adds this form to most kernels for the CPU, for 29 % of the time; no launch passes such arrays of one axis
+    text, *others = type(module)._run_codegen(module, *given)
+    return re.sub(r" *if \(wp_linear_contiguous\)\n(.*<true>.*\n) *else\n.*<false>.*", r"\1", text), *others
+
+
 def _load(module: wp.Module, device: wp.Device, block_dim: int, tells: bool = True):
     """Load a module as `load_module` does, on this thread; tell no listener if ``tells`` is False."""
     # Fits that start at once on a fresh machine need the same modules: a file lock makes one compile, and the others find the
@@ -235,6 +242,7 @@ def _load(module: wp.Module, device: wp.Device, block_dim: int, tells: bool = Tr
     with exclusive(lock_of(name := module_name(module, block_dim), device)):
         compiles, began = not is_cached(name), time.perf_counter()
         told = tuple(_LISTENERS) if compiles else ()
+        module._run_codegen = functools.partial(_packed_text, module)
         for listener, _ in told if tells else ():
             listener(name)
         with _announced() if compiles and not told else contextlib.nullcontext():
@@ -266,49 +274,42 @@ def lock_of(name: str, device: wp.Device) -> Path:
 _AHEAD: dict[tuple[wp.Module, object, int], Future[object]] = {}
 """Modules that threads of `loaded_ahead` are to load, by the key of `_LOADED`."""
 PER_FLAGS = 4
-"""Most threads that compile modules with the same compiler flags: each has to precompile Warp's headers first."""
+"""Most threads that compile modules for the CPU with the same flags: each has to precompile Warp's headers first."""
 
 
 @contextlib.contextmanager
-def loaded_ahead(modules: Iterable[tuple[wp.Module, int]], device: wp.Device) -> Iterator[None]:
-    """Compile and load modules that the cache lacks in threads during the block, in this order, each for a size of blocks.
+def loaded_ahead(modules: list[tuple[wp.Module, wp.Device, int]], later: int = 0) -> Iterator[None]:
+    """Compile and load modules that the cache lacks in threads during the block, in this order, by device and size of blocks.
 
-    `load_module` waits for such a module and raises its error. A module that is not begun when the block ends is left out, and
-    after an error none is waited for.
+    The last ``later`` modules are begun once the others are done. `load_module` waits for such a module and raises its error. A
+    module that is not begun when the block ends is left out, and after an error none is waited for.
     """
     # Names are computed before any module is compiled: Warp's hash of a module depends on which modules were compiled before
     # it in the process, and another process would not find it in the cache.
-    missing = [(m, block) for m, block in modules if not is_cached(module_name(m, block))]
-    made: dict[tuple[wp.Module, object, int], Future[object]] = {(m, device.context, block): Future() for m, block in missing}
-    waiting: dict[str, deque[tuple[wp.Module, int]]] = {}
-    for module, block in missing:
-        waiting.setdefault(module.options["cpu_compiler_flags"], deque()).append((module, block))
+    missing = [job for job in modules if not is_cached(module_name(job[0], job[2]))]
+    last, most, needed = modules[len(modules) - later :], max(1, usable_cores() // 2), list[Future[object]]()
+    pools: dict[str | None, ThreadPoolExecutor] = {}
+    made: dict[tuple[wp.Module, object, int], Future[object]] = {}
 
-    def work(jobs: deque[tuple[wp.Module, int]]) -> None:
-        while True:
-            try:
-                module, block = jobs.popleft()
-            except IndexError:
-                return
-            future = made[module, device.context, block]
-            if future.set_running_or_notify_cancel():
-                try:
-                    future.set_result(_load(module, device, block, False))
-                except BaseException as e:  # the launch that needs the module tries again, and raises it
-                    future.set_exception(e)
+    def load(*job: Any) -> object:
+        wait(needed if job in last else [])
+        return _load(*job, False)  # after an error, the launch that needs the module tries again, and raises it
 
-    _AHEAD.update(made)
     try:
-        # no daemons: a compiler that is at work when the process ends brings it down
-        for jobs in waiting.values():
-            for _ in range(min(PER_FLAGS, max(1, usable_cores() // 2), len(jobs))):
-                threading.Thread(target=work, args=(jobs,), name="compile").start()
+        for job in missing:
+            module, device, block = job
+            key, flags = (module, device.context, block), None if device.is_cuda else module.options["cpu_compiler_flags"]
+            # no daemons: a compiler at work when the process ends brings it down; the threads end with the pool
+            pool = pools.setdefault(flags, ThreadPoolExecutor(most if flags is None else min(PER_FLAGS, most), "compile"))
+            made[key] = _AHEAD[key] = pool.submit(load, *job)
+            if job not in last:
+                needed.append(made[key])
         yield
         wait([future for future in made.values() if not future.cancel()])
     finally:
         for key, future in made.items():
             future.cancel()
-            del _AHEAD[key]
+            _AHEAD.pop(key, None)
 
 
 @contextlib.contextmanager

@@ -25,6 +25,9 @@ THREADS = 256
 CAMERA_MODEL = "pinhole"
 """Camera model whose kernels are compiled: the model of scenes read without native lenses."""
 
+AFTER_STEP = 9
+"""Number of kernels at the end of `fit_kernels` on the CPU that are launched after the first step."""
+
 
 def fit_kernels(cuda: bool) -> list[tuple[wp.Kernel, int]]:
     """Return a kernel of each module that a fit on CUDA or on the CPU launches, with its block size, in the order of need."""
@@ -82,16 +85,18 @@ def scoring() -> wp.Kernel:
 
 
 @contextlib.contextmanager
-def compiled_ahead(device: torch.device) -> Iterator[list[tuple[wp.Kernel, int]]]:
-    """Compile modules for the CPU that a fit needs and the cache lacks in threads during the block; yield `fit_kernels`.
+def compiled_ahead(*devices: torch.device, calls: bool = False) -> Iterator[list[tuple[wp.Kernel, int, torch.device]]]:
+    """Compile modules that fits on devices, and with ``calls`` `call_kernels`, need and the cache lacks, in threads.
 
-    A launch that needs a module waits for it or compiles it, and raises its error.
+    The threads begin no module after the block, which gets the kernels, block sizes and devices. A launch that needs a module
+    waits for it or compiles it, and raises its error.
     """
-    kernels = fit_kernels(device.type == "cuda")
-    # NVRTC compiles for one thread of a process at a time, and more processes gained .5 s (docs/decisions/032)
-    ahead = kernels if device.type == "cpu" else [(scoring(), 1)]
-    with loaded_ahead([(kernel.module, block) for kernel, block in ahead], wp.get_device("cpu")):
-        yield kernels
+    jobs = [] if (cpu := torch.device("cpu")) in devices else [(scoring(), 1, cpu)]
+    for device, cuda in [(device, device.type == "cuda") for device in devices]:
+        jobs += [(*job, device) for job in [*fit_kernels(cuda), *(call_kernels(cuda) if calls else ())]]
+    later = AFTER_STEP if devices == (cpu,) and not calls else 0
+    with loaded_ahead([(kernel.module, warp_device(device), block) for kernel, block, device in jobs], later):
+        yield jobs
 
 
 def precompile_kernels(devices: list[torch.device] | None = None) -> Iterator[tuple[str, str, int, bool, float]]:
@@ -102,12 +107,11 @@ def precompile_kernels(devices: list[torch.device] | None = None) -> Iterator[tu
     if devices is None:
         devices = [torch.device("cpu"), *(torch.device("cuda", i) for i in range(torch.cuda.device_count()))]
     began, wall = time.perf_counter(), time.time()
-    for device in devices:
-        with compiled_ahead(device) as kernels:
-            for kernel, block in [*kernels, *call_kernels(device.type == "cuda")]:
-                path = Path(load_module(kernel.module, warp_device(device), block).binary_path)
-                name = f"{kernel.func.__module__.rpartition('.')[2]}.{kernel.func.__name__}"
-                yield str(device), name, block, path.stat().st_mtime >= wall, time.perf_counter() - began
+    with compiled_ahead(*devices, calls=True) as jobs:
+        for kernel, block, device in jobs:
+            path = Path(load_module(kernel.module, warp_device(device), block).binary_path)
+            name = f"{kernel.func.__module__.rpartition('.')[2]}.{kernel.func.__name__}"
+            yield str(device), name, block, path.stat().st_mtime >= wall, time.perf_counter() - began
 
 
 def print_warming(devices: list[torch.device] | None = None) -> None:
