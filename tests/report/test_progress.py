@@ -38,8 +38,8 @@ def clock(monkeypatch):
     return now
 
 
-def test_plain_lines_come_about_every_ten_seconds_and_a_live_view_has_all_values(capsys, clock):
-    """The live view shows the same values; nothing done prints nothing, and an error passes through."""
+def test_plain_lines_come_about_every_ten_seconds_and_a_live_line_shows_the_main_values(capsys, clock, terminal):
+    """At the end of a live view, the last plain line stays; nothing done prints nothing, and an error passes through."""
     with Progress(100, live=False) as progress:
         for step in range(1, 101):
             clock[0] += 0.5
@@ -50,14 +50,15 @@ def test_plain_lines_come_about_every_ten_seconds_and_a_live_view_has_all_values
     last = lines[-1]
     for word in ("step 100 of 100", "loss 0.2500", "training PSNR 20.50 dB", "Gaussians 12,345", "per step 500 ms", "left 0 s"):
         assert word in last
-    with Progress(10, live=True) as progress:
+    out = terminal()
+    with Progress(10) as progress:
         for step in range(1, 11):
             progress.update(step=step, loss=0.125, psnr=33.0, count=4321, seconds=0.1)
-    out = capsys.readouterr().out
-    for word in ("10 of 10", "0.1250", "33.00 dB", "4,321", "left"):
-        assert word in out
+    for word in ("fitting", "10 of 10", "loss 0.1250", "33.00 dB", "4,321", "left"):
+        assert word in out.getvalue()
+    module.sys.stdout = io.StringIO()
     with pytest.raises(KeyboardInterrupt), Progress(10) as progress:
-        assert progress.live is False
+        assert progress.stages.live is False
         raise KeyboardInterrupt
     with Progress(10, live=False):
         pass
@@ -165,19 +166,16 @@ def test_in_a_terminal_a_stage_has_one_line_with_a_bar(terminal):
     assert "scoring" in text and "0 of 3 views" in text and "a note\n" in text and "image 12" in text
     assert text.count("scoring\n") == 0 and text.rindex("\x1b[?25h") > text.rindex("\x1b[?25l")
     assert module._STATUS.display is None
-    # while steps are taken, what is told beside them, such as a wait for kernels, stands below their panel
+    # while steps are taken, what is told beside them, such as a wait for kernels, has the line until the next step
     out, stages = terminal(), Stages()
     stages("setting up")
     with Progress(10, live=True) as progress:
-        assert module._STATUS.display is None
+        assert module._STATUS.stage == "taking the first step"
         stages("compiling kernels")
-        assert module._STATUS.display is None and progress.doing == "compiling kernels"
-        progress.display.refresh()
-        assert "compiling kernels" in out.getvalue()
+        assert module._STATUS.stage == "compiling kernels" and "compiling kernels" in out.getvalue()
         progress.update(step=1, loss=0.1, psnr=20.0, count=5)
-        assert progress.doing == ""
-    stages("scoring")
-    assert module._STATUS.display is not None
+        assert module._STATUS.stage == "fitting"
+    assert module._STATUS.display is None and out.getvalue().endswith("left -\n")
 
 
 def test_a_wait_is_told_to_terminals_alone(monkeypatch, terminal):

@@ -14,7 +14,7 @@ import threading
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import BinaryIO
 
 from warpgs import schema
 from warpgs.files import appending, plain, read_file, writable, write_bytes
@@ -47,13 +47,6 @@ def is_live() -> bool:
     """Return whether stdout is a terminal in which a line can be overwritten."""
     stdout = getattr(sys.stdout, "rich_proxied_file", sys.stdout)  # while a line is shown, rich wraps stdout
     return stdout is not None and stdout.isatty() and os.environ.get("TERM") != "dumb"
-
-
-def _console() -> tuple[Any, bool]:
-    """Return rich's console, and whether stderr is a terminal, too: redirected errors do not disturb a line."""
-    from rich.console import Console
-
-    return Console(file=careful(sys.stdout)), sys.stderr is not None and sys.stderr.isatty()
 
 
 class _StatusLine:
@@ -91,22 +84,23 @@ class _StatusLine:
 
     def _started(self):
         """Return rich's display of one task, which draws itself eight times a second until it is stopped."""
+        from rich.console import Console
         from rich.progress import BarColumn, Progress as Display, SpinnerColumn, TextColumn, TimeElapsedColumn
 
-        console, own = _console()
+        console, own = Console(file=careful(sys.stdout)), sys.stderr is not None and sys.stderr.isatty()
         columns = (
             SpinnerColumn("dots" if (console.encoding or "").startswith("utf") else "line"),
             TextColumn("{task.description}", markup=False), BarColumn(24), TextColumn("{task.fields[detail]}", markup=False),
             TimeElapsedColumn(),
         )  # fmt: skip
-        display = Display(*columns, console=console, transient=True, refresh_per_second=8, redirect_stderr=own)
+        display = Display(
+            *columns, console=console, transient=True, refresh_per_second=8, redirect_stderr=own
+        )  # a redirected stderr disturbs no line
         display.start()
         return display
 
 
 _STATUS = _StatusLine()
-_PANELS: list[Progress] = []
-"""Panel of a fit's steps that occupies the terminal now, if any."""
 
 
 class Stages(contextlib.AbstractContextManager["Stages"]):
@@ -131,9 +125,7 @@ class Stages(contextlib.AbstractContextManager["Stages"]):
         stage, now, counted = line.rpartition(":")[0] or line, time.perf_counter(), COUNTED.search(line)
         done, total = (int(n.replace(",", "")) for n in counted.groups()) if counted else (0, 0)
         state, (last, before) = STAGE_LINES * done // total if total else line, self.printed.get(stage, (-STAGE_INTERVAL, None))
-        if self.live and _PANELS:
-            _PANELS[-1].doing = line
-        elif self.live:
+        if self.live:
             _STATUS.show(line)
         elif state != before and now - last >= STAGE_INTERVAL:
             self.printed[stage] = now, state
@@ -157,7 +149,7 @@ class Progress:
     """
 
     def __init__(self, total: int, done: int = 0, *, planned: Sequence[float] | None = None, live: bool | None = None):
-        """Prepare for ``total`` steps, of which ``done`` are already done; ``live`` None shows the panel only in a terminal.
+        """Prepare for ``total`` steps, of which ``done`` are done; ``live`` None writes in place only in a terminal.
 
         ``planned`` is the expected time of each step, in any unit; None: all are equal.
         """
@@ -168,39 +160,26 @@ class Progress:
         """Sums of measured and planned times of the last steps, with falling weights."""
         self.left: float | None = None
         """Time left [s]."""
-        self.live = is_live() if live is None else live
+        self.stages = Stages(live=is_live() if live is None else live)
         self.loss = self.psnr = self.seconds = None
-        self.count, self.began, self.printed = 0, time.perf_counter(), 0.0
-        self.doing = "taking the first step"
-        self.display = self.spinner = None
+        self.count, self.printed = 0, 0.0
 
     def __enter__(self) -> Progress:
         """Start the display."""
-        if self.live:
-            from rich.live import Live
-            from rich.spinner import Spinner
-
-            _STATUS.clear()
-            self.spinner = Spinner("dots" if (sys.stdout.encoding or "").lower().startswith("utf") else "line")
-            console, own = _console()
-            self.display = Live(console=console, get_renderable=self._panel, refresh_per_second=8, redirect_stderr=own)
-            self.display.__enter__()
-            _PANELS.append(self)
+        if self.stages.live:
+            self.stages("taking the first step")
         return self
 
     def __exit__(self, *error) -> None:
-        """Show the last state and stop."""
-        self.doing = ""
-        if self.display is not None:
-            _PANELS.remove(self)
-            self.display.__exit__(*error)
-        elif error[0] is None and self.step > self.told:
+        """Print the last state."""
+        self.stages.clear()
+        if error[0] is None and self.step > self.told:
             say(self._line())
 
     def update(self, *, step: int, loss: float, psnr: float, count: int, seconds: float | None = None) -> None:
         """Show the numbers of one finished step; ``seconds`` is its time, None if later steps will take another time."""
         seconds = None if self.loss is None else seconds  # the first step waits for memory and caches
-        self.step, self.count, self.doing = step, count, ""
+        self.step, self.count = step, count
         self.loss, self.psnr = _mean(self.loss, loss), _mean(self.psnr, psnr)
         if seconds is not None:
             self.seconds = _mean(self.seconds, seconds)
@@ -210,41 +189,18 @@ class Progress:
             if self.left is None or not self.left < left < (1 + NOISE) * self.left:
                 self.left = left
         now = time.perf_counter()
-        if self.display is None and now - self.printed >= PLAIN_INTERVAL:
+        if self.stages.live:
+            left = "-" if self.left is None else duration(self.left)
+            self.stages(f"fitting: {step:,} of {self.total:,}, {left} left, PSNR {self.psnr:.2f} dB, {count:,} Gaussians")
+        elif now - self.printed >= PLAIN_INTERVAL:
             self.printed, self.told = now, step
             say(self._line())
 
-    def _values(self) -> list[tuple[str, str]]:
-        return [
-            ("step", f"{self.step:,} of {self.total:,}"),
-            ("loss", "-" if self.loss is None else f"{self.loss:.4f}"),
-            ("training PSNR", "-" if self.psnr is None else f"{self.psnr:.2f} dB"),
-            ("Gaussians", f"{self.count:,}"),
-            ("per step", "-" if self.seconds is None else f"{1000 * self.seconds:.0f} ms"),
-            ("left", "-" if self.left is None else duration(self.left)),
-        ]
-
     def _line(self) -> str:
-        return "  ".join(f"{name} {value}" for name, value in self._values())
-
-    def _panel(self):
-        from rich.console import Group
-        from rich.progress_bar import ProgressBar
-        from rich.table import Table
-        from rich.text import Text
-
-        table = Table.grid(padding=(0, 3))
-        names, values = zip(*self._values(), ("elapsed", duration(time.perf_counter() - self.began)))
-        table.add_row(*names, style="dim")
-        table.add_row(*values, style="bold")
-        # Alone, the bar does not end its line, and the names would follow on it; a grid row does.
-        bar = Table.grid()
-        bar.add_row(ProgressBar(total=self.total, completed=self.step, width=78))
-        if not self.doing:
-            return Group(bar, table)
-        doing = Table.grid(padding=(0, 1))
-        doing.add_row(self.spinner, Text(printable(self.doing)))
-        return Group(bar, table, doing)
+        each = "-" if self.seconds is None else f"{1000 * self.seconds:.0f} ms"
+        left = "-" if self.left is None else duration(self.left)
+        values = f"step {self.step:,} of {self.total:,}  loss {self.loss:.4f}  training PSNR {self.psnr:.2f} dB"
+        return f"{values}  Gaussians {self.count:,}  per step {each}  left {left}"
 
 
 def _mean(old: float | None, new: float) -> float:
