@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Literal
 
 from warpgs.app.flags import call
-from warpgs.device import ASSUMED_BYTES, format_bytes, machine_memory, prepare_kernel_cache, processor_name, usable_cores
+from warpgs.device import format_bytes, machine_memory, prepare_kernel_cache, processor_name, usable_cores
 from warpgs.errors import ResourceError, install_extras
 from warpgs.process import Say, counted, fast_imports, hidden_stderr, printable, silent
 from warpgs.report.progress import Stages, waiting
@@ -49,7 +49,7 @@ PACKAGES = (
     ("scipy", "scipy", True, "rotations and neighbours"),
     ("scikit-image", "skimage", False, "`warpgs mesh`"),
     ("opencv-contrib-python-headless", "cv2", True, "images, matches, video"),
-    ("psutil", "psutil", False, "free memory"),
+    ("psutil", "psutil", True, "free memory"),
     ("safetensors", "safetensors", True, "checkpoints"),
     ("onnxruntime", "onnxruntime", False, "depth and feature networks"),
     ("pyvista", "pyvista", False, "`warpgs mesh`"),
@@ -115,11 +115,9 @@ def _extras() -> Iterable[Finding]:
 
 def _processor() -> Iterable[Finding]:
     yield Finding("CPU", OK, f"{processor_name()}, {usable_cores()} of {os.cpu_count()} cores usable")
-    if (memory := machine_memory()) is None:
-        yield Finding("Memory", NOTE, f"the system does not report its memory; {format_bytes(ASSUMED_BYTES)} are assumed")
-        return
-    detail = f"{format_bytes(memory[0])}, {format_bytes(memory[1])} available"
-    yield _noted("Memory", memory[1] >= LOW_MEMORY, detail, "close other programs, or fit at a smaller image size")
+    installed, free = machine_memory()
+    detail = f"{format_bytes(installed)}, {format_bytes(free)} available"
+    yield _noted("Memory", free >= LOW_MEMORY, detail, "close other programs, or fit at a smaller image size")
 
 
 def _cuda() -> Iterable[Finding]:

@@ -489,8 +489,7 @@ number where each has this much free memory [bytes], which is enough for 100 meg
 
 def loaders() -> int:
     """Return the number of threads that load images on this machine."""
-    _, free = machine_memory() or (0, 0)
-    return min(usable_cores(), max(LOADERS, min(MOST_LOADERS, free // LOADER_BYTES)))
+    return min(usable_cores(), max(LOADERS, min(MOST_LOADERS, machine_memory()[1] // LOADER_BYTES)))
 
 
 class ViewList:
