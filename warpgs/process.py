@@ -268,21 +268,6 @@ def is_utf8(text: str) -> bool:
     return readable(text) == text
 
 
-def use_utf8_names() -> None:
-    """Start this program again in Python's UTF-8 mode, with a note, if Python reads file names in another encoding."""
-    # File names in scene files are UTF-8. Under LC_ALL=C with PYTHONUTF8=0, or in a locale of another encoding, Python
-    # cannot open them.
-    encoding = sys.getfilesystemencoding()
-    if sys.platform == "win32" or sys.flags.utf8_mode or encoding.lower().replace("-", "") == "utf8":
-        return
-    say(f"warpgs: this locale reads file names as {encoding}; started again in Python's UTF-8 mode (PYTHONUTF8=1)", error=True)
-    os.environ["PYTHONUTF8"] = "1"  # for processes that this one starts
-    if sys.stdout is not None:  # letters that the terminal lacks are still printed as codes
-        os.environ.setdefault("PYTHONIOENCODING", f"{sys.stdout.encoding}:backslashreplace")
-    # the options of the interpreter, -P and -I among them, are part of orig_argv
-    os.execv(sys.executable, [sys.executable, "-X", "utf8", *sys.orig_argv[1:]])
-
-
 @contextlib.contextmanager
 def utf8_name(path: Path) -> Iterator[str]:
     """Give a UTF-8 path to a file: its own path if possible, else one through a descriptor of its folder or of itself."""

@@ -1,7 +1,6 @@
 """Processes: nothing of the current folder runs, signals end in one sentence, names that are not UTF-8, other systems."""
 
 import ast
-import contextlib
 import csv
 import importlib
 import io
@@ -85,20 +84,16 @@ def test_no_fit_runs_what_lies_beside_a_scene(trap, tmp_path):
     assert run("-c", "import pyvista").returncode == 1 and "pyvista.py" in mark.read_text()
 
 
-ASCII = pytest.mark.skipif(sys.platform != "linux", reason="locales and file names of Linux")
-
-
-@pytest.mark.parametrize("early, ascii", [(True, False), *(pytest.param(e, True, marks=ASCII) for e in (True, False))])
-def test_the_program_runs_nothing_from_the_current_folder(trap, program, early, ascii):
-    """Even with what Python imports first planted there; where file names are ASCII it starts again, as safe as before."""
+@pytest.mark.parametrize("early", [True, False])
+def test_the_program_runs_nothing_from_the_current_folder(trap, program, early):
+    """Even with what Python imports first planted there."""
     folder, mark = trap
     for name in EARLY if early else ():
         (folder / f"{name}.py").write_text((folder / "json.py").read_text())
-    environment = {"LC_ALL": "C", "PYTHONUTF8": "0"} if ascii else {}
     for command in ([program], ["-P", "-m", "warpgs"]) if early else (["-m", "warpgs"],):
-        done = run(*command, "demo", f"new{len(command)}", *SIZE, **environment)
+        done = run(*command, "demo", f"new{len(command)}", *SIZE)
         assert done.returncode == 0 and (folder / f"new{len(command)}" / "images").is_dir(), done.stderr
-        assert ("started again" in done.stderr) == ascii and not mark.exists(), mark.read_text()
+        assert not mark.exists(), mark.read_text()
 
 
 @pytest.mark.fault
@@ -537,26 +532,6 @@ def test_poses(tmp_path, capfd):
     assert code in (0, 3), capfd.readouterr().err
     if code == 0:
         assert load_scene(tmp_path / f"{BYTES}out").views
-
-
-@on_linux
-def test_python_that_takes_names_for_ascii(tmp_path, monkeypatch):
-    """It is started again in its UTF-8 mode, once, which is said, with its own options and words."""
-    program, ascii_names = ("-P", "-m", "warpgs"), {"LC_ALL": "C", "PYTHONUTF8": "0"}
-    done = run(*program, "demo", str(tmp_path / "写"), "--views", "8", "--width", "32", "--height", "32", **ascii_names)
-    said = done.stderr
-    assert done.returncode == 0 and (tmp_path / "写" / "sparse").is_dir() and said.isascii(), said
-    assert said.count("UTF-8 mode") == 1 and said.count("\n") == 1 and "\\u5199" in done.stdout
-    assert run(*program, "--version", LC_ALL="C.UTF-8", PYTHONUTF8="0").stderr == ""
-    called: list[list[str]] = []  # the words, the interpreter's own options, and nothing twice
-    monkeypatch.setattr(os, "execv", lambda program, words: called.append([program, *words]))
-    monkeypatch.setattr(os, "environ", dict(os.environ))
-    monkeypatch.setattr(sys, "getfilesystemencoding", lambda: "iso8859-1")
-    monkeypatch.setattr(sys, "orig_argv", ["python", "-P", "-m", "warpgs", "fit"])
-    with contextlib.suppress(SystemExit):
-        process.use_utf8_names()
-    mode = [] if sys.flags.utf8_mode else [[sys.executable, sys.executable, "-X", "utf8", "-P", "-m", "warpgs", "fit"]]
-    assert called == mode and (not mode or os.environ["PYTHONUTF8"] == "1")
 
 
 # No file of the product calls what only some systems have, but for those whose tests stand in for the others.

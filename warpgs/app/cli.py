@@ -162,8 +162,6 @@ def _help() -> str:
 
 def main(arguments: list[str] | None = None) -> int:
     """Run one command; returns its exit code: 0 done, 2 usage, 3 data, 4 resources, 5 defect or NaN, 130 interrupted."""
-    if arguments is None:
-        process.use_utf8_names()
     with contextlib.suppress(OSError):  # no folder for temporary files: a command that needs one raises the error
         system_folder()
     words = sys.argv[1:] if arguments is None else arguments
