@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from warpgs import folders
-from warpgs.errors import DataError, ResourceError, UsageError
+from warpgs.errors import DataError, MalformedError, ResourceError, UsageError, expect
 from warpgs.folders import WINDOWS, Folder, RefusedError, Temporary, is_below, open_folder, output_folder, sweep, temporary_file
 
 # Opening of input files: only regular files of bounded size, so that no pipe hangs a command and no device fills its
@@ -97,6 +97,46 @@ PLY_TYPES = {
     "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4", "double": "f8", "float64": "f8",
 }  # fmt: skip
 """Scalar types of a PLY file, as numpy names them without the order of bytes."""
+
+
+PLY_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "<"}
+"""Order of bytes by format; the numbers of an ASCII file do not need one."""
+PLY_LIST = "list"
+"""Type of a property that is a list, so that rows differ in length."""
+PlyElement = tuple[str, int, list[tuple[str, str]]]
+"""Name and number of rows of an element, and pairs (name, numpy type) of its properties in file order."""
+MAX_HEADER_BYTES = 65536
+"""Largest accepted header of a PLY file [bytes]; real headers have some two thousand."""
+
+
+def ply_header(head: bytes) -> tuple[list[PlyElement], int, bool]:
+    """Return the elements of the header in a PLY file's first bytes, the offset [bytes] of the data, and if they are ASCII."""
+    expect(re.match(rb"ply[ \t]*\r?\n", head), "it does not start with 'ply'")
+    end = re.search(rb"^end_header[ \t]*\r?\n", head, re.MULTILINE)
+    expect(end, f"no 'end_header' line within the first {MAX_HEADER_BYTES} bytes")
+    elements: list[PlyElement] = []
+    formats = []
+    # comments may have any encoding
+    for line in head[: end.start()].decode("utf-8", "replace").split("\n")[1:]:
+        match line.split():
+            case [] | ["comment" | "obj_info", *_]:
+                pass
+            case ["format", *words]:
+                formats.append(" ".join(words))
+            case ["element", name, count] if re.fullmatch(r"[0-9]{1,18}", count):
+                elements.append((name, int(count), []))
+            case ["property", "list", count, item, name] if elements and count in PLY_TYPES and item in PLY_TYPES:
+                elements[-1][2].append((name, PLY_LIST))
+            case ["property", kind, name] if elements and kind in PLY_TYPES:
+                elements[-1][2].append((name, PLY_TYPES[kind]))
+            case _:
+                raise MalformedError(f"header line {line[:80]!r} is invalid")
+    known = [f"{name} 1.0" for name in PLY_ORDERS]
+    given = " and ".join(formats)[:80] or "not given"
+    expect(given in known, f"its format is {given}, not one of {', '.join(known)}")
+    order = PLY_ORDERS[given.split()[0]]
+    elements = [(n, c, [(p, k if k in (PLY_LIST, "i1", "u1") else order + k) for p, k in own]) for n, c, own in elements]
+    return elements, end.end(), given == "ascii 1.0"
 
 
 def tensor_pieces(tensors: dict[str, Any], metadata: dict[str, str]) -> list[memoryview | bytes]:
