@@ -9,7 +9,7 @@ import itertools
 import os
 import sys
 import textwrap
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TypeVar
 
@@ -88,6 +88,11 @@ def expect(condition: object, what: str) -> None:
     """Raise a `MalformedError` unless a condition holds; ``what`` is wrong with the content otherwise."""
     if not condition:
         raise MalformedError(what)
+
+
+def listed(names: Sequence[object], most: int = 100) -> str:
+    """Return names for a message: all of them, or the first of very many."""
+    return ", ".join(map(str, names[:most])) + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
 MAX_COMPARED = 60

@@ -334,7 +334,7 @@ def test_photographs_are_left_out_by_name_before_they_are_decoded(kind, tmp_path
         assert [v.name for v in left.views] == [v.name for v in scene.views if v.name not in gone]
         assert any(n.startswith(f"left out by --exclude: {len(gone)} image") and name in n for n in left.notes)
     first = scene.views[0].name
-    refused(root, f"--exclude x{first}: no view has this name; the nearest are {first}", exclude=f"x{first},{name}")
+    refused(root, f"--exclude x{first}: no view has this name; did you mean {first}", exclude=f"x{first},{name}")
 
 
 @pytest.mark.parametrize("kind", ["colmap", "colmap text", "transforms"])

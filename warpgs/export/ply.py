@@ -12,7 +12,7 @@ from typing import BinaryIO
 
 import numpy as np
 
-from warpgs.errors import DataError, expect
+from warpgs.errors import DataError, expect, listed
 from warpgs.export import base
 from warpgs.files import MAX_HEADER_BYTES, PLY_LIST, PlyElement, ply_header, replacing
 from warpgs.scene import ORIGIN, Gaussians, Normalization, base_coefficients, base_colors
@@ -460,7 +460,7 @@ def _check_properties(properties: list[tuple[str, str]]) -> int:
     if missing[:3] == [*_DC] and all((name, "u1") in properties for name in _RGB):
         missing = missing[3:]  # nerfstudio's export with colours, not coefficients
     expect(missing != ["scale_2"], "its Gaussians are flat (2DGS, no scale_2), which is not supported")
-    expect(not missing, f"properties missing: {', '.join(missing[:8])}{' ...' if len(missing) > 8 else ''}")
+    expect(not missing, f"properties missing: {listed(missing, 8)}")
     return rest
 
 

@@ -13,7 +13,7 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from warpgs.errors import DataError, expect
+from warpgs.errors import DataError, expect, listed
 from warpgs.files import MAX_HEADER_BYTES, PLY_LIST, open_input, ply_header, read_file
 from warpgs.geometry import pose_of
 from warpgs.io import folder as scenes
@@ -229,7 +229,7 @@ def without_unaligned(
     kept = {number: pose for number, pose in poses.items() if finite(pose)}
     if strict or not kept or len(kept) == len(poses):
         return poses, []
-    names = scenes.listed(sorted(pose[0] for number, pose in poses.items() if number not in kept))
+    names = listed(sorted(pose[0] for number, pose in poses.items() if number not in kept))
     count = f"{len(poses) - len(kept)} of {len(poses)} images of {file.name}"
     return kept, [f"left out: {count} have a pose or camera that is not finite: {names}"]
 

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from warpgs.device import format_bytes
-from warpgs.errors import FolderHeldError, ResourceError, UsageError
+from warpgs.errors import FolderHeldError, ResourceError, UsageError, listed
 from warpgs.files import remove_leftovers, write_csv, write_text, writing_into
 from warpgs.locks import check_free, hold_folder
 from warpgs.pipeline.farm.job import PLY, THUMBNAIL, Engine, Event, FarmJob, JobRecord, finished, read_job_record, write_record
@@ -443,6 +443,6 @@ def check_failures(statuses: list[JobStatus]) -> None:
     """Check that no job failed."""
     if failed := [s for s in statuses if s.state == "failed"]:
         first = failed[0].record
-        names = ", ".join(s.job.name for s in failed[:5]) + ("" if len(failed) <= 5 else f" and {len(failed) - 5} more")
+        names = listed([s.job.name for s in failed], 5)
         fix = f"First message: {first.message.rstrip('.') if first else 'unknown'}. Repeat the command to try them again"
         raise ResourceError(f"{len(failed)} of {len(statuses)} jobs failed: {names}; {INDEX} has their messages. {fix}")
