@@ -63,29 +63,28 @@ class CarefulStream:
     """A text stream that does not raise if it cannot be written: the first error is kept, and later writes are dropped."""
 
     def __init__(self, stream: TextIO | None, says: bool = True):
-        """Wrap a stream; ``says`` prints on stderr that the command continues without it."""
-        self.closed_at_start, self.says = stream is None, says
+        """Wrap a stream, or none where it was closed at the start; ``says`` prints on stderr that the command continues."""
         self.stream: TextIO = io.StringIO() if stream is None else stream
-        self.failure: BaseException | None = None
+        self.says, self.failure = says, cast("BaseException | None", None)
+        if stream is None:
+            self._lose(OSError(errno.EBADF, os.strerror(errno.EBADF)))
 
     def write(self, text: str) -> int:
         """Write text, if the stream takes it; return its length."""
-        self._try(lambda: self.stream.write(text), not self.closed_at_start)
+        self._try(self.stream.write, text)
         return len(text)
 
     def flush(self) -> None:
         """Flush the buffer, if the stream takes it."""
         self._try(self.stream.flush)
 
-    def _try(self, call: Callable[[], object], is_open: bool = True) -> None:
+    def _try(self, call: Callable[..., object], *arguments: object) -> None:
         """Call a method of the stream, unless it has failed before."""
-        try:
-            if not is_open:
-                raise OSError(errno.EBADF, os.strerror(errno.EBADF))
-            if self.failure is None:
-                call()
-        except (OSError, ValueError) as e:
-            self._lose(e)
+        if self.failure is None:
+            try:
+                call(*arguments)
+            except (OSError, ValueError) as e:
+                self._lose(e)
 
     def writelines(self, lines: Any) -> None:
         """Write several texts."""
@@ -96,12 +95,9 @@ class CarefulStream:
         """Keep the first error, and point the descriptor at the null device: buffers are flushed once more when Python ends."""
         if isinstance(error, ValueError) and not isinstance(error, OSError) and not self.stream.closed:
             raise error
-        if self.failure is not None:
-            return
         self.failure = error
-        if not self.closed_at_start:
-            with contextlib.suppress(OSError, ValueError):
-                _send_to_null(self.stream.fileno())
+        with contextlib.suppress(OSError, ValueError):
+            _send_to_null(self.stream.fileno())
         if self.says:
             _lost(error, GOES_ON)
 
