@@ -80,19 +80,11 @@ class Registry(Generic[T]):
         return self._classes.get(getattr(cls, "name", "")) is cls
 
     def unnamed(self, cls: type) -> str:
-        """Return the message on a class that is not registered by its ``name``."""
-        other = self._classes.get(getattr(cls, "name", ""))
-        same = other is not None and other.__qualname__ == cls.__qualname__
-        modules = {k.__module__: getattr(sys.modules.get(k.__module__), "__file__", None) for k in (cls, other) if k and same}
-        files = {os.path.realpath(file) for file in modules.values() if file}
-        if len(modules) == 2 and len(files) == 1:
-            (file,), module = files, min(modules, key=lambda name: name.startswith(_PREFIX))
-            fix = f"give {module}:NAME instead of {Path(file).name}:NAME, or use one file"
-            return f"the file of the {self.kind} {cls.__qualname__} was loaded twice ({file}, and the module {module}); {fix}"
+        """Return the message on a class that is not registered by its ``name``; its file may have been loaded twice."""
         return (
             f"the {self.kind} {cls.__qualname__} has no registered name; register it with "
             f'@warpgs.{_FACES.get(self.kind, "train")}.register_{self.kind.replace(" ", "_")}("name") above the class, '
-            "or name it as module:Class"
+            "or name it as module:Class, in one way everywhere"
         )
 
     def find(self, name: str | type[T]) -> type[T]:
