@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, NoReturn, TextIO, TypeVar, cast
 
 from warpgs.errors import ResourceError, UsageError
-from warpgs.files import DESCRIPTORS, FULL, readable
+from warpgs.files import FULL, readable
 from warpgs.folders import shared_locks
 
 # Output that cannot be written: one line on stderr, and the command continues.
@@ -264,20 +264,11 @@ def is_utf8(text: str) -> bool:
     return readable(text) == text
 
 
-@contextlib.contextmanager
-def utf8_name(path: Path) -> Iterator[str]:
-    """Give a UTF-8 path to a file: its own path if possible, else one through a descriptor of its folder or of itself."""
-    if is_utf8(str(path)):
-        yield str(path)
-        return
-    by_folder = is_utf8(path.name)
-    if not DESCRIPTORS.is_dir():
+def utf8_name(path: Path) -> str:
+    """Return the name of a file or folder for a library that needs UTF-8."""
+    if not is_utf8(str(path)):
         raise UsageError(f"{readable(str(path))}: the name is not UTF-8, which is needed here; rename the file or its folder")
-    descriptor = os.open(path.parent if by_folder else path, os.O_RDONLY)
-    try:
-        yield f"{DESCRIPTORS}/{descriptor}/{path.name}" if by_folder else f"{DESCRIPTORS}/{descriptor}"
-    finally:
-        os.close(descriptor)
+    return str(path)
 
 
 @contextlib.contextmanager

@@ -25,7 +25,7 @@ from warpgs.errors import UsageError
 from warpgs.files import readable, write_text
 from warpgs.io.load import load_scene
 from warpgs.pipeline.run.folder import load_checkpoint
-from warpgs.poses.photographs import _frames, scene_name
+from warpgs.poses.photographs import scene_name
 from warpgs.process import ignored_signals, interrupting_signals, noted_signals, utf8_name
 from warpgs.report.film import write_film
 from warpgs.report.progress import EventLog
@@ -399,23 +399,14 @@ def test_names_that_are_no_text_for_output_libraries_and_films(tmp_path, monkeyp
     # a name that a library can take
     folder = tmp_path / BYTES
     folder.mkdir()
-    for path in (folder / "file", folder / f"{BYTES}.txt", tmp_path / "plain"):
-        path.write_bytes(b"content")
-        with utf8_name(path) as name:
-            assert Path(name.encode("utf-8").decode()).read_bytes() == b"content"
-    with utf8_name(folder / "new") as name:
-        Path(name).write_bytes(b"new")
-    assert (folder / "new").read_bytes() == b"new"
-    monkeypatch.setattr(process, "DESCRIPTORS", tmp_path / "none")
-    with pytest.raises(UsageError, match=r"b\\xe4ü/file: the name is not UTF-8"), utf8_name(folder / "file"):
-        pass
-    # OpenCV ended the process at such a name; a film is written, checked and read
-    monkeypatch.undo()
+    assert utf8_name(tmp_path / "plain") == str(tmp_path / "plain")
+    with pytest.raises(UsageError, match=r"b\\xe4ü/file: the name is not UTF-8"):
+        utf8_name(folder / "file")
+    # OpenCV ended the process at such a name; a film is written and checked
     path = tmp_path / "films" / BYTES / f"{BYTES}.mp4"
     path.parent.mkdir(parents=True)
     frames = [np.full((16, 16, 3), 0.2 * i, np.float32) for i in range(3)]
     assert write_film(path, frames) == 3 and [p.name for p in path.parent.iterdir()] == [path.name]
-    assert len(list(_frames(path))) == 3
 
 
 def rename_an_image(scene: Path) -> str:
