@@ -10,7 +10,6 @@ import os
 import re
 import shutil
 import stat
-import time
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -191,8 +190,6 @@ LOCK = ".warpgs.lock"
 """Name of the file that a process holds while it writes into a folder."""
 UNDECODABLE = re.compile("[\udc80-\udcff]")
 """Characters that Python puts in the place of bytes that are not UTF-8."""
-PAUSES = (0.05, 0.1, 0.2, 0.4, 0.8)
-"""Pauses between attempts to replace a file on Windows [s]: a virus scanner holds a new file open for about that long."""
 FULL = (errno.ENOSPC, errno.EDQUOT)
 """Errors of a full disk, or of an exhausted disk quota."""
 NO_FOLDER_SYNC = (errno.EINVAL, errno.ENOTSUP, errno.EBADF, errno.EACCES)
@@ -242,13 +239,7 @@ def replacing(
             check(reachable)
         if WINDOWS:  # where no open file can be replaced
             file.close()
-        for pause in PAUSES if WINDOWS else ():
-            with contextlib.suppress(PermissionError):
-                folder.replace(name, path.name)
-                break
-            time.sleep(pause)
-        else:
-            folder.replace(name, path.name)
+        folder.replace(name, path.name)
         _sync(folder)
 
 
