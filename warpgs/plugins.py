@@ -94,10 +94,8 @@ class Registry(Generic[T]):
         if name in self._classes or name in self.names():
             return self._classes[name]
         if isinstance(name, str) and ":" in name:
-            own = name.rpartition(":")[2]
-            in_study = f'; in a study, use a preset in a .py file with "strategy": {own}' if self.kind == "strategy" else ""
             why = "a class of your own. The file of a preset or run does not load your code"
-            fix = f"name the class on the command line, or pass it in Python{in_study}"
+            fix = "name the class on the command line or in a preset that is a .py file, or pass it in Python"
             raise UsageError(f"the {self.kind} {name!r} is {why}: {fix}")
         more = "import the file that registers it first, in Python" if self.kind == "camera model" else "give module:Class"
         raise UsageError(f"unknown {self.kind} {name!r}; choose one of {', '.join(self.names())}, or {more}")
