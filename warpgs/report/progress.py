@@ -20,8 +20,6 @@ from warpgs import schema
 from warpgs.files import appending, plain, read_file, writable, write_bytes
 from warpgs.process import Say, careful, printable, say, silent
 
-PLAIN_INTERVAL = 10.0
-"""Seconds between two plain lines on the steps of a fit."""
 STAGE_INTERVAL, STAGE_LINES = 5.0, 20
 """Least seconds between two plain lines on one stage, and most lines on a stage that counts."""
 SMOOTHING = 0.05
@@ -143,7 +141,7 @@ def waiting() -> Stages:
 
 
 class Progress:
-    """Context manager that shows step, loss, PSNR, number of Gaussians, time per step and time left.
+    """Context manager that shows step, loss, PSNR, number of Gaussians, time per step and time left, as `Stages` does.
 
     Times exclude steps that compile kernels; no time is shown before the first step without compilation.
     """
@@ -153,28 +151,25 @@ class Progress:
 
         ``planned`` is the expected time of each step, in any unit; None: all are equal.
         """
-        self.total, self.told, self.step = total, done, done
+        self.total, self.done, self.step = total, done, done
         self.planned = [0.0, *itertools.accumulate([1.0] * total if planned is None else planned)]
         """Expected time up to the end of each step, from 0."""
         self.took = self.expected = 0.0
         """Sums of measured and planned times of the last steps, with falling weights."""
         self.left: float | None = None
         """Time left [s]."""
-        self.stages = Stages(live=is_live() if live is None else live)
+        self.stages, self.count = Stages(live=live), 0
         self.loss = self.psnr = self.seconds = None
-        self.count, self.printed = 0, 0.0
 
     def __enter__(self) -> Progress:
-        """Start the display."""
-        if self.stages.live:
-            self.stages("taking the first step")
+        """Begin."""
         return self
 
     def __exit__(self, *error) -> None:
         """Print the last state."""
         self.stages.clear()
-        if error[0] is None and self.step > self.told:
-            say(self._line())
+        if error[0] is None and self.step > self.done:
+            say(self.line())
 
     def update(self, *, step: int, loss: float, psnr: float, count: int, seconds: float | None = None) -> None:
         """Show the numbers of one finished step; ``seconds`` is its time, None if later steps will take another time."""
@@ -188,19 +183,15 @@ class Progress:
             left = self.took / self.expected * (self.planned[self.total] - self.planned[step])
             if self.left is None or not self.left < left < (1 + NOISE) * self.left:
                 self.left = left
-        now = time.perf_counter()
-        if self.stages.live:
-            left = "-" if self.left is None else duration(self.left)
-            self.stages(f"fitting: {step:,} of {self.total:,}, {left} left, PSNR {self.psnr:.2f} dB, {count:,} Gaussians")
-        elif now - self.printed >= PLAIN_INTERVAL:
-            self.printed, self.told = now, step
-            say(self._line())
+        if step < self.total:
+            self.stages(self.line())
 
-    def _line(self) -> str:
-        each = "-" if self.seconds is None else f"{1000 * self.seconds:.0f} ms"
+    def line(self) -> str:
+        """Return the state of the fit as one line."""
         left = "-" if self.left is None else duration(self.left)
-        values = f"step {self.step:,} of {self.total:,}  loss {self.loss:.4f}  training PSNR {self.psnr:.2f} dB"
-        return f"{values}  Gaussians {self.count:,}  per step {each}  left {left}"
+        each = "-" if self.seconds is None else f"{1000 * self.seconds:.0f} ms"
+        values = f"PSNR {self.psnr:.2f} dB, loss {self.loss:.4f}, {self.count:,} Gaussians, {each} per step"
+        return f"fitting: {self.step:,} of {self.total:,} steps, left {left}, {values}"
 
 
 def _mean(old: float | None, new: float) -> float:
