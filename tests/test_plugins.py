@@ -22,7 +22,7 @@ from warpgs.pipeline.train.strategies.base import STRATEGIES, Strategy
 from warpgs.pipeline.train.trainer import Trainer
 from warpgs.pipeline.train.view_modules import VIEW_MODULES, ViewModule
 from warpgs.pipeline.train.views import LearnedViews
-from warpgs.plugins import Registry, load_object
+from warpgs.plugins import Registry
 from warpgs.synthetic.demo import split_spec
 
 OWN = """
@@ -111,34 +111,6 @@ def test_a_file_that_fails_is_not_half_loaded(registry, own):
         registry.load(f"{folder / 'probe.py'}:Own")
     assert "(No module named 'own_neighbour');" in str(e.value)
     assert str(e.value).endswith(f"set PYTHONPATH={folder} and give probe:Own, or use one file")
-
-
-TERM = """
-from dataclasses import dataclass
-from warpgs.pipeline.train.loss import LossTerm, register
-@register("own_twice")
-@dataclass(frozen=True)
-class Twice(LossTerm):
-    pass
-"""
-
-
-@pytest.mark.usefixtures("registries_as_they_were")
-@pytest.mark.parametrize("by_path_first", [True, False])
-def test_a_file_that_is_loaded_twice_is_named(tmp_path, monkeypatch, by_path_first):
-    """By its path and by an import: two classes have one name, and the message says so."""
-    monkeypatch.syspath_prepend(tmp_path)
-    (tmp_path / "own_twice.py").write_text(TERM)
-    (tmp_path / "own_probe.py").write_text("from own_twice import Twice\n")
-    specs = [f"{tmp_path}/own_twice.py:Twice", f"{tmp_path}/own_probe.py:Twice"]
-    first, _ = (load_object("preset", s) for s in (specs if by_path_first else specs[::-1]))
-    with pytest.raises(UsageError) as e:
-        FitConfig(loss_terms=(first(),))
-    twice = f"({tmp_path / 'own_twice.py'}, and the module own_twice)"
-    assert f"the file of the loss term Twice was loaded twice {twice}" in str(e.value)
-    assert "give own_twice:NAME instead of own_twice.py:NAME" in str(e.value)
-    for name in [n for n in sys.modules if "own_twice" in n or "own_probe" in n]:
-        del sys.modules[name]
 
 
 def test_unknown_names_list_those_there_are_and_none_is_imported_by_find(registry, own):

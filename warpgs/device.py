@@ -214,9 +214,6 @@ def add_needs(parts: Iterable[Callable[[StepSizes], Needs]], sizes: StepSizes) -
     return dict(total)
 
 
-ASSUMED_BYTES = 2 * 2**30
-"""Assumed memory of a machine that does not report it [bytes]: the memory of a small machine."""
-
 OWN_CGROUPS = Path("/proc/self/cgroup")
 CGROUPS = Path("/sys/fs/cgroup")
 
@@ -239,7 +236,7 @@ def available_bytes(device: torch.device) -> int:
 
         free, _ = torch.cuda.mem_get_info(device)
         return free + torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
-    return _machine_or_assumed()[1]
+    return machine_memory()[1]
 
 
 def free_for(needed: int, device: torch.device) -> float:
@@ -288,18 +285,16 @@ def installed_bytes(device: torch.device) -> int:
         import torch
 
         return torch.cuda.get_device_properties(device).total_memory
-    return _machine_or_assumed()[0]
+    return machine_memory()[0]
 
 
-def machine_memory() -> Memory | None:
-    """Return the memory of the machine within the limits of the container, if any; None if unknown."""
-    found = [m for m in (container_memory(),) if m is not None]
-    with contextlib.suppress(ImportError, AttributeError, KeyError, OSError, RuntimeError, ValueError):  # access may be denied
-        import psutil
+def machine_memory() -> Memory:
+    """Return the memory of the machine within the limits of the container, if any."""
+    import psutil
 
-        system = psutil.virtual_memory()
-        found.append((int(system.total), int(system.available)))
-    return (min(total for total, _ in found), max(0, min(free for _, free in found))) if found else None
+    system = psutil.virtual_memory()
+    total, free = container_memory() or (math.inf, math.inf)
+    return int(min(total, system.total)), int(max(0, min(free, system.available)))
 
 
 def container_memory(own: Path | None = None, mount: Path | None = None) -> Memory | None:
@@ -331,17 +326,6 @@ def _groups(own: Path, mount: Path) -> Iterator[tuple[Path, str, str, str]]:
         # a path that leaves the mounted tree is a group that cannot be seen from here
         for end in range(0 if ".." in parts else len(parts), -1, -1):
             yield root.joinpath(*parts[:end]), *names
-
-
-def _machine_or_assumed() -> Memory:
-    if (found := machine_memory()) is None:
-        _say_assumed()
-    return found or (ASSUMED_BYTES, ASSUMED_BYTES)
-
-
-@functools.cache
-def _say_assumed() -> None:
-    say(f"warpgs: neither psutil nor a container reports the memory; {ASSUMED_BYTES / 2**30:.0f} GiB are assumed", error=True)
 
 
 def _text(path: Path) -> str:

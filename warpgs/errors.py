@@ -9,7 +9,7 @@ import itertools
 import os
 import sys
 import textwrap
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TypeVar
 
@@ -90,6 +90,11 @@ def expect(condition: object, what: str) -> None:
         raise MalformedError(what)
 
 
+def listed(names: Sequence[object], most: int = 100) -> str:
+    """Return names for a message: all of them, or the first of very many."""
+    return ", ".join(map(str, names[:most])) + (f" and {len(names) - most} more" if len(names) > most else "")
+
+
 MAX_COMPARED = 60
 """Letters of a mistyped name that are compared."""
 
@@ -111,15 +116,8 @@ def similar_folder(path: Path) -> str:
 
 
 def install_extras(*names: str) -> str:
-    """Return the words on how to install the packages of extras, by name, since warpgs is on no package index."""
-    import importlib.metadata
-
-    try:
-        rows = importlib.metadata.requires("warpgs") or []
-    except importlib.metadata.PackageNotFoundError:  # a copy of the repository that is not installed
-        return f"`pip install '.[{','.join(names)}]'` in your copy of the repository"
-    wanted = [repr(package) for package, _, extra in (r.partition("; extra == ") for r in rows) if extra.strip("'\"") in names]
-    return f"`pip install {' '.join(wanted)}`"
+    """Return the words on how to install extras, by name: warpgs is on no package index."""
+    return f"`pip install '.[{','.join(names)}]'` in your copy of the repository"
 
 
 Kind = TypeVar("Kind", bound=type)

@@ -10,13 +10,12 @@ import os
 import re
 import shutil
 import stat
-import time
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any, BinaryIO
 
 from warpgs import folders
-from warpgs.errors import DataError, ResourceError, UsageError
+from warpgs.errors import DataError, MalformedError, ResourceError, UsageError, expect
 from warpgs.folders import WINDOWS, Folder, RefusedError, Temporary, is_below, open_folder, output_folder, sweep, temporary_file
 
 # Opening of input files: only regular files of bounded size, so that no pipe hangs a command and no device fills its
@@ -99,6 +98,46 @@ PLY_TYPES = {
 """Scalar types of a PLY file, as numpy names them without the order of bytes."""
 
 
+PLY_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "<"}
+"""Order of bytes by format; the numbers of an ASCII file do not need one."""
+PLY_LIST = "list"
+"""Type of a property that is a list, so that rows differ in length."""
+PlyElement = tuple[str, int, list[tuple[str, str]]]
+"""Name and number of rows of an element, and pairs (name, numpy type) of its properties in file order."""
+MAX_HEADER_BYTES = 65536
+"""Largest accepted header of a PLY file [bytes]; real headers have some two thousand."""
+
+
+def ply_header(head: bytes) -> tuple[list[PlyElement], int, bool]:
+    """Return the elements of the header in a PLY file's first bytes, the offset [bytes] of the data, and if they are ASCII."""
+    expect(re.match(rb"ply[ \t]*\r?\n", head), "it does not start with 'ply'")
+    end = re.search(rb"^end_header[ \t]*\r?\n", head, re.MULTILINE)
+    expect(end, f"no 'end_header' line within the first {MAX_HEADER_BYTES} bytes")
+    elements: list[PlyElement] = []
+    formats = []
+    # comments may have any encoding
+    for line in head[: end.start()].decode("utf-8", "replace").split("\n")[1:]:
+        match line.split():
+            case [] | ["comment" | "obj_info", *_]:
+                pass
+            case ["format", *words]:
+                formats.append(" ".join(words))
+            case ["element", name, count] if re.fullmatch(r"[0-9]{1,18}", count):
+                elements.append((name, int(count), []))
+            case ["property", "list", count, item, name] if elements and count in PLY_TYPES and item in PLY_TYPES:
+                elements[-1][2].append((name, PLY_LIST))
+            case ["property", kind, name] if elements and kind in PLY_TYPES:
+                elements[-1][2].append((name, PLY_TYPES[kind]))
+            case _:
+                raise MalformedError(f"header line {line[:80]!r} is invalid")
+    known = [f"{name} 1.0" for name in PLY_ORDERS]
+    given = " and ".join(formats)[:80] or "not given"
+    expect(given in known, f"its format is {given}, not one of {', '.join(known)}")
+    order = PLY_ORDERS[given.split()[0]]
+    elements = [(n, c, [(p, k if k in (PLY_LIST, "i1", "u1") else order + k) for p, k in own]) for n, c, own in elements]
+    return elements, end.end(), given == "ascii 1.0"
+
+
 def tensor_pieces(tensors: dict[str, Any], metadata: dict[str, str]) -> list[memoryview | bytes]:
     """Return a safetensors file in pieces, the same for the same tensors; those of CPU tensors share their memory."""
     import torch
@@ -151,8 +190,6 @@ LOCK = ".warpgs.lock"
 """Name of the file that a process holds while it writes into a folder."""
 UNDECODABLE = re.compile("[\udc80-\udcff]")
 """Characters that Python puts in the place of bytes that are not UTF-8."""
-PAUSES = (0.05, 0.1, 0.2, 0.4, 0.8)
-"""Pauses between attempts to replace a file on Windows [s]: a virus scanner holds a new file open for about that long."""
 FULL = (errno.ENOSPC, errno.EDQUOT)
 """Errors of a full disk, or of an exhausted disk quota."""
 NO_FOLDER_SYNC = (errno.EINVAL, errno.ENOTSUP, errno.EBADF, errno.EACCES)
@@ -202,13 +239,7 @@ def replacing(
             check(reachable)
         if WINDOWS:  # where no open file can be replaced
             file.close()
-        for pause in PAUSES if WINDOWS else ():
-            with contextlib.suppress(PermissionError):
-                folder.replace(name, path.name)
-                break
-            time.sleep(pause)
-        else:
-            folder.replace(name, path.name)
+        folder.replace(name, path.name)
         _sync(folder)
 
 

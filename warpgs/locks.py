@@ -2,9 +2,7 @@
 
 import contextlib
 import datetime
-import errno
 import hashlib
-import json
 import os
 import platform
 import shlex
@@ -14,7 +12,6 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from warpgs import schema
 from warpgs.errors import FolderHeldError, ResourceError, UsageError
 from warpgs.files import LOCK, remove_leftovers, writable, writing_into
 from warpgs.folders import LOCKED, Folder, Temporary, cache_home, lock, open_folder, sweep, sweep_temporary_files, unlock
@@ -64,8 +61,8 @@ def _is_own_group(gid: int) -> bool:
     return False
 
 
-MOST_LETTERS = 200
-"""Length at which a command is cut short in a message."""
+MOST_LETTERS, MOST_BYTES = 200, 2**11
+"""Length at which a command is cut short in a lock file, and bytes of the file that are read."""
 
 
 @contextlib.contextmanager
@@ -94,21 +91,10 @@ def hold_folder(folder: Path, *parts: str, name: str = LOCK) -> Iterator[list[st
 def hold_file(path: Path) -> contextlib.AbstractContextManager[list[str]]:
     """Lock a file that the block writes, in a folder that no process holds; see `hold_folder`."""
     # other processes may write other files of the folder; a lock of a killed process is swept as other leftovers are
-    check_file_path(path)
+    if os.path.isdir(path):
+        raise UsageError(f"{path}: is a folder; give the name of the file to write, such as one in this folder")
     check_free(path.parent)
     return hold_folder(path.parent, name=f".warpgs-{hashlib.sha256(os.fsencode(path.name)).hexdigest()[:16]}.tmp{LOCKED}")
-
-
-def check_file_path(path: Path) -> None:
-    """Check, before the work, that a file can be written at a path: it is not a folder, and not too long."""
-    try:
-        is_folder = stat.S_ISDIR(path.lstat().st_mode)
-    except OSError as e:
-        if e.errno == errno.ENAMETOOLONG:
-            raise UsageError(f"{path}: the name of the file is too long; choose a shorter one") from e
-        return  # no such path, or an error that `hold_folder` reports
-    if is_folder:
-        raise UsageError(f"{path}: is a folder; give the name of the file to write, such as one in this folder")
 
 
 def check_free(folder: Path) -> None:
@@ -151,7 +137,7 @@ def _locked(folder: Folder, name: str, flags: int) -> tuple[int, bool | None]:
             locked = lock(descriptor)
         if locked is False:
             os.lseek(descriptor, 1, os.SEEK_SET)
-            holder = _signed(os.read(descriptor, 2**16)) or "another process"
+            holder = os.read(descriptor, MOST_BYTES).decode("utf-8", "replace") or "another process"
             fix = "Wait until that process ends, end it, or choose another folder"
             raise FolderHeldError(f"{folder.path}: {holder} is writing there. {fix}")
         return descriptor, locked
@@ -164,18 +150,9 @@ def _signature() -> bytes:
     """Return the text of a lock file, which names its owner; Windows locks its first byte, which no other process may read."""
     program = Path(sys.argv[0])
     name = program.parent.name if program.name == "__main__.py" else program.name  # of `python -m warpgs`
-    now = datetime.datetime.now().astimezone().isoformat(" ", "seconds")
-    values = {"process": os.getpid(), "host": platform.node(), "since": now, "command": shlex.join([name, *sys.argv[1:]])}
-    return b"\n" + json.dumps(values).encode()
-
-
-def _signed(text: bytes) -> str | None:
-    """Return who signed a lock file; None if the signature is missing or incomplete."""
-    with contextlib.suppress(ValueError, KeyError, TypeError):
-        found = schema.parse(text)
-        command = found["command"] if len(found["command"]) <= MOST_LETTERS else f"{found['command'][:MOST_LETTERS]}..."
-        return f"process {found['process']} on {found['host']}, since {found['since']}, `{command}`,"
-    return None
+    now, command = datetime.datetime.now().astimezone().isoformat(" ", "seconds"), shlex.join([name, *sys.argv[1:]])
+    short = command if len(command) <= MOST_LETTERS else f"{command[:MOST_LETTERS]}..."
+    return f"\nprocess {os.getpid()} on {platform.node()}, since {now}, `{short}`,".encode("utf-8", "replace")
 
 
 @contextlib.contextmanager

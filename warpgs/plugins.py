@@ -80,19 +80,11 @@ class Registry(Generic[T]):
         return self._classes.get(getattr(cls, "name", "")) is cls
 
     def unnamed(self, cls: type) -> str:
-        """Return the message on a class that is not registered by its ``name``."""
-        other = self._classes.get(getattr(cls, "name", ""))
-        same = other is not None and other.__qualname__ == cls.__qualname__
-        modules = {k.__module__: getattr(sys.modules.get(k.__module__), "__file__", None) for k in (cls, other) if k and same}
-        files = {os.path.realpath(file) for file in modules.values() if file}
-        if len(modules) == 2 and len(files) == 1:
-            (file,), module = files, min(modules, key=lambda name: name.startswith(_PREFIX))
-            fix = f"give {module}:NAME instead of {Path(file).name}:NAME, or use one file"
-            return f"the file of the {self.kind} {cls.__qualname__} was loaded twice ({file}, and the module {module}); {fix}"
+        """Return the message on a class that is not registered by its ``name``; its file may have been loaded twice."""
         return (
             f"the {self.kind} {cls.__qualname__} has no registered name; register it with "
             f'@warpgs.{_FACES.get(self.kind, "train")}.register_{self.kind.replace(" ", "_")}("name") above the class, '
-            "or name it as module:Class"
+            "or name it as module:Class, in one way everywhere"
         )
 
     def find(self, name: str | type[T]) -> type[T]:
@@ -102,10 +94,8 @@ class Registry(Generic[T]):
         if name in self._classes or name in self.names():
             return self._classes[name]
         if isinstance(name, str) and ":" in name:
-            own = name.rpartition(":")[2]
-            in_study = f'; in a study, use a preset in a .py file with "strategy": {own}' if self.kind == "strategy" else ""
             why = "a class of your own. The file of a preset or run does not load your code"
-            fix = f"name the class on the command line, or pass it in Python{in_study}"
+            fix = "name the class on the command line or in a preset that is a .py file, or pass it in Python"
             raise UsageError(f"the {self.kind} {name!r} is {why}: {fix}")
         more = "import the file that registers it first, in Python" if self.kind == "camera model" else "give module:Class"
         raise UsageError(f"unknown {self.kind} {name!r}; choose one of {', '.join(self.names())}, or {more}")

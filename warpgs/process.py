@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, NoReturn, TextIO, TypeVar, cast
 
 from warpgs.errors import ResourceError, UsageError
-from warpgs.files import DESCRIPTORS, FULL, readable
+from warpgs.files import FULL, readable
 from warpgs.folders import shared_locks
 
 # Output that cannot be written: one line on stderr, and the command continues.
@@ -63,29 +63,28 @@ class CarefulStream:
     """A text stream that does not raise if it cannot be written: the first error is kept, and later writes are dropped."""
 
     def __init__(self, stream: TextIO | None, says: bool = True):
-        """Wrap a stream; ``says`` prints on stderr that the command continues without it."""
-        self.closed_at_start, self.says = stream is None, says
+        """Wrap a stream, or none where it was closed at the start; ``says`` prints on stderr that the command continues."""
         self.stream: TextIO = io.StringIO() if stream is None else stream
-        self.failure: BaseException | None = None
+        self.says, self.failure = says, cast("BaseException | None", None)
+        if stream is None:
+            self._lose(OSError(errno.EBADF, os.strerror(errno.EBADF)))
 
     def write(self, text: str) -> int:
         """Write text, if the stream takes it; return its length."""
-        self._try(lambda: self.stream.write(text), not self.closed_at_start)
+        self._try(self.stream.write, text)
         return len(text)
 
     def flush(self) -> None:
         """Flush the buffer, if the stream takes it."""
         self._try(self.stream.flush)
 
-    def _try(self, call: Callable[[], object], is_open: bool = True) -> None:
+    def _try(self, call: Callable[..., object], *arguments: object) -> None:
         """Call a method of the stream, unless it has failed before."""
-        try:
-            if not is_open:
-                raise OSError(errno.EBADF, os.strerror(errno.EBADF))
-            if self.failure is None:
-                call()
-        except (OSError, ValueError) as e:
-            self._lose(e)
+        if self.failure is None:
+            try:
+                call(*arguments)
+            except (OSError, ValueError) as e:
+                self._lose(e)
 
     def writelines(self, lines: Any) -> None:
         """Write several texts."""
@@ -96,12 +95,9 @@ class CarefulStream:
         """Keep the first error, and point the descriptor at the null device: buffers are flushed once more when Python ends."""
         if isinstance(error, ValueError) and not isinstance(error, OSError) and not self.stream.closed:
             raise error
-        if self.failure is not None:
-            return
         self.failure = error
-        if not self.closed_at_start:
-            with contextlib.suppress(OSError, ValueError):
-                _send_to_null(self.stream.fileno())
+        with contextlib.suppress(OSError, ValueError):
+            _send_to_null(self.stream.fileno())
         if self.says:
             _lost(error, GOES_ON)
 
@@ -268,35 +264,11 @@ def is_utf8(text: str) -> bool:
     return readable(text) == text
 
 
-def use_utf8_names() -> None:
-    """Start this program again in Python's UTF-8 mode, with a note, if Python reads file names in another encoding."""
-    # File names in scene files are UTF-8. Under LC_ALL=C with PYTHONUTF8=0, or in a locale of another encoding, Python
-    # cannot open them.
-    encoding = sys.getfilesystemencoding()
-    if sys.platform == "win32" or sys.flags.utf8_mode or encoding.lower().replace("-", "") == "utf8":
-        return
-    say(f"warpgs: this locale reads file names as {encoding}; started again in Python's UTF-8 mode (PYTHONUTF8=1)", error=True)
-    os.environ["PYTHONUTF8"] = "1"  # for processes that this one starts
-    if sys.stdout is not None:  # letters that the terminal lacks are still printed as codes
-        os.environ.setdefault("PYTHONIOENCODING", f"{sys.stdout.encoding}:backslashreplace")
-    # the options of the interpreter, -P and -I among them, are part of orig_argv
-    os.execv(sys.executable, [sys.executable, "-X", "utf8", *sys.orig_argv[1:]])
-
-
-@contextlib.contextmanager
-def utf8_name(path: Path) -> Iterator[str]:
-    """Give a UTF-8 path to a file: its own path if possible, else one through a descriptor of its folder or of itself."""
-    if is_utf8(str(path)):
-        yield str(path)
-        return
-    by_folder = is_utf8(path.name)
-    if not DESCRIPTORS.is_dir():
+def utf8_name(path: Path) -> str:
+    """Return the name of a file or folder for a library that needs UTF-8."""
+    if not is_utf8(str(path)):
         raise UsageError(f"{readable(str(path))}: the name is not UTF-8, which is needed here; rename the file or its folder")
-    descriptor = os.open(path.parent if by_folder else path, os.O_RDONLY)
-    try:
-        yield f"{DESCRIPTORS}/{descriptor}/{path.name}" if by_folder else f"{DESCRIPTORS}/{descriptor}"
-    finally:
-        os.close(descriptor)
+    return str(path)
 
 
 @contextlib.contextmanager

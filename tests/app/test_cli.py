@@ -373,14 +373,6 @@ def test_a_deleted_working_folder_is_named(program, tmp_path):
     assert (done.returncode, done.stderr) == (2, "warpgs: the current folder was deleted; change to another one\n")
 
 
-def test_help_of_a_narrow_terminal_ends(monkeypatch, capsys):
-    for columns in ("3", "0", "200"):
-        monkeypatch.setenv("COLUMNS", columns)
-        with pytest.raises(SystemExit) as end:
-            main(["render", "--help"])
-        assert not end.value.code and "--fps" in capsys.readouterr().out and os.environ["COLUMNS"] == columns
-
-
 def test_defects_are_called_defects(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("warpgs.pipeline.run.export.export", lambda *a: 1 / 0)
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))

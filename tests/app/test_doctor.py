@@ -6,7 +6,6 @@ import io
 import os
 import sys
 import types
-from pathlib import Path
 
 import pytest
 from rich.console import Console
@@ -35,13 +34,8 @@ def test_missing_extras_are_named_with_what_they_are_for(monkeypatch):
     (found,) = doctor._extras()
     assert (found.status, found.detail, found.remedy) == (OK, "poses, view, formats", "")
     there -= {"pycolmap", "zstandard"}
-    rows = ["numpy>=2", 'pycolmap<5; extra == "poses"', "viser; extra == 'view'", "zstandard<1; extra == 'formats'"]
-    monkeypatch.setattr(importlib.metadata, "requires", lambda _: rows)
     (found,) = doctor._extras()
     assert found.status == NOTE and "view; not installed: poses (photographs without cameras), formats" in found.detail
-    assert found.remedy == "`pip install 'pycolmap<5' 'zstandard<1'`"
-    monkeypatch.setattr(importlib.metadata, "requires", lambda _: importlib.metadata.distribution("not-installed"))
-    (found,) = doctor._extras()
     assert found.remedy == "`pip install '.[poses,formats]'` in your copy of the repository"
 
 
@@ -118,7 +112,7 @@ def test_caches_that_cannot_be_used(monkeypatch, tmp_path):
     """Maps: a note. Kernels: a private folder is a note, as a fit compiles each time; none at all stops it."""
     monkeypatch.setenv("WARPGS_CACHE", str(tmp_path / "maps"))
     (f,) = doctor._prior_cache()
-    assert f.status == OK and str(tmp_path / "maps") in f.detail and "0 B" in f.detail
+    assert f.status == OK and str(tmp_path / "maps") in f.detail
     (tmp_path / "file").write_text("in the way")
     monkeypatch.setenv("WARPGS_CACHE", str(tmp_path / "file" / "maps"))
     (f,) = doctor._prior_cache()
@@ -133,19 +127,6 @@ def test_caches_that_cannot_be_used(monkeypatch, tmp_path):
     monkeypatch.setattr(doctor, "prepare_kernel_cache", refuse)
     (f,) = doctor._kernel_cache()
     assert f.status == MISSING and f.required and "WARP_CACHE_PATH" in f.remedy
-    for name in ("gone", "kept"):
-        (tmp_path / name).mkdir()
-        (tmp_path / name / "a").write_bytes(bytes(7))
-    real = os.scandir
-
-    def scandir(path):  # another process removes a folder
-        if Path(path).name == "gone":
-            raise FileNotFoundError(path)
-        return real(path)
-
-    monkeypatch.setattr(os, "scandir", scandir)
-    (tmp_path / "file").unlink()
-    assert doctor._size(tmp_path) == 7
 
 
 def test_encoder_disk_and_memory(monkeypatch, tmp_path):

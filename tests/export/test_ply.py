@@ -12,7 +12,8 @@ import torch
 from tests.gaussians import cloud
 from warpgs.errors import DataError, ResourceError
 from warpgs.export.base import read_gaussians, write_gaussians
-from warpgs.export.ply import MAX_HEADER_BYTES, read_ply, write_ply
+from warpgs.export.ply import read_ply, write_ply
+from warpgs.files import MAX_HEADER_BYTES
 from warpgs.pipeline.run.export import convert
 from warpgs.scene import Gaussians, Normalization, base_colors
 
@@ -242,14 +243,14 @@ def test_gaussians_with_bad_numbers_are_left_out(tmp_path, own):
     values[1, 20], values[2, -6], values[4, -4:], values[5, 0] = np.nan, np.inf, 0, -np.inf
     head = "\n".join([*(line for line in lines if own or "comment" not in line), "end_header\n"])
     path.write_bytes(head.encode() + values.tobytes())
-    with pytest.raises(DataError, match="f_rest_11 of Gaussian 1 is not finite"):
+    with pytest.raises(DataError, match="means of Gaussian 5 is not finite"):
         read_gaussians(path, strict=True)
     if own:
-        with pytest.raises(DataError, match="f_rest_11 of Gaussian 1 is not finite"):
+        with pytest.raises(DataError, match="means of Gaussian 5 is not finite"):
             read_ply(path)
         return
     for read in (read_ply, read_gaussians):
-        with pytest.warns(UserWarning, match=r"4 of 7 Gaussians left out.*\(f_rest_11 of Gaussian 1 is not finite") as caught:
+        with pytest.warns(UserWarning, match=r"4 of 7 Gaussians left out.*\(means of Gaussian 5 is not finite") as caught:
             back = read(path)
         assert len(caught) == 1 and caught[0].filename == __file__ and torch.equal(back.means, model.means[[0, 3, 6]])
 
@@ -298,7 +299,7 @@ MALFORMED = {
     "gap": (ply(["element vertex 0", *PROPERTIES, *REST[:8], "property float f_rest_9"]), "missing: f_rest_8"),
     "vertex list": (ply(["element vertex 0", *PROPERTIES, "property list uchar int i"]), "'vertex' has list"),
     "list before": (ply(["element face 1", "property list uchar int i", "element vertex 0"]), "'face' has list"),
-    "nan": (ply(["element vertex 1", *PROPERTIES], ROW[:24] + b"\0\0\xc0\x7f" + ROW[28:]), "opacity of Gaussian 0"),
+    "nan": (ply(["element vertex 1", *PROPERTIES], ROW[:24] + b"\0\0\xc0\x7f" + ROW[28:]), "logit_opacities of Gaussian 0"),
     "zero rotation": (ply(["element vertex 1", *PROPERTIES], ROW[:40] + bytes(16)), "zero length"),
 }
 
@@ -323,9 +324,9 @@ def test_infinite_logits_and_axes_without_length(tmp_path):
         path.write_bytes(header + row.tobytes())
         model = read_ply(path)
         assert abs(float(model.logit_opacities.sigmoid()) - wanted) < 1e-12 and 0 < float(model.log_scales.exp()[0, 2]) < 1e-36
-    for name in ("x", "scale_0", "f_dc_0", "rot_0"):
+    for name, tensor in {"x": "means", "scale_0": "log_scales", "f_dc_0": "sh", "rot_0": "quats"}.items():
         row = np.frombuffer(ROW, "<f4").copy()
         row[NAMES.index(name)] = inf
         path.write_bytes(header + row.tobytes())
-        with pytest.raises(DataError, match=f"{name} of Gaussian 0 is not finite"):
+        with pytest.raises(DataError, match=f"{tensor} of Gaussian 0 is not finite"):
             read_ply(path)

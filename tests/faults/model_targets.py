@@ -15,10 +15,9 @@ from tests.faults.targets import Target, not_finite, register, writing
 from tests.gaussians import cloud
 from tests.io import scenes
 from tests.priors import networks as nw
-from warpgs import onnx
+from warpgs import files, onnx
 from warpgs.export import ply
 from warpgs.export.base import read_gaussians
-from warpgs.export.ply import parse_header, ply_error
 from warpgs.files import write_json
 from warpgs.io.load import Split, load_scene
 from warpgs.pipeline.metrics import lpips
@@ -77,7 +76,7 @@ def ply_files(root: Path) -> list[Path]:
     return [root / f"{name}.ply" for name in "abcd"]
 
 
-PLY = (ply._read, parse_header, ply._locate_vertices, ply._check_properties, ply._assemble, ply_error)
+PLY = (ply._plain, files.ply_header, ply.declared, ply._locate_vertices, ply._check_properties)
 PLY_CHANGES = (ply_header(text_number), ply_header(text_line), ply_body, ply_body)
 register(Target("ply", ply_files, lambda root, path: read_gaussians(path), PLY, PLY_CHANGES, nonsense=nonsense))
 

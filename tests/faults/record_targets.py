@@ -18,7 +18,7 @@ from tests.faults.model_targets import SMALL, onnx_field, run_files, tensors_bod
 from tests.faults.mutations import Change, json_value, many_rows, rarely, text_line, text_number, zip_bomb
 from tests.faults.targets import Target, not_finite, register, writing
 from tests.priors import networks as nw
-from warpgs import locks, onnx, schema
+from warpgs import onnx, schema
 from warpgs.app import farm as farm_command
 from warpgs.errors import DataError, UsageError
 from warpgs.files import write_json
@@ -176,18 +176,6 @@ def events_nonsense(found: list[dict]) -> str:
 EVENTS = (progress.read_events, progress.EventLog.rewind)
 register(Target("events", event_files, events_of, EVENTS, LINE_CHANGES, nonsense=events_nonsense, lines=0.75))
 
-
-SIGNATURE = {"process": 7, "host": "machine", "since": "2024-01-01 10:00", "command": "warpgs fit scene"}
-LOCK = {"lock": b"\n" + json.dumps(SIGNATURE).encode()}
-
-
-register(
-    Target(
-        "signature of a lock", writing(LOCK),
-        lambda root, path: locks._signed(path.read_bytes()[1:] if path.is_file() else b""),
-        (locks._signed,), (one_line(json_value), text_number),
-    )
-)  # fmt: skip
 
 # ---- runs --------------------------------------------------------------------------------------------------------------
 

@@ -238,14 +238,10 @@ def test_broken_text_files(name, content, message, tmp_path):
     refused(tmp_path, message)
 
 
-@pytest.mark.parametrize("kind", ["colmap", "transforms"])
-def test_a_long_text_of_a_file_is_shortened(kind, tmp_path):
+def test_a_long_text_of_a_file_is_shortened(tmp_path):
     """In errors and notes, which go into the files of a run or a farm; the file is still named."""
     long = "x" * 1_000_000
-    if kind == "colmap":
-        patched_pose(tmp_path, _2=long)
-    else:
-        scenes.write_transforms(tmp_path, scenes.transforms_json(fl_x=long))
+    patched_pose(tmp_path, _2=long)
     with pytest.raises(DataError) as raised:
         load_scene(tmp_path)
     text = str(raised.value)
@@ -300,10 +296,10 @@ SCALED = (np.array(scenes.opengl(1)) @ np.diag([2.0, 2, 2, 1])).tolist()
         ({"mask_path": "m.png"}, r"frame 1 .*: its mask .*m.png is missing; restore it, or remove mask_path"),
         ({"file_path": "images/photo0.png"}, r"the image 'images/photo0.png' is listed twice"),
         ({"fl_x": -1}, r"frame 1 .*: focal lengths \[-1.0, 20.0\] px must be over 0."),
-        ({"fl_x": True}, r"frame 1 .*: fl_x is True, not a finite number"),
-        ({"fl_x": 10**400}, r"frame 1 .*: fl_x is too large"),
-        ({"cx": "8"}, r"frame 1 .*: cx is '8', not a finite number; write it .* without quotes"),
-        *(({"fl_x": n}, rf"frame 1 .*: fl_x is {n}, not a finite number") for n in (np.nan, np.inf, -np.inf)),
+        ({"fl_x": True}, r"frame 1 .*: fl_x must be a finite number, not True"),
+        ({"fl_x": 10**400}, r"frame 1 .*: fl_x must be a finite number"),
+        ({"cx": "8"}, r"frame 1 .*: cx must be a finite number, not '8'; write it .* without quotes"),
+        *(({"fl_x": n}, rf"frame 1 .*: fl_x must be a finite number, not {n}") for n in (np.nan, np.inf, -np.inf)),
         ({"transform_matrix": [[np.nan] * 4] * 4}, r"frame 1 .*: the pose is not finite"),
         ({"w": 0}, r"frame 1 .*: the camera's image size 0 x 12 px is impossible"),
         ({"w": 30}, r"photo1.png: the image is 16 x 12 px, its camera 30 x 12"),

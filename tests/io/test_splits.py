@@ -108,8 +108,8 @@ def test_explicit_names(spec, train, test):
     "spec,message",
     [
         ("train=x", r"'x' could be any of a/x.png, b/x.png; give the whole name"),
-        ("train=q/yy.png", r"no view 'q/yy.png'; the nearest names are b/y.png"),
-        ("train=zz", r"no view 'zz'; the nearest names are z.jpg"),
+        ("train=q/yy.png", r"no view 'q/yy.png'; did you mean b/y.png"),
+        ("train=zz", r"no view 'zz'; the views are a/x.png"),
         ("train=z,z.jpg", r"train names z.jpg twice"),
         ("train=z;test=z", r"views z.jpg are in training and in test"),
         ("train=;test=z", r"leaves no training view"),

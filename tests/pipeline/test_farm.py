@@ -385,7 +385,7 @@ def test_folders_globs_and_lines_of_flags(tmp_path, monkeypatch):
     path = tmp_path / "jobs.jsonl"
     for word, values in {
         "is not a valid name": [{"name": n} for n in ("../b", "index.html", ".b", 101 * "x")], "must be text": [{"steps": [1]}],
-        "has 300 bytes, but a job's name may have at most 200": [{"name": 100 * "写"}], "scene must be text": [{"scene": 3}],
+        "which may have 200 bytes": [{"name": 100 * "写"}], "scene must be text": [{"scene": 3}],
         "cannot be set for a single job": [{"out": "/b"}, {"allow_outside": True}, {"--steps": 1}],
         "names user code": [{"strategy": "evil.py:Evil"}, {"view_modules": "evil.py:Evil"}],
         "without a zero byte": [{"scene": "a\0"}], "not valid JSON": ["{"], "must be an object": ["[]"],

@@ -211,8 +211,8 @@ def test_nothing_is_written_or_printed_unless_asked_for(folder, tmp_path, monkey
     printed = capsys.readouterr().out
     assert printed.splitlines()[0] == f"reading {folder / 'scene'}"
     assert "views to fit" in printed and "no run folder (out) was given" in printed
-    (first,) = (line for line in printed.splitlines() if line.startswith("step 1 of 2"))
-    assert first.endswith("per step -  left -")  # it may have compiled
+    (first,) = (line for line in printed.splitlines() if line.startswith("fitting: 1 of 2 steps, left -,"))
+    assert first.endswith(" - per step")  # it may have compiled
     details = [n for n in loud.notes if isinstance(n, Detail)]
     assert any(n.startswith("shape: ") for n in details) and len(details) < len(loud.notes)
     assert all((n in printed) != isinstance(n, Detail) for n in loud.notes)

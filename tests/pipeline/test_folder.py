@@ -313,9 +313,9 @@ def test_plain_names_stay_as_they_are():
 @pytest.mark.parametrize(
     "views",
     [["a/b.png", "a_b.png"], ["c.png", "C.png"], ["c.png", "c.jpg"], ["é.png", "e\u0301.png"], ["Straße.png", "STRASSE.png"],
-     ["x" * 251 + ".png", "x" * 250 + "y.png"], ["con.png", "NUL"], ["a?b.png", "a*b.png"], [".warpgs.lock", "..", "/", ".png"],
-     ["a/b.png", "a_b.png", image_names(["a/b.png", "a_b.png"])["a_b.png"] + ".png"]],
-    ids=["folder", "capitals", "suffix", "accent", "ss", "long", "reserved", "signs", "hidden", "taken"],
+     ["x" * 251 + ".png", "x" * 250 + "y.png"], ["con.png", "NUL"], ["a?b.png", "a*b.png"],
+     [".warpgs.lock", "..", "/", ".png"]],
+    ids=["folder", "capitals", "suffix", "accent", "ss", "long", "reserved", "signs", "hidden"],
 )  # fmt: skip
 def test_names_that_meet_are_told_apart(views):
     """In no case two files that some system takes for one; the order of the views does not matter; the note names them."""

@@ -2,7 +2,6 @@
 
 import base64
 import hashlib
-import io
 import json
 import math
 import re
@@ -11,11 +10,10 @@ from html.parser import HTMLParser
 import cv2
 import numpy as np
 import pytest
-from rich.console import Console
 
 from warpgs.errors import ResourceError
 from warpgs.files import write_json
-from warpgs.pipeline.farm.farm import FarmTable, farm_page
+from warpgs.pipeline.farm.farm import farm_page
 from warpgs.pipeline.farm.job import JobRecord
 from warpgs.process import Detail, Task
 from warpgs.report.images import png, webp
@@ -231,7 +229,7 @@ def steps_of(path):
     return [e["step"] for e in read_events(path)]
 
 
-# The index of a farm and its live table: every job, whatever it is called.
+# The index of a farm: every job, whatever it is called.
 
 ROWS = [
     JobRecord("a", "", "done", seconds=61.0, psnr=25.5, gaussians=1200, steps=500),
@@ -240,20 +238,7 @@ ROWS = [
 ]  # fmt: skip
 
 
-def test_the_table_shows_running_jobs_and_without_a_terminal_each_job_once(capsys):
-    table = FarmTable(live=True)
-    table.display = type("Live", (), {"update": lambda self, panel: None})()
-    table.update(ROWS, 75.0)
-    console = Console(file=io.StringIO(), width=100)
-    console.print(table.panel())
-    text = console.file.getvalue()
-    assert "1 waiting  1 running  1 done  2 failed" in text and "left 1 min 15 s" in text
-    assert "25.50 dB" in text and "\x1b" not in text and "\\x1b[31m" in text
-    with FarmTable(live=False) as table:
-        for _ in range(2):
-            table.update(ROWS, None)
-    lines = capsys.readouterr().out.splitlines()
-    assert [line.split("  ")[0] for line in lines[:3]] == ["a", "d", "e"] and len(lines) == 4
+def test_a_farm_s_index_shows_every_job():
     # the index counts failures by message; the name of the scene in it makes no other message; nothing of a name is markup
     page = farm_page("a & b", [(r, "x y/t.jpg" if r.name == "a" else "", "") for r in ROWS], 90)
     assert "<td>SCENE: no images &lt;b&gt;</td><td>2</td><td>d, e</td>" in page and "<h1>a &amp; b</h1>" in page

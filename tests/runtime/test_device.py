@@ -106,15 +106,9 @@ def test_sizes_are_read_and_written():
 CPU, GIB = torch.device("cpu"), 2**30
 
 
-def psutil_like(error=None, **found):
-    """Return a stand-in for psutil that finds this, or raises an error."""
-
-    def virtual_memory():
-        if error:
-            raise error
-        return SimpleNamespace(**found)
-
-    return SimpleNamespace(virtual_memory=virtual_memory)
+def psutil_like(**found):
+    """Return a stand-in for psutil that finds this."""
+    return SimpleNamespace(virtual_memory=lambda: SimpleNamespace(**found))
 
 
 @pytest.fixture
@@ -123,12 +117,9 @@ def elsewhere(monkeypatch, tmp_path):
     for name, file in (("OWN_CGROUPS", "proc"), ("CGROUPS", "sys"), ("CPU_INFO", "cpuinfo")):
         monkeypatch.setattr(device, name, tmp_path / file)
     monkeypatch.setitem(sys.modules, "psutil", psutil_like(total=16 * GIB, available=10 * GIB))
-    forgotten = (device.installed_bytes, device._say_assumed)
-    for f in forgotten:
-        f.cache_clear()
+    device.installed_bytes.cache_clear()
     yield tmp_path
-    for f in forgotten:
-        f.cache_clear()
+    device.installed_bytes.cache_clear()
 
 
 def group(root, parts: str, **files):
@@ -187,21 +178,6 @@ def test_the_root_of_a_container_is_its_own_group(elsewhere, own):
         (elsewhere / "proc").write_text(own, "utf-8")
     group(elsewhere, "", memory__max=GIB, memory__current=2**20)
     assert device.machine_memory() == (GIB, GIB - 2**20)
-
-
-REFUSALS = [PermissionError("/proc"), RuntimeError("host_statistics64"), None]
-
-
-@pytest.mark.parametrize("error", [*REFUSALS, False], ids=[*map(repr, REFUSALS), "no field"])
-def test_a_system_that_says_nothing(elsewhere, monkeypatch, capsys, error):
-    """A stated amount is assumed, with one line; a container's limit still counts."""
-    monkeypatch.setitem(sys.modules, "psutil", None if error is None else psutil_like(error, total=GIB))
-    assert device.machine_memory() is None
-    assert [device.available_bytes(CPU), device.available_bytes(CPU), device.installed_bytes(CPU)] == [device.ASSUMED_BYTES] * 3
-    said = capsys.readouterr().err
-    assert said.count("\n") == 1 and "2 GiB are assumed" in said
-    group(elsewhere, "", memory__max=GIB, memory__current=2**20)
-    assert device.available_bytes(CPU) == GIB - 2**20 and not capsys.readouterr().err
 
 
 def test_processors(elsewhere, monkeypatch):

@@ -44,14 +44,15 @@ def test_a_second_holder_is_told_whose_the_folder_is_and_impossible_paths_are_na
     with hold_folder(tmp_path):
         assert "`warpgs eval`" in refusal(tmp_path)
     with hold_folder(tmp_path):
-        for signature in (b"[" * 100_000, b"[]", b'{"command": ""}', bytes(1)):
+        for signature in (b"[" * 100_000, b"\xff"):
             (tmp_path / LOCK).write_bytes(b"\n" + signature)
-            assert refusal(tmp_path).startswith(f"{tmp_path}: another process is writing there")
+            assert "is writing there" in refusal(tmp_path) and len(refusal(tmp_path)) < 3000
+        (tmp_path / LOCK).write_bytes(b"\n")
+        assert refusal(tmp_path).startswith(f"{tmp_path}: another process is writing there")
     (tmp_path / "made.ply").mkdir()
     (tmp_path / "file").touch()
-    for name, message in (("made.ply", "made.ply: is a folder"), (300 * "a", "too long; choose a shorter")):
-        with pytest.raises(UsageError, match=message), hold_file(tmp_path / name):
-            pytest.fail("held")
+    with pytest.raises(UsageError, match="is a folder; give"), hold_file(tmp_path / "made.ply"):
+        pytest.fail("held")
     for name in ("x" * 300, "file/below"):
         with pytest.raises(ResourceError, match="choose another folder"), hold_folder(tmp_path / name):
             pytest.fail("held")

@@ -1,6 +1,5 @@
 """`warpgs doctor`: checks of this machine, each by itself."""
 
-import contextlib
 import importlib
 import importlib.metadata
 import importlib.util
@@ -15,7 +14,7 @@ from pathlib import Path
 from typing import Literal
 
 from warpgs.app.flags import call
-from warpgs.device import ASSUMED_BYTES, format_bytes, machine_memory, prepare_kernel_cache, processor_name, usable_cores
+from warpgs.device import format_bytes, machine_memory, prepare_kernel_cache, processor_name, usable_cores
 from warpgs.errors import ResourceError, install_extras
 from warpgs.process import Say, counted, fast_imports, hidden_stderr, printable, silent
 from warpgs.report.progress import Stages, waiting
@@ -49,7 +48,7 @@ PACKAGES = (
     ("scipy", "scipy", True, "rotations and neighbours"),
     ("scikit-image", "skimage", False, "`warpgs mesh`"),
     ("opencv-contrib-python-headless", "cv2", True, "images, matches, video"),
-    ("psutil", "psutil", False, "free memory"),
+    ("psutil", "psutil", True, "free memory"),
     ("safetensors", "safetensors", True, "checkpoints"),
     ("onnxruntime", "onnxruntime", False, "depth and feature networks"),
     ("pyvista", "pyvista", False, "`warpgs mesh`"),
@@ -115,11 +114,9 @@ def _extras() -> Iterable[Finding]:
 
 def _processor() -> Iterable[Finding]:
     yield Finding("CPU", OK, f"{processor_name()}, {usable_cores()} of {os.cpu_count()} cores usable")
-    if (memory := machine_memory()) is None:
-        yield Finding("Memory", NOTE, f"the system does not report its memory; {format_bytes(ASSUMED_BYTES)} are assumed")
-        return
-    detail = f"{format_bytes(memory[0])}, {format_bytes(memory[1])} available"
-    yield _noted("Memory", memory[1] >= LOW_MEMORY, detail, "close other programs, or fit at a smaller image size")
+    installed, free = machine_memory()
+    detail = f"{format_bytes(installed)}, {format_bytes(free)} available"
+    yield _noted("Memory", free >= LOW_MEMORY, detail, "close other programs, or fit at a smaller image size")
 
 
 def _cuda() -> Iterable[Finding]:
@@ -174,16 +171,6 @@ def _warp_cuda() -> Finding:
     return Finding("Warp on CUDA", MISSING, why, "update the NVIDIA driver and warp-lang, or fit with --device cpu")
 
 
-def _size(folder: Path) -> int:
-    """Return the size of all files below a folder [bytes]."""
-    size = 0
-    for above, _, names in os.walk(folder):  # it skips folders that another process removes meanwhile
-        for name in names:
-            with contextlib.suppress(OSError):
-                size += os.stat(os.path.join(above, name)).st_size
-    return size
-
-
 def _prior_cache() -> Iterable[Finding]:
     """Check the cache folder for maps of networks; a fit works without it."""
     from warpgs.priors.networks import cache_folder
@@ -196,7 +183,7 @@ def _prior_cache() -> Iterable[Finding]:
     except OSError as e:
         remedy = "set WARPGS_CACHE to a folder that you may write to"
         return [Finding("Prior cache", NOTE, f"{folder} is not writable ({e.strerror}); networks run again each time", remedy)]
-    return [Finding("Prior cache", OK, f"{folder}, {format_bytes(_size(folder))}, writable")]
+    return [Finding("Prior cache", OK, f"{folder}, writable")]
 
 
 def _kernel_cache() -> Iterable[Finding]:
@@ -211,9 +198,8 @@ def _kernel_cache() -> Iterable[Finding]:
     if refused:
         remedy = "set WARP_CACHE_PATH to a folder that only you may write to"
         return [Finding(topic, NOTE, f"{refused}; every run compiles its kernels for up to a minute", remedy, True)]
-    size = _size(folder)
-    first = "" if size else "; empty: the first fit compiles for up to a minute"
-    return [Finding(topic, OK, f"{folder}, {format_bytes(size)}, writable{first}", required=True)]
+    first = "" if any(folder.iterdir()) else "; empty: the first fit compiles for up to a minute"
+    return [Finding(topic, OK, f"{folder}, writable{first}", required=True)]
 
 
 def _video() -> Iterable[Finding]:
@@ -261,7 +247,7 @@ def diagnose(tell: Say = silent) -> list[Finding]:
 
 
 def print_report(findings: list[Finding], console=None) -> int:
-    """Print the findings as a table, and the fixes below it."""
+    """Print the findings as a table, each with its fix."""
     from rich.box import SIMPLE_HEAD
     from rich.console import Console
     from rich.markup import escape
@@ -269,23 +255,16 @@ def print_report(findings: list[Finding], console=None) -> int:
 
     console = console or Console()
     styles = {OK: "green", NOTE: "yellow", MISSING: "bold red"}
-    names = {"opencv-contrib-python-headless": "opencv-contrib"}  # the long name would take a third of 80 columns
     table = Table(box=SIMPLE_HEAD, pad_edge=False, header_style="bold")
-    table.add_column("Topic", no_wrap=True)
-    table.add_column("Status", no_wrap=True)
-    table.add_column("Detail", overflow="fold")
+    for name in ("Topic", "Status"):
+        table.add_column(name, no_wrap=True)
+    table.add_column("Detail, and what to do", overflow="fold")
     for f in findings:
-        table.add_row(escape(names.get(f.topic, f.topic)), f"[{styles[f.status]}]{f.status}[/]", escape(printable(f.detail)))
+        style, detail = styles[f.status], escape(printable(f.detail))
+        fix = f"\n[{style}]{escape(printable(f.remedy))}[/]" if f.status != OK and f.remedy else ""
+        table.add_row(escape(f.topic), f"[{style}]{f.status}[/]", detail + fix)
     console.print(table)
-    remedies = Table.grid(padding=(0, 2))
-    remedies.add_column(no_wrap=True)
-    remedies.add_column(overflow="fold")
-    for f in findings:
-        if f.status != OK and f.remedy:
-            remedies.add_row(f"[{styles[f.status]}]{escape(names.get(f.topic, f.topic))}[/]", escape(printable(f.remedy)))
-    if remedies.row_count:
-        console.print("[bold]What to do[/]", remedies, "", sep="\n")
-    if stops := [names.get(f.topic, f.topic) for f in findings if f.status == MISSING and f.required]:
+    if stops := [f.topic for f in findings if f.status == MISSING and f.required]:
         console.print(f"[bold red]A fit cannot run yet[/]: {escape(', '.join(stops))}.")
         return ResourceError.exit_code
     console.print("[bold green]A fit can run here.[/]")

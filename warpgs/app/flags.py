@@ -5,12 +5,10 @@ import dataclasses
 import functools
 import io
 import itertools
-import os
 import re
-import shutil
 import types
 import typing
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from typing import Annotated, Any, TypeVar
 
 import tyro  # noqa: TID253 - only a command imports this file
@@ -24,8 +22,6 @@ SPELLED = {"--size": "1080 1920", "--scale": "a.jpg:41,22 b.jpg:95,31 1.2", "--g
 """Examples of flags that take several values."""
 MAX_THREADS = 4096
 """Most threads that a flag takes."""
-MIN_COLUMNS = 40
-"""Smallest width of the help [columns]."""
 MAX_WHOLE = 2**31 - 1
 """Largest number of steps and factor of a size: the largest integer of 32 bits."""
 
@@ -61,20 +57,6 @@ def _open_value(info: Any) -> Any:
     )  # fmt: skip
 
 
-@contextlib.contextmanager
-def _columns() -> Iterator[None]:
-    """Give tyro a terminal of at least `MIN_COLUMNS` columns: it wraps its help for narrower ones without end."""
-    before = os.environ.get("COLUMNS")
-    if shutil.get_terminal_size().columns < MIN_COLUMNS:
-        os.environ["COLUMNS"] = str(MIN_COLUMNS)
-    try:
-        yield
-    finally:
-        os.environ.pop("COLUMNS", None)
-        if before is not None:
-            os.environ["COLUMNS"] = before
-
-
 def parse_flags(kind: Callable[..., Any], arguments: list[str], program: str, description: str) -> Any:
     """Return the instance of a dataclass of flags for the arguments of a command line."""
     words = ["--help" if word == "--help-all" else word for word in arguments]
@@ -82,13 +64,13 @@ def parse_flags(kind: Callable[..., Any], arguments: list[str], program: str, de
     complaint, help_text, registry = io.StringIO(), io.StringIO(), tyro.constructors.ConstructorRegistry()
     registry.primitive_rule(_open_value)
     try:
-        with contextlib.redirect_stderr(complaint), _columns():
+        with contextlib.redirect_stderr(complaint):
             return tyro.cli(kind, args=words, prog=program, description=description, registry=registry)
     except SystemExit as e:
         if not e.code:  # after the help
             raise
     said = re.sub(r"\[/?bold\]", "", complaint.getvalue())
-    with contextlib.redirect_stdout(help_text), contextlib.suppress(SystemExit), _columns():
+    with contextlib.redirect_stdout(help_text), contextlib.suppress(SystemExit):
         tyro.cli(kind, args=["--help"], prog=program, registry=registry)
     known = {*re.findall(r"--[\w.-]+", help_text.getvalue())}
     for flag in (word.partition("=")[0].replace("_", "-") for word in arguments if word.startswith("--")):

@@ -130,7 +130,12 @@ def arrays_to_write(
 def gaussians_of(
     path: Path, arrays: Arrays, strict: Callable[[], bool] = lambda: True, notes: list[str] | None = None
 ) -> Gaussians:
-    """Return Gaussians of decoded arrays, as float32 tensors; see `usable`."""
+    """Return Gaussians of decoded arrays, as float32 tensors, without bad rows, which get a note.
+
+    The reason of the first bad row is an error if `strict` asks for it, or if no Gaussian is left.
+    """
+    import torch
+
     with np.errstate(over="ignore", invalid="ignore"):  # values beyond float32 become infinities, which the error below names
         single = {name: np.ascontiguousarray(array, dtype=np.float32) for name, array in arrays.items()}
     bad, reason = np.zeros(len(single["means"]), bool), ""
@@ -143,26 +148,14 @@ def gaussians_of(
     zero = ~single["quats"].any(axis=1)
     if zero.any():
         reason = reason or f"the rotation of Gaussian {int(zero.argmax())} has zero length"
-    return usable(path, single, bad | zero, reason, strict, notes)
-
-
-def usable(
-    path: Path, arrays: Arrays, bad: np.ndarray, reason: str, strict: Callable[[], bool], notes: list[str] | None,
-    error: Callable[[Path, str], DataError] = malformed,
-) -> Gaussians:  # fmt: skip
-    """Return the Gaussians of float32 arrays without the ``bad`` rows [N], which get a note.
-
-    The ``reason`` of the first bad row is an error if `strict` asks for it, or if no Gaussian is left.
-    """
-    import torch
-
+        bad |= zero
     if count := int(bad.sum()):
         if count == len(bad) or strict():
-            raise error(path, reason)
+            raise malformed(path, reason)
         if notes is not None:
             notes.append(f"{path}: {count:,} of {len(bad):,} Gaussians left out, not finite or with a zero rotation ({reason})")
-        arrays = {name: array[~bad] for name, array in arrays.items()}
-    return Gaussians(**{name: torch.from_numpy(array) for name, array in arrays.items()})
+        single = {name: array[~bad] for name, array in single.items()}
+    return Gaussians(**{name: torch.from_numpy(array) for name, array in single.items()})
 
 
 def sigmoid(logits: np.ndarray) -> np.ndarray:
@@ -291,7 +284,7 @@ class Format:
     sorted: ClassVar[bool] = False
     """True to sort the Gaussians along a space-filling curve, so that neighbours in space are near each other in the file."""
     archive: ClassVar[bool] = False
-    """True for an archive of several files: `decode` then receives the open file instead of its bytes."""
+    """True to have `decode` receive the open file instead of its bytes, as for an archive of several files."""
     max_degree: ClassVar[int] = 3
     """Highest degree of spherical harmonics that the format supports."""
     note: ClassVar[str] = ""
@@ -402,6 +395,7 @@ class Format:
 
     def read_stored(self, path: Path) -> Gaussians:
         """Read Gaussians in file units about `origin`, which this sets, as float32."""
+        self.notes = []
         with reading(path, whole=not self.archive) as file:
             arrays = self.decode(path, file if self.archive else file.read())
             what, names = "an array for each tensor of Gaussians, by name", Gaussians.__dataclass_fields__
@@ -409,10 +403,10 @@ class Format:
             returned(self, "decode", {n: arrays.get(n) for n in names}, Mapping, what, each=np.ndarray)
         with reading(path):
             stated = self.origin_in(path)
-        self.notes = []
         self.origin = np.zeros(3) if stated is None else checked_origin(stated, str(path))
-        if (means := arrays["means"]).dtype == np.float64 and (middle := origin_of(means)).any():
-            arrays, self.origin = arrays | {"means": means - middle}, self.origin + middle
+        if (means := arrays["means"]).dtype == np.float64 and (middle := origin_of(means[:ROWS])).any():
+            moved = np.subtract(means, middle, out=np.empty(means.shape, np.float32), casting="same_kind")
+            arrays, self.origin = arrays | {"means": moved}, self.origin + middle
         return gaussians_of(path, arrays, lambda: self.strict or self.is_own(path), self.notes)
 
 

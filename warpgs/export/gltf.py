@@ -8,6 +8,7 @@ import base64
 import json
 import math
 import struct
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +33,7 @@ MAX_COPIES = 32
 MAX_SHEAR = 1e-4
 """Largest difference of a node's transformation from a similarity, relative to its scale; float32 leaves 1e-6."""
 _KINDS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
+_CODES = {"u2": 5123, "u4": 5125, "f4": 5126}
 _WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 _TINY = 1e-37
 
@@ -51,6 +53,23 @@ def glb(document: dict[str, Any], *body: bytes) -> list[bytes]:
     return [head, text, struct.pack("<II", size, BINARY_CHUNK), *body]
 
 
+def buffer_of(columns: Sequence[tuple[str, np.ndarray]], *more: bytes) -> tuple[dict[str, Any], list[bytes]]:
+    """Return the members of a document for columns of its type, positions first, and for ``more`` files, with their bytes."""
+    pieces = [*(np.ascontiguousarray(values).tobytes() for _, values in columns), *more]
+    starts = np.cumsum([0, *map(len, pieces)]).tolist()
+    views: list[dict[str, int]] = [{"buffer": 0, "byteOffset": at, "byteLength": len(p)} for at, p in zip(starts, pieces)]
+    accessors: list[dict[str, Any]] = []
+    for kind, values in columns:
+        code = values.dtype.str[1:]
+        views[len(accessors)]["target"] = 34963 if code == "u4" else 34962  # indices, or attributes
+        accessor = {"bufferView": len(accessors), "componentType": _CODES[code], "count": len(values), "type": kind}
+        accessor |= {"normalized": True} if code == "u2" else {}
+        if not accessors and len(values):  # glTF requires the bounds of positions
+            accessor |= {"min": values.min(0).tolist(), "max": values.max(0).tolist()}
+        accessors.append(accessor)
+    return {"buffers": [{"byteLength": starts[-1]}], "bufferViews": views, "accessors": accessors}, pieces
+
+
 def _document(arrays: base.Arrays, origin: np.ndarray | None) -> tuple[dict[str, Any], bytes]:
     """Return the glTF document and its binary buffer."""
     a = base.half_turn({k: np.asarray(v) for k, v in arrays.items()}, "z")
@@ -66,21 +85,8 @@ def _document(arrays: base.Arrays, origin: np.ndarray | None) -> tuple[dict[str,
     # for programs that show Gaussians as points
     opacities, colors = attributes[f"{EXTENSION}:OPACITY"][1][:, None], linear(base_colors(a["sh"][:, :1]))
     attributes["COLOR_0"] = ("VEC4", base.rounded(65535 * np.concatenate([colors, opacities], 1), 65535).astype("<u2"))
-    views: list[dict] = []
-    accessors: list[dict] = []
-    parts_of_body: list[bytes] = []
-    start = 0
-    for name, (kind, given) in attributes.items():
-        values = np.ascontiguousarray(given, "<u2" if name == "COLOR_0" else "<f4")
-        views.append({"buffer": 0, "byteOffset": start, "byteLength": values.nbytes, "target": 34962})
-        accessor = {"bufferView": len(accessors), "componentType": 5126, "count": len(values), "type": kind}
-        if name == "COLOR_0":
-            accessor |= {"componentType": 5123, "normalized": True}
-        if name == "POSITION":  # glTF requires the bounds of positions
-            accessor |= {"min": values.min(0).tolist(), "max": values.max(0).tolist()}
-        accessors.append(accessor)
-        parts_of_body.append(values.tobytes())
-        start += values.nbytes
+    columns = [(kind, values.astype("<u2" if name == "COLOR_0" else "<f4")) for name, (kind, values) in attributes.items()]
+    members, pieces = buffer_of(columns)
     extension = {"kernel": "ellipse", "colorSpace": COLOR_SPACE, "sortingMethod": "cameraDistance", "projection": "perspective"}
     names = {name: i for i, name in enumerate(attributes)}
     document = {
@@ -90,13 +96,11 @@ def _document(arrays: base.Arrays, origin: np.ndarray | None) -> tuple[dict[str,
         "scenes": [{"nodes": [0]}],
         "nodes": [{"mesh": 0}],
         "meshes": [{"primitives": [{"attributes": names, "mode": 0, "extensions": {EXTENSION: extension}}]}],
-        "buffers": [{"byteLength": start}],
-        "bufferViews": views,
-        "accessors": accessors,
+        **members,
     }
     if origin is not None and origin.any():
         document["extras"] = {ORIGIN: origin.tolist()}
-    return document, b"".join(parts_of_body)
+    return document, b"".join(pieces)
 
 
 def decode(path: Path, data: bytes) -> base.Arrays:

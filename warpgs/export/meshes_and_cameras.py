@@ -10,7 +10,7 @@ import numpy as np
 
 from warpgs.errors import DataError, UsageError
 from warpgs.export.base import origin_comment
-from warpgs.export.gltf import glb, linear
+from warpgs.export.gltf import buffer_of, glb, linear
 from warpgs.files import filling, is_empty, make_folder, write_bytes, write_json, write_text
 from warpgs.geometry import pinhole_of, pose_of, quaternions
 from warpgs.scene import ORIGIN, Camera, Mesh
@@ -105,28 +105,22 @@ def _glb(path: Path, mesh: Mesh, rotation: list[float] | None, origin: np.ndarra
     attributes: dict[str, int] = {"POSITION": 0, "COLOR_0": 1}
     material: dict[str, Any] = {"doubleSided": True, "extensions": {"KHR_materials_unlit": {}}}
     textures: dict[str, Any] = {}
-    coordinates: list[bytes] = []
+    coordinates: list[tuple[str, np.ndarray]] = []
+    files: list[bytes] = []
     if mesh.texture is not None and mesh.uv is not None:  # which multiplies the colours: they are white where it shows
         shown = (mesh.uv != mesh.uv[:, :1]).any((1, 2))
         corners = np.concatenate([mesh.faces.reshape(-1, 1), mesh.uv.astype("<f4").view("<i4").reshape(-1, 2)], 1)
         corners, first, number = np.unique(corners, axis=0, return_index=True, return_inverse=True)
         faces, positions = number.reshape(-1, 3), positions[corners[:, 0]]
         colors = np.where(shown.repeat(3)[first, None], 1, mesh.colors[corners[:, 0]])
-        coordinates = [np.ascontiguousarray(corners[:, 1:], "<i4").tobytes(), _jpeg(mesh.texture)]
+        coordinates, files = [("VEC2", np.ascontiguousarray(corners[:, 1:], "<i4").view("<f4"))], [_jpeg(mesh.texture)]
         textures = {"textures": [{"source": 0}], "images": [{"bufferView": 4, "mimeType": "image/jpeg"}]}
         attributes["TEXCOORD_0"] = 3
         material["pbrMetallicRoughness"] = {"baseColorTexture": {"index": 0}}
     levels = np.full((len(positions), 4), 65535, "<u2")
     levels[:, :3] = np.round(65535 * linear(colors))
-    arrays = [positions.tobytes(), levels.tobytes(), faces.astype("<u4").tobytes(), *coordinates]
-    extent = {"min": positions.min(0).tolist(), "max": positions.max(0).tolist()} if len(positions) else {}
-    kinds = [
-        (5126, "VEC3", len(positions), extent),
-        (5123, "VEC4", len(positions), {"normalized": True}),
-        (5125, "SCALAR", faces.size, {}),
-        (5126, "VEC2", len(positions), {}),
-    ]
-    starts = np.cumsum([0, *map(len, arrays)]).tolist()
+    columns = [("VEC3", positions), ("VEC4", levels), ("SCALAR", faces.astype("<u4").reshape(-1)), *coordinates]
+    members, pieces = buffer_of(columns, *files)
     text = {
         "asset": {"version": "2.0", "generator": f"warpgs {__version__}"},
         "extensionsUsed": ["KHR_materials_unlit"],
@@ -134,21 +128,13 @@ def _glb(path: Path, mesh: Mesh, rotation: list[float] | None, origin: np.ndarra
         "nodes": [{"children": [1], "rotation": rotation or [0.0, 0.0, 0.0, 1.0]}, {"mesh": 0, "translation": middle.tolist()}],
         "materials": [material], **textures,
         "meshes": [{"primitives": [{"attributes": attributes, "indices": 2, "material": 0}]}],
-        "buffers": [{"byteLength": starts[-1]}],
-        "bufferViews": [
-            {"buffer": 0, "byteOffset": begin, "byteLength": len(a)} | ({"target": target} if target else {})
-            for begin, a, target in zip(starts, arrays, (34962, 34962, 34963, 34962, 0))
-        ],
-        "accessors": [
-            {"bufferView": i, "componentType": kind, "type": form, "count": count, **more}
-            for i, (kind, form, count, more) in enumerate(kinds[: len(arrays) - bool(textures)])
-        ],
+        **members,
     }  # fmt: skip
     if origin.any():
         text["extras"] = _stated(origin)
-    if starts[-1] > MAX_BYTES:
-        raise DataError(f"{path}: a mesh of {starts[-1]:,} bytes is over the 4 GiB of .glb; ask for less, or write .ply")
-    return glb(text, *arrays)
+    if (size := sum(map(len, pieces))) > MAX_BYTES:
+        raise DataError(f"{path}: a mesh of {size:,} bytes is over the 4 GiB of .glb; ask for less, or write .ply")
+    return glb(text, *pieces)
 
 
 # Cameras as files for other programs: cameras.json of the INRIA 3DGS code, which splat editors read, transforms.json,

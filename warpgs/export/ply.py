@@ -1,6 +1,5 @@
 """PLY files of Gaussians, plain and compressed."""
 
-import functools
 import itertools
 import math
 import os
@@ -9,29 +8,19 @@ import warnings
 from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 
-from warpgs.errors import DataError, expect
+from warpgs.errors import DataError, expect, listed
 from warpgs.export import base
-from warpgs.files import PLY_TYPES, replacing
-from warpgs.geometry import checked_normalization
-from warpgs.scene import ORIGIN, Gaussians, Normalization, base_coefficients, base_colors, checked_origin
+from warpgs.files import MAX_HEADER_BYTES, PLY_LIST, PlyElement, ply_header, replacing
+from warpgs.scene import ORIGIN, Gaussians, Normalization, base_coefficients, base_colors
 
-MAX_HEADER_BYTES = 65536
-"""Largest accepted header [bytes]; real headers have some two thousand."""
-REMEDY = "Export the model again with warpgs, or with any tool that writes the binary layout of the INRIA 3DGS code."
-
-_TYPES = {name: kind if kind.endswith("1") else f"<{kind}" for name, kind in PLY_TYPES.items()}
-_FORMATS = {"binary_little_endian 1.0": "<", "binary_big_endian 1.0": ">", "ascii 1.0": "<"}
-"""Formats that are read, with their byte order in numpy; the numbers of an ASCII file do not need one."""
-ASCII = re.compile(rb"^format[ \t]+ascii", re.MULTILINE)
-
-
-Element = tuple[str, int, list[tuple[str, str]]]
-"""Name and number of rows of an element, and pairs (name, numpy type) of its properties in file order."""
-LIST = "list"
-"""Type of a property that is a list, so that rows differ in length."""
+MODES = re.compile(
+    rb"^comment[ \t]+(?:splatrendermode[ \t:]+(\S+)|antialiased[ \t:]+(\S+))[ \t]*\r?$", re.MULTILINE | re.IGNORECASE
+)
+"""Comments of Brush and Postshot that declare antialiasing."""
 
 
 def mode_comments(antialiased: bool) -> tuple[str, str]:
@@ -45,57 +34,21 @@ def origin_stated(head: bytes) -> list[str] | None:
     return None if line is None else line[1].decode("utf-8", "replace").split()
 
 
+def declared(head: bytes) -> bool:
+    """Return whether a header, which is checked, declares antialiasing; the last such comment decides."""
+    found = False
+    for mode, value in MODES.findall(head[: ply_header(head)[1]]):
+        known = mode.lower() in (b"", b"default", b"mip")
+        expect(
+            known, f"render mode {mode[:40].decode('utf-8', 'replace')!r} is not supported; train with mode 'default' or 'mip'"
+        )
+        found = mode.lower() == b"mip" or value.lower() in (b"1", b"true")
+    return found
+
+
 def is_own(head: bytes) -> bool:
     """Return whether a header has both comments of `mode_comments`, of which other programs write one or none."""
     return any("\n".join(mode_comments(antialiased)).encode() in head for antialiased in (True, False))
-
-
-def ply_error(path: Path, what: str) -> DataError:
-    """Return a DataError about a malformed file, with the remedy."""
-    return DataError(f"{path}: not a usable Gaussian PLY file: {what}. {REMEDY}")
-
-
-def parse_header(path: Path, head: bytes) -> tuple[list[Element], int, bool]:
-    """Return the elements of the header in the first bytes of a file, and the offset [bytes] of the data behind it.
-
-    Also returns whether it declares antialiasing; the last such comment decides.
-    """
-    if not re.match(rb"ply[ \t]*\r?\n", head):
-        raise ply_error(path, "it does not start with 'ply'")
-    if (end := re.search(rb"^end_header[ \t]*\r?\n", head, re.MULTILINE)) is None:
-        raise ply_error(path, f"no 'end_header' line within the first {MAX_HEADER_BYTES} bytes")
-    elements: list[Element] = []
-    formats, antialiased = [], False
-    # comments may have any encoding
-    for line in head[: end.start()].decode("utf-8", "replace").split("\n")[1:]:
-        match line.split():
-            case ["comment", *words]:
-                match " ".join(words).lower().replace(":", " ").split():
-                    case ["splatrendermode", "default" | "mip" as mode]:
-                        antialiased = mode == "mip"
-                    case ["splatrendermode", mode]:
-                        fix = "train or export with mode 'default' or 'mip'"
-                        raise DataError(f"{path}: render mode {mode[:40]!r} is not supported; {fix}")
-                    case ["antialiased", value]:
-                        antialiased = value in ("1", "true")
-            case [] | ["obj_info", *_]:
-                pass
-            case ["format", *words]:
-                formats.append(" ".join(words))
-            case ["element", name, count] if re.fullmatch(r"[0-9]{1,18}", count):
-                elements.append((name, int(count), []))
-            case ["property", "list", count, item, name] if elements and count in _TYPES and item in _TYPES:
-                elements[-1][2].append((name, LIST))
-            case ["property", kind, name] if elements and kind in _TYPES:
-                elements[-1][2].append((name, _TYPES[kind]))
-            case _:
-                raise ply_error(path, f"header line {line[:80]!r} is invalid")
-    if len(formats) != 1 or formats[0] not in _FORMATS:
-        given = " and ".join(formats)[:80] or "not given"
-        raise ply_error(path, f"its format is {given}, not one of {', '.join(_FORMATS)}")
-    order = _FORMATS[formats[0]]
-    elements = [(name, n, [(key, kind.replace("<", order)) for key, kind in given]) for name, n, given in elements]
-    return elements, end.end(), antialiased
 
 
 # The compressed PLY of PlayCanvas and SuperSplat: 16 bytes a Gaussian, and one more byte per harmonic and channel.
@@ -146,24 +99,23 @@ def start_of(path: Path) -> bytes:
     """Return the first `MAX_HEADER_BYTES` bytes of a PLY file, or the whole file if it is shorter, and check its header."""
     with base.reading(path) as file:
         head = file.read(MAX_HEADER_BYTES)
-    parse_header(path, head)
+        declared(head)
     return head
 
 
-def is_compressed(path: Path, data: bytes) -> bool:
-    """Return whether the header of a .ply file announces this format; DataError if the file has no header."""
-    elements, *_ = parse_header(path, data[:MAX_HEADER_BYTES])
-    return any(name == "vertex" and "packed_position" in dict(properties) for name, _, properties in elements)
+def is_compressed(head: bytes) -> bool:
+    """Return whether the header of a .ply file announces this format."""
+    return any(name == "vertex" and "packed_position" in dict(properties) for name, _, properties in ply_header(head)[0])
 
 
 def decode(path: Path, data: bytes) -> base.Arrays:
     """Return the Gaussians of a file's bytes."""
-    elements, start, _ = parse_header(path, data[:MAX_HEADER_BYTES])
-    expect(not ASCII.search(data[:start]), "it is compressed, but in ASCII")
+    elements, start, text = ply_header(data[:MAX_HEADER_BYTES])
+    expect(not text, "it is compressed, but in ASCII")
     tables = {}
     for element in elements:
         name, _, properties = element
-        sound = name not in tables and properties and LIST not in dict(properties).values()
+        sound = name not in tables and properties and PLY_LIST not in dict(properties).values()
         expect(sound, f"its element {name[:40]!r} is invalid")
         tables[name], start = _table(data, element, start)
     expect({"chunk", "vertex"} <= tables.keys(), "the element chunk or vertex is missing")
@@ -227,7 +179,7 @@ def _harmonics(sh: np.ndarray, n: int) -> tuple[Callable[[slice], np.ndarray], i
     return rows, count // 3 + 1
 
 
-def _table(data: bytes, element: Element, start: int) -> tuple[np.ndarray, int]:
+def _table(data: bytes, element: PlyElement, start: int) -> tuple[np.ndarray, int]:
     """Return the rows of an element that begins at byte ``start`` of the file, and the byte at which the next one begins."""
     name, count, properties = element
     expect(len(dict(properties)) == len(properties), f"a property of {name[:40]!r} appears twice")
@@ -274,7 +226,7 @@ class _HeadedFormat(base.Format):
 
     def is_antialiased(self, path: Path) -> bool:
         """Return whether the header declares antialiasing."""
-        return parse_header(path, start_of(path))[2]
+        return declared(start_of(path))
 
     def is_own(self, path: Path) -> bool:
         """Return whether the header has the comments of warpgs."""
@@ -387,56 +339,79 @@ def read_ply(path: str | os.PathLike[str], normalization: Normalization | None =
             has one that is not usable; the message names the place.
         warpgs.UsageError: The units are unknown, or scene units are requested without a normalization.
     """
-    path = Path(path)
-    notes: list[str] = []
-    normalization = checked_normalization(normalization, units, str(path))
-    gaussians = base.from_origin(*_read(path, False, notes), normalization, units)
-    if parse_header(path, start_of(path))[2]:
+    path, kind = Path(path), PLY()
+    if is_compressed(start_of(path)):
+        raise DataError(f"{path}: is a compressed PLY file, which read_ply does not read; use warpgs.export.read_gaussians")
+    gaussians = kind.read(path, normalization, units)
+    if kind.is_antialiased(path):
         base.warn_of_antialiasing(path)
-    for note in notes:
+    for note in kind.notes:
         warnings.warn(note, stacklevel=2)
     return gaussians
 
 
-def _read(path: Path, strict: bool, notes: list[str]) -> tuple[Gaussians, np.ndarray]:
-    """Return the Gaussians in file units about an origin, and the origin [3]; fills ``notes``."""
-    with base.reading(path) as file:
-        size = os.fstat(file.fileno()).st_size
-        head = file.read(MAX_HEADER_BYTES)
-        elements, start, _ = parse_header(path, head)
-        file.seek(start)
-        text, own = ASCII.search(head[:start]), is_own(head[:start])
-        vertex, start = _locate_vertices(path, elements, start)
-        _, n, properties = vertex
-        rest = _check_properties(path, properties)
-        dtype = np.dtype(properties)
-        width = 2 * len(properties) if text else dtype.itemsize  # a number of one digit and a space
-        end = file.tell() + n * width - 1 if text else start + n * width
-        if end > size:
-            raise ply_error(path, f"truncated: {n} Gaussians of {width} bytes end at byte {end}, but the file has {size} bytes")
-        lines = (line.decode("ascii", "replace") for line in file if line.strip())
-        if text:
-            before = sum(count for _, count, _ in elements[: elements.index(vertex)])
-            next(itertools.islice(lines, before, before), None)
-        else:
-            file.seek(start)
+def _plain(path: Path, file: BinaryIO, notes: list[str]) -> base.Arrays:
+    """Return the Gaussians of an open file that is not compressed; fills ``notes``."""
+    elements, end_of_header, text = ply_header(file.read(MAX_HEADER_BYTES))
+    vertex, start = _locate_vertices(elements, end_of_header)
+    _, n, properties = vertex
+    rest, dtype = _check_properties(properties), np.dtype(properties)
+    width = 2 * len(properties) if text else dtype.itemsize  # a number of one digit and a space
+    end, size = end_of_header + n * width - 1 if text else start + n * width, os.fstat(file.fileno()).st_size
+    expect(end <= size, f"truncated: {n} Gaussians of {width} bytes end at byte {end}, but the file has {size} bytes")
+    file.seek(end_of_header if text else start)
+    lines = (line.decode("ascii", "replace") for line in file if line.strip())
+    if text:
+        before = sum(count for _, count, _ in elements[: elements.index(vertex)])
+        next(itertools.islice(lines, before, before), None)
+        dtype = np.dtype([(name, "f8") for name, _ in properties])
 
-        def numbers(part: slice) -> np.ndarray:
-            found = list(itertools.islice(lines, part.stop - part.start))
-            values = np.loadtxt(found, ndmin=2, comments=None) if found else np.empty((0, len(properties)))
-            if values.shape != (part.stop - part.start, len(properties)):
-                raise ply_error(path, f"Gaussians {part.start} to {part.stop - 1} are not rows of {len(properties)} numbers")
-            return values.view([(name, "f8") for name, _ in properties])[:, 0]
+    def rows(part: slice) -> np.ndarray:
+        """Return the next rows, structured."""
+        count = part.stop - part.start
+        if not text:
+            table = np.fromfile(file, dtype, count)
+            expect(len(table) == count, f"truncated: {n} Gaussians announced, {part.start + len(table)} read")
+            return table
+        some = list(itertools.islice(lines, count))
+        values = np.loadtxt(some, ndmin=2, comments=None) if some else np.empty((0, len(properties)))
+        fits = values.shape == (count, len(properties))
+        expect(fits, f"Gaussians {part.start} to {part.stop - 1} are not rows of {len(properties)} numbers")
+        return values.view(dtype)[:, 0]
 
-        def rows(part: slice) -> np.ndarray:
-            found = np.fromfile(file, dtype=dtype, count=part.stop - part.start)
-            if len(found) != part.stop - part.start:
-                raise ply_error(path, f"truncated: {n} Gaussians announced, {part.start + len(found)} read")
-            return found
+    k, names = rest // 3, dtype.names or ()
+    shapes = {"means": (3,), "quats": (4,), "log_scales": (3,), "logit_opacities": (), "sh": (1 + k, 3)}
+    arrays = {name: np.empty((n, *shape), np.float32) for name, shape in shapes.items()}
+    if all(dtype[name].itemsize == 8 for name in _POSITION):  # maybe map coordinates
+        arrays["means"] = np.empty((n, 3))
+    for part in base.parts(n):
+        table = rows(part)
+        means, quats, scales, logits, sh = (array[part] for array in arrays.values())
+        means[:] = np.stack([table[name] for name in _POSITION], 1)
+        quats[:], scales[:], logits[:] = _columns(table, _ROTATION), _columns(table, _SCALE), table["opacity"]
+        sh[:, 0] = _columns(table, _DC) if _DC[0] in names else base_coefficients(_columns(table, _RGB) / 255)
+        sh[:, 1:] = _columns(table, _names(rest)[9 : 9 + rest]).reshape(len(table), 3, k).transpose(0, 2, 1) if rest else 0
+        scales[scales == -np.inf] = FLAT
+        np.copyto(logits, np.copysign(np.float32(OPAQUE), logits), where=np.isinf(logits))
+        # Mip-Splatting (Yu et al. 2024, section 4.1) convolves each Gaussian with a ball of this standard deviation
+        if "filter_3D" in names:
+            narrow = scales.astype(np.float64)
+            filters = np.maximum(_columns(table, ["filter_3D"]), math.exp(FLAT))
+            scales[:] = wide = 0.5 * np.logaddexp(2 * narrow, 2 * np.log(filters))
+            logits[:] = base.logits(base.sigmoid(logits) * np.exp((narrow - wide).sum(1)), 4 * math.exp(-OPAQUE))
+    if n and "filter_3D" in names:
+        notes.append(f"{path}: filter_3D of Mip-Splatting is applied to sizes and opacities")
+    logits, scales = arrays["logit_opacities"], arrays["log_scales"]
+    if n >= LEAST_JUDGED and logits.min() >= 0 and logits.max() <= 1 and scales.min() > 0:
+        values = f"all opacities are from {logits.min():.2g} to {logits.max():.2g} and all log scales above 0"
+        why = "as if stored after the sigmoid and the exponential; they are read as logits and logarithms"
+        notes.append(f"{path}: {values}, {why}. If images are foggy, export the model again without activations")
+    return arrays
 
-        stated = origin_stated(head[:start])
-        origin = np.zeros(3) if stated is None else checked_origin(stated, str(path))
-        return _assemble(path, numbers if text else rows, n, rest, strict or own, notes, origin)
+
+def _columns(table: np.ndarray, names: Sequence[str]) -> np.ndarray:
+    """Return columns of structured rows, float32 [N, C]; numbers beyond float32 become infinities."""
+    return np.stack([table[name].astype(np.float32) for name in names], 1)
 
 
 def _names(rest: int) -> list[str]:
@@ -461,107 +436,32 @@ def _rows(arrays: dict[str, np.ndarray]) -> np.ndarray:
     return np.concatenate(columns, axis=1, dtype="<f4", casting="same_kind")
 
 
-def _locate_vertices(path: Path, elements: list[Element], start: int) -> tuple[Element, int]:
+def _locate_vertices(elements: list[PlyElement], start: int) -> tuple[PlyElement, int]:
     """Return the vertex element and the offset [bytes] of its rows, behind the rows of any elements before it."""
-    if [name for name, *_ in elements].count("vertex") != 1:
-        raise ply_error(path, "the header must have one 'element vertex'")
+    expect([name for name, *_ in elements].count("vertex") == 1, "the header must have one 'element vertex'")
     for element in elements:
         name, count, properties = element
-        if LIST in (kinds := [kind for _, kind in properties]) and (count or name == "vertex"):
-            raise ply_error(path, f"element {name[:40]!r} has list properties, so the Gaussians cannot be located")
+        listed = PLY_LIST in (kinds := [kind for _, kind in properties]) and (count or name == "vertex")
+        expect(not listed, f"element {name[:40]!r} has list properties, so the Gaussians cannot be located")
         if name == "vertex":
             break
         start += count * sum(np.dtype(kind).itemsize for kind in kinds if count)
     return element, start
 
 
-def _check_properties(path: Path, properties: list[tuple[str, str]]) -> int:
-    """Return the number of coefficients above degree 0; DataError where the layout is incomplete."""
+def _check_properties(properties: list[tuple[str, str]]) -> int:
+    """Return the number of coefficients above degree 0; `MalformedError` where the layout is incomplete."""
     names = [name for name, _ in properties]
-    if len(set(names)) < len(names):
-        raise ply_error(path, f"property {Counter(names).most_common(1)[0][0][:40]!r} appears twice")
+    expect(len(set(names)) == len(names), f"property {Counter(names).most_common(1)[0][0][:40]!r} appears twice")
     rest = sum(bool(re.fullmatch(r"f_rest_[0-9]+", name)) for name in names)
-    if rest not in _REST_COUNTS:
-        raise ply_error(path, f"it has {rest} f_rest properties, but degrees 0 to 4 have 0, 9, 24, 45 or 72")
+    expect(rest in _REST_COUNTS, f"it has {rest} f_rest properties, but degrees 0 to 4 have 0, 9, 24, 45 or 72")
     # Normals are unused, and some tools leave them out.
     missing = sorted(set(_names(rest)) - set(names) - {"nx", "ny", "nz"})
     if missing[:3] == [*_DC] and all((name, "u1") in properties for name in _RGB):
         missing = missing[3:]  # nerfstudio's export with colours, not coefficients
-    if "packed_position" in names:
-        raise DataError(f"{path}: is a compressed PLY file, which read_ply does not read; use warpgs.export.read_gaussians")
-    if missing == ["scale_2"]:
-        raise ply_error(path, "its Gaussians are flat (2DGS, no scale_2), which is not supported")
-    if missing:
-        raise ply_error(path, f"properties missing: {', '.join(missing[:8])}{' ...' if len(missing) > 8 else ''}")
+    expect(missing != ["scale_2"], "its Gaussians are flat (2DGS, no scale_2), which is not supported")
+    expect(not missing, f"properties missing: {listed(missing, 8)}")
     return rest
-
-
-def _assemble(
-    path: Path, read: Callable[[slice], np.ndarray], n: int, rest: int, strict: bool, notes: list[str], origin: np.ndarray
-) -> tuple[Gaussians, np.ndarray]:
-    """Return the Gaussians of N structured rows, which are read in their order, and their ``origin`` [3]; see `usable`.
-
-    Doubles far from 0 become float32 about a point near the first rows, which is added to the origin.
-    """
-    middle = np.zeros(3)
-    k = rest // 3
-    shapes = {"means": (3,), "quats": (4,), "log_scales": (3,), "logit_opacities": (), "sh": (1 + k, 3)}
-    arrays = {name: np.empty((n, *shape), np.float32) for name, shape in shapes.items()}
-    bad = np.zeros(n, bool)
-    reasons: list[str] = []
-    for part in base.parts(n):
-        rows = read(part)
-        if part.start == 0 and all(rows.dtype[name].itemsize == 8 for name in _POSITION):
-            middle = base.origin_of(np.stack([rows[name] for name in _POSITION], 1).astype(np.float64))
-        columns = functools.partial(_columns, rows, part.start, bad[part], reasons)
-        arrays["sh"][part, 0] = columns(_DC) if _DC[0] in (rows.dtype.names or ()) else base_coefficients(columns(_RGB) / 255)
-        if rest:
-            arrays["sh"][part, 1:] = columns([f"f_rest_{i}" for i in range(rest)]).reshape(len(rows), 3, k).transpose(0, 2, 1)
-        quats = arrays["quats"][part] = columns(_ROTATION)
-        zero = ~quats.any(axis=1)
-        if zero.any():
-            reasons.append(f"the rotation of Gaussian {part.start + int(np.argmax(zero))} has zero length")
-            bad[part] |= zero
-        arrays["means"][part] = columns(_POSITION, shift=middle)
-        arrays["log_scales"][part] = columns(_SCALE, least=FLAT)
-        arrays["logit_opacities"][part] = columns(["opacity"], -OPAQUE, OPAQUE)[:, 0]
-        # Mip-Splatting (Yu et al. 2024, section 4.1) convolves each Gaussian with a ball of this standard deviation
-        if filtered := "filter_3D" in (rows.dtype.names or ()):
-            narrow = arrays["log_scales"][part].astype(np.float64)
-            wide = 0.5 * np.logaddexp(2 * narrow, 2 * np.log(np.maximum(columns(["filter_3D"]), math.exp(FLAT))))
-            with np.errstate(invalid="ignore"):  # of rows that are left out
-                opacities = base.sigmoid(arrays["logit_opacities"][part]) * np.exp((narrow - wide).sum(1))
-            arrays["log_scales"][part], arrays["logit_opacities"][part] = wide, base.logits(opacities, 4 * math.exp(-OPAQUE))
-    if n and filtered:
-        notes.append(f"{path}: filter_3D of Mip-Splatting is applied to sizes and opacities")
-    stored, scales = arrays["logit_opacities"], arrays["log_scales"]
-    if n >= LEAST_JUDGED and stored.min() >= 0 and stored.max() <= 1 and scales.min() > 0:
-        values = f"all opacities are from {stored.min():.2g} to {stored.max():.2g} and all log scales above 0"
-        why = "as if stored after the sigmoid and the exponential; they are read as logits and logarithms"
-        notes.append(f"{path}: {values}, {why}. If images are foggy, export the model again without activations")
-    return base.usable(path, arrays, bad, next(iter(reasons), ""), lambda: strict, notes, ply_error), origin + middle
-
-
-def _columns(
-    rows: np.ndarray, first: int, bad: np.ndarray, reasons: list[str], names: Sequence[str], least: float = -np.inf,
-    most: float = np.inf, shift: Sequence[float] | np.ndarray = (),
-) -> np.ndarray:  # fmt: skip
-    """Return columns of structured rows less a ``shift``, float32 [N, C]; infinities become ``least`` and ``most``.
-
-    Rows with other numbers are marked as ``bad`` [N], with a reason, in which ``first`` is the number of the first row.
-    """
-    out = np.empty((len(rows), len(names)), np.float32)
-    # A double beyond float32 becomes an infinity, and the check below finds it.
-    with np.errstate(over="ignore", invalid="ignore"):
-        for i, name in enumerate(names):
-            out[:, i] = rows[name] - shift[i] if np.any(shift) else rows[name]
-    out[out == -np.inf], out[out == np.inf] = least, most
-    finite = np.isfinite(out)
-    if not finite.all():
-        row, column = np.argwhere(~finite)[0]
-        reasons.append(f"{names[column]} of Gaussian {first + row} is not finite in float32")
-        bad |= ~finite.all(axis=1)
-    return out
 
 
 @base.register("ply")
@@ -572,16 +472,14 @@ class PLY(_HeadedFormat):
     description = "layout of Kerbl et al. 2023, float32; every tool"
     cleaned = False
     max_degree = 4
-    decode = staticmethod(decode)
+    archive = True
+
+    def decode(self, path: Path, file: BinaryIO) -> base.Arrays:
+        """Return the Gaussians of an open file, which may be compressed."""
+        compressed = is_compressed(file.read(MAX_HEADER_BYTES))
+        file.seek(0)
+        return decode(path, file.read()) if compressed else _plain(path, file, self.notes)
 
     def write(self, path: Path, gaussians: Gaussians, normalization: Normalization | None, units: str) -> None:
         """Write Gaussians with `write_ply`."""
         _write(path, gaussians, normalization, units, self.antialiased, self.origin)
-
-    def read_stored(self, path: Path) -> Gaussians:
-        """Read Gaussians as `read_ply` does, or as `CompressedPLY` if the header announces that format."""
-        if is_compressed(path, start_of(path)):
-            return super().read_stored(path)
-        self.notes = []
-        gaussians, self.origin = _read(path, self.strict, self.notes)
-        return gaussians

@@ -13,8 +13,8 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from warpgs.errors import DataError, expect
-from warpgs.files import PLY_TYPES, open_input, read_file
+from warpgs.errors import DataError, expect, listed
+from warpgs.files import MAX_HEADER_BYTES, PLY_LIST, open_input, ply_header, read_file
 from warpgs.geometry import pose_of
 from warpgs.io import folder as scenes
 from warpgs.io.folder import Probe, Reader, SceneFolder, ViewList, register
@@ -229,7 +229,7 @@ def without_unaligned(
     kept = {number: pose for number, pose in poses.items() if finite(pose)}
     if strict or not kept or len(kept) == len(poses):
         return poses, []
-    names = scenes.listed(sorted(pose[0] for number, pose in poses.items() if number not in kept))
+    names = listed(sorted(pose[0] for number, pose in poses.items() if number not in kept))
     count = f"{len(poses) - len(kept)} of {len(poses)} images of {file.name}"
     return kept, [f"left out: {count} have a pose or camera that is not finite: {names}"]
 
@@ -287,8 +287,6 @@ def _cloud(
     return PointCloud(positions, np.clip(colors, 0, 255).astype(np.float32) / np.float32(1 if fractions else 255), tracks)
 
 
-PLY_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
-
 COLORS = [c.split() for c in ("red green blue", "r g b", "diffuse_red diffuse_green diffuse_blue", "f_dc_0 f_dc_1 f_dc_2")]
 """Names of the colours of points; the last are coefficients of Gaussians."""
 
@@ -299,27 +297,20 @@ def read_ply_points(path: Path, notes: list[str] | None = None) -> PointCloud:
     See `_cloud` for ``notes``.
     """
     data = read_file(path, fix="fix its permissions or copy it again")
-    head, mark, rest = data[: 2**16].partition(b"end_header")
     try:
-        expect(data[:3] == b"ply" and mark, "it has no PLY header")
-        lines = [line.split() for line in head.decode("ascii", "replace").splitlines()]
-        order = PLY_ORDERS[next(w[1] for w in lines if w[:1] == ["format"])]
-        elements = [i for i, w in enumerate(lines) if w[:1] == ["element"]]
-        expect(elements and lines[elements[0]][1] == "vertex", "its first element is not vertex")
-        count = int(lines[elements[0]][2])
-        rows = [w for w in lines[elements[0] : [*elements, len(lines)][1]] if w[:1] == ["property"]]
-        kinds = {w[2]: PLY_TYPES[w[1]] for w in rows}
-        expect(count >= 0 and len(kinds) == len(rows), "its header is inconsistent")
-        expect({"x", "y", "z"} <= kinds.keys(), "its vertices lack x, y or z")
-        body = data[len(head) + len(mark) + rest.find(b"\n") + 1 :]
-        if order:
-            table = np.frombuffer(body, np.dtype([(n, order + k) for n, k in kinds.items()]), count)
-            values = {n: table[n].astype(np.float64) for n in kinds}
-        else:
+        ((name, count, properties), *_), start, text = ply_header(data[:MAX_HEADER_BYTES])
+        kinds, body = dict(properties), data[start:]
+        expect(name == "vertex", "its first element is not vertex")
+        plain = len(kinds) == len(properties) and PLY_LIST not in kinds.values()
+        expect(plain and {"x", "y", "z"} <= kinds.keys(), "its vertices lack x, y or z, have one twice, or have lists")
+        if text:
             words = np.array([row.split()[: len(kinds)] for row in NAN.sub(b"nan", body).splitlines()[:count]], np.float64)
             expect(count == len(words), f"it lists {len(words)} of {count} points")
             values = dict(zip(kinds, words.reshape(count, len(kinds)).T))
-    except (ValueError, KeyError, IndexError, OverflowError, StopIteration) as e:
+        else:
+            table = np.frombuffer(body, np.dtype(properties), count)
+            values = {n: table[n].astype(np.float64) for n in kinds}
+    except (ValueError, OverflowError) as e:
         raise DataError(f"{path}: the points cannot be understood ({e}); export them again as PLY, or remove the file") from e
     rgb = next((c for c in COLORS if kinds.keys() >= set(c)), [])
     colors = np.stack([values[c] for c in rgb], 1) if rgb else np.full((count, 3), 127.0)
@@ -327,9 +318,9 @@ def read_ply_points(path: Path, notes: list[str] | None = None) -> PointCloud:
         notes.append("they have no colours and start gray")
     if "f_dc_0" in rgb:
         colors = 255 * np.asarray(base_colors(colors[:, None]))
-    elif rgb and kinds[rgb[0]] == "u2":
+    elif rgb and kinds[rgb[0]][1:] == "u2":
         colors = colors / 257
-    elif rgb and kinds[rgb[0]][0] == "f" and colors.size and colors.max() <= 1:
+    elif rgb and kinds[rgb[0]][1:2] == "f" and colors.size and colors.max() <= 1:
         colors = colors * 255
     return _cloud(path, np.stack([values[c] for c in "xyz"], 1), colors, notes)
 

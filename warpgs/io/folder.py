@@ -19,7 +19,7 @@ import numpy as np
 
 from warpgs.constants import POSE_TOLERANCE
 from warpgs.device import machine_memory, usable_cores
-from warpgs.errors import DataError, UsageError, shortened
+from warpgs.errors import DataError, UsageError, listed, shortened
 from warpgs.files import inside, is_within
 from warpgs.geometry import matmul, nearest_rotation, pose_at, pose_of, rotation_matrices
 from warpgs.io.image_files import READ, decode, unread_note
@@ -142,10 +142,9 @@ def protocol_ids(names: list[str], wanted: tuple[int, ...], least: int, where: s
     first = 1 if min(ids) == 1 and not named_by_dtu(names) else 0  # files renamed 001, 002, ... count from one
     by_id = {i - first: name for i, name in zip(ids, names)}
     if missing := [i for i in range(max(least, len(names))) if i not in by_id]:
-        shown = ", ".join(map(str, missing[:8])) + (", ..." if len(missing) > 8 else "")
         counted = f"(ids are counted from 0, names run from {names[0]} to {names[-1]})"
         fix = "restore them, because the protocol's ids would otherwise select other views"
-        raise DataError(f"{where}: images with the ids {shown} are missing {counted}; {fix}")
+        raise DataError(f"{where}: images with the ids {listed(missing, 8)} are missing {counted}; {fix}")
     return {i: by_id[i] for i in wanted}
 
 
@@ -456,16 +455,6 @@ def matched_note(found: dict[str, Path], place: str, root: Path, noun: str = "im
     return [f"{count} of {place} {how} ({first} is {found[first].relative_to(root)})"]
 
 
-SHOWN = 100
-"""Largest number of names in a note."""
-
-
-def listed(names: list[str]) -> str:
-    """Return names for a note: all of them, or the first of very many."""
-    more = f" and {len(names) - SHOWN} more" if len(names) > SHOWN else ""
-    return f"{', '.join(names[:SHOWN])}{more}"
-
-
 def missing_note(missing: list[str], total: int, noun: str, file: Path, strict: bool) -> list[str]:
     """Return the note on frames without an image file, which are skipped; a DataError if ``strict``; [] if all have one."""
     if not missing:
@@ -489,8 +478,7 @@ number where each has this much free memory [bytes], which is enough for 100 meg
 
 def loaders() -> int:
     """Return the number of threads that load images on this machine."""
-    _, free = machine_memory() or (0, 0)
-    return min(usable_cores(), max(LOADERS, min(MOST_LOADERS, free // LOADER_BYTES)))
+    return min(usable_cores(), max(LOADERS, min(MOST_LOADERS, machine_memory()[1] // LOADER_BYTES)))
 
 
 class ViewList:
@@ -574,5 +562,5 @@ class ViewList:
         out = "" if cutout else ", so that their views are left out (see --mask-keeps)"
         for fraction, what in ((0.0, f"keep no pixel{out}"), (1.0, "keep every pixel")):
             if names := [n for n, kept in self._kept.items() if kept == fraction]:
-                notes.append(f"masks that {what}: {', '.join(names[:5])}{' ...' if len(names) > 5 else ''} ({len(names)})")
+                notes.append(f"masks that {what}: {listed(names, 5)} ({len(names)})")
         return notes

@@ -1,6 +1,5 @@
 """`load_scene`: a folder becomes a scene, recentred and rescaled, with its views split."""
 
-import difflib
 import functools
 import hashlib
 import itertools
@@ -12,7 +11,7 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from warpgs.errors import DataError, UsageError, similar_folder
+from warpgs.errors import DataError, UsageError, did_you_mean, listed, similar_folder
 from warpgs.geometry import FAR_OFF, camera_extent, matmul, near_cameras
 from warpgs.io import folder as scenes
 from warpgs.io.folder import Probe, Reader, SceneFolder
@@ -32,10 +31,9 @@ def far_off_note(views: list[View], points: PointCloud | None) -> list[str]:
     """Return a note that names the cameras far off the rest, if there are any."""
     near = near_cameras(np.array([v.camera.center for v in views]), None if points is None else points.points)
     names = [v.name for v, n in zip(views, near) if not n]
-    some = f"{', '.join(names[:5])}{' ...' if len(names) > 5 else ''}"
     return [
         f"{len(names)} of {len(views)} cameras are far off the rest ({FAR_OFF:g} times the median distance) and do not set the "
-        f"scale: {some}. Their poses may be wrong: estimate them again, or remove these images"
+        f"scale: {listed(names, 5)}. Their poses may be wrong: estimate them again, or remove these images"
     ] * bool(names)
 
 
@@ -112,8 +110,6 @@ DTU_VIEWS = 49
 BLENDER_TRAIN = (2, 16, 26, 55, 73, 76, 86, 93)
 """Training ids of DietNeRF's 8-view Blender protocol; tests are every 8th of the test frames."""
 
-MAX_COMPARED = 200
-"""Longest name for which similar names are suggested."""
 SPECS = "llff:K, mip360:K, dtu:3|6|9, blender:8, every:N, all, or train=NAMES;test=NAMES"
 
 
@@ -126,8 +122,9 @@ class Split:
 
     def __post_init__(self):
         if both := set(self.train) & set(self.test):
-            some = ", ".join(sorted(both)[:5])
-            raise DataError(f"views {some} are in training and in test, so their scores would be meaningless; name each once")
+            raise DataError(
+                f"views {listed(sorted(both), 5)} are in training and in test, so scores would be meaningless; name each once"
+            )
         if not self.train:
             raise DataError("the split leaves no training view; name at least one")
 
@@ -163,15 +160,6 @@ def _blender(names: list[str], count: int, spec: str) -> Split:
     return Split(tuple(train[i] for i in BLENDER_TRAIN), tuple(test[::8]))
 
 
-def _nearest(names: list[str], wanted: str) -> str:
-    """Return up to three names that resemble a wanted one, for messages."""
-    paths = {n: PurePosixPath(n) for n in names}
-    forms = {f: n for n, p in paths.items() for f in (p.stem, p.name, str(p.with_suffix("")), n)}
-    short = [f for f in forms if len(f) <= MAX_COMPARED]  # the comparison takes the product of both lengths
-    near = dict.fromkeys(forms[f] for f in difflib.get_close_matches(wanted[:MAX_COMPARED], short, 4, 0.3))
-    return ", ".join(list(near)[:3] or names[:3])
-
-
 def _finder(names: list[str], spec: str) -> Callable[[str], str]:
     """Return a function that finds views by name or name end, with suffix or without; the strictest kind of match decides."""
     bare = {n: str(PurePosixPath(n).with_suffix("")) for n in names}
@@ -192,8 +180,10 @@ def _finder(names: list[str], spec: str) -> Callable[[str], str]:
             if len(matches) == 1:
                 return matches[0]
             if matches:
-                raise DataError(f"split {spec}: {wanted!r} could be any of {', '.join(matches[:5])}; give the whole name")
-        raise DataError(f"split {spec}: no view {wanted!r}; the nearest names are {_nearest(names, wanted)}")
+                raise DataError(f"split {spec}: {wanted!r} could be any of {listed(matches, 5)}; give the whole name")
+        raise DataError(
+            f"split {spec}: no view {wanted!r}; {did_you_mean(wanted, names, 0.3) or f'the views are {listed(names, 3)}'}"
+        )
 
     return find
 
@@ -325,10 +315,9 @@ def add_score_masks(views: list[View], folder: Path, scene: SceneFolder) -> tupl
     if ids is None:
         raise DataError(f"{folder}: masks have image ids, the images ({views[0].name}, ...) no distinct ones; name them by id")
     if missing := sorted(set(ids) - set(masks)):
-        shown = ", ".join(map(str, missing[:8])) + (", ..." if len(missing) > 8 else "")
         counted = "(ids are counted from 0; an image rect_001_... is id 0)"
         fix = f"the masks run from {files[0].name} to {files[-1].name}. Restore the missing ones"
-        raise DataError(f"{folder}: no mask for image id {shown} {counted}; {fix}")
+        raise DataError(f"{folder}: no mask for image id {listed(missing, 8)} {counted}; {fix}")
     if min(ids) == 1 and 0 in masks and not scenes.named_by_dtu([v.name for v in views]):
         fix = "so the masks may be off by one; rename the images so that they count from 0, or remove mask 0"
         raise DataError(f"{folder}: the images start with 1 ({views[ids.index(1)].name}), the masks with 0, {fix}")
@@ -493,8 +482,9 @@ def _exclusions(options: ReadOptions, names: list[str]) -> list[str]:
     out = options.excluded
     for pattern in options.patterns():
         if not any(matches(name, pattern) for name in out):
-            raise DataError(f"--exclude {pattern[:80]}: no view has this name; the nearest are {_nearest(names, pattern)}")
-    return [f"left out by --exclude: {len(out)} image{'s' if len(out) != 1 else ''}: {scenes.listed(out)}"] if out else []
+            near = did_you_mean(pattern, names, 0.3) or f"the views are {listed(names, 3)}"
+            raise DataError(f"--exclude {pattern[:80]}: no view has this name; {near}")
+    return [f"left out by --exclude: {len(out)} image{'s' if len(out) != 1 else ''}: {listed(out)}"] if out else []
 
 
 MAX_FOCAL = 100

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from warpgs import schema
 from warpgs.errors import DataError
 from warpgs.files import is_within, read_file
 from warpgs.geometry import matmul, pose_of, seen_pixels
@@ -19,7 +20,6 @@ from warpgs.io.folder import Probe, Reader, SceneFolder, ViewList, register
 from warpgs.io.images import BLACK, SUFFIXES, Lens, ReadOptions, list_images
 from warpgs.io.maps import SUFFIXES as MAPS, NamedMaps
 from warpgs.scene import ORIGIN, Camera, PointCloud, Scene, View, checked_origin
-from warpgs.schema import SchemaError, check_depth, check_parts
 
 BLENDER_FILES = tuple(f"transforms_{split}.json" for split in ("train", "val", "test"))
 MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "FULL_OPENCV", "PERSPECTIVE")
@@ -46,7 +46,7 @@ def _json(path: Path, fix: str) -> Any:
     """Return the values of a JSON file of bounded size."""
     try:
         text = read_file(path, None, MAX_BYTES, fix).decode("utf-8-sig", "surrogateescape")
-        check_parts(text)
+        schema.check_parts(text)
         return json.loads(text)
     except (ValueError, RecursionError) as e:
         raise DataError(f"{path}: cannot be read as JSON ({str(e)[:80]}); {fix}") from e
@@ -56,8 +56,8 @@ def read_json(path: Path) -> dict:
     """Return the parsed file with its list of frames."""
     values = _json(path, "write it again")
     try:
-        check_depth(values, MAX_DEPTH)
-    except SchemaError as e:  # else the error message could not name its values
+        schema.check_depth(values, MAX_DEPTH)
+    except schema.SchemaError as e:  # else the error message could not name its values
         raise DataError(f"{path}: is nested deeper than {MAX_DEPTH} levels; write it again") from e
     if not isinstance(values, dict) or not isinstance(values.get("frames"), list):
         raise DataError(f"{path}: has no list 'frames'; write it again")
@@ -69,10 +69,9 @@ def _number(frame: dict, shared: dict, key: str, where: str) -> float | None:
     if (value := frame.get(key, shared.get(key))) is None:
         return None
     try:
-        if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
-            raise DataError(f"{where}: {key} is {value!r}, not a finite number; write it as one, without quotes")
-    except OverflowError as e:
-        raise DataError(f"{where}: {key} is too large") from e
+        schema.number()(value, key)
+    except schema.SchemaError as e:
+        raise DataError(f"{where}: {e}; write it as a number, without quotes") from e
     return float(value)
 
 

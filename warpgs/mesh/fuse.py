@@ -10,7 +10,7 @@ import torch
 
 from warpgs.device import available_bytes, format_bytes
 from warpgs.errors import DataError, ResourceError, UsageError
-from warpgs.geometry import evenly_spaced, matmul, pinhole_of, project_points
+from warpgs.geometry import evenly_spaced, in_image, matmul, pinhole_of, project_points
 from warpgs.kernels.launch import MAX_SIZE
 from warpgs.kernels.tsdf import gather_colors, integrate
 from warpgs.mesh.views import DEPTHS, SAMPLES, SurfaceView, SurfaceViews, agreed, depth_map, neighbours, sample_surface
@@ -76,8 +76,7 @@ def subject(points: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
     """Mask [N] of the points [N, 3] [u] that are in the images of at least `SUBJECT` of the cameras, if any are."""
     counts = np.zeros(len(points), int)
     for camera in map(pinhole_of, cameras):
-        pixels, depths = project_points(camera, points)
-        counts += (depths > 0) & (pixels >= 0).all(1) & (pixels < [camera.width, camera.height]).all(1)
+        counts += in_image(camera, points)
     return counts >= min(SUBJECT * len(cameras), counts.max(initial=0))
 
 

@@ -187,8 +187,6 @@ MIN_PHOTOGRAPHS = 3
 """Fewest photographs: with two, nothing checks the focal length and the depths."""
 FRAMES = 60
 """Default number of frames from a video."""
-LINKS = 6
-"""Number of pairs of photographs to report if no poses are found; pairs with the fewest matches come first."""
 MODEL_FILES = ("cameras.bin", "images.bin", "points3D.bin", "rigs.bin", "frames.bin")
 """Files of a COLMAP model; the first three make a scene."""
 
@@ -369,21 +367,6 @@ def _notes(photographs: list[photos.Photograph]) -> list[str]:
     return notes
 
 
-def _links(found: Mapping, photographs: list[photos.Photograph]) -> str:
-    """Return which pairs match best, and which photographs match none; fewest matches first."""
-    pairs: dict[tuple[int, ...], int] = {}
-    for i in range(len(photographs)):
-        best = found.links[i][:1]
-        pairs[tuple(sorted((i, best[0][0]))) if best else (i,)] = best[0][1] if best else 0
-    order = sorted(pairs, key=lambda pair: (pairs[pair], pair))
-    words = []
-    for pair in order[:LINKS]:
-        names = " and ".join(photographs[i].name for i in pair)
-        words.append(f"{names} share {pairs[pair]} matches" if pairs[pair] else f"{names} matches no other")
-    more = len(order) - LINKS
-    return "; ".join([*words, *([f"{more} more pairs"] if more > 0 else [])])
-
-
 def _check_found(source: Path, found: Mapping, photographs: list[photos.Photograph]) -> None:
     """Raise a DataError where too few photographs fit together, with the reason that most of them have."""
     if len(found.views) >= MIN_PHOTOGRAPHS:
@@ -401,6 +384,6 @@ def _check_found(source: Path, found: Mapping, photographs: list[photos.Photogra
         why = (
             f"at most {len(found.views)} of {count} photographs fit together, and {MIN_PHOTOGRAPHS} are needed. Take "
             "photographs that overlap by two thirds, moving the camera, not only turning it. "
-            f"So far {_links(found, photographs)}"
+            f"First, {advice(found, [p.name for p in photographs])[0]}"
         )
     raise DataError(f"{source}: no poses: {why}")

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from warpgs.errors import DataError, UsageError, install_extras
+from warpgs.errors import DataError, UsageError, install_extras, listed
 from warpgs.files import UNDECODABLE, inside, make_folder, read_start, unread_reason, write_bytes, write_json
 from warpgs.io import image_files
 from warpgs.io.images import list_images, turn_upright
@@ -71,8 +71,8 @@ def _frames(path: Path) -> Iterator[np.ndarray]:
     import cv2
 
     _check_container(path)
-    with utf8_name(path) as name, hidden_stderr():  # for a broken file, both would print the error, too
-        capture = cv2.VideoCapture(name, cv2.CAP_FFMPEG)
+    with hidden_stderr():  # for a broken file, both would print the error, too
+        capture = cv2.VideoCapture(utf8_name(path), cv2.CAP_FFMPEG)
     try:
         if not capture.isOpened():
             raise DataError(f"{path}: OpenCV cannot read it as a video; convert it to mp4 with H.264, or give its frames")
@@ -285,10 +285,9 @@ def find_photographs(folder: Path) -> tuple[list[Path], list[str]]:
             files.append(path)
     count = Counter(p.parent.relative_to(root).as_posix() for p in files)
     places = [f"{n} in {'the folder itself' if name == '.' else name}" for name, n in sorted(count.items())]
-    more = [f"{len(places) - SHOWN_FOLDERS} more folders"] if len(places) > SHOWN_FOLDERS else []
     notes = [f"skipped as {why}: {', '.join(sorted(others))}" for why, others in sorted(skipped.items())]
     if len(places) > 1:
-        notes.append(f"photographs by folder: {', '.join([*places[:SHOWN_FOLDERS], *more])}")
+        notes.append(f"photographs by folder: {listed(places, SHOWN_FOLDERS)}")
     return files, notes
 
 

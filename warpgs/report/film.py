@@ -91,7 +91,8 @@ def write_film(path: Path, frames: Iterable[np.ndarray], fps: int = 30) -> int:
             fix = "Disk full, or the encoder failed; the old file is untouched. Free disk space, or write elsewhere"
             raise ResourceError(f"{path}: cannot be written; {read}. {fix}")
 
-    with replacing(path, check, suffix=suffix) as (_, temporary), utf8_name(temporary) as name:
+    with replacing(path, check, suffix=suffix) as (_, temporary):
+        name = utf8_name(temporary)
         if suffix == ".mp4" and (program := h264_encoder()):
             _encode_h264(program, name, _even(frames, sizes), fps)
         else:
@@ -170,7 +171,8 @@ def _encode_vp9(path: Path, temporary: str, frames: Iterator[np.ndarray], fps: i
         encoder.release()
         return name
 
-    with temporary_folder() as made, utf8_name(made.path) as folder:
+    with temporary_folder() as made:
+        folder = utf8_name(made.path)
         parts = iter(lambda: list(itertools.islice(frames, size)), [])
         for name in in_background(encode, ((f"{folder}/{i}.mp4", p) for i, p in enumerate(parts)), threads):
             packets = cv2.VideoCapture(name, cv2.CAP_FFMPEG, (cv2.CAP_PROP_FORMAT, -1))
@@ -184,11 +186,10 @@ def _decoded_sizes(path: Path) -> list[tuple[int, int]]:
     """Return the size of each frame, [width, height], that can be decoded."""
     import cv2
 
-    with utf8_name(path) as name:
-        film, sizes = cv2.VideoCapture(name), []
-        try:
-            while (read := film.read())[0]:
-                sizes.append((read[1].shape[1], read[1].shape[0]))
-        finally:
-            film.release()
+    film, sizes = cv2.VideoCapture(utf8_name(path)), []
+    try:
+        while (read := film.read())[0]:
+            sizes.append((read[1].shape[1], read[1].shape[0]))
+    finally:
+        film.release()
     return sizes

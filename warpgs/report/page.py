@@ -11,6 +11,7 @@ from collections.abc import Iterable
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from urllib.parse import quote
 
+from warpgs.errors import listed
 from warpgs.files import write_text
 from warpgs.io.image_files import format_of, header_size
 from warpgs.process import Detail, Task
@@ -28,25 +29,19 @@ def image_names(views: Iterable[str]) -> dict[str, str]:
     own = {view: _own_name(view) for view in views}
     count = Counter(map(_folded, own.values()))
     kept = {v: n for v, n in own.items() if count[_folded(n)] == 1 and not NOT_EVERYWHERE.search(n) and _size(n) <= MOST_BYTES}
-    taken = set(map(_folded, kept.values()))
     for view, name in own.items():
         if view in kept:
             continue
         part = re.sub(r"[^\w.-]", "_", name).lstrip(".").encode("utf-8", "replace")[: MOST_BYTES // 2].decode("utf-8", "ignore")
-        digits, length = hashlib.sha256(view.encode("utf-8", "surrogatepass")).hexdigest(), 8
-        while _folded(f"{part}-{digits[:length]}") in taken:
-            length += 1
-        kept[view] = f"{part}-{digits[:length]}"
-        taken.add(_folded(kept[view]))
+        kept[view] = f"{part}-{hashlib.sha256(view.encode('utf-8', 'surrogatepass')).hexdigest()[:8]}"
     return {view: kept[view] for view in own}
 
 
 def renaming_notes(names: dict[str, str]) -> list[str]:
     """Return notes on views with other names for their images."""
     changed = [f"{view} is {name}.png" for view, name in names.items() if name != _own_name(view)]
-    words = ", ".join(changed[:3]) + (f", and {len(changed) - 3} more" if len(changed) > 3 else "")
     why = "because view names are alike, long, or not allowed on every system"
-    return [f"images of some views have other names, {why}: {words}"] if changed else []
+    return [f"images of some views have other names, {why}: {listed(changed, 3)}"] if changed else []
 
 
 def _own_name(view: str) -> str:

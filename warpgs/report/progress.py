@@ -14,14 +14,12 @@ import threading
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import BinaryIO
 
 from warpgs import schema
 from warpgs.files import appending, plain, read_file, writable, write_bytes
 from warpgs.process import Say, careful, printable, say, silent
 
-PLAIN_INTERVAL = 10.0
-"""Seconds between two plain lines on the steps of a fit."""
 STAGE_INTERVAL, STAGE_LINES = 5.0, 20
 """Least seconds between two plain lines on one stage, and most lines on a stage that counts."""
 SMOOTHING = 0.05
@@ -47,13 +45,6 @@ def is_live() -> bool:
     """Return whether stdout is a terminal in which a line can be overwritten."""
     stdout = getattr(sys.stdout, "rich_proxied_file", sys.stdout)  # while a line is shown, rich wraps stdout
     return stdout is not None and stdout.isatty() and os.environ.get("TERM") != "dumb"
-
-
-def _console() -> tuple[Any, bool]:
-    """Return rich's console, and whether stderr is a terminal, too: redirected errors do not disturb a line."""
-    from rich.console import Console
-
-    return Console(file=careful(sys.stdout)), sys.stderr is not None and sys.stderr.isatty()
 
 
 class _StatusLine:
@@ -91,22 +82,23 @@ class _StatusLine:
 
     def _started(self):
         """Return rich's display of one task, which draws itself eight times a second until it is stopped."""
+        from rich.console import Console
         from rich.progress import BarColumn, Progress as Display, SpinnerColumn, TextColumn, TimeElapsedColumn
 
-        console, own = _console()
+        console, own = Console(file=careful(sys.stdout)), sys.stderr is not None and sys.stderr.isatty()
         columns = (
             SpinnerColumn("dots" if (console.encoding or "").startswith("utf") else "line"),
             TextColumn("{task.description}", markup=False), BarColumn(24), TextColumn("{task.fields[detail]}", markup=False),
             TimeElapsedColumn(),
         )  # fmt: skip
-        display = Display(*columns, console=console, transient=True, refresh_per_second=8, redirect_stderr=own)
+        display = Display(
+            *columns, console=console, transient=True, refresh_per_second=8, redirect_stderr=own
+        )  # a redirected stderr disturbs no line
         display.start()
         return display
 
 
 _STATUS = _StatusLine()
-_PANELS: list[Progress] = []
-"""Panel of a fit's steps that occupies the terminal now, if any."""
 
 
 class Stages(contextlib.AbstractContextManager["Stages"]):
@@ -131,9 +123,7 @@ class Stages(contextlib.AbstractContextManager["Stages"]):
         stage, now, counted = line.rpartition(":")[0] or line, time.perf_counter(), COUNTED.search(line)
         done, total = (int(n.replace(",", "")) for n in counted.groups()) if counted else (0, 0)
         state, (last, before) = STAGE_LINES * done // total if total else line, self.printed.get(stage, (-STAGE_INTERVAL, None))
-        if self.live and _PANELS:
-            _PANELS[-1].doing = line
-        elif self.live:
+        if self.live:
             _STATUS.show(line)
         elif state != before and now - last >= STAGE_INTERVAL:
             self.printed[stage] = now, state
@@ -151,56 +141,40 @@ def waiting() -> Stages:
 
 
 class Progress:
-    """Context manager that shows step, loss, PSNR, number of Gaussians, time per step and time left.
+    """Context manager that shows step, loss, PSNR, number of Gaussians, time per step and time left, as `Stages` does.
 
     Times exclude steps that compile kernels; no time is shown before the first step without compilation.
     """
 
     def __init__(self, total: int, done: int = 0, *, planned: Sequence[float] | None = None, live: bool | None = None):
-        """Prepare for ``total`` steps, of which ``done`` are already done; ``live`` None shows the panel only in a terminal.
+        """Prepare for ``total`` steps, of which ``done`` are done; ``live`` None writes in place only in a terminal.
 
         ``planned`` is the expected time of each step, in any unit; None: all are equal.
         """
-        self.total, self.told, self.step = total, done, done
+        self.total, self.done, self.step = total, done, done
         self.planned = [0.0, *itertools.accumulate([1.0] * total if planned is None else planned)]
         """Expected time up to the end of each step, from 0."""
         self.took = self.expected = 0.0
         """Sums of measured and planned times of the last steps, with falling weights."""
         self.left: float | None = None
         """Time left [s]."""
-        self.live = is_live() if live is None else live
+        self.stages, self.count = Stages(live=live), 0
         self.loss = self.psnr = self.seconds = None
-        self.count, self.began, self.printed = 0, time.perf_counter(), 0.0
-        self.doing = "taking the first step"
-        self.display = self.spinner = None
 
     def __enter__(self) -> Progress:
-        """Start the display."""
-        if self.live:
-            from rich.live import Live
-            from rich.spinner import Spinner
-
-            _STATUS.clear()
-            self.spinner = Spinner("dots" if (sys.stdout.encoding or "").lower().startswith("utf") else "line")
-            console, own = _console()
-            self.display = Live(console=console, get_renderable=self._panel, refresh_per_second=8, redirect_stderr=own)
-            self.display.__enter__()
-            _PANELS.append(self)
+        """Begin."""
         return self
 
     def __exit__(self, *error) -> None:
-        """Show the last state and stop."""
-        self.doing = ""
-        if self.display is not None:
-            _PANELS.remove(self)
-            self.display.__exit__(*error)
-        elif error[0] is None and self.step > self.told:
-            say(self._line())
+        """Print the last state."""
+        self.stages.clear()
+        if error[0] is None and self.step > self.done:
+            say(self.line())
 
     def update(self, *, step: int, loss: float, psnr: float, count: int, seconds: float | None = None) -> None:
         """Show the numbers of one finished step; ``seconds`` is its time, None if later steps will take another time."""
         seconds = None if self.loss is None else seconds  # the first step waits for memory and caches
-        self.step, self.count, self.doing = step, count, ""
+        self.step, self.count = step, count
         self.loss, self.psnr = _mean(self.loss, loss), _mean(self.psnr, psnr)
         if seconds is not None:
             self.seconds = _mean(self.seconds, seconds)
@@ -209,42 +183,15 @@ class Progress:
             left = self.took / self.expected * (self.planned[self.total] - self.planned[step])
             if self.left is None or not self.left < left < (1 + NOISE) * self.left:
                 self.left = left
-        now = time.perf_counter()
-        if self.display is None and now - self.printed >= PLAIN_INTERVAL:
-            self.printed, self.told = now, step
-            say(self._line())
+        if step < self.total:
+            self.stages(self.line())
 
-    def _values(self) -> list[tuple[str, str]]:
-        return [
-            ("step", f"{self.step:,} of {self.total:,}"),
-            ("loss", "-" if self.loss is None else f"{self.loss:.4f}"),
-            ("training PSNR", "-" if self.psnr is None else f"{self.psnr:.2f} dB"),
-            ("Gaussians", f"{self.count:,}"),
-            ("per step", "-" if self.seconds is None else f"{1000 * self.seconds:.0f} ms"),
-            ("left", "-" if self.left is None else duration(self.left)),
-        ]
-
-    def _line(self) -> str:
-        return "  ".join(f"{name} {value}" for name, value in self._values())
-
-    def _panel(self):
-        from rich.console import Group
-        from rich.progress_bar import ProgressBar
-        from rich.table import Table
-        from rich.text import Text
-
-        table = Table.grid(padding=(0, 3))
-        names, values = zip(*self._values(), ("elapsed", duration(time.perf_counter() - self.began)))
-        table.add_row(*names, style="dim")
-        table.add_row(*values, style="bold")
-        # Alone, the bar does not end its line, and the names would follow on it; a grid row does.
-        bar = Table.grid()
-        bar.add_row(ProgressBar(total=self.total, completed=self.step, width=78))
-        if not self.doing:
-            return Group(bar, table)
-        doing = Table.grid(padding=(0, 1))
-        doing.add_row(self.spinner, Text(printable(self.doing)))
-        return Group(bar, table, doing)
+    def line(self) -> str:
+        """Return the state of the fit as one line."""
+        left = "-" if self.left is None else duration(self.left)
+        each = "-" if self.seconds is None else f"{1000 * self.seconds:.0f} ms"
+        values = f"PSNR {self.psnr:.2f} dB, loss {self.loss:.4f}, {self.count:,} Gaussians, {each} per step"
+        return f"fitting: {self.step:,} of {self.total:,} steps, left {left}, {values}"
 
 
 def _mean(old: float | None, new: float) -> float:

@@ -1,11 +1,10 @@
-"""A farm: jobs, the engine of this machine, the table of jobs on the terminal, and the index page of their runs."""
+"""A farm: jobs, the engine of this machine, its progress, and the index page of the runs."""
 
 import contextlib
 import json
 import os
 import queue
 import re
-import sys
 import textwrap
 import threading
 import time
@@ -14,17 +13,16 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 from warpgs.device import format_bytes
-from warpgs.errors import FolderHeldError, ResourceError, UsageError
+from warpgs.errors import FolderHeldError, ResourceError, UsageError, listed
 from warpgs.files import remove_leftovers, write_csv, write_text, writing_into
 from warpgs.locks import check_free, hold_folder
 from warpgs.pipeline.farm.job import PLY, THUMBNAIL, Engine, Event, FarmJob, JobRecord, finished, read_job_record, write_record
 from warpgs.pipeline.run.request import choose_device
-from warpgs.process import PythonWorker, careful, printable, say
+from warpgs.process import PythonWorker, say
 from warpgs.report.page import rendered
-from warpgs.report.progress import PLAIN_INTERVAL, duration, is_live, waiting
+from warpgs.report.progress import Stages, duration
 
 WORKER = "warpgs.pipeline.farm.worker"
 SECONDS_TO_SAVE = 60.0
@@ -283,11 +281,6 @@ def seconds_left(statuses: list[JobStatus], slots: int) -> float | None:
 
 
 STATES = ("waiting", "running", "elsewhere", "done", "failed")
-STYLES = {"running": "bold", "elsewhere": "dim", "done": "green", "failed": "bold red"}
-LAST = 6
-"""Number of rows for the jobs that ended last."""
-MOST_RUNNING = 12
-"""Largest number of rows for running jobs."""
 
 
 def row_values(row: JobRecord) -> tuple[str, ...]:
@@ -298,78 +291,12 @@ def row_values(row: JobRecord) -> tuple[str, ...]:
     )  # fmt: skip
 
 
-class FarmTable:
-    """Context manager that shows the numbers of jobs by state, the running jobs, the last finished jobs, and the time left."""
-
-    def __init__(self, *, live: bool | None = None):
-        """Prepare; ``live`` None shows the table only in a terminal."""
-        self.live = is_live() if live is None else live
-        self.began = self.printed = time.monotonic()
-        self.rows: list[JobRecord] = []
-        self.left: float | None = None
-        self.ended: dict[str, JobRecord] = {}
-        self.display: Any = None
-
-    def __enter__(self) -> "FarmTable":
-        """Start the display."""
-        if self.live:
-            from rich.console import Console
-            from rich.live import Live
-
-            waiting().clear()
-            self.display = Live(self.panel(), console=Console(file=careful(sys.stdout)), refresh_per_second=4)
-            self.display.__enter__()
-        return self
-
-    def __exit__(self, *error: Any) -> None:
-        """Show the last state and stop."""
-        if self.display is not None:
-            self.display.update(self.panel())
-            self.display.__exit__(*error)
-        elif error[0] is not None:
-            say(self.summary())
-
-    def update(self, rows: list[JobRecord], left: float | None) -> None:
-        """Show the jobs, and the time left [s] where it is known."""
-        ended = [r for r in rows if r.state in ("done", "failed") and r.name not in self.ended]
-        self.ended |= {r.name: r for r in ended}
-        self.rows, self.left = rows, left
-        if self.display is not None:
-            self.display.update(self.panel())
-            return
-        for row in ended:
-            say("  ".join(filter(None, row_values(row))))
-        if ended or time.monotonic() - self.printed >= PLAIN_INTERVAL:
-            self.printed = time.monotonic()
-            say(self.summary())
-
-    def summary(self) -> str:
-        """Return the numbers of jobs by state, the time that passed, and the time left."""
-        counts = Counter(r.state for r in self.rows)
-        states = "  ".join(f"{counts[s]:,} {s}" for s in STATES if counts[s] or s != "elsewhere")
-        left = "" if self.left is None or not self.left else f"  left {duration(self.left)}"
-        return f"{states}  after {duration(time.monotonic() - self.began)}{left}"
-
-    def panel(self) -> Any:
-        """Return the table."""
-        from rich.console import Group
-        from rich.progress_bar import ProgressBar
-        from rich.table import Table
-        from rich.text import Text
-
-        table = Table(box=None, padding=(0, 2, 0, 0), header_style="dim")
-        for name in ("scene", "state", "step", "time", "PSNR", "Gaussians"):
-            table.add_column(name, justify="left" if name in ("scene", "state") else "right", no_wrap=True)
-        last, running = [*self.ended.values()][: -LAST - 1 : -1], [r for r in self.rows if r.state == "running"]
-        for row in [*running[:MOST_RUNNING], *last]:
-            table.add_row(*(Text(printable(c)) for c in row_values(row)[:-1]), style=STYLES.get(row.state, ""))
-        bar = Table.grid()  # alone, the bar does not end its line
-        bar.add_row(ProgressBar(total=max(1, len(self.rows)), completed=len(self.ended), width=78))
-        more = len(running) - MOST_RUNNING
-        rest = [Text(f"and {more} more running", style="dim")] if more > 0 else []
-        words = (printable(f"{r.name}: {r.message}") for r in last if r.message)
-        messages = (Text(line, style="dim", no_wrap=True, overflow="ellipsis") for line in words)
-        return Group(bar, Text(self.summary(), style="bold"), table, *rest, *messages)
+def progress_line(statuses: list[JobStatus], slots: int, seconds: float) -> str:
+    """Return the numbers of jobs that ended and by state, the time that passed, and the time left."""
+    counts, left = Counter(s.state for s in statuses), seconds_left(statuses, slots)
+    states = ", ".join(f"{counts[s]:,} {s}" for s in STATES if counts[s])
+    ending = f", left {duration(left)}" if left else ""
+    return f"farm: {counts['done'] + counts['failed']:,} of {len(statuses):,} jobs, {states}, after {duration(seconds)}{ending}"
 
 
 SHORT = 120
@@ -453,7 +380,7 @@ def write_index(folder: Path, statuses: list[JobStatus], seconds: float) -> None
 
 
 SHOW_INTERVAL = 0.2
-"""Shortest time between two updates of the table [s]."""
+"""Shortest time between two lines of progress [s]."""
 INDEX_INTERVAL = 30.0
 """Time between two updates of the index while jobs run [s]."""
 
@@ -480,26 +407,30 @@ def make_engine(
 def run_and_show(jobs: list[FarmJob], engine: Engine, results: Path, *, live: bool | None = None) -> list[JobStatus]:
     """Run a farm, show its progress, and write its index."""
     began = time.monotonic()
-    shown = written = began - INDEX_INTERVAL
+    shown, written, told = began - SHOW_INTERVAL, began - INDEX_INTERVAL, set[str]()
     count = f"{len(jobs)} job{'' if len(jobs) == 1 else 's'}"
     say(f"{count}, engine {engine.name}, {engine.slots} at a time; results: {results / INDEX}, {TABLE}")
     try:
-        with writing_into(results), FarmTable(live=live) as table:
+        with writing_into(results), Stages(live=live) as stage:
             remove_leftovers(results)  # of a farm that was killed while it wrote its index
 
-            def show(statuses: list[JobStatus]) -> None:
+            def show(statuses: list[JobStatus], *, last: bool = False) -> None:
                 nonlocal shown, written
-                if time.monotonic() - shown < SHOW_INTERVAL:
+                now = time.monotonic()
+                if now - shown < SHOW_INTERVAL and not last:
                     return
-                table.update([row_of(s) for s in statuses], seconds_left(statuses, engine.slots))
-                shown = time.monotonic()
-                if shown - written >= INDEX_INTERVAL:
-                    write_index(results, statuses, shown - began)
-                    written = shown
+                for status in statuses:
+                    if status.ended and status.job.name not in told:
+                        told.add(status.job.name)
+                        say("  ".join(filter(None, row_values(row_of(status)))))
+                (say if last else stage)(progress_line(statuses, engine.slots, now - began))
+                shown = now
+                if now - written >= INDEX_INTERVAL or last:
+                    write_index(results, statuses, now - began)
+                    written = now
 
             statuses = run_farm(jobs, engine, show)
-            table.update([row_of(s) for s in statuses], None)
-            write_index(results, statuses, time.monotonic() - began)
+            show(statuses, last=True)
             return statuses
     except KeyboardInterrupt:
         say("repeat the command to continue: finished jobs are kept, and interrupted jobs continue")
@@ -512,6 +443,6 @@ def check_failures(statuses: list[JobStatus]) -> None:
     """Check that no job failed."""
     if failed := [s for s in statuses if s.state == "failed"]:
         first = failed[0].record
-        names = ", ".join(s.job.name for s in failed[:5]) + ("" if len(failed) <= 5 else f" and {len(failed) - 5} more")
+        names = listed([s.job.name for s in failed], 5)
         fix = f"First message: {first.message.rstrip('.') if first else 'unknown'}. Repeat the command to try them again"
         raise ResourceError(f"{len(failed)} of {len(statuses)} jobs failed: {names}; {INDEX} has their messages. {fix}")

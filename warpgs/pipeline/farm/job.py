@@ -129,12 +129,9 @@ def list_jobs(jobs: str) -> list[ListedJob]:
         raise UsageError(f"{jobs}: no scene found; give a folder of scenes, a glob in quotes, or a .jsonl file")
     taken: set[str] = set()
     for name, _, _ in found:
-        size, wrong = len(os.fsencode(name)), ""
-        if not NAME.fullmatch(name) or name.endswith((".", " ")) or name in OWN_FILES:
-            wrong = "is not a valid name for a job and its folder"
-        elif size > MOST_BYTES:
-            wrong = f"has {size} bytes, but a job's name may have at most {MOST_BYTES}"
-        if wrong:
+        long = len(os.fsencode(name)) > MOST_BYTES
+        if long or not NAME.fullmatch(name) or name.endswith((".", " ")) or name in OWN_FILES:
+            wrong = f"is not a valid name for a job and its folder, which may have {MOST_BYTES} bytes"
             raise DataError(f"{jobs}: {name[:100]!r} {wrong}; give another name in a .jsonl file")
         if name.casefold() in taken:
             raise UsageError(f"{jobs}: two jobs have the name {name!r}; give each line of a .jsonl file its own name")

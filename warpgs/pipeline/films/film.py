@@ -1,7 +1,6 @@
 """Films of a model: what they show, rendered frame by frame."""
 
 import collections
-import itertools
 import math
 import time
 from collections.abc import Iterator, Sequence
@@ -12,7 +11,7 @@ import numpy as np
 import torch
 
 from warpgs.device import background
-from warpgs.errors import UsageError, did_you_mean
+from warpgs.errors import UsageError, did_you_mean, listed
 from warpgs.files import make_folder, write_bytes
 from warpgs.geometry import convert_camera, pinhole_of
 from warpgs.locks import hold_file, hold_folder
@@ -39,14 +38,6 @@ BLACK = 1 / 255
 
 OUTSIDE = 0.1
 """Fraction of a frame outside all photographs above which a note is printed."""
-
-
-def _ranges(numbers: list[int]) -> str:
-    """Return ascending numbers as text such as "3 to 7, 9 and 12 to 20"; after five ranges, the number of the others."""
-    runs = [[n for _, n in run] for _, run in itertools.groupby(enumerate(numbers), lambda pair: pair[1] - pair[0])]
-    words = [f"{r[0]} to {r[-1]}" if len(r) > 1 else str(r[0]) for r in runs[:5]]
-    words += [f"{sum(map(len, runs[5:]))} more"] if len(runs) > 5 else []
-    return " and ".join(part for part in (", ".join(words[:-1]), words[-1]) if part)
 
 
 NEARLY_NOTHING, ARE_BLACK = "show nearly nothing", "are black"
@@ -81,7 +72,7 @@ def fault_notes(faults: list[str], remedy: str, nearer: str, cut: str = "") -> l
     }
     frames = {fault: [i for i, f in enumerate(faults) if f == fault] for fault in advice}
     return [
-        f"{len(numbers)} of {len(faults)} frames {fault} (frames {_ranges(numbers)}): {advice[fault]}"
+        f"{len(numbers)} of {len(faults)} frames {fault} (frames {listed(numbers, 8)}): {advice[fault]}"
         for fault, numbers in frames.items() if numbers
     ]  # fmt: skip
 

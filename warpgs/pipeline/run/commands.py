@@ -206,12 +206,10 @@ TRIED_VIEWS = 8
 
 
 def _new_folder(folder: Path, out: Path | None) -> Path:
-    """Return the folder to write; UsageError if it exists already or cannot be made."""
+    """Return the folder to write; UsageError if it exists already."""
     out = folder.resolve().with_name(f"{folder.resolve().name}-pruned") if out is None else out
     if os.path.exists(out):
         raise UsageError(f"{out} exists already; choose another --out")
-    if not os.path.isdir(out.parent):
-        raise UsageError(f"{out.parent} is not a folder; create it, or choose another --out")
     return out
 
 

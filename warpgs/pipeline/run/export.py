@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from warpgs.device import format_bytes
-from warpgs.errors import DataError, UsageError
+from warpgs.errors import DataError, UsageError, listed
 from warpgs.export.base import Format, find_format, format_of, origin_of, write_gaussians
 from warpgs.export.meshes_and_cameras import check_suffix, holds_cameras, write_cameras, write_mesh
 from warpgs.geometry import convert_box, convert_camera, convert_gaussians, convert_points, matmul, rotate
@@ -253,7 +253,7 @@ def _cameras_written(
         lines += write_cameras(target, cameras, list(named) if keep_names else None, points, origin)
     lines += origin_line(origin)
     sizes = sorted({(c.width, c.height) for c in cameras})
-    some = ", ".join(f"{w} x {h}" for w, h in sizes[:3]) + (" ..." if len(sizes) > 3 else "")
+    some = listed([f"{w} x {h}" for w, h in sizes], 3)
     names = "kept" if keep_names else "numbers"
     return [*notes, *lines, f"{len(cameras):,} cameras for images of {some} px in {target}; their names are {names}"]
 

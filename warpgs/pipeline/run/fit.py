@@ -14,7 +14,7 @@ from typing import Any, Literal
 import torch
 
 from warpgs.clock import Clock, section, timed
-from warpgs.errors import DataError, NotFiniteError, UsageError
+from warpgs.errors import DataError, NotFiniteError, UsageError, listed
 from warpgs.export.ply import write_ply
 from warpgs.files import write_json
 from warpgs.geometry import CENTRAL
@@ -284,9 +284,11 @@ def with_poses(request: SceneRequest, out: Path | None, progress: Say, ranks: in
             source, scene, threads=torch.get_num_threads(), max_pixels=request.max_pixels, allow_outside=request.allow_outside,
             matcher=request.matcher, progress=progress,
         )  # fmt: skip
-    lost = [f"no pose: {p['name']} {p['reason']}" for p in record["photographs"] if not p["registered"]]
-    notes = [*record["notes"], *lost[:5], *([f"and {len(lost) - 5} more without a pose"] if len(lost) > 5 else [])]
-    return replace(request, path=str(scene), matcher=None), notes
+    lost = [f"{p['name']} {p['reason']}" for p in record["photographs"] if not p["registered"]]
+    return replace(request, path=str(scene), matcher=None), [
+        *record["notes"],
+        *([f"no pose: {listed(lost, 5)}"] if lost else []),
+    ]
 
 
 SHOWN_ADVICE = 3
