@@ -111,12 +111,8 @@ def make_linear(real: type) -> SimpleNamespace:
 
     @wp.func
     def intrinsics_of(fx: real, fy: real, center: vec2) -> mat33:
-        v_K = mat33()
-        v_K[0, 0] = fx
-        v_K[1, 1] = fy
-        v_K[0, 2] = center[0]
-        v_K[1, 2] = center[1]
-        return v_K
+        zero = real(0.0)
+        return mat33(fx, zero, center[0], zero, fy, center[1], zero, zero, zero)
 
     @wp.func
     def in_front(position: vec3, lens: Reals, near: real) -> wp.bool:
@@ -182,17 +178,7 @@ class Pinhole(CameraModel):
             jy = K[1, 1] / z
             jxz = (K[0, 2] - point[0]) / z
             jyz = (K[1, 2] - point[1]) / z
-            first = vec3(
-                jx * axes[0, 0] + jxz * axes[2, 0],
-                jx * axes[0, 1] + jxz * axes[2, 1],
-                jx * axes[0, 2] + jxz * axes[2, 2],
-            )
-            second = vec3(
-                jy * axes[1, 0] + jyz * axes[2, 0],
-                jy * axes[1, 1] + jyz * axes[2, 1],
-                jy * axes[1, 2] + jyz * axes[2, 2],
-            )
-            return linear.Rows(first, second)
+            return linear.Rows(jx * axes[0] + jxz * axes[2], jy * axes[1] + jyz * axes[2])
 
         @wp.func
         def axes_backward(position: vec3, K: mat33, lens: Reals, point: vec2, v_first: vec3, v_second: vec3) -> mat33:
@@ -215,11 +201,10 @@ class Pinhole(CameraModel):
             jy = K[1, 1] * inv_z
             jxz = (K[0, 2] - point[0]) * inv_z
             jyz = (K[1, 2] - point[1]) * inv_z
-            axes2 = vec3(axes[2, 0], axes[2, 1], axes[2, 2])
-            v_jx = wp.dot(v_first, vec3(axes[0, 0], axes[0, 1], axes[0, 2]))
-            v_jxz = wp.dot(v_first, axes2)
-            v_jy = wp.dot(v_second, vec3(axes[1, 0], axes[1, 1], axes[1, 2]))
-            v_jyz = wp.dot(v_second, axes2)
+            v_jx = wp.dot(v_first, axes[0])
+            v_jxz = wp.dot(v_first, axes[2])
+            v_jy = wp.dot(v_second, axes[1])
+            v_jyz = wp.dot(v_second, axes[2])
             v_x = v_pixel[0] * jx
             v_y = v_pixel[1] * jy
             v_z = (

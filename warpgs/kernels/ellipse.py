@@ -153,27 +153,12 @@ def checked_factors(means: torch.Tensor, factors: torch.Tensor | None) -> torch.
     return factors.detach()
 
 
-class _PackedCovariances(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, covars):
-        off = covars.new_zeros(len(covars), 4)
-        for k, (i, j) in enumerate(OFF_DIAGONAL):
-            off[:, k] = 0.5 * covars[:, i, j] + 0.5 * covars[:, j, i]
-        return off, covars.diagonal(dim1=1, dim2=2).contiguous()
-
-    @staticmethod
-    @launch.first_order
-    def backward(ctx, v_off, v_diagonal):
-        v_covars = torch.diag_embed(v_diagonal)
-        for k, (i, j) in enumerate(OFF_DIAGONAL):
-            v_covars[:, i, j] = v_covars[:, j, i] = 0.5 * v_off[:, k]
-        return (v_covars,)
-
-
 def packed_covariances(covars: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Return the symmetric part of covariances [N, 3, 3] as xy, xz, yz and a 0 [N, 4], and diagonals [N, 3]. Differentiable."""
-    found: tuple[torch.Tensor, torch.Tensor] = _PackedCovariances.apply(covars)
-    return found
+    # both halves first, since a sum could overflow
+    halves = 0.5 * covars
+    off = [halves[:, i, j] + halves[:, j, i] for i, j in OFF_DIAGONAL]
+    return torch.stack([*off, torch.zeros_like(off[0])], 1), covars.diagonal(dim1=1, dim2=2).contiguous()
 
 
 @functools.cache
@@ -268,9 +253,7 @@ def make_projection(real, camera_model: str, parameters: str = "stored", lanes: 
 
     @wp.func
     def finite3(v: vec3) -> wp.bool:
-        if wp.static(lanes):  # isfinite would be a function call
-            return (v[0] - v[0]) + (v[1] - v[1]) + (v[2] - v[2]) == real(0.0)
-        return wp.isfinite(v[0]) and wp.isfinite(v[1]) and wp.isfinite(v[2])
+        return (v[0] - v[0]) + (v[1] - v[1]) + (v[2] - v[2]) == real(0.0)  # isfinite would be a function call on a CPU
 
     @wp.func
     def sigmoid(x: real) -> real:
@@ -302,14 +285,12 @@ def make_projection(real, camera_model: str, parameters: str = "stored", lanes: 
         e.position = rotation * mean + vec3(view[0, 3], view[1, 3], view[2, 3])
         # Guards are phrased so that a NaN fails them.
         before = camera.in_range(e.position, lens, near)
-        if wp.static(not lanes):
-            if not before:
-                return e
+        if wp.static(not lanes) and not before:
+            return e
         pixel = camera.pixel_of(e.position, K, lens)
         near_image = wp.abs(pixel[0]) <= real(FARTHEST_PIXEL) and wp.abs(pixel[1]) <= real(FARTHEST_PIXEL)
-        if wp.static(not lanes):
-            if not near_image:
-                return e
+        if wp.static(not lanes) and not near_image:
+            return e
         e.pixel = pixel
         e.expansion_point = camera.expansion_point(pixel, width, height)
         turned = wp.bool(True)
@@ -319,29 +300,25 @@ def make_projection(real, camera_model: str, parameters: str = "stored", lanes: 
         else:
             e.quat_length = r.quat_length(q)
             turned = e.quat_length >= real(SHORTEST_QUAT) and e.quat_length * real(SHORTEST_QUAT) <= real(1.0)
-            if wp.static(not lanes):
-                if not turned:
-                    return e
+            if wp.static(not lanes) and not turned:
+                return e
             e.quat = q / e.quat_length
             e.scales = scales_of(log_scale)
             sized = finite3(e.scales)  # the logarithm of 0 is -inf, and no error
-            if wp.static(not lanes):
-                if not sized:
-                    return e
+            if wp.static(not lanes) and not sized:
+                return e
             e.axes = rotation * r.rotation(e.quat) * wp.diag(e.scales)
         rows = camera.project_axes(e.position, K, lens, e.expansion_point, e.axes)
         m1 = rows.first
         m2 = rows.second
         finite = finite3(m1) and finite3(m2)
-        if wp.static(not lanes):
-            if not finite:
-                return e
+        if wp.static(not lanes) and not finite:
+            return e
         # det grows with the fourth power of the axes: shrink them below 2^16 px by exact powers of two.
         largest = wp.max(wp.max(wp.abs(m1)), wp.max(wp.abs(m2)))
         short = largest <= real(LARGEST_AXIS)
-        if wp.static(not lanes):
-            if not short:
-                return e
+        if wp.static(not lanes) and not short:
+            return e
         shrink = real(1.0)
         if wp.static(lanes):
             for _ in range(wp.static(SHRINKS)):
@@ -398,28 +375,18 @@ def make_projection(real, camera_model: str, parameters: str = "stored", lanes: 
             view[0, 2] * view[0, 3] + view[1, 2] * view[1, 3] + view[2, 2] * view[2, 3],
         )
         largest = wp.max(wp.abs(centered))
-        if wp.static(lanes):
-            apart = wp.where(largest > real(0.0), largest - largest == real(0.0), False)
-        else:
-            apart = largest > real(0.0) and wp.isfinite(largest)
-            if not apart:
-                return vec4()
+        apart = wp.where(largest > real(0.0), largest - largest == real(0.0), False)
         d = centered / largest
         length = wp.sqrt(wp.dot(d, d))
         d = d / length
-        if wp.static(lanes):
-            none = real(0.0)
-            return vec4(
-                wp.where(apart, d[0], none), wp.where(apart, d[1], none), wp.where(apart, d[2], none),
-                wp.where(apart, length * largest, none),
-            )  # fmt: skip
-        return vec4(d[0], d[1], d[2], length * largest)
+        none = real(0.0)
+        return vec4(
+            wp.where(apart, d[0], none), wp.where(apart, d[1], none), wp.where(apart, d[2], none),
+            wp.where(apart, length * largest, none),
+        )  # fmt: skip
 
-    own = {
-        "Ellipse": Ellipse, "ellipse": ellipse, "factor_of": factor_of, "compensation": compensation, "sigmoid": sigmoid,
-        "opacity_of": opacity_of, "scales_of": scales_of, "direction": direction, "finite3": finite3,
-    }  # fmt: skip
-    return SimpleNamespace(**vars(camera) | vars(r) | own)
+    own = named(Ellipse, ellipse, factor_of, compensation, sigmoid, opacity_of, scales_of, direction, finite3)
+    return SimpleNamespace(**vars(camera) | vars(r) | vars(own))
 
 
 @functools.cache
@@ -641,15 +608,9 @@ def make_functions(real, camera_model: str, parameters: str, antialiased: bool, 
     @wp.func
     def centered(d: vec4, w: basis.values) -> vec3:
         """Return the gradient of the mean through its viewing direction ``d``; ``w`` is that of the basis (section 5)."""
-        v_centered = vec3()
         unit = vec3(d[0], d[1], d[2])
-        if wp.static(lanes):
-            v_unit = basis.basis_backward(unit, w)
-            v_centered = (v_unit - unit * wp.dot(unit, v_unit)) / wp.where(d[3] > real(0.0), d[3], real(wp.inf))
-        elif d[3] > real(0.0):
-            v_unit = basis.basis_backward(unit, w)
-            v_centered = (v_unit - unit * wp.dot(unit, v_unit)) / d[3]
-        return v_centered
+        v_unit = basis.basis_backward(unit, w)
+        return (v_unit - unit * wp.dot(unit, v_unit)) / wp.where(d[3] > real(0.0), d[3], real(wp.inf))
 
     @wp.func
     def logit(projected: row, v_projected: row, i: int, logit_opacity: real) -> real:

@@ -265,9 +265,7 @@ class _Recorded:
         raise TypeError(f"{self.kernel.key}: {label} must be {self.dtypes[i]} on {kind}, not {found}")
 
 
-@functools.cache
-def _recorded(kernel, device: torch.device, block_dim: int) -> _Recorded:
-    return _Recorded(kernel, device, block_dim)
+_recorded = functools.cache(_Recorded)
 
 
 class _OfThread(threading.local):

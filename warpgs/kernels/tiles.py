@@ -100,16 +100,6 @@ def make_emit(real, slotted: bool, ranked: bool = False):
     vec2i = s.vec2i
     write = make_write(slotted)
 
-    @wp.func
-    def span_of(
-        projected: Rows, i: int, row: int, alpha_cut: real, square_sigma: real, origin_x: int, width: int, tile_size: int
-    ) -> vec2i:
-        factor = vec3(projected[i, 2], projected[i, 3], projected[i, 4])
-        reach = s.reach_of(projected[i, 5], alpha_cut, square_sigma)
-        return s.tile_columns(
-            projected[i, 0], projected[i, 1], factor, reach, projected[i, 10], projected[i, 11], row, origin_x, width, tile_size
-        )
-
     @wp.func_native(source("blend_pack.cu", SCALE=SCALE, LARGEST_HALF=f"{LARGEST_HALF}f"))
     def pack(j: int, i: int, count: int, projected: Rows, records: Ints): ...
 
@@ -161,7 +151,12 @@ def make_emit(real, slotted: bool, ranked: bool = False):
             row = cuda.broadcast(rows[0], owner) + batch + lane - cuda.broadcast(row_begin, owner)
             span = vec2i(0, 0)
             if batch + lane < row_count:
-                span = span_of(projected, g, row, alpha_cut, square_sigma, origin_x, width, tile_size)
+                factor = vec3(projected[g, 2], projected[g, 3], projected[g, 4])
+                reach = s.reach_of(projected[g, 5], alpha_cut, square_sigma)
+                span = s.tile_columns(
+                    projected[g, 0], projected[g, 1], factor, reach, projected[g, 10], projected[g, 11],
+                    row, origin_x, width, tile_size,
+                )  # fmt: skip
             tile_end = cuda.running_sum(span[1] - span[0])
             tile_begin = tile_end - (span[1] - span[0])
             tile_count = cuda.broadcast(tile_end, 31)
