@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from warpgs.priors.flow import Features, agreeing_matches, sift_features
+from warpgs.priors.flow import Features, agreeing_matches, nearest_views, sift_features
 from warpgs.priors.networks import single_threaded_opencv, without_ipp
 from warpgs.process import Say, Task, silent
 from warpgs.scene import View
@@ -115,11 +115,7 @@ def _difference(views: Sequence[View], places: Sequence[Places], i: int, j: int)
 
 def _pairs(views: Sequence[View]) -> list[tuple[int, int]]:
     """Return the pairs of a photograph and one of its `NEIGHBORS` nearest photographs, each pair once."""
-    centers, pairs = np.array([v.camera.center for v in views]), set()
-    for i in range(len(views)):
-        order = np.argsort(((centers - centers[i]) ** 2).sum(1), kind="stable")
-        pairs |= {(min(i, j), max(i, j)) for j in order[order != i][:NEIGHBORS].tolist()}
-    return sorted(pairs)
+    return sorted({(min(i, j), max(i, j)) for i in range(len(views)) for j in nearest_views(views, i, NEIGHBORS)})
 
 
 def _typical(differences: list[float]) -> float | None:
