@@ -375,15 +375,6 @@ def _make_distortion(real: type) -> SimpleNamespace:
     one, two = real(1.0), real(2.0)
 
     @wp.struct
-    class Radial:
-        """The radial factor R = N / M at a squared radius, and its first two derivatives by the squared radius."""
-
-        value: real
-        first: real
-        second: real
-        denominator: real
-
-    @wp.struct
     class Distorted:
         """The distorted point of (a, b), and its Jacobian, which is symmetric."""
 
@@ -395,7 +386,8 @@ def _make_distortion(real: type) -> SimpleNamespace:
         folded: wp.bool
 
     @wp.func
-    def radial_at(t: real, lens: Reals) -> Radial:
+    def radial_at(t: real, lens: Reals):
+        """Return the radial factor R = N / M at a squared radius, its first two derivatives by the squared radius, and M."""
         three = real(3.0)
         k1 = lens[0]
         k2 = lens[1]
@@ -408,7 +400,7 @@ def _make_distortion(real: type) -> SimpleNamespace:
         m2 = two * (k5 + t * three * k6)
         value = (one + t * (k1 + t * (k2 + t * k3))) / m
         first = (k1 + t * (two * k2 + t * three * k3) - value * m1) / m
-        return Radial(value, first, (two * (k2 + t * three * k3) - two * first * m1 - value * m2) / m, m)  # type: ignore[call-arg]
+        return value, first, (two * (k2 + t * three * k3) - two * first * m1 - value * m2) / m, m
 
     @wp.func
     def distort(a: real, b: real, lens: Reals) -> Distorted:
@@ -416,15 +408,15 @@ def _make_distortion(real: type) -> SimpleNamespace:
         p1 = lens[2]
         p2 = lens[3]
         t = a * a + b * b
-        r = radial_at(t, lens)
+        value, first, _second, denominator = radial_at(t, lens)
         d = Distorted()
-        d.a = a * r.value + two * p1 * a * b + p2 * (t + two * a * a)
-        d.b = b * r.value + p1 * (t + two * b * b) + two * p2 * a * b
-        d.aa = r.value + two * a * a * r.first + two * p1 * b + six * p2 * a
-        d.ab = two * (a * b * r.first + p1 * a + p2 * b)
-        d.bb = r.value + two * b * b * r.first + six * p1 * b + two * p2 * a
+        d.a = a * value + two * p1 * a * b + p2 * (t + two * a * a)
+        d.b = b * value + p1 * (t + two * b * b) + two * p2 * a * b
+        d.aa = value + two * a * a * first + two * p1 * b + six * p2 * a
+        d.ab = two * (a * b * first + p1 * a + p2 * b)
+        d.bb = value + two * b * b * first + six * p1 * b + two * p2 * a
         # phrased so that a NaN is folded
-        d.folded = not (r.denominator > real(0.0) and d.aa + d.bb > real(0.0) and d.aa * d.bb - d.ab * d.ab > real(0.0))
+        d.folded = not (denominator > real(0.0) and d.aa + d.bb > real(0.0) and d.aa * d.bb - d.ab * d.ab > real(0.0))
         return d
 
     @wp.func
@@ -434,11 +426,11 @@ def _make_distortion(real: type) -> SimpleNamespace:
         six = real(6.0)
         p1 = lens[2]
         p2 = lens[3]
-        r = radial_at(a * a + b * b, lens)
-        aaa = six * a * r.first + four * a * a * a * r.second + six * p2
-        aab = two * b * r.first + four * a * a * b * r.second + two * p1
-        abb = two * a * r.first + four * a * b * b * r.second + two * p2
-        bbb = six * b * r.first + four * b * b * b * r.second + six * p1
+        _value, first, second, _denominator = radial_at(a * a + b * b, lens)
+        aaa = six * a * first + four * a * a * a * second + six * p2
+        aab = two * b * first + four * a * a * b * second + two * p1
+        abb = two * a * first + four * a * b * b * second + two * p2
+        bbb = six * b * first + four * b * b * b * second + six * p1
         return vec2(v_aa * aaa + v_ab * aab + v_bb * abb, v_aa * aab + v_ab * abb + v_bb * bbb)
 
     return SimpleNamespace(distort=distort, curved=curved)

@@ -25,13 +25,6 @@ def make_covariance(real):
     """Make the functions for one scalar type. A covariance is stored as xy, xz, yz and a 0, and its diagonal."""
     _, vec3, vec4, mat33, *_ = types_of(real)
 
-    @wp.struct
-    class Packed:
-        """Gradient of a covariance."""
-
-        off: vec4
-        diagonal: vec3
-
     @wp.func
     def factor(off: vec4, diagonal: vec3) -> mat33:
         """Return M with M M^T = Sigma where Sigma is positive semi-definite within the tolerance; else a NaN, which culls."""
@@ -90,12 +83,12 @@ def make_covariance(real):
         return M
 
     @wp.func
-    def gradient(first: vec3, second: vec3, v11: real, v12: real, v22: real) -> Packed:
+    def gradient(first: vec3, second: vec3, v11: real, v12: real, v22: real):
         """Return the gradient of Sigma from those of the projected covariance; ``first`` and ``second`` are J R."""
         V = v11 * wp.outer(first, first) + v12 * (wp.outer(first, second) + wp.outer(second, first))
         V += v22 * wp.outer(second, second)
         off = vec4(V[0, 1] + V[1, 0], V[0, 2] + V[2, 0], V[1, 2] + V[2, 1], real(0.0))
-        return Packed(off, vec3(V[0, 0], V[1, 1], V[2, 2]))
+        return off, vec3(V[0, 0], V[1, 1], V[2, 2])
 
     return SimpleNamespace(factor=factor, gradient=gradient)
 
@@ -575,9 +568,9 @@ def make_functions(real, camera_model: str, parameters: str, antialiased: bool, 
         if wp.static(parameters == "covariances"):
             V = covariance_2d(e, projected, v_projected, i, low_pass)
             rows = m.project_axes(e.position, K, lens, e.expansion_point, rotation)
-            packed = c.gradient(rows.first, rows.second, V[0], V[1], V[2])
-            g.quat = packed.off
-            g.log_scale = packed.diagonal
+            off, diagonal = c.gradient(rows.first, rows.second, V[0], V[1], V[2])
+            g.quat = off
+            g.log_scale = diagonal
         else:
             g.log_scale = wp.cw_mul(v_axes[0], axes[0]) + wp.cw_mul(v_axes[1], axes[1]) + wp.cw_mul(v_axes[2], axes[2])
             v_turned = v_axes * wp.diag(e.scales)

@@ -180,20 +180,9 @@ def make_backward(real, camera_model: str, parameters: str = "stored", antialias
             if tile_counts[i] > 0:
                 view = viewmats[camera]
                 g = f.shape(
-                    means[n],
-                    quats[n],
-                    log_scales[n],
-                    view,
-                    Ks[camera],
-                    lenses[camera],
-                    real(width),
-                    real(height),
-                    near,
-                    low_pass,
-                    projected,
-                    v_projected,
-                    i,
-                )
+                    means[n], quats[n], log_scales[n], view, Ks[camera], lenses[camera],
+                    real(width), real(height), near, low_pass, projected, v_projected, i,
+                )  # fmt: skip
                 v_mean += g.mean
                 v_quat += g.quat
                 v_log_scale += g.log_scale

@@ -32,10 +32,7 @@ def make_walk(real, tile_size: int, make_visit):
         reals: Reals, ids: Ints, counts: Ints,
     ):  # fmt: skip
         tile = begin + wp.tid()
-        place = f.place_of(tile, side, settings)
-        camera = place[0]
-        left = place[1]
-        top = place[2]
+        camera, left, top = f.place_of(tile, side, settings)
         rows = wp.min(side, settings.height - top)
         lanes = wp.min(side, settings.width - left)
         ramp = strip_reals()
@@ -142,14 +139,14 @@ def make_weights(real, tile_size: int):
         weights: Rows,
     ):  # fmt: skip
         tile = begin + wp.tid()
-        place = f.place_of(tile, side, settings)
-        left = settings.origin_x + place[1]
-        top = settings.origin_y + place[2]
+        _camera, left, top = f.place_of(tile, side, settings)
         t = tile_reals()  # falls below the stop once a pixel is finished
         for row in range(side):
             for column in range(side):
-                inside = place[1] + column < settings.width and place[2] + row < settings.height
+                inside = left + column < settings.width and top + row < settings.height
                 t[row * side + column] = wp.where(inside, real(1.0), outside)
+        left += settings.origin_x
+        top += settings.origin_y
         sums = strip_reals()
         maxima = strip_reals()
         rows = b.Rows()
