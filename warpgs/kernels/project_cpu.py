@@ -144,12 +144,9 @@ def make_forward(real, camera_model: str, parameters: str, antialiased: bool, ba
             if wp.static(antialiased):
                 opacity[lane] = opacity[lane] * m.compensation(e)
             factor = m.factor_of(e)
-            found = wp.where(m.finite3(factor), e.valid, 0)
-            found = wp.where(m.depth_of(e.position) <= far, found, 0)
             o = opacity[lane]
-            found = wp.where(o - o == real(0.0), found, 0)
-            found = wp.where(o > real(0.0), found, 0)
-            valid[lane] = wp.where(o >= alpha_cut, found, 0)
+            shown = m.finite3(factor) and m.depth_of(e.position) <= far and o - o == real(0.0)
+            valid[lane] = wp.where(shown and o > real(0.0) and o >= alpha_cut, e.valid, 0)
             v = row.vector()
             v[0] = e.pixel[0]
             v[1] = e.pixel[1]
@@ -236,15 +233,6 @@ def make_backward(real, camera_model: str, parameters: str, antialiased: bool, b
     vec9 = wp.types.vector(9, real)
     lane_reals, lane_ints = (wp.types.vector(LANES, kind) for kind in (real, wp.int32))
 
-    @wp.struct
-    class CameraParts:
-        """Values of each lane for the gradients of the cameras."""
-
-        position: three.vectors
-        turned: nine.vectors
-        unit: four.vectors
-        K: nine.vectors
-
     @wp.func
     def flat(a: mat33) -> vec9:
         return vec9(a[0, 0], a[0, 1], a[0, 2], a[1, 0], a[1, 1], a[1, 2], a[2, 0], a[2, 1], a[2, 2])
@@ -284,7 +272,10 @@ def make_backward(real, camera_model: str, parameters: str, antialiased: bool, b
         values = basis.vectors()
         weights = basis.vectors()
         centered = three.vectors()
-        parts = CameraParts()
+        positions = three.vectors()  # these four for the gradients of the cameras
+        turned = nine.vectors()
+        units = four.vectors()
+        v_K = nine.vectors()
         for camera in range(viewmats.shape[0]):
             view = viewmats[camera]
             K = Ks[camera]
@@ -305,10 +296,10 @@ def make_backward(real, camera_model: str, parameters: str, antialiased: bool, b
                 four.add(hit, g.quat, lane, sums.quat)
                 three.add(hit, g.log_scale, lane, sums.scale)
                 if wp.static(camera_gradients):
-                    three.put(g.position, lane, parts.position)
-                    nine.put(flat(g.turned), lane, parts.turned)
-                    four.put(g.unit, lane, parts.unit)
-                    nine.put(flat(g.K), lane, parts.K)
+                    three.put(g.position, lane, positions)
+                    nine.put(flat(g.turned), lane, turned)
+                    four.put(g.unit, lane, units)
+                    nine.put(flat(g.K), lane, v_K)
             for lane in range(LANES):
                 d = m.direction(three.get(shapes.mean, lane), view)
                 basis.put(basis_of(vec3(d[0], d[1], d[2])), lane, values)
@@ -340,10 +331,10 @@ def make_backward(real, camera_model: str, parameters: str, antialiased: bool, b
                         n = first + lane
                         v_centered = three.get(centered, lane)
                         v_viewmats[camera, n] = f.view_gradient(
-                            view, means[n], quats[n], log_scales[n], three.get(parts.position, lane),
-                            square(nine.get(parts.turned, lane)), four.get(parts.unit, lane), v_centered,
+                            view, means[n], quats[n], log_scales[n], three.get(positions, lane),
+                            square(nine.get(turned, lane)), four.get(units, lane), v_centered,
                         )  # fmt: skip
-                        v_Ks[camera, n] = square(nine.get(parts.K, lane))
+                        v_Ks[camera, n] = square(nine.get(v_K, lane))
         for lane in range(used):
             n = first + lane
             v_means[n] = three.get(sums.mean, lane)
