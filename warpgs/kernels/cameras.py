@@ -69,10 +69,8 @@ def check_camera(camera: Camera) -> type[CameraModel]:
         others = ', or give model="opencv" (8) or model="fisheye" (4)' if camera.model == "pinhole" else ""
         raise UsageError(f"the camera model {camera.model!r} takes no distortion, found {found} coefficients; omit it{others}")
     if found != model.coefficients:
-        raise UsageError(
-            f"the camera model {camera.model!r} takes {model.coefficients} coefficients of distortion, found {found}; give "
-            "Camera.distortion the shape [P] or [C, P], zeros for a lens without distortion"
-        )
+        takes = f"{camera.model!r} takes {model.coefficients} coefficients of distortion, found {found}"
+        raise UsageError(f"the camera model {takes}; give Camera.distortion the shape [P] or [C, P], zeros for none")
     if getattr(camera.distortion, "requires_grad", False):
         raise UsageError("gradients of distortion coefficients are not supported: give Camera.distortion.detach()")
     return model

@@ -48,10 +48,7 @@ MAX_SIZE = 2**31 - 1
 def _check_size(size: int) -> None:
     """Raise ResourceError where kernels cannot index so many entries."""
     if size > MAX_SIZE:
-        raise ResourceError(
-            f"an array of {size:,} entries is beyond the {MAX_SIZE:,} that kernels can index; use fewer Gaussians or "
-            "coefficients, smaller images, or fewer cameras at once"
-        )
+        raise ResourceError(f"kernels cannot index {size:,} entries, only {MAX_SIZE:,}; use fewer Gaussians, pixels or cameras")
 
 
 def check_device(name: str, tensor: torch.Tensor) -> None:

@@ -571,10 +571,8 @@ def bin_tiles(
     columns, rows = grid(width, height, tile_size)
     no_tile = cameras * columns * rows
     if no_tile > launch.MAX_SIZE:
-        raise ResourceError(
-            f"{cameras:,} images of {width} x {height} px have {no_tile:,} tiles of {tile_size} px, beyond the "
-            f"{launch.MAX_SIZE:,} that kernels can index; render fewer cameras at once, or a window of each image"
-        )
+        images = f"{cameras:,} images of {width} x {height} px have {no_tile:,} tiles, and kernels index {launch.MAX_SIZE:,}"
+        raise ResourceError(f"{images}; render fewer cameras at once, or a window of each image")
     counts = tile_counts.contiguous().view(-1)
     device, real, native, allocator = projected.device, launch.real_of(projected), projected.is_cuda, memory.allocator
     ranges = allocator.saved((no_tile, 2), torch.int32, device).zero_()

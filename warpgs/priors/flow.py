@@ -427,9 +427,8 @@ def _network(path: Path) -> Callable[[View, View], np.ndarray]:
         ]
         found = network.outputs_of(*(t[None] for t in tensors))
         if not (flows := [f for f in found if np.shape(f) == (1, 2, size[1], size[0])]):
-            raise DataError(
-                f"{path}: none of {[np.shape(f) for f in found]} is a flow [1, 2, {size[1]}, {size[0]}]; export it upsampled"
-            )
+            shapes = [np.shape(f) for f in found]
+            raise DataError(f"{path}: none of {shapes} is a flow [1, 2, {size[1]}, {size[0]}]; export it upsampled")
         return resize_flow(np.ascontiguousarray(flows[-1][0].transpose(1, 2, 0), dtype=np.float32), w, h)
 
     return compute

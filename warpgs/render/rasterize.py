@@ -224,9 +224,8 @@ def _checked_window(camera: Camera, options: RasterizeOptions) -> Window:
     x, y, w, h = options.window
     inside = 0 <= x < x + w <= width and 0 <= y < y + h <= height
     if not inside or x % side or y % side or ((x + w) % side and x + w != width) or ((y + h) % side and y + h != height):
-        raise UsageError(
-            f"window {options.window}: its edges must be multiples of {side} px, or edges of the {width} x {height} px image"
-        )
+        fix = f"its edges must be multiples of {side} px, or edges of the {width} x {height} px image"
+        raise UsageError(f"window {options.window}: {fix}")
     return x, y, w, h
 
 
