@@ -362,11 +362,7 @@ def make_projection(real, camera_model: str, parameters: str = "stored", lanes: 
     @wp.func
     def direction(mean: vec3, view: mat44) -> vec4:
         """Return the unit vector from the camera centre to the mean, and the distance; zeros where the two coincide."""
-        centered = mean + vec3(
-            view[0, 0] * view[0, 3] + view[1, 0] * view[1, 3] + view[2, 0] * view[2, 3],
-            view[0, 1] * view[0, 3] + view[1, 1] * view[1, 3] + view[2, 1] * view[2, 3],
-            view[0, 2] * view[0, 3] + view[1, 2] * view[1, 3] + view[2, 2] * view[2, 3],
-        )
+        centered = mean + wp.transpose(r.rotation_of(view)) * vec3(view[0, 3], view[1, 3], view[2, 3])
         largest = wp.max(wp.abs(centered))
         apart = wp.where(largest > real(0.0), largest - largest == real(0.0), False)
         d = centered / largest

@@ -59,6 +59,11 @@ def check_device(name: str, tensor: torch.Tensor) -> None:
         raise ValueError(f"{name} is a fake tensor, without memory; leave FakeTensorMode before the call")
 
 
+def is_native(tensor: torch.Tensor) -> bool:
+    """Return whether the kernels with bodies in CUDA apply to a tensor [...]; otherwise those in plain Warp do."""
+    return tensor.is_cuda and tensor.dtype == torch.float32
+
+
 def real_of(tensor: torch.Tensor) -> type:
     """Return the Warp scalar type of a tensor [...]; TypeError unless float32 or float64."""
     if tensor.dtype not in REALS:

@@ -287,16 +287,11 @@ def difference_bytes(sizes: StepSizes) -> int:
     return images + (0 if sizes.cuda else 5 * FLOAT * (CHANNELS * sizes.width + 2 * PADDING) * -(-sizes.height // BLOCK))
 
 
-def _native(image: torch.Tensor) -> bool:
-    """Return whether the CUDA kernels apply."""
-    return image.is_cuda and image.dtype == torch.float32
-
-
 class _Ssim(torch.autograd.Function):
     @staticmethod
     def forward(ctx, image, target, summed):
         image, target = image.contiguous(), target.contiguous()
-        native, (batch, height, width, _) = _native(image), image.shape
+        native, (batch, height, width, _) = launch.is_native(image), image.shape
         columns, blocks = width * CHANNELS, -(-height // (SIDE if native else BLOCK))
         tasks = batch * blocks * (-(-width // SIDE) if native else 1)
         result = image.new_empty(tasks, 2) if summed else torch.empty_like(image)
@@ -318,7 +313,7 @@ class _Ssim(torch.autograd.Function):
         image, target, *partials = launch.kept(ctx)
         height, columns, tasks = image.shape[1], image.shape[2] * CHANNELS, ctx.tasks
         v_image, v_result = torch.empty_like(image), v_result.contiguous()
-        if _native(image):
+        if launch.is_native(image):
             inputs = [image, target, v_result, *partials, height, columns, int(ctx.summed), v_image]
             launch.launch(cuda_backward, tasks * THREADS, inputs, image.device, block_dim=THREADS)
         else:
@@ -367,6 +362,6 @@ def differences(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
     """Return the sums over pixels and channels of 1 - `ssim` and |image - target| [2], for images [H, W, 3] or [B, H, W, 3]."""
     # One pass computes both sums; for tiny images, torch sums the map of `ssim`.
     a, b = _checked(image, target)
-    if not (_native(a) or a.shape[2] * CHANNELS >= LANES):
+    if not (launch.is_native(a) or a.shape[2] * CHANNELS >= LANES):
         return torch.stack([(1 - ssim(a, b)).sum(), (a - b).abs().sum()])
     return _Ssim.apply(a, b, True)

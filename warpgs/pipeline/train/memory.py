@@ -7,6 +7,7 @@ compiled kernels need additional memory. Small parts are not counted: parameters
 rates and losses (`StepBuffers`).
 """
 
+from bisect import bisect_left
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
@@ -101,10 +102,7 @@ class Layout:
 
 def _largest(low: int, high: int, fits: Callable[[int], bool]) -> int:
     """Return the largest number that fits, by bisection: all smaller numbers fit, too; ``low`` if none fits."""
-    while low < high:
-        middle = (low + high + 1) // 2
-        low, high = (middle, high) if fits(middle) else (low, middle - 1)
-    return low
+    return low + bisect_left(range(low + 1, high + 1), True, key=lambda n: not fits(n))
 
 
 @torch.no_grad()
