@@ -192,8 +192,7 @@ class Pinhole(CameraModel):
             position: vec3, K: mat33, lens: Reals, pixel: vec2, point: vec2, axes: mat33,
             v_first: vec3, v_second: vec3, v_pixel: vec2, v_depth: real,
         ) -> linear.Gradients:  # fmt: skip
-            x = position[0]
-            y = position[1]
+            x, y = position[0], position[1]
             inv_z = real(1.0) / position[2]
             jx = K[0, 0] * inv_z
             jy = K[1, 1] * inv_z
@@ -387,12 +386,7 @@ def _make_distortion(real: type) -> SimpleNamespace:
     def radial_at(t: real, lens: Reals):
         """Return the radial factor R = N / M at a squared radius, its first two derivatives by the squared radius, and M."""
         three = real(3.0)
-        k1 = lens[0]
-        k2 = lens[1]
-        k3 = lens[4]
-        k4 = lens[5]
-        k5 = lens[6]
-        k6 = lens[7]
+        k1, k2, k3, k4, k5, k6 = lens[0], lens[1], lens[4], lens[5], lens[6], lens[7]
         m = one + t * (k4 + t * (k5 + t * k6))
         m1 = k4 + t * (two * k5 + t * three * k6)
         m2 = two * (k5 + t * three * k6)
@@ -403,8 +397,7 @@ def _make_distortion(real: type) -> SimpleNamespace:
     @wp.func
     def distort(a: real, b: real, lens: Reals) -> Distorted:
         six = real(6.0)
-        p1 = lens[2]
-        p2 = lens[3]
+        p1, p2 = lens[2], lens[3]
         t = a * a + b * b
         value, first, _second, denominator = radial_at(t, lens)
         d = Distorted()
@@ -422,8 +415,7 @@ def _make_distortion(real: type) -> SimpleNamespace:
         """Return the gradients of (a, b) from those of the Jacobian's entries."""
         four = real(4.0)
         six = real(6.0)
-        p1 = lens[2]
-        p2 = lens[3]
+        p1, p2 = lens[2], lens[3]
         _value, first, second, _denominator = radial_at(a * a + b * b, lens)
         aaa = six * a * first + four * a * a * a * second + six * p2
         aab = two * b * first + four * a * a * b * second + two * p1
@@ -484,8 +476,7 @@ class Fisheye(CameraModel):
         def jacobian(position: vec3, K: mat33, lens: Reals, point: vec2) -> linear.Rows:
             distance = radial.distance(position)
             unit = position / distance
-            x = unit[0]
-            y = unit[1]
+            x, y = unit[0], unit[1]
             p = radial.profile(unit, lens)
             jx = K[0, 0] / distance
             jy = K[1, 1] / distance
@@ -501,8 +492,7 @@ class Fisheye(CameraModel):
             two = real(2.0)
             distance = radial.distance(position)
             unit = position / distance
-            x = unit[0]
-            y = unit[1]
+            x, y = unit[0], unit[1]
             p = radial.profile(unit, lens)
             v_row0 = axes * v_first / distance  # gradients of the rows of J, at unit distance
             v_row1 = axes * v_second / distance
@@ -552,7 +542,7 @@ def _make_profile(real: type) -> SimpleNamespace:
         )
 
     @wp.func
-    def angle_over_sine(r2: real, z: real) -> vec3:
+    def angle_over_sine(r2: real, z: real):
         """Return A = angle / r, B = A_r / r and C = B_r / r at a unit position."""
         t = r2 / (z * z)
         if z > real(0.0) and t < real(NEAR_AXIS):
@@ -566,19 +556,18 @@ def _make_profile(real: type) -> SimpleNamespace:
                 B = B * q - (n + real(1.0)) / (real(2.0) * n + real(3.0))
                 C = C * q + (n + real(1.0)) * (n + real(2.0)) / (real(2.0) * n + real(5.0))
             inv = real(1.0) / z
-            return vec3(A * inv, real(2.0) * B * inv * inv * inv, real(4.0) * C * inv * inv * inv * inv * inv)
+            return A * inv, real(2.0) * B * inv * inv * inv, real(4.0) * C * inv * inv * inv * inv * inv
         r = wp.sqrt(r2)
         A = wp.atan2(r, z) / r
         B = (z - A) / r2
-        return vec3(A, B, -(real(2.0) * z + real(3.0) * B) / r2)
+        return A, B, -(real(2.0) * z + real(3.0) * B) / r2
 
     @wp.func
     def profile(unit: vec3, lens: Reals) -> Profile:
         two = real(2.0)
         r2 = unit[0] * unit[0] + unit[1] * unit[1]
         z = unit[2]
-        abc = angle_over_sine(r2, z)
-        A = abc[0]
+        A, B, C = angle_over_sine(r2, z)
         t = A * A * r2
         s = real(1.0) + t * (lens[0] + t * (lens[1] + t * (lens[2] + t * lens[3])))
         s1 = lens[0] + t * (two * lens[1] + t * (real(3.0) * lens[2] + t * real(4.0) * lens[3]))
@@ -588,8 +577,8 @@ def _make_profile(real: type) -> SimpleNamespace:
         Az = A * z
         p = Profile()
         p.G = A * s
-        p.H = abc[1] * s + two * A * Az * s1
-        p.L = abc[2] * s + real(6.0) * abc[1] * Az * s1 + real(4.0) * A * (Az * Az * s2 - Az * s1)
+        p.H = B * s + two * A * Az * s1
+        p.L = C * s + real(6.0) * B * Az * s1 + real(4.0) * A * (Az * Az * s2 - Az * s1)
         p.E = -m
         p.N = two * m - Az * m1
         p.P = r2 * A * m1 + two * m * z

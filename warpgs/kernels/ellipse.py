@@ -170,10 +170,7 @@ def make_rotations(real):
     def rotation(q: vec4) -> mat33:
         # q is a unit quaternion wxyz. Every entry is quadratic in q, so a rounding error of the length only scales the
         # matrix. With ones on the diagonal, the error would rotate it, and move the end of a needle across its width.
-        w = q[0]
-        x = q[1]
-        y = q[2]
-        z = q[3]
+        w, x, y, z = q[0], q[1], q[2], q[3]
         two = real(2.0)
         return mat33(
             (w * w - z * z) + (x * x - y * y), two * (x * y - w * z), two * (x * z + w * y),
@@ -184,10 +181,7 @@ def make_rotations(real):
     @wp.func
     def rotation_backward(q: vec4, v: mat33) -> vec4:
         # gradient of sum(v * rotation(q)) by q, not constrained to unit length
-        w = q[0]
-        x = q[1]
-        y = q[2]
-        z = q[3]
+        w, x, y, z = q[0], q[1], q[2], q[3]
         two = real(2.0)
         four = real(4.0)
         v_w = two * (x * (v[2, 1] - v[1, 2]) + y * (v[0, 2] - v[2, 0]) + z * (v[1, 0] - v[0, 1]))
@@ -498,9 +492,7 @@ def make_functions(real, camera_model: str, parameters: str, antialiased: bool, 
     @wp.func
     def covariance_2d(e: m.Ellipse, projected: row, v_projected: row, i: int, low_pass: real) -> vec3:
         """Return the gradients of xx, of each xy and of yy of the projected covariance [px^2] (section 9)."""
-        u11 = at(projected, i, 2)
-        u12 = at(projected, i, 3)
-        u22 = at(projected, i, 4)
+        u11, u12, u22 = at(projected, i, 2), at(projected, i, 3), at(projected, i, 4)
         h11 = at(v_projected, i, 2) * u11 + at(v_projected, i, 3) * u12
         h12 = at(v_projected, i, 3) * u22
         h22 = at(v_projected, i, 4) * u22
