@@ -307,15 +307,10 @@ def make_projection(real, camera_model: str, parameters: str = "stored", lanes: 
         if wp.static(not lanes) and not short:
             return e
         shrink = real(1.0)
-        if wp.static(lanes):
-            for _ in range(wp.static(SHRINKS)):
-                times = wp.where(largest > real(65536.0), real(1.0 / 65536.0), real(1.0))
-                largest *= times
-                shrink *= times
-        else:
-            while largest > real(65536.0):
-                largest *= real(1.0 / 65536.0)
-                shrink *= real(1.0 / 65536.0)
+        for _ in range(wp.static(SHRINKS)):
+            times = wp.where(largest > real(65536.0), real(1.0 / 65536.0), real(1.0))
+            largest *= times
+            shrink *= times
         e.shrink = shrink
         e.m1 = m1 * shrink
         e.m2 = m2 * shrink
@@ -373,7 +368,7 @@ def make_projection(real, camera_model: str, parameters: str = "stored", lanes: 
 
 
 @functools.cache
-def make_spans(real, lanes: bool = False):
+def make_spans(real):
     """Make the functions that decide which tiles a projected Gaussian touches, for one scalar type (docs/tiles.md)."""
     # Counting and emitting call the same functions. Every bound is widened by a margin that covers the rounding of its own
     # arithmetic, so a pixel that blending would change is never missed; a tile listed in excess changes nothing.
@@ -387,13 +382,9 @@ def make_spans(real, lanes: bool = False):
         # clipped before the cast to int
         first = wp.ceil(wp.clamp(lo - real(0.5), real(begin), limit))
         last = wp.floor(wp.clamp(hi - real(0.5), real(begin) - real(1.0), limit - real(1.0)))
-        if wp.static(lanes):  # divisions of integers do not vectorise; those of floats below 2^24 round to no other integer
-            side = real(tile_size)
-            end = wp.where(last < first, 0, int(last / side) + 1)
-            return vec2i(wp.where(last < first, 0, int(first / side)), end)
-        if last < first:
-            return vec2i(0, 0)
-        return vec2i(int(first) // tile_size, int(last) // tile_size + 1)
+        side = real(tile_size)  # divisions of integers do not vectorise; those of floats below 2^24 round to no other integer
+        end = wp.where(last < first, 0, int(last / side) + 1)
+        return vec2i(wp.where(last < first, 0, int(first / side)), end)
 
     @wp.func
     def tile_rows(my: real, half_height: real, origin_y: wp.int32, height: wp.int32, tile_size: wp.int32) -> vec2i:

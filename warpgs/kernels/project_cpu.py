@@ -92,7 +92,7 @@ def make_forward(real, camera_model: str, parameters: str, antialiased: bool, ba
     """Make the kernel; arguments are those of `project_cuda.make_forward`."""
     one = make_projection(real, camera_model, parameters)
     m = make_projection(real, camera_model, parameters, lanes=True)
-    s = make_spans(real, lanes=True)
+    s = make_spans(real)
     g = make_shapes(real, parameters)
     three, four, row, basis = (make_lanes(real, size) for size in (3, 4, PROJECTED_SIZE, bases))
     basis_of = sh.make_functions(real, bases).basis

@@ -203,7 +203,7 @@ def make_emit(real, slotted: bool, ranked: bool = False):
 @functools.cache
 def make_emit_cpu(real, slotted: bool):
     """Make the kernel; arguments are those of `make_emit`."""
-    s = make_spans(real, lanes=True)
+    s = make_spans(real)
     vec3, Rows = wp.types.vector(3, real), wp.array2d(dtype=real)
     lane_reals, lane_ints = (wp.types.vector(LANES, kind) for kind in (real, wp.int32))
     lanes = LANES
