@@ -154,10 +154,20 @@ def packed_covariances(covars: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor
     return torch.stack([*off, torch.zeros_like(off[0])], 1), covars.diagonal(dim1=1, dim2=2).contiguous()
 
 
+SHRINKS = 6
+"""Number of divisions by 2^16 that take `LARGEST_AXIS` below 2^16 px."""
+
+
 @functools.cache
-def make_rotations(real):
-    """Make the quaternion and rotation functions for one scalar type (docs/project.md, section 2)."""
-    *_, vec4, mat33, mat44, _ = types_of(real)
+def make_projection(real, camera_model: str, parameters: str = "stored", lanes: bool = False):
+    """Make the steps of the projection that forward and backward share (derivation: docs/project.md)."""
+    # ``lanes`` is True for loops that the compiler vectorises: without branches and calls, so culled Gaussians are computed to
+    # the end, too. Scales and opacities are activated beforehand.
+    factor = make_covariance(real).factor
+    camera = CAMERA_MODELS.find(camera_model).make_functions(real)
+    vec2, vec3, vec4, mat33, mat44, Reals = types_of(real)
+
+    # quaternions and rotations: docs/project.md, section 2
 
     @wp.func
     def quat_length(q: vec4) -> real:
@@ -200,23 +210,6 @@ def make_rotations(real):
     def rotation_of(view: mat44) -> mat33:
         """Return the rotation of a view matrix."""
         return mat33(view[0, 0], view[0, 1], view[0, 2], view[1, 0], view[1, 1], view[1, 2], view[2, 0], view[2, 1], view[2, 2])
-
-    return named(quat_length, rotation, rotation_backward, rotation_of)
-
-
-SHRINKS = 6
-"""Number of divisions by 2^16 that take `LARGEST_AXIS` below 2^16 px."""
-
-
-@functools.cache
-def make_projection(real, camera_model: str, parameters: str = "stored", lanes: bool = False):
-    """Make the steps of the projection that forward and backward share (derivation: docs/project.md)."""
-    # ``lanes`` is True for loops that the compiler vectorises: without branches and calls, so culled Gaussians are computed to
-    # the end, too. Scales and opacities are activated beforehand.
-    r = make_rotations(real)
-    factor = make_covariance(real).factor
-    camera = CAMERA_MODELS.find(camera_model).make_functions(real)
-    vec2, vec3, vec4, mat33, mat44, Reals = types_of(real)
 
     @wp.struct
     class Ellipse:
@@ -268,8 +261,8 @@ def make_projection(real, camera_model: str, parameters: str = "stored", lanes: 
     ) -> Ellipse:  # fmt: skip
         e = Ellipse()
         e.valid = 0
-        rotation = r.rotation_of(view)
-        e.position = rotation * mean + vec3(view[0, 3], view[1, 3], view[2, 3])
+        of_view = rotation_of(view)
+        e.position = of_view * mean + vec3(view[0, 3], view[1, 3], view[2, 3])
         # Guards are phrased so that a NaN fails them.
         before = camera.in_range(e.position, lens, near)
         if wp.static(not lanes) and not before:
@@ -283,9 +276,9 @@ def make_projection(real, camera_model: str, parameters: str = "stored", lanes: 
         turned = wp.bool(True)
         sized = wp.bool(True)
         if wp.static(parameters == "covariances"):
-            e.axes = rotation * factor(q, log_scale)  # NaN without a factor; culled below
+            e.axes = of_view * factor(q, log_scale)  # NaN without a factor; culled below
         else:
-            e.quat_length = r.quat_length(q)
+            e.quat_length = quat_length(q)
             turned = e.quat_length >= real(SHORTEST_QUAT) and e.quat_length * real(SHORTEST_QUAT) <= real(1.0)
             if wp.static(not lanes) and not turned:
                 return e
@@ -294,7 +287,7 @@ def make_projection(real, camera_model: str, parameters: str = "stored", lanes: 
             sized = finite3(e.scales)  # the logarithm of 0 is -inf, and no error
             if wp.static(not lanes) and not sized:
                 return e
-            e.axes = rotation * r.rotation(e.quat) * wp.diag(e.scales)
+            e.axes = of_view * rotation(e.quat) * wp.diag(e.scales)
         rows = camera.project_axes(e.position, K, lens, e.expansion_point, e.axes)
         m1 = rows.first
         m2 = rows.second
@@ -351,7 +344,7 @@ def make_projection(real, camera_model: str, parameters: str = "stored", lanes: 
     @wp.func
     def direction(mean: vec3, view: mat44) -> vec4:
         """Return the unit vector from the camera centre to the mean, and the distance; zeros where the two coincide."""
-        centered = mean + wp.transpose(r.rotation_of(view)) * vec3(view[0, 3], view[1, 3], view[2, 3])
+        centered = mean + wp.transpose(rotation_of(view)) * vec3(view[0, 3], view[1, 3], view[2, 3])
         largest = wp.max(wp.abs(centered))
         apart = wp.where(largest > real(0.0), largest - largest == real(0.0), False)
         d = centered / largest
@@ -364,7 +357,7 @@ def make_projection(real, camera_model: str, parameters: str = "stored", lanes: 
         )  # fmt: skip
 
     own = named(Ellipse, ellipse, factor_of, compensation, sigmoid, opacity_of, scales_of, direction, finite3)
-    return SimpleNamespace(**vars(camera) | vars(r) | vars(own))
+    return SimpleNamespace(**vars(camera) | vars(named(rotation, rotation_backward, rotation_of)) | vars(own))
 
 
 @functools.cache
