@@ -113,11 +113,6 @@ def _difference(views: Sequence[View], places: Sequence[Places], i: int, j: int)
     return np.array([detail, *np.median(np.log(both[0, usable] / both[1, usable]), axis=0)])
 
 
-def _pairs(views: Sequence[View]) -> list[tuple[int, int]]:
-    """Return the pairs of a photograph and one of its `NEIGHBORS` nearest photographs, each pair once."""
-    return sorted({(min(i, j), max(i, j)) for i in range(len(views)) for j in nearest_views(views, i, NEIGHBORS)})
-
-
 def _typical(differences: list[float]) -> float | None:
     """Return the median; with two middle values, the number between them nearest to 0; None if all are NaN."""
     # a faulty photograph differs from most others, so the choice does not hide it
@@ -130,7 +125,7 @@ def _typical(differences: list[float]) -> float | None:
 def check_photos(views: Sequence[View], progress: Say = silent) -> list[PhotoCheck]:
     """Compare each photograph with the nearest ones; ``views`` include those that are held out."""
     count, began = len(views), time.monotonic()
-    pairs = _pairs(views)
+    pairs = sorted({(min(i, j), max(i, j)) for i in range(count) for j in nearest_views(views, i, NEIGHBORS)})
     with single_threaded_opencv(), ThreadPoolExecutor(torch.get_num_threads(), initializer=without_ipp) as pool:
         places = []
         for place in pool.map(_places, views):

@@ -501,7 +501,5 @@ def select_rule(
                 break
         else:
             return rule, error
-    raise UsageError(
-        f"no rule keeps the {measure} error within {max_error:g}: with rule exact, rounding alone gives {error:.1e}; raise "
-        "max_error, or give the Gaussians as float64"
-    )
+    why = f"no rule keeps the {measure} error within {max_error:g}: with rule exact, rounding alone gives {error:.1e}"
+    raise UsageError(f"{why}; raise max_error, or give the Gaussians as float64")
