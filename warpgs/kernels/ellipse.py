@@ -20,79 +20,6 @@ def arrays_of(real):
     return *(wp.array(dtype=kind) for kind in (vec3, vec4, mat33, mat44)), wp.array2d(dtype=real), wp.array2d(dtype=vec3)
 
 
-@functools.cache
-def make_covariance(real):
-    """Make the functions for one scalar type. A covariance is stored as xy, xz, yz and a 0, and its diagonal."""
-    _, vec3, vec4, mat33, *_ = types_of(real)
-
-    @wp.func
-    def factor(off: vec4, diagonal: vec3) -> mat33:
-        """Return M with M M^T = Sigma where Sigma is positive semi-definite within the tolerance; else a NaN, which culls."""
-        none = mat33()
-        none[0, 0] = real(wp.static(float("nan")))
-        S = mat33(
-            diagonal[0], off[0], off[1],
-            off[0], diagonal[1], off[2],
-            off[1], off[2], diagonal[2],
-        )  # fmt: skip
-        # the axis of the largest variance first, so that rounding stays below it
-        p = int(0)
-        if S[1, 1] > S[0, 0]:
-            p = int(1)
-        if S[2, 2] > S[p, p]:
-            p = int(2)
-        q = (p + 1) % 3
-        r = (p + 2) % 3
-        largest = S[p, p]
-        if not (largest > real(0.0)):
-            size = wp.abs(off[0]) + wp.abs(off[1]) + wp.abs(off[2])
-            size += wp.abs(diagonal[0]) + wp.abs(diagonal[1]) + wp.abs(diagonal[2])
-            if size == real(0.0):
-                return mat33()
-            return none
-        root = wp.sqrt(largest)
-        mq = S[p, q] / root
-        mr = S[p, r] / root
-        # the remainder of the other two axes after the first column
-        sqq = S[q, q] - mq * mq
-        srr = S[r, r] - mr * mr
-        sqr = S[q, r] - mq * mr
-        half = real(0.5) * (sqq - srr) / largest
-        cross = sqr / largest
-        lowest = real(0.5) * (sqq + srr) / largest - wp.sqrt(half * half + cross * cross)
-        if not (lowest >= -real(COVARIANCE_TOLERANCE)):
-            return none
-        if srr > sqq:
-            swapped = q
-            q = r
-            r = swapped
-            sqq, srr = srr, sqq
-            mq, mr = mr, mq
-        mqq = real(0.0)
-        mrq = real(0.0)
-        if sqq > real(0.0):
-            mqq = wp.sqrt(sqq)
-            mrq = wp.clamp(sqr / mqq, -mqq, mqq)
-        M = mat33()
-        M[p, 0] = root
-        M[q, 0] = mq
-        M[r, 0] = mr
-        M[q, 1] = mqq
-        M[r, 1] = mrq
-        M[r, 2] = wp.sqrt(wp.max(srr - mrq * mrq, real(0.0)))
-        return M
-
-    @wp.func
-    def gradient(first: vec3, second: vec3, v11: real, v12: real, v22: real):
-        """Return the gradient of Sigma from those of the projected covariance; ``first`` and ``second`` are J R."""
-        V = v11 * wp.outer(first, first) + v12 * (wp.outer(first, second) + wp.outer(second, first))
-        V += v22 * wp.outer(second, second)
-        off = vec4(V[0, 1] + V[1, 0], V[0, 2] + V[2, 0], V[1, 2] + V[2, 1], real(0.0))
-        return off, vec3(V[0, 0], V[1, 1], V[2, 2])
-
-    return SimpleNamespace(factor=factor, gradient=gradient)
-
-
 PROJECTED_SIZE = 12
 """Number of values of a projected Gaussian, whose rows are 16-byte aligned in float32:
 0:2 mean [px], 2:5 factor u11 u12 u22 [1/px], 5 opacity, 6:9 colour, 9 depth [u] (z; the distance for a fisheye),
@@ -163,9 +90,65 @@ def make_projection(real, camera_model: str, parameters: str = "stored", lanes: 
     """Make the steps of the projection that forward and backward share (derivation: docs/project.md)."""
     # ``lanes`` is True for loops that the compiler vectorises: without branches and calls, so culled Gaussians are computed to
     # the end, too. Scales and opacities are activated beforehand.
-    factor = make_covariance(real).factor
     camera = CAMERA_MODELS.find(camera_model).make_functions(real)
     vec2, vec3, vec4, mat33, mat44, Reals = types_of(real)
+
+    # A covariance is stored as xy, xz, yz and a 0, and its diagonal.
+
+    @wp.func
+    def factor(off: vec4, diagonal: vec3) -> mat33:
+        """Return M with M M^T = Sigma where Sigma is positive semi-definite within the tolerance; else a NaN, which culls."""
+        none = mat33()
+        none[0, 0] = real(wp.static(float("nan")))
+        S = mat33(
+            diagonal[0], off[0], off[1],
+            off[0], diagonal[1], off[2],
+            off[1], off[2], diagonal[2],
+        )  # fmt: skip
+        # the axis of the largest variance first, so that rounding stays below it
+        p = int(0)
+        if S[1, 1] > S[0, 0]:
+            p = int(1)
+        if S[2, 2] > S[p, p]:
+            p = int(2)
+        q = (p + 1) % 3
+        r = (p + 2) % 3
+        largest = S[p, p]
+        if not (largest > real(0.0)):
+            size = wp.abs(off[0]) + wp.abs(off[1]) + wp.abs(off[2])
+            size += wp.abs(diagonal[0]) + wp.abs(diagonal[1]) + wp.abs(diagonal[2])
+            if size == real(0.0):
+                return mat33()
+            return none
+        root = wp.sqrt(largest)
+        mq = S[p, q] / root
+        mr = S[p, r] / root
+        # the remainder of the other two axes after the first column
+        sqq = S[q, q] - mq * mq
+        srr = S[r, r] - mr * mr
+        sqr = S[q, r] - mq * mr
+        half = real(0.5) * (sqq - srr) / largest
+        cross = sqr / largest
+        lowest = real(0.5) * (sqq + srr) / largest - wp.sqrt(half * half + cross * cross)
+        if not (lowest >= -real(COVARIANCE_TOLERANCE)):
+            return none
+        if srr > sqq:
+            q, r = r, q
+            sqq, srr = srr, sqq
+            mq, mr = mr, mq
+        mqq = real(0.0)
+        mrq = real(0.0)
+        if sqq > real(0.0):
+            mqq = wp.sqrt(sqq)
+            mrq = wp.clamp(sqr / mqq, -mqq, mqq)
+        M = mat33()
+        M[p, 0] = root
+        M[q, 0] = mq
+        M[r, 0] = mr
+        M[q, 1] = mqq
+        M[r, 1] = mrq
+        M[r, 2] = wp.sqrt(wp.max(srr - mrq * mrq, real(0.0)))
+        return M
 
     # quaternions and rotations: docs/project.md, section 2
 
@@ -357,7 +340,7 @@ def make_projection(real, camera_model: str, parameters: str = "stored", lanes: 
         )  # fmt: skip
 
     own = named(Ellipse, ellipse, factor_of, compensation, sigmoid, opacity_of, scales_of, direction, finite3)
-    return SimpleNamespace(**vars(camera) | vars(named(rotation, rotation_backward, rotation_of)) | vars(own))
+    return SimpleNamespace(**vars(camera) | vars(named(factor, rotation, rotation_backward, rotation_of)) | vars(own))
 
 
 @functools.cache
@@ -449,9 +432,17 @@ def make_functions(real, camera_model: str, parameters: str, antialiased: bool, 
     # With ``lanes``, they take a projected Gaussian and its gradient as vectors, not as rows of arrays.
     m = make_projection(real, camera_model, parameters, lanes)
     vec2, vec3, vec4, mat33, mat44, Reals = types_of(real)
-    c, basis = make_covariance(real), sh.make_functions(real, bases)
+    basis = sh.make_functions(real, bases)
 
     row = wp.types.vector(PROJECTED_SIZE, real) if lanes else wp.array2d(dtype=real)
+
+    @wp.func
+    def covariance_gradient(first: vec3, second: vec3, v11: real, v12: real, v22: real):
+        """Return the gradient of Sigma from those of the projected covariance; ``first`` and ``second`` are J R."""
+        V = v11 * wp.outer(first, first) + v12 * (wp.outer(first, second) + wp.outer(second, first))
+        V += v22 * wp.outer(second, second)
+        off = vec4(V[0, 1] + V[1, 0], V[0, 2] + V[2, 0], V[1, 2] + V[2, 1], real(0.0))
+        return off, vec3(V[0, 0], V[1, 1], V[2, 2])
 
     @wp.func
     def at(values: row, i: int, k: int) -> real:
@@ -540,7 +531,7 @@ def make_functions(real, camera_model: str, parameters: str, antialiased: bool, 
         if wp.static(parameters == "covariances"):
             V = covariance_2d(e, projected, v_projected, i, low_pass)
             rows = m.project_axes(e.position, K, lens, e.expansion_point, rotation)
-            off, diagonal = c.gradient(rows.first, rows.second, V[0], V[1], V[2])
+            off, diagonal = covariance_gradient(rows.first, rows.second, V[0], V[1], V[2])
             g.quat = off
             g.log_scale = diagonal
         else:
@@ -592,7 +583,7 @@ def make_functions(real, camera_model: str, parameters: str, antialiased: bool, 
         rotation = m.rotation_of(view)
         t = vec3(view[0, 3], view[1, 3], view[2, 3])
         if wp.static(parameters == "covariances"):
-            turning = c.factor(quat, log_scale)
+            turning = m.factor(quat, log_scale)
         else:
             turning = m.rotation(unit)
         v_rotation = wp.outer(position, mean) + wp.outer(t, v_centered) + turned * wp.transpose(turning)

@@ -100,30 +100,6 @@ def make_kernel(real, summed: bool, backward: bool):
         by_mean = real(2.0) * (structure * (mb - luminance * ma) * r1 - ma * v - (ma - mb) * g)
         return vec4(luminance * structure, by_mean, v, g)
 
-    @wp.func
-    def starts_of(y: wp.int32, height: wp.int32, image: wp.int32, columns: wp.int32) -> vec11i:
-        """Return the first elements of the rows in the window of row y; rows outside the image are replaced, and weigh 0."""
-        o = vec11i()
-        for k in range(TAPS):
-            o[k] = (image * height + wp.clamp(y + k - RADIUS, 0, height - 1)) * columns
-        return o
-
-    @wp.func
-    def taps_of(y: wp.int32, height: wp.int32) -> vec11:
-        w = vec11()
-        for k in range(TAPS):
-            inside = y + k >= RADIUS and y + k < height + RADIUS
-            w[k] = wp.where(inside, window[k], real(0.0))
-        return w
-
-    @wp.func
-    def clear_padding(scratch: Reals, first: wp.int32, columns: wp.int32, rows: wp.int32):
-        for row in range(rows):
-            o = first + row * (columns + 2 * PADDING)
-            for k in range(PADDING):
-                scratch[o + k] = real(0.0)
-                scratch[o + PADDING + columns + k] = real(0.0)
-
     # Warp unrolls loops that hold a `wp.static`: inside the loop over lanes, they would keep the latter from vectorising.
 
     @wp.func
@@ -158,13 +134,21 @@ def make_kernel(real, summed: bool, backward: bool):
         top = (task - image * blocks) * BLOCK
         stride = columns + 2 * PADDING
         first = task * fields * stride
-        clear_padding(scratch, first, columns, fields)
+        for field in range(fields):
+            padding = first + field * stride
+            for k in range(PADDING):
+                scratch[padding + k] = real(0.0)
+                scratch[padding + PADDING + columns + k] = real(0.0)
+        o = vec11i()  # first elements of the rows in the window
+        w = vec11()
         sums = several()
         unlike = values()
         error = values()
         for y in range(top, wp.min(top + BLOCK, height)):
-            o = starts_of(y, height, image, columns)
-            w = taps_of(y, height)
+            for k in range(TAPS):  # rows outside the image are replaced, and weigh 0
+                o[k] = (image * height + wp.clamp(y + k - RADIUS, 0, height - 1)) * columns
+                inside = y + k >= RADIUS and y + k < height + RADIUS
+                w[k] = wp.where(inside, window[k], real(0.0))
             for step in range((columns + LANES - 1) // LANES):
                 x = wp.min(step * LANES, columns - LANES)
                 # of the row that the next window adds: too many streams for the processor

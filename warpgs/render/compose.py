@@ -10,7 +10,6 @@ from warpgs.constants import Rule
 from warpgs.kernels import blend as blending, launch, sh
 from warpgs.kernels.ellipse import ProjectInputs, checked_factors, nothing, packed_covariances
 from warpgs.kernels.falloff import Pass
-from warpgs.kernels.project import project_inputs
 from warpgs.kernels.tiles import AS_NEEDED, InstanceMemory, Tiles, bin_tiles
 from warpgs.kernels.walk import contributions, heaviest, median_depth
 from warpgs.scene import ActivatedGaussians, Camera, CovarianceGaussians, RasterizedGaussians, Tensors
@@ -96,9 +95,3 @@ def further_of(projected: torch.Tensor, tiles: Tiles, settings: Pass, weights: b
     if k:
         found |= dict(zip(("heaviest_ids", "heaviest_weights", "blend_counts"), heaviest(projected, tiles, k, settings)))
     return found
-
-
-@torch.no_grad()
-def count_instances(inputs: ProjectInputs, settings: Pass) -> torch.Tensor:
-    """Return the number of (Gaussian, tile) instances of a render, int64, shape []."""
-    return project_inputs(inputs, settings)[1].sum()

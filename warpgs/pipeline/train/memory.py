@@ -26,7 +26,7 @@ from warpgs.pipeline.train.strategies.base import Strategy
 from warpgs.pipeline.train.view_modules import ViewModule
 from warpgs.pipeline.train.views import TrainingView
 from warpgs.process import Detail
-from warpgs.render.compose import count_instances, inputs_of
+from warpgs.render.compose import inputs_of
 from warpgs.render.options import RasterizeOptions, image_settings
 from warpgs.scene import Camera, Gaussians
 
@@ -108,7 +108,8 @@ def _largest(low: int, high: int, fits: Callable[[int], bool]) -> int:
 @torch.no_grad()
 def most_instances(gaussians: Gaussians, cameras: list[Camera], options: RasterizeOptions) -> int:
     """Return the number of (Gaussian, tile) instances for the camera that has the most; cameras hold tensors."""
-    return max(int(count_instances(inputs_of(gaussians, c), image_settings(c, 0, options))) for c in cameras)
+    counts = (project.project_inputs(inputs_of(gaussians, c), image_settings(c, 0, options))[1].sum() for c in cameras)
+    return max(map(int, counts))
 
 
 def plan(

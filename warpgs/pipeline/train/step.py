@@ -22,7 +22,7 @@ from warpgs.pipeline.train.schedule import over
 from warpgs.pipeline.train.strategies.base import Strategy
 from warpgs.pipeline.train.views import Kind, LearnedViews, Rows, ViewStack, camera_at, current, seen
 from warpgs.plugins import returned
-from warpgs.render.compose import bin_and_blend, count_instances, inputs_of
+from warpgs.render.compose import bin_and_blend, inputs_of
 from warpgs.render.options import RasterizeOptions, image_settings
 from warpgs.render.rasterize import rasterize
 from warpgs.scene import Camera, Gaussians, Render, Tensors
@@ -382,7 +382,7 @@ class StepTaker:
 def instance_capacity(gaussians: Gaussians, views: ViewStack, degree: int, options: RasterizeOptions) -> int:
     """Return the capacity of a captured step for (Gaussian, tile) instances, over all views of a stack."""
     cameras = [camera_at(views.camera, i) for i in range(len(views.numbers))]
-    counts = [count_instances(inputs_of(gaussians, c), image_settings(c, degree, options)) for c in cameras]
+    counts = [project_inputs(inputs_of(gaussians, c), image_settings(c, degree, options))[1].sum() for c in cameras]
     wanted = int(CAPACITY_FACTOR * int(torch.stack(counts).max())) + 1024
     budget = available_bytes(gaussians.means.device) * 4 // 5
     if wanted > MAX_INSTANCES or wanted * BYTES_PER_INSTANCE > budget:
