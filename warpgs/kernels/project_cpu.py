@@ -90,7 +90,6 @@ def make_shapes(real, parameters: str):
 @functools.cache
 def make_forward(real, camera_model: str, parameters: str, antialiased: bool, bases: int):
     """Make the kernel; arguments are those of `project_cuda.make_forward`."""
-    one = make_projection(real, camera_model, parameters)
     m = make_projection(real, camera_model, parameters, lanes=True)
     s = make_spans(real)
     g = make_shapes(real, parameters)
@@ -128,7 +127,7 @@ def make_forward(real, camera_model: str, parameters: str, antialiased: bool, ba
         for lane in range(used):
             n = first + lane
             g.store(means[n], quats[n], log_scales[n], lane, shapes)
-            opacity[lane] = one.opacity_of(logit_opacities[n])
+            opacity[lane] = m.opacity_of(logit_opacities[n])
             if opacity_factors.shape[0] > 0:
                 opacity[lane] = opacity[lane] * opacity_factors[n]
 
@@ -223,7 +222,6 @@ def make_forward(real, camera_model: str, parameters: str, antialiased: bool, ba
 def make_backward(real, camera_model: str, parameters: str, antialiased: bool, bases: int, camera_gradients: bool):
     """Make the kernel; each task sums over all cameras, so no sum needs atomics. Arguments are those of `make_forward`."""
     m = make_projection(real, camera_model, parameters, lanes=True)
-    of_one = ellipse.make_functions(real, camera_model, parameters, antialiased, bases)
     f = ellipse.make_functions(real, camera_model, parameters, antialiased, bases, lanes=True)
     gaussians = make_shapes(real, parameters)
     three, four, nine, row, basis = (make_lanes(real, size) for size in (3, 4, 9, PROJECTED_SIZE, bases))
@@ -306,9 +304,10 @@ def make_backward(real, camera_model: str, parameters: str, antialiased: bool, b
             for lane in range(used):
                 if seen[lane] != 0:
                     n = wp.max(first + lane, 0)
-                    i = camera * count + n
-                    v_logit[lane] = v_logit[lane] + of_one.logit(projected, v_projected, i, logit_opacities[n])
-                    v_color = of_one.color(projected, v_projected, i)
+                    p = row.get(rows, lane)
+                    v_p = row.get(v_rows, lane)
+                    v_logit[lane] = v_logit[lane] + f.logit(p, v_p, 0, logit_opacities[n])
+                    v_color = f.color(p, v_p, 0)
                     k = int(0)
                     while k < sh_count:
                         o = wp.max(k, 0)
