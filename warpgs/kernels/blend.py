@@ -83,11 +83,6 @@ def make_segments(real, values: int = VALUES, width: int = 9 + COLORS):
     return SimpleNamespace(sum_gradients=sum_gradients, gather_weights=gather_weights)
 
 
-def is_native(projected: torch.Tensor) -> bool:
-    """Return whether the CUDA kernels apply to projected Gaussians [C, N, 9 + D]; otherwise the generic kernels do."""
-    return projected.is_cuda and projected.dtype == torch.float32
-
-
 def composite(
     projected: torch.Tensor, tiles: Tiles, backgrounds: torch.Tensor, settings: Pass, *, save: bool,
     allocator: Allocator = TORCH, image: torch.Tensor | None = None,
@@ -98,7 +93,7 @@ def composite(
     # depth, and bounds of the error of rgb [C].
     if settings.max_error and tiles.packed is None:
         return _rounded(projected, tiles, backgrounds, settings)
-    if is_native(projected):
+    if launch.is_native(projected):
         return blend_cuda.forward(projected, tiles, backgrounds, settings, save=save, allocator=allocator, image=image)
     real, device = launch.real_of(projected), projected.device
     cameras, channels = backgrounds.shape
@@ -144,7 +139,7 @@ def composite_gradients(
     v_rgb, v_alpha, v_depth = v_images
     channels = backgrounds.shape[1]
     v_rgb = saved[0].new_zeros(*saved[0].shape[:-1], channels) if v_rgb is None else v_rgb
-    if is_native(projected):
+    if launch.is_native(projected):
         return blend_cuda.backward(projected, tiles, backgrounds, settings, saved, (v_rgb, v_alpha, v_depth), allocator)
     _, depth, transmittances, weights, ends, _ = saved
     real, device, deep = launch.real_of(projected), projected.device, v_alpha is not None or v_depth is not None
@@ -199,7 +194,7 @@ def _width(projected: torch.Tensor, channels: int, absgrad: bool) -> int:
     # The generic kernels hold a tile in local memory, which CUDA reserves for every thread that fits the device: 25 GB on an
     # H100 for float64 and 11 channels, 12 GB for 3. So float64 on CUDA has the smallest width, except with ``absgrad``, which
     # needs one pass.
-    narrow = projected.is_cuda and not is_native(projected) and not absgrad
+    narrow = projected.is_cuda and not launch.is_native(projected) and not absgrad
     return width_of(channels, WIDTHS[:1] if narrow else WIDTHS)
 
 
@@ -292,7 +287,7 @@ class _Blend(torch.autograd.Function):
                 whole = part.shape[-1] == behind.shape[-1]
                 rgb, *rest = composite(
                     colored, tiles, behind, settings, save=save and found is None,
-                    image=part if whole or is_native(projected) else None,
+                    image=part if whole or launch.is_native(projected) else None,
                 )  # fmt: skip
                 if rgb is not part:
                     part.copy_(rgb[..., : part.shape[-1]])
@@ -322,11 +317,11 @@ class _Blend(torch.autograd.Function):
             if v_image is None and first > 0:
                 break
             saved = [image[..., channels], *shared]
-            if is_native(projected) and first > 0:
+            if launch.is_native(projected) and first > 0:
                 # states hold the channels of one group, so that memory does not grow with the number of channels
                 saved[1:] = composite(colored, tiles, behind, ctx.settings, save=True, image=image[..., :0])[2:]
             v_rgb = None if v_image is None else v_image[..., channels]
-            if v_rgb is not None and v_rgb.shape[-1] < width and not is_native(projected):
+            if v_rgb is not None and v_rgb.shape[-1] < width and not launch.is_native(projected):
                 v_rgb = _padded(v_rgb, width)  # generic kernels read all channels of a pass
             v_images = (v_rgb, v_alpha, v_depth) if first == 0 else (v_rgb, None, None)
             v = composite_gradients(colored, tiles, behind, ctx.settings, saved, v_images)

@@ -116,14 +116,11 @@ def make_backward(real, tile_size: int, channels: int, absgrad: bool = False, de
 
     @wp.func(inline=True)
     def load_pixels(
-        place: wp.vec3i, settings: f.Blending, backgrounds: Rows, transmittances: Reals, weights: Reals, depth: Reals,
-        ends: Ints, v_rgb: Reals, pitch: wp.int32, v_alpha: Reals, v_depth: Reals, pixels: wp.ref[Pixels],
-        until: wp.ref[b.strip_ints],
+        camera: wp.int32, left: wp.int32, top: wp.int32, settings: f.Blending, backgrounds: Rows, transmittances: Reals,
+        weights: Reals, depth: Reals, ends: Ints, v_rgb: Reals, pitch: wp.int32, v_alpha: Reals, v_depth: Reals,
+        pixels: wp.ref[Pixels], until: wp.ref[b.strip_ints],
     ) -> wp.int32:  # fmt: skip
         """Load the pixels, and for each strip one past the last instance that it blended; return the largest of these."""
-        camera = place[0]
-        left = place[1]
-        top = place[2]
         rows = wp.min(side, settings.height - top)
         across = wp.min(side, settings.width - left)
         row = int(0)
@@ -313,9 +310,7 @@ def make_backward(real, tile_size: int, channels: int, absgrad: bool = False, de
         v_slots: Rows,
     ):  # fmt: skip
         tile = ranges.shape[0] - 1 - begin - wp.tid()  # from the last on, as the instances
-        place = f.place_of(tile, side, settings)
-        left = settings.origin_x + place[1]
-        top = settings.origin_y + place[2]
+        camera, left, top = f.place_of(tile, side, settings)
         pixels = Pixels()
         until = b.strip_ints()
         gaussians = b.Batch()
@@ -324,12 +319,14 @@ def make_backward(real, tile_size: int, channels: int, absgrad: bool = False, de
         held = Held()
         first = ranges[tile, 0]
         last = load_pixels(
-            place, settings, backgrounds, transmittances, weights, depth, ends, v_rgb, pitch, v_alpha, v_depth, pixels, until
-        )
-        # the pixels of the next tile
-        behind = f.place_of(wp.max(tile - 1, 0), side, settings)
-        for row in range(side):
-            o = (behind[0] * settings.height + behind[2] + row) * settings.width + behind[1]
+            camera, left, top, settings, backgrounds, transmittances, weights, depth, ends, v_rgb, pitch, v_alpha, v_depth,
+            pixels, until,
+        )  # fmt: skip
+        left += settings.origin_x
+        top += settings.origin_y
+        next_camera, next_left, next_top = f.place_of(wp.max(tile - 1, 0), side, settings)
+        for row in range(side):  # the pixels of the next tile
+            o = (next_camera * settings.height + next_top + row) * settings.width + next_left
             prefetch_end(ends, o)
             prefetch_value(transmittances, o)
             for part in range(touches):
@@ -432,10 +429,7 @@ def make_forward(real, tile_size: int, channels: int):
         rgb: Reals, pitch: int, alpha_out: Reals, depth: Reals, transmittances: Reals, weights: Reals, ends: Ints,
     ):  # fmt: skip
         tile = begin + wp.tid()
-        place = f.place_of(tile, side, settings)
-        camera = place[0]
-        left = place[1]
-        top = place[2]
+        camera, left, top = f.place_of(tile, side, settings)
 
         # The state of the tile: transmittance of what was blended, and of all that was visited, which falls below the stop once
         # the pixel is finished; sums; one past the last instance blended.

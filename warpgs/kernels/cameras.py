@@ -69,10 +69,8 @@ def check_camera(camera: Camera) -> type[CameraModel]:
         others = ', or give model="opencv" (8) or model="fisheye" (4)' if camera.model == "pinhole" else ""
         raise UsageError(f"the camera model {camera.model!r} takes no distortion, found {found} coefficients; omit it{others}")
     if found != model.coefficients:
-        raise UsageError(
-            f"the camera model {camera.model!r} takes {model.coefficients} coefficients of distortion, found {found}; give "
-            "Camera.distortion the shape [P] or [C, P], zeros for a lens without distortion"
-        )
+        takes = f"{camera.model!r} takes {model.coefficients} coefficients of distortion, found {found}"
+        raise UsageError(f"the camera model {takes}; give Camera.distortion the shape [P] or [C, P], zeros for none")
     if getattr(camera.distortion, "requires_grad", False):
         raise UsageError("gradients of distortion coefficients are not supported: give Camera.distortion.detach()")
     return model
@@ -111,12 +109,8 @@ def make_linear(real: type) -> SimpleNamespace:
 
     @wp.func
     def intrinsics_of(fx: real, fy: real, center: vec2) -> mat33:
-        v_K = mat33()
-        v_K[0, 0] = fx
-        v_K[1, 1] = fy
-        v_K[0, 2] = center[0]
-        v_K[1, 2] = center[1]
-        return v_K
+        zero = real(0.0)
+        return mat33(fx, zero, center[0], zero, fy, center[1], zero, zero, zero)
 
     @wp.func
     def in_front(position: vec3, lens: Reals, near: real) -> wp.bool:
@@ -182,17 +176,7 @@ class Pinhole(CameraModel):
             jy = K[1, 1] / z
             jxz = (K[0, 2] - point[0]) / z
             jyz = (K[1, 2] - point[1]) / z
-            first = vec3(
-                jx * axes[0, 0] + jxz * axes[2, 0],
-                jx * axes[0, 1] + jxz * axes[2, 1],
-                jx * axes[0, 2] + jxz * axes[2, 2],
-            )
-            second = vec3(
-                jy * axes[1, 0] + jyz * axes[2, 0],
-                jy * axes[1, 1] + jyz * axes[2, 1],
-                jy * axes[1, 2] + jyz * axes[2, 2],
-            )
-            return linear.Rows(first, second)
+            return linear.Rows(jx * axes[0] + jxz * axes[2], jy * axes[1] + jyz * axes[2])
 
         @wp.func
         def axes_backward(position: vec3, K: mat33, lens: Reals, point: vec2, v_first: vec3, v_second: vec3) -> mat33:
@@ -208,18 +192,16 @@ class Pinhole(CameraModel):
             position: vec3, K: mat33, lens: Reals, pixel: vec2, point: vec2, axes: mat33,
             v_first: vec3, v_second: vec3, v_pixel: vec2, v_depth: real,
         ) -> linear.Gradients:  # fmt: skip
-            x = position[0]
-            y = position[1]
+            x, y = position[0], position[1]
             inv_z = real(1.0) / position[2]
             jx = K[0, 0] * inv_z
             jy = K[1, 1] * inv_z
             jxz = (K[0, 2] - point[0]) * inv_z
             jyz = (K[1, 2] - point[1]) * inv_z
-            axes2 = vec3(axes[2, 0], axes[2, 1], axes[2, 2])
-            v_jx = wp.dot(v_first, vec3(axes[0, 0], axes[0, 1], axes[0, 2]))
-            v_jxz = wp.dot(v_first, axes2)
-            v_jy = wp.dot(v_second, vec3(axes[1, 0], axes[1, 1], axes[1, 2]))
-            v_jyz = wp.dot(v_second, axes2)
+            v_jx = wp.dot(v_first, axes[0])
+            v_jxz = wp.dot(v_first, axes[2])
+            v_jy = wp.dot(v_second, axes[1])
+            v_jyz = wp.dot(v_second, axes[2])
             v_x = v_pixel[0] * jx
             v_y = v_pixel[1] * jy
             v_z = (
@@ -288,9 +270,60 @@ class OpenCV(CameraModel):
     def make_functions(real: type) -> SimpleNamespace:
         """Make the functions of `CameraModel.make_functions`."""
         linear = make_linear(real)
-        lensed = _make_distortion(real)
         vec2, vec3, _, mat33, _, Reals = types_of(real)
-        one = real(1.0)
+        one, two = real(1.0), real(2.0)
+
+        @wp.struct
+        class Distorted:
+            """The distorted point of (a, b), and its Jacobian, which is symmetric."""
+
+            a: real
+            b: real
+            aa: real
+            ab: real
+            bb: real
+            folded: wp.bool
+
+        @wp.func
+        def radial_at(t: real, lens: Reals):
+            """Return the radial factor R = N / M at a squared radius, its first two derivatives by that, and M."""
+            three = real(3.0)
+            k1, k2, k3, k4, k5, k6 = lens[0], lens[1], lens[4], lens[5], lens[6], lens[7]
+            m = one + t * (k4 + t * (k5 + t * k6))
+            m1 = k4 + t * (two * k5 + t * three * k6)
+            m2 = two * (k5 + t * three * k6)
+            value = (one + t * (k1 + t * (k2 + t * k3))) / m
+            first = (k1 + t * (two * k2 + t * three * k3) - value * m1) / m
+            return value, first, (two * (k2 + t * three * k3) - two * first * m1 - value * m2) / m, m
+
+        @wp.func
+        def distort(a: real, b: real, lens: Reals) -> Distorted:
+            six = real(6.0)
+            p1, p2 = lens[2], lens[3]
+            t = a * a + b * b
+            value, first, _second, denominator = radial_at(t, lens)
+            d = Distorted()
+            d.a = a * value + two * p1 * a * b + p2 * (t + two * a * a)
+            d.b = b * value + p1 * (t + two * b * b) + two * p2 * a * b
+            d.aa = value + two * a * a * first + two * p1 * b + six * p2 * a
+            d.ab = two * (a * b * first + p1 * a + p2 * b)
+            d.bb = value + two * b * b * first + six * p1 * b + two * p2 * a
+            # phrased so that a NaN is folded
+            d.folded = not (denominator > real(0.0) and d.aa + d.bb > real(0.0) and d.aa * d.bb - d.ab * d.ab > real(0.0))
+            return d
+
+        @wp.func
+        def curved(a: real, b: real, v_aa: real, v_ab: real, v_bb: real, lens: Reals) -> vec2:
+            """Return the gradients of (a, b) from those of the Jacobian's entries."""
+            four = real(4.0)
+            six = real(6.0)
+            p1, p2 = lens[2], lens[3]
+            _value, first, second, _denominator = radial_at(a * a + b * b, lens)
+            aaa = six * a * first + four * a * a * a * second + six * p2
+            aab = two * b * first + four * a * a * b * second + two * p1
+            abb = two * a * first + four * a * b * b * second + two * p2
+            bbb = six * b * first + four * b * b * b * second + six * p1
+            return vec2(v_aa * aaa + v_ab * aab + v_bb * abb, v_aa * aab + v_ab * abb + v_bb * bbb)
 
         @wp.func
         def in_range(position: vec3, lens: Reals, near: real) -> wp.bool:
@@ -303,14 +336,14 @@ class OpenCV(CameraModel):
             for i in range(count):  # several samples, since the map may rise again beyond a fold
                 part = real(i + 1) / real(RIM_SAMPLES)
                 s = wp.sqrt(part / (one + (one - part) * (a * a + b * b)))  # evenly spaced in the squared sine of the angle
-                d = lensed.distort(s * a, s * b, lens)
+                d = distort(s * a, s * b, lens)
                 if d.folded:
                     return False
             return True
 
         @wp.func
         def pixel_of(position: vec3, K: mat33, lens: Reals) -> vec2:
-            d = lensed.distort(position[0] / position[2], position[1] / position[2], lens)
+            d = distort(position[0] / position[2], position[1] / position[2], lens)
             return vec2(K[0, 0] * d.a + K[0, 2], K[1, 1] * d.b + K[1, 2])
 
         @wp.func
@@ -327,7 +360,7 @@ class OpenCV(CameraModel):
             inv_z = one / position[2]
             a = position[0] * inv_z * scale_to(point[0] - K[0, 2], pixel[0] - K[0, 2])
             b = position[1] * inv_z * scale_to(point[1] - K[1, 2], pixel[1] - K[1, 2])
-            d = lensed.distort(a, b, lens)
+            d = distort(a, b, lens)
             first = K[0, 0] * inv_z * vec3(d.aa, d.ab, -(d.aa * a + d.ab * b))
             second = K[1, 1] * inv_z * vec3(d.ab, d.bb, -(d.ab * a + d.bb * b))
             return linear.Rows(first, second)
@@ -342,7 +375,7 @@ class OpenCV(CameraModel):
             jy = K[1, 1] * inv_z
             a0 = position[0] * inv_z
             b0 = position[1] * inv_z
-            mean = lensed.distort(a0, b0, lens)
+            mean = distort(a0, b0, lens)
             sx = one
             sy = one
             if point[0] != pixel[0]:
@@ -351,7 +384,7 @@ class OpenCV(CameraModel):
                 sy = scale_to(point[1] - K[1, 2], pixel[1] - K[1, 2])
             a = sx * a0
             b = sy * b0
-            d = lensed.distort(a, b, lens)
+            d = distort(a, b, lens)
             g = axes * v_first  # gradients of the rows of J
             h = axes * v_second
             u_aa = g[0] - a * g[2]
@@ -360,7 +393,7 @@ class OpenCV(CameraModel):
             w_bb = h[1] - b * h[2]
             first = d.aa * u_aa + d.ab * u_ab  # by jx and jy
             second = d.ab * w_ab + d.bb * w_bb
-            bent = lensed.curved(a, b, jx * u_aa, jx * u_ab + jy * w_ab, jy * w_bb, lens)
+            bent = curved(a, b, jx * u_aa, jx * u_ab + jy * w_ab, jy * w_bb, lens)
             v_ea = bent[0] - jx * g[2] * d.aa - jy * h[2] * d.ab  # of the expansion point
             v_eb = bent[1] - jx * g[2] * d.ab - jy * h[2] * d.bb
             v_a = v_pixel[0] * K[0, 0] * mean.aa + v_pixel[1] * K[1, 1] * mean.ab
@@ -384,81 +417,6 @@ class OpenCV(CameraModel):
         return linear.products(jacobian, in_range, pixel_of, position_backward)
 
 
-@functools.cache
-def _make_distortion(real: type) -> SimpleNamespace:
-    vec2, *_, Reals = types_of(real)
-    one, two = real(1.0), real(2.0)
-
-    @wp.struct
-    class Radial:
-        """The radial factor R = N / M at a squared radius, and its first two derivatives by the squared radius."""
-
-        value: real
-        first: real
-        second: real
-        denominator: real
-
-    @wp.struct
-    class Distorted:
-        """The distorted point of (a, b), and its Jacobian, which is symmetric."""
-
-        a: real
-        b: real
-        aa: real
-        ab: real
-        bb: real
-        folded: wp.bool
-
-    @wp.func
-    def radial_at(t: real, lens: Reals) -> Radial:
-        three = real(3.0)
-        k1 = lens[0]
-        k2 = lens[1]
-        k3 = lens[4]
-        k4 = lens[5]
-        k5 = lens[6]
-        k6 = lens[7]
-        m = one + t * (k4 + t * (k5 + t * k6))
-        m1 = k4 + t * (two * k5 + t * three * k6)
-        m2 = two * (k5 + t * three * k6)
-        value = (one + t * (k1 + t * (k2 + t * k3))) / m
-        first = (k1 + t * (two * k2 + t * three * k3) - value * m1) / m
-        return Radial(value, first, (two * (k2 + t * three * k3) - two * first * m1 - value * m2) / m, m)  # type: ignore[call-arg]
-
-    @wp.func
-    def distort(a: real, b: real, lens: Reals) -> Distorted:
-        six = real(6.0)
-        p1 = lens[2]
-        p2 = lens[3]
-        t = a * a + b * b
-        r = radial_at(t, lens)
-        d = Distorted()
-        d.a = a * r.value + two * p1 * a * b + p2 * (t + two * a * a)
-        d.b = b * r.value + p1 * (t + two * b * b) + two * p2 * a * b
-        d.aa = r.value + two * a * a * r.first + two * p1 * b + six * p2 * a
-        d.ab = two * (a * b * r.first + p1 * a + p2 * b)
-        d.bb = r.value + two * b * b * r.first + six * p1 * b + two * p2 * a
-        # phrased so that a NaN is folded
-        d.folded = not (r.denominator > real(0.0) and d.aa + d.bb > real(0.0) and d.aa * d.bb - d.ab * d.ab > real(0.0))
-        return d
-
-    @wp.func
-    def curved(a: real, b: real, v_aa: real, v_ab: real, v_bb: real, lens: Reals) -> vec2:
-        """Return the gradients of (a, b) from those of the Jacobian's entries."""
-        four = real(4.0)
-        six = real(6.0)
-        p1 = lens[2]
-        p2 = lens[3]
-        r = radial_at(a * a + b * b, lens)
-        aaa = six * a * r.first + four * a * a * a * r.second + six * p2
-        aab = two * b * r.first + four * a * a * b * r.second + two * p1
-        abb = two * a * r.first + four * a * b * b * r.second + two * p2
-        bbb = six * b * r.first + four * b * b * b * r.second + six * p1
-        return vec2(v_aa * aaa + v_ab * aab + v_bb * abb, v_aa * aab + v_ab * abb + v_bb * bbb)
-
-    return SimpleNamespace(distort=distort, curved=curved)
-
-
 ANTIPODE = 1e-3
 """Smallest sine of the angle from the backward axis that is rendered: on that axis, the image of a point is a circle."""
 NEAR_AXIS = 0.04
@@ -478,13 +436,83 @@ class Fisheye(CameraModel):
     def make_functions(real: type) -> SimpleNamespace:
         """Make the functions of `CameraModel.make_functions`."""
         linear = make_linear(real)
-        radial = _make_profile(real)
         vec2, vec3, _, mat33, _, Reals = types_of(real)
+
+        @wp.struct
+        class Profile:
+            """Radius over sine, G, at a unit position (x, y, z) with r^2 = x^2 + y^2, and its derivatives.
+
+            H = G_r / r, L = H_r / r, E = G_z, N = E_r / r = H_z and P = E_z.
+            """
+
+            G: real
+            H: real
+            L: real
+            E: real
+            N: real
+            P: real
+
+        @wp.func
+        def slope(t: real, lens: Reals) -> real:
+            """Return the derivative of the radius by the angle, whose square is t."""
+            return real(1.0) + t * (
+                real(3.0) * lens[0] + t * (real(5.0) * lens[1] + t * (real(7.0) * lens[2] + t * real(9.0) * lens[3]))
+            )
+
+        @wp.func
+        def angle_over_sine(r2: real, z: real):
+            """Return A = angle / r, B = A_r / r and C = B_r / r at a unit position."""
+            t = r2 / (z * z)
+            if z > real(0.0) and t < real(NEAR_AXIS):
+                q = -t
+                A = real(0.0)
+                B = real(0.0)
+                C = real(0.0)
+                for i in range(TERMS):  # Horner's scheme, from the last term to the first, of arctan(sqrt t) / sqrt t
+                    n = real(TERMS - 1 - i)
+                    A = A * q + real(1.0) / (real(2.0) * n + real(1.0))
+                    B = B * q - (n + real(1.0)) / (real(2.0) * n + real(3.0))
+                    C = C * q + (n + real(1.0)) * (n + real(2.0)) / (real(2.0) * n + real(5.0))
+                inv = real(1.0) / z
+                return A * inv, real(2.0) * B * inv * inv * inv, real(4.0) * C * inv * inv * inv * inv * inv
+            r = wp.sqrt(r2)
+            A = wp.atan2(r, z) / r
+            B = (z - A) / r2
+            return A, B, -(real(2.0) * z + real(3.0) * B) / r2
+
+        @wp.func
+        def profile(unit: vec3, lens: Reals) -> Profile:
+            two = real(2.0)
+            r2 = unit[0] * unit[0] + unit[1] * unit[1]
+            z = unit[2]
+            A, B, C = angle_over_sine(r2, z)
+            t = A * A * r2
+            s = real(1.0) + t * (lens[0] + t * (lens[1] + t * (lens[2] + t * lens[3])))
+            s1 = lens[0] + t * (two * lens[1] + t * (real(3.0) * lens[2] + t * real(4.0) * lens[3]))
+            s2 = two * lens[1] + t * (real(6.0) * lens[2] + t * real(12.0) * lens[3])
+            m = slope(t, lens)
+            m1 = real(6.0) * lens[0] + t * (real(20.0) * lens[1] + t * (real(42.0) * lens[2] + t * real(72.0) * lens[3]))
+            Az = A * z
+            p = Profile()
+            p.G = A * s
+            p.H = B * s + two * A * Az * s1
+            p.L = C * s + real(6.0) * B * Az * s1 + real(4.0) * A * (Az * Az * s2 - Az * s1)
+            p.E = -m
+            p.N = two * m - Az * m1
+            p.P = r2 * A * m1 + two * m * z
+            return p
+
+        @wp.func
+        def distance_of(position: vec3) -> real:
+            largest = wp.max(wp.abs(position))
+            if not (largest > real(0.0)):
+                return largest
+            return largest * wp.length(position / largest)
 
         @wp.func
         def in_range(position: vec3, lens: Reals, near: real) -> wp.bool:
             # phrased so that a NaN gives False
-            distance = radial.distance(position)
+            distance = distance_of(position)
             if not (distance >= near and distance <= real(FAR)):
                 return False
             unit = position / distance
@@ -495,23 +523,22 @@ class Fisheye(CameraModel):
             count = int(RIM_SAMPLES)  # a loop, not sixteen copies
             for i in range(count):  # several samples, since the polynomial may rise again beyond a fold
                 t = angle * (real(i + 1) / real(RIM_SAMPLES))
-                if not (radial.slope(t * t, lens) > real(0.0)):
+                if not (slope(t * t, lens) > real(0.0)):
                     return False
             return True
 
         @wp.func
         def pixel_of(position: vec3, K: mat33, lens: Reals) -> vec2:
-            unit = position / radial.distance(position)
-            p = radial.profile(unit, lens)
+            unit = position / distance_of(position)
+            p = profile(unit, lens)
             return vec2(K[0, 0] * unit[0] * p.G + K[0, 2], K[1, 1] * unit[1] * p.G + K[1, 2])
 
         @wp.func
         def jacobian(position: vec3, K: mat33, lens: Reals, point: vec2) -> linear.Rows:
-            distance = radial.distance(position)
+            distance = distance_of(position)
             unit = position / distance
-            x = unit[0]
-            y = unit[1]
-            p = radial.profile(unit, lens)
+            x, y = unit[0], unit[1]
+            p = profile(unit, lens)
             jx = K[0, 0] / distance
             jy = K[1, 1] / distance
             first = vec3(jx * (p.G + x * x * p.H), jx * x * y * p.H, jx * x * p.E)
@@ -524,11 +551,10 @@ class Fisheye(CameraModel):
             v_first: vec3, v_second: vec3, v_pixel: vec2, v_depth: real,
         ) -> linear.Gradients:  # fmt: skip
             two = real(2.0)
-            distance = radial.distance(position)
+            distance = distance_of(position)
             unit = position / distance
-            x = unit[0]
-            y = unit[1]
-            p = radial.profile(unit, lens)
+            x, y = unit[0], unit[1]
+            p = profile(unit, lens)
             v_row0 = axes * v_first / distance  # gradients of the rows of J, at unit distance
             v_row1 = axes * v_second / distance
             g = K[0, 0] * v_row0
@@ -547,84 +573,5 @@ class Fisheye(CameraModel):
             v_position = vec3(v_x, v_y, v_z) / distance + v_depth * unit
             return linear.Gradients(v_position, linear.intrinsics_of(fx, fy, v_pixel))
 
-        own = {"depth_of": radial.distance, "expansion_point": linear.unclamped}
+        own = {"depth_of": distance_of, "expansion_point": linear.unclamped}
         return linear.products(jacobian, in_range, pixel_of, position_backward, **own)
-
-
-@functools.cache
-def _make_profile(real: type) -> SimpleNamespace:
-    _, vec3, *_, Reals = types_of(real)
-
-    @wp.struct
-    class Profile:
-        """Radius over sine, G, at a unit position (x, y, z) with r^2 = x^2 + y^2, and its derivatives.
-
-        H = G_r / r, L = H_r / r, E = G_z, N = E_r / r = H_z and P = E_z.
-        """
-
-        G: real
-        H: real
-        L: real
-        E: real
-        N: real
-        P: real
-
-    @wp.func
-    def slope(t: real, lens: Reals) -> real:
-        """Return the derivative of the radius by the angle, whose square is t."""
-        return real(1.0) + t * (
-            real(3.0) * lens[0] + t * (real(5.0) * lens[1] + t * (real(7.0) * lens[2] + t * real(9.0) * lens[3]))
-        )
-
-    @wp.func
-    def angle_over_sine(r2: real, z: real) -> vec3:
-        """Return A = angle / r, B = A_r / r and C = B_r / r at a unit position."""
-        t = r2 / (z * z)
-        if z > real(0.0) and t < real(NEAR_AXIS):
-            q = -t
-            A = real(0.0)
-            B = real(0.0)
-            C = real(0.0)
-            for i in range(TERMS):  # Horner's scheme, from the last term to the first, of arctan(sqrt t) / sqrt t
-                n = real(TERMS - 1 - i)
-                A = A * q + real(1.0) / (real(2.0) * n + real(1.0))
-                B = B * q - (n + real(1.0)) / (real(2.0) * n + real(3.0))
-                C = C * q + (n + real(1.0)) * (n + real(2.0)) / (real(2.0) * n + real(5.0))
-            inv = real(1.0) / z
-            return vec3(A * inv, real(2.0) * B * inv * inv * inv, real(4.0) * C * inv * inv * inv * inv * inv)
-        r = wp.sqrt(r2)
-        A = wp.atan2(r, z) / r
-        B = (z - A) / r2
-        return vec3(A, B, -(real(2.0) * z + real(3.0) * B) / r2)
-
-    @wp.func
-    def profile(unit: vec3, lens: Reals) -> Profile:
-        two = real(2.0)
-        r2 = unit[0] * unit[0] + unit[1] * unit[1]
-        z = unit[2]
-        abc = angle_over_sine(r2, z)
-        A = abc[0]
-        t = A * A * r2
-        s = real(1.0) + t * (lens[0] + t * (lens[1] + t * (lens[2] + t * lens[3])))
-        s1 = lens[0] + t * (two * lens[1] + t * (real(3.0) * lens[2] + t * real(4.0) * lens[3]))
-        s2 = two * lens[1] + t * (real(6.0) * lens[2] + t * real(12.0) * lens[3])
-        m = slope(t, lens)
-        m1 = real(6.0) * lens[0] + t * (real(20.0) * lens[1] + t * (real(42.0) * lens[2] + t * real(72.0) * lens[3]))
-        Az = A * z
-        p = Profile()
-        p.G = A * s
-        p.H = abc[1] * s + two * A * Az * s1
-        p.L = abc[2] * s + real(6.0) * abc[1] * Az * s1 + real(4.0) * A * (Az * Az * s2 - Az * s1)
-        p.E = -m
-        p.N = two * m - Az * m1
-        p.P = r2 * A * m1 + two * m * z
-        return p
-
-    @wp.func
-    def distance(position: vec3) -> real:
-        largest = wp.max(wp.abs(position))
-        if not (largest > real(0.0)):
-            return largest
-        return largest * wp.length(position / largest)
-
-    return SimpleNamespace(slope=slope, profile=profile, distance=distance)

@@ -20,86 +20,6 @@ def arrays_of(real):
     return *(wp.array(dtype=kind) for kind in (vec3, vec4, mat33, mat44)), wp.array2d(dtype=real), wp.array2d(dtype=vec3)
 
 
-@functools.cache
-def make_covariance(real):
-    """Make the functions for one scalar type. A covariance is stored as xy, xz, yz and a 0, and its diagonal."""
-    _, vec3, vec4, mat33, *_ = types_of(real)
-
-    @wp.struct
-    class Packed:
-        """Gradient of a covariance."""
-
-        off: vec4
-        diagonal: vec3
-
-    @wp.func
-    def factor(off: vec4, diagonal: vec3) -> mat33:
-        """Return M with M M^T = Sigma where Sigma is positive semi-definite within the tolerance; else a NaN, which culls."""
-        none = mat33()
-        none[0, 0] = real(wp.static(float("nan")))
-        S = mat33(
-            diagonal[0], off[0], off[1],
-            off[0], diagonal[1], off[2],
-            off[1], off[2], diagonal[2],
-        )  # fmt: skip
-        # the axis of the largest variance first, so that rounding stays below it
-        p = int(0)
-        if S[1, 1] > S[0, 0]:
-            p = int(1)
-        if S[2, 2] > S[p, p]:
-            p = int(2)
-        q = (p + 1) % 3
-        r = (p + 2) % 3
-        largest = S[p, p]
-        if not (largest > real(0.0)):
-            size = wp.abs(off[0]) + wp.abs(off[1]) + wp.abs(off[2])
-            size += wp.abs(diagonal[0]) + wp.abs(diagonal[1]) + wp.abs(diagonal[2])
-            if size == real(0.0):
-                return mat33()
-            return none
-        root = wp.sqrt(largest)
-        mq = S[p, q] / root
-        mr = S[p, r] / root
-        # the remainder of the other two axes after the first column
-        sqq = S[q, q] - mq * mq
-        srr = S[r, r] - mr * mr
-        sqr = S[q, r] - mq * mr
-        half = real(0.5) * (sqq - srr) / largest
-        cross = sqr / largest
-        lowest = real(0.5) * (sqq + srr) / largest - wp.sqrt(half * half + cross * cross)
-        if not (lowest >= -real(COVARIANCE_TOLERANCE)):
-            return none
-        if srr > sqq:
-            swapped = q
-            q = r
-            r = swapped
-            sqq, srr = srr, sqq
-            mq, mr = mr, mq
-        mqq = real(0.0)
-        mrq = real(0.0)
-        if sqq > real(0.0):
-            mqq = wp.sqrt(sqq)
-            mrq = wp.clamp(sqr / mqq, -mqq, mqq)
-        M = mat33()
-        M[p, 0] = root
-        M[q, 0] = mq
-        M[r, 0] = mr
-        M[q, 1] = mqq
-        M[r, 1] = mrq
-        M[r, 2] = wp.sqrt(wp.max(srr - mrq * mrq, real(0.0)))
-        return M
-
-    @wp.func
-    def gradient(first: vec3, second: vec3, v11: real, v12: real, v22: real) -> Packed:
-        """Return the gradient of Sigma from those of the projected covariance; ``first`` and ``second`` are J R."""
-        V = v11 * wp.outer(first, first) + v12 * (wp.outer(first, second) + wp.outer(second, first))
-        V += v22 * wp.outer(second, second)
-        off = vec4(V[0, 1] + V[1, 0], V[0, 2] + V[2, 0], V[1, 2] + V[2, 1], real(0.0))
-        return Packed(off, vec3(V[0, 0], V[1, 1], V[2, 2]))
-
-    return SimpleNamespace(factor=factor, gradient=gradient)
-
-
 PROJECTED_SIZE = 12
 """Number of values of a projected Gaussian, whose rows are 16-byte aligned in float32:
 0:2 mean [px], 2:5 factor u11 u12 u22 [1/px], 5 opacity, 6:9 colour, 9 depth [u] (z; the distance for a fisheye),
@@ -153,33 +73,84 @@ def checked_factors(means: torch.Tensor, factors: torch.Tensor | None) -> torch.
     return factors.detach()
 
 
-class _PackedCovariances(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, covars):
-        off = covars.new_zeros(len(covars), 4)
-        for k, (i, j) in enumerate(OFF_DIAGONAL):
-            off[:, k] = 0.5 * covars[:, i, j] + 0.5 * covars[:, j, i]
-        return off, covars.diagonal(dim1=1, dim2=2).contiguous()
-
-    @staticmethod
-    @launch.first_order
-    def backward(ctx, v_off, v_diagonal):
-        v_covars = torch.diag_embed(v_diagonal)
-        for k, (i, j) in enumerate(OFF_DIAGONAL):
-            v_covars[:, i, j] = v_covars[:, j, i] = 0.5 * v_off[:, k]
-        return (v_covars,)
-
-
 def packed_covariances(covars: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Return the symmetric part of covariances [N, 3, 3] as xy, xz, yz and a 0 [N, 4], and diagonals [N, 3]. Differentiable."""
-    found: tuple[torch.Tensor, torch.Tensor] = _PackedCovariances.apply(covars)
-    return found
+    # both halves first, since a sum could overflow
+    halves = 0.5 * covars
+    off = [halves[:, i, j] + halves[:, j, i] for i, j in OFF_DIAGONAL]
+    return torch.stack([*off, torch.zeros_like(off[0])], 1), covars.diagonal(dim1=1, dim2=2).contiguous()
+
+
+SHRINKS = 6
+"""Number of divisions by 2^16 that take `LARGEST_AXIS` below 2^16 px."""
 
 
 @functools.cache
-def make_rotations(real):
-    """Make the quaternion and rotation functions for one scalar type (docs/project.md, section 2)."""
-    *_, vec4, mat33, mat44, _ = types_of(real)
+def make_projection(real, camera_model: str, parameters: str = "stored", lanes: bool = False):
+    """Make the steps of the projection that forward and backward share (derivation: docs/project.md)."""
+    # ``lanes`` is True for loops that the compiler vectorises: without branches and calls, so culled Gaussians are computed to
+    # the end, too. Scales and opacities are activated beforehand.
+    camera = CAMERA_MODELS.find(camera_model).make_functions(real)
+    vec2, vec3, vec4, mat33, mat44, Reals = types_of(real)
+
+    # A covariance is stored as xy, xz, yz and a 0, and its diagonal.
+
+    @wp.func
+    def factor(off: vec4, diagonal: vec3) -> mat33:
+        """Return M with M M^T = Sigma where Sigma is positive semi-definite within the tolerance; else a NaN, which culls."""
+        none = mat33()
+        none[0, 0] = real(wp.static(float("nan")))
+        S = mat33(
+            diagonal[0], off[0], off[1],
+            off[0], diagonal[1], off[2],
+            off[1], off[2], diagonal[2],
+        )  # fmt: skip
+        # the axis of the largest variance first, so that rounding stays below it
+        p = int(0)
+        if S[1, 1] > S[0, 0]:
+            p = int(1)
+        if S[2, 2] > S[p, p]:
+            p = int(2)
+        q = (p + 1) % 3
+        r = (p + 2) % 3
+        largest = S[p, p]
+        if not (largest > real(0.0)):
+            size = wp.abs(off[0]) + wp.abs(off[1]) + wp.abs(off[2])
+            size += wp.abs(diagonal[0]) + wp.abs(diagonal[1]) + wp.abs(diagonal[2])
+            if size == real(0.0):
+                return mat33()
+            return none
+        root = wp.sqrt(largest)
+        mq = S[p, q] / root
+        mr = S[p, r] / root
+        # the remainder of the other two axes after the first column
+        sqq = S[q, q] - mq * mq
+        srr = S[r, r] - mr * mr
+        sqr = S[q, r] - mq * mr
+        half = real(0.5) * (sqq - srr) / largest
+        cross = sqr / largest
+        lowest = real(0.5) * (sqq + srr) / largest - wp.sqrt(half * half + cross * cross)
+        if not (lowest >= -real(COVARIANCE_TOLERANCE)):
+            return none
+        if srr > sqq:
+            q, r = r, q
+            sqq, srr = srr, sqq
+            mq, mr = mr, mq
+        mqq = real(0.0)
+        mrq = real(0.0)
+        if sqq > real(0.0):
+            mqq = wp.sqrt(sqq)
+            mrq = wp.clamp(sqr / mqq, -mqq, mqq)
+        M = mat33()
+        M[p, 0] = root
+        M[q, 0] = mq
+        M[r, 0] = mr
+        M[q, 1] = mqq
+        M[r, 1] = mrq
+        M[r, 2] = wp.sqrt(wp.max(srr - mrq * mrq, real(0.0)))
+        return M
+
+    # quaternions and rotations: docs/project.md, section 2
 
     @wp.func
     def quat_length(q: vec4) -> real:
@@ -192,10 +163,7 @@ def make_rotations(real):
     def rotation(q: vec4) -> mat33:
         # q is a unit quaternion wxyz. Every entry is quadratic in q, so a rounding error of the length only scales the
         # matrix. With ones on the diagonal, the error would rotate it, and move the end of a needle across its width.
-        w = q[0]
-        x = q[1]
-        y = q[2]
-        z = q[3]
+        w, x, y, z = q[0], q[1], q[2], q[3]
         two = real(2.0)
         return mat33(
             (w * w - z * z) + (x * x - y * y), two * (x * y - w * z), two * (x * z + w * y),
@@ -206,10 +174,7 @@ def make_rotations(real):
     @wp.func
     def rotation_backward(q: vec4, v: mat33) -> vec4:
         # gradient of sum(v * rotation(q)) by q, not constrained to unit length
-        w = q[0]
-        x = q[1]
-        y = q[2]
-        z = q[3]
+        w, x, y, z = q[0], q[1], q[2], q[3]
         two = real(2.0)
         four = real(4.0)
         v_w = two * (x * (v[2, 1] - v[1, 2]) + y * (v[0, 2] - v[2, 0]) + z * (v[1, 0] - v[0, 1]))
@@ -228,23 +193,6 @@ def make_rotations(real):
     def rotation_of(view: mat44) -> mat33:
         """Return the rotation of a view matrix."""
         return mat33(view[0, 0], view[0, 1], view[0, 2], view[1, 0], view[1, 1], view[1, 2], view[2, 0], view[2, 1], view[2, 2])
-
-    return named(quat_length, rotation, rotation_backward, rotation_of)
-
-
-SHRINKS = 6
-"""Number of divisions by 2^16 that take `LARGEST_AXIS` below 2^16 px."""
-
-
-@functools.cache
-def make_projection(real, camera_model: str, parameters: str = "stored", lanes: bool = False):
-    """Make the steps of the projection that forward and backward share (derivation: docs/project.md)."""
-    # ``lanes`` is True for loops that the compiler vectorises: without branches and calls, so culled Gaussians are computed to
-    # the end, too. Scales and opacities are activated beforehand.
-    r = make_rotations(real)
-    factor = make_covariance(real).factor
-    camera = CAMERA_MODELS.find(camera_model).make_functions(real)
-    vec2, vec3, vec4, mat33, mat44, Reals = types_of(real)
 
     @wp.struct
     class Ellipse:
@@ -268,9 +216,7 @@ def make_projection(real, camera_model: str, parameters: str = "stored", lanes: 
 
     @wp.func
     def finite3(v: vec3) -> wp.bool:
-        if wp.static(lanes):  # isfinite would be a function call
-            return (v[0] - v[0]) + (v[1] - v[1]) + (v[2] - v[2]) == real(0.0)
-        return wp.isfinite(v[0]) and wp.isfinite(v[1]) and wp.isfinite(v[2])
+        return (v[0] - v[0]) + (v[1] - v[1]) + (v[2] - v[2]) == real(0.0)  # isfinite would be a function call on a CPU
 
     @wp.func
     def sigmoid(x: real) -> real:
@@ -298,60 +244,49 @@ def make_projection(real, camera_model: str, parameters: str = "stored", lanes: 
     ) -> Ellipse:  # fmt: skip
         e = Ellipse()
         e.valid = 0
-        rotation = r.rotation_of(view)
-        e.position = rotation * mean + vec3(view[0, 3], view[1, 3], view[2, 3])
+        of_view = rotation_of(view)
+        e.position = of_view * mean + vec3(view[0, 3], view[1, 3], view[2, 3])
         # Guards are phrased so that a NaN fails them.
         before = camera.in_range(e.position, lens, near)
-        if wp.static(not lanes):
-            if not before:
-                return e
+        if wp.static(not lanes) and not before:
+            return e
         pixel = camera.pixel_of(e.position, K, lens)
         near_image = wp.abs(pixel[0]) <= real(FARTHEST_PIXEL) and wp.abs(pixel[1]) <= real(FARTHEST_PIXEL)
-        if wp.static(not lanes):
-            if not near_image:
-                return e
+        if wp.static(not lanes) and not near_image:
+            return e
         e.pixel = pixel
         e.expansion_point = camera.expansion_point(pixel, width, height)
         turned = wp.bool(True)
         sized = wp.bool(True)
         if wp.static(parameters == "covariances"):
-            e.axes = rotation * factor(q, log_scale)  # NaN without a factor; culled below
+            e.axes = of_view * factor(q, log_scale)  # NaN without a factor; culled below
         else:
-            e.quat_length = r.quat_length(q)
+            e.quat_length = quat_length(q)
             turned = e.quat_length >= real(SHORTEST_QUAT) and e.quat_length * real(SHORTEST_QUAT) <= real(1.0)
-            if wp.static(not lanes):
-                if not turned:
-                    return e
+            if wp.static(not lanes) and not turned:
+                return e
             e.quat = q / e.quat_length
             e.scales = scales_of(log_scale)
             sized = finite3(e.scales)  # the logarithm of 0 is -inf, and no error
-            if wp.static(not lanes):
-                if not sized:
-                    return e
-            e.axes = rotation * r.rotation(e.quat) * wp.diag(e.scales)
+            if wp.static(not lanes) and not sized:
+                return e
+            e.axes = of_view * rotation(e.quat) * wp.diag(e.scales)
         rows = camera.project_axes(e.position, K, lens, e.expansion_point, e.axes)
         m1 = rows.first
         m2 = rows.second
         finite = finite3(m1) and finite3(m2)
-        if wp.static(not lanes):
-            if not finite:
-                return e
+        if wp.static(not lanes) and not finite:
+            return e
         # det grows with the fourth power of the axes: shrink them below 2^16 px by exact powers of two.
         largest = wp.max(wp.max(wp.abs(m1)), wp.max(wp.abs(m2)))
         short = largest <= real(LARGEST_AXIS)
-        if wp.static(not lanes):
-            if not short:
-                return e
+        if wp.static(not lanes) and not short:
+            return e
         shrink = real(1.0)
-        if wp.static(lanes):
-            for _ in range(wp.static(SHRINKS)):
-                times = wp.where(largest > real(65536.0), real(1.0 / 65536.0), real(1.0))
-                largest *= times
-                shrink *= times
-        else:
-            while largest > real(65536.0):
-                largest *= real(1.0 / 65536.0)
-                shrink *= real(1.0 / 65536.0)
+        for _ in range(wp.static(SHRINKS)):
+            times = wp.where(largest > real(65536.0), real(1.0 / 65536.0), real(1.0))
+            largest *= times
+            shrink *= times
         e.shrink = shrink
         e.m1 = m1 * shrink
         e.m2 = m2 * shrink
@@ -392,38 +327,24 @@ def make_projection(real, camera_model: str, parameters: str = "stored", lanes: 
     @wp.func
     def direction(mean: vec3, view: mat44) -> vec4:
         """Return the unit vector from the camera centre to the mean, and the distance; zeros where the two coincide."""
-        centered = mean + vec3(
-            view[0, 0] * view[0, 3] + view[1, 0] * view[1, 3] + view[2, 0] * view[2, 3],
-            view[0, 1] * view[0, 3] + view[1, 1] * view[1, 3] + view[2, 1] * view[2, 3],
-            view[0, 2] * view[0, 3] + view[1, 2] * view[1, 3] + view[2, 2] * view[2, 3],
-        )
+        centered = mean + wp.transpose(rotation_of(view)) * vec3(view[0, 3], view[1, 3], view[2, 3])
         largest = wp.max(wp.abs(centered))
-        if wp.static(lanes):
-            apart = wp.where(largest > real(0.0), largest - largest == real(0.0), False)
-        else:
-            apart = largest > real(0.0) and wp.isfinite(largest)
-            if not apart:
-                return vec4()
+        apart = wp.where(largest > real(0.0), largest - largest == real(0.0), False)
         d = centered / largest
         length = wp.sqrt(wp.dot(d, d))
         d = d / length
-        if wp.static(lanes):
-            none = real(0.0)
-            return vec4(
-                wp.where(apart, d[0], none), wp.where(apart, d[1], none), wp.where(apart, d[2], none),
-                wp.where(apart, length * largest, none),
-            )  # fmt: skip
-        return vec4(d[0], d[1], d[2], length * largest)
+        none = real(0.0)
+        return vec4(
+            wp.where(apart, d[0], none), wp.where(apart, d[1], none), wp.where(apart, d[2], none),
+            wp.where(apart, length * largest, none),
+        )  # fmt: skip
 
-    own = {
-        "Ellipse": Ellipse, "ellipse": ellipse, "factor_of": factor_of, "compensation": compensation, "sigmoid": sigmoid,
-        "opacity_of": opacity_of, "scales_of": scales_of, "direction": direction, "finite3": finite3,
-    }  # fmt: skip
-    return SimpleNamespace(**vars(camera) | vars(r) | own)
+    own = named(Ellipse, ellipse, factor_of, compensation, sigmoid, opacity_of, scales_of, direction, finite3)
+    return SimpleNamespace(**vars(camera) | vars(named(factor, rotation, rotation_backward, rotation_of)) | vars(own))
 
 
 @functools.cache
-def make_spans(real, lanes: bool = False):
+def make_spans(real):
     """Make the functions that decide which tiles a projected Gaussian touches, for one scalar type (docs/tiles.md)."""
     # Counting and emitting call the same functions. Every bound is widened by a margin that covers the rounding of its own
     # arithmetic, so a pixel that blending would change is never missed; a tile listed in excess changes nothing.
@@ -437,13 +358,9 @@ def make_spans(real, lanes: bool = False):
         # clipped before the cast to int
         first = wp.ceil(wp.clamp(lo - real(0.5), real(begin), limit))
         last = wp.floor(wp.clamp(hi - real(0.5), real(begin) - real(1.0), limit - real(1.0)))
-        if wp.static(lanes):  # divisions of integers do not vectorise; those of floats below 2^24 round to no other integer
-            side = real(tile_size)
-            end = wp.where(last < first, 0, int(last / side) + 1)
-            return vec2i(wp.where(last < first, 0, int(first / side)), end)
-        if last < first:
-            return vec2i(0, 0)
-        return vec2i(int(first) // tile_size, int(last) // tile_size + 1)
+        side = real(tile_size)  # divisions of integers do not vectorise; those of floats below 2^24 round to no other integer
+        end = wp.where(last < first, 0, int(last / side) + 1)
+        return vec2i(wp.where(last < first, 0, int(first / side)), end)
 
     @wp.func
     def tile_rows(my: real, half_height: real, origin_y: wp.int32, height: wp.int32, tile_size: wp.int32) -> vec2i:
@@ -515,9 +432,17 @@ def make_functions(real, camera_model: str, parameters: str, antialiased: bool, 
     # With ``lanes``, they take a projected Gaussian and its gradient as vectors, not as rows of arrays.
     m = make_projection(real, camera_model, parameters, lanes)
     vec2, vec3, vec4, mat33, mat44, Reals = types_of(real)
-    c, basis = make_covariance(real), sh.make_functions(real, bases)
+    basis = sh.make_functions(real, bases)
 
     row = wp.types.vector(PROJECTED_SIZE, real) if lanes else wp.array2d(dtype=real)
+
+    @wp.func
+    def covariance_gradient(first: vec3, second: vec3, v11: real, v12: real, v22: real):
+        """Return the gradient of Sigma from those of the projected covariance; ``first`` and ``second`` are J R."""
+        V = v11 * wp.outer(first, first) + v12 * (wp.outer(first, second) + wp.outer(second, first))
+        V += v22 * wp.outer(second, second)
+        off = vec4(V[0, 1] + V[1, 0], V[0, 2] + V[2, 0], V[1, 2] + V[2, 1], real(0.0))
+        return off, vec3(V[0, 0], V[1, 1], V[2, 2])
 
     @wp.func
     def at(values: row, i: int, k: int) -> real:
@@ -542,9 +467,7 @@ def make_functions(real, camera_model: str, parameters: str, antialiased: bool, 
     @wp.func
     def covariance_2d(e: m.Ellipse, projected: row, v_projected: row, i: int, low_pass: real) -> vec3:
         """Return the gradients of xx, of each xy and of yy of the projected covariance [px^2] (section 9)."""
-        u11 = at(projected, i, 2)
-        u12 = at(projected, i, 3)
-        u22 = at(projected, i, 4)
+        u11, u12, u22 = at(projected, i, 2), at(projected, i, 3), at(projected, i, 4)
         h11 = at(v_projected, i, 2) * u11 + at(v_projected, i, 3) * u12
         h12 = at(v_projected, i, 3) * u22
         h22 = at(v_projected, i, 4) * u22
@@ -608,9 +531,9 @@ def make_functions(real, camera_model: str, parameters: str, antialiased: bool, 
         if wp.static(parameters == "covariances"):
             V = covariance_2d(e, projected, v_projected, i, low_pass)
             rows = m.project_axes(e.position, K, lens, e.expansion_point, rotation)
-            packed = c.gradient(rows.first, rows.second, V[0], V[1], V[2])
-            g.quat = packed.off
-            g.log_scale = packed.diagonal
+            off, diagonal = covariance_gradient(rows.first, rows.second, V[0], V[1], V[2])
+            g.quat = off
+            g.log_scale = diagonal
         else:
             g.log_scale = wp.cw_mul(v_axes[0], axes[0]) + wp.cw_mul(v_axes[1], axes[1]) + wp.cw_mul(v_axes[2], axes[2])
             v_turned = v_axes * wp.diag(e.scales)
@@ -641,15 +564,9 @@ def make_functions(real, camera_model: str, parameters: str, antialiased: bool, 
     @wp.func
     def centered(d: vec4, w: basis.values) -> vec3:
         """Return the gradient of the mean through its viewing direction ``d``; ``w`` is that of the basis (section 5)."""
-        v_centered = vec3()
         unit = vec3(d[0], d[1], d[2])
-        if wp.static(lanes):
-            v_unit = basis.basis_backward(unit, w)
-            v_centered = (v_unit - unit * wp.dot(unit, v_unit)) / wp.where(d[3] > real(0.0), d[3], real(wp.inf))
-        elif d[3] > real(0.0):
-            v_unit = basis.basis_backward(unit, w)
-            v_centered = (v_unit - unit * wp.dot(unit, v_unit)) / d[3]
-        return v_centered
+        v_unit = basis.basis_backward(unit, w)
+        return (v_unit - unit * wp.dot(unit, v_unit)) / wp.where(d[3] > real(0.0), d[3], real(wp.inf))
 
     @wp.func
     def logit(projected: row, v_projected: row, i: int, logit_opacity: real) -> real:
@@ -666,7 +583,7 @@ def make_functions(real, camera_model: str, parameters: str, antialiased: bool, 
         rotation = m.rotation_of(view)
         t = vec3(view[0, 3], view[1, 3], view[2, 3])
         if wp.static(parameters == "covariances"):
-            turning = c.factor(quat, log_scale)
+            turning = m.factor(quat, log_scale)
         else:
             turning = m.rotation(unit)
         v_rotation = wp.outer(position, mean) + wp.outer(t, v_centered) + turned * wp.transpose(turning)

@@ -3,13 +3,13 @@
 import functools
 import math
 from dataclasses import dataclass
-from types import SimpleNamespace
 
 import warp as wp
 from warp.types import vector
 
 from warpgs.constants import TILE_SIZE, Rule
 from warpgs.kernels import sh
+from warpgs.kernels.cameras import named
 from warpgs.kernels.native import Ints
 from warpgs.kernels.tiles import grid
 
@@ -156,12 +156,12 @@ def make_functions(real):
     Blending = make_struct(real)
 
     @wp.func
-    def place_of(tile: wp.int32, side: wp.int32, settings: Blending) -> wp.vec3i:
+    def place_of(tile: wp.int32, side: wp.int32, settings: Blending):
         """Return the number of a tile's image, and left and top of the tile in the window [px]."""
         image = tile // settings.tiles
         in_image = tile - image * settings.tiles
         row = in_image // settings.columns
-        return wp.vec3i(image, (in_image - row * settings.columns) * side, row * side)
+        return image, (in_image - row * settings.columns) * side, row * side
 
     @wp.func
     def apart(product: real) -> real:
@@ -192,10 +192,8 @@ def make_functions(real):
         least = wp.max(wp.abs(start + u11 * half_strip) - aside, real(0.0))
         return least * least + e22 <= limit
 
-    return SimpleNamespace(
-        Blending=Blending, place_of=place_of, apart=apart, never=never, bounds_of=bounds_of, reaches=reaches,
-        falloff=make_falloff(real), falloffs=make_falloffs(real, ABREAST), abreast=vector(ABREAST, real),
-    )  # fmt: skip
+    of_several = {"falloff": make_falloff(real), "falloffs": make_falloffs(real, ABREAST), "abreast": vector(ABREAST, real)}
+    return named(Blending, place_of, apart, never, bounds_of, reaches, **of_several)
 
 
 BATCH = 64
@@ -345,10 +343,8 @@ def make_batches(real, tile_size: int, channels: int):
                     falloffs[(k + n) * STRIP + lane] = found[n]
             k += abreast  # the last few may lie beyond the end; their values are not read
 
-    return SimpleNamespace(
-        record=record, Batch=Batch, Rows=Rows, strip_ints=strip_ints, column_reals=column_reals, at=at, at_int=at_int,
-        load=load, find_rows=find_rows, find_row_values=find_row_values, find_falloffs=find_falloffs,
-    )  # fmt: skip
+    types = {"record": record, "strip_ints": strip_ints, "column_reals": column_reals}
+    return named(Batch, Rows, at, at_int, load, find_rows, find_row_values, find_falloffs, **types)
 
 
 COLORS = 3

@@ -48,10 +48,7 @@ MAX_SIZE = 2**31 - 1
 def _check_size(size: int) -> None:
     """Raise ResourceError where kernels cannot index so many entries."""
     if size > MAX_SIZE:
-        raise ResourceError(
-            f"an array of {size:,} entries is beyond the {MAX_SIZE:,} that kernels can index; use fewer Gaussians or "
-            "coefficients, smaller images, or fewer cameras at once"
-        )
+        raise ResourceError(f"kernels cannot index {size:,} entries, only {MAX_SIZE:,}; use fewer Gaussians, pixels or cameras")
 
 
 def check_device(name: str, tensor: torch.Tensor) -> None:
@@ -60,6 +57,11 @@ def check_device(name: str, tensor: torch.Tensor) -> None:
         raise ValueError(f"{name} is on {tensor.device}, but the kernels run on cpu and cuda only; .to('cpu') moves it")
     if type(tensor) is not torch.Tensor and isinstance(tensor, FakeTensor):
         raise ValueError(f"{name} is a fake tensor, without memory; leave FakeTensorMode before the call")
+
+
+def is_native(tensor: torch.Tensor) -> bool:
+    """Return whether the kernels with bodies in CUDA apply to a tensor [...]; otherwise those in plain Warp do."""
+    return tensor.is_cuda and tensor.dtype == torch.float32
 
 
 def real_of(tensor: torch.Tensor) -> type:
@@ -265,9 +267,7 @@ class _Recorded:
         raise TypeError(f"{self.kernel.key}: {label} must be {self.dtypes[i]} on {kind}, not {found}")
 
 
-@functools.cache
-def _recorded(kernel, device: torch.device, block_dim: int) -> _Recorded:
-    return _Recorded(kernel, device, block_dim)
+_recorded = functools.cache(_Recorded)
 
 
 class _OfThread(threading.local):

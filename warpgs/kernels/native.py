@@ -11,7 +11,6 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import CancelledError, Future, ThreadPoolExecutor, wait
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import warp as wp
@@ -88,7 +87,7 @@ BLOCK = 128
 """Threads of a block in kernels that call `compact` or `clear_rows`."""
 
 
-# Functions for CUDA; `make_color` makes those on colours.
+# Functions for CUDA; `project_cuda` makes those on colours.
 
 
 @wp.func_native(source("native_compact.cu", BLOCK=BLOCK))
@@ -138,25 +137,6 @@ def make_prefetch(kind: type, axes: int = 1):
         """Load row i into the cache; i may be outside the array. Does nothing on CUDA."""
 
     return prefetch
-
-
-@functools.cache
-def make_color(bases: int):
-    """Make the functions on colours, for CUDA and float32, and for a number of basis values (`sh.bases_for`)."""
-    values = wp.types.vector(bases, wp.float32)
-
-    @wp.func_native(source("native_color.cu", BASES=bases))
-    def color(sh: wp.array2d(dtype=wp.vec3), n: int, count: int, weights: values) -> wp.vec4:
-        """Return the weighted sum of the first ``count`` coefficients of row n, and their largest magnitude (ignoring NaN)."""
-
-    @wp.func_native(source("native_color_backward.cu", BASES=bases))
-    def color_backward(
-        sh: wp.array2d(dtype=wp.vec3), n: int, count: int, weights: values, v: wp.vec3, add: int,
-        v_sh: wp.array2d(dtype=wp.vec3),
-    ) -> values:  # fmt: skip
-        """Return the weights' gradient of `color` for upstream ``v``; store (0 past ``count``) or add the row's gradient."""
-
-    return SimpleNamespace(color=color, color_backward=color_backward)
 
 
 def module_name(module: wp.Module, block_dim: int) -> str:

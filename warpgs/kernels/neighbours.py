@@ -39,11 +39,6 @@ def make_knn_kernels(real):
         group_upper[box] = hi
 
     @wp.func
-    def gap_squared(lo: vec3, hi: vec3, p: vec3) -> real:
-        """Return the squared distance of a point to a box."""
-        return wp.length_sq(wp.max(wp.max(lo - p, p - hi), vec3()))
-
-    @wp.func
     def insert(nearest: vec8, k: wp.int32, squared: real) -> vec8:
         """Return the k smallest squared distances in ascending order, after inserting one more."""
         if squared < nearest[k - 1]:
@@ -76,7 +71,8 @@ def make_knn_kernels(real):
         at = int(0)  # number of the box within its level
         while at < starts[level + 1] - starts[level]:
             box = starts[level] + at
-            if gap_squared(lower[box], upper[box], p) < nearest[k - 1]:
+            gap = wp.max(wp.max(lower[box] - p, p - upper[box]), vec3())  # from the point to the box
+            if wp.length_sq(gap) < nearest[k - 1]:
                 if level > 0:
                     level -= 1
                     at = at * BOX

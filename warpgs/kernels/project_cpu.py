@@ -90,9 +90,8 @@ def make_shapes(real, parameters: str):
 @functools.cache
 def make_forward(real, camera_model: str, parameters: str, antialiased: bool, bases: int):
     """Make the kernel; arguments are those of `project_cuda.make_forward`."""
-    one = make_projection(real, camera_model, parameters)
     m = make_projection(real, camera_model, parameters, lanes=True)
-    s = make_spans(real, lanes=True)
+    s = make_spans(real)
     g = make_shapes(real, parameters)
     three, four, row, basis = (make_lanes(real, size) for size in (3, 4, PROJECTED_SIZE, bases))
     basis_of = sh.make_functions(real, bases).basis
@@ -128,7 +127,7 @@ def make_forward(real, camera_model: str, parameters: str, antialiased: bool, ba
         for lane in range(used):
             n = first + lane
             g.store(means[n], quats[n], log_scales[n], lane, shapes)
-            opacity[lane] = one.opacity_of(logit_opacities[n])
+            opacity[lane] = m.opacity_of(logit_opacities[n])
             if opacity_factors.shape[0] > 0:
                 opacity[lane] = opacity[lane] * opacity_factors[n]
 
@@ -144,12 +143,9 @@ def make_forward(real, camera_model: str, parameters: str, antialiased: bool, ba
             if wp.static(antialiased):
                 opacity[lane] = opacity[lane] * m.compensation(e)
             factor = m.factor_of(e)
-            found = wp.where(m.finite3(factor), e.valid, 0)
-            found = wp.where(m.depth_of(e.position) <= far, found, 0)
             o = opacity[lane]
-            found = wp.where(o - o == real(0.0), found, 0)
-            found = wp.where(o > real(0.0), found, 0)
-            valid[lane] = wp.where(o >= alpha_cut, found, 0)
+            shown = m.finite3(factor) and m.depth_of(e.position) <= far and o - o == real(0.0)
+            valid[lane] = wp.where(shown and o > real(0.0) and o >= alpha_cut, e.valid, 0)
             v = row.vector()
             v[0] = e.pixel[0]
             v[1] = e.pixel[1]
@@ -226,7 +222,6 @@ def make_forward(real, camera_model: str, parameters: str, antialiased: bool, ba
 def make_backward(real, camera_model: str, parameters: str, antialiased: bool, bases: int, camera_gradients: bool):
     """Make the kernel; each task sums over all cameras, so no sum needs atomics. Arguments are those of `make_forward`."""
     m = make_projection(real, camera_model, parameters, lanes=True)
-    of_one = ellipse.make_functions(real, camera_model, parameters, antialiased, bases)
     f = ellipse.make_functions(real, camera_model, parameters, antialiased, bases, lanes=True)
     gaussians = make_shapes(real, parameters)
     three, four, nine, row, basis = (make_lanes(real, size) for size in (3, 4, 9, PROJECTED_SIZE, bases))
@@ -235,15 +230,6 @@ def make_backward(real, camera_model: str, parameters: str, antialiased: bool, b
     Vec3s, Vec4s, Mat33s, Mat44s, Rows, Vec3Rows = arrays_of(real)
     vec9 = wp.types.vector(9, real)
     lane_reals, lane_ints = (wp.types.vector(LANES, kind) for kind in (real, wp.int32))
-
-    @wp.struct
-    class CameraParts:
-        """Values of each lane for the gradients of the cameras."""
-
-        position: three.vectors
-        turned: nine.vectors
-        unit: four.vectors
-        K: nine.vectors
 
     @wp.func
     def flat(a: mat33) -> vec9:
@@ -284,7 +270,10 @@ def make_backward(real, camera_model: str, parameters: str, antialiased: bool, b
         values = basis.vectors()
         weights = basis.vectors()
         centered = three.vectors()
-        parts = CameraParts()
+        positions = three.vectors()  # these four for the gradients of the cameras
+        turned = nine.vectors()
+        units = four.vectors()
+        v_K = nine.vectors()
         for camera in range(viewmats.shape[0]):
             view = viewmats[camera]
             K = Ks[camera]
@@ -305,19 +294,20 @@ def make_backward(real, camera_model: str, parameters: str, antialiased: bool, b
                 four.add(hit, g.quat, lane, sums.quat)
                 three.add(hit, g.log_scale, lane, sums.scale)
                 if wp.static(camera_gradients):
-                    three.put(g.position, lane, parts.position)
-                    nine.put(flat(g.turned), lane, parts.turned)
-                    four.put(g.unit, lane, parts.unit)
-                    nine.put(flat(g.K), lane, parts.K)
+                    three.put(g.position, lane, positions)
+                    nine.put(flat(g.turned), lane, turned)
+                    four.put(g.unit, lane, units)
+                    nine.put(flat(g.K), lane, v_K)
             for lane in range(LANES):
                 d = m.direction(three.get(shapes.mean, lane), view)
                 basis.put(basis_of(vec3(d[0], d[1], d[2])), lane, values)
             for lane in range(used):
                 if seen[lane] != 0:
                     n = wp.max(first + lane, 0)
-                    i = camera * count + n
-                    v_logit[lane] = v_logit[lane] + of_one.logit(projected, v_projected, i, logit_opacities[n])
-                    v_color = of_one.color(projected, v_projected, i)
+                    p = row.get(rows, lane)
+                    v_p = row.get(v_rows, lane)
+                    v_logit[lane] = v_logit[lane] + f.logit(p, v_p, 0, logit_opacities[n])
+                    v_color = f.color(p, v_p, 0)
                     k = int(0)
                     while k < sh_count:
                         o = wp.max(k, 0)
@@ -340,10 +330,10 @@ def make_backward(real, camera_model: str, parameters: str, antialiased: bool, b
                         n = first + lane
                         v_centered = three.get(centered, lane)
                         v_viewmats[camera, n] = f.view_gradient(
-                            view, means[n], quats[n], log_scales[n], three.get(parts.position, lane),
-                            square(nine.get(parts.turned, lane)), four.get(parts.unit, lane), v_centered,
+                            view, means[n], quats[n], log_scales[n], three.get(positions, lane),
+                            square(nine.get(turned, lane)), four.get(units, lane), v_centered,
                         )  # fmt: skip
-                        v_Ks[camera, n] = square(nine.get(parts.K, lane))
+                        v_Ks[camera, n] = square(nine.get(v_K, lane))
         for lane in range(used):
             n = first + lane
             v_means[n] = three.get(sums.mean, lane)

@@ -8,7 +8,7 @@ from warpgs.constants import LARGEST_COEFFICIENT
 from warpgs.kernels import ellipse, sh
 from warpgs.kernels.cameras import types_of
 from warpgs.kernels.ellipse import PROJECTED_SIZE, arrays_of, make_projection, make_spans
-from warpgs.kernels.native import Ints, clear_rows, compact, make_color, store_row
+from warpgs.kernels.native import Ints, clear_rows, compact, source, store_row
 
 
 def _module(kind: str, real, camera_model: str, parameters: str, antialiased: bool, bases: int) -> str:
@@ -26,8 +26,11 @@ def make_forward(real, camera_model: str, parameters: str = "stored", antialiase
     basis = sh.make_functions(real, bases).basis
     _, vec3, *_, mat44, Reals = types_of(real)
     Vec3s, Vec4s, Mat33s, Mat44s, Rows, Vec3Rows = arrays_of(real)
-    color_of = make_color(bases).color if native else None
-    vec12 = wp.types.vector(PROJECTED_SIZE, real)
+    vec12, weights_of_row = wp.types.vector(PROJECTED_SIZE, real), wp.types.vector(bases, wp.float32)
+
+    @wp.func_native(source("native_color.cu", BASES=bases))
+    def color_of(sh: wp.array2d(dtype=wp.vec3), n: int, count: int, weights: weights_of_row) -> wp.vec4:
+        """Return the weighted sum of the first ``count`` coefficients of row n, and their largest magnitude (ignoring NaN)."""
 
     @wp.func
     def store_values(projected: Rows, i: int, values: vec12):
@@ -132,7 +135,14 @@ def make_backward(real, camera_model: str, parameters: str = "stored", antialias
     functions = sh.make_functions(real, bases)
     _, vec3, vec4, mat33, mat44, Reals = types_of(real)
     Vec3s, Vec4s, Mat33s, Mat44s, Rows, Vec3Rows = arrays_of(real)
-    color_backward = make_color(bases).color_backward if native else None
+    weights_of_row = wp.types.vector(bases, wp.float32)
+
+    @wp.func_native(source("native_color_backward.cu", BASES=bases))
+    def color_backward(
+        sh: wp.array2d(dtype=wp.vec3), n: int, count: int, weights: weights_of_row, v: wp.vec3, add: int,
+        v_sh: wp.array2d(dtype=wp.vec3),
+    ) -> weights_of_row:  # fmt: skip
+        """Return the weights' gradient of `color_of` for upstream ``v``; store (0 past ``count``) or add the row's gradient."""
 
     # three blocks to a multiprocessor: enough registers
     registers = {"cuda_max_registers": 168, "grid_stride": False} if native else {}
@@ -180,20 +190,9 @@ def make_backward(real, camera_model: str, parameters: str = "stored", antialias
             if tile_counts[i] > 0:
                 view = viewmats[camera]
                 g = f.shape(
-                    means[n],
-                    quats[n],
-                    log_scales[n],
-                    view,
-                    Ks[camera],
-                    lenses[camera],
-                    real(width),
-                    real(height),
-                    near,
-                    low_pass,
-                    projected,
-                    v_projected,
-                    i,
-                )
+                    means[n], quats[n], log_scales[n], view, Ks[camera], lenses[camera],
+                    real(width), real(height), near, low_pass, projected, v_projected, i,
+                )  # fmt: skip
                 v_mean += g.mean
                 v_quat += g.quat
                 v_log_scale += g.log_scale

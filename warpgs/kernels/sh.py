@@ -71,9 +71,7 @@ def make_functions(real, bases: int = BASES):
     @wp.func
     def up_to_3(d: vec3) -> vec16:
         """Return the 16 basis values of degrees 0 to 3 at a unit direction."""
-        x = d[0]
-        y = d[1]
-        z = d[2]
+        x, y, z = d[0], d[1], d[2]
         xx = x * x
         yy = y * y
         zz = z * z
@@ -99,9 +97,7 @@ def make_functions(real, bases: int = BASES):
     @wp.func
     def up_to_4(d: vec3) -> values:
         """Return the 25 basis values at a unit direction."""
-        x = d[0]
-        y = d[1]
-        z = d[2]
+        x, y, z = d[0], d[1], d[2]
         xx = x * x
         yy = y * y
         zz = z * z
@@ -124,9 +120,7 @@ def make_functions(real, bases: int = BASES):
     @wp.func
     def basis_backward(d: vec3, w: values) -> vec3:
         """Return the gradient of sum(w * basis(d)) by d, not constrained to unit length."""
-        x = d[0]
-        y = d[1]
-        z = d[2]
+        x, y, z = d[0], d[1], d[2]
         xx = x * x
         yy = y * y
         zz = z * z

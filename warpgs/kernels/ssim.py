@@ -2,7 +2,6 @@
 
 import functools
 import math
-from types import SimpleNamespace
 
 import torch
 import warp as wp
@@ -38,17 +37,16 @@ BLOCK = 8
 
 
 @functools.cache
-def make_functions(real):
-    """Make the functions that the kernels of both kinds of device share, for one scalar type."""
-    vec4, vec5, vec6 = (wp.types.vector(size, real) for size in (4, 5, 6))
+def make_kernel(real, summed: bool, backward: bool):
+    """Make a generic kernel, of one task per block of rows; ``summed`` for sums over the image instead of a map."""
+    # The sums of a row are in ``scratch``, where each task has a few rows of its own. A row is processed in steps of `LANES`
+    # elements; the last step starts early, to end with the row, and elements that it computes again get the same values.
+    vec4, vec5, vec11 = (wp.types.vector(size, real) for size in (4, 5, TAPS))
+    values, several = (wp.types.vector(size, real) for size in (LANES, 5 * LANES))
+    vec11i, Reals = wp.types.vector(TAPS, wp.int32), wp.array(dtype=real)
+    prefetch, fields, channels = make_prefetch(real), 3 if backward else 5, CHANNELS
+    window = wp.constant(vec11(*WINDOW))
     w0, w1, w2, w3, w4, w5 = (real(w) for w in WINDOW[RADIUS:])
-    channels, Reals = CHANNELS, wp.array(dtype=real)
-
-    @wp.func
-    def tap(k: wp.int32) -> real:
-        """Return the weight at a distance of |k| rows or columns, 0 beyond the window."""
-        w = vec6(w0, w1, w2, w3, w4, w5)
-        return wp.where(wp.abs(k) <= RADIUS, w[wp.min(wp.abs(k), RADIUS)], real(0.0))
 
     @wp.func
     def at(first: wp.int32, lane: wp.int32) -> wp.int32:
@@ -102,62 +100,25 @@ def make_functions(real):
         by_mean = real(2.0) * (structure * (mb - luminance * ma) * r1 - ma * v - (ma - mb) * g)
         return vec4(luminance * structure, by_mean, v, g)
 
-    return SimpleNamespace(tap=tap, at=at, across=across, add_pair=add_pair, score=score, vec5=vec5)
-
-
-@functools.cache
-def make_kernel(real, summed: bool, backward: bool):
-    """Make a generic kernel, of one task per block of rows; ``summed`` for sums over the image instead of a map."""
-    # The sums of a row are in ``scratch``, where each task has a few rows of its own. A row is processed in steps of `LANES`
-    # elements; the last step starts early, to end with the row, and elements that it computes again get the same values.
-    f = make_functions(real)
-    vec11, values, several = (wp.types.vector(size, real) for size in (TAPS, LANES, 5 * LANES))
-    vec11i, Reals = wp.types.vector(TAPS, wp.int32), wp.array(dtype=real)
-    prefetch, fields = make_prefetch(real), 3 if backward else 5
-
-    @wp.func
-    def starts_of(y: wp.int32, height: wp.int32, image: wp.int32, columns: wp.int32) -> vec11i:
-        """Return the first elements of the rows in the window of row y; rows outside the image are replaced, and weigh 0."""
-        o = vec11i()
-        for k in range(TAPS):
-            o[k] = (image * height + wp.clamp(y + k - RADIUS, 0, height - 1)) * columns
-        return o
-
-    @wp.func
-    def taps_of(y: wp.int32, height: wp.int32) -> vec11:
-        w = vec11()
-        for k in range(TAPS):
-            inside = y + k >= RADIUS and y + k < height + RADIUS
-            w[k] = wp.where(inside, f.tap(k - RADIUS), real(0.0))
-        return w
-
-    @wp.func
-    def clear_padding(scratch: Reals, first: wp.int32, columns: wp.int32, rows: wp.int32):
-        for row in range(rows):
-            o = first + row * (columns + 2 * PADDING)
-            for k in range(PADDING):
-                scratch[o + k] = real(0.0)
-                scratch[o + PADDING + columns + k] = real(0.0)
-
     # Warp unrolls loops that hold a `wp.static`: inside the loop over lanes, they would keep the latter from vectorising.
 
     @wp.func
-    def down_pairs(a: Reals, b: Reals, o: vec11i, w: vec11, x: wp.int32, lane: wp.int32) -> f.vec5:
-        s = f.vec5()
+    def down_pairs(a: Reals, b: Reals, o: vec11i, w: vec11, x: wp.int32, lane: wp.int32) -> vec5:
+        s = vec5()
         for k in range(TAPS):
-            s = f.add_pair(s, w[wp.static(k)], a[f.at(o[k] + x, lane)], b[f.at(o[k] + x, lane)])
+            s = add_pair(s, w[wp.static(k)], a[at(o[k] + x, lane)], b[at(o[k] + x, lane)])
         return s
 
     @wp.func(inline=True)
-    def put(s: f.vec5, lane: wp.int32, sums: wp.ref[several]):
+    def put(s: vec5, lane: wp.int32, sums: wp.ref[several]):
         for k in range(wp.static(5)):
             sums[k * LANES + lane] = s[k]
 
     @wp.func
     def down(m: Reals, o: vec11i, w: vec11, x: wp.int32, lane: wp.int32) -> real:
-        s = w[0] * m[f.at(o[0] + x, lane)]
+        s = w[0] * m[at(o[0] + x, lane)]
         for k in range(1, TAPS):
-            s += w[wp.static(k)] * m[f.at(o[k] + x, lane)]
+            s += w[wp.static(k)] * m[at(o[k] + x, lane)]
         return s
 
     @wp.kernel(enable_backward=False, module="unique", module_options=ROLLED)
@@ -173,13 +134,21 @@ def make_kernel(real, summed: bool, backward: bool):
         top = (task - image * blocks) * BLOCK
         stride = columns + 2 * PADDING
         first = task * fields * stride
-        clear_padding(scratch, first, columns, fields)
+        for field in range(fields):
+            padding = first + field * stride
+            for k in range(PADDING):
+                scratch[padding + k] = real(0.0)
+                scratch[padding + PADDING + columns + k] = real(0.0)
+        o = vec11i()  # first elements of the rows in the window
+        w = vec11()
         sums = several()
         unlike = values()
         error = values()
         for y in range(top, wp.min(top + BLOCK, height)):
-            o = starts_of(y, height, image, columns)
-            w = taps_of(y, height)
+            for k in range(TAPS):  # rows outside the image are replaced, and weigh 0
+                o[k] = (image * height + wp.clamp(y + k - RADIUS, 0, height - 1)) * columns
+                inside = y + k >= RADIUS and y + k < height + RADIUS
+                w[k] = wp.where(inside, window[k], real(0.0))
             for step in range((columns + LANES - 1) // LANES):
                 x = wp.min(step * LANES, columns - LANES)
                 # of the row that the next window adds: too many streams for the processor
@@ -198,42 +167,42 @@ def make_kernel(real, summed: bool, backward: bool):
                         put(down_pairs(a, b, o, w, x, lane), lane, sums)
                 for k in range(fields):
                     for lane in range(LANES):
-                        scratch[f.at(first + k * stride + PADDING + x, lane)] = sums[k * LANES + lane]
+                        scratch[at(first + k * stride + PADDING + x, lane)] = sums[k * LANES + lane]
             row = (image * height + y) * columns
             for step in range((columns + LANES - 1) // LANES):
                 x = wp.min(step * LANES, columns - LANES)
                 if wp.static(backward):
                     for lane in range(LANES):
-                        p = a[f.at(row + x, lane)]
-                        d = p - b[f.at(row + x, lane)]
-                        v = f.across(scratch, first + stride + x, lane) * p
-                        v = v + f.across(scratch, first + 2 * stride + x, lane) * d
-                        v = f.across(scratch, first + x, lane) + real(2.0) * v
+                        p = a[at(row + x, lane)]
+                        d = p - b[at(row + x, lane)]
+                        v = across(scratch, first + stride + x, lane) * p
+                        v = v + across(scratch, first + 2 * stride + x, lane) * d
+                        v = across(scratch, first + x, lane) + real(2.0) * v
                         if wp.static(summed):
                             sign = wp.where(d > real(0.0), result[1], wp.where(d < real(0.0), -result[1], real(0.0)))
                             v = sign - result[0] * v
                         sums[lane] = v
                     for lane in range(LANES):
-                        v_a[f.at(row + x, lane)] = sums[lane]
+                        v_a[at(row + x, lane)] = sums[lane]
                 else:
                     fresh = step * LANES - x  # elements before this one were counted in the step before
                     for lane in range(LANES):
-                        t = f.score(
-                            f.across(scratch, first + x, lane), f.across(scratch, first + stride + x, lane),
-                            f.across(scratch, first + 2 * stride + x, lane), f.across(scratch, first + 3 * stride + x, lane),
-                            f.across(scratch, first + 4 * stride + x, lane),
+                        t = score(
+                            across(scratch, first + x, lane), across(scratch, first + stride + x, lane),
+                            across(scratch, first + 2 * stride + x, lane), across(scratch, first + 3 * stride + x, lane),
+                            across(scratch, first + 4 * stride + x, lane),
                         )  # fmt: skip
-                        put(f.vec5(t[0], t[1], t[2], t[3], real(0.0)), lane, sums)
+                        put(vec5(t[0], t[1], t[2], t[3], real(0.0)), lane, sums)
                         if wp.static(summed):
                             unlike[lane] = unlike[lane] + wp.where(lane >= fresh, real(1.0) - t[0], real(0.0))
-                            gap = wp.abs(a[f.at(row + x, lane)] - b[f.at(row + x, lane)])
+                            gap = wp.abs(a[at(row + x, lane)] - b[at(row + x, lane)])
                             error[lane] = error[lane] + wp.where(lane >= fresh, gap, real(0.0))
                     for lane in range(LANES):
                         if not wp.static(summed):
-                            result[f.at(row + x, lane)] = sums[lane]
-                        by_mean[f.at(row + x, lane)] = sums[LANES + lane]
-                        by_variance[f.at(row + x, lane)] = sums[2 * LANES + lane]
-                        by_gap[f.at(row + x, lane)] = sums[3 * LANES + lane]
+                            result[at(row + x, lane)] = sums[lane]
+                        by_mean[at(row + x, lane)] = sums[LANES + lane]
+                        by_variance[at(row + x, lane)] = sums[2 * LANES + lane]
+                        by_gap[at(row + x, lane)] = sums[3 * LANES + lane]
         if wp.static(summed and not backward):
             unlike_sum = real(0.0)
             error_sum = real(0.0)
@@ -287,16 +256,11 @@ def difference_bytes(sizes: StepSizes) -> int:
     return images + (0 if sizes.cuda else 5 * FLOAT * (CHANNELS * sizes.width + 2 * PADDING) * -(-sizes.height // BLOCK))
 
 
-def _native(image: torch.Tensor) -> bool:
-    """Return whether the CUDA kernels apply."""
-    return image.is_cuda and image.dtype == torch.float32
-
-
 class _Ssim(torch.autograd.Function):
     @staticmethod
     def forward(ctx, image, target, summed):
         image, target = image.contiguous(), target.contiguous()
-        native, (batch, height, width, _) = _native(image), image.shape
+        native, (batch, height, width, _) = launch.is_native(image), image.shape
         columns, blocks = width * CHANNELS, -(-height // (SIDE if native else BLOCK))
         tasks = batch * blocks * (-(-width // SIDE) if native else 1)
         result = image.new_empty(tasks, 2) if summed else torch.empty_like(image)
@@ -318,7 +282,7 @@ class _Ssim(torch.autograd.Function):
         image, target, *partials = launch.kept(ctx)
         height, columns, tasks = image.shape[1], image.shape[2] * CHANNELS, ctx.tasks
         v_image, v_result = torch.empty_like(image), v_result.contiguous()
-        if _native(image):
+        if launch.is_native(image):
             inputs = [image, target, v_result, *partials, height, columns, int(ctx.summed), v_image]
             launch.launch(cuda_backward, tasks * THREADS, inputs, image.device, block_dim=THREADS)
         else:
@@ -367,6 +331,6 @@ def differences(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
     """Return the sums over pixels and channels of 1 - `ssim` and |image - target| [2], for images [H, W, 3] or [B, H, W, 3]."""
     # One pass computes both sums; for tiny images, torch sums the map of `ssim`.
     a, b = _checked(image, target)
-    if not (_native(a) or a.shape[2] * CHANNELS >= LANES):
+    if not (launch.is_native(a) or a.shape[2] * CHANNELS >= LANES):
         return torch.stack([(1 - ssim(a, b)).sum(), (a - b).abs().sum()])
     return _Ssim.apply(a, b, True)

@@ -13,10 +13,10 @@ from warpgs.device import BINNING, BLENDING, FLOAT, LOSS, SAMPLING, Needs, StepS
 from warpgs.errors import ResourceError
 from warpgs.kernels import launch, native as cuda
 from warpgs.kernels.cameras import named
-from warpgs.kernels.ellipse import make_spans
+from warpgs.kernels.ellipse import PROJECTED_SIZE, make_spans
 from warpgs.kernels.graphs import TORCH, Allocator
 from warpgs.kernels.native import EXACT, SCALE, IntRows, Ints, Longs, make_prefetch, source
-from warpgs.kernels.project_cpu import LANES
+from warpgs.kernels.project_cpu import LANES, make_lanes
 
 EACH = 4
 """Number of items per thread in short kernels on CUDA: with one item, waiting for its load would take longer than the work."""
@@ -100,16 +100,6 @@ def make_emit(real, slotted: bool, ranked: bool = False):
     vec2i = s.vec2i
     write = make_write(slotted)
 
-    @wp.func
-    def span_of(
-        projected: Rows, i: int, row: int, alpha_cut: real, square_sigma: real, origin_x: int, width: int, tile_size: int
-    ) -> vec2i:
-        factor = vec3(projected[i, 2], projected[i, 3], projected[i, 4])
-        reach = s.reach_of(projected[i, 5], alpha_cut, square_sigma)
-        return s.tile_columns(
-            projected[i, 0], projected[i, 1], factor, reach, projected[i, 10], projected[i, 11], row, origin_x, width, tile_size
-        )
-
     @wp.func_native(source("blend_pack.cu", SCALE=SCALE, LARGEST_HALF=f"{LARGEST_HALF}f"))
     def pack(j: int, i: int, count: int, projected: Rows, records: Ints): ...
 
@@ -161,7 +151,12 @@ def make_emit(real, slotted: bool, ranked: bool = False):
             row = cuda.broadcast(rows[0], owner) + batch + lane - cuda.broadcast(row_begin, owner)
             span = vec2i(0, 0)
             if batch + lane < row_count:
-                span = span_of(projected, g, row, alpha_cut, square_sigma, origin_x, width, tile_size)
+                factor = vec3(projected[g, 2], projected[g, 3], projected[g, 4])
+                reach = s.reach_of(projected[g, 5], alpha_cut, square_sigma)
+                span = s.tile_columns(
+                    projected[g, 0], projected[g, 1], factor, reach, projected[g, 10], projected[g, 11],
+                    row, origin_x, width, tile_size,
+                )  # fmt: skip
             tile_end = cuda.running_sum(span[1] - span[0])
             tile_begin = tile_end - (span[1] - span[0])
             tile_count = cuda.broadcast(tile_end, 31)
@@ -208,10 +203,10 @@ def make_emit(real, slotted: bool, ranked: bool = False):
 @functools.cache
 def make_emit_cpu(real, slotted: bool):
     """Make the kernel; arguments are those of `make_emit`."""
-    s = make_spans(real, lanes=True)
+    s = make_spans(real)
     vec3, Rows = wp.types.vector(3, real), wp.array2d(dtype=real)
     lane_reals, lane_ints = (wp.types.vector(LANES, kind) for kind in (real, wp.int32))
-    lanes = LANES
+    lanes, row = LANES, make_lanes(real, PROJECTED_SIZE)
     write, prefetch, prefetch_count = make_write(slotted), make_prefetch(real, 2), make_prefetch(wp.int32)
 
     @wp.kernel(enable_backward=False, module="unique", module_options=EXACT)
@@ -232,14 +227,8 @@ def make_emit_cpu(real, slotted: bool):
         first_tile = lane_ints()
         slot = lane_ints()
         end = lane_ints()
-        x = lane_reals()
-        y = lane_reals()
-        u11 = lane_reals()
-        u12 = lane_reals()
-        u22 = lane_reals()
+        gaussians = row.vectors()
         reach = lane_reals()
-        half_width = lane_reals()
-        half_height = lane_reals()
         for lane in range(used):
             i = order[first + lane]
             touched = tile_counts[i]
@@ -254,20 +243,14 @@ def make_emit_cpu(real, slotted: bool):
             end[lane] = int(last)
             slot[lane] = int(last) - touched
             starts[i] = int(last) - touched
-            x[lane] = projected[i, 0]
-            y[lane] = projected[i, 1]
-            u11[lane] = projected[i, 2]
-            u12[lane] = projected[i, 3]
-            u22[lane] = projected[i, 4]
-            reach[lane] = projected[i, 5]
-            half_width[lane] = projected[i, 10]
-            half_height[lane] = projected[i, 11]
+            row.load(projected, i, lane, gaussians)
         begin_row = lane_ints()
         end_row = lane_ints()
         begin_column = lane_ints()
         end_column = lane_ints()
         for lane in range(lanes):
-            rows = s.tile_rows(y[lane], half_height[lane], origin_y, height, tile_size)
+            p = row.get(gaussians, lane)
+            rows = s.tile_rows(p[1], p[11], origin_y, height, tile_size)
             touches = slot[lane] < end[lane]
             begin_row[lane] = wp.where(touches, rows[0], 0)
             end_row[lane] = wp.where(touches, rows[1], 0)
@@ -275,16 +258,15 @@ def make_emit_cpu(real, slotted: bool):
         for lane in range(used):
             most = wp.max(most, end_row[lane] - begin_row[lane])
             if slot[lane] < end[lane]:
-                reach[lane] = s.reach_of(reach[lane], alpha_cut, square_sigma)
+                reach[lane] = s.reach_of(projected[owner[lane], 5], alpha_cut, square_sigma)
         for k in range(most):
             for lane in range(lanes):
-                row = begin_row[lane] + k
-                span = s.tile_columns(
-                    x[lane], y[lane], vec3(u11[lane], u12[lane], u22[lane]), reach[lane], half_width[lane], half_height[lane],
-                    row, origin_x, width, tile_size,
-                )  # fmt: skip
+                at_row = begin_row[lane] + k
+                p = row.get(gaussians, lane)
+                factor = vec3(p[2], p[3], p[4])
+                span = s.tile_columns(p[0], p[1], factor, reach[lane], p[10], p[11], at_row, origin_x, width, tile_size)
                 begin_column[lane] = span[0]
-                end_column[lane] = wp.where(row < end_row[lane], span[1], 0)
+                end_column[lane] = wp.where(at_row < end_row[lane], span[1], 0)
             for lane in range(used):
                 to = slot[lane]
                 key = first_tile[lane] + (begin_row[lane] + k) * columns + begin_column[lane]
@@ -576,10 +558,8 @@ def bin_tiles(
     columns, rows = grid(width, height, tile_size)
     no_tile = cameras * columns * rows
     if no_tile > launch.MAX_SIZE:
-        raise ResourceError(
-            f"{cameras:,} images of {width} x {height} px have {no_tile:,} tiles of {tile_size} px, beyond the "
-            f"{launch.MAX_SIZE:,} that kernels can index; render fewer cameras at once, or a window of each image"
-        )
+        images = f"{cameras:,} images of {width} x {height} px have {no_tile:,} tiles, and kernels index {launch.MAX_SIZE:,}"
+        raise ResourceError(f"{images}; render fewer cameras at once, or a window of each image")
     counts = tile_counts.contiguous().view(-1)
     device, real, native, allocator = projected.device, launch.real_of(projected), projected.is_cuda, memory.allocator
     ranges = allocator.saved((no_tile, 2), torch.int32, device).zero_()

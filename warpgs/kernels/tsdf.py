@@ -27,14 +27,6 @@ def make_kernels(real):
     near = real(NEAR)
 
     @wp.func
-    def in_camera(view: mat44, point: vec3) -> vec3:
-        return vec3(
-            view[0, 0] * point[0] + view[0, 1] * point[1] + view[0, 2] * point[2] + view[0, 3],
-            view[1, 0] * point[0] + view[1, 1] * point[1] + view[1, 2] * point[2] + view[1, 3],
-            view[2, 0] * point[0] + view[2, 1] * point[1] + view[2, 2] * point[2] + view[2, 3],
-        )
-
-    @wp.func
     def least_slope(before: real, here: real, after: real) -> real:
         """Return the smaller of the two differences to the neighbours; 0 where neither has a depth."""
         back = here - before
@@ -109,7 +101,7 @@ def make_kernels(real):
         x = column_of_grid // size_y
         point = origins[0] + voxel * vec3(real(x), real(column_of_grid - x * size_y), real(i - column_of_grid * size_z))
         K = Ks[0]
-        p = in_camera(viewmats[0], point)
+        p = wp.transform_point(viewmats[0], point)
         if p[2] >= near:
             u = K[0, 0] * p[0] / p[2] + K[0, 2]
             v = K[1, 1] * p[1] / p[2] + K[1, 2]
@@ -133,7 +125,7 @@ def make_kernels(real):
     ):  # fmt: skip
         i = begin + wp.tid()
         K = Ks[0]
-        p = in_camera(viewmats[0], points[i])
+        p = wp.transform_point(viewmats[0], points[i])
         if p[2] >= near:
             u = K[0, 0] * p[0] / p[2] + K[0, 2]
             v = K[1, 1] * p[1] / p[2] + K[1, 2]

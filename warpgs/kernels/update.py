@@ -42,10 +42,10 @@ class Setting(IntEnum):
         return dropout, number, means_lr, *shift, step
 
 
-ERROR_LANES = 16
-"""Neighbouring elements whose errors are summed together on a CPU, in a loop that vectorises."""
-ERROR_SEGMENT = 4096
-"""Elements whose errors a task sums on a CPU, a multiple of `ERROR_LANES`."""
+LANES = 16
+"""Neighbouring elements that are processed together on a CPU, in a loop that vectorises."""
+SEGMENT = 4096
+"""Elements that one task processes on a CPU, a multiple of `LANES`."""
 SHIFT = slice(Setting.RED, Setting.BLUE + 1)
 """Columns of the difference of the backgrounds."""
 
@@ -90,7 +90,7 @@ def end_kernel(
         counter[0] = wp.int64(step + 1)
 
 
-error_values = wp.types.vector(ERROR_LANES, wp.float32)
+error_values = wp.types.vector(LANES, wp.float32)
 
 
 @wp.kernel(enable_backward=False, module="unique", module_options=ROLLED)
@@ -99,16 +99,16 @@ def squared_errors(
     # outputs
     sums: Floats,
 ):  # fmt: skip
-    """Sum squared errors on a CPU, one task per `ERROR_SEGMENT` elements."""
+    """Sum squared errors on a CPU, one task per `SEGMENT` elements."""
     task = begin + wp.tid()
-    base = task * ERROR_SEGMENT
-    end = wp.min(base + ERROR_SEGMENT, rgb.shape[0])
+    base = task * SEGMENT
+    end = wp.min(base + SEGMENT, rgb.shape[0])
     s = error_values()
     while base < end:
         o = wp.max(base, 0)
-        base += ERROR_LANES
+        base += LANES
         if base <= end:
-            for lane in range(ERROR_LANES):
+            for lane in range(LANES):
                 p = rgb[o + lane]
                 d = wp.where(p < 0.0, 0.0, wp.where(p > 1.0, 1.0, p)) - target[o + lane]  # a NaN stays one
                 s[lane] = s[lane] + d * d
@@ -118,7 +118,7 @@ def squared_errors(
                 d = wp.where(p < 0.0, 0.0, wp.where(p > 1.0, 1.0, p)) - target[o + lane]
                 s[lane] = s[lane] + d * d
     total = float(0.0)
-    for lane in range(ERROR_LANES):
+    for lane in range(LANES):
         total += s[lane]
     sums[task] = total
 
@@ -127,9 +127,9 @@ def squared_error(rgb: Tensor, target: Tensor) -> Tensor:
     """Return the sum of squared errors of an image [H, W, 3] clamped to [0, 1]; the same bits on any number of CPU threads."""
     if rgb.device.type != "cpu" or rgb.dtype != torch.float32:
         return torch.nn.functional.mse_loss(rgb.clamp(0, 1), target, reduction="sum")
-    tasks = -(-rgb.numel() // ERROR_SEGMENT)
+    tasks = -(-rgb.numel() // SEGMENT)
     sums = rgb.new_empty(tasks)
-    launch.launch(squared_errors, tasks, [rgb.contiguous(), target.contiguous(), sums], rgb.device, cost=ERROR_SEGMENT // 10)
+    launch.launch(squared_errors, tasks, [rgb.contiguous(), target.contiguous(), sums], rgb.device, cost=SEGMENT // 10)
     return sums.sum()
 
 
@@ -157,10 +157,6 @@ BETAS = (0.9, 0.999)
 """Decay rates of the two moments (Kingma and Ba 2015)."""
 EPS = 1e-15
 """Number added to the root of the second moment, as in Kerbl et al. 2023, since gradients are tiny."""
-LANES = 16
-"""Elements that are updated together on a CPU, in a loop that vectorises."""
-SEGMENT = 4096
-"""Elements that one task updates on a CPU, a multiple of `LANES`."""
 
 
 @functools.cache
@@ -270,13 +266,12 @@ def update_rows(param, grad, exp_avg, exp_avg_sq, lrs: list[float], head: int, b
     real, device = launch.real_of(param), param.device
     length, lanes = (SEGMENT, LANES) if device.type == "cpu" else (1, 1)
     head_lr, lr, root_correction2 = lrs
-    with launch.stream_of(device):
-        inputs = [
-            grad.contiguous(), length, param[0].numel(), head, head_lr, lr, *betas, 1 - betas[0], 1 - betas[1],
-            root_correction2, eps, param, exp_avg, exp_avg_sq,
-        ]  # fmt: skip
-        kernel = make_adam_kernel(real, head > 0, lanes)
-        launch.launch(kernel, -(-param.numel() // length), inputs, device, cost=max(1, length // 16))
+    inputs = [
+        grad.contiguous(), length, param[0].numel(), head, head_lr, lr, *betas, 1 - betas[0], 1 - betas[1],
+        root_correction2, eps, param, exp_avg, exp_avg_sq,
+    ]  # fmt: skip
+    kernel = make_adam_kernel(real, head > 0, lanes)
+    launch.launch(kernel, -(-param.numel() // length), inputs, device, cost=max(1, length // 16))
 
 
 # Opacity decay: multiply every opacity by a factor, so that only Gaussians that the views support stay opaque.

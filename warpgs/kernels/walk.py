@@ -7,7 +7,7 @@ import torch
 import warp as wp
 
 from warpgs.kernels import blend_cuda, launch
-from warpgs.kernels.blend import check_slots, composite, is_native, make_segments
+from warpgs.kernels.blend import check_slots, composite, make_segments
 from warpgs.kernels.ellipse import PROJECTED_SIZE
 from warpgs.kernels.falloff import COLORS, STRIP, TOGETHER, Pass, make_batches, make_functions, make_struct
 from warpgs.kernels.native import ROLLED, SCALE, Floats, IntRows, Ints, cuda_kernel, make_prefetch, source
@@ -32,10 +32,7 @@ def make_walk(real, tile_size: int, make_visit):
         reals: Reals, ids: Ints, counts: Ints,
     ):  # fmt: skip
         tile = begin + wp.tid()
-        place = f.place_of(tile, side, settings)
-        camera = place[0]
-        left = place[1]
-        top = place[2]
+        camera, left, top = f.place_of(tile, side, settings)
         rows = wp.min(side, settings.height - top)
         lanes = wp.min(side, settings.width - left)
         ramp = strip_reals()
@@ -142,14 +139,14 @@ def make_weights(real, tile_size: int):
         weights: Rows,
     ):  # fmt: skip
         tile = begin + wp.tid()
-        place = f.place_of(tile, side, settings)
-        left = settings.origin_x + place[1]
-        top = settings.origin_y + place[2]
+        _camera, left, top = f.place_of(tile, side, settings)
         t = tile_reals()  # falls below the stop once a pixel is finished
         for row in range(side):
             for column in range(side):
-                inside = place[1] + column < settings.width and place[2] + row < settings.height
+                inside = left + column < settings.width and top + row < settings.height
                 t[row * side + column] = wp.where(inside, real(1.0), outside)
+        left += settings.origin_x
+        top += settings.origin_y
         sums = strip_reals()
         maxima = strip_reals()
         rows = b.Rows()
@@ -238,7 +235,7 @@ def _walk(make_visit, projected: torch.Tensor, tiles: Tiles, settings: Pass, k: 
     real, device, count, pixels = launch.real_of(projected), projected.device, len(tiles.ranges), tiles.size * tiles.size
     inputs = [settings.struct(tiles.size, real), projected, tiles.ranges, tiles.gaussian_ids, projected.shape[1], k, *outputs]
     inputs += [tiles.ranges.new_empty(0)] * (3 - len(outputs))
-    if is_native(projected):
+    if launch.is_native(projected):
         kernels = make_native(tiles.size)
         launch.launch(kernels.heaviest if k else kernels.median, count * pixels, inputs, device, block_dim=pixels)
     else:
@@ -273,7 +270,7 @@ def contributions(projected: torch.Tensor, tiles: Tiles, settings: Pass) -> tupl
     check_slots(tiles)
     projected = projected.detach().contiguous()
     weights = projected.new_zeros(len(tiles.slots), 2)
-    if is_native(projected):
+    if launch.is_native(projected):
         ends = composite(projected, tiles, projected.new_zeros(len(projected), 3), settings, save=False)[5]
         blend_cuda.instance_weights(projected, tiles, settings, ends, weights)
     else:

@@ -276,10 +276,8 @@ def _fcn_resnet18(request: ExportRequest) -> torch.nn.Module:
 def _own_weights(path: str | None) -> dict[str, Tensor]:
     """Return the tensors [...] of the user's weights by name, before any library of networks is loaded."""
     if path is None:
-        raise UsageError(
-            "fcn-resnet18: no public weights for the 21 VOC classes are known; give your own with --weights FILE.safetensors, "
-            "or export fcn-resnet50, for which torchvision has weights"
-        )
+        fix = "give your own with --weights FILE.safetensors, or export fcn-resnet50, for which torchvision has weights"
+        raise UsageError(f"fcn-resnet18: no public weights for the 21 VOC classes are known; {fix}")
     from safetensors import SafetensorError
     from safetensors.torch import load
 

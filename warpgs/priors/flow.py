@@ -198,34 +198,26 @@ def sift_features(view: View, max_pixels: int | None = None, most: int = 0) -> F
     return pixels, None if descriptors is None else descriptors.astype(np.uint8)
 
 
-def _blocks(descriptors: np.ndarray) -> np.ndarray:
-    """Return descriptors [K, 128] in blocks, float32 [B, BLOCK, 128]; the last block ends with zeros."""
-    blocks = np.zeros((-(-len(descriptors) // BLOCK), BLOCK, descriptors.shape[1]), np.float32)
-    blocks.reshape(-1, blocks.shape[2])[: len(descriptors)] = descriptors
-    return blocks
-
-
 def _ratio_matches(first: np.ndarray | None, second: np.ndarray | None) -> np.ndarray:
     """Return the rows [N, 2] of descriptors, uint8 [K, 128], that match by Lowe's test."""
     if first is None or second is None or min(len(first), len(second)) < 2:
         return np.zeros((0, 2), int)
     # whole numbers below 2^24 are exact in float32, in any order of additions
-    others, rows, pairs = _blocks(second), np.arange(BLOCK), []
+    others, pairs = np.zeros((-(-len(second) // BLOCK), BLOCK, second.shape[1]), np.float32), []
+    others.reshape(-1, second.shape[1])[: len(second)] = second
     others_squared = np.square(others).sum(-1).ravel()
     others_squared[len(second) :] = np.inf
-    squares = np.empty((BLOCK, len(others_squared)), np.float32)
-    products = squares.reshape(BLOCK, -1, BLOCK).transpose(1, 0, 2)
-    for number, block in enumerate(_blocks(first)):
-        np.matmul(-2 * block, others.transpose(0, 2, 1), out=products)
-        squares += others_squared
+    for start in range(0, len(first), BLOCK):
+        block = first[start : start + BLOCK].astype(np.float32)
+        products = np.matmul(-2 * block, others.transpose(0, 2, 1))  # a block of the others after the other
+        squares, rows = products.transpose(1, 0, 2).reshape(len(block), -1) + others_squared, np.arange(len(block))
         best = squares.argmin(1)
         nearest = squares[rows, best]
         squares[rows, best] = np.inf
         distances = np.sqrt(np.stack([nearest, squares.min(1)]) + np.square(block).sum(-1)).astype(float)
-        matched = rows[distances[0] < MATCH_RATIO * distances[1]]
-        pairs.append(np.stack([BLOCK * number + matched, best[matched]], 1))
-    found = np.concatenate(pairs)
-    return found[found[:, 0] < len(first)]
+        matched = np.flatnonzero(distances[0] < MATCH_RATIO * distances[1])
+        pairs.append(np.stack([start + matched, best[matched]], 1))
+    return np.concatenate(pairs)
 
 
 def agreeing_matches(
@@ -435,9 +427,8 @@ def _network(path: Path) -> Callable[[View, View], np.ndarray]:
         ]
         found = network.outputs_of(*(t[None] for t in tensors))
         if not (flows := [f for f in found if np.shape(f) == (1, 2, size[1], size[0])]):
-            raise DataError(
-                f"{path}: none of {[np.shape(f) for f in found]} is a flow [1, 2, {size[1]}, {size[0]}]; export it upsampled"
-            )
+            shapes = [np.shape(f) for f in found]
+            raise DataError(f"{path}: none of {shapes} is a flow [1, 2, {size[1]}, {size[0]}]; export it upsampled")
         return resize_flow(np.ascontiguousarray(flows[-1][0].transpose(1, 2, 0), dtype=np.float32), w, h)
 
     return compute

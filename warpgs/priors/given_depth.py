@@ -220,10 +220,8 @@ def pinhole_view(view: View) -> View:
     if camera.model == "pinhole":
         return view
     if camera.model not in geometry.CENTRAL:
-        raise UsageError(
-            f"depth estimation and coverage need pinholes and do not support the camera model {camera.model!r}: start "
-            "from points (--init.source points), with --strategy clone_split or mcmc"
-        )
+        fix = "start from points (--init.source points), with --strategy clone_split or mcmc"
+        raise UsageError(f"depth estimation and coverage do not support the camera model {camera.model!r}: {fix}")
     shape = (camera.height, camera.width)
     x, y = (_lens_pixels(camera) - 0.5).reshape(*shape, 2).astype(np.float32).transpose(2, 0, 1)  # OpenCV's centres are whole
     inside = (x >= -0.5) & (x <= camera.width - 0.5) & (y >= -0.5) & (y <= camera.height - 0.5)

@@ -283,10 +283,8 @@ def network_disparity(network: Network, preprocessing: Preprocessing, image: np.
     """Return the relative inverse depth of an image [H, W, 3] by a network, in [0, 1], float32 [H, W]."""
     output = network.run(preprocessing.prepare(network, image))
     shape = output.shape
-    if len(shape) == 4 and shape[1] != 1:
-        output = output[..., 0] if shape[3] == 1 else output
-    elif len(shape) == 4:
-        output = output[:, 0]
+    if len(shape) == 4:
+        output = output[:, 0] if shape[1] == 1 else output[..., 0] if shape[3] == 1 else output
     if output.ndim == 3 and shape[0] == 1:
         output = output[0]
     if output.ndim != 2:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from warpgs.priors.flow import Features, agreeing_matches, sift_features
+from warpgs.priors.flow import Features, agreeing_matches, nearest_views, sift_features
 from warpgs.priors.networks import single_threaded_opencv, without_ipp
 from warpgs.process import Say, Task, silent
 from warpgs.scene import View
@@ -113,15 +113,6 @@ def _difference(views: Sequence[View], places: Sequence[Places], i: int, j: int)
     return np.array([detail, *np.median(np.log(both[0, usable] / both[1, usable]), axis=0)])
 
 
-def _pairs(views: Sequence[View]) -> list[tuple[int, int]]:
-    """Return the pairs of a photograph and one of its `NEIGHBORS` nearest photographs, each pair once."""
-    centers, pairs = np.array([v.camera.center for v in views]), set()
-    for i in range(len(views)):
-        order = np.argsort(((centers - centers[i]) ** 2).sum(1), kind="stable")
-        pairs |= {(min(i, j), max(i, j)) for j in order[order != i][:NEIGHBORS].tolist()}
-    return sorted(pairs)
-
-
 def _typical(differences: list[float]) -> float | None:
     """Return the median; with two middle values, the number between them nearest to 0; None if all are NaN."""
     # a faulty photograph differs from most others, so the choice does not hide it
@@ -134,7 +125,7 @@ def _typical(differences: list[float]) -> float | None:
 def check_photos(views: Sequence[View], progress: Say = silent) -> list[PhotoCheck]:
     """Compare each photograph with the nearest ones; ``views`` include those that are held out."""
     count, began = len(views), time.monotonic()
-    pairs = _pairs(views)
+    pairs = sorted({(min(i, j), max(i, j)) for i in range(count) for j in nearest_views(views, i, NEIGHBORS)})
     with single_threaded_opencv(), ThreadPoolExecutor(torch.get_num_threads(), initializer=without_ipp) as pool:
         places = []
         for place in pool.map(_places, views):

@@ -1,6 +1,6 @@
 """One pass of the rasterizer: the tensors and settings of a render, projection, binning and blending."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -10,7 +10,6 @@ from warpgs.constants import Rule
 from warpgs.kernels import blend as blending, launch, sh
 from warpgs.kernels.ellipse import ProjectInputs, checked_factors, nothing, packed_covariances
 from warpgs.kernels.falloff import Pass
-from warpgs.kernels.project import project_inputs
 from warpgs.kernels.tiles import AS_NEEDED, InstanceMemory, Tiles, bin_tiles
 from warpgs.kernels.walk import contributions, heaviest, median_depth
 from warpgs.scene import ActivatedGaussians, Camera, CovarianceGaussians, RasterizedGaussians, Tensors
@@ -72,14 +71,6 @@ def pass_of(camera: Camera, degree: int, rule: Rule, **others: Any) -> Pass:
     return Pass(size, rule=rule, sh_count=sh.coefficient_count(degree), **named)
 
 
-def compose(
-    inputs: ProjectInputs, backgrounds: torch.Tensor, settings: Pass, memory: InstanceMemory = AS_NEEDED
-) -> tuple[Images, torch.Tensor, torch.Tensor]:
-    """Return images over backgrounds [C, 3], projected Gaussians [C, N, 12] and their tile counts [C, N]; differentiable."""
-    projected, tile_counts = project_inputs(inputs, settings)
-    return bin_and_blend(projected, tile_counts, backgrounds, settings, memory), projected, tile_counts
-
-
 def bin_and_blend(
     projected: torch.Tensor, tile_counts: torch.Tensor, backgrounds: torch.Tensor, settings: Pass,
     memory: InstanceMemory = AS_NEEDED, colors: torch.Tensor | None = None,
@@ -104,18 +95,3 @@ def further_of(projected: torch.Tensor, tiles: Tiles, settings: Pass, weights: b
     if k:
         found |= dict(zip(("heaviest_ids", "heaviest_weights", "blend_counts"), heaviest(projected, tiles, k, settings)))
     return found
-
-
-@torch.no_grad()
-def count_instances(inputs: ProjectInputs, settings: Pass) -> torch.Tensor:
-    """Return the number of (Gaussian, tile) instances of a render, int64, shape []."""
-    return project_inputs(inputs, settings)[1].sum()
-
-
-def composite_into(
-    projected: torch.Tensor, tile_counts: torch.Tensor, backgrounds: torch.Tensor, settings: Pass, memory: InstanceMemory,
-    save: bool = True,
-) -> tuple[Tiles, Sequence[torch.Tensor]]:  # fmt: skip
-    """Bin and blend [C, N, 12] without autograd, in the allocator's memory; also return the backward pass's tensors."""
-    tiles = bin_tiles(projected, tile_counts, settings, memory, save)
-    return tiles, blending.composite(projected, tiles, backgrounds, settings, save=save, allocator=memory.allocator)

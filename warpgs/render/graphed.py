@@ -23,9 +23,8 @@ from warpgs.kernels.cameras import CAMERA_MODELS
 from warpgs.kernels.ellipse import ProjectInputs
 from warpgs.kernels.falloff import Pass
 from warpgs.kernels.graphs import MIN_REPLAYS, Allocator, GraphedFunction, GraphPool, fetch
-from warpgs.kernels.tiles import BYTES_PER_INSTANCE, InstanceMemory, Tiles, grid, running_counts, split_sum, sums_fit
+from warpgs.kernels.tiles import BYTES_PER_INSTANCE, InstanceMemory, Tiles, bin_tiles, grid, running_counts, split_sum, sums_fit
 from warpgs.means2d import count_passes
-from warpgs.render.compose import composite_into
 
 MIN_CALLS = 3
 """Number of calls in a row with equal keys (`call_key`) before kernels are captured. It doubles after a capture that is
@@ -68,10 +67,7 @@ class GraphedRasterizer:
         )
         self._sums: torch.Tensor | None = None
         self._no_factors = torch.empty(0, dtype=torch.float32, device=self.device)
-
-    @functools.cached_property
-    def _black(self) -> torch.Tensor:
-        return torch.zeros(self.cameras, 3, dtype=torch.float32, device=self.device)
+        self._black = torch.zeros(cameras, 3, dtype=torch.float32, device=self.device)
 
     def render(self, inputs: ProjectInputs, backgrounds: torch.Tensor | None):
         """Return images, projected Gaussians [C, N, 12] and tile counts [C, N]; None if the call exceeds the capacity."""
@@ -117,8 +113,10 @@ class GraphedRasterizer:
         overflow = allocator.workspace((1,), torch.int32, self.device)  # not read, since the sums show it first
         visible, instances = self.capacity
         memory = InstanceMemory(None, instances, overflow, allocator, (self._sums, visible))
-        tiles, (_, _, _, *saved) = composite_into(projected, counts, backgrounds, self.settings, memory, self.gradients)
-        if not self.gradients:
+        settings, save = self.settings, self.gradients
+        tiles = bin_tiles(projected, counts, settings, memory, save)
+        _, _, _, *saved = blend.composite(projected, tiles, backgrounds, settings, save=save, allocator=allocator)
+        if not save:
             return ()
         return *(t for t in tiles.tensors() if t is not tiles.counts), *saved
 

@@ -224,9 +224,8 @@ def _checked_window(camera: Camera, options: RasterizeOptions) -> Window:
     x, y, w, h = options.window
     inside = 0 <= x < x + w <= width and 0 <= y < y + h <= height
     if not inside or x % side or y % side or ((x + w) % side and x + w != width) or ((y + h) % side and y + h != height):
-        raise UsageError(
-            f"window {options.window}: its edges must be multiples of {side} px, or edges of the {width} x {height} px image"
-        )
+        fix = f"its edges must be multiples of {side} px, or edges of the {width} x {height} px image"
+        raise UsageError(f"window {options.window}: {fix}")
     return x, y, w, h
 
 
@@ -502,7 +501,5 @@ def select_rule(
                 break
         else:
             return rule, error
-    raise UsageError(
-        f"no rule keeps the {measure} error within {max_error:g}: with rule exact, rounding alone gives {error:.1e}; raise "
-        "max_error, or give the Gaussians as float64"
-    )
+    why = f"no rule keeps the {measure} error within {max_error:g}: with rule exact, rounding alone gives {error:.1e}"
+    raise UsageError(f"{why}; raise max_error, or give the Gaussians as float64")

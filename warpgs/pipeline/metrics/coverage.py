@@ -2,7 +2,6 @@
 
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,7 @@ from warpgs.io.image_files import decode
 from warpgs.io.images import without_masked
 from warpgs.kernels.ssim import ssim
 from warpgs.mesh.views import MIN_ALPHA, TOLERANCE, depth_difference, seen_from
-from warpgs.pipeline.metrics.scores import Renders, psnr_of, scored_pair
+from warpgs.pipeline.metrics.scores import Renders, psnr_of, resized, scored_pair
 from warpgs.priors.given_depth import pinhole_view
 from warpgs.process import Say, counted, silent
 from warpgs.report.images import COVERAGE_LEGEND, channel_mean, coverage_image, png, webp
@@ -43,7 +42,7 @@ def depth_views(
     factor = min(1.0, (MAX_PIXELS / max(1, sum(c.width * c.height for c in cameras))) ** 0.5)
     views = []
     for camera, mask in zip(cameras, masks or [None] * len(cameras)):
-        small = _resized(pinhole_of(camera), factor)
+        small = resized(pinhole_of(camera), factor)
         _, depth, alpha = (torch.from_numpy(a).to(renders.gaussians.means.device) for a in renders(small))
         depth = torch.where(alpha >= MIN_ALPHA, depth, 0)
         if mask is not None:
@@ -51,15 +50,6 @@ def depth_views(
             depth = torch.where(torch.nn.functional.interpolate(counts, depth.shape, mode="area")[0, 0] > 0.5, depth, 0)
         views.append((small, depth))
     return views
-
-
-def _resized(camera: Camera, factor: float) -> Camera:
-    """Return the camera of the image at another size, at least one pixel on each side."""
-    if factor == 1:
-        return camera
-    width, height = (max(1, int(factor * n)) for n in (camera.width, camera.height))
-    scale = np.array([[width / camera.width], [height / camera.height], [1.0]])
-    return replace(camera, K=scale * camera.K, width=width, height=height)
 
 
 def coverage_map(depth: torch.Tensor, camera: Camera, training: Sequence[DepthView]) -> tuple[torch.Tensor, torch.Tensor]:
@@ -81,7 +71,7 @@ def coverage_map(depth: torch.Tensor, camera: Camera, training: Sequence[DepthVi
 
 def fraction_outside(depth: torch.Tensor, camera: Camera, photographs: Sequence[Camera], empty: bool = True) -> float:
     """Return the fraction of a render's pixels, on a grid, that show a point outside the images of all photographs."""
-    small = _resized(camera, min(1.0, GRID / max(camera.width, camera.height)))
+    small = resized(camera, min(1.0, GRID / max(camera.width, camera.height)))
     rows, columns = (
         ((torch.arange(few, device=depth.device) + 0.5) * (many / few)).long()
         for few, many in ((small.height, camera.height), (small.width, camera.width))

@@ -371,20 +371,28 @@ _Small = tuple[Camera, np.ndarray, np.ndarray, np.ndarray]
 """A view reduced to `MAX_PIXELS`: its camera, residuals, depths and the mask of its pixels that count, [H, W] each."""
 
 
+def resized(camera: Camera, factor: float) -> Camera:
+    """Return the camera of the image at another size, at least one pixel on each side."""
+    if factor == 1:
+        return camera
+    width, height = (max(1, int(factor * n)) for n in (camera.width, camera.height))
+    scale = np.array([[width / camera.width], [height / camera.height], [1.0]])
+    return replace(camera, K=scale * camera.K, width=width, height=height)
+
+
 def _reduced(view: View, rgb: np.ndarray, depth: np.ndarray, alpha: np.ndarray) -> _Small:
     """Return the small view of a render; its residuals are those beyond what a shift by one pixel explains."""
     import cv2
 
     c = view.camera
-    shrink = min(1.0, (MAX_PIXELS / (c.width * c.height)) ** 0.5)
-    size = width, height = max(1, int(c.width * shrink)), max(1, int(c.height * shrink))
+    small = resized(c, min(1.0, (MAX_PIXELS / (c.width * c.height)) ** 0.5))
+    size = small.width, small.height
     photo, mask = without_masked(view).image, np.ones(alpha.shape) if view.mask is None else view.mask
     image, rgb = (cv2.resize(a.astype(np.float32), size, interpolation=cv2.INTER_AREA) for a in (photo, np.clip(rgb, 0, 1)))
     depth, alpha, mask = (cv2.resize(a.astype(np.float32), size, interpolation=cv2.INTER_NEAREST) for a in (depth, alpha, mask))
     around = np.ones((3, 3), np.uint8)
     beyond = np.maximum(np.maximum(cv2.erode(image, around) - rgb, rgb - cv2.dilate(image, around)), 0).mean(-1)
-    side = max(3, round(width / SMOOTHING) | 1)
-    small = replace(c, K=np.diag([width / c.width, height / c.height, 1]) @ c.K, width=width, height=height)
+    side = max(3, round(small.width / SMOOTHING) | 1)
     return small, cv2.blur(beyond, (side, side)), depth, (alpha > 0.5) & (depth > 0) & (mask > 0)
 
 

@@ -335,9 +335,16 @@ def initial_gaussians(
     count = len(points)
     # in float64, since the rounding of float32's roots and logarithms depends on the processor (MKL)
     scales = config.scale_factor * mean_square_distances(points).double().sqrt().clamp(1e-6 * extent, 0.1 * extent)
-    sh = points.new_zeros(count, coefficient_count(sh_degree), 3)
-    sh[:, 0] = base_coefficients(colors)
-    quats = points.new_tensor([1, 0, 0, 0]).repeat(count, 1)
     logits = points.new_full((count,), geometry.logit(config.opacity))
     logits[count - extrapolated :] = geometry.logit(depth_points.EXTRAPOLATED_OPACITY)
-    return Gaussians(points, quats, scales.log().to(points.dtype)[:, None].repeat(1, 3), logits, sh)
+    return isotropic(points, colors, scales.log().to(points.dtype), logits, coefficient_count(sh_degree))
+
+
+def isotropic(
+    means: torch.Tensor, colors: torch.Tensor, log_sizes: torch.Tensor, logits: torch.Tensor, coefficients: int
+) -> Gaussians:
+    """Return Gaussians of means and colours [N, 3], logarithms of sizes and logits of opacities [N]; K ``coefficients``."""
+    sh = means.new_zeros(len(means), coefficients, 3)
+    sh[:, 0] = base_coefficients(colors)
+    quats = means.new_tensor([1, 0, 0, 0]).repeat(len(means), 1)
+    return Gaussians(means, quats, log_sizes[:, None].repeat(1, 3), logits, sh)

@@ -339,10 +339,8 @@ class Table:
         own = self.state()
         stored = {n: t for n, t in state.items() if n.partition(".")[0] in self._groups()}
         if own.keys() != stored.keys():
-            raise DataError(
-                f"the stored table has other columns or parameters: {', '.join(sorted(own.keys() ^ stored.keys()))}; continue "
-                "with the code and the settings that the run was started with"
-            )
+            others = ", ".join(sorted(own.keys() ^ stored.keys()))
+            raise DataError(f"the stored table has other columns or parameters: {others}; continue with the run's own settings")
         same_rows = len({t.shape[:1] for t in stored.values()}) <= 1
         for name, t in stored.items():
             if not same_rows or t.shape[1:] != own[name].shape[1:] or t.dtype != own[name].dtype:

@@ -7,6 +7,7 @@ compiled kernels need additional memory. Small parts are not counted: parameters
 rates and losses (`StepBuffers`).
 """
 
+from bisect import bisect_left
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
@@ -25,7 +26,7 @@ from warpgs.pipeline.train.strategies.base import Strategy
 from warpgs.pipeline.train.view_modules import ViewModule
 from warpgs.pipeline.train.views import TrainingView
 from warpgs.process import Detail
-from warpgs.render.compose import count_instances, inputs_of
+from warpgs.render.compose import inputs_of
 from warpgs.render.options import RasterizeOptions, image_settings
 from warpgs.scene import Camera, Gaussians
 
@@ -101,16 +102,14 @@ class Layout:
 
 def _largest(low: int, high: int, fits: Callable[[int], bool]) -> int:
     """Return the largest number that fits, by bisection: all smaller numbers fit, too; ``low`` if none fits."""
-    while low < high:
-        middle = (low + high + 1) // 2
-        low, high = (middle, high) if fits(middle) else (low, middle - 1)
-    return low
+    return low + bisect_left(range(low + 1, high + 1), True, key=lambda n: not fits(n))
 
 
 @torch.no_grad()
 def most_instances(gaussians: Gaussians, cameras: list[Camera], options: RasterizeOptions) -> int:
     """Return the number of (Gaussian, tile) instances for the camera that has the most; cameras hold tensors."""
-    return max(int(count_instances(inputs_of(gaussians, c), image_settings(c, 0, options))) for c in cameras)
+    counts = (project.project_inputs(inputs_of(gaussians, c), image_settings(c, 0, options))[1].sum() for c in cameras)
+    return max(map(int, counts))
 
 
 def plan(

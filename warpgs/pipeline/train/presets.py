@@ -80,9 +80,6 @@ class Presets(Mapping[str, "FitConfig"]):
     def __len__(self) -> int:
         return sum(1 for _ in self)  # a list would ask for its length first
 
-    def __contains__(self, name: object) -> bool:
-        return name in self._files or name in self._made
-
 
 PRESETS = Presets(FOLDER)
 """Presets by name."""

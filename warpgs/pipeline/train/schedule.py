@@ -185,9 +185,8 @@ def color_of(text: str) -> Color | None:
         red, green, blue = map(float, parts)
         if max(red, green, blue) <= 1:
             return red, green, blue
-    raise UsageError(
-        f"background {text[:60]!r} is not a colour: give auto, mean, scene, black, white, #rrggbb, or r,g,b in [0, 1]"
-    )
+    known = "auto, mean, scene, black, white, #rrggbb, or r,g,b in [0, 1]"
+    raise UsageError(f"background {text[:60]!r} is not a colour: give {known}")
 
 
 def mean_color(views: list[View]) -> Color:

@@ -89,10 +89,8 @@ def _check_models(train: list[View], config: FitConfig) -> None:
     """Check that every camera has a pinhole of the same K if the settings compare views with each other."""
     others = sorted({v.camera.model for v in train} - {*CENTRAL})
     if others and (config.init.source != "points" or find_strategy(config.strategy).samples):
-        raise UsageError(
-            f"camera model {others[0]}: this start or strategy compares views, which requires {' or '.join(CENTRAL)}; fit "
-            "with --preset 3dgs --init.source points, or undistort the images"
-        )
+        fix = "fit with --preset 3dgs --init.source points, or undistort the images"
+        raise UsageError(f"camera model {others[0]}: comparing views requires {' or '.join(CENTRAL)}; {fix}")
 
 
 def needs_priors(config: FitConfig) -> bool:

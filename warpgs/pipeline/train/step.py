@@ -11,6 +11,7 @@ from torch import Tensor
 from warpgs.device import available_bytes, keep_freed_memory
 from warpgs.errors import ResourceError
 from warpgs.kernels.graphs import CapturedGraph, GraphMemory
+from warpgs.kernels.project import project_inputs
 from warpgs.kernels.tiles import BYTES_PER_INSTANCE, MAX_INSTANCES, InstanceMemory
 from warpgs.kernels.update import NOT_FINITE, SHIFT, Setting, begin_step, end_step, opacity_decay, opacity_dropout
 from warpgs.pipeline.metrics.scores import masked_mse
@@ -21,7 +22,7 @@ from warpgs.pipeline.train.schedule import over
 from warpgs.pipeline.train.strategies.base import Strategy
 from warpgs.pipeline.train.views import Kind, LearnedViews, Rows, ViewStack, camera_at, current, seen
 from warpgs.plugins import returned
-from warpgs.render.compose import compose, count_instances, inputs_of
+from warpgs.render.compose import bin_and_blend, inputs_of
 from warpgs.render.options import RasterizeOptions, image_settings
 from warpgs.render.rasterize import rasterize
 from warpgs.scene import Camera, Gaussians, Render, Tensors
@@ -162,7 +163,8 @@ def captured_renderer(options: RasterizeOptions, capacity: int, overflow: Tensor
     def render(gaussians: Gaussians, camera: Camera, degree: int, factors: Tensor | None, shift: Tensor | None) -> Render:
         behind = backgrounds if shift is None else backgrounds + shift
         settings = image_settings(camera, degree, options)
-        images, projected, tile_counts = compose(inputs_of(gaussians, camera, factors), behind, settings, memory)
+        projected, tile_counts = project_inputs(inputs_of(gaussians, camera, factors), settings)
+        images = bin_and_blend(projected, tile_counts, behind, settings, memory)
         return _single(Render(*images, projected, tile_counts))
 
     return render
@@ -380,7 +382,7 @@ class StepTaker:
 def instance_capacity(gaussians: Gaussians, views: ViewStack, degree: int, options: RasterizeOptions) -> int:
     """Return the capacity of a captured step for (Gaussian, tile) instances, over all views of a stack."""
     cameras = [camera_at(views.camera, i) for i in range(len(views.numbers))]
-    counts = [count_instances(inputs_of(gaussians, c), image_settings(c, degree, options)) for c in cameras]
+    counts = [project_inputs(inputs_of(gaussians, c), image_settings(c, degree, options))[1].sum() for c in cameras]
     wanted = int(CAPACITY_FACTOR * int(torch.stack(counts).max())) + 1024
     budget = available_bytes(gaussians.means.device) * 4 // 5
     if wanted > MAX_INSTANCES or wanted * BYTES_PER_INSTANCE > budget:

@@ -557,8 +557,6 @@ def warm_up(config: FitConfig, device: torch.device, stopped: Callable[[], bool]
         density=replace(config.density, every=1),
         strategy_config=find_strategy(config.strategy).warmup_config(config.strategy_config),
     )  # fmt: skip
-    if hasattr(small.strategy_config, "every"):  # a strategy with events of its own, such as mcmc: it has some, too
-        small = replace(small, strategy_config=replace(small.strategy_config, every=1))
     if sweeps(config.init, len(views)) and config.memory_limit is None:
         sweep_depths(views, [(2, 4)] * len(views), device, max_planes=PLANES)
     fit = Trainer(views, cloud, small, device, priors=[Prior(*maps, "noise", "noise") for _ in views])

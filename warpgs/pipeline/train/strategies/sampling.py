@@ -14,6 +14,7 @@ from warpgs.device import FLOAT, SAMPLING, Needs, StepSizes
 from warpgs.geometry import back_project_tensors, logit
 from warpgs.kernels.update import Setting
 from warpgs.pipeline.model.edit import SEEN, coverage
+from warpgs.pipeline.model.start import isotropic
 from warpgs.pipeline.model.table import Column, DensityUpdate
 from warpgs.pipeline.train.schedule import Phases
 from warpgs.pipeline.train.strategies.base import Growth, Strategy, StrategyContext, register
@@ -22,7 +23,7 @@ from warpgs.pipeline.train.views import TrainingView, batch_of, half_size_camera
 from warpgs.plugins import is_ours
 from warpgs.render.options import RasterizeOptions
 from warpgs.render.rasterize import rasterize
-from warpgs.scene import Camera, Gaussians, Tensors, base_coefficients
+from warpgs.scene import Camera, Gaussians, Tensors
 from warpgs.schema import Checked, Within, fields, items, real, whole
 
 COARSE, FINE = 0, 1
@@ -155,19 +156,9 @@ def fine_gaussians(
     rows, columns = at.unbind(1)
     depths = depth[rows, columns]
     means = back_project_tensors(camera, torch.stack([columns, rows], 1).to(depth.dtype) + 0.5, depths)
-    count = len(means)
     focal = 0.5 * (camera.K[0, 0] + camera.K[1, 1])
-    sh = means.new_zeros(count, coefficients, 3)
-    sh[:, 0] = base_coefficients(image[rows, columns])
-    quats = means.new_zeros(count, 4)
-    quats[:, 0] = 1
-    return {
-        "means": means,
-        "quats": quats,
-        "log_scales": (math.log(footprint) + (depths / focal).double().log()).to(depths.dtype)[:, None].repeat(1, 3),
-        "logit_opacities": torch.full_like(depths, logit(OPACITY)),
-        "sh": sh,
-    }
+    log_sizes = (math.log(footprint) + (depths / focal).double().log()).to(depths.dtype)
+    return isotropic(means, image[rows, columns], log_sizes, torch.full_like(depths, logit(OPACITY)), coefficients).tensors()
 
 
 def weight_sums(gaussians: Gaussians, cameras: list[Camera], options: RasterizeOptions) -> torch.Tensor:
