@@ -111,15 +111,9 @@ def similar_folder(path: Path) -> str:
 
 
 def install_extras(*names: str) -> str:
-    """Return the words on how to install the packages of extras, by name, since warpgs is on no package index."""
-    import importlib.metadata
-
-    try:
-        rows = importlib.metadata.requires("warpgs") or []
-    except importlib.metadata.PackageNotFoundError:  # a copy of the repository that is not installed
-        return f"`pip install '.[{','.join(names)}]'` in your copy of the repository"
-    wanted = [repr(package) for package, _, extra in (r.partition("; extra == ") for r in rows) if extra.strip("'\"") in names]
-    return f"`pip install {' '.join(wanted)}`"
+    """Return the words on how to install extras by name; warpgs is on no package index."""
+    extras = f"[{','.join(names)}]"
+    return f"`pip install '.{extras}'` in your copy of the repository; of a wheel, append {extras} to its path"
 
 
 Kind = TypeVar("Kind", bound=type)
