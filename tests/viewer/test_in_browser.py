@@ -4,11 +4,13 @@ import dataclasses
 import http.server
 import json
 import threading
+import time
 from contextlib import contextmanager
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
 
 from tests.scenes import ring, three_gaussians
 from tests.viewer import wait_shown
@@ -109,6 +111,25 @@ def test_a_page_turns_as_far_as_the_photographs_and_shows_what_they_saw():
     assert (lying[0].width, lying[0].height) == (lying[1].height, lying[1].width)
     np.testing.assert_allclose(html.place_first_camera(server, lying[0], three_gaussians(), lying)[1], UP, atol=1e-6)
     assert -lying[0].viewmat[1] @ [*UP, 0] > 0.9
+
+
+def test_limits_end_where_fewer_than_two_photographs_saw_the_surface():
+    """Two photographs of the front and one of the back do not support the sides; photographs between them do."""
+    i = torch.arange(900, dtype=torch.float64) + 0.5  # a ball
+    polar, azimuth = torch.arccos(1 - 2 * i / 900), np.pi * (1 + 5**0.5) * i
+    ball = torch.stack([polar.sin() * azimuth.cos(), polar.cos(), polar.sin() * azimuth.sin()], 1).float()
+    one, turn = torch.ones(900), torch.tensor([[1.0, 0, 0, 0]])
+    g = type(three_gaussians())(ball, turn.repeat(900, 1), ball * 0 - 2.5, 4 * one, ball[:, None] * 0)
+
+    def ends(*azimuths):
+        cameras = [looking(np.radians(a)) for a in azimuths]
+        arc, margin = html.supported(g, cameras, TARGET, UP, *html.turning_limits(cameras, TARGET, UP))
+        return np.degrees(arc[:2] + margin)
+
+    few, many = ends(0, 10, 170), ends(*range(0, 180, 10))
+    assert 10 < few[1] < 30 and few[0] == pytest.approx(15, abs=3) and 170 < many[1] < 185
+    # the first camera at an end of the arc, a rounding error beyond it, is no whole turn
+    assert html.turning_limits([looking(1.0), looking(1.1)], TARGET, UP)[0][:2] == pytest.approx([0, 0.1], abs=1e-6)
 
 
 TURNED = "(()=>{const t=__viserMutable.cameraControl;t.update(9);return t.azimuthAngle})()"
@@ -395,8 +416,13 @@ def test_the_viewer_has_the_limits_of_the_page(folder, browser):
         ahead = html.distance_ahead(window.first, content.model.gaussians())
         browser.wait(f"({TURNED}, Math.abs(__viserMutable.cameraControl.distance - {ahead}) < 1e-3)")
         first = browser.value(TURNED)
+        until = time.monotonic() + 60
+        while window._limits is window._widest and time.monotonic() < until:
+            time.sleep(0.02)
+        sides = tilt.replace("tilt", "sides")
+        browser.wait(f"Math.abs({sides}.z - {window._limits[1]}) < 1e-5 && Math.abs({sides}.y - {window._limits[0][1]}) < 1e-5")
         browser.value("void __viserMutable.cameraControl.rotate(2, 0, false)")
-        arc, margin = html.turning_limits(window._rig, window._target, window._up)
+        arc, margin = window._limits
         assert np.degrees(browser.value(TURNED) - first) == pytest.approx(np.degrees(arc[1] + 0.95 * margin), abs=0.1)
         window.panel.limits.value = False
         browser.wait(f"{tilt}?.z === 0")

@@ -20,11 +20,14 @@ from warpgs.errors import DataError
 from warpgs.files import write_text
 from warpgs.geometry import convert_camera, convert_gaussians, look_at, matmul, pose_at, quaternions, rotation_matrices
 from warpgs.locks import hold_file
-from warpgs.pipeline.films.paths import fov_y, rig_among, rig_of, upright
+from warpgs.pipeline.films.paths import fov_y, framed, rig_among, rig_of, upright
+from warpgs.pipeline.metrics.coverage import coverage_map, depth_views
+from warpgs.pipeline.metrics.scores import Renders
 from warpgs.pipeline.run.export import NO_FILTERS, Filters, file_gaussians, filtered
 from warpgs.pipeline.run.folder import open_run
+from warpgs.render.options import RasterizeOptions
 from warpgs.scene import Camera, Gaussians, Normalization, base_colors
-from warpgs.viewer.server import LIMITS, NO_PARAMETERS, NO_TEXT_AS_CODE, TURNING, open_server, require_viser, stop_server
+from warpgs.viewer.server import FIRST, LIMITS, TURNING, open_server, require_viser, stop_server
 
 if TYPE_CHECKING:
     import viser
@@ -187,7 +190,8 @@ def turning_limits(cameras: Sequence[Camera], target: np.ndarray, up: np.ndarray
     heights = np.clip((ways * up).sum(1), -1, 1)
     flat = ways - heights[:, None] * up
     level = np.abs(heights) < max(0.95, abs(heights[0]) + 1e-9)  # straight down there is no azimuth
-    azimuths = np.sort(np.arctan2((flat * np.cross(up, flat[0])).sum(1), (flat * flat[0]).sum(1))[level])
+    azimuths = np.arctan2((flat * np.cross(up, flat[0])).sum(1), (flat * flat[0]).sum(1))[level]
+    azimuths = np.sort(azimuths.round(9))  # -1e-17 for the first camera itself would be a whole turn
     gaps = np.diff(azimuths, append=azimuths[0] + 2 * math.pi)
     widest = int(np.argmax(gaps))  # the arc is all but the widest gap, and has the first camera at 0
     if gaps[widest] > ALL_ROUND:
@@ -197,12 +201,44 @@ def turning_limits(cameras: Sequence[Camera], target: np.ndarray, up: np.ndarray
     return arc, float(np.clip(max(arc[:2].sum(), arc[2:].sum()) / 4, LEAST_MARGIN, LARGEST_MARGIN))
 
 
-def add_limits(
-    server: viser.ViserServer, cameras: Sequence[Camera], target: np.ndarray, up: np.ndarray, on: bool = True
-) -> None:
-    """Give pages the limits of cameras, the first of which they start at, as positions of nodes that draw nothing."""
-    (left, right, above, below), margin = turning_limits(cameras, target, up)
-    positions = {"": cameras[0].center - target, "/sides": (left, right, margin), "/tilt": (above, below, on)}
+SIDE, TRIED, SUPPORT = 160, 8, 0.8
+"""Longer side of the views [px] that are tried on each side of the first camera, their number, and the least part of their
+surface that two photographs saw, as a fraction of this part at the first camera: below it, smears prevail."""
+
+
+def _small(camera: Camera) -> Camera:
+    factor = SIDE / max(camera.width, camera.height)
+    return framed(camera, (max(1, round(factor * camera.width)), max(1, round(factor * camera.height))))
+
+
+def supported(
+    gaussians: Gaussians, cameras: Sequence[Camera], target: np.ndarray, up: np.ndarray, arc: np.ndarray, margin: float
+) -> tuple[np.ndarray, float]:
+    """Return an arc and a margin that end, on each side, before views that show mostly what fewer than two cameras saw."""
+    if len(cameras) < 2:
+        return arc, margin
+    first, renders = _small(cameras[0]), Renders(gaussians, RasterizeOptions())
+    photographs = depth_views(renders, [_small(c) for c in cameras])
+
+    def share(axis: np.ndarray, angle: float) -> float:
+        turn = rotation_matrices(np.array([math.cos(angle / 2), *(math.sin(angle / 2) * axis)]))
+        pose = pose_at(matmul(first.viewmat[:3, :3], turn.T), target + matmul(turn, first.center - target))
+        ((turned, depth),) = depth_views(renders, [replace(first, viewmat=pose)])
+        return float((coverage_map(depth, turned, photographs)[0] > 1).sum() / max(1, int((depth > 0).sum())))
+
+    ends, least, right = arc + margin, SUPPORT * share(up, 0.0), np.asarray(first.viewmat[0, :3])
+    for side, axis in enumerate((-up, up, -right, right)):
+        angles = min(ends[side], math.pi) * np.linspace(0, 1, TRIED + 1) ** 2
+        shares = [share(axis, angle) for angle in angles]
+        if i := int(np.argmax(np.less(shares, least))):
+            ends[side] = max(LEAST_MARGIN, np.interp(least, [shares[i], shares[i - 1]], [angles[i], angles[i - 1]]))
+    margin = min(margin, float(ends.min()))
+    return ends - margin, margin
+
+
+def add_limits(server: viser.ViserServer, away: np.ndarray, arc: np.ndarray, margin: float, on: bool = True) -> None:
+    """Give pages the limits about the first camera, ``away`` [u] from the target, as positions of nodes that draw nothing."""
+    positions = {"": away, "/sides": (*arc[:2], margin), "/tilt": (*arc[2:], on)}
     for name, position in positions.items():
         server.scene.add_frame(LIMITS + name, show_axes=False, position=np.minimum(position, 1e3).astype(float))
 
@@ -251,13 +287,14 @@ def write_html(
     try:
         target, up = place_first_camera(server, first, gaussians, cameras, normalization.up)
         server.scene.set_background_image(plain_background(background), format="png")
-        add_limits(server, cameras, target, up)
+        limits = supported(gaussians, cameras, target, up, *turning_limits(cameras, target, up))
+        add_limits(server, first.center - target, *limits)
         server.scene.add_gaussian_splats("/gaussians", *arrays, scale=scale)
         text = server.get_scene_serializer().as_html(dark_mode=True)
     finally:
         stop_server(server)
     head = f'<head><meta http-equiv="Content-Security-Policy" content="{POLICY}" />'
-    head += f"<script>{NO_PARAMETERS}{NO_TEXT_AS_CODE}{TURNING}</script>{SORT_FROM_DISK}{NO_REMARKS}{NO_SCENE_TREE}"
+    head += f"<script>{FIRST}{TURNING}</script>{SORT_FROM_DISK}{NO_REMARKS}{NO_SCENE_TREE}"
     text = re.sub(r"<title>[^<]*</title>", lambda _: f"<title>{html.escape(title)}</title>", text, count=1)
     text, end, rest = text.replace("<head>", head, 1).replace("<body>", f"<body>{LOADING}", 1).rpartition("</body>")
     wide, tall = seen_at(cameras, target) if known else (1e3, 1e3)

@@ -65,6 +65,11 @@ _MARK_LOADED = (
 )
 """JavaScript that gives the nonce to the one script that viser's page unpacks."""
 
+_NO_FALSE_ALARM = "{const tell=console.error;console.error=(...a)=>/Computed radius is NaN/.test(a[0])||tell(...a)};"
+"""JavaScript that hides an error of three.js on viser's mesh of Gaussians: its positions have two coordinates, so no radius."""
+FIRST = NO_PARAMETERS + NO_TEXT_AS_CODE + _NO_FALSE_ALARM
+"""JavaScript that runs before viser's own."""
+
 LIMITS = "/limits"
 """Scene node with the limits of `TURNING`, as positions: of itself the way from the target to the first camera [u], of
 ``sides`` the captured arc to the left and right, and the margin, of ``tilt`` that above and below [rad], and 1 for on."""
@@ -100,7 +105,7 @@ FOLD = (
 
 def live_page(text: str, nonce: str) -> str:
     """Return viser's page for a content policy that only runs scripts with a nonce."""
-    own = f"<script>{NO_PARAMETERS}{NO_TEXT_AS_CODE}{_MARK_LOADED.replace('NONCE', nonce)}{TURNING}{FOLD}</script>"
+    own = f"<script>{FIRST}{_MARK_LOADED.replace('NONCE', nonce)}{TURNING}{FOLD}</script>"
     return text.replace("<head>", f"<head>{own}", 1).replace("<script", f'<script nonce="{nonce}"')
 
 

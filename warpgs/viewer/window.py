@@ -421,8 +421,8 @@ MAP_SIDE = {"cpu": 480, "cuda": 1280}
 """Longer side of an image that is rendered here, by device [px]."""
 SETTLED = 0.15
 """Time without motion of a browser's camera before an image is rendered for it [s]."""
-HIDDEN = 3.0
-"""Cameras nearer than this to a browser's eye, in sizes of their frusta, are hidden, because they would cover the scene."""
+HIDDEN = 8.0
+"""Cameras nearer than this to a browser's eye, in sizes of their frusta, are hidden: photographs would look like the scene."""
 TRAIN_COLOR, TEST_COLOR = (20, 150, 150), (224, 138, 44)
 
 
@@ -436,8 +436,8 @@ class Window:
         train = [content.model.scene_cameras[n] for n in content.model.train]
         # the limits include held-out cameras, too, because the user can step into each, without those far off the rest
         gaussians = content.model.gaussians()
-        rigs = (html.middle_first(some, gaussians) for some in (train, cameras))
-        self._rig = [*itertools.chain(*rigs)] or [html.camera_before(gaussians)]
+        self._photographs, known = (html.middle_first(some, gaussians) for some in (train, cameras))
+        self._rig = [*self._photographs, *known] or [html.camera_before(gaussians)]
         self.first = self._rig[0]
         self.extent = camera_extent(cameras) if len(cameras) > 1 else 0.1 * html.distance_ahead(self.first, gaussians)
         self.maps = Maps(content, self.extent)
@@ -447,8 +447,10 @@ class Window:
         self._drawn: dict[int, tuple[Any, ...]] = {}
         self._lock, self._wake, self._open = threading.RLock(), threading.Event(), True
         rig, up = cameras or [self.first], content.model.normalization.up
-        self._target, self._up = html.place_first_camera(server, self.first, gaussians, rig, up)
+        self._place = html.place_first_camera(server, self.first, gaussians, rig, up)
         server.scene.set_background_image(html.plain_background(content.model.background), format="png")
+        self._widest = self._narrow = self._limits = html.turning_limits(self._rig, *self._place)
+        self._measures, self._unmeasured = maps, content.model if maps else None
         self.panel = Panel(server, content, self, maps)
         self.limit()
         self._draw_cameras()
@@ -461,6 +463,7 @@ class Window:
         """Show another state of the model, with the same cameras."""
         with self._lock:
             self.content, self.maps = content, Maps(content, self.extent)
+            self._unmeasured = content.model if self._measures else None
             self.removed, self._reasons = [], None
             self.panel.tell(content)
             self.redraw()
@@ -542,14 +545,21 @@ class Window:
 
     def limit(self) -> None:
         """Send the limits of turning to the browsers, as the panel switches them."""
-        html.add_limits(self.server, self._rig, self._target, self._up, bool(self.panel.limits.value))
+        html.add_limits(self.server, self.first.center - self._place[0], *self._limits, bool(self.panel.limits.value))
+
+    def _measure(self) -> None:
+        """Narrow the limits to views that the photographs support, once for each model."""
+        model, self._unmeasured = self._unmeasured, None
+        if model is not None:
+            self._narrow = self._limits = html.supported(model.gaussians(), self._photographs, *self._place, *self._widest)
+            self.limit()
 
     def _draw_cameras(self) -> None:
         """Draw the cameras with their photographs; a click steps into one."""
         model = self.content.model
         centers = np.array([c.center for c in model.scene_cameras.values()]).reshape(-1, 3)
         gaps = np.linalg.norm(centers[:, None] - centers[None], axis=2) + np.where(np.eye(len(centers)), np.inf, 0)
-        size = 0.4 * float(np.median(gaps.min(1))) if len(centers) > 1 else 0.5 * self.extent
+        size = 0.25 * float(np.median(gaps.min(1))) if len(centers) > 1 else 0.5 * self.extent
         for number, (name, camera) in enumerate(model.scene_cameras.items()):
             view = self.content.views.get(name)
             frustum = self.server.scene.add_camera_frustum(
@@ -569,6 +579,8 @@ class Window:
         """Give a browser, or all browsers if ``client`` is None, the pose of a camera, and show its whole image."""
         forward, up = np.asarray(camera.viewmat[2, :3]), -np.asarray(camera.viewmat[1, :3])
         ahead = html.distance_ahead(camera, self.content.model.gaussians())
+        self._limits = self._narrow if camera is self.first else self._widest  # cameras to step into are within the latter
+        self.limit()
         for c in [client] if client is not None else list(self.server.get_clients().values()):
             with c.atomic():
                 c.camera.position = camera.center
@@ -627,6 +639,7 @@ class Window:
             time.sleep(SETTLED)
             if self._wake.is_set() or not self._open:
                 continue  # still moving
+            guarded(self._measure)()
             for client in list(self.server.get_clients().values()):
                 try:
                     self._render_for(client)
