@@ -36,12 +36,8 @@ def test_missing_extras_are_named_with_what_they_are_for(monkeypatch):
     there -= {"pycolmap", "zstandard"}
     (found,) = doctor._extras()
     assert found.status == NOTE and "view; not installed: poses (photographs without cameras), formats" in found.detail
-<<<<<<< HEAD
-    assert found.remedy == "`pip install '.[poses,formats]'` in your copy of the repository"
-=======
     extras = "[poses,formats]"
     assert found.remedy == f"`pip install '.{extras}'` in your copy of the repository; of a wheel, append {extras} to its path"
->>>>>>> page
 
 
 def test_this_machine_can_fit():
