@@ -285,7 +285,7 @@ class OpenCV(CameraModel):
             folded: wp.bool
 
         @wp.func
-        def radial_at(t: real, lens: Reals):
+        def radial_at(t: real, lens: Reals) -> tuple[real, real, real, real]:
             """Return the radial factor R = N / M at a squared radius, its first two derivatives by that, and M."""
             three = real(3.0)
             k1, k2, k3, k4, k5, k6 = lens[0], lens[1], lens[4], lens[5], lens[6], lens[7]
@@ -460,7 +460,7 @@ class Fisheye(CameraModel):
             )
 
         @wp.func
-        def angle_over_sine(r2: real, z: real):
+        def angle_over_sine(r2: real, z: real) -> tuple[real, real, real]:
             """Return A = angle / r, B = A_r / r and C = B_r / r at a unit position."""
             t = r2 / (z * z)
             if z > real(0.0) and t < real(NEAR_AXIS):
