@@ -67,7 +67,10 @@ class GraphedRasterizer:
         )
         self._sums: torch.Tensor | None = None
         self._no_factors = torch.empty(0, dtype=torch.float32, device=self.device)
-        self._black = torch.zeros(cameras, 3, dtype=torch.float32, device=self.device)
+
+    @functools.cached_property
+    def _black(self) -> torch.Tensor:
+        return torch.zeros(self.cameras, 3, dtype=torch.float32, device=self.device)
 
     def render(self, inputs: ProjectInputs, backgrounds: torch.Tensor | None):
         """Return images, projected Gaussians [C, N, 12] and tile counts [C, N]; None if the call exceeds the capacity."""
