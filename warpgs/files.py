@@ -176,9 +176,12 @@ def read_tensors(path: Path, fix: str, again: str) -> tuple[dict[str, Any], dict
 
 
 def input_digest(path: str | os.PathLike[str], below: Path | None = None) -> str:
-    """Return the SHA-256 of a regular file, hexadecimal; ``below`` as in `open_input`."""
-    with open_input(path, below) as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+    """Return the SHA-256 of a regular file, hexadecimal, or raise DataError; ``below`` as in `open_input`."""
+    try:
+        with open_input(path, below) as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as e:
+        raise DataError(f"{path}: cannot be read ({unread_reason(e)}); fix its permissions or copy it again") from e
 
 
 def unread_reason(error: Exception) -> str:
