@@ -111,7 +111,7 @@ MAX_HEADER_BYTES = 65536
 def ply_header(head: bytes) -> tuple[list[PlyElement], int, bool]:
     """Return the elements of the header in a PLY file's first bytes, the offset [bytes] of the data, and if they are ASCII."""
     expect(re.match(rb"ply[ \t]*\r?\n", head), "it does not start with 'ply'")
-    end = re.search(rb"^end_header[ \t]*\r?\n", head, re.MULTILINE)
+    end: Any = re.search(rb"^end_header[ \t]*\r?\n", head, re.MULTILINE)
     expect(end, f"no 'end_header' line within the first {MAX_HEADER_BYTES} bytes")
     elements: list[PlyElement] = []
     formats = []
